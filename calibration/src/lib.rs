@@ -1,0 +1,12 @@
+//! What is true of one bench: units, display geometry and the rig file.
+//!
+//! Every other crate of the workspace takes its words and units from here. Lengths are metres, angles radians, times
+//! seconds (`f64`) or nanoseconds (`i64`); a pupil is the one quantity kept in millimetres, as trackers and the
+//! literature give it.
+
+mod geometry;
+pub mod rig;
+mod units;
+
+pub use geometry::DisplayGeometry;
+pub use units::{Colour, Dioptres, Metres, PerColour, PupilDiameter, Resolution, TimeNs};

@@ -1,0 +1,3 @@
+//! The holod daemon.
+
+fn main() {}
