@@ -78,10 +78,15 @@ pub struct Lasers {
 }
 
 /// Which laser box is on the bench.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum LaserDriver {
     /// No box: a simulated laser that logs its edges.
     Simulated,
+    /// A microcontroller that speaks holod's laser protocol on a serial port.
+    Serial {
+        /// The port, for example `/dev/holod-lasers`.
+        path: PathBuf,
+    },
 }
 
 /// The eye tracker.
