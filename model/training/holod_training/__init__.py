@@ -1,0 +1,1 @@
+"""Trains, judges and exports holod's pupil-adaptive hologram networks."""

@@ -1,0 +1,9 @@
+"""python -m holod_training {train,evaluate,export,golden}"""
+
+from __future__ import annotations
+
+import sys
+
+from holod_training.cli import main
+
+sys.exit(main())

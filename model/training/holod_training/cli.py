@@ -1,0 +1,122 @@
+"""The command line: python -m holod_training {train,evaluate,export,golden}."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+import torch
+
+from holod_training.config import ConfigError, NetworkConfig
+from holod_training.export import WeightsError
+from holod_training.loss import LossWeights
+from holod_training.shards import ShardError
+from holod_training.train import TrainConfig, TrainingError
+
+EX_DATAERR = 65
+
+
+def choose_device(name: str) -> torch.device:
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and "LOCAL_RANK" in os.environ:
+        name = f"cuda:{os.environ['LOCAL_RANK']}"
+        torch.cuda.set_device(name)
+    return torch.device(name)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options = _parser().parse_args(arguments)
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    try:
+        options.run(options)
+    except (ConfigError, ShardError, TrainingError, WeightsError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EX_DATAERR
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="holod_training", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(name: str, about: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=about, description=about)
+        sub.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
+        sub.add_argument("--threads", type=int, default=0, help="CPU threads; 0 leaves torch's own choice")
+        return sub
+
+    train = command("train", "Trains a network on shards; run under torchrun for several processes")
+    train.add_argument("--shards", required=True, help="folder of training scenes; may grow while training")
+    train.add_argument("--validation", help="folder of held-out scenes")
+    train.add_argument("--out", required=True, help="run folder")
+    train.add_argument("--steps", type=int, required=True)
+    train.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
+    train.add_argument("--initial-weights", help="start from a weights file instead of random numbers")
+    defaults, loss = TrainConfig("", "", 0), LossWeights()
+    train.add_argument("--crop", type=int, default=defaults.crop)
+    train.add_argument("--batch", type=int, default=defaults.batch, help="crops per process and step")
+    train.add_argument("--learning-rate", type=float, default=defaults.learning_rate)
+    train.add_argument("--warm-up-steps", type=int, default=defaults.warm_up_steps)
+    train.add_argument("--seed", type=int, default=defaults.seed)
+    train.add_argument("--layers", type=int, default=14)
+    train.add_argument("--channels", type=int, default=32)
+    train.add_argument("--grid", choices=("half-band", "full"), default="half-band")
+    train.add_argument("--absolute-weight", type=float, default=loss.absolute)
+    train.add_argument("--gradient-weight", type=float, default=loss.gradient)
+    train.add_argument("--squared-weight", type=float, default=loss.squared)
+    train.add_argument("--focus-weight", type=float, default=loss.focus)
+    train.add_argument("--coc-floor-px", type=float, default=loss.coc_floor_px)
+    train.add_argument("--validate-every", type=int, default=defaults.validate_every)
+    train.add_argument("--stop-below-slope", type=float, default=defaults.stop_below_slope)
+    train.set_defaults(run=_train)
+    golden = command("golden", "Writes the golden vectors that the engines are tested against")
+    golden.add_argument("--out", required=True, help="folder, model/golden")
+    golden.add_argument("--weights", help="the shipped weights file, for vectors of it too")
+    golden.add_argument("--seed", type=int, default=20)
+    golden.set_defaults(run=_golden)
+    return parser
+
+
+def _golden(options: argparse.Namespace) -> None:
+    from holod_training.golden import write_golden
+
+    shipped = Path(options.weights) if options.weights else None
+    for path in write_golden(Path(options.out), shipped, options.seed):
+        print(path)
+
+
+def _train(options: argparse.Namespace) -> None:
+    from holod_training.train import train
+
+    config = TrainConfig(
+        shards=options.shards,
+        out=options.out,
+        steps=options.steps,
+        validation=options.validation,
+        network=NetworkConfig(
+            grid=options.grid,
+            layers=options.layers,
+            channels=options.channels,
+            adjustable_layers=(options.layers // 2,),
+        ),
+        loss=LossWeights(
+            absolute=options.absolute_weight,
+            gradient=options.gradient_weight,
+            squared=options.squared_weight,
+            focus=options.focus_weight,
+            coc_floor_px=options.coc_floor_px,
+        ),
+        crop=options.crop,
+        batch=options.batch,
+        learning_rate=options.learning_rate,
+        warm_up_steps=options.warm_up_steps,
+        seed=options.seed,
+        validate_every=options.validate_every,
+        stop_below_slope=options.stop_below_slope,
+        initial_weights=options.initial_weights,
+    )
+    print(train(config, choose_device(options.device), options.resume))

@@ -1,0 +1,75 @@
+"""Weights files: safetensors F32 with everything a reader must know in the metadata (DESIGN §6)."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from holod_training.config import WEIGHTS_FORMAT, ConfigError, NetworkConfig
+from holod_training.network import DirectNetwork
+
+
+class WeightsError(ValueError):
+    """A weights file that cannot be used; the message names the file and what was found."""
+
+
+def write_beside(path: Path, content: bytes) -> None:
+    """Writes beside and renames, so that no reader ever meets half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part.write_bytes(content)
+    part.replace(path)
+
+
+def save_weights(path: Path, network: DirectNetwork, metrics: dict[str, Any], provenance: dict[str, Any]) -> None:
+    tensors = {name: value.detach().float().cpu().contiguous() for name, value in network.state_dict().items()}
+    metadata = {
+        "format": WEIGHTS_FORMAT,
+        "config": network.config.to_json(),
+        "metrics": json.dumps(metrics),
+        "provenance": json.dumps(provenance),
+    }
+    write_beside(path, save(tensors, metadata))
+
+
+def read_metadata(path: Path) -> dict[str, Any]:
+    """{config: NetworkConfig, metrics: ..., provenance: ...}. Raises WeightsError."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{path}: not a readable weights file ({error})") from error
+    if metadata.get("format") != WEIGHTS_FORMAT:
+        raise WeightsError(f"{path}: metadata format is {metadata.get('format')!r}, expected {WEIGHTS_FORMAT!r}")
+    try:
+        return {
+            "config": NetworkConfig.from_json(metadata.get("config", "")),
+            "metrics": json.loads(metadata.get("metrics", "{}")),
+            "provenance": json.loads(metadata.get("provenance", "{}")),
+        }
+    except (ConfigError, json.JSONDecodeError) as error:
+        raise WeightsError(f"{path}: {error}") from error
+
+
+def load_weights(path: Path) -> DirectNetwork:
+    """The network in a weights file, on the CPU. Raises WeightsError for a missing, extra or ill-shaped tensor."""
+    network = DirectNetwork(read_metadata(path)["config"])
+    expected = network.state_dict()
+    with safe_open(path, framework="pt") as file:
+        found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    if expected.keys() != found.keys():
+        raise WeightsError(
+            f"{path}: missing tensors {sorted(expected.keys() - found.keys())}, "
+            f"unknown tensors {sorted(found.keys() - expected.keys())}"
+        )
+    for name, value in found.items():
+        if value.shape != expected[name].shape:
+            raise WeightsError(f"{path}: {name} has shape {list(value.shape)}, expected {list(expected[name].shape)}")
+    network.load_state_dict({name: value.to(torch.float32) for name, value in found.items()})
+    return network.eval()

@@ -1,0 +1,186 @@
+"""The bench in numbers: propagation, the half band, the eye, double phase (DESIGN §3).
+
+FFTs here are circular; a border is left out of losses and metrics instead of padding (DESIGN §5).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from holod_training.config import OpticsConfig
+
+
+def frequencies(size: int, pitch_m: float, device: torch.device | str = "cpu") -> Tensor:
+    """Cycles per metre of an FFT's bins, float64 [size]."""
+    return torch.fft.fftfreq(size, pitch_m, dtype=torch.float64, device=device)
+
+
+def _phase(angle: Tensor) -> Tensor:
+    """exp(j·angle), complex128."""
+    return torch.polar(torch.ones_like(angle), angle)
+
+
+def transfer(optics: OpticsConfig, fx: Tensor, fy: Tensor, distances_m: list[float]) -> Tensor:
+    """Angular spectrum transfer functions, complex128 [K, 3, len(fy), len(fx)], constant phase exp(j·k·u) dropped.
+
+    exp(j·2π·u·(sqrt(1/λ² − fx² − fy²) − 1/λ)) inside 1/λ, 0 outside (Goodman, Introduction to Fourier Optics).
+    """
+    squared = fx[None, :] ** 2 + fy[:, None] ** 2
+    per_colour = []
+    for wavelength in optics.wavelengths_m:
+        axial2 = wavelength**-2 - squared
+        # sqrt(a) − 1/λ without cancellation.
+        axial = -squared / (torch.sqrt(axial2.clamp_min(0)) + 1 / wavelength)
+        u = torch.tensor(distances_m, dtype=torch.float64, device=fx.device)[:, None, None]
+        per_colour.append(_phase(2 * math.pi * u * axial) * (axial2 > 0))
+    return torch.stack(per_colour, dim=1)
+
+
+def propagate(field: Tensor, optics: OpticsConfig, distance_m: float) -> Tensor:
+    """The field [..., 3, H, W] a distance further; positive goes from the SLM plane towards the images."""
+    height, width = field.shape[-2:]
+    fy = frequencies(height, optics.pitch_m, field.device)
+    fx = frequencies(width, optics.pitch_m, field.device)
+    return torch.fft.ifft2(torch.fft.fft2(field) * transfer(optics, fx, fy, [distance_m])[0].to(field.dtype))
+
+
+def propagate_padded(field: Tensor, optics: OpticsConfig, distance_m: float) -> Tensor:
+    """The same without wrapping round: zero-padded to twice the size, band-limited (Matsushima, Shimobaba 2009)."""
+    height, width = field.shape[-2:]
+    fy = frequencies(2 * height, optics.pitch_m, field.device)
+    fx = frequencies(2 * width, optics.pitch_m, field.device)
+    kernel = transfer(optics, fx, fy, [distance_m])[0]
+    limits = []
+    for wavelength in optics.wavelengths_m:
+        limit_y, limit_x = (
+            1 / (wavelength * math.sqrt((2 * distance_m / (2 * size * optics.pitch_m)) ** 2 + 1))
+            for size in (height, width)
+        )
+        limits.append((fy.abs() <= limit_y)[:, None] & (fx.abs() <= limit_x)[None, :])
+    spectrum = torch.fft.fft2(field, s=(2 * height, 2 * width)) * (kernel * torch.stack(limits)).to(field.dtype)
+    return torch.fft.ifft2(spectrum)[..., :height, :width]
+
+
+def half_band_mask(height: int, width: int, device: torch.device | str = "cpu") -> Tensor:
+    """The 4f stop: |fx|, |fy| < 1/4 cycle per pixel, bool [H, W]."""
+    fy = frequencies(height, 1.0, device).abs() < 0.25
+    fx = frequencies(width, 1.0, device).abs() < 0.25
+    return fy[:, None] & fx[None, :]
+
+
+def pupil_mask(optics: OpticsConfig, fx: Tensor, fy: Tensor, pupil_mm: float) -> Tensor:
+    """The eye's pupil in the Fourier plane: a disc of radius (s/2)/(λ·f), bool [3, len(fy), len(fx)]."""
+    radius = torch.sqrt(fx[None, :] ** 2 + fy[:, None] ** 2)
+    limits = [pupil_mm * 0.5e-3 / (wavelength * optics.focal_length_m) for wavelength in optics.wavelengths_m]
+    return torch.stack([radius < limit for limit in limits])
+
+
+def upsample_half_band(low: Tensor) -> Tensor:
+    """Fourier upsampling by 2: complex [..., h, w] with samples at the centres of 2x2 blocks -> [..., 2h, 2w].
+
+    The result is strictly half band (the low grid's Nyquist bins are dropped) and keeps the amplitude.
+    """
+    h, w = low.shape[-2:]
+    spectrum = torch.fft.fft2(low)
+    fy, fx = frequencies(2 * h, 1.0, low.device), frequencies(2 * w, 1.0, low.device)
+    full = torch.zeros(*low.shape[:-2], 2 * h, 2 * w, dtype=low.dtype, device=low.device)
+    low_rows, rows = _kept_bins(h, low.device)
+    low_columns, columns = _kept_bins(w, low.device)
+    full[..., rows[:, None], columns] = spectrum[..., low_rows[:, None], low_columns]
+    shift = _phase(-2 * math.pi * 0.5 * (fy[:, None] + fx[None, :]))
+    return torch.fft.ifft2(full * (4 * shift).to(low.dtype))
+
+
+def _kept_bins(size: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Bins below the low grid's Nyquist frequency: where they lie on the low grid, and on one of twice the size."""
+    signed = torch.arange(-((size - 1) // 2), (size - 1) // 2 + 1, device=device)
+    return signed % size, signed % (2 * size)
+
+
+class Eye:
+    """What a simulated eye sees of a field on the full grid: 4f stop, pupil, propagation, intensity."""
+
+    def __init__(self, optics: OpticsConfig, height: int, width: int, focus_dpt: list[float]) -> None:
+        self.optics = optics
+        self.fy = frequencies(height, optics.pitch_m)
+        self.fx = frequencies(width, optics.pitch_m)
+        self.stop = half_band_mask(height, width)
+        self.transfer = transfer(optics, self.fx, self.fy, [optics.distance_m(d) for d in focus_dpt])
+
+    def look(self, field: Tensor, pupil_mm: float) -> Tensor:
+        """field complex [3, H, W] -> linear intensity [K, 3, H, W], one picture for each focus."""
+        spectrum = torch.fft.fft2(field) * (self.stop & pupil_mask(self.optics, self.fx, self.fy, pupil_mm))
+        return intensity(torch.fft.ifft2(spectrum * self.transfer.to(field.dtype)))
+
+
+class HalfBandEye:
+    """The same for a field on the half-band grid, at the cost that training can bear.
+
+    Only the low grid's spectrum is propagated. It is laid in bins 0 .. h-1 of the full one: that moves every
+    frequency by a constant, a phase ramp in space, which no intensity shows; so the inverse FFT pads by itself.
+    """
+
+    def __init__(
+        self,
+        optics: OpticsConfig,
+        height: int,
+        width: int,
+        focus_dpt: list[float],
+        device: torch.device | str,
+    ) -> None:
+        self.optics = optics
+        self.size = (height, width)
+        h, w = height // 2, width // 2
+        pitch = 2 * optics.pitch_m
+        self.fy = torch.fft.fftshift(frequencies(h, pitch, device))
+        self.fx = torch.fft.fftshift(frequencies(w, pitch, device))
+        kernel = transfer(optics, self.fx, self.fy, [optics.distance_m(d) for d in focus_dpt])
+        limit = 0.25 / optics.pitch_m * (1 - 1e-9)
+        inside = (self.fy.abs() < limit)[:, None] & (self.fx.abs() < limit)[None, :]
+        # Samples of the low grid lie half a full pixel down and right.
+        shift = _phase(-math.pi * optics.pitch_m * (self.fy[:, None] + self.fx[None, :]))
+        self.kernel = (kernel * (4 * inside * shift)).to(torch.complex64)
+        radius = [0.25 * math.sqrt(2) / optics.pitch_m * wl * optics.focal_length_m for wl in optics.wavelengths_m]
+        self.widest_cut_mm = 2e3 * max(radius)
+
+    def look(self, low: Tensor, pupil_mm: float) -> Tensor:
+        """low complex [3, h, w] -> linear intensity [K, 3, H, W]."""
+        spectrum = torch.fft.fftshift(torch.fft.fft2(low), dim=(-2, -1))
+        if pupil_mm < self.widest_cut_mm:
+            spectrum = spectrum * pupil_mask(self.optics, self.fx, self.fy, pupil_mm)
+        return intensity(torch.fft.ifft2(spectrum * self.kernel, s=self.size))
+
+
+def intensity(field: Tensor) -> Tensor:
+    return field.real * field.real + field.imag * field.imag
+
+
+def double_phase(field: Tensor, amplitude_constant: float) -> tuple[Tensor, float]:
+    """Phase pattern in [0, 2π) for a field [..., H, W], and the share of pixels whose amplitude was clipped.
+
+    arg ∓ acos(min(|c|/K, 1)) in a checkerboard, minus where x + y is even (Hsueh and Sawchuk 1978; Maimone 2017).
+    """
+    amplitude = field.abs() / amplitude_constant
+    clipped = (amplitude > 1).float().mean().item()
+    height, width = field.shape[-2:]
+    rows = torch.arange(height, device=field.device)[:, None]
+    columns = torch.arange(width, device=field.device)
+    sign = torch.where((rows + columns) % 2 == 0, -1.0, 1.0)
+    phase = field.angle() + sign * torch.acos(amplitude.clamp(max=1))
+    phase = torch.remainder(phase, 2 * math.pi)
+    return torch.where(phase >= 2 * math.pi, torch.zeros_like(phase), phase), clipped
+
+
+def panel_field(phase: Tensor) -> Tensor:
+    """What leaves a phase-only panel: exp(j·phase)."""
+    return torch.polar(torch.ones_like(phase), phase)
+
+
+def coc_px(optics: OpticsConfig, depth: Tensor, focus_dpt: Tensor | list[float], pupil_mm: float) -> Tensor:
+    """Diameter of the circle of confusion in panel pixels, [K, H, W] for depth [H, W] (0 far .. 1 near)."""
+    focus = torch.as_tensor(focus_dpt, dtype=depth.dtype, device=depth.device)[:, None, None]
+    dioptres = optics.depth_far_dpt + depth * (optics.depth_near_dpt - optics.depth_far_dpt)
+    return (dioptres - focus).abs() * (pupil_mm * 1e-3 / optics.pixel_angle_rad)

@@ -1,0 +1,117 @@
+"""Which crop of which shard a training step sees, and how it is varied."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from holod_training.config import OpticsConfig
+from holod_training.shards import Shard, ShardError, Stack, shard_names
+
+
+@dataclass(frozen=True)
+class AugmentConfig:
+    """Chances of each change. All are exact: thin-lens pictures are linear in the scene's light, pixel by pixel
+    colour included, and the bench is symmetric under flips and quarter turns. Near and far are never swapped."""
+
+    permute_colours: float = 0.5
+    desaturate: float = 0.2
+    dim: float = 0.3
+    invert: float = 0.1
+    dimmest: float = 0.3
+
+
+def augment(stack: Stack, config: AugmentConfig, rng: np.random.Generator) -> Stack:
+    flip_y, flip_x, turn = (bool(b) for b in rng.integers(0, 2, 3))
+
+    def turned(t: Tensor) -> Tensor:
+        flips = [axis for axis, wanted in ((-2, flip_y), (-1, flip_x)) if wanted]
+        t = t.flip(flips) if flips else t
+        return t.transpose(-2, -1) if turn else t
+
+    matrix = np.eye(3, dtype=np.float32)
+    if rng.random() < config.permute_colours:
+        matrix = matrix[rng.permutation(3)]
+    if rng.random() < config.desaturate:
+        share = np.float32(rng.random())
+        matrix = (1 - share) * matrix + share / 3
+    offset = 0.0
+    if rng.random() < config.invert:
+        matrix, offset = -matrix, 1.0
+    if rng.random() < config.dim:
+        gain = np.float32(rng.uniform(config.dimmest, 1))
+        matrix, offset = matrix * gain, offset * float(gain)
+    mix = torch.from_numpy(np.ascontiguousarray(matrix))
+
+    def recoloured(light: Tensor) -> Tensor:
+        if np.array_equal(matrix, np.eye(3)) and offset == 0:
+            return light
+        mixed = mix @ light.reshape(*light.shape[:-2], -1) + offset
+        return mixed.reshape(light.shape)
+
+    return Stack(
+        image=recoloured(turned(stack.image)).clamp_min(0).contiguous(),
+        depth=turned(stack.depth).contiguous(),
+        target=recoloured(turned(stack.target)).contiguous(),
+        pupil_mm=stack.pupil_mm,
+        focus_dpt=stack.focus_dpt,
+    )
+
+
+class Sampler:
+    """Crops by (seed, step, rank): nothing is remembered between steps but the list of shards, so a run that is
+    resumed with that list goes on exactly as if it had never stopped."""
+
+    def __init__(
+        self,
+        folder: Path,
+        optics: OpticsConfig,
+        crop: int,
+        seed: int,
+        rank: int,
+        augment_config: AugmentConfig,
+    ) -> None:
+        self.folder = folder
+        self.optics = optics
+        self.crop = crop
+        self.seed = seed
+        self.rank = rank
+        self.augment_config = augment_config
+        self.shards: list[Shard] = []
+
+    @property
+    def names(self) -> list[str]:
+        return [shard.path.name for shard in self.shards]
+
+    def use(self, names: list[str]) -> None:
+        """Makes exactly these the shards. Raises ShardError for one that is missing, damaged or too small."""
+        known = {shard.path.name: shard for shard in self.shards}
+        self.shards = [known.get(name) or self._open(name) for name in names]
+        if not self.shards:
+            raise ShardError(f"{self.folder}: no scene_*.safetensors in it; write some with `holod-scenes generate`")
+
+    def _open(self, name: str) -> Shard:
+        shard = Shard(self.folder / name)
+        shard.require_optics(self.optics)
+        if min(shard.height, shard.width) < self.crop:
+            raise ShardError(f"{shard.path}: {shard.width}x{shard.height} pixels, smaller than the crop {self.crop}")
+        return shard
+
+    def rescan(self) -> None:
+        """Takes in shards that were written since; those already known stay."""
+        self.use(sorted({*self.names, *shard_names(self.folder)}))
+
+    def draw(self, step: int, count: int) -> list[Stack]:
+        rng = np.random.default_rng((self.seed, self.rank, step))
+        drawn = []
+        for _ in range(count):
+            shard = self.shards[rng.integers(len(self.shards))]
+            pupil = int(rng.integers(len(shard.pupils_mm)))
+            top = int(rng.integers(shard.height - self.crop + 1))
+            left = int(rng.integers(shard.width - self.crop + 1))
+            drawn.append(augment(shard.read(pupil, top, left, self.crop), self.augment_config, rng))
+        return drawn

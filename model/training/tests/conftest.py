@@ -1,0 +1,60 @@
+"""Small made-up shards: the format of `holod-scenes`, pictures that need no renderer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from holod_training.config import OpticsConfig
+
+torch.set_num_threads(1)
+
+
+def write_shard(
+    path: Path,
+    seed: int = 0,
+    size: int = 64,
+    pupils_mm: tuple[float, ...] = (1.0, 2.0, 3.0),
+    planes: int = 3,
+    metadata: dict[str, str] | None = None,
+) -> Path:
+    """A flat picture with a brighter square that fades with |focus - depth|: enough for a loss to fall."""
+    optics = OpticsConfig()
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.rand(3, size, size, generator=generator) * 0.2 + 0.3
+    image[:, size // 4 : size // 2, size // 4 : size // 2] += 0.4
+    depth = torch.linspace(0, 1, size).expand(size, size).contiguous()
+    focus = [optics.dioptres(k / (planes - 1)) for k in range(planes)]
+    tensors = {"image": image.half(), "depth": depth}
+    for index, pupil in enumerate(pupils_mm):
+        mean = image.mean(dim=(1, 2), keepdim=True)
+        share = torch.stack([(depth - k / (planes - 1)).abs() for k in range(planes)])[:, None] * pupil / 5
+        tensors[f"stack_{index}"] = (image * (1 - share) + mean * share).half()
+    values = {
+        "format": "holod-scene-1",
+        "seed": str(seed),
+        "index": str(seed),
+        "kind": "test",
+        "pupils_mm": json.dumps(pupils_mm),
+        "focus_dpt": json.dumps(focus),
+        "far_dpt": str(optics.depth_far_dpt),
+        "near_dpt": str(optics.depth_near_dpt),
+        "pixel_angle_rad": str(optics.pixel_angle_rad),
+        "rays": "64",
+        **(metadata or {}),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_file(tensors, path, values)
+    return path
+
+
+@pytest.fixture
+def shards(tmp_path: Path) -> Path:
+    folder = tmp_path / "shards"
+    for index in range(2):
+        write_shard(folder / f"scene_{index:06}.safetensors", seed=index)
+    return folder

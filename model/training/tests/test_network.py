@@ -1,0 +1,113 @@
+import pytest
+import torch
+import torch.nn.functional as F
+from torchvision.ops import deform_conv2d
+
+from holod_training.config import ConfigError, NetworkConfig
+from holod_training.network import AdjustableLayer, DirectNetwork, gather_conv3x3
+
+
+def random_layer(dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+    g = torch.Generator().manual_seed(3)
+    x = torch.randn(2, 5, 11, 14, generator=g, dtype=dtype)
+    # Up to several pixels, so that taps leave the picture on every side.
+    offsets = 4 * torch.randn(2, 18, 11, 14, generator=g, dtype=dtype)
+    weight = torch.randn(7, 5, 3, 3, generator=g, dtype=dtype)
+    bias = torch.randn(7, generator=g, dtype=dtype)
+    return x, offsets, weight, bias
+
+
+def test_gather_equals_torchvision_forward_and_backward() -> None:
+    inputs = random_layer(torch.float64)
+    results = []
+    for layer in (gather_conv3x3, lambda *a: deform_conv2d(*a, padding=1)):
+        leaves = [t.clone().requires_grad_() for t in inputs]
+        out = layer(*leaves)
+        out.square().sum().backward()
+        results.append([out.detach(), *(leaf.grad for leaf in leaves)])
+    for ours, oracle in zip(*results, strict=True):
+        torch.testing.assert_close(ours, oracle, rtol=1e-9, atol=1e-9)
+
+
+def test_gather_comparator_rejects_swapped_dy_dx() -> None:
+    x, offsets, weight, bias = random_layer(torch.float64)
+    swapped = offsets.view(2, 9, 2, 11, 14).flip(2).reshape_as(offsets)
+    oracle = deform_conv2d(x, offsets, weight, bias, padding=1)
+    with pytest.raises(AssertionError):
+        torch.testing.assert_close(gather_conv3x3(x, swapped, weight, bias), oracle, rtol=1e-9, atol=1e-9)
+
+
+def test_adjustable_layer_is_algorithm_1() -> None:
+    torch.manual_seed(1)
+    layer = AdjustableLayer(channels=6, hidden=5, leaky_slope=0.1).double()
+    x = torch.randn(2, 6, 9, 10, dtype=torch.float64)
+    pupils = torch.tensor([1.5, 4.0], dtype=torch.float64)
+    together = layer(x, pupils)
+    for n in range(2):
+        h = (pupils[n : n + 1] - 3) / 2
+        for index, linear in enumerate(layer.modulation):
+            h = F.linear(h, linear.weight, linear.bias)
+            h = F.leaky_relu(h, 0.1) if index < 2 else h
+        gamma, beta = h[: 18 * 6].view(18, 6), h[18 * 6 :]
+        weight = layer.offset.weight * (1 + gamma)[:, :, None, None]
+        offsets = F.conv2d(x[n : n + 1], weight, layer.offset.bias + beta, padding=1)
+        oracle = deform_conv2d(x[n : n + 1], offsets, layer.weight, layer.bias, padding=1)
+        torch.testing.assert_close(together[n : n + 1], oracle)
+
+
+@pytest.mark.parametrize("grid", ["half-band", "full"])
+def test_direct_network_written_out(grid: str) -> None:
+    """The network again as one flat list of operations, with torchvision's deformable layer."""
+    torch.manual_seed(2)
+    network = DirectNetwork(NetworkConfig(grid=grid, layers=6, channels=8, adjustable_layers=(3,))).double()
+    state = network.state_dict()
+    a = torch.rand(1, 3, 12, 16, dtype=torch.float64)
+    d = torch.rand(1, 12, 16, dtype=torch.float64)
+    s = 2.2
+    x = torch.cat((a, d[:, None] - 0.5, s * (d[:, None] - 0.5)), 1)
+    if grid == "half-band":
+        blocks = x.view(1, 5, 6, 2, 8, 2).permute(0, 1, 3, 5, 2, 4)
+        x = blocks.reshape(1, 20, 6, 8)
+    x = torch.cat((x, torch.full_like(x[:, :1], (s - 3) / 2)), 1)
+
+    def conv(i: int, t: torch.Tensor) -> torch.Tensor:
+        weight, bias = state[f"layers.{i}.weight"], state[f"layers.{i}.bias"]
+        if i != 3:
+            return F.conv2d(t, weight, bias, padding=1)
+        offsets = network.layers[3].offsets(t, torch.tensor([s], dtype=torch.float64))
+        return deform_conv2d(t, offsets, weight, bias, padding=1)
+
+    h = F.leaky_relu(conv(0, x), 0.1)
+    for first in (1, 3):
+        h = F.leaky_relu(0.5 * conv(first + 1, F.leaky_relu(conv(first, h), 0.1)) + h, 0.1)
+    out = conv(5, h)
+    base = a.view(1, 3, 6, 2, 8, 2).mean((3, 5)) if grid == "half-band" else a
+    torch.testing.assert_close(
+        network(a, d, torch.tensor([s], dtype=torch.float64)),
+        torch.complex(base + out[:, :3], out[:, 3:].contiguous()),
+    )
+
+
+def test_pupil_changes_the_field() -> None:
+    torch.manual_seed(4)
+    network = DirectNetwork(NetworkConfig(layers=6, channels=8, adjustable_layers=(3,)))
+    a, d = torch.rand(1, 3, 16, 16), torch.full((1, 16, 16), 0.5)
+    offsets = []
+    for s in (1.0, 5.0):
+        trace: dict[str, torch.Tensor] = {}
+        network(a, d, torch.tensor([s]), trace)
+        offsets.append(trace["offsets_3"])
+    assert (offsets[0] - offsets[1]).abs().max() > 0.01
+
+
+def test_config_round_trip_and_errors() -> None:
+    config = NetworkConfig(layers=20, adjustable_layers=(9, 11))
+    assert NetworkConfig.from_json(config.to_json()) == config
+    with pytest.raises(ConfigError, match="unknown keys: depht"):
+        NetworkConfig.from_json(config.to_json().replace('"layers"', '"depht": 1, "layers"'))
+    with pytest.raises(ConfigError, match="keys missing: grid"):
+        NetworkConfig.from_json(config.to_json().replace('"grid": "half-band", ', ""))
+    with pytest.raises(ConfigError, match="adjustable_layers: found 13"):
+        NetworkConfig(adjustable_layers=(13,))
+    with pytest.raises(ConfigError, match="not JSON"):
+        NetworkConfig.from_json("{")

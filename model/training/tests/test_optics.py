@@ -1,0 +1,146 @@
+import math
+
+import pytest
+import torch
+
+from holod_training.config import OpticsConfig
+from holod_training.optics import (
+    Eye,
+    HalfBandEye,
+    coc_px,
+    double_phase,
+    frequencies,
+    half_band_mask,
+    intensity,
+    panel_field,
+    propagate,
+    propagate_padded,
+    pupil_mask,
+    upsample_half_band,
+)
+
+OPTICS = OpticsConfig()
+
+
+def gaussian_beam(size: int, waist_m: float, wavelength_m: float, z_m: float) -> torch.Tensor:
+    """Saleh and Teich, eq. 3.1-7, without exp(j·k·z): an analytic solution of the paraxial wave equation."""
+    x = (torch.arange(size, dtype=torch.float64) - size // 2) * OPTICS.pitch_m
+    r2 = x[None, :] ** 2 + x[:, None] ** 2
+    z0 = math.pi * waist_m**2 / wavelength_m
+    width = waist_m * math.sqrt(1 + (z_m / z0) ** 2)
+    curvature = 0.0 if z_m == 0 else 1 / (z_m * (1 + (z0 / z_m) ** 2))
+    phase = math.pi / wavelength_m * r2 * curvature - math.atan2(z_m, z0)
+    return waist_m / width * torch.exp(-r2 / width**2) * torch.polar(torch.ones_like(phase), phase)
+
+
+@pytest.mark.parametrize("method", [propagate, propagate_padded])
+@pytest.mark.parametrize("z_m", [-0.004, 0.002, 0.0045])
+def test_asm_spreads_a_gaussian_beam(method, z_m: float) -> None:
+    waist = 60e-6
+    start = torch.stack([gaussian_beam(128, waist, w, 0.0) for w in OPTICS.wavelengths_m])
+    expected = torch.stack([gaussian_beam(128, waist, w, z_m) for w in OPTICS.wavelengths_m])
+    found = method(start, OPTICS, z_m)
+    assert (found - expected).abs().max() < 2e-4
+    assert (found - start).abs().max() > 1e-2, "the beam must change at all"
+
+
+def test_asm_comparator_rejects_the_wrong_direction() -> None:
+    start = torch.stack([gaussian_beam(128, 60e-6, w, 0.0) for w in OPTICS.wavelengths_m])
+    expected = torch.stack([gaussian_beam(128, 60e-6, w, 0.0045) for w in OPTICS.wavelengths_m])
+    assert (propagate(start, OPTICS, -0.0045) - expected).abs().max() > 1e-2
+
+
+def test_padding_keeps_light_from_wrapping_round() -> None:
+    field = torch.zeros(3, 64, 64, dtype=torch.complex128)
+    ramp = torch.polar(torch.ones(64, dtype=torch.float64), 2 * math.pi * 0.2 * torch.arange(64, dtype=torch.float64))
+    field[..., -24:] = ramp[-24:]
+    far = 0.006
+    wrapped, padded = (intensity(m(field, OPTICS, far))[..., :16].sum() for m in (propagate, propagate_padded))
+    assert wrapped > 5 * padded
+
+
+def low_field(h: int = 24, w: int = 32) -> torch.Tensor:
+    g = torch.Generator().manual_seed(5)
+    return torch.complex(
+        torch.randn(3, h, w, generator=g, dtype=torch.float64),
+        torch.randn(3, h, w, generator=g, dtype=torch.float64),
+    )
+
+
+def test_upsampled_field_is_strictly_half_band() -> None:
+    low = low_field()
+    full = upsample_half_band(low)
+    spectrum = torch.fft.fft2(full)
+    mask = half_band_mask(*full.shape[-2:])
+    assert spectrum[..., ~mask].abs().max() < 1e-9
+    assert spectrum[..., mask].abs().max() > 1
+
+
+def test_upsampling_keeps_a_wave_where_it_was() -> None:
+    """exp(j·2π(…)) sampled at block centres becomes the same wave at pixel positions."""
+    h, w = 24, 32
+    u, v = 3 / (2 * w), -2 / (2 * h)
+
+    def wave(y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        angle = 2 * math.pi * (u * x[None, :] + v * y[:, None])
+        return torch.polar(torch.ones_like(angle), angle)
+
+    rows, columns = torch.arange(h, dtype=torch.float64), torch.arange(w, dtype=torch.float64)
+    low = wave(2 * rows + 0.5, 2 * columns + 0.5)
+    full = wave(torch.arange(2 * h, dtype=torch.float64), torch.arange(2 * w, dtype=torch.float64))
+    torch.testing.assert_close(upsample_half_band(low), full)
+
+
+@pytest.mark.parametrize("pupil_mm", [1.0, 1.7, 4.0])
+def test_training_eye_equals_full_eye(pupil_mm: float) -> None:
+    low = low_field(25, 32).to(torch.complex64)
+    focus = [0.0, 1.1, 2.8]
+    fast = HalfBandEye(OPTICS, 50, 64, focus, "cpu").look(low, pupil_mm)
+    slow = Eye(OPTICS, 50, 64, focus).look(upsample_half_band(low), pupil_mm)
+    torch.testing.assert_close(fast, slow, rtol=1e-4, atol=1e-4)
+
+
+def test_eye_comparator_rejects_another_pupil() -> None:
+    low = low_field().to(torch.complex64)
+    fast = HalfBandEye(OPTICS, 48, 64, [0.0], "cpu").look(low, 1.0)
+    slow = Eye(OPTICS, 48, 64, [0.0]).look(upsample_half_band(low), 1.2)
+    assert not torch.allclose(fast, slow, rtol=1e-4, atol=1e-4)
+
+
+def test_pupil_mask_is_a_disc_of_the_eyes_radius() -> None:
+    f = frequencies(256, OPTICS.pitch_m)
+    mask = pupil_mask(OPTICS, f, f, 1.0)
+    step = float(f[1])
+    for colour, wavelength in enumerate(OPTICS.wavelengths_m):
+        area = math.pi * (0.5e-3 / (wavelength * 0.04)) ** 2
+        assert mask[colour].sum() * step**2 == pytest.approx(area, rel=0.02)
+
+
+def test_double_phase_round_trip_through_the_stop() -> None:
+    """A smooth field comes back: the checkerboard's mean is the field over K, its difference is stopped."""
+    y, x = torch.meshgrid(torch.arange(128.0), torch.arange(128.0), indexing="ij")
+    amplitude = 0.6 + 0.3 * torch.cos(2 * math.pi * x / 64) * torch.cos(2 * math.pi * y / 64)
+    field = torch.polar(amplitude, 1.5 * torch.sin(2 * math.pi * (x + y) / 128)).expand(3, -1, -1)
+    phase, clipped = double_phase(field, 1.4)
+    assert clipped == 0
+    assert phase.min() >= 0 and phase.max() < 2 * math.pi
+    spectrum = torch.fft.fft2(panel_field(phase)) * half_band_mask(128, 128)
+    back = torch.fft.ifft2(spectrum) * 1.4
+    assert (back - field).abs().max() < 0.02
+    assert (panel_field(phase) * 1.4 - field).abs().max() > 0.3, "before the stop the checkerboard must be there"
+
+
+def test_double_phase_sign_and_clipping() -> None:
+    field = torch.full((1, 2, 2), 0.7, dtype=torch.complex64)
+    field[0, 1, 1] = 3.0
+    phase, clipped = double_phase(field, 1.4)
+    a = math.acos(0.5)
+    torch.testing.assert_close(phase, torch.tensor([[[2 * math.pi - a, a], [a, 0.0]]]))
+    assert clipped == 0.25
+
+
+def test_coc_of_the_default_bench() -> None:
+    depth = torch.tensor([[0.0, 1.0]])
+    blur = coc_px(OPTICS, depth, [1 / 0.35], 3.0)
+    assert blur[0, 0, 0] == pytest.approx(42.857, abs=1e-3)
+    assert blur[0, 0, 1] == pytest.approx(0, abs=1e-3)

@@ -1,0 +1,105 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import write_shard
+
+from holod_training.config import OpticsConfig
+from holod_training.sampling import AugmentConfig, Sampler, augment
+from holod_training.shards import Shard, ShardError, open_shards, shard_names
+
+
+def test_crop_is_a_window_of_the_whole(shards: Path) -> None:
+    shard = Shard(shards / "scene_000000.safetensors")
+    whole, crop = shard.read(1), shard.read(1, top=5, left=9, size=32)
+    assert crop.pupil_mm == 2.0
+    assert len(crop.focus_dpt) == 3
+    torch.testing.assert_close(crop.target, whole.target[:, :, 5:37, 9:41])
+    torch.testing.assert_close(crop.image, whole.image[:, 5:37, 9:41])
+    torch.testing.assert_close(crop.depth, whole.depth[5:37, 9:41])
+
+
+def test_truncated_file_is_named(tmp_path: Path) -> None:
+    path = write_shard(tmp_path / "scene_000000.safetensors")
+    path.write_bytes(path.read_bytes()[:-1000])
+    with pytest.raises(ShardError, match=r"scene_000000\.safetensors: not a whole safetensors file"):
+        Shard(path)
+
+
+def test_garbage_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "scene_000000.safetensors"
+    path.write_bytes(b"no shard at all")
+    with pytest.raises(ShardError, match="not a whole safetensors file"):
+        Shard(path)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [
+        ({"format": "holod-scene-2"}, "format is 'holod-scene-2', expected 'holod-scene-1'"),
+        ({"pupils_mm": "2.0"}, "pupils_mm = 2.0, expected a list of numbers"),
+        ({"focus_dpt": "[0.0, 1.0]"}, r"stack_0 has shape \[3, 3, 64, 64\], expected \[2, 3, 64, 64\]"),
+        ({"near_dpt": "4.0"}, "near_dpt is 4.0, the network is made for 2.857"),
+        ({"far_dpt": "far"}, "far_dpt = 'far' is not JSON"),
+        ({"pupils_mm": "[1.0, 2.0, 3.0, 4.0]"}, "stack_3 has shape None"),
+    ],
+)
+def test_wrong_metadata_is_said(tmp_path: Path, metadata: dict[str, str], message: str) -> None:
+    write_shard(tmp_path / "scene_000000.safetensors", metadata=metadata)
+    with pytest.raises(ShardError, match=message):
+        open_shards(tmp_path, OpticsConfig())
+
+
+def test_no_shards(tmp_path: Path) -> None:
+    with pytest.raises(ShardError, match="holod-scenes generate"):
+        open_shards(tmp_path, OpticsConfig())
+    with pytest.raises(ShardError, match="no such folder"):
+        shard_names(tmp_path / "missing")
+    with pytest.raises(ShardError, match="no such shard"):
+        Shard(tmp_path / "scene_000000.safetensors")
+
+
+def sampler(folder: Path, crop: int = 32, seed: int = 1) -> Sampler:
+    made = Sampler(folder, OpticsConfig(), crop, seed, 0, AugmentConfig())
+    made.rescan()
+    return made
+
+
+def test_draws_depend_on_seed_and_step_alone(shards: Path) -> None:
+    first, again = sampler(shards).draw(7, 3), sampler(shards).draw(7, 3)
+    for a, b in zip(first, again, strict=True):
+        assert torch.equal(a.target, b.target)
+    assert not torch.equal(sampler(shards).draw(8, 1)[0].target, first[0].target)
+    assert not torch.equal(sampler(shards, seed=2).draw(7, 1)[0].target, first[0].target)
+
+
+def test_rescan_takes_in_new_shards_and_refuses_small_ones(shards: Path) -> None:
+    growing = sampler(shards)
+    write_shard(shards / "scene_000009.safetensors", seed=9)
+    growing.rescan()
+    assert growing.names[-1] == "scene_000009.safetensors"
+    with pytest.raises(ShardError, match="64x64 pixels, smaller than the crop 80"):
+        sampler(shards, crop=80)
+
+
+def test_augmentation_changes_picture_and_targets_alike(shards: Path) -> None:
+    """Where a target equals the picture (at the depth in focus), it must do so after every change, too."""
+    stack = Shard(shards / "scene_000000.safetensors").read(0)
+    always = AugmentConfig(permute_colours=1, desaturate=1, dim=1, invert=0.5)
+    changed = 0
+    for seed in range(12):
+        out = augment(stack, always, np.random.default_rng(seed))
+        sharp = (out.depth < 1e-6)[None]
+        assert sharp.any()
+        torch.testing.assert_close(out.target[0][sharp.expand(3, -1, -1)], out.image[sharp.expand(3, -1, -1)])
+        assert out.target.min() >= 0 and out.target.max() <= 1
+        changed += not torch.equal(out.image, stack.image)
+    assert changed == 12
+
+
+def test_no_augmentation_but_turns_keeps_every_value(shards: Path) -> None:
+    stack = Shard(shards / "scene_000000.safetensors").read(0)
+    none = AugmentConfig(permute_colours=0, desaturate=0, dim=0, invert=0)
+    out = augment(stack, none, np.random.default_rng(1))
+    assert torch.equal(out.target.flatten().sort().values, stack.target.flatten().sort().values)

@@ -1,0 +1,168 @@
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from holod_training.cli import main
+from holod_training.config import NetworkConfig
+from holod_training.export import WeightsError, load_weights, read_metadata, save_weights
+from holod_training.network import DirectNetwork
+from holod_training.sampling import AugmentConfig
+from holod_training.train import TrainConfig, TrainingError, train
+
+CPU = torch.device("cpu")
+TINY = NetworkConfig(layers=4, channels=8, adjustable_layers=(1,), modulation_hidden=4)
+
+
+def tiny(shards: Path, out: Path, **changes: object) -> TrainConfig:
+    config = TrainConfig(
+        shards=str(shards),
+        out=str(out),
+        steps=6,
+        validation=str(shards),
+        network=TINY,
+        crop=48,
+        border_px=8,
+        log_every=2,
+        checkpoint_every=3,
+        validate_every=6,
+        rescan_every=2,
+        stop_below_slope=-10,
+    )
+    return dataclasses.replace(config, **changes)
+
+
+def test_a_run_learns_and_leaves_its_folder(shards: Path, tmp_path: Path) -> None:
+    config = tiny(
+        shards,
+        tmp_path / "run",
+        steps=60,
+        crop=64,
+        augment=AugmentConfig(permute_colours=0, desaturate=0, dim=0, invert=0),
+        validate_every=30,
+        warm_up_steps=5,
+        learning_rate=5e-3,
+    )
+    weights = train(config, CPU)
+    rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    losses = [r["loss"] for r in rows if r["kind"] == "train"]
+    assert sum(losses[-8:]) < 0.9 * sum(losses[:8])
+    assert sum(r["kind"] == "validation" for r in rows) == 2
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["steps"] == 60
+    assert (tmp_path / "run" / "curves.png").stat().st_size > 1000
+    metadata = read_metadata(weights)
+    assert metadata["config"] == TINY
+    assert metadata["provenance"]["steps"] == 60
+    assert metadata["metrics"]["validation_before_double_phase"]["2.0"]["psnr_db"] > 10
+
+
+def test_resume_is_bit_exact(shards: Path, tmp_path: Path) -> None:
+    whole = load_file(train(tiny(shards, tmp_path / "whole"), CPU))
+
+    class StopError(Exception):
+        pass
+
+    from holod_training import train as module
+
+    original = module.Run.train_step
+
+    def interrupted(self: module.Run) -> dict[str, float]:
+        if self.step == 4:
+            raise StopError
+        return original(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module.Run, "train_step", interrupted)
+        with pytest.raises(StopError):
+            train(tiny(shards, tmp_path / "cut"), CPU)
+    state = torch.load(tmp_path / "cut" / "checkpoint.pt", weights_only=True)
+    assert state["step"] == 3
+    resumed = load_file(train(tiny(shards, tmp_path / "cut"), CPU, resume=True))
+    assert resumed.keys() == whole.keys()
+    for name, value in whole.items():
+        assert torch.equal(value, resumed[name]), name
+    other = load_file(train(tiny(shards, tmp_path / "other", seed=2), CPU))
+    assert not torch.equal(other["layers.0.weight"], whole["layers.0.weight"])
+
+
+def test_a_flat_run_is_stopped(shards: Path, tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="shows one blurred picture"):
+        train(tiny(shards, tmp_path / "run", stop_below_slope=2.0), CPU)
+
+
+def test_an_old_run_is_not_overwritten(shards: Path, tmp_path: Path) -> None:
+    train(tiny(shards, tmp_path / "run", steps=1), CPU)
+    with pytest.raises(TrainingError, match="holds a run already"):
+        train(tiny(shards, tmp_path / "run"), CPU)
+    with pytest.raises(TrainingError, match="no checkpoint to resume"):
+        train(tiny(shards, tmp_path / "none"), CPU, resume=True)
+
+
+def test_learning_rate_warms_up_and_ends_at_three_percent() -> None:
+    config = TrainConfig("", "", steps=1000)
+    assert config.learning_rate_at(0) == pytest.approx(2e-3 / 30, rel=0.01)
+    assert config.learning_rate_at(30) == pytest.approx(2e-3, rel=0.01)
+    assert config.learning_rate_at(1000) == pytest.approx(6e-5)
+
+
+def test_two_processes_agree(shards: Path, tmp_path: Path) -> None:
+    """Under torchrun with gloo: both ranks see other crops, one writes, and the result is not that of one alone."""
+    script = tmp_path / "two.py"
+    script.write_text(
+        "import sys, torch\n"
+        "torch.set_num_threads(1)\n"
+        f"sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}\n"
+        "from pathlib import Path\n"
+        "from test_train import tiny, CPU\n"
+        "from holod_training.train import train\n"
+        f"train(tiny(Path({str(shards)!r}), Path({str(tmp_path / 'two')!r}), steps=3), CPU)\n"
+    )
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node=2",
+        str(script),
+    ]
+    done = subprocess.run(
+        command,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    two = load_file(tmp_path / "two" / "weights.safetensors")
+    one = load_file(train(tiny(shards, tmp_path / "one", steps=3), CPU))
+    assert not torch.equal(two["layers.0.weight"], one["layers.0.weight"])
+    assert "2 x 1 thread(s)" in read_metadata(tmp_path / "two" / "weights.safetensors")["provenance"]["machine"]
+
+
+def test_weights_round_trip_and_errors(tmp_path: Path) -> None:
+    network = DirectNetwork(TINY)
+    path = tmp_path / "w.safetensors"
+    save_weights(path, network, {}, {})
+    back = load_weights(path).state_dict()
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, back[name])
+    network.layers[0] = torch.nn.Conv2d(20, 8, 3, padding=1)
+    save_weights(path, network, {}, {})
+    with pytest.raises(WeightsError, match=r"layers\.0\.weight has shape \[8, 20, 3, 3\], expected \[8, 21, 3, 3\]"):
+        load_weights(path)
+    path.write_bytes(b"garbage")
+    with pytest.raises(WeightsError, match="not a readable weights file"):
+        load_weights(path)
+
+
+def test_cli_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["train", "--shards", str(tmp_path / "none"), "--out", str(tmp_path / "run"), "--steps", "1"])
+    assert code == 65
+    assert "no such folder of shards" in capsys.readouterr().err
