@@ -1,0 +1,211 @@
+//! What the tracker's thread counts.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use crate::gate::Rejection;
+use crate::source::replay::{LOG_FAULT_NAMES, LogFault};
+
+/// One thing that is counted, beside the reasons for rejection.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Counter {
+    /// Bytes read from a port.
+    Bytes,
+    /// Samples decoded.
+    Samples,
+    /// Samples that the gate believed.
+    Accepted,
+    /// Comment lines.
+    Comments,
+    /// Lines whose beginning was missed when a port was opened.
+    PartialLines,
+    /// Times at which running numbers were skipped.
+    SequenceGaps,
+    /// Running numbers skipped in all.
+    SequenceMissing,
+    /// Samples with the same number and eye as their predecessor.
+    SequenceRepeats,
+    /// Times at which the running number fell.
+    SequenceRestarts,
+    /// Times at which the port was opened.
+    Connects,
+    /// Times at which the port was lost.
+    Disconnects,
+    /// Tries to open it again.
+    ReconnectAttempts,
+    /// Times at which an open port fell silent.
+    Silences,
+    /// Times at which the tracker's clock was reset or stepped.
+    ClockResets,
+    /// Times at which a looped log began again.
+    Loops,
+    /// Decisions that the tap had no room for.
+    DecisionsDropped,
+}
+
+impl Counter {
+    /// Every counter, in the order of their indices.
+    pub const ALL: [Self; 16] = [
+        Self::Bytes,
+        Self::Samples,
+        Self::Accepted,
+        Self::Comments,
+        Self::PartialLines,
+        Self::SequenceGaps,
+        Self::SequenceMissing,
+        Self::SequenceRepeats,
+        Self::SequenceRestarts,
+        Self::Connects,
+        Self::Disconnects,
+        Self::ReconnectAttempts,
+        Self::Silences,
+        Self::ClockResets,
+        Self::Loops,
+        Self::DecisionsDropped,
+    ];
+
+    /// The name used in records.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Bytes => "bytes",
+            Self::Samples => "samples",
+            Self::Accepted => "accepted",
+            Self::Comments => "comments",
+            Self::PartialLines => "partial_lines",
+            Self::SequenceGaps => "sequence_gaps",
+            Self::SequenceMissing => "sequence_missing",
+            Self::SequenceRepeats => "sequence_repeats",
+            Self::SequenceRestarts => "sequence_restarts",
+            Self::Connects => "connects",
+            Self::Disconnects => "disconnects",
+            Self::ReconnectAttempts => "reconnect_attempts",
+            Self::Silences => "silences",
+            Self::ClockResets => "clock_resets",
+            Self::Loops => "loops",
+            Self::DecisionsDropped => "decisions_dropped",
+        }
+    }
+}
+
+const COUNTERS: usize = Counter::ALL.len();
+const REJECTIONS: usize = Rejection::ALL.len();
+const FAULTS: usize = LOG_FAULT_NAMES.len();
+
+/// The counters themselves; written by the tracker's thread only.
+#[derive(Debug)]
+pub(crate) struct Counters {
+    counts: [AtomicU64; COUNTERS],
+    rejected: [AtomicU64; REJECTIONS],
+    faults: [AtomicU64; FAULTS],
+}
+
+impl Counters {
+    pub(crate) const fn new() -> Self {
+        Self {
+            counts: [const { AtomicU64::new(0) }; COUNTERS],
+            rejected: [const { AtomicU64::new(0) }; REJECTIONS],
+            faults: [const { AtomicU64::new(0) }; FAULTS],
+        }
+    }
+
+    pub(crate) fn add(&self, counter: Counter, count: u64) {
+        self.counts[counter as usize].fetch_add(count, Ordering::Relaxed);
+    }
+
+    pub(crate) fn add_rejected(&self, reason: Rejection) {
+        self.rejected[reason.index()].fetch_add(1, Ordering::Relaxed);
+    }
+
+    pub(crate) fn add_fault(&self, fault: LogFault, count: u64) {
+        self.faults[fault.index()].fetch_add(count, Ordering::Relaxed);
+    }
+
+    pub(crate) fn add_faults(&self, faults: impl Iterator<Item = (&'static str, u64)>) {
+        for (counter, (_, count)) in self.faults.iter().zip(faults) {
+            counter.fetch_add(count, Ordering::Relaxed);
+        }
+    }
+
+    pub(crate) fn snapshot(&self) -> CounterSnapshot {
+        let load = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        CounterSnapshot {
+            counts: self.counts.each_ref().map(load),
+            rejected: self.rejected.each_ref().map(load),
+            faults: self.faults.each_ref().map(load),
+        }
+    }
+}
+
+/// All counts at one moment.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct CounterSnapshot {
+    counts: [u64; COUNTERS],
+    rejected: [u64; REJECTIONS],
+    faults: [u64; FAULTS],
+}
+
+impl CounterSnapshot {
+    /// One count.
+    pub const fn of(&self, counter: Counter) -> u64 {
+        self.counts[counter as usize]
+    }
+
+    /// Samples that the gate rejected for `reason`.
+    pub const fn rejected(&self, reason: Rejection) -> u64 {
+        self.rejected[reason.index()]
+    }
+
+    /// Samples that the gate rejected.
+    pub fn rejected_in_all(&self) -> u64 {
+        self.rejected.iter().sum()
+    }
+
+    /// Lines or cells that held no sample, for `fault`.
+    pub const fn fault(&self, fault: LogFault) -> u64 {
+        self.faults[fault.index()]
+    }
+
+    /// Lines or cells that held no sample.
+    pub fn faults_in_all(&self) -> u64 {
+        self.faults.iter().sum()
+    }
+
+    /// Every name with its count: counters, then `line_*` and `log_*` faults, then `rejected_*`.
+    pub fn entries(&self) -> impl Iterator<Item = (String, u64)> {
+        let counts = Counter::ALL.into_iter().map(|counter| (counter.name().to_owned(), self.of(counter)));
+        let faults = LOG_FAULT_NAMES.into_iter().zip(self.faults).map(|(name, count)| (name.to_owned(), count));
+        let rejected =
+            Rejection::ALL.into_iter().map(|reason| (format!("rejected_{}", reason.name()), self.rejected(reason)));
+        counts.chain(faults).chain(rejected)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+    use crate::wire::line::LineFault;
+
+    #[test]
+    fn every_count_has_a_name_of_its_own_and_its_own_place() {
+        let counters = Counters::new();
+        counters.add(Counter::Silences, 3);
+        counters.add_rejected(Rejection::Guard);
+        counters.add_fault(LogFault::Line(LineFault::BadCrc), 2);
+        counters.add_fault(LogFault::Backwards, 5);
+        let snapshot = counters.snapshot();
+        let entries: Vec<_> = snapshot.entries().collect();
+        let names: HashSet<_> = entries.iter().map(|(name, _)| name).collect();
+        assert_eq!(names.len(), COUNTERS + REJECTIONS + FAULTS);
+        let mut counted: Vec<_> = entries.iter().filter(|(_, count)| *count > 0).cloned().collect();
+        counted.sort();
+        let expected = [("line_bad_crc", 2), ("log_backwards", 5), ("rejected_guard", 1), ("silences", 3)];
+        assert_eq!(counted, expected.map(|(name, count)| (name.to_owned(), count)));
+        for (index, counter) in Counter::ALL.into_iter().enumerate() {
+            assert_eq!(counter as usize, index);
+        }
+        for (index, reason) in Rejection::ALL.into_iter().enumerate() {
+            assert_eq!(reason.index(), index);
+        }
+    }
+}

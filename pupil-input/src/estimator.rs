@@ -1,0 +1,374 @@
+//! From samples to `pupil_at(t)`: gate and filter per eye, eyes combined, hold, fallback and the slides between.
+
+use holod_calibration::{PupilDiameter, TimeNs, rig};
+
+use crate::filter::{Filter, FilterSettings, Motion};
+use crate::gate::{Expected, Gate, GateSettings, Rejection, Verdict};
+use crate::{PupilSample, SampleEye};
+
+/// How samples become an estimate.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EstimatorSettings {
+    /// Whose samples drive the display.
+    pub eye: rig::Eye,
+    /// Factor from the tracker's figure to millimetres.
+    pub scale: f64,
+    /// Diameter to slide to when nothing has been believed for longer than `hold`.
+    pub fallback: PupilDiameter,
+    /// How long the last good value is held.
+    pub hold: TimeNs,
+    /// Speed of the slide to the fallback, mm/s.
+    pub fallback_mm_per_s: f32,
+    /// Speed at which a difference between what is shown and what is measured is worked off when samples come back,
+    /// mm/s.
+    pub return_mm_per_s: f32,
+    /// A stream whose last believed sample is older than this is held.
+    pub silence: TimeNs,
+    /// Over how long the difference between the two eyes is learnt.
+    pub eye_offset: TimeNs,
+    /// Limits of the gate.
+    pub gate: GateSettings,
+    /// Tuning of the filter.
+    pub filter: FilterSettings,
+}
+
+impl From<&rig::Tracker> for EstimatorSettings {
+    fn from(tracker: &rig::Tracker) -> Self {
+        Self {
+            eye: tracker.eye,
+            scale: tracker.scale,
+            fallback: tracker.fallback,
+            hold: tracker.hold,
+            fallback_mm_per_s: 1.3,
+            return_mm_per_s: 4.0,
+            silence: TimeNs(150_000_000),
+            eye_offset: TimeNs(1_000_000_000),
+            gate: GateSettings::default(),
+            filter: FilterSettings::default(),
+        }
+    }
+}
+
+/// What the estimate rests on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum PupilState {
+    /// Fresh samples.
+    Tracking,
+    /// The last good value, through a blink or a short loss.
+    Holding,
+    /// The configured diameter, or the slide to it: nothing has been believed for long, or ever.
+    Fallback,
+}
+
+impl PupilState {
+    /// The name used in records.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Tracking => "tracking",
+            Self::Holding => "holding",
+            Self::Fallback => "fallback",
+        }
+    }
+}
+
+/// The pupil at one time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PupilEstimate {
+    /// The diameter to render for.
+    pub pupil: PupilDiameter,
+    /// What it rests on.
+    pub state: PupilState,
+    /// Latest sample as measured, scaled, believed or not.
+    pub raw_mm: Option<f32>,
+    /// When that sample was taken.
+    pub t_sample: Option<TimeNs>,
+    /// Rate of change of `pupil`, mm/s.
+    pub velocity_mm_per_s: f32,
+}
+
+/// A verdict on a sample, for plots and records.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Decision {
+    /// The sample, scaled to millimetres.
+    pub sample: PupilSample,
+    /// What the gate said.
+    pub verdict: Verdict,
+}
+
+/// All that `pupil_at` needs, frozen after a sample: small, `Copy`, and valid for any later time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EstimateSnapshot {
+    /// The combined motion at the last believed sample.
+    motion: Option<Motion>,
+    /// A bad sample has come since.
+    lost: bool,
+    /// Difference between what was shown and the motion, and when; worked off at the return speed.
+    blend: Blend,
+    raw: Option<(TimeNs, f32)>,
+    clock: StreamClock,
+    settings: EstimatorSettings,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Blend {
+    t: TimeNs,
+    excess_mm: f32,
+}
+
+/// Host time to the stream's time, for logs that are replayed at another speed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct StreamClock {
+    pub(crate) host: TimeNs,
+    pub(crate) stream: TimeNs,
+    /// Stream seconds in a host second.
+    pub(crate) rate: f64,
+}
+
+impl StreamClock {
+    /// The stream's time is the host's.
+    pub(crate) const LIVE: Self = Self { host: TimeNs(0), stream: TimeNs(0), rate: 1.0 };
+
+    pub(crate) fn to_stream(self, host: TimeNs) -> TimeNs {
+        self.stream + scaled(host - self.host, self.rate)
+    }
+
+    pub(crate) fn to_host(self, stream: TimeNs) -> TimeNs {
+        self.host + scaled(stream - self.stream, 1.0 / self.rate)
+    }
+}
+
+fn scaled(span: TimeNs, factor: f64) -> TimeNs {
+    if factor == 1.0 { span } else { TimeNs((span.0 as f64 * factor).round() as i64) }
+}
+
+impl EstimateSnapshot {
+    /// What is known before any sample.
+    pub fn new(settings: EstimatorSettings) -> Self {
+        Self {
+            motion: None,
+            lost: false,
+            blend: Blend { t: TimeNs(0), excess_mm: 0.0 },
+            raw: None,
+            clock: StreamClock::LIVE,
+            settings,
+        }
+    }
+
+    /// The pupil at host time `t`, which may lie in the future. Pure: no clock is read, nothing is allocated.
+    pub fn pupil_at(&self, t: TimeNs) -> PupilEstimate {
+        let shown = self.shown_at(self.clock.to_stream(t));
+        PupilEstimate {
+            pupil: PupilDiameter::from_mm(shown.diameter_mm),
+            state: shown.state,
+            raw_mm: self.raw.map(|(_, raw_mm)| raw_mm),
+            t_sample: self.raw.map(|(t_sample, _)| self.clock.to_host(t_sample)),
+            velocity_mm_per_s: shown.velocity_mm_per_s * self.clock.rate as f32,
+        }
+    }
+
+    pub(crate) const fn set_clock(&mut self, clock: StreamClock) {
+        self.clock = clock;
+    }
+
+    fn shown_at(&self, t: TimeNs) -> Shown {
+        let settings = &self.settings;
+        let fallback_mm = settings.fallback.mm();
+        let Some(motion) = self.motion else {
+            return Shown { diameter_mm: fallback_mm, velocity_mm_per_s: 0.0, state: PupilState::Fallback };
+        };
+        let slide_begins = motion.t + settings.hold;
+        let followed = self.followed_at(&motion, t.min(slide_begins));
+        let age = t - motion.t;
+        let (diameter_mm, velocity_mm_per_s, state) = if age > settings.hold {
+            let left_mm = fallback_mm - followed.0;
+            let slid_mm = settings.fallback_mm_per_s * (t - slide_begins).seconds() as f32;
+            let velocity = if slid_mm < left_mm.abs() { settings.fallback_mm_per_s.copysign(left_mm) } else { 0.0 };
+            (followed.0 + slid_mm.min(left_mm.abs()).copysign(left_mm), velocity, PupilState::Fallback)
+        } else if self.lost || age > settings.silence {
+            (followed.0, followed.1, PupilState::Holding)
+        } else {
+            (followed.0, followed.1, PupilState::Tracking)
+        };
+        let diameter_mm = diameter_mm.clamp(settings.gate.least_mm, settings.gate.greatest_mm);
+        Shown { diameter_mm, velocity_mm_per_s, state }
+    }
+
+    /// The motion and what is left of the blend: diameter and velocity.
+    fn followed_at(&self, motion: &Motion, t: TimeNs) -> (f32, f32) {
+        let motion = motion.at(t);
+        let worked_off_mm = self.settings.return_mm_per_s * (t - self.blend.t).seconds().max(0.0) as f32;
+        let left_mm = (self.blend.excess_mm.abs() - worked_off_mm).max(0.0);
+        let speed = if left_mm > 0.0 { -self.settings.return_mm_per_s.copysign(self.blend.excess_mm) } else { 0.0 };
+        (motion.diameter_mm + left_mm.copysign(self.blend.excess_mm), motion.velocity_mm_per_s + speed)
+    }
+}
+
+struct Shown {
+    diameter_mm: f32,
+    velocity_mm_per_s: f32,
+    state: PupilState,
+}
+
+/// One eye: its gate, its filter, and how far it lies from the mean of the eyes.
+#[derive(Clone, Debug)]
+struct Channel {
+    gate: Gate,
+    filter: Filter,
+    /// Added to this eye's diameter to give the mean of the eyes, as learnt while there were two.
+    to_mean_mm: f32,
+    /// Trusted now: believed at least once, and no bad sample since.
+    live: bool,
+}
+
+/// Samples in, estimate out. Times come with the samples and with the questions; it reads no clock and, once made,
+/// allocates nothing.
+#[derive(Clone, Debug)]
+pub struct Estimator {
+    channels: [Channel; 3],
+    learnt: TimeNs,
+    t_learnt: Option<TimeNs>,
+    snapshot: EstimateSnapshot,
+}
+
+impl Estimator {
+    /// An estimator that has seen nothing.
+    pub fn new(settings: EstimatorSettings) -> Self {
+        let channel = || Channel {
+            gate: Gate::new(settings.gate),
+            filter: Filter::new(settings.filter),
+            to_mean_mm: 0.0,
+            live: false,
+        };
+        Self {
+            channels: [channel(), channel(), channel()],
+            learnt: TimeNs(0),
+            t_learnt: None,
+            snapshot: EstimateSnapshot::new(settings),
+        }
+    }
+
+    /// Takes the next sample and calls `on_decision` once for each sample on which the gate has now made up its mind:
+    /// an accepted one comes [`GateSettings::lead`] late.
+    pub fn push(&mut self, sample: PupilSample, mut on_decision: impl FnMut(Decision)) {
+        let settings = self.snapshot.settings;
+        let sample = PupilSample { diameter_mm: (f64::from(sample.diameter_mm) * settings.scale) as f32, ..sample };
+        if !drives(settings.eye, sample.eye) {
+            return on_decision(Decision { sample, verdict: Verdict::Rejected(Rejection::OtherEye) });
+        }
+        let t = sample.t_sample;
+        let channel = &mut self.channels[sample.eye.index()];
+        let lives_before = channel.live;
+        let mut believed = false;
+        while let Some(ripe) = channel.gate.ripe(t) {
+            channel.filter.update(ripe.t_sample, ripe.diameter_mm, channel.gate.noise_mm());
+            believed = true;
+            on_decision(Decision { sample: ripe, verdict: Verdict::Accepted });
+        }
+        let expected = channel
+            .filter
+            .motion()
+            .map(|motion| Expected { diameter_mm: motion.at(t).diameter_mm, t_believed: motion.t });
+        let mut backwards = false;
+        channel.gate.judge(sample, expected, |sample, reason| {
+            backwards |= reason == Rejection::Backwards;
+            on_decision(Decision { sample, verdict: Verdict::Rejected(reason) });
+        });
+        if backwards {
+            return;
+        }
+        channel.live = (channel.live || believed) && channel.gate.is_open();
+        let set_changed = channel.live != lives_before;
+
+        if self.snapshot.raw.is_none_or(|(latest, _)| t >= latest) {
+            self.snapshot.raw = Some((t, sample.diameter_mm));
+        }
+        if believed || set_changed {
+            self.learn_eye_offsets();
+            self.combine(t, set_changed);
+        }
+    }
+
+    /// The pupil at `t`, on the stream's clock.
+    pub fn pupil_at(&self, t: TimeNs) -> PupilEstimate {
+        self.snapshot.pupil_at(t)
+    }
+
+    /// What [`Self::pupil_at`] rests on, to be handed to another thread.
+    pub const fn snapshot(&self) -> EstimateSnapshot {
+        self.snapshot
+    }
+
+    /// Ends the stream: the samples that still wait for their successors are given up.
+    pub fn finish(&mut self, mut on_decision: impl FnMut(Decision)) {
+        for channel in &mut self.channels {
+            channel.gate.reject_pending(&mut |sample, reason| {
+                on_decision(Decision { sample, verdict: Verdict::Rejected(reason) });
+            });
+            channel.live = false;
+        }
+        self.snapshot.lost = true;
+    }
+
+    /// While both eyes are live, follows how far each lies from their mean.
+    fn learn_eye_offsets(&mut self) {
+        let [left, right, _] = &mut self.channels;
+        let both = (left.live && right.live).then(|| left.filter.motion().zip(right.filter.motion())).flatten();
+        let Some((left_motion, right_motion)) = both else {
+            self.t_learnt = None;
+            return;
+        };
+        let t = left_motion.t.max(right_motion.t);
+        let Some(before) = self.t_learnt.replace(t) else { return };
+        let elapsed = t - before;
+        // A plain mean at first, an exponential one once the time constant has passed.
+        self.learnt = (self.learnt + elapsed).min(self.snapshot.settings.eye_offset);
+        if elapsed.0 <= 0 {
+            return;
+        }
+        let share = (elapsed.seconds() / self.learnt.seconds()).min(1.0) as f32;
+        let half_mm = 0.5 * (right_motion.at(t).diameter_mm - left_motion.at(t).diameter_mm);
+        left.to_mean_mm += share * (half_mm - left.to_mean_mm);
+        right.to_mean_mm += share * (-half_mm - right.to_mean_mm);
+    }
+
+    /// Combines the live eyes into one motion; where the set of eyes changed or samples came back, what is shown stays
+    /// continuous at `t` and the difference is worked off.
+    fn combine(&mut self, t: TimeNs, set_changed: bool) {
+        let live = || self.channels.iter().filter(|channel| channel.live);
+        let Some(newest) = live().filter_map(|channel| channel.filter.motion()).map(|motion| motion.t).max() else {
+            self.snapshot.lost = true;
+            return;
+        };
+        let alone = live().count() == 1;
+        let mut sum = (0.0, 0.0, 0.0_f32);
+        for channel in live() {
+            if let Some(motion) = channel.filter.motion() {
+                let motion = motion.at(newest);
+                let to_mean_mm = if alone { channel.to_mean_mm } else { 0.0 };
+                sum = (sum.0 + motion.diameter_mm + to_mean_mm, sum.1 + motion.velocity_mm_per_s, sum.2 + 1.0);
+            }
+        }
+        let motion = Motion {
+            t: newest,
+            diameter_mm: sum.0 / sum.2,
+            velocity_mm_per_s: sum.1 / sum.2,
+            velocity_lasts: self.snapshot.settings.filter.velocity_lasts,
+        };
+        if set_changed || self.snapshot.lost {
+            let shown_mm = self.snapshot.shown_at(t).diameter_mm;
+            self.snapshot.blend = Blend { t, excess_mm: shown_mm - motion.at(t).diameter_mm };
+        }
+        self.snapshot.motion = Some(motion);
+        self.snapshot.lost = false;
+    }
+}
+
+const fn drives(chosen: rig::Eye, eye: SampleEye) -> bool {
+    matches!(
+        (chosen, eye),
+        (rig::Eye::Both, _)
+            | (_, SampleEye::Both)
+            | (rig::Eye::Left, SampleEye::Left)
+            | (rig::Eye::Right, SampleEye::Right)
+    )
+}

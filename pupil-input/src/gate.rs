@@ -1,0 +1,421 @@
+//! Which samples are of the pupil, and which of a lid.
+//!
+//! In a blink a tracker measures what is left of the pupil beside the lid. Some say so (confidence, lid aperture); many
+//! send plausible millimetres without a word. So a sample is believed only if
+//!
+//! 1. its diameter is in range, its confidence and lid aperture (where known) are high enough;
+//! 2. it did not step from its predecessor faster than a pupil moves, beyond what the tracker's own noise explains;
+//! 3. it lies within reach of the estimate: a band that widens with the time since the last believed sample, so that
+//!    a dip of a lid is outside for longer than a blink lasts, and a real change of the pupil is inside soon after;
+//! 4. none of this happened within the guard times around it. The leading guard needs the sample's successors, so every
+//!    sample waits for [`GateSettings::lead`] before it is believed: that is the gate's whole latency, and because of it
+//!    the estimate never starts to follow the onset of a blink.
+
+use holod_calibration::TimeNs;
+
+use crate::PupilSample;
+
+/// Limits of the gate. Diameters are millimetres after the rig's scale.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct GateSettings {
+    /// Least diameter of a human pupil.
+    pub least_mm: f32,
+    /// Greatest diameter of a human pupil.
+    pub greatest_mm: f32,
+    /// Least confidence.
+    pub least_confidence: f32,
+    /// Least distance between the lids, for trackers that measure it.
+    pub least_aperture_mm: f32,
+    /// Fastest change of a pupil, millimetres a second, noise aside.
+    pub slew_mm_per_s: f32,
+    /// How far from the estimate a sample may lie when the last believed one is fresh.
+    pub reach_mm: f32,
+    /// How fast that reach widens, millimetres a second.
+    pub reach_mm_per_s: f32,
+    /// Leading guard: a sample this close before a bad one is not believed. Also the gate's latency.
+    pub lead: TimeNs,
+    /// Trailing guard: a sample this close after a bad one is not believed.
+    pub trail: TimeNs,
+    /// A silence longer than this is a loss, with guards on both sides.
+    pub gap: TimeNs,
+}
+
+impl Default for GateSettings {
+    fn default() -> Self {
+        Self {
+            least_mm: 1.0,
+            greatest_mm: 9.0,
+            least_confidence: 0.6,
+            least_aperture_mm: 3.5,
+            slew_mm_per_s: 10.0,
+            reach_mm: 0.45,
+            reach_mm_per_s: 2.5,
+            lead: TimeNs(30_000_000),
+            trail: TimeNs(50_000_000),
+            gap: TimeNs(100_000_000),
+        }
+    }
+}
+
+/// Why a sample was not believed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Rejection {
+    /// Of an eye that does not drive the display.
+    OtherEye,
+    /// Its time is not later than its predecessor's.
+    Backwards,
+    /// Diameter, confidence or aperture is NaN or infinite.
+    NotFinite,
+    /// The diameter is none of a human pupil.
+    OutOfRange,
+    /// The tracker's confidence is low.
+    LowConfidence,
+    /// The lids are nearly closed.
+    LidsClosed,
+    /// It stepped faster than a pupil moves.
+    Slew,
+    /// It is out of reach of the estimate.
+    OutOfReach,
+    /// It is close to a bad sample or to a gap.
+    Guard,
+}
+
+impl Rejection {
+    /// Every reason, in the order of their indices.
+    pub const ALL: [Self; 9] = [
+        Self::OtherEye,
+        Self::Backwards,
+        Self::NotFinite,
+        Self::OutOfRange,
+        Self::LowConfidence,
+        Self::LidsClosed,
+        Self::Slew,
+        Self::OutOfReach,
+        Self::Guard,
+    ];
+
+    /// Its place in [`Self::ALL`].
+    pub const fn index(self) -> usize {
+        self as usize
+    }
+
+    /// The name under which it is counted and plotted.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::OtherEye => "other_eye",
+            Self::Backwards => "backwards",
+            Self::NotFinite => "not_finite",
+            Self::OutOfRange => "out_of_range",
+            Self::LowConfidence => "low_confidence",
+            Self::LidsClosed => "lids_closed",
+            Self::Slew => "slew",
+            Self::OutOfReach => "out_of_reach",
+            Self::Guard => "guard",
+        }
+    }
+}
+
+/// What the gate says of a sample.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// Believed.
+    Accepted,
+    /// Not believed.
+    Rejected(Rejection),
+}
+
+/// Where the estimate expects the pupil.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Expected {
+    pub(crate) diameter_mm: f32,
+    /// Time of the last believed sample.
+    pub(crate) t_believed: TimeNs,
+}
+
+/// Samples that may wait at once: 30 ms at 4 kHz.
+const PENDING: usize = 128;
+/// A step is judged against a predecessor no older than this.
+const STEP_WITHIN: TimeNs = TimeNs(50_000_000);
+
+/// The gate of one eye: samples in, verdicts out, some after a delay of [`GateSettings::lead`]. Constant memory.
+#[derive(Clone, Debug)]
+pub(crate) struct Gate {
+    settings: GateSettings,
+    pending: [Option<PupilSample>; PENDING],
+    oldest: usize,
+    waiting: usize,
+    previous: Option<(TimeNs, f32)>,
+    t_newest: Option<TimeNs>,
+    t_bad: Option<TimeNs>,
+    step: StepScale,
+}
+
+impl Gate {
+    pub(crate) fn new(settings: GateSettings) -> Self {
+        Self {
+            settings,
+            pending: [None; PENDING],
+            oldest: 0,
+            waiting: 0,
+            previous: None,
+            t_newest: None,
+            t_bad: None,
+            step: StepScale::default(),
+        }
+    }
+
+    /// The tracker's noise, as the standard deviation of one sample in millimetres.
+    pub(crate) fn noise_mm(&self) -> f32 {
+        self.step.noise_mm()
+    }
+
+    /// Whether the newest sample is fit to be believed, its successors permitting.
+    pub(crate) fn is_open(&self) -> bool {
+        self.waiting > 0
+    }
+
+    /// The next sample that has waited long enough at time `t`, to be taken before the sample of time `t` is judged.
+    pub(crate) fn ripe(&mut self, t: TimeNs) -> Option<PupilSample> {
+        if self.t_newest.is_some_and(|newest| t <= newest || t - newest > self.settings.gap) {
+            return None;
+        }
+        let sample = self.pending[self.oldest].filter(|_| self.waiting > 0)?;
+        let waited = t - sample.t_sample >= self.settings.lead;
+        if !waited && self.waiting < PENDING {
+            return None;
+        }
+        self.pop()
+    }
+
+    /// Judges `sample`, given where the pupil is expected; calls `on_rejected` for it or for those waiting, if they are
+    /// not to be believed. Diameters are already in scaled millimetres.
+    pub(crate) fn judge(
+        &mut self,
+        sample: PupilSample,
+        expected: Option<Expected>,
+        mut on_rejected: impl FnMut(PupilSample, Rejection),
+    ) {
+        let t = sample.t_sample;
+        if let Some(newest) = self.t_newest {
+            if t <= newest {
+                return on_rejected(sample, Rejection::Backwards);
+            }
+            if t - newest > self.settings.gap {
+                self.reject_pending(&mut on_rejected);
+                self.t_bad = Some(t);
+                self.previous = None;
+            }
+        }
+        self.t_newest = Some(t);
+
+        let fault = self.fault_of_itself(&sample).or_else(|| self.fault_among_others(&sample, expected));
+        if let Some(fault) = fault {
+            self.reject_pending(&mut on_rejected);
+            self.t_bad = Some(t);
+            return on_rejected(sample, fault);
+        }
+        if self.t_bad.is_some_and(|bad| t - bad <= self.settings.trail) {
+            return on_rejected(sample, Rejection::Guard);
+        }
+        let free = (self.oldest + self.waiting) % PENDING;
+        self.pending[free] = Some(sample);
+        self.waiting += 1;
+    }
+
+    /// Gives up on the samples that wait, as at the end of a stream.
+    pub(crate) fn reject_pending(&mut self, on_rejected: &mut impl FnMut(PupilSample, Rejection)) {
+        while let Some(sample) = self.pop() {
+            on_rejected(sample, Rejection::Guard);
+        }
+    }
+
+    fn pop(&mut self) -> Option<PupilSample> {
+        if self.waiting == 0 {
+            return None;
+        }
+        let sample = self.pending[self.oldest].take();
+        self.oldest = (self.oldest + 1) % PENDING;
+        self.waiting -= 1;
+        sample
+    }
+
+    fn fault_of_itself(&self, sample: &PupilSample) -> Option<Rejection> {
+        let limits = &self.settings;
+        let finite = sample.diameter_mm.is_finite()
+            && sample.confidence.is_finite()
+            && sample.aperture_mm.is_none_or(f32::is_finite);
+        if !finite {
+            Some(Rejection::NotFinite)
+        } else if sample.confidence < limits.least_confidence {
+            Some(Rejection::LowConfidence)
+        } else if sample.aperture_mm.is_some_and(|aperture| aperture < limits.least_aperture_mm) {
+            Some(Rejection::LidsClosed)
+        } else if !(limits.least_mm..=limits.greatest_mm).contains(&sample.diameter_mm) {
+            Some(Rejection::OutOfRange)
+        } else {
+            None
+        }
+    }
+
+    fn fault_among_others(&mut self, sample: &PupilSample, expected: Option<Expected>) -> Option<Rejection> {
+        let t = sample.t_sample;
+        let previous = self.previous.replace((t, sample.diameter_mm)).filter(|(then, _)| t - *then <= STEP_WITHIN);
+        let noise = self.step.allowance_mm();
+        if let Some((then, diameter_mm)) = previous {
+            let step = (sample.diameter_mm - diameter_mm).abs();
+            self.step.note(step);
+            if step > noise + self.settings.slew_mm_per_s * (t - then).seconds() as f32 {
+                return Some(Rejection::Slew);
+            }
+        }
+        let expected = expected?;
+        let reach = self.settings.reach_mm.max(noise)
+            + self.settings.reach_mm_per_s * (t - expected.t_believed).seconds() as f32;
+        ((sample.diameter_mm - expected.diameter_mm).abs() > reach).then_some(Rejection::OutOfReach)
+    }
+}
+
+/// A running median of the steps between neighbouring samples: the tracker's own noise, whatever its rate. A median, so
+/// that blinks do not widen it.
+#[derive(Clone, Copy, Debug)]
+struct StepScale {
+    median_mm: f32,
+}
+
+impl Default for StepScale {
+    fn default() -> Self {
+        Self { median_mm: 0.05 }
+    }
+}
+
+impl StepScale {
+    /// A sign-following median: moves by a fixed share towards each step.
+    fn note(&mut self, step_mm: f32) {
+        // A frozen repeat tells nothing about noise.
+        if step_mm > 0.0 {
+            let factor = if step_mm > self.median_mm { 1.01 } else { 1.0 / 1.01 };
+            self.median_mm = (self.median_mm * factor).clamp(0.002, 0.25);
+        }
+    }
+
+    /// A step that noise alone all but never makes: about six times the median, which for normal noise is the step's
+    /// four-sigma point.
+    fn allowance_mm(self) -> f32 {
+        (6.0 * self.median_mm).clamp(0.3, 0.9)
+    }
+
+    /// For normal noise the median absolute step is 0.6745·√2 of one sample's standard deviation.
+    fn noise_mm(self) -> f32 {
+        (self.median_mm / 0.954).clamp(0.01, 0.25)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::SampleEye;
+
+    fn sample(t_ms: i64, diameter_mm: f32) -> PupilSample {
+        PupilSample {
+            t_device: TimeNs(0),
+            t_sample: TimeNs(t_ms * 1_000_000),
+            t_arrival: TimeNs(0),
+            eye: SampleEye::Left,
+            diameter_mm,
+            confidence: 1.0,
+            aperture_mm: None,
+            sequence: None,
+        }
+    }
+
+    /// Feeds samples; expects the estimate to be the last believed sample. Gives (time in ms, verdict) in time order.
+    fn verdicts(samples: &[PupilSample]) -> Vec<(i64, Verdict)> {
+        let mut gate = Gate::new(GateSettings::default());
+        let mut expected = None;
+        let mut out = Vec::new();
+        for &sample in samples {
+            while let Some(ripe) = gate.ripe(sample.t_sample) {
+                expected = Some(Expected { diameter_mm: ripe.diameter_mm, t_believed: ripe.t_sample });
+                out.push((ripe.t_sample.0 / 1_000_000, Verdict::Accepted));
+            }
+            gate.judge(sample, expected, |sample, reason| {
+                out.push((sample.t_sample.0 / 1_000_000, Verdict::Rejected(reason)));
+            });
+        }
+        out.sort_by_key(|(t, _)| *t);
+        out
+    }
+
+    fn steady(t_ms: impl Iterator<Item = i64>) -> Vec<PupilSample> {
+        t_ms.map(|t| sample(t, 4.0)).collect()
+    }
+
+    #[test]
+    fn a_bad_sample_takes_its_neighbours_with_it() {
+        let spoil: [(fn(&mut PupilSample), Rejection); 6] = [
+            (|s| s.diameter_mm = f32::NAN, Rejection::NotFinite),
+            (|s| s.diameter_mm = 0.5, Rejection::OutOfRange),
+            (|s| s.diameter_mm = 16.7, Rejection::OutOfRange),
+            (|s| s.confidence = 0.2, Rejection::LowConfidence),
+            (|s| s.aperture_mm = Some(0.1), Rejection::LidsClosed),
+            (|s| s.diameter_mm = 3.0, Rejection::Slew),
+        ];
+        for (spoil, reason) in spoil {
+            let mut samples = steady((0..80).map(|k| 5 * k));
+            spoil(&mut samples[40]);
+            let verdicts = verdicts(&samples);
+            let at = |t_ms: i64| verdicts.iter().find(|(t, _)| *t == t_ms).expect("judged").1;
+            assert_eq!(at(200), Verdict::Rejected(reason));
+            assert_eq!(at(165), Verdict::Accepted);
+            assert_eq!(at(175), Verdict::Rejected(Rejection::Guard));
+            assert_eq!(at(245), Verdict::Rejected(Rejection::Guard));
+            assert_eq!(at(265), Verdict::Accepted);
+        }
+    }
+
+    #[test]
+    fn a_low_level_is_out_of_reach_until_longer_than_a_blink() {
+        // Drops by 1.5 mm and stays: a quiet lid, or a true change missed.
+        let samples: Vec<_> = (0..300).map(|k| sample(5 * k, if k < 100 { 4.0 } else { 2.5 })).collect();
+        let verdicts = verdicts(&samples);
+        let again = verdicts.iter().find(|(t, v)| *t > 500 && *v == Verdict::Accepted).expect("believed in the end").0;
+        assert!((800..1100).contains(&again), "believed again {again} ms");
+    }
+
+    #[test]
+    fn a_gap_is_guarded_on_both_sides() {
+        let samples = steady((0..20).map(|k| 5 * k).chain((60..100).map(|k| 5 * k)));
+        let verdicts = verdicts(&samples);
+        let rejected: Vec<_> = verdicts.iter().filter(|(_, v)| *v != Verdict::Accepted).map(|(t, _)| *t).collect();
+        assert_eq!(rejected.first(), Some(&70));
+        assert_eq!(rejected.last(), Some(&350));
+    }
+
+    #[test]
+    fn a_time_that_does_not_advance_is_rejected_alone() {
+        let mut samples = steady((0..40).map(|k| 5 * k));
+        samples[20].t_sample = samples[18].t_sample;
+        let rejected: Vec<_> = verdicts(&samples).into_iter().filter(|(_, v)| *v != Verdict::Accepted).collect();
+        assert_eq!(rejected, [(90, Verdict::Rejected(Rejection::Backwards))]);
+    }
+
+    #[test]
+    fn frozen_repeats_and_the_fastest_reflex_pass() {
+        // 8 frozen samples, then 5.5 mm/s down.
+        let samples: Vec<_> = (0..100).map(|k| sample(5 * k, 6.0 - 0.0275 * (k - 8).max(0) as f32)).collect();
+        assert!(verdicts(&samples).iter().all(|(_, v)| *v == Verdict::Accepted));
+    }
+
+    #[test]
+    fn more_samples_than_fit_are_believed_early_not_lost() {
+        let samples: Vec<_> = (0..20_000)
+            .map(|k| {
+                let mut sample = sample(0, 4.0);
+                sample.t_sample = TimeNs(k * 50_000);
+                sample
+            })
+            .collect();
+        let accepted = verdicts(&samples).len();
+        assert!(accepted >= 20_000 - PENDING, "{accepted}");
+    }
+}

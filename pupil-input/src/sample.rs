@@ -1,0 +1,67 @@
+//! One measurement of a pupil.
+
+use std::fmt;
+
+use holod_calibration::TimeNs;
+
+/// Which eye a sample was taken of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum SampleEye {
+    /// The left eye.
+    Left,
+    /// The right eye.
+    Right,
+    /// Both: the tracker gives one figure for the pair.
+    Both,
+}
+
+impl SampleEye {
+    /// Left, right, both.
+    pub const ALL: [Self; 3] = [Self::Left, Self::Right, Self::Both];
+
+    /// 0 for left, 1 for right, 2 for both.
+    pub const fn index(self) -> usize {
+        self as usize
+    }
+
+    /// The letter that stands for it on the wire.
+    pub const fn letter(self) -> char {
+        match self {
+            Self::Left => 'L',
+            Self::Right => 'R',
+            Self::Both => 'B',
+        }
+    }
+}
+
+impl fmt::Display for SampleEye {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Left => "left",
+            Self::Right => "right",
+            Self::Both => "both",
+        })
+    }
+}
+
+/// A pupil diameter as the tracker gave it, with the three times that matter.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PupilSample {
+    /// When it was taken, on the tracker's own clock; its origin means nothing to the host.
+    pub t_device: TimeNs,
+    /// When it was taken, on the stream's clock: the host's monotonic clock for a live tracker
+    /// ([`ClockModel`](crate::ClockModel) maps it), the log's own time for a log.
+    pub t_sample: TimeNs,
+    /// When its bytes were read, on the host's monotonic clock.
+    pub t_arrival: TimeNs,
+    /// The eye.
+    pub eye: SampleEye,
+    /// Diameter in millimetres as given, before the rig's scale.
+    pub diameter_mm: f32,
+    /// The tracker's confidence, 0..=1; 1 where it gives none.
+    pub confidence: f32,
+    /// Distance between the lids in millimetres, from trackers that measure it.
+    pub aperture_mm: Option<f32>,
+    /// The tracker's running number, where it has one.
+    pub sequence: Option<u64>,
+}

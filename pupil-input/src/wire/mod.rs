@@ -1,0 +1,3 @@
+//! Bytes to samples: pure, incremental, in bounded memory.
+
+pub mod line;
