@@ -1,3 +1,3 @@
-//! The holod daemon.
+//! holod: drives a holographic near-eye display in real time.
 
 fn main() {}

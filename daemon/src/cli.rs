@@ -1,0 +1,297 @@
+//! The command line, as clap sees it.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use holod_calibration::{Dioptres, PupilDiameter, Resolution};
+
+/// Drives a holographic near-eye display in real time, closed loop with an eye tracker.
+///
+/// With no subcommand holod runs: tracker in, holograms out. Whatever is not named is built in: a sample scene, a
+/// simulated eye tracker, a headless panel and simulated lasers.
+#[derive(Parser, Debug)]
+#[command(name = "holod", version, args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+pub struct Cli {
+    /// What to do; `run` when it is left out.
+    #[command(subcommand)]
+    pub command: Option<Command>,
+    /// The options of `run`.
+    #[command(flatten)]
+    pub run: RunArgs,
+}
+
+/// The subcommands.
+#[derive(Subcommand, Debug)]
+pub enum Command {
+    /// Drive the display until told to stop.
+    Run(RunArgs),
+    /// Run the whole loop for some seconds on built-in inputs and write pictures of what happened.
+    Demo(DemoArgs),
+    /// Compute one hologram and its phase patterns.
+    Render(RenderArgs),
+    /// Show what an eye sees of a hologram at one focus.
+    View(ViewArgs),
+    /// Say what the rig file means and whether this bench is ready.
+    Check(CheckArgs),
+    /// Measure the median time of each stage, beside the machine's arithmetic peak.
+    Bench(BenchArgs),
+    /// Put the lasers out and a flat pattern on the panel (for a service's ExecStopPost).
+    #[command(hide = true)]
+    Dark(DarkArgs),
+}
+
+/// Where the rig comes from.
+#[derive(Args, Debug, Clone, Default)]
+pub struct RigArgs {
+    /// Rig file (TOML) of this bench; the built-in bench when left out.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+}
+
+/// Where pictures with depth come from.
+#[derive(Args, Debug, Clone, Default)]
+pub struct SceneArgs {
+    /// A scene directory with scene.toml, or COLOUR,DEPTH (or one OpenEXR file that holds both).
+    #[arg(long, value_name = "PATH")]
+    pub scene: Option<String>,
+    /// What the depth file's numbers are; required for COLOUR,DEPTH: metres, millimetres, dioptres, or
+    /// normalised_dioptres:FAR,NEAR (both in dioptres; 0 in the file is FAR).
+    #[arg(long, value_name = "ENCODING")]
+    pub depth_encoding: Option<String>,
+    /// How a picture of another size is brought to --resolution.
+    #[arg(long, value_enum, default_value_t = FitArg::Native)]
+    pub fit: FitArg,
+    /// Size of the hologram in panel pixels; the scene's own size when left out.
+    #[arg(long, value_name = "WxH", value_parser = parse_resolution)]
+    pub resolution: Option<Resolution>,
+}
+
+/// How a picture of another size is fitted. Nothing is ever stretched.
+#[derive(ValueEnum, Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum FitArg {
+    /// Pixel for pixel, centred; a picture larger than the target is refused.
+    #[default]
+    Native,
+    /// Scaled to fit inside, the rest black.
+    Contain,
+    /// Scaled to cover, the overhang cut off.
+    Cover,
+    /// Pixel for pixel, centred, the overhang cut off.
+    Crop,
+}
+
+/// Which engine computes the network.
+#[derive(ValueEnum, Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Backend {
+    /// The best that this build and machine have.
+    #[default]
+    Auto,
+    /// Native code on the processor's cores.
+    Cpu,
+    /// WebGPU compute.
+    Gpu,
+}
+
+/// Options of `run`.
+#[derive(Args, Debug, Clone, Default)]
+pub struct RunArgs {
+    /// The rig.
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// Eye tracker: /dev/ttyUSB0, serial:PATH[,baud=N], replay:FILE[,speed=X][,loop], FILE, or mock[:SCENARIO].
+    #[arg(long, value_name = "SPEC")]
+    pub tracker: Option<String>,
+    /// The scene.
+    #[command(flatten)]
+    pub scene: SceneArgs,
+    /// Where patterns go: headless (a virtual panel that records what it showed).
+    #[arg(long, value_name = "SPEC", default_value = "headless")]
+    pub output: String,
+    /// Engine for the network.
+    #[arg(long, value_enum, default_value_t = Backend::Auto)]
+    pub backend: Backend,
+    /// Stop after this many frames.
+    #[arg(long, value_name = "N", conflicts_with = "duration")]
+    pub frames: Option<u64>,
+    /// Stop after this long, for example 10s or 2m.
+    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration)]
+    pub duration: Option<Duration>,
+    /// Write frames.csv and summary.json into this directory.
+    #[arg(long, value_name = "DIR")]
+    pub record: Option<PathBuf>,
+    /// Print the summary as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Options of `demo`.
+#[derive(Args, Debug, Clone)]
+pub struct DemoArgs {
+    /// Directory for the pictures.
+    #[arg(long, value_name = "DIR", default_value = "holod-demo")]
+    pub out: PathBuf,
+    /// How long the loop runs.
+    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration, default_value = "10s")]
+    pub duration: Duration,
+}
+
+/// Options of `render`.
+#[derive(Args, Debug, Clone)]
+pub struct RenderArgs {
+    /// The rig.
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// The scene.
+    #[command(flatten)]
+    pub scene: SceneArgs,
+    /// Pupil diameter for which the hologram is made, in millimetres.
+    #[arg(long, value_name = "MM", value_parser = parse_pupil)]
+    pub pupil: PupilDiameter,
+    /// Engine for the network.
+    #[arg(long, value_enum, default_value_t = Backend::Auto)]
+    pub backend: Backend,
+    /// Directory for field.safetensors, phase_{red,green,blue}.png and report.json.
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Print the report as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Options of `view`.
+#[derive(Args, Debug, Clone)]
+pub struct ViewArgs {
+    /// The rig.
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// A directory that `holod render` wrote.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "pupil"])]
+    pub hologram: Option<PathBuf>,
+    /// The scene.
+    #[command(flatten)]
+    pub scene: SceneArgs,
+    /// Pupil diameter for which the hologram is made, in millimetres.
+    #[arg(long, value_name = "MM", value_parser = parse_pupil)]
+    pub pupil: Option<PupilDiameter>,
+    /// Engine for the network.
+    #[arg(long, value_enum, default_value_t = Backend::Auto)]
+    pub backend: Backend,
+    /// Where the eye focuses, in dioptres: 0 is infinity, 2.857 is 35 cm.
+    #[arg(long, value_name = "DPT", value_parser = parse_focus)]
+    pub focus: Dioptres,
+    /// Diameter of the pupil that looks, in millimetres; the one that the hologram was made for when left out.
+    #[arg(long, value_name = "MM", value_parser = parse_pupil)]
+    pub eye_pupil: Option<PupilDiameter>,
+    /// PNG to write.
+    #[arg(long, value_name = "FILE.png")]
+    pub out: PathBuf,
+    /// Print what was done as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Options of `check`.
+#[derive(Args, Debug, Clone)]
+pub struct CheckArgs {
+    /// The rig.
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// Print the findings as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Options of `bench`.
+#[derive(Args, Debug, Clone)]
+pub struct BenchArgs {
+    /// The rig.
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// Engine for the network.
+    #[arg(long, value_enum, default_value_t = Backend::Auto)]
+    pub backend: Backend,
+    /// Size of the hologram.
+    #[arg(long, value_name = "WxH", value_parser = parse_resolution, default_value = "512x512")]
+    pub resolution: Resolution,
+    /// Repetitions of which the medians are taken.
+    #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u32).range(1..))]
+    pub repeat: u32,
+    /// Print the figures as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Options of `dark`.
+#[derive(Args, Debug, Clone)]
+pub struct DarkArgs {
+    /// The rig.
+    #[command(flatten)]
+    pub rig: RigArgs,
+}
+
+fn parse_resolution(text: &str) -> Result<Resolution, String> {
+    let wrong = || format!("found '{text}', expected WIDTHxHEIGHT in pixels such as 1920x1080");
+    let (width, height) = text.split_once('x').ok_or_else(wrong)?;
+    let side = |s: &str| s.parse::<usize>().map_err(|_| wrong());
+    let resolution = Resolution { width: side(width)?, height: side(height)? };
+    let allowed = 16..=8192;
+    if allowed.contains(&resolution.width) && allowed.contains(&resolution.height) {
+        Ok(resolution)
+    } else {
+        Err(format!("found '{text}', expected a width and a height of 16 to 8192 pixels"))
+    }
+}
+
+fn parse_pupil(text: &str) -> Result<PupilDiameter, String> {
+    let mm: f32 =
+        text.parse().map_err(|_| format!("found '{text}', expected a diameter in millimetres such as 3.5"))?;
+    if (0.5..=9.0).contains(&mm) {
+        Ok(PupilDiameter::from_mm(mm))
+    } else {
+        Err(format!("found {mm} mm, expected a human pupil of 0.5 to 9 mm"))
+    }
+}
+
+fn parse_focus(text: &str) -> Result<Dioptres, String> {
+    let dpt: f64 =
+        text.parse().map_err(|_| format!("found '{text}', expected dioptres such as 2.5 (0 is infinity)"))?;
+    if (-1.0..=10.0).contains(&dpt) {
+        Ok(Dioptres(dpt))
+    } else {
+        Err(format!("found {dpt} dpt, expected -1 to 10 dioptres (0 is infinity, 2.857 is 35 cm)"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn options_with_no_subcommand_belong_to_run() {
+        let cli = Cli::try_parse_from(["holod", "--tracker", "/dev/ttyUSB0", "--duration", "2s"]).unwrap();
+        assert!(cli.command.is_none());
+        assert_eq!(cli.run.tracker.as_deref(), Some("/dev/ttyUSB0"));
+        assert_eq!(cli.run.duration, Some(Duration::from_secs(2)));
+    }
+
+    #[test]
+    fn values_out_of_range_are_refused() {
+        for bad in ["12", "-1", "nan", "3mm", ""] {
+            assert!(parse_pupil(bad).is_err(), "{bad}");
+        }
+        for bad in ["1920", "0x0", "1920x", "x", "99999x2", "8x8"] {
+            assert!(parse_resolution(bad).is_err(), "{bad}");
+        }
+        for bad in ["inf", "nan", "near", "40"] {
+            assert!(parse_focus(bad).is_err(), "{bad}");
+        }
+        assert_eq!(parse_resolution("640x480").unwrap(), Resolution { width: 640, height: 480 });
+    }
+}

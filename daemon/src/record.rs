@@ -1,0 +1,208 @@
+//! The frame record: `frames.csv`, one row per colour field that the panel showed.
+
+use std::collections::HashMap;
+use std::fs::{self, File, OpenOptions};
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use holod_calibration::{Colour, PupilDiameter, TimeNs};
+
+use crate::failure::{Exit, Failure};
+
+/// What the frame loop did for one frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FrameRecord {
+    /// Number of the frame.
+    pub frame: u64,
+    /// Host time of the newest tracker sample behind the estimate, where there is one.
+    pub t_sample: Option<TimeNs>,
+    /// That sample's diameter as the tracker gave it.
+    pub pupil_raw_mm: Option<f32>,
+    /// The diameter that the hologram was computed for.
+    pub pupil: PupilDiameter,
+    /// Name of the estimator's state.
+    pub pupil_state: &'static str,
+    /// The loop woke for this frame.
+    pub t_wake: TimeNs,
+    /// The network began.
+    pub t_render_begin: TimeNs,
+    /// The levels were ready.
+    pub t_render_end: TimeNs,
+    /// The levels were handed to the presenter.
+    pub t_submit: TimeNs,
+    /// The refresh that the pacing aimed at.
+    pub t_desired_present: TimeNs,
+}
+
+/// One colour field that the panel showed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FieldRecord {
+    /// Number of the frame that the field belongs to.
+    pub frame: u64,
+    /// Place of the field in the panel's order.
+    pub field: u8,
+    /// Its colour.
+    pub colour: Colour,
+    /// When the field appeared on the panel.
+    pub t_present: TimeNs,
+    /// Who says so.
+    pub provenance: &'static str,
+    /// The laser's lit window, where it was lit.
+    pub laser_window: Option<(TimeNs, TimeNs)>,
+    /// This is the first time that the panel shows this frame, and it is later than planned.
+    pub deadline_missed: bool,
+}
+
+/// The columns of `frames.csv`.
+pub const HEADER: &str = "frame,field,colour,t_sample_ns,pupil_raw_mm,pupil_mm,pupil_state,t_wake_ns,t_render_begin_ns,\
+t_render_end_ns,t_submit_ns,t_present_ns,present_provenance,laser_on_ns,laser_off_ns,deadline_missed";
+
+/// Writes `frames.csv` as the run goes; what a crash can cost is what came since the last [`FrameLog::flush`].
+pub struct FrameLog {
+    file: BufWriter<File>,
+    path: PathBuf,
+    frames: HashMap<u64, FrameRecord>,
+}
+
+/// Presented frames remembered for fields that are still to be shown.
+const KEPT_FRAMES: u64 = 64;
+
+impl FrameLog {
+    /// Starts `frames.csv` in `folder`, which is created; a record that is already there is never overwritten.
+    pub fn create(folder: &Path) -> Result<Self, Failure> {
+        let cannot = |error: std::io::Error| {
+            Failure::new(
+                Exit::CannotCreate,
+                format!("cannot record into {}: {error}; name another directory with --record", folder.display()),
+            )
+        };
+        fs::create_dir_all(folder).map_err(cannot)?;
+        let path = folder.join("frames.csv");
+        let file = OpenOptions::new().write(true).create_new(true).open(&path).map_err(|error| match error.kind() {
+            std::io::ErrorKind::AlreadyExists => Failure::new(
+                Exit::CannotCreate,
+                format!("{} holds an earlier record; name another directory with --record", path.display()),
+            ),
+            _ => cannot(error),
+        })?;
+        let mut file = BufWriter::new(file);
+        writeln!(file, "{HEADER}").map_err(cannot)?;
+        Ok(Self { file, path, frames: HashMap::new() })
+    }
+
+    /// Takes note of a rendered frame; its rows are written when its fields are shown.
+    pub fn frame(&mut self, record: FrameRecord) {
+        self.frames.insert(record.frame, record);
+        if self.frames.len() as u64 > 2 * KEPT_FRAMES {
+            self.frames.retain(|&frame, _| frame + KEPT_FRAMES >= record.frame);
+        }
+    }
+
+    /// Writes the row of a field that was shown.
+    ///
+    /// # Errors
+    /// The disk's, with the file's name.
+    pub fn field(&mut self, field: &FieldRecord) -> Result<(), Failure> {
+        let frame = self.frames.get(&field.frame);
+        let time = |t: Option<TimeNs>| t.map(|t| t.0.to_string()).unwrap_or_default();
+        let (on, off) = (field.laser_window.map(|w| w.0), field.laser_window.map(|w| w.1));
+        writeln!(
+            self.file,
+            "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            field.frame,
+            field.field,
+            field.colour,
+            time(frame.and_then(|f| f.t_sample)),
+            frame.and_then(|f| f.pupil_raw_mm).map(|mm| format!("{mm:.4}")).unwrap_or_default(),
+            frame.map(|f| format!("{:.4}", f.pupil.mm())).unwrap_or_default(),
+            frame.map_or("", |f| f.pupil_state),
+            time(frame.map(|f| f.t_wake)),
+            time(frame.map(|f| f.t_render_begin)),
+            time(frame.map(|f| f.t_render_end)),
+            time(frame.map(|f| f.t_submit)),
+            field.t_present.0,
+            field.provenance,
+            time(on),
+            time(off),
+            u8::from(field.deadline_missed),
+        )
+        .map_err(|error| self.lost(&error))
+    }
+
+    /// Hands everything to the operating system.
+    ///
+    /// # Errors
+    /// The disk's, with the file's name.
+    pub fn flush(&mut self) -> Result<(), Failure> {
+        self.file.flush().map_err(|error| self.lost(&error))
+    }
+
+    fn lost(&self, error: &std::io::Error) -> Failure {
+        Failure::new(Exit::CannotCreate, format!("cannot go on recording into {}: {error}", self.path.display()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(number: u64) -> FrameRecord {
+        FrameRecord {
+            frame: number,
+            t_sample: Some(TimeNs(5)),
+            pupil_raw_mm: Some(3.25),
+            pupil: PupilDiameter::from_mm(3.3),
+            pupil_state: "tracking",
+            t_wake: TimeNs(10),
+            t_render_begin: TimeNs(11),
+            t_render_end: TimeNs(20),
+            t_submit: TimeNs(21),
+            t_desired_present: TimeNs(30),
+        }
+    }
+
+    fn field(number: u64) -> FieldRecord {
+        FieldRecord {
+            frame: number,
+            field: 1,
+            colour: Colour::Green,
+            t_present: TimeNs(30),
+            provenance: "software",
+            laser_window: Some((TimeNs(33), TimeNs(36))),
+            deadline_missed: false,
+        }
+    }
+
+    #[test]
+    fn a_row_has_one_cell_per_column_and_holds_both_halves() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = FrameLog::create(folder.path()).unwrap();
+        log.frame(frame(7));
+        log.field(&field(7)).unwrap();
+        log.field(&field(999)).unwrap();
+        log.flush().unwrap();
+        let text = fs::read_to_string(folder.path().join("frames.csv")).unwrap();
+        let rows: Vec<&str> = text.lines().collect();
+        assert_eq!(rows[1], "7,1,green,5,3.2500,3.3000,tracking,10,11,20,21,30,software,33,36,0");
+        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0");
+        assert!(rows.iter().all(|row| row.split(',').count() == HEADER.split(',').count()));
+    }
+
+    #[test]
+    fn an_earlier_record_is_never_overwritten() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("frames.csv"), "precious").unwrap();
+        assert_eq!(FrameLog::create(folder.path()).err().unwrap().exit, Exit::CannotCreate);
+        assert_eq!(fs::read_to_string(folder.path().join("frames.csv")).unwrap(), "precious");
+    }
+
+    #[test]
+    fn a_day_of_frames_does_not_grow_the_log() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = FrameLog::create(folder.path()).unwrap();
+        for number in 0..10_000 {
+            log.frame(frame(number));
+        }
+        assert!(log.frames.len() as u64 <= 2 * KEPT_FRAMES + 1);
+    }
+}

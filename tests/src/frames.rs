@@ -1,0 +1,167 @@
+//! A reader and a judge of `frames.csv`.
+
+use std::collections::HashMap;
+use std::fs;
+use std::path::Path;
+
+/// A row: one colour field that the panel showed. Empty cells are `None`.
+#[derive(Clone, Debug, PartialEq)]
+#[allow(missing_docs, reason = "the fields are the columns of frames.csv, defined by the daemon's record module")]
+pub struct FieldRow {
+    pub frame: u64,
+    pub field: u8,
+    pub colour: String,
+    pub t_sample_ns: Option<i64>,
+    pub pupil_raw_mm: Option<f64>,
+    pub pupil_mm: f64,
+    pub pupil_state: String,
+    pub t_wake_ns: i64,
+    pub t_render_begin_ns: i64,
+    pub t_render_end_ns: i64,
+    pub t_submit_ns: i64,
+    pub t_present_ns: i64,
+    pub present_provenance: String,
+    pub laser_on_ns: Option<i64>,
+    pub laser_off_ns: Option<i64>,
+    pub deadline_missed: bool,
+}
+
+/// Reads every row of a record.
+///
+/// # Errors
+/// What is wrong with the file, with its line.
+pub fn read(path: &Path) -> Result<Vec<FieldRow>, String> {
+    let text = fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()))?;
+    let mut lines = text.lines();
+    let header: Vec<&str> = lines.next().ok_or("the record is empty")?.split(',').collect();
+    lines
+        .enumerate()
+        .map(|(index, line)| {
+            let cells: HashMap<&str, &str> = header.iter().copied().zip(line.split(',')).collect();
+            row(&cells).map_err(|what| format!("{} line {}: {what}", path.display(), index + 2))
+        })
+        .collect()
+}
+
+fn row(cells: &HashMap<&str, &str>) -> Result<FieldRow, String> {
+    fn cell<T: std::str::FromStr>(cells: &HashMap<&str, &str>, name: &str) -> Result<Option<T>, String> {
+        let text = *cells.get(name).ok_or_else(|| format!("no column {name}"))?;
+        match text {
+            "" => Ok(None),
+            _ => text.parse().map(Some).map_err(|_| format!("{name} is '{text}'")),
+        }
+    }
+    fn needed<T: std::str::FromStr>(cells: &HashMap<&str, &str>, name: &str) -> Result<T, String> {
+        cell(cells, name)?.ok_or_else(|| format!("{name} is empty"))
+    }
+    Ok(FieldRow {
+        frame: needed(cells, "frame")?,
+        field: needed(cells, "field")?,
+        colour: needed(cells, "colour")?,
+        t_sample_ns: cell(cells, "t_sample_ns")?,
+        pupil_raw_mm: cell(cells, "pupil_raw_mm")?,
+        pupil_mm: needed(cells, "pupil_mm")?,
+        pupil_state: needed(cells, "pupil_state")?,
+        t_wake_ns: needed(cells, "t_wake_ns")?,
+        t_render_begin_ns: needed(cells, "t_render_begin_ns")?,
+        t_render_end_ns: needed(cells, "t_render_end_ns")?,
+        t_submit_ns: needed(cells, "t_submit_ns")?,
+        t_present_ns: needed(cells, "t_present_ns")?,
+        present_provenance: needed(cells, "present_provenance")?,
+        laser_on_ns: cell(cells, "laser_on_ns")?,
+        laser_off_ns: cell(cells, "laser_off_ns")?,
+        deadline_missed: needed::<u8>(cells, "deadline_missed")? == 1,
+    })
+}
+
+/// What breaks the rules that hold for every record, empty for a good one.
+///
+/// A lit field has one window that begins after the field appeared and ends before the next one does; no two windows
+/// overlap; the time points of a frame are in order; fields follow one another in the panel's order.
+pub fn faults(rows: &[FieldRow], field_order: [&str; 3]) -> Vec<String> {
+    let mut found = Vec::new();
+    let mut last_off_ns = i64::MIN;
+    for (index, row) in rows.iter().enumerate() {
+        let name = format!("row {index} (frame {} {})", row.frame, row.colour);
+        let times = [row.t_wake_ns, row.t_render_begin_ns, row.t_render_end_ns, row.t_submit_ns, row.t_present_ns];
+        if !times.is_sorted() {
+            found.push(format!("{name}: time points out of order: {times:?}"));
+        }
+        if row.colour != field_order[usize::from(row.field) % 3] {
+            found.push(format!("{name}: field {} is not {} in the panel's order", row.field, row.colour));
+        }
+        let next_ns = rows.get(index + 1).map_or(i64::MAX, |next| next.t_present_ns);
+        if next_ns <= row.t_present_ns {
+            found.push(format!("{name}: the next field is not later"));
+        }
+        match (row.laser_on_ns, row.laser_off_ns) {
+            (Some(on_ns), Some(off_ns)) => {
+                if on_ns <= row.t_present_ns || off_ns <= on_ns || off_ns > next_ns {
+                    found.push(format!(
+                        "{name}: window {on_ns}..{off_ns} is not within {}..{next_ns}",
+                        row.t_present_ns
+                    ));
+                }
+                if on_ns < last_off_ns {
+                    found.push(format!("{name}: lit before the last laser went out"));
+                }
+                last_off_ns = off_ns;
+            }
+            (None, None) => found.push(format!("{name}: no laser window")),
+            _ => found.push(format!("{name}: half a laser window")),
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn good() -> Vec<FieldRow> {
+        (0..6)
+            .map(|index| {
+                let t_ns = 1_000 + index * 100;
+                FieldRow {
+                    frame: index as u64 / 3,
+                    field: (index % 3) as u8,
+                    colour: ["red", "green", "blue"][index as usize % 3].into(),
+                    t_sample_ns: Some(1),
+                    pupil_raw_mm: Some(3.0),
+                    pupil_mm: 3.0,
+                    pupil_state: "tracking".into(),
+                    t_wake_ns: 10,
+                    t_render_begin_ns: 20,
+                    t_render_end_ns: 30,
+                    t_submit_ns: 40,
+                    t_present_ns: t_ns,
+                    present_provenance: "software".into(),
+                    laser_on_ns: Some(t_ns + 20),
+                    laser_off_ns: Some(t_ns + 90),
+                    deadline_missed: false,
+                }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn the_judge_objects_to_each_wrong_value() {
+        const RGB: [&str; 3] = ["red", "green", "blue"];
+        assert_eq!(faults(&good(), RGB), Vec::<String>::new());
+        let canaries: [fn(&mut FieldRow); 8] = [
+            |row| row.colour = "blue".into(),
+            |row| row.laser_on_ns = None,
+            |row| (row.laser_on_ns, row.laser_off_ns) = (None, None),
+            |row| row.laser_on_ns = Some(row.t_present_ns - 1),
+            |row| row.laser_off_ns = Some(row.t_present_ns + 150),
+            |row| row.t_present_ns += 100,
+            |row| row.t_submit_ns = 2_000,
+            |row| row.t_wake_ns = 25,
+        ];
+        for (number, canary) in canaries.iter().enumerate() {
+            let mut rows = good();
+            canary(&mut rows[1]);
+            assert!(!faults(&rows, RGB).is_empty(), "canary {number}");
+        }
+    }
+}
