@@ -1,0 +1,293 @@
+//! Writes random scenes with their thin-lens focal stacks, for training and judging a network.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Instant;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use holod_calibration::Resolution;
+use holod_model::scene_renderer::shard::{Outcome, Preview, PupilPlan, ShardError, ShardPlan};
+use holod_model::scene_renderer::{Scene, SceneKind};
+use indicatif::{ProgressBar, ProgressStyle};
+
+/// Random scenes and their thin-lens focal stacks.
+#[derive(Parser)]
+#[command(version, about)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Write one file for each scene; complete files that are there already are kept.
+    Generate(Generate),
+    /// Put scenes of a folder on one picture: all in focus, depth, and the widest pupil focused far and near.
+    Sheet(Sheet),
+    /// Measure how many aperture rays are traced in a second.
+    Bench(Bench),
+}
+
+#[derive(Args)]
+struct Generate {
+    /// Folder to write to; made if it is not there.
+    #[arg(long)]
+    out: PathBuf,
+    /// With the kind and the index, says which scene it is.
+    #[arg(long)]
+    seed: u64,
+    /// Number of scenes.
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    count: u64,
+    /// Index of the first scene.
+    #[arg(long, default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
+    first: u64,
+    #[command(flatten)]
+    look: Look,
+}
+
+/// What the scenes are like.
+#[derive(Args)]
+struct Look {
+    /// What the scenes are for.
+    #[arg(long, value_enum, default_value_t = Kind::Train)]
+    kind: Kind,
+    /// Width and height in pixels.
+    #[arg(long, default_value_t = 256, value_parser = even_size)]
+    size: usize,
+    /// Pupils in mm, or strata:N for one random pupil in each N-th of 1 to 5 mm.
+    #[arg(long, default_value = "strata:4")]
+    pupils: PupilPlan,
+    /// Focus planes, uniform in dioptres, both ends included.
+    #[arg(long, default_value_t = 6, value_parser = clap::value_parser!(u16).range(2..=256))]
+    planes: u16,
+    /// Rays for each pixel of each plane and pupil, at least.
+    #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    rays: u32,
+}
+
+impl Look {
+    fn plan(&self, seed: u64) -> ShardPlan {
+        ShardPlan {
+            kind: match self.kind {
+                Kind::Train => SceneKind::Train,
+                Kind::Test => SceneKind::Test,
+                Kind::Cards => SceneKind::Cards,
+            },
+            seed,
+            resolution: Resolution { width: self.size, height: self.size },
+            pupils: self.pupils.clone(),
+            planes: usize::from(self.planes),
+            rays: self.rays as usize,
+        }
+    }
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Kind {
+    /// For training.
+    Train,
+    /// For testing, with textures that no training scene has.
+    Test,
+    /// The refocus test: a near and a far card of fine marks.
+    Cards,
+}
+
+#[derive(Args)]
+struct Sheet {
+    /// Folder of scenes.
+    folder: PathBuf,
+    /// PNG file to write.
+    #[arg(long)]
+    out: PathBuf,
+    /// Scenes to show, the first of the folder.
+    #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u16).range(1..=400))]
+    scenes: u16,
+}
+
+#[derive(Args)]
+struct Bench {
+    /// Scenes to render.
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    scenes: u64,
+    #[command(flatten)]
+    look: Look,
+}
+
+fn even_size(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(size @ 16..=4096) if size % 2 == 0 => Ok(size),
+        _ => Err("expected an even number from 16 to 4096".to_owned()),
+    }
+}
+
+/// Exit codes of sysexits.h.
+mod exit {
+    pub(super) const USAGE: u8 = 64;
+    pub(super) const DATA: u8 = 65;
+    pub(super) const NO_INPUT: u8 = 66;
+    pub(super) const CANNOT_CREATE: u8 = 73;
+    pub(super) const IO: u8 = 74;
+}
+
+struct Failure {
+    code: u8,
+    message: String,
+}
+
+impl From<ShardError> for Failure {
+    fn from(error: ShardError) -> Self {
+        let code = match error {
+            ShardError::Folder { .. } | ShardError::Occupied { .. } => exit::CANNOT_CREATE,
+            ShardError::Read { .. } => exit::NO_INPUT,
+            ShardError::Write { .. } => exit::IO,
+            ShardError::Malformed { .. } => exit::DATA,
+        };
+        Self { code, message: error.to_string() }
+    }
+}
+
+fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(error) => {
+            // Help and version are no errors; where standard output is closed there is nobody to tell.
+            let _ = error.print();
+            return if error.use_stderr() { ExitCode::from(exit::USAGE) } else { ExitCode::SUCCESS };
+        }
+    };
+    let done = match cli.command {
+        Command::Generate(options) => generate(&options),
+        Command::Sheet(options) => sheet(&options),
+        Command::Bench(options) => bench(&options),
+    };
+    match done {
+        Ok(report) => {
+            let _ = writeln!(std::io::stdout(), "{report}");
+            ExitCode::SUCCESS
+        }
+        Err(failure) => {
+            let _ = writeln!(std::io::stderr(), "holod-scenes: {}", failure.message);
+            ExitCode::from(failure.code)
+        }
+    }
+}
+
+fn generate(options: &Generate) -> Result<String, Failure> {
+    let plan = options.look.plan(options.seed);
+    let style =
+        ProgressStyle::with_template("{bar:40} {pos}/{len} scenes, {eta} left").expect("the template is constant");
+    let bar = ProgressBar::new(options.count).with_style(style);
+    let (mut written, mut present) = (0, 0);
+    for index in options.first..options.first + options.count {
+        match plan.write(&options.out, index)? {
+            Outcome::Written { .. } => written += 1,
+            Outcome::Present => present += 1,
+        }
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
+    Ok(format!("{written} scenes written to {}, {present} were there already", options.out.display()))
+}
+
+fn bench(options: &Bench) -> Result<String, Failure> {
+    let plan = options.look.plan(1);
+    let mut rays = 0;
+    let (mut composing_s, mut tracing_s) = (0.0, 0.0);
+    for index in 0..options.scenes {
+        let begin = Instant::now();
+        let scene = Scene::random(plan.kind, plan.seed, index, plan.resolution);
+        let composed = Instant::now();
+        let pupils = plan.pupils.pupils(plan.kind, plan.seed, index);
+        rays += scene.traced_focal_stacks(&pupils, &plan.focus(), plan.rays).1;
+        composing_s += (composed - begin).as_secs_f64();
+        tracing_s += composed.elapsed().as_secs_f64();
+    }
+    let threads = rayon::current_num_threads();
+    let rate = rays as f64 / tracing_s / threads as f64;
+    Ok(format!(
+        "{:.2} million aperture rays/s on each of {threads} threads, each ray serving {} planes; a scene takes {:.2} s to compose and {:.2} s to trace ({:.1} million rays)",
+        rate * 1e-6,
+        plan.planes,
+        composing_s / options.scenes as f64,
+        tracing_s / options.scenes as f64,
+        rays as f64 * 1e-6 / options.scenes as f64,
+    ))
+}
+
+fn sheet(options: &Sheet) -> Result<String, Failure> {
+    let unreadable = |error: std::io::Error| Failure {
+        code: exit::NO_INPUT,
+        message: format!("cannot read the folder {}: {error}", options.folder.display()),
+    };
+    let mut files = Vec::new();
+    for entry in fs::read_dir(&options.folder).map_err(unreadable)? {
+        let path = entry.map_err(unreadable)?.path();
+        let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        if name.starts_with("scene_") && name.ends_with(".safetensors") {
+            files.push(path);
+        }
+    }
+    files.sort();
+    files.truncate(usize::from(options.scenes));
+    if files.is_empty() {
+        let message = format!(
+            "{} holds no scene_*.safetensors; write some with `holod-scenes generate`",
+            options.folder.display()
+        );
+        return Err(Failure { code: exit::NO_INPUT, message });
+    }
+    let previews = files.iter().map(|path| Preview::read(path)).collect::<Result<Vec<_>, _>>()?;
+    let picture = contact_sheet(&previews);
+    save_png(&picture, &options.out)?;
+    Ok(format!(
+        "{} scenes on {} (all in focus, depth, focused far, focused near)",
+        previews.len(),
+        options.out.display()
+    ))
+}
+
+/// One row for each scene.
+fn contact_sheet(previews: &[Preview]) -> image::RgbImage {
+    const GAP: u32 = 4;
+    let cell_width = previews.iter().map(|p| p.resolution.width).max().unwrap_or(0) as u32 + GAP;
+    let cell_height = previews.iter().map(|p| p.resolution.height).max().unwrap_or(0) as u32 + GAP;
+    let mut sheet = image::RgbImage::new(4 * cell_width, cell_height * previews.len() as u32);
+    for (row, preview) in previews.iter().enumerate() {
+        let pixels = preview.resolution.pixels();
+        let mut put = |column: u32, colour: &dyn Fn(usize) -> [u8; 3]| {
+            for pixel in 0..pixels {
+                let x = (pixel % preview.resolution.width) as u32 + column * cell_width;
+                let y = (pixel / preview.resolution.width) as u32 + row as u32 * cell_height;
+                sheet.put_pixel(x, y, image::Rgb(colour(pixel)));
+            }
+        };
+        let coloured = |image: &[f32], pixel: usize| [0, 1, 2].map(|c| srgb_level(image[c * pixels + pixel]));
+        put(0, &|pixel| coloured(&preview.image, pixel));
+        put(1, &|pixel| [(preview.depth[pixel] * 255.0) as u8; 3]);
+        put(2, &|pixel| coloured(&preview.focused_far, pixel));
+        put(3, &|pixel| coloured(&preview.focused_near, pixel));
+    }
+    sheet
+}
+
+fn srgb_level(linear: f32) -> u8 {
+    let linear = linear.clamp(0.0, 1.0);
+    let encoded = if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
+    (encoded * 255.0).round() as u8
+}
+
+/// Writes beside and renames.
+fn save_png(picture: &image::RgbImage, path: &Path) -> Result<(), Failure> {
+    let beside = path.with_extension("png.partial");
+    picture
+        .save_with_format(&beside, image::ImageFormat::Png)
+        .map_err(|error| error.to_string())
+        .and_then(|()| fs::rename(&beside, path).map_err(|error| error.to_string()))
+        .map_err(|reason| Failure {
+            code: exit::CANNOT_CREATE,
+            message: format!("cannot write {}: {reason}", path.display()),
+        })
+}

@@ -1,0 +1,123 @@
+//! Scenes of our own making and their thin-lens images: what a network learns from, is judged by and is shown with.
+//!
+//! A [`Scene`] is a set of textured surfaces between infinity and the near end of the depth range. Its
+//! [`picture`](Scene::picture) is what a pinhole sees; its [`focal_stack`](Scene::focal_stack) is what an eye with a
+//! round pupil sees at each focus. Light is linear throughout. [`shard`] writes scenes as files for the trainer.
+
+mod compose;
+mod demo;
+mod glyphs;
+mod random;
+pub mod shard;
+mod surface;
+mod texture;
+mod thin_lens;
+
+use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
+
+use surface::Surface;
+
+/// What a random scene is for. The kinds never share a scene: each has a seed space of its own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SceneKind {
+    /// For training.
+    Train,
+    /// For testing: families of textures, and ranges, that no training scene has.
+    Test,
+    /// The refocus test: fine marks on a near card at 2.5 dioptres and a far card at 0.25 dioptres; dark on bright
+    /// where the index is even, bright on dark where it is odd.
+    Cards,
+}
+
+impl SceneKind {
+    /// The name in files and on the command line.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Train => "train",
+            Self::Test => "test",
+            Self::Cards => "cards",
+        }
+    }
+
+    fn stream(self) -> u64 {
+        match self {
+            Self::Train => 0x7472_6169_6e00,
+            Self::Test => 0x7465_7374_0000,
+            Self::Cards => 0x6361_7264_7300,
+        }
+    }
+}
+
+/// A pinhole picture with its depth.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Picture {
+    /// Linear light, [3, height, width], 0..=1.
+    pub image: Vec<f32>,
+    /// Normalised depth, [height, width]: 0 far, 1 near, uniform in dioptres.
+    pub depth: Vec<f32>,
+}
+
+/// Textured surfaces between infinity and the near end of [`DisplayGeometry::DEFAULT`]'s depth range, laid out for one
+/// resolution.
+pub struct Scene {
+    surfaces: Vec<Surface>,
+    resolution: Resolution,
+    ray_key: u64,
+}
+
+/// The built-in demonstration: text cards near on the left and far on the right, objects between them, a checkered
+/// floor through all depths. It fills a picture of any resolution.
+pub fn sample_scene(resolution: Resolution) -> Scene {
+    Scene { surfaces: demo::surfaces(resolution), resolution, ray_key: 0 }
+}
+
+impl Scene {
+    /// A scene that depends on its arguments alone.
+    pub fn random(kind: SceneKind, seed: u64, index: u64, resolution: Resolution) -> Self {
+        let surfaces = match kind {
+            SceneKind::Cards => compose::refocus_cards(index.is_multiple_of(2), seed ^ (index / 2), resolution),
+            SceneKind::Train | SceneKind::Test => compose::random_surfaces(kind, seed, index, resolution),
+        };
+        let ray_key = random::mix(random::mix(seed) ^ kind.stream() ^ index);
+        Self { surfaces, resolution, ray_key }
+    }
+
+    /// The refocus test: see [`SceneKind::Cards`].
+    pub fn cards(dark_on_bright: bool, resolution: Resolution) -> Self {
+        Self::random(SceneKind::Cards, 0, u64::from(!dark_on_bright), resolution)
+    }
+
+    /// The resolution that the scene was laid out for.
+    pub fn resolution(&self) -> Resolution {
+        self.resolution
+    }
+
+    /// What a pinhole sees: each pixel's mean colour, and the depth along its central ray.
+    pub fn picture(&self) -> Picture {
+        let (image, depth_dpt) = thin_lens::pinhole(&self.surfaces, self.resolution);
+        let normalised = |depth: f32| DisplayGeometry::DEFAULT.normalised_depth(Dioptres(f64::from(depth))) as f32;
+        Picture { image, depth: depth_dpt.into_iter().map(|depth| normalised(depth).clamp(0.0, 1.0)).collect() }
+    }
+
+    /// Thin-lens images, [planes, 3, height, width] in linear light, for one pupil and each focus, averaged over at
+    /// least `rays` rays a pixel. Each point blurs to a disc of diameter [`DisplayGeometry::coc_px`].
+    pub fn focal_stack(&self, pupil: PupilDiameter, focus: &[Dioptres], rays: usize) -> Vec<f32> {
+        self.focal_stacks(&[pupil], focus, rays).swap_remove(0)
+    }
+
+    /// [`focal_stack`](Self::focal_stack) for several pupils at little more than the cost of one: the rays of narrower
+    /// pupils serve the wider ones too.
+    pub fn focal_stacks(&self, pupils: &[PupilDiameter], focus: &[Dioptres], rays: usize) -> Vec<Vec<f32>> {
+        self.traced_focal_stacks(pupils, focus, rays).0
+    }
+
+    /// [`focal_stacks`](Self::focal_stacks), and the number of rays traced for them.
+    pub fn traced_focal_stacks(
+        &self,
+        pupils: &[PupilDiameter],
+        focus: &[Dioptres],
+        rays: usize,
+    ) -> (Vec<Vec<f32>>, u64) {
+        thin_lens::focal_stacks(&self.surfaces, self.resolution, pupils, focus, rays, self.ray_key)
+    }
+}

@@ -1,0 +1,326 @@
+//! Shards: one safetensors file for each scene, with its picture, depth and focal stacks.
+//!
+//! `scene_000123.safetensors` holds `image` F16 [3, H, W] (linear light, pinhole), `depth` F32 [H, W] (normalised, 0 far,
+//! 1 near) and `stack_0` … `stack_n` F16 [planes, 3, H, W] (linear light, one for each pupil). Its metadata are strings:
+//! `format` = "holod-scene-1", `kind`, `seed`, `index`, `pupils_mm` and `focus_dpt` (JSON lists), `far_dpt`, `near_dpt`,
+//! `pixel_angle_rad`, `rays`.
+
+use std::collections::HashMap;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use half::f16;
+use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
+use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
+
+use super::random::{Random, mix};
+use super::{Scene, SceneKind};
+
+/// The `format` that a shard's metadata names.
+pub const FORMAT: &str = "holod-scene-1";
+/// Pupils outside this range are no human's.
+const PUPIL_RANGE_MM: (f32, f32) = (0.5, 9.0);
+/// The range that [`PupilPlan::Strata`] divides.
+const STRATA_RANGE_MM: (f32, f32) = (1.0, 5.0);
+
+/// Which pupils a scene is rendered for.
+#[derive(Clone, Debug, PartialEq)]
+pub enum PupilPlan {
+    /// One random pupil in each of so many equal parts of 1 to 5 mm, drawn anew for each scene.
+    Strata(usize),
+    /// These, in every scene.
+    Fixed(Vec<PupilDiameter>),
+}
+
+impl PupilPlan {
+    /// The pupils of one scene.
+    pub fn pupils(&self, kind: SceneKind, seed: u64, index: u64) -> Vec<PupilDiameter> {
+        match self {
+            Self::Fixed(pupils) => pupils.clone(),
+            Self::Strata(parts) => {
+                let mut random = Random::new(mix(seed ^ 0x7075_7069_6c73) ^ kind.stream(), index);
+                let (low, high) = STRATA_RANGE_MM;
+                let width = (high - low) / *parts as f32;
+                (0..*parts).map(|part| PupilDiameter::from_mm(low + width * (part as f32 + random.unit()))).collect()
+            }
+        }
+    }
+}
+
+impl FromStr for PupilPlan {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if let Some(parts) = text.strip_prefix("strata:") {
+            return match parts.parse() {
+                Ok(parts @ 1..=64) => Ok(Self::Strata(parts)),
+                _ => Err(format!("`{parts}` after `strata:` is not a whole number from 1 to 64")),
+            };
+        }
+        let pupil = |item: &str| match item.trim().parse::<f32>() {
+            Ok(mm) if (PUPIL_RANGE_MM.0..=PUPIL_RANGE_MM.1).contains(&mm) => Ok(PupilDiameter::from_mm(mm)),
+            _ => Err(format!(
+                "`{item}` is not a pupil diameter of {} to {} mm; give a list such as 1,2,3,4,5 or strata:4",
+                PUPIL_RANGE_MM.0, PUPIL_RANGE_MM.1
+            )),
+        };
+        Ok(Self::Fixed(text.split(',').map(pupil).collect::<Result<_, _>>()?))
+    }
+}
+
+/// What the scenes of one shard folder have in common.
+#[derive(Clone, Debug)]
+pub struct ShardPlan {
+    /// What the scenes are for.
+    pub kind: SceneKind,
+    /// With the index, says which scene it is.
+    pub seed: u64,
+    /// Pixels of each picture.
+    pub resolution: Resolution,
+    /// Pupils of each scene.
+    pub pupils: PupilPlan,
+    /// Focus planes, uniform in dioptres, both ends of the depth range included; at least two.
+    pub planes: usize,
+    /// Rays for each pixel of each plane and pupil, at least.
+    pub rays: usize,
+}
+
+/// Why a shard could not be written.
+#[derive(Debug, thiserror::Error)]
+pub enum ShardError {
+    /// The output folder cannot be made or written to.
+    #[error("cannot write to the folder {}: {source}; choose another with --out", path.display())]
+    Folder {
+        /// The folder.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A file could not be read.
+    #[error("cannot read {}: {source}", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A file could not be written.
+    #[error("cannot write {}: {reason}", path.display())]
+    Write {
+        /// The file.
+        path: PathBuf,
+        /// What went wrong.
+        reason: String,
+    },
+    /// A file of that name is there and holds something else.
+    #[error("{} is there already, but {found}, where {expected} was expected; remove it or choose another --out", path.display())]
+    Occupied {
+        /// The file.
+        path: PathBuf,
+        /// What the file holds.
+        found: String,
+        /// What it should hold.
+        expected: String,
+    },
+    /// A file is not a shard.
+    #[error("{} is not a scene shard: {reason}", path.display())]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+}
+
+/// What became of one scene.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// It was rendered and written.
+    Written {
+        /// Aperture rays traced for it.
+        rays_traced: u64,
+    },
+    /// A complete file was there already.
+    Present,
+}
+
+/// The file name of scene `index`.
+pub fn file_name(index: u64) -> String {
+    format!("scene_{index:06}.safetensors")
+}
+
+impl ShardPlan {
+    /// The focus planes.
+    pub fn focus(&self) -> Vec<Dioptres> {
+        let last = (self.planes - 1) as f64;
+        (0..self.planes).map(|plane| DisplayGeometry::DEFAULT.depth_at(plane as f64 / last)).collect()
+    }
+
+    fn metadata(&self, index: u64) -> HashMap<String, String> {
+        let geometry = DisplayGeometry::DEFAULT;
+        let pupils_mm: Vec<f32> = self.pupils.pupils(self.kind, self.seed, index).iter().map(|p| p.mm()).collect();
+        let focus_dpt: Vec<f64> = self.focus().iter().map(|f| f.0).collect();
+        [
+            ("format", FORMAT.to_owned()),
+            ("kind", self.kind.name().to_owned()),
+            ("seed", self.seed.to_string()),
+            ("index", index.to_string()),
+            ("pupils_mm", format!("{pupils_mm:?}")),
+            ("focus_dpt", format!("{focus_dpt:?}")),
+            ("far_dpt", geometry.depth_far.0.to_string()),
+            ("near_dpt", geometry.depth_near.0.to_string()),
+            ("pixel_angle_rad", geometry.pixel_angle_rad().to_string()),
+            ("rays", self.rays.to_string()),
+        ]
+        .map(|(key, value)| (key.to_owned(), value))
+        .into()
+    }
+
+    /// Renders scene `index` into `folder`, unless its complete file is there already. The file appears whole or not
+    /// at all.
+    pub fn write(&self, folder: &Path, index: u64) -> Result<Outcome, ShardError> {
+        let path = folder.join(file_name(index));
+        if self.is_present(&path, index)? {
+            return Ok(Outcome::Present);
+        }
+        fs::create_dir_all(folder).map_err(|source| ShardError::Folder { path: folder.to_owned(), source })?;
+
+        let scene = Scene::random(self.kind, self.seed, index, self.resolution);
+        let picture = scene.picture();
+        let pupils = self.pupils.pupils(self.kind, self.seed, index);
+        let (stacks, rays_traced) = scene.traced_focal_stacks(&pupils, &self.focus(), self.rays);
+
+        let Resolution { width, height } = self.resolution;
+        let depth: Vec<u8> = picture.depth.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let mut tensors = vec![
+            ("image".to_owned(), Dtype::F16, vec![3, height, width], half_bytes(&picture.image)),
+            ("depth".to_owned(), Dtype::F32, vec![height, width], depth),
+        ];
+        for (number, stack) in stacks.iter().enumerate() {
+            tensors.push((
+                format!("stack_{number}"),
+                Dtype::F16,
+                vec![self.planes, 3, height, width],
+                half_bytes(stack),
+            ));
+        }
+        let unwritable = |reason: String| ShardError::Write { path: path.clone(), reason };
+        let views = tensors
+            .iter()
+            .map(|(name, dtype, shape, bytes)| Ok((name, TensorView::new(*dtype, shape.clone(), bytes)?)))
+            .collect::<Result<Vec<_>, SafeTensorError>>()
+            .map_err(|error| unwritable(error.to_string()))?;
+        let bytes =
+            safetensors::serialize(views, Some(self.metadata(index))).map_err(|error| unwritable(error.to_string()))?;
+        let beside = folder.join(format!(".{}.{}.partial", file_name(index), std::process::id()));
+        fs::write(&beside, bytes).and_then(|()| fs::rename(&beside, &path)).map_err(|error| {
+            // The partial file is only litter; the first error is the one to report.
+            let _ = fs::remove_file(&beside);
+            unwritable(error.to_string())
+        })?;
+        Ok(Outcome::Written { rays_traced })
+    }
+
+    /// Whether `path` is the complete shard of scene `index`; an error if it is a whole shard of something else.
+    fn is_present(&self, path: &Path, index: u64) -> Result<bool, ShardError> {
+        if !path.try_exists().map_err(|source| ShardError::Read { path: path.to_owned(), source })? {
+            return Ok(false);
+        }
+        let Some(header) = Header::read(path)? else { return Ok(false) };
+        let mut expected: Vec<(String, String)> = self.metadata(index).into_iter().collect();
+        expected.push(("size".to_owned(), self.resolution.to_string()));
+        expected.sort();
+        for (key, value) in expected {
+            let found = match key.as_str() {
+                "size" => header.size.clone(),
+                key => header.metadata.get(key).cloned().unwrap_or_else(|| "nothing".to_owned()),
+            };
+            if found != value {
+                let (found, expected) = (format!("its `{key}` is {found}"), value);
+                return Err(ShardError::Occupied { path: path.to_owned(), found, expected });
+            }
+        }
+        Ok(true)
+    }
+}
+
+fn half_bytes(values: &[f32]) -> Vec<u8> {
+    values.iter().flat_map(|&value| f16::from_f32(value).to_le_bytes()).collect()
+}
+
+struct Header {
+    metadata: HashMap<String, String>,
+    size: String,
+}
+
+impl Header {
+    /// The header of a shard; nothing if the file is cut short.
+    fn read(path: &Path) -> Result<Option<Self>, ShardError> {
+        let malformed = |reason: String| ShardError::Malformed { path: path.to_owned(), reason };
+        let bytes = fs::read(path).map_err(|source| ShardError::Read { path: path.to_owned(), source })?;
+        let tensors = match SafeTensors::deserialize(&bytes) {
+            Ok(tensors) => tensors,
+            Err(SafeTensorError::HeaderTooSmall | SafeTensorError::InvalidHeaderLength) => return Ok(None),
+            Err(SafeTensorError::MetadataIncompleteBuffer) => return Ok(None),
+            Err(error) => return Err(malformed(error.to_string())),
+        };
+        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|error| malformed(error.to_string()))?;
+        let size = match tensors.tensor("depth").as_ref().map(TensorView::shape) {
+            Ok(&[height, width]) => Resolution { width, height }.to_string(),
+            _ => return Err(malformed("it has no depth of two dimensions".to_owned())),
+        };
+        Ok(Some(Self { metadata: header.metadata().clone().unwrap_or_default(), size }))
+    }
+}
+
+/// The parts of a shard that a person wants to see.
+#[derive(Debug)]
+pub struct Preview {
+    /// Pixels of each picture.
+    pub resolution: Resolution,
+    /// Linear light, [3, height, width].
+    pub image: Vec<f32>,
+    /// Normalised depth, [height, width].
+    pub depth: Vec<f32>,
+    /// The widest pupil's image focused at the farthest plane, [3, height, width].
+    pub focused_far: Vec<f32>,
+    /// The widest pupil's image focused at the nearest plane, [3, height, width].
+    pub focused_near: Vec<f32>,
+}
+
+impl Preview {
+    /// Reads the shard at `path`.
+    pub fn read(path: &Path) -> Result<Self, ShardError> {
+        let malformed = |reason: String| ShardError::Malformed { path: path.to_owned(), reason };
+        let bytes = fs::read(path).map_err(|source| ShardError::Read { path: path.to_owned(), source })?;
+        let tensors = SafeTensors::deserialize(&bytes).map_err(|error| malformed(error.to_string()))?;
+        let tensor = |name: &str, dtype: Dtype, rank: usize| match tensors.tensor(name) {
+            Ok(tensor) if tensor.dtype() == dtype && tensor.shape().len() == rank => Ok(tensor),
+            Ok(tensor) => Err(malformed(format!("`{name}` is {:?} {:?}", tensor.dtype(), tensor.shape()))),
+            Err(_) => Err(malformed(format!("it has no `{name}`"))),
+        };
+        let depth = tensor("depth", Dtype::F32, 2)?;
+        let resolution = Resolution { width: depth.shape()[1], height: depth.shape()[0] };
+        let stacks = tensors.names().iter().filter(|name| name.starts_with("stack_")).count();
+        let widest = tensor(&format!("stack_{}", stacks.saturating_sub(1)), Dtype::F16, 4)?;
+        let image = half_values(tensor("image", Dtype::F16, 3)?.data());
+        let stack = half_values(widest.data());
+        let size = 3 * resolution.pixels();
+        if image.len() != size || stack.len() < size || !stack.len().is_multiple_of(size) {
+            return Err(malformed("its images differ in size".to_owned()));
+        }
+        Ok(Self {
+            resolution,
+            image,
+            depth: depth.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
+            focused_far: stack[..size].to_vec(),
+            focused_near: stack[stack.len() - size..].to_vec(),
+        })
+    }
+}
+
+fn half_values(bytes: &[u8]) -> Vec<f32> {
+    bytes.chunks_exact(2).map(|pair| f16::from_le_bytes([pair[0], pair[1]]).to_f32()).collect()
+}

@@ -1,0 +1,260 @@
+//! Procedural surface patterns, in linear light.
+//!
+//! A pattern is a function of a point in pixels; it knows nothing of sampling. The surface that wears it bakes it into
+//! texels of half a pixel with several samples each, which band-limits it.
+
+use super::glyphs;
+use super::random::{hash, hash_unit};
+
+/// Linear red, green, blue.
+pub(super) type Rgb = [f32; 3];
+
+pub(super) fn blend(a: Rgb, b: Rgb, share: f32) -> Rgb {
+    std::array::from_fn(|c| a[c] + (b[c] - a[c]) * share)
+}
+
+/// A cosine of a spectral texture: wave vector in radians per pixel, phase, amplitude.
+pub(super) struct Wave {
+    pub(super) kx: f32,
+    pub(super) ky: f32,
+    pub(super) phase: f32,
+    pub(super) amplitude: f32,
+}
+
+/// What a surface is painted with. Lengths are pixels.
+pub(super) enum Pattern {
+    Flat(Rgb),
+    /// From `a` to `b` along x over `length`, centred on the origin.
+    Gradient {
+        a: Rgb,
+        b: Rgb,
+        length: f32,
+    },
+    Checker {
+        a: Rgb,
+        b: Rgb,
+        period: f32,
+    },
+    Stripes {
+        a: Rgb,
+        b: Rgb,
+        period: f32,
+        duty: f32,
+        sine: bool,
+    },
+    /// Value noise of several octaves.
+    Noise {
+        a: Rgb,
+        b: Rgb,
+        scale: f32,
+        octaves: u32,
+        contrast: f32,
+        seed: u32,
+    },
+    /// At most one round mark in each cell.
+    Dots {
+        ground: Rgb,
+        mark: Rgb,
+        cell: f32,
+        radius: f32,
+        presence: f32,
+        seed: u32,
+    },
+    /// Lines of random words.
+    Text {
+        ground: Rgb,
+        mark: Rgb,
+        height: f32,
+        weight: f32,
+        seed: u32,
+    },
+    /// These words, centred on the origin, repeated downwards by line.
+    Words {
+        ground: Rgb,
+        mark: Rgb,
+        height: f32,
+        weight: f32,
+        lines: Vec<&'static str>,
+    },
+    /// Convex polygons, at most one in each cell, each in a colour between `a` and `b`.
+    Polygons {
+        ground: Rgb,
+        a: Rgb,
+        b: Rgb,
+        cell: f32,
+        seed: u32,
+    },
+    /// Strokes in random directions, one in each cell.
+    Ticks {
+        ground: Rgb,
+        mark: Rgb,
+        cell: f32,
+        width: f32,
+        seed: u32,
+    },
+    /// A sum of cosines whose amplitudes fall as 1/f, as in natural pictures.
+    Spectral {
+        a: Rgb,
+        b: Rgb,
+        waves: Vec<Wave>,
+    },
+    /// Rings around a far-off axis, warped by noise.
+    Wood {
+        a: Rgb,
+        b: Rgb,
+        ring: f32,
+        warp: f32,
+        seed: u32,
+    },
+    /// Veins along zeros of a warped sine.
+    Marble {
+        a: Rgb,
+        b: Rgb,
+        scale: f32,
+        warp: f32,
+        seed: u32,
+    },
+    /// Threads over and under.
+    Weave {
+        a: Rgb,
+        b: Rgb,
+        period: f32,
+    },
+}
+
+impl Pattern {
+    /// The colour at a point.
+    pub(super) fn colour(&self, x: f32, y: f32) -> Rgb {
+        match *self {
+            Self::Flat(colour) => colour,
+            Self::Gradient { a, b, length } => blend(a, b, (x / length + 0.5).clamp(0.0, 1.0)),
+            Self::Checker { a, b, period } => {
+                let odd = ((x / period).floor() as i32 + (y / period).floor() as i32) & 1 == 1;
+                if odd { a } else { b }
+            }
+            Self::Stripes { a, b, period, duty, sine } => {
+                let phase = (x / period).rem_euclid(1.0);
+                if sine {
+                    blend(a, b, 0.5 + 0.5 * (std::f32::consts::TAU * phase).sin())
+                } else if phase < duty {
+                    a
+                } else {
+                    b
+                }
+            }
+            Self::Noise { a, b, scale, octaves, contrast, seed } => {
+                let value = fractal_noise(x / scale, y / scale, octaves, seed);
+                blend(a, b, (0.5 + (value - 0.5) * contrast).clamp(0.0, 1.0))
+            }
+            Self::Dots { ground, mark, cell, radius, presence, seed } => {
+                let (column, row) = ((x / cell).floor() as i32, (y / cell).floor() as i32);
+                if hash_unit(column, row, seed) > presence {
+                    return ground;
+                }
+                let room = (cell - 2.0 * radius).max(0.0);
+                let centre_x = column as f32 * cell + radius + room * hash_unit(column, row, seed ^ 1);
+                let centre_y = row as f32 * cell + radius + room * hash_unit(column, row, seed ^ 2);
+                let inside = (x - centre_x).powi(2) + (y - centre_y).powi(2) < radius * radius;
+                if inside { mark } else { ground }
+            }
+            Self::Text { ground, mark, height, weight, seed } => {
+                let (unit, line) = (height / 6.0, (y / (height * 1.7)).floor() as i32);
+                let column = (x / (unit * 5.6)).floor() as i32;
+                let letter = match hash(column, line, seed) % 44 {
+                    n @ 0..26 => b'A' + n as u8,
+                    n @ 26..36 => b'0' + (n - 26) as u8,
+                    _ => b' ',
+                };
+                let local_x = (x - column as f32 * unit * 5.6) / unit - 0.8;
+                let local_y = (y - line as f32 * height * 1.7) / unit - 1.6;
+                let inked = glyphs::stroke_distance(letter, local_x, local_y) * unit < 0.5 * weight;
+                if inked { mark } else { ground }
+            }
+            Self::Words { ground, mark, height, weight, ref lines } => {
+                let (unit, pitch) = (height / 6.0, height * 1.7);
+                let from_top = y + 0.5 * pitch * lines.len() as f32;
+                let line = (from_top / pitch).floor();
+                if line < 0.0 || line >= lines.len() as f32 {
+                    return ground;
+                }
+                let text = lines[line as usize].as_bytes();
+                let from_left = x + 0.5 * unit * 5.6 * text.len() as f32;
+                let column = (from_left / (unit * 5.6)).floor();
+                if column < 0.0 || column >= text.len() as f32 {
+                    return ground;
+                }
+                let local_x = (from_left - column * unit * 5.6) / unit - 0.8;
+                let local_y = (from_top - line * pitch) / unit - 2.1;
+                let inked = glyphs::stroke_distance(text[column as usize], local_x, local_y) * unit < 0.5 * weight;
+                if inked { mark } else { ground }
+            }
+            Self::Polygons { ground, a, b, cell, seed } => {
+                let (column, row) = ((x / cell).floor() as i32, (y / cell).floor() as i32);
+                let random = |salt: u32| hash_unit(column, row, seed ^ salt);
+                if random(1) < 0.3 {
+                    return ground;
+                }
+                let sides = 3 + (random(2) * 3.0) as u32;
+                let inradius = cell * (0.12 + 0.12 * random(3));
+                let turn = std::f32::consts::TAU * random(4);
+                let (dx, dy) = (x - (column as f32 + 0.5) * cell, y - (row as f32 + 0.5) * cell);
+                let inside = (0..sides).all(|side| {
+                    let (sin, cos) = (turn + std::f32::consts::TAU * side as f32 / sides as f32).sin_cos();
+                    dx * cos + dy * sin < inradius
+                });
+                if inside { blend(a, b, random(5)) } else { ground }
+            }
+            Self::Ticks { ground, mark, cell, width, seed } => {
+                let (column, row) = ((x / cell).floor() as i32, (y / cell).floor() as i32);
+                let (sin, cos) = (std::f32::consts::PI * hash_unit(column, row, seed)).sin_cos();
+                let (dx, dy) = (x - (column as f32 + 0.5) * cell, y - (row as f32 + 0.5) * cell);
+                let inside = (dx * sin - dy * cos).abs() < 0.5 * width && (dx * cos + dy * sin).abs() < 0.38 * cell;
+                if inside { mark } else { ground }
+            }
+            Self::Spectral { a, b, ref waves } => {
+                let sum: f32 = waves.iter().map(|w| w.amplitude * (w.kx * x + w.ky * y + w.phase).cos()).sum();
+                blend(a, b, (0.5 + sum).clamp(0.0, 1.0))
+            }
+            Self::Wood { a, b, ring, warp, seed } => {
+                let bend = fractal_noise(x / (8.0 * ring), y / (2.0 * ring), 3, seed) * warp;
+                let fibre = fractal_noise(x / 24.0, y / 1.6, 2, seed ^ 9);
+                let phase = ((x * 0.15).hypot(y + 3.0 * ring) / ring + bend).rem_euclid(1.0);
+                blend(a, b, (phase * phase * 0.75 + 0.35 * fibre).clamp(0.0, 1.0))
+            }
+            Self::Marble { a, b, scale, warp, seed } => {
+                let bend = fractal_noise(x / scale, y / scale, 4, seed) * warp;
+                let vein = ((x + 0.6 * y) / scale * 2.0 + bend).sin().abs();
+                blend(a, b, vein.powf(0.6))
+            }
+            Self::Weave { a, b, period } => {
+                let (u, v) = (x / period, y / period);
+                let over = (u.floor() as i32 + v.floor() as i32) & 1 == 0;
+                let across = if over { u.rem_euclid(1.0) } else { v.rem_euclid(1.0) };
+                let round = (std::f32::consts::PI * across).sin();
+                blend([0.0; 3], if over { a } else { b }, 0.25 + 0.75 * round)
+            }
+        }
+    }
+}
+
+/// Value noise in 0..1, the sum of `octaves` of it, each at twice the frequency and 0.55 of the amplitude.
+pub(super) fn fractal_noise(x: f32, y: f32, octaves: u32, seed: u32) -> f32 {
+    let (mut sum, mut weight, mut amplitude, mut frequency) = (0.0, 0.0, 1.0, 1.0);
+    for octave in 0..octaves {
+        sum += amplitude * value_noise(x * frequency, y * frequency, seed.wrapping_add(octave * 7919));
+        weight += amplitude;
+        amplitude *= 0.55;
+        frequency *= 2.03;
+    }
+    sum / weight
+}
+
+fn value_noise(x: f32, y: f32, seed: u32) -> f32 {
+    let (fx, fy) = (x.floor(), y.floor());
+    let (column, row) = (fx as i32, fy as i32);
+    let smooth = |t: f32| t * t * (3.0 - 2.0 * t);
+    let (u, v) = (smooth(x - fx), smooth(y - fy));
+    let top = hash_unit(column, row, seed) * (1.0 - u) + hash_unit(column + 1, row, seed) * u;
+    let bottom = hash_unit(column, row + 1, seed) * (1.0 - u) + hash_unit(column + 1, row + 1, seed) * u;
+    top * (1.0 - v) + bottom * v
+}
