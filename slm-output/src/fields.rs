@@ -1,0 +1,251 @@
+//! The three colour fields of a frame as the panel is sent them, and back again.
+
+use holod_calibration::rig::{Panel, PanelMode};
+use holod_calibration::{Colour, Resolution};
+
+/// Fields in a colour frame: one for each laser.
+pub const FIELDS: usize = 3;
+
+/// How a panel wants the levels of a colour frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FrameLayout {
+    /// Panel pixels.
+    pub resolution: Resolution,
+    /// How the fields are carried.
+    pub mode: PanelMode,
+    /// The colour of each field, in the order in which they are shown.
+    pub field_order: [Colour; FIELDS],
+}
+
+impl FrameLayout {
+    /// The layout for `panel` with `resolution` pixels.
+    pub fn new(panel: &Panel, resolution: Resolution) -> Self {
+        Self { resolution, mode: panel.mode, field_order: panel.field_order }
+    }
+
+    /// The position of `colour` in the field order.
+    ///
+    /// # Panics
+    /// Where the order lacks the colour, which the rig file's validation excludes.
+    pub fn field_of(&self, colour: Colour) -> usize {
+        self.field_order.iter().position(|&shown| shown == colour).expect("a field order holds each colour once")
+    }
+
+    /// Distance in samples between neighbouring pixels of one field.
+    const fn stride(&self) -> usize {
+        match self.mode {
+            PanelMode::ChannelPacked => FIELDS,
+            PanelMode::FieldSequential => 1,
+        }
+    }
+
+    /// Index of the first sample of `field`.
+    const fn offset(&self, field: usize) -> usize {
+        match self.mode {
+            PanelMode::ChannelPacked => field,
+            PanelMode::FieldSequential => field * self.resolution.pixels(),
+        }
+    }
+}
+
+/// One colour frame of levels, laid out as the panel takes it.
+///
+/// - Channel-packed: one video frame `[height, width, 3]`, row-major; the video's R, G and B channels carry the first,
+///   second and third *shown* field, whatever their colours are.
+/// - Field-sequential: three gray video frames `[3 (shown order), height, width]`; whoever sends one to a colour video
+///   link repeats each level in R, G and B.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LevelsFrame {
+    pub(crate) tag: FrameTag,
+    layout: FrameLayout,
+    samples: Vec<u16>,
+}
+
+/// What travels with a frame's levels.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FrameTag {
+    /// The frame's number, as the pacer gave it.
+    pub frame_id: u64,
+    /// When the frame was handed to the panel.
+    pub t_submit: holod_calibration::TimeNs,
+    /// The refresh that it was made for.
+    pub t_desired_present: holod_calibration::TimeNs,
+    /// The memory slot in which the panel shall keep the levels that it has really shown, if any.
+    pub keep: Option<usize>,
+}
+
+impl LevelsFrame {
+    /// A frame whose every sample is level 0.
+    pub fn new(layout: FrameLayout) -> Self {
+        Self { tag: FrameTag::default(), layout, samples: vec![0; FIELDS * layout.resolution.pixels()] }
+    }
+
+    /// The frame's number and times.
+    pub fn tag(&self) -> FrameTag {
+        self.tag
+    }
+
+    /// How the samples are laid out.
+    pub fn layout(&self) -> FrameLayout {
+        self.layout
+    }
+
+    /// All samples, as the panel takes them.
+    pub fn samples(&self) -> &[u16] {
+        &self.samples
+    }
+
+    /// The levels of `colour`, to be written.
+    pub fn field_mut(&mut self, colour: Colour) -> FieldMut<'_> {
+        let (stride, offset) = (self.layout.stride(), self.layout.offset(self.layout.field_of(colour)));
+        FieldMut { samples: &mut self.samples[offset..], stride, resolution: self.layout.resolution }
+    }
+
+    /// Takes out of the frame what the panel shows as its `field`-th field: the colour it is shown in and its levels,
+    /// `[height, width]`, row-major.
+    ///
+    /// # Panics
+    /// Where `field` is not below [`FIELDS`].
+    pub fn unpack(&self, field: usize) -> ColourField {
+        let samples = self.samples[self.layout.offset(field)..].iter().step_by(self.layout.stride());
+        ColourField {
+            frame_id: self.tag.frame_id,
+            field,
+            colour: self.layout.field_order[field],
+            resolution: self.layout.resolution,
+            levels: samples.take(self.layout.resolution.pixels()).copied().collect(),
+        }
+    }
+
+    /// The field in which `colour` is shown.
+    pub fn unpack_colour(&self, colour: Colour) -> ColourField {
+        self.unpack(self.layout.field_of(colour))
+    }
+
+    /// Overwrites samples and tag with those of `other`, which has the same layout, without allocating.
+    pub(crate) fn copy_from(&mut self, other: &Self) {
+        debug_assert_eq!(self.layout, other.layout);
+        self.tag = other.tag;
+        self.samples.copy_from_slice(&other.samples);
+    }
+}
+
+/// One colour's pattern while its laser is lit.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ColourField {
+    /// The frame it belongs to.
+    pub frame_id: u64,
+    /// Its position in the panel's field order.
+    pub field: usize,
+    /// The laser that belongs to it.
+    pub colour: Colour,
+    /// Panel pixels.
+    pub resolution: Resolution,
+    /// Levels `[height, width]`, row-major.
+    pub levels: Vec<u16>,
+}
+
+/// The samples of one field inside a frame.
+#[derive(Debug)]
+pub struct FieldMut<'a> {
+    samples: &'a mut [u16],
+    stride: usize,
+    resolution: Resolution,
+}
+
+impl FieldMut<'_> {
+    /// Panel pixels.
+    pub fn resolution(&self) -> Resolution {
+        self.resolution
+    }
+
+    /// Distance in samples between neighbouring pixels.
+    pub(crate) fn stride(&self) -> usize {
+        self.stride
+    }
+
+    /// The samples of pixels `first..first + count` in row-major order, beginning with pixel `first`, `stride` apart.
+    pub(crate) fn run(&mut self, first: usize, count: usize) -> &mut [u16] {
+        let begin = first * self.stride;
+        &mut self.samples[begin..begin + (count * self.stride).saturating_sub(self.stride - 1)]
+    }
+
+    /// Copies `levels` `[height, width]`, row-major, into the field.
+    ///
+    /// # Panics
+    /// Where `levels` has another number of pixels than the panel.
+    pub fn write(&mut self, levels: &[u16]) {
+        assert_eq!(levels.len(), self.resolution.pixels(), "a field has one level for each panel pixel");
+        for (sample, &level) in self.samples.iter_mut().step_by(self.stride).zip(levels) {
+            *sample = level;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const SMALL: Resolution = Resolution { width: 5, height: 3 };
+
+    fn orders() -> impl Strategy<Value = [Colour; FIELDS]> {
+        Just(Colour::ALL).prop_shuffle()
+    }
+
+    fn modes() -> impl Strategy<Value = PanelMode> {
+        prop_oneof![Just(PanelMode::ChannelPacked), Just(PanelMode::FieldSequential)]
+    }
+
+    fn levels() -> impl Strategy<Value = Vec<u16>> {
+        prop::collection::vec(0u16..1024, SMALL.pixels())
+    }
+
+    proptest! {
+        #[test]
+        fn unpacking_gives_back_each_colour_in_its_place(
+            field_order in orders(), mode in modes(), red in levels(), green in levels(), blue in levels(),
+        ) {
+            let layout = FrameLayout { resolution: SMALL, mode, field_order };
+            let mut frame = LevelsFrame::new(layout);
+            let given = [red, green, blue];
+            for colour in Colour::ALL {
+                frame.field_mut(colour).write(&given[colour.index()]);
+            }
+            for (position, &colour) in field_order.iter().enumerate() {
+                let field = frame.unpack(position);
+                prop_assert_eq!(field.colour, colour);
+                prop_assert_eq!(field.field, position);
+                prop_assert_eq!(&field.levels, &given[colour.index()]);
+                prop_assert_eq!(&frame.unpack_colour(colour), &field);
+            }
+        }
+    }
+
+    #[test]
+    fn channel_packed_puts_the_first_shown_field_in_the_first_channel() {
+        let field_order = [Colour::Green, Colour::Red, Colour::Blue];
+        let layout =
+            FrameLayout { resolution: Resolution { width: 2, height: 1 }, mode: PanelMode::ChannelPacked, field_order };
+        let mut frame = LevelsFrame::new(layout);
+        frame.field_mut(Colour::Red).write(&[10, 11]);
+        frame.field_mut(Colour::Green).write(&[20, 21]);
+        frame.field_mut(Colour::Blue).write(&[30, 31]);
+        assert_eq!(frame.samples(), [20, 10, 30, 21, 11, 31]);
+    }
+
+    #[test]
+    fn field_sequential_puts_the_first_shown_field_first() {
+        let field_order = [Colour::Blue, Colour::Red, Colour::Green];
+        let layout = FrameLayout {
+            resolution: Resolution { width: 2, height: 1 },
+            mode: PanelMode::FieldSequential,
+            field_order,
+        };
+        let mut frame = LevelsFrame::new(layout);
+        frame.field_mut(Colour::Red).write(&[10, 11]);
+        frame.field_mut(Colour::Green).write(&[20, 21]);
+        frame.field_mut(Colour::Blue).write(&[30, 31]);
+        assert_eq!(frame.samples(), [30, 31, 10, 11, 20, 21]);
+    }
+}

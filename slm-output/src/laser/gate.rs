@@ -1,0 +1,107 @@
+//! The lit window of each field.
+
+use holod_calibration::rig::{Lasers, Panel, PanelMode};
+use holod_calibration::{PerColour, TimeNs};
+
+use super::{FieldWindow, LaserError, LaserProgram, LitWindow, Trigger};
+use crate::present::{PanelTiming, PresentedField};
+
+/// Cuts a window out of each colour field: after the panel's settle time and the laser's on delay, and never past the
+/// field's end.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Gate {
+    timing: PanelTiming,
+    /// From a field's start to its on edge.
+    delay: TimeNs,
+    /// From the on edge to the off edge.
+    width: TimeNs,
+    settle: TimeNs,
+}
+
+impl Gate {
+    /// The gate for one bench; a window that is longer than its field is cut at the field's end.
+    ///
+    /// # Errors
+    /// [`LaserError::NoRoom`] where the window would begin after the field's end; [`LaserError::Figure`] for a
+    /// negative time or a width of 0.
+    pub fn new(panel: &Panel, lasers: &Lasers) -> Result<Self, LaserError> {
+        let timing = PanelTiming::new(panel);
+        for (what, time) in [("panel.settle", panel.settle), ("on_delay", lasers.on_delay)] {
+            if time < TimeNs(0) {
+                let found = format!("{} ns", time.0);
+                return Err(LaserError::Figure { what, found, expected: "0 or more" });
+            }
+        }
+        if lasers.width <= TimeNs(0) {
+            let found = format!("{} ns", lasers.width.0);
+            return Err(LaserError::Figure { what: "width", found, expected: "more than 0" });
+        }
+        let delay = panel.settle + lasers.on_delay;
+        let room = timing.field_period - delay;
+        if room <= TimeNs(0) {
+            let (field_us, delay_us) = (timing.field_period.0 / 1000, delay.0 / 1000);
+            return Err(LaserError::NoRoom { field_us, delay_us });
+        }
+        Ok(Self { timing, delay, width: lasers.width.min(room), settle: panel.settle })
+    }
+
+    /// From a field's presentation to the middle of its lit window.
+    pub fn middle(&self) -> TimeNs {
+        TimeNs(self.delay.0 + self.width.0 / 2)
+    }
+
+    /// Time that the panel needs before a field may be lit.
+    pub fn settle(&self) -> TimeNs {
+        self.settle
+    }
+
+    /// The panel's clockwork.
+    pub fn timing(&self) -> PanelTiming {
+        self.timing
+    }
+
+    /// When `field` makes way for the next one.
+    pub fn t_end(&self, field: &PresentedField) -> TimeNs {
+        field.t_present + self.timing.field_period
+    }
+
+    /// The window in which `field`'s own laser may be lit.
+    pub fn window(&self, field: &PresentedField) -> LitWindow {
+        let t_on = field.t_present + self.delay;
+        LitWindow { colour: field.colour, t_on, t_off: t_on + self.width }
+    }
+
+    /// What a box must be told for `panel` and `lasers`, the ones that this gate was made for.
+    ///
+    /// # Errors
+    /// [`LaserError::Figure`] for a power that is negative, not finite or above 4 W, or a heartbeat timeout of 0.
+    pub fn program(&self, panel: &Panel, lasers: &Lasers) -> Result<LaserProgram, LaserError> {
+        let mut power_uw = PerColour([0; 3]);
+        for (colour, &power_mw) in lasers.power_mw.iter() {
+            if !(0.0..=4000.0).contains(&power_mw) {
+                let found = format!("{power_mw} mW");
+                return Err(LaserError::Figure { what: "power_mw", found, expected: "0 to 4000" });
+            }
+            power_uw[colour] = (power_mw * 1e3).round() as u32;
+        }
+        if lasers.heartbeat_timeout <= TimeNs(0) {
+            let found = format!("{} ns", lasers.heartbeat_timeout.0);
+            return Err(LaserError::Figure { what: "heartbeat_timeout", found, expected: "more than 0" });
+        }
+        let window = |field: i64| FieldWindow {
+            delay: TimeNs(field * self.timing.field_period.0 + self.delay.0),
+            width: self.width,
+        };
+        Ok(LaserProgram {
+            trigger: match panel.mode {
+                PanelMode::ChannelPacked => Trigger::PanelSync,
+                PanelMode::FieldSequential => Trigger::Host,
+            },
+            sequence: panel.field_order,
+            windows: [window(0), window(1), window(2)],
+            frame_period: self.timing.frame_period,
+            power_uw,
+            heartbeat_timeout: lasers.heartbeat_timeout,
+        })
+    }
+}

@@ -1,0 +1,234 @@
+//! Was the rule kept? Judged from what was on the panel and from the box's own log of edges, and from nothing else.
+
+use std::fmt;
+
+use holod_calibration::{Colour, TimeNs};
+
+use super::{DarkReason, LaserEdge};
+
+/// One colour field that was on the panel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FieldSpan {
+    /// The frame.
+    pub frame_id: u64,
+    /// Position in the field order.
+    pub field: usize,
+    /// The laser that belongs to it.
+    pub colour: Colour,
+    /// When it came on the panel.
+    pub t_present: TimeNs,
+    /// When it may first be lit.
+    pub t_settled: TimeNs,
+    /// When it made way for the next one.
+    pub t_end: TimeNs,
+    /// Why it was meant to stay dark, if it was.
+    pub dark: Option<DarkReason>,
+}
+
+/// What is wrong.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Finding {
+    /// A laser was lit while no field was on the panel.
+    WindowWithoutField {
+        /// Which laser.
+        colour: Colour,
+        /// Since when.
+        t_on: TimeNs,
+    },
+    /// A laser was lit over a field of another colour.
+    WrongColour {
+        /// Which laser.
+        colour: Colour,
+        /// Since when.
+        t_on: TimeNs,
+        /// The field's colour.
+        field_colour: Colour,
+        /// The field's frame.
+        frame_id: u64,
+    },
+    /// A laser was lit over its own field but also before it had settled or after its end.
+    OutsideField {
+        /// Which laser.
+        colour: Colour,
+        /// Since when.
+        t_on: TimeNs,
+        /// Until when.
+        t_off: TimeNs,
+        /// The field's frame.
+        frame_id: u64,
+    },
+    /// Two lasers were lit at once.
+    TwoLit {
+        /// The two lasers.
+        colours: [Colour; 2],
+        /// Since when.
+        t: TimeNs,
+    },
+    /// A laser was lit twice in one field.
+    SecondWindow {
+        /// Which laser.
+        colour: Colour,
+        /// Since when.
+        t_on: TimeNs,
+        /// The field's frame.
+        frame_id: u64,
+    },
+    /// A field that should have been lit was not.
+    FieldWithoutWindow {
+        /// The field's colour.
+        colour: Colour,
+        /// The field's frame.
+        frame_id: u64,
+        /// When it came on the panel.
+        t_present: TimeNs,
+    },
+    /// A laser went on that was on, or off that was off.
+    BrokenLog {
+        /// Which laser.
+        colour: Colour,
+        /// When.
+        t: TimeNs,
+    },
+    /// A laser was never switched off.
+    StillLit {
+        /// Which laser.
+        colour: Colour,
+        /// Since when.
+        t_on: TimeNs,
+    },
+}
+
+impl Finding {
+    /// Whether light went where it must not; otherwise some was only missing.
+    pub fn is_unsafe(&self) -> bool {
+        !matches!(self, Self::FieldWithoutWindow { .. })
+    }
+}
+
+impl fmt::Display for Finding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::WindowWithoutField { colour, t_on } => {
+                write!(f, "{colour} lit at {} ns with no field on the panel", t_on.0)
+            }
+            Self::WrongColour { colour, t_on, field_colour, frame_id } => {
+                write!(f, "{colour} lit at {} ns over the {field_colour} field of frame {frame_id}", t_on.0)
+            }
+            Self::OutsideField { colour, t_on, t_off, frame_id } => {
+                write!(
+                    f,
+                    "{colour} lit from {} to {} ns, outside its settled field of frame {frame_id}",
+                    t_on.0, t_off.0
+                )
+            }
+            Self::TwoLit { colours: [a, b], t } => write!(f, "{a} and {b} both lit at {} ns", t.0),
+            Self::SecondWindow { colour, t_on, frame_id } => {
+                write!(f, "{colour} lit again at {} ns in one field of frame {frame_id}", t_on.0)
+            }
+            Self::FieldWithoutWindow { colour, frame_id, t_present } => {
+                write!(f, "the {colour} field of frame {frame_id} at {} ns was not lit", t_present.0)
+            }
+            Self::BrokenLog { colour, t } => write!(f, "{colour} switched at {} ns to what it was already", t.0),
+            Self::StillLit { colour, t_on } => write!(f, "{colour} lit at {} ns and never switched off", t_on.0),
+        }
+    }
+}
+
+/// The judgement.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct EdgeReport {
+    /// Fields judged.
+    pub fields: usize,
+    /// Of those, fields lit by exactly one window of their own laser, inside their settled time.
+    pub lit: usize,
+    /// Of those, fields that were meant to stay dark and did.
+    pub dark: usize,
+    /// What is wrong.
+    pub findings: Vec<Finding>,
+}
+
+impl EdgeReport {
+    /// Findings of light where it must not be.
+    pub fn unsafe_findings(&self) -> impl Iterator<Item = &Finding> {
+        self.findings.iter().filter(|finding| finding.is_unsafe())
+    }
+}
+
+/// Judges `edges` against `fields`. Both are given in order of time; fields do not overlap.
+///
+/// A window that touches no field, a field of another colour, or its own field's unsettled part, is a finding; so are
+/// two lasers lit at once, two windows in one field and a field without a window that has no reason to be dark.
+pub fn verify_edges(fields: &[FieldSpan], edges: &[LaserEdge]) -> EdgeReport {
+    let mut report = EdgeReport { fields: fields.len(), ..EdgeReport::default() };
+    let windows = windows(edges, &mut report.findings);
+    for pair in windows.windows(2) {
+        let [(before, _, t_off), (after, t_on, _)] = [pair[0], pair[1]];
+        if t_on < t_off {
+            report.findings.push(Finding::TwoLit { colours: [before, after], t: t_on });
+        }
+    }
+
+    let mut lit = vec![0u32; fields.len()];
+    let mut tainted = vec![false; fields.len()];
+    for &(colour, t_on, t_off) in &windows {
+        let first = fields.partition_point(|field| field.t_end <= t_on);
+        let touched = fields[first..].iter().take_while(|field| field.t_present < t_off).count();
+        let touched = first..first + touched;
+        let Some(own) = touched.clone().find(|&index| fields[index].colour == colour) else {
+            report.findings.push(match fields.get(first).filter(|_| !touched.is_empty()) {
+                Some(field) => {
+                    let (field_colour, frame_id) = (field.colour, field.frame_id);
+                    Finding::WrongColour { colour, t_on, field_colour, frame_id }
+                }
+                None => Finding::WindowWithoutField { colour, t_on },
+            });
+            continue;
+        };
+        let (field, frame_id) = (&fields[own], fields[own].frame_id);
+        lit[own] += 1;
+        if t_on < field.t_settled || t_off > field.t_end {
+            tainted[own] = true;
+            report.findings.push(Finding::OutsideField { colour, t_on, t_off, frame_id });
+        }
+        if lit[own] > 1 {
+            tainted[own] = true;
+            report.findings.push(Finding::SecondWindow { colour, t_on, frame_id });
+        }
+    }
+    for ((field, lit), tainted) in fields.iter().zip(lit).zip(tainted) {
+        match (lit, field.dark) {
+            (0, Some(_)) => report.dark += 1,
+            (0, None) => {
+                let (colour, frame_id, t_present) = (field.colour, field.frame_id, field.t_present);
+                report.findings.push(Finding::FieldWithoutWindow { colour, frame_id, t_present });
+            }
+            _ => report.lit += usize::from(!tainted),
+        }
+    }
+    report
+}
+
+/// The lit windows (laser, on, off) in order of their on edges.
+fn windows(edges: &[LaserEdge], findings: &mut Vec<Finding>) -> Vec<(Colour, TimeNs, TimeNs)> {
+    let mut windows = Vec::with_capacity(edges.len() / 2);
+    let mut on_since: [Option<TimeNs>; 3] = [None; 3];
+    for edge in edges {
+        let since = &mut on_since[edge.colour.index()];
+        match (edge.on, *since) {
+            (true, None) => *since = Some(edge.t),
+            (false, Some(t_on)) => {
+                *since = None;
+                windows.push((edge.colour, t_on, edge.t));
+            }
+            _ => findings.push(Finding::BrokenLog { colour: edge.colour, t: edge.t }),
+        }
+    }
+    for (colour, since) in Colour::ALL.into_iter().zip(on_since) {
+        if let Some(t_on) = since {
+            findings.push(Finding::StillLit { colour, t_on });
+            windows.push((colour, t_on, edges.last().map_or(t_on, |last| last.t)));
+        }
+    }
+    windows.sort_by_key(|&(_, t_on, _)| t_on);
+    windows
+}

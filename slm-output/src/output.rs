@@ -1,0 +1,737 @@
+//! The output's threads: the panel, and the lasers that follow it.
+//!
+//! | Thread | Does |
+//! |---|---|
+//! | the caller's frame thread | fills a frame from [`FramePort::acquire`], hands it over with [`FramePort::submit`] |
+//! | `holod-panel` | runs the [`Presenter`]; tells the laser thread of each field that came on the panel |
+//! | `holod-laser` | asks the [`Interlock`], drives the [`LaserBox`], publishes a [`FieldEvent`] when a field is over |
+//!
+//! After their start they neither allocate, lock nor log; what they have to say goes through wait-free rings and
+//! counters, and where nobody reads a ring its newest entries are dropped and counted.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
+use std::thread::{JoinHandle, Thread};
+use std::time::Duration;
+
+use holod_calibration::rig::{LaserDriver, Rig};
+use holod_calibration::{Colour, TimeNs};
+use rtrb::{Consumer, Producer, RingBuffer};
+
+use crate::fields::{FIELDS, FrameLayout, FrameTag, LevelsFrame};
+use crate::laser::gate::Gate;
+use crate::laser::interlock::{Interlock, Orders};
+use crate::laser::verify::FieldSpan;
+use crate::laser::{BoxEvent, DarkReason, LaserBox, LaserEdge, LaserError, LaserProgram, SerialBox, SimulatedLaser};
+use crate::levels::PanelEncoder;
+use crate::pacing::{FramePlan, Pacer, PacingConfig};
+use crate::present::{FrameSource, HeadlessPanel, PanelTiming, PresentedField, Presenter, Provenance};
+
+/// A monotonic clock. The threads read it; nothing below them does.
+pub type Clock = fn() -> TimeNs;
+
+/// Fields on their way to the laser thread, and reports on their way to the frame thread.
+const SHORT_RING: usize = 256;
+/// Events on their way to whoever records them: some 20 s of fields at 180 Hz.
+const LONG_RING: usize = 4096;
+/// Longest sleep of a thread, so that it sees an order to stop.
+const SLEEP_MAX: TimeNs = TimeNs(20_000_000);
+/// How long shutdown waits for the lasers' acknowledgement.
+const DARK_WAIT: TimeNs = TimeNs(500_000_000);
+/// How long a panic waits for it.
+const PANIC_WAIT: TimeNs = TimeNs(20_000_000);
+/// How long a laser box that failed is left alone.
+const RETRY_AFTER: TimeNs = TimeNs(1_000_000_000);
+
+/// What may be chosen about the output.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OutputOptions {
+    /// Frames whose presented levels can be kept in memory (see [`FramePort::submit`]).
+    pub keep_slots: usize,
+    /// Lasers go dark when one frame has stayed on the panel for this long. Not less than a few times the slowest frame.
+    pub stall_timeout: TimeNs,
+}
+
+impl Default for OutputOptions {
+    /// Nothing is kept; 2 s.
+    fn default() -> Self {
+        Self { keep_slots: 0, stall_timeout: TimeNs(2_000_000_000) }
+    }
+}
+
+/// Why the output could not be started.
+#[derive(Debug, thiserror::Error)]
+pub enum OutputError {
+    /// The lasers.
+    #[error(transparent)]
+    Laser(#[from] LaserError),
+    /// A thread could not be started.
+    #[error("cannot start a thread: {0}; check the limits on threads and memory")]
+    Thread(#[from] std::io::Error),
+}
+
+/// One colour field that was on the panel, with what its laser did.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FieldEvent {
+    /// The frame shown.
+    pub frame_id: u64,
+    /// Position in the panel's field order.
+    pub field: usize,
+    /// Its colour.
+    pub colour: Colour,
+    /// When the frame was submitted.
+    pub t_submit: TimeNs,
+    /// The refresh that the frame was made for.
+    pub t_desired_present: TimeNs,
+    /// When the field came on the panel.
+    pub t_present: TimeNs,
+    /// When it may first be lit.
+    pub t_settled: TimeNs,
+    /// When it made way for the next one.
+    pub t_end: TimeNs,
+    /// Where `t_present` comes from.
+    pub provenance: Provenance,
+    /// The on edge of its laser, if it was lit.
+    pub laser_on: Option<TimeNs>,
+    /// The off edge of its laser, if it was lit.
+    pub laser_off: Option<TimeNs>,
+    /// Why it was not lit.
+    pub dark: Option<DarkReason>,
+    /// The frame had been shown before: no newer one was there in time.
+    pub repeated: bool,
+    /// The frame came a refresh or more later than it was made for. Repetitions are not counted again.
+    pub deadline_missed: bool,
+}
+
+impl FieldEvent {
+    /// The field as [`crate::laser::verify::verify_edges`] wants it.
+    pub fn span(&self) -> FieldSpan {
+        FieldSpan {
+            frame_id: self.frame_id,
+            field: self.field,
+            colour: self.colour,
+            t_present: self.t_present,
+            t_settled: self.t_settled,
+            t_end: self.t_end,
+            dark: self.dark,
+        }
+    }
+}
+
+/// What the panel did at the start of a colour frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PresentReport {
+    /// The frame shown.
+    pub frame_id: u64,
+    /// Since when.
+    pub t_present: TimeNs,
+    /// Where `t_present` comes from.
+    pub provenance: Provenance,
+    /// The frame had been shown before.
+    pub repeated: bool,
+}
+
+/// Counters of the output's threads.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct OutputCounts {
+    /// Colour fields of frames that came on the panel.
+    pub fields: u64,
+    /// Of those, fields of a frame that had been shown before.
+    pub repeated: u64,
+    /// Fields that were not lit.
+    pub dark_fields: u64,
+    /// Times that the lasers went dark while they were armed.
+    pub went_dark: u64,
+    /// Commands that the laser box failed or refused.
+    pub box_faults: u64,
+    /// Reports and events lost because nobody read them.
+    pub lost: u64,
+    /// Whether lasers may be lit now.
+    pub armed: bool,
+}
+
+/// How the output ended.
+#[derive(Debug)]
+pub struct ShutdownReport {
+    /// The laser box acknowledged that it is dark.
+    pub lasers_dark: bool,
+    /// The flat pattern was on the panel before the threads ended.
+    pub flat_presented: bool,
+    /// The last frame that was shown, where the presenter can say.
+    pub last_frame: Option<LevelsFrame>,
+    /// Levels of the frames that were shown and kept, by slot.
+    pub kept: Vec<Option<LevelsFrame>>,
+    /// Counters at the end.
+    pub counts: OutputCounts,
+}
+
+/// The running output, by the threads that hold its parts.
+#[derive(Debug)]
+pub struct Output {
+    /// For the frame thread.
+    pub frames: FramePort,
+    /// For whoever records: each field that was on the panel, in order, once it is over.
+    pub events: Consumer<FieldEvent>,
+    /// For whoever records: what the laser box did.
+    pub box_events: Consumer<BoxEvent>,
+    /// For whoever ends it.
+    pub control: OutputControl,
+}
+
+impl Output {
+    /// Starts on a virtual panel, with the laser box that the rig names.
+    ///
+    /// # Errors
+    /// [`OutputError`].
+    pub fn headless(
+        rig: &Rig,
+        encoder: &PanelEncoder,
+        options: OutputOptions,
+        clock: Clock,
+    ) -> Result<Self, OutputError> {
+        let timing = PanelTiming::new(&rig.panel);
+        let presenter =
+            HeadlessPanel::new(timing, flat_frame(rig, encoder), clock() + timing.frame_period, options.keep_slots);
+        let laser: Box<dyn LaserBox> = match &rig.lasers.driver {
+            LaserDriver::Simulated => Box::new(SimulatedLaser::new(clock())),
+            LaserDriver::Serial { path } => Box::new(SerialBox::open(path, clock)?),
+        };
+        Self::start(rig, encoder, Box::new(presenter), laser, options, clock)
+    }
+
+    /// Starts on any panel with any laser box.
+    ///
+    /// # Errors
+    /// [`OutputError`] where the rig leaves no time for light, the box refuses its program or a thread does not start.
+    pub fn start(
+        rig: &Rig,
+        encoder: &PanelEncoder,
+        presenter: Box<dyn Presenter>,
+        mut laser: Box<dyn LaserBox>,
+        options: OutputOptions,
+        clock: Clock,
+    ) -> Result<Self, OutputError> {
+        let gate = Gate::new(&rig.panel, &rig.lasers)?;
+        let program = gate.program(&rig.panel, &rig.lasers)?;
+        laser.dark(DarkReason::Asked, clock())?;
+        laser.program(&program, clock())?;
+        let interlock =
+            Interlock::new(gate, program.trigger, program.sequence, presenter.is_virtual(), options.stall_timeout);
+
+        let (input, output) = triple_buffer::triple_buffer(&flat_frame(rig, encoder));
+        let (field_producer, field_consumer) = RingBuffer::new(SHORT_RING);
+        let (report_producer, report_consumer) = RingBuffer::new(SHORT_RING);
+        let (event_producer, event_consumer) = RingBuffer::new(LONG_RING);
+        let (box_producer, box_consumer) = RingBuffer::new(LONG_RING);
+        let shared = Arc::new(Shared::default());
+
+        let laser_thread = LaserThread {
+            laser,
+            program,
+            interlock,
+            gate,
+            fields: field_consumer,
+            ledger: Ledger::new(gate, event_producer, box_producer),
+            t_retry: TimeNs(i64::MIN),
+            program_lost: false,
+            shared: Arc::clone(&shared),
+            clock,
+        };
+        let laser = std::thread::Builder::new().name("holod-laser".into()).spawn(move || laser_thread.run())?;
+        let panel_thread = PanelThread {
+            presenter,
+            frames: FrameSource(output),
+            fields: field_producer,
+            reports: report_producer,
+            laser: laser.thread().clone(),
+            shared: Arc::clone(&shared),
+            clock,
+        };
+        let spawned = std::thread::Builder::new().name("holod-panel".into()).spawn(move || panel_thread.run());
+        let panel = match spawned {
+            Ok(panel) => panel,
+            Err(why) => {
+                shared.stop.store(true, Ordering::Release);
+                laser.thread().unpark();
+                return Err(why.into());
+            }
+        };
+        Ok(Self {
+            frames: FramePort { input, reports: report_consumer },
+            events: event_consumer,
+            box_events: box_consumer,
+            control: OutputControl {
+                switch: DarkSwitch { shared, laser: laser.thread().clone() },
+                frame_period: gate.timing().frame_period,
+                threads: Some((panel, laser)),
+                clock,
+            },
+        })
+    }
+}
+
+/// What a pacer must know to make frames for the output of `rig`.
+///
+/// # Errors
+/// As [`Gate::new`].
+pub fn pacing_config(rig: &Rig, first_frame_time: TimeNs) -> Result<PacingConfig, LaserError> {
+    let gate = Gate::new(&rig.panel, &rig.lasers)?;
+    let timing = gate.timing();
+    Ok(PacingConfig {
+        refresh_period: timing.frame_period,
+        // The middle of the three fields stands for all of them.
+        photon_delay: timing.field_period + gate.middle(),
+        submit_margin: TimeNs(timing.frame_period.0 / 16),
+        first_frame_time,
+    })
+}
+
+fn flat_frame(rig: &Rig, encoder: &PanelEncoder) -> LevelsFrame {
+    let mut flat = LevelsFrame::new(FrameLayout::new(&rig.panel, encoder.panel_resolution()));
+    encoder.encode_flat(&mut flat);
+    flat
+}
+
+/// The frame thread's end of the output.
+#[derive(Debug)]
+pub struct FramePort {
+    input: triple_buffer::Input<LevelsFrame>,
+    reports: Consumer<PresentReport>,
+}
+
+impl FramePort {
+    /// The buffer of the next frame, with the levels of some older one in it. Wait-free.
+    pub fn acquire(&mut self) -> &mut LevelsFrame {
+        self.input.input_buffer_mut()
+    }
+
+    /// Hands the acquired frame to the panel, which shows it from its next colour frame on unless a newer one comes
+    /// before. With `keep`, the panel stores the levels in that slot when they have come on the panel, over what was
+    /// there; they are in the [`ShutdownReport`]. Wait-free.
+    pub fn submit(&mut self, plan: &FramePlan, keep: Option<usize>, now: TimeNs) {
+        self.acquire().tag =
+            FrameTag { frame_id: plan.frame_id, t_submit: now, t_desired_present: plan.t_desired_present, keep };
+        self.input.publish();
+    }
+
+    /// Gives `pacer` what the panel has reported since the last call, and calls `report` for each report.
+    pub fn feed(&mut self, pacer: &mut Pacer, mut report: impl FnMut(PresentReport)) {
+        while let Ok(presented) = self.reports.pop() {
+            if presented.repeated {
+                pacer.observe_refresh(presented.t_present, presented.provenance);
+            } else {
+                pacer.report(presented.frame_id, presented.t_present, presented.provenance);
+            }
+            report(presented);
+        }
+    }
+}
+
+/// Ends the output; dropped, it ends it too.
+#[derive(Debug)]
+pub struct OutputControl {
+    switch: DarkSwitch,
+    frame_period: TimeNs,
+    threads: Option<(JoinHandle<Box<dyn Presenter>>, JoinHandle<()>)>,
+    clock: Clock,
+}
+
+impl OutputControl {
+    /// The switch that makes the lasers dark for good.
+    pub fn dark_switch(&self) -> DarkSwitch {
+        self.switch.clone()
+    }
+
+    /// Counters so far.
+    pub fn counts(&self) -> OutputCounts {
+        self.switch.shared.counts()
+    }
+
+    /// Ends the output in order: lasers dark and acknowledged, flat pattern on the panel, threads joined. The wait for
+    /// each is bounded; a box that does not answer is left to its heartbeat timeout.
+    pub fn shutdown(mut self) -> ShutdownReport {
+        self.end()
+    }
+
+    fn end(&mut self) -> ShutdownReport {
+        let shared = &self.switch.shared;
+        self.switch.dark(DarkReason::Shutdown);
+        let wait_for = |done: &dyn Fn() -> bool, patience: TimeNs| {
+            let t_end = (self.clock)() + patience;
+            while !done() && (self.clock)() < t_end {
+                std::thread::sleep(Duration::from_micros(500));
+            }
+            done()
+        };
+        let answered = wait_for(&|| shared.acknowledged.load(Ordering::Acquire) != NOT_YET, DARK_WAIT);
+        let lasers_dark = answered && shared.acknowledged.load(Ordering::Acquire) == DARK;
+        shared.flat_wanted.store(true, Ordering::Release);
+        let flat_patience = TimeNs(4 * self.frame_period.0 + SLEEP_MAX.0 + 200_000_000);
+        let flat_presented = wait_for(&|| shared.flat_shown.load(Ordering::Acquire), flat_patience);
+        shared.stop.store(true, Ordering::Release);
+        let mut report = ShutdownReport {
+            lasers_dark,
+            flat_presented,
+            last_frame: None,
+            kept: Vec::new(),
+            counts: OutputCounts::default(),
+        };
+        if let Some((panel, laser)) = self.threads.take() {
+            panel.thread().unpark();
+            if let Ok(mut presenter) = panel.join() {
+                report.last_frame = presenter.last_frame().cloned();
+                report.kept = presenter.take_kept();
+            }
+            laser.thread().unpark();
+            report.lasers_dark &= laser.join().is_ok();
+        }
+        report.counts = self.counts();
+        report
+    }
+}
+
+impl Drop for OutputControl {
+    fn drop(&mut self) {
+        if self.threads.is_some() {
+            self.end();
+        }
+    }
+}
+
+/// Makes the lasers dark for good, from any thread.
+#[derive(Clone, Debug)]
+pub struct DarkSwitch {
+    shared: Arc<Shared>,
+    laser: Thread,
+}
+
+impl DarkSwitch {
+    /// Asks the laser thread for darkness; the first reason stays. Does not wait.
+    pub fn dark(&self, reason: DarkReason) {
+        let code = 1 + DarkReason::ALL.iter().position(|&known| known == reason).unwrap_or_default() as u8;
+        let _first = self.shared.latch.compare_exchange(0, code, Ordering::AcqRel, Ordering::Acquire);
+        self.laser.unpark();
+    }
+
+    /// Whether the box has acknowledged.
+    pub fn is_dark(&self) -> bool {
+        self.shared.acknowledged.load(Ordering::Acquire) == DARK
+    }
+
+    /// From now on any panic of the program first makes the lasers dark, and waits a moment for the acknowledgement.
+    pub fn install_panic_hook(&self, clock: Clock) {
+        let switch = self.clone();
+        let before = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |info| {
+            switch.dark(DarkReason::Panic);
+            let t_end = clock() + PANIC_WAIT;
+            let on_laser_thread = std::thread::current().id() == switch.laser.id();
+            while !on_laser_thread && !switch.is_dark() && clock() < t_end {
+                std::thread::sleep(Duration::from_micros(200));
+            }
+            before(info);
+        }));
+    }
+}
+
+const NOT_YET: u8 = 0;
+const DARK: u8 = 1;
+const FAILED: u8 = 2;
+
+/// What the threads share.
+#[derive(Debug, Default)]
+struct Shared {
+    /// 0, or 1 + the index of the reason for which lasers are dark for good.
+    latch: AtomicU8,
+    /// What the box said to that.
+    acknowledged: AtomicU8,
+    flat_wanted: AtomicBool,
+    flat_shown: AtomicBool,
+    stop: AtomicBool,
+    armed: AtomicBool,
+    fields: AtomicU64,
+    repeated: AtomicU64,
+    dark_fields: AtomicU64,
+    went_dark: AtomicU64,
+    box_faults: AtomicU64,
+    lost: AtomicU64,
+}
+
+impl Shared {
+    fn counts(&self) -> OutputCounts {
+        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        OutputCounts {
+            fields: get(&self.fields),
+            repeated: get(&self.repeated),
+            dark_fields: get(&self.dark_fields),
+            went_dark: get(&self.went_dark),
+            box_faults: get(&self.box_faults),
+            lost: get(&self.lost),
+            armed: self.armed.load(Ordering::Relaxed),
+        }
+    }
+
+    fn latched(&self) -> Option<DarkReason> {
+        let code = self.latch.load(Ordering::Acquire);
+        DarkReason::ALL.get(usize::from(code).wrapping_sub(1)).copied()
+    }
+}
+
+fn count(counter: &AtomicU64) {
+    counter.fetch_add(1, Ordering::Relaxed);
+}
+
+/// The thread of the panel.
+struct PanelThread {
+    presenter: Box<dyn Presenter>,
+    frames: FrameSource,
+    fields: Producer<PresentedField>,
+    reports: Producer<PresentReport>,
+    laser: Thread,
+    shared: Arc<Shared>,
+    clock: Clock,
+}
+
+impl PanelThread {
+    fn run(mut self) -> Box<dyn Presenter> {
+        while !self.shared.stop.load(Ordering::Acquire) {
+            let flat_wanted = self.shared.flat_wanted.load(Ordering::Acquire);
+            if flat_wanted {
+                self.presenter.show_flat();
+            }
+            let Self { presenter, frames, fields, reports, laser, shared, clock } = &mut self;
+            presenter.tick(clock(), frames, &mut |field| {
+                if fields.push(field).is_err() {
+                    count(&shared.lost);
+                }
+                let report = field.frame.filter(|_| field.field == 0).map(|frame| PresentReport {
+                    frame_id: frame.frame_id,
+                    t_present: field.t_present,
+                    provenance: field.provenance,
+                    repeated: field.repeated,
+                });
+                if report.is_some_and(|report| reports.push(report).is_err()) {
+                    count(&shared.lost);
+                }
+                if flat_wanted && field.frame.is_none() {
+                    shared.flat_shown.store(true, Ordering::Release);
+                }
+                laser.unpark();
+            });
+            let rest = (presenter.t_next() - clock()).min(SLEEP_MAX);
+            if rest > TimeNs(0) {
+                std::thread::park_timeout(Duration::from_nanos(rest.0 as u64));
+            }
+        }
+        self.presenter
+    }
+}
+
+/// The thread of the lasers.
+struct LaserThread {
+    laser: Box<dyn LaserBox>,
+    program: LaserProgram,
+    interlock: Interlock,
+    gate: Gate,
+    fields: Consumer<PresentedField>,
+    ledger: Ledger,
+    /// A box that failed is left alone until then.
+    t_retry: TimeNs,
+    /// The box failed and may have lost its program.
+    program_lost: bool,
+    shared: Arc<Shared>,
+    clock: Clock,
+}
+
+impl LaserThread {
+    fn run(mut self) {
+        loop {
+            let stop = self.shared.stop.load(Ordering::Acquire);
+            let now = (self.clock)();
+            self.poll(now);
+            if let Some(reason) = self.shared.latched() {
+                self.latch(reason, now);
+            }
+            while let Ok(field) = self.fields.pop() {
+                self.on_field(&field, now);
+            }
+            let orders = self.interlock.watch(now);
+            self.obey(orders, now);
+            self.poll(now);
+            self.shared.armed.store(self.interlock.is_armed(), Ordering::Relaxed);
+            if stop {
+                self.ledger.flush(TimeNs(i64::MAX), &self.shared);
+                return;
+            }
+            self.ledger.flush(now, &self.shared);
+            let t_next = self.interlock.t_watch().map_or(SLEEP_MAX, |t| (t - now).max(TimeNs(0)));
+            let rest = t_next.min(self.gate.timing().field_period).min(SLEEP_MAX);
+            std::thread::park_timeout(Duration::from_nanos(rest.0 as u64));
+        }
+    }
+
+    fn on_field(&mut self, field: &PresentedField, now: TimeNs) {
+        let (orders, mut dark) = self.interlock.on_field(field, now);
+        if orders.arm && now < self.t_retry {
+            self.interlock.box_went_dark();
+            dark = Some(DarkReason::BoxFault);
+        } else if !self.obey(orders, now) {
+            dark = Some(DarkReason::BoxFault);
+        }
+        self.ledger.field(field, dark, &self.shared);
+    }
+
+    /// Does what the interlock says; whether the box did it, too.
+    fn obey(&mut self, orders: Orders, now: TimeNs) -> bool {
+        let done = self.try_obey(orders, now);
+        if done.is_err() {
+            self.fault(now);
+        }
+        done.is_ok()
+    }
+
+    fn try_obey(&mut self, orders: Orders, now: TimeNs) -> Result<(), LaserError> {
+        if let Some(reason) = orders.dark {
+            return self.laser.dark(reason, now);
+        }
+        if orders.arm {
+            if std::mem::take(&mut self.program_lost) {
+                self.laser.program(&self.program, now)?;
+            }
+            self.laser.arm(now)?;
+        }
+        if orders.heartbeat {
+            self.laser.heartbeat(now)?;
+        }
+        if let Some(t_sync) = orders.sync {
+            self.laser.sync(t_sync, now)?;
+        }
+        orders.light.map_or(Ok(()), |window| self.laser.light(window, now))
+    }
+
+    fn fault(&mut self, now: TimeNs) {
+        count(&self.shared.box_faults);
+        self.interlock.box_went_dark();
+        self.program_lost = true;
+        self.t_retry = now + RETRY_AFTER;
+        if self.laser.dark(DarkReason::BoxFault, now).is_err() {
+            count(&self.shared.box_faults);
+        }
+    }
+
+    fn latch(&mut self, reason: DarkReason, now: TimeNs) {
+        if self.shared.acknowledged.load(Ordering::Acquire) != NOT_YET {
+            return;
+        }
+        let orders = self.interlock.latch(reason);
+        let answer = if self.try_obey(orders, now).is_ok() { DARK } else { FAILED };
+        self.shared.acknowledged.store(answer, Ordering::Release);
+    }
+
+    fn poll(&mut self, now: TimeNs) {
+        let Self { laser, ledger, interlock, shared, .. } = self;
+        let polled = laser.poll(now, &mut |event| {
+            if matches!(event, BoxEvent::Dark { .. }) {
+                interlock.box_went_dark();
+                count(&shared.went_dark);
+            }
+            ledger.box_event(event, shared);
+        });
+        if polled.is_err() && now >= self.t_retry {
+            self.fault(now);
+        }
+    }
+}
+
+/// Puts fields and laser edges together.
+struct Ledger {
+    gate: Gate,
+    open: VecDeque<(PresentedField, Option<DarkReason>)>,
+    edges: VecDeque<LaserEdge>,
+    last_dark: Option<DarkReason>,
+    events: Producer<FieldEvent>,
+    box_events: Producer<BoxEvent>,
+}
+
+impl Ledger {
+    fn new(gate: Gate, events: Producer<FieldEvent>, box_events: Producer<BoxEvent>) -> Self {
+        let open = VecDeque::with_capacity(SHORT_RING);
+        Self { gate, open, edges: VecDeque::with_capacity(SHORT_RING), last_dark: None, events, box_events }
+    }
+
+    fn field(&mut self, field: &PresentedField, dark: Option<DarkReason>, shared: &Shared) {
+        if field.frame.is_none() {
+            return;
+        }
+        count(&shared.fields);
+        if field.repeated {
+            count(&shared.repeated);
+        }
+        if self.open.len() == SHORT_RING {
+            count(&shared.lost);
+        } else {
+            self.open.push_back((*field, dark));
+        }
+    }
+
+    fn box_event(&mut self, event: BoxEvent, shared: &Shared) {
+        match event {
+            BoxEvent::Edge(edge) => {
+                if self.edges.len() == SHORT_RING {
+                    self.edges.pop_front();
+                }
+                self.edges.push_back(edge);
+            }
+            BoxEvent::Dark { reason, .. } => self.last_dark = Some(reason),
+            BoxEvent::Armed { .. } => {}
+        }
+        if self.box_events.push(event).is_err() {
+            count(&shared.lost);
+        }
+    }
+
+    /// Publishes the fields that are over at `now`, when all their edges are known.
+    fn flush(&mut self, now: TimeNs, shared: &Shared) {
+        while let Some((field, dark)) = self.open.front().copied().filter(|(field, _)| self.gate.t_end(field) <= now) {
+            self.open.pop_front();
+            let event = self.event(&field, dark);
+            if event.laser_on.is_none() {
+                count(&shared.dark_fields);
+            }
+            if self.events.push(event).is_err() {
+                count(&shared.lost);
+            }
+        }
+    }
+
+    fn event(&self, field: &PresentedField, dark: Option<DarkReason>) -> FieldEvent {
+        let tag = field.frame.unwrap_or_default();
+        let t_end = self.gate.t_end(field);
+        let own = |edge: &&LaserEdge| edge.colour == field.colour;
+        let on = self.edges.iter().filter(own).find(|edge| edge.on && edge.t >= field.t_present && edge.t < t_end);
+        let off =
+            on.and_then(|on| self.edges.iter().filter(own).find(|edge| !edge.on && edge.t >= on.t && edge.t <= t_end));
+        let timing = self.gate.timing();
+        let t_frame = TimeNs(field.t_present.0 - field.field as i64 * timing.field_period.0);
+        let late_ns = t_frame.0 - tag.t_desired_present.0;
+        FieldEvent {
+            frame_id: tag.frame_id,
+            field: field.field,
+            colour: field.colour,
+            t_submit: tag.t_submit,
+            t_desired_present: tag.t_desired_present,
+            t_present: field.t_present,
+            t_settled: field.t_present + self.gate.settle(),
+            t_end,
+            provenance: field.provenance,
+            laser_on: on.map(|edge| edge.t),
+            laser_off: off.map(|edge| edge.t),
+            dark: if on.is_some() { None } else { dark.or(self.last_dark).or(Some(DarkReason::Late)) },
+            repeated: field.repeated,
+            deadline_missed: !field.repeated && late_ns > timing.frame_period.0 / 2,
+        }
+    }
+}
+
+const _: () = assert!(FIELDS == 3, "three lasers, three fields");
