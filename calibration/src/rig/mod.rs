@@ -1,6 +1,19 @@
 //! The rig: everything that is true of one bench, as one validated value.
 
-use std::path::PathBuf;
+mod error;
+mod files;
+mod flatness;
+mod lut;
+mod meaning;
+mod parse;
+mod profile;
+mod reader;
+
+use std::path::{Path, PathBuf};
+
+pub use error::{Fault, RigError};
+pub use meaning::{ActiveFile, BlurMeaning, FieldMeaning, Meaning, PerColourFigures};
+pub use profile::PanelProfile;
 
 use crate::{Colour, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
 
@@ -19,6 +32,23 @@ pub struct Rig {
     pub tracker: Tracker,
     /// The network's weights.
     pub model: Model,
+    /// Where all this was read.
+    pub provenance: Provenance,
+}
+
+/// Where a rig's figures come from, for logs and reports.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Provenance {
+    /// The rig file as it was named; empty for the built-in rig.
+    pub origin: String,
+    /// FNV-1a hash of the rig file's text.
+    pub text_hash: Option<u64>,
+    /// The panel profile that the rig file names.
+    pub panel_profile: Option<&'static str>,
+    /// The file behind each table of [`Panel::lut_rad`].
+    pub lut_files: PerColour<Option<PathBuf>>,
+    /// The file behind each picture of [`Panel::flatness_rad`].
+    pub flatness_files: PerColour<Option<PathBuf>>,
 }
 
 /// The phase panel as a display.
@@ -36,7 +66,8 @@ pub struct Panel {
     pub phase_sign: PhaseSign,
     /// Phase at the top level of each colour, radians; 2π where a pattern can be shown without loss.
     pub stroke_rad: PerColour<f64>,
-    /// Phase in radians at each level (2^bit_depth entries, monotonic), where it was measured; else it is linear.
+    /// Phase in radians at each level (2^bit_depth entries), where it was measured; else it is linear. It rises where
+    /// `phase_sign` is positive and falls where it is negative.
     pub lut_rad: PerColour<Option<Vec<f64>>>,
     /// Phase in radians to add at each panel pixel, row-major, to flatten the panel.
     pub flatness_rad: PerColour<Option<Vec<f32>>>,
@@ -156,6 +187,25 @@ impl Default for Rig {
                 hold: TimeNs(1_000_000_000),
             },
             model: Model { weights: None, allow_optics_mismatch: false },
+            provenance: Provenance::default(),
+        }
+    }
+}
+
+impl PanelMode {
+    /// The mode's name in a rig file.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::ChannelPacked => "channel-packed",
+            Self::FieldSequential => "field-sequential",
+        }
+    }
+
+    /// Colour fields that the panel shows in one video frame.
+    pub const fn fields_per_refresh(self) -> f64 {
+        match self {
+            Self::ChannelPacked => 3.0,
+            Self::FieldSequential => 1.0,
         }
     }
 }
@@ -163,15 +213,40 @@ impl Default for Rig {
 impl Panel {
     /// Time for which one colour field is on the panel.
     pub fn field_period(&self) -> TimeNs {
-        let fields_per_refresh = match self.mode {
-            PanelMode::ChannelPacked => 3.0,
-            PanelMode::FieldSequential => 1.0,
-        };
-        TimeNs::from_seconds(1.0 / (self.refresh_hz * fields_per_refresh))
+        TimeNs::from_seconds(1.0 / (self.refresh_hz * self.mode.fields_per_refresh()))
     }
 }
 
 impl Rig {
+    /// The built-in bench as a rig file; it parses to [`Rig::default`].
+    pub const BUILT_IN_TOML: &str = include_str!("built-in.toml");
+
+    /// Reads and validates the rig file at `path`, and the files that it names.
+    ///
+    /// # Errors
+    /// [`RigError`] with every fault of the file: one that is missing, no file, or not UTF-8; whatever
+    /// [`Rig::parse`] finds.
+    pub fn load(path: &Path) -> Result<Self, RigError> {
+        let text = files::read_text(path)
+            .map_err(|fault| RigError { origin: path.display().to_string(), faults: vec![fault.of_rig_file()] })?;
+        Self::parse(&text, path)
+    }
+
+    /// Validates a rig file's text. Relative paths in it start at the folder of `origin`, and the files there are
+    /// read.
+    ///
+    /// # Errors
+    /// [`RigError`] with every fault: no TOML, duplicate, unknown, misplaced and missing keys, wrong types, figures
+    /// out of range or at odds with each other, and faulty files. Where the text is no TOML, only that is reported.
+    pub fn parse(text: &str, origin: &Path) -> Result<Self, RigError> {
+        parse::parse(text, origin)
+    }
+
+    /// What the rig's figures mean, for a person who checks a bench.
+    pub fn meaning(&self) -> Meaning {
+        Meaning::of(self)
+    }
+
     /// Panel pixels.
     pub fn resolution(&self) -> Resolution {
         self.geometry.resolution

@@ -1,0 +1,305 @@
+//! What a rig's figures mean, for a person who checks a bench.
+
+use std::f64::consts::{PI, TAU};
+use std::fmt;
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+use super::{LaserDriver, PanelProfile, Rig};
+use crate::{PerColour, PupilDiameter};
+
+/// The pupils for which blur is worked out.
+const PUPILS_MM: [f32; 3] = [2.0, 3.0, 4.0];
+
+/// A figure for each colour.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[expect(missing_docs, reason = "the names say it")]
+pub struct PerColourFigures {
+    pub red: f64,
+    pub green: f64,
+    pub blue: f64,
+}
+
+/// What follows from a rig file.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Meaning {
+    /// The rig's name.
+    pub name: String,
+    /// The rig file; empty for the built-in rig.
+    pub origin: String,
+    /// Hash of the rig file's text, hexadecimal; absent for the built-in rig.
+    pub text_hash: Option<String>,
+    /// The panel profile behind the rig file's own keys.
+    pub panel_profile: Option<String>,
+    /// Panel width in pixels.
+    pub width_px: usize,
+    /// Panel height in pixels.
+    pub height_px: usize,
+    /// Angle that one pixel subtends at the eye.
+    pub pixel_angle_mrad: f64,
+    /// Field of view across the panel's width and height.
+    pub field_of_view_deg: [f64; 2],
+    /// Vergence of the far end of the depth range.
+    pub depth_far_dpt: f64,
+    /// Vergence of the near end of the depth range.
+    pub depth_near_dpt: f64,
+    /// Distance of the far end in metres; absent at infinity.
+    pub depth_far_m: Option<f64>,
+    /// Distance of the near end in metres.
+    pub depth_near_m: f64,
+    /// Distance u = f²·D from the panel to the image plane of the far end.
+    pub u_far_mm: f64,
+    /// Distance u = f²·D from the panel to the image plane of the near end.
+    pub u_near_mm: f64,
+    /// Width λf/p of the eyebox.
+    pub eyebox_mm: PerColourFigures,
+    /// Half-angle λ/2p to which the panel can send light.
+    pub panel_half_angle_mrad: PerColourFigures,
+    /// The blur of a point at one end of the depth range for an eye focused at the other.
+    pub blurs: Vec<BlurMeaning>,
+    /// How one colour field passes.
+    pub field: FieldMeaning,
+    /// The calibration files in use, each applied once.
+    pub files: Vec<ActiveFile>,
+    /// What a person should know before the lasers are armed.
+    pub notes: Vec<String>,
+}
+
+/// The largest blur for one pupil.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct BlurMeaning {
+    /// Pupil diameter.
+    pub pupil_mm: f64,
+    /// Diameter of the largest circle of confusion.
+    pub largest_blur_px: f64,
+    /// Half-angle s/2f that light must leave the panel with to fill the pupil.
+    pub half_angle_needed_mrad: f64,
+    /// That half-angle over the panel's own; above 1 the panel cannot fill the pupil.
+    pub share_of_panel_band: PerColourFigures,
+}
+
+/// One colour field, in time from the panel's update.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct FieldMeaning {
+    /// How the fields reach the panel.
+    pub mode: String,
+    /// The panel's refresh rate.
+    pub refresh_hz: f64,
+    /// Complete colour frames a second.
+    pub colour_frames_hz: f64,
+    /// The colours in the order in which the panel shows them.
+    pub order: [String; 3],
+    /// Length of one field.
+    pub period_ms: f64,
+    /// When the phase has settled.
+    pub settled_ms: f64,
+    /// When the laser goes on.
+    pub laser_on_ms: f64,
+    /// When the laser goes off.
+    pub laser_off_ms: f64,
+    /// Share of the field for which the laser is lit.
+    pub lit_share: f64,
+}
+
+/// A calibration file that is in use.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct ActiveFile {
+    /// `lut` or `flatness`.
+    pub kind: String,
+    /// The colour that it serves.
+    pub colour: String,
+    /// The file.
+    pub path: PathBuf,
+}
+
+impl From<PerColour<f64>> for PerColourFigures {
+    fn from(figures: PerColour<f64>) -> Self {
+        let [red, green, blue] = figures.0;
+        Self { red, green, blue }
+    }
+}
+
+impl Meaning {
+    pub(super) fn of(rig: &Rig) -> Self {
+        let geometry = &rig.geometry;
+        let field_of_view_deg = [geometry.resolution.width, geometry.resolution.height].map(|pixels| {
+            let half_width_m = pixels as f64 * geometry.pixel_pitch.0 / 2.0;
+            2.0 * (half_width_m / geometry.eyepiece_focal_length.0).atan().to_degrees()
+        });
+        let panel_half_angle = geometry.panel_half_angle_rad();
+        let blurs = PUPILS_MM.map(|pupil_mm| {
+            let pupil = PupilDiameter::from_mm(pupil_mm);
+            let needed_rad = geometry.blur_half_angle_rad(pupil);
+            BlurMeaning {
+                pupil_mm: f64::from(pupil_mm),
+                largest_blur_px: geometry.largest_coc_px(pupil),
+                half_angle_needed_mrad: needed_rad * 1e3,
+                share_of_panel_band: panel_half_angle.map(|there_is_rad| needed_rad / there_is_rad).into(),
+            }
+        });
+        Self {
+            name: rig.name.clone(),
+            origin: rig.provenance.origin.clone(),
+            text_hash: rig.provenance.text_hash.map(|hash| format!("{hash:016x}")),
+            panel_profile: rig.provenance.panel_profile.map(str::to_owned),
+            width_px: geometry.resolution.width,
+            height_px: geometry.resolution.height,
+            pixel_angle_mrad: geometry.pixel_angle_rad() * 1e3,
+            field_of_view_deg,
+            depth_far_dpt: geometry.depth_far.0,
+            depth_near_dpt: geometry.depth_near.0,
+            depth_far_m: (geometry.depth_far.0 > 0.0).then(|| 1.0 / geometry.depth_far.0),
+            depth_near_m: 1.0 / geometry.depth_near.0,
+            u_far_mm: geometry.image_distance(geometry.depth_far).0 * 1e3,
+            u_near_mm: geometry.image_distance(geometry.depth_near).0 * 1e3,
+            eyebox_mm: geometry.eyebox().map(|width| width.0 * 1e3).into(),
+            panel_half_angle_mrad: panel_half_angle.map(|angle_rad| angle_rad * 1e3).into(),
+            blurs: blurs.to_vec(),
+            field: FieldMeaning::of(rig),
+            files: active_files(rig),
+            notes: notes(rig),
+        }
+    }
+}
+
+impl FieldMeaning {
+    fn of(rig: &Rig) -> Self {
+        let panel = &rig.panel;
+        let period_ms = 1e3 / (panel.refresh_hz * panel.mode.fields_per_refresh());
+        let settled_ms = panel.settle.seconds() * 1e3;
+        let laser_on_ms = settled_ms + rig.lasers.on_delay.seconds() * 1e3;
+        let lit_ms = rig.lasers.width.seconds() * 1e3;
+        Self {
+            mode: panel.mode.name().into(),
+            refresh_hz: panel.refresh_hz,
+            colour_frames_hz: 1e3 / (3.0 * period_ms),
+            order: panel.field_order.map(|colour| colour.name().to_owned()),
+            period_ms,
+            settled_ms,
+            laser_on_ms,
+            laser_off_ms: laser_on_ms + lit_ms,
+            lit_share: lit_ms / period_ms,
+        }
+    }
+}
+
+fn active_files(rig: &Rig) -> Vec<ActiveFile> {
+    let kinds = [("lut", &rig.provenance.lut_files), ("flatness", &rig.provenance.flatness_files)];
+    let files = kinds.into_iter().flat_map(|(kind, paths)| {
+        paths.iter().filter_map(move |(colour, path)| {
+            Some(ActiveFile { kind: kind.into(), colour: colour.name().into(), path: path.clone()? })
+        })
+    });
+    files.collect()
+}
+
+fn notes(rig: &Rig) -> Vec<String> {
+    let mut notes = Vec::new();
+    let levels = f64::from(1u32 << rig.panel.bit_depth);
+    for (colour, &stroke_rad) in rig.panel.stroke_rad.iter() {
+        // The top level of a 2π panel stands one step short of 2π.
+        if stroke_rad < TAU * (levels - 1.5) / levels {
+            notes.push(format!(
+                "{colour}: the panel's stroke is {:.3} π; phases between that and 2 π cannot be shown",
+                stroke_rad / PI
+            ));
+        }
+    }
+    for (colour, power_mw) in rig.lasers.power_mw.iter() {
+        if *power_mw == 0.0 {
+            notes.push(format!("{colour}: the laser's power is 0, so this colour stays dark"));
+        }
+    }
+    let eyebox_mm = rig.geometry.eyebox().map(|width| width.0 * 1e3);
+    for (colour, width_mm) in eyebox_mm.iter() {
+        if *width_mm < f64::from(PUPILS_MM[PUPILS_MM.len() - 1]) {
+            notes.push(format!(
+                "{colour}: the eyebox is {width_mm:.2} mm wide; a pupil wider than that cannot be filled"
+            ));
+        }
+    }
+    if let Some(profile) = rig.provenance.panel_profile.and_then(PanelProfile::named)
+        && !profile.unverified.is_empty()
+    {
+        notes.push(format!(
+            "panel profile {} ({}): no source confirms {}; compare with the panel's data sheet",
+            profile.name,
+            profile.description,
+            profile.unverified.join(", ")
+        ));
+    }
+    if rig.lasers.driver == LaserDriver::Simulated {
+        notes.push("the lasers are simulated: no light will be lit".into());
+    }
+    if rig.model.allow_optics_mismatch {
+        notes.push("weights that were trained for other optics are allowed: expect a worse picture".into());
+    }
+    notes
+}
+
+impl fmt::Display for PerColourFigures {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "red {:.2}, green {:.2}, blue {:.2}", self.red, self.green, self.blue)
+    }
+}
+
+impl fmt::Display for Meaning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "rig            {}", self.name)?;
+        if let Some(hash) = &self.text_hash {
+            write!(f, " ({}, {hash})", self.origin)?;
+        }
+        writeln!(f)?;
+        write!(f, "panel          {}x{} pixels", self.width_px, self.height_px)?;
+        if let Some(profile) = &self.panel_profile {
+            write!(f, ", profile {profile}")?;
+        }
+        let [across_deg, down_deg] = self.field_of_view_deg;
+        writeln!(
+            f,
+            "; one pixel is {:.3} mrad, the view {across_deg:.1} x {down_deg:.1} degrees",
+            self.pixel_angle_mrad
+        )?;
+        let far_m = self.depth_far_m.map_or("infinity".into(), |far_m| format!("{far_m:.2} m"));
+        writeln!(
+            f,
+            "depth          {:.3} to {:.3} dioptres: {far_m} to {:.2} m, u = {:.3} to {:.3} mm",
+            self.depth_far_dpt, self.depth_near_dpt, self.depth_near_m, self.u_far_mm, self.u_near_mm
+        )?;
+        writeln!(f, "eyebox         {} mm", self.eyebox_mm)?;
+        writeln!(f, "panel's band   {} mrad either side", self.panel_half_angle_mrad)?;
+        for blur in &self.blurs {
+            writeln!(
+                f,
+                "pupil {} mm     blur up to {:.1} px; needs {:.1} mrad, of the panel's band {}",
+                blur.pupil_mm, blur.largest_blur_px, blur.half_angle_needed_mrad, blur.share_of_panel_band
+            )?;
+        }
+        let field = &self.field;
+        writeln!(
+            f,
+            "colour fields  {} at {} Hz: {}, {:.3} ms each, {:.1} colour frames a second",
+            field.mode,
+            field.refresh_hz,
+            field.order.join(", "),
+            field.period_ms,
+            field.colour_frames_hz
+        )?;
+        writeln!(
+            f,
+            "in one field   settled at {:.3} ms, laser on at {:.3}, off at {:.3}: lit for {:.0} % of it",
+            field.settled_ms,
+            field.laser_on_ms,
+            field.laser_off_ms,
+            field.lit_share * 100.0
+        )?;
+        if self.files.is_empty() {
+            writeln!(f, "files          none: phase is linear in the level, and the panel is taken as flat")?;
+        }
+        for file in &self.files {
+            writeln!(f, "{:<14} {}: {}", file.kind, file.colour, file.path.display())?;
+        }
+        self.notes.iter().try_for_each(|note| writeln!(f, "note           {note}"))
+    }
+}

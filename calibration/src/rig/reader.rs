@@ -1,0 +1,474 @@
+//! Reads keys out of a TOML document and keeps count of everything that is wrong with them.
+
+use std::ops::Range;
+
+use toml_edit::{Document, Item, Table, TableLike};
+
+use super::Fault;
+use super::files::FileFault;
+use crate::{Colour, PerColour};
+
+/// How many syntax faults are looked for before a file is given up.
+const SYNTAX_FAULTS_MAX: usize = 16;
+
+/// The numbers that a key takes.
+#[derive(Clone, Copy)]
+pub(super) struct Span {
+    /// Smallest number taken.
+    pub(super) min: f64,
+    /// Largest number taken.
+    pub(super) max: f64,
+    /// The unit that the key's suffix names.
+    pub(super) unit: &'static str,
+    /// Units that are given by mistake, each with the factor that turns it into `unit`.
+    pub(super) slips: &'static [(&'static str, f64)],
+}
+
+impl Span {
+    /// The numbers from `min` to `max`.
+    pub(super) const fn new(min: f64, max: f64, unit: &'static str) -> Self {
+        Self { min, max, unit, slips: &[] }
+    }
+
+    /// Adds the units that are given by mistake.
+    pub(super) const fn slips(self, slips: &'static [(&'static str, f64)]) -> Self {
+        Self { slips, ..self }
+    }
+
+    fn takes(&self, value: f64) -> bool {
+        value >= self.min && value <= self.max
+    }
+
+    fn expected(&self) -> String {
+        let gap = if self.unit.is_empty() { "" } else { " " };
+        format!("a number from {} to {}{gap}{}", self.min, self.max, self.unit)
+    }
+
+    fn advice(&self, value: f64) -> String {
+        for (unit, factor) in self.slips {
+            if self.takes(value * factor) {
+                let converted = rounded(value * factor);
+                return format!("{value} looks like {unit}: write {converted} for {converted} {}", self.unit);
+            }
+        }
+        "correct it".into()
+    }
+}
+
+/// A number without the last digits that a conversion of units leaves behind.
+fn rounded(value: f64) -> f64 {
+    let rounded = (value * 1e9).round() / 1e9;
+    if rounded == 0.0 { value } else { rounded }
+}
+
+/// A value and the line that it stands in; no line where it comes from a panel profile.
+#[derive(Clone, Copy)]
+pub(super) struct Found<T> {
+    pub(super) value: T,
+    pub(super) line: Option<usize>,
+}
+
+/// One table of the rig file, with the values of a panel profile behind it.
+#[derive(Clone, Copy)]
+pub(super) struct Section<'a> {
+    pub(super) name: &'static str,
+    table: Option<&'a dyn TableLike>,
+    line: Option<usize>,
+    profile: Option<&'a Table>,
+}
+
+impl<'a> Section<'a> {
+    /// The section with `profile` behind it, for the keys that the rig file leaves out.
+    pub(super) fn with_profile(self, profile: Option<&'a Table>) -> Self {
+        Self { profile, ..self }
+    }
+
+    /// Whether the rig file itself gives `key`.
+    pub(super) fn has(&self, key: &str) -> bool {
+        self.table.is_some_and(|table| table.contains_key(key))
+    }
+
+    fn path(&self, key: &str) -> String {
+        if self.name.is_empty() { key.into() } else { format!("{}.{key}", self.name) }
+    }
+}
+
+/// A parsed rig file and the faults found in it so far.
+pub(super) struct Reader<'a> {
+    text: &'a str,
+    /// What was found wrong; the caller adds what only it can judge.
+    pub(super) faults: Vec<Fault>,
+}
+
+impl<'a> Reader<'a> {
+    /// A reader of the file whose text is `text`.
+    pub(super) fn new(text: &'a str) -> Self {
+        Self { text, faults: Vec::new() }
+    }
+
+    /// The document, or nothing where it is not TOML; then every syntax fault is noted that shows up when the faulty
+    /// lines before it are left out.
+    pub(super) fn document(&mut self) -> Option<Document<String>> {
+        let mut remaining = self.text.to_owned();
+        while self.faults.len() < SYNTAX_FAULTS_MAX {
+            let error = match Document::parse(remaining.clone()) {
+                Ok(document) if self.faults.is_empty() => return Some(document),
+                Ok(_) => return None,
+                Err(error) => error,
+            };
+            let start = error.span().map_or(0, |span| span.start).min(remaining.len());
+            let line_start = remaining.as_bytes()[..start].iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);
+            let line_end = remaining.as_bytes()[start..].iter().position(|&b| b == b'\n');
+            let line_end = line_end.map_or(remaining.len(), |at| start + at);
+            let content = remaining[line_start..line_end].trim().to_owned();
+            self.faults.push(Fault {
+                key: String::new(),
+                line: Some(self.line_at(start)),
+                found: format!("`{content}`"),
+                expected: "TOML".into(),
+                advice: error.message().replace('\n', ", "),
+            });
+            if content.is_empty() || content.starts_with('[') {
+                return None;
+            }
+            remaining.replace_range(line_start..line_end, &" ".repeat(line_end - line_start));
+        }
+        None
+    }
+
+    /// The line, from 1, in which the byte at `offset` stands.
+    pub(super) fn line_at(&self, offset: usize) -> usize {
+        1 + self.text.as_bytes()[..offset.min(self.text.len())].iter().filter(|&&b| b == b'\n').count()
+    }
+
+    fn line_of(&self, span: Option<Range<usize>>) -> Option<usize> {
+        span.map(|span| self.line_at(span.start))
+    }
+
+    /// The keys of the file's top level, outside any table.
+    pub(super) fn root(&self, document: &'a Document<String>) -> Section<'a> {
+        Section { name: "", table: Some(document.as_table()), line: None, profile: None }
+    }
+
+    /// The table `name`; a fault where something else has its name, or where it is required and missing.
+    pub(super) fn section(&mut self, root: Section<'a>, name: &'static str, required: bool) -> Section<'a> {
+        let entry = root.table.and_then(|table| table.get_key_value(name));
+        let Some((key, item)) = entry else {
+            if required {
+                self.fault(
+                    name.into(),
+                    None,
+                    "no such table",
+                    "the table",
+                    format!("add a line [{name}] and its keys"),
+                );
+            }
+            return Section { name, table: None, line: None, profile: None };
+        };
+        let line = self.line_of(item.span().or_else(|| key.span()));
+        let table = item.as_table_like();
+        if table.is_none() {
+            let found = describe(item);
+            self.fault(name.into(), line, &found, "a table", format!("begin the table with a line [{name}]"));
+        }
+        Section { name, table, line, profile: None }
+    }
+
+    /// Notes a fault.
+    pub(super) fn fault(&mut self, key: String, line: Option<usize>, found: &str, expected: &str, advice: String) {
+        self.faults.push(Fault { key, line, found: found.into(), expected: expected.into(), advice });
+    }
+
+    /// Notes a fault of a key in `section`.
+    pub(super) fn fault_in(
+        &mut self,
+        section: Section<'_>,
+        key: &str,
+        line: Option<usize>,
+        found: &str,
+        expected: &str,
+        advice: String,
+    ) {
+        self.fault(section.path(key), line.or(section.line), found, expected, advice);
+    }
+
+    /// Notes every key of `section` that is not in the section's part of `layout`, which holds the keys of every
+    /// section, to tell where a misplaced one belongs.
+    pub(super) fn reject_unknown(&mut self, section: Section<'a>, layout: &[(&'static str, &[&'static str])]) {
+        let Some(table) = section.table else { return };
+        let known = layout.iter().find(|(name, _)| *name == section.name).map_or(&[][..], |(_, keys)| keys);
+        for (key, item) in table.iter() {
+            if known.contains(&key) {
+                continue;
+            }
+            let line = self.line_of(table.key(key).and_then(|key| key.span()).or_else(|| item.span()));
+            let home = layout.iter().find(|(name, keys)| *name != section.name && keys.contains(&key));
+            let advice = match (home, nearest(key, known)) {
+                (Some(("", _)), _) => format!("move `{key}` above the first table"),
+                (Some((home, _)), _) => format!("move `{key}` to [{home}]"),
+                (None, Some(name)) => format!("did you mean `{name}`?"),
+                (None, None) => "take it out".into(),
+            };
+            let found = if item.is_table() { "an unknown table" } else { "an unknown key" };
+            self.fault_in(section, key, line, found, &format!("one of {}", known.join(", ")), advice);
+        }
+    }
+
+    fn lookup(&self, section: Section<'a>, key: &str) -> Option<Found<&'a Item>> {
+        if let Some((key, item)) = section.table.and_then(|table| table.get_key_value(key)) {
+            return Some(Found { value: item, line: self.line_of(key.span().or_else(|| item.span())) });
+        }
+        let item = section.profile?.get(key)?;
+        Some(Found { value: item, line: None })
+    }
+
+    fn missing(&mut self, section: Section<'a>, key: &str, expected: &str) {
+        // A missing table is one fault, not one for each of its keys.
+        if section.table.is_some() {
+            let advice = format!("add {key} to [{}]", section.name);
+            self.fault_in(section, key, None, "no such key", expected, advice);
+        }
+    }
+
+    fn wrong_type(&mut self, section: Section<'a>, key: &str, found: Found<&Item>, expected: &str, advice: String) {
+        let described = describe(found.value);
+        self.fault_in(section, key, found.line, &described, expected, advice);
+    }
+
+    /// A number within `span`, where the key is there.
+    pub(super) fn number(&mut self, section: Section<'a>, key: &str, span: Span) -> Option<Found<f64>> {
+        let found = self.lookup(section, key)?;
+        let value = self.number_of(section, key, found, span)?;
+        Some(Found { value, line: found.line })
+    }
+
+    fn number_of(&mut self, section: Section<'a>, key: &str, found: Found<&Item>, span: Span) -> Option<f64> {
+        let Some(value) = number_in(found.value) else {
+            let advice = match found.value.as_str() {
+                Some(text) if text.trim().parse::<f64>().is_ok() => "take the quotes away".into(),
+                _ => format!("write a plain number in {}", if span.unit.is_empty() { "digits" } else { span.unit }),
+            };
+            self.wrong_type(section, key, found, &span.expected(), advice);
+            return None;
+        };
+        if !span.takes(value) {
+            let advice = span.advice(value);
+            self.fault_in(section, key, found.line, &value.to_string(), &span.expected(), advice);
+            return None;
+        }
+        Some(value)
+    }
+
+    /// A number within `span`; a fault where the key is missing.
+    pub(super) fn required_number(&mut self, section: Section<'a>, key: &str, span: Span) -> Option<Found<f64>> {
+        if self.lookup(section, key).is_none() {
+            self.missing(section, key, &span.expected());
+        }
+        self.number(section, key, span)
+    }
+
+    /// A whole number within `span`; a fault where the key is missing.
+    pub(super) fn required_integer(&mut self, section: Section<'a>, key: &str, span: Span) -> Option<Found<usize>> {
+        let found = self.required_number(section, key, span)?;
+        if found.value.fract() != 0.0 {
+            let advice = "write it without a fraction".into();
+            self.fault_in(section, key, found.line, &found.value.to_string(), "a whole number", advice);
+            return None;
+        }
+        Some(Found { value: found.value as usize, line: found.line })
+    }
+
+    /// A number for each colour within `span`; `required` says which colours may not be left out.
+    pub(super) fn numbers(
+        &mut self,
+        section: Section<'a>,
+        key: &str,
+        span: Span,
+        required: PerColour<bool>,
+    ) -> PerColour<Option<Found<f64>>> {
+        let example = format!("{{ red = {0}, green = {0}, blue = {0} }}", rounded((span.min * span.max).abs().sqrt()));
+        let items = self.colours(section, key, &span.expected(), required, &example);
+        PerColour(Colour::ALL.map(|colour| {
+            let found = items[colour]?;
+            let value = self.number_of(section, &format!("{key}.{colour}"), found, span)?;
+            Some(Found { value, line: found.line })
+        }))
+    }
+
+    /// A text for each colour, none required.
+    pub(super) fn texts(
+        &mut self,
+        section: Section<'a>,
+        key: &str,
+        expected: &str,
+    ) -> PerColour<Option<Found<&'a str>>> {
+        let example = "{ red = \"red.file\", green = \"green.file\", blue = \"blue.file\" }";
+        let items = self.colours(section, key, expected, PerColour([false; 3]), example);
+        PerColour(Colour::ALL.map(|colour| {
+            let found = items[colour]?;
+            self.text_of(section, &format!("{key}.{colour}"), found, expected)
+        }))
+    }
+
+    fn colours(
+        &mut self,
+        section: Section<'a>,
+        key: &str,
+        expected: &str,
+        required: PerColour<bool>,
+        example: &str,
+    ) -> PerColour<Option<Found<&'a Item>>> {
+        const NONE: PerColour<Option<Found<&Item>>> = PerColour([None; 3]);
+        let Some(found) = self.lookup(section, key) else {
+            if required.0.contains(&true) {
+                self.missing(section, key, &format!("{expected} for each colour"));
+            }
+            return NONE;
+        };
+        let Some(table) = found.value.as_table_like() else {
+            let advice = format!("write it as {example}");
+            self.wrong_type(section, key, found, &format!("{expected} for each colour"), advice);
+            return NONE;
+        };
+        let names = Colour::ALL.map(Colour::name);
+        for (name, item) in table.iter().filter(|(name, _)| !names.contains(name)) {
+            let line = found.line.map(|line| self.line_of(item.span()).unwrap_or(line));
+            let advice = nearest(name, &names).map_or("take it out".into(), |name| format!("did you mean `{name}`?"));
+            self.fault_in(section, &format!("{key}.{name}"), line, "an unknown key", "one of red, green, blue", advice);
+        }
+        PerColour(Colour::ALL.map(|colour| {
+            let item = table.get(colour.name());
+            if item.is_none() && required[colour] {
+                let path = format!("{key}.{colour}");
+                self.fault_in(section, &path, found.line, "no such key", expected, format!("add {colour} to {key}"));
+            }
+            item.map(|item| Found {
+                value: item,
+                line: found.line.map(|line| self.line_of(item.span()).unwrap_or(line)),
+            })
+        }))
+    }
+
+    /// A text that is not empty, where the key is there.
+    pub(super) fn text(&mut self, section: Section<'a>, key: &str, expected: &str) -> Option<Found<&'a str>> {
+        let found = self.lookup(section, key)?;
+        self.text_of(section, key, found, expected)
+    }
+
+    fn text_of(
+        &mut self,
+        section: Section<'a>,
+        key: &str,
+        found: Found<&'a Item>,
+        expected: &str,
+    ) -> Option<Found<&'a str>> {
+        match found.value.as_str() {
+            Some(text) if !text.trim().is_empty() && !text.contains('\0') => {
+                Some(Found { value: text, line: found.line })
+            }
+            Some(_) => {
+                self.fault_in(section, key, found.line, "an empty text", expected, "fill it in or take it out".into());
+                None
+            }
+            None => {
+                self.wrong_type(section, key, found, expected, "write it in double quotes".into());
+                None
+            }
+        }
+    }
+
+    /// What was read from the file that `key` names; its fault becomes the key's.
+    pub(super) fn of_file<T>(
+        &mut self,
+        section: Section<'a>,
+        key: &str,
+        line: Option<usize>,
+        read: Result<T, FileFault>,
+    ) -> Option<T> {
+        read.map_err(|fault| self.fault_in(section, key, line, &fault.found, &fault.expected, fault.advice)).ok()
+    }
+
+    /// true or false; `default` where the key is missing.
+    pub(super) fn flag(&mut self, section: Section<'a>, key: &str, default: bool) -> bool {
+        let Some(found) = self.lookup(section, key) else { return default };
+        found.value.as_bool().unwrap_or_else(|| {
+            self.wrong_type(section, key, found, "true or false", "write true or false, without quotes".into());
+            default
+        })
+    }
+
+    /// One of the named choices; a fault where the key is missing and `required`.
+    pub(super) fn choice<T: Clone>(
+        &mut self,
+        section: Section<'a>,
+        key: &str,
+        choices: &[(&'static str, T)],
+        required: bool,
+    ) -> Option<Found<T>> {
+        let expected =
+            format!("one of {}", choices.iter().map(|(name, _)| format!("\"{name}\"")).collect::<Vec<_>>().join(", "));
+        if self.lookup(section, key).is_none() && required {
+            self.missing(section, key, &expected);
+        }
+        let text = self.text(section, key, &expected)?;
+        let choice = choices.iter().find(|(name, _)| *name == text.value);
+        if choice.is_none() {
+            let names: Vec<&str> = choices.iter().map(|(name, _)| *name).collect();
+            let advice =
+                nearest(text.value, &names).map_or("choose one".into(), |name| format!("did you mean \"{name}\"?"));
+            self.fault_in(section, key, text.line, &format!("{:?}", text.value), &expected, advice);
+        }
+        choice.map(|(_, value)| Found { value: value.clone(), line: text.line })
+    }
+
+    /// The order of the colours: each of the three once.
+    pub(super) fn colour_order(&mut self, section: Section<'a>, key: &str) -> Option<[Colour; 3]> {
+        const EXPECTED: &str = "red, green and blue, each once";
+        let Some(found) = self.lookup(section, key) else {
+            self.missing(section, key, EXPECTED);
+            return None;
+        };
+        let names: Option<Vec<&str>> =
+            found.value.as_array().and_then(|array| array.iter().map(|v| v.as_str()).collect());
+        let order: Option<Vec<Colour>> = names.and_then(|names| {
+            names.iter().map(|name| Colour::ALL.into_iter().find(|colour| colour.name() == *name)).collect()
+        });
+        match order.and_then(|order| <[Colour; 3]>::try_from(order).ok()) {
+            Some(order) if Colour::ALL.iter().all(|colour| order.contains(colour)) => Some(order),
+            _ => {
+                let advice = format!("write for example {key} = [\"red\", \"green\", \"blue\"]");
+                self.wrong_type(section, key, found, EXPECTED, advice);
+                None
+            }
+        }
+    }
+}
+
+/// The number that `item` gives: an integer, a float, or the text "inf".
+fn number_in(item: &Item) -> Option<f64> {
+    item.as_float().or_else(|| item.as_integer().map(|integer| integer as f64)).or_else(|| match item.as_str() {
+        Some("inf" | "infinity") => Some(f64::INFINITY),
+        _ => None,
+    })
+}
+
+/// What stands in the file, short enough for one line.
+fn describe(item: &Item) -> String {
+    const SHOWN_MAX: usize = 60;
+    let text = item.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
+    let shown: String = text.chars().take(SHOWN_MAX).collect();
+    let more = if shown.len() < text.len() { "..." } else { "" };
+    match item.type_name() {
+        kind @ ("array" | "integer") => format!("an {kind} {shown}{more}"),
+        "table" | "array of tables" => "a table".into(),
+        kind => format!("a {kind} {shown}{more}"),
+    }
+}
+
+/// The name among `names` that `given` was most likely meant to be.
+fn nearest<'n>(given: &str, names: &[&'n str]) -> Option<&'n str> {
+    const ALIKE_MIN: f64 = 0.8;
+    let alike = |name: &&&str| strsim::jaro_winkler(given, name);
+    let best = names.iter().max_by(|a, b| alike(a).total_cmp(&alike(b)))?;
+    (alike(&best) >= ALIKE_MIN).then_some(*best)
+}

@@ -1,0 +1,733 @@
+//! Rig files: what they mean, and what is said of faulty ones.
+
+use std::f64::consts::{PI, TAU};
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use holod_calibration::rig::{Fault, LaserDriver, PanelMode, PanelProfile, PhaseSign, Provenance, Rig, RigError};
+use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, Resolution, TimeNs};
+use image::{GrayImage, ImageBuffer, Luma, RgbImage};
+use proptest::prelude::*;
+
+const EXAMPLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/rigs/example.toml");
+
+/// The built-in rig's text with each `from` replaced by its `to`; every `from` must be there.
+fn changed(changes: &[(&str, &str)]) -> String {
+    changes.iter().fold(Rig::BUILT_IN_TOML.to_owned(), |text, (from, to)| {
+        assert!(text.contains(from), "{from} is not in the built-in rig");
+        text.replacen(from, to, 1)
+    })
+}
+
+fn faults_of(text: &str) -> Vec<Fault> {
+    Rig::parse(text, Path::new("rig.toml")).expect_err("a fault").faults
+}
+
+/// The one fault of the built-in rig with one change.
+fn fault_of(from: &str, to: &str) -> Fault {
+    let mut faults = faults_of(&changed(&[(from, to)]));
+    assert_eq!(faults.len(), 1, "{faults:#?}");
+    faults.remove(0)
+}
+
+/// The line of the built-in rig that begins with `start`.
+fn line_of(start: &str) -> Option<usize> {
+    let line = Rig::BUILT_IN_TOML.lines().position(|line| line.starts_with(start));
+    Some(1 + line.unwrap_or_else(|| panic!("no line begins with {start}")))
+}
+
+#[track_caller]
+fn assert_fault(fault: &Fault, key: &str, line: Option<usize>, found: &str, expected: &str, advice: &str) {
+    assert_eq!((fault.key.as_str(), fault.line), (key, line), "{fault}");
+    assert!(fault.found.contains(found), "found: {fault}");
+    assert!(fault.expected.contains(expected), "expected: {fault}");
+    assert!(fault.advice.contains(advice), "advice: {fault}");
+}
+
+/// Checks the one fault that `from` → `to` makes, in the line that begins with `from`'s first line.
+#[track_caller]
+fn check(from: &str, to: &str, key: &str, found: &str, expected: &str, advice: &str) {
+    assert_fault(&fault_of(from, to), key, line_of(from), found, expected, advice);
+}
+
+#[test]
+fn the_built_in_file_is_the_built_in_rig() {
+    let rig = Rig::parse(Rig::BUILT_IN_TOML, Path::new("built-in.toml")).unwrap();
+    assert_eq!(rig.provenance.origin, "built-in.toml");
+    assert_eq!(Rig { provenance: Provenance::default(), ..rig }, Rig::default());
+}
+
+#[test]
+fn the_example_rig_says_what_its_comments_say() {
+    let rig = Rig::load(Path::new(EXAMPLE)).unwrap();
+    assert_eq!(rig.name, "lab bench 1");
+    assert_eq!(rig.resolution(), Resolution { width: 1920, height: 1080 });
+    assert!((rig.pixel_pitch().0 - 6.4e-6).abs() < 1e-15);
+    assert_eq!(rig.provenance.panel_profile, Some("holoeye-leto"));
+    assert_eq!((rig.panel.mode, rig.panel.phase_sign), (PanelMode::ChannelPacked, PhaseSign::Positive));
+    assert_eq!(rig.panel.stroke_rad, PerColour([TAU * 255.0 / 256.0; 3]));
+    assert_eq!((rig.panel.settle, rig.panel.field_period()), (TimeNs(2_000_000), TimeNs(5_555_556)));
+    assert_eq!(rig.geometry.depth_near, DisplayGeometry::DEFAULT.depth_near);
+    assert_eq!(rig.lasers.driver, LaserDriver::Serial { path: "/dev/holod-lasers".into() });
+    assert_eq!(rig.lasers.power_mw, PerColour([1.2, 0.8, 1.0]));
+    assert_eq!(rig.tracker.spec.as_deref(), Some("serial:/dev/holod-tracker"));
+    assert!(rig.model.allow_optics_mismatch);
+
+    let meaning = rig.meaning();
+    assert!((meaning.pixel_angle_mrad - 0.16).abs() < 1e-12);
+    assert!((meaning.u_near_mm - 4.571).abs() < 1e-3 && meaning.u_far_mm == 0.0 && meaning.depth_far_m.is_none());
+    assert!((meaning.eyebox_mm.blue - 2.8125).abs() < 1e-9);
+    assert!((meaning.blurs[0].largest_blur_px - 2.0 / 0.35 / 0.16).abs() < 1e-3);
+    assert!((meaning.field.laser_on_ms - 2.1).abs() < 1e-9 && (meaning.field.laser_off_ms - 5.1).abs() < 1e-9);
+    assert!(meaning.files.is_empty());
+    assert!(meaning.notes.iter().any(|note| note.contains("other optics")), "{:?}", meaning.notes);
+}
+
+#[test]
+fn the_example_comments_name_every_profile_and_its_own_figures() {
+    let text = fs::read_to_string(EXAMPLE).unwrap();
+    for profile in PanelProfile::all() {
+        assert!(text.contains(profile.name), "{} is not in the example's comments", profile.name);
+    }
+    let spelled_out = ["width_px", "height_px", "pixel_pitch_um", "refresh_hz", "bit_depth"]
+        .iter()
+        .fold(text.clone(), |text, key| text.replace(&format!("# {key} = "), &format!("{key} = ")))
+        .replace("profile = \"holoeye-leto\"", "");
+    let explicit = Rig::parse(&spelled_out, Path::new(EXAMPLE)).unwrap();
+    let by_profile = Rig::load(Path::new(EXAMPLE)).unwrap();
+    assert_eq!(Rig { provenance: by_profile.provenance.clone(), ..explicit }, by_profile);
+}
+
+#[test]
+fn three_faults_are_one_report_of_three_keys_and_lines() {
+    let text = changed(&[
+        ("pixel_pitch_um = 8.0", "pixel_pitch_um = 8e-6"),
+        ("green = 520.0", "green = 0.52"),
+        ("fallback_mm = 3.0", "fallback_mm = 12"),
+    ]);
+    let error = Rig::parse(&text, Path::new("bench.toml")).unwrap_err();
+    let keys: Vec<_> = error.faults.iter().map(|fault| (fault.key.as_str(), fault.line)).collect();
+    let expected = [
+        ("panel.pixel_pitch_um", line_of("pixel_pitch_um")),
+        ("optics.wavelengths_nm.green", line_of("wavelengths_nm")),
+        ("tracker.fallback_mm", line_of("fallback_mm")),
+    ];
+    assert_eq!(keys, expected);
+    let shown = error.to_string();
+    assert!(
+        shown.starts_with("rig file bench.toml: 3 faults\n  line 7, panel.pixel_pitch_um: found 0.000008;"),
+        "{shown}"
+    );
+    assert!(shown.contains("0.52 looks like micrometres: write 520"), "{shown}");
+}
+
+#[test]
+fn figures_in_another_unit_are_recognised() {
+    for (from, to, key, advice) in [
+        (
+            "pixel_pitch_um = 8.0",
+            "pixel_pitch_um = 8e-6",
+            "panel.pixel_pitch_um",
+            "looks like metres: write 8 for 8 µm",
+        ),
+        ("pixel_pitch_um = 8.0", "pixel_pitch_um = 0.008", "panel.pixel_pitch_um", "looks like millimetres: write 8 "),
+        ("refresh_hz = 60.0", "refresh_hz = 60000", "panel.refresh_hz", "looks like millihertz: write 60 "),
+        ("settle_ms = 2.0", "settle_ms = 2000", "panel.settle_ms", "looks like microseconds: write 2 "),
+        (
+            "eyepiece_focal_length_mm = 40.0",
+            "eyepiece_focal_length_mm = 0.04",
+            "optics.eyepiece_focal_length_mm",
+            "write 40 ",
+        ),
+        ("lit_ms = 3.0", "lit_ms = 3000", "lasers.lit_ms", "looks like microseconds: write 3 "),
+        (
+            "heartbeat_timeout_ms = 100.0",
+            "heartbeat_timeout_ms = 0.1",
+            "lasers.heartbeat_timeout_ms",
+            "seconds: write 100 ",
+        ),
+        ("fallback_mm = 3.0", "fallback_mm = 0.003", "tracker.fallback_mm", "looks like metres: write 3 "),
+    ] {
+        check(from, to, key, "", "a number from", advice);
+    }
+    let degrees = fault_of("red = 1.9921875", "red = 360");
+    assert_fault(&degrees, "panel.stroke_pi.red", line_of("stroke_pi"), "360", "π", "looks like degrees: write 2 ");
+    let metres = fault_of("red = 638.0", "red = 638e-9");
+    assert_fault(
+        &metres,
+        "optics.wavelengths_nm.red",
+        line_of("wavelengths_nm"),
+        "0.000000638",
+        "380 to 780 nm",
+        "write 638",
+    );
+}
+
+#[test]
+fn figures_out_of_range_are_refused() {
+    for (from, to, key) in [
+        ("width_px = 1920", "width_px = 0", "panel.width_px"),
+        ("height_px = 1080", "height_px = -1080", "panel.height_px"),
+        ("pixel_pitch_um = 8.0", "pixel_pitch_um = nan", "panel.pixel_pitch_um"),
+        ("refresh_hz = 60.0", "refresh_hz = inf", "panel.refresh_hz"),
+        ("bit_depth = 8", "bit_depth = 12", "panel.bit_depth"),
+        ("settle_ms = 2.0", "settle_ms = -1", "panel.settle_ms"),
+        ("eyepiece_focal_length_mm = 40.0", "eyepiece_focal_length_mm = 1", "optics.eyepiece_focal_length_mm"),
+        ("depth_near_m = 0.35", "depth_near_m = 0", "optics.depth_near_m"),
+        ("depth_near_m = 0.35", "depth_near_dpt = 25", "optics.depth_near_dpt"),
+        ("on_delay_ms = 0.1", "on_delay_ms = -0.1", "lasers.on_delay_ms"),
+        ("lit_ms = 3.0", "lit_ms = 0", "lasers.lit_ms"),
+        ("heartbeat_timeout_ms = 100.0", "heartbeat_timeout_ms = 5000", "lasers.heartbeat_timeout_ms"),
+        ("scale_mm_per_unit = 1.0", "scale_mm_per_unit = 0", "tracker.scale_mm_per_unit"),
+        ("fallback_mm = 3.0", "fallback_mm = 0.5", "tracker.fallback_mm"),
+        ("hold_ms = 1000.0", "hold_ms = -1", "tracker.hold_ms"),
+    ] {
+        check(from, to, key, "", "a number from", "");
+    }
+    let red = fault_of("red = 1.0,", "red = -1,");
+    assert_fault(&red, "lasers.power_mw.red", line_of("power_mw"), "-1", "0 to 500 mW", "");
+}
+
+#[test]
+fn wrong_types_are_named() {
+    check(
+        "width_px = 1920",
+        "width_px = \"1920\"",
+        "panel.width_px",
+        "a string \"1920\"",
+        "a number",
+        "take the quotes away",
+    );
+    check("width_px = 1920", "width_px = 1920.5", "panel.width_px", "1920.5", "a whole number", "without a fraction");
+    check("width_px = 1920", "width_px = 1921", "panel.width_px", "1921", "an even number", "leave out");
+    check("bit_depth = 8", "bit_depth = 9", "panel.bit_depth", "9", "8 or 10", "");
+    check("bit_depth = 8", "bit_depth = true", "panel.bit_depth", "a boolean true", "a number", "");
+    check("mode = ", "mode = 3 #", "panel.mode", "an integer 3", "\"channel-packed\"", "in double quotes");
+    check("eye = \"both\"", "eye = \"\"", "tracker.eye", "an empty text", "\"left\"", "");
+    let flag = "allow_optics_mismatch = ";
+    check(
+        flag,
+        "allow_optics_mismatch = \"no\" #",
+        "model.allow_optics_mismatch",
+        "a string",
+        "true or false",
+        "without quotes",
+    );
+    let stroke = fault_of("stroke_pi = {", "stroke_pi = 2.0 # {");
+    assert_fault(&stroke, "panel.stroke_pi", line_of("stroke_pi"), "a float 2.0", "for each colour", "{ red = ");
+    let section = faults_of("panel = 3\n[optics]\n[[lasers]]\n");
+    let keys: Vec<_> = section.iter().map(|fault| (fault.key.as_str(), fault.line)).collect();
+    assert!(keys.contains(&("panel", Some(1))) && keys.contains(&("lasers", Some(3))), "{keys:?}");
+}
+
+#[test]
+fn names_that_are_nearly_right_are_guessed() {
+    let pitch = faults_of(&changed(&[("pixel_pitch_um", "pixel_pitch_mm")]));
+    assert_eq!(pitch.len(), 2, "{pitch:#?}");
+    let unknown = pitch.iter().find(|fault| fault.key == "panel.pixel_pitch_mm").unwrap();
+    assert_fault(
+        unknown,
+        "panel.pixel_pitch_mm",
+        Some(7),
+        "an unknown key",
+        "pixel_pitch_um",
+        "did you mean `pixel_pitch_um`?",
+    );
+    let missing = pitch.iter().find(|fault| fault.key == "panel.pixel_pitch_um").unwrap();
+    assert_fault(
+        missing,
+        "panel.pixel_pitch_um",
+        line_of("[panel]"),
+        "no such key",
+        "1 to 50 µm",
+        "add pixel_pitch_um to [panel]",
+    );
+
+    check(
+        "mode = \"channel-packed\"",
+        "mode = \"channel_packed\"",
+        "panel.mode",
+        "channel_packed",
+        "",
+        "did you mean \"channel-packed\"?",
+    );
+    check(
+        "phase_sign = ",
+        "phase_sign = \"+\" #",
+        "panel.phase_sign",
+        "\"+\"",
+        "\"positive\", \"negative\"",
+        "choose one",
+    );
+    check(
+        "bit_depth = 8",
+        "profile = \"holoeye-plut\"\nbit_depth = 8",
+        "panel.profile",
+        "plut",
+        "",
+        "did you mean \"holoeye-pluto\"?",
+    );
+}
+
+#[test]
+fn unknown_misplaced_and_superfluous_keys_are_refused() {
+    check(
+        "hold_ms = 1000.0",
+        "settle_ms = 2\nhold_ms = 1000.0",
+        "tracker.settle_ms",
+        "an unknown key",
+        "",
+        "move `settle_ms` to [panel]",
+    );
+    check("hold_ms = 1000.0", "name = \"x\"\nhold_ms = 1000.0", "tracker.name", "", "", "above the first table");
+    check("hold_ms = 1000.0", "zzz = 1\nhold_ms = 1000.0", "tracker.zzz", "", "one of spec, eye", "take it out");
+    check("name = ", "nmae = ", "nmae", "an unknown key", "name, panel", "did you mean `name`?");
+    let violet = fault_of("blue = 450.0 }", "blue = 450.0, violet = 405.0 }");
+    assert_fault(
+        &violet,
+        "optics.wavelengths_nm.violet",
+        line_of("wavelengths_nm"),
+        "an unknown key",
+        "red, green, blue",
+        "take it out",
+    );
+}
+
+#[test]
+fn missing_tables_and_keys_are_named_once() {
+    let keys: Vec<String> = faults_of("").into_iter().map(|fault| fault.key).collect();
+    assert_eq!(keys, ["panel", "optics", "lasers"]);
+    for (key, section) in [
+        ("width_px", "panel"),
+        ("refresh_hz", "panel"),
+        ("mode", "panel"),
+        ("field_order", "panel"),
+        ("bit_depth", "panel"),
+        ("phase_sign", "panel"),
+        ("stroke_pi", "panel"),
+        ("settle_ms", "panel"),
+        ("wavelengths_nm", "optics"),
+        ("eyepiece_focal_length_mm", "optics"),
+        ("driver", "lasers"),
+        ("power_mw", "lasers"),
+        ("on_delay_ms", "lasers"),
+        ("lit_ms", "lasers"),
+        ("heartbeat_timeout_ms", "lasers"),
+    ] {
+        let fault = fault_of(&format!("{key} = "), &format!("# {key} = "));
+        assert_fault(&fault, &format!("{section}.{key}"), line_of(&format!("[{section}]")), "no such key", "", "add ");
+    }
+    let blue = fault_of(", blue = 450.0", "");
+    assert_fault(&blue, "optics.wavelengths_nm.blue", line_of("wavelengths_nm"), "no such key", "380", "add blue");
+    let optional =
+        changed(&[("[tracker]", "#"), ("eye =", "#"), ("scale_mm", "#"), ("fallback_mm", "#"), ("hold_ms", "#")]);
+    let optional = optional.replace("[model]", "").replace("allow_optics", "#").replace("depth_", "# depth_");
+    let rig = Rig::parse(&optional, Path::new("")).unwrap();
+    assert_eq!(
+        (rig.tracker, rig.model, rig.geometry),
+        (Rig::default().tracker, Rig::default().model, DisplayGeometry::DEFAULT)
+    );
+}
+
+#[test]
+fn a_field_order_is_a_permutation() {
+    for order in
+        ["[\"red\", \"red\", \"blue\"]", "[\"red\", \"green\"]", "[1, 2, 3]", "\"rgb\"", "[\"r\", \"g\", \"b\"]"]
+    {
+        check(
+            "field_order = ",
+            &format!("field_order = {order} #"),
+            "panel.field_order",
+            "",
+            "each once",
+            "field_order = [",
+        );
+    }
+    let text = changed(&[("[\"red\", \"green\", \"blue\"]", "[\"green\", \"red\", \"blue\"]")]);
+    let rig = Rig::parse(&text, Path::new("")).unwrap();
+    assert_eq!(rig.panel.field_order, [Colour::Green, Colour::Red, Colour::Blue]);
+}
+
+#[test]
+fn timings_that_do_not_fit_into_the_field_state_the_numbers() {
+    check(
+        "settle_ms = 2.0",
+        "settle_ms = 6",
+        "panel.settle_ms",
+        "6 ms",
+        "5.556 ms of one field (60 Hz, channel-packed)",
+        "",
+    );
+    let lit = fault_of("lit_ms = 3.0", "lit_ms = 4");
+    let sum = "settle 2 + on_delay 0.1 + lit 4 = 6.1 ms";
+    assert_fault(
+        &lit,
+        "lasers.lit_ms",
+        line_of("lit_ms"),
+        sum,
+        "5.556 ms of one field",
+        "write lit_ms = 3.455 at most",
+    );
+    check("lit_ms = 3.0", "lit_ms = 3.456", "lasers.lit_ms", "= 5.556 ms", "", "");
+    assert!(Rig::parse(&changed(&[("lit_ms = 3.0", "lit_ms = 3.455")]), Path::new("")).is_ok());
+    check(
+        "heartbeat_timeout_ms = 100.0",
+        "heartbeat_timeout_ms = 30",
+        "lasers.heartbeat_timeout_ms",
+        "30 ms",
+        "33.333 ms",
+        "",
+    );
+    let slow = changed(&[("channel-packed", "field-sequential"), ("settle_ms = 2.0", "settle_ms = 6")]);
+    let rig = Rig::parse(&slow, Path::new("")).unwrap();
+    assert_eq!((rig.panel.mode, rig.panel.field_period()), (PanelMode::FieldSequential, TimeNs(16_666_667)));
+}
+
+#[test]
+fn depths_are_given_once_and_in_order() {
+    let inverted = fault_of("depth_far_m = inf", "depth_far_m = 0.2");
+    assert_fault(&inverted, "optics.depth_near", line_of("depth_near_m"), "near 2.857 and far 5", "nearer", "exchange");
+    let millimetres = fault_of("depth_near_m = 0.35", "depth_near_m = 350");
+    assert_fault(
+        &millimetres,
+        "optics.depth_near",
+        line_of("depth_near_m"),
+        "near 0.003",
+        "0.1 dioptres apart",
+        "350 mm",
+    );
+    let twice = fault_of("depth_near_m = 0.35", "depth_near_m = 0.35\ndepth_near_dpt = 2.5");
+    assert_eq!(
+        (twice.key.as_str(), twice.line),
+        ("optics.depth_near_dpt", line_of("depth_near_m").map(|line| line + 1))
+    );
+    let text =
+        changed(&[("depth_far_m = inf", "depth_far_dpt = 0.25"), ("depth_near_m = 0.35", "depth_near_dpt = 2.5")]);
+    let geometry = Rig::parse(&text, Path::new("")).unwrap().geometry;
+    assert_eq!((geometry.depth_far, geometry.depth_near), (Dioptres(0.25), Dioptres(2.5)));
+    let quoted = Rig::parse(&changed(&[("= inf", "= \"inf\"")]), Path::new("")).unwrap();
+    assert_eq!(quoted.geometry.depth_far, Dioptres(0.0));
+}
+
+#[test]
+fn wavelengths_stand_under_their_own_colours() {
+    let fault = fault_of("red = 638.0, green = 520.0", "red = 520.0, green = 638.0");
+    assert_fault(
+        &fault,
+        "optics.wavelengths_nm",
+        line_of("wavelengths_nm"),
+        "520, 638 and 450 nm",
+        "red longer",
+        "own colour",
+    );
+}
+
+#[test]
+fn a_laser_box_needs_its_port() {
+    check("driver = \"simulated\"", "driver = \"serial\"", "lasers.device", "no such key", "port", "/dev/holod-lasers");
+    let fault = fault_of("driver = \"simulated\"", "driver = \"simulated\"\ndevice = \"/dev/ttyACM0\"");
+    assert_fault(
+        &fault,
+        "lasers.device",
+        line_of("driver").map(|line| line + 1),
+        "simulated",
+        "\"serial\"",
+        "take device out",
+    );
+}
+
+#[test]
+fn broken_toml_names_every_line_that_is_broken() {
+    let text = changed(&[("width_px = 1920", "width_px = = 1920"), ("lit_ms = 3.0", "lit_ms 3.0")]);
+    let faults = faults_of(&text);
+    assert_eq!(faults.iter().map(|fault| fault.line).collect::<Vec<_>>(), [line_of("width_px"), line_of("lit_ms")]);
+    assert_fault(&faults[0], "", line_of("width_px"), "`width_px = = 1920`", "TOML", "");
+    let twice = fault_of("settle_ms = 2.0", "settle_ms = 2.0\nsettle_ms = 3.0");
+    assert_fault(&twice, "", line_of("settle_ms").map(|line| line + 1), "`settle_ms = 3.0`", "TOML", "duplicate");
+    let header = fault_of("[lasers]", "[lasers");
+    assert_eq!(header.line, line_of("[lasers]"));
+}
+
+fn folder_error(make: impl FnOnce(&Path) -> PathBuf) -> RigError {
+    let folder = tempfile::tempdir().unwrap();
+    Rig::load(&make(folder.path())).unwrap_err()
+}
+
+#[test]
+fn files_that_are_no_rig_file_are_named() {
+    let missing = folder_error(|folder| folder.join("none.toml"));
+    assert!(missing.origin.ends_with("none.toml") && missing.to_string().contains("No such file"), "{missing}");
+    let directory = folder_error(Path::to_path_buf);
+    assert!(directory.to_string().contains("a directory"), "{directory}");
+    let binary = folder_error(|folder| {
+        let path = folder.join("binary.toml");
+        fs::write(&path, b"name = \"x\"\n# caf\xe9\n").unwrap();
+        path
+    });
+    assert!(binary.to_string().contains("line 2 is not UTF-8"), "{binary}");
+}
+
+#[test]
+fn a_profile_gives_way_to_explicit_keys() {
+    let text = changed(&[
+        ("width_px = 1920", "profile = \"holoeye-gaea-2.1\""),
+        ("height_px = 1080\n", "\n"),
+        ("pixel_pitch_um = 8.0", ""),
+    ]);
+    let rig = Rig::parse(&text, Path::new("")).unwrap();
+    assert_eq!((rig.resolution(), rig.pixel_pitch()), (Resolution { width: 4160, height: 2464 }, Metres(3.74e-6)));
+    assert!(rig.meaning().notes.iter().any(|note| note.contains("no source confirms width_px")));
+    let pitch = Rig::parse(&text.replace("[optics]", "pixel_pitch_um = 3.7\n[optics]"), Path::new("")).unwrap();
+    assert_eq!((pitch.resolution().width, pitch.pixel_pitch()), (4160, Metres(3.7e-6)));
+}
+
+#[test]
+fn every_profile_makes_a_rig() {
+    for profile in PanelProfile::all() {
+        let text = Rig::BUILT_IN_TOML
+            .replace("width_px = 1920", &format!("profile = \"{}\"", profile.name))
+            .replace("height_px = 1080", "")
+            .replace("pixel_pitch_um = 8.0", "")
+            .replace("refresh_hz = 60.0", "")
+            .replace("bit_depth = 8", "");
+        let rig = Rig::parse(&text, Path::new("")).unwrap_or_else(|error| panic!("{}: {error}", profile.name));
+        assert_eq!(rig.meaning().panel_profile.as_deref(), Some(profile.name));
+    }
+}
+
+/// A folder with a rig file that names `name` under `key` for green, and that file.
+fn load_with_file(key: &str, name: &str, write: impl FnOnce(&Path)) -> Result<Rig, RigError> {
+    let folder = tempfile::tempdir().unwrap();
+    write(&folder.path().join(name));
+    let rig = folder.path().join("rig.toml");
+    let text = changed(&[
+        ("settle_ms = 2.0", &format!("settle_ms = 2.0\n{key} = {{ green = \"{name}\" }}")),
+        ("width_px = 1920", "width_px = 64"),
+        ("height_px = 1080", "height_px = 66"),
+    ]);
+    fs::write(&rig, text).unwrap();
+    Rig::load(&rig)
+}
+
+fn lut_csv(phase_rad: impl Fn(usize) -> f64) -> String {
+    let rows: Vec<String> = (0..256).map(|level| format!("{level},{}", phase_rad(level))).collect();
+    format!("level,phase_rad\n# at 520 nm\n{}\n", rows.join("\n"))
+}
+
+fn load_lut(csv: &str) -> Result<Rig, RigError> {
+    load_with_file("lut_file", "green.csv", |path| fs::write(path, csv).unwrap())
+}
+
+#[track_caller]
+fn assert_lut_fault(csv: &str, found: &str, expected: &str) {
+    let error = load_lut(csv).expect_err("a fault");
+    assert_eq!(error.faults.len(), 1, "{error}");
+    assert_fault(
+        &error.faults[0],
+        "panel.lut_file.green",
+        line_of("settle_ms").map(|line| line + 1),
+        found,
+        expected,
+        "",
+    );
+}
+
+/// A rising table that ends at the stroke of the built-in rig.
+fn straight(level: usize) -> f64 {
+    level as f64 * TAU / 256.0
+}
+
+#[test]
+fn a_lut_is_read_and_named_among_the_active_files() {
+    let rig = load_lut(&lut_csv(|level| 0.1 + straight(level))).unwrap();
+    let lut_rad = rig.panel.lut_rad[Colour::Green].as_ref().unwrap();
+    assert_eq!((lut_rad.len(), lut_rad[0], lut_rad[7]), (256, 0.1, 0.1 + straight(7)));
+    assert!((rig.panel.stroke_rad[Colour::Green] - straight(255)).abs() < 1e-12);
+    assert!(rig.panel.lut_rad[Colour::Red].is_none());
+    let files = rig.meaning().files;
+    assert_eq!((files.len(), files[0].kind.as_str(), files[0].colour.as_str()), (1, "lut", "green"));
+    assert!(files[0].path.is_absolute() && files[0].path.ends_with("green.csv"));
+    let one_column: String = (0..256).map(|level| format!("{}\n", straight(level))).collect();
+    assert_eq!(load_lut(&one_column).unwrap().panel.lut_rad[Colour::Green].as_ref().unwrap()[255], straight(255));
+}
+
+#[test]
+fn a_faulty_lut_names_its_file_and_row() {
+    let good = lut_csv(straight);
+    assert_lut_fault(&good.replacen("\n3,", "\n3;", 1), "green.csv: row 6 `3;0.07", "256 rows");
+    assert_lut_fault(&good.replacen("\n5,", "\n6,", 1), "row 8", "");
+    assert_lut_fault(&good.replacen("\n5,", "\n5,nan #", 1), "row 8 `5,nan #", "");
+    assert_lut_fault(&good.replacen("\n9,", "\n9,9e9\n#", 1), "row 12 `9,9e9` has no phase in radians", "");
+    assert_lut_fault(&good.replacen("\n9,", "\n9,1,", 1), "has more than two columns", "");
+    assert_lut_fault(&good.replacen("255,", "#", 1), "255 rows", "256 rows");
+    assert_lut_fault(
+        &lut_csv(|level| straight(level) + if level == 40 { 0.1 } else { 0.0 }),
+        "at level 40",
+        "monotonic",
+    );
+    assert_lut_fault(&lut_csv(|level| straight(level) / TAU), "changes by 0.317 π", "0.5 to 6 π");
+    assert_lut_fault(&lut_csv(|level| -straight(level)), "-1.992 π", "a rising table");
+    assert_lut_fault(&lut_csv(|level| straight(level) * 1.03), "2.052 π", "1.992 π that stroke_pi states");
+    assert_lut_fault(&good.replace(',', ";"), "and 253 rows more", "");
+    let missing = load_with_file("lut_file", "green.csv", |_| ()).unwrap_err();
+    assert!(missing.to_string().contains("green.csv: No such file"), "{missing}");
+    let directory = load_with_file("lut_file", "green.csv", |path| fs::create_dir(path).unwrap()).unwrap_err();
+    assert!(directory.to_string().contains("a directory"), "{directory}");
+}
+
+#[test]
+fn a_falling_lut_goes_with_the_negative_sign() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("green.csv"), lut_csv(|level| -straight(level))).unwrap();
+    let text = changed(&[
+        ("phase_sign = \"positive\"", "phase_sign = \"negative\"\nlut_file.green = \"green.csv\""),
+        (", green = 1.9921875", ""),
+    ]);
+    let rig = Rig::parse(&text, &folder.path().join("rig.toml")).unwrap();
+    assert!((rig.panel.stroke_rad[Colour::Green] - straight(255)).abs() < 1e-12);
+    let rising = Rig::parse(&text.replace("negative", "positive"), &folder.path().join("rig.toml")).unwrap_err();
+    assert!(rising.to_string().contains("phase_sign = \"negative\""), "{rising}");
+}
+
+#[test]
+fn a_flatness_picture_is_read_at_either_depth() {
+    let rig = load_with_file("flatness_file", "flat.png", |path| {
+        GrayImage::from_fn(64, 66, |x, y| Luma([(x + 64 * y) as u8])).save(path).unwrap();
+    });
+    let rig = rig.unwrap();
+    let flatness_rad = rig.panel.flatness_rad[Colour::Green].as_ref().unwrap();
+    assert_eq!(flatness_rad.len(), 64 * 66);
+    assert!((flatness_rad[128] - std::f32::consts::PI).abs() < 1e-6 && flatness_rad[256] == 0.0);
+    assert_eq!(rig.meaning().files[0].kind, "flatness");
+    let rig = load_with_file("flatness_file", "flat.png", |path| {
+        ImageBuffer::<Luma<u16>, Vec<u16>>::from_pixel(64, 66, Luma([16384])).save(path).unwrap();
+    });
+    let flatness_rad = &rig.unwrap().panel.flatness_rad;
+    assert!((f64::from(flatness_rad[Colour::Green].as_ref().unwrap()[0]) - PI / 2.0).abs() < 1e-6);
+}
+
+#[test]
+fn a_faulty_flatness_picture_is_named() {
+    let cases: [(fn(&Path), &str); 4] = [
+        (|path| GrayImage::new(66, 64).save(path).unwrap(), "66x64 pixels"),
+        (|path| RgbImage::new(64, 66).save(path).unwrap(), "Rgb8 pixels"),
+        (|path| fs::write(path, b"no picture").unwrap(), "flat.png: "),
+        (
+            |path| {
+                GrayImage::from_fn(64, 66, |x, y| Luma([(x * y) as u8])).save(path).unwrap();
+                let bytes = fs::read(path).unwrap();
+                fs::write(path, &bytes[..bytes.len() / 2]).unwrap();
+            },
+            "flat.png: ",
+        ),
+    ];
+    for (write, found) in cases {
+        let error = load_with_file("flatness_file", "flat.png", write).expect_err(found);
+        assert_eq!(error.faults.len(), 1, "{error}");
+        let line = line_of("settle_ms").map(|line| line + 1);
+        assert_fault(&error.faults[0], "panel.flatness_file.green", line, found, "64x66 pixels", "");
+    }
+}
+
+#[test]
+fn a_weights_file_must_be_there() {
+    check(
+        "allow_optics_mismatch = false",
+        "weights_file = \"none.safetensors\"",
+        "model.weights_file",
+        "No such file",
+        "",
+        "rig file's folder",
+    );
+}
+
+#[test]
+fn meaning_warns_of_what_a_bench_cannot_do() {
+    let text = changed(&[("blue = 1.9921875", "blue = 1.5"), ("green = 1.0", "green = 0")]);
+    let notes = Rig::parse(&text, Path::new("")).unwrap().meaning().notes;
+    for note in [
+        "blue: the panel's stroke is 1.500 π",
+        "green: the laser's power is 0",
+        "simulated",
+        "blue: the eyebox is 2.25 mm",
+    ] {
+        assert!(notes.iter().any(|said| said.contains(note)), "{note}: {notes:?}");
+    }
+    assert!(!notes.iter().any(|said| said.starts_with("red: the panel's stroke")));
+}
+
+#[test]
+fn meaning_is_readable_and_becomes_json() {
+    let meaning = Rig::default().meaning();
+    let text = meaning.to_string();
+    for part in [
+        "1920x1080 pixels; one pixel is 0.200 mrad",
+        "0.000 to 2.857 dioptres: infinity to 0.35 m, u = 0.000 to 4.571 mm",
+        "red 3.19, green 2.60, blue 2.25 mm",
+        "pupil 4 mm     blur up to 57.1 px; needs 50.0 mrad, of the panel's band red 1.25, green 1.54, blue 1.78",
+        "channel-packed at 60 Hz: red, green, blue, 5.556 ms each, 60.0 colour frames a second",
+        "settled at 2.000 ms, laser on at 2.100, off at 5.100: lit for 54 % of it",
+    ] {
+        assert!(text.contains(part), "{part} is not in\n{text}");
+    }
+    let json = serde_json::to_value(&meaning).unwrap();
+    assert_eq!(json["eyebox_mm"]["red"].as_f64(), Some(meaning.eyebox_mm.red));
+    assert_eq!(json["depth_far_m"], serde_json::Value::Null);
+}
+
+#[test]
+fn the_hash_follows_the_text() {
+    let parse = |text: &str| Rig::parse(text, Path::new("")).unwrap().provenance.text_hash;
+    assert_eq!(parse(Rig::BUILT_IN_TOML), parse(Rig::BUILT_IN_TOML));
+    assert_ne!(parse(Rig::BUILT_IN_TOML), parse(&format!("{}\n", Rig::BUILT_IN_TOML)));
+}
+
+/// Values that a key might be given by mistake.
+fn any_value() -> impl Strategy<Value = String> {
+    prop_oneof![
+        any::<f64>().prop_map(|value| format!("{value:?}")),
+        any::<i64>().prop_map(|value| value.to_string()),
+        "[ -~]{0,12}",
+        "\\PC{0,8}",
+        Just("[]".to_owned()),
+        Just("{}".to_owned()),
+        Just("{ red = 1, green = [], blue = {} }".to_owned()),
+        Just("\"\"".to_owned()),
+        Just("\"..\"".to_owned()),
+        Just("1979-05-27".to_owned()),
+        Just("true".to_owned()),
+    ]
+}
+
+fn assert_sound(result: Result<Rig, RigError>) {
+    match result {
+        Ok(rig) => assert!(!rig.meaning().to_string().is_empty()),
+        Err(error) => {
+            assert!(!error.faults.is_empty());
+            for fault in &error.faults {
+                assert!(fault.line.is_some() || !fault.key.is_empty(), "{fault:?}");
+                assert!(!fault.found.is_empty() && !fault.expected.is_empty() && !fault.advice.is_empty(), "{fault:?}");
+            }
+        }
+    }
+}
+
+proptest! {
+    #[test]
+    fn no_value_of_any_key_panics(line in any::<prop::sample::Index>(), value in any_value()) {
+        let text = fs::read_to_string(EXAMPLE).unwrap();
+        let keys: Vec<&str> = text.lines().filter(|line| line.contains(" = ") && !line.starts_with('#')).collect();
+        let line = *line.get(&keys);
+        let key = line.split(" = ").next().unwrap();
+        assert_sound(Rig::parse(&text.replacen(line, &format!("{key} = {value}"), 1), Path::new(EXAMPLE)));
+    }
+
+    #[test]
+    fn no_damage_to_the_text_panics(at in any::<prop::sample::Index>(), length in 0usize..40, put in "\\PC{0,6}") {
+        let mut characters: Vec<char> = Rig::BUILT_IN_TOML.chars().collect();
+        let start = at.index(characters.len());
+        let end = (start + length).min(characters.len());
+        characters.splice(start..end, put.chars());
+        assert_sound(Rig::parse(&characters.into_iter().collect::<String>(), Path::new("rig.toml")));
+    }
+}
