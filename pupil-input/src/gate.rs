@@ -352,7 +352,8 @@ mod tests {
 
     #[test]
     fn a_bad_sample_takes_its_neighbours_with_it() {
-        let spoil: [(fn(&mut PupilSample), Rejection); 6] = [
+        type Spoil = fn(&mut PupilSample);
+        let spoil: [(Spoil, Rejection); 6] = [
             (|s| s.diameter_mm = f32::NAN, Rejection::NotFinite),
             (|s| s.diameter_mm = 0.5, Rejection::OutOfRange),
             (|s| s.diameter_mm = 16.7, Rejection::OutOfRange),

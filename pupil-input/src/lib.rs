@@ -6,6 +6,25 @@
 //!
 //! [`Tracker::start`] runs all of it on a thread of its own; [`Estimator`] is the same without a thread or a clock, for
 //! tests and for logs that are read as fast as they can be.
+//!
+//! # What the estimate costs and gives
+//!
+//! A sample is believed 30 ms after it was taken, when its successors have shown that no blink was beginning
+//! ([`GateSettings::lead`]). The filter bridges that time by extrapolation, so the estimate of the present moment lags much
+//! less than the gate. With the default settings, as `tests/eye.rs` measures and bounds them:
+//!
+//! | | |
+//! |---|---|
+//! | lag on a ramp, 200 ms after its onset | 10 ms |
+//! | noise of the estimate over noise of one sample, at 60 / 200 / 1000 Hz | 0.71 / 0.53 / 0.36 |
+//! | rms error on the mock's `steady` / `light-steps` / `sweep` / `blinks`, sensor noise 0.05 mm | 0.03 / 0.04 / 0.04 / 0.04 mm |
+//! | worst error while tracking, on the same | 0.11 / 0.39 / 0.27 / 0.21 mm |
+//! | after a blink, until samples are believed again | 50 ms trailing guard and 30 ms lead |
+//! | a step no pupil can make (a lid, or a change missed) of 1.5 mm is believed after | about 0.4 s |
+//!
+//! A pupil is held for as long as the rig says ([`rig::Tracker::hold`](holod_calibration::rig::Tracker::hold)), then slides to
+//! the fallback at 1.3 mm/s; when samples come back, what is shown meets them at 4 mm/s. Neither is
+//! faster than the peak of the light reflex, 5.5 mm/s.
 
 mod clock;
 mod counters;

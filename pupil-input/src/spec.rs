@@ -88,11 +88,11 @@ fn parse(spec: &str) -> Result<TrackerSpec, String> {
 }
 
 /// The path and the `key=value` or bare options behind it. Options are taken from the end, so that a path may hold a comma.
-fn split_options<'a>(rest: &'a str, is_option: impl Fn(&str) -> bool) -> Result<(&'a str, Vec<&'a str>), String> {
+fn split_options(rest: &str) -> Result<(&str, Vec<&str>), String> {
     let mut path = rest;
     let mut options = Vec::new();
     while let Some((before, last)) = path.rsplit_once(',') {
-        if is_option(last) {
+        if is_word_option(last) {
             options.push(last);
             path = before;
         } else {
@@ -108,7 +108,7 @@ fn is_word_option(option: &str) -> bool {
 }
 
 fn parse_serial(rest: &str) -> Result<TrackerSpec, String> {
-    let (path, options) = split_options(rest, is_word_option)?;
+    let (path, options) = split_options(rest)?;
     let mut baud = DEFAULT_BAUD;
     for option in options {
         match option.split_once('=') {
@@ -128,7 +128,7 @@ fn parse_serial(rest: &str) -> Result<TrackerSpec, String> {
 }
 
 fn parse_replay(rest: &str) -> Result<TrackerSpec, String> {
-    let (path, options) = split_options(rest, is_word_option)?;
+    let (path, options) = split_options(rest)?;
     let mut speed = ReplaySpeed::Times(1.0);
     let mut repeat = false;
     for option in options {

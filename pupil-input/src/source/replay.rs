@@ -351,10 +351,8 @@ impl LogReader {
     }
 
     fn read_lines(&mut self, text: &[u8]) {
-        let mut line = 0;
         let mut decoder = LineDecoder::new();
-        for bytes in text.split_inclusive(|byte| *byte == b'\n') {
-            line += 1;
+        for (line, bytes) in (1..).zip(text.split_inclusive(|byte| *byte == b'\n')) {
             let mut take = |event| match event {
                 LineEvent::Sample(sample) => {
                     let Some(t_ns) = sample.device_us.checked_mul(1000) else {

@@ -373,7 +373,7 @@ mod tests {
 
     #[test]
     fn a_half_line_costs_itself_and_not_its_neighbour() {
-        let half = &encoded(&sample())[..12];
+        let half = &encoded(&sample())[..11];
         let text = format!("{half}{}{}", encoded(&sample()), encoded(&sample()));
         let good = LineEvent::Sample(sample());
         assert_eq!(decode(text.as_bytes()), [LineEvent::Rejected(LineFault::BadCrc), good, good]);

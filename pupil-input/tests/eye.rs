@@ -1,0 +1,233 @@
+//! The estimate against the true diameter of a made-up eye.
+
+mod support;
+
+use holod_calibration::{TimeNs, rig};
+use holod_pupil_input::{
+    Decision, Estimator, EstimatorSettings, MockSource, PupilSample, PupilState, Rejection, SampleEye, Scenario,
+    Verdict,
+};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use support::settings;
+
+/// (time, true, estimated, state) of the left eye at each of its samples.
+fn followed(
+    source: MockSource,
+    settings: EstimatorSettings,
+    seconds: f64,
+    ahead: TimeNs,
+) -> Vec<(f64, f32, f32, PupilState)> {
+    let mut estimator = Estimator::new(settings);
+    let mut out = Vec::new();
+    for mock in source.take_while(|mock| mock.sample.t_sample < TimeNs::from_seconds(seconds)) {
+        estimator.push(mock.sample, |_| {});
+        if mock.sample.eye == SampleEye::Left {
+            let estimate = estimator.pupil_at(mock.sample.t_sample + ahead);
+            out.push((mock.sample.t_sample.seconds(), mock.truth_mm, estimate.pupil.mm(), estimate.state));
+        }
+    }
+    out
+}
+
+fn rms(errors: impl Iterator<Item = f32>) -> f32 {
+    let (sum, count) = errors.fold((0.0, 0.0), |(sum, count), error| (sum + error * error, count + 1.0));
+    (sum / count).sqrt()
+}
+
+fn sample(t_ms: i64, eye: SampleEye, diameter_mm: f32) -> PupilSample {
+    let t = TimeNs(t_ms * 1_000_000);
+    PupilSample {
+        t_device: t,
+        t_sample: t,
+        t_arrival: t,
+        eye,
+        diameter_mm,
+        confidence: 1.0,
+        aperture_mm: None,
+        sequence: None,
+    }
+}
+
+/// Pushes one eye's diameters, `interval_ms` apart from `from_ms` on, and gives what was decided.
+fn push_all(estimator: &mut Estimator, eye: SampleEye, from_ms: i64, diameters_mm: &[f32]) -> Vec<Decision> {
+    let mut decisions = Vec::new();
+    for (k, &diameter_mm) in diameters_mm.iter().enumerate() {
+        estimator.push(sample(from_ms + 5 * k as i64, eye, diameter_mm), |decision| decisions.push(decision));
+    }
+    decisions
+}
+
+fn at(estimator: &Estimator, t_ms: i64) -> (f32, PupilState) {
+    let estimate = estimator.pupil_at(TimeNs(t_ms * 1_000_000));
+    (estimate.pupil.mm(), estimate.state)
+}
+
+#[test]
+fn a_ramp_is_followed_within_the_stated_lag() {
+    for speed_mm_per_s in [-4.0_f32, 1.3] {
+        let mut estimator = Estimator::new(settings(rig::Eye::Left));
+        let truth = |t_ms: i64| 5.0 + speed_mm_per_s * (t_ms - 2000).clamp(0, 500) as f32 * 1e-3;
+        let mut worst_ms = 0.0_f32;
+        for k in 0..=500 {
+            let t_ms = 5 * k;
+            estimator.push(sample(t_ms, SampleEye::Left, truth(t_ms)), |_| {});
+            // After the onset, which no filter can foresee.
+            if t_ms > 2200 {
+                let behind_mm = at(&estimator, t_ms).0 - truth(t_ms);
+                worst_ms = worst_ms.max(behind_mm / -speed_mm_per_s * 1e3);
+            }
+        }
+        eprintln!("ramp of {speed_mm_per_s} mm/s: {worst_ms:.1} ms behind 200 ms after its onset");
+        assert!(worst_ms < 25.0, "{worst_ms}");
+    }
+}
+
+#[test]
+fn the_error_on_a_made_up_eye_is_small() {
+    // rms of all, and the worst while tracking, of the estimate for the present moment.
+    let limits = [
+        (Scenario::Steady, 0.05, 0.15),
+        (Scenario::LightSteps, 0.08, 0.45),
+        (Scenario::Sweep, 0.09, 0.40),
+        (Scenario::Blinks, 0.07, 0.25),
+    ];
+    for (scenario, rms_mm, worst_mm) in limits {
+        for source in [MockSource::new(scenario, 7), MockSource::new(scenario, 7).without_confidence()] {
+            let trace = followed(source, settings(rig::Eye::Left), 32.0, TimeNs(0));
+            let settled = || trace.iter().filter(|row| row.0 > 1.0);
+            let error = rms(settled().map(|row| row.2 - row.1));
+            let tracking = settled().filter(|row| row.3 == PupilState::Tracking);
+            let worst = tracking.map(|row| (row.2 - row.1).abs()).fold(0.0, f32::max);
+            eprintln!("{:12} rms {error:.3} mm, worst while tracking {worst:.3} mm", scenario.name());
+            assert!(error < rms_mm, "{}: {error}", scenario.name());
+            assert!(worst < worst_mm, "{}: {worst}", scenario.name());
+        }
+    }
+}
+
+#[test]
+fn noise_is_damped() {
+    for (rate_hz, greatest_gain) in [(60, 0.8), (200, 0.6), (1000, 0.4)] {
+        let noise_mm = 0.06;
+        let mut random = Pcg64Mcg::seed_from_u64(9);
+        let mut estimator = Estimator::new(settings(rig::Eye::Left));
+        let mut errors = Vec::new();
+        for k in 0..60 * rate_hz {
+            // The sum of twelve uniform deviates is all but normal.
+            let deviate: f32 = (0..12).map(|_| random.random::<f32>()).sum::<f32>() - 6.0;
+            let t = TimeNs(k * 1_000_000_000 / rate_hz);
+            let noisy = PupilSample { t_sample: t, ..sample(0, SampleEye::Left, 4.0 + noise_mm * deviate) };
+            estimator.push(noisy, |_| {});
+            if k > rate_hz {
+                errors.push(estimator.pupil_at(t).pupil.mm() - 4.0);
+            }
+        }
+        let gain = rms(errors.into_iter()) / noise_mm;
+        eprintln!("noise gain at {rate_hz} Hz: {gain:.2}");
+        assert!((0.05..greatest_gain).contains(&gain), "{rate_hz} Hz: {gain}");
+    }
+}
+
+#[test]
+fn a_loss_is_held_then_slides_to_the_fallback_and_back() {
+    let mut estimator = Estimator::new(settings(rig::Eye::Left));
+    assert_eq!(at(&estimator, 0), (3.0, PupilState::Fallback));
+    push_all(&mut estimator, SampleEye::Left, 0, &[5.0; 400]);
+    assert_eq!(at(&estimator, 2000), (5.0, PupilState::Tracking));
+    // The last sample that was believed is of 1.96 s.
+    assert_eq!(at(&estimator, 2200), (5.0, PupilState::Holding));
+    assert_eq!(at(&estimator, 2950), (5.0, PupilState::Holding));
+    let (sliding, state) = at(&estimator, 2965 + 500);
+    assert_eq!(state, PupilState::Fallback);
+    assert!((sliding - (5.0 - 0.65)).abs() < 0.02, "{sliding}");
+    assert_eq!(at(&estimator, 10_000), (3.0, PupilState::Fallback));
+    // Back at 10 s: after the guards it slides, no faster than a pupil, to what is measured.
+    let mut shown = vec![at(&estimator, 10_000).0];
+    for k in 0..300 {
+        let t_ms = 10_000 + 5 * k;
+        estimator.push(sample(t_ms, SampleEye::Left, 5.0), |_| {});
+        shown.push(at(&estimator, t_ms).0);
+    }
+    let fastest = shown.windows(2).map(|pair| (pair[1] - pair[0]).abs() / 5e-3).fold(0.0, f32::max);
+    assert!(fastest < 5.5, "{fastest} mm/s");
+    assert_eq!(at(&estimator, 11_495), (5.0, PupilState::Tracking));
+}
+
+#[test]
+fn losing_one_of_two_eyes_does_not_jump() {
+    let mut estimator = Estimator::new(settings(rig::Eye::Both));
+    let (left_mm, right_mm) = (3.72, 3.35);
+    let mut shown = Vec::new();
+    for k in 0..1200 {
+        let t_ms = 5 * k;
+        estimator.push(sample(t_ms, SampleEye::Left, left_mm), |_| {});
+        // The right eye is lost from the third second to the fourth.
+        let lost = (3000..4000).contains(&t_ms);
+        estimator.push(sample(t_ms, SampleEye::Right, if lost { 0.0 } else { right_mm }), |_| {});
+        if t_ms > 1000 {
+            assert_eq!(at(&estimator, t_ms).1, PupilState::Tracking, "{t_ms} ms");
+            shown.push(at(&estimator, t_ms).0);
+        }
+    }
+    let mean_mm = 0.5 * (left_mm + right_mm);
+    assert!(shown.iter().all(|mm| (mm - mean_mm).abs() < 0.01), "{shown:?}");
+}
+
+#[test]
+fn one_eye_alone_is_taken_as_it_is() {
+    let mut estimator = Estimator::new(settings(rig::Eye::Both));
+    push_all(&mut estimator, SampleEye::Right, 0, &[3.35; 400]);
+    assert!((at(&estimator, 2000).0 - 3.35).abs() < 1e-3);
+}
+
+#[test]
+fn only_the_chosen_eye_counts_and_the_scale_is_applied() {
+    let mut settings = settings(rig::Eye::Right);
+    settings.scale = 0.5;
+    let mut estimator = Estimator::new(settings);
+    let other = push_all(&mut estimator, SampleEye::Left, 0, &[4.0]);
+    assert_eq!(other[0].verdict, Verdict::Rejected(Rejection::OtherEye));
+    push_all(&mut estimator, SampleEye::Right, 5, &[8.0; 400]);
+    let estimate = estimator.pupil_at(TimeNs(2_000_000_000));
+    assert!((estimate.pupil.mm() - 4.0).abs() < 1e-3);
+    assert_eq!(estimate.raw_mm, Some(4.0));
+    assert_eq!(estimate.t_sample, Some(TimeNs(2_000_000_000)));
+}
+
+#[test]
+fn a_pupil_that_changed_behind_the_lid_is_believed_soon_after() {
+    let mut estimator = Estimator::new(settings(rig::Eye::Left));
+    push_all(&mut estimator, SampleEye::Left, 0, &[5.0; 200]);
+    push_all(&mut estimator, SampleEye::Left, 1000, &[0.5; 50]);
+    push_all(&mut estimator, SampleEye::Left, 1250, &[3.8; 200]);
+    let (shown, state) = at(&estimator, 2245);
+    assert_eq!(state, PupilState::Tracking);
+    assert!((shown - 3.8).abs() < 0.05, "{shown}");
+}
+
+proptest::proptest! {
+    #![proptest_config(proptest::test_runner::Config { failure_persistence: None, ..Default::default() })]
+
+    #[test]
+    fn any_stream_gives_a_diameter_of_a_pupil_and_one_decision_a_sample(
+        rows in proptest::collection::vec((-20_i64..200, 0..3_usize, -2.0_f32..12.0, 0.0_f32..1.0, proptest::bool::ANY), 1..300),
+    ) {
+        let mut estimator = Estimator::new(settings(rig::Eye::Both));
+        let mut decided = 0;
+        let mut t_ms = 0;
+        for &(step_ms, eye, diameter_mm, confidence, steady) in &rows {
+            t_ms += step_ms;
+            let diameter_mm = if steady { 4.0 } else if diameter_mm < -1.0 { f32::NAN } else { diameter_mm };
+            let confidence = if steady { 1.0 } else { confidence };
+            estimator.push(PupilSample { confidence, ..sample(t_ms, SampleEye::ALL[eye], diameter_mm) }, |_| decided += 1);
+            for ahead_ms in [-50, 0, 30, 3000] {
+                let estimate = estimator.pupil_at(TimeNs((t_ms + ahead_ms) * 1_000_000));
+                proptest::prop_assert!((1.0..=9.0).contains(&estimate.pupil.mm()), "{:?}", estimate);
+                proptest::prop_assert!(estimate.velocity_mm_per_s.is_finite());
+            }
+        }
+        estimator.finish(|_| decided += 1);
+        proptest::prop_assert_eq!(decided, rows.len());
+    }
+}

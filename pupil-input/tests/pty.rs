@@ -1,0 +1,309 @@
+//! Trackers that run: on real PTYs that are unplugged, fall silent and send rubbish, and on logs.
+
+mod support;
+
+use std::io::Write as _;
+use std::os::unix::fs::symlink;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use holod_calibration::{TimeNs, rig};
+use holod_pupil_input::wire::line::{LineFault, LineSample, encode_line};
+use holod_pupil_input::{
+    Counter, Link, LogFault, PupilState, Recording, SampleEye, Tracker, TrackerHandle, TrackerSpec, Verdict, host_now,
+};
+use serialport::{SerialPort, TTYPort};
+use support::{NEON_BLINKS_S, neon_like_csv};
+use tempfile::TempDir;
+
+/// A tracker at the far end of a PTY. Dropping it unplugs it.
+struct Plug {
+    tracker: TTYPort,
+    /// Kept open, so that the tracker may write before holod reads.
+    port: TTYPort,
+}
+
+impl Plug {
+    fn new() -> Self {
+        let (tracker, port) = TTYPort::pair().expect("a PTY");
+        Self { tracker, port }
+    }
+
+    /// Where holod finds it.
+    fn path(&self) -> String {
+        self.port.name().expect("a path")
+    }
+
+    fn send(&mut self, bytes: &[u8]) {
+        self.tracker.write_all(bytes).expect("writes");
+    }
+}
+
+fn start(spec: &str) -> TrackerHandle {
+    let settings = rig::Tracker { eye: rig::Eye::Left, ..rig::Rig::default().tracker };
+    Tracker::start(&spec.parse().expect("a spec"), &settings, host_now()).expect("starts")
+}
+
+fn refused(spec: &str) -> String {
+    let spec: TrackerSpec = spec.parse().expect("a spec");
+    Tracker::start(&spec, &rig::Rig::default().tracker, host_now()).expect_err("is refused").to_string()
+}
+
+/// Waits until `holds`, for as long as a slow machine may need.
+fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
+    let begun = Instant::now();
+    while !holds() {
+        assert!(begun.elapsed() < Duration::from_secs(20), "never came: {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn line(sequence: u64, diameter_mm: f32) -> String {
+    let mut text = String::new();
+    let eye = SampleEye::Left;
+    encode_line(
+        &LineSample { sequence, device_us: sequence as i64 * 5000, eye, diameter_mm, confidence: 1.0 },
+        &mut text,
+    );
+    text
+}
+
+/// Sends steady samples at about 200 Hz until `holds`; gives the next sequence number.
+fn feed_until(tracker: &mut Plug, first: u64, what: &str, mut holds: impl FnMut() -> bool) -> u64 {
+    let mut sequence = first;
+    eventually(what, || {
+        tracker.send(line(sequence, 4.0).as_bytes());
+        sequence += 1;
+        holds()
+    });
+    sequence
+}
+
+fn tracks(handle: &mut TrackerHandle) -> bool {
+    let estimate = handle.pupil_at(host_now());
+    estimate.state == PupilState::Tracking && (estimate.pupil.mm() - 4.0).abs() < 0.01
+}
+
+#[test]
+fn samples_are_followed_and_rubbish_is_counted() {
+    let mut tracker = Plug::new();
+    let mut handle = start(&tracker.path());
+    let next = feed_until(&mut tracker, 0, "tracking", || tracks(&mut handle));
+    let before = handle.counters();
+    assert_eq!(before.of(Counter::Connects), 1);
+    assert_eq!(before.faults_in_all(), 0);
+
+    let half = &line(next, 4.0)[..10];
+    let rubbish = format!(
+        "# hello\r\n{}\nnonsense\n{half}{}{}{}",
+        "x".repeat(5000),
+        line(next + 1, 4.0),
+        line(next + 2, 4.0).replace("4,1", "5,1"),
+        line(next + 5, 4.0).replace('\n', "\r\n"),
+    );
+    // Byte by byte, as a slow port has it.
+    for byte in rubbish.as_bytes() {
+        tracker.send(&[*byte]);
+    }
+    feed_until(&mut tracker, next + 6, "tracking through rubbish", || {
+        handle.counters().of(Counter::Samples) > before.of(Counter::Samples) + 10 && tracks(&mut handle)
+    });
+    let counters = handle.counters();
+    assert_eq!(counters.of(Counter::Comments), 1);
+    assert_eq!(counters.fault(LogFault::Line(LineFault::TooLong)), 1);
+    assert_eq!(counters.fault(LogFault::Line(LineFault::Malformed)), 1);
+    assert_eq!(counters.fault(LogFault::Line(LineFault::BadCrc)), 2);
+    assert_eq!(counters.of(Counter::SequenceGaps), 2);
+    assert_eq!(counters.of(Counter::SequenceMissing), 4);
+    assert_eq!(counters.of(Counter::Disconnects), 0);
+    handle.stop();
+    assert_eq!(handle.link(), Link::Finished);
+
+    let mut accepted = 0;
+    while let Some(decision) = handle.decisions().pop() {
+        accepted += u64::from(decision.verdict == Verdict::Accepted);
+    }
+    let counters = handle.counters();
+    assert_eq!(accepted, counters.of(Counter::Accepted));
+    assert_eq!(counters.of(Counter::Accepted) + counters.rejected_in_all(), counters.of(Counter::Samples));
+}
+
+#[test]
+fn a_port_that_is_unplugged_is_opened_again_where_it_comes_back() {
+    let dir = TempDir::new().expect("a folder");
+    let by_id = dir.path().join("tracker");
+    let mut tracker = Plug::new();
+    symlink(tracker.path(), &by_id).expect("links");
+    let mut handle = start(&format!("serial:{},baud=9600", by_id.display()));
+    feed_until(&mut tracker, 0, "tracking", || tracks(&mut handle));
+
+    drop(tracker);
+    std::fs::remove_file(&by_id).expect("unlinks");
+    eventually("the loss", || handle.link() == Link::Down);
+    eventually("holding", || handle.pupil_at(host_now()).state == PupilState::Holding);
+    eventually("tries", || handle.counters().of(Counter::ReconnectAttempts) >= 2);
+    eventually("fallback", || handle.pupil_at(host_now() + TimeNs::from_seconds(5.0)).pupil.mm() == 3.0);
+
+    // A file or folder in its place is no port.
+    std::fs::create_dir(&by_id).expect("a folder");
+    let tries = handle.counters().of(Counter::ReconnectAttempts);
+    eventually("another try", || handle.counters().of(Counter::ReconnectAttempts) > tries);
+    std::fs::remove_dir(&by_id).expect("removes");
+
+    let mut tracker = Plug::new();
+    symlink(tracker.path(), &by_id).expect("links");
+    // The tracker restarted: numbers and clock begin anew.
+    feed_until(&mut tracker, 0, "tracking again", || tracks(&mut handle));
+    let counters = handle.counters();
+    assert_eq!(counters.of(Counter::Disconnects), 1);
+    assert_eq!(counters.of(Counter::Connects), 2);
+    assert_eq!(counters.of(Counter::SequenceRestarts), 0);
+}
+
+#[test]
+fn silence_is_noticed_once_and_ends() {
+    let mut tracker = Plug::new();
+    let mut handle = start(&tracker.path());
+    let next = feed_until(&mut tracker, 0, "tracking", || tracks(&mut handle));
+    eventually("silence", || handle.link() == Link::Silent);
+    std::thread::sleep(Duration::from_millis(200));
+    assert_eq!(handle.counters().of(Counter::Silences), 1);
+    feed_until(&mut tracker, next, "tracking again", || tracks(&mut handle));
+    assert_eq!(handle.link(), Link::Up);
+}
+
+#[test]
+fn stopping_does_not_wait_for_the_tracker() {
+    let tracker = Plug::new();
+    let mut handle = start(&tracker.path());
+    handle.stop();
+    assert!(handle.finished());
+    // The port is free again.
+    start(&tracker.path()).stop();
+    // So it is in the middle of a log that has hours to go.
+    let dir = TempDir::new().expect("a folder");
+    let log = dir.path().join("log");
+    std::fs::write(&log, line(0, 4.0) + &line(3_600_000, 4.0)).expect("writes");
+    start(&log.display().to_string()).stop();
+}
+
+#[test]
+fn what_is_no_port_is_refused_with_what_to_do() {
+    let dir = TempDir::new().expect("a folder");
+    let message = refused("/dev/holod-no-such-port");
+    assert!(message.contains("/dev/holod-no-such-port does not exist"), "{message}");
+    assert!(message.contains("port"), "{message}");
+    let message = refused(&dir.path().display().to_string());
+    assert!(message.contains("is a directory; expected a serial port"), "{message}");
+    let file = dir.path().join("log.csv");
+    std::fs::write(&file, "x").expect("writes");
+    let message = refused(&format!("serial:{}", file.display()));
+    assert!(message.contains("is a regular file"), "{message}");
+    assert!(message.contains(&format!("replay:{}", file.display())), "{message}");
+    let message = refused("/dev/null");
+    assert!(message.contains("/dev/null does not open"), "{message}");
+    let message = refused(&file.display().to_string());
+    assert!(message.contains("found `x`"), "{message}");
+
+    let tracker = Plug::new();
+    let _first = start(&tracker.path());
+    let message = refused(&tracker.path());
+    assert!(message.contains("another program"), "{message}");
+}
+
+/// Plays a Neon-like log in real time, as protocol lines of confidence 1, through a PTY.
+#[test]
+fn blinks_are_held_on_a_pty_that_tells_only_diameters() {
+    let dir = TempDir::new().expect("a folder");
+    let log = dir.path().join("log.csv");
+    std::fs::write(&log, neon_like_csv(12)).expect("writes");
+    let recording = Recording::read(&log).expect("reads");
+    let mut tracker = Plug::new();
+    let mut handle = start(&tracker.path());
+
+    let begun = host_now();
+    let first = recording.begins();
+    let mut held_in = [false; NEON_BLINKS_S.len()];
+    for (sequence, sample) in recording.samples().filter(|sample| sample.eye == SampleEye::Left).enumerate() {
+        let since = sample.t_sample - first;
+        let due = begun + since - host_now();
+        std::thread::sleep(Duration::from_nanos(due.0.max(0).unsigned_abs()));
+        let mut text = String::new();
+        let device_us = since.0 / 1000;
+        let diameter_mm = sample.diameter_mm;
+        let eye = SampleEye::Left;
+        encode_line(&LineSample { sequence: sequence as u64, device_us, eye, diameter_mm, confidence: 1.0 }, &mut text);
+        tracker.send(text.as_bytes());
+        if since > TimeNs::from_seconds(0.6) {
+            for ahead_ms in [0, 20, 40] {
+                let estimate = handle.pupil_at(host_now() + TimeNs(ahead_ms * 1_000_000));
+                assert!((3.3..4.3).contains(&estimate.pupil.mm()), "{estimate:?} at {} s", since.seconds());
+                for (held, begin_s) in held_in.iter_mut().zip(NEON_BLINKS_S) {
+                    let within = (begin_s + 0.1..begin_s + 0.2).contains(&since.seconds());
+                    *held |= within && estimate.state == PupilState::Holding;
+                }
+            }
+        }
+    }
+    assert_eq!(held_in, [true; 2]);
+}
+
+fn play(path: &Path, options: &str) -> TrackerHandle {
+    start(&format!("replay:{}{options}", path.display()))
+}
+
+#[test]
+fn a_log_ends_in_the_fallback() {
+    let dir = TempDir::new().expect("a folder");
+    let log = dir.path().join("log.csv");
+    std::fs::write(&log, neon_like_csv(13)).expect("writes");
+    for options in [",speed=20", ",speed=max"] {
+        let mut handle = play(&log, options);
+        eventually("the end", || handle.finished());
+        let counters = handle.counters();
+        assert_eq!(counters.of(Counter::Samples), 2000);
+        assert_eq!(counters.of(Counter::Accepted) + counters.rejected_in_all(), 2000);
+        assert_eq!(counters.rejected(holod_pupil_input::Rejection::OtherEye), 1000);
+        assert!(counters.of(Counter::Accepted) > 800, "{options}: {}", counters.of(Counter::Accepted));
+        let later = handle.pupil_at(host_now() + TimeNs::from_seconds(30.0));
+        assert_eq!((later.state, later.pupil.mm()), (PupilState::Fallback, 3.0));
+        if options == ",speed=max" {
+            let now = handle.pupil_at(host_now());
+            assert!(now.raw_mm.is_some_and(|raw_mm| (3.3..4.2).contains(&raw_mm)));
+        }
+        let mut last = TimeNs(i64::MIN);
+        while let Some(decision) = handle.decisions().pop() {
+            last = last.max(decision.sample.t_sample);
+        }
+        assert!(last <= host_now(), "decisions are on the host's clock");
+    }
+}
+
+#[test]
+fn a_looped_log_goes_on() {
+    let dir = TempDir::new().expect("a folder");
+    let log = dir.path().join("log");
+    std::fs::write(&log, (0..200).map(|k| line(k, 4.0)).collect::<String>()).expect("writes");
+    let mut handle = play(&log, ",speed=50,loop");
+    eventually("three loops", || handle.counters().of(Counter::Loops) >= 3);
+    eventually("tracking", || tracks(&mut handle));
+    let counters = handle.counters();
+    assert_eq!(counters.rejected_in_all(), 0, "the seam is no step");
+    assert!(!handle.finished());
+}
+
+#[test]
+fn the_mock_runs_and_is_followed() {
+    let mut handle = start("mock:steady");
+    eventually("tracking", || {
+        let estimate = handle.pupil_at(host_now());
+        estimate.state == PupilState::Tracking && (3.7..4.4).contains(&estimate.pupil.mm())
+    });
+    let (mut reader, mut tap, mut control) = handle.split();
+    let t = host_now();
+    assert_eq!(reader.pupil_at(t).state, PupilState::Tracking);
+    assert!(tap.pop().is_some());
+    assert_eq!(control.link(), Link::Up);
+    control.stop();
+    assert!(control.finished());
+}
