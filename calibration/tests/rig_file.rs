@@ -608,7 +608,8 @@ fn a_flatness_picture_is_read_at_either_depth() {
 
 #[test]
 fn a_faulty_flatness_picture_is_named() {
-    let cases: [(fn(&Path), &str); 4] = [
+    type Write = fn(&Path);
+    let cases: [(Write, &str); 4] = [
         (|path| GrayImage::new(66, 64).save(path).unwrap(), "66x64 pixels"),
         (|path| RgbImage::new(64, 66).save(path).unwrap(), "Rgb8 pixels"),
         (|path| fs::write(path, b"no picture").unwrap(), "flat.png: "),
