@@ -406,3 +406,261 @@ fn circle_distance(a_rad: f64, b_rad: f64) -> f64 {
     let apart = (a_rad - b_rad).rem_euclid(TAU);
     apart.min(TAU - apart)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fields::FrameLayout;
+    use holod_calibration::rig::{PanelMode, Rig};
+    use proptest::prelude::*;
+
+    const FULL_STROKE_RAD: f64 = TAU * 255.0 / 256.0;
+
+    fn panel() -> Panel {
+        Rig::default().panel
+    }
+
+    fn row(pixels: usize) -> Resolution {
+        Resolution { width: pixels, height: 1 }
+    }
+
+    fn encoded(panel: &Panel, phases_rad: &[f32]) -> (Vec<u16>, f32) {
+        let size = row(phases_rad.len());
+        let encoder = PanelEncoder::new(panel, size, size).unwrap();
+        let mut frame = LevelsFrame::new(FrameLayout::new(panel, size));
+        let report = encoder.encode(PerColour([phases_rad; 3]), &mut frame);
+        (frame.unpack_colour(Colour::Green).levels, report.unreachable_share[Colour::Green])
+    }
+
+    /// The first pixel whose shown phase is farther than `tolerance_rad` from the one asked for.
+    fn first_wrong(asked_rad: &[f32], shown_rad: &[f32], tolerance_rad: f64) -> Option<usize> {
+        let apart = |(&a, &b): (&f32, &f32)| circle_distance(f64::from(a), f64::from(b)) > tolerance_rad;
+        asked_rad.iter().zip(shown_rad).position(apart)
+    }
+
+    fn nearest_by_search(panel: &Panel, phase_rad: f64) -> f64 {
+        let levels = signed_phases(panel, Colour::Green).unwrap();
+        levels.iter().map(|&level_rad| circle_distance(level_rad, phase_rad)).fold(f64::MAX, f64::min)
+    }
+
+    #[test]
+    fn levels_of_the_default_panel_are_one_256th_of_a_turn_apart() {
+        let phases: Vec<f32> = (0..256).map(|level| (TAU * f64::from(level) / 256.0) as f32).collect();
+        let (levels, unreachable) = encoded(&panel(), &phases);
+        assert_eq!(levels, (0..256).collect::<Vec<u16>>());
+        assert_eq!(unreachable, 0.0);
+    }
+
+    #[test]
+    fn rounding_goes_round_the_circle() {
+        let step = TAU / 256.0;
+        let phases = [TAU - 0.4 * step, TAU - 0.6 * step, 0.4 * step, 0.6 * step].map(|phase| phase as f32);
+        assert_eq!(encoded(&panel(), &phases).0, [0, 255, 0, 1]);
+    }
+
+    #[test]
+    fn a_stroke_of_a_whole_turn_leaves_its_top_level_unused() {
+        let panel = Panel { stroke_rad: PerColour([TAU; 3]), ..panel() };
+        let phases: Vec<f32> = (0..5000).map(|part| (TAU * f64::from(part) / 5000.0) as f32).collect();
+        let (levels, unreachable) = encoded(&panel, &phases);
+        assert_eq!(levels.iter().max(), Some(&254));
+        assert_eq!(unreachable, 0.0);
+        let half_step = 0.5 * TAU / 255.0;
+        assert_eq!(encoded(&panel, &[(TAU - 0.9 * half_step) as f32, (TAU - 1.2 * half_step) as f32]).0, [0, 254]);
+    }
+
+    #[test]
+    fn a_short_stroke_goes_to_the_nearer_rim_and_says_how_often() {
+        let half_turn = Panel { stroke_rad: PerColour([TAU / 2.0; 3]), ..panel() };
+        let (levels, unreachable) = encoded(&half_turn, &[0.7, 0.55, 0.8, 0.25].map(|turns: f32| turns * TAU as f32));
+        assert_eq!(levels, [255, 255, 0, 128]);
+        assert_eq!(unreachable, 0.75);
+        let circle: Vec<f32> = (0..8192).map(|part| (TAU * (f64::from(part) + 0.5) / 8192.0) as f32).collect();
+        let (_, unreachable) = encoded(&half_turn, &circle);
+        assert!((unreachable - 0.5).abs() < 0.01, "{unreachable}");
+    }
+
+    #[test]
+    fn a_long_stroke_uses_its_first_turn_only() {
+        let long = Panel { stroke_rad: PerColour([1.5 * TAU; 3]), ..panel() };
+        let circle: Vec<f32> = (0..8192).map(|part| (TAU * (f64::from(part) + 0.5) / 8192.0) as f32).collect();
+        let (levels, unreachable) = encoded(&long, &circle);
+        assert!(levels.iter().all(|&level| level <= 170));
+        assert_eq!(unreachable, 0.0);
+    }
+
+    #[test]
+    fn phases_outside_the_circle_are_wrapped() {
+        let inside = [0.1f32, 3.0, 6.0];
+        let outside = [0.1 - TAU as f32, 3.0 + 5.0 * TAU as f32, 6.0 - 7.0 * TAU as f32];
+        assert_eq!(encoded(&panel(), &inside).0, encoded(&panel(), &outside).0);
+    }
+
+    #[test]
+    fn a_negative_sign_turns_the_levels_round() {
+        let negative = Panel { phase_sign: PhaseSign::Negative, ..panel() };
+        let quarter = [0.25 * TAU as f32];
+        assert_eq!(encoded(&panel(), &quarter).0, [64]);
+        assert_eq!(encoded(&negative, &quarter).0, [192]);
+    }
+
+    #[test]
+    fn a_falling_table_is_signed_already() {
+        let falling: Vec<f64> = (0..256).map(|level| -FULL_STROKE_RAD * f64::from(level) / 255.0).collect();
+        let lut_rad = PerColour([None, Some(falling), None]);
+        let negative = Panel { phase_sign: PhaseSign::Negative, lut_rad: lut_rad.clone(), ..panel() };
+        assert_eq!(encoded(&negative, &[0.25 * TAU as f32]).0, [192]);
+        let positive = Panel { lut_rad, ..panel() };
+        let refused = PanelEncoder::new(&positive, row(4), row(4)).unwrap_err();
+        assert_eq!(refused, LevelsError::LutSign { colour: Colour::Green });
+    }
+
+    #[test]
+    fn a_small_pattern_is_centred_in_a_flat_surround() {
+        let panel = Panel { mode: PanelMode::FieldSequential, ..panel() };
+        let (big, small) = (Resolution { width: 6, height: 5 }, Resolution { width: 3, height: 2 });
+        let encoder = PanelEncoder::new(&panel, big, small).unwrap();
+        let mut frame = LevelsFrame::new(FrameLayout::new(&panel, big));
+        for colour in Colour::ALL {
+            frame.field_mut(colour).write(&[99; 30]);
+        }
+        let half_turn = [TAU as f32 / 2.0; 6];
+        encoder.encode(PerColour([&half_turn; 3]), &mut frame);
+        let (z, x) = (0, 128);
+        let expected =
+            [[z, z, z, z, z, z], [z, x, x, x, z, z], [z, x, x, x, z, z], [z, z, z, z, z, z], [z, z, z, z, z, z]];
+        let levels = frame.unpack_colour(Colour::Red).levels;
+        assert_eq!(levels, expected.concat());
+        assert_eq!(first_wrong(&half_turn, &encoder.decode_pattern(Colour::Red, &levels), 1e-6), None);
+        encoder.encode_flat(&mut frame);
+        assert_eq!(frame.samples(), [0; 90]);
+    }
+
+    #[test]
+    fn flatness_is_added_before_wrapping_and_taken_off_when_decoded() {
+        let flatness = vec![0.75 * TAU as f32, -0.25 * TAU as f32, 0.0];
+        let panel = Panel { flatness_rad: PerColour([None, Some(flatness), None]), ..panel() };
+        let half_turn = [TAU as f32 / 2.0; 3];
+        let (levels, _) = encoded(&panel, &half_turn);
+        assert_eq!(levels, [64, 64, 128]);
+        let shown = PanelEncoder::new(&panel, row(3), row(3)).unwrap().decode(Colour::Green, &levels);
+        assert_eq!(first_wrong(&half_turn, &shown, 1e-6), None);
+    }
+
+    #[test]
+    fn bad_descriptions_are_refused_with_what_is_wrong() {
+        let green = |lut: Vec<f64>| PerColour([None, Some(lut), None]);
+        let colour = Colour::Green;
+        let mut bent: Vec<f64> = (0..256).map(f64::from).collect();
+        bent[100] = 0.0;
+        let mut hole = bent.clone();
+        hole[7] = f64::NAN;
+        let cases = [
+            (Panel { bit_depth: 12, ..panel() }, LevelsError::BitDepth { found: 12 }),
+            (
+                Panel { lut_rad: green(vec![0.0; 255]), ..panel() },
+                LevelsError::LutLength { colour, found: 255, expected: 256 },
+            ),
+            (Panel { lut_rad: green(bent), ..panel() }, LevelsError::LutShape { colour, level: 100 }),
+            (Panel { lut_rad: green(hole), ..panel() }, LevelsError::LutShape { colour, level: 7 }),
+            (Panel { lut_rad: green(vec![1.0; 256]), ..panel() }, LevelsError::LutShape { colour, level: 255 }),
+            (
+                Panel { flatness_rad: PerColour([None, Some(vec![0.0; 3]), None]), ..panel() },
+                LevelsError::Flatness { colour, found: 3, expected: 4, panel: row(4) },
+            ),
+            (Panel { stroke_rad: PerColour([1.0, -1.0, 1.0]), ..panel() }, LevelsError::Stroke { colour, found: -1.0 }),
+        ];
+        for (panel, expected) in cases {
+            assert_eq!(PanelEncoder::new(&panel, row(4), row(4)).unwrap_err(), expected);
+        }
+        let too_big = PanelEncoder::new(&panel(), row(4), row(5)).unwrap_err();
+        assert_eq!(too_big, LevelsError::PatternSize { pattern: row(5), panel: row(4) });
+    }
+
+    fn panels() -> impl Strategy<Value = Panel> {
+        let lut = prop_oneof![
+            Just(None),
+            (0.3f64..3.0).prop_map(Some), // exponent of a measured, bent response
+        ];
+        (prop::bool::ANY, prop::bool::ANY, prop::bool::ANY, lut, 0.2f64..1.6).prop_map(
+            |(ten_bits, negative, packed, exponent, turns)| {
+                let bit_depth = if ten_bits { 10 } else { 8 };
+                let top = (1u32 << bit_depth) - 1;
+                let bent = exponent.map(|exponent| {
+                    (0..=top)
+                        .map(|level| 0.3 + turns * TAU * (f64::from(level) / f64::from(top)).powf(exponent))
+                        .collect()
+                });
+                Panel {
+                    bit_depth,
+                    phase_sign: if negative { PhaseSign::Negative } else { PhaseSign::Positive },
+                    mode: if packed { PanelMode::ChannelPacked } else { PanelMode::FieldSequential },
+                    stroke_rad: PerColour([turns * TAU; 3]),
+                    lut_rad: PerColour([None, bent, None]),
+                    ..panel()
+                }
+            },
+        )
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(64))]
+
+        /// With any panel, the level shown is the nearest on the circle to within one table entry.
+        #[test]
+        fn every_phase_goes_to_the_nearest_level(
+            panel in panels(), phases in prop::collection::vec(0.0f32..TAU as f32, 1..600),
+        ) {
+            let levels = encoded(&panel, &phases).0;
+            let encoder = PanelEncoder::new(&panel, row(phases.len()), row(phases.len())).unwrap();
+            let shown = encoder.decode(Colour::Green, &levels);
+            let entry_rad = TAU / (ENTRIES_PER_LEVEL << panel.bit_depth) as f64;
+            // In a long stroke a level of the second turn may be nearer: those are left out on purpose.
+            let longest = signed_phases(&panel, Colour::Green).unwrap();
+            let one_turn = (longest[longest.len() - 1] - longest[0]).abs() < TAU;
+            for (&asked, &shown) in phases.iter().zip(&shown).filter(|_| one_turn) {
+                let reached = circle_distance(f64::from(asked), f64::from(shown));
+                let best = nearest_by_search(&panel, f64::from(asked));
+                prop_assert!(reached <= best + entry_rad + 2e-6, "asked {} shown {} best {}", asked, shown, best);
+            }
+        }
+
+        /// A full-stroke panel shows every phase to within half a step, wherever the pattern sits and whatever the
+        /// flatness is.
+        #[test]
+        fn what_is_encoded_is_shown(
+            seed in 0u32..1000, ten_bits in prop::bool::ANY, packed in prop::bool::ANY, negative in prop::bool::ANY,
+            width in 1usize..300, height in 1usize..4, more in 0usize..5,
+        ) {
+            let bit_depth = if ten_bits { 10 } else { 8 };
+            let levels = f64::from(1u32 << bit_depth);
+            let pattern = Resolution { width, height };
+            let size = Resolution { width: width + more, height: height + more };
+            let noise = |index: usize| (index as u32).wrapping_mul(2_654_435_761).wrapping_add(seed * 40_503) as f32 / 4.3e9;
+            let phases: Vec<f32> = (0..pattern.pixels()).map(|index| noise(index) * TAU as f32).collect();
+            let flatness: Vec<f32> = (0..size.pixels()).map(|index| (noise(index + 7) - 0.5) * 40.0).collect();
+            let panel = Panel {
+                bit_depth,
+                mode: if packed { PanelMode::ChannelPacked } else { PanelMode::FieldSequential },
+                phase_sign: if negative { PhaseSign::Negative } else { PhaseSign::Positive },
+                stroke_rad: PerColour([TAU * (levels - 1.0) / levels; 3]),
+                flatness_rad: PerColour([Some(flatness), None, None]),
+                ..panel()
+            };
+            let encoder = PanelEncoder::new(&panel, size, pattern).unwrap();
+            let mut frame = LevelsFrame::new(FrameLayout::new(&panel, size));
+            let report = encoder.encode(PerColour([&phases; 3]), &mut frame);
+            prop_assert_eq!(report, EncodeReport::default());
+            let half_step_rad = TAU / levels / 2.0 + 2e-5;
+            for colour in Colour::ALL {
+                let mut levels = frame.unpack_colour(colour).levels;
+                prop_assert_eq!(first_wrong(&phases, &encoder.decode_pattern(colour, &levels), half_step_rad), None);
+                // Canary: a first pixel that is two levels off is found.
+                let (left, top) = encoder.pattern_origin();
+                let first = top * size.width + left;
+                levels[first] = (levels[first] + 2) % (1 << bit_depth);
+                prop_assert_eq!(first_wrong(&phases, &encoder.decode_pattern(colour, &levels), half_step_rad), Some(0));
+            }
+        }
+    }
+}

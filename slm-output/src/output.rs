@@ -26,10 +26,18 @@ use crate::laser::verify::FieldSpan;
 use crate::laser::{BoxEvent, DarkReason, LaserBox, LaserEdge, LaserError, LaserProgram, SerialBox, SimulatedLaser};
 use crate::levels::PanelEncoder;
 use crate::pacing::{FramePlan, Pacer, PacingConfig};
-use crate::present::{FrameSource, HeadlessPanel, PanelTiming, PresentedField, Presenter, Provenance};
+use crate::present::{
+    FrameSink, FrameSource, HeadlessPanel, PanelTiming, PresentedField, Presenter, Provenance, frame_channel,
+};
 
 /// A monotonic clock. The threads read it; nothing below them does.
 pub type Clock = fn() -> TimeNs;
+
+/// The system's monotonic clock, which a simulated laser box in another process shares.
+pub fn monotonic_now() -> TimeNs {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    TimeNs(now.tv_sec * 1_000_000_000 + now.tv_nsec)
+}
 
 /// Fields on their way to the laser thread, and reports on their way to the frame thread.
 const SHORT_RING: usize = 256;
@@ -96,7 +104,7 @@ pub struct FieldEvent {
     pub laser_on: Option<TimeNs>,
     /// The off edge of its laser, if it was lit.
     pub laser_off: Option<TimeNs>,
-    /// Why it was not lit.
+    /// Why it was not lit, or must not have been.
     pub dark: Option<DarkReason>,
     /// The frame had been shown before: no newer one was there in time.
     pub repeated: bool,
@@ -219,7 +227,7 @@ impl Output {
         let interlock =
             Interlock::new(gate, program.trigger, program.sequence, presenter.is_virtual(), options.stall_timeout);
 
-        let (input, output) = triple_buffer::triple_buffer(&flat_frame(rig, encoder));
+        let (sink, source) = frame_channel(&flat_frame(rig, encoder));
         let (field_producer, field_consumer) = RingBuffer::new(SHORT_RING);
         let (report_producer, report_consumer) = RingBuffer::new(SHORT_RING);
         let (event_producer, event_consumer) = RingBuffer::new(LONG_RING);
@@ -241,7 +249,7 @@ impl Output {
         let laser = std::thread::Builder::new().name("holod-laser".into()).spawn(move || laser_thread.run())?;
         let panel_thread = PanelThread {
             presenter,
-            frames: FrameSource(output),
+            frames: source,
             fields: field_producer,
             reports: report_producer,
             laser: laser.thread().clone(),
@@ -258,13 +266,13 @@ impl Output {
             }
         };
         Ok(Self {
-            frames: FramePort { input, reports: report_consumer },
+            frames: FramePort { sink, reports: report_consumer },
             events: event_consumer,
             box_events: box_consumer,
             control: OutputControl {
                 switch: DarkSwitch { shared, laser: laser.thread().clone() },
                 frame_period: gate.timing().frame_period,
-                threads: Some((panel, laser)),
+                threads: Some(Threads { panel, laser }),
                 clock,
             },
         })
@@ -296,23 +304,26 @@ fn flat_frame(rig: &Rig, encoder: &PanelEncoder) -> LevelsFrame {
 /// The frame thread's end of the output.
 #[derive(Debug)]
 pub struct FramePort {
-    input: triple_buffer::Input<LevelsFrame>,
+    sink: FrameSink,
     reports: Consumer<PresentReport>,
 }
 
 impl FramePort {
     /// The buffer of the next frame, with the levels of some older one in it. Wait-free.
     pub fn acquire(&mut self) -> &mut LevelsFrame {
-        self.input.input_buffer_mut()
+        self.sink.acquire()
     }
 
     /// Hands the acquired frame to the panel, which shows it from its next colour frame on unless a newer one comes
     /// before. With `keep`, the panel stores the levels in that slot when they have come on the panel, over what was
     /// there; they are in the [`ShutdownReport`]. Wait-free.
     pub fn submit(&mut self, plan: &FramePlan, keep: Option<usize>, now: TimeNs) {
-        self.acquire().tag =
-            FrameTag { frame_id: plan.frame_id, t_submit: now, t_desired_present: plan.t_desired_present, keep };
-        self.input.publish();
+        self.sink.submit(FrameTag {
+            frame_id: plan.frame_id,
+            t_submit: now,
+            t_desired_present: plan.t_desired_present,
+            keep,
+        });
     }
 
     /// Gives `pacer` what the panel has reported since the last call, and calls `report` for each report.
@@ -328,12 +339,18 @@ impl FramePort {
     }
 }
 
+#[derive(Debug)]
+struct Threads {
+    panel: JoinHandle<Box<dyn Presenter>>,
+    laser: JoinHandle<()>,
+}
+
 /// Ends the output; dropped, it ends it too.
 #[derive(Debug)]
 pub struct OutputControl {
     switch: DarkSwitch,
     frame_period: TimeNs,
-    threads: Option<(JoinHandle<Box<dyn Presenter>>, JoinHandle<()>)>,
+    threads: Option<Threads>,
     clock: Clock,
 }
 
@@ -377,7 +394,7 @@ impl OutputControl {
             kept: Vec::new(),
             counts: OutputCounts::default(),
         };
-        if let Some((panel, laser)) = self.threads.take() {
+        if let Some(Threads { panel, laser }) = self.threads.take() {
             panel.thread().unpark();
             if let Ok(mut presenter) = panel.join() {
                 report.last_frame = presenter.last_frame().cloned();
@@ -549,26 +566,31 @@ impl LaserThread {
         loop {
             let stop = self.shared.stop.load(Ordering::Acquire);
             let now = (self.clock)();
-            self.poll(now);
-            if let Some(reason) = self.shared.latched() {
-                self.latch(reason, now);
-            }
-            while let Ok(field) = self.fields.pop() {
-                self.on_field(&field, now);
-            }
-            let orders = self.interlock.watch(now);
-            self.obey(orders, now);
-            self.poll(now);
-            self.shared.armed.store(self.interlock.is_armed(), Ordering::Relaxed);
+            self.step(now);
             if stop {
                 self.ledger.flush(TimeNs(i64::MAX), &self.shared);
                 return;
             }
-            self.ledger.flush(now, &self.shared);
             let t_next = self.interlock.t_watch().map_or(SLEEP_MAX, |t| (t - now).max(TimeNs(0)));
             let rest = t_next.min(self.gate.timing().field_period).min(SLEEP_MAX);
             std::thread::park_timeout(Duration::from_nanos(rest.0 as u64));
         }
+    }
+
+    /// Does all that is to be done at `now`.
+    fn step(&mut self, now: TimeNs) {
+        self.poll(now);
+        if let Some(reason) = self.shared.latched() {
+            self.latch(reason, now);
+        }
+        while let Ok(field) = self.fields.pop() {
+            self.on_field(&field, now);
+        }
+        let orders = self.interlock.watch(now);
+        self.obey(orders, now);
+        self.poll(now);
+        self.shared.armed.store(self.interlock.is_armed(), Ordering::Relaxed);
+        self.ledger.flush(now, &self.shared);
     }
 
     fn on_field(&mut self, field: &PresentedField, now: TimeNs) {
@@ -727,7 +749,10 @@ impl Ledger {
             provenance: field.provenance,
             laser_on: on.map(|edge| edge.t),
             laser_off: off.map(|edge| edge.t),
-            dark: if on.is_some() { None } else { dark.or(self.last_dark).or(Some(DarkReason::Late)) },
+            dark: match (on, dark) {
+                (Some(_), reason) => reason.filter(|reason| reason.forbids_light()),
+                (None, reason) => reason.or(self.last_dark).or(Some(DarkReason::Late)),
+            },
             repeated: field.repeated,
             deadline_missed: !field.repeated && late_ns > timing.frame_period.0 / 2,
         }
@@ -735,3 +760,433 @@ impl Ledger {
 }
 
 const _: () = assert!(FIELDS == 3, "three lasers, three fields");
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::laser::verify::{EdgeReport, Finding, verify_edges};
+    use crate::laser::{LitWindow, Refusal};
+    use holod_calibration::rig::{Panel, PanelMode};
+    use holod_calibration::{PerColour, Resolution};
+    use proptest::prelude::*;
+
+    const SIZE: Resolution = Resolution { width: 8, height: 4 };
+    const MS: i64 = 1_000_000;
+    /// When the panel begins its first colour frame.
+    const T_FIRST: TimeNs = TimeNs(10 * MS);
+
+    fn rig(mode: PanelMode) -> Rig {
+        let rig = Rig::default();
+        Rig {
+            panel: Panel { mode, refresh_hz: if mode == PanelMode::ChannelPacked { 60.0 } else { 180.0 }, ..rig.panel },
+            ..rig
+        }
+    }
+
+    /// The panel and the laser thread's work, in a time of its own.
+    struct Bench {
+        panel: HeadlessPanel,
+        sink: FrameSink,
+        source: FrameSource,
+        fields: Producer<PresentedField>,
+        laser: LaserThread,
+        events: Consumer<FieldEvent>,
+        box_events: Consumer<BoxEvent>,
+        /// What is made of the panel's reports on their way.
+        falsify: fn(PresentedField) -> Option<PresentedField>,
+        now: TimeNs,
+        last_frame_id: u64,
+        all_events: Vec<FieldEvent>,
+        edges: Vec<LaserEdge>,
+        darks: Vec<(TimeNs, DarkReason)>,
+    }
+
+    impl Bench {
+        fn new(mode: PanelMode) -> Self {
+            Self::with_box(mode, Box::new(SimulatedLaser::new(TimeNs(0))))
+        }
+
+        fn with_box(mode: PanelMode, mut laser: Box<dyn LaserBox>) -> Self {
+            let rig = rig(mode);
+            let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
+            let flat = flat_frame(&rig, &encoder);
+            let gate = Gate::new(&rig.panel, &rig.lasers).unwrap();
+            let program = gate.program(&rig.panel, &rig.lasers).unwrap();
+            laser.program(&program, TimeNs(0)).unwrap();
+            let (sink, source) = frame_channel(&flat);
+            let (fields, field_consumer) = RingBuffer::new(SHORT_RING);
+            let (event_producer, events) = RingBuffer::new(LONG_RING);
+            let (box_producer, box_events) = RingBuffer::new(LONG_RING);
+            let stall_timeout = TimeNs(500 * MS);
+            let laser = LaserThread {
+                laser,
+                program,
+                interlock: Interlock::new(gate, program.trigger, program.sequence, true, stall_timeout),
+                gate,
+                fields: field_consumer,
+                ledger: Ledger::new(gate, event_producer, box_producer),
+                t_retry: TimeNs(i64::MIN),
+                program_lost: false,
+                shared: Arc::default(),
+                clock: || TimeNs(0),
+            };
+            let panel = HeadlessPanel::new(gate.timing(), flat, T_FIRST, 0);
+            Self {
+                panel,
+                sink,
+                source,
+                fields,
+                laser,
+                events,
+                box_events,
+                falsify: Some,
+                now: TimeNs(0),
+                last_frame_id: 0,
+                all_events: Vec::new(),
+                edges: Vec::new(),
+                darks: Vec::new(),
+            }
+        }
+
+        fn submit(&mut self) {
+            self.last_frame_id += 1;
+            self.sink.submit(FrameTag {
+                frame_id: self.last_frame_id,
+                t_submit: self.now,
+                t_desired_present: self.now,
+                keep: None,
+            });
+        }
+
+        /// Both threads wake up at `now` and do what they find.
+        fn wake(&mut self, now: TimeNs) {
+            self.now = now;
+            let Self { panel, source, fields, falsify, .. } = self;
+            panel.tick(now, source, &mut |field| {
+                if let Some(field) = falsify(field) {
+                    fields.push(field).unwrap();
+                }
+            });
+            self.laser.step(now);
+            while let Ok(event) = self.events.pop() {
+                self.all_events.push(event);
+            }
+            while let Ok(event) = self.box_events.pop() {
+                match event {
+                    BoxEvent::Edge(edge) => self.edges.push(edge),
+                    BoxEvent::Dark { t, reason } => self.darks.push((t, reason)),
+                    BoxEvent::Armed { .. } => {}
+                }
+            }
+        }
+
+        /// Wakes up at every field, `late` after it, with a new frame for every refresh.
+        fn run(&mut self, until: TimeNs, late: TimeNs) {
+            while self.panel.t_next() + late < until {
+                let now = self.panel.t_next() + late;
+                if (self.panel.t_next() - T_FIRST).0 % self.panel.timing().frame_period.0 == 0 {
+                    self.now = self.panel.t_next() - TimeNs(MS);
+                    self.submit();
+                }
+                self.wake(now);
+            }
+        }
+
+        fn verdict(&mut self) -> EdgeReport {
+            // Everything that was begun is over.
+            self.laser.ledger.flush(TimeNs(i64::MAX), &self.laser.shared);
+            while let Ok(event) = self.events.pop() {
+                self.all_events.push(event);
+            }
+            let spans: Vec<_> = self.all_events.iter().map(FieldEvent::span).collect();
+            verify_edges(&spans, &self.edges)
+        }
+    }
+
+    const MODES: [PanelMode; 2] = [PanelMode::ChannelPacked, PanelMode::FieldSequential];
+
+    #[test]
+    fn every_field_is_lit_once_by_its_own_laser() {
+        for mode in MODES {
+            for late_ns in [0, 100_000, 1_900_000] {
+                let mut bench = Bench::new(mode);
+                bench.run(TimeNs(1000 * MS), TimeNs(late_ns));
+                bench.wake(TimeNs(1000 * MS));
+                bench.laser.latch(DarkReason::Shutdown, TimeNs(1000 * MS));
+                bench.wake(TimeNs(1001 * MS));
+                let report = bench.verdict();
+                assert_eq!(report.unsafe_findings().collect::<Vec<_>>(), Vec::<&Finding>::new());
+                assert!(report.fields >= 170, "{report:?}");
+                assert!(report.lit >= report.fields - 2, "{mode:?} late {late_ns}: {report:?}");
+                assert!(bench.all_events.iter().any(|event| !event.repeated && event.laser_on.is_some()));
+            }
+        }
+    }
+
+    #[test]
+    fn events_carry_the_edges_of_their_own_field() {
+        let mut bench = Bench::new(PanelMode::ChannelPacked);
+        bench.run(TimeNs(300 * MS), TimeNs(50_000));
+        for event in bench.all_events.iter().filter(|event| event.dark.is_none()).skip(3) {
+            let (on, off) = (event.laser_on.unwrap(), event.laser_off.unwrap());
+            assert_eq!((on - event.t_present, off - on), (TimeNs(2_100_000), TimeNs(3 * MS)));
+            assert!(on >= event.t_settled && off <= event.t_end);
+        }
+    }
+
+    #[test]
+    fn nothing_is_lit_over_the_flat_pattern_or_before_the_first_frame() {
+        let mut bench = Bench::new(PanelMode::ChannelPacked);
+        for tick in 0..100 {
+            bench.wake(TimeNs(tick * 5 * MS));
+        }
+        assert_eq!((bench.edges.len(), bench.all_events.len()), (0, 0));
+    }
+
+    #[test]
+    fn times_that_nobody_saw_light_nothing() {
+        for mode in MODES {
+            let mut bench = Bench::new(mode);
+            bench.falsify = |field| Some(PresentedField { provenance: Provenance::Estimated, ..field });
+            bench.run(TimeNs(500 * MS), TimeNs(0));
+            assert_eq!(bench.edges, []);
+            // Of a real panel, software's word is not enough either.
+            let mut bench = Bench::new(mode);
+            let gate = bench.laser.gate;
+            let program = bench.laser.program;
+            bench.laser.interlock = Interlock::new(gate, program.trigger, program.sequence, false, TimeNs(500 * MS));
+            bench.run(TimeNs(500 * MS), TimeNs(0));
+            assert_eq!(bench.edges, []);
+            assert!(bench.all_events.iter().all(|event| event.dark == Some(DarkReason::Untrusted)));
+            bench.falsify = |field| Some(PresentedField { provenance: Provenance::Hardware, ..field });
+            bench.run(TimeNs(1000 * MS), TimeNs(0));
+            assert_ne!(bench.edges, []);
+        }
+    }
+
+    #[test]
+    fn a_pattern_of_another_colour_lights_nothing() {
+        for mode in MODES {
+            let mut bench = Bench::new(mode);
+            bench.falsify = |field| Some(PresentedField { colour: Colour::Green, ..field });
+            bench.run(TimeNs(500 * MS), TimeNs(0));
+            let greens = bench.edges.iter().filter(|edge| edge.colour == Colour::Green).count();
+            assert_eq!(greens, bench.edges.len());
+            assert!(bench.all_events.iter().filter(|event| event.field != 1).all(|event| event.dark.is_some()));
+        }
+    }
+
+    #[test]
+    fn missing_reports_make_dark_and_fields_that_return_make_light() {
+        for mode in MODES {
+            let mut bench = Bench::new(mode);
+            bench.run(TimeNs(500 * MS), TimeNs(0));
+            bench.falsify = |_| None;
+            let t_lost = bench.now;
+            bench.run(TimeNs(900 * MS), TimeNs(0));
+            let &(t_dark, _) = bench.darks.last().unwrap();
+            let refresh_ms = if mode == PanelMode::ChannelPacked { 17 } else { 6 };
+            assert!(t_dark - t_lost <= TimeNs(3 * refresh_ms * MS + 6 * MS), "{mode:?}: {t_dark:?} {t_lost:?}");
+            let edges = bench.edges.len();
+            assert!(bench.edges.iter().all(|edge| edge.t <= t_dark));
+            bench.falsify = Some;
+            bench.run(TimeNs(1200 * MS), TimeNs(0));
+            assert!(bench.edges.len() > edges);
+        }
+    }
+
+    #[test]
+    fn a_frame_that_nobody_renews_goes_dark_after_the_stall_timeout() {
+        for mode in MODES {
+            let mut bench = Bench::new(mode);
+            bench.submit();
+            for tick in 0..2000 {
+                bench.wake(TimeNs(tick * MS));
+            }
+            let last = bench.edges.last().unwrap();
+            assert!(!last.on && last.t > TimeNs(480 * MS) && last.t < TimeNs(540 * MS), "{last:?}");
+            assert_eq!(bench.all_events.last().unwrap().dark, Some(DarkReason::Stall));
+            assert_eq!(bench.verdict().findings, []);
+        }
+    }
+
+    #[test]
+    fn a_latched_dark_stays_dark() {
+        let mut bench = Bench::new(PanelMode::ChannelPacked);
+        bench.run(TimeNs(300 * MS), TimeNs(0));
+        bench.laser.shared.latch.store(1, Ordering::Release);
+        bench.run(TimeNs(305 * MS), TimeNs(0));
+        assert_eq!(bench.laser.shared.acknowledged.load(Ordering::Acquire), DARK);
+        let edges = bench.edges.len();
+        bench.run(TimeNs(2000 * MS), TimeNs(0));
+        assert_eq!(bench.edges.len(), edges);
+        assert_eq!(bench.verdict().unsafe_findings().count(), 0);
+    }
+
+    /// A box that fails when it is told so.
+    struct Faulty {
+        inner: SimulatedLaser,
+        fails: Arc<AtomicBool>,
+    }
+
+    impl Faulty {
+        fn check(&self) -> Result<(), LaserError> {
+            let refused = LaserError::Refused { command: "test", refusal: Refusal::Malformed };
+            if self.fails.load(Ordering::Relaxed) { Err(refused) } else { Ok(()) }
+        }
+    }
+
+    impl LaserBox for Faulty {
+        fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
+            self.check().and_then(|()| self.inner.program(program, now))
+        }
+        fn arm(&mut self, now: TimeNs) -> Result<(), LaserError> {
+            self.check().and_then(|()| self.inner.arm(now))
+        }
+        fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<(), LaserError> {
+            self.check().and_then(|()| self.inner.sync(t_sync, now))
+        }
+        fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<(), LaserError> {
+            self.check().and_then(|()| self.inner.light(window, now))
+        }
+        fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
+            self.check().and_then(|()| self.inner.heartbeat(now))
+        }
+        fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
+            self.check().and_then(|()| self.inner.dark(reason, now))
+        }
+        fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
+            self.inner.poll(now, event)
+        }
+    }
+
+    #[test]
+    fn a_box_that_fails_goes_dark_by_itself_and_is_tried_again_later() {
+        for mode in MODES {
+            let fails = Arc::new(AtomicBool::new(false));
+            let laser = Faulty { inner: SimulatedLaser::new(TimeNs(0)), fails: Arc::clone(&fails) };
+            let mut bench = Bench::with_box(mode, Box::new(laser));
+            bench.run(TimeNs(300 * MS), TimeNs(0));
+            fails.store(true, Ordering::Relaxed);
+            let t_failed = bench.now;
+            bench.run(TimeNs(800 * MS), TimeNs(0));
+            let &(t_dark, _) = bench.darks.last().unwrap();
+            assert!(t_dark - t_failed <= TimeNs(100 * MS), "the heartbeat timeout");
+            assert!(bench.edges.iter().all(|edge| edge.t <= t_dark));
+            assert!(bench.all_events.last().unwrap().dark.is_some());
+            fails.store(false, Ordering::Relaxed);
+            bench.run(TimeNs(2500 * MS), TimeNs(0));
+            assert!(bench.edges.last().unwrap().t > TimeNs(2400 * MS));
+            assert_eq!(bench.verdict().unsafe_findings().count(), 0);
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(96))]
+
+        /// However late the threads wake up, and whenever frames come, no light goes where it must not, every field
+        /// without light has a reason, and when everything stops the box goes dark by itself.
+        #[test]
+        fn no_jitter_and_no_stall_lights_what_it_must_not(
+            packed in prop::bool::ANY,
+            wakes in prop::collection::vec((prop_oneof![6 => 1i64..6000, 2 => 6000i64..40_000, 1 => 40_000i64..900_000], 0u8..4), 50..400),
+        ) {
+            let mut bench = Bench::new(if packed { PanelMode::ChannelPacked } else { PanelMode::FieldSequential });
+            let mut now = TimeNs(0);
+            for (later_us, frames) in wakes {
+                if frames == 0 {
+                    bench.now = now;
+                    bench.submit();
+                }
+                now = now + TimeNs(later_us * 1000);
+                bench.wake(now);
+            }
+            // The host hangs for good; only the box's own time goes on.
+            let t_hang = now;
+            let mut left = Vec::new();
+            bench.laser.laser.poll(now + TimeNs(10_000 * MS), &mut |event| left.push(event)).unwrap();
+            for event in left {
+                match event {
+                    BoxEvent::Edge(edge) => {
+                        prop_assert!(edge.t - t_hang <= TimeNs(100 * MS));
+                        bench.edges.push(edge);
+                    }
+                    BoxEvent::Dark { t, .. } => prop_assert!(t - t_hang <= TimeNs(100 * MS)),
+                    BoxEvent::Armed { .. } => prop_assert!(false),
+                }
+            }
+            // The panel shows on what it has, and a panel would say so.
+            let mut fields = Vec::new();
+            bench.panel.tick(t_hang + TimeNs(60 * MS), &mut bench.source, &mut |field| fields.push(field));
+            for field in fields {
+                bench.laser.ledger.field(&field, Some(DarkReason::Heartbeat), &bench.laser.shared);
+            }
+            let report = bench.verdict();
+            prop_assert_eq!(report.findings, vec![], "edges {:?}", bench.edges.len());
+        }
+    }
+
+    #[test]
+    fn the_real_threads_show_light_and_end_in_order() {
+        for mode in MODES {
+            let rig = rig(mode);
+            let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
+            let options = OutputOptions { keep_slots: 1, ..OutputOptions::default() };
+            let mut output = Output::headless(&rig, &encoder, options, monotonic_now).unwrap();
+            let config = pacing_config(&rig, TimeNs(2 * MS)).unwrap();
+            let mut pacer = Pacer::new(config, monotonic_now());
+            let pattern = vec![1.0f32; SIZE.pixels()];
+            let mut last_plan = None;
+            let mut reports = 0;
+            for frame in 0..30 {
+                output.frames.feed(&mut pacer, |_| reports += 1);
+                let plan = pacer.predict(monotonic_now());
+                let rest = plan.t_wake - monotonic_now();
+                std::thread::sleep(Duration::from_nanos(rest.0.max(0) as u64));
+                encoder.encode(PerColour([&pattern; 3]), output.frames.acquire());
+                let now = monotonic_now();
+                output.frames.submit(&plan, Some(0), now);
+                pacer.mark(crate::pacing::Point::Submit, plan.frame_id, now);
+                last_plan = Some(plan);
+                assert_eq!(plan.frame_id, frame + 1);
+            }
+            let report = output.control.shutdown();
+            assert!(report.lasers_dark && report.flat_presented, "{report:?}");
+            assert!(reports > 0);
+            let kept = report.kept[0].as_ref().unwrap();
+            assert_eq!(kept.unpack_colour(Colour::Blue).levels, [41; SIZE.pixels()]);
+            assert!(report.last_frame.unwrap().tag().frame_id <= last_plan.unwrap().frame_id);
+
+            let mut events = Vec::new();
+            while let Ok(event) = output.events.pop() {
+                events.push(event);
+            }
+            let mut edges = Vec::new();
+            let mut t_dark = None;
+            while let Ok(event) = output.box_events.pop() {
+                match event {
+                    BoxEvent::Edge(edge) => edges.push(edge),
+                    BoxEvent::Dark { t, .. } => t_dark = Some(t),
+                    BoxEvent::Armed { .. } => t_dark = None,
+                }
+            }
+            assert!(t_dark.is_some(), "the box ends dark");
+            let spans: Vec<_> = events.iter().map(FieldEvent::span).collect();
+            let verdict = verify_edges(&spans, &edges);
+            assert_eq!(verdict.findings, [], "{:?}", report.counts);
+            assert!(verdict.lit > 0);
+            assert_eq!((report.counts.fields, report.counts.lost), (events.len() as u64, 0));
+        }
+    }
+
+    #[test]
+    fn a_control_that_is_dropped_ends_the_output() {
+        let rig = rig(PanelMode::ChannelPacked);
+        let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
+        let output = Output::headless(&rig, &encoder, OutputOptions::default(), monotonic_now).unwrap();
+        let switch = output.control.dark_switch();
+        drop(output);
+        assert!(switch.is_dark());
+        assert!(switch.shared.flat_shown.load(Ordering::Acquire));
+    }
+}

@@ -21,6 +21,8 @@ const PHASE_GAIN: f64 = 0.1;
 const PERIOD_GAIN: f64 = 0.005;
 /// A panel's rate differs from its nominal one by less than this share.
 const PERIOD_TOLERANCE: f64 = 0.02;
+/// A report of a frame that was submitted longer ago than this has a wrong time.
+const LATENESS_MAX: TimeNs = TimeNs(60_000_000_000);
 /// Reports in a row that fit no refresh, after which the panel's clock is taken from the last of them.
 const STRAYS_MAX: u32 = 8;
 
@@ -185,8 +187,9 @@ impl Pacer {
             return Outcome::Unknown;
         };
         // Half a refresh of grace for times taken by software.
-        let earliest = TimeNs(slot.t_submit.unwrap_or_default().0 - self.config.refresh_period.0 / 2);
-        if t_present <= TimeNs(0) || t_present < earliest {
+        let after_submit_ns = t_present.0.saturating_sub(slot.t_submit.unwrap_or_default().0);
+        let possible = -self.config.refresh_period.0 / 2..LATENESS_MAX.0;
+        if t_present <= TimeNs(0) || !possible.contains(&after_submit_ns) {
             self.counts.implausible_reports += 1;
             return Outcome::Implausible;
         }
@@ -206,7 +209,8 @@ impl Pacer {
 
     /// The panel refreshed at `t_refresh` with whatever it had: keeps its clock true while frames are rare.
     pub fn observe_refresh(&mut self, t_refresh: TimeNs, provenance: Provenance) {
-        if provenance != Provenance::Estimated && t_refresh > TimeNs(0) && self.clock.observe(t_refresh) {
+        let possible = t_refresh > TimeNs(0) && t_refresh.0 < i64::MAX / 4;
+        if provenance != Provenance::Estimated && possible && self.clock.observe(t_refresh) {
             self.counts.resyncs += 1;
         }
     }
@@ -348,5 +352,266 @@ impl FrameTimes {
         }
         // With few frames the longest is the best guess.
         if self.count < 2 * RANK { longest[0] } else { longest[RANK - 1] }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_pcg::Pcg64Mcg;
+    use std::collections::VecDeque;
+
+    const MS: i64 = 1_000_000;
+    const REFRESH: TimeNs = TimeNs(16_666_668);
+
+    fn config() -> PacingConfig {
+        PacingConfig {
+            refresh_period: REFRESH,
+            photon_delay: TimeNs(9 * MS),
+            submit_margin: TimeNs(MS),
+            first_frame_time: TimeNs(10 * MS),
+        }
+    }
+
+    /// A host and a panel that run by themselves: what really happens while a pacer plans.
+    struct Bench {
+        /// The panel's true period, of which it is told only the nominal one.
+        period_ns: f64,
+        /// Render time and its jitter.
+        render_ns: i64,
+        jitter_ns: i64,
+        /// From a presentation to its report.
+        report_delay_ns: i64,
+        random: Pcg64Mcg,
+    }
+
+    #[derive(Debug, Default, PartialEq)]
+    struct Ran {
+        frames: u64,
+        missed: u64,
+        /// Refreshes between one frame and the next, by their count; the last bin holds all that are more.
+        spacing: [u64; 5],
+        /// Mean time from waking to presentation.
+        latency_ms: f64,
+        counts: PacingCounts,
+    }
+
+    impl Bench {
+        fn new(period_ns: f64, render_ms: f64, jitter_ms: f64) -> Self {
+            Self {
+                period_ns,
+                render_ns: (render_ms * 1e6) as i64,
+                jitter_ns: (jitter_ms * 1e6) as i64,
+                report_delay_ns: 300_000,
+                random: Pcg64Mcg::seed_from_u64(7),
+            }
+        }
+
+        fn run(&mut self, hours: f64) -> Ran {
+            // The panel's refreshes have nothing to do with the time at which the host begins.
+            let t_first_ns = 5.3e6;
+            let mut pacer = Pacer::new(config(), TimeNs(0));
+            let mut reports: VecDeque<(u64, TimeNs)> = VecDeque::new();
+            let mut ran = Ran::default();
+            let mut now = TimeNs(1000);
+            let mut last_refresh = 0i64;
+            let t_end = TimeNs((hours * 3600e9) as i64);
+            let mut latency_ns = 0.0;
+            while now < t_end {
+                while let Some(&(id, t_present)) = reports.front()
+                    && t_present.0 + self.report_delay_ns <= now.0
+                {
+                    reports.pop_front();
+                    ran.missed +=
+                        u64::from(matches!(pacer.report(id, t_present, Provenance::Hardware), Outcome::Missed { .. }));
+                }
+                let plan = pacer.predict(now);
+                assert!(plan.t_wake >= now && plan.t_desired_present > plan.t_wake);
+                let t_wake = plan.t_wake + TimeNs(self.random.random_range(0..200_000));
+                pacer.mark(Point::WakeUp, plan.frame_id, t_wake);
+                let render_ns = self.render_ns + self.random.random_range(0..=self.jitter_ns);
+                now = t_wake + TimeNs(render_ns);
+                pacer.mark(Point::Submit, plan.frame_id, now);
+                let refresh = ((now.0 as f64 - t_first_ns) / self.period_ns).ceil();
+                let t_present = TimeNs((t_first_ns + refresh * self.period_ns) as i64);
+                reports.push_back((plan.frame_id, t_present));
+                let since = (refresh as i64 - last_refresh).clamp(0, 4) as usize;
+                if ran.frames > 0 {
+                    ran.spacing[since] += 1;
+                }
+                last_refresh = refresh as i64;
+                latency_ns += (t_present - t_wake).0 as f64;
+                ran.frames += 1;
+            }
+            ran.latency_ms = latency_ns / 1e6 / ran.frames as f64;
+            ran.counts = pacer.counts();
+            ran
+        }
+    }
+
+    #[test]
+    fn a_day_of_frames_hits_every_refresh() {
+        let ran = Bench::new(REFRESH.0 as f64, 6.0, 2.0).run(24.0);
+        let refreshes = 24.0 * 3600e9 / REFRESH.0 as f64;
+        assert!((ran.frames as f64) > 0.999 * refreshes, "{ran:?}");
+        assert!((ran.spacing[1] as f64) > 0.999 * ran.frames as f64, "{ran:?}");
+        assert!((ran.missed as f64) < 0.001 * ran.frames as f64, "{ran:?}");
+        // Waking is as late as it can be: the longest render time, the margin and little more.
+        assert!(ran.latency_ms < 9.6, "{ran:?}");
+    }
+
+    #[test]
+    fn a_panel_that_is_faster_or_slower_than_it_says_is_followed() {
+        for share in [0.985, 0.999, 1.001, 1.015] {
+            let ran = Bench::new(REFRESH.0 as f64 * share, 6.0, 2.0).run(1.0);
+            assert!((ran.spacing[1] as f64) > 0.99 * ran.frames as f64, "{share}: {ran:?}");
+            assert!((ran.missed as f64) < 0.01 * ran.frames as f64, "{share}: {ran:?}");
+            assert_eq!(ran.counts.resyncs, 0, "{share}: {ran:?}");
+        }
+    }
+
+    #[test]
+    fn late_reports_do_no_harm() {
+        let mut bench = Bench::new(REFRESH.0 as f64 * 1.002, 6.0, 2.0);
+        bench.report_delay_ns = 100 * MS;
+        let ran = bench.run(1.0);
+        assert!((ran.spacing[1] as f64) > 0.99 * ran.frames as f64, "{ran:?}");
+        assert_eq!(ran.counts.unknown_reports, 0, "{ran:?}");
+    }
+
+    #[test]
+    fn slow_frames_aim_at_every_second_refresh_and_very_slow_ones_at_every_fourth() {
+        for (render_ms, every) in [(20.0, 2), (52.0, 4)] {
+            let ran = Bench::new(REFRESH.0 as f64, render_ms, 2.0).run(1.0);
+            assert!((ran.spacing[every] as f64) > 0.999 * ran.frames as f64, "{render_ms} ms: {ran:?}");
+            assert!((ran.missed as f64) < 0.005 * ran.frames as f64, "{render_ms} ms: {ran:?}");
+        }
+    }
+
+    /// Canary for the benches above: a pacer whose budget is too small is seen to miss.
+    #[test]
+    fn frames_that_take_longer_than_planned_are_missed_and_counted() {
+        let mut pacer = Pacer::new(config(), TimeNs(0));
+        pacer.observe_refresh(TimeNs(MS), Provenance::Hardware);
+        let plan = pacer.predict(TimeNs(2 * MS));
+        pacer.mark(Point::Submit, plan.frame_id, plan.t_desired_present + TimeNs(MS));
+        let shown = plan.t_desired_present + REFRESH;
+        assert_eq!(pacer.report(plan.frame_id, shown, Provenance::Hardware), Outcome::Missed { refreshes: 1 });
+        assert_eq!(pacer.counts().missed, 1);
+    }
+
+    #[test]
+    fn useless_reports_are_counted_and_change_no_plan() {
+        let mut pacer = Pacer::new(config(), TimeNs(0));
+        let plan = pacer.predict(TimeNs(MS));
+        let id = plan.frame_id;
+        assert_eq!(pacer.report(id, plan.t_desired_present, Provenance::Hardware), Outcome::Unknown, "not submitted");
+        pacer.mark(Point::Submit, id, plan.t_wake + TimeNs(5 * MS));
+        assert_eq!(pacer.report(id + 1, plan.t_desired_present, Provenance::Hardware), Outcome::Unknown);
+        assert_eq!(pacer.report(id, TimeNs(0), Provenance::Hardware), Outcome::Implausible);
+        assert_eq!(pacer.report(id, TimeNs(i64::MAX), Provenance::Hardware), Outcome::Implausible);
+        assert_eq!(pacer.report(id, plan.t_wake - REFRESH, Provenance::Hardware), Outcome::Implausible);
+        assert_eq!(pacer.report(id, plan.t_desired_present, Provenance::Hardware), Outcome::OnTime);
+        assert_eq!(pacer.report(id, plan.t_desired_present + REFRESH, Provenance::Hardware), Outcome::Unknown);
+        let counts = pacer.counts();
+        assert_eq!((counts.unknown_reports, counts.implausible_reports, counts.missed), (3, 3, 0));
+    }
+
+    #[test]
+    fn a_guess_does_not_move_the_clock() {
+        let mut pacer = Pacer::new(config(), TimeNs(0));
+        let before = pacer.clone().predict(TimeNs(MS));
+        pacer.observe_refresh(TimeNs(7 * MS), Provenance::Estimated);
+        assert_eq!(pacer.clone().predict(TimeNs(MS)), before);
+        pacer.observe_refresh(TimeNs(7 * MS), Provenance::External);
+        assert_ne!(pacer.predict(TimeNs(MS)), before);
+    }
+
+    #[test]
+    fn a_panel_that_jumps_is_found_again() {
+        let mut pacer = Pacer::new(config(), TimeNs(0));
+        pacer.observe_refresh(TimeNs(MS), Provenance::Hardware);
+        for refresh in 1..=8 {
+            pacer.observe_refresh(TimeNs(9 * MS + refresh * REFRESH.0), Provenance::Hardware);
+        }
+        assert_eq!(pacer.counts().resyncs, 1);
+        let plan = pacer.predict(TimeNs(200 * MS));
+        let phase = (plan.t_desired_present.0 - 9 * MS).rem_euclid(REFRESH.0);
+        assert!(!(1000..REFRESH.0 - 1000).contains(&phase), "{phase}");
+    }
+
+    #[test]
+    fn light_is_predicted_after_presentation() {
+        let plan = Pacer::new(config(), TimeNs(0)).predict(TimeNs(MS));
+        assert_eq!(plan.t_predicted_photon - plan.t_desired_present, TimeNs(9 * MS));
+    }
+
+    #[derive(Clone, Debug)]
+    enum Step {
+        Predict { later_ns: i64 },
+        Mark { back: u64, later_ns: i64 },
+        Report { back: u64, t_ns: i64, provenance: Provenance },
+        Refresh { t_ns: i64 },
+    }
+
+    fn steps() -> impl Strategy<Value = Step> {
+        let odd_times =
+            prop_oneof![Just(0), Just(-1), Just(i64::MAX), Just(i64::MIN), 0i64..2_000_000_000, any::<i64>()];
+        let provenance =
+            prop_oneof![Just(Provenance::Hardware), Just(Provenance::Software), Just(Provenance::Estimated)];
+        prop_oneof![
+            4 => (0i64..40 * MS).prop_map(|later_ns| Step::Predict { later_ns }),
+            4 => (0u64..20, 0i64..60 * MS).prop_map(|(back, later_ns)| Step::Mark { back, later_ns }),
+            4 => (0u64..20, odd_times.clone(), provenance)
+                .prop_map(|(back, t_ns, provenance)| Step::Report { back, t_ns, provenance }),
+            1 => odd_times.prop_map(|t_ns| Step::Refresh { t_ns }),
+        ]
+    }
+
+    proptest! {
+        /// Whatever it is told, a pacer plans forward: frames are numbered without a gap, never for a refresh of another
+        /// frame, never in the past.
+        #[test]
+        fn plans_go_forward_whatever_is_reported(steps in prop::collection::vec(steps(), 1..200)) {
+            let mut pacer = Pacer::new(config(), TimeNs(0));
+            let mut now = TimeNs(0);
+            let mut last: Option<FramePlan> = None;
+            for step in steps {
+                match step {
+                    Step::Predict { later_ns } => {
+                        now = now + TimeNs(later_ns);
+                        let plan = pacer.predict(now);
+                        prop_assert!(plan.t_wake >= now);
+                        prop_assert!(plan.t_desired_present >= plan.t_wake);
+                        prop_assert_eq!(plan.frame_id, last.map_or(1, |last| last.frame_id + 1));
+                        if let Some(last) = last {
+                            prop_assert!(plan.t_desired_present > last.t_desired_present);
+                        }
+                        last = Some(plan);
+                    }
+                    Step::Mark { back, later_ns } => {
+                        let id = last.map_or(0, |last| last.frame_id).wrapping_sub(back);
+                        pacer.mark(Point::Submit, id, now + TimeNs(later_ns));
+                    }
+                    Step::Report { back, t_ns, provenance } => {
+                        let id = last.map_or(0, |last| last.frame_id).wrapping_sub(back);
+                        pacer.report(id, TimeNs(t_ns), provenance);
+                    }
+                    Step::Refresh { t_ns } => pacer.observe_refresh(TimeNs(t_ns), Provenance::Hardware),
+                }
+            }
+        }
+
+        /// The short cut that leaves out most rankings never changes the result.
+        #[test]
+        fn the_estimate_is_the_ranked_time(times in prop::collection::vec(0i64..50, 1..900)) {
+            let mut kept = FrameTimes::new(TimeNs(1));
+            for time in times {
+                kept.push(TimeNs(time));
+                prop_assert_eq!(kept.estimate, kept.ranked());
+            }
+        }
     }
 }

@@ -105,3 +105,55 @@ impl Gate {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::present::Provenance;
+    use holod_calibration::Colour;
+    use holod_calibration::rig::Rig;
+
+    const MS: i64 = 1_000_000;
+
+    #[test]
+    fn windows_lie_after_settling_and_end_with_their_field() {
+        let rig = Rig::default();
+        let long = Lasers { width: TimeNs(50 * MS), ..rig.lasers.clone() };
+        for (lasers, t_off) in [(&rig.lasers, TimeNs(105_100_000)), (&long, TimeNs(105_555_556))] {
+            let gate = Gate::new(&rig.panel, lasers).unwrap();
+            let field = PresentedField {
+                frame: None,
+                field: 1,
+                colour: Colour::Blue,
+                t_present: TimeNs(100 * MS),
+                provenance: Provenance::Hardware,
+                repeated: false,
+            };
+            let window = LitWindow { colour: Colour::Blue, t_on: TimeNs(102_100_000), t_off };
+            assert_eq!(gate.window(&field), window);
+            let program = gate.program(&rig.panel, lasers).unwrap();
+            for (index, programmed) in program.windows.iter().enumerate() {
+                let t_field = TimeNs(index as i64 * gate.timing().field_period.0);
+                assert_eq!(programmed.delay, t_field + window.t_on - field.t_present);
+                assert_eq!(programmed.width, window.t_off - window.t_on);
+                assert!(programmed.delay + programmed.width <= t_field + gate.timing().field_period);
+            }
+        }
+    }
+
+    #[test]
+    fn figures_that_leave_no_light_are_refused() {
+        let rig = Rig::default();
+        let slow = Panel { settle: TimeNs(6 * MS), ..rig.panel.clone() };
+        assert!(matches!(Gate::new(&slow, &rig.lasers), Err(LaserError::NoRoom { field_us: 5555, delay_us: 6100 })));
+        let backwards = Panel { settle: TimeNs(-1), ..rig.panel.clone() };
+        assert!(matches!(Gate::new(&backwards, &rig.lasers), Err(LaserError::Figure { what: "panel.settle", .. })));
+        let never = Lasers { width: TimeNs(0), ..rig.lasers.clone() };
+        assert!(matches!(Gate::new(&rig.panel, &never), Err(LaserError::Figure { what: "width", .. })));
+        let gate = Gate::new(&rig.panel, &rig.lasers).unwrap();
+        for power_mw in [-1.0, f64::NAN, 5000.0] {
+            let lasers = Lasers { power_mw: PerColour([1.0, power_mw, 1.0]), ..rig.lasers.clone() };
+            assert!(matches!(gate.program(&rig.panel, &lasers), Err(LaserError::Figure { what: "power_mw", .. })));
+        }
+    }
+}

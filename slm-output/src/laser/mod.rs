@@ -126,6 +126,11 @@ impl DarkReason {
         Self::Asked,
     ];
 
+    /// Whether a field that is dark for this reason must have been dark from its first moment on.
+    pub const fn forbids_light(self) -> bool {
+        matches!(self, Self::Untrusted | Self::WrongColour)
+    }
+
     /// The reason called `name`.
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|reason| reason.name() == name)

@@ -160,3 +160,59 @@ pub fn code(refusal: Refusal) -> &'static str {
 pub fn refusal(code: &str) -> Refusal {
     CODES.iter().find(|(_, known)| *known == code).map_or(Refusal::Malformed, |(refusal, _)| *refusal)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_checksum_is_the_one_of_the_catalogue() {
+        assert_eq!(crc8(b"123456789"), 0xF4);
+    }
+
+    #[test]
+    fn a_line_comes_back_and_any_damaged_bit_is_noticed() {
+        let line = Line::new(format_args!("7 LIT G {} {}", 123_456_789, 987_654_321));
+        let (&end, text) = line.as_bytes().split_last().unwrap();
+        assert_eq!(end, b'\n');
+        assert_eq!(checked(text), Some("7 LIT G 123456789 987654321"));
+        assert_eq!(checked(&[text, b"\r"].concat()), Some("7 LIT G 123456789 987654321"));
+        for byte in 0..text.len() {
+            for bit in 0..8 {
+                let mut damaged = text.to_vec();
+                damaged[byte] ^= 1 << bit;
+                // A checksum's letter in the other case is the same checksum.
+                let same = damaged.eq_ignore_ascii_case(text) && byte + 2 >= text.len();
+                assert_eq!(checked(&damaged).is_some(), same, "byte {byte} bit {bit}");
+            }
+        }
+        for line in [&b""[..], b"*", b"7 HB", b"7 HB*", b"7 HB*+1", b"\xff\xfe*00"] {
+            assert_eq!(checked(line), None);
+        }
+    }
+
+    #[test]
+    fn lines_are_cut_wherever_the_bytes_come_apart() {
+        let mut buffer = LineBuffer::default();
+        let mut lines: Vec<Vec<u8>> = Vec::new();
+        for bytes in [&b"on"[..], b"e\ntwo\n", b"", b"\nthr"] {
+            buffer.feed(bytes, |line| lines.push(line.to_vec()));
+        }
+        buffer.feed(&[b'x'; 500], |line| lines.push(line.to_vec()));
+        buffer.feed(b"\nfour\n", |line| lines.push(line.to_vec()));
+        assert_eq!(lines, [&b"one"[..], b"two", b"", b"", b"four"]);
+    }
+
+    #[test]
+    fn refusals_and_colours_come_back() {
+        for (known, text) in CODES {
+            assert_eq!(refusal(code(known)), known);
+            assert_eq!(code(known), text);
+        }
+        for colour in Colour::ALL {
+            assert_eq!(colour_of(&letter(colour).to_string()), Some(colour));
+        }
+        assert_eq!(colour_of("RG"), None);
+        assert_eq!(colour_of(""), None);
+    }
+}

@@ -12,7 +12,7 @@ use super::{BoxEvent, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow,
 
 const BAUD: u32 = 115_200;
 /// A box that does not answer for this long is at fault.
-const ANSWER_WAIT: TimeNs = TimeNs(50_000_000);
+const ANSWER_WAIT: TimeNs = TimeNs(100_000_000);
 /// A box may take this long to answer the first line, while its USB wakes up.
 const IDENTIFY_WAIT: TimeNs = TimeNs(2_000_000_000);
 /// Commands that may wait for an answer: half a second of frames.
@@ -68,6 +68,8 @@ impl<S: Read + Write> SerialBox<S> {
             unanswered: [None; UNANSWERED_MAX],
             clock,
         };
+        // Ends whatever an earlier host left half said; the box answers it with an error of number 0.
+        this.stream.write_all(b"\n")?;
         let number = this.send("ID?", format_args!("ID?"), clock())?;
         let t_end = clock() + IDENTIFY_WAIT;
         let mut answer = None;
@@ -78,7 +80,7 @@ impl<S: Read + Write> SerialBox<S> {
                 let ours = format!("OK {number} {IDENTITY}");
                 if checked(line) == Some(ours.as_str()) {
                     answer = Some(Ok(()));
-                } else if !text.starts_with('!') && !text.starts_with("OK ") {
+                } else if !text.is_empty() && !["!", "OK ", "ERR 0 "].iter().any(|known| text.starts_with(known)) {
                     answer.get_or_insert(Err(text));
                 }
             })?;

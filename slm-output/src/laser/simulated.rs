@@ -316,3 +316,249 @@ impl LaserBox for SimulatedLaser {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::laser::FieldWindow;
+    use holod_calibration::PerColour;
+    use proptest::prelude::*;
+
+    /// Fields of 1000 ns, windows from 400 to 700, a heartbeat timeout of ten frames.
+    fn program(trigger: Trigger) -> LaserProgram {
+        let window = |field: i64| FieldWindow { delay: TimeNs(1000 * field + 400), width: TimeNs(300) };
+        LaserProgram {
+            trigger,
+            sequence: [Colour::Green, Colour::Red, Colour::Blue],
+            windows: [window(0), window(1), window(2)],
+            frame_period: TimeNs(3000),
+            power_uw: PerColour([100; 3]),
+            heartbeat_timeout: TimeNs(30_000),
+        }
+    }
+
+    fn armed(trigger: Trigger) -> SimulatedLaser {
+        let mut laser = SimulatedLaser::new(TimeNs(0));
+        laser.set_program(&program(trigger), TimeNs(0)).unwrap();
+        laser.set_armed(TimeNs(0)).unwrap();
+        laser
+    }
+
+    fn events(laser: &mut SimulatedLaser) -> Vec<BoxEvent> {
+        std::iter::from_fn(|| laser.next_event()).collect()
+    }
+
+    /// (time, colour, on) of the edges among the waiting events.
+    fn edges(laser: &mut SimulatedLaser) -> Vec<(i64, Colour, bool)> {
+        let edge = |event| match event {
+            BoxEvent::Edge(edge) => Some((edge.t.0, edge.colour, edge.on)),
+            _ => None,
+        };
+        events(laser).into_iter().filter_map(edge).collect()
+    }
+
+    #[test]
+    fn it_boots_dark_and_does_nothing_until_it_is_programmed_and_armed() {
+        let mut laser = SimulatedLaser::new(TimeNs(0));
+        assert_eq!(laser.set_armed(TimeNs(0)), Err(Refusal::NotProgrammed));
+        laser.set_program(&program(Trigger::PanelSync), TimeNs(0)).unwrap();
+        assert_eq!(laser.see_sync(TimeNs(0), TimeNs(0)), Err(Refusal::NotArmed));
+        assert_eq!(laser.hear_heartbeat(TimeNs(0)), Err(Refusal::NotArmed));
+        laser.advance(TimeNs(100_000));
+        assert_eq!(events(&mut laser), []);
+        laser.set_armed(TimeNs(100_000)).unwrap();
+        assert_eq!(laser.set_program(&program(Trigger::Host), TimeNs(100_000)), Err(Refusal::Armed));
+    }
+
+    #[test]
+    fn sync_lights_each_field_in_its_order_with_exact_times() {
+        let mut laser = armed(Trigger::PanelSync);
+        laser.see_sync(TimeNs(0), TimeNs(5)).unwrap();
+        laser.advance(TimeNs(2999));
+        let (g, r, b) = (Colour::Green, Colour::Red, Colour::Blue);
+        let expected =
+            [(400, g, true), (700, g, false), (1400, r, true), (1700, r, false), (2400, b, true), (2700, b, false)];
+        assert_eq!(edges(&mut laser), expected);
+    }
+
+    #[test]
+    fn a_sync_that_is_told_late_or_jitters_neither_skips_nor_doubles_a_window() {
+        let mut laser = armed(Trigger::PanelSync);
+        for (t_sync, told) in [(0, 5), (3010, 5500), (5990, 6001), (9000, 11_900)] {
+            laser.hear_heartbeat(TimeNs(told)).unwrap();
+            laser.see_sync(TimeNs(t_sync), TimeNs(told)).unwrap();
+        }
+        laser.advance(TimeNs(12_000));
+        let ons: Vec<_> = edges(&mut laser).into_iter().filter(|edge| edge.2).map(|edge| edge.0).collect();
+        let expected = [400, 1400, 2400, 3400, 4400, 5410, 6390, 7390, 8390, 9390, 10_390, 11_390];
+        assert_eq!(ons.len(), expected.len(), "{ons:?}");
+        for (on, expected) in ons.iter().zip(expected) {
+            assert!((on - expected).abs() <= 20, "{ons:?}");
+        }
+    }
+
+    #[test]
+    fn it_goes_dark_without_sync_for_two_frames() {
+        let mut laser = armed(Trigger::PanelSync);
+        laser.see_sync(TimeNs(0), TimeNs(0)).unwrap();
+        laser.advance(TimeNs(29_000));
+        let events = events(&mut laser);
+        assert_eq!(events.last(), Some(&BoxEvent::Dark { t: TimeNs(6000), reason: DarkReason::SyncLost }));
+        assert_eq!(events.len(), 2 + 2 * 6);
+        assert_eq!(laser.see_sync(TimeNs(29_000), TimeNs(29_000)), Err(Refusal::NotArmed));
+    }
+
+    #[test]
+    fn it_goes_dark_without_heartbeat_in_the_middle_of_a_window_even_if_nobody_looks() {
+        let mut laser = armed(Trigger::Host);
+        laser.hear_heartbeat(TimeNs(0)).unwrap();
+        let window = LitWindow { colour: Colour::Blue, t_on: TimeNs(29_900), t_off: TimeNs(30_200) };
+        laser.take_window(window, TimeNs(100)).unwrap();
+        laser.advance(TimeNs(5_000_000_000));
+        let expected = [
+            BoxEvent::Armed { t: TimeNs(0) },
+            BoxEvent::Edge(LaserEdge { t: TimeNs(29_900), colour: Colour::Blue, on: true }),
+            BoxEvent::Edge(LaserEdge { t: TimeNs(30_000), colour: Colour::Blue, on: false }),
+            BoxEvent::Dark { t: TimeNs(30_000), reason: DarkReason::Heartbeat },
+        ];
+        assert_eq!(events(&mut laser), expected);
+        assert!(!laser.is_armed());
+    }
+
+    #[test]
+    fn dark_is_at_once_and_forgets_what_was_asked() {
+        let mut laser = armed(Trigger::Host);
+        for t_on in [100, 1000] {
+            let window = LitWindow { colour: Colour::Red, t_on: TimeNs(t_on), t_off: TimeNs(t_on + 200) };
+            laser.take_window(window, TimeNs(0)).unwrap();
+        }
+        laser.set_dark(DarkReason::Asked, TimeNs(150));
+        assert_eq!(laser.lit(), None);
+        laser.set_armed(TimeNs(160)).unwrap();
+        laser.advance(TimeNs(2000));
+        assert_eq!(edges(&mut laser), [(100, Colour::Red, true), (150, Colour::Red, false)]);
+    }
+
+    #[test]
+    fn windows_of_the_host_are_cut_to_the_present_and_never_overlap() {
+        let mut laser = armed(Trigger::Host);
+        let window = |colour, t_on, t_off| LitWindow { colour, t_on: TimeNs(t_on), t_off: TimeNs(t_off) };
+        laser.take_window(window(Colour::Red, 100, 400), TimeNs(200)).unwrap();
+        assert_eq!(laser.take_window(window(Colour::Green, 399, 600), TimeNs(210)), Err(Refusal::Overlap));
+        assert_eq!(laser.take_window(window(Colour::Green, 100, 210), TimeNs(210)), Err(Refusal::Late));
+        laser.take_window(window(Colour::Green, 400, 600), TimeNs(220)).unwrap();
+        laser.advance(TimeNs(1000));
+        let (r, g) = (Colour::Red, Colour::Green);
+        assert_eq!(edges(&mut laser), [(200, r, true), (400, r, false), (400, g, true), (600, g, false)]);
+        let mut synced = armed(Trigger::PanelSync);
+        assert_eq!(synced.take_window(window(Colour::Red, 100, 400), TimeNs(0)), Err(Refusal::Trigger));
+    }
+
+    #[test]
+    fn a_program_whose_windows_overlap_is_refused() {
+        let mut overlapping = program(Trigger::PanelSync);
+        overlapping.windows[1].delay = TimeNs(699);
+        let mut laser = SimulatedLaser::new(TimeNs(0));
+        assert_eq!(laser.set_program(&overlapping, TimeNs(0)), Err(Refusal::Overlap));
+        let mut round_the_end = program(Trigger::PanelSync);
+        round_the_end.windows[2].width = TimeNs(1001);
+        assert_eq!(laser.set_program(&round_the_end, TimeNs(0)), Err(Refusal::Overlap));
+    }
+
+    #[derive(Clone, Debug)]
+    enum Deed {
+        Wait,
+        Sync { ago: i64 },
+        Light { colour: usize, ahead: i64, width: i64 },
+        Heartbeat,
+        Dark,
+        Arm,
+    }
+
+    fn deeds() -> impl Strategy<Value = (i64, Deed)> {
+        let deed = prop_oneof![
+            Just(Deed::Wait),
+            (-100i64..4000).prop_map(|ago| Deed::Sync { ago }),
+            (0usize..3, -500i64..3000, -10i64..2000).prop_map(|(colour, ahead, width)| Deed::Light {
+                colour,
+                ahead,
+                width
+            }),
+            Just(Deed::Heartbeat),
+            Just(Deed::Dark),
+            Just(Deed::Arm),
+        ];
+        (0i64..6000, deed)
+    }
+
+    proptest! {
+        /// Whatever a host does: never two lit, edges in order and in pairs, dark when not armed, and no light later than
+        /// the heartbeat timeout after the last heartbeat.
+        #[test]
+        fn no_host_can_make_it_break_its_rules(host in prop::bool::ANY, deeds in prop::collection::vec(deeds(), 1..120)) {
+            let mut laser = armed(if host { Trigger::Host } else { Trigger::PanelSync });
+            let mut now = TimeNs(0);
+            let mut heartbeats = vec![TimeNs(0)];
+            let mut log = Vec::new();
+            for (later, deed) in deeds {
+                now = now + TimeNs(later);
+                let _refused = match deed {
+                    Deed::Wait => {
+                        laser.advance(now);
+                        Ok(())
+                    }
+                    Deed::Sync { ago } => laser.see_sync(now - TimeNs(ago), now),
+                    Deed::Light { colour, ahead, width } => {
+                        let t_on = now + TimeNs(ahead);
+                        laser.take_window(LitWindow { colour: Colour::ALL[colour], t_on, t_off: t_on + TimeNs(width) }, now)
+                    }
+                    Deed::Heartbeat => {
+                        heartbeats.push(now);
+                        laser.hear_heartbeat(now)
+                    }
+                    Deed::Dark => {
+                        laser.set_dark(DarkReason::Asked, now);
+                        Ok(())
+                    }
+                    Deed::Arm => {
+                        heartbeats.push(now);
+                        laser.set_armed(now)
+                    }
+                };
+                log.extend(events(&mut laser));
+            }
+            laser.advance(now + TimeNs(1_000_000));
+            log.extend(events(&mut laser));
+            prop_assert_eq!(laser.lit(), None);
+
+            let mut lit: Option<LaserEdge> = None;
+            let mut is_armed = false;
+            let mut t_before = TimeNs(0);
+            for event in log {
+                let t = match event {
+                    BoxEvent::Armed { t } => { is_armed = true; t }
+                    BoxEvent::Dark { t, .. } => {
+                        prop_assert_eq!(lit, None);
+                        is_armed = false;
+                        t
+                    }
+                    BoxEvent::Edge(edge) => {
+                        prop_assert!(is_armed);
+                        if edge.on {
+                            prop_assert_eq!(lit, None);
+                            lit = Some(edge);
+                        } else {
+                            let on = lit.take();
+                            prop_assert!(on.is_some_and(|on| on.colour == edge.colour && on.t <= edge.t));
+                            let heard = heartbeats.iter().any(|&t| t <= edge.t && edge.t.0 - t.0 <= 30_000);
+                            prop_assert!(heard, "lit until {:?} without heartbeat", edge.t);
+                        }
+                        edge.t
+                    }
+                };
+                prop_assert!(t >= t_before);
+                t_before = t;
+            }
+        }
+    }
+}

@@ -2,10 +2,16 @@
 //!
 //! It outlives the program that it serves, so its log tells what the lasers did when that program was killed.
 
+use std::ffi::OsString;
+use std::fs::File;
 use std::io::{self, ErrorKind, Read, Write};
+use std::os::unix::ffi::OsStringExt;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use holod_calibration::{Colour, PerColour, TimeNs};
+use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
+use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 
 use super::protocol::{ARM_TOKEN, IDENTITY, Line, LineBuffer, checked, code, colour_of, letter};
 use super::{BoxEvent, DarkReason, FieldWindow, LaserEdge, LaserProgram, LitWindow, Refusal, SimulatedLaser, Trigger};
@@ -196,32 +202,33 @@ pub const LOG_HEADER: &str = "t_ns,event,colour,reason";
 ///
 /// # Errors
 /// [`io::Error`] where the log cannot be written.
-pub fn serve(
-    mut reader: impl Read,
-    mut writer: impl Write,
-    mut log: impl Write,
-    clock: impl Fn() -> TimeNs,
-) -> io::Result<()> {
-    let mut laser = SimulatedBox::new(clock());
-    let mut hung_up = false;
+pub fn serve(reader: impl Read, writer: impl Write, mut log: impl Write, clock: impl Fn() -> TimeNs) -> io::Result<()> {
     writeln!(log, "{LOG_HEADER}")?;
     log.flush()?;
+    let mut laser = SimulatedBox::new(clock());
+    serve_until_hung_up(&mut laser, reader, writer, &mut log, clock)
+}
+
+fn serve_until_hung_up(
+    laser: &mut SimulatedBox,
+    mut reader: impl Read,
+    mut writer: impl Write,
+    log: &mut impl Write,
+    clock: impl Fn() -> TimeNs,
+) -> io::Result<()> {
+    let mut hung_up = false;
     loop {
         let mut bytes = [0; 256];
-        if !hung_up {
-            match reader.read(&mut bytes) {
-                Ok(0) => hung_up = true,
-                Ok(count) => laser.receive(&bytes[..count], clock(), |line| {
-                    let _dropped = writer.write_all(line.as_bytes());
-                }),
-                Err(why) if matches!(why.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
-                    std::thread::sleep(Duration::from_micros(200));
-                }
-                Err(why) if why.kind() == ErrorKind::Interrupted => {}
-                Err(_) => hung_up = true,
+        match if hung_up { Err(ErrorKind::WouldBlock.into()) } else { reader.read(&mut bytes) } {
+            Ok(0) => hung_up = true,
+            Ok(count) => laser.receive(&bytes[..count], clock(), |line| {
+                let _dropped = writer.write_all(line.as_bytes());
+            }),
+            Err(why) if matches!(why.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
+                std::thread::sleep(Duration::from_micros(200));
             }
-        } else {
-            std::thread::sleep(Duration::from_millis(1));
+            Err(why) if why.kind() == ErrorKind::Interrupted => {}
+            Err(_) => hung_up = true,
         }
         let mut written = Ok(());
         let mut any = false;
@@ -230,7 +237,7 @@ pub fn serve(
             |event| {
                 any = true;
                 if written.is_ok() {
-                    written = log_event(&mut log, event);
+                    written = log_event(log, event);
                 }
             },
             |line| {
@@ -243,6 +250,53 @@ pub fn serve(
         }
         if hung_up && !laser.is_armed() {
             return Ok(());
+        }
+    }
+}
+
+/// A pseudo-terminal with a simulated box behind it.
+#[derive(Debug)]
+pub struct SimulatedTerminal {
+    terminal: File,
+    path: PathBuf,
+}
+
+impl SimulatedTerminal {
+    /// Opens a new one.
+    ///
+    /// # Errors
+    /// [`io::Error`] where the system has none.
+    pub fn open() -> io::Result<Self> {
+        let terminal = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY)?;
+        grantpt(&terminal)?;
+        unlockpt(&terminal)?;
+        let name = ptsname(&terminal, Vec::new())?;
+        let path = PathBuf::from(OsString::from_vec(name.into_bytes()));
+        // Without echo from the first byte on, whatever the host sets later.
+        let mut attributes = tcgetattr(&terminal)?;
+        attributes.make_raw();
+        tcsetattr(&terminal, OptionalActions::Now, &attributes)?;
+        rustix::fs::fcntl_setfl(&terminal, rustix::fs::OFlags::NONBLOCK)?;
+        Ok(Self { terminal: File::from(terminal), path })
+    }
+
+    /// The path that a host opens.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Serves one host after another, for ever; see [`serve`]. The box keeps its program between them.
+    ///
+    /// # Errors
+    /// As [`serve`].
+    pub fn serve(&self, mut log: impl Write, clock: impl Fn() -> TimeNs) -> io::Result<()> {
+        writeln!(log, "{LOG_HEADER}")?;
+        log.flush()?;
+        let mut laser = SimulatedBox::new(clock());
+        loop {
+            serve_until_hung_up(&mut laser, &self.terminal, &self.terminal, &mut log, &clock)?;
+            // A terminal that nobody has open looks hung up, too.
+            std::thread::sleep(Duration::from_millis(2));
         }
     }
 }
@@ -277,5 +331,141 @@ fn read_event(line: &str) -> Option<BoxEvent> {
         "on" | "off" => Some(BoxEvent::Edge(LaserEdge { t, colour: colour()?, on: event == "on" })),
         "dark" => Some(BoxEvent::Dark { t, reason: DarkReason::from_name(reason)? }),
         _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn answer(laser: &mut SimulatedBox, text: &str, now: i64) -> String {
+        let mut answers = String::new();
+        laser.receive(Line::new(format_args!("{text}")).as_bytes(), TimeNs(now), |line| {
+            let line = checked(line.as_bytes().strip_suffix(b"\n").unwrap()).unwrap();
+            answers.push_str(line);
+        });
+        answers
+    }
+
+    fn said(laser: &mut SimulatedBox, now: i64) -> (Vec<BoxEvent>, Vec<String>) {
+        let (mut events, mut lines) = (Vec::new(), Vec::new());
+        laser.advance(
+            TimeNs(now),
+            |event| events.push(event),
+            |line| lines.push(String::from_utf8_lossy(line.as_bytes()).into_owned()),
+        );
+        (events, lines)
+    }
+
+    fn set_up(trigger: &str) -> SimulatedBox {
+        let mut laser = SimulatedBox::new(TimeNs(0));
+        let lines = [
+            format!("SEQ GRB 3000 {trigger}"),
+            "FLD 0 400 300".into(),
+            "FLD 1 1400 300".into(),
+            "FLD 2 2400 300".into(),
+            "POW 10 20 30".into(),
+            "TMO 10000".into(),
+        ];
+        for (number, line) in lines.iter().enumerate() {
+            assert_eq!(answer(&mut laser, "9 ARM LIGHT", 0), "ERR 9 PROGRAM");
+            assert_eq!(answer(&mut laser, &format!("{number} {line}"), 0), format!("OK {number}"));
+        }
+        laser
+    }
+
+    #[test]
+    fn it_says_who_it_is_and_how_it_is() {
+        let mut laser = set_up("SYNC");
+        assert_eq!(answer(&mut laser, "1 ID?", 0), "OK 1 holod-laser-box 1");
+        assert_eq!(answer(&mut laser, "2 STAT?", 0), "OK 2 dark -");
+        assert_eq!(answer(&mut laser, "3 ARM LIGHT", 0), "OK 3");
+        assert_eq!(answer(&mut laser, "4 SYN 0", 1), "OK 4");
+        assert_eq!(answer(&mut laser, "5 STAT?", 1500), "OK 5 armed R");
+        assert_eq!(answer(&mut laser, "6 POW 1 1 1", 1500), "ERR 6 ARMED");
+        assert_eq!(answer(&mut laser, "7 DISARM shutdown", 1600), "OK 7");
+        let (events, lines) = said(&mut laser, 1700);
+        assert_eq!(events.last(), Some(&BoxEvent::Dark { t: TimeNs(1600), reason: DarkReason::Shutdown }));
+        assert_eq!(lines, Vec::<String>::new());
+        assert_eq!(answer(&mut laser, "8 HB", 1800), "ERR 8 DARK");
+    }
+
+    #[test]
+    fn silence_makes_dark_and_it_says_so() {
+        for (trigger, t_dark, reason, word) in
+            [("SYNC", 6000, DarkReason::SyncLost, "!SYNCLOST"), ("HOST", 10_000, DarkReason::Heartbeat, "!HBLOST")]
+        {
+            let mut laser = set_up(trigger);
+            answer(&mut laser, "1 ARM LIGHT", 0);
+            let (events, lines) = said(&mut laser, 50_000);
+            assert_eq!(events.last(), Some(&BoxEvent::Dark { t: TimeNs(t_dark), reason }));
+            assert!(lines[0].starts_with(word), "{lines:?}");
+        }
+    }
+
+    #[test]
+    fn any_line_that_it_does_not_understand_makes_dark() {
+        let sound = "3 HB";
+        let broken = [
+            "",
+            "HB",
+            "3 NONSENSE",
+            "3 HB 1",
+            "3 LIT X 1 2",
+            "3 LIT R 1",
+            "3 LIT R -1 5",
+            "3 SYN x",
+            "3 ARM",
+            "3 ARM NOW",
+            "x HB",
+        ];
+        for line in broken {
+            let mut laser = set_up("HOST");
+            answer(&mut laser, "1 ARM LIGHT", 0);
+            assert_eq!(answer(&mut laser, sound, 5), "OK 3");
+            assert!(laser.is_armed());
+            assert!(answer(&mut laser, line, 10).ends_with("LINE"), "{line}");
+            assert!(!laser.is_armed(), "{line}");
+            assert!(said(&mut laser, 20).1[0].starts_with("!LINE"));
+        }
+        let mut laser = set_up("HOST");
+        answer(&mut laser, "1 ARM LIGHT", 0);
+        laser.receive(b"3 HB*00\n", TimeNs(5), |_| ());
+        assert!(!laser.is_armed());
+    }
+
+    #[test]
+    fn programs_that_are_nonsense_are_refused() {
+        let mut laser = set_up("HOST");
+        for line in [
+            "SEQ RGR 3000 SYNC",
+            "SEQ RG 3000 SYNC",
+            "SEQ RGB 0 SYNC",
+            "SEQ RGB 3000 ME",
+            "FLD 3 1 1",
+            "FLD 0 1 0",
+            "POW 1 2",
+            "TMO 0",
+        ] {
+            assert!(answer(&mut laser, &format!("1 {line}"), 0).ends_with("LINE"), "{line}");
+        }
+    }
+
+    #[test]
+    fn a_log_is_read_as_it_was_written() {
+        let events = [
+            BoxEvent::Armed { t: TimeNs(5) },
+            BoxEvent::Edge(LaserEdge { t: TimeNs(7), colour: Colour::Blue, on: true }),
+            BoxEvent::Edge(LaserEdge { t: TimeNs(9), colour: Colour::Blue, on: false }),
+            BoxEvent::Dark { t: TimeNs(10), reason: DarkReason::SyncLost },
+        ];
+        let mut log = format!("{LOG_HEADER}\n").into_bytes();
+        for event in events {
+            log_event(&mut log, event).unwrap();
+        }
+        let text = String::from_utf8(log).unwrap();
+        assert_eq!(read_log(&text), Ok(events.to_vec()));
+        assert_eq!(read_log(&format!("{text}12,on,re")), Ok(events.to_vec()));
+        assert_eq!(read_log(&format!("{text}12,on,ultraviolet,\n")), Err(6));
     }
 }

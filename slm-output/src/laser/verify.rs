@@ -21,7 +21,7 @@ pub struct FieldSpan {
     pub t_settled: TimeNs,
     /// When it made way for the next one.
     pub t_end: TimeNs,
-    /// Why it was meant to stay dark, if it was.
+    /// Why it was meant to be dark, if it was.
     pub dark: Option<DarkReason>,
 }
 
@@ -72,6 +72,15 @@ pub enum Finding {
         t_on: TimeNs,
         /// The field's frame.
         frame_id: u64,
+    },
+    /// A laser was lit over a field that must stay dark.
+    ForbiddenField {
+        /// Which laser.
+        colour: Colour,
+        /// The field's frame.
+        frame_id: u64,
+        /// Why it must.
+        reason: DarkReason,
     },
     /// A field that should have been lit was not.
     FieldWithoutWindow {
@@ -125,6 +134,9 @@ impl fmt::Display for Finding {
             Self::SecondWindow { colour, t_on, frame_id } => {
                 write!(f, "{colour} lit again at {} ns in one field of frame {frame_id}", t_on.0)
             }
+            Self::ForbiddenField { colour, frame_id, reason } => {
+                write!(f, "{colour} lit over the field of frame {frame_id}, which must stay dark: {reason}")
+            }
             Self::FieldWithoutWindow { colour, frame_id, t_present } => {
                 write!(f, "the {colour} field of frame {frame_id} at {} ns was not lit", t_present.0)
             }
@@ -161,10 +173,16 @@ impl EdgeReport {
 pub fn verify_edges(fields: &[FieldSpan], edges: &[LaserEdge]) -> EdgeReport {
     let mut report = EdgeReport { fields: fields.len(), ..EdgeReport::default() };
     let windows = windows(edges, &mut report.findings);
-    for pair in windows.windows(2) {
-        let [(before, _, t_off), (after, t_on, _)] = [pair[0], pair[1]];
-        if t_on < t_off {
-            report.findings.push(Finding::TwoLit { colours: [before, after], t: t_on });
+    let mut longest: Option<(Colour, TimeNs)> = None;
+    for &(colour, t_on, t_off) in &windows {
+        match longest {
+            Some((other, t_until)) if t_on < t_until => {
+                report.findings.push(Finding::TwoLit { colours: [other, colour], t: t_on });
+                if t_off > t_until {
+                    longest = Some((colour, t_off));
+                }
+            }
+            _ => longest = Some((colour, t_off)),
         }
     }
 
@@ -202,6 +220,10 @@ pub fn verify_edges(fields: &[FieldSpan], edges: &[LaserEdge]) -> EdgeReport {
                 let (colour, frame_id, t_present) = (field.colour, field.frame_id, field.t_present);
                 report.findings.push(Finding::FieldWithoutWindow { colour, frame_id, t_present });
             }
+            (_, Some(reason)) if reason.forbids_light() => {
+                let (colour, frame_id) = (field.colour, field.frame_id);
+                report.findings.push(Finding::ForbiddenField { colour, frame_id, reason });
+            }
             _ => report.lit += usize::from(!tainted),
         }
     }
@@ -231,4 +253,156 @@ fn windows(edges: &[LaserEdge], findings: &mut Vec<Finding>) -> Vec<(Colour, Tim
     }
     windows.sort_by_key(|&(_, t_on, _)| t_on);
     windows
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Three frames of three fields of 100 ns that settle for 20 ns.
+    fn fields() -> Vec<FieldSpan> {
+        (0..9)
+            .map(|index: i64| FieldSpan {
+                frame_id: 1 + index as u64 / 3,
+                field: index as usize % 3,
+                colour: Colour::ALL[index as usize % 3],
+                t_present: TimeNs(1000 + 100 * index),
+                t_settled: TimeNs(1020 + 100 * index),
+                t_end: TimeNs(1100 + 100 * index),
+                dark: None,
+            })
+            .collect()
+    }
+
+    /// A window of each field, from 30 to 80 ns after its start.
+    fn windows() -> Vec<(Colour, i64, i64)> {
+        fields().iter().map(|field| (field.colour, field.t_present.0 + 30, field.t_present.0 + 80)).collect()
+    }
+
+    fn edges(windows: &[(Colour, i64, i64)]) -> Vec<LaserEdge> {
+        let mut edges: Vec<_> = windows
+            .iter()
+            .flat_map(|&(colour, on, off)| {
+                [LaserEdge { t: TimeNs(on), colour, on: true }, LaserEdge { t: TimeNs(off), colour, on: false }]
+            })
+            .collect();
+        edges.sort_by_key(|edge| edge.t);
+        edges
+    }
+
+    fn findings(windows: &[(Colour, i64, i64)]) -> Vec<Finding> {
+        verify_edges(&fields(), &edges(windows)).findings
+    }
+
+    #[test]
+    fn each_field_with_its_own_window_is_right() {
+        let report = verify_edges(&fields(), &edges(&windows()));
+        assert_eq!(report, EdgeReport { fields: 9, lit: 9, dark: 0, findings: vec![] });
+    }
+
+    #[test]
+    fn a_window_may_fill_all_of_the_settled_field() {
+        let mut full = windows();
+        full[4] = (Colour::Green, 1420, 1500);
+        assert_eq!(findings(&full), []);
+    }
+
+    #[test]
+    fn canary_a_window_without_field() {
+        let mut extra = windows();
+        extra.push((Colour::Red, 1950, 1960));
+        assert_eq!(findings(&extra), [Finding::WindowWithoutField { colour: Colour::Red, t_on: TimeNs(1950) }]);
+        extra.pop();
+        extra.insert(0, (Colour::Red, 930, 980));
+        assert_eq!(findings(&extra), [Finding::WindowWithoutField { colour: Colour::Red, t_on: TimeNs(930) }]);
+    }
+
+    #[test]
+    fn canary_a_field_without_window() {
+        let mut missing = windows();
+        missing.remove(4);
+        let (colour, t_present) = (Colour::Green, TimeNs(1400));
+        let found = findings(&missing);
+        assert_eq!(found, [Finding::FieldWithoutWindow { colour, frame_id: 2, t_present }]);
+        assert!(!found[0].is_unsafe());
+    }
+
+    #[test]
+    fn a_field_that_was_meant_to_be_dark_may_be() {
+        let mut missing = windows();
+        missing.remove(4);
+        let mut fields = fields();
+        fields[4].dark = Some(DarkReason::Shutdown);
+        assert_eq!(
+            verify_edges(&fields, &edges(&missing)),
+            EdgeReport { fields: 9, lit: 8, dark: 1, findings: vec![] }
+        );
+    }
+
+    #[test]
+    fn canary_light_over_a_field_that_is_not_known_to_be_shown() {
+        let mut fields = fields();
+        fields[4].dark = Some(DarkReason::Untrusted);
+        let reason = DarkReason::Untrusted;
+        let expected = [Finding::ForbiddenField { colour: Colour::Green, frame_id: 2, reason }];
+        assert_eq!(verify_edges(&fields, &edges(&windows())).findings, expected);
+    }
+
+    #[test]
+    fn canary_the_wrong_colour() {
+        let mut wrong = windows();
+        wrong[4].0 = Colour::Blue;
+        let (colour, t_on, t_present) = (Colour::Blue, TimeNs(1430), TimeNs(1400));
+        let expected = [
+            Finding::WrongColour { colour, t_on, field_colour: Colour::Green, frame_id: 2 },
+            Finding::FieldWithoutWindow { colour: Colour::Green, frame_id: 2, t_present },
+        ];
+        assert_eq!(findings(&wrong), expected);
+    }
+
+    #[test]
+    fn canary_two_lit_at_once() {
+        let mut two = windows();
+        // Blue stays lit over the whole next field, so that its overlap is not with its neighbour only.
+        two[2].2 = 1335;
+        let found = findings(&two);
+        let two_lit = Finding::TwoLit { colours: [Colour::Blue, Colour::Red], t: TimeNs(1330) };
+        assert!(found.contains(&two_lit), "{found:?}");
+        two[2].2 = 1435;
+        let found = findings(&two);
+        assert!(
+            found.contains(&Finding::TwoLit { colours: [Colour::Blue, Colour::Green], t: TimeNs(1430) }),
+            "{found:?}"
+        );
+    }
+
+    #[test]
+    fn canary_lit_outside_the_field() {
+        for (t_on, t_off) in [(1419, 1480), (1430, 1501)] {
+            let mut outside = windows();
+            outside[4] = (Colour::Green, t_on, t_off);
+            let (t_on, t_off) = (TimeNs(t_on), TimeNs(t_off));
+            let expected = [Finding::OutsideField { colour: Colour::Green, t_on, t_off, frame_id: 2 }];
+            assert_eq!(findings(&outside), expected);
+        }
+    }
+
+    #[test]
+    fn canary_a_second_window_in_one_field() {
+        let mut twice = windows();
+        twice.push((Colour::Green, 1485, 1490));
+        let expected = [Finding::SecondWindow { colour: Colour::Green, t_on: TimeNs(1485), frame_id: 2 }];
+        assert_eq!(findings(&twice), expected);
+    }
+
+    #[test]
+    fn canary_a_broken_log() {
+        let mut edges = edges(&windows());
+        let last = edges.pop().unwrap();
+        let still = Finding::StillLit { colour: Colour::Blue, t_on: TimeNs(1830) };
+        assert!(verify_edges(&fields(), &edges).findings.contains(&still));
+        edges.push(LaserEdge { on: true, ..last });
+        let broken = Finding::BrokenLog { colour: Colour::Blue, t: last.t };
+        assert!(verify_edges(&fields(), &edges).findings.contains(&broken));
+    }
 }

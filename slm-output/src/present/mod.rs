@@ -68,12 +68,36 @@ pub struct PresentedField {
     pub repeated: bool,
 }
 
+/// The way of frames to the panel: three buffers, of which the newest complete one is shown; wait-free at both ends.
+/// `blank` gives the layout; its copies are all the memory that is ever taken.
+pub fn frame_channel(blank: &LevelsFrame) -> (FrameSink, FrameSource) {
+    let (input, output) = triple_buffer::triple_buffer(blank);
+    (FrameSink(input), FrameSource(output))
+}
+
+/// Where frames are made.
+#[derive(Debug)]
+pub struct FrameSink(triple_buffer::Input<LevelsFrame>);
+
+impl FrameSink {
+    /// The buffer of the next frame, with the levels of some older one in it.
+    pub fn acquire(&mut self) -> &mut LevelsFrame {
+        self.0.input_buffer_mut()
+    }
+
+    /// Hands the acquired frame over.
+    pub fn submit(&mut self, tag: FrameTag) {
+        self.acquire().tag = tag;
+        self.0.publish();
+    }
+}
+
 /// What a presenter takes frames from: the newest one that has been submitted.
 #[derive(Debug)]
-pub struct FrameSource(pub(crate) triple_buffer::Output<LevelsFrame>);
+pub struct FrameSource(triple_buffer::Output<LevelsFrame>);
 
 impl FrameSource {
-    /// Makes the newest submitted frame current; whether there was one since the last call. Wait-free.
+    /// Makes the newest submitted frame current; whether there was one since the last call.
     pub fn update(&mut self) -> bool {
         self.0.update()
     }
