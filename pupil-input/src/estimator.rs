@@ -22,7 +22,8 @@ pub struct EstimatorSettings {
     /// Speed at which a difference between what is shown and what is measured is worked off when samples come back,
     /// mm/s.
     pub return_mm_per_s: f32,
-    /// A stream whose last believed sample is older than this is held.
+    /// A stream whose last believed sample is older than this, and than the gate's lead and three of the tracker's usual
+    /// intervals, is held.
     pub silence: TimeNs,
     /// Over how long the difference between the two eyes is learnt.
     pub eye_offset: TimeNs,
@@ -105,6 +106,8 @@ pub struct EstimateSnapshot {
     /// Difference between what was shown and the motion, and when; worked off at the return speed.
     blend: Blend,
     raw: Option<(TimeNs, f32)>,
+    /// A last believed sample older than this is held.
+    silence: TimeNs,
     clock: StreamClock,
     settings: EstimatorSettings,
 }
@@ -149,6 +152,7 @@ impl EstimateSnapshot {
             lost: false,
             blend: Blend { t: TimeNs(0), excess_mm: 0.0 },
             raw: None,
+            silence: settings.silence,
             clock: StreamClock::LIVE,
             settings,
         }
@@ -184,7 +188,7 @@ impl EstimateSnapshot {
             let slid_mm = settings.fallback_mm_per_s * (t - slide_begins).seconds() as f32;
             let velocity = if slid_mm < left_mm.abs() { settings.fallback_mm_per_s.copysign(left_mm) } else { 0.0 };
             (followed.0 + slid_mm.min(left_mm.abs()).copysign(left_mm), velocity, PupilState::Fallback)
-        } else if self.lost || age > settings.silence {
+        } else if self.lost || age > self.silence {
             (followed.0, followed.1, PupilState::Holding)
         } else {
             (followed.0, followed.1, PupilState::Tracking)
@@ -278,6 +282,7 @@ impl Estimator {
         }
         channel.live = (channel.live || believed) && channel.gate.is_open();
         let set_changed = channel.live != lives_before;
+        self.snapshot.silence = settings.silence.max(settings.gate.lead + channel.gate.usual_silence());
 
         if self.snapshot.raw.is_none_or(|(latest, _)| t >= latest) {
             self.snapshot.raw = Some((t, sample.diameter_mm));

@@ -36,7 +36,7 @@ pub struct GateSettings {
     pub lead: TimeNs,
     /// Trailing guard: a sample this close after a bad one is not believed.
     pub trail: TimeNs,
-    /// A silence longer than this is a loss, with guards on both sides.
+    /// A silence longer than this, and than three of the tracker's usual intervals, is a loss with guards on both sides.
     pub gap: TimeNs,
 }
 
@@ -148,6 +148,7 @@ pub(crate) struct Gate {
     t_newest: Option<TimeNs>,
     t_bad: Option<TimeNs>,
     step: StepScale,
+    interval: Interval,
 }
 
 impl Gate {
@@ -161,7 +162,17 @@ impl Gate {
             t_newest: None,
             t_bad: None,
             step: StepScale::default(),
+            interval: Interval::default(),
         }
+    }
+
+    /// For how long the tracker may usually be silent.
+    pub(crate) fn usual_silence(&self) -> TimeNs {
+        TimeNs(3 * self.interval.median_ns)
+    }
+
+    fn gap(&self) -> TimeNs {
+        self.settings.gap.max(self.usual_silence())
     }
 
     /// The tracker's noise, as the standard deviation of one sample in millimetres.
@@ -176,7 +187,7 @@ impl Gate {
 
     /// The next sample that has waited long enough at time `t`, to be taken before the sample of time `t` is judged.
     pub(crate) fn ripe(&mut self, t: TimeNs) -> Option<PupilSample> {
-        if self.t_newest.is_some_and(|newest| t <= newest || t - newest > self.settings.gap) {
+        if self.t_newest.is_some_and(|newest| t <= newest || t - newest > self.gap()) {
             return None;
         }
         let sample = self.pending[self.oldest].filter(|_| self.waiting > 0)?;
@@ -200,7 +211,9 @@ impl Gate {
             if t <= newest {
                 return on_rejected(sample, Rejection::Backwards);
             }
-            if t - newest > self.settings.gap {
+            let gap = self.gap();
+            self.interval.note(t - newest);
+            if t - newest > gap {
                 self.reject_pending(&mut on_rejected);
                 self.t_bad = Some(t);
                 self.previous = None;
@@ -310,6 +323,26 @@ impl StepScale {
     }
 }
 
+/// A running median of the time between samples, from 1 kHz to 6 Hz, so that a slow tracker is not taken for a lost one.
+#[derive(Clone, Copy, Debug)]
+struct Interval {
+    median_ns: i64,
+}
+
+impl Default for Interval {
+    fn default() -> Self {
+        Self { median_ns: 20_000_000 }
+    }
+}
+
+impl Interval {
+    fn note(&mut self, interval: TimeNs) {
+        let tenth = self.median_ns / 10;
+        self.median_ns += if interval.0 > self.median_ns { tenth } else { -tenth };
+        self.median_ns = self.median_ns.clamp(1_000_000, 160_000_000);
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -390,6 +423,13 @@ mod tests {
         let rejected: Vec<_> = verdicts.iter().filter(|(_, v)| *v != Verdict::Accepted).map(|(t, _)| *t).collect();
         assert_eq!(rejected.first(), Some(&70));
         assert_eq!(rejected.last(), Some(&350));
+    }
+
+    #[test]
+    fn a_slow_tracker_is_not_a_lost_one() {
+        let verdicts = verdicts(&steady((0..100).map(|k| 105 * k)));
+        assert!(verdicts.iter().skip(30).all(|(_, v)| *v == Verdict::Accepted));
+        assert_eq!(verdicts.len(), 99);
     }
 
     #[test]

@@ -206,6 +206,43 @@ fn a_pupil_that_changed_behind_the_lid_is_believed_soon_after() {
     assert!((shown - 3.8).abs() < 0.05, "{shown}");
 }
 
+/// Trackers of other rates, which tell a blink by a dip and then zeros: 4.5 mm, 30 ms down, 0.0 for 120 ms, 60 ms up.
+#[test]
+fn blinks_are_held_at_any_rate() {
+    for rate_hz in [15, 30, 60, 120, 250, 500, 1000, 2000] {
+        for phase in 0..4 {
+            let mut random = Pcg64Mcg::seed_from_u64(10 + phase);
+            let mut estimator = Estimator::new(settings(rig::Eye::Left));
+            let mut held = 0;
+            for k in 0..6 * rate_hz {
+                let t = TimeNs(k * 1_000_000_000 / rate_hz + phase as i64 * 4_000_000);
+                let since_s = (t.seconds() - 0.7).rem_euclid(2.0) - 1.0;
+                let open = match since_s {
+                    s if s < 0.0 => 1.0,
+                    s if s < 0.03 => 1.0 - s / 0.03,
+                    s if s < 0.15 => 0.0,
+                    s => ((s - 0.15) / 0.06).min(1.0),
+                };
+                let measured_mm = (open as f32) * (4.5 + 0.1 * (random.random::<f32>() - 0.5));
+                estimator.push(PupilSample { t_sample: t, ..sample(0, SampleEye::Left, measured_mm) }, |_| {});
+                if t.seconds() > 1.0 {
+                    for ahead_ms in [0, 20, 40] {
+                        let estimate = estimator.pupil_at(t + TimeNs(ahead_ms * 1_000_000));
+                        let shown_mm = estimate.pupil.mm();
+                        assert!((4.2..4.8).contains(&shown_mm), "{rate_hz} Hz, {} s: {shown_mm}", t.seconds());
+                        held += u32::from(estimate.state == PupilState::Holding);
+                    }
+                }
+                // Believed again well before the next blink.
+                if (0.6..0.9).contains(&since_s) || (-0.4..0.0).contains(&since_s) && t.seconds() > 1.2 {
+                    assert_eq!(estimator.pupil_at(t).state, PupilState::Tracking, "{rate_hz} Hz, {} s", t.seconds());
+                }
+            }
+            assert!(held > 0, "{rate_hz} Hz");
+        }
+    }
+}
+
 proptest::proptest! {
     #![proptest_config(proptest::test_runner::Config { failure_persistence: None, ..Default::default() })]
 

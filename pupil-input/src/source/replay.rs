@@ -293,6 +293,8 @@ impl Recording {
     }
 }
 
+/// A time beyond this, a hundred years from any origin, is no time; differences of two stay within i64.
+const GREATEST_NS: u64 = 3_200_000_000_000_000_000;
 const NEON_TIME: &str = "timestamp [ns]";
 const NEON_DIAMETERS: [(&str, &str, SampleEye); 2] = [
     ("pupil diameter left [mm]", "eyelid aperture left [mm]", SampleEye::Left),
@@ -339,6 +341,10 @@ struct LogReader {
 impl LogReader {
     /// Whether the time of line `line` may follow those before it.
     fn in_order(&mut self, eye: SampleEye, t_ns: i64, line: u64) -> bool {
+        if t_ns.unsigned_abs() > GREATEST_NS {
+            self.faults.count(LogFault::BadNumber);
+            return false;
+        }
         self.times += 1;
         let latest = &mut self.latest_ns[eye.index()];
         if latest.is_some_and(|latest| t_ns < latest) {

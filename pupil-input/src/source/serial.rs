@@ -12,7 +12,7 @@ use serialport::TTYPort;
 pub enum SerialError {
     /// There is nothing at the path.
     #[error(
-        "tracker port {path} does not exist; {ports}; plug the tracker in or name its port (best by /dev/serial/by-id)"
+        "tracker port {path} does not exist; {ports}; plug the tracker in, name its port (best by /dev/serial/by-id), or correct the name of the log"
     )]
     Missing {
         /// The path.
