@@ -214,7 +214,14 @@ fn wrong_types_are_named() {
         "without quotes",
     );
     let stroke = fault_of("stroke_pi = {", "stroke_pi = 2.0 # {");
-    assert_fault(&stroke, "panel.stroke_pi", line_of("stroke_pi"), "a float 2.0", "for each colour", "{ red = ");
+    assert_fault(
+        &stroke,
+        "panel.stroke_pi",
+        line_of("stroke_pi"),
+        "a float 2.0",
+        "for each colour",
+        "{ red = 2, green = 2, blue = 2 }",
+    );
     let section = faults_of("panel = 3\n[optics]\n[[lasers]]\n");
     let keys: Vec<_> = section.iter().map(|fault| (fault.key.as_str(), fault.line)).collect();
     assert!(keys.contains(&("panel", Some(1))) && keys.contains(&("lasers", Some(3))), "{keys:?}");
@@ -238,7 +245,7 @@ fn names_that_are_nearly_right_are_guessed() {
         missing,
         "panel.pixel_pitch_um",
         line_of("[panel]"),
-        "no such key",
+        "nothing",
         "1 to 50 µm",
         "add pixel_pitch_um to [panel]",
     );
@@ -315,10 +322,10 @@ fn missing_tables_and_keys_are_named_once() {
         ("heartbeat_timeout_ms", "lasers"),
     ] {
         let fault = fault_of(&format!("{key} = "), &format!("# {key} = "));
-        assert_fault(&fault, &format!("{section}.{key}"), line_of(&format!("[{section}]")), "no such key", "", "add ");
+        assert_fault(&fault, &format!("{section}.{key}"), line_of(&format!("[{section}]")), "nothing", "", "add ");
     }
     let blue = fault_of(", blue = 450.0", "");
-    assert_fault(&blue, "optics.wavelengths_nm.blue", line_of("wavelengths_nm"), "no such key", "380", "add blue");
+    assert_fault(&blue, "optics.wavelengths_nm.blue", line_of("wavelengths_nm"), "nothing", "380", "add blue");
     let optional =
         changed(&[("[tracker]", "#"), ("eye =", "#"), ("scale_mm", "#"), ("fallback_mm", "#"), ("hold_ms", "#")]);
     let optional = optional.replace("[model]", "").replace("allow_optics", "#").replace("depth_", "# depth_");
@@ -424,7 +431,7 @@ fn wavelengths_stand_under_their_own_colours() {
 
 #[test]
 fn a_laser_box_needs_its_port() {
-    check("driver = \"simulated\"", "driver = \"serial\"", "lasers.device", "no such key", "port", "/dev/holod-lasers");
+    check("driver = \"simulated\"", "driver = \"serial\"", "lasers.device", "nothing", "port", "/dev/holod-lasers");
     let fault = fault_of("driver = \"simulated\"", "driver = \"simulated\"\ndevice = \"/dev/ttyACM0\"");
     assert_fault(
         &fault,
@@ -479,6 +486,19 @@ fn a_profile_gives_way_to_explicit_keys() {
     assert!(rig.meaning().notes.iter().any(|note| note.contains("no source confirms width_px")));
     let pitch = Rig::parse(&text.replace("[optics]", "pixel_pitch_um = 3.7\n[optics]"), Path::new("")).unwrap();
     assert_eq!((pitch.resolution().width, pitch.pixel_pitch()), (4160, Metres(3.7e-6)));
+}
+
+#[test]
+fn a_misspelt_profile_is_one_fault() {
+    let text = changed(&[
+        ("width_px = 1920", "profile = \"holoeye-plut\""),
+        ("height_px = 1080\n", "\n"),
+        ("pixel_pitch_um = 8.0", ""),
+        ("refresh_hz = 60.0", ""),
+        ("bit_depth = 8", ""),
+    ]);
+    let keys: Vec<String> = faults_of(&text).into_iter().map(|fault| fault.key).collect();
+    assert_eq!(keys, ["panel.profile"]);
 }
 
 #[test]

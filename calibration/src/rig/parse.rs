@@ -48,6 +48,9 @@ const LAYOUT: [(&str, &[&str]); 6] = [
     ("model", &["weights_file", "allow_optics_mismatch"]),
 ];
 
+/// The keys that a panel profile gives.
+const PROFILE_KEYS: [&str; 5] = ["width_px", "height_px", "pixel_pitch_um", "refresh_hz", "bit_depth"];
+
 const PIXELS: Span = Span::new(64.0, 16384.0, "px");
 const PITCH: Span = Span::new(1.0, 50.0, "µm").slips(&[("metres", 1e6), ("millimetres", 1e3), ("nanometres", 1e-3)]);
 const REFRESH: Span = Span::new(10.0, 2000.0, "Hz").slips(&[("millihertz", 1e-3)]);
@@ -106,7 +109,10 @@ fn read_rig<'a>(reader: &mut Reader<'a>, root: Section<'a>, text: &str, origin: 
     // Each part is read whatever became of the others, so that one report holds all the faults.
     let profile = read_profile(reader, panel);
     provenance.panel_profile = profile.map(|profile| profile.name);
-    let panel = panel.with_profile(profile.map(PanelProfile::values));
+    let mut panel = panel.with_profile(profile.map(PanelProfile::values));
+    if panel.has("profile") && profile.is_none() {
+        panel = panel.excusing(&PROFILE_KEYS);
+    }
     let pixels = read_pixels(reader, panel);
     let timing = read_field_timing(reader, panel);
     let phase = read_phase(reader, panel, pixels.map(|(resolution, _)| resolution), folder, &mut provenance);
@@ -407,7 +413,7 @@ fn read_driver<'a>(reader: &mut Reader<'a>, lasers: Section<'a>) -> Option<Laser
         (true, None) => {
             if !lasers.has("device") {
                 let advice = "write for example device = \"/dev/holod-lasers\"".into();
-                reader.fault_in(lasers, "device", driver.line, "no such key", EXPECTED, advice);
+                reader.fault_in(lasers, "device", driver.line, "nothing", EXPECTED, advice);
             }
             None
         }

@@ -75,12 +75,18 @@ pub(super) struct Section<'a> {
     table: Option<&'a dyn TableLike>,
     line: Option<usize>,
     profile: Option<&'a Table>,
+    excused: &'static [&'static str],
 }
 
 impl<'a> Section<'a> {
     /// The section with `profile` behind it, for the keys that the rig file leaves out.
     pub(super) fn with_profile(self, profile: Option<&'a Table>) -> Self {
         Self { profile, ..self }
+    }
+
+    /// The section with `keys` excused from being required.
+    pub(super) fn excusing(self, keys: &'static [&'static str]) -> Self {
+        Self { excused: keys, ..self }
     }
 
     /// Whether the rig file itself gives `key`.
@@ -147,7 +153,7 @@ impl<'a> Reader<'a> {
 
     /// The keys of the file's top level, outside any table.
     pub(super) fn root(&self, document: &'a Document<String>) -> Section<'a> {
-        Section { name: "", table: Some(document.as_table()), line: None, profile: None }
+        Section { name: "", table: Some(document.as_table()), line: None, profile: None, excused: &[] }
     }
 
     /// The table `name`; a fault where something else has its name, or where it is required and missing.
@@ -163,7 +169,7 @@ impl<'a> Reader<'a> {
                     format!("add a line [{name}] and its keys"),
                 );
             }
-            return Section { name, table: None, line: None, profile: None };
+            return Section { name, table: None, line: None, profile: None, excused: &[] };
         };
         let line = self.line_of(item.span().or_else(|| key.span()));
         let table = item.as_table_like();
@@ -171,7 +177,7 @@ impl<'a> Reader<'a> {
             let found = describe(item);
             self.fault(name.into(), line, &found, "a table", format!("begin the table with a line [{name}]"));
         }
-        Section { name, table, line, profile: None }
+        Section { name, table, line, profile: None, excused: &[] }
     }
 
     /// Notes a fault.
@@ -224,9 +230,9 @@ impl<'a> Reader<'a> {
 
     fn missing(&mut self, section: Section<'a>, key: &str, expected: &str) {
         // A missing table is one fault, not one for each of its keys.
-        if section.table.is_some() {
+        if section.table.is_some() && !section.excused.contains(&key) {
             let advice = format!("add {key} to [{}]", section.name);
-            self.fault_in(section, key, None, "no such key", expected, advice);
+            self.fault_in(section, key, None, "nothing", expected, advice);
         }
     }
 
@@ -286,7 +292,8 @@ impl<'a> Reader<'a> {
         span: Span,
         required: PerColour<bool>,
     ) -> PerColour<Option<Found<f64>>> {
-        let example = format!("{{ red = {0}, green = {0}, blue = {0} }}", rounded((span.min * span.max).abs().sqrt()));
+        let given = self.lookup(section, key).and_then(|found| number_in(found.value)).unwrap_or(span.max);
+        let example = format!("{{ red = {given}, green = {given}, blue = {given} }}");
         let items = self.colours(section, key, &span.expected(), required, &example);
         PerColour(Colour::ALL.map(|colour| {
             let found = items[colour]?;
@@ -340,7 +347,7 @@ impl<'a> Reader<'a> {
             let item = table.get(colour.name());
             if item.is_none() && required[colour] {
                 let path = format!("{key}.{colour}");
-                self.fault_in(section, &path, found.line, "no such key", expected, format!("add {colour} to {key}"));
+                self.fault_in(section, &path, found.line, "nothing", expected, format!("add {colour} to {key}"));
             }
             item.map(|item| Found {
                 value: item,
