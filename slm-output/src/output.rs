@@ -188,7 +188,8 @@ pub struct Output {
 }
 
 impl Output {
-    /// Starts on a virtual panel, with the laser box that the rig names.
+    /// Starts on a virtual panel, with the laser box that the rig names. Where that box has real lasers they stay dark:
+    /// nothing is on any panel.
     ///
     /// # Errors
     /// [`OutputError`].
@@ -224,8 +225,13 @@ impl Output {
         let program = gate.program(&rig.panel, &rig.lasers)?;
         laser.dark(DarkReason::Asked, clock())?;
         laser.program(&program, clock())?;
-        let interlock =
-            Interlock::new(gate, program.trigger, program.sequence, presenter.is_virtual(), options.stall_timeout);
+        let interlock = Interlock::new(
+            gate,
+            program.trigger,
+            program.sequence,
+            presenter.is_virtual() && laser.is_simulated(),
+            options.stall_timeout,
+        );
 
         let (sink, source) = frame_channel(&flat_frame(rig, encoder));
         let (field_producer, field_consumer) = RingBuffer::new(SHORT_RING);
@@ -1037,6 +1043,9 @@ mod tests {
     }
 
     impl LaserBox for Faulty {
+        fn is_simulated(&self) -> bool {
+            true
+        }
         fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
             self.check().and_then(|()| self.inner.program(program, now))
         }

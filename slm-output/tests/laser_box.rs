@@ -10,13 +10,15 @@ use std::time::Duration;
 
 use holod_calibration::rig::{LaserDriver, Lasers, PanelMode, Rig};
 use holod_calibration::{PerColour, Resolution, TimeNs};
-use holod_slm_output::PanelEncoder;
 use holod_slm_output::laser::gate::Gate;
-use holod_slm_output::laser::simulated_box::{LOG_HEADER, SimulatedTerminal, read_log};
+use holod_slm_output::laser::protocol::Line;
+use holod_slm_output::laser::simulated_box::{LOG_HEADER, SimulatedBox, SimulatedTerminal, read_log};
 use holod_slm_output::laser::verify::verify_edges;
 use holod_slm_output::laser::{BoxEvent, DarkReason, LaserBox, LaserEdge, LaserError, LaserProgram, SerialBox};
 use holod_slm_output::output::{FieldEvent, Output, OutputOptions, monotonic_now, pacing_config};
 use holod_slm_output::pacing::{Pacer, Point};
+use holod_slm_output::present::{HeadlessPanel, PanelTiming};
+use holod_slm_output::{FrameLayout, LevelsFrame, PanelEncoder};
 
 const MS: i64 = 1_000_000;
 
@@ -166,6 +168,49 @@ fn a_second_host_finds_a_box_that_answers() {
         host.arm(monotonic_now()).unwrap();
         host.dark(DarkReason::Asked, monotonic_now()).unwrap();
     }
+}
+
+/// A box that gives itself out for one with lasers.
+fn real_box(stream: UnixStream) {
+    let mut simulated = SimulatedBox::new(monotonic_now());
+    let mut bytes = [0; 256];
+    while let Ok(count @ 1..) = (&stream).read(&mut bytes) {
+        simulated.receive(&bytes[..count], monotonic_now(), |line| {
+            let text = String::from_utf8_lossy(line.as_bytes()).into_owned();
+            let text = text.split('*').next().unwrap().replace(" simulated", " bench-4");
+            let _gone = (&stream).write_all(Line::new(format_args!("{text}")).as_bytes());
+        });
+    }
+}
+
+#[test]
+fn real_lasers_stay_dark_over_a_virtual_panel() {
+    let (host, far) = UnixStream::pair().unwrap();
+    host.set_nonblocking(true).unwrap();
+    let served = std::thread::spawn(move || real_box(far));
+    let laser = SerialBox::identify(host, "bench", monotonic_now).unwrap();
+    assert!(!laser.is_simulated());
+    let rig = Rig::default();
+    let size = Resolution { width: 4, height: 2 };
+    let encoder = PanelEncoder::new(&rig.panel, size, size).unwrap();
+    let timing = PanelTiming::new(&rig.panel);
+    let flat = LevelsFrame::new(FrameLayout::new(&rig.panel, size));
+    let panel = HeadlessPanel::new(timing, flat, monotonic_now(), 0);
+    let options = OutputOptions::default();
+    let mut output = Output::start(&rig, &encoder, Box::new(panel), Box::new(laser), options, monotonic_now).unwrap();
+    let plan = Pacer::new(pacing_config(&rig, TimeNs(MS)).unwrap(), monotonic_now()).predict(monotonic_now());
+    output.frames.submit(&plan, None, monotonic_now());
+    let mut dark = 0;
+    while dark < 20 {
+        while let Ok(field) = output.events.pop() {
+            assert_eq!((field.laser_on, field.dark), (None, Some(DarkReason::Untrusted)));
+            dark += 1;
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    output.control.shutdown();
+    assert!(output.box_events.pop().is_err(), "never armed");
+    served.join().unwrap();
 }
 
 #[test]

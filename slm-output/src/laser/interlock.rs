@@ -51,7 +51,8 @@ pub struct Interlock {
 impl Interlock {
     /// An interlock that begins dark.
     ///
-    /// `virtual_panel`: accept software times, which are exact there. `stall_timeout`: longest time for which one frame
+    /// `virtual_panel`: accept software times, which are exact there; only where the lasers are no more real than the
+    /// panel. `stall_timeout`: longest time for which one frame
     /// may stay lit without a newer one.
     pub fn new(
         gate: Gate,

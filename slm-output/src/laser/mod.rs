@@ -277,6 +277,9 @@ pub enum Refusal {
 /// Once dark it stays dark until it is armed again. No method waits but [`Self::program`], [`Self::arm`] and
 /// [`Self::dark`], which wait for the box's answer for a bounded time.
 pub trait LaserBox: Send {
+    /// Whether it has no lasers. Only such a box is lit over a panel that is not there.
+    fn is_simulated(&self) -> bool;
+
     /// Sets sequence, windows and powers; only in the dark.
     ///
     /// # Errors

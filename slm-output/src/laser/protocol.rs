@@ -8,7 +8,7 @@
 //!
 //! | Word | Arguments | Effect |
 //! |---|---|---|
-//! | `ID?` | | answers `OK N holod-laser-box 1`: name and version of this protocol |
+//! | `ID?` | | answers `OK N holod-laser-box 1 NAME`: this protocol, its version, and the box's name, `simulated` where it has no lasers |
 //! | `SEQ` | `RGB`, period, `SYNC` or `HOST` | colour of each field, length of a colour frame, who starts windows; forgets `FLD` and `POW` |
 //! | `FLD` | field 0..2, delay, width | that field's lit window, from the colour frame's start |
 //! | `POW` | red, green, blue | optical power in µW |
@@ -37,6 +37,8 @@ use super::Refusal;
 pub const LINE_BYTES_MAX: usize = 120;
 /// How a box of this protocol answers `ID?`.
 pub const IDENTITY: &str = "holod-laser-box 1";
+/// The name of a box without lasers.
+pub const SIMULATED: &str = "simulated";
 /// The argument of `ARM`.
 pub const ARM_TOKEN: &str = "LIGHT";
 

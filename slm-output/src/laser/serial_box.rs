@@ -7,7 +7,7 @@ use std::time::Duration;
 use holod_calibration::TimeNs;
 use serialport::TTYPort;
 
-use super::protocol::{ARM_TOKEN, IDENTITY, Line, LineBuffer, checked, letter, refusal};
+use super::protocol::{ARM_TOKEN, IDENTITY, Line, LineBuffer, SIMULATED, checked, letter, refusal};
 use super::{BoxEvent, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow, Refusal, SimulatedLaser, Trigger};
 
 const BAUD: u32 = 115_200;
@@ -28,6 +28,7 @@ pub struct SerialBox<S: Read + Write> {
     stream: S,
     received: LineBuffer,
     model: SimulatedLaser,
+    simulated: bool,
     last_number: u32,
     unanswered: [Option<Sent>; UNANSWERED_MAX],
     clock: fn() -> TimeNs,
@@ -64,6 +65,7 @@ impl<S: Read + Write> SerialBox<S> {
             stream,
             received: LineBuffer::default(),
             model: SimulatedLaser::new(clock()),
+            simulated: false,
             last_number: 0,
             unanswered: [None; UNANSWERED_MAX],
             clock,
@@ -77,9 +79,9 @@ impl<S: Read + Write> SerialBox<S> {
             this.read_lines(|line| {
                 // What a box or another device has sent before is no answer to us.
                 let text = String::from_utf8_lossy(line).trim_end().to_owned();
-                let ours = format!("OK {number} {IDENTITY}");
-                if checked(line) == Some(ours.as_str()) {
-                    answer = Some(Ok(()));
+                let ours = format!("OK {number} {IDENTITY} ");
+                if let Some(name) = checked(line).and_then(|text| text.strip_prefix(&ours)) {
+                    answer = Some(Ok(name == SIMULATED));
                 } else if !text.is_empty() && !["!", "OK ", "ERR 0 "].iter().any(|known| text.starts_with(known)) {
                     answer.get_or_insert(Err(text));
                 }
@@ -87,7 +89,8 @@ impl<S: Read + Write> SerialBox<S> {
             std::thread::sleep(Duration::from_micros(500));
         }
         match answer {
-            Some(Ok(())) => {
+            Some(Ok(simulated)) => {
+                this.simulated = simulated;
                 this.unanswered = [None; UNANSWERED_MAX];
                 Ok(this)
             }
@@ -193,6 +196,10 @@ fn refused(command: &'static str) -> impl Fn(Refusal) -> LaserError {
 }
 
 impl<S: Read + Write + Send> LaserBox for SerialBox<S> {
+    fn is_simulated(&self) -> bool {
+        self.simulated
+    }
+
     fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
         let [a, b, c] = program.sequence.map(letter);
         let trigger = match program.trigger {

@@ -283,6 +283,10 @@ fn refused(command: &'static str) -> impl Fn(Refusal) -> LaserError {
 }
 
 impl LaserBox for SimulatedLaser {
+    fn is_simulated(&self) -> bool {
+        true
+    }
+
     fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
         self.set_program(program, now).map_err(refused("program"))
     }

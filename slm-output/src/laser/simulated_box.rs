@@ -13,7 +13,7 @@ use holod_calibration::{Colour, PerColour, TimeNs};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 
-use super::protocol::{ARM_TOKEN, IDENTITY, Line, LineBuffer, checked, code, colour_of, letter};
+use super::protocol::{ARM_TOKEN, IDENTITY, Line, LineBuffer, SIMULATED, checked, code, colour_of, letter};
 use super::{BoxEvent, DarkReason, FieldWindow, LaserEdge, LaserProgram, LitWindow, Refusal, SimulatedLaser, Trigger};
 use crate::fields::FIELDS;
 
@@ -78,7 +78,7 @@ impl SimulatedBox {
         };
         answer(match self.command(command, now) {
             Ok(Reply::Done) => Line::new(format_args!("OK {number}")),
-            Ok(Reply::Identity) => Line::new(format_args!("OK {number} {IDENTITY}")),
+            Ok(Reply::Identity) => Line::new(format_args!("OK {number} {IDENTITY} {SIMULATED}")),
             Ok(Reply::State) => {
                 let state = if self.model.is_armed() { "armed" } else { "dark" };
                 Line::new(format_args!("OK {number} {state} {}", self.model.lit().map_or('-', letter)))
@@ -377,7 +377,7 @@ mod tests {
     #[test]
     fn it_says_who_it_is_and_how_it_is() {
         let mut laser = set_up("SYNC");
-        assert_eq!(answer(&mut laser, "1 ID?", 0), "OK 1 holod-laser-box 1");
+        assert_eq!(answer(&mut laser, "1 ID?", 0), "OK 1 holod-laser-box 1 simulated");
         assert_eq!(answer(&mut laser, "2 STAT?", 0), "OK 2 dark -");
         assert_eq!(answer(&mut laser, "3 ARM LIGHT", 0), "OK 3");
         assert_eq!(answer(&mut laser, "4 SYN 0", 1), "OK 4");

@@ -1,0 +1,41 @@
+//! A panic anywhere in the program makes the lasers dark. Alone in its process, since a panic hook is global.
+
+use std::time::Duration;
+
+use holod_calibration::rig::Rig;
+use holod_calibration::{PerColour, Resolution, TimeNs};
+use holod_slm_output::PanelEncoder;
+use holod_slm_output::laser::{BoxEvent, DarkReason};
+use holod_slm_output::output::{Output, OutputOptions, monotonic_now, pacing_config};
+use holod_slm_output::pacing::Pacer;
+
+#[test]
+fn a_panic_in_any_thread_goes_dark_for_good() {
+    let rig = Rig::default();
+    let size = Resolution { width: 4, height: 2 };
+    let encoder = PanelEncoder::new(&rig.panel, size, size).unwrap();
+    let mut output = Output::headless(&rig, &encoder, OutputOptions::default(), monotonic_now).unwrap();
+    let switch = output.control.dark_switch();
+    switch.install_panic_hook(monotonic_now);
+    let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(1_000_000)).unwrap(), monotonic_now());
+    let mut show = |frames: &mut holod_slm_output::FramePort| {
+        encoder.encode(PerColour([&[1.0; 8]; 3]), frames.acquire());
+        frames.submit(&pacer.predict(monotonic_now()), None, monotonic_now());
+        std::thread::sleep(Duration::from_millis(20));
+    };
+    while !output.control.counts().armed {
+        show(&mut output.frames);
+    }
+    assert!(!switch.is_dark());
+    assert!(std::thread::spawn(|| panic!("meant")).join().is_err());
+    while !switch.is_dark() {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    for _ in 0..5 {
+        show(&mut output.frames);
+    }
+    assert!(!output.control.counts().armed);
+    output.control.shutdown();
+    let last = std::iter::from_fn(|| output.box_events.pop().ok()).last();
+    assert!(matches!(last, Some(BoxEvent::Dark { reason: DarkReason::Panic, .. })), "{last:?}");
+}
