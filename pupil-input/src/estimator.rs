@@ -6,6 +6,10 @@ use crate::filter::{Filter, FilterSettings, Motion};
 use crate::gate::{Expected, Gate, GateSettings, Rejection, Verdict};
 use crate::{PupilSample, SampleEye};
 
+/// With the default settings the estimate of the present moment is never farther behind a moving pupil than this: the gate's
+/// lead, and the filter's rise at the onset of a reflex.
+pub const STATED_LAG: TimeNs = TimeNs(50_000_000);
+
 /// How samples become an estimate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EstimatorSettings {

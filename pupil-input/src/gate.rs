@@ -49,7 +49,7 @@ impl Default for GateSettings {
             least_aperture_mm: 3.5,
             slew_mm_per_s: 10.0,
             reach_mm: 0.45,
-            reach_mm_per_s: 2.5,
+            reach_mm_per_s: 2.0,
             lead: TimeNs(30_000_000),
             trail: TimeNs(50_000_000),
             gap: TimeNs(100_000_000),

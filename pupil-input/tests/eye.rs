@@ -4,8 +4,8 @@ mod support;
 
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::{
-    Decision, Estimator, EstimatorSettings, MockSource, PupilSample, PupilState, Rejection, SampleEye, Scenario,
-    Verdict,
+    Decision, Estimator, EstimatorSettings, MockSource, PupilSample, PupilState, Rejection, STATED_LAG, SampleEye,
+    Scenario, Verdict,
 };
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -49,6 +49,11 @@ fn sample(t_ms: i64, eye: SampleEye, diameter_mm: f32) -> PupilSample {
     }
 }
 
+/// The sum of twelve uniform deviates is all but normal.
+fn normal(random: &mut Pcg64Mcg, deviation: f32) -> f32 {
+    deviation * ((0..12).map(|_| random.random::<f32>()).sum::<f32>() - 6.0)
+}
+
 /// Pushes one eye's diameters, `interval_ms` apart from `from_ms` on, and gives what was decided.
 fn push_all(estimator: &mut Estimator, eye: SampleEye, from_ms: i64, diameters_mm: &[f32]) -> Vec<Decision> {
     let mut decisions = Vec::new();
@@ -65,21 +70,29 @@ fn at(estimator: &Estimator, t_ms: i64) -> (f32, PupilState) {
 
 #[test]
 fn a_ramp_is_followed_within_the_stated_lag() {
-    for speed_mm_per_s in [-4.0_f32, 1.3] {
-        let mut estimator = Estimator::new(settings(rig::Eye::Left));
-        let truth = |t_ms: i64| 5.0 + speed_mm_per_s * (t_ms - 2000).clamp(0, 500) as f32 * 1e-3;
-        let mut worst_ms = 0.0_f32;
-        for k in 0..=500 {
-            let t_ms = 5 * k;
-            estimator.push(sample(t_ms, SampleEye::Left, truth(t_ms)), |_| {});
-            // After the onset, which no filter can foresee.
-            if t_ms > 2200 {
-                let behind_mm = at(&estimator, t_ms).0 - truth(t_ms);
-                worst_ms = worst_ms.max(behind_mm / -speed_mm_per_s * 1e3);
+    for speed_mm_per_s in [-5.5_f32, -4.0, 1.3] {
+        let truth = |t_ms: i64| 6.0 + speed_mm_per_s * (t_ms - 2000).clamp(0, 500) as f32 * 1e-3;
+        // The filter trusts a noisy tracker less; the mean over many runs shows its lag without the noise.
+        let runs = 100;
+        let mut mean_behind_ms = vec![0.0_f32; 501];
+        for seed in 0..runs {
+            let mut random = Pcg64Mcg::seed_from_u64(seed);
+            let mut estimator = Estimator::new(settings(rig::Eye::Left));
+            for (k, mean_ms) in (0..).zip(&mut mean_behind_ms) {
+                let t_ms = 5 * k;
+                let noisy_mm = truth(t_ms) + normal(&mut random, 0.06);
+                estimator.push(sample(t_ms, SampleEye::Left, noisy_mm), |_| {});
+                *mean_ms += (at(&estimator, t_ms).0 - truth(t_ms)) / -speed_mm_per_s * 1e3 / runs as f32;
             }
         }
-        eprintln!("ramp of {speed_mm_per_s} mm/s: {worst_ms:.1} ms behind 200 ms after its onset");
-        assert!(worst_ms < 25.0, "{worst_ms}");
+        let worst_from = |t_ms: usize| mean_behind_ms[t_ms / 5..].iter().copied().fold(0.0, f32::max);
+        let (worst_ms, later_ms) = (worst_from(2005), worst_from(2205));
+        eprintln!(
+            "ramp of {speed_mm_per_s} mm/s: {worst_ms:.1} ms behind, {later_ms:.1} ms from 200 ms after its onset"
+        );
+        assert!(worst_ms > 30.0, "nothing is known before the gate's lead is over: {worst_ms}");
+        assert!(f64::from(worst_ms) * 1e-3 < STATED_LAG.seconds(), "{worst_ms}");
+        assert!(later_ms < 30.0, "{later_ms}");
     }
 }
 
@@ -88,7 +101,7 @@ fn the_error_on_a_made_up_eye_is_small() {
     // rms of all, and the worst while tracking, of the estimate for the present moment.
     let limits = [
         (Scenario::Steady, 0.05, 0.15),
-        (Scenario::LightSteps, 0.08, 0.45),
+        (Scenario::LightSteps, 0.08, 0.60),
         (Scenario::Sweep, 0.09, 0.40),
         (Scenario::Blinks, 0.07, 0.25),
     ];
@@ -114,10 +127,8 @@ fn noise_is_damped() {
         let mut estimator = Estimator::new(settings(rig::Eye::Left));
         let mut errors = Vec::new();
         for k in 0..60 * rate_hz {
-            // The sum of twelve uniform deviates is all but normal.
-            let deviate: f32 = (0..12).map(|_| random.random::<f32>()).sum::<f32>() - 6.0;
             let t = TimeNs(k * 1_000_000_000 / rate_hz);
-            let noisy = PupilSample { t_sample: t, ..sample(0, SampleEye::Left, 4.0 + noise_mm * deviate) };
+            let noisy = PupilSample { t_sample: t, ..sample(0, SampleEye::Left, 4.0 + normal(&mut random, noise_mm)) };
             estimator.push(noisy, |_| {});
             if k > rate_hz {
                 errors.push(estimator.pupil_at(t).pupil.mm() - 4.0);
@@ -241,6 +252,22 @@ fn blinks_are_held_at_any_rate() {
             assert!(held > 0, "{rate_hz} Hz");
         }
     }
+}
+
+#[test]
+fn a_long_blink_that_looks_like_a_quiet_small_pupil_is_held() {
+    let mut random = Pcg64Mcg::seed_from_u64(14);
+    let mut estimator = Estimator::new(settings(rig::Eye::Left));
+    for k in 0..600 {
+        let t_ms = 5 * k;
+        let level_mm = if (1500..1900).contains(&t_ms) { 1.8 } else { 3.2 };
+        let measured_mm = level_mm + 0.1 * (random.random::<f32>() - 0.5);
+        estimator.push(sample(t_ms, SampleEye::Left, measured_mm), |_| {});
+        if t_ms > 500 {
+            assert!((3.1..3.3).contains(&at(&estimator, t_ms).0), "{t_ms} ms: {:?}", at(&estimator, t_ms));
+        }
+    }
+    assert_eq!(at(&estimator, 2995).1, PupilState::Tracking);
 }
 
 proptest::proptest! {
