@@ -21,7 +21,7 @@
 //! | rms error on the mock's `steady` / `light-steps` / `sweep` / `blinks`, sensor noise 0.05 mm | 0.03 / 0.05 / 0.04 / 0.04 mm |
 //! | worst error while tracking, on the same (`light-steps` has a constriction that begins behind a blink) | 0.11 / 0.51 / 0.27 / 0.15 mm |
 //! | after a blink, until samples are believed again | 50 ms trailing guard and 30 ms lead |
-//! | a step no pupil can make (a lid, or a change missed) of 1.5 mm is believed after | about 0.55 s |
+//! | a step no pupil can make (a lid, or a change missed) of 1.5 mm is believed after | about 0.6 s |
 //!
 //! A pupil is held for as long as the rig says ([`rig::Tracker::hold`](holod_calibration::rig::Tracker::hold)), then slides to
 //! the fallback at 1.3 mm/s; when samples come back, what is shown meets them at 4 mm/s. Neither is
