@@ -73,12 +73,47 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--validate-every", type=int, default=defaults.validate_every)
     train.add_argument("--stop-below-slope", type=float, default=defaults.stop_below_slope)
     train.set_defaults(run=_train)
+    evaluate = command("evaluate", "Judges a weights file on held-out scenes and cards, beside its rivals")
+    evaluate.add_argument("--weights", required=True)
+    evaluate.add_argument("--test", required=True, help="folder of held-out scenes with pupils 1,2,3,4,5")
+    evaluate.add_argument("--cards", help="folder of refocus cards")
+    evaluate.add_argument("--out", required=True)
+    evaluate.add_argument("--limit", type=int, help="only so many scenes")
+    evaluate.set_defaults(run=_evaluate)
+
+    export = command("export", "Writes a weights file from a checkpoint or another weights file")
+    export.add_argument(
+        "--source", required=True, help="checkpoint.pt of a run (its averaged weights) or a weights file"
+    )
+    export.add_argument("--out", required=True)
+    export.add_argument("--amplitude-constant", type=float, help="double phase's K; the source's own where left out")
+    export.add_argument("--evaluation", help="evaluation.json whose numbers the file is to carry")
+    export.set_defaults(run=_export)
+
     golden = command("golden", "Writes the golden vectors that the engines are tested against")
     golden.add_argument("--out", required=True, help="folder, model/golden")
     golden.add_argument("--weights", help="the shipped weights file, for vectors of it too")
     golden.add_argument("--seed", type=int, default=20)
     golden.set_defaults(run=_golden)
     return parser
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    from holod_training.evaluate import evaluate
+    from holod_training.report import markdown
+
+    cards = Path(options.cards) if options.cards else None
+    print(
+        markdown(evaluate(Path(options.weights), Path(options.test), cards, Path(options.out), limit=options.limit)),
+        end="",
+    )
+
+
+def _export(options: argparse.Namespace) -> None:
+    from holod_training.export import export
+
+    evaluation = Path(options.evaluation) if options.evaluation else None
+    print(export(Path(options.source), Path(options.out), options.amplitude_constant, evaluation))
 
 
 def _golden(options: argparse.Namespace) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -73,3 +75,46 @@ def load_weights(path: Path) -> DirectNetwork:
             raise WeightsError(f"{path}: {name} has shape {list(value.shape)}, expected {list(expected[name].shape)}")
     network.load_state_dict({name: value.to(torch.float32) for name, value in found.items()})
     return network.eval()
+
+
+def export(source: Path, out: Path, amplitude_constant: float | None, evaluation: Path | None) -> Path:
+    """Writes `out` from a run's checkpoint or a weights file; raises WeightsError."""
+    if source.suffix == ".pt":
+        network, metrics, provenance = _from_checkpoint(source)
+    else:
+        metadata = read_metadata(source)
+        network, metrics, provenance = load_weights(source), metadata["metrics"], metadata["provenance"]
+    if amplitude_constant is not None:
+        if not amplitude_constant > 0:
+            raise WeightsError(f"amplitude constant: found {amplitude_constant}, expected a number above 0")
+        network.config = dataclasses.replace(network.config, amplitude_constant=amplitude_constant)
+    if evaluation:
+        metrics = _summary(evaluation)
+    save_weights(out, network, metrics, provenance)
+    return out
+
+
+def _from_checkpoint(source: Path) -> tuple[DirectNetwork, dict[str, Any], dict[str, Any]]:
+    try:
+        state = torch.load(source, map_location="cpu", weights_only=True)
+        run = json.loads(state["config"])
+        network = DirectNetwork(NetworkConfig.from_json(json.dumps(run["network"])))
+        network.load_state_dict(state["average"])
+        provenance = state["provenance"]
+    except (OSError, RuntimeError, KeyError, ValueError, pickle.UnpicklingError) as error:
+        raise WeightsError(f"{source}: not a checkpoint of a run ({error})") from error
+    return network, {}, provenance
+
+
+def _summary(evaluation: Path) -> dict[str, Any]:
+    """Our own rows, the matrix and the refocus ratios of an evaluation.json."""
+    try:
+        result = json.loads(evaluation.read_text())
+        return {
+            "scenes": result["scenes"],
+            "rows": [row for row in result["rows"] if row["method"] == "holod"],
+            "matrix_psnr_db": result["matrix_psnr_db"],
+            "refocus": [row for row in result.get("refocus", []) if row["method"] == "holod"],
+        }
+    except (OSError, json.JSONDecodeError, KeyError) as error:
+        raise WeightsError(f"{evaluation}: not an evaluation ({error})") from error

@@ -39,8 +39,8 @@ def narrow_network(grid: str, seed: int) -> DirectNetwork:
             if isinstance(layer, AdjustableLayer):
                 layer.offset.weight.mul_(6)
                 layer.offset.bias.uniform_(-1.5, 1.5)
-                layer.modulation[2].bias.uniform_(-0.3, 0.3)
-        network.layers[-1].weight.mul_(6)
+                layer.modulation.get_parameter("2.bias").uniform_(-0.3, 0.3)
+        network.get_parameter(f"layers.{network.config.layers - 1}.weight").mul_(6)
     return network
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import cache
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from holod_training.loss import inner
@@ -60,13 +60,10 @@ def focus_response(picture: Tensor, target: Tensor) -> tuple[float, float]:
 
 def ssim(picture: Tensor, target: Tensor) -> float:
     """Wang et al. 2004: 11x11 Gaussian, σ 1.5, peak 1, over [K, 3, H, W]; windows that fit only, mean of all."""
-    x = torch.arange(11, dtype=picture.dtype) - 5
-    g = torch.exp(-x.square() / (2 * 1.5**2))
-    g = g / g.sum()
+    rows, columns = _gaussian_windows(picture.shape[-2]), _gaussian_windows(picture.shape[-1])
 
     def blur(t: Tensor) -> Tensor:
-        t = t.flatten(0, 1)[:, None]
-        return F.conv2d(F.conv2d(t, g.view(1, 1, 11, 1)), g.view(1, 1, 1, 11))
+        return rows @ t @ columns.T
 
     mp, mt = blur(picture), blur(target)
     vp = blur(picture * picture) - mp * mp
@@ -74,6 +71,17 @@ def ssim(picture: Tensor, target: Tensor) -> float:
     covariance = blur(picture * target) - mp * mt
     c1, c2 = 0.01**2, 0.03**2
     return float((((2 * mp * mt + c1) * (2 * covariance + c2)) / ((mp**2 + mt**2 + c1) * (vp + vt + c2))).mean())
+
+
+@cache
+def _gaussian_windows(size: int) -> Tensor:
+    """The 11-tap Gaussian at every place where it fits, as a banded matrix [size - 10, size]."""
+    x = torch.arange(11, dtype=torch.float32) - 5
+    g = torch.exp(-x.square() / (2 * 1.5**2))
+    band = torch.zeros(size - 10, size)
+    for row in range(size - 10):
+        band[row, row : row + 11] = g / g.sum()
+    return band
 
 
 def judge(picture: Tensor, target: Tensor, coc_px: Tensor, border_px: int, with_ssim: bool = True) -> Judgement:

@@ -80,12 +80,11 @@ class AdjustableLayer(nn.Module):
         self.bias = nn.Parameter(torch.empty(channels).uniform_(-bound, bound))
         self.offset = OffsetPredictor(channels)
         outputs = 2 * TAPS
-        self.modulation = nn.ModuleList(
-            [nn.Linear(1, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, outputs * channels + outputs)]
-        )
+        last = nn.Linear(hidden, outputs * channels + outputs)
         # A weaker start leaves the conditioning on the pupil asleep (DESIGN §5).
-        nn.init.normal_(self.modulation[2].weight, std=0.5 / math.sqrt(hidden))
-        nn.init.zeros_(self.modulation[2].bias)
+        nn.init.normal_(last.weight, std=0.5 / math.sqrt(hidden))
+        nn.init.zeros_(last.bias)
+        self.modulation = nn.ModuleList([nn.Linear(1, hidden), nn.Linear(hidden, hidden), last])
         self.leaky_slope = leaky_slope
 
     def modulate(self, pupil_mm: Tensor) -> tuple[Tensor, Tensor]:
@@ -119,8 +118,8 @@ class DirectNetwork(nn.Module):
                 layers.append(nn.Conv2d(channels, channels, 3, padding=1))
         last = nn.Conv2d(channels, OUTPUT_CHANNELS, 3, padding=1)
         with torch.no_grad():
-            last.weight.mul_(0.1)
-            last.bias.zero_()
+            for parameter, share in zip(last.parameters(), (0.1, 0.0), strict=True):
+                parameter.mul_(share)
         self.layers = nn.ModuleList([*layers, last])
 
     def encode(self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor) -> Tensor:

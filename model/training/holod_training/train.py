@@ -193,6 +193,7 @@ class Run:
             "average": self.average.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "shards": self.sampler.names,
+            "provenance": self.provenance(),
             "config": json.dumps(dataclasses.asdict(self.config)),
         }
 

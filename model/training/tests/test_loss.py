@@ -18,9 +18,9 @@ def test_loss_is_zero_only_at_the_target() -> None:
 
 
 def test_gradient_agrees_with_finite_differences() -> None:
-    target = stack(1)
-    picture = stack(2).requires_grad_()
-    assert torch.autograd.gradcheck(lambda p: focus_loss(p, target, COC, LossWeights()).total, picture)
+    target = stack(1)[:2, :, :5, :4]
+    picture = stack(2)[:2, :, :5, :4].requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: focus_loss(p, target, COC[:2, :5, :4], LossWeights()).total, picture)
 
 
 def test_only_the_focus_term_sees_how_planes_differ() -> None:
