@@ -80,11 +80,12 @@ class AdjustableLayer(nn.Module):
         self.bias = nn.Parameter(torch.empty(channels).uniform_(-bound, bound))
         self.offset = OffsetPredictor(channels)
         outputs = 2 * TAPS
+        first, second = nn.Linear(1, hidden), nn.Linear(hidden, hidden)
         last = nn.Linear(hidden, outputs * channels + outputs)
         # A weaker start leaves the conditioning on the pupil asleep (DESIGN §5).
         nn.init.normal_(last.weight, std=0.5 / math.sqrt(hidden))
         nn.init.zeros_(last.bias)
-        self.modulation = nn.ModuleList([nn.Linear(1, hidden), nn.Linear(hidden, hidden), last])
+        self.modulation = nn.ModuleList([first, second, last])
         self.leaky_slope = leaky_slope
 
     def modulate(self, pupil_mm: Tensor) -> tuple[Tensor, Tensor]:

@@ -90,8 +90,8 @@ def markdown(result: dict[str, Any]) -> str:
         f"{result['date']}: {result['scenes']} held-out scenes of {width}x{height}, all "
         f"{len(result['focus_dpt'])} focal planes, a border of {result['border_px']} px left out; linear light, peak "
         f"1; means over scenes. Amplitude constant {result['amplitude_constant']}. Slope and correlation: "
-        "P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, 0 = one picture at all depths). In focus: CoC < 2 px; "
-        "out of focus: CoC > 8 px.",
+        "P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, 0 = one picture at all "
+        "depths). In focus: CoC < 2 px; out of focus: CoC > 8 px.",
         "",
     ]
     for stage in STAGES:
