@@ -1,4 +1,29 @@
-//! A simulated bench: a tracker on a pseudo-terminal and a judge of `frames.csv`.
+//! A simulated bench: the daemon as a process, a tracker on a pseudo-terminal, a judge of `frames.csv`.
 
+pub mod daemon;
 pub mod frames;
 pub mod tracker;
+
+/// A rig file for tests: the default optics on a panel of `width` x `height` pixels, which a processor keeps up with.
+/// `lasers` is the text of the `[lasers]` table's driver.
+pub fn small_rig(width: usize, height: usize, lasers: &str) -> String {
+    format!(
+        "name = \"test bench\"\n\
+         [panel]\n\
+         width_px = {width}\nheight_px = {height}\npixel_pitch_um = 8.0\nrefresh_hz = 60.0\nbit_depth = 8\n\
+         mode = \"channel-packed\"\nfield_order = [\"green\", \"red\", \"blue\"]\nphase_sign = \"positive\"\n\
+         stroke_pi = {{ red = 1.9921875, green = 1.9921875, blue = 1.9921875 }}\nsettle_ms = 2.0\n\
+         [optics]\n\
+         wavelengths_nm = {{ red = 638.0, green = 520.0, blue = 450.0 }}\neyepiece_focal_length_mm = 40.0\n\
+         depth_far_m = inf\ndepth_near_m = 0.35\n\
+         [lasers]\n\
+         {lasers}\n\
+         power_mw = {{ red = 1.0, green = 1.0, blue = 1.0 }}\non_delay_ms = 0.1\nlit_ms = 3.0\n\
+         heartbeat_timeout_ms = 100.0\n\
+         [tracker]\n\
+         eye = \"left\"\nscale_mm_per_unit = 1.0\nfallback_mm = 3.0\nhold_ms = 1000.0\n"
+    )
+}
+
+/// The panel's field order in [`small_rig`].
+pub const FIELD_ORDER: [&str; 3] = ["green", "red", "blue"];

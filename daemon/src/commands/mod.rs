@@ -1,0 +1,29 @@
+//! One file for each subcommand.
+
+mod bench;
+mod check;
+mod dark;
+mod demo;
+mod render;
+mod run;
+mod view;
+
+use crate::cli::{Cli, Command};
+use crate::failure::Failure;
+
+/// Does what the command line asks for.
+///
+/// # Errors
+/// Whatever ended it early, with its exit code.
+pub fn dispatch(cli: Cli) -> Result<(), Failure> {
+    match cli.command {
+        None => run::run(&cli.run),
+        Some(Command::Run(args)) => run::run(&args),
+        Some(Command::Demo(args)) => demo::demo(&args),
+        Some(Command::Render(args)) => render::render(&args),
+        Some(Command::View(args)) => view::view(&args),
+        Some(Command::Check(args)) => check::check(&args),
+        Some(Command::Bench(args)) => bench::bench(&args),
+        Some(Command::Dark(args)) => dark::dark(&args),
+    }
+}

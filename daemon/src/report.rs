@@ -1,0 +1,87 @@
+//! What a command says: text or JSON on standard output, and files that are written beside and renamed.
+
+use std::io::Write;
+use std::path::Path;
+
+use image::RgbImage;
+use serde::Serialize;
+
+use holod_model::files;
+
+use crate::failure::{Exit, Failure};
+use crate::session::Summary;
+
+/// Prints lines on standard output. A reader that has gone away is no failure.
+pub fn print(text: &str) -> Result<(), Failure> {
+    match writeln!(std::io::stdout().lock(), "{text}") {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
+            Err(Failure::new(Exit::CannotCreate, format!("cannot write to standard output: {error}")))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Prints a value as JSON.
+pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
+    print(&to_json(value)?)
+}
+
+/// Saves a value as JSON.
+pub fn save_json(value: &impl Serialize, path: &Path) -> Result<(), Failure> {
+    let text = to_json(value)? + "\n";
+    files::write_atomically(path, text.as_bytes()).map_err(Failure::because(Exit::CannotCreate))
+}
+
+/// Saves a picture as PNG.
+pub fn save_png(picture: &RgbImage, path: &Path) -> Result<(), Failure> {
+    let mut bytes = std::io::Cursor::new(Vec::new());
+    picture
+        .write_to(&mut bytes, image::ImageFormat::Png)
+        .map_err(|error| Failure::new(Exit::Software, format!("{}: {error}", path.display())))?;
+    files::write_atomically(path, bytes.get_ref()).map_err(Failure::because(Exit::CannotCreate))
+}
+
+fn to_json(value: &impl Serialize) -> Result<String, Failure> {
+    serde_json::to_string_pretty(value).map_err(Failure::because(Exit::Software))
+}
+
+/// A run in a few lines.
+pub fn summary_text(summary: &Summary) -> String {
+    let spread = |spread: Option<crate::session::Spread>| {
+        spread.map_or("not measured".to_owned(), |s| format!("median {:.1} ms, p99 {:.1} ms", s.median_ms, s.p99_ms))
+    };
+    let states: Vec<String> =
+        summary.frames_by_pupil_state.iter().map(|(state, count)| format!("{count} {state}")).collect();
+    let pupils = summary.pupil_range_mm.map_or("none".to_owned(), |[a, b]| format!("{a:.2} to {b:.2} mm"));
+    let lasers = &summary.lasers;
+    format!(
+        "ended by {} after {:.1} s\n\
+         frames    {} made, {} shown ({} late); {} colour fields shown, {} of them repetitions\n\
+         pupil     {pupils}; frames: {}\n\
+         tracker   {}: link {}, {} samples, {} rejected\n\
+         time      per frame {}; tracker sample to photons {}\n\
+         lasers    {} fields judged: {} lit by their own colour, {} kept dark, {} faults of which {} unsafe\n\
+         shutdown  lasers dark: {}; flat pattern on the panel: {}",
+        summary.ended_by,
+        summary.duration_s,
+        summary.frames_made,
+        summary.frames_shown,
+        summary.deadline_misses,
+        summary.fields_shown,
+        summary.fields_repeated,
+        states.join(", "),
+        summary.tracker,
+        summary.tracker_link,
+        summary.tracker_counts.get("samples").copied().unwrap_or(0),
+        summary.samples_rejected,
+        spread(summary.frame_time),
+        spread(summary.sample_to_photon),
+        lasers.fields,
+        lasers.lit,
+        lasers.dark,
+        lasers.findings_in_all,
+        lasers.unsafe_findings,
+        summary.lasers_dark_at_end,
+        summary.flat_at_end,
+    )
+}

@@ -1,0 +1,161 @@
+//! The frame thread: wake, ask for the pupil, compute the hologram, encode it, submit it.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use holod_calibration::{Colour, PerColour, PupilDiameter, TimeNs};
+use holod_model::optics::{DoublePhase, PhasePattern};
+use holod_model::{ComplexHologram, CpuEngine};
+use holod_pupil_input::{EstimateReader, PupilState, host_now};
+use holod_slm_output::pacing::Point;
+use holod_slm_output::{FramePlan, FramePort, Pacer, PanelEncoder};
+
+use super::keep::keep_slot;
+use crate::record::FrameRecord;
+use crate::setup::Frames;
+
+/// An order to stop is seen within this time.
+const LONGEST_SLEEP: Duration = Duration::from_millis(20);
+
+/// A pupil is not predicted farther ahead than this; slower frames use the prediction for this time.
+const FARTHEST_PREDICTION: TimeNs = TimeNs(200_000_000);
+
+/// Everything that a frame needs, allocated before the first one.
+pub(super) struct FrameLoop {
+    /// The tracker's newest estimate.
+    pub pupil: EstimateReader,
+    /// The network.
+    pub engine: CpuEngine,
+    /// Hologram to phase.
+    pub double_phase: DoublePhase,
+    /// Phase to levels.
+    pub encoder: PanelEncoder,
+    /// Levels to the panel.
+    pub port: FramePort,
+    /// Which refresh each frame is for.
+    pub pacer: Pacer,
+    /// What to show.
+    pub frames: Arc<Frames>,
+    /// The pupils that the network knows.
+    pub trained: TrainedPupils,
+    /// When the run began.
+    pub t_origin: TimeNs,
+    /// Buffer between network and double phase.
+    pub hologram: ComplexHologram,
+    /// Buffer between double phase and levels.
+    pub pattern: PhasePattern,
+    /// To whoever records.
+    pub records: rtrb::Producer<LoopRecord>,
+    /// Whether presented levels are kept by pupil.
+    pub keep_levels: bool,
+    /// Frames to make; without end where absent.
+    pub limit: Option<u64>,
+    /// Set by the control thread.
+    pub stop: Arc<AtomicBool>,
+}
+
+/// The pupils that a network was trained for.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct TrainedPupils {
+    /// The narrowest.
+    pub narrowest: PupilDiameter,
+    /// The widest.
+    pub widest: PupilDiameter,
+}
+
+impl TrainedPupils {
+    /// The nearest pupil that the network knows.
+    fn clamp(self, pupil: PupilDiameter) -> PupilDiameter {
+        PupilDiameter::from_mm(pupil.mm().clamp(self.narrowest.mm(), self.widest.mm()))
+    }
+}
+
+/// What the loop tells of one frame.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct LoopRecord {
+    /// Times and pupil.
+    pub frame: FrameRecord,
+    /// Share of amplitudes above the double phase's constant.
+    pub clipped_share: f32,
+    /// Share of phases that the panel cannot reach.
+    pub unreachable_share: f32,
+}
+
+impl FrameLoop {
+    /// Makes frames until told to stop or the limit is reached.
+    pub(super) fn run(mut self) {
+        let mut made = 0;
+        while !self.stop.load(Ordering::Acquire) && self.limit.is_none_or(|limit| made < limit) {
+            let plan = self.pacer.predict(host_now());
+            if !self.sleep_until(plan.t_wake) {
+                break;
+            }
+            self.frame(plan);
+            made += 1;
+        }
+    }
+
+    /// One frame, top to bottom.
+    fn frame(&mut self, plan: FramePlan) {
+        let t_wake = self.mark(Point::WakeUp, plan);
+        let state = self.pupil.pupil_at(t_wake).state;
+        let estimate = self.pupil.pupil_at(plan.t_predicted_photon.min(t_wake + FARTHEST_PREDICTION));
+        let scene = self.frames.index_at((plan.t_predicted_photon - self.t_origin).seconds());
+        let hologram_pupil = self.trained.clamp(estimate.pupil);
+
+        let t_render_begin = self.mark(Point::RenderBegin, plan);
+        self.engine
+            .render(&self.frames.frames[scene], hologram_pupil, &mut self.hologram)
+            .expect("engine, scene and hologram were made for one size, and the estimator gives positive diameters");
+        let double_phase = self.double_phase.encode(&self.hologram, &mut self.pattern);
+        let phase_rad = PerColour(Colour::ALL.map(|colour| self.pattern.plane(colour)));
+        let levels = self.encoder.encode(phase_rad, self.port.acquire());
+        let t_render_end = self.mark(Point::RenderEnd, plan);
+
+        let keep = if self.keep_levels && state != PupilState::Fallback { keep_slot(hologram_pupil) } else { None };
+        let t_submit = host_now();
+        self.port.submit(&plan, keep, t_submit);
+        self.pacer.mark(Point::Submit, plan.frame_id, t_submit);
+        self.port.feed(&mut self.pacer, |_| ());
+
+        // A full ring means that nobody records; the frame was shown all the same.
+        let _ = self.records.push(LoopRecord {
+            frame: FrameRecord {
+                frame: plan.frame_id,
+                t_sample: estimate.t_sample,
+                pupil_raw_mm: estimate.raw_mm,
+                pupil: estimate.pupil,
+                hologram_pupil,
+                pupil_state: state.name(),
+                t_wake,
+                t_render_begin,
+                t_render_end,
+                t_submit,
+                t_desired_present: plan.t_desired_present,
+            },
+            clipped_share: double_phase.clipped_share,
+            unreachable_share: levels.unreachable_share.0.into_iter().fold(0.0, f32::max),
+        });
+    }
+
+    fn mark(&mut self, point: Point, plan: FramePlan) -> TimeNs {
+        let now = host_now();
+        self.pacer.mark(point, plan.frame_id, now);
+        now
+    }
+
+    /// Sleeps in short steps, so that an order to stop is seen; false where it came.
+    fn sleep_until(&self, t: TimeNs) -> bool {
+        loop {
+            if self.stop.load(Ordering::Acquire) {
+                return false;
+            }
+            let left_ns = (t - host_now()).0;
+            if left_ns <= 0 {
+                return true;
+            }
+            std::thread::sleep(Duration::from_nanos(left_ns as u64).min(LONGEST_SLEEP));
+        }
+    }
+}

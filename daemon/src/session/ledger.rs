@@ -1,0 +1,145 @@
+//! Running judgement of the lasers against the fields that were shown.
+
+use std::collections::VecDeque;
+
+use holod_calibration::TimeNs;
+use holod_slm_output::FieldEvent;
+use holod_slm_output::laser::verify::{FieldSpan, verify_edges};
+use holod_slm_output::laser::{BoxEvent, LaserEdge};
+use serde::Serialize;
+
+/// Fields that wait before they are judged, so that the edges that belong to them have come.
+const WAITING_FIELDS: usize = 600;
+/// Findings that are kept word for word.
+const KEPT_FINDINGS: usize = 20;
+
+/// What the lasers did in the whole run.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct LaserSummary {
+    /// Fields judged.
+    pub fields: usize,
+    /// Of those, lit by exactly one window of their own colour.
+    pub lit: usize,
+    /// Of those, meant to stay dark and dark.
+    pub dark: usize,
+    /// Light where there must be none.
+    pub unsafe_findings: usize,
+    /// Everything that was not as it should be.
+    pub findings_in_all: usize,
+    /// The first findings in words.
+    pub findings: Vec<String>,
+    /// Times and reasons of going dark, newest last.
+    pub went_dark: Vec<String>,
+}
+
+/// Collects fields and edges and judges them in batches.
+#[derive(Default)]
+pub(super) struct LaserLedger {
+    fields: VecDeque<FieldSpan>,
+    edges: VecDeque<LaserEdge>,
+    summary: LaserSummary,
+}
+
+impl LaserLedger {
+    /// A field is over.
+    pub(super) fn field(&mut self, event: &FieldEvent) {
+        self.fields.push_back(event.span());
+        if self.fields.len() >= 2 * WAITING_FIELDS {
+            let until = self.fields[WAITING_FIELDS].t_present;
+            self.judge(Some(until));
+        }
+    }
+
+    /// The laser box spoke.
+    pub(super) fn box_event(&mut self, event: &BoxEvent) {
+        match event {
+            BoxEvent::Edge(edge) => self.edges.push_back(*edge),
+            BoxEvent::Armed { .. } => {}
+            BoxEvent::Dark { t, reason } => {
+                if self.summary.went_dark.len() == KEPT_FINDINGS {
+                    self.summary.went_dark.remove(0);
+                }
+                self.summary.went_dark.push(format!("{} at {} ns", reason.name(), t.0));
+            }
+        }
+    }
+
+    /// Judges what is left.
+    pub(super) fn finish(mut self) -> LaserSummary {
+        self.judge(None);
+        self.summary
+    }
+
+    fn judge(&mut self, until: Option<TimeNs>) {
+        let before = |t: TimeNs| until.is_none_or(|until| t < until);
+        let fields: Vec<FieldSpan> = take_while(&mut self.fields, |field| before(field.t_present));
+        let edges: Vec<LaserEdge> = take_while(&mut self.edges, |edge| before(edge.t));
+        let report = verify_edges(&fields, &edges);
+        self.summary.fields += report.fields;
+        self.summary.lit += report.lit;
+        self.summary.dark += report.dark;
+        self.summary.unsafe_findings += report.unsafe_findings().count();
+        self.summary.findings_in_all += report.findings.len();
+        let room = KEPT_FINDINGS.saturating_sub(self.summary.findings.len());
+        self.summary.findings.extend(report.findings.iter().take(room).map(ToString::to_string));
+    }
+}
+
+fn take_while<T>(queue: &mut VecDeque<T>, mut wanted: impl FnMut(&T) -> bool) -> Vec<T> {
+    let count = queue.iter().take_while(|item| wanted(item)).count();
+    queue.drain(..count).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use holod_calibration::Colour;
+    use holod_slm_output::Provenance;
+
+    fn event(index: i64) -> FieldEvent {
+        let t = TimeNs(index * 1000);
+        FieldEvent {
+            frame_id: (index / 3) as u64,
+            field: (index % 3) as usize,
+            colour: Colour::ALL[(index % 3) as usize],
+            t_submit: TimeNs(0),
+            t_desired_present: TimeNs(0),
+            t_present: t,
+            t_settled: t + TimeNs(100),
+            t_end: t + TimeNs(1000),
+            provenance: Provenance::Software,
+            laser_on: Some(t + TimeNs(200)),
+            laser_off: Some(t + TimeNs(900)),
+            dark: None,
+            repeated: false,
+            deadline_missed: false,
+        }
+    }
+
+    fn run(fields: i64, mut colour_of: impl FnMut(i64, Colour) -> Colour) -> LaserSummary {
+        let mut ledger = LaserLedger::default();
+        for index in 0..fields {
+            let event = event(index);
+            let colour = colour_of(index, event.colour);
+            for (t, on) in [(event.laser_on, true), (event.laser_off, false)] {
+                ledger.box_event(&BoxEvent::Edge(LaserEdge { t: t.unwrap(), colour, on }));
+            }
+            ledger.field(&event);
+        }
+        ledger.finish()
+    }
+
+    #[test]
+    fn batches_judge_every_field_once_and_find_nothing_wrong_at_their_seams() {
+        let summary = run(5000, |_, colour| colour);
+        assert_eq!((summary.fields, summary.lit, summary.findings_in_all), (5000, 5000, 0));
+    }
+
+    #[test]
+    fn one_wrong_colour_among_thousands_is_found() {
+        let summary =
+            run(5000, |index, colour| if index == 2500 { Colour::ALL[(colour.index() + 1) % 3] } else { colour });
+        assert!(summary.unsafe_findings >= 1);
+        assert!(!summary.findings.is_empty());
+    }
+}

@@ -1,0 +1,499 @@
+//! One run of the whole loop: starts the threads, watches them, takes them down in the right order.
+
+mod frame_loop;
+mod keep;
+mod ledger;
+mod scheduling;
+mod service;
+mod stats;
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use holod_calibration::rig::Rig;
+use holod_calibration::{PupilDiameter, TimeNs};
+use holod_model::optics::{DoublePhase, PhasePattern};
+use holod_model::{ComplexHologram, Weights};
+use holod_pupil_input::{
+    Decision, DecisionTap, Link, PupilState, ReplayError, Tracker, TrackerControl, TrackerError, TrackerSpec, host_now,
+};
+use holod_slm_output::laser::{BoxEvent, DarkReason};
+use holod_slm_output::output::pacing_config;
+use holod_slm_output::{FieldEvent, LevelsFrame, Output, OutputControl, OutputOptions, Pacer, PanelEncoder};
+use serde::Serialize;
+
+use self::frame_loop::{FrameLoop, LoopRecord, TrainedPupils};
+use self::keep::{KEEP_SLOTS, keep_slot};
+use self::ledger::LaserLedger;
+use self::service::{Service, Signals};
+use self::stats::Recent;
+use crate::cli::Backend;
+use crate::failure::{Exit, Failure};
+use crate::record::{FieldRecord, FrameRecord};
+use crate::setup::{self, Frames};
+
+pub use self::ledger::LaserSummary;
+pub use self::stats::Spread;
+
+/// What to run.
+pub struct SessionPlan {
+    /// The bench.
+    pub rig: Rig,
+    /// The network.
+    pub weights: Weights,
+    /// Which engine runs it.
+    pub backend: Backend,
+    /// What to show.
+    pub frames: Frames,
+    /// Where samples come from.
+    pub tracker: TrackerSpec,
+    /// Stop after so many frames.
+    pub frame_limit: Option<u64>,
+    /// Stop after so long.
+    pub duration: Option<Duration>,
+    /// Keep the levels that the panel showed, the newest for each half millimetre of pupil.
+    pub keep_levels: bool,
+}
+
+/// Hears of everything in the run, on the control thread.
+pub trait Observer {
+    /// A frame was made.
+    fn frame(&mut self, _record: &FrameRecord) -> Result<(), Failure> {
+        Ok(())
+    }
+    /// A field was shown and is over.
+    fn field(&mut self, _event: &FieldEvent) -> Result<(), Failure> {
+        Ok(())
+    }
+    /// The gate decided on a sample.
+    fn decision(&mut self, _decision: &Decision) -> Result<(), Failure> {
+        Ok(())
+    }
+    /// About ten times a second.
+    fn tick(&mut self) -> Result<(), Failure> {
+        Ok(())
+    }
+}
+
+/// What the run came to.
+pub struct SessionReport {
+    /// Everything that can be said in numbers.
+    pub summary: Summary,
+    /// When the run began.
+    pub t_origin: TimeNs,
+    /// Levels that the panel showed, with the pupil that each frame was made for, narrowest first.
+    pub shown: Vec<(PupilDiameter, LevelsFrame)>,
+    /// Turns levels back into phase.
+    pub encoder: PanelEncoder,
+}
+
+/// The numbers of a run; `summary.json`.
+#[derive(Clone, Debug, Serialize)]
+pub struct Summary {
+    /// Why the run ended.
+    pub ended_by: String,
+    /// How long it ran.
+    pub duration_s: f64,
+    /// The rig's name.
+    pub rig: String,
+    /// The scene's name.
+    pub scene: String,
+    /// The tracker spec.
+    pub tracker: String,
+    /// Hologram size in pixels.
+    pub hologram: String,
+    /// Frames that were made.
+    pub frames_made: u64,
+    /// Of those, frames that came on the panel.
+    pub frames_shown: u64,
+    /// Colour fields that the panel showed, repetitions included.
+    pub fields_shown: u64,
+    /// Fields of a frame that had been shown before.
+    pub fields_repeated: u64,
+    /// Frames that came on the panel later than planned.
+    pub deadline_misses: u64,
+    /// From waking to the submitted levels.
+    pub frame_time: Option<Spread>,
+    /// From the newest tracker sample behind a frame to the middle of its first light.
+    pub sample_to_photon: Option<Spread>,
+    /// Frames by the pupil estimator's state.
+    pub frames_by_pupil_state: BTreeMap<&'static str, u64>,
+    /// The narrowest and the widest pupil that a frame was made for.
+    pub pupil_range_mm: Option<[f32; 2]>,
+    /// Frames whose pupil lay outside those that the network was trained for, and was moved to the nearest one.
+    pub frames_beyond_trained_pupils: u64,
+    /// How the tracker's link was at the end.
+    pub tracker_link: &'static str,
+    /// Samples and log rows that were not believed, for any reason.
+    pub samples_rejected: u64,
+    /// Counters of the tracker: samples, connections, rejections by reason.
+    pub tracker_counts: BTreeMap<String, u64>,
+    /// Largest share of a frame's amplitudes that the double phase clipped.
+    pub clipped_share_max: f32,
+    /// Largest share of a frame's phases that the panel cannot reach.
+    pub unreachable_share_max: f32,
+    /// What the lasers did.
+    pub lasers: LaserSummary,
+    /// The lasers acknowledged darkness before the end.
+    pub lasers_dark_at_end: bool,
+    /// A flat pattern was on the panel at the end.
+    pub flat_at_end: bool,
+    /// Records that were lost because the control thread was late.
+    pub records_lost: u64,
+}
+
+const TICK: Duration = Duration::from_millis(10);
+const TICKS_PER_REPORT: u32 = 10;
+/// Frame records on their way to the control thread.
+const RECORDS: usize = 1024;
+/// Frame time that pacing supposes before it has seen one.
+const FIRST_FRAME_TIME: TimeNs = TimeNs(500_000_000);
+/// Lasers go dark when one frame has stayed on the panel for this long.
+const STALL_TIMEOUT: TimeNs = TimeNs(10_000_000_000);
+/// How long the end of a run waits for its last frame to be shown.
+const LAST_FRAME_WAIT: TimeNs = TimeNs(1_000_000_000);
+
+/// The daemon's state, as `systemctl status` shows it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum State {
+    Dark,
+    Running,
+    Degraded,
+}
+
+/// Runs until a limit, a signal or a failure ends it; lasers are dark when it returns.
+///
+/// # Errors
+/// What could not be started, or the observer's failure; in both cases everything has been taken down.
+pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionReport, Failure> {
+    let signals = Signals::install()?;
+    let resolution = plan.frames.resolution();
+    let rig = &plan.rig;
+    let engine = scheduling::patient(|| setup::engine(plan.backend, &plan.weights, resolution))?;
+    let encoder =
+        PanelEncoder::new(&rig.panel, rig.resolution(), resolution).map_err(Failure::because(Exit::Config))?;
+    let pacing = pacing_config(rig, FIRST_FRAME_TIME).map_err(Failure::because(Exit::Config))?;
+    let t_origin = host_now();
+    let (estimates, tap, tracker) =
+        scheduling::prompt(|| Tracker::start(&plan.tracker, &rig.tracker, t_origin)).map_err(tracker_failure)?.split();
+    let options =
+        OutputOptions { keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 }, stall_timeout: STALL_TIMEOUT };
+    let output = Output::headless(rig, &encoder, options, host_now).map_err(Failure::because(Exit::Unavailable))?;
+    output.control.dark_switch().install_panic_hook(host_now);
+
+    let stop = Arc::new(AtomicBool::new(false));
+    let (record_producer, records) = rtrb::RingBuffer::new(RECORDS);
+    let frames = Arc::new(plan.frames);
+    let frame_loop = FrameLoop {
+        pupil: estimates,
+        engine,
+        double_phase: DoublePhase::new(resolution, plan.weights.config().amplitude_constant),
+        encoder: encoder.clone(),
+        port: output.frames,
+        pacer: Pacer::new(pacing, host_now()),
+        frames: Arc::clone(&frames),
+        trained: TrainedPupils {
+            narrowest: PupilDiameter::from_mm(plan.weights.config().pupil_range_mm[0]),
+            widest: PupilDiameter::from_mm(plan.weights.config().pupil_range_mm[1]),
+        },
+        t_origin,
+        hologram: ComplexHologram::dark(resolution),
+        pattern: PhasePattern::flat(resolution),
+        records: record_producer,
+        keep_levels: plan.keep_levels,
+        limit: plan.frame_limit,
+        stop: Arc::clone(&stop),
+    };
+    let frame_thread = std::thread::Builder::new()
+        .name("holod-frame".into())
+        .spawn(move || frame_loop.run())
+        .map_err(Failure::because(Exit::Unavailable))?;
+    let replay_ends_run = plan.frame_limit.is_none()
+        && plan.duration.is_none()
+        && match &plan.tracker {
+            TrackerSpec::Replay { repeat, .. } => !repeat,
+            TrackerSpec::Path(path) => path.is_file(),
+            _ => false,
+        };
+
+    let mut watch = Watch {
+        records,
+        events: output.events,
+        box_events: output.box_events,
+        tap,
+        tracker,
+        signals,
+        service: Service::connect(),
+        state: State::Dark,
+        tally: Tally::default(),
+        t_dark_untold: TimeNs(i64::MIN),
+        observer,
+    };
+    let limits = Limits { t_origin, duration: plan.duration, replay_ends_run };
+    let ended = watch.until_the_end(&limits, &output.control, &frame_thread);
+
+    watch.service.stopping();
+    tracing::info!("stopping: {}", ended.as_deref().unwrap_or("a failure"));
+    stop.store(true, Ordering::Release);
+    let down = output.control.shutdown();
+    let frame_loop_failed = frame_thread.join().is_err();
+    let tracker_link = watch.tracker.link().name();
+    watch.tracker.stop();
+    let observed = watch.drain();
+    let Watch { tracker, tally, .. } = watch;
+    let ended_by = ended?;
+    observed?;
+    if frame_loop_failed {
+        return Err(Failure::new(
+            Exit::Software,
+            "the frame loop failed (its message stands above); the lasers were put out first",
+        ));
+    }
+
+    let mut shown: Vec<(PupilDiameter, LevelsFrame)> = down
+        .kept
+        .into_iter()
+        .flatten()
+        .filter_map(|levels| Some((tally.pupil_of_kept(levels.tag().frame_id)?, levels)))
+        .collect();
+    shown.sort_by(|(a, _), (b, _)| a.mm().total_cmp(&b.mm()));
+    let summary = Summary {
+        ended_by,
+        duration_s: (host_now() - t_origin).seconds(),
+        rig: plan.rig.name.clone(),
+        scene: frames.name.clone(),
+        tracker: plan.tracker.to_string(),
+        hologram: resolution.to_string(),
+        frames_made: tally.frames_made,
+        frames_shown: tally.frames_shown,
+        fields_shown: tally.fields_shown,
+        fields_repeated: tally.fields_repeated,
+        deadline_misses: tally.deadline_misses,
+        frame_time: tally.frame_time.spread(),
+        sample_to_photon: tally.sample_to_photon.spread(),
+        frames_by_pupil_state: tally.by_state,
+        pupil_range_mm: tally.pupil_range_mm,
+        frames_beyond_trained_pupils: tally.beyond_trained,
+        tracker_link,
+        samples_rejected: tracker.counters().rejected_in_all() + tracker.counters().faults_in_all(),
+        tracker_counts: tracker.counters().entries().collect(),
+        clipped_share_max: tally.clipped_share_max,
+        unreachable_share_max: tally.unreachable_share_max,
+        lasers: tally.lasers.finish(),
+        lasers_dark_at_end: down.lasers_dark,
+        flat_at_end: down.flat_presented,
+        records_lost: down.counts.lost,
+    };
+    Ok(SessionReport { summary, t_origin, shown, encoder })
+}
+
+/// When a run is over.
+struct Limits {
+    t_origin: TimeNs,
+    duration: Option<Duration>,
+    replay_ends_run: bool,
+}
+
+/// The control thread's view of a run.
+struct Watch<'a> {
+    records: rtrb::Consumer<LoopRecord>,
+    events: rtrb::Consumer<FieldEvent>,
+    box_events: rtrb::Consumer<BoxEvent>,
+    tap: DecisionTap,
+    tracker: TrackerControl,
+    signals: Signals,
+    service: Service,
+    state: State,
+    tally: Tally,
+    t_dark_untold: TimeNs,
+    observer: &'a mut dyn Observer,
+}
+
+impl Watch<'_> {
+    /// Watches until something ends the run, and says what.
+    fn until_the_end(
+        &mut self,
+        limits: &Limits,
+        output: &OutputControl,
+        frame_thread: &JoinHandle<()>,
+    ) -> Result<String, Failure> {
+        let mut t_give_up = None;
+        let mut ticks = 0_u32;
+        loop {
+            std::thread::sleep(TICK);
+            let now = host_now();
+            self.drain()?;
+            self.service.progress(self.tally.frames_shown, now);
+            ticks = ticks.wrapping_add(1);
+            if ticks.is_multiple_of(TICKS_PER_REPORT) {
+                self.tell_state(output);
+                self.observer.tick()?;
+            }
+            if let Some(signal) = self.signals.caught() {
+                return Ok(signal.to_owned());
+            }
+            if limits.duration.is_some_and(|duration| (now - limits.t_origin).0 >= duration.as_nanos() as i64) {
+                return Ok("the asked duration".to_owned());
+            }
+            if limits.replay_ends_run && self.tracker.finished() {
+                return Ok("the end of the pupil log".to_owned());
+            }
+            if frame_thread.is_finished() {
+                let t_end = *t_give_up.get_or_insert(now + LAST_FRAME_WAIT);
+                if self.tally.newest_frame_shown() || now >= t_end {
+                    return Ok("the asked number of frames".to_owned());
+                }
+            }
+        }
+    }
+
+    /// Takes note of everything that the other threads have said.
+    fn drain(&mut self) -> Result<(), Failure> {
+        while let Ok(record) = self.records.pop() {
+            self.tally.frame(&record);
+            self.observer.frame(&record.frame)?;
+        }
+        while let Ok(event) = self.box_events.pop() {
+            self.tally.lasers.box_event(&event);
+            if let BoxEvent::Dark { t, reason } = event {
+                self.tell_dark(t, reason);
+            }
+        }
+        while let Ok(event) = self.events.pop() {
+            self.tally.field(&event);
+            self.observer.field(&event)?;
+        }
+        while let Some(decision) = self.tap.pop() {
+            self.observer.decision(&decision)?;
+        }
+        Ok(())
+    }
+
+    /// One line at most a second: lasers that flicker must not flood the log.
+    fn tell_dark(&mut self, t: TimeNs, reason: DarkReason) {
+        if t >= self.t_dark_untold {
+            tracing::info!("lasers dark: {}", reason.name());
+            self.t_dark_untold = t + TimeNs(1_000_000_000);
+        }
+    }
+
+    fn tell_state(&mut self, output: &OutputControl) {
+        let lit = output.counts().armed && self.tally.frames_shown > 0;
+        let link = self.tracker.link();
+        let follows = link == Link::Up && self.tally.newest_state != PupilState::Fallback.name();
+        let state = match (lit, follows) {
+            (false, _) => State::Dark,
+            (true, false) => State::Degraded,
+            (true, true) => State::Running,
+        };
+        if state != self.state {
+            let text = format!("{state:?}: tracker {}, pupil {}", link.name(), self.tally.newest_state);
+            tracing::info!("{text}");
+            self.service.status(&text);
+            self.state = state;
+        }
+    }
+}
+
+/// Frames whose fields may still come.
+const REMEMBERED: usize = 64;
+
+/// Running numbers of a run.
+#[derive(Default)]
+struct Tally {
+    recent: VecDeque<FrameRecord>,
+    kept: [Option<(u64, PupilDiameter)>; KEEP_SLOTS],
+    lasers: LaserLedger,
+    frames_made: u64,
+    frames_shown: u64,
+    fields_shown: u64,
+    fields_repeated: u64,
+    deadline_misses: u64,
+    newest_made: u64,
+    newest_shown: u64,
+    newest_state: &'static str,
+    frame_time: Recent,
+    sample_to_photon: Recent,
+    by_state: BTreeMap<&'static str, u64>,
+    pupil_range_mm: Option<[f32; 2]>,
+    beyond_trained: u64,
+    clipped_share_max: f32,
+    unreachable_share_max: f32,
+}
+
+impl Tally {
+    fn frame(&mut self, record: &LoopRecord) {
+        let frame = &record.frame;
+        self.frames_made += 1;
+        self.newest_made = frame.frame;
+        self.newest_state = frame.pupil_state;
+        *self.by_state.entry(frame.pupil_state).or_default() += 1;
+        self.frame_time.push((frame.t_submit - frame.t_wake).seconds() as f32 * 1e3);
+        let pupil_mm = frame.pupil.mm();
+        self.beyond_trained += u64::from(frame.pupil != frame.hologram_pupil);
+        let [narrowest, widest] = self.pupil_range_mm.unwrap_or([pupil_mm; 2]);
+        self.pupil_range_mm = Some([narrowest.min(pupil_mm), widest.max(pupil_mm)]);
+        self.clipped_share_max = self.clipped_share_max.max(record.clipped_share);
+        self.unreachable_share_max = self.unreachable_share_max.max(record.unreachable_share);
+        if self.recent.len() == REMEMBERED {
+            self.recent.pop_front();
+        }
+        self.recent.push_back(*frame);
+    }
+
+    fn field(&mut self, event: &FieldEvent) {
+        self.lasers.field(event);
+        self.fields_shown += 1;
+        self.fields_repeated += u64::from(event.repeated);
+        if event.repeated || event.frame_id == self.newest_shown {
+            return;
+        }
+        self.newest_shown = event.frame_id;
+        self.frames_shown += 1;
+        self.deadline_misses += u64::from(event.deadline_missed);
+        let Some(frame) = self.recent.iter().find(|frame| frame.frame == event.frame_id) else { return };
+        if let Some(slot) = keep_slot(frame.hologram_pupil) {
+            self.kept[slot] = Some((frame.frame, frame.hologram_pupil));
+        }
+        if let (Some(t_sample), Some(on), Some(off)) = (frame.t_sample, event.laser_on, event.laser_off) {
+            let middle = TimeNs(on.0 / 2 + off.0 / 2);
+            self.sample_to_photon.push((middle - t_sample).seconds() as f32 * 1e3);
+        }
+    }
+
+    fn newest_frame_shown(&self) -> bool {
+        self.newest_shown == self.newest_made
+    }
+
+    fn pupil_of_kept(&self, frame: u64) -> Option<PupilDiameter> {
+        self.kept.iter().flatten().find(|(kept, _)| *kept == frame).map(|(_, pupil)| *pupil)
+    }
+}
+
+fn tracker_failure(error: TrackerError) -> Failure {
+    let exit = match &error {
+        TrackerError::Serial(_) => Exit::NoInput,
+        TrackerError::Replay(ReplayError::Io { .. }) => Exit::NoInput,
+        TrackerError::Replay(_) => Exit::Data,
+        TrackerError::Thread(_) => Exit::Unavailable,
+    };
+    Failure::because(exit)(error)
+}
+
+impl FieldRecord {
+    /// The row of a field that was shown.
+    pub fn of(event: &FieldEvent) -> Self {
+        Self {
+            frame: event.frame_id,
+            field: event.field as u8,
+            colour: event.colour,
+            t_present: event.t_present,
+            provenance: event.provenance.name(),
+            laser_window: event.laser_on.zip(event.laser_off),
+            deadline_missed: event.deadline_missed && !event.repeated,
+        }
+    }
+}

@@ -1,0 +1,120 @@
+//! What the operating system and its service manager are told, and tell.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::Duration;
+
+use holod_calibration::TimeNs;
+use sd_notify::NotifyState;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+
+use crate::failure::{Exit, Failure};
+
+/// SIGINT, SIGTERM and SIGHUP, as a flag.
+pub(super) struct Signals(Arc<AtomicUsize>);
+
+impl Signals {
+    /// Takes the signals over. A second one while the first is being obeyed ends the process at once: the laser box's
+    /// heartbeat makes it dark.
+    pub(super) fn install() -> Result<Self, Failure> {
+        let caught = Arc::new(AtomicUsize::new(0));
+        let again = Arc::new(AtomicBool::new(false));
+        for signal in [SIGINT, SIGTERM, SIGHUP] {
+            signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&again))
+                .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&again)))
+                .and_then(|_| signal_hook::flag::register_usize(signal, Arc::clone(&caught), signal as usize))
+                .map_err(Failure::because(Exit::Software))?;
+        }
+        Ok(Self(caught))
+    }
+
+    /// The name of the signal that came.
+    pub(super) fn caught(&self) -> Option<&'static str> {
+        match self.0.load(Ordering::Acquire) as i32 {
+            0 => None,
+            SIGINT => Some("SIGINT"),
+            SIGTERM => Some("SIGTERM"),
+            _ => Some("SIGHUP"),
+        }
+    }
+}
+
+/// The service manager's end of the line; silent where there is none.
+pub(super) struct Service {
+    watchdog: Option<Watchdog>,
+    ready: bool,
+}
+
+/// Decides when the service manager's watchdog is fed: only when frames have come on the panel since the last time.
+#[derive(Debug)]
+struct Watchdog {
+    every: TimeNs,
+    t_fed: TimeNs,
+    frames_fed: u64,
+}
+
+impl Watchdog {
+    fn wants_food(&mut self, frames_shown: u64, now: TimeNs) -> bool {
+        let due = now - self.t_fed >= self.every && frames_shown > self.frames_fed;
+        if due {
+            (self.t_fed, self.frames_fed) = (now, frames_shown);
+        }
+        due
+    }
+}
+
+impl Service {
+    /// Looks whether a service manager listens.
+    pub(super) fn connect() -> Self {
+        let watchdog = sd_notify::watchdog_enabled().map(|limit: Duration| Watchdog {
+            every: TimeNs(limit.as_nanos() as i64 / 4),
+            t_fed: TimeNs(i64::MIN / 2),
+            frames_fed: 0,
+        });
+        Self { watchdog, ready: false }
+    }
+
+    /// Frames were shown: tells readiness after the first, feeds the watchdog.
+    pub(super) fn progress(&mut self, frames_shown: u64, now: TimeNs) {
+        if frames_shown > 0 && !self.ready {
+            self.ready = true;
+            tell(&[NotifyState::Ready]);
+        }
+        if self.watchdog.as_mut().is_some_and(|watchdog| watchdog.wants_food(frames_shown, now)) {
+            tell(&[NotifyState::Watchdog]);
+        }
+    }
+
+    /// One line for `systemctl status`.
+    pub(super) fn status(&self, text: &str) {
+        tell(&[NotifyState::Status(text)]);
+    }
+
+    /// The way down has begun.
+    pub(super) fn stopping(&self) {
+        tell(&[NotifyState::Stopping]);
+    }
+}
+
+fn tell(states: &[NotifyState<'_>]) {
+    if let Err(error) = sd_notify::notify(states) {
+        tracing::warn!("the service manager does not listen: {error}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_watchdog_starves_when_no_new_frame_is_shown() {
+        let mut watchdog = Watchdog { every: TimeNs(100), t_fed: TimeNs(0), frames_fed: 0 };
+        assert!(!watchdog.wants_food(0, TimeNs(1_000)));
+        assert!(watchdog.wants_food(1, TimeNs(1_000)));
+        assert!(!watchdog.wants_food(5, TimeNs(1_050)), "not due yet");
+        assert!(watchdog.wants_food(5, TimeNs(1_100)));
+        for t in 0..100 {
+            assert!(!watchdog.wants_food(5, TimeNs(2_000 + t * 100)), "a stalled panel does not feed it");
+        }
+    }
+}

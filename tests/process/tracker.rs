@@ -1,0 +1,236 @@
+//! The daemon on a tracker's pseudo-terminal, in real time.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use holod_calibration::TimeNs;
+use holod_pupil_input::wire::line::{LineSample, encode_line};
+use holod_pupil_input::{MOCK_SEED, MockSource, PupilSample, Recording, SampleEye, Scenario, host_now};
+use holod_tests::daemon::{Daemon, wait_until};
+use holod_tests::frames::{self, FieldRow};
+use holod_tests::tracker::{PtyTracker, TimedLine};
+use holod_tests::{FIELD_ORDER, small_rig};
+use rustix::process::Signal;
+
+const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+
+/// Lines of the line protocol, as a bridge between a tracker and holod sends them: no lid apertures, full confidence.
+fn lines(samples: &[PupilSample]) -> Vec<TimedLine> {
+    let first = samples[0].t_sample;
+    samples
+        .iter()
+        .enumerate()
+        .map(|(index, sample)| {
+            let since = sample.t_sample - first;
+            let line = LineSample {
+                sequence: index as u64,
+                device_us: since.0 / 1000,
+                eye: sample.eye,
+                diameter_mm: sample.diameter_mm,
+                confidence: 1.0,
+            };
+            let mut text = String::new();
+            encode_line(&line, &mut text);
+            TimedLine { due: Duration::from_nanos(since.0 as u64), bytes: text.into_bytes() }
+        })
+        .collect()
+}
+
+struct Bench {
+    folder: tempfile::TempDir,
+    rig: PathBuf,
+    link: PathBuf,
+    record: PathBuf,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        let (rig, link, record) = (path("rig.toml"), path("ttyTracker"), path("record"));
+        fs::write(&rig, small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+        Self { folder, rig, link, record }
+    }
+
+    fn start(&self, more: &[&str]) -> Daemon {
+        let (rig, link, record) = (text(&self.rig), text(&self.link), text(&self.record));
+        let mut args = vec!["--config", rig, "--tracker", link, "--resolution", "64x64", "--record", record];
+        args.extend_from_slice(more);
+        let daemon = Daemon::start(HOLOD, &args, self.folder.path());
+        let csv = self.record.join("frames.csv");
+        let began =
+            wait_until(Duration::from_secs(30), || fs::read_to_string(&csv).is_ok_and(|t| t.lines().count() > 30));
+        assert!(began, "the loop runs before the tracker speaks");
+        daemon
+    }
+
+    fn stop(&self, daemon: Daemon) -> (Vec<FieldRow>, serde_json::Value) {
+        daemon.signal(Signal::TERM);
+        let ended = daemon.wait(Duration::from_secs(20));
+        assert!(ended.status.success(), "{}", ended.stderr);
+        let rows = frames::read(&self.record.join("frames.csv")).unwrap();
+        let summary = fs::read_to_string(self.record.join("summary.json")).unwrap();
+        (rows, serde_json::from_str(&summary).unwrap())
+    }
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// Judges what every run must show, and that nobody's laser was lit over another's field.
+fn judge(rows: &[FieldRow], summary: &serde_json::Value) {
+    assert_eq!(frames::faults(rows, FIELD_ORDER), Vec::<String>::new());
+    assert_eq!(summary["lasers"]["unsafe_findings"], 0, "{summary:#}");
+    assert_eq!(summary["lasers_dark_at_end"], true);
+    assert_eq!(summary["flat_at_end"], true);
+    let missed =
+        rows.iter().filter(|row| row.deadline_missed).map(|row| row.frame).collect::<std::collections::BTreeSet<_>>();
+    assert_eq!(summary["deadline_misses"], missed.len());
+    assert_eq!(summary["records_lost"], 0);
+}
+
+/// The largest and the median distance between what frames were made for and what `truth_mm` was `lag` before their
+/// light, over frames for which `counts`.
+fn errors(rows: &[FieldRow], t_first: TimeNs, lag: TimeNs, truth_mm: impl Fn(TimeNs) -> Option<f64>) -> (f64, f64) {
+    let mut errors: Vec<f64> = rows
+        .iter()
+        .filter_map(|row| {
+            let t = TimeNs(row.laser_on_ns?) - t_first - lag;
+            Some((row.pupil_mm - truth_mm(t)?).abs())
+        })
+        .collect();
+    errors.sort_by(f64::total_cmp);
+    assert!(errors.len() > 300, "{} frames to judge", errors.len());
+    (errors[errors.len() - 1], errors[errors.len() / 2])
+}
+
+/// The lag that the filter states.
+const LAG: TimeNs = TimeNs(0);
+
+#[test]
+fn the_display_follows_the_eye_and_holds_through_blinks() {
+    let bench = Bench::new();
+    let mut tracker = PtyTracker::plug_in(&bench.link).unwrap();
+    let daemon = bench.start(&[]);
+    let eye: Vec<_> = MockSource::new(Scenario::LightSteps, MOCK_SEED)
+        .without_confidence()
+        .take_while(|sample| sample.sample.t_sample < TimeNs(8_000_000_000))
+        .filter(|sample| sample.sample.eye == SampleEye::Left)
+        .collect();
+    let samples: Vec<PupilSample> = eye.iter().map(|sample| sample.sample).collect();
+    let t_first = host_now();
+    tracker.feed(&lines(&samples), Instant::now()).unwrap();
+    let (rows, summary) = bench.stop(daemon);
+    judge(&rows, &summary);
+
+    let raw_lowest = samples.iter().map(|sample| sample.diameter_mm).fold(f32::MAX, f32::min);
+    let true_lowest = eye.iter().map(|sample| sample.truth_mm).fold(f32::MAX, f32::min);
+    assert!(
+        raw_lowest < true_lowest - 0.8,
+        "the test's blinks must show in the raw samples: {raw_lowest} {true_lowest}"
+    );
+    let after_start = TimeNs(500_000_000);
+    let truth = |t: TimeNs| {
+        let index = usize::try_from(t.0 / 5_000_000).ok()?;
+        (t > after_start).then(|| eye.get(index).map(|sample| f64::from(sample.truth_mm)))?
+    };
+    let (worst_mm, median_mm) = errors(&rows, t_first, LAG, truth);
+    assert!(median_mm < 0.1, "median error {median_mm} mm");
+    assert!(worst_mm < 0.6, "worst error {worst_mm} mm: a blink or a light step was not followed");
+    let (_, canary_mm) = errors(&rows, t_first, TimeNs(-600_000_000), truth);
+    assert!(canary_mm > 2.0 * median_mm, "the judge must object to an eye that is 0.6 s off: {canary_mm}");
+    let blinked = rows.iter().filter(|row| row.pupil_state == "holding").count();
+    assert!(blinked > 20, "blinks are held: {blinked} fields");
+}
+
+#[test]
+fn unplugging_garbage_and_silence_are_survived_and_counted() {
+    let bench = Bench::new();
+    let mut tracker = PtyTracker::plug_in(&bench.link).unwrap();
+    let mut daemon = bench.start(&[]);
+    let steady: Vec<PupilSample> = MockSource::new(Scenario::Steady, MOCK_SEED)
+        .take_while(|sample| sample.sample.t_sample < TimeNs(1_500_000_000))
+        .filter(|sample| sample.sample.eye == SampleEye::Left)
+        .map(|sample| sample.sample)
+        .collect();
+    let lines = lines(&steady);
+    tracker.feed(&lines, Instant::now()).unwrap();
+    tracker.send(b"P1,half a li").unwrap();
+    tracker.send(&[0xff; 4096]).unwrap();
+    tracker.send(b"\nP1,9,9,L,-3.0,1.0*00\nP1,9,9,L,nan,1.0*00\n").unwrap();
+    thread::sleep(Duration::from_millis(1800));
+    drop(tracker);
+    thread::sleep(Duration::from_millis(1200));
+    assert!(daemon.runs(), "an unplugged tracker is no reason to end");
+    let mut tracker = PtyTracker::plug_in(&bench.link).unwrap();
+    thread::sleep(Duration::from_millis(2500));
+    tracker.feed(&lines, Instant::now()).unwrap();
+    let (rows, summary) = bench.stop(daemon);
+    judge(&rows, &summary);
+
+    let mut expected = ["tracking", "holding", "fallback", "tracking"].into_iter().peekable();
+    for row in &rows {
+        expected.next_if_eq(&row.pupil_state.as_str());
+    }
+    assert_eq!(expected.next(), None, "the state that never came");
+    let count = |name: &str| summary["tracker_counts"][name].as_u64().unwrap_or_else(|| panic!("{name}: {summary:#}"));
+    assert!(count("disconnects") >= 1);
+    assert!(count("connects") >= 2);
+    assert!(count("silences") >= 1);
+    assert!(count("line_too_long") + count("line_malformed") >= 1);
+    assert!(count("line_bad_crc") >= 2);
+    assert!(rows.iter().all(|row| (2.5..5.5).contains(&row.pupil_mm)), "garbage never reaches the display");
+}
+
+#[test]
+#[ignore = "needs shared data"]
+fn shared_data_neon_recording_through_a_port_holds_through_both_blinks() {
+    let shared = std::env::var("HOLOD_SHARED_DATA")
+        .map(PathBuf::from)
+        .unwrap_or_else(|_| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"));
+    let log = shared.join("pupil/neon_demo/3d_eye_states.csv");
+    let recording = Recording::read(&log).unwrap();
+    let samples: Vec<PupilSample> = recording.samples().filter(|sample| sample.eye == SampleEye::Left).collect();
+    let bench = Bench::new();
+    let mut tracker = PtyTracker::plug_in(&bench.link).unwrap();
+    let daemon = bench.start(&[]);
+    let t_first = host_now();
+    tracker.feed(&lines(&samples), Instant::now()).unwrap();
+    let (rows, summary) = bench.stop(daemon);
+    judge(&rows, &summary);
+
+    let during: Vec<&FieldRow> =
+        rows.iter().filter(|row| row.t_present_ns > t_first.0 + 500_000_000 && row.pupil_state != "fallback").collect();
+    let lowest = during.iter().map(|row| row.pupil_mm).fold(f64::MAX, f64::min);
+    let raw_lowest = during.iter().filter_map(|row| row.pupil_raw_mm).fold(f64::MAX, f64::min);
+    assert!(raw_lowest < 2.0, "the raw samples that the frames saw fall in the blinks: {raw_lowest}");
+    assert!(lowest >= 3.0, "the estimate fell to {lowest} mm");
+    let start = samples[0].t_sample;
+    let open = |t: TimeNs| {
+        let blinks = recording.blinks();
+        let guard = TimeNs(250_000_000);
+        let near_blink = blinks.iter().any(|(begin, end)| t > *begin - guard && t < *end + guard);
+        (!near_blink).then_some(())
+    };
+    let truth = |t: TimeNs| {
+        let at = start + t;
+        open(at)?;
+        if t < TimeNs(500_000_000) {
+            return None;
+        }
+        // The median of a tenth of a second stands for the truth.
+        let mut near: Vec<f32> = samples
+            .iter()
+            .filter(|sample| (sample.t_sample - at).0.abs() < 50_000_000)
+            .map(|sample| sample.diameter_mm)
+            .collect();
+        near.sort_by(f32::total_cmp);
+        near.get(near.len() / 2).copied().map(f64::from)
+    };
+    let (worst_mm, median_mm) = errors(&rows, t_first, LAG, truth);
+    assert!(median_mm < 0.08, "median error {median_mm} mm");
+    assert!(worst_mm < 0.6, "worst error {worst_mm} mm");
+}

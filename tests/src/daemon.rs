@@ -1,0 +1,105 @@
+//! The `holod` binary as a process.
+
+use std::io::Read;
+use std::path::Path;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+
+/// A running `holod`; killed when it is dropped.
+pub struct Daemon {
+    child: Child,
+}
+
+/// How a `holod` ended.
+#[derive(Debug)]
+pub struct Ended {
+    /// Exit status.
+    pub status: ExitStatus,
+    /// All of standard output.
+    pub stdout: String,
+    /// All of standard error.
+    pub stderr: String,
+}
+
+impl Daemon {
+    /// Starts `binary` with `args` in `folder`.
+    ///
+    /// # Panics
+    /// Where it cannot be started: the test has no subject.
+    pub fn start(binary: &str, args: &[&str], folder: &Path) -> Self {
+        let child = Command::new(binary)
+            .args(args)
+            .current_dir(folder)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .expect("holod starts");
+        Self { child }
+    }
+
+    /// Sends a signal.
+    pub fn signal(&self, signal: Signal) {
+        let pid = Pid::from_raw(self.child.id() as i32).expect("a child has a process number");
+        kill_process(pid, signal).expect("the child takes signals");
+    }
+
+    /// Whether it still runs.
+    pub fn runs(&mut self) -> bool {
+        self.child.try_wait().expect("a child can be asked").is_none()
+    }
+
+    /// Waits for its end.
+    ///
+    /// # Panics
+    /// Where it has not ended within `patience`.
+    pub fn wait(mut self, patience: Duration) -> Ended {
+        let read = |mut pipe: Box<dyn Read + Send>| {
+            thread::spawn(move || {
+                let mut bytes = Vec::new();
+                let _ = pipe.read_to_end(&mut bytes);
+                String::from_utf8_lossy(&bytes).into_owned()
+            })
+        };
+        let stdout = read(Box::new(self.child.stdout.take().expect("piped")));
+        let stderr = read(Box::new(self.child.stderr.take().expect("piped")));
+        let began = Instant::now();
+        while self.runs() {
+            assert!(began.elapsed() < patience, "holod has not ended within {patience:?}");
+            thread::sleep(Duration::from_millis(10));
+        }
+        let status = self.child.wait().expect("a child that ended has a status");
+        Ended {
+            status,
+            stdout: stdout.join().expect("the reader ends with the pipe"),
+            stderr: stderr.join().expect("the reader ends with the pipe"),
+        }
+    }
+}
+
+impl Drop for Daemon {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Runs `binary` to its end.
+pub fn run(binary: &str, args: &[&str], folder: &Path) -> Ended {
+    Daemon::start(binary, args, folder).wait(Duration::from_secs(120))
+}
+
+/// Waits until `done`, at most `patience`; false where it never came.
+pub fn wait_until(patience: Duration, mut done: impl FnMut() -> bool) -> bool {
+    let began = Instant::now();
+    while began.elapsed() < patience {
+        if done() {
+            return true;
+        }
+        thread::sleep(Duration::from_millis(20));
+    }
+    false
+}
