@@ -1,0 +1,230 @@
+//! Vectors of `f32` for whichever instruction set the processor has, chosen at run time.
+//!
+//! A value of an instruction set's type exists only where the processor has that set, which is what makes calling its
+//! instructions sound.
+
+/// One instruction set. Everything here is inlined into [`Simd::vectorise`], where the set's features are enabled.
+pub(super) trait Simd: Copy + Send + Sync {
+    /// A vector of `LANES` values.
+    type Vector: Copy;
+    const LANES: usize;
+
+    fn splat(self, value: f32) -> Self::Vector;
+    /// # Safety
+    /// `from` points to `LANES` readable values.
+    unsafe fn load(self, from: *const f32) -> Self::Vector;
+    /// # Safety
+    /// `to` points to `LANES` writable values.
+    unsafe fn store(self, to: *mut f32, vector: Self::Vector);
+    /// a·b + c
+    fn mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
+    fn mul(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
+    fn max(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
+
+    /// Runs `task` with this set's instructions enabled.
+    fn vectorise<T: Task>(self, task: T);
+}
+
+/// Work that is compiled once for each instruction set. `run` must be `#[inline(always)]`.
+pub(super) trait Task {
+    fn run<S: Simd>(self, simd: S);
+}
+
+/// The best instruction set of this processor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum InstructionSet {
+    #[cfg(target_arch = "x86_64")]
+    Avx512(Avx512),
+    #[cfg(target_arch = "x86_64")]
+    Avx2(Avx2),
+    Portable(Portable<4>),
+    /// Sixteen lanes in plain Rust: the blocking of AVX-512 on machines without it.
+    #[cfg(test)]
+    Wide(Portable<16>),
+}
+
+impl InstructionSet {
+    /// Every set that this processor has, best first; never empty.
+    pub(super) fn available() -> impl Iterator<Item = Self> {
+        #[cfg(target_arch = "x86_64")]
+        let special = [Avx512::detect().map(Self::Avx512), Avx2::detect().map(Self::Avx2)];
+        #[cfg(not(target_arch = "x86_64"))]
+        let special: [Option<Self>; 0] = [];
+        special.into_iter().flatten().chain([
+            Self::Portable(Portable),
+            #[cfg(test)]
+            Self::Wide(Portable),
+        ])
+    }
+
+    pub(super) fn best() -> Self {
+        Self::available().next().unwrap_or(Self::Portable(Portable))
+    }
+
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(_) => "avx512",
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(_) => "avx2",
+            Self::Portable(_) => "portable",
+            #[cfg(test)]
+            Self::Wide(_) => "wide",
+        }
+    }
+
+    pub(super) fn lanes(self) -> usize {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(_) => Avx512::LANES,
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(_) => Avx2::LANES,
+            Self::Portable(_) => Portable::<4>::LANES,
+            #[cfg(test)]
+            Self::Wide(_) => Portable::<16>::LANES,
+        }
+    }
+
+    pub(super) fn run(self, task: impl Task) {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512(simd) => simd.vectorise(task),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx2(simd) => simd.vectorise(task),
+            Self::Portable(simd) => simd.vectorise(task),
+            #[cfg(test)]
+            Self::Wide(simd) => simd.vectorise(task),
+        }
+    }
+}
+
+/// Lanes in plain Rust; four are what every compiler target has base vectors for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Portable<const N: usize>;
+
+impl<const N: usize> Simd for Portable<N> {
+    type Vector = [f32; N];
+    const LANES: usize = N;
+
+    #[inline(always)]
+    fn splat(self, value: f32) -> [f32; N] {
+        [value; N]
+    }
+
+    #[inline(always)]
+    unsafe fn load(self, from: *const f32) -> [f32; N] {
+        // SAFETY: the caller promises N readable values; f32 arrays have f32's alignment.
+        unsafe { *from.cast() }
+    }
+
+    #[inline(always)]
+    unsafe fn store(self, to: *mut f32, vector: [f32; N]) {
+        // SAFETY: the caller promises N writable values; f32 arrays have f32's alignment.
+        unsafe { *to.cast() = vector }
+    }
+
+    #[inline(always)]
+    fn mul_add(self, a: [f32; N], b: [f32; N], c: [f32; N]) -> [f32; N] {
+        // Where the target has no fused instruction, `mul_add` would be a slow library call.
+        std::array::from_fn(|lane| {
+            if cfg!(any(target_arch = "aarch64", target_feature = "fma")) {
+                a[lane].mul_add(b[lane], c[lane])
+            } else {
+                a[lane] * b[lane] + c[lane]
+            }
+        })
+    }
+
+    #[inline(always)]
+    fn mul(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
+        std::array::from_fn(|lane| a[lane] * b[lane])
+    }
+
+    #[inline(always)]
+    fn max(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
+        std::array::from_fn(|lane| if a[lane] > b[lane] { a[lane] } else { b[lane] })
+    }
+
+    #[inline(always)]
+    fn vectorise<T: Task>(self, task: T) {
+        task.run(self);
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+macro_rules! x86_instruction_set {
+    (
+        $(#[$doc:meta])* $name:ident, $lanes:literal, $vector:ident, $features:literal, detect $($feature:tt),+;
+        $set1:ident, $loadu:ident, $storeu:ident, $fmadd:ident, $mul:ident, $max:ident
+    ) => {
+        $(#[$doc])*
+        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+        pub(super) struct $name(());
+
+        impl $name {
+            fn detect() -> Option<Self> {
+                ($(std::arch::is_x86_feature_detected!($feature))&&+).then_some(Self(()))
+            }
+        }
+
+        // SAFETY, for every block below: a value of this type exists only where `detect` found the features, so the
+        // instructions are there; `load` and `store` pass their callers' promises on.
+        #[allow(clippy::undocumented_unsafe_blocks, reason = "one reason for all, above")]
+        impl Simd for $name {
+            type Vector = std::arch::x86_64::$vector;
+            const LANES: usize = $lanes;
+
+            #[inline(always)]
+            fn splat(self, value: f32) -> Self::Vector {
+                unsafe { std::arch::x86_64::$set1(value) }
+            }
+
+            #[inline(always)]
+            unsafe fn load(self, from: *const f32) -> Self::Vector {
+                unsafe { std::arch::x86_64::$loadu(from) }
+            }
+
+            #[inline(always)]
+            unsafe fn store(self, to: *mut f32, vector: Self::Vector) {
+                unsafe { std::arch::x86_64::$storeu(to, vector) }
+            }
+
+            #[inline(always)]
+            fn mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector {
+                unsafe { std::arch::x86_64::$fmadd(a, b, c) }
+            }
+
+            #[inline(always)]
+            fn mul(self, a: Self::Vector, b: Self::Vector) -> Self::Vector {
+                unsafe { std::arch::x86_64::$mul(a, b) }
+            }
+
+            #[inline(always)]
+            fn max(self, a: Self::Vector, b: Self::Vector) -> Self::Vector {
+                unsafe { std::arch::x86_64::$max(a, b) }
+            }
+
+            fn vectorise<T: Task>(self, task: T) {
+                #[target_feature(enable = $features)]
+                fn with_features<T: Task>(simd: $name, task: T) {
+                    task.run(simd);
+                }
+                unsafe { with_features(self, task) }
+            }
+        }
+    };
+}
+
+#[cfg(target_arch = "x86_64")]
+x86_instruction_set! {
+    /// AVX2 with fused multiply-add: 16 registers of 8 lanes.
+    Avx2, 8, __m256, "avx2,fma", detect "avx2", "fma";
+    _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_mul_ps, _mm256_max_ps
+}
+
+#[cfg(target_arch = "x86_64")]
+x86_instruction_set! {
+    /// AVX-512: 32 registers of 16 lanes.
+    Avx512, 16, __m512, "avx512f", detect "avx512f";
+    _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_mul_ps, _mm512_max_ps
+}

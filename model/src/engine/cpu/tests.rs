@@ -1,0 +1,166 @@
+//! The CPU engine against the double-precision reference, on every instruction set that this machine has.
+
+use holod_calibration::{PupilDiameter, Resolution};
+use num_complex::Complex64;
+use proptest::prelude::*;
+
+use super::conv::FeatureMap;
+use super::network::Network;
+use super::simd::InstructionSet;
+use super::*;
+use crate::engine::reference;
+use crate::weights::tests::{self as weights_tests, random_weights};
+use crate::weights::{Grid, NetworkConfig};
+
+/// Largest difference allowed between a map and its reference, relative to the reference's largest value.
+const TOLERANCE: f64 = 2e-5;
+
+fn frame(resolution: Resolution, seed: u32) -> RgbdFrame {
+    let noise = |index: usize| {
+        let mixed = (index as u32).wrapping_mul(0x9E37_79B9) ^ seed.wrapping_mul(0x85EB_CA6B);
+        f64::from((mixed ^ (mixed >> 15)).wrapping_mul(0x2C1B_3C6D) >> 8) / f64::from(1 << 24)
+    };
+    RgbdFrame {
+        resolution,
+        amplitude: (0..3 * resolution.pixels()).map(|index| noise(index) as f32).collect(),
+        depth_normalised: (0..resolution.pixels()).map(|index| noise(index + 77_777) as f32).collect(),
+    }
+}
+
+fn largest(values: impl Iterator<Item = f64>) -> f64 {
+    values.map(f64::abs).fold(0.0, |largest, value| if value.is_nan() { f64::INFINITY } else { largest.max(value) })
+}
+
+/// Difference of two maps relative to the reference's largest value.
+fn map_error(actual: &FeatureMap, expected: &reference::Map) -> f64 {
+    let [channels, height, width] = [expected.channels, expected.height, expected.width];
+    let differences = reference::Map::from_fn([channels, height, width], |channel, y, x| {
+        f64::from(actual.pixel(x, y)[channel]) - expected.at(channel, y as isize, x as isize)
+    });
+    largest(differences.values.into_iter()) / largest(expected.values.iter().copied()).max(1e-6)
+}
+
+fn field_error(actual: &ComplexHologram, expected: &[Complex64]) -> f64 {
+    assert_eq!(actual.field.len(), expected.len());
+    let difference =
+        |(a, e): (&num_complex::Complex32, &Complex64)| (Complex64::new(a.re.into(), a.im.into()) - e).norm();
+    largest(actual.field.iter().zip(expected).map(difference)) / largest(expected.iter().map(|value| value.norm()))
+}
+
+/// Runs a network stage by stage against the reference; every comparison must also see one wrong value.
+fn check_all_stages(weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32, set: InstructionSet) {
+    let frame = frame(resolution, seed);
+    let mut expected = reference::run(weights, &frame, f64::from(pupil_mm));
+    let mut network = Network::new(weights, resolution, set);
+    let context = format!("{resolution}, {} on {}", weights.config().channels, set.name());
+
+    // The second time round, what the first left in the maps must not show.
+    let mut hologram = ComplexHologram::dark(resolution);
+    network.render(&self::frame(resolution, seed + 1), PupilDiameter::from_mm(2.0), &mut hologram);
+    network.encode(&frame, pupil_mm);
+    for (index, map) in expected.layers.iter_mut().enumerate() {
+        network.run_layer(index, pupil_mm);
+        if let Some(offsets) = &expected.offsets[index] {
+            let error = map_error(network.offsets_of(index).expect("an adjustable layer has offsets"), offsets);
+            assert!(error < TOLERANCE, "{context}: offsets of layer {index}: {error}");
+        }
+        let error = map_error(network.map_after(index), map);
+        assert!(error < TOLERANCE, "{context}: layer {index}: {error}");
+        let middle = map.values.len() / 2;
+        map.values[middle] += 1e-3 * largest(map.values.iter().copied()).max(1e-6);
+        assert!(
+            map_error(network.map_after(index), map) > TOLERANCE,
+            "{context}: the comparison of layer {index} is blind"
+        );
+    }
+    network.render(&frame, PupilDiameter::from_mm(pupil_mm), &mut hologram);
+    let error = field_error(&hologram, &expected.field);
+    assert!(error < TOLERANCE, "{context}: field: {error}");
+    let middle = expected.field.len() / 2;
+    expected.field[middle].im += 1e-3 * largest(expected.field.iter().map(|value| value.norm()));
+    assert!(field_error(&hologram, &expected.field) > TOLERANCE, "{context}: the comparison of the field is blind");
+}
+
+fn config(grid: Grid, layers: usize, channels: usize, adjustable_layers: Vec<usize>) -> NetworkConfig {
+    NetworkConfig { grid, layers, channels, adjustable_layers, modulation_hidden: 8, ..weights_tests::config() }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+    #[test]
+    fn every_stage_matches_the_reference(
+        width in 1usize..64,
+        height in 1usize..10,
+        channels in 1usize..40,
+        half_band in any::<bool>(),
+        adjustable in 1usize..3,
+        pupil_mm in 1.0f32..5.0,
+        seed in 0u32..1000,
+    ) {
+        let grid = if half_band { Grid::HalfBand } else { Grid::Full };
+        let weights = random_weights(config(grid, 4, channels, vec![adjustable]), u64::from(seed));
+        for set in InstructionSet::available() {
+            check_all_stages(&weights, Resolution { width, height }, pupil_mm, seed, set);
+        }
+    }
+}
+
+#[test]
+fn one_pixel_one_column_and_one_row_match_the_reference() {
+    let weights = random_weights(config(Grid::HalfBand, 6, 12, vec![3, 4]), 5);
+    for (width, height) in [(1, 1), (1, 33), (57, 1), (2, 2), (101, 5)] {
+        for set in InstructionSet::available() {
+            check_all_stages(&weights, Resolution { width, height }, 3.3, 9, set);
+        }
+    }
+}
+
+#[test]
+fn the_built_in_network_matches_the_reference_at_both_ends_of_the_pupil_range() {
+    for pupil_mm in [1.0, 5.0] {
+        check_all_stages(
+            &Weights::builtin(),
+            Resolution { width: 34, height: 22 },
+            pupil_mm,
+            3,
+            InstructionSet::best(),
+        );
+    }
+}
+
+#[test]
+fn an_engine_renders_as_its_network_does_and_clamps_the_pupil() {
+    let weights = random_weights(config(Grid::HalfBand, 4, 8, vec![1]), 2);
+    let resolution = Resolution { width: 31, height: 18 };
+    let mut engine = CpuEngine::new(&weights, resolution, 2).unwrap();
+    let frame = frame(resolution, 4);
+    let mut hologram = ComplexHologram::dark(resolution);
+    for (given_mm, meant_mm) in [(5.0, 5.0), (1.5, 1.5), (9.0, 5.0), (0.2, 1.0)] {
+        engine.render(&frame, PupilDiameter::from_mm(given_mm), &mut hologram).unwrap();
+        let error = field_error(&hologram, &reference::run(&weights, &frame, meant_mm).field);
+        assert!(error < TOLERANCE, "{given_mm} mm: {error}");
+    }
+    let (last, timings) = (weights.config().layers - 1, engine.last_timings());
+    assert_eq!(timings.stages.len(), last + 3);
+    assert_eq!(timings.stages[2].name, "layer 1 (adjustable)");
+    assert_eq!(timings.stages[2].flop, 2 * 9 * 8 * (8 + 18) * 16 * 9);
+}
+
+#[test]
+fn wrong_sizes_and_pupils_are_refused() {
+    let weights = random_weights(config(Grid::HalfBand, 4, 8, vec![]), 2);
+    let (right, wrong) = (Resolution { width: 8, height: 6 }, Resolution { width: 6, height: 8 });
+    let mut engine = CpuEngine::new(&weights, right, 1).unwrap();
+    let pupil = PupilDiameter::from_mm(3.0);
+    let mut render = |frame_size, pupil, hologram_size| {
+        engine.render(&frame(frame_size, 0), pupil, &mut ComplexHologram::dark(hologram_size))
+    };
+    assert!(render(right, pupil, right).is_ok());
+    assert!(matches!(render(wrong, pupil, right), Err(EngineError::Resolution { what: "the frame", .. })));
+    assert!(matches!(render(right, pupil, wrong), Err(EngineError::Resolution { what: "the hologram", .. })));
+    for pupil_mm in [f32::NAN, f32::INFINITY, 0.0, -2.0] {
+        assert!(matches!(render(right, PupilDiameter::from_mm(pupil_mm), right), Err(EngineError::Pupil { .. })));
+    }
+    let empty = Resolution { width: 0, height: 4 };
+    assert!(matches!(CpuEngine::new(&weights, empty, 1), Err(EngineError::Empty { .. })));
+}

@@ -1,0 +1,170 @@
+//! The engine and the optics against the vectors that the trainer wrote (model/golden/README.md).
+
+use std::path::Path;
+
+use holod_calibration::{Colour, Metres, PupilDiameter, Resolution};
+use num_complex::{Complex32, Complex64};
+use safetensors::SafeTensors;
+
+use super::{CpuEngine, reference};
+use crate::optics::{DoublePhase, Propagator};
+use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
+
+/// Largest difference allowed between a stage of the double-precision reference and its golden map, relative to the
+/// map's largest value: both are exact but for the rounding of the stored F32.
+const REFERENCE_TOLERANCE: f64 = 1e-5;
+/// The same for what single precision computed through all the layers.
+const ENGINE_TOLERANCE: f64 = 5e-5;
+/// Largest difference of a phase, radians, where the amplitude is not near 0 or the constant, where acos and arg are
+/// steep.
+const PHASE_TOLERANCE_RAD: f64 = 2e-3;
+
+struct Golden {
+    bytes: Vec<u8>,
+    folder: std::path::PathBuf,
+}
+
+impl Golden {
+    fn open(name: &str) -> Self {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("golden");
+        Self { bytes: std::fs::read(folder.join(name)).unwrap(), folder }
+    }
+
+    fn values(&self, name: &str) -> Option<Vec<f64>> {
+        let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
+        let tensor = tensors.tensor(name).ok()?;
+        Some(tensor.data().as_chunks().0.iter().map(|&bytes| f64::from(f32::from_le_bytes(bytes))).collect())
+    }
+
+    /// Real parts, then imaginary parts.
+    fn complex(&self, name: &str) -> Option<Vec<Complex64>> {
+        let values = self.values(name)?;
+        let (real, imaginary) = values.split_at(values.len() / 2);
+        Some(real.iter().zip(imaginary).map(|(&re, &im)| Complex64::new(re, im)).collect())
+    }
+
+    fn metadata(&self, key: &str) -> String {
+        let (_, header) = SafeTensors::read_metadata(&self.bytes).unwrap();
+        header.metadata().as_ref().unwrap()[key].clone()
+    }
+
+    fn weights(&self) -> Weights {
+        let name: String = serde_json::from_str(&self.metadata("weights")).unwrap();
+        let beside = self.folder.join(&name);
+        let path = if beside.exists() { beside } else { self.folder.join("../weights").join(name) };
+        Weights::load(&path).unwrap()
+    }
+
+    fn frame(&self) -> RgbdFrame {
+        let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
+        let shape = tensors.tensor("depth").unwrap().shape().to_vec();
+        let single = |name| self.values(name).unwrap().into_iter().map(|value| value as f32).collect();
+        RgbdFrame {
+            resolution: Resolution { width: shape[1], height: shape[0] },
+            amplitude: single("amplitude"),
+            depth_normalised: single("depth"),
+        }
+    }
+}
+
+fn widen(values: &[Complex32]) -> Vec<Complex64> {
+    values.iter().map(|value| Complex64::new(value.re.into(), value.im.into())).collect()
+}
+
+/// Largest difference relative to the golden's largest value; infinite where anything is NaN.
+fn error(actual: &[Complex64], golden: &[Complex64]) -> f64 {
+    assert_eq!(actual.len(), golden.len());
+    let largest = golden.iter().map(|value| value.norm()).fold(0.0, f64::max);
+    let differences = actual.iter().zip(golden).map(|(a, g)| (a - g).norm() / largest);
+    differences.fold(0.0, |worst, value| if value.is_nan() { f64::INFINITY } else { worst.max(value) })
+}
+
+/// Asserts that `actual` is `golden` within `tolerance`, and that one wrong value would have been seen.
+fn assert_matches(what: &str, actual: &[Complex64], golden: &[Complex64], tolerance: f64) {
+    let found = error(actual, golden);
+    assert!(found <= tolerance, "{what}: {found}");
+    let mut spoiled = golden.to_vec();
+    let largest = spoiled.iter().map(|value| value.norm()).fold(0.0, f64::max);
+    spoiled[golden.len() / 3] += 3.0 * tolerance * largest;
+    assert!(error(actual, &spoiled) > tolerance, "{what}: the comparison is blind");
+}
+
+fn real(values: &[f64]) -> Vec<Complex64> {
+    values.iter().map(|&value| Complex64::new(value, 0.0)).collect()
+}
+
+fn check(name: &str) {
+    let golden = Golden::open(name);
+    let (weights, frame) = (golden.weights(), golden.frame());
+    let pupil_mm = golden.values("pupil_mm").unwrap()[0];
+
+    let trace = reference::run(&weights, &frame, pupil_mm);
+    let stage = |what: &str, map: &reference::Map| {
+        if let Some(expected) = golden.values(what) {
+            assert_matches(&format!("{name} {what}"), &real(&map.values), &real(&expected), REFERENCE_TOLERANCE);
+        }
+    };
+    stage("encoded", &trace.encoded);
+    for (index, map) in trace.layers.iter().enumerate() {
+        stage(&format!("layer_{index}"), map);
+        if let Some(offsets) = &trace.offsets[index] {
+            stage(&format!("offsets_{index}"), offsets);
+        }
+    }
+    let field = golden.complex("field").unwrap();
+    assert_matches(&format!("{name} field"), &trace.field, &field, REFERENCE_TOLERANCE);
+
+    let mut engine = CpuEngine::new(&weights, frame.resolution, 2).unwrap();
+    let mut hologram = ComplexHologram::dark(frame.resolution);
+    engine.render(&frame, PupilDiameter::from_mm(pupil_mm as f32), &mut hologram).unwrap();
+    assert_matches(&format!("{name} engine"), &widen(&hologram.field), &field, ENGINE_TOLERANCE);
+
+    let golden_hologram = ComplexHologram {
+        resolution: frame.resolution,
+        field: field.iter().map(|value| Complex32::new(value.re as f32, value.im as f32)).collect(),
+    };
+    check_phase(name, &golden, &golden_hologram, weights.config().amplitude_constant);
+
+    let distance_m: f64 = golden.metadata("asm_distance_m").parse().unwrap();
+    let mut propagator = Propagator::new(&weights.config().optics.geometry(frame.resolution), frame.resolution);
+    let mut propagated = golden_hologram;
+    for colour in Colour::ALL {
+        propagator.propagate(propagated.plane_mut(colour), colour, Metres(distance_m));
+    }
+    let expected = golden.complex("asm_padded").unwrap();
+    assert_matches(&format!("{name} propagation"), &widen(&propagated.field), &expected, ENGINE_TOLERANCE);
+}
+
+fn check_phase(name: &str, golden: &Golden, hologram: &ComplexHologram, amplitude_constant: f32) {
+    let mut pattern = PhasePattern::flat(hologram.resolution);
+    let report = DoublePhase::new(hologram.resolution, amplitude_constant).encode(hologram, &mut pattern);
+    assert!((f64::from(report.clipped_share) - golden.values("clipped_share").unwrap()[0]).abs() < 1e-3);
+    let mut expected = golden.values("phase").unwrap();
+    let amplitudes: Vec<f32> = hologram.field.iter().map(|value| value.norm() / amplitude_constant).collect();
+    let worst = |expected: &[f64]| {
+        let judged =
+            amplitudes.iter().zip(&pattern.phase_rad).zip(expected).filter(|((a, _), _)| (0.01..0.99).contains(*a));
+        judged
+            .map(|((_, &phase), &golden)| (Complex64::cis(phase.into()) - Complex64::cis(golden)).norm())
+            .fold(0.0, f64::max)
+    };
+    assert!(worst(&expected) < PHASE_TOLERANCE_RAD, "{name} phase: {}", worst(&expected));
+    let judged = amplitudes.iter().position(|a| (0.1..0.9).contains(a)).unwrap();
+    expected[judged] += 0.01;
+    assert!(worst(&expected) > PHASE_TOLERANCE_RAD, "{name} phase: the comparison is blind");
+}
+
+#[test]
+fn a_narrow_half_band_network_matches_its_golden_vectors() {
+    check("direct-narrow.safetensors");
+}
+
+#[test]
+fn a_narrow_network_on_the_full_grid_matches_its_golden_vectors() {
+    check("direct-narrow-full.safetensors");
+}
+
+#[test]
+fn the_built_in_network_matches_its_golden_vectors() {
+    check("direct-shipped.safetensors");
+}

@@ -1,0 +1,66 @@
+//! Engines run the network on frames.
+
+mod cpu;
+#[cfg(test)]
+mod golden;
+#[cfg(test)]
+mod reference;
+
+use std::time::Duration;
+
+use holod_calibration::Resolution;
+
+pub use cpu::{CpuEngine, fma_peak};
+
+/// A frame that an engine refuses.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum EngineError {
+    /// A buffer has another size than the engine was made for.
+    #[error("{what} is {found}; this engine was made for {expected}: make one for the other size or fit the frame")]
+    Resolution {
+        /// Which buffer.
+        what: &'static str,
+        /// Its size.
+        found: Resolution,
+        /// The engine's size.
+        expected: Resolution,
+    },
+    /// There is nothing to render.
+    #[error("frame size {resolution}; expected at least one pixel each way")]
+    Empty {
+        /// The size asked for.
+        resolution: Resolution,
+    },
+    /// The pupil is not a positive length.
+    #[error("pupil diameter {pupil_mm} mm; expected a positive number")]
+    Pupil {
+        /// What was given.
+        pupil_mm: f32,
+    },
+    /// Threads could not be started.
+    #[error("cannot start {threads} threads for the CPU engine: {detail}")]
+    Threads {
+        /// How many were asked for.
+        threads: usize,
+        /// What the system said.
+        detail: String,
+    },
+}
+
+/// Where the time of one frame went.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct StageTimings {
+    /// Stages in the order in which they ran.
+    pub stages: Vec<StageTiming>,
+}
+
+/// One stage of a frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StageTiming {
+    /// The stage's name, such as `layer 3`.
+    pub name: String,
+    /// Wall-clock time.
+    pub duration: Duration,
+    /// Floating-point operations done in matrix-like work (two to a multiply-add), 0 for other stages.
+    pub flop: u64,
+}

@@ -1,0 +1,290 @@
+//! Holograms and pictures on disk. Everything is written beside its place and renamed, so nothing is ever half written.
+
+use std::collections::HashMap;
+use std::f32::consts::TAU;
+use std::fs::File;
+use std::io::{Cursor, Write};
+use std::path::{Path, PathBuf};
+
+use holod_calibration::{Colour, PupilDiameter, Resolution};
+use image::{ImageBuffer, ImageFormat, Luma, PixelWithColorType, Rgb};
+use num_complex::Complex32;
+use safetensors::tensor::TensorView;
+use safetensors::{Dtype, SafeTensors};
+
+use crate::picture::linear_to_srgb;
+use crate::weights::TrainedOptics;
+use crate::{ComplexHologram, LinearImage, PhasePattern};
+
+/// The value of the metadata key `format` of a hologram file.
+const FORMAT: &str = "holod-hologram-1";
+/// Larger hologram files are refused: this is more than an 8K frame takes.
+const LARGEST_FILE_BYTES: u64 = 1 << 30;
+
+/// A hologram with what one must know to look at it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StoredHologram {
+    /// The field at the SLM plane.
+    pub hologram: ComplexHologram,
+    /// The pupil that it was made for.
+    pub pupil: PupilDiameter,
+    /// The optics that it was made for.
+    pub optics: TrainedOptics,
+    /// Amplitude that double phase maps to 1.
+    pub amplitude_constant: f32,
+}
+
+/// A file that cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum FileError {
+    /// Reading or writing failed.
+    #[error("{path}: {source}", path = path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The content is not what it should be.
+    #[error("{path}: {found}; expected {expected}", path = path.display())]
+    Content {
+        /// The file.
+        path: PathBuf,
+        /// What was found.
+        found: String,
+        /// What was expected.
+        expected: String,
+    },
+}
+
+impl StoredHologram {
+    /// Writes a safetensors file: `field` [3, height, width, 2] (real, imaginary) in F32, and in the metadata format,
+    /// pupil_mm, amplitude_constant and optics (JSON).
+    pub fn save(&self, path: &Path) -> Result<(), FileError> {
+        let Resolution { width, height } = self.hologram.resolution;
+        let bytes: Vec<u8> =
+            self.hologram.field.iter().flat_map(|value| [value.re, value.im]).flat_map(f32::to_le_bytes).collect();
+        let content = |error: String| FileError::Content {
+            path: path.to_owned(),
+            found: error,
+            expected: "a hologram that safetensors can hold".into(),
+        };
+        let optics = serde_json::to_string(&self.optics).map_err(|error| content(error.to_string()))?;
+        let metadata = HashMap::from([
+            ("format".to_owned(), FORMAT.to_owned()),
+            ("pupil_mm".to_owned(), self.pupil.mm().to_string()),
+            ("amplitude_constant".to_owned(), self.amplitude_constant.to_string()),
+            ("optics".to_owned(), optics),
+        ]);
+        let file = TensorView::new(Dtype::F32, vec![3, height, width, 2], &bytes)
+            .and_then(|view| safetensors::serialize([("field", view)], Some(metadata)))
+            .map_err(|error| content(error.to_string()))?;
+        write_atomically(path, &file)
+    }
+
+    /// Reads what [`Self::save`] wrote.
+    pub fn load(path: &Path) -> Result<Self, FileError> {
+        let io = |source| FileError::Io { path: path.to_owned(), source };
+        let content = |found: String, expected: &str| FileError::Content {
+            path: path.to_owned(),
+            found,
+            expected: format!("{expected}; write the hologram again with `holod render`"),
+        };
+        let metadata = std::fs::metadata(path).map_err(io)?;
+        if !metadata.is_file() || metadata.len() > LARGEST_FILE_BYTES {
+            let found = if metadata.is_file() { format!("{} bytes", metadata.len()) } else { "no regular file".into() };
+            return Err(content(found, "a hologram file of at most 1 GiB"));
+        }
+        let bytes = std::fs::read(path).map_err(io)?;
+        let damaged = |error: safetensors::SafeTensorError| content(error.to_string(), "a safetensors file");
+        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(damaged)?;
+        let tensors = SafeTensors::deserialize(&bytes).map_err(damaged)?;
+
+        let entries = header.metadata().clone().unwrap_or_default();
+        let entry = |key: &str| {
+            entries
+                .get(key)
+                .map(String::as_str)
+                .ok_or_else(|| content(format!("no metadata `{key}`"), "a hologram file"))
+        };
+        let positive = |key: &str| -> Result<f32, FileError> {
+            let text = entry(key)?;
+            let number = text.parse().ok().filter(|number: &f32| *number > 0.0 && number.is_finite());
+            number.ok_or_else(|| content(format!("`{key}` = {text}"), "a positive number"))
+        };
+        if entry("format")? != FORMAT {
+            return Err(content(format!("format \"{}\"", entry("format")?), &format!("\"{FORMAT}\"")));
+        }
+        let optics = serde_json::from_str(entry("optics")?).map_err(|error| {
+            content(format!("`optics` that cannot be used ({error})"), "the hologram's optics as JSON")
+        })?;
+
+        let view = tensors.tensor("field").map_err(|_| content("no tensor `field`".into(), "the field"))?;
+        let &[3, height, width, 2] = view.shape() else {
+            return Err(content(format!("`field` of shape {:?}", view.shape()), "[3, height, width, 2]"));
+        };
+        if view.dtype() != Dtype::F32 || width == 0 || height == 0 {
+            return Err(content(
+                format!("`field` of {:?}, {width}x{height}", view.dtype()),
+                "F32 and at least one pixel",
+            ));
+        }
+        let number = |bytes: &[u8; 8]| {
+            let [a, b, c, d, e, f, g, h] = *bytes;
+            Complex32::new(f32::from_le_bytes([a, b, c, d]), f32::from_le_bytes([e, f, g, h]))
+        };
+        let field: Vec<_> = view.data().as_chunks().0.iter().map(number).collect();
+        if let Some(index) = field.iter().position(|value| !value.is_finite()) {
+            return Err(content(format!("{} at index {index} of `field`", field[index]), "finite values"));
+        }
+        Ok(Self {
+            hologram: ComplexHologram { resolution: Resolution { width, height }, field },
+            pupil: PupilDiameter::from_mm(positive("pupil_mm")?),
+            optics,
+            amplitude_constant: positive("amplitude_constant")?,
+        })
+    }
+}
+
+/// Writes a picture as an 8-bit sRGB PNG, the one place where linear light is encoded. What is brighter than white is
+/// white.
+pub fn save_picture(image: &LinearImage, path: &Path) -> Result<(), FileError> {
+    let planes = Colour::ALL.map(|colour| image.plane(colour));
+    let width = image.resolution.width;
+    save_png(path, image.resolution, |x, y| {
+        Rgb(planes.map(|plane| (255.0 * linear_to_srgb(plane[y * width + x].clamp(0.0, 1.0))).round() as u8))
+    })
+}
+
+/// Writes one colour's phase as a 16-bit grey PNG: level·2π/65536, rounded.
+pub fn save_phase(pattern: &PhasePattern, colour: Colour, path: &Path) -> Result<(), FileError> {
+    let (plane, width) = (pattern.plane(colour), pattern.resolution.width);
+    save_png(path, pattern.resolution, |x, y| {
+        Luma([((plane[y * width + x] / TAU * 65536.0).round() as u32 % 65536) as u16])
+    })
+}
+
+/// Writes `bytes` beside `path` and renames them into place.
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
+    let io = |source| FileError::Io { path: path.to_owned(), source };
+    let Some(name) = path.file_name() else {
+        return Err(FileError::Content {
+            path: path.to_owned(),
+            found: "no file name".into(),
+            expected: "a path that ends in one".into(),
+        });
+    };
+    let mut beside_name = std::ffi::OsString::from(".");
+    beside_name.push(name);
+    beside_name.push(format!(".{}.part", std::process::id()));
+    let beside = path.with_file_name(beside_name);
+    let written = File::create(&beside)
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
+        .and_then(|()| std::fs::rename(&beside, path));
+    if written.is_err() {
+        // Whatever there is of it is of no use; that it may not be there is no second error.
+        let _ = std::fs::remove_file(&beside);
+    }
+    written.map_err(io)
+}
+
+fn save_png<P>(path: &Path, size: Resolution, pixel: impl Fn(usize, usize) -> P) -> Result<(), FileError>
+where
+    P: PixelWithColorType,
+    [P::Subpixel]: image::EncodableLayout,
+{
+    let content = |found: String| FileError::Content {
+        path: path.to_owned(),
+        found,
+        expected: "a picture that PNG can hold".into(),
+    };
+    let too_large = |_| content(format!("a picture of {size}"));
+    let (width, height) =
+        (u32::try_from(size.width).map_err(too_large)?, u32::try_from(size.height).map_err(too_large)?);
+    let picture = ImageBuffer::from_fn(width, height, |x, y| pixel(x as usize, y as usize));
+    let mut bytes = Cursor::new(Vec::new());
+    picture.write_to(&mut bytes, ImageFormat::Png).map_err(|error| content(error.to_string()))?;
+    write_atomically(path, bytes.get_ref())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use holod_calibration::DisplayGeometry;
+
+    const SIZE: Resolution = Resolution { width: 5, height: 3 };
+
+    fn hologram() -> StoredHologram {
+        let field = (0..45).map(|index| Complex32::from_polar(index as f32 / 45.0, index as f32)).collect();
+        StoredHologram {
+            hologram: ComplexHologram { resolution: SIZE, field },
+            pupil: PupilDiameter::from_mm(3.25),
+            optics: TrainedOptics::of(&DisplayGeometry::DEFAULT),
+            amplitude_constant: 1.4,
+        }
+    }
+
+    #[test]
+    fn a_hologram_round_trips_and_leaves_nothing_beside_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("field.safetensors");
+        hologram().save(&path).unwrap();
+        assert_eq!(StoredHologram::load(&path).unwrap(), hologram());
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn damaged_and_foreign_holograms_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("field.safetensors");
+        hologram().save(&path).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        for length in [0, 7, 40, whole.len() - 1] {
+            std::fs::write(&path, &whole[..length]).unwrap();
+            assert!(matches!(StoredHologram::load(&path), Err(FileError::Content { .. })), "{length}");
+        }
+        let mut infinite = whole.clone();
+        let last = infinite.len() - 4;
+        infinite[last..].copy_from_slice(&f32::INFINITY.to_le_bytes());
+        std::fs::write(&path, infinite).unwrap();
+        assert!(StoredHologram::load(&path).unwrap_err().to_string().contains("index 44"));
+        assert!(matches!(StoredHologram::load(folder.path()), Err(FileError::Content { .. })));
+        assert!(matches!(StoredHologram::load(&folder.path().join("absent")), Err(FileError::Io { .. })));
+    }
+
+    #[test]
+    fn pictures_are_encoded_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("picture.png");
+        let mut picture = LinearImage::black(SIZE);
+        picture.pixels[0] = 0.215_861;
+        picture.pixels[15] = 7.0;
+        save_picture(&picture, &path).unwrap();
+        let read = image::open(&path).unwrap().to_rgb8();
+        assert_eq!(
+            (read.dimensions(), read.get_pixel(0, 0).0, read.get_pixel(1, 0).0),
+            ((5, 3), [128, 255, 0], [0; 3])
+        );
+    }
+
+    #[test]
+    fn phases_are_levels_of_sixteen_bits() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("phase.png");
+        let mut pattern = PhasePattern::flat(SIZE);
+        pattern.plane_mut(Colour::Blue)[..3].copy_from_slice(&[TAU / 4.0, TAU / 2.0, TAU * 0.999_999]);
+        save_phase(&pattern, Colour::Blue, &path).unwrap();
+        let read = image::open(&path).unwrap().into_luma16();
+        assert_eq!([0, 1, 2, 3].map(|x| read.get_pixel(x, 0).0[0]), [16384, 32768, 0, 0]);
+    }
+
+    #[test]
+    fn a_failed_write_leaves_what_was_there() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("taken");
+        std::fs::create_dir(&path).unwrap();
+        assert!(matches!(write_atomically(&path, b"x"), Err(FileError::Io { .. })));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+        assert!(write_atomically(Path::new("/"), b"x").is_err());
+    }
+}

@@ -1,0 +1,279 @@
+//! How good a picture or a focal stack is. Intensities are linear light with white = 1.
+//!
+//! PSNR alone rewards one blurred picture that is shown at every focus, so a stack is judged by a row of figures: see
+//! [`StackScore`].
+
+use holod_calibration::{Colour, Dioptres, DisplayGeometry, PupilDiameter, Resolution};
+
+use crate::LinearImage;
+
+/// Side and standard deviation of SSIM's window (Wang et al. 2004).
+const SSIM_WINDOW: usize = 11;
+const SSIM_SIGMA: f64 = 1.5;
+/// Pixels blurred by less are in focus, pixels blurred by more than the other are out of focus.
+const IN_FOCUS_COC_PX: f64 = 2.0;
+const OUT_OF_FOCUS_COC_PX: f64 = 8.0;
+
+/// Peak signal-to-noise ratio in dB with peak 1, over all colours, leaving out `border_px` at each edge; infinite for
+/// equal pictures.
+pub fn psnr_db(actual: &LinearImage, expected: &LinearImage, border_px: usize) -> f64 {
+    assert_same_size(actual, expected);
+    let mut error = SquaredError::default();
+    for_each_inside(actual.resolution, border_px, |index| {
+        error.add(actual.pixels[index], expected.pixels[index]);
+    });
+    error.psnr_db()
+}
+
+/// Structural similarity with an 11x11 Gaussian window of σ = 1.5 that lies wholly inside the picture, mean over pixels
+/// and colours, leaving out `border_px` at each edge. `None` where no window fits.
+pub fn ssim(actual: &LinearImage, expected: &LinearImage, border_px: usize) -> Option<f64> {
+    assert_same_size(actual, expected);
+    let Resolution { width, height } = actual.resolution;
+    let (inner_width, inner_height) = (width.checked_sub(2 * border_px)?, height.checked_sub(2 * border_px)?);
+    if inner_width < SSIM_WINDOW || inner_height < SSIM_WINDOW {
+        return None;
+    }
+    let inner = |plane: &[f32]| -> Vec<f64> {
+        let rows = plane.chunks_exact(width).skip(border_px).take(inner_height);
+        rows.flat_map(|row| &row[border_px..][..inner_width]).map(|&value| f64::from(value)).collect()
+    };
+    let mean_of_planes = Colour::ALL.iter().map(|&colour| {
+        let (x, y) = (inner(actual.plane(colour)), inner(expected.plane(colour)));
+        let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<_>>();
+        let windowed = |plane: &[f64]| gaussian_means(plane, inner_width);
+        let (mean_x, mean_y) = (windowed(&x), windowed(&y));
+        let (square_x, square_y, cross) =
+            (windowed(&product(&x, &x)), windowed(&product(&y, &y)), windowed(&product(&x, &y)));
+        let (c1, c2) = (0.01f64.powi(2), 0.03f64.powi(2));
+        let similarity = (0..mean_x.len()).map(|index| {
+            let (mx, my) = (mean_x[index], mean_y[index]);
+            let (vx, vy, cov) = (square_x[index] - mx * mx, square_y[index] - my * my, cross[index] - mx * my);
+            (2.0 * mx * my + c1) * (2.0 * cov + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
+        });
+        similarity.sum::<f64>() / mean_x.len() as f64
+    });
+    Some(mean_of_planes.sum::<f64>() / 3.0)
+}
+
+/// Sum of squared differences of neighbouring pixels, along x and y, over all colours and the rectangle of `columns` and
+/// `rows`: how sharp that part is.
+pub fn gradient_energy(image: &LinearImage, columns: std::ops::Range<usize>, rows: std::ops::Range<usize>) -> f64 {
+    let width = image.resolution.width;
+    let mut energy = 0.0;
+    for colour in Colour::ALL {
+        let plane = image.plane(colour);
+        let at = |x: usize, y: usize| f64::from(plane[y * width + x]);
+        for (y, x) in rows.clone().flat_map(|y| columns.clone().map(move |x| (y, x))) {
+            if x + 1 < columns.end {
+                energy += (at(x + 1, y) - at(x, y)).powi(2);
+            }
+            if y + 1 < rows.end {
+                energy += (at(x, y + 1) - at(x, y)).powi(2);
+            }
+        }
+    }
+    energy
+}
+
+/// How a focal stack compares with its target.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StackScore {
+    /// PSNR over all planes.
+    pub psnr_db: f64,
+    /// PSNR over the pixels with less than 2 px of blur; `None` where there is none.
+    pub in_focus_psnr_db: Option<f64>,
+    /// PSNR over the pixels with more than 8 px of blur; `None` where there is none.
+    pub out_of_focus_psnr_db: Option<f64>,
+    /// Slope of the regression of P_k − mean P on R_k − mean R: 1 is the target's full refocus, 0 the same picture at
+    /// all planes. 0 where the target does not change with focus.
+    pub focus_slope: f64,
+    /// Correlation of the same two.
+    pub focus_correlation: f64,
+    /// PSNR of showing the target's mean at every plane: what no focus at all would score.
+    pub flat_oracle_psnr_db: f64,
+}
+
+/// Judges the pictures `actual` against `expected`, seen by an eye with `pupil` at each of `focuses`, of a scene whose
+/// normalised depth [height, width] is `depth_normalised`; `border_px` at each edge are left out.
+pub fn score_stack(
+    actual: &[LinearImage],
+    expected: &[LinearImage],
+    focuses: &[Dioptres],
+    depth_normalised: &[f32],
+    geometry: &DisplayGeometry,
+    pupil: PupilDiameter,
+    border_px: usize,
+) -> StackScore {
+    let planes = expected.len();
+    assert!(planes > 0 && actual.len() == planes && focuses.len() == planes, "stacks and focuses have one length");
+    for (actual, expected) in actual.iter().zip(expected) {
+        assert_same_size(actual, expected);
+        assert_eq!(expected.resolution.pixels(), depth_normalised.len(), "depth has the pictures' size");
+    }
+    let resolution = expected[0].resolution;
+    let (mut all, mut sharp, mut blurred, mut flat) =
+        (SquaredError::default(), SquaredError::default(), SquaredError::default(), SquaredError::default());
+    let (mut cross, mut actual_energy, mut expected_energy) = (0.0f64, 0.0f64, 0.0f64);
+    for_each_inside(resolution, border_px, |index| {
+        let mean = |stack: &[LinearImage]| {
+            stack.iter().map(|image| f64::from(image.pixels[index])).sum::<f64>() / planes as f64
+        };
+        let (actual_mean, expected_mean) = (mean(actual), mean(expected));
+        let depth = geometry.depth_at(depth_normalised[index % resolution.pixels()].into());
+        for ((actual, expected), &focus) in actual.iter().zip(expected).zip(focuses) {
+            let (shown, wanted) = (actual.pixels[index], expected.pixels[index]);
+            let coc_px = geometry.coc_px(pupil, depth, focus);
+            all.add(shown, wanted);
+            flat.add(expected_mean as f32, wanted);
+            if coc_px < IN_FOCUS_COC_PX {
+                sharp.add(shown, wanted);
+            } else if coc_px > OUT_OF_FOCUS_COC_PX {
+                blurred.add(shown, wanted);
+            }
+            let (shown, wanted) = (f64::from(shown) - actual_mean, f64::from(wanted) - expected_mean);
+            cross += shown * wanted;
+            actual_energy += shown * shown;
+            expected_energy += wanted * wanted;
+        }
+    });
+    let ratio = |numerator: f64, denominator: f64| if denominator > 0.0 { numerator / denominator } else { 0.0 };
+    let some = |error: SquaredError| (error.count > 0).then(|| error.psnr_db());
+    StackScore {
+        psnr_db: all.psnr_db(),
+        in_focus_psnr_db: some(sharp),
+        out_of_focus_psnr_db: some(blurred),
+        focus_slope: ratio(cross, expected_energy),
+        focus_correlation: ratio(cross, (actual_energy * expected_energy).sqrt()),
+        flat_oracle_psnr_db: flat.psnr_db(),
+    }
+}
+
+#[derive(Clone, Copy, Default)]
+struct SquaredError {
+    sum: f64,
+    count: usize,
+}
+
+impl SquaredError {
+    fn add(&mut self, actual: f32, expected: f32) {
+        self.sum += (f64::from(actual) - f64::from(expected)).powi(2);
+        self.count += 1;
+    }
+
+    fn psnr_db(self) -> f64 {
+        -10.0 * (self.sum / self.count.max(1) as f64).log10()
+    }
+}
+
+fn assert_same_size(actual: &LinearImage, expected: &LinearImage) {
+    assert_eq!(actual.resolution, expected.resolution, "pictures that are compared have one size");
+}
+
+/// Calls `visit` with each index into [3, height, width] that is not in the border.
+fn for_each_inside(resolution: Resolution, border_px: usize, mut visit: impl FnMut(usize)) {
+    let Resolution { width, height } = resolution;
+    for colour in 0..3 {
+        for y in border_px..height.saturating_sub(border_px) {
+            for x in border_px..width.saturating_sub(border_px) {
+                visit((colour * height + y) * width + x);
+            }
+        }
+    }
+}
+
+/// Gaussian-weighted means of every window that lies wholly inside `plane`, whose rows have `width` values.
+fn gaussian_means(plane: &[f64], width: usize) -> Vec<f64> {
+    let middle = (SSIM_WINDOW / 2) as f64;
+    let weights: [f64; SSIM_WINDOW] =
+        std::array::from_fn(|tap| (-0.5 * ((tap as f64 - middle) / SSIM_SIGMA).powi(2)).exp());
+    let sum: f64 = weights.iter().sum();
+    let weights = weights.map(|weight| weight / sum);
+    let narrowed: Vec<f64> = plane
+        .chunks_exact(width)
+        .flat_map(|row| row.windows(SSIM_WINDOW).map(|window| window.iter().zip(weights).map(|(v, w)| v * w).sum()))
+        .collect();
+    let narrow = width + 1 - SSIM_WINDOW;
+    let height = narrowed.len() / narrow;
+    (0..(height + 1 - SSIM_WINDOW) * narrow)
+        .map(|index| weights.iter().enumerate().map(|(tap, weight)| weight * narrowed[index + tap * narrow]).sum())
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn image(width: usize, height: usize, value: impl Fn(usize) -> f32) -> LinearImage {
+        let resolution = Resolution { width, height };
+        LinearImage { resolution, pixels: (0..3 * resolution.pixels()).map(value).collect() }
+    }
+
+    fn wave(index: usize) -> f32 {
+        0.5 + 0.4 * (index as f32 * 0.7).sin()
+    }
+
+    #[test]
+    fn psnr_of_a_known_error() {
+        let expected = image(8, 8, wave);
+        let actual = image(8, 8, |index| wave(index) + 0.01);
+        assert!((psnr_db(&actual, &expected, 0) - 40.0).abs() < 1e-3);
+        assert_eq!(psnr_db(&expected, &expected, 2), f64::INFINITY);
+        let mut spoiled = expected.clone();
+        spoiled.pixels[0] += 1.0;
+        assert!((psnr_db(&spoiled, &expected, 0) - 10.0 * 192f64.log10()).abs() < 1e-4);
+        assert_eq!(psnr_db(&spoiled, &expected, 1), f64::INFINITY, "the border is left out");
+    }
+
+    #[test]
+    fn ssim_is_one_for_equals_and_follows_its_formula_for_constants() {
+        let expected = image(24, 20, wave);
+        assert!((ssim(&expected, &expected, 2).unwrap() - 1.0).abs() < 1e-12);
+        let (dark, light) = (image(16, 16, |_| 0.25), image(16, 16, |_| 0.75));
+        let formula = (2.0 * 0.25 * 0.75 + 1e-4) / (0.25f64.powi(2) + 0.75f64.powi(2) + 1e-4);
+        assert!((ssim(&dark, &light, 0).unwrap() - formula).abs() < 1e-9);
+        let inverted = image(24, 20, |index| 1.0 - wave(index));
+        assert!(ssim(&inverted, &expected, 0).unwrap() < 0.0);
+        assert_eq!(ssim(&dark, &light, 3), None);
+    }
+
+    #[test]
+    fn gradient_energy_of_a_step() {
+        let step = image(6, 4, |index| if index % 6 < 3 { 0.0 } else { 0.5 });
+        assert_eq!(gradient_energy(&step, 0..6, 0..4), 3.0 * 4.0 * 0.25);
+        assert_eq!(gradient_energy(&step, 0..3, 0..4), 0.0);
+    }
+
+    /// A target of three planes that swings by `swing` around a constant.
+    fn stack(swing: f32) -> Vec<LinearImage> {
+        [-1.0, 0.0, 1.0]
+            .into_iter()
+            .map(|plane| image(10, 10, |index| wave(index) * 0.5 + 0.2 + swing * plane * wave(3 * index)))
+            .collect()
+    }
+
+    fn score(actual: &[LinearImage], expected: &[LinearImage]) -> StackScore {
+        let focuses = [0.0, 1.0, 2.5].map(Dioptres);
+        let pupil = PupilDiameter::from_mm(4.0);
+        score_stack(actual, expected, &focuses, &[0.0; 100], &DisplayGeometry::DEFAULT, pupil, 1)
+    }
+
+    #[test]
+    fn a_flat_stack_has_no_focus_and_scores_as_the_flat_oracle() {
+        let (target, flat) = (stack(0.1), stack(0.0));
+        let flat_score = score(&flat, &target);
+        assert!(flat_score.focus_slope.abs() < 1e-6 && flat_score.focus_correlation.abs() < 1e-6);
+        assert!((flat_score.psnr_db - flat_score.flat_oracle_psnr_db).abs() < 1e-3);
+        assert_eq!(flat_score.in_focus_psnr_db.unwrap(), psnr_db(&flat[0], &target[0], 1));
+        let perfect = score(&target, &target);
+        assert!((perfect.focus_slope - 1.0).abs() < 1e-9 && (perfect.focus_correlation - 1.0).abs() < 1e-9);
+        assert_eq!(perfect.psnr_db, f64::INFINITY);
+    }
+
+    #[test]
+    fn half_the_swing_is_half_the_slope() {
+        let half = score(&stack(0.05), &stack(0.1));
+        assert!((half.focus_slope - 0.5).abs() < 1e-4 && (half.focus_correlation - 1.0).abs() < 1e-4);
+        assert_eq!(score(&stack(0.05), &stack(0.0)).focus_slope, 0.0);
+    }
+}

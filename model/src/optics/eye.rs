@@ -1,0 +1,159 @@
+//! The simulated eye: what is seen of the phases that a panel really showed.
+
+use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution};
+use num_complex::Complex32;
+
+use super::propagation::Propagator;
+use super::{ComplexHologram, PhasePattern};
+use crate::LinearImage;
+
+/// An eye that looks into the display.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Eye {
+    /// Diameter of its pupil, which lies centred in the eyebox.
+    pub pupil: PupilDiameter,
+    /// What it is focused at.
+    pub focus: Dioptres,
+}
+
+/// The bench's optics from the panel to a retina.
+///
+/// Light leaves the panel, passes the 4f stop (|fx|, |fy| < 1/4p) and the pupil (a disc of radius (s/2)/(λf) in the
+/// panel's spectrum), and is focused at u = f²·D. Both stops are hard. The panel is surrounded by darkness.
+pub struct SimulatedEye {
+    geometry: DisplayGeometry,
+    propagator: Propagator,
+}
+
+impl SimulatedEye {
+    /// For patterns of `resolution` on the bench `geometry`, whose own resolution does not matter.
+    pub fn new(geometry: &DisplayGeometry, resolution: Resolution) -> Self {
+        Self { geometry: *geometry, propagator: Propagator::new(geometry, resolution) }
+    }
+
+    /// What `eye` sees of a phase pattern that was encoded with `amplitude_constant`, white = 1.
+    pub fn view(&mut self, pattern: &PhasePattern, amplitude_constant: f32, eye: Eye) -> LinearImage {
+        self.view_weighted(pattern, amplitude_constant, eye, PerColour([1.0; 3]))
+    }
+
+    /// The same with each colour's light multiplied by `light`: laser power times lit time, relative to those at which
+    /// white is white.
+    pub fn view_weighted(
+        &mut self,
+        pattern: &PhasePattern,
+        amplitude_constant: f32,
+        eye: Eye,
+        light: PerColour<f32>,
+    ) -> LinearImage {
+        let mut image = LinearImage::black(pattern.resolution);
+        for colour in Colour::ALL {
+            let gain = amplitude_constant * amplitude_constant * light[colour];
+            self.view_colour(colour, pattern.plane(colour), eye, gain, image.plane_mut(colour));
+        }
+        image
+    }
+
+    /// What `eye` sees of one colour's phases [height, width] in radians, intensities times `gain`, into `intensity`.
+    pub fn view_colour(&mut self, colour: Colour, phase_rad: &[f32], eye: Eye, gain: f32, intensity: &mut [f32]) {
+        assert_eq!(phase_rad.len(), self.propagator.resolution().pixels(), "phases have the eye's resolution");
+        self.propagator.pad(|index| Complex32::cis(phase_rad[index]));
+        self.see(colour, eye, gain, intensity);
+    }
+
+    /// What `eye` would see of a complex hologram if a panel could show it.
+    pub fn view_field(&mut self, hologram: &ComplexHologram, eye: Eye) -> LinearImage {
+        assert_eq!(hologram.resolution, self.propagator.resolution(), "the hologram has the eye's resolution");
+        let mut image = LinearImage::black(hologram.resolution);
+        for colour in Colour::ALL {
+            let plane = hologram.plane(colour);
+            self.propagator.pad(|index| plane[index]);
+            self.see(colour, eye, 1.0, image.plane_mut(colour));
+        }
+        image
+    }
+
+    fn see(&mut self, colour: Colour, eye: Eye, gain: f32, intensity: &mut [f32]) {
+        let Metres(wavelength_m) = self.geometry.wavelengths[colour];
+        let stop = 1.0 / (4.0 * self.geometry.pixel_pitch.0);
+        let pupil_radius = 0.5 * eye.pupil.metres().0 / (wavelength_m * self.geometry.eyepiece_focal_length.0);
+        let u = self.geometry.image_distance(eye.focus);
+        self.propagator.filter(colour, u, |fx, fy| {
+            fx.abs() < stop && fy.abs() < stop && fx * fx + fy * fy <= pupil_radius * pupil_radius
+        });
+        let width = self.propagator.resolution().width;
+        for (y, row) in intensity.chunks_exact_mut(width).enumerate() {
+            for (pixel, value) in row.iter_mut().zip(self.propagator.row(y)) {
+                *pixel = value.norm_sqr() * gain;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::optics::DoublePhase;
+
+    const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
+    const SIZE: Resolution = Resolution { width: 96, height: 72 };
+
+    fn eye(pupil_mm: f32, focus_dpt: f64) -> Eye {
+        Eye { pupil: PupilDiameter::from_mm(pupil_mm), focus: Dioptres(focus_dpt) }
+    }
+
+    /// A soft spot of amplitude 0.8 and 1/e radius `radius_px` that converges at `focus_dpt`.
+    fn spot(focus_dpt: f64, radius_px: f32) -> ComplexHologram {
+        let mut hologram = ComplexHologram::dark(SIZE);
+        let mut propagator = Propagator::new(&BENCH, SIZE);
+        for colour in Colour::ALL {
+            let plane = hologram.plane_mut(colour);
+            for (index, value) in plane.iter_mut().enumerate() {
+                let (x, y) = ((index % SIZE.width) as f32 - 48.0, (index / SIZE.width) as f32 - 36.0);
+                *value = Complex32::new(0.8 * (-(x * x + y * y) / (radius_px * radius_px)).exp(), 0.0);
+            }
+            propagator.propagate(plane, colour, Metres(-BENCH.image_distance(Dioptres(focus_dpt)).0));
+        }
+        hologram
+    }
+
+    #[test]
+    fn a_phase_pattern_shows_the_field_that_it_encodes() {
+        let hologram = spot(1.5, 14.0);
+        let mut pattern = PhasePattern::flat(SIZE);
+        DoublePhase::new(SIZE, 1.4).encode(&hologram, &mut pattern);
+        let mut simulated = SimulatedEye::new(&BENCH, SIZE);
+        let (field, phases) =
+            (simulated.view_field(&hologram, eye(4.0, 1.5)), simulated.view(&pattern, 1.4, eye(4.0, 1.5)));
+        for colour in Colour::ALL {
+            let centre = 36 * SIZE.width + 48;
+            let (expected, actual) = (field.plane(colour)[centre], phases.plane(colour)[centre]);
+            assert!((expected - 0.64).abs() < 0.01, "{colour}: {expected}");
+            assert!((actual - expected).abs() < 0.05, "{colour}: {actual} for {expected}");
+        }
+    }
+
+    #[test]
+    fn a_spot_is_sharpest_where_it_is_focused_and_a_narrow_pupil_sees_it_wider() {
+        let hologram = spot(2.0, 4.0);
+        let mut simulated = SimulatedEye::new(&BENCH, SIZE);
+        let centre = 36 * SIZE.width + 48;
+        let mut peak = |pupil_mm, focus_dpt| {
+            simulated.view_field(&hologram, eye(pupil_mm, focus_dpt)).plane(Colour::Green)[centre]
+        };
+        assert!(peak(4.0, 2.0) > 1.2 * peak(4.0, 0.0));
+        assert!(peak(4.0, 2.0) > 1.2 * peak(0.5, 2.0));
+    }
+
+    #[test]
+    fn light_is_weighted_by_colour() {
+        let mut pattern = PhasePattern::flat(SIZE);
+        DoublePhase::new(SIZE, 1.0).encode(&spot(0.0, 14.0), &mut pattern);
+        let mut simulated = SimulatedEye::new(&BENCH, SIZE);
+        let plain = simulated.view(&pattern, 1.0, eye(3.0, 0.0));
+        let weighted = simulated.view_weighted(&pattern, 1.0, eye(3.0, 0.0), PerColour([0.5, 1.0, 0.0]));
+        let centre = 36 * SIZE.width + 48;
+        assert!((weighted.plane(Colour::Red)[centre] - 0.5 * plain.plane(Colour::Red)[centre]).abs() < 1e-6);
+        assert_eq!(weighted.plane(Colour::Green)[centre], plain.plane(Colour::Green)[centre]);
+        assert!(weighted.plane(Colour::Blue).iter().all(|&value| value == 0.0));
+    }
+}

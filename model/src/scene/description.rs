@@ -1,0 +1,359 @@
+//! What a scene is made of: `scene.toml`, a pair of files, or one OpenEXR file.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use toml::Spanned;
+
+use super::depth::DepthReading;
+use super::{DepthEncoding, SceneError};
+
+/// Scene files are small; a larger one is something else.
+const LARGEST_FILE_BYTES: u64 = 1 << 20;
+/// A day at 120 frames a second.
+const MOST_FRAMES: u64 = 24 * 3600 * 120;
+
+/// The files of a scene and how to read them.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Description {
+    /// The scene as it was named, for errors.
+    pub(super) path: PathBuf,
+    pub(super) colour: FilePattern,
+    pub(super) depth: FilePattern,
+    pub(super) depth_reading: DepthReading,
+    pub(super) frames: usize,
+    pub(super) first: u64,
+    pub(super) step: u64,
+    pub(super) fps: Option<f64>,
+}
+
+/// A path in which `{}` or `{:05}` stands for the number of a frame.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct FilePattern {
+    before: String,
+    /// Least digits of the number, where there is one.
+    digits: Option<usize>,
+    after: String,
+    directory: PathBuf,
+}
+
+impl FilePattern {
+    /// `None` where the braces are not a number's.
+    fn parse(text: &str, directory: &Path) -> Option<Self> {
+        let pattern = |before: &str, digits, after: &str| Self {
+            before: before.into(),
+            digits,
+            after: after.into(),
+            directory: directory.to_owned(),
+        };
+        let Some((before, rest)) = text.split_once('{') else {
+            return (!text.contains('}')).then(|| pattern(text, None, ""));
+        };
+        let (format, after) = rest.split_once('}')?;
+        if after.contains(['{', '}']) {
+            return None;
+        }
+        let digits = match format {
+            "" => 1,
+            _ => format.strip_prefix(':')?.parse().ok().filter(|digits| (1..=20).contains(digits))?,
+        };
+        Some(pattern(before, Some(digits), after))
+    }
+
+    /// A file that is named literally, whatever characters its name has.
+    fn literal(path: &Path) -> Option<Self> {
+        Some(Self { before: path.to_str()?.into(), digits: None, after: String::new(), directory: PathBuf::new() })
+    }
+
+    fn numbered(&self) -> bool {
+        self.digits.is_some()
+    }
+
+    /// The file of frame number `number`.
+    pub(super) fn path(&self, number: u64) -> PathBuf {
+        let Self { before, digits, after, directory } = self;
+        directory.join(match digits {
+            None => before.clone(),
+            Some(digits) => format!("{before}{number:0digits$}{after}"),
+        })
+    }
+}
+
+/// `scene.toml`.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SceneFile {
+    colour: Spanned<String>,
+    depth: Option<Spanned<String>>,
+    depth_encoding: Spanned<String>,
+    far_dpt: Option<Spanned<f64>>,
+    near_dpt: Option<Spanned<f64>>,
+    depth_scale: Option<Spanned<f64>>,
+    depth_missing: Option<f64>,
+    first: Option<u64>,
+    step: Option<Spanned<u64>>,
+    count: Option<Spanned<u64>>,
+    fps: Option<Spanned<f64>>,
+}
+
+/// The scene that `spec` names; see [`super::Scene::open`].
+pub(super) fn describe(spec: &str, encoding: Option<DepthEncoding>) -> Result<Description, SceneError> {
+    let path = Path::new(spec);
+    if path.is_dir() {
+        return read_scene_file(&path.join("scene.toml"));
+    }
+    if path.extension().is_some_and(|extension| extension == "toml") {
+        return read_scene_file(path);
+    }
+    let pair = if path.exists() { None } else { spec.split_once(',') };
+    let (colour, depth) = pair.map_or((path, path), |(colour, depth)| (Path::new(colour), Path::new(depth)));
+    if pair.is_none() {
+        single_file(path)?;
+    }
+    let encoding =
+        encoding.ok_or_else(|| SceneError::DepthEncoding { found: "none for a scene of plain files".into() })?;
+    let literal = |path: &Path| {
+        FilePattern::literal(path).ok_or_else(|| SceneError::Kind {
+            path: path.to_owned(),
+            found: "a name that is not UTF-8".into(),
+            expected: "a UTF-8 name: rename the file",
+        })
+    };
+    Ok(Description {
+        path: path.to_owned(),
+        colour: literal(colour)?,
+        depth: literal(depth)?,
+        depth_reading: DepthReading { encoding, scale: None, missing: None },
+        frames: 1,
+        first: 0,
+        step: 1,
+        fps: None,
+    })
+}
+
+/// What a scene can be, for errors.
+const KINDS: &str = "a directory with a scene.toml, COLOUR,DEPTH, or one OpenEXR file with colour and depth";
+
+/// Checks that `path` can be one file with both colour and depth.
+fn single_file(path: &Path) -> Result<(), SceneError> {
+    std::fs::metadata(path).map_err(|source| SceneError::Read { path: path.to_owned(), source, expected: KINDS })?;
+    let is_exr = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("exr"));
+    if is_exr {
+        return Ok(());
+    }
+    Err(SceneError::Kind { path: path.to_owned(), found: "one file that is not OpenEXR".into(), expected: KINDS })
+}
+
+fn read_scene_file(path: &Path) -> Result<Description, SceneError> {
+    let read_error = |source| SceneError::Read { path: path.to_owned(), source, expected: "a scene.toml" };
+    let metadata = std::fs::metadata(path).map_err(read_error)?;
+    if !metadata.is_file() || metadata.len() > LARGEST_FILE_BYTES {
+        let found = if metadata.is_file() { format!("{} bytes", metadata.len()) } else { "no regular file".into() };
+        return Err(SceneError::Kind { path: path.to_owned(), found, expected: "a scene.toml of at most 1 MiB" });
+    }
+    let text = std::fs::read_to_string(path).map_err(read_error)?;
+    parse(path, &text)
+}
+
+fn parse(path: &Path, text: &str) -> Result<Description, SceneError> {
+    let error_at = |offset: usize, key: &str, found: String, expected: &str| SceneError::Description {
+        path: path.to_owned(),
+        line: text[..offset.min(text.len())].matches('\n').count() + 1,
+        key: key.into(),
+        found,
+        expected: expected.into(),
+    };
+    let file: SceneFile = toml::from_str(text).map_err(|error| {
+        let span = error.span().unwrap_or_default();
+        let key = text.get(span.clone()).filter(|key| !key.is_empty() && key.len() < 60 && !key.contains('\n'));
+        error_at(span.start, key.unwrap_or("scene"), error.message().to_string(), KEYS)
+    })?;
+
+    let name = file.depth_encoding.get_ref().as_str();
+    let bounds = (file.near_dpt.as_ref(), file.far_dpt.as_ref());
+    let encoding = match (name, bounds) {
+        ("metres", _) => DepthEncoding::Metres,
+        ("millimetres", _) => DepthEncoding::Millimetres,
+        ("dioptres", _) => DepthEncoding::Dioptres,
+        ("normalised_dioptres", (Some(near), Some(far))) => {
+            let (near_dpt, far_dpt) = (*near.get_ref(), *far.get_ref());
+            if !(far_dpt >= 0.0 && near_dpt > far_dpt && near_dpt.is_finite()) {
+                let found = format!("{near_dpt} with far_dpt {far_dpt}");
+                return Err(error_at(
+                    near.span().start,
+                    "near_dpt",
+                    found,
+                    "more dioptres than far_dpt, which is at least 0",
+                ));
+            }
+            DepthEncoding::NormalisedDioptres { far_dpt, near_dpt }
+        }
+        ("normalised_dioptres", _) => {
+            let found = "normalised_dioptres without both near_dpt and far_dpt".into();
+            return Err(error_at(
+                file.depth_encoding.span().start,
+                "depth_encoding",
+                found,
+                "the vergences of 1 and 0 in dioptres",
+            ));
+        }
+        (other, _) => {
+            let expected = "metres, millimetres, dioptres or normalised_dioptres (with near_dpt and far_dpt)";
+            return Err(error_at(file.depth_encoding.span().start, "depth_encoding", format!("\"{other}\""), expected));
+        }
+    };
+    if !matches!(encoding, DepthEncoding::NormalisedDioptres { .. })
+        && let Some((key, bound)) =
+            file.near_dpt.as_ref().map(|near| ("near_dpt", near)).or(file.far_dpt.as_ref().map(|far| ("far_dpt", far)))
+    {
+        let found = format!("{} with depth_encoding \"{name}\"", bound.get_ref());
+        return Err(error_at(bound.span().start, key, found, "it only with normalised_dioptres"));
+    }
+    for (key, value) in [("depth_scale", &file.depth_scale), ("fps", &file.fps)] {
+        if let Some(value) = value
+            && !(*value.get_ref() > 0.0 && value.get_ref().is_finite())
+        {
+            return Err(error_at(value.span().start, key, value.get_ref().to_string(), "a positive number"));
+        }
+    }
+    if let Some(step) = &file.step
+        && *step.get_ref() == 0
+    {
+        return Err(error_at(step.span().start, "step", "0".into(), "at least 1"));
+    }
+
+    let directory = path.parent().unwrap_or(Path::new(""));
+    let pattern = |key: &str, text: &Spanned<String>| {
+        FilePattern::parse(text.get_ref(), directory).ok_or_else(|| {
+            let expected = "a file name, with at most one {} or {:05} for the frame's number";
+            error_at(text.span().start, key, format!("\"{}\"", text.get_ref()), expected)
+        })
+    };
+    let colour = pattern("colour", &file.colour)?;
+    let depth = match &file.depth {
+        Some(depth) => pattern("depth", depth)?,
+        None => colour.clone(),
+    };
+    let (first, step) = (file.first.unwrap_or(0), file.step.map_or(1, Spanned::into_inner));
+    let numbered = colour.numbered() || depth.numbered();
+    let frames = match file.count {
+        Some(count) if !(1..=MOST_FRAMES).contains(count.get_ref()) => {
+            let expected = format!("1 to {MOST_FRAMES}");
+            return Err(error_at(count.span().start, "count", count.get_ref().to_string(), &expected));
+        }
+        Some(count) if *count.get_ref() > 1 && !numbered => {
+            let expected = "1, or a {} for the frame's number in colour or depth";
+            return Err(error_at(count.span().start, "count", count.get_ref().to_string(), expected));
+        }
+        Some(count) => count.into_inner(),
+        None if numbered => {
+            let there = |index: u64| {
+                let number = first.saturating_add(index.saturating_mul(step));
+                colour.path(number).exists() && depth.path(number).exists()
+            };
+            // A sequence without its first frame is reported when that is loaded.
+            (0..MOST_FRAMES).take_while(|&index| there(index)).count().max(1) as u64
+        }
+        None => 1,
+    };
+    if first.checked_add((frames - 1).saturating_mul(step)).is_none() {
+        return Err(error_at(0, "first", first.to_string(), "frame numbers below 2^64"));
+    }
+    Ok(Description {
+        path: path.to_owned(),
+        colour,
+        depth,
+        depth_reading: DepthReading {
+            encoding,
+            scale: file.depth_scale.map(Spanned::into_inner),
+            missing: file.depth_missing,
+        },
+        frames: frames as usize,
+        first,
+        step,
+        fps: file.fps.map(Spanned::into_inner),
+    })
+}
+
+/// What a scene file can say, for errors.
+const KEYS: &str = "TOML with colour, depth and depth_encoding, and where they apply near_dpt, far_dpt, depth_scale, \
+                    depth_missing, first, step, count and fps";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse_text(text: &str) -> Result<Description, SceneError> {
+        parse(Path::new("somewhere/scene.toml"), text)
+    }
+
+    fn assert_refused(text: &str, line: usize, parts: &[&str]) {
+        let message = parse_text(text).unwrap_err().to_string();
+        for part in parts.iter().copied().chain(["scene.toml", &format!("line {line}:")]) {
+            assert!(message.contains(part), "`{part}` is not in: {message}");
+        }
+    }
+
+    const PAIR: &str = "colour = \"c.png\"\ndepth = \"d.png\"\n";
+
+    #[test]
+    fn a_still_and_a_sequence_are_read() {
+        let still = parse_text(&format!("{PAIR}depth_encoding = \"metres\"\ndepth_missing = 0")).unwrap();
+        assert_eq!((still.frames, still.fps), (1, None));
+        assert_eq!(still.colour.path(7), Path::new("somewhere/c.png"));
+        assert_eq!(still.depth_reading.missing, Some(0.0));
+
+        let sequence = parse_text(
+            "colour = \"rgb/{:05}.jpg\"\ndepth = \"depth/{}.png\"\ndepth_encoding = \"normalised_dioptres\"\n\
+             near_dpt = 2.5\nfar_dpt = 0\nfirst = 30\nstep = 30\ncount = 4\nfps = 24",
+        )
+        .unwrap();
+        assert_eq!((sequence.frames, sequence.first, sequence.step, sequence.fps), (4, 30, 30, Some(24.0)));
+        assert_eq!(sequence.colour.path(30), Path::new("somewhere/rgb/00030.jpg"));
+        assert_eq!(sequence.depth.path(30), Path::new("somewhere/depth/30.png"));
+        let encoding = DepthEncoding::NormalisedDioptres { far_dpt: 0.0, near_dpt: 2.5 };
+        assert_eq!(sequence.depth_reading.encoding, encoding);
+    }
+
+    #[test]
+    fn faults_name_the_key_and_the_line() {
+        let encoded = |rest: &str| format!("{PAIR}depth_encoding = \"metres\"\n{rest}");
+        assert_refused(&encoded("colr = 3"), 4, &["colr"]);
+        assert_refused(PAIR, 1, &["depth_encoding"]);
+        assert_refused(
+            &format!("{PAIR}\ndepth_encoding = \"inches\""),
+            4,
+            &["`depth_encoding`", "inches", "millimetres", "dioptres"],
+        );
+        assert_refused(&format!("{PAIR}depth_encoding = \"normalised_dioptres\"\nnear_dpt = 2"), 3, &["far_dpt"]);
+        assert_refused(
+            &format!("{PAIR}depth_encoding = \"normalised_dioptres\"\nnear_dpt = 1\nfar_dpt = 2"),
+            4,
+            &["`near_dpt`"],
+        );
+        assert_refused(&encoded("near_dpt = 2.0"), 4, &["`near_dpt`", "normalised_dioptres"]);
+        assert_refused(&encoded("depth_scale = -1"), 4, &["`depth_scale`", "-1"]);
+        assert_refused(&encoded("fps = nan"), 4, &["`fps`"]);
+        assert_refused(&encoded("step = 0"), 4, &["`step`"]);
+        assert_refused(&encoded("count = 3"), 4, &["`count`", "{}"]);
+        assert_refused(&encoded("count = 0"), 4, &["`count`"]);
+        assert_refused("colour = \"{x}.png\"\ndepth_encoding = \"metres\"", 1, &["`colour`", "{x}"]);
+        assert_refused("colour = ", 1, &["scene"]);
+    }
+
+    #[test]
+    fn plain_files_need_an_encoding() {
+        let folder = tempfile::tempdir().unwrap();
+        let png = folder.path().join("a.png");
+        std::fs::write(&png, b"x").unwrap();
+        let pair = format!("{0},{0}", png.display());
+        assert!(matches!(describe(&pair, None), Err(SceneError::DepthEncoding { .. })));
+        assert!(describe(&pair, Some(DepthEncoding::Metres)).is_ok());
+        let single = describe(png.to_str().unwrap(), Some(DepthEncoding::Metres)).unwrap_err();
+        assert!(matches!(single, SceneError::Kind { .. }), "{single}");
+        let absent = describe("/no/such/scene", None).unwrap_err();
+        assert!(matches!(absent, SceneError::Read { .. }), "{absent}");
+        let empty = describe(folder.path().to_str().unwrap(), None).unwrap_err();
+        assert!(empty.to_string().contains("scene.toml"), "{empty}");
+    }
+}

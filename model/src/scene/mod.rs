@@ -1,0 +1,224 @@
+//! Scenes: RGB-D frames from files.
+//!
+//! A scene is a directory with a `scene.toml`:
+//!
+//! ```toml
+//! colour = "rgb/{:05}.png"         # 8- or 16-bit PNG, JPEG or OpenEXR; {} or {:05} is the frame's number
+//! depth = "depth/{:05}.png"        # the colour file, an OpenEXR with a Z channel, where absent
+//! depth_encoding = "millimetres"   # metres, millimetres, dioptres, or normalised_dioptres with far_dpt and near_dpt
+//! depth_scale = 1.0                # factor from the file's numbers to that unit; 1 where absent
+//! depth_missing = 0                # the number that means that there is no depth, where there is one
+//! first = 0                        # for a sequence: its first number,
+//! step = 1                         # the distance of numbers,
+//! count = 240                      # how many (as many as are there, where absent)
+//! fps = 30.0                       # and how many a second
+//! ```
+//!
+//! PNG and JPEG are decoded from sRGB once; OpenEXR is linear already. NaN, lengths that are not positive and OpenEXR
+//! pixels outside the data window have no depth and are filled from their surroundings.
+
+mod depth;
+mod description;
+mod error;
+mod fit;
+mod openexr;
+mod raster;
+
+use holod_calibration::{DisplayGeometry, Resolution};
+
+use self::description::Description;
+use self::fit::Placement;
+
+pub use self::error::SceneError;
+
+/// Normalised depths this little outside 0..=1 are rounding, not clamping.
+const ROUNDING: f32 = 1e-5;
+
+/// One RGB-D frame as the network reads it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RgbdFrame {
+    /// Width and height.
+    pub resolution: Resolution,
+    /// Square root of linear light, 0..=1, [3, height, width].
+    pub amplitude: Vec<f32>,
+    /// 0 at the far end of the display's depth range and 1 at the near end, uniform in dioptres, [height, width].
+    pub depth_normalised: Vec<f32>,
+}
+
+/// What happened to a frame between its files and the network.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct FrameReport {
+    /// Size of the colour picture in its file.
+    pub source: Option<Resolution>,
+    /// Pixels without a valid depth, which were filled from their surroundings.
+    pub depth_missing_px: usize,
+    /// Pixels farther than the display shows, set to its far end.
+    pub depth_clamped_far_px: usize,
+    /// Pixels nearer than the display shows, set to its near end.
+    pub depth_clamped_near_px: usize,
+    /// Colour values above white or not finite, which were clipped.
+    pub colour_clipped_px: usize,
+    /// Pixels of the frame that the picture does not reach: black, at the far end.
+    pub padded_px: usize,
+}
+
+/// What the numbers of a depth file mean.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum DepthEncoding {
+    /// Metres; infinity is 0 dioptres.
+    Metres,
+    /// Millimetres; 0 is missing.
+    Millimetres,
+    /// Dioptres.
+    Dioptres,
+    /// 0 at `far_dpt` and 1 (the largest integer of an integer file) at `near_dpt`, uniform in dioptres.
+    NormalisedDioptres {
+        /// Vergence of the value 0.
+        far_dpt: f64,
+        /// Vergence of the value 1.
+        near_dpt: f64,
+    },
+}
+
+/// How a picture of another size is brought to the wanted one.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Fit {
+    /// Unscaled and centred; a smaller picture is padded, a larger one is an error.
+    #[default]
+    Native,
+    /// Scaled so that all of it is visible, padded.
+    Contain,
+    /// Scaled so that it fills the frame, the rest cut off evenly.
+    Cover,
+    /// Unscaled and centred; what sticks out is cut off, a smaller picture is padded.
+    Crop,
+}
+
+/// A still picture or a sequence of them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scene {
+    description: Description,
+}
+
+impl Scene {
+    /// Opens a scene as a command line names it: a directory with a `scene.toml`, that file itself, `COLOUR,DEPTH`, or
+    /// one OpenEXR file with colour and depth. The latter two need `depth_encoding`; a scene file names its own.
+    ///
+    /// Pictures are read when they are loaded, so a missing or damaged one is reported then.
+    pub fn open(spec: &str, depth_encoding: Option<DepthEncoding>) -> Result<Self, SceneError> {
+        Ok(Self { description: description::describe(spec, depth_encoding)? })
+    }
+
+    /// Frames of the scene, at least one.
+    pub fn frames(&self) -> usize {
+        self.description.frames
+    }
+
+    /// Frames a second, where the scene says so.
+    pub fn fps(&self) -> Option<f64> {
+        self.description.fps
+    }
+
+    /// Loads frame `index` for the depth range of `geometry`, at `resolution` or, without one, at the picture's own.
+    ///
+    /// Depth of another size than colour is an error with [`Fit::Native`]; any other fit resamples it to the colour's
+    /// size, where their aspect ratios agree to a hundredth.
+    pub fn load(
+        &self,
+        index: usize,
+        geometry: &DisplayGeometry,
+        resolution: Option<Resolution>,
+        fit: Fit,
+    ) -> Result<(RgbdFrame, FrameReport), SceneError> {
+        let Description { path, frames, first, step, .. } = &self.description;
+        if index >= *frames {
+            return Err(SceneError::NoSuchFrame { path: path.clone(), index, frames: *frames });
+        }
+        let number = first + index as u64 * step;
+        let (colour_path, depth_path) = (self.description.colour.path(number), self.description.depth.path(number));
+        let colour = raster::read_colour(&colour_path)?;
+        let mut report =
+            FrameReport { source: Some(colour.size), colour_clipped_px: colour.clipped_px, ..FrameReport::default() };
+
+        let depth = raster::read_depth(&depth_path)?;
+        let mut depth_dpt = self.description.depth_reading.dioptres(&depth.numbers);
+        report.depth_missing_px =
+            depth::fill_missing(&mut depth_dpt, depth.size).ok_or_else(|| SceneError::Picture {
+                path: depth_path.clone(),
+                found: "no pixel with a valid depth".into(),
+                expected:
+                    "depth in the encoding that the scene names: look at the encoding, its scale and the missing value"
+                        .into(),
+            })?;
+        if depth.size != colour.size {
+            let aspect = |size: Resolution| size.width as f64 / size.height as f64;
+            let alike = (aspect(depth.size) / aspect(colour.size) - 1.0).abs() < 0.01;
+            let placement = Placement::new(depth.size, colour.size, Fit::Cover).filter(|_| alike && fit != Fit::Native);
+            let Some(placement) = placement else {
+                return Err(SceneError::SizesDiffer {
+                    colour: colour_path,
+                    colour_size: colour.size,
+                    depth: depth_path,
+                    depth_size: depth.size,
+                });
+            };
+            depth_dpt = placement.nearest(&depth_dpt, 0.0);
+        }
+
+        let target = resolution.unwrap_or(colour.size);
+        let placement = Placement::new(colour.size, target, fit).ok_or_else(|| SceneError::TooLarge {
+            path: colour_path,
+            found: colour.size,
+            wanted: target,
+        })?;
+        report.padded_px = placement.padded_px();
+        let mut normalise = |depth_dpt: f32| {
+            let normalised = geometry.normalised_depth(holod_calibration::Dioptres(depth_dpt.into())) as f32;
+            report.depth_clamped_far_px += usize::from(normalised < -ROUNDING);
+            report.depth_clamped_near_px += usize::from(normalised > 1.0 + ROUNDING);
+            normalised.clamp(0.0, 1.0)
+        };
+        let depth_normalised: Vec<f32> = depth_dpt.into_iter().map(&mut normalise).collect();
+        let frame = RgbdFrame {
+            resolution: target,
+            amplitude: colour
+                .linear
+                .chunks_exact(colour.size.pixels())
+                .flat_map(|plane| placement.light(plane))
+                .map(f32::sqrt)
+                .collect(),
+            depth_normalised: placement.nearest(&depth_normalised, 0.0),
+        };
+        Ok((frame, report))
+    }
+}
+
+impl DepthEncoding {
+    /// Reads `metres`, `millimetres`, `dioptres` or `normalised_dioptres[:FAR_DPT,NEAR_DPT]` as on a command line;
+    /// without its two ends the latter spans the depth range of `geometry`.
+    pub fn parse(text: &str, geometry: &DisplayGeometry) -> Result<Self, SceneError> {
+        let unknown = || SceneError::DepthEncoding { found: format!("\"{text}\"") };
+        match text {
+            "metres" => Ok(Self::Metres),
+            "millimetres" => Ok(Self::Millimetres),
+            "dioptres" => Ok(Self::Dioptres),
+            "normalised_dioptres" => {
+                Ok(Self::NormalisedDioptres { far_dpt: geometry.depth_far.0, near_dpt: geometry.depth_near.0 })
+            }
+            _ => {
+                let bounds = text.strip_prefix("normalised_dioptres:").ok_or_else(unknown)?;
+                let (far, near) = bounds.split_once(',').ok_or_else(unknown)?;
+                let number = |text: &str| text.trim().parse::<f64>().map_err(|_| unknown());
+                let (far_dpt, near_dpt) = (number(far)?, number(near)?);
+                if far_dpt >= 0.0 && near_dpt > far_dpt && near_dpt.is_finite() {
+                    Ok(Self::NormalisedDioptres { far_dpt, near_dpt })
+                } else {
+                    Err(unknown())
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,162 @@
+//! Colour and depth pictures from files, as linear light and raw depth numbers.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use holod_calibration::Resolution;
+use image::{DynamicImage, ImageReader};
+
+use super::depth::DepthNumbers;
+use super::{SceneError, openexr};
+use crate::picture::srgb_to_linear;
+
+/// More pixels than an 8K frame are refused before anything is allocated for them.
+pub(super) const MOST_PIXELS: usize = 7680 * 4320;
+/// What is read, for errors.
+pub(super) const FORMATS: &str = "an 8- or 16-bit PNG, a JPEG or an OpenEXR picture";
+
+/// A colour picture in linear light.
+pub(super) struct ColourRaster {
+    pub(super) size: Resolution,
+    /// [3, height, width], 0..=1
+    pub(super) linear: Vec<f32>,
+    /// Pixels of which some colour was above 1, below 0 or not finite.
+    pub(super) clipped_px: usize,
+}
+
+/// A depth picture.
+pub(super) struct DepthRaster {
+    pub(super) size: Resolution,
+    pub(super) numbers: DepthNumbers,
+}
+
+/// What kind of file a path holds, by its first bytes.
+enum Format {
+    OpenExr,
+    Other,
+}
+
+/// Reads the colours of a picture.
+pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
+    match format_of(path)? {
+        Format::OpenExr => openexr::read_colour(path),
+        Format::Other => {
+            let picture = decode(path)?;
+            let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
+            Ok(ColourRaster { size, linear: linear_planes(&picture), clipped_px: 0 })
+        }
+    }
+}
+
+/// Reads the depth numbers of a picture.
+pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
+    match format_of(path)? {
+        Format::OpenExr => openexr::read_depth(path),
+        Format::Other => {
+            let picture = decode(path)?;
+            let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
+            Ok(DepthRaster { size, numbers: depth_numbers(path, picture)? })
+        }
+    }
+}
+
+/// Checks a picture's claimed size before memory is spent on it.
+pub(super) fn check_size(path: &Path, width: usize, height: usize) -> Result<Resolution, SceneError> {
+    let size = Resolution { width, height };
+    if width == 0 || height == 0 || width.checked_mul(height).is_none_or(|pixels| pixels > MOST_PIXELS) {
+        return Err(SceneError::Picture {
+            path: path.to_owned(),
+            found: format!("a picture of {size}"),
+            expected: format!("at least one pixel and at most {MOST_PIXELS}, as many as 7680x4320"),
+        });
+    }
+    Ok(size)
+}
+
+fn format_of(path: &Path) -> Result<Format, SceneError> {
+    use std::io::Read;
+    let read_error = |source| SceneError::Read { path: path.to_owned(), source, expected: FORMATS };
+    let metadata = std::fs::metadata(path).map_err(read_error)?;
+    if !metadata.is_file() {
+        let found = if metadata.is_dir() { "a directory" } else { "no regular file" };
+        return Err(SceneError::Kind { path: path.to_owned(), found: found.into(), expected: FORMATS });
+    }
+    let mut magic = Vec::new();
+    File::open(path).and_then(|file| file.take(4).read_to_end(&mut magic)).map_err(read_error)?;
+    Ok(if magic == [0x76, 0x2f, 0x31, 0x01] { Format::OpenExr } else { Format::Other })
+}
+
+fn decode(path: &Path) -> Result<DynamicImage, SceneError> {
+    let damaged = |found: String| SceneError::Picture {
+        path: path.to_owned(),
+        found,
+        expected: format!("{FORMATS}; the file may be damaged or cut short: export or copy it again"),
+    };
+    let read_error = |source| SceneError::Read { path: path.to_owned(), source, expected: FORMATS };
+    let open = || -> Result<_, SceneError> {
+        let reader = BufReader::new(File::open(path).map_err(read_error)?);
+        ImageReader::new(reader).with_guessed_format().map_err(read_error)
+    };
+    let (width, height) = open()?.into_dimensions().map_err(|error| damaged(error.to_string()))?;
+    check_size(path, width as usize, height as usize)?;
+    open()?.decode().map_err(|error| damaged(error.to_string()))
+}
+
+/// Linear light of each colour; transparent pixels over black.
+fn linear_planes(picture: &DynamicImage) -> Vec<f32> {
+    let pixels = picture.width() as usize * picture.height() as usize;
+    let mut planes = vec![0.0; 3 * pixels];
+    let mut write = |index: usize, colours: [f32; 3], alpha: f32| {
+        for (colour, value) in colours.into_iter().enumerate() {
+            planes[colour * pixels + index] = value * alpha;
+        }
+    };
+    let wide = matches!(
+        picture,
+        DynamicImage::ImageLuma16(_)
+            | DynamicImage::ImageLumaA16(_)
+            | DynamicImage::ImageRgb16(_)
+            | DynamicImage::ImageRgba16(_)
+    );
+    if wide {
+        for (index, pixel) in picture.to_rgba16().pixels().enumerate() {
+            let [red, green, blue, alpha] = pixel.0.map(|value| f32::from(value) / 65535.0);
+            write(index, [red, green, blue].map(srgb_to_linear), alpha);
+        }
+    } else {
+        let table: [f32; 256] = std::array::from_fn(|value| srgb_to_linear(value as f32 / 255.0));
+        for (index, pixel) in picture.to_rgba8().pixels().enumerate() {
+            let [red, green, blue, alpha] = pixel.0;
+            write(index, [red, green, blue].map(|value| table[usize::from(value)]), f32::from(alpha) / 255.0);
+        }
+    }
+    planes
+}
+
+/// The numbers of a grey picture, or of a coloured one whose colours are equal everywhere.
+fn depth_numbers(path: &Path, picture: DynamicImage) -> Result<DepthNumbers, SceneError> {
+    let coloured = || SceneError::Picture {
+        path: path.to_owned(),
+        found: "a picture whose red, green and blue differ".into(),
+        expected: "depth as one grey channel; a colour-mapped depth picture cannot be read: export the numbers".into(),
+    };
+    fn grey<T: Copy + PartialEq + Into<f32>, const N: usize>(pixels: impl Iterator<Item = [T; N]>) -> Option<Vec<f32>> {
+        let number = |pixel: [T; N]| (pixel[0] == pixel[1] && pixel[1] == pixel[2]).then(|| pixel[0].into());
+        pixels.map(number).collect()
+    }
+    let (values, full_scale) = match picture {
+        DynamicImage::ImageLuma8(picture) => (Some(picture.into_raw().into_iter().map(f32::from).collect()), 255.0),
+        DynamicImage::ImageLuma16(picture) => (Some(picture.into_raw().into_iter().map(f32::from).collect()), 65535.0),
+        DynamicImage::ImageLumaA8(picture) => (Some(picture.pixels().map(|pixel| pixel.0[0].into()).collect()), 255.0),
+        DynamicImage::ImageLumaA16(picture) => {
+            (Some(picture.pixels().map(|pixel| pixel.0[0].into()).collect()), 65535.0)
+        }
+        DynamicImage::ImageRgb8(picture) => (grey(picture.pixels().map(|pixel| pixel.0)), 255.0),
+        DynamicImage::ImageRgba8(picture) => (grey(picture.pixels().map(|pixel| pixel.0)), 255.0),
+        DynamicImage::ImageRgb16(picture) => (grey(picture.pixels().map(|pixel| pixel.0)), 65535.0),
+        DynamicImage::ImageRgba16(picture) => (grey(picture.pixels().map(|pixel| pixel.0)), 65535.0),
+        _ => return Err(coloured()),
+    };
+    Ok(DepthNumbers { values: values.ok_or_else(coloured)?, full_scale: Some(full_scale) })
+}

@@ -1,0 +1,332 @@
+//! Scenes in files that these tests write, and in the shared real ones.
+
+use std::path::{Path, PathBuf};
+
+use exr::image::{AnyChannel, AnyChannels, FlatSamples, Image, Layer};
+use exr::math::Vec2;
+use exr::meta::attribute::{IntegerBounds, Text};
+use exr::meta::header::{ImageAttributes, LayerAttributes};
+use exr::prelude::{Encoding, WritableImage};
+use image::{ImageBuffer, Luma, Rgb};
+
+use super::*;
+
+const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
+
+fn size(width: usize, height: usize) -> Resolution {
+    Resolution { width, height }
+}
+
+/// A folder with files of one scene.
+struct Files(tempfile::TempDir);
+
+impl Files {
+    fn new() -> Self {
+        Self(tempfile::tempdir().unwrap())
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    fn spec(&self) -> String {
+        self.0.path().to_str().unwrap().into()
+    }
+
+    fn colour8(&self, name: &str, width: u32, height: u32, value: impl Fn(u32, u32) -> [u8; 3]) {
+        ImageBuffer::from_fn(width, height, |x, y| Rgb(value(x, y))).save(self.path(name)).unwrap();
+    }
+
+    fn depth16(&self, name: &str, width: u32, height: u32, value: impl Fn(u32, u32) -> u16) {
+        ImageBuffer::from_fn(width, height, |x, y| Luma([value(x, y)])).save(self.path(name)).unwrap();
+    }
+
+    fn describe(&self, text: &str) {
+        std::fs::write(self.path("scene.toml"), text).unwrap();
+    }
+
+    fn open(&self) -> Scene {
+        Scene::open(&self.spec(), None).unwrap()
+    }
+
+    /// An OpenEXR file with half colours and float depth whose data window begins at `origin` of the display window.
+    fn exr(
+        &self,
+        name: &str,
+        display: Resolution,
+        origin: [i32; 2],
+        data: Resolution,
+        value: impl Fn(&str, usize) -> f32,
+    ) {
+        let channel = |name: &str, half: bool| {
+            let samples = (0..data.pixels()).map(|index| value(name, index));
+            let samples = if half {
+                FlatSamples::F16(samples.map(half::f16::from_f32).collect())
+            } else {
+                FlatSamples::F32(samples.collect())
+            };
+            AnyChannel::new(name, samples)
+        };
+        let channels = ["B", "G", "R"].map(|name| channel(name, true)).into_iter().chain([channel("Z", false)]);
+        let mut attributes = LayerAttributes::named(Text::from("main"));
+        attributes.layer_position = Vec2(origin[0] - 3, origin[1] - 5);
+        let layer = Layer::new(
+            Vec2(data.width, data.height),
+            attributes,
+            Encoding::SMALL_FAST_LOSSLESS,
+            AnyChannels::sort(channels.collect()),
+        );
+        let window = IntegerBounds { position: Vec2(-3, -5), size: Vec2(display.width, display.height) };
+        let image = Image::empty(ImageAttributes::new(window)).with_layer(layer);
+        image.write().to_file(self.path(name)).unwrap();
+    }
+}
+
+const MILLIMETRES: &str = "colour = \"c.png\"\ndepth = \"d.png\"\ndepth_encoding = \"millimetres\"\n";
+
+#[test]
+fn a_pair_of_pngs_becomes_amplitude_and_normalised_depth() {
+    let files = Files::new();
+    files.colour8("c.png", 3, 1, |x, _| [[255, 128, 0], [0, 0, 0], [255, 255, 255]][x as usize]);
+    files.depth16("d.png", 3, 1, |x, _| [350, 0, 700][x as usize]);
+    files.describe(MILLIMETRES);
+    let (frame, report) = files.open().load(0, &BENCH, None, Fit::Native).unwrap();
+    assert_eq!(frame.resolution, size(3, 1));
+    let expected = [1.0, 0.0, 1.0, 0.215_861f32.sqrt(), 0.0, 1.0, 0.0, 0.0, 1.0];
+    for (actual, expected) in frame.amplitude.iter().zip(expected) {
+        assert!((actual - expected).abs() < 1e-5, "{actual} for {expected}");
+    }
+    // The hole takes the farther of its neighbours.
+    for (actual, expected) in frame.depth_normalised.iter().zip([1.0, 0.5, 0.5]) {
+        assert!((actual - expected).abs() < 1e-5, "{actual} for {expected}");
+    }
+    let expected = FrameReport { source: Some(size(3, 1)), depth_missing_px: 1, ..FrameReport::default() };
+    assert_eq!(report, expected);
+
+    let pair = format!("{},{}", files.path("c.png").display(), files.path("d.png").display());
+    let scene = Scene::open(&pair, Some(DepthEncoding::Millimetres)).unwrap();
+    assert_eq!(scene.load(0, &BENCH, None, Fit::Native).unwrap().0, frame);
+}
+
+#[test]
+fn sixteen_bit_colour_and_eight_bit_depth_are_read() {
+    let files = Files::new();
+    ImageBuffer::from_pixel(1, 1, Rgb([32768u16, 65535, 0])).save(files.path("c.png")).unwrap();
+    ImageBuffer::from_pixel(1, 1, Luma([51u8])).save(files.path("d.png")).unwrap();
+    files.describe(
+        "colour = \"c.png\"\ndepth = \"d.png\"\ndepth_encoding = \"normalised_dioptres\"\nnear_dpt = 2.5\nfar_dpt = 0.0",
+    );
+    let (frame, _) = files.open().load(0, &BENCH, None, Fit::Native).unwrap();
+    assert!((frame.amplitude[0] - 0.214_06f32.sqrt()).abs() < 1e-4 && frame.amplitude[1] == 1.0);
+    assert!((frame.depth_normalised[0] - 0.5 * 0.35).abs() < 1e-5);
+}
+
+#[test]
+fn depths_beyond_the_display_are_clamped_and_counted() {
+    let files = Files::new();
+    files.colour8("c.png", 3, 1, |_, _| [9; 3]);
+    files.depth16("d.png", 3, 1, |x, _| [100, 350, 5000][x as usize]);
+    files.describe(MILLIMETRES);
+    let geometry = DisplayGeometry { depth_far: holod_calibration::Dioptres(0.5), ..BENCH };
+    let (frame, report) = files.open().load(0, &geometry, None, Fit::Native).unwrap();
+    assert_eq!((report.depth_clamped_near_px, report.depth_clamped_far_px), (1, 1));
+    assert_eq!((frame.depth_normalised[0], frame.depth_normalised[2]), (1.0, 0.0));
+}
+
+#[test]
+fn sizes_are_fitted_only_as_asked() {
+    let files = Files::new();
+    files.colour8("c.png", 8, 4, |_, _| [255; 3]);
+    files.depth16("d.png", 8, 4, |_, _| 350);
+    files.describe(MILLIMETRES);
+    let scene = files.open();
+    let load = |width, height, fit| scene.load(0, &BENCH, Some(size(width, height)), fit);
+    let (padded, report) = load(10, 5, Fit::Native).unwrap();
+    assert_eq!((padded.resolution, report.padded_px), (size(10, 5), 50 - 32));
+    assert_eq!((padded.amplitude[0], padded.depth_normalised[0]), (0.0, 0.0));
+    assert_eq!((padded.amplitude[1], padded.depth_normalised[1]), (1.0, 1.0));
+    let error = load(6, 6, Fit::Native).unwrap_err().to_string();
+    assert!(error.contains("8x4") && error.contains("6x6") && error.contains("contain"), "{error}");
+    assert_eq!(load(4, 4, Fit::Contain).unwrap().1.padded_px, 8);
+    assert_eq!(load(5, 5, Fit::Cover).unwrap().1.padded_px, 0);
+    assert_eq!(load(6, 6, Fit::Crop).unwrap().1.padded_px, 12);
+}
+
+#[test]
+fn a_depth_map_of_another_size_is_refused_unless_a_fit_is_asked() {
+    let files = Files::new();
+    files.colour8("c.png", 8, 4, |_, _| [255; 3]);
+    files.depth16("d.png", 4, 2, |x, _| if x < 2 { 350 } else { 3500 });
+    files.describe(MILLIMETRES);
+    let error = files.open().load(0, &BENCH, None, Fit::Native).unwrap_err().to_string();
+    assert!(["c.png", "d.png", "8x4", "4x2"].iter().all(|part| error.contains(part)), "{error}");
+    let (frame, _) = files.open().load(0, &BENCH, None, Fit::Cover).unwrap();
+    for (actual, expected) in frame.depth_normalised[..8].iter().zip([1.0, 1.0, 1.0, 1.0, 0.1, 0.1, 0.1, 0.1]) {
+        assert!((actual - expected).abs() < 1e-5, "{actual}");
+    }
+    files.depth16("d.png", 4, 4, |_, _| 350);
+    assert!(matches!(files.open().load(0, &BENCH, None, Fit::Cover), Err(SceneError::SizesDiffer { .. })));
+}
+
+#[test]
+fn an_exr_with_a_small_data_window_fills_the_display_window() {
+    let files = Files::new();
+    files.exr("both.exr", size(5, 4), [1, 1], size(2, 2), |channel, index| match (channel, index) {
+        ("Z", 0) => f32::INFINITY,
+        ("Z", 1) => f32::NAN,
+        ("Z", _) => 0.7,
+        ("R", _) => 0.25,
+        ("G", 3) => 4.0,
+        _ => 0.0,
+    });
+    let path = files.path("both.exr");
+    let scene = Scene::open(path.to_str().unwrap(), Some(DepthEncoding::Metres)).unwrap();
+    let (frame, report) = scene.load(0, &BENCH, None, Fit::Native).unwrap();
+    assert_eq!(frame.resolution, size(5, 4));
+    let red: Vec<_> = frame.amplitude[..20].iter().enumerate().filter(|(_, value)| **value > 0.0).collect();
+    assert_eq!(red, [(6, &0.5), (7, &0.5), (11, &0.5), (12, &0.5)]);
+    assert_eq!((report.colour_clipped_px, report.depth_missing_px), (1, 17));
+    assert!((frame.depth_normalised[12] - 0.5).abs() < 1e-5 && frame.depth_normalised[6] == 0.0);
+    assert!(frame.depth_normalised.iter().all(|value| (0.0..=1.0).contains(value)));
+
+    files.describe("colour = \"both.exr\"\ndepth_encoding = \"metres\"");
+    assert_eq!(files.open().load(0, &BENCH, None, Fit::Native).unwrap().0, frame);
+}
+
+#[test]
+fn a_sequence_has_as_many_frames_as_files() {
+    let files = Files::new();
+    for index in 2..5 {
+        files.colour8(&format!("c{index:03}.png"), 2, 2, |_, _| [index as u8 * 50; 3]);
+        files.depth16(&format!("d{index:03}.png"), 2, 2, |_, _| 500);
+    }
+    files.describe(
+        "colour = \"c{:03}.png\"\ndepth = \"d{:03}.png\"\ndepth_encoding = \"millimetres\"\nfirst = 2\nfps = 25.0",
+    );
+    let scene = files.open();
+    assert_eq!((scene.frames(), scene.fps()), (3, Some(25.0)));
+    let brightness = |index| scene.load(index, &BENCH, None, Fit::Native).unwrap().0.amplitude[0];
+    assert!(brightness(0) < brightness(1) && brightness(1) < brightness(2));
+    assert!(matches!(
+        scene.load(3, &BENCH, None, Fit::Native),
+        Err(SceneError::NoSuchFrame { index: 3, frames: 3, .. })
+    ));
+}
+
+#[test]
+fn damaged_files_are_refused_and_never_half_read() {
+    let files = Files::new();
+    files.colour8("c.png", 40, 40, |x, y| [(x * y) as u8, x as u8, y as u8]);
+    files.depth16("d.png", 40, 40, |x, y| (400 + x * y) as u16);
+    files.exr("e.exr", size(40, 40), [0, 0], size(40, 40), |_, index| 0.1 + index as f32 * 1e-3);
+    for (name, spec) in [("c.png", "c.png,d.png"), ("d.png", "c.png,d.png"), ("e.exr", "e.exr")] {
+        let whole = std::fs::read(files.path(name)).unwrap();
+        let spec: Vec<_> = spec.split(',').map(|file| files.path(file).display().to_string()).collect();
+        let load =
+            || Scene::open(&spec.join(","), Some(DepthEncoding::Metres)).unwrap().load(0, &BENCH, None, Fit::Native);
+        load().unwrap();
+        for length in [0, 3, 20, whole.len() / 3, whole.len() / 2, whole.len() - 30] {
+            std::fs::write(files.path(name), &whole[..length]).unwrap();
+            let error = load().unwrap_err().to_string();
+            assert!(error.contains(name), "{length} bytes of {name}: {error}");
+        }
+        // Whatever the damage, there is an answer and no panic.
+        for place in (0..whole.len()).step_by(whole.len() / 100 + 1) {
+            let mut damaged = whole.clone();
+            damaged[place] ^= 0x55;
+            std::fs::write(files.path(name), damaged).unwrap();
+            let _ = load();
+        }
+        std::fs::write(files.path(name), whole).unwrap();
+    }
+}
+
+#[test]
+fn a_file_that_claims_a_huge_picture_is_refused_before_it_is_decoded() {
+    let files = Files::new();
+    files.colour8("c.png", 2, 2, |_, _| [0; 3]);
+    let mut bytes = std::fs::read(files.path("c.png")).unwrap();
+    bytes[16..24].copy_from_slice(&[0, 1, 0, 0, 0, 1, 0, 0]);
+    let checksum = crc32(&bytes[12..29]);
+    bytes[29..33].copy_from_slice(&checksum.to_be_bytes());
+    std::fs::write(files.path("c.png"), bytes).unwrap();
+    let error = raster::read_colour(&files.path("c.png")).err().unwrap().to_string();
+    assert!(error.contains("65536x65536"), "{error}");
+}
+
+/// The checksum of a PNG chunk.
+fn crc32(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(!0, |crc, byte| {
+        (0..8).fold(crc ^ u32::from(*byte), |crc, _| if crc & 1 == 1 { (crc >> 1) ^ 0xEDB8_8320 } else { crc >> 1 })
+    })
+}
+
+#[test]
+fn what_is_no_picture_says_so() {
+    let files = Files::new();
+    files.colour8("c.png", 2, 2, |_, _| [0; 3]);
+    files.depth16("d.png", 2, 2, |_, _| 0);
+    files.describe(MILLIMETRES);
+    let error = files.open().load(0, &BENCH, None, Fit::Native).unwrap_err().to_string();
+    assert!(error.contains("d.png") && error.contains("encoding"), "{error}");
+    files.describe("colour = \"absent.png\"\ndepth = \"d.png\"\ndepth_encoding = \"metres\"");
+    assert!(matches!(files.open().load(0, &BENCH, None, Fit::Native), Err(SceneError::Read { .. })));
+    files.describe("colour = \"c.png\"\ndepth = \".\"\ndepth_encoding = \"metres\"");
+    assert!(matches!(files.open().load(0, &BENCH, None, Fit::Native), Err(SceneError::Kind { .. })));
+    files.colour8("d.png", 2, 2, |x, _| [10, 20, x as u8]);
+    files.describe(MILLIMETRES);
+    let error = files.open().load(0, &BENCH, None, Fit::Native).unwrap_err().to_string();
+    assert!(error.contains("d.png") && error.contains("grey"), "{error}");
+}
+
+#[test]
+fn encodings_are_read_from_a_command_line() {
+    let parse = |text| DepthEncoding::parse(text, &BENCH);
+    let normalised = |far_dpt, near_dpt| DepthEncoding::NormalisedDioptres { far_dpt, near_dpt };
+    assert_eq!(parse("metres").unwrap(), DepthEncoding::Metres);
+    assert_eq!(parse("normalised_dioptres:0.25,2.5").unwrap(), normalised(0.25, 2.5));
+    assert_eq!(parse("normalised_dioptres").unwrap(), normalised(BENCH.depth_far.0, BENCH.depth_near.0));
+    for unknown in ["inches", "", "normalised_dioptres:", "normalised_dioptres:2,1", "normalised_dioptres:0,x"] {
+        let error = parse(unknown).unwrap_err().to_string();
+        assert!(error.contains("metres, millimetres, dioptres") && error.contains(unknown), "{error}");
+    }
+}
+
+fn shared_data() -> PathBuf {
+    std::env::var_os("HOLOD_SHARED_DATA")
+        .map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data"), PathBuf::from)
+}
+
+#[test]
+#[ignore = "needs shared data"]
+fn shared_data_living_room_sequence_loads() {
+    let files = Files::new();
+    let room = shared_data().join("rgbd/livingroom");
+    files.describe(&format!(
+        "colour = \"{0}/rgb/{{:05}}.jpg\"\ndepth = \"{0}/depth/{{:05}}.png\"\ndepth_encoding = \"millimetres\"\nstep = 30",
+        room.canonicalize().unwrap().display()
+    ));
+    let scene = files.open();
+    assert_eq!(scene.frames(), 8);
+    for index in 0..8 {
+        let (frame, report) = scene.load(index, &BENCH, Some(size(512, 512)), Fit::Cover).unwrap();
+        assert_eq!((frame.resolution, report.source), (size(512, 512), Some(size(640, 480))));
+        assert!(report.depth_missing_px < 640 * 480 / 4, "{report:?}");
+        let mean = frame.depth_normalised.iter().sum::<f32>() / (512.0 * 512.0);
+        assert!((0.02..0.9).contains(&mean), "{mean}");
+    }
+}
+
+#[test]
+#[ignore = "needs shared data"]
+fn shared_data_beach_ball_loads_at_its_display_window() {
+    let path = shared_data().join("rgbd/beachball/singlepart.0001.exr");
+    let scene = Scene::open(path.to_str().unwrap(), Some(DepthEncoding::Metres)).unwrap();
+    let (frame, report) = scene.load(0, &BENCH, None, Fit::Native).unwrap();
+    assert_eq!(frame.resolution, size(2048, 1556));
+    assert!(report.depth_missing_px >= 2048 * 1556 - 911 * 876, "{report:?}");
+    let inside = 600 * 2048 + 1100;
+    assert!(frame.amplitude[inside] > 0.0 && frame.amplitude[0] == 0.0);
+    assert!(scene.load(0, &BENCH, Some(size(1920, 1080)), Fit::Native).is_err());
+    scene.load(0, &BENCH, Some(size(640, 360)), Fit::Contain).unwrap();
+}

@@ -1,0 +1,664 @@
+//! The network's weights: one safetensors file that says what it was trained for.
+
+use std::collections::HashMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use holod_calibration::DisplayGeometry;
+use safetensors::{Dtype, SafeTensors};
+use serde::{Deserialize, Serialize};
+
+/// The value of the metadata key `format` that this crate reads.
+const FORMAT: &str = "holod-weights-1";
+/// Larger files are refused before they are read.
+const LARGEST_FILE_BYTES: u64 = 256 << 20;
+/// Relative difference below which two optical lengths are the same.
+const OPTICS_TOLERANCE: f64 = 1e-4;
+
+/// Weights that were checked as a whole: every tensor is there, finite, and of the shape that the configuration asks for.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Weights {
+    pub(crate) config: NetworkConfig,
+    pub(crate) layers: Vec<Layer>,
+    metrics: serde_json::Value,
+    provenance: serde_json::Value,
+}
+
+/// What network the weights are for and what they were trained for, as the file's `config` says it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NetworkConfig {
+    /// The family; `direct` is known.
+    pub architecture: String,
+    /// Version of the family; 1 is known.
+    pub version: u32,
+    /// The grid on which the network predicts.
+    pub grid: Grid,
+    /// 3x3 layers in all: the first, pairs of body layers, the last.
+    pub layers: usize,
+    /// Feature channels of the body.
+    pub channels: usize,
+    /// Which body layers are adjustable deformable ones.
+    pub adjustable_layers: Vec<usize>,
+    /// Width of the hidden layers of the network that turns the pupil into a modulation.
+    pub modulation_hidden: usize,
+    /// Slope of the leaky rectifier below zero.
+    pub leaky_slope: f32,
+    /// Optics trained for.
+    pub optics: TrainedOptics,
+    /// Smallest and largest pupil trained, millimetres.
+    pub pupil_range_mm: [f32; 2],
+    /// Amplitude that double phase maps to 1.
+    pub amplitude_constant: f32,
+}
+
+/// The grid on which a network predicts the field.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Grid {
+    /// Half the resolution in each direction; the field is Fourier-upsampled by 2 afterwards.
+    HalfBand,
+    /// The panel's own.
+    Full,
+}
+
+/// The optics that weights were trained for, in the units of their file.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainedOptics {
+    /// Red, green, blue.
+    pub wavelengths_nm: [f64; 3],
+    /// Distance between the centres of neighbouring pixels.
+    pub pixel_pitch_um: f64,
+    /// Focal length of the eyepiece.
+    pub eyepiece_focal_length_mm: f64,
+    /// Vergence of normalised depth 0.
+    pub depth_far_dpt: f64,
+    /// Vergence of normalised depth 1.
+    pub depth_near_dpt: f64,
+}
+
+impl TrainedOptics {
+    /// The same optics with a panel of `resolution`.
+    pub fn geometry(&self, resolution: holod_calibration::Resolution) -> DisplayGeometry {
+        use holod_calibration::{Dioptres, Metres, PerColour};
+        DisplayGeometry {
+            resolution,
+            pixel_pitch: Metres(self.pixel_pitch_um * 1e-6),
+            wavelengths: PerColour(self.wavelengths_nm.map(|wavelength_nm| Metres(wavelength_nm * 1e-9))),
+            eyepiece_focal_length: Metres(self.eyepiece_focal_length_mm * 1e-3),
+            depth_far: Dioptres(self.depth_far_dpt),
+            depth_near: Dioptres(self.depth_near_dpt),
+        }
+    }
+
+    /// The optics of `geometry` in this type's units.
+    pub fn of(geometry: &DisplayGeometry) -> Self {
+        Self {
+            wavelengths_nm: geometry.wavelengths.0.map(|wavelength| wavelength.0 * 1e9),
+            pixel_pitch_um: geometry.pixel_pitch.0 * 1e6,
+            eyepiece_focal_length_mm: geometry.eyepiece_focal_length.0 * 1e3,
+            depth_far_dpt: geometry.depth_far.0,
+            depth_near_dpt: geometry.depth_near.0,
+        }
+    }
+}
+
+/// One 3x3 layer.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Layer {
+    pub(crate) out_channels: usize,
+    pub(crate) in_channels: usize,
+    /// [out, in, 3, 3]
+    pub(crate) weight: Vec<f32>,
+    /// [out]
+    pub(crate) bias: Vec<f32>,
+    pub(crate) adjustable: Option<Adjustable>,
+}
+
+/// What an adjustable deformable layer has besides its own kernel.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Adjustable {
+    /// W0, [18, in, 3, 3]
+    pub(crate) offset_weight: Vec<f32>,
+    /// b0, [18]
+    pub(crate) offset_bias: Vec<f32>,
+    /// g_m: 1 → hidden → hidden → 18·in + 18
+    pub(crate) modulation: [Dense; 3],
+}
+
+/// A fully connected layer.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Dense {
+    pub(crate) inputs: usize,
+    /// [outputs, inputs]
+    pub(crate) weight: Vec<f32>,
+    /// [outputs]
+    pub(crate) bias: Vec<f32>,
+}
+
+/// Offsets that an adjustable layer predicts for each pixel: (dy, dx) of nine taps.
+pub(crate) const OFFSET_CHANNELS: usize = 18;
+
+/// Weights that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum WeightsError {
+    /// The file cannot be read.
+    #[error("weights {path}: {source}; expected a safetensors file that holod's trainer exported", path = path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The path is a directory or the file is far too large.
+    #[error("weights {path}: found {found}; expected a safetensors file of at most 256 MiB", path = path.display())]
+    NotAFile {
+        /// The path.
+        path: PathBuf,
+        /// What is there.
+        found: String,
+    },
+    /// The bytes are no safetensors file.
+    #[error(
+        "weights {name}: not a valid safetensors file ({detail}); the file is damaged or of another kind: export or copy it again"
+    )]
+    Damaged {
+        /// Which weights.
+        name: String,
+        /// What the parser said.
+        detail: String,
+    },
+    /// The metadata does not describe a network that this version runs.
+    #[error(
+        "weights {name}: metadata `{key}` is {found}; expected {expected}; export the weights with this version's trainer"
+    )]
+    Metadata {
+        /// Which weights.
+        name: String,
+        /// The metadata key, with a path inside it where it is structured.
+        key: String,
+        /// What was found.
+        found: String,
+        /// What was expected.
+        expected: String,
+    },
+    /// One tensor is missing or cannot be used.
+    #[error("weights {name}: tensor `{tensor}` is {found}; expected {expected}")]
+    Tensor {
+        /// Which weights.
+        name: String,
+        /// The tensor's name.
+        tensor: String,
+        /// What was found.
+        found: String,
+        /// What was expected.
+        expected: String,
+    },
+}
+
+/// Every optical value in which weights and bench differ.
+#[derive(Clone, Debug, PartialEq)]
+pub struct OpticsMismatch {
+    /// At least one.
+    pub differences: Vec<OpticsDifference>,
+}
+
+/// One optical value in which weights and bench differ.
+#[derive(Clone, Debug, PartialEq)]
+pub struct OpticsDifference {
+    /// Name with unit, as in a rig file.
+    pub name: &'static str,
+    /// The value that the weights were trained for.
+    pub weights: f64,
+    /// The value of the bench.
+    pub bench: f64,
+}
+
+impl fmt::Display for OpticsMismatch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "the weights were trained for other optics than this bench has:")?;
+        for (index, OpticsDifference { name, weights, bench }) in self.differences.iter().enumerate() {
+            let separator = if index == 0 { "" } else { "," };
+            write!(f, "{separator} {name} {weights:.6} in the weights and {bench:.6} on the bench")?;
+        }
+        write!(f, "; use weights trained for this bench, or allow the mismatch in the rig file")
+    }
+}
+
+impl std::error::Error for OpticsMismatch {}
+
+impl Weights {
+    /// The weights that ship with holod.
+    pub fn builtin() -> Self {
+        Self::from_bytes(include_bytes!("../weights/direct-halfband-14.safetensors"), "built-in")
+            .expect("the built-in weights are valid: a test loads them")
+    }
+
+    /// Reads and checks a weights file.
+    pub fn load(path: &Path) -> Result<Self, WeightsError> {
+        let read_error = |source| WeightsError::Read { path: path.to_owned(), source };
+        let metadata = std::fs::metadata(path).map_err(read_error)?;
+        if !metadata.is_file() || metadata.len() > LARGEST_FILE_BYTES {
+            let found = if metadata.is_file() { format!("{} bytes", metadata.len()) } else { "no regular file".into() };
+            return Err(WeightsError::NotAFile { path: path.to_owned(), found });
+        }
+        Self::from_bytes(&std::fs::read(path).map_err(read_error)?, &path.display().to_string())
+    }
+
+    /// Checks weights in memory; `name` says in errors which they are.
+    pub fn from_bytes(bytes: &[u8], name: &str) -> Result<Self, WeightsError> {
+        let damaged = |error: safetensors::SafeTensorError| WeightsError::Damaged {
+            name: name.into(),
+            detail: error.to_string(),
+        };
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(damaged)?;
+        let tensors = SafeTensors::deserialize(bytes).map_err(damaged)?;
+        let metadata = Metadata { name, entries: header.metadata().clone().unwrap_or_default() };
+
+        let config = metadata.config()?;
+        let file = TensorReader { name, tensors };
+        let layers = (0..config.layers).map(|index| file.layer(&config, index)).collect::<Result<_, _>>()?;
+        Ok(Self { config, layers, metrics: metadata.remark("metrics"), provenance: metadata.remark("provenance") })
+    }
+
+    /// What network this is and what it was trained for.
+    pub fn config(&self) -> &NetworkConfig {
+        &self.config
+    }
+
+    /// What the weights reached when they were evaluated, as the trainer wrote it.
+    pub fn metrics(&self) -> &serde_json::Value {
+        &self.metrics
+    }
+
+    /// Script, seed, steps and date of the training.
+    pub fn provenance(&self) -> &serde_json::Value {
+        &self.provenance
+    }
+
+    /// Whether `bench` has the optics that the weights were trained for. The panel's resolution is free.
+    pub fn check_optics(&self, bench: &DisplayGeometry) -> Result<(), OpticsMismatch> {
+        let (ours, theirs) = (&self.config.optics, TrainedOptics::of(bench));
+        let [red, green, blue] = ours.wavelengths_nm;
+        let [bench_red, bench_green, bench_blue] = theirs.wavelengths_nm;
+        let differences: Vec<_> = [
+            ("wavelengths_nm.red", red, bench_red),
+            ("wavelengths_nm.green", green, bench_green),
+            ("wavelengths_nm.blue", blue, bench_blue),
+            ("pixel_pitch_um", ours.pixel_pitch_um, theirs.pixel_pitch_um),
+            ("eyepiece_focal_length_mm", ours.eyepiece_focal_length_mm, theirs.eyepiece_focal_length_mm),
+            ("depth_far_dpt", ours.depth_far_dpt, theirs.depth_far_dpt),
+            ("depth_near_dpt", ours.depth_near_dpt, theirs.depth_near_dpt),
+        ]
+        .into_iter()
+        .filter(|&(_, weights, bench)| {
+            let difference = (weights - bench).abs();
+            difference.is_nan() || difference > OPTICS_TOLERANCE * weights.abs().max(bench.abs()).max(1e-3)
+        })
+        .map(|(name, weights, bench)| OpticsDifference { name, weights, bench })
+        .collect();
+        if differences.is_empty() { Ok(()) } else { Err(OpticsMismatch { differences }) }
+    }
+}
+
+/// The file's metadata with the name that errors give it.
+struct Metadata<'a> {
+    name: &'a str,
+    entries: HashMap<String, String>,
+}
+
+impl Metadata<'_> {
+    fn error(&self, key: &str, found: impl Into<String>, expected: impl Into<String>) -> WeightsError {
+        WeightsError::Metadata {
+            name: self.name.into(),
+            key: key.into(),
+            found: found.into(),
+            expected: expected.into(),
+        }
+    }
+
+    /// An entry that only people read: `null` where it is absent, plain text where it is not JSON.
+    fn remark(&self, key: &str) -> serde_json::Value {
+        let Some(text) = self.entries.get(key) else { return serde_json::Value::Null };
+        serde_json::from_str(text).unwrap_or_else(|_| serde_json::Value::String(text.clone()))
+    }
+
+    fn config(&self) -> Result<NetworkConfig, WeightsError> {
+        match self.entries.get("format").map(String::as_str) {
+            Some(FORMAT) => {}
+            Some(other) => return Err(self.error("format", format!("\"{other}\""), format!("\"{FORMAT}\""))),
+            None => return Err(self.error("format", "absent", format!("\"{FORMAT}\""))),
+        }
+        let text =
+            self.entries.get("config").ok_or_else(|| self.error("config", "absent", "a network configuration"))?;
+        let config: NetworkConfig = serde_json::from_str(text)
+            .map_err(|error| self.error("config", format!("unusable ({error})"), "a network configuration"))?;
+        self.check(&config)?;
+        Ok(config)
+    }
+
+    fn check(&self, config: &NetworkConfig) -> Result<(), WeightsError> {
+        let require = |holds: bool, key: &str, found: String, expected: &str| {
+            if holds { Ok(()) } else { Err(self.error(&format!("config.{key}"), found, expected)) }
+        };
+        let NetworkConfig { architecture, version, layers, channels, .. } = config;
+        require(architecture == "direct", "architecture", format!("\"{architecture}\""), "\"direct\"")?;
+        require(*version == 1, "version", version.to_string(), "1")?;
+        require(
+            (4..=64).contains(layers) && layers % 2 == 0,
+            "layers",
+            layers.to_string(),
+            "an even number from 4 to 64 (a first, a last and pairs between)",
+        )?;
+        require((1..=256).contains(channels), "channels", channels.to_string(), "1 to 256")?;
+        let adjustable = &config.adjustable_layers;
+        require(
+            adjustable.iter().all(|index| (1..layers - 1).contains(index))
+                && adjustable.windows(2).all(|pair| pair[0] < pair[1]),
+            "adjustable_layers",
+            format!("{adjustable:?}"),
+            "ascending numbers of body layers",
+        )?;
+        let hidden = config.modulation_hidden;
+        require((1..=1024).contains(&hidden), "modulation_hidden", hidden.to_string(), "1 to 1024")?;
+        let slope = config.leaky_slope;
+        require((0.0..1.0).contains(&slope), "leaky_slope", slope.to_string(), "at least 0 and below 1")?;
+        let [smallest, largest] = config.pupil_range_mm;
+        require(
+            smallest > 0.0 && largest >= smallest && largest.is_finite(),
+            "pupil_range_mm",
+            format!("[{smallest}, {largest}]"),
+            "two positive millimetre values in ascending order",
+        )?;
+        let constant = config.amplitude_constant;
+        require(
+            constant > 0.0 && constant.is_finite(),
+            "amplitude_constant",
+            constant.to_string(),
+            "a positive number",
+        )?;
+        let optics = &config.optics;
+        let lengths = [optics.pixel_pitch_um, optics.eyepiece_focal_length_mm];
+        require(
+            lengths.iter().chain(&optics.wavelengths_nm).all(|&length| length > 0.0 && length.is_finite())
+                && optics.depth_far_dpt.is_finite()
+                && optics.depth_near_dpt.is_finite()
+                && optics.depth_near_dpt > optics.depth_far_dpt,
+            "optics",
+            format!("{optics:?}"),
+            "positive lengths, and a near end with more dioptres than the far end",
+        )
+    }
+}
+
+/// Reads tensors of known shape.
+struct TensorReader<'a> {
+    name: &'a str,
+    tensors: SafeTensors<'a>,
+}
+
+impl TensorReader<'_> {
+    fn layer(&self, config: &NetworkConfig, index: usize) -> Result<Layer, WeightsError> {
+        let in_channels = if index == 0 { config.input_channels() } else { config.channels };
+        let out_channels = if index + 1 == config.layers { OUTPUT_CHANNELS } else { config.channels };
+        let prefix = format!("layers.{index}");
+        let adjustable = config
+            .adjustable_layers
+            .contains(&index)
+            .then(|| self.adjustable(&prefix, in_channels, config.modulation_hidden))
+            .transpose()?;
+        Ok(Layer {
+            out_channels,
+            in_channels,
+            weight: self.tensor(&format!("{prefix}.weight"), &[out_channels, in_channels, 3, 3])?,
+            bias: self.tensor(&format!("{prefix}.bias"), &[out_channels])?,
+            adjustable,
+        })
+    }
+
+    fn adjustable(&self, prefix: &str, channels: usize, hidden: usize) -> Result<Adjustable, WeightsError> {
+        let outputs = OFFSET_CHANNELS * channels + OFFSET_CHANNELS;
+        let dense = |index: usize, inputs: usize, outputs: usize| -> Result<Dense, WeightsError> {
+            Ok(Dense {
+                inputs,
+                weight: self.tensor(&format!("{prefix}.modulation.{index}.weight"), &[outputs, inputs])?,
+                bias: self.tensor(&format!("{prefix}.modulation.{index}.bias"), &[outputs])?,
+            })
+        };
+        Ok(Adjustable {
+            offset_weight: self.tensor(&format!("{prefix}.offset.weight"), &[OFFSET_CHANNELS, channels, 3, 3])?,
+            offset_bias: self.tensor(&format!("{prefix}.offset.bias"), &[OFFSET_CHANNELS])?,
+            modulation: [dense(0, 1, hidden)?, dense(1, hidden, hidden)?, dense(2, hidden, outputs)?],
+        })
+    }
+
+    fn tensor(&self, tensor: &str, shape: &[usize]) -> Result<Vec<f32>, WeightsError> {
+        let error = |found: String| WeightsError::Tensor {
+            name: self.name.into(),
+            tensor: tensor.into(),
+            found,
+            expected: format!("F32 of shape {shape:?} with finite values"),
+        };
+        let view = self.tensors.tensor(tensor).map_err(|_| error("absent".into()))?;
+        if view.dtype() != Dtype::F32 || view.shape() != shape {
+            return Err(error(format!("{:?} of shape {:?}", view.dtype(), view.shape())));
+        }
+        let values: Vec<f32> = view.data().as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect();
+        match values.iter().position(|value| !value.is_finite()) {
+            Some(index) => Err(error(format!("{} at index {index}", values[index]))),
+            None => Ok(values),
+        }
+    }
+}
+
+/// Real and imaginary residual of three colours.
+pub(crate) const OUTPUT_CHANNELS: usize = 6;
+
+impl NetworkConfig {
+    /// Channels that the first layer reads: amplitude, two depth channels (each four times after the unshuffle on the
+    /// half-band grid), and the pupil.
+    pub(crate) fn input_channels(&self) -> usize {
+        match self.grid {
+            Grid::HalfBand => 4 * 5 + 1,
+            Grid::Full => 5 + 1,
+        }
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+    use rand::RngExt;
+    use safetensors::tensor::TensorView;
+
+    /// A network with random weights of such a size that its features keep their scale and its offsets reach a few
+    /// pixels.
+    pub(crate) fn random_weights(config: NetworkConfig, seed: u64) -> Weights {
+        let mut random = rand_pcg::Pcg32::new(seed, 1);
+        let mut tensor = |count: usize, scale: f32| -> Vec<f32> {
+            (0..count).map(|_| random.random_range(-1.0f32..1.0) * scale).collect()
+        };
+        let layers = (0..config.layers)
+            .map(|index| {
+                let in_channels = if index == 0 { config.input_channels() } else { config.channels };
+                let out_channels = if index + 1 == config.layers { OUTPUT_CHANNELS } else { config.channels };
+                let scale = (3.0 / (9 * in_channels) as f32).sqrt();
+                let hidden = config.modulation_hidden;
+                let modulated = OFFSET_CHANNELS * in_channels + OFFSET_CHANNELS;
+                let adjustable = config.adjustable_layers.contains(&index).then(|| Adjustable {
+                    offset_weight: tensor(OFFSET_CHANNELS * in_channels * 9, 4.0 * scale),
+                    offset_bias: tensor(OFFSET_CHANNELS, 1.0),
+                    modulation: [(1, hidden), (hidden, hidden), (hidden, modulated)].map(|(inputs, outputs)| Dense {
+                        inputs,
+                        weight: tensor(inputs * outputs, (1.0 / inputs as f32).sqrt()),
+                        bias: tensor(outputs, 0.1),
+                    }),
+                });
+                Layer {
+                    out_channels,
+                    in_channels,
+                    weight: tensor(out_channels * in_channels * 9, scale),
+                    bias: tensor(out_channels, 0.1),
+                    adjustable,
+                }
+            })
+            .collect();
+        Weights { config, layers, metrics: serde_json::Value::Null, provenance: serde_json::Value::Null }
+    }
+
+    /// The tensors of `weights` under the names and shapes of the file format.
+    fn tensors(weights: &Weights) -> Vec<(String, Vec<usize>, Vec<f32>)> {
+        let mut tensors = Vec::new();
+        for (index, layer) in weights.layers.iter().enumerate() {
+            let Layer { out_channels, in_channels, weight, bias, adjustable } = layer;
+            let mut add = |name: &str, shape: Vec<usize>, values: &Vec<f32>| {
+                tensors.push((format!("layers.{index}.{name}"), shape, values.clone()));
+            };
+            add("weight", vec![*out_channels, *in_channels, 3, 3], weight);
+            add("bias", vec![*out_channels], bias);
+            if let Some(Adjustable { offset_weight, offset_bias, modulation }) = adjustable {
+                add("offset.weight", vec![18, *in_channels, 3, 3], offset_weight);
+                add("offset.bias", vec![18], offset_bias);
+                for (step, Dense { inputs, weight, bias }) in modulation.iter().enumerate() {
+                    add(&format!("modulation.{step}.weight"), vec![bias.len(), *inputs], weight);
+                    add(&format!("modulation.{step}.bias"), vec![bias.len()], bias);
+                }
+            }
+        }
+        tensors
+    }
+
+    type Tensors = Vec<(String, Vec<usize>, Vec<f32>)>;
+    type Entries = HashMap<String, String>;
+
+    pub(crate) fn config() -> NetworkConfig {
+        let optics = TrainedOptics::of(&DisplayGeometry::DEFAULT);
+        NetworkConfig {
+            architecture: "direct".into(),
+            version: 1,
+            grid: Grid::HalfBand,
+            layers: 4,
+            channels: 5,
+            adjustable_layers: vec![2],
+            modulation_hidden: 3,
+            leaky_slope: 0.1,
+            optics,
+            pupil_range_mm: [1.0, 5.0],
+            amplitude_constant: 1.4,
+        }
+    }
+
+    /// A file with small random weights, after `change` has changed it.
+    fn file(change: impl FnOnce(&mut Tensors, &mut Entries)) -> Vec<u8> {
+        let weights = random_weights(config(), 1);
+        let mut tensors = tensors(&weights);
+        let mut entries = Entries::from([
+            ("format".into(), FORMAT.into()),
+            ("config".into(), serde_json::to_string(&weights.config).unwrap()),
+            ("metrics".into(), r#"{"psnr_db": 29.0}"#.into()),
+        ]);
+        change(&mut tensors, &mut entries);
+        let bytes: Vec<(String, Vec<usize>, Vec<u8>)> = tensors
+            .into_iter()
+            .map(|(name, shape, values)| (name, shape, values.into_iter().flat_map(f32::to_le_bytes).collect()))
+            .collect();
+        let views =
+            bytes.iter().map(|(name, shape, bytes)| (name, TensorView::new(Dtype::F32, shape.clone(), bytes).unwrap()));
+        safetensors::serialize(views, Some(entries)).unwrap()
+    }
+
+    fn error_of(change: impl FnOnce(&mut Tensors, &mut Entries)) -> String {
+        Weights::from_bytes(&file(change), "test.safetensors").unwrap_err().to_string()
+    }
+
+    fn assert_mentions(message: &str, parts: &[&str]) {
+        for part in parts {
+            assert!(message.contains(part), "`{part}` is not in: {message}");
+        }
+    }
+
+    #[test]
+    fn a_file_round_trips() {
+        let weights = Weights::from_bytes(&file(|_, _| {}), "test").unwrap();
+        let expected = random_weights(config(), 1);
+        assert_eq!((&weights.config, &weights.layers), (&expected.config, &expected.layers));
+        assert_eq!(weights.metrics()["psnr_db"], 29.0);
+        assert!(weights.provenance().is_null());
+
+        let remarked = file(|_, entries| drop(entries.insert("metrics".into(), "{\"psnr_db\": NaN}".into())));
+        assert_eq!(Weights::from_bytes(&remarked, "test").unwrap().metrics(), "{\"psnr_db\": NaN}");
+    }
+
+    #[test]
+    fn the_built_in_weights_are_valid_and_fit_the_built_in_bench() {
+        let weights = Weights::builtin();
+        assert_eq!((weights.config().layers, weights.config().grid), (14, Grid::HalfBand));
+        weights.check_optics(&DisplayGeometry::DEFAULT).unwrap();
+    }
+
+    #[test]
+    fn faulty_tensors_are_named() {
+        let missing = error_of(|tensors, _| tensors.retain(|(name, ..)| name != "layers.2.offset.bias"));
+        assert_mentions(&missing, &["test.safetensors", "`layers.2.offset.bias`", "absent", "[18]"]);
+        let reshaped = error_of(|tensors, _| tensors[2].1 = vec![5, 5, 9, 1]);
+        assert_mentions(&reshaped, &["`layers.1.weight`", "[5, 5, 9, 1]", "[5, 5, 3, 3]"]);
+        let nan = error_of(|tensors, _| tensors[1].2[3] = f32::NAN);
+        assert_mentions(&nan, &["`layers.0.bias`", "NaN at index 3", "finite"]);
+    }
+
+    #[test]
+    fn faulty_metadata_is_named() {
+        let set = |key: &'static str, value: &'static str| {
+            error_of(move |_, entries| drop(entries.insert(key.into(), value.into())))
+        };
+        assert_mentions(&set("format", "holod-weights-9"), &["`format`", "holod-weights-9", "holod-weights-1"]);
+        assert_mentions(&error_of(|_, entries| entries.clear()), &["`format`", "absent"]);
+        assert_mentions(&set("config", "{}"), &["`config`", "missing field"]);
+        let configured = |change: fn(&mut NetworkConfig)| {
+            error_of(move |_, entries| {
+                let mut changed = config();
+                change(&mut changed);
+                entries.insert("config".into(), serde_json::to_string(&changed).unwrap());
+            })
+        };
+        assert_mentions(
+            &configured(|c| c.architecture = "layered".into()),
+            &["config.architecture", "layered", "direct"],
+        );
+        assert_mentions(&configured(|c| c.version = 7), &["config.version", "7"]);
+        assert_mentions(&configured(|c| c.layers = 5), &["config.layers", "5", "even"]);
+        assert_mentions(&configured(|c| c.channels = 100_000), &["config.channels", "100000"]);
+        assert_mentions(&configured(|c| c.adjustable_layers = vec![3]), &["config.adjustable_layers", "[3]"]);
+        assert_mentions(&configured(|c| c.pupil_range_mm = [5.0, 1.0]), &["config.pupil_range_mm"]);
+        assert_mentions(&configured(|c| c.amplitude_constant = 0.0), &["config.amplitude_constant"]);
+        assert_mentions(&configured(|c| c.optics.wavelengths_nm[1] = -1.0), &["config.optics", "-1"]);
+    }
+
+    #[test]
+    fn truncated_and_foreign_files_are_refused() {
+        let whole = file(|_, _| {});
+        for length in [0, 4, 9, whole.len() / 2, whole.len() - 1] {
+            assert!(
+                matches!(Weights::from_bytes(&whole[..length], "test"), Err(WeightsError::Damaged { .. })),
+                "{length}"
+            );
+        }
+        let folder = tempfile::tempdir().unwrap();
+        assert!(matches!(Weights::load(folder.path()), Err(WeightsError::NotAFile { .. })));
+        assert!(matches!(Weights::load(&folder.path().join("absent")), Err(WeightsError::Read { .. })));
+    }
+
+    #[test]
+    fn every_difference_in_optics_is_listed() {
+        let weights = random_weights(config(), 1);
+        let mut bench = DisplayGeometry::DEFAULT;
+        weights.check_optics(&bench).unwrap();
+        bench.pixel_pitch.0 = 6.4e-6;
+        bench.wavelengths.0[2].0 = 455e-9;
+        let mismatch = weights.check_optics(&bench).unwrap_err();
+        let names: Vec<_> = mismatch.differences.iter().map(|difference| difference.name).collect();
+        assert_eq!(names, ["wavelengths_nm.blue", "pixel_pitch_um"]);
+        assert_mentions(&mismatch.to_string(), &["450.0", "455.0", "8.0", "6.4", "allow"]);
+    }
+}

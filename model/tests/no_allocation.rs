@@ -1,0 +1,58 @@
+//! A running frame loop must not allocate: counts every allocation of the process while frames are rendered.
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use holod_calibration::{PupilDiameter, Resolution};
+use holod_model::optics::DoublePhase;
+use holod_model::{ComplexHologram, CpuEngine, PhasePattern, RgbdFrame, Weights};
+
+struct Counting;
+
+static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
+
+// SAFETY: every call is passed on to the system's allocator as it is.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
+        // SAFETY: the caller's promises are passed on.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller's promises are passed on.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+#[test]
+fn frames_do_not_allocate() {
+    let resolution = Resolution { width: 30, height: 21 };
+    let weights = Weights::builtin();
+    let mut engine = CpuEngine::new(&weights, resolution, 2).unwrap();
+    let mut double_phase = DoublePhase::new(resolution, weights.config().amplitude_constant).with_blur(0.7);
+    let frame = RgbdFrame {
+        resolution,
+        amplitude: vec![0.5; 3 * resolution.pixels()],
+        depth_normalised: vec![0.5; resolution.pixels()],
+    };
+    let (mut hologram, mut pattern) = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
+    let mut frames = |count: usize| {
+        for index in 0..count {
+            // The pupil changes with every frame, so the modulation is computed anew.
+            let pupil = PupilDiameter::from_mm(2.0 + index as f32 / count as f32);
+            engine.render(&frame, pupil, &mut hologram).unwrap();
+            double_phase.encode(&hologram, &mut pattern);
+        }
+    };
+    frames(3);
+    let before = ALLOCATIONS.load(Ordering::Relaxed);
+    frames(200);
+    assert_eq!(ALLOCATIONS.load(Ordering::Relaxed) - before, 0);
+
+    drop(std::hint::black_box(Box::new(1)));
+    assert!(ALLOCATIONS.load(Ordering::Relaxed) > before, "the counter counts");
+}
