@@ -58,6 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--initial-weights", help="start from a weights file instead of random numbers")
     defaults, loss = TrainConfig("", "", 0), LossWeights()
     train.add_argument("--crop", type=int, default=defaults.crop)
+    train.add_argument("--border-px", type=int, default=defaults.border_px, help="left out of the loss on every side")
     train.add_argument("--batch", type=int, default=defaults.batch, help="crops per process and step")
     train.add_argument("--learning-rate", type=float, default=defaults.learning_rate)
     train.add_argument("--warm-up-steps", type=int, default=defaults.warm_up_steps)
@@ -146,6 +147,7 @@ def _train(options: argparse.Namespace) -> None:
             coc_floor_px=options.coc_floor_px,
         ),
         crop=options.crop,
+        border_px=options.border_px,
         batch=options.batch,
         learning_rate=options.learning_rate,
         warm_up_steps=options.warm_up_steps,

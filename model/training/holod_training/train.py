@@ -51,6 +51,7 @@ class TrainConfig:
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     crop: int = 160
     border_px: int = 24
+    validation_border_px: int = 24
     batch: int = 1
     learning_rate: float = 2e-3
     final_rate_share: float = 0.03
@@ -180,7 +181,7 @@ class Run:
                 )[0]
                 picture = see(self.config.network, low, stack, stack.pupil_mm)
                 blur = coc_px(self.config.network.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
-                judged.append(judge(picture, stack.target, blur, self.config.border_px, with_ssim=False))
+                judged.append(judge(picture, stack.target, blur, self.config.validation_border_px, with_ssim=False))
             result[str(wanted)] = Judgement.mean(judged).known()
         return result
 

@@ -29,6 +29,7 @@ def tiny(shards: Path, out: Path, **changes: object) -> TrainConfig:
         network=TINY,
         crop=48,
         border_px=8,
+        validation_border_px=8,
         log_every=2,
         checkpoint_every=3,
         validate_every=6,
