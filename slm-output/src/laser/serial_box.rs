@@ -77,12 +77,12 @@ impl<S: Read + Write> SerialBox<S> {
         let mut answer = None;
         while answer.is_none() && clock() < t_end {
             this.read_lines(|line| {
-                // What a box or another device has sent before is no answer to us.
+                // What a box still had to say to an earlier host, a killed one say, is no answer to us.
                 let text = String::from_utf8_lossy(line).trim_end().to_owned();
                 let ours = format!("OK {number} {IDENTITY} ");
                 if let Some(name) = checked(line).and_then(|text| text.strip_prefix(&ours)) {
                     answer = Some(Ok(name == SIMULATED));
-                } else if !text.is_empty() && !["!", "OK ", "ERR 0 "].iter().any(|known| text.starts_with(known)) {
+                } else if !text.is_empty() && !["!", "OK ", "ERR "].iter().any(|known| text.starts_with(known)) {
                     answer.get_or_insert(Err(text));
                 }
             })?;
