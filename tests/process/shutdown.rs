@@ -69,7 +69,8 @@ fn a_killed_daemon_leaves_the_laser_box_dark_within_its_heartbeat_timeout() {
     let dark = wait_until(Duration::from_secs(2), || matches!(laser_box.events().last(), Some(BoxEvent::Dark { .. })));
     assert!(dark, "{:?}", laser_box.events().last());
     let Some(BoxEvent::Dark { t, reason }) = laser_box.events().last().copied() else { unreachable!() };
-    assert_eq!(reason, DarkReason::Heartbeat);
+    // The box sees that the panel's reports end before it misses the heartbeat: either makes it dark.
+    assert!(matches!(reason, DarkReason::Heartbeat | DarkReason::SyncLost), "{reason:?}");
     assert!(t - t_killed < TimeNs(130_000_000), "dark {} ms after the kill", (t - t_killed).seconds() * 1e3);
     laser_box.assert_dark();
 

@@ -83,6 +83,8 @@ fn text(path: &Path) -> &str {
 /// Judges what every run must show, and that nobody's laser was lit over another's field.
 fn judge(rows: &[FieldRow], summary: &serde_json::Value) {
     assert_eq!(frames::faults(rows, FIELD_ORDER), Vec::<String>::new());
+    let unlit = frames::unlit(rows);
+    assert!(unlit * 50 <= rows.len(), "{unlit} of {} fields were not lit: {summary:#}", rows.len());
     assert_eq!(summary["lasers"]["unsafe_findings"], 0, "{summary:#}");
     assert_eq!(summary["lasers_dark_at_end"], true);
     assert_eq!(summary["flat_at_end"], true);

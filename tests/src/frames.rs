@@ -76,8 +76,8 @@ fn row(cells: &HashMap<&str, &str>) -> Result<FieldRow, String> {
 
 /// What breaks the rules that hold for every record, empty for a good one.
 ///
-/// A lit field has one window that begins after the field appeared and ends before the next one does; no two windows
-/// overlap; the time points of a frame are in order; fields follow one another in the panel's order.
+/// A field has one window or none; the window begins after the field appeared and ends before the next one does; no two
+/// windows overlap; the time points of a frame are in order; fields follow one another in the panel's order.
 pub fn faults(rows: &[FieldRow], field_order: [&str; 3]) -> Vec<String> {
     let mut found = Vec::new();
     let mut last_off_ns = i64::MIN;
@@ -107,11 +107,21 @@ pub fn faults(rows: &[FieldRow], field_order: [&str; 3]) -> Vec<String> {
                 }
                 last_off_ns = off_ns;
             }
-            (None, None) => found.push(format!("{name}: no laser window")),
+            (None, None) => {}
             _ => found.push(format!("{name}: half a laser window")),
         }
     }
     found
+}
+
+/// Fields that were not lit, between the first and the last one that was: lasers arm at the beginning and are out
+/// before the end.
+pub fn unlit(rows: &[FieldRow]) -> usize {
+    let is_lit = |row: &FieldRow| row.laser_on_ns.is_some();
+    let (Some(first), Some(last)) = (rows.iter().position(is_lit), rows.iter().rposition(is_lit)) else {
+        return rows.len();
+    };
+    rows[first..=last].iter().filter(|row| !is_lit(row)).count()
 }
 
 #[cfg(test)]
@@ -148,10 +158,13 @@ mod tests {
     fn the_judge_objects_to_each_wrong_value() {
         const RGB: [&str; 3] = ["red", "green", "blue"];
         assert_eq!(faults(&good(), RGB), Vec::<String>::new());
-        let canaries: [fn(&mut FieldRow); 8] = [
+        assert_eq!(unlit(&good()), 0);
+        let mut rows = good();
+        (rows[2].laser_on_ns, rows[2].laser_off_ns) = (None, None);
+        assert_eq!(unlit(&rows), 1);
+        let canaries: [fn(&mut FieldRow); 7] = [
             |row| row.colour = "blue".into(),
             |row| row.laser_on_ns = None,
-            |row| (row.laser_on_ns, row.laser_off_ns) = (None, None),
             |row| row.laser_on_ns = Some(row.t_present_ns - 1),
             |row| row.laser_off_ns = Some(row.t_present_ns + 150),
             |row| row.t_present_ns += 100,

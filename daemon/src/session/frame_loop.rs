@@ -115,10 +115,6 @@ impl FrameLoop {
 
         let keep = if self.keep_levels && state != PupilState::Fallback { keep_slot(hologram_pupil) } else { None };
         let t_submit = host_now();
-        self.port.submit(&plan, keep, t_submit);
-        self.pacer.mark(Point::Submit, plan.frame_id, t_submit);
-        self.port.feed(&mut self.pacer, |_| ());
-
         // A full ring means that nobody records; the frame was shown all the same.
         let _ = self.records.push(LoopRecord {
             frame: FrameRecord {
@@ -137,6 +133,9 @@ impl FrameLoop {
             clipped_share: double_phase.clipped_share,
             unreachable_share: levels.unreachable_share.0.into_iter().fold(0.0, f32::max),
         });
+        self.port.submit(&plan, keep, t_submit);
+        self.pacer.mark(Point::Submit, plan.frame_id, t_submit);
+        self.port.feed(&mut self.pacer, |_| ());
     }
 
     fn mark(&mut self, point: Point, plan: FramePlan) -> TimeNs {

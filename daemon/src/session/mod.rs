@@ -222,6 +222,7 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
     let mut watch = Watch {
         records,
         events: output.events,
+        fields_over: Vec::new(),
         box_events: output.box_events,
         tap,
         tracker,
@@ -301,6 +302,7 @@ struct Limits {
 struct Watch<'a> {
     records: rtrb::Consumer<LoopRecord>,
     events: rtrb::Consumer<FieldEvent>,
+    fields_over: Vec<FieldEvent>,
     box_events: rtrb::Consumer<BoxEvent>,
     tap: DecisionTap,
     tracker: TrackerControl,
@@ -351,7 +353,13 @@ impl Watch<'_> {
     }
 
     /// Takes note of everything that the other threads have said.
+    ///
+    /// A frame's record is written before the frame is submitted, so the records of all fields that are taken first are
+    /// there when records are taken next.
     fn drain(&mut self) -> Result<(), Failure> {
+        while let Ok(event) = self.events.pop() {
+            self.fields_over.push(event);
+        }
         while let Ok(record) = self.records.pop() {
             self.tally.frame(&record);
             self.observer.frame(&record.frame)?;
@@ -362,7 +370,7 @@ impl Watch<'_> {
                 self.tell_dark(t, reason);
             }
         }
-        while let Ok(event) = self.events.pop() {
+        for event in self.fields_over.drain(..) {
             self.tally.field(&event);
             self.observer.field(&event)?;
         }
