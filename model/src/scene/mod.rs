@@ -166,7 +166,7 @@ impl Scene {
         }
 
         let target = resolution.unwrap_or(colour.size);
-        let placement = Placement::new(colour.size, target, fit).ok_or_else(|| SceneError::TooLarge {
+        let placement = Placement::new(colour.size, target, fit).ok_or(SceneError::TooLarge {
             path: colour_path,
             found: colour.size,
             wanted: target,
