@@ -30,7 +30,7 @@ static ALLOCATOR: Counting = Counting;
 
 #[test]
 fn frames_do_not_allocate() {
-    let resolution = Resolution { width: 30, height: 21 };
+    let resolution = Resolution { width: 10, height: 7 };
     let weights = Weights::builtin();
     let mut engine = CpuEngine::new(&weights, resolution, 2).unwrap();
     let mut double_phase = DoublePhase::new(resolution, weights.config().amplitude_constant).with_blur(0.7);
@@ -50,7 +50,7 @@ fn frames_do_not_allocate() {
     };
     frames(3);
     let before = ALLOCATIONS.load(Ordering::Relaxed);
-    frames(200);
+    frames(130);
     assert_eq!(ALLOCATIONS.load(Ordering::Relaxed) - before, 0);
 
     drop(std::hint::black_box(Box::new(1)));
