@@ -62,8 +62,8 @@ fn the_example_rig_says_what_its_comments_say() {
     let rig = Rig::load(Path::new(EXAMPLE)).unwrap();
     assert_eq!(rig.name, "lab bench 1");
     assert_eq!(rig.resolution(), Resolution { width: 1920, height: 1080 });
-    assert!((rig.pixel_pitch().0 - 6.4e-6).abs() < 1e-15);
-    assert_eq!(rig.provenance.panel_profile, Some("holoeye-leto"));
+    assert!((rig.pixel_pitch().0 - 8e-6).abs() < 1e-15);
+    assert_eq!(rig.provenance.panel_profile, Some("holoeye-pluto"));
     assert_eq!((rig.panel.mode, rig.panel.phase_sign), (PanelMode::ChannelPacked, PhaseSign::Positive));
     assert_eq!(rig.panel.stroke_rad, PerColour([TAU * 255.0 / 256.0; 3]));
     assert_eq!((rig.panel.settle, rig.panel.field_period()), (TimeNs(2_000_000), TimeNs(5_555_556)));
@@ -71,16 +71,16 @@ fn the_example_rig_says_what_its_comments_say() {
     assert_eq!(rig.lasers.driver, LaserDriver::Serial { path: "/dev/holod-lasers".into() });
     assert_eq!(rig.lasers.power_mw, PerColour([1.2, 0.8, 1.0]));
     assert_eq!(rig.tracker.spec.as_deref(), Some("serial:/dev/holod-tracker"));
-    assert!(rig.model.allow_optics_mismatch);
+    assert!(!rig.model.allow_optics_mismatch);
 
     let meaning = rig.meaning();
-    assert!((meaning.pixel_angle_mrad - 0.16).abs() < 1e-12);
+    assert!((meaning.pixel_angle_mrad - 0.2).abs() < 1e-12);
     assert!((meaning.u_near_mm - 4.571).abs() < 1e-3 && meaning.u_far_mm == 0.0 && meaning.depth_far_m.is_none());
-    assert!((meaning.eyebox_mm.blue - 2.8125).abs() < 1e-9);
-    assert!((meaning.blurs[0].largest_blur_px - 2.0 / 0.35 / 0.16).abs() < 1e-3);
+    assert!((meaning.eyebox_mm.blue - 2.25).abs() < 1e-9);
+    assert!((meaning.blurs[0].largest_blur_px - 2.0 / 0.35 / 0.2).abs() < 1e-3);
     assert!((meaning.field.laser_on_ms - 2.1).abs() < 1e-9 && (meaning.field.laser_off_ms - 5.1).abs() < 1e-9);
     assert!(meaning.files.is_empty());
-    assert!(meaning.notes.iter().any(|note| note.contains("other optics")), "{:?}", meaning.notes);
+    assert!(!meaning.notes.iter().any(|note| note.contains("other optics")), "{:?}", meaning.notes);
 }
 
 #[test]
@@ -92,7 +92,7 @@ fn the_example_comments_name_every_profile_and_its_own_figures() {
     let spelled_out = ["width_px", "height_px", "pixel_pitch_um", "refresh_hz", "bit_depth"]
         .iter()
         .fold(text.clone(), |text, key| text.replace(&format!("# {key} = "), &format!("{key} = ")))
-        .replace("profile = \"holoeye-leto\"", "");
+        .replace("profile = \"holoeye-pluto\"", "");
     let explicit = Rig::parse(&spelled_out, Path::new(EXAMPLE)).unwrap();
     let by_profile = Rig::load(Path::new(EXAMPLE)).unwrap();
     assert_eq!(Rig { provenance: by_profile.provenance.clone(), ..explicit }, by_profile);

@@ -10,6 +10,8 @@ mod glyphs;
 mod random;
 pub mod shard;
 mod surface;
+#[cfg(test)]
+mod tests;
 mod texture;
 mod thin_lens;
 

@@ -99,7 +99,7 @@ pub enum ShardError {
         source: io::Error,
     },
     /// A file could not be read.
-    #[error("cannot read {}: {source}", path.display())]
+    #[error("cannot read {}: {source}; choose another folder with --out", path.display())]
     Read {
         /// The file.
         path: PathBuf,
