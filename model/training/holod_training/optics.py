@@ -103,11 +103,18 @@ def _kept_bins(size: int, device: torch.device) -> tuple[Tensor, Tensor]:
 class Eye:
     """What a simulated eye sees of a field on the full grid: 4f stop, pupil, propagation, intensity."""
 
-    def __init__(self, optics: OpticsConfig, height: int, width: int, focus_dpt: list[float]) -> None:
+    def __init__(
+        self,
+        optics: OpticsConfig,
+        height: int,
+        width: int,
+        focus_dpt: list[float],
+        device: torch.device | str = "cpu",
+    ) -> None:
         self.optics = optics
-        self.fy = frequencies(height, optics.pitch_m)
-        self.fx = frequencies(width, optics.pitch_m)
-        self.stop = half_band_mask(height, width)
+        self.fy = frequencies(height, optics.pitch_m, device)
+        self.fx = frequencies(width, optics.pitch_m, device)
+        self.stop = half_band_mask(height, width, device)
         self.transfer = transfer(optics, self.fx, self.fy, [optics.distance_m(d) for d in focus_dpt])
 
     def look(self, field: Tensor, pupil_mm: float) -> Tensor:

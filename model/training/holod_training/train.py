@@ -82,8 +82,8 @@ def half_band_eye(
 
 
 @cache
-def full_eye(optics: OpticsConfig, height: int, width: int, focus_dpt: tuple[float, ...]) -> Eye:
-    return Eye(optics, height, width, list(focus_dpt))
+def full_eye(optics: OpticsConfig, height: int, width: int, focus_dpt: tuple[float, ...], device: str) -> Eye:
+    return Eye(optics, height, width, list(focus_dpt), device)
 
 
 def see(config: NetworkConfig, field_: Tensor, stack: Stack, pupil_mm: float) -> Tensor:
@@ -92,7 +92,7 @@ def see(config: NetworkConfig, field_: Tensor, stack: Stack, pupil_mm: float) ->
     if config.grid == "half-band":
         eye = half_band_eye(config.optics, height, width, stack.focus_dpt, str(field_.device))
         return eye.look(field_, pupil_mm)
-    return full_eye(config.optics, height, width, stack.focus_dpt).look(field_, pupil_mm)
+    return full_eye(config.optics, height, width, stack.focus_dpt, str(field_.device)).look(field_, pupil_mm)
 
 
 class Run:

@@ -7,18 +7,20 @@ from safetensors.torch import load_file
 from holod_training.golden import write_golden
 
 COMMITTED = Path(__file__).parents[2] / "golden"
+SHIPPED = Path(__file__).parents[2] / "weights" / "direct-halfband-14.safetensors"
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("golden")
-    write_golden(out, None)
+    write_golden(out, SHIPPED)
     return out
 
 
-@pytest.mark.parametrize("name", ["direct-narrow", "direct-narrow-full"])
+@pytest.mark.parametrize("name", ["direct-narrow", "direct-narrow-full", "direct-shipped"])
 def test_committed_vectors_are_what_the_script_writes(name: str, written: Path) -> None:
-    for file in (f"{name}.safetensors", f"{name}.weights.safetensors"):
+    files = [f"{name}.safetensors"] + ([f"{name}.weights.safetensors"] if name != "direct-shipped" else [])
+    for file in files:
         ours, committed = load_file(written / file), load_file(COMMITTED / file)
         assert ours.keys() == committed.keys()
         for key, value in ours.items():

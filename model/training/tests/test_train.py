@@ -63,6 +63,11 @@ def test_a_run_learns_and_leaves_its_folder(shards: Path, tmp_path: Path) -> Non
     assert metadata["metrics"]["validation_before_double_phase"]["2.0"]["psnr_db"] > 10
 
 
+def test_the_full_grid_trains_too(shards: Path, tmp_path: Path) -> None:
+    config = tiny(shards, tmp_path / "run", steps=2, network=dataclasses.replace(TINY, grid="full"))
+    assert read_metadata(train(config, CPU))["config"].grid == "full"
+
+
 def test_resume_is_bit_exact(shards: Path, tmp_path: Path) -> None:
     whole = load_file(train(tiny(shards, tmp_path / "whole"), CPU))
 
