@@ -176,10 +176,7 @@ impl PanelEncoder {
     }
 
     /// Encodes one colour's pattern into `field`, as [`Self::encode`]; returns the share of pixels out of reach.
-    ///
-    /// # Panics
-    /// As [`Self::encode`].
-    pub fn encode_colour(&self, colour: Colour, phase_rad: &[f32], field: &mut FieldMut<'_>) -> f32 {
+    fn encode_colour(&self, colour: Colour, phase_rad: &[f32], field: &mut FieldMut<'_>) -> f32 {
         assert_eq!(phase_rad.len(), self.pattern.pixels(), "a pattern has one phase for each pixel");
         assert_eq!(field.resolution(), self.panel, "a frame has the panel's size");
         let encoder = &self.colours[colour.index()];

@@ -268,6 +268,8 @@ impl Output {
             Err(why) => {
                 shared.stop.store(true, Ordering::Release);
                 laser.thread().unpark();
+                // A panic over there has been reported by the panic hook.
+                let _ended = laser.join();
                 return Err(why.into());
             }
         };
@@ -371,8 +373,8 @@ impl OutputControl {
         self.switch.shared.counts()
     }
 
-    /// Ends the output in order: lasers dark and acknowledged, flat pattern on the panel, threads joined. The wait for
-    /// each is bounded; a box that does not answer is left to its heartbeat timeout.
+    /// Ends the output in order: lasers dark and acknowledged, flat pattern on the panel, threads joined. The waits for
+    /// darkness and for the flat pattern are bounded; a box that does not answer is left to its heartbeat timeout.
     pub fn shutdown(mut self) -> ShutdownReport {
         self.end()
     }
