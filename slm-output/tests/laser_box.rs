@@ -52,13 +52,12 @@ impl BoxProcess {
 
     /// Waits until the box's log ends with darkness, and reads it.
     fn dark_log(&self) -> Vec<BoxEvent> {
-        loop {
-            let events = read_log(&fs::read_to_string(&self.log).unwrap()).unwrap();
-            if matches!(events.last(), Some(BoxEvent::Dark { .. })) {
-                return events;
-            }
-            std::thread::sleep(Duration::from_millis(5));
-        }
+        let mut events = Vec::new();
+        eventually("darkness", || {
+            events = read_log(&fs::read_to_string(&self.log).unwrap()).unwrap();
+            matches!(events.last(), Some(BoxEvent::Dark { .. }))
+        });
+        events
     }
 }
 
@@ -67,6 +66,15 @@ impl Drop for BoxProcess {
         // Its standard input ends, and so does it.
         drop(self.process.stdin.take());
         self.process.wait().unwrap();
+    }
+}
+
+/// Waits until `holds`, for as long as a slow machine may need.
+fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
+    let t_end = monotonic_now() + TimeNs(30_000 * MS);
+    while !holds() {
+        assert!(monotonic_now() < t_end, "never came: {what}");
+        std::thread::sleep(Duration::from_millis(5));
     }
 }
 
@@ -201,13 +209,13 @@ fn real_lasers_stay_dark_over_a_virtual_panel() {
     let plan = Pacer::new(pacing_config(&rig, TimeNs(MS)).unwrap(), monotonic_now()).predict(monotonic_now());
     output.frames.submit(&plan, None, monotonic_now());
     let mut dark = 0;
-    while dark < 20 {
+    eventually("twenty dark fields", || {
         while let Ok(field) = output.events.pop() {
             assert_eq!((field.laser_on, field.dark), (None, Some(DarkReason::Untrusted)));
             dark += 1;
         }
-        std::thread::sleep(Duration::from_millis(5));
-    }
+        dark >= 20
+    });
     output.control.shutdown();
     assert!(output.box_events.pop().is_err(), "never armed");
     served.join().unwrap();
@@ -280,14 +288,15 @@ fn a_damaged_line_makes_the_box_dark_and_the_host_hears_of_it() {
     host.heartbeat(monotonic_now()).unwrap();
     wire.store(SOUND, Ordering::Relaxed);
     let mut dark = None;
-    while dark.is_none() {
+    eventually("the box's word", || {
         // The unanswered heartbeat may become an error first; the box's own word comes all the same.
         let _unanswered = host.poll(monotonic_now(), &mut |event| {
             if let BoxEvent::Dark { reason, .. } = event {
                 dark = Some(reason);
             }
         });
-    }
+        dark.is_some()
+    });
     assert!(matches!(dark, Some(DarkReason::BoxFault | DarkReason::SyncLost)), "{dark:?}");
     drop(host);
     let log = String::from_utf8(served.join().unwrap()).unwrap();

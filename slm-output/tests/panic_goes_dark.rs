@@ -23,12 +23,15 @@ fn a_panic_in_any_thread_goes_dark_for_good() {
         frames.submit(&pacer.predict(monotonic_now()), None, monotonic_now());
         std::thread::sleep(Duration::from_millis(20));
     };
+    let t_end = monotonic_now() + TimeNs(30_000_000_000);
     while !output.control.counts().armed {
+        assert!(monotonic_now() < t_end, "never armed");
         show(&mut output.frames);
     }
     assert!(!switch.is_dark());
     assert!(std::thread::spawn(|| panic!("meant")).join().is_err());
     while !switch.is_dark() {
+        assert!(monotonic_now() < t_end, "never dark");
         std::thread::sleep(Duration::from_millis(1));
     }
     for _ in 0..5 {
