@@ -99,8 +99,13 @@ pub struct RunArgs {
     /// The rig.
     #[command(flatten)]
     pub rig: RigArgs,
-    /// Eye tracker: /dev/ttyUSB0, serial:PATH[,baud=N], replay:FILE[,speed=X][,loop], FILE, or mock[:SCENARIO].
-    #[arg(long, value_name = "SPEC")]
+    /// The eye tracker's spec.
+    #[arg(
+        long,
+        value_name = "SPEC",
+        help = "Eye tracker: /dev/ttyUSB0, serial:PATH[,baud=N], replay:FILE[,speed=X|max][,loop], a log FILE, or \
+                mock[:SCENARIO]"
+    )]
     pub tracker: Option<String>,
     /// The scene.
     #[command(flatten)]
