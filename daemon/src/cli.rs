@@ -36,7 +36,7 @@ pub enum Command {
     Check(CheckArgs),
     /// Measure the median time of each stage, beside the machine's arithmetic peak.
     Bench(BenchArgs),
-    /// Put the lasers out and a flat pattern on the panel (for a service's ExecStopPost).
+    /// Put the lasers out (for a service's ExecStopPost).
     #[command(hide = true)]
     Dark(DarkArgs),
 }

@@ -66,8 +66,8 @@ pub struct FrameLog {
     frames: HashMap<u64, FrameRecord>,
 }
 
-/// Presented frames remembered for fields that are still to be shown.
-const KEPT_FRAMES: u64 = 64;
+/// Frames remembered for fields that are still to be shown: more than can wait for a control thread that is late.
+const KEPT_FRAMES: u64 = 2048;
 
 impl FrameLog {
     /// Starts `frames.csv` in `folder`, which is created; a record that is already there is never overwritten.
@@ -137,6 +137,17 @@ impl FrameLog {
     /// The disk's, with the file's name.
     pub fn flush(&mut self) -> Result<(), Failure> {
         self.file.flush().map_err(|error| self.lost(&error))
+    }
+
+    /// Takes the file away again where no frame was ever made, so that the same directory may be named again.
+    pub fn discard_if_empty(self) {
+        if self.frames.is_empty() {
+            let _gone = fs::remove_file(&self.path);
+            if let Some(folder) = self.path.parent() {
+                // Fails where something else is in it, which then stays.
+                let _gone = fs::remove_dir(folder);
+            }
+        }
     }
 
     fn lost(&self, error: &std::io::Error) -> Failure {

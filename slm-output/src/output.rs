@@ -439,6 +439,11 @@ impl DarkSwitch {
         self.laser.unpark();
     }
 
+    /// Why the lasers are dark for good, if they are.
+    pub fn reason(&self) -> Option<DarkReason> {
+        self.shared.latched()
+    }
+
     /// Whether the box has acknowledged.
     pub fn is_dark(&self) -> bool {
         self.shared.acknowledged.load(Ordering::Acquire) == DARK

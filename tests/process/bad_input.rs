@@ -106,6 +106,12 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
         Case { args: &["--tracker", "/dev/nothing-here"], exit: 66, says: &["/dev/nothing-here", "does not exist"] },
         Case { args: &["--tracker", "directory"], exit: 66, says: &["directory"] },
         Case { args: &["--tracker", "log.csv"], exit: 65, says: &["log.csv", "when,how wide"] },
+        Case { args: &["--tracker", "log.csv", "--record", "record"], exit: 65, says: &["log.csv"] },
+        Case {
+            args: &["view", "--pupil", "3", "--focus", "1", "--out", "directory"],
+            exit: 73,
+            says: &["directory", "PNG"],
+        },
         Case { args: &["--tracker", "empty.csv"], exit: 65, says: &["empty.csv"] },
         Case { args: &["--tracker", "mock:nosuch"], exit: 64, says: &["nosuch", "light-steps"] },
         Case { args: &["--tracker", "hid:1234:5678"], exit: 64, says: &["hid"] },

@@ -3,7 +3,7 @@
 use std::io::Read;
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
-use std::thread;
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
@@ -11,6 +11,8 @@ use rustix::process::{Pid, Signal, kill_process};
 /// A running `holod`; killed when it is dropped.
 pub struct Daemon {
     child: Child,
+    stdout: Option<JoinHandle<String>>,
+    stderr: Option<JoinHandle<String>>,
 }
 
 /// How a `holod` ended.
@@ -30,7 +32,7 @@ impl Daemon {
     /// # Panics
     /// Where it cannot be started: the test has no subject.
     pub fn start(binary: &str, args: &[&str], folder: &Path) -> Self {
-        let child = Command::new(binary)
+        let mut child = Command::new(binary)
             .args(args)
             .current_dir(folder)
             .stdin(Stdio::null())
@@ -38,7 +40,9 @@ impl Daemon {
             .stderr(Stdio::piped())
             .spawn()
             .expect("holod starts");
-        Self { child }
+        let stdout = child.stdout.take().map(read_to_end);
+        let stderr = child.stderr.take().map(read_to_end);
+        Self { child, stdout, stderr }
     }
 
     /// Sends a signal.
@@ -57,15 +61,6 @@ impl Daemon {
     /// # Panics
     /// Where it has not ended within `patience`.
     pub fn wait(mut self, patience: Duration) -> Ended {
-        let read = |mut pipe: Box<dyn Read + Send>| {
-            thread::spawn(move || {
-                let mut bytes = Vec::new();
-                let _ = pipe.read_to_end(&mut bytes);
-                String::from_utf8_lossy(&bytes).into_owned()
-            })
-        };
-        let stdout = read(Box::new(self.child.stdout.take().expect("piped")));
-        let stderr = read(Box::new(self.child.stderr.take().expect("piped")));
         let began = Instant::now();
         while self.runs() {
             assert!(began.elapsed() < patience, "holod has not ended within {patience:?}");
@@ -74,10 +69,23 @@ impl Daemon {
         let status = self.child.wait().expect("a child that ended has a status");
         Ended {
             status,
-            stdout: stdout.join().expect("the reader ends with the pipe"),
-            stderr: stderr.join().expect("the reader ends with the pipe"),
+            stdout: self.stdout.take().map(text_of).unwrap_or_default(),
+            stderr: self.stderr.take().map(text_of).unwrap_or_default(),
         }
     }
+}
+
+/// Reads a pipe from the beginning on, so that a talkative child never waits for its reader.
+fn read_to_end(mut pipe: impl Read + Send + 'static) -> JoinHandle<String> {
+    thread::spawn(move || {
+        let mut bytes = Vec::new();
+        let _ = pipe.read_to_end(&mut bytes);
+        String::from_utf8_lossy(&bytes).into_owned()
+    })
+}
+
+fn text_of(reader: JoinHandle<String>) -> String {
+    reader.join().expect("the reader ends with the pipe")
 }
 
 impl Drop for Daemon {

@@ -90,6 +90,11 @@ pub fn faults(rows: &[FieldRow], field_order: [&str; 3]) -> Vec<String> {
         if row.colour != field_order[usize::from(row.field) % 3] {
             found.push(format!("{name}: field {} is not {} in the panel's order", row.field, row.colour));
         }
+        if let Some(next) = rows.get(index + 1)
+            && next.field != (row.field + 1) % 3
+        {
+            found.push(format!("{name}: field {} follows field {}", next.field, row.field));
+        }
         let next_ns = rows.get(index + 1).map_or(i64::MAX, |next| next.t_present_ns);
         if next_ns <= row.t_present_ns {
             found.push(format!("{name}: the next field is not later"));
@@ -171,6 +176,9 @@ mod tests {
             |row| row.t_submit_ns = 2_000,
             |row| row.t_wake_ns = 25,
         ];
+        let mut gap = good();
+        gap.remove(2);
+        assert!(!faults(&gap, RGB).is_empty(), "a field that is not there");
         for (number, canary) in canaries.iter().enumerate() {
             let mut rows = good();
             canary(&mut rows[1]);

@@ -35,7 +35,15 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         duration: args.duration,
         keep_levels: args.record.is_some(),
     };
-    let session = session::run(plan, &mut recorder)?;
+    let session = match session::run(plan, &mut recorder) {
+        Ok(session) => session,
+        Err(failure) => {
+            if let Some(log) = recorder.log {
+                log.discard_if_empty();
+            }
+            return Err(failure);
+        }
+    };
     if let (Some(log), Some(folder)) = (&mut recorder.log, &args.record) {
         log.flush()?;
         save(&session, folder)?;

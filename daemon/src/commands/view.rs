@@ -29,6 +29,12 @@ struct Report<'a> {
 }
 
 pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
+    if args.out.is_dir() {
+        return Err(Failure::new(
+            Exit::CannotCreate,
+            format!("--out {}: found a directory, expected the name of a PNG file to write", args.out.display()),
+        ));
+    }
     let rig = setup::rig(&args.rig)?;
     let hologram = match (&args.hologram, args.pupil) {
         (Some(folder), _) => load(folder)?,

@@ -1,7 +1,7 @@
 //! The frame thread: wake, ask for the pupil, compute the hologram, encode it, submit it.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use holod_calibration::{Colour, PerColour, PupilDiameter, TimeNs};
@@ -47,6 +47,8 @@ pub(super) struct FrameLoop {
     pub pattern: PhasePattern,
     /// To whoever records.
     pub records: rtrb::Producer<LoopRecord>,
+    /// Records that found no room.
+    pub records_lost: Arc<AtomicU64>,
     /// Whether presented levels are kept by pupil.
     pub keep_levels: bool,
     /// Frames to make; without end where absent.
@@ -115,8 +117,7 @@ impl FrameLoop {
 
         let keep = if self.keep_levels && state != PupilState::Fallback { keep_slot(hologram_pupil) } else { None };
         let t_submit = host_now();
-        // A full ring means that nobody records; the frame was shown all the same.
-        let _ = self.records.push(LoopRecord {
+        let record = LoopRecord {
             frame: FrameRecord {
                 frame: plan.frame_id,
                 t_sample: estimate.t_sample,
@@ -132,7 +133,11 @@ impl FrameLoop {
             },
             clipped_share: double_phase.clipped_share,
             unreachable_share: levels.unreachable_share.0.into_iter().fold(0.0, f32::max),
-        });
+        };
+        // A full ring means that nobody records; the frame is shown all the same.
+        if self.records.push(record).is_err() {
+            self.records_lost.fetch_add(1, Ordering::Relaxed);
+        }
         self.port.submit(&plan, keep, t_submit);
         self.pacer.mark(Point::Submit, plan.frame_id, t_submit);
         self.port.feed(&mut self.pacer, |_| ());

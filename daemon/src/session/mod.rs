@@ -9,14 +9,14 @@ mod stats;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{PupilDiameter, TimeNs};
 use holod_model::optics::{DoublePhase, PhasePattern};
-use holod_model::{ComplexHologram, Weights};
+use holod_model::{ComplexHologram, CpuEngine, Weights};
 use holod_pupil_input::{
     Decision, DecisionTap, Link, PupilState, ReplayError, Tracker, TrackerControl, TrackerError, TrackerSpec, host_now,
 };
@@ -149,10 +149,10 @@ const TICK: Duration = Duration::from_millis(10);
 const TICKS_PER_REPORT: u32 = 10;
 /// Frame records on their way to the control thread.
 const RECORDS: usize = 1024;
-/// Frame time that pacing supposes before it has seen one.
-const FIRST_FRAME_TIME: TimeNs = TimeNs(500_000_000);
-/// Lasers go dark when one frame has stayed on the panel for this long.
-const STALL_TIMEOUT: TimeNs = TimeNs(10_000_000_000);
+/// Lasers go dark when one frame has stayed on the panel for so many frame times, within these limits.
+const STALL_FRAMES: i64 = 6;
+const STALL_TIMEOUT_MIN: TimeNs = TimeNs(2_000_000_000);
+const STALL_TIMEOUT_MAX: TimeNs = TimeNs(10_000_000_000);
 /// How long the end of a run waits for its last frame to be shown.
 const LAST_FRAME_WAIT: TimeNs = TimeNs(1_000_000_000);
 
@@ -172,16 +172,20 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
     let signals = Signals::install()?;
     let resolution = plan.frames.resolution();
     let rig = &plan.rig;
-    let engine = scheduling::patient(|| setup::engine(plan.backend, &plan.weights, resolution))?;
+    let mut engine = scheduling::patient(|| setup::engine(plan.backend, &plan.weights, resolution))?;
+    let frame_time = first_frame_time(&mut engine, &plan)?;
     let encoder =
         PanelEncoder::new(&rig.panel, rig.resolution(), resolution).map_err(Failure::because(Exit::Config))?;
-    let pacing = pacing_config(rig, FIRST_FRAME_TIME).map_err(Failure::because(Exit::Config))?;
+    let pacing = pacing_config(rig, frame_time).map_err(Failure::because(Exit::Config))?;
     let t_origin = host_now();
     let (estimates, tap, tracker) =
         scheduling::prompt(|| Tracker::start(&plan.tracker, &rig.tracker, t_origin)).map_err(tracker_failure)?.split();
-    let options =
-        OutputOptions { keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 }, stall_timeout: STALL_TIMEOUT };
-    let output = Output::headless(rig, &encoder, options, host_now).map_err(Failure::because(Exit::Unavailable))?;
+    let options = OutputOptions {
+        keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 },
+        stall_timeout: stall_timeout(frame_time),
+    };
+    let output = scheduling::prompt(|| Output::headless(rig, &encoder, options, host_now))
+        .map_err(Failure::because(Exit::Unavailable))?;
     output.control.dark_switch().install_panic_hook(host_now);
 
     let stop = Arc::new(AtomicBool::new(false));
@@ -203,10 +207,12 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         hologram: ComplexHologram::dark(resolution),
         pattern: PhasePattern::flat(resolution),
         records: record_producer,
+        records_lost: Arc::new(AtomicU64::new(0)),
         keep_levels: plan.keep_levels,
         limit: plan.frame_limit,
         stop: Arc::clone(&stop),
     };
+    let records_lost = Arc::clone(&frame_loop.records_lost);
     let frame_thread = std::thread::Builder::new()
         .name("holod-frame".into())
         .spawn(move || frame_loop.run())
@@ -286,9 +292,23 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         lasers: tally.lasers.finish(),
         lasers_dark_at_end: down.lasers_dark,
         flat_at_end: down.flat_presented,
-        records_lost: down.counts.lost,
+        records_lost: down.counts.lost + records_lost.load(Ordering::Relaxed),
     };
     Ok(SessionReport { summary, t_origin, shown, encoder })
+}
+
+/// How long the network takes for a frame, measured before anything is shown.
+fn first_frame_time(engine: &mut CpuEngine, plan: &SessionPlan) -> Result<TimeNs, Failure> {
+    let scene = &plan.frames.frames[0];
+    let mut hologram = ComplexHologram::dark(scene.resolution);
+    let pupil = PupilDiameter::from_mm(plan.weights.config().pupil_range_mm[0]);
+    let began = host_now();
+    engine.render(scene, pupil, &mut hologram).map_err(Failure::because(Exit::Software))?;
+    Ok(host_now() - began)
+}
+
+fn stall_timeout(frame_time: TimeNs) -> TimeNs {
+    TimeNs(STALL_FRAMES * frame_time.0).clamp(STALL_TIMEOUT_MIN, STALL_TIMEOUT_MAX)
 }
 
 /// When a run is over.
@@ -337,11 +357,19 @@ impl Watch<'_> {
             if let Some(signal) = self.signals.caught() {
                 return Ok(signal.to_owned());
             }
-            if limits.duration.is_some_and(|duration| (now - limits.t_origin).0 >= duration.as_nanos() as i64) {
+            if limits.duration.is_some_and(|duration| {
+                (now - limits.t_origin).0 >= i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)
+            }) {
                 return Ok("the asked duration".to_owned());
             }
             if limits.replay_ends_run && self.tracker.finished() {
                 return Ok("the end of the pupil log".to_owned());
+            }
+            if output.dark_switch().reason() == Some(DarkReason::Panic) {
+                return Err(Failure::new(
+                    Exit::Software,
+                    "a thread failed (its message stands above); the lasers were put out first",
+                ));
             }
             if frame_thread.is_finished() {
                 let t_end = *t_give_up.get_or_insert(now + LAST_FRAME_WAIT);
@@ -406,8 +434,8 @@ impl Watch<'_> {
     }
 }
 
-/// Frames whose fields may still come.
-const REMEMBERED: usize = 64;
+/// Frames whose fields may still come: all that the ring of records can hold at once, and some more.
+const REMEMBERED: usize = RECORDS + 64;
 
 /// Running numbers of a run.
 #[derive(Default)]

@@ -145,6 +145,32 @@ mod tests {
     }
 
     #[test]
+    fn stop_and_pupil_cut_where_their_figures_say() {
+        // The pupil's edge (s/2)/(λf) for s = 1 mm, in cycles a pixel: red 0.157, green 0.192, blue 0.222.
+        let edges = [0.1567, 0.1923, 0.2222];
+        let centre = 36 * SIZE.width + 48;
+        let mut simulated = SimulatedEye::new(&BENCH, SIZE);
+        let mut seen = |pupil_mm, fx: f32, fy: f32, colour| {
+            let mut hologram = ComplexHologram::dark(SIZE);
+            for (index, value) in hologram.plane_mut(colour).iter_mut().enumerate() {
+                let (x, y) = ((index % SIZE.width) as f32, (index / SIZE.width) as f32);
+                *value = Complex32::cis(std::f32::consts::TAU * (fx * x + fy * y));
+            }
+            simulated.view_field(&hologram, eye(pupil_mm, 0.0)).plane(colour)[centre]
+        };
+        for (colour, edge) in Colour::ALL.into_iter().zip(edges) {
+            for (fx, fy) in [(1.0, 0.0), (0.0, -1.0), (0.6, 0.8)] {
+                let (inside, outside) = (edge - 0.025, edge + 0.025);
+                assert!(seen(1.0, inside * fx, inside * fy, colour) > 0.7, "{colour} {fx} {fy}");
+                assert!(seen(1.0, outside * fx, outside * fy, colour) < 0.1, "{colour} {fx} {fy}");
+            }
+            // A wide pupil leaves the square 4f stop, corners included.
+            assert!(seen(9.0, 0.225, 0.225, colour) > 0.7 && seen(9.0, -0.225, 0.0, colour) > 0.7, "{colour}");
+            assert!(seen(9.0, 0.275, 0.0, colour) < 0.1 && seen(9.0, 0.0, 0.275, colour) < 0.1, "{colour}");
+        }
+    }
+
+    #[test]
     fn light_is_weighted_by_colour() {
         let mut pattern = PhasePattern::flat(SIZE);
         DoublePhase::new(SIZE, 1.0).encode(&spot(0.0, 14.0), &mut pattern);

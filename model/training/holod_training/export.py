@@ -1,4 +1,4 @@
-"""Weights files: safetensors F32 with everything a reader must know in the metadata (DESIGN §6)."""
+"""Weights files: safetensors F32 with everything a reader must know in the metadata."""
 
 from __future__ import annotations
 

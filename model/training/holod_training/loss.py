@@ -1,4 +1,4 @@
-"""The training loss: the paper's two terms, a plain squared error and a squared focus error (DESIGN §5, the trap)."""
+"""The training loss: the paper's two terms, a plain squared error and a squared focus error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The numbers that judge a hologram (DESIGN §3): never PSNR alone."""
+"""The numbers that judge a hologram: never PSNR alone."""
 
 from __future__ import annotations
 

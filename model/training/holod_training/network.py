@@ -1,4 +1,4 @@
-"""The `direct` network of DESIGN §4: (amplitude, depth, pupil) to the complex field at the SLM plane."""
+"""The `direct` network: (amplitude, depth, pupil) to the complex field at the SLM plane."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class AdjustableLayer(nn.Module):
         outputs = 2 * TAPS
         first, second = nn.Linear(1, hidden), nn.Linear(hidden, hidden)
         last = nn.Linear(hidden, outputs * channels + outputs)
-        # A weaker start leaves the conditioning on the pupil asleep (DESIGN §5).
+        # A weaker start leaves the conditioning on the pupil asleep.
         nn.init.normal_(last.weight, std=0.5 / math.sqrt(hidden))
         nn.init.zeros_(last.bias)
         self.modulation = nn.ModuleList([first, second, last])

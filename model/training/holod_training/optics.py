@@ -1,6 +1,6 @@
-"""The bench in numbers: propagation, the half band, the eye, double phase (DESIGN §3).
+"""The bench in numbers: propagation, the half band, the eye, double phase.
 
-FFTs here are circular; a border is left out of losses and metrics instead of padding (DESIGN §5).
+FFTs here are circular; a border is left out of losses and metrics instead of padding.
 """
 
 from __future__ import annotations
