@@ -115,10 +115,26 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
                 ),
             ));
         }
+        warn_of_odd_depth(spec, &frame, &report, geometry);
         loaded.frames.push(frame);
         loaded.reports.push(report);
     }
     Ok(loaded)
+}
+
+/// Depth that is nearly all clamped, or all one, is most often a wrong encoding.
+fn warn_of_odd_depth(name: &str, frame: &RgbdFrame, report: &FrameReport, geometry: &DisplayGeometry) {
+    let pixels = frame.resolution.pixels();
+    let clamped = report.depth_clamped_far_px + report.depth_clamped_near_px;
+    let ends = frame.depth_normalised.iter().fold((f32::MAX, f32::MIN), |(a, b), &d| (a.min(d), b.max(d)));
+    let spread_dpt = geometry.depth_at(f64::from(ends.1)).0 - geometry.depth_at(f64::from(ends.0)).0;
+    if 2 * clamped > pixels {
+        tracing::warn!(
+            "{name}: {clamped} of {pixels} pixels lie outside the display's depth range: is the depth encoding right?"
+        );
+    } else if spread_dpt < 0.05 && pixels > 1 {
+        tracing::warn!("{name}: all depths lie within {spread_dpt:.3} dpt: is the depth encoding right?");
+    }
 }
 
 fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {

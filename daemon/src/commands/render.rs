@@ -27,6 +27,8 @@ struct Report {
     depth_clamped_near_px: usize,
     colour_clipped_px: usize,
     padded_px: usize,
+    depth_least_dpt: f64,
+    depth_greatest_dpt: f64,
     network_ms: f64,
     files: [&'static str; 5],
 }
@@ -51,15 +53,21 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
         return report::print_json(&report);
     }
     report::print(&format!(
-        "{}: hologram of {}x{} for a pupil of {} mm in {:.0} ms; {:.3} % of amplitudes clipped; {} pixels of missing \
-         depth filled\nin {}: {}",
+        "{}: hologram of {}x{} for a pupil of {} mm in {:.0} ms; {:.3} % of amplitudes clipped\n\
+         depth {:.2} to {:.2} dpt; pixels filled {}, clamped to the far end {}, to the near end {}, padded {}\n\
+         in {}: {}",
         report.scene,
         report.width_px,
         report.height_px,
         report.pupil_mm,
         report.network_ms,
         report.clipped_share * 100.0,
+        report.depth_least_dpt,
+        report.depth_greatest_dpt,
         report.depth_missing_px,
+        report.depth_clamped_far_px,
+        report.depth_clamped_near_px,
+        report.padded_px,
         args.out.display(),
         FILES.join(", ")
     ))
@@ -83,6 +91,10 @@ fn compute(
     let network_ms = began.elapsed().as_secs_f64() * 1e3;
     let amplitude_constant = weights.config().amplitude_constant;
     let done = &frames.reports[0];
+    let depths = &frames.frames[0].depth_normalised;
+    let depth_at = |start: f32, pick: fn(f32, f32) -> f32| {
+        rig.geometry.depth_at(f64::from(depths.iter().copied().fold(start, pick))).0
+    };
     let report = Report {
         scene: frames.name.clone(),
         pupil_mm: pupil.mm(),
@@ -95,6 +107,8 @@ fn compute(
         depth_clamped_near_px: done.depth_clamped_near_px,
         colour_clipped_px: done.colour_clipped_px,
         padded_px: done.padded_px,
+        depth_least_dpt: depth_at(f32::MAX, f32::min),
+        depth_greatest_dpt: depth_at(f32::MIN, f32::max),
         network_ms,
         files: FILES,
     };

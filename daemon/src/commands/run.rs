@@ -69,11 +69,12 @@ fn check_output(spec: &str) -> Result<(), Failure> {
 
 /// Writes `summary.json` and the levels that the panel showed.
 fn save(session: &SessionReport, folder: &Path) -> Result<(), Failure> {
+    report::save_json(&session.summary, &folder.join("summary.json"))?;
     for (pupil, levels) in &session.shown {
         let name = format!("shown_pupil_{:.2}mm_frame_{:06}.png", pupil.mm(), levels.tag().frame_id);
         report::save_png(&levels_picture(levels), &folder.join(name))?;
     }
-    report::save_json(&session.summary, &folder.join("summary.json"))
+    Ok(())
 }
 
 struct Recorder {

@@ -260,6 +260,9 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         ));
     }
 
+    if tally.frames_shown == 0 {
+        tracing::warn!("no frame was shown: the run ended before the first one was ready; give it longer");
+    }
     let mut shown: Vec<(PupilDiameter, LevelsFrame)> = down
         .kept
         .into_iter()
@@ -362,7 +365,7 @@ impl Watch<'_> {
             }) {
                 return Ok("the asked duration".to_owned());
             }
-            if limits.replay_ends_run && self.tracker.finished() {
+            if limits.replay_ends_run && self.tracker.finished() && self.tally.frames_shown > 0 {
                 return Ok("the end of the pupil log".to_owned());
             }
             if output.dark_switch().reason() == Some(DarkReason::Panic) {

@@ -5,7 +5,7 @@ use std::io::BufReader;
 use std::path::Path;
 
 use holod_calibration::Resolution;
-use image::{DynamicImage, ImageReader};
+use image::{DynamicImage, ImageFormat, ImageReader};
 
 use super::depth::DepthNumbers;
 use super::{SceneError, openexr};
@@ -98,9 +98,21 @@ fn decode(path: &Path) -> Result<DynamicImage, SceneError> {
         let reader = BufReader::new(File::open(path).map_err(read_error)?);
         ImageReader::new(reader).with_guessed_format().map_err(read_error)
     };
+    if open()?.format() == Some(ImageFormat::Jpeg) {
+        let bytes = std::fs::read(path).map_err(read_error)?;
+        if !jpeg_is_whole(&bytes) {
+            return Err(damaged("the JPEG data end before the end-of-image marker".into()));
+        }
+    }
     let (width, height) = open()?.into_dimensions().map_err(|error| damaged(error.to_string()))?;
     check_size(path, width as usize, height as usize)?;
     open()?.decode().map_err(|error| damaged(error.to_string()))
+}
+
+/// Whether an end-of-image marker stands behind the last start of a scan: the decoder fills what was cut off with grey.
+fn jpeg_is_whole(bytes: &[u8]) -> bool {
+    let last = |marker: [u8; 2]| bytes.windows(2).rposition(|pair| pair == marker);
+    last([0xff, 0xd9]) > last([0xff, 0xda])
 }
 
 /// Linear light of each colour; transparent pixels over black.

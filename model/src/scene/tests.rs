@@ -242,6 +242,21 @@ fn damaged_files_are_refused_and_never_half_read() {
 }
 
 #[test]
+fn a_jpeg_that_was_cut_short_is_refused() {
+    let files = Files::new();
+    files.colour8("c.png", 64, 64, |x, y| [(x * 3) as u8, (y * 3) as u8, (x * y) as u8]);
+    let path = files.path("c.jpg");
+    image::open(files.path("c.png")).unwrap().to_rgb8().save(&path).unwrap();
+    let whole = std::fs::read(&path).unwrap();
+    raster::read_colour(&path).unwrap();
+    for length in [whole.len() / 2, whole.len() - 40, whole.len() - 1] {
+        std::fs::write(&path, &whole[..length]).unwrap();
+        let error = raster::read_colour(&path).err().unwrap().to_string();
+        assert!(error.contains("c.jpg") && error.contains("end-of-image"), "{length}: {error}");
+    }
+}
+
+#[test]
 fn a_file_that_claims_a_huge_picture_is_refused_before_it_is_decoded() {
     let files = Files::new();
     files.colour8("c.png", 2, 2, |_, _| [0; 3]);

@@ -271,6 +271,9 @@ pub enum SequenceEvent {
     Restart,
 }
 
+/// A longer leap of the running number is a new count, not a loss: an hour at 1 kHz.
+const LONGEST_GAP: u64 = 3_600_000;
+
 impl SequenceTracker {
     /// A tracker that has seen no number.
     pub const fn new() -> Self {
@@ -286,6 +289,7 @@ impl SequenceTracker {
             None => SequenceEvent::Restart,
             Some(0) if eye == last_eye => SequenceEvent::Repeat,
             Some(0 | 1) => SequenceEvent::InOrder,
+            Some(step) if step > LONGEST_GAP => SequenceEvent::Restart,
             Some(step) => SequenceEvent::Gap(step - 1),
         }
     }

@@ -203,7 +203,7 @@ pub enum LaserError {
     },
     /// The box cannot be opened.
     #[error(
-        "{path}: {why}; expected the serial port of a laser box: check lasers.path, the cable and the port's permissions"
+        "{path}: {why}; expected the serial port of a laser box: check lasers.device, the cable and the port's permissions"
     )]
     Open {
         /// The port.
@@ -213,7 +213,7 @@ pub enum LaserError {
     },
     /// What answers is no laser box of this protocol.
     #[error(
-        "{path}: answered `{found}`; expected `{expected}`: check that lasers.path names the laser box and not another device"
+        "{path}: answered `{found}`; expected `{expected}`: check that lasers.device names the laser box and not another device"
     )]
     NotABox {
         /// The port.
