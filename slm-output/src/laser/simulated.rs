@@ -25,6 +25,9 @@ pub struct SimulatedLaser {
     program: Option<LaserProgram>,
     armed: Option<Armed>,
     lit: Option<LitWindow>,
+    /// The programmed on edge of the last window lit. It outlives darkness, so that a box that is armed again within a
+    /// field does not light that field a second time.
+    t_lit: Option<TimeNs>,
     queue: VecDeque<LitWindow>,
     events: VecDeque<BoxEvent>,
     events_lost: u64,
@@ -38,8 +41,6 @@ struct Armed {
     t_alive: TimeNs,
     /// Start of the last colour frame that was reported.
     t_sync: Option<TimeNs>,
-    /// The programmed on edge of the last window lit.
-    t_lit: Option<TimeNs>,
 }
 
 impl SimulatedLaser {
@@ -50,6 +51,7 @@ impl SimulatedLaser {
             program: None,
             armed: None,
             lit: None,
+            t_lit: None,
             queue: VecDeque::with_capacity(QUEUE_MAX),
             events: VecDeque::with_capacity(EVENTS_MAX),
             events_lost: 0,
@@ -88,9 +90,7 @@ impl SimulatedLaser {
                 Step::Dark(reason) => self.go_dark(reason, t),
                 Step::On(window, t_programmed) => {
                     self.switch_on(window);
-                    if let Some(armed) = &mut self.armed {
-                        armed.t_lit = Some(t_programmed);
-                    }
+                    self.t_lit = Some(t_programmed);
                 }
             }
         }
@@ -133,7 +133,7 @@ impl SimulatedLaser {
             return Err(Refusal::NotProgrammed);
         }
         if self.armed.is_none() {
-            self.armed = Some(Armed { t_heartbeat: self.now, t_alive: self.now, t_sync: None, t_lit: None });
+            self.armed = Some(Armed { t_heartbeat: self.now, t_alive: self.now, t_sync: None });
             self.push(BoxEvent::Armed { t: self.now });
         }
         Ok(())
@@ -230,7 +230,7 @@ impl SimulatedLaser {
                 let t_programmed = t_frame + window.delay;
                 let t_off = t_programmed + window.width;
                 // A sync that comes a little early or late must not light a window a second time.
-                let lit_already = armed.t_lit.is_some_and(|t_lit| t_programmed < t_lit + half_field);
+                let lit_already = self.t_lit.is_some_and(|t_lit| t_programmed < t_lit + half_field);
                 if t_off > self.now && !lit_already {
                     let t_on = t_programmed.max(self.now);
                     return Some((LitWindow { colour: program.sequence[field], t_on, t_off }, t_programmed));
