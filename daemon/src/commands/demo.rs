@@ -130,7 +130,8 @@ fn eye_sheet(views: &[EyeView]) -> Sheet {
         footer: vec![
             "Left: the eye focuses on the near card. Right: on the far card. Top: narrow pupil. Bottom: wide pupil."
                 .into(),
-            "What is in focus stays sharp; what is out of focus blurs, and blurs more for the wider pupil.".into(),
+            "What is in focus is sharper than what is not, and the wider pupil blurs more (in focus, too, a little)."
+                .into(),
         ],
     }
 }
