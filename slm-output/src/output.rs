@@ -578,8 +578,8 @@ impl LaserThread {
     fn run(mut self) {
         loop {
             let stop = self.shared.stop.load(Ordering::Acquire);
-            let now = (self.clock)();
-            self.step(now);
+            let clock = self.clock;
+            let now = self.step(clock);
             if stop {
                 self.ledger.flush(TimeNs(i64::MAX), &self.shared);
                 return;
@@ -590,20 +590,24 @@ impl LaserThread {
         }
     }
 
-    /// Does all that is to be done at `now`.
-    fn step(&mut self, now: TimeNs) {
+    /// Does all that is to be done at the time that `clock` says, which is handed back. The clock is read again for each
+    /// field: a field that came since the last reading is not one that was reported before it was shown.
+    fn step(&mut self, clock: impl Fn() -> TimeNs) -> TimeNs {
+        let now = clock();
         self.poll(now);
         if let Some(reason) = self.shared.latched() {
             self.latch(reason, now);
         }
         while let Ok(field) = self.fields.pop() {
-            self.on_field(&field, now);
+            self.on_field(&field, clock());
         }
+        let now = clock();
         let orders = self.interlock.watch(now);
         self.obey(orders, now);
         self.poll(now);
         self.shared.armed.store(self.interlock.is_armed(), Ordering::Relaxed);
         self.ledger.flush(now, &self.shared);
+        now
     }
 
     fn on_field(&mut self, field: &PresentedField, now: TimeNs) {
@@ -880,7 +884,7 @@ mod tests {
                     fields.push(field).unwrap();
                 }
             });
-            self.laser.step(now);
+            self.laser.step(|| now);
             while let Ok(event) = self.events.pop() {
                 self.all_events.push(event);
             }
