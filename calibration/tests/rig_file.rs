@@ -178,7 +178,7 @@ fn figures_out_of_range_are_refused() {
         ("on_delay_ms = 0.1", "on_delay_ms = -0.1", "lasers.on_delay_ms"),
         ("lit_ms = 3.0", "lit_ms = 0", "lasers.lit_ms"),
         ("heartbeat_timeout_ms = 100.0", "heartbeat_timeout_ms = 5000", "lasers.heartbeat_timeout_ms"),
-        ("scale_mm_per_unit = 1.0", "scale_mm_per_unit = 0", "tracker.scale_mm_per_unit"),
+        ("eye = \"both\"", "scale_mm_per_unit = 0\neye = \"both\"", "tracker.scale_mm_per_unit"),
         ("fallback_mm = 3.0", "fallback_mm = 0.5", "tracker.fallback_mm"),
         ("hold_ms = 1000.0", "hold_ms = -1", "tracker.hold_ms"),
     ] {
@@ -326,8 +326,7 @@ fn missing_tables_and_keys_are_named_once() {
     }
     let blue = fault_of(", blue = 450.0", "");
     assert_fault(&blue, "optics.wavelengths_nm.blue", line_of("wavelengths_nm"), "nothing", "380", "add blue");
-    let optional =
-        changed(&[("[tracker]", "#"), ("eye =", "#"), ("scale_mm", "#"), ("fallback_mm", "#"), ("hold_ms", "#")]);
+    let optional = changed(&[("[tracker]", "#"), ("eye =", "#"), ("fallback_mm", "#"), ("hold_ms", "#")]);
     let optional = optional.replace("[model]", "").replace("allow_optics", "#").replace("depth_", "# depth_");
     let rig = Rig::parse(&optional, Path::new("")).unwrap();
     assert_eq!(

@@ -3,7 +3,7 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::gate::Rejection;
-use crate::source::replay::{LOG_FAULT_NAMES, LogFault};
+use crate::import::{LOG_FAULT_NAMES, LogFault};
 
 /// One thing that is counted, beside the reasons for rejection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -14,10 +14,10 @@ pub enum Counter {
     Samples,
     /// Samples that the gate believed.
     Accepted,
-    /// Comment lines.
-    Comments,
-    /// Lines whose beginning was missed when a port was opened.
-    PartialLines,
+    /// Messages that are neither samples nor faults, such as comments.
+    Notes,
+    /// Messages whose beginning was missed when a link was opened.
+    Partials,
     /// Times at which running numbers were skipped.
     SequenceGaps,
     /// Running numbers skipped in all.
@@ -48,8 +48,8 @@ impl Counter {
         Self::Bytes,
         Self::Samples,
         Self::Accepted,
-        Self::Comments,
-        Self::PartialLines,
+        Self::Notes,
+        Self::Partials,
         Self::SequenceGaps,
         Self::SequenceMissing,
         Self::SequenceRepeats,
@@ -69,8 +69,8 @@ impl Counter {
             Self::Bytes => "bytes",
             Self::Samples => "samples",
             Self::Accepted => "accepted",
-            Self::Comments => "comments",
-            Self::PartialLines => "partial_lines",
+            Self::Notes => "notes",
+            Self::Partials => "partials",
             Self::SequenceGaps => "sequence_gaps",
             Self::SequenceMissing => "sequence_missing",
             Self::SequenceRepeats => "sequence_repeats",
@@ -169,7 +169,7 @@ impl CounterSnapshot {
         self.faults.iter().sum()
     }
 
-    /// Every name with its count: counters, then `line_*` and `log_*` faults, then `rejected_*`.
+    /// Every name with its count: counters, then `wire_*` and `log_*` faults, then `rejected_*`.
     pub fn entries(&self) -> impl Iterator<Item = (String, u64)> {
         let counts = Counter::ALL.into_iter().map(|counter| (counter.name().to_owned(), self.of(counter)));
         let faults = LOG_FAULT_NAMES.into_iter().zip(self.faults).map(|(name, count)| (name.to_owned(), count));
@@ -184,14 +184,14 @@ mod tests {
     use std::collections::HashSet;
 
     use super::*;
-    use crate::wire::line::LineFault;
+    use crate::wire::WireFault;
 
     #[test]
     fn every_count_has_a_name_of_its_own_and_its_own_place() {
         let counters = Counters::new();
         counters.add(Counter::Silences, 3);
         counters.add_rejected(Rejection::Guard);
-        counters.add_fault(LogFault::Line(LineFault::BadCrc), 2);
+        counters.add_fault(LogFault::Wire(WireFault::BadChecksum), 2);
         counters.add_fault(LogFault::Backwards, 5);
         let snapshot = counters.snapshot();
         let entries: Vec<_> = snapshot.entries().collect();
@@ -199,7 +199,7 @@ mod tests {
         assert_eq!(names.len(), COUNTERS + REJECTIONS + FAULTS);
         let mut counted: Vec<_> = entries.iter().filter(|(_, count)| *count > 0).cloned().collect();
         counted.sort();
-        let expected = [("line_bad_crc", 2), ("log_backwards", 5), ("rejected_guard", 1), ("silences", 3)];
+        let expected = [("log_backwards", 5), ("rejected_guard", 1), ("silences", 3), ("wire_bad_checksum", 2)];
         assert_eq!(counted, expected.map(|(name, count)| (name.to_owned(), count)));
         for (index, counter) in Counter::ALL.into_iter().enumerate() {
             assert_eq!(counter as usize, index);

@@ -41,7 +41,7 @@ impl From<&rig::Tracker> for EstimatorSettings {
     fn from(tracker: &rig::Tracker) -> Self {
         Self {
             eye: tracker.eye,
-            scale: tracker.scale,
+            scale: tracker.scale.unwrap_or(1.0),
             fallback: tracker.fallback,
             hold: tracker.hold,
             fallback_mm_per_s: 1.3,

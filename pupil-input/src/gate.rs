@@ -64,6 +64,8 @@ pub enum Rejection {
     OtherEye,
     /// Its time is not later than its predecessor's.
     Backwards,
+    /// The tracker itself says that it sees no pupil.
+    Lost,
     /// Diameter, confidence or aperture is NaN or infinite.
     NotFinite,
     /// The diameter is none of a human pupil.
@@ -82,9 +84,10 @@ pub enum Rejection {
 
 impl Rejection {
     /// Every reason, in the order of their indices.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 10] = [
         Self::OtherEye,
         Self::Backwards,
+        Self::Lost,
         Self::NotFinite,
         Self::OutOfRange,
         Self::LowConfidence,
@@ -104,6 +107,7 @@ impl Rejection {
         match self {
             Self::OtherEye => "other_eye",
             Self::Backwards => "backwards",
+            Self::Lost => "lost",
             Self::NotFinite => "not_finite",
             Self::OutOfRange => "out_of_range",
             Self::LowConfidence => "low_confidence",
@@ -257,7 +261,9 @@ impl Gate {
         let finite = sample.diameter_mm.is_finite()
             && sample.confidence.is_finite()
             && sample.aperture_mm.is_none_or(f32::is_finite);
-        if !finite {
+        if !sample.valid {
+            Some(Rejection::Lost)
+        } else if !finite {
             Some(Rejection::NotFinite)
         } else if sample.confidence < limits.least_confidence {
             Some(Rejection::LowConfidence)
@@ -358,6 +364,7 @@ mod tests {
             confidence: 1.0,
             aperture_mm: None,
             sequence: None,
+            valid: true,
         }
     }
 
@@ -386,7 +393,8 @@ mod tests {
     #[test]
     fn a_bad_sample_takes_its_neighbours_with_it() {
         type Spoil = fn(&mut PupilSample);
-        let spoil: [(Spoil, Rejection); 6] = [
+        let spoil: [(Spoil, Rejection); 7] = [
+            (|s| s.valid = false, Rejection::Lost),
             (|s| s.diameter_mm = f32::NAN, Rejection::NotFinite),
             (|s| s.diameter_mm = 0.5, Rejection::OutOfRange),
             (|s| s.diameter_mm = 16.7, Rejection::OutOfRange),

@@ -32,7 +32,10 @@ mod counters;
 mod estimator;
 mod filter;
 mod gate;
+mod import;
+mod profile;
 mod sample;
+mod sequence;
 pub mod source;
 mod spec;
 mod tracker;
@@ -43,9 +46,12 @@ pub use counters::{Counter, CounterSnapshot};
 pub use estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, PupilState, STATED_LAG};
 pub use filter::FilterSettings;
 pub use gate::{GateSettings, Rejection, Verdict};
+pub use import::{Blink, LogFault, LogFaults, LogFormat, Recording, ReplayError, SizeUnit};
+pub use profile::{DEFAULT_PROFILE, Profile, ProfileError};
 pub use sample::{PupilSample, SampleEye};
 pub use source::mock::{MockSample, MockSource, Scenario};
-pub use source::replay::{LogFault, LogFormat, Recording, ReplayError};
+
+pub use source::SourceError;
 pub use source::serial::SerialError;
 pub use spec::{ReplaySpeed, SpecError, TrackerSpec};
 pub use tracker::{

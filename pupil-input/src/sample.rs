@@ -64,4 +64,6 @@ pub struct PupilSample {
     pub aperture_mm: Option<f32>,
     /// The tracker's running number, where it has one.
     pub sequence: Option<u64>,
+    /// False where the tracker itself says that it sees no pupil; the diameter then means nothing.
+    pub valid: bool,
 }

@@ -4,6 +4,7 @@ use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
+use crate::profile::DEFAULT_PROFILE;
 use crate::source::mock::Scenario;
 
 /// A parsed tracker spec.
@@ -15,8 +16,10 @@ pub enum TrackerSpec {
     Serial {
         /// The port.
         path: PathBuf,
-        /// Bits a second.
-        baud: u32,
+        /// The tracker's profile.
+        profile: String,
+        /// Bits a second; the profile's own where the spec names none.
+        baud: Option<u32>,
     },
     /// `replay:FILE[,speed=X][,loop]`
     Replay {
@@ -48,10 +51,8 @@ pub struct SpecError {
     problem: String,
 }
 
-/// Bits a second where the spec names none.
+/// Bits a second where neither spec nor profile names any.
 pub(crate) const DEFAULT_BAUD: u32 = 115_200;
-/// The wire formats that this version reads.
-pub(crate) const PROFILES: [&str; 1] = ["holod"];
 const FORMS: &str = "`/dev/ttyUSB0`, `serial:PATH[,profile=NAME][,baud=N]`, `replay:FILE[,speed=X|max][,loop]`, a log \
                      file, or `mock[:SCENARIO]`";
 
@@ -109,22 +110,20 @@ fn is_word_option(option: &str) -> bool {
 
 fn parse_serial(rest: &str) -> Result<TrackerSpec, String> {
     let (path, options) = split_options(rest)?;
-    let mut baud = DEFAULT_BAUD;
+    let mut baud = None;
+    let mut profile = DEFAULT_PROFILE.to_owned();
     for option in options {
         match option.split_once('=') {
             Some(("baud", value)) => {
-                baud = value.parse().ok().filter(|baud| *baud > 0).ok_or_else(|| {
+                baud = Some(value.parse().ok().filter(|baud| *baud > 0).ok_or_else(|| {
                     format!("baud `{value}` is not a whole number of bits a second, such as {DEFAULT_BAUD}")
-                })?;
+                })?);
             }
-            Some(("profile", name)) if PROFILES.contains(&name) => {}
-            Some(("profile", name)) => {
-                return Err(format!("no profile `{name}`; this version reads {}", PROFILES.join(", ")));
-            }
+            Some(("profile", name)) => name.clone_into(&mut profile),
             _ => return Err(format!("unknown option `{option}`; expected profile=NAME or baud=N")),
         }
     }
-    Ok(TrackerSpec::Serial { path: path.into(), baud })
+    Ok(TrackerSpec::Serial { path: path.into(), profile, baud })
 }
 
 fn parse_replay(rest: &str) -> Result<TrackerSpec, String> {
@@ -154,7 +153,10 @@ impl fmt::Display for TrackerSpec {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Path(path) => path.display().fmt(f),
-            Self::Serial { path, baud } => write!(f, "serial:{},baud={baud}", path.display()),
+            Self::Serial { path, profile, baud } => {
+                write!(f, "serial:{},profile={profile}", path.display())?;
+                baud.map_or(Ok(()), |baud| write!(f, ",baud={baud}"))
+            }
             Self::Replay { path, speed, repeat } => {
                 write!(f, "replay:{}", path.display())?;
                 match speed {
@@ -181,10 +183,14 @@ mod tests {
         assert_eq!(parsed("/dev/ttyUSB0"), TrackerSpec::Path("/dev/ttyUSB0".into()));
         assert_eq!(parsed("./odd:name.csv"), TrackerSpec::Path("./odd:name.csv".into()));
         assert_eq!(parsed("/dev/serial/by-id/usb:1"), TrackerSpec::Path("/dev/serial/by-id/usb:1".into()));
-        assert_eq!(parsed("serial:/dev/x"), TrackerSpec::Serial { path: "/dev/x".into(), baud: DEFAULT_BAUD });
+        let profile = || "holod".to_owned();
+        assert_eq!(
+            parsed("serial:/dev/x"),
+            TrackerSpec::Serial { path: "/dev/x".into(), profile: profile(), baud: None }
+        );
         assert_eq!(
             parsed("serial:/dev/x,profile=holod,baud=9600"),
-            TrackerSpec::Serial { path: "/dev/x".into(), baud: 9600 }
+            TrackerSpec::Serial { path: "/dev/x".into(), profile: profile(), baud: Some(9600) }
         );
         assert_eq!(
             parsed("replay:a,B.csv,speed=2.5,loop"),
@@ -216,7 +222,6 @@ mod tests {
             ("serial", "lacks a path"),
             ("serial:/dev/x,baud=fast", "baud `fast`"),
             ("serial:/dev/x,baud=0", "baud `0`"),
-            ("serial:/dev/x,profile=iscan", "no profile `iscan`"),
             ("serial:/dev/x,parity=odd", "unknown option `parity=odd`"),
             ("replay:x,speed=0", "speed `0`"),
             ("replay:x,speed=NaN", "speed `NaN`"),

@@ -1,6 +1,6 @@
 //! A tracker that runs: one thread reads, decodes, gates and filters; others ask for the pupil without waiting.
 
-use std::path::PathBuf;
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::thread::{self, JoinHandle};
@@ -13,11 +13,14 @@ use crate::clock::ClockModel;
 use crate::counters::{Counter, CounterSnapshot, Counters};
 use crate::estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, StreamClock};
 use crate::gate::Verdict;
+use crate::import::{LogFault, Recording, ReplayError, SizeUnit};
+use crate::profile::{DEFAULT_PROFILE, Profile, ProfileError};
+use crate::sequence::{SequenceEvent, SequenceTracker};
 use crate::source::mock::{MockSource, Scenario};
-use crate::source::replay::{LogFault, Recording, ReplayError};
-use crate::source::serial::{ReadEvent, SerialError, SerialSource};
+use crate::source::serial::SerialFeed;
+use crate::source::{ByteSource, Feed, ReadEvent, SourceError};
 use crate::spec::{DEFAULT_BAUD, ReplaySpeed, TrackerSpec};
-use crate::wire::line::{LineDecoder, LineEvent, LineSample, SequenceEvent, SequenceTracker};
+use crate::wire::{Decoder, WireEvent, WireSample};
 
 /// The host's monotonic clock: the one place where it is read.
 pub fn host_now() -> TimeNs {
@@ -28,12 +31,26 @@ pub fn host_now() -> TimeNs {
 /// Why a tracker could not be started.
 #[derive(Debug, thiserror::Error)]
 pub enum TrackerError {
-    /// There is nothing at the path, or it is neither a log nor a port.
+    /// The tracker cannot be reached.
     #[error(transparent)]
-    Serial(#[from] SerialError),
+    Source(#[from] SourceError),
+    /// Its profile cannot be had.
+    #[error(transparent)]
+    Profile(#[from] ProfileError),
     /// The log cannot be played.
     #[error(transparent)]
     Replay(#[from] ReplayError),
+    /// Its figures are no millimetres, and nobody said how many millimetres one of them is.
+    #[error(
+        "tracker `{spec}` gives pupil sizes in {unit}; holod needs millimetres: measure an artificial pupil of known \
+         diameter and write tracker.scale_mm_per_unit = (its millimetres / its units) into the rig file"
+    )]
+    NoScale {
+        /// The tracker's spec.
+        spec: String,
+        /// What it gives.
+        unit: &'static str,
+    },
     /// The system gave no thread.
     #[error("no thread for the pupil reader: {0}; free memory or raise the limit on threads")]
     Thread(std::io::Error),
@@ -88,6 +105,9 @@ impl Tracker {
     /// What fails later is counted and tried again.
     pub fn start(spec: &TrackerSpec, settings: &rig::Tracker, origin: TimeNs) -> Result<TrackerHandle, TrackerError> {
         let job = Job::open(spec, origin)?;
+        if job.unit() != SizeUnit::Millimetres && settings.scale.is_none() {
+            return Err(TrackerError::NoScale { spec: spec.to_string(), unit: job.unit().name() });
+        }
         let settings = EstimatorSettings::from(settings);
         let (input, output) = triple_buffer::triple_buffer(&EstimateSnapshot::new(settings));
         let (producer, consumer) = rtrb::RingBuffer::new(TAP_DECISIONS);
@@ -235,30 +255,45 @@ struct Shared {
 
 /// What the thread is to do.
 enum Job {
-    Serial { port: SerialSource, path: PathBuf, baud: u32 },
-    Replay { recording: Recording, speed: ReplaySpeed, repeat: bool, origin: TimeNs },
+    Live { open: Box<dyn ByteSource>, feed: Box<dyn Feed>, profile: Profile },
+    Replay { recording: Box<Recording>, speed: ReplaySpeed, repeat: bool, origin: TimeNs },
     Mock { scenario: Scenario, origin: TimeNs },
 }
 
 impl Job {
     fn open(spec: &TrackerSpec, origin: TimeNs) -> Result<Self, TrackerError> {
-        let serial = |path: &PathBuf, baud| {
-            SerialSource::open(path, baud).map(|port| Self::Serial { port, path: path.clone(), baud })
-        };
-        Ok(match spec {
-            TrackerSpec::Path(path) if path.is_file() => Self::Replay {
-                recording: Recording::read(path)?,
+        match spec {
+            TrackerSpec::Path(path) if path.is_file() => Ok(Self::Replay {
+                recording: Box::new(Recording::read(path)?),
                 speed: ReplaySpeed::Times(1.0),
                 repeat: false,
                 origin,
-            },
-            TrackerSpec::Path(path) => serial(path, DEFAULT_BAUD)?,
-            TrackerSpec::Serial { path, baud } => serial(path, *baud)?,
+            }),
+            TrackerSpec::Path(path) => Self::serial(path, DEFAULT_PROFILE, None),
+            TrackerSpec::Serial { path, profile, baud } => Self::serial(path, profile, *baud),
             TrackerSpec::Replay { path, speed, repeat } => {
-                Self::Replay { recording: Recording::read(path)?, speed: *speed, repeat: *repeat, origin }
+                Ok(Self::Replay { recording: Box::new(Recording::read(path)?), speed: *speed, repeat: *repeat, origin })
             }
-            TrackerSpec::Mock(scenario) => Self::Mock { scenario: *scenario, origin },
-        })
+            TrackerSpec::Mock(scenario) => Ok(Self::Mock { scenario: *scenario, origin }),
+        }
+    }
+
+    /// What its sizes are before the rig's scale.
+    fn unit(&self) -> SizeUnit {
+        match self {
+            Self::Live { profile, .. } => profile.unit,
+            Self::Replay { recording, .. } => recording.unit(),
+            Self::Mock { .. } => SizeUnit::Millimetres,
+        }
+    }
+
+    fn serial(path: &Path, profile: &str, baud: Option<u32>) -> Result<Self, TrackerError> {
+        let profile = Profile::find(profile)?;
+        Self::live(Box::new(SerialFeed { path: path.into(), baud: baud.unwrap_or(DEFAULT_BAUD) }), profile)
+    }
+
+    fn live(mut feed: Box<dyn Feed>, profile: Profile) -> Result<Self, TrackerError> {
+        Ok(Self::Live { open: feed.open()?, feed, profile })
     }
 }
 
@@ -274,30 +309,30 @@ struct Worker {
 impl Worker {
     fn run(mut self, job: Job) {
         match job {
-            Job::Serial { port, path, baud } => self.run_serial(port, &path, baud),
+            Job::Live { open, feed, profile } => self.run_live(open, feed, &profile),
             Job::Replay { recording, speed, repeat, origin } => self.run_replay(&recording, speed, repeat, origin),
             Job::Mock { scenario, origin } => self.run_mock(scenario, origin),
         }
         self.finish();
     }
 
-    fn run_serial(&mut self, port: SerialSource, path: &std::path::Path, baud: u32) {
-        let mut port = Some(port);
-        let mut line = LineStream::new();
+    fn run_live(&mut self, open: Box<dyn ByteSource>, mut feed: Box<dyn Feed>, profile: &Profile) {
+        let mut link = Some(open);
+        let mut stream = LiveStream::new(profile);
         let mut buffer = [0; 4096];
         let mut back_off = FIRST_BACK_OFF;
         let mut last_heard = host_now();
         self.count(Counter::Connects, 1);
         while !self.stopping() {
-            let Some(open) = &mut port else {
+            let Some(open) = &mut link else {
                 if !self.wait_until(host_now() + TimeNs(back_off.as_nanos() as i64)) {
                     return;
                 }
                 self.count(Counter::ReconnectAttempts, 1);
                 back_off = (back_off * 2).min(LONGEST_BACK_OFF);
-                port = SerialSource::open(path, baud).ok();
-                if port.is_some() {
-                    line = LineStream::new();
+                link = feed.open().ok();
+                if link.is_some() {
+                    stream = LiveStream::new(profile);
                     last_heard = host_now();
                     self.count(Counter::Connects, 1);
                     self.set_link(Link::Up);
@@ -311,7 +346,7 @@ impl Worker {
                     back_off = FIRST_BACK_OFF;
                     self.set_link(Link::Up);
                     self.count(Counter::Bytes, count as u64);
-                    line.push(&buffer[..count], arrival, self);
+                    stream.push(&buffer[..count], arrival, self);
                     self.publish();
                 }
                 ReadEvent::Silence => {
@@ -321,7 +356,7 @@ impl Worker {
                     }
                 }
                 ReadEvent::Gone => {
-                    port = None;
+                    link = None;
                     self.count(Counter::Disconnects, 1);
                     self.set_link(Link::Down);
                 }
@@ -441,30 +476,32 @@ fn note(mut decision: Decision, clock: StreamClock, tap: &mut rtrb::Producer<Dec
     }
 }
 
-/// Protocol lines of one connection: decoder, running numbers, clock.
-struct LineStream {
-    decoder: LineDecoder,
+/// What one connection has brought: decoder, running numbers, clock.
+struct LiveStream {
+    decoder: Box<dyn Decoder>,
     sequence: SequenceTracker,
     clock: ClockModel,
 }
 
-impl LineStream {
-    const fn new() -> Self {
-        Self { decoder: LineDecoder::joining(), sequence: SequenceTracker::new(), clock: ClockModel::new() }
+impl LiveStream {
+    fn new(profile: &Profile) -> Self {
+        Self { decoder: profile.decoder(), sequence: SequenceTracker::new(), clock: ClockModel::new() }
     }
 
     fn push(&mut self, bytes: &[u8], arrival: TimeNs, worker: &mut Worker) {
         let Self { decoder, sequence, clock } = self;
-        decoder.push(bytes, |event| match event {
-            LineEvent::Sample(line) => {
+        decoder.push(bytes, &mut |event| match event {
+            WireEvent::Sample(sample) => {
                 let resets = clock.resets();
-                worker.count_sequence(sequence.next(line.sequence, line.eye));
-                worker.take(to_sample(&line, arrival, clock));
+                if let Some(number) = sample.sequence {
+                    worker.count_sequence(sequence.next(number, sample.eye));
+                }
+                worker.take(to_sample(&sample, arrival, clock));
                 worker.count(Counter::ClockResets, clock.resets() - resets);
             }
-            LineEvent::Comment => worker.count(Counter::Comments, 1),
-            LineEvent::Partial => worker.count(Counter::PartialLines, 1),
-            LineEvent::Rejected(fault) => worker.shared.counters.add_fault(LogFault::Line(fault), 1),
+            WireEvent::Note => worker.count(Counter::Notes, 1),
+            WireEvent::Partial => worker.count(Counter::Partials, 1),
+            WireEvent::Rejected(fault) => worker.shared.counters.add_fault(LogFault::Wire(fault), 1),
         });
     }
 }
@@ -483,16 +520,16 @@ impl Worker {
     }
 }
 
-fn to_sample(line: &LineSample, arrival: TimeNs, clock: &mut ClockModel) -> PupilSample {
-    let t_device = TimeNs(line.device_us.saturating_mul(1000));
+fn to_sample(wire: &WireSample, arrival: TimeNs, clock: &mut ClockModel) -> PupilSample {
     PupilSample {
-        t_device,
-        t_sample: clock.map(t_device, arrival),
+        t_device: wire.t_device.unwrap_or(arrival),
+        t_sample: wire.t_device.map_or(arrival, |t_device| clock.map(t_device, arrival)),
         t_arrival: arrival,
-        eye: line.eye,
-        diameter_mm: line.diameter_mm,
-        confidence: line.confidence,
-        aperture_mm: None,
-        sequence: Some(line.sequence),
+        eye: wire.eye,
+        diameter_mm: wire.diameter_mm,
+        confidence: wire.confidence,
+        aperture_mm: wire.aperture_mm,
+        sequence: wire.sequence,
+        valid: wire.valid,
     }
 }

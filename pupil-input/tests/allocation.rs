@@ -4,10 +4,9 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
 use holod_calibration::{TimeNs, rig};
-use holod_pupil_input::wire::line::{LineDecoder, LineEvent, encode_line};
-use holod_pupil_input::{
-    ClockModel, Estimator, EstimatorSettings, MockSource, PupilSample, Scenario, wire::line::LineSample,
-};
+use holod_pupil_input::wire::line::{LineDecoder, LineSample, encode_line};
+use holod_pupil_input::wire::{Decoder, WireEvent};
+use holod_pupil_input::{ClockModel, Estimator, EstimatorSettings, MockSource, PupilSample, Scenario};
 
 /// The system's allocator, counting for each thread.
 struct Counting;
@@ -59,9 +58,9 @@ fn bytes_become_estimates_without_allocation() {
     let mut sum_mm = 0.0;
     let allocations = allocations_of(|| {
         for chunk in bytes.as_bytes().chunks(61) {
-            decoder.push(chunk, |event| {
-                let LineEvent::Sample(line) = event else { return };
-                let t_device = TimeNs(line.device_us * 1000);
+            decoder.push(chunk, &mut |event| {
+                let WireEvent::Sample(line) = event else { return };
+                let t_device = line.t_device.expect("a line has a time");
                 let t_arrival = t_device + TimeNs(7_000_000_000);
                 let sample = PupilSample {
                     t_device,
@@ -71,7 +70,8 @@ fn bytes_become_estimates_without_allocation() {
                     diameter_mm: line.diameter_mm,
                     confidence: line.confidence,
                     aperture_mm: None,
-                    sequence: Some(line.sequence),
+                    sequence: line.sequence,
+                    valid: true,
                 };
                 estimator.push(sample, |_| {});
                 sum_mm += estimator.snapshot().pupil_at(t_arrival).pupil.mm();

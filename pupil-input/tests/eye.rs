@@ -46,6 +46,7 @@ fn sample(t_ms: i64, eye: SampleEye, diameter_mm: f32) -> PupilSample {
         confidence: 1.0,
         aperture_mm: None,
         sequence: None,
+        valid: true,
     }
 }
 

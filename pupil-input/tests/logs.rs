@@ -6,8 +6,9 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::{TimeNs, rig};
-use holod_pupil_input::wire::line::{LineFault, LineSample, crc8, encode_line};
-use holod_pupil_input::{LogFault, LogFormat, PupilSample, PupilState, Recording, ReplayError, SampleEye};
+use holod_pupil_input::wire::WireFault;
+use holod_pupil_input::wire::line::{LineSample, crc8, encode_line};
+use holod_pupil_input::{Blink, LogFault, LogFormat, PupilSample, PupilState, Recording, ReplayError, SampleEye};
 use support::{estimates, first_below, least_raw, neon_like_csv, settings};
 use tempfile::TempDir;
 
@@ -118,8 +119,8 @@ fn bad_lines_of_a_recording_are_counted_and_skipped() {
     let dir = TempDir::new().expect("a folder");
     let recording = Recording::read(&written(&dir, "log", text)).expect("reads");
     assert_eq!(recording.len(), 50);
-    assert_eq!(recording.faults().of(LogFault::Line(LineFault::NotFinite)), 1);
-    assert_eq!(recording.faults().of(LogFault::Line(LineFault::BadCrc)), 2);
+    assert_eq!(recording.faults().of(LogFault::Wire(WireFault::NotFinite)), 1);
+    assert_eq!(recording.faults().of(LogFault::Wire(WireFault::BadChecksum)), 2);
 }
 
 #[test]
@@ -140,7 +141,7 @@ fn a_log_as_a_whole_is_refused_with_its_reason() {
     assert!(refused(&dir.path().join("absent")).to_string().contains("absent"));
 
     let error = refused(&written(&dir, "lines", "P1,1,2,L,3,1*00\n"));
-    assert!(error.to_string().contains("line_bad_crc 1"), "{error}");
+    assert!(error.to_string().contains("wire_bad_checksum 1"), "{error}");
     let error = refused(&written(&dir, "future", "P2,1,2,L,3,1*00\n"));
     assert!(error.to_string().contains("line_unknown_version 1"), "{error}");
 
@@ -157,7 +158,8 @@ fn blinks_of_the_companion_are_known_and_do_not_reach_the_samples() {
                   0,x,1,100,200,0\n0,x,2,soon,400,0\n0,x,3,500,600,0\n";
     written(&dir, "blinks.csv", blinks);
     let recording = Recording::read(&written(&dir, "3d_eye_states.csv", neon_like_csv(11))).expect("reads");
-    assert_eq!(recording.blinks(), [(TimeNs(100), TimeNs(200)), (TimeNs(500), TimeNs(600))]);
+    let blink = |begins, ends| Blink { eye: SampleEye::Both, begins: TimeNs(begins), ends: TimeNs(ends) };
+    assert_eq!(recording.blinks(), [blink(100, 200), blink(500, 600)]);
     assert!(recording.samples().all(|sample| sample.confidence == 1.0));
 }
 
@@ -180,9 +182,9 @@ fn shared_data_neon_blinks_are_held() {
         for (eye, least_mm) in [(rig::Eye::Left, 3.0), (rig::Eye::Both, 2.5), (rig::Eye::Right, 2.1)] {
             let trace = estimates(samples.iter().copied(), settings(eye));
             assert_eq!(first_below(&trace, least_mm), None, "{eye:?}");
-            for (begin, end) in recording.blinks() {
+            for blink in recording.blinks() {
                 // The dip of a blink lasts from 40 ms after its begin to about 60 ms before its end.
-                let (from, to) = (*begin + TimeNs(60_000_000), *end - TimeNs(80_000_000));
+                let (from, to) = (blink.begins + TimeNs(60_000_000), blink.ends - TimeNs(80_000_000));
                 let within = trace.iter().filter(|(t, _)| (from..to).contains(t));
                 assert!(within.clone().count() > 50);
                 assert!(within.clone().all(|(_, estimate)| estimate.state == PupilState::Holding), "{eye:?}");

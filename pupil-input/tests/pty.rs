@@ -8,7 +8,8 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use holod_calibration::{TimeNs, rig};
-use holod_pupil_input::wire::line::{LineFault, LineSample, encode_line};
+use holod_pupil_input::wire::WireFault;
+use holod_pupil_input::wire::line::{LineSample, encode_line};
 use holod_pupil_input::{
     Counter, Link, LogFault, PupilState, Recording, SampleEye, Tracker, TrackerHandle, TrackerSpec, Verdict, host_now,
 };
@@ -109,10 +110,10 @@ fn samples_are_followed_and_rubbish_is_counted() {
         handle.counters().of(Counter::Samples) > before.of(Counter::Samples) + 10 && tracks(&mut handle)
     });
     let counters = handle.counters();
-    assert_eq!(counters.of(Counter::Comments), 1);
-    assert_eq!(counters.fault(LogFault::Line(LineFault::TooLong)), 1);
-    assert_eq!(counters.fault(LogFault::Line(LineFault::Malformed)), 1);
-    assert_eq!(counters.fault(LogFault::Line(LineFault::BadCrc)), 2);
+    assert_eq!(counters.of(Counter::Notes), 1);
+    assert_eq!(counters.fault(LogFault::Wire(WireFault::TooLong)), 1);
+    assert_eq!(counters.fault(LogFault::Wire(WireFault::Malformed)), 1);
+    assert_eq!(counters.fault(LogFault::Wire(WireFault::BadChecksum)), 2);
     assert_eq!(counters.of(Counter::SequenceGaps), 2);
     assert_eq!(counters.of(Counter::SequenceMissing), 4);
     assert_eq!(counters.of(Counter::Disconnects), 0);

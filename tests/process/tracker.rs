@@ -184,8 +184,8 @@ fn unplugging_garbage_and_silence_are_survived_and_counted() {
     assert!(count("disconnects") >= 1);
     assert!(count("connects") >= 2);
     assert!(count("silences") >= 1);
-    assert!(count("line_too_long") + count("line_malformed") >= 1);
-    assert!(count("line_bad_crc") >= 2);
+    assert!(count("wire_too_long") + count("wire_malformed") >= 1);
+    assert!(count("wire_bad_checksum") >= 2);
     assert!(rows.iter().all(|row| (2.5..5.5).contains(&row.pupil_mm)), "garbage never reaches the display");
 }
 
@@ -216,7 +216,7 @@ fn shared_data_neon_recording_through_a_port_holds_through_both_blinks() {
     let open = |t: TimeNs| {
         let blinks = recording.blinks();
         let guard = TimeNs(250_000_000);
-        let near_blink = blinks.iter().any(|(begin, end)| t > *begin - guard && t < *end + guard);
+        let near_blink = blinks.iter().any(|blink| t > blink.begins - guard && t < blink.ends + guard);
         (!near_blink).then_some(())
     };
     let truth = |t: TimeNs| {

@@ -21,7 +21,7 @@ pub fn small_rig(width: usize, height: usize, lasers: &str) -> String {
          power_mw = {{ red = 1.0, green = 1.0, blue = 1.0 }}\non_delay_ms = 0.1\nlit_ms = 3.0\n\
          heartbeat_timeout_ms = 100.0\n\
          [tracker]\n\
-         eye = \"left\"\nscale_mm_per_unit = 1.0\nfallback_mm = 3.0\nhold_ms = 1000.0\n"
+         eye = \"left\"\nfallback_mm = 3.0\nhold_ms = 1000.0\n"
     )
 }
 

@@ -127,8 +127,9 @@ pub struct Tracker {
     pub spec: Option<String>,
     /// Which eye looks into the display.
     pub eye: Eye,
-    /// Factor from the tracker's figure to millimetres.
-    pub scale: f64,
+    /// Factor from the tracker's figure to millimetres, where the rig names one; a tracker that gives millimetres needs
+    /// none.
+    pub scale: Option<f64>,
     /// The diameter to slide to when the tracker has been lost for long.
     pub fallback: PupilDiameter,
     /// How long the last good value is held before the slide begins.
@@ -182,7 +183,7 @@ impl Default for Rig {
             tracker: Tracker {
                 spec: None,
                 eye: Eye::Both,
-                scale: 1.0,
+                scale: None,
                 fallback: PupilDiameter::from_mm(3.0),
                 hold: TimeNs(1_000_000_000),
             },

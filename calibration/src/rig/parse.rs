@@ -431,7 +431,7 @@ fn read_tracker<'a>(reader: &mut Reader<'a>, tracker: Section<'a>) -> Option<Tra
     Some(Tracker {
         spec: spec.map(|spec| spec.value.into()),
         eye: eye.map_or(default.eye, |eye| eye.value),
-        scale: scale.map_or(default.scale, |scale| scale.value),
+        scale: scale.map(|scale| scale.value),
         fallback: fallback_mm.map_or(default.fallback, |mm| PupilDiameter::from_mm(mm.value as f32)),
         hold: hold_ms.map_or(default.hold, |ms| milliseconds(ms.value)),
     })

@@ -514,9 +514,11 @@ impl Tally {
 
 fn tracker_failure(error: TrackerError) -> Failure {
     let exit = match &error {
-        TrackerError::Serial(_) => Exit::NoInput,
+        TrackerError::Source(_) => Exit::NoInput,
+        TrackerError::Profile(_) => Exit::Usage,
         TrackerError::Replay(ReplayError::Io { .. }) => Exit::NoInput,
         TrackerError::Replay(_) => Exit::Data,
+        TrackerError::NoScale { .. } => Exit::Config,
         TrackerError::Thread(_) => Exit::Unavailable,
     };
     Failure::because(exit)(error)

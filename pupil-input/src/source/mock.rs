@@ -199,6 +199,7 @@ impl MockSource {
                     confidence: sure.clamp(0.0, 1.0) as f32,
                     aperture_mm: self.apertures.then_some(aperture_mm as f32),
                     sequence: Some(self.tick),
+                    valid: true,
                 },
                 truth_mm: truth_mm as f32,
             }

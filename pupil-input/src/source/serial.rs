@@ -1,11 +1,11 @@
 //! A serial port or PTY: opened exclusively, read with a timeout.
 
+use serialport::TTYPort;
 use std::io::{ErrorKind, Read};
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
-use serialport::TTYPort;
+use super::{ByteSource, Feed, READ_TIMEOUT, ReadEvent, SourceError};
 
 /// Why a serial tracker could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -42,26 +42,25 @@ pub enum SerialError {
     },
 }
 
-/// How long one read waits; also how soon a stop is noticed.
-pub(crate) const READ_TIMEOUT: Duration = Duration::from_millis(50);
-
-/// What one read brought.
-pub(crate) enum ReadEvent {
-    /// This many bytes.
-    Bytes(usize),
-    /// Nothing within [`READ_TIMEOUT`].
-    Silence,
-    /// The port is gone.
-    Gone,
+/// A port by its path.
+pub(crate) struct SerialFeed {
+    pub(crate) path: PathBuf,
+    pub(crate) baud: u32,
 }
 
-pub(crate) struct SerialSource {
+impl Feed for SerialFeed {
+    fn open(&mut self) -> Result<Box<dyn ByteSource>, SourceError> {
+        Ok(Box::new(SerialSource::open(&self.path, self.baud)?))
+    }
+}
+
+struct SerialSource {
     port: TTYPort,
 }
 
 impl SerialSource {
     /// Opens `path`, saying what is wrong and what to do about it.
-    pub(crate) fn open(path: &Path, baud: u32) -> Result<Self, SerialError> {
+    fn open(path: &Path, baud: u32) -> Result<Self, SerialError> {
         check_kind(path)?;
         let builder = serialport::new(path.to_string_lossy(), baud).timeout(READ_TIMEOUT);
         match TTYPort::open(&builder) {
@@ -78,9 +77,10 @@ impl SerialSource {
             }
         }
     }
+}
 
-    /// Waits for bytes. Without allocation while bytes come.
-    pub(crate) fn read(&mut self, buffer: &mut [u8]) -> ReadEvent {
+impl ByteSource for SerialSource {
+    fn read(&mut self, buffer: &mut [u8]) -> ReadEvent {
         match self.port.read(buffer) {
             // End of file: some drivers tell an unplugged device in this way, at once and for ever.
             Ok(0) => ReadEvent::Gone,

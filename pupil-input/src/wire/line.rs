@@ -12,6 +12,9 @@
 
 use std::fmt::Write;
 
+use holod_calibration::TimeNs;
+
+use super::{Decoder, WireEvent, WireFault, WireSample};
 use crate::SampleEye;
 
 /// Bytes of the longest line that is read, without its ending.
@@ -30,77 +33,6 @@ pub struct LineSample {
     pub diameter_mm: f32,
     /// Confidence, 0..=1.
     pub confidence: f32,
-}
-
-/// Why a line was rejected.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum LineFault {
-    /// Longer than [`MAX_LINE_BYTES`].
-    TooLong,
-    /// Not printable ASCII, or not of the protocol's form.
-    Malformed,
-    /// `P` and a number that is not 1.
-    UnknownVersion,
-    /// No `*` with two hex digits at the end, or they do not match.
-    BadCrc,
-    /// Sequence, time, diameter or confidence is not a number.
-    BadNumber,
-    /// The eye is none of L, R, B.
-    BadEye,
-    /// Diameter or confidence is NaN or infinite.
-    NotFinite,
-    /// The diameter is negative.
-    Negative,
-    /// The confidence lies outside 0..=1.
-    BadConfidence,
-}
-
-impl LineFault {
-    /// Every reason, in the order of their indices.
-    pub const ALL: [Self; 9] = [
-        Self::TooLong,
-        Self::Malformed,
-        Self::UnknownVersion,
-        Self::BadCrc,
-        Self::BadNumber,
-        Self::BadEye,
-        Self::NotFinite,
-        Self::Negative,
-        Self::BadConfidence,
-    ];
-
-    /// Its place in [`Self::ALL`].
-    pub const fn index(self) -> usize {
-        self as usize
-    }
-
-    /// The name under which it is counted.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::TooLong => "line_too_long",
-            Self::Malformed => "line_malformed",
-            Self::UnknownVersion => "line_unknown_version",
-            Self::BadCrc => "line_bad_crc",
-            Self::BadNumber => "line_bad_number",
-            Self::BadEye => "line_bad_eye",
-            Self::NotFinite => "line_not_finite",
-            Self::Negative => "line_negative",
-            Self::BadConfidence => "line_bad_confidence",
-        }
-    }
-}
-
-/// What one line turned out to be.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum LineEvent {
-    /// A sample.
-    Sample(LineSample),
-    /// A comment.
-    Comment,
-    /// A line that is no sample, with the reason.
-    Rejected(LineFault),
-    /// What was left of a line when reading began in its middle; not a fault.
-    Partial,
 }
 
 /// Bytes in, lines out; the same lines however the bytes are split.
@@ -129,16 +61,40 @@ impl LineDecoder {
     }
 
     /// A decoder for a stream that may be joined in the middle of a line: the first line, if bad, is
-    /// [`LineEvent::Partial`].
+    /// [`WireEvent::Partial`].
     pub const fn joining() -> Self {
         Self { first: true, ..Self::new() }
     }
 
-    /// Takes `bytes` and calls `on_event` for each line that they complete.
-    pub fn push(&mut self, bytes: &[u8], mut on_event: impl FnMut(LineEvent)) {
+    fn end_line(&mut self, on_event: &mut dyn FnMut(WireEvent)) {
+        let joined = std::mem::take(&mut self.first);
+        let overlong = std::mem::take(&mut self.overlong);
+        let used = std::mem::take(&mut self.used);
+        let line = self.line[..used].strip_suffix(b"\r").unwrap_or(&self.line[..used]);
+        if line.is_empty() {
+            return;
+        }
+        if line[0] == b'#' {
+            return on_event(WireEvent::Note);
+        }
+        let parsed = if overlong { Err(WireFault::TooLong) } else { parse_line(line) };
+        match parsed {
+            Ok(sample) => on_event(WireEvent::Sample(sample.into())),
+            Err(fault) => {
+                on_event(if joined { WireEvent::Partial } else { WireEvent::Rejected(fault) });
+                if !overlong && let Some(sample) = later_sample(line) {
+                    on_event(WireEvent::Sample(sample.into()));
+                }
+            }
+        }
+    }
+}
+
+impl Decoder for LineDecoder {
+    fn push(&mut self, bytes: &[u8], on_event: &mut dyn FnMut(WireEvent)) {
         for &byte in bytes {
             if byte == b'\n' {
-                self.end_line(&mut on_event);
+                self.end_line(on_event);
             } else if self.used < MAX_LINE_BYTES {
                 self.line[self.used] = byte;
                 self.used += 1;
@@ -148,33 +104,23 @@ impl LineDecoder {
         }
     }
 
-    /// Ends a last line that has no line ending, as at the end of a file.
-    pub fn finish(&mut self, mut on_event: impl FnMut(LineEvent)) {
+    fn finish(&mut self, on_event: &mut dyn FnMut(WireEvent)) {
         if self.used > 0 {
-            self.end_line(&mut on_event);
+            self.end_line(on_event);
         }
     }
+}
 
-    fn end_line(&mut self, on_event: &mut impl FnMut(LineEvent)) {
-        let joined = std::mem::take(&mut self.first);
-        let overlong = std::mem::take(&mut self.overlong);
-        let used = std::mem::take(&mut self.used);
-        let line = self.line[..used].strip_suffix(b"\r").unwrap_or(&self.line[..used]);
-        if line.is_empty() {
-            return;
-        }
-        if line[0] == b'#' {
-            return on_event(LineEvent::Comment);
-        }
-        let parsed = if overlong { Err(LineFault::TooLong) } else { parse_line(line) };
-        match parsed {
-            Ok(sample) => on_event(LineEvent::Sample(sample)),
-            Err(fault) => {
-                on_event(if joined { LineEvent::Partial } else { LineEvent::Rejected(fault) });
-                if !overlong && let Some(sample) = later_sample(line) {
-                    on_event(LineEvent::Sample(sample));
-                }
-            }
+impl From<LineSample> for WireSample {
+    fn from(line: LineSample) -> Self {
+        Self {
+            t_device: Some(TimeNs(line.device_us.saturating_mul(1000))),
+            eye: line.eye,
+            diameter_mm: line.diameter_mm,
+            confidence: line.confidence,
+            aperture_mm: None,
+            sequence: Some(line.sequence),
+            valid: true,
         }
     }
 }
@@ -189,49 +135,49 @@ fn later_sample(line: &[u8]) -> Option<LineSample> {
 ///
 /// # Errors
 /// The first reason why it is not a sample.
-pub fn parse_line(line: &[u8]) -> Result<LineSample, LineFault> {
+pub fn parse_line(line: &[u8]) -> Result<LineSample, WireFault> {
     if line.len() > MAX_LINE_BYTES {
-        return Err(LineFault::TooLong);
+        return Err(WireFault::TooLong);
     }
     let text = std::str::from_utf8(line)
         .ok()
         .filter(|text| text.bytes().all(|byte| (b' '..=b'~').contains(&byte)))
-        .ok_or(LineFault::Malformed)?;
-    let version = text.split_once(',').and_then(|(tag, _)| tag.strip_prefix('P')).ok_or(LineFault::Malformed)?;
+        .ok_or(WireFault::Malformed)?;
+    let version = text.split_once(',').and_then(|(tag, _)| tag.strip_prefix('P')).ok_or(WireFault::Malformed)?;
     if version.is_empty() || !version.bytes().all(|byte| byte.is_ascii_digit()) {
-        return Err(LineFault::Malformed);
+        return Err(WireFault::Malformed);
     }
     if version != "1" {
-        return Err(LineFault::UnknownVersion);
+        return Err(WireFault::UnknownVersion);
     }
-    let (body, check) = text.rsplit_once('*').ok_or(LineFault::BadCrc)?;
+    let (body, check) = text.rsplit_once('*').ok_or(WireFault::BadChecksum)?;
     if check.len() != 2 || !check.bytes().all(|byte| byte.is_ascii_hexdigit()) {
-        return Err(LineFault::BadCrc);
+        return Err(WireFault::BadChecksum);
     }
     if u8::from_str_radix(check, 16) != Ok(crc8(body.as_bytes())) {
-        return Err(LineFault::BadCrc);
+        return Err(WireFault::BadChecksum);
     }
 
     let mut fields = body.split(',').skip(1);
-    let mut field = || fields.next().ok_or(LineFault::Malformed);
-    let sequence = field()?.parse().map_err(|_| LineFault::BadNumber)?;
-    let device_us = field()?.parse().map_err(|_| LineFault::BadNumber)?;
+    let mut field = || fields.next().ok_or(WireFault::Malformed);
+    let sequence = field()?.parse().map_err(|_| WireFault::BadNumber)?;
+    let device_us = field()?.parse().map_err(|_| WireFault::BadNumber)?;
     let eye = match field()? {
         "L" => SampleEye::Left,
         "R" => SampleEye::Right,
         "B" => SampleEye::Both,
-        _ => return Err(LineFault::BadEye),
+        _ => return Err(WireFault::BadEye),
     };
-    let diameter_mm: f32 = field()?.parse().map_err(|_| LineFault::BadNumber)?;
-    let confidence: f32 = field()?.parse().map_err(|_| LineFault::BadNumber)?;
+    let diameter_mm: f32 = field()?.parse().map_err(|_| WireFault::BadNumber)?;
+    let confidence: f32 = field()?.parse().map_err(|_| WireFault::BadNumber)?;
     if !diameter_mm.is_finite() || !confidence.is_finite() {
-        return Err(LineFault::NotFinite);
+        return Err(WireFault::NotFinite);
     }
     if diameter_mm < 0.0 {
-        return Err(LineFault::Negative);
+        return Err(WireFault::Negative);
     }
     if !(0.0..=1.0).contains(&confidence) {
-        return Err(LineFault::BadConfidence);
+        return Err(WireFault::BadConfidence);
     }
     Ok(LineSample { sequence, device_us, eye, diameter_mm, confidence })
 }
@@ -252,49 +198,6 @@ pub fn crc8(bytes: &[u8]) -> u8 {
     })
 }
 
-/// What a sequence of running numbers says about lost lines.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct SequenceTracker {
-    last: Option<(u64, SampleEye)>,
-}
-
-/// What one running number tells after those before it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum SequenceEvent {
-    /// The next one, the first one, or the other eye of the same instant.
-    InOrder,
-    /// This many numbers are missing.
-    Gap(u64),
-    /// The same number of the same eye again.
-    Repeat,
-    /// The count went backwards: the tracker restarted or its counter wrapped.
-    Restart,
-}
-
-/// A longer leap of the running number is a new count, not a loss: an hour at 1 kHz.
-const LONGEST_GAP: u64 = 3_600_000;
-
-impl SequenceTracker {
-    /// A tracker that has seen no number.
-    pub const fn new() -> Self {
-        Self { last: None }
-    }
-
-    /// Takes the next sample's number.
-    pub fn next(&mut self, sequence: u64, eye: SampleEye) -> SequenceEvent {
-        let Some((last, last_eye)) = self.last.replace((sequence, eye)) else {
-            return SequenceEvent::InOrder;
-        };
-        match sequence.checked_sub(last) {
-            None => SequenceEvent::Restart,
-            Some(0) if eye == last_eye => SequenceEvent::Repeat,
-            Some(0 | 1) => SequenceEvent::InOrder,
-            Some(step) if step > LONGEST_GAP => SequenceEvent::Restart,
-            Some(step) => SequenceEvent::Gap(step - 1),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
@@ -311,10 +214,10 @@ mod tests {
         text
     }
 
-    fn decode(bytes: &[u8]) -> Vec<LineEvent> {
+    fn decode(bytes: &[u8]) -> Vec<WireEvent> {
         let mut events = Vec::new();
         let mut decoder = LineDecoder::new();
-        decoder.push(bytes, |event| events.push(event));
+        decoder.push(bytes, &mut |event| events.push(event));
         events
     }
 
@@ -331,7 +234,7 @@ mod tests {
 
     #[test]
     fn a_known_line_reads_as_its_fields() {
-        assert_eq!(decode(encoded(&sample()).as_bytes()), [LineEvent::Sample(sample())]);
+        assert_eq!(decode(encoded(&sample()).as_bytes()), [WireEvent::Sample(sample().into())]);
         assert_eq!(encoded(&sample()), with_crc("P1,7,1234567,L,3.25,0.9").to_uppercase());
     }
 
@@ -342,36 +245,36 @@ mod tests {
             with_crc("P1,7,1234567,L,3.25,0.9,future,*x").replace('\n', "\r\n"),
             encoded(&sample())
         );
-        let both = LineEvent::Sample(sample());
-        assert_eq!(decode(text.as_bytes()), [LineEvent::Comment, both, both]);
+        let both = WireEvent::Sample(sample().into());
+        assert_eq!(decode(text.as_bytes()), [WireEvent::Note, both, both]);
     }
 
     #[test]
     fn each_fault_has_its_reason() {
         let cases = [
-            (format!("P1,{}\n", "9".repeat(300)), LineFault::TooLong),
-            ("hello\n".into(), LineFault::Malformed),
-            ("P1,\u{e9}\n".into(), LineFault::Malformed),
-            ("Px,1,2\n".into(), LineFault::Malformed),
-            (with_crc("P1,7,8,L"), LineFault::Malformed),
-            (with_crc("P2,7,8,L,3,1"), LineFault::UnknownVersion),
-            ("P1,7,8,L,3,1\n".into(), LineFault::BadCrc),
-            ("P1,7,8,L,3,1*0\n".into(), LineFault::BadCrc),
-            ("P1,7,8,L,3,1*+1\n".into(), LineFault::BadCrc),
-            (with_crc("P1,7,8,L,3,1").replace("L,3", "L,4"), LineFault::BadCrc),
-            (with_crc("P1,-7,8,L,3,1"), LineFault::BadNumber),
-            (with_crc("P1,7,8.5,L,3,1"), LineFault::BadNumber),
-            (with_crc("P1,7,8,L,three,1"), LineFault::BadNumber),
-            (with_crc("P1,7,8,L,3,"), LineFault::BadNumber),
-            (with_crc("P1,7,8,X,3,1"), LineFault::BadEye),
-            (with_crc("P1,7,8,L,NaN,1"), LineFault::NotFinite),
-            (with_crc("P1,7,8,L,3,inf"), LineFault::NotFinite),
-            (with_crc("P1,7,8,L,-1,1"), LineFault::Negative),
-            (with_crc("P1,7,8,L,3,1.01"), LineFault::BadConfidence),
-            (with_crc("P1,7,8,L,3,-0.5"), LineFault::BadConfidence),
+            (format!("P1,{}\n", "9".repeat(300)), WireFault::TooLong),
+            ("hello\n".into(), WireFault::Malformed),
+            ("P1,\u{e9}\n".into(), WireFault::Malformed),
+            ("Px,1,2\n".into(), WireFault::Malformed),
+            (with_crc("P1,7,8,L"), WireFault::Malformed),
+            (with_crc("P2,7,8,L,3,1"), WireFault::UnknownVersion),
+            ("P1,7,8,L,3,1\n".into(), WireFault::BadChecksum),
+            ("P1,7,8,L,3,1*0\n".into(), WireFault::BadChecksum),
+            ("P1,7,8,L,3,1*+1\n".into(), WireFault::BadChecksum),
+            (with_crc("P1,7,8,L,3,1").replace("L,3", "L,4"), WireFault::BadChecksum),
+            (with_crc("P1,-7,8,L,3,1"), WireFault::BadNumber),
+            (with_crc("P1,7,8.5,L,3,1"), WireFault::BadNumber),
+            (with_crc("P1,7,8,L,three,1"), WireFault::BadNumber),
+            (with_crc("P1,7,8,L,3,"), WireFault::BadNumber),
+            (with_crc("P1,7,8,X,3,1"), WireFault::BadEye),
+            (with_crc("P1,7,8,L,NaN,1"), WireFault::NotFinite),
+            (with_crc("P1,7,8,L,3,inf"), WireFault::NotFinite),
+            (with_crc("P1,7,8,L,-1,1"), WireFault::Negative),
+            (with_crc("P1,7,8,L,3,1.01"), WireFault::BadConfidence),
+            (with_crc("P1,7,8,L,3,-0.5"), WireFault::BadConfidence),
         ];
         for (text, fault) in cases {
-            assert_eq!(decode(text.as_bytes()), [LineEvent::Rejected(fault)], "{text}");
+            assert_eq!(decode(text.as_bytes()), [WireEvent::Rejected(fault)], "{text}");
         }
     }
 
@@ -379,28 +282,16 @@ mod tests {
     fn a_half_line_costs_itself_and_not_its_neighbour() {
         let half = &encoded(&sample())[..11];
         let text = format!("{half}{}{}", encoded(&sample()), encoded(&sample()));
-        let good = LineEvent::Sample(sample());
-        assert_eq!(decode(text.as_bytes()), [LineEvent::Rejected(LineFault::BadCrc), good, good]);
+        let good = WireEvent::Sample(sample().into());
+        assert_eq!(decode(text.as_bytes()), [WireEvent::Rejected(WireFault::BadChecksum), good, good]);
     }
 
     #[test]
     fn joining_in_the_middle_of_a_line_is_no_fault() {
         let mut events = Vec::new();
         let mut decoder = LineDecoder::joining();
-        decoder.push(format!("{}{}", &encoded(&sample())[5..], encoded(&sample())).as_bytes(), |e| events.push(e));
-        assert_eq!(events, [LineEvent::Partial, LineEvent::Sample(sample())]);
-    }
-
-    #[test]
-    fn sequence_gaps_repeats_and_restarts_are_told_apart() {
-        let mut tracker = SequenceTracker::default();
-        let mut next = |sequence, eye| tracker.next(sequence, eye);
-        assert_eq!(next(5, SampleEye::Left), SequenceEvent::InOrder);
-        assert_eq!(next(5, SampleEye::Right), SequenceEvent::InOrder);
-        assert_eq!(next(6, SampleEye::Left), SequenceEvent::InOrder);
-        assert_eq!(next(6, SampleEye::Left), SequenceEvent::Repeat);
-        assert_eq!(next(10, SampleEye::Left), SequenceEvent::Gap(3));
-        assert_eq!(next(0, SampleEye::Left), SequenceEvent::Restart);
+        decoder.push(format!("{}{}", &encoded(&sample())[5..], encoded(&sample())).as_bytes(), &mut |e| events.push(e));
+        assert_eq!(events, [WireEvent::Partial, WireEvent::Sample(sample().into())]);
     }
 
     fn any_sample() -> impl Strategy<Value = LineSample> {
@@ -420,7 +311,7 @@ mod tests {
         fn what_is_encoded_is_decoded(samples in prop::collection::vec(any_sample(), 0..20)) {
             let mut text = String::new();
             samples.iter().for_each(|sample| encode_line(sample, &mut text));
-            let expected: Vec<_> = samples.into_iter().map(LineEvent::Sample).collect();
+            let expected: Vec<_> = samples.into_iter().map(|sample| WireEvent::Sample(sample.into())).collect();
             prop_assert_eq!(decode(text.as_bytes()), expected);
         }
 
@@ -445,7 +336,7 @@ mod tests {
                     break;
                 }
                 let (now, later) = rest.split_at(cut.min(rest.len()));
-                decoder.push(now, |event| events.push(event));
+                decoder.push(now, &mut |event| events.push(event));
                 rest = later;
             }
             prop_assert_eq!(events, decode(&bytes));
@@ -458,7 +349,7 @@ mod tests {
             bytes[at] ^= flip;
             // The CRC is hexadecimal of either case, and a comment is no sample.
             prop_assume!(!(at >= bytes.len() - 3 && flip == 0x20));
-            let samples = decode(&bytes).into_iter().filter(|event| matches!(event, LineEvent::Sample(_))).count();
+            let samples = decode(&bytes).into_iter().filter(|event| matches!(event, WireEvent::Sample(_))).count();
             prop_assert_eq!(samples, 0);
         }
     }

@@ -1,3 +1,123 @@
-//! Bytes to samples: pure, incremental, in bounded memory.
+//! Bytes of trackers to samples: pure, incremental, one file for each format.
+//!
+//! A decoder is pushed bytes as they come and tells what they hold. However the bytes of a stream are split, the events
+//! are the same; formats that come in messages (a HID report, a datagram) are pushed one message at a time instead.
 
 pub mod line;
+
+use holod_calibration::TimeNs;
+
+use crate::SampleEye;
+
+/// A sample as the wire gives it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct WireSample {
+    /// The tracker's own clock; its origin means nothing. None where the wire carries no time: the time of arrival stands
+    /// in for it.
+    pub t_device: Option<TimeNs>,
+    /// The eye.
+    pub eye: SampleEye,
+    /// Diameter in millimetres, by the profile's conversion; in the tracker's own unit where only the rig's scale knows
+    /// the conversion. Means nothing unless `valid`.
+    pub diameter_mm: f32,
+    /// The tracker's confidence, 0..=1; 1 where it gives none.
+    pub confidence: f32,
+    /// Distance between the lids in millimetres, from trackers that measure it.
+    pub aperture_mm: Option<f32>,
+    /// The tracker's running number, where it has one.
+    pub sequence: Option<u64>,
+    /// False where the tracker itself says that it sees no pupil.
+    pub valid: bool,
+}
+
+/// Why bytes were rejected.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum WireFault {
+    /// Longer than any message of the format.
+    TooLong,
+    /// Shorter than a message of the format.
+    TooShort,
+    /// Not of the format's form.
+    Malformed,
+    /// A version of the format that is not known.
+    UnknownVersion,
+    /// The checksum is missing or does not match.
+    BadChecksum,
+    /// A field is not a number.
+    BadNumber,
+    /// The eye is none that the format knows.
+    BadEye,
+    /// A figure is NaN or infinite.
+    NotFinite,
+    /// The size is negative, and that is not the format's word for a lost pupil.
+    Negative,
+    /// The confidence lies outside its range.
+    BadConfidence,
+    /// A field that a sample needs is not there.
+    MissingField,
+    /// Bytes between two messages that belong to neither.
+    OutOfStep,
+}
+
+impl WireFault {
+    /// Every reason, in the order of their indices.
+    pub const ALL: [Self; 12] = [
+        Self::TooLong,
+        Self::TooShort,
+        Self::Malformed,
+        Self::UnknownVersion,
+        Self::BadChecksum,
+        Self::BadNumber,
+        Self::BadEye,
+        Self::NotFinite,
+        Self::Negative,
+        Self::BadConfidence,
+        Self::MissingField,
+        Self::OutOfStep,
+    ];
+
+    /// Its place in [`Self::ALL`].
+    pub const fn index(self) -> usize {
+        self as usize
+    }
+
+    /// The name under which it is counted.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::TooLong => "wire_too_long",
+            Self::TooShort => "wire_too_short",
+            Self::Malformed => "wire_malformed",
+            Self::UnknownVersion => "wire_unknown_version",
+            Self::BadChecksum => "wire_bad_checksum",
+            Self::BadNumber => "wire_bad_number",
+            Self::BadEye => "wire_bad_eye",
+            Self::NotFinite => "wire_not_finite",
+            Self::Negative => "wire_negative",
+            Self::BadConfidence => "wire_bad_confidence",
+            Self::MissingField => "wire_missing_field",
+            Self::OutOfStep => "wire_out_of_step",
+        }
+    }
+}
+
+/// What some bytes turned out to be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum WireEvent {
+    /// A sample. A message about two eyes is two of these.
+    Sample(WireSample),
+    /// A message that is no sample and no fault: a comment, a header, an acknowledgement.
+    Note,
+    /// A message that is no sample, with the reason.
+    Rejected(WireFault),
+    /// What was left of a message when reading began in its middle; not a fault.
+    Partial,
+}
+
+/// Bytes in, events out. After it is made it allocates nothing.
+pub trait Decoder: Send {
+    /// Takes bytes and calls `on_event` for each message that they complete.
+    fn push(&mut self, bytes: &[u8], on_event: &mut dyn FnMut(WireEvent));
+
+    /// Ends the stream: a last line without its ending is read, anything else that is incomplete is dropped.
+    fn finish(&mut self, on_event: &mut dyn FnMut(WireEvent));
+}

@@ -1,0 +1,516 @@
+//! Logs of pupil diameters, told apart by their content and read into one shape: one file for each format.
+//!
+//! A log is read in one pass, as a stream: what stays in memory is 24 bytes a sample.
+
+mod lines;
+mod neon;
+
+use std::fmt;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+
+use holod_calibration::TimeNs;
+
+use crate::wire::WireFault;
+use crate::{PupilSample, SampleEye};
+
+/// The kinds of log that are known.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LogFormat {
+    /// holod's line protocol.
+    Lines,
+    /// Pupil Labs Neon, 3D eye states.
+    NeonEyeStates,
+}
+
+impl LogFormat {
+    /// Its name for people.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Lines => "holod line protocol",
+            Self::NeonEyeStates => "Pupil Labs Neon 3d_eye_states.csv",
+        }
+    }
+}
+
+impl fmt::Display for LogFormat {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// What a tracker's figures are, before the rig's scale.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum SizeUnit {
+    /// Diameters in millimetres.
+    #[default]
+    Millimetres,
+    /// Diameters in pixels of the eye camera.
+    Pixels,
+    /// Diameters in units of the tracker's own; an area A is given as the diameter 2·√(A/π) of its disc.
+    Arbitrary,
+}
+
+impl SizeUnit {
+    /// Its name for people.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Millimetres => "mm",
+            Self::Pixels => "camera pixels",
+            Self::Arbitrary => "arbitrary units",
+        }
+    }
+}
+
+/// What goes into reading one log, apart from the log itself.
+pub(crate) struct Importer {
+    pub(crate) format: LogFormat,
+    /// Whether the log is of this format; looks at content.
+    pub(crate) recognises: fn(&LogInput<'_>) -> bool,
+    /// Reads all of it into the builder. Single bad lines are counted there; an error is for a log that is wrong as a whole.
+    pub(crate) read: fn(&LogInput<'_>, &mut LogBuilder) -> Result<(), ReplayError>,
+}
+
+/// In the order in which they are asked.
+const IMPORTERS: [Importer; 2] = [lines::IMPORTER, neon::IMPORTER];
+
+/// A log file that has not been read yet.
+pub(crate) struct LogInput<'a> {
+    pub(crate) path: &'a Path,
+    /// Its first 64 KiB (all of a shorter one), without a byte order mark.
+    pub(crate) head: Vec<u8>,
+}
+
+const HEAD_BYTES: u64 = 1 << 16;
+const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
+
+impl<'a> LogInput<'a> {
+    fn new(path: &'a Path) -> Result<Self, ReplayError> {
+        let mut input = Self { path, head: Vec::new() };
+        let mut head = Vec::new();
+        input.open()?.take(HEAD_BYTES).read_to_end(&mut head).map_err(|source| input.io(source))?;
+        input.head = head;
+        Ok(input)
+    }
+
+    /// From its beginning, without a byte order mark.
+    pub(crate) fn open(&self) -> Result<Box<dyn BufRead>, ReplayError> {
+        let file = File::open(self.path).map_err(|source| self.io(source))?;
+        let mut reader = BufReader::with_capacity(1 << 18, file);
+        if reader.fill_buf().map_err(|source| self.io(source))?.starts_with(BYTE_ORDER_MARK) {
+            reader.consume(BYTE_ORDER_MARK.len());
+        }
+        Ok(Box::new(reader))
+    }
+
+    /// Its non-empty first lines, trimmed; the last may be cut off by the end of the head.
+    pub(crate) fn head_lines(&self) -> impl Iterator<Item = &[u8]> {
+        self.head.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii).filter(|line| !line.is_empty())
+    }
+
+    pub(crate) fn io(&self, source: std::io::Error) -> ReplayError {
+        ReplayError::Io { path: self.path.into(), source }
+    }
+}
+
+/// What went wrong with a log as a whole.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// It cannot be read.
+    #[error("pupil log {path}: {source}; expected a readable file")]
+    Io {
+        /// The log.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// It is a directory or a device.
+    #[error("pupil log {path} is {found}; expected a log file{hint}")]
+    NotAFile {
+        /// The path.
+        path: PathBuf,
+        /// What it is.
+        found: &'static str,
+        /// What to do.
+        hint: &'static str,
+    },
+    /// Its beginning is of no known format.
+    #[error(
+        "pupil log {path}, line 1: found {found}; expected one of: {}; convert the log to one of these",
+        known_formats()
+    )]
+    UnknownFormat {
+        /// The log.
+        path: PathBuf,
+        /// How it begins.
+        found: String,
+    },
+    /// It is of a known format and wrong as a whole.
+    #[error("pupil log {path}{at}: found {found}; expected {expected}")]
+    Content {
+        /// The log.
+        path: PathBuf,
+        /// `, line 7`, or nothing.
+        at: String,
+        /// What is there.
+        found: String,
+        /// What should be there, and what to do.
+        expected: String,
+    },
+    /// Not one sample could be read.
+    #[error(
+        "pupil log {path} holds no sample: {rejected} of its lines were rejected ({reasons}); expected at least one"
+    )]
+    Empty {
+        /// The log.
+        path: PathBuf,
+        /// Rejected lines.
+        rejected: u64,
+        /// How many for which reason.
+        reasons: String,
+    },
+    /// Its times are in no order.
+    #[error(
+        "pupil log {path} is not in order of time: {backwards} of {rows} times go backwards, the first in line {line}; \
+         sort it by time"
+    )]
+    Unsorted {
+        /// The log.
+        path: PathBuf,
+        /// Times that go backwards.
+        backwards: u64,
+        /// Times in all.
+        rows: u64,
+        /// Line of the first.
+        line: u64,
+    },
+}
+
+/// Why a line or a cell of a log was rejected.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum LogFault {
+    /// A message of a wire format with this fault.
+    Wire(WireFault),
+    /// A row that is too short or not text.
+    Malformed,
+    /// Time or diameter is not a number.
+    BadNumber,
+    /// The diameter is missing.
+    Missing,
+    /// The diameter is NaN or infinite.
+    NotFinite,
+    /// The diameter is negative.
+    Negative,
+    /// The time lies before its predecessor's.
+    Backwards,
+}
+
+/// The names under which faults are counted, in the order of [`LogFault::index`].
+pub(crate) const LOG_FAULT_NAMES: [&str; 6 + WireFault::ALL.len()] = {
+    let mut names = [""; 6 + WireFault::ALL.len()];
+    let mut k = 0;
+    while k < WireFault::ALL.len() {
+        names[k] = WireFault::ALL[k].name();
+        k += 1;
+    }
+    names[k] = "log_malformed";
+    names[k + 1] = "log_bad_number";
+    names[k + 2] = "log_missing";
+    names[k + 3] = "log_not_finite";
+    names[k + 4] = "log_negative";
+    names[k + 5] = "log_backwards";
+    names
+};
+
+impl LogFault {
+    pub(crate) const fn index(self) -> usize {
+        let lines = WireFault::ALL.len();
+        match self {
+            Self::Wire(fault) => fault.index(),
+            Self::Malformed => lines,
+            Self::BadNumber => lines + 1,
+            Self::Missing => lines + 2,
+            Self::NotFinite => lines + 3,
+            Self::Negative => lines + 4,
+            Self::Backwards => lines + 5,
+        }
+    }
+}
+
+/// How many lines or cells of a log were rejected, by reason.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct LogFaults([u64; LOG_FAULT_NAMES.len()]);
+
+impl LogFaults {
+    /// How many were rejected for `fault`.
+    pub const fn of(&self, fault: LogFault) -> u64 {
+        self.0[fault.index()]
+    }
+
+    /// How many were rejected in all.
+    pub fn total(&self) -> u64 {
+        self.0.iter().sum()
+    }
+
+    /// Each reason's name and count.
+    pub fn entries(&self) -> impl Iterator<Item = (&'static str, u64)> {
+        LOG_FAULT_NAMES.into_iter().zip(self.0)
+    }
+
+    pub(crate) const fn count(&mut self, fault: LogFault) {
+        self.0[fault.index()] += 1;
+    }
+}
+
+/// One recorded sample, compact.
+#[derive(Clone, Copy, Debug)]
+struct Row {
+    t_ns: i64,
+    diameter_mm: f32,
+    confidence: f32,
+    /// NaN where there is none.
+    aperture_mm: f32,
+    eye: SampleEye,
+    valid: bool,
+}
+
+/// A sample for [`LogBuilder::push`].
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct LogSample {
+    pub(crate) t: TimeNs,
+    pub(crate) eye: SampleEye,
+    /// In the log's unit; means nothing unless `valid`.
+    pub(crate) diameter: f32,
+    /// 1 where the log has none.
+    pub(crate) confidence: f32,
+    pub(crate) aperture_mm: Option<f32>,
+    /// False where the log says that the tracker saw no pupil: such a sample tells the gate of a blink, a missing one does
+    /// not.
+    pub(crate) valid: bool,
+}
+
+/// A blink that the tracker or its software found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Blink {
+    /// The eye; both where the log does not say.
+    pub eye: SampleEye,
+    /// Its first instant on the log's clock.
+    pub begins: TimeNs,
+    /// Its last instant on the log's clock.
+    pub ends: TimeNs,
+}
+
+/// What an importer fills.
+#[derive(Debug, Default)]
+pub(crate) struct LogBuilder {
+    rows: Vec<Row>,
+    pub(crate) faults: LogFaults,
+    pub(crate) unit: SizeUnit,
+    /// The rate that the log's header states.
+    pub(crate) stated_rate_hz: Option<f64>,
+    pub(crate) blinks: Vec<Blink>,
+    /// What a user should know of how the log was read, a sentence each.
+    pub(crate) notes: Vec<String>,
+    /// Lines or rows whose time could be read.
+    times: u64,
+    first_backwards: Option<u64>,
+    /// Of each eye: the cameras of two eyes may run free of each other.
+    latest_ns: [Option<i64>; 3],
+}
+
+/// A time beyond this, a hundred years from any origin, is no time; differences of two stay within i64.
+const GREATEST_NS: u64 = 3_200_000_000_000_000_000;
+
+impl LogBuilder {
+    pub(crate) fn count(&mut self, fault: LogFault) {
+        self.faults.count(fault);
+    }
+
+    /// Takes a sample of line (or record) `line`; one that goes back in time against its own eye is counted and dropped.
+    pub(crate) fn push(&mut self, sample: LogSample, line: u64) {
+        let LogSample { t, eye, diameter, confidence, aperture_mm, valid } = sample;
+        if t.0.unsigned_abs() > GREATEST_NS {
+            return self.count(LogFault::BadNumber);
+        }
+        self.times += 1;
+        let latest = &mut self.latest_ns[eye.index()];
+        if latest.is_some_and(|latest| t.0 < latest) {
+            self.first_backwards.get_or_insert(line);
+            return self.count(LogFault::Backwards);
+        }
+        *latest = Some(t.0);
+        let aperture_mm = aperture_mm.unwrap_or(f32::NAN);
+        self.rows.push(Row { t_ns: t.0, diameter_mm: diameter, confidence, aperture_mm, eye, valid });
+    }
+
+    /// Reads a diameter's cell: a finite number that is not negative.
+    pub(crate) fn diameter(text: &str) -> Result<f32, LogFault> {
+        if text.is_empty() {
+            return Err(LogFault::Missing);
+        }
+        let diameter: f32 = text.parse().map_err(|_| LogFault::BadNumber)?;
+        if !diameter.is_finite() {
+            Err(LogFault::NotFinite)
+        } else if diameter < 0.0 {
+            Err(LogFault::Negative)
+        } else {
+            Ok(diameter)
+        }
+    }
+
+    fn finish(mut self, format: LogFormat, path: &Path) -> Result<Recording, ReplayError> {
+        let backwards = self.faults.of(LogFault::Backwards);
+        if backwards * 2 > self.times {
+            let line = self.first_backwards.unwrap_or(0);
+            return Err(ReplayError::Unsorted { path: path.into(), backwards, rows: self.times, line });
+        }
+        if self.rows.is_empty() {
+            let reasons = self.faults.entries().filter(|(_, count)| *count > 0);
+            let reasons: Vec<_> = reasons.map(|(name, count)| format!("{name} {count}")).collect();
+            let reasons = if reasons.is_empty() { "there are no lines".into() } else { reasons.join(", ") };
+            return Err(ReplayError::Empty { path: path.into(), rejected: self.faults.total(), reasons });
+        }
+        if !self.rows.is_sorted_by_key(|row| row.t_ns) {
+            self.rows.sort_by_key(|row| row.t_ns);
+        }
+        self.rows.shrink_to_fit();
+        self.blinks.sort_by_key(|blink| blink.begins);
+        let Self { rows, faults, unit, stated_rate_hz, blinks, notes, .. } = self;
+        Ok(Recording { format, unit, rows, blinks, faults, stated_rate_hz, notes })
+    }
+}
+
+/// A whole log in memory, in order of time.
+#[derive(Clone, Debug)]
+pub struct Recording {
+    format: LogFormat,
+    unit: SizeUnit,
+    rows: Vec<Row>,
+    blinks: Vec<Blink>,
+    faults: LogFaults,
+    stated_rate_hz: Option<f64>,
+    notes: Vec<String>,
+}
+
+impl Recording {
+    /// Reads a log.
+    ///
+    /// # Errors
+    /// It is no readable file, of no known format, without a single sample, or in no order of time. Single bad lines are
+    /// counted instead: [`Self::faults`].
+    pub fn read(path: &Path) -> Result<Self, ReplayError> {
+        let kind = std::fs::metadata(path).map_err(|source| ReplayError::Io { path: path.into(), source })?.file_type();
+        if kind.is_dir() {
+            let hint = "; give the file in it, such as 3d_eye_states.csv";
+            return Err(ReplayError::NotAFile { path: path.into(), found: "a directory", hint });
+        }
+        if !kind.is_file() {
+            let hint = "; for a live tracker give `serial:PATH`";
+            return Err(ReplayError::NotAFile { path: path.into(), found: "a device or pipe", hint });
+        }
+        let input = LogInput::new(path)?;
+        let importer = IMPORTERS
+            .iter()
+            .find(|importer| (importer.recognises)(&input))
+            .ok_or_else(|| ReplayError::UnknownFormat { path: path.into(), found: beginning(&input) })?;
+        let mut builder = LogBuilder::default();
+        (importer.read)(&input, &mut builder)?;
+        builder.finish(importer.format, path)
+    }
+
+    /// The format that was recognised.
+    pub const fn format(&self) -> LogFormat {
+        self.format
+    }
+
+    /// What the diameters are, before the rig's scale.
+    pub const fn unit(&self) -> SizeUnit {
+        self.unit
+    }
+
+    /// The rate that the log's header states, if it does.
+    pub const fn stated_rate_hz(&self) -> Option<f64> {
+        self.stated_rate_hz
+    }
+
+    /// What a user should know of how the log was read.
+    pub fn notes(&self) -> &[String] {
+        &self.notes
+    }
+
+    /// How many samples there are.
+    pub const fn len(&self) -> usize {
+        self.rows.len()
+    }
+
+    /// Never: a log without samples is an error.
+    pub const fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
+    /// Blinks that the log or a companion file tells, in order of time. They do not reach the gate, since no live tracker
+    /// knows them.
+    pub fn blinks(&self) -> &[Blink] {
+        &self.blinks
+    }
+
+    /// What was rejected.
+    pub const fn faults(&self) -> LogFaults {
+        self.faults
+    }
+
+    /// Time of the first sample on the log's clock.
+    pub fn begins(&self) -> TimeNs {
+        TimeNs(self.rows[0].t_ns)
+    }
+
+    /// Time of the last sample on the log's clock.
+    pub fn ends(&self) -> TimeNs {
+        TimeNs(self.rows[self.rows.len() - 1].t_ns)
+    }
+
+    /// Every sample, its three times the log's own.
+    pub fn samples(&self) -> impl Iterator<Item = PupilSample> {
+        (0..self.rows.len()).map(|index| self.sample(index))
+    }
+
+    pub(crate) fn sample(&self, index: usize) -> PupilSample {
+        let row = self.rows[index];
+        let t = TimeNs(row.t_ns);
+        PupilSample {
+            t_device: t,
+            t_sample: t,
+            t_arrival: t,
+            eye: row.eye,
+            diameter_mm: row.diameter_mm,
+            confidence: row.confidence,
+            aperture_mm: (!row.aperture_mm.is_nan()).then_some(row.aperture_mm),
+            sequence: None,
+            valid: row.valid,
+        }
+    }
+
+    /// By how much a repetition of the log is later: its length and one usual interval.
+    pub(crate) fn period(&self) -> TimeNs {
+        let length = self.ends() - self.begins();
+        let instants = 1 + self.rows.windows(2).filter(|pair| pair[0].t_ns != pair[1].t_ns).count() as i64;
+        length + TimeNs((length.0 / instants.max(1)).max(1_000_000))
+    }
+}
+
+fn known_formats() -> String {
+    let names: Vec<_> = IMPORTERS.iter().map(|importer| importer.format.name()).collect();
+    names.join(", ")
+}
+
+/// How an unknown file begins, for people.
+fn beginning(input: &LogInput<'_>) -> String {
+    match input.head_lines().next() {
+        None => "an empty file".into(),
+        Some(line) => {
+            let shown: String = String::from_utf8_lossy(&line[..line.len().min(120)]).escape_debug().collect();
+            format!("`{shown}`{}", if line.len() > 120 { "..." } else { "" })
+        }
+    }
+}
