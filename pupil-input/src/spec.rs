@@ -4,7 +4,6 @@ use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use crate::profile::DEFAULT_PROFILE;
 use crate::source::mock::Scenario;
 
 /// A parsed tracker spec.
@@ -16,11 +15,38 @@ pub enum TrackerSpec {
     Serial {
         /// The port.
         path: PathBuf,
-        /// The tracker's profile.
-        profile: String,
+        /// The tracker's profile; [`DEFAULT_PROFILE`](crate::DEFAULT_PROFILE) where the spec names none.
+        profile: Option<String>,
         /// Bits a second; the profile's own where the spec names none.
         baud: Option<u32>,
     },
+    /// `hid[:VID:PID][,profile=NAME][,serial=TEXT]`
+    Hid {
+        /// USB vendor and product; the profile's own where the spec names none.
+        ids: Option<UsbIds>,
+        /// The device's serial number, to tell two of a kind apart.
+        serial: Option<String>,
+        /// The tracker's profile; the one that knows the ids where the spec names none.
+        profile: Option<String>,
+    },
+    /// `tcp:HOST:PORT,profile=NAME`
+    Tcp {
+        /// Host and port.
+        address: HostPort,
+        /// The tracker's profile.
+        profile: String,
+    },
+    /// `udp:HOST:PORT,profile=NAME`: listens there
+    Udp {
+        /// Address of this machine and port.
+        address: HostPort,
+        /// The tracker's profile.
+        profile: String,
+    },
+    /// `core[:HOST[:PORT]]`: Pupil Labs Core, its Pupil Remote
+    Core(HostPort),
+    /// `neon[:HOST[:PORT]]`: Pupil Labs Neon, its Companion's REST port
+    Neon(HostPort),
     /// `replay:FILE[,speed=X][,loop]`
     Replay {
         /// The log.
@@ -32,6 +58,49 @@ pub enum TrackerSpec {
     },
     /// `mock[:SCENARIO]`
     Mock(Scenario),
+}
+
+/// USB vendor and product.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct UsbIds {
+    /// Vendor.
+    pub vendor: u16,
+    /// Product.
+    pub product: u16,
+}
+
+impl fmt::Display for UsbIds {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:04x}:{:04x}", self.vendor, self.product)
+    }
+}
+
+impl FromStr for UsbIds {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let number = |part: &str| (part.len() <= 4).then(|| u16::from_str_radix(part, 16).ok()).flatten();
+        let ids = text.split_once(':').and_then(|(vendor, product)| number(vendor).zip(number(product)));
+        let (vendor, product) =
+            ids.ok_or_else(|| format!("`{text}` is no USB VID:PID, two hexadecimal numbers such as 1209:0001"))?;
+        Ok(Self { vendor, product })
+    }
+}
+
+/// A name or address of a host, and a port.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct HostPort {
+    /// Name or address; an IPv6 address without its brackets.
+    pub host: String,
+    /// Port.
+    pub port: u16,
+}
+
+impl fmt::Display for HostPort {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { host, port } = self;
+        if host.contains(':') { write!(f, "[{host}]:{port}") } else { write!(f, "{host}:{port}") }
+    }
 }
 
 /// How fast a log is played.
@@ -53,8 +122,13 @@ pub struct SpecError {
 
 /// Bits a second where neither spec nor profile names any.
 pub(crate) const DEFAULT_BAUD: u32 = 115_200;
-const FORMS: &str = "`/dev/ttyUSB0`, `serial:PATH[,profile=NAME][,baud=N]`, `replay:FILE[,speed=X|max][,loop]`, a log \
-                     file, or `mock[:SCENARIO]`";
+/// Port of Pupil Remote.
+const CORE_PORT: u16 = 50020;
+/// Port of the Companion's REST interface.
+const NEON_PORT: u16 = 8080;
+const FORMS: &str = "`/dev/ttyUSB0`, `serial:PATH[,profile=NAME][,baud=N]`, `hid:VID:PID[,profile=NAME][,serial=TEXT]`, \
+                     `tcp:HOST:PORT,profile=NAME`, `udp:HOST:PORT,profile=NAME`, `core[:HOST[:PORT]]`, \
+                     `neon[:HOST[:PORT]]`, `replay:FILE[,speed=X|max][,loop]`, a log file, or `mock[:SCENARIO]`";
 
 impl FromStr for TrackerSpec {
     type Err = SpecError;
@@ -78,9 +152,13 @@ fn parse(spec: &str) -> Result<TrackerSpec, String> {
         ("serial", Some(rest)) => parse_serial(rest),
         ("replay", Some(rest)) => parse_replay(rest),
         ("serial" | "replay", None) => Err(format!("lacks a path: expected `{scheme}:PATH`")),
-        ("hid", _) => Err("HID trackers are not supported by this version of holod; have a small bridge write the \
-                           line protocol to a serial port or PTY and give that port's path"
-            .into()),
+        ("hid", rest) => parse_hid(rest.unwrap_or_default()),
+        ("tcp", Some(rest)) => parse_network(rest).map(|(address, profile)| TrackerSpec::Tcp { address, profile }),
+        ("udp", Some(rest)) => parse_network(rest).map(|(address, profile)| TrackerSpec::Udp { address, profile }),
+        ("core", None) => Ok(TrackerSpec::Core(HostPort { host: "127.0.0.1".into(), port: CORE_PORT })),
+        ("core", Some(rest)) => host_port(rest, Some(CORE_PORT)).map(TrackerSpec::Core),
+        ("neon", None) => Ok(TrackerSpec::Neon(HostPort { host: "neon.local".into(), port: NEON_PORT })),
+        ("neon", Some(rest)) => host_port(rest, Some(NEON_PORT)).map(TrackerSpec::Neon),
         (scheme, Some(_)) if !scheme.contains('/') && !scheme.contains('.') => {
             Err(format!("unknown kind `{scheme}:`; expected {FORMS}"))
         }
@@ -111,7 +189,7 @@ fn is_word_option(option: &str) -> bool {
 fn parse_serial(rest: &str) -> Result<TrackerSpec, String> {
     let (path, options) = split_options(rest)?;
     let mut baud = None;
-    let mut profile = DEFAULT_PROFILE.to_owned();
+    let mut profile = None;
     for option in options {
         match option.split_once('=') {
             Some(("baud", value)) => {
@@ -119,11 +197,60 @@ fn parse_serial(rest: &str) -> Result<TrackerSpec, String> {
                     format!("baud `{value}` is not a whole number of bits a second, such as {DEFAULT_BAUD}")
                 })?);
             }
-            Some(("profile", name)) => name.clone_into(&mut profile),
+            Some(("profile", name)) => profile = Some(name.to_owned()),
             _ => return Err(format!("unknown option `{option}`; expected profile=NAME or baud=N")),
         }
     }
     Ok(TrackerSpec::Serial { path: path.into(), profile, baud })
+}
+
+fn parse_hid(rest: &str) -> Result<TrackerSpec, String> {
+    let (ids, options) = match rest.split_once(',') {
+        Some((ids, options)) => (ids, options.split(',').collect()),
+        None => (rest, Vec::new()),
+    };
+    let ids = if ids.is_empty() { None } else { Some(ids.parse()?) };
+    let (mut serial, mut profile) = (None, None);
+    for option in options {
+        match option.split_once('=') {
+            Some(("profile", name)) => profile = Some(name.to_owned()),
+            Some(("serial", text)) => serial = Some(text.to_owned()),
+            _ => return Err(format!("unknown option `{option}`; expected profile=NAME or serial=TEXT")),
+        }
+    }
+    if ids.is_none() && profile.is_none() {
+        return Err("names no device: expected `hid:VID:PID` or `hid:,profile=NAME`".into());
+    }
+    Ok(TrackerSpec::Hid { ids, serial, profile })
+}
+
+fn parse_network(rest: &str) -> Result<(HostPort, String), String> {
+    let (address, option) = rest.split_once(',').unwrap_or((rest, ""));
+    let address = host_port(address, None)?;
+    match option.split_once('=') {
+        Some(("profile", name)) => Ok((address, name.to_owned())),
+        _ => Err(format!("found `{option}` behind the address, expected `profile=NAME`")),
+    }
+}
+
+/// `HOST:PORT`, `[IPV6]:PORT`, or just a host where there is a default port.
+fn host_port(text: &str, default_port: Option<u16>) -> Result<HostPort, String> {
+    let wrong = || format!("`{text}` is no address such as 192.168.1.20:{}", default_port.unwrap_or(4242));
+    let (host, port) = match text.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+        Some((host, port)) => (host, port.strip_prefix(':')),
+        None => match text.split_once(':') {
+            Some((host, port)) => (host, Some(port)),
+            None => (text, None),
+        },
+    };
+    let port = match port {
+        Some(port) => port.parse().ok().filter(|port| *port > 0),
+        None => default_port,
+    };
+    if host.is_empty() {
+        return Err(wrong());
+    }
+    Ok(HostPort { host: host.into(), port: port.ok_or_else(wrong)? })
 }
 
 fn parse_replay(rest: &str) -> Result<TrackerSpec, String> {
@@ -149,14 +276,29 @@ fn parse_replay(rest: &str) -> Result<TrackerSpec, String> {
     Ok(TrackerSpec::Replay { path: path.into(), speed, repeat })
 }
 
+fn write_option(f: &mut fmt::Formatter<'_>, key: &str, value: Option<&impl fmt::Display>) -> fmt::Result {
+    value.map_or(Ok(()), |value| write!(f, ",{key}={value}"))
+}
+
 impl fmt::Display for TrackerSpec {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Path(path) => path.display().fmt(f),
             Self::Serial { path, profile, baud } => {
-                write!(f, "serial:{},profile={profile}", path.display())?;
-                baud.map_or(Ok(()), |baud| write!(f, ",baud={baud}"))
+                write!(f, "serial:{}", path.display())?;
+                write_option(f, "profile", profile.as_ref())?;
+                write_option(f, "baud", baud.as_ref())
             }
+            Self::Hid { ids, serial, profile } => {
+                f.write_str("hid:")?;
+                ids.map_or(Ok(()), |ids| ids.fmt(f))?;
+                write_option(f, "profile", profile.as_ref())?;
+                write_option(f, "serial", serial.as_ref())
+            }
+            Self::Tcp { address, profile } => write!(f, "tcp:{address},profile={profile}"),
+            Self::Udp { address, profile } => write!(f, "udp:{address},profile={profile}"),
+            Self::Core(address) => write!(f, "core:{address}"),
+            Self::Neon(address) => write!(f, "neon:{address}"),
             Self::Replay { path, speed, repeat } => {
                 write!(f, "replay:{}", path.display())?;
                 match speed {
@@ -183,14 +325,10 @@ mod tests {
         assert_eq!(parsed("/dev/ttyUSB0"), TrackerSpec::Path("/dev/ttyUSB0".into()));
         assert_eq!(parsed("./odd:name.csv"), TrackerSpec::Path("./odd:name.csv".into()));
         assert_eq!(parsed("/dev/serial/by-id/usb:1"), TrackerSpec::Path("/dev/serial/by-id/usb:1".into()));
-        let profile = || "holod".to_owned();
-        assert_eq!(
-            parsed("serial:/dev/x"),
-            TrackerSpec::Serial { path: "/dev/x".into(), profile: profile(), baud: None }
-        );
+        assert_eq!(parsed("serial:/dev/x"), TrackerSpec::Serial { path: "/dev/x".into(), profile: None, baud: None });
         assert_eq!(
             parsed("serial:/dev/x,profile=holod,baud=9600"),
-            TrackerSpec::Serial { path: "/dev/x".into(), profile: profile(), baud: Some(9600) }
+            TrackerSpec::Serial { path: "/dev/x".into(), profile: Some("holod".into()), baud: Some(9600) }
         );
         assert_eq!(
             parsed("replay:a,B.csv,speed=2.5,loop"),
@@ -206,7 +344,18 @@ mod tests {
 
     #[test]
     fn what_is_shown_reads_as_the_same() {
-        for spec in ["/dev/ttyUSB0", "serial:/dev/x,baud=9600", "replay:a.csv,speed=0.5,loop", "mock:steady"] {
+        for spec in [
+            "/dev/ttyUSB0",
+            "serial:/dev/x,profile=iscan,baud=9600",
+            "hid:1209:0001,profile=x,serial=A1",
+            "hid:,profile=x",
+            "tcp:host:4242,profile=open-gaze",
+            "udp:[::1]:6900,profile=pupilext-csv",
+            "core:10.0.0.2:50020",
+            "neon:neon.local:8080",
+            "replay:a.csv,speed=0.5,loop",
+            "mock:steady",
+        ] {
             assert_eq!(parsed(&parsed(spec).to_string()), parsed(spec));
         }
     }
@@ -215,9 +364,15 @@ mod tests {
     fn each_mistake_is_told() {
         let cases = [
             ("", "is empty"),
-            ("hid:1234:5678", "HID trackers are not supported"),
-            ("hid", "HID trackers are not supported"),
-            ("tcp:host", "unknown kind `tcp:`"),
+            ("hid:1234", "`1234` is no USB VID:PID"),
+            ("hid:12345:1", "is no USB VID:PID"),
+            ("hid", "names no device"),
+            ("hid:1234:5678,port=1", "unknown option `port=1`"),
+            ("tcp:host,profile=x", "`host` is no address"),
+            ("tcp:host:0,profile=x", "`host:0` is no address"),
+            ("tcp:host:4242", "expected `profile=NAME`"),
+            ("core::1", "is no address"),
+            ("usb:host", "unknown kind `usb:`"),
             ("serial:", "lacks a path"),
             ("serial", "lacks a path"),
             ("serial:/dev/x,baud=fast", "baud `fast`"),

@@ -269,8 +269,13 @@ impl Job {
                 repeat: false,
                 origin,
             }),
-            TrackerSpec::Path(path) => Self::serial(path, DEFAULT_PROFILE, None),
-            TrackerSpec::Serial { path, profile, baud } => Self::serial(path, profile, *baud),
+            TrackerSpec::Path(path) => Self::serial(path, None, None),
+            TrackerSpec::Serial { path, profile, baud } => Self::serial(path, profile.as_deref(), *baud),
+            TrackerSpec::Hid { .. } => unimplemented!("HID"),
+            TrackerSpec::Tcp { .. } => unimplemented!("TCP"),
+            TrackerSpec::Udp { .. } => unimplemented!("UDP"),
+            TrackerSpec::Core(_) => unimplemented!("Core"),
+            TrackerSpec::Neon(_) => unimplemented!("Neon"),
             TrackerSpec::Replay { path, speed, repeat } => {
                 Ok(Self::Replay { recording: Box::new(Recording::read(path)?), speed: *speed, repeat: *repeat, origin })
             }
@@ -287,8 +292,8 @@ impl Job {
         }
     }
 
-    fn serial(path: &Path, profile: &str, baud: Option<u32>) -> Result<Self, TrackerError> {
-        let profile = Profile::find(profile)?;
+    fn serial(path: &Path, profile: Option<&str>, baud: Option<u32>) -> Result<Self, TrackerError> {
+        let profile = Profile::find(profile.unwrap_or(DEFAULT_PROFILE))?;
         Self::live(Box::new(SerialFeed { path: path.into(), baud: baud.unwrap_or(DEFAULT_BAUD) }), profile)
     }
 

@@ -80,6 +80,13 @@ fn tracker(rig: &Rig) -> Check {
         Ok(TrackerSpec::Path(path) | TrackerSpec::Serial { path, .. } | TrackerSpec::Replay { path, .. }) => {
             present(&path, "plug the tracker in or correct tracker.spec")
         }
+        Ok(
+            TrackerSpec::Hid { .. }
+            | TrackerSpec::Tcp { .. }
+            | TrackerSpec::Udp { .. }
+            | TrackerSpec::Core(_)
+            | TrackerSpec::Neon(_),
+        ) => (true, format!("{spec}: not tried; `holod tracker try {spec}` does")),
     };
     Check { name, passed, says }
 }
