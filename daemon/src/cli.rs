@@ -36,9 +36,35 @@ pub enum Command {
     Check(CheckArgs),
     /// Measure the median time of each stage, beside the machine's arithmetic peak.
     Bench(BenchArgs),
+    /// Say what the running daemon is doing.
+    Status(StatusArgs),
+    /// List trackers, or try one out.
+    #[command(subcommand)]
+    Tracker(TrackerCommand),
+    /// Look into logs of pupil diameters, or convert them.
+    #[command(subcommand)]
+    Log(LogCommand),
     /// Put the lasers out (for a service's ExecStopPost).
     #[command(hide = true)]
     Dark(DarkArgs),
+}
+
+/// What can be done with trackers.
+#[derive(Subcommand, Debug)]
+pub enum TrackerCommand {
+    /// The profiles that holod knows, and the ports and devices that are plugged in.
+    List(ListArgs),
+    /// Read a tracker for a while: a live plot, rates, jitter, losses, and each rejection with its reason.
+    Try(TryArgs),
+}
+
+/// What can be done with logs.
+#[derive(Subcommand, Debug)]
+pub enum LogCommand {
+    /// Say what a log is: format, eyes, rate, gaps, blinks, range, units, rejected lines.
+    Info(LogInfoArgs),
+    /// Write a log in another format.
+    Convert(LogConvertArgs),
 }
 
 /// Where the rig comes from.
@@ -103,8 +129,9 @@ pub struct RunArgs {
     #[arg(
         long,
         value_name = "SPEC",
-        help = "Eye tracker: /dev/ttyUSB0, serial:PATH[,baud=N], replay:FILE[,speed=X|max][,loop], a log FILE, or \
-                mock[:SCENARIO]"
+        help = "Eye tracker: /dev/ttyUSB0, serial:PATH[,profile=NAME][,baud=N], hid:VID:PID[,profile=NAME], \
+                tcp:HOST:PORT,profile=NAME, udp:HOST:PORT,profile=NAME, core[:HOST], neon[:HOST], \
+                replay:FILE[,speed=X|max][,loop], a log FILE, or mock[:SCENARIO]; `holod tracker list` names profiles"
     )]
     pub tracker: Option<String>,
     /// The scene.
@@ -227,12 +254,98 @@ pub struct BenchArgs {
     pub json: bool,
 }
 
+/// Options of `status`.
+#[derive(Args, Debug, Clone)]
+pub struct StatusArgs {
+    /// Print the status as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Options of `tracker list`.
+#[derive(Args, Debug, Clone)]
+pub struct ListArgs {
+    /// Print the list as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Options of `tracker try`.
+#[derive(Args, Debug, Clone)]
+pub struct TryArgs {
+    /// The tracker, as after `--tracker`; the rig's own when left out.
+    #[arg(value_name = "SPEC")]
+    pub spec: Option<String>,
+    /// The rig.
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// How long it is read, for example 10s or 2m.
+    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration, default_value = "10s")]
+    pub duration: Duration,
+    /// Millimetres for one unit of the tracker's figure, in place of the rig's tracker.scale_mm_per_unit.
+    #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
+    pub scale: Option<f64>,
+    /// Print what was found as JSON, and show nothing meanwhile.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Options of `log info`.
+#[derive(Args, Debug, Clone)]
+pub struct LogInfoArgs {
+    /// The log; its format is recognised by its content.
+    #[arg(value_name = "FILE")]
+    pub log: PathBuf,
+    /// Millimetres for one unit of the log's figure, where it is not in millimetres.
+    #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
+    pub scale: Option<f64>,
+    /// Write a plot of raw, rejected and believed samples as SVG.
+    #[arg(long, value_name = "FILE.svg")]
+    pub plot: Option<PathBuf>,
+    /// Print what was found as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// The formats that logs are written in.
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LogFormatArg {
+    /// holod's line protocol; millimetres only.
+    Lines,
+    /// A table with a header.
+    Csv,
+}
+
+/// Options of `log convert`.
+#[derive(Args, Debug, Clone)]
+pub struct LogConvertArgs {
+    /// The log; its format is recognised by its content.
+    #[arg(value_name = "FILE")]
+    pub log: PathBuf,
+    /// The format to write.
+    #[arg(long, value_enum)]
+    pub to: LogFormatArg,
+    /// The file to write; one that is there already is never overwritten.
+    #[arg(long, value_name = "FILE")]
+    pub out: PathBuf,
+    /// Millimetres for one unit of the log's figure, where it is not in millimetres.
+    #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
+    pub scale: Option<f64>,
+}
+
 /// Options of `dark`.
 #[derive(Args, Debug, Clone)]
 pub struct DarkArgs {
     /// The rig.
     #[command(flatten)]
     pub rig: RigArgs,
+}
+
+fn parse_scale(text: &str) -> Result<f64, String> {
+    text.parse()
+        .ok()
+        .filter(|scale: &f64| scale.is_finite() && *scale > 0.0)
+        .ok_or_else(|| format!("found '{text}', expected millimetres for one unit, a number above 0 such as 0.0125"))
 }
 
 fn parse_resolution(text: &str) -> Result<Resolution, String> {

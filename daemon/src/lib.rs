@@ -9,3 +9,5 @@ pub mod report;
 pub mod session;
 pub mod setup;
 pub mod staging;
+pub mod status;
+pub mod terminal;

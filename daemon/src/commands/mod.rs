@@ -4,8 +4,11 @@ mod bench;
 mod check;
 mod dark;
 mod demo;
+mod log;
 mod render;
 mod run;
+mod status;
+mod tracker;
 mod view;
 
 use crate::cli::{Cli, Command};
@@ -24,6 +27,9 @@ pub fn dispatch(cli: Cli) -> Result<(), Failure> {
         Some(Command::View(args)) => view::view(&args),
         Some(Command::Check(args)) => check::check(&args),
         Some(Command::Bench(args)) => bench::bench(&args),
+        Some(Command::Status(args)) => status::status(&args),
+        Some(Command::Tracker(command)) => tracker::tracker(&command),
+        Some(Command::Log(command)) => log::log(&command),
         Some(Command::Dark(args)) => dark::dark(&args),
     }
 }

@@ -28,14 +28,16 @@ use serde::Serialize;
 use self::frame_loop::{FrameLoop, LoopRecord, TrainedPupils};
 use self::keep::{KEEP_SLOTS, keep_slot};
 use self::ledger::LaserLedger;
-use self::service::{Service, Signals};
+use self::service::Service;
 use self::stats::Recent;
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
 use crate::record::{FieldRecord, FrameRecord};
 use crate::setup::{self, Frames};
+use crate::status::{Status, StatusFile};
 
 pub use self::ledger::LaserSummary;
+pub(crate) use self::service::Signals;
 pub use self::stats::Spread;
 
 /// What to run.
@@ -147,6 +149,7 @@ pub struct Summary {
 
 const TICK: Duration = Duration::from_millis(10);
 const TICKS_PER_REPORT: u32 = 10;
+const TICKS_PER_STATUS: u32 = 100;
 /// Frame records on their way to the control thread.
 const RECORDS: usize = 1024;
 /// Lasers go dark when one frame has stayed on the panel for so many frame times, within these limits.
@@ -162,6 +165,16 @@ enum State {
     Dark,
     Running,
     Degraded,
+}
+
+impl State {
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Dark => "dark",
+            Self::Running => "running",
+            Self::Degraded => "degraded",
+        }
+    }
 }
 
 /// Runs until a limit, a signal or a failure ends it; lasers are dark when it returns.
@@ -234,6 +247,10 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         tracker,
         signals,
         service: Service::connect(),
+        status: StatusFile::create(),
+        rig: plan.rig.name.clone(),
+        spec: plan.tracker.to_string(),
+        t_origin,
         state: State::Dark,
         tally: Tally::default(),
         t_dark_untold: TimeNs(i64::MIN),
@@ -331,6 +348,10 @@ struct Watch<'a> {
     tracker: TrackerControl,
     signals: Signals,
     service: Service,
+    status: StatusFile,
+    rig: String,
+    spec: String,
+    t_origin: TimeNs,
     state: State,
     tally: Tally,
     t_dark_untold: TimeNs,
@@ -356,6 +377,10 @@ impl Watch<'_> {
             if ticks.is_multiple_of(TICKS_PER_REPORT) {
                 self.tell_state(output);
                 self.observer.tick()?;
+            }
+            if ticks.is_multiple_of(TICKS_PER_STATUS) {
+                let status = self.status_at(now);
+                self.status.write(&status);
             }
             if let Some(signal) = self.signals.caught() {
                 return Ok(signal.to_owned());
@@ -429,10 +454,32 @@ impl Watch<'_> {
             (true, true) => State::Running,
         };
         if state != self.state {
-            let text = format!("{state:?}: tracker {}, pupil {}", link.name(), self.tally.newest_state);
+            let text = format!("{}: tracker {}, pupil {}", state.name(), link.name(), self.tally.newest_state);
             tracing::info!("{text}");
             self.service.status(&text);
             self.state = state;
+        }
+    }
+}
+
+impl Watch<'_> {
+    fn status_at(&self, now: TimeNs) -> Status {
+        let tally = &self.tally;
+        Status {
+            pid: std::process::id(),
+            state: self.state.name().to_owned(),
+            uptime_s: (now - self.t_origin).seconds(),
+            rig: self.rig.clone(),
+            tracker: self.spec.clone(),
+            tracker_link: self.tracker.link().name().to_owned(),
+            pupil_state: tally.newest_state.to_owned(),
+            pupil_mm: tally.recent.back().map(|frame| frame.pupil.mm()),
+            frames_made: tally.frames_made,
+            frames_shown: tally.frames_shown,
+            deadline_misses: tally.deadline_misses,
+            frame_time: tally.frame_time.spread(),
+            sample_to_photon: tally.sample_to_photon.spread(),
+            tracker_counts: self.tracker.counters().entries().collect(),
         }
     }
 }
@@ -512,7 +559,8 @@ impl Tally {
     }
 }
 
-fn tracker_failure(error: TrackerError) -> Failure {
+/// The exit code of a tracker that cannot be started.
+pub(crate) fn tracker_failure(error: TrackerError) -> Failure {
     let exit = match &error {
         TrackerError::Source(_) => Exit::NoInput,
         TrackerError::Profile(_) => Exit::Usage,

@@ -11,12 +11,12 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use crate::failure::{Exit, Failure};
 
 /// SIGINT, SIGTERM and SIGHUP, as a flag.
-pub(super) struct Signals(Arc<AtomicUsize>);
+pub(crate) struct Signals(Arc<AtomicUsize>);
 
 impl Signals {
     /// Takes the signals over. A second one while the first is being obeyed ends the process at once: the laser box's
     /// heartbeat makes it dark.
-    pub(super) fn install() -> Result<Self, Failure> {
+    pub(crate) fn install() -> Result<Self, Failure> {
         let caught = Arc::new(AtomicUsize::new(0));
         let again = Arc::new(AtomicBool::new(false));
         for signal in [SIGINT, SIGTERM, SIGHUP] {
@@ -29,7 +29,7 @@ impl Signals {
     }
 
     /// The name of the signal that came.
-    pub(super) fn caught(&self) -> Option<&'static str> {
+    pub(crate) fn caught(&self) -> Option<&'static str> {
         match self.0.load(Ordering::Acquire) as i32 {
             0 => None,
             SIGINT => Some("SIGINT"),

@@ -1,6 +1,6 @@
 //! Medians of what came lately.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 const WINDOW: usize = 1 << 14;
 
@@ -12,7 +12,7 @@ pub(super) struct Recent {
 }
 
 /// Median and tail of a quantity, milliseconds.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Spread {
     /// Half of the values are smaller.
     pub median_ms: f32,

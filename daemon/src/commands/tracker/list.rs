@@ -1,0 +1,39 @@
+//! `holod tracker list`: the profiles that holod brings with it.
+
+use std::fmt::Write as _;
+
+use holod_pupil_input::{Profile, SizeUnit};
+use serde::Serialize;
+
+use crate::cli::ListArgs;
+use crate::failure::Failure;
+use crate::report;
+
+#[derive(Serialize)]
+struct Entry {
+    name: String,
+    wire: &'static str,
+    unit: &'static str,
+    about: String,
+}
+
+pub(super) fn list(args: &ListArgs) -> Result<(), Failure> {
+    let entries: Vec<Entry> = Profile::shipped()
+        .map(|profile| Entry {
+            wire: profile.format.kind(),
+            unit: profile.unit.name(),
+            name: profile.name,
+            about: profile.about,
+        })
+        .collect();
+    if args.json {
+        return report::print_json(&entries);
+    }
+    let mut text = String::from("Profiles, for `profile=NAME` in a tracker spec:\n");
+    for Entry { name, wire, unit, about } in &entries {
+        let scale = if *unit == SizeUnit::Millimetres.name() { "" } else { " (needs tracker.scale_mm_per_unit)" };
+        writeln!(text, "  {name:16} {wire:14} {unit}{scale}\n      {about}").expect("a String takes all");
+    }
+    text.push_str("A file of your own is named by its path: profile=./my-tracker.toml");
+    report::print(&text)
+}

@@ -1,0 +1,207 @@
+//! `holod tracker try`: reads a tracker for a while and shows what it sends.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::time::Duration;
+
+use holod_calibration::TimeNs;
+use holod_calibration::rig::Rig;
+use holod_pupil_input::{Tracker, TrackerHandle, TrackerSpec, Verdict, host_now};
+use ratatui::style::Color;
+use serde::Serialize;
+
+use super::observed::{EyeFigures, Observed, Quantiles};
+use crate::cli::TryArgs;
+use crate::failure::{Exit, Failure};
+use crate::session::{Signals, tracker_failure};
+use crate::terminal::{Axes, LiveText, PLOT_SIZE, Series, TextSize, plot};
+use crate::{report, setup};
+
+/// What came of it.
+#[derive(Serialize)]
+struct Report {
+    tracker: String,
+    ended_by: String,
+    duration_s: f64,
+    link: &'static str,
+    eyes: BTreeMap<String, EyeFigures>,
+    /// The estimate of the present moment, at the end.
+    pupil_mm: f32,
+    pupil_state: &'static str,
+    counts: BTreeMap<String, u64>,
+}
+
+const TICK: Duration = Duration::from_millis(20);
+/// How often the live picture changes.
+const REDRAW: TimeNs = TimeNs(200_000_000);
+/// The live plot's length.
+const PLOTTED_S: f64 = 10.0;
+
+pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
+    let mut rig = setup::rig(&args.rig)?;
+    let spec = spec_of(args, &rig)?;
+    if let Some(scale) = args.scale {
+        rig.tracker.scale = Some(scale);
+    }
+    let signals = Signals::install()?;
+    let began = host_now();
+    let mut tracker = Tracker::start(&spec, &rig.tracker, began).map_err(tracker_failure)?;
+    let mut observed = Observed::default();
+    let mut live = LiveText::default();
+    let mut redrawn = began;
+    let ended_by = loop {
+        std::thread::sleep(TICK);
+        let now = host_now();
+        while let Some(decision) = tracker.decisions().pop() {
+            observed.take(&decision);
+        }
+        if let Some(signal) = signals.caught() {
+            break signal.to_owned();
+        }
+        if (now - began).seconds() >= args.duration.as_secs_f64() {
+            break "the asked duration".to_owned();
+        }
+        if tracker.finished() && observed.accepted() > 0 {
+            break "the end of the pupil log".to_owned();
+        }
+        if !args.json && now - redrawn >= REDRAW {
+            redrawn = now;
+            let state = report_of(&spec, "", began, now, &observed, &mut tracker);
+            live.show(&format!("{}\n{}", traces(&observed, now, LiveText::visible()), text_of(&state)));
+        }
+    };
+    let now = host_now();
+    tracker.stop();
+    while let Some(decision) = tracker.decisions().pop() {
+        observed.take(&decision);
+    }
+    let report = report_of(&spec, &ended_by, began, now, &observed, &mut tracker);
+    if args.json {
+        report::print_json(&report)?;
+    } else {
+        live.show("");
+        report::print(&format!("{}\n{}", traces(&observed, now, LiveText::visible()), text_of(&report)))?;
+    }
+    if observed.accepted() > 0 {
+        return Ok(());
+    }
+    let bytes = report.counts.get("bytes").copied().unwrap_or(0);
+    let heard = match (bytes, observed.eyes().next()) {
+        (_, Some(_)) => "samples came, and the gate believed none: see the reasons above".to_owned(),
+        (0, None) => "nothing was heard; is it switched on, and does it send without being asked?".to_owned(),
+        (bytes, None) => format!("{bytes} bytes came, and no sample was in them: is it this profile and baud rate?"),
+    };
+    Err(Failure::new(Exit::Unavailable, format!("tracker {spec}: {heard}")))
+}
+
+fn spec_of(args: &TryArgs, rig: &Rig) -> Result<TrackerSpec, Failure> {
+    let text = args.spec.as_ref().or(rig.tracker.spec.as_ref()).ok_or_else(|| {
+        Failure::new(Exit::Usage, "which tracker? name its spec, or a rig file with tracker.spec by --config")
+    })?;
+    text.parse().map_err(Failure::because(Exit::Usage))
+}
+
+fn report_of(
+    spec: &TrackerSpec,
+    ended_by: &str,
+    began: TimeNs,
+    now: TimeNs,
+    observed: &Observed,
+    tracker: &mut TrackerHandle,
+) -> Report {
+    let estimate = tracker.pupil_at(now);
+    Report {
+        tracker: spec.to_string(),
+        ended_by: ended_by.to_owned(),
+        duration_s: (now - began).seconds(),
+        link: tracker.link().name(),
+        eyes: observed.figures(),
+        pupil_mm: estimate.pupil.mm(),
+        pupil_state: estimate.state.name(),
+        counts: tracker.counters().entries().collect(),
+    }
+}
+
+/// The last seconds of all eyes: raw, rejected, believed.
+fn traces(observed: &Observed, now: TimeNs, colours: bool) -> String {
+    let since_s = |t: TimeNs| (t - now).seconds();
+    let points = |wanted: fn(&Verdict) -> bool| -> Vec<(f64, f64)> {
+        observed
+            .eyes()
+            .flat_map(|(_, eye)| &eye.marks)
+            .filter(|mark| wanted(&mark.verdict) && mark.valid)
+            .map(|mark| (since_s(mark.t_sample), f64::from(mark.raw_mm)))
+            .collect()
+    };
+    let believed = points(|verdict| *verdict == Verdict::Accepted);
+    let rejected = points(|verdict| *verdict != Verdict::Accepted);
+    let series = [
+        Series { name: "rejected", colour: Color::Red, points: &rejected },
+        Series { name: "believed", colour: Color::Green, points: &believed },
+    ];
+    let axes = Axes { x_name: "s", x: [-PLOTTED_S, 0.0], y_name: "pupil / mm", y: [0.0, 9.0] };
+    if colours {
+        return plot(&series, &axes, PLOT_SIZE, true);
+    }
+    // Without colours the two are told apart by standing in two plots.
+    let size = TextSize { height: 12, ..PLOT_SIZE };
+    let [rejected, believed] = series.map(|series| plot(&[series], &axes, size, false));
+    believed + &rejected
+}
+
+fn text_of(report: &Report) -> String {
+    let count = |name: &str| report.counts.get(name).copied().unwrap_or(0);
+    let mut text = format!(
+        "{}: link {}, {:.1} s, {} bytes, {} samples; pupil {:.2} mm, {}\n",
+        report.tracker,
+        report.link,
+        report.duration_s,
+        count("bytes"),
+        count("samples"),
+        report.pupil_mm,
+        report.pupil_state,
+    );
+    let put = |text: &mut String, line: String| writeln!(text, "{line}").expect("a String takes all");
+    let three = |quantiles: Option<Quantiles>, unit: &str, decimals: usize| {
+        quantiles.map_or("-".to_owned(), |q| {
+            format!("{:.decimals$} / {:.decimals$} / {:.decimals$} {unit}", q.p1, q.median, q.p99)
+        })
+    };
+    if !report.eyes.is_empty() {
+        put(
+            &mut text,
+            format!(
+                "{:6} {:>10}  {:24} {:24} {:24} {:24} {:>8}",
+                "eye",
+                "rate",
+                "interval p1/median/p99",
+                "arrivals",
+                "delay over the least",
+                "raw",
+                "believed"
+            ),
+        );
+    }
+    for (name, eye) in &report.eyes {
+        put(
+            &mut text,
+            format!(
+                "{name:6} {:>10}  {:24} {:24} {:24} {:24} {:>6.1} %",
+                eye.rate_hz.map_or("-".to_owned(), |rate| format!("{rate:.1} Hz")),
+                three(eye.interval_ms, "ms", 2),
+                three(eye.arrival_interval_ms, "ms", 2),
+                three(eye.delay_ms, "ms", 2),
+                three(eye.raw_mm, "mm", 2),
+                100.0 * eye.accepted as f64 / eye.samples.max(1) as f64,
+            ),
+        );
+    }
+    let shown: Vec<_> = report
+        .counts
+        .iter()
+        .filter(|(name, count)| **count > 0 && !["bytes", "samples"].contains(&name.as_str()))
+        .map(|(name, count)| format!("{name} {count}"))
+        .collect();
+    put(&mut text, format!("counts: {}", if shown.is_empty() { "none".to_owned() } else { shown.join(", ") }));
+    text
+}

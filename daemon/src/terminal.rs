@@ -1,0 +1,161 @@
+//! Plots and tables as text, for a terminal.
+
+use std::fmt::Write as _;
+use std::io::{self, IsTerminal, Write};
+
+use ratatui::buffer::Buffer;
+use ratatui::layout::Rect;
+use ratatui::style::{Color, Style};
+use ratatui::symbols::Marker;
+use ratatui::text::Line;
+use ratatui::widgets::{Axis, Chart, Dataset, GraphType, Widget};
+
+/// One set of points in a [`plot`].
+pub struct Series<'a> {
+    /// What it is.
+    pub name: &'a str,
+    /// Its colour; where there are no colours, a plot with one series still says all.
+    pub colour: Color,
+    /// (x, y); points outside the plot are not drawn.
+    pub points: &'a [(f64, f64)],
+}
+
+/// The axes of a [`plot`].
+pub struct Axes<'a> {
+    /// What x is, with its unit.
+    pub x_name: &'a str,
+    /// First and last x.
+    pub x: [f64; 2],
+    /// What y is, with its unit.
+    pub y_name: &'a str,
+    /// Lowest and highest y.
+    pub y: [f64; 2],
+}
+
+/// Columns and rows of a plot.
+#[derive(Clone, Copy, Debug)]
+pub struct TextSize {
+    /// Columns.
+    pub width: u16,
+    /// Rows.
+    pub height: u16,
+}
+
+/// The size of plots where nothing else is known.
+pub const PLOT_SIZE: TextSize = TextSize { width: 100, height: 18 };
+
+/// Points as braille dots, with axes and a legend; `colours` adds ANSI colours.
+pub fn plot(series: &[Series<'_>], axes: &Axes<'_>, size: TextSize, colours: bool) -> String {
+    let area = Rect::new(0, 0, size.width, size.height);
+    let mut buffer = Buffer::empty(area);
+    let datasets = series.iter().map(|series| {
+        Dataset::default()
+            .name(series.name)
+            .marker(Marker::Braille)
+            .graph_type(GraphType::Scatter)
+            .style(Style::default().fg(series.colour))
+            .data(series.points)
+    });
+    let axis = |name: &str, [least, most]: [f64; 2]| {
+        let labels = [least, 0.5 * (least + most), most].map(|value| Line::from(format!("{value:.1}")));
+        Axis::default().title(name.to_owned()).bounds([least, most]).labels(labels)
+    };
+    Chart::new(datasets.collect())
+        .x_axis(axis(axes.x_name, axes.x))
+        .y_axis(axis(axes.y_name, axes.y))
+        .render(area, &mut buffer);
+    text_of(&buffer, colours)
+}
+
+fn text_of(buffer: &Buffer, colours: bool) -> String {
+    let mut text = String::new();
+    for row in buffer.content.chunks(usize::from(buffer.area.width)) {
+        let mut line = String::new();
+        let mut now = Color::Reset;
+        for cell in row {
+            if colours && cell.fg != now {
+                now = cell.fg;
+                write!(line, "\x1b[{}m", ansi(now)).expect("a String takes all");
+            }
+            line.push_str(cell.symbol());
+        }
+        if now != Color::Reset {
+            line.push_str("\x1b[39m");
+        }
+        text.push_str(line.trim_end());
+        text.push('\n');
+    }
+    text
+}
+
+/// The foreground's code (ECMA-48, SGR 30 to 39).
+const fn ansi(colour: Color) -> u8 {
+    match colour {
+        Color::Red => 31,
+        Color::Green => 32,
+        Color::Yellow => 33,
+        Color::Blue => 34,
+        Color::Magenta => 35,
+        Color::Cyan => 36,
+        _ => 39,
+    }
+}
+
+/// Text that is shown again and again in the same place of a terminal; nothing where standard output is none.
+#[derive(Debug, Default)]
+pub struct LiveText {
+    lines: usize,
+}
+
+impl LiveText {
+    /// Whether anybody would see it.
+    pub fn visible() -> bool {
+        io::stdout().is_terminal()
+    }
+
+    /// Puts `text` in the place of what was shown before.
+    pub fn show(&mut self, text: &str) {
+        if !Self::visible() {
+            return;
+        }
+        let back = if self.lines == 0 { String::new() } else { format!("\x1b[{}F\x1b[J", self.lines) };
+        let text = text.trim_end();
+        // A terminal that has gone away is no failure of what it showed.
+        let _ = writeln!(io::stdout().lock(), "{back}{text}");
+        self.lines = text.lines().count();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const AXES: Axes<'_> = Axes { x_name: "time / s", x: [0.0, 10.0], y_name: "pupil / mm", y: [0.0, 8.0] };
+
+    fn drawn(points: &[(f64, f64)], colours: bool) -> String {
+        let size = TextSize { width: 40, height: 12 };
+        plot(&[Series { name: "raw", colour: Color::Red, points }], &AXES, size, colours)
+    }
+
+    fn dots(text: &str) -> usize {
+        text.chars().filter(|c| ('\u{2801}'..='\u{28ff}').contains(c)).count()
+    }
+
+    #[test]
+    fn points_and_axes_are_drawn() {
+        let text = drawn(&[(0.0, 0.0), (5.0, 4.0), (10.0, 8.0)], false);
+        assert_eq!(text.lines().count(), 12);
+        assert!(text.contains("pupil / mm") && text.contains("8.0") && text.contains("10.0"), "{text}");
+        assert_eq!(dots(&text), 3, "{text}");
+        assert_eq!(dots(&drawn(&[(5.0, 9.0)], false)), 0, "a point outside is not drawn");
+        assert!(!text.contains('\x1b'));
+    }
+
+    #[test]
+    fn colours_are_switched_off_at_the_end_of_each_line() {
+        let text = drawn(&[(5.0, 4.0)], true);
+        let coloured: Vec<_> = text.lines().filter(|line| line.contains("\x1b[31m")).collect();
+        assert!(!coloured.is_empty());
+        assert!(coloured.iter().all(|line| line.matches("\x1b[39m").count() >= 1), "{text:?}");
+    }
+}
