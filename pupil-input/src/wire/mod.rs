@@ -3,7 +3,12 @@
 //! A decoder is pushed bytes as they come and tells what they hold. However the bytes of a stream are split, the events
 //! are the same; formats that come in messages (a HID report, a datagram) are pushed one message at a time instead.
 
+pub mod iscan;
 pub mod line;
+pub mod livetrack;
+pub mod open_gaze;
+pub mod pupilext;
+mod text;
 
 use holod_calibration::TimeNs;
 
