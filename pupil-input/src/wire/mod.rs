@@ -11,6 +11,11 @@ pub mod packet;
 pub mod report;
 #[cfg(test)]
 mod testing;
+pub mod iscan;
+pub mod livetrack;
+pub mod open_gaze;
+pub mod pupilext;
+mod text;
 
 use holod_calibration::TimeNs;
 
