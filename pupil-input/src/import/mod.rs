@@ -4,6 +4,7 @@
 
 mod lines;
 mod neon;
+pub(crate) mod raw;
 
 use std::fmt;
 use std::fs::File;
@@ -22,6 +23,8 @@ pub enum LogFormat {
     Lines,
     /// Pupil Labs Neon, 3D eye states.
     NeonEyeStates,
+    /// holod's recording of the bytes of a link.
+    Raw,
 }
 
 impl LogFormat {
@@ -30,6 +33,7 @@ impl LogFormat {
         match self {
             Self::Lines => "holod line protocol",
             Self::NeonEyeStates => "Pupil Labs Neon 3d_eye_states.csv",
+            Self::Raw => "holod recording of a link",
         }
     }
 }
@@ -73,7 +77,7 @@ pub(crate) struct Importer {
 }
 
 /// In the order in which they are asked.
-const IMPORTERS: [Importer; 2] = [lines::IMPORTER, neon::IMPORTER];
+const IMPORTERS: [Importer; 3] = [raw::IMPORTER, lines::IMPORTER, neon::IMPORTER];
 
 /// A log file that has not been read yet.
 pub(crate) struct LogInput<'a> {
