@@ -52,6 +52,7 @@ pub use sample::{PupilSample, SampleEye};
 pub use source::mock::{MockSample, MockSource, Scenario};
 
 pub use source::SourceError;
+pub use source::hid::{HidError, RULE_FILE, udev_rule};
 pub use source::serial::SerialError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
 pub use tracker::{

@@ -16,10 +16,11 @@ use crate::gate::Verdict;
 use crate::import::{LogFault, Recording, ReplayError, SizeUnit};
 use crate::profile::{DEFAULT_PROFILE, Profile, ProfileError};
 use crate::sequence::{SequenceEvent, SequenceTracker};
+use crate::source::hid::{self, HidFeed, Wanted};
 use crate::source::mock::{MockSource, Scenario};
 use crate::source::serial::SerialFeed;
 use crate::source::{ByteSource, Feed, ReadEvent, SourceError};
-use crate::spec::{DEFAULT_BAUD, ReplaySpeed, TrackerSpec};
+use crate::spec::{DEFAULT_BAUD, ReplaySpeed, TrackerSpec, UsbIds};
 use crate::wire::{Decoder, WireEvent, WireSample};
 
 /// The host's monotonic clock: the one place where it is read.
@@ -271,7 +272,7 @@ impl Job {
             }),
             TrackerSpec::Path(path) => Self::serial(path, None, None),
             TrackerSpec::Serial { path, profile, baud } => Self::serial(path, profile.as_deref(), *baud),
-            TrackerSpec::Hid { .. } => unimplemented!("HID"),
+            TrackerSpec::Hid { ids, serial, profile } => Self::hid(*ids, serial.as_deref(), profile.as_deref()),
             TrackerSpec::Tcp { .. } => unimplemented!("TCP"),
             TrackerSpec::Udp { .. } => unimplemented!("UDP"),
             TrackerSpec::Core(_) => unimplemented!("Core"),
@@ -295,6 +296,15 @@ impl Job {
     fn serial(path: &Path, profile: Option<&str>, baud: Option<u32>) -> Result<Self, TrackerError> {
         let profile = Profile::find(profile.unwrap_or(DEFAULT_PROFILE))?;
         Self::live(Box::new(SerialFeed { path: path.into(), baud: baud.unwrap_or(DEFAULT_BAUD) }), profile)
+    }
+
+    fn hid(ids: Option<UsbIds>, serial: Option<&str>, profile: Option<&str>) -> Result<Self, TrackerError> {
+        let profile = match profile {
+            Some(name) => Profile::find(name)?,
+            None => hid::profile_of(ids).map_err(SourceError::from)?,
+        };
+        let wanted = Wanted::new(ids, serial, &profile).map_err(SourceError::from)?;
+        Self::live(Box::new(HidFeed::new(wanted)), profile)
     }
 
     fn live(mut feed: Box<dyn Feed>, profile: Profile) -> Result<Self, TrackerError> {

@@ -1,10 +1,12 @@
 //! Where bytes come from: one file for each kind of link, behind one trait.
 
+pub(crate) mod hid;
 pub mod mock;
 pub(crate) mod serial;
 
 use std::time::Duration;
 
+use hid::HidError;
 use serial::SerialError;
 
 /// How long one read waits; also how soon a stop is noticed.
@@ -38,4 +40,7 @@ pub enum SourceError {
     /// A serial port.
     #[error(transparent)]
     Serial(#[from] SerialError),
+    /// A HID device.
+    #[error(transparent)]
+    Hid(#[from] HidError),
 }
