@@ -1,12 +1,24 @@
 //! Reads a tracker for some seconds and prints its counters: `read_tracker SPEC SECONDS`.
 
+use std::error::Error;
 use std::io::{self, Write};
+use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use holod_calibration::rig;
 use holod_pupil_input::{SampleEye, Tracker, host_now};
 
-fn main() -> Result<(), Box<dyn std::error::Error>> {
+fn main() -> ExitCode {
+    match read() {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("{error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn read() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<_> = std::env::args().collect();
     let [_, spec, seconds] = &arguments[..] else { return Err("expected SPEC SECONDS".into()) };
     let settings = rig::Tracker { eye: rig::Eye::Left, ..rig::Rig::default().tracker };
