@@ -55,6 +55,7 @@ pub use source::mock::{MockSample, MockSource, Scenario};
 
 pub use source::SourceError;
 pub use source::commands::CommandError;
+pub use source::hid::{HidError, RULE_FILE, udev_rule};
 pub use source::serial::SerialError;
 pub use source::serial::identity::{SerialPortInfo, UsbPort, serial_ports};
 pub use source::tcp::NetworkError;

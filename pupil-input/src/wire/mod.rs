@@ -6,6 +6,7 @@
 mod checksum;
 pub mod delimited;
 pub mod field;
+pub mod hid_descriptor;
 pub mod line;
 pub mod packet;
 pub mod report;
