@@ -9,7 +9,7 @@ use std::time::Duration;
 use holod_calibration::{TimeNs, rig};
 
 use crate::PupilSample;
-use crate::clock::ClockModel;
+use crate::clock::{ClockGauge, ClockModel, ClockReport};
 use crate::counters::{Counter, CounterSnapshot, Counters};
 use crate::estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, StreamClock};
 use crate::gate::Verdict;
@@ -113,6 +113,7 @@ impl Tracker {
         let (producer, consumer) = rtrb::RingBuffer::new(TAP_DECISIONS);
         let shared = Arc::new(Shared {
             counters: Counters::new(),
+            clock: ClockGauge::new(),
             stop: AtomicBool::new(false),
             link: AtomicU8::new(Link::Up as u8),
         });
@@ -157,6 +158,11 @@ impl TrackerHandle {
     /// All counts at this moment.
     pub fn counters(&self) -> CounterSnapshot {
         self.control.counters()
+    }
+
+    /// What has been found of the tracker's clock; nothing where its samples carry no time.
+    pub fn clock(&self) -> Option<ClockReport> {
+        self.control.clock()
     }
 
     /// How the link is.
@@ -219,6 +225,11 @@ impl TrackerControl {
         self.shared.counters.snapshot()
     }
 
+    /// What has been found of the tracker's clock; nothing where its samples carry no time.
+    pub fn clock(&self) -> Option<ClockReport> {
+        self.shared.clock.get()
+    }
+
     /// How the link is.
     pub fn link(&self) -> Link {
         Link::ALL[usize::from(self.shared.link.load(Ordering::Acquire))]
@@ -249,6 +260,7 @@ impl Drop for TrackerControl {
 #[derive(Debug)]
 struct Shared {
     counters: Counters,
+    clock: ClockGauge,
     stop: AtomicBool,
     link: AtomicU8,
 }
@@ -508,6 +520,7 @@ impl LiveStream {
             WireEvent::Partial => worker.count(Counter::Partials, 1),
             WireEvent::Rejected(fault) => worker.shared.counters.add_fault(LogFault::Wire(fault), 1),
         });
+        worker.shared.clock.set(clock.report());
     }
 }
 
