@@ -42,9 +42,11 @@ mod spec;
 mod tracker;
 pub mod wire;
 
-pub use clock::ClockModel;
+pub use clock::{ClockModel, ClockReport};
 pub use counters::{Counter, CounterSnapshot};
-pub use estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, PupilState, STATED_LAG};
+pub use estimator::{
+    BetterSettings, Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, PupilState, STATED_LAG,
+};
 pub use filter::FilterSettings;
 pub use gate::{GateSettings, Rejection, Verdict};
 pub use import::{Blink, LogFault, LogFaults, LogFormat, Recording, ReplayError, SizeUnit};

@@ -58,5 +58,6 @@ pub enum SourceError {
     #[error(transparent)]
     Network(#[from] NetworkError),
     /// A HID device.
+    #[error(transparent)]
     Hid(#[from] HidError),
 }
