@@ -3,7 +3,9 @@
 //! A decoder is pushed bytes as they come and tells what they hold. However the bytes of a stream are split, the events
 //! are the same; formats that come in messages (a HID report, a datagram) are pushed one message at a time instead.
 
+pub(crate) mod core;
 pub mod line;
+pub(crate) mod neon;
 
 use holod_calibration::TimeNs;
 
