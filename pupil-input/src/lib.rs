@@ -47,7 +47,7 @@ pub use estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, Pu
 pub use filter::FilterSettings;
 pub use gate::{GateSettings, Rejection, Verdict};
 pub use import::{Blink, LogFault, LogFaults, LogFormat, Recording, ReplayError, SizeUnit};
-pub use profile::{DEFAULT_PROFILE, Profile, ProfileError};
+pub use profile::{Command, DEFAULT_PROFILE, HidSettings, NetworkSettings, Profile, ProfileError, SerialSettings};
 pub use sample::{PupilSample, SampleEye};
 pub use source::mock::{MockSample, MockSource, Scenario};
 

@@ -255,7 +255,7 @@ struct Shared {
 
 /// What the thread is to do.
 enum Job {
-    Live { open: Box<dyn ByteSource>, feed: Box<dyn Feed>, profile: Profile },
+    Live { open: Box<dyn ByteSource>, feed: Box<dyn Feed>, profile: Box<Profile> },
     Replay { recording: Box<Recording>, speed: ReplaySpeed, repeat: bool, origin: TimeNs },
     Mock { scenario: Scenario, origin: TimeNs },
 }
@@ -298,7 +298,7 @@ impl Job {
     }
 
     fn live(mut feed: Box<dyn Feed>, profile: Profile) -> Result<Self, TrackerError> {
-        Ok(Self::Live { open: feed.open()?, feed, profile })
+        Ok(Self::Live { open: feed.open()?, feed, profile: Box::new(profile) })
     }
 }
 

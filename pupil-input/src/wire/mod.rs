@@ -123,3 +123,19 @@ pub trait Decoder: Send {
     /// Ends the stream: a last line without its ending is read, anything else that is incomplete is dropped.
     fn finish(&mut self, on_event: &mut dyn FnMut(WireEvent));
 }
+
+/// How a tracker's bytes are read: every decoder, with its settings.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Format {
+    /// holod's line protocol.
+    Lines,
+}
+
+impl Format {
+    /// A decoder for a stream that may be joined in the middle of a message.
+    pub fn decoder(&self) -> Box<dyn Decoder> {
+        match self {
+            Self::Lines => Box::new(line::LineDecoder::joining()),
+        }
+    }
+}
