@@ -17,6 +17,8 @@ pub mod livetrack;
 pub mod open_gaze;
 pub mod pupilext;
 mod text;
+pub(crate) mod core;
+pub(crate) mod neon;
 
 use holod_calibration::TimeNs;
 
