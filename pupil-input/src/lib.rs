@@ -30,6 +30,7 @@
 mod clock;
 mod counters;
 mod estimator;
+pub mod export;
 mod filter;
 mod gate;
 mod import;
