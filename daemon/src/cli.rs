@@ -149,7 +149,7 @@ pub struct RunArgs {
     /// Stop after this long, for example 10s or 2m.
     #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration)]
     pub duration: Option<Duration>,
-    /// Write frames.csv and summary.json into this directory.
+    /// Write frames.csv, summary.json, and what the tracker sent (tracker.holodraw, samples.csv) into this directory.
     #[arg(long, value_name = "DIR")]
     pub record: Option<PathBuf>,
     /// Print the summary as JSON.
@@ -285,6 +285,10 @@ pub struct TryArgs {
     /// Millimetres for one unit of the tracker's figure, in place of the rig's tracker.scale_mm_per_unit.
     #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
     pub scale: Option<f64>,
+    /// Record the link's bytes (tracker.holodraw) and every sample (samples.csv) into this directory; `replay:` plays
+    /// the first.
+    #[arg(long, value_name = "DIR")]
+    pub record: Option<PathBuf>,
     /// Print what was found as JSON, and show nothing meanwhile.
     #[arg(long)]
     pub json: bool,
@@ -312,7 +316,7 @@ pub struct LogInfoArgs {
 pub enum LogFormatArg {
     /// holod's line protocol; millimetres only.
     Lines,
-    /// A table with a header.
+    /// A table with a header, in the log's own unit.
     Csv,
 }
 
@@ -328,7 +332,7 @@ pub struct LogConvertArgs {
     /// The file to write; one that is there already is never overwritten.
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
-    /// Millimetres for one unit of the log's figure, where it is not in millimetres.
+    /// Millimetres for one unit of the log's figure, where it is not in millimetres; for lines only.
     #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
     pub scale: Option<f64>,
 }

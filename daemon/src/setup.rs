@@ -152,6 +152,14 @@ fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames,
     })
 }
 
+/// Ports that belong to something else than the tracker: the laser box's.
+pub fn ports_of_others(rig: &Rig) -> Vec<PathBuf> {
+    match &rig.lasers.driver {
+        LaserDriver::Simulated => Vec::new(),
+        LaserDriver::Serial { path } => vec![path.clone()],
+    }
+}
+
 /// The built-in scene as the network reads it.
 pub fn sample_frame(resolution: Resolution) -> RgbdFrame {
     let picture = scene_renderer::sample_scene(resolution).picture();

@@ -46,6 +46,7 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
             backend: Backend::Auto,
             frames,
             tracker: TrackerSpec::Mock(SCENARIO),
+            record_tracker: None,
             frame_limit: None,
             duration: Some(args.duration),
             keep_levels: true,

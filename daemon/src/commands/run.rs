@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use holod_pupil_input::TrackerSpec;
+use holod_pupil_input::{RecordFiles, TrackerSpec};
 use holod_slm_output::FieldEvent;
 
 use crate::cli::RunArgs;
@@ -31,6 +31,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         backend: args.backend,
         frames,
         tracker,
+        record_tracker: args.record.as_deref().map(RecordFiles::in_folder),
         frame_limit: args.frames,
         duration: args.duration,
         keep_levels: args.record.is_some(),

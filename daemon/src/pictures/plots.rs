@@ -8,6 +8,7 @@ use plotters::prelude::*;
 use crate::failure::{Exit, Failure};
 
 /// A raw sample and what the gate made of it.
+#[derive(Clone, Copy, Debug)]
 pub struct PupilSampleMark {
     /// Seconds since the run began.
     pub t_s: f64,

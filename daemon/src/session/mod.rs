@@ -18,7 +18,8 @@ use holod_calibration::{PupilDiameter, TimeNs};
 use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::{ComplexHologram, CpuEngine, Weights};
 use holod_pupil_input::{
-    Decision, DecisionTap, Link, PupilState, ReplayError, Tracker, TrackerControl, TrackerError, TrackerSpec, host_now,
+    Decision, DecisionTap, Link, PupilState, RecordFiles, ReplayError, Tracker, TrackerControl, TrackerError,
+    TrackerOptions, TrackerSpec, host_now,
 };
 use holod_slm_output::laser::{BoxEvent, DarkReason};
 use holod_slm_output::output::pacing_config;
@@ -52,6 +53,8 @@ pub struct SessionPlan {
     pub frames: Frames,
     /// Where samples come from.
     pub tracker: TrackerSpec,
+    /// Where the tracker's bytes and samples are written down.
+    pub record_tracker: Option<RecordFiles>,
     /// Stop after so many frames.
     pub frame_limit: Option<u64>,
     /// Stop after so long.
@@ -133,6 +136,10 @@ pub struct Summary {
     pub samples_rejected: u64,
     /// Counters of the tracker: samples, connections, rejections by reason.
     pub tracker_counts: BTreeMap<String, u64>,
+    /// How much slower the tracker's clock ran than the host's, parts per million.
+    pub tracker_clock_drift_ppm: Option<f64>,
+    /// Pieces of the tracker's bytes and decisions on its samples that the recording lost.
+    pub tracker_records_lost: u64,
     /// Largest share of a frame's amplitudes that the double phase clipped.
     pub clipped_share_max: f32,
     /// Largest share of a frame's phases that the panel cannot reach.
@@ -191,8 +198,18 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         PanelEncoder::new(&rig.panel, rig.resolution(), resolution).map_err(Failure::because(Exit::Config))?;
     let pacing = pacing_config(rig, frame_time).map_err(Failure::because(Exit::Config))?;
     let t_origin = host_now();
+    let tracker_options = TrackerOptions {
+        origin: t_origin,
+        record: plan.record_tracker.clone(),
+        forbidden: setup::ports_of_others(rig),
+    };
     let (estimates, tap, tracker) =
-        scheduling::prompt(|| Tracker::start(&plan.tracker, &rig.tracker, t_origin)).map_err(tracker_failure)?.split();
+        scheduling::prompt(|| Tracker::start(&plan.tracker, &rig.tracker, tracker_options))
+            .map_err(tracker_failure)?
+            .split();
+    for warning in tracker.warnings() {
+        tracing::warn!("{warning}");
+    }
     let options = OutputOptions {
         keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 },
         stall_timeout: stall_timeout(frame_time),
@@ -268,6 +285,10 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
     watch.tracker.stop();
     let observed = watch.drain();
     let Watch { tracker, tally, .. } = watch;
+    let recorded = tracker.recording();
+    if let Some(failure) = recorded.as_ref().and_then(|status| status.failure.as_deref()) {
+        tracing::error!("the tracker's recording is not whole: {failure}");
+    }
     let ended_by = ended?;
     observed?;
     if frame_loop_failed {
@@ -307,6 +328,8 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         tracker_link,
         samples_rejected: tracker.counters().rejected_in_all() + tracker.counters().faults_in_all(),
         tracker_counts: tracker.counters().entries().collect(),
+        tracker_clock_drift_ppm: tracker.clock().map(|clock| clock.drift_ppm),
+        tracker_records_lost: recorded.as_ref().map_or(0, |status| status.chunks_lost + status.decisions_lost),
         clipped_share_max: tally.clipped_share_max,
         unreachable_share_max: tally.unreachable_share_max,
         lasers: tally.lasers.finish(),

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use holod_pupil_input::{Profile, SizeUnit};
+use holod_pupil_input::{Profile, SizeUnit, serial_ports};
 use serde::Serialize;
 
 use crate::cli::ListArgs;
@@ -34,6 +34,18 @@ pub(super) fn list(args: &ListArgs) -> Result<(), Failure> {
         let scale = if *unit == SizeUnit::Millimetres.name() { "" } else { " (needs tracker.scale_mm_per_unit)" };
         writeln!(text, "  {name:16} {wire:14} {unit}{scale}\n      {about}").expect("a String takes all");
     }
-    text.push_str("A file of your own is named by its path: profile=./my-tracker.toml");
+    text.push_str("A file of your own is named by its path: profile=./my-tracker.toml\n\nSerial ports:\n");
+    for port in serial_ports() {
+        let usb = port.usb.as_ref().map_or("no USB device".to_owned(), |usb| {
+            let names = [&usb.manufacturer, &usb.product, &usb.serial].map(|name| name.as_deref().unwrap_or("-"));
+            format!("{} {}", usb.ids, names.join(", "))
+        });
+        let stable = port.by_id.as_ref().unwrap_or(&port.path).display();
+        let held = port.latency_timer_ms.map_or(String::new(), |ms| format!("; holds bytes for up to {ms} ms"));
+        writeln!(text, "  {stable}\n      {}, {usb}{held}", port.path.display()).expect("a String takes all");
+    }
+    if serial_ports().is_empty() {
+        text.push_str("  none\n");
+    }
     report::print(&text)
 }

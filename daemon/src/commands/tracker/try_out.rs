@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
+use std::path::Path;
 use std::time::Duration;
 
 use holod_calibration::TimeNs;
 use holod_calibration::rig::Rig;
-use holod_pupil_input::{Tracker, TrackerHandle, TrackerSpec, Verdict, host_now};
+use holod_pupil_input::{RecordFiles, Tracker, TrackerHandle, TrackerOptions, TrackerSpec, Verdict, host_now};
 use ratatui::style::Color;
 use serde::Serialize;
 
@@ -28,7 +29,12 @@ struct Report {
     /// The estimate of the present moment, at the end.
     pupil_mm: f32,
     pupil_state: &'static str,
+    /// How much slower the tracker's clock runs than the host's, parts per million.
+    clock_drift_ppm: Option<f64>,
+    /// 19 of 20 samples arrive within this after the quickest ones of their time.
+    delay_spread_ms: Option<f64>,
     counts: BTreeMap<String, u64>,
+    warnings: Vec<String>,
 }
 
 const TICK: Duration = Duration::from_millis(20);
@@ -45,7 +51,17 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     }
     let signals = Signals::install()?;
     let began = host_now();
-    let mut tracker = Tracker::start(&spec, &rig.tracker, began).map_err(tracker_failure)?;
+    let options = TrackerOptions {
+        origin: began,
+        record: args.record.as_deref().map(created).transpose()?,
+        forbidden: setup::ports_of_others(&rig),
+    };
+    let mut tracker = Tracker::start(&spec, &rig.tracker, options).map_err(tracker_failure)?;
+    if !args.json {
+        for warning in tracker.warnings() {
+            tracing::warn!("{warning}");
+        }
+    }
     let mut observed = Observed::default();
     let mut live = LiveText::default();
     let mut redrawn = began;
@@ -94,6 +110,13 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     Err(Failure::new(Exit::Unavailable, format!("tracker {spec}: {heard}")))
 }
 
+fn created(folder: &Path) -> Result<RecordFiles, Failure> {
+    std::fs::create_dir_all(folder).map_err(|error| {
+        Failure::new(Exit::CannotCreate, format!("cannot record into {}: {error}", folder.display()))
+    })?;
+    Ok(RecordFiles::in_folder(folder))
+}
+
 fn spec_of(args: &TryArgs, rig: &Rig) -> Result<TrackerSpec, Failure> {
     let text = args.spec.as_ref().or(rig.tracker.spec.as_ref()).ok_or_else(|| {
         Failure::new(Exit::Usage, "which tracker? name its spec, or a rig file with tracker.spec by --config")
@@ -118,7 +141,10 @@ fn report_of(
         eyes: observed.figures(),
         pupil_mm: estimate.pupil.mm(),
         pupil_state: estimate.state.name(),
+        clock_drift_ppm: tracker.clock().map(|clock| clock.drift_ppm),
+        delay_spread_ms: tracker.clock().map(|clock| clock.delay_spread.seconds() * 1e3),
         counts: tracker.counters().entries().collect(),
+        warnings: tracker.warnings().to_vec(),
     }
 }
 
@@ -194,6 +220,12 @@ fn text_of(report: &Report) -> String {
                 three(eye.raw_mm, "mm", 2),
                 100.0 * eye.accepted as f64 / eye.samples.max(1) as f64,
             ),
+        );
+    }
+    if let Some((drift_ppm, spread_ms)) = report.clock_drift_ppm.zip(report.delay_spread_ms) {
+        put(
+            &mut text,
+            format!("clock: {drift_ppm:+.0} ppm against this machine's; 19 of 20 samples within {spread_ms:.2} ms of the quickest"),
         );
     }
     let shown: Vec<_> = report

@@ -1,0 +1,40 @@
+//! `holod log convert`: a log in another format.
+
+use holod_pupil_input::export;
+
+use super::read;
+use crate::cli::{LogConvertArgs, LogFormatArg};
+use crate::failure::{Exit, Failure};
+use crate::report;
+
+pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
+    if args.out.exists() {
+        return Err(Failure::new(
+            Exit::CannotCreate,
+            format!("{} exists already; name another file with --out, or remove it", args.out.display()),
+        ));
+    }
+    let recording = read(&args.log)?;
+    for note in recording.notes() {
+        tracing::info!("{note}");
+    }
+    let written = match args.to {
+        LogFormatArg::Lines => export::write_lines(&recording, args.scale, &args.out),
+        LogFormatArg::Csv => export::write_csv(&recording, &args.out),
+    };
+    written.map_err(|error| {
+        let exit = match error {
+            export::ExportError::Io { .. } => Exit::CannotCreate,
+            _ => Exit::Usage,
+        };
+        Failure::because(exit)(error)
+    })?;
+    let rejected = recording.faults().total();
+    report::print(&format!(
+        "{}: {} samples of {} written to {}; {rejected} lines or cells held none",
+        args.log.display(),
+        recording.len(),
+        recording.format(),
+        args.out.display(),
+    ))
+}

@@ -1,0 +1,188 @@
+//! `holod log info`: what a log holds, and what the gate makes of it.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::Path;
+
+use holod_calibration::TimeNs;
+use holod_calibration::rig::Rig;
+use holod_pupil_input::{Estimator, EstimatorSettings, LogInfo, Recording, SizeUnit, Verdict};
+use ratatui::style::Color;
+use serde::Serialize;
+
+use super::read;
+use crate::cli::LogInfoArgs;
+use crate::failure::Failure;
+use crate::pictures::{PupilPlot, PupilSampleMark};
+use crate::report;
+use crate::terminal::{Axes, LiveText, PLOT_SIZE, Series, plot};
+
+/// What was found, with the gate's word.
+#[derive(Serialize)]
+struct Report<'a> {
+    #[serde(flatten)]
+    info: &'a LogInfo,
+    gate: Option<&'a GateCounts>,
+}
+
+/// What the gate made of the samples, with both eyes driving.
+#[derive(Serialize)]
+struct GateCounts {
+    believed: u64,
+    rejected: BTreeMap<&'static str, u64>,
+}
+
+/// Every sample with its verdict, and the estimate of its time.
+struct Judged {
+    counts: GateCounts,
+    marks: Vec<PupilSampleMark>,
+    estimate: Vec<(f64, f64)>,
+}
+
+pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
+    let recording = read(&args.log)?;
+    let info = LogInfo::of(&recording, args.scale);
+    let in_mm = recording.unit() == SizeUnit::Millimetres || args.scale.is_some();
+    let judged = in_mm.then(|| judge(&recording, args.scale));
+    if let (Some(path), Some(judged)) = (&args.plot, &judged) {
+        save(judged, path)?;
+    }
+    if args.json {
+        let gate = judged.as_ref().map(|judged| &judged.counts);
+        return report::print_json(&Report { info: &info, gate });
+    }
+    let mut text = format!("{}\n{}", args.log.display(), text_of(&info));
+    match &judged {
+        Some(judged) => text.push_str(&gate_text(judged)),
+        None => text.push_str(
+            "gate     not asked: it judges millimetres; give --scale MM_PER_UNIT, measured with an artificial pupil\n",
+        ),
+    }
+    text.push_str(&drawn(&recording, args.scale, info.duration_s));
+    report::print(text.trim_end())
+}
+
+/// Lets the gate and the filter see the whole log.
+fn judge(recording: &Recording, scale: Option<f64>) -> Judged {
+    let mut settings = Rig::default().tracker;
+    settings.scale = scale;
+    let mut estimator = Estimator::new(EstimatorSettings::from(&settings));
+    let begins = recording.begins();
+    let seconds = |t: TimeNs| (t - begins).seconds();
+    let mut counts = GateCounts { believed: 0, rejected: BTreeMap::new() };
+    let mut marks = Vec::with_capacity(recording.len());
+    let mut note = |decision: holod_pupil_input::Decision| {
+        let accepted = decision.verdict == Verdict::Accepted;
+        match decision.verdict {
+            Verdict::Accepted => counts.believed += 1,
+            Verdict::Rejected(reason) => *counts.rejected.entry(reason.name()).or_default() += 1,
+        }
+        if decision.sample.valid && decision.sample.diameter_mm.is_finite() {
+            let (t_s, raw_mm) = (seconds(decision.sample.t_sample), f64::from(decision.sample.diameter_mm));
+            marks.push(PupilSampleMark { t_s, raw_mm, accepted });
+        }
+    };
+    let mut estimate = Vec::with_capacity(recording.len());
+    for sample in recording.samples() {
+        let t = sample.t_sample;
+        estimator.push(sample, &mut note);
+        estimate.push((seconds(t), f64::from(estimator.pupil_at(t).pupil.mm())));
+    }
+    estimator.finish(&mut note);
+    Judged { counts, marks, estimate }
+}
+
+/// More points than this say no more in a plot.
+const PLOTTED: usize = 20_000;
+
+fn save(judged: &Judged, path: &Path) -> Result<(), Failure> {
+    let every = judged.estimate.len().div_ceil(PLOTTED).max(1);
+    let estimate: Vec<_> = judged.estimate.iter().copied().step_by(every).collect();
+    let every = judged.marks.len().div_ceil(PLOTTED).max(1);
+    let samples: Vec<_> = judged.marks.iter().step_by(every).copied().collect();
+    PupilPlot { samples: &samples, estimate: &estimate, truth: &[] }.save(path)
+}
+
+fn gate_text(judged: &Judged) -> String {
+    let GateCounts { believed, rejected } = &judged.counts;
+    let reasons: Vec<_> = rejected.iter().map(|(name, count)| format!("{name} {count}")).collect();
+    let reasons = if reasons.is_empty() { "none rejected".to_owned() } else { reasons.join(", ") };
+    let share = 100.0 * *believed as f64 / (believed + rejected.values().sum::<u64>()).max(1) as f64;
+    format!("gate     {believed} samples believed ({share:.1} %); {reasons}\n")
+}
+
+fn text_of(info: &LogInfo) -> String {
+    let mut text = String::new();
+    let mut put = |name: &str, says: String| writeln!(text, "{name:8} {says}").expect("a String takes all");
+    put("format", format!("{}, diameters in {}", info.format, info.unit));
+    put("length", format!("{:.3} s, {} samples, first at {} ns", info.duration_s, info.samples, info.begins_ns));
+    if let Some(rate_hz) = info.stated_rate_hz {
+        put("states", format!("{rate_hz} Hz"));
+    }
+    for eye in &info.eyes {
+        let rate = eye.rate_hz.map_or("unknown rate".to_owned(), |rate| format!("{rate:.2} Hz"));
+        let interval = eye.interval_ms.map_or(String::new(), |[p1, p50, p99]| {
+            format!(", interval p1/median/p99 {p1:.2} / {p50:.2} / {p99:.2} ms")
+        });
+        put(eye.eye, format!("{} samples at {rate}{interval}", eye.samples));
+        put(
+            "",
+            format!(
+                "{} lost in {} runs (longest {:.2} s), {} unsure; {} gaps ({:.2} s in all, longest {:.2} s), {} samples missing",
+                eye.lost,
+                eye.lost_runs,
+                eye.longest_lost_s,
+                eye.unsure,
+                eye.gaps,
+                eye.gaps_s,
+                eye.longest_gap_s,
+                eye.missing
+            ),
+        );
+        if let Some(range) = &eye.diameter {
+            put(
+                "",
+                format!(
+                    "diameter p1/median/p99 {:.2} / {:.2} / {:.2}, from {:.2} to {:.2} {}",
+                    range.p1, range.median, range.p99, range.least, range.greatest, info.unit
+                ),
+            );
+        }
+        let found = eye.blinks_found.map_or("not judged".to_owned(), |found| format!("{found} found"));
+        put("", format!("blinks: {} told by the log, {found}; {} longer losses", eye.blinks_told, eye.long_losses.unwrap_or(0)));
+    }
+    let blinks = &info.blinks;
+    put(
+        "blinks",
+        format!("{} told, {} found, {} of them in one eye only", blinks.told, blinks.found, blinks.found_in_one_eye),
+    );
+    let faults: Vec<_> = info.faults.iter().map(|fault| format!("{} {}", fault.name, fault.count)).collect();
+    put("faults", if faults.is_empty() { "none".to_owned() } else { faults.join(", ") });
+    for note in &info.notes {
+        put("note", note.clone());
+    }
+    text
+}
+
+/// The whole log as a plot for the terminal.
+fn drawn(recording: &Recording, scale: Option<f64>, duration_s: f64) -> String {
+    let every = recording.len().div_ceil(PLOTTED).max(1);
+    let begins = recording.begins();
+    let points: Vec<_> = recording
+        .samples()
+        .step_by(every)
+        .filter(|sample| sample.valid && sample.diameter_mm.is_finite())
+        .map(|sample| {
+            ((sample.t_sample - begins).seconds(), f64::from(sample.diameter_mm) * scale.unwrap_or(1.0))
+        })
+        .collect();
+    let most = points.iter().map(|(_, diameter)| *diameter).fold(0.0, f64::max);
+    let in_mm = scale.is_some() || recording.unit() == SizeUnit::Millimetres;
+    let axes = Axes {
+        x_name: "s",
+        x: [0.0, duration_s.max(1e-3)],
+        y_name: if in_mm { "pupil / mm" } else { recording.unit().name() },
+        y: [0.0, if in_mm { 9.0 } else { (1.1 * most).max(1e-3) }],
+    };
+    plot(&[Series { name: "raw", colour: Color::Green, points: &points }], &axes, PLOT_SIZE, LiveText::visible())
+}

@@ -1,0 +1,25 @@
+//! `holod log`: what logs of pupil diameters hold, and other forms of them.
+
+mod convert;
+mod info;
+
+use std::path::Path;
+
+use holod_pupil_input::{Recording, ReplayError};
+
+use crate::cli::LogCommand;
+use crate::failure::{Exit, Failure};
+
+pub(super) fn log(command: &LogCommand) -> Result<(), Failure> {
+    match command {
+        LogCommand::Info(args) => info::info(args),
+        LogCommand::Convert(args) => convert::convert(args),
+    }
+}
+
+fn read(path: &Path) -> Result<Recording, Failure> {
+    Recording::read(path).map_err(|error| {
+        let exit = if matches!(error, ReplayError::Io { .. }) { Exit::NoInput } else { Exit::Data };
+        Failure::because(exit)(error)
+    })
+}
