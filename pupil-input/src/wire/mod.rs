@@ -6,11 +6,16 @@
 mod checksum;
 pub mod delimited;
 pub mod field;
+pub mod iscan;
 pub mod line;
+pub mod livetrack;
+pub mod open_gaze;
 pub mod packet;
+pub mod pupilext;
 pub mod report;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
+mod text;
 
 use holod_calibration::TimeNs;
 
@@ -18,7 +23,11 @@ use crate::SampleEye;
 
 pub use checksum::{ChecksumKind, Crc};
 use delimited::{DelimitedDecoder, DelimitedSettings};
+use iscan::{IscanDecoder, IscanSettings};
+use livetrack::{LiveTrackDecoder, LiveTrackSettings};
+use open_gaze::{OpenGazeDecoder, OpenGazeSettings};
 use packet::{PacketDecoder, PacketSettings};
+use pupilext::{PupilExtDecoder, PupilExtSettings};
 use report::{ReportDecoder, ReportSettings};
 
 /// A sample as the wire gives it.
@@ -145,6 +154,14 @@ pub enum Format {
     Packet(PacketSettings),
     /// Whole messages.
     Report(ReportSettings),
+    /// ISCAN's binary packets.
+    Iscan(IscanSettings),
+    /// LiveTrack's rows.
+    LiveTrack(LiveTrackSettings),
+    /// Gazepoint's Open Gaze records.
+    OpenGaze(OpenGazeSettings),
+    /// PupilEXT's rows or objects.
+    PupilExt(PupilExtSettings),
 }
 
 impl Format {
@@ -155,6 +172,10 @@ impl Format {
             Self::Delimited(settings) => Box::new(DelimitedDecoder::joining(settings)),
             Self::Packet(settings) => Box::new(PacketDecoder::joining(settings)),
             Self::Report(settings) => Box::new(ReportDecoder::new(settings)),
+            Self::Iscan(settings) => Box::new(IscanDecoder::new(settings.clone())),
+            Self::LiveTrack(settings) => Box::new(LiveTrackDecoder::new(*settings)),
+            Self::OpenGaze(settings) => Box::new(OpenGazeDecoder::new(*settings)),
+            Self::PupilExt(settings) => Box::new(PupilExtDecoder::new(*settings)),
         }
     }
 }
