@@ -30,6 +30,7 @@
 mod clock;
 mod counters;
 mod estimator;
+pub mod export;
 mod filter;
 mod gate;
 mod import;
@@ -42,9 +43,11 @@ mod spec;
 mod tracker;
 pub mod wire;
 
-pub use clock::ClockModel;
+pub use clock::{ClockModel, ClockReport};
 pub use counters::{Counter, CounterSnapshot};
-pub use estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, PupilState, STATED_LAG};
+pub use estimator::{
+    BetterSettings, Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, PupilState, STATED_LAG,
+};
 pub use filter::FilterSettings;
 pub use gate::{GateSettings, Rejection, Verdict};
 pub use import::{Blink, LogFault, LogFaults, LogFormat, Recording, ReplayError, SizeUnit};
@@ -55,6 +58,7 @@ pub use source::mock::{MockSample, MockSource, Scenario};
 
 pub use source::SourceError;
 pub use source::commands::CommandError;
+pub use source::hid::{HidError, RULE_FILE, udev_rule};
 pub use source::serial::SerialError;
 pub use source::serial::identity::{SerialPortInfo, UsbPort, serial_ports};
 pub use source::tcp::NetworkError;

@@ -1,7 +1,10 @@
 //! What is known of a kind of tracker: how its bytes are read, and how it is started and told from others.
+//!
+//! A profile is a TOML file. `profiles/README.md` in this crate describes every key; the files beside it are shipped.
 
 mod parse;
 mod reader;
+mod wire;
 
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
@@ -118,7 +121,13 @@ fn in_words(faults: &[Fault]) -> String {
 pub const DEFAULT_PROFILE: &str = "holod";
 
 /// By name.
-const FILES: [(&str, &str); 1] = [("holod", include_str!("../../profiles/holod.toml"))];
+const FILES: [(&str, &str); 5] = [
+    ("asl-eye-trac", include_str!("../../profiles/asl-eye-trac.toml")),
+    ("example-lines", include_str!("../../profiles/example-lines.toml")),
+    ("example-packet", include_str!("../../profiles/example-packet.toml")),
+    ("holod", include_str!("../../profiles/holod.toml")),
+    ("holod-hid", include_str!("../../profiles/holod-hid.toml")),
+];
 
 /// A test holds each of them to be right.
 static SHIPPED: LazyLock<Vec<Profile>> =

@@ -1,6 +1,7 @@
 //! Where bytes come from: one file for each kind of link, behind one trait.
 
 pub(crate) mod commands;
+pub(crate) mod hid;
 pub mod mock;
 pub(crate) mod serial;
 pub(crate) mod tcp;
@@ -8,6 +9,7 @@ pub(crate) mod udp;
 
 use std::time::Duration;
 
+use hid::HidError;
 use serial::SerialError;
 use tcp::NetworkError;
 
@@ -55,4 +57,7 @@ pub enum SourceError {
     /// A TCP or UDP link.
     #[error(transparent)]
     Network(#[from] NetworkError),
+    /// A HID device.
+    #[error(transparent)]
+    Hid(#[from] HidError),
 }

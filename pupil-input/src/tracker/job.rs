@@ -8,12 +8,13 @@ use super::TrackerError;
 use crate::import::raw::RawLog;
 use crate::import::{Recording, SizeUnit};
 use crate::profile::{DEFAULT_PROFILE, Profile};
+use crate::source::hid::{self, HidFeed, Wanted};
 use crate::source::mock::Scenario;
 use crate::source::serial::SerialFeed;
 use crate::source::tcp::TcpFeed;
 use crate::source::udp::UdpFeed;
-use crate::source::{ByteSource, Feed};
-use crate::spec::{ReplaySpeed, TrackerSpec};
+use crate::source::{ByteSource, Feed, SourceError};
+use crate::spec::{ReplaySpeed, TrackerSpec, UsbIds};
 
 /// What the thread is to do.
 pub(super) enum Job {
@@ -54,7 +55,7 @@ impl Job {
             }
             TrackerSpec::Path(path) => Self::serial(path, None, None, forbidden),
             TrackerSpec::Serial { path, profile, baud } => Self::serial(path, profile.as_deref(), *baud, forbidden),
-            TrackerSpec::Hid { .. } => unimplemented!("HID"),
+            TrackerSpec::Hid { ids, serial, profile } => Self::hid(*ids, serial.as_deref(), profile.as_deref()),
             TrackerSpec::Tcp { address, profile } => {
                 let profile = Profile::find(profile)?;
                 Self::live(Box::new(TcpFeed::new(address.clone(), &profile)), profile)
@@ -108,6 +109,15 @@ impl Job {
     ) -> Result<Self, TrackerError> {
         let profile = Profile::find(profile.unwrap_or(DEFAULT_PROFILE))?;
         Self::live(Box::new(SerialFeed::new(path, baud, profile.clone(), forbidden)), profile)
+    }
+
+    fn hid(ids: Option<UsbIds>, serial: Option<&str>, profile: Option<&str>) -> Result<Self, TrackerError> {
+        let profile = match profile {
+            Some(name) => Profile::find(name)?,
+            None => hid::profile_of(ids).map_err(SourceError::from)?,
+        };
+        let wanted = Wanted::new(ids, serial, &profile).map_err(SourceError::from)?;
+        Self::live(Box::new(HidFeed::new(wanted)), profile)
     }
 
     fn live(mut feed: Box<dyn Feed>, profile: Profile) -> Result<Self, TrackerError> {

@@ -13,6 +13,7 @@ use holod_calibration::{TimeNs, rig};
 
 use self::job::Job;
 use self::worker::Worker;
+use crate::clock::{ClockGauge, ClockReport};
 use crate::counters::{CounterSnapshot, Counters};
 use crate::estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, StreamClock};
 use crate::import::{ReplayError, SizeUnit};
@@ -147,6 +148,7 @@ impl Tracker {
         let (producer, consumer) = rtrb::RingBuffer::new(TAP_DECISIONS);
         let shared = Arc::new(Shared {
             counters: Counters::new(),
+            clock: ClockGauge::new(),
             stop: AtomicBool::new(false),
             link: AtomicU8::new(Link::Up as u8),
         });
@@ -193,6 +195,11 @@ impl TrackerHandle {
     /// All counts at this moment.
     pub fn counters(&self) -> CounterSnapshot {
         self.control.counters()
+    }
+
+    /// What has been found of the tracker's clock; nothing where its samples carry no time.
+    pub fn clock(&self) -> Option<ClockReport> {
+        self.control.clock()
     }
 
     /// How the link is.
@@ -267,6 +274,11 @@ impl TrackerControl {
         self.shared.counters.snapshot()
     }
 
+    /// What has been found of the tracker's clock; nothing where its samples carry no time.
+    pub fn clock(&self) -> Option<ClockReport> {
+        self.shared.clock.get()
+    }
+
     /// How the link is.
     pub fn link(&self) -> Link {
         Link::ALL[usize::from(self.shared.link.load(Ordering::Acquire))]
@@ -311,6 +323,7 @@ impl Drop for TrackerControl {
 #[derive(Debug)]
 struct Shared {
     counters: Counters,
+    clock: ClockGauge,
     stop: AtomicBool,
     link: AtomicU8,
 }

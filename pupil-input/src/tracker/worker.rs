@@ -340,6 +340,7 @@ impl LiveStream {
         if *datagrams {
             decoder.finish(&mut take);
         }
+        worker.shared.clock.set(clock.report());
     }
 }
 
