@@ -1,7 +1,10 @@
 //! What is known of a kind of tracker: how its bytes are read, and how it is started and told from others.
+//!
+//! A profile is a TOML file. `profiles/README.md` in this crate describes every key; the files beside it are shipped.
 
 mod parse;
 mod reader;
+mod wire;
 
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
@@ -11,6 +14,7 @@ use holod_calibration::rig::Fault;
 
 use crate::import::SizeUnit;
 use crate::spec::UsbIds;
+use crate::wire::hid_descriptor::DescriptorError;
 use crate::wire::{Decoder, Format};
 
 /// A kind of tracker.
@@ -118,7 +122,13 @@ fn in_words(faults: &[Fault]) -> String {
 pub const DEFAULT_PROFILE: &str = "holod";
 
 /// By name.
-const FILES: [(&str, &str); 1] = [("holod", include_str!("../../profiles/holod.toml"))];
+const FILES: [(&str, &str); 5] = [
+    ("asl-eye-trac", include_str!("../../profiles/asl-eye-trac.toml")),
+    ("example-lines", include_str!("../../profiles/example-lines.toml")),
+    ("example-packet", include_str!("../../profiles/example-packet.toml")),
+    ("holod", include_str!("../../profiles/holod.toml")),
+    ("holod-hid", include_str!("../../profiles/holod-hid.toml")),
+];
 
 /// A test holds each of them to be right.
 static SHIPPED: LazyLock<Vec<Profile>> =
@@ -150,6 +160,18 @@ impl Profile {
         let text = std::fs::read_to_string(path)
             .map_err(|error| ProfileError::Unreadable { path: path.into(), reason: error.to_string() })?;
         parse::parse(&text).map_err(|faults| ProfileError::Wrong { origin: path.display().to_string(), faults })
+    }
+
+    /// The profile for the HID device with this report descriptor: what it names by usage gets its place.
+    ///
+    /// # Errors
+    /// The descriptor is faulty, or does not have what the profile names.
+    pub(crate) fn described(self, descriptor: &[u8]) -> Result<Self, DescriptorError> {
+        let format = match self.format {
+            Format::Usages(settings) => Format::Report(settings.resolve(descriptor)?),
+            format => format,
+        };
+        Ok(Self { format, ..self })
     }
 
     /// A decoder for a stream that may be joined in the middle of a message.

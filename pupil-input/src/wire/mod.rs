@@ -3,12 +3,26 @@
 //! A decoder is pushed bytes as they come and tells what they hold. However the bytes of a stream are split, the events
 //! are the same; formats that come in messages (a HID report, a datagram) are pushed one message at a time instead.
 
+mod checksum;
+pub mod delimited;
+pub mod field;
 pub mod hid_descriptor;
 pub mod line;
+pub mod packet;
+pub mod report;
+#[cfg(test)]
+mod testing;
+pub mod usages;
 
 use holod_calibration::TimeNs;
 
 use crate::SampleEye;
+
+pub use checksum::{ChecksumKind, Crc};
+use delimited::{DelimitedDecoder, DelimitedSettings};
+use packet::{PacketDecoder, PacketSettings};
+use report::{ReportDecoder, ReportSettings};
+use usages::{Undescribed, UsageSettings};
 
 /// A sample as the wire gives it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -128,6 +142,14 @@ pub trait Decoder: Send {
 pub enum Format {
     /// holod's line protocol.
     Lines,
+    /// Lines with columns.
+    Delimited(DelimitedSettings),
+    /// Binary packets.
+    Packet(PacketSettings),
+    /// Whole messages.
+    Report(ReportSettings),
+    /// HID reports, by the device's descriptor.
+    Usages(UsageSettings),
 }
 
 impl Format {
@@ -135,6 +157,10 @@ impl Format {
     pub fn decoder(&self) -> Box<dyn Decoder> {
         match self {
             Self::Lines => Box::new(line::LineDecoder::joining()),
+            Self::Delimited(settings) => Box::new(DelimitedDecoder::joining(settings)),
+            Self::Packet(settings) => Box::new(PacketDecoder::joining(settings)),
+            Self::Report(settings) => Box::new(ReportDecoder::new(settings)),
+            Self::Usages(_) => Box::new(Undescribed),
         }
     }
 }
