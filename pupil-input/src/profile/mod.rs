@@ -159,7 +159,12 @@ impl Profile {
     fn read(path: &Path) -> Result<Self, ProfileError> {
         let text = std::fs::read_to_string(path)
             .map_err(|error| ProfileError::Unreadable { path: path.into(), reason: error.to_string() })?;
-        parse::parse(&text).map_err(|faults| ProfileError::Wrong { origin: path.display().to_string(), faults })
+        Self::from_toml(&text, &path.display().to_string())
+    }
+
+    /// The profile that a text describes; `origin` names it in errors.
+    pub(crate) fn from_toml(text: &str, origin: &str) -> Result<Self, ProfileError> {
+        parse::parse(text).map_err(|faults| ProfileError::Wrong { origin: origin.into(), faults })
     }
 
     /// The profile for the HID device with this report descriptor: what it names by usage gets its place.

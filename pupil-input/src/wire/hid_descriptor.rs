@@ -213,7 +213,9 @@ pub enum DescriptorError {
         found: String,
     },
     /// Two fields of a sample are in different reports.
-    #[error("the fields of usages {one} and {other} are in different reports; a sample must be in one: correct the profile's usages")]
+    #[error(
+        "the fields of usages {one} and {other} are in different reports; a sample must be in one: correct the profile's usages"
+    )]
     OtherReport {
         /// The first field.
         one: Usage,
@@ -221,7 +223,9 @@ pub enum DescriptorError {
         other: Usage,
     },
     /// Its bits are no number that can be read.
-    #[error("the field of usage {usage}, {bits} bits from bit {bit_offset}, spans more than 8 bytes, or is signed and ends within a byte")]
+    #[error(
+        "the field of usage {usage}, {bits} bits from bit {bit_offset}, spans more than 8 bytes, or is signed and ends within a byte"
+    )]
     Unreadable {
         /// What it is.
         usage: Usage,
@@ -231,7 +235,9 @@ pub enum DescriptorError {
         bit_offset: u32,
     },
     /// It has a unit, and no range to convert by.
-    #[error("the field of usage {usage} has a unit and no range; name its offset, type and scale in a profile of kind `report`")]
+    #[error(
+        "the field of usage {usage} has a unit and no range; name its offset, type and scale in a profile of kind `report`"
+    )]
     NoRange {
         /// What it is.
         usage: Usage,

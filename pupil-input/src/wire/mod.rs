@@ -4,14 +4,21 @@
 //! are the same; formats that come in messages (a HID report, a datagram) are pushed one message at a time instead.
 
 mod checksum;
+pub(crate) mod core;
 pub mod delimited;
 pub mod field;
 pub mod hid_descriptor;
+pub mod iscan;
 pub mod line;
+pub mod livetrack;
+pub(crate) mod neon;
+pub mod open_gaze;
 pub mod packet;
+pub mod pupilext;
 pub mod report;
 #[cfg(test)]
 mod testing;
+mod text;
 pub mod usages;
 
 use holod_calibration::TimeNs;
