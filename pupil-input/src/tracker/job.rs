@@ -117,7 +117,10 @@ impl Job {
             None => hid::profile_of(ids).map_err(SourceError::from)?,
         };
         let wanted = Wanted::new(ids, serial, &profile).map_err(SourceError::from)?;
-        Self::live(Box::new(HidFeed::new(wanted)), profile)
+        let mut feed = HidFeed::new(wanted);
+        let open = feed.open()?;
+        let profile = feed.describe(profile).map_err(SourceError::from)?;
+        Ok(Self::Live { open, feed: Box::new(feed), profile: Box::new(profile) })
     }
 
     fn live(mut feed: Box<dyn Feed>, profile: Profile) -> Result<Self, TrackerError> {

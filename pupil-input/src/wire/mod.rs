@@ -19,6 +19,7 @@ pub mod report;
 #[cfg(test)]
 pub(crate) mod testing;
 mod text;
+pub mod usages;
 
 use holod_calibration::TimeNs;
 
@@ -32,6 +33,7 @@ use open_gaze::{OpenGazeDecoder, OpenGazeSettings};
 use packet::{PacketDecoder, PacketSettings};
 use pupilext::{PupilExtDecoder, PupilExtSettings};
 use report::{ReportDecoder, ReportSettings};
+use usages::{Undescribed, UsageSettings};
 
 /// A sample as the wire gives it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -165,6 +167,8 @@ pub enum Format {
     OpenGaze(OpenGazeSettings),
     /// PupilEXT's rows or objects.
     PupilExt(PupilExtSettings),
+    /// HID reports, by the device's descriptor.
+    Usages(UsageSettings),
 }
 
 impl Format {
@@ -179,6 +183,7 @@ impl Format {
             Self::LiveTrack(settings) => Box::new(LiveTrackDecoder::new(*settings)),
             Self::OpenGaze(settings) => Box::new(OpenGazeDecoder::new(*settings)),
             Self::PupilExt(settings) => Box::new(PupilExtDecoder::new(*settings)),
+            Self::Usages(_) => Box::new(Undescribed),
         }
     }
 }
