@@ -53,6 +53,7 @@ pub use source::mock::{MockSample, MockSource, Scenario};
 
 pub use source::SourceError;
 pub use source::serial::SerialError;
+pub use source::server::ServerError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
 pub use tracker::{
     DecisionTap, EstimateReader, Link, MOCK_SEED, Tracker, TrackerControl, TrackerError, TrackerHandle, host_now,

@@ -16,7 +16,9 @@ use crate::gate::Verdict;
 use crate::import::{LogFault, Recording, ReplayError, SizeUnit};
 use crate::profile::{DEFAULT_PROFILE, Profile, ProfileError};
 use crate::sequence::{SequenceEvent, SequenceTracker};
+use crate::source::core::CoreFeed;
 use crate::source::mock::{MockSource, Scenario};
+use crate::source::neon::NeonFeed;
 use crate::source::serial::SerialFeed;
 use crate::source::{ByteSource, Feed, ReadEvent, SourceError};
 use crate::spec::{DEFAULT_BAUD, ReplaySpeed, TrackerSpec};
@@ -274,8 +276,10 @@ impl Job {
             TrackerSpec::Hid { .. } => unimplemented!("HID"),
             TrackerSpec::Tcp { .. } => unimplemented!("TCP"),
             TrackerSpec::Udp { .. } => unimplemented!("UDP"),
-            TrackerSpec::Core(_) => unimplemented!("Core"),
-            TrackerSpec::Neon(_) => unimplemented!("Neon"),
+            TrackerSpec::Core(address) => {
+                Self::live(Box::new(CoreFeed { address: address.clone() }), Profile::find("core")?)
+            }
+            TrackerSpec::Neon(address) => Self::live(Box::new(NeonFeed::new(address.clone())), Profile::find("neon")?),
             TrackerSpec::Replay { path, speed, repeat } => {
                 Ok(Self::Replay { recording: Box::new(Recording::read(path)?), speed: *speed, repeat: *repeat, origin })
             }

@@ -118,7 +118,11 @@ fn in_words(faults: &[Fault]) -> String {
 pub const DEFAULT_PROFILE: &str = "holod";
 
 /// By name.
-const FILES: [(&str, &str); 1] = [("holod", include_str!("../../profiles/holod.toml"))];
+const FILES: [(&str, &str); 3] = [
+    ("core", include_str!("../../profiles/core.toml")),
+    ("holod", include_str!("../../profiles/holod.toml")),
+    ("neon", include_str!("../../profiles/neon.toml")),
+];
 
 /// A test holds each of them to be right.
 static SHIPPED: LazyLock<Vec<Profile>> =

@@ -130,13 +130,15 @@ fn read_size(size: &Section<'_>) -> Size {
     Size { unit }
 }
 
-const KINDS: [&str; 1] = ["holod"];
+const KINDS: [&str; 3] = ["holod", "core", "neon"];
 
 fn read_wire(wire: &Section<'_>, _context: &Context) -> Option<Format> {
     let expected = format!("one of \"{}\"", KINDS.join("\", \""));
     let kind = wire.require("kind", &expected)?;
     let format = match wire.reader().text(&kind, &expected)? {
         "holod" => Some(Format::Lines),
+        "core" => Some(Format::CoreMsgpack),
+        "neon" => Some(Format::NeonRtp),
         unknown => {
             let advice = did_you_mean(unknown, &KINDS).unwrap_or("choose one".into());
             wire.reader().fault(&kind, format!("\"{unknown}\""), &expected, advice);

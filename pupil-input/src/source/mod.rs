@@ -1,11 +1,16 @@
 //! Where bytes come from: one file for each kind of link, behind one trait.
 
+pub(crate) mod core;
 pub mod mock;
+pub(crate) mod neon;
 pub(crate) mod serial;
+pub(crate) mod server;
+mod zmtp;
 
 use std::time::Duration;
 
 use serial::SerialError;
+use server::ServerError;
 
 /// How long one read waits; also how soon a stop is noticed.
 pub(crate) const READ_TIMEOUT: Duration = Duration::from_millis(50);
@@ -38,4 +43,7 @@ pub enum SourceError {
     /// A serial port.
     #[error(transparent)]
     Serial(#[from] SerialError),
+    /// The server of a Pupil Labs tracker.
+    #[error(transparent)]
+    Server(#[from] ServerError),
 }

@@ -129,6 +129,10 @@ pub trait Decoder: Send {
 pub enum Format {
     /// holod's line protocol.
     Lines,
+    /// Pupil Labs Core's MessagePack maps.
+    CoreMsgpack,
+    /// Pupil Labs Neon's gaze stream, RTP and RTCP as RTSP interleaves them.
+    NeonRtp,
 }
 
 impl Format {
@@ -136,6 +140,8 @@ impl Format {
     pub fn decoder(&self) -> Box<dyn Decoder> {
         match self {
             Self::Lines => Box::new(line::LineDecoder::joining()),
+            Self::CoreMsgpack => Box::new(core::CoreDecoder),
+            Self::NeonRtp => Box::new(neon::NeonDecoder::new()),
         }
     }
 }

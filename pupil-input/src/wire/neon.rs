@@ -25,7 +25,7 @@ use super::{Decoder, WireEvent, WireFault, WireSample};
 use crate::SampleEye;
 
 /// Bytes of the longest RTSP message that is read; a Companion's SDP has about 300.
-const MAX_TEXT_BYTES: usize = 4096;
+pub(crate) const MAX_TEXT_BYTES: usize = 4096;
 /// Bytes of the longest packet. The gaze stream's have 101; after rubbish no more than this can be swallowed.
 const MAX_PACKET_BYTES: usize = 256;
 const FRAME_HEADER_BYTES: usize = 4;
@@ -178,6 +178,12 @@ pub(crate) fn header<'a>(head: &'a [u8], name: &str) -> Option<&'a str> {
     })
 }
 
+/// The part of an SDP that is about the gaze stream.
+pub(crate) fn gaze_media(sdp: &[u8]) -> &[u8] {
+    const MEDIA: &[u8] = b"\nm=application";
+    sdp.windows(MEDIA.len()).position(|window| window == MEDIA).map_or(sdp, |begin| &sdp[begin..])
+}
+
 /// One RTP stream's clock and numbers.
 #[derive(Clone, Copy, Debug)]
 struct Stream {
@@ -205,7 +211,7 @@ impl Stream {
 
     /// Looks for the clock rate: `a=rtpmap:96 com.pupillabs.gaze1/90000`.
     fn read_text(&mut self, message: &[u8]) {
-        let rate = message.split(|byte| *byte == b'\n').find_map(|line| {
+        let rate = gaze_media(message).split(|byte| *byte == b'\n').find_map(|line| {
             let format = std::str::from_utf8(line).ok()?.strip_prefix("a=rtpmap:")?;
             let (_, encoding) = format.split_once(' ')?;
             encoding.trim().split('/').nth(1)?.parse().ok().filter(|rate| *rate > 0)
