@@ -422,7 +422,7 @@ mod tests {
     /// Payload of 89 bytes, or its first 65, 17 or 9 of another meaning.
     fn payload(length: usize, worn: u8, left_mm: f32, right_mm: f32) -> Vec<u8> {
         let mut bytes = Vec::new();
-        let mut float = |bytes: &mut Vec<u8>, value: f32| bytes.extend(value.to_be_bytes());
+        let float = |bytes: &mut Vec<u8>, value: f32| bytes.extend(value.to_be_bytes());
         float(&mut bytes, 812.5);
         float(&mut bytes, 601.25);
         bytes.push(worn);
@@ -711,8 +711,6 @@ mod tests {
             rubbish in prop::collection::vec(any::<u8>(), 0..600),
             cut in 0..101_usize,
         ) {
-            // A text that never ends is given up after 4096 bytes; all else at the next packet but one.
-            prop_assume!(!rubbish.ends_with(b"R"));
             let packets: Vec<_> = (1..6).map(|number| framed(0, &datum(number, 0))).collect();
             let bytes = [&packets[0][..], &packets[1][..cut], &rubbish, &packets[2], &packets[3], &packets[4]].concat();
             let numbers: Vec<_> = samples(&decode(&bytes)).iter().map(|sample| sample.sequence).collect();
