@@ -62,6 +62,7 @@ pub use source::hid::{HidError, RULE_FILE, udev_rule};
 pub use source::serial::SerialError;
 pub use source::serial::identity::{SerialPortInfo, UsbPort, serial_ports};
 pub use source::tcp::NetworkError;
+pub use source::server::ServerError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
 pub use tracker::{
     DecisionTap, EstimateReader, Link, MOCK_SEED, Tracker, TrackerControl, TrackerError, TrackerHandle, TrackerOptions,

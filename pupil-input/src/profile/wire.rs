@@ -27,8 +27,9 @@ pub(super) struct Context {
     pub(super) size_at: Option<Found<()>>,
 }
 
-const KINDS: [&str; 9] =
-    ["holod", "delimited", "packet", "report", "usages", "iscan", "livetrack", "open-gaze", "pupilext"];
+const KINDS: [&str; 11] = [
+    "holod", "delimited", "packet", "report", "usages", "iscan", "livetrack", "open-gaze", "pupilext", "core", "neon",
+];
 /// Bytes of the longest sync word.
 const SYNC_MAX: usize = 16;
 
@@ -50,6 +51,8 @@ pub(super) fn read_wire<'a>(wire: &Section<'a>, context: &Context) -> Option<(Fo
         }
         "iscan" => read_iscan(wire, context).map(|settings| (Format::Iscan(settings), context.unit)),
         "livetrack" => read_livetrack(wire, context),
+        "core" => Some((Format::CoreMsgpack, SizeUnit::Millimetres)),
+        "neon" => Some((Format::NeonRtp, SizeUnit::Millimetres)),
         "open-gaze" => Some(read_open_gaze(wire, context)),
         "pupilext" => Some(read_pupilext(wire, context)),
         unknown => {

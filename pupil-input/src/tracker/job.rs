@@ -8,7 +8,9 @@ use super::TrackerError;
 use crate::import::raw::RawLog;
 use crate::import::{Recording, SizeUnit};
 use crate::profile::{DEFAULT_PROFILE, Profile};
+use crate::source::core::CoreFeed;
 use crate::source::hid::{self, HidFeed, Wanted};
+use crate::source::neon::NeonFeed;
 use crate::source::mock::Scenario;
 use crate::source::serial::SerialFeed;
 use crate::source::tcp::TcpFeed;
@@ -64,8 +66,10 @@ impl Job {
                 let profile = Profile::find(profile)?;
                 Self::live(Box::new(UdpFeed::new(address.clone(), &profile)), profile)
             }
-            TrackerSpec::Core(_) => unimplemented!("Core"),
-            TrackerSpec::Neon(_) => unimplemented!("Neon"),
+            TrackerSpec::Core(address) => {
+                Self::live(Box::new(CoreFeed { address: address.clone() }), Profile::find("core")?)
+            }
+            TrackerSpec::Neon(address) => Self::live(Box::new(NeonFeed::new(address.clone())), Profile::find("neon")?),
             TrackerSpec::Replay { path, speed, repeat } => {
                 Self::log(path, Play { speed: *speed, repeat: *repeat, origin })
             }

@@ -169,6 +169,10 @@ pub enum Format {
     PupilExt(PupilExtSettings),
     /// HID reports, by the device's descriptor.
     Usages(UsageSettings),
+    /// Pupil Labs Core's MessagePack maps.
+    CoreMsgpack,
+    /// Pupil Labs Neon's gaze stream, RTP and RTCP as RTSP interleaves them.
+    NeonRtp,
 }
 
 impl Format {
@@ -184,6 +188,8 @@ impl Format {
             Self::OpenGaze(settings) => Box::new(OpenGazeDecoder::new(*settings)),
             Self::PupilExt(settings) => Box::new(PupilExtDecoder::new(*settings)),
             Self::Usages(_) => Box::new(Undescribed),
+            Self::CoreMsgpack => Box::new(core::CoreDecoder),
+            Self::NeonRtp => Box::new(neon::NeonDecoder::new()),
         }
     }
 }
