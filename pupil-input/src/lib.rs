@@ -36,6 +36,7 @@ mod import;
 mod profile;
 mod sample;
 mod sequence;
+mod simulate;
 pub mod source;
 mod spec;
 mod tracker;
@@ -51,11 +52,9 @@ pub use gate::{GateSettings, Rejection, Verdict};
 pub use import::{Blink, LogFault, LogFaults, LogFormat, Recording, ReplayError, SizeUnit};
 pub use profile::{DEFAULT_PROFILE, Profile, ProfileError};
 pub use sample::{PupilSample, SampleEye};
-pub use source::mock::{MockSample, MockSource, Scenario};
+pub use simulate::{MOCK_SEED, MockSample, MockSource, Scenario, Script, ScriptError};
 
 pub use source::SourceError;
 pub use source::serial::SerialError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
-pub use tracker::{
-    DecisionTap, EstimateReader, Link, MOCK_SEED, Tracker, TrackerControl, TrackerError, TrackerHandle, host_now,
-};
+pub use tracker::{DecisionTap, EstimateReader, Link, Tracker, TrackerControl, TrackerError, TrackerHandle, host_now};

@@ -16,7 +16,7 @@ use crate::gate::Verdict;
 use crate::import::{LogFault, Recording, ReplayError, SizeUnit};
 use crate::profile::{DEFAULT_PROFILE, Profile, ProfileError};
 use crate::sequence::{SequenceEvent, SequenceTracker};
-use crate::source::mock::{MockSource, Scenario};
+use crate::simulate::{MockSource, Script, ScriptError};
 use crate::source::serial::SerialFeed;
 use crate::source::{ByteSource, Feed, ReadEvent, SourceError};
 use crate::spec::{DEFAULT_BAUD, ReplaySpeed, TrackerSpec};
@@ -40,6 +40,9 @@ pub enum TrackerError {
     /// The log cannot be played.
     #[error(transparent)]
     Replay(#[from] ReplayError),
+    /// The simulated eye's scenario cannot be had.
+    #[error(transparent)]
+    Script(#[from] ScriptError),
     /// Its figures are no millimetres, and nobody said how many millimetres one of them is.
     #[error(
         "tracker `{spec}` gives pupil sizes in {unit}; holod needs millimetres: measure an artificial pupil of known \
@@ -55,9 +58,6 @@ pub enum TrackerError {
     #[error("no thread for the pupil reader: {0}; free memory or raise the limit on threads")]
     Thread(std::io::Error),
 }
-
-/// Seed of the `mock` tracker.
-pub const MOCK_SEED: u64 = 1;
 
 /// How the link to the tracker is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -269,7 +269,7 @@ struct Shared {
 enum Job {
     Live { open: Box<dyn ByteSource>, feed: Box<dyn Feed>, profile: Profile },
     Replay { recording: Box<Recording>, speed: ReplaySpeed, repeat: bool, origin: TimeNs },
-    Mock { scenario: Scenario, origin: TimeNs },
+    Mock { script: Box<Script>, origin: TimeNs },
 }
 
 impl Job {
@@ -291,7 +291,8 @@ impl Job {
             TrackerSpec::Replay { path, speed, repeat } => {
                 Ok(Self::Replay { recording: Box::new(Recording::read(path)?), speed: *speed, repeat: *repeat, origin })
             }
-            TrackerSpec::Mock(scenario) => Ok(Self::Mock { scenario: *scenario, origin }),
+            TrackerSpec::Mock(scenario) => Ok(Self::Mock { script: Box::new(scenario.script()), origin }),
+            TrackerSpec::MockFile(path) => Ok(Self::Mock { script: Box::new(Script::read(path)?), origin }),
         }
     }
 
@@ -328,7 +329,7 @@ impl Worker {
         match job {
             Job::Live { open, feed, profile } => self.run_live(open, feed, &profile),
             Job::Replay { recording, speed, repeat, origin } => self.run_replay(&recording, speed, repeat, origin),
-            Job::Mock { scenario, origin } => self.run_mock(scenario, origin),
+            Job::Mock { script, origin } => self.run_mock(*script, origin),
         }
         self.finish();
     }
@@ -418,9 +419,9 @@ impl Worker {
         }
     }
 
-    fn run_mock(&mut self, scenario: Scenario, origin: TimeNs) {
+    fn run_mock(&mut self, script: Script, origin: TimeNs) {
         self.clock = StreamClock { host: origin, stream: TimeNs(0), rate: 1.0 };
-        for mock in MockSource::new(scenario, MOCK_SEED) {
+        for mock in MockSource::of(script) {
             let mut sample = mock.sample;
             if !self.wait_until(self.clock.to_host(sample.t_sample)) {
                 return;

@@ -1,6 +1,5 @@
 //! Where bytes come from: one file for each kind of link, behind one trait.
 
-pub mod mock;
 pub(crate) mod serial;
 
 use std::time::Duration;
