@@ -3,7 +3,6 @@
 pub(crate) mod commands;
 pub(crate) mod hid;
 pub(crate) mod core;
-pub mod mock;
 pub(crate) mod neon;
 pub(crate) mod serial;
 pub(crate) mod tcp;

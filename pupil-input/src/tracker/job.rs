@@ -8,10 +8,10 @@ use super::TrackerError;
 use crate::import::raw::RawLog;
 use crate::import::{Recording, SizeUnit};
 use crate::profile::{DEFAULT_PROFILE, Profile};
+use crate::simulate::Script;
 use crate::source::core::CoreFeed;
 use crate::source::hid::{self, HidFeed, Wanted};
 use crate::source::neon::NeonFeed;
-use crate::source::mock::Scenario;
 use crate::source::serial::SerialFeed;
 use crate::source::tcp::TcpFeed;
 use crate::source::udp::UdpFeed;
@@ -35,7 +35,7 @@ pub(super) enum Job {
         play: Play,
     },
     Mock {
-        scenario: Scenario,
+        script: Box<Script>,
         origin: TimeNs,
     },
 }
@@ -73,7 +73,8 @@ impl Job {
             TrackerSpec::Replay { path, speed, repeat } => {
                 Self::log(path, Play { speed: *speed, repeat: *repeat, origin })
             }
-            TrackerSpec::Mock(scenario) => Ok(Self::Mock { scenario: *scenario, origin }),
+            TrackerSpec::Mock(scenario) => Ok(Self::Mock { script: Box::new(scenario.script()), origin }),
+            TrackerSpec::MockFile(path) => Ok(Self::Mock { script: Box::new(Script::read(path)?), origin }),
         }
     }
 
