@@ -9,8 +9,8 @@ mod lines;
 mod neon;
 mod pupilext;
 mod table;
-mod text;
 mod tobii;
+mod unpack;
 mod xdf;
 
 use std::fmt;
@@ -130,7 +130,7 @@ impl<'a> LogInput<'a> {
 
     /// From its beginning: unpacked if it is gzip, in UTF-8 if it is UTF-16, without a byte order mark.
     pub(crate) fn open(&self) -> Result<Box<dyn BufRead>, ReplayError> {
-        File::open(self.path).and_then(text::plain).map_err(|source| self.io(source))
+        File::open(self.path).and_then(unpack::plain).map_err(|source| self.io(source))
     }
 
     /// Its non-empty first lines, trimmed; the last may be cut off by the end of the head.
