@@ -8,6 +8,7 @@ mod gazepoint;
 mod lines;
 mod neon;
 mod pupilext;
+pub(crate) mod raw;
 mod table;
 mod tobii;
 mod unpack;
@@ -30,6 +31,8 @@ pub enum LogFormat {
     Lines,
     /// Pupil Labs Neon, 3D eye states.
     NeonEyeStates,
+    /// holod's recording of the bytes of a link.
+    Raw,
     /// holod's own CSV.
     Csv,
     /// Tobii Pro Lab or Studio.
@@ -50,6 +53,7 @@ impl LogFormat {
         match self {
             Self::Lines => "holod line protocol",
             Self::NeonEyeStates => "Pupil Labs Neon 3d_eye_states.csv",
+            Self::Raw => "holod recording of a link",
             Self::Csv => "holod CSV",
             Self::Tobii => "Tobii Pro Lab or Studio TSV",
             Self::Gazepoint => "Gazepoint CSV",
@@ -99,7 +103,8 @@ pub(crate) struct Importer {
 }
 
 /// In the order in which they are asked.
-const IMPORTERS: [Importer; 8] = [
+const IMPORTERS: [Importer; 9] = [
+    raw::IMPORTER,
     lines::IMPORTER,
     neon::IMPORTER,
     csv::IMPORTER,

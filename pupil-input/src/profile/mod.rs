@@ -1,43 +1,203 @@
 //! What is known of a kind of tracker: how its bytes are read, and how it is started and told from others.
+//!
+//! A profile is a TOML file. `profiles/README.md` in this crate describes every key; the files beside it are shipped.
+
+mod parse;
+mod reader;
+mod wire;
+
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+use std::time::Duration;
+
+use holod_calibration::rig::Fault;
 
 use crate::import::SizeUnit;
-use crate::wire::Decoder;
-use crate::wire::line::LineDecoder;
+use crate::spec::UsbIds;
+use crate::wire::{Decoder, Format};
 
 /// A kind of tracker.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Profile {
     /// The name by which a tracker spec asks for it.
     pub name: String,
+    /// One sentence about the tracker, with what of the profile is unverified.
+    pub about: String,
     /// What its sizes are before the rig's scale.
     pub unit: SizeUnit,
+    /// Its serial port.
+    pub serial: SerialSettings,
+    /// Its HID device.
+    pub hid: HidSettings,
+    /// Its address on a network.
+    pub network: NetworkSettings,
+    /// How its bytes are read.
+    pub format: Format,
+}
+
+/// How a tracker is reached through a serial port.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SerialSettings {
+    /// Bits a second.
+    pub baud: u32,
+    /// The USB devices that it may be; none where its adapter may be any.
+    pub usb: Vec<UsbIds>,
+    /// What is sent after the port was opened, in this order.
+    pub start: Vec<Command>,
+    /// What is sent before the port is closed.
+    pub stop: Vec<Command>,
+}
+
+/// How a tracker is found among the HID devices.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct HidSettings {
+    /// The USB devices that it may be.
+    pub usb: Vec<UsbIds>,
+    /// The usage page of its collection.
+    pub usage_page: Option<u16>,
+    /// The usage of its collection.
+    pub usage: Option<u16>,
+}
+
+/// How a tracker is reached over a network.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NetworkSettings {
+    /// The port where a spec names none.
+    pub port: Option<u16>,
+    /// What is sent after the connection was made, in this order.
+    pub start: Vec<Command>,
+    /// What is sent before it is closed.
+    pub stop: Vec<Command>,
+}
+
+/// Something to say to a tracker.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Command {
+    /// The bytes.
+    pub send: Vec<u8>,
+    /// Bytes that its answer holds; None where it gives none.
+    pub expect: Option<Vec<u8>>,
+    /// How long the answer may take.
+    pub within: Duration,
 }
 
 /// Why there is no such profile.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no tracker profile `{name}`; there are {known}")]
-pub struct ProfileError {
-    name: String,
-    known: String,
+pub enum ProfileError {
+    /// No profile of that name is shipped.
+    #[error("no tracker profile `{name}`; there are {known}; {advice}")]
+    Unknown {
+        /// The name.
+        name: String,
+        /// The names that there are.
+        known: String,
+        /// What to do.
+        advice: String,
+    },
+    /// Its file cannot be read.
+    #[error("tracker profile {path}: {reason}; expected a readable TOML file")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+    /// It is wrong.
+    #[error("tracker profile {origin}: {}", in_words(.faults))]
+    Wrong {
+        /// Its name or file.
+        origin: String,
+        /// At least one fault, in the order of its lines.
+        faults: Vec<Fault>,
+    },
+}
+
+fn in_words(faults: &[Fault]) -> String {
+    let count = format!("{} fault{}", faults.len(), if faults.len() == 1 { "" } else { "s" });
+    faults.iter().fold(count, |text, fault| format!("{text}\n  {fault}"))
 }
 
 /// The profile that a tracker spec means when it names none.
 pub const DEFAULT_PROFILE: &str = "holod";
 
+/// By name.
+const FILES: [(&str, &str); 5] = [
+    ("asl-eye-trac", include_str!("../../profiles/asl-eye-trac.toml")),
+    ("example-lines", include_str!("../../profiles/example-lines.toml")),
+    ("example-packet", include_str!("../../profiles/example-packet.toml")),
+    ("holod", include_str!("../../profiles/holod.toml")),
+    ("holod-hid", include_str!("../../profiles/holod-hid.toml")),
+];
+
+/// A test holds each of them to be right.
+static SHIPPED: LazyLock<Vec<Profile>> =
+    LazyLock::new(|| FILES.into_iter().filter_map(|(_, text)| parse::parse(text).ok()).collect());
+
 impl Profile {
-    /// The profile of that name.
+    /// The shipped profile of that name, or the one in a file: what has a `/` or ends in `.toml` is a path.
     ///
     /// # Errors
-    /// There is none; the error names those that there are.
-    pub fn find(name: &str) -> Result<Self, ProfileError> {
-        if name == DEFAULT_PROFILE {
-            return Ok(Self { name: name.into(), unit: SizeUnit::Millimetres });
+    /// There is none of that name, or the file is not readable or wrong.
+    pub fn find(name_or_path: &str) -> Result<Self, ProfileError> {
+        if name_or_path.contains('/') || name_or_path.ends_with(".toml") {
+            return Self::read(Path::new(name_or_path));
         }
-        Err(ProfileError { name: name.into(), known: DEFAULT_PROFILE.into() })
+        Self::shipped().find(|profile| profile.name == name_or_path).ok_or_else(|| {
+            let names = FILES.map(|(name, _)| name);
+            let advice = reader::did_you_mean(name_or_path, &names)
+                .unwrap_or_else(|| "name one of these, or the path of a profile of your own".into());
+            ProfileError::Unknown { name: name_or_path.into(), known: names.join(", "), advice }
+        })
+    }
+
+    /// Every profile that holod brings with it, by name.
+    pub fn shipped() -> impl Iterator<Item = Self> {
+        SHIPPED.iter().cloned()
+    }
+
+    fn read(path: &Path) -> Result<Self, ProfileError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|error| ProfileError::Unreadable { path: path.into(), reason: error.to_string() })?;
+        Self::from_toml(&text, &path.display().to_string())
+    }
+
+    /// The profile that a text describes; `origin` names it in errors.
+    pub(crate) fn from_toml(text: &str, origin: &str) -> Result<Self, ProfileError> {
+        parse::parse(text).map_err(|faults| ProfileError::Wrong { origin: origin.into(), faults })
     }
 
     /// A decoder for a stream that may be joined in the middle of a message.
     pub fn decoder(&self) -> Box<dyn Decoder> {
-        Box::new(LineDecoder::joining())
+        self.format.decoder()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_file_in_the_folder_is_shipped_under_its_name_and_is_right() {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/profiles");
+        let files = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+        let mut names: Vec<_> = files
+            .filter(|path| path.extension().is_some_and(|extension| extension == "toml"))
+            .map(|path| path.file_stem().unwrap().to_str().unwrap().to_owned())
+            .collect();
+        names.sort();
+        assert_eq!(names, FILES.map(|(name, _)| name));
+        for (name, text) in FILES {
+            let profile = parse::parse(text).unwrap_or_else(|faults| panic!("{name}: {}", in_words(&faults)));
+            assert_eq!(profile.name, name);
+            assert_eq!(Profile::find(name), Ok(profile));
+        }
+    }
+
+    #[test]
+    fn a_name_that_is_not_there_is_told_with_those_that_are() {
+        let error = Profile::find("holodd").unwrap_err().to_string();
+        assert!(error.contains("no tracker profile `holodd`") && error.contains("did you mean `holod`?"), "{error}");
+        let error = Profile::find("./none.toml").unwrap_err().to_string();
+        assert!(error.starts_with("tracker profile ./none.toml: "), "{error}");
     }
 }

@@ -3,11 +3,31 @@
 //! A decoder is pushed bytes as they come and tells what they hold. However the bytes of a stream are split, the events
 //! are the same; formats that come in messages (a HID report, a datagram) are pushed one message at a time instead.
 
+mod checksum;
+pub(crate) mod core;
+pub mod delimited;
+pub mod field;
+pub mod hid_descriptor;
+pub mod iscan;
 pub mod line;
+pub mod livetrack;
+pub(crate) mod neon;
+pub mod open_gaze;
+pub mod packet;
+pub mod pupilext;
+pub mod report;
+#[cfg(test)]
+mod testing;
+mod text;
 
 use holod_calibration::TimeNs;
 
 use crate::SampleEye;
+
+pub use checksum::{ChecksumKind, Crc};
+use delimited::{DelimitedDecoder, DelimitedSettings};
+use packet::{PacketDecoder, PacketSettings};
+use report::{ReportDecoder, ReportSettings};
 
 /// A sample as the wire gives it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -120,4 +140,29 @@ pub trait Decoder: Send {
 
     /// Ends the stream: a last line without its ending is read, anything else that is incomplete is dropped.
     fn finish(&mut self, on_event: &mut dyn FnMut(WireEvent));
+}
+
+/// How a tracker's bytes are read: every decoder, with its settings.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Format {
+    /// holod's line protocol.
+    Lines,
+    /// Lines with columns.
+    Delimited(DelimitedSettings),
+    /// Binary packets.
+    Packet(PacketSettings),
+    /// Whole messages.
+    Report(ReportSettings),
+}
+
+impl Format {
+    /// A decoder for a stream that may be joined in the middle of a message.
+    pub fn decoder(&self) -> Box<dyn Decoder> {
+        match self {
+            Self::Lines => Box::new(line::LineDecoder::joining()),
+            Self::Delimited(settings) => Box::new(DelimitedDecoder::joining(settings)),
+            Self::Packet(settings) => Box::new(PacketDecoder::joining(settings)),
+            Self::Report(settings) => Box::new(ReportDecoder::new(settings)),
+        }
+    }
 }

@@ -1,0 +1,122 @@
+//! From a profile's text to a [`Profile`].
+
+use std::time::Duration;
+
+use holod_calibration::rig::Fault;
+
+use super::reader::{Found, Reader, Section};
+use super::wire::{Context, read_wire};
+use super::{Command, HidSettings, NetworkSettings, Profile, SerialSettings};
+use crate::SampleEye;
+use crate::import::SizeUnit;
+use crate::spec::{DEFAULT_BAUD, UsbIds};
+use crate::wire::field::{SizeKind, SizeRule};
+
+/// What a profile's first key must say.
+const SCHEMA: &str = "holod-tracker-1";
+/// How long a command's answer is waited for where the profile does not say.
+const ANSWER_WITHIN_MS: i64 = 1000;
+
+/// Parses a profile, or tells all that is wrong with it, in the order of its lines.
+pub(super) fn parse(text: &str) -> Result<Profile, Vec<Fault>> {
+    let reader = Reader::new(text);
+    let document = reader.document();
+    let profile = document.as_ref().and_then(|document| read(&reader.root(document)));
+    let mut faults = reader.faults.take();
+    match profile {
+        Some(profile) if faults.is_empty() => Ok(profile),
+        _ => {
+            faults.sort_by_key(|fault| fault.line.unwrap_or(usize::MAX));
+            Err(faults)
+        }
+    }
+}
+
+fn read(root: &Section<'_>) -> Option<Profile> {
+    if let Some(found) = root.require("format", &format!("\"{SCHEMA}\"")) {
+        root.reader().choose(&found, &[(SCHEMA, ())]);
+    }
+    let name = root.require("name", "the profile's name").and_then(|at| root.reader().text(&at, "the profile's name"));
+    let about = root.text("about", "one sentence about the tracker").unwrap_or_default();
+    let eye = root.get("eye").and_then(|found| Some(found.with(root.reader().choose(&found, &EYES)?)));
+    let rate_hz = root.positive("rate_hz");
+    let (unit, size) = read_size(&root.section("size"));
+    let serial = read_serial(&root.section("serial"));
+    let hid = read_hid(&root.section("hid"));
+    let network = read_network(&root.section("network"));
+    let wire = root.require("wire", "the table that says how bytes are read");
+    let format = wire.and_then(|wire| read_wire(&root.reader().table(&wire), &Context { eye, rate_hz, size }));
+    root.finish();
+    let (name, about) = (name?.to_owned(), about.to_owned());
+    Some(Profile { name, about, unit, serial, hid, network, format: format? })
+}
+
+pub(super) const EYES: [(&str, SampleEye); 3] =
+    [("left", SampleEye::Left), ("right", SampleEye::Right), ("both", SampleEye::Both)];
+
+fn read_serial(serial: &Section<'_>) -> SerialSettings {
+    let baud = serial.integer("baud", 1..=i64::from(u32::MAX)).map_or(DEFAULT_BAUD, |baud| baud as u32);
+    let [start, stop] = ["start", "stop"].map(|key| read_commands(serial, key));
+    let settings = SerialSettings { baud, usb: read_usb(serial), start, stop };
+    serial.finish();
+    settings
+}
+
+fn read_hid(hid: &Section<'_>) -> HidSettings {
+    let [usage_page, usage] = ["usage_page", "usage"].map(|key| hid.integer(key, 0..=0xFFFF).map(|page| page as u16));
+    let settings = HidSettings { usb: read_usb(hid), usage_page, usage };
+    hid.finish();
+    settings
+}
+
+fn read_network(network: &Section<'_>) -> NetworkSettings {
+    let port = network.integer("port", 1..=0xFFFF).map(|port| port as u16);
+    let [start, stop] = ["start", "stop"].map(|key| read_commands(network, key));
+    network.finish();
+    NetworkSettings { port, start, stop }
+}
+
+fn read_usb(section: &Section<'_>) -> Vec<UsbIds> {
+    const EXPECTED: &str = "USB identities such as [\"1209:0001\"]";
+    let Some(found) = section.get("usb") else { return Vec::new() };
+    let reader = section.reader();
+    let read = |item: Found<toml_edit::Item>| {
+        let ids = item.value.as_str().map(str::parse);
+        match ids {
+            Some(Ok(ids)) => return Some(ids),
+            Some(Err(problem)) => reader.fault(&item, item.value.to_string().trim(), EXPECTED, problem),
+            None => reader.fault(&item, item.value.to_string().trim(), EXPECTED, "write each in quotes"),
+        }
+        None
+    };
+    reader.items(&found, EXPECTED).into_iter().filter_map(read).collect()
+}
+
+fn read_commands(section: &Section<'_>, key: &'static str) -> Vec<Command> {
+    let Some(found) = section.get(key) else { return Vec::new() };
+    let reader = section.reader();
+    let items = reader.items(&found, "commands such as [{ send = \"Go\\r\", expect = \"OK\", within_ms = 500 }]");
+    let read = |item: &Found<toml_edit::Item>| {
+        let command = reader.table(&item.with(&item.value));
+        let send = command.require("send", "the bytes to send").and_then(|send| reader.bytes(&send));
+        let expect = command.bytes("expect");
+        let within_ms = command.integer("within_ms", 1..=60_000).unwrap_or(ANSWER_WITHIN_MS);
+        command.finish();
+        Some(Command { send: send?, expect, within: Duration::from_millis(within_ms as u64) })
+    };
+    items.iter().filter_map(read).collect()
+}
+
+fn read_size(size: &Section<'_>) -> (SizeUnit, SizeRule) {
+    const KINDS: [(&str, SizeKind); 3] =
+        [("diameter", SizeKind::Diameter), ("radius", SizeKind::Radius), ("area", SizeKind::Area)];
+    const UNITS: [(&str, SizeUnit); 3] =
+        [("mm", SizeUnit::Millimetres), ("pixels", SizeUnit::Pixels), ("arbitrary", SizeUnit::Arbitrary)];
+    let kind = size.choice("kind", &KINDS).unwrap_or(SizeKind::Diameter);
+    let unit = size.choice("unit", &UNITS).unwrap_or_default();
+    let mm_per_unit = size.positive("mm_per_unit");
+    size.finish();
+    // Where the profile knows the conversion, what it gives is millimetres.
+    let given = if mm_per_unit.is_some() { SizeUnit::Millimetres } else { unit };
+    (given, SizeRule { kind, mm_per_unit: mm_per_unit.unwrap_or(1.0) })
+}
