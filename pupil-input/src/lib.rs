@@ -46,7 +46,10 @@ pub use counters::{Counter, CounterSnapshot};
 pub use estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, PupilState, STATED_LAG};
 pub use filter::FilterSettings;
 pub use gate::{GateSettings, Rejection, Verdict};
-pub use import::{Blink, LogFault, LogFaults, LogFormat, Recording, ReplayError, SizeUnit};
+pub use import::{
+    Blink, BlinkCounts, EyeInfo, FaultCount, LogFault, LogFaults, LogFormat, LogInfo, Range, Recording, ReplayError,
+    SizeUnit,
+};
 pub use profile::{DEFAULT_PROFILE, Profile, ProfileError};
 pub use sample::{PupilSample, SampleEye};
 pub use source::mock::{MockSample, MockSource, Scenario};
