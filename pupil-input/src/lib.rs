@@ -51,7 +51,10 @@ pub use estimator::{
 };
 pub use filter::FilterSettings;
 pub use gate::{GateSettings, Rejection, Verdict};
-pub use import::{Blink, LogFault, LogFaults, LogFormat, Recording, ReplayError, SizeUnit};
+pub use import::{
+    Blink, BlinkCounts, EyeInfo, FaultCount, LogFault, LogFaults, LogFormat, LogInfo, Range, Recording, ReplayError,
+    SizeUnit,
+};
 pub use profile::{Command, DEFAULT_PROFILE, HidSettings, NetworkSettings, Profile, ProfileError, SerialSettings};
 pub use record::{RecordError, RecordFiles, RecordStatus};
 pub use sample::{PupilSample, SampleEye};
@@ -62,10 +65,9 @@ pub use source::commands::CommandError;
 pub use source::hid::{HidError, RULE_FILE, udev_rule};
 pub use source::serial::SerialError;
 pub use source::serial::identity::{SerialPortInfo, UsbPort, serial_ports};
-pub use source::tcp::NetworkError;
 pub use source::server::ServerError;
+pub use source::tcp::NetworkError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
 pub use tracker::{
-    DecisionTap, EstimateReader, Link, Tracker, TrackerControl, TrackerError, TrackerHandle, TrackerOptions,
-    host_now,
+    DecisionTap, EstimateReader, Link, Tracker, TrackerControl, TrackerError, TrackerHandle, TrackerOptions, host_now,
 };
