@@ -131,7 +131,7 @@ pub struct RunArgs {
         value_name = "SPEC",
         help = "Eye tracker: /dev/ttyUSB0, serial:PATH[,profile=NAME][,baud=N], hid:VID:PID[,profile=NAME], \
                 tcp:HOST:PORT,profile=NAME, udp:HOST:PORT,profile=NAME, core[:HOST], neon[:HOST], \
-                replay:FILE[,speed=X|max][,loop], a log FILE, or mock[:SCENARIO]; `holod tracker list` names profiles"
+                replay:FILE[,speed=X|max][,loop], a log FILE, or mock[:SCENARIO or FILE]; `holod tracker list` names profiles"
     )]
     pub tracker: Option<String>,
     /// The scene.

@@ -1,6 +1,8 @@
 //! From names on the command line to the parts of a run: rig, weights, scene.
 
-use holod_calibration::rig::Rig;
+use std::path::PathBuf;
+
+use holod_calibration::rig::{LaserDriver, Rig};
 use holod_calibration::{DisplayGeometry, Resolution};
 use holod_model::scene::{DepthEncoding, Fit, FrameReport, Scene, SceneError};
 use holod_model::{CpuEngine, RgbdFrame, Weights, scene_renderer};

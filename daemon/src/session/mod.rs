@@ -589,6 +589,8 @@ pub(crate) fn tracker_failure(error: TrackerError) -> Failure {
         TrackerError::Profile(_) => Exit::Usage,
         TrackerError::Replay(ReplayError::Io { .. }) => Exit::NoInput,
         TrackerError::Replay(_) => Exit::Data,
+        TrackerError::Script(_) => Exit::Data,
+        TrackerError::Record(_) => Exit::CannotCreate,
         TrackerError::NoScale { .. } => Exit::Config,
         TrackerError::Thread(_) => Exit::Unavailable,
     };

@@ -4,6 +4,7 @@
 
 mod parse;
 mod reader;
+mod vendor;
 mod wire;
 
 use std::path::{Path, PathBuf};
@@ -14,6 +15,7 @@ use holod_calibration::rig::Fault;
 
 use crate::import::SizeUnit;
 use crate::spec::UsbIds;
+use crate::wire::hid_descriptor::DescriptorError;
 use crate::wire::{Decoder, Format};
 
 /// A kind of tracker.
@@ -121,12 +123,19 @@ fn in_words(faults: &[Fault]) -> String {
 pub const DEFAULT_PROFILE: &str = "holod";
 
 /// By name.
-const FILES: [(&str, &str); 5] = [
+const FILES: [(&str, &str); 12] = [
     ("asl-eye-trac", include_str!("../../profiles/asl-eye-trac.toml")),
+    ("core", include_str!("../../profiles/core.toml")),
     ("example-lines", include_str!("../../profiles/example-lines.toml")),
     ("example-packet", include_str!("../../profiles/example-packet.toml")),
     ("holod", include_str!("../../profiles/holod.toml")),
     ("holod-hid", include_str!("../../profiles/holod-hid.toml")),
+    ("iscan-etl", include_str!("../../profiles/iscan-etl.toml")),
+    ("livetrack", include_str!("../../profiles/livetrack.toml")),
+    ("neon", include_str!("../../profiles/neon.toml")),
+    ("open-gaze", include_str!("../../profiles/open-gaze.toml")),
+    ("pupilext-csv", include_str!("../../profiles/pupilext-csv.toml")),
+    ("pupilext-json", include_str!("../../profiles/pupilext-json.toml")),
 ];
 
 /// A test holds each of them to be right.
@@ -164,6 +173,18 @@ impl Profile {
     /// The profile that a text describes; `origin` names it in errors.
     pub(crate) fn from_toml(text: &str, origin: &str) -> Result<Self, ProfileError> {
         parse::parse(text).map_err(|faults| ProfileError::Wrong { origin: origin.into(), faults })
+    }
+
+    /// The profile for the HID device with this report descriptor: what it names by usage gets its place.
+    ///
+    /// # Errors
+    /// The descriptor is faulty, or does not have what the profile names.
+    pub(crate) fn described(self, descriptor: &[u8]) -> Result<Self, DescriptorError> {
+        let format = match self.format {
+            Format::Usages(settings) => Format::Report(settings.resolve(descriptor)?),
+            format => format,
+        };
+        Ok(Self { format, ..self })
     }
 
     /// A decoder for a stream that may be joined in the middle of a message.

@@ -6,11 +6,15 @@ use toml_edit::Item;
 
 use super::parse::EYES;
 use super::reader::{Found, Reader, Section, did_you_mean};
+use super::vendor::{read_iscan, read_livetrack, read_open_gaze, read_pupilext};
 use crate::SampleEye;
+use crate::import::SizeUnit;
 use crate::wire::delimited::{Column, DelimitedSettings, MAX_COLUMNS, Separator};
 use crate::wire::field::{Field, Figure, Layout, Literal, NumberType, PupilAt, SizeRule, TimeAt, Validity};
+use crate::wire::hid_descriptor::Usage;
 use crate::wire::packet::{MAX_PACKET_BYTES, PacketChecksum, PacketLength, PacketSettings};
 use crate::wire::report::ReportSettings;
+use crate::wire::usages::{UsageAt, UsageSettings};
 use crate::wire::{ChecksumKind, Crc, Format};
 
 /// What the rest of the profile says about the figures on the wire.
@@ -18,31 +22,53 @@ pub(super) struct Context {
     pub(super) eye: Option<Found<SampleEye>>,
     pub(super) rate_hz: Option<f64>,
     pub(super) size: SizeRule,
+    pub(super) unit: SizeUnit,
+    /// Where `[size]` is.
+    pub(super) size_at: Option<Found<()>>,
 }
 
-const KINDS: [&str; 4] = ["holod", "delimited", "packet", "report"];
+const KINDS: [&str; 11] =
+    ["holod", "delimited", "packet", "report", "usages", "iscan", "livetrack", "open-gaze", "pupilext", "core", "neon"];
 /// Bytes of the longest sync word.
 const SYNC_MAX: usize = 16;
 
-pub(super) fn read_wire<'a>(wire: &Section<'a>, context: &Context) -> Option<Format> {
+/// The format, and what its sizes are before the rig's scale.
+pub(super) fn read_wire<'a>(wire: &Section<'a>, context: &Context) -> Option<(Format, SizeUnit)> {
     let expected = format!("one of \"{}\"", KINDS.join("\", \""));
     let kind = wire.require("kind", &expected)?;
-    let format = match wire.reader().text(&kind, &expected)? {
-        "holod" => Some(Format::Lines),
-        "delimited" => read_delimited(wire, context).map(Format::Delimited),
-        "packet" => read_packet(wire, context).map(Format::Packet),
-        "report" => read_report(wire, context).map(Format::Report),
+    let name = wire.reader().text(&kind, &expected)?;
+    let configurable = ["delimited", "packet", "report", "usages", "iscan"].contains(&name);
+    let read = match name {
+        "holod" => Some((Format::Lines, SizeUnit::Millimetres)),
+        "delimited" => read_delimited(wire, context).map(|settings| (Format::Delimited(settings), context.unit)),
+        "packet" => read_packet(wire, context).map(|settings| (Format::Packet(settings), context.unit)),
+        "report" => read_report(wire, context).map(|settings| (Format::Report(settings), context.unit)),
+        "usages" => {
+            let places = UsagePlaces { reader: wire.reader() };
+            let layout = read_layout(&places, wire, context);
+            layout.map(|layout| (Format::Usages(UsageSettings { layout }), context.unit))
+        }
+        "iscan" => read_iscan(wire, context).map(|settings| (Format::Iscan(settings), context.unit)),
+        "livetrack" => read_livetrack(wire, context),
+        "core" => Some((Format::CoreMsgpack, SizeUnit::Millimetres)),
+        "neon" => Some((Format::NeonRtp, SizeUnit::Millimetres)),
+        "open-gaze" => Some(read_open_gaze(wire, context)),
+        "pupilext" => Some(read_pupilext(wire, context)),
         unknown => {
             let advice = did_you_mean(unknown, &KINDS).unwrap_or("choose one".into());
             wire.reader().fault(&kind, format!("\"{unknown}\""), &expected, advice);
             return None;
         }
     };
+    if let Some(size) = context.size_at.as_ref().filter(|_| !configurable) {
+        let advice = "take it out; the rig's tracker.scale_mm_per_unit is for sizes that are no millimetres";
+        wire.reader().fault(size, "a table", &format!("none for \"{name}\": its sizes are known"), advice);
+    }
     // Where it is none, keys may not have been asked for.
-    if format.is_some() {
+    if read.is_some() {
         wire.finish();
     }
-    format
+    read
 }
 
 /// How the places of a kind of message are written.
@@ -592,6 +618,54 @@ fn read_report<'a>(wire: &Section<'a>, context: &Context) -> Option<ReportSettin
     }
     let layout = read_layout(&places, wire, context)?;
     Some(ReportSettings { id, least, most: exact, layout })
+}
+
+/// The fields of a HID report, by their usages.
+struct UsagePlaces<'r, 'a> {
+    reader: &'r Reader<'a>,
+}
+
+impl UsagePlaces<'_, '_> {
+    fn usage(&self, found: &Found<&Item>) -> Option<Usage> {
+        const EXPECTED: &str = "a page and a number in hexadecimals, such as \"ff00:0030\"";
+        let text = self.reader.text(found, EXPECTED)?;
+        let usage = text.parse().ok();
+        if usage.is_none() {
+            self.reader.fault(found, format!("{text:?}"), EXPECTED, "correct it");
+        }
+        usage
+    }
+}
+
+impl<'a> Places<'a> for UsagePlaces<'_, 'a> {
+    type Place = UsageAt;
+
+    fn bare(&self, found: &Found<&'a Item>) -> Option<Option<UsageAt>> {
+        let bare = || self.usage(found).map(|usage| UsageAt { usage, collection: None });
+        found.value.as_table_like().is_none().then(bare)
+    }
+
+    fn read(&self, table: &Section<'a>) -> Option<UsageAt> {
+        let usage = table.require("usage", "the field's usage, such as \"ff00:0030\"");
+        let usage = usage.and_then(|found| self.usage(&found));
+        let collection = match table.get("collection") {
+            None => None,
+            Some(found) => Some(self.usage(&found)?),
+        };
+        Some(UsageAt { usage: usage?, collection })
+    }
+
+    fn wrap_bits(&self, _: &UsageAt) -> Option<u32> {
+        None
+    }
+
+    fn texts(&self) -> bool {
+        false
+    }
+
+    fn same(&self, one: &UsageAt, other: &UsageAt) -> bool {
+        one == other
+    }
 }
 
 #[cfg(test)]

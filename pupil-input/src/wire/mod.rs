@@ -17,8 +17,9 @@ pub mod packet;
 pub mod pupilext;
 pub mod report;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 mod text;
+pub mod usages;
 
 use holod_calibration::TimeNs;
 
@@ -26,8 +27,13 @@ use crate::SampleEye;
 
 pub use checksum::{ChecksumKind, Crc};
 use delimited::{DelimitedDecoder, DelimitedSettings};
+use iscan::{IscanDecoder, IscanSettings};
+use livetrack::{LiveTrackDecoder, LiveTrackSettings};
+use open_gaze::{OpenGazeDecoder, OpenGazeSettings};
 use packet::{PacketDecoder, PacketSettings};
+use pupilext::{PupilExtDecoder, PupilExtSettings};
 use report::{ReportDecoder, ReportSettings};
+use usages::{Undescribed, UsageSettings};
 
 /// A sample as the wire gives it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -153,9 +159,40 @@ pub enum Format {
     Packet(PacketSettings),
     /// Whole messages.
     Report(ReportSettings),
+    /// ISCAN's binary packets.
+    Iscan(IscanSettings),
+    /// LiveTrack's rows.
+    LiveTrack(LiveTrackSettings),
+    /// Gazepoint's Open Gaze records.
+    OpenGaze(OpenGazeSettings),
+    /// PupilEXT's rows or objects.
+    PupilExt(PupilExtSettings),
+    /// HID reports, by the device's descriptor.
+    Usages(UsageSettings),
+    /// Pupil Labs Core's MessagePack maps.
+    CoreMsgpack,
+    /// Pupil Labs Neon's gaze stream, RTP and RTCP as RTSP interleaves them.
+    NeonRtp,
 }
 
 impl Format {
+    /// The kind's name in a profile.
+    pub const fn kind(&self) -> &'static str {
+        match self {
+            Self::Lines => "holod",
+            Self::Delimited(_) => "delimited",
+            Self::Packet(_) => "packet",
+            Self::Report(_) => "report",
+            Self::Usages(_) => "usages",
+            Self::Iscan(_) => "iscan",
+            Self::LiveTrack(_) => "livetrack",
+            Self::OpenGaze(_) => "open-gaze",
+            Self::PupilExt(_) => "pupilext",
+            Self::CoreMsgpack => "core",
+            Self::NeonRtp => "neon",
+        }
+    }
+
     /// A decoder for a stream that may be joined in the middle of a message.
     pub fn decoder(&self) -> Box<dyn Decoder> {
         match self {
@@ -163,6 +200,13 @@ impl Format {
             Self::Delimited(settings) => Box::new(DelimitedDecoder::joining(settings)),
             Self::Packet(settings) => Box::new(PacketDecoder::joining(settings)),
             Self::Report(settings) => Box::new(ReportDecoder::new(settings)),
+            Self::Iscan(settings) => Box::new(IscanDecoder::new(settings.clone())),
+            Self::LiveTrack(settings) => Box::new(LiveTrackDecoder::new(*settings)),
+            Self::OpenGaze(settings) => Box::new(OpenGazeDecoder::new(*settings)),
+            Self::PupilExt(settings) => Box::new(PupilExtDecoder::new(*settings)),
+            Self::Usages(_) => Box::new(Undescribed),
+            Self::CoreMsgpack => Box::new(core::CoreDecoder),
+            Self::NeonRtp => Box::new(neon::NeonDecoder::new()),
         }
     }
 }
