@@ -820,7 +820,7 @@ mod tests {
     #[test]
     fn a_reader_that_fails_ends_and_its_error_is_kept() {
         let failure = Failure::default();
-        let mut watched = Watched { reader: Failing(0), failure: failure.clone() };
+        let mut watched = Watched { reader: io::BufReader::new(Failing(0)), failure: failure.clone() };
         let mut bytes = Vec::new();
         watched.read_to_end(&mut bytes).expect("ends");
         assert_eq!(bytes, b"x");
