@@ -576,7 +576,7 @@ fn a_line_without_end_is_read_past() {
     let long = "x".repeat(3 << 20);
     let recording =
         read(tobii("Recording timestamp [ms]", 1.0, "").replacen("0\t0\t\tP1", &format!("{long}\t0\t\tP1"), 1));
-    assert_eq!(recording.faults().of(LogFault::Wire(WireFault::TooLong)), 1);
+    assert_eq!(recording.faults().of(LogFault::TooLong), 1);
     assert_eq!(of_eye(&recording, Left).len(), 50);
 }
 

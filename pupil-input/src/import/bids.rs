@@ -12,7 +12,7 @@ use serde_json::{Map, Value};
 
 use crate::SampleEye;
 
-use super::table::{Lines, cells, is_missing, ns_of, ns_per_unit, number, time_ns, usual_step};
+use super::table::{Row, cells, is_missing, ns_of, ns_per_unit, number, time_ns, usual_step};
 use super::{Blink, Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError, SizeUnit};
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Bids, recognises, read };
@@ -315,10 +315,12 @@ impl Part {
             return Ok(ns);
         }
         let input = self.input();
-        let mut lines = Lines::new(input.unwatched()?);
+        let mut lines = input.lines()?;
         let mut times = Vec::with_capacity(UNIT_ROWS);
-        while times.len() < UNIT_ROWS && lines.advance(&mut LogBuilder::default()).map_err(|source| input.io(source))? {
-            times.extend(cells(lines.line(), b'\t').nth(time).and_then(|cell| number(cell).ok()));
+        while times.len() < UNIT_ROWS
+            && let Some(line) = lines.next(&mut LogBuilder::default())
+        {
+            times.extend(cells(line.bytes, b'\t').nth(time).and_then(|cell| number(cell).ok()));
         }
         let step = usual_step(&times).zip(self.sidecar.rate_hz());
         let Some((ticks, rate_hz)) = step else {
@@ -336,7 +338,7 @@ impl Part {
         let near = [1e9, 1e6, 1e3, 1.0].into_iter().find(|unit| (0.8..1.25).contains(&(ns / unit)));
         let ns = near.unwrap_or(ns);
         let stated = stated.map_or("no unit".into(), |unit| format!("the unit `{}`", unit.escape_debug()));
-        log.notes.push(format!(
+        log.note(format!(
             "{}: its times have {stated}; by the sampling frequency of {rate_hz} Hz one is {ns} ns",
             self.path.display()
         ));
@@ -350,33 +352,26 @@ impl Part {
         let at_row = |row: f64| ns_of(start_s + row / rate_hz.unwrap_or(1.0), 1e9);
         for (_, eye, size) in &self.pupils {
             if size.is_area {
-                log.notes.push(format!("{}: the {eye} eye's pupil areas were made diameters", self.path.display()));
+                log.note(format!("{}: the {eye} eye's pupil areas were made diameters", self.path.display()));
             }
         }
 
         let input = self.input();
-        let mut lines = Lines::new(input.unwatched()?);
-        let wanted = self.pupils.iter().map(|pupil| pupil.0).chain(self.time).max().unwrap_or(0);
-        let mut row: Vec<std::ops::Range<usize>> = Vec::with_capacity(wanted + 1);
+        let mut lines = input.lines()?;
+        let width = 1 + self.pupils.iter().map(|pupil| pupil.0).chain(self.time).max().unwrap_or(0);
+        let mut bounds = Vec::with_capacity(width);
         let mut rows = 0_u64;
-        while lines.advance(log).map_err(|source| input.io(source))? {
-            let line = lines.line();
-            if line.trim_ascii().is_empty() {
+        while let Some(line) = lines.next(log) {
+            if line.bytes.trim_ascii().is_empty() {
                 continue;
             }
-            let begin = line.as_ptr() as usize;
-            row.clear();
-            row.extend(cells(line, b'\t').take(wanted + 1).map(|cell| {
-                let from = cell.as_ptr() as usize - begin;
-                from..from + cell.len()
-            }));
-            let cell = |column: usize| row.get(column).map(|range| &line[range.clone()]).ok_or(LogFault::Malformed);
-            if rows == 0 && self.sidecar.columns().iter().map(|name| name.as_bytes()).eq(cells(line, b'\t')) {
-                log.notes.push(format!("{}: a line of names was skipped; BIDS has none", self.path.display()));
+            if rows == 0 && self.is_header(line.bytes) {
+                log.note(format!("{}: a line of names was skipped; BIDS has none", self.path.display()));
                 continue;
             }
+            let row = Row::cut(line.bytes, line.number, b'\t', width, &mut bounds);
             let t = match (self.time, ns_per_tick) {
-                (Some(time), Some(ns)) => cell(time).and_then(|cell| match is_missing(cell) {
+                (Some(time), Some(ns)) => row.cell(time).and_then(|cell| match is_missing(cell) {
                     true => Err(LogFault::Missing),
                     false => time_ns(cell, ns),
                 }),
@@ -394,19 +389,23 @@ impl Part {
                 if size.unit != unit {
                     continue;
                 }
-                let figure = cell(column).and_then(|cell| if is_missing(cell) { Ok(0.0) } else { number(cell) });
+                let figure = row.cell(column).and_then(|cell| if is_missing(cell) { Ok(0.0) } else { number(cell) });
                 match figure {
                     Ok(figure) => {
                         let diameter = size.diameter(figure.max(0.0)) as f32;
                         let (confidence, valid) = (1.0, figure > 0.0);
-                        log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid }, lines.number);
+                        log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid }, row.number);
                     }
                     Err(fault) => log.count(fault),
                 }
             }
         }
         self.read_blinks(ns_per_tick, log);
-        Ok(())
+        input.failed()
+    }
+
+    fn is_header(&self, line: &[u8]) -> bool {
+        self.sidecar.columns().iter().map(|name| name.as_bytes()).eq(cells(line, b'\t'))
     }
 
     /// Blinks of the events beside it; none where they cannot be read, since nothing rests on them.
@@ -417,7 +416,7 @@ impl Part {
         let blinks = events.sidecar().and_then(|sidecar| self.blinks(&path, &sidecar, ns_per_tick));
         match blinks {
             Ok(blinks) => log.blinks.extend(blinks),
-            Err(error) => log.notes.push(format!("its blinks could not be read: {error}")),
+            Err(error) => log.note(format!("its blinks could not be read: {error}")),
         }
     }
 
@@ -442,10 +441,10 @@ impl Part {
         let duration_ns = stated("duration").unwrap_or(if by_row { 1e9 } else { onset_ns });
 
         let input = LogInput::at(path);
-        let mut lines = Lines::new(input.unwatched()?);
+        let mut lines = input.lines()?;
         let (mut called, mut shut) = (Vec::new(), Vec::new());
-        while lines.advance(&mut LogBuilder::default()).map_err(|source| input.io(source))? {
-            let cell = |column: Option<usize>| column.and_then(|column| cells(lines.line(), b'\t').nth(column));
+        while let Some(line) = lines.next(&mut LogBuilder::default()) {
+            let cell = |column: Option<usize>| column.and_then(|column| cells(line.bytes, b'\t').nth(column));
             let is_called =
                 cell(kind).is_some_and(|kind| kind.to_ascii_lowercase().windows(5).any(|word| word == b"blink"));
             let is_shut = cell(closed).is_some_and(|closed| number(closed).is_ok_and(|closed| closed == 1.0));
@@ -460,6 +459,7 @@ impl Part {
             let blink = Blink { eye: self.sidecar.eye(), begins: TimeNs(begins), ends };
             if is_called { called.push(blink) } else { shut.push(blink) }
         }
+        input.failed()?;
         Ok(if called.is_empty() { shut } else { called })
     }
 }
@@ -473,13 +473,13 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     for sibling in stem.siblings() {
         let Some(path) = sibling.table() else { continue };
         match Part::load(&sibling, path.clone()) {
-            Err(error) => log.notes.push(format!("{} was left out: {error}", path.display())),
+            Err(error) => log.note(format!("{} was left out: {error}", path.display())),
             Ok(part) => {
                 // A pupil of an eye that is there already, or of both eyes, adds nothing.
                 let known: Vec<_> = parts.iter().flat_map(Part::eyes).collect();
                 let is_news = |eye| eye != SampleEye::Both && !known.contains(&eye);
                 if part.eyes().all(is_news) && !known.contains(&SampleEye::Both) {
-                    log.notes.push(format!("{} was read too", path.display()));
+                    log.note(format!("{} was read too", path.display()));
                     parts.push(part);
                 }
             }
@@ -493,7 +493,7 @@ fn read_parts(parts: &[Part], log: &mut LogBuilder) -> Result<(), ReplayError> {
     log.unit = first.pupils[0].2.unit;
     log.stated_rate_hz = first.sidecar.rate_hz();
     if let Some(kind) = first.sidecar.text("PhysioType").filter(|kind| *kind != "eyetrack") {
-        log.notes.push(format!("the sidecar's PhysioType is `{}`, not `eyetrack`", kind.escape_debug()));
+        log.note(format!("the sidecar's PhysioType is `{}`, not `eyetrack`", kind.escape_debug()));
     }
     for part in parts {
         part.read(log.unit, log)?;

@@ -31,7 +31,7 @@ fn recognises(input: &LogInput<'_>) -> bool {
 fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let Some(mut table) = Table::open(input, log, |line| unit(line).is_some())? else { return Ok(()) };
     log.unit = unit(table.names.join(",").as_bytes()).unwrap_or_default();
-    while let Some(row) = table.next_row(input, log)? {
+    while let Some(row) = table.next_row(log) {
         match sample(&row) {
             Ok(sample) => log.push(sample, row.number),
             Err(fault) => log.count(fault),

@@ -53,10 +53,10 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         .map(|(diameter, validity, eye)| column(diameter).map(|diameter| (diameter, column(validity), eye)));
     let mut blinks = Blinks { id: column("BKID"), duration: column("BKDUR"), ..Blinks::default() };
     if let Some(begin) = table.names.iter().find_map(|name| name.strip_prefix("TIME(")?.strip_suffix(')')) {
-        log.notes.push(format!("the header says that it began at {}", begin.escape_debug()));
+        log.note(format!("the header says that it began at {}", begin.escape_debug()));
     }
 
-    while let Some(row) = table.next_row(input, log)? {
+    while let Some(row) = table.next_row(log) {
         let t = match row.cell(clock.column).and_then(|cell| time_ns(cell, clock.ns_per_unit)) {
             Ok(t) => TimeNs(t),
             Err(fault) => {
@@ -94,7 +94,7 @@ fn choose_clock(input: &LogInput<'_>) -> Result<Option<Clock>, ReplayError> {
     // Steps of both clocks, added up over rows where TIME goes on.
     let (mut by_seconds, mut by_ticks, mut before) = (0_i128, 0_i128, None);
     for _ in 0..CLOCK_ROWS {
-        let Some(row) = table.next_row(input, &mut ignored)? else { break };
+        let Some(row) = table.next_row(&mut ignored) else { break };
         let at = |clock: Clock| row.cell(clock.column).and_then(|cell| time_ns(cell, clock.ns_per_unit)).ok();
         let Some(now) = at(seconds).zip(at(ticks)) else { continue };
         if let Some((seconds, ticks)) = before

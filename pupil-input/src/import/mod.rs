@@ -164,19 +164,22 @@ impl<'a> LogInput<'a> {
         Ok(input)
     }
 
-    /// A file of which only what [`Self::unwatched`] reads is wanted.
+    /// A file whose beginning nobody looks at.
     pub(crate) fn at(path: &'a Path) -> Self {
         Self { path, head: Vec::new(), failure: Failure::default() }
     }
 
     /// From its beginning: unpacked if it is gzip, in UTF-8 if it is UTF-16, without a byte order mark.
-    pub(crate) fn unwatched(&self) -> Result<Box<dyn BufRead>, ReplayError> {
-        File::open(self.path).and_then(unpack::plain).map_err(|source| self.io(source))
+    ///
+    /// Where reading fails the file seems to end, and [`Self::failed`] tells why.
+    pub(crate) fn open(&self) -> Result<Box<dyn BufRead>, ReplayError> {
+        let reader = File::open(self.path).and_then(unpack::plain).map_err(|source| self.io(source))?;
+        Ok(Box::new(Watched { reader, failure: self.failure.clone() }))
     }
 
-    /// As [`Self::unwatched`], but where reading fails the file seems to end, and [`Recording::read`] returns the error.
-    pub(crate) fn open(&self) -> Result<Box<dyn BufRead>, ReplayError> {
-        Ok(Box::new(Watched { reader: self.unwatched()?, failure: self.failure.clone() }))
+    /// Why reading failed, if it did.
+    pub(crate) fn failed(&self) -> Result<(), ReplayError> {
+        self.failure.take().map_or(Ok(()), |source| Err(self.io(source)))
     }
 
     /// Its lines from its beginning.
@@ -571,18 +574,14 @@ impl Recording {
             return Err(ReplayError::NotAFile { path: path.into(), found: "a device or pipe", hint });
         }
         let input = LogInput::new(path)?;
-        if let Some(source) = input.failure.take() {
-            return Err(input.io(source));
-        }
+        input.failed()?;
         let importer = IMPORTERS
             .iter()
             .find(|importer| (importer.recognises)(&input))
             .ok_or_else(|| ReplayError::UnknownFormat { path: path.into(), found: beginning(&input) })?;
         let mut builder = LogBuilder::default();
         (importer.read)(&input, &mut builder)?;
-        if let Some(source) = input.failure.take() {
-            return Err(input.io(source));
-        }
+        input.failed()?;
         builder.finish(importer.format, path)
     }
 
@@ -722,6 +721,13 @@ mod tests {
             text(LogFormat::Smi, "Time,Type,Trial,L Dia X [px],L Dia Y [px]\n1,SMP,1,20,20\n"),
             text(LogFormat::Smi, "RecordingTime [ms]\tTrial\tPupil Diameter Left [mm]\tCategory Left\n"),
             (LogFormat::Smi, utf16.encode_utf16().flat_map(u16::to_le_bytes).collect()),
+            text(LogFormat::Csv, "t_ns,eye,diameter_mm,confidence,aperture_mm,valid\n"),
+            text(LogFormat::Xdf, "XDF:\u{1}\u{14}"),
+            text(LogFormat::Tobii, "Recording timestamp\tSensor\tPupil diameter left\tValidity left\n"),
+            text(LogFormat::Tobii, "System\tx\n\nTimestamp\tPupilLeft\tValidityLeft\n"),
+            text(LogFormat::Gazepoint, "MEDIA_ID,TIME(2020/11/03 12:00:00.000),LPD,LPV,LPMM,LPMMV\n"),
+            text(LogFormat::PupilExt, "filename,timestamp_ms,algorithm,diameter_px\n"),
+            text(LogFormat::PupilExt, "timestamp_ms;pupilDiameter_px_L_M\n"),
         ]
     }
 
@@ -753,6 +759,12 @@ mod tests {
             "START\tSAMPLES\n",
             "Pupil,1,2\n",
             "P,1,2\n",
+            "Recording timestamp\tSensor\tGaze point X\n",
+            "Timestamp\tPupilLeft\n",
+            "TIME,LPD\n",
+            "timestamp_ms,diameter\n",
+            "t_ns,eye,diameter_cm,confidence,aperture_mm,valid\n",
+            "XDF",
         ] {
             assert_eq!(recognised(beginning.as_bytes()), [], "{beginning}");
         }
@@ -820,7 +832,7 @@ mod tests {
     #[test]
     fn a_reader_that_fails_ends_and_its_error_is_kept() {
         let failure = Failure::default();
-        let mut watched = Watched { reader: Failing(0), failure: failure.clone() };
+        let mut watched = Watched { reader: io::BufReader::new(Failing(0)), failure: failure.clone() };
         let mut bytes = Vec::new();
         watched.read_to_end(&mut bytes).expect("ends");
         assert_eq!(bytes, b"x");

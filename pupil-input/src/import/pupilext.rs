@@ -77,12 +77,12 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let pupils = PUPILS.map(|names| Pupil::find(&table, names));
     if size > 0 {
         log.unit = SizeUnit::Pixels;
-        log.notes.push("PupilEXT was not calibrated: there is no diameter in millimetres".into());
+        log.note("PupilEXT was not calibrated: there is no diameter in millimetres");
     }
     if table.column(|name| name.contains("Sec_") || name.starts_with("pupil") && name.ends_with("_S")).is_some() {
-        log.notes.push("two cameras looked at each pupil; pixels and confidence are the main one's".into());
+        log.note("two cameras looked at each pupil; pixels and confidence are the main one's");
     }
-    while let Some(row) = table.next_row(input, log)? {
+    while let Some(row) = table.next_row(log) {
         let t = match row.cell(time).and_then(|cell| time_ns(cell, 1e6)) {
             Ok(t) => TimeNs(t),
             Err(fault) => {
@@ -111,7 +111,7 @@ fn choose_size(input: &LogInput<'_>) -> Result<Option<usize>, ReplayError> {
     let Some(mut table) = Table::open(input, &mut ignored, is_header)? else { return Ok(None) };
     let pupils = PUPILS.map(|names| Pupil::find(&table, names));
     let mut best: Option<usize> = None;
-    while let Some(row) = table.next_row(input, &mut ignored)? {
+    while let Some(row) = table.next_row(&mut ignored) {
         for pupil in pupils.iter().flatten() {
             let holds = |column: Option<usize>| {
                 column.is_some_and(|column| figure(&row, column).is_ok_and(|diameter| diameter > 0.0))

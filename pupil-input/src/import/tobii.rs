@@ -107,9 +107,9 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         None => return Ok(()),
         Some((_, columns)) if columns.ns_per_unit.is_some() => columns.ns_per_unit.unwrap_or(1e6),
         Some((table, columns)) => {
-            let us = is_in_microseconds(input, table, &columns)?;
+            let us = is_in_microseconds(table, &columns);
             let unit = if us { "microseconds" } else { "milliseconds" };
-            log.notes.push(format!(
+            log.note(format!(
                 "the times have no unit; they are taken for {unit}, after the usual step from sample to sample"
             ));
             if us { 1e3 } else { 1e6 }
@@ -119,7 +119,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
 
     let mut first: Option<[Vec<u8>; 2]> = None;
     let (mut of_others, mut unmeasured) = (0_u64, 0_u64);
-    while let Some(row) = table.next_row(input, log)? {
+    while let Some(row) = table.next_row(log) {
         if !columns.is_of_eyes(&row) {
             continue;
         }
@@ -154,13 +154,13 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         }
     }
     if unmeasured > 0 {
-        log.notes.push(format!(
+        log.note(format!(
             "{unmeasured} times an eye is valid and has no diameter: some trackers measure pupils at a lower rate than gaze"
         ));
     }
     if let Some(first) = first.filter(|_| of_others > 0) {
         let [recording, participant] = first.map(|name| String::from_utf8_lossy(&name).escape_debug().to_string());
-        log.notes.push(format!(
+        log.note(format!(
             "the file holds several recordings; only the first was read (recording `{recording}`, participant \
              `{participant}`), and {of_others} rows of others were left out"
         ));
@@ -178,16 +178,16 @@ fn open(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<Option<(Table, Col
 }
 
 /// Whether the first times are microseconds rather than milliseconds.
-fn is_in_microseconds(input: &LogInput<'_>, mut table: Table, columns: &Columns) -> Result<bool, ReplayError> {
+fn is_in_microseconds(mut table: Table, columns: &Columns) -> bool {
     let mut times = Vec::with_capacity(UNIT_ROWS);
     while times.len() < UNIT_ROWS {
-        let Some(row) = table.next_row(input, &mut LogBuilder::default())? else { break };
+        let Some(row) = table.next_row(&mut LogBuilder::default()) else { break };
         let measured = |eye: &Eye| row.cell(eye.diameter).is_ok_and(|cell| !is_missing(cell));
         if columns.is_of_eyes(&row) && columns.eyes.iter().flatten().any(measured) {
             times.extend(row.cell(columns.time).and_then(number));
         }
     }
-    Ok(usual_step(&times).is_some_and(|step| step > GREATEST_STEP_MS))
+    usual_step(&times).is_some_and(|step| step > GREATEST_STEP_MS)
 }
 
 /// The diameter of an eye and whether the tracker saw it; None where it was not measured.

@@ -270,7 +270,7 @@ fn take_header(chunk: &mut Chunk<'_>, streams: &mut BTreeMap<u32, Stream>, log: 
         Ok(stream) => stream,
         Err(error) => {
             log.count(LogFault::Malformed);
-            log.notes.push(format!("stream {id} was left out: its header cannot be read ({error})"));
+            log.note(format!("stream {id} was left out: its header cannot be read ({error})"));
             return Ok(());
         }
     };
@@ -418,7 +418,7 @@ fn choose(streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> Result<(
             left_out.push(told(stream));
         } else {
             let eyes: Vec<_> = stream.taken.iter().map(|taken| taken.0.to_string()).collect();
-            log.notes.push(format!("read from the stream {}: {}", told(stream), eyes.join(", ")));
+            log.note(format!("read from the stream {}: {}", told(stream), eyes.join(", ")));
             if stream.rate_hz > 0.0 {
                 log.stated_rate_hz.get_or_insert(stream.rate_hz);
             }
@@ -428,7 +428,7 @@ fn choose(streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> Result<(
         let more = left_out.len().saturating_sub(20);
         left_out.truncate(20);
         let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-        log.notes.push(format!("other streams: {}{more}", left_out.join(", ")));
+        log.note(format!("other streams: {}{more}", left_out.join(", ")));
     }
     Ok(())
 }
