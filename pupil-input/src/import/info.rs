@@ -30,6 +30,7 @@ const LONGEST_NS: i64 = 500_000_000;
 const SILENCE_NS: i64 = 100_000_000;
 /// Share of shut samples from which on a log is taken to have a sign of them.
 const SIGN_SHARE: f64 = 0.001;
+const MILLISECOND_S: f32 = 1e-3;
 /// An interval of this many usual ones is a gap: more than three, jitter aside.
 const GAP_INTERVALS: f32 = 3.5;
 
@@ -96,7 +97,8 @@ pub struct EyeInfo {
     pub longest_lost_s: f64,
     /// Valid samples with a confidence below 0.6.
     pub unsure: u64,
-    /// Samples a second: by the mean of the intervals of half to one and a half usual ones.
+    /// Samples a second, by the median interval; where all times are whole milliseconds, by the mean of the intervals
+    /// within one millisecond of it.
     pub rate_hz: Option<f64>,
     /// Interval between samples, milliseconds: its 1st, 50th and 99th percentile.
     pub interval_ms: Option<[f64; 3]>,
@@ -221,12 +223,18 @@ fn eye_info(recording: &Recording, eye: SampleEye, scale: f32) -> Option<(EyeInf
     let unsure = rows().filter(|row| row.valid && row.confidence < LEAST_CONFIDENCE).count() as u64;
     let (lost_runs, longest_lost) = lost_runs(rows());
 
-    let mut scratch: Vec<f32> = intervals_s(rows()).collect();
+    let mut scratch: Vec<f32> = intervals_ns(rows()).map(|ns| (ns as f64 * 1e-9) as f32).collect();
     let interval_s = quantiles(&mut scratch, [0.01, 0.5, 0.99]);
     let usual_s = interval_s.map_or(0.0, |[_, median, _]| median);
-    let near = scratch.iter().filter(|s| (0.5 * usual_s..=1.5 * usual_s).contains(*s));
-    let (sum, count) = near.fold((0.0, 0_u64), |(sum, count), s| (sum + f64::from(*s), count + 1));
-    let rate_hz = (sum > 0.0).then(|| count as f64 / sum);
+    let whole_ms = intervals_ns(rows()).all(|ns| ns % 1_000_000 == 0);
+    let usual_exactly_s = if whole_ms && usual_s >= 4.0 * MILLISECOND_S {
+        let near = scratch.iter().filter(|s| (*s - usual_s).abs() < 1.5 * MILLISECOND_S);
+        let (sum, count) = near.fold((0.0, 0_u64), |(sum, count), s| (sum + f64::from(*s), count + 1));
+        sum / count as f64
+    } else {
+        usual_s.into()
+    };
+    let rate_hz = (usual_exactly_s > 0.0).then(|| usual_exactly_s.recip());
     let gaps = || scratch.iter().filter(|s| usual_s > 0.0 && **s > GAP_INTERVALS * usual_s);
     let (gap_count, gaps_s) = (gaps().count() as u64, gaps().map(|s| f64::from(*s)).sum());
     let longest_gap_s = gaps().copied().fold(0.0, f32::max).into();
@@ -284,8 +292,8 @@ fn is_sure(row: &Row) -> bool {
     row.valid && row.confidence >= LEAST_CONFIDENCE && row.diameter_mm.is_finite()
 }
 
-fn intervals_s<'r>(rows: impl Iterator<Item = &'r Row> + Clone) -> impl Iterator<Item = f32> {
-    rows.clone().zip(rows.skip(1)).map(|(before, after)| ((after.t_ns - before.t_ns) as f64 * 1e-9) as f32)
+fn intervals_ns<'r>(rows: impl Iterator<Item = &'r Row> + Clone) -> impl Iterator<Item = i64> {
+    rows.clone().zip(rows.skip(1)).map(|(before, after)| after.t_ns - before.t_ns)
 }
 
 /// How many runs of lost samples there are, and the longest.

@@ -105,7 +105,7 @@ pub(crate) fn smi(rate_hz: f64, separator: char, decimal_comma: bool) -> String 
         names.join(&separator.to_string())
     );
     for (row, t_s) in instants(rate_hz).enumerate() {
-        let jitter_us = [0, 900, -700, 0][row % 4];
+        let jitter_us = [0, 60, -50, 0][row % 4];
         let t_us = 8_412_345_678 + jitter_us + (1e6 * t_s).round() as i64;
         if row % 100 == 7 {
             writeln!(text, "{t_us}{separator}MSG{separator}1{separator}# Message: picture_{row}.jpg\r")
