@@ -259,8 +259,12 @@ impl Part {
             .enumerate()
             .filter_map(|(index, column)| {
                 let name = column.to_lowercase();
-                let is_pupil =
-                    name == "pupil" || has(&name, &["pupil"]) && has(&name, &["size", "diam", "area", "radius"]);
+                // `pupil_size` by the standard, `pupil_left`, `left_pupil_diameter` and the like in the field.
+                let rest = ["pupil", "left", "right", "_", "-", " "]
+                    .iter()
+                    .fold(name.clone(), |rest, word| rest.replace(word, ""));
+                let is_size = has(&rest, &["size", "diam", "area", "radius"]);
+                let is_pupil = has(&name, &["pupil"]) && (is_size || rest.is_empty());
                 let eye = match name.as_str() {
                     name if has(name, &["left"]) => SampleEye::Left,
                     name if has(name, &["right"]) => SampleEye::Right,

@@ -10,8 +10,8 @@ mod neon;
 mod pupilext;
 pub(crate) mod raw;
 mod table;
-mod text;
 mod tobii;
+mod unpack;
 mod xdf;
 
 use std::fmt;
@@ -135,7 +135,7 @@ impl<'a> LogInput<'a> {
 
     /// From its beginning: unpacked if it is gzip, in UTF-8 if it is UTF-16, without a byte order mark.
     pub(crate) fn open(&self) -> Result<Box<dyn BufRead>, ReplayError> {
-        File::open(self.path).and_then(text::plain).map_err(|source| self.io(source))
+        File::open(self.path).and_then(unpack::plain).map_err(|source| self.io(source))
     }
 
     /// Its non-empty first lines, trimmed; the last may be cut off by the end of the head.

@@ -40,15 +40,18 @@ fn read(root: &Section<'_>) -> Option<Profile> {
     let about = root.text("about", "one sentence about the tracker").unwrap_or_default();
     let eye = root.get("eye").and_then(|found| Some(found.with(root.reader().choose(&found, &EYES)?)));
     let rate_hz = root.positive("rate_hz");
+    let size_at = root.get("size").map(|found| found.with(()));
     let (unit, size) = read_size(&root.section("size"));
     let serial = read_serial(&root.section("serial"));
     let hid = read_hid(&root.section("hid"));
     let network = read_network(&root.section("network"));
     let wire = root.require("wire", "the table that says how bytes are read");
-    let format = wire.and_then(|wire| read_wire(&root.reader().table(&wire), &Context { eye, rate_hz, size }));
+    let context = Context { eye, rate_hz, size, unit, size_at };
+    let wire = wire.and_then(|wire| read_wire(&root.reader().table(&wire), &context));
     root.finish();
     let (name, about) = (name?.to_owned(), about.to_owned());
-    Some(Profile { name, about, unit, serial, hid, network, format: format? })
+    let (format, unit) = wire?;
+    Some(Profile { name, about, unit, serial, hid, network, format })
 }
 
 pub(super) const EYES: [(&str, SampleEye); 3] =

@@ -6,7 +6,9 @@ use toml_edit::Item;
 
 use super::parse::EYES;
 use super::reader::{Found, Reader, Section, did_you_mean};
+use super::vendor::{read_iscan, read_livetrack, read_open_gaze, read_pupilext};
 use crate::SampleEye;
+use crate::import::SizeUnit;
 use crate::wire::delimited::{Column, DelimitedSettings, MAX_COLUMNS, Separator};
 use crate::wire::field::{Field, Figure, Layout, Literal, NumberType, PupilAt, SizeRule, TimeAt, Validity};
 use crate::wire::hid_descriptor::Usage;
@@ -20,35 +22,54 @@ pub(super) struct Context {
     pub(super) eye: Option<Found<SampleEye>>,
     pub(super) rate_hz: Option<f64>,
     pub(super) size: SizeRule,
+    pub(super) unit: SizeUnit,
+    /// Where `[size]` is.
+    pub(super) size_at: Option<Found<()>>,
 }
 
-const KINDS: [&str; 5] = ["holod", "delimited", "packet", "report", "usages"];
+const KINDS: [&str; 11] = [
+    "holod", "delimited", "packet", "report", "usages", "iscan", "livetrack", "open-gaze", "pupilext", "core", "neon",
+];
 /// Bytes of the longest sync word.
 const SYNC_MAX: usize = 16;
 
-pub(super) fn read_wire<'a>(wire: &Section<'a>, context: &Context) -> Option<Format> {
+/// The format, and what its sizes are before the rig's scale.
+pub(super) fn read_wire<'a>(wire: &Section<'a>, context: &Context) -> Option<(Format, SizeUnit)> {
     let expected = format!("one of \"{}\"", KINDS.join("\", \""));
     let kind = wire.require("kind", &expected)?;
-    let format = match wire.reader().text(&kind, &expected)? {
-        "holod" => Some(Format::Lines),
-        "delimited" => read_delimited(wire, context).map(Format::Delimited),
-        "packet" => read_packet(wire, context).map(Format::Packet),
-        "report" => read_report(wire, context).map(Format::Report),
+    let name = wire.reader().text(&kind, &expected)?;
+    let configurable = ["delimited", "packet", "report", "usages", "iscan"].contains(&name);
+    let read = match name {
+        "holod" => Some((Format::Lines, SizeUnit::Millimetres)),
+        "delimited" => read_delimited(wire, context).map(|settings| (Format::Delimited(settings), context.unit)),
+        "packet" => read_packet(wire, context).map(|settings| (Format::Packet(settings), context.unit)),
+        "report" => read_report(wire, context).map(|settings| (Format::Report(settings), context.unit)),
         "usages" => {
             let places = UsagePlaces { reader: wire.reader() };
-            read_layout(&places, wire, context).map(|layout| Format::Usages(UsageSettings { layout }))
+            let layout = read_layout(&places, wire, context);
+            layout.map(|layout| (Format::Usages(UsageSettings { layout }), context.unit))
         }
+        "iscan" => read_iscan(wire, context).map(|settings| (Format::Iscan(settings), context.unit)),
+        "livetrack" => read_livetrack(wire, context),
+        "core" => Some((Format::CoreMsgpack, SizeUnit::Millimetres)),
+        "neon" => Some((Format::NeonRtp, SizeUnit::Millimetres)),
+        "open-gaze" => Some(read_open_gaze(wire, context)),
+        "pupilext" => Some(read_pupilext(wire, context)),
         unknown => {
             let advice = did_you_mean(unknown, &KINDS).unwrap_or("choose one".into());
             wire.reader().fault(&kind, format!("\"{unknown}\""), &expected, advice);
             return None;
         }
     };
+    if let Some(size) = context.size_at.as_ref().filter(|_| !configurable) {
+        let advice = "take it out; the rig's tracker.scale_mm_per_unit is for sizes that are no millimetres";
+        wire.reader().fault(size, "a table", &format!("none for \"{name}\": its sizes are known"), advice);
+    }
     // Where it is none, keys may not have been asked for.
-    if format.is_some() {
+    if read.is_some() {
         wire.finish();
     }
-    format
+    read
 }
 
 /// How the places of a kind of message are written.

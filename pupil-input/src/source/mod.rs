@@ -2,16 +2,20 @@
 
 pub(crate) mod commands;
 pub(crate) mod hid;
-pub mod mock;
+pub(crate) mod core;
+pub(crate) mod neon;
 pub(crate) mod serial;
 pub(crate) mod tcp;
 pub(crate) mod udp;
+pub(crate) mod server;
+mod zmtp;
 
 use std::time::Duration;
 
 use hid::HidError;
 use serial::SerialError;
 use tcp::NetworkError;
+use server::ServerError;
 
 /// How long one read waits; also how soon a stop is noticed.
 pub(crate) const READ_TIMEOUT: Duration = Duration::from_millis(50);
@@ -65,4 +69,7 @@ pub enum SourceError {
     /// A HID device.
     #[error(transparent)]
     Hid(#[from] HidError),
+    /// The server of a Pupil Labs tracker.
+    #[error(transparent)]
+    Server(#[from] ServerError),
 }

@@ -17,7 +17,7 @@ pub mod packet;
 pub mod pupilext;
 pub mod report;
 #[cfg(test)]
-mod testing;
+pub(crate) mod testing;
 mod text;
 pub mod usages;
 
@@ -27,7 +27,11 @@ use crate::SampleEye;
 
 pub use checksum::{ChecksumKind, Crc};
 use delimited::{DelimitedDecoder, DelimitedSettings};
+use iscan::{IscanDecoder, IscanSettings};
+use livetrack::{LiveTrackDecoder, LiveTrackSettings};
+use open_gaze::{OpenGazeDecoder, OpenGazeSettings};
 use packet::{PacketDecoder, PacketSettings};
+use pupilext::{PupilExtDecoder, PupilExtSettings};
 use report::{ReportDecoder, ReportSettings};
 use usages::{Undescribed, UsageSettings};
 
@@ -155,8 +159,20 @@ pub enum Format {
     Packet(PacketSettings),
     /// Whole messages.
     Report(ReportSettings),
+    /// ISCAN's binary packets.
+    Iscan(IscanSettings),
+    /// LiveTrack's rows.
+    LiveTrack(LiveTrackSettings),
+    /// Gazepoint's Open Gaze records.
+    OpenGaze(OpenGazeSettings),
+    /// PupilEXT's rows or objects.
+    PupilExt(PupilExtSettings),
     /// HID reports, by the device's descriptor.
     Usages(UsageSettings),
+    /// Pupil Labs Core's MessagePack maps.
+    CoreMsgpack,
+    /// Pupil Labs Neon's gaze stream, RTP and RTCP as RTSP interleaves them.
+    NeonRtp,
 }
 
 impl Format {
@@ -167,7 +183,13 @@ impl Format {
             Self::Delimited(settings) => Box::new(DelimitedDecoder::joining(settings)),
             Self::Packet(settings) => Box::new(PacketDecoder::joining(settings)),
             Self::Report(settings) => Box::new(ReportDecoder::new(settings)),
+            Self::Iscan(settings) => Box::new(IscanDecoder::new(settings.clone())),
+            Self::LiveTrack(settings) => Box::new(LiveTrackDecoder::new(*settings)),
+            Self::OpenGaze(settings) => Box::new(OpenGazeDecoder::new(*settings)),
+            Self::PupilExt(settings) => Box::new(PupilExtDecoder::new(*settings)),
             Self::Usages(_) => Box::new(Undescribed),
+            Self::CoreMsgpack => Box::new(core::CoreDecoder),
+            Self::NeonRtp => Box::new(neon::NeonDecoder::new()),
         }
     }
 }
