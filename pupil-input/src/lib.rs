@@ -62,10 +62,9 @@ pub use source::commands::CommandError;
 pub use source::hid::{HidError, RULE_FILE, udev_rule};
 pub use source::serial::SerialError;
 pub use source::serial::identity::{SerialPortInfo, UsbPort, serial_ports};
-pub use source::tcp::NetworkError;
 pub use source::server::ServerError;
+pub use source::tcp::NetworkError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
 pub use tracker::{
-    DecisionTap, EstimateReader, Link, Tracker, TrackerControl, TrackerError, TrackerHandle, TrackerOptions,
-    host_now,
+    DecisionTap, EstimateReader, Link, Tracker, TrackerControl, TrackerError, TrackerHandle, TrackerOptions, host_now,
 };

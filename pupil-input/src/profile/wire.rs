@@ -27,9 +27,8 @@ pub(super) struct Context {
     pub(super) size_at: Option<Found<()>>,
 }
 
-const KINDS: [&str; 11] = [
-    "holod", "delimited", "packet", "report", "usages", "iscan", "livetrack", "open-gaze", "pupilext", "core", "neon",
-];
+const KINDS: [&str; 11] =
+    ["holod", "delimited", "packet", "report", "usages", "iscan", "livetrack", "open-gaze", "pupilext", "core", "neon"];
 /// Bytes of the longest sync word.
 const SYNC_MAX: usize = 16;
 

@@ -295,6 +295,10 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::SampleEye;
+    use crate::import::Recording;
+    use crate::import::raw::RawLog;
+    use crate::wire::hid_descriptor::HOLOD_HID_DESCRIPTOR;
 
     fn header() -> Header {
         Header {
@@ -411,5 +415,41 @@ mod tests {
         let mut bytes = header().encode();
         bytes[8] = 7;
         assert!(matches!(read(&bytes), Err(HeaderFault::Bad(found)) if found.contains("version 7")));
+    }
+
+    /// Report 1 of `holod-hid`: 1 s, number 7, left 3.25 mm seen, right not.
+    const REPORT: [u8; 15] = [1, 0x40, 0x42, 0x0F, 0, 7, 0, 0xB2, 0x0C, 255, 1, 0, 0, 0, 0];
+
+    #[test]
+    fn a_recording_by_usage_is_read_by_the_descriptor_in_it() {
+        let file = |hid_descriptor| {
+            let header = Header {
+                spec: "hid:1209:0001,profile=example-usages".into(),
+                profile: "example-usages".into(),
+                profile_toml: None,
+                hid_descriptor,
+                datagrams: true,
+                t_started: TimeNs(0),
+                started_unix_ns: 0,
+            };
+            let mut bytes = header.encode();
+            for (kind, payload) in [(Kind::Connected, &[][..]), (Kind::Bytes, &REPORT), (Kind::End, &[])] {
+                encode_record(&RecordHead { kind, t: TimeNs(5), connection: 0 }, payload, &mut bytes);
+            }
+            let file = tempfile::NamedTempFile::new().expect("a file");
+            std::fs::write(file.path(), bytes).expect("writes");
+            file
+        };
+        let described = file(Some(HOLOD_HID_DESCRIPTOR.to_vec()));
+        let recording = Recording::read(described.path()).expect("reads");
+        let samples: Vec<_> = recording.samples().collect();
+        assert_eq!(samples.len(), 2);
+        assert_eq!((samples[0].eye, samples[0].diameter_mm, samples[0].valid), (SampleEye::Left, 3.25, true));
+        assert_eq!((samples[1].eye, samples[1].valid), (SampleEye::Right, false));
+        assert!(RawLog::open(described.path()).is_ok());
+
+        let message = Recording::read(file(Some(vec![0xC0])).path()).expect_err("is refused").to_string();
+        assert!(message.contains("the report descriptor is faulty at byte 0"), "{message}");
+        assert!(Recording::read(file(None).path()).is_err(), "without a descriptor there are no samples");
     }
 }

@@ -1,21 +1,21 @@
 //! Where bytes come from: one file for each kind of link, behind one trait.
 
 pub(crate) mod commands;
-pub(crate) mod hid;
 pub(crate) mod core;
+pub(crate) mod hid;
 pub(crate) mod neon;
 pub(crate) mod serial;
+pub(crate) mod server;
 pub(crate) mod tcp;
 pub(crate) mod udp;
-pub(crate) mod server;
 mod zmtp;
 
 use std::time::Duration;
 
 use hid::HidError;
 use serial::SerialError;
-use tcp::NetworkError;
 use server::ServerError;
+use tcp::NetworkError;
 
 /// How long one read waits; also how soon a stop is noticed.
 pub(crate) const READ_TIMEOUT: Duration = Duration::from_millis(50);
