@@ -1,7 +1,7 @@
 //! A virtual HID tracker, made with the kernel's UHID: plugged in, read, unplugged, and plugged in again at another node.
 //!
-//! `uhid_tracker [reports=N] [wrong=KIND]`: for each of two plugs it waits until someone opens the tracker, sends N reports
-//! at 1 kHz, and tells on the standard output what it did. KIND makes it lie, so that a test of it can be shown to fail:
+//! `uhid_tracker [plugs=N] [reports=N] [wrong=KIND]`: for each plug it waits until someone opens the tracker, sends the
+//! reports at 1 kHz, and tells on the standard output what it did. KIND makes it lie, so that a test of it can be shown to fail:
 //! `missing` leaves a report out, `diameter` adds a millimetre to it.
 //!
 //! Layouts are those of the kernel's linux/uhid.h: an event is its type, 32 bits, and what belongs to that type.
@@ -103,9 +103,10 @@ fn node() -> io::Result<String> {
 }
 
 fn main() -> io::Result<()> {
-    let (mut reports, mut wrong) = (1000, String::new());
+    let (mut plugs, mut reports, mut wrong) = (2, 1000, String::new());
     for argument in std::env::args().skip(1) {
         match argument.split_once('=') {
+            Some(("plugs", count)) => plugs = count.parse().map_err(io::Error::other)?,
             Some(("reports", count)) => reports = count.parse().map_err(io::Error::other)?,
             Some(("wrong", kind)) => wrong = kind.to_owned(),
             _ => return Err(io::Error::other(format!("unknown option `{argument}`"))),
@@ -115,7 +116,7 @@ fn main() -> io::Result<()> {
     let added_um = if wrong == "diameter" { 1000 } else { 0 };
     let mut out = io::stdout();
     let mut decoys = Vec::new();
-    for plug in 1..=2 {
+    for plug in 1..=plugs {
         let mut tracker = Device::plug_in(TRACKER, "holod virtual tracker", "V1")?;
         tracker.wait_for(UHID_OPEN)?;
         let node = node()?;
@@ -133,7 +134,7 @@ fn main() -> io::Result<()> {
         writeln!(out, r#"{{"plug": {plug}, "node": "{node}", "sent": {sent}, "took_ms": {took_ms}}}"#)?;
         // What the reader has not read when the tracker goes is lost.
         sleep(Duration::from_millis(300));
-        if plug == 2 {
+        if plug == plugs {
             tracker.wait_for(UHID_CLOSE)?;
         }
         tracker.unplug()?;

@@ -42,6 +42,8 @@ def parse(log: str) -> dict:
         "rule_fits": pattern is not None and fnmatch.fnmatchcase(name, pattern[1]),
         "sent": [json.loads(line) for line in found["sent"]],
         "read": json.loads(found["read"][-1]),
+        "sent_by_usage": [json.loads(line) for line in found["sent_by_usage"]],
+        "read_by_usage": json.loads(found["read_by_usage"][-1]),
     }
 
 
@@ -68,49 +70,56 @@ def mismatches(result: dict) -> list[str]:
     expect_text("as another user", result["refused"], "/etc/udev/rules.d/61-holod-tracker-hid.rules")
     expect("the rule told fits the kernel's name of the device", result["rule_fits"], True)
 
-    sent = result["sent"]
-    expect("plugs", [plug["plug"] for plug in sent], list(range(1, PLUGS + 1)))
-    expect("different nodes", len({plug["node"] for plug in sent}), PLUGS)
-    for plug in sent:
-        expect(f"reports sent in plug {plug['plug']}", plug["sent"], REPORTS)
-        expect_near(f"milliseconds of plug {plug['plug']}", plug["took_ms"], REPORTS, 0.05 * REPORTS)
-
-    read = result["read"]
-    samples = REPORTS * PLUGS * EYES
-    for name, expected in {
-        "samples": samples,
-        "bytes": REPORTS * PLUGS * REPORT_BYTES,
-        "left": samples // EYES,
-        "right": samples // EYES,
-        "both": 0,
-        "sequence_gaps": 0,
-        "sequence_missing": 0,
-        "sequence_repeats": 0,
-        "sequence_restarts": 0,
-        "clock_resets": 0,
-        "connects": PLUGS,
-        "disconnects": PLUGS - 1,
-    }.items():
-        expect(name, read[name], expected)
-    expect("faults", {name: count for name, count in read.items() if name.startswith("wire_") and count}, {})
-    expect_near("mean of the left eye, mm", read["left_mean_mm"], 4.0495, 0.0001)
-    expect_near("mean of the right eye, mm", read["right_mean_mm"], 3.5495, 0.0001)
+    # Once by the places that the profile names, over a replug; once by usages, which the kernel hands on.
+    for run, plugs in {"": PLUGS, "_by_usage": 1}.items():
+        sent, read = result[f"sent{run}"], result[f"read{run}"]
+        expect(f"plugs{run}", [plug["plug"] for plug in sent], list(range(1, plugs + 1)))
+        expect(f"different nodes{run}", len({plug["node"] for plug in sent}), plugs)
+        for plug in sent:
+            expect(f"reports sent in plug {plug['plug']}{run}", plug["sent"], REPORTS)
+            expect_near(f"milliseconds of plug {plug['plug']}{run}", plug["took_ms"], REPORTS, 0.05 * REPORTS)
+        samples = REPORTS * plugs * EYES
+        for name, expected in {
+            "samples": samples,
+            "bytes": REPORTS * plugs * REPORT_BYTES,
+            "left": samples // EYES,
+            "right": samples // EYES,
+            "both": 0,
+            "sequence_gaps": 0,
+            "sequence_missing": 0,
+            "sequence_repeats": 0,
+            "sequence_restarts": 0,
+            "clock_resets": 0,
+            "connects": plugs,
+            "disconnects": plugs - 1,
+        }.items():
+            expect(f"{name}{run}", read[name], expected)
+        expect(f"faults{run}", {name: count for name, count in read.items() if name.startswith("wire_") and count}, {})
+        expect_near(f"mean of the left eye{run}, mm", read["left_mean_mm"], 4.0495, 0.0001)
+        expect_near(f"mean of the right eye{run}, mm", read["right_mean_mm"], 3.5495, 0.0001)
     return wrong
 
 
 def right_result() -> dict:
     """A made-up result that is right."""
-    read = dict.fromkeys(["sequence_gaps", "sequence_missing", "sequence_repeats", "sequence_restarts"], 0)
-    read |= {"samples": 4000, "bytes": 30000, "left": 2000, "right": 2000, "both": 0, "clock_resets": 0}
-    read |= {"connects": 2, "disconnects": 1, "wire_too_short": 0, "left_mean_mm": 4.0495, "right_mean_mm": 3.5495}
-    return {
+    result = {
         "absent": "no HID device is 1209:0001; there is no HID device at all; plug the tracker in",
         "refused": "permission denied; write this line to /etc/udev/rules.d/61-holod-tracker-hid.rules:",
         "node_mode": "crw-------",
         "rule_fits": True,
-        "sent": [{"plug": plug, "node": f"hidraw{plug}", "sent": 1000, "took_ms": 1000} for plug in (1, 2)],
-        "read": read,
     }
+    for run, plugs in {"": 2, "_by_usage": 1}.items():
+        sent = [{"plug": plug + 1, "node": f"hidraw{plug}", "sent": 1000, "took_ms": 1000} for plug in range(plugs)]
+        result |= {f"sent{run}": sent, f"read{run}": right_counts(plugs)}
+    return result
+
+
+def right_counts(plugs: int) -> dict:
+    """What a reader counts that reads all of so many plugs."""
+    read = dict.fromkeys(["sequence_gaps", "sequence_missing", "sequence_repeats", "sequence_restarts"], 0)
+    read |= {"samples": 2000 * plugs, "bytes": 15000 * plugs, "left": 1000 * plugs, "right": 1000 * plugs, "both": 0}
+    read |= {"clock_resets": 0, "connects": plugs, "disconnects": plugs - 1, "wire_too_short": 0}
+    return read | {"left_mean_mm": 4.0495, "right_mean_mm": 3.5495}
 
 
 def check_the_judge() -> list[str]:
@@ -123,10 +132,11 @@ def check_the_judge() -> list[str]:
 
     for key, value in {"absent": "", "refused": "", "node_mode": "crw-rw----", "rule_fits": False, "sent": []}.items():
         try_wrong(key, right_result() | {key: value})
-    for name, value in right_result()["read"].items():
-        result = right_result()
-        result["read"][name] = value + 1
-        try_wrong(name, result)
+    for name in ["read", "read_by_usage"]:
+        for key, value in right_result()[name].items():
+            result = right_result()
+            result[name][key] = value + 1
+            try_wrong(f"{name} {key}", result)
     for name in ["plug", "sent", "node", "took_ms"]:
         result = copy.deepcopy(right_result())
         result["sent"][1][name] = result["sent"][0][name] if name in {"plug", "node"} else 900
@@ -144,7 +154,7 @@ def main() -> int:
     for line in wrong:
         print(f"wrong: {line}")
     if not wrong:
-        print(f"{PLUGS} times {REPORTS} reports at 1 kHz were read, over an unplug and a replug at another node")
+        print(f"{PLUGS} times {REPORTS} reports at 1 kHz were read, over a replug at another node, and {REPORTS} by usage")
     return 1 if wrong else 0
 
 

@@ -72,7 +72,13 @@ fn profile_of(header: &Header, path: &Path) -> Result<Profile, ReplayError> {
         Some(text) => Profile::from_toml(text, &header.profile),
         None => Profile::find(&header.profile),
     };
-    profile.map_err(|error| ReplayError::Content {
+    let described = match &header.hid_descriptor {
+        None => profile.map_err(|error| error.to_string()),
+        Some(descriptor) => profile
+            .map_err(|error| error.to_string())
+            .and_then(|profile| profile.described(descriptor).map_err(|error| error.to_string())),
+    };
+    described.map_err(|error| ReplayError::Content {
         path: path.into(),
         at: String::new(),
         found: format!("a recording by a profile that cannot be had: {error}"),

@@ -123,11 +123,12 @@ fn in_words(faults: &[Fault]) -> String {
 pub const DEFAULT_PROFILE: &str = "holod";
 
 /// By name.
-const FILES: [(&str, &str); 12] = [
+const FILES: [(&str, &str); 13] = [
     ("asl-eye-trac", include_str!("../../profiles/asl-eye-trac.toml")),
     ("core", include_str!("../../profiles/core.toml")),
     ("example-lines", include_str!("../../profiles/example-lines.toml")),
     ("example-packet", include_str!("../../profiles/example-packet.toml")),
+    ("example-usages", include_str!("../../profiles/example-usages.toml")),
     ("holod", include_str!("../../profiles/holod.toml")),
     ("holod-hid", include_str!("../../profiles/holod-hid.toml")),
     ("iscan-etl", include_str!("../../profiles/iscan-etl.toml")),

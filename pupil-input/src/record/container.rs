@@ -7,7 +7,7 @@
 //! | 8 | `HOLOD`, 0x1A, CR, LF |
 //! | 4 | version of the format, 1 |
 //! | 4 | length of the header, n |
-//! | n | the header, TOML: `spec`, `profile`, `profile_toml` where it is a user's own, `datagrams`, `holod`, `t_started_ns` (the host's monotonic clock) and `started_unix_ns` (the wall clock at the same moment) |
+//! | n | the header, TOML: `spec`, `profile`, `profile_toml` where it is a user's own, `hid_descriptor` in hexadecimals for a HID device, `datagrams`, `holod`, `t_started_ns` (the host's monotonic clock) and `started_unix_ns` (the wall clock at the same moment) |
 //! | 4 | CRC-32 of all of these |
 //!
 //! and goes on with records:
@@ -109,6 +109,8 @@ pub(crate) struct Header {
     pub(crate) profile: String,
     /// The profile itself, where it is none that ships with holod.
     pub(crate) profile_toml: Option<String>,
+    /// The report descriptor of a HID device, by which fields are found that the profile names by usage.
+    pub(crate) hid_descriptor: Option<Vec<u8>>,
     /// Whether each piece is a message of its own, at whose end the decoder's stream ends.
     pub(crate) datagrams: bool,
     /// When the run began, on the host's monotonic clock.
@@ -125,6 +127,9 @@ impl Header {
         text["profile"] = value(&self.profile);
         if let Some(profile_toml) = &self.profile_toml {
             text["profile_toml"] = value(profile_toml);
+        }
+        if let Some(descriptor) = &self.hid_descriptor {
+            text["hid_descriptor"] = value(descriptor.iter().map(|byte| format!("{byte:02x}")).collect::<String>());
         }
         text["datagrams"] = value(self.datagrams);
         text["holod"] = value(env!("CARGO_PKG_VERSION"));
@@ -147,11 +152,20 @@ impl Header {
             spec: string("spec")?,
             profile: string("profile")?,
             profile_toml: string("profile_toml"),
+            hid_descriptor: match text.get("hid_descriptor") {
+                None => None,
+                Some(item) => Some(bytes_of_hex(item.as_str()?)?),
+            },
             datagrams: text.get("datagrams")?.as_bool()?,
             t_started: TimeNs(integer("t_started_ns")?),
             started_unix_ns: integer("started_unix_ns")?,
         })
     }
+}
+
+fn bytes_of_hex(text: &str) -> Option<Vec<u8>> {
+    let pairs = text.as_bytes().chunks(2);
+    pairs.map(|pair| u8::from_str_radix(str::from_utf8(pair).ok().filter(|pair| pair.len() == 2)?, 16).ok()).collect()
 }
 
 /// Why a file is not read as a recording.
@@ -281,12 +295,17 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::SampleEye;
+    use crate::import::Recording;
+    use crate::import::raw::RawLog;
+    use crate::wire::hid_descriptor::HOLOD_HID_DESCRIPTOR;
 
     fn header() -> Header {
         Header {
             spec: "serial:/dev/\"odd\"\nname".into(),
             profile: "holod".into(),
             profile_toml: Some("name = '''x'''\n".into()),
+            hid_descriptor: Some(vec![0x05, 0xFF, 0x00]),
             datagrams: true,
             t_started: TimeNs(-5),
             started_unix_ns: 1_700_000_000_000_000_000,
@@ -396,5 +415,41 @@ mod tests {
         let mut bytes = header().encode();
         bytes[8] = 7;
         assert!(matches!(read(&bytes), Err(HeaderFault::Bad(found)) if found.contains("version 7")));
+    }
+
+    /// Report 1 of `holod-hid`: 1 s, number 7, left 3.25 mm seen, right not.
+    const REPORT: [u8; 15] = [1, 0x40, 0x42, 0x0F, 0, 7, 0, 0xB2, 0x0C, 255, 1, 0, 0, 0, 0];
+
+    #[test]
+    fn a_recording_by_usage_is_read_by_the_descriptor_in_it() {
+        let file = |hid_descriptor| {
+            let header = Header {
+                spec: "hid:1209:0001,profile=example-usages".into(),
+                profile: "example-usages".into(),
+                profile_toml: None,
+                hid_descriptor,
+                datagrams: true,
+                t_started: TimeNs(0),
+                started_unix_ns: 0,
+            };
+            let mut bytes = header.encode();
+            for (kind, payload) in [(Kind::Connected, &[][..]), (Kind::Bytes, &REPORT), (Kind::End, &[])] {
+                encode_record(&RecordHead { kind, t: TimeNs(5), connection: 0 }, payload, &mut bytes);
+            }
+            let file = tempfile::NamedTempFile::new().expect("a file");
+            std::fs::write(file.path(), bytes).expect("writes");
+            file
+        };
+        let described = file(Some(HOLOD_HID_DESCRIPTOR.to_vec()));
+        let recording = Recording::read(described.path()).expect("reads");
+        let samples: Vec<_> = recording.samples().collect();
+        assert_eq!(samples.len(), 2);
+        assert_eq!((samples[0].eye, samples[0].diameter_mm, samples[0].valid), (SampleEye::Left, 3.25, true));
+        assert_eq!((samples[1].eye, samples[1].valid), (SampleEye::Right, false));
+        assert!(RawLog::open(described.path()).is_ok());
+
+        let message = Recording::read(file(Some(vec![0xC0])).path()).expect_err("is refused").to_string();
+        assert!(message.contains("the report descriptor is faulty at byte 0"), "{message}");
+        assert!(Recording::read(file(None).path()).is_err(), "without a descriptor there are no samples");
     }
 }

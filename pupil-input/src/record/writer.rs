@@ -327,6 +327,7 @@ mod tests {
             spec: "serial:/dev/x".into(),
             profile: "holod".into(),
             profile_toml: None,
+            hid_descriptor: None,
             datagrams: false,
             t_started: TimeNs(7),
             started_unix_ns: 0,

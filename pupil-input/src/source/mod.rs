@@ -46,6 +46,11 @@ pub(crate) trait Feed: Send {
         false
     }
 
+    /// The report descriptor of the device that was opened last, where it is a HID device.
+    fn descriptor(&self) -> Option<&[u8]> {
+        None
+    }
+
     /// What a user should know of the link although it opens, a sentence each.
     fn warnings(&self) -> Vec<String> {
         Vec::new()

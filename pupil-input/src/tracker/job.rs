@@ -96,6 +96,14 @@ impl Job {
         }
     }
 
+    /// The report descriptor of a HID device.
+    pub(super) fn descriptor(&self) -> Option<&[u8]> {
+        match self {
+            Self::Live { feed, .. } => feed.descriptor(),
+            Self::Replay { .. } | Self::Rerun { .. } | Self::Mock { .. } => None,
+        }
+    }
+
     /// What a user should know before it runs.
     pub(super) fn warnings(&self) -> Vec<String> {
         match self {

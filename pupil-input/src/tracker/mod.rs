@@ -135,6 +135,7 @@ impl Tracker {
             spec: spec.to_string(),
             profile: profile.name.clone(),
             profile_toml: job::own_profile(spec),
+            hid_descriptor: job.descriptor().map(<[u8]>::to_vec),
             datagrams,
             t_started: host_now(),
             started_unix_ns: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as i64),

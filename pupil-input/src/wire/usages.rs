@@ -142,7 +142,8 @@ fn null_state(field: &ReportField) -> Option<Validity> {
 /// The number of 1, 2, 4 or 8 bytes that holds a field's bits; None where no such number does.
 ///
 /// It ends with the field's last byte if the report has as many bytes before that, so that nothing behind a report's last
-/// field is asked for; a field of 3, 5, 6 or 7 bytes at the very beginning needs bytes behind it. A signed field must end with a byte: its sign is then the number's.
+/// field is asked for; a field of 3, 5, 6 or 7 bytes at the very beginning needs bytes behind it. A signed field must end
+/// with a byte: its sign is then the number's.
 fn place(field: &ReportField) -> Option<Field> {
     let end = field.bit_offset + field.bits;
     let (first, last) = (field.bit_offset / 8, end.div_ceil(8));
@@ -186,28 +187,11 @@ mod tests {
     use crate::wire::testing::events_of;
     use crate::wire::{Format, WireSample};
 
-    /// The shipped HID profile's fields by their usages, as a profile's text.
-    const BY_USAGE: &str = r#"
-        format = "holod-tracker-1"
-        name = "by-usage"
-        [wire]
-        kind = "usages"
-        time = { usage = "ff00:0020", unit = "s" }
-        sequence = "FF00:21"
-        [wire.left]
-        size = { usage = "ff00:0030", collection = "ff00:0010" }
-        confidence = { usage = "ff00:0031", collection = "ff00:0010" }
-        valid = { usage = "ff00:0032", collection = "ff00:0010", all_bits = 1 }
-        [wire.right]
-        size = { usage = "ff00:0030", collection = "ff00:0011" }
-        confidence = { usage = "ff00:0031", collection = "ff00:0011" }
-        valid = { usage = "ff00:0032", collection = "ff00:0011", all_bits = 1 }
-    "#;
+    /// The shipped HID profile's fields by their usages.
+    const BY_USAGE: &str = include_str!("../../profiles/example-usages.toml");
 
     fn profile(text: &str) -> Profile {
-        let file = tempfile::Builder::new().suffix(".toml").tempfile().expect("a file");
-        std::fs::write(file.path(), text).expect("writes");
-        Profile::find(&file.path().display().to_string()).unwrap_or_else(|error| panic!("{error}"))
+        Profile::from_toml(text, "test").unwrap_or_else(|error| panic!("{error}"))
     }
 
     fn refused(text: &str, descriptor: &[u8]) -> String {

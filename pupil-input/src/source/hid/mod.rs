@@ -194,6 +194,14 @@ impl Feed for HidFeed {
     fn open(&mut self) -> Result<Box<dyn ByteSource>, SourceError> {
         Ok(Box::new(self.connect()?))
     }
+
+    fn datagrams(&self) -> bool {
+        true
+    }
+
+    fn descriptor(&self) -> Option<&[u8]> {
+        self.last.as_ref().map(|(_, descriptor)| &descriptor[..])
+    }
 }
 
 struct HidSource {
