@@ -122,7 +122,7 @@ fn the_error_on_a_made_up_eye_is_small() {
 
 #[test]
 fn noise_is_damped() {
-    for (rate_hz, greatest_gain) in [(60, 0.8), (200, 0.6), (1000, 0.4)] {
+    for (rate_hz, greatest_gain) in [(60, 0.7), (200, 0.5), (1000, 0.35)] {
         let noise_mm = 0.06;
         let mut random = Pcg64Mcg::seed_from_u64(9);
         let mut estimator = Estimator::new(settings(rig::Eye::Left));
