@@ -24,8 +24,8 @@ pub struct FilterSettings {
 impl Default for FilterSettings {
     fn default() -> Self {
         Self {
-            velocity_lasts: TimeNs(150_000_000),
-            agility: 5.0,
+            velocity_lasts: TimeNs(200_000_000),
+            agility: 3.0,
             constriction_mm_per_s: 7.0,
             dilation_mm_per_s: 4.0,
             forgets: TimeNs(150_000_000),
@@ -151,7 +151,7 @@ mod tests {
             velocity_lasts: FilterSettings::default().velocity_lasts,
         };
         let rest = motion.at(TimeNs::from_seconds(10.0));
-        assert!((rest.diameter_mm - 3.25).abs() < 1e-3);
+        assert!((rest.diameter_mm - 3.0).abs() < 1e-3);
         assert!(rest.velocity_mm_per_s.abs() < 1e-6);
         assert_eq!(motion.at(TimeNs(-5)).diameter_mm, 4.0);
     }

@@ -15,13 +15,16 @@
 //!
 //! | | |
 //! |---|---|
-//! | lag at the onset of a ramp of 1.3 to 5.5 mm/s ([`STATED_LAG`] bounds it), sensor noise 0.06 mm at 200 Hz | 38 ms |
-//! | lag on the same ramp, from 200 ms after its onset | 17 ms |
-//! | noise of the estimate over noise of one sample, at 60 / 200 / 1000 Hz | 0.71 / 0.53 / 0.36 |
-//! | rms error on the mock's `steady` / `light-steps` / `sweep` / `blinks`, sensor noise 0.05 mm | 0.03 / 0.05 / 0.04 / 0.04 mm |
-//! | worst error while tracking, on the same (`light-steps` has a constriction that begins behind a blink) | 0.11 / 0.51 / 0.27 / 0.15 mm |
+//! | lag at the onset of a ramp of 1.3 to 5.5 mm/s ([`STATED_LAG`] bounds it), sensor noise 0.06 mm at 200 Hz | 42 ms |
+//! | lag on the same ramp, from 200 ms after its onset | 18 ms |
+//! | noise of the estimate over noise of one sample, at 60 / 200 / 1000 Hz | 0.61 / 0.44 / 0.29 |
+//! | rms error on the mock's `steady` / `light-steps` / `sweep` / `blinks`, sensor noise 0.05 mm | 0.02 / 0.05 / 0.04 / 0.03 mm |
+//! | worst error while tracking, on the same (`light-steps` has a constriction that begins behind a blink) | 0.09 / 0.53 / 0.27 / 0.12 mm |
 //! | after a blink, until samples are believed again | 50 ms trailing guard and 30 ms lead |
 //! | a step no pupil can make (a lid, or a change missed) of 1.5 mm is believed after | about 0.6 s |
+//!
+//! Flicker in pixels of blur, the error of predictions, and how other filters do: `doc/estimate.md`. Scenarios of the
+//! simulated eye: [`Script`].
 //!
 //! A pupil is held for as long as the rig says ([`rig::Tracker::hold`](holod_calibration::rig::Tracker::hold)), then slides to
 //! the fallback at 1.3 mm/s; when samples come back, what is shown meets them at 4 mm/s. Neither is

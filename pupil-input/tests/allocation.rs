@@ -16,6 +16,23 @@ fn allocations_of(work: impl FnOnce()) -> u64 {
 }
 
 #[test]
+fn the_simulated_eye_its_clock_and_the_choice_of_an_eye_allocate_nothing() {
+    let text = "free-running\njitter 20ms\nahead 9s\ndrift 90ppm\n3s every 5s blink 200ms\n4s every 7s steps -600ms";
+    let mut source = MockSource::of(holod_pupil_input::Script::parse("test", text).expect("a script"));
+    let mut clock = ClockModel::new();
+    let mut estimator =
+        Estimator::new(EstimatorSettings::from(&rig::Tracker { eye: rig::Eye::Better, ..rig::Rig::default().tracker }));
+    let allocations = allocations_of(|| {
+        for mock in source.by_ref().take(20_000) {
+            let t_sample = clock.map(mock.sample.t_device, mock.sample.t_arrival);
+            estimator.push(PupilSample { t_sample, ..mock.sample }, |_| {});
+        }
+    });
+    assert_eq!(allocations, 0);
+    assert!(clock.resets() > 3);
+}
+
+#[test]
 fn the_count_sees_an_allocation() {
     assert_eq!(allocations_of(|| drop(std::hint::black_box(Box::new(1)))), 1);
 }

@@ -160,6 +160,33 @@ fn a_wrong_eye_model_that_looks_right_is_believed_in_the_end_and_left_again() {
     assert!((0.95..0.98).contains(&shown.tracking), "{}", shown.tracking);
 }
 
+#[test]
+fn a_loss_is_held_slides_to_the_fallback_and_slides_back() {
+    let mut estimator = Estimator::new(settings(rig::Eye::Both));
+    let mut states = Vec::new();
+    let mut shown: Vec<(i64, f32)> = Vec::new();
+    let mut samples = MockSource::of(script("hippus 0mm\n0s pupil 5mm\n5s lost 5s")).map(|mock| mock.sample).peekable();
+    for t_ms in 0..15_000 {
+        let t = TimeNs(t_ms * 1_000_000);
+        while let Some(sample) = samples.next_if(|sample| sample.t_sample <= t) {
+            estimator.push(sample, |_| {});
+        }
+        let estimate = estimator.pupil_at(t);
+        shown.push((t_ms, estimate.pupil.mm()));
+        if states.last() != Some(&estimate.state) {
+            states.push(estimate.state);
+        }
+    }
+    use PupilState::{Fallback, Holding, Tracking};
+    assert_eq!(states, [Fallback, Tracking, Holding, Fallback, Tracking]);
+    let at = |t_ms: usize| shown[t_ms].1;
+    assert!((at(4900) - 5.0).abs() < 0.1 && (at(5900) - 5.0).abs() < 0.1 && (at(9900) - 3.0).abs() < 1e-3);
+    assert!((at(14_000) - 5.0).abs() < 0.1);
+    // The way back is 4 mm/s, and what the noise of the first samples adds.
+    let fastest = shown.windows(51).map(|window| (window[50].1 - window[0].1).abs() / 0.05).fold(0.0, f32::max);
+    assert!((3.9..6.5).contains(&fastest), "{fastest} mm/s");
+}
+
 /// The neighbourhood of two blinks of a real 60 Hz recording: lost samples are 0.00, and their neighbours are low.
 #[test]
 fn the_low_neighbours_of_lost_samples_are_not_believed() {
