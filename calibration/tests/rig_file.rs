@@ -4,7 +4,7 @@ use std::f64::consts::{PI, TAU};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use holod_calibration::rig::{Fault, LaserDriver, PanelMode, PanelProfile, PhaseSign, Provenance, Rig, RigError};
+use holod_calibration::rig::{Eye, Fault, LaserDriver, PanelMode, PanelProfile, PhaseSign, Provenance, Rig, RigError};
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, Resolution, TimeNs};
 use image::{GrayImage, ImageBuffer, Luma, RgbImage};
 use proptest::prelude::*;
@@ -204,6 +204,7 @@ fn wrong_types_are_named() {
     check("bit_depth = 8", "bit_depth = true", "panel.bit_depth", "a boolean true", "a number", "");
     check("mode = ", "mode = 3 #", "panel.mode", "an integer 3", "\"channel-packed\"", "in double quotes");
     check("eye = \"both\"", "eye = \"\"", "tracker.eye", "an empty text", "\"left\"", "");
+    check("eye = \"both\"", "eye = \"best\"", "tracker.eye", "", "\"better\"", "");
     let flag = "allow_optics_mismatch = ";
     check(
         flag,
@@ -333,6 +334,15 @@ fn missing_tables_and_keys_are_named_once() {
         (rig.tracker, rig.model, rig.geometry),
         (Rig::default().tracker, Rig::default().model, DisplayGeometry::DEFAULT)
     );
+}
+
+#[test]
+fn each_choice_of_eye_is_read() {
+    let eyes = [("left", Eye::Left), ("right", Eye::Right), ("both", Eye::Both), ("better", Eye::Better)];
+    for (name, eye) in eyes {
+        let text = changed(&[("eye = \"both\"", &format!("eye = \"{name}\""))]);
+        assert_eq!(Rig::parse(&text, Path::new("")).unwrap().tracker.eye, eye);
+    }
 }
 
 #[test]

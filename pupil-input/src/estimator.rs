@@ -1,4 +1,4 @@
-//! From samples to `pupil_at(t)`: gate and filter per eye, eyes combined, hold, fallback and the slides between.
+//! From samples to `pupil_at(t)`: gate and filter per eye, eyes combined or chosen, hold, fallback and the slides between.
 
 use holod_calibration::{PupilDiameter, TimeNs, rig};
 
@@ -31,10 +31,23 @@ pub struct EstimatorSettings {
     pub silence: TimeNs,
     /// Over how long the difference between the two eyes is learnt.
     pub eye_offset: TimeNs,
+    /// How the better eye is chosen; used for [`rig::Eye::Better`] only.
+    pub better: BetterSettings,
     /// Limits of the gate.
     pub gate: GateSettings,
     /// Tuning of the filter.
     pub filter: FilterSettings,
+}
+
+/// How the better of two eyes is chosen. A change of eye slides like every other change of what is shown.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BetterSettings {
+    /// Over how long confidences are averaged.
+    pub recent: TimeNs,
+    /// The other eye's recent confidence must be higher by this.
+    pub margin: f32,
+    /// For this long neither eye must have been lost or come back; longer than eyes differ at either end of a blink.
+    pub settles: TimeNs,
 }
 
 impl From<&rig::Tracker> for EstimatorSettings {
@@ -48,6 +61,7 @@ impl From<&rig::Tracker> for EstimatorSettings {
             return_mm_per_s: 4.0,
             silence: TimeNs(150_000_000),
             eye_offset: TimeNs(1_000_000_000),
+            better: BetterSettings { recent: TimeNs(500_000_000), margin: 0.1, settles: TimeNs(150_000_000) },
             gate: GateSettings::default(),
             filter: FilterSettings::default(),
         }
@@ -226,6 +240,31 @@ struct Channel {
     to_mean_mm: f32,
     /// Trusted now: believed at least once, and no bad sample since.
     live: bool,
+    /// When `live` changed last.
+    t_changed: TimeNs,
+    t_latest: TimeNs,
+    /// Mean of the recent confidences; a sample that is itself bad counts as 0.
+    confidence: f32,
+}
+
+impl Channel {
+    fn new(settings: &EstimatorSettings) -> Self {
+        Self {
+            gate: Gate::new(settings.gate),
+            filter: Filter::new(settings.filter),
+            to_mean_mm: 0.0,
+            live: false,
+            t_changed: TimeNs(0),
+            t_latest: TimeNs(0),
+            confidence: 0.0,
+        }
+    }
+
+    fn note_confidence(&mut self, t: TimeNs, confidence: f32, recent: TimeNs) {
+        let elapsed_s = (t - self.t_latest).seconds().max(0.0);
+        self.t_latest = t;
+        self.confidence += (1.0 - (-elapsed_s / recent.seconds()).exp()) as f32 * (confidence - self.confidence);
+    }
 }
 
 /// Samples in, estimate out. Times come with the samples and with the questions; it reads no clock and, once made,
@@ -233,6 +272,8 @@ struct Channel {
 #[derive(Clone, Debug)]
 pub struct Estimator {
     channels: [Channel; 3],
+    /// The channel that is shown where only the better one is.
+    chosen: Option<usize>,
     learnt: TimeNs,
     t_learnt: Option<TimeNs>,
     snapshot: EstimateSnapshot,
@@ -241,14 +282,9 @@ pub struct Estimator {
 impl Estimator {
     /// An estimator that has seen nothing.
     pub fn new(settings: EstimatorSettings) -> Self {
-        let channel = || Channel {
-            gate: Gate::new(settings.gate),
-            filter: Filter::new(settings.filter),
-            to_mean_mm: 0.0,
-            live: false,
-        };
         Self {
-            channels: [channel(), channel(), channel()],
+            channels: std::array::from_fn(|_| Channel::new(&settings)),
+            chosen: None,
             learnt: TimeNs(0),
             t_learnt: None,
             snapshot: EstimateSnapshot::new(settings),
@@ -276,16 +312,25 @@ impl Estimator {
             .filter
             .motion()
             .map(|motion| Expected { diameter_mm: motion.at(t).diameter_mm, t_believed: motion.t });
-        let mut backwards = false;
+        let mut fault = None;
         channel.gate.judge(sample, expected, |sample, reason| {
-            backwards |= reason == Rejection::Backwards;
+            fault = (reason != Rejection::Guard).then_some(reason).or(fault);
             on_decision(Decision { sample, verdict: Verdict::Rejected(reason) });
         });
-        if backwards {
+        if matches!(fault, Some(Rejection::Backwards | Rejection::Repeated)) {
             return;
         }
         channel.live = (channel.live || believed) && channel.gate.is_open();
-        let set_changed = channel.live != lives_before;
+        let mut set_changed = channel.live != lives_before;
+        if set_changed {
+            channel.t_changed = t;
+        }
+        let confidence = if fault.is_some() { 0.0 } else { sample.confidence.clamp(0.0, 1.0) };
+        channel.note_confidence(t, confidence, settings.better.recent);
+        if settings.eye == rig::Eye::Better {
+            set_changed |= self.choose(t);
+        }
+        let channel = &self.channels[sample.eye.index()];
         self.snapshot.silence = settings.silence.max(settings.gate.lead + channel.gate.usual_silence());
 
         if self.snapshot.raw.is_none_or(|(latest, _)| t >= latest) {
@@ -318,6 +363,22 @@ impl Estimator {
         self.snapshot.lost = true;
     }
 
+    /// Chooses the eye to show at `t`; whether that changed.
+    fn choose(&mut self, t: TimeNs) -> bool {
+        let BetterSettings { margin, settles, .. } = self.snapshot.settings.better;
+        let channels = &self.channels;
+        let better = |other: &usize| {
+            let Some(chosen) = self.chosen.map(|chosen| &channels[chosen]) else { return true };
+            let surer = channels[*other].confidence > chosen.confidence + margin;
+            t - channels[*other].t_changed.max(chosen.t_changed) >= settles && (surer || !chosen.live)
+        };
+        let others = (0..channels.len()).filter(|other| channels[*other].live && Some(*other) != self.chosen);
+        let best = others.filter(better).max_by(|a, b| channels[*a].confidence.total_cmp(&channels[*b].confidence));
+        let changed = best.is_some();
+        self.chosen = best.or(self.chosen);
+        changed
+    }
+
     /// While both eyes are live, follows how far each lies from their mean.
     fn learn_eye_offsets(&mut self) {
         let [left, right, _] = &mut self.channels;
@@ -343,12 +404,13 @@ impl Estimator {
     /// Combines the live eyes into one motion; where the set of eyes changed or samples came back, what is shown stays
     /// continuous at `t` and the difference is worked off.
     fn combine(&mut self, t: TimeNs, set_changed: bool) {
-        let live = || self.channels.iter().filter(|channel| channel.live);
+        let shown = |index| self.snapshot.settings.eye != rig::Eye::Better || Some(index) == self.chosen;
+        let live = || (0..).zip(&self.channels).filter(|(i, eye)| eye.live && shown(*i)).map(|(_, eye)| eye);
         let Some(newest) = live().filter_map(|channel| channel.filter.motion()).map(|motion| motion.t).max() else {
             self.snapshot.lost = true;
             return;
         };
-        let alone = live().count() == 1;
+        let alone = live().count() == 1 && self.snapshot.settings.eye == rig::Eye::Both;
         let mut sum = (0.0, 0.0, 0.0_f32);
         for channel in live() {
             if let Some(motion) = channel.filter.motion() {
@@ -375,7 +437,7 @@ impl Estimator {
 const fn drives(chosen: rig::Eye, eye: SampleEye) -> bool {
     matches!(
         (chosen, eye),
-        (rig::Eye::Both, _)
+        (rig::Eye::Both | rig::Eye::Better, _)
             | (_, SampleEye::Both)
             | (rig::Eye::Left, SampleEye::Left)
             | (rig::Eye::Right, SampleEye::Right)

@@ -3,7 +3,8 @@
 //! In a blink a tracker measures what is left of the pupil beside the lid. Some say so (confidence, lid aperture); many
 //! send plausible millimetres without a word. So a sample is believed only if
 //!
-//! 1. its diameter is in range, its confidence and lid aperture (where known) are high enough;
+//! 1. its diameter is in range, its confidence is high enough, and the lids (where known) are open: as wide as that eye
+//!    holds them open, since in bright light people squint all the time;
 //! 2. it did not step from its predecessor faster than a pupil moves, beyond what the tracker's own noise explains;
 //! 3. it lies within reach of the estimate: a band that widens with the time since the last believed sample, so that
 //!    a dip of a lid is outside for longer than a blink lasts, and a real change of the pupil is inside soon after;
@@ -24,8 +25,14 @@ pub struct GateSettings {
     pub greatest_mm: f32,
     /// Least confidence.
     pub least_confidence: f32,
-    /// Least distance between the lids, for trackers that measure it.
-    pub least_aperture_mm: f32,
+    /// Lids this far apart are open, however wide the eye opens them at other times.
+    pub open_aperture_mm: f32,
+    /// Lids nearer than this are closed, however little the eye opens at other times.
+    pub closed_aperture_mm: f32,
+    /// Between the two, lids nearer than this share of how wide they usually are count as closed.
+    pub least_aperture_share: f32,
+    /// How soon a narrower opening is taken to be the usual one; much longer than a blink.
+    pub aperture_settles: TimeNs,
     /// Fastest change of a pupil, millimetres a second, noise aside.
     pub slew_mm_per_s: f32,
     /// How far from the estimate a sample may lie when the last believed one is fresh.
@@ -46,7 +53,10 @@ impl Default for GateSettings {
             least_mm: 1.0,
             greatest_mm: 9.0,
             least_confidence: 0.6,
-            least_aperture_mm: 3.5,
+            open_aperture_mm: 3.5,
+            closed_aperture_mm: 1.0,
+            least_aperture_share: 0.5,
+            aperture_settles: TimeNs(3_000_000_000),
             slew_mm_per_s: 10.0,
             reach_mm: 0.45,
             reach_mm_per_s: 2.0,
@@ -62,8 +72,10 @@ impl Default for GateSettings {
 pub enum Rejection {
     /// Of an eye that does not drive the display.
     OtherEye,
-    /// Its time is not later than its predecessor's.
+    /// It comes late: its time is before its predecessor's.
     Backwards,
+    /// Its time is its predecessor's.
+    Repeated,
     /// The tracker itself says that it sees no pupil.
     Lost,
     /// Diameter, confidence or aperture is NaN or infinite.
@@ -84,9 +96,10 @@ pub enum Rejection {
 
 impl Rejection {
     /// Every reason, in the order of their indices.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::OtherEye,
         Self::Backwards,
+        Self::Repeated,
         Self::Lost,
         Self::NotFinite,
         Self::OutOfRange,
@@ -107,6 +120,7 @@ impl Rejection {
         match self {
             Self::OtherEye => "other_eye",
             Self::Backwards => "backwards",
+            Self::Repeated => "repeated",
             Self::Lost => "lost",
             Self::NotFinite => "not_finite",
             Self::OutOfRange => "out_of_range",
@@ -153,6 +167,7 @@ pub(crate) struct Gate {
     t_bad: Option<TimeNs>,
     step: StepScale,
     interval: Interval,
+    lids: Lids,
 }
 
 impl Gate {
@@ -167,6 +182,7 @@ impl Gate {
             t_bad: None,
             step: StepScale::default(),
             interval: Interval::default(),
+            lids: Lids::default(),
         }
     }
 
@@ -213,7 +229,7 @@ impl Gate {
         let t = sample.t_sample;
         if let Some(newest) = self.t_newest {
             if t <= newest {
-                return on_rejected(sample, Rejection::Backwards);
+                return on_rejected(sample, if t < newest { Rejection::Backwards } else { Rejection::Repeated });
             }
             let gap = self.gap();
             self.interval.note(t - newest);
@@ -256,8 +272,9 @@ impl Gate {
         sample
     }
 
-    fn fault_of_itself(&self, sample: &PupilSample) -> Option<Rejection> {
+    fn fault_of_itself(&mut self, sample: &PupilSample) -> Option<Rejection> {
         let limits = &self.settings;
+        let shut = sample.aperture_mm.is_some_and(|aperture_mm| self.lids.shut(sample.t_sample, aperture_mm, limits));
         let finite = sample.diameter_mm.is_finite()
             && sample.confidence.is_finite()
             && sample.aperture_mm.is_none_or(f32::is_finite);
@@ -267,7 +284,7 @@ impl Gate {
             Some(Rejection::NotFinite)
         } else if sample.confidence < limits.least_confidence {
             Some(Rejection::LowConfidence)
-        } else if sample.aperture_mm.is_some_and(|aperture| aperture < limits.least_aperture_mm) {
+        } else if shut {
             Some(Rejection::LidsClosed)
         } else if !(limits.least_mm..=limits.greatest_mm).contains(&sample.diameter_mm) {
             Some(Rejection::OutOfRange)
@@ -291,6 +308,31 @@ impl Gate {
         let reach = self.settings.reach_mm.max(noise)
             + self.settings.reach_mm_per_s * (t - expected.t_believed).seconds() as f32;
         ((sample.diameter_mm - expected.diameter_mm).abs() > reach).then_some(Rejection::OutOfReach)
+    }
+}
+
+/// How wide an eye holds its lids: rises at once, falls slowly.
+#[derive(Clone, Copy, Debug, Default)]
+struct Lids {
+    open_mm: f32,
+    t: Option<TimeNs>,
+}
+
+/// A silence says nothing of the lids.
+const LIDS_SILENCE: TimeNs = TimeNs(100_000_000);
+
+impl Lids {
+    /// Notes the aperture of time `t`; tells whether the lids are too near.
+    fn shut(&mut self, t: TimeNs, aperture_mm: f32, limits: &GateSettings) -> bool {
+        if aperture_mm.is_finite() {
+            let elapsed = self.t.replace(t).map_or(TimeNs(0), |before| (t - before).min(LIDS_SILENCE));
+            let keeps = (-elapsed.seconds() / limits.aperture_settles.seconds()).exp() as f32;
+            // What is beyond this bound changes no verdict, and an outlier is soon forgotten.
+            let widest_mm = limits.open_aperture_mm / limits.least_aperture_share;
+            self.open_mm = (aperture_mm + keeps * (self.open_mm - aperture_mm)).max(aperture_mm).min(widest_mm);
+        }
+        let least_mm = limits.least_aperture_share * self.open_mm;
+        aperture_mm < least_mm.clamp(limits.closed_aperture_mm, limits.open_aperture_mm)
     }
 }
 
@@ -399,7 +441,7 @@ mod tests {
             (|s| s.diameter_mm = 0.5, Rejection::OutOfRange),
             (|s| s.diameter_mm = 16.7, Rejection::OutOfRange),
             (|s| s.confidence = 0.2, Rejection::LowConfidence),
-            (|s| s.aperture_mm = Some(0.1), Rejection::LidsClosed),
+            (|s| s.aperture_mm = Some(0.9), Rejection::LidsClosed),
             (|s| s.diameter_mm = 3.0, Rejection::Slew),
         ];
         for (spoil, reason) in spoil {
@@ -424,6 +466,43 @@ mod tests {
         assert!((800..1100).contains(&again), "believed again {again} ms");
     }
 
+    /// The times in ms of the samples that are rejected because of the lids: 200 Hz, steady, with these apertures.
+    fn shut(aperture_mm: impl Fn(i64) -> f32) -> Vec<i64> {
+        let samples = (0..2000).map(|k| PupilSample { aperture_mm: Some(aperture_mm(5 * k)), ..sample(5 * k, 2.4) });
+        let closed = Verdict::Rejected(Rejection::LidsClosed);
+        let verdicts = verdicts(&samples.collect::<Vec<_>>());
+        verdicts.into_iter().filter(|(_, verdict)| *verdict == closed).map(|(t, _)| t).collect()
+    }
+
+    #[test]
+    fn lids_are_judged_by_how_wide_that_eye_opens() {
+        // Wide open, with a blink of 0.2 s that passes 3.2 mm on its way.
+        let blink = |t: i64, open_mm: f32| if (5000..5200).contains(&t) { 0.2 } else { open_mm };
+        assert_eq!(shut(|t| if t == 4995 || t == 5200 { 3.2 } else { blink(t, 7.0) }).len(), 42);
+        // A squint, in and out of blinks, from the first sample on.
+        assert_eq!(
+            shut(|t| blink(t, 3.0 + 0.5 * (t as f32 * 0.01).sin())),
+            (5000..5200).step_by(5).collect::<Vec<_>>()
+        );
+        // The recording begins with closed lids.
+        assert_eq!(shut(|t| if t < 1000 { 0.0 } else { 2.6 }).last(), Some(&995));
+    }
+
+    #[test]
+    fn a_squint_that_begins_is_believed_within_two_seconds() {
+        let rejected = shut(|t| if t < 4000 { 7.0 } else { 2.6 });
+        assert_eq!(rejected.first(), Some(&4000));
+        assert!((4500..6000).contains(rejected.last().expect("some")), "{:?}", rejected.last());
+        // An outlier costs nothing beyond that.
+        let rejected = shut(|t| if t == 4000 { 1e30 } else { 2.6 });
+        assert!((4500..6000).contains(rejected.last().expect("some")), "{:?}", rejected.last());
+    }
+
+    #[test]
+    fn eyes_closed_for_long_are_closed_all_the_while() {
+        assert_eq!(shut(|t| if t < 1000 { 7.0 } else { 0.6 }).len(), 1800);
+    }
+
     #[test]
     fn a_gap_is_guarded_on_both_sides() {
         let samples = steady((0..20).map(|k| 5 * k).chain((60..100).map(|k| 5 * k)));
@@ -444,8 +523,10 @@ mod tests {
     fn a_time_that_does_not_advance_is_rejected_alone() {
         let mut samples = steady((0..40).map(|k| 5 * k));
         samples[20].t_sample = samples[18].t_sample;
+        samples[30].t_sample = samples[29].t_sample;
         let rejected: Vec<_> = verdicts(&samples).into_iter().filter(|(_, v)| *v != Verdict::Accepted).collect();
-        assert_eq!(rejected, [(90, Verdict::Rejected(Rejection::Backwards))]);
+        let expected = [(90, Rejection::Backwards), (145, Rejection::Repeated)];
+        assert_eq!(rejected, expected.map(|(t, reason)| (t, Verdict::Rejected(reason))));
     }
 
     #[test]

@@ -30,10 +30,12 @@
 mod clock;
 mod counters;
 mod estimator;
+pub mod export;
 mod filter;
 mod gate;
 mod import;
 mod profile;
+mod record;
 mod sample;
 mod sequence;
 pub mod source;
@@ -41,20 +43,28 @@ mod spec;
 mod tracker;
 pub mod wire;
 
-pub use clock::ClockModel;
+pub use clock::{ClockModel, ClockReport};
 pub use counters::{Counter, CounterSnapshot};
-pub use estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, PupilState, STATED_LAG};
+pub use estimator::{
+    BetterSettings, Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, PupilState, STATED_LAG,
+};
 pub use filter::FilterSettings;
 pub use gate::{GateSettings, Rejection, Verdict};
 pub use import::{Blink, LogFault, LogFaults, LogFormat, Recording, ReplayError, SizeUnit};
 pub use profile::{Command, DEFAULT_PROFILE, HidSettings, NetworkSettings, Profile, ProfileError, SerialSettings};
+pub use record::{RecordError, RecordFiles, RecordStatus};
 pub use sample::{PupilSample, SampleEye};
 pub use source::mock::{MockSample, MockSource, Scenario};
 
 pub use source::SourceError;
+pub use source::commands::CommandError;
+pub use source::hid::{HidError, RULE_FILE, udev_rule};
 pub use source::serial::SerialError;
+pub use source::serial::identity::{SerialPortInfo, UsbPort, serial_ports};
 pub use source::server::ServerError;
+pub use source::tcp::NetworkError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
 pub use tracker::{
-    DecisionTap, EstimateReader, Link, MOCK_SEED, Tracker, TrackerControl, TrackerError, TrackerHandle, host_now,
+    DecisionTap, EstimateReader, Link, MOCK_SEED, Tracker, TrackerControl, TrackerError, TrackerHandle, TrackerOptions,
+    host_now,
 };

@@ -6,7 +6,9 @@ use std::cell::Cell;
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::wire::line::{LineDecoder, LineSample, encode_line};
 use holod_pupil_input::wire::{Decoder, WireEvent};
-use holod_pupil_input::{ClockModel, Estimator, EstimatorSettings, MockSource, PupilSample, Scenario};
+use holod_pupil_input::{
+    ClockModel, Estimator, EstimatorSettings, MockSource, Profile, PupilSample, SampleEye, Scenario,
+};
 
 /// The system's allocator, counting for each thread.
 struct Counting;
@@ -80,4 +82,36 @@ fn bytes_become_estimates_without_allocation() {
     });
     assert_eq!(allocations, 0);
     assert!((3.5..4.5).contains(&(sum_mm / 4000.0)), "{}", sum_mm / 4000.0);
+}
+
+#[test]
+fn no_decoder_of_a_shipped_profile_allocates_for_its_bytes() {
+    let mut line = String::new();
+    let sample = LineSample { sequence: 7, device_us: 8, eye: SampleEye::Left, diameter_mm: 3.5, confidence: 0.9 };
+    encode_line(&sample, &mut line);
+    let packet = [0xAA, 0x55, 9, 0, 0x40, 0x42, 0x0F, 0, 0xB2, 0x0C, 0xB2, 0x0C, 255, 51, 0, 0];
+    let frame = [0xFA, 0, 0, 0, 1, 2, 0x10, 0, 0, 0, 0, 0];
+    let messages = [
+        line.as_bytes(),
+        b"millis,left_mm,right_mm\r\n1000,3.25,4.125\r\nx,,\n# comment\n",
+        &packet,
+        &frame,
+        &[1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15],
+        b"\x44\x44\x01\x02 rubbish \r\n",
+    ];
+    // Whatever comes, and however it is cut: lines and packets of the right kind, of others, and halves of them.
+    let bytes = [messages.concat(), messages[..3].concat(), vec![b'7'; 9000], messages.concat()].concat();
+    for profile in Profile::shipped() {
+        let mut decoder = profile.decoder();
+        let mut events = 0;
+        let allocations = allocations_of(|| {
+            for round in 0..20 {
+                for chunk in bytes.chunks(7 + 31 * round) {
+                    decoder.push(chunk, &mut |_| events += 1);
+                }
+            }
+        });
+        assert_eq!(allocations, 0, "{}", profile.name);
+        assert!(events > 0, "{}", profile.name);
+    }
 }

@@ -186,6 +186,58 @@ fn losing_one_of_two_eyes_does_not_jump() {
     assert!(shown.iter().all(|mm| (mm - mean_mm).abs() < 0.01), "{shown:?}");
 }
 
+/// The better of two eyes, each 200 Hz: what is shown at each time, from (time in ms) to (left's and right's diameter
+/// and confidence).
+fn better_of(eyes: impl Fn(i64) -> [(f32, f32); 2]) -> Vec<(i64, f32, PupilState)> {
+    let mut estimator = Estimator::new(settings(rig::Eye::Better));
+    let mut shown = Vec::new();
+    for k in 0..1600 {
+        let t_ms = 5 * k;
+        for (eye, (diameter_mm, confidence)) in [SampleEye::Left, SampleEye::Right].into_iter().zip(eyes(t_ms)) {
+            estimator.push(PupilSample { confidence, ..sample(t_ms, eye, diameter_mm) }, |_| {});
+        }
+        let (mm, state) = at(&estimator, t_ms);
+        shown.push((t_ms, mm, state));
+    }
+    shown
+}
+
+#[test]
+fn the_better_eye_is_shown_and_a_change_of_eye_slides() {
+    // The left eye is the surer one, until from 3 s on it is the less sure one by more than the margin.
+    let shown = better_of(|t| [(4.0, if t < 3000 { 0.95 } else { 0.7 }), (3.5, 0.85)]);
+    let from = |t_ms: i64| shown.iter().filter(move |row| row.0 >= t_ms);
+    assert!(from(1000).take_while(|row| row.0 < 3000).all(|row| (row.1 - 4.0).abs() < 1e-3));
+    assert!(from(1000).all(|row| row.2 == PupilState::Tracking));
+    let changed = from(3000).find(|row| row.1 < 3.99).expect("the eye is changed").0;
+    assert!((3100..4500).contains(&changed), "{changed}");
+    assert!(from(changed + 200).all(|row| (row.1 - 3.5).abs() < 1e-3));
+    let fastest = shown.windows(2).skip(100).map(|pair| (pair[1].1 - pair[0].1).abs() / 5e-3).fold(0.0, f32::max);
+    assert!(fastest < 5.5, "{fastest} mm/s");
+}
+
+#[test]
+fn eyes_that_are_about_as_sure_are_not_changed_to_and_fro() {
+    let sway = |t: i64, phase: f32| 0.85 + 0.08 * (t as f32 * 4e-3 + phase).sin();
+    let shown = better_of(|t| [(4.0, sway(t, 0.0)), (3.5, sway(t, 3.0))]);
+    let settled: Vec<_> = shown.iter().filter(|row| row.0 >= 1000).map(|row| row.1).collect();
+    assert!(settled.iter().all(|mm| (mm - settled[0]).abs() < 1e-3));
+}
+
+#[test]
+fn the_other_eye_is_shown_when_the_better_one_is_lost_but_not_at_the_end_of_a_blink() {
+    // Both blink, the right eye is back 60 ms earlier; later the left eye is lost.
+    let shown = better_of(|t| {
+        let left_lost = (2000..2300).contains(&t) || t >= 4000;
+        [(if left_lost { 0.0 } else { 4.0 }, 0.95), (if (2000..2240).contains(&t) { 0.0 } else { 3.5 }, 0.94)]
+    });
+    let of = |from: i64, to: i64| shown.iter().filter(move |row| (from..to).contains(&row.0));
+    let not_left = of(1000, 4000).find(|row| (row.1 - 4.0).abs() > 1e-3);
+    assert_eq!(not_left, None);
+    assert!(of(2100, 2300).all(|row| row.2 == PupilState::Holding));
+    assert!(of(4400, 8000).all(|row| (row.1 - 3.5).abs() < 1e-3 && row.2 == PupilState::Tracking));
+}
+
 #[test]
 fn one_eye_alone_is_taken_as_it_is() {
     let mut estimator = Estimator::new(settings(rig::Eye::Both));

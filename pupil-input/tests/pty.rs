@@ -93,6 +93,8 @@ fn samples_are_followed_and_rubbish_is_counted() {
     let before = handle.counters();
     assert_eq!(before.of(Counter::Connects), 1);
     assert_eq!(before.faults_in_all(), 0);
+    let clock = handle.clock().expect("lines carry times");
+    assert!((TimeNs(0)..host_now()).contains(&clock.offset), "{clock:?}");
 
     let half = &line(next, 4.0)[..10];
     let rubbish = format!(

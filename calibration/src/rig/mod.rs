@@ -145,6 +145,8 @@ pub enum Eye {
     Right,
     /// The mean of whichever eyes are valid.
     Both,
+    /// The eye of which the tracker is surer.
+    Better,
 }
 
 /// The network.

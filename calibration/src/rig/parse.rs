@@ -423,7 +423,7 @@ fn read_driver<'a>(reader: &mut Reader<'a>, lasers: Section<'a>) -> Option<Laser
 fn read_tracker<'a>(reader: &mut Reader<'a>, tracker: Section<'a>) -> Option<Tracker> {
     let default = Rig::default().tracker;
     let spec = reader.text(tracker, "spec", "a tracker spec, as on the command line");
-    let eyes = [("left", Eye::Left), ("right", Eye::Right), ("both", Eye::Both)];
+    let eyes = [("left", Eye::Left), ("right", Eye::Right), ("both", Eye::Both), ("better", Eye::Better)];
     let eye = reader.choice(tracker, "eye", &eyes, false);
     let scale = reader.number(tracker, "scale_mm_per_unit", SCALE);
     let fallback_mm = reader.number(tracker, "fallback_mm", FALLBACK);

@@ -29,7 +29,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
                 log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid: true }, line);
             }
             WireEvent::Rejected(fault) => log.count(LogFault::Wire(fault)),
-            WireEvent::Note | WireEvent::Partial => {}
+            WireEvent::Note | WireEvent::Partial | WireEvent::Clock(_) => {}
         };
         decoder.push(&bytes, &mut take);
         decoder.finish(&mut take);

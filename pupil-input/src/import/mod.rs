@@ -2,12 +2,21 @@
 //!
 //! A log is read in one pass, as a stream: what stays in memory is 24 bytes a sample.
 
+mod bids;
+pub(crate) mod csv;
+mod gazepoint;
 mod lines;
 mod neon;
+mod pupilext;
+pub(crate) mod raw;
+mod table;
+mod text;
+mod tobii;
+mod xdf;
 
 use std::fmt;
 use std::fs::File;
-use std::io::{BufRead, BufReader, Read};
+use std::io::{BufRead, Read};
 use std::path::{Path, PathBuf};
 
 use holod_calibration::TimeNs;
@@ -22,6 +31,20 @@ pub enum LogFormat {
     Lines,
     /// Pupil Labs Neon, 3D eye states.
     NeonEyeStates,
+    /// holod's recording of the bytes of a link.
+    Raw,
+    /// holod's own CSV.
+    Csv,
+    /// Tobii Pro Lab or Studio.
+    Tobii,
+    /// Gazepoint Analysis or Control.
+    Gazepoint,
+    /// PupilEXT.
+    PupilExt,
+    /// Lab Streaming Layer recordings.
+    Xdf,
+    /// BIDS eye tracking.
+    Bids,
 }
 
 impl LogFormat {
@@ -30,6 +53,13 @@ impl LogFormat {
         match self {
             Self::Lines => "holod line protocol",
             Self::NeonEyeStates => "Pupil Labs Neon 3d_eye_states.csv",
+            Self::Raw => "holod recording of a link",
+            Self::Csv => "holod CSV",
+            Self::Tobii => "Tobii Pro Lab or Studio TSV",
+            Self::Gazepoint => "Gazepoint CSV",
+            Self::PupilExt => "PupilEXT CSV",
+            Self::Xdf => "XDF (Lab Streaming Layer)",
+            Self::Bids => "BIDS eye tracking _physio.tsv.gz",
         }
     }
 }
@@ -73,17 +103,26 @@ pub(crate) struct Importer {
 }
 
 /// In the order in which they are asked.
-const IMPORTERS: [Importer; 2] = [lines::IMPORTER, neon::IMPORTER];
+const IMPORTERS: [Importer; 9] = [
+    raw::IMPORTER,
+    lines::IMPORTER,
+    neon::IMPORTER,
+    csv::IMPORTER,
+    xdf::IMPORTER,
+    tobii::IMPORTER,
+    gazepoint::IMPORTER,
+    pupilext::IMPORTER,
+    bids::IMPORTER,
+];
 
 /// A log file that has not been read yet.
 pub(crate) struct LogInput<'a> {
     pub(crate) path: &'a Path,
-    /// Its first 64 KiB (all of a shorter one), without a byte order mark.
+    /// Its first 64 KiB (all of a shorter one), as [`Self::open`] gives them.
     pub(crate) head: Vec<u8>,
 }
 
 const HEAD_BYTES: u64 = 1 << 16;
-const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
 
 impl<'a> LogInput<'a> {
     fn new(path: &'a Path) -> Result<Self, ReplayError> {
@@ -94,14 +133,9 @@ impl<'a> LogInput<'a> {
         Ok(input)
     }
 
-    /// From its beginning, without a byte order mark.
+    /// From its beginning: unpacked if it is gzip, in UTF-8 if it is UTF-16, without a byte order mark.
     pub(crate) fn open(&self) -> Result<Box<dyn BufRead>, ReplayError> {
-        let file = File::open(self.path).map_err(|source| self.io(source))?;
-        let mut reader = BufReader::with_capacity(1 << 18, file);
-        if reader.fill_buf().map_err(|source| self.io(source))?.starts_with(BYTE_ORDER_MARK) {
-            reader.consume(BYTE_ORDER_MARK.len());
-        }
-        Ok(Box::new(reader))
+        File::open(self.path).and_then(text::plain).map_err(|source| self.io(source))
     }
 
     /// Its non-empty first lines, trimmed; the last may be cut off by the end of the head.

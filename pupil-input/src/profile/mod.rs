@@ -1,7 +1,11 @@
 //! What is known of a kind of tracker: how its bytes are read, and how it is started and told from others.
+//!
+//! A profile is a TOML file. `profiles/README.md` in this crate describes every key; the files beside it are shipped.
 
 mod parse;
 mod reader;
+mod vendor;
+mod wire;
 
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
@@ -118,10 +122,19 @@ fn in_words(faults: &[Fault]) -> String {
 pub const DEFAULT_PROFILE: &str = "holod";
 
 /// By name.
-const FILES: [(&str, &str); 3] = [
+const FILES: [(&str, &str); 12] = [
+    ("asl-eye-trac", include_str!("../../profiles/asl-eye-trac.toml")),
     ("core", include_str!("../../profiles/core.toml")),
+    ("example-lines", include_str!("../../profiles/example-lines.toml")),
+    ("example-packet", include_str!("../../profiles/example-packet.toml")),
     ("holod", include_str!("../../profiles/holod.toml")),
+    ("holod-hid", include_str!("../../profiles/holod-hid.toml")),
+    ("iscan-etl", include_str!("../../profiles/iscan-etl.toml")),
+    ("livetrack", include_str!("../../profiles/livetrack.toml")),
     ("neon", include_str!("../../profiles/neon.toml")),
+    ("open-gaze", include_str!("../../profiles/open-gaze.toml")),
+    ("pupilext-csv", include_str!("../../profiles/pupilext-csv.toml")),
+    ("pupilext-json", include_str!("../../profiles/pupilext-json.toml")),
 ];
 
 /// A test holds each of them to be right.
@@ -153,7 +166,12 @@ impl Profile {
     fn read(path: &Path) -> Result<Self, ProfileError> {
         let text = std::fs::read_to_string(path)
             .map_err(|error| ProfileError::Unreadable { path: path.into(), reason: error.to_string() })?;
-        parse::parse(&text).map_err(|faults| ProfileError::Wrong { origin: path.display().to_string(), faults })
+        Self::from_toml(&text, &path.display().to_string())
+    }
+
+    /// The profile that a text describes; `origin` names it in errors.
+    pub(crate) fn from_toml(text: &str, origin: &str) -> Result<Self, ProfileError> {
+        parse::parse(text).map_err(|faults| ProfileError::Wrong { origin: origin.into(), faults })
     }
 
     /// A decoder for a stream that may be joined in the middle of a message.

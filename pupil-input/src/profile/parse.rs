@@ -4,12 +4,13 @@ use std::time::Duration;
 
 use holod_calibration::rig::Fault;
 
-use super::reader::{Found, Reader, Section, did_you_mean};
+use super::reader::{Found, Reader, Section};
+use super::wire::{Context, read_wire};
 use super::{Command, HidSettings, NetworkSettings, Profile, SerialSettings};
 use crate::SampleEye;
 use crate::import::SizeUnit;
 use crate::spec::{DEFAULT_BAUD, UsbIds};
-use crate::wire::Format;
+use crate::wire::field::{SizeKind, SizeRule};
 
 /// What a profile's first key must say.
 const SCHEMA: &str = "holod-tracker-1";
@@ -37,23 +38,23 @@ fn read(root: &Section<'_>) -> Option<Profile> {
     }
     let name = root.require("name", "the profile's name").and_then(|at| root.reader().text(&at, "the profile's name"));
     let about = root.text("about", "one sentence about the tracker").unwrap_or_default();
-    let eye = root.choice("eye", &EYES);
+    let eye = root.get("eye").and_then(|found| Some(found.with(root.reader().choose(&found, &EYES)?)));
     let rate_hz = root.positive("rate_hz");
-    let size = read_size(&root.section("size"));
+    let size_at = root.get("size").map(|found| found.with(()));
+    let (unit, size) = read_size(&root.section("size"));
     let serial = read_serial(&root.section("serial"));
     let hid = read_hid(&root.section("hid"));
     let network = read_network(&root.section("network"));
-    if root.require("wire", "the table that says how bytes are read").is_none() {
-        root.finish();
-        return None;
-    }
-    let format = read_wire(&root.section("wire"), &Context { eye, rate_hz, size });
+    let wire = root.require("wire", "the table that says how bytes are read");
+    let context = Context { eye, rate_hz, size, unit, size_at };
+    let wire = wire.and_then(|wire| read_wire(&root.reader().table(&wire), &context));
     root.finish();
     let (name, about) = (name?.to_owned(), about.to_owned());
-    Some(Profile { name, about, unit: size.unit, serial, hid, network, format: format? })
+    let (format, unit) = wire?;
+    Some(Profile { name, about, unit, serial, hid, network, format })
 }
 
-const EYES: [(&str, SampleEye); 3] =
+pub(super) const EYES: [(&str, SampleEye); 3] =
     [("left", SampleEye::Left), ("right", SampleEye::Right), ("both", SampleEye::Both)];
 
 fn read_serial(serial: &Section<'_>) -> SerialSettings {
@@ -109,42 +110,16 @@ fn read_commands(section: &Section<'_>, key: &'static str) -> Vec<Command> {
     items.iter().filter_map(read).collect()
 }
 
-/// What the rest of the profile says about the figures on the wire.
-struct Context {
-    eye: Option<SampleEye>,
-    rate_hz: Option<f64>,
-    size: Size,
-}
-
-/// Figures to diameters.
-#[derive(Clone, Copy)]
-struct Size {
-    unit: SizeUnit,
-}
-
-fn read_size(size: &Section<'_>) -> Size {
+fn read_size(size: &Section<'_>) -> (SizeUnit, SizeRule) {
+    const KINDS: [(&str, SizeKind); 3] =
+        [("diameter", SizeKind::Diameter), ("radius", SizeKind::Radius), ("area", SizeKind::Area)];
     const UNITS: [(&str, SizeUnit); 3] =
         [("mm", SizeUnit::Millimetres), ("pixels", SizeUnit::Pixels), ("arbitrary", SizeUnit::Arbitrary)];
+    let kind = size.choice("kind", &KINDS).unwrap_or(SizeKind::Diameter);
     let unit = size.choice("unit", &UNITS).unwrap_or_default();
+    let mm_per_unit = size.positive("mm_per_unit");
     size.finish();
-    Size { unit }
-}
-
-const KINDS: [&str; 3] = ["holod", "core", "neon"];
-
-fn read_wire(wire: &Section<'_>, _context: &Context) -> Option<Format> {
-    let expected = format!("one of \"{}\"", KINDS.join("\", \""));
-    let kind = wire.require("kind", &expected)?;
-    let format = match wire.reader().text(&kind, &expected)? {
-        "holod" => Some(Format::Lines),
-        "core" => Some(Format::CoreMsgpack),
-        "neon" => Some(Format::NeonRtp),
-        unknown => {
-            let advice = did_you_mean(unknown, &KINDS).unwrap_or("choose one".into());
-            wire.reader().fault(&kind, format!("\"{unknown}\""), &expected, advice);
-            return None;
-        }
-    };
-    wire.finish();
-    format
+    // Where the profile knows the conversion, what it gives is millimetres.
+    let given = if mm_per_unit.is_some() { SizeUnit::Millimetres } else { unit };
+    (given, SizeRule { kind, mm_per_unit: mm_per_unit.unwrap_or(1.0) })
 }

@@ -176,6 +176,11 @@ impl<'a> Section<'a> {
         if self.path.is_empty() { key.into() } else { format!("{}.{key}", self.path) }
     }
 
+    /// Whether there is an item called `key`.
+    pub(super) fn has(&self, key: &str) -> bool {
+        self.table.is_some_and(|table| table.contains_key(key))
+    }
+
     /// The item called `key`, if there is one.
     pub(super) fn get(&self, key: &'static str) -> Option<Found<&'a Item>> {
         self.asked.borrow_mut().push(key);
@@ -191,6 +196,11 @@ impl<'a> Section<'a> {
             self.missing(key, expected);
         }
         item
+    }
+
+    /// Notes what is wrong with the table as a whole.
+    pub(super) fn fault(&self, found: &str, expected: &str, advice: &str) {
+        self.reader.push(&self.path, self.line, found, expected, advice.into());
     }
 
     /// Notes that `key` is missing.
@@ -232,6 +242,30 @@ impl<'a> Section<'a> {
         good.then_some(number)
     }
 
+    /// Whether the file has this table.
+    pub(super) const fn is_there(&self) -> bool {
+        self.table.is_some()
+    }
+
+    /// A finite number.
+    pub(super) fn finite(&self, key: &'static str) -> Option<f64> {
+        let found = self.get(key)?;
+        let number = self.reader.number(&found, "a number")?;
+        if !number.is_finite() {
+            self.reader.fault(&found, number, "a finite number", "correct it");
+        }
+        number.is_finite().then_some(number)
+    }
+
+    pub(super) fn flag(&self, key: &'static str) -> bool {
+        let Some(found) = self.get(key) else { return false };
+        let flag = found.value.as_bool();
+        if flag.is_none() {
+            self.reader.wrong_type(&found, "true or false", "write true or false, without quotes");
+        }
+        flag.unwrap_or_default()
+    }
+
     pub(super) fn choice<T: Clone>(&self, key: &'static str, choices: &[(&'static str, T)]) -> Option<T> {
         self.reader.choose(&self.get(key)?, choices)
     }
@@ -243,7 +277,14 @@ impl<'a> Section<'a> {
     /// Notes every key that nobody asked for.
     pub(super) fn finish(&self) {
         let Some(table) = self.table else { return };
-        let asked = self.asked.borrow();
+        let mut asked = self.asked.borrow().clone();
+        let mut seen = Vec::new();
+        asked.retain(|key| {
+            !seen.contains(key) && {
+                seen.push(*key);
+                true
+            }
+        });
         for (name, item) in table.iter().filter(|(name, _)| !asked.contains(name)) {
             let span = table.key(name).and_then(|key| key.span()).or_else(|| item.span());
             let line = self.reader.line_of(span).or(self.line);
@@ -255,6 +296,11 @@ impl<'a> Section<'a> {
 }
 
 impl<'a> Reader<'a> {
+    /// An empty table in place of what stands at `found`.
+    pub(super) fn empty<T>(&'a self, found: &Found<T>) -> Section<'a> {
+        Section { reader: self, path: found.key.clone(), line: found.line, table: None, asked: RefCell::default() }
+    }
+
     /// The table that stands at `found`; an empty one, with a fault, where something else stands there.
     pub(super) fn table(&'a self, found: &Found<&'a Item>) -> Section<'a> {
         let table = found.value.as_table_like();

@@ -1,16 +1,22 @@
 //! Where bytes come from: one file for each kind of link, behind one trait.
 
+pub(crate) mod commands;
 pub(crate) mod core;
+pub(crate) mod hid;
 pub mod mock;
 pub(crate) mod neon;
 pub(crate) mod serial;
 pub(crate) mod server;
+pub(crate) mod tcp;
+pub(crate) mod udp;
 mod zmtp;
 
 use std::time::Duration;
 
+use hid::HidError;
 use serial::SerialError;
 use server::ServerError;
+use tcp::NetworkError;
 
 /// How long one read waits; also how soon a stop is noticed.
 pub(crate) const READ_TIMEOUT: Duration = Duration::from_millis(50);
@@ -35,6 +41,16 @@ pub(crate) trait ByteSource: Send {
 /// How a link is opened, and opened again after it was lost.
 pub(crate) trait Feed: Send {
     fn open(&mut self) -> Result<Box<dyn ByteSource>, SourceError>;
+
+    /// Whether each read is a message that stands for itself: what is incomplete at its end stays so.
+    fn datagrams(&self) -> bool {
+        false
+    }
+
+    /// What a user should know of the link although it opens, a sentence each.
+    fn warnings(&self) -> Vec<String> {
+        Vec::new()
+    }
 }
 
 /// Why a tracker cannot be reached.
@@ -46,4 +62,10 @@ pub enum SourceError {
     /// The server of a Pupil Labs tracker.
     #[error(transparent)]
     Server(#[from] ServerError),
+    /// A TCP or UDP link.
+    #[error(transparent)]
+    Network(#[from] NetworkError),
+    /// A HID device.
+    #[error(transparent)]
+    Hid(#[from] HidError),
 }

@@ -3,13 +3,35 @@
 //! A decoder is pushed bytes as they come and tells what they hold. However the bytes of a stream are split, the events
 //! are the same; formats that come in messages (a HID report, a datagram) are pushed one message at a time instead.
 
+mod checksum;
 pub(crate) mod core;
+pub mod delimited;
+pub mod field;
+pub mod hid_descriptor;
+pub mod iscan;
 pub mod line;
+pub mod livetrack;
 pub(crate) mod neon;
+pub mod open_gaze;
+pub mod packet;
+pub mod pupilext;
+pub mod report;
+#[cfg(test)]
+pub(crate) mod testing;
+mod text;
 
 use holod_calibration::TimeNs;
 
 use crate::SampleEye;
+
+pub use checksum::{ChecksumKind, Crc};
+use delimited::{DelimitedDecoder, DelimitedSettings};
+use iscan::{IscanDecoder, IscanSettings};
+use livetrack::{LiveTrackDecoder, LiveTrackSettings};
+use open_gaze::{OpenGazeDecoder, OpenGazeSettings};
+use packet::{PacketDecoder, PacketSettings};
+use pupilext::{PupilExtDecoder, PupilExtSettings};
+use report::{ReportDecoder, ReportSettings};
 
 /// A sample as the wire gives it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -113,6 +135,8 @@ pub enum WireEvent {
     Rejected(WireFault),
     /// What was left of a message when reading began in its middle; not a fault.
     Partial,
+    /// The tracker's own clock, told by itself: it showed this, or a little more, when the bytes came.
+    Clock(TimeNs),
 }
 
 /// Bytes in, events out. After it is made it allocates nothing.
@@ -129,6 +153,20 @@ pub trait Decoder: Send {
 pub enum Format {
     /// holod's line protocol.
     Lines,
+    /// Lines with columns.
+    Delimited(DelimitedSettings),
+    /// Binary packets.
+    Packet(PacketSettings),
+    /// Whole messages.
+    Report(ReportSettings),
+    /// ISCAN's binary packets.
+    Iscan(IscanSettings),
+    /// LiveTrack's rows.
+    LiveTrack(LiveTrackSettings),
+    /// Gazepoint's Open Gaze records.
+    OpenGaze(OpenGazeSettings),
+    /// PupilEXT's rows or objects.
+    PupilExt(PupilExtSettings),
     /// Pupil Labs Core's MessagePack maps.
     CoreMsgpack,
     /// Pupil Labs Neon's gaze stream, RTP and RTCP as RTSP interleaves them.
@@ -140,6 +178,13 @@ impl Format {
     pub fn decoder(&self) -> Box<dyn Decoder> {
         match self {
             Self::Lines => Box::new(line::LineDecoder::joining()),
+            Self::Delimited(settings) => Box::new(DelimitedDecoder::joining(settings)),
+            Self::Packet(settings) => Box::new(PacketDecoder::joining(settings)),
+            Self::Report(settings) => Box::new(ReportDecoder::new(settings)),
+            Self::Iscan(settings) => Box::new(IscanDecoder::new(settings.clone())),
+            Self::LiveTrack(settings) => Box::new(LiveTrackDecoder::new(*settings)),
+            Self::OpenGaze(settings) => Box::new(OpenGazeDecoder::new(*settings)),
+            Self::PupilExt(settings) => Box::new(PupilExtDecoder::new(*settings)),
             Self::CoreMsgpack => Box::new(core::CoreDecoder),
             Self::NeonRtp => Box::new(neon::NeonDecoder::new()),
         }

@@ -1,0 +1,142 @@
+//! PupilEXT: the CSV of its data recording, parted by comma, semicolon or tab.
+//!
+//! One camera or two that look at one eye (`Main` and `Sec` are views, not eyes) give one pupil, [`SampleEye::Both`] since
+//! the file does not say of which eye. With two pupils in the picture they are called A and B; A is taken for the left.
+
+use holod_calibration::TimeNs;
+
+use crate::SampleEye;
+
+use super::table::{Row, Table, cells, is_missing, number, separator, time_ns};
+use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError, SizeUnit};
+
+pub(super) const IMPORTER: Importer = Importer { format: LogFormat::PupilExt, recognises, read };
+
+const TIME: &str = "timestamp_ms";
+/// What stands for the pupil in the names of columns, and the eye that it is taken for.
+const PUPILS: [(&str, SampleEye); 3] = [("", SampleEye::Both), ("A", SampleEye::Left), ("B", SampleEye::Right)];
+
+fn recognises(input: &LogInput<'_>) -> bool {
+    input.head_lines().next().is_some_and(is_header)
+}
+
+fn is_header(line: &[u8]) -> bool {
+    let has = |is: &dyn Fn(&[u8]) -> bool| cells(line, separator(line)).any(is);
+    has(&|name| name == TIME.as_bytes())
+        && has(&|name| name.starts_with(b"diameter") && name.ends_with(b"_px") || name.starts_with(b"physicalDiameter"))
+}
+
+/// The columns of one pupil.
+#[derive(Clone, Copy)]
+struct Pupil {
+    eye: SampleEye,
+    physical: Option<usize>,
+    undistorted: Option<usize>,
+    image: Option<usize>,
+    confidence: Option<usize>,
+    outline: Option<usize>,
+}
+
+impl Pupil {
+    fn find(table: &Table, pupil: &str, eye: SampleEye) -> Option<Self> {
+        // Of two views the main one counts.
+        let column = |begin: &str, end: &str| {
+            [format!("{begin}{pupil}{end}"), format!("{begin}{pupil}Main{end}")]
+                .iter()
+                .find_map(|wanted| table.column(|name| name == wanted))
+        };
+        let pupil = Self {
+            eye,
+            physical: column("physicalDiameter", "_mm"),
+            undistorted: column("undistortedDiameter", "_px"),
+            image: column("diameter", "_px"),
+            confidence: column("confidence", ""),
+            outline: column("outlineConfidence", ""),
+        };
+        (pupil.physical.is_some() || pupil.image.is_some()).then_some(pupil)
+    }
+
+    fn sizes(&self) -> [Option<usize>; 3] {
+        [self.physical, self.undistorted, self.image]
+    }
+}
+
+fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
+    let Some(size) = choose_size(input)? else { return Ok(()) };
+    let Some(mut table) = Table::open(input, log, is_header)? else { return Ok(()) };
+    let Some(time) = table.column(|name| name == TIME) else { return Ok(()) };
+    let pupils = PUPILS.map(|(name, eye)| Pupil::find(&table, name, eye));
+    if size > 0 {
+        log.unit = SizeUnit::Pixels;
+        log.notes.push("PupilEXT was not calibrated: there is no diameter in millimetres".into());
+    }
+    if pupils[1..].iter().any(Option::is_some) {
+        log.notes
+            .push("PupilEXT does not say which pupil is of which eye; A is taken for the left, B for the right".into());
+    }
+    if table.column(|name| name.contains("Sec_")).is_some() {
+        log.notes.push(
+            "two cameras looked at the same pupil; the main one's figures are used, with both for millimetres".into(),
+        );
+    }
+    while let Some(row) = table.next_row(input, log)? {
+        let t = match row.cell(time).and_then(|cell| time_ns(cell, 1e6)) {
+            Ok(t) => TimeNs(t),
+            Err(fault) => {
+                log.count(fault);
+                continue;
+            }
+        };
+        for pupil in pupils.iter().flatten() {
+            let Some(column) = pupil.sizes()[size] else { continue };
+            match figure(&row, column) {
+                Ok(diameter) => {
+                    let (eye, valid) = (pupil.eye, diameter > 0.0);
+                    let confidence = confidence(&row, pupil);
+                    log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid }, row.number);
+                }
+                Err(fault) => log.count(fault),
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Which of [`Pupil::sizes`] the whole log is read from: the first that holds a figure anywhere.
+fn choose_size(input: &LogInput<'_>) -> Result<Option<usize>, ReplayError> {
+    let mut ignored = LogBuilder::default();
+    let Some(mut table) = Table::open(input, &mut ignored, is_header)? else { return Ok(None) };
+    let pupils = PUPILS.map(|(name, eye)| Pupil::find(&table, name, eye));
+    let mut best: Option<usize> = None;
+    while let Some(row) = table.next_row(input, &mut ignored)? {
+        for pupil in pupils.iter().flatten() {
+            let holds = |column: Option<usize>| {
+                column.is_some_and(|column| figure(&row, column).is_ok_and(|diameter| diameter > 0.0))
+            };
+            let here = pupil.sizes().into_iter().position(holds);
+            best = [best, here].into_iter().flatten().min();
+        }
+        if best == Some(0) {
+            break;
+        }
+    }
+    // No pupil in the whole log: whatever there is, lost throughout.
+    let any = || pupils.iter().flatten().find_map(|pupil| pupil.sizes().iter().position(Option::is_some));
+    Ok(best.or_else(any))
+}
+
+/// -1 where no pupil was found.
+fn figure(row: &Row<'_>, column: usize) -> Result<f32, LogFault> {
+    let cell = row.cell(column)?;
+    if is_missing(cell) { Err(LogFault::Missing) } else { Ok(number(cell)? as f32) }
+}
+
+/// The detector's confidence, the outline's where the detector has none (-1), 1 without either.
+fn confidence(row: &Row<'_>, pupil: &Pupil) -> f32 {
+    [pupil.confidence, pupil.outline]
+        .into_iter()
+        .flatten()
+        .filter_map(|column| number(row.cell(column).ok()?).ok())
+        .find(|confidence| (0.0..=1.0).contains(confidence))
+        .map_or(1.0, |confidence| confidence as f32)
+}

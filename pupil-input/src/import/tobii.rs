@@ -1,0 +1,210 @@
+//! Tobii Pro Lab and Tobii Studio: the TSV of their data export.
+//!
+//! Names of columns came and went with versions, with and without a unit behind them (`Recording timestamp [μs]`,
+//! `Pupil diameter left [mm]`, Studio's `RecordingTimestamp`, `PupilLeft`): they are compared without case, spaces and
+//! unit. Diameters are millimetres in all.
+
+use holod_calibration::TimeNs;
+
+use crate::SampleEye;
+
+use super::table::{Row, Table, cells, is_missing, ns_per_unit, number, separator, time_ns, usual_step};
+use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError};
+
+pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Tobii, recognises, read };
+
+/// Recording times, the finer first; `Timestamp` is that of old versions of Studio.
+const TIMES: [&str; 2] = ["recordingtimestamp", "timestamp"];
+const EYES: [(&[&str], &str, SampleEye); 2] = [
+    (&["pupildiameterleft", "pupilleft"], "validityleft", SampleEye::Left),
+    (&["pupildiameterright", "pupilright"], "validityright", SampleEye::Right),
+];
+/// Lines in which the header is looked for: old versions of Studio put some about the recording before it.
+const HEADER_WITHIN: usize = 64;
+/// Rows whose times tell the unit of a column that does not name it.
+const UNIT_ROWS: usize = 1000;
+/// Trackers sample between 0.5 and 100 ms, so a usual step above this is of microseconds.
+const GREATEST_STEP_MS: f64 = 300.0;
+
+fn recognises(input: &LogInput<'_>) -> bool {
+    input.head_lines().take(HEADER_WITHIN).any(is_header)
+}
+
+fn is_header(line: &[u8]) -> bool {
+    let (mut time, mut old_time, mut pupil, mut validity) = (false, false, false, false);
+    for cell in cells(line, separator(line)) {
+        let Ok(name) = std::str::from_utf8(cell) else { continue };
+        let (name, _) = plain_name(name);
+        time |= name == TIMES[0];
+        old_time |= name == TIMES[1];
+        pupil |= EYES.iter().any(|(names, _, _)| names.contains(&name.as_str()));
+        validity |= EYES.iter().any(|(_, validity, _)| name == *validity);
+    }
+    pupil && (time || old_time && validity)
+}
+
+/// `Pupil diameter left [mm]` as `pupildiameterleft` and `mm`.
+fn plain_name(name: &str) -> (String, Option<&str>) {
+    let (name, unit) = match name.split_once(['[', '(']) {
+        Some((name, unit)) => (name, Some(unit.trim_end_matches([']', ')']))),
+        None => (name, None),
+    };
+    (name.chars().filter(|letter| !letter.is_whitespace()).flat_map(char::to_lowercase).collect(), unit)
+}
+
+struct Columns {
+    time: usize,
+    ns_per_unit: Option<f64>,
+    sensor: Option<usize>,
+    event: Option<usize>,
+    /// What tells recordings apart that were exported into one file.
+    recording: [Option<usize>; 2],
+    eyes: [Option<Eye>; 2],
+}
+
+#[derive(Clone, Copy)]
+struct Eye {
+    eye: SampleEye,
+    diameter: usize,
+    validity: Option<usize>,
+}
+
+impl Columns {
+    fn of(table: &Table) -> Option<Self> {
+        let column = |wanted: &str| table.column(|name| plain_name(name).0 == wanted);
+        let times = table.names.iter().enumerate().filter_map(|(index, name)| {
+            let (name, unit) = plain_name(name);
+            let rank = TIMES.iter().position(|time| *time == name)?;
+            let ns_per_unit = unit.and_then(ns_per_unit);
+            Some((rank, ns_per_unit.unwrap_or(f64::MAX), index, ns_per_unit))
+        });
+        let (_, _, time, ns_per_unit) = times.min_by(|one, other| {
+            (one.0, one.1).partial_cmp(&(other.0, other.1)).unwrap_or(std::cmp::Ordering::Equal)
+        })?;
+        let eyes = EYES.map(|(names, validity, eye)| {
+            let diameter = names.iter().find_map(|name| column(name))?;
+            Some(Eye { eye, diameter, validity: column(validity) })
+        });
+        let recording = [column("recordingname"), column("participantname")];
+        Some(Self { time, ns_per_unit, sensor: column("sensor"), event: column("event"), recording, eyes })
+    }
+
+    /// Whether the row is of the eye tracker: other sensors and events have rows of their own.
+    fn is_of_eyes(&self, row: &Row<'_>) -> bool {
+        match self.sensor {
+            Some(sensor) => row.cell(sensor).is_ok_and(|sensor| {
+                let named =
+                    |word: &[u8]| sensor.get(..word.len()).is_some_and(|begin| begin.eq_ignore_ascii_case(word));
+                named(b"eye")
+            }),
+            None => true,
+        }
+    }
+}
+
+fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
+    let ns_per_unit = match open(input, &mut LogBuilder::default())? {
+        None => return Ok(()),
+        Some((_, columns)) if columns.ns_per_unit.is_some() => columns.ns_per_unit.unwrap_or(1e6),
+        Some((table, columns)) => {
+            let us = is_in_microseconds(input, table, &columns)?;
+            let unit = if us { "microseconds" } else { "milliseconds" };
+            log.notes.push(format!(
+                "the times have no unit; they are taken for {unit}, after the usual step from sample to sample"
+            ));
+            if us { 1e3 } else { 1e6 }
+        }
+    };
+    let Some((mut table, columns)) = open(input, log)? else { return Ok(()) };
+
+    let mut first: Option<[Vec<u8>; 2]> = None;
+    let (mut of_others, mut unmeasured) = (0_u64, 0_u64);
+    while let Some(row) = table.next_row(input, log)? {
+        let recording = columns.recording.map(|column| column.and_then(|column| row.cell(column).ok()).unwrap_or(b""));
+        match &first {
+            None => first = Some(recording.map(<[u8]>::to_vec)),
+            Some(first) if first.iter().zip(recording).any(|(first, this)| first != this) => {
+                of_others += 1;
+                continue;
+            }
+            Some(_) => {}
+        }
+        if !columns.is_of_eyes(&row) {
+            continue;
+        }
+        let t = match row.cell(columns.time).and_then(|cell| time_ns(cell, ns_per_unit)) {
+            Ok(t) => TimeNs(t),
+            Err(fault) => {
+                log.count(fault);
+                continue;
+            }
+        };
+        let is_event = columns.sensor.is_none()
+            && columns.event.and_then(|event| row.cell(event).ok()).is_some_and(|event| !is_missing(event));
+        for eye in columns.eyes.iter().flatten() {
+            match figure(&row, eye) {
+                Ok(Some((diameter, valid))) => {
+                    let sample = LogSample { t, eye: eye.eye, diameter, confidence: 1.0, aperture_mm: None, valid };
+                    log.push(sample, row.number);
+                }
+                Ok(None) if is_event => {}
+                Ok(None) => unmeasured += 1,
+                Err(fault) => log.count(fault),
+            }
+        }
+    }
+    if unmeasured > 0 {
+        log.notes.push(format!(
+            "{unmeasured} times an eye is valid and has no diameter: some trackers measure pupils at a lower rate than gaze"
+        ));
+    }
+    if let Some(first) = first.filter(|_| of_others > 0) {
+        let [recording, participant] = first.map(|name| String::from_utf8_lossy(&name).escape_debug().to_string());
+        log.notes.push(format!(
+            "the file holds several recordings; only the first was read (recording `{recording}`, participant \
+             `{participant}`), and {of_others} rows of others were left out"
+        ));
+    }
+    Ok(())
+}
+
+fn open(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<Option<(Table, Columns)>, ReplayError> {
+    let table = Table::open(input, log, is_header)?;
+    Ok(table.and_then(|table| Columns::of(&table).map(|columns| (table, columns))))
+}
+
+/// Whether the first times are microseconds rather than milliseconds.
+fn is_in_microseconds(input: &LogInput<'_>, mut table: Table, columns: &Columns) -> Result<bool, ReplayError> {
+    let mut times = Vec::with_capacity(UNIT_ROWS);
+    while times.len() < UNIT_ROWS {
+        let Some(row) = table.next_row(input, &mut LogBuilder::default())? else { break };
+        let measured = |eye: &Eye| row.cell(eye.diameter).is_ok_and(|cell| !is_missing(cell));
+        if columns.is_of_eyes(&row) && columns.eyes.iter().flatten().any(measured) {
+            times.extend(row.cell(columns.time).and_then(number));
+        }
+    }
+    Ok(usual_step(&times).is_some_and(|step| step > GREATEST_STEP_MS))
+}
+
+/// The diameter of an eye and whether the tracker saw it; None where it was not measured.
+///
+/// Pro Lab says `Valid` or `Invalid`; Studio gives 0 (sure) to 4 (not found) and advises to use 0 and 1.
+fn figure(row: &Row<'_>, eye: &Eye) -> Result<Option<(f32, bool)>, LogFault> {
+    let validity = match eye.validity {
+        None => None,
+        Some(column) => match row.cell(column)? {
+            cell if is_missing(cell) => None,
+            cell if cell.eq_ignore_ascii_case(b"valid") => Some(true),
+            cell if cell.eq_ignore_ascii_case(b"invalid") => Some(false),
+            cell => Some(number(cell)? < 2.0),
+        },
+    };
+    let cell = row.cell(eye.diameter)?;
+    if is_missing(cell) {
+        // Without a word on validity an empty cell is the only sign of a lost pupil.
+        let lost = validity == Some(false) || eye.validity.is_none();
+        return Ok(lost.then_some((0.0, false)));
+    }
+    let diameter = number(cell)? as f32;
+    Ok(Some((diameter, validity != Some(false) && diameter > 0.0)))
+}

@@ -1,0 +1,543 @@
+//! XDF, the recordings of the Lab Streaming Layer (<https://github.com/sccn/xdf/wiki/Specifications>).
+//!
+//! After the four bytes `XDF:` come chunks: the number of bytes of their length (1, 4 or 8), the length, a tag of two
+//! bytes, the content; all little-endian. The file is read twice: once for the streams and their clock offsets, which
+//! come all along it, once for the samples.
+
+use std::collections::BTreeMap;
+use std::io::{self, BufRead, Read};
+
+use holod_calibration::TimeNs;
+use roxmltree::{Document, Node, ParsingOptions};
+
+use crate::SampleEye;
+use crate::wire::WireFault;
+
+use super::table::ns_of;
+use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError, SizeUnit};
+
+pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Xdf, recognises, read };
+
+const MAGIC: &[u8] = b"XDF:";
+const STREAM_HEADER: u16 = 2;
+const SAMPLES: u16 = 3;
+const CLOCK_OFFSET: u16 = 4;
+const TAGS: std::ops::RangeInclusive<u16> = 1..=6;
+/// What a boundary chunk holds, for readers that have lost their step.
+const BOUNDARY: [u8; 16] =
+    [0x43, 0xA5, 0x46, 0xDC, 0xCB, 0xF5, 0x41, 0x0F, 0xB3, 0x0E, 0xD5, 0x46, 0x73, 0x83, 0xCB, 0xE4];
+/// Bounds of what is kept in memory.
+const MAX_XML_BYTES: u64 = 1 << 22;
+const MAX_XML_NODES: u32 = 200_000;
+const MAX_STREAMS: usize = 1024;
+const MAX_CHANNELS: usize = 1 << 14;
+const MAX_OFFSETS: usize = 1 << 18;
+
+fn recognises(input: &LogInput<'_>) -> bool {
+    input.head.starts_with(MAGIC)
+}
+
+fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
+    let mut streams = BTreeMap::new();
+    let damage = for_chunks(input, |chunk| match chunk.tag {
+        STREAM_HEADER => take_header(chunk, &mut streams, log),
+        CLOCK_OFFSET => take_offset(chunk, &mut streams),
+        _ => Ok(()),
+    })?;
+    (0..damage.out_of_step).for_each(|_| log.count(LogFault::Wire(WireFault::OutOfStep)));
+    (0..damage.too_short).for_each(|_| log.count(LogFault::Wire(WireFault::TooShort)));
+    choose(&mut streams, log).map_err(|found| ReplayError::Content {
+        path: input.path.into(),
+        at: String::new(),
+        found,
+        expected: "a stream with a channel whose label or type tells of a pupil's diameter".into(),
+    })?;
+    for stream in streams.values_mut() {
+        stream.clock = Clock::fit(&std::mem::take(&mut stream.offsets));
+    }
+    let mut record = 0;
+    let damage = for_chunks(input, |chunk| match chunk.tag {
+        SAMPLES => take_samples(chunk, &mut streams, log, &mut record),
+        _ => Ok(()),
+    })?;
+    (0..damage.too_short).for_each(|_| log.count(LogFault::Wire(WireFault::TooShort)));
+    Ok(())
+}
+
+/// A chunk whose content has not been read yet.
+struct Chunk<'a> {
+    tag: u16,
+    content: io::Take<&'a mut dyn BufRead>,
+}
+
+impl Chunk<'_> {
+    fn bytes<const N: usize>(&mut self) -> io::Result<[u8; N]> {
+        let mut bytes = [0; N];
+        self.content.read_exact(&mut bytes)?;
+        Ok(bytes)
+    }
+
+    /// A number that is preceded by how many bytes it has.
+    fn variable_length(&mut self) -> io::Result<u64> {
+        variable_length(&mut self.content)?.ok_or_else(|| io::Error::from(io::ErrorKind::InvalidData))
+    }
+}
+
+/// None if the number of bytes is none of 1, 4 and 8.
+fn variable_length(reader: &mut dyn Read) -> io::Result<Option<u64>> {
+    let mut count = [0];
+    reader.read_exact(&mut count)?;
+    let mut bytes = [0; 8];
+    let Some(used) = bytes.get_mut(..usize::from(count[0])).filter(|used| matches!(used.len(), 1 | 4 | 8)) else {
+        return Ok(None);
+    };
+    reader.read_exact(used)?;
+    Ok(Some(u64::from_le_bytes(bytes)))
+}
+
+/// What was wrong with the chunks.
+#[derive(Clone, Copy, Debug, Default)]
+struct Damage {
+    /// Times at which no chunk began where one should have.
+    out_of_step: u64,
+    /// Chunks that end before what they hold.
+    too_short: u64,
+}
+
+/// Goes through the chunks. From where no chunk begins, reading goes on behind the next boundary; a file that is cut off
+/// ends where it is cut off.
+fn for_chunks(
+    input: &LogInput<'_>,
+    mut take: impl FnMut(&mut Chunk<'_>) -> io::Result<()>,
+) -> Result<Damage, ReplayError> {
+    let mut reader = input.open()?;
+    let mut damage = Damage::default();
+    io::copy(&mut (&mut reader).take(MAGIC.len() as u64), &mut io::sink()).map_err(|source| input.io(source))?;
+    loop {
+        match reader.fill_buf() {
+            Ok([]) => return Ok(damage),
+            Ok(_) => {}
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+            Err(source) => return Err(input.io(source)),
+        }
+        let header = match chunk_header(&mut *reader) {
+            Err(error) if is_of_content(&error) => None,
+            header => header.map_err(|source| input.io(source))?,
+        };
+        let Some((tag, length)) = header else {
+            damage.out_of_step += 1;
+            if !seek_boundary(&mut *reader).map_err(|source| input.io(source))? {
+                return Ok(damage);
+            }
+            continue;
+        };
+        let mut chunk = Chunk { tag, content: (&mut *reader as &mut dyn BufRead).take(length) };
+        match take(&mut chunk) {
+            Ok(()) => {}
+            Err(error) if is_of_content(&error) => damage.too_short += 1,
+            Err(source) => return Err(input.io(source)),
+        }
+        io::copy(&mut chunk.content, &mut io::sink()).map_err(|source| input.io(source))?;
+    }
+}
+
+/// Tag and length of the content; None where no chunk begins.
+fn chunk_header(reader: &mut dyn BufRead) -> io::Result<Option<(u16, u64)>> {
+    let Some(length) = variable_length(reader)? else { return Ok(None) };
+    let mut tag = [0; 2];
+    reader.read_exact(&mut tag)?;
+    let tag = u16::from_le_bytes(tag);
+    Ok(length.checked_sub(2).filter(|_| TAGS.contains(&tag)).map(|length| (tag, length)))
+}
+
+/// Whether the bytes are at fault rather than the reading of them.
+fn is_of_content(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::UnexpectedEof | io::ErrorKind::InvalidData)
+}
+
+/// Reads past the next boundary; false if there is none.
+fn seek_boundary(reader: &mut dyn BufRead) -> io::Result<bool> {
+    let mut window = [0; BOUNDARY.len()];
+    loop {
+        let bytes = reader.fill_buf()?;
+        if bytes.is_empty() {
+            return Ok(false);
+        }
+        for (index, &byte) in bytes.iter().enumerate() {
+            window.copy_within(1.., 0);
+            window[BOUNDARY.len() - 1] = byte;
+            if window == BOUNDARY {
+                reader.consume(index + 1);
+                return Ok(true);
+            }
+        }
+        let count = bytes.len();
+        reader.consume(count);
+    }
+}
+
+/// The type of a stream's figures.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Figure {
+    F32,
+    F64,
+    I8,
+    I16,
+    I32,
+    I64,
+    Text,
+}
+
+impl Figure {
+    fn named(name: &str) -> Option<Self> {
+        Some(match name {
+            "float32" => Self::F32,
+            "double64" => Self::F64,
+            "int8" => Self::I8,
+            "int16" => Self::I16,
+            "int32" => Self::I32,
+            "int64" => Self::I64,
+            "string" => Self::Text,
+            _ => return None,
+        })
+    }
+
+    const fn bytes(self) -> usize {
+        match self {
+            Self::I8 => 1,
+            Self::I16 => 2,
+            Self::F32 | Self::I32 => 4,
+            Self::F64 | Self::I64 => 8,
+            Self::Text => 0,
+        }
+    }
+
+    fn read(self, bytes: &[u8]) -> f64 {
+        let mut eight = [0; 8];
+        eight[..bytes.len()].copy_from_slice(bytes);
+        let four = [eight[0], eight[1], eight[2], eight[3]];
+        match self {
+            Self::F32 => f64::from(f32::from_le_bytes(four)),
+            Self::F64 => f64::from_le_bytes(eight),
+            Self::I8 => f64::from(i8::from_le_bytes([eight[0]])),
+            Self::I16 => f64::from(i16::from_le_bytes([eight[0], eight[1]])),
+            Self::I32 => f64::from(i32::from_le_bytes(four)),
+            Self::I64 => i64::from_le_bytes(eight) as f64,
+            Self::Text => f64::NAN,
+        }
+    }
+}
+
+/// How a figure becomes a diameter.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Measure {
+    Diameter,
+    Radius,
+    Area,
+}
+
+/// What a channel holds of a pupil.
+#[derive(Clone, Debug, PartialEq)]
+enum Channel {
+    Size { eye: SampleEye, measure: Measure, unit: SizeUnit, factor: f64 },
+    Confidence { eye: SampleEye },
+    Other,
+}
+
+#[derive(Debug)]
+struct Stream {
+    name: String,
+    kind: String,
+    rate_hz: f64,
+    figure: Figure,
+    channels: Vec<Channel>,
+    /// Of Pupil Capture's relay: a sample is of one eye, and the other eye's figures are NaN in it.
+    one_eye_a_sample: bool,
+    offsets: Vec<(f64, f64)>,
+    clock: Clock,
+    /// Index of the size, and of the confidence, of each eye that is taken from this stream.
+    taken: Vec<(SampleEye, usize, Option<usize>)>,
+    /// Time of the sample before, on the stream's own clock, seconds.
+    latest_s: f64,
+    row: Vec<u8>,
+}
+
+fn take_header(chunk: &mut Chunk<'_>, streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> io::Result<()> {
+    let id = u32::from_le_bytes(chunk.bytes()?);
+    let mut xml = Vec::new();
+    (&mut chunk.content).take(MAX_XML_BYTES).read_to_end(&mut xml)?;
+    let stream = match std::str::from_utf8(&xml).map_err(|error| error.to_string()).and_then(Stream::parse) {
+        Ok(stream) => stream,
+        Err(error) => {
+            log.count(LogFault::Malformed);
+            log.notes.push(format!("stream {id} was left out: its header cannot be read ({error})"));
+            return Ok(());
+        }
+    };
+    if streams.len() < MAX_STREAMS {
+        streams.entry(id).or_insert(stream);
+    }
+    Ok(())
+}
+
+impl Stream {
+    fn parse(xml: &str) -> Result<Self, String> {
+        let options = ParsingOptions { nodes_limit: MAX_XML_NODES, ..ParsingOptions::default() };
+        let document =
+            Document::parse_with_options(xml.trim_end_matches('\0'), options).map_err(|error| error.to_string())?;
+        let info = document.root_element();
+        let text = |name| child_text(info, name).unwrap_or_default();
+        let count: usize = text("channel_count").parse().map_err(|_| "no channel_count".to_owned())?;
+        if count == 0 || count > MAX_CHANNELS {
+            return Err(format!("{count} channels"));
+        }
+        let format = text("channel_format");
+        let figure = Figure::named(format).ok_or_else(|| format!("channel_format `{}`", format.escape_debug()))?;
+        let kind = text("type").to_owned();
+        let labels = info.children().find(|node| node.has_tag_name("desc"));
+        let labels = labels.and_then(|desc| desc.children().find(|node| node.has_tag_name("channels")));
+        let described = labels.into_iter().flat_map(|labels| labels.children());
+        let described = described.filter(|node| node.has_tag_name("channel"));
+        let mut channels: Vec<_> = described.take(count).map(channel).collect();
+        channels.resize(count, Channel::Other);
+        let is_relay = |label: &str| label.starts_with("diameter0_") || label.starts_with("diameter1_");
+        let one_eye_a_sample =
+            document.descendants().any(|node| node.has_tag_name("label") && node.text().is_some_and(is_relay));
+        Ok(Self {
+            name: text("name").to_owned(),
+            kind,
+            rate_hz: text("nominal_srate").parse().ok().filter(|rate: &f64| rate.is_finite()).unwrap_or(0.0),
+            figure,
+            channels,
+            one_eye_a_sample,
+            offsets: Vec::new(),
+            clock: Clock::default(),
+            taken: Vec::new(),
+            latest_s: 0.0,
+            row: Vec::new(),
+        })
+    }
+
+    /// Streams of pupils alone come before those of gaze, which pair eyes and repeat pupils.
+    fn rank(&self) -> usize {
+        let name = self.name.to_lowercase();
+        usize::from(!name.contains("pupillometry"))
+    }
+}
+
+fn child_text<'a>(node: Node<'a, '_>, name: &str) -> Option<&'a str> {
+    node.children().find(|child| child.has_tag_name(name))?.text().map(str::trim)
+}
+
+/// What a channel holds, by its label, type, eye and unit
+/// (<https://github.com/sccn/xdf/wiki/Gaze-Meta-Data>, and what recorders write in fact).
+fn channel(node: Node<'_, '_>) -> Channel {
+    let text = |name| child_text(node, name).unwrap_or_default().to_lowercase();
+    let (label, kind, eye, unit) = (text("label"), text("type"), text("eye"), text("unit"));
+    let says = |word: &str| label.contains(word) || kind.contains(word);
+    let words: Vec<&str> = label.split(|letter: char| !letter.is_alphanumeric()).collect();
+    let has_word = |word: &str| words.contains(&word);
+    let eye = match eye.as_str() {
+        "left" => SampleEye::Left,
+        "right" => SampleEye::Right,
+        "both" => SampleEye::Both,
+        _ if label.contains("left") || has_word("l") || has_word("diameter1") => SampleEye::Left,
+        _ if label.contains("right") || has_word("r") || has_word("diameter0") => SampleEye::Right,
+        _ => SampleEye::Both,
+    };
+    if says("confidence") {
+        return Channel::Confidence { eye };
+    }
+    let measure = if says("diam") {
+        Measure::Diameter
+    } else if says("radius") && !says("sphere") && !says("eyeball") {
+        Measure::Radius
+    } else if says("area") && says("pupil") {
+        Measure::Area
+    } else if says("pupilsize") || says("pupil_size") || says("pupil size") || label == "pupil" || kind == "pupil" {
+        Measure::Diameter
+    } else {
+        return Channel::Other;
+    };
+    // A diameter of something else: the eyeball's, a fixation's circle.
+    if !says("pupil") && !matches!(kind.as_str(), "diameter" | "radius") && !label.starts_with("diameter") {
+        return Channel::Other;
+    }
+    let (unit, factor) = match unit.trim_end_matches("^2").trim_end_matches('\u{b2}') {
+        "mm" | "millimeter" | "millimeters" | "millimetre" | "millimetres" => (SizeUnit::Millimetres, 1.0),
+        "m" | "meter" | "meters" | "metre" | "metres" => (SizeUnit::Millimetres, 1e3),
+        "px" | "pixel" | "pixels" => (SizeUnit::Pixels, 1.0),
+        "" if label.ends_with("_3d") || has_word("mm") => (SizeUnit::Millimetres, 1.0),
+        "" if label.ends_with("_2d") || has_word("px") => (SizeUnit::Pixels, 1.0),
+        _ => (SizeUnit::Arbitrary, 1.0),
+    };
+    Channel::Size { eye, measure, unit, factor }
+}
+
+/// Says of which channels the samples are taken: the best unit that there is, and of each eye the first of it. On error,
+/// what streams there are.
+fn choose(streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> Result<(), String> {
+    let units = [SizeUnit::Millimetres, SizeUnit::Pixels, SizeUnit::Arbitrary];
+    let has = |stream: &Stream, wanted: SizeUnit| {
+        stream.figure != Figure::Text
+            && stream.channels.iter().any(|channel| matches!(channel, Channel::Size { unit, .. } if *unit == wanted))
+    };
+    let told = |stream: &Stream| format!("`{}` of type `{}`", stream.name.escape_debug(), stream.kind.escape_debug());
+    let Some(unit) = units.into_iter().find(|unit| streams.values().any(|stream| has(stream, *unit))) else {
+        let names: Vec<_> = streams.values().take(20).map(told).collect();
+        return Err(format!("no pupil among {} streams ({})", streams.len(), names.join(", ")));
+    };
+    log.unit = unit;
+    let mut order: Vec<u32> = streams.keys().copied().collect();
+    order.sort_by_key(|id| streams[id].rank());
+    let (mut known, mut left_out) = (Vec::new(), Vec::new());
+    for id in order {
+        let Some(stream) = streams.get_mut(&id) else { continue };
+        let sizes = stream.channels.iter().enumerate().filter_map(|(index, channel)| match channel {
+            Channel::Size { eye, unit: of, .. } if *of == unit && stream.figure != Figure::Text => Some((*eye, index)),
+            _ => None,
+        });
+        for (eye, size) in sizes {
+            // Both eyes in one figure add nothing to an eye's own, and the other way round.
+            let again = known
+                .iter()
+                .any(|&(of, by)| of == eye || by != id && (of == SampleEye::Both || eye == SampleEye::Both));
+            if again {
+                continue;
+            }
+            known.push((eye, id));
+            let confidence =
+                |wanted| stream.channels.iter().position(|channel| *channel == Channel::Confidence { eye: wanted });
+            stream.taken.push((eye, size, confidence(eye).or_else(|| confidence(SampleEye::Both))));
+        }
+        if stream.taken.is_empty() {
+            left_out.push(told(stream));
+        } else {
+            let eyes: Vec<_> = stream.taken.iter().map(|taken| taken.0.to_string()).collect();
+            log.notes.push(format!("read from the stream {}: {}", told(stream), eyes.join(", ")));
+            if stream.rate_hz > 0.0 {
+                log.stated_rate_hz.get_or_insert(stream.rate_hz);
+            }
+        }
+    }
+    if !left_out.is_empty() {
+        let more = left_out.len().saturating_sub(20);
+        left_out.truncate(20);
+        let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+        log.notes.push(format!("other streams: {}{more}", left_out.join(", ")));
+    }
+    Ok(())
+}
+
+fn take_offset(chunk: &mut Chunk<'_>, streams: &mut BTreeMap<u32, Stream>) -> io::Result<()> {
+    let id = u32::from_le_bytes(chunk.bytes()?);
+    let (at_s, offset_s) = (f64::from_le_bytes(chunk.bytes()?), f64::from_le_bytes(chunk.bytes()?));
+    if let Some(stream) = streams.get_mut(&id)
+        && at_s.is_finite()
+        && offset_s.is_finite()
+        && stream.offsets.len() < MAX_OFFSETS
+    {
+        stream.offsets.push((at_s, offset_s));
+    }
+    Ok(())
+}
+
+/// A straight line through a stream's clock offsets: what is to be added to its times to get the recorder's.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Clock {
+    origin_s: f64,
+    offset_s: f64,
+    drift: f64,
+}
+
+impl Clock {
+    /// Least squares, twice over without what lies three deviations off: an offset is too large when a packet was late.
+    fn fit(offsets: &[(f64, f64)]) -> Self {
+        let mut kept = offsets.to_vec();
+        let mut clock = Self::line(&kept);
+        for _ in 0..2 {
+            let mut errors: Vec<f64> = kept.iter().map(|at| (at.1 - clock.at(at.0)).abs()).collect();
+            errors.sort_by(f64::total_cmp);
+            // 1.4826 times the median is the deviation of a normal distribution.
+            let Some(median_s) = errors.get(errors.len() / 2).copied() else { break };
+            let limit_s = (3.0 * 1.4826 * median_s).max(1e-6);
+            kept.retain(|at| (at.1 - clock.at(at.0)).abs() <= limit_s);
+            clock = Self::line(&kept);
+        }
+        clock
+    }
+
+    fn line(offsets: &[(f64, f64)]) -> Self {
+        if offsets.is_empty() {
+            return Self::default();
+        }
+        let count = offsets.len() as f64;
+        let mean = |of: &dyn Fn(&(f64, f64)) -> f64| offsets.iter().map(of).sum::<f64>() / count;
+        let (origin_s, offset_s) = (mean(&|at| at.0), mean(&|at| at.1));
+        let spread = mean(&|at| (at.0 - origin_s).powi(2));
+        let common = mean(&|at| (at.0 - origin_s) * (at.1 - offset_s));
+        let drift = if spread > 0.0 { common / spread } else { 0.0 };
+        Self { origin_s, offset_s, drift: if drift.is_finite() { drift } else { 0.0 } }
+    }
+
+    fn at(&self, t_s: f64) -> f64 {
+        self.offset_s + self.drift * (t_s - self.origin_s)
+    }
+}
+
+fn take_samples(
+    chunk: &mut Chunk<'_>,
+    streams: &mut BTreeMap<u32, Stream>,
+    log: &mut LogBuilder,
+    record: &mut u64,
+) -> io::Result<()> {
+    let id = u32::from_le_bytes(chunk.bytes()?);
+    let Some(stream) = streams.get_mut(&id).filter(|stream| !stream.taken.is_empty()) else { return Ok(()) };
+    let count = chunk.variable_length()?;
+    let mut row = std::mem::take(&mut stream.row);
+    row.resize(stream.channels.len() * stream.figure.bytes(), 0);
+    for _ in 0..count {
+        *record += 1;
+        let t_s = match chunk.bytes::<1>() {
+            Ok([0]) => stream.latest_s + if stream.rate_hz > 0.0 { 1.0 / stream.rate_hz } else { 0.0 },
+            Ok([8]) => f64::from_le_bytes(chunk.bytes()?),
+            Ok(_) => return Err(io::ErrorKind::InvalidData.into()),
+            Err(error) => return Err(error),
+        };
+        chunk.content.read_exact(&mut row)?;
+        stream.latest_s = t_s;
+        stream.push(t_s, &row, log, *record);
+    }
+    stream.row = row;
+    Ok(())
+}
+
+impl Stream {
+    fn push(&self, t_s: f64, row: &[u8], log: &mut LogBuilder, record: u64) {
+        let t = match ns_of(t_s + self.clock.at(t_s), 1e9) {
+            Ok(t) if t_s.is_finite() => TimeNs(t),
+            _ => return log.count(LogFault::BadNumber),
+        };
+        let bytes = self.figure.bytes();
+        let figure = |index: usize| self.figure.read(&row[index * bytes..(index + 1) * bytes]);
+        for &(eye, size, confidence) in &self.taken {
+            let Channel::Size { measure, factor, .. } = &self.channels[size] else { continue };
+            let raw = figure(size);
+            if raw.is_nan() && self.one_eye_a_sample {
+                continue;
+            }
+            let diameter = match measure {
+                Measure::Diameter => raw,
+                Measure::Radius => 2.0 * raw,
+                Measure::Area => 2.0 * (raw / std::f64::consts::PI).sqrt(),
+            };
+            let diameter = (diameter * factor) as f32;
+            // NaN, 0 and -1 are what recorders write of a pupil that was not found.
+            let valid = diameter.is_finite() && diameter > 0.0;
+            let confidence = confidence.map_or(1.0, |index| figure(index) as f32);
+            let confidence = if confidence.is_nan() { 0.0 } else { confidence.clamp(0.0, 1.0) };
+            let diameter = if valid { diameter } else { 0.0 };
+            log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid }, record);
+        }
+    }
+}

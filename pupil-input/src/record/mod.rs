@@ -1,0 +1,61 @@
+//! A run written down: the bytes of the link with their times of arrival, and the samples with their verdicts.
+//!
+//! The reader thread puts what it has into rings that were allocated at the start, and never waits: what finds no room is
+//! counted and left out, and the file says so. A thread of its own writes. What it has written is handed to the system ten
+//! times a second and is on the disk after at most a second, so a crash, of the program or of the machine, costs what came
+//! since then and never the file.
+
+mod container;
+mod crc32;
+mod samples;
+mod writer;
+
+use std::path::{Path, PathBuf};
+
+pub(crate) use container::{Ending, Header, HeaderFault, Kind, MAGIC, RawReader};
+pub(crate) use writer::{Recorder, Taps, start};
+
+/// Where a run is written down.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RecordFiles {
+    /// The bytes of the link: `replay:` plays them as if they came again. For links only: a log and the mock have none.
+    pub raw: Option<PathBuf>,
+    /// Every sample with the gate's verdict, CSV.
+    pub samples: Option<PathBuf>,
+}
+
+impl RecordFiles {
+    /// `tracker.holodraw` and `samples.csv` in `folder`, which must exist.
+    pub fn in_folder(folder: &Path) -> Self {
+        Self { raw: Some(folder.join("tracker.holodraw")), samples: Some(folder.join("samples.csv")) }
+    }
+}
+
+/// Why a run cannot be written down.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// The file cannot be made.
+    #[error("recording {path}: {source}; {hint}")]
+    Create {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+        /// What to do.
+        hint: &'static str,
+    },
+    /// The system gave no thread.
+    #[error("no thread for the recording: {0}; free memory or raise the limit on threads")]
+    Thread(std::io::Error),
+}
+
+/// How the writing goes.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct RecordStatus {
+    /// Pieces of the link's bytes that found no room.
+    pub chunks_lost: u64,
+    /// Decisions that found no room.
+    pub decisions_lost: u64,
+    /// Why nothing is written any more: a full disk, for one.
+    pub failure: Option<String>,
+}

@@ -1,0 +1,301 @@
+//! The rings between the reader and the disk, and the thread that empties them.
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, BufWriter, ErrorKind, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use holod_calibration::TimeNs;
+
+use super::container::{Header, Kind, MAX_PAYLOAD_BYTES, RECORD_HEAD_BYTES, RecordHead, encode_record};
+use super::samples::{SAMPLES_HEADER, write_sample};
+use super::{RecordError, RecordFiles, RecordStatus};
+use crate::estimator::Decision;
+
+/// Bytes on their way to the disk: ten seconds of a link of 3 Mbit/s.
+const RING_BYTES: usize = 1 << 22;
+/// Decisions on their way to the disk: 16 s at 1 kHz.
+const RING_DECISIONS: usize = 1 << 14;
+/// How often the rings are emptied and what they held is handed to the system.
+const WRITE_INTERVAL: Duration = Duration::from_millis(100);
+/// How often it is forced to the disk; with the time that takes, a second at most.
+const SYNC_INTERVAL: Duration = Duration::from_millis(500);
+
+/// The reader thread's part: wait-free, without allocation.
+pub(crate) struct Taps {
+    raw: Option<rtrb::Producer<u8>>,
+    decisions: Option<rtrb::Producer<Decision>>,
+    connection: u32,
+    /// Pieces lost of which the file does not tell yet.
+    untold: u64,
+    /// Of the last record that was put in.
+    t_last: TimeNs,
+    shared: Arc<Shared>,
+}
+
+/// The control thread's part.
+#[derive(Debug)]
+pub(crate) struct Recorder {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    chunks_lost: AtomicU64,
+    decisions_lost: AtomicU64,
+    failure: Mutex<Option<String>>,
+}
+
+/// Makes the files and starts the thread that writes them; it ends when the taps are dropped. `header` is none where there
+/// is no link whose bytes could be written.
+pub(crate) fn start(files: &RecordFiles, header: Option<&Header>) -> Result<(Taps, Recorder), RecordError> {
+    let shared = Arc::new(Shared::default());
+    let mut taps = Taps {
+        raw: None,
+        decisions: None,
+        connection: 0,
+        untold: 0,
+        t_last: header.map_or(TimeNs(0), |header| header.t_started),
+        shared: Arc::clone(&shared),
+    };
+    let mut writer = Writer { raw: None, decisions: None, shared: Arc::clone(&shared) };
+    if let (Some(path), Some(header)) = (&files.raw, header) {
+        let (producer, ring) = rtrb::RingBuffer::new(RING_BYTES);
+        let out = Output::create(path, &header.encode())?;
+        let last = RecordHead { kind: Kind::Connected, t: header.t_started, connection: 0 };
+        writer.raw = Some(RawWriter { ring, head: None, payload: Vec::new(), bytes: Vec::new(), last, told: 0, out });
+        taps.raw = Some(producer);
+    }
+    if let Some(path) = &files.samples {
+        let (producer, ring) = rtrb::RingBuffer::new(RING_DECISIONS);
+        let out = Output::create(path, format!("{SAMPLES_HEADER}\n").as_bytes())?;
+        writer.decisions = Some((ring, out));
+        taps.decisions = Some(producer);
+    }
+    let thread = thread::Builder::new()
+        .name("pupil-recorder".into())
+        .spawn(move || writer.run())
+        .map_err(RecordError::Thread)?;
+    Ok((taps, Recorder { shared, thread: Some(thread) }))
+}
+
+impl Taps {
+    pub(crate) fn connected(&mut self, t: TimeNs) {
+        self.connection = self.connection.wrapping_add(1);
+        self.put(Kind::Connected, t, &[]);
+    }
+
+    pub(crate) fn bytes(&mut self, arrival: TimeNs, bytes: &[u8]) {
+        for piece in bytes.chunks(MAX_PAYLOAD_BYTES) {
+            self.put(Kind::Bytes, arrival, piece);
+        }
+    }
+
+    pub(crate) fn disconnected(&mut self, t: TimeNs) {
+        self.put(Kind::Disconnected, t, &[]);
+    }
+
+    pub(crate) fn decision(&mut self, decision: Decision) {
+        let Some(ring) = &mut self.decisions else { return };
+        if ring.push(decision).is_err() {
+            self.shared.decisions_lost.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    fn put(&mut self, kind: Kind, t: TimeNs, payload: &[u8]) {
+        let Some(ring) = &mut self.raw else { return };
+        let connection = self.connection;
+        if self.untold > 0 {
+            let head = RecordHead { kind: Kind::Lost, t: self.t_last, connection };
+            if push(ring, &head, &self.untold.to_le_bytes()) {
+                self.untold = 0;
+            }
+        }
+        if self.untold == 0 && push(ring, &RecordHead { kind, t, connection }, payload) {
+            self.t_last = t;
+        } else {
+            self.untold += 1;
+            self.shared.chunks_lost.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Puts a record in, if there is room for all of it.
+fn push(ring: &mut rtrb::Producer<u8>, head: &RecordHead, payload: &[u8]) -> bool {
+    ring.slots() >= RECORD_HEAD_BYTES + payload.len()
+        && ring.push_entire_slice(&head.encode(payload.len())).is_ok()
+        && ring.push_entire_slice(payload).is_ok()
+}
+
+impl Recorder {
+    pub(crate) fn status(&self) -> RecordStatus {
+        let shared = &self.shared;
+        RecordStatus {
+            chunks_lost: shared.chunks_lost.load(Ordering::Relaxed),
+            decisions_lost: shared.decisions_lost.load(Ordering::Relaxed),
+            failure: shared.failure.lock().unwrap_or_else(PoisonError::into_inner).clone(),
+        }
+    }
+
+    /// Waits until all is on the disk; the taps must have been dropped.
+    pub(crate) fn finish(&mut self) {
+        if let Some(thread) = self.thread.take() {
+            thread.thread().unpark();
+            // A panic over there has been reported by the panic hook; here it only means that it has ended.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// A file that is written in pieces and synced.
+struct Output {
+    path: PathBuf,
+    file: BufWriter<File>,
+}
+
+impl Output {
+    fn create(path: &Path, begin: &[u8]) -> Result<Self, RecordError> {
+        let open = || {
+            let mut file = OpenOptions::new().write(true).create_new(true).open(path)?;
+            file.write_all(begin)?;
+            file.sync_all()?;
+            // The file's name is on the disk once its folder is.
+            if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+                File::open(folder)?.sync_all()?;
+            }
+            Ok(file)
+        };
+        let file = open().map_err(|source: io::Error| {
+            let hint = match source.kind() {
+                ErrorKind::AlreadyExists => "nothing is overwritten; name another file",
+                ErrorKind::NotFound => "make the folder first",
+                ErrorKind::PermissionDenied => "name a folder in which you may write",
+                _ => "name a file on a disk with room",
+            };
+            RecordError::Create { path: path.into(), source, hint }
+        })?;
+        Ok(Self { path: path.into(), file: BufWriter::with_capacity(1 << 16, file) })
+    }
+
+    fn failed(&self, error: &io::Error) -> String {
+        format!("recording {}: {error}; what was written before is kept", self.path.display())
+    }
+}
+
+/// The thread's own state.
+struct Writer {
+    raw: Option<RawWriter>,
+    decisions: Option<(rtrb::Consumer<Decision>, Output)>,
+    shared: Arc<Shared>,
+}
+
+struct RawWriter {
+    ring: rtrb::Consumer<u8>,
+    /// A record whose payload is not in the ring yet.
+    head: Option<(RecordHead, usize)>,
+    payload: Vec<u8>,
+    bytes: Vec<u8>,
+    /// The last record that was written.
+    last: RecordHead,
+    /// Lost pieces of which the file tells.
+    told: u64,
+    out: Output,
+}
+
+impl Writer {
+    fn run(mut self) {
+        let mut synced = Instant::now();
+        loop {
+            // Asked before the rings are emptied: what was put in before the taps were dropped is written.
+            let over = self.raw.as_ref().is_none_or(|raw| raw.ring.is_abandoned())
+                && self.decisions.as_ref().is_none_or(|(ring, _)| ring.is_abandoned());
+            let sync = over || synced.elapsed() >= SYNC_INTERVAL;
+            if sync {
+                synced = Instant::now();
+            }
+            self.write(over, sync);
+            if over {
+                return;
+            }
+            thread::park_timeout(WRITE_INTERVAL);
+        }
+    }
+
+    /// Writes what has come. A file that fails is given up, and the other one goes on.
+    fn write(&mut self, over: bool, sync: bool) {
+        let end_with_lost = over.then(|| self.shared.chunks_lost.load(Ordering::Relaxed));
+        if let Some(raw) = &mut self.raw
+            && let Err(error) = raw.write(end_with_lost).and_then(|()| hand_over(&mut raw.out, sync))
+        {
+            self.shared.fail(raw.out.failed(&error));
+            self.raw = None;
+        }
+        if let Some((ring, out)) = &mut self.decisions {
+            let mut write = || {
+                while let Ok(decision) = ring.pop() {
+                    write_sample(&decision, &mut out.file)?;
+                }
+                hand_over(out, sync)
+            };
+            if let Err(error) = write() {
+                self.shared.fail(out.failed(&error));
+                self.decisions = None;
+            }
+        }
+    }
+}
+
+/// Hands what is buffered to the system, and forces it to the disk if asked.
+fn hand_over(out: &mut Output, sync: bool) -> io::Result<()> {
+    out.file.flush()?;
+    if sync { out.file.get_ref().sync_data() } else { Ok(()) }
+}
+
+impl RawWriter {
+    /// Writes every whole record that is in the ring; at the end of a run also that it ended, and of how many pieces the
+    /// file does not tell yet that they were lost.
+    fn write(&mut self, end_with_lost: Option<u64>) -> io::Result<()> {
+        while let Some((head, length)) = self.head.take().or_else(|| self.next_head()) {
+            self.payload.resize(length, 0);
+            if self.ring.pop_entire_slice(&mut self.payload).is_err() {
+                self.head = Some((head, length));
+                break;
+            }
+            self.write_record(&head)?;
+            self.last = head;
+            if head.kind == Kind::Lost {
+                self.told += self.payload.first_chunk().map_or(0, |count| u64::from_le_bytes(*count));
+            }
+        }
+        let Some(lost) = end_with_lost else { return Ok(()) };
+        if lost > self.told {
+            self.payload.clear();
+            self.payload.extend((lost - self.told).to_le_bytes());
+            self.write_record(&RecordHead { kind: Kind::Lost, ..self.last })?;
+        }
+        self.payload.clear();
+        self.write_record(&RecordHead { kind: Kind::End, ..self.last })
+    }
+
+    fn next_head(&mut self) -> Option<(RecordHead, usize)> {
+        let mut head = [0; RECORD_HEAD_BYTES];
+        self.ring.pop_entire_slice(&mut head).ok()?;
+        RecordHead::decode(&head)
+    }
+
+    fn write_record(&mut self, head: &RecordHead) -> io::Result<()> {
+        self.bytes.clear();
+        encode_record(head, &self.payload, &mut self.bytes);
+        self.out.file.write_all(&self.bytes)
+    }
+}
+
+impl Shared {
+    fn fail(&self, failure: String) {
+        self.failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(failure);
+    }
+}

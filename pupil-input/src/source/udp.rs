@@ -1,0 +1,92 @@
+//! A tracker that sends datagrams to this machine, each a message of its own.
+
+use std::io::ErrorKind;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, UdpSocket};
+use std::time::{Duration, Instant};
+
+use super::tcp::{NetworkError, resolve};
+use super::{ByteSource, Feed, READ_TIMEOUT, ReadEvent, SourceError};
+use crate::profile::Profile;
+use crate::spec::HostPort;
+
+/// A sender that was silent for so long may be followed by another.
+const SENDER_LASTS: Duration = Duration::from_secs(2);
+
+/// A port of this machine at which datagrams are received; a multicast address joins its group.
+pub(crate) struct UdpFeed {
+    address: HostPort,
+    profile: String,
+    has_commands: bool,
+}
+
+impl UdpFeed {
+    pub(crate) fn new(address: HostPort, profile: &Profile) -> Self {
+        let has_commands = !profile.network.start.is_empty() || !profile.network.stop.is_empty();
+        Self { address, profile: profile.name.clone(), has_commands }
+    }
+
+    fn bind(&self) -> Result<UdpSocket, NetworkError> {
+        let address = resolve(&self.address)?[0];
+        let port = address.port();
+        let bound = match address.ip() {
+            IpAddr::V4(group) if group.is_multicast() => UdpSocket::bind((Ipv4Addr::UNSPECIFIED, port))
+                .and_then(|socket| socket.join_multicast_v4(&group, &Ipv4Addr::UNSPECIFIED).map(|()| socket)),
+            IpAddr::V6(group) if group.is_multicast() => UdpSocket::bind((Ipv6Addr::UNSPECIFIED, port))
+                .and_then(|socket| socket.join_multicast_v6(&group, 0).map(|()| socket)),
+            _ => UdpSocket::bind(address),
+        };
+        let bound = bound.and_then(|socket| socket.set_read_timeout(Some(READ_TIMEOUT)).map(|()| socket));
+        bound.map_err(|reason| {
+            let hint = match reason.kind() {
+                ErrorKind::AddrInUse => "another program listens on this port; close it",
+                ErrorKind::AddrNotAvailable => {
+                    "give an address of this machine, not the tracker's: 0.0.0.0 for all of them"
+                }
+                ErrorKind::PermissionDenied => "take a port above 1023",
+                _ => "check this machine's network",
+            };
+            NetworkError::Listen { address: self.address.clone(), reason, hint }
+        })
+    }
+}
+
+impl Feed for UdpFeed {
+    fn open(&mut self) -> Result<Box<dyn ByteSource>, SourceError> {
+        if self.has_commands {
+            let (address, profile) = (self.address.clone(), self.profile.clone());
+            return Err(NetworkError::NobodyToTell { address, profile }.into());
+        }
+        Ok(Box::new(Listener { socket: self.bind()?, sender: None }))
+    }
+
+    fn datagrams(&self) -> bool {
+        true
+    }
+}
+
+struct Listener {
+    socket: UdpSocket,
+    /// Whose datagrams are taken, and when the last one came. Two trackers at once would be mixed up.
+    sender: Option<(IpAddr, Instant)>,
+}
+
+impl ByteSource for Listener {
+    fn read(&mut self, buffer: &mut [u8]) -> ReadEvent {
+        match self.socket.recv_from(buffer) {
+            Ok((count, from)) => {
+                let now = Instant::now();
+                let stranger =
+                    self.sender.is_some_and(|(ip, last)| ip != from.ip() && now.duration_since(last) < SENDER_LASTS);
+                if stranger || count == 0 {
+                    return ReadEvent::Silence;
+                }
+                self.sender = Some((from.ip(), now));
+                ReadEvent::Bytes(count)
+            }
+            Err(error) => match error.kind() {
+                ErrorKind::TimedOut | ErrorKind::WouldBlock | ErrorKind::Interrupted => ReadEvent::Silence,
+                _ => ReadEvent::Gone,
+            },
+        }
+    }
+}

@@ -1,0 +1,148 @@
+//! What a tracker's thread is to do, by its spec.
+
+use std::path::{Path, PathBuf};
+
+use holod_calibration::TimeNs;
+
+use super::TrackerError;
+use crate::import::raw::RawLog;
+use crate::import::{Recording, SizeUnit};
+use crate::profile::{DEFAULT_PROFILE, Profile};
+use crate::source::core::CoreFeed;
+use crate::source::hid::{self, HidFeed, Wanted};
+use crate::source::mock::Scenario;
+use crate::source::neon::NeonFeed;
+use crate::source::serial::SerialFeed;
+use crate::source::tcp::TcpFeed;
+use crate::source::udp::UdpFeed;
+use crate::source::{ByteSource, Feed, SourceError};
+use crate::spec::{ReplaySpeed, TrackerSpec, UsbIds};
+
+/// What the thread is to do.
+pub(super) enum Job {
+    Live {
+        open: Box<dyn ByteSource>,
+        feed: Box<dyn Feed>,
+        profile: Box<Profile>,
+    },
+    Replay {
+        recording: Box<Recording>,
+        play: Play,
+    },
+    /// holod's own recording: its bytes come again.
+    Rerun {
+        raw: Box<RawLog>,
+        play: Play,
+    },
+    Mock {
+        scenario: Scenario,
+        origin: TimeNs,
+    },
+}
+
+/// How a log is played.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Play {
+    pub(super) speed: ReplaySpeed,
+    pub(super) repeat: bool,
+    /// Host time at which it begins.
+    pub(super) origin: TimeNs,
+}
+
+impl Job {
+    pub(super) fn open(spec: &TrackerSpec, origin: TimeNs, forbidden: &[PathBuf]) -> Result<Self, TrackerError> {
+        match spec {
+            TrackerSpec::Path(path) if path.is_file() => {
+                Self::log(path, Play { speed: ReplaySpeed::Times(1.0), repeat: false, origin })
+            }
+            TrackerSpec::Path(path) => Self::serial(path, None, None, forbidden),
+            TrackerSpec::Serial { path, profile, baud } => Self::serial(path, profile.as_deref(), *baud, forbidden),
+            TrackerSpec::Hid { ids, serial, profile } => Self::hid(*ids, serial.as_deref(), profile.as_deref()),
+            TrackerSpec::Tcp { address, profile } => {
+                let profile = Profile::find(profile)?;
+                Self::live(Box::new(TcpFeed::new(address.clone(), &profile)), profile)
+            }
+            TrackerSpec::Udp { address, profile } => {
+                let profile = Profile::find(profile)?;
+                Self::live(Box::new(UdpFeed::new(address.clone(), &profile)), profile)
+            }
+            TrackerSpec::Core(address) => {
+                Self::live(Box::new(CoreFeed { address: address.clone() }), Profile::find("core")?)
+            }
+            TrackerSpec::Neon(address) => Self::live(Box::new(NeonFeed::new(address.clone())), Profile::find("neon")?),
+            TrackerSpec::Replay { path, speed, repeat } => {
+                Self::log(path, Play { speed: *speed, repeat: *repeat, origin })
+            }
+            TrackerSpec::Mock(scenario) => Ok(Self::Mock { scenario: *scenario, origin }),
+        }
+    }
+
+    /// What its sizes are before the rig's scale.
+    pub(super) fn unit(&self) -> SizeUnit {
+        match self {
+            Self::Live { profile, .. } => profile.unit,
+            Self::Replay { recording, .. } => recording.unit(),
+            Self::Rerun { raw, .. } => raw.profile().unit,
+            Self::Mock { .. } => SizeUnit::Millimetres,
+        }
+    }
+
+    /// A link's profile, and whether it brings datagrams.
+    pub(super) fn link(&self) -> Option<(&Profile, bool)> {
+        match self {
+            Self::Live { profile, feed, .. } => Some((profile, feed.datagrams())),
+            Self::Replay { .. } | Self::Rerun { .. } | Self::Mock { .. } => None,
+        }
+    }
+
+    /// What a user should know before it runs.
+    pub(super) fn warnings(&self) -> Vec<String> {
+        match self {
+            Self::Live { feed, .. } => feed.warnings(),
+            Self::Replay { recording, .. } => recording.notes().to_vec(),
+            Self::Rerun { raw, .. } => raw.warnings(),
+            Self::Mock { .. } => Vec::new(),
+        }
+    }
+
+    fn serial(
+        path: &Path,
+        profile: Option<&str>,
+        baud: Option<u32>,
+        forbidden: &[PathBuf],
+    ) -> Result<Self, TrackerError> {
+        let profile = Profile::find(profile.unwrap_or(DEFAULT_PROFILE))?;
+        Self::live(Box::new(SerialFeed::new(path, baud, profile.clone(), forbidden)), profile)
+    }
+
+    fn hid(ids: Option<UsbIds>, serial: Option<&str>, profile: Option<&str>) -> Result<Self, TrackerError> {
+        let profile = match profile {
+            Some(name) => Profile::find(name)?,
+            None => hid::profile_of(ids).map_err(SourceError::from)?,
+        };
+        let wanted = Wanted::new(ids, serial, &profile).map_err(SourceError::from)?;
+        Self::live(Box::new(HidFeed::new(wanted)), profile)
+    }
+
+    fn live(mut feed: Box<dyn Feed>, profile: Profile) -> Result<Self, TrackerError> {
+        Ok(Self::Live { open: feed.open()?, feed, profile: Box::new(profile) })
+    }
+
+    fn log(path: &Path, play: Play) -> Result<Self, TrackerError> {
+        if RawLog::recognises(path) {
+            return Ok(Self::Rerun { raw: Box::new(RawLog::open(path)?), play });
+        }
+        Ok(Self::Replay { recording: Box::new(Recording::read(path)?), play })
+    }
+}
+
+/// The text of the profile that a spec names, where it is a user's own and no name would find it again.
+pub(super) fn own_profile(spec: &TrackerSpec) -> Option<String> {
+    let name = match spec {
+        TrackerSpec::Serial { profile, .. } | TrackerSpec::Hid { profile, .. } => profile.as_deref()?,
+        TrackerSpec::Tcp { profile, .. } | TrackerSpec::Udp { profile, .. } => profile,
+        _ => return None,
+    };
+    let is_path = name.contains('/') || name.ends_with(".toml");
+    is_path.then(|| std::fs::read_to_string(name).ok()).flatten()
+}

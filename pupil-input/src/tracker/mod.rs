@@ -1,0 +1,329 @@
+//! A tracker that runs: one thread reads, decodes, gates and filters; others ask for the pupil without waiting.
+
+mod job;
+mod worker;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::thread::{self, JoinHandle};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use holod_calibration::{TimeNs, rig};
+
+use self::job::Job;
+use self::worker::Worker;
+use crate::clock::{ClockGauge, ClockReport};
+use crate::counters::{CounterSnapshot, Counters};
+use crate::estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, StreamClock};
+use crate::import::{ReplayError, SizeUnit};
+use crate::profile::ProfileError;
+use crate::record::{self, Header, RecordError, RecordFiles, RecordStatus, Recorder};
+use crate::source::SourceError;
+use crate::spec::TrackerSpec;
+
+/// The host's monotonic clock: the one place where it is read.
+pub fn host_now() -> TimeNs {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    TimeNs(now.tv_sec * 1_000_000_000 + now.tv_nsec)
+}
+
+/// Why a tracker could not be started.
+#[derive(Debug, thiserror::Error)]
+pub enum TrackerError {
+    /// The tracker cannot be reached.
+    #[error(transparent)]
+    Source(#[from] SourceError),
+    /// Its profile cannot be had.
+    #[error(transparent)]
+    Profile(#[from] ProfileError),
+    /// The log cannot be played.
+    #[error(transparent)]
+    Replay(#[from] ReplayError),
+    /// The run cannot be written down.
+    #[error(transparent)]
+    Record(#[from] RecordError),
+    /// Its figures are no millimetres, and nobody said how many millimetres one of them is.
+    #[error(
+        "tracker `{spec}` gives pupil sizes in {unit}; holod needs millimetres: measure an artificial pupil of known \
+         diameter and write tracker.scale_mm_per_unit = (its millimetres / its units) into the rig file"
+    )]
+    NoScale {
+        /// The tracker's spec.
+        spec: String,
+        /// What it gives.
+        unit: &'static str,
+    },
+    /// The system gave no thread.
+    #[error("no thread for the pupil reader: {0}; free memory or raise the limit on threads")]
+    Thread(std::io::Error),
+}
+
+/// Seed of the `mock` tracker.
+pub const MOCK_SEED: u64 = 1;
+
+/// How the link to the tracker is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Link {
+    /// Samples come, or may come.
+    Up,
+    /// The port is open and nothing has come for half a second.
+    Silent,
+    /// The port is gone; it is tried again and again.
+    Down,
+    /// The log has been played to its end, or the tracker was stopped.
+    Finished,
+}
+
+impl Link {
+    const ALL: [Self; 4] = [Self::Up, Self::Silent, Self::Down, Self::Finished];
+
+    /// The name used in records.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Up => "up",
+            Self::Silent => "silent",
+            Self::Down => "down",
+            Self::Finished => "finished",
+        }
+    }
+}
+
+/// Decisions that the tap holds: five minutes of two eyes at 100 Hz, or half a minute at 1 kHz.
+const TAP_DECISIONS: usize = 1 << 16;
+
+/// What a tracker is started with beside its spec and the rig's settings.
+#[derive(Clone, Debug, Default)]
+pub struct TrackerOptions {
+    /// Host time at which a log or a mock begins; a live tracker does not need it.
+    pub origin: TimeNs,
+    /// Where the run is written down.
+    pub record: Option<RecordFiles>,
+    /// Serial ports that belong to something else, the laser box for one: a tracker is never looked for there.
+    pub forbidden: Vec<PathBuf>,
+}
+
+impl From<TimeNs> for TrackerOptions {
+    fn from(origin: TimeNs) -> Self {
+        Self { origin, ..Self::default() }
+    }
+}
+
+/// Starts trackers.
+#[derive(Debug)]
+pub struct Tracker;
+
+impl Tracker {
+    /// Opens what `spec` names and starts the thread that reads it. In the place of options an origin will do.
+    ///
+    /// # Errors
+    /// The path does not exist, is of the wrong kind or does not open; what is there is another device; the log is of no
+    /// known format, empty or unsorted; the recording cannot be made. What fails later is counted and tried again.
+    pub fn start(
+        spec: &TrackerSpec,
+        settings: &rig::Tracker,
+        options: impl Into<TrackerOptions>,
+    ) -> Result<TrackerHandle, TrackerError> {
+        let TrackerOptions { origin, record, forbidden } = options.into();
+        let job = Job::open(spec, origin, &forbidden)?;
+        if job.unit() != SizeUnit::Millimetres && settings.scale.is_none() {
+            return Err(TrackerError::NoScale { spec: spec.to_string(), unit: job.unit().name() });
+        }
+        let mut warnings = job.warnings();
+        let header = job.link().map(|(profile, datagrams)| Header {
+            spec: spec.to_string(),
+            profile: profile.name.clone(),
+            profile_toml: job::own_profile(spec),
+            datagrams,
+            t_started: host_now(),
+            started_unix_ns: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as i64),
+        });
+        if header.is_none() && record.as_ref().is_some_and(|files| files.raw.is_some()) {
+            warnings
+                .push(format!("tracker `{spec}` is no link, so it has no bytes to record; its samples are recorded"));
+        }
+        let (taps, recorder) = record.map(|files| record::start(&files, header.as_ref())).transpose()?.unzip();
+        let settings = EstimatorSettings::from(settings);
+        let (input, output) = triple_buffer::triple_buffer(&EstimateSnapshot::new(settings));
+        let (producer, consumer) = rtrb::RingBuffer::new(TAP_DECISIONS);
+        let shared = Arc::new(Shared {
+            counters: Counters::new(),
+            clock: ClockGauge::new(),
+            stop: AtomicBool::new(false),
+            link: AtomicU8::new(Link::Up as u8),
+        });
+        let worker = Worker {
+            estimator: Estimator::new(settings),
+            clock: StreamClock::LIVE,
+            published: input,
+            tap: producer,
+            record: taps,
+            arrivals_of_stream: false,
+            shared: Arc::clone(&shared),
+        };
+        let thread = thread::Builder::new()
+            .name("pupil-reader".into())
+            .spawn(move || worker.run(job))
+            .map_err(TrackerError::Thread)?;
+        Ok(TrackerHandle {
+            reader: EstimateReader { output },
+            tap: DecisionTap { consumer },
+            control: TrackerControl { shared, thread: Some(thread), recorder, warnings },
+        })
+    }
+}
+
+/// A running tracker.
+#[derive(Debug)]
+pub struct TrackerHandle {
+    reader: EstimateReader,
+    tap: DecisionTap,
+    control: TrackerControl,
+}
+
+impl TrackerHandle {
+    /// The pupil at host time `t`: wait-free, no allocation.
+    pub fn pupil_at(&mut self, t: TimeNs) -> PupilEstimate {
+        self.reader.pupil_at(t)
+    }
+
+    /// The gate's decisions since the last call.
+    pub const fn decisions(&mut self) -> &mut DecisionTap {
+        &mut self.tap
+    }
+
+    /// All counts at this moment.
+    pub fn counters(&self) -> CounterSnapshot {
+        self.control.counters()
+    }
+
+    /// What has been found of the tracker's clock; nothing where its samples carry no time.
+    pub fn clock(&self) -> Option<ClockReport> {
+        self.control.clock()
+    }
+
+    /// How the link is.
+    pub fn link(&self) -> Link {
+        self.control.link()
+    }
+
+    /// Whether a log has been played to its end.
+    pub fn finished(&self) -> bool {
+        self.control.finished()
+    }
+
+    /// What a user should know of the tracker although it runs.
+    pub fn warnings(&self) -> &[String] {
+        self.control.warnings()
+    }
+
+    /// How the recording goes, where there is one.
+    pub fn recording(&self) -> Option<RecordStatus> {
+        self.control.recording()
+    }
+
+    /// Stops the thread and waits for its end.
+    pub fn stop(&mut self) {
+        self.control.stop();
+    }
+
+    /// Its three parts, each for the thread that needs it.
+    pub fn split(self) -> (EstimateReader, DecisionTap, TrackerControl) {
+        (self.reader, self.tap, self.control)
+    }
+}
+
+/// The frame thread's part: the newest estimate.
+#[derive(Debug)]
+pub struct EstimateReader {
+    output: triple_buffer::Output<EstimateSnapshot>,
+}
+
+impl EstimateReader {
+    /// The pupil at host time `t`: wait-free, no allocation.
+    pub fn pupil_at(&mut self, t: TimeNs) -> PupilEstimate {
+        self.output.read().pupil_at(t)
+    }
+}
+
+/// The recorder's part: every decision of the gate, in a bounded ring. What finds no room is counted and dropped.
+#[derive(Debug)]
+pub struct DecisionTap {
+    consumer: rtrb::Consumer<Decision>,
+}
+
+impl DecisionTap {
+    /// The next decision; its `t_sample` is on the host's clock.
+    pub fn pop(&mut self) -> Option<Decision> {
+        self.consumer.pop().ok()
+    }
+}
+
+/// The control thread's part. Dropping it stops the tracker.
+#[derive(Debug)]
+pub struct TrackerControl {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+    recorder: Option<Recorder>,
+    warnings: Vec<String>,
+}
+
+impl TrackerControl {
+    /// All counts at this moment.
+    pub fn counters(&self) -> CounterSnapshot {
+        self.shared.counters.snapshot()
+    }
+
+    /// What has been found of the tracker's clock; nothing where its samples carry no time.
+    pub fn clock(&self) -> Option<ClockReport> {
+        self.shared.clock.get()
+    }
+
+    /// How the link is.
+    pub fn link(&self) -> Link {
+        Link::ALL[usize::from(self.shared.link.load(Ordering::Acquire))]
+    }
+
+    /// Whether a log has been played to its end.
+    pub fn finished(&self) -> bool {
+        self.link() == Link::Finished
+    }
+
+    /// What a user should know of the tracker although it runs, found at its start: a port that will change its name, an
+    /// adapter that holds bytes back, a recording that is torn. A sentence each.
+    pub fn warnings(&self) -> &[String] {
+        &self.warnings
+    }
+
+    /// How the recording goes, where there is one.
+    pub fn recording(&self) -> Option<RecordStatus> {
+        self.recorder.as_ref().map(Recorder::status)
+    }
+
+    /// Stops the thread and waits for its end, and for that of the recording; again is no harm.
+    pub fn stop(&mut self) {
+        self.shared.stop.store(true, Ordering::Release);
+        if let Some(thread) = self.thread.take() {
+            thread.thread().unpark();
+            // A panic over there has been reported by the panic hook; here it only means that it has ended.
+            let _ = thread.join();
+        }
+        if let Some(recorder) = &mut self.recorder {
+            recorder.finish();
+        }
+    }
+}
+
+impl Drop for TrackerControl {
+    fn drop(&mut self) {
+        self.stop();
+    }
+}
+
+#[derive(Debug)]
+struct Shared {
+    counters: Counters,
+    clock: ClockGauge,
+    stop: AtomicBool,
+    link: AtomicU8,
+}

@@ -1,0 +1,377 @@
+//! The thread of a tracker: reads, decodes, gates, filters, publishes.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::thread;
+use std::time::Duration;
+
+use holod_calibration::TimeNs;
+
+use super::job::{Job, Play};
+use super::{Link, MOCK_SEED, Shared, host_now};
+use crate::PupilSample;
+use crate::clock::ClockModel;
+use crate::counters::Counter;
+use crate::estimator::{Decision, EstimateSnapshot, Estimator, StreamClock};
+use crate::gate::Verdict;
+use crate::import::raw::RawLog;
+use crate::import::{LogFault, Recording};
+use crate::profile::Profile;
+use crate::record::{Kind, Taps};
+use crate::sequence::{SequenceEvent, SequenceTracker};
+use crate::source::mock::{MockSource, Scenario};
+use crate::source::{ByteSource, Feed, ReadEvent};
+use crate::spec::ReplaySpeed;
+use crate::wire::{Decoder, WireEvent, WireSample};
+
+/// A link that has brought bytes is silent after this long without any.
+const SILENCE: TimeNs = TimeNs(500_000_000);
+/// A link that was just opened is, after this long: a board that was reset by that starts in two seconds.
+const FIRST_SILENCE: TimeNs = TimeNs(2_500_000_000);
+const FIRST_BACK_OFF: Duration = Duration::from_millis(100);
+const LONGEST_BACK_OFF: Duration = Duration::from_secs(2);
+/// The longest datagram there is.
+const BUFFER_BYTES: usize = 1 << 16;
+
+/// The thread's own state. After its first sample nothing is allocated.
+pub(super) struct Worker {
+    pub(super) estimator: Estimator,
+    /// From the stream's time to the host's.
+    pub(super) clock: StreamClock,
+    pub(super) published: triple_buffer::Input<EstimateSnapshot>,
+    pub(super) tap: rtrb::Producer<Decision>,
+    pub(super) record: Option<Taps>,
+    /// Times of arrival are the stream's too.
+    pub(super) arrivals_of_stream: bool,
+    pub(super) shared: Arc<Shared>,
+}
+
+impl Worker {
+    pub(super) fn run(mut self, job: Job) {
+        match job {
+            Job::Live { open, feed, profile, .. } => self.run_live(open, feed, &profile),
+            Job::Replay { recording, play } => self.run_replay(&recording, play),
+            Job::Rerun { raw, play } => {
+                self.arrivals_of_stream = true;
+                self.run_again(&raw, play);
+            }
+            Job::Mock { scenario, origin } => self.run_mock(scenario, origin),
+        }
+        self.finish();
+    }
+
+    fn run_live(&mut self, open: Box<dyn ByteSource>, mut feed: Box<dyn Feed>, profile: &Profile) {
+        let mut link = Some(open);
+        let datagrams = feed.datagrams();
+        let mut stream = LiveStream::new(profile, datagrams);
+        let mut buffer = vec![0; BUFFER_BYTES];
+        let mut back_off = FIRST_BACK_OFF;
+        let mut silent_from = host_now() + FIRST_SILENCE;
+        self.connected(host_now());
+        while !self.stopping() {
+            let Some(open) = &mut link else {
+                if !self.wait_until(host_now() + TimeNs(back_off.as_nanos() as i64)) {
+                    return;
+                }
+                self.count(Counter::ReconnectAttempts, 1);
+                back_off = (back_off * 2).min(LONGEST_BACK_OFF);
+                link = feed.open().ok();
+                if link.is_some() {
+                    stream = LiveStream::new(profile, datagrams);
+                    silent_from = host_now() + FIRST_SILENCE;
+                    self.connected(host_now());
+                }
+                continue;
+            };
+            match open.read(&mut buffer) {
+                ReadEvent::Bytes(count) => {
+                    let arrival = host_now();
+                    silent_from = arrival + SILENCE;
+                    back_off = FIRST_BACK_OFF;
+                    self.set_link(Link::Up);
+                    let bytes = &buffer[..count];
+                    if let Some(taps) = &mut self.record {
+                        taps.bytes(arrival, bytes);
+                    }
+                    stream.push(bytes, arrival, self);
+                    self.publish();
+                }
+                ReadEvent::Silence => {
+                    if host_now() > silent_from && self.link() == Link::Up {
+                        self.count(Counter::Silences, 1);
+                        self.set_link(Link::Silent);
+                    }
+                }
+                ReadEvent::Gone => {
+                    link = None;
+                    self.disconnected(host_now());
+                }
+            }
+        }
+    }
+
+    fn connected(&mut self, t: TimeNs) {
+        self.count(Counter::Connects, 1);
+        self.set_link(Link::Up);
+        if let Some(taps) = &mut self.record {
+            taps.connected(t);
+        }
+    }
+
+    fn disconnected(&mut self, t: TimeNs) {
+        self.count(Counter::Disconnects, 1);
+        self.set_link(Link::Down);
+        if let Some(taps) = &mut self.record {
+            taps.disconnected(t);
+        }
+    }
+
+    /// Plays a recording of a link: the same bytes at the same times of arrival, so the same samples.
+    fn run_again(&mut self, raw: &RawLog, play: Play) {
+        let Play { speed, repeat, origin } = play;
+        if let ReplaySpeed::Times(rate) = speed {
+            self.clock = StreamClock { host: origin, stream: raw.begins(), rate };
+        }
+        let mut later = TimeNs(0);
+        loop {
+            let mut stream = LiveStream::new(raw.profile(), raw.datagrams());
+            // It was read to its end when the tracker was started. What cannot be read any more is its end now.
+            let Ok(mut records) = raw.records() else { return };
+            while let Ok(Some((head, payload))) = records.next() {
+                let arrival = head.t + later;
+                match speed {
+                    ReplaySpeed::Times(_) => {
+                        if !self.wait_until(self.clock.to_host(arrival)) {
+                            return;
+                        }
+                    }
+                    // The newest bytes always come now.
+                    ReplaySpeed::Fastest => {
+                        if self.stopping() {
+                            return;
+                        }
+                        self.clock = StreamClock { host: host_now(), stream: arrival, rate: 1.0 };
+                    }
+                }
+                match head.kind {
+                    Kind::Connected => {
+                        stream = LiveStream::new(raw.profile(), raw.datagrams());
+                        self.connected(arrival);
+                    }
+                    Kind::Bytes => {
+                        stream.push(payload, arrival, self);
+                        self.publish();
+                    }
+                    Kind::Disconnected => self.disconnected(arrival),
+                    Kind::Lost | Kind::End => {}
+                }
+            }
+            if !repeat {
+                return;
+            }
+            later = later + raw.period();
+            self.count(Counter::Loops, 1);
+        }
+    }
+
+    fn run_replay(&mut self, recording: &Recording, play: Play) {
+        let Play { speed, repeat, origin } = play;
+        self.shared.counters.add_faults(recording.faults().entries());
+        let begins = recording.begins();
+        if let ReplaySpeed::Times(rate) = speed {
+            self.clock = StreamClock { host: origin, stream: begins, rate };
+        }
+        let mut later = TimeNs(0);
+        loop {
+            for index in 0..recording.len() {
+                let mut sample = recording.sample(index);
+                sample.t_sample = sample.t_sample + later;
+                match speed {
+                    ReplaySpeed::Times(_) => {
+                        if !self.wait_until(self.clock.to_host(sample.t_sample)) {
+                            return;
+                        }
+                    }
+                    // The newest sample is always now.
+                    ReplaySpeed::Fastest => {
+                        if self.stopping() {
+                            return;
+                        }
+                        self.clock = StreamClock { host: host_now(), stream: sample.t_sample, rate: 1.0 };
+                    }
+                }
+                sample.t_arrival = host_now();
+                self.take(sample);
+                self.publish();
+            }
+            if !repeat {
+                return;
+            }
+            later = later + recording.period();
+            self.count(Counter::Loops, 1);
+        }
+    }
+
+    fn run_mock(&mut self, scenario: Scenario, origin: TimeNs) {
+        self.clock = StreamClock { host: origin, stream: TimeNs(0), rate: 1.0 };
+        for mock in MockSource::new(scenario, MOCK_SEED) {
+            let mut sample = mock.sample;
+            if !self.wait_until(self.clock.to_host(sample.t_sample)) {
+                return;
+            }
+            sample.t_arrival = host_now();
+            self.take(sample);
+            self.publish();
+        }
+    }
+
+    fn take(&mut self, sample: PupilSample) {
+        self.count(Counter::Samples, 1);
+        let Self { estimator, tap, shared, clock, record, arrivals_of_stream, .. } = self;
+        let mut tap = Tap { tap, record, clock: *clock, arrivals_of_stream: *arrivals_of_stream, shared };
+        estimator.push(sample, |decision| tap.note(decision));
+    }
+
+    fn finish(&mut self) {
+        let Self { estimator, tap, shared, clock, record, arrivals_of_stream, .. } = self;
+        let mut tap = Tap { tap, record, clock: *clock, arrivals_of_stream: *arrivals_of_stream, shared };
+        estimator.finish(|decision| tap.note(decision));
+        self.publish();
+        self.set_link(Link::Finished);
+    }
+
+    fn publish(&mut self) {
+        let mut snapshot = self.estimator.snapshot();
+        snapshot.set_clock(self.clock);
+        self.published.write(snapshot);
+    }
+
+    /// Waits until host time `t`; false if the tracker is to stop.
+    fn wait_until(&self, t: TimeNs) -> bool {
+        loop {
+            if self.stopping() {
+                return false;
+            }
+            let left = t - host_now();
+            if left.0 <= 0 {
+                return true;
+            }
+            thread::park_timeout(Duration::from_nanos(left.0.unsigned_abs()));
+        }
+    }
+
+    fn stopping(&self) -> bool {
+        self.shared.stop.load(Ordering::Acquire)
+    }
+
+    fn count(&self, counter: Counter, count: u64) {
+        self.shared.counters.add(counter, count);
+    }
+
+    fn link(&self) -> Link {
+        Link::ALL[usize::from(self.shared.link.load(Ordering::Relaxed))]
+    }
+
+    fn set_link(&self, link: Link) {
+        self.shared.link.store(link as u8, Ordering::Release);
+    }
+}
+
+/// Where decisions go.
+struct Tap<'a> {
+    tap: &'a mut rtrb::Producer<Decision>,
+    record: &'a mut Option<Taps>,
+    clock: StreamClock,
+    arrivals_of_stream: bool,
+    shared: &'a Shared,
+}
+
+impl Tap<'_> {
+    /// Counts a decision and hands it to the recording, as the stream has it, and to the tap, on the host's clock.
+    fn note(&mut self, mut decision: Decision) {
+        match decision.verdict {
+            Verdict::Accepted => self.shared.counters.add(Counter::Accepted, 1),
+            Verdict::Rejected(reason) => self.shared.counters.add_rejected(reason),
+        }
+        if let Some(record) = self.record {
+            record.decision(decision);
+        }
+        let sample = &mut decision.sample;
+        sample.t_sample = self.clock.to_host(sample.t_sample);
+        if self.arrivals_of_stream {
+            sample.t_arrival = self.clock.to_host(sample.t_arrival);
+        }
+        if self.tap.push(decision).is_err() {
+            self.shared.counters.add(Counter::DecisionsDropped, 1);
+        }
+    }
+}
+
+/// What one connection has brought: decoder, running numbers, clock.
+struct LiveStream {
+    decoder: Box<dyn Decoder>,
+    sequence: SequenceTracker,
+    clock: ClockModel,
+    datagrams: bool,
+}
+
+impl LiveStream {
+    fn new(profile: &Profile, datagrams: bool) -> Self {
+        Self { decoder: profile.decoder(), sequence: SequenceTracker::new(), clock: ClockModel::new(), datagrams }
+    }
+
+    fn push(&mut self, bytes: &[u8], arrival: TimeNs, worker: &mut Worker) {
+        worker.count(Counter::Bytes, bytes.len() as u64);
+        let Self { decoder, sequence, clock, datagrams } = self;
+        let mut take = |event| match event {
+            WireEvent::Sample(sample) => {
+                let resets = clock.resets();
+                if let Some(number) = sample.sequence {
+                    worker.count_sequence(sequence.next(number, sample.eye));
+                }
+                worker.take(to_sample(&sample, arrival, clock));
+                worker.count(Counter::ClockResets, clock.resets() - resets);
+            }
+            WireEvent::Note => worker.count(Counter::Notes, 1),
+            WireEvent::Partial => worker.count(Counter::Partials, 1),
+            WireEvent::Clock(t_device) => {
+                clock.observe(t_device, arrival);
+                worker.count(Counter::Notes, 1);
+            }
+            WireEvent::Rejected(fault) => worker.shared.counters.add_fault(LogFault::Wire(fault), 1),
+        };
+        decoder.push(bytes, &mut take);
+        if *datagrams {
+            decoder.finish(&mut take);
+        }
+        worker.shared.clock.set(clock.report());
+    }
+}
+
+impl Worker {
+    fn count_sequence(&self, event: SequenceEvent) {
+        match event {
+            SequenceEvent::InOrder => {}
+            SequenceEvent::Gap(missing) => {
+                self.count(Counter::SequenceGaps, 1);
+                self.count(Counter::SequenceMissing, missing);
+            }
+            SequenceEvent::Repeat => self.count(Counter::SequenceRepeats, 1),
+            SequenceEvent::Restart => self.count(Counter::SequenceRestarts, 1),
+        }
+    }
+}
+
+fn to_sample(wire: &WireSample, arrival: TimeNs, clock: &mut ClockModel) -> PupilSample {
+    PupilSample {
+        t_device: wire.t_device.unwrap_or(arrival),
+        t_sample: wire.t_device.map_or(arrival, |t_device| clock.map(t_device, arrival)),
+        t_arrival: arrival,
+        eye: wire.eye,
+        diameter_mm: wire.diameter_mm,
+        confidence: wire.confidence,
+        aperture_mm: wire.aperture_mm,
+        sequence: wire.sequence,
+        valid: wire.valid,
+    }
+}

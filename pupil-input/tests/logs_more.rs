@@ -1,0 +1,631 @@
+//! Logs of Tobii, Gazepoint, PupilEXT, BIDS and the Lab Streaming Layer, made here in the layout of real ones.
+
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use holod_calibration::TimeNs;
+use holod_pupil_input::wire::WireFault;
+use holod_pupil_input::{Blink, LogFault, LogFormat, Recording, ReplayError, SampleEye, SizeUnit};
+use proptest::prelude::*;
+use tempfile::TempDir;
+
+const MS: i64 = 1_000_000;
+
+fn written(dir: &TempDir, name: &str, content: impl AsRef<[u8]>) -> PathBuf {
+    let path = dir.path().join(name);
+    std::fs::create_dir_all(path.parent().expect("a folder")).expect("makes folders");
+    std::fs::write(&path, content).expect("writes");
+    path
+}
+
+fn read(content: impl AsRef<[u8]>) -> Recording {
+    let dir = TempDir::new().expect("a folder");
+    Recording::read(&written(&dir, "log", content)).expect("reads")
+}
+
+fn gzip(content: impl AsRef<[u8]>) -> Vec<u8> {
+    let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());
+    encoder.write_all(content.as_ref()).expect("a Vec takes all");
+    encoder.finish().expect("a Vec takes all")
+}
+
+fn utf16(text: &str) -> Vec<u8> {
+    format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect()
+}
+
+/// Time, eye and diameter of each sample; None where the log says that the pupil was lost.
+fn samples(recording: &Recording) -> Vec<(i64, SampleEye, Option<f32>)> {
+    recording.samples().map(|s| (s.t_sample.0, s.eye, s.valid.then_some(s.diameter_mm))).collect()
+}
+
+fn of_eye(recording: &Recording, eye: SampleEye) -> Vec<(i64, Option<f32>)> {
+    samples(recording).into_iter().filter(|row| row.1 == eye).map(|row| (row.0, row.2)).collect()
+}
+
+fn noted(recording: &Recording, words: &str) -> bool {
+    recording.notes().iter().any(|note| note.contains(words))
+}
+
+use SampleEye::{Both, Left, Right};
+
+// Tobii.
+
+/// A Pro Lab export of 60 Hz: gyroscope and event rows between the eye tracker's, the right eye lost from row 10 to 14,
+/// the last rows of another participant.
+fn tobii(time: &str, per_ms: f64, unit: &str) -> String {
+    let mut text = format!(
+        "{time}\tComputer timestamp\tSensor\tParticipant name\tRecording name\tEvent\tEvent value\tGaze point X\t\
+         Pupil diameter left{unit}\tPupil diameter right{unit}\tValidity left\tValidity right\tEye movement type\r\n"
+    );
+    let stamp = |row: i32| (f64::from(row) * 16.667 * per_ms).round();
+    writeln!(text, "0\t0\t\tP1\tRec 1\tRecordingStart\tsaid \"go\t\t\t\t\t\t\r").expect("a String takes all");
+    for row in 0..50 {
+        let (right, validity) = if (10..15).contains(&row) { ("", "Invalid") } else { ("3.50", "Valid") };
+        writeln!(
+            text,
+            "{t}\t{t}\tEye Tracker\tP1\tRec 1\t\t\t960\t{left:.2}\t{right}\tValid\t{validity}\tFixation\r",
+            t = stamp(row),
+            left = 3.0 + 0.01 * f64::from(row),
+        )
+        .expect("a String takes all");
+        writeln!(text, "{}\t0\tGyroscope\tP1\tRec 1\t\t\t\t\t\t\t\tFixation\r", stamp(row) + 1.0).expect("writes");
+    }
+    for row in 0..5 {
+        writeln!(text, "{}\t0\tEye Tracker\tP2\tRec 1\t\t\t1\t9.0\t9.0\tValid\tValid\tFixation\r", stamp(row))
+            .expect("a String takes all");
+    }
+    text
+}
+
+fn judge_tobii(recording: &Recording, step_ns: f64) {
+    assert_eq!((recording.format(), recording.unit()), (LogFormat::Tobii, SizeUnit::Millimetres));
+    assert_eq!(recording.faults().total(), 0);
+    let (left, right) = (of_eye(recording, Left), of_eye(recording, Right));
+    assert_eq!((left.len(), right.len()), (50, 50));
+    for (row, (left, right)) in left.iter().zip(&right).enumerate() {
+        assert!((left.0 as f64 - row as f64 * step_ns).abs() <= 500_500.0, "{row}: {left:?}");
+        assert!((left.1.expect("valid") - (3.0 + 0.01 * row as f32)).abs() < 1e-5, "{left:?}");
+        assert_eq!(right.1, (!(10..15).contains(&row)).then_some(3.5));
+    }
+    assert!(noted(recording, "5 rows of others"), "{:?}", recording.notes());
+}
+
+#[test]
+fn tobii_pro_lab_reads_in_each_of_its_dialects() {
+    let step_ns = 16.667e6;
+    let us = tobii("Recording timestamp [\u{3bc}s]", 1e3, " [mm]");
+    judge_tobii(&read(&us), step_ns);
+    judge_tobii(&read(format!("\u{feff}{us}")), step_ns);
+    judge_tobii(&read(utf16(&us)), step_ns);
+    judge_tobii(&read(gzip(utf16(&us))), step_ns);
+    judge_tobii(&read(tobii("Recording timestamp [ms]", 1.0, "")), step_ns);
+    // Without a unit the steps tell.
+    for (per_ms, told) in [(1.0, "milliseconds"), (1e3, "microseconds")] {
+        let recording = read(tobii("Recording timestamp", per_ms, ""));
+        judge_tobii(&recording, step_ns);
+        assert!(noted(&recording, told), "{:?}", recording.notes());
+    }
+    // A comma for the point.
+    judge_tobii(&read(us.replace("3.", "3,")), step_ns);
+    // Saved again with semicolons.
+    judge_tobii(&read(us.replace("said \"go", "").replace('\t', ";")), step_ns);
+}
+
+#[test]
+fn tobii_studio_reads_with_its_names_and_validity_codes() {
+    let header = "ParticipantName\tMediaName\tRecordingTimestamp\tGazePointIndex\tPupilLeft\tPupilRight\tValidityLeft\tValidityRight\t\n";
+    let rows = "P03\t\t3\t1\t2,80\t2,62\t0\t0\t\nP03\t\t19\t2\t2,81\t-1,00\t1\t4\t\nP03\t\t36\t3\t2,82\t2,6\t2\t3\t\n\
+                P03\t\t40\t\t\t\t\t\t\nP03\t\t53\t4\tx\t2,60\t0\t0\t\nP03\t\tsoon\t5\t2,8\t2,6\t0\t0\t\nP03\n";
+    let recording = read(format!("{header}{rows}"));
+    assert_eq!(
+        of_eye(&recording, Left),
+        [(3 * MS, Some(2.8)), (19 * MS, Some(2.81)), (36 * MS, None)],
+        "{:?}",
+        recording.notes()
+    );
+    assert_eq!(
+        of_eye(&recording, Right),
+        [(3 * MS, Some(2.62)), (19 * MS, None), (36 * MS, None), (53 * MS, Some(2.6))]
+    );
+    assert_eq!(recording.faults().of(LogFault::BadNumber), 2);
+    assert_eq!(recording.faults().of(LogFault::Malformed), 1);
+    assert_eq!(recording.faults().total(), 3);
+    assert!(noted(&recording, "2 times an eye is valid and has no diameter"), "{:?}", recording.notes());
+}
+
+// Gazepoint.
+
+const GAZEPOINT_EYES: &str = "LPCX,LPCY,LPD,LPS,LPV,RPCX,RPCY,RPD,RPS,RPV";
+
+/// 60 Hz; the left eye lost and blink 7 from row 20 to 25, its length told in row 26; TIME starts again at row 30.
+fn gazepoint(millimetres: bool) -> String {
+    let more = if millimetres { ",BKID,BKDUR,BKPMIN,LPMM,LPMMV,RPMM,RPMMV" } else { "" };
+    let mut text = format!(
+        "MEDIA_ID,MEDIA_NAME,CNT,TIME(2020/11/03 12:00:00.000),TIMETICK(f=10000000),FPOGX,FPOGY,{GAZEPOINT_EYES}{more},\r\n"
+    );
+    for row in 0..60 {
+        let (media, time_s) = if row < 30 { (0, row) } else { (1, row - 30) };
+        let time_s = f64::from(time_s) / 60.0;
+        let tick = 696_216_388_878_i64 + i64::from(row) * 10_000_000 / 60;
+        let seen = u8::from(!(20..26).contains(&row));
+        write!(
+            text,
+            "{media},\"a, b\",{row},{time_s:.5},{tick},0.5,0.5,0.4,0.6,{:.3},1.05,{seen},0.6,0.6,18.2,1.06,1",
+            if seen == 1 { 18.3 } else { 0.0 }
+        )
+        .expect("a String takes all");
+        if millimetres {
+            let (id, lasted_s) = (if seen == 1 { 0 } else { 7 }, if row == 26 { 0.1 } else { 0.0 });
+            let left = if seen == 1 { 3.5 } else { 0.0 };
+            write!(text, ",{id},{lasted_s:.5},12,{left:.5},{seen},3.56681,1").expect("a String takes all");
+        }
+        text.push_str(",\r\n");
+    }
+    text
+}
+
+#[test]
+fn gazepoint_reads_on_its_tick_clock_with_each_blink_once() {
+    let recording = read(gazepoint(true));
+    assert_eq!((recording.format(), recording.unit()), (LogFormat::Gazepoint, SizeUnit::Millimetres));
+    assert_eq!((recording.faults().total(), recording.len()), (0, 120));
+    let tick = |row: i64| (696_216_388_878 + row * 10_000_000 / 60) * 100;
+    let left = of_eye(&recording, Left);
+    assert_eq!((left[0], left[59]), ((tick(0), Some(3.5)), (tick(59), Some(3.5))));
+    assert!((0..60).all(|row| left[row].1.is_none() == (20..26).contains(&row)));
+    assert_eq!(of_eye(&recording, Right)[22], (tick(22), Some(3.56681)));
+    let blink = Blink { eye: Both, begins: TimeNs(tick(20)), ends: TimeNs(tick(25)) };
+    assert_eq!(recording.blinks(), [blink]);
+    assert!(noted(&recording, "2020/11/03 12:00:00.000"));
+}
+
+#[test]
+fn gazepoint_without_millimetres_or_ticks_reads_what_there_is() {
+    let recording = read(gazepoint(false));
+    assert_eq!((recording.unit(), recording.len()), (SizeUnit::Pixels, 120));
+    assert_eq!(of_eye(&recording, Left)[19].1, Some(18.3));
+    // A tick clock that stands still is none: then the times that start again go backwards.
+    let mut standing = String::new();
+    for line in gazepoint(true).lines() {
+        let cells: Vec<_> = line.split(',').collect();
+        let cells = cells.iter().map(|cell| if cell.starts_with("6962163") { "0" } else { cell });
+        standing.extend(cells.flat_map(|cell| [cell, ","]).chain(["\n"]));
+    }
+    let recording = read(standing);
+    assert_eq!(of_eye(&recording, Right)[1].0, 16_670_000);
+    assert_eq!(recording.faults().of(LogFault::Backwards), 58);
+}
+
+#[test]
+fn gazepoint_blinks_are_told_by_length_where_there_is_no_number() {
+    let mut text = String::from("CNT,TIME,LPMM,LPMMV,BKDUR\n");
+    for row in 0..100_i64 {
+        // The length stays until row 60 in the first, one row in the second.
+        let lasted_s = if (40..60).contains(&row) { "0.2" } else { ["0", "0.15"][usize::from(row == 80)] };
+        writeln!(text, "{row},{:.2},3.1,1,{lasted_s}", row as f64 * 0.01).expect("a String takes all");
+    }
+    let recording = read(text);
+    let blink = |from: i64, to: i64| Blink { eye: Both, begins: TimeNs(from * MS), ends: TimeNs(to * MS) };
+    assert_eq!(recording.blinks(), [blink(200, 400), blink(650, 800)]);
+}
+
+// PupilEXT.
+
+const PUPILEXT: &str = "filename,timestamp_ms,algorithm,diameter_px,undistortedDiameter_px,physicalDiameter_mm,width_px,height_px,\
+                        axisRatio,center_x,center_y,angle_deg,circumference_px,confidence,outlineConfidence";
+const PUPILEXT_STEREO: &str = "filename,timestamp_ms,algorithm,diameterMain_px,diameterSec_px,undistortedDiameterMain_px,undistortedDiameterSec_px,\
+                               physicalDiameter_mm,confidenceMain,outlineConfidenceMain,confidenceSec,outlineConfidenceSec";
+
+#[test]
+fn pupilext_reads_millimetres_where_it_has_them_and_pixels_where_not() {
+    let row = |t: i64, px: &str, flat: &str, mm: &str, confidence: &str, outline: &str| {
+        format!("1.bmp,{t},PuRe,{px},{flat},{mm},40,41,0.97,1,2,3,130,{confidence},{outline}\n")
+    };
+    let t = 1_600_000_000_000;
+    let lost = row(t, "-1", "-1", "-1", "-1", "-1");
+    let calibrated = format!(
+        "{PUPILEXT}\n{lost}{}{}",
+        row(t + 8, "40.5", "40.6", "4.25", "0.9", "0.8"),
+        row(t + 16, "41", "41", "4.3", "-1", "0.7")
+    );
+    for text in [calibrated.clone(), calibrated.replace(',', ";").replace('.', ","), calibrated.replace(',', "\t")] {
+        let recording = read(text);
+        assert_eq!((recording.format(), recording.unit()), (LogFormat::PupilExt, SizeUnit::Millimetres));
+        let expected = [(t * MS, Both, None), ((t + 8) * MS, Both, Some(4.25)), ((t + 16) * MS, Both, Some(4.3))];
+        assert_eq!(samples(&recording), expected);
+        assert_eq!(recording.samples().map(|s| s.confidence).collect::<Vec<_>>(), [1.0, 0.9, 0.7]);
+    }
+    let plain = format!("{PUPILEXT}\n{lost}{}", row(t + 8, "40.5", "-1", "-1", "0.9", "0.8"));
+    let recording = read(plain);
+    assert_eq!(recording.unit(), SizeUnit::Pixels);
+    assert_eq!(samples(&recording)[1].2, Some(40.5));
+    assert!(noted(&recording, "not calibrated"));
+}
+
+#[test]
+fn pupilext_with_two_views_is_one_pupil_and_with_two_pupils_two() {
+    let recording = read(format!(
+        "{PUPILEXT_STEREO}\nx,10,PuRe,40,41,-1,-1,4.5,0.9,0.8,0.7,0.6\nx,20,PuRe,-1,41,-1,-1,-1,-1,-1,0.7,0.6\n"
+    ));
+    assert_eq!(samples(&recording), [(10 * MS, Both, Some(4.5)), (20 * MS, Both, None)]);
+    assert_eq!(recording.samples().next().map(|s| s.confidence), Some(0.9));
+    assert!(noted(&recording, "two cameras"));
+    let two = "filename,timestamp_ms,algorithm,diameterA_px,diameterB_px,undistortedDiameterA_px,undistortedDiameterB_px,physicalDiameterA_mm,physicalDiameterB_mm,confidenceA,confidenceB\n\
+               x,10,PuRe,40,41,-1,-1,-1,-1,0.5,0.6\nx,20,PuRe,40\n";
+    let recording = read(two);
+    assert_eq!(
+        samples(&recording),
+        [(10 * MS, Left, Some(40.0)), (10 * MS, Right, Some(41.0)), (20 * MS, Left, Some(40.0))]
+    );
+    assert_eq!(recording.faults().of(LogFault::Malformed), 1);
+    assert!(noted(&recording, "A is taken for the left"));
+}
+
+// BIDS.
+
+const SIDECAR: &str = r#"{
+    "Columns": ["timestamp", "x_coordinate", "y_coordinate", "pupil_size"],
+    "PhysioType": "eyetrack", "RecordedEye": "right", "SamplingFrequency": 1000,
+    "timestamp": {"Units": "ms", "Origin": "System startup"},
+    "pupil_size": {"Description": "Diameter as the tracker gives it", "Units": "arbitrary"}
+}"#;
+const TABLE: &str =
+    "7186799\t416.29\t267.39\t4612.0\n7186800\tn/a\tn/a\tn/a\n7186801\t416.2\t269\t0.0\n7186802\t415\t269\t4623\n";
+const STEM: &str = "sub-01/func/sub-01_task-search_recording-eye1_physio";
+
+fn bids(files: &[(&str, &[u8])]) -> Result<Recording, ReplayError> {
+    let dir = TempDir::new().expect("a folder");
+    let paths: Vec<_> = files.iter().map(|(name, content)| written(&dir, name, content)).collect();
+    Recording::read(&paths[0])
+}
+
+#[test]
+fn bids_reads_what_its_sidecar_says() {
+    let table = format!("{STEM}.tsv.gz");
+    let recording = bids(&[(&table, &gzip(TABLE)), (&format!("{STEM}.json"), SIDECAR.as_bytes())]).expect("reads");
+    assert_eq!((recording.format(), recording.unit()), (LogFormat::Bids, SizeUnit::Arbitrary));
+    assert_eq!(recording.stated_rate_hz(), Some(1000.0));
+    let at = |ms: i64| (7_186_799 + ms) * MS;
+    let expected =
+        [(at(0), Right, Some(4612.0)), (at(1), Right, None), (at(2), Right, None), (at(3), Right, Some(4623.0))];
+    assert_eq!(samples(&recording), expected);
+    assert_eq!(recording.faults().total(), 0);
+
+    // Not packed; an area; millimetres; another eye; a clock of ticks that the sidecar does not explain.
+    let plain = |sidecar: &str, table: &str| {
+        bids(&[("x_recording-eye1_physio.tsv", table.as_bytes()), ("x_recording-eye1_physio.json", sidecar.as_bytes())])
+    };
+    let recording =
+        plain(&SIDECAR.replace("Diameter as", "Pupil area as").replace("\"right\"", "\"cyclopean\""), TABLE)
+            .expect("reads");
+    let area_of = 2.0 * (4612.0_f64 / std::f64::consts::PI).sqrt();
+    assert_eq!(samples(&recording)[0], (at(0), Both, Some(area_of as f32)));
+    assert!(noted(&recording, "areas were made diameters"));
+    let recording = plain(&SIDECAR.replace("arbitrary", "mm").replace("\"ms\"", "\"ns\""), TABLE).expect("reads");
+    assert_eq!((recording.unit(), recording.begins()), (SizeUnit::Millimetres, TimeNs(7_186_799)));
+    let recording = plain(&SIDECAR.replace("\"ms\"", "\"ticks\"").replace("1000", "250"), TABLE).expect("reads");
+    assert_eq!(recording.ends() - recording.begins(), TimeNs(12 * MS));
+    assert!(noted(&recording, "the unit `ticks`"), "{:?}", recording.notes());
+
+    // No clock at all: rows at the rate, from the start time on.
+    let sidecar = r#"{"Columns": ["pupil_size"], "SamplingFrequency": 500, "StartTime": -1.5, "RecordedEye": "left", "pupil_size": {"Units": "pixels"}}"#;
+    let recording = plain(sidecar, "20.5\nn/a\n\n21\nx\n").expect("reads");
+    assert_eq!(
+        samples(&recording),
+        [(-1500 * MS, Left, Some(20.5)), (-1498 * MS, Left, None), (-1496 * MS, Left, Some(21.0))]
+    );
+    assert_eq!(recording.unit(), SizeUnit::Pixels);
+    assert_eq!(recording.faults().of(LogFault::BadNumber), 1);
+
+    // Both eyes in one file, in nanoseconds, as some converters write it.
+    let sidecar = r#"{"Columns": ["timestamp", "left_pupil_diameter", "right_pupil_diameter"], "RecordedEye": "cyclopean",
+        "SamplingFrequency": 200, "timestamp": {"Units": "ns"}, "left_pupil_diameter": {"Units": "mm"}, "right_pupil_diameter": {"Units": "mm"}}"#;
+    let recording = plain(sidecar, "1700000000000000001\t3.5\t3.6\n1700000000005000001\t3.5\t3.6\n").expect("reads");
+    assert_eq!(
+        samples(&recording)[..2],
+        [(1_700_000_000_000_000_001, Left, Some(3.5)), (1_700_000_000_000_000_001, Right, Some(3.6))]
+    );
+}
+
+#[test]
+fn bids_sidecars_are_inherited_and_the_nearer_wins() {
+    let table = format!("{STEM}.tsv");
+    let recording = bids(&[
+        (&table, TABLE.as_bytes()),
+        ("dataset_description.json", b"{}"),
+        ("task-search_recording-eye1_physio.json", SIDECAR.as_bytes()),
+        ("task-other_recording-eye1_physio.json", b"not even JSON"),
+        ("sub-01/sub-01_recording-eye1_physio.json", br#"{"RecordedEye": "left"}"#),
+    ]);
+    assert_eq!(of_eye(&recording.expect("reads"), Left).len(), 4);
+
+    let message = bids(&[(&table, TABLE.as_bytes())]).expect_err("refused").to_string();
+    assert!(message.contains(&format!("{STEM}.json")) && message.contains("Columns"), "{message}");
+    let message = bids(&[(&table, TABLE.as_bytes()), (&format!("{STEM}.json"), b"{\n\"Columns\": [")])
+        .expect_err("refused")
+        .to_string();
+    assert!(message.contains("line 2"), "{message}");
+    let gaze = SIDECAR.replace(", \"pupil_size\"]", "]");
+    let message = bids(&[(&table, TABLE.as_bytes()), (&format!("{STEM}.json"), gaze.as_bytes())])
+        .expect_err("refused")
+        .to_string();
+    assert!(message.contains("no pupils"), "{message}");
+}
+
+#[test]
+fn bids_reads_the_other_eye_and_the_blinks_of_both() {
+    let left = SIDECAR.replace("\"right\"", "\"left\"");
+    let eye2 = STEM.replace("eye1", "eye2");
+    let eye3 = STEM.replace("eye1", "eye3");
+    let events = r#"{"Columns": ["onset", "duration", "trial_type", "blink", "message"], "OnsetSource": "timestamp"}"#;
+    let called = "7186700\tn/a\tn/a\tn/a\t\"RECCFG\"\n7186800\t2\tblink\tn/a\tn/a\n7186799\t3\tsaccade\t1\tn/a\n";
+    let shut = "7186799\t2\tsaccade\t1\tn/a\n7186900\t2\tsaccade\t0\tn/a\n";
+    let recording = bids(&[
+        (&format!("{STEM}.tsv.gz"), &gzip(TABLE)),
+        (&format!("{STEM}.json"), SIDECAR.as_bytes()),
+        (&format!("{STEM}events.tsv.gz"), &gzip(called)),
+        (&format!("{STEM}events.json"), events.as_bytes()),
+        (&format!("{eye2}.tsv.gz"), &gzip(TABLE.replace("4612", "4000"))),
+        (&format!("{eye2}.json"), left.as_bytes()),
+        (&format!("{eye2}events.tsv.gz"), &gzip(shut)),
+        (&format!("{eye2}events.json"), events.as_bytes()),
+        (&format!("{eye3}.tsv.gz"), &gzip(TABLE)),
+        (&format!("{eye3}.json"), SIDECAR.replace("\"right\"", "\"cyclopean\"").as_bytes()),
+    ])
+    .expect("reads");
+    let at = |ms: i64| TimeNs((7_186_799 + ms) * MS);
+    assert_eq!(of_eye(&recording, Right)[0], (at(0).0, Some(4612.0)));
+    assert_eq!(of_eye(&recording, Left)[0], (at(0).0, Some(4000.0)));
+    assert_eq!(recording.len(), 8);
+    let blink = |eye, begins, ends| Blink { eye, begins: at(begins), ends: at(ends) };
+    assert_eq!(recording.blinks(), [blink(Left, 0, 2), blink(Right, 1, 3)]);
+    assert!(noted(&recording, "eye2_physio.tsv.gz was read too"), "{:?}", recording.notes());
+
+    // Onsets that are rows.
+    let rows = r#"{"Columns": ["onset", "duration", "trial_type"], "OnsetSource": "n/a"}"#;
+    let sidecar = r#"{"Columns": ["pupil_size"], "SamplingFrequency": 500, "StartTime": 10, "RecordedEye": "left"}"#;
+    let recording = bids(&[
+        ("x_physio.tsv", b"1\n2\n3\n"),
+        ("x_physio.json", sidecar.as_bytes()),
+        ("x_physioevents.tsv", b"1\t0.004\tBlink\n"),
+        ("x_physioevents.json", rows.as_bytes()),
+    ])
+    .expect("reads");
+    assert_eq!(recording.blinks(), [Blink { eye: Left, begins: TimeNs(10_002 * MS), ends: TimeNs(10_006 * MS) }]);
+}
+
+// The Lab Streaming Layer.
+
+fn chunk(tag: u16, content: &[u8]) -> Vec<u8> {
+    let length = content.len() as u64 + 2;
+    let head = match u8::try_from(length) {
+        Ok(length) => vec![1, length],
+        Err(_) if length < 70_000 => [&[4][..], &(length as u32).to_le_bytes()].concat(),
+        Err(_) => [&[8][..], &length.to_le_bytes()].concat(),
+    };
+    [&head, &tag.to_le_bytes()[..], content].concat()
+}
+
+fn stream_header(id: u32, name: &str, kind: &str, rate_hz: f64, format: &str, channels: &[[&str; 4]]) -> Vec<u8> {
+    let mut xml = format!(
+        "<?xml version=\"1.0\"?><info><name>{name}</name><type>{kind}</type><channel_count>{}</channel_count>\
+         <nominal_srate>{rate_hz}</nominal_srate><channel_format>{format}</channel_format><desc><channels>",
+        channels.len()
+    );
+    for [label, eye, kind, unit] in channels {
+        write!(xml, "<channel><label>{label}</label><eye>{eye}</eye><type>{kind}</type><unit>{unit}</unit></channel>")
+            .expect("a String takes all");
+    }
+    xml.push_str("</channels></desc></info>");
+    chunk(2, &[&id.to_le_bytes()[..], xml.as_bytes()].concat())
+}
+
+/// Samples of doubles; those without a time have theirs left out.
+fn doubles(id: u32, rows: &[(Option<f64>, &[f64])]) -> Vec<u8> {
+    let mut content = [&id.to_le_bytes()[..], &[4], &(rows.len() as u32).to_le_bytes()].concat();
+    for (t_s, figures) in rows {
+        match t_s {
+            None => content.push(0),
+            Some(t_s) => content.extend([8].into_iter().chain(t_s.to_le_bytes())),
+        }
+        content.extend(figures.iter().flat_map(|figure| figure.to_le_bytes()));
+    }
+    chunk(3, &content)
+}
+
+fn offset(id: u32, at_s: f64, offset_s: f64) -> Vec<u8> {
+    chunk(4, &[&id.to_le_bytes()[..], &at_s.to_le_bytes(), &offset_s.to_le_bytes()].concat())
+}
+
+const BOUNDARY: [u8; 16] =
+    [0x43, 0xA5, 0x46, 0xDC, 0xCB, 0xF5, 0x41, 0x0F, 0xB3, 0x0E, 0xD5, 0x46, 0x73, 0x83, 0xCB, 0xE4];
+
+fn xdf(chunks: &[Vec<u8>]) -> Vec<u8> {
+    let header = chunk(1, b"<?xml version=\"1.0\"?><info><version>1.0</version></info>");
+    [b"XDF:".to_vec(), header, chunks.concat()].concat()
+}
+
+const RELAY: [[&str; 4]; 7] = [
+    ["confidence", "both", "Confidence", "normalized"],
+    ["norm_pos_x", "both", "ScreenX", "normalized"],
+    ["norm_pos_y", "both", "ScreenY", "normalized"],
+    ["diameter0_2d", "right", "Diameter", "pixels"],
+    ["diameter1_2d", "left", "Diameter", "pixels"],
+    ["diameter0_3d", "right", "Diameter", "mm"],
+    ["diameter1_3d", "left", "Diameter", "mm"],
+];
+
+fn relay() -> Vec<Vec<u8>> {
+    let nan = f64::NAN;
+    let right = |t, mm, confidence| (Some(t), [confidence, 0.5, 0.5, 40.0, nan, mm, nan]);
+    let left = |t, mm, confidence| (Some(t), [confidence, 0.5, 0.5, nan, 41.0, nan, mm]);
+    let rows = [right(10.0, 3.5, 0.9), left(10.004, 3.25, 0.8), right(10.008, 3.5, 0.0), left(10.012, nan, 0.8)];
+    let rows: Vec<(Option<f64>, &[f64])> = rows.iter().map(|(t_s, row)| (*t_s, &row[..])).collect();
+    vec![
+        stream_header(1, "pupil_capture", "Gaze", 0.0, "double64", &RELAY),
+        stream_header(2, "pupil_capture_pupillometry_only", "Gaze", 0.0, "double64", &RELAY),
+        stream_header(3, "Markers", "Markers", 0.0, "string", &[["", "", "", ""]]),
+        chunk(3, &[&3_u32.to_le_bytes()[..], &[1, 1, 0, 1, 5], b"hello"].concat()),
+        doubles(2, &rows),
+        doubles(1, &[(Some(10.0), &[1.0, 0.0, 0.0, 1.0, 1.0, 9.0, 9.0])]),
+        chunk(5, &BOUNDARY),
+        chunk(6, &[&2_u32.to_le_bytes()[..], b"<info><sample_count>4</sample_count></info>"].concat()),
+    ]
+}
+
+#[test]
+fn xdf_of_pupil_capture_reads_each_eye_in_its_turn() {
+    let recording = read(xdf(&relay()));
+    assert_eq!((recording.format(), recording.unit()), (LogFormat::Xdf, SizeUnit::Millimetres));
+    let s = |t_ms: i64| (10_000 + t_ms) * MS;
+    assert_eq!(samples(&recording), [(s(0), Right, Some(3.5)), (s(4), Left, Some(3.25)), (s(8), Right, Some(3.5))]);
+    assert_eq!(recording.samples().map(|s| s.confidence).collect::<Vec<_>>(), [0.9, 0.8, 0.0]);
+    assert!(noted(&recording, "`pupil_capture_pupillometry_only` of type `Gaze`: right, left"));
+    assert!(
+        noted(&recording, "other streams: `pupil_capture` of type `Gaze`, `Markers` of type `Markers`"),
+        "{:?}",
+        recording.notes()
+    );
+    assert_eq!(samples(&read(gzip(xdf(&relay())))), samples(&recording));
+}
+
+#[test]
+fn xdf_times_are_completed_and_put_on_the_recorders_clock() {
+    // Radii and areas of floats at 100 Hz, the left lost in the second sample; one late packet among the offsets.
+    let channels = [
+        ["L pupil", "", "Radius", "meters"],
+        ["right_pupil_area", "right", "Area", "px"],
+        ["R pupil", "right", "Radius", "meters"],
+    ];
+    let row =
+        |left: f32, right: f32| [left, 1.0, right].iter().flat_map(|figure| figure.to_le_bytes()).collect::<Vec<_>>();
+    let mut content = [&7_u32.to_le_bytes()[..], &[1, 3, 8], &100.0_f64.to_le_bytes()].concat();
+    content.extend([row(0.0015, 0.002), vec![0], row(f32::NAN, 0.002), vec![0], row(0.0016, -1.0)].concat());
+    let mut chunks = vec![stream_header(7, "tracker", "Eye", 100.0, "float32", &channels)];
+    for k in 0..20 {
+        let at_s = 50.0 + 5.0 * f64::from(k);
+        chunks.push(offset(7, at_s, 1000.0 + 1e-4 * (at_s - 100.0) + if k == 5 { 0.5 } else { 0.0 }));
+    }
+    chunks.push(chunk(3, &content));
+    let recording = read(xdf(&chunks));
+    assert_eq!(recording.stated_rate_hz(), Some(100.0));
+    let expected = [
+        (0, Left, Some(3.0)),
+        (0, Right, Some(4.0)),
+        (10, Left, None),
+        (10, Right, Some(4.0)),
+        (20, Left, Some(3.2)),
+        (20, Right, None),
+    ];
+    for (sample, expected) in samples(&recording).iter().zip(expected) {
+        let t_ns = 1_100_000 * MS + expected.0 * MS;
+        assert!((sample.0 - t_ns).abs() < 10_000, "{} us off", (sample.0 - t_ns) / 1000);
+        assert_eq!((sample.1, sample.2.map(|mm| (mm * 1e4).round() / 1e4)), (expected.1, expected.2));
+    }
+    assert_eq!(recording.len(), 6);
+}
+
+#[test]
+fn xdf_that_is_damaged_reads_on_behind_the_next_boundary() {
+    let chunks = relay();
+    let mut damaged = chunks[..4].to_vec();
+    damaged.push(vec![3, 0, 0, 0, 9, 9]);
+    damaged.push(chunk(5, &BOUNDARY));
+    // A chunk that says more samples than it holds.
+    damaged.push(chunk(3, &[&2_u32.to_le_bytes()[..], &[1, 200, 8, 0, 0]].concat()));
+    damaged.push(chunks[4].clone());
+    let whole = xdf(&damaged);
+    let recording = read(&whole);
+    assert_eq!(recording.len(), 3);
+    assert_eq!(recording.faults().of(LogFault::Wire(WireFault::OutOfStep)), 1);
+    assert_eq!(recording.faults().of(LogFault::Wire(WireFault::TooShort)), 1);
+    // Cut off within the last sample.
+    let recording = read(&whole[..whole.len() - 70]);
+    assert_eq!(recording.len(), 2);
+    assert_eq!(recording.faults().of(LogFault::Wire(WireFault::TooShort)), 2);
+
+    let refused = |content: Vec<u8>| {
+        let dir = TempDir::new().expect("a folder");
+        Recording::read(&written(&dir, "log", content)).expect_err("refused").to_string()
+    };
+    let message = refused(xdf(&chunks[2..4]));
+    assert!(message.contains("no pupil among 1 streams (`Markers`"), "{message}");
+    assert!(refused(xdf(&[])).contains("no pupil among 0 streams"));
+    // Nesting as deep as a header may be.
+    let deep = [&9_u32.to_le_bytes()[..], "<a>".repeat(1 << 19).as_bytes()].concat();
+    assert!(refused(xdf(&[chunk(2, &deep)])).contains("no pupil"));
+}
+
+// All of them.
+
+#[test]
+fn a_line_without_end_is_read_past() {
+    let long = "x".repeat(3 << 20);
+    let recording =
+        read(tobii("Recording timestamp [ms]", 1.0, "").replacen("0\t0\t\tP1", &format!("{long}\t0\t\tP1"), 1));
+    assert_eq!(recording.faults().of(LogFault::Wire(WireFault::TooLong)), 1);
+    assert_eq!(of_eye(&recording, Left).len(), 50);
+}
+
+/// Whatever is done to a log, it is read or refused.
+fn survives(content: &[u8], sidecar: Option<&str>) {
+    let dir = TempDir::new().expect("a folder");
+    let path = written(&dir, "x_recording-eye1_physio.tsv", content);
+    if let Some(sidecar) = sidecar {
+        written(&dir, "x_recording-eye1_physio.json", sidecar);
+    }
+    if let Ok(recording) = Recording::read(Path::new(&path)) {
+        assert!(!recording.is_empty());
+        for sample in recording.samples().filter(|sample| sample.valid) {
+            assert!(sample.diameter_mm.is_finite() && sample.diameter_mm >= 0.0, "{sample:?}");
+            assert!((0.0..=1.0).contains(&sample.confidence), "{sample:?}");
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, cases: 400, ..ProptestConfig::default() })]
+
+    #[test]
+    fn a_mutated_log_of_any_format_is_read_or_refused(
+        which in 0..8_usize,
+        edits in proptest::collection::vec((any::<proptest::sample::Index>(), any::<u8>(), 0..4_u8), 0..12),
+        cut in any::<proptest::sample::Index>(),
+        cuts in proptest::bool::weighted(0.3),
+    ) {
+        let mut content = match which {
+            0 => tobii("Recording timestamp", 1.0, "").into_bytes(),
+            1 => utf16(&tobii("Recording timestamp [ms]", 1.0, "")),
+            2 => gazepoint(true).into_bytes(),
+            3 => format!("{PUPILEXT}\n{}", "x,10,PuRe,40,41,4.5,40,41,0.9,1,2,3,130,0.9,0.8\n".repeat(9)).into_bytes(),
+            4 => TABLE.into(),
+            5 => gzip(TABLE),
+            6 => xdf(&relay()),
+            _ => b"t_ns,eye,diameter_mm,confidence,aperture_mm,valid\n1,left,3.5,1,,1\n2,left,,0,7.5,0\n".to_vec(),
+        };
+        for (index, byte, kind) in &edits {
+            let at = index.index(content.len());
+            match kind {
+                0 => content[at] = *byte,
+                1 => content.insert(at, *byte),
+                2 => content[at] ^= 1 << (byte % 8),
+                _ => { content.remove(at); }
+            }
+        }
+        if cuts {
+            content.truncate(cut.index(content.len()));
+        }
+        survives(&content, Some(SIDECAR));
+    }
+
+    #[test]
+    fn a_mutated_sidecar_is_used_or_refused(at in any::<proptest::sample::Index>(), byte in any::<u8>()) {
+        let mut sidecar = SIDECAR.as_bytes().to_vec();
+        let at = at.index(sidecar.len());
+        sidecar[at] = byte;
+        survives(TABLE.as_bytes(), Some(&String::from_utf8_lossy(&sidecar)));
+    }
+}

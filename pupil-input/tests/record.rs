@@ -1,0 +1,222 @@
+//! Runs that are written down and played again.
+
+mod support;
+
+use std::fs;
+use std::io::Write as _;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use holod_calibration::{TimeNs, rig};
+use holod_pupil_input::wire::line::{LineSample, encode_line};
+use holod_pupil_input::{
+    Counter, Decision, LogFormat, MockSource, RecordFiles, Recording, SampleEye, Scenario, Tracker, TrackerHandle,
+    TrackerOptions, host_now,
+};
+use serialport::{SerialPort, TTYPort};
+use tempfile::TempDir;
+
+fn start(spec: &str, record: Option<RecordFiles>) -> TrackerHandle {
+    let settings = rig::Tracker { eye: rig::Eye::Both, ..rig::Rig::default().tracker };
+    let options = TrackerOptions { origin: host_now(), record, forbidden: Vec::new() };
+    Tracker::start(&spec.parse().expect("a spec"), &settings, options).expect("starts")
+}
+
+fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
+    let begun = Instant::now();
+    while !holds() {
+        assert!(begun.elapsed() < Duration::from_secs(30), "never came: {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// Both eyes with blinks, as protocol lines, with rubbish between.
+fn lines() -> String {
+    let mut text = String::new();
+    for mock in MockSource::new(Scenario::Blinks, 5).take(1200) {
+        let sample = mock.sample;
+        let (sequence, device_us) = (sample.sequence.expect("the mock counts"), sample.t_device.0 / 1000);
+        let (eye, diameter_mm, confidence) = (sample.eye, sample.diameter_mm, sample.confidence);
+        encode_line(&LineSample { sequence, device_us, eye, diameter_mm, confidence }, &mut text);
+        if sequence % 97 == 0 && eye == SampleEye::Left {
+            text.push_str("# a comment\nrubbish\n");
+        }
+    }
+    text
+}
+
+/// Sends `text` through a PTY in pieces that respect no line, some 3 s of samples in a good second.
+fn send(tracker: &mut TTYPort, text: &str, handle: &TrackerHandle) {
+    let before = handle.counters().of(Counter::Bytes);
+    for piece in text.as_bytes().chunks(211) {
+        tracker.write_all(piece).expect("writes");
+        std::thread::sleep(Duration::from_millis(3));
+    }
+    eventually("all bytes", || handle.counters().of(Counter::Bytes) == before + text.len() as u64);
+}
+
+fn decisions(handle: &mut TrackerHandle) -> Vec<Decision> {
+    std::iter::from_fn(|| handle.decisions().pop()).collect()
+}
+
+/// A run with a reconnect, recorded into `folder`; its decisions.
+fn recorded_run(folder: &Path) -> Vec<Decision> {
+    let text = lines();
+    let (first, second) = text.split_at(text.len() / 2 + 7);
+    let link = folder.join("port");
+    let plug = || {
+        let (tracker, port) = TTYPort::pair().expect("a PTY");
+        std::os::unix::fs::symlink(port.name().expect("a path"), &link).expect("links");
+        (tracker, port)
+    };
+    let (mut tracker, port) = plug();
+    let mut handle = start(&link.display().to_string(), Some(RecordFiles::in_folder(folder)));
+    drop(port);
+    send(&mut tracker, first, &handle);
+    fs::remove_file(&link).expect("unlinks");
+    drop(tracker);
+    eventually("the loss", || handle.counters().of(Counter::Disconnects) == 1);
+    let (mut tracker, port) = plug();
+    eventually("the return", || handle.counters().of(Counter::Connects) == 2);
+    drop(port);
+    send(&mut tracker, second, &handle);
+    handle.stop();
+    let status = handle.recording().expect("it is recorded");
+    assert_eq!((status.chunks_lost, status.decisions_lost, status.failure), (0, 0, None));
+    decisions(&mut handle)
+}
+
+#[test]
+fn a_recorded_run_plays_again_bit_for_bit() {
+    let folder = TempDir::new().expect("a folder");
+    let live = recorded_run(folder.path());
+    assert!(live.len() > 1000, "{}", live.len());
+    let raw = folder.path().join("tracker.holodraw");
+    let samples = fs::read_to_string(folder.path().join("samples.csv")).expect("reads");
+    assert_eq!(samples.lines().count(), live.len() + 1);
+
+    let again = folder.path().join("again.csv");
+    let files = RecordFiles { raw: None, samples: Some(again.clone()) };
+    let mut handle = start(&format!("replay:{},speed=max", raw.display()), Some(files));
+    eventually("the end", || handle.finished());
+    handle.stop();
+    assert_eq!(handle.warnings(), [""; 0]);
+    let counters = handle.counters();
+    assert_eq!((counters.of(Counter::Connects), counters.of(Counter::Disconnects)), (2, 1));
+    assert!(counters.faults_in_all() > 0 && counters.of(Counter::Notes) > 0);
+    assert_eq!(fs::read_to_string(&again).expect("reads"), samples);
+    // What the tap tells is the same but for its times, which are those of the host that plays.
+    let played = decisions(&mut handle);
+    assert_eq!(played.len(), live.len());
+    for (live, played) in live.iter().zip(&played) {
+        let (a, b) = (live.sample, played.sample);
+        assert_eq!(live.verdict, played.verdict);
+        assert_eq!(a.diameter_mm.to_bits(), b.diameter_mm.to_bits());
+        assert_eq!((a.t_device, a.eye, a.sequence, a.valid), (b.t_device, b.eye, b.sequence, b.valid));
+        assert_eq!(a.t_arrival - a.t_sample, b.t_arrival - b.t_sample);
+    }
+}
+
+#[test]
+fn one_wrong_byte_in_a_recording_is_not_played() {
+    let folder = TempDir::new().expect("a folder");
+    recorded_run(folder.path());
+    let raw = folder.path().join("tracker.holodraw");
+    let samples = fs::read_to_string(folder.path().join("samples.csv")).expect("reads");
+    let mut bytes = fs::read(&raw).expect("reads");
+    let at = bytes.len() / 2;
+    bytes[at] ^= 1;
+    fs::write(&raw, &bytes).expect("writes");
+
+    let again = folder.path().join("again.csv");
+    let files = RecordFiles { raw: None, samples: Some(again.clone()) };
+    let mut handle = start(&format!("replay:{},speed=max", raw.display()), Some(files));
+    eventually("the end", || handle.finished());
+    handle.stop();
+    let [warning] = handle.warnings() else { panic!("{:?}", handle.warnings()) };
+    assert!(warning.contains("is torn: its last"), "{warning}");
+    let played = fs::read_to_string(&again).expect("reads");
+    assert_ne!(played, samples);
+    // The gate decides on a sample by its successors too, so the last rows before the tear may differ.
+    let (played, samples): (Vec<_>, Vec<_>) = (played.lines().collect(), samples.lines().collect());
+    let same = played.iter().zip(&samples).take_while(|(a, b)| a == b).count();
+    assert!(played.len() < samples.len() && same + 100 > played.len() && same > 100, "{same} of {}", played.len());
+}
+
+#[test]
+fn a_run_that_was_killed_keeps_what_had_come() {
+    let folder = TempDir::new().expect("a folder");
+    let (mut tracker, port) = TTYPort::pair().expect("a PTY");
+    let handle = start(&port.name().expect("a path"), Some(RecordFiles::in_folder(folder.path())));
+    send(&mut tracker, &lines(), &handle);
+    let in_all = handle.counters().of(Counter::Samples) as usize;
+    // The files as a killed process would leave them: copied while it runs.
+    let raw = folder.path().join("tracker.holodraw");
+    let copy = folder.path().join("copy.holodraw");
+    eventually("the writer", || {
+        fs::copy(&raw, &copy).expect("copies");
+        Recording::read(&copy).is_ok_and(|log| log.len() == in_all)
+    });
+    let log = Recording::read(&copy).expect("reads");
+    assert_eq!(log.format(), LogFormat::Raw);
+    assert!(log.notes().iter().any(|note| note.contains("was cut off")), "{:?}", log.notes());
+    assert!(log.faults().total() > 0);
+
+    let bytes = fs::read(&copy).expect("reads");
+    fs::write(&copy, &bytes[..bytes.len() - 5]).expect("writes");
+    let torn = Recording::read(&copy).expect("reads");
+    assert!(torn.notes().iter().any(|note| note.contains("is torn")), "{:?}", torn.notes());
+    assert!(torn.len() < log.len() && torn.len() + 20 > log.len());
+    drop(handle);
+    let whole = Recording::read(&raw).expect("reads");
+    assert_eq!(whole.notes().len(), 1, "{:?}", whole.notes());
+    assert_eq!(whole.len(), in_all);
+}
+
+#[test]
+fn nothing_is_overwritten_and_what_cannot_be_made_is_told() {
+    let folder = TempDir::new().expect("a folder");
+    let settings = rig::Rig::default().tracker;
+    let refused = |files: RecordFiles| {
+        let options = TrackerOptions { record: Some(files), ..TrackerOptions::from(host_now()) };
+        Tracker::start(&"mock:steady".parse().expect("a spec"), &settings, options).expect_err("refused").to_string()
+    };
+    let path = folder.path().join("samples.csv");
+    fs::write(&path, "mine").expect("writes");
+    let message = refused(RecordFiles { raw: None, samples: Some(path.clone()) });
+    assert!(message.contains("nothing is overwritten"), "{message}");
+    assert_eq!(fs::read_to_string(&path).expect("reads"), "mine");
+    let message = refused(RecordFiles { raw: None, samples: Some(folder.path().join("none/samples.csv")) });
+    assert!(message.contains("make the folder first"), "{message}");
+}
+
+#[test]
+fn the_mock_has_samples_and_no_bytes() {
+    let folder = TempDir::new().expect("a folder");
+    let mut handle = start("mock:steady", Some(RecordFiles::in_folder(folder.path())));
+    assert!(handle.warnings()[0].contains("no bytes to record"), "{:?}", handle.warnings());
+    eventually("samples", || handle.counters().of(Counter::Accepted) > 50);
+    handle.stop();
+    let samples = fs::read_to_string(folder.path().join("samples.csv")).expect("reads");
+    assert_eq!(samples.lines().count() as u64, 1 + handle.counters().of(Counter::Samples));
+    assert!(!folder.path().join("tracker.holodraw").exists());
+}
+
+#[test]
+fn a_full_disk_is_told_and_the_run_goes_on() {
+    let files = RecordFiles { raw: None, samples: Some("/dev/full".into()) };
+    let options = TrackerOptions { record: Some(files), ..TrackerOptions::from(host_now()) };
+    let refused = Tracker::start(&"mock:steady".parse().expect("a spec"), &rig::Rig::default().tracker, options);
+    assert!(refused.expect_err("a device is there already").to_string().contains("/dev/full"));
+}
+
+#[test]
+fn a_recording_without_bytes_says_so() {
+    let folder = TempDir::new().expect("a folder");
+    let (_tracker, port) = TTYPort::pair().expect("a PTY");
+    start(&port.name().expect("a path"), Some(RecordFiles::in_folder(folder.path()))).stop();
+    let raw = folder.path().join("tracker.holodraw");
+    let spec = format!("replay:{}", raw.display()).parse().expect("a spec");
+    let error = Tracker::start(&spec, &rig::Rig::default().tracker, TimeNs(0)).expect_err("empty").to_string();
+    assert!(error.contains("no bytes came"), "{error}");
+}
