@@ -168,6 +168,18 @@ impl ClockModel {
         host
     }
 
+    /// Takes a reading of the device's clock that came by itself, as the answer to a question. It delays no sample and is
+    /// mapped to nothing, but the line cannot lie above it: where samples take long to be made, as those of a camera do, it
+    /// lies below theirs by as much, so that they are mapped to when they were taken.
+    pub fn observe(&mut self, device: TimeNs, arrival: TimeNs) {
+        let offset_ns = arrival.0.saturating_sub(device.0);
+        // One far above is late, or the clock was set back, which the samples will tell.
+        let late = |line: &Line| offset_ns.saturating_sub(line.offset_at(device)) > STRAY_ABOVE.0;
+        if self.line.noted == 0 || !late(&self.line) {
+            self.line.note(device, offset_ns, arrival);
+        }
+    }
+
     /// Starts anew, as after a reconnect.
     pub fn forget(&mut self) {
         *self = Self { resets: self.resets, ..Self::new() };

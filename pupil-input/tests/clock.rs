@@ -334,3 +334,42 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn readings_of_the_clock_tell_a_delay_that_all_samples_have() {
+    let errors_ms = |with_readings: bool| {
+        let mut model = ClockModel::new();
+        let mut errors_ms = Vec::new();
+        for k in 0..2000 {
+            let now = BEGINS + k * 5 * MS;
+            if with_readings && k % 50 == 0 {
+                model.observe(TimeNs(k * 5 * MS - MS), TimeNs(now));
+            }
+            // Published 40 ms after its image, or up to 3 ms later.
+            let taken = now - 40 * MS - (k * 7919 % 4) * MS;
+            errors_ms.push((model.map(TimeNs(taken - BEGINS), TimeNs(now)).0 - taken) / MS);
+        }
+        assert_eq!(model.resets(), 0);
+        errors_ms.split_off(200)
+    };
+    assert!(errors_ms(true).iter().all(|error_ms| (0..=2).contains(error_ms)));
+    assert!(errors_ms(false).iter().all(|error_ms| *error_ms >= 38));
+}
+
+#[test]
+fn wrong_readings_do_no_lasting_harm() {
+    let mut model = ClockModel::new();
+    let mut errors = Vec::new();
+    for k in 0..2000 {
+        let now = BEGINS + k * 5 * MS;
+        match k {
+            400 => model.observe(TimeNs(i64::MAX), TimeNs(now)),
+            600 => model.observe(TimeNs(i64::MIN), TimeNs(now)),
+            800 => model.observe(TimeNs(k * 5 * MS + 10 * S), TimeNs(now)),
+            _ => {}
+        }
+        errors.push(model.map(TimeNs(k * 5 * MS), TimeNs(now)).0 - now);
+    }
+    assert!(errors[590..800].iter().all(|error| error.abs() < MS));
+    assert!(errors[1000..].iter().all(|error| error.abs() < MS));
+}

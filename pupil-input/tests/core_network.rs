@@ -11,9 +11,13 @@ use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use holod_calibration::TimeNs;
 use holod_pupil_input::wire::WireFault;
 use holod_pupil_input::{Counter, Link, LogFault, PupilState, Rejection, host_now};
 use network::{eventually, refused, start, tracks};
+
+/// What Capture needs from an image to its pupil.
+const PIPELINE_S: f64 = 0.04;
 
 /// A Pupil Capture: its Pupil Remote and its publisher.
 struct Capture {
@@ -29,8 +33,16 @@ struct Shared {
     /// How often it was asked for the time.
     asked: AtomicU64,
     publish_port: u16,
+    begun: TimeNs,
     open: Mutex<Vec<TcpStream>>,
     subscribers: Mutex<Vec<TcpStream>>,
+}
+
+impl Shared {
+    /// Pupil's time, which may begin anywhere.
+    fn pupil_time_s(&self) -> f64 {
+        (host_now() - self.begun).seconds() - 300_000.0
+    }
 }
 
 impl Capture {
@@ -43,6 +55,7 @@ impl Capture {
             answers: AtomicBool::new(true),
             asked: AtomicU64::new(0),
             publish_port: publisher.local_addr().expect("bound").port(),
+            begun: host_now(),
             open: Mutex::default(),
             subscribers: Mutex::default(),
         });
@@ -149,7 +162,7 @@ fn answer_requests(stream: &mut TcpStream, shared: &Shared) -> io::Result<()> {
             b"SUB_PORT" => shared.publish_port.to_string(),
             b"t" => {
                 shared.asked.fetch_add(1, Ordering::Relaxed);
-                "1234.5678".into()
+                shared.pupil_time_s().to_string()
             }
             _ => "Unknown command.".into(),
         };
@@ -191,15 +204,14 @@ fn datum(eye: u8, t_s: f64, diameter_mm: Option<f64>, confidence: f64) -> Vec<u8
     bytes
 }
 
-/// Publishes steady samples of the left eye at about 200 Hz, and those of the 2-D detector, until `holds`.
+/// Publishes steady samples of the left eye at about 200 Hz, and those of the 2-D detector, until `holds`. Their images
+/// were taken [`PIPELINE_S`] before.
 fn publish_until(capture: &Capture, what: &str, mut holds: impl FnMut() -> bool) {
-    let begun = host_now();
     eventually(what, || {
-        // Pupil's clock may begin anywhere.
-        let t_s = (host_now() - begun).seconds() - 300_000.0;
+        let t_s = capture.shared.pupil_time_s() - PIPELINE_S;
         capture.publish("pupil.1.2d", &datum(1, t_s, None, 0.9));
         capture.publish("pupil.1.3d", &datum(1, t_s, Some(4.0), 0.9));
-        capture.publish("pupil.0.3d", &datum(0, t_s + 0.002, Some(7.0), 0.9));
+        capture.publish("pupil.0.3d", &datum(0, t_s - 0.002, Some(7.0), 0.9));
         holds()
     });
 }
@@ -248,6 +260,22 @@ fn published_pupils_are_followed_and_rubbish_is_counted() {
     capture.publish_raw(&whole[40..]);
     eventually("a lost pupil", || handle.counters().rejected(Rejection::Lost) > lost);
     assert_eq!(handle.counters().faults_in_all(), 8);
+}
+
+#[test]
+fn samples_are_put_to_the_time_of_their_images() {
+    let capture = Capture::start(0);
+    let mut handle = start(&capture.spec());
+    let mut delays_s = Vec::new();
+    publish_until(&capture, "delays of the pipeline", || {
+        while let Some(decision) = handle.decisions().pop() {
+            delays_s.push((decision.sample.t_arrival - decision.sample.t_sample).seconds());
+        }
+        // Arrival times alone would tell of no delay that all samples have.
+        let newest = &delays_s[delays_s.len().saturating_sub(50)..];
+        newest.iter().filter(|delay_s| **delay_s > PIPELINE_S / 2.0).count() >= 40
+    });
+    assert_eq!(handle.counters().of(Counter::ClockResets), 0);
 }
 
 #[test]

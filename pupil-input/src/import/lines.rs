@@ -24,7 +24,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
                 log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid: true }, line.number);
             }
             WireEvent::Rejected(fault) => log.count(LogFault::Wire(fault)),
-            WireEvent::Note | WireEvent::Partial => {}
+            WireEvent::Note | WireEvent::Partial | WireEvent::Clock(_) => {}
         };
         decoder.push(line.bytes, &mut take);
         decoder.finish(&mut take);

@@ -42,6 +42,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
                         log.push(LogSample { t, eye, diameter, confidence, aperture_mm, valid }, number);
                     }
                     WireEvent::Rejected(fault) => log.count(LogFault::Wire(fault)),
+                    WireEvent::Clock(t_device) => clock.observe(t_device, head.t),
                     WireEvent::Note | WireEvent::Partial => {}
                 };
                 decoder.push(payload, &mut take);

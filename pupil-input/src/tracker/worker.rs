@@ -334,6 +334,10 @@ impl LiveStream {
             }
             WireEvent::Note => worker.count(Counter::Notes, 1),
             WireEvent::Partial => worker.count(Counter::Partials, 1),
+            WireEvent::Clock(t_device) => {
+                clock.observe(t_device, arrival);
+                worker.count(Counter::Notes, 1);
+            }
             WireEvent::Rejected(fault) => worker.shared.counters.add_fault(LogFault::Wire(fault), 1),
         };
         decoder.push(bytes, &mut take);

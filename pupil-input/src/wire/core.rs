@@ -8,6 +8,10 @@
 //! are the gate's to judge.
 //!
 //! Confidence 0 is Pupil's word for "no pupil found".
+//!
+//! A map with `pupil_time` (seconds) is none of Pupil's: the link puts it between them where Pupil Remote has told the time,
+//! [`time_message`], so that a recording holds it too. The times of samples are those of their images, some tens of
+//! milliseconds before they are published; that alone tells how many.
 
 use holod_calibration::TimeNs;
 use rmp::Marker;
@@ -20,35 +24,38 @@ pub(crate) const MAX_MESSAGE_BYTES: usize = 4000;
 /// Maps and arrays in each other; Pupil's are three.
 const DEEPEST: usize = 16;
 
+/// What Pupil Remote said is Pupil's time, as a message of its own.
+pub(crate) fn time_message(t_s: f64) -> [u8; 21] {
+    let mut message = *b"\x81\xaapupil_time\xcb\0\0\0\0\0\0\0\0";
+    message[13..].copy_from_slice(&t_s.to_be_bytes());
+    message
+}
+
 /// One message a push; what a message lacks is not looked for in the next one.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct CoreDecoder;
 
 impl Decoder for CoreDecoder {
     fn push(&mut self, bytes: &[u8], on_event: &mut dyn FnMut(WireEvent)) {
-        on_event(match read_message(bytes) {
-            Ok(Some(sample)) => WireEvent::Sample(sample),
-            Ok(None) => WireEvent::Note,
-            Err(fault) => WireEvent::Rejected(fault),
-        });
+        on_event(read_message(bytes).unwrap_or_else(WireEvent::Rejected));
     }
 
     fn finish(&mut self, _on_event: &mut dyn FnMut(WireEvent)) {}
 }
 
-/// A sample, or `None` for a message that is well-formed and has no size in millimetres.
-fn read_message(message: &[u8]) -> Result<Option<WireSample>, WireFault> {
+fn read_message(message: &[u8]) -> Result<WireEvent, WireFault> {
     if message.len() > MAX_MESSAGE_BYTES {
         return Err(WireFault::TooLong);
     }
     let mut rest = Cursor { rest: message };
-    let (mut id, mut timestamp_s, mut confidence, mut diameter_mm) = (None, None, None, None);
+    let (mut id, mut timestamp_s, mut confidence, mut diameter_mm, mut time_s) = (None, None, None, None, None);
     for _ in 0..rest.map_len()? {
         let slot = match rest.key()? {
             b"id" => &mut id,
             b"timestamp" => &mut timestamp_s,
             b"confidence" => &mut confidence,
             b"diameter_3d" => &mut diameter_mm,
+            b"pupil_time" => &mut time_s,
             _ => {
                 rest.skip()?;
                 continue;
@@ -59,8 +66,11 @@ fn read_message(message: &[u8]) -> Result<Option<WireSample>, WireFault> {
     if !rest.rest.is_empty() {
         return Err(WireFault::Malformed);
     }
+    if let Some(time_s) = time_s {
+        return Ok(WireEvent::Clock(device_time(time_s)?));
+    }
     let Some(diameter_mm) = diameter_mm else {
-        return Ok(None);
+        return Ok(WireEvent::Note);
     };
     let (Some(id), Some(timestamp_s), Some(confidence)) = (id, timestamp_s, confidence) else {
         return Err(WireFault::MissingField);
@@ -70,16 +80,13 @@ fn read_message(message: &[u8]) -> Result<Option<WireSample>, WireFault> {
         1.0 => SampleEye::Left,
         _ => return Err(WireFault::BadEye),
     };
-    if !timestamp_s.is_finite() {
-        return Err(WireFault::NotFinite);
-    }
+    let t_device = device_time(timestamp_s)?;
     if !(0.0..=1.0).contains(&confidence) {
         return Err(WireFault::BadConfidence);
     }
     let seen = confidence > 0.0 && diameter_mm.is_finite() && diameter_mm > 0.0;
-    Ok(Some(WireSample {
-        // Saturates: a time is untrusted, and its origin means nothing.
-        t_device: Some(TimeNs((timestamp_s * 1e9).round() as i64)),
+    Ok(WireEvent::Sample(WireSample {
+        t_device: Some(t_device),
         eye,
         diameter_mm: diameter_mm as f32,
         confidence: confidence as f32,
@@ -87,6 +94,11 @@ fn read_message(message: &[u8]) -> Result<Option<WireSample>, WireFault> {
         sequence: None,
         valid: seen,
     }))
+}
+
+/// Saturates: a time is untrusted, and its origin means nothing.
+fn device_time(time_s: f64) -> Result<TimeNs, WireFault> {
+    if time_s.is_finite() { Ok(TimeNs((time_s * 1e9).round() as i64)) } else { Err(WireFault::NotFinite) }
 }
 
 /// MessagePack, read in place.
@@ -342,6 +354,12 @@ mod tests {
         let mut entries = message();
         entries.retain(|(key, _)| !matches!(*key, "diameter_3d" | "sphere" | "circle_3d"));
         assert_eq!(decode(&packed(&entries)), WireEvent::Note);
+    }
+
+    #[test]
+    fn pupil_remotes_time_is_a_reading_of_the_clock() {
+        assert_eq!(decode(&time_message(-1.25)), WireEvent::Clock(TimeNs(-1_250_000_000)));
+        assert_eq!(decode(&time_message(f64::NAN)), WireEvent::Rejected(WireFault::NotFinite));
     }
 
     #[test]

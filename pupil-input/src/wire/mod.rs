@@ -137,6 +137,8 @@ pub enum WireEvent {
     Rejected(WireFault),
     /// What was left of a message when reading began in its middle; not a fault.
     Partial,
+    /// The tracker's own clock, told by itself: it showed this, or a little more, when the bytes came.
+    Clock(TimeNs),
 }
 
 /// Bytes in, events out. After it is made it allocates nothing.

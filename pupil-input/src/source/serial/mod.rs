@@ -299,7 +299,7 @@ fn samples(heard: &[u8], profile: &Profile) -> u32 {
     profile.decoder().push(heard, &mut |event| match event {
         WireEvent::Sample(_) => samples += 1,
         WireEvent::Rejected(_) => rejected += 1,
-        WireEvent::Note | WireEvent::Partial => {}
+        WireEvent::Note | WireEvent::Partial | WireEvent::Clock(_) => {}
     });
     if samples > rejected { samples } else { 0 }
 }
