@@ -122,14 +122,16 @@ fn in_words(faults: &[Fault]) -> String {
 pub const DEFAULT_PROFILE: &str = "holod";
 
 /// By name.
-const FILES: [(&str, &str); 10] = [
+const FILES: [(&str, &str); 12] = [
     ("asl-eye-trac", include_str!("../../profiles/asl-eye-trac.toml")),
+    ("core", include_str!("../../profiles/core.toml")),
     ("example-lines", include_str!("../../profiles/example-lines.toml")),
     ("example-packet", include_str!("../../profiles/example-packet.toml")),
     ("holod", include_str!("../../profiles/holod.toml")),
     ("holod-hid", include_str!("../../profiles/holod-hid.toml")),
     ("iscan-etl", include_str!("../../profiles/iscan-etl.toml")),
     ("livetrack", include_str!("../../profiles/livetrack.toml")),
+    ("neon", include_str!("../../profiles/neon.toml")),
     ("open-gaze", include_str!("../../profiles/open-gaze.toml")),
     ("pupilext-csv", include_str!("../../profiles/pupilext-csv.toml")),
     ("pupilext-json", include_str!("../../profiles/pupilext-json.toml")),

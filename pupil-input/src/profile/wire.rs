@@ -25,7 +25,8 @@ pub(super) struct Context {
     pub(super) size_at: Option<Found<()>>,
 }
 
-const KINDS: [&str; 8] = ["holod", "delimited", "packet", "report", "iscan", "livetrack", "open-gaze", "pupilext"];
+const KINDS: [&str; 10] =
+    ["holod", "delimited", "packet", "report", "core", "iscan", "livetrack", "neon", "open-gaze", "pupilext"];
 /// Bytes of the longest sync word.
 const SYNC_MAX: usize = 16;
 
@@ -37,6 +38,8 @@ pub(super) fn read_wire<'a>(wire: &Section<'a>, context: &Context) -> Option<(Fo
     let configurable = ["delimited", "packet", "report", "iscan"].contains(&name);
     let read = match name {
         "holod" => Some((Format::Lines, SizeUnit::Millimetres)),
+        "core" => Some((Format::CoreMsgpack, SizeUnit::Millimetres)),
+        "neon" => Some((Format::NeonRtp, SizeUnit::Millimetres)),
         "delimited" => read_delimited(wire, context).map(|settings| (Format::Delimited(settings), context.unit)),
         "packet" => read_packet(wire, context).map(|settings| (Format::Packet(settings), context.unit)),
         "report" => read_report(wire, context).map(|settings| (Format::Report(settings), context.unit)),

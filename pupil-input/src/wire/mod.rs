@@ -157,6 +157,10 @@ pub enum Format {
     Packet(PacketSettings),
     /// Whole messages.
     Report(ReportSettings),
+    /// Pupil Labs Core's MessagePack maps.
+    CoreMsgpack,
+    /// Pupil Labs Neon's gaze stream, RTP and RTCP as RTSP interleaves them.
+    NeonRtp,
     /// ISCAN's binary packets.
     Iscan(IscanSettings),
     /// LiveTrack's rows.
@@ -175,6 +179,8 @@ impl Format {
             Self::Delimited(settings) => Box::new(DelimitedDecoder::joining(settings)),
             Self::Packet(settings) => Box::new(PacketDecoder::joining(settings)),
             Self::Report(settings) => Box::new(ReportDecoder::new(settings)),
+            Self::CoreMsgpack => Box::new(core::CoreDecoder),
+            Self::NeonRtp => Box::new(neon::NeonDecoder::new()),
             Self::Iscan(settings) => Box::new(IscanDecoder::new(settings.clone())),
             Self::LiveTrack(settings) => Box::new(LiveTrackDecoder::new(*settings)),
             Self::OpenGaze(settings) => Box::new(OpenGazeDecoder::new(*settings)),
