@@ -104,7 +104,7 @@ pub struct RunArgs {
         long,
         value_name = "SPEC",
         help = "Eye tracker: /dev/ttyUSB0, serial:PATH[,baud=N], replay:FILE[,speed=X|max][,loop], a log FILE, or \
-                mock[:SCENARIO]"
+                mock[:SCENARIO|:FILE]"
     )]
     pub tracker: Option<String>,
     /// The scene.

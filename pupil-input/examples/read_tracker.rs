@@ -25,8 +25,14 @@ fn read() -> Result<(), Box<dyn Error>> {
     let mut handle = Tracker::start(&spec.parse()?, &settings, host_now())?;
     let end = Instant::now() + Duration::from_secs_f64(seconds.parse()?);
     let mut sums = [(0_u32, 0.0); SampleEye::ALL.len()];
-    while Instant::now() < end {
+    let mut running = true;
+    while running {
         std::thread::sleep(Duration::from_millis(20));
+        running = Instant::now() < end;
+        if !running {
+            // The gate lets go of the samples that it still holds.
+            handle.stop();
+        }
         while let Some(decision) = handle.decisions().pop() {
             let (count, sum_mm) = &mut sums[decision.sample.eye.index()];
             *count += 1;

@@ -38,6 +38,7 @@ mod profile;
 mod record;
 mod sample;
 mod sequence;
+mod simulate;
 pub mod source;
 mod spec;
 mod tracker;
@@ -50,20 +51,23 @@ pub use estimator::{
 };
 pub use filter::FilterSettings;
 pub use gate::{GateSettings, Rejection, Verdict};
-pub use import::{Blink, LogFault, LogFaults, LogFormat, Recording, ReplayError, SizeUnit};
+pub use import::{
+    Blink, BlinkCounts, EyeInfo, FaultCount, LogFault, LogFaults, LogFormat, LogInfo, Range, Recording, ReplayError,
+    SizeUnit,
+};
 pub use profile::{Command, DEFAULT_PROFILE, HidSettings, NetworkSettings, Profile, ProfileError, SerialSettings};
 pub use record::{RecordError, RecordFiles, RecordStatus};
 pub use sample::{PupilSample, SampleEye};
-pub use source::mock::{MockSample, MockSource, Scenario};
+pub use simulate::{MOCK_SEED, MockSample, MockSource, Scenario, Script, ScriptError};
 
 pub use source::SourceError;
 pub use source::commands::CommandError;
 pub use source::hid::{HidError, RULE_FILE, udev_rule};
 pub use source::serial::SerialError;
 pub use source::serial::identity::{SerialPortInfo, UsbPort, serial_ports};
+pub use source::server::ServerError;
 pub use source::tcp::NetworkError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
 pub use tracker::{
-    DecisionTap, EstimateReader, Link, MOCK_SEED, Tracker, TrackerControl, TrackerError, TrackerHandle, TrackerOptions,
-    host_now,
+    DecisionTap, EstimateReader, Link, Tracker, TrackerControl, TrackerError, TrackerHandle, TrackerOptions, host_now,
 };

@@ -4,7 +4,7 @@ use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use crate::source::mock::Scenario;
+use crate::simulate::Scenario;
 
 /// A parsed tracker spec.
 #[derive(Clone, Debug, PartialEq)]
@@ -58,6 +58,8 @@ pub enum TrackerSpec {
     },
     /// `mock[:SCENARIO]`
     Mock(Scenario),
+    /// `mock:FILE`: the text of a [`Script`](crate::Script)
+    MockFile(PathBuf),
 }
 
 /// USB vendor and product.
@@ -128,7 +130,7 @@ const CORE_PORT: u16 = 50020;
 const NEON_PORT: u16 = 8080;
 const FORMS: &str = "`/dev/ttyUSB0`, `serial:PATH[,profile=NAME][,baud=N]`, `hid:VID:PID[,profile=NAME][,serial=TEXT]`, \
                      `tcp:HOST:PORT,profile=NAME`, `udp:HOST:PORT,profile=NAME`, `core[:HOST[:PORT]]`, \
-                     `neon[:HOST[:PORT]]`, `replay:FILE[,speed=X|max][,loop]`, a log file, or `mock[:SCENARIO]`";
+                     `neon[:HOST[:PORT]]`, `replay:FILE[,speed=X|max][,loop]`, a log file, or `mock[:SCENARIO|:FILE]`";
 
 impl FromStr for TrackerSpec {
     type Err = SpecError;
@@ -146,9 +148,7 @@ fn parse(spec: &str) -> Result<TrackerSpec, String> {
     match (scheme, rest) {
         ("", None) => Err(format!("is empty; expected {FORMS}")),
         ("mock", None) => Ok(TrackerSpec::Mock(Scenario::default())),
-        ("mock", Some(name)) => Scenario::by_name(name)
-            .map(TrackerSpec::Mock)
-            .ok_or_else(|| format!("no scenario `{name}`; there are {}", Scenario::ALL.map(Scenario::name).join(", "))),
+        ("mock", Some(name)) => parse_mock(name),
         ("serial", Some(rest)) => parse_serial(rest),
         ("replay", Some(rest)) => parse_replay(rest),
         ("serial" | "replay", None) => Err(format!("lacks a path: expected `{scheme}:PATH`")),
@@ -163,6 +163,17 @@ fn parse(spec: &str) -> Result<TrackerSpec, String> {
             Err(format!("unknown kind `{scheme}:`; expected {FORMS}"))
         }
         _ => Ok(TrackerSpec::Path(spec.into())),
+    }
+}
+
+fn parse_mock(name: &str) -> Result<TrackerSpec, String> {
+    match Scenario::by_name(name) {
+        Some(scenario) => Ok(TrackerSpec::Mock(scenario)),
+        None if name.contains(['/', '.']) => Ok(TrackerSpec::MockFile(name.into())),
+        None => {
+            let known = Scenario::ALL.map(Scenario::name).join(", ");
+            Err(format!("no scenario `{name}`; there are {known}, and files such as ./{name}.txt"))
+        }
     }
 }
 
@@ -308,6 +319,7 @@ impl fmt::Display for TrackerSpec {
                 if *repeat { f.write_str(",loop") } else { Ok(()) }
             }
             Self::Mock(scenario) => write!(f, "mock:{}", scenario.name()),
+            Self::MockFile(path) => write!(f, "mock:{}", path.display()),
         }
     }
 }
@@ -340,6 +352,7 @@ mod tests {
         );
         assert_eq!(parsed("mock"), TrackerSpec::Mock(Scenario::default()));
         assert_eq!(parsed("mock:blinks"), TrackerSpec::Mock(Scenario::Blinks));
+        assert_eq!(parsed("mock:my.txt"), TrackerSpec::MockFile("my.txt".into()));
     }
 
     #[test]
@@ -355,6 +368,7 @@ mod tests {
             "neon:neon.local:8080",
             "replay:a.csv,speed=0.5,loop",
             "mock:steady",
+            "mock:./steady",
         ] {
             assert_eq!(parsed(&parsed(spec).to_string()), parsed(spec));
         }

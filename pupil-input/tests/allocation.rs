@@ -1,7 +1,6 @@
 //! After its start the way from bytes to an estimate allocates nothing.
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
+mod counting;
 
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::wire::line::{LineDecoder, LineSample, encode_line};
@@ -10,34 +9,10 @@ use holod_pupil_input::{
     ClockModel, Estimator, EstimatorSettings, MockSource, Profile, PupilSample, SampleEye, Scenario,
 };
 
-/// The system's allocator, counting for each thread.
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: every call is passed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.set(ALLOCATIONS.get() + 1);
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
-
-#[global_allocator]
-static COUNTING: Counting = Counting;
-
 fn allocations_of(work: impl FnOnce()) -> u64 {
-    let before = ALLOCATIONS.get();
+    let before = counting::here();
     work();
-    ALLOCATIONS.get() - before
+    counting::here() - before
 }
 
 #[test]

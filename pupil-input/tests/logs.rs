@@ -1,5 +1,6 @@
 //! Logs: recognised by content, read whole or refused with a reason, and held through blinks.
 
+mod formats;
 mod support;
 
 use std::fmt::Write;
@@ -8,7 +9,10 @@ use std::path::{Path, PathBuf};
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::wire::WireFault;
 use holod_pupil_input::wire::line::{LineSample, crc8, encode_line};
-use holod_pupil_input::{Blink, LogFault, LogFormat, PupilSample, PupilState, Recording, ReplayError, SampleEye};
+use holod_pupil_input::{
+    Blink, LogFault, LogFormat, LogInfo, PupilSample, PupilState, Recording, ReplayError, SampleEye, SizeUnit,
+};
+use proptest::prelude::*;
 use support::{estimates, first_below, least_raw, neon_like_csv, settings};
 use tempfile::TempDir;
 
@@ -101,10 +105,11 @@ fn each_bad_cell_is_counted_by_its_reason() {
     assert_eq!(faults.of(LogFault::NotFinite), 2);
     assert_eq!(faults.of(LogFault::Negative), 1);
     assert_eq!(faults.of(LogFault::Backwards), 1);
-    assert_eq!(faults.of(LogFault::Missing), 1);
     assert_eq!(faults.of(LogFault::BadNumber), 2);
     assert_eq!(faults.of(LogFault::Malformed), 2);
-    assert_eq!(faults.total(), 9);
+    assert_eq!(faults.total(), 8);
+    // An empty cell with a time is an eye that is lost.
+    assert_eq!(recording.samples().filter(|sample| !sample.valid).count(), 1);
     let left: Vec<_> = recording.samples().filter(|s| s.eye == SampleEye::Left).map(|s| s.diameter_mm).collect();
     assert_eq!(left, [3.6, 3.6, 3.5]);
 }
@@ -163,6 +168,274 @@ fn blinks_of_the_companion_are_known_and_do_not_reach_the_samples() {
     assert!(recording.samples().all(|sample| sample.confidence == 1.0));
 }
 
+fn info(path: &Path) -> (Recording, LogInfo) {
+    let recording = Recording::read(path).expect("reads");
+    let info = LogInfo::of(&recording, None);
+    (recording, info)
+}
+
+/// What a log of [`formats::diameter_mm`] must be found to hold.
+fn assert_truth(info: &LogInfo, eyes: &[&str], rate_hz: f64, unit_mm: f32) {
+    assert_eq!(info.eyes.iter().map(|eye| eye.eye).collect::<Vec<_>>(), eyes);
+    assert_eq!(info.blinks.found, formats::BLINKS_S.len() as u64, "{info:?}");
+    assert!((info.duration_s - formats::LENGTH_S).abs() < 0.1, "{info:?}");
+    for eye in &info.eyes {
+        let found = eye.rate_hz.expect("a rate");
+        assert!((found / rate_hz - 1.0).abs() < 0.01, "{found} for {rate_hz}: {eye:?}");
+        assert_eq!((eye.gaps, eye.blinks_found), (0, Some(info.blinks.found)), "{eye:?}");
+        let range = eye.diameter.expect("a range");
+        for (read, expected) in [(range.p1, 3.7), (range.median, 4.0), (range.p99, 4.3)] {
+            assert!((read / unit_mm - expected).abs() < 0.05, "{range:?}");
+        }
+    }
+}
+
+#[test]
+#[should_panic(expected = "for 123")]
+fn the_judge_of_what_a_log_holds_sees_a_wrong_rate() {
+    let dir = TempDir::new().expect("a folder");
+    let (_, info) = info(&written(&dir, "log", formats::core(130.0, true)));
+    assert_truth(&info, &["left", "right"], 123.0, 1.0);
+}
+
+#[test]
+fn core_takes_the_3d_rows_of_both_eyes() {
+    let dir = TempDir::new().expect("a folder");
+    let (recording, info) = info(&written(&dir, "log", formats::core(123.0, true)));
+    assert_eq!((recording.format(), recording.unit()), (LogFormat::Core, SizeUnit::Millimetres));
+    assert_truth(&info, &["left", "right"], 123.0, 1.0);
+    assert!(recording.begins().0 < 0);
+    assert_eq!(recording.faults().total(), 0);
+    assert_eq!(info.notes.len(), 1);
+    assert!(info.notes[0].contains("2460 rows of 2-D detection are left out"), "{:?}", info.notes);
+    // In a blink the model says -0.1 mm, which is lost, and 16 mm with little confidence, which is handed on.
+    assert!(info.eyes[0].lost > 20 && info.eyes[0].unsure > 20);
+    assert!(recording.samples().any(|sample| sample.valid && sample.diameter_mm > 16.0));
+    assert!(recording.samples().all(|sample| !sample.valid || sample.diameter_mm > 0.0));
+}
+
+#[test]
+fn core_without_3d_rows_is_in_pixels() {
+    let dir = TempDir::new().expect("a folder");
+    let (recording, info) = info(&written(&dir, "log", formats::core(123.0, false)));
+    assert_eq!(recording.unit(), SizeUnit::Pixels);
+    assert_truth(&info, &["left", "right"], 123.0, 10.0);
+    assert!(info.notes[0].contains("pixels"), "{:?}", info.notes);
+}
+
+#[test]
+fn core_prefers_the_model_fitted_afterwards_and_reads_older_names() {
+    let header = "timestamp,index,id,confidence,norm_pos_x,norm_pos_y,diameter,method,diameter_3d\n";
+    let rows = "-1.5,0,0,0.9,0,0,40,2d c++,\n-1.5,0,0,0.9,0,0,41,pye3d 0.3.0 real-time,3.1\n\
+                -1.5,0,0,0.9,0,0,41,pye3d 0.3.0 post-hoc,3.2\n-1.4,0,0,0.9,0,0,41,pye3d 0.3.0 real-time,3.3\n\
+                -1.4,0,0,0,0,0,41,pye3d 0.3.0 post-hoc,3.4\n-1.3,0,2,0.9,0,0,41,pye3d 0.3.0 post-hoc,3\n\
+                -1.3,0,1,high,0,0,41,pye3d 0.3.0 post-hoc,3\n-1.3,0,1,1,0,0,41,pye3d 0.3.0 post-hoc,inf\n\
+                -1.2,0,1,1,0,0\n-1.1,0,1,1,0,0,41,pye3d 0.3.0 post-hoc,\n-1.2,0,1,1,0,0,41,pye3d 0.3.0 post-hoc,3\n";
+    let dir = TempDir::new().expect("a folder");
+    let (recording, info) = info(&written(&dir, "log", format!("{header}{rows}")));
+    let read: Vec<_> =
+        recording.samples().map(|sample| (sample.t_sample.0, sample.eye, sample.diameter_mm, sample.valid)).collect();
+    let expected = [
+        (-1_500_000_000, SampleEye::Right, 3.2, true),
+        (-1_400_000_000, SampleEye::Right, 3.4, false),
+        (-1_100_000_000, SampleEye::Left, 0.0, false),
+    ];
+    assert_eq!(read, expected);
+    assert!(info.notes[0].contains("2 rows of the live model and 1 of 2-D"), "{:?}", info.notes);
+    let faults: Vec<_> = info.faults.iter().map(|fault| (fault.name, fault.count)).collect();
+    let expected =
+        [("log_malformed", 1), ("log_bad_number", 1), ("log_not_finite", 1), ("log_backwards", 1), ("log_bad_eye", 1)];
+    assert_eq!(faults, expected);
+}
+
+#[test]
+fn eyelink_areas_and_diameters_are_read_of_one_eye_and_of_two() {
+    let dir = TempDir::new().expect("a folder");
+    for (rate_hz, eyes, area, named) in [
+        (500.0, "LR", true, vec!["left", "right"]),
+        (1000.0, "L", true, vec!["left"]),
+        (1000.0, "R", false, vec!["right"]),
+        (2000.0, "LR", false, vec!["left", "right"]),
+    ] {
+        let (recording, info) = info(&written(&dir, "log", formats::eyelink(rate_hz, eyes, area)));
+        assert_eq!((recording.format(), recording.unit()), (LogFormat::EyeLink, SizeUnit::Arbitrary));
+        assert_truth(&info, &named, rate_hz, 100.0);
+        assert_eq!((info.stated_rate_hz, info.blinks.told), (Some(rate_hz), info.blinks.found));
+        assert_eq!(recording.faults().total(), 0);
+        assert!(info.eyes.iter().all(|eye| eye.lost_runs == 3 && eye.blinks_told == 3), "{info:?}");
+        assert!(info.notes[0].contains("scale_mm_per_unit"), "{:?}", info.notes);
+    }
+}
+
+#[test]
+fn eyelink_blocks_keep_their_gap_and_a_clock_that_begins_anew_is_put_behind() {
+    let block = |begin: u32, rows: u32| {
+        let rows = (0..rows).map(|k| format!("{}\t  1.0\t  1.0\t  314.0\t...\n", begin + k)).collect::<String>();
+        format!(
+            "START\t{begin} \tRIGHT\tSAMPLES\tEVENTS\nPUPIL\tAREA\nSAMPLES\tGAZE\tRIGHT\tRATE\t1000.00\n\
+             MSG\t5 !V\n{rows}SBLINK R {0}\nEND\t{0} \tSAMPLES\n",
+            begin + 99
+        )
+    };
+    let text = format!("{}{}{}", block(1000, 100), block(9000, 100), block(200, 100));
+    let dir = TempDir::new().expect("a folder");
+    let (recording, info) = info(&written(&dir, "log", text));
+    let times: Vec<_> = recording.samples().map(|sample| sample.t_sample.0 / 1_000_000).collect();
+    assert_eq!((times[99], times[100], times[199], times[200]), (1099, 9000, 9099, 10_099));
+    assert_eq!((info.eyes[0].gaps, info.blinks.told, recording.faults().total()), (2, 3, 0));
+    assert_eq!(recording.blinks()[2].begins, TimeNs(10_198_000_000));
+    let notes = info.notes.join("\n");
+    assert!(notes.contains("3 blocks") && notes.contains("anew at 1 blocks"), "{notes}");
+}
+
+#[test]
+fn eyelink_exports_of_samples_alone_are_read() {
+    let two = "10\t  1.0\t  1.0\t  314.0\t  1.0\t  1.0\t    0.0\t.....\n11\t   .\t   .\t    0.0\t  1.0\t  1.0\t  314.0\t.C...\n";
+    let dir = TempDir::new().expect("a folder");
+    let (recording, info) = info(&written(&dir, "two", two));
+    let read: Vec<_> = recording.samples().map(|sample| (sample.eye, sample.valid)).collect();
+    let (left, right) = (SampleEye::Left, SampleEye::Right);
+    assert_eq!(read, [(left, true), (right, false), (left, false), (right, true)]);
+    assert!((recording.samples().next().expect("one").diameter_mm - 19.995).abs() < 0.001);
+    assert!(info.notes.iter().any(|note| note.contains("no header names the eyes")));
+    // Velocity and resolution of one eye are no second eye.
+    let one = "10.5\t  1.0\t  1.0\t  314.0\t  0.1\t  0.1\t 40.0\t 41.0\t...\n";
+    let recording = Recording::read(&written(&dir, "one", one)).expect("reads");
+    assert_eq!(recording.samples().map(|sample| sample.eye).collect::<Vec<_>>(), [SampleEye::Both]);
+    assert_eq!(recording.begins(), TimeNs(10_500_000));
+}
+
+#[test]
+fn eyelink_whole_milliseconds_at_2_khz_and_remote_columns_are_read() {
+    let header = "START\t10 \tLEFT\tSAMPLES\nPUPIL\tDIAMETER\nSAMPLES\tGAZE\tLEFT\tRATE\t2000.00\tINPUT\n";
+    let rest = "\t  1.0\t  1.0\t  900.0\t 127.0\t 3124.0\t 4567.0\t 650.4\t.............\n";
+    let rows: String = (0..8).map(|k| format!("{}{rest}", 10 + k / 2)).collect();
+    let dir = TempDir::new().expect("a folder");
+    let bad = "14\t  1.0\t  1.0\n15\t  1.0\t  1.0\t  -9.0\n1x\t  1.0\t  1.0\t  9.0\n16\t 1.0\t 1.0\tbig\n";
+    let (recording, info) = info(&written(&dir, "log", format!("{header}{rows}{bad}")));
+    let times: Vec<_> = recording.samples().map(|sample| sample.t_sample.0 / 500_000).collect();
+    assert_eq!(times, [20, 21, 22, 23, 24, 25, 26, 27]);
+    assert!(recording.samples().all(|sample| sample.diameter_mm == 900.0));
+    let faults: Vec<_> = info.faults.iter().map(|fault| (fault.name, fault.count)).collect();
+    assert_eq!(faults, [("log_malformed", 1), ("log_bad_number", 2), ("log_negative", 1)]);
+}
+
+#[test]
+fn smi_is_read_whatever_sets_its_columns_apart() {
+    let dir = TempDir::new().expect("a folder");
+    for (separator, comma) in [(';', false), (';', true), ('\t', false), ('\t', true), (',', false)] {
+        let text = formats::smi(60.0, separator, comma);
+        let utf16: Vec<u8> = format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect();
+        for bytes in [text.into_bytes(), utf16] {
+            let (recording, info) = info(&written(&dir, "log", bytes));
+            assert_eq!((recording.format(), recording.unit()), (LogFormat::Smi, SizeUnit::Millimetres));
+            assert_truth(&info, &["left", "right"], 60.0, 1.0);
+            assert_eq!((info.stated_rate_hz, info.blinks.told), (Some(60.0), 3));
+            assert_eq!((recording.faults().total(), info.eyes[0].lost_runs), (0, 3));
+        }
+    }
+}
+
+#[test]
+fn smi_in_pixels_gives_the_disc_of_the_ellipse_and_counts_bad_rows() {
+    let text = "## [iView]\r\nTime\tType\tTrial\tR Dia X [px]\tR Dia Y [px]\r\n1000\tSMP\t1\t16.00\t25.00\r\n\
+                2000\tMSG\t1\t# Message: go\r\n3000\tSMP\t1\t0.00\t0.00\r\n4000\tSMP\t1\t16.00\r\n\
+                5000\tSMP\t1\tx\t2\r\nsoon\tSMP\t1\t2\t2\r\n6000\tSMP\t1\t-1\t2\r\n7000\tSMP\t1\tnan\t2\r\n";
+    let dir = TempDir::new().expect("a folder");
+    let (recording, info) = info(&written(&dir, "log", text));
+    let read: Vec<_> = recording.samples().map(|s| (s.t_sample.0, s.eye, s.diameter_mm, s.valid)).collect();
+    assert_eq!(read, [(1_000_000, SampleEye::Right, 20.0, true), (3_000_000, SampleEye::Right, 0.0, false)]);
+    assert_eq!(recording.unit(), SizeUnit::Pixels);
+    let faults: Vec<_> = info.faults.iter().map(|fault| (fault.name, fault.count)).collect();
+    let expected = [("log_malformed", 1), ("log_bad_number", 2), ("log_not_finite", 1), ("log_negative", 1)];
+    assert_eq!(faults, expected);
+}
+
+#[test]
+fn neon_of_the_phone_is_read_with_its_companions() {
+    let dir = TempDir::new().expect("a folder");
+    let (states, times) = formats::neon_native(200.0);
+    let path = written(&dir, "eye_state ps1.raw", &states);
+    let refused = || Recording::read(&path).expect_err("refused").to_string();
+    assert!(refused().contains("no file `eye_state ps1.time`"), "{}", refused());
+    written(&dir, "eye_state ps1.time", &times[8..]);
+    assert!(refused().contains("2000 records of 80 bytes and 15992 bytes in"), "{}", refused());
+
+    written(&dir, "eye_state ps1.time", &times);
+    let mut blink = 4_i32.to_le_bytes().to_vec();
+    blink.extend([5_i64, 9].into_iter().flat_map(i64::to_le_bytes));
+    written(&dir, "blinks ps1.raw", [&blink[..], &blink[..7]].concat());
+    let (recording, info) = info(&path);
+    assert_eq!(recording.format(), LogFormat::NeonNative);
+    assert_truth(&info, &["left", "right"], 200.0, 1.0);
+    assert_eq!(recording.blinks(), [Blink { eye: SampleEye::Both, begins: TimeNs(5), ends: TimeNs(9) }]);
+    assert!(recording.samples().any(|sample| sample.aperture_mm.is_some_and(|lids| lids < 1.0)));
+    assert_eq!(recording.faults().total(), 0);
+
+    written(&dir, "eye_state.dtype", "[('pupil_diameter_left_mm', 'float64')]");
+    assert!(refused().contains("`eye_state.dtype` of another form"), "{}", refused());
+    let names: Vec<_> = (0..20)
+        .map(|k| match k {
+            0 => "('pupil_diameter_left_mm', 'float32')".into(),
+            19 => "('eyelid_aperture_right_mm', '<f4')".into(),
+            _ => format!("('field_{k}', '<f4')"),
+        })
+        .collect();
+    written(&dir, "eye_state.dtype", format!("[{}]", names.join(", ")));
+    let recording = Recording::read(&path).expect("reads");
+    assert!(recording.samples().all(|sample| sample.eye == SampleEye::Left && sample.aperture_mm.is_none()));
+}
+
+/// An example of each format, short enough to be spoilt often.
+fn examples() -> Vec<Vec<u8>> {
+    let short = |text: String| text.into_bytes()[..2500].to_vec();
+    let (states, _) = formats::neon_native(200.0);
+    vec![
+        short(neon_like_csv(3)),
+        short(as_lines(&neon_like()[..80])),
+        short(formats::core(123.0, true)),
+        short(formats::eyelink(500.0, "LR", true)),
+        short(formats::smi(60.0, ';', true)),
+        states[..1600].to_vec(),
+    ]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 96, ..ProptestConfig::default() })]
+
+    #[test]
+    fn no_spoilt_log_makes_an_importer_panic(
+        spoils in proptest::collection::vec((any::<u16>(), 0..4_u8, any::<u8>()), 0..12),
+        companion in any::<bool>(),
+    ) {
+        let dir = TempDir::new().expect("a folder");
+        for mut bytes in examples() {
+            for (at, how, value) in &spoils {
+                let at = usize::from(*at) % bytes.len();
+                let value = usize::from(*value);
+                match how {
+                    0 => bytes[at] = value as u8,
+                    1 => drop(bytes.drain(at..(at + value).min(bytes.len() - 1).max(at))),
+                    2 => {
+                        let odd: &[u8] = [&b"9999999999999999999"[..], b"-1e309\t.\t;,;\n\0nan"][value % 2];
+                        drop(bytes.splice(at..at, odd.iter().copied()));
+                    }
+                    _ => drop(bytes.splice(at..at, b"\n".repeat(value % 4))),
+                }
+            }
+            if companion {
+                written(&dir, "log.time", &bytes[..bytes.len() / 80 * 8]);
+            }
+            let path = written(&dir, "log", &bytes);
+            if let Ok(recording) = Recording::read(&path) {
+                let info = LogInfo::of(&recording, None);
+                prop_assert_eq!(info.eyes.iter().map(|eye| eye.samples).sum::<u64>(), recording.len() as u64);
+                prop_assert!(recording.samples().is_sorted_by_key(|sample| sample.t_sample));
+            }
+        }
+    }
+}
+
 fn shared_data() -> PathBuf {
     let default = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/data");
     std::env::var_os("HOLOD_SHARED_DATA").map_or_else(default, PathBuf::from)
@@ -190,5 +463,36 @@ fn shared_data_neon_blinks_are_held() {
                 assert!(within.clone().all(|(_, estimate)| estimate.state == PupilState::Holding), "{eye:?}");
             }
         }
+    }
+}
+
+#[test]
+#[ignore = "needs shared data"]
+fn shared_data_logs_hold_what_is_known_of_them() {
+    let known = [
+        ("neon_demo/3d_eye_states.csv", vec!["left", "right"], 200.0, 2, 2),
+        ("eyelink_small/eyelink_binocular_example.asc", vec!["left", "right"], 1000.0, 1, 1),
+    ];
+    for (name, eyes, rate_hz, told, found) in known {
+        let (recording, info) = info(&shared_data().join("pupil").join(name));
+        assert_eq!(recording.faults().total(), 0, "{name}");
+        assert_eq!(info.eyes.iter().map(|eye| eye.eye).collect::<Vec<_>>(), eyes, "{name}");
+        assert_eq!((info.blinks.told, info.blinks.found), (told, found), "{name}");
+        for eye in &info.eyes {
+            assert!((eye.rate_hz.expect("a rate") / rate_hz - 1.0).abs() < 0.005, "{name}: {eye:?}");
+            assert!(eye.blinks_found >= Some(found), "{name}: {eye:?}");
+        }
+    }
+    // At 7.4 s the lids of the right eye are told to be shut for 60 ms while the left eye is wide open.
+    let (_, neon) = info(&shared_data().join("pupil/neon_demo/3d_eye_states.csv"));
+    assert_eq!(neon.blinks.found_in_one_eye, 1);
+    // These have a few samples of each block only.
+    for (name, stated_hz) in [("monocular", 1000.0), ("monocular_2khz", 2000.0)] {
+        let (recording, info) = info(&shared_data().join(format!("pupil/eyelink_small/eyelink_{name}_example.asc")));
+        assert_eq!((info.stated_rate_hz, recording.len(), recording.faults().total()), (Some(stated_hz), 16, 0));
+        assert_eq!((info.eyes[0].eye, info.eyes[0].lost, info.blinks.told), ("left", 0, 0));
+        let range = info.eyes[0].diameter.expect("a range");
+        // Areas of 617 to 798.
+        assert!(range.least > 27.9 && range.greatest < 32.0, "{range:?}");
     }
 }

@@ -252,16 +252,24 @@ fn pupilext_with_two_views_is_one_pupil_and_with_two_pupils_two() {
     ));
     assert_eq!(samples(&recording), [(10 * MS, Both, Some(4.5)), (20 * MS, Both, None)]);
     assert_eq!(recording.samples().next().map(|s| s.confidence), Some(0.9));
-    assert!(noted(&recording, "two cameras"));
+    assert!(noted(&recording, "two cameras"), "{:?}", recording.notes());
     let two = "filename,timestamp_ms,algorithm,diameterA_px,diameterB_px,undistortedDiameterA_px,undistortedDiameterB_px,physicalDiameterA_mm,physicalDiameterB_mm,confidenceA,confidenceB\n\
                x,10,PuRe,40,41,-1,-1,-1,-1,0.5,0.6\nx,20,PuRe,40\n";
     let recording = read(two);
     assert_eq!(
         samples(&recording),
-        [(10 * MS, Left, Some(40.0)), (10 * MS, Right, Some(41.0)), (20 * MS, Left, Some(40.0))]
+        [(10 * MS, Right, Some(40.0)), (10 * MS, Left, Some(41.0)), (20 * MS, Right, Some(40.0))]
     );
     assert_eq!(recording.faults().of(LogFault::Malformed), 1);
-    assert!(noted(&recording, "A is taken for the left"));
+    // Later versions name the eye and the camera.
+    let late = "timestamp_ms;pupilDiameter_px_R_M;pupilUndistortedDiameter_px_R_M;pupilPhysicalDiameter_mm_R_M;pupilConfidence_R_M;\
+                pupilOutlineConfidence_R_M;pupilDiameter_px_L_M;pupilPhysicalDiameter_mm_L_M;pupilConfidence_L_M;trial;message\n\
+                10;40;41;3.5;0.9;0.8;42;-1;0.7;1;\n";
+    let recording = read(late);
+    assert_eq!(samples(&recording), [(10 * MS, Right, Some(3.5)), (10 * MS, Left, None)]);
+    assert_eq!(recording.samples().map(|s| s.confidence).collect::<Vec<_>>(), [0.9, 0.7]);
+    let nobodys = late.replace("_R_", "_U_").replace("_L_", "_x_");
+    assert_eq!(samples(&read(nobodys)), [(10 * MS, Both, Some(3.5))]);
 }
 
 // BIDS.
@@ -496,12 +504,14 @@ fn xdf_of_pupil_capture_reads_each_eye_in_its_turn() {
 fn xdf_times_are_completed_and_put_on_the_recorders_clock() {
     // Radii and areas of floats at 100 Hz, the left lost in the second sample; one late packet among the offsets.
     let channels = [
+        ["pupilWidth", "right", "DiameterX", "m"],
         ["L pupil", "", "Radius", "meters"],
         ["right_pupil_area", "right", "Area", "px"],
         ["R pupil", "right", "Radius", "meters"],
     ];
-    let row =
-        |left: f32, right: f32| [left, 1.0, right].iter().flat_map(|figure| figure.to_le_bytes()).collect::<Vec<_>>();
+    let row = |left: f32, right: f32| {
+        [9.0, left, 1.0, right].iter().flat_map(|figure| figure.to_le_bytes()).collect::<Vec<_>>()
+    };
     let mut content = [&7_u32.to_le_bytes()[..], &[1, 3, 8], &100.0_f64.to_le_bytes()].concat();
     content.extend([row(0.0015, 0.002), vec![0], row(f32::NAN, 0.002), vec![0], row(0.0016, -1.0)].concat());
     let mut chunks = vec![stream_header(7, "tracker", "Eye", 100.0, "float32", &channels)];

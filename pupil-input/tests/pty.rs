@@ -2,16 +2,17 @@
 
 mod support;
 
-use std::io::Write as _;
+use std::io::{Read as _, Write as _};
 use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::wire::WireFault;
-use holod_pupil_input::wire::line::{LineSample, encode_line};
+use holod_pupil_input::wire::line::{LineSample, crc8, encode_line};
 use holod_pupil_input::{
-    Counter, Link, LogFault, PupilState, Recording, SampleEye, Tracker, TrackerHandle, TrackerSpec, Verdict, host_now,
+    Counter, Link, LogFault, PupilState, Recording, SampleEye, Tracker, TrackerHandle, TrackerOptions, TrackerSpec,
+    Verdict, host_now,
 };
 use serialport::{SerialPort, TTYPort};
 use support::{NEON_BLINKS_S, neon_like_csv};
@@ -175,6 +176,94 @@ fn silence_is_noticed_once_and_ends() {
     assert_eq!(handle.counters().of(Counter::Silences), silences);
     feed_until(&mut tracker, next, "tracking again", || tracks(&mut handle));
     assert_eq!(handle.link(), Link::Up);
+}
+
+/// A tracker that must be told to start, and its profile.
+fn profile_with_commands(dir: &TempDir) -> String {
+    let path = dir.path().join("talks.toml");
+    let text = r#"
+format = "holod-tracker-1"
+name = "talks"
+about = "Holod's lines from a device that must be asked."
+
+[wire]
+kind = "holod"
+
+[serial]
+baud = 115200
+start = [{ send = "GO\r", expect = "OK\r", within_ms = 300 }]
+stop = [{ send = "HALT\r", expect = "BYE\r", within_ms = 100 }]
+"#;
+    std::fs::write(&path, text).expect("writes");
+    path.display().to_string()
+}
+
+/// What the tracker hears until it hears nothing more.
+fn heard(tracker: &mut Plug) -> String {
+    tracker.tracker.set_timeout(Duration::from_millis(100)).expect("sets");
+    let mut bytes = Vec::new();
+    let _ = tracker.tracker.read_to_end(&mut bytes);
+    String::from_utf8(bytes).expect("text")
+}
+
+#[test]
+fn a_tracker_is_told_to_start_and_by_a_drop_to_stop() {
+    let dir = TempDir::new().expect("a folder");
+    let mut tracker = Plug::new();
+    let spec = format!("serial:{},profile={}", tracker.path(), profile_with_commands(&dir));
+    // It is reset when its port is opened, and hears only the second command.
+    let mut ends = tracker.tracker.try_clone_native().expect("clones");
+    let boot = std::thread::spawn(move || {
+        let mut word = [0; 3];
+        for _ in 0..2 {
+            ends.set_timeout(Duration::from_secs(20)).expect("sets");
+            ends.read_exact(&mut word).expect("hears");
+            assert_eq!(&word, b"GO\r");
+        }
+        ends.write_all(format!("boot\nOK\r{}", line(0, 4.0)).as_bytes()).expect("answers");
+    });
+    let mut handle = start(&spec);
+    boot.join().expect("no panic");
+    feed_until(&mut tracker, 1, "tracking", || tracks(&mut handle));
+    assert_eq!(handle.counters().of(Counter::SequenceMissing), 0, "the first sample came with the answer");
+    drop(handle);
+    assert_eq!(heard(&mut tracker), "HALT\r".repeat(3), "it never said BYE");
+}
+
+#[test]
+fn a_laser_box_is_refused_before_a_byte_is_written() {
+    let dir = TempDir::new().expect("a folder");
+    let mut tracker = Plug::new();
+    let settings = rig::Rig::default().tracker;
+    let options = TrackerOptions { forbidden: vec![tracker.path().into()], ..TrackerOptions::from(host_now()) };
+    let spec = tracker.path().parse().expect("a spec");
+    let message = Tracker::start(&spec, &settings, options).expect_err("is refused").to_string();
+    assert!(message.contains("nothing was opened"), "{message}");
+
+    let text = "!HBLOST";
+    tracker.send(format!("{text}*{:02X}\n", crc8(text.as_bytes())).as_bytes());
+    let message = refused(&format!("serial:{},profile={}", tracker.path(), profile_with_commands(&dir)));
+    assert!(message.contains("a laser box of holod's") && message.contains("nothing was written"), "{message}");
+    assert_eq!(heard(&mut tracker), "");
+}
+
+#[test]
+fn a_board_that_restarts_when_its_port_is_opened_is_not_called_silent() {
+    let mut tracker = Plug::new();
+    let mut handle = start(&tracker.path());
+    std::thread::sleep(Duration::from_millis(1500));
+    assert_eq!((handle.link(), handle.counters().of(Counter::Silences)), (Link::Up, 0));
+    // What it sent before the reset is cut off.
+    tracker.send(&line(7, 4.0).as_bytes()[5..]);
+    feed_until(&mut tracker, 0, "tracking", || tracks(&mut handle));
+    assert_eq!((handle.counters().of(Counter::Partials), handle.counters().faults_in_all()), (1, 0));
+}
+
+#[test]
+fn a_port_that_never_speaks_is_called_silent() {
+    let tracker = Plug::new();
+    let handle = start(&tracker.path());
+    eventually("silence", || handle.link() == Link::Silent);
 }
 
 #[test]

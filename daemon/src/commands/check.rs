@@ -77,9 +77,12 @@ fn tracker(rig: &Rig) -> Check {
     let (passed, says) = match spec.parse::<TrackerSpec>() {
         Err(error) => (false, error.to_string()),
         Ok(TrackerSpec::Mock(_)) => (true, format!("{spec}: a simulated eye")),
-        Ok(TrackerSpec::Path(path) | TrackerSpec::Serial { path, .. } | TrackerSpec::Replay { path, .. }) => {
-            present(&path, "plug the tracker in or correct tracker.spec")
-        }
+        Ok(
+            TrackerSpec::Path(path)
+            | TrackerSpec::Serial { path, .. }
+            | TrackerSpec::Replay { path, .. }
+            | TrackerSpec::MockFile(path),
+        ) => present(&path, "plug the tracker in or correct tracker.spec"),
         Ok(
             TrackerSpec::Hid { .. }
             | TrackerSpec::Tcp { .. }

@@ -259,8 +259,12 @@ impl Part {
             .enumerate()
             .filter_map(|(index, column)| {
                 let name = column.to_lowercase();
-                let is_pupil =
-                    name == "pupil" || has(&name, &["pupil"]) && has(&name, &["size", "diam", "area", "radius"]);
+                // `pupil_size` by the standard, `pupil_left`, `left_pupil_diameter` and the like in the field.
+                let rest = ["pupil", "left", "right", "_", "-", " "]
+                    .iter()
+                    .fold(name.clone(), |rest, word| rest.replace(word, ""));
+                let is_size = has(&rest, &["size", "diam", "area", "radius"]);
+                let is_pupil = has(&name, &["pupil"]) && (is_size || rest.is_empty());
                 let eye = match name.as_str() {
                     name if has(name, &["left"]) => SampleEye::Left,
                     name if has(name, &["right"]) => SampleEye::Right,
@@ -299,7 +303,7 @@ impl Part {
     }
 
     fn input(&self) -> LogInput<'_> {
-        LogInput { path: &self.path, head: Vec::new() }
+        LogInput::at(&self.path)
     }
 
     /// Nanoseconds of one unit of the time column. Where the sidecar gives no unit, or one that is none of time, the usual
@@ -311,7 +315,7 @@ impl Part {
             return Ok(ns);
         }
         let input = self.input();
-        let mut lines = Lines::new(input.open()?);
+        let mut lines = Lines::new(input.unwatched()?);
         let mut times = Vec::with_capacity(UNIT_ROWS);
         while times.len() < UNIT_ROWS && lines.advance(&mut LogBuilder::default()).map_err(|source| input.io(source))? {
             times.extend(cells(lines.line(), b'\t').nth(time).and_then(|cell| number(cell).ok()));
@@ -351,7 +355,7 @@ impl Part {
         }
 
         let input = self.input();
-        let mut lines = Lines::new(input.open()?);
+        let mut lines = Lines::new(input.unwatched()?);
         let wanted = self.pupils.iter().map(|pupil| pupil.0).chain(self.time).max().unwrap_or(0);
         let mut row: Vec<std::ops::Range<usize>> = Vec::with_capacity(wanted + 1);
         let mut rows = 0_u64;
@@ -437,8 +441,8 @@ impl Part {
         // BIDS' durations are seconds; with onsets of the tracker's clock they are given on that clock too.
         let duration_ns = stated("duration").unwrap_or(if by_row { 1e9 } else { onset_ns });
 
-        let input = LogInput { path, head: Vec::new() };
-        let mut lines = Lines::new(input.open()?);
+        let input = LogInput::at(path);
+        let mut lines = Lines::new(input.unwatched()?);
         let (mut called, mut shut) = (Vec::new(), Vec::new());
         while lines.advance(&mut LogBuilder::default()).map_err(|source| input.io(source))? {
             let cell = |column: Option<usize>| column.and_then(|column| cells(lines.line(), b'\t').nth(column));

@@ -14,24 +14,19 @@ fn recognises(input: &LogInput<'_>) -> bool {
 }
 
 fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
-    let mut reader = input.open()?;
+    let mut lines = input.lines()?;
     let mut decoder = LineDecoder::new();
-    let mut bytes = Vec::new();
-    for line in 1.. {
-        bytes.clear();
-        if reader.read_until(b'\n', &mut bytes).map_err(|source| input.io(source))? == 0 {
-            break;
-        }
+    while let Some(line) = lines.next(log) {
         let mut take = |event| match event {
             WireEvent::Sample(sample) => {
                 let Some(t) = sample.t_device else { return log.count(LogFault::BadNumber) };
                 let (eye, diameter, confidence) = (sample.eye, sample.diameter_mm, sample.confidence);
-                log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid: true }, line);
+                log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid: true }, line.number);
             }
             WireEvent::Rejected(fault) => log.count(LogFault::Wire(fault)),
             WireEvent::Note | WireEvent::Partial => {}
         };
-        decoder.push(&bytes, &mut take);
+        decoder.push(line.bytes, &mut take);
         decoder.finish(&mut take);
     }
     Ok(())

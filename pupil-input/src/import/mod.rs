@@ -3,33 +3,44 @@
 //! A log is read in one pass, as a stream: what stays in memory is 24 bytes a sample.
 
 mod bids;
+mod core;
 pub(crate) mod csv;
+mod eyelink;
 mod gazepoint;
+mod info;
 mod lines;
 mod neon;
 mod pupilext;
 pub(crate) mod raw;
+mod smi;
 mod table;
 mod text;
 mod tobii;
+mod unpack;
 mod xdf;
 
+use std::cell::RefCell;
 use std::fmt;
 use std::fs::File;
-use std::io::{BufRead, Read};
+use std::io::{self, BufRead, ErrorKind, Read};
+use std::ops::AddAssign;
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 
 use holod_calibration::TimeNs;
 
 use crate::wire::WireFault;
 use crate::{PupilSample, SampleEye};
 
+pub use info::{BlinkCounts, EyeInfo, FaultCount, LogInfo, Range};
+use text::Lines;
+
 /// The kinds of log that are known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LogFormat {
     /// holod's line protocol.
     Lines,
-    /// Pupil Labs Neon, 3D eye states.
+    /// Pupil Labs Neon, 3D eye states of its cloud.
     NeonEyeStates,
     /// holod's recording of the bytes of a link.
     Raw,
@@ -45,6 +56,14 @@ pub enum LogFormat {
     Xdf,
     /// BIDS eye tracking.
     Bids,
+    /// Pupil Labs Neon, eye states as its phone writes them.
+    NeonNative,
+    /// Pupil Labs Core.
+    Core,
+    /// SR Research EyeLink.
+    EyeLink,
+    /// SMI, of BeGaze or the IDF converter.
+    Smi,
 }
 
 impl LogFormat {
@@ -60,6 +79,10 @@ impl LogFormat {
             Self::PupilExt => "PupilEXT CSV",
             Self::Xdf => "XDF (Lab Streaming Layer)",
             Self::Bids => "BIDS eye tracking _physio.tsv.gz",
+            Self::NeonNative => "Pupil Labs Neon eye_state ps1.raw",
+            Self::Core => "Pupil Labs Core pupil_positions.csv",
+            Self::EyeLink => "EyeLink .asc",
+            Self::Smi => "SMI BeGaze text",
         }
     }
 }
@@ -102,11 +125,15 @@ pub(crate) struct Importer {
     pub(crate) read: fn(&LogInput<'_>, &mut LogBuilder) -> Result<(), ReplayError>,
 }
 
-/// In the order in which they are asked.
-const IMPORTERS: [Importer; 9] = [
+/// In the order in which they are asked; no two recognise the same log.
+const IMPORTERS: &[Importer] = &[
     raw::IMPORTER,
     lines::IMPORTER,
-    neon::IMPORTER,
+    neon::CLOUD,
+    neon::NATIVE,
+    core::IMPORTER,
+    eyelink::IMPORTER,
+    smi::IMPORTER,
     csv::IMPORTER,
     xdf::IMPORTER,
     tobii::IMPORTER,
@@ -120,22 +147,41 @@ pub(crate) struct LogInput<'a> {
     pub(crate) path: &'a Path,
     /// Its first 64 KiB (all of a shorter one), as [`Self::open`] gives them.
     pub(crate) head: Vec<u8>,
+    failure: Failure,
 }
+
+/// The first error of any reader of a log.
+type Failure = Rc<RefCell<Option<io::Error>>>;
 
 const HEAD_BYTES: u64 = 1 << 16;
 
 impl<'a> LogInput<'a> {
     fn new(path: &'a Path) -> Result<Self, ReplayError> {
-        let mut input = Self { path, head: Vec::new() };
+        let mut input = Self::at(path);
         let mut head = Vec::new();
         input.open()?.take(HEAD_BYTES).read_to_end(&mut head).map_err(|source| input.io(source))?;
         input.head = head;
         Ok(input)
     }
 
+    /// A file of which only what [`Self::unwatched`] reads is wanted.
+    pub(crate) fn at(path: &'a Path) -> Self {
+        Self { path, head: Vec::new(), failure: Failure::default() }
+    }
+
     /// From its beginning: unpacked if it is gzip, in UTF-8 if it is UTF-16, without a byte order mark.
+    pub(crate) fn unwatched(&self) -> Result<Box<dyn BufRead>, ReplayError> {
+        File::open(self.path).and_then(unpack::plain).map_err(|source| self.io(source))
+    }
+
+    /// As [`Self::unwatched`], but where reading fails the file seems to end, and [`Recording::read`] returns the error.
     pub(crate) fn open(&self) -> Result<Box<dyn BufRead>, ReplayError> {
-        File::open(self.path).and_then(text::plain).map_err(|source| self.io(source))
+        Ok(Box::new(Watched { reader: self.unwatched()?, failure: self.failure.clone() }))
+    }
+
+    /// Its lines from its beginning.
+    pub(crate) fn lines(&self) -> Result<Lines, ReplayError> {
+        Ok(Lines::new(self.open()?))
     }
 
     /// Its non-empty first lines, trimmed; the last may be cut off by the end of the head.
@@ -143,8 +189,51 @@ impl<'a> LogInput<'a> {
         self.head.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii).filter(|line| !line.is_empty())
     }
 
-    pub(crate) fn io(&self, source: std::io::Error) -> ReplayError {
+    pub(crate) fn io(&self, source: io::Error) -> ReplayError {
         ReplayError::Io { path: self.path.into(), source }
+    }
+
+    /// An error for what is wrong with the log as a whole.
+    pub(crate) fn content(&self, found: impl Into<String>, expected: impl Into<String>) -> ReplayError {
+        ReplayError::Content {
+            path: self.path.into(),
+            at: String::new(),
+            found: found.into(),
+            expected: expected.into(),
+        }
+    }
+}
+
+/// A reader that ends where reading fails, and keeps why.
+struct Watched<R> {
+    reader: R,
+    failure: Failure,
+}
+
+impl<R: BufRead> Read for Watched<R> {
+    fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+        let mut piece = self.fill_buf()?;
+        let count = piece.read(into)?;
+        self.consume(count);
+        Ok(count)
+    }
+}
+
+impl<R: BufRead> BufRead for Watched<R> {
+    fn fill_buf(&mut self) -> io::Result<&[u8]> {
+        while self.failure.borrow().is_none() {
+            match self.reader.fill_buf() {
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(error) => *self.failure.borrow_mut() = Some(error),
+                // Asked once more, since a piece that is returned from a loop is borrowed for good.
+                Ok(_) => return self.reader.fill_buf(),
+            }
+        }
+        Ok(&[])
+    }
+
+    fn consume(&mut self, count: usize) {
+        self.reader.consume(count);
     }
 }
 
@@ -228,6 +317,10 @@ pub enum LogFault {
     Wire(WireFault),
     /// A row that is too short or not text.
     Malformed,
+    /// A line longer than any of a log.
+    TooLong,
+    /// The eye is none that the format knows.
+    BadEye,
     /// Time or diameter is not a number.
     BadNumber,
     /// The diameter is missing.
@@ -241,8 +334,8 @@ pub enum LogFault {
 }
 
 /// The names under which faults are counted, in the order of [`LogFault::index`].
-pub(crate) const LOG_FAULT_NAMES: [&str; 6 + WireFault::ALL.len()] = {
-    let mut names = [""; 6 + WireFault::ALL.len()];
+pub(crate) const LOG_FAULT_NAMES: [&str; 8 + WireFault::ALL.len()] = {
+    let mut names = [""; 8 + WireFault::ALL.len()];
     let mut k = 0;
     while k < WireFault::ALL.len() {
         names[k] = WireFault::ALL[k].name();
@@ -254,6 +347,8 @@ pub(crate) const LOG_FAULT_NAMES: [&str; 6 + WireFault::ALL.len()] = {
     names[k + 3] = "log_not_finite";
     names[k + 4] = "log_negative";
     names[k + 5] = "log_backwards";
+    names[k + 6] = "log_too_long";
+    names[k + 7] = "log_bad_eye";
     names
 };
 
@@ -268,6 +363,8 @@ impl LogFault {
             Self::NotFinite => lines + 3,
             Self::Negative => lines + 4,
             Self::Backwards => lines + 5,
+            Self::TooLong => lines + 6,
+            Self::BadEye => lines + 7,
         }
     }
 }
@@ -294,6 +391,14 @@ impl LogFaults {
 
     pub(crate) const fn count(&mut self, fault: LogFault) {
         self.0[fault.index()] += 1;
+    }
+}
+
+impl AddAssign for LogFaults {
+    fn add_assign(&mut self, other: Self) {
+        for (count, more) in self.0.iter_mut().zip(other.0) {
+            *count += more;
+        }
     }
 }
 
@@ -353,6 +458,9 @@ pub(crate) struct LogBuilder {
     latest_ns: [Option<i64>; 3],
 }
 
+/// By how many samples one eye may be behind the other before the whole log is sorted.
+const EYES_OUT_OF_STEP: usize = 64;
+
 /// A time beyond this, a hundred years from any origin, is no time; differences of two stay within i64.
 const GREATEST_NS: u64 = 3_200_000_000_000_000_000;
 
@@ -375,15 +483,34 @@ impl LogBuilder {
         }
         *latest = Some(t.0);
         let aperture_mm = aperture_mm.unwrap_or(f32::NAN);
-        self.rows.push(Row { t_ns: t.0, diameter_mm: diameter, confidence, aperture_mm, eye, valid });
+        let row = Row { t_ns: t.0, diameter_mm: diameter, confidence, aperture_mm, eye, valid };
+        // The eyes come interleaved, a few samples out of step; what lies farther back is left to one sort at the end.
+        let recent = self.rows.len().saturating_sub(EYES_OUT_OF_STEP);
+        let behind = self.rows[recent..].iter().rev().take_while(|before| before.t_ns > row.t_ns).count();
+        if behind == 0 || behind == EYES_OUT_OF_STEP {
+            self.rows.push(row);
+        } else {
+            self.rows.insert(self.rows.len() - behind, row);
+        }
+    }
+
+    /// The latest time of any eye.
+    pub(crate) fn latest(&self) -> Option<TimeNs> {
+        self.latest_ns.into_iter().flatten().max().map(TimeNs)
+    }
+
+    /// Tells the user something of how the log was read.
+    pub(crate) fn note(&mut self, note: impl Into<String>) {
+        self.notes.push(note.into());
     }
 
     /// Reads a diameter's cell: a finite number that is not negative.
-    pub(crate) fn diameter(text: &str) -> Result<f32, LogFault> {
-        if text.is_empty() {
+    pub(crate) fn diameter(cell: impl AsRef<[u8]>) -> Result<f32, LogFault> {
+        let cell = cell.as_ref();
+        if cell.is_empty() {
             return Err(LogFault::Missing);
         }
-        let diameter: f32 = text.parse().map_err(|_| LogFault::BadNumber)?;
+        let diameter = text::number(cell).ok_or(LogFault::BadNumber)? as f32;
         if !diameter.is_finite() {
             Err(LogFault::NotFinite)
         } else if diameter < 0.0 {
@@ -444,12 +571,18 @@ impl Recording {
             return Err(ReplayError::NotAFile { path: path.into(), found: "a device or pipe", hint });
         }
         let input = LogInput::new(path)?;
+        if let Some(source) = input.failure.take() {
+            return Err(input.io(source));
+        }
         let importer = IMPORTERS
             .iter()
             .find(|importer| (importer.recognises)(&input))
             .ok_or_else(|| ReplayError::UnknownFormat { path: path.into(), found: beginning(&input) })?;
         let mut builder = LogBuilder::default();
         (importer.read)(&input, &mut builder)?;
+        if let Some(source) = input.failure.take() {
+            return Err(input.io(source));
+        }
         builder.finish(importer.format, path)
     }
 
@@ -546,5 +679,152 @@ fn beginning(input: &LogInput<'_>) -> String {
             let shown: String = String::from_utf8_lossy(&line[..line.len().min(120)]).escape_debug().collect();
             format!("`{shown}`{}", if line.len() > 120 { "..." } else { "" })
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+
+    /// How a log of each format begins.
+    fn beginnings() -> Vec<(LogFormat, Vec<u8>)> {
+        let mut native = Vec::new();
+        for record in 0..4 {
+            for index in 0..20_u8 {
+                let value = match index {
+                    0 | 7 => 3.5 + 0.1 * record as f32,
+                    5 | 12 => 0.6,
+                    6 | 13 => 0.8,
+                    4 | 11 => 0.0,
+                    _ => f32::from(index),
+                };
+                native.extend(value.to_le_bytes());
+            }
+        }
+        let text = |format, text: &str| (format, text.as_bytes().to_vec());
+        let utf16 = "\u{feff}## [BeGaze]\r\nTime\tType\tTrial\tR Mapped Diameter [mm]\r\n";
+        vec![
+            text(LogFormat::Lines, "# converted\nP1,1,2,L,3,1*00\n"),
+            text(LogFormat::NeonEyeStates, "section id,timestamp [ns],pupil diameter left [mm]\n0,1,3.5\n"),
+            (LogFormat::NeonNative, native),
+            text(
+                LogFormat::Core,
+                "pupil_timestamp,world_index,eye_id,confidence,norm_pos_x,norm_pos_y,diameter,method,diameter_3d\n",
+            ),
+            text(LogFormat::Core, "timestamp,index,id,confidence,norm_pos_x,norm_pos_y,diameter,method\n"),
+            text(LogFormat::EyeLink, "** CONVERTED FROM a.edf\n** TYPE: EDF_FILE BINARY EVENT SAMPLE TAGGED\n"),
+            text(LogFormat::EyeLink, "MSG\t12 hello\nSTART\t15 \tLEFT\tRIGHT\tSAMPLES\tEVENTS\n"),
+            text(LogFormat::EyeLink, "1408660\t  964.3\t  541.5\t  288.0\t...\n"),
+            text(LogFormat::EyeLink, "1408660.5\t   .\t   .\t    0.0\n"),
+            text(LogFormat::Smi, "## [iView]\n## Sample Rate:\t60\nTime;Type;Trial;L Pupil Diameter [mm]\n"),
+            text(LogFormat::Smi, "Time,Type,Trial,L Dia X [px],L Dia Y [px]\n1,SMP,1,20,20\n"),
+            text(LogFormat::Smi, "RecordingTime [ms]\tTrial\tPupil Diameter Left [mm]\tCategory Left\n"),
+            (LogFormat::Smi, utf16.encode_utf16().flat_map(u16::to_le_bytes).collect()),
+        ]
+    }
+
+    fn recognised(beginning: &[u8]) -> Vec<LogFormat> {
+        let dir = tempfile::TempDir::new().expect("a folder");
+        let path = dir.path().join("log");
+        std::fs::write(&path, beginning).expect("writes");
+        let input = LogInput::new(&path).expect("opens");
+        IMPORTERS.iter().filter(|importer| (importer.recognises)(&input)).map(|importer| importer.format).collect()
+    }
+
+    #[test]
+    fn each_log_is_recognised_by_its_format_alone() {
+        for (format, beginning) in beginnings() {
+            assert_eq!(recognised(&beginning), [format], "{}", String::from_utf8_lossy(&beginning));
+        }
+    }
+
+    #[test]
+    fn what_only_looks_like_a_log_is_not_recognised() {
+        for beginning in [
+            "",
+            "\n\n",
+            "1,2,3\n",
+            "1408660\t964.3\t541.5\t288.0\n",
+            "timestamp\tx\ty\tpupil\n1\t2\t3\t4\n",
+            "Time;Type;Trial;L POR X [px]\n",
+            "timestamp,confidence,diameter\n",
+            "START\tSAMPLES\n",
+            "Pupil,1,2\n",
+            "P,1,2\n",
+        ] {
+            assert_eq!(recognised(beginning.as_bytes()), [], "{beginning}");
+        }
+        assert_eq!(recognised(&[0; 800]), []);
+        assert_eq!(recognised(b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\x03"), []);
+    }
+
+    #[test]
+    fn every_fault_has_a_name_of_its_own() {
+        assert_eq!(LOG_FAULT_NAMES.iter().collect::<HashSet<_>>().len(), LOG_FAULT_NAMES.len());
+        assert_eq!(LOG_FAULT_NAMES[LogFault::TooLong.index()], "log_too_long");
+        assert_eq!(LOG_FAULT_NAMES[LogFault::BadEye.index()], "log_bad_eye");
+        assert_eq!(LOG_FAULT_NAMES[LogFault::Malformed.index()], "log_malformed");
+    }
+
+    fn sample(t_ns: i64, eye: SampleEye) -> LogSample {
+        LogSample { t: TimeNs(t_ns), eye, diameter: 3.0, confidence: 1.0, aperture_mm: None, valid: true }
+    }
+
+    fn finished(samples: impl IntoIterator<Item = LogSample>) -> Vec<(i64, SampleEye)> {
+        let mut log = LogBuilder::default();
+        samples.into_iter().zip(1..).for_each(|(sample, line)| log.push(sample, line));
+        let recording = log.finish(LogFormat::Lines, Path::new("x")).expect("a recording");
+        recording.samples().map(|sample| (sample.t_sample.0, sample.eye)).collect()
+    }
+
+    #[test]
+    fn eyes_a_little_or_far_out_of_step_end_in_order_of_time() {
+        let at = |t_ns, eye| sample(t_ns, eye);
+        for behind in [1, 40, 63, 64, 65, 500] {
+            let samples = (0..1000).flat_map(|k| {
+                let right = (k >= behind).then(|| at(2 * (k - behind), SampleEye::Right));
+                [Some(at(2 * k, SampleEye::Left)), right]
+            });
+            let finished = finished(samples.flatten());
+            assert!(finished.is_sorted_by_key(|(t_ns, _)| *t_ns), "{behind}");
+            assert_eq!(finished.len() as i64, 2000 - behind);
+        }
+        // Samples of one time stay in the order of the log.
+        let finished = finished([at(1, SampleEye::Left), at(2, SampleEye::Left), at(1, SampleEye::Right)]);
+        assert_eq!(finished, [(1, SampleEye::Left), (1, SampleEye::Right), (2, SampleEye::Left)]);
+    }
+
+    #[test]
+    fn a_row_takes_24_bytes() {
+        assert_eq!(size_of::<Row>(), 24);
+    }
+
+    struct Failing(u8);
+
+    impl Read for Failing {
+        fn read(&mut self, into: &mut [u8]) -> io::Result<usize> {
+            self.0 += 1;
+            match self.0 {
+                1 => Err(ErrorKind::Interrupted.into()),
+                2 => {
+                    into[0] = b'x';
+                    Ok(1)
+                }
+                _ => Err(io::Error::other("torn cable")),
+            }
+        }
+    }
+
+    #[test]
+    fn a_reader_that_fails_ends_and_its_error_is_kept() {
+        let failure = Failure::default();
+        let mut watched = Watched { reader: Failing(0), failure: failure.clone() };
+        let mut bytes = Vec::new();
+        watched.read_to_end(&mut bytes).expect("ends");
+        assert_eq!(bytes, b"x");
+        assert_eq!(watched.read(&mut [0; 8]).ok(), Some(0));
+        assert_eq!(failure.take().map(|error| error.to_string()), Some("torn cable".into()));
     }
 }

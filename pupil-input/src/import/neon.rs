@@ -1,83 +1,283 @@
-//! Pupil Labs Neon: `3d_eye_states.csv` of its cloud, with the blinks of a `blinks.csv` beside it.
+//! Pupil Labs Neon: `3d_eye_states.csv` of its cloud, and `eye_state ps1.raw` as the phone writes it, with the blinks of
+//! the file beside either.
+//!
+//! The layout of the phone's files: one record of 20 little-endian f32 an eye camera frame (14 before eyelids were
+//! measured), their times as i64 nanoseconds in the `.time` file, the fields' names in `eye_state.dtype`; each blink an
+//! i32 and its begin and end as i64 nanoseconds.
 
-use std::path::Path;
+use std::io::Read;
+use std::path::{Path, PathBuf};
 
 use holod_calibration::TimeNs;
 
 use crate::SampleEye;
 
+use super::text::{Header, Picker, number, time};
 use super::{Blink, Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError};
 
-pub(super) const IMPORTER: Importer = Importer { format: LogFormat::NeonEyeStates, recognises, read };
+pub(super) const CLOUD: Importer =
+    Importer { format: LogFormat::NeonEyeStates, recognises: recognises_cloud, read: read_cloud };
+pub(super) const NATIVE: Importer =
+    Importer { format: LogFormat::NeonNative, recognises: recognises_native, read: read_native };
 
 const TIME: &str = "timestamp [ns]";
-const DIAMETERS: [(&str, &str, SampleEye); 2] = [
+const DIAMETERS: [(&str, &str, SampleEye); 3] = [
     ("pupil diameter left [mm]", "eyelid aperture left [mm]", SampleEye::Left),
     ("pupil diameter right [mm]", "eyelid aperture right [mm]", SampleEye::Right),
+    // As the cloud wrote it at first.
+    ("pupil diameter [mm]", "eyelid aperture [mm]", SampleEye::Both),
 ];
 
-fn recognises(input: &LogInput<'_>) -> bool {
-    let Some(Ok(header)) = input.head_lines().next().map(std::str::from_utf8) else { return false };
-    let has = |name: &str| header.split(',').any(|cell| cell.trim().trim_matches('"') == name);
-    has(TIME) && DIAMETERS.iter().any(|(diameter, _, _)| has(diameter))
+fn recognises_cloud(input: &LogInput<'_>) -> bool {
+    let Some(line) = input.head_lines().next() else { return false };
+    let header = Header::of(line, b',');
+    header.has(TIME) && DIAMETERS.iter().any(|(diameter, _, _)| header.has(diameter))
 }
 
-fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
-    let mut csv = csv::ReaderBuilder::new().flexible(true).trim(csv::Trim::All).from_reader(input.open()?);
-    let Ok(header) = csv.byte_headers().cloned() else { return Ok(()) };
-    let column = |name: &str| header.iter().position(|cell| cell == name.as_bytes());
-    let Some(time) = column(TIME) else { return Ok(()) };
-    let eyes =
-        DIAMETERS.map(|(diameter, aperture, eye)| column(diameter).map(|diameter| (diameter, column(aperture), eye)));
-
-    let mut record = csv::ByteRecord::new();
-    loop {
-        match csv.read_byte_record(&mut record) {
-            Ok(false) => break,
-            Ok(true) => {}
-            Err(_) => {
-                log.count(LogFault::Malformed);
-                continue;
-            }
+fn read_cloud(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
+    let mut lines = input.lines()?;
+    let header = loop {
+        let Some(line) = lines.next(log) else { return Ok(()) };
+        if !line.bytes.trim_ascii().is_empty() {
+            break Header::of(line.bytes, b',');
         }
-        let cell = |index: usize| record.get(index).and_then(|cell| std::str::from_utf8(cell).ok());
-        let line = record.position().map_or(0, csv::Position::line);
-        let Some(t_text) = cell(time) else {
+    };
+    let [left, right, both] = DIAMETERS.map(|(diameter, _, _)| header.column(diameter));
+    let [lid_left, lid_right, lid_both] = DIAMETERS.map(|(_, aperture, _)| header.column(aperture));
+    let there = [left, right, both].map(|column| column.is_some());
+    let columns = [header.column(TIME), left, right, both, lid_left, lid_right, lid_both];
+    let picker = Picker::new(header.separator, columns);
+
+    while let Some(line) = lines.next(log) {
+        if line.bytes.is_empty() {
+            continue;
+        }
+        let [t, diameters @ .., lid_left, lid_right, lid_both] = picker.pick(line.bytes);
+        let Some(t) = t else {
             log.count(LogFault::Malformed);
             continue;
         };
-        let Ok(t_ns) = t_text.parse() else {
+        let Some(t) = time(t, 9) else {
             log.count(LogFault::BadNumber);
             continue;
         };
-        for (diameter, aperture, eye) in eyes.into_iter().flatten() {
-            match cell(diameter).ok_or(LogFault::Malformed).and_then(LogBuilder::diameter) {
+        let lids = [lid_left, lid_right, lid_both];
+        for (index, (_, _, eye)) in DIAMETERS.into_iter().enumerate().filter(|(index, _)| there[*index]) {
+            let lost = diameters[index] == Some(b"");
+            let diameter = match diameters[index] {
+                None => Err(LogFault::Malformed),
+                Some(b"") => Ok(0.0),
+                Some(cell) => LogBuilder::diameter(cell),
+            };
+            match diameter {
                 Err(fault) => log.count(fault),
                 Ok(diameter) => {
-                    let aperture_mm = aperture.and_then(cell).and_then(|text| text.parse().ok());
-                    let sample =
-                        LogSample { t: TimeNs(t_ns), eye, diameter, confidence: 1.0, aperture_mm, valid: true };
-                    log.push(sample, line);
+                    let aperture_mm = lids[index].and_then(number).map(|aperture| aperture as f32);
+                    log.push(LogSample { t, eye, diameter, confidence: 1.0, aperture_mm, valid: !lost }, line.number);
                 }
             }
         }
     }
-    log.blinks = read_blinks(&input.path.with_file_name("blinks.csv"));
+    read_cloud_blinks(&input.path.with_file_name("blinks.csv"), log);
     Ok(())
 }
 
 /// Blinks of a companion file; none where there is none or it cannot be read, since nothing rests on it.
-fn read_blinks(path: &Path) -> Vec<Blink> {
-    let Ok(mut csv) = csv::Reader::from_path(path) else { return Vec::new() };
-    let Ok(header) = csv.headers().cloned() else { return Vec::new() };
-    let column = |name: &str| header.iter().position(|cell| cell.trim() == name);
-    let Some((begin, end)) = column("start timestamp [ns]").zip(column("end timestamp [ns]")) else {
-        return Vec::new();
+fn read_cloud_blinks(path: &Path, log: &mut LogBuilder) {
+    if !path.is_file() {
+        return;
+    }
+    let opened = LogInput::new(path).and_then(|input| input.lines());
+    let Ok(mut lines) = opened else {
+        return log.note("blinks.csv beside the log cannot be read");
     };
-    let time = |record: &csv::StringRecord, index: usize| record.get(index)?.trim().parse().ok().map(TimeNs);
-    let blink = |record: csv::StringRecord| {
-        let (begins, ends) = time(&record, begin).zip(time(&record, end))?;
-        Some(Blink { eye: SampleEye::Both, begins, ends })
+    // Its faults are its own, not the log's.
+    let mut faults = LogBuilder::default();
+    let Some(header) = lines.next(&mut faults).map(|line| Header::of(line.bytes, b',')) else { return };
+    let columns = ["start timestamp [ns]", "end timestamp [ns]"].map(|name| header.column(name));
+    if columns.contains(&None) {
+        return log.note("blinks.csv beside the log lacks the columns of begin and end");
+    }
+    let picker = Picker::new(b',', columns);
+    let mut unread = 0;
+    while let Some(line) = lines.next(&mut faults) {
+        let [begins, ends] = picker.pick(line.bytes).map(|cell| cell.and_then(|cell| time(cell, 9)));
+        match begins.zip(ends) {
+            Some((begins, ends)) if begins <= ends => log.blinks.push(Blink { eye: SampleEye::Both, begins, ends }),
+            _ if line.bytes.is_empty() => {}
+            _ => unread += 1,
+        }
+    }
+    if unread > 0 {
+        log.note(format!("{unread} rows of blinks.csv beside the log are no blinks"));
+    }
+}
+
+/// Floats of a record, with eyelids and before there were any.
+const RECORD_FLOATS: [usize; 2] = [20, 14];
+
+/// Where in a record the figures are, as indices of its floats.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Layout {
+    floats: usize,
+    /// Left, right.
+    diameters: [Option<usize>; 2],
+    apertures: [Option<usize>; 2],
+}
+
+impl Layout {
+    const fn usual(floats: usize) -> Self {
+        let apertures = if floats == 20 { [Some(16), Some(19)] } else { [None, None] };
+        Self { floats, diameters: [Some(0), Some(7)], apertures }
+    }
+
+    /// Reads `eye_state.dtype`: a list of pairs of a field's name and its type, in quotation marks.
+    fn of_dtype(text: &str) -> Option<Self> {
+        let quoted: Vec<_> = text.split(['\'', '"']).skip(1).step_by(2).collect();
+        if quoted.is_empty() || quoted.len() % 2 != 0 {
+            return None;
+        }
+        let fields: Vec<_> = quoted.chunks_exact(2).collect();
+        if !fields.iter().all(|field| matches!(field[1], "<f4" | "f4" | "float32")) {
+            return None;
+        }
+        let find = |what: &str| fields.iter().position(|field| field[0].replace(' ', "_").starts_with(what));
+        let layout = Self {
+            floats: fields.len(),
+            diameters: ["pupil_diameter_left", "pupil_diameter_right"].map(find),
+            apertures: ["eyelid_aperture_left", "eyelid_aperture_right"].map(find),
+        };
+        (layout.diameters != [None, None]).then_some(layout)
+    }
+}
+
+/// The records have no mark, but each holds two optical axes of length 1 at known places.
+fn recognises_native(input: &LogInput<'_>) -> bool {
+    record_floats(&input.head).is_some()
+}
+
+fn record_floats(head: &[u8]) -> Option<usize> {
+    RECORD_FLOATS.into_iter().find(|floats| {
+        let records = head.chunks_exact(4 * floats).take(16);
+        let looked_at = records.len();
+        let alike = records.filter(|record| looks_like_eye_state(record)).count();
+        alike > 0 && 2 * alike > looked_at
+    })
+}
+
+fn looks_like_eye_state(record: &[u8]) -> bool {
+    let axis_length = |first: usize| (first..first + 3).map(|index| float(record, index).powi(2)).sum::<f32>();
+    let diameter = |index: usize| (0.0..20.0).contains(&float(record, index));
+    let axis = |first: usize| (axis_length(first) - 1.0).abs() < 0.02;
+    diameter(0) && axis(4) && diameter(7) && axis(11)
+}
+
+fn float(record: &[u8], index: usize) -> f32 {
+    record.get(4 * index..4 * index + 4).map_or(f32::NAN, |b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+}
+
+fn name_of(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+fn read_native(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
+    let layout = native_layout(input, log)?;
+    let times_path = input.path.with_extension("time");
+    let times_name = name_of(&times_path);
+    let length = |path: &Path| std::fs::metadata(path).map(|metadata| metadata.len());
+    let times_bytes = length(&times_path).map_err(|_| {
+        let expected = format!("`{times_name}` of the same recording beside it: it holds the times of the records");
+        input.content(format!("no file `{times_name}`"), expected)
+    })?;
+    let record_bytes = 4 * layout.floats;
+    let records = length(input.path).map_err(|source| input.io(source))? / record_bytes as u64;
+    if times_bytes != 8 * records {
+        let found = format!("{records} records of {record_bytes} bytes and {times_bytes} bytes in `{times_name}`");
+        let expected = format!("{} bytes there, 8 for each record; copy both files again", 8 * records);
+        return Err(input.content(found, expected));
+    }
+
+    let times_input = LogInput::new(&times_path)?;
+    let (mut states, mut times) = (input.open()?, times_input.open()?);
+    let mut record = vec![0; record_bytes];
+    let mut t = [0; 8];
+    for number in 1..=records {
+        if states.read_exact(&mut record).is_err() || times.read_exact(&mut t).is_err() {
+            break;
+        }
+        let t = TimeNs(i64::from_le_bytes(t));
+        for (index, eye) in [SampleEye::Left, SampleEye::Right].into_iter().enumerate() {
+            let Some(diameter) = layout.diameters[index].map(|at| float(&record, at)) else { continue };
+            let aperture_mm = layout.apertures[index].map(|at| float(&record, at)).filter(|lid| lid.is_finite());
+            if diameter.is_infinite() {
+                log.count(LogFault::NotFinite);
+            } else if diameter < 0.0 {
+                log.count(LogFault::Negative);
+            } else {
+                // NaN and 0 are its words for an eye that it does not see.
+                let valid = diameter > 0.0;
+                let diameter = if valid { diameter } else { 0.0 };
+                log.push(LogSample { t, eye, diameter, confidence: 1.0, aperture_mm, valid }, number);
+            }
+        }
+    }
+    if let Some(source) = times_input.failure.take() {
+        return Err(times_input.io(source));
+    }
+    let mut cut_off = [0; 1];
+    if states.read(&mut cut_off).is_ok_and(|count| count > 0) {
+        log.count(LogFault::Malformed);
+    }
+    read_native_blinks(input.path, log);
+    Ok(())
+}
+
+/// As `eye_state.dtype` says; as usual where there is none.
+fn native_layout(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<Layout, ReplayError> {
+    let stem = input.path.file_stem().unwrap_or_default().to_string_lossy();
+    let path = input.path.with_file_name(format!("{}.dtype", stem.split(" ps").next().unwrap_or_default()));
+    let name = name_of(&path);
+    let mut text = String::new();
+    match std::fs::File::open(&path) {
+        Err(_) => {
+            log.note(format!("there is no `{name}` beside the log: its fields are taken to be the usual ones"));
+            Ok(Layout::usual(record_floats(&input.head).unwrap_or(RECORD_FLOATS[0])))
+        }
+        Ok(file) => {
+            let read = file.take(1 << 16).read_to_string(&mut text).ok();
+            read.and_then(|_| Layout::of_dtype(&text)).ok_or_else(|| {
+                let expected = "pairs of a name and `float32`, with `pupil_diameter_left_mm` or its right twin among \
+                                them; copy the file again, or move it away to read the usual fields";
+                input.content(format!("a `{name}` of another form"), expected)
+            })
+        }
+    }
+}
+
+/// Bytes of a blink: type, begin, end.
+const BLINK_BYTES: usize = 20;
+
+fn read_native_blinks(path: &Path, log: &mut LogBuilder) {
+    let name = name_of(path).replacen("eye_state", "blinks", 1);
+    let path: PathBuf = path.with_file_name(&name);
+    if !path.is_file() || name == name_of(&path.with_file_name("")) {
+        return;
+    }
+    let Ok(mut blinks) = LogInput::new(&path).and_then(|input| input.open()) else {
+        return log.note(format!("`{name}` beside the log cannot be read"));
     };
-    csv.records().flatten().filter_map(blink).collect()
+    let mut record = [0; BLINK_BYTES];
+    let mut unread = 0;
+    while blinks.read_exact(&mut record).is_ok() {
+        let at = |from: usize| TimeNs(i64::from_le_bytes(std::array::from_fn(|index| record[from + index])));
+        let (begins, ends) = (at(4), at(12));
+        if begins <= ends {
+            log.blinks.push(Blink { eye: SampleEye::Both, begins, ends });
+        } else {
+            unread += 1;
+        }
+    }
+    if unread > 0 {
+        log.note(format!("{unread} records of `{name}` beside the log are no blinks"));
+    }
 }

@@ -1,7 +1,10 @@
 //! PupilEXT: the CSV of its data recording, parted by comma, semicolon or tab.
 //!
-//! One camera or two that look at one eye (`Main` and `Sec` are views, not eyes) give one pupil, [`SampleEye::Both`] since
-//! the file does not say of which eye. With two pupils in the picture they are called A and B; A is taken for the left.
+//! Names are `diameter_px`, `physicalDiameter_mm`, `confidence` and so on up to version 0.1.2, with `A` or `B` behind the
+//! first word where there are two pupils and `Main` or `Sec` where there are two views (`diameterAMain_px`), and later
+//! `pupilDiameter_px_R_M` (eye, camera). `A` is the right eye: later versions put R in its place. Of two views the main one
+//! counts; a lone pupil without an eye's letter is [`SampleEye::Both`]. (Open-PupilEXT, `eyeDataSerializer` and
+//! `pDataTypes`.)
 
 use holod_calibration::TimeNs;
 
@@ -13,8 +16,9 @@ use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, Repl
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::PupilExt, recognises, read };
 
 const TIME: &str = "timestamp_ms";
-/// What stands for the pupil in the names of columns, and the eye that it is taken for.
-const PUPILS: [(&str, SampleEye); 3] = [("", SampleEye::Both), ("A", SampleEye::Left), ("B", SampleEye::Right)];
+/// Eyes, and what stands for each in the names of earlier and of later versions; other letters of later ones are no eye's.
+const PUPILS: [(SampleEye, &str, Option<&str>); 3] =
+    [(SampleEye::Both, "", None), (SampleEye::Right, "A", Some("R")), (SampleEye::Left, "B", Some("L"))];
 
 fn recognises(input: &LogInput<'_>) -> bool {
     input.head_lines().next().is_some_and(is_header)
@@ -22,8 +26,11 @@ fn recognises(input: &LogInput<'_>) -> bool {
 
 fn is_header(line: &[u8]) -> bool {
     let has = |is: &dyn Fn(&[u8]) -> bool| cells(line, separator(line)).any(is);
-    has(&|name| name == TIME.as_bytes())
-        && has(&|name| name.starts_with(b"diameter") && name.ends_with(b"_px") || name.starts_with(b"physicalDiameter"))
+    let is_size = |name: &[u8]| {
+        let begins = [&b"diameter"[..], b"physicalDiameter", b"pupilDiameter", b"pupilPhysicalDiameter"];
+        begins.iter().any(|begin| name.starts_with(begin)) && memchr::memchr(b'_', name).is_some()
+    };
+    has(&|name| name == TIME.as_bytes()) && has(&is_size)
 }
 
 /// The columns of one pupil.
@@ -38,12 +45,14 @@ struct Pupil {
 }
 
 impl Pupil {
-    fn find(table: &Table, pupil: &str, eye: SampleEye) -> Option<Self> {
-        // Of two views the main one counts.
-        let column = |begin: &str, end: &str| {
-            [format!("{begin}{pupil}{end}"), format!("{begin}{pupil}Main{end}")]
-                .iter()
-                .find_map(|wanted| table.column(|name| name == wanted))
+    fn find(table: &Table, (eye, early, late): (SampleEye, &str, Option<&str>)) -> Option<Self> {
+        let is_late = |letter: &str| late.map_or(!matches!(letter, "R" | "L"), |late| letter == late);
+        let column = |word: &str, unit: &str| {
+            let names = [format!("{word}{early}{unit}"), format!("{word}{early}Main{unit}")];
+            let (first, rest) = word.split_at(1);
+            let begin = format!("pupil{}{rest}{unit}_", first.to_uppercase());
+            let letter = |name: &str| name.strip_prefix(&begin)?.strip_suffix("_M").map(is_late);
+            table.column(|name| names.iter().any(|wanted| name == wanted) || letter(name) == Some(true))
         };
         let pupil = Self {
             eye,
@@ -65,19 +74,13 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let Some(size) = choose_size(input)? else { return Ok(()) };
     let Some(mut table) = Table::open(input, log, is_header)? else { return Ok(()) };
     let Some(time) = table.column(|name| name == TIME) else { return Ok(()) };
-    let pupils = PUPILS.map(|(name, eye)| Pupil::find(&table, name, eye));
+    let pupils = PUPILS.map(|names| Pupil::find(&table, names));
     if size > 0 {
         log.unit = SizeUnit::Pixels;
         log.notes.push("PupilEXT was not calibrated: there is no diameter in millimetres".into());
     }
-    if pupils[1..].iter().any(Option::is_some) {
-        log.notes
-            .push("PupilEXT does not say which pupil is of which eye; A is taken for the left, B for the right".into());
-    }
-    if table.column(|name| name.contains("Sec_")).is_some() {
-        log.notes.push(
-            "two cameras looked at the same pupil; the main one's figures are used, with both for millimetres".into(),
-        );
+    if table.column(|name| name.contains("Sec_") || name.starts_with("pupil") && name.ends_with("_S")).is_some() {
+        log.notes.push("two cameras looked at each pupil; pixels and confidence are the main one's".into());
     }
     while let Some(row) = table.next_row(input, log)? {
         let t = match row.cell(time).and_then(|cell| time_ns(cell, 1e6)) {
@@ -106,7 +109,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
 fn choose_size(input: &LogInput<'_>) -> Result<Option<usize>, ReplayError> {
     let mut ignored = LogBuilder::default();
     let Some(mut table) = Table::open(input, &mut ignored, is_header)? else { return Ok(None) };
-    let pupils = PUPILS.map(|(name, eye)| Pupil::find(&table, name, eye));
+    let pupils = PUPILS.map(|names| Pupil::find(&table, names));
     let mut best: Option<usize> = None;
     while let Some(row) = table.next_row(input, &mut ignored)? {
         for pupil in pupils.iter().flatten() {

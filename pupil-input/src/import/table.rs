@@ -105,6 +105,8 @@ pub(super) struct Table {
     lines: Lines,
     separator: u8,
     pub(super) names: Vec<String>,
+    /// Cells of a row that are looked at.
+    width: usize,
     /// Begin and end of each cell of the row, relative to its line.
     cells: Vec<(u32, u32)>,
 }
@@ -121,8 +123,9 @@ impl Table {
             if is_header(lines.line()) {
                 let separator = separator(lines.line());
                 let name = |cell: &[u8]| String::from_utf8_lossy(cell).into_owned();
-                let names = cells(lines.line(), separator).take(MAX_COLUMNS).map(name).collect();
-                return Ok(Some(Self { lines, separator, names, cells: Vec::new() }));
+                let names: Vec<_> = cells(lines.line(), separator).take(MAX_COLUMNS).map(name).collect();
+                let width = names.len();
+                return Ok(Some(Self { lines, separator, names, width, cells: Vec::new() }));
             }
         }
         Ok(None)
@@ -131,6 +134,11 @@ impl Table {
     /// The first column whose name `is` the one.
     pub(super) fn column(&self, is: impl Fn(&str) -> bool) -> Option<usize> {
         self.names.iter().position(|name| is(name))
+    }
+
+    /// Reads no column behind the last of `columns` from now on.
+    pub(super) fn keep_to(&mut self, columns: impl IntoIterator<Item = usize>) {
+        self.width = columns.into_iter().max().map_or(0, |last| last + 1);
     }
 
     /// The next row that is not empty; None at the end.
@@ -150,7 +158,7 @@ impl Table {
         let line = self.lines.line();
         self.cells.clear();
         let origin = line.as_ptr() as usize;
-        self.cells.extend(cells(line, self.separator).take(self.names.len()).map(|cell| {
+        self.cells.extend(cells(line, self.separator).take(self.width).map(|cell| {
             let begin = (cell.as_ptr() as usize - origin) as u32;
             (begin, begin + cell.len() as u32)
         }));
@@ -186,8 +194,10 @@ pub(super) fn number(cell: &[u8]) -> Result<f64, LogFault> {
     let mut text = [0; 40];
     let text = text.get_mut(..cell.len()).ok_or(LogFault::BadNumber)?;
     text.copy_from_slice(cell);
-    if let Some(comma) = memchr::memchr(b',', text).filter(|_| memchr::memchr(b'.', cell).is_none()) {
-        text[comma] = b'.';
+    if !cell.contains(&b'.')
+        && let Some(comma) = text.iter_mut().find(|byte| **byte == b',')
+    {
+        *comma = b'.';
     }
     let number: f64 = std::str::from_utf8(text).ok().and_then(|text| text.parse().ok()).ok_or(LogFault::BadNumber)?;
     if number.is_finite() { Ok(number) } else { Err(LogFault::NotFinite) }
@@ -200,9 +210,9 @@ pub(super) fn time_ns(cell: &[u8], ns_per_unit: f64) -> Result<i64, LogFault> {
     }
     if ns_per_unit.fract() == 0.0
         && (1.0..=1e12).contains(&ns_per_unit)
-        && let Some(ns) = decimal_ns(cell, ns_per_unit as i128)
+        && let Some(ns) = decimal_ns(cell, ns_per_unit as u64)
     {
-        return i64::try_from(ns).map_err(|_| LogFault::BadNumber);
+        return Ok(ns);
     }
     ns_of(number(cell)?, ns_per_unit)
 }
@@ -214,26 +224,33 @@ pub(super) fn ns_of(units: f64, ns_per_unit: f64) -> Result<i64, LogFault> {
 }
 
 /// `-123.456` in exact arithmetic, cut off below the nanosecond; None for any other form or too many digits.
-fn decimal_ns(cell: &[u8], ns_per_unit: i128) -> Option<i128> {
+fn decimal_ns(cell: &[u8], ns_per_unit: u64) -> Option<i64> {
     let (negative, digits) = match cell {
         [b'-', digits @ ..] => (true, digits),
         digits => (false, digits),
     };
-    let (mut value, mut scale, mut point) = (0_i128, 1_i128, false);
-    if digits.len() > 24 || !digits.iter().any(u8::is_ascii_digit) {
-        return None;
-    }
+    // Nineteen digits and a point: both products below stay within their types.
+    let (mut value, mut scale, mut point, mut count) = (0_u64, 1_u64, false, 0);
     for &byte in digits {
         match byte {
-            b'0'..=b'9' => {
-                value = value * 10 + i128::from(byte - b'0');
+            b'0'..=b'9' if count < 19 => {
+                value = value * 10 + u64::from(byte - b'0');
                 scale *= if point { 10 } else { 1 };
+                count += 1;
             }
             b'.' | b',' if !point => point = true,
             _ => return None,
         }
     }
-    let ns = value.checked_mul(ns_per_unit)? / scale;
+    if count == 0 {
+        return None;
+    }
+    let ns = if ns_per_unit.is_multiple_of(scale) {
+        u128::from(value) * u128::from(ns_per_unit / scale)
+    } else {
+        u128::from(value) * u128::from(ns_per_unit) / u128::from(scale)
+    };
+    let ns = i64::try_from(ns).ok()?;
     Some(if negative { -ns } else { ns })
 }
 

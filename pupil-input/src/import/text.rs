@@ -1,170 +1,359 @@
-//! A log's bytes as they should have been stored: unpacked from gzip and turned from UTF-16 into UTF-8, both told by
-//! their first bytes.
+//! Lines, cells and numbers of text logs: in bounded memory whatever a file holds, and without an allocation a line.
 
-use std::io::{self, BufRead, BufReader, Read};
+use std::io::Read;
 
-use flate2::bufread::MultiGzDecoder;
+use holod_calibration::TimeNs;
 
-/// Bytes read at a time.
-const BUFFER_BYTES: usize = 1 << 18;
-const GZIP: &[u8] = b"\x1F\x8B";
-const UTF8_MARK: &[u8] = b"\xEF\xBB\xBF";
-const UTF16_LE_MARK: &[u8] = b"\xFF\xFE";
-const UTF16_BE_MARK: &[u8] = b"\xFE\xFF";
+use super::{LogBuilder, LogFault};
 
-/// `source` without gzip, UTF-16 and byte order mark.
-///
-/// A bomb of gzip does no harm: what it holds is never kept, only read past.
-pub(super) fn plain(source: impl Read + 'static) -> io::Result<Box<dyn BufRead>> {
-    let mut reader = BufReader::with_capacity(BUFFER_BYTES, source);
-    if reader.fill_buf()?.starts_with(GZIP) {
-        text(BufReader::with_capacity(BUFFER_BYTES, MultiGzDecoder::new(reader)))
-    } else {
-        text(reader)
-    }
+/// A longer line is no line of any log: it is counted as [`LogFault::TooLong`] and never held.
+pub(crate) const MAX_LINE_BYTES: usize = 1 << 16;
+const BUFFER_BYTES: usize = 4 * MAX_LINE_BYTES;
+
+/// The lines of a log, from its beginning.
+pub(crate) struct Lines {
+    reader: Box<dyn Read>,
+    buffer: Vec<u8>,
+    /// What is read and not yet handed out.
+    from: usize,
+    to: usize,
+    ended: bool,
+    number: u64,
 }
 
-fn text(mut reader: BufReader<impl Read + 'static>) -> io::Result<Box<dyn BufRead>> {
-    // A gzip member may begin with fewer bytes than a mark has: what was peeked at is put back in front.
-    let mut mark = [0; 3];
-    let mut known = 0;
-    while known < mark.len() {
-        match reader.read(&mut mark[known..]) {
-            Ok(0) => break,
-            Ok(count) => known += count,
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-            Err(error) => return Err(error),
-        }
-    }
-    let begins = &mark[..known];
-    let (skip, encoding) = if begins.starts_with(UTF8_MARK) {
-        (UTF8_MARK.len(), None)
-    } else if begins.starts_with(UTF16_LE_MARK) {
-        (UTF16_LE_MARK.len(), Some(u16::from_le_bytes as fn([u8; 2]) -> u16))
-    } else if begins.starts_with(UTF16_BE_MARK) {
-        (UTF16_BE_MARK.len(), Some(u16::from_be_bytes as fn([u8; 2]) -> u16))
-    } else {
-        (0, None)
-    };
-    let whole = io::Cursor::new(begins[skip..].to_vec()).chain(reader);
-    Ok(match encoding {
-        None => Box::new(whole),
-        Some(unit) => Box::new(BufReader::with_capacity(
-            BUFFER_BYTES,
-            Utf16 { source: whole, unit, high: None, text: [0; 4], left: 0..0 },
-        )),
-    })
+/// One line, without its ending.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Line<'l> {
+    /// From 1.
+    pub(crate) number: u64,
+    pub(crate) bytes: &'l [u8],
 }
 
-/// UTF-16 read as UTF-8; half a surrogate pair becomes U+FFFD, a last odd byte nothing.
-struct Utf16<R> {
-    source: R,
-    unit: fn([u8; 2]) -> u16,
-    /// The first half of a pair whose second half was no second half, to be given next.
-    high: Option<u16>,
-    text: [u8; 4],
-    /// What of `text` has not been given yet.
-    left: std::ops::Range<usize>,
-}
-
-impl<R: BufRead> Utf16<R> {
-    fn next_unit(&mut self) -> io::Result<Option<u16>> {
-        if let Some(unit) = self.high.take() {
-            return Ok(Some(unit));
-        }
-        let mut bytes = [0; 2];
-        match self.source.read_exact(&mut bytes) {
-            Ok(()) => Ok(Some((self.unit)(bytes))),
-            Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => Ok(None),
-            Err(error) => Err(error),
-        }
+impl Lines {
+    pub(super) fn new(reader: Box<dyn Read>) -> Self {
+        Self { reader, buffer: vec![0; BUFFER_BYTES], from: 0, to: 0, ended: false, number: 0 }
     }
 
-    fn next_char(&mut self) -> io::Result<Option<char>> {
-        let Some(first) = self.next_unit()? else { return Ok(None) };
-        if !(0xD800..0xDC00).contains(&first) {
-            return Ok(Some(char::from_u32(u32::from(first)).unwrap_or(char::REPLACEMENT_CHARACTER)));
-        }
-        let Some(second) = self.next_unit()? else { return Ok(Some(char::REPLACEMENT_CHARACTER)) };
-        let pair = char::decode_utf16([first, second]).next();
-        Ok(Some(pair.and_then(Result::ok).unwrap_or_else(|| {
-            self.high = Some(second);
-            char::REPLACEMENT_CHARACTER
-        })))
-    }
-}
-
-impl<R: BufRead> Read for Utf16<R> {
-    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
-        let mut used = 0;
-        while used < out.len() {
-            if self.left.is_empty() {
-                let Some(next) = self.next_char()? else { break };
-                self.left = 0..next.encode_utf8(&mut self.text).len();
+    /// The next line, be it empty; overlong ones are counted in `log` and skipped. None at the end, or where reading
+    /// failed, which [`Recording::read`](super::Recording::read) tells.
+    pub(crate) fn next(&mut self, log: &mut LogBuilder) -> Option<Line<'_>> {
+        let mut overlong = false;
+        loop {
+            let (end, next) = match memchr::memchr(b'\n', &self.buffer[self.from..self.to]) {
+                Some(length) => (self.from + length, self.from + length + 1),
+                None if !self.ended => {
+                    if self.to - self.from > MAX_LINE_BYTES {
+                        overlong = true;
+                        self.from = self.to;
+                    }
+                    self.fill();
+                    continue;
+                }
+                None if self.from == self.to && !overlong => return None,
+                None => (self.to, self.to),
+            };
+            let begin = std::mem::replace(&mut self.from, next);
+            self.number += 1;
+            if std::mem::take(&mut overlong) || end - begin > MAX_LINE_BYTES {
+                log.count(LogFault::TooLong);
+                continue;
             }
-            let count = self.left.len().min(out.len() - used);
-            out[used..used + count].copy_from_slice(&self.text[self.left.start..self.left.start + count]);
-            self.left.start += count;
-            used += count;
+            let bytes = &self.buffer[begin..end];
+            return Some(Line { number: self.number, bytes: bytes.strip_suffix(b"\r").unwrap_or(bytes) });
         }
-        Ok(used)
     }
+
+    fn fill(&mut self) {
+        self.buffer.copy_within(self.from..self.to, 0);
+        (self.from, self.to) = (0, self.to - self.from);
+        match self.reader.read(&mut self.buffer[self.to..]) {
+            Ok(0) | Err(_) => self.ended = true,
+            Ok(count) => self.to += count,
+        }
+    }
+}
+
+/// The names of a table's columns.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Header {
+    pub(crate) separator: u8,
+    names: Vec<String>,
+}
+
+impl Header {
+    /// Reads a header line; cells are trimmed and freed of quotation marks.
+    pub(crate) fn of(line: &[u8], separator: u8) -> Self {
+        let mut names = Vec::new();
+        let mut rest = Some(line);
+        while let Some(line) = rest {
+            let (name, after) = first_cell(line, separator);
+            names.push(String::from_utf8_lossy(name).into_owned());
+            rest = after;
+        }
+        Self { separator, names }
+    }
+
+    /// The column of this name.
+    pub(crate) fn column(&self, name: &str) -> Option<usize> {
+        self.names.iter().position(|candidate| candidate == name)
+    }
+
+    /// The column of the first of these names that there is.
+    pub(crate) fn first_of(&self, names: &[&str]) -> Option<usize> {
+        names.iter().find_map(|name| self.column(name))
+    }
+
+    pub(crate) fn has(&self, name: &str) -> bool {
+        self.column(name).is_some()
+    }
+}
+
+/// The cells of some columns, out of rows that may have many more.
+#[derive(Clone, Debug)]
+pub(crate) struct Picker<const N: usize> {
+    separator: u8,
+    /// Column and place, in order of columns.
+    wanted: Vec<(usize, usize)>,
+}
+
+impl<const N: usize> Picker<N> {
+    /// Picks `columns`, each into its own place; a place whose column is None stays None.
+    pub(crate) fn new(separator: u8, columns: [Option<usize>; N]) -> Self {
+        let mut wanted: Vec<_> =
+            columns.into_iter().enumerate().filter_map(|(place, column)| Some((column?, place))).collect();
+        wanted.sort_unstable();
+        Self { separator, wanted }
+    }
+
+    /// The cells, trimmed and freed of quotation marks; None where the row ends before the column.
+    pub(crate) fn pick<'l>(&self, row: &'l [u8]) -> [Option<&'l [u8]>; N] {
+        let mut cells = [None; N];
+        let mut rest = Some(row);
+        let mut column = 0;
+        for &(wanted, place) in &self.wanted {
+            while column < wanted {
+                rest = rest.and_then(|line| after_cell(line, self.separator));
+                column += 1;
+            }
+            let Some(line) = rest else { break };
+            cells[place] = Some(first_cell(line, self.separator).0);
+        }
+        cells
+    }
+}
+
+/// The first cell, trimmed, and what comes after its separator.
+fn first_cell(line: &[u8], separator: u8) -> (&[u8], Option<&[u8]>) {
+    let end = cell_end(line, separator);
+    let cell = line[..end].trim_ascii();
+    let cell = cell.strip_prefix(b"\"").and_then(|cell| cell.strip_suffix(b"\"")).unwrap_or(cell);
+    (cell, line.get(end + 1..))
+}
+
+fn after_cell(line: &[u8], separator: u8) -> Option<&[u8]> {
+    line.get(cell_end(line, separator) + 1..)
+}
+
+fn cell_end(line: &[u8], separator: u8) -> usize {
+    let quoted =
+        if line.first() == Some(&b'"') { memchr::memchr(b'"', &line[1..]).map_or(0, |closing| closing + 2) } else { 0 };
+    memchr::memchr(separator, &line[quoted..]).map_or(line.len(), |length| quoted + length)
+}
+
+/// A decimal number as it is written: ±`digits`·10^`exponent`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Decimal {
+    negative: bool,
+    digits: u64,
+    exponent: i32,
+}
+
+/// A plain number of up to 19 digits with a decimal point or comma; None for everything else, be it a number or not.
+fn decimal(text: &[u8]) -> Option<Decimal> {
+    let (negative, text) = match text {
+        [b'-', rest @ ..] => (true, rest),
+        [b'+', rest @ ..] => (false, rest),
+        _ => (false, text),
+    };
+    if text.len() > 20 {
+        return None;
+    }
+    let mut digits: u64 = 0;
+    let mut count = 0;
+    let mut point = None;
+    for &byte in text {
+        match byte {
+            b'0'..=b'9' => {
+                digits = digits.wrapping_mul(10).wrapping_add(u64::from(byte - b'0'));
+                count += 1;
+            }
+            b'.' | b',' if point.is_none() => point = Some(count),
+            _ => return None,
+        }
+    }
+    (1..=19).contains(&count).then(|| Decimal { negative, digits, exponent: point.map_or(0, |point| point - count) })
+}
+
+/// What [`decimal`] does not read: exponents, very long numbers, `NaN`, `inf`.
+fn unusual(text: &[u8]) -> Option<f64> {
+    let text = std::str::from_utf8(text).ok()?;
+    text.parse().or_else(|_| text.replacen(',', ".", 1).parse()).ok()
+}
+
+const POWERS: [f64; 23] = [
+    1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19, 1e20,
+    1e21, 1e22,
+];
+
+/// Reads a number, with a decimal point or comma; the same as parsing it as f64.
+pub(crate) fn number(text: &[u8]) -> Option<f64> {
+    match decimal(text) {
+        // Digits and power are exact, so that their quotient is rounded once.
+        Some(Decimal { negative, digits, exponent }) if digits < 1 << 53 => {
+            let size = digits as f64 / POWERS[exponent.unsigned_abs() as usize];
+            Some(if negative { -size } else { size })
+        }
+        _ => unusual(text),
+    }
+}
+
+/// Reads a time in units of 10^-`places` seconds (9 for nanoseconds, 6, 3, 0 for seconds), exactly; None where it is no
+/// number or beyond what i64 holds.
+pub(crate) fn time(text: &[u8], places: i32) -> Option<TimeNs> {
+    let Some(Decimal { negative, digits, exponent }) = decimal(text) else {
+        let ns = (unusual(text)? * 10_f64.powi(9 - places)).round();
+        return (ns.abs() < 9.2e18).then_some(TimeNs(ns as i64));
+    };
+    let shift = 9 - places + exponent;
+    let ns = if shift >= 0 {
+        i128::from(digits) * 10_i128.pow(shift.unsigned_abs())
+    } else {
+        let unit = 10_i128.pow(shift.unsigned_abs());
+        (i128::from(digits) + unit / 2) / unit
+    };
+    i64::try_from(if negative { -ns } else { ns }).ok().map(TimeNs)
 }
 
 #[cfg(test)]
 mod tests {
-    use std::io::Write;
-
-    use flate2::Compression;
-    use flate2::write::GzEncoder;
+    use proptest::prelude::*;
 
     use super::*;
 
-    fn read(bytes: Vec<u8>) -> io::Result<String> {
-        let mut text = String::new();
-        plain(io::Cursor::new(bytes))?.read_to_string(&mut text)?;
-        Ok(text)
+    /// A reader that gives at most `step` bytes at a time.
+    struct Dripping {
+        bytes: Vec<u8>,
+        at: usize,
+        step: usize,
     }
 
-    fn gzip(bytes: &[u8]) -> Vec<u8> {
-        let mut encoder = GzEncoder::new(Vec::new(), Compression::fast());
-        encoder.write_all(bytes).expect("a Vec takes all");
-        encoder.finish().expect("a Vec takes all")
+    impl Read for Dripping {
+        fn read(&mut self, into: &mut [u8]) -> std::io::Result<usize> {
+            let count = into.len().min(self.step).min(self.bytes.len() - self.at);
+            into[..count].copy_from_slice(&self.bytes[self.at..self.at + count]);
+            self.at += count;
+            Ok(count)
+        }
     }
 
-    fn utf16(text: &str, big: bool) -> Vec<u8> {
-        let bytes = |unit: u16| if big { unit.to_be_bytes() } else { unit.to_le_bytes() };
-        format!("\u{feff}{text}").encode_utf16().flat_map(bytes).collect()
+    fn lines_of(bytes: &[u8], step: usize) -> (Vec<(u64, Vec<u8>)>, u64) {
+        let mut log = LogBuilder::default();
+        let mut lines = Lines::new(Box::new(Dripping { bytes: bytes.into(), at: 0, step }));
+        let mut all = Vec::new();
+        while let Some(line) = lines.next(&mut log) {
+            all.push((line.number, line.bytes.to_vec()));
+        }
+        assert!(lines.next(&mut log).is_none());
+        (all, log.faults.of(LogFault::TooLong))
     }
 
     #[test]
-    fn each_encoding_reads_as_the_same_text() {
-        let text = "Time [\u{b5}s]\t\u{1F441}\r\n1,5\n";
-        for bytes in
-            [text.as_bytes().to_vec(), format!("\u{feff}{text}").into_bytes(), utf16(text, false), utf16(text, true)]
+    fn lines_come_whole_with_their_numbers_and_overlong_ones_are_counted() {
+        let mut text = b"one\r\n\ntwo\n".to_vec();
+        text.extend(vec![b'x'; 3 * BUFFER_BYTES]);
+        text.extend(b"\nthree\n");
+        text.extend(vec![b'y'; MAX_LINE_BYTES]);
+        text.extend(b"\nlast");
+        let longest = vec![b'y'; MAX_LINE_BYTES];
+        let expected: Vec<(u64, Vec<u8>)> = vec![
+            (1, b"one".into()),
+            (2, b"".into()),
+            (3, b"two".into()),
+            (5, b"three".into()),
+            (6, longest),
+            (7, b"last".into()),
+        ];
+        for step in [7, 4096, usize::MAX] {
+            assert_eq!(lines_of(&text, step), (expected.clone(), 1));
+        }
+        assert_eq!(lines_of(&vec![0; 2 * BUFFER_BYTES], usize::MAX), (vec![], 1));
+        assert_eq!(lines_of(b"", 1), (vec![], 0));
+    }
+
+    #[test]
+    fn cells_are_picked_by_column_whatever_their_order_and_quotes() {
+        let header = Header::of(b" a ,\"b, c\",d", b',');
+        assert_eq!(header, Header { separator: b',', names: ["a", "b, c", "d"].map(String::from).to_vec() });
+        assert_eq!(header.first_of(&["x", "d", "a"]), Some(2));
+        let picker = Picker::new(b';', [Some(3), None, Some(0), Some(1)]);
+        assert_eq!(picker.pick(b"p; \"q\";r;s ;t"), [Some(&b"s"[..]), None, Some(b"p"), Some(b"q")]);
+        assert_eq!(picker.pick(b"p;"), [None, None, Some(&b"p"[..]), Some(b"")]);
+        assert_eq!(picker.pick(b""), [None, None, Some(&b""[..]), None]);
+        assert_eq!(picker.pick(b"\";;;"), [Some(&b""[..]), None, Some(b"\""), Some(b"")]);
+    }
+
+    #[test]
+    fn times_are_exact_to_the_nanosecond() {
+        assert_eq!(time(b"-323801.600000001", 0), Some(TimeNs(-323_801_600_000_001)));
+        assert_eq!(time(b"2154556.5", 3), Some(TimeNs(2_154_556_500_000)));
+        assert_eq!(time(b"10000000123", 6), Some(TimeNs(10_000_000_123_000)));
+        assert_eq!(time(b"1760676790465965534", 9), Some(TimeNs(1_760_676_790_465_965_534)));
+        assert_eq!(time(b"0,25", 3), Some(TimeNs(250_000)));
+        assert_eq!(time(b"1.23456789e3", 0), Some(TimeNs(1_234_567_890_000)));
+        assert_eq!(time(b"8067.36209123456789", 0), Some(TimeNs(8_067_362_091_235)));
+        for none in [&b""[..], b"soon", b"1.2.3", b"-", b".", b"NaN", b"1e99", b"99999999999999999999999"] {
+            assert_eq!(time(none, 9), None, "{}", String::from_utf8_lossy(none));
+        }
+    }
+
+    #[test]
+    fn numbers_are_read_with_either_decimal_mark() {
+        for (text, expected) in
+            [("3.5", 3.5), ("-0,25", -0.25), ("+1", 1.0), (".5", 0.5), ("1e-3", 1e-3), ("1,5e2", 150.0)]
         {
-            assert_eq!(read(gzip(&bytes)).expect("reads"), text);
-            assert_eq!(read(bytes).expect("reads"), text);
+            assert_eq!(number(text.as_bytes()), Some(expected), "{text}");
+        }
+        assert!(number(b"nan").is_some_and(f64::is_nan));
+        for none in ["", " ", "-", ".", "1.2.3", "0x10", "3.5mm", "\u{ff}"] {
+            assert_eq!(number(none.as_bytes()), None, "{none}");
         }
     }
 
-    #[test]
-    fn short_and_damaged_inputs_are_read_as_far_as_they_go() {
-        for text in ["", "a", "ab"] {
-            assert_eq!(read(text.into()).expect("reads"), text);
+    proptest! {
+        #[test]
+        fn a_number_is_what_std_reads(value in any::<f64>(), places in 0_usize..18) {
+            for text in [value.to_string(), format!("{value:.places$}"), format!("{:.places$}", value % 1e4), format!("{value:e}")] {
+                let expected: f64 = text.parse().expect("a number");
+                let read = number(text.as_bytes()).expect("a number");
+                prop_assert!(read == expected || read.is_nan() && expected.is_nan(), "{} {} {}", text, read, expected);
+            }
         }
-        // Two halves in the wrong order, a half at the end, an odd byte.
-        assert_eq!(
-            read(b"\xFF\xFE\x41\xD8a\0\x41\xDCb\0\x41\xD8c".to_vec()).expect("reads"),
-            "\u{fffd}a\u{fffd}b\u{fffd}"
-        );
-        let packed = gzip(b"P1,1,2,L,3,1\n");
-        assert!(read(packed[..packed.len() - 4].to_vec()).is_err(), "a cut archive is an error, not a shorter log");
-    }
 
-    #[test]
-    fn archives_in_a_row_are_one_log() {
-        let both = [gzip(b"\xEF"), gzip(b"\xBB\xBFone\n"), gzip(b"two\n")].concat();
-        assert_eq!(read(both).expect("reads"), "one\ntwo\n");
+        #[test]
+        fn no_text_makes_the_readers_panic(bytes in proptest::collection::vec(any::<u8>(), 0..60), places in 0..10) {
+            let _ = (time(&bytes, places), number(&bytes));
+            let header = Header::of(&bytes, b',');
+            prop_assert!(!header.names.is_empty());
+            let cells = Picker::new(b',', [Some(0), Some(7), Some(2)]).pick(&bytes);
+            prop_assert!(cells[0].is_some());
+        }
+
+        #[test]
+        fn lines_do_not_depend_on_how_they_are_read(
+            lines in proptest::collection::vec("[a-c]{0,9}", 0..40), step in 1_usize..20,
+        ) {
+            let text = lines.join("\n");
+            prop_assert_eq!(lines_of(text.as_bytes(), step), lines_of(text.as_bytes(), usize::MAX));
+        }
     }
 }

@@ -120,6 +120,9 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let mut first: Option<[Vec<u8>; 2]> = None;
     let (mut of_others, mut unmeasured) = (0_u64, 0_u64);
     while let Some(row) = table.next_row(input, log)? {
+        if !columns.is_of_eyes(&row) {
+            continue;
+        }
         let recording = columns.recording.map(|column| column.and_then(|column| row.cell(column).ok()).unwrap_or(b""));
         match &first {
             None => first = Some(recording.map(<[u8]>::to_vec)),
@@ -128,9 +131,6 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
                 continue;
             }
             Some(_) => {}
-        }
-        if !columns.is_of_eyes(&row) {
-            continue;
         }
         let t = match row.cell(columns.time).and_then(|cell| time_ns(cell, ns_per_unit)) {
             Ok(t) => TimeNs(t),
@@ -169,8 +169,12 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
 }
 
 fn open(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<Option<(Table, Columns)>, ReplayError> {
-    let table = Table::open(input, log, is_header)?;
-    Ok(table.and_then(|table| Columns::of(&table).map(|columns| (table, columns))))
+    let Some(mut table) = Table::open(input, log, is_header)? else { return Ok(None) };
+    let Some(columns) = Columns::of(&table) else { return Ok(None) };
+    let eyes = columns.eyes.iter().flatten().flat_map(|eye| [Some(eye.diameter), eye.validity]);
+    let others = [Some(columns.time), columns.sensor, columns.event];
+    table.keep_to(eyes.chain(others).chain(columns.recording).flatten());
+    Ok(Some((table, columns)))
 }
 
 /// Whether the first times are microseconds rather than milliseconds.

@@ -348,6 +348,10 @@ fn channel(node: Node<'_, '_>) -> Channel {
     if says("confidence") {
         return Channel::Confidence { eye };
     }
+    // The width and height of the pupil's picture.
+    if matches!(kind.as_str(), "diameterx" | "diametery") {
+        return Channel::Other;
+    }
     let measure = if says("diam") {
         Measure::Diameter
     } else if says("radius") && !says("sphere") && !says("eyeball") {

@@ -15,6 +15,7 @@ use holod_calibration::rig::Fault;
 
 use crate::import::SizeUnit;
 use crate::spec::UsbIds;
+use crate::wire::hid_descriptor::DescriptorError;
 use crate::wire::{Decoder, Format};
 
 /// A kind of tracker.
@@ -172,6 +173,18 @@ impl Profile {
     /// The profile that a text describes; `origin` names it in errors.
     pub(crate) fn from_toml(text: &str, origin: &str) -> Result<Self, ProfileError> {
         parse::parse(text).map_err(|faults| ProfileError::Wrong { origin: origin.into(), faults })
+    }
+
+    /// The profile for the HID device with this report descriptor: what it names by usage gets its place.
+    ///
+    /// # Errors
+    /// The descriptor is faulty, or does not have what the profile names.
+    pub(crate) fn described(self, descriptor: &[u8]) -> Result<Self, DescriptorError> {
+        let format = match self.format {
+            Format::Usages(settings) => Format::Report(settings.resolve(descriptor)?),
+            format => format,
+        };
+        Ok(Self { format, ..self })
     }
 
     /// A decoder for a stream that may be joined in the middle of a message.

@@ -11,8 +11,10 @@ use crate::SampleEye;
 use crate::import::SizeUnit;
 use crate::wire::delimited::{Column, DelimitedSettings, MAX_COLUMNS, Separator};
 use crate::wire::field::{Field, Figure, Layout, Literal, NumberType, PupilAt, SizeRule, TimeAt, Validity};
+use crate::wire::hid_descriptor::Usage;
 use crate::wire::packet::{MAX_PACKET_BYTES, PacketChecksum, PacketLength, PacketSettings};
 use crate::wire::report::ReportSettings;
+use crate::wire::usages::{UsageAt, UsageSettings};
 use crate::wire::{ChecksumKind, Crc, Format};
 
 /// What the rest of the profile says about the figures on the wire.
@@ -25,8 +27,8 @@ pub(super) struct Context {
     pub(super) size_at: Option<Found<()>>,
 }
 
-const KINDS: [&str; 10] =
-    ["holod", "delimited", "packet", "report", "core", "iscan", "livetrack", "neon", "open-gaze", "pupilext"];
+const KINDS: [&str; 11] =
+    ["holod", "delimited", "packet", "report", "usages", "iscan", "livetrack", "open-gaze", "pupilext", "core", "neon"];
 /// Bytes of the longest sync word.
 const SYNC_MAX: usize = 16;
 
@@ -35,16 +37,21 @@ pub(super) fn read_wire<'a>(wire: &Section<'a>, context: &Context) -> Option<(Fo
     let expected = format!("one of \"{}\"", KINDS.join("\", \""));
     let kind = wire.require("kind", &expected)?;
     let name = wire.reader().text(&kind, &expected)?;
-    let configurable = ["delimited", "packet", "report", "iscan"].contains(&name);
+    let configurable = ["delimited", "packet", "report", "usages", "iscan"].contains(&name);
     let read = match name {
         "holod" => Some((Format::Lines, SizeUnit::Millimetres)),
-        "core" => Some((Format::CoreMsgpack, SizeUnit::Millimetres)),
-        "neon" => Some((Format::NeonRtp, SizeUnit::Millimetres)),
         "delimited" => read_delimited(wire, context).map(|settings| (Format::Delimited(settings), context.unit)),
         "packet" => read_packet(wire, context).map(|settings| (Format::Packet(settings), context.unit)),
         "report" => read_report(wire, context).map(|settings| (Format::Report(settings), context.unit)),
+        "usages" => {
+            let places = UsagePlaces { reader: wire.reader() };
+            let layout = read_layout(&places, wire, context);
+            layout.map(|layout| (Format::Usages(UsageSettings { layout }), context.unit))
+        }
         "iscan" => read_iscan(wire, context).map(|settings| (Format::Iscan(settings), context.unit)),
         "livetrack" => read_livetrack(wire, context),
+        "core" => Some((Format::CoreMsgpack, SizeUnit::Millimetres)),
+        "neon" => Some((Format::NeonRtp, SizeUnit::Millimetres)),
         "open-gaze" => Some(read_open_gaze(wire, context)),
         "pupilext" => Some(read_pupilext(wire, context)),
         unknown => {
@@ -611,6 +618,54 @@ fn read_report<'a>(wire: &Section<'a>, context: &Context) -> Option<ReportSettin
     }
     let layout = read_layout(&places, wire, context)?;
     Some(ReportSettings { id, least, most: exact, layout })
+}
+
+/// The fields of a HID report, by their usages.
+struct UsagePlaces<'r, 'a> {
+    reader: &'r Reader<'a>,
+}
+
+impl UsagePlaces<'_, '_> {
+    fn usage(&self, found: &Found<&Item>) -> Option<Usage> {
+        const EXPECTED: &str = "a page and a number in hexadecimals, such as \"ff00:0030\"";
+        let text = self.reader.text(found, EXPECTED)?;
+        let usage = text.parse().ok();
+        if usage.is_none() {
+            self.reader.fault(found, format!("{text:?}"), EXPECTED, "correct it");
+        }
+        usage
+    }
+}
+
+impl<'a> Places<'a> for UsagePlaces<'_, 'a> {
+    type Place = UsageAt;
+
+    fn bare(&self, found: &Found<&'a Item>) -> Option<Option<UsageAt>> {
+        let bare = || self.usage(found).map(|usage| UsageAt { usage, collection: None });
+        found.value.as_table_like().is_none().then(bare)
+    }
+
+    fn read(&self, table: &Section<'a>) -> Option<UsageAt> {
+        let usage = table.require("usage", "the field's usage, such as \"ff00:0030\"");
+        let usage = usage.and_then(|found| self.usage(&found));
+        let collection = match table.get("collection") {
+            None => None,
+            Some(found) => Some(self.usage(&found)?),
+        };
+        Some(UsageAt { usage: usage?, collection })
+    }
+
+    fn wrap_bits(&self, _: &UsageAt) -> Option<u32> {
+        None
+    }
+
+    fn texts(&self) -> bool {
+        false
+    }
+
+    fn same(&self, one: &UsageAt, other: &UsageAt) -> bool {
+        one == other
+    }
 }
 
 #[cfg(test)]

@@ -63,18 +63,24 @@ pub(crate) fn start(files: &RecordFiles, header: Option<&Header>) -> Result<(Tap
         shared: Arc::clone(&shared),
     };
     let mut writer = Writer { raw: None, decisions: None, shared: Arc::clone(&shared) };
-    if let (Some(path), Some(header)) = (&files.raw, header) {
-        let (producer, ring) = rtrb::RingBuffer::new(RING_BYTES);
-        let out = Output::create(path, &header.encode())?;
-        let last = RecordHead { kind: Kind::Connected, t: header.t_started, connection: 0 };
-        writer.raw = Some(RawWriter { ring, head: None, payload: Vec::new(), bytes: Vec::new(), last, told: 0, out });
-        taps.raw = Some(producer);
-    }
+    let raw = files.raw.as_ref().zip(header);
+    let raw = raw.map(|(path, header)| Ok((header, Output::create(path, &header.encode())?))).transpose()?;
     if let Some(path) = &files.samples {
+        let begin = format!("{SAMPLES_HEADER}\n");
+        let out = Output::create(path, begin.as_bytes()).inspect_err(|_| {
+            // A recording without its samples was not asked for.
+            if let Some((_, raw)) = &raw {
+                let _ = std::fs::remove_file(&raw.path);
+            }
+        })?;
         let (producer, ring) = rtrb::RingBuffer::new(RING_DECISIONS);
-        let out = Output::create(path, format!("{SAMPLES_HEADER}\n").as_bytes())?;
         writer.decisions = Some((ring, out));
         taps.decisions = Some(producer);
+    }
+    if let Some((header, out)) = raw {
+        let (producer, ring) = rtrb::RingBuffer::new(RING_BYTES);
+        writer.raw = Some(RawWriter::new(ring, header.t_started, out));
+        taps.raw = Some(producer);
     }
     let thread = thread::Builder::new()
         .name("pupil-recorder".into())
@@ -256,6 +262,13 @@ fn hand_over(out: &mut Output, sync: bool) -> io::Result<()> {
 }
 
 impl RawWriter {
+    fn new(ring: rtrb::Consumer<u8>, t_started: TimeNs, out: Output) -> Self {
+        let payload = Vec::with_capacity(MAX_PAYLOAD_BYTES);
+        let bytes = Vec::with_capacity(RECORD_HEAD_BYTES + MAX_PAYLOAD_BYTES + 4);
+        let last = RecordHead { kind: Kind::Connected, t: t_started, connection: 0 };
+        Self { ring, head: None, payload, bytes, last, told: 0, out }
+    }
+
     /// Writes every whole record that is in the ring; at the end of a run also that it ended, and of how many pieces the
     /// file does not tell yet that they were lost.
     fn write(&mut self, end_with_lost: Option<u64>) -> io::Result<()> {
@@ -297,5 +310,101 @@ impl RawWriter {
 impl Shared {
     fn fail(&self, failure: String) {
         self.failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(failure);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::BufReader;
+
+    use tempfile::TempDir;
+
+    use super::super::container::{Ending, RawReader};
+    use super::*;
+
+    fn header() -> Header {
+        Header {
+            spec: "serial:/dev/x".into(),
+            profile: "holod".into(),
+            profile_toml: None,
+            datagrams: false,
+            t_started: TimeNs(7),
+            started_unix_ns: 0,
+        }
+    }
+
+    /// Taps whose rings nobody empties yet, and what will.
+    fn parts(ring_bytes: usize, path: &Path) -> (Taps, Writer) {
+        let shared = Arc::new(Shared::default());
+        let (producer, ring) = rtrb::RingBuffer::new(ring_bytes);
+        let out = Output::create(path, &header().encode()).expect("makes");
+        let writer =
+            Writer { raw: Some(RawWriter::new(ring, TimeNs(7), out)), decisions: None, shared: Arc::clone(&shared) };
+        let taps = Taps { raw: Some(producer), decisions: None, connection: 0, untold: 0, t_last: TimeNs(7), shared };
+        (taps, writer)
+    }
+
+    fn records(path: &Path) -> (Vec<(RecordHead, Vec<u8>)>, Option<Ending>) {
+        let mut reader = RawReader::new(BufReader::new(File::open(path).expect("opens"))).expect("a header");
+        let mut records = Vec::new();
+        while let Some((head, payload)) = reader.next().expect("reads") {
+            records.push((head, payload.to_vec()));
+        }
+        (records, reader.ending())
+    }
+
+    #[test]
+    fn what_finds_no_room_is_counted_and_the_file_tells_of_it() {
+        let folder = TempDir::new().expect("a folder");
+        let path = folder.path().join("raw");
+        let (mut taps, mut writer) = parts(100, &path);
+        let bytes = |t: i64| (RecordHead { kind: Kind::Bytes, t: TimeNs(t), connection: 0 }, vec![1; 30]);
+        let lost = |t: i64, count: u64| {
+            (RecordHead { kind: Kind::Lost, t: TimeNs(t), connection: 0 }, count.to_le_bytes().to_vec())
+        };
+        for t in 1..=4 {
+            taps.bytes(TimeNs(t), &[1; 30]);
+        }
+        writer.write(false, false);
+        taps.bytes(TimeNs(5), &[1; 30]);
+        for t in 6..=8 {
+            taps.bytes(TimeNs(t), &[1; 30]);
+        }
+        writer.write(true, true);
+        let (read, ending) = records(&path);
+        assert_eq!(read, [bytes(1), bytes(2), lost(2, 2), bytes(5), lost(5, 1), lost(5, 2)]);
+        assert_eq!(ending, Some(Ending::Whole));
+        assert_eq!(taps.shared.chunks_lost.load(Ordering::Relaxed), 5);
+    }
+
+    #[test]
+    fn a_record_that_is_half_in_the_ring_is_waited_for() {
+        let folder = TempDir::new().expect("a folder");
+        let path = folder.path().join("raw");
+        let (mut taps, mut writer) = parts(100, &path);
+        let head = RecordHead { kind: Kind::Bytes, t: TimeNs(1), connection: 1 };
+        let ring = taps.raw.as_mut().expect("a ring");
+        ring.push_entire_slice(&head.encode(3)).expect("room");
+        writer.write(false, true);
+        ring.push_entire_slice(b"abc").expect("room");
+        writer.write(true, true);
+        assert_eq!(records(&path), (vec![(head, b"abc".to_vec())], Some(Ending::Whole)));
+    }
+
+    #[test]
+    fn a_disk_that_is_full_is_told_and_nothing_waits_for_it() {
+        let folder = TempDir::new().expect("a folder");
+        let (mut taps, mut writer) = parts(1 << 12, &folder.path().join("raw"));
+        let full = OpenOptions::new().write(true).open("/dev/full").expect("opens");
+        writer.raw.as_mut().expect("a file").out.file = BufWriter::new(full);
+        taps.bytes(TimeNs(1), b"abc");
+        writer.write(false, true);
+        assert!(writer.raw.is_none());
+        let failure = writer.shared.failure.lock().expect("no panic").clone().expect("a failure");
+        assert!(failure.contains("No space left"), "{failure}");
+        for t in 0..1000 {
+            taps.bytes(TimeNs(t), b"abc");
+        }
+        assert!(taps.shared.chunks_lost.load(Ordering::Relaxed) > 500);
     }
 }

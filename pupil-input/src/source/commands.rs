@@ -24,10 +24,10 @@ pub(crate) trait Dialogue {
 /// Why a tracker did not do as it was told.
 #[derive(Debug, thiserror::Error)]
 pub enum CommandError {
-    /// It could not be told.
-    #[error("`{command}` could not be sent: {source}")]
-    Unsent {
-        /// What was to be sent.
+    /// The link failed.
+    #[error("the link failed at `{command}`: {source}")]
+    Link {
+        /// What was to be sent, or had been.
         command: String,
         /// Why.
         source: io::Error,
@@ -51,9 +51,9 @@ pub(crate) fn perform(link: &mut dyn Dialogue, commands: &[Command]) -> Result<V
     let mut heard = Vec::new();
     for command in commands {
         heard.clear();
-        let unsent = |source| CommandError::Unsent { command: in_words(&command.send), source };
+        let failed = |source| CommandError::Link { command: in_words(&command.send), source };
         let Some(expected) = &command.expect else {
-            link.send(&command.send).map_err(unsent)?;
+            link.send(&command.send).map_err(failed)?;
             continue;
         };
         let mut told = String::new();
@@ -68,7 +68,7 @@ pub(crate) fn perform(link: &mut dyn Dialogue, commands: &[Command]) -> Result<V
             }
             Ok(answered)
         });
-        if !answered.map_err(unsent)? {
+        if !answered.map_err(failed)? {
             return Err(CommandError::NoAnswer {
                 command: in_words(&command.send),
                 found: if told.is_empty() { "nothing".into() } else { format!("`{told}`") },

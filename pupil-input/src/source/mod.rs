@@ -1,16 +1,20 @@
 //! Where bytes come from: one file for each kind of link, behind one trait.
 
 pub(crate) mod commands;
+pub(crate) mod core;
 pub(crate) mod hid;
-pub mod mock;
+pub(crate) mod neon;
 pub(crate) mod serial;
+pub(crate) mod server;
 pub(crate) mod tcp;
 pub(crate) mod udp;
+mod zmtp;
 
 use std::time::Duration;
 
 use hid::HidError;
 use serial::SerialError;
+use server::ServerError;
 use tcp::NetworkError;
 
 /// How long one read waits; also how soon a stop is noticed.
@@ -60,4 +64,7 @@ pub enum SourceError {
     /// A HID device.
     #[error(transparent)]
     Hid(#[from] HidError),
+    /// The server of a Pupil Labs tracker.
+    #[error(transparent)]
+    Server(#[from] ServerError),
 }

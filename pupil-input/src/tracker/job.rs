@@ -8,8 +8,10 @@ use super::TrackerError;
 use crate::import::raw::RawLog;
 use crate::import::{Recording, SizeUnit};
 use crate::profile::{DEFAULT_PROFILE, Profile};
+use crate::simulate::Script;
+use crate::source::core::CoreFeed;
 use crate::source::hid::{self, HidFeed, Wanted};
-use crate::source::mock::Scenario;
+use crate::source::neon::NeonFeed;
 use crate::source::serial::SerialFeed;
 use crate::source::tcp::TcpFeed;
 use crate::source::udp::UdpFeed;
@@ -33,7 +35,7 @@ pub(super) enum Job {
         play: Play,
     },
     Mock {
-        scenario: Scenario,
+        script: Box<Script>,
         origin: TimeNs,
     },
 }
@@ -64,12 +66,15 @@ impl Job {
                 let profile = Profile::find(profile)?;
                 Self::live(Box::new(UdpFeed::new(address.clone(), &profile)), profile)
             }
-            TrackerSpec::Core(_) => unimplemented!("Core"),
-            TrackerSpec::Neon(_) => unimplemented!("Neon"),
+            TrackerSpec::Core(address) => {
+                Self::live(Box::new(CoreFeed { address: address.clone() }), Profile::find("core")?)
+            }
+            TrackerSpec::Neon(address) => Self::live(Box::new(NeonFeed::new(address.clone())), Profile::find("neon")?),
             TrackerSpec::Replay { path, speed, repeat } => {
                 Self::log(path, Play { speed: *speed, repeat: *repeat, origin })
             }
-            TrackerSpec::Mock(scenario) => Ok(Self::Mock { scenario: *scenario, origin }),
+            TrackerSpec::Mock(scenario) => Ok(Self::Mock { script: Box::new(scenario.script()), origin }),
+            TrackerSpec::MockFile(path) => Ok(Self::Mock { script: Box::new(Script::read(path)?), origin }),
         }
     }
 
@@ -117,7 +122,10 @@ impl Job {
             None => hid::profile_of(ids).map_err(SourceError::from)?,
         };
         let wanted = Wanted::new(ids, serial, &profile).map_err(SourceError::from)?;
-        Self::live(Box::new(HidFeed::new(wanted)), profile)
+        let mut feed = HidFeed::new(wanted);
+        let open = feed.open()?;
+        let profile = feed.describe(profile).map_err(SourceError::from)?;
+        Ok(Self::Live { open, feed: Box::new(feed), profile: Box::new(profile) })
     }
 
     fn live(mut feed: Box<dyn Feed>, profile: Profile) -> Result<Self, TrackerError> {

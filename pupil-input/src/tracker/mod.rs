@@ -19,6 +19,7 @@ use crate::estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings,
 use crate::import::{ReplayError, SizeUnit};
 use crate::profile::ProfileError;
 use crate::record::{self, Header, RecordError, RecordFiles, RecordStatus, Recorder};
+use crate::simulate::ScriptError;
 use crate::source::SourceError;
 use crate::spec::TrackerSpec;
 
@@ -40,6 +41,9 @@ pub enum TrackerError {
     /// The log cannot be played.
     #[error(transparent)]
     Replay(#[from] ReplayError),
+    /// The simulated eye's scenario cannot be had.
+    #[error(transparent)]
+    Script(#[from] ScriptError),
     /// The run cannot be written down.
     #[error(transparent)]
     Record(#[from] RecordError),
@@ -58,9 +62,6 @@ pub enum TrackerError {
     #[error("no thread for the pupil reader: {0}; free memory or raise the limit on threads")]
     Thread(std::io::Error),
 }
-
-/// Seed of the `mock` tracker.
-pub const MOCK_SEED: u64 = 1;
 
 /// How the link to the tracker is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

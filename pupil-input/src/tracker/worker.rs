@@ -8,7 +8,7 @@ use std::time::Duration;
 use holod_calibration::TimeNs;
 
 use super::job::{Job, Play};
-use super::{Link, MOCK_SEED, Shared, host_now};
+use super::{Link, Shared, host_now};
 use crate::PupilSample;
 use crate::clock::ClockModel;
 use crate::counters::Counter;
@@ -19,7 +19,7 @@ use crate::import::{LogFault, Recording};
 use crate::profile::Profile;
 use crate::record::{Kind, Taps};
 use crate::sequence::{SequenceEvent, SequenceTracker};
-use crate::source::mock::{MockSource, Scenario};
+use crate::simulate::{MockSource, Script};
 use crate::source::{ByteSource, Feed, ReadEvent};
 use crate::spec::ReplaySpeed;
 use crate::wire::{Decoder, WireEvent, WireSample};
@@ -55,7 +55,7 @@ impl Worker {
                 self.arrivals_of_stream = true;
                 self.run_again(&raw, play);
             }
-            Job::Mock { scenario, origin } => self.run_mock(scenario, origin),
+            Job::Mock { script, origin } => self.run_mock(*script, origin),
         }
         self.finish();
     }
@@ -212,9 +212,9 @@ impl Worker {
         }
     }
 
-    fn run_mock(&mut self, scenario: Scenario, origin: TimeNs) {
+    fn run_mock(&mut self, script: Script, origin: TimeNs) {
         self.clock = StreamClock { host: origin, stream: TimeNs(0), rate: 1.0 };
-        for mock in MockSource::new(scenario, MOCK_SEED) {
+        for mock in MockSource::of(script) {
             let mut sample = mock.sample;
             if !self.wait_until(self.clock.to_host(sample.t_sample)) {
                 return;

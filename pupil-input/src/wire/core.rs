@@ -16,7 +16,7 @@ use super::{Decoder, WireEvent, WireFault, WireSample};
 use crate::SampleEye;
 
 /// Bytes of the longest message that is read; Pupil's are about 1000.
-pub(crate) const MAX_MESSAGE_BYTES: usize = 4096;
+pub(crate) const MAX_MESSAGE_BYTES: usize = 4000;
 /// Maps and arrays in each other; Pupil's are three.
 const DEEPEST: usize = 16;
 

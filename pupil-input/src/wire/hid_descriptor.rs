@@ -8,6 +8,7 @@
 //! no more than [`MAX_FIELDS`] of them.
 
 use std::fmt;
+use std::str::FromStr;
 
 /// Bytes of the longest descriptor: Linux takes no longer one.
 pub const MAX_DESCRIPTOR_BYTES: usize = 4096;
@@ -69,6 +70,18 @@ pub struct Usage {
     pub page: u16,
     /// The number on that page.
     pub id: u16,
+}
+
+impl FromStr for Usage {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let number = |part: &str| (part.len() <= 4).then(|| u16::from_str_radix(part, 16).ok()).flatten();
+        let usage = text.split_once(':').and_then(|(page, id)| number(page).zip(number(id)));
+        usage
+            .map(|(page, id)| Self { page, id })
+            .ok_or_else(|| format!("`{text}` is no page and number in hexadecimals, such as ff00:0030"))
+    }
 }
 
 impl fmt::Display for Usage {
@@ -198,6 +211,36 @@ pub enum DescriptorError {
         wanted: String,
         /// Where they are, in words.
         found: String,
+    },
+    /// Two fields of a sample are in different reports.
+    #[error(
+        "the fields of usages {one} and {other} are in different reports; a sample must be in one: correct the profile's usages"
+    )]
+    OtherReport {
+        /// The first field.
+        one: Usage,
+        /// The field in another report.
+        other: Usage,
+    },
+    /// Its bits are no number that can be read.
+    #[error(
+        "the field of usage {usage}, {bits} bits from bit {bit_offset}, spans more than 8 bytes, or is signed and ends within a byte"
+    )]
+    Unreadable {
+        /// What it is.
+        usage: Usage,
+        /// Its width.
+        bits: u32,
+        /// Its lowest bit.
+        bit_offset: u32,
+    },
+    /// It has a unit, and no range to convert by.
+    #[error(
+        "the field of usage {usage} has a unit and no range; name its offset, type and scale in a profile of kind `report`"
+    )]
+    NoRange {
+        /// What it is.
+        usage: Usage,
     },
 }
 

@@ -19,6 +19,7 @@ pub mod report;
 #[cfg(test)]
 pub(crate) mod testing;
 mod text;
+pub mod usages;
 
 use holod_calibration::TimeNs;
 
@@ -32,6 +33,7 @@ use open_gaze::{OpenGazeDecoder, OpenGazeSettings};
 use packet::{PacketDecoder, PacketSettings};
 use pupilext::{PupilExtDecoder, PupilExtSettings};
 use report::{ReportDecoder, ReportSettings};
+use usages::{Undescribed, UsageSettings};
 
 /// A sample as the wire gives it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -157,10 +159,6 @@ pub enum Format {
     Packet(PacketSettings),
     /// Whole messages.
     Report(ReportSettings),
-    /// Pupil Labs Core's MessagePack maps.
-    CoreMsgpack,
-    /// Pupil Labs Neon's gaze stream, RTP and RTCP as RTSP interleaves them.
-    NeonRtp,
     /// ISCAN's binary packets.
     Iscan(IscanSettings),
     /// LiveTrack's rows.
@@ -169,6 +167,12 @@ pub enum Format {
     OpenGaze(OpenGazeSettings),
     /// PupilEXT's rows or objects.
     PupilExt(PupilExtSettings),
+    /// HID reports, by the device's descriptor.
+    Usages(UsageSettings),
+    /// Pupil Labs Core's MessagePack maps.
+    CoreMsgpack,
+    /// Pupil Labs Neon's gaze stream, RTP and RTCP as RTSP interleaves them.
+    NeonRtp,
 }
 
 impl Format {
@@ -179,12 +183,13 @@ impl Format {
             Self::Delimited(settings) => Box::new(DelimitedDecoder::joining(settings)),
             Self::Packet(settings) => Box::new(PacketDecoder::joining(settings)),
             Self::Report(settings) => Box::new(ReportDecoder::new(settings)),
-            Self::CoreMsgpack => Box::new(core::CoreDecoder),
-            Self::NeonRtp => Box::new(neon::NeonDecoder::new()),
             Self::Iscan(settings) => Box::new(IscanDecoder::new(settings.clone())),
             Self::LiveTrack(settings) => Box::new(LiveTrackDecoder::new(*settings)),
             Self::OpenGaze(settings) => Box::new(OpenGazeDecoder::new(*settings)),
             Self::PupilExt(settings) => Box::new(PupilExtDecoder::new(*settings)),
+            Self::Usages(_) => Box::new(Undescribed),
+            Self::CoreMsgpack => Box::new(core::CoreDecoder),
+            Self::NeonRtp => Box::new(neon::NeonDecoder::new()),
         }
     }
 }

@@ -135,7 +135,7 @@ impl Decoder for PupilExtDecoder {
         let settings = &self.settings;
         match &mut self.reader {
             Reader::Csv { delimiter, lines } => lines.push(bytes, |row| take_row(settings, *delimiter, row, on_event)),
-            Reader::Json(scanner) => bytes.iter().for_each(|&byte| scanner.take(settings, byte, on_event)),
+            Reader::Json(scanner) => scanner.push(settings, bytes, on_event),
         }
     }
 
@@ -381,14 +381,12 @@ struct Token {
 }
 
 impl Token {
-    fn keep(&mut self, byte: u8) {
-        match self.bytes.get_mut(self.used) {
-            Some(place) => {
-                *place = byte;
-                self.used += 1;
-            }
-            None => self.overlong = true,
-        }
+    fn keep(&mut self, bytes: &[u8]) {
+        let room = &mut self.bytes[self.used..];
+        let kept = bytes.len().min(room.len());
+        room[..kept].copy_from_slice(&bytes[..kept]);
+        self.used += kept;
+        self.overlong |= kept < bytes.len();
     }
 
     /// The text, and none of one that is too long to matter.
@@ -416,6 +414,32 @@ impl Scanner {
         }
     }
 
+    fn push(&mut self, settings: &PupilExtSettings, mut bytes: &[u8], on_event: &mut dyn FnMut(WireEvent)) {
+        while let Some(&byte) = bytes.first() {
+            // What a string holds and the blanks of an indent come in runs.
+            let run = match self.state {
+                State::Text { escaped: false, .. } => {
+                    bytes.iter().position(|byte| matches!(byte, b'"' | b'\\' | b'\n'))
+                }
+                State::Name | State::Value | State::Comma if !self.at_line_start => {
+                    bytes.iter().position(|&byte| byte != b' ')
+                }
+                _ => Some(0),
+            };
+            let (run, rest) = bytes.split_at(run.unwrap_or(bytes.len()));
+            if run.is_empty() {
+                self.take(settings, byte, on_event);
+                bytes = &rest[1..];
+            } else {
+                if matches!(self.state, State::Text { .. }) {
+                    self.token.keep(run);
+                }
+                self.at_line_start = false;
+                bytes = rest;
+            }
+        }
+    }
+
     fn take(&mut self, settings: &PupilExtSettings, byte: u8, on_event: &mut dyn FnMut(WireEvent)) {
         let at_line_start = std::mem::replace(&mut self.at_line_start, byte == b'\n');
         if byte == b'{' && (at_line_start || self.state == State::Outside) {
@@ -438,7 +462,7 @@ impl Scanner {
             (State::Text { .. }, b'\n') => self.lose(WireFault::Malformed, on_event),
             (State::Text { name, escaped }, _) => {
                 self.state = State::Text { name, escaped: byte == b'\\' && !escaped };
-                self.token.keep(byte);
+                self.token.keep(&[byte]);
             }
             (State::Word, b',' | b'}' | b']') => {
                 self.end_value(settings);
@@ -446,7 +470,7 @@ impl Scanner {
             }
             (State::Word, _) if is_blank => self.end_value(settings),
             (State::Word, _) if byte.is_ascii_alphanumeric() || matches!(byte, b'.' | b'-' | b'+') => {
-                self.token.keep(byte);
+                self.token.keep(&[byte]);
             }
             (State::Word, _) => self.lose(WireFault::Malformed, on_event),
             _ if is_blank => {}
@@ -467,7 +491,7 @@ impl Scanner {
             (State::Value | State::Comma, b']') if is_array => self.close(settings, on_event),
             (State::Value, b'-' | b'0'..=b'9' | b'a'..=b'z') => {
                 self.begin_token(State::Word);
-                self.token.keep(byte);
+                self.token.keep(&[byte]);
             }
             _ => self.lose(WireFault::Malformed, on_event),
         }

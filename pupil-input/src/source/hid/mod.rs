@@ -19,6 +19,7 @@ use select::{Candidate, Choice, Identity, either, in_words};
 use super::{ByteSource, Feed, READ_TIMEOUT, ReadEvent, SourceError};
 use crate::profile::{HidSettings, Profile};
 use crate::spec::UsbIds;
+use crate::wire::hid_descriptor::DescriptorError;
 
 /// Why a HID tracker could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -92,6 +93,17 @@ pub enum HidError {
         /// Why.
         reason: String,
     },
+    /// It does not have the fields that the profile names.
+    #[error("HID tracker {ids}, profile `{profile}`: {fault}")]
+    Descriptor {
+        /// Its vendor and product.
+        ids: UsbIds,
+        /// The profile's name.
+        profile: String,
+        /// What is wrong.
+        #[source]
+        fault: DescriptorError,
+    },
     /// It came back as something else.
     #[error(
         "HID tracker {ids} at {path} came back with another report descriptor; its reports would be misread: start holod again"
@@ -137,6 +149,13 @@ pub(crate) struct HidFeed {
 impl HidFeed {
     pub(crate) const fn new(wanted: Wanted) -> Self {
         Self { wanted, last: None }
+    }
+
+    /// The profile for the device that was opened last.
+    pub(crate) fn describe(&self, profile: Profile) -> Result<Profile, HidError> {
+        let Some((Identity { ids, .. }, descriptor)) = &self.last else { return Ok(profile) };
+        let name = profile.name.clone();
+        profile.described(descriptor).map_err(|fault| HidError::Descriptor { ids: *ids, profile: name, fault })
     }
 
     fn connect(&mut self) -> Result<HidSource, HidError> {

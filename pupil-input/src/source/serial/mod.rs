@@ -226,10 +226,10 @@ impl Feed for SerialFeed {
             let owner = owner.into();
             return Err(SerialError::Forbidden { path, owner, ports: ports_in_words(&self.root) }.into());
         }
-        let known = self.check_device(&path, usb)?;
-        let mut port = OpenPort::new(&path, self.baud)?;
         let Profile { name, serial, .. } = &self.profile;
         let has_commands = !serial.start.is_empty() || !serial.stop.is_empty();
+        let known = has_commands && self.check_device(&path, usb)?;
+        let mut port = OpenPort::new(&path, self.baud)?;
         if has_commands && !known {
             self.check_protocol(&path, &mut port)?;
         }
@@ -528,7 +528,7 @@ mod tests {
                 assert!(message.contains("for another device, such as its laser box; nothing was opened"), "{message}");
             }
         }
-        let mut own = feed(&system, &by_id, talks(""), &[by_id.clone()]);
+        let mut own = feed(&system, &by_id, talks(""), std::slice::from_ref(&by_id));
         error(&mut own);
         assert_eq!(heard(&mut laser), b"");
     }

@@ -1,0 +1,182 @@
+//! SMI: text exports of BeGaze and of the IDF converter.
+//!
+//! Lines that begin with `#` come first, then names of columns, then rows of samples (`SMP`) and messages (`MSG`).
+//! Columns are set apart by tabs, semicolons or commas, figures may have decimal commas, and 0.00 or `-` is a lost eye.
+
+use holod_calibration::TimeNs;
+
+use crate::SampleEye;
+
+use super::text::{Header, Picker, number, time};
+use super::{Blink, Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError, SizeUnit};
+
+pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Smi, recognises, read };
+
+/// Names of the columns of one eye.
+struct Names {
+    eye: SampleEye,
+    diameter_mm: [&'static str; 3],
+    width_px: [&'static str; 2],
+    height_px: [&'static str; 2],
+    event: [&'static str; 2],
+}
+
+const EYES: [Names; 2] = [
+    Names {
+        eye: SampleEye::Left,
+        diameter_mm: ["L Pupil Diameter [mm]", "L Mapped Diameter [mm]", "Pupil Diameter Left [mm]"],
+        width_px: ["L Dia X [px]", "Pupil Size Left X [px]"],
+        height_px: ["L Dia Y [px]", "Pupil Size Left Y [px]"],
+        event: ["L Event Info", "Category Left"],
+    },
+    Names {
+        eye: SampleEye::Right,
+        diameter_mm: ["R Pupil Diameter [mm]", "R Mapped Diameter [mm]", "Pupil Diameter Right [mm]"],
+        width_px: ["R Dia X [px]", "Pupil Size Right X [px]"],
+        height_px: ["R Dia Y [px]", "Pupil Size Right Y [px]"],
+        event: ["R Event Info", "Category Right"],
+    },
+];
+
+/// Its column of times and their unit as [`time`] wants it.
+fn times(header: &Header) -> Option<(usize, i32)> {
+    let microseconds = header.column("Time").map(|column| (column, 6));
+    microseconds.or_else(|| header.column("RecordingTime [ms]").map(|column| (column, 3)))
+}
+
+/// The names of columns, if this line is of them.
+fn header_of(line: &[u8]) -> Option<Header> {
+    let separator = *b"\t;,".iter().max_by_key(|separator| line.iter().filter(|byte| byte == separator).count())?;
+    let header = Header::of(line, separator);
+    let sizes =
+        EYES.iter().any(|eye| header.first_of(&eye.diameter_mm).is_some() || header.first_of(&eye.width_px).is_some());
+    (sizes && times(&header).is_some() && (header.has("Type") || header.has("Trial"))).then_some(header)
+}
+
+fn recognises(input: &LogInput<'_>) -> bool {
+    input.head_lines().find(|line| line[0] != b'#').is_some_and(|line| header_of(line).is_some())
+}
+
+fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
+    let mut lines = input.lines()?;
+    let header = loop {
+        let Some(line) = lines.next(log) else { return Ok(()) };
+        let text = line.bytes.trim_ascii();
+        if let Some(rate_hz) = stated_rate(text) {
+            log.stated_rate_hz.get_or_insert(rate_hz);
+        }
+        if !text.is_empty() && text[0] != b'#' {
+            match header_of(text) {
+                Some(header) => break header,
+                None => return Ok(()),
+            }
+        }
+    };
+    let Some((time_column, places)) = times(&header) else { return Ok(()) };
+    let in_mm = EYES.iter().any(|eye| header.first_of(&eye.diameter_mm).is_some());
+    let [left, right] = EYES.map(|eye| {
+        if in_mm {
+            (header.first_of(&eye.diameter_mm), None)
+        } else {
+            (header.first_of(&eye.width_px), header.first_of(&eye.height_px))
+        }
+    });
+    let [left_event, right_event] = EYES.map(|eye| header.first_of(&eye.event));
+    let columns = [Some(time_column), header.column("Type"), left.0, left.1, right.0, right.1, left_event, right_event];
+    let picker = Picker::new(header.separator, columns);
+    let has_type = header.has("Type");
+
+    let mut blinks = [Shut::default(), Shut::default()];
+    while let Some(line) = lines.next(log) {
+        if line.bytes.is_empty() || line.bytes[0] == b'#' {
+            continue;
+        }
+        let [t, kind, left_size, left_height, right_size, right_height, left_event, right_event] =
+            picker.pick(line.bytes);
+        if has_type && kind.is_some_and(|kind| kind != b"SMP") {
+            continue;
+        }
+        let Some(t) = t else {
+            log.count(LogFault::Malformed);
+            continue;
+        };
+        let Some(t) = time(t, places) else {
+            log.count(LogFault::BadNumber);
+            continue;
+        };
+        let sizes = [(left.0, left_size, left.1, left_height), (right.0, right_size, right.1, right_height)];
+        for ((column, size, height_column, height), names) in sizes.into_iter().zip(&EYES) {
+            if column.is_none() {
+                continue;
+            }
+            let diameter = figure(size).and_then(|width| match height_column {
+                None => Ok(width),
+                // The disc of the area of the ellipse.
+                Some(_) => figure(height).map(|height| (width * height).sqrt()),
+            });
+            match diameter {
+                Err(fault) => log.count(fault),
+                Ok(diameter) => {
+                    let (eye, valid) = (names.eye, diameter > 0.0);
+                    let diameter = diameter as f32;
+                    log.push(LogSample { t, eye, diameter, confidence: 1.0, aperture_mm: None, valid }, line.number);
+                }
+            }
+        }
+        for ((shut, event), names) in blinks.iter_mut().zip([left_event, right_event]).zip(&EYES) {
+            shut.note(t, event == Some(b"Blink"), names.eye, log);
+        }
+    }
+    for (shut, names) in blinks.iter_mut().zip(&EYES) {
+        shut.end(names.eye, log);
+    }
+    if !in_mm {
+        log.unit = SizeUnit::Pixels;
+        log.note("there are no diameters in millimetres: sizes are in pixels of the eye camera, √(width·height)");
+    }
+    Ok(())
+}
+
+/// The rate of `## Sample Rate: 250`.
+fn stated_rate(line: &[u8]) -> Option<f64> {
+    let rest = line.strip_prefix(b"##")?.trim_ascii_start().strip_prefix(b"Sample Rate")?;
+    let rate_hz = number(rest.strip_prefix(b":")?.trim_ascii())?;
+    (1.0..=1e5).contains(&rate_hz).then_some(rate_hz)
+}
+
+/// A size, or 0 where the eye is lost.
+fn figure(cell: Option<&[u8]>) -> Result<f64, LogFault> {
+    let size = match cell.ok_or(LogFault::Malformed)? {
+        b"" | b"-" | b"." => 0.0,
+        cell => number(cell).ok_or(LogFault::BadNumber)?,
+    };
+    if !size.is_finite() {
+        Err(LogFault::NotFinite)
+    } else if size < 0.0 {
+        Err(LogFault::Negative)
+    } else {
+        Ok(size)
+    }
+}
+
+/// A run of rows that say `Blink`.
+#[derive(Default)]
+struct Shut {
+    run: Option<(TimeNs, TimeNs)>,
+}
+
+impl Shut {
+    fn note(&mut self, t: TimeNs, blinks: bool, eye: SampleEye, log: &mut LogBuilder) {
+        if !blinks {
+            return self.end(eye, log);
+        }
+        let begins = self.run.map_or(t, |(begins, _)| begins);
+        self.run = Some((begins, t.max(begins)));
+    }
+
+    fn end(&mut self, eye: SampleEye, log: &mut LogBuilder) {
+        if let Some((begins, ends)) = self.run.take() {
+            log.blinks.push(Blink { eye, begins, ends });
+        }
+    }
+}

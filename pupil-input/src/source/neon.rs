@@ -1,0 +1,451 @@
+//! Pupil Labs Neon: the Companion app on its phone says over HTTP where its gaze stream is (`/api/status`), and sends it
+//! by RTSP (RFC 2326).
+//!
+//! Datagrams come first, as in the maker's own client. Where none arrives, as behind a firewall, the next try
+//! has the packets interleaved with RTSP's TCP connection; where that stays empty too, datagrams are tried again. Nothing is
+//! sent back over TCP but a sign of life: Companions were seen to answer receiver reports there with errors in the middle
+//! of a packet.
+//!
+//! Bytes are given as RTSP interleaves them, with the answer to `DESCRIBE` first, so that one decoder reads both.
+
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpStream, UdpSocket};
+use std::os::fd::AsFd;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+use super::server::{OPEN_WITHIN, Server, ServerError, wait};
+use super::{ByteSource, Feed, READ_TIMEOUT, ReadEvent, SourceError};
+use crate::spec::HostPort;
+use crate::wire::neon::{MAX_TEXT_BYTES, gaze_media, header};
+
+/// How long packets are waited for before the other transport is tried.
+const FIRST_PACKET_WITHIN: Duration = Duration::from_secs(3);
+/// A session's life without a sign of it, where the server does not say (RFC 2326, 12.37).
+const SESSION_LASTS: Duration = Duration::from_secs(60);
+/// Bytes of the longest status that is read; a Companion's has about 3000.
+const LONGEST_STATUS: usize = 1 << 18;
+/// Tries to find two free ports that follow each other.
+const PORT_TRIES: usize = 20;
+
+const COMPANION: &str = "Neon Companion";
+const NOT_REACHED: &str = "open the Companion app, bring this machine into the phone's network, and take host and port \
+                           from the app's menu, Streaming";
+const NOT_UNDERSTOOD: &str = "update the Companion app, and check that this is its address";
+
+/// A Companion by its address.
+pub(crate) struct NeonFeed {
+    address: HostPort,
+    /// Whether the packets are to come over TCP.
+    interleaved: Arc<AtomicBool>,
+}
+
+impl NeonFeed {
+    pub(crate) fn new(address: HostPort) -> Self {
+        Self { address, interleaved: Arc::default() }
+    }
+}
+
+impl Feed for NeonFeed {
+    fn open(&mut self) -> Result<Box<dyn ByteSource>, SourceError> {
+        let server = Server { name: COMPANION, address: &self.address, hint: NOT_REACHED, deadline: Instant::now() };
+        let addresses = server.resolve()?;
+        let server = Server { deadline: Instant::now() + OPEN_WITHIN, ..server };
+        let stream = find_stream(&server, &addresses)?;
+        Ok(Box::new(NeonSource::open(&server, &stream, Arc::clone(&self.interleaved))?))
+    }
+}
+
+/// Where the gaze stream is.
+struct GazeStream {
+    address: SocketAddr,
+    url: String,
+}
+
+/// Asks for the Companion's status: a list of components, one of them the sensor `gaze` that is streamed directly.
+fn find_stream(server: &Server<'_>, addresses: &[SocketAddr]) -> Result<GazeStream, ServerError> {
+    const EXPECTED: &str = "the status of a Companion, JSON with a list `result` of sensors";
+    let stream = server.connect(addresses)?;
+    let host = stream.peer_addr().map_err(|error| server.broken(error))?.ip();
+    let answer = get_status(stream, server.address, server.deadline).map_err(|error| server.broken(error))?;
+    let unexpected = |found: &[u8]| server.unexpected(found, EXPECTED, NOT_UNDERSTOOD);
+    let body = http_body(&answer).ok_or_else(|| unexpected(&answer))?;
+    let status: Value = serde_json::from_slice(&body).map_err(|_| unexpected(&body))?;
+    let components = status["result"].as_array().ok_or_else(|| unexpected(&body))?;
+    let mut sensors =
+        components.iter().filter(|component| component["model"] == "Sensor").map(|sensor| &sensor["data"]);
+    let gaze = sensors
+        .find(|sensor| sensor["sensor"] == "gaze" && sensor["conn_type"] == "DIRECT")
+        .filter(|gaze| gaze["connected"] == true)
+        .ok_or_else(|| {
+            let expected = "a connected sensor `gaze` with conn_type DIRECT";
+            server.unexpected(b"a status without", expected, "connect the glasses to the phone")
+        })?;
+    let port = gaze["port"].as_u64().and_then(|port| u16::try_from(port).ok());
+    let port = port
+        .ok_or_else(|| server.unexpected(gaze.to_string().as_bytes(), "a port of the gaze stream", NOT_UNDERSTOOD))?;
+    // The address that the phone knows itself by, or the one that it answers at.
+    let host = gaze["ip"].as_str().and_then(|ip| ip.parse().ok()).unwrap_or(host);
+    let address = SocketAddr::new(host, port);
+    let params = gaze["params"].as_str().unwrap_or_default();
+    if params.bytes().any(|byte| !byte.is_ascii_graphic()) {
+        return Err(server.unexpected(params.as_bytes(), "parameters that fit into a URL", NOT_UNDERSTOOD));
+    }
+    Ok(GazeStream { address, url: format!("rtsp://{address}/?{params}") })
+}
+
+/// The whole answer to one HTTP request; the connection is closed behind it.
+fn get_status(mut stream: TcpStream, address: &HostPort, deadline: Instant) -> io::Result<Vec<u8>> {
+    write!(
+        stream,
+        "GET /api/status HTTP/1.1\r\nHost: {address}\r\nAccept: application/json\r\nConnection: close\r\n\r\n"
+    )?;
+    let mut answer = Vec::new();
+    let mut piece = [0; 4096];
+    loop {
+        let count = read_by(&mut stream, &mut piece, deadline)?;
+        answer.extend_from_slice(&piece[..count]);
+        if count == 0 || http_complete(&answer) {
+            return Ok(answer);
+        }
+        if answer.len() > LONGEST_STATUS {
+            return Err(io::Error::new(
+                ErrorKind::InvalidData,
+                format!("its status is longer than {LONGEST_STATUS} bytes"),
+            ));
+        }
+    }
+}
+
+fn split_head(message: &[u8]) -> Option<(&[u8], &[u8])> {
+    let end = message.windows(4).position(|window| window == b"\r\n\r\n")?;
+    Some(message.split_at(end + 4))
+}
+
+/// Whether an answer says itself that it ends here.
+fn http_complete(answer: &[u8]) -> bool {
+    split_head(answer).is_some_and(|(head, body)| {
+        header(head, "content-length")
+            .and_then(|length| length.parse::<usize>().ok())
+            .is_some_and(|length| body.len() >= length)
+            || is_chunked(head) && body.ends_with(b"0\r\n\r\n")
+    })
+}
+
+fn is_chunked(head: &[u8]) -> bool {
+    header(head, "transfer-encoding").is_some_and(|coding| coding.eq_ignore_ascii_case("chunked"))
+}
+
+/// The body of an HTTP answer of status 200.
+fn http_body(answer: &[u8]) -> Option<Vec<u8>> {
+    let (head, mut body) = split_head(answer)?;
+    if status_code(head) != Some(200) {
+        return None;
+    }
+    if !is_chunked(head) {
+        return Some(body.to_vec());
+    }
+    let mut whole = Vec::new();
+    loop {
+        let end = body.windows(2).position(|window| window == b"\r\n")?;
+        let size = std::str::from_utf8(&body[..end]).ok()?;
+        let size = usize::from_str_radix(size.split(';').next()?.trim(), 16).ok()?;
+        if size == 0 {
+            return Some(whole);
+        }
+        let (chunk, rest) = body[end + 2..].split_at_checked(size)?;
+        whole.extend_from_slice(chunk);
+        body = rest.strip_prefix(b"\r\n")?;
+    }
+}
+
+/// The number behind `HTTP/1.1 ` or `RTSP/1.0 `.
+fn status_code(head: &[u8]) -> Option<u16> {
+    let line = std::str::from_utf8(head.split(|byte| *byte == b'\r').next()?).ok()?;
+    line.split(' ').nth(1)?.parse().ok()
+}
+
+/// Waits for bytes; 0 is the end of the stream.
+fn read_by(stream: &mut TcpStream, buffer: &mut [u8], deadline: Instant) -> io::Result<usize> {
+    loop {
+        match stream.read(buffer) {
+            Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => {}
+            outcome => return outcome,
+        }
+        if Instant::now() >= deadline {
+            return Err(ErrorKind::TimedOut.into());
+        }
+        wait([stream.as_fd()], deadline)?;
+    }
+}
+
+/// A session's control connection.
+struct Rtsp {
+    stream: TcpStream,
+    /// Bytes read behind the last answer.
+    rest: Vec<u8>,
+    number: u32,
+    session: Option<String>,
+}
+
+impl Rtsp {
+    fn send(&mut self, method: &str, url: &str, headers: &str) -> io::Result<()> {
+        self.number += 1;
+        let session = self.session.iter().map(|session| format!("Session: {session}\r\n")).collect::<String>();
+        let request = format!("{method} {url} RTSP/1.0\r\nCSeq: {}\r\n{session}{headers}\r\n", self.number);
+        self.stream.write_all(request.as_bytes())
+    }
+
+    /// Sends a request and gives its answer, head and body.
+    fn ask(&mut self, server: &Server<'_>, method: &str, url: &str, headers: &str) -> Result<Vec<u8>, ServerError> {
+        let answer = self
+            .send(method, url, headers)
+            .and_then(|()| self.receive(server.deadline))
+            .map_err(|error| server.broken(error))?;
+        if status_code(&answer) != Some(200) {
+            let hint = "close other programs that stream from this phone, or restart the Companion app";
+            return Err(server.unexpected(&answer, "RTSP/1.0 200 OK", hint));
+        }
+        Ok(answer)
+    }
+
+    fn receive(&mut self, deadline: Instant) -> io::Result<Vec<u8>> {
+        loop {
+            if let Some((head, _)) = split_head(&self.rest) {
+                let length = header(head, "content-length").map_or(Ok(0), str::parse::<usize>);
+                let whole = length.ok().and_then(|length| length.checked_add(head.len()));
+                match whole.filter(|whole| *whole <= MAX_TEXT_BYTES) {
+                    Some(whole) if whole <= self.rest.len() => {
+                        let rest = self.rest.split_off(whole);
+                        return Ok(std::mem::replace(&mut self.rest, rest));
+                    }
+                    Some(_) => {}
+                    None => return Err(io::Error::new(ErrorKind::InvalidData, "its answer is too long")),
+                }
+            }
+            if self.rest.len() > MAX_TEXT_BYTES {
+                return Err(io::Error::new(ErrorKind::InvalidData, "its answer is none of RTSP"));
+            }
+            let mut piece = [0; 1024];
+            match read_by(&mut self.stream, &mut piece, deadline)? {
+                0 => return Err(ErrorKind::UnexpectedEof.into()),
+                count => self.rest.extend_from_slice(&piece[..count]),
+            }
+        }
+    }
+}
+
+/// How the packets come.
+enum Transport {
+    Datagrams { rtp: UdpSocket, rtcp: UdpSocket, sender: IpAddr },
+    Interleaved,
+}
+
+struct NeonSource {
+    rtsp: Rtsp,
+    url: String,
+    transport: Transport,
+    /// What has been read and is to be given first.
+    first: Vec<u8>,
+    began: Instant,
+    heard: bool,
+    alive_each: Duration,
+    alive_last: Instant,
+    interleaved: Arc<AtomicBool>,
+}
+
+impl NeonSource {
+    fn open(server: &Server<'_>, gaze: &GazeStream, interleaved: Arc<AtomicBool>) -> Result<Self, ServerError> {
+        let broken = |error| server.broken(error);
+        let stream = server.connect(&[gaze.address])?;
+        let mut rtsp = Rtsp { stream, rest: Vec::new(), number: 0, session: None };
+        rtsp.ask(server, "OPTIONS", &gaze.url, "")?;
+        let description = rtsp.ask(server, "DESCRIBE", &gaze.url, "Accept: application/sdp\r\n")?;
+        let (head, sdp) = split_head(&description).unwrap_or((&description, b""));
+        let base = header(head, "content-base").unwrap_or(&gaze.url).to_owned();
+        let track = track_url(&base, sdp);
+
+        let (transport, asked) = if interleaved.load(Ordering::Relaxed) {
+            (Transport::Interleaved, "RTP/AVP/TCP;unicast;interleaved=0-1".into())
+        } else {
+            let (rtp, rtcp) = datagram_sockets(&rtsp.stream).map_err(broken)?;
+            let port = rtp.local_addr().map_err(broken)?.port();
+            let sender = gaze.address.ip();
+            (Transport::Datagrams { rtp, rtcp, sender }, format!("RTP/AVP;unicast;client_port={port}-{}", port + 1))
+        };
+        let answer = rtsp.ask(server, "SETUP", &track, &format!("Transport: {asked}\r\n"));
+        if answer.is_err() {
+            // One that does not know this transport may know the other.
+            interleaved.fetch_xor(true, Ordering::Relaxed);
+        }
+        let answer = answer?;
+        let session = header(&answer, "session").unwrap_or_default();
+        let (session, options) = session.split_once(';').unwrap_or((session, ""));
+        rtsp.session = Some(session.trim().to_owned()).filter(|session| !session.is_empty());
+        let lasts = options.split(';').find_map(|option| option.trim().strip_prefix("timeout=")?.parse().ok());
+        let lasts = lasts.map_or(SESSION_LASTS, Duration::from_secs);
+        if let Transport::Datagrams { rtp, rtcp, sender } = &transport {
+            let ports = header(&answer, "transport").and_then(server_ports);
+            for (socket, port) in [rtp, rtcp].into_iter().zip(ports.into_iter().flatten()) {
+                // An empty receiver report: firewalls let pass what seems to answer it. What fails here is lost there.
+                let _ = socket.send_to(&[0x80, 201, 0, 1, 0, 0, 0, 0], SocketAddr::new(*sender, port));
+            }
+        }
+        rtsp.ask(server, "PLAY", &base, "Range: npt=now-\r\n")?;
+        let mut first = description;
+        if matches!(transport, Transport::Interleaved) {
+            first.append(&mut rtsp.rest);
+        }
+        let now = Instant::now();
+        Ok(Self {
+            rtsp,
+            url: base,
+            transport,
+            first,
+            began: now,
+            heard: false,
+            alive_each: (lasts / 2).clamp(Duration::from_secs(1), SESSION_LASTS),
+            alive_last: now,
+            interleaved,
+        })
+    }
+
+    fn read_by(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<Option<usize>> {
+        if !self.first.is_empty() {
+            let count = self.first.len().min(buffer.len());
+            buffer[..count].copy_from_slice(&self.first[..count]);
+            self.first.drain(..count);
+            return Ok(Some(count));
+        }
+        loop {
+            let count = match &self.transport {
+                Transport::Interleaved => receive(&mut self.rtsp.stream, buffer)?,
+                Transport::Datagrams { rtp, rtcp, sender } => {
+                    // Answers to signs of life; the connection's end is the session's.
+                    receive(&mut self.rtsp.stream, &mut [0; 1024])?;
+                    match receive_framed(rtp, 0, *sender, buffer)? {
+                        None => receive_framed(rtcp, 1, *sender, buffer)?,
+                        packet => packet,
+                    }
+                }
+            };
+            if count.is_some() {
+                self.heard = true;
+                return Ok(count);
+            }
+            let now = Instant::now();
+            if !self.heard && now - self.began >= FIRST_PACKET_WITHIN {
+                self.interleaved.fetch_xor(true, Ordering::Relaxed);
+                return Err(ErrorKind::TimedOut.into());
+            }
+            if now - self.alive_last >= self.alive_each {
+                self.alive_last = now;
+                let url = std::mem::take(&mut self.url);
+                let sent = self.rtsp.send("OPTIONS", &url, "");
+                self.url = url;
+                sent?;
+            }
+            if now >= deadline {
+                return Ok(None);
+            }
+            let rtsp = self.rtsp.stream.as_fd();
+            match &self.transport {
+                Transport::Interleaved => wait([rtsp], deadline)?,
+                Transport::Datagrams { rtp, rtcp, .. } => wait([rtsp, rtp.as_fd(), rtcp.as_fd()], deadline)?,
+            }
+        }
+    }
+}
+
+impl ByteSource for NeonSource {
+    fn read(&mut self, buffer: &mut [u8]) -> ReadEvent {
+        match self.read_by(buffer, Instant::now() + READ_TIMEOUT) {
+            Ok(Some(count)) => ReadEvent::Bytes(count),
+            Ok(None) => ReadEvent::Silence,
+            Err(_) => ReadEvent::Gone,
+        }
+    }
+}
+
+impl Drop for NeonSource {
+    fn drop(&mut self) {
+        // Where it does not get through, the session ends with its connection.
+        let _ = self.rtsp.send("TEARDOWN", &self.url, "");
+    }
+}
+
+/// Where the media is set up: its `a=control:` in the SDP, absolute or behind the base.
+fn track_url(base: &str, sdp: &[u8]) -> String {
+    let control = gaze_media(sdp).split(|byte| *byte == b'\n').find_map(|line| line.strip_prefix(b"a=control:"));
+    match control.and_then(|control| std::str::from_utf8(control).ok()).map(str::trim) {
+        None | Some("" | "*") => base.into(),
+        Some(control) if control.starts_with("rtsp://") => control.into(),
+        Some(control) if base.ends_with('/') || control.starts_with('/') => format!("{base}{control}"),
+        Some(control) => format!("{base}/{control}"),
+    }
+}
+
+/// The ports that the server sends from: `server_port=5000-5001`, or just the first.
+fn server_ports(transport: &str) -> Option<[u16; 2]> {
+    let ports = transport.split(';').find_map(|option| option.trim().strip_prefix("server_port="))?;
+    let (rtp, rtcp) = ports.split_once('-').unwrap_or((ports, ""));
+    let rtp: u16 = rtp.parse().ok()?;
+    Some([rtp, rtcp.parse().unwrap_or(rtp.saturating_add(1))])
+}
+
+/// An even port for RTP and the next one for RTCP, at which `control`'s peer can reach this machine.
+fn datagram_sockets(control: &TcpStream) -> io::Result<(UdpSocket, UdpSocket)> {
+    let any: IpAddr = match control.peer_addr()?.ip() {
+        IpAddr::V4(_) => Ipv4Addr::UNSPECIFIED.into(),
+        IpAddr::V6(_) => Ipv6Addr::UNSPECIFIED.into(),
+    };
+    let mut outcome = Err(io::Error::from(ErrorKind::AddrInUse));
+    for _ in 0..PORT_TRIES {
+        let rtp = UdpSocket::bind((any, 0))?;
+        let port = rtp.local_addr()?.port();
+        if port % 2 == 1 {
+            continue;
+        }
+        match UdpSocket::bind((any, port + 1)) {
+            Ok(rtcp) => {
+                rtp.set_nonblocking(true)?;
+                rtcp.set_nonblocking(true)?;
+                return Ok((rtp, rtcp));
+            }
+            Err(error) => outcome = Err(error),
+        }
+    }
+    outcome
+}
+
+/// What has come by TCP.
+fn receive(stream: &mut TcpStream, buffer: &mut [u8]) -> io::Result<Option<usize>> {
+    match stream.read(buffer) {
+        Ok(0) => Err(ErrorKind::UnexpectedEof.into()),
+        Ok(count) => Ok(Some(count)),
+        Err(error) => nothing_yet(error),
+    }
+}
+
+/// A datagram of `sender`'s, in RTSP's frame.
+fn receive_framed(socket: &UdpSocket, channel: u8, sender: IpAddr, buffer: &mut [u8]) -> io::Result<Option<usize>> {
+    let Some((frame, packet)) = buffer.split_first_chunk_mut::<4>() else {
+        return Ok(None);
+    };
+    match socket.recv_from(packet) {
+        Ok((count, from)) if from.ip() == sender => {
+            let [high, low] = (count as u16).to_be_bytes();
+            *frame = [b'$', channel, high, low];
+            Ok(Some(frame.len() + count))
+        }
+        Ok(_) => Ok(None),
+        Err(error) => nothing_yet(error),
+    }
+}
+
+fn nothing_yet(error: io::Error) -> io::Result<Option<usize>> {
+    if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) { Ok(None) } else { Err(error) }
+}

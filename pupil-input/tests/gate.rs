@@ -1,0 +1,202 @@
+//! The gate on simulated trackers that blink, lose and misread as real ones do: what is shown stays with the true pupil.
+
+mod support;
+
+use holod_calibration::{TimeNs, rig};
+use holod_pupil_input::{
+    Decision, Estimator, EstimatorSettings, GateSettings, MockSource, PupilSample, PupilState, Rejection, SampleEye,
+    Scenario, Script, Verdict,
+};
+use support::settings;
+
+/// What a viewer would have been shown, from the second second on.
+struct Shown {
+    /// Greatest distance from the true diameter while samples were followed, mm.
+    worst_tracking_mm: f32,
+    /// The same while the last good one was held.
+    worst_holding_mm: f32,
+    /// Share of the samples at whose time the state was tracking.
+    tracking: f32,
+    holding: u32,
+    rejected: [u32; Rejection::ALL.len()],
+    /// Raw diameters farther from the truth than half a millimetre.
+    spoilt: u32,
+}
+
+impl Shown {
+    fn of(&self, reason: Rejection) -> u32 {
+        self.rejected[reason.index()]
+    }
+}
+
+/// Plays a script and asks for the pupil now and up to 40 ms ahead at each sample of the left eye (or of the pair).
+fn shown(script: Script, settings: EstimatorSettings) -> Shown {
+    let mut estimator = Estimator::new(settings);
+    let mut shown = Shown {
+        worst_tracking_mm: 0.0,
+        worst_holding_mm: 0.0,
+        tracking: 0.0,
+        holding: 0,
+        rejected: [0; Rejection::ALL.len()],
+        spoilt: 0,
+    };
+    let (mut tracking, mut asked) = (0, 0);
+    for mock in MockSource::of(script) {
+        let PupilSample { t_sample, eye, diameter_mm, .. } = mock.sample;
+        estimator.push(mock.sample, |Decision { verdict, .. }| {
+            if let Verdict::Rejected(reason) = verdict {
+                shown.rejected[reason.index()] += 1;
+            }
+        });
+        if eye == SampleEye::Right || t_sample < TimeNs::from_seconds(1.0) {
+            continue;
+        }
+        shown.spoilt += u32::from((diameter_mm - mock.truth_mm).abs() > 0.5);
+        for ahead_ms in [0, 20, 40] {
+            let estimate = estimator.pupil_at(t_sample + TimeNs(ahead_ms * 1_000_000));
+            let error_mm = (estimate.pupil.mm() - mock.truth_mm).abs();
+            asked += 1;
+            match estimate.state {
+                PupilState::Tracking => {
+                    tracking += 1;
+                    shown.worst_tracking_mm = shown.worst_tracking_mm.max(error_mm);
+                }
+                _ => {
+                    shown.holding += 1;
+                    shown.worst_holding_mm = shown.worst_holding_mm.max(error_mm);
+                }
+            }
+        }
+    }
+    shown.tracking = tracking as f32 / asked as f32;
+    shown
+}
+
+fn script(text: &str) -> Script {
+    Script::parse("test", &format!("{text}\nends 40s")).expect("a script")
+}
+
+/// One eye's worth of the trackers that the tests are about.
+const SMI_LIKE: &str = "rate 60\nblinks zeros\nnoise 0.03mm\nconfidence none\nmissing 1%\n0s pupil 4.5mm\n\
+                        1.5s every 6s blink 150ms\n3.51s every 6s blink 260ms\n5.523s every 6s blink 100ms";
+const EYELINK_LIKE: &str = "rate 500\nblinks zeros\nnoise 0.008mm\nconfidence none\napart 0.1mm\n0s pupil 4.5mm\n\
+                            1.5s every 6s blink 150ms\n3.511s every 6s blink 260ms\n5.523s every 6s blink 100ms";
+const CORE_LIKE: &str = "rate 123\nfree-running\nnoise 0.04mm\n0s pupil 4mm\n2s every 5s blink 200ms\n\
+                         3s every 7s unsure 0.3 300ms\n3s every 7s reads -0.1mm 150ms\n3.15s every 7s reads 16.66mm 150ms\n\
+                         5s every 11s reads 22mm 400ms";
+
+#[test]
+fn blinks_of_zeros_never_leak() {
+    for (text, least_tracking) in [(SMI_LIKE, 0.80), (EYELINK_LIKE, 0.80)] {
+        let shown = shown(script(text), settings(rig::Eye::Left));
+        assert!(shown.spoilt > 50 && shown.of(Rejection::Lost) > 50, "the blinks are there");
+        assert!(shown.worst_tracking_mm < 0.35, "{text}: {}", shown.worst_tracking_mm);
+        assert!(shown.worst_holding_mm < 0.35, "{text}: {}", shown.worst_holding_mm);
+        assert!(shown.tracking > least_tracking, "{text}: {}", shown.tracking);
+    }
+}
+
+#[test]
+fn the_judge_sees_a_gate_that_lets_all_pass() {
+    let mut open = settings(rig::Eye::Left);
+    open.gate = GateSettings {
+        least_mm: 0.0,
+        slew_mm_per_s: 1e6,
+        reach_mm: 20.0,
+        lead: TimeNs(0),
+        trail: TimeNs(0),
+        ..open.gate
+    };
+    for text in [SMI_LIKE, EYELINK_LIKE] {
+        let shown = shown(script(text), open);
+        assert!(shown.worst_tracking_mm.max(shown.worst_holding_mm) > 0.6, "{text}: {}", shown.worst_tracking_mm);
+    }
+}
+
+#[test]
+fn low_confidence_and_wrong_eye_models_never_leak() {
+    for eye in [rig::Eye::Left, rig::Eye::Better, rig::Eye::Both] {
+        let shown = shown(script(CORE_LIKE), settings(eye));
+        assert!(shown.of(Rejection::LowConfidence) > 100 && shown.of(Rejection::OutOfRange) > 100);
+        // The right pupil is 0.2 mm narrower, and the mean 0.1 mm.
+        assert!(shown.worst_tracking_mm < 0.5, "{eye:?}: {}", shown.worst_tracking_mm);
+        assert!(shown.worst_holding_mm < 0.5, "{eye:?}: {}", shown.worst_holding_mm);
+        assert!(shown.tracking > 0.7, "{eye:?}: {}", shown.tracking);
+    }
+}
+
+#[test]
+fn a_squinting_eye_is_followed_between_its_blinks() {
+    let shown = shown(
+        Script::parse("squint", &format!("{}\nends 40s", Scenario::Squint.text())).expect("a script"),
+        settings(rig::Eye::Left),
+    );
+    assert!(shown.of(Rejection::LidsClosed) > 200);
+    assert!(shown.tracking > 0.80, "{}", shown.tracking);
+    assert!(shown.worst_tracking_mm < 0.3 && shown.worst_holding_mm < 0.3);
+}
+
+#[test]
+fn an_eye_that_begins_to_squint_is_lost_for_a_moment_only() {
+    let text = "aperture 8mm\nconfidence none\n0s pupil 2.5mm\n10s squint 2.6mm 20s\n12s every 3s blink 200ms";
+    let shown = shown(script(text), settings(rig::Eye::Left));
+    assert!(shown.tracking > 0.85, "{}", shown.tracking);
+    assert!(shown.worst_tracking_mm < 0.35 && shown.worst_holding_mm < 0.35);
+}
+
+#[test]
+fn coarse_pixels_are_noise_and_no_steps() {
+    let shown = shown(script("noise 0.08mm\ngrain 0.12mm\nconfidence none\n0s pupil 4mm"), settings(rig::Eye::Left));
+    assert!(shown.tracking > 0.99, "{}", shown.tracking);
+    assert_eq!(shown.holding, 0);
+    assert!(shown.worst_tracking_mm < 0.3, "{}", shown.worst_tracking_mm);
+}
+
+#[test]
+fn a_wrong_eye_model_that_looks_right_is_believed_in_the_end_and_left_again() {
+    // Nothing tells 1.2 mm more for four seconds from a pupil that changed unseen.
+    let shown = shown(script("confidence none\n0s pupil 4mm\n10s jump 1.2mm 4s"), settings(rig::Eye::Left));
+    assert!(shown.worst_tracking_mm > 1.0);
+    assert!((0.95..0.98).contains(&shown.tracking), "{}", shown.tracking);
+}
+
+/// The neighbourhood of two blinks of a real 60 Hz recording: lost samples are 0.00, and their neighbours are low.
+#[test]
+fn the_low_neighbours_of_lost_samples_are_not_believed() {
+    let blinks: [&[f32]; 3] = [
+        &[3.16, 0.0, 0.0, 0.0, 2.96, 4.3],
+        &[4.35, 2.96, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.96, 3.9],
+        &[4.1, 0.0, 3.9],
+    ];
+    let blinks = blinks.map(|blink| [&[4.5; 90][..], blink].concat());
+    let diameters = std::iter::repeat_n([4.5; 90].as_slice(), 1).chain(blinks.iter().map(Vec::as_slice)).flatten();
+    // 15.55 to 34.01 ms from sample to sample.
+    let intervals_us = [16_700, 15_550, 17_100, 16_700, 34_010, 16_700, 16_650];
+    for intervals_us in [&[16_667][..], &intervals_us] {
+        let mut estimator = Estimator::new(settings(rig::Eye::Left));
+        let (mut t, mut accepted) = (TimeNs(0), 0);
+        for (k, &diameter_mm) in diameters.clone().enumerate() {
+            t = t + TimeNs(intervals_us[k % intervals_us.len()] * 1000);
+            let sample = PupilSample {
+                t_device: t,
+                t_sample: t,
+                t_arrival: t,
+                eye: SampleEye::Left,
+                diameter_mm,
+                confidence: 1.0,
+                aperture_mm: None,
+                sequence: None,
+                valid: diameter_mm > 0.0,
+            };
+            estimator.push(sample, |decision| {
+                if decision.verdict == Verdict::Accepted {
+                    accepted += 1;
+                    assert!(decision.sample.diameter_mm >= 4.3, "{} mm is believed", decision.sample.diameter_mm);
+                }
+            });
+            let shown_mm = estimator.pupil_at(t).pupil.mm();
+            assert!(k < 30 || (4.4..4.6).contains(&shown_mm), "sample {k}: {shown_mm} mm");
+        }
+        assert!(accepted > 300, "{accepted}");
+    }
+}
