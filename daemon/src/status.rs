@@ -64,16 +64,17 @@ pub struct StatusFile {
 impl StatusFile {
     /// The file, in its folder; a process without a runtime folder has none, which is no fault.
     pub fn create() -> Self {
-        let path = own_folder().filter(|folder| std::fs::create_dir_all(folder).is_ok()).map(|folder| folder.join(NAME));
+        let path =
+            own_folder().filter(|folder| std::fs::create_dir_all(folder).is_ok()).map(|folder| folder.join(NAME));
         Self { path }
     }
 
     /// Writes the file anew. A disk that refuses is told once.
     pub fn write(&mut self, status: &Status) {
         let Some(path) = &self.path else { return };
-        let written = serde_json::to_vec(status).map_err(|error| error.to_string()).and_then(|bytes| {
-            files::write_atomically(path, &bytes).map_err(|error| error.to_string())
-        });
+        let written = serde_json::to_vec(status)
+            .map_err(|error| error.to_string())
+            .and_then(|bytes| files::write_atomically(path, &bytes).map_err(|error| error.to_string()));
         if let Err(error) = written {
             tracing::warn!("`holod status` will know nothing of this run: {error}");
             self.path = None;

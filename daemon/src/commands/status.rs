@@ -9,7 +9,11 @@ use crate::status::{self, Status};
 pub(super) fn status(args: &StatusArgs) -> Result<(), Failure> {
     let (status, stale) = status::of_running()?;
     if let Some(age) = stale {
-        tracing::warn!("process {} wrote its status {:.0} s ago: its loop does not turn", status.pid, age.as_secs_f64());
+        tracing::warn!(
+            "process {} wrote its status {:.0} s ago: its loop does not turn",
+            status.pid,
+            age.as_secs_f64()
+        );
     }
     if args.json { report::print_json(&status) } else { report::print(&text_of(&status)) }
 }

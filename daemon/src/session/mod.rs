@@ -203,10 +203,9 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         record: plan.record_tracker.clone(),
         forbidden: setup::ports_of_others(rig),
     };
-    let (estimates, tap, tracker) =
-        scheduling::prompt(|| Tracker::start(&plan.tracker, &rig.tracker, tracker_options))
-            .map_err(tracker_failure)?
-            .split();
+    let (estimates, tap, tracker) = scheduling::prompt(|| Tracker::start(&plan.tracker, &rig.tracker, tracker_options))
+        .map_err(tracker_failure)?
+        .split();
     for warning in tracker.warnings() {
         tracing::warn!("{warning}");
     }

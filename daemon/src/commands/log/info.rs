@@ -149,7 +149,14 @@ fn text_of(info: &LogInfo) -> String {
             );
         }
         let found = eye.blinks_found.map_or("not judged".to_owned(), |found| format!("{found} found"));
-        put("", format!("blinks: {} told by the log, {found}; {} longer losses", eye.blinks_told, eye.long_losses.unwrap_or(0)));
+        put(
+            "",
+            format!(
+                "blinks: {} told by the log, {found}; {} longer losses",
+                eye.blinks_told,
+                eye.long_losses.unwrap_or(0)
+            ),
+        );
     }
     let blinks = &info.blinks;
     put(
@@ -172,9 +179,7 @@ fn drawn(recording: &Recording, scale: Option<f64>, duration_s: f64) -> String {
         .samples()
         .step_by(every)
         .filter(|sample| sample.valid && sample.diameter_mm.is_finite())
-        .map(|sample| {
-            ((sample.t_sample - begins).seconds(), f64::from(sample.diameter_mm) * scale.unwrap_or(1.0))
-        })
+        .map(|sample| ((sample.t_sample - begins).seconds(), f64::from(sample.diameter_mm) * scale.unwrap_or(1.0)))
         .collect();
     let most = points.iter().map(|(_, diameter)| *diameter).fold(0.0, f64::max);
     let in_mm = scale.is_some() || recording.unit() == SizeUnit::Millimetres;

@@ -198,13 +198,7 @@ fn text_of(report: &Report) -> String {
             &mut text,
             format!(
                 "{:6} {:>10}  {:24} {:24} {:24} {:24} {:>8}",
-                "eye",
-                "rate",
-                "interval p1/median/p99",
-                "arrivals",
-                "delay over the least",
-                "raw",
-                "believed"
+                "eye", "rate", "interval p1/median/p99", "arrivals", "delay over the least", "raw", "believed"
             ),
         );
     }
@@ -225,7 +219,9 @@ fn text_of(report: &Report) -> String {
     if let Some((drift_ppm, spread_ms)) = report.clock_drift_ppm.zip(report.delay_spread_ms) {
         put(
             &mut text,
-            format!("clock: {drift_ppm:+.0} ppm against this machine's; 19 of 20 samples within {spread_ms:.2} ms of the quickest"),
+            format!(
+                "clock: {drift_ppm:+.0} ppm against this machine's; 19 of 20 samples within {spread_ms:.2} ms of the quickest"
+            ),
         );
     }
     let shown: Vec<_> = report
