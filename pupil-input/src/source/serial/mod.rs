@@ -16,8 +16,8 @@ use self::identity::{SerialPortInfo, UsbPort, ports_below};
 use super::commands::{CommandError, Dialogue, Told, hung_up, overhear};
 use super::{ByteSource, Feed, READ_TIMEOUT, SourceError};
 use crate::profile::Profile;
-use crate::wire::WireEvent;
 use crate::wire::line::crc8;
+use crate::wire::{Format, WireEvent};
 
 /// Why a serial tracker could not be opened.
 #[derive(Debug, thiserror::Error)]
@@ -289,8 +289,14 @@ fn recognise(heard: &[u8], profile: &Profile) -> Option<String> {
     if samples(heard, profile) > 0 {
         return None;
     }
-    let other = Profile::shipped().find(|other| samples(heard, other) >= RECOGNISED_SAMPLES)?;
+    let mut others = Profile::shipped().filter(|other| is_telling(&other.format));
+    let other = others.find(|other| samples(heard, other) >= RECOGNISED_SAMPLES)?;
     Some(format!("a tracker of profile `{}`, which sends `{}`", other.name, shown.escape_ascii()))
+}
+
+/// Whether nothing else reads as this format: bare numbers might be anything's.
+const fn is_telling(format: &Format) -> bool {
+    matches!(format, Format::Lines | Format::LiveTrack(_) | Format::OpenGaze(_) | Format::PupilExt(_))
 }
 
 /// Samples that a profile finds in the bytes; none if it rejects as many messages.
@@ -562,15 +568,17 @@ mod tests {
 
     #[test]
     fn other_protocols_are_recognised_and_the_own_one_is_not_refused() {
-        let other = Profile::from_toml(
-            "format = \"holod-tracker-1\"\nname = \"a\"\nabout = \"A.\"\n[wire]\nkind = \"holod\"\n",
-            "test",
-        )
-        .expect("a profile");
-        assert_eq!(recognise(lines(5).as_bytes(), &other), None);
-        assert_eq!(recognise(b"", &other), None);
-        assert_eq!(recognise(b"rubbish\nrubbish\nrubbish\n", &other), None);
-        assert_eq!(recognise(&boxed("HELLO"), &other), None);
+        let profile = |name: &str| Profile::find(name).expect("it is shipped");
+        let told = recognise(lines(5).as_bytes(), &profile("livetrack")).expect("recognised");
+        assert!(told.starts_with("a tracker of profile `holod`, which sends `"), "{told}");
+        let gaze = "<REC TIME=\"1.5\" LPMM=\"4.8\" LPMMV=\"1\" RPMM=\"4.9\" RPMMV=\"1\" />\r\n".repeat(4);
+        let told = recognise(gaze.as_bytes(), &profile("livetrack")).expect("recognised");
+        assert!(told.contains("`open-gaze`"), "{told}");
+        assert_eq!(recognise(gaze.as_bytes(), &profile("open-gaze")), None);
+        assert_eq!(recognise(lines(5).as_bytes(), &talks("")), None);
+        for heard in [&b""[..], b"Booting...\r\nready\r\n> \r\n", &boxed("HELLO"), lines(2).as_bytes()] {
+            assert_eq!(recognise(heard, &profile("livetrack")), None);
+        }
         assert!(is_laser_box(boxed("ERR 3 RANGE").trim_ascii_end()));
         assert!(!is_laser_box(b"ERR 3 RANGE*00"));
         assert!(!is_laser_box("!\u{e9}*é".as_bytes()));
