@@ -343,12 +343,12 @@ fn datagrams_are_followed_and_what_is_wrong_with_them_is_counted() {
     for packet in [&first, &third, &second, &third] {
         companion.send(0, packet);
     }
+    let notes = handle.counters().of(Counter::Notes);
     for (length, worn) in [(9, 255), (17, 255), (40, 255), (70, 255), (65, 255), (89, 0)] {
         companion.send_datum(&payload(length, worn));
     }
     companion.send(0, b"no packet at all");
     companion.send(0, b"");
-    let notes = handle.counters().of(Counter::Notes);
     let before = handle.counters().of(Counter::Samples);
     companion.stream_until("tracking through rubbish", || {
         handle.counters().of(Counter::Samples) > before + 40 && tracks(&mut handle)

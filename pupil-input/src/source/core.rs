@@ -44,6 +44,8 @@ struct CoreSource {
     /// When Pupil Remote was last asked for the time.
     asked: Instant,
     answered: bool,
+    /// Whether something was published since a time was last given: times alone are no sign of a tracker that tracks.
+    heard: bool,
 }
 
 impl CoreSource {
@@ -67,7 +69,7 @@ impl CoreSource {
         let mut published = Zmtp::open(published, "SUB", &["PUB", "XPUB"], longest, server.deadline).map_err(broken)?;
         published.send(SUBSCRIPTION).map_err(broken)?;
         remote.request(b"t").map_err(broken)?;
-        Ok(Self { published, remote, asked: Instant::now(), answered: false })
+        Ok(Self { published, remote, asked: Instant::now(), answered: false, heard: true })
     }
 
     fn read_by(&mut self, buffer: &mut [u8], deadline: Instant) -> io::Result<Option<usize>> {
@@ -75,7 +77,8 @@ impl CoreSource {
             if let Some(answer) = self.remote.receive()? {
                 self.answered = true;
                 let time_s = std::str::from_utf8(answer).ok().and_then(|text| text.trim().parse().ok());
-                if let Some(time_s) = time_s.filter(|time_s: &f64| time_s.is_finite()) {
+                if let Some(time_s) = time_s.filter(|time_s: &f64| self.heard && time_s.is_finite()) {
+                    self.heard = false;
                     return Ok(Some(give(&time_message(time_s), buffer)));
                 }
             }
@@ -87,6 +90,7 @@ impl CoreSource {
                 return Err(io::ErrorKind::TimedOut.into());
             }
             if let Some(message) = self.published.receive()? {
+                self.heard = true;
                 return Ok(Some(give(message, buffer)));
             }
             if now >= deadline {
