@@ -108,7 +108,7 @@ fn main() -> io::Result<()> {
         match argument.split_once('=') {
             Some(("plugs", count)) => plugs = count.parse().map_err(io::Error::other)?,
             Some(("reports", count)) => reports = count.parse().map_err(io::Error::other)?,
-            Some(("wrong", kind)) => wrong = kind.to_owned(),
+            Some(("wrong", kind @ ("missing" | "diameter"))) => wrong = kind.to_owned(),
             _ => return Err(io::Error::other(format!("unknown option `{argument}`"))),
         }
     }
