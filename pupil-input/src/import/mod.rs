@@ -769,7 +769,14 @@ mod tests {
             assert_eq!(recognised(beginning.as_bytes()), [], "{beginning}");
         }
         assert_eq!(recognised(&[0; 800]), []);
-        assert_eq!(recognised(b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\x03"), []);
+    }
+
+    #[test]
+    fn a_gzip_that_ends_in_its_middle_is_told() {
+        let dir = tempfile::TempDir::new().expect("a folder");
+        let path = dir.path().join("log");
+        std::fs::write(&path, b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\x03").expect("writes");
+        assert!(matches!(Recording::read(&path), Err(ReplayError::Io { .. })));
     }
 
     #[test]
