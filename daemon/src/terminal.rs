@@ -7,7 +7,7 @@ use ratatui::buffer::Buffer;
 use ratatui::layout::Rect;
 use ratatui::style::{Color, Style};
 use ratatui::symbols::Marker;
-use ratatui::text::Line;
+use ratatui::text::{Line, Span};
 use ratatui::widgets::{Axis, Chart, Dataset, GraphType, Widget};
 
 /// One set of points in a [`plot`].
@@ -50,19 +50,22 @@ pub fn plot(series: &[Series<'_>], axes: &Axes<'_>, size: TextSize, colours: boo
     let mut buffer = Buffer::empty(area);
     let datasets = series.iter().map(|series| {
         Dataset::default()
-            .name(series.name)
             .marker(Marker::Braille)
             .graph_type(GraphType::Scatter)
             .style(Style::default().fg(series.colour))
             .data(series.points)
     });
-    let axis = |name: &str, [least, most]: [f64; 2]| {
+    let axis = |[least, most]: [f64; 2]| {
         let labels = [least, 0.5 * (least + most), most].map(|value| Line::from(format!("{value:.1}")));
-        Axis::default().title(name.to_owned()).bounds([least, most]).labels(labels)
+        Axis::default().bounds([least, most]).labels(labels)
     };
+    // The legend stands in the axis' title: a box of its own would hide what is under it.
+    let legend = series.iter().map(|series| Span::styled(format!("  • {}", series.name), series.colour));
+    let title: Line<'_> = std::iter::once(Span::raw(axes.y_name)).chain(legend).collect();
     Chart::new(datasets.collect())
-        .x_axis(axis(axes.x_name, axes.x))
-        .y_axis(axis(axes.y_name, axes.y))
+        .legend_position(None)
+        .x_axis(axis(axes.x).title(axes.x_name))
+        .y_axis(axis(axes.y).title(title))
         .render(area, &mut buffer);
     text_of(&buffer, colours)
 }
@@ -143,9 +146,9 @@ mod tests {
 
     #[test]
     fn points_and_axes_are_drawn() {
-        let text = drawn(&[(0.0, 0.0), (5.0, 4.0), (10.0, 8.0)], false);
+        let text = drawn(&[(0.0, 1.0), (5.0, 4.0), (10.0, 7.0)], false);
         assert_eq!(text.lines().count(), 12);
-        assert!(text.contains("pupil / mm") && text.contains("8.0") && text.contains("10.0"), "{text}");
+        assert!(text.contains("pupil / mm  • raw") && text.contains("8.0") && text.contains("10.0"), "{text}");
         assert_eq!(dots(&text), 3, "{text}");
         assert_eq!(dots(&drawn(&[(5.0, 9.0)], false)), 0, "a point outside is not drawn");
         assert!(!text.contains('\x1b'));
