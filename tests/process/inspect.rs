@@ -115,6 +115,21 @@ fn a_tracker_is_never_looked_for_at_the_laser_boxs_port() {
 }
 
 #[test]
+fn check_names_a_profile_that_is_not_there() {
+    let folder = tempfile::tempdir().unwrap();
+    let rig = |profile: &str| {
+        let rig = small_rig(64, 64, "driver = \"simulated\"");
+        rig.replace("[tracker]\n", &format!("[tracker]\nspec = \"tcp:127.0.0.1:4242,profile={profile}\"\n"))
+    };
+    fs::write(folder.path().join("good.toml"), rig("open-gaze")).unwrap();
+    fs::write(folder.path().join("bad.toml"), rig("open-gase")).unwrap();
+    assert!(run(HOLOD, &["check", "--config", "good.toml"], folder.path()).status.success());
+    let ended = run(HOLOD, &["check", "--config", "bad.toml"], folder.path());
+    assert_eq!(ended.status.code(), Some(69));
+    assert!(ended.stderr.contains("did you mean `open-gaze`?"), "{ended:?}");
+}
+
+#[test]
 fn logs_are_looked_into_and_converted_without_loss() {
     let folder = tempfile::tempdir().unwrap();
     let text: Vec<u8> = lines(4000).into_iter().flat_map(|line| line.bytes).collect();
