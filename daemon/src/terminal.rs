@@ -41,8 +41,21 @@ pub struct TextSize {
     pub height: u16,
 }
 
-/// The size of plots where nothing else is known.
-pub const PLOT_SIZE: TextSize = TextSize { width: 100, height: 18 };
+/// The size of plots, on a terminal that is as wide.
+const PLOT_SIZE: TextSize = TextSize { width: 100, height: 18 };
+
+impl TextSize {
+    /// A plot's size on this terminal.
+    pub fn of_plot() -> Self {
+        Self { width: PLOT_SIZE.width.min(columns()).max(40), ..PLOT_SIZE }
+    }
+}
+
+/// Columns of the terminal that standard output is, or as many as a plot likes to have.
+fn columns() -> u16 {
+    let size = rustix::termios::tcgetwinsize(io::stdout()).ok();
+    size.map_or(PLOT_SIZE.width, |size| size.ws_col).max(1)
+}
 
 /// Points as braille dots, with axes and a legend; `colours` adds ANSI colours.
 pub fn plot(series: &[Series<'_>], axes: &Axes<'_>, size: TextSize, colours: bool) -> String {
@@ -107,7 +120,8 @@ const fn ansi(colour: Color) -> u8 {
 /// Text that is shown again and again in the same place of a terminal; nothing where standard output is none.
 #[derive(Debug, Default)]
 pub struct LiveText {
-    lines: usize,
+    /// Rows of the terminal that the text took.
+    rows: usize,
 }
 
 impl LiveText {
@@ -121,12 +135,25 @@ impl LiveText {
         if !Self::visible() {
             return;
         }
-        let back = if self.lines == 0 { String::new() } else { format!("\x1b[{}F\x1b[J", self.lines) };
+        let back = if self.rows == 0 { String::new() } else { format!("\x1b[{}F\x1b[J", self.rows) };
         let text = text.trim_end();
         // A terminal that has gone away is no failure of what it showed.
         let _ = writeln!(io::stdout().lock(), "{back}{text}");
-        self.lines = text.lines().count();
+        let columns = usize::from(columns());
+        self.rows = text.lines().map(|line| visible(line).div_ceil(columns).max(1)).sum();
     }
+}
+
+/// Characters of a line that take a column: all but those of the colours.
+fn visible(line: &str) -> usize {
+    let mut inside = false;
+    line.chars()
+        .filter(|&c| {
+            let hidden = inside || c == '\x1b';
+            inside = hidden && c != 'm';
+            !hidden
+        })
+        .count()
 }
 
 #[cfg(test)]
@@ -152,6 +179,12 @@ mod tests {
         assert_eq!(dots(&text), 3, "{text}");
         assert_eq!(dots(&drawn(&[(5.0, 9.0)], false)), 0, "a point outside is not drawn");
         assert!(!text.contains('\x1b'));
+    }
+
+    #[test]
+    fn colours_take_no_column() {
+        assert_eq!(visible("\x1b[31m⠡\x1b[39m m"), 3);
+        assert_eq!(visible(""), 0);
     }
 
     #[test]
