@@ -16,7 +16,7 @@
 //! |---|---|
 //! | 4 | length of the payload, n, at most 65536 |
 //! | 1 | kind |
-//! | 8 | time in ns on the host's monotonic clock; of bytes, when they were read |
+//! | 8 | time in ns on the host's monotonic clock, not negative and at most 2^60; of bytes, when they were read |
 //! | 4 | number of the connection, counted from 1 |
 //! | n | payload |
 //! | 4 | CRC-32 of the record up to here |
@@ -44,6 +44,9 @@ pub(crate) const MAGIC: [u8; 8] = *b"HOLOD\x1a\r\n";
 const VERSION: u32 = 1;
 /// Longest payload of a record.
 pub(crate) const MAX_PAYLOAD_BYTES: usize = 1 << 16;
+/// Times of records lie between 0 and this, 36 years after the machine was started; differences of two then stay within
+/// i64 whatever a file holds.
+const LATEST: TimeNs = TimeNs(1 << 60);
 /// Longest header, the text alone.
 const MAX_HEADER_BYTES: usize = 1 << 20;
 /// A record's bytes before its payload.
@@ -90,8 +93,9 @@ impl RecordHead {
     /// The head and the length of its payload; none where it is of no record.
     pub(crate) fn decode(bytes: &[u8]) -> Option<(Self, usize)> {
         let length = u32_at(bytes, 0) as usize;
-        let kind = Kind::from_byte(bytes[4]).filter(|_| length <= MAX_PAYLOAD_BYTES)?;
         let t = TimeNs(i64::from_le_bytes(bytes[5..13].try_into().expect("eight bytes")));
+        let possible = length <= MAX_PAYLOAD_BYTES && (TimeNs(0)..=LATEST).contains(&t);
+        let kind = Kind::from_byte(bytes[4]).filter(|_| possible)?;
         Some((Self { kind, t, connection: u32_at(bytes, 13) }, length))
     }
 }
@@ -326,7 +330,7 @@ mod tests {
 
     fn any_record() -> impl Strategy<Value = (RecordHead, Vec<u8>)> {
         let kinds = [Kind::Connected, Kind::Bytes, Kind::Disconnected, Kind::Lost];
-        (prop::sample::select(kinds.to_vec()), any::<i64>(), any::<u32>(), prop::collection::vec(any::<u8>(), 0..60))
+        (prop::sample::select(kinds.to_vec()), 0..=LATEST.0, any::<u32>(), prop::collection::vec(any::<u8>(), 0..60))
             .prop_map(|(kind, t, connection, payload)| (RecordHead { kind, t: TimeNs(t), connection }, payload))
     }
 
@@ -407,6 +411,15 @@ mod tests {
         fn rubbish_is_refused(bytes in prop::collection::vec(any::<u8>(), 0..200), begins in any::<bool>()) {
             let bytes = if begins { [&MAGIC[..], &[1, 0, 0, 0], &bytes].concat() } else { bytes };
             prop_assert!(matches!(RawReader::new(&bytes[..]), Err(HeaderFault::Bad(_))));
+        }
+    }
+
+    #[test]
+    fn a_time_that_no_clock_shows_is_no_record() {
+        for t in [i64::MIN, -1, LATEST.0 + 1, i64::MAX] {
+            let head = RecordHead { kind: Kind::Bytes, t: TimeNs(t), connection: 1 };
+            let (bytes, _) = file(&vec![(head, b"x".to_vec())]);
+            assert!(matches!(read(&bytes), Ok((records, Ending::Torn { .. })) if records.is_empty()), "{t}");
         }
     }
 
