@@ -161,7 +161,7 @@ fn text_of(info: &LogInfo) -> String {
     let blinks = &info.blinks;
     put(
         "blinks",
-        format!("{} told, {} found, {} of them in one eye only", blinks.told, blinks.found, blinks.found_in_one_eye),
+        format!("{} told, {} found, {} more in one eye only", blinks.told, blinks.found, blinks.found_in_one_eye),
     );
     let faults: Vec<_> = info.faults.iter().map(|fault| format!("{} {}", fault.name, fault.count)).collect();
     put("faults", if faults.is_empty() { "none".to_owned() } else { faults.join(", ") });
