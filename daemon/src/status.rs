@@ -25,6 +25,8 @@ pub struct Status {
     pub tracker: String,
     /// How the tracker's link is.
     pub tracker_link: String,
+    /// Why a lost link does not come back.
+    pub tracker_trouble: Option<String>,
     /// What the pupil's estimate rests on.
     pub pupil_state: String,
     /// The pupil that the newest frame was made for.

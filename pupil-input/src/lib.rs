@@ -44,6 +44,7 @@ mod sequence;
 mod simulate;
 pub mod source;
 mod spec;
+mod stamp;
 mod tracker;
 pub mod wire;
 

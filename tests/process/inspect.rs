@@ -61,7 +61,7 @@ fn a_tracker_that_is_tried_is_counted_recorded_and_played_again() {
     let count = |name: &str| report["counts"][name].as_u64().unwrap();
     assert_eq!((count("samples"), count("sequence_gaps"), count("notes")), (800, 0, 1));
     assert_eq!(count("wire_bad_checksum"), 1);
-    assert_eq!(report["link"], "finished");
+    assert!(["up", "silent"].contains(&report["link"].as_str().unwrap()), "{report}");
     for eye in ["left", "right"] {
         let rate_hz = report["eyes"][eye]["rate_hz"].as_f64().unwrap();
         assert!((rate_hz - 200.0).abs() < 10.0, "{eye}: {rate_hz}");

@@ -31,7 +31,7 @@ fn text_of(status: &Status) -> String {
     format!(
         "{} for {:.0} s, process {}, {}\n\
          pupil    {}, {}\n\
-         tracker  {}: link {}\n\
+         tracker  {}: link {}{}\n\
          \x20        {}\n\
          frames   {} made, {} shown, {} late\n\
          time     per frame {}; tracker sample to photons {}",
@@ -43,6 +43,7 @@ fn text_of(status: &Status) -> String {
         status.pupil_state,
         status.tracker,
         status.tracker_link,
+        status.tracker_trouble.as_ref().map_or(String::new(), |trouble| format!("; {trouble}")),
         counts.join(", "),
         status.frames_made,
         status.frames_shown,

@@ -267,6 +267,7 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         rig: plan.rig.name.clone(),
         spec: plan.tracker.to_string(),
         t_origin,
+        trouble: None,
         state: State::Dark,
         tally: Tally::default(),
         t_dark_untold: TimeNs(i64::MIN),
@@ -374,6 +375,7 @@ struct Watch<'a> {
     rig: String,
     spec: String,
     t_origin: TimeNs,
+    trouble: Option<String>,
     state: State,
     tally: Tally,
     t_dark_untold: TimeNs,
@@ -469,6 +471,13 @@ impl Watch<'_> {
     fn tell_state(&mut self, output: &OutputControl) {
         let lit = output.counts().armed && self.tally.frames_shown > 0;
         let link = self.tracker.link();
+        let trouble = self.tracker.trouble();
+        if trouble != self.trouble.as_deref() {
+            self.trouble = trouble.map(str::to_owned);
+            if let Some(trouble) = &self.trouble {
+                tracing::warn!("the tracker is not found again: {trouble}");
+            }
+        }
         let follows = link == Link::Up && self.tally.newest_state != PupilState::Fallback.name();
         let state = match (lit, follows) {
             (false, _) => State::Dark,
@@ -494,6 +503,7 @@ impl Watch<'_> {
             rig: self.rig.clone(),
             tracker: self.spec.clone(),
             tracker_link: self.tracker.link().name().to_owned(),
+            tracker_trouble: self.trouble.clone(),
             pupil_state: tally.newest_state.to_owned(),
             pupil_mm: tally.recent.back().map(|frame| frame.pupil.mm()),
             frames_made: tally.frames_made,

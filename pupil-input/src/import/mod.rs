@@ -464,6 +464,8 @@ pub(crate) struct LogBuilder {
 /// By how many samples one eye may be behind the other before the whole log is sorted.
 const EYES_OUT_OF_STEP: usize = 64;
 
+/// Samples that are kept: 2.4 GB of them.
+const MOST_SAMPLES: usize = 100_000_000;
 /// A time beyond this, a hundred years from any origin, is no time; differences of two stay within i64.
 const GREATEST_NS: u64 = 3_200_000_000_000_000_000;
 
@@ -479,6 +481,9 @@ impl LogBuilder {
             return self.count(LogFault::BadNumber);
         }
         self.times += 1;
+        if self.rows.len() == MOST_SAMPLES {
+            return self.count(LogFault::TooLong);
+        }
         let latest = &mut self.latest_ns[eye.index()];
         if latest.is_some_and(|latest| t.0 < latest) {
             self.first_backwards.get_or_insert(line);
@@ -534,6 +539,14 @@ impl LogBuilder {
             let reasons: Vec<_> = reasons.map(|(name, count)| format!("{name} {count}")).collect();
             let reasons = if reasons.is_empty() { "there are no lines".into() } else { reasons.join(", ") };
             return Err(ReplayError::Empty { path: path.into(), rejected: self.faults.total(), reasons });
+        }
+        if self.rows.len() == MOST_SAMPLES {
+            return Err(ReplayError::Content {
+                path: path.into(),
+                at: String::new(),
+                found: format!("more than {MOST_SAMPLES} samples"),
+                expected: "no more, which is a day of one eye at 1 kHz; cut the log into pieces".into(),
+            });
         }
         if !self.rows.is_sorted_by_key(|row| row.t_ns) {
             self.rows.sort_by_key(|row| row.t_ns);

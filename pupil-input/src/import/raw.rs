@@ -7,9 +7,10 @@ use std::path::{Path, PathBuf};
 use holod_calibration::TimeNs;
 
 use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError};
-use crate::clock::ClockModel;
+use crate::PupilSample;
 use crate::profile::Profile;
 use crate::record::{Ending, Header, HeaderFault, Kind, MAGIC, RawReader};
+use crate::stamp::Stamper;
 use crate::wire::WireEvent;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Raw, recognises, read };
@@ -26,29 +27,29 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     log.notes.push(format!("recorded from `{}`, profile `{}`", raw.header().spec, raw.header().profile));
     let datagrams = raw.header().datagrams;
     let mut decoder = profile.decoder();
-    let mut clock = ClockModel::new();
+    let mut stamper = Stamper::new();
     let mut lost = 0_u64;
     let mut number = 0;
     while let Some((head, payload)) = raw.next().map_err(|source| input.io(source))? {
         number += 1;
         match head.kind {
-            Kind::Connected => (decoder, clock) = (profile.decoder(), ClockModel::new()),
+            Kind::Connected => (decoder, stamper) = (profile.decoder(), Stamper::new()),
             Kind::Bytes => {
                 let mut take = |event| match event {
                     WireEvent::Sample(sample) => {
-                        let t = sample.t_device.map_or(head.t, |t_device| clock.map(t_device, head.t));
-                        let (eye, diameter, confidence) = (sample.eye, sample.diameter_mm, sample.confidence);
-                        let (aperture_mm, valid) = (sample.aperture_mm, sample.valid);
-                        log.push(LogSample { t, eye, diameter, confidence, aperture_mm, valid }, number);
+                        if let Some(sample) = stamper.take(sample, head.t) {
+                            log.push(log_sample(&sample), number);
+                        }
                     }
                     WireEvent::Rejected(fault) => log.count(LogFault::Wire(fault)),
-                    WireEvent::Clock(t_device) => clock.observe(t_device, head.t),
+                    WireEvent::Clock(t_device) => stamper.observe(t_device, head.t),
                     WireEvent::Note | WireEvent::Partial => {}
                 };
                 decoder.push(payload, &mut take);
                 if datagrams {
                     decoder.finish(&mut take);
                 }
+                stamper.rest(head.t, |sample| log.push(log_sample(&sample), number));
             }
             Kind::Lost => lost = lost.saturating_add(lost_chunks(payload)),
             Kind::Disconnected | Kind::End => {}
@@ -57,6 +58,17 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     log.notes.extend(raw.ending().and_then(Ending::in_words));
     log.notes.extend(lost_in_words(lost));
     Ok(())
+}
+
+const fn log_sample(sample: &PupilSample) -> LogSample {
+    LogSample {
+        t: sample.t_sample,
+        eye: sample.eye,
+        diameter: sample.diameter_mm,
+        confidence: sample.confidence,
+        aperture_mm: sample.aperture_mm,
+        valid: sample.valid,
+    }
 }
 
 /// How many pieces a record of [`Kind::Lost`] tells of.

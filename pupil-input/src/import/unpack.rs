@@ -14,7 +14,7 @@ const UTF16_BE_MARK: &[u8] = b"\xFE\xFF";
 
 /// `source` without gzip, UTF-16 and byte order mark.
 ///
-/// A bomb of gzip does no harm: what it holds is never kept, only read past.
+/// Of a bomb of gzip nothing is kept but the samples in it, and [`LogBuilder`](super::LogBuilder) bounds those.
 pub(super) fn plain(source: impl Read + 'static) -> io::Result<Box<dyn BufRead>> {
     let mut reader = BufReader::with_capacity(BUFFER_BYTES, source);
     if reader.fill_buf()?.starts_with(GZIP) {

@@ -223,12 +223,14 @@ impl MockSource {
 impl Iterator for MockSource {
     type Item = MockSample;
 
+    /// None at the script's end, or where it is silent for more than an hour on end.
     fn next(&mut self) -> Option<MockSample> {
+        let mut silent_from_s = None;
         loop {
             let eyes = self.script.eyes.len();
             let index = usize::from(eyes == 2 && self.next_s(1) < self.next_s(0));
             let (t_s, sequence) = (self.next_s(index), self.ticks[index]);
-            if t_s >= self.script.ends_s {
+            if t_s >= self.script.ends_s || t_s - *silent_from_s.get_or_insert(t_s) > LONGEST_SILENCE_S {
                 return None;
             }
             self.ticks[index] += 1;
@@ -239,6 +241,9 @@ impl Iterator for MockSource {
         }
     }
 }
+
+/// A tracker that is silent for longer will not speak again.
+const LONGEST_SILENCE_S: f64 = 3600.0;
 
 /// What the tracker's clock says at `t_s`.
 fn device_time(script: &Script, t_s: f64) -> TimeNs {

@@ -55,7 +55,12 @@ impl Feed for NeonFeed {
         let addresses = server.resolve()?;
         let server = Server { deadline: Instant::now() + OPEN_WITHIN, ..server };
         let stream = find_stream(&server, &addresses)?;
-        Ok(Box::new(NeonSource::open(&server, &stream, Arc::clone(&self.interleaved))?))
+        let open = || NeonSource::open(&server, &stream, Arc::clone(&self.interleaved));
+        let before = self.interleaved.load(Ordering::Relaxed);
+        // A Companion that refuses one transport is asked for the other at once.
+        let refused = |_: &ServerError| self.interleaved.load(Ordering::Relaxed) != before;
+        let source = open().or_else(|error| if refused(&error) { open() } else { Err(error) })?;
+        Ok(Box::new(source))
     }
 }
 

@@ -93,6 +93,9 @@ impl Link {
 /// Decisions that the tap holds: five minutes of two eyes at 100 Hz, or half a minute at 1 kHz.
 const TAP_DECISIONS: usize = 1 << 16;
 
+/// Reasons why a link does not come back, on their way to the control thread.
+const TROUBLES: usize = 16;
+
 /// What a tracker is started with beside its spec and the rig's settings.
 #[derive(Clone, Debug, Default)]
 pub struct TrackerOptions {
@@ -148,6 +151,7 @@ impl Tracker {
         let settings = EstimatorSettings::from(settings);
         let (input, output) = triple_buffer::triple_buffer(&EstimateSnapshot::new(settings));
         let (producer, consumer) = rtrb::RingBuffer::new(TAP_DECISIONS);
+        let (troubles, untold) = rtrb::RingBuffer::new(TROUBLES);
         let shared = Arc::new(Shared {
             counters: Counters::new(),
             clock: ClockGauge::new(),
@@ -159,6 +163,7 @@ impl Tracker {
             clock: StreamClock::LIVE,
             published: input,
             tap: producer,
+            troubles,
             record: taps,
             arrivals_of_stream: false,
             shared: Arc::clone(&shared),
@@ -170,7 +175,7 @@ impl Tracker {
         Ok(TrackerHandle {
             reader: EstimateReader { output },
             tap: DecisionTap { consumer },
-            control: TrackerControl { shared, thread: Some(thread), recorder, warnings },
+            control: TrackerControl { shared, thread: Some(thread), recorder, warnings, untold, trouble: None },
         })
     }
 }
@@ -217,6 +222,11 @@ impl TrackerHandle {
     /// What a user should know of the tracker although it runs.
     pub fn warnings(&self) -> &[String] {
         self.control.warnings()
+    }
+
+    /// Why a link that was lost does not come back, while it does not.
+    pub fn trouble(&mut self) -> Option<&str> {
+        self.control.trouble()
     }
 
     /// How the recording goes, where there is one.
@@ -268,6 +278,8 @@ pub struct TrackerControl {
     thread: Option<JoinHandle<()>>,
     recorder: Option<Recorder>,
     warnings: Vec<String>,
+    untold: rtrb::Consumer<String>,
+    trouble: Option<String>,
 }
 
 impl TrackerControl {
@@ -295,6 +307,14 @@ impl TrackerControl {
     /// adapter that holds bytes back, a recording that is torn. A sentence each.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
+    }
+
+    /// Why a link that was lost does not come back, while it does not.
+    pub fn trouble(&mut self) -> Option<&str> {
+        while let Ok(text) = self.untold.pop() {
+            self.trouble = Some(text).filter(|text| !text.is_empty());
+        }
+        self.trouble.as_deref()
     }
 
     /// How the recording goes, where there is one.

@@ -10,7 +10,6 @@ use holod_calibration::TimeNs;
 use super::job::{Job, Play};
 use super::{Link, Shared, host_now};
 use crate::PupilSample;
-use crate::clock::ClockModel;
 use crate::counters::Counter;
 use crate::estimator::{Decision, EstimateSnapshot, Estimator, StreamClock};
 use crate::gate::Verdict;
@@ -22,7 +21,8 @@ use crate::sequence::{SequenceEvent, SequenceTracker};
 use crate::simulate::{MockSource, Script};
 use crate::source::{ByteSource, Feed, ReadEvent};
 use crate::spec::ReplaySpeed;
-use crate::wire::{Decoder, WireEvent, WireSample};
+use crate::stamp::Stamper;
+use crate::wire::{Decoder, WireEvent};
 
 /// A link that has brought bytes is silent after this long without any.
 const SILENCE: TimeNs = TimeNs(500_000_000);
@@ -33,13 +33,14 @@ const LONGEST_BACK_OFF: Duration = Duration::from_secs(2);
 /// The longest datagram there is.
 const BUFFER_BYTES: usize = 1 << 16;
 
-/// The thread's own state. After its first sample nothing is allocated.
+/// The thread's own state. While a link lasts nothing is allocated after its first sample.
 pub(super) struct Worker {
     pub(super) estimator: Estimator,
     /// From the stream's time to the host's.
     pub(super) clock: StreamClock,
     pub(super) published: triple_buffer::Input<EstimateSnapshot>,
     pub(super) tap: rtrb::Producer<Decision>,
+    pub(super) troubles: rtrb::Producer<String>,
     pub(super) record: Option<Taps>,
     /// Times of arrival are the stream's too.
     pub(super) arrivals_of_stream: bool,
@@ -48,6 +49,7 @@ pub(super) struct Worker {
 
 impl Worker {
     pub(super) fn run(mut self, job: Job) {
+        let _finished = FinishedAtEnd(Arc::clone(&self.shared));
         match job {
             Job::Live { open, feed, profile, .. } => self.run_live(open, feed, &profile),
             Job::Replay { recording, play } => self.run_replay(&recording, play),
@@ -75,7 +77,16 @@ impl Worker {
                 }
                 self.count(Counter::ReconnectAttempts, 1);
                 back_off = (back_off * 2).min(LONGEST_BACK_OFF);
-                link = feed.open().ok();
+                link = match feed.open() {
+                    Ok(link) => {
+                        self.trouble(String::new());
+                        Some(link)
+                    }
+                    Err(error) => {
+                        self.trouble(error.to_string());
+                        None
+                    }
+                };
                 if link.is_some() {
                     stream = LiveStream::new(profile, datagrams);
                     silent_from = host_now() + FIRST_SILENCE;
@@ -108,6 +119,11 @@ impl Worker {
                 }
             }
         }
+    }
+
+    /// Tells why the link does not come back; an empty text that it has. What finds no room is told again soon.
+    fn trouble(&mut self, text: String) {
+        let _ = self.troubles.push(text);
     }
 
     fn connected(&mut self, t: TimeNs) {
@@ -277,6 +293,15 @@ impl Worker {
     }
 }
 
+/// However the thread ends, by a panic too, the link is finished then.
+struct FinishedAtEnd(Arc<Shared>);
+
+impl Drop for FinishedAtEnd {
+    fn drop(&mut self) {
+        self.0.link.store(Link::Finished as u8, Ordering::Release);
+    }
+}
+
 /// Where decisions go.
 struct Tap<'a> {
     tap: &'a mut rtrb::Producer<Decision>,
@@ -311,31 +336,32 @@ impl Tap<'_> {
 struct LiveStream {
     decoder: Box<dyn Decoder>,
     sequence: SequenceTracker,
-    clock: ClockModel,
+    stamper: Stamper,
     datagrams: bool,
 }
 
 impl LiveStream {
     fn new(profile: &Profile, datagrams: bool) -> Self {
-        Self { decoder: profile.decoder(), sequence: SequenceTracker::new(), clock: ClockModel::new(), datagrams }
+        Self { decoder: profile.decoder(), sequence: SequenceTracker::new(), stamper: Stamper::new(), datagrams }
     }
 
     fn push(&mut self, bytes: &[u8], arrival: TimeNs, worker: &mut Worker) {
         worker.count(Counter::Bytes, bytes.len() as u64);
-        let Self { decoder, sequence, clock, datagrams } = self;
+        let Self { decoder, sequence, stamper, datagrams } = self;
+        let resets = stamper.resets();
         let mut take = |event| match event {
             WireEvent::Sample(sample) => {
-                let resets = clock.resets();
                 if let Some(number) = sample.sequence {
                     worker.count_sequence(sequence.next(number, sample.eye));
                 }
-                worker.take(to_sample(&sample, arrival, clock));
-                worker.count(Counter::ClockResets, clock.resets() - resets);
+                if let Some(sample) = stamper.take(sample, arrival) {
+                    worker.take(sample);
+                }
             }
             WireEvent::Note => worker.count(Counter::Notes, 1),
             WireEvent::Partial => worker.count(Counter::Partials, 1),
             WireEvent::Clock(t_device) => {
-                clock.observe(t_device, arrival);
+                stamper.observe(t_device, arrival);
                 worker.count(Counter::Notes, 1);
             }
             WireEvent::Rejected(fault) => worker.shared.counters.add_fault(LogFault::Wire(fault), 1),
@@ -344,7 +370,9 @@ impl LiveStream {
         if *datagrams {
             decoder.finish(&mut take);
         }
-        worker.shared.clock.set(clock.report());
+        stamper.rest(arrival, |sample| worker.take(sample));
+        worker.count(Counter::ClockResets, stamper.resets() - resets);
+        worker.shared.clock.set(stamper.report());
     }
 }
 
@@ -359,19 +387,5 @@ impl Worker {
             SequenceEvent::Repeat => self.count(Counter::SequenceRepeats, 1),
             SequenceEvent::Restart => self.count(Counter::SequenceRestarts, 1),
         }
-    }
-}
-
-fn to_sample(wire: &WireSample, arrival: TimeNs, clock: &mut ClockModel) -> PupilSample {
-    PupilSample {
-        t_device: wire.t_device.unwrap_or(arrival),
-        t_sample: wire.t_device.map_or(arrival, |t_device| clock.map(t_device, arrival)),
-        t_arrival: arrival,
-        eye: wire.eye,
-        diameter_mm: wire.diameter_mm,
-        confidence: wire.confidence,
-        aperture_mm: wire.aperture_mm,
-        sequence: wire.sequence,
-        valid: wire.valid,
     }
 }

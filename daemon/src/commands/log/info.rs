@@ -2,11 +2,10 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::path::Path;
 
 use holod_calibration::TimeNs;
 use holod_calibration::rig::Rig;
-use holod_pupil_input::{Estimator, EstimatorSettings, LogInfo, Recording, SizeUnit, Verdict};
+use holod_pupil_input::{Decision, Estimator, EstimatorSettings, LogInfo, Recording, SizeUnit, Verdict};
 use ratatui::style::Color;
 use serde::Serialize;
 
@@ -32,7 +31,7 @@ struct GateCounts {
     rejected: BTreeMap<&'static str, u64>,
 }
 
-/// Every sample with its verdict, and the estimate of its time.
+/// What a plot can show of the samples with their verdicts, and the estimate of their times.
 struct Judged {
     counts: GateCounts,
     marks: Vec<PupilSampleMark>,
@@ -45,7 +44,7 @@ pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
     let in_mm = recording.unit() == SizeUnit::Millimetres || args.scale.is_some();
     let judged = in_mm.then(|| judge(&recording, args.scale));
     if let (Some(path), Some(judged)) = (&args.plot, &judged) {
-        save(judged, path)?;
+        PupilPlot { samples: &judged.marks, estimate: &judged.estimate, truth: &[] }.save(path)?;
     }
     if args.json {
         let gate = judged.as_ref().map(|judged| &judged.counts);
@@ -70,23 +69,29 @@ fn judge(recording: &Recording, scale: Option<f64>) -> Judged {
     let begins = recording.begins();
     let seconds = |t: TimeNs| (t - begins).seconds();
     let mut counts = GateCounts { believed: 0, rejected: BTreeMap::new() };
-    let mut marks = Vec::with_capacity(recording.len());
-    let mut note = |decision: holod_pupil_input::Decision| {
+    let every = recording.len().div_ceil(PLOTTED).max(1);
+    let mut marks = Vec::with_capacity(PLOTTED);
+    let mut decided = 0_usize;
+    let mut note = |decision: Decision| {
         let accepted = decision.verdict == Verdict::Accepted;
         match decision.verdict {
             Verdict::Accepted => counts.believed += 1,
             Verdict::Rejected(reason) => *counts.rejected.entry(reason.name()).or_default() += 1,
         }
-        if decision.sample.valid && decision.sample.diameter_mm.is_finite() {
+        decided += 1;
+        let shown = decided.is_multiple_of(every) && decision.sample.valid;
+        if shown && decision.sample.diameter_mm.is_finite() {
             let (t_s, raw_mm) = (seconds(decision.sample.t_sample), f64::from(decision.sample.diameter_mm));
             marks.push(PupilSampleMark { t_s, raw_mm, accepted });
         }
     };
-    let mut estimate = Vec::with_capacity(recording.len());
-    for sample in recording.samples() {
+    let mut estimate = Vec::with_capacity(PLOTTED);
+    for (index, sample) in recording.samples().enumerate() {
         let t = sample.t_sample;
         estimator.push(sample, &mut note);
-        estimate.push((seconds(t), f64::from(estimator.pupil_at(t).pupil.mm())));
+        if index.is_multiple_of(every) {
+            estimate.push((seconds(t), f64::from(estimator.pupil_at(t).pupil.mm())));
+        }
     }
     estimator.finish(&mut note);
     Judged { counts, marks, estimate }
@@ -94,14 +99,6 @@ fn judge(recording: &Recording, scale: Option<f64>) -> Judged {
 
 /// More points than this say no more in a plot.
 const PLOTTED: usize = 20_000;
-
-fn save(judged: &Judged, path: &Path) -> Result<(), Failure> {
-    let every = judged.estimate.len().div_ceil(PLOTTED).max(1);
-    let estimate: Vec<_> = judged.estimate.iter().copied().step_by(every).collect();
-    let every = judged.marks.len().div_ceil(PLOTTED).max(1);
-    let samples: Vec<_> = judged.marks.iter().step_by(every).copied().collect();
-    PupilPlot { samples: &samples, estimate: &estimate, truth: &[] }.save(path)
-}
 
 fn gate_text(judged: &Judged) -> String {
     let GateCounts { believed, rejected } = &judged.counts;

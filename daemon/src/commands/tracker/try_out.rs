@@ -34,6 +34,10 @@ struct Report {
     /// 19 of 20 samples arrive within this after the quickest ones of their time.
     delay_spread_ms: Option<f64>,
     counts: BTreeMap<String, u64>,
+    /// Pieces of the link's bytes and decisions that the recording lost.
+    records_lost: u64,
+    /// Why a link that was lost did not come back.
+    trouble: Option<String>,
     warnings: Vec<String>,
 }
 
@@ -77,7 +81,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         if (now - began).seconds() >= args.duration.as_secs_f64() {
             break "the asked duration".to_owned();
         }
-        if tracker.finished() && observed.accepted() > 0 {
+        if tracker.finished() {
             break "the end of the pupil log".to_owned();
         }
         if !args.json && now - redrawn >= REDRAW {
@@ -87,16 +91,28 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         }
     };
     let now = host_now();
+    let last = report_of(&spec, &ended_by, began, now, &observed, &mut tracker);
     tracker.stop();
     while let Some(decision) = tracker.decisions().pop() {
         observed.take(&decision);
     }
-    let report = report_of(&spec, &ended_by, began, now, &observed, &mut tracker);
+    // Counts and figures are of all samples; link and pupil as they were before the tracker was stopped.
+    let Report { link, pupil_mm, pupil_state, trouble, .. } = last;
+    let report = Report {
+        link,
+        pupil_mm,
+        pupil_state,
+        trouble,
+        ..report_of(&spec, &ended_by, began, now, &observed, &mut tracker)
+    };
     if args.json {
         report::print_json(&report)?;
     } else {
         live.show("");
         report::print(&format!("{}\n{}", traces(&observed, now, LiveText::visible()), text_of(&report)))?;
+    }
+    if let Some(failure) = tracker.recording().and_then(|recording| recording.failure) {
+        return Err(Failure::new(Exit::CannotCreate, format!("the recording is not whole: {failure}")));
     }
     if observed.accepted() > 0 {
         return Ok(());
@@ -144,6 +160,8 @@ fn report_of(
         clock_drift_ppm: tracker.clock().map(|clock| clock.drift_ppm),
         delay_spread_ms: tracker.clock().map(|clock| clock.delay_spread.seconds() * 1e3),
         counts: tracker.counters().entries().collect(),
+        records_lost: tracker.recording().map_or(0, |status| status.chunks_lost + status.decisions_lost),
+        trouble: tracker.trouble().map(str::to_owned),
         warnings: tracker.warnings().to_vec(),
     }
 }
@@ -212,6 +230,12 @@ fn text_of(report: &Report) -> String {
                 "clock: {drift_ppm:+.0} ppm against this machine's; 19 of 20 samples within {spread_ms:.2} ms of the quickest"
             ),
         );
+    }
+    if report.records_lost > 0 {
+        put(&mut text, format!("the recording lost {} pieces: the disk is too slow for it", report.records_lost));
+    }
+    if let Some(trouble) = &report.trouble {
+        put(&mut text, format!("lost, and not found again: {trouble}"));
     }
     let shown: Vec<_> = report
         .counts
