@@ -1,9 +1,11 @@
-//! What every decoder must hold on any bytes.
+//! What every decoder and every importer must hold on any bytes.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
+use std::path::{Path, PathBuf};
 
 use holod_pupil_input::wire::{Decoder, WireEvent};
+use holod_pupil_input::{LogInfo, Recording};
 
 /// The system's allocator, counting for each thread.
 struct Counting;
@@ -28,6 +30,9 @@ unsafe impl GlobalAlloc for Counting {
 
 #[global_allocator]
 static COUNTING: Counting = Counting;
+
+/// The longest input, as `run` sets it.
+const MOST_BYTES: usize = 16384;
 
 /// More than any decoder makes of `bytes`, so that what it does can be written down without an allocation.
 const fn most_events(bytes: usize) -> usize {
@@ -67,7 +72,7 @@ pub fn check_message(mut decoder: Box<dyn Decoder>, message: &[u8]) {
 }
 
 fn events_of<'a>(decoder: &mut dyn Decoder, pieces: impl IntoIterator<Item = &'a [u8]>) -> Vec<WireEvent> {
-    let mut events = Vec::with_capacity(1 << 16);
+    let mut events = Vec::with_capacity(most_events(MOST_BYTES));
     let mut bytes = 0;
     let allocations = ALLOCATIONS.get();
     for piece in pieces {
@@ -77,12 +82,55 @@ fn events_of<'a>(decoder: &mut dyn Decoder, pieces: impl IntoIterator<Item = &'a
     decoder.finish(&mut |event| events.push(event));
     assert_eq!(ALLOCATIONS.get(), allocations, "the decoder, or too many events, allocated");
     assert!(events.len() <= most_events(bytes), "{} events of {bytes} bytes", events.len());
-    for event in &events {
+    for event in &mut events {
         if let WireEvent::Sample(sample) = event {
             assert!(!sample.valid || (sample.diameter_mm.is_finite() && sample.diameter_mm >= 0.0), "{sample:?}");
             assert!((0.0..=1.0).contains(&sample.confidence), "{sample:?}");
             assert!(sample.aperture_mm.is_none_or(f32::is_finite), "{sample:?}");
+            if !sample.valid {
+                // Means nothing, and a NaN is not itself.
+                sample.diameter_mm = 0.0;
+            }
         }
     }
     events
+}
+
+/// A folder of this process for log files.
+pub fn folder() -> PathBuf {
+    let folder = std::env::temp_dir().join(format!("holod-fuzz-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).expect("the folder can be made");
+    folder
+}
+
+/// Reads a log and holds what it gives to: times in order, diameters that can be used, and a summary.
+pub fn check_log(path: &Path) {
+    let recording = match Recording::read(path) {
+        Ok(recording) => recording,
+        Err(error) => return drop(std::hint::black_box(error.to_string())),
+    };
+    let mut last = recording.begins();
+    for sample in recording.samples() {
+        assert!(sample.t_sample >= last, "{sample:?} behind {last:?}");
+        assert!(!sample.valid || (sample.diameter_mm.is_finite() && sample.diameter_mm >= 0.0), "{sample:?}");
+        last = sample.t_sample;
+    }
+    assert_eq!(recording.samples().count(), recording.len());
+    assert!(last <= recording.ends());
+    assert!(recording.blinks().iter().all(|blink| blink.begins <= blink.ends), "a blink that ends before it begins");
+    let info = LogInfo::of(&recording, Some(0.01));
+    assert_eq!(info.samples, recording.len() as u64);
+    assert_eq!(info.eyes.iter().map(|eye| eye.samples).sum::<u64>(), info.samples, "samples of no eye");
+}
+
+/// The first part of an input that is cut by zero bytes, and what follows it.
+pub fn cut_at_zero(bytes: &[u8]) -> (&[u8], &[u8]) {
+    let at = bytes.iter().position(|&byte| byte == 0).unwrap_or(bytes.len());
+    (&bytes[..at], bytes.get(at + 1..).unwrap_or_default())
+}
+
+/// The first part of an input, whose length its first two bytes tell, and what follows it.
+pub fn cut_by_length(bytes: &[u8]) -> (&[u8], &[u8]) {
+    let Some((length, rest)) = bytes.split_first_chunk() else { return (&[], bytes) };
+    rest.split_at(usize::from(u16::from_le_bytes(*length)).min(rest.len()))
 }
