@@ -16,7 +16,7 @@
 //! |---|---|
 //! | 4 | length of the payload, n, at most 65536 |
 //! | 1 | kind |
-//! | 8 | time in ns on the host's monotonic clock; of bytes, when they were read |
+//! | 8 | time in ns on the host's monotonic clock, not negative and at most 3.2e18; of bytes, when they were read |
 //! | 4 | number of the connection, counted from 1 |
 //! | n | payload |
 //! | 4 | CRC-32 of the record up to here |
@@ -29,8 +29,8 @@
 //! | 4 | pieces found no room on their way to the file | how many, 8 bytes |
 //! | 5 | the run ended as it should | none |
 //!
-//! A file whose last record is not of kind 5 was cut off. A record that is incomplete, or whose checksum is wrong, is
-//! where the file was torn; nothing behind it is read.
+//! A file whose last record is not of kind 5 was cut off. A record that is incomplete, or whose checksum or time is wrong,
+//! is where the file was torn; nothing behind it is read.
 
 use std::io::{self, Read};
 
@@ -46,6 +46,8 @@ const VERSION: u32 = 1;
 pub(crate) const MAX_PAYLOAD_BYTES: usize = 1 << 16;
 /// Longest header, the text alone.
 const MAX_HEADER_BYTES: usize = 1 << 20;
+/// Latest time of a record, a hundred years after the host's start, so that differences and sums of two stay within i64.
+const LATEST_NS: i64 = 3_200_000_000_000_000_000;
 /// A record's bytes before its payload.
 pub(crate) const RECORD_HEAD_BYTES: usize = 17;
 
@@ -255,7 +257,8 @@ impl<R: Read> RawReader<R> {
         };
         take(&mut self.input, length + 4, &mut self.record)?;
         let end = RECORD_HEAD_BYTES + length;
-        if self.record.len() != end + 4 || crc32(&self.record[..end]) != u32_at(&self.record, end) {
+        let sound = self.record.len() == end + 4 && crc32(&self.record[..end]) == u32_at(&self.record, end);
+        if !sound || !(0..=LATEST_NS).contains(&head.t.0) {
             return self.torn();
         }
         if head.kind == Kind::End {
@@ -326,7 +329,7 @@ mod tests {
 
     fn any_record() -> impl Strategy<Value = (RecordHead, Vec<u8>)> {
         let kinds = [Kind::Connected, Kind::Bytes, Kind::Disconnected, Kind::Lost];
-        (prop::sample::select(kinds.to_vec()), any::<i64>(), any::<u32>(), prop::collection::vec(any::<u8>(), 0..60))
+        (prop::sample::select(kinds.to_vec()), 0..=LATEST_NS, any::<u32>(), prop::collection::vec(any::<u8>(), 0..60))
             .prop_map(|(kind, t, connection, payload)| (RecordHead { kind, t: TimeNs(t), connection }, payload))
     }
 
@@ -415,6 +418,16 @@ mod tests {
         let mut bytes = header().encode();
         bytes[8] = 7;
         assert!(matches!(read(&bytes), Err(HeaderFault::Bad(found)) if found.contains("version 7")));
+    }
+
+    #[test]
+    fn a_time_that_no_host_has_is_where_the_file_is_torn() {
+        let record = |t_ns| (RecordHead { kind: Kind::Connected, t: TimeNs(t_ns), connection: 1 }, Vec::new());
+        for (t_ns, is_read) in [(0, true), (LATEST_NS, true), (-1, false), (LATEST_NS + 1, false), (i64::MIN, false)] {
+            let (bytes, _) = file(&vec![record(5), record(t_ns)]);
+            let (records, ending) = read(&bytes).expect("reads");
+            assert_eq!((records.len(), ending == Ending::CutOff), (1 + usize::from(is_read), is_read), "{t_ns}");
+        }
     }
 
     /// Report 1 of `holod-hid`: 1 s, number 7, left 3.25 mm seen, right not.
