@@ -31,9 +31,6 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
-/// The longest input, as `run` sets it.
-const MOST_BYTES: usize = 16384;
-
 /// More than any decoder makes of `bytes`, so that what it does can be written down without an allocation.
 const fn most_events(bytes: usize) -> usize {
     4 * bytes + 16
@@ -42,7 +39,7 @@ const fn most_events(bytes: usize) -> usize {
 /// Pushes a stream at once and in pieces that the stream itself decides, and holds the decoder to: the same events, no
 /// more of them than there is reason for, samples that can be used, and nothing allocated, so that no state grows.
 pub fn check_stream(decoder: impl Fn() -> Box<dyn Decoder>, bytes: &[u8]) {
-    let whole = events_of(&mut *decoder(), [bytes]);
+    let whole = events_of(&mut *decoder(), bytes.len(), [bytes]);
     let mut rest = bytes;
     let pieces = std::iter::from_fn(|| {
         let first = rest.first()?;
@@ -50,8 +47,8 @@ pub fn check_stream(decoder: impl Fn() -> Box<dyn Decoder>, bytes: &[u8]) {
         rest = later;
         Some(now)
     });
-    assert_eq!(events_of(&mut *decoder(), pieces), whole, "the split of the bytes matters");
-    assert_eq!(events_of(&mut *decoder(), bytes.chunks(1)), whole, "bytes one by one give other events");
+    assert_eq!(events_of(&mut *decoder(), bytes.len(), pieces), whole, "the split of the bytes matters");
+    assert_eq!(events_of(&mut *decoder(), bytes.len(), bytes.chunks(1)), whole, "bytes one by one give other events");
 }
 
 /// Pushes messages (a byte for the length, then as many) to a decoder of whole messages.
@@ -63,20 +60,23 @@ pub fn check_messages(mut decoder: Box<dyn Decoder>, bytes: &[u8]) {
         rest = later;
         Some(message)
     });
-    events_of(&mut *decoder, messages);
+    events_of(&mut *decoder, bytes.len(), messages);
 }
 
 /// Pushes one message to a decoder of whole messages.
 pub fn check_message(mut decoder: Box<dyn Decoder>, message: &[u8]) {
-    events_of(&mut *decoder, [message]);
+    events_of(&mut *decoder, message.len(), [message]);
 }
 
-fn events_of<'a>(decoder: &mut dyn Decoder, pieces: impl IntoIterator<Item = &'a [u8]>) -> Vec<WireEvent> {
-    let mut events = Vec::with_capacity(most_events(MOST_BYTES));
-    let mut bytes = 0;
+/// The events of `bytes` bytes in pieces.
+fn events_of<'a>(
+    decoder: &mut dyn Decoder,
+    bytes: usize,
+    pieces: impl IntoIterator<Item = &'a [u8]>,
+) -> Vec<WireEvent> {
+    let mut events = Vec::with_capacity(most_events(bytes));
     let allocations = ALLOCATIONS.get();
     for piece in pieces {
-        bytes += piece.len();
         decoder.push(piece, &mut |event| events.push(event));
     }
     decoder.finish(&mut |event| events.push(event));
