@@ -4,8 +4,9 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::path::{Path, PathBuf};
 
+use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::wire::{Decoder, WireEvent};
-use holod_pupil_input::{LogInfo, Recording};
+use holod_pupil_input::{Estimator, EstimatorSettings, LogInfo, Recording};
 
 /// The system's allocator, counting for each thread.
 struct Counting;
@@ -103,7 +104,8 @@ pub fn folder() -> PathBuf {
     folder
 }
 
-/// Reads a log and holds what it gives to: times in order, diameters that can be used, and a summary.
+/// Reads a log and holds what it gives to: times in order, diameters that can be used, a summary, and estimates of a pupil
+/// that an eye can have.
 pub fn check_log(path: &Path) {
     let recording = match Recording::read(path) {
         Ok(recording) => recording,
@@ -121,6 +123,23 @@ pub fn check_log(path: &Path) {
     let info = LogInfo::of(&recording, Some(0.01));
     assert_eq!(info.samples, recording.len() as u64);
     assert_eq!(info.eyes.iter().map(|eye| eye.samples).sum::<u64>(), info.samples, "samples of no eye");
+    for eye in [rig::Eye::Both, rig::Eye::Better] {
+        check_estimates(&recording, EstimatorSettings::from(&rig::Tracker { eye, ..rig::Rig::default().tracker }));
+    }
+}
+
+fn check_estimates(recording: &Recording, settings: EstimatorSettings) {
+    let pupils_mm = settings.gate.least_mm..=settings.gate.greatest_mm;
+    let mut estimator = Estimator::new(settings);
+    let mut decided = 0;
+    for sample in recording.samples() {
+        estimator.push(sample, |_| decided += 1);
+        let estimate = estimator.pupil_at(sample.t_sample + TimeNs(20_000_000));
+        assert!(pupils_mm.contains(&estimate.pupil.mm()), "{estimate:?} after {sample:?}");
+        assert!(estimate.velocity_mm_per_s.is_finite(), "{estimate:?} after {sample:?}");
+    }
+    estimator.finish(|_| decided += 1);
+    assert_eq!(decided, recording.len(), "each sample is judged once");
 }
 
 /// The first part of an input that is cut by zero bytes, and what follows it.
