@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
+use holod_pupil_input::UsbIds;
 
 /// Drives a holographic near-eye display in real time, closed loop with an eye tracker.
 ///
@@ -54,6 +55,8 @@ pub enum Command {
 pub enum TrackerCommand {
     /// The profiles that holod knows, and the ports and devices that are plugged in.
     List(ListArgs),
+    /// Print the udev rule that lets holod open a HID device.
+    Rule(RuleArgs),
     /// Read a tracker for a while: a live plot, rates, jitter, losses, and each rejection with its reason.
     Try(TryArgs),
 }
@@ -268,6 +271,14 @@ pub struct ListArgs {
     /// Print the list as JSON.
     #[arg(long)]
     pub json: bool,
+}
+
+/// Options of `tracker rule`.
+#[derive(Args, Debug, Clone)]
+pub struct RuleArgs {
+    /// USB vendor and product, hexadecimal, as lsusb shows them.
+    #[arg(value_name = "VID:PID")]
+    pub ids: UsbIds,
 }
 
 /// Options of `tracker try`.

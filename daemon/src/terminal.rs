@@ -7,7 +7,7 @@ use ratatui::buffer::Buffer;
 use ratatui::layout::Rect;
 use ratatui::style::{Color, Style};
 use ratatui::symbols::Marker;
-use ratatui::text::Line;
+use ratatui::text::{Line, Span};
 use ratatui::widgets::{Axis, Chart, Dataset, GraphType, Widget};
 
 /// One set of points in a [`plot`].
@@ -41,8 +41,21 @@ pub struct TextSize {
     pub height: u16,
 }
 
-/// The size of plots where nothing else is known.
-pub const PLOT_SIZE: TextSize = TextSize { width: 100, height: 18 };
+/// The size of plots, on a terminal that is as wide.
+const PLOT_SIZE: TextSize = TextSize { width: 100, height: 18 };
+
+impl TextSize {
+    /// A plot's size on this terminal.
+    pub fn of_plot() -> Self {
+        Self { width: PLOT_SIZE.width.min(columns()).max(40), ..PLOT_SIZE }
+    }
+}
+
+/// Columns of the terminal that standard output is, or as many as a plot likes to have.
+fn columns() -> u16 {
+    let size = rustix::termios::tcgetwinsize(io::stdout()).ok();
+    size.map_or(PLOT_SIZE.width, |size| size.ws_col).max(1)
+}
 
 /// Points as braille dots, with axes and a legend; `colours` adds ANSI colours.
 pub fn plot(series: &[Series<'_>], axes: &Axes<'_>, size: TextSize, colours: bool) -> String {
@@ -50,19 +63,22 @@ pub fn plot(series: &[Series<'_>], axes: &Axes<'_>, size: TextSize, colours: boo
     let mut buffer = Buffer::empty(area);
     let datasets = series.iter().map(|series| {
         Dataset::default()
-            .name(series.name)
             .marker(Marker::Braille)
             .graph_type(GraphType::Scatter)
             .style(Style::default().fg(series.colour))
             .data(series.points)
     });
-    let axis = |name: &str, [least, most]: [f64; 2]| {
+    let axis = |[least, most]: [f64; 2]| {
         let labels = [least, 0.5 * (least + most), most].map(|value| Line::from(format!("{value:.1}")));
-        Axis::default().title(name.to_owned()).bounds([least, most]).labels(labels)
+        Axis::default().bounds([least, most]).labels(labels)
     };
+    // The legend stands in the axis' title: a box of its own would hide what is under it.
+    let legend = series.iter().map(|series| Span::styled(format!("  • {}", series.name), series.colour));
+    let title: Line<'_> = std::iter::once(Span::raw(axes.y_name)).chain(legend).collect();
     Chart::new(datasets.collect())
-        .x_axis(axis(axes.x_name, axes.x))
-        .y_axis(axis(axes.y_name, axes.y))
+        .legend_position(None)
+        .x_axis(axis(axes.x).title(axes.x_name))
+        .y_axis(axis(axes.y).title(title))
         .render(area, &mut buffer);
     text_of(&buffer, colours)
 }
@@ -104,7 +120,8 @@ const fn ansi(colour: Color) -> u8 {
 /// Text that is shown again and again in the same place of a terminal; nothing where standard output is none.
 #[derive(Debug, Default)]
 pub struct LiveText {
-    lines: usize,
+    /// Rows of the terminal that the text took.
+    rows: usize,
 }
 
 impl LiveText {
@@ -118,12 +135,25 @@ impl LiveText {
         if !Self::visible() {
             return;
         }
-        let back = if self.lines == 0 { String::new() } else { format!("\x1b[{}F\x1b[J", self.lines) };
+        let back = if self.rows == 0 { String::new() } else { format!("\x1b[{}F\x1b[J", self.rows) };
         let text = text.trim_end();
         // A terminal that has gone away is no failure of what it showed.
         let _ = writeln!(io::stdout().lock(), "{back}{text}");
-        self.lines = text.lines().count();
+        let columns = usize::from(columns());
+        self.rows = text.lines().map(|line| visible(line).div_ceil(columns).max(1)).sum();
     }
+}
+
+/// Characters of a line that take a column: all but those of the colours.
+fn visible(line: &str) -> usize {
+    let mut inside = false;
+    line.chars()
+        .filter(|&c| {
+            let hidden = inside || c == '\x1b';
+            inside = hidden && c != 'm';
+            !hidden
+        })
+        .count()
 }
 
 #[cfg(test)]
@@ -143,12 +173,18 @@ mod tests {
 
     #[test]
     fn points_and_axes_are_drawn() {
-        let text = drawn(&[(0.0, 0.0), (5.0, 4.0), (10.0, 8.0)], false);
+        let text = drawn(&[(0.0, 1.0), (5.0, 4.0), (10.0, 7.0)], false);
         assert_eq!(text.lines().count(), 12);
-        assert!(text.contains("pupil / mm") && text.contains("8.0") && text.contains("10.0"), "{text}");
+        assert!(text.contains("pupil / mm  • raw") && text.contains("8.0") && text.contains("10.0"), "{text}");
         assert_eq!(dots(&text), 3, "{text}");
         assert_eq!(dots(&drawn(&[(5.0, 9.0)], false)), 0, "a point outside is not drawn");
         assert!(!text.contains('\x1b'));
+    }
+
+    #[test]
+    fn colours_take_no_column() {
+        assert_eq!(visible("\x1b[31m⠡\x1b[39m m"), 3);
+        assert_eq!(visible(""), 0);
     }
 
     #[test]

@@ -180,11 +180,6 @@ impl ClockModel {
         }
     }
 
-    /// Starts anew, as after a reconnect.
-    pub fn forget(&mut self) {
-        *self = Self { resets: self.resets, ..Self::new() };
-    }
-
     /// How often the device's clock was found to have been reset or stepped.
     pub const fn resets(&self) -> u64 {
         self.resets

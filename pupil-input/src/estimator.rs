@@ -150,11 +150,11 @@ impl StreamClock {
     pub(crate) const LIVE: Self = Self { host: TimeNs(0), stream: TimeNs(0), rate: 1.0 };
 
     pub(crate) fn to_stream(self, host: TimeNs) -> TimeNs {
-        self.stream + scaled(host - self.host, self.rate)
+        TimeNs(self.stream.0.saturating_add(scaled(host - self.host, self.rate).0))
     }
 
     pub(crate) fn to_host(self, stream: TimeNs) -> TimeNs {
-        self.host + scaled(stream - self.stream, 1.0 / self.rate)
+        TimeNs(self.host.0.saturating_add(scaled(stream - self.stream, 1.0 / self.rate).0))
     }
 }
 
@@ -238,7 +238,7 @@ struct Channel {
     filter: Filter,
     /// Added to this eye's diameter to give the mean of the eyes, as learnt while there were two.
     to_mean_mm: f32,
-    /// Trusted now: believed at least once, and no bad sample since.
+    /// Trusted now: believed at least once, and neither a bad sample nor a long silence since.
     live: bool,
     /// When `live` changed last.
     t_changed: TimeNs,
@@ -327,6 +327,7 @@ impl Estimator {
         }
         let confidence = if fault.is_some() { 0.0 } else { sample.confidence.clamp(0.0, 1.0) };
         channel.note_confidence(t, confidence, settings.better.recent);
+        set_changed |= self.distrust_silent(sample.eye.index(), t);
         if settings.eye == rig::Eye::Better {
             set_changed |= self.choose(t);
         }
@@ -361,6 +362,22 @@ impl Estimator {
             channel.live = false;
         }
         self.snapshot.lost = true;
+    }
+
+    /// Trusts no other eye than `heard` of which nothing has come for so long, so that one that stopped coming does not
+    /// stand still beside the one that moves; whether there was such an eye.
+    fn distrust_silent(&mut self, heard: usize, t: TimeNs) -> bool {
+        let settings = &self.snapshot.settings;
+        let mut any = false;
+        for (_, channel) in self.channels.iter_mut().enumerate().filter(|(index, _)| *index != heard) {
+            let silence = settings.silence.max(settings.gate.lead + channel.gate.usual_silence());
+            if channel.live && t - channel.t_latest > silence {
+                channel.live = false;
+                channel.t_changed = t;
+                any = true;
+            }
+        }
+        any
     }
 
     /// Chooses the eye to show at `t`; whether that changed.

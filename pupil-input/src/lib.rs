@@ -68,8 +68,8 @@ pub use simulate::{MOCK_SEED, MockSample, MockSource, Scenario, Script, ScriptEr
 pub use source::SourceError;
 pub use source::commands::CommandError;
 pub use source::hid::{HidError, RULE_FILE, udev_rule};
-pub use source::serial::SerialError;
 pub use source::serial::identity::{SerialPortInfo, UsbPort, serial_ports};
+pub use source::serial::{SerialError, serial_port_warnings};
 pub use source::server::ServerError;
 pub use source::tcp::NetworkError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};

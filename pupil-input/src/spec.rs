@@ -4,6 +4,7 @@ use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
+use crate::profile::Profile;
 use crate::simulate::Scenario;
 
 /// A parsed tracker spec.
@@ -29,14 +30,14 @@ pub enum TrackerSpec {
         /// The tracker's profile; the one that knows the ids where the spec names none.
         profile: Option<String>,
     },
-    /// `tcp:HOST:PORT,profile=NAME`
+    /// `tcp:HOST[:PORT],profile=NAME`: the profile's port where there is none
     Tcp {
         /// Host and port.
         address: HostPort,
         /// The tracker's profile.
         profile: String,
     },
-    /// `udp:HOST:PORT,profile=NAME`: listens there
+    /// `udp:HOST[:PORT],profile=NAME`: listens there
     Udp {
         /// Address of this machine and port.
         address: HostPort,
@@ -129,7 +130,7 @@ const CORE_PORT: u16 = 50020;
 /// Port of the Companion's REST interface.
 const NEON_PORT: u16 = 8080;
 const FORMS: &str = "`/dev/ttyUSB0`, `serial:PATH[,profile=NAME][,baud=N]`, `hid:VID:PID[,profile=NAME][,serial=TEXT]`, \
-                     `tcp:HOST:PORT,profile=NAME`, `udp:HOST:PORT,profile=NAME`, `core[:HOST[:PORT]]`, \
+                     `tcp:HOST[:PORT],profile=NAME`, `udp:HOST[:PORT],profile=NAME`, `core[:HOST[:PORT]]`, \
                      `neon[:HOST[:PORT]]`, `replay:FILE[,speed=X|max][,loop]`, a log file, or `mock[:SCENARIO|:FILE]`";
 
 impl FromStr for TrackerSpec {
@@ -237,9 +238,12 @@ fn parse_hid(rest: &str) -> Result<TrackerSpec, String> {
 
 fn parse_network(rest: &str) -> Result<(HostPort, String), String> {
     let (address, option) = rest.split_once(',').unwrap_or((rest, ""));
-    let address = host_port(address, None)?;
     match option.split_once('=') {
-        Some(("profile", name)) => Ok((address, name.to_owned())),
+        Some(("profile", name)) => {
+            // A profile that cannot be had is told of when the tracker is opened.
+            let port = Profile::find(name).ok().and_then(|profile| profile.network.port);
+            Ok((host_port(address, port)?, name.to_owned()))
+        }
         _ => Err(format!("found `{option}` behind the address, expected `profile=NAME`")),
     }
 }
@@ -352,6 +356,12 @@ mod tests {
         );
         assert_eq!(parsed("mock"), TrackerSpec::Mock(Scenario::default()));
         assert_eq!(parsed("mock:blinks"), TrackerSpec::Mock(Scenario::Blinks));
+        let address = HostPort { host: "host".into(), port: 4242 };
+        assert_eq!(
+            parsed("tcp:host,profile=open-gaze"),
+            TrackerSpec::Tcp { address, profile: "open-gaze".into() },
+            "the profile has the port"
+        );
         assert_eq!(parsed("mock:my.txt"), TrackerSpec::MockFile("my.txt".into()));
     }
 

@@ -186,6 +186,25 @@ fn losing_one_of_two_eyes_does_not_jump() {
     assert!(shown.iter().all(|mm| (mm - mean_mm).abs() < 0.01), "{shown:?}");
 }
 
+/// As when one eye's camera is unplugged: no sample says so, they just end.
+#[test]
+fn an_eye_that_stops_coming_does_not_stand_still_beside_the_other() {
+    for (eye, shown_mm) in [(rig::Eye::Both, 4.5), (rig::Eye::Better, 4.0)] {
+        let mut estimator = Estimator::new(settings(eye));
+        let left_mm = |t_ms: i64| 5.0 - (t_ms - 3000).clamp(0, 1000) as f32 * 1e-3;
+        for t_ms in (0..6000).step_by(5) {
+            let left = PupilSample { confidence: 0.8, ..sample(t_ms, SampleEye::Left, left_mm(t_ms)) };
+            estimator.push(left, |_| {});
+            if t_ms < 2000 {
+                estimator.push(sample(t_ms, SampleEye::Right, 6.0), |_| {});
+            }
+        }
+        let (mm, state) = at(&estimator, 6000);
+        assert_eq!(state, PupilState::Tracking, "{eye:?}");
+        assert!((mm - shown_mm).abs() < 0.02, "{eye:?}: {mm}");
+    }
+}
+
 /// The better of two eyes, each 200 Hz: what is shown at each time, from (time in ms) to (left's and right's diameter
 /// and confidence).
 fn better_of(eyes: impl Fn(i64) -> [(f32, f32); 2]) -> Vec<(i64, f32, PupilState)> {

@@ -32,8 +32,17 @@ impl Daemon {
     /// # Panics
     /// Where it cannot be started: the test has no subject.
     pub fn start(binary: &str, args: &[&str], folder: &Path) -> Self {
+        Self::start_with(binary, args, folder, &[])
+    }
+
+    /// The same with additional variables in its environment.
+    ///
+    /// # Panics
+    /// Where it cannot be started.
+    pub fn start_with(binary: &str, args: &[&str], folder: &Path, environment: &[(&str, &Path)]) -> Self {
         let mut child = Command::new(binary)
             .args(args)
+            .envs(environment.iter().copied())
             .current_dir(folder)
             .stdin(Stdio::null())
             .stdout(Stdio::piped())

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use holod_calibration::rig::{LaserDriver, Meaning, Rig};
-use holod_pupil_input::TrackerSpec;
+use holod_pupil_input::{Profile, TrackerSpec, serial_port_warnings};
 use serde::Serialize;
 
 use crate::cli::CheckArgs;
@@ -76,22 +76,40 @@ fn tracker(rig: &Rig) -> Check {
     };
     let (passed, says) = match spec.parse::<TrackerSpec>() {
         Err(error) => (false, error.to_string()),
-        Ok(TrackerSpec::Mock(_)) => (true, format!("{spec}: a simulated eye")),
-        Ok(
-            TrackerSpec::Path(path)
-            | TrackerSpec::Serial { path, .. }
-            | TrackerSpec::Replay { path, .. }
-            | TrackerSpec::MockFile(path),
-        ) => present(&path, "plug the tracker in or correct tracker.spec"),
-        Ok(
-            TrackerSpec::Hid { .. }
-            | TrackerSpec::Tcp { .. }
-            | TrackerSpec::Udp { .. }
-            | TrackerSpec::Core(_)
-            | TrackerSpec::Neon(_),
-        ) => (true, format!("{spec}: not tried; `holod tracker try {spec}` does")),
+        Ok(spec) => match profile_of(&spec).map(Profile::find) {
+            Some(Err(error)) => (false, error.to_string()),
+            _ => reachable(&spec),
+        },
     };
     Check { name, passed, says }
+}
+
+fn profile_of(spec: &TrackerSpec) -> Option<&str> {
+    match spec {
+        TrackerSpec::Serial { profile, .. } | TrackerSpec::Hid { profile, .. } => profile.as_deref(),
+        TrackerSpec::Tcp { profile, .. } | TrackerSpec::Udp { profile, .. } => Some(profile),
+        _ => None,
+    }
+}
+
+/// Whether the tracker is there, as far as that can be told without opening it.
+fn reachable(spec: &TrackerSpec) -> (bool, String) {
+    match spec {
+        TrackerSpec::Mock(_) => (true, format!("{spec}: a simulated eye")),
+        TrackerSpec::Path(path)
+        | TrackerSpec::Serial { path, .. }
+        | TrackerSpec::Replay { path, .. }
+        | TrackerSpec::MockFile(path) => {
+            let (passed, says) = present(path, "plug the tracker in or correct tracker.spec");
+            let warnings = serial_port_warnings(path);
+            (passed, std::iter::once(says).chain(warnings).collect::<Vec<_>>().join("; "))
+        }
+        TrackerSpec::Hid { .. }
+        | TrackerSpec::Tcp { .. }
+        | TrackerSpec::Udp { .. }
+        | TrackerSpec::Core(_)
+        | TrackerSpec::Neon(_) => (true, format!("{spec}: not tried; `holod tracker try {spec}` does")),
+    }
 }
 
 fn lasers(rig: &Rig) -> Check {

@@ -18,8 +18,8 @@ use holod_calibration::{PupilDiameter, TimeNs};
 use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::{ComplexHologram, CpuEngine, Weights};
 use holod_pupil_input::{
-    Decision, DecisionTap, Link, PupilState, RecordFiles, ReplayError, Tracker, TrackerControl, TrackerError,
-    TrackerOptions, TrackerSpec, host_now,
+    Decision, DecisionTap, Link, PupilState, RecordFiles, ReplayError, SourceError, Tracker, TrackerControl,
+    TrackerError, TrackerOptions, TrackerSpec, host_now,
 };
 use holod_slm_output::laser::{BoxEvent, DarkReason};
 use holod_slm_output::output::pacing_config;
@@ -584,7 +584,8 @@ impl Tally {
 /// The exit code of a tracker that cannot be started.
 pub(crate) fn tracker_failure(error: TrackerError) -> Failure {
     let exit = match &error {
-        TrackerError::Source(_) => Exit::NoInput,
+        TrackerError::Source(SourceError::Serial(_)) => Exit::NoInput,
+        TrackerError::Source(_) => Exit::Unavailable,
         TrackerError::Profile(_) => Exit::Usage,
         TrackerError::Replay(ReplayError::Io { .. }) => Exit::NoInput,
         TrackerError::Replay(_) => Exit::Data,

@@ -236,7 +236,7 @@ fn eye_info(recording: &Recording, eye: SampleEye, scale: f32) -> Option<(EyeInf
     };
     let rate_hz = (usual_exactly_s > 0.0).then(|| usual_exactly_s.recip());
     let gaps = || scratch.iter().filter(|s| usual_s > 0.0 && **s > GAP_INTERVALS * usual_s);
-    let (gap_count, gaps_s) = (gaps().count() as u64, gaps().map(|s| f64::from(*s)).sum());
+    let (gap_count, gaps_s) = (gaps().count() as u64, gaps().fold(0.0, |sum, s| sum + f64::from(*s)));
     let longest_gap_s = gaps().copied().fold(0.0, f32::max).into();
     let late = scratch.iter().filter(|s| usual_s > 0.0 && **s > 1.5 * usual_s);
     let missing = late.map(|s| (s / usual_s).round() as u64 - 1).sum();

@@ -15,7 +15,7 @@ use crate::cli::LogInfoArgs;
 use crate::failure::Failure;
 use crate::pictures::{PupilPlot, PupilSampleMark};
 use crate::report;
-use crate::terminal::{Axes, LiveText, PLOT_SIZE, Series, plot};
+use crate::terminal::{Axes, LiveText, Series, TextSize, plot};
 
 /// What was found, with the gate's word.
 #[derive(Serialize)]
@@ -161,7 +161,7 @@ fn text_of(info: &LogInfo) -> String {
     let blinks = &info.blinks;
     put(
         "blinks",
-        format!("{} told, {} found, {} of them in one eye only", blinks.told, blinks.found, blinks.found_in_one_eye),
+        format!("{} told, {} found, {} more in one eye only", blinks.told, blinks.found, blinks.found_in_one_eye),
     );
     let faults: Vec<_> = info.faults.iter().map(|fault| format!("{} {}", fault.name, fault.count)).collect();
     put("faults", if faults.is_empty() { "none".to_owned() } else { faults.join(", ") });
@@ -189,5 +189,10 @@ fn drawn(recording: &Recording, scale: Option<f64>, duration_s: f64) -> String {
         y_name: if in_mm { "pupil / mm" } else { recording.unit().name() },
         y: [0.0, if in_mm { 9.0 } else { (1.1 * most).max(1e-3) }],
     };
-    plot(&[Series { name: "raw", colour: Color::Green, points: &points }], &axes, PLOT_SIZE, LiveText::visible())
+    plot(
+        &[Series { name: "raw", colour: Color::Green, points: &points }],
+        &axes,
+        TextSize::of_plot(),
+        LiveText::visible(),
+    )
 }

@@ -15,7 +15,7 @@ use super::observed::{EyeFigures, Observed, Quantiles};
 use crate::cli::TryArgs;
 use crate::failure::{Exit, Failure};
 use crate::session::{Signals, tracker_failure};
-use crate::terminal::{Axes, LiveText, PLOT_SIZE, Series, TextSize, plot};
+use crate::terminal::{Axes, LiveText, Series, TextSize, plot};
 use crate::{report, setup};
 
 /// What came of it.
@@ -167,10 +167,10 @@ fn traces(observed: &Observed, now: TimeNs, colours: bool) -> String {
     ];
     let axes = Axes { x_name: "s", x: [-PLOTTED_S, 0.0], y_name: "pupil / mm", y: [0.0, 9.0] };
     if colours {
-        return plot(&series, &axes, PLOT_SIZE, true);
+        return plot(&series, &axes, TextSize::of_plot(), true);
     }
     // Without colours the two are told apart by standing in two plots.
-    let size = TextSize { height: 12, ..PLOT_SIZE };
+    let size = TextSize { height: 12, ..TextSize::of_plot() };
     let [rejected, believed] = series.map(|series| plot(&[series], &axes, size, false));
     believed + &rejected
 }
@@ -193,28 +193,17 @@ fn text_of(report: &Report) -> String {
             format!("{:.decimals$} / {:.decimals$} / {:.decimals$} {unit}", q.p1, q.median, q.p99)
         })
     };
-    if !report.eyes.is_empty() {
-        put(
-            &mut text,
-            format!(
-                "{:6} {:>10}  {:24} {:24} {:24} {:24} {:>8}",
-                "eye", "rate", "interval p1/median/p99", "arrivals", "delay over the least", "raw", "believed"
-            ),
-        );
-    }
     for (name, eye) in &report.eyes {
-        put(
-            &mut text,
-            format!(
-                "{name:6} {:>10}  {:24} {:24} {:24} {:24} {:>6.1} %",
-                eye.rate_hz.map_or("-".to_owned(), |rate| format!("{rate:.1} Hz")),
-                three(eye.interval_ms, "ms", 2),
-                three(eye.arrival_interval_ms, "ms", 2),
-                three(eye.delay_ms, "ms", 2),
-                three(eye.raw_mm, "mm", 2),
-                100.0 * eye.accepted as f64 / eye.samples.max(1) as f64,
-            ),
-        );
+        let share = 100.0 * eye.accepted as f64 / eye.samples.max(1) as f64;
+        let rate = eye.rate_hz.map_or("rate unknown".to_owned(), |rate| format!("{rate:.1} Hz"));
+        let raw = three(eye.raw_mm, "mm", 2);
+        let [taken, arrived] = [eye.interval_ms, eye.arrival_interval_ms].map(|interval| three(interval, "ms", 2));
+        put(&mut text, format!("{name:6} {rate}, {share:.1} % believed; raw {raw}"));
+        put(&mut text, format!("       interval {taken}, as they arrive {arrived}"));
+        put(&mut text, format!("       delay over the least {}", three(eye.delay_ms, "ms", 2)));
+    }
+    if !report.eyes.is_empty() {
+        put(&mut text, "       (1st / 50th / 99th percentile)".to_owned());
     }
     if let Some((drift_ppm, spread_ms)) = report.clock_drift_ppm.zip(report.delay_spread_ms) {
         put(

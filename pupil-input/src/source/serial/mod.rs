@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 
 use serialport::{ClearBuffer, SerialPort, TTYPort};
 
-use self::identity::{SerialPortInfo, UsbPort, ports_below};
+use self::identity::{SerialPortInfo, UsbPort, ports_below, serial_ports};
 use super::commands::{CommandError, Dialogue, Told, hung_up, overhear};
 use super::{ByteSource, Feed, READ_TIMEOUT, SourceError};
 use crate::profile::Profile;
@@ -248,6 +248,13 @@ impl Feed for SerialFeed {
         let ports = ports_below(&self.root);
         port_at(&self.path, &ports).map_or_else(Vec::new, |port| port_warnings(port, &self.path))
     }
+}
+
+/// What a user should know of reading a tracker at the serial port `path`: a name that will change, an adapter that holds
+/// bytes back. A sentence each; none where there is no port.
+pub fn serial_port_warnings(path: &Path) -> Vec<String> {
+    let ports = serial_ports();
+    port_at(path, &ports).map_or_else(Vec::new, |port| port_warnings(port, path))
 }
 
 /// What is wrong with reading a tracker at this port by that path.

@@ -1,0 +1,215 @@
+//! What holod says of trackers and logs, as a user asks it: `tracker try`, `log`, `status`.
+
+use std::fs;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use holod_pupil_input::wire::line::{LineSample, encode_line};
+use holod_pupil_input::{MockSource, Scenario};
+use holod_tests::daemon::{Daemon, Ended, run, wait_until};
+use holod_tests::small_rig;
+use holod_tests::tracker::{PtyTracker, TimedLine};
+use rustix::process::Signal;
+use serde_json::Value;
+
+const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+/// Room for a machine that does something else, too.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+fn json(ended: &Ended) -> Value {
+    serde_json::from_str(&ended.stdout).unwrap_or_else(|error| panic!("{error}: {ended:?}"))
+}
+
+/// The first `count` samples of the scenario `blinks`, as protocol lines.
+fn lines(count: usize) -> Vec<TimedLine> {
+    MockSource::new(Scenario::Blinks, 3)
+        .take(count)
+        .map(|mock| {
+            let sample = mock.sample;
+            let line = LineSample {
+                sequence: sample.sequence.unwrap(),
+                device_us: sample.t_device.0 / 1000,
+                eye: sample.eye,
+                diameter_mm: sample.diameter_mm,
+                confidence: sample.confidence,
+            };
+            let mut text = String::new();
+            encode_line(&line, &mut text);
+            TimedLine { due: Duration::from_nanos(sample.t_device.0 as u64), bytes: text.into_bytes() }
+        })
+        .collect()
+}
+
+fn samples(folder: &Path) -> String {
+    fs::read_to_string(folder.join("samples.csv")).unwrap()
+}
+
+#[test]
+fn a_tracker_that_is_tried_is_counted_recorded_and_played_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let link = folder.path().join("ttyTracker");
+    let mut tracker = PtyTracker::plug_in(&link).unwrap();
+    let args = ["tracker", "try", "ttyTracker", "--duration", "6s", "--record", "live", "--json"];
+    let tried = Daemon::start(HOLOD, &args, folder.path());
+    assert!(wait_until(PATIENCE, || folder.path().join("live/samples.csv").exists()));
+    let lines = lines(800);
+    tracker.send(b"# hello\nP1,broken\n").unwrap();
+    tracker.feed(&lines, Instant::now()).unwrap();
+    let ended = tried.wait(PATIENCE);
+    assert!(ended.status.success(), "{ended:?}");
+    let report = json(&ended);
+    let count = |name: &str| report["counts"][name].as_u64().unwrap();
+    assert_eq!((count("samples"), count("sequence_gaps"), count("notes")), (800, 0, 1));
+    assert_eq!(count("wire_bad_checksum"), 1);
+    assert_eq!(report["link"], "finished");
+    for eye in ["left", "right"] {
+        let rate_hz = report["eyes"][eye]["rate_hz"].as_f64().unwrap();
+        assert!((rate_hz - 200.0).abs() < 10.0, "{eye}: {rate_hz}");
+        let judged = report["eyes"][eye]["samples"].as_u64().unwrap();
+        assert_eq!(judged, 400, "{eye}");
+        assert!(report["eyes"][eye]["rejected"]["low_confidence"].as_u64().unwrap() > 10);
+    }
+
+    let again = ["tracker", "try", "replay:live/tracker.holodraw,speed=max", "--record", "again", "--json"];
+    let ended = run(HOLOD, &again, folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    assert_eq!(samples(&folder.path().join("again")), samples(&folder.path().join("live")));
+    let replayed = json(&ended);
+    for name in ["samples", "accepted", "wire_bad_checksum", "rejected_low_confidence"] {
+        assert_eq!(replayed["counts"][name], report["counts"][name], "{name}");
+    }
+}
+
+#[test]
+fn a_tracker_that_says_nothing_or_nonsense_is_told_from_one_that_works() {
+    let folder = tempfile::tempdir().unwrap();
+    let link = folder.path().join("ttyTracker");
+    let mut tracker = PtyTracker::plug_in(&link).unwrap();
+    let args = ["tracker", "try", "ttyTracker", "--duration", "1s"];
+    let ended = run(HOLOD, &args, folder.path());
+    assert_eq!(ended.status.code(), Some(69));
+    assert!(ended.stderr.contains("nothing was heard"), "{ended:?}");
+
+    let tried = Daemon::start(HOLOD, &["tracker", "try", "ttyTracker", "--duration", "4s"], folder.path());
+    for _ in 0..20 {
+        tracker.send(b"7f 03 ff rubbish\n").unwrap();
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    let ended = tried.wait(PATIENCE);
+    assert_eq!(ended.status.code(), Some(69));
+    assert!(ended.stderr.contains("no sample was in them"), "{ended:?}");
+    assert!(ended.stdout.contains("wire_malformed"), "{ended:?}");
+}
+
+#[test]
+fn a_tracker_is_never_looked_for_at_the_laser_boxs_port() {
+    let folder = tempfile::tempdir().unwrap();
+    let box_link = folder.path().join("ttyLasers");
+    let _laser_box = PtyTracker::plug_in(&box_link).unwrap();
+    let lasers = format!("driver = \"serial\"\ndevice = \"{}\"", box_link.display());
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, &lasers)).unwrap();
+    std::os::unix::fs::symlink(&box_link, folder.path().join("ttyOther")).unwrap();
+    let ended = run(HOLOD, &["tracker", "try", "ttyOther", "--config", "rig.toml", "--duration", "1s"], folder.path());
+    assert!(!ended.status.success());
+    assert!(ended.stderr.contains("ttyOther") && ended.stderr.contains("laser"), "{ended:?}");
+}
+
+#[test]
+fn check_names_a_profile_that_is_not_there() {
+    let folder = tempfile::tempdir().unwrap();
+    let rig = |profile: &str| {
+        let rig = small_rig(64, 64, "driver = \"simulated\"");
+        rig.replace("[tracker]\n", &format!("[tracker]\nspec = \"tcp:127.0.0.1:4242,profile={profile}\"\n"))
+    };
+    fs::write(folder.path().join("good.toml"), rig("open-gaze")).unwrap();
+    fs::write(folder.path().join("bad.toml"), rig("open-gase")).unwrap();
+    assert!(run(HOLOD, &["check", "--config", "good.toml"], folder.path()).status.success());
+    let ended = run(HOLOD, &["check", "--config", "bad.toml"], folder.path());
+    assert_eq!(ended.status.code(), Some(69));
+    assert!(ended.stderr.contains("did you mean `open-gaze`?"), "{ended:?}");
+}
+
+#[test]
+fn logs_are_looked_into_and_converted_without_loss() {
+    let folder = tempfile::tempdir().unwrap();
+    let text: Vec<u8> = lines(4000).into_iter().flat_map(|line| line.bytes).collect();
+    fs::write(folder.path().join("log"), text).unwrap();
+    let info = |name: &str| json(&run(HOLOD, &["log", "info", name, "--json"], folder.path()));
+    let first = info("log");
+    assert_eq!((&first["format"], &first["samples"]), (&"holod line protocol".into(), &4000.into()));
+    assert!((first["eyes"][0]["rate_hz"].as_f64().unwrap() - 200.0).abs() < 1.0, "{first}");
+    // In ten seconds of the scenario the lids shut at 1, 2.5, 4, 5.5, 7 and 8.5 s.
+    assert_eq!(first["blinks"]["found"], 6, "{first}");
+    assert!(first["gate"]["believed"].as_u64().unwrap() > 3000);
+
+    for (from, to, out) in [("log", "csv", "a.csv"), ("a.csv", "lines", "b.lines")] {
+        let ended = run(HOLOD, &["log", "convert", from, "--to", to, "--out", out], folder.path());
+        assert!(ended.status.success(), "{ended:?}");
+        let mut again = info(out);
+        again["format"] = first["format"].clone();
+        assert_eq!(again, first, "{out}");
+    }
+    let ended = run(HOLOD, &["log", "convert", "log", "--to", "csv", "--out", "a.csv"], folder.path());
+    assert_eq!(ended.status.code(), Some(73));
+    assert!(ended.stderr.contains("a.csv exists already"), "{ended:?}");
+
+    let ended = run(HOLOD, &["log", "info", "log", "--plot", "log.svg"], folder.path());
+    assert!(ended.stdout.contains("blinks") && ended.stdout.contains("pupil / mm"), "{ended:?}");
+    assert!(fs::read_to_string(folder.path().join("log.svg")).unwrap().contains("raw sample, rejected"));
+}
+
+#[test]
+fn a_log_in_arbitrary_units_needs_a_scale_and_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut text = String::from("SAMPLES\tGAZE\tLEFT\tRATE\t1000.00\nPUPIL\tAREA\nSTART\t1000 \tLEFT\tSAMPLES\n");
+    for t_ms in 1000..3000 {
+        text.push_str(&format!("{t_ms}\t  964.3\t  541.5\t  1256.0\t...\n"));
+    }
+    fs::write(folder.path().join("log.asc"), text).unwrap();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let tried = |more: &[&str]| {
+        let mut args = vec!["tracker", "try", "replay:log.asc,speed=max", "--config", "rig.toml", "--json"];
+        args.extend_from_slice(more);
+        run(HOLOD, &args, folder.path())
+    };
+    let ended = tried(&[]);
+    assert_eq!(ended.status.code(), Some(78), "{ended:?}");
+    assert!(ended.stderr.contains("arbitrary units") && ended.stderr.contains("scale_mm_per_unit"), "{ended:?}");
+    let report = json(&tried(&["--scale", "0.1"]));
+    // A disc of area 1256 is 40 units wide.
+    let median_mm = report["eyes"]["left"]["believed_mm"]["median"].as_f64().unwrap();
+    assert!((median_mm - 4.0).abs() < 0.01, "{report}");
+}
+
+#[test]
+fn a_running_holod_says_how_it_is_and_a_stopped_one_is_not_found() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let runtime = folder.path().join("runtime");
+    let environment = [("RUNTIME_DIRECTORY", runtime.as_path())];
+    let args = ["--config", "rig.toml", "--tracker", "mock:blinks", "--resolution", "64x64"];
+    let daemon = Daemon::start_with(HOLOD, &args, folder.path(), &environment);
+    let ask = || Daemon::start_with(HOLOD, &["status", "--json"], folder.path(), &environment).wait(PATIENCE);
+    let shown = |ended: &Ended| ended.status.success() && json(ended)["frames_shown"].as_u64() > Some(10);
+    assert!(wait_until(PATIENCE, || shown(&ask())));
+    let status = json(&ask());
+    assert_eq!((&status["state"], &status["tracker"]), (&"running".into(), &"mock:blinks".into()));
+    assert!(status["tracker_counts"]["rejected_low_confidence"].as_u64().is_some());
+    assert!(status["pupil_mm"].as_f64().is_some());
+    daemon.signal(Signal::TERM);
+    assert!(daemon.wait(PATIENCE).status.success());
+    let ended = ask();
+    assert_eq!(ended.status.code(), Some(69));
+    assert!(ended.stderr.contains("no holod is running"), "{ended:?}");
+}
+
+#[test]
+fn profiles_are_listed_with_what_they_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let ended = run(HOLOD, &["tracker", "list", "--json"], folder.path());
+    let profiles = json(&ended);
+    let of = |name: &str| profiles.as_array().unwrap().iter().find(|profile| profile["name"] == name).cloned();
+    assert_eq!(of("iscan-etl").unwrap()["unit"], "arbitrary units");
+    assert_eq!(of("holod-hid").unwrap()["wire"], "report");
+    assert!(of("nobody").is_none());
+}
