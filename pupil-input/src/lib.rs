@@ -35,6 +35,8 @@ mod counters;
 mod estimator;
 pub mod export;
 mod filter;
+#[cfg(fuzzing)]
+pub mod fuzzing;
 mod gate;
 mod import;
 mod profile;

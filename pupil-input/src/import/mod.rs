@@ -480,6 +480,10 @@ impl LogBuilder {
         if t.0.unsigned_abs() > GREATEST_NS {
             return self.count(LogFault::BadNumber);
         }
+        // Not even a finite figure need be one in f32, or once it is in millimetres.
+        if valid && !diameter.is_finite() {
+            return self.count(LogFault::NotFinite);
+        }
         self.times += 1;
         if self.rows.len() == MOST_SAMPLES {
             return self.count(LogFault::TooLong);
@@ -826,6 +830,15 @@ mod tests {
         // Samples of one time stay in the order of the log.
         let finished = finished([at(1, SampleEye::Left), at(2, SampleEye::Left), at(1, SampleEye::Right)]);
         assert_eq!(finished, [(1, SampleEye::Left), (1, SampleEye::Right), (2, SampleEye::Left)]);
+    }
+
+    #[test]
+    fn a_diameter_that_became_infinite_is_rejected() {
+        let mut log = LogBuilder::default();
+        log.push(LogSample { diameter: 1e39_f64 as f32, ..sample(1, SampleEye::Left) }, 1);
+        log.push(LogSample { diameter: f32::INFINITY, valid: false, ..sample(2, SampleEye::Left) }, 2);
+        log.push(sample(3, SampleEye::Left), 3);
+        assert_eq!((log.faults.of(LogFault::NotFinite), log.faults.total(), log.rows.len()), (1, 1, 2));
     }
 
     #[test]

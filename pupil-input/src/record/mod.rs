@@ -12,7 +12,11 @@ mod writer;
 
 use std::path::{Path, PathBuf};
 
+#[cfg(fuzzing)]
+pub(crate) use container::RECORD_HEAD_BYTES;
 pub(crate) use container::{Ending, Header, HeaderFault, Kind, MAGIC, RawReader};
+#[cfg(fuzzing)]
+pub(crate) use crc32::crc32;
 pub(crate) use writer::{Recorder, Taps, start};
 
 /// Where a run is written down.

@@ -84,11 +84,13 @@ fn read_message(message: &[u8]) -> Result<WireEvent, WireFault> {
     if !(0.0..=1.0).contains(&confidence) {
         return Err(WireFault::BadConfidence);
     }
+    // The narrower type makes infinities and zeros of its own.
+    let diameter_mm = diameter_mm as f32;
     let seen = confidence > 0.0 && diameter_mm.is_finite() && diameter_mm > 0.0;
     Ok(WireEvent::Sample(WireSample {
         t_device: Some(t_device),
         eye,
-        diameter_mm: diameter_mm as f32,
+        diameter_mm,
         confidence: confidence as f32,
         aperture_mm: None,
         sequence: None,
@@ -372,6 +374,9 @@ mod tests {
         assert!(lost(0.9, Value::Double(0.0)));
         assert!(lost(0.1, Value::Double(-0.11)));
         assert!(lost(0.9, Value::Double(f64::NAN)));
+        // Too great and too small for the narrower type of a sample.
+        assert!(lost(0.9, Value::Double(1e300)));
+        assert!(lost(0.9, Value::Double(1e-300)));
         // A bad eyeball model is not for the decoder to judge.
         assert!(!lost(0.9, Value::Double(22.0)));
         assert!(!lost(0.1, Value::Single(3.0)));
