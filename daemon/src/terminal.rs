@@ -47,14 +47,23 @@ const PLOT_SIZE: TextSize = TextSize { width: 100, height: 18 };
 impl TextSize {
     /// A plot's size on this terminal.
     pub fn of_plot() -> Self {
-        Self { width: PLOT_SIZE.width.min(columns()).max(40), ..PLOT_SIZE }
+        Self { width: PLOT_SIZE.width.min(window().width).max(40), ..PLOT_SIZE }
+    }
+
+    /// The same where `rows` rows of text stand below it, none of which should be lost.
+    pub fn of_plot_above(rows: usize) -> Self {
+        let left = usize::from(window().height).saturating_sub(rows + 2).max(6);
+        Self { height: PLOT_SIZE.height.min(left as u16), ..Self::of_plot() }
     }
 }
 
-/// Columns of the terminal that standard output is, or as many as a plot likes to have.
-fn columns() -> u16 {
-    let size = rustix::termios::tcgetwinsize(io::stdout()).ok();
-    size.map_or(PLOT_SIZE.width, |size| size.ws_col).max(1)
+/// The terminal that standard output is, or as much as a plot and its text like to have.
+fn window() -> TextSize {
+    let size = rustix::termios::tcgetwinsize(io::stdout()).ok().filter(|size| size.ws_col > 0 && size.ws_row > 0);
+    size.map_or(TextSize { width: PLOT_SIZE.width, height: 60 }, |size| TextSize {
+        width: size.ws_col,
+        height: size.ws_row,
+    })
 }
 
 /// Points as braille dots, with axes and a legend; `colours` adds ANSI colours.
@@ -136,11 +145,19 @@ impl LiveText {
             return;
         }
         let back = if self.rows == 0 { String::new() } else { format!("\x1b[{}F\x1b[J", self.rows) };
-        let text = text.trim_end();
+        let TextSize { width, height } = window();
+        let rows_of = |line: &str| visible(line).div_ceil(usize::from(width)).max(1);
+        // Rows that have left the screen at its top cannot be written anew: only the last ones are shown.
+        let mut rows = 0;
+        let mut shown: Vec<_> = text.trim_end().lines().rev().collect();
+        shown.retain(|line| {
+            rows += rows_of(line);
+            rows < usize::from(height)
+        });
+        shown.reverse();
+        self.rows = shown.iter().map(|line| rows_of(line)).sum();
         // A terminal that has gone away is no failure of what it showed.
-        let _ = writeln!(io::stdout().lock(), "{back}{text}");
-        let columns = usize::from(columns());
-        self.rows = text.lines().map(|line| visible(line).div_ceil(columns).max(1)).sum();
+        let _ = writeln!(io::stdout().lock(), "{back}{}", shown.join("\n"));
     }
 }
 

@@ -117,6 +117,7 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
         Case { args: &["--tracker", "hid:1234"], exit: 64, says: &["hid:1234", "VID:PID"] },
         Case { args: &["--tracker", "hid:1234:5678"], exit: 69, says: &["1234:5678", "profile="] },
         Case { args: &["--tracker", "tcp:127.0.0.1:1,profile=open-gaze"], exit: 69, says: &["127.0.0.1:1"] },
+        Case { args: &["--tracker", "serial:/dev/null,profile=neon"], exit: 64, says: &["neon:HOST"] },
         Case { args: &["--tracker", "serial:/dev/null,profile=nosuch"], exit: 64, says: &["nosuch", "holod-hid"] },
         Case { args: &["--output", "window"], exit: 69, says: &["window", "headless"] },
         Case { args: &["--backend", "gpu"], exit: 69, says: &["gpu", "cpu"] },

@@ -596,7 +596,7 @@ pub(crate) fn tracker_failure(error: TrackerError) -> Failure {
     let exit = match &error {
         TrackerError::Source(SourceError::Serial(_)) => Exit::NoInput,
         TrackerError::Source(_) => Exit::Unavailable,
-        TrackerError::Profile(_) => Exit::Usage,
+        TrackerError::Profile(_) | TrackerError::WrongLink { .. } => Exit::Usage,
         TrackerError::Replay(ReplayError::Io { .. }) => Exit::NoInput,
         TrackerError::Replay(_) => Exit::Data,
         TrackerError::Script(_) => Exit::Data,

@@ -34,6 +34,9 @@ fn is_time(name: &str) -> bool {
     name == "TIME" || name.starts_with("TIME(") || name == "Time (in secs)"
 }
 
+/// A fall of the time by more than this is a new medium.
+const BETWEEN_MEDIA_NS: i64 = 1_000_000_000;
+
 /// Where time is read.
 #[derive(Clone, Copy)]
 struct Clock {
@@ -56,9 +59,18 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         log.note(format!("the header says that it began at {}", begin.escape_debug()));
     }
 
+    // `TIME` starts again with each medium; the next one is put a second behind the one before.
+    let (mut later_ns, mut latest_ns, mut media) = (0, None, 1);
     while let Some(row) = table.next_row(log) {
         let t = match row.cell(clock.column).and_then(|cell| time_ns(cell, clock.ns_per_unit)) {
-            Ok(t) => TimeNs(t),
+            Ok(t_ns) => {
+                if let Some(latest_ns) = latest_ns.filter(|latest| t_ns < latest - BETWEEN_MEDIA_NS) {
+                    later_ns += latest_ns - t_ns + BETWEEN_MEDIA_NS;
+                    media += 1;
+                }
+                latest_ns = Some(t_ns);
+                TimeNs(t_ns.saturating_add(later_ns))
+            }
             Err(fault) => {
                 log.count(fault);
                 continue;
@@ -76,6 +88,9 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         blinks.take(&row, t, log);
     }
     blinks.end(log);
+    if media > 1 {
+        log.note(format!("its clock starts anew {} times; each part was put 1 s behind the one before", media - 1));
+    }
     Ok(())
 }
 

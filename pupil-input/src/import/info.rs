@@ -25,6 +25,8 @@ const SHUT_LIDS: f32 = 0.3;
 const LOW: f32 = 0.8;
 const AVERAGED_NS: f32 = 100e6;
 const SHORTEST_NS: i64 = 40_000_000;
+/// A tracker with a longer interval sees some blinks in one sample only.
+const SLOW_NS: i64 = 10_000_000;
 const LONGEST_NS: i64 = 500_000_000;
 /// A silence of at least this, and longer than a gap, ends a run.
 const SILENCE_NS: i64 = 100_000_000;
@@ -227,7 +229,9 @@ fn eye_info(recording: &Recording, eye: SampleEye, scale: f32) -> Option<(EyeInf
     let interval_s = quantiles(&mut scratch, [0.01, 0.5, 0.99]);
     let usual_s = interval_s.map_or(0.0, |[_, median, _]| median);
     let whole_ms = intervals_ns(rows()).all(|ns| ns % 1_000_000 == 0);
-    let usual_exactly_s = if whole_ms && usual_s >= 4.0 * MILLISECOND_S {
+    // A clock of whole milliseconds, if their number alternates, tells the rate by the mean.
+    let other = scratch.iter().filter(|s| (*s - usual_s).abs() > 0.5 * MILLISECOND_S).count();
+    let usual_exactly_s = if whole_ms && 10 * other > scratch.len() {
         let near = scratch.iter().filter(|s| (*s - usual_s).abs() < 1.5 * MILLISECOND_S);
         let (sum, count) = near.fold((0.0, 0_u64), |(sum, count), s| (sum + f64::from(*s), count + 1));
         sum / count as f64
@@ -255,8 +259,7 @@ fn eye_info(recording: &Recording, eye: SampleEye, scale: f32) -> Option<(EyeInf
     let is_shut = |row: &Row| !is_sure(row) || row.aperture_mm < shut_lids_mm;
     let shut = rows().filter(|row| is_shut(row)).count() as u64;
     let has_sign = apertures_known || shut as f64 > SIGN_SHARE * samples as f64;
-    let silence_ns = SILENCE_NS.max((GAP_INTERVALS * usual_s * 1e9) as i64);
-    let mut finder = BlinkFinder::new(eye, has_sign, silence_ns);
+    let mut finder = BlinkFinder::new(eye, has_sign, usual_s);
     rows().for_each(|row| finder.take(row, is_shut(row)));
     let runs = finder.finish();
     let judged = 2 * shut <= samples;
@@ -337,6 +340,8 @@ struct BlinkFinder {
     eye: SampleEye,
     has_sign: bool,
     silence_ns: i64,
+    /// Of runs with a sign: a slow tracker may see a blink in one sample.
+    shortest_shut_ns: i64,
     /// Of good samples.
     average: Option<f32>,
     latest_ns: Option<i64>,
@@ -347,11 +352,13 @@ struct BlinkFinder {
 }
 
 impl BlinkFinder {
-    const fn new(eye: SampleEye, has_sign: bool, silence_ns: i64) -> Self {
+    fn new(eye: SampleEye, has_sign: bool, usual_s: f32) -> Self {
+        let usual_ns = (usual_s * 1e9) as i64;
         Self {
             eye,
             has_sign,
-            silence_ns,
+            silence_ns: SILENCE_NS.max((GAP_INTERVALS * usual_s * 1e9) as i64),
+            shortest_shut_ns: if usual_ns > SLOW_NS { SHORTEST_NS.min(usual_ns * 3 / 2) } else { SHORTEST_NS },
             average: None,
             latest_ns: None,
             latest_good_ns: None,
@@ -403,7 +410,8 @@ impl BlinkFinder {
     fn end_run(&mut self) {
         let Some(run) = self.run.take().filter(|run| run.shut || !self.has_sign) else { return };
         let ends_ns = run.ends_ns.unwrap_or(run.last_ns);
-        if ends_ns - run.begins_ns >= SHORTEST_NS {
+        let shortest_ns = if run.shut { self.shortest_shut_ns } else { SHORTEST_NS };
+        if ends_ns - run.begins_ns >= shortest_ns {
             self.runs.push(Blink { eye: self.eye, begins: TimeNs(run.begins_ns), ends: TimeNs(ends_ns) });
         }
     }

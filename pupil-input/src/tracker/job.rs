@@ -17,6 +17,7 @@ use crate::source::tcp::TcpFeed;
 use crate::source::udp::UdpFeed;
 use crate::source::{ByteSource, Feed, SourceError};
 use crate::spec::{ReplaySpeed, TrackerSpec, UsbIds};
+use crate::wire::Format;
 
 /// What the thread is to do.
 pub(super) enum Job {
@@ -121,6 +122,15 @@ impl Job {
         forbidden: &[PathBuf],
     ) -> Result<Self, TrackerError> {
         let profile = Profile::find(profile.unwrap_or(DEFAULT_PROFILE))?;
+        let other = match profile.format {
+            Format::Report(_) | Format::Usages(_) => Some(("HID reports", "hid:VID:PID")),
+            Format::CoreMsgpack => Some(("Pupil Labs Core's server", "core:HOST")),
+            Format::NeonRtp => Some(("Pupil Labs Neon's Companion", "neon:HOST")),
+            _ => None,
+        };
+        if let Some((link, instead)) = other {
+            return Err(TrackerError::WrongLink { profile: profile.name, link, instead });
+        }
         Self::live(Box::new(SerialFeed::new(path, baud, profile.clone(), forbidden)), profile)
     }
 

@@ -58,6 +58,16 @@ pub enum TrackerError {
         /// What it gives.
         unit: &'static str,
     },
+    /// The profile is for another kind of link.
+    #[error("profile `{profile}` is for {link}; a serial port does not bring such messages: write `{instead}`")]
+    WrongLink {
+        /// The profile's name.
+        profile: String,
+        /// What it is for.
+        link: &'static str,
+        /// A spec that fits.
+        instead: &'static str,
+    },
     /// The system gave no thread.
     #[error("no thread for the pupil reader: {0}; free memory or raise the limit on threads")]
     Thread(std::io::Error),

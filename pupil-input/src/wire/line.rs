@@ -120,7 +120,8 @@ impl From<LineSample> for WireSample {
             confidence: line.confidence,
             aperture_mm: None,
             sequence: Some(line.sequence),
-            valid: true,
+            // What a log says that is lost is written so, since the protocol has no word for it.
+            valid: line.diameter_mm > 0.0 || line.confidence > 0.0,
         }
     }
 }

@@ -14,6 +14,9 @@ pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
             format!("{} exists already; name another file with --out, or remove it", args.out.display()),
         ));
     }
+    if args.to == LogFormatArg::Csv && args.scale.is_some() {
+        return Err(Failure::new(Exit::Usage, "--scale is for --to lines: CSV keeps the log's own unit"));
+    }
     let recording = read(&args.log)?;
     for note in recording.notes() {
         tracing::info!("{note}");
@@ -29,6 +32,11 @@ pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
         };
         Failure::because(exit)(error)
     })?;
+    if args.to == LogFormatArg::Lines && recording.samples().any(|sample| sample.aperture_mm.is_some()) {
+        tracing::warn!(
+            "the log has lid apertures, by which the gate knows blinks; the line protocol has none: --to csv keeps them"
+        );
+    }
     let rejected = recording.faults().total();
     report::print(&format!(
         "{}: {} samples of {} written to {}; {rejected} lines or cells held none",

@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use super::read;
 use crate::cli::LogInfoArgs;
-use crate::failure::Failure;
+use crate::failure::{Exit, Failure};
 use crate::pictures::{PupilPlot, PupilSampleMark};
 use crate::report;
 use crate::terminal::{Axes, LiveText, Series, TextSize, plot};
@@ -43,6 +43,15 @@ pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
     let info = LogInfo::of(&recording, args.scale);
     let in_mm = recording.unit() == SizeUnit::Millimetres || args.scale.is_some();
     let judged = in_mm.then(|| judge(&recording, args.scale));
+    if args.plot.is_some() && judged.is_none() {
+        return Err(Failure::new(
+            Exit::Usage,
+            format!(
+                "--plot shows millimetres, and the log is in {}: give --scale MM_PER_UNIT",
+                recording.unit().name()
+            ),
+        ));
+    }
     if let (Some(path), Some(judged)) = (&args.plot, &judged) {
         PupilPlot { samples: &judged.marks, estimate: &judged.estimate, truth: &[] }.save(path)?;
     }
@@ -69,7 +78,7 @@ fn judge(recording: &Recording, scale: Option<f64>) -> Judged {
     let begins = recording.begins();
     let seconds = |t: TimeNs| (t - begins).seconds();
     let mut counts = GateCounts { believed: 0, rejected: BTreeMap::new() };
-    let every = recording.len().div_ceil(PLOTTED).max(1);
+    let every = step(recording);
     let mut marks = Vec::with_capacity(PLOTTED);
     let mut decided = 0_usize;
     let mut note = |decision: Decision| {
@@ -99,6 +108,11 @@ fn judge(recording: &Recording, scale: Option<f64>) -> Judged {
 
 /// More points than this say no more in a plot.
 const PLOTTED: usize = 20_000;
+
+/// Of how many samples one is plotted: an odd number, so that of two eyes that take turns both are seen.
+fn step(recording: &Recording) -> usize {
+    recording.len().div_ceil(PLOTTED) | 1
+}
 
 fn gate_text(judged: &Judged) -> String {
     let GateCounts { believed, rejected } = &judged.counts;
@@ -170,7 +184,7 @@ fn text_of(info: &LogInfo) -> String {
 
 /// The whole log as a plot for the terminal.
 fn drawn(recording: &Recording, scale: Option<f64>, duration_s: f64) -> String {
-    let every = recording.len().div_ceil(PLOTTED).max(1);
+    let every = step(recording);
     let begins = recording.begins();
     let points: Vec<_> = recording
         .samples()

@@ -58,7 +58,7 @@ pub(super) struct EyeFigures {
     pub(super) accepted: u64,
     /// Of those that it did not: how many for which reason.
     pub(super) rejected: BTreeMap<&'static str, u64>,
-    /// Samples a second, over the samples of the last minute.
+    /// Samples a second while they come, over those of the last minute.
     pub(super) rate_hz: Option<f64>,
     /// Time between neighbouring samples as the tracker took them.
     pub(super) interval_ms: Option<Quantiles>,
@@ -106,16 +106,20 @@ impl ObservedEye {
         };
         let seen = || self.marks.iter().filter(|mark| mark.valid && mark.raw_mm.is_finite());
         let believed = || seen().filter(|mark| mark.verdict == Verdict::Accepted);
-        let spanned_s = match (self.marks.front(), self.marks.back()) {
-            (Some(first), Some(last)) => (last.t_sample - first.t_sample).seconds(),
-            _ => 0.0,
-        };
+        let interval_ms = differences(|mark| mark.t_sample);
+        // Losses and silences are no part of the rate: the mean of the intervals that are not much longer than usual.
+        let usual_ms = interval_ms.map_or(0.0, |interval| interval.median);
+        let times = self.marks.iter().map(|mark| mark.t_sample);
+        let steps = times.clone().zip(times.skip(1)).map(|(t, next)| (next - t).seconds() * 1e3);
+        let (count, sum_ms) = steps
+            .filter(|step| *step <= 1.5 * usual_ms)
+            .fold((0_u32, 0.0), |(count, sum), step| (count + 1, sum + step));
         EyeFigures {
             samples: self.samples,
             accepted: self.accepted,
             rejected: self.rejected.clone(),
-            rate_hz: (spanned_s > 0.0).then(|| (self.marks.len() - 1) as f64 / spanned_s),
-            interval_ms: differences(|mark| mark.t_sample),
+            rate_hz: (sum_ms > 0.0).then(|| 1e3 * f64::from(count) / sum_ms),
+            interval_ms,
             arrival_interval_ms: differences(|mark| mark.t_arrival),
             delay_ms: Quantiles::of(
                 self.marks.iter().map(|mark| (mark.t_arrival - mark.t_sample).seconds() * 1e3).collect(),

@@ -87,7 +87,8 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         if !args.json && now - redrawn >= REDRAW {
             redrawn = now;
             let state = report_of(&spec, "", began, now, &observed, &mut tracker);
-            live.show(&format!("{}\n{}", traces(&observed, now, LiveText::visible()), text_of(&state)));
+            let text = text_of(&state);
+            live.show(&format!("{}\n{text}", traces(&observed, now, LiveText::visible(), text.lines().count())));
         }
     };
     let now = host_now();
@@ -109,7 +110,8 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         report::print_json(&report)?;
     } else {
         live.show("");
-        report::print(&format!("{}\n{}", traces(&observed, now, LiveText::visible()), text_of(&report)))?;
+        let text = text_of(&report);
+        report::print(&format!("{}\n{text}", traces(&observed, now, LiveText::visible(), text.lines().count())))?;
     }
     if let Some(failure) = tracker.recording().and_then(|recording| recording.failure) {
         return Err(Failure::new(Exit::CannotCreate, format!("the recording is not whole: {failure}")));
@@ -166,8 +168,8 @@ fn report_of(
     }
 }
 
-/// The last seconds of all eyes: raw, rejected, believed.
-fn traces(observed: &Observed, now: TimeNs, colours: bool) -> String {
+/// The last seconds of all eyes, above so many rows of text: rejected and believed.
+fn traces(observed: &Observed, now: TimeNs, colours: bool, rows_below: usize) -> String {
     let since_s = |t: TimeNs| (t - now).seconds();
     let points = |wanted: fn(&Verdict) -> bool| -> Vec<(f64, f64)> {
         observed
@@ -185,7 +187,7 @@ fn traces(observed: &Observed, now: TimeNs, colours: bool) -> String {
     ];
     let axes = Axes { x_name: "s", x: [-PLOTTED_S, 0.0], y_name: "pupil / mm", y: [0.0, 9.0] };
     if colours {
-        return plot(&series, &axes, TextSize::of_plot(), true);
+        return plot(&series, &axes, TextSize::of_plot_above(rows_below), true);
     }
     // Without colours the two are told apart by standing in two plots.
     let size = TextSize { height: 12, ..TextSize::of_plot() };
