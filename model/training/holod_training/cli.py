@@ -70,6 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--gradient-weight", type=float, default=loss.gradient)
     train.add_argument("--squared-weight", type=float, default=loss.squared)
     train.add_argument("--focus-weight", type=float, default=loss.focus)
+    train.add_argument("--in-focus-weight", type=float, default=loss.in_focus)
     train.add_argument("--coc-floor-px", type=float, default=loss.coc_floor_px)
     train.add_argument("--validate-every", type=int, default=defaults.validate_every)
     train.add_argument("--stop-below-slope", type=float, default=defaults.stop_below_slope)
@@ -145,6 +146,7 @@ def _train(options: argparse.Namespace) -> None:
             squared=options.squared_weight,
             focus=options.focus_weight,
             coc_floor_px=options.coc_floor_px,
+            in_focus=options.in_focus_weight,
         ),
         crop=options.crop,
         border_px=options.border_px,

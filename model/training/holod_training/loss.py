@@ -1,4 +1,4 @@
-"""The training loss: the paper's two terms, a plain squared error and a squared focus error."""
+"""The training loss: the paper's two terms, plain and in-focus squared errors, and a squared focus error."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+IN_FOCUS_PX = 2.0
 
 
 @dataclass(frozen=True)
@@ -15,6 +17,7 @@ class LossWeights:
     squared: float = 8.0
     focus: float = 15.0
     coc_floor_px: float = 0.2
+    in_focus: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,11 @@ def sharpness_weight(coc_px: Tensor, floor_px: float) -> Tensor:
     return 1 / torch.log2(1 + coc_px.clamp_min(floor_px))
 
 
+def in_focus_weight(coc_px: Tensor) -> Tensor:
+    """1 where the scene is sharp, falling softly through 1/2 at the CoC that metrics call in focus."""
+    return 1 / (1 + (coc_px / IN_FOCUS_PX) ** 4)
+
+
 def inner(x: Tensor, border_px: int) -> Tensor:
     """Without a border on the last two axes."""
     return x[..., border_px : x.shape[-2] - border_px, border_px : x.shape[-1] - border_px]
@@ -42,18 +50,21 @@ def focus_loss(picture: Tensor, target: Tensor, coc_px: Tensor, weights: LossWei
 
     The focus error compares P_k − mean_k P with R_k − mean_k R *squared*: an absolute error would pull sparse
     differences to their median, zero, and the network would show one blurred picture at every depth.
+    In-focus pixels are a few per cent of a stack: only a weight on *their* squared error makes them sharp.
     """
     w = sharpness_weight(coc_px, weights.coc_floor_px)[:, None]
     error = picture - target
     dx = error[..., :, 1:] - error[..., :, :-1]
     dy = error[..., 1:, :] - error[..., :-1, :]
-    squared = error.square().mean()
+    squared_error = error.square()
+    squared = squared_error.mean()
     centred_error = error - error.mean(dim=0)
     total = (
         weights.absolute * (w * error.abs()).mean()
         + weights.gradient * ((w[..., 1:] * dx.abs()).mean() + (w[..., 1:, :] * dy.abs()).mean())
         + weights.squared * squared
         + weights.focus * centred_error.square().mean()
+        + weights.in_focus * (in_focus_weight(coc_px)[:, None] * squared_error).mean()
     )
     with torch.no_grad():
         r = target - target.mean(dim=0)

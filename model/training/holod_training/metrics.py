@@ -9,9 +9,8 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from holod_training.loss import inner
+from holod_training.loss import IN_FOCUS_PX, inner
 
-IN_FOCUS_PX = 2.0
 OUT_OF_FOCUS_PX = 8.0
 
 

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from holod_training.loss import LossWeights, focus_loss, inner, sharpness_weight
+from holod_training.loss import LossWeights, focus_loss, in_focus_weight, inner, sharpness_weight
 
 
 def stack(seed: int) -> torch.Tensor:
@@ -49,6 +49,19 @@ def test_sharp_pixels_weigh_most() -> None:
     w = sharpness_weight(torch.tensor([0.0, 0.2, 1.0, 57.0]), 0.2)
     assert w[0] == w[1] > w[2] == 1 > w[3] > 0
     assert w[0] == pytest.approx(3.80, abs=0.01)
+
+
+def test_the_in_focus_term_sees_sharp_pixels_only() -> None:
+    target = stack(1)
+    coc = torch.full_like(COC, 30.0)
+    coc[:, :5] = 0.5
+    sharp, blurred = target.clone(), target.clone()
+    sharp[..., :5, :] += 0.1
+    blurred[..., 5:, :] += 0.1
+    only = LossWeights(absolute=0, gradient=0, squared=0, focus=0, in_focus=1)
+    assert focus_loss(sharp, target, coc, only).total == pytest.approx(0.005, rel=0.01)
+    assert focus_loss(blurred, target, coc, only).total < 1e-6
+    assert in_focus_weight(torch.tensor([0.0, 2.0])).tolist() == [1.0, 0.5]
 
 
 def test_inner_leaves_out_the_border_on_every_side() -> None:
