@@ -4,7 +4,7 @@ use std::f64::consts::{PI, TAU};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use holod_calibration::rig::{Eye, Fault, LaserDriver, PanelMode, PanelProfile, PhaseSign, Provenance, Rig, RigError};
+use holod_calibration::rig::{Eye, Fault, LaserDriver, PanelMode, PanelProfile, PhaseSign, Provenance, Rig, RigError, WeightsChoice};
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, Resolution, TimeNs};
 use image::{GrayImage, ImageBuffer, Luma, RgbImage};
 use proptest::prelude::*;
@@ -669,6 +669,23 @@ fn a_weights_file_must_be_there() {
         "",
         "rig file's folder",
     );
+}
+
+#[test]
+fn a_network_is_built_in_or_a_file_and_never_both() {
+    check(
+        "allow_optics_mismatch = false",
+        "network = \"smal\"",
+        "model.network",
+        "\"smal\"",
+        "one of \"standard\", \"small\"",
+        "did you mean \"small\"?",
+    );
+    let flag = "allow_optics_mismatch = false";
+    let both = faults_of(&changed(&[(flag, "network = \"small\"\nweights_file = \".\"")]));
+    assert!(both.iter().any(|fault| fault.advice.contains("remove network, or weights_file")), "{both:#?}");
+    let small = Rig::parse(&changed(&[(flag, "network = \"small\"")]), Path::new("rig.toml")).unwrap();
+    assert_eq!(small.model.weights, WeightsChoice::Small);
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use holod_calibration::rig::{LaserDriver, Rig};
+use holod_calibration::rig::{LaserDriver, Rig, WeightsChoice};
 use holod_calibration::{DisplayGeometry, Resolution};
 use holod_model::scene::{DepthEncoding, Fit, FrameReport, Scene, SceneError};
 use holod_model::{CpuEngine, RgbdFrame, Weights, scene_renderer};
@@ -27,8 +27,9 @@ pub fn rig(args: &RigArgs) -> Result<Rig, Failure> {
 /// The rig's weights, checked against its optics.
 pub fn weights(rig: &Rig) -> Result<Weights, Failure> {
     let weights = match &rig.model.weights {
-        None => Weights::builtin(),
-        Some(path) => Weights::load(path).map_err(Failure::because(Exit::Data))?,
+        WeightsChoice::Standard => Weights::builtin(),
+        WeightsChoice::Small => Weights::builtin_small(),
+        WeightsChoice::File(path) => Weights::load(path).map_err(Failure::because(Exit::Data))?,
     };
     if let Err(mismatch) = weights.check_optics(&rig.geometry) {
         if !rig.model.allow_optics_mismatch {

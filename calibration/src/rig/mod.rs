@@ -152,10 +152,27 @@ pub enum Eye {
 /// The network.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Model {
-    /// Weights file; the built-in weights where absent.
-    pub weights: Option<PathBuf>,
+    /// Which network computes the holograms.
+    pub weights: WeightsChoice,
     /// Run weights that were trained for other optics.
     pub allow_optics_mismatch: bool,
+}
+
+/// A network's weights by name or by file.
+#[derive(Clone, Debug, PartialEq, Eq, Default)]
+pub enum WeightsChoice {
+    /// The built-in network of the best quality.
+    #[default]
+    Standard,
+    /// The built-in network for weak machines.
+    Small,
+    /// A file that the trainer exported.
+    File(PathBuf),
+}
+
+impl WeightsChoice {
+    /// The names of the built-in networks in a rig file and on the command line.
+    pub const BUILT_IN: [(&'static str, Self); 2] = [("standard", Self::Standard), ("small", Self::Small)];
 }
 
 impl Default for Rig {
@@ -189,7 +206,7 @@ impl Default for Rig {
                 fallback: PupilDiameter::from_mm(3.0),
                 hold: TimeNs(1_000_000_000),
             },
-            model: Model { weights: None, allow_optics_mismatch: false },
+            model: Model { weights: WeightsChoice::Standard, allow_optics_mismatch: false },
             provenance: Provenance::default(),
         }
     }

@@ -7,7 +7,8 @@ use super::files::plain_file;
 use super::profile::PanelProfile;
 use super::reader::{Found, Reader, Section, Span};
 use super::{
-    Eye, LaserDriver, Lasers, Model, Panel, PanelMode, PhaseSign, Provenance, Rig, RigError, Tracker, flatness, lut,
+    Eye, LaserDriver, Lasers, Model, Panel, PanelMode, PhaseSign, Provenance, Rig, RigError, Tracker, WeightsChoice, flatness,
+    lut,
 };
 use crate::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
 
@@ -45,7 +46,7 @@ const LAYOUT: [(&str, &[&str]); 6] = [
     ),
     ("lasers", &["driver", "device", "power_mw", "on_delay_ms", "lit_ms", "heartbeat_timeout_ms"]),
     ("tracker", &["spec", "eye", "scale_mm_per_unit", "fallback_mm", "hold_ms"]),
-    ("model", &["weights_file", "allow_optics_mismatch"]),
+    ("model", &["network", "weights_file", "allow_optics_mismatch"]),
 ];
 
 /// The keys that a panel profile gives.
@@ -438,13 +439,23 @@ fn read_tracker<'a>(reader: &mut Reader<'a>, tracker: Section<'a>) -> Option<Tra
 }
 
 fn read_model<'a>(reader: &mut Reader<'a>, model: Section<'a>, folder: &Path) -> Option<Model> {
-    let weights = reader.text(model, "weights_file", "a safetensors file's path").map(|path| {
+    let network = reader.choice(model, "network", &WeightsChoice::BUILT_IN, false);
+    let file = reader.text(model, "weights_file", "a safetensors file's path").map(|path| {
         let file = folder.join(path.value);
         let there = plain_file(&file).map(|_| file);
-        reader.of_file(model, "weights_file", path.line, there)
+        Found { value: reader.of_file(model, "weights_file", path.line, there), line: path.line }
     });
+    if let (Some(_), Some(file)) = (&network, &file) {
+        let expected = "either a built-in network or a weights file";
+        let advice = "remove network, or weights_file".into();
+        reader.fault_in(model, "weights_file", file.line, "a second network", expected, advice);
+    }
     let allow_optics_mismatch = reader.flag(model, "allow_optics_mismatch", false);
-    Some(Model { weights: weights.flatten(), allow_optics_mismatch })
+    let weights = match file.and_then(|file| file.value) {
+        Some(file) => WeightsChoice::File(file),
+        None => network.map_or(WeightsChoice::Standard, |network| network.value),
+    };
+    Some(Model { weights, allow_optics_mismatch })
 }
 
 fn milliseconds(ms: f64) -> TimeNs {
