@@ -73,7 +73,7 @@ def structure_loss(picture: Tensor, target: Tensor) -> Tensor:
         return F.avg_pool2d(t, WINDOW_PX, stride=WINDOW_PX // 2)
 
     c1, c2 = 0.01**2, 0.03**2
-    scales = []
+    scales: list[Tensor] = []
     while True:
         mp, mt = mean(picture), mean(target)
         vp, vt = mean(picture * picture) - mp * mp, mean(target * target) - mt * mt

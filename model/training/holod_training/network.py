@@ -106,8 +106,8 @@ class DeformableLayer(nn.Module):
     def offset_predictor(self, channels: int) -> nn.Module:
         predictor = nn.Conv2d(channels, 2 * TAPS, 3, padding=1)
         with torch.no_grad():
-            predictor.weight.mul_(0.5)
-            predictor.bias.zero_()
+            for parameter, share in zip(predictor.parameters(), (0.5, 0.0), strict=True):
+                parameter.mul_(share)
         return predictor
 
     def offsets(self, x: Tensor, pupil_mm: Tensor) -> Tensor:
