@@ -108,6 +108,8 @@ def _training_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--seed", type=int, default=defaults.seed)
     sub.add_argument("--precision", choices=PRECISIONS, default=defaults.precision, help="of convolutions in training")
     sub.add_argument("--teacher", help="weights file whose pictures the loss compares too")
+    sub.add_argument("--lpips-backbone", help="torchvision's AlexNet state dict; with it LPIPS is a term of the loss")
+    sub.add_argument("--lpips-linear", help="the authors' linear layers, lin0.model.1.weight and so on")
     sub.add_argument("--validate-every", type=int, default=defaults.validate_every)
     sub.add_argument("--validation-scenes", type=int, default=defaults.validation_scenes)
     sub.add_argument(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 IN_FOCUS_PX = 2.0
-STRUCTURE_PLANES = 5
+PERCEPTUAL_PLANES = 5
 STRUCTURE_SCALES = 3
 WINDOW_PX = 8
 
@@ -18,8 +19,8 @@ WINDOW_PX = 8
 class LossWeights:
     """The weight of each term, and the CoC below which sharpness counts no more.
 
-    `absolute`, `gradient` and `structure` are the paper's: |P − R| and |∇P − ∇R| weighted by W, and how unlike the
-    structure of some planes is. `teacher` counts only where a run has a teacher.
+    `absolute` and `gradient` are the paper's: |P − R| and |∇P − ∇R| weighted by W; so is a perceptual error of some
+    planes: `lpips` where a run has its weights, `structure` needs none. `teacher` counts only where there is one.
     """
 
     absolute: float = 1.0
@@ -30,6 +31,7 @@ class LossWeights:
     in_focus: float = 0.0
     focus_absolute: float = 0.0
     structure: float = 0.0
+    lpips: float = 1.0
     teacher: float = 8.0
 
 
@@ -91,12 +93,14 @@ def focus_loss(
     target: Tensor,
     coc_px: Tensor,
     weights: LossWeights,
-    structure_planes: Tensor | None = None,
+    perceptual_planes: Tensor | None = None,
+    lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
     teacher: Tensor | None = None,
 ) -> LossParts:
     """picture, target [K, 3, H, W] linear light at every focus of one pupil; coc_px [K, H, W] for these focuses.
 
-    structure_planes: indices of the planes whose structure is compared; all of them where left out.
+    perceptual_planes: indices of the planes for `structure` and `lpips`; all of them where left out.
+    lpips: distances [N] of pictures [N, 3, H, W] of linear light.
     teacher [K, 3, H, W]: the pictures of another network, for in-network distillation.
 
     The focus error compares P_k − mean_k P with R_k − mean_k R *squared*: an absolute error would pull sparse
@@ -119,9 +123,11 @@ def focus_loss(
     }
     if weights.focus_absolute:
         terms["focus_absolute"] = centred_error.abs().mean()
+    chosen = slice(None) if perceptual_planes is None else perceptual_planes
     if weights.structure:
-        chosen = slice(None) if structure_planes is None else structure_planes
         terms["structure"] = structure_loss(picture[chosen], target[chosen])
+    if lpips is not None:
+        terms["lpips"] = lpips(picture[chosen], target[chosen]).mean()
     if teacher is not None:
         terms["teacher"] = (picture - teacher).square().mean()
     total = sum((getattr(weights, name) * value for name, value in terms.items()), picture.new_zeros(()))

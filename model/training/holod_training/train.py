@@ -27,7 +27,8 @@ from tqdm import tqdm
 from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.curves import plot_curves
 from holod_training.export import load_weights, save_weights, write_beside
-from holod_training.loss import STRUCTURE_PLANES, LossWeights, focus_loss, inner
+from holod_training.loss import PERCEPTUAL_PLANES, LossWeights, focus_loss, inner
+from holod_training.lpips import Lpips
 from holod_training.metrics import Judgement, judge, psnr_db
 from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, HalfBandEye, coc_px
@@ -38,7 +39,7 @@ from holod_training.variants import build_network, network_amplitude
 
 VALIDATION_PUPILS_MM = (2.0, 3.0, 4.0)
 PRECISIONS = ("f32", "bf16")
-STRUCTURE_STREAM = 2
+PERCEPTUAL_STREAM = 2
 
 
 class TrainingError(RuntimeError):
@@ -75,6 +76,9 @@ class TrainConfig:
     precision: str = "f32"
     # A weights file whose pictures the loss compares too, at weight `loss.teacher`.
     teacher: str | None = None
+    # Files of LPIPS's weights, see `lpips.py`; both or none.
+    lpips_backbone: str | None = None
+    lpips_linear: str | None = None
 
     def learning_rate_at(self, step: int) -> float:
         """Linear warm-up, then cosine to `final_rate_share` of the peak."""
@@ -126,6 +130,7 @@ class Run:
         if config.initial_weights:
             self.network.load_state_dict(self._initial_weights(Path(config.initial_weights)))
         self.teacher = self._teacher(Path(config.teacher)) if config.teacher else None
+        self.lpips = self._lpips()
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
         self.optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
         self.trained: nn.Module = self.network
@@ -152,6 +157,14 @@ class Run:
             raise TrainingError(f"{path}: the teacher was trained for other optics than this run's")
         return teacher
 
+    def _lpips(self) -> Lpips | None:
+        backbone, linear = self.config.lpips_backbone, self.config.lpips_linear
+        if backbone and linear:
+            return Lpips(Path(backbone), Path(linear)).to(self.device)
+        if backbone or linear:
+            raise TrainingError("LPIPS: found one of its two weights files, expected backbone and linear, or neither")
+        return None
+
     def _fields(self, network: nn.Module, config: NetworkConfig, stacks: list[Stack], depths: list[Tensor]) -> Tensor:
         pupils = torch.tensor([s.pupil_mm for s in stacks], device=self.device)
         amplitudes = torch.stack([network_amplitude(config, s) for s in stacks])
@@ -170,11 +183,11 @@ class Run:
         with torch.no_grad():
             return [see(config, f, stack, stack.pupil_mm) for f, stack in zip(fields, stacks, strict=True)]
 
-    def _structure_planes(self, stacks: list[Stack]) -> list[Tensor]:
+    def _perceptual_planes(self, stacks: list[Stack]) -> list[Tensor]:
         """Five random planes of each stack."""
-        rng = np.random.default_rng((self.config.seed, self.rank, self.step, STRUCTURE_STREAM))
+        rng = np.random.default_rng((self.config.seed, self.rank, self.step, PERCEPTUAL_STREAM))
         counts = [len(s.focus_dpt) for s in stacks]
-        return [torch.from_numpy(rng.permutation(count)[:STRUCTURE_PLANES]).to(self.device) for count in counts]
+        return [torch.from_numpy(rng.permutation(count)[:PERCEPTUAL_PLANES]).to(self.device) for count in counts]
 
     def train_step(self) -> dict[str, float]:
         config = self.config
@@ -187,7 +200,7 @@ class Run:
         with self._precision():
             fields = self._fields(self.trained, config.network, stacks, [s.given_depth for s in stacks])
         taught = self._taught(stacks)
-        structure_planes = self._structure_planes(stacks)
+        perceptual_planes = self._perceptual_planes(stacks)
         parts = []
         for index, (low, stack) in enumerate(zip(fields, stacks, strict=True)):
             border = config.border_px
@@ -199,7 +212,8 @@ class Run:
                     inner(stack.target, border),
                     inner(blur, border),
                     config.loss,
-                    structure_planes[index],
+                    perceptual_planes[index],
+                    self.lpips,
                     inner(taught[index], border) if taught else None,
                 )
             )

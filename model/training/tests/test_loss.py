@@ -55,7 +55,7 @@ def test_structure_looks_at_the_chosen_planes_only() -> None:
     picture[2] = stack(2)[2]
     weights = LossWeights(**{**NONE, "structure": 1.0})
     others, all_planes = (
-        focus_loss(picture, target, COC, weights, structure_planes=planes).total
+        focus_loss(picture, target, COC, weights, perceptual_planes=planes).total
         for planes in (torch.tensor([0, 3, 1]), None)
     )
     assert others == pytest.approx(0, abs=1e-12)

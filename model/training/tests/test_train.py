@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
+from test_lpips import random_lpips_files
 
 from holod_training import cli
 from holod_training.cli import main
@@ -155,6 +156,16 @@ def test_a_teacher_is_compared_by_its_pictures(shards: Path, tmp_path: Path) -> 
     assert taught.train_step()["loss_teacher"] > 0
     with pytest.raises(TrainingError, match="its network has other layers"):
         Run(dataclasses.replace(started, initial_weights=str(tmp_path / "larger.safetensors")), CPU)
+
+
+def test_lpips_joins_the_loss_where_its_files_are_given(shards: Path, tmp_path: Path) -> None:
+    backbone, linear = random_lpips_files(tmp_path)
+    config = tiny(shards, tmp_path / "run", crop=64, border_px=0, lpips_backbone=str(backbone))
+    with pytest.raises(TrainingError, match="LPIPS: found one of its two weights files"):
+        Run(config, CPU)
+    run = Run(dataclasses.replace(config, lpips_linear=str(linear)), CPU)
+    assert run.train_step()["loss_lpips"] > 0
+    assert not any("lpips" in key for key in run.state()["network"])
 
 
 def test_options_change_the_variant_that_they_name() -> None:
