@@ -36,7 +36,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         if path.suffix == ".safetensors":
             return load_file(path)
         found = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, SafetensorError, pickle.UnpicklingError) as error:
+    except (OSError, EOFError, RuntimeError, SafetensorError, pickle.UnpicklingError) as error:
         raise ConfigError(f"{path}: not a readable file of tensors ({error})") from error
     if not isinstance(found, dict):
         raise ConfigError(f"{path}: found {type(found).__name__}, expected a state dict")
@@ -74,7 +74,7 @@ class Lpips(nn.Module):
 
     def _features(self, light: Tensor) -> list[Tensor]:
         """Each stage's map, of unit length over channels."""
-        x = (2 * srgb_encoded(light) - 1 - self.shift) / self.scale
+        x = (2 * srgb_encoded(light) - 1 - self.get_buffer("shift")) / self.get_buffer("scale")
         result = []
         for stage, (*_, stride, padding, pooled) in enumerate(CONVOLUTIONS):
             x = F.max_pool2d(x, 3, stride=2) if pooled else x
