@@ -1,4 +1,4 @@
-"""The command line: python -m holod_training {train,compare,evaluate,export,golden}."""
+"""The command line: python -m holod_training {train,compare,evaluate,eyebox,export,golden}."""
 
 from __future__ import annotations
 
@@ -76,6 +76,13 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--out", required=True)
     evaluate.add_argument("--limit", type=int, help="only so many scenes")
     evaluate.set_defaults(run=_evaluate)
+
+    eyebox = command("eyebox", "Shows where the light is in the pupil's plane, and how far an eye may move")
+    eyebox.add_argument("--weights", required=True)
+    eyebox.add_argument("--test", required=True, help="folder of held-out scenes")
+    eyebox.add_argument("--out", required=True)
+    eyebox.add_argument("--limit", type=int, help="only so many scenes")
+    eyebox.set_defaults(run=_eyebox)
 
     export = command("export", "Writes a weights file from a checkpoint or another weights file")
     export.add_argument(
@@ -177,6 +184,12 @@ def _evaluate(options: argparse.Namespace) -> None:
         markdown(evaluate(Path(options.weights), Path(options.test), cards, Path(options.out), limit=options.limit)),
         end="",
     )
+
+
+def _eyebox(options: argparse.Namespace) -> None:
+    from holod_training.eyebox import write_eyebox
+
+    print(write_eyebox(Path(options.weights), Path(options.test), Path(options.out), options.limit), end="")
 
 
 def _export(options: argparse.Namespace) -> None:

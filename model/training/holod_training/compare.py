@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 import statistics
 import time
 from pathlib import Path
@@ -136,6 +137,8 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
     """
     if not base.validation:
         raise ConfigError("validation: found no folder of held-out scenes; variants are compared on them")
+    if os.environ.get("WORLD_SIZE", "1") != "1":
+        raise ConfigError("WORLD_SIZE: found several processes; variants are compared by one, run it without torchrun")
     if not seconds > 0:
         raise ConfigError(f"minutes: found {seconds / 60}, expected more than 0")
     networks = {name: variant(name) for name in names}

@@ -45,12 +45,15 @@ def test_variants_compete_for_the_same_time(shards: Path, tmp_path: Path, capsys
     assert again[0] == small and again[1]["variant"] == "half-band-blur-input"
 
 
-def test_comparison_says_what_is_missing(shards: Path, tmp_path: Path) -> None:
+def test_comparison_says_what_is_missing(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = TrainConfig(str(shards), str(tmp_path / "out"), 0)
     with pytest.raises(ConfigError, match="validation: found no folder"):
         compare(config, ["half-band-8"], 1, CPU)
     with pytest.raises(ConfigError, match="variant: found 'half'"):
         compare(TrainConfig(str(shards), str(tmp_path), 0, validation=str(shards)), ["half"], 1, CPU)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(ConfigError, match="WORLD_SIZE: found several processes"):
+        compare(TrainConfig(str(shards), str(tmp_path), 0, validation=str(shards)), ["half-band-8"], 1, CPU)
 
 
 def test_operations_are_counted() -> None:
