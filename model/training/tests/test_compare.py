@@ -3,11 +3,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from holod_training.cli import main
 from holod_training.compare import compare, judge_held_out, operations_per_pixel
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
-from holod_training.curves import PANELS, held_out
+from holod_training.curves import plot_curves
 from holod_training.network import DirectNetwork
 from holod_training.shards import open_shards
 from holod_training.train import TrainConfig
@@ -73,11 +74,22 @@ def test_held_out_numbers_are_those_after_double_phase(shards: Path) -> None:
     assert judge_held_out(network, scenes, 8)["2.0"]["psnr_db"] < fair - 3
 
 
-def test_curves_draw_the_five_numbers_and_skip_what_old_rows_lack() -> None:
-    assert {"psnr_db", "psnr_in_focus_db", "psnr_out_of_focus_db", "slope", "correlation"} < {k for k, _ in PANELS}
+def test_curves_draw_the_five_numbers_and_skip_what_old_rows_lack(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    five = {"psnr_db": 21, "psnr_in_focus_db": 22, "psnr_out_of_focus_db": 23, "slope": 0.4, "correlation": 0.5}
     rows = [
-        {"step": 1, "pupils": {"2.0": {"psnr_db": 20.0}}},
-        {"step": 2, "pupils": {"2.0": {"psnr_db": 21.0, "flat_oracle_db": 25.0}}},
+        {"kind": "validation", "step": 1, "pupils": {"2.0": {"psnr_db": 20}}},
+        {"kind": "validation", "step": 2, "pupils": {"2.0": {**five, "flat_oracle_db": 25}}},
     ]
-    assert held_out(rows, "2.0", "psnr_db") == ([1, 2], [20.0, 21.0])
-    assert held_out(rows, "2.0", "flat_oracle_db") == ([2], [25.0])
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    drawn: list[list[tuple[list[float], list[float]]]] = []
+
+    def keep(figure: Figure, path: Path, **_: object) -> None:
+        drawn.extend([(list(li.get_xdata()), list(li.get_ydata())) for li in ax.lines] for ax in figure.axes)
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    plot_curves(tmp_path)
+    later = [[([2], [value])] for key, value in five.items() if key != "psnr_db"]
+    assert drawn == [[], [([1, 2], [20, 21]), ([2], [25])], *later]
