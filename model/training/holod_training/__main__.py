@@ -1,4 +1,4 @@
-"""python -m holod_training {train,evaluate,export,golden}"""
+"""python -m holod_training {train,compare,evaluate,eyebox,export,golden}"""
 
 from __future__ import annotations
 

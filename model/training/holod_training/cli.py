@@ -1,19 +1,24 @@
-"""The command line: python -m holod_training {train,evaluate,eyebox,export,golden}."""
+"""The command line: python -m holod_training {train,compare,evaluate,eyebox,export,golden}."""
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 
-from holod_training.config import ConfigError, NetworkConfig
+from holod_training.config import CONDITIONINGS, ConfigError, NetworkConfig
 from holod_training.export import WeightsError
 from holod_training.loss import LossWeights
+from holod_training.sampling import AugmentConfig
 from holod_training.shards import ShardError
-from holod_training.train import TrainConfig, TrainingError
+from holod_training.train import PRECISIONS, TrainConfig, TrainingError, train
+from holod_training.variants import DEFAULT_VARIANT, VARIANTS, variant
 
 EX_DATAERR = 65
 
@@ -49,32 +54,21 @@ def _parser() -> argparse.ArgumentParser:
         sub.add_argument("--threads", type=int, default=0, help="CPU threads; 0 leaves torch's own choice")
         return sub
 
-    train = command("train", "Trains a network on shards; run under torchrun for several processes")
-    train.add_argument("--shards", required=True, help="folder of training scenes; may grow while training")
-    train.add_argument("--validation", help="folder of held-out scenes")
-    train.add_argument("--out", required=True, help="run folder")
-    train.add_argument("--steps", type=int, required=True)
-    train.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
-    train.add_argument("--initial-weights", help="start from a weights file instead of random numbers")
-    defaults, loss = TrainConfig("", "", 0), LossWeights()
-    train.add_argument("--crop", type=int, default=defaults.crop)
-    train.add_argument("--border-px", type=int, default=defaults.border_px, help="left out of the loss on every side")
-    train.add_argument("--batch", type=int, default=defaults.batch, help="crops per process and step")
-    train.add_argument("--learning-rate", type=float, default=defaults.learning_rate)
-    train.add_argument("--warm-up-steps", type=int, default=defaults.warm_up_steps)
-    train.add_argument("--seed", type=int, default=defaults.seed)
-    train.add_argument("--layers", type=int, default=14)
-    train.add_argument("--channels", type=int, default=32)
-    train.add_argument("--grid", choices=("half-band", "full"), default="half-band")
-    train.add_argument("--absolute-weight", type=float, default=loss.absolute)
-    train.add_argument("--gradient-weight", type=float, default=loss.gradient)
-    train.add_argument("--squared-weight", type=float, default=loss.squared)
-    train.add_argument("--focus-weight", type=float, default=loss.focus)
-    train.add_argument("--in-focus-weight", type=float, default=loss.in_focus)
-    train.add_argument("--coc-floor-px", type=float, default=loss.coc_floor_px)
-    train.add_argument("--validate-every", type=int, default=defaults.validate_every)
-    train.add_argument("--stop-below-slope", type=float, default=defaults.stop_below_slope)
-    train.set_defaults(run=_train)
+    training = command("train", "Trains a network on shards; run under torchrun for several processes")
+    _training_options(training)
+    training.add_argument("--steps", type=int, required=True)
+    training.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
+    training.add_argument("--initial-weights", help="start from a weights file instead of random numbers")
+    training.add_argument("--stop-below-slope", type=float, default=TrainConfig("", "", 0).stop_below_slope)
+    _network_options(training)
+    training.set_defaults(run=_train)
+
+    comparison = command("compare", "Trains several variants for the same time each and judges them in one table")
+    _training_options(comparison)
+    comparison.add_argument("--variants", required=True, help=f"commas between: {', '.join(VARIANTS)}")
+    comparison.add_argument("--minutes", type=float, required=True, help="training time of each variant")
+    comparison.set_defaults(run=_compare)
+
     evaluate = command("evaluate", "Judges a weights file on held-out scenes and cards, beside its rivals")
     evaluate.add_argument("--weights", required=True)
     evaluate.add_argument("--test", required=True, help="folder of held-out scenes with pupils 1,2,3,4,5")
@@ -105,6 +99,80 @@ def _parser() -> argparse.ArgumentParser:
     golden.add_argument("--seed", type=int, default=20)
     golden.set_defaults(run=_golden)
     return parser
+
+
+def _training_options(sub: argparse.ArgumentParser) -> None:
+    defaults, loss = TrainConfig("", "", 0), LossWeights()
+    sub.add_argument("--shards", required=True, help="folder of training scenes; may grow while training")
+    sub.add_argument("--validation", help="folder of held-out scenes")
+    sub.add_argument("--out", required=True, help="run folder")
+    sub.add_argument("--crop", type=int, default=defaults.crop)
+    sub.add_argument("--border-px", type=int, default=defaults.border_px, help="left out of the loss on every side")
+    sub.add_argument("--validation-border-px", type=int, default=defaults.validation_border_px)
+    sub.add_argument("--batch", type=int, default=defaults.batch, help="crops per process and step")
+    sub.add_argument("--learning-rate", type=float, default=defaults.learning_rate)
+    sub.add_argument("--warm-up-steps", type=int, default=defaults.warm_up_steps)
+    sub.add_argument("--seed", type=int, default=defaults.seed)
+    sub.add_argument("--precision", choices=PRECISIONS, default=defaults.precision, help="of convolutions in training")
+    sub.add_argument("--teacher", help="weights file whose pictures the loss compares too")
+    sub.add_argument("--lpips-backbone", help="torchvision's AlexNet state dict; with it LPIPS is a term of the loss")
+    sub.add_argument("--lpips-linear", help="the authors' linear layers, lin0.model.1.weight and so on")
+    sub.add_argument("--validate-every", type=int, default=defaults.validate_every)
+    sub.add_argument("--validation-scenes", type=int, default=defaults.validation_scenes)
+    sub.add_argument(
+        "--faulty-depth", type=float, default=defaults.augment.faulty_depth, help="chance of a poor camera's depth"
+    )
+    for term in dataclasses.fields(LossWeights):
+        sub.add_argument(_option_of(term.name), dest=f"loss_{term.name}", type=float, default=getattr(loss, term.name))
+
+
+def _option_of(loss_key: str) -> str:
+    return f"--{loss_key.replace('_', '-')}" + ("" if loss_key.endswith("_px") else "-weight")
+
+
+def _numbers(kind: Callable[[str], float]) -> Callable[[str], tuple[float, ...]]:
+    return lambda text: tuple(kind(part) for part in text.split(",") if part)
+
+
+def _network_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--variant", choices=VARIANTS, default=DEFAULT_VARIANT, help="what the options below change")
+    sub.add_argument("--layers", type=int, help="the adjustable layer moves to the middle unless it is named too")
+    sub.add_argument("--channels", type=int)
+    sub.add_argument("--grid", choices=("half-band", "full"))
+    sub.add_argument("--adjustable-layers", type=_numbers(int), metavar="I,I,..")
+    sub.add_argument("--dilations", type=_numbers(int), metavar="D,D,..", help="one for each layer")
+    sub.add_argument("--conditioning", choices=CONDITIONINGS)
+    sub.add_argument("--pupil-inputs", action=argparse.BooleanOptionalAction)
+    sub.add_argument("--blur-input", action=argparse.BooleanOptionalAction)
+    sub.add_argument("--frames", type=int)
+    sub.add_argument("--specialists-mm", type=_numbers(float), metavar="MM,MM,..")
+    sub.add_argument("--depth-layers", type=int)
+    sub.add_argument("--transport-prior", action=argparse.BooleanOptionalAction)
+    sub.add_argument("--planes", type=int)
+
+
+def _network(options: argparse.Namespace) -> NetworkConfig:
+    base = variant(options.variant)
+    named = {f.name: getattr(options, f.name, None) for f in dataclasses.fields(NetworkConfig)}
+    changes = {key: value for key, value in named.items() if value is not None}
+    if "layers" in changes and base.adjustable_layers:
+        changes.setdefault("adjustable_layers", (options.layers // 2,))
+    return dataclasses.replace(base, **changes)
+
+
+def _train_config(options: argparse.Namespace, **changes: Any) -> TrainConfig:
+    values = {f.name: getattr(options, f.name) for f in dataclasses.fields(TrainConfig) if hasattr(options, f.name)}
+    loss = LossWeights(**{f.name: getattr(options, f"loss_{f.name}") for f in dataclasses.fields(LossWeights)})
+    return TrainConfig(
+        **{**values, "loss": loss, "augment": AugmentConfig(faulty_depth=options.faulty_depth), **changes}
+    )
+
+
+def _compare(options: argparse.Namespace) -> None:
+    from holod_training.compare import compare
+
+    names = [name for name in options.variants.split(",") if name]
+    print(compare(_train_config(options, steps=0), names, 60 * options.minutes, choose_device(options.device)), end="")
 
 
 def _evaluate(options: argparse.Namespace) -> None:
@@ -140,35 +208,4 @@ def _golden(options: argparse.Namespace) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
-    from holod_training.train import train
-
-    config = TrainConfig(
-        shards=options.shards,
-        out=options.out,
-        steps=options.steps,
-        validation=options.validation,
-        network=NetworkConfig(
-            grid=options.grid,
-            layers=options.layers,
-            channels=options.channels,
-            adjustable_layers=(options.layers // 2,),
-        ),
-        loss=LossWeights(
-            absolute=options.absolute_weight,
-            gradient=options.gradient_weight,
-            squared=options.squared_weight,
-            focus=options.focus_weight,
-            coc_floor_px=options.coc_floor_px,
-            in_focus=options.in_focus_weight,
-        ),
-        crop=options.crop,
-        border_px=options.border_px,
-        batch=options.batch,
-        learning_rate=options.learning_rate,
-        warm_up_steps=options.warm_up_steps,
-        seed=options.seed,
-        validate_every=options.validate_every,
-        stop_below_slope=options.stop_below_slope,
-        initial_weights=options.initial_weights,
-    )
-    print(train(config, choose_device(options.device), options.resume))
+    print(train(_train_config(options, network=_network(options)), choose_device(options.device), options.resume))

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 WEIGHTS_FORMAT = "holod-weights-1"
+ARCHITECTURES = ("direct", "layered", "focal-stack")
+CONDITIONINGS = ("adjustable", "deformable", "modulated")
 
 
 class ConfigError(ValueError):
@@ -48,9 +50,18 @@ class OpticsConfig:
         return self.depth_far_dpt + normalised * (self.depth_near_dpt - self.depth_far_dpt)
 
 
+def _optional(default: Any) -> Any:
+    """A key that a weights file carries only where it differs from the default: readers that do not know it keep on."""
+    return field(default=default, metadata={"optional": True})
+
+
 @dataclass(frozen=True)
 class NetworkConfig:
-    """The `direct` family; `model/weights` carries this as JSON under the key `config`."""
+    """One network; `model/weights` carries this as JSON under the key `config`. `variants.py` has a table of them.
+
+    direct: field at the SLM plane from amplitude and depth. layered: light on the objects' surfaces, carried by
+    physics. focal-stack: phases and masks for `planes` images, uniform in dioptres, carried back and summed.
+    """
 
     architecture: str = "direct"
     version: int = 1
@@ -63,24 +74,68 @@ class NetworkConfig:
     optics: OpticsConfig = field(default_factory=OpticsConfig)
     pupil_range_mm: tuple[float, float] = (1.0, 5.0)
     amplitude_constant: float = 1.4
+    # One for each layer; none stands for all 1.
+    dilations: tuple[int, ...] = _optional(())
+    # What stands at `adjustable_layers`: the ADC, a deformable layer or a modulated one.
+    conditioning: str = _optional("adjustable")
+    # Whether s and s·(D − ½) are inputs.
+    pupil_inputs: bool = _optional(True)
+    # Whether the mean CoC over all focuses is an input (`direct` only).
+    blur_input: bool = _optional(False)
+    # Time-multiplexed frames, whose intensities the eye averages (`direct` only).
+    frames: int = _optional(1)
+    # One whole network for each of these pupils, the nearest serves; none stands for one network for all.
+    specialists_mm: tuple[float, ...] = _optional(())
+    depth_layers: int = _optional(8)
+    transport_prior: bool = _optional(True)
+    planes: int = _optional(6)
 
     def __post_init__(self) -> None:
-        if self.architecture != "direct":
-            raise ConfigError(f"architecture: found {self.architecture!r}, this trainer builds 'direct'")
-        if self.version != 1:
-            raise ConfigError(f"version: found {self.version}, this trainer builds version 1")
-        if self.grid not in ("half-band", "full"):
-            raise ConfigError(f"grid: found {self.grid!r}, expected 'half-band' or 'full'")
-        if self.layers < 4 or self.layers % 2:
-            raise ConfigError(f"layers: found {self.layers}, expected an even number of at least 4")
+        self._require("architecture", self.architecture in ARCHITECTURES, f"one of {', '.join(ARCHITECTURES)}")
+        self._require("version", self.version == 1, "version 1, which this trainer builds")
+        self._require("grid", self.grid in ("half-band", "full"), "'half-band' or 'full'")
+        self._require("layers", self.layers >= 4 and self.layers % 2 == 0, "an even number of at least 4")
+        self._require("channels", self.channels >= 1, "at least 1")
         for index in self.adjustable_layers:
             if not 1 <= index <= self.layers - 2:
                 raise ConfigError(
                     f"adjustable_layers: found {index}, expected layers of the body, 1 to {self.layers - 2}"
                 )
+        known = f"one of {', '.join(CONDITIONINGS)}"
+        self._require("conditioning", self.conditioning in CONDITIONINGS, known)
+        self._require(
+            "dilations",
+            len(self.dilations) in (0, self.layers) and all(d >= 1 for d in self.dilations),
+            f"none, or {self.layers} numbers of at least 1, one for each layer",
+        )
+        self._require(
+            "dilations",
+            not self.dilations or all(self.dilations[i] == 1 for i in self.adjustable_layers),
+            f"1 at the adjustable layers {self.adjustable_layers}",
+        )
+        direct = self.architecture == "direct"
+        self._require("frames", self.frames >= 1 and (direct or self.frames == 1), "1; `direct` may have more")
+        self._require("blur_input", direct or not self.blur_input, "false; only `direct` can have it")
+        self._require("pupil_inputs", self.architecture != "layered" or self.pupil_inputs, "true for `layered`")
+        self._require("grid", self.architecture != "layered" or self.grid == "full", "'full' for `layered`")
+        self._require("depth_layers", self.depth_layers >= 2, "at least 2")
+        self._require("planes", self.planes >= 2, "at least 2")
+        self._require(
+            "specialists_mm",
+            all(a < b for a, b in zip(self.specialists_mm, self.specialists_mm[1:], strict=False)),
+            "pupils in rising order",
+        )
+
+    def _require(self, key: str, met: bool, expected: str) -> None:
+        if not met:
+            raise ConfigError(f"{key}: found {getattr(self, key)!r}, expected {expected}")
 
     def to_json(self) -> str:
-        return json.dumps(dataclasses.asdict(self))
+        values = dataclasses.asdict(self)
+        for f in dataclasses.fields(self):
+            if f.metadata.get("optional") and getattr(self, f.name) == f.default:
+                del values[f.name]
+        return json.dumps(values)
 
     @classmethod
     def from_json(cls, text: str) -> NetworkConfig:
@@ -98,7 +153,8 @@ def _checked(cls: type, found: Any, where: str) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise ConfigError(f"{where}: found {type(found).__name__}, expected an object")
     expected = {f.name for f in dataclasses.fields(cls)}
-    if missing := sorted(expected - found.keys()):
+    optional = {f.name for f in dataclasses.fields(cls) if f.metadata.get("optional")}
+    if missing := sorted(expected - optional - found.keys()):
         raise ConfigError(f"{where}: keys missing: {', '.join(missing)}")
     if unknown := sorted(found.keys() - expected):
         raise ConfigError(f"{where}: unknown keys: {', '.join(unknown)}")

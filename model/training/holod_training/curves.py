@@ -6,13 +6,28 @@ import json
 from pathlib import Path
 from typing import Any
 
+PANELS = (
+    ("loss", "loss"),
+    ("psnr_db", "PSNR, dB (dotted: flat oracle)"),
+    ("psnr_in_focus_db", "PSNR in focus, dB"),
+    ("psnr_out_of_focus_db", "PSNR out of focus, dB"),
+    ("slope", "focus slope"),
+    ("correlation", "focus correlation"),
+)
+
 
 def read_rows(run: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
 
 
+def held_out(rows: list[dict[str, Any]], pupil: str, key: str) -> tuple[list[int], list[float]]:
+    """Steps and values of one number, where the run has it."""
+    found = [(r["step"], r["pupils"][pupil][key]) for r in rows if key in r["pupils"].get(pupil, {})]
+    return [step for step, _ in found], [value for _, value in found]
+
+
 def plot_curves(run: Path) -> Path:
-    """Loss, PSNR, slope and correlation against steps, into curves.png."""
+    """Loss and the five numbers against steps, into curves.png; beside PSNR what the flat oracle scores."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -21,29 +36,25 @@ def plot_curves(run: Path) -> Path:
     rows = read_rows(run)
     trained = [r for r in rows if r["kind"] == "train"]
     judged = [r for r in rows if r["kind"] == "validation" and r["pupils"]]
-    figure, axes = plt.subplots(2, 2, figsize=(11, 7), constrained_layout=True)
-    panels = (
-        ("loss", None),
-        ("psnr_db", "PSNR, dB"),
-        ("slope", "focus slope"),
-        ("correlation", "focus correlation"),
-    )
-    for ax, (key, label) in zip(axes.flat, panels, strict=True):
-        ax.plot([r["step"] for r in trained], [r[key] for r in trained], lw=0.6, alpha=0.5, label="training")
-        if label:
-            for pupil in judged[0]["pupils"] if judged else ():
-                ax.plot(
-                    [r["step"] for r in judged],
-                    [r["pupils"][pupil][key] for r in judged],
-                    label=f"held out, {pupil} mm",
-                )
-        else:
+    pupils = list(judged[-1]["pupils"]) if judged else []
+    figure, axes = plt.subplots(2, 3, figsize=(15, 7), constrained_layout=True)
+    for ax, (key, title) in zip(axes.flat, PANELS, strict=True):
+        if trained and key in trained[0]:
+            ax.plot([r["step"] for r in trained], [r[key] for r in trained], lw=0.6, alpha=0.5, label="training")
+        if key == "loss":
             ax.set_yscale("log")
-        ax.set_title(label or "loss")
+        else:
+            for index, pupil in enumerate(pupils):
+                ax.plot(*held_out(judged, pupil, key), color=f"C{index + 1}", label=f"held out, {pupil} mm")
+        if key == "psnr_db":
+            for index, pupil in enumerate(pupils):
+                ax.plot(*held_out(judged, pupil, "flat_oracle_db"), color=f"C{index + 1}", ls=":")
+        ax.set_title(title)
         ax.set_xlabel("step")
         ax.grid(alpha=0.3)
-        ax.legend(fontsize=7)
-    path = run / "curves.png"
-    figure.savefig(path, dpi=80)
+        if ax.lines:
+            ax.legend(fontsize=7)
+    part = run / ".curves.png.part"
+    figure.savefig(part, dpi=80, format="png")
     plt.close(figure)
-    return path
+    return part.replace(run / "curves.png")

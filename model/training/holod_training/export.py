@@ -14,7 +14,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from holod_training.config import WEIGHTS_FORMAT, ConfigError, NetworkConfig
-from holod_training.network import DirectNetwork
+from holod_training.network import FieldNetwork
+from holod_training.variants import build_network
 
 
 class WeightsError(ValueError):
@@ -29,7 +30,7 @@ def write_beside(path: Path, content: bytes) -> None:
     part.replace(path)
 
 
-def save_weights(path: Path, network: DirectNetwork, metrics: dict[str, Any], provenance: dict[str, Any]) -> None:
+def save_weights(path: Path, network: FieldNetwork, metrics: dict[str, Any], provenance: dict[str, Any]) -> None:
     tensors = {name: value.detach().float().cpu().contiguous() for name, value in network.state_dict().items()}
     metadata = {
         "format": WEIGHTS_FORMAT,
@@ -59,9 +60,9 @@ def read_metadata(path: Path) -> dict[str, Any]:
         raise WeightsError(f"{path}: {error}") from error
 
 
-def load_weights(path: Path) -> DirectNetwork:
+def load_weights(path: Path) -> FieldNetwork:
     """The network in a weights file, on the CPU. Raises WeightsError for a missing, extra or ill-shaped tensor."""
-    network = DirectNetwork(read_metadata(path)["config"])
+    network = build_network(read_metadata(path)["config"])
     expected = network.state_dict()
     with safe_open(path, framework="pt") as file:
         found = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -94,11 +95,11 @@ def export(source: Path, out: Path, amplitude_constant: float | None, evaluation
     return out
 
 
-def _from_checkpoint(source: Path) -> tuple[DirectNetwork, dict[str, Any], dict[str, Any]]:
+def _from_checkpoint(source: Path) -> tuple[FieldNetwork, dict[str, Any], dict[str, Any]]:
     try:
         state = torch.load(source, map_location="cpu", weights_only=True)
         run = json.loads(state["config"])
-        network = DirectNetwork(NetworkConfig.from_json(json.dumps(run["network"])))
+        network = build_network(NetworkConfig.from_json(json.dumps(run["network"])))
         network.load_state_dict(state["average"])
         provenance = state["provenance"]
     except (OSError, RuntimeError, KeyError, ValueError, pickle.UnpicklingError) as error:

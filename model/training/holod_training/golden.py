@@ -15,7 +15,7 @@ from torch import Tensor
 
 from holod_training.config import NetworkConfig
 from holod_training.export import load_weights, save_weights, write_beside
-from holod_training.network import AdjustableLayer, DirectNetwork
+from holod_training.network import AdjustableLayer, DirectNetwork, FieldNetwork
 from holod_training.optics import (
     Eye,
     double_phase,
@@ -37,8 +37,8 @@ def narrow_network(grid: str, seed: int) -> DirectNetwork:
     with torch.no_grad():
         for layer in network.layers:
             if isinstance(layer, AdjustableLayer):
-                layer.offset.weight.mul_(6)
-                layer.offset.bias.uniform_(-1.5, 1.5)
+                layer.offset.get_parameter("weight").mul_(6)
+                layer.offset.get_parameter("bias").uniform_(-1.5, 1.5)
                 layer.modulation.get_parameter("2.bias").uniform_(-0.3, 0.3)
         network.get_parameter(f"layers.{network.config.layers - 1}.weight").mul_(6)
     return network
@@ -64,7 +64,7 @@ def complex_parts(field: Tensor) -> Tensor:
 
 @torch.no_grad()
 def vectors(
-    network: DirectNetwork, amplitude: Tensor, depth: Tensor, pupil_mm: float, layers: tuple[int, ...] | None
+    network: FieldNetwork, amplitude: Tensor, depth: Tensor, pupil_mm: float, layers: tuple[int, ...] | None
 ) -> dict[str, Tensor]:
     """Every stage's answer, float64. `layers`, where given, are the only ones whose maps are kept."""
     config = network.config

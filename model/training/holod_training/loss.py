@@ -1,30 +1,46 @@
-"""The training loss: the paper's two terms, plain and in-focus squared errors, and a squared focus error."""
+"""The training loss: the paper's terms, plain and in-focus squared errors, focus errors, and a teacher's pictures."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 IN_FOCUS_PX = 2.0
+PERCEPTUAL_PLANES = 5
+STRUCTURE_SCALES = 3
+WINDOW_PX = 8
 
 
 @dataclass(frozen=True)
 class LossWeights:
+    """The weight of each term, and the CoC below which sharpness counts no more.
+
+    `absolute` and `gradient` are the paper's: |P − R| and |∇P − ∇R| weighted by W; so is a perceptual error of some
+    planes: `lpips` where a run has its weights, `structure` needs none. `teacher` counts only where there is one.
+    """
+
     absolute: float = 1.0
     gradient: float = 1.0
     squared: float = 8.0
     focus: float = 15.0
     coc_floor_px: float = 0.2
     in_focus: float = 0.0
+    focus_absolute: float = 0.0
+    structure: float = 0.0
+    lpips: float = 1.0
+    teacher: float = 8.0
 
 
 @dataclass(frozen=True)
 class LossParts:
-    """`total` carries the gradient; the rest are plain numbers to log."""
+    """`total` carries the gradient; the rest are plain numbers to log. `terms` are as yet without their weights."""
 
     total: Tensor
+    terms: dict[str, float]
     psnr_db: float
     slope: float
     correlation: float
@@ -45,8 +61,47 @@ def inner(x: Tensor, border_px: int) -> Tensor:
     return x[..., border_px : x.shape[-2] - border_px, border_px : x.shape[-1] - border_px]
 
 
-def focus_loss(picture: Tensor, target: Tensor, coc_px: Tensor, weights: LossWeights) -> LossParts:
+def structure_loss(picture: Tensor, target: Tensor) -> Tensor:
+    """1 − a multi-scale structural similarity of [K, 3, H, W], peak 1; 0 for equal pictures, at most 2.
+
+    After Wang, Simoncelli and Bovik 2003: contrast and structure at every scale, luminance at the coarsest. Windows
+    are plain 8x8 squares every 4 pixels, and scales are averaged, not multiplied: that keeps gradients alive where a
+    scale fails. Scales of fewer pixels than a window are left out. Raises ValueError where not even the first fits.
+    """
+    if min(picture.shape[-2:]) < WINDOW_PX:
+        raise ValueError(f"pictures of {tuple(picture.shape[-2:])} pixels have no {WINDOW_PX}-pixel window")
+
+    def mean(t: Tensor) -> Tensor:
+        return F.avg_pool2d(t, WINDOW_PX, stride=WINDOW_PX // 2)
+
+    c1, c2 = 0.01**2, 0.03**2
+    scales: list[Tensor] = []
+    while True:
+        mp, mt = mean(picture), mean(target)
+        vp, vt = mean(picture * picture) - mp * mp, mean(target * target) - mt * mt
+        similarity = (2 * (mean(picture * target) - mp * mt) + c2) / (vp + vt + c2)
+        picture, target = F.avg_pool2d(picture, 2), F.avg_pool2d(target, 2)
+        if len(scales) + 1 == STRUCTURE_SCALES or min(picture.shape[-2:]) < WINDOW_PX:
+            luminance = (2 * mp * mt + c1) / (mp * mp + mt * mt + c1)
+            scales.append((luminance * similarity).mean())
+            return 1 - torch.stack(scales).mean()
+        scales.append(similarity.mean())
+
+
+def focus_loss(
+    picture: Tensor,
+    target: Tensor,
+    coc_px: Tensor,
+    weights: LossWeights,
+    perceptual_planes: Tensor | None = None,
+    lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
+    teacher: Tensor | None = None,
+) -> LossParts:
     """picture, target [K, 3, H, W] linear light at every focus of one pupil; coc_px [K, H, W] for these focuses.
+
+    perceptual_planes: indices of the planes for `structure` and `lpips`; all of them where left out.
+    lpips: distances [N] of pictures [N, 3, H, W] of linear light.
+    teacher [K, 3, H, W]: the pictures of another network, for in-network distillation.
 
     The focus error compares P_k − mean_k P with R_k − mean_k R *squared*: an absolute error would pull sparse
     differences to their median, zero, and the network would show one blurred picture at every depth.
@@ -59,19 +114,30 @@ def focus_loss(picture: Tensor, target: Tensor, coc_px: Tensor, weights: LossWei
     squared_error = error.square()
     squared = squared_error.mean()
     centred_error = error - error.mean(dim=0)
-    total = (
-        weights.absolute * (w * error.abs()).mean()
-        + weights.gradient * ((w[..., 1:] * dx.abs()).mean() + (w[..., 1:, :] * dy.abs()).mean())
-        + weights.squared * squared
-        + weights.focus * centred_error.square().mean()
-        + weights.in_focus * (in_focus_weight(coc_px)[:, None] * squared_error).mean()
-    )
+    terms = {
+        "absolute": (w * error.abs()).mean(),
+        "gradient": (w[..., 1:] * dx.abs()).mean() + (w[..., 1:, :] * dy.abs()).mean(),
+        "squared": squared,
+        "focus": centred_error.square().mean(),
+        "in_focus": (in_focus_weight(coc_px)[:, None] * squared_error).mean(),
+    }
+    if weights.focus_absolute:
+        terms["focus_absolute"] = centred_error.abs().mean()
+    chosen = slice(None) if perceptual_planes is None else perceptual_planes
+    if weights.structure:
+        terms["structure"] = structure_loss(picture[chosen], target[chosen])
+    if lpips is not None:
+        terms["lpips"] = lpips(picture[chosen], target[chosen]).mean()
+    if teacher is not None:
+        terms["teacher"] = (picture - teacher).square().mean()
+    total = sum((getattr(weights, name) * value for name, value in terms.items()), picture.new_zeros(()))
     with torch.no_grad():
         r = target - target.mean(dim=0)
         p = centred_error + r
         pr, rr, pp = (p * r).sum(), r.square().sum(), p.square().sum()
         return LossParts(
             total=total,
+            terms=dict(zip(terms, torch.stack(list(terms.values())).tolist(), strict=True)),
             psnr_db=float(-10 * torch.log10(squared.clamp_min(1e-12))),
             slope=float(pr / rr.clamp_min(1e-12)),
             correlation=float(pr / (pp * rr).sqrt().clamp_min(1e-12)),

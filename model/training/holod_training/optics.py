@@ -122,9 +122,12 @@ class Eye:
         self.transfer = transfer(optics, self.fx, self.fy, [optics.distance_m(d) for d in focus_dpt])
 
     def look(self, field: Tensor, pupil_mm: float) -> Tensor:
-        """field complex [3, H, W] -> linear intensity [K, 3, H, W], one picture for each focus."""
+        """field complex [3, H, W] -> linear intensity [K, 3, H, W], one picture for each focus.
+
+        Of time-multiplexed frames [F, 3, H, W] the eye sees the mean intensity.
+        """
         spectrum = torch.fft.fft2(field) * (self.stop & pupil_mask(self.optics, self.fx, self.fy, pupil_mm))
-        return intensity(torch.fft.ifft2(spectrum * self.transfer.to(field.dtype)))
+        return _seen(spectrum, self.transfer.to(field.dtype))
 
 
 class HalfBandEye:
@@ -158,11 +161,18 @@ class HalfBandEye:
         self.widest_cut_mm = 2e3 * max(radius)
 
     def look(self, low: Tensor, pupil_mm: float) -> Tensor:
-        """low complex [3, h, w] -> linear intensity [K, 3, H, W]."""
+        """low complex [3, h, w] or frames [F, 3, h, w] -> linear intensity [K, 3, H, W], as `Eye.look`."""
         spectrum = torch.fft.fftshift(torch.fft.fft2(low), dim=(-2, -1))
         if pupil_mm < self.widest_cut_mm:
             spectrum = spectrum * pupil_mask(self.optics, self.fx, self.fy, pupil_mm)
-        return intensity(torch.fft.ifft2(spectrum * self.kernel, s=self.size))
+        return _seen(spectrum, self.kernel, self.size)
+
+
+def _seen(spectrum: Tensor, kernel: Tensor, size: tuple[int, int] | None = None) -> Tensor:
+    """Mean intensity over the frames of spectrum [(F,) 3, h, w] after kernel [K, 3, h, w]."""
+    if spectrum.dim() == 3:
+        return intensity(torch.fft.ifft2(spectrum * kernel, s=size))
+    return intensity(torch.fft.ifft2(spectrum[:, None] * kernel, s=size)).mean(dim=0)
 
 
 def intensity(field: Tensor) -> Tensor:

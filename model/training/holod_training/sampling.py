@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,19 +10,24 @@ import torch
 from torch import Tensor
 
 from holod_training.config import OpticsConfig
+from holod_training.depth_faults import faulty_depth
 from holod_training.shards import Shard, ShardError, Stack, shard_names
+
+FAULTS_STREAM = 1
 
 
 @dataclass(frozen=True)
 class AugmentConfig:
     """Chances of each change. All are exact: thin-lens pictures are linear in the scene's light, pixel by pixel
-    colour included, and the bench is symmetric under flips and quarter turns. Near and far are never swapped."""
+    colour included, and the bench is symmetric under flips and quarter turns. Near and far are never swapped.
+    `faulty_depth` is the chance that the network is given the depth of a poor camera (`depth_faults.py`)."""
 
     permute_colours: float = 0.5
     desaturate: float = 0.2
     dim: float = 0.3
     invert: float = 0.1
     dimmest: float = 0.3
+    faulty_depth: float = 0.0
 
 
 def augment(stack: Stack, config: AugmentConfig, rng: np.random.Generator) -> Stack:
@@ -114,4 +119,13 @@ class Sampler:
             top = int(rng.integers(shard.height - self.crop + 1))
             left = int(rng.integers(shard.width - self.crop + 1))
             drawn.append(augment(shard.read(pupil, top, left, self.crop), self.augment_config, rng))
+        if self.augment_config.faulty_depth > 0:
+            # A generator of its own: whether faults are drawn changes nothing else of a run.
+            faults = np.random.default_rng((self.seed, self.rank, step, FAULTS_STREAM))
+            drawn = [
+                replace(stack, faulty_depth=faulty_depth(stack.depth, faults))
+                if faults.random() < self.augment_config.faulty_depth
+                else stack
+                for stack in drawn
+            ]
         return drawn

@@ -25,7 +25,8 @@ class ShardError(ValueError):
 class Stack:
     """One scene, or a crop of it, for one pupil. Linear light, 0 .. 1; float32.
 
-    image [3, H, W] all in focus; depth [H, W], 0 far .. 1 near; target [K, 3, H, W] thin-lens pictures.
+    image [3, H, W] all in focus; depth [H, W], 0 far .. 1 near; target [K, 3, H, W] thin-lens pictures;
+    faulty_depth [H, W] what a poor depth camera would give the network in place of `depth`, where that was drawn.
     """
 
     image: Tensor
@@ -33,6 +34,12 @@ class Stack:
     target: Tensor
     pupil_mm: float
     focus_dpt: tuple[float, ...]
+    faulty_depth: Tensor | None = None
+
+    @property
+    def given_depth(self) -> Tensor:
+        """What the network is given; targets and CoC go by `depth`."""
+        return self.depth if self.faulty_depth is None else self.faulty_depth
 
     @property
     def amplitude(self) -> Tensor:
@@ -45,6 +52,7 @@ class Stack:
             self.target.to(device),
             self.pupil_mm,
             self.focus_dpt,
+            None if self.faulty_depth is None else self.faulty_depth.to(device),
         )
 
 

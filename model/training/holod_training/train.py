@@ -13,10 +13,11 @@ import platform
 import sys
 import time
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
@@ -25,15 +26,20 @@ from tqdm import tqdm
 
 from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.curves import plot_curves
-from holod_training.export import save_weights, write_beside
-from holod_training.loss import LossWeights, focus_loss, inner
-from holod_training.metrics import Judgement, judge
-from holod_training.network import DirectNetwork
+from holod_training.export import load_weights, save_weights, write_beside
+from holod_training.loss import PERCEPTUAL_PLANES, LossWeights, focus_loss, inner
+from holod_training.lpips import Lpips
+from holod_training.metrics import Judgement, judge, psnr_db
+from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, HalfBandEye, coc_px
+from holod_training.rivals import flat_oracle
 from holod_training.sampling import AugmentConfig, Sampler
 from holod_training.shards import Shard, Stack, open_shards
+from holod_training.variants import build_network, network_amplitude
 
 VALIDATION_PUPILS_MM = (2.0, 3.0, 4.0)
+PRECISIONS = ("f32", "bf16")
+PERCEPTUAL_STREAM = 2
 
 
 class TrainingError(RuntimeError):
@@ -66,6 +72,13 @@ class TrainConfig:
     validation_scenes: int = 8
     stop_below_slope: float = 0.1
     initial_weights: str | None = None
+    # bf16: convolutions only; FFTs, taps of deformable layers and the loss stay f32.
+    precision: str = "f32"
+    # A weights file whose pictures the loss compares too, at weight `loss.teacher`.
+    teacher: str | None = None
+    # Files of LPIPS's weights, see `lpips.py`; both or none.
+    lpips_backbone: str | None = None
+    lpips_linear: str | None = None
 
     def learning_rate_at(self, step: int) -> float:
         """Linear warm-up, then cosine to `final_rate_share` of the peak."""
@@ -95,6 +108,11 @@ def see(config: NetworkConfig, field_: Tensor, stack: Stack, pupil_mm: float) ->
     return full_eye(config.optics, height, width, stack.focus_dpt, str(field_.device)).look(field_, pupil_mm)
 
 
+def nearest_pupil(shard: Shard, pupil_mm: float) -> Stack:
+    """The whole stack of a shard whose pupil is nearest."""
+    return shard.read(min(range(len(shard.pupils_mm)), key=lambda i: abs(shard.pupils_mm[i] - pupil_mm)))
+
+
 class Run:
     """One rank's share of a run; everything that a checkpoint holds is an attribute."""
 
@@ -106,20 +124,70 @@ class Run:
         self.step = 0
         self.seconds = 0.0
         torch.manual_seed(config.seed)
-        self.network = DirectNetwork(config.network).to(device)
+        if config.precision not in PRECISIONS:
+            raise TrainingError(f"precision: found {config.precision!r}, expected one of {', '.join(PRECISIONS)}")
+        self.network = build_network(config.network).to(device)
         if config.initial_weights:
-            from holod_training.export import load_weights
-
-            self.network.load_state_dict(load_weights(Path(config.initial_weights)).state_dict())
+            self.network.load_state_dict(self._initial_weights(Path(config.initial_weights)))
+        self.teacher = self._teacher(Path(config.teacher)) if config.teacher else None
+        self.lpips = self._lpips()
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
         self.optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
-        self.trained: nn.Module = DistributedDataParallel(self.network) if world > 1 else self.network
+        self.trained: nn.Module = self.network
+        if world > 1:
+            # A batch may have no pupil for one of the specialists.
+            unused = bool(config.network.specialists_mm)
+            self.trained = DistributedDataParallel(self.network, find_unused_parameters=unused)
         self.sampler = Sampler(
             Path(config.shards), config.network.optics, config.crop, config.seed, rank, config.augment
         )
         self.validation: list[Shard] = []
         if config.validation:
             self.validation = open_shards(Path(config.validation), config.network.optics, config.validation_scenes)
+
+    def _initial_weights(self, path: Path) -> dict[str, Tensor]:
+        found, wanted = load_weights(path).state_dict(), self.network.state_dict()
+        if {k: v.shape for k, v in found.items()} != {k: v.shape for k, v in wanted.items()}:
+            raise TrainingError(f"{path}: its network has other layers than this run's; start from the same variant")
+        return found
+
+    def _teacher(self, path: Path) -> FieldNetwork:
+        teacher = load_weights(path).to(self.device).requires_grad_(False)
+        if teacher.config.optics != self.config.network.optics:
+            raise TrainingError(f"{path}: the teacher was trained for other optics than this run's")
+        return teacher
+
+    def _lpips(self) -> Lpips | None:
+        backbone, linear = self.config.lpips_backbone, self.config.lpips_linear
+        if backbone and linear:
+            return Lpips(Path(backbone), Path(linear)).to(self.device)
+        if backbone or linear:
+            raise TrainingError("LPIPS: found one of its two weights files, expected backbone and linear, or neither")
+        return None
+
+    def _fields(self, network: nn.Module, config: NetworkConfig, stacks: list[Stack], depths: list[Tensor]) -> Tensor:
+        pupils = torch.tensor([s.pupil_mm for s in stacks], device=self.device)
+        amplitudes = torch.stack([network_amplitude(config, s) for s in stacks])
+        return network(amplitudes, torch.stack(depths), pupils)
+
+    def _precision(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16")
+
+    def _taught(self, stacks: list[Stack]) -> list[Tensor] | None:
+        """The teacher's pictures; it is given the true depth."""
+        if self.teacher is None:
+            return None
+        config = self.teacher.config
+        with torch.no_grad(), self._precision():
+            fields = self._fields(self.teacher, config, stacks, [s.depth for s in stacks])
+        with torch.no_grad():
+            return [see(config, f, stack, stack.pupil_mm) for f, stack in zip(fields, stacks, strict=True)]
+
+    def _perceptual_planes(self, stacks: list[Stack]) -> list[Tensor]:
+        """Five random planes of each stack."""
+        rng = np.random.default_rng((self.config.seed, self.rank, self.step, PERCEPTUAL_STREAM))
+        counts = [len(s.focus_dpt) for s in stacks]
+        return [torch.from_numpy(rng.permutation(count)[:PERCEPTUAL_PLANES]).to(self.device) for count in counts]
 
     def train_step(self) -> dict[str, float]:
         config = self.config
@@ -129,17 +197,25 @@ class Run:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         stacks = [s.to(self.device) for s in self.sampler.draw(self.step, config.batch)]
-        pupils = torch.tensor([s.pupil_mm for s in stacks], device=self.device)
-        fields = self.trained(
-            torch.stack([s.amplitude for s in stacks]), torch.stack([s.depth for s in stacks]), pupils
-        )
+        with self._precision():
+            fields = self._fields(self.trained, config.network, stacks, [s.given_depth for s in stacks])
+        taught = self._taught(stacks)
+        perceptual_planes = self._perceptual_planes(stacks)
         parts = []
-        for low, stack in zip(fields, stacks, strict=True):
+        for index, (low, stack) in enumerate(zip(fields, stacks, strict=True)):
             border = config.border_px
             picture = see(config.network, low, stack, stack.pupil_mm)
             blur = coc_px(config.network.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
             parts.append(
-                focus_loss(inner(picture, border), inner(stack.target, border), inner(blur, border), config.loss)
+                focus_loss(
+                    inner(picture, border),
+                    inner(stack.target, border),
+                    inner(blur, border),
+                    config.loss,
+                    perceptual_planes[index],
+                    self.lpips,
+                    inner(taught[index], border) if taught else None,
+                )
             )
         loss = torch.stack([p.total for p in parts]).mean()
         if not torch.isfinite(loss):
@@ -157,6 +233,7 @@ class Run:
             "slope": sum(p.slope for p in parts) / n,
             "correlation": sum(p.correlation for p in parts) / n,
             "gradient_norm": float(norm),
+            **{f"loss_{name}": sum(p.terms[name] for p in parts) / n for name in parts[0].terms},
         }
 
     @torch.no_grad()
@@ -167,23 +244,31 @@ class Run:
 
     @torch.no_grad()
     def validate(self) -> dict[str, dict[str, float]]:
-        """The averaged weights on held-out scenes, before double phase: {"2.0": {psnr_db: ...}, ...}."""
+        """The averaged weights on held-out scenes, before double phase: {"2.0": {psnr_db: ..., flat_oracle_db: ..}}."""
         result = {}
         for wanted in VALIDATION_PUPILS_MM:
             judged = []
             for shard in self.validation:
-                index = min(range(len(shard.pupils_mm)), key=lambda i: abs(shard.pupils_mm[i] - wanted))
-                stack = shard.read(index).to(self.device)
-                low = self.average(
-                    stack.amplitude[None],
-                    stack.depth[None],
-                    torch.tensor([stack.pupil_mm], device=self.device),
-                )[0]
+                stack = nearest_pupil(shard, wanted).to(self.device)
+                low = self._fields(self.average, self.config.network, [stack], [stack.depth])[0]
                 picture = see(self.config.network, low, stack, stack.pupil_mm)
                 blur = coc_px(self.config.network.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
                 judged.append(judge(picture, stack.target, blur, self.config.validation_border_px, with_ssim=False))
-            result[str(wanted)] = Judgement.mean(judged).known()
+            result[str(wanted)] = Judgement.mean(judged).known() | self.flat_oracle_db.get(str(wanted), {})
         return result
+
+    @cached_property
+    def flat_oracle_db(self) -> dict[str, dict[str, float]]:
+        """What the one picture scores that is shown at every focus, on the same scenes."""
+        border = self.config.validation_border_px
+
+        def score(stack: Stack) -> float:
+            return psnr_db(inner(flat_oracle(stack.target) - stack.target, border).square())
+
+        scores = {
+            pupil: [score(nearest_pupil(shard, pupil)) for shard in self.validation] for pupil in VALIDATION_PUPILS_MM
+        }
+        return {str(p): {"flat_oracle_db": sum(of) / len(of)} for p, of in scores.items() if of}
 
     def state(self) -> dict[str, Any]:
         return {

@@ -53,6 +53,12 @@ def write_shard(
 
 
 @pytest.fixture
+def no_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing curves costs more than training a tiny run does."""
+    monkeypatch.setattr("holod_training.train.plot_curves", lambda run: run)
+
+
+@pytest.fixture
 def shards(tmp_path: Path) -> Path:
     folder = tmp_path / "shards"
     for index in range(2):

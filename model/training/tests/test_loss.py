@@ -1,7 +1,10 @@
 import pytest
 import torch
 
-from holod_training.loss import LossWeights, focus_loss, in_focus_weight, inner, sharpness_weight
+from holod_training.loss import LossWeights, focus_loss, in_focus_weight, inner, sharpness_weight, structure_loss
+
+TERMS = ("absolute", "gradient", "squared", "focus", "in_focus", "focus_absolute", "structure", "teacher")
+NONE = {name: 0.0 for name in TERMS}
 
 
 def stack(seed: int) -> torch.Tensor:
@@ -21,6 +24,52 @@ def test_gradient_agrees_with_finite_differences() -> None:
     target = stack(1)[:2, :, :5, :4]
     picture = stack(2)[:2, :, :5, :4].requires_grad_()
     assert torch.autograd.gradcheck(lambda p: focus_loss(p, target, COC[:2, :5, :4], LossWeights()).total, picture)
+
+
+@pytest.mark.parametrize("term", TERMS)
+def test_each_term_alone_is_zero_at_the_target_positive_elsewhere_and_has_the_gradient(term: str) -> None:
+    weights = LossWeights(**{**NONE, term: 2.0})
+    target, picture = stack(1), stack(2)
+    away = focus_loss(picture, target, COC, weights, teacher=target)
+    assert focus_loss(target, target, COC, weights, teacher=target).total == pytest.approx(0, abs=1e-12)
+    assert away.total > 0.01
+    assert away.total.item() == pytest.approx(2 * away.terms[term])
+    small = stack(2)[:2, :1, :8, :8].clone().requires_grad_()
+    shown = target[:2, :1, :8, :8]
+    assert torch.autograd.gradcheck(
+        lambda p: focus_loss(p, shown, COC[:2, :8, :8], weights, teacher=shown).total, small
+    )
+
+
+def test_every_term_is_logged_and_the_total_is_their_weighted_sum() -> None:
+    weights = LossWeights(**{name: 0.5 + index for index, name in enumerate(TERMS)})
+    parts = focus_loss(stack(2), stack(1), COC, weights, teacher=stack(3))
+    assert set(parts.terms) == set(TERMS)
+    assert parts.total.item() == pytest.approx(sum(getattr(weights, k) * v for k, v in parts.terms.items()))
+    assert "teacher" not in focus_loss(stack(2), stack(1), COC, weights).terms
+
+
+def test_structure_looks_at_the_chosen_planes_only() -> None:
+    target = stack(1)
+    picture = target.clone()
+    picture[2] = stack(2)[2]
+    weights = LossWeights(**{**NONE, "structure": 1.0})
+    others, all_planes = (
+        focus_loss(picture, target, COC, weights, perceptual_planes=planes).total
+        for planes in (torch.tensor([0, 3, 1]), None)
+    )
+    assert others == pytest.approx(0, abs=1e-12)
+    assert all_planes > 0.1
+
+
+def test_structure_hears_blur_at_fine_scales_and_brightness_at_the_coarsest() -> None:
+    target = torch.rand(1, 1, 32, 32, generator=torch.Generator().manual_seed(4), dtype=torch.float64) * 0.5
+    blurred = torch.nn.functional.avg_pool2d(target, 3, stride=1, padding=1)
+    assert structure_loss(blurred, target) > 0.1
+    brighter = structure_loss(target + 0.2, target)
+    assert 0 < brighter < 0.1
+    with pytest.raises(ValueError, match="no 8-pixel window"):
+        structure_loss(target[..., :7], target[..., :7])
 
 
 def test_only_the_focus_term_sees_how_planes_differ() -> None:

@@ -8,13 +8,17 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
+from test_lpips import random_lpips_files
 
+from holod_training import cli
 from holod_training.cli import main
-from holod_training.config import NetworkConfig
+from holod_training.config import ConfigError, NetworkConfig
 from holod_training.export import WeightsError, load_weights, read_metadata, save_weights
+from holod_training.loss import LossWeights
 from holod_training.network import DirectNetwork
 from holod_training.sampling import AugmentConfig
-from holod_training.train import TrainConfig, TrainingError, train
+from holod_training.train import Run, TrainConfig, TrainingError, train
+from holod_training.variants import variant
 
 CPU = torch.device("cpu")
 TINY = NetworkConfig(layers=4, channels=8, adjustable_layers=(1,), modulation_hidden=4)
@@ -63,13 +67,16 @@ def test_a_run_learns_and_leaves_its_folder(shards: Path, tmp_path: Path) -> Non
     assert metadata["metrics"]["validation_before_double_phase"]["2.0"]["psnr_db"] > 10
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_the_full_grid_trains_too(shards: Path, tmp_path: Path) -> None:
     config = tiny(shards, tmp_path / "run", steps=2, network=dataclasses.replace(TINY, grid="full"))
     assert read_metadata(train(config, CPU))["config"].grid == "full"
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_resume_is_bit_exact(shards: Path, tmp_path: Path) -> None:
-    whole = load_file(train(tiny(shards, tmp_path / "whole"), CPU))
+    random = {"augment": AugmentConfig(faulty_depth=0.5), "loss": LossWeights(structure=1.0)}
+    whole = load_file(train(tiny(shards, tmp_path / "whole", **random), CPU))
 
     class StopError(Exception):
         pass
@@ -86,22 +93,105 @@ def test_resume_is_bit_exact(shards: Path, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module.Run, "train_step", interrupted)
         with pytest.raises(StopError):
-            train(tiny(shards, tmp_path / "cut"), CPU)
+            train(tiny(shards, tmp_path / "cut", **random), CPU)
     state = torch.load(tmp_path / "cut" / "checkpoint.pt", weights_only=True)
     assert state["step"] == 3
-    resumed = load_file(train(tiny(shards, tmp_path / "cut"), CPU, resume=True))
+    resumed = load_file(train(tiny(shards, tmp_path / "cut", **random), CPU, resume=True))
     assert resumed.keys() == whole.keys()
     for name, value in whole.items():
         assert torch.equal(value, resumed[name]), name
-    other = load_file(train(tiny(shards, tmp_path / "other", seed=2), CPU))
+    other = load_file(train(tiny(shards, tmp_path / "other", seed=2, **random), CPU))
     assert not torch.equal(other["layers.0.weight"], whole["layers.0.weight"])
 
 
+@pytest.mark.parametrize(
+    "network",
+    [
+        dataclasses.replace(variant("layered-4"), channels=4),
+        dataclasses.replace(variant("focal-stack"), channels=4, planes=3),
+        dataclasses.replace(variant("two-frames"), layers=4, channels=4, adjustable_layers=(1,)),
+        dataclasses.replace(variant("ablation-three-plain"), layers=4, channels=4),
+    ],
+    ids=lambda network: network.architecture,
+)
+@pytest.mark.usefixtures("no_plots")
+def test_other_networks_train_and_come_back_from_their_file(
+    network: NetworkConfig, shards: Path, tmp_path: Path
+) -> None:
+    weights = train(tiny(shards, tmp_path / "run", steps=2, network=network), CPU)
+    assert load_weights(weights).config == network
+    numbers = read_metadata(weights)["metrics"]["validation_before_double_phase"]["3.0"]
+    assert {"psnr_db", "psnr_in_focus_db", "slope", "correlation", "flat_oracle_db"} <= numbers.keys()
+
+
+def test_a_focal_stack_network_refuses_scenes_with_other_planes(shards: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"planes: found focal images at 0\.000, 1\.429, 2\.857 dpt"):
+        train(tiny(shards, tmp_path / "run", network=variant("focal-stack")), CPU)
+
+
+def test_bf16_is_near_f32_and_leaves_the_weights_f32(shards: Path, tmp_path: Path) -> None:
+    runs = {p: Run(tiny(shards, tmp_path, precision=p), CPU) for p in ("f32", "bf16")}
+    rows = {p: [run.train_step() for _ in range(3)] for p, run in runs.items()}
+    assert rows["bf16"][0]["loss"] == pytest.approx(rows["f32"][0]["loss"], rel=0.02)
+    assert rows["bf16"][0]["loss"] != rows["f32"][0]["loss"]
+    assert all(p.dtype == torch.float32 for p in runs["bf16"].network.parameters())
+    with pytest.raises(TrainingError, match="precision: found 'f16'"):
+        Run(tiny(shards, tmp_path, precision="f16"), CPU)
+
+
+def test_a_teacher_is_compared_by_its_pictures(shards: Path, tmp_path: Path) -> None:
+    """Against itself the term is nothing, against another grid something; its own weights never move."""
+    itself = tmp_path / "itself.safetensors"
+    torch.manual_seed(3)
+    save_weights(itself, DirectNetwork(TINY), {}, {})
+    started = tiny(shards, tmp_path / "run", initial_weights=str(itself))
+    run = Run(dataclasses.replace(started, teacher=str(itself)), CPU)
+    before = {k: v.clone() for k, v in run.teacher.state_dict().items()}
+    first, second = run.train_step(), run.train_step()
+    assert first["loss_teacher"] < 1e-9 < second["loss_teacher"]
+    assert all(torch.equal(v, before[k]) for k, v in run.teacher.state_dict().items())
+    larger = dataclasses.replace(TINY, grid="full", layers=6)
+    save_weights(tmp_path / "larger.safetensors", DirectNetwork(larger), {}, {})
+    taught = Run(dataclasses.replace(started, teacher=str(tmp_path / "larger.safetensors")), CPU)
+    assert taught.train_step()["loss_teacher"] > 0
+    with pytest.raises(TrainingError, match="its network has other layers"):
+        Run(dataclasses.replace(started, initial_weights=str(tmp_path / "larger.safetensors")), CPU)
+
+
+def test_lpips_joins_the_loss_where_its_files_are_given(shards: Path, tmp_path: Path) -> None:
+    backbone, linear = random_lpips_files(tmp_path)
+    config = tiny(shards, tmp_path / "run", crop=64, border_px=0, lpips_backbone=str(backbone))
+    with pytest.raises(TrainingError, match="LPIPS: found one of its two weights files"):
+        Run(config, CPU)
+    run = Run(dataclasses.replace(config, lpips_linear=str(linear)), CPU)
+    assert run.train_step()["loss_lpips"] > 0
+    assert not any("lpips" in key for key in run.state()["network"])
+
+
+def test_options_change_the_variant_that_they_name() -> None:
+    common = ["train", "--shards", "s", "--out", "o", "--steps", "1"]
+
+    def network(*options: str) -> NetworkConfig:
+        return cli._network(cli._parser().parse_args([*common, *options]))
+
+    assert network() == NetworkConfig()
+    assert network("--layers", "20") == NetworkConfig(layers=20, adjustable_layers=(10,))
+    assert network("--layers", "20", "--adjustable-layers", "5,9").adjustable_layers == (5, 9)
+    assert network("--variant", "layered-12", "--no-transport-prior") == variant("layered-12-no-prior")
+    dilated = network("--layers", "10", "--dilations", "1,1,2,4,8,1,8,4,2,1")
+    assert dilated == variant("half-band-dilated")
+    options = cli._parser().parse_args([*common, "--in-focus-weight", "7", "--faulty-depth", "0.5", "--crop", "96"])
+    config = cli._train_config(options)
+    assert (config.loss.in_focus, config.augment.faulty_depth, config.crop) == (7, 0.5, 96)
+
+
+@pytest.mark.usefixtures("no_plots")
 def test_a_flat_run_is_stopped(shards: Path, tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="shows one blurred picture"):
         train(tiny(shards, tmp_path / "run", stop_below_slope=2.0), CPU)
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_an_old_run_is_not_overwritten(shards: Path, tmp_path: Path) -> None:
     train(tiny(shards, tmp_path / "run", steps=1), CPU)
     with pytest.raises(TrainingError, match="holds a run already"):
@@ -117,6 +207,7 @@ def test_learning_rate_warms_up_and_ends_at_three_percent() -> None:
     assert config.learning_rate_at(1000) == pytest.approx(6e-5)
 
 
+@pytest.mark.usefixtures("no_plots")
 def test_two_processes_agree(shards: Path, tmp_path: Path) -> None:
     """Under torchrun with gloo: both ranks see other crops, one writes, and the result is not that of one alone."""
     script = tmp_path / "two.py"
@@ -126,8 +217,9 @@ def test_two_processes_agree(shards: Path, tmp_path: Path) -> None:
         f"sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}\n"
         "from pathlib import Path\n"
         "from test_train import tiny, CPU\n"
-        "from holod_training.train import train\n"
-        f"train(tiny(Path({str(shards)!r}), Path({str(tmp_path / 'two')!r}), steps=3), CPU)\n"
+        "from holod_training import train as module\n"
+        "module.plot_curves = lambda run: run\n"
+        f"module.train(tiny(Path({str(shards)!r}), Path({str(tmp_path / 'two')!r}), steps=3), CPU)\n"
     )
     command = [
         sys.executable,

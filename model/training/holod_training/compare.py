@@ -1,0 +1,204 @@
+"""Several variants, each trained for the same time on the same scenes and seed, then judged: one Markdown table."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
+from holod_training.curves import read_rows
+from holod_training.export import load_weights, write_beside
+from holod_training.metrics import Judgement, judge
+from holod_training.network import FieldNetwork
+from holod_training.optics import Eye, coc_px, double_phase, panel_field, upsample_half_band
+from holod_training.rivals import flat_oracle
+from holod_training.shards import Shard, open_shards
+from holod_training.train import VALIDATION_PUPILS_MM, Run, TrainConfig, nearest_pupil, train
+from holod_training.variants import build_network, network_amplitude, variant
+
+WARM_STEPS, TIMED_STEPS = 2, 7
+COUNTED_SIZE_PX = 512
+NO_STOP = -10.0
+FLAT_ORACLE = "flat oracle"
+NUMBERS = (
+    ("psnr_db", "PSNR dB", 2),
+    ("psnr_in_focus_db", "in focus", 2),
+    ("psnr_out_of_focus_db", "out of focus", 2),
+    ("slope", "slope", 3),
+    ("correlation", "correlation", 3),
+)
+
+
+def operations_per_pixel(config: NetworkConfig) -> float:
+    """Floating-point operations a panel pixel of one frame, counted on 512x512: two a product and sum of convolutions
+    and matrices, 8 a bilinear tap, 5·log2(n) a value of a complex FFT of n values and half of it of a real one."""
+
+    def fft(share: float) -> Any:
+        def count(shape: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
+            largest = max(shape, out_shape, key=math.prod)
+            return int(share * 5 * math.prod(largest) * math.log2(largest[-1] * largest[-2]))
+
+        return count
+
+    def taps(shape: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
+        return 8 * math.prod(out_shape)
+
+    aten = torch.ops.aten
+    mapping = {
+        aten._fft_c2c: fft(1),
+        aten._fft_r2c: fft(0.5),
+        aten._fft_c2r: fft(0.5),
+        aten.grid_sampler_2d: taps,
+    }
+    size = COUNTED_SIZE_PX
+    pupil = torch.tensor([3.0])
+    with torch.device("meta"):
+        # Specialists choose by the pupil's value, which meta tensors do not have; one of them runs.
+        network = build_network(dataclasses.replace(config, specialists_mm=()))
+        images = (config.planes, 3) if config.architecture == "focal-stack" else (3,)
+        amplitude, depth = torch.zeros(1, *images, size, size), torch.zeros(1, size, size)
+        pupil = torch.zeros(1)
+    with FlopCounterMode(display=False, custom_mapping=mapping) as counter, torch.no_grad():
+        network(amplitude, depth, pupil)
+    return counter.get_total_flops() / size**2
+
+
+def seconds_per_step(config: TrainConfig, device: torch.device) -> float:
+    """The median of a few training steps, after some to warm up; on a CPU by the time that its threads were given,
+    which other programs do not stretch."""
+
+    def now() -> float:
+        return time.process_time() / torch.get_num_threads() if device.type == "cpu" else time.monotonic()
+
+    run = Run(dataclasses.replace(config, steps=WARM_STEPS + TIMED_STEPS), device)
+    taken = []
+    for _ in range(run.config.steps):
+        began = now()
+        run.train_step()
+        taken.append(now() - began)
+    return statistics.median(taken[WARM_STEPS:])
+
+
+@torch.no_grad()
+def judge_held_out(network: FieldNetwork, shards: list[Shard], border_px: int) -> dict[str, dict[str, float]]:
+    """The five numbers after double phase, means over scenes: {"2.0": {psnr_db: ...}, ...}."""
+    config = network.config
+    result = {}
+    for pupil_mm in VALIDATION_PUPILS_MM:
+        judged = []
+        for shard in shards:
+            stack = nearest_pupil(shard, pupil_mm)
+            pupil = torch.tensor([stack.pupil_mm])
+            field = network(network_amplitude(config, stack)[None], stack.depth[None], pupil)[0]
+            if config.grid == "half-band":
+                field = upsample_half_band(field)
+            phase, _ = double_phase(field, config.amplitude_constant)
+            eye = Eye(config.optics, shard.height, shard.width, list(stack.focus_dpt))
+            picture = eye.look(panel_field(phase), stack.pupil_mm) * config.amplitude_constant**2
+            blur = coc_px(config.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
+            judged.append(judge(picture, stack.target, blur, border_px, with_ssim=False))
+        result[str(pupil_mm)] = Judgement.mean(judged).known()
+    return result
+
+
+def judge_flat_oracle(shards: list[Shard], optics: OpticsConfig, border_px: int) -> dict[str, dict[str, float]]:
+    result = {}
+    for pupil_mm in VALIDATION_PUPILS_MM:
+        stacks = [nearest_pupil(shard, pupil_mm) for shard in shards]
+        judged = [
+            judge(
+                flat_oracle(s.target),
+                s.target,
+                coc_px(optics, s.depth, list(s.focus_dpt), s.pupil_mm),
+                border_px,
+                with_ssim=False,
+            )
+            for s in stacks
+        ]
+        result[str(pupil_mm)] = Judgement.mean(judged).known()
+    return result
+
+
+def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.device) -> str:
+    """Trains each variant for `seconds`, writes comparison.md and .json into `base.out` and returns the table.
+
+    What a step takes is measured first, and gives the number of steps: so each run has its whole learning-rate
+    schedule and can be had again from its config.json. A variant whose folder holds its row already is not trained
+    again. Raises ConfigError, ShardError, TrainingError.
+    """
+    if not base.validation:
+        raise ConfigError("validation: found no folder of held-out scenes; variants are compared on them")
+    if os.environ.get("WORLD_SIZE", "1") != "1":
+        raise ConfigError("WORLD_SIZE: found several processes; variants are compared by one, run it without torchrun")
+    if not seconds > 0:
+        raise ConfigError(f"minutes: found {seconds / 60}, expected more than 0")
+    networks = {name: variant(name) for name in names}
+    out = Path(base.out)
+    rows = []
+    for name, network in networks.items():
+        known = out / name / "comparison.json"
+        if known.is_file():
+            print(f"{name}: taken from {known}")
+        else:
+            config = dataclasses.replace(base, network=network, out=str(out / name), stop_below_slope=NO_STOP)
+            row = {"variant": name, **_contest(config, seconds, device)}
+            write_beside(known, (json.dumps(row, indent=1) + "\n").encode())
+        rows.append(json.loads(known.read_text()))
+    shards = open_shards(Path(base.validation), base.network.optics, base.validation_scenes)
+    flat = judge_flat_oracle(shards, base.network.optics, base.validation_border_px)
+    table = markdown(rows, flat, len(shards))
+    result = {"rows": rows, FLAT_ORACLE: flat, "scenes": [s.path.name for s in shards]}
+    write_beside(out / "comparison.json", (json.dumps(result, indent=1) + "\n").encode())
+    write_beside(out / "comparison.md", table.encode())
+    return table
+
+
+def _contest(config: TrainConfig, seconds: float, device: torch.device) -> dict[str, Any]:
+    step_seconds = seconds_per_step(config, device)
+    steps = max(1, round(seconds / step_seconds))
+    config = dataclasses.replace(config, steps=steps, validate_every=steps, checkpoint_every=steps)
+    network = load_weights(train(config, device))
+    shards = open_shards(Path(config.validation or ""), config.network.optics, config.validation_scenes)
+    return {
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "operations_per_pixel": operations_per_pixel(config.network),
+        "steps": steps,
+        "step_seconds": step_seconds,
+        "seconds": read_rows(Path(config.out))[-1]["seconds"],
+        "pupils": judge_held_out(network, shards, config.validation_border_px),
+    }
+
+
+def markdown(rows: list[dict[str, Any]], flat: dict[str, dict[str, float]], scenes: int) -> str:
+    """One table: a row a variant, s = 2 / 3 / 4 mm in each cell."""
+
+    def cells(pupils: dict[str, dict[str, float]]) -> str:
+        def cell(key: str, digits: int) -> str:
+            values = [p[key] for p in pupils.values() if key in p]
+            return " / ".join(f"{v:.{digits}f}" for v in values) or "-"
+
+        return " | ".join(cell(key, digits) for key, _, digits in NUMBERS)
+
+    named = " | ".join(label for _, label, _ in NUMBERS)
+    lines = [
+        f"After double phase, means over {scenes} held-out scenes, s = 2 / 3 / 4 mm in each cell.",
+        "",
+        f"| variant | parameters | kFLOP a pixel | steps | minutes | ms a step | {named} |",
+        "|---|" + "---|" * (5 + len(NUMBERS)),
+    ]
+    for row in rows:
+        lines.append(
+            f"| {row['variant']} | {row['parameters']} | {row['operations_per_pixel'] / 1000:.1f} | {row['steps']} "
+            f"| {row['seconds'] / 60:.1f} | {1000 * row['step_seconds']:.0f} | {cells(row['pupils'])} |"
+        )
+    lines.append(f"| {FLAT_ORACLE} | | | | | | {cells(flat)} |")
+    return "\n".join(lines) + "\n"

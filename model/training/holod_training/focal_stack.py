@@ -1,0 +1,84 @@
+"""The `focal-stack` network: N images focused at N depths in, phases and masks for N planes out."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
+from holod_training.network import FieldNetwork, Trunk
+from holod_training.optics import frequencies, transfer
+from holod_training.shards import Stack
+
+
+def planes_dpt(config: NetworkConfig) -> list[float]:
+    """Where the images are focused, far to near."""
+    return [config.optics.dioptres(k / (config.planes - 1)) for k in range(config.planes)]
+
+
+def focal_amplitudes(config: NetworkConfig, stack: Stack) -> Tensor:
+    """The focal images' amplitudes [planes, 3, H, W]. Raises ConfigError where a stack has other focuses."""
+    expected = planes_dpt(config)
+    found = stack.focus_dpt
+    if len(found) != len(expected) or max(abs(f - e) for f, e in zip(found, expected, strict=True)) > 1e-3:
+        raise ConfigError(
+            f"planes: found focal images at {', '.join(f'{f:.3f}' for f in found)} dpt, "
+            f"the network takes {', '.join(f'{e:.3f}' for e in expected)}; render such scenes or change `planes`"
+        )
+    return stack.target.clamp_min(0).sqrt()
+
+
+@lru_cache(maxsize=8)
+def carriers_back(config: NetworkConfig, height: int, width: int, dtype: torch.dtype, device: str) -> Tensor:
+    """Transfer functions [planes, 3, h, w] from every plane to the SLM plane on the network's grid, half band."""
+    optics: OpticsConfig = config.optics
+    pitch_m = optics.pitch_m * (2 if config.grid == "half-band" else 1)
+    fy, fx = (frequencies(size, pitch_m, device) for size in (height, width))
+    limit = 0.25 / optics.pitch_m * (1 - 1e-9)
+    inside = (fy.abs() < limit)[:, None] & (fx.abs() < limit)
+    return (transfer(optics, fx, fy, [-optics.distance_m(d) for d in planes_dpt(config)]) * inside).to(dtype)
+
+
+class FocalStackNetwork(FieldNetwork):
+    """Σ_n ASM(mask_n · A_n · exp(jφ_n), −u_n): each image lights its own plane, through a mask of 0 to 1.
+
+    Masks start at 1/N and phases near 0.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        spatial = 3 * config.planes * (4 if config.grid == "half-band" else 1)
+        self.layers = Trunk(
+            config,
+            inputs=spatial + config.pupil_inputs,
+            outputs=4 * config.planes,
+            layers=config.layers,
+            dilations=config.dilations,
+            adjustable_layers=config.adjustable_layers,
+            last_share=0.1,
+        )
+
+    def forward(self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor) -> Tensor:
+        """amplitude [N, planes, 3, H, W] from `focal_amplitudes`; depth is not looked at."""
+        count = self.config.planes
+        if amplitude.dim() != 5 or amplitude.shape[1] != count:
+            raise ConfigError(f"planes: found input of shape {list(amplitude.shape)}, expected [N, {count}, 3, H, W]")
+        n = len(amplitude)
+        x = amplitude.flatten(1, 2)
+        lit = amplitude
+        if self.config.grid == "half-band":
+            lit = F.avg_pool2d(x, 2).unflatten(1, (count, 3))
+            x = F.pixel_unshuffle(x, 2)
+        if self.config.pupil_inputs:
+            constant = ((pupil_mm - 3) / 2)[:, None, None, None].expand(-1, 1, *x.shape[2:])
+            x = torch.cat((x, constant), dim=1)
+        out = self.layers(x, pupil_mm).to(amplitude.dtype).view(n, count, 4, *x.shape[2:])
+        phase = math.pi * out[:, :, :3]
+        light = torch.sigmoid(out[:, :, 3:] - math.log(count - 1)) * lit
+        planes = torch.complex(light * torch.cos(phase), light * torch.sin(phase))
+        kernels = carriers_back(self.config, *x.shape[2:], planes.dtype, str(planes.device))
+        return torch.fft.ifft2((torch.fft.fft2(planes) * kernels).sum(dim=1))

@@ -1,0 +1,97 @@
+"""Every network that can be trained, each a config of one set of parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor, nn
+
+from holod_training.config import ConfigError, NetworkConfig
+from holod_training.focal_stack import FocalStackNetwork, focal_amplitudes
+from holod_training.layered import LayeredNetwork
+from holod_training.network import DirectNetwork, FieldNetwork
+from holod_training.shards import Stack
+
+DEFAULT_VARIANT = "half-band-14"
+ABLATION_PUPILS_MM = (2.0, 3.0, 4.0)
+
+_HALF_BAND = NetworkConfig()
+_LAYERED = NetworkConfig(
+    architecture="layered",
+    grid="full",
+    layers=12,
+    channels=24,
+    adjustable_layers=(5,),
+    dilations=(1, 1, 2, 4, 8, 1, 8, 4, 2, 1, 1, 1),
+)
+
+
+def _direct(layers: int) -> NetworkConfig:
+    return NetworkConfig(grid="full", layers=layers, channels=24, adjustable_layers=(layers // 2,))
+
+
+VARIANTS: dict[str, NetworkConfig] = {
+    "direct-26": _direct(26),
+    "direct-20": _direct(20),
+    "direct-14": _direct(14),
+    DEFAULT_VARIANT: _HALF_BAND,
+    "half-band-8": replace(_HALF_BAND, layers=8, channels=24, adjustable_layers=(4,)),
+    "half-band-dilated": replace(
+        _HALF_BAND, layers=10, adjustable_layers=(5,), dilations=(1, 1, 2, 4, 8, 1, 8, 4, 2, 1)
+    ),
+    "half-band-3-adc": replace(_HALF_BAND, adjustable_layers=(3, 7, 11)),
+    "half-band-blur-input": replace(_HALF_BAND, blur_input=True),
+    "two-frames": replace(_HALF_BAND, frames=2),
+    "layered-4": replace(_LAYERED, depth_layers=4),
+    "layered-8": _LAYERED,
+    "layered-12": replace(_LAYERED, depth_layers=12),
+    "layered-4-no-prior": replace(_LAYERED, depth_layers=4, transport_prior=False),
+    "layered-8-no-prior": replace(_LAYERED, transport_prior=False),
+    "layered-12-no-prior": replace(_LAYERED, depth_layers=12, transport_prior=False),
+    "focal-stack": replace(_HALF_BAND, architecture="focal-stack"),
+    "ablation-three-plain": replace(
+        _HALF_BAND, adjustable_layers=(), pupil_inputs=False, specialists_mm=ABLATION_PUPILS_MM
+    ),
+    "ablation-three-deformable": replace(
+        _HALF_BAND, conditioning="deformable", pupil_inputs=False, specialists_mm=ABLATION_PUPILS_MM
+    ),
+    "ablation-modulated": replace(_HALF_BAND, conditioning="modulated"),
+    "ablation-no-pupil": replace(_HALF_BAND, adjustable_layers=(), pupil_inputs=False),
+}
+_FAMILIES = {"direct": DirectNetwork, "layered": LayeredNetwork, "focal-stack": FocalStackNetwork}
+
+
+def variant(name: str) -> NetworkConfig:
+    """Raises ConfigError for a name that the table does not have."""
+    if name not in VARIANTS:
+        raise ConfigError(f"variant: found {name!r}, expected one of {', '.join(VARIANTS)}")
+    return VARIANTS[name]
+
+
+def build_network(config: NetworkConfig) -> FieldNetwork:
+    """A network with new weights from torch's generator."""
+    return SpecialistNetwork(config) if config.specialists_mm else _FAMILIES[config.architecture](config)
+
+
+def network_amplitude(config: NetworkConfig, stack: Stack) -> Tensor:
+    """The first input of a network for one stack, without the batch axis. Raises ConfigError."""
+    return focal_amplitudes(config, stack) if config.architecture == "focal-stack" else stack.amplitude
+
+
+class SpecialistNetwork(FieldNetwork):
+    """One whole network for each pupil of `specialists_mm`; the nearest serves, and none is told its pupil."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        single = replace(config, specialists_mm=())
+        self.networks = nn.ModuleList([build_network(single) for _ in config.specialists_mm])
+
+    def forward(self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor) -> Tensor:
+        known = pupil_mm.new_tensor(self.config.specialists_mm)
+        nearest = (pupil_mm[:, None] - known).abs().argmin(dim=1).tolist()
+        fields = [
+            self.networks[index](amplitude[n : n + 1], depth[n : n + 1], pupil_mm[n : n + 1])
+            for n, index in enumerate(nearest)
+        ]
+        return torch.cat(fields)

@@ -1,0 +1,95 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+from holod_training.cli import main
+from holod_training.compare import compare, judge_held_out, operations_per_pixel
+from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
+from holod_training.curves import plot_curves
+from holod_training.network import DirectNetwork
+from holod_training.shards import open_shards
+from holod_training.train import TrainConfig
+
+CPU = torch.device("cpu")
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_variants_compete_for_the_same_time(shards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    command = ["compare", "--shards", str(shards), "--validation", str(shards), "--out", str(out), "--crop", "48"]
+    command += ["--border-px", "8", "--validation-border-px", "8", "--variants", "half-band-8,two-frames"]
+    command += ["--minutes", "0.003", "--device", "cpu"]
+    assert main(command) == 0
+    table = capsys.readouterr().out
+    assert (out / "comparison.md").read_text() == table
+    result = json.loads((out / "comparison.json").read_text())
+    small, two = result["rows"]
+    assert (small["variant"], two["variant"]) == ("half-band-8", "two-frames")
+    assert small["steps"] >= 1 and small["parameters"] == 56986
+    assert small["operations_per_pixel"] < two["operations_per_pixel"]
+    for row in (*result["rows"], {"pupils": result["flat oracle"]}):
+        assert set(row["pupils"]) == {"2.0", "3.0", "4.0"}
+        for numbers in row["pupils"].values():
+            assert numbers["psnr_db"] > 5
+    assert result["flat oracle"]["2.0"]["slope"] == pytest.approx(0, abs=1e-6)
+    config = json.loads((out / "half-band-8" / "config.json").read_text())
+    assert (config["steps"], config["network"]["layers"]) == (small["steps"], 8)
+    line = next(line for line in table.splitlines() if line.startswith("| half-band-8 "))
+    assert f"| 56986 | {small['operations_per_pixel'] / 1000:.1f} | {small['steps']} |" in line
+    assert f"{small['pupils']['2.0']['psnr_db']:.2f} / " in line
+    # Asked again, what is known is not trained again, and a new one joins.
+    assert main([*command[:-5], "half-band-8,half-band-blur-input", *command[-4:]]) == 0
+    again = json.loads((out / "comparison.json").read_text())["rows"]
+    assert again[0] == small and again[1]["variant"] == "half-band-blur-input"
+
+
+def test_comparison_says_what_is_missing(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = TrainConfig(str(shards), str(tmp_path / "out"), 0)
+    with pytest.raises(ConfigError, match="validation: found no folder"):
+        compare(config, ["half-band-8"], 1, CPU)
+    with pytest.raises(ConfigError, match="variant: found 'half'"):
+        compare(TrainConfig(str(shards), str(tmp_path), 0, validation=str(shards)), ["half"], 1, CPU)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(ConfigError, match="WORLD_SIZE: found several processes"):
+        compare(TrainConfig(str(shards), str(tmp_path), 0, validation=str(shards)), ["half-band-8"], 1, CPU)
+
+
+def test_operations_are_counted() -> None:
+    """Layer by layer: 3x3 kernels at a quarter of the pixels, offsets, 8 a bilinear tap."""
+    config = NetworkConfig(layers=4, channels=8, adjustable_layers=(1,), modulation_hidden=4)
+    kernels = 2 * 9 * (21 * 8 + 2 * 8 * 8 + 8 * 18 + 8 * 6)
+    assert operations_per_pixel(config) == pytest.approx((kernels + 9 * 8 * 8) / 4, rel=0.01)
+
+
+def test_held_out_numbers_are_those_after_double_phase(shards: Path) -> None:
+    """An amplitude constant far below the picture's clips every pixel: before double phase nothing would change."""
+    torch.manual_seed(1)
+    network = DirectNetwork(NetworkConfig(layers=4, channels=8, adjustable_layers=(1,)))
+    scenes = open_shards(shards, OpticsConfig())
+    fair = judge_held_out(network, scenes, 8)["2.0"]["psnr_db"]
+    network.config = NetworkConfig(layers=4, channels=8, adjustable_layers=(1,), amplitude_constant=0.3)
+    assert judge_held_out(network, scenes, 8)["2.0"]["psnr_db"] < fair - 3
+
+
+def test_curves_draw_the_five_numbers_and_skip_what_old_rows_lack(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    five = {"psnr_db": 21, "psnr_in_focus_db": 22, "psnr_out_of_focus_db": 23, "slope": 0.4, "correlation": 0.5}
+    rows = [
+        {"kind": "validation", "step": 1, "pupils": {"2.0": {"psnr_db": 20}}},
+        {"kind": "validation", "step": 2, "pupils": {"2.0": {**five, "flat_oracle_db": 25}}},
+    ]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    drawn: list[list[tuple[list[float], list[float]]]] = []
+
+    def keep(figure: Figure, path: Path, **_: object) -> None:
+        drawn.extend([(list(li.get_xdata()), list(li.get_ydata())) for li in ax.lines] for ax in figure.axes)
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    plot_curves(tmp_path)
+    later = [[([2], [value])] for key, value in five.items() if key != "psnr_db"]
+    assert drawn == [[], [([1, 2], [20, 21]), ([2], [25])], *later]

@@ -1,0 +1,225 @@
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+
+from holod_training.compare import operations_per_pixel
+from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
+from holod_training.layered import LayeredNetwork, blurred
+from holod_training.metrics import focus_response
+from holod_training.network import DirectNetwork
+from holod_training.optics import Eye, half_band_mask, propagate
+from holod_training.rivals import layered_asm
+from holod_training.shards import Stack
+from holod_training.variants import VARIANTS, build_network, network_amplitude, variant
+
+SHIPPED = Path(__file__).parents[2] / "weights" / "direct-halfband-14.safetensors"
+SIZE = 16
+PUPIL_BLIND = {"ablation-no-pupil"}
+
+
+def scene(config: NetworkConfig, pictures: int, size: int = SIZE) -> tuple[torch.Tensor, torch.Tensor]:
+    g = torch.Generator().manual_seed(5)
+    images = (config.planes, 3) if config.architecture == "focal-stack" else (3,)
+    return torch.rand(pictures, *images, size, size, generator=g), torch.rand(pictures, size, size, generator=g)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_every_variant_learns_from_every_parameter_and_sees_the_pupil(name: str) -> None:
+    config = variant(name)
+    torch.manual_seed(1)
+    network = build_network(config)
+    amplitude, depth = scene(config, 3)
+    fields = network(amplitude, depth, torch.tensor([2.0, 3.0, 4.0]))
+    grid = SIZE // 2 if config.grid == "half-band" else SIZE
+    frames = (config.frames,) if config.frames > 1 else ()
+    assert fields.shape == (3, *frames, 3, grid, grid)
+    assert fields.is_complex()
+    fields.abs().square().sum().backward()
+    for key, parameter in network.named_parameters():
+        assert parameter.grad is not None, key
+        assert torch.isfinite(parameter.grad).all(), key
+        assert parameter.grad.abs().max() > 0, key
+    with torch.no_grad():
+        one, other = (network(amplitude[:1], depth[:1], torch.tensor([s])) for s in (1.0, 5.0))
+    difference = (one - other).abs().max()
+    assert difference == 0 if name in PUPIL_BLIND else difference > 1e-4
+
+
+def test_the_table_is_what_it_says() -> None:
+    assert variant("half-band-14") == NetworkConfig()
+    assert [variant(f"direct-{n}").layers for n in (26, 20, 14)] == [26, 20, 14]
+    layered = build_network(variant("layered-8"))
+    assert sum(p.numel() for p in layered.parameters()) == 103_882
+    # Two operations a weight of each 3x3 convolution, the offsets' too; taps and FFTs are a few per cent.
+    convolutions = 2 * 9 * (9 * 24 + 10 * 24 * 24 + 24 * 24 + 24 * 18 + 12 * 24 + 4 * 24 * 24 + 24 * 6)
+    assert convolutions < operations_per_pixel(variant("layered-8")) < 1.06 * convolutions
+    with pytest.raises(ConfigError, match="variant: found 'layered-5'"):
+        variant("layered-5")
+
+
+def test_configs_that_do_not_fit_say_which_key() -> None:
+    for changes, message in (
+        ({"dilations": (1, 2)}, "dilations: found .* expected none, or 14 numbers"),
+        ({"dilations": (2,) * 14}, "dilations: .* expected 1 at the adjustable layers"),
+        ({"conditioning": "some"}, "conditioning: found 'some'"),
+        ({"architecture": "layered"}, "grid: found 'half-band', expected 'full' for `layered`"),
+        ({"architecture": "focal-stack", "frames": 2}, "frames: found 2"),
+        ({"specialists_mm": (3.0, 2.0)}, "specialists_mm: .* rising order"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            NetworkConfig(**changes)
+
+
+def test_files_of_known_networks_are_unchanged_and_new_keys_appear_where_they_differ() -> None:
+    with safe_open(SHIPPED, framework="pt") as file:
+        text = file.metadata()["config"]
+    assert NetworkConfig.from_json(text).to_json() == text
+    for name, config in VARIANTS.items():
+        assert NetworkConfig.from_json(config.to_json()) == config, name
+    assert '"frames": 2' in variant("two-frames").to_json()
+    assert "frames" not in variant("direct-26").to_json()
+
+
+def test_dilations_reach_the_convolutions() -> None:
+    layers = build_network(variant("half-band-dilated")).layers
+    plain = [i for i in range(10) if i != 5]
+    assert [layers[i].dilation[0] for i in plain] == [1, 1, 2, 4, 8, 8, 4, 2, 1]
+
+
+def test_blur_input_is_the_mean_blur_over_all_focuses() -> None:
+    network = DirectNetwork(NetworkConfig(grid="full", layers=4, adjustable_layers=(1,), blur_input=True))
+    depth = torch.linspace(0, 1, 16).expand(1, 16, 16)
+    encoded = network.encode(torch.zeros(1, 3, 16, 16), depth, torch.tensor([4.0]))
+    focus = (torch.arange(1000) + 0.5) / 1000
+    mean = 4 * (depth[0, 0, :, None] - focus).abs().mean(dim=1)
+    torch.testing.assert_close(encoded[0, 5, 0], mean, rtol=1e-4, atol=1e-4)
+
+
+def test_the_nearest_specialist_serves() -> None:
+    torch.manual_seed(3)
+    network = build_network(variant("ablation-three-deformable"))
+    amplitude, depth = scene(network.config, 3)
+    with torch.no_grad():
+        together = network(amplitude, depth, torch.tensor([2.4, 3.2, 9.0]))
+        for n, serving in enumerate(network.networks):
+            alone = serving(amplitude[n : n + 1], depth[n : n + 1], torch.tensor([1.0]))
+            torch.testing.assert_close(together[n : n + 1], alone)
+
+
+def test_the_eye_averages_the_intensities_of_frames() -> None:
+    g = torch.Generator().manual_seed(2)
+    frames = torch.complex(*torch.randn(2, 2, 3, 16, 16, generator=g))
+    eye = Eye(OpticsConfig(), 16, 16, [0.5, 2.0, 2.5])
+    mean = (eye.look(frames[0], 3.0) + eye.look(frames[1], 3.0)) / 2
+    torch.testing.assert_close(eye.look(frames, 3.0), mean)
+    assert (eye.look(frames.mean(dim=0), 3.0) - mean).abs().max() > 0.1
+
+
+def unlearned(**changes: object) -> LayeredNetwork:
+    """A layered network whose learned parts put out zero."""
+    network = LayeredNetwork(dataclasses.replace(variant("layered-8"), **changes))
+    with torch.no_grad():
+        for trunk in (network.surface, network.middle):
+            trunk[-1].weight.zero_()
+    return network
+
+
+def discs(size: int = 48) -> tuple[torch.Tensor, torch.Tensor]:
+    """Smooth bright discs, far on the left and near on the right: amplitude [1, 3, H, W], depth [1, H, W]."""
+    y, x = torch.arange(size)[:, None] - size / 2, torch.arange(size)
+    light = sum(torch.exp(-(y**2 + (x - centre) ** 2) / 30) for centre in (size / 4, 3 * size / 4))
+    depth = torch.where(x < size / 2, 0.06, 0.94).expand(1, size, size).contiguous()
+    return (0.1 + 0.8 * light).sqrt().expand(1, 3, size, size).contiguous(), depth
+
+
+def test_layered_without_learning_or_prior_is_the_layered_rival() -> None:
+    amplitude, depth = scene(variant("layered-8"), 1, 32)
+    optics = OpticsConfig()
+    with torch.no_grad():
+        ours = unlearned(transport_prior=False)(amplitude, depth, torch.tensor([3.0]))[0]
+        with_prior = unlearned()(amplitude, depth, torch.tensor([3.0]))[0]
+        fewer = unlearned(transport_prior=False, depth_layers=4)(amplitude, depth, torch.tensor([3.0]))[0]
+    rival = layered_asm(amplitude[0], depth[0], optics)
+    torch.testing.assert_close(ours, rival, rtol=1e-4, atol=1e-4)
+    for other in (with_prior, fewer):
+        assert (other - rival).abs().max() > 0.05
+
+
+def test_the_prior_has_no_sign_at_mid_depth_and_the_reference_wavelength_sets_its_size() -> None:
+    network = unlearned()
+    amplitude, _ = discs()
+    condition = torch.zeros(1, 3, 48, 48)
+
+    def phase(depth: float) -> torch.Tensor:
+        centred = torch.full((1, 1, 48, 48), depth - 0.5)
+        with torch.no_grad():
+            return network.surface_light(amplitude, centred, condition, torch.tensor([3.0]))[0].angle()
+
+    assert phase(0.5).abs().max() < 1e-5
+    torch.testing.assert_close(phase(0.9), -phase(0.1))
+    torch.testing.assert_close(phase(0.1)[0] * 638, phase(0.1)[2] * 450, rtol=1e-4, atol=1e-2)
+    b = torch.log(amplitude.square() + 0.03)
+    narrow, wide, _ = (blurred(b, (1.0, 2.5, 6.0)) + 1.66)[0]
+    expected = torch.tanh(torch.tensor(4 * 0.4)) * (-0.5 * narrow[1] - wide[1])
+    torch.testing.assert_close(phase(0.1)[1], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_prior_refocuses_more_than_no_phase() -> None:
+    """Against Gaussian blur that grows away from each disc's depth: the wrong sign would lower the slope."""
+    amplitude, depth = discs()
+    optics = OpticsConfig()
+    focus = [optics.dioptres(0.06), optics.dioptres(0.94)]
+    light = amplitude[0].square()
+    soft = blurred(light[None], (4.0,))[0, 0]
+    near = depth[0] > 0.5
+    target = torch.stack((torch.where(near, soft, light), torch.where(near, light, soft)))
+    eye = Eye(optics, 48, 48, focus)
+
+    def slope(network: LayeredNetwork) -> float:
+        with torch.no_grad():
+            field = network(amplitude, depth, torch.tensor([3.0]))[0]
+        return focus_response(eye.look(field, 8.0), target)[0]
+
+    assert slope(unlearned()) > slope(unlearned(transport_prior=False)) + 0.1
+
+
+@pytest.mark.parametrize("grid", ["full", "half-band"])
+def test_a_focal_stack_of_one_open_plane_is_its_image_carried_back(grid: str) -> None:
+    config = dataclasses.replace(variant("focal-stack"), grid=grid, planes=3)
+    network = build_network(config)
+    amplitude, depth = scene(config, 1, 32)
+    with torch.no_grad():
+        network.layers[-1].weight.zero_()
+        # Of each plane's four outputs the last is the mask.
+        network.layers[-1].bias.copy_(torch.tensor([0.0, 0, 0, -90, 0, 0, 0, 90, 0, 0, 0, -90]))
+        field = network(amplitude, depth, torch.tensor([3.0]))[0]
+    optics, shown = config.optics, amplitude[0, 1]
+    if grid == "half-band":
+        shown = torch.nn.functional.avg_pool2d(shown, 2)
+        optics = dataclasses.replace(optics, pixel_pitch_um=16.0)
+    back = propagate(shown.to(torch.complex64), optics, -optics.distance_m(optics.dioptres(0.5)))
+    if grid == "full":
+        back = torch.fft.ifft2(torch.fft.fft2(back) * half_band_mask(32, 32))
+        torch.testing.assert_close(field, back, rtol=1e-4, atol=1e-4)
+    else:
+        # The low grid's Nyquist bins are outside the half band.
+        spectrum = torch.fft.fft2(back)
+        spectrum[:, 8] = 0
+        spectrum[:, :, 8] = 0
+        torch.testing.assert_close(field, torch.fft.ifft2(spectrum), rtol=1e-4, atol=1e-4)
+
+
+def test_focal_stacks_focused_elsewhere_are_refused() -> None:
+    config = variant("focal-stack")
+    target = torch.rand(3, 3, 8, 8)
+    stack = Stack(target[0], target[0, 0], target, 3.0, (0.0, 1.0, 2.857))
+    with pytest.raises(ConfigError, match=r"planes: found focal images at 0\.000, 1\.000, 2\.857 dpt"):
+        network_amplitude(config, stack)
+    with pytest.raises(ConfigError, match="planes: found input of shape"):
+        build_network(config)(target[:1], target[:1, 0], torch.tensor([3.0]))
+    three = dataclasses.replace(config, planes=3)
+    fitting = dataclasses.replace(stack, focus_dpt=(0.0, 1.42857, 2.85714))
+    torch.testing.assert_close(network_amplitude(three, fitting).square(), target)
