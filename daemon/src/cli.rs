@@ -37,6 +37,8 @@ pub enum Command {
     Check(CheckArgs),
     /// Measure the median time of each stage, beside the machine's arithmetic peak.
     Bench(BenchArgs),
+    /// Judge weights by what an eye sees of the panel's levels, on held-out scenes with known thin-lens pictures.
+    Evaluate(EvaluateArgs),
     /// Say what the running daemon is doing.
     Status(StatusArgs),
     /// List trackers, or try one out.
@@ -257,6 +259,41 @@ pub struct BenchArgs {
     pub json: bool,
 }
 
+/// Options of `evaluate`.
+#[derive(Args, Debug, Clone)]
+pub struct EvaluateArgs {
+    /// The rig, whose panel the levels are for.
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// Folder of held-out scenes, as `holod-scenes generate --kind test --pupils 1,2,3,4,5` writes them.
+    #[arg(long, value_name = "DIR")]
+    pub scenes: PathBuf,
+    /// Folder of refocus cards, as `holod-scenes generate --kind cards` writes them.
+    #[arg(long, value_name = "DIR")]
+    pub cards: Option<PathBuf>,
+    /// Weights to judge; the rig's, or the built-in ones, when left out.
+    #[arg(long, value_name = "FILE")]
+    pub weights: Option<PathBuf>,
+    /// Engine for the network.
+    #[arg(long, value_enum, default_value_t = Backend::Auto)]
+    pub backend: Backend,
+    /// Pupils to judge, in millimetres, among those of the scenes; all of these when left out.
+    #[arg(long, value_name = "MM", value_parser = parse_pupil, num_args = 1.., value_delimiter = ',')]
+    pub pupil: Vec<PupilDiameter>,
+    /// Judge only the first N scenes.
+    #[arg(long, value_name = "N", value_parser = parse_count)]
+    pub limit: Option<usize>,
+    /// Pixels at each edge that are not judged.
+    #[arg(long, value_name = "PX", default_value_t = 24)]
+    pub border_px: usize,
+    /// Print the evaluation as JSON.
+    #[arg(long)]
+    pub json: bool,
+    /// Write evaluation.json and sheet.png into this directory.
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+}
+
 /// Options of `status`.
 #[derive(Args, Debug, Clone)]
 pub struct StatusArgs {
@@ -363,6 +400,10 @@ fn parse_scale(text: &str) -> Result<f64, String> {
         .ok_or_else(|| format!("found '{text}', expected millimetres for one unit, a number above 0 such as 0.0125"))
 }
 
+fn parse_count(text: &str) -> Result<usize, String> {
+    text.parse().ok().filter(|&count| count > 0).ok_or_else(|| format!("found '{text}', expected a number above 0"))
+}
+
 fn parse_resolution(text: &str) -> Result<Resolution, String> {
     let wrong = || format!("found '{text}', expected WIDTHxHEIGHT in pixels such as 1920x1080");
     let (width, height) = text.split_once('x').ok_or_else(wrong)?;
@@ -415,12 +456,24 @@ mod tests {
     }
 
     #[test]
+    fn several_pupils_are_named_one_after_another_or_with_commas() {
+        for pupils in [&["--pupil", "2,4.5"][..], &["--pupil", "2", "4.5"], &["--pupil", "2", "--pupil", "4.5"]] {
+            let line = ["holod", "evaluate", "--scenes", "s"].iter().chain(pupils);
+            let Some(Command::Evaluate(args)) = Cli::try_parse_from(line).unwrap().command else { panic!() };
+            assert_eq!(args.pupil, [2.0, 4.5].map(PupilDiameter::from_mm));
+        }
+    }
+
+    #[test]
     fn values_out_of_range_are_refused() {
         for bad in ["12", "-1", "nan", "3mm", ""] {
             assert!(parse_pupil(bad).is_err(), "{bad}");
         }
         for bad in ["1920", "0x0", "1920x", "x", "99999x2", "8x8"] {
             assert!(parse_resolution(bad).is_err(), "{bad}");
+        }
+        for bad in ["0", "-1", "all", ""] {
+            assert!(parse_count(bad).is_err(), "{bad}");
         }
         for bad in ["inf", "nan", "near", "40"] {
             assert!(parse_focus(bad).is_err(), "{bad}");

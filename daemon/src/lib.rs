@@ -2,6 +2,7 @@
 
 pub mod cli;
 pub mod commands;
+pub mod evaluation;
 pub mod failure;
 pub mod pictures;
 pub mod record;

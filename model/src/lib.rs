@@ -2,16 +2,19 @@
 //!
 //! The data's way: [`scene`] loads a frame, [`engine`] runs the pupil-adaptive network of [`weights`] on it and gives a
 //! [`ComplexHologram`], [`optics::DoublePhase`] turns that into a [`PhasePattern`], and [`optics::SimulatedEye`] shows
-//! what an eye sees of it. [`metrics`] judges pictures and [`files`] keeps holograms and pictures on disk.
+//! what an eye sees of it. [`metrics`] and [`refocus`] judge pictures against those of [`scene_shard`], and [`files`] keeps
+//! holograms and pictures on disk.
 
 pub mod engine;
 pub mod files;
 pub mod metrics;
 pub mod optics;
 mod picture;
+pub mod refocus;
 mod resident;
 pub mod scene;
 pub mod scene_renderer;
+pub mod scene_shard;
 pub mod weights;
 
 pub use engine::CpuEngine;

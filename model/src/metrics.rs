@@ -4,6 +4,7 @@
 //! [`StackScore`].
 
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, PupilDiameter, Resolution};
+use rayon::prelude::*;
 
 use crate::LinearImage;
 
@@ -13,15 +14,26 @@ const SSIM_SIGMA: f64 = 1.5;
 /// Pixels blurred by less are in focus, pixels blurred by more than the other are out of focus.
 const IN_FOCUS_COC_PX: f64 = 2.0;
 const OUT_OF_FOCUS_COC_PX: f64 = 8.0;
+/// A stack whose squared changes with focus sum to no more does not change.
+const NO_CHANGE: f64 = 1e-12;
 
 /// Peak signal-to-noise ratio in dB with peak 1, over all colours, leaving out `border_px` at each edge; infinite for
 /// equal pictures.
 pub fn psnr_db(actual: &LinearImage, expected: &LinearImage, border_px: usize) -> f64 {
     assert_same_size(actual, expected);
+    stack_psnr_db(std::slice::from_ref(actual), std::slice::from_ref(expected), border_px)
+}
+
+/// [`psnr_db`] over all pictures of a stack together.
+pub fn stack_psnr_db(actual: &[LinearImage], expected: &[LinearImage], border_px: usize) -> f64 {
+    assert_same_length(actual, expected);
     let mut error = SquaredError::default();
-    for_each_inside(actual.resolution, border_px, |index| {
-        error.add(actual.pixels[index], expected.pixels[index]);
-    });
+    for (actual, expected) in actual.iter().zip(expected) {
+        assert_same_size(actual, expected);
+        for_each_inside(actual.resolution, border_px, |index| {
+            error.add(actual.pixels[index], expected.pixels[index]);
+        });
+    }
     error.psnr_db()
 }
 
@@ -38,7 +50,7 @@ pub fn ssim(actual: &LinearImage, expected: &LinearImage, border_px: usize) -> O
         let rows = plane.chunks_exact(width).skip(border_px).take(inner_height);
         rows.flat_map(|row| &row[border_px..][..inner_width]).map(|&value| f64::from(value)).collect()
     };
-    let mean_of_planes = Colour::ALL.iter().map(|&colour| {
+    let mean_of_planes = Colour::ALL.par_iter().map(|&colour| {
         let (x, y) = (inner(actual.plane(colour)), inner(expected.plane(colour)));
         let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<_>>();
         let windowed = |plane: &[f64]| gaussian_means(plane, inner_width);
@@ -86,10 +98,12 @@ pub struct StackScore {
     /// PSNR over the pixels with more than 8 px of blur; `None` where there is none.
     pub out_of_focus_psnr_db: Option<f64>,
     /// Slope of the regression of P_k − mean P on R_k − mean R: 1 is the target's full refocus, 0 the same picture at
-    /// all planes. 0 where the target does not change with focus.
-    pub focus_slope: f64,
-    /// Correlation of the same two.
-    pub focus_correlation: f64,
+    /// all planes. `None` where the target does not change with focus.
+    pub focus_slope: Option<f64>,
+    /// Correlation of the same two; 0 where only the pictures do not change with focus.
+    pub focus_correlation: Option<f64>,
+    /// [`ssim`], mean over planes; `None` where its window does not fit.
+    pub ssim: Option<f64>,
     /// PSNR of showing the target's mean at every plane: what no focus at all would score.
     pub flat_oracle_psnr_db: f64,
 }
@@ -106,7 +120,8 @@ pub fn score_stack(
     border_px: usize,
 ) -> StackScore {
     let planes = expected.len();
-    assert!(planes > 0 && actual.len() == planes && focuses.len() == planes, "stacks and focuses have one length");
+    assert_same_length(actual, expected);
+    assert!(planes > 0 && focuses.len() == planes, "stacks and focuses have one length");
     for (actual, expected) in actual.iter().zip(expected) {
         assert_same_size(actual, expected);
         assert_eq!(expected.resolution.pixels(), depth_normalised.len(), "depth has the pictures' size");
@@ -137,14 +152,18 @@ pub fn score_stack(
             expected_energy += wanted * wanted;
         }
     });
-    let ratio = |numerator: f64, denominator: f64| if denominator > 0.0 { numerator / denominator } else { 0.0 };
+    let refocuses = expected_energy > NO_CHANGE;
+    let correlation = if actual_energy > NO_CHANGE { cross / (actual_energy * expected_energy).sqrt() } else { 0.0 };
+    let ssims: Option<Vec<f64>> =
+        actual.par_iter().zip(expected).map(|(actual, expected)| ssim(actual, expected, border_px)).collect();
     let some = |error: SquaredError| (error.count > 0).then(|| error.psnr_db());
     StackScore {
         psnr_db: all.psnr_db(),
         in_focus_psnr_db: some(sharp),
         out_of_focus_psnr_db: some(blurred),
-        focus_slope: ratio(cross, expected_energy),
-        focus_correlation: ratio(cross, (actual_energy * expected_energy).sqrt()),
+        focus_slope: refocuses.then(|| cross / expected_energy),
+        focus_correlation: refocuses.then_some(correlation),
+        ssim: ssims.map(|ssims| ssims.iter().sum::<f64>() / planes as f64),
         flat_oracle_psnr_db: flat.psnr_db(),
     }
 }
@@ -164,6 +183,10 @@ impl SquaredError {
     fn psnr_db(self) -> f64 {
         -10.0 * (self.sum / self.count.max(1) as f64).log10()
     }
+}
+
+fn assert_same_length(actual: &[LinearImage], expected: &[LinearImage]) {
+    assert_eq!(actual.len(), expected.len(), "stacks that are compared have one length");
 }
 
 fn assert_same_size(actual: &LinearImage, expected: &LinearImage) {
@@ -262,18 +285,36 @@ mod tests {
     fn a_flat_stack_has_no_focus_and_scores_as_the_flat_oracle() {
         let (target, flat) = (stack(0.1), stack(0.0));
         let flat_score = score(&flat, &target);
-        assert!(flat_score.focus_slope.abs() < 1e-6 && flat_score.focus_correlation.abs() < 1e-6);
+        let response = |score: &StackScore| (score.focus_slope.unwrap(), score.focus_correlation.unwrap());
+        let (slope, correlation) = response(&flat_score);
+        assert!(slope.abs() < 1e-6 && correlation.abs() < 1e-6);
         assert!((flat_score.psnr_db - flat_score.flat_oracle_psnr_db).abs() < 1e-3);
         assert_eq!(flat_score.in_focus_psnr_db.unwrap(), psnr_db(&flat[0], &target[0], 1));
         let perfect = score(&target, &target);
-        assert!((perfect.focus_slope - 1.0).abs() < 1e-9 && (perfect.focus_correlation - 1.0).abs() < 1e-9);
-        assert_eq!(perfect.psnr_db, f64::INFINITY);
+        let (slope, correlation) = response(&perfect);
+        assert!((slope - 1.0).abs() < 1e-9 && (correlation - 1.0).abs() < 1e-9);
+        assert_eq!((perfect.psnr_db, perfect.ssim), (f64::INFINITY, None));
+    }
+
+    #[test]
+    fn a_stacks_psnr_and_ssim_are_over_all_its_planes() {
+        let expected = [image(24, 20, wave), image(24, 20, |index| 0.5 * wave(index))];
+        let brighter = [image(24, 20, |index| wave(index) + 0.02), expected[1].clone()];
+        assert!((stack_psnr_db(&brighter, &expected, 1) - 10.0 * (2.0 / 4e-4f64).log10()).abs() < 1e-3);
+        let (depth, pupil) = ([0.0; 480], PupilDiameter::from_mm(3.0));
+        let focuses = [0.0, 2.0].map(Dioptres);
+        let judged = score_stack(&brighter, &expected, &focuses, &depth, &DisplayGeometry::DEFAULT, pupil, 1);
+        assert!((judged.psnr_db - stack_psnr_db(&brighter, &expected, 1)).abs() < 1e-9);
+        let mean = 0.5 * (ssim(&brighter[0], &expected[0], 1).unwrap() + 1.0);
+        assert!((judged.ssim.unwrap() - mean).abs() < 1e-12 && mean < 0.9999);
     }
 
     #[test]
     fn half_the_swing_is_half_the_slope() {
         let half = score(&stack(0.05), &stack(0.1));
-        assert!((half.focus_slope - 0.5).abs() < 1e-4 && (half.focus_correlation - 1.0).abs() < 1e-4);
-        assert_eq!(score(&stack(0.05), &stack(0.0)).focus_slope, 0.0);
+        assert!((half.focus_slope.unwrap() - 0.5).abs() < 1e-4);
+        assert!((half.focus_correlation.unwrap() - 1.0).abs() < 1e-4);
+        let unchanging = score(&stack(0.05), &stack(0.0));
+        assert_eq!((unchanging.focus_slope, unchanging.focus_correlation), (None, None));
     }
 }

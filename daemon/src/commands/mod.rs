@@ -4,6 +4,7 @@ mod bench;
 mod check;
 mod dark;
 mod demo;
+mod evaluate;
 mod log;
 mod render;
 mod run;
@@ -27,6 +28,7 @@ pub fn dispatch(cli: Cli) -> Result<(), Failure> {
         Some(Command::View(args)) => view::view(&args),
         Some(Command::Check(args)) => check::check(&args),
         Some(Command::Bench(args)) => bench::bench(&args),
+        Some(Command::Evaluate(args)) => evaluate::evaluate(&args),
         Some(Command::Status(args)) => status::status(&args),
         Some(Command::Tracker(command)) => tracker::tracker(&command),
         Some(Command::Log(command)) => log::log(&command),

@@ -2,12 +2,12 @@
 
 use std::path::Path;
 
-use holod_calibration::{Colour, Metres, PupilDiameter, Resolution};
+use holod_calibration::{Colour, Dioptres, Metres, PupilDiameter, Resolution};
 use num_complex::{Complex32, Complex64};
 use safetensors::SafeTensors;
 
 use super::{CpuEngine, reference};
-use crate::optics::{DoublePhase, Propagator};
+use crate::optics::{DoublePhase, Eye, Propagator, SimulatedEye};
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
 
 /// Largest difference allowed between a stage of the double-precision reference and its golden map, relative to the
@@ -125,14 +125,37 @@ fn check(name: &str) {
     };
     check_phase(name, &golden, &golden_hologram, weights.config().amplitude_constant);
 
+    let geometry = weights.config().optics.geometry(frame.resolution);
     let distance_m: f64 = golden.metadata("asm_distance_m").parse().unwrap();
-    let mut propagator = Propagator::new(&weights.config().optics.geometry(frame.resolution), frame.resolution);
-    let mut propagated = golden_hologram;
-    for colour in Colour::ALL {
-        propagator.propagate(propagated.plane_mut(colour), colour, Metres(distance_m));
+    for (what, mut propagator) in [
+        ("asm_padded", Propagator::new(&geometry, frame.resolution)),
+        ("asm_circular", Propagator::repeating(&geometry, frame.resolution)),
+    ] {
+        let mut propagated = golden_hologram.clone();
+        for colour in Colour::ALL {
+            propagator.propagate(propagated.plane_mut(colour), colour, Metres(distance_m));
+        }
+        let expected = golden.complex(what).unwrap();
+        assert_matches(&format!("{name} {what}"), &widen(&propagated.field), &expected, ENGINE_TOLERANCE);
     }
-    let expected = golden.complex("asm_padded").unwrap();
-    assert_matches(&format!("{name} propagation"), &widen(&propagated.field), &expected, ENGINE_TOLERANCE);
+
+    let focus_dpt: Vec<f64> = serde_json::from_str(&golden.metadata("focus_dpt")).unwrap();
+    let eyes = focus_dpt
+        .into_iter()
+        .map(|focus_dpt| Eye { pupil: PupilDiameter::from_mm(pupil_mm as f32), focus: Dioptres(focus_dpt) });
+    let phases = golden.values("phase").unwrap().into_iter().map(|phase| phase as f32).collect();
+    let pattern = PhasePattern { resolution: frame.resolution, phase_rad: phases };
+    let constant = weights.config().amplitude_constant;
+    let mut simulated = SimulatedEye::repeating(&geometry, frame.resolution);
+    for (planes_before, eye) in eyes.enumerate() {
+        let (field, panel) = (simulated.view_field(&golden_hologram, eye), simulated.view(&pattern, constant, eye));
+        for (what, seen) in [("eye_field", field), ("eye_panel", panel)] {
+            let expected = golden.values(what).unwrap();
+            let plane = &expected[planes_before * seen.pixels.len()..][..seen.pixels.len()];
+            let seen: Vec<f64> = seen.pixels.iter().map(|&light| light.into()).collect();
+            assert_matches(&format!("{name} {what}"), &real(&seen), &real(plane), ENGINE_TOLERANCE);
+        }
+    }
 }
 
 fn check_phase(name: &str, golden: &Golden, hologram: &ComplexHologram, amplitude_constant: f32) {

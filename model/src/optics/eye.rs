@@ -19,7 +19,8 @@ pub struct Eye {
 /// The bench's optics from the panel to a retina.
 ///
 /// Light leaves the panel, passes the 4f stop (|fx|, |fy| < 1/4p) and the pupil (a disc of radius (s/2)/(λf) in the
-/// panel's spectrum), and is focused at u = f²·D. Both stops are hard. The panel is surrounded by darkness.
+/// panel's spectrum), and is focused at u = f²·D. Both stops are hard. The panel is surrounded by darkness, unless it is
+/// [`repeating`](Self::repeating).
 pub struct SimulatedEye {
     geometry: DisplayGeometry,
     propagator: Propagator,
@@ -29,6 +30,12 @@ impl SimulatedEye {
     /// For patterns of `resolution` on the bench `geometry`, whose own resolution does not matter.
     pub fn new(geometry: &DisplayGeometry, resolution: Resolution) -> Self {
         Self { geometry: *geometry, propagator: Propagator::new(geometry, resolution) }
+    }
+
+    /// The same where the pattern goes on beyond its edges as if it were repeated: for a picture that is cut out of a
+    /// larger one, where darkness would put light that rings round edges that are not there.
+    pub fn repeating(geometry: &DisplayGeometry, resolution: Resolution) -> Self {
+        Self { geometry: *geometry, propagator: Propagator::repeating(geometry, resolution) }
     }
 
     /// What `eye` sees of a phase pattern that was encoded with `amplitude_constant`, white = 1.

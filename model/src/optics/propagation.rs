@@ -12,24 +12,38 @@ use super::fft::{TransposedFft2d, signed_bin};
 ///
 /// The transfer function is exp(j·2π·u·(sqrt(1/λ² − fx² − fy²) − 1/λ)) inside 1/λ and 0 outside, without the constant
 /// phase of a plane wave. The field is zero-padded to twice its size, and the transfer function is cut where its own
-/// samples would alias (Matsushima and Shimobaba 2009), so that nothing wraps round.
+/// samples would alias (Matsushima and Shimobaba 2009), so that nothing wraps round; unless it is
+/// [`repeating`](Self::repeating).
 pub struct Propagator {
     geometry: DisplayGeometry,
     resolution: Resolution,
+    /// The field's size with its padding.
+    padded_size: Resolution,
     fft: TransposedFft2d<f32>,
-    /// [2·height, 2·width]
+    /// [padded height, padded width]
     padded: Vec<Complex32>,
 }
 
 impl Propagator {
     /// For fields of `resolution` with the pitch and wavelengths of `geometry`.
     pub fn new(geometry: &DisplayGeometry, resolution: Resolution) -> Self {
-        let (width, height) = (2 * resolution.width, 2 * resolution.height);
+        let padded_size = Resolution { width: 2 * resolution.width, height: 2 * resolution.height };
+        Self::with_padding(geometry, resolution, padded_size)
+    }
+
+    /// The same where the field goes on beyond its edges as if it were repeated: no padding, no band limit, and what
+    /// leaves at one edge comes in at the opposite one.
+    pub fn repeating(geometry: &DisplayGeometry, resolution: Resolution) -> Self {
+        Self::with_padding(geometry, resolution, resolution)
+    }
+
+    fn with_padding(geometry: &DisplayGeometry, resolution: Resolution, padded_size: Resolution) -> Self {
         Self {
             geometry: *geometry,
             resolution,
-            fft: TransposedFft2d::new(width, height),
-            padded: vec![Complex32::ZERO; width * height],
+            padded_size,
+            fft: TransposedFft2d::new(padded_size.width, padded_size.height),
+            padded: vec![Complex32::ZERO; padded_size.pixels()],
         }
     }
 
@@ -38,7 +52,7 @@ impl Propagator {
         self.pad(|index| field[index]);
         self.filter(colour, u, |_, _| true);
         let width = self.resolution.width;
-        for (row, from) in field.chunks_exact_mut(width).zip(self.padded.chunks_exact(2 * width)) {
+        for (row, from) in field.chunks_exact_mut(width).zip(self.padded.chunks_exact(self.padded_size.width)) {
             row.copy_from_slice(&from[..width]);
         }
     }
@@ -46,7 +60,7 @@ impl Propagator {
     /// Fills the padded field: sample `index` of the [height, width] field from `value`, zero outside.
     pub(super) fn pad(&mut self, value: impl Fn(usize) -> Complex32 + Sync) {
         let Resolution { width, height } = self.resolution;
-        self.padded.par_chunks_exact_mut(2 * width).enumerate().for_each(|(y, row)| {
+        self.padded.par_chunks_exact_mut(self.padded_size.width).enumerate().for_each(|(y, row)| {
             row.fill(Complex32::ZERO);
             if y < height {
                 for (x, sample) in row[..width].iter_mut().enumerate() {
@@ -59,10 +73,14 @@ impl Propagator {
     /// Multiplies the padded field's spectrum by the transfer function where `passes` (fx, fy in cycles per metre) and
     /// by zero elsewhere.
     pub(super) fn filter(&mut self, colour: Colour, u: Metres, passes: impl Fn(f64, f64) -> bool + Sync) {
-        let (width, height) = (2 * self.resolution.width, 2 * self.resolution.height);
+        let Resolution { width, height } = self.padded_size;
         let pitch_m = self.geometry.pixel_pitch.0;
-        let transfer =
-            Transfer::new(self.geometry.wavelengths[colour].0, u.0, [width as f64 * pitch_m, height as f64 * pitch_m]);
+        let wavelength_m = self.geometry.wavelengths[colour].0;
+        let transfer = if self.padded_size == self.resolution {
+            Transfer::unlimited(wavelength_m, u.0)
+        } else {
+            Transfer::new(wavelength_m, u.0, [width as f64 * pitch_m, height as f64 * pitch_m])
+        };
         let norm = 1.0 / (width * height) as f64;
         self.fft.forward(&mut self.padded);
         self.fft.spectrum.par_chunks_exact_mut(height).enumerate().for_each(|(kx, column)| {
@@ -83,7 +101,7 @@ impl Propagator {
 
     /// One row of the field inside the padding.
     pub(super) fn row(&self, y: usize) -> &[Complex32] {
-        &self.padded[y * 2 * self.resolution.width..][..self.resolution.width]
+        &self.padded[y * self.padded_size.width..][..self.resolution.width]
     }
 
     pub(super) fn resolution(&self) -> Resolution {
@@ -103,7 +121,11 @@ impl Transfer {
     /// `extents_m` are width and height of the padded field.
     fn new(wavelength_m: f64, u_m: f64, extents_m: [f64; 2]) -> Self {
         let limits = extents_m.map(|extent_m| 1.0 / (wavelength_m * (2.0 * u_m / extent_m).hypot(1.0)));
-        Self { inverse_wavelength: 1.0 / wavelength_m, u_m, limits }
+        Self { limits, ..Self::unlimited(wavelength_m, u_m) }
+    }
+
+    fn unlimited(wavelength_m: f64, u_m: f64) -> Self {
+        Self { inverse_wavelength: 1.0 / wavelength_m, u_m, limits: [f64::INFINITY; 2] }
     }
 
     fn at(&self, fx: f64, fy: f64) -> Complex64 {
@@ -208,6 +230,33 @@ mod tests {
         let right: f32 =
             (0..64).flat_map(|y| (48..64).map(move |x| (x, y))).map(|(x, y)| field[y * 64 + x].norm_sqr()).sum();
         assert!(left < 1e-3 * right, "{left} against {right}");
+    }
+
+    #[test]
+    fn a_repeating_field_wraps_round_and_keeps_its_energy() {
+        let resolution = Resolution { width: 64, height: 48 };
+        let spot = |centre_x: isize| -> Vec<Complex32> {
+            let at = |index: usize| {
+                let x = (index as isize % 64 - centre_x + 32).rem_euclid(64) - 32;
+                let y = index as isize / 64 - 24;
+                Complex32::new((-(x * x + y * y) as f32 / 18.0).exp(), 0.0)
+            };
+            (0..resolution.pixels()).map(at).collect()
+        };
+        let mut propagator = Propagator::repeating(&BENCH, resolution);
+        let mut spread = |centre_x| {
+            let mut field = spot(centre_x);
+            propagator.propagate(&mut field, Colour::Red, Metres(4e-3));
+            field
+        };
+        let (middle, edge) = (spread(32), spread(0));
+        for (index, value) in edge.iter().enumerate() {
+            let shifted = index / 64 * 64 + (index % 64 + 32) % 64;
+            assert!((middle[shifted] - value).norm() < 1e-5, "{index}");
+        }
+        let energy = |field: &[Complex32]| field.iter().map(|value| f64::from(value.norm_sqr())).sum::<f64>();
+        assert!((energy(&edge) / energy(&spot(0)) - 1.0).abs() < 1e-5);
+        assert!(middle[24 * 64 + 32].norm() < 0.9, "it did spread");
     }
 
     #[test]

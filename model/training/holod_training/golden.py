@@ -15,6 +15,7 @@ from torch import Tensor
 
 from holod_training.config import NetworkConfig
 from holod_training.export import load_weights, save_weights, write_beside
+from holod_training.golden_evaluation import write_evaluation
 from holod_training.network import AdjustableLayer, DirectNetwork, FieldNetwork
 from holod_training.optics import (
     Eye,
@@ -123,5 +124,6 @@ def write_golden(out: Path, shipped: Path | None, seed: int = 20) -> list[Path]:
         result = vectors(load_weights(shipped).double(), amplitude, depth, 3.4, (0, 7, 13))
         path = out / "direct-shipped.safetensors"
         write_vectors(path, result, {"seed": seed, "weights": shipped.name})
-        written.append(path)
+        write_evaluation(out / "evaluation.safetensors", shipped, seed)
+        written += [path, out / "evaluation.safetensors"]
     return written

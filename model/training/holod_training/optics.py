@@ -195,6 +195,12 @@ def double_phase(field: Tensor, amplitude_constant: float) -> tuple[Tensor, floa
     return torch.where(phase >= 2 * math.pi, torch.zeros_like(phase), phase), clipped
 
 
+def through_levels(phase: Tensor, bit_depth: int = 8) -> Tensor:
+    """The phases that a linear panel with a stroke of a full turn shows: each goes to the nearest of 2^bit_depth."""
+    step = 2 * math.pi / 2**bit_depth
+    return torch.remainder(torch.round(phase / step), 2**bit_depth) * step
+
+
 def panel_field(phase: Tensor) -> Tensor:
     """What leaves a phase-only panel: exp(j·phase)."""
     return torch.polar(torch.ones_like(phase), phase)

@@ -1,10 +1,16 @@
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file
 
+from holod_training.config import OpticsConfig
 from holod_training.golden import write_golden
+from holod_training.optics import coc_px
+from holod_training.shards import Shard
 
 COMMITTED = Path(__file__).parents[2] / "golden"
 SHIPPED = Path(__file__).parents[2] / "weights" / "direct-halfband-14.safetensors"
@@ -41,3 +47,43 @@ def test_no_stage_of_the_vectors_is_idle() -> None:
     assert vectors["low"][1].abs().mean() > 0.01
     assert (vectors["eye_field"][0] - vectors["eye_field"][1]).abs().mean() > 1e-3
     assert (vectors["eye_field"] - vectors["eye_panel"]).abs().mean() < 0.05
+
+
+def found_in(path: Path) -> Any:
+    with safe_open(path, framework="pt") as file:
+        return json.loads(file.metadata()["found"])
+
+
+def flattened(found: Any) -> list[float]:
+    rows = [value for row in found["rows"] for value in row.values()]
+    return rows + [value for row in found["matrix_psnr_db"] for value in row]
+
+
+def test_committed_evaluation_is_what_the_script_writes(written: Path) -> None:
+    ours, committed = (load_file(folder / "evaluation.safetensors") for folder in (written, COMMITTED))
+    assert ours.keys() == committed.keys()
+    for key, value in ours.items():
+        torch.testing.assert_close(value, committed[key], rtol=1e-3, atol=1e-3, msg=lambda m, k=key: f"{k}: {m}")
+    found, expected = (flattened(found_in(folder / "evaluation.safetensors")) for folder in (written, COMMITTED))
+    assert found == pytest.approx(expected, abs=2e-3)
+    expected[4] += 5e-3
+    assert found != pytest.approx(expected, abs=2e-3), "the comparison is blind"
+
+
+def test_committed_evaluation_tells_right_from_wrong() -> None:
+    """Every figure is one that a fault would change: far from what a picture without focus would score."""
+    found = found_in(COMMITTED / "evaluation.safetensors")
+    for row in found["rows"]:
+        assert row["psnr_db"] > row["flat_oracle_psnr_db"] + 0.5
+        assert row["slope"] > 0.2 and row["correlation"] > 0.5 and row["ssim"] > 0.4
+        assert min(row["near_card"], row["far_card"]) > 2 and 0 < row["clipped_share"] < 0.02
+    given_narrow, given_wide = found["matrix_psnr_db"]
+    assert given_narrow[0] > given_wide[0] and given_wide[1] > given_narrow[1]
+
+
+def test_no_blur_of_the_committed_evaluation_lies_on_the_rim_of_in_or_out_of_focus() -> None:
+    """There single and double precision may decide differently, and the comparison would compare roundings."""
+    for stack in Shard(COMMITTED / "evaluation.safetensors").stacks():
+        blur = coc_px(OpticsConfig(), stack.depth, list(stack.focus_dpt), stack.pupil_mm)
+        assert min((blur - rim).abs().min() for rim in (2.0, 8.0)) > 1e-3
+        assert (blur < 2).any() and (blur > 8).any()

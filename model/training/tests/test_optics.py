@@ -16,6 +16,7 @@ from holod_training.optics import (
     propagate,
     propagate_padded,
     pupil_mask,
+    through_levels,
     upsample_half_band,
 )
 
@@ -144,3 +145,12 @@ def test_coc_of_the_default_bench() -> None:
     blur = coc_px(OPTICS, depth, [1 / 0.35], 3.0)
     assert blur[0, 0, 0] == pytest.approx(42.857, abs=1e-3)
     assert blur[0, 0, 1] == pytest.approx(0, abs=1e-3)
+
+
+def test_levels_are_the_nearest_ones_on_the_circle() -> None:
+    step = math.pi / 2
+    phase = torch.tensor([0.0, 0.49 * step, 0.51 * step, 3.4 * step, 3.6 * step])
+    torch.testing.assert_close(through_levels(phase, bit_depth=2) / step, torch.tensor([0.0, 0.0, 1.0, 3.0, 0.0]))
+    many = torch.linspace(0, 2 * math.pi, 1001)[:-1]
+    assert (panel_field(through_levels(many)) - panel_field(many)).abs().max() <= math.pi / 256 + 1e-6
+    assert len(through_levels(torch.linspace(0, 2 * math.pi, 9999)).unique()) == 256

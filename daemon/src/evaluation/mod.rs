@@ -1,0 +1,230 @@
+//! Judges weights by what an eye sees of the levels that the panel would be sent, on scenes whose thin-lens pictures are
+//! known.
+//!
+//! Each hologram goes network → double phase → levels of the rig's panel → the phases that these show → 4f stop, pupil
+//! and focus of a simulated eye. The scenes are pieces cut out of a wider view, so the eye takes the pattern as going on
+//! beyond its edges ([`SimulatedEye::repeating`]), as the trainer's own evaluation does.
+
+mod statistics;
+
+use holod_calibration::rig::Rig;
+use holod_calibration::{Colour, Dioptres, DisplayGeometry, PerColour, PupilDiameter, Resolution};
+use holod_model::metrics::{self, StackScore};
+use holod_model::optics::{DoublePhase, Eye, PhasePattern, SimulatedEye};
+use holod_model::refocus::{CardArea, FAR_CARD, NEAR_CARD};
+use holod_model::scene_shard::SceneShard;
+use holod_model::{ComplexHologram, CpuEngine, LinearImage, RgbdFrame, Weights};
+use holod_slm_output::fields::FrameLayout;
+use holod_slm_output::{LevelsFrame, PanelEncoder};
+use serde::Serialize;
+
+pub use statistics::Estimate;
+
+use crate::cli::Backend;
+use crate::failure::{Exit, Failure};
+use crate::pictures::shown_pattern;
+use crate::setup;
+
+/// PSNR of a picture that is exactly right, so that means over scenes stay finite.
+const HIGHEST_PSNR_DB: f64 = 120.0;
+
+/// Looks at scenes of one size through one bench.
+pub struct Judge {
+    geometry: DisplayGeometry,
+    amplitude_constant: f32,
+    border_px: usize,
+    engine: CpuEngine,
+    double_phase: DoublePhase,
+    encoder: PanelEncoder,
+    levels: LevelsFrame,
+    eye: SimulatedEye,
+    hologram: ComplexHologram,
+    encoded: PhasePattern,
+}
+
+/// One scene: its figures, and pictures to look at.
+pub struct JudgedScene {
+    /// For each pupil, how the stack made for it compares with the target for it.
+    pub scores: Vec<StackScore>,
+    /// PSNR of what is made for the pupil of the row and seen by the pupil of the column.
+    pub matrix_psnr_db: Vec<Vec<f64>>,
+    /// For each pupil, the share of amplitudes above the double phase's constant.
+    pub clipped_share: Vec<f32>,
+    /// For each pupil, the pictures at the farthest and at the nearest focus.
+    pub views: Vec<EndViews>,
+}
+
+/// Target and what the eye sees at both ends of a stack.
+pub struct EndViews {
+    /// The target focused at the first plane.
+    pub target_far: LinearImage,
+    /// What the eye sees there.
+    pub seen_far: LinearImage,
+    /// The target focused at the last plane.
+    pub target_near: LinearImage,
+    /// What the eye sees there.
+    pub seen_near: LinearImage,
+}
+
+/// The refocus ratios of one card scene for one pupil: gradient energy in focus over out of focus.
+#[derive(Clone, Debug, Serialize)]
+pub struct Refocus {
+    /// `dark on bright` or `bright on dark`.
+    pub contrast: &'static str,
+    /// The pupil, which the hologram is made for and which looks.
+    pub pupil_mm: f32,
+    /// Ratio of the near card.
+    pub near_card: f64,
+    /// Ratio of the far card.
+    pub far_card: f64,
+}
+
+impl Judge {
+    /// A judge of `weights` on `rig` for scenes of `resolution`, of which `border_px` at each edge are not judged.
+    ///
+    /// # Errors
+    /// Where the engine cannot be had, or the scenes do not fit on the panel.
+    pub fn new(
+        rig: &Rig,
+        weights: &Weights,
+        backend: Backend,
+        resolution: Resolution,
+        border_px: usize,
+    ) -> Result<Self, Failure> {
+        let engine = setup::engine(backend, weights, resolution)?;
+        let encoder =
+            PanelEncoder::new(&rig.panel, rig.resolution(), resolution).map_err(Failure::because(Exit::Config))?;
+        let amplitude_constant = weights.config().amplitude_constant;
+        Ok(Self {
+            geometry: rig.geometry,
+            amplitude_constant,
+            border_px,
+            engine,
+            double_phase: DoublePhase::new(resolution, amplitude_constant),
+            encoder,
+            levels: LevelsFrame::new(FrameLayout::new(&rig.panel, rig.resolution())),
+            eye: SimulatedEye::repeating(&rig.geometry, resolution),
+            hologram: ComplexHologram::dark(resolution),
+            encoded: PhasePattern::flat(resolution),
+        })
+    }
+
+    /// Judges a scene with the stacks `pupil_indices` of the shard, each made for its pupil and seen by every one.
+    ///
+    /// # Errors
+    /// Where the shard cannot be read.
+    pub fn scene(&mut self, shard: &SceneShard, pupil_indices: &[usize]) -> Result<JudgedScene, Failure> {
+        let unreadable = Failure::because(Exit::Data);
+        let frame = shard.frame().map_err(&unreadable)?;
+        let pupils: Vec<PupilDiameter> = pupil_indices.iter().map(|&index| shard.pupils()[index]).collect();
+        let mut shown = Vec::new();
+        for &pupil in &pupils {
+            shown.push(self.shown(&frame, pupil)?);
+        }
+        let mut judged = JudgedScene {
+            scores: Vec::new(),
+            matrix_psnr_db: vec![Vec::new(); pupils.len()],
+            clipped_share: shown.iter().map(|(_, clipped_share)| *clipped_share).collect(),
+            views: Vec::new(),
+        };
+        for (column, (&pupil, &index)) in pupils.iter().zip(pupil_indices).enumerate() {
+            let target = shard.stack(index).map_err(&unreadable)?;
+            for (row, (pattern, _)) in shown.iter().enumerate() {
+                let seen = self.look(pattern, pupil, shard.focuses());
+                let psnr_db = metrics::stack_psnr_db(&seen, &target, self.border_px).min(HIGHEST_PSNR_DB);
+                judged.matrix_psnr_db[row].push(psnr_db);
+                if row == column {
+                    judged.scores.push(self.score(&seen, &target, shard, &frame, pupil));
+                    let ends = |stack: &[LinearImage]| (stack[0].clone(), stack[stack.len() - 1].clone());
+                    let ((target_far, target_near), (seen_far, seen_near)) = (ends(&target), ends(&seen));
+                    judged.views.push(EndViews { target_far, seen_far, target_near, seen_near });
+                }
+            }
+        }
+        Ok(judged)
+    }
+
+    /// Judges how a scene of [`cards`](holod_model::scene_renderer::SceneKind::Cards) refocuses, and returns what each
+    /// pupil sees of it, focused near and far.
+    ///
+    /// # Errors
+    /// Where the shard cannot be read or holds no cards.
+    pub fn cards(
+        &mut self,
+        shard: &SceneShard,
+        pupils: &[PupilDiameter],
+    ) -> Result<Vec<(Refocus, [LinearImage; 2])>, Failure> {
+        let frame = shard.frame().map_err(Failure::because(Exit::Data))?;
+        let area = |name: &str, card: Dioptres| {
+            CardArea::find(&frame.depth_normalised, shard.resolution(), &self.geometry, card, self.border_px)
+                .ok_or_else(|| {
+                    let said = format!(
+                        "{}: found no {name} card at {} dpt; expected a scene of `holod-scenes generate --kind cards`",
+                        shard.path().display(),
+                        card.0
+                    );
+                    Failure::new(Exit::Data, said)
+                })
+        };
+        let (near, far) = (area("near", NEAR_CARD)?, area("far", FAR_CARD)?);
+        let contrast = if shard.index().is_multiple_of(2) { "dark on bright" } else { "bright on dark" };
+        let mut found = Vec::new();
+        for &pupil in pupils {
+            let (pattern, _) = self.shown(&frame, pupil)?;
+            let views = [NEAR_CARD, FAR_CARD].map(|focus| self.view(&pattern, Eye { pupil, focus }));
+            let [near_focus, far_focus] = &views;
+            let ratio = |area: &CardArea, sharp, soft| area.gradient_energy(sharp) / area.gradient_energy(soft);
+            let refocus = Refocus {
+                contrast,
+                pupil_mm: pupil.mm(),
+                near_card: ratio(&near, near_focus, far_focus),
+                far_card: ratio(&far, far_focus, near_focus),
+            };
+            found.push((refocus, views));
+        }
+        Ok(found)
+    }
+
+    /// The phases that the panel's levels show of the hologram of `frame` for `pupil`, and the share that was clipped.
+    fn shown(&mut self, frame: &RgbdFrame, pupil: PupilDiameter) -> Result<(PhasePattern, f32), Failure> {
+        self.engine.render(frame, pupil, &mut self.hologram).map_err(Failure::because(Exit::Software))?;
+        let report = self.double_phase.encode(&self.hologram, &mut self.encoded);
+        let phases = PerColour(Colour::ALL.map(|colour| self.encoded.plane(colour)));
+        self.encoder.encode(phases, &mut self.levels);
+        Ok((shown_pattern(&self.encoder, &self.levels), report.clipped_share))
+    }
+
+    fn look(&mut self, pattern: &PhasePattern, pupil: PupilDiameter, focuses: &[Dioptres]) -> Vec<LinearImage> {
+        focuses.iter().map(|&focus| self.view(pattern, Eye { pupil, focus })).collect()
+    }
+
+    fn view(&mut self, pattern: &PhasePattern, eye: Eye) -> LinearImage {
+        self.eye.view(pattern, self.amplitude_constant, eye)
+    }
+
+    fn score(
+        &self,
+        seen: &[LinearImage],
+        target: &[LinearImage],
+        shard: &SceneShard,
+        frame: &RgbdFrame,
+        pupil: PupilDiameter,
+    ) -> StackScore {
+        let score = metrics::score_stack(
+            seen,
+            target,
+            shard.focuses(),
+            &frame.depth_normalised,
+            &self.geometry,
+            pupil,
+            self.border_px,
+        );
+        StackScore {
+            psnr_db: score.psnr_db.min(HIGHEST_PSNR_DB),
+            in_focus_psnr_db: score.in_focus_psnr_db.map(|psnr_db| psnr_db.min(HIGHEST_PSNR_DB)),
+            out_of_focus_psnr_db: score.out_of_focus_psnr_db.map(|psnr_db| psnr_db.min(HIGHEST_PSNR_DB)),
+            flat_oracle_psnr_db: score.flat_oracle_psnr_db.min(HIGHEST_PSNR_DB),
+            ..score
+        }
+    }
+}

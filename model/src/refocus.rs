@@ -1,0 +1,133 @@
+//! The refocus test: is a card with fine marks sharper where the eye is focused at it than where it is not?
+//!
+//! Looked at on the scenes of [`SceneKind::Cards`](crate::scene_renderer::SceneKind::Cards), for each card alone.
+
+use holod_calibration::{Colour, Dioptres, DisplayGeometry, Resolution};
+
+use crate::LinearImage;
+
+/// Where the near card stands.
+pub const NEAR_CARD: Dioptres = Dioptres(2.5);
+/// Where the far card stands.
+pub const FAR_CARD: Dioptres = Dioptres(0.25);
+
+/// How far a pixel of a card may lie from it.
+const TOLERANCE_DPT: f64 = 0.05;
+/// Pixels this near to anything else, each way, are left out: in front of and behind a card's rim other things blur.
+const SEAM_PX: usize = 16;
+/// Fewer pixels tell nothing.
+const FEWEST_PX: usize = 256;
+
+/// The inner part of one card.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct CardArea {
+    /// [height, width]
+    inside: Vec<bool>,
+}
+
+impl CardArea {
+    /// The card at `card` in a scene of `depth_normalised` [height, width], without 16 px along its edges and without
+    /// `border_px` at each edge of the picture; nothing where fewer than 256 pixels are left.
+    pub fn find(
+        depth_normalised: &[f32],
+        resolution: Resolution,
+        geometry: &DisplayGeometry,
+        card: Dioptres,
+        border_px: usize,
+    ) -> Option<Self> {
+        let Resolution { width, height } = resolution;
+        assert_eq!(depth_normalised.len(), resolution.pixels(), "depth has the resolution's size");
+        let outside: Vec<bool> = depth_normalised
+            .iter()
+            .map(|&depth| (geometry.depth_at(depth.into()).0 - card.0).abs() > TOLERANCE_DPT)
+            .collect();
+        let around = |at: usize, end: usize| at.saturating_sub(SEAM_PX)..(at + SEAM_PX + 1).min(end);
+        let beside_outside: Vec<bool> = (0..resolution.pixels())
+            .map(|index| around(index % width, width).any(|x| outside[index / width * width + x]))
+            .collect();
+        let in_picture = |at: usize, end: usize| at >= border_px && at + border_px < end;
+        let inside: Vec<bool> = (0..resolution.pixels())
+            .map(|index| {
+                let (x, y) = (index % width, index / width);
+                in_picture(x, width)
+                    && in_picture(y, height)
+                    && !around(y, height).any(|row| beside_outside[row * width + x])
+            })
+            .collect();
+        (inside.iter().filter(|&&inside| inside).count() >= FEWEST_PX).then_some(Self { inside })
+    }
+
+    /// Gradient energy: the mean squared difference of neighbouring pixels, along x and y and over all colours, where
+    /// both lie in the area. `image` has the size that the area was found in.
+    pub fn gradient_energy(&self, image: &LinearImage) -> f64 {
+        let Resolution { width, .. } = image.resolution;
+        assert_eq!(self.inside.len(), image.resolution.pixels(), "the area was found in a picture of this size");
+        let pairs = |step: usize| {
+            (0..self.inside.len().saturating_sub(step)).filter(move |&index| {
+                self.inside[index] && self.inside[index + step] && (step == width || index % width + 1 < width)
+            })
+        };
+        let (mut sum, mut count) = (0.0, 0usize);
+        for (index, step) in pairs(1).map(|index| (index, 1)).chain(pairs(width).map(|index| (index, width))) {
+            for colour in Colour::ALL {
+                let plane = image.plane(colour);
+                sum += (f64::from(plane[index + step]) - f64::from(plane[index])).powi(2);
+            }
+            count += 3;
+        }
+        sum / count.max(1) as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene_renderer::Scene;
+
+    const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
+
+    #[test]
+    fn a_card_without_its_rim_and_the_pictures_border() {
+        let resolution = Resolution { width: 100, height: 70 };
+        let near = BENCH.normalised_depth(NEAR_CARD) as f32;
+        let depth: Vec<f32> = (0..7000).map(|index| if index % 100 < 60 { near } else { 0.0 }).collect();
+        let area = CardArea::find(&depth, resolution, &BENCH, NEAR_CARD, 10).unwrap();
+        for index in 0..7000 {
+            let (x, y) = (index % 100, index / 100);
+            assert_eq!(area.inside[index], (10..44).contains(&x) && (10..60).contains(&y), "{x}, {y}");
+        }
+        assert_eq!(CardArea::find(&depth, resolution, &BENCH, FAR_CARD, 10), None);
+        assert_eq!(CardArea::find(&depth, resolution, &BENCH, NEAR_CARD, 34), None, "too little is left");
+    }
+
+    #[test]
+    fn gradient_energy_counts_pairs_inside_only() {
+        let resolution = Resolution { width: 20, height: 20 };
+        let area = CardArea::find(&[0.0; 400], resolution, &BENCH, Dioptres(0.0), 2).unwrap();
+        let image = |value: fn(usize, usize) -> f32| LinearImage {
+            resolution,
+            pixels: (0..1200).map(|index| value(index % 20, index / 20 % 20)).collect(),
+        };
+        // Of 16·15 pairs each way, 16 along x step by a half.
+        let step = image(|x, _| if x < 10 { 0.0 } else { 0.5 });
+        assert!((area.gradient_energy(&step) - 16.0 * 0.25 / 480.0).abs() < 1e-12);
+        let at_the_border = image(|x, y| if x == 1 || y == 18 { 5.0 } else { 0.25 });
+        assert_eq!(area.gradient_energy(&at_the_border), 0.0);
+    }
+
+    #[test]
+    fn the_renderers_cards_are_found_and_refocus_as_an_eye_sees_them() {
+        let resolution = Resolution { width: 160, height: 160 };
+        let scene = Scene::cards(true, resolution);
+        let depth = scene.picture().depth;
+        let pixels = scene.focal_stack(holod_calibration::PupilDiameter::from_mm(4.0), &[NEAR_CARD, FAR_CARD], 128);
+        let [near, far] = [0, 1].map(|plane| LinearImage {
+            resolution,
+            pixels: pixels[plane * 3 * resolution.pixels()..][..3 * resolution.pixels()].to_vec(),
+        });
+        let area = |card| CardArea::find(&depth, resolution, &BENCH, card, 8).unwrap();
+        let (near_card, far_card) = (area(NEAR_CARD), area(FAR_CARD));
+        assert!(near_card.gradient_energy(&near) > 4.0 * near_card.gradient_energy(&far));
+        assert!(far_card.gradient_energy(&far) > 4.0 * far_card.gradient_energy(&near));
+    }
+}

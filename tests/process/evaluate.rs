@@ -1,0 +1,224 @@
+//! `holod evaluate` against what the trainer's evaluation finds on the same scene, and what it says and writes.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use holod_calibration::{PupilDiameter, Resolution};
+use holod_model::scene_renderer::SceneKind;
+use holod_model::scene_renderer::shard::{PupilPlan, ShardPlan, file_name};
+use holod_tests::daemon::run;
+use serde_json::Value;
+
+const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+const SIZE: Resolution = Resolution { width: 64, height: 48 };
+
+/// How far the two evaluations may be apart.
+const TOLERANCES: [(&str, f64); 8] = [
+    ("psnr_db", 0.05),
+    ("psnr_in_focus_db", 0.05),
+    ("psnr_out_of_focus_db", 0.05),
+    ("flat_oracle_psnr_db", 0.05),
+    ("slope", 0.005),
+    ("correlation", 0.005),
+    ("ssim", 0.005),
+    ("clipped_share", 0.0002),
+];
+/// Largest relative difference of a refocus ratio.
+const REFOCUS_TOLERANCE: f64 = 0.02;
+
+fn model() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../model")
+}
+
+/// A safetensors file's header, and where its tensors begin.
+fn header(bytes: &[u8]) -> (Value, usize) {
+    let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    (serde_json::from_slice(&bytes[8..8 + length]).unwrap(), 8 + length)
+}
+
+/// A JSON value in the metadata of a shard.
+fn entry(bytes: &[u8], key: &str) -> Value {
+    serde_json::from_str(header(bytes).0["__metadata__"][key].as_str().unwrap()).unwrap()
+}
+
+/// Evaluates the golden scene whose file is `bytes`, as scene and as cards, with the weights and border that it names.
+fn evaluated(bytes: &[u8]) -> Value {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join(file_name(0)), bytes).unwrap();
+    let weights = model().join("weights").join(entry(bytes, "weights").as_str().unwrap());
+    let border_px = entry(bytes, "border_px").to_string();
+    let args = ["evaluate", "--scenes", ".", "--cards", ".", "--border-px", &border_px, "--json"];
+    let args = [&args[..], &["--weights", weights.to_str().unwrap()]].concat();
+    let ended = run(HOLOD, &args, folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    serde_json::from_str(&ended.stdout).unwrap()
+}
+
+/// Every figure in which `evaluated` is not what the trainer `found`.
+fn disagreements(evaluated: &Value, found: &Value) -> Vec<String> {
+    let mut wrong = Vec::new();
+    let mut compare = |what: String, ours: &Value, theirs: &Value, tolerance: f64| {
+        let (ours, theirs) = (ours.as_f64().unwrap_or(f64::NAN), theirs.as_f64().unwrap());
+        let difference = (ours - theirs).abs();
+        if difference.is_nan() || difference > tolerance {
+            wrong.push(format!("{what}: {ours} for {theirs}"));
+        }
+    };
+    let rows = found["rows"].as_array().unwrap();
+    for (number, theirs) in rows.iter().enumerate() {
+        let pupil = &theirs["pupil_mm"];
+        let (ours, refocus) = (&evaluated["rows"][number], &evaluated["refocus"][number]);
+        compare(format!("pupil of row {number}"), &ours["pupil_mm"], pupil, 0.0);
+        for (figure, tolerance) in TOLERANCES {
+            compare(format!("{figure} at {pupil} mm"), &ours[figure]["mean"], &theirs[figure], tolerance);
+        }
+        for card in ["near_card", "far_card"] {
+            let tolerance = REFOCUS_TOLERANCE * theirs[card].as_f64().unwrap();
+            compare(format!("{card} at {pupil} mm"), &refocus[card], &theirs[card], tolerance);
+        }
+        for column in 0..rows.len() {
+            let (ours, theirs) = (&evaluated["matrix"]["psnr_db"], &found["matrix_psnr_db"]);
+            let what = format!("matrix [{number}][{column}]");
+            compare(what, &ours[number][column], &theirs[number][column], 0.05);
+        }
+    }
+    wrong
+}
+
+#[test]
+fn the_trainers_evaluation_finds_the_same() {
+    let golden = fs::read(model().join("golden/evaluation.safetensors")).unwrap();
+    let found = entry(&golden, "found");
+    let ours = evaluated(&golden);
+    assert_eq!(disagreements(&ours, &found), Vec::<String>::new());
+    assert_eq!(ours["refocus"][0]["contrast"], "dark on bright");
+
+    // Every figure counts: one that is 0.06 dB, 0.006 or 2.5 % off is seen, and it alone.
+    for row in 0..2 {
+        for (figure, tolerance) in TOLERANCES.into_iter().chain([("near_card", 0.0), ("far_card", 0.0)]) {
+            let mut spoiled = found.clone();
+            let value = spoiled["rows"][row][figure].as_f64().unwrap();
+            spoiled["rows"][row][figure] =
+                (value * 1.025f64.powf(f64::from(tolerance == 0.0)) + 1.2 * tolerance).into();
+            let wrong = disagreements(&ours, &spoiled);
+            assert!(matches!(wrong.as_slice(), [one] if one.starts_with(figure)), "{figure}: {wrong:?}");
+        }
+    }
+
+    // A scene whose red and blue are swapped is another scene.
+    let (header, start) = header(&golden);
+    let offset = |end: usize| start + header["image"]["data_offsets"][end].as_u64().unwrap() as usize;
+    let mut swapped = golden;
+    let image = &mut swapped[offset(0)..offset(1)];
+    let plane = image.len() / 3;
+    let (red, rest) = image.split_at_mut(plane);
+    red.swap_with_slice(&mut rest[plane..]);
+    let wrong = disagreements(&evaluated(&swapped), &found);
+    assert!(wrong.iter().any(|what| what.starts_with("psnr_db at 2")), "{wrong:?}");
+}
+
+/// Renders `count` small scenes of `kind` into `folder`.
+fn render(folder: &Path, kind: SceneKind, count: u64) {
+    let plan = ShardPlan {
+        kind,
+        seed: 11,
+        resolution: SIZE,
+        pupils: PupilPlan::Fixed([2.0, 4.0].map(PupilDiameter::from_mm).to_vec()),
+        planes: 2,
+        rays: 8,
+    };
+    for index in 0..count {
+        plan.write(folder, index).unwrap();
+    }
+}
+
+fn names(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> =
+        fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned()).collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn scenes_of_the_renderer_are_judged_told_and_written() {
+    let folder = tempfile::tempdir().unwrap();
+    render(&folder.path().join("scenes"), SceneKind::Test, 2);
+    let common = ["evaluate", "--scenes", "scenes", "--border-px", "8"];
+    let with = |more: &[&str]| {
+        let ended = run(HOLOD, &[&common[..], more].concat(), folder.path());
+        assert!(ended.status.success(), "{ended:?}");
+        ended.stdout
+    };
+
+    let printed: Value = serde_json::from_str(&with(&["--json", "--out", "judged"])).unwrap();
+    assert_eq!(names(folder.path()), ["judged", "scenes"]);
+    assert_eq!(names(&folder.path().join("judged")), ["evaluation.json", "sheet.png"]);
+    let written = fs::read(folder.path().join("judged/evaluation.json")).unwrap();
+    assert_eq!(serde_json::from_slice::<Value>(&written).unwrap(), printed);
+    let sheet = image::open(folder.path().join("judged/sheet.png")).unwrap();
+    assert!(sheet.width() as usize > 4 * SIZE.width && sheet.height() as usize > 4 * SIZE.height);
+
+    assert_eq!((&printed["scenes"], &printed["width_px"], &printed["height_px"]), (&2.into(), &64.into(), &48.into()));
+    assert_eq!((&printed["panel_bit_depth"], &printed["border_px"]), (&8.into(), &8.into()));
+    let rows = printed["rows"].as_array().unwrap();
+    assert_eq!(rows.iter().map(|row| row["pupil_mm"].as_f64().unwrap()).collect::<Vec<_>>(), [2.0, 4.0]);
+    for (number, row) in rows.iter().enumerate() {
+        let mean = |figure: &str| row[figure]["mean"].as_f64().unwrap_or_else(|| panic!("{figure}: {row}"));
+        assert!(
+            (15.0..50.0).contains(&mean("psnr_db")) && (15.0..60.0).contains(&mean("flat_oracle_psnr_db")),
+            "{row}"
+        );
+        assert!(row["psnr_db"]["ci95_half_width"].as_f64().unwrap() > 0.0, "{row}");
+        assert!(mean("ssim") > 0.2 && mean("slope").is_finite() && mean("correlation").abs() <= 1.0, "{row}");
+        let own = printed["matrix"]["psnr_db"][number][number].as_f64().unwrap();
+        assert!((own - mean("psnr_db")).abs() < 1e-9, "the matrix' diagonal is the row's own PSNR");
+    }
+    assert_eq!(printed["refocus"], Value::Array(Vec::new()));
+
+    let one: Value = serde_json::from_str(&with(&["--json", "--limit", "1", "--pupil", "4"])).unwrap();
+    assert_eq!((one["rows"].as_array().unwrap().len(), &one["rows"][0]["pupil_mm"]), (1, &4.0.into()));
+    assert_eq!((&one["scenes"], &one["rows"][0]["psnr_db"]["ci95_half_width"]), (&1.into(), &Value::Null));
+
+    let told = with(&["--limit", "1"]);
+    for words in ["1 scenes of 64x48", "8-bit levels", "in focus", "flat oracle", "seen by another"] {
+        assert!(told.contains(words), "no '{words}' in {told}");
+    }
+}
+
+#[test]
+fn each_bad_folder_gets_a_clear_error_and_leaves_nothing_behind() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    render(&at("scenes"), SceneKind::Test, 1);
+    fs::create_dir(at("empty")).unwrap();
+    fs::create_dir(at("cut")).unwrap();
+    let whole = fs::read(at("scenes").join(file_name(0))).unwrap();
+    fs::write(at("cut").join(file_name(3)), &whole[..whole.len() / 2]).unwrap();
+    fs::write(at("file"), "").unwrap();
+    let cases: [(&[&str], i32, &[&str]); 9] = [
+        (&["--scenes", "nowhere"], 66, &["nowhere", "holod-scenes"]),
+        (&["--scenes", "empty"], 66, &["empty", "scene_*.safetensors", "holod-scenes generate"]),
+        (&["--scenes", "cut"], 65, &["cut/scene_000003.safetensors", "bytes", "holod-scenes generate"]),
+        (&["--scenes", "scenes", "--pupil", "3"], 65, &["scene_000000", "[2.0, 4.0] mm", "3 mm", "--pupil"]),
+        (&["--scenes", "scenes", "--border-px", "30"], 64, &["--border-px", "30", "at most 18", "64x48"]),
+        (
+            &["--scenes", "scenes", "--border-px", "8", "--cards", "scenes"],
+            65,
+            &["scene_000000", "card", "--kind cards"],
+        ),
+        (&["--scenes", "scenes", "--limit", "0"], 64, &["--limit", "0"]),
+        (&["--scenes", "scenes", "--weights", "file"], 65, &["file"]),
+        (&["--border-px", "8"], 64, &["--scenes"]),
+    ];
+    let before = names(folder.path());
+    for (args, exit, says) in cases {
+        let ended = run(HOLOD, &[&["evaluate"], args, &["--out", "out"]].concat(), folder.path());
+        let what = format!("holod evaluate {}\n{}", args.join(" "), ended.stderr);
+        assert_eq!(ended.status.code(), Some(exit), "{what}");
+        for words in says {
+            assert!(ended.stderr.contains(words), "no '{words}' in: {what}");
+        }
+        assert!(!ended.stderr.contains("panicked") && ended.stdout.is_empty(), "{what}");
+        assert_eq!(names(folder.path()), before, "something was left behind by {what}");
+    }
+}
