@@ -14,6 +14,7 @@ from holod_training.config import ConfigError, NetworkConfig
 from holod_training.evaluate_config import EvaluateConfig
 from holod_training.export import WeightsError
 from holod_training.goals import ReportError
+from holod_training.judging import LAYERED_ASM, OURS
 from holod_training.loss import LossWeights
 from holod_training.rgbd import RgbdError
 from holod_training.shards import ShardError
@@ -21,6 +22,7 @@ from holod_training.solver import SolverConfig
 from holod_training.train import TrainConfig, TrainingError
 
 EX_DATAERR = 65
+SOLVER_STARTS = {"network": OURS, "layered-asm": LAYERED_ASM}
 
 
 def choose_device(name: str) -> torch.device:
@@ -95,6 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--solver-scenes", type=int, default=judging.solver_scenes, help="scenes for direct optimisation; 0: none"
     )
+    evaluate.add_argument("--solver-start", choices=tuple(SOLVER_STARTS), default="network")
     evaluate.add_argument("--solver-iterations", type=int, default=judging.solver.iterations)
     evaluate.add_argument("--solver-frames", type=_numbers(int), default=judging.solver_frames, help="such as 1,2,3")
     evaluate.add_argument("--solver-focus-weight", type=float, default=judging.solver.loss.focus)
@@ -148,6 +151,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         limit=options.limit,
         border_px=options.border_px,
         solver=SolverConfig(iterations=options.solver_iterations, loss=loss),
+        solver_start=SOLVER_STARTS[options.solver_start],
         solver_scenes=options.solver_scenes,
         solver_frames=options.solver_frames,
         focus_curve_weights=options.focus_curve_weights,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import json
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -54,7 +54,8 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     bench = Bench(optics, network.config.amplitude_constant, config.border_px, device)
     trained = [network_method(name, one) for name, one in networks.items()]
     learned_and_rivals = [*trained, *rivals(optics)]
-    methods = [*learned_and_rivals, *_solvers(config, trained[0], bench, min(config.solver_scenes, len(shards)))]
+    start = next(method for method in learned_and_rivals if method.name == config.solver_start)
+    methods = [*learned_and_rivals, *_solvers(config, start, bench, min(config.solver_scenes, len(shards)))]
     timed = min(range(len(shards[0].pupils_mm)), key=lambda i: abs(shards[0].pupils_mm[i] - TIMED_PUPIL_MM))
 
     config.out.mkdir(parents=True, exist_ok=True)
@@ -70,7 +71,12 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
         "amplitude_constant": network.config.amplitude_constant,
         "pupils_mm": table_pupils(shards[0].pupils_mm),
         "all_pupils_mm": list(shards[0].pupils_mm),
-        "solver": {"scenes": config.solver_scenes, "iterations": config.solver.iterations},
+        "solver": {
+            "start": config.solver_start,
+            "scenes": config.solver_scenes,
+            "iterations": config.solver.iterations,
+            "loss": dataclasses.asdict(config.solver.loss),
+        },
         **judged.summary(),
     }
     if cards:
@@ -85,7 +91,7 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     if config.focus_curve_weights and config.solver_scenes:
         scenes = shards[: config.solver_scenes]
         result["focus_curve"] = {
-            "solver": focus_curve(scenes, trained[0], bench, config.solver, config.focus_curve_weights),
+            "solver": focus_curve(scenes, start, bench, config.solver, config.focus_curve_weights),
             "methods": on_the_same_scenes(judged, len(scenes)),
         }
     write_sheet(config.out / "sheet.png", shards, trained[0], bench)
@@ -114,18 +120,18 @@ def _load(config: EvaluateConfig, device: torch.device | str) -> dict[str, Direc
     return networks
 
 
-def _solvers(config: EvaluateConfig, ours: Method, bench: Bench, scenes: int) -> list[Method]:
-    """Direct optimisation from our own field, for each number of frames; named by it."""
+def _solvers(config: EvaluateConfig, start: Method, bench: Bench, scenes: int) -> list[Method]:
+    """Direct optimisation from the start's field, for each number of frames; named by it."""
     if scenes == 0:
         return []
 
     def solver(frames: int) -> Method:
-        solver_config = replace(config.solver, frames=frames)
+        solver_config = dataclasses.replace(config.solver, frames=frames)
         name = f"optimised, {frames} frame{'s' if frames > 1 else ''}"
         return Method(
             name,
             lambda stack, pupil: (
-                optimise(stack, ours.field(stack, pupil), bench.optics, bench.amplitude_constant, solver_config).field
+                optimise(stack, start.field(stack, pupil), bench.optics, bench.amplitude_constant, solver_config).field
             ),
             adapts=True,
             scenes=scenes,

@@ -21,11 +21,12 @@ from holod_training.rivals import all_in_focus, flat_oracle, layered_asm, smooth
 from holod_training.shards import Shard, ShardError, Stack, open_shards
 
 OURS = "holod"
-FLAT_ORACLE = "flat oracle"
+LAYERED_ASM, FLAT_ORACLE = "layered ASM", "flat oracle"
 BEFORE, AFTER = "before", "after"
 NUMBERS = tuple(f.name for f in fields(Judgement))
 KEPT_EYE_ELEMENTS = 2**23
-AMPLITUDE_STRIDE = 7
+LEAST_AMPLITUDE_STRIDE = 7
+MOST_AMPLITUDES = 2**16
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ def rivals(optics: OpticsConfig) -> list[Method]:
 
     return [
         method("all-in-focus", all_in_focus),
-        method("layered ASM", layered_asm),
+        method(LAYERED_ASM, layered_asm),
         method("smooth phase", smooth_phase),
         method("transport of intensity", transport_of_intensity),
     ]
@@ -247,7 +248,8 @@ def _judge_method(judged: Judged, scene: int, shard: Shard, method: Method, benc
         field_ = method.field(bench.read(shard, given), given_mm)
         panel, share = bench.panel(field_)
         if method.name == OURS:
-            judged.amplitudes.append(field_.abs().flatten()[::AMPLITUDE_STRIDE].cpu())
+            stride = max(LEAST_AMPLITUDE_STRIDE, field_.numel() // MOST_AMPLITUDES)
+            judged.amplitudes.append(field_.abs().flatten()[::stride].cpu())
         wanted = [given] if method.adapts else list(range(len(judged.pupils_mm)))
         crossed = [i for i, p in enumerate(judged.pupils_mm) if given_mm in of_matrix and p in of_matrix and i != given]
         for index in wanted:

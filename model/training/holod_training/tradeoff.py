@@ -17,22 +17,22 @@ CURVE_PUPILS_MM = (2.0, 3.0, 4.0)
 
 
 def focus_curve(
-    shards: list[Shard], ours: Method, bench: Bench, config: SolverConfig, in_focus_weights: Sequence[float]
+    shards: list[Shard], start: Method, bench: Bench, config: SolverConfig, in_focus_weights: Sequence[float]
 ) -> list[dict[str, Any]]:
-    """The solver's optimum for each weight on what is in focus, from the network's own field; after double phase, means
-    over `shards`."""
+    """The solver's optimum for each weight on what is in focus, from `start`'s field; after double phase, means over
+    `shards`."""
     pupils = [p for p in shards[0].pupils_mm if p in CURVE_PUPILS_MM] or [shards[0].pupils_mm[-1]]
     found: dict[tuple[float, float], list[Judgement]] = {}
     with tqdm(total=len(shards) * len(pupils) * len(in_focus_weights), unit="field", disable=None) as progress:
         for shard in shards:
             for pupil in pupils:
                 stack = bench.read(shard, shard.pupils_mm.index(pupil))
-                start = ours.field(stack, pupil)
+                field = start.field(stack, pupil)
                 for weight in sorted(in_focus_weights):
                     loss = dataclasses.replace(config.loss, in_focus=weight)
                     weighted = dataclasses.replace(config, loss=loss, frames=1)
-                    field = optimise(stack, start, bench.optics, bench.amplitude_constant, weighted).field[0]
-                    picture = bench.look(bench.panel(field)[0], pupil, stack.focus_dpt)
+                    optimum = optimise(stack, field, bench.optics, bench.amplitude_constant, weighted).field[0]
+                    picture = bench.look(bench.panel(optimum)[0], pupil, stack.focus_dpt)
                     judgement = judge(picture, stack.target, bench.blur_px(stack), bench.border_px)
                     found.setdefault((weight, pupil), []).append(judgement)
                     progress.update()

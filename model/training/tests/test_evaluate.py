@@ -56,7 +56,16 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Path:
             Image.fromarray(millimetres.numpy().astype("uint16")).save(tmp_path / "real" / kind / name)
     folders = ["--test", tmp_path / "test", "--cards", tmp_path / "cards", "--rgbd", tmp_path / "real"]
     weights = ["--weights", tmp_path / "w.safetensors", "--also", tmp_path / "deeper.safetensors"]
-    solver = ["--solver-scenes", "1", "--solver-iterations", "5", "--solver-frames", "2"]
+    solver = [
+        "--solver-start",
+        "layered-asm",
+        "--solver-scenes",
+        "1",
+        "--solver-iterations",
+        "5",
+        "--solver-frames",
+        "2",
+    ]
     options = [*folders, *weights, *solver, "--focus-curve-weights", "0,100", "--timing-calls", "1"]
     assert main(["evaluate", *map(str, options), "--out", str(tmp_path / "out")]) == 0
     return tmp_path
