@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from holod_training.config import OpticsConfig
-from holod_training.optics import half_band_mask, propagate
+from holod_training.optics import frequencies, half_band_mask, propagate, transfer
 
 OCCLUSION_LAYERS = 8
 SMOOTH_PHASE_LAYERS = 24
@@ -39,10 +39,12 @@ def layered_asm(amplitude: Tensor, depth: Tensor, optics: OpticsConfig, layers: 
     layer = (depth * layers).long().clamp(0, layers - 1)
     centres = [optics.distance_m(optics.dioptres((k + 0.5) / layers)) for k in range(layers)]
     source = amplitude.to(torch.complex64)
+    fy, fx = (frequencies(size, optics.pitch_m, depth.device) for size in depth.shape)
+    step = transfer(optics, fx, fy, [centres[1] - centres[0]])[0].to(source.dtype)
     field = torch.zeros_like(source)
-    for k, centre in enumerate(centres):
+    for k in range(layers):
         if k:
-            field = propagate(field, optics, centre - centres[k - 1])
+            field = torch.fft.ifft2(torch.fft.fft2(field) * step)
         field = torch.where((layer == k) | (layer == k + 1), source, field)
     return stop_half_band(propagate(field, optics, -centres[-1]))
 
