@@ -1,4 +1,4 @@
-"""The command line: python -m holod_training {train,evaluate,export,golden}."""
+"""The command line: python -m holod_training {train,evaluate,eyebox,export,golden}."""
 
 from __future__ import annotations
 
@@ -111,6 +111,13 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--timing-calls", type=int, default=judging.timing_calls)
     evaluate.set_defaults(run=_evaluate)
 
+    eyebox = command("eyebox", "Shows where the light is in the pupil's plane, and how far an eye may move")
+    eyebox.add_argument("--weights", required=True)
+    eyebox.add_argument("--test", required=True, help="folder of held-out scenes")
+    eyebox.add_argument("--out", required=True)
+    eyebox.add_argument("--limit", type=int, help="only so many scenes")
+    eyebox.set_defaults(run=_eyebox)
+
     export = command("export", "Writes a weights file from a checkpoint or another weights file")
     export.add_argument(
         "--source", required=True, help="checkpoint.pt of a run (its averaged weights) or a weights file"
@@ -158,6 +165,12 @@ def _evaluate(options: argparse.Namespace) -> None:
         timing_calls=options.timing_calls,
     )
     print(markdown(evaluate(config, choose_device(options.device))), end="")
+
+
+def _eyebox(options: argparse.Namespace) -> None:
+    from holod_training.eyebox import write_eyebox
+
+    print(write_eyebox(Path(options.weights), Path(options.test), Path(options.out), options.limit), end="")
 
 
 def _export(options: argparse.Namespace) -> None:

@@ -71,11 +71,15 @@ def half_band_mask(height: int, width: int, device: torch.device | str = "cpu") 
     return fy[:, None] & fx[None, :]
 
 
-def pupil_mask(optics: OpticsConfig, fx: Tensor, fy: Tensor, pupil_mm: float) -> Tensor:
-    """The eye's pupil in the Fourier plane: a disc of radius (s/2)/(λ·f), bool [3, len(fy), len(fx)]."""
-    radius = torch.sqrt(fx[None, :] ** 2 + fy[:, None] ** 2)
-    limits = [pupil_mm * 0.5e-3 / (wavelength * optics.focal_length_m) for wavelength in optics.wavelengths_m]
-    return torch.stack([radius < limit for limit in limits])
+def pupil_mask(optics: OpticsConfig, fx: Tensor, fy: Tensor, pupil_mm: float, shift_mm: float = 0.0) -> Tensor:
+    """The eye's pupil in the Fourier plane, bool [3, len(fy), len(fx)]: a disc of radius (s/2)/(λ·f), its centre
+    `shift_mm` along x from the eyebox's."""
+    masks = []
+    for wavelength in optics.wavelengths_m:
+        per_mm = 1e-3 / (wavelength * optics.focal_length_m)
+        radius = torch.sqrt((fx[None, :] - shift_mm * per_mm) ** 2 + fy[:, None] ** 2)
+        masks.append(radius < 0.5 * pupil_mm * per_mm)
+    return torch.stack(masks)
 
 
 def upsample_half_band(low: Tensor) -> Tensor:
