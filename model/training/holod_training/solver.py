@@ -83,7 +83,7 @@ def shown_by_panel(low: Tensor, amplitude_constant: float) -> Tensor:
 def optimise(
     stack: Stack, start: Tensor, optics: OpticsConfig, amplitude_constant: float, config: SolverConfig
 ) -> Solution:
-    """Adam on the field itself, from `start` (complex [3, H, W]; its half band counts), towards the stack's target.
+    """Adam on the field itself, from `start` (complex [3, H, W], of frames [N, 3, H, W] the first; its half band counts), towards the stack's target.
 
     The loss is the training's own, of what the panel shows after double phase. The best field met is returned, so it
     never ends above where it began.
@@ -94,7 +94,8 @@ def optimise(
     height, width = stack.depth.shape
     eye = HalfBandEye(optics, height, width, focus, stack.depth.device)
     blur = coc_px(optics, stack.depth, focus, stack.pupil_mm)
-    samples = half_band_samples(start).repeat(config.frames, 1, 1, 1)
+    first = start if start.dim() == 3 else start[0]
+    samples = half_band_samples(first).repeat(config.frames, 1, 1, 1)
     if config.frames > 1:
         samples += config.spread * smooth_noise(tuple(samples.shape), config.seed).to(samples.device)
     low = torch.view_as_real(samples).requires_grad_()

@@ -58,6 +58,8 @@ def test_it_beats_its_start_and_itself_with_more_iterations(stack: Stack) -> Non
     assert more.last_loss < few.last_loss < few.first_loss == more.first_loss
     assert psnr_db(stack, more.field) > psnr_db(stack, start(stack)) + 1
     assert more.field.shape == (1, 3, 32, 48)
+    frames = torch.stack((start(stack), torch.zeros_like(start(stack))))
+    assert optimise(stack, frames, OPTICS, CONSTANT, SolverConfig(iterations=0)).last_loss == more.first_loss
     none = solve(stack, iterations=0)
     assert none.last_loss == none.first_loss
     torch.testing.assert_close(none.field[0], start(stack), atol=1e-4, rtol=0)
