@@ -83,10 +83,11 @@ def shown_by_panel(low: Tensor, amplitude_constant: float) -> Tensor:
 def optimise(
     stack: Stack, start: Tensor, optics: OpticsConfig, amplitude_constant: float, config: SolverConfig
 ) -> Solution:
-    """Adam on the field itself, from `start` (complex [3, H, W], of frames [N, 3, H, W] the first; its half band counts), towards the stack's target.
+    """Adam on the field itself, towards the stack's target.
 
-    The loss is the training's own, of what the panel shows after double phase. The best field met is returned, so it
-    never ends above where it began.
+    start: complex [3, H, W], of which the half band counts; of frames [N, 3, H, W] the first. The loss is the
+    training's own, of what the panel shows after double phase. The best field met is returned, so it never ends above
+    where it began.
     """
     chosen = torch.linspace(0, len(stack.focus_dpt) - 1, min(config.planes, len(stack.focus_dpt))).round().long()
     focus = [stack.focus_dpt[k] for k in chosen]
