@@ -16,6 +16,7 @@ NUMBERS = (
     ("ssim", "SSIM", 3),
 )
 PAIRED = NUMBERS[:4]
+FEW_SCENES = 10
 PLOTS = {
     "pupils": "PSNR and slope against the pupil",
     "focus_curve": "sharp in focus against right over all",
@@ -41,12 +42,13 @@ def _opening(result: dict[str, Any]) -> list[str]:
         if solver["scenes"]
         else ""
     )
+    few = " With so few scenes these are too narrow." if result["scenes"] < FEW_SCENES else ""
     return [
         f"# Evaluation of {result['weights']}",
         "",
         f"{result['date']}: {result['scenes']} held-out scenes of {width}x{height}, all {len(result['focus_dpt'])} "
         f"focal planes, a border of {result['border_px']} px left out; linear light, peak 1. Means over scenes, in "
-        f"brackets their 95 % bootstrap interval. Amplitude constant {result['amplitude_constant']}. Slope and "
+        f"brackets their 95 % bootstrap interval.{few} Amplitude constant {result['amplitude_constant']}. Slope and "
         "correlation: P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, 0 = one picture at all "
         f"depths). In focus: CoC < 2 px; out of focus: CoC > 8 px. Everything is after double phase.{optimised}",
     ]
