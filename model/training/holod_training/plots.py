@@ -79,10 +79,12 @@ def focus_curve_plot(curve: dict[str, Any]) -> Figure:
         sharey=True,
     )
     styles = _styles(dict.fromkeys(row["method"] for row in curve["methods"]))
+    scenes = curve["solver"][0]["scenes"]
+    label = f"optimised, 1 frame, by in-focus\nweight (all on {scenes} scene{'s' if scenes > 1 else ''})"
     for ax, pupil in zip(axes[0], pupils, strict=True):
         rows = [r for r in curve["solver"] if r["pupil_mm"] == pupil]
         x, y = [r["psnr_db"] for r in rows], [r["psnr_in_focus_db"] for r in rows]
-        ax.plot(x, y, "k.-", lw=1, label="optimised, 1 frame, by in-focus weight")
+        ax.plot(x, y, "k.-", lw=1, label=label)
         for row in rows:
             at = (row["psnr_db"], row["psnr_in_focus_db"])
             ax.annotate(f"{row['in_focus_weight']:g}", at, (-5, 0), textcoords="offset points", fontsize=7, ha="right")
@@ -194,12 +196,8 @@ def _on_every_scene(result: dict[str, Any]) -> Iterable[str]:
 
 
 def _with_scenes(result: dict[str, Any], method: str) -> str:
-    scenes = _shown_rows(result, method)[0]["scenes"]
-    return (
-        method
-        if scenes == result["scenes"]
-        else f"{method} (difference to ours, {scenes} of {result['scenes']} scenes)"
-    )
+    found, every = _shown_rows(result, method)[0]["scenes"], result["scenes"]
+    return method if found == every else f"{method} (by difference, {found} of {every} scenes)"
 
 
 def _styles(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
