@@ -99,12 +99,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     evaluate.add_argument("--solver-start", choices=tuple(SOLVER_STARTS), default="network")
     evaluate.add_argument("--solver-iterations", type=int, default=judging.solver.iterations)
-    evaluate.add_argument("--solver-frames", type=_numbers(int), default=judging.solver_frames, help="such as 1,2,3")
+    evaluate.add_argument("--solver-frames", type=_list_of(int), default=judging.solver_frames, help="such as 1,2,3")
     evaluate.add_argument("--solver-focus-weight", type=float, default=judging.solver.loss.focus)
     evaluate.add_argument("--solver-in-focus-weight", type=float, default=judging.solver.loss.in_focus)
     evaluate.add_argument(
         "--focus-curve-weights",
-        type=_numbers(float),
+        type=_list_of(float),
         default=judging.focus_curve_weights,
         help="in-focus weights, such as 0,30,100,300: adds the curve between sharp in focus and soft out of it",
     )
@@ -135,7 +135,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _numbers(kind: type[int] | type[float]) -> Callable[[str], tuple[float, ...]]:
+def _list_of(kind: type[int] | type[float]) -> Callable[[str], tuple[float, ...]]:
     def parse(text: str) -> tuple[float, ...]:
         return tuple(kind(part) for part in text.split(","))
 

@@ -28,7 +28,7 @@ from holod_training.offsets import offset_statistics
 from holod_training.plots import write_plots
 from holod_training.refocus import refocus_cards
 from holod_training.report import markdown
-from holod_training.rgbd import write_rgbd_sheet
+from holod_training.rgbd import find_pairs, write_rgbd_sheet
 from holod_training.shards import open_shards
 from holod_training.sheets import write_sheet
 from holod_training.solver import optimise
@@ -51,6 +51,8 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     optics = network.config.optics
     shards = open_alike(config.test, optics, config.limit)
     cards = open_shards(config.cards, optics) if config.cards else []
+    if config.rgbd:
+        find_pairs(config.rgbd)
     bench = Bench(optics, network.config.amplitude_constant, config.border_px, device)
     trained = [network_method(name, one) for name, one in networks.items()]
     learned_and_rivals = [*trained, *rivals(optics)]

@@ -53,7 +53,8 @@ def refocus_cards(shards: list[Shard], methods: list[Method], bench: Bench, shee
             panel = None
             for pupil in PUPILS_MM:
                 if panel is None or method.adapts:
-                    panel, _ = bench.panel(method.field(stack, pupil))
+                    given = shard.pupils_mm.index(pupil) if pupil in shard.pupils_mm else 0
+                    panel, _ = bench.panel(method.field(bench.read(shard, given), pupil))
                 near_focus, far_focus = bench.look(panel, pupil, focus)
                 energy = {
                     name: (gradient_energy(near_focus, area), gradient_energy(far_focus, area))

@@ -146,6 +146,20 @@ def test_costs_and_offsets(evaluation: Path) -> None:
     assert {r["scenes"] for r in curve["methods"]} == {1}
 
 
+def test_a_folder_without_pictures_is_refused_before_the_work(evaluation: Path, tmp_path: Path, capsys) -> None:
+    arguments = ["--weights", str(evaluation / "w.safetensors"), "--test", str(evaluation / "test")]
+    assert main(["evaluate", *arguments, "--rgbd", str(tmp_path), "--out", str(tmp_path / "out")]) == 65
+    assert "no RGB-D pairs in it" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_methods_of_one_name_are_refused(evaluation: Path, tmp_path: Path, capsys) -> None:
+    weights = str(evaluation / "deeper.safetensors")
+    arguments = ["--weights", weights, "--also", weights, "--also", weights, "--test", str(evaluation / "test")]
+    assert main(["evaluate", *arguments, "--out", str(tmp_path / "out")]) == 65
+    assert "a second method named 'deeper'" in capsys.readouterr().err
+
+
 def verdicts(result: dict) -> dict[str, bool]:
     return {what: passed for what, _, _, passed in checks(result)}
 
