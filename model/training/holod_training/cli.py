@@ -13,14 +13,20 @@ from typing import Any
 import torch
 
 from holod_training.config import CONDITIONINGS, ConfigError, NetworkConfig
+from holod_training.evaluate_config import EvaluateConfig
 from holod_training.export import WeightsError
+from holod_training.goals import ReportError
+from holod_training.judging import LAYERED_ASM, OURS
 from holod_training.loss import LossWeights
+from holod_training.rgbd import RgbdError
 from holod_training.sampling import AugmentConfig
 from holod_training.shards import ShardError
+from holod_training.solver import SolverConfig
 from holod_training.train import PRECISIONS, TrainConfig, TrainingError, train
 from holod_training.variants import DEFAULT_VARIANT, VARIANTS, variant
 
 EX_DATAERR = 65
+SOLVER_STARTS = {"network": OURS, "layered-asm": LAYERED_ASM}
 
 
 def choose_device(name: str) -> torch.device:
@@ -38,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
         torch.set_num_threads(options.threads)
     try:
         options.run(options)
-    except (ConfigError, ShardError, TrainingError, WeightsError) as error:
+    except (ConfigError, ReportError, RgbdError, ShardError, TrainingError, WeightsError) as error:
         print(f"error: {error}", file=sys.stderr)
         return EX_DATAERR
     return 0
@@ -70,11 +76,32 @@ def _parser() -> argparse.ArgumentParser:
     comparison.set_defaults(run=_compare)
 
     evaluate = command("evaluate", "Judges a weights file on held-out scenes and cards, beside its rivals")
+    judging = EvaluateConfig(Path(), Path(), Path())
     evaluate.add_argument("--weights", required=True)
-    evaluate.add_argument("--test", required=True, help="folder of held-out scenes with pupils 1,2,3,4,5")
+    evaluate.add_argument(
+        "--test", required=True, help="folder of held-out scenes of one size and with the same pupils"
+    )
     evaluate.add_argument("--cards", help="folder of refocus cards")
     evaluate.add_argument("--out", required=True)
     evaluate.add_argument("--limit", type=int, help="only so many scenes")
+    evaluate.add_argument("--also", action="append", default=[], help="another weights file to judge too; repeatable")
+    evaluate.add_argument("--rgbd", help="folder with rgb/NAME.jpg and depth/NAME.png (millimetres): adds a sheet")
+    evaluate.add_argument("--border-px", type=int, default=judging.border_px, help="left out on every side")
+    evaluate.add_argument(
+        "--solver-scenes", type=int, default=judging.solver_scenes, help="scenes for direct optimisation; 0: none"
+    )
+    evaluate.add_argument("--solver-start", choices=tuple(SOLVER_STARTS), default="network")
+    evaluate.add_argument("--solver-iterations", type=int, default=judging.solver.iterations)
+    evaluate.add_argument("--solver-frames", type=_list_of(int), default=judging.solver_frames, help="such as 1,2,3")
+    evaluate.add_argument("--solver-focus-weight", type=float, default=judging.solver.loss.focus)
+    evaluate.add_argument("--solver-in-focus-weight", type=float, default=judging.solver.loss.in_focus)
+    evaluate.add_argument(
+        "--focus-curve-weights",
+        type=_list_of(float),
+        default=judging.focus_curve_weights,
+        help="in-focus weights, such as 0,30,100,300: adds the curve between sharp in focus and soft out of it",
+    )
+    evaluate.add_argument("--timing-calls", type=int, default=judging.timing_calls)
     evaluate.set_defaults(run=_evaluate)
 
     eyebox = command("eyebox", "Shows where the light is in the pupil's plane, and how far an eye may move")
@@ -130,22 +157,18 @@ def _option_of(loss_key: str) -> str:
     return f"--{loss_key.replace('_', '-')}" + ("" if loss_key.endswith("_px") else "-weight")
 
 
-def _numbers(kind: Callable[[str], float]) -> Callable[[str], tuple[float, ...]]:
-    return lambda text: tuple(kind(part) for part in text.split(",") if part)
-
-
 def _network_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--variant", choices=VARIANTS, default=DEFAULT_VARIANT, help="what the options below change")
     sub.add_argument("--layers", type=int, help="the adjustable layer moves to the middle unless it is named too")
     sub.add_argument("--channels", type=int)
     sub.add_argument("--grid", choices=("half-band", "full"))
-    sub.add_argument("--adjustable-layers", type=_numbers(int), metavar="I,I,..")
-    sub.add_argument("--dilations", type=_numbers(int), metavar="D,D,..", help="one for each layer")
+    sub.add_argument("--adjustable-layers", type=_list_of(int), metavar="I,I,..")
+    sub.add_argument("--dilations", type=_list_of(int), metavar="D,D,..", help="one for each layer")
     sub.add_argument("--conditioning", choices=CONDITIONINGS)
     sub.add_argument("--pupil-inputs", action=argparse.BooleanOptionalAction)
     sub.add_argument("--blur-input", action=argparse.BooleanOptionalAction)
     sub.add_argument("--frames", type=int)
-    sub.add_argument("--specialists-mm", type=_numbers(float), metavar="MM,MM,..")
+    sub.add_argument("--specialists-mm", type=_list_of(float), metavar="MM,MM,..")
     sub.add_argument("--depth-layers", type=int)
     sub.add_argument("--transport-prior", action=argparse.BooleanOptionalAction)
     sub.add_argument("--planes", type=int)
@@ -175,15 +198,36 @@ def _compare(options: argparse.Namespace) -> None:
     print(compare(_train_config(options, steps=0), names, 60 * options.minutes, choose_device(options.device)), end="")
 
 
+def _list_of(kind: type[int] | type[float]) -> Callable[[str], tuple[float, ...]]:
+    def parse(text: str) -> tuple[float, ...]:
+        return tuple(kind(part) for part in text.split(","))
+
+    parse.__name__ = f"comma-separated {kind.__name__}"
+    return parse
+
+
 def _evaluate(options: argparse.Namespace) -> None:
     from holod_training.evaluate import evaluate
     from holod_training.report import markdown
 
-    cards = Path(options.cards) if options.cards else None
-    print(
-        markdown(evaluate(Path(options.weights), Path(options.test), cards, Path(options.out), limit=options.limit)),
-        end="",
+    loss = LossWeights(focus=options.solver_focus_weight, in_focus=options.solver_in_focus_weight)
+    config = EvaluateConfig(
+        weights=Path(options.weights),
+        test=Path(options.test),
+        out=Path(options.out),
+        cards=Path(options.cards) if options.cards else None,
+        rgbd=Path(options.rgbd) if options.rgbd else None,
+        also=tuple(Path(path) for path in options.also),
+        limit=options.limit,
+        border_px=options.border_px,
+        solver=SolverConfig(iterations=options.solver_iterations, loss=loss),
+        solver_start=SOLVER_STARTS[options.solver_start],
+        solver_scenes=options.solver_scenes,
+        solver_frames=options.solver_frames,
+        focus_curve_weights=options.focus_curve_weights,
+        timing_calls=options.timing_calls,
     )
+    print(markdown(evaluate(config, choose_device(options.device))), end="")
 
 
 def _eyebox(options: argparse.Namespace) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from functools import cache
 
 import torch
 from torch import Tensor
@@ -49,55 +48,79 @@ def focus_response(picture: Tensor, target: Tensor) -> tuple[float, float]:
 
     1 is the target's full refocus, 0 the same picture at all planes; a flat picture has correlation 0.
     """
-    p = (picture - picture.mean(dim=0)).double()
-    r = (target - target.mean(dim=0)).double()
-    pr, rr, pp = (p * r).sum(), r.square().sum(), p.square().sum()
+    picture_mean, target_mean = picture.mean(dim=0), target.mean(dim=0)
+    pr = rr = pp = 0.0
+    for shown, wanted in zip(picture, target, strict=True):
+        p, r = (shown - picture_mean).double(), (wanted - target_mean).double()
+        pr += float((p * r).sum())
+        rr += float(r.square().sum())
+        pp += float(p.square().sum())
     if rr <= 1e-12:
         return math.nan, math.nan
-    return float(pr / rr), float(pr / (pp * rr).sqrt()) if pp > 1e-12 else 0.0
+    return pr / rr, pr / math.sqrt(pp * rr) if pp > 1e-12 else 0.0
 
 
 def ssim(picture: Tensor, target: Tensor) -> float:
     """Wang et al. 2004: 11x11 Gaussian, σ 1.5, peak 1, over [K, 3, H, W]; windows that fit only, mean of all."""
-    rows, columns = _gaussian_windows(picture.shape[-2]), _gaussian_windows(picture.shape[-1])
+    return sum(_ssim_map(p, t).double().mean().item() for p, t in zip(picture, target, strict=True)) / len(target)
 
-    def blur(t: Tensor) -> Tensor:
-        return rows @ t @ columns.T
 
-    mp, mt = blur(picture), blur(target)
-    vp = blur(picture * picture) - mp * mp
-    vt = blur(target * target) - mt * mt
-    covariance = blur(picture * target) - mp * mt
+def _ssim_map(picture: Tensor, target: Tensor) -> Tensor:
+    mp, mt = _windowed(picture), _windowed(target)
+    vp = _windowed(picture * picture) - mp * mp
+    vt = _windowed(target * target) - mt * mt
+    covariance = _windowed(picture * target) - mp * mt
     c1, c2 = 0.01**2, 0.03**2
-    return float((((2 * mp * mt + c1) * (2 * covariance + c2)) / ((mp**2 + mt**2 + c1) * (vp + vt + c2))).mean())
+    return ((2 * mp * mt + c1) * (2 * covariance + c2)) / ((mp**2 + mt**2 + c1) * (vp + vt + c2))
 
 
-@cache
-def _gaussian_windows(size: int) -> Tensor:
-    """The 11-tap Gaussian at every place where it fits, as a banded matrix [size - 10, size]."""
-    x = torch.arange(11, dtype=torch.float32) - 5
-    g = torch.exp(-x.square() / (2 * 1.5**2))
-    band = torch.zeros(size - 10, size)
-    for row in range(size - 10):
-        band[row, row : row + 11] = g / g.sum()
-    return band
+def _windowed(light: Tensor) -> Tensor:
+    """The Gaussian mean [..., H - 10, W - 10] where the window fits. Eleven shifted sums a way: on a CPU eight times
+    faster than a convolution of one channel, and without a matrix that grows with the picture."""
+    taps = [math.exp(-((k - 5) ** 2) / (2 * 1.5**2)) for k in range(11)]
+    for dim in (-1, -2):
+        size = light.shape[dim] - 10
+        total = torch.zeros_like(light.narrow(dim, 0, size))
+        for k, tap in enumerate(taps):
+            total.add_(light.narrow(dim, k, size), alpha=tap / sum(taps))
+        light = total
+    return light
 
 
 def judge(picture: Tensor, target: Tensor, coc_px: Tensor, border_px: int, with_ssim: bool = True) -> Judgement:
-    """picture, target [K, 3, H, W] linear light; coc_px [K, H, W]; a border is left out."""
+    """picture, target [K, 3, H, W] linear light; coc_px [K, H, W]; a border is left out. Plane by plane: a stack of
+    fifty focuses in full HD leaves no room for copies."""
     picture, target, coc_px = (inner(t, border_px) for t in (picture, target, coc_px))
-    error = (picture - target).square()
-    sharp = (coc_px < IN_FOCUS_PX)[:, None].expand_as(error)
-    blurred = (coc_px > OUT_OF_FOCUS_PX)[:, None].expand_as(error)
+    whole, sharp, blurred = _Mean(), _Mean(), _Mean()
+    for shown, wanted, blur in zip(picture, target, coc_px, strict=True):
+        error = (shown - wanted).square()
+        whole.add(error)
+        sharp.add(error[:, blur < IN_FOCUS_PX])
+        blurred.add(error[:, blur > OUT_OF_FOCUS_PX])
     slope, correlation = focus_response(picture, target)
     return Judgement(
-        psnr_db=psnr_db(error),
-        psnr_in_focus_db=psnr_db(error[sharp]),
-        psnr_out_of_focus_db=psnr_db(error[blurred]),
+        psnr_db=whole.psnr_db(),
+        psnr_in_focus_db=sharp.psnr_db(),
+        psnr_out_of_focus_db=blurred.psnr_db(),
         slope=slope,
         correlation=correlation,
         ssim=ssim(picture, target) if with_ssim else math.nan,
     )
+
+
+class _Mean:
+    """Of squared errors that come in parts."""
+
+    def __init__(self) -> None:
+        self.total = 0.0
+        self.count = 0
+
+    def add(self, squared_error: Tensor) -> None:
+        self.total += squared_error.double().sum().item()
+        self.count += squared_error.numel()
+
+    def psnr_db(self) -> float:
+        return -10 * math.log10(max(self.total / self.count, 1e-12)) if self.count else math.nan
 
 
 def gradient_energy(picture: Tensor, area: Tensor) -> float:

@@ -91,14 +91,14 @@ def upsample_half_band(low: Tensor) -> Tensor:
     spectrum = torch.fft.fft2(low)
     fy, fx = frequencies(2 * h, 1.0, low.device), frequencies(2 * w, 1.0, low.device)
     full = torch.zeros(*low.shape[:-2], 2 * h, 2 * w, dtype=low.dtype, device=low.device)
-    low_rows, rows = _kept_bins(h, low.device)
-    low_columns, columns = _kept_bins(w, low.device)
+    low_rows, rows = kept_bins(h, low.device)
+    low_columns, columns = kept_bins(w, low.device)
     full[..., rows[:, None], columns] = spectrum[..., low_rows[:, None], low_columns]
     shift = _phase(-2 * math.pi * 0.5 * (fy[:, None] + fx[None, :]))
     return torch.fft.ifft2(full * (4 * shift).to(low.dtype))
 
 
-def _kept_bins(size: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def kept_bins(size: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Bins below the low grid's Nyquist frequency: where they lie on the low grid, and on one of twice the size."""
     signed = torch.arange(-((size - 1) // 2), (size - 1) // 2 + 1, device=device)
     return signed % size, signed % (2 * size)

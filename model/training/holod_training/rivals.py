@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from holod_training.config import OpticsConfig
-from holod_training.optics import half_band_mask, propagate
+from holod_training.optics import frequencies, half_band_mask, propagate, transfer
 
 OCCLUSION_LAYERS = 8
+SMOOTH_PHASE_LAYERS = 24
+ANTI_ALIASING_SIGMA_PX = 0.7
+PRIOR_SIGMAS_PX = (1.0, 2.5)
+PRIOR_GAINS = (-0.5, -1.0)
+PRIOR_WAVELENGTH_NM = 520.0
 
 
 def stop_half_band(field: Tensor) -> Tensor:
-    return torch.fft.ifft2(torch.fft.fft2(field) * half_band_mask(*field.shape[-2:]))
+    return torch.fft.ifft2(torch.fft.fft2(field) * half_band_mask(field.shape[-2], field.shape[-1], field.device))
 
 
 def all_in_focus(amplitude: Tensor, depth: Tensor, optics: OpticsConfig) -> Tensor:
@@ -24,21 +30,65 @@ def all_in_focus(amplitude: Tensor, depth: Tensor, optics: OpticsConfig) -> Tens
     return stop_half_band(propagate(amplitude.to(torch.complex64), optics, -middle))
 
 
-def layered_asm(amplitude: Tensor, depth: Tensor, optics: OpticsConfig) -> Tensor:
-    """Eight depth layers composed far to near with occlusion, zero phase on the object.
+def layered_asm(amplitude: Tensor, depth: Tensor, optics: OpticsConfig, layers: int = OCCLUSION_LAYERS) -> Tensor:
+    """Equal depth layers composed far to near with occlusion, zero phase on the object (or `amplitude`'s own).
 
     f ← f·(1 − m) + O·m, where m covers the layer and its next nearer one (no seams on slanted surfaces), propagated
     by one layer's distance between them. Same shapes as `all_in_focus`.
     """
-    layer = (depth * OCCLUSION_LAYERS).long().clamp(0, OCCLUSION_LAYERS - 1)
-    centres = [optics.distance_m(optics.dioptres((k + 0.5) / OCCLUSION_LAYERS)) for k in range(OCCLUSION_LAYERS)]
+    layer = (depth * layers).long().clamp(0, layers - 1)
+    centres = [optics.distance_m(optics.dioptres((k + 0.5) / layers)) for k in range(layers)]
     source = amplitude.to(torch.complex64)
+    fy, fx = (frequencies(size, optics.pitch_m, depth.device) for size in depth.shape)
+    step = transfer(optics, fx, fy, [centres[1] - centres[0]])[0].to(source.dtype)
     field = torch.zeros_like(source)
-    for k, centre in enumerate(centres):
+    for k in range(layers):
         if k:
-            field = propagate(field, optics, centre - centres[k - 1])
+            field = torch.fft.ifft2(torch.fft.fft2(field) * step)
         field = torch.where((layer == k) | (layer == k + 1), source, field)
     return stop_half_band(propagate(field, optics, -centres[-1]))
+
+
+def smooth_phase(amplitude: Tensor, depth: Tensor, optics: OpticsConfig) -> Tensor:
+    """Every pixel in focus at its own depth, its phase that of one axial plane wave there, so smooth in the hologram.
+
+    Twenty-four layers with occlusion instead of `layered_asm`'s eight, and the anti-aliasing Gaussian of double phase
+    (3x3, σ 0.7 px) on the complex field before the 4f stop: the kind of target that smooth-phase networks learn.
+    """
+    field = layered_asm(amplitude, depth, optics, SMOOTH_PHASE_LAYERS)
+    return stop_half_band(
+        torch.complex(
+            gaussian_blur(field.real, ANTI_ALIASING_SIGMA_PX, radius_px=1),
+            gaussian_blur(field.imag, ANTI_ALIASING_SIGMA_PX, radius_px=1),
+        )
+    )
+
+
+def transport_of_intensity(amplitude: Tensor, depth: Tensor, optics: OpticsConfig) -> Tensor:
+    """`layered_asm` of an object whose phase makes light drift from bright to dark where it is out of focus.
+
+    φ = (520 nm / λ) · Σ_j g_j · tanh(4·(½ − D)) · (G_σj(log(I + 0.03)) + 1.66), σ = 1 and 2.5 px, g = −0.5 and −1.
+    Near objects take the other sign than far ones, since the drift turns round behind the volume's middle.
+    """
+    logarithm = torch.log(amplitude.square() + 0.03)
+    sign = torch.tanh(4 * (0.5 - depth))
+    phase = torch.zeros_like(amplitude)
+    for gain, sigma in zip(PRIOR_GAINS, PRIOR_SIGMAS_PX, strict=True):
+        phase += gain * sign * (gaussian_blur(logarithm, sigma) + 1.66)
+    wavelengths = torch.tensor(optics.wavelengths_nm, dtype=phase.dtype, device=phase.device)
+    phase = phase * (PRIOR_WAVELENGTH_NM / wavelengths)[:, None, None]
+    return layered_asm(torch.polar(amplitude, phase), depth, optics)
+
+
+def gaussian_blur(light: Tensor, sigma_px: float, radius_px: int | None = None) -> Tensor:
+    """[3, H, W] blurred on itself, the edge's value going on outside; cut off at 3 σ or `radius_px`."""
+    radius = radius_px or int(3 * sigma_px + 0.5)
+    x = torch.arange(-radius, radius + 1, dtype=light.dtype, device=light.device)
+    window = torch.exp(-x.square() / (2 * sigma_px**2))
+    window = (window / window.sum()).expand(len(light), 1, 1, -1)
+    padded = F.pad(light[None], (radius, radius, radius, radius), mode="replicate")
+    rows = F.conv2d(padded, window, groups=len(light))
+    return F.conv2d(rows, window.transpose(-2, -1), groups=len(light))[0]
 
 
 def flat_oracle(target: Tensor) -> Tensor:

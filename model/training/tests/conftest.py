@@ -17,17 +17,18 @@ torch.set_num_threads(1)
 def write_shard(
     path: Path,
     seed: int = 0,
-    size: int = 64,
+    size: int | tuple[int, int] = 64,
     pupils_mm: tuple[float, ...] = (1.0, 2.0, 3.0),
     planes: int = 3,
     metadata: dict[str, str] | None = None,
 ) -> Path:
     """A flat picture with a brighter square that fades with |focus - depth|: enough for a loss to fall."""
     optics = OpticsConfig()
+    height, width = size if isinstance(size, tuple) else (size, size)
     generator = torch.Generator().manual_seed(seed)
-    image = torch.rand(3, size, size, generator=generator) * 0.2 + 0.3
-    image[:, size // 4 : size // 2, size // 4 : size // 2] += 0.4
-    depth = torch.linspace(0, 1, size).expand(size, size).contiguous()
+    image = torch.rand(3, height, width, generator=generator) * 0.2 + 0.3
+    image[:, height // 4 : height // 2, width // 4 : width // 2] += 0.4
+    depth = torch.linspace(0, 1, width).expand(height, width).contiguous()
     focus = [optics.dioptres(k / (planes - 1)) for k in range(planes)]
     tensors = {"image": image.half(), "depth": depth}
     for index, pupil in enumerate(pupils_mm):

@@ -1,3 +1,4 @@
+import copy
 import json
 from pathlib import Path
 
@@ -10,19 +11,23 @@ from safetensors.torch import load_file, save_file
 
 from holod_training.cli import main
 from holod_training.config import NetworkConfig, OpticsConfig
-from holod_training.evaluate import card_areas
 from holod_training.export import load_weights, read_metadata, save_weights
+from holod_training.goals import ReportError, checks, row_of
 from holod_training.network import DirectNetwork
 from holod_training.optics import coc_px, intensity, propagate
-from holod_training.report import bars, row_of
-from holod_training.rivals import all_in_focus, flat_oracle, layered_asm
+from holod_training.plots import on_all_scenes
+from holod_training.refocus import card_areas
+from holod_training.report import markdown
+from holod_training.rivals import all_in_focus, flat_oracle, layered_asm, smooth_phase, transport_of_intensity
 
-PUPILS = (1.0, 2.0, 3.0, 4.0, 5.0)
+PUPILS = (1.0, 2.0, 2.5, 4.0)
+TABLE_PUPILS = (1.0, 2.0, 4.0)
+RIVALS = ("all-in-focus", "layered ASM", "smooth phase", "transport of intensity")
 OPTICS = OpticsConfig()
 
 
 def write_card(path: Path, seed: int) -> None:
-    write_shard(path, seed=seed, size=128, pupils_mm=PUPILS)
+    write_shard(path, seed=seed, size=128, pupils_mm=(1.0, 2.0))
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata()
     tensors = load_file(path)
@@ -33,53 +38,182 @@ def write_card(path: Path, seed: int) -> None:
 
 @pytest.fixture(scope="module")
 def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes that are not square, two networks, cards and a real-looking RGB-D pair, everything on."""
     torch.manual_seed(1)
     tmp_path = tmp_path_factory.mktemp("evaluation")
-    weights = tmp_path / "w.safetensors"
-    save_weights(weights, DirectNetwork(NetworkConfig(layers=4, channels=8, adjustable_layers=(1,))), {}, {"seed": 1})
-    write_shard(tmp_path / "test" / "scene_000000.safetensors", size=64, pupils_mm=PUPILS)
+    for name, layers in (("w", 4), ("deeper", 6)):
+        config = NetworkConfig(layers=layers, channels=8, adjustable_layers=(1,))
+        save_weights(tmp_path / f"{name}.safetensors", DirectNetwork(config), {}, {"seed": 1})
     for index in range(2):
+        write_shard(tmp_path / "test" / f"scene_{index:06}.safetensors", index, size=(64, 80), pupils_mm=PUPILS)
         write_card(tmp_path / "cards" / f"scene_{index:06}.safetensors", seed=index)
-    arguments = ["--weights", weights, "--test", tmp_path / "test", "--cards", tmp_path / "cards"]
-    assert main(["evaluate", *map(str, arguments), "--out", str(tmp_path / "out")]) == 0
+    for kind, name in (("rgb", "0.jpg"), ("depth", "0.png")):
+        (tmp_path / "real" / kind).mkdir(parents=True)
+        millimetres = torch.full((48, 65), 1500, dtype=torch.int32)
+        millimetres[:, :20], millimetres[10:14, 30:34] = 500, 0
+        if kind == "rgb":
+            Image.new("RGB", (65, 48), (200, 120, 60)).save(tmp_path / "real" / kind / name)
+        else:
+            Image.fromarray(millimetres.numpy().astype("uint16")).save(tmp_path / "real" / kind / name)
+    folders = ["--test", tmp_path / "test", "--cards", tmp_path / "cards", "--rgbd", tmp_path / "real"]
+    weights = ["--weights", tmp_path / "w.safetensors", "--also", tmp_path / "deeper.safetensors"]
+    solver = [
+        "--solver-start",
+        "layered-asm",
+        "--solver-scenes",
+        "1",
+        "--solver-iterations",
+        "5",
+        "--solver-frames",
+        "2",
+    ]
+    options = [*folders, *weights, *solver, "--focus-curve-weights", "0,100", "--timing-calls", "1"]
+    assert main(["evaluate", *map(str, options), "--out", str(tmp_path / "out")]) == 0
     return tmp_path
 
 
+def read(evaluation: Path) -> dict:
+    return json.loads((evaluation / "out" / "evaluation.json").read_text())
+
+
 def test_evaluation_is_complete(evaluation: Path) -> None:
-    result = json.loads((evaluation / "out" / "evaluation.json").read_text())
-    for method in ("holod", "all-in-focus", "layered ASM"):
+    result = read(evaluation)
+    assert (result["pupils_mm"], result["all_pupils_mm"]) == (list(TABLE_PUPILS), list(PUPILS))
+    for method in ("holod", "deeper", *RIVALS, "optimised, 2 frames"):
         for stage in ("before", "after"):
             for pupil in PUPILS:
-                assert row_of(result, method, stage, pupil)["psnr_db"] > 5
+                row = row_of(result, method, stage, pupil)
+                assert row["psnr_db"] > 5
+                assert row["scenes"] == (1 if "optimised" in method else 2)
+                assert ("psnr_db" in row["interval_95"]) == (row["scenes"] == 2)
     assert row_of(result, "flat oracle", "before", 4.0)["slope"] == 0
     matrix = result["matrix_psnr_db"]["after"]
-    for index, pupil in enumerate(PUPILS):
+    for index, pupil in enumerate(TABLE_PUPILS):
         assert matrix[index][index] == pytest.approx(row_of(result, "holod", "after", pupil)["psnr_db"], abs=1e-3)
-    assert matrix[0][4] != pytest.approx(matrix[4][4], abs=1e-3)
-    assert len(result["refocus"]) == 2 * 3 * 5
+    assert matrix[0][2] != pytest.approx(matrix[2][2], abs=1e-3)
+    assert len(result["refocus"]) == 2 * 6 * 5
     text = (evaluation / "out" / "evaluation.md").read_text()
-    assert "## After double phase" in text and "refocus ratio, near card, bright on dark, s = 4 mm" in text
-    assert Image.open(evaluation / "out" / "sheet.png").size == (4 * 68, 2 * 68)
+    assert "refocus ratio, near card, bright on dark, s = 5 mm" in text and "scenes are 80x64" in text
+    assert Image.open(evaluation / "out" / "sheet.png").size == (4 * 84, 4 * 68)
     assert Image.open(evaluation / "out" / "cards.png").size == (5 * 132, 2 * 132)
+    assert Image.open(evaluation / "out" / "rgbd.png").size == (5 * 68, 52)
+    assert result["plots"] == ["pupils", "focus_curve", "offsets", "capacity", "run_time"]
+    for name in result["plots"]:
+        assert Image.open(evaluation / "out" / f"{name}.png").size[0] > 500
 
 
-def test_bars_reject_a_flat_network_and_an_ignored_pupil(evaluation: Path) -> None:
-    result = json.loads((evaluation / "out" / "evaluation.json").read_text())
-    row_of(result, "holod", "after", 2.0)["slope"] = 0.19
-    result["matrix_psnr_db"]["after"] = [[20.0] * 5 for _ in range(5)]
-    verdicts = {what: passed for what, _, _, passed in bars(result)}
-    assert not verdicts["slope at s = 2 mm"]
-    assert not verdicts["right over opposite s, judged s = 1 mm"]
-    assert verdicts["right s behind the best, judged s = 3 mm"]
-    result["matrix_psnr_db"]["after"][0][2] = 20.2
-    assert not {what: passed for what, _, _, passed in bars(result)}["right s behind the best, judged s = 3 mm"]
+def test_means_and_pairs_are_those_of_the_scenes(evaluation: Path) -> None:
+    result, scenes = read(evaluation), json.loads((evaluation / "out" / "scenes.json").read_text())
+
+    def values(method: str, stage: str) -> list[float]:
+        key = (method, stage, 2.0)
+        return [s["psnr_db"] for s in scenes if (s["method"], s["double_phase"], s["pupil_mm"]) == key]
+
+    ours, theirs = values("holod", "after"), values("smooth phase", "after")
+    assert row_of(result, "holod", "after", 2.0)["psnr_db"] == pytest.approx(sum(ours) / 2)
+    pairs = {(r["method"], r["pupil_mm"]): r for r in result["paired"]}
+    found = pairs["smooth phase", 2.0]
+    differences = sorted(a - b for a, b in zip(ours, theirs, strict=True))
+    assert found["difference"]["psnr_db"] == pytest.approx(sum(differences) / 2)
+    assert found["interval_95"]["psnr_db"] == pytest.approx(differences)
+    flat = pairs["flat oracle", 2.0]["difference"]["psnr_db"]
+    assert flat == pytest.approx((sum(ours) - sum(values("flat oracle", "before"))) / 2)
+    few = pairs["optimised, 2 frames", 2.0]
+    shown = on_all_scenes(result, "optimised, 2 frames", 2.0, "psnr_db")
+    assert shown == pytest.approx(sum(ours) / 2 - (ours[0] - values("optimised, 2 frames", "after")[0]))
+    assert on_all_scenes(result, "smooth phase", 2.0, "psnr_db") == pytest.approx(sum(theirs) / 2)
+    assert few["scenes"] == 1 and ("holod", 2.0) not in pairs
 
 
-def test_evaluation_needs_the_five_pupils(evaluation: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_shard(evaluation / "few" / "scene_000000.safetensors", pupils_mm=(1.0, 2.0))
-    arguments = ["--weights", str(evaluation / "w.safetensors"), "--test", str(evaluation / "few")]
-    assert main(["evaluate", *arguments, "--out", str(evaluation / "none")]) == 65
-    assert "evaluation needs (1.0, 2.0, 3.0, 4.0, 5.0)" in capsys.readouterr().err
+def test_costs_and_offsets(evaluation: Path) -> None:
+    result = read(evaluation)
+    networks = {row["method"]: row for row in result["networks"]}
+    assert networks["holod"]["parameters"] == sum(
+        p.numel() for p in load_weights(evaluation / "w.safetensors").parameters()
+    )
+    # Two more layers: 9 taps, 8 channels in and out, two operations, on a quarter of the pixels.
+    more = networks["deeper"]["operations_per_px"] - networks["holod"]["operations_per_px"]
+    assert more == pytest.approx(2 * 9 * 8 * 8 * 2 / 4)
+    times = {row["method"]: row["ratio_to_ours"] for row in result["run_time"]["rows"]}
+    assert times["holod"] == 1 and times["optimised, 2 frames"] > 1
+    assert {(r["layer"], r["from_dpt"]) for r in result["offsets"]} == {
+        ("layers.1", round(OPTICS.dioptres(k / 5), 4)) for k in range(5)
+    }
+    curve = result["focus_curve"]
+    assert {(r["in_focus_weight"], r["pupil_mm"]) for r in curve["solver"]} == {
+        (w, s) for w in (0, 100) for s in (2, 4)
+    }
+    assert {r["scenes"] for r in curve["methods"]} == {1}
+
+
+def test_a_folder_without_pictures_is_refused_before_the_work(evaluation: Path, tmp_path: Path, capsys) -> None:
+    arguments = ["--weights", str(evaluation / "w.safetensors"), "--test", str(evaluation / "test")]
+    assert main(["evaluate", *arguments, "--rgbd", str(tmp_path), "--out", str(tmp_path / "out")]) == 65
+    assert "no RGB-D pairs in it" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_methods_of_one_name_are_refused(evaluation: Path, tmp_path: Path, capsys) -> None:
+    weights = str(evaluation / "deeper.safetensors")
+    arguments = ["--weights", weights, "--also", weights, "--also", weights, "--test", str(evaluation / "test")]
+    assert main(["evaluate", *arguments, "--out", str(tmp_path / "out")]) == 65
+    assert "a second method named 'deeper'" in capsys.readouterr().err
+
+
+def verdicts(result: dict) -> dict[str, bool]:
+    return {what: passed for what, _, _, passed in checks(result)}
+
+
+def test_goals_reject_a_flat_network_and_an_ignored_pupil(evaluation: Path) -> None:
+    result = read(evaluation)
+    row = row_of(result, "holod", "after", 2.0)
+    rows = [r for r in result["rows"] if (r["method"], r["double_phase"], r["pupil_mm"]) == ("holod", "after", 2.0)]
+    flat = row_of(result, "flat oracle", "before", 2.0)["psnr_db"]
+    before = row_of(result, "holod", "before", 2.0)["psnr_db"]
+    for slope, psnr_db in ((0.51, max(flat, before) + 1.1), (0.49, flat + 0.9)):
+        rows[0].update(slope=slope, psnr_db=psnr_db)
+        found = verdicts(result)
+        assert found["slope at s = 2 mm"] == (slope > 0.5)
+        assert found["over the flat oracle, dB, at s = 2 mm"] == (psnr_db > flat + 1)
+    rows[0]["psnr_db"] = before - 0.31
+    assert not verdicts(result)["double phase costs, dB, at s = 2 mm"]
+    rows[0]["psnr_db"] = before - 0.29
+    assert verdicts(result)["double phase costs, dB, at s = 2 mm"] and row["double_phase"] == "after"
+    result["matrix_psnr_db"]["after"] = [[20.0] * 3 for _ in range(3)]
+    assert not verdicts(result)["right over opposite s, dB, judged s = 1 mm"]
+    assert verdicts(result)["right s behind the best, dB, judged s = 2 mm"]
+    result["matrix_psnr_db"]["after"][0][1] = 20.2
+    assert not verdicts(result)["right s behind the best, dB, judged s = 2 mm"]
+    result["refocus"][0]["near_card"] = 1.99
+    assert not verdicts(result)["refocus ratio, near card, dark on bright, s = 1 mm"]
+
+
+def test_the_report_refuses_mixed_pupils(evaluation: Path) -> None:
+    result = read(evaluation)
+    assert markdown(result).startswith("# Evaluation of w.safetensors")
+    for change, message in (
+        (lambda r: r["rows"][0].update(pupil_mm=3.0), "rows are for s ="),
+        (lambda r: r["matrix_psnr_db"]["after"].pop(), "not 3 by 3"),
+        (lambda r: r.update(scenes=3), "was judged on 2 scenes, it states 3"),
+    ):
+        mixed = copy.deepcopy(result)
+        change(mixed)
+        with pytest.raises(ReportError, match=message):
+            markdown(mixed)
+
+
+@pytest.mark.parametrize(
+    ("odd", "message"),
+    [({"pupils_mm": (1.0, 3.0)}, "pupils_mm is"), ({"size": 80}, "size is"), ({"planes": 4}, "focus_dpt is")],
+)
+def test_scenes_must_be_alike(tmp_path: Path, evaluation: Path, capsys, odd: dict, message: str) -> None:
+    write_shard(tmp_path / "scene_000000.safetensors", pupils_mm=(1.0, 2.0))
+    write_shard(tmp_path / "scene_000001.safetensors", **{"pupils_mm": (1.0, 2.0), **odd})
+    arguments = ["--weights", str(evaluation / "w.safetensors"), "--test", str(tmp_path)]
+    assert main(["evaluate", *arguments, "--out", str(tmp_path / "out")]) == 65
+    error = capsys.readouterr().err
+    assert "scene_000001.safetensors" in error and message in error
+    assert not (tmp_path / "out").exists()
 
 
 def test_export_stamps_the_constant_and_the_evaluation(evaluation: Path) -> None:
@@ -114,6 +248,29 @@ def test_all_in_focus_is_sharp_in_the_middle() -> None:
     field = all_in_focus(amplitude, depth, OPTICS)
     back = intensity(propagate(field, OPTICS, OPTICS.distance_m(OPTICS.dioptres(0.5))))
     assert (back - amplitude.square()).abs().max() < 0.01
+
+
+def test_smooth_phase_is_sharp_in_the_middle() -> None:
+    amplitude, depth = smooth_scene()
+    depth = depth + 0.5 / 24
+    field = smooth_phase(amplitude, depth, OPTICS)
+    back = intensity(propagate(field, OPTICS, OPTICS.distance_m(OPTICS.dioptres(12.5 / 24))))
+    assert (back - amplitude.square()).abs().max() < 0.02
+    spectrum = torch.fft.fft2(field).abs()
+    assert spectrum[:, 17:48].max() < 1e-3
+
+
+def test_transport_of_intensity_blurs_far_marks_towards_the_near_focus() -> None:
+    """A bright square on dark, far away: with the prior its peak falls faster when the eye looks near."""
+    image = torch.full((3, 64, 64), 0.2)
+    image[:, 28:36, 28:36] = 0.8
+    amplitude, depth = image.sqrt(), torch.full((64, 64), 0.5 / 8)
+    peak = {}
+    for make in (layered_asm, transport_of_intensity):
+        field = make(amplitude, depth, OPTICS)
+        far, near = (intensity(propagate(field, OPTICS, OPTICS.distance_m(OPTICS.dioptres(d)))) for d in (0.0625, 0.5))
+        peak[make] = float(near[:, 30:34, 30:34].mean() / far[:, 30:34, 30:34].mean())
+    assert peak[transport_of_intensity] < 0.9 * peak[layered_asm]
 
 
 @pytest.mark.parametrize("layer", [0, 3, 7])

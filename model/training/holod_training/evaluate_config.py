@@ -1,0 +1,32 @@
+"""What an evaluation is to judge; light to import, for the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from holod_training.judging import OURS
+from holod_training.solver import SolverConfig
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """`also`: further weights files, each a method. `solver_scenes`: direct optimisation runs on the first so many
+    scenes from the field of the method `solver_start`, once for each of `solver_frames`; 0 leaves it out.
+    `focus_curve_weights`: in-focus weights of the curve between sharp in focus and soft out of it, on the same
+    scenes; none leaves it out."""
+
+    weights: Path
+    test: Path
+    out: Path
+    cards: Path | None = None
+    rgbd: Path | None = None
+    also: tuple[Path, ...] = ()
+    limit: int | None = None
+    border_px: int = 24
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    solver_start: str = OURS
+    solver_scenes: int = 2
+    solver_frames: tuple[int, ...] = (1, 2)
+    focus_curve_weights: tuple[float, ...] = ()
+    timing_calls: int = 5
