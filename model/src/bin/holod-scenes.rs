@@ -28,6 +28,8 @@ enum Command {
     Sheet(Sheet),
     /// Measure how many aperture rays are traced in a second.
     Bench(Bench),
+    /// Measure the noise of the thin-lens images, in and out of focus, for each pupil.
+    Noise(Bench),
 }
 
 #[derive(Args)]
@@ -54,17 +56,18 @@ struct Look {
     /// What the scenes are for.
     #[arg(long, value_enum, default_value_t = Kind::Train)]
     kind: Kind,
-    /// Width and height in pixels.
-    #[arg(long, default_value_t = 256, value_parser = even_size)]
-    size: usize,
+    /// Pixels: one number for a square, or WIDTHxHEIGHT.
+    #[arg(long, default_value = "256", value_parser = even_size)]
+    size: Resolution,
     /// Pupils in mm, or strata:N for one random pupil in each N-th of 1 to 5 mm.
     #[arg(long, default_value = "strata:4")]
     pupils: PupilPlan,
-    /// Focus planes, uniform in dioptres, both ends included.
-    #[arg(long, default_value_t = 6, value_parser = clap::value_parser!(u16).range(2..=256))]
-    planes: u16,
+    /// Focus planes, uniform in dioptres, both ends included; or `auto`: as many as keep the widest pupil's blur from
+    /// changing by a pixel between neighbours.
+    #[arg(long, default_value = "6", value_parser = planes)]
+    planes: Planes,
     /// Rays for each pixel of each plane and pupil, at least.
-    #[arg(long, default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..=65_536))]
+    #[arg(long, default_value_t = 128, value_parser = clap::value_parser!(u32).range(1..=65_536))]
     rays: u32,
 }
 
@@ -77,9 +80,12 @@ impl Look {
                 Kind::Cards => SceneKind::Cards,
             },
             seed,
-            resolution: Resolution { width: self.size, height: self.size },
+            resolution: self.size,
+            planes: match self.planes {
+                Planes::Count(count) => count,
+                Planes::Auto => self.pupils.planes(),
+            },
             pupils: self.pupils.clone(),
-            planes: usize::from(self.planes),
             rays: self.rays as usize,
         }
     }
@@ -116,10 +122,26 @@ struct Bench {
     look: Look,
 }
 
-fn even_size(text: &str) -> Result<usize, String> {
-    match text.parse() {
-        Ok(size @ 16..=4096) if size % 2 == 0 => Ok(size),
-        _ => Err("expected an even number from 16 to 4096".to_owned()),
+fn even_size(text: &str) -> Result<Resolution, String> {
+    let length = |text: &str| match text.parse() {
+        Ok(length @ 16..=8192) if length % 2 == 0 => Ok(length),
+        _ => Err("expected even numbers from 16 to 8192: SIZE or WIDTHxHEIGHT".to_owned()),
+    };
+    let (width, height) = text.split_once('x').unwrap_or((text, text));
+    Ok(Resolution { width: length(width)?, height: length(height)? })
+}
+
+#[derive(Clone, Copy)]
+enum Planes {
+    Count(usize),
+    Auto,
+}
+
+fn planes(text: &str) -> Result<Planes, String> {
+    match (text, text.parse()) {
+        ("auto", _) => Ok(Planes::Auto),
+        (_, Ok(count @ 2..=256)) => Ok(Planes::Count(count)),
+        _ => Err("expected a number from 2 to 256, or `auto`".to_owned()),
     }
 }
 
@@ -162,6 +184,7 @@ fn main() -> ExitCode {
         Command::Generate(options) => generate(&options),
         Command::Sheet(options) => sheet(&options),
         Command::Bench(options) => bench(&options),
+        Command::Noise(options) => noise(&options),
     };
     match done {
         Ok(report) => {
@@ -217,6 +240,40 @@ fn bench(options: &Bench) -> Result<String, Failure> {
     ))
 }
 
+/// Noise is averaged as power over the scenes.
+fn noise(options: &Bench) -> Result<String, Failure> {
+    let plan = options.look.plan(1);
+    let power = |db: f64| 10f64.powf(0.1 * db);
+    let mut sums: Vec<(f32, [(f64, u32); 3])> = Vec::new();
+    let begin = Instant::now();
+    for index in 0..options.scenes {
+        let mut scene = Scene::random(plan.kind, plan.seed, index, plan.resolution);
+        let pupils = plan.pupils.pupils(plan.kind, plan.seed, index);
+        let measured = scene.noise(&pupils, &plan.focus(), plan.rays);
+        sums.resize(measured.len(), (0.0, [(0.0, 0); 3]));
+        for ((pupil_mm, sums), noise) in sums.iter_mut().zip(measured) {
+            *pupil_mm += noise.pupil.mm() / options.scenes as f32;
+            for (sum, db) in sums.iter_mut().zip([noise.all_db, noise.in_focus_db, noise.out_of_focus_db]) {
+                if !db.is_nan() {
+                    *sum = (sum.0 + power(db), sum.1 + 1);
+                }
+            }
+        }
+    }
+    let mut report = format!(
+        "{} rays, {} scenes of {}, {:.2} s a rendering; noise in dB\n  pupil/mm       all  in focus  out of focus",
+        plan.rays,
+        options.scenes,
+        plan.resolution,
+        0.5 * begin.elapsed().as_secs_f64() / options.scenes as f64
+    );
+    for (pupil_mm, sums) in sums {
+        let [all, sharp, soft] = sums.map(|(sum, count)| 10.0 * (sum / f64::from(count)).log10());
+        report += &format!("\n  {pupil_mm:8.2}  {all:8.1}  {sharp:8.1}  {soft:12.1}");
+    }
+    Ok(report)
+}
+
 fn sheet(options: &Sheet) -> Result<String, Failure> {
     let unreadable = |error: std::io::Error| Failure {
         code: exit::NO_INPUT,
@@ -249,17 +306,20 @@ fn sheet(options: &Sheet) -> Result<String, Failure> {
     ))
 }
 
-/// One row for each scene.
+/// Four pictures for each scene, and scenes below and beside one another so that the sheet is about square.
 fn contact_sheet(previews: &[Preview]) -> image::RgbImage {
     const GAP: u32 = 4;
     let cell_width = previews.iter().map(|p| p.resolution.width).max().unwrap_or(0) as u32 + GAP;
     let cell_height = previews.iter().map(|p| p.resolution.height).max().unwrap_or(0) as u32 + GAP;
-    let mut sheet = image::RgbImage::new(4 * cell_width, cell_height * previews.len() as u32);
-    for (row, preview) in previews.iter().enumerate() {
+    let across = ((0.25 * previews.len() as f32).sqrt().round() as usize).max(1);
+    let down = previews.len().div_ceil(across) as u32;
+    let mut sheet = image::RgbImage::new(4 * cell_width * across as u32, cell_height * down);
+    for (place, preview) in previews.iter().enumerate() {
+        let (row, first_column) = (place / across, 4 * (place % across) as u32);
         let pixels = preview.resolution.pixels();
         let mut put = |column: u32, colour: &dyn Fn(usize) -> [u8; 3]| {
             for pixel in 0..pixels {
-                let x = (pixel % preview.resolution.width) as u32 + column * cell_width;
+                let x = (pixel % preview.resolution.width) as u32 + (first_column + column) * cell_width;
                 let y = (pixel / preview.resolution.width) as u32 + row as u32 * cell_height;
                 sheet.put_pixel(x, y, image::Rgb(colour(pixel)));
             }

@@ -3,10 +3,12 @@
 use holod_calibration::{DisplayGeometry, Resolution};
 
 use super::SceneKind;
+use super::families::{bright_and_dark, colour, marks, pattern};
 use super::random::{Random, mix};
 use super::surface::{Bounds, Paint, Shape, Surface};
-use super::texture::{Pattern, Rgb, Wave, blend};
+use super::texture::{Pattern, blend};
 use super::thin_lens::mean_light;
+use super::{meshes, rooms, shadow};
 
 /// Surfaces reach this far beyond the picture, so that a wide pupil's rays never miss the background.
 pub(super) const OVERSCAN_PX: f32 = 60.0;
@@ -14,41 +16,53 @@ pub(super) const OVERSCAN_PX: f32 = 60.0;
 const STEEPEST: f32 = 0.03;
 
 /// The picture's extent and the size that random lengths scale with.
-struct Stage {
-    half_width: f32,
-    half_height: f32,
-    /// 1 for a picture of 256 pixels.
+pub(super) struct Stage {
+    pub(super) half_width: f32,
+    pub(super) half_height: f32,
+    /// 1 for a picture of 256 by 256 pixels. Half of what a larger picture gains is larger objects, half is more of them.
     scale: f32,
-    near: f32,
-    kind: SceneKind,
+    pub(super) near: f32,
+    pub(super) kind: SceneKind,
 }
 
-/// A random scene of 15 to 40 primitives.
+/// A random scene: a background or a room, cards with print, and 15 to 40 primitives, more in a picture larger than 256
+/// by 256 pixels.
 pub(super) fn random_surfaces(kind: SceneKind, seed: u64, index: u64, resolution: Resolution) -> Vec<Surface> {
     let mut random = Random::new(mix(seed) ^ kind.stream(), index);
-    let smaller = resolution.width.min(resolution.height) as f32;
+    let area = resolution.pixels() as f32 / (256.0 * 256.0);
     let stage = Stage {
         half_width: 0.5 * resolution.width as f32,
         half_height: 0.5 * resolution.height as f32,
-        scale: smaller / 256.0,
+        scale: if area < 1.0 { area.sqrt() } else { area.powf(0.25) },
         near: DisplayGeometry::DEFAULT.depth_near.0 as f32,
         kind,
     };
-    let mut surfaces = vec![background(&mut random, &stage)];
-    if random.chance(0.55) {
-        surfaces.push(ground(&mut random, &stage));
+    let more = area.sqrt().max(1.0);
+    let mut surfaces = Vec::new();
+    if random.chance(0.5) {
+        surfaces.extend(rooms::room(&mut random, &stage));
+    } else {
+        surfaces.push(background(&mut random, &stage));
+        if random.chance(0.4) {
+            surfaces.push(ground(&mut random, &stage));
+        }
     }
-    if random.chance(0.6) {
-        let depth = random.between(0.72, 1.0) * stage.near;
-        surfaces.push(marked_card(&mut random, &stage, depth));
+    let walls = surfaces.len();
+    // Print near, far and anywhere.
+    for (chance, low, high) in [(0.6, 0.72, 1.0), (0.35, 0.0, 0.3), (0.5, 0.0, 1.0)] {
+        for _ in 0..more.round() as u32 {
+            if random.chance(chance) {
+                let depth = random.between(low, high) * stage.near;
+                surfaces.push(marked_card(&mut random, &stage, depth));
+            }
+        }
     }
-    if random.chance(0.35) {
-        let depth = random.between(0.0, 0.3) * stage.near;
-        surfaces.push(marked_card(&mut random, &stage, depth));
-    }
-    let count = 15 + random.below(26) as usize;
+    let count = walls + ((12 + random.below(26)) as f32 * more) as usize;
     while surfaces.len() < count {
         primitive(&mut random, &stage, &mut surfaces);
+    }
+    if random.chance(0.8) {
+        shadow::cast(&mut random, &mut surfaces, walls);
     }
     let target = random.between(0.15, 0.4);
     // Clipping at 1 takes some light away, so the gain is found in steps.
@@ -64,12 +78,15 @@ fn primitive(random: &mut Random, stage: &Stage, surfaces: &mut Vec<Surface>) {
     let cy = random.between(-1.05, 1.05) * stage.half_height;
     let depth = random.between(0.0, 1.0) * stage.near;
     let size = random.log_between(9.0, 58.0) * stage.scale;
-    match random.below(20) {
-        0..=11 => surfaces.push(card(random, stage, (cx, cy), depth, size)),
-        12..=14 => surfaces.push(ellipsoid(random, stage, (cx, cy), depth, size * 0.8)),
-        15..=16 => boxed(random, stage, (cx, cy), depth, size * 0.8, surfaces),
-        17..=18 => surfaces.push(rod(random, stage, (cx, cy), depth)),
-        _ => surfaces.push(lattice(random, stage, (cx, cy), depth, size)),
+    match random.below(26) {
+        0..=10 => surfaces.push(card(random, stage, (cx, cy), depth, size)),
+        11..=12 => surfaces.push(ellipsoid(random, stage, (cx, cy), depth, size * 0.8)),
+        13..=16 => surfaces.push(meshes::solid(random, stage.kind, (cx, cy), depth, size * 0.7, stage.near)),
+        17..=18 => boxed(random, stage, (cx, cy), depth, size * 0.8, surfaces),
+        19..=20 => surfaces.push(rod(random, stage, (cx, cy), depth)),
+        21 => surfaces.push(lattice(random, stage, (cx, cy), depth, size)),
+        22..=23 => surfaces.push(strands(random, stage, (cx, cy), depth, size)),
+        _ => surfaces.push(sparks(random, stage, (cx, cy), depth, size)),
     }
 }
 
@@ -78,7 +95,9 @@ fn plane(random: &mut Random, stage: &Stage, (cx, cy): (f32, f32), depth: f32, r
     if !random.chance(slanted) {
         return Shape::Plane { cx, cy, depth, gx: 0.0, gy: 0.0 };
     }
-    let half_span = random.between(0.05, 0.9).min(depth).min(stage.near - depth);
+    // One in four runs through most of the depth that there is around it.
+    let most = if random.chance(0.25) { 1.4 } else { 0.7 };
+    let half_span = random.between(0.05, most).min(depth).min(stage.near - depth);
     let slope = (half_span / radius).min(STEEPEST);
     let (sin, cos) = random.between(0.0, std::f32::consts::TAU).sin_cos();
     Shape::Plane { cx, cy, depth, gx: slope * cos, gy: slope * sin }
@@ -227,6 +246,55 @@ fn lattice(random: &mut Random, stage: &Stage, (cx, cy): (f32, f32), depth: f32,
     })
 }
 
+/// Grass, hair or wires: bent strokes that share a plane and taper.
+fn strands(random: &mut Random, stage: &Stage, (cx, cy): (f32, f32), depth: f32, size: f32) -> Surface {
+    let size = size.max(16.0);
+    let shape = plane(random, stage, (cx, cy), depth, 1.5 * size, 0.5);
+    let (light, dark) = bright_and_dark(random);
+    let wires = random.chance(0.4);
+    let count = if wires { 2 + random.below(5) } else { 12 + random.below(30) };
+    let thickest = if wires { random.log_between(0.5, 1.2) } else { random.log_between(0.6, 1.6) };
+    // Each starts at a foot, leans and bends as it goes up: x = foot + lean·t + bend·t².
+    let strokes: Vec<[f32; 6]> = (0..count)
+        .map(|_| {
+            let foot = random.between(-0.9, 0.9) * size;
+            let spread = if wires { 0.5 } else { 0.25 };
+            let (lean, bend) = (random.between(-spread, spread) * size, random.between(-spread, spread) * size);
+            [foot, lean, bend, random.between(0.5, 1.0), thickest * random.between(0.6, 1.0), random.unit()]
+        })
+        .collect();
+    let turn = if wires { random.between(0.0, std::f32::consts::TAU) } else { random.between(-0.4, 0.4) };
+    let (sin, cos) = turn.sin_cos();
+    let reach = 1.9 * size;
+    let bounds = Bounds { left: cx - reach, right: cx + reach, top: cy - reach, bottom: cy + reach };
+    Surface::bake(shape, bounds, |x, y| {
+        let (u, v) = ((x - cx) * cos + (y - cy) * sin, (y - cy) * cos - (x - cx) * sin);
+        // Along the strands, from 0 at the foot.
+        let t = 0.5 - 0.5 * v / size;
+        if !(0.0..=1.0).contains(&t) {
+            return None;
+        }
+        let on = strokes.iter().find(|[foot, lean, bend, height, width, _]| {
+            let taper = if wires { 1.0 } else { 1.0 - t / height };
+            t < *height && (u - foot - lean * t - bend * t * t).abs() < width * taper.max(0.25)
+        })?;
+        Some(blend(dark, light, (0.3 + 0.7 * t) * (0.4 + 0.6 * on[5])))
+    })
+}
+
+/// Small bright dots that float before whatever is behind them.
+fn sparks(random: &mut Random, stage: &Stage, (cx, cy): (f32, f32), depth: f32, size: f32) -> Surface {
+    let size = size.max(12.0);
+    let shape = plane(random, stage, (cx, cy), depth, 1.5 * size, 0.4);
+    let radius = random.log_between(0.7, 2.5);
+    let (light, dark) = (colour(random, 1.0), [0.0; 3]);
+    let cell = radius * random.between(5.0, 14.0);
+    let dots = Pattern::Dots { ground: dark, mark: light, cell, radius, presence: 0.7, seed: random.seed() };
+    let reach = 1.5 * size;
+    let bounds = Bounds { left: cx - reach, right: cx + reach, top: cy - reach, bottom: cy + reach };
+    Surface::bake(shape, bounds, |x, y| Some(dots.colour(x, y)).filter(|colour| *colour != dark))
+}
+
 fn background(random: &mut Random, stage: &Stage) -> Surface {
     let depth = if random.chance(0.7) { 0.0 } else { random.between(0.0, 0.35) };
     let mut paint = Paint::plain(pattern(random, stage.kind), random.between(-50.0, 50.0), random.between(-50.0, 50.0));
@@ -372,122 +440,6 @@ impl Outline {
             &Self::Ring { outer, inner } => (inner * inner..outer * outer).contains(&(dx * dx + dy * dy)),
             Self::Polygon { sides, .. } => sides.iter().all(|(nx, ny, distance)| dx * nx + dy * ny < *distance),
         }
-    }
-}
-
-/// A random reflectance.
-fn colour(random: &mut Random, brightness: f32) -> Rgb {
-    let grey = random.chance(0.35);
-    let saturation = if grey { random.between(0.0, 0.12) } else { random.between(0.2, 0.95) };
-    let hue = random.between(0.0, 6.0);
-    [0.0, 4.0, 2.0].map(|offset| {
-        let wedge = ((hue + offset) % 6.0 - 3.0).abs() - 1.0;
-        (brightness * (1.0 - saturation * (1.0 - wedge.clamp(0.0, 1.0)))).clamp(0.02, 1.0)
-    })
-}
-
-fn bright_and_dark(random: &mut Random) -> (Rgb, Rgb) {
-    let brightness = random.between(0.35, 1.0);
-    let light = colour(random, brightness);
-    let darkness = brightness * random.log_between(0.02, 0.5);
-    (light, colour(random, darkness))
-}
-
-/// Fine marks on a plain ground: text, dots or strokes; dark on bright in six of ten.
-fn marks(random: &mut Random, kind: SceneKind) -> Pattern {
-    let light = colour(random, 0.95).map(|c| c.max(0.3));
-    let darkness = random.log_between(0.02, 0.1);
-    let dark = colour(random, darkness);
-    let (ground, mark) = if random.chance(0.6) { (light, dark) } else { (dark, light) };
-    let seed = random.seed();
-    let coarse = if kind == SceneKind::Test { 1.3 } else { 1.0 };
-    match random.below(5) {
-        0..=2 => {
-            let height = coarse * random.log_between(7.0, 20.0);
-            Pattern::Text { ground, mark, height, weight: (height * random.between(0.13, 0.22)).max(1.6), seed }
-        }
-        3 => {
-            let radius = coarse * random.log_between(1.0, 4.0);
-            Pattern::Dots { ground, mark, cell: radius * random.between(3.0, 6.0), radius, presence: 0.75, seed }
-        }
-        _ => {
-            let width = coarse * random.log_between(1.5, 4.0);
-            Pattern::Ticks { ground, mark, cell: width * random.between(3.0, 6.0), width, seed }
-        }
-    }
-}
-
-fn pattern(random: &mut Random, kind: SceneKind) -> Pattern {
-    match kind {
-        SceneKind::Test => test_pattern(random),
-        SceneKind::Train | SceneKind::Cards => train_pattern(random),
-    }
-}
-
-fn train_pattern(random: &mut Random) -> Pattern {
-    let (light, dark) = bright_and_dark(random);
-    let (a, b) = if random.chance(0.5) { (light, dark) } else { (dark, light) };
-    let seed = random.seed();
-    match random.below(20) {
-        0 => Pattern::Flat(a),
-        1..=2 => Pattern::Gradient { a, b, length: random.between(30.0, 250.0) },
-        3..=4 => Pattern::Checker { a, b, period: random.log_between(3.0, 30.0) },
-        5..=7 => Pattern::Stripes {
-            a,
-            b,
-            period: random.log_between(4.0, 40.0),
-            duty: random.between(0.2, 0.8),
-            sine: random.chance(0.35),
-        },
-        8..=11 => Pattern::Noise {
-            a,
-            b,
-            scale: random.log_between(6.0, 80.0),
-            octaves: 2 + random.below(5),
-            contrast: random.between(1.0, 2.5),
-            seed,
-        },
-        12..=13 => {
-            let cell = random.log_between(12.0, 50.0);
-            Pattern::Polygons { ground: b, a, b: light, cell, seed }
-        }
-        14 => {
-            let radius = random.log_between(1.0, 8.0);
-            let cell = radius * random.between(2.6, 7.0);
-            Pattern::Dots { ground: b, mark: a, cell, radius, presence: random.between(0.4, 0.95), seed }
-        }
-        _ => marks(random, SceneKind::Train),
-    }
-}
-
-/// Families and ranges that no training scene has.
-fn test_pattern(random: &mut Random) -> Pattern {
-    let (light, dark) = bright_and_dark(random);
-    let (a, b) = if random.chance(0.5) { (light, dark) } else { (dark, light) };
-    let seed = random.seed();
-    match random.below(20) {
-        0..=6 => {
-            let exponent = random.between(0.9, 1.3);
-            let contrast = random.between(0.5, 1.2);
-            let mut waves: Vec<Wave> = (0..48)
-                .map(|_| {
-                    let period = random.log_between(3.0, 200.0);
-                    let (sin, cos) = random.between(0.0, std::f32::consts::TAU).sin_cos();
-                    let k = std::f32::consts::TAU / period;
-                    let phase = random.between(0.0, std::f32::consts::TAU);
-                    Wave { kx: k * cos, ky: k * sin, phase, amplitude: period.powf(exponent - 1.0 + 0.25) }
-                })
-                .collect();
-            let power: f32 = waves.iter().map(|w| 0.5 * w.amplitude * w.amplitude).sum();
-            waves.iter_mut().for_each(|w| w.amplitude *= 0.3 * contrast / power.sqrt());
-            Pattern::Spectral { a, b, waves }
-        }
-        7..=9 => Pattern::Wood { a, b, ring: random.between(6.0, 22.0), warp: random.between(1.0, 4.0), seed },
-        10..=12 => Pattern::Marble { a, b, scale: random.between(15.0, 60.0), warp: random.between(3.0, 9.0), seed },
-        13 => Pattern::Weave { a, b, period: random.between(5.0, 14.0) },
-        14 => Pattern::Flat(a),
-        15 => Pattern::Gradient { a, b, length: random.between(30.0, 250.0) },
-        _ => marks(random, SceneKind::Test),
     }
 }
 

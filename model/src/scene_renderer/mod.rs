@@ -6,18 +6,27 @@
 
 mod compose;
 mod demo;
+mod families;
 mod glyphs;
+mod meshes;
+mod noise;
+mod points;
 mod random;
+mod rooms;
+mod shadow;
 pub mod shard;
 mod surface;
 #[cfg(test)]
 mod tests;
 mod texture;
 mod thin_lens;
+mod view;
 
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 
+pub use noise::Noise;
 use surface::Surface;
+use thin_lens::PixelSamples;
 
 /// What a random scene is for. The kinds never share a scene: each has a seed space of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -65,23 +74,29 @@ pub struct Scene {
     surfaces: Vec<Surface>,
     resolution: Resolution,
     ray_key: u64,
+    pixel_samples: PixelSamples,
 }
 
 /// The built-in demonstration: text cards near on the left and far on the right, objects between them, a checkered
 /// floor through all depths. It fills a picture of any resolution.
 pub fn sample_scene(resolution: Resolution) -> Scene {
-    Scene { surfaces: demo::surfaces(resolution), resolution, ray_key: 0 }
+    Scene { surfaces: demo::surfaces(resolution), resolution, ray_key: 0, pixel_samples: PixelSamples::Grid }
 }
 
 impl Scene {
     /// A scene that depends on its arguments alone.
     pub fn random(kind: SceneKind, seed: u64, index: u64, resolution: Resolution) -> Self {
-        let surfaces = match kind {
-            SceneKind::Cards => compose::refocus_cards(index.is_multiple_of(2), seed ^ (index / 2), resolution),
-            SceneKind::Train | SceneKind::Test => compose::random_surfaces(kind, seed, index, resolution),
+        let (surfaces, pixel_samples) = match kind {
+            SceneKind::Cards => {
+                let cards = compose::refocus_cards(index.is_multiple_of(2), seed ^ (index / 2), resolution);
+                (cards, PixelSamples::Grid)
+            }
+            SceneKind::Train | SceneKind::Test => {
+                (compose::random_surfaces(kind, seed, index, resolution), PixelSamples::Lattice)
+            }
         };
         let ray_key = random::mix(random::mix(seed) ^ kind.stream() ^ index);
-        Self { surfaces, resolution, ray_key }
+        Self { surfaces, resolution, ray_key, pixel_samples }
     }
 
     /// The refocus test: see [`SceneKind::Cards`].
@@ -96,7 +111,7 @@ impl Scene {
 
     /// What a pinhole sees: each pixel's mean colour, and the depth along its central ray.
     pub fn picture(&self) -> Picture {
-        let (image, depth_dpt) = thin_lens::pinhole(&self.surfaces, self.resolution);
+        let (image, depth_dpt) = thin_lens::pinhole(&self.surfaces, self.resolution, self.pixel_samples);
         let normalised = |depth: f32| DisplayGeometry::DEFAULT.normalised_depth(Dioptres(f64::from(depth))) as f32;
         Picture { image, depth: depth_dpt.into_iter().map(|depth| normalised(depth).clamp(0.0, 1.0)).collect() }
     }
@@ -107,7 +122,7 @@ impl Scene {
         self.focal_stacks(&[pupil], focus, rays).swap_remove(0)
     }
 
-    /// [`focal_stack`](Self::focal_stack) for several pupils at little more than the cost of one: the rays of narrower
+    /// [`focal_stack`](Self::focal_stack) for several pupils at less than the cost of each alone: the rays of narrower
     /// pupils serve the wider ones too.
     pub fn focal_stacks(&self, pupils: &[PupilDiameter], focus: &[Dioptres], rays: usize) -> Vec<Vec<f32>> {
         self.traced_focal_stacks(pupils, focus, rays).0
@@ -120,6 +135,21 @@ impl Scene {
         focus: &[Dioptres],
         rays: usize,
     ) -> (Vec<Vec<f32>>, u64) {
-        thin_lens::focal_stacks(&self.surfaces, self.resolution, pupils, focus, rays, self.ray_key)
+        let mut stacks = vec![Vec::new(); pupils.len()];
+        let traced = self.trace_stacks(pupils, focus, rays, |pupil, sums, share| {
+            stacks[pupil] = sums.iter().map(|sum| sum * share).collect();
+        });
+        (stacks, traced)
+    }
+
+    /// The stacks one by one, as [`thin_lens::focal_stacks`] hands them out.
+    fn trace_stacks(
+        &self,
+        pupils: &[PupilDiameter],
+        focus: &[Dioptres],
+        rays: usize,
+        finish: impl FnMut(usize, &[f32], f32),
+    ) -> u64 {
+        thin_lens::focal_stacks(&self.surfaces, self.resolution, pupils, focus, rays, self.ray_key, finish)
     }
 }

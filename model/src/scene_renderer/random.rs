@@ -1,7 +1,7 @@
 //! Reproducible random numbers: one PCG stream for each purpose, and a hash for textures.
 
-use rand::{Rng, SeedableRng};
-use rand_pcg::{Pcg32, Pcg64Mcg};
+use rand::Rng;
+use rand_pcg::Pcg32;
 
 /// A stream of random numbers that depends on nothing but its key.
 pub(super) struct Random(Pcg32);
@@ -37,11 +37,6 @@ impl Random {
     pub(super) fn seed(&mut self) -> u32 {
         self.0.next_u32()
     }
-}
-
-/// The fast stream that jitters rays, keyed by what it is for.
-pub(super) fn ray_stream(key: u64) -> Pcg64Mcg {
-    Pcg64Mcg::seed_from_u64(mix(key))
 }
 
 /// The SplitMix64 finaliser: neighbouring keys give unrelated values.

@@ -2,24 +2,30 @@
 //!
 //! `scene_000123.safetensors` holds `image` F16 [3, H, W] (linear light, pinhole), `depth` F32 [H, W] (normalised, 0 far,
 //! 1 near) and `stack_0` … `stack_n` F16 [planes, 3, H, W] (linear light, one for each pupil). Its metadata are strings:
-//! `format` = "holod-scene-1", `kind`, `seed`, `index`, `pupils_mm` and `focus_dpt` (JSON lists), `far_dpt`, `near_dpt`,
-//! `pixel_angle_rad`, `rays`.
+//! `format` = "holod-scene-1", `generator` (see [`GENERATOR`]), `kind`, `seed`, `index`, `pupils_mm` and `focus_dpt` (JSON
+//! lists), `far_dpt`, `near_dpt`, `pixel_angle_rad`, `rays`.
+//!
+//! While a shard is made, memory holds its stacks as F16 and, once, the F32 sums of one: at 1920x1080 12 MB and 25 MB a
+//! plane. It is written from there, and read for a sheet, without a copy of the whole.
 
 use std::collections::HashMap;
-use std::fs;
-use std::io;
+use std::fs::{self, File};
+use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use half::f16;
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
-use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
+use safetensors::tensor::{Dtype, Metadata, SafeTensorError, TensorView};
 
 use super::random::{Random, mix};
 use super::{Scene, SceneKind};
 
 /// The `format` that a shard's metadata names.
 pub const FORMAT: &str = "holod-scene-1";
+/// The generation of the random scenes: the same kind, seed and index give the same scene within one generation only.
+/// Shards that name none are of the first.
+pub const GENERATOR: u32 = 2;
 /// Pupils outside this range are no human's.
 const PUPIL_RANGE_MM: (f32, f32) = (0.5, 9.0);
 /// The range that [`PupilPlan::Strata`] divides.
@@ -46,6 +52,18 @@ impl PupilPlan {
                 (0..*parts).map(|part| PupilDiameter::from_mm(low + width * (part as f32 + random.unit()))).collect()
             }
         }
+    }
+}
+
+impl PupilPlan {
+    /// The least number of planes, uniform in dioptres over the depth range, between any two neighbours of which the
+    /// widest pupil's circle of confusion changes by less than one pixel.
+    pub fn planes(&self) -> usize {
+        let widest_mm = match self {
+            Self::Fixed(pupils) => pupils.iter().map(|pupil| pupil.mm()).fold(0.0, f32::max),
+            Self::Strata(_) => STRATA_RANGE_MM.1,
+        };
+        DisplayGeometry::DEFAULT.largest_coc_px(PupilDiameter::from_mm(widest_mm)) as usize + 2
     }
 }
 
@@ -164,6 +182,7 @@ impl ShardPlan {
         let focus_dpt: Vec<f64> = self.focus().iter().map(|f| f.0).collect();
         [
             ("format", FORMAT.to_owned()),
+            ("generator", GENERATOR.to_string()),
             ("kind", self.kind.name().to_owned()),
             ("seed", self.seed.to_string()),
             ("index", index.to_string()),
@@ -190,21 +209,19 @@ impl ShardPlan {
         let scene = Scene::random(self.kind, self.seed, index, self.resolution);
         let picture = scene.picture();
         let pupils = self.pupils.pupils(self.kind, self.seed, index);
-        let (stacks, rays_traced) = scene.traced_focal_stacks(&pupils, &self.focus(), self.rays);
+        let mut stacks = vec![Vec::new(); pupils.len()];
+        let rays_traced = scene.trace_stacks(&pupils, &self.focus(), self.rays, |pupil, sums, share| {
+            stacks[pupil] = half_bytes(sums.iter().map(|sum| sum * share));
+        });
 
         let Resolution { width, height } = self.resolution;
         let depth: Vec<u8> = picture.depth.iter().flat_map(|value| value.to_le_bytes()).collect();
         let mut tensors = vec![
-            ("image".to_owned(), Dtype::F16, vec![3, height, width], half_bytes(&picture.image)),
+            ("image".to_owned(), Dtype::F16, vec![3, height, width], half_bytes(picture.image.iter().copied())),
             ("depth".to_owned(), Dtype::F32, vec![height, width], depth),
         ];
-        for (number, stack) in stacks.iter().enumerate() {
-            tensors.push((
-                format!("stack_{number}"),
-                Dtype::F16,
-                vec![self.planes, 3, height, width],
-                half_bytes(stack),
-            ));
+        for (number, stack) in stacks.into_iter().enumerate() {
+            tensors.push((format!("stack_{number}"), Dtype::F16, vec![self.planes, 3, height, width], stack));
         }
         let unwritable = |reason: String| ShardError::Write { path: path.clone(), reason };
         let views = tensors
@@ -212,13 +229,15 @@ impl ShardPlan {
             .map(|(name, dtype, shape, bytes)| Ok((name, TensorView::new(*dtype, shape.clone(), bytes)?)))
             .collect::<Result<Vec<_>, SafeTensorError>>()
             .map_err(|error| unwritable(error.to_string()))?;
-        let bytes =
-            safetensors::serialize(views, Some(self.metadata(index))).map_err(|error| unwritable(error.to_string()))?;
         let beside = folder.join(format!(".{}.{}.partial", file_name(index), std::process::id()));
-        fs::write(&beside, bytes).and_then(|()| fs::rename(&beside, &path)).map_err(|error| {
+        let written = safetensors::serialize_to_file(views, Some(self.metadata(index)), &beside);
+        let renamed = written
+            .map_err(|error| error.to_string())
+            .and_then(|()| fs::rename(&beside, &path).map_err(|error| error.to_string()));
+        renamed.map_err(|reason| {
             // The partial file is only litter; the first error is the one to report.
             let _ = fs::remove_file(&beside);
-            unwritable(error.to_string())
+            unwritable(reason)
         })?;
         Ok(Outcome::Written { rays_traced })
     }
@@ -232,10 +251,17 @@ impl ShardPlan {
         let mut expected: Vec<(String, String)> = self.metadata(index).into_iter().collect();
         expected.push(("size".to_owned(), self.resolution.to_string()));
         expected.sort();
+        let size = header.resolution.to_string();
         for (key, value) in expected {
             let found = match key.as_str() {
-                "size" => header.size.clone(),
-                key => header.metadata.get(key).cloned().unwrap_or_else(|| "nothing".to_owned()),
+                "size" => size.clone(),
+                key => header
+                    .metadata
+                    .metadata()
+                    .as_ref()
+                    .and_then(|values| values.get(key))
+                    .cloned()
+                    .unwrap_or_else(|| "nothing".to_owned()),
             };
             if found != value {
                 let (found, expected) = (format!("its `{key}` is {found}"), value);
@@ -246,32 +272,53 @@ impl ShardPlan {
     }
 }
 
-fn half_bytes(values: &[f32]) -> Vec<u8> {
-    values.iter().flat_map(|&value| f16::from_f32(value).to_le_bytes()).collect()
+fn half_bytes(values: impl ExactSizeIterator<Item = f32>) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(2 * values.len());
+    values.for_each(|value| bytes.extend(f16::from_f32(value).to_le_bytes()));
+    bytes
 }
 
+/// A shard's header, read without its tensors.
 struct Header {
-    metadata: HashMap<String, String>,
-    size: String,
+    metadata: Metadata,
+    resolution: Resolution,
+    /// Where the tensors begin in the file.
+    start: u64,
 }
 
 impl Header {
     /// The header of a shard; nothing if the file is cut short.
     fn read(path: &Path) -> Result<Option<Self>, ShardError> {
+        /// As the format has it.
+        const LONGEST: u64 = 100_000_000;
+        let unreadable = |source| ShardError::Read { path: path.to_owned(), source };
         let malformed = |reason: String| ShardError::Malformed { path: path.to_owned(), reason };
-        let bytes = fs::read(path).map_err(|source| ShardError::Read { path: path.to_owned(), source })?;
-        let tensors = match SafeTensors::deserialize(&bytes) {
-            Ok(tensors) => tensors,
-            Err(SafeTensorError::HeaderTooSmall | SafeTensorError::InvalidHeaderLength) => return Ok(None),
-            Err(SafeTensorError::MetadataIncompleteBuffer) => return Ok(None),
-            Err(error) => return Err(malformed(error.to_string())),
-        };
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|error| malformed(error.to_string()))?;
-        let size = match tensors.tensor("depth").as_ref().map(TensorView::shape) {
-            Ok(&[height, width]) => Resolution { width, height }.to_string(),
+        let mut file = File::open(path).map_err(unreadable)?;
+        let file_length = file.metadata().map_err(unreadable)?.len();
+        if file_length < 8 {
+            return Ok(None);
+        }
+        let mut length = [0; 8];
+        file.read_exact(&mut length).map_err(unreadable)?;
+        let length = u64::from_le_bytes(length);
+        if length > LONGEST {
+            return Err(malformed(format!("its header would be {length} bytes long")));
+        }
+        let start = 8 + length;
+        if file_length < start {
+            return Ok(None);
+        }
+        let mut bytes = vec![0; length as usize];
+        file.read_exact(&mut bytes).map_err(unreadable)?;
+        let metadata: Metadata = serde_json::from_slice(&bytes).map_err(|error| malformed(error.to_string()))?;
+        if file_length < start + metadata.data_len() as u64 {
+            return Ok(None);
+        }
+        let resolution = match metadata.info("depth").map(|info| info.shape.as_slice()) {
+            Some(&[height, width]) => Resolution { width, height },
             _ => return Err(malformed("it has no depth of two dimensions".to_owned())),
         };
-        Ok(Some(Self { metadata: header.metadata().clone().unwrap_or_default(), size }))
+        Ok(Some(Self { metadata, resolution, start }))
     }
 }
 
@@ -294,29 +341,34 @@ impl Preview {
     /// Reads the shard at `path`.
     pub fn read(path: &Path) -> Result<Self, ShardError> {
         let malformed = |reason: String| ShardError::Malformed { path: path.to_owned(), reason };
-        let bytes = fs::read(path).map_err(|source| ShardError::Read { path: path.to_owned(), source })?;
-        let tensors = SafeTensors::deserialize(&bytes).map_err(|error| malformed(error.to_string()))?;
-        let tensor = |name: &str, dtype: Dtype, rank: usize| match tensors.tensor(name) {
-            Ok(tensor) if tensor.dtype() == dtype && tensor.shape().len() == rank => Ok(tensor),
-            Ok(tensor) => Err(malformed(format!("`{name}` is {:?} {:?}", tensor.dtype(), tensor.shape()))),
-            Err(_) => Err(malformed(format!("it has no `{name}`"))),
+        let unreadable = |source| ShardError::Read { path: path.to_owned(), source };
+        let header = Header::read(path)?.ok_or_else(|| malformed("it is cut short".to_owned()))?;
+        let resolution = header.resolution;
+        let mut file = File::open(path).map_err(unreadable)?;
+        // The first or last `count` values of a tensor.
+        let mut read = |name: &str, dtype: Dtype, count: usize, last: bool| {
+            let info = header.metadata.info(name).ok_or_else(|| malformed(format!("it has no `{name}`")))?;
+            let (begin, end) = info.data_offsets;
+            let length = count * dtype.bitsize() / 8;
+            if info.dtype != dtype || end - begin < length || !(end - begin).is_multiple_of(length) {
+                return Err(malformed(format!("`{name}` is {:?} {:?}", info.dtype, info.shape)));
+            }
+            let from = if last { end - length } else { begin };
+            let mut bytes = vec![0; length];
+            file.seek(SeekFrom::Start(header.start + from as u64)).map_err(unreadable)?;
+            file.read_exact(&mut bytes).map_err(unreadable)?;
+            Ok(bytes)
         };
-        let depth = tensor("depth", Dtype::F32, 2)?;
-        let resolution = Resolution { width: depth.shape()[1], height: depth.shape()[0] };
-        let stacks = tensors.names().iter().filter(|name| name.starts_with("stack_")).count();
-        let widest = tensor(&format!("stack_{}", stacks.saturating_sub(1)), Dtype::F16, 4)?;
-        let image = half_values(tensor("image", Dtype::F16, 3)?.data());
-        let stack = half_values(widest.data());
-        let size = 3 * resolution.pixels();
-        if image.len() != size || stack.len() < size || !stack.len().is_multiple_of(size) {
-            return Err(malformed("its images differ in size".to_owned()));
-        }
+        let stacks = header.metadata.offset_keys().iter().filter(|name| name.starts_with("stack_")).count();
+        let widest = format!("stack_{}", stacks.saturating_sub(1));
+        let pixels = resolution.pixels();
+        let depth = read("depth", Dtype::F32, pixels, false)?;
         Ok(Self {
             resolution,
-            image,
-            depth: depth.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
-            focused_far: stack[..size].to_vec(),
-            focused_near: stack[stack.len() - size..].to_vec(),
+            image: half_values(&read("image", Dtype::F16, 3 * pixels, false)?),
+            depth: depth.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
+            focused_far: half_values(&read(&widest, Dtype::F16, 3 * pixels, false)?),
+            focused_near: half_values(&read(&widest, Dtype::F16, 3 * pixels, true)?),
         })
     }
 }

@@ -92,6 +92,50 @@ pub(super) enum Pattern {
         width: f32,
         seed: u32,
     },
+    /// Bricks in a running bond, each of its own brightness.
+    Bricks {
+        brick: Rgb,
+        mortar: Rgb,
+        width: f32,
+        height: f32,
+        joint: f32,
+        seed: u32,
+    },
+    /// Rings around the origin.
+    Rings {
+        a: Rgb,
+        b: Rgb,
+        period: f32,
+    },
+    /// Bands of three colours, crossed.
+    Plaid {
+        a: Rgb,
+        b: Rgb,
+        c: Rgb,
+        period: f32,
+    },
+    /// Polygonal cells around scattered points, each of its own bright colour.
+    Mosaic {
+        cell: f32,
+        saturation: f32,
+        seed: u32,
+    },
+    /// Noise of natural pictures: luminance whose logarithm has an amplitude spectrum of 1/f, and fainter chrominance
+    /// of the same spectrum along blue-yellow and red-green.
+    Natural {
+        mean: f32,
+        tint: Rgb,
+        contrast: f32,
+        chroma: f32,
+        seed: u32,
+    },
+    /// Discs that hide one another, as many of each size as looks alike at every scale.
+    DeadLeaves {
+        hue: Rgb,
+        saturation: f32,
+        largest: f32,
+        seed: u32,
+    },
     /// A sum of cosines whose amplitudes fall as 1/f, as in natural pictures.
     Spectral {
         a: Rgb,
@@ -211,6 +255,79 @@ impl Pattern {
                 let inside = (dx * sin - dy * cos).abs() < 0.5 * width && (dx * cos + dy * sin).abs() < 0.38 * cell;
                 if inside { mark } else { ground }
             }
+            Self::Bricks { brick, mortar, width, height, joint, seed } => {
+                let row = (y / height).floor();
+                let shifted = x + 0.5 * width * (row as i32 & 1) as f32;
+                let column = (shifted / width).floor();
+                let inside = y - row * height > joint && shifted - column * width > joint;
+                let shade = 0.55 + 0.45 * hash_unit(column as i32, row as i32, seed);
+                if inside { brick.map(|c| c * shade) } else { mortar }
+            }
+            Self::Rings { a, b, period } => {
+                if (x.hypot(y) / period).rem_euclid(1.0) < 0.5 {
+                    a
+                } else {
+                    b
+                }
+            }
+            Self::Plaid { a, b, c, period } => {
+                let band = |place: f32| match (place / period).rem_euclid(1.0) {
+                    t if t < 0.4 => a,
+                    t if t < 0.5 => c,
+                    t if t < 0.9 => b,
+                    _ => c,
+                };
+                blend(band(x), band(y), 0.5)
+            }
+            Self::Mosaic { cell, saturation, seed } => {
+                let (column, row) = ((x / cell).floor() as i32, (y / cell).floor() as i32);
+                let (mut nearest, mut owner) = (f32::INFINITY, (0, 0));
+                for (c, r) in (-1..=1).flat_map(|dr| (-1..=1).map(move |dc| (column + dc, row + dr))) {
+                    let px = (c as f32 + hash_unit(c, r, seed)) * cell - x;
+                    let py = (r as f32 + hash_unit(c, r, seed ^ 1)) * cell - y;
+                    if px * px + py * py < nearest {
+                        (nearest, owner) = (px * px + py * py, (c, r));
+                    }
+                }
+                let bright = 0.15 + 0.85 * hash_unit(owner.0, owner.1, seed ^ 2);
+                let vivid = |salt| 1.0 - saturation * hash_unit(owner.0, owner.1, seed ^ salt);
+                [bright * vivid(3), bright * vivid(4), bright * vivid(5)]
+            }
+            Self::Natural { mean, tint, contrast, chroma, seed } => {
+                let luminance = mean * (contrast * pink_noise(x, y, seed)).exp();
+                let blue_yellow = chroma * pink_noise(x, y, seed ^ 0x51);
+                let red_green = 0.5 * chroma * pink_noise(x, y, seed ^ 0xa7);
+                let balance = [1.0 + blue_yellow + red_green, 1.0 + blue_yellow - red_green, 1.0 - blue_yellow];
+                std::array::from_fn(|c| (luminance * tint[c] * balance[c]).clamp(0.0, 1.0))
+            }
+            Self::DeadLeaves { hue, saturation, largest, seed } => {
+                // Each size has a lattice of its own with one leaf in each cell; the leaf with the highest number is on
+                // top. A leaf is no wider than a cell, so that of each size only four can be here.
+                let (mut highest, mut colour) = (-1.0, hue.map(|c| 0.3 * c));
+                let mut diameter = largest;
+                let mut salt = seed;
+                while diameter > 2.0 {
+                    let (column, row) = ((x / diameter - 0.5).floor() as i32, (y / diameter - 0.5).floor() as i32);
+                    for (c, r) in [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(dc, dr)| (column + dc, row + dr)) {
+                        let bits = hash(c, r, salt);
+                        let part = |shift: u32| ((bits >> shift) & 0xff) as f32 / 255.0;
+                        let radius = 0.5 * diameter * (0.55 + 0.15 * part(0));
+                        let room = diameter - 2.0 * radius;
+                        let centre_x = c as f32 * diameter + radius + room * part(8) - x;
+                        let centre_y = r as f32 * diameter + radius + room * part(16) - y;
+                        let height = hash_unit(c, r, salt ^ 0x35);
+                        if height > highest && centre_x * centre_x + centre_y * centre_y < radius * radius {
+                            highest = height;
+                            let bright = 0.03 + 0.9 * part(24) * part(24);
+                            let tone = |salt_of: u32| 1.0 - saturation * hash_unit(c, r, salt ^ salt_of);
+                            colour = [bright * tone(1), bright * tone(2), bright * tone(3)];
+                        }
+                    }
+                    diameter /= 1.7;
+                    salt = salt.wrapping_add(0x9e37);
+                }
+                colour
+            }
             Self::Spectral { a, b, ref waves } => {
                 let sum: f32 = waves.iter().map(|w| w.amplitude * (w.kx * x + w.ky * y + w.phase).cos()).sum();
                 blend(a, b, (0.5 + sum).clamp(0.0, 1.0))
@@ -247,6 +364,19 @@ pub(super) fn fractal_noise(x: f32, y: f32, octaves: u32, seed: u32) -> f32 {
         frequency *= 2.03;
     }
     sum / weight
+}
+
+/// Noise of zero mean and about unit variance whose octaves, from 2 to 256 px, have equal power: an amplitude spectrum
+/// of 1/f.
+fn pink_noise(x: f32, y: f32, seed: u32) -> f32 {
+    let mut sum = 0.0;
+    let mut period = 256.0;
+    for octave in 0..8 {
+        sum += value_noise(x / period + 0.37 * octave as f32, y / period, seed.wrapping_add(octave * 7919)) - 0.5;
+        period *= 0.5;
+    }
+    // Smooth value noise has a standard deviation of about 0.21 an octave.
+    sum / (0.21 * 8f32.sqrt())
 }
 
 fn value_noise(x: f32, y: f32, seed: u32) -> f32 {
