@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import os
 import statistics
 import time
@@ -12,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
-from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
+from holod_training.config import ConfigError, OpticsConfig
+from holod_training.costs import operations_per_pixel
 from holod_training.curves import read_rows
 from holod_training.export import load_weights, write_beside
 from holod_training.metrics import Judgement, judge
@@ -23,10 +22,9 @@ from holod_training.optics import Eye, coc_px, double_phase, panel_field, upsamp
 from holod_training.rivals import flat_oracle
 from holod_training.shards import Shard, open_shards
 from holod_training.train import VALIDATION_PUPILS_MM, Run, TrainConfig, nearest_pupil, train
-from holod_training.variants import build_network, network_amplitude, variant
+from holod_training.variants import network_amplitude, variant
 
 WARM_STEPS, TIMED_STEPS = 2, 7
-COUNTED_SIZE_PX = 512
 NO_STOP = -10.0
 FLAT_ORACLE = "flat oracle"
 NUMBERS = (
@@ -36,40 +34,6 @@ NUMBERS = (
     ("slope", "slope", 3),
     ("correlation", "correlation", 3),
 )
-
-
-def operations_per_pixel(config: NetworkConfig) -> float:
-    """Floating-point operations a panel pixel of one frame, counted on 512x512: two a product and sum of convolutions
-    and matrices, 8 a bilinear tap, 5·log2(n) a value of a complex FFT of n values and half of it of a real one."""
-
-    def fft(share: float) -> Any:
-        def count(shape: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
-            largest = max(shape, out_shape, key=math.prod)
-            return int(share * 5 * math.prod(largest) * math.log2(largest[-1] * largest[-2]))
-
-        return count
-
-    def taps(shape: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
-        return 8 * math.prod(out_shape)
-
-    aten = torch.ops.aten
-    mapping = {
-        aten._fft_c2c: fft(1),
-        aten._fft_r2c: fft(0.5),
-        aten._fft_c2r: fft(0.5),
-        aten.grid_sampler_2d: taps,
-    }
-    size = COUNTED_SIZE_PX
-    pupil = torch.tensor([3.0])
-    with torch.device("meta"):
-        # Specialists choose by the pupil's value, which meta tensors do not have; one of them runs.
-        network = build_network(dataclasses.replace(config, specialists_mm=()))
-        images = (config.planes, 3) if config.architecture == "focal-stack" else (3,)
-        amplitude, depth = torch.zeros(1, *images, size, size), torch.zeros(1, size, size)
-        pupil = torch.zeros(1)
-    with FlopCounterMode(display=False, custom_mapping=mapping) as counter, torch.no_grad():
-        network(amplitude, depth, pupil)
-    return counter.get_total_flops() / size**2
 
 
 def seconds_per_step(config: TrainConfig, device: torch.device) -> float:

@@ -2,35 +2,64 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import statistics
 import time
 from typing import Any
 
 import torch
-from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from holod_training.judging import Method, network_field
+from holod_training.config import NetworkConfig
+from holod_training.judging import Method
+from holod_training.network import FieldNetwork
 from holod_training.shards import Stack
+from holod_training.variants import build_network
+
+COUNTED_SIZE_PX = 512
 
 
-def _fft_operations(shape: tuple[int, ...], dim: list[int], *_: Any, **__: Any) -> int:
-    """5·N·log2 N real operations a complex transform of N points (Cooley and Tukey's usual count)."""
-    points = math.prod(shape[d] for d in dim)
-    return round(math.prod(shape) / points * 5 * points * math.log2(points))
+def operations_per_pixel(config: NetworkConfig) -> float:
+    """Floating-point operations a panel pixel of one frame, counted on 512x512: two a product and sum of convolutions
+    and matrices, 8 a bilinear tap, 5·log2(n) a value of a complex FFT of n values and half of it of a real one."""
+
+    def fft(share: float) -> Any:
+        def count(shape: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
+            largest = max(shape, out_shape, key=math.prod)
+            return int(share * 5 * math.prod(largest) * math.log2(largest[-1] * largest[-2]))
+
+        return count
+
+    def taps(shape: Any, *_: Any, out_shape: Any = None, **__: Any) -> int:
+        return 8 * math.prod(out_shape)
+
+    aten = torch.ops.aten
+    mapping = {
+        aten._fft_c2c: fft(1),
+        aten._fft_r2c: fft(0.5),
+        aten._fft_c2r: fft(0.5),
+        aten.grid_sampler_2d: taps,
+    }
+    size = COUNTED_SIZE_PX
+    pupil = torch.tensor([3.0])
+    with torch.device("meta"):
+        # Specialists choose by the pupil's value, which meta tensors do not have; one of them runs.
+        network = build_network(dataclasses.replace(config, specialists_mm=()))
+        images = (config.planes, 3) if config.architecture == "focal-stack" else (3,)
+        amplitude, depth = torch.zeros(1, *images, size, size), torch.zeros(1, size, size)
+        pupil = torch.zeros(1)
+    with FlopCounterMode(display=False, custom_mapping=mapping) as counter, torch.no_grad():
+        network(amplitude, depth, pupil)
+    return counter.get_total_flops() / size**2
 
 
 @torch.no_grad()
-def network_cost(network: FieldNetwork, stack: Stack) -> dict[str, Any]:
-    """Parameters, and floating-point operations for each of the picture's pixels: convolutions and matrix products
-    (two for each multiply-add) and FFTs; what merely moves or scales numbers is not counted."""
-    counter = FlopCounterMode(display=False, custom_mapping={torch.ops.aten._fft_c2c: _fft_operations})
-    with counter:
-        network_field(network, stack, stack.pupil_mm)
+def network_cost(network: FieldNetwork) -> dict[str, Any]:
+    """Parameters, and `operations_per_pixel`."""
     return {
         "parameters": sum(p.numel() for p in network.parameters()),
-        "operations_per_px": counter.get_total_flops() / stack.depth.numel(),
+        "operations_per_px": operations_per_pixel(network.config),
     }
 
 

@@ -87,8 +87,7 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
         "pupil_mm": shards[0].pupils_mm[timed],
         "rows": time_methods(methods, bench.read(shards[0], timed), config.timing_calls),
     }
-    stack = bench.read(shards[0], timed)
-    result["networks"] = [{"method": name, **network_cost(one, stack)} for name, one in networks.items()]
+    result["networks"] = [{"method": name, **network_cost(one)} for name, one in networks.items()]
     result["offsets"] = offset_statistics(network, shards, bench)
     if config.focus_curve_weights and config.solver_scenes:
         scenes = shards[: config.solver_scenes]

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from holod_training.judging import Bench, network_field
-from holod_training.network import AdjustableLayer
+from holod_training.network import AdjustableLayer, FieldNetwork
 from holod_training.shards import Shard, Stack
 
 DEPTH_INTERVALS = 5

@@ -7,14 +7,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from holod_training.config import OpticsConfig
+from holod_training.layered import LOG_FLOOR, LOG_OFFSET, PHASE_SIGMAS_PX, PRIOR_GAINS, REFERENCE_NM
 from holod_training.optics import frequencies, half_band_mask, propagate, transfer
 
 OCCLUSION_LAYERS = 8
 SMOOTH_PHASE_LAYERS = 24
 ANTI_ALIASING_SIGMA_PX = 0.7
-PRIOR_SIGMAS_PX = (1.0, 2.5)
-PRIOR_GAINS = (-0.5, -1.0)
-PRIOR_WAVELENGTH_NM = 520.0
 
 
 def stop_half_band(field: Tensor) -> Tensor:
@@ -67,16 +65,16 @@ def smooth_phase(amplitude: Tensor, depth: Tensor, optics: OpticsConfig) -> Tens
 def transport_of_intensity(amplitude: Tensor, depth: Tensor, optics: OpticsConfig) -> Tensor:
     """`layered_asm` of an object whose phase makes light drift from bright to dark where it is out of focus.
 
-    φ = (520 nm / λ) · Σ_j g_j · tanh(4·(½ − D)) · (G_σj(log(I + 0.03)) + 1.66), σ = 1 and 2.5 px, g = −0.5 and −1.
+    φ = (520 nm / λ) · Σ_j g_j · tanh(4·(½ − D)) · (G_σj(log(I + 0.03)) + 1.66), σ = 1, 2.5, 6 px, g = −0.5, −1, 0.
     Near objects take the other sign than far ones, since the drift turns round behind the volume's middle.
     """
-    logarithm = torch.log(amplitude.square() + 0.03)
+    logarithm = torch.log(amplitude.square() + LOG_FLOOR)
     sign = torch.tanh(4 * (0.5 - depth))
     phase = torch.zeros_like(amplitude)
-    for gain, sigma in zip(PRIOR_GAINS, PRIOR_SIGMAS_PX, strict=True):
-        phase += gain * sign * (gaussian_blur(logarithm, sigma) + 1.66)
+    for gain, sigma in zip(PRIOR_GAINS, PHASE_SIGMAS_PX, strict=True):
+        phase += gain * sign * (gaussian_blur(logarithm, sigma) + LOG_OFFSET)
     wavelengths = torch.tensor(optics.wavelengths_nm, dtype=phase.dtype, device=phase.device)
-    phase = phase * (PRIOR_WAVELENGTH_NM / wavelengths)[:, None, None]
+    phase = phase * (REFERENCE_NM / wavelengths)[:, None, None]
     return layered_asm(torch.polar(amplitude, phase), depth, optics)
 
 

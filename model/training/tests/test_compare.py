@@ -6,8 +6,9 @@ import torch
 from matplotlib.figure import Figure
 
 from holod_training.cli import main
-from holod_training.compare import compare, judge_held_out, operations_per_pixel
+from holod_training.compare import compare, judge_held_out
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
+from holod_training.costs import operations_per_pixel
 from holod_training.curves import plot_curves
 from holod_training.network import DirectNetwork
 from holod_training.shards import open_shards

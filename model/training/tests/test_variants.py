@@ -5,8 +5,8 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from holod_training.compare import operations_per_pixel
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
+from holod_training.costs import operations_per_pixel
 from holod_training.layered import LayeredNetwork, blurred
 from holod_training.metrics import focus_response
 from holod_training.network import DirectNetwork
