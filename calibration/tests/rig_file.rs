@@ -4,7 +4,9 @@ use std::f64::consts::{PI, TAU};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use holod_calibration::rig::{Eye, Fault, LaserDriver, PanelMode, PanelProfile, PhaseSign, Provenance, Rig, RigError, WeightsChoice};
+use holod_calibration::rig::{
+    Eye, Fault, LaserDriver, PanelMode, PanelProfile, PhaseSign, Provenance, Rig, RigError, WeightsChoice,
+};
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, Resolution, TimeNs};
 use image::{GrayImage, ImageBuffer, Luma, RgbImage};
 use proptest::prelude::*;

@@ -1,9 +1,11 @@
 //! The command line, as clap sees it.
 
+use std::convert::Infallible;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use holod_calibration::rig::WeightsChoice;
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_pupil_input::UsbIds;
 
@@ -80,6 +82,20 @@ pub struct RigArgs {
     pub config: Option<PathBuf>,
 }
 
+/// Which network computes the holograms.
+#[derive(Args, Debug, Clone, Default)]
+pub struct NetworkArgs {
+    /// The network's weights: standard or small (built in), or a file that the trainer exported (./small is a file); what the rig names
+    /// when left out.
+    #[arg(long, value_name = "NAME|FILE", value_parser = parse_weights)]
+    pub weights: Option<WeightsChoice>,
+}
+
+fn parse_weights(text: &str) -> Result<WeightsChoice, Infallible> {
+    let built_in = WeightsChoice::BUILT_IN.into_iter().find(|(name, _)| *name == text);
+    Ok(built_in.map_or_else(|| WeightsChoice::File(text.into()), |(_, choice)| choice))
+}
+
 /// Where pictures with depth come from.
 #[derive(Args, Debug, Clone, Default)]
 pub struct SceneArgs {
@@ -130,6 +146,9 @@ pub struct RunArgs {
     /// The rig.
     #[command(flatten)]
     pub rig: RigArgs,
+    /// The network.
+    #[command(flatten)]
+    pub network: NetworkArgs,
     /// The eye tracker's spec.
     #[arg(
         long,
@@ -179,6 +198,9 @@ pub struct RenderArgs {
     /// The rig.
     #[command(flatten)]
     pub rig: RigArgs,
+    /// The network.
+    #[command(flatten)]
+    pub network: NetworkArgs,
     /// The scene.
     #[command(flatten)]
     pub scene: SceneArgs,
@@ -202,8 +224,11 @@ pub struct ViewArgs {
     /// The rig.
     #[command(flatten)]
     pub rig: RigArgs,
+    /// The network.
+    #[command(flatten)]
+    pub network: NetworkArgs,
     /// A directory that `holod render` wrote.
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "pupil"])]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "pupil", "weights"])]
     pub hologram: Option<PathBuf>,
     /// The scene.
     #[command(flatten)]
@@ -245,6 +270,9 @@ pub struct BenchArgs {
     /// The rig.
     #[command(flatten)]
     pub rig: RigArgs,
+    /// The network.
+    #[command(flatten)]
+    pub network: NetworkArgs,
     /// Engine for the network.
     #[arg(long, value_enum, default_value_t = Backend::Auto)]
     pub backend: Backend,
@@ -271,9 +299,9 @@ pub struct EvaluateArgs {
     /// Folder of refocus cards, as `holod-scenes generate --kind cards` writes them.
     #[arg(long, value_name = "DIR")]
     pub cards: Option<PathBuf>,
-    /// Weights to judge; the rig's, or the built-in ones, when left out.
-    #[arg(long, value_name = "FILE")]
-    pub weights: Option<PathBuf>,
+    /// The network to judge.
+    #[command(flatten)]
+    pub network: NetworkArgs,
     /// Engine for the network.
     #[arg(long, value_enum, default_value_t = Backend::Auto)]
     pub backend: Backend,

@@ -7,7 +7,7 @@ use holod_calibration::{DisplayGeometry, Resolution};
 use holod_model::scene::{DepthEncoding, Fit, FrameReport, Scene, SceneError};
 use holod_model::{CpuEngine, RgbdFrame, Weights, scene_renderer};
 
-use crate::cli::{Backend, FitArg, RigArgs, SceneArgs};
+use crate::cli::{Backend, FitArg, NetworkArgs, RigArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
 
 /// Size of a hologram of the built-in scene on a processor.
@@ -22,6 +22,15 @@ pub fn rig(args: &RigArgs) -> Result<Rig, Failure> {
         None => Ok(Rig::default()),
         Some(path) => Rig::load(path).map_err(Failure::because(Exit::Config)),
     }
+}
+
+/// The same with the network that was named in place of the rig's own.
+pub fn rig_with_network(args: &RigArgs, network: &NetworkArgs) -> Result<Rig, Failure> {
+    let mut rig = rig(args)?;
+    if let Some(weights) = &network.weights {
+        rig.model.weights.clone_from(weights);
+    }
+    Ok(rig)
 }
 
 /// The rig's weights, checked against its optics.

@@ -20,6 +20,8 @@ use crate::{LinearImage, RgbdFrame};
 const LONGEST_HEADER_BYTES: u64 = 1 << 20;
 /// Relative difference below which two optical figures are the same.
 const OPTICS_TOLERANCE: f64 = 1e-4;
+/// Pupils outside this range are no pupils.
+const PUPILS_MM: std::ops::RangeInclusive<f64> = 0.1..=100.0;
 
 /// A shard that cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -118,8 +120,8 @@ impl SceneShard {
         let numbers = |key| entries.numbers(key);
         let pupils_mm = numbers("pupils_mm")?;
         let focus_dpt = numbers("focus_dpt")?;
-        if let Some(pupil_mm) = pupils_mm.iter().find(|&&pupil_mm| pupil_mm <= 0.0) {
-            return Err(entries.error("metadata `pupils_mm`", format!("{pupil_mm}"), "diameters above 0 mm"));
+        if let Some(pupil_mm) = pupils_mm.iter().find(|&&mm| !PUPILS_MM.contains(&mm)) {
+            return Err(entries.error("metadata `pupils_mm`", format!("{pupil_mm}"), "diameters of 0.1 to 100 mm"));
         }
         for (key, expected) in [
             ("far_dpt", geometry.depth_far.0),

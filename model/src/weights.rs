@@ -229,9 +229,15 @@ impl fmt::Display for OpticsMismatch {
 impl std::error::Error for OpticsMismatch {}
 
 impl Weights {
-    /// The weights that ship with holod.
+    /// The weights that ship with holod, of the best quality.
     pub fn builtin() -> Self {
-        Self::from_bytes(include_bytes!("../weights/direct-halfband-14.safetensors"), "built-in")
+        Self::from_bytes(include_bytes!("../weights/direct-halfband-14.safetensors"), "standard")
+            .expect("the built-in weights are valid: a test loads them")
+    }
+
+    /// The weights that ship with holod for weak machines: a third of the operations.
+    pub fn builtin_small() -> Self {
+        Self::from_bytes(include_bytes!("../weights/direct-halfband-8.safetensors"), "small")
             .expect("the built-in weights are valid: a test loads them")
     }
 
@@ -594,7 +600,11 @@ pub(crate) mod tests {
     fn the_built_in_weights_are_valid_and_fit_the_built_in_bench() {
         let weights = Weights::builtin();
         assert_eq!((weights.config().layers, weights.config().grid), (14, Grid::HalfBand));
-        weights.check_optics(&DisplayGeometry::DEFAULT).unwrap();
+        let small = Weights::builtin_small();
+        assert_eq!((small.config().layers, small.config().channels), (8, 24));
+        for weights in [weights, small] {
+            weights.check_optics(&DisplayGeometry::DEFAULT).unwrap();
+        }
     }
 
     #[test]

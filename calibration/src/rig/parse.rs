@@ -7,8 +7,8 @@ use super::files::plain_file;
 use super::profile::PanelProfile;
 use super::reader::{Found, Reader, Section, Span};
 use super::{
-    Eye, LaserDriver, Lasers, Model, Panel, PanelMode, PhaseSign, Provenance, Rig, RigError, Tracker, WeightsChoice, flatness,
-    lut,
+    Eye, LaserDriver, Lasers, Model, Panel, PanelMode, PhaseSign, Provenance, Rig, RigError, Tracker, WeightsChoice,
+    flatness, lut,
 };
 use crate::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
 

@@ -34,7 +34,7 @@ struct Stage {
 }
 
 pub(super) fn bench(args: &BenchArgs) -> Result<(), Failure> {
-    let rig = setup::rig(&args.rig)?;
+    let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let weights = setup::weights(&rig)?;
     let resolution = args.resolution;
     if resolution.width > rig.resolution().width || resolution.height > rig.resolution().height {

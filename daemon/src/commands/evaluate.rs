@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use holod_calibration::rig::Rig;
+use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_calibration::{PupilDiameter, Resolution};
 use holod_model::metrics::StackScore;
 use holod_model::scene_shard::{SceneShard, SceneShardError};
@@ -64,10 +64,7 @@ struct Matrix {
 }
 
 pub(super) fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
-    let mut rig = setup::rig(&args.rig)?;
-    if args.weights.is_some() {
-        rig.model.weights.clone_from(&args.weights);
-    }
+    let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let weights = setup::weights(&rig)?;
     let shards = open(&args.scenes, args.limit, &rig)?;
     let cards = args.cards.as_deref().map(|folder| open(folder, None, &rig)).transpose()?.unwrap_or_default();
@@ -76,18 +73,7 @@ pub(super) fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
     let staging = args.out.as_deref().map(Staging::new).transpose()?;
 
     let progress = progress_bar(shards.len() + cards.len());
-    let mut judge = judge(&rig, &weights, args, &shards[0])?;
-    let mut judged = Vec::new();
-    let mut views = Vec::new();
-    for shard in &shards {
-        let mut scene = judge.scene(shard, &pupil_indices(shard, &pupils)?)?;
-        if views.len() < SHEET_SCENES {
-            views.push((shard, std::mem::take(&mut scene.views)));
-        }
-        scene.views.clear();
-        judged.push(scene);
-        progress.inc(1);
-    }
+    // Cards first: they are few, and what is wrong with them is told before the long work.
     let mut refocus = Vec::new();
     let mut card_views = Vec::new();
     if let Some(first) = cards.first() {
@@ -100,10 +86,22 @@ pub(super) fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
             progress.inc(1);
         }
     }
+    let mut judge = judge(&rig, &weights, args, &shards[0])?;
+    let mut judged = Vec::new();
+    let mut views = Vec::new();
+    for shard in &shards {
+        let mut scene = judge.scene(shard, &pupil_indices(shard, &pupils)?)?;
+        if views.len() < SHEET_SCENES {
+            views.push((shard, std::mem::take(&mut scene.views)));
+        }
+        scene.views.clear();
+        judged.push(scene);
+        progress.inc(1);
+    }
     progress.finish_and_clear();
 
     let evaluation = Evaluation {
-        weights: file_name(rig.model.weights.as_deref()),
+        weights: name_of(&rig.model.weights),
         scenes: shards.len(),
         width_px: shards[0].resolution().width,
         height_px: shards[0].resolution().height,
@@ -204,9 +202,12 @@ fn judge(rig: &Rig, weights: &Weights, args: &EvaluateArgs, shard: &SceneShard) 
     Judge::new(rig, weights, args.backend, size, args.border_px)
 }
 
-fn file_name(weights: Option<&Path>) -> String {
-    let name = weights.map(|path| path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned());
-    name.unwrap_or_else(|| "built-in".into())
+fn name_of(weights: &WeightsChoice) -> String {
+    match weights {
+        WeightsChoice::Standard => "standard".into(),
+        WeightsChoice::Small => "small".into(),
+        WeightsChoice::File(path) => path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
+    }
 }
 
 fn progress_bar(scenes: usize) -> ProgressBar {

@@ -36,7 +36,7 @@ struct Report {
 const FILES: [&str; 5] = ["field.safetensors", "phase_red.png", "phase_green.png", "phase_blue.png", "report.json"];
 
 pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
-    let rig = setup::rig(&args.rig)?;
+    let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let staging = Staging::new(&args.out)?;
     let (hologram, mut report) = compute(&rig, &args.scene, args.pupil, args.backend)?;
     let mut double_phase = DoublePhase::new(hologram.hologram.resolution, hologram.amplitude_constant);

@@ -18,7 +18,7 @@ const SAMPLE_TRACKER: &str = "mock";
 
 pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     check_output(&args.output)?;
-    let rig = setup::rig(&args.rig)?;
+    let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let spec = args.tracker.clone().or_else(|| rig.tracker.spec.clone()).unwrap_or_else(|| SAMPLE_TRACKER.to_owned());
     let tracker: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
     let weights = setup::weights(&rig)?;

@@ -35,7 +35,7 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
             format!("--out {}: found a directory, expected the name of a PNG file to write", args.out.display()),
         ));
     }
-    let rig = setup::rig(&args.rig)?;
+    let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let hologram = match (&args.hologram, args.pupil) {
         (Some(folder), _) => load(folder)?,
         (None, Some(pupil)) => render::hologram(&rig, &args.scene, pupil, args.backend)?,

@@ -191,3 +191,8 @@ fn a_narrow_network_on_the_full_grid_matches_its_golden_vectors() {
 fn the_built_in_network_matches_its_golden_vectors() {
     check("direct-shipped.safetensors");
 }
+
+#[test]
+fn the_small_built_in_network_matches_its_golden_vectors() {
+    check("direct-shipped-small.safetensors");
+}

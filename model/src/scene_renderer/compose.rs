@@ -14,6 +14,8 @@ use super::{meshes, rooms, shadow};
 pub(super) const OVERSCAN_PX: f32 = 60.0;
 /// Steepest plane, in dioptres per pixel: beyond it an aperture ray could meet the plane from behind.
 const STEEPEST: f32 = 0.03;
+/// The same for walls and grounds: an 8 mm pupil's outermost ray goes 20 px a dioptre.
+pub(super) const STEEPEST_WALL: f32 = 0.045;
 
 /// The picture's extent and the size that random lengths scale with.
 pub(super) struct Stage {
@@ -338,7 +340,7 @@ pub(super) fn slope(
     dim: f32,
 ) -> Surface {
     const FARTHEST: f32 = 0.12;
-    let rate = nearest / (half_along - horizon);
+    let rate = (nearest / (half_along - horizon)).min(STEEPEST_WALL);
     let start = horizon + FARTHEST / rate;
     let end = half_along + OVERSCAN_PX;
     let across = half_across + OVERSCAN_PX;

@@ -1,6 +1,6 @@
 //! A room in true perspective: a back wall, and side walls, floor and ceiling that run from it to the viewer.
 
-use super::compose::{OVERSCAN_PX, Stage};
+use super::compose::{OVERSCAN_PX, STEEPEST_WALL, Stage};
 use super::families::pattern;
 use super::random::Random;
 use super::surface::{Bounds, Shape, Surface};
@@ -56,7 +56,7 @@ fn side_wall(
         (vanishing.0, vanishing.1, stage.half_width)
     };
     // Depth grows in proportion to the distance from the vanishing point: a plane of the world beside the viewer.
-    let rate = nearest / (half_along - sign * centre_along);
+    let rate = (nearest / (half_along - sign * centre_along)).min(STEEPEST_WALL);
     let slope = sign * rate;
     let (gx, gy) = if upright { (0.0, slope) } else { (slope, 0.0) };
     let shape = Shape::Plane { cx: vanishing.0, cy: vanishing.1, depth: 0.0, gx, gy };

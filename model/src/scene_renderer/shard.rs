@@ -26,8 +26,8 @@ pub const FORMAT: &str = "holod-scene-1";
 /// The generation of the random scenes: the same kind, seed and index give the same scene within one generation only.
 /// Shards that name none are of the first.
 pub const GENERATOR: u32 = 2;
-/// Pupils outside this range are no human's.
-const PUPIL_RANGE_MM: (f32, f32) = (0.5, 9.0);
+/// Pupils outside this range are no human's; rays of wider ones would pass the background's edge.
+const PUPIL_RANGE_MM: (f32, f32) = (0.5, 8.0);
 /// The range that [`PupilPlan::Strata`] divides.
 const STRATA_RANGE_MM: (f32, f32) = (1.0, 5.0);
 

@@ -122,7 +122,8 @@ def _parser() -> argparse.ArgumentParser:
 
     golden = command("golden", "Writes the golden vectors that the engines are tested against")
     golden.add_argument("--out", required=True, help="folder, model/golden")
-    golden.add_argument("--weights", help="the shipped weights file, for vectors of it too")
+    golden.add_argument("--weights", help="the shipped standard weights, for vectors of them too")
+    golden.add_argument("--small-weights", help="the shipped small weights, likewise")
     golden.add_argument("--seed", type=int, default=20)
     golden.set_defaults(run=_golden)
     return parser
@@ -246,8 +247,8 @@ def _export(options: argparse.Namespace) -> None:
 def _golden(options: argparse.Namespace) -> None:
     from holod_training.golden import write_golden
 
-    shipped = Path(options.weights) if options.weights else None
-    for path in write_golden(Path(options.out), shipped, options.seed):
+    standard, small = (Path(path) if path else None for path in (options.weights, options.small_weights))
+    for path in write_golden(Path(options.out), standard, small, options.seed):
         print(path)
 
 

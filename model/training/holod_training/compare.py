@@ -18,7 +18,7 @@ from holod_training.curves import read_rows
 from holod_training.export import load_weights, write_beside
 from holod_training.metrics import Judgement, judge
 from holod_training.network import FieldNetwork
-from holod_training.optics import Eye, coc_px, double_phase, panel_field, upsample_half_band
+from holod_training.optics import Eye, coc_px, double_phase, panel_field, through_levels, upsample_half_band
 from holod_training.rivals import flat_oracle
 from holod_training.shards import Shard, open_shards
 from holod_training.train import VALIDATION_PUPILS_MM, Run, TrainConfig, nearest_pupil, train
@@ -67,7 +67,7 @@ def judge_held_out(network: FieldNetwork, shards: list[Shard], border_px: int) -
                 field = upsample_half_band(field)
             phase, _ = double_phase(field, config.amplitude_constant)
             eye = Eye(config.optics, shard.height, shard.width, list(stack.focus_dpt))
-            picture = eye.look(panel_field(phase), stack.pupil_mm) * config.amplitude_constant**2
+            picture = eye.look(panel_field(through_levels(phase)), stack.pupil_mm) * config.amplitude_constant**2
             blur = coc_px(config.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
             judged.append(judge(picture, stack.target, blur, border_px, with_ssim=False))
         result[str(pupil_mm)] = Judgement.mean(judged).known()
@@ -110,11 +110,18 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
     rows = []
     for name, network in networks.items():
         known = out / name / "comparison.json"
+        config = dataclasses.replace(base, network=network, out=str(out / name), stop_below_slope=NO_STOP)
+        terms = {"minutes": seconds / 60, **json.loads(json.dumps(dataclasses.asdict(config)))}
         if known.is_file():
+            kept = json.loads(known.read_text())["terms"]
+            other = [key for key in terms if kept.get(key) != terms[key]]
+            if other:
+                raise ConfigError(
+                    f"{known}: found a row with another {', '.join(other)}; choose another --out, or delete {known.parent}"
+                )
             print(f"{name}: taken from {known}")
         else:
-            config = dataclasses.replace(base, network=network, out=str(out / name), stop_below_slope=NO_STOP)
-            row = {"variant": name, **_contest(config, seconds, device)}
+            row = {"variant": name, "terms": terms, **_contest(config, seconds, device)}
             write_beside(known, (json.dumps(row, indent=1) + "\n").encode())
         rows.append(json.loads(known.read_text()))
     shards = open_shards(Path(base.validation), base.network.optics, base.validation_scenes)

@@ -42,7 +42,6 @@ def operations_per_pixel(config: NetworkConfig) -> float:
         aten.grid_sampler_2d: taps,
     }
     size = COUNTED_SIZE_PX
-    pupil = torch.tensor([3.0])
     with torch.device("meta"):
         # Specialists choose by the pupil's value, which meta tensors do not have; one of them runs.
         network = build_network(dataclasses.replace(config, specialists_mm=()))

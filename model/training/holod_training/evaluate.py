@@ -61,6 +61,8 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     timed = min(range(len(shards[0].pupils_mm)), key=lambda i: abs(shards[0].pupils_mm[i] - TIMED_PUPIL_MM))
 
     config.out.mkdir(parents=True, exist_ok=True)
+    # Cards first: they are few, and what is wrong with them is told before the long work.
+    refocus = refocus_cards(cards, learned_and_rivals, bench, config.out / "cards.png") if cards else []
     judged = judge_scenes(shards, methods, bench)
     result: dict[str, Any] = {
         "weights": config.weights.name,
@@ -75,14 +77,16 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
         "all_pupils_mm": list(shards[0].pupils_mm),
         "solver": {
             "start": config.solver_start,
-            "scenes": config.solver_scenes,
+            "scenes": min(config.solver_scenes, len(shards)),
             "iterations": config.solver.iterations,
             "loss": dataclasses.asdict(config.solver.loss),
         },
         **judged.summary(),
     }
+    per_scene = judged.per_scene([shard.path.name for shard in shards])
+    write_beside(config.out / "scenes.json", (json.dumps(per_scene) + "\n").encode())
     if cards:
-        result["refocus"] = refocus_cards(cards, learned_and_rivals, bench, config.out / "cards.png")
+        result["refocus"] = refocus
     result["run_time"] = {
         "pupil_mm": shards[0].pupils_mm[timed],
         "rows": time_methods(methods, bench.read(shards[0], timed), config.timing_calls),
@@ -99,8 +103,6 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     if config.rgbd:
         write_rgbd_sheet(config.out / "rgbd.png", config.rgbd, trained[0], bench)
     result["plots"] = write_plots(config.out, result)
-    per_scene = judged.per_scene([shard.path.name for shard in shards])
-    write_beside(config.out / "scenes.json", (json.dumps(per_scene) + "\n").encode())
     write_beside(config.out / "evaluation.json", (json.dumps(result, indent=1) + "\n").encode())
     write_beside(config.out / "evaluation.md", markdown(result).encode())
     return result

@@ -33,7 +33,8 @@ from holod_training.shards import Stack, open_shards
 PUPILS_MM = (1.0, 2.0, 3.0, 4.0, 5.0)
 SHARES = (0.5, 0.9, 0.99)
 DIAMETERS_MM = (0.02, 0.05, *(round(0.1 * k, 1) for k in range(1, 26)))
-SHIFTS_MM = tuple(round(0.1 * k, 1) for k in range(26))
+SHIFTS_MM = (0.0, 0.01, 0.02, 0.05, *(round(0.1 * k, 1) for k in range(1, 26)))
+LIGHT_SHIFT_MM = 0.5
 SAME_PICTURE_DB = 30.0
 GREEN = 1
 NETWORK_PUPIL_MM = 3.0
@@ -83,6 +84,9 @@ def sampling_interval(alike_db: list[float]) -> float | None:
     for index in range(1, len(SHIFTS_MM)):
         before, after = alike_db[index - 1], alike_db[index]
         if after < SAME_PICTURE_DB:
+            if index == 1:
+                # From nothing the error grows with the square of the shift.
+                return SHIFTS_MM[1] * 10 ** ((after - SAME_PICTURE_DB) / 20)
             part = (before - SAME_PICTURE_DB) / (before - after)
             return SHIFTS_MM[index - 1] + part * (SHIFTS_MM[index] - SHIFTS_MM[index - 1])
     return None
@@ -195,7 +199,7 @@ def markdown(found: Study, optics: OpticsConfig, scenes: int, weights: str) -> s
         f"Shift in mm at which what a pupil sees falls below {SAME_PICTURE_DB:.0f} dB PSNR against what the "
         "centred one sees (the pupil sampling",
         "interval: holograms for a moving eye must be made anew at least that often), and in brackets the light that",
-        f"is left at {SHIFTS_MM[5]} mm:",
+        f"is left at {LIGHT_SHIFT_MM} mm:",
         "",
         "| field | " + " | ".join(f"s = {pupil_mm:g} mm" for pupil_mm in PUPILS_MM) + " |",
         "|---|" + "---|" * len(PUPILS_MM),
@@ -203,7 +207,7 @@ def markdown(found: Study, optics: OpticsConfig, scenes: int, weights: str) -> s
     for name in found.share_inside:
         cells = [
             f"{mm(sampling_interval(found.alike_db[name, pupil_mm]), SHIFTS_MM[-1])} "
-            f"({found.light[name, pupil_mm][5]:.0%})"
+            f"({found.light[name, pupil_mm][SHIFTS_MM.index(LIGHT_SHIFT_MM)]:.0%})"
             for pupil_mm in PUPILS_MM
         ]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")

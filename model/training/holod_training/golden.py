@@ -105,8 +105,8 @@ def write_vectors(path: Path, result: dict[str, Tensor], about: dict[str, Any]) 
     write_beside(path, save(tensors, metadata))
 
 
-def write_golden(out: Path, shipped: Path | None, seed: int = 20) -> list[Path]:
-    """Writes every golden file into `out`; `shipped` is the weights file that the product loads, if it exists."""
+def write_golden(out: Path, standard: Path | None, small: Path | None = None, seed: int = 20) -> list[Path]:
+    """Writes every golden file into `out`; `standard` and `small` are the weights that the product has."""
     written = []
     for name, grid, height, width in (
         ("direct-narrow", "half-band", 32, 48),
@@ -119,11 +119,16 @@ def write_golden(out: Path, shipped: Path | None, seed: int = 20) -> list[Path]:
         result = vectors(load_weights(weights).double(), amplitude, depth, 2.7, None)
         write_vectors(out / f"{name}.safetensors", result, {"seed": seed, "weights": weights.name})
         written += [weights, out / f"{name}.safetensors"]
-    if shipped:
+    for name, shipped in (("direct-shipped", standard), ("direct-shipped-small", small)):
+        if not shipped:
+            continue
+        network = load_weights(shipped)
         amplitude, depth = scene(32, 48, seed)
-        result = vectors(load_weights(shipped).double(), amplitude, depth, 3.4, (0, 7, 13))
-        path = out / "direct-shipped.safetensors"
-        write_vectors(path, result, {"seed": seed, "weights": shipped.name})
-        write_evaluation(out / "evaluation.safetensors", shipped, seed)
-        written += [path, out / "evaluation.safetensors"]
+        kept = (0, *network.config.adjustable_layers, network.config.layers - 1)
+        result = vectors(network.double(), amplitude, depth, 3.4, kept)
+        write_vectors(out / f"{name}.safetensors", result, {"seed": seed, "weights": shipped.name})
+        written.append(out / f"{name}.safetensors")
+    if standard:
+        write_evaluation(out / "evaluation.safetensors", standard, seed)
+        written.append(out / "evaluation.safetensors")
     return written

@@ -13,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from holod_training.config import OpticsConfig
-from holod_training.intervals import bootstrap_interval
+from holod_training.intervals import interval_95
 from holod_training.loss import inner
 from holod_training.metrics import Judgement, judge, psnr_db
 from holod_training.network import FieldNetwork
@@ -224,7 +224,7 @@ class Judged:
 
 
 def _intervals(numbers: dict[str, list[float]]) -> dict[str, list[float]]:
-    found = {name: bootstrap_interval(values) for name, values in numbers.items()}
+    found = {name: interval_95(values) for name, values in numbers.items()}
     return {name: list(interval) for name, interval in found.items() if interval}
 
 

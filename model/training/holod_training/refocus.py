@@ -42,7 +42,7 @@ def refocus_cards(shards: list[Shard], methods: list[Method], bench: Bench, shee
     rows = []
     pictures = []
     focus = (CARD_NEAR_DPT, CARD_FAR_DPT)
-    for index, shard in enumerate(shards):
+    for shard in shards:
         stack = bench.read(shard, 0)
         areas = card_areas(stack.depth, bench.optics, bench.border_px)
         for name, area in areas.items():
@@ -63,7 +63,7 @@ def refocus_cards(shards: list[Shard], methods: list[Method], bench: Bench, shee
                 rows.append(
                     {
                         "method": method.name,
-                        "contrast": "dark on bright" if index % 2 == 0 else "bright on dark",
+                        "contrast": "dark on bright" if shard.index % 2 == 0 else "bright on dark",
                         "pupil_mm": pupil,
                         "near_card": energy["near"][0] / energy["near"][1],
                         "far_card": energy["far"][1] / energy["far"][0],

@@ -16,7 +16,6 @@ NUMBERS = (
     ("ssim", "SSIM", 3),
 )
 PAIRED = NUMBERS[:4]
-FEW_SCENES = 10
 PLOTS = {
     "pupils": "PSNR and slope against the pupil",
     "focus_curve": "sharp in focus against right over all",
@@ -42,13 +41,12 @@ def _opening(result: dict[str, Any]) -> list[str]:
         if solver["scenes"]
         else ""
     )
-    few = " With so few scenes these are too narrow." if result["scenes"] < FEW_SCENES else ""
     return [
         f"# Evaluation of {result['weights']}",
         "",
         f"{result['date']}: {result['scenes']} held-out scenes of {width}x{height}, all {len(result['focus_dpt'])} "
         f"focal planes, a border of {result['border_px']} px left out; linear light, peak 1. Means over scenes, in "
-        f"brackets their 95 % bootstrap interval.{few} Amplitude constant {result['amplitude_constant']}. Slope and "
+        f"brackets their 95 % interval (Student's t). Amplitude constant {result['amplitude_constant']}. Slope and "
         "correlation: P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, 0 = one picture at all "
         f"depths). In focus: CoC < 2 px; out of focus: CoC > 8 px. Everything is after double phase.{optimised}",
     ]
@@ -70,8 +68,8 @@ def _paired(result: dict[str, Any]) -> list[str]:
     lines = [
         "## Ours less each other, scene by scene",
         "",
-        "Means of the differences on the scenes that both were judged on; an interval without 0 is a difference that "
-        "more scenes would not undo.",
+        "Means of the differences on the scenes that both were judged on; an interval without 0 is a difference "
+        "that scenes alone hardly make.",
         "",
     ]
     lines += _header(["s mm", "against", "scenes", *(label for _, label, _ in PAIRED)])
@@ -121,7 +119,7 @@ def _costs(result: dict[str, Any]) -> list[str]:
         "",
         f"Time for one field at s = {result['run_time']['pupil_mm']:g} mm, all methods in turn in this run, median of "
         "the calls, as ratio to ours: one thread's CPU time, or wall time on a GPU. Operations: convolutions, matrix "
-        "products (two a multiply-add) and FFTs.",
+        "products (two a multiply-add), bilinear taps and FFTs.",
         "",
     ]
     networks = {row["method"]: row for row in result["networks"]}

@@ -68,6 +68,7 @@ class Shard:
                 self.height, self.width = self._size(file, names)
                 self.kind = metadata.get("kind", "")
                 self._check_format(metadata)
+                self.index = int(self._number(metadata, "index"))
                 self.pupils_mm: tuple[float, ...] = tuple(self._list(metadata, "pupils_mm"))
                 self.focus_dpt: tuple[float, ...] = tuple(self._list(metadata, "focus_dpt"))
                 self.far_dpt = self._number(metadata, "far_dpt")

@@ -375,7 +375,11 @@ def _stop_if_flat(run: Run, measured: dict[str, dict[str, float]]) -> None:
     config = run.config
     if not run.validation or run.step < 0.1 * config.steps:
         return
-    slope = measured["2.0"]["slope"]
+    slope = measured["2.0"].get("slope", math.nan)
+    if math.isnan(slope):
+        raise TrainingError(
+            f"{config.validation}: found scenes that look the same at every focus at s = 2 mm; expected depth in them"
+        )
     if slope < config.stop_below_slope:
         raise TrainingError(
             f"step {run.step}: focus slope {slope:.3f} at s = 2 mm is below {config.stop_below_slope}: the network "

@@ -1,3 +1,4 @@
+import math
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,8 @@ from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.export import save_weights
 from holod_training.eyebox import (
     ALL_IN_FOCUS,
+    DIAMETERS_MM,
+    LIGHT_SHIFT_MM,
     RANDOM,
     SAME_PICTURE_DB,
     SHIFTS_MM,
@@ -52,16 +55,19 @@ def test_random_phase_fills_the_stop_and_tolerates_shifts_less_than_smooth_phase
     smooth, rough = (diameter_holding(0.5, found.share_inside[name]) for name in (ALL_IN_FOCUS, RANDOM))
     assert smooth is not None and rough is not None and smooth < 0.2 < 0.7 < rough
     assert found.light[ALL_IN_FOCUS, 3.0][0] == 1
-    assert found.light[RANDOM, 1.0][5] > 4 * found.light[ALL_IN_FOCUS, 1.0][5]
+    half = SHIFTS_MM.index(LIGHT_SHIFT_MM)
+    assert found.light[RANDOM, 1.0][half] > 4 * found.light[ALL_IN_FOCUS, 1.0][half]
     # A shift that leaves the whole stop inside the pupil changes nothing.
-    assert found.alike_db[RANDOM, 5.0][5] == found.alike_db[RANDOM, 5.0][0]
+    assert found.alike_db[RANDOM, 5.0][half] == found.alike_db[RANDOM, 5.0][0]
 
 
 def test_the_interval_lies_where_the_curve_crosses_the_bar() -> None:
-    falling = [120.0] + [SAME_PICTURE_DB + 5 - 2 * k for k in range(1, len(SHIFTS_MM))]
-    assert sampling_interval(falling) == pytest.approx(0.25)
+    falling = [120.0, *(SAME_PICTURE_DB + 60 - 200 * shift for shift in SHIFTS_MM[1:])]
+    assert sampling_interval(falling) == pytest.approx(0.3)
+    squares = [120.0, *(-20 * math.log10(shift / 0.004) + SAME_PICTURE_DB for shift in SHIFTS_MM[1:])]
+    assert sampling_interval(squares) == pytest.approx(0.004)
     assert sampling_interval([120.0] * len(SHIFTS_MM)) is None
-    assert diameter_holding(0.9, [0.0] * 27) is None
+    assert diameter_holding(0.9, [0.0] * len(DIAMETERS_MM)) is None
 
 
 def test_the_command_writes_page_record_and_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,19 +13,19 @@ from holod_training.optics import coc_px
 from holod_training.shards import Shard
 
 COMMITTED = Path(__file__).parents[2] / "golden"
-SHIPPED = Path(__file__).parents[2] / "weights" / "direct-halfband-14.safetensors"
+WEIGHTS = Path(__file__).parents[2] / "weights"
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("golden")
-    write_golden(out, SHIPPED)
+    write_golden(out, WEIGHTS / "direct-halfband-14.safetensors", WEIGHTS / "direct-halfband-8.safetensors")
     return out
 
 
-@pytest.mark.parametrize("name", ["direct-narrow", "direct-narrow-full", "direct-shipped"])
+@pytest.mark.parametrize("name", ["direct-narrow", "direct-narrow-full", "direct-shipped", "direct-shipped-small"])
 def test_committed_vectors_are_what_the_script_writes(name: str, written: Path) -> None:
-    files = [f"{name}.safetensors"] + ([f"{name}.weights.safetensors"] if name != "direct-shipped" else [])
+    files = [f"{name}.safetensors"] + ([f"{name}.weights.safetensors"] if "narrow" in name else [])
     for file in files:
         ours, committed = load_file(written / file), load_file(COMMITTED / file)
         assert ours.keys() == committed.keys()
