@@ -117,7 +117,8 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
             other = [key for key in terms if kept.get(key) != terms[key]]
             if other:
                 raise ConfigError(
-                    f"{known}: found a row with another {', '.join(other)}; choose another --out, or delete {known.parent}"
+                    f"{known}: found a row with another {', '.join(other)}; choose another --out, "
+                    f"or delete {known.parent}"
                 )
             print(f"{name}: taken from {known}")
         else:

@@ -122,10 +122,10 @@ def write_golden(out: Path, standard: Path | None, small: Path | None = None, se
     for name, shipped in (("direct-shipped", standard), ("direct-shipped-small", small)):
         if not shipped:
             continue
-        network = load_weights(shipped)
+        built_in = load_weights(shipped)
         amplitude, depth = scene(32, 48, seed)
-        kept = (0, *network.config.adjustable_layers, network.config.layers - 1)
-        result = vectors(network.double(), amplitude, depth, 3.4, kept)
+        kept = (0, *built_in.config.adjustable_layers, built_in.config.layers - 1)
+        result = vectors(built_in.double(), amplitude, depth, 3.4, kept)
         write_vectors(out / f"{name}.safetensors", result, {"seed": seed, "weights": shipped.name})
         written.append(out / f"{name}.safetensors")
     if standard:

@@ -60,7 +60,9 @@ def scene(optics: OpticsConfig, seed: int) -> tuple[Tensor, Tensor, list[Tensor]
     dioptres = torch.full((HEIGHT, WIDTH), FAR_DPT, dtype=torch.float64)
     near, middle, _ = COLUMNS
     dioptres[:, near.start : near.stop] = NEAR_DPT
-    dioptres[:, middle.start : middle.stop] = torch.linspace(*reversed(MIDDLE_DPT), len(middle), dtype=torch.float64)
+    dioptres[:, middle.start : middle.stop] = torch.linspace(
+        MIDDLE_DPT[1], MIDDLE_DPT[0], len(middle), dtype=torch.float64
+    )
     stacks = []
     for pupil_mm in PUPILS_MM:
         planes = []

@@ -45,6 +45,9 @@ def test_variants_compete_for_the_same_time(shards: Path, tmp_path: Path, capsys
     assert main([*command[:-5], "half-band-8,half-band-blur-input", *command[-4:]]) == 0
     again = json.loads((out / "comparison.json").read_text())["rows"]
     assert again[0] == small and again[1]["variant"] == "half-band-blur-input"
+    # Rows of other terms never share a table.
+    assert main([*command, "--in-focus-weight", "7"]) == 65
+    assert "half-band-8/comparison.json: found a row with another loss" in capsys.readouterr().err
 
 
 def test_comparison_says_what_is_missing(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
