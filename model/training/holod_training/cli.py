@@ -118,6 +118,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--out", required=True)
     export.add_argument("--amplitude-constant", type=float, help="double phase's K; the source's own where left out")
     export.add_argument("--evaluation", help="evaluation.json whose numbers the file is to carry")
+    export.add_argument("--evaluation-method", default="holod", help="whose rows of it: another file named by --also")
     export.set_defaults(run=_export)
 
     golden = command("golden", "Writes the golden vectors that the engines are tested against")
@@ -241,7 +242,11 @@ def _export(options: argparse.Namespace) -> None:
     from holod_training.export import export
 
     evaluation = Path(options.evaluation) if options.evaluation else None
-    print(export(Path(options.source), Path(options.out), options.amplitude_constant, evaluation))
+    print(
+        export(
+            Path(options.source), Path(options.out), options.amplitude_constant, evaluation, options.evaluation_method
+        )
+    )
 
 
 def _golden(options: argparse.Namespace) -> None:

@@ -78,7 +78,13 @@ def load_weights(path: Path) -> FieldNetwork:
     return network.eval()
 
 
-def export(source: Path, out: Path, amplitude_constant: float | None, evaluation: Path | None) -> Path:
+def export(
+    source: Path,
+    out: Path,
+    amplitude_constant: float | None,
+    evaluation: Path | None,
+    method: str = "holod",
+) -> Path:
     """Writes `out` from a run's checkpoint or a weights file; raises WeightsError."""
     if source.suffix == ".pt":
         network, metrics, provenance = _from_checkpoint(source)
@@ -90,7 +96,7 @@ def export(source: Path, out: Path, amplitude_constant: float | None, evaluation
             raise WeightsError(f"amplitude constant: found {amplitude_constant}, expected a number above 0")
         network.config = dataclasses.replace(network.config, amplitude_constant=amplitude_constant)
     if evaluation:
-        metrics = _summary(evaluation)
+        metrics = _summary(evaluation, method)
     save_weights(out, network, metrics, provenance)
     return out
 
@@ -107,15 +113,18 @@ def _from_checkpoint(source: Path) -> tuple[FieldNetwork, dict[str, Any], dict[s
     return network, {}, provenance
 
 
-def _summary(evaluation: Path) -> dict[str, Any]:
-    """Our own rows, the matrix and the refocus ratios of an evaluation.json."""
+def _summary(evaluation: Path, method: str) -> dict[str, Any]:
+    """The rows and refocus ratios of one method of an evaluation.json, and the matrix, which it has of `holod` only."""
     try:
         result = json.loads(evaluation.read_text())
-        return {
+        found = {
             "scenes": result["scenes"],
-            "rows": [row for row in result["rows"] if row["method"] == "holod"],
-            "matrix_psnr_db": result["matrix_psnr_db"],
-            "refocus": [row for row in result.get("refocus", []) if row["method"] == "holod"],
+            "rows": [{**row, "method": "holod"} for row in result["rows"] if row["method"] == method],
+            "refocus": [{**row, "method": "holod"} for row in result.get("refocus", []) if row["method"] == method],
         }
+        if not found["rows"]:
+            there = ", ".join(sorted({row["method"] for row in result["rows"]}))
+            raise WeightsError(f"{evaluation}: no method {method!r}; found {there}")
+        return {**found, "matrix_psnr_db": result["matrix_psnr_db"]} if method == "holod" else found
     except (OSError, json.JSONDecodeError, KeyError) as error:
         raise WeightsError(f"{evaluation}: not an evaluation ({error})") from error

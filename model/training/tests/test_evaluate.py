@@ -228,6 +228,10 @@ def test_export_stamps_the_constant_and_the_evaluation(evaluation: Path) -> None
     before, after = load_weights(evaluation / "w.safetensors").state_dict(), load_weights(out).state_dict()
     assert all(torch.equal(before[name], after[name]) for name in before)
     assert main(["export", *arguments[:4], "--amplitude-constant", "0"]) == 65
+    judged = ["--evaluation", str(evaluation / "out" / "evaluation.json"), "--evaluation-method"]
+    assert main(["export", *arguments, *judged, "layered ASM"]) == 0
+    assert "matrix_psnr_db" not in read_metadata(out)["metrics"]
+    assert main(["export", *arguments, *judged, "nobody"]) == 65
 
 
 def test_card_areas_leave_out_border_and_seam() -> None:
