@@ -414,7 +414,8 @@ mod tests {
         says(message_with("\"near_dpt\":\"2", "\"near_dpt\":\"3"), &["near_dpt", "3.857", "2.857", "this bench"]);
         says(message_with("pixel_angle_rad", "pixel_angle_deg"), &["pixel_angle_rad", "absent"]);
         says(message_with("\"[1.5, 4.0]\"", "\"[-1.5, 4.]\""), &["pupils_mm", "list"]);
-        says(message_with("\"[1.5, 4.0]\"", "\"[-1.5, 40]\""), &["pupils_mm", "-1.5", "above 0"]);
+        says(message_with("\"[1.5, 4.0]\"", "\"[-1.5, 40]\""), &["pupils_mm", "-1.5", "0.1 to 100"]);
+        says(message_with("\"[1.5, 4.0]\"", "\"[1, 9e300]\""), &["pupils_mm", "9000", "0.1 to 100"]);
         says(message_with("\"[1.5, 4.0]\"", "\"[1.5,4,4.]\""), &["pupils_mm", "[1.5,4,4.]"]);
         says(message_with("\"[1.5, 4.0]\"", "\"[1, 4, 2 ]\""), &["stack_2", "absent", "F16 [2, 3, 24, 32]"]);
         says(message_with("\"stack_1\"", "\"stack_7\""), &["stack_1", "absent"]);
