@@ -19,6 +19,7 @@ from holod_training.export import load_weights, write_beside
 from holod_training.metrics import Judgement, judge
 from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, coc_px, double_phase, panel_field, through_levels, upsample_half_band
+from holod_training.report import NUMBERS
 from holod_training.rivals import flat_oracle
 from holod_training.shards import Shard, open_shards
 from holod_training.train import VALIDATION_PUPILS_MM, Run, TrainConfig, nearest_pupil, train
@@ -27,13 +28,7 @@ from holod_training.variants import network_amplitude, variant
 WARM_STEPS, TIMED_STEPS = 2, 7
 NO_STOP = -10.0
 FLAT_ORACLE = "flat oracle"
-NUMBERS = (
-    ("psnr_db", "PSNR dB", 2),
-    ("psnr_in_focus_db", "in focus", 2),
-    ("psnr_out_of_focus_db", "out of focus", 2),
-    ("slope", "slope", 3),
-    ("correlation", "correlation", 3),
-)
+FIVE_NUMBERS = NUMBERS[:5]
 
 
 def seconds_per_step(config: TrainConfig, device: torch.device) -> float:
@@ -158,14 +153,14 @@ def markdown(rows: list[dict[str, Any]], flat: dict[str, dict[str, float]], scen
             values = [p[key] for p in pupils.values() if key in p]
             return " / ".join(f"{v:.{digits}f}" for v in values) or "-"
 
-        return " | ".join(cell(key, digits) for key, _, digits in NUMBERS)
+        return " | ".join(cell(key, digits) for key, _, digits in FIVE_NUMBERS)
 
-    named = " | ".join(label for _, label, _ in NUMBERS)
+    named = " | ".join(label for _, label, _ in FIVE_NUMBERS)
     lines = [
         f"After double phase, means over {scenes} held-out scenes, s = 2 / 3 / 4 mm in each cell.",
         "",
         f"| variant | parameters | kFLOP a pixel | steps | minutes | ms a step | {named} |",
-        "|---|" + "---|" * (5 + len(NUMBERS)),
+        "|---|" + "---|" * (5 + len(FIVE_NUMBERS)),
     ]
     for row in rows:
         lines.append(
