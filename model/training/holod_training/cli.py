@@ -18,6 +18,7 @@ from holod_training.export import WeightsError
 from holod_training.goals import ReportError
 from holod_training.judging import LAYERED_ASM, OURS
 from holod_training.loss import LossWeights
+from holod_training.optimizer import OPTIMIZERS
 from holod_training.rgbd import RgbdError
 from holod_training.sampling import AugmentConfig
 from holod_training.shards import ShardError
@@ -101,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
         default=judging.focus_curve_weights,
         help="in-focus weights, such as 0,30,100,300: adds the curve between sharp in focus and soft out of it",
     )
+    _lpips_options(evaluate, "adds its column")
     evaluate.add_argument("--timing-calls", type=int, default=judging.timing_calls)
     evaluate.set_defaults(run=_evaluate)
 
@@ -140,12 +142,12 @@ def _training_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--validation-border-px", type=int, default=defaults.validation_border_px)
     sub.add_argument("--batch", type=int, default=defaults.batch, help="crops per process and step")
     sub.add_argument("--learning-rate", type=float, default=defaults.learning_rate)
+    sub.add_argument("--optimizer", choices=OPTIMIZERS, default=defaults.optimizer)
     sub.add_argument("--warm-up-steps", type=int, default=defaults.warm_up_steps)
     sub.add_argument("--seed", type=int, default=defaults.seed)
     sub.add_argument("--precision", choices=PRECISIONS, default=defaults.precision, help="of convolutions in training")
     sub.add_argument("--teacher", help="weights file whose pictures the loss compares too")
-    sub.add_argument("--lpips-backbone", help="torchvision's AlexNet state dict; with it LPIPS is a term of the loss")
-    sub.add_argument("--lpips-linear", help="the authors' linear layers, lin0.model.1.weight and so on")
+    _lpips_options(sub, "adds LPIPS to the loss")
     sub.add_argument("--validate-every", type=int, default=defaults.validate_every)
     sub.add_argument("--validation-scenes", type=int, default=defaults.validation_scenes)
     sub.add_argument(
@@ -153,6 +155,11 @@ def _training_options(sub: argparse.ArgumentParser) -> None:
     )
     for term in dataclasses.fields(LossWeights):
         sub.add_argument(_option_of(term.name), dest=f"loss_{term.name}", type=float, default=getattr(loss, term.name))
+
+
+def _lpips_options(sub: argparse.ArgumentParser, effect: str) -> None:
+    sub.add_argument("--lpips-backbone", help=f"torchvision's AlexNet state dict; with the linear layers {effect}")
+    sub.add_argument("--lpips-linear", help="LPIPS's authors' linear layers, lin0.model.1.weight and so on")
 
 
 def _option_of(loss_key: str) -> str:
@@ -172,6 +179,8 @@ def _network_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--frames", type=int)
     sub.add_argument("--specialists-mm", type=_list_of(float), metavar="MM,MM,..")
     sub.add_argument("--depth-layers", type=int)
+    sub.add_argument("--correction-layers", type=int)
+    sub.add_argument("--correction-dilations", type=_list_of(int), metavar="D,D,..")
     sub.add_argument("--transport-prior", action=argparse.BooleanOptionalAction)
     sub.add_argument("--planes", type=int)
 
@@ -228,6 +237,8 @@ def _evaluate(options: argparse.Namespace) -> None:
         solver_frames=options.solver_frames,
         focus_curve_weights=options.focus_curve_weights,
         timing_calls=options.timing_calls,
+        lpips_backbone=Path(options.lpips_backbone) if options.lpips_backbone else None,
+        lpips_linear=Path(options.lpips_linear) if options.lpips_linear else None,
     )
     print(markdown(evaluate(config, choose_device(options.device))), end="")
 

@@ -21,7 +21,7 @@ from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, coc_px, double_phase, panel_field, through_levels, upsample_half_band
 from holod_training.report import NUMBERS
 from holod_training.rivals import flat_oracle
-from holod_training.shards import Shard, open_shards
+from holod_training.shards import Shard, open_held_out
 from holod_training.train import VALIDATION_PUPILS_MM, Run, TrainConfig, nearest_pupil, train
 from holod_training.variants import network_amplitude, variant
 
@@ -120,7 +120,7 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
             row = {"variant": name, "terms": terms, **_contest(config, seconds, device)}
             write_beside(known, (json.dumps(row, indent=1) + "\n").encode())
         rows.append(json.loads(known.read_text()))
-    shards = open_shards(Path(base.validation), base.network.optics, base.validation_scenes)
+    shards = open_held_out(Path(base.validation), base.network.optics, base.validation_scenes)
     flat = judge_flat_oracle(shards, base.network.optics, base.validation_border_px)
     table = markdown(rows, flat, len(shards))
     result = {"rows": rows, FLAT_ORACLE: flat, "scenes": [s.path.name for s in shards]}
@@ -134,7 +134,7 @@ def _contest(config: TrainConfig, seconds: float, device: torch.device) -> dict[
     steps = max(1, round(seconds / step_seconds))
     config = dataclasses.replace(config, steps=steps, validate_every=steps, checkpoint_every=steps)
     network = load_weights(train(config, device))
-    shards = open_shards(Path(config.validation or ""), config.network.optics, config.validation_scenes)
+    shards = open_held_out(Path(config.validation or ""), config.network.optics, config.validation_scenes)
     return {
         "parameters": sum(p.numel() for p in network.parameters()),
         "operations_per_pixel": operations_per_pixel(config.network),

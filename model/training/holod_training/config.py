@@ -88,6 +88,9 @@ class NetworkConfig:
     specialists_mm: tuple[float, ...] = _optional(())
     depth_layers: int = _optional(8)
     transport_prior: bool = _optional(True)
+    # The second net of `layered`; dilations as above.
+    correction_layers: int = _optional(10)
+    correction_dilations: tuple[int, ...] = _optional(())
     planes: int = _optional(6)
 
     def __post_init__(self) -> None:
@@ -117,7 +120,17 @@ class NetworkConfig:
         self._require("frames", self.frames >= 1 and (direct or self.frames == 1), "1; `direct` may have more")
         self._require("blur_input", direct or not self.blur_input, "false; only `direct` can have it")
         self._require("pupil_inputs", self.architecture != "layered" or self.pupil_inputs, "true for `layered`")
-        self._require("grid", self.architecture != "layered" or self.grid == "full", "'full' for `layered`")
+        self._require(
+            "correction_layers",
+            self.correction_layers >= 4 and self.correction_layers % 2 == 0,
+            "an even number of at least 4",
+        )
+        self._require(
+            "correction_dilations",
+            len(self.correction_dilations) in (0, self.correction_layers)
+            and all(d >= 1 for d in self.correction_dilations),
+            f"none, or {self.correction_layers} numbers of at least 1, one for each layer",
+        )
         self._require("depth_layers", self.depth_layers >= 2, "at least 2")
         self._require("planes", self.planes >= 2, "at least 2")
         self._require(

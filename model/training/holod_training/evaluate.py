@@ -23,12 +23,13 @@ from holod_training.judging import (
     rivals,
     table_pupils,
 )
+from holod_training.lpips import Lpips
 from holod_training.network import FieldNetwork
 from holod_training.offsets import offset_statistics
 from holod_training.plots import write_plots
 from holod_training.refocus import refocus_cards
 from holod_training.report import markdown
-from holod_training.rgbd import find_pairs, write_rgbd_sheet
+from holod_training.rgbd import read_pictures, write_rgbd_sheet
 from holod_training.shards import open_shards
 from holod_training.sheets import write_sheet
 from holod_training.solver import optimise
@@ -43,7 +44,7 @@ TIMED_PUPIL_MM = 3.0
 def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Writes evaluation.json, scenes.json, evaluation.md, plots and sheets into `config.out`.
 
-    Raises WeightsError, ShardError, RgbdError.
+    Raises ConfigError, WeightsError, ShardError, RgbdError.
     """
     metadata = read_metadata(config.weights)
     networks = _load(config, device)
@@ -51,9 +52,9 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     optics = network.config.optics
     shards = open_alike(config.test, optics, config.limit)
     cards = open_shards(config.cards, optics) if config.cards else []
-    if config.rgbd:
-        find_pairs(config.rgbd)
-    bench = Bench(optics, network.config.amplitude_constant, config.border_px, device)
+    pictures = read_pictures(config.rgbd, optics) if config.rgbd else []
+    lpips = Lpips.open(config.lpips_backbone, config.lpips_linear, device)
+    bench = Bench(optics, network.config.amplitude_constant, config.border_px, device, lpips)
     trained = [network_method(name, one) for name, one in networks.items()]
     learned_and_rivals = [*trained, *rivals(optics)]
     start = next(method for method in learned_and_rivals if method.name == config.solver_start)
@@ -61,7 +62,9 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     timed = min(range(len(shards[0].pupils_mm)), key=lambda i: abs(shards[0].pupils_mm[i] - TIMED_PUPIL_MM))
 
     config.out.mkdir(parents=True, exist_ok=True)
-    # Cards first: they are few, and what is wrong with them is told before the long work.
+    # Real pictures and cards first: they are few, and what is wrong with them is told before the long work.
+    if pictures:
+        write_rgbd_sheet(config.out / "rgbd.png", pictures, trained[0], bench)
     refocus = refocus_cards(cards, learned_and_rivals, bench, config.out / "cards.png") if cards else []
     judged = judge_scenes(shards, methods, bench)
     result: dict[str, Any] = {
@@ -100,8 +103,6 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
             "methods": on_the_same_scenes(judged, len(scenes)),
         }
     write_sheet(config.out / "sheet.png", shards, trained[0], bench)
-    if config.rgbd:
-        write_rgbd_sheet(config.out / "rgbd.png", config.rgbd, trained[0], bench)
     result["plots"] = write_plots(config.out, result)
     write_beside(config.out / "evaluation.json", (json.dumps(result, indent=1) + "\n").encode())
     write_beside(config.out / "evaluation.md", markdown(result).encode())

@@ -14,7 +14,7 @@ class EvaluateConfig:
     """`also`: further weights files, each a method. `solver_scenes`: direct optimisation runs on the first so many
     scenes from the field of the method `solver_start`, once for each of `solver_frames`; 0 leaves it out.
     `focus_curve_weights`: in-focus weights of the curve between sharp in focus and soft out of it, on the same
-    scenes; none leaves it out."""
+    scenes; none leaves it out. `lpips_*`: files of LPIPS's weights, see `lpips.py`; both or none."""
 
     weights: Path
     test: Path
@@ -30,3 +30,5 @@ class EvaluateConfig:
     solver_frames: tuple[int, ...] = (1, 2)
     focus_curve_weights: tuple[float, ...] = ()
     timing_calls: int = 5
+    lpips_backbone: Path | None = None
+    lpips_linear: Path | None = None

@@ -28,7 +28,7 @@ from holod_training.loss import inner
 from holod_training.metrics import psnr_db
 from holod_training.optics import frequencies, half_band_mask, intensity, pupil_mask, transfer
 from holod_training.rivals import all_in_focus, layered_asm
-from holod_training.shards import Stack, open_shards
+from holod_training.shards import Stack, open_held_out
 
 PUPILS_MM = (1.0, 2.0, 3.0, 4.0, 5.0)
 SHARES = (0.5, 0.9, 0.99)
@@ -133,7 +133,7 @@ def write_eyebox(weights: Path, test: Path, out: Path, limit: int | None) -> str
     """
     network = load_weights(weights)
     optics = network.config.optics
-    shards = open_shards(test, optics, limit)
+    shards = open_held_out(test, optics, limit)
     stacks = [shard.read(0) for shard in shards]
     methods: dict[str, Callable[[Stack], Tensor]] = {
         NETWORK: lambda stack: network_field(network, stack, NETWORK_PUPIL_MM),

@@ -14,9 +14,10 @@ from safetensors.torch import save
 from torch import Tensor
 
 from holod_training.config import NetworkConfig
-from holod_training.export import load_weights, save_weights, write_beside
+from holod_training.export import WeightsError, load_weights, save_weights, write_beside
 from holod_training.golden_evaluation import write_evaluation
-from holod_training.network import AdjustableLayer, DirectNetwork, FieldNetwork
+from holod_training.layered import LayeredNetwork
+from holod_training.network import AdjustableLayer, DirectNetwork, FieldNetwork, Trunk
 from holod_training.optics import (
     Eye,
     double_phase,
@@ -25,23 +26,40 @@ from holod_training.optics import (
     propagate_padded,
     upsample_half_band,
 )
+from holod_training.variants import build_network
 
 GOLDEN_FORMAT = "holod-golden-1"
 FOCUS_DPT = (0.25, 2.5)
 ASM_DISTANCE_M = 0.0032
 
 
-def narrow_network(grid: str, seed: int) -> DirectNetwork:
-    """Eight channels, random weights; offsets of some pixels and outputs of some tenths, so that no stage is idle."""
+NARROW: dict[str, NetworkConfig] = {
+    "direct-narrow": NetworkConfig(channels=8, modulation_hidden=8),
+    "direct-narrow-full": NetworkConfig(grid="full", channels=8, modulation_hidden=8),
+    "layered-narrow": NetworkConfig(
+        architecture="layered",
+        layers=4,
+        channels=8,
+        adjustable_layers=(2,),
+        modulation_hidden=8,
+        depth_layers=4,
+        correction_layers=4,
+    ),
+}
+
+
+def narrow_network(config: NetworkConfig, seed: int) -> FieldNetwork:
+    """Random weights; offsets of some pixels and outputs of some tenths, so that no stage is idle."""
     torch.manual_seed(seed)
-    network = DirectNetwork(NetworkConfig(grid=grid, channels=8, modulation_hidden=8))
+    network = build_network(config)
     with torch.no_grad():
-        for layer in network.layers:
-            if isinstance(layer, AdjustableLayer):
-                layer.offset.get_parameter("weight").mul_(6)
-                layer.offset.get_parameter("bias").uniform_(-1.5, 1.5)
-                layer.modulation.get_parameter("2.bias").uniform_(-0.3, 0.3)
-        network.get_parameter(f"layers.{network.config.layers - 1}.weight").mul_(6)
+        for trunk in (module for module in network.children() if isinstance(module, Trunk)):
+            for layer in trunk:
+                if isinstance(layer, AdjustableLayer):
+                    layer.offset.get_parameter("weight").mul_(6)
+                    layer.offset.get_parameter("bias").uniform_(-1.5, 1.5)
+                    layer.modulation.get_parameter("2.bias").uniform_(-0.3, 0.3)
+            trunk[-1].get_parameter("weight").mul_(6)
     return network
 
 
@@ -63,11 +81,21 @@ def complex_parts(field: Tensor) -> Tensor:
     return torch.stack((field.real, field.imag))
 
 
+def told_layers(config: NetworkConfig) -> set[str]:
+    """The trace's names of what is kept of a large network: the first, the adjustable and the last layer of a net."""
+    nets = {"": (config.layers, config.adjustable_layers)}
+    if config.architecture == "layered":
+        nets = {"surface.": nets[""], "correction.": (config.correction_layers, ())}
+    return {
+        f"{net}layer_{index}" for net, (layers, adjustable) in nets.items() for index in (0, *adjustable, layers - 1)
+    }
+
+
 @torch.no_grad()
 def vectors(
-    network: FieldNetwork, amplitude: Tensor, depth: Tensor, pupil_mm: float, layers: tuple[int, ...] | None
+    network: FieldNetwork, amplitude: Tensor, depth: Tensor, pupil_mm: float, every_layer: bool = True
 ) -> dict[str, Tensor]:
-    """Every stage's answer, float64. `layers`, where given, are the only ones whose maps are kept."""
+    """Every stage's answer, float64; without `every_layer` only the maps of `told_layers`."""
     config = network.config
     height, width = depth.shape
     trace: dict[str, Tensor] = {}
@@ -77,10 +105,10 @@ def vectors(
     phase, clipped = double_phase(field, config.amplitude_constant)
     eye = Eye(config.optics, height, width, list(FOCUS_DPT))
     result = {"amplitude": amplitude, "depth": depth, "pupil_mm": pupil}
-    result["encoded"] = trace.pop("encoded")[0]
+    told = told_layers(config)
     for name, value in trace.items():
-        if layers is None or name.startswith("offsets") or int(name.removeprefix("layer_")) in layers:
-            result[name] = value[0]
+        if every_layer or "layer_" not in name or name in told:
+            result[name] = complex_parts(value[0]) if value.is_complex() else value[0]
     if config.grid == "half-band":
         result["low"] = complex_parts(low)
     result["field"] = complex_parts(field)
@@ -106,28 +134,28 @@ def write_vectors(path: Path, result: dict[str, Tensor], about: dict[str, Any]) 
 
 
 def write_golden(out: Path, standard: Path | None, small: Path | None = None, seed: int = 20) -> list[Path]:
-    """Writes every golden file into `out`; `standard` and `small` are the weights that the product has."""
+    """Writes every golden file into `out`; `standard` and `small` are the weights that the product has. Raises
+    WeightsError."""
     written = []
-    for name, grid, height, width in (
-        ("direct-narrow", "half-band", 32, 48),
-        ("direct-narrow-full", "full", 12, 16),
-    ):
-        network = narrow_network(grid, seed)
+    for name, config in NARROW.items():
         weights = out / f"{name}.weights.safetensors"
-        save_weights(weights, network, {}, {"script": "python -m holod_training golden", "seed": seed})
-        amplitude, depth = scene(height, width, seed)
-        result = vectors(load_weights(weights).double(), amplitude, depth, 2.7, None)
+        provenance = {"script": "python -m holod_training golden", "seed": seed}
+        save_weights(weights, narrow_network(config, seed), {}, provenance)
+        amplitude, depth = scene(*((32, 48) if config.grid == "half-band" else (12, 16)), seed)
+        result = vectors(load_weights(weights).double(), amplitude, depth, 2.7)
         write_vectors(out / f"{name}.safetensors", result, {"seed": seed, "weights": weights.name})
         written += [weights, out / f"{name}.safetensors"]
-    for name, shipped in (("direct-shipped", standard), ("direct-shipped-small", small)):
+    for suffix, shipped in (("", standard), ("-small", small)):
         if not shipped:
             continue
         built_in = load_weights(shipped)
+        if not isinstance(built_in, DirectNetwork | LayeredNetwork):
+            raise WeightsError(f"{shipped}: found a {type(built_in).__name__}, expected a direct or layered network")
+        path = out / f"{built_in.config.architecture}-shipped{suffix}.safetensors"
         amplitude, depth = scene(32, 48, seed)
-        kept = (0, *built_in.config.adjustable_layers, built_in.config.layers - 1)
-        result = vectors(built_in.double(), amplitude, depth, 3.4, kept)
-        write_vectors(out / f"{name}.safetensors", result, {"seed": seed, "weights": shipped.name})
-        written.append(out / f"{name}.safetensors")
+        result = vectors(built_in.double(), amplitude, depth, 3.4, every_layer=False)
+        write_vectors(path, result, {"seed": seed, "weights": shipped.name})
+        written.append(path)
     if standard:
         write_evaluation(out / "evaluation.safetensors", standard, seed)
         written.append(out / "evaluation.safetensors")

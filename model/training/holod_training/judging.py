@@ -15,11 +15,12 @@ from tqdm import tqdm
 from holod_training.config import OpticsConfig
 from holod_training.intervals import interval_95
 from holod_training.loss import inner
+from holod_training.lpips import Lpips
 from holod_training.metrics import Judgement, judge, psnr_db
 from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, coc_px, double_phase, panel_field, through_levels, upsample_half_band
 from holod_training.rivals import all_in_focus, flat_oracle, layered_asm, smooth_phase, transport_of_intensity
-from holod_training.shards import Shard, ShardError, Stack, open_shards
+from holod_training.shards import Shard, ShardError, Stack, open_held_out
 from holod_training.variants import network_amplitude
 
 OURS = "holod"
@@ -75,11 +76,13 @@ class Bench:
         amplitude_constant: float,
         border_px: int,
         device: torch.device | str = "cpu",
+        lpips: Lpips | None = None,
     ) -> None:
         self.optics = optics
         self.amplitude_constant = amplitude_constant
         self.border_px = border_px
         self.device = device
+        self.lpips = lpips
         self.eyes: dict[tuple[Any, ...], Eye] = {}
         self.widest_cut_mm = 1e3 * max(optics.wavelengths_m) * optics.focal_length_m / (2 * optics.pitch_m) * 2**0.5
 
@@ -117,13 +120,18 @@ class Bench:
         """Pupils wider than the stop's diagonal all see alike: the widest that must be told apart."""
         return min(pupil_mm, self.widest_cut_mm + 0.01)
 
+    def judge(self, picture: Tensor, stack: Stack) -> Judgement:
+        """What a stack's focuses show, [K, 3, H, W], against its target."""
+        return judge(picture, stack.target, self.blur_px(stack), self.border_px, lpips=self.lpips)
+
     def blur_px(self, stack: Stack) -> Tensor:
         return coc_px(self.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
 
 
 def open_alike(folder: Path, optics: OpticsConfig, limit: int | None = None) -> list[Shard]:
-    """The shards of one evaluation: same size, pupils and focuses. Raises ShardError that names the odd one."""
-    shards = open_shards(folder, optics, limit)
+    """The shards of one evaluation: held out, same size, pupils and focuses. Raises ShardError that names the odd
+    one."""
+    shards = open_held_out(folder, optics, limit)
     first = shards[0]
     for shard in shards[1:]:
         for what, found, expected in (
@@ -235,8 +243,7 @@ def judge_scenes(shards: list[Shard], methods: list[Method], bench: Bench) -> Ju
     for scene, shard in enumerate(tqdm(shards, unit="scene", disable=None)):
         for index in range(len(pupils)):
             stack = bench.read(shard, index)
-            found = judge(flat_oracle(stack.target), stack.target, bench.blur_px(stack), bench.border_px)
-            judged.add(FLAT_ORACLE, BEFORE, stack.pupil_mm, scene, found)
+            judged.add(FLAT_ORACLE, BEFORE, stack.pupil_mm, scene, bench.judge(flat_oracle(stack.target), stack))
         for method in methods:
             if method.scenes is None or scene < method.scenes:
                 _judge_method(judged, scene, shard, method, bench)
@@ -265,7 +272,7 @@ def _judge_method(judged: Judged, scene: int, shard: Shard, method: Method, benc
                     picture, seen_with = None, bench.same_to_the_eye(pupil)
                     picture = bench.look(shown, seen_with, stack.focus_dpt)
                 if index in wanted:
-                    found = judge(picture, stack.target, bench.blur_px(stack), bench.border_px)
+                    found = bench.judge(picture, stack)
                     judged.add(method.name, stage, pupil, scene, found)
                     cell = found.psnr_db
                 else:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 IN_FOCUS_PX = 2.0
+IN_FOCUS_PUPIL_MM = 2.0
 PERCEPTUAL_PLANES = 5
 STRUCTURE_SCALES = 3
 WINDOW_PX = 8
@@ -19,8 +20,10 @@ WINDOW_PX = 8
 class LossWeights:
     """The weight of each term, and the CoC below which sharpness counts no more.
 
-    `absolute` and `gradient` are the paper's: |P − R| and |∇P − ∇R| weighted by W; so is a perceptual error of some
-    planes: `lpips` where a run has its weights, `structure` needs none. `teacher` counts only where there is one.
+    `in_focus` is for a pupil of 2 mm: what is in focus is a share of a stack that falls as 1/s, so `for_pupil` lets its
+    weight grow in proportion. `absolute` and `gradient` are the paper's: |P − R| and |∇P − ∇R| weighted by W; so is a
+    perceptual error of some planes: `lpips` where a run has its weights, `structure` needs none. `teacher` counts only
+    where there is one.
     """
 
     absolute: float = 1.0
@@ -33,6 +36,9 @@ class LossWeights:
     structure: float = 0.0
     lpips: float = 1.0
     teacher: float = 8.0
+
+    def for_pupil(self, pupil_mm: float) -> LossWeights:
+        return replace(self, in_focus=self.in_focus * pupil_mm / IN_FOCUS_PUPIL_MM)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from holod_training.config import ConfigError
+from holod_training.srgb import srgb_encoded
 
 # (index in torchvision's `features`, inputs, outputs, kernel, stride, padding, whether a 3x3 pooling by 2 comes before)
 CONVOLUTIONS = (
@@ -41,12 +42,6 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     if not isinstance(found, dict):
         raise ConfigError(f"{path}: found {type(found).__name__}, expected a state dict")
     return found
-
-
-def srgb_encoded(light: Tensor) -> Tensor:
-    """Linear light, cut to 0 .. 1, as sRGB of 0 .. 1."""
-    x = light.clamp(0, 1)
-    return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
 
 
 class Lpips(nn.Module):
@@ -82,6 +77,17 @@ class Lpips(nn.Module):
             x = F.relu(F.conv2d(x, weight, bias, stride=stride, padding=padding))
             result.append(x / (x.square().sum(dim=1, keepdim=True) + 1e-20).sqrt())
         return result
+
+    @staticmethod
+    def open(
+        backbone: Path | str | None, linear: Path | str | None, device: torch.device | str = "cpu"
+    ) -> Lpips | None:
+        """None where neither file is named. Raises ConfigError for one without the other."""
+        if backbone and linear:
+            return Lpips(Path(backbone), Path(linear)).to(device)
+        if backbone or linear:
+            raise ConfigError("LPIPS: found one of its two weights files, expected backbone and linear, or neither")
+        return None
 
     def forward(self, picture: Tensor, target: Tensor) -> Tensor:
         if min(picture.shape[-2:]) < SMALLEST_PX:

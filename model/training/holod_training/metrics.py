@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import torch
@@ -15,7 +16,7 @@ OUT_OF_FOCUS_PX = 8.0
 
 @dataclass(frozen=True)
 class Judgement:
-    """One scene at one pupil, or a mean over scenes. A part of the picture that is empty gives NaN."""
+    """One scene at one pupil, or a mean over scenes. NaN: of a part of the picture that is empty, or not asked for."""
 
     psnr_db: float
     psnr_in_focus_db: float
@@ -23,6 +24,7 @@ class Judgement:
     slope: float
     correlation: float
     ssim: float
+    lpips: float = math.nan
 
     def known(self) -> dict[str, float]:
         """Without what is NaN: JSON has no word for it."""
@@ -87,9 +89,16 @@ def _windowed(light: Tensor) -> Tensor:
     return light
 
 
-def judge(picture: Tensor, target: Tensor, coc_px: Tensor, border_px: int, with_ssim: bool = True) -> Judgement:
+def judge(
+    picture: Tensor,
+    target: Tensor,
+    coc_px: Tensor,
+    border_px: int,
+    with_ssim: bool = True,
+    lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
+) -> Judgement:
     """picture, target [K, 3, H, W] linear light; coc_px [K, H, W]; a border is left out. Plane by plane: a stack of
-    fifty focuses in full HD leaves no room for copies."""
+    fifty focuses in full HD leaves no room for copies. `lpips`: distances [N] of pictures [N, 3, H, W]."""
     picture, target, coc_px = (inner(t, border_px) for t in (picture, target, coc_px))
     whole, sharp, blurred = _Mean(), _Mean(), _Mean()
     for shown, wanted, blur in zip(picture, target, coc_px, strict=True):
@@ -105,7 +114,13 @@ def judge(picture: Tensor, target: Tensor, coc_px: Tensor, border_px: int, with_
         slope=slope,
         correlation=correlation,
         ssim=ssim(picture, target) if with_ssim else math.nan,
+        lpips=math.nan if lpips is None else _mean_distance(lpips, picture, target),
     )
+
+
+def _mean_distance(distance: Callable[[Tensor, Tensor], Tensor], picture: Tensor, target: Tensor) -> float:
+    planes = zip(picture.split(1), target.split(1), strict=True)
+    return sum(float(distance(shown, wanted)) for shown, wanted in planes) / len(target)
 
 
 class _Mean:

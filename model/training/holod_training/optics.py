@@ -71,6 +71,12 @@ def half_band_mask(height: int, width: int, device: torch.device | str = "cpu") 
     return fy[:, None] & fx[None, :]
 
 
+def stop_half_band(field: Tensor) -> Tensor:
+    """What the 4f stop lets through of a field [..., H, W] on the panel's grid."""
+    height, width = field.shape[-2:]
+    return torch.fft.ifft2(torch.fft.fft2(field) * half_band_mask(height, width, field.device))
+
+
 def pupil_mask(optics: OpticsConfig, fx: Tensor, fy: Tensor, pupil_mm: float, shift_mm: float = 0.0) -> Tensor:
     """The eye's pupil in the Fourier plane, bool [3, len(fy), len(fx)]: a disc of radius (s/2)/(λ·f), its centre
     `shift_mm` along x from the eyebox's."""

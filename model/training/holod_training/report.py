@@ -15,6 +15,7 @@ NUMBERS = (
     ("correlation", "correlation", 3),
     ("ssim", "SSIM", 3),
 )
+LPIPS = ("lpips", "LPIPS", 4)
 PAIRED = NUMBERS[:4]
 PLOTS = {
     "pupils": "PSNR and slope against the pupil",
@@ -54,12 +55,16 @@ def _opening(result: dict[str, Any]) -> list[str]:
 
 def _numbers(result: dict[str, Any]) -> list[str]:
     lines = ["## Methods", ""]
-    lines += _header(["s mm", "method", "scenes", *(label for _, label, _ in NUMBERS)])
+    numbers: tuple[tuple[str, str, int], ...] = NUMBERS
+    if any("lpips" in row for row in result["rows"]):
+        lines += ["LPIPS: AlexNet's, of sRGB pictures, mean over the focal planes; less is better.", ""]
+        numbers = (*NUMBERS, LPIPS)
+    lines += _header(["s mm", "method", "scenes", *(label for _, label, _ in numbers)])
     for pupil in result["pupils_mm"]:
         for method in _methods(result):
             row = find_row(result, method, "before" if method == "flat oracle" else "after", pupil)
             if row:
-                cells = [_with_interval(row, row["interval_95"], key, digits) for key, _, digits in NUMBERS]
+                cells = [_with_interval(row, row["interval_95"], key, digits) for key, _, digits in numbers]
                 lines.append(_line([f"{pupil:g}", method, row["scenes"], *cells]))
     return lines
 

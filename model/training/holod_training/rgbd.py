@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from PIL import Image
 from torch import Tensor
 
 from holod_training.config import OpticsConfig
+from holod_training.depth_faults import fill_holes
 from holod_training.judging import Bench, Method
 from holod_training.shards import Stack
 from holod_training.sheets import SHEET_PUPILS_MM, save_sheet
+from holod_training.srgb import srgb_decoded
 
 COLOUR_SUFFIXES = (".jpg", ".jpeg", ".png")
 MOST_PAIRS = 4
@@ -39,14 +40,22 @@ def find_pairs(folder: Path) -> list[tuple[Path, Path]]:
     return pairs
 
 
+def read_image(path: Path, mode: str | None = None) -> Tensor:
+    """The file's values as they are, float32, or converted to a mode of Pillow's."""
+    try:
+        with Image.open(path) as image:
+            return torch.from_numpy(np.array(image if mode is None else image.convert(mode)).astype(np.float32))
+    except (OSError, SyntaxError) as error:
+        raise RgbdError(f"{path}: not a readable picture ({error})") from error
+
+
 def read_pair(colour: Path, depth: Path, optics: OpticsConfig) -> tuple[Tensor, Tensor]:
     """Linear light [3, H, W] and normalised depth [H, W]; depth in millimetres, 0 = missing, filled from around it.
 
     Odd sizes lose their last row or column; what lies outside the bench's depth volume is put on its near or far end.
     """
-    encoded = torch.from_numpy(np.array(Image.open(colour).convert("RGB"), dtype=np.float32) / 255)
-    linear = torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).permute(2, 0, 1)
-    millimetres = torch.from_numpy(np.array(Image.open(depth)).astype(np.float32))
+    linear = srgb_decoded(read_image(colour, "RGB") / 255).permute(2, 0, 1)
+    millimetres = read_image(depth)
     if millimetres.dim() != 2 or millimetres.shape != linear.shape[1:]:
         raise RgbdError(
             f"{depth}: shape {list(millimetres.shape)}, expected one channel of {list(linear.shape[1:])} as in "
@@ -57,40 +66,35 @@ def read_pair(colour: Path, depth: Path, optics: OpticsConfig) -> tuple[Tensor, 
         raise RgbdError(f"{depth}: every pixel is 0, which means missing")
     dioptres = torch.where(valid, 1000 / millimetres.clamp_min(1), torch.zeros(()))
     volume = optics.depth_near_dpt - optics.depth_far_dpt
-    normalised = ((fill_missing(dioptres, valid) - optics.depth_far_dpt) / volume).clamp(0, 1)
+    normalised = ((fill_holes(dioptres, ~valid) - optics.depth_far_dpt) / volume).clamp(0, 1)
     height, width = (size // 2 * 2 for size in normalised.shape)
     return linear[:, :height, :width].contiguous(), normalised[:height, :width].contiguous()
 
 
-def fill_missing(values: Tensor, valid: Tensor) -> Tensor:
-    """Pixels of [H, W] that are not valid, from the rim of each hole inwards, become the mean of known neighbours."""
-    known = valid.to(values.dtype)[None, None]
-    filled = values[None, None] * known
-    while not bool(known.all()):
-        weight = F.avg_pool2d(known, 3, stride=1, padding=1)
-        mean = F.avg_pool2d(filled, 3, stride=1, padding=1) / weight.clamp_min(1e-9)
-        reached = (known == 0) & (weight > 0)
-        filled = torch.where(reached, mean, filled)
-        known = torch.where(reached, torch.ones_like(known), known)
-    return filled[0, 0]
+def read_pictures(folder: Path, optics: OpticsConfig) -> list[tuple[Tensor, Tensor]]:
+    """The first four of `find_pairs`, read. Raises RgbdError for one of another size than the first, too."""
+    pairs = find_pairs(folder)[:MOST_PAIRS]
+    pictures = [read_pair(colour, depth, optics) for colour, depth in pairs]
+    for (colour, _), (image, _) in zip(pairs, pictures, strict=True):
+        found, expected = list(image.shape[1:]), list(pictures[0][0].shape[1:])
+        if found != expected:
+            raise RgbdError(f"{colour}: shape {found}, expected {expected} as in {pairs[0][0]}: a sheet needs one size")
+    return pictures
 
 
-def write_rgbd_sheet(path: Path, folder: Path, ours: Method, bench: Bench) -> int:
+def write_rgbd_sheet(path: Path, pictures: list[tuple[Tensor, Tensor]], ours: Method, bench: Bench) -> None:
     """Rows: pictures; columns: the picture, then near and far focus at s = 2 and 4 mm after double phase.
 
-    Near and far are the dioptres that 5 % of the picture's pixels lie beyond on either side. Returns how many pictures.
+    Near and far are the dioptres that 5 % of the picture's pixels lie beyond on either side.
     """
     lines = []
-    for colour, depth in find_pairs(folder)[:MOST_PAIRS]:
-        image, normalised = (t.to(bench.device) for t in read_pair(colour, depth, bench.optics))
-        ends = np.quantile(normalised.cpu().numpy(), (NEAR_SHARE, FAR_SHARE))
+    for image, depth in pictures:
+        image, depth = image.to(bench.device), depth.to(bench.device)
+        ends = np.quantile(depth.cpu().numpy(), (NEAR_SHARE, FAR_SHARE))
         focus = tuple(bench.optics.dioptres(float(end)) for end in ends)
         line = [image]
         for pupil in SHEET_PUPILS_MM:
-            panel, _ = bench.panel(ours.field(Stack(image, normalised, image[None], pupil, focus), pupil))
+            panel, _ = bench.panel(ours.field(Stack(image, depth, image[None], pupil, focus), pupil))
             line += list(bench.look(panel, pupil, focus))
         lines.append(line)
-    if len({tuple(line[0].shape) for line in lines}) > 1:
-        raise RgbdError(f"{folder}: pictures of different sizes; a sheet needs one size")
     save_sheet(path, lines)
-    return len(lines)

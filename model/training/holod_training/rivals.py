@@ -7,16 +7,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from holod_training.config import OpticsConfig
-from holod_training.layered import LOG_FLOOR, LOG_OFFSET, PHASE_SIGMAS_PX, PRIOR_GAINS, REFERENCE_NM
-from holod_training.optics import frequencies, half_band_mask, propagate, transfer
+from holod_training.layered import LOG_FLOOR, LOG_OFFSET, PRIOR_GAINS, REFERENCE_NM, SIGMAS_PX, compose
+from holod_training.optics import propagate, stop_half_band
 
 OCCLUSION_LAYERS = 8
 SMOOTH_PHASE_LAYERS = 24
 ANTI_ALIASING_SIGMA_PX = 0.7
-
-
-def stop_half_band(field: Tensor) -> Tensor:
-    return torch.fft.ifft2(torch.fft.fft2(field) * half_band_mask(field.shape[-2], field.shape[-1], field.device))
 
 
 def all_in_focus(amplitude: Tensor, depth: Tensor, optics: OpticsConfig) -> Tensor:
@@ -29,22 +25,9 @@ def all_in_focus(amplitude: Tensor, depth: Tensor, optics: OpticsConfig) -> Tens
 
 
 def layered_asm(amplitude: Tensor, depth: Tensor, optics: OpticsConfig, layers: int = OCCLUSION_LAYERS) -> Tensor:
-    """Equal depth layers composed far to near with occlusion, zero phase on the object (or `amplitude`'s own).
-
-    f ← f·(1 − m) + O·m, where m covers the layer and its next nearer one (no seams on slanted surfaces), propagated
-    by one layer's distance between them. Same shapes as `all_in_focus`.
-    """
-    layer = (depth * layers).long().clamp(0, layers - 1)
-    centres = [optics.distance_m(optics.dioptres((k + 0.5) / layers)) for k in range(layers)]
-    source = amplitude.to(torch.complex64)
-    fy, fx = (frequencies(size, optics.pitch_m, depth.device) for size in depth.shape)
-    step = transfer(optics, fx, fy, [centres[1] - centres[0]])[0].to(source.dtype)
-    field = torch.zeros_like(source)
-    for k in range(layers):
-        if k:
-            field = torch.fft.ifft2(torch.fft.fft2(field) * step)
-        field = torch.where((layer == k) | (layer == k + 1), source, field)
-    return stop_half_band(propagate(field, optics, -centres[-1]))
+    """Equal depth layers composed far to near with occlusion (`layered.compose`), zero phase on the object (or
+    `amplitude`'s own). Same shapes as `all_in_focus`."""
+    return stop_half_band(compose(amplitude.to(torch.complex64)[None], depth[None], optics, layers)[0])
 
 
 def smooth_phase(amplitude: Tensor, depth: Tensor, optics: OpticsConfig) -> Tensor:
@@ -71,7 +54,7 @@ def transport_of_intensity(amplitude: Tensor, depth: Tensor, optics: OpticsConfi
     logarithm = torch.log(amplitude.square() + LOG_FLOOR)
     sign = torch.tanh(4 * (0.5 - depth))
     phase = torch.zeros_like(amplitude)
-    for gain, sigma in zip(PRIOR_GAINS, PHASE_SIGMAS_PX, strict=True):
+    for gain, sigma in zip(PRIOR_GAINS, SIGMAS_PX, strict=True):
         phase += gain * sign * (gaussian_blur(logarithm, sigma) + LOG_OFFSET)
     wavelengths = torch.tensor(optics.wavelengths_nm, dtype=phase.dtype, device=phase.device)
     phase = phase * (REFERENCE_NM / wavelengths)[:, None, None]

@@ -15,6 +15,7 @@ from torch import Tensor
 from holod_training.config import OpticsConfig
 
 SHARD_FORMAT = "holod-scene-1"
+TRAINING_KIND = "train"
 
 
 class ShardError(ValueError):
@@ -165,4 +166,16 @@ def open_shards(folder: Path, optics: OpticsConfig, limit: int | None = None) ->
     shards = [Shard(folder / name) for name in names]
     for shard in shards:
         shard.require_optics(optics)
+    return shards
+
+
+def open_held_out(folder: Path, optics: OpticsConfig, limit: int | None = None) -> list[Shard]:
+    """`open_shards` for judging. Raises ShardError for a scene that was rendered for training, too."""
+    shards = open_shards(folder, optics, limit)
+    for shard in shards:
+        if shard.kind == TRAINING_KIND:
+            raise ShardError(
+                f"{shard.path}: metadata kind is {shard.kind!r}, expected held-out scenes: networks are not judged on "
+                "what they learn from; write others with `holod-scenes generate --kind test`"
+            )
     return shards

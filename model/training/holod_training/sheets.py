@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 from torch import Tensor
 
 from holod_training.judging import Bench, Method
 from holod_training.shards import Shard
+from holod_training.srgb import srgb_encoded
 
 SHEET_SCENES = 2
 SHEET_PUPILS_MM = (2.0, 4.0)
@@ -18,9 +18,7 @@ SHEET_PUPILS_MM = (2.0, 4.0)
 
 def srgb(linear: Tensor) -> np.ndarray:
     """Linear light [3, H, W] -> 8-bit sRGB [H, W, 3]."""
-    x = linear.clamp(0, 1).cpu()
-    encoded = torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp_min(1e-8) ** (1 / 2.4) - 0.055)
-    return (encoded * 255 + 0.5).byte().permute(1, 2, 0).numpy()
+    return (srgb_encoded(linear.cpu()) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
 
 
 def save_sheet(path: Path, lines: list[list[Tensor]], gap_px: int = 4) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 from tqdm import tqdm
 
 from holod_training.judging import AFTER, Bench, Judged, Method
-from holod_training.metrics import Judgement, judge
+from holod_training.metrics import Judgement
 from holod_training.shards import Shard
 from holod_training.solver import SolverConfig, optimise
 
@@ -33,8 +33,7 @@ def focus_curve(
                     weighted = dataclasses.replace(config, loss=loss, frames=1)
                     optimum = optimise(stack, field, bench.optics, bench.amplitude_constant, weighted).field[0]
                     picture = bench.look(bench.panel(optimum)[0], pupil, stack.focus_dpt)
-                    judgement = judge(picture, stack.target, bench.blur_px(stack), bench.border_px)
-                    found.setdefault((weight, pupil), []).append(judgement)
+                    found.setdefault((weight, pupil), []).append(bench.judge(picture, stack))
                     progress.update()
     return [
         {"in_focus_weight": weight, "pupil_mm": pupil, "scenes": len(of), **Judgement.mean(of).known()}

@@ -32,9 +32,10 @@ from holod_training.lpips import Lpips
 from holod_training.metrics import Judgement, judge, psnr_db
 from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, HalfBandEye, coc_px
+from holod_training.optimizer import OPTIMIZERS, make_optimizer
 from holod_training.rivals import flat_oracle
 from holod_training.sampling import AugmentConfig, Sampler
-from holod_training.shards import Shard, Stack, open_shards
+from holod_training.shards import Shard, Stack, open_held_out
 from holod_training.variants import build_network, network_amplitude
 
 VALIDATION_PUPILS_MM = (2.0, 3.0, 4.0)
@@ -60,6 +61,7 @@ class TrainConfig:
     validation_border_px: int = 24
     batch: int = 1
     learning_rate: float = 2e-3
+    optimizer: str = "muon"
     final_rate_share: float = 0.03
     warm_up_steps: int = 30
     gradient_clip: float = 1.0
@@ -126,13 +128,15 @@ class Run:
         torch.manual_seed(config.seed)
         if config.precision not in PRECISIONS:
             raise TrainingError(f"precision: found {config.precision!r}, expected one of {', '.join(PRECISIONS)}")
+        if config.optimizer not in OPTIMIZERS:
+            raise TrainingError(f"optimizer: found {config.optimizer!r}, expected one of {', '.join(OPTIMIZERS)}")
         self.network = build_network(config.network).to(device)
         if config.initial_weights:
             self.network.load_state_dict(self._initial_weights(Path(config.initial_weights)))
         self.teacher = self._teacher(Path(config.teacher)) if config.teacher else None
-        self.lpips = self._lpips()
+        self.lpips = Lpips.open(config.lpips_backbone, config.lpips_linear, device)
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
-        self.optimizer = torch.optim.Adam(self.network.parameters(), config.learning_rate)
+        self.optimizer = make_optimizer(config.optimizer, self.network.parameters(), config.learning_rate)
         self.trained: nn.Module = self.network
         if world > 1:
             # A batch may have no pupil for one of the specialists.
@@ -143,7 +147,7 @@ class Run:
         )
         self.validation: list[Shard] = []
         if config.validation:
-            self.validation = open_shards(Path(config.validation), config.network.optics, config.validation_scenes)
+            self.validation = open_held_out(Path(config.validation), config.network.optics, config.validation_scenes)
 
     def _initial_weights(self, path: Path) -> dict[str, Tensor]:
         found, wanted = load_weights(path).state_dict(), self.network.state_dict()
@@ -156,14 +160,6 @@ class Run:
         if teacher.config.optics != self.config.network.optics:
             raise TrainingError(f"{path}: the teacher was trained for other optics than this run's")
         return teacher
-
-    def _lpips(self) -> Lpips | None:
-        backbone, linear = self.config.lpips_backbone, self.config.lpips_linear
-        if backbone and linear:
-            return Lpips(Path(backbone), Path(linear)).to(self.device)
-        if backbone or linear:
-            raise TrainingError("LPIPS: found one of its two weights files, expected backbone and linear, or neither")
-        return None
 
     def _fields(self, network: nn.Module, config: NetworkConfig, stacks: list[Stack], depths: list[Tensor]) -> Tensor:
         pupils = torch.tensor([s.pupil_mm for s in stacks], device=self.device)
@@ -211,7 +207,7 @@ class Run:
                     inner(picture, border),
                     inner(stack.target, border),
                     inner(blur, border),
-                    config.loss,
+                    config.loss.for_pupil(stack.pupil_mm),
                     perceptual_planes[index],
                     self.lpips,
                     inner(taught[index], border) if taught else None,
@@ -284,6 +280,13 @@ class Run:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
+        # Runs from before there was a choice had Adam.
+        found = json.loads(state["config"]).get("optimizer", "adam")
+        if found != self.config.optimizer:
+            raise TrainingError(
+                f"{self.config.out}: optimizer: found a checkpoint of {found!r}, expected {self.config.optimizer!r}; "
+                f"resume with --optimizer {found}"
+            )
         self.step = state["step"]
         self.seconds = state["seconds"]
         self.network.load_state_dict(state["network"])

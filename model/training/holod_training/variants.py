@@ -24,7 +24,10 @@ _LAYERED = NetworkConfig(
     channels=24,
     adjustable_layers=(5,),
     dilations=(1, 1, 2, 4, 8, 1, 8, 4, 2, 1, 1, 1),
+    correction_layers=6,
+    correction_dilations=(1, 1, 2, 4, 2, 1),
 )
+_HALF_BAND_LAYERED = NetworkConfig(architecture="layered", layers=8, adjustable_layers=(4,))
 
 
 def _direct(layers: int) -> NetworkConfig:
@@ -43,6 +46,11 @@ VARIANTS: dict[str, NetworkConfig] = {
     "half-band-3-adc": replace(_HALF_BAND, adjustable_layers=(3, 7, 11)),
     "half-band-blur-input": replace(_HALF_BAND, blur_input=True),
     "two-frames": replace(_HALF_BAND, frames=2),
+    "half-band-layered": _HALF_BAND_LAYERED,
+    "half-band-layered-no-prior": replace(_HALF_BAND_LAYERED, transport_prior=False),
+    "half-band-layered-small": replace(
+        _HALF_BAND_LAYERED, layers=4, channels=24, adjustable_layers=(2,), correction_layers=6
+    ),
     "layered-4": replace(_LAYERED, depth_layers=4),
     "layered-8": _LAYERED,
     "layered-12": replace(_LAYERED, depth_layers=12),

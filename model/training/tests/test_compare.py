@@ -3,6 +3,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import write_shard
 from matplotlib.figure import Figure
 
 from holod_training.cli import main
@@ -11,7 +12,7 @@ from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
 from holod_training.costs import operations_per_pixel
 from holod_training.curves import plot_curves
 from holod_training.network import DirectNetwork
-from holod_training.shards import open_shards
+from holod_training.shards import ShardError, open_shards
 from holod_training.train import TrainConfig
 
 CPU = torch.device("cpu")
@@ -56,6 +57,10 @@ def test_comparison_says_what_is_missing(shards: Path, tmp_path: Path, monkeypat
         compare(config, ["half-band-8"], 1, CPU)
     with pytest.raises(ConfigError, match="variant: found 'half'"):
         compare(TrainConfig(str(shards), str(tmp_path), 0, validation=str(shards)), ["half"], 1, CPU)
+    write_shard(tmp_path / "own" / "scene_000000.safetensors", metadata={"kind": "train"})
+    own = TrainConfig(str(shards), str(tmp_path / "out"), 0, validation=str(tmp_path / "own"), crop=48)
+    with pytest.raises(ShardError, match=r"own/scene_000000\.safetensors: metadata kind is 'train'"):
+        compare(own, ["half-band-8"], 1, CPU)
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(ConfigError, match="WORLD_SIZE: found several processes"):
         compare(TrainConfig(str(shards), str(tmp_path), 0, validation=str(shards)), ["half-band-8"], 1, CPU)

@@ -53,6 +53,10 @@ def test_holes_are_filled_from_their_rims() -> None:
     assert 0.01 < error.max() < 0.2
     poisoned = torch.where(missing, torch.tensor(7.0), depth)
     assert torch.equal(fill_holes(poisoned, missing), filled)
+    step, hole = torch.full((7, 7), 4.0), torch.zeros(7, 7, dtype=torch.bool)
+    step[:, 4:], hole[2:5, 1:4] = 8.0, True
+    across = fill_holes(step, hole)
+    assert (across[3, 1], across[3, 3]) == (4, 8) and 4 < across[3, 2] < 8
     flat = torch.full((5, 5), 0.3)
     torch.testing.assert_close(fill_holes(flat, torch.eye(5) > 0), flat)
     assert fill_holes(flat, torch.ones(5, 5) > 0).abs().max() == 0

@@ -2,24 +2,29 @@ import copy
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from conftest import write_shard
 from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from test_lpips import random_lpips_files
+from test_rgbd import write_pair
 
 from holod_training.cli import main
 from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.export import load_weights, read_metadata, save_weights
 from holod_training.goals import ReportError, checks, row_of
 from holod_training.intervals import interval_95
+from holod_training.lpips import Lpips
 from holod_training.network import DirectNetwork
 from holod_training.optics import coc_px, intensity, propagate
 from holod_training.plots import on_all_scenes
 from holod_training.refocus import card_areas
 from holod_training.report import markdown
 from holod_training.rivals import all_in_focus, flat_oracle, layered_asm, smooth_phase, transport_of_intensity
+from holod_training.shards import Shard
 
 PUPILS = (1.0, 2.0, 2.5, 4.0)
 TABLE_PUPILS = (1.0, 2.0, 4.0)
@@ -147,11 +152,41 @@ def test_costs_and_offsets(evaluation: Path) -> None:
     assert {r["scenes"] for r in curve["methods"]} == {1}
 
 
-def test_a_folder_without_pictures_is_refused_before_the_work(evaluation: Path, tmp_path: Path, capsys) -> None:
+def test_pictures_that_cannot_be_used_are_refused_before_the_work(evaluation: Path, tmp_path: Path, capsys) -> None:
     arguments = ["--weights", str(evaluation / "w.safetensors"), "--test", str(evaluation / "test")]
-    assert main(["evaluate", *arguments, "--rgbd", str(tmp_path), "--out", str(tmp_path / "out")]) == 65
+    arguments = ["evaluate", *arguments, "--rgbd", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main(arguments) == 65
     assert "no RGB-D pairs in it" in capsys.readouterr().err
+    write_pair(tmp_path, np.zeros((4, 4)))
+    assert main(arguments) == 65
+    assert "depth/a.png: every pixel is 0" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_lpips_has_a_column_where_its_files_are_given(evaluation: Path, tmp_path: Path, capsys) -> None:
+    backbone, linear = random_lpips_files(tmp_path)
+    write_shard(tmp_path / "test" / "scene_000000.safetensors", size=(64, 80), pupils_mm=(2.0,))
+    arguments = ["evaluate", "--weights", evaluation / "w.safetensors", "--test", tmp_path / "test", "--border-px", "0"]
+    arguments += ["--solver-scenes", "0", "--timing-calls", "1", "--out", tmp_path / "out"]
+    arguments = [*map(str, arguments), "--lpips-backbone", str(backbone)]
+    assert main(arguments) == 65
+    assert "LPIPS: found one of its two weights files" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert main([*arguments, "--lpips-linear", str(linear)]) == 0
+    result = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    target = Shard(tmp_path / "test" / "scene_000000.safetensors").read(0).target
+    expected = Lpips(backbone, linear)(flat_oracle(target), target)
+    assert expected.max() > 1.2 * expected.min()
+    found = row_of(result, "flat oracle", "before", 2.0)["lpips"]
+    assert found == pytest.approx(float(expected.mean()), rel=1e-4)
+    assert all(row["lpips"] > 2 * found for row in result["rows"] if row["method"] != "flat oracle")
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| 2 | flat oracle "))
+    assert line.endswith(f" | {found:.4f} |")
+    heading = "| s mm | method | scenes | PSNR dB | in focus | out of focus | slope | correlation | SSIM |"
+    assert f"{heading} LPIPS |" in (tmp_path / "out" / "evaluation.md").read_text()
+    without = (evaluation / "out" / "evaluation.md").read_text()
+    assert heading in without and "LPIPS" not in without
+    assert not any("lpips" in row for row in read(evaluation)["rows"])
 
 
 def test_two_methods_of_one_name_are_refused(evaluation: Path, tmp_path: Path, capsys) -> None:
@@ -214,6 +249,15 @@ def test_scenes_must_be_alike(tmp_path: Path, evaluation: Path, capsys, odd: dic
     assert main(["evaluate", *arguments, "--out", str(tmp_path / "out")]) == 65
     error = capsys.readouterr().err
     assert "scene_000001.safetensors" in error and message in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_scenes_of_training_are_refused(tmp_path: Path, evaluation: Path, capsys) -> None:
+    write_shard(tmp_path / "scene_000000.safetensors", metadata={"kind": "train"})
+    for command in ("evaluate", "eyebox"):
+        arguments = [command, "--weights", str(evaluation / "w.safetensors"), "--test", str(tmp_path)]
+        assert main([*arguments, "--out", str(tmp_path / "out")]) == 65
+        assert "scene_000000.safetensors: metadata kind is 'train', expected held-out" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -8,12 +8,15 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 
 from holod_training.config import OpticsConfig
-from holod_training.golden import write_golden
+from holod_training.export import WeightsError, save_weights
+from holod_training.golden import NARROW, narrow_network, scene, vectors, write_golden
 from holod_training.optics import coc_px
 from holod_training.shards import Shard
+from holod_training.variants import build_network, variant
 
 COMMITTED = Path(__file__).parents[2] / "golden"
 WEIGHTS = Path(__file__).parents[2] / "weights"
+NETS = ("surface", "correction")
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +26,9 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.parametrize("name", ["direct-narrow", "direct-narrow-full", "direct-shipped", "direct-shipped-small"])
+@pytest.mark.parametrize(
+    "name", ["direct-narrow", "direct-narrow-full", "layered-narrow", "direct-shipped", "direct-shipped-small"]
+)
 def test_committed_vectors_are_what_the_script_writes(name: str, written: Path) -> None:
     files = [f"{name}.safetensors"] + ([f"{name}.weights.safetensors"] if "narrow" in name else [])
     for file in files:
@@ -33,20 +38,63 @@ def test_committed_vectors_are_what_the_script_writes(name: str, written: Path) 
             torch.testing.assert_close(value, committed[key], rtol=1e-5, atol=1e-5, msg=lambda m, k=key: f"{k}: {m}")
 
 
-def test_comparison_would_notice_one_wrong_value(written: Path) -> None:
-    tensors = load_file(written / "direct-narrow.safetensors")
-    wrong = tensors["layer_7"].clone()
+@pytest.mark.parametrize(("name", "key"), [("direct-narrow", "layer_7"), ("layered-narrow", "correction.layer_3")])
+def test_comparison_would_notice_one_wrong_value(name: str, key: str, written: Path) -> None:
+    tensors = load_file(written / f"{name}.safetensors")
+    wrong = tensors[key].clone()
     wrong[3, 5, 7] += 1e-3
     with pytest.raises(AssertionError):
-        torch.testing.assert_close(wrong, tensors["layer_7"], rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(wrong, tensors[key], rtol=1e-5, atol=1e-5)
 
 
 def test_no_stage_of_the_vectors_is_idle() -> None:
-    vectors = load_file(COMMITTED / "direct-narrow.safetensors")
-    assert vectors["offsets_7"].abs().max() > 1.5
-    assert vectors["low"][1].abs().mean() > 0.01
-    assert (vectors["eye_field"][0] - vectors["eye_field"][1]).abs().mean() > 1e-3
-    assert (vectors["eye_field"] - vectors["eye_panel"]).abs().mean() < 0.05
+    found = load_file(COMMITTED / "direct-narrow.safetensors")
+    assert found["offsets_7"].abs().max() > 1.5
+    assert found["low"][1].abs().mean() > 0.01
+    assert (found["eye_field"][0] - found["eye_field"][1]).abs().mean() > 1e-3
+    assert (found["eye_field"] - found["eye_panel"]).abs().mean() < 0.05
+
+
+def test_no_stage_of_the_layered_vectors_is_idle() -> None:
+    found = load_file(COMMITTED / "layered-narrow.safetensors")
+    light = torch.nn.functional.avg_pool2d(found["amplitude"], 2)
+    source, carried, low = (torch.complex(*found[name]) for name in ("source", "carried", "low"))
+    assert found["surface.offsets_2"].abs().max() > 1.5
+    for net in NETS:
+        assert found[f"{net}.layer_3"].abs().mean() > 0.02
+    assert (source.abs() - light).abs().mean() > 0.02 and source.angle().abs().mean() > 0.1
+    assert (carried - source).abs().mean() > 0.1
+    residual = torch.complex(*found["correction.layer_3"].split(3))
+    torch.testing.assert_close(low, carried + 0.3 * residual, rtol=1e-5, atol=1e-5)
+    assert (low - carried).abs().mean() > 5e-3
+    assert (found["eye_field"][0] - found["eye_field"][1]).abs().mean() > 1e-2
+    assert (found["eye_field"] - found["eye_panel"]).abs().mean() < 0.05
+
+
+def test_layered_vectors_are_computed_in_double_precision() -> None:
+    network = narrow_network(NARROW["layered-narrow"], 3)
+    amplitude, depth = scene(32, 48, 3)
+    double = vectors(network.double(), amplitude, depth, 2.7)
+    single = network.float()(amplitude[None], depth[None], torch.tensor([2.7]))[0]
+    for name in ("source", "carried", "low", "field", "correction.layer_3"):
+        assert double[name].dtype == torch.float64, name
+    assert 1e-9 < (single - torch.complex(*double["low"])).abs().max() < 1e-5
+
+
+def test_shipped_layered_weights_have_files_named_for_them(tmp_path: Path) -> None:
+    """The first, the adjustable and the last layer of both nets, and every other stage."""
+    layered = tmp_path / "layered.safetensors"
+    save_weights(layered, narrow_network(NARROW["layered-narrow"], 3), {}, {})
+    files = write_golden(tmp_path / "out", None, layered)
+    assert files[-1] == tmp_path / "out" / "layered-shipped-small.safetensors"
+    written = load_file(files[-1]).keys()
+    assert written >= {"source", "carried", "surface.encoded", "correction.encoded", "surface.offsets_2", "low"}
+    layers = {net: [name for name in sorted(written) if name.startswith(f"{net}.layer_")] for net in NETS}
+    assert layers["surface"] == ["surface.layer_0", "surface.layer_2", "surface.layer_3"]
+    assert layers["correction"] == ["correction.layer_0", "correction.layer_3"]
+    save_weights(layered, build_network(variant("focal-stack")), {}, {})
+    with pytest.raises(WeightsError, match="found a FocalStackNetwork, expected a direct or layered network"):
+        write_golden(tmp_path / "out", None, layered)
 
 
 def found_in(path: Path) -> Any:

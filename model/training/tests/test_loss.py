@@ -1,3 +1,5 @@
+import dataclasses
+
 import pytest
 import torch
 
@@ -111,6 +113,14 @@ def test_the_in_focus_term_sees_sharp_pixels_only() -> None:
     assert focus_loss(sharp, target, coc, only).total == pytest.approx(0.005, rel=0.01)
     assert focus_loss(blurred, target, coc, only).total < 1e-6
     assert in_focus_weight(torch.tensor([0.0, 2.0])).tolist() == [1.0, 0.5]
+
+
+def test_a_wider_pupil_weighs_the_in_focus_term_more_and_no_other() -> None:
+    weights = LossWeights(in_focus=7.0, squared=3.0)
+    assert weights.for_pupil(2.0) == weights
+    assert weights.for_pupil(4.0) == dataclasses.replace(weights, in_focus=14.0)
+    assert weights.for_pupil(1.0).in_focus == pytest.approx(3.5)
+    assert LossWeights().for_pupil(5.0) == LossWeights()
 
 
 def test_inner_leaves_out_the_border_on_every_side() -> None:

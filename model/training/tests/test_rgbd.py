@@ -3,38 +3,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from holod_training.config import OpticsConfig
-from holod_training.rgbd import RgbdError, fill_missing, find_pairs, read_pair
+from holod_training.rgbd import RgbdError, find_pairs, read_pair, read_pictures
 
 OPTICS = OpticsConfig()
 SHARED = Path(os.environ.get("HOLOD_SHARED_DATA", Path(__file__).parents[3].parent / "shared" / "data")) / "rgbd"
 
 
-def write_pair(
-    folder: Path, millimetres: np.ndarray, colour: tuple[int, int, int] = (255, 188, 0)
-) -> tuple[Path, Path]:
-    paths = folder / "rgb" / "a.png", folder / "depth" / "a.png"
+def write_pair(folder: Path, millimetres: np.ndarray, name: str = "a") -> tuple[Path, Path]:
+    paths = folder / "rgb" / f"{name}.png", folder / "depth" / f"{name}.png"
     for path in paths:
         path.parent.mkdir(parents=True, exist_ok=True)
     height, width = millimetres.shape
     Image.new("RGB", (width, height), (255, 188, 0)).save(paths[0])
     Image.fromarray(millimetres.astype("uint16")).save(paths[1])
     return paths
-
-
-def test_holes_fill_from_their_rim_inwards() -> None:
-    values = torch.full((7, 7), 4.0)
-    values[:, 4:] = 8.0
-    valid = torch.ones(7, 7, dtype=torch.bool)
-    valid[2:5, 1:4] = False
-    values[~valid] = 100.0
-    filled = fill_missing(values, valid)
-    assert torch.equal(filled[valid], values[valid])
-    assert (filled[3, 1], filled[3, 3]) == (4, 8)
-    assert 4 < filled[3, 2] < 8
 
 
 def test_a_pair_becomes_linear_light_and_dioptres(tmp_path: Path) -> None:
@@ -57,6 +42,18 @@ def test_what_is_wrong_is_said(tmp_path: Path) -> None:
     Image.fromarray(np.ones((4, 5), "uint16")).save(depth)
     with pytest.raises(RgbdError, match=r"shape \[4, 5\], expected one channel of \[4, 4\]"):
         read_pair(colour, depth, OPTICS)
+    depth.write_bytes(depth.read_bytes()[:50])
+    with pytest.raises(RgbdError, match=r"depth/a\.png: not a readable picture"):
+        read_pair(colour, depth, OPTICS)
+
+
+def test_pictures_of_one_sheet_are_few_and_of_one_size(tmp_path: Path) -> None:
+    for name in "abcdef":
+        write_pair(tmp_path, np.full((4, 6), 1000), name)
+    assert [image.shape for image, _ in read_pictures(tmp_path, OPTICS)] == [(3, 4, 6)] * 4
+    write_pair(tmp_path, np.full((4, 8), 1000), "b")
+    with pytest.raises(RgbdError, match=r"rgb/b\.png: shape \[4, 8\], expected \[4, 6\] as in .*rgb/a\.png"):
+        read_pictures(tmp_path, OPTICS)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason=f"no real RGB-D pictures at {SHARED}")

@@ -7,7 +7,7 @@ from conftest import write_shard
 
 from holod_training.config import OpticsConfig
 from holod_training.sampling import AugmentConfig, Sampler, augment
-from holod_training.shards import Shard, ShardError, open_shards, shard_names
+from holod_training.shards import Shard, ShardError, open_held_out, open_shards, shard_names
 
 
 def test_crop_is_a_window_of_the_whole(shards: Path) -> None:
@@ -49,6 +49,18 @@ def test_wrong_metadata_is_said(tmp_path: Path, metadata: dict[str, str], messag
     write_shard(tmp_path / "scene_000000.safetensors", metadata=metadata)
     with pytest.raises(ShardError, match=message):
         open_shards(tmp_path, OpticsConfig())
+
+
+def test_scenes_of_training_are_not_held_out(tmp_path: Path) -> None:
+    """Of any other kind they are, also where a shard does not say."""
+    for index, kind in enumerate(("test", "cards", "")):
+        write_shard(tmp_path / f"scene_{index:06}.safetensors", metadata={"kind": kind})
+    assert len(open_held_out(tmp_path, OpticsConfig())) == 3
+    write_shard(tmp_path / "scene_000003.safetensors", metadata={"kind": "train"})
+    with pytest.raises(ShardError, match=r"scene_000003\.safetensors: metadata kind is 'train'.* --kind test"):
+        open_held_out(tmp_path, OpticsConfig())
+    assert len(open_held_out(tmp_path, OpticsConfig(), 3)) == 3
+    assert len(open_shards(tmp_path, OpticsConfig())) == 4
 
 
 def test_no_shards(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ from holod_training.judging import Bench, network_field
 from holod_training.loss import LossWeights, focus_loss
 from holod_training.metrics import judge
 from holod_training.network import DirectNetwork
-from holod_training.optics import double_phase, panel_field, upsample_half_band
-from holod_training.rivals import layered_asm, stop_half_band
+from holod_training.optics import double_phase, panel_field, stop_half_band, upsample_half_band
+from holod_training.rivals import layered_asm
 from holod_training.shards import Shard, Stack
 from holod_training.solver import Solution, SolverConfig, half_band_samples, optimise, shown_by_panel
 

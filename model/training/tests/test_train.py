@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import write_shard
 from safetensors.torch import load_file
 from test_lpips import random_lpips_files
 
@@ -17,6 +18,7 @@ from holod_training.export import WeightsError, load_weights, read_metadata, sav
 from holod_training.loss import LossWeights
 from holod_training.network import DirectNetwork
 from holod_training.sampling import AugmentConfig
+from holod_training.shards import ShardError
 from holod_training.train import Run, TrainConfig, TrainingError, train
 from holod_training.variants import variant
 
@@ -96,6 +98,8 @@ def test_resume_is_bit_exact(shards: Path, tmp_path: Path) -> None:
             train(tiny(shards, tmp_path / "cut", **random), CPU)
     state = torch.load(tmp_path / "cut" / "checkpoint.pt", weights_only=True)
     assert state["step"] == 3
+    with pytest.raises(TrainingError, match="optimizer: found a checkpoint of 'muon', expected 'adam'"):
+        train(tiny(shards, tmp_path / "cut", optimizer="adam", **random), CPU, resume=True)
     resumed = load_file(train(tiny(shards, tmp_path / "cut", **random), CPU, resume=True))
     assert resumed.keys() == whole.keys()
     for name, value in whole.items():
@@ -108,11 +112,12 @@ def test_resume_is_bit_exact(shards: Path, tmp_path: Path) -> None:
     "network",
     [
         dataclasses.replace(variant("layered-4"), channels=4),
+        dataclasses.replace(variant("half-band-layered-small"), channels=4),
         dataclasses.replace(variant("focal-stack"), channels=4, planes=3),
         dataclasses.replace(variant("two-frames"), layers=4, channels=4, adjustable_layers=(1,)),
         dataclasses.replace(variant("ablation-three-plain"), layers=4, channels=4),
     ],
-    ids=lambda network: network.architecture,
+    ids=lambda network: f"{network.grid}-{network.architecture}",
 )
 @pytest.mark.usefixtures("no_plots")
 def test_other_networks_train_and_come_back_from_their_file(
@@ -161,11 +166,26 @@ def test_a_teacher_is_compared_by_its_pictures(shards: Path, tmp_path: Path) -> 
 def test_lpips_joins_the_loss_where_its_files_are_given(shards: Path, tmp_path: Path) -> None:
     backbone, linear = random_lpips_files(tmp_path)
     config = tiny(shards, tmp_path / "run", crop=64, border_px=0, lpips_backbone=str(backbone))
-    with pytest.raises(TrainingError, match="LPIPS: found one of its two weights files"):
+    with pytest.raises(ConfigError, match="LPIPS: found one of its two weights files"):
         Run(config, CPU)
     run = Run(dataclasses.replace(config, lpips_linear=str(linear)), CPU)
     assert run.train_step()["loss_lpips"] > 0
     assert not any("lpips" in key for key in run.state()["network"])
+
+
+def test_the_in_focus_term_counts_by_the_pupil_of_each_crop(shards: Path, tmp_path: Path) -> None:
+    """The shards' pupils are 1, 2 and 3 mm: the total has the weight of the one that was drawn."""
+    run = Run(tiny(shards, tmp_path, loss=LossWeights(in_focus=20.0)), CPU)
+    run.sampler.rescan()
+    drawn = set()
+    for step in range(4):
+        pupil_mm = run.sampler.draw(step, 1)[0].pupil_mm
+        row = run.train_step()
+        weights = LossWeights(in_focus=10.0 * pupil_mm)
+        total = sum(getattr(weights, key.removeprefix("loss_")) * row[key] for key in row if key.startswith("loss_"))
+        assert row["loss"] == pytest.approx(total, rel=1e-4)
+        drawn.add(pupil_mm)
+    assert len(drawn) > 1
 
 
 def test_options_change_the_variant_that_they_name() -> None:
@@ -178,6 +198,10 @@ def test_options_change_the_variant_that_they_name() -> None:
     assert network("--layers", "20") == NetworkConfig(layers=20, adjustable_layers=(10,))
     assert network("--layers", "20", "--adjustable-layers", "5,9").adjustable_layers == (5, 9)
     assert network("--variant", "layered-12", "--no-transport-prior") == variant("layered-12-no-prior")
+    corrected = network(
+        "--variant", "half-band-layered", "--correction-layers", "4", "--correction-dilations", "1,2,2,1"
+    )
+    assert (corrected.correction_layers, corrected.correction_dilations) == (4, (1, 2, 2, 1))
     dilated = network("--layers", "10", "--dilations", "1,1,2,4,8,1,8,4,2,1")
     assert dilated == variant("half-band-dilated")
     options = cli._parser().parse_args([*common, "--in-focus-weight", "7", "--faulty-depth", "0.5", "--crop", "96"])
@@ -189,6 +213,18 @@ def test_options_change_the_variant_that_they_name() -> None:
 def test_a_flat_run_is_stopped(shards: Path, tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="shows one blurred picture"):
         train(tiny(shards, tmp_path / "run", stop_below_slope=2.0), CPU)
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_training_scenes_are_no_validation(shards: Path, tmp_path: Path) -> None:
+    """They may be trained on; that they are refused is told before the first step."""
+    own = tmp_path / "own"
+    write_shard(own / "scene_000000.safetensors", metadata={"kind": "train"})
+    config = tiny(own, tmp_path / "run", steps=1, validation=str(shards))
+    train(config, CPU)
+    with pytest.raises(ShardError, match="metadata kind is 'train', expected held-out scenes"):
+        train(dataclasses.replace(config, out=str(tmp_path / "other"), validation=str(own)), CPU)
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.usefixtures("no_plots")

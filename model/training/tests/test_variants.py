@@ -1,4 +1,5 @@
 import dataclasses
+import math
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from holod_training.costs import operations_per_pixel
 from holod_training.layered import LayeredNetwork, blurred
 from holod_training.metrics import focus_response
 from holod_training.network import DirectNetwork
-from holod_training.optics import Eye, half_band_mask, propagate
+from holod_training.optics import Eye, half_band_mask, propagate, stop_half_band, upsample_half_band
 from holod_training.rivals import layered_asm
 from holod_training.shards import Stack
 from holod_training.variants import VARIANTS, build_network, network_amplitude, variant
@@ -51,8 +52,12 @@ def test_every_variant_learns_from_every_parameter_and_sees_the_pupil(name: str)
 def test_the_table_is_what_it_says() -> None:
     assert variant("half-band-14") == NetworkConfig()
     assert [variant(f"direct-{n}").layers for n in (26, 20, 14)] == [26, 20, 14]
-    layered = build_network(variant("layered-8"))
-    assert sum(p.numel() for p in layered.parameters()) == 103_882
+    for name, parameters in (
+        ("layered-8", 103_882),
+        ("half-band-layered", 178_818),
+        ("half-band-layered-small", 68_698),
+    ):
+        assert sum(p.numel() for p in build_network(variant(name)).parameters()) == parameters, name
     # Two operations a weight of each 3x3 convolution, the offsets' too; taps and FFTs are a few per cent.
     convolutions = 2 * 9 * (9 * 24 + 10 * 24 * 24 + 24 * 24 + 24 * 18 + 12 * 24 + 4 * 24 * 24 + 24 * 6)
     assert convolutions < operations_per_pixel(variant("layered-8")) < 1.06 * convolutions
@@ -65,7 +70,11 @@ def test_configs_that_do_not_fit_say_which_key() -> None:
         ({"dilations": (1, 2)}, "dilations: found .* expected none, or 14 numbers"),
         ({"dilations": (2,) * 14}, "dilations: .* expected 1 at the adjustable layers"),
         ({"conditioning": "some"}, "conditioning: found 'some'"),
-        ({"architecture": "layered"}, "grid: found 'half-band', expected 'full' for `layered`"),
+        ({"correction_layers": 5}, "correction_layers: found 5, expected an even number of at least 4"),
+        ({"correction_layers": 2}, "correction_layers: found 2"),
+        ({"correction_dilations": (1, 2)}, r"correction_dilations: found \(1, 2\), expected none, or 10 numbers"),
+        ({"correction_dilations": (0,) * 10}, "correction_dilations: .* of at least 1"),
+        ({"architecture": "layered", "pupil_inputs": False}, "pupil_inputs: found False, expected true"),
         ({"architecture": "focal-stack", "frames": 2}, "frames: found 2"),
         ({"specialists_mm": (3.0, 2.0)}, "specialists_mm: .* rising order"),
     ):
@@ -87,6 +96,7 @@ def test_dilations_reach_the_convolutions() -> None:
     layers = build_network(variant("half-band-dilated")).layers
     plain = [i for i in range(10) if i != 5]
     assert [layers[i].dilation[0] for i in plain] == [1, 1, 2, 4, 8, 8, 4, 2, 1]
+    assert [layer.dilation[0] for layer in build_network(variant("layered-8")).correction] == [1, 1, 2, 4, 2, 1]
 
 
 def test_blur_input_is_the_mean_blur_over_all_focuses() -> None:
@@ -118,13 +128,35 @@ def test_the_eye_averages_the_intensities_of_frames() -> None:
     assert (eye.look(frames.mean(dim=0), 3.0) - mean).abs().max() > 0.1
 
 
-def unlearned(**changes: object) -> LayeredNetwork:
+GRIDS = ("full", "half-band")
+
+
+def unlearned(grid: str, **changes: object) -> LayeredNetwork:
     """A layered network whose learned parts put out zero."""
-    network = LayeredNetwork(dataclasses.replace(variant("layered-8"), **changes))
+    config = variant("layered-8" if grid == "full" else "half-band-layered")
+    network = LayeredNetwork(dataclasses.replace(config, **changes))
     with torch.no_grad():
-        for trunk in (network.surface, network.middle):
+        for trunk in (network.surface, network.correction):
             trunk[-1].weight.zero_()
     return network
+
+
+def composed(amplitude: torch.Tensor, depth: torch.Tensor, grid: str, pitch_um: float, layers: int = 8) -> torch.Tensor:
+    """Layers with occlusion and zero phase, written out for one scene [3, H, W]: complex [3, h, w], no 4f stop."""
+    optics = OpticsConfig(pixel_pitch_um=pitch_um)
+
+    def low(x: torch.Tensor) -> torch.Tensor:
+        return x if grid == "full" else sum(x[..., i::2, j::2] for i in (0, 1) for j in (0, 1)) / 4
+
+    source = low(amplitude).to(torch.complex64)
+    field, reached_m = torch.zeros_like(source), 0.0
+    for k in range(layers):
+        centre_m = optics.distance_m(optics.dioptres((k + 0.5) / layers))
+        field = propagate(field, optics, centre_m - reached_m)
+        behind = (depth < k / layers) | (depth >= (k + 2) / layers)
+        field = low(behind.float()) * field + low((~behind).float()) * source
+        reached_m = centre_m
+    return propagate(field, optics, -reached_m)
 
 
 def discs(size: int = 48) -> tuple[torch.Tensor, torch.Tensor]:
@@ -135,39 +167,72 @@ def discs(size: int = 48) -> tuple[torch.Tensor, torch.Tensor]:
     return (0.1 + 0.8 * light).sqrt().expand(1, 3, size, size).contiguous(), depth
 
 
-def test_layered_without_learning_or_prior_is_the_layered_rival() -> None:
-    amplitude, depth = scene(variant("layered-8"), 1, 32)
-    optics = OpticsConfig()
+def on_the_panel(network: LayeredNetwork, amplitude: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+    """The field [3, H, W] of one scene at s = 3 mm."""
     with torch.no_grad():
-        ours = unlearned(transport_prior=False)(amplitude, depth, torch.tensor([3.0]))[0]
-        with_prior = unlearned()(amplitude, depth, torch.tensor([3.0]))[0]
-        fewer = unlearned(transport_prior=False, depth_layers=4)(amplitude, depth, torch.tensor([3.0]))[0]
-    rival = layered_asm(amplitude[0], depth[0], optics)
-    torch.testing.assert_close(ours, rival, rtol=1e-4, atol=1e-4)
-    for other in (with_prior, fewer):
-        assert (other - rival).abs().max() > 0.05
+        field = network(amplitude, depth, torch.tensor([3.0]))[0]
+    return field if network.config.grid == "full" else upsample_half_band(field)
 
 
-def test_the_prior_has_no_sign_at_mid_depth_and_the_reference_wavelength_sets_its_size() -> None:
-    network = unlearned()
+@pytest.mark.parametrize("grid", GRIDS)
+def test_layered_without_learning_or_prior_is_layers_of_objects_carried_on_its_own_grid(grid: str) -> None:
+    amplitude, depth = scene(variant("layered-8"), 1, 32)
+    pitch_um, other_um = (8.0, 16.0) if grid == "full" else (16.0, 8.0)
+
+    def found(**changes: object) -> torch.Tensor:
+        with torch.no_grad():
+            return unlearned(grid, **changes)(amplitude, depth, torch.tensor([3.0]))[0]
+
+    def expected(pitch: float) -> torch.Tensor:
+        field = composed(amplitude[0], depth[0], grid, pitch)
+        return stop_half_band(field) if grid == "full" else field
+
+    ours = found(transport_prior=False)
+    torch.testing.assert_close(ours, expected(pitch_um), rtol=1e-4, atol=1e-4)
+    for wrong in (expected(other_um), found(), found(transport_prior=False, depth_layers=4)):
+        assert (ours - wrong).abs().max() > 0.05
+    if grid == "full":
+        torch.testing.assert_close(ours, layered_asm(amplitude[0], depth[0], OpticsConfig()), rtol=1e-4, atol=1e-4)
+
+
+def test_half_band_without_learning_is_the_layered_rival_of_a_smooth_scene() -> None:
+    """What the grid of half the resolution leaves out is little where the picture has nothing finer."""
+    amplitude, depth = discs()
+    rival = layered_asm(amplitude[0], depth[0], OpticsConfig())
+
+    def error(network: LayeredNetwork, turned: bool = False) -> float:
+        field = on_the_panel(network, amplitude, 1 - depth if turned else depth)
+        return float((field - rival).abs().square().mean().sqrt() / rival.abs().square().mean().sqrt())
+
+    assert error(unlearned("half-band", transport_prior=False)) < 0.03
+    assert error(unlearned("half-band")) > 0.1
+    assert error(unlearned("half-band", transport_prior=False), turned=True) > 0.1
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_the_prior_has_no_sign_at_mid_depth_and_the_reference_wavelength_sets_its_size(grid: str) -> None:
+    network = unlearned(grid)
     amplitude, _ = discs()
-    condition = torch.zeros(1, 3, 48, 48)
 
     def phase(depth: float) -> torch.Tensor:
-        centred = torch.full((1, 1, 48, 48), depth - 0.5)
+        trace: dict[str, torch.Tensor] = {}
         with torch.no_grad():
-            return network.surface_light(amplitude, centred, condition, torch.tensor([3.0]))[0].angle()
+            network(amplitude, torch.full((1, 48, 48), depth), torch.tensor([3.0]), trace)
+        return trace["source"][0].angle()
 
     assert phase(0.5).abs().max() < 1e-5
     torch.testing.assert_close(phase(0.9), -phase(0.1))
-    torch.testing.assert_close(phase(0.1)[0] * 638, phase(0.1)[2] * 450, rtol=1e-4, atol=1e-2)
-    b = torch.log(amplitude.square() + 0.03)
-    narrow, wide, _ = (blurred(b, (1.0, 2.5, 6.0)) + 1.66)[0]
-    expected = torch.tanh(torch.tensor(4 * 0.4)) * (-0.5 * narrow[1] - wide[1])
+    for colour, nm in ((0, 638), (2, 450)):
+        torch.testing.assert_close(phase(0.1)[colour] * nm, phase(0.1)[1] * 520, rtol=1e-4, atol=1e-2)
+    light = amplitude if grid == "full" else torch.nn.functional.avg_pool2d(amplitude, 2)
+    sigmas = (1.0, 2.5) if grid == "full" else (0.5, 1.25)
+    narrow, wide = (blurred(torch.log(light.square() + 0.03), sigmas) + 1.66)[0]
+    expected = math.tanh(4 * 0.4) * (-0.5 * narrow[1] - wide[1])
     torch.testing.assert_close(phase(0.1)[1], expected, rtol=1e-4, atol=1e-4)
 
 
-def test_the_prior_refocuses_more_than_no_phase() -> None:
+@pytest.mark.parametrize("grid", GRIDS)
+def test_the_prior_refocuses_more_than_no_phase(grid: str) -> None:
     """Against Gaussian blur that grows away from each disc's depth: the wrong sign would lower the slope."""
     amplitude, depth = discs()
     optics = OpticsConfig()
@@ -178,12 +243,32 @@ def test_the_prior_refocuses_more_than_no_phase() -> None:
     target = torch.stack((torch.where(near, soft, light), torch.where(near, light, soft)))
     eye = Eye(optics, 48, 48, focus)
 
-    def slope(network: LayeredNetwork) -> float:
-        with torch.no_grad():
-            field = network(amplitude, depth, torch.tensor([3.0]))[0]
-        return focus_response(eye.look(field, 8.0), target)[0]
+    def slope(**changes: object) -> float:
+        return focus_response(eye.look(on_the_panel(unlearned(grid, **changes), amplitude, depth), 8.0), target)[0]
 
-    assert slope(unlearned()) > slope(unlearned(transport_prior=False)) + 0.1
+    assert slope() > slope(transport_prior=False) + 0.1
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_the_second_net_adds_three_tenths_of_its_output_to_the_carried_field(grid: str) -> None:
+    """And a trace changes nothing."""
+    config = dataclasses.replace(variant("half-band-layered-small"), grid=grid, channels=4)
+    torch.manual_seed(2)
+    network = build_network(config).double()
+    amplitude, depth = (t.double() for t in scene(config, 2))
+    pupil = torch.tensor([2.0, 4.0], dtype=torch.float64)
+    trace: dict[str, torch.Tensor] = {}
+    with torch.no_grad():
+        field = network(amplitude, depth, pupil, trace)
+        assert torch.equal(network(amplitude, depth, pupil), field)
+    assert field.dtype == torch.complex128
+    residual = torch.complex(*trace["correction.layer_5"].split(3, dim=1))
+    expected = trace["carried"] + 0.3 * residual
+    torch.testing.assert_close(field, expected if grid == "half-band" else stop_half_band(expected))
+    assert residual.abs().mean() > 1e-3
+    seen = trace["correction.encoded"]
+    torch.testing.assert_close(torch.complex(seen[:, :3], seen[:, 3:6]), trace["carried"])
+    torch.testing.assert_close(seen[:, 6:], trace["surface.encoded"][:, : seen.shape[1] - 6])
 
 
 @pytest.mark.parametrize("grid", ["full", "half-band"])
