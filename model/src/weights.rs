@@ -19,7 +19,7 @@ const OPTICS_TOLERANCE: f64 = 1e-4;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Weights {
     pub(crate) config: NetworkConfig,
-    pub(crate) layers: Vec<Layer>,
+    pub(crate) family: Family,
     metrics: serde_json::Value,
     provenance: serde_json::Value,
 }
@@ -28,13 +28,13 @@ pub struct Weights {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct NetworkConfig {
-    /// The family; `direct` is known.
-    pub architecture: String,
+    /// The family.
+    pub architecture: Architecture,
     /// Version of the family; 1 is known.
     pub version: u32,
     /// The grid on which the network predicts.
     pub grid: Grid,
-    /// 3x3 layers in all: the first, pairs of body layers, the last.
+    /// 3x3 layers of `direct`'s net or `layered`'s first: the first, pairs of body layers, the last.
     pub layers: usize,
     /// Feature channels of the body.
     pub channels: usize,
@@ -50,6 +50,55 @@ pub struct NetworkConfig {
     pub pupil_range_mm: [f32; 2],
     /// Amplitude that double phase maps to 1.
     pub amplitude_constant: f32,
+    /// `layered`: into how many layers, equal in dioptres, the depth volume is divided.
+    #[serde(default = "default_depth_layers", skip_serializing_if = "is_default_depth_layers")]
+    pub depth_layers: usize,
+    /// `layered`: whether the surfaces' phase starts from the transport of intensity.
+    #[serde(default = "default_transport_prior", skip_serializing_if = "Clone::clone")]
+    pub transport_prior: bool,
+    /// `layered`: 3x3 layers of the net that corrects what arrives at the SLM plane.
+    #[serde(default = "default_correction_layers", skip_serializing_if = "is_default_correction_layers")]
+    pub correction_layers: usize,
+}
+
+// The trainer leaves out what has its default, so that files of older networks stay as they are.
+const fn default_depth_layers() -> usize {
+    8
+}
+
+fn is_default_depth_layers(count: &usize) -> bool {
+    *count == default_depth_layers()
+}
+
+const fn default_transport_prior() -> bool {
+    true
+}
+
+const fn default_correction_layers() -> usize {
+    10
+}
+
+fn is_default_correction_layers(count: &usize) -> bool {
+    *count == default_correction_layers()
+}
+
+/// How a network comes to the field at the SLM plane.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Architecture {
+    /// The field is a residual to the amplitude.
+    Direct,
+    /// Light on the objects' surfaces, carried by physics, and a residual to what arrives.
+    Layered,
+}
+
+impl fmt::Display for Architecture {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Direct => "direct",
+            Self::Layered => "layered",
+        })
+    }
 }
 
 /// The grid on which a network predicts the field.
@@ -102,6 +151,62 @@ impl TrainedOptics {
             depth_near_dpt: geometry.depth_near.0,
         }
     }
+}
+
+/// The stacks of layers that a family has.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Family {
+    Direct { layers: Vec<Layer> },
+    Layered { surface: Vec<Layer>, correction: Vec<Layer> },
+}
+
+impl Family {
+    /// Every stack with the name that its tensors begin with, as `config` asks for it.
+    fn read<E>(config: &NetworkConfig, mut layer: impl FnMut(&LayerShape) -> Result<Layer, E>) -> Result<Self, E> {
+        let mut stack = |name, inputs, outputs, count, adjustable: &[usize]| {
+            (0..count)
+                .map(|index| {
+                    layer(&LayerShape {
+                        name: format!("{name}.{index}"),
+                        in_channels: if index == 0 { inputs } else { config.channels },
+                        out_channels: if index + 1 == count { outputs } else { config.channels },
+                        modulation_hidden: adjustable.contains(&index).then_some(config.modulation_hidden),
+                    })
+                })
+                .collect::<Result<Vec<_>, E>>()
+        };
+        let maps = config.map_channels();
+        let adjustable = &config.adjustable_layers;
+        Ok(match config.architecture {
+            Architecture::Direct => {
+                Self::Direct { layers: stack("layers", maps, OUTPUT_CHANNELS, config.layers, adjustable)? }
+            }
+            Architecture::Layered => {
+                let prior = usize::from(config.transport_prior);
+                let outputs = 3 * (2 + LAYERED_BLURS * (1 + prior));
+                Self::Layered {
+                    surface: stack("surface", maps + 3 * prior, outputs, config.layers, adjustable)?,
+                    correction: stack(
+                        "correction",
+                        OUTPUT_CHANNELS + maps,
+                        OUTPUT_CHANNELS,
+                        config.correction_layers,
+                        &[],
+                    )?,
+                }
+            }
+        })
+    }
+}
+
+/// What the configuration says of one layer.
+struct LayerShape {
+    /// What its tensors' names begin with.
+    name: String,
+    in_channels: usize,
+    out_channels: usize,
+    /// Of an adjustable layer.
+    modulation_hidden: Option<usize>,
 }
 
 /// One 3x3 layer.
@@ -264,8 +369,8 @@ impl Weights {
 
         let config = metadata.config()?;
         let file = TensorReader { name, tensors };
-        let layers = (0..config.layers).map(|index| file.layer(&config, index)).collect::<Result<_, _>>()?;
-        Ok(Self { config, layers, metrics: metadata.remark("metrics"), provenance: metadata.remark("provenance") })
+        let family = Family::read(&config, |shape| file.layer(shape))?;
+        Ok(Self { config, family, metrics: metadata.remark("metrics"), provenance: metadata.remark("provenance") })
     }
 
     /// What network this is and what it was trained for.
@@ -348,14 +453,22 @@ impl Metadata<'_> {
         let require = |holds: bool, key: &str, found: String, expected: &str| {
             if holds { Ok(()) } else { Err(self.error(&format!("config.{key}"), found, expected)) }
         };
-        let NetworkConfig { architecture, version, layers, channels, .. } = config;
-        require(architecture == "direct", "architecture", format!("\"{architecture}\""), "\"direct\"")?;
+        let NetworkConfig { version, layers, channels, correction_layers, depth_layers, .. } = config;
         require(*version == 1, "version", version.to_string(), "1")?;
+        for (key, layers) in [("layers", layers), ("correction_layers", correction_layers)] {
+            require(
+                (4..=64).contains(layers) && layers % 2 == 0,
+                key,
+                layers.to_string(),
+                "an even number from 4 to 64 (a first, a last and pairs between)",
+            )?;
+        }
+        require((2..=64).contains(depth_layers), "depth_layers", depth_layers.to_string(), "2 to 64")?;
         require(
-            (4..=64).contains(layers) && layers % 2 == 0,
-            "layers",
-            layers.to_string(),
-            "an even number from 4 to 64 (a first, a last and pairs between)",
+            config.architecture == Architecture::Direct || config.grid == Grid::HalfBand,
+            "grid",
+            format!("{:?}", config.grid),
+            "\"half-band\" for `layered`",
         )?;
         require((1..=256).contains(channels), "channels", channels.to_string(), "1 to 256")?;
         let adjustable = &config.adjustable_layers;
@@ -405,21 +518,14 @@ struct TensorReader<'a> {
 }
 
 impl TensorReader<'_> {
-    fn layer(&self, config: &NetworkConfig, index: usize) -> Result<Layer, WeightsError> {
-        let in_channels = if index == 0 { config.input_channels() } else { config.channels };
-        let out_channels = if index + 1 == config.layers { OUTPUT_CHANNELS } else { config.channels };
-        let prefix = format!("layers.{index}");
-        let adjustable = config
-            .adjustable_layers
-            .contains(&index)
-            .then(|| self.adjustable(&prefix, in_channels, config.modulation_hidden))
-            .transpose()?;
+    fn layer(&self, shape: &LayerShape) -> Result<Layer, WeightsError> {
+        let LayerShape { name, in_channels, out_channels, modulation_hidden } = shape;
         Ok(Layer {
-            out_channels,
-            in_channels,
-            weight: self.tensor(&format!("{prefix}.weight"), &[out_channels, in_channels, 3, 3])?,
-            bias: self.tensor(&format!("{prefix}.bias"), &[out_channels])?,
-            adjustable,
+            out_channels: *out_channels,
+            in_channels: *in_channels,
+            weight: self.tensor(&format!("{name}.weight"), &[*out_channels, *in_channels, 3, 3])?,
+            bias: self.tensor(&format!("{name}.bias"), &[*out_channels])?,
+            adjustable: modulation_hidden.map(|hidden| self.adjustable(name, *in_channels, hidden)).transpose()?,
         })
     }
 
@@ -461,10 +567,21 @@ impl TensorReader<'_> {
 /// Real and imaginary residual of three colours.
 pub(crate) const OUTPUT_CHANNELS: usize = 6;
 
+/// Gaussian blurs between which the `layered` family's first net chooses.
+pub(crate) const LAYERED_BLURS: usize = 3;
+
 impl NetworkConfig {
-    /// Channels that the first layer reads: amplitude, two depth channels (each four times after the unshuffle on the
+    /// 3x3 layers of all its nets.
+    pub fn layer_count(&self) -> usize {
+        match self.architecture {
+            Architecture::Direct => self.layers,
+            Architecture::Layered => self.layers + self.correction_layers,
+        }
+    }
+
+    /// Channels that describe the frame: amplitude, two depth channels (each four times after the unshuffle on the
     /// half-band grid), and the pupil.
-    pub(crate) fn input_channels(&self) -> usize {
+    pub(crate) fn map_channels(&self) -> usize {
         match self.grid {
             Grid::HalfBand => 4 * 5 + 1,
             Grid::Full => 5 + 1,
@@ -485,41 +602,45 @@ pub(crate) mod tests {
         let mut tensor = |count: usize, scale: f32| -> Vec<f32> {
             (0..count).map(|_| random.random_range(-1.0f32..1.0) * scale).collect()
         };
-        let layers = (0..config.layers)
-            .map(|index| {
-                let in_channels = if index == 0 { config.input_channels() } else { config.channels };
-                let out_channels = if index + 1 == config.layers { OUTPUT_CHANNELS } else { config.channels };
-                let scale = (3.0 / (9 * in_channels) as f32).sqrt();
-                let hidden = config.modulation_hidden;
-                let modulated = OFFSET_CHANNELS * in_channels + OFFSET_CHANNELS;
-                let adjustable = config.adjustable_layers.contains(&index).then(|| Adjustable {
-                    offset_weight: tensor(OFFSET_CHANNELS * in_channels * 9, 4.0 * scale),
-                    offset_bias: tensor(OFFSET_CHANNELS, 1.0),
-                    modulation: [(1, hidden), (hidden, hidden), (hidden, modulated)].map(|(inputs, outputs)| Dense {
-                        inputs,
-                        weight: tensor(inputs * outputs, (1.0 / inputs as f32).sqrt()),
-                        bias: tensor(outputs, 0.1),
-                    }),
-                });
-                Layer {
-                    out_channels,
-                    in_channels,
-                    weight: tensor(out_channels * in_channels * 9, scale),
-                    bias: tensor(out_channels, 0.1),
-                    adjustable,
-                }
+        let family = Family::read(&config, |shape| {
+            let &LayerShape { in_channels, out_channels, .. } = shape;
+            let scale = (3.0 / (9 * in_channels) as f32).sqrt();
+            let modulated = OFFSET_CHANNELS * in_channels + OFFSET_CHANNELS;
+            let adjustable = shape.modulation_hidden.map(|hidden| Adjustable {
+                offset_weight: tensor(OFFSET_CHANNELS * in_channels * 9, 4.0 * scale),
+                offset_bias: tensor(OFFSET_CHANNELS, 1.0),
+                modulation: [(1, hidden), (hidden, hidden), (hidden, modulated)].map(|(inputs, outputs)| Dense {
+                    inputs,
+                    weight: tensor(inputs * outputs, (1.0 / inputs as f32).sqrt()),
+                    bias: tensor(outputs, 0.1),
+                }),
+            });
+            Ok::<_, std::convert::Infallible>(Layer {
+                out_channels,
+                in_channels,
+                weight: tensor(out_channels * in_channels * 9, scale),
+                bias: tensor(out_channels, 0.1),
+                adjustable,
             })
-            .collect();
-        Weights { config, layers, metrics: serde_json::Value::Null, provenance: serde_json::Value::Null }
+        })
+        .unwrap();
+        Weights { config, family, metrics: serde_json::Value::Null, provenance: serde_json::Value::Null }
     }
 
     /// The tensors of `weights` under the names and shapes of the file format.
     fn tensors(weights: &Weights) -> Vec<(String, Vec<usize>, Vec<f32>)> {
+        let stacks = match &weights.family {
+            Family::Direct { layers } => vec![("layers", layers)],
+            Family::Layered { surface, correction } => vec![("surface", surface), ("correction", correction)],
+        };
+        let layers = stacks.into_iter().flat_map(|(stack, layers)| {
+            layers.iter().enumerate().map(move |(index, layer)| (format!("{stack}.{index}"), layer))
+        });
         let mut tensors = Vec::new();
-        for (index, layer) in weights.layers.iter().enumerate() {
+        for (prefix, layer) in layers {
             let Layer { out_channels, in_channels, weight, bias, adjustable } = layer;
             let mut add = |name: &str, shape: Vec<usize>, values: &Vec<f32>| {
-                tensors.push((format!("layers.{index}.{name}"), shape, values.clone()));
+                tensors.push((format!("{prefix}.{name}"), shape, values.clone()));
             };
             add("weight", vec![*out_channels, *in_channels, 3, 3], weight);
             add("bias", vec![*out_channels], bias);
@@ -541,7 +662,7 @@ pub(crate) mod tests {
     pub(crate) fn config() -> NetworkConfig {
         let optics = TrainedOptics::of(&DisplayGeometry::DEFAULT);
         NetworkConfig {
-            architecture: "direct".into(),
+            architecture: Architecture::Direct,
             version: 1,
             grid: Grid::HalfBand,
             layers: 4,
@@ -552,12 +673,23 @@ pub(crate) mod tests {
             optics,
             pupil_range_mm: [1.0, 5.0],
             amplitude_constant: 1.4,
+            depth_layers: default_depth_layers(),
+            transport_prior: default_transport_prior(),
+            correction_layers: default_correction_layers(),
         }
+    }
+
+    pub(crate) fn layered_config() -> NetworkConfig {
+        NetworkConfig { architecture: Architecture::Layered, depth_layers: 5, correction_layers: 4, ..config() }
     }
 
     /// A file with small random weights, after `change` has changed it.
     fn file(change: impl FnOnce(&mut Tensors, &mut Entries)) -> Vec<u8> {
-        let weights = random_weights(config(), 1);
+        file_of(config(), change)
+    }
+
+    fn file_of(config: NetworkConfig, change: impl FnOnce(&mut Tensors, &mut Entries)) -> Vec<u8> {
+        let weights = random_weights(config, 1);
         let mut tensors = tensors(&weights);
         let mut entries = Entries::from([
             ("format".into(), FORMAT.into()),
@@ -588,7 +720,13 @@ pub(crate) mod tests {
     fn a_file_round_trips() {
         let weights = Weights::from_bytes(&file(|_, _| {}), "test").unwrap();
         let expected = random_weights(config(), 1);
-        assert_eq!((&weights.config, &weights.layers), (&expected.config, &expected.layers));
+        assert_eq!((&weights.config, &weights.family), (&expected.config, &expected.family));
+        let layered = Weights::from_bytes(&file_of(layered_config(), |_, _| {}), "test").unwrap();
+        let expected = random_weights(layered_config(), 1);
+        assert_eq!((&layered.config, &layered.family), (&expected.config, &expected.family));
+        let written = |config: NetworkConfig| serde_json::to_string(&config).unwrap();
+        assert!(!written(config()).contains("depth_layers"));
+        assert!(written(layered_config()).contains("\"depth_layers\":5,\"correction_layers\":4"));
         assert_eq!(weights.metrics()["psnr_db"], 29.0);
         assert!(weights.provenance().is_null());
 
@@ -632,10 +770,16 @@ pub(crate) mod tests {
                 entries.insert("config".into(), serde_json::to_string(&changed).unwrap());
             })
         };
-        assert_mentions(
-            &configured(|c| c.architecture = "layered".into()),
-            &["config.architecture", "layered", "direct"],
-        );
+        let unknown = error_of(|_, entries| {
+            let config = entries["config"].replace("\"direct\"", "\"diffusion\"");
+            entries.insert("config".into(), config);
+        });
+        assert_mentions(&unknown, &["`config`", "diffusion", "`direct`", "`layered`"]);
+        let full = file_of(NetworkConfig { grid: Grid::Full, ..layered_config() }, |_, _| {});
+        let full = Weights::from_bytes(&full, "test").unwrap_err().to_string();
+        assert_mentions(&full, &["config.grid", "Full", "half-band"]);
+        assert_mentions(&configured(|c| c.correction_layers = 3), &["config.correction_layers", "3", "even"]);
+        assert_mentions(&configured(|c| c.depth_layers = 1), &["config.depth_layers", "1"]);
         assert_mentions(&configured(|c| c.version = 7), &["config.version", "7"]);
         assert_mentions(&configured(|c| c.layers = 5), &["config.layers", "5", "even"]);
         assert_mentions(&configured(|c| c.channels = 100_000), &["config.channels", "100000"]);

@@ -60,7 +60,9 @@ fn weights(rig: &Rig) -> Check {
                 true,
                 format!(
                     "{} {} with {} layers, trained for these optics and pupils of {narrowest} to {widest} mm",
-                    config.architecture, config.version, config.layers
+                    config.architecture,
+                    config.version,
+                    config.layer_count()
                 ),
             )
         }

@@ -47,6 +47,20 @@ pub enum EngineError {
     },
 }
 
+/// One step of a frame, before it is timed.
+struct Stage {
+    name: String,
+    /// As in [`StageTiming`].
+    flop: u64,
+}
+
+impl Stage {
+    /// A step that is not matrix-like work.
+    fn plain(name: &str) -> Self {
+        Self { name: name.into(), flop: 0 }
+    }
+}
+
 /// Where the time of one frame went.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct StageTimings {

@@ -2,13 +2,13 @@
 //!
 //! Maps are [channels, height, width].
 
-use std::f64::consts::TAU;
+use std::f64::consts::{PI, TAU};
 
 use holod_calibration::Resolution;
 use num_complex::Complex64;
 
 use crate::RgbdFrame;
-use crate::weights::{Adjustable, Dense, Grid, Layer, Weights};
+use crate::weights::{Adjustable, Dense, Family, Grid, LAYERED_BLURS, Layer, Weights};
 
 #[derive(Clone, Debug)]
 pub(crate) struct Map {
@@ -62,28 +62,81 @@ fn leaky(value: f64, slope: f64) -> f64 {
 
 /// What every stage of one frame gives.
 pub(crate) struct Trace {
-    pub(crate) encoded: Map,
-    /// Each layer's map after its activation.
-    pub(crate) layers: Vec<Map>,
-    /// The offsets of each adjustable layer.
-    pub(crate) offsets: Vec<Option<Map>>,
+    /// In the order in which they run, under the names that golden files give them.
+    pub(crate) stages: Vec<Stage>,
     /// [3, height, width] at the frame's resolution.
     pub(crate) field: Vec<Complex64>,
 }
 
+pub(crate) struct Stage {
+    pub(crate) name: String,
+    pub(crate) value: Value,
+}
+
+pub(crate) enum Value {
+    /// What a first layer reads.
+    Encoded(Map),
+    /// A layer's map after its activation, and the offsets of an adjustable one.
+    Layer(Map, Option<Map>),
+    /// A field on the network's grid, [3, height, width].
+    Light(Vec<Complex64>),
+}
+
 pub(crate) fn run(weights: &Weights, frame: &RgbdFrame, pupil_mm: f64) -> Trace {
+    let mut stages = Vec::new();
+    let low = match &weights.family {
+        Family::Direct { layers } => {
+            let encoded = encode(weights.config.grid, frame, pupil_mm);
+            let residual = trunk(&mut stages, "", layers, weights, encoded, pupil_mm);
+            let base = block_means(weights.config.grid, frame);
+            add(&base.values.iter().map(|&value| value.into()).collect::<Vec<_>>(), &residual, 1.0)
+        }
+        Family::Layered { surface, correction } => {
+            let maps = encode_layered(frame, pupil_mm);
+            let light = block_means(Grid::HalfBand, frame);
+            let soft = blurs(&light);
+            let logs = blurs(&light.clone().map(|a| (a * a + 0.03).ln())).map(|blur| blur.map(|value| value + 1.66));
+            let encoded = match weights.config.transport_prior {
+                true => concatenate(&[&maps, &logs[1]]),
+                false => maps.clone(),
+            };
+            let out = trunk(&mut stages, "surface.", surface, weights, encoded, pupil_mm);
+            let source = surface_light(weights, frame, &out, &light, &soft, &logs);
+            let carried = carry_to_slm(weights, frame, &source, [light.height, light.width]);
+            let parts = [|value: &Complex64| value.re, |value: &Complex64| value.im]
+                .map(|part| Map { values: carried.iter().map(part).collect(), ..light.clone() });
+            stages.push(Stage { name: "source".into(), value: Value::Light(source) });
+            stages.push(Stage { name: "carried".into(), value: Value::Light(carried.clone()) });
+            let encoded = concatenate(&[&parts[0], &parts[1], &maps]);
+            let residual = trunk(&mut stages, "correction.", correction, weights, encoded, pupil_mm);
+            add(&carried, &residual, 0.3)
+        }
+    };
+    let scale = scale_of(weights.config.grid);
+    let (rows, columns) = (frame.resolution.height.div_ceil(scale), frame.resolution.width.div_ceil(scale));
+    Trace { stages, field: onto_panel(weights.config.grid, frame.resolution, &low, [rows, columns]) }
+}
+
+/// Runs a stack of layers; its stages are added to `stages`, the last layer's map is returned.
+fn trunk(
+    stages: &mut Vec<Stage>,
+    prefix: &str,
+    layers: &[Layer],
+    weights: &Weights,
+    encoded: Map,
+    pupil_mm: f64,
+) -> Map {
     let slope = f64::from(weights.config.leaky_slope);
-    let encoded = encode(weights.config.grid, frame, pupil_mm);
-    let (mut layers, mut offsets) = (Vec::<Map>::new(), Vec::new());
-    for (index, layer) in weights.layers.iter().enumerate() {
-        let input = layers.last().unwrap_or(&encoded);
-        let layer_offsets =
-            layer.adjustable.as_ref().map(|adjustable| predict_offsets(adjustable, input, pupil_mm, slope));
-        let sum = convolve(layer, input, layer_offsets.as_ref());
-        let output = if index + 1 == weights.layers.len() {
+    let mut maps = Vec::<Map>::new();
+    stages.push(Stage { name: format!("{prefix}encoded"), value: Value::Encoded(encoded.clone()) });
+    for (index, layer) in layers.iter().enumerate() {
+        let input = maps.last().unwrap_or(&encoded);
+        let offsets = layer.adjustable.as_ref().map(|adjustable| predict_offsets(adjustable, input, pupil_mm, slope));
+        let sum = convolve(layer, input, offsets.as_ref());
+        let output = if index + 1 == layers.len() {
             sum
         } else if index > 0 && index % 2 == 0 {
-            let skip = &layers[index - 2];
+            let skip = &maps[index - 2];
             Map::from_fn([sum.channels, sum.height, sum.width], |channel, y, x| {
                 let (y, x) = (y as isize, x as isize);
                 leaky(0.5 * sum.at(channel, y, x) + skip.at(channel, y, x), slope)
@@ -91,11 +144,25 @@ pub(crate) fn run(weights: &Weights, frame: &RgbdFrame, pupil_mm: f64) -> Trace 
         } else {
             sum.map(|value| leaky(value, slope))
         };
-        layers.push(output);
-        offsets.push(layer_offsets);
+        stages.push(Stage { name: format!("{prefix}layer_{index}"), value: Value::Layer(output.clone(), offsets) });
+        maps.push(output);
     }
-    let field = field(weights.config.grid, frame, &layers[layers.len() - 1]);
-    Trace { encoded, layers, offsets, field }
+    maps.pop().unwrap()
+}
+
+/// base + share·residual, whose channels are three real parts and three imaginary ones.
+fn add(base: &[Complex64], residual: &Map, share: f64) -> Vec<Complex64> {
+    let (real, imaginary) = residual.values.split_at(base.len());
+    let residual = real.iter().zip(imaginary).map(|(&re, &im)| Complex64::new(re, im));
+    base.iter().zip(residual).map(|(base, residual)| base + residual * share).collect()
+}
+
+fn concatenate(maps: &[&Map]) -> Map {
+    Map {
+        channels: maps.iter().map(|map| map.channels).sum(),
+        values: maps.iter().flat_map(|map| map.values.iter().copied()).collect(),
+        ..*maps[0]
+    }
 }
 
 /// One sample of the frame; beyond an odd edge the edge again.
@@ -182,23 +249,158 @@ fn predict_offsets(adjustable: &Adjustable, input: &Map, pupil_mm: f64, slope: f
     })
 }
 
-fn field(grid: Grid, frame: &RgbdFrame, residual: &Map) -> Vec<Complex64> {
+/// Means of the amplitude over what becomes one sample of the grid.
+fn block_means(grid: Grid, frame: &RgbdFrame) -> Map {
     let scale = scale_of(grid);
-    let resolution = frame.resolution;
-    let mut field = Vec::new();
+    let Resolution { width, height } = frame.resolution;
+    Map::from_fn([3, height.div_ceil(scale), width.div_ceil(scale)], |colour, y, x| {
+        let corners = (0..scale).flat_map(|dy| (0..scale).map(move |dx| (scale * y + dy, scale * x + dx)));
+        let plane = &frame.amplitude[colour * width * height..];
+        corners.map(|(y, x)| sample(plane, frame.resolution, y, x)).sum::<f64>() / (scale * scale) as f64
+    })
+}
+
+fn encode_layered(frame: &RgbdFrame, pupil_mm: f64) -> Map {
+    let mut maps = encode(Grid::HalfBand, frame, pupil_mm);
+    let plane = maps.width * maps.height;
+    for (channel, values) in maps.values.chunks_exact_mut(plane).enumerate() {
+        for value in values {
+            *value = match channel {
+                0..12 => *value - 0.4,
+                12..16 => 2.0 * *value,
+                20 => (pupil_mm - 2.5) / 2.0,
+                _ => *value,
+            };
+        }
+    }
+    maps
+}
+
+/// Circular Gaussian blurs of 1, 2.5 and 6 panel pixels on the half-band grid.
+fn blurs(map: &Map) -> [Map; LAYERED_BLURS] {
+    [0.5, 1.25, 3.0].map(|sigma: f64| {
+        let plane = map.width * map.height;
+        let values = map.values.chunks_exact(plane).flat_map(|plane| {
+            let light: Vec<_> = plane.iter().map(|&value| Complex64::from(value)).collect();
+            filtered(&light, [map.height, map.width], |fx, fy| {
+                Complex64::from((-2.0 * (PI * sigma).powi(2) * (fx * fx + fy * fy)).exp())
+            })
+        });
+        Map { values: values.map(|value| value.re).collect(), ..*map }
+    })
+}
+
+fn surface_light(
+    weights: &Weights,
+    frame: &RgbdFrame,
+    out: &Map,
+    light: &Map,
+    soft: &[Map; LAYERED_BLURS],
+    logs: &[Map; LAYERED_BLURS],
+) -> Vec<Complex64> {
+    let maps = encode(Grid::HalfBand, frame, 0.0);
+    let mut source = Vec::new();
     for colour in 0..3 {
-        let amplitude = &frame.amplitude[colour * resolution.pixels()..];
-        let predicted: Vec<Complex64> = (0..residual.height * residual.width)
-            .map(|index| {
-                let (y, x) = (index / residual.width, index % residual.width);
-                let corners = (0..scale).flat_map(|dy| (0..scale).map(move |dx| (dy, dx)));
-                let sum: f64 =
-                    corners.map(|(dy, dx)| sample(amplitude, resolution, scale * y + dy, scale * x + dx)).sum();
-                let at = |channel| residual.at(channel, y as isize, x as isize);
-                Complex64::new(sum / (scale * scale) as f64 + at(colour), at(3 + colour))
+        for (y, x) in (0..light.height as isize).flat_map(|y| (0..light.width as isize).map(move |x| (y, x))) {
+            let out = |channel: usize| out.at(3 * channel + colour, y, x);
+            let centred = (12..16).map(|channel| maps.at(channel, y, x)).sum::<f64>() / 4.0;
+            let light = light.at(colour, y, x);
+            let blurs = 0..LAYERED_BLURS;
+            let softened: f64 = blurs.clone().map(|j| out(2 + j) * (soft[j].at(colour, y, x) - light)).sum();
+            let mut phase = out(1);
+            if weights.config.transport_prior {
+                let gain = |j: usize| [-0.5, -1.0, 0.0][j] * (4.0 * -centred).tanh() + out(2 + LAYERED_BLURS + j);
+                let drift: f64 = blurs.map(|j| gain(j) * logs[j].at(colour, y, x)).sum();
+                phase += 520.0 / weights.config.optics.wavelengths_nm[colour] * drift;
+            }
+            source.push(Complex64::from_polar(1.0, phase) * (light + 0.5 * out(0) + softened));
+        }
+    }
+    source
+}
+
+fn carry_to_slm(weights: &Weights, frame: &RgbdFrame, source: &[Complex64], size: [usize; 2]) -> Vec<Complex64> {
+    let (config, Resolution { width, height }) = (&weights.config, frame.resolution);
+    let [rows, columns] = size;
+    let optics = &config.optics;
+    let layers = config.depth_layers;
+    let layer_of = |y: usize, x: usize| {
+        let depth = frame.depth_normalised[y.min(height - 1) * width + x.min(width - 1)];
+        ((depth * layers as f32) as usize).min(layers - 1)
+    };
+    let centre_m = |layer: usize| {
+        let share = (layer as f64 + 0.5) / layers as f64;
+        let dioptres = optics.depth_far_dpt + share * (optics.depth_near_dpt - optics.depth_far_dpt);
+        (optics.eyepiece_focal_length_mm * 1e-3).powi(2) * dioptres
+    };
+    let mut carried = Vec::new();
+    for (source, wavelength_nm) in source.chunks_exact(rows * columns).zip(optics.wavelengths_nm) {
+        let carry = |field: &[Complex64], u_m: f64| {
+            let per_m = 1.0 / (wavelength_nm * 1e-9);
+            filtered(field, size, |fx, fy| {
+                let [fx, fy] = [fx, fy].map(|f| f / (2e-6 * optics.pixel_pitch_um));
+                let squared = per_m * per_m - fx * fx - fy * fy;
+                if squared > 0.0 { Complex64::cis(TAU * u_m * (squared.sqrt() - per_m)) } else { Complex64::ZERO }
+            })
+        };
+        let mut field = vec![Complex64::ZERO; rows * columns];
+        for layer in 0..layers {
+            if layer > 0 {
+                field = carry(&field, centre_m(layer) - centre_m(layer - 1));
+            }
+            for (index, field) in field.iter_mut().enumerate() {
+                let (y, x) = (2 * (index / columns), 2 * (index % columns));
+                let corners = [(y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)];
+                let inside = corners.iter().filter(|&&(y, x)| (layer..=layer + 1).contains(&layer_of(y, x))).count();
+                let cover = inside as f64 / 4.0;
+                *field = *field * (1.0 - cover) + source[index] * cover;
+            }
+        }
+        carried.extend(carry(&field, -centre_m(layers - 1)));
+    }
+    carried
+}
+
+/// Multiplies the spectrum of `light` [rows, columns] by `factor`(fx, fy), in cycles per sample; by the definition of
+/// the transform, rows first.
+fn filtered(
+    light: &[Complex64],
+    [rows, columns]: [usize; 2],
+    factor: impl Fn(f64, f64) -> Complex64,
+) -> Vec<Complex64> {
+    let signed = |bin: usize, bins: usize| {
+        let bin = bin as f64;
+        if 2.0 * bin < bins as f64 { bin / bins as f64 } else { bin / bins as f64 - 1.0 }
+    };
+    let transform = |values: &[Complex64], sign: f64| -> Vec<Complex64> {
+        let turn = |bin: usize, sample: usize, bins: usize| {
+            Complex64::cis(sign * TAU * (bin * sample % bins) as f64 / bins as f64)
+        };
+        let along_rows: Vec<_> = (0..rows * columns)
+            .map(|i| {
+                let row = &values[i / columns * columns..][..columns];
+                row.iter().enumerate().map(|(x, value)| value * turn(i % columns, x, columns)).sum::<Complex64>()
             })
             .collect();
-        let (rows, columns) = (residual.height, residual.width);
+        (0..rows * columns)
+            .map(|i| {
+                let column = along_rows[i % columns..].iter().step_by(columns).enumerate();
+                let sum: Complex64 = column.map(|(y, value)| value * turn(i / columns, y, rows)).sum();
+                sum / ((rows * columns) as f64).sqrt()
+            })
+            .collect()
+    };
+    let mut spectrum = transform(light, -1.0);
+    for (index, value) in spectrum.iter_mut().enumerate() {
+        *value *= factor(signed(index % columns, columns), signed(index / columns, rows));
+    }
+    transform(&spectrum, 1.0)
+}
+
+/// The field [3, rows, columns] of the network's grid at the panel's resolution.
+fn onto_panel(grid: Grid, resolution: Resolution, low: &[Complex64], [rows, columns]: [usize; 2]) -> Vec<Complex64> {
+    let mut field = Vec::new();
+    for predicted in low.chunks_exact(rows * columns) {
         for (y, x) in (0..resolution.height).flat_map(|y| (0..resolution.width).map(move |x| (y, x))) {
             field.push(match grid {
                 Grid::Full => predicted[y * columns + x],

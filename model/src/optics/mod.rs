@@ -11,7 +11,9 @@ use num_complex::Complex32;
 
 pub use double_phase::{DoublePhase, DoublePhaseReport};
 pub use eye::{Eye, SimulatedEye};
+pub(crate) use fft::{TransposedFft2d, signed_bin};
 pub use propagation::Propagator;
+pub(crate) use propagation::transfer_table;
 pub(crate) use upsample::FourierUpsampler;
 
 /// Amplitude and phase of each colour at the SLM plane, [3, height, width]. |value|² is linear light with white = 1.

@@ -109,6 +109,23 @@ impl Propagator {
     }
 }
 
+/// The transfer function over the distance `u` for fields that repeat beyond their edges, on a grid of `size` samples
+/// `pitch` apart: transposed, [width, height], as [`TransposedFft2d`] holds spectra, and divided by width·height, so
+/// that a transform there and back keeps amplitudes.
+pub(crate) fn transfer_table(wavelength: Metres, pitch: Metres, size: Resolution, u: Metres) -> Vec<Complex32> {
+    let Resolution { width, height } = size;
+    let transfer = Transfer::unlimited(wavelength.0, u.0);
+    let norm = 1.0 / (width * height) as f64;
+    let frequency = |bin, bins| signed_bin(bin, bins) as f64 / (bins as f64 * pitch.0);
+    (0..width)
+        .flat_map(|kx| (0..height).map(move |ky| (kx, ky)))
+        .map(|(kx, ky)| {
+            let value = transfer.at(frequency(kx, width), frequency(ky, height)) * norm;
+            Complex32::new(value.re as f32, value.im as f32)
+        })
+        .collect()
+}
+
 /// The band-limited transfer function of one wavelength and distance.
 struct Transfer {
     inverse_wavelength: f64,

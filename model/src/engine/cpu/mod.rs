@@ -1,11 +1,15 @@
 //! The network on the CPU: channels-last maps, rayon over rows, SIMD chosen at run time.
 
 mod conv;
+mod depth_layers;
+mod direct;
+mod layered;
 mod network;
 mod peak;
 mod simd;
 #[cfg(test)]
 mod tests;
+mod trunk;
 
 use holod_calibration::{PupilDiameter, Resolution};
 
