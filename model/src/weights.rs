@@ -54,7 +54,7 @@ pub struct NetworkConfig {
     #[serde(default = "default_depth_layers", skip_serializing_if = "is_default_depth_layers")]
     pub depth_layers: usize,
     /// `layered`: whether the surfaces' phase starts from the transport of intensity.
-    #[serde(default = "default_transport_prior", skip_serializing_if = "Clone::clone")]
+    #[serde(default = "default_transport_prior", skip_serializing_if = "is_default_transport_prior")]
     pub transport_prior: bool,
     /// `layered`: 3x3 layers of the net that corrects what arrives at the SLM plane.
     #[serde(default = "default_correction_layers", skip_serializing_if = "is_default_correction_layers")]
@@ -72,6 +72,10 @@ fn is_default_depth_layers(count: &usize) -> bool {
 
 const fn default_transport_prior() -> bool {
     true
+}
+
+fn is_default_transport_prior(prior: &bool) -> bool {
+    *prior == default_transport_prior()
 }
 
 const fn default_correction_layers() -> usize {
@@ -336,13 +340,13 @@ impl std::error::Error for OpticsMismatch {}
 impl Weights {
     /// The weights that ship with holod, of the best quality.
     pub fn builtin() -> Self {
-        Self::from_bytes(include_bytes!("../weights/direct-halfband-14.safetensors"), "standard")
+        Self::from_bytes(include_bytes!("../weights/standard.safetensors"), "standard")
             .expect("the built-in weights are valid: a test loads them")
     }
 
     /// The weights that ship with holod for weak machines: a third of the operations.
     pub fn builtin_small() -> Self {
-        Self::from_bytes(include_bytes!("../weights/direct-halfband-8.safetensors"), "small")
+        Self::from_bytes(include_bytes!("../weights/small.safetensors"), "small")
             .expect("the built-in weights are valid: a test loads them")
     }
 
@@ -724,6 +728,9 @@ pub(crate) mod tests {
         let layered = Weights::from_bytes(&file_of(layered_config(), |_, _| {}), "test").unwrap();
         let expected = random_weights(layered_config(), 1);
         assert_eq!((&layered.config, &layered.family), (&expected.config, &expected.family));
+        let without_prior = NetworkConfig { transport_prior: false, ..layered_config() };
+        let read = Weights::from_bytes(&file_of(without_prior.clone(), |_, _| {}), "test").unwrap();
+        assert_eq!((&read.config, &read.family), (&without_prior, &random_weights(without_prior.clone(), 1).family));
         let written = |config: NetworkConfig| serde_json::to_string(&config).unwrap();
         assert!(!written(config()).contains("depth_layers"));
         assert!(written(layered_config()).contains("\"depth_layers\":5,\"correction_layers\":4"));
@@ -737,9 +744,9 @@ pub(crate) mod tests {
     #[test]
     fn the_built_in_weights_are_valid_and_fit_the_built_in_bench() {
         let weights = Weights::builtin();
-        assert_eq!((weights.config().layers, weights.config().grid), (14, Grid::HalfBand));
+        assert_eq!((weights.config().layer_count(), weights.config().channels), (18, 32));
         let small = Weights::builtin_small();
-        assert_eq!((small.config().layers, small.config().channels), (8, 24));
+        assert_eq!((small.config().layer_count(), small.config().channels), (10, 24));
         for weights in [weights, small] {
             weights.check_optics(&DisplayGeometry::DEFAULT).unwrap();
         }
@@ -780,6 +787,7 @@ pub(crate) mod tests {
         assert_mentions(&full, &["config.grid", "Full", "half-band"]);
         assert_mentions(&configured(|c| c.correction_layers = 3), &["config.correction_layers", "3", "even"]);
         assert_mentions(&configured(|c| c.depth_layers = 1), &["config.depth_layers", "1"]);
+        assert_mentions(&configured(|c| c.depth_layers = 65), &["config.depth_layers", "65", "2 to 64"]);
         assert_mentions(&configured(|c| c.version = 7), &["config.version", "7"]);
         assert_mentions(&configured(|c| c.layers = 5), &["config.layers", "5", "even"]);
         assert_mentions(&configured(|c| c.channels = 100_000), &["config.channels", "100000"]);

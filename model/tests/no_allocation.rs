@@ -1,6 +1,7 @@
 //! A running frame loop must not allocate: counts every allocation of the process while frames are rendered.
 
 use std::alloc::{GlobalAlloc, Layout, System};
+use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use holod_calibration::{PupilDiameter, Resolution};
@@ -30,9 +31,16 @@ static ALLOCATOR: Counting = Counting;
 
 #[test]
 fn frames_do_not_allocate() {
+    let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/golden/");
+    for name in ["direct-narrow", "layered-narrow"] {
+        check(&Weights::load(&Path::new(golden).join(format!("{name}.weights.safetensors"))).unwrap());
+    }
+    check(&Weights::builtin());
+}
+
+fn check(weights: &Weights) {
     let resolution = Resolution { width: 10, height: 7 };
-    let weights = Weights::builtin();
-    let mut engine = CpuEngine::new(&weights, resolution, 2).unwrap();
+    let mut engine = CpuEngine::new(weights, resolution, 2).unwrap();
     let mut double_phase = DoublePhase::new(resolution, weights.config().amplitude_constant).with_blur(0.7);
     let frame = RgbdFrame {
         resolution,

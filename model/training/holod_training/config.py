@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 WEIGHTS_FORMAT = "holod-weights-1"
@@ -55,6 +57,10 @@ def _optional(default: Any) -> Any:
     return field(default=default, metadata={"optional": True})
 
 
+def _rises(values: Sequence[float]) -> bool:
+    return all(a < b for a, b in pairwise(values))
+
+
 @dataclass(frozen=True)
 class NetworkConfig:
     """One network; `model/weights` carries this as JSON under the key `config`. `variants.py` has a table of them.
@@ -97,13 +103,18 @@ class NetworkConfig:
         self._require("architecture", self.architecture in ARCHITECTURES, f"one of {', '.join(ARCHITECTURES)}")
         self._require("version", self.version == 1, "version 1, which this trainer builds")
         self._require("grid", self.grid in ("half-band", "full"), "'half-band' or 'full'")
-        self._require("layers", self.layers >= 4 and self.layers % 2 == 0, "an even number of at least 4")
-        self._require("channels", self.channels >= 1, "at least 1")
-        for index in self.adjustable_layers:
-            if not 1 <= index <= self.layers - 2:
-                raise ConfigError(
-                    f"adjustable_layers: found {index}, expected layers of the body, 1 to {self.layers - 2}"
-                )
+        # The bounds are those of the engines.
+        for key in ("layers", "correction_layers"):
+            count = getattr(self, key)
+            self._require(key, 4 <= count <= 64 and count % 2 == 0, "an even number from 4 to 64")
+        self._require("channels", 1 <= self.channels <= 256, "1 to 256")
+        self._require("depth_layers", 2 <= self.depth_layers <= 64, "2 to 64")
+        self._require(
+            "adjustable_layers",
+            all(1 <= index <= self.layers - 2 for index in self.adjustable_layers) and _rises(self.adjustable_layers),
+            f"layers of the body, 1 to {self.layers - 2}, in rising order",
+        )
+        self._require("modulation_hidden", 1 <= self.modulation_hidden <= 1024, "1 to 1024")
         known = f"one of {', '.join(CONDITIONINGS)}"
         self._require("conditioning", self.conditioning in CONDITIONINGS, known)
         self._require(
@@ -121,23 +132,13 @@ class NetworkConfig:
         self._require("blur_input", direct or not self.blur_input, "false; only `direct` can have it")
         self._require("pupil_inputs", self.architecture != "layered" or self.pupil_inputs, "true for `layered`")
         self._require(
-            "correction_layers",
-            self.correction_layers >= 4 and self.correction_layers % 2 == 0,
-            "an even number of at least 4",
-        )
-        self._require(
             "correction_dilations",
             len(self.correction_dilations) in (0, self.correction_layers)
             and all(d >= 1 for d in self.correction_dilations),
             f"none, or {self.correction_layers} numbers of at least 1, one for each layer",
         )
-        self._require("depth_layers", self.depth_layers >= 2, "at least 2")
         self._require("planes", self.planes >= 2, "at least 2")
-        self._require(
-            "specialists_mm",
-            all(a < b for a, b in zip(self.specialists_mm, self.specialists_mm[1:], strict=False)),
-            "pupils in rising order",
-        )
+        self._require("specialists_mm", _rises(self.specialists_mm), "pupils in rising order")
 
     def _require(self, key: str, met: bool, expected: str) -> None:
         if not met:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors.torch import save
@@ -31,19 +31,44 @@ from holod_training.variants import build_network
 GOLDEN_FORMAT = "holod-golden-1"
 FOCUS_DPT = (0.25, 2.5)
 ASM_DISTANCE_M = 0.0032
+SHIPPED_FAMILIES = ("direct", "layered")
 
 
-NARROW: dict[str, NetworkConfig] = {
-    "direct-narrow": NetworkConfig(channels=8, modulation_hidden=8),
-    "direct-narrow-full": NetworkConfig(grid="full", channels=8, modulation_hidden=8),
-    "layered-narrow": NetworkConfig(
-        architecture="layered",
-        layers=4,
-        channels=8,
-        adjustable_layers=(2,),
-        modulation_hidden=8,
-        depth_layers=4,
-        correction_layers=4,
+class Narrow(NamedTuple):
+    """A random network and the size of the scene that it answers."""
+
+    config: NetworkConfig
+    height: int
+    width: int
+
+
+# Depth and correction layers are left at their defaults, so that no engine has others.
+NARROW: dict[str, Narrow] = {
+    "direct-narrow": Narrow(NetworkConfig(channels=8, modulation_hidden=8), 32, 48),
+    "direct-narrow-full": Narrow(NetworkConfig(grid="full", channels=8, modulation_hidden=8), 12, 16),
+    "layered-narrow": Narrow(
+        NetworkConfig(
+            architecture="layered",
+            layers=4,
+            channels=8,
+            adjustable_layers=(2,),
+            modulation_hidden=8,
+            correction_layers=4,
+        ),
+        32,
+        48,
+    ),
+    "layered-narrow-no-prior": Narrow(
+        NetworkConfig(
+            architecture="layered",
+            layers=4,
+            channels=4,
+            adjustable_layers=(2,),
+            modulation_hidden=8,
+            transport_prior=False,
+        ),
+        16,
+        24,
     ),
 }
 
@@ -134,14 +159,14 @@ def write_vectors(path: Path, result: dict[str, Tensor], about: dict[str, Any]) 
 
 
 def write_golden(out: Path, standard: Path | None, small: Path | None = None, seed: int = 20) -> list[Path]:
-    """Writes every golden file into `out`; `standard` and `small` are the weights that the product has. Raises
-    WeightsError."""
+    """Writes every golden file into `out`; `standard` and `small` are the weights that the product has, and a file of
+    another family's in their place goes. Raises WeightsError."""
     written = []
-    for name, config in NARROW.items():
+    for name, (config, height, width) in NARROW.items():
         weights = out / f"{name}.weights.safetensors"
         provenance = {"script": "python -m holod_training golden", "seed": seed}
         save_weights(weights, narrow_network(config, seed), {}, provenance)
-        amplitude, depth = scene(*((32, 48) if config.grid == "half-band" else (12, 16)), seed)
+        amplitude, depth = scene(height, width, seed)
         result = vectors(load_weights(weights).double(), amplitude, depth, 2.7)
         write_vectors(out / f"{name}.safetensors", result, {"seed": seed, "weights": weights.name})
         written += [weights, out / f"{name}.safetensors"]
@@ -151,11 +176,15 @@ def write_golden(out: Path, standard: Path | None, small: Path | None = None, se
         built_in = load_weights(shipped)
         if not isinstance(built_in, DirectNetwork | LayeredNetwork):
             raise WeightsError(f"{shipped}: found a {type(built_in).__name__}, expected a direct or layered network")
-        path = out / f"{built_in.config.architecture}-shipped{suffix}.safetensors"
+        family = built_in.config.architecture
+        path = out / f"{family}-shipped{suffix}.safetensors"
         amplitude, depth = scene(32, 48, seed)
         result = vectors(built_in.double(), amplitude, depth, 3.4, every_layer=False)
         write_vectors(path, result, {"seed": seed, "weights": shipped.name})
         written.append(path)
+        for other in SHIPPED_FAMILIES:
+            if other != family:
+                (out / f"{other}-shipped{suffix}.safetensors").unlink(missing_ok=True)
     if standard:
         write_evaluation(out / "evaluation.safetensors", standard, seed)
         written.append(out / "evaluation.safetensors")

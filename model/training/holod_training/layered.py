@@ -70,6 +70,16 @@ def compose(source: Tensor, depth: Tensor, optics: OpticsConfig, count: int, sca
     return carry(field, optics, scale, -centres[-1])
 
 
+def drift_phase(centred: Tensor, logs: Tensor, optics: OpticsConfig, gates: Tensor | float = 0.0) -> Tensor:
+    """The phase [..., 3, h, w] that makes light drift from bright to dark where it is out of focus:
+    (520 nm / λ) · Σ_j (g_j · tanh(4·(½ − D)) + gate_j) · L_j, from D − ½ [..., 1, h, w], blurs of log(I + 0.03) + 1.66
+    and gates [..., len(SIGMAS_PX), 3, h, w]."""
+    gains = centred.new_tensor(PRIOR_GAINS)[:, None, None, None]
+    drift = gains * torch.tanh(-4 * centred).unsqueeze(-4) + gates
+    colours = centred.new_tensor([REFERENCE_NM / nm for nm in optics.wavelengths_nm])
+    return colours[:, None, None] * (drift * logs).sum(dim=-4)
+
+
 class LayeredNetwork(FieldNetwork):
     """Net 1 (`surface`) gives each point of the network's grid and each colour a correction of amplitude, a phase, and
     gates of three blurs; `depth_layers` are composed far to near with occlusion and carried to the SLM plane; net 2
@@ -153,8 +163,5 @@ class LayeredNetwork(FieldNetwork):
         correction, phase, gates = out[:, 0], out[:, 1], out[:, 2:]
         strength = light + 0.5 * correction + (gates[:, :count] * (soft - light[:, None])).sum(dim=1)
         if self.config.transport_prior:
-            gains = light.new_tensor(PRIOR_GAINS)[:, None, None, None]
-            drift = gains * torch.tanh(-4 * centred)[:, None] + gates[:, count:]
-            colours = light.new_tensor([REFERENCE_NM / nm for nm in self.config.optics.wavelengths_nm])
-            phase = phase + colours[:, None, None] * (drift * logs).sum(dim=1)
+            phase = phase + drift_phase(centred, logs, self.config.optics, gates[:, count:])
         return torch.complex(strength * torch.cos(phase), strength * torch.sin(phase))

@@ -18,7 +18,7 @@ STEP_RMS = 0.2
 
 
 def orthogonalised(matrix: Tensor) -> Tensor:
-    """Nearly U·Vᵀ of matrix = U·Σ·Vᵀ: singular values end between 0.7 and 1.2."""
+    """Nearly U·Vᵀ of matrix = U·Σ·Vᵀ: singular values end between 0.7 and 1.2, but for those far below the largest."""
     wide = matrix if matrix.shape[0] <= matrix.shape[1] else matrix.T
     x = wide / wide.norm().clamp_min(1e-7)
     a, b, c = NEWTON_SCHULZ
@@ -56,7 +56,10 @@ class Muon(Optimizer):
     def _orthogonal_step(self, parameter: Tensor, group: dict[str, Any]) -> None:
         gradient, keep = parameter.grad, group["momentum"]
         assert gradient is not None
-        mean = self.state[parameter].setdefault("mean", torch.zeros_like(parameter))
+        state = self.state[parameter]
+        if "mean" not in state:
+            state["mean"] = torch.zeros_like(parameter)
+        mean = state["mean"]
         mean.lerp_(gradient, 1 - keep)
         direction = orthogonalised(gradient.lerp(mean, keep).flatten(1))
         size = STEP_RMS * max(direction.shape) ** 0.5
@@ -67,9 +70,10 @@ class Muon(Optimizer):
         assert gradient is not None
         of_mean, of_square = group["betas"]
         state = self.state[parameter]
-        state["step"] = state.get("step", 0) + 1
-        mean = state.setdefault("mean", torch.zeros_like(parameter))
-        square = state.setdefault("square", torch.zeros_like(parameter))
+        if "mean" not in state:
+            state |= {"step": 0, "mean": torch.zeros_like(parameter), "square": torch.zeros_like(parameter)}
+        state["step"] += 1
+        mean, square = state["mean"], state["square"]
         mean.lerp_(gradient, 1 - of_mean)
         square.lerp_(gradient.square(), 1 - of_square)
         spread = (square / (1 - of_square ** state["step"])).sqrt_().add_(group["eps"])

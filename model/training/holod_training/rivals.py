@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from holod_training.config import OpticsConfig
-from holod_training.layered import LOG_FLOOR, LOG_OFFSET, PRIOR_GAINS, REFERENCE_NM, SIGMAS_PX, compose
+from holod_training.layered import LOG_FLOOR, LOG_OFFSET, SIGMAS_PX, compose, drift_phase
 from holod_training.optics import propagate, stop_half_band
 
 OCCLUSION_LAYERS = 8
@@ -49,15 +49,12 @@ def transport_of_intensity(amplitude: Tensor, depth: Tensor, optics: OpticsConfi
     """`layered_asm` of an object whose phase makes light drift from bright to dark where it is out of focus.
 
     φ = (520 nm / λ) · Σ_j g_j · tanh(4·(½ − D)) · (G_σj(log(I + 0.03)) + 1.66), σ = 1, 2.5, 6 px, g = −0.5, −1, 0.
-    Near objects take the other sign than far ones, since the drift turns round behind the volume's middle.
+    Near objects take the other sign than far ones, since the drift turns round behind the volume's middle. The blurs go
+    on with the edge's value, where those of the layered network are circular.
     """
     logarithm = torch.log(amplitude.square() + LOG_FLOOR)
-    sign = torch.tanh(4 * (0.5 - depth))
-    phase = torch.zeros_like(amplitude)
-    for gain, sigma in zip(PRIOR_GAINS, SIGMAS_PX, strict=True):
-        phase += gain * sign * (gaussian_blur(logarithm, sigma) + LOG_OFFSET)
-    wavelengths = torch.tensor(optics.wavelengths_nm, dtype=phase.dtype, device=phase.device)
-    phase = phase * (REFERENCE_NM / wavelengths)[:, None, None]
+    logs = torch.stack([gaussian_blur(logarithm, sigma) for sigma in SIGMAS_PX]) + LOG_OFFSET
+    phase = drift_phase(depth[None] - 0.5, logs, optics)
     return layered_asm(torch.polar(amplitude, phase), depth, optics)
 
 

@@ -280,17 +280,31 @@ class Run:
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
+        stored = json.loads(state["config"])
+        in_focus = stored["loss"].get("in_focus", 0)
+        if "optimizer" not in stored and in_focus:
+            raise TrainingError(
+                f"{self.config.out}: loss.in_focus: found {in_focus} in a checkpoint from before that weight grew with "
+                "the pupil, so that its loss would change; go on with the version that began it, or start again from "
+                "its weights with --initial-weights"
+            )
         # Runs from before there was a choice had Adam.
-        found = json.loads(state["config"]).get("optimizer", "adam")
+        found = stored.get("optimizer", "adam")
         if found != self.config.optimizer:
             raise TrainingError(
                 f"{self.config.out}: optimizer: found a checkpoint of {found!r}, expected {self.config.optimizer!r}; "
                 f"resume with --optimizer {found}"
             )
+        try:
+            self.network.load_state_dict(state["network"])
+            self.average.load_state_dict(state["average"])
+        except RuntimeError as error:
+            raise TrainingError(
+                f"{self.config.out}: its checkpoint is of a network with other layers than this run's; "
+                "resume with the network's options as config.json there has them"
+            ) from error
         self.step = state["step"]
         self.seconds = state["seconds"]
-        self.network.load_state_dict(state["network"])
-        self.average.load_state_dict(state["average"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.sampler.use(state["shards"])
 

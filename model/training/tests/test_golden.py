@@ -8,7 +8,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 
 from holod_training.config import OpticsConfig
-from holod_training.export import WeightsError, save_weights
+from holod_training.export import WeightsError, save_weights, write_beside
 from holod_training.golden import NARROW, narrow_network, scene, vectors, write_golden
 from holod_training.optics import coc_px
 from holod_training.shards import Shard
@@ -22,12 +22,13 @@ NETS = ("surface", "correction")
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("golden")
-    write_golden(out, WEIGHTS / "direct-halfband-14.safetensors", WEIGHTS / "direct-halfband-8.safetensors")
+    write_golden(out, WEIGHTS / "standard.safetensors", WEIGHTS / "small.safetensors")
     return out
 
 
 @pytest.mark.parametrize(
-    "name", ["direct-narrow", "direct-narrow-full", "layered-narrow", "direct-shipped", "direct-shipped-small"]
+    "name",
+    [*NARROW, "layered-shipped", "layered-shipped-small"],
 )
 def test_committed_vectors_are_what_the_script_writes(name: str, written: Path) -> None:
     files = [f"{name}.safetensors"] + ([f"{name}.weights.safetensors"] if "narrow" in name else [])
@@ -71,8 +72,20 @@ def test_no_stage_of_the_layered_vectors_is_idle() -> None:
     assert (found["eye_field"] - found["eye_panel"]).abs().mean() < 0.05
 
 
+def test_layered_vectors_without_the_prior_have_their_own_phase_and_the_defaults() -> None:
+    with safe_open(COMMITTED / "layered-narrow-no-prior.weights.safetensors", framework="pt") as file:
+        stated = json.loads(file.metadata()["config"])
+    assert stated["transport_prior"] is False and not {"depth_layers", "correction_layers"} & stated.keys()
+    found = load_file(COMMITTED / "layered-narrow-no-prior.safetensors")
+    assert found["surface.encoded"].shape == (21, 8, 12)
+    source, carried, low = (torch.complex(*found[name]) for name in ("source", "carried", "low"))
+    torch.testing.assert_close(low, carried + 0.3 * torch.complex(*found["correction.layer_9"].split(3)))
+    assert source.angle().abs().mean() > 0.03 and (low - carried).abs().mean() > 5e-3
+    assert found["surface.offsets_2"].abs().max() > 1.5
+
+
 def test_layered_vectors_are_computed_in_double_precision() -> None:
-    network = narrow_network(NARROW["layered-narrow"], 3)
+    network = narrow_network(NARROW["layered-narrow"].config, 3)
     amplitude, depth = scene(32, 48, 3)
     double = vectors(network.double(), amplitude, depth, 2.7)
     single = network.float()(amplitude[None], depth[None], torch.tensor([2.7]))[0]
@@ -82,11 +95,16 @@ def test_layered_vectors_are_computed_in_double_precision() -> None:
 
 
 def test_shipped_layered_weights_have_files_named_for_them(tmp_path: Path) -> None:
-    """The first, the adjustable and the last layer of both nets, and every other stage."""
+    """The first, the adjustable and the last layer of both nets, and every other stage. What another family left in
+    their place goes, and nothing else."""
     layered = tmp_path / "layered.safetensors"
-    save_weights(layered, narrow_network(NARROW["layered-narrow"], 3), {}, {})
+    save_weights(layered, narrow_network(NARROW["layered-narrow"].config, 3), {}, {})
+    stale, other = (tmp_path / "out" / f"direct-shipped{suffix}.safetensors" for suffix in ("-small", ""))
+    for path in (stale, other):
+        write_beside(path, b"")
     files = write_golden(tmp_path / "out", None, layered)
     assert files[-1] == tmp_path / "out" / "layered-shipped-small.safetensors"
+    assert other.exists() and not stale.exists()
     written = load_file(files[-1]).keys()
     assert written >= {"source", "carried", "surface.encoded", "correction.encoded", "surface.offsets_2", "low"}
     layers = {net: [name for name in sorted(written) if name.startswith(f"{net}.layer_")] for net in NETS}

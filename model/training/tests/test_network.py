@@ -107,7 +107,7 @@ def test_config_round_trip_and_errors() -> None:
         NetworkConfig.from_json(config.to_json().replace('"layers"', '"depht": 1, "layers"'))
     with pytest.raises(ConfigError, match="keys missing: grid"):
         NetworkConfig.from_json(config.to_json().replace('"grid": "half-band", ', ""))
-    with pytest.raises(ConfigError, match="adjustable_layers: found 13"):
+    with pytest.raises(ConfigError, match=r"adjustable_layers: found \(13,\)"):
         NetworkConfig(adjustable_layers=(13,))
     with pytest.raises(ConfigError, match="not JSON"):
         NetworkConfig.from_json("{")

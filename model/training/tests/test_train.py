@@ -108,6 +108,37 @@ def test_resume_is_bit_exact(shards: Path, tmp_path: Path) -> None:
     assert not torch.equal(other["layers.0.weight"], whole["layers.0.weight"])
 
 
+def test_a_checkpoint_of_another_network_or_of_another_loss_is_refused(shards: Path, tmp_path: Path) -> None:
+    """Before there was a choice of optimizers, the weight of what is in focus did not grow with the pupil."""
+    run = Run(tiny(shards, tmp_path / "run", optimizer="adam"), CPU)
+    run.train_step()
+    state = run.state()
+
+    def resumed(in_focus: float | None, older: bool, **changes: object) -> Run:
+        stored = json.loads(state["config"])
+        stored["loss"]["in_focus"] = in_focus
+        if in_focus is None:
+            del stored["loss"]["in_focus"]
+        if older:
+            del stored["optimizer"]
+        again = Run(tiny(shards, tmp_path / "run", optimizer="adam", **changes), CPU)
+        try:
+            again.load_state({**state, "config": json.dumps(stored)})
+        except TrainingError:
+            assert again.step == 0
+            raise
+        return again
+
+    for in_focus, older in ((20.0, False), (0.0, True), (None, True)):
+        assert resumed(in_focus, older, loss=LossWeights(in_focus=30.0)).step == 1
+    for loss in (LossWeights(), LossWeights(in_focus=20.0)):
+        with pytest.raises(TrainingError, match=r"loss\.in_focus: found 20\.0 in a checkpoint .* --initial-weights"):
+            resumed(20.0, True, loss=loss)
+    for changes in ({"layers": 6}, {"channels": 6}):
+        with pytest.raises(TrainingError, match="of a network with other layers than this run's"):
+            resumed(0.0, False, network=dataclasses.replace(TINY, **changes))
+
+
 @pytest.mark.parametrize(
     "network",
     [

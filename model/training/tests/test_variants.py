@@ -1,5 +1,6 @@
 import dataclasses
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from holod_training.rivals import layered_asm
 from holod_training.shards import Stack
 from holod_training.variants import VARIANTS, build_network, network_amplitude, variant
 
-SHIPPED = Path(__file__).parents[2] / "weights" / "direct-halfband-14.safetensors"
+SHIPPED = Path(__file__).parents[2] / "weights" / "standard.safetensors"
 SIZE = 16
 PUPIL_BLIND = {"ablation-no-pupil"}
 
@@ -70,8 +71,6 @@ def test_configs_that_do_not_fit_say_which_key() -> None:
         ({"dilations": (1, 2)}, "dilations: found .* expected none, or 14 numbers"),
         ({"dilations": (2,) * 14}, "dilations: .* expected 1 at the adjustable layers"),
         ({"conditioning": "some"}, "conditioning: found 'some'"),
-        ({"correction_layers": 5}, "correction_layers: found 5, expected an even number of at least 4"),
-        ({"correction_layers": 2}, "correction_layers: found 2"),
         ({"correction_dilations": (1, 2)}, r"correction_dilations: found \(1, 2\), expected none, or 10 numbers"),
         ({"correction_dilations": (0,) * 10}, "correction_dilations: .* of at least 1"),
         ({"architecture": "layered", "pupil_inputs": False}, "pupil_inputs: found False, expected true"),
@@ -80,6 +79,33 @@ def test_configs_that_do_not_fit_say_which_key() -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             NetworkConfig(**changes)
+
+
+@pytest.mark.parametrize(
+    ("key", "good", "bad", "expected"),
+    [
+        ("layers", (4, 64), (2, 9, 66), "an even number from 4 to 64"),
+        ("correction_layers", (4, 64), (2, 5, 66), "an even number from 4 to 64"),
+        ("channels", (1, 256), (0, 257), "1 to 256"),
+        ("depth_layers", (2, 64), (1, 65), "2 to 64"),
+        ("modulation_hidden", (1, 1024), (0, 1025), "1 to 1024"),
+        (
+            "adjustable_layers",
+            ((), (1, 2, 12)),
+            ((0,), (13,), (7, 3), (5, 5)),
+            "layers of the body, 1 to 12, in rising",
+        ),
+    ],
+)
+def test_no_network_is_larger_than_the_engines_take(
+    key: str, good: tuple[object, ...], bad: tuple[object, ...], expected: str
+) -> None:
+    others = {"adjustable_layers": ()} if key == "layers" else {}
+    for value in good:
+        assert getattr(NetworkConfig(**{key: value}, **others), key) == value
+    for value in bad:
+        with pytest.raises(ConfigError, match=re.escape(f"{key}: found {value!r}, expected {expected}")):
+            NetworkConfig(**{key: value}, **others)
 
 
 def test_files_of_known_networks_are_unchanged_and_new_keys_appear_where_they_differ() -> None:

@@ -4,13 +4,13 @@ use holod_calibration::{Colour, Metres, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
+use super::blocks::{Blocks, scale_of};
+use super::layered::BLOCK;
 use crate::RgbdFrame;
 use crate::optics::{TransposedFft2d, transfer_table};
-use crate::weights::NetworkConfig;
+use crate::weights::{Grid, NetworkConfig};
 
-/// Panel pixels to a sample of the half-band grid, each way.
-const SCALE: usize = 2;
-const BLOCK: usize = SCALE * SCALE;
+const SCALE: usize = scale_of(Grid::HalfBand);
 
 /// f ← f·(1 − m) + O·m from far to near, by ASM between layers and at last back to the SLM plane; m is the share of a
 /// block whose pixels lie in a layer or its next nearer one, so that slanted surfaces show no seams.
@@ -31,8 +31,8 @@ impl DepthLayers {
     pub(super) fn new(config: &NetworkConfig, size: Resolution) -> Self {
         let optics = config.optics.geometry(size);
         let pitch = Metres(SCALE as f64 * optics.pixel_pitch.0);
-        let near_to_far_m = optics.image_distance(optics.depth_near).0 - optics.image_distance(optics.depth_far).0;
-        let layer_m = near_to_far_m / config.depth_layers as f64;
+        let volume_m = optics.image_distance(optics.depth_near).0 - optics.image_distance(optics.depth_far).0;
+        let layer_m = volume_m / config.depth_layers as f64;
         let nearest_m = optics.image_distance(optics.depth_near).0 - layer_m / 2.0;
         let table = |colour, u_m| transfer_table(optics.wavelengths[colour], pitch, size, Metres(u_m));
         Self {
@@ -46,16 +46,14 @@ impl DepthLayers {
         }
     }
 
-    /// Takes the depths of `frame`; one of odd size repeats its edge.
+    /// Takes the depths of `frame`.
     pub(super) fn place(&mut self, frame: &RgbdFrame) {
-        let (Resolution { width, height }, columns) = (frame.resolution, self.size.width);
-        let count = self.count;
+        let blocks = Blocks { frame: frame.resolution, scale: SCALE };
+        let (columns, count) = (self.size.width, self.count);
         self.layer_of.par_chunks_exact_mut(columns).enumerate().for_each(|(y, row)| {
             for (x, block) in row.iter_mut().enumerate() {
                 for (corner, layer) in block.iter_mut().enumerate() {
-                    let source_y = (SCALE * y + corner / SCALE).min(height - 1);
-                    let source_x = (SCALE * x + corner % SCALE).min(width - 1);
-                    let depth = frame.depth_normalised[source_y * width + source_x];
+                    let depth = frame.depth_normalised[blocks.index(x, y, corner)];
                     // A cast of what lies outside saturates.
                     *layer = ((depth * f32::from(count)) as u8).min(count - 1);
                 }

@@ -1,14 +1,15 @@
 //! The `direct` family: the field at the SLM plane as a residual to the amplitude.
 
-use holod_calibration::{Colour, Resolution};
+use holod_calibration::Colour;
 use num_complex::Complex32;
 use rayon::prelude::*;
 
+use super::blocks::{Blocks, scale_of};
 use super::simd::InstructionSet;
 use super::trunk::Trunk;
 use crate::RgbdFrame;
 use crate::engine::Stage;
-use crate::weights::{Grid, Layer, NetworkConfig};
+use crate::weights::{Layer, NetworkConfig};
 
 /// Nothing is allocated after `new`.
 pub(super) struct Direct {
@@ -27,7 +28,7 @@ impl Direct {
         set: InstructionSet,
     ) -> Self {
         Self {
-            scale: if config.grid == Grid::HalfBand { 2 } else { 1 },
+            scale: scale_of(config.grid),
             trunk: Trunk::new(layers, config.leaky_slope, (width, height), set),
             base: vec![0.0; 3 * width * height],
         }
@@ -47,17 +48,13 @@ impl Direct {
     /// Writes the first layer's input, and the amplitude to which the last layer's output is a residual.
     fn encode(&mut self, frame: &RgbdFrame, pupil_mm: f32) {
         let Self { scale, trunk, base } = self;
-        let scale = *scale;
-        let (Resolution { width, height }, pixels) = (frame.resolution, frame.resolution.pixels());
-        let block = scale * scale;
+        let (pixels, block) = (frame.resolution.pixels(), *scale * *scale);
+        let blocks = Blocks { frame: frame.resolution, scale: *scale };
         let (map_width, stride) = (trunk.input.width, trunk.input.stride);
         trunk.input.rows_mut().enumerate().for_each(|(y, row)| {
             for (x, channels) in row[stride..][..map_width * stride].chunks_exact_mut(stride).enumerate() {
-                // torch's pixel_unshuffle order: channel, then dy, then dx. A frame of odd size repeats its edge.
                 for corner in 0..block {
-                    let source_y = (scale * y + corner / scale).min(height - 1);
-                    let source_x = (scale * x + corner % scale).min(width - 1);
-                    let source = source_y * width + source_x;
+                    let source = blocks.index(x, y, corner);
                     for colour in 0..3 {
                         channels[colour * block + corner] = frame.amplitude[colour * pixels + source];
                     }

@@ -7,17 +7,18 @@ use holod_calibration::{Colour, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
+use super::blocks::{Blocks, scale_of};
 use super::depth_layers::DepthLayers;
 use super::simd::InstructionSet;
 use super::trunk::Trunk;
 use crate::RgbdFrame;
 use crate::engine::Stage;
 use crate::optics::{TransposedFft2d, signed_bin};
-use crate::weights::{LAYERED_BLURS, Layer, NetworkConfig};
+use crate::weights::{Grid, LAYERED_BLURS, Layer, NetworkConfig};
 
-/// Panel pixels to a sample of the grid, each way.
-const SCALE: usize = 2;
-const BLOCK: usize = SCALE * SCALE;
+const SCALE: usize = scale_of(Grid::HalfBand);
+/// Panel pixels to a sample of the grid.
+pub(super) const BLOCK: usize = SCALE * SCALE;
 /// Amplitude, two depth maps, each four times, and the pupil.
 const MAPS: usize = 5 * BLOCK + 1;
 /// Standard deviations of the blurs, panel pixels.
@@ -74,7 +75,7 @@ impl Layered {
     }
 
     pub(super) fn stages(&self) -> Vec<Stage> {
-        std::iter::once(Stage::plain("encode"))
+        std::iter::once(Stage::plain("encode, blur"))
             .chain(self.surface.stages("surface "))
             .chain([Stage::plain("surface light"), Stage::plain("depth layers")])
             .chain(self.correction.stages("correction "))
@@ -94,7 +95,7 @@ impl Layered {
 
     /// Writes the maps that both nets see, the means and their blurs.
     fn encode(&mut self, frame: &RgbdFrame, pupil_mm: f32) {
-        let Resolution { width, height } = frame.resolution;
+        let blocks = Blocks { frame: frame.resolution, scale: SCALE };
         let (columns, pixels) = (self.size.width, frame.resolution.pixels());
         let pupil = (pupil_mm - 2.5) / 2.0;
         for (map, first) in [(&mut self.surface.input, 0), (&mut self.correction.input, 6)] {
@@ -102,11 +103,8 @@ impl Layered {
             map.rows_mut().enumerate().for_each(|(y, row)| {
                 for (x, channels) in row[stride..][..columns * stride].chunks_exact_mut(stride).enumerate() {
                     let maps = &mut channels[first..][..MAPS];
-                    // torch's pixel_unshuffle order: channel, then dy, then dx. A frame of odd size repeats its edge.
                     for corner in 0..BLOCK {
-                        let source_y = (SCALE * y + corner / SCALE).min(height - 1);
-                        let source_x = (SCALE * x + corner % SCALE).min(width - 1);
-                        let source = source_y * width + source_x;
+                        let source = blocks.index(x, y, corner);
                         for colour in 0..3 {
                             maps[colour * BLOCK + corner] = frame.amplitude[colour * pixels + source] - 0.4;
                         }

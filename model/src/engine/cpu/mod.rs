@@ -1,5 +1,6 @@
 //! The network on the CPU: channels-last maps, rayon over rows, SIMD chosen at run time.
 
+mod blocks;
 mod conv;
 mod depth_layers;
 mod direct;

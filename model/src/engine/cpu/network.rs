@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use holod_calibration::{Colour, PupilDiameter, Resolution};
 use num_complex::Complex32;
 
+use super::blocks::scale_of;
 use super::direct::Direct;
 use super::layered::Layered;
 use super::simd::InstructionSet;
@@ -58,10 +59,7 @@ impl Predictor {
 impl Network {
     pub(super) fn new(weights: &Weights, resolution: Resolution, set: InstructionSet) -> Self {
         let config = &weights.config;
-        let scale = match config.grid {
-            Grid::HalfBand => 2,
-            Grid::Full => 1,
-        };
+        let scale = scale_of(config.grid);
         let size @ (width, height) = (resolution.width.div_ceil(scale), resolution.height.div_ceil(scale));
         let padded = Resolution { width: scale * width, height: scale * height };
         let predictor = match &weights.family {

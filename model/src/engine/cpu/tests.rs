@@ -23,7 +23,14 @@ fn frame(resolution: Resolution, seed: u32) -> RgbdFrame {
     RgbdFrame {
         resolution,
         amplitude: (0..3 * resolution.pixels()).map(|index| noise(index) as f32).collect(),
-        depth_normalised: (0..resolution.pixels()).map(|index| noise(index + 77_777) as f32).collect(),
+        // A little is outside 0 to 1, and both ends are met exactly.
+        depth_normalised: (0..resolution.pixels())
+            .map(|index| match index % 7 {
+                3 => 1.0,
+                5 => 0.0,
+                _ => (1.2 * noise(index + 77_777) - 0.1) as f32,
+            })
+            .collect(),
     }
 }
 
@@ -143,10 +150,13 @@ proptest! {
 
 #[test]
 fn one_pixel_one_column_and_one_row_match_the_reference() {
-    let weights = random_weights(config(Grid::HalfBand, 6, 12, vec![3, 4]), 5);
+    let direct = random_weights(config(Grid::HalfBand, 6, 12, vec![3, 4]), 5);
+    let layered = random_weights(weights_tests::layered_config(), 5);
     for (width, height) in [(1, 1), (1, 33), (57, 1), (2, 2), (101, 5)] {
-        for set in InstructionSet::available() {
-            check_all_stages(&weights, Resolution { width, height }, 3.3, 9, set);
+        for weights in [&direct, &layered] {
+            for set in InstructionSet::available() {
+                check_all_stages(weights, Resolution { width, height }, 3.3, 9, set);
+            }
         }
     }
 }

@@ -16,7 +16,7 @@ pub(super) struct Trunk {
 }
 
 impl Trunk {
-    /// For maps of `width` by `height`. Panics without at least two layers: weights are checked when they are read.
+    /// For maps of `width` by `height`, of at least two layers: weights are checked when they are read.
     pub(super) fn new(
         layers: &[Layer],
         leaky_slope: f32,
