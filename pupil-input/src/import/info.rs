@@ -358,7 +358,11 @@ impl BlinkFinder {
             eye,
             has_sign,
             silence_ns: SILENCE_NS.max((GAP_INTERVALS * usual_s * 1e9) as i64),
-            shortest_shut_ns: if usual_ns > SLOW_NS { SHORTEST_NS.min(usual_ns * 3 / 2) } else { SHORTEST_NS },
+            shortest_shut_ns: if usual_ns > SLOW_NS {
+                SHORTEST_NS.min(usual_ns.saturating_mul(3) / 2)
+            } else {
+                SHORTEST_NS
+            },
             average: None,
             latest_ns: None,
             latest_good_ns: None,
@@ -425,7 +429,7 @@ impl BlinkFinder {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::import::{LogBuilder, LogFormat, LogSample};
+    use crate::import::{GREATEST_NS, LogBuilder, LogFormat, LogSample};
 
     /// 20 s at 200 Hz of 4 units; `at` makes of the time in milliseconds diameter, confidence, aperture and validity.
     fn info(at: impl Fn(i64) -> (f32, f32, Option<f32>, bool)) -> LogInfo {
@@ -457,6 +461,23 @@ mod tests {
         assert_eq!(lost(&[(1000, 100), (3000, 100), (3175, 100)]), (Some(2), Some(0)));
         assert_eq!(lost(&[(0, 100), (19_900, 100)]), (Some(2), Some(0)));
         assert_eq!(lost(&[(0, 10_100)]), (None, None));
+    }
+
+    #[test]
+    fn a_log_of_two_samples_as_far_apart_as_a_log_can_hold_has_its_summary() {
+        let mut log = LogBuilder::default();
+        for t in [-(GREATEST_NS as i64), GREATEST_NS as i64] {
+            let (eye, t) = (SampleEye::Left, TimeNs(t));
+            log.push(LogSample { t, eye, diameter: 4.0, confidence: 0.2, aperture_mm: None, valid: true }, 1);
+        }
+        let info = LogInfo::of(&log.finish(LogFormat::Lines, std::path::Path::new("x")).expect("a recording"), None);
+        assert_eq!((info.eyes[0].unsure, info.eyes[0].blinks_found), (2, None));
+        let hz = 1e9 / (2 * GREATEST_NS) as f64;
+        assert!(
+            info.eyes[0].rate_hz.is_some_and(|rate_hz| (rate_hz / hz - 1.0).abs() < 1e-6),
+            "{:?}",
+            info.eyes[0].rate_hz
+        );
     }
 
     #[test]
