@@ -3,10 +3,11 @@
 //! The data's way: [`scene`] loads a frame, [`engine`] runs the pupil-adaptive network of [`weights`] on it and gives a
 //! [`ComplexHologram`], [`optics::DoublePhase`] turns that into a [`PhasePattern`], and [`optics::SimulatedEye`] shows
 //! what an eye sees of it. [`metrics`] and [`refocus`] judge pictures against those of [`scene_shard`], and [`files`] keeps
-//! holograms and pictures on disk.
+//! holograms and pictures on disk. [`scene_renderer`] makes scenes, on the processor or by [`gpu`].
 
 pub mod engine;
 pub mod files;
+pub mod gpu;
 pub mod metrics;
 pub mod optics;
 mod picture;

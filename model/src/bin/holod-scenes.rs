@@ -8,8 +8,9 @@ use std::time::Instant;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::Resolution;
+use holod_model::gpu::GpuError;
 use holod_model::scene_renderer::shard::{Outcome, Preview, PupilPlan, ShardError, ShardPlan};
-use holod_model::scene_renderer::{Scene, SceneKind};
+use holod_model::scene_renderer::{Scene, SceneKind, Tracer};
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// Random scenes and their thin-lens focal stacks.
@@ -26,10 +27,10 @@ enum Command {
     Generate(Generate),
     /// Put scenes of a folder on one picture: all in focus, depth, and the widest pupil focused far and near.
     Sheet(Sheet),
-    /// Measure how many aperture rays are traced in a second.
+    /// Measure how many aperture rays are traced in a second, by the processor and, where there is one, by a GPU.
     Bench(Bench),
     /// Measure the noise of the thin-lens images, in and out of focus, for each pupil.
-    Noise(Bench),
+    Noise(Measure),
 }
 
 #[derive(Args)]
@@ -48,6 +49,29 @@ struct Generate {
     first: u64,
     #[command(flatten)]
     look: Look,
+    /// What traces the rays; scenes agree to rounding.
+    #[arg(long, value_enum, default_value_t = Backend::Auto)]
+    backend: Backend,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Backend {
+    /// A graphics processor where there is one.
+    Auto,
+    /// The processor's cores.
+    Cpu,
+    /// Vulkan's best device.
+    Gpu,
+}
+
+impl Backend {
+    fn open(self) -> Result<Tracer, GpuError> {
+        match self {
+            Self::Auto => Ok(Tracer::fastest()),
+            Self::Cpu => Ok(Tracer::Cpu),
+            Self::Gpu => Tracer::gpu(),
+        }
+    }
 }
 
 /// What the scenes are like.
@@ -115,6 +139,15 @@ struct Sheet {
 
 #[derive(Args)]
 struct Bench {
+    #[command(flatten)]
+    measure: Measure,
+    /// What is measured beside the processor.
+    #[arg(long, value_enum, default_value_t = Backend::Auto)]
+    backend: Backend,
+}
+
+#[derive(Args)]
+struct Measure {
     /// Scenes to render.
     #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
     scenes: u64,
@@ -150,6 +183,7 @@ mod exit {
     pub(super) const USAGE: u8 = 64;
     pub(super) const DATA: u8 = 65;
     pub(super) const NO_INPUT: u8 = 66;
+    pub(super) const UNAVAILABLE: u8 = 69;
     pub(super) const CANNOT_CREATE: u8 = 73;
     pub(super) const IO: u8 = 74;
 }
@@ -166,8 +200,15 @@ impl From<ShardError> for Failure {
             ShardError::Read { .. } => exit::NO_INPUT,
             ShardError::Write { .. } => exit::IO,
             ShardError::Malformed { .. } => exit::DATA,
+            ShardError::Gpu(_) => exit::UNAVAILABLE,
         };
         Self { code, message: error.to_string() }
+    }
+}
+
+impl From<GpuError> for Failure {
+    fn from(error: GpuError) -> Self {
+        ShardError::Gpu(error).into()
     }
 }
 
@@ -203,45 +244,71 @@ fn generate(options: &Generate) -> Result<String, Failure> {
     let style =
         ProgressStyle::with_template("{bar:40} {pos}/{len} scenes, {eta} left").expect("the template is constant");
     let bar = ProgressBar::new(options.count).with_style(style);
+    let tracer = options.backend.open()?;
     let (mut written, mut present) = (0, 0);
     for index in options.first..options.first + options.count {
-        match plan.write(&options.out, index)? {
+        match plan.write(&options.out, index, &tracer)? {
             Outcome::Written { .. } => written += 1,
             Outcome::Present => present += 1,
         }
         bar.inc(1);
     }
     bar.finish_and_clear();
-    Ok(format!("{written} scenes written to {}, {present} were there already", options.out.display()))
+    let by = if written == 0 { String::new() } else { format!(", traced by {}", tracer.name()) };
+    Ok(format!("{written} scenes written to {}, {present} were there already{by}", options.out.display()))
 }
 
 fn bench(options: &Bench) -> Result<String, Failure> {
-    let plan = options.look.plan(1);
-    let mut rays = 0;
-    let (mut composing_s, mut tracing_s) = (0.0, 0.0);
-    for index in 0..options.scenes {
+    let Measure { scenes, look } = &options.measure;
+    let plan = look.plan(1);
+    let mut tracers = vec![Tracer::Cpu];
+    tracers.extend(Some(options.backend.open()?).filter(|tracer| !matches!(tracer, Tracer::Cpu)));
+    let mut composing_s = Vec::new();
+    let (mut tracing_s, mut rates) = (vec![Vec::new(); tracers.len()], vec![Vec::new(); tracers.len()]);
+    for index in 0..*scenes {
         let begin = Instant::now();
         let scene = Scene::random(plan.kind, plan.seed, index, plan.resolution);
-        let composed = Instant::now();
+        composing_s.push(begin.elapsed().as_secs_f64());
         let pupils = plan.pupils.pupils(plan.kind, plan.seed, index);
-        rays += scene.traced_focal_stacks(&pupils, &plan.focus(), plan.rays).1;
-        composing_s += (composed - begin).as_secs_f64();
-        tracing_s += composed.elapsed().as_secs_f64();
+        for (tracer, (tracing_s, rates)) in tracers.iter().zip(tracing_s.iter_mut().zip(&mut rates)) {
+            let begin = Instant::now();
+            let (_, rays) = scene.traced_focal_stacks(tracer, &pupils, &plan.focus(), plan.rays)?;
+            let seconds = begin.elapsed().as_secs_f64();
+            tracing_s.push(seconds);
+            rates.push(rays as f64 * 1e-6 / seconds);
+        }
     }
     let threads = rayon::current_num_threads();
-    let rate = rays as f64 / tracing_s / threads as f64;
-    Ok(format!(
-        "{:.2} million aperture rays/s on each of {threads} threads, each ray serving {} planes; a scene takes {:.2} s to compose and {:.2} s to trace ({:.1} million rays)",
-        rate * 1e-6,
+    let mut report = format!(
+        "{scenes} scenes of {}, {} planes; medians\n{:>8.2} s to compose a scene",
+        plan.resolution,
         plan.planes,
-        composing_s / options.scenes as f64,
-        tracing_s / options.scenes as f64,
-        rays as f64 * 1e-6 / options.scenes as f64,
-    ))
+        median(&mut composing_s)
+    );
+    let of_cpu = median(&mut rates[0].clone());
+    for (tracer, (tracing_s, rates)) in tracers.iter().zip(tracing_s.iter_mut().zip(&mut rates)) {
+        let rate = median(rates);
+        report += &format!(
+            "\n{:>8.2} s to trace it by {}: {rate:.2} million aperture rays/s",
+            median(tracing_s),
+            tracer.name()
+        );
+        report += &if matches!(tracer, Tracer::Cpu) {
+            format!(", {:.2} on each of {threads} threads", rate / threads as f64)
+        } else {
+            format!(", {:.2} times the cpu's", rate / of_cpu)
+        };
+    }
+    Ok(report)
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
 }
 
 /// Noise is averaged as power over the scenes.
-fn noise(options: &Bench) -> Result<String, Failure> {
+fn noise(options: &Measure) -> Result<String, Failure> {
     let plan = options.look.plan(1);
     let power = |db: f64| 10f64.powf(0.1 * db);
     let mut sums: Vec<(f32, [(f64, u32); 3])> = Vec::new();

@@ -8,6 +8,8 @@ mod compose;
 mod demo;
 mod families;
 mod glyphs;
+#[cfg(feature = "gpu")]
+mod gpu;
 mod meshes;
 mod noise;
 mod points;
@@ -20,6 +22,7 @@ mod surface;
 mod tests;
 mod texture;
 mod thin_lens;
+mod tracer;
 mod view;
 
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
@@ -27,6 +30,9 @@ use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 pub use noise::Noise;
 use surface::Surface;
 use thin_lens::PixelSamples;
+pub use tracer::Tracer;
+
+use crate::gpu::GpuError;
 
 /// What a random scene is for. The kinds never share a scene: each has a seed space of its own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -125,31 +131,26 @@ impl Scene {
     /// [`focal_stack`](Self::focal_stack) for several pupils at less than the cost of each alone: the rays of narrower
     /// pupils serve the wider ones too.
     pub fn focal_stacks(&self, pupils: &[PupilDiameter], focus: &[Dioptres], rays: usize) -> Vec<Vec<f32>> {
-        self.traced_focal_stacks(pupils, focus, rays).0
+        let (stacks, _) =
+            self.traced_focal_stacks(&Tracer::Cpu, pupils, focus, rays).expect("the processor has no errors");
+        stacks
     }
 
-    /// [`focal_stacks`](Self::focal_stacks), and the number of rays traced for them.
+    /// [`focal_stacks`](Self::focal_stacks) by a tracer, and the number of rays traced for them.
+    ///
+    /// # Errors
+    /// The graphics processor fails, or has no room for the scene.
     pub fn traced_focal_stacks(
         &self,
+        tracer: &Tracer,
         pupils: &[PupilDiameter],
         focus: &[Dioptres],
         rays: usize,
-    ) -> (Vec<Vec<f32>>, u64) {
+    ) -> Result<(Vec<Vec<f32>>, u64), GpuError> {
         let mut stacks = vec![Vec::new(); pupils.len()];
-        let traced = self.trace_stacks(pupils, focus, rays, |pupil, sums, share| {
+        let traced = tracer.trace(self, pupils, focus, rays, |pupil, sums, share| {
             stacks[pupil] = sums.iter().map(|sum| sum * share).collect();
-        });
-        (stacks, traced)
-    }
-
-    /// The stacks one by one, as [`thin_lens::focal_stacks`] hands them out.
-    fn trace_stacks(
-        &self,
-        pupils: &[PupilDiameter],
-        focus: &[Dioptres],
-        rays: usize,
-        finish: impl FnMut(usize, &[f32], f32),
-    ) -> u64 {
-        thin_lens::focal_stacks(&self.surfaces, self.resolution, pupils, focus, rays, self.ray_key, finish)
+        })?;
+        Ok((stacks, traced))
     }
 }

@@ -19,7 +19,8 @@ use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 use safetensors::tensor::{Dtype, Metadata, SafeTensorError, TensorView};
 
 use super::random::{Random, mix};
-use super::{Scene, SceneKind};
+use super::{Scene, SceneKind, Tracer};
+use crate::gpu::GpuError;
 
 /// The `format` that a shard's metadata names.
 pub const FORMAT: &str = "holod-scene-1";
@@ -150,6 +151,9 @@ pub enum ShardError {
         /// What is wrong with it.
         reason: String,
     },
+    /// The graphics processor could not render the scene.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
 }
 
 /// What became of one scene.
@@ -199,7 +203,7 @@ impl ShardPlan {
 
     /// Renders scene `index` into `folder`, unless its complete file is there already. The file appears whole or not
     /// at all.
-    pub fn write(&self, folder: &Path, index: u64) -> Result<Outcome, ShardError> {
+    pub fn write(&self, folder: &Path, index: u64, tracer: &Tracer) -> Result<Outcome, ShardError> {
         let path = folder.join(file_name(index));
         if self.is_present(&path, index)? {
             return Ok(Outcome::Present);
@@ -210,9 +214,9 @@ impl ShardPlan {
         let picture = scene.picture();
         let pupils = self.pupils.pupils(self.kind, self.seed, index);
         let mut stacks = vec![Vec::new(); pupils.len()];
-        let rays_traced = scene.trace_stacks(&pupils, &self.focus(), self.rays, |pupil, sums, share| {
+        let rays_traced = tracer.trace(&scene, &pupils, &self.focus(), self.rays, |pupil, sums, share| {
             stacks[pupil] = half_bytes(sums.iter().map(|sum| sum * share));
-        });
+        })?;
 
         let Resolution { width, height } = self.resolution;
         let depth: Vec<u8> = picture.depth.iter().flat_map(|value| value.to_le_bytes()).collect();

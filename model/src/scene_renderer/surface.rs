@@ -93,9 +93,10 @@ pub(super) struct Surface {
     /// Nearest and farthest depth within the outline.
     pub(super) depth_near: f32,
     pub(super) depth_far: f32,
-    columns: i32,
-    rows: i32,
-    texels: Vec<[f32; 4]>,
+    pub(super) columns: i32,
+    pub(super) rows: i32,
+    /// [rows, columns] of red, green, blue and the painted share.
+    pub(super) texels: Vec<[f32; 4]>,
 }
 
 impl Surface {

@@ -1,0 +1,214 @@
+//! One device with its queue. Faults that the driver tells late, between calls, are kept and given by the next call that
+//! can fail, so none is lost and none panics.
+
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use super::GpuError;
+
+/// Which devices will do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Adapters {
+    /// Graphics processors.
+    Hardware,
+    /// Those, or else a processor that plays one: right, and slow.
+    Any,
+}
+
+/// A device and its queue. Clones are the same device.
+#[derive(Clone)]
+pub struct Gpu {
+    pub(crate) device: wgpu::Device,
+    pub(crate) queue: wgpu::Queue,
+    name: String,
+    fault: Arc<OnceLock<String>>,
+}
+
+/// The longest that any piece of work may take before the device counts as hung.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+impl Gpu {
+    /// Opens the best device: a card of its own before one that is a part of the processor.
+    ///
+    /// # Errors
+    /// There is none, or its driver refuses.
+    pub fn open(adapters: Adapters) -> Result<Self, GpuError> {
+        let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
+            backends: wgpu::Backends::VULKAN,
+            ..wgpu::InstanceDescriptor::new_without_display_handle()
+        });
+        let rank = |adapter: &wgpu::Adapter| match adapter.get_info().device_type {
+            wgpu::DeviceType::DiscreteGpu => 0,
+            wgpu::DeviceType::IntegratedGpu => 1,
+            wgpu::DeviceType::VirtualGpu | wgpu::DeviceType::Other => 2,
+            wgpu::DeviceType::Cpu => 3,
+        };
+        let mut found = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::VULKAN));
+        found.sort_by_key(rank);
+        let usable = |adapter: &&wgpu::Adapter| adapters == Adapters::Any || rank(adapter) < 3;
+        let Some(adapter) = found.iter().find(usable) else {
+            return Err(GpuError::None { passed_over: found.iter().map(|adapter| adapter.get_info().name).collect() });
+        };
+        let name = adapter.get_info().name;
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("holod"),
+            required_limits: adapter.limits(),
+            memory_hints: wgpu::MemoryHints::Performance,
+            ..wgpu::DeviceDescriptor::default()
+        };
+        let (device, queue) = pollster::block_on(adapter.request_device(&descriptor))
+            .map_err(|error| GpuError::Refused { name: name.clone(), reason: error.to_string() })?;
+        let fault = Arc::new(OnceLock::new());
+        let kept = fault.clone();
+        // Only the first is kept: the others follow from it.
+        device.on_uncaptured_error(Arc::new(move |error| drop(kept.set(error.to_string()))));
+        let kept = fault.clone();
+        device.set_device_lost_callback(move |reason, text| {
+            if reason != wgpu::DeviceLostReason::Destroyed {
+                drop(kept.set(format!("it was lost ({text})")));
+            }
+        });
+        Ok(Self { device, queue, name, fault })
+    }
+
+    /// The device's name, as its driver has it.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The first fault that there was, if there was one.
+    pub(crate) fn check(&self) -> Result<(), GpuError> {
+        self.fault.get().map_or(Ok(()), |reason| Err(self.failed(reason)))
+    }
+
+    fn failed(&self, reason: impl ToString) -> GpuError {
+        GpuError::Failed { name: self.name.clone(), reason: reason.to_string() }
+    }
+
+    /// The most bytes that a shader can see as one buffer.
+    pub(crate) fn largest_buffer(&self) -> u64 {
+        let limits = self.device.limits();
+        limits.max_storage_buffer_binding_size.min(limits.max_buffer_size)
+    }
+
+    /// A buffer of zeros for a shader.
+    pub(crate) fn buffer(
+        &self,
+        what: &'static str,
+        bytes: u64,
+        usage: wgpu::BufferUsages,
+    ) -> Result<wgpu::Buffer, GpuError> {
+        let limit = self.largest_buffer();
+        if bytes > limit {
+            return Err(GpuError::TooLarge { what, bytes, name: self.name.clone(), limit });
+        }
+        let descriptor = wgpu::BufferDescriptor { label: Some(what), size: bytes, usage, mapped_at_creation: false };
+        let buffer = self.device.create_buffer(&descriptor);
+        self.check()?;
+        Ok(buffer)
+    }
+
+    /// A buffer for a shader that holds `values`, or one zero where there are none: an empty one cannot be bound.
+    pub(crate) fn upload<T: bytemuck::NoUninit>(
+        &self,
+        what: &'static str,
+        values: &[T],
+    ) -> Result<wgpu::Buffer, GpuError> {
+        let bytes: &[u8] = bytemuck::cast_slice(values);
+        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST;
+        let buffer = self.buffer(what, bytes.len().max(size_of::<T>()) as u64, usage)?;
+        if !bytes.is_empty() {
+            self.queue.write_buffer(&buffer, 0, bytes);
+        }
+        Ok(buffer)
+    }
+
+    /// A shader's only entry point, with the bindings that it names.
+    pub(crate) fn pipeline(&self, label: &str, wgsl: &str) -> Result<wgpu::ComputePipeline, GpuError> {
+        let source = wgpu::ShaderSource::Wgsl(wgsl.into());
+        let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(label), source });
+        let pipeline = self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(label),
+            layout: None,
+            module: &module,
+            entry_point: None,
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            cache: None,
+        });
+        self.check()?;
+        Ok(pipeline)
+    }
+
+    /// The buffers as a pipeline's bindings 0, 1, …
+    pub(crate) fn bind(&self, pipeline: &wgpu::ComputePipeline, buffers: &[&wgpu::Buffer]) -> wgpu::BindGroup {
+        let entries: Vec<_> = (0..)
+            .zip(buffers)
+            .map(|(binding, buffer)| wgpu::BindGroupEntry { binding, resource: buffer.as_entire_binding() })
+            .collect();
+        let layout = pipeline.get_bind_group_layout(0);
+        self.device.create_bind_group(&wgpu::BindGroupDescriptor { label: None, layout: &layout, entries: &entries })
+    }
+
+    /// Waits until the work of `submission`, and all before it, is done.
+    pub(crate) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), GpuError> {
+        let until = wgpu::PollType::Wait { submission_index: Some(submission), timeout: Some(PATIENCE) };
+        self.device.poll(until).map_err(|error| self.failed(error))?;
+        self.check()
+    }
+
+    /// Copies a buffer that was made with `COPY_SRC` to `values`, once all work before is done.
+    pub(crate) fn read(&self, buffer: &wgpu::Buffer, values: &mut [f32]) -> Result<(), GpuError> {
+        let bytes = size_of_val(values) as u64;
+        let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
+        let staging = self.buffer("reading back", bytes, usage)?;
+        let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, bytes);
+        let submission = self.queue.submit([encoder.finish()]);
+        // Whether it can be read is asked below.
+        staging.map_async(wgpu::MapMode::Read, .., |_| ());
+        self.wait(submission)?;
+        let view = staging.get_mapped_range(..).map_err(|error| self.failed(error))?;
+        values.copy_from_slice(bytemuck::cast_slice(&view));
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn gpu() -> Gpu {
+        Gpu::open(Adapters::Any).expect("a Vulkan device; install mesa-vulkan-drivers for a software one")
+    }
+
+    #[test]
+    fn what_is_uploaded_is_read_back() {
+        let gpu = gpu();
+        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
+        let buffer = gpu.buffer("numbers", 12, usage).expect("a buffer");
+        gpu.queue.write_buffer(&buffer, 0, bytemuck::cast_slice(&[1.5f32, -2.0, 1e-30]));
+        let mut values = [0.0; 3];
+        gpu.read(&buffer, &mut values).expect("the numbers");
+        assert_eq!(values, [1.5, -2.0, 1e-30]);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_told_with_both_sizes() {
+        let gpu = gpu();
+        let bytes = gpu.largest_buffer() + 4;
+        let error = gpu.buffer("the sky", bytes, wgpu::BufferUsages::STORAGE).expect_err("too large");
+        let text = error.to_string();
+        assert!(
+            ["the sky", &bytes.to_string(), gpu.name(), "--backend cpu"].iter().all(|part| text.contains(part)),
+            "{text}"
+        );
+    }
+
+    #[test]
+    fn a_shader_that_is_none_is_an_error_now_and_ever_after() {
+        let gpu = gpu();
+        let error = gpu.pipeline("broken", "@compute @workgroup_size(1) fn f() { nonsense(); }").expect_err("nonsense");
+        assert!(matches!(&error, GpuError::Failed { reason, .. } if reason.contains("nonsense")), "{error}");
+        assert_eq!(gpu.check(), Err(error));
+    }
+}

@@ -1,0 +1,55 @@
+//! The graphics processor, through Vulkan. Without the feature `gpu` there is only the error that says so.
+
+#[cfg(feature = "gpu")]
+mod device;
+
+#[cfg(feature = "gpu")]
+pub use device::{Adapters, Gpu};
+
+/// Why the graphics processor cannot be used.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum GpuError {
+    /// The program holds no code for it.
+    #[error("this program was built without the GPU; build it with `--features gpu`, or choose --backend cpu")]
+    NotBuilt,
+    /// No device is there.
+    #[error("no GPU was found by Vulkan{}; install its driver, or choose --backend cpu", found(passed_over))]
+    None {
+        /// Names of devices that were found and are none, such as a processor that plays one.
+        passed_over: Vec<String>,
+    },
+    /// The device could not be opened.
+    #[error("the GPU {name} could not be opened: {reason}; choose --backend cpu")]
+    Refused {
+        /// The device.
+        name: String,
+        /// What its driver said.
+        reason: String,
+    },
+    /// Something does not fit.
+    #[error(
+        "no room for {what}: {bytes} bytes, of which the GPU {name} can hold {limit} at once; choose --backend cpu, or a smaller size"
+    )]
+    TooLarge {
+        /// What does not fit.
+        what: &'static str,
+        /// Its size.
+        bytes: u64,
+        /// The device.
+        name: String,
+        /// What fits.
+        limit: u64,
+    },
+    /// The device failed at work.
+    #[error("the GPU {name} failed: {reason}; try again, or choose --backend cpu")]
+    Failed {
+        /// The device.
+        name: String,
+        /// What its driver said.
+        reason: String,
+    },
+}
+
+fn found(passed_over: &[String]) -> String {
+    if passed_over.is_empty() { String::new() } else { format!(" (but {})", passed_over.join(", ")) }
+}
