@@ -351,7 +351,7 @@ mod tests {
             planes: 2,
             rays: 4,
         };
-        plan.write(folder.path(), 5, &crate::scene_renderer::Tracer::Cpu).unwrap();
+        plan.write(folder.path(), 5, &crate::scene_renderer::Tracer::cpu()).unwrap();
         let path = folder.path().join(file_name(5));
         (folder, path)
     }

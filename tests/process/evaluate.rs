@@ -128,7 +128,7 @@ fn render(folder: &Path, kind: SceneKind, count: u64) {
         rays: 8,
     };
     for index in 0..count {
-        plan.write(folder, index, &holod_model::scene_renderer::Tracer::Cpu).unwrap();
+        plan.write(folder, index, &holod_model::scene_renderer::Tracer::cpu()).unwrap();
     }
 }
 

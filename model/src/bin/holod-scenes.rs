@@ -27,7 +27,7 @@ enum Command {
     Generate(Generate),
     /// Put scenes of a folder on one picture: all in focus, depth, and the widest pupil focused far and near.
     Sheet(Sheet),
-    /// Measure how many aperture rays are traced in a second, by the processor and, where there is one, by a GPU.
+    /// Measure how many aperture rays are traced in a second.
     Bench(Bench),
     /// Measure the noise of the thin-lens images, in and out of focus, for each pupil.
     Noise(Measure),
@@ -50,26 +50,27 @@ struct Generate {
     #[command(flatten)]
     look: Look,
     /// What traces the rays; scenes agree to rounding.
-    #[arg(long, value_enum, default_value_t = Backend::Auto)]
+    #[arg(long, value_enum, default_value_t = Backend::Cpu)]
     backend: Backend,
 }
 
+/// All but the first need a build with the feature `gpu`.
 #[derive(Clone, Copy, ValueEnum)]
 enum Backend {
-    /// A graphics processor where there is one.
-    Auto,
     /// The processor's cores.
     Cpu,
-    /// Vulkan's best device.
+    /// The best graphics processor that Vulkan shows.
     Gpu,
+    /// A processor that plays one (Mesa's llvmpipe): slow, to test the shaders.
+    Software,
 }
 
 impl Backend {
     fn open(self) -> Result<Tracer, GpuError> {
         match self {
-            Self::Auto => Ok(Tracer::fastest()),
-            Self::Cpu => Ok(Tracer::Cpu),
+            Self::Cpu => Ok(Tracer::cpu()),
             Self::Gpu => Tracer::gpu(),
+            Self::Software => Tracer::software_gpu(),
         }
     }
 }
@@ -142,14 +143,14 @@ struct Bench {
     #[command(flatten)]
     measure: Measure,
     /// What is measured beside the processor.
-    #[arg(long, value_enum, default_value_t = Backend::Auto)]
+    #[arg(long, value_enum, default_value_t = Backend::Cpu)]
     backend: Backend,
 }
 
 #[derive(Args)]
 struct Measure {
     /// Scenes to render.
-    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u64).range(1..=1000))]
     scenes: u64,
     #[command(flatten)]
     look: Look,
@@ -241,10 +242,10 @@ fn main() -> ExitCode {
 
 fn generate(options: &Generate) -> Result<String, Failure> {
     let plan = options.look.plan(options.seed);
-    let style =
-        ProgressStyle::with_template("{bar:40} {pos}/{len} scenes, {eta} left").expect("the template is constant");
-    let bar = ProgressBar::new(options.count).with_style(style);
+    let style = ProgressStyle::with_template("{bar:40} {pos}/{len} scenes by {msg}, {eta} left")
+        .expect("the template is constant");
     let tracer = options.backend.open()?;
+    let bar = ProgressBar::new(options.count).with_style(style).with_message(tracer.name().to_owned());
     let (mut written, mut present) = (0, 0);
     for index in options.first..options.first + options.count {
         match plan.write(&options.out, index, &tracer)? {
@@ -254,15 +255,16 @@ fn generate(options: &Generate) -> Result<String, Failure> {
         bar.inc(1);
     }
     bar.finish_and_clear();
-    let by = if written == 0 { String::new() } else { format!(", traced by {}", tracer.name()) };
-    Ok(format!("{written} scenes written to {}, {present} were there already{by}", options.out.display()))
+    Ok(format!("{written} scenes written to {}, {present} were there already", options.out.display()))
 }
 
 fn bench(options: &Bench) -> Result<String, Failure> {
     let Measure { scenes, look } = &options.measure;
     let plan = look.plan(1);
-    let mut tracers = vec![Tracer::Cpu];
-    tracers.extend(Some(options.backend.open()?).filter(|tracer| !matches!(tracer, Tracer::Cpu)));
+    let mut tracers = vec![Tracer::cpu()];
+    if !matches!(options.backend, Backend::Cpu) {
+        tracers.push(options.backend.open()?);
+    }
     let mut composing_s = Vec::new();
     let (mut tracing_s, mut rates) = (vec![Vec::new(); tracers.len()], vec![Vec::new(); tracers.len()]);
     for index in 0..*scenes {
@@ -286,14 +288,15 @@ fn bench(options: &Bench) -> Result<String, Failure> {
         median(&mut composing_s)
     );
     let of_cpu = median(&mut rates[0].clone());
-    for (tracer, (tracing_s, rates)) in tracers.iter().zip(tracing_s.iter_mut().zip(&mut rates)) {
+    for (place, (tracing_s, rates)) in tracing_s.iter_mut().zip(&mut rates).enumerate() {
+        let tracer = &tracers[place];
         let rate = median(rates);
         report += &format!(
             "\n{:>8.2} s to trace it by {}: {rate:.2} million aperture rays/s",
             median(tracing_s),
             tracer.name()
         );
-        report += &if matches!(tracer, Tracer::Cpu) {
+        report += &if place == 0 {
             format!(", {:.2} on each of {threads} threads", rate / threads as f64)
         } else {
             format!(", {:.2} times the cpu's", rate / of_cpu)
@@ -304,7 +307,7 @@ fn bench(options: &Bench) -> Result<String, Failure> {
 
 fn median(values: &mut [f64]) -> f64 {
     values.sort_by(f64::total_cmp);
-    values[values.len() / 2]
+    0.5 * (values[values.len() / 2] + values[(values.len() - 1) / 2])
 }
 
 /// Noise is averaged as power over the scenes.

@@ -1,6 +1,7 @@
 //! One device with its queue. Faults that the driver tells late, between calls, are kept and given by the next call that
-//! can fail, so none is lost and none panics.
+//! can fail, so that none is missed.
 
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -8,22 +9,25 @@ use super::GpuError;
 
 /// Which devices will do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Adapters {
+pub(crate) enum Adapters {
     /// Graphics processors.
     Hardware,
-    /// Those, or else a processor that plays one: right, and slow.
-    Any,
+    /// A processor that plays one: right, and slow.
+    Software,
 }
 
-/// A device and its queue. Clones are the same device.
-#[derive(Clone)]
-pub struct Gpu {
+/// A device and its queue.
+pub(crate) struct Gpu {
     pub(crate) device: wgpu::Device,
     pub(crate) queue: wgpu::Queue,
     name: String,
     fault: Arc<OnceLock<String>>,
+    /// The most bytes that a shader can see as one buffer.
+    pub(crate) largest_buffer: u64,
 }
 
+/// Bytes that are read back at a time.
+const READ_BYTES: u64 = 64 << 20;
 /// The longest that any piece of work may take before the device counts as hung.
 const PATIENCE: Duration = Duration::from_secs(120);
 
@@ -32,7 +36,7 @@ impl Gpu {
     ///
     /// # Errors
     /// There is none, or its driver refuses.
-    pub fn open(adapters: Adapters) -> Result<Self, GpuError> {
+    pub(crate) fn open(adapters: Adapters) -> Result<Self, GpuError> {
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
             backends: wgpu::Backends::VULKAN,
             ..wgpu::InstanceDescriptor::new_without_display_handle()
@@ -45,7 +49,7 @@ impl Gpu {
         };
         let mut found = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::VULKAN));
         found.sort_by_key(rank);
-        let usable = |adapter: &&wgpu::Adapter| adapters == Adapters::Any || rank(adapter) < 3;
+        let usable = |adapter: &&wgpu::Adapter| (adapters == Adapters::Software) == (rank(adapter) == 3);
         let Some(adapter) = found.iter().find(usable) else {
             return Err(GpuError::None { passed_over: found.iter().map(|adapter| adapter.get_info().name).collect() });
         };
@@ -68,11 +72,13 @@ impl Gpu {
                 drop(kept.set(format!("it was lost ({text})")));
             }
         });
-        Ok(Self { device, queue, name, fault })
+        let limits = device.limits();
+        let largest_buffer = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
+        Ok(Self { device, queue, name, fault, largest_buffer })
     }
 
     /// The device's name, as its driver has it.
-    pub fn name(&self) -> &str {
+    pub(crate) fn name(&self) -> &str {
         &self.name
     }
 
@@ -85,20 +91,14 @@ impl Gpu {
         GpuError::Failed { name: self.name.clone(), reason: reason.to_string() }
     }
 
-    /// The most bytes that a shader can see as one buffer.
-    pub(crate) fn largest_buffer(&self) -> u64 {
-        let limits = self.device.limits();
-        limits.max_storage_buffer_binding_size.min(limits.max_buffer_size)
-    }
-
-    /// A buffer of zeros for a shader.
+    /// A buffer of zeros.
     pub(crate) fn buffer(
         &self,
         what: &'static str,
         bytes: u64,
         usage: wgpu::BufferUsages,
     ) -> Result<wgpu::Buffer, GpuError> {
-        let limit = self.largest_buffer();
+        let limit = self.largest_buffer;
         if bytes > limit {
             return Err(GpuError::TooLarge { what, bytes, name: self.name.clone(), limit });
         }
@@ -152,23 +152,31 @@ impl Gpu {
     /// Waits until the work of `submission`, and all before it, is done.
     pub(crate) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), GpuError> {
         let until = wgpu::PollType::Wait { submission_index: Some(submission), timeout: Some(PATIENCE) };
-        self.device.poll(until).map_err(|error| self.failed(error))?;
-        self.check()
+        // wgpu panics in `poll` where a device is lost, after it has told the callback.
+        let polled = catch_unwind(AssertUnwindSafe(|| self.device.poll(until)));
+        self.check()?;
+        polled.map_err(|_| self.failed("it was lost"))?.map(|_| ()).map_err(|error| self.failed(error))
     }
 
     /// Copies a buffer that was made with `COPY_SRC` to `values`, once all work before is done.
     pub(crate) fn read(&self, buffer: &wgpu::Buffer, values: &mut [f32]) -> Result<(), GpuError> {
-        let bytes = size_of_val(values) as u64;
         let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
-        let staging = self.buffer("reading back", bytes, usage)?;
-        let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-        encoder.copy_buffer_to_buffer(buffer, 0, &staging, 0, bytes);
-        let submission = self.queue.submit([encoder.finish()]);
-        // Whether it can be read is asked below.
-        staging.map_async(wgpu::MapMode::Read, .., |_| ());
-        self.wait(submission)?;
-        let view = staging.get_mapped_range(..).map_err(|error| self.failed(error))?;
-        values.copy_from_slice(bytemuck::cast_slice(&view));
+        let staging = self.buffer("reading back", READ_BYTES.min(size_of_val(values) as u64), usage)?;
+        let mut offset = 0;
+        for part in values.chunks_mut((staging.size() / 4) as usize) {
+            let bytes = size_of_val(part) as u64;
+            let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+            encoder.copy_buffer_to_buffer(buffer, offset, &staging, 0, bytes);
+            let submission = self.queue.submit([encoder.finish()]);
+            // Whether it can be read is asked below.
+            staging.map_async(wgpu::MapMode::Read, ..bytes, |_| ());
+            self.wait(submission)?;
+            let view = staging.get_mapped_range(..bytes).map_err(|error| self.failed(error))?;
+            part.copy_from_slice(bytemuck::cast_slice(&view));
+            drop(view);
+            staging.unmap();
+            offset += bytes;
+        }
         Ok(())
     }
 }
@@ -178,7 +186,7 @@ mod tests {
     use super::*;
 
     fn gpu() -> Gpu {
-        Gpu::open(Adapters::Any).expect("a Vulkan device; install mesa-vulkan-drivers for a software one")
+        Gpu::open(Adapters::Software).expect("Mesa's software device; install mesa-vulkan-drivers")
     }
 
     #[test]
@@ -195,7 +203,7 @@ mod tests {
     #[test]
     fn what_does_not_fit_is_told_with_both_sizes() {
         let gpu = gpu();
-        let bytes = gpu.largest_buffer() + 4;
+        let bytes = gpu.largest_buffer + 4;
         let error = gpu.buffer("the sky", bytes, wgpu::BufferUsages::STORAGE).expect_err("too large");
         let text = error.to_string();
         assert!(
@@ -210,5 +218,27 @@ mod tests {
         let error = gpu.pipeline("broken", "@compute @workgroup_size(1) fn f() { nonsense(); }").expect_err("nonsense");
         assert!(matches!(&error, GpuError::Failed { reason, .. } if reason.contains("nonsense")), "{error}");
         assert_eq!(gpu.check(), Err(error));
+    }
+
+    #[test]
+    fn a_lost_device_is_an_error() {
+        let gpu = gpu();
+        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
+        let buffer = gpu.buffer("numbers", 12, usage).expect("a buffer");
+        gpu.device.destroy();
+        assert!(matches!(gpu.read(&buffer, &mut [0.0; 3]), Err(GpuError::Failed { .. })));
+    }
+
+    #[test]
+    fn much_is_read_back_in_parts() {
+        let gpu = gpu();
+        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
+        let count = (READ_BYTES / 4) as usize + 3;
+        let buffer = gpu.buffer("numbers", 4 * count as u64, usage).expect("a buffer");
+        let numbers: Vec<f32> = (0..count).map(|n| n as f32).collect();
+        gpu.queue.write_buffer(&buffer, 0, bytemuck::cast_slice(&numbers));
+        let mut values = vec![-1.0; count];
+        gpu.read(&buffer, &mut values).expect("the numbers");
+        assert!(values == numbers);
     }
 }

@@ -1,10 +1,10 @@
-//! The graphics processor, through Vulkan. Without the feature `gpu` there is only the error that says so.
+//! The graphics processor, through Vulkan. Without the feature `gpu` no device can be opened.
 
 #[cfg(feature = "gpu")]
 mod device;
 
 #[cfg(feature = "gpu")]
-pub use device::{Adapters, Gpu};
+pub(crate) use device::{Adapters, Gpu};
 
 /// Why the graphics processor cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -13,9 +13,9 @@ pub enum GpuError {
     #[error("this program was built without the GPU; build it with `--features gpu`, or choose --backend cpu")]
     NotBuilt,
     /// No device is there.
-    #[error("no GPU was found by Vulkan{}; install its driver, or choose --backend cpu", found(passed_over))]
+    #[error("Vulkan shows no such device{}; install the GPU's driver, or choose --backend cpu", found(passed_over))]
     None {
-        /// Names of devices that were found and are none, such as a processor that plays one.
+        /// Names of devices of the other kind, such as a processor that plays a GPU.
         passed_over: Vec<String>,
     },
     /// The device could not be opened.
@@ -28,7 +28,7 @@ pub enum GpuError {
     },
     /// Something does not fit.
     #[error(
-        "no room for {what}: {bytes} bytes, of which the GPU {name} can hold {limit} at once; choose --backend cpu, or a smaller size"
+        "no room for {what}: {bytes} bytes, of which the GPU {name} can see {limit} as one; choose --backend cpu, or a smaller size"
     )]
     TooLarge {
         /// What does not fit.
@@ -41,7 +41,9 @@ pub enum GpuError {
         limit: u64,
     },
     /// The device failed at work.
-    #[error("the GPU {name} failed: {reason}; try again, or choose --backend cpu")]
+    #[error(
+        "the GPU {name} failed: {reason}; start again, choose a smaller size if its memory was full, or --backend cpu"
+    )]
     Failed {
         /// The device.
         name: String,
@@ -51,5 +53,5 @@ pub enum GpuError {
 }
 
 fn found(passed_over: &[String]) -> String {
-    if passed_over.is_empty() { String::new() } else { format!(" (but {})", passed_over.join(", ")) }
+    if passed_over.is_empty() { String::new() } else { format!(", only {}", passed_over.join(", ")) }
 }

@@ -22,8 +22,8 @@ const VIEWS_AT_ONCE: usize = 8;
 const LEAF: usize = 4;
 
 /// The two shaders, ready to run.
-pub struct GpuTracer {
-    gpu: Gpu,
+pub(super) struct GpuTracer {
+    pub(super) gpu: Gpu,
     draw: wgpu::ComputePipeline,
     add: wgpu::ComputePipeline,
 }
@@ -33,14 +33,14 @@ impl GpuTracer {
     ///
     /// # Errors
     /// The driver refuses them.
-    pub fn new(gpu: Gpu) -> Result<Self, GpuError> {
+    pub(super) fn new(gpu: Gpu) -> Result<Self, GpuError> {
         let draw = gpu.pipeline("view", include_str!("view.wgsl"))?;
         let add = gpu.pipeline("thin lens", include_str!("thin_lens.wgsl"))?;
         Ok(Self { gpu, draw, add })
     }
 
     /// The device's name.
-    pub fn name(&self) -> &str {
+    pub(super) fn name(&self) -> &str {
         self.gpu.name()
     }
 }
@@ -211,11 +211,13 @@ impl<'a> GpuAdder<'a> {
             packed.clear();
             packed.extend(surface.texels.iter().map(|texel| texel.map(|value| f16::from_f32(value).to_bits())));
             gpu.queue.write_buffer(&texels, u64::from(place.first_texel) * 8, bytemuck::cast_slice(&packed));
+            // Sends it off, so that no second copy of the whole scene gathers in the queue.
+            gpu.queue.submit([]);
         }
         let nodes = hierarchy(&mut triangles);
 
         let plane_bytes = (12 * lens.resolution.pixels()) as u64;
-        let planes_at_once = ((gpu.largest_buffer() / plane_bytes) as usize).clamp(1, lens.planes());
+        let planes_at_once = ((gpu.largest_buffer / plane_bytes) as usize).clamp(1, lens.planes());
         let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC;
         let planes = (0..lens.planes())
             .step_by(planes_at_once)
@@ -257,7 +259,7 @@ impl Adder for GpuAdder<'_> {
             .flat_map(|point| lifts.iter().map(|&lift| Lens::first_sample(point, lift, margin, grid.columns) as u32))
             .collect();
         let view_bytes = (12 * grid.columns * grid.rows) as u64;
-        let views_at_once = ((gpu.largest_buffer() / view_bytes) as usize).clamp(1, VIEWS_AT_ONCE.min(points.len()));
+        let views_at_once = ((gpu.largest_buffer / view_bytes) as usize).clamp(1, VIEWS_AT_ONCE.min(points.len()));
         let colours = gpu.buffer("one view", views_at_once as u64 * view_bytes, BufferUsages::STORAGE)?;
         let uniform = |size: usize| gpu.buffer("batch", size as u64, BufferUsages::UNIFORM | BufferUsages::COPY_DST);
         let (frame, batch) = (uniform(size_of::<Frame>())?, uniform(size_of::<Batch>())?);

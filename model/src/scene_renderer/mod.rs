@@ -132,7 +132,7 @@ impl Scene {
     /// pupils serve the wider ones too.
     pub fn focal_stacks(&self, pupils: &[PupilDiameter], focus: &[Dioptres], rays: usize) -> Vec<Vec<f32>> {
         let (stacks, _) =
-            self.traced_focal_stacks(&Tracer::Cpu, pupils, focus, rays).expect("the processor has no errors");
+            self.traced_focal_stacks(&Tracer::cpu(), pupils, focus, rays).expect("the processor has no errors");
         stacks
     }
 

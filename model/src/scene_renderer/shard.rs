@@ -3,7 +3,7 @@
 //! `scene_000123.safetensors` holds `image` F16 [3, H, W] (linear light, pinhole), `depth` F32 [H, W] (normalised, 0 far,
 //! 1 near) and `stack_0` … `stack_n` F16 [planes, 3, H, W] (linear light, one for each pupil). Its metadata are strings:
 //! `format` = "holod-scene-1", `generator` (see [`GENERATOR`]), `kind`, `seed`, `index`, `pupils_mm` and `focus_dpt` (JSON
-//! lists), `far_dpt`, `near_dpt`, `pixel_angle_rad`, `rays`.
+//! lists), `far_dpt`, `near_dpt`, `pixel_angle_rad`, `rays`, and `traced_by`: `cpu` or a device's name.
 //!
 //! While a shard is made, memory holds its stacks as F16 and, once, the F32 sums of one: at 1920x1080 12 MB and 25 MB a
 //! plane. It is written from there, and read for a sheet, without a copy of the whole.
@@ -234,7 +234,9 @@ impl ShardPlan {
             .collect::<Result<Vec<_>, SafeTensorError>>()
             .map_err(|error| unwritable(error.to_string()))?;
         let beside = folder.join(format!(".{}.{}.partial", file_name(index), std::process::id()));
-        let written = safetensors::serialize_to_file(views, Some(self.metadata(index)), &beside);
+        let mut metadata = self.metadata(index);
+        metadata.insert("traced_by".to_owned(), tracer.name().to_owned());
+        let written = safetensors::serialize_to_file(views, Some(metadata), &beside);
         let renamed = written
             .map_err(|error| error.to_string())
             .and_then(|()| fs::rename(&beside, &path).map_err(|error| error.to_string()));

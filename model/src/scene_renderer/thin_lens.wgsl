@@ -21,7 +21,7 @@ struct Batch {
 // [points, planes]: the sample that lands in the picture's first pixel.
 @group(0) @binding(2) var<storage, read> first_samples: array<u32>;
 // The plane of the stack that comes first in `sums`.
-@group(0) @binding(3) var<storage, read> first_plane: array<u32>;
+@group(0) @binding(3) var<storage, read> first_plane: u32;
 // [planes from there on, 3, height, width].
 @group(0) @binding(4) var<storage, read_write> sums: array<f32>;
 
@@ -30,7 +30,7 @@ fn add(@builtin(global_invocation_id) id: vec3<u32>) {
     if id.x >= batch.width || id.y >= batch.height {
         return;
     }
-    let plane = first_plane[0] + id.z;
+    let plane = first_plane + id.z;
     let pixels = batch.width * batch.height;
     let samples = batch.columns * batch.rows;
     let at = id.z * 3u * pixels + id.y * batch.width + id.x;

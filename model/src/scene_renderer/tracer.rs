@@ -9,43 +9,57 @@ use super::Scene;
 use super::gpu::{GpuAdder, GpuTracer};
 use super::thin_lens::{CpuAdder, Lens, focal_stacks};
 use crate::gpu::GpuError;
+#[cfg(feature = "gpu")]
+use crate::gpu::{Adapters, Gpu};
 
-/// Where rays are traced: the images agree to rounding.
-pub enum Tracer {
-    /// On the processor.
+/// Where rays are traced: the same rays, so that images agree to rounding.
+pub struct Tracer(Kind);
+
+enum Kind {
     Cpu,
-    /// On a graphics processor.
     #[cfg(feature = "gpu")]
     Gpu(Box<GpuTracer>),
 }
 
 impl Tracer {
-    /// The best graphics processor if there is one and its driver takes the shaders, else the processor.
-    pub fn fastest() -> Self {
-        #[cfg(feature = "gpu")]
-        if let Ok(tracer) = crate::gpu::Gpu::open(crate::gpu::Adapters::Hardware).and_then(GpuTracer::new) {
-            return Self::Gpu(Box::new(tracer));
-        }
-        Self::Cpu
+    /// On the processor.
+    pub fn cpu() -> Self {
+        Self(Kind::Cpu)
     }
 
-    /// Vulkan's best device, be it a processor that plays one.
+    /// On the best graphics processor that Vulkan shows.
     ///
     /// # Errors
     /// There is none, its driver refuses, or this program was built without the feature `gpu`.
     pub fn gpu() -> Result<Self, GpuError> {
         #[cfg(feature = "gpu")]
-        return Ok(Self::Gpu(Box::new(GpuTracer::new(crate::gpu::Gpu::open(crate::gpu::Adapters::Any)?)?)));
+        return Self::on(Gpu::open(Adapters::Hardware)?);
         #[cfg(not(feature = "gpu"))]
         Err(GpuError::NotBuilt)
     }
 
+    /// On a processor that plays a graphics processor, such as Mesa's llvmpipe: slow, to test the shaders.
+    ///
+    /// # Errors
+    /// As [`Tracer::gpu`].
+    pub fn software_gpu() -> Result<Self, GpuError> {
+        #[cfg(feature = "gpu")]
+        return Self::on(Gpu::open(Adapters::Software)?);
+        #[cfg(not(feature = "gpu"))]
+        Err(GpuError::NotBuilt)
+    }
+
+    #[cfg(feature = "gpu")]
+    pub(super) fn on(gpu: Gpu) -> Result<Self, GpuError> {
+        Ok(Self(Kind::Gpu(Box::new(GpuTracer::new(gpu)?))))
+    }
+
     /// The device's name, or `cpu`.
     pub fn name(&self) -> &str {
-        match self {
-            Self::Cpu => "cpu",
+        match &self.0 {
+            Kind::Cpu => "cpu",
             #[cfg(feature = "gpu")]
-            Self::Gpu(tracer) => tracer.name(),
+            Kind::Gpu(tracer) => tracer.name(),
         }
     }
 
@@ -59,13 +73,15 @@ impl Tracer {
         finish: impl FnMut(usize, &[f32], f32),
     ) -> Result<u64, GpuError> {
         let lens = Lens::new(&scene.surfaces, scene.resolution, focus);
-        match self {
-            Self::Cpu => {
-                let traced = focal_stacks(&lens, &mut CpuAdder::new(&lens), pupils, rays, scene.ray_key, finish);
-                Ok(traced.unwrap_or_else(|never: Infallible| match never {}))
+        match &self.0 {
+            Kind::Cpu => {
+                let traced: Result<u64, Infallible> =
+                    focal_stacks(&lens, &mut CpuAdder::new(&lens), pupils, rays, scene.ray_key, finish);
+                let Ok(traced) = traced;
+                Ok(traced)
             }
             #[cfg(feature = "gpu")]
-            Self::Gpu(tracer) => {
+            Kind::Gpu(tracer) => {
                 focal_stacks(&lens, &mut GpuAdder::new(tracer, &lens)?, pupils, rays, scene.ray_key, finish)
             }
         }

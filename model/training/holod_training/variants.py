@@ -51,6 +51,9 @@ VARIANTS: dict[str, NetworkConfig] = {
     "half-band-layered-small": replace(
         _HALF_BAND_LAYERED, layers=4, channels=24, adjustable_layers=(2,), correction_layers=6
     ),
+    "half-band-layered-small-no-prior": replace(
+        _HALF_BAND_LAYERED, layers=4, channels=24, adjustable_layers=(2,), correction_layers=6, transport_prior=False
+    ),
     "layered-4": replace(_LAYERED, depth_layers=4),
     "layered-8": _LAYERED,
     "layered-12": replace(_LAYERED, depth_layers=12),

@@ -57,6 +57,7 @@ def test_the_table_is_what_it_says() -> None:
         ("layered-8", 103_882),
         ("half-band-layered", 178_818),
         ("half-band-layered-small", 68_698),
+        ("half-band-layered-small-no-prior", 66_097),
     ):
         assert sum(p.numel() for p in build_network(variant(name)).parameters()) == parameters, name
     # Two operations a weight of each 3x3 convolution, the offsets' too; taps and FFTs are a few per cent.
