@@ -19,12 +19,21 @@ from holod_training.lpips import Lpips
 from holod_training.metrics import Judgement, judge, psnr_db
 from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, coc_px, double_phase, panel_field, through_levels, upsample_half_band
-from holod_training.rivals import all_in_focus, flat_oracle, layered_asm, smooth_phase, transport_of_intensity
+from holod_training.rivals import (
+    all_in_focus,
+    flat_oracle,
+    layered_asm,
+    rgbd_blur,
+    smooth_phase,
+    transport_of_intensity,
+)
 from holod_training.shards import Shard, ShardError, Stack, open_held_out
 from holod_training.variants import network_amplitude
 
 OURS = "holod"
-LAYERED_ASM, FLAT_ORACLE = "layered ASM", "flat oracle"
+LAYERED_ASM, FLAT_ORACLE, RGBD_BLUR = "layered ASM", "flat oracle", "RGB-D blur"
+# Pictures that no hologram makes.
+PICTURES = (RGBD_BLUR, FLAT_ORACLE)
 BEFORE, AFTER = "before", "after"
 NUMBERS = tuple(f.name for f in fields(Judgement))
 KEPT_EYE_ELEMENTS = 2**23
@@ -186,11 +195,11 @@ class Judged:
     def paired(self) -> list[dict[str, Any]]:
         """Ours less each other method after double phase, scene by scene, over the scenes that both were judged on.
 
-        The flat oracle has no hologram: it is taken as it is.
+        What has no hologram is taken as it is.
         """
         rows = []
         for (method, stage, pupil), of in self.values.items():
-            if method == OURS or (stage == BEFORE) != (method == FLAT_ORACLE):
+            if method == OURS or (stage == BEFORE) != (method in PICTURES):
                 continue
             ours = self.values[OURS, AFTER, pupil]
             common = sorted(of.keys() & ours.keys())
@@ -243,6 +252,8 @@ def judge_scenes(shards: list[Shard], methods: list[Method], bench: Bench) -> Ju
     for scene, shard in enumerate(tqdm(shards, unit="scene", disable=None)):
         for index in range(len(pupils)):
             stack = bench.read(shard, index)
+            blurred = rgbd_blur(stack.amplitude, stack.depth, bench.optics, list(stack.focus_dpt), stack.pupil_mm)
+            judged.add(RGBD_BLUR, BEFORE, stack.pupil_mm, scene, bench.judge(blurred, stack))
             judged.add(FLAT_ORACLE, BEFORE, stack.pupil_mm, scene, bench.judge(flat_oracle(stack.target), stack))
         for method in methods:
             if method.scenes is None or scene < method.scenes:

@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from holod_training.export import write_beside
+from holod_training.judging import PICTURES
 
 MARKERS = "osD^vPX*<>"
 FIXED_STYLES = {
@@ -26,6 +27,7 @@ FIXED_STYLES = {
     "transport of intensity": ("tab:purple", "D"),
     "optimised, 1 frame": ("tab:pink", "^"),
     "optimised, 2 frames": ("0.1", "^"),
+    "RGB-D blur": ("0.6", ""),
     "flat oracle": ("0.45", ""),
 }
 DPI = 110
@@ -186,7 +188,7 @@ def _row(result: dict[str, Any], method: str, pupil_mm: float) -> dict[str, Any]
 
 
 def _shown_rows(result: dict[str, Any], method: str) -> list[dict[str, Any]]:
-    stage = "before" if method == "flat oracle" else "after"
+    stage = "before" if method in PICTURES else "after"
     return [row for row in result["rows"] if (row["method"], row["double_phase"]) == (method, stage)]
 
 
@@ -201,16 +203,17 @@ def _with_scenes(result: dict[str, Any], method: str) -> str:
 
 
 def _styles(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Ours bold and blue, the flat oracle grey and dashed, each rival the same in every plot, the rest in turn."""
+    """Ours bold and blue, what has no hologram grey and broken, each rival the same in every plot, the rest in turn."""
     rest = itertools.cycle(zip(("tab:red", "tab:olive", "tab:cyan", "k"), "*<>X", strict=True))
     styles: dict[str, dict[str, Any]] = {}
-    for method in sorted(methods, key=lambda method: method == "flat oracle"):
+    for method in sorted(methods, key=lambda method: method in PICTURES):
         colour, marker = FIXED_STYLES.get(method) or next(rest)
         styles[method] = {"color": colour, "marker": marker, "lw": 1.2}
     if "holod" in styles:
         styles["holod"].update(lw=2.2, zorder=3)
-    if "flat oracle" in styles:
-        styles["flat oracle"].update(ls="--")
+    for method, line in zip(PICTURES, (":", "--"), strict=True):
+        if method in styles:
+            styles[method].update(ls=line)
     return styles
 
 

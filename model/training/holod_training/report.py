@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from holod_training.goals import checks, find_row, require_one_set_of_pupils, row_of
+from holod_training.judging import PICTURES
 
 NUMBERS = (
     ("psnr_db", "PSNR dB", 2),
@@ -49,7 +50,9 @@ def _opening(result: dict[str, Any]) -> list[str]:
         f"focal planes, a border of {result['border_px']} px left out; linear light, peak 1. Means over scenes, in "
         f"brackets their 95 % interval (Student's t). Amplitude constant {result['amplitude_constant']}. Slope and "
         "correlation: P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, 0 = one picture at all "
-        f"depths). In focus: CoC < 2 px; out of focus: CoC > 8 px. Everything is after double phase.{optimised}",
+        f"depths). In focus: CoC < 2 px; out of focus: CoC > 8 px. Everything is after double phase.{optimised} Two "
+        "rows are no holograms: the flat oracle is the target's mean at every focus, RGB-D blur is what an incoherent "
+        "display would show that knows the picture and its depth alone: what it lacks, RGB-D leaves open.",
     ]
 
 
@@ -62,7 +65,7 @@ def _numbers(result: dict[str, Any]) -> list[str]:
     lines += _header(["s mm", "method", "scenes", *(label for _, label, _ in numbers)])
     for pupil in result["pupils_mm"]:
         for method in _methods(result):
-            row = find_row(result, method, "before" if method == "flat oracle" else "after", pupil)
+            row = find_row(result, method, "before" if method in PICTURES else "after", pupil)
             if row:
                 cells = [_with_interval(row, row["interval_95"], key, digits) for key, _, digits in numbers]
                 lines.append(_line([f"{pupil:g}", method, row["scenes"], *cells]))
@@ -171,9 +174,9 @@ def _goals(result: dict[str, Any]) -> list[str]:
 
 
 def _methods(result: dict[str, Any]) -> list[str]:
-    """In the order in which they were judged, the flat oracle last."""
+    """In the order in which they were judged, what has no hologram last."""
     names = dict.fromkeys(row["method"] for row in result["rows"])
-    return [*(name for name in names if name != "flat oracle"), "flat oracle"]
+    return [*(name for name in names if name not in PICTURES), *(name for name in PICTURES if name in names)]
 
 
 def _with_interval(

@@ -1,6 +1,9 @@
-"""What the network must beat: holograms made without learning, and the oracle that has no focus."""
+"""What the network must beat: holograms made without learning, and the oracle that has no focus. And what no hologram
+has to show: the blur that one picture with depth lets one guess."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 import torch.nn.functional as F
@@ -8,10 +11,11 @@ from torch import Tensor
 
 from holod_training.config import OpticsConfig
 from holod_training.layered import LOG_FLOOR, LOG_OFFSET, SIGMAS_PX, compose, drift_phase
-from holod_training.optics import propagate, stop_half_band
+from holod_training.optics import coc_px, frequencies, propagate, stop_half_band
 
 OCCLUSION_LAYERS = 8
 SMOOTH_PHASE_LAYERS = 24
+RGBD_BLUR_LAYERS = 24
 ANTI_ALIASING_SIGMA_PX = 0.7
 
 
@@ -67,6 +71,40 @@ def gaussian_blur(light: Tensor, sigma_px: float, radius_px: int | None = None) 
     padded = F.pad(light[None], (radius, radius, radius, radius), mode="replicate")
     rows = F.conv2d(padded, window, groups=len(light))
     return F.conv2d(rows, window.transpose(-2, -1), groups=len(light))[0]
+
+
+def rgbd_blur(
+    amplitude: Tensor, depth: Tensor, optics: OpticsConfig, focus_dpt: list[float], pupil_mm: float
+) -> Tensor:
+    """The focal stack [K, 3, H, W] that a display of incoherent light would show which knows the picture and its depth
+    alone: twenty-four layers, each blurred by its disc of confusion, composed far to near, and divided by the light
+    that a white scene would have, for where nothing is known behind an edge.
+
+    It has no hologram and none of its faults. How far it is from the target is what a picture with depth leaves open.
+    """
+    height, width = depth.shape
+    light = amplitude.square()
+    layer = (depth * RGBD_BLUR_LAYERS).long().clamp(0, RGBD_BLUR_LAYERS - 1)
+    centres = (torch.arange(RGBD_BLUR_LAYERS, device=depth.device) + 0.5) / RGBD_BLUR_LAYERS
+    blurs = coc_px(optics, centres[None].to(depth.dtype), focus_dpt, pupil_mm)[:, 0]
+    fy = frequencies(height, 1.0, depth.device)[:, None]
+    fx = torch.fft.rfftfreq(width, dtype=torch.float64, device=depth.device)
+    turns = math.pi * torch.sqrt(fx**2 + fy**2)
+    # White and the three colours.
+    seen = torch.zeros(len(focus_dpt), 4, height, width, dtype=depth.dtype, device=depth.device)
+    for k in range(RGBD_BLUR_LAYERS):
+        # As in `layered.compose`: slanted surfaces show no seams.
+        inside = ((layer == k) | (layer == k + 1)).to(depth.dtype)
+        if not inside.any():
+            continue
+        spectrum = torch.fft.rfft2(torch.cat((inside[None], light * inside)))
+        for plane, blur in zip(seen, blurs[:, k].tolist(), strict=True):
+            # A disc's spectrum, 2·J1(x)/x.
+            x = (blur * turns).clamp_min(1e-6)
+            disc = (2 * torch.special.bessel_j1(x) / x).to(depth.dtype)
+            blurred = torch.fft.irfft2(spectrum * disc, s=(height, width))
+            plane.mul_(1 - blurred[0].clamp(0, 1)).add_(blurred)
+    return seen[:, 1:] / seen[:, :1].clamp_min(1e-3)
 
 
 def flat_oracle(target: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 import copy
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,14 @@ from holod_training.optics import coc_px, intensity, propagate
 from holod_training.plots import on_all_scenes
 from holod_training.refocus import card_areas
 from holod_training.report import markdown
-from holod_training.rivals import all_in_focus, flat_oracle, layered_asm, smooth_phase, transport_of_intensity
+from holod_training.rivals import (
+    all_in_focus,
+    flat_oracle,
+    layered_asm,
+    rgbd_blur,
+    smooth_phase,
+    transport_of_intensity,
+)
 from holod_training.shards import Shard
 
 PUPILS = (1.0, 2.0, 2.5, 4.0)
@@ -93,6 +101,7 @@ def test_evaluation_is_complete(evaluation: Path) -> None:
                 assert row["scenes"] == (1 if "optimised" in method else 2)
                 assert ("psnr_db" in row["interval_95"]) == (row["scenes"] == 2)
     assert row_of(result, "flat oracle", "before", 4.0)["slope"] == 0
+    assert row_of(result, "RGB-D blur", "before", 4.0)["slope"] > 0.2
     matrix = result["matrix_psnr_db"]["after"]
     for index, pupil in enumerate(TABLE_PUPILS):
         assert matrix[index][index] == pytest.approx(row_of(result, "holod", "after", pupil)["psnr_db"], abs=1e-3)
@@ -179,7 +188,7 @@ def test_lpips_has_a_column_where_its_files_are_given(evaluation: Path, tmp_path
     assert expected.max() > 1.2 * expected.min()
     found = row_of(result, "flat oracle", "before", 2.0)["lpips"]
     assert found == pytest.approx(float(expected.mean()), rel=1e-4)
-    assert all(row["lpips"] > 2 * found for row in result["rows"] if row["method"] != "flat oracle")
+    assert all(row["lpips"] > 2 * found for row in result["rows"] if row["method"] not in ("flat oracle", "RGB-D blur"))
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| 2 | flat oracle "))
     assert line.endswith(f" | {found:.4f} |")
     heading = "| s mm | method | scenes | PSNR dB | in focus | out of focus | slope | correlation | SSIM |"
@@ -331,6 +340,33 @@ def test_layered_asm_is_sharp_at_its_own_layer(layer: int) -> None:
     assert (back - amplitude.square()).abs().max() < 0.01
     elsewhere = intensity(propagate(field, OPTICS, OPTICS.distance_m(OPTICS.dioptres(1 - normalised))))
     assert layer == 3 or (elsewhere - amplitude.square()).abs().max() > 0.02
+
+
+def test_rgbd_blur_is_a_disc_of_confusion_that_nearer_things_hide() -> None:
+    near, far = (17.5 / 24, 3.5 / 24)
+    focus = [OPTICS.dioptres(near), OPTICS.dioptres(far)]
+    point = torch.zeros(3, 64, 64)
+    point[:, 32, 32] = 1
+    sharp, soft = rgbd_blur(point, torch.full((64, 64), near), OPTICS, focus, 2.0)
+    torch.testing.assert_close(sharp, point, atol=1e-4, rtol=0)
+    assert soft.sum().item() == pytest.approx(3, rel=0.02)
+    diameter = coc_px(OPTICS, torch.tensor([[near]]), [focus[1]], 2.0).item()
+    offsets = torch.arange(64) - 32.0
+    radius = torch.hypot(offsets[:, None], offsets[None])
+    inside = soft[0][radius < 0.5 * diameter - 1]
+    expected = 4 / (math.pi * diameter**2)
+    assert inside.mean().item() == pytest.approx(expected, rel=0.1)
+    assert soft[0][radius > 0.5 * diameter + 1].abs().max() < 0.3 * expected
+
+    # A bright half in front of a dark one: in focus its edge is sharp, and it hides what is behind.
+    depth = torch.full((64, 64), far)
+    depth[:, :32] = near
+    amplitude = torch.where(depth == near, 0.9, 0.1).expand(3, -1, -1)
+    for plane, picture in enumerate(rgbd_blur(amplitude, depth, OPTICS, focus, 2.0)):
+        assert (picture[:, :, 10:20] - 0.81).abs().max() < 0.02
+        assert (picture[:, :, 44:54] - 0.01).abs().max() < 0.02
+        edge = (picture[0, 32, 30] - picture[0, 32, 33]).item()
+        assert (edge > 0.7) == (plane == 0)
 
 
 def test_flat_oracle_shows_one_picture() -> None:
