@@ -97,6 +97,8 @@ class NetworkConfig:
     # The second net of `layered`; dilations as above.
     correction_layers: int = _optional(10)
     correction_dilations: tuple[int, ...] = _optional(())
+    # `layered`: the second net starts from, and is shown, what would set each point right where it is in focus.
+    focus_feedback: bool = _optional(False)
     planes: int = _optional(6)
 
     def __post_init__(self) -> None:
@@ -130,6 +132,8 @@ class NetworkConfig:
         direct = self.architecture == "direct"
         self._require("frames", self.frames >= 1 and (direct or self.frames == 1), "1; `direct` may have more")
         self._require("blur_input", direct or not self.blur_input, "false; only `direct` can have it")
+        layered = self.architecture == "layered"
+        self._require("focus_feedback", layered or not self.focus_feedback, "false; only `layered` can have it")
         self._require("pupil_inputs", self.architecture != "layered" or self.pupil_inputs, "true for `layered`")
         self._require(
             "correction_dilations",

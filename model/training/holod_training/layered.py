@@ -7,11 +7,11 @@ from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.network import OUTPUT_CHANNELS, FieldNetwork, Trunk
-from holod_training.optics import frequencies, stop_half_band, transfer
+from holod_training.optics import frequencies, intensity, pupil_mask, stop_half_band, transfer
 
 LOG_FLOOR = 0.03
 LOG_OFFSET = 1.66
@@ -19,6 +19,9 @@ SIGMAS_PX = (1.0, 2.5, 6.0)
 PRIOR_GAINS = (-0.5, -1.0, 0.0)
 REFERENCE_NM = 520.0
 CORRECTION_SHARE = 0.3
+FEEDBACK_SHARE = 0.5
+FEEDBACK_CHANNELS = 9
+DARK = 1e-6
 
 
 @lru_cache(maxsize=32)
@@ -70,6 +73,30 @@ def compose(source: Tensor, depth: Tensor, optics: OpticsConfig, count: int, sca
     return carry(field, optics, scale, -centres[-1])
 
 
+def refocus(
+    field: Tensor, light: Tensor, depth: Tensor, pupil_mm: Tensor, optics: OpticsConfig, count: int, scale: int = 1
+) -> tuple[Tensor, Tensor]:
+    """What an eye lacks of the amplitude `light` [N, 3, h, w] where each point is in focus, and the change of the field
+    at the SLM plane, both [N, 3, h, w], that would give it: one step of Gerchberg and Saxton (1972) at all `count`
+    layers of depth [N, H, W] at once, through pupils [N]. It keeps the phases there; the layers change one another too.
+    """
+    height, width = field.shape[-2:]
+    fy, fx = (frequencies(size, scale * optics.pitch_m, field.device) for size in (height, width))
+    pupil = pupil_mask(optics, fx, fy, pupil_mm[:, None, None])
+    layer = (depth * count).long().clamp(0, count - 1)[:, None]
+    spectrum = torch.fft.fft2(field) * pupil
+    change, lack = torch.zeros_like(spectrum), torch.zeros_like(light)
+    for k in range(count):
+        distance_m = optics.distance_m(optics.dioptres((k + 0.5) / count))
+        kernel = carrier(optics, scale, height, width, distance_m, field.dtype, str(field.device))
+        arriving = torch.fft.ifft2(spectrum * kernel)
+        amplitude = torch.sqrt(intensity(arriving) + DARK)
+        here = (light - amplitude) * F.avg_pool2d((layer == k).to(light.dtype), scale)
+        change = change + torch.fft.fft2(arriving * (here / amplitude)) * kernel.conj()
+        lack = lack + here
+    return lack, torch.fft.ifft2(change * pupil)
+
+
 def drift_phase(centred: Tensor, logs: Tensor, optics: OpticsConfig, gates: Tensor | float = 0.0) -> Tensor:
     """The phase [..., 3, h, w] that makes light drift from bright to dark where it is out of focus:
     (520 nm / λ) · Σ_j (g_j · tanh(4·(½ − D)) + gate_j) · L_j, from D − ½ [..., 1, h, w], blurs of log(I + 0.03) + 1.66
@@ -83,7 +110,8 @@ def drift_phase(centred: Tensor, logs: Tensor, optics: OpticsConfig, gates: Tens
 class LayeredNetwork(FieldNetwork):
     """Net 1 (`surface`) gives each point of the network's grid and each colour a correction of amplitude, a phase, and
     gates of three blurs; `depth_layers` are composed far to near with occlusion and carried to the SLM plane; net 2
-    (`correction`) sees that field and adds a residual to it.
+    (`correction`) sees that field and adds a residual to it. With `focus_feedback` the field first takes a learned
+    share of what would set each point right where it is in focus (`refocus`), which net 2 sees too.
 
     With `transport_prior` the phase starts where light flows from bright to dark away from focus, as a wider pupil
     makes it: φ ∝ tanh(4·(½ − D)) · G_σ(log(I + 0.03)), from the transport of intensity I·∇φ ∝ −∇I.
@@ -105,13 +133,15 @@ class LayeredNetwork(FieldNetwork):
         )
         self.correction = Trunk(
             config,
-            inputs=OUTPUT_CHANNELS + maps,
+            inputs=OUTPUT_CHANNELS + maps + FEEDBACK_CHANNELS * config.focus_feedback,
             outputs=OUTPUT_CHANNELS,
             layers=config.correction_layers,
             dilations=config.correction_dilations,
             adjustable_layers=(),
             last_share=0.1,
         )
+        if config.focus_feedback:
+            self.feedback_share = nn.Parameter(torch.tensor([FEEDBACK_SHARE]))
 
     def forward(
         self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor, trace: dict[str, Tensor] | None = None
@@ -134,9 +164,16 @@ class LayeredNetwork(FieldNetwork):
         out = run("surface", self.surface, seen)
         source = self.surface_light(out, light, self.mean(depth[:, None] - 0.5), soft, logs)
         field = compose(source, depth, self.config.optics, self.config.depth_layers, self.scale)
-        residual = run("correction", self.correction, torch.cat((field.real, field.imag, maps), dim=1))
         if trace is not None:
             trace |= {"source": source, "carried": field}
+        seen = maps
+        if self.config.focus_feedback:
+            lack, change = refocus(
+                field, light, depth, pupil_mm, self.config.optics, self.config.depth_layers, self.scale
+            )
+            field = field + self.feedback_share * change
+            seen = torch.cat((maps, change.real, change.imag, lack), dim=1)
+        residual = run("correction", self.correction, torch.cat((field.real, field.imag, seen), dim=1))
         field = field + CORRECTION_SHARE * torch.complex(residual[:, :3].contiguous(), residual[:, 3:].contiguous())
         return field if self.scale == 2 else stop_half_band(field)
 

@@ -77,15 +77,15 @@ def stop_half_band(field: Tensor) -> Tensor:
     return torch.fft.ifft2(torch.fft.fft2(field) * half_band_mask(height, width, field.device))
 
 
-def pupil_mask(optics: OpticsConfig, fx: Tensor, fy: Tensor, pupil_mm: float, shift_mm: float = 0.0) -> Tensor:
+def pupil_mask(optics: OpticsConfig, fx: Tensor, fy: Tensor, pupil_mm: float | Tensor, shift_mm: float = 0.0) -> Tensor:
     """The eye's pupil in the Fourier plane, bool [3, len(fy), len(fx)]: a disc of radius (s/2)/(λ·f), its centre
-    `shift_mm` along x from the eyebox's."""
+    `shift_mm` along x from the eyebox's. Of pupils [N, 1, 1], [N, 3, len(fy), len(fx)]."""
     masks = []
     for wavelength in optics.wavelengths_m:
         per_mm = 1e-3 / (wavelength * optics.focal_length_m)
         radius = torch.sqrt((fx[None, :] - shift_mm * per_mm) ** 2 + fy[:, None] ** 2)
         masks.append(radius < 0.5 * pupil_mm * per_mm)
-    return torch.stack(masks)
+    return torch.stack(masks, dim=-3)
 
 
 def upsample_half_band(low: Tensor) -> Tensor:

@@ -48,6 +48,7 @@ VARIANTS: dict[str, NetworkConfig] = {
     "two-frames": replace(_HALF_BAND, frames=2),
     "half-band-layered": _HALF_BAND_LAYERED,
     "half-band-layered-no-prior": replace(_HALF_BAND_LAYERED, transport_prior=False),
+    "half-band-layered-feedback": replace(_HALF_BAND_LAYERED, transport_prior=False, focus_feedback=True),
     "half-band-layered-small": replace(
         _HALF_BAND_LAYERED, layers=4, channels=24, adjustable_layers=(2,), correction_layers=6
     ),

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
+import torch.nn.functional as F
 from safetensors import safe_open
 
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
 from holod_training.costs import operations_per_pixel
-from holod_training.layered import LayeredNetwork, blurred
+from holod_training.layered import LayeredNetwork, blurred, carry, refocus
 from holod_training.metrics import focus_response
 from holod_training.network import DirectNetwork
 from holod_training.optics import Eye, half_band_mask, propagate, stop_half_band, upsample_half_band
@@ -58,6 +59,7 @@ def test_the_table_is_what_it_says() -> None:
         ("half-band-layered", 178_818),
         ("half-band-layered-small", 68_698),
         ("half-band-layered-small-no-prior", 66_097),
+        ("half-band-layered-feedback", 177_946),
     ):
         assert sum(p.numel() for p in build_network(variant(name)).parameters()) == parameters, name
     # Two operations a weight of each 3x3 convolution, the offsets' too; taps and FFTs are a few per cent.
@@ -76,6 +78,7 @@ def test_configs_that_do_not_fit_say_which_key() -> None:
         ({"correction_dilations": (0,) * 10}, "correction_dilations: .* of at least 1"),
         ({"architecture": "layered", "pupil_inputs": False}, "pupil_inputs: found False, expected true"),
         ({"architecture": "focal-stack", "frames": 2}, "frames: found 2"),
+        ({"focus_feedback": True}, "focus_feedback: found True, expected false"),
         ({"specialists_mm": (3.0, 2.0)}, "specialists_mm: .* rising order"),
     ):
         with pytest.raises(ConfigError, match=message):
@@ -234,6 +237,31 @@ def test_half_band_without_learning_is_the_layered_rival_of_a_smooth_scene() -> 
     assert error(unlearned("half-band", transport_prior=False)) < 0.03
     assert error(unlearned("half-band")) > 0.1
     assert error(unlearned("half-band", transport_prior=False), turned=True) > 0.1
+
+
+def test_refocusing_sets_right_what_an_eye_lacks_in_focus_through_its_pupil() -> None:
+    optics, count, layer = OpticsConfig(), 8, 6
+    depth = torch.full((1, 64, 64), (layer + 0.5) / count)
+    distance_m = optics.distance_m(optics.dioptres((layer + 0.5) / count))
+    amplitude = F.interpolate(0.3 + 0.6 * torch.rand(1, 3, 4, 4), size=(32, 32), mode="bicubic").clamp(0.2, 1)
+    phase = F.interpolate(torch.rand(1, 3, 4, 4), size=(32, 32), mode="bicubic")
+    there = torch.polar(amplitude, phase)
+    wrong = there.clone()
+    wrong[..., 10:20, 10:20] *= 0.7
+    field = carry(wrong, optics, 2, -distance_m)
+
+    lack, change = refocus(field, amplitude, depth, torch.tensor([5.0]), optics, count, 2)
+    torch.testing.assert_close(lack, amplitude - wrong.abs(), atol=1e-4, rtol=0)
+    mended = carry(field + change, optics, 2, distance_m)
+    torch.testing.assert_close(mended, there, atol=1e-3, rtol=0)
+    assert (carry(field, optics, 2, distance_m) - there).abs().max() > 0.1
+    # Of another depth it would be another change, and what a narrow pupil cuts off is no part of it.
+    elsewhere = refocus(field, amplitude, 0.5 * depth, torch.tensor([5.0]), optics, count, 2)[1]
+    assert (elsewhere - change).abs().max() > 0.02
+    narrow = refocus(field, amplitude, depth, torch.tensor([1.0]), optics, count, 2)[1]
+    spectrum = torch.fft.fft2(narrow).abs()
+    assert torch.fft.fft2(change).abs()[..., 0, 15:18].max() > 1e-3 * spectrum.max()
+    assert spectrum[..., 0, 15:18].max() < 1e-4 * spectrum.max()
 
 
 @pytest.mark.parametrize("grid", GRIDS)
