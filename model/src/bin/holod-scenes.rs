@@ -54,14 +54,13 @@ struct Generate {
     backend: Backend,
 }
 
-/// All but the first need a build with the feature `gpu`.
 #[derive(Clone, Copy, ValueEnum)]
 enum Backend {
     /// The processor's cores.
     Cpu,
-    /// The best graphics processor that Vulkan shows.
+    /// The best graphics processor that Vulkan shows (in a build with `--features gpu`).
     Gpu,
-    /// A processor that plays one (Mesa's llvmpipe): slow, to test the shaders.
+    /// A processor that plays one, Mesa's llvmpipe: slow, to test the shaders (likewise).
     Software,
 }
 
@@ -142,7 +141,7 @@ struct Sheet {
 struct Bench {
     #[command(flatten)]
     measure: Measure,
-    /// What is measured beside the processor.
+    /// What is measured beside the processor; `cpu`: nothing.
     #[arg(long, value_enum, default_value_t = Backend::Cpu)]
     backend: Backend,
 }

@@ -51,7 +51,12 @@ impl Gpu {
         found.sort_by_key(rank);
         let usable = |adapter: &&wgpu::Adapter| (adapters == Adapters::Software) == (rank(adapter) == 3);
         let Some(adapter) = found.iter().find(usable) else {
-            return Err(GpuError::None { passed_over: found.iter().map(|adapter| adapter.get_info().name).collect() });
+            let wanted = match adapters {
+                Adapters::Hardware => "GPU; install its driver",
+                Adapters::Software => "software device; install mesa-vulkan-drivers",
+            };
+            let passed_over = found.iter().map(|adapter| adapter.get_info().name).collect();
+            return Err(GpuError::None { wanted, passed_over });
         };
         let name = adapter.get_info().name;
         let descriptor = wgpu::DeviceDescriptor {
@@ -152,10 +157,15 @@ impl Gpu {
     /// Waits until the work of `submission`, and all before it, is done.
     pub(crate) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), GpuError> {
         let until = wgpu::PollType::Wait { submission_index: Some(submission), timeout: Some(PATIENCE) };
-        // wgpu panics in `poll` where a device is lost, after it has told the callback.
-        let polled = catch_unwind(AssertUnwindSafe(|| self.device.poll(until)));
+        self.guarded(|| self.device.poll(until).map(drop))
+    }
+
+    /// What was told late comes first: it is the cause. wgpu panics where a device is lost in `poll`, after it has told
+    /// the callback.
+    fn guarded<E: ToString>(&self, poll: impl FnOnce() -> Result<(), E>) -> Result<(), GpuError> {
+        let polled = catch_unwind(AssertUnwindSafe(poll));
         self.check()?;
-        polled.map_err(|_| self.failed("it was lost"))?.map(|_| ()).map_err(|error| self.failed(error))
+        polled.map_err(|_| self.failed("it was lost"))?.map_err(|error| self.failed(error))
     }
 
     /// Copies a buffer that was made with `COPY_SRC` to `values`, once all work before is done.
@@ -225,6 +235,8 @@ mod tests {
         let gpu = gpu();
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
         let buffer = gpu.buffer("numbers", 12, usage).expect("a buffer");
+        let panicked = gpu.guarded::<String>(|| panic!("as wgpu does")).expect_err("a panic");
+        assert!(panicked.to_string().contains("it was lost"), "{panicked}");
         gpu.device.destroy();
         assert!(matches!(gpu.read(&buffer, &mut [0.0; 3]), Err(GpuError::Failed { .. })));
     }

@@ -13,8 +13,10 @@ pub enum GpuError {
     #[error("this program was built without the GPU; build it with `--features gpu`, or choose --backend cpu")]
     NotBuilt,
     /// No device is there.
-    #[error("Vulkan shows no such device{}; install the GPU's driver, or choose --backend cpu", found(passed_over))]
+    #[error("Vulkan shows {} and no {wanted}, or choose --backend cpu", found(passed_over))]
     None {
+        /// What was looked for, and what to do.
+        wanted: &'static str,
         /// Names of devices of the other kind, such as a processor that plays a GPU.
         passed_over: Vec<String>,
     },
@@ -53,5 +55,5 @@ pub enum GpuError {
 }
 
 fn found(passed_over: &[String]) -> String {
-    if passed_over.is_empty() { String::new() } else { format!(", only {}", passed_over.join(", ")) }
+    if passed_over.is_empty() { "nothing".to_owned() } else { passed_over.join(", ") }
 }

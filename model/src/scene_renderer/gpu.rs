@@ -23,7 +23,7 @@ const LEAF: usize = 4;
 
 /// The two shaders, ready to run.
 pub(super) struct GpuTracer {
-    pub(super) gpu: Gpu,
+    gpu: Gpu,
     draw: wgpu::ComputePipeline,
     add: wgpu::ComputePipeline,
 }

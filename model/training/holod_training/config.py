@@ -132,8 +132,10 @@ class NetworkConfig:
         direct = self.architecture == "direct"
         self._require("frames", self.frames >= 1 and (direct or self.frames == 1), "1; `direct` may have more")
         self._require("blur_input", direct or not self.blur_input, "false; only `direct` can have it")
-        layered = self.architecture == "layered"
-        self._require("focus_feedback", layered or not self.focus_feedback, "false; only `layered` can have it")
+        fed_back = self.architecture == "layered" and self.grid == "half-band"
+        self._require(
+            "focus_feedback", fed_back or not self.focus_feedback, "false; only `layered` on `half-band` can have it"
+        )
         self._require("pupil_inputs", self.architecture != "layered" or self.pupil_inputs, "true for `layered`")
         self._require(
             "correction_dilations",

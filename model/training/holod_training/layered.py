@@ -78,7 +78,8 @@ def refocus(
 ) -> tuple[Tensor, Tensor]:
     """What an eye lacks of the amplitude `light` [N, 3, h, w] where each point is in focus, and the change of the field
     at the SLM plane, both [N, 3, h, w], that would give it: one step of Gerchberg and Saxton (1972) at all `count`
-    layers of depth [N, H, W] at once, through pupils [N]. It keeps the phases there; the layers change one another too.
+    layers of depth [N, H, W] at once, through pupils [N], of which only those below 2.3 mm cut the half band of the
+    default bench. It keeps the phases there; the layers change one another too.
     """
     height, width = field.shape[-2:]
     fy, fx = (frequencies(size, scale * optics.pitch_m, field.device) for size in (height, width))
@@ -147,7 +148,8 @@ class LayeredNetwork(FieldNetwork):
         self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor, trace: dict[str, Tensor] | None = None
     ) -> Tensor:
         """`trace`, where given, receives what each stage puts out: both nets' `encoded`, `layer_{i}` and `offsets_{i}`
-        under their names and a dot, the light of the surfaces under `source`, the carried field under `carried`."""
+        under their names and a dot, the light of the surfaces under `source`, the carried field under `carried`
+        (before any feedback)."""
 
         def run(name: str, trunk: Trunk, x: Tensor) -> Tensor:
             inner: dict[str, Tensor] | None = None if trace is None else {"encoded": x}

@@ -51,8 +51,8 @@ def _opening(result: dict[str, Any]) -> list[str]:
         f"brackets their 95 % interval (Student's t). Amplitude constant {result['amplitude_constant']}. Slope and "
         "correlation: P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, 0 = one picture at all "
         f"depths). In focus: CoC < 2 px; out of focus: CoC > 8 px. Everything is after double phase.{optimised} Two "
-        "rows are no holograms: the flat oracle is the target's mean at every focus, RGB-D blur is what an incoherent "
-        "display would show that knows the picture and its depth alone: what it lacks, RGB-D leaves open.",
+        "rows are no holograms: the flat oracle is the target's mean at every focus, RGB-D blur is what a simple "
+        "incoherent display would show that knows the picture and its depth alone, and guesses nothing that is hidden.",
     ]
 
 

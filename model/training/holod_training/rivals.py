@@ -1,5 +1,5 @@
-"""What the network must beat: holograms made without learning, and the oracle that has no focus. And what no hologram
-has to show: the blur that one picture with depth lets one guess."""
+"""What the network must beat: holograms made without learning, and the oracle that has no focus. And what a
+display without holograms would show of the same input."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from holod_training.optics import coc_px, frequencies, propagate, stop_half_band
 
 OCCLUSION_LAYERS = 8
 SMOOTH_PHASE_LAYERS = 24
-RGBD_BLUR_LAYERS = 24
+RGBD_BLUR_LAYERS = 32
+SHARP_PX = 0.7
 ANTI_ALIASING_SIGMA_PX = 0.7
 
 
@@ -76,35 +77,36 @@ def gaussian_blur(light: Tensor, sigma_px: float, radius_px: int | None = None) 
 def rgbd_blur(
     amplitude: Tensor, depth: Tensor, optics: OpticsConfig, focus_dpt: list[float], pupil_mm: float
 ) -> Tensor:
-    """The focal stack [K, 3, H, W] that a display of incoherent light would show which knows the picture and its depth
-    alone: twenty-four layers, each blurred by its disc of confusion, composed far to near, and divided by the light
-    that a white scene would have, for where nothing is known behind an edge.
+    """The focal stack [K, 3, H, W] that a simple display of incoherent light would show which knows the picture and its
+    depth alone: layers, each blurred by its disc of confusion, composed far to near, and divided by the light that a
+    white scene would have, for where nothing is known behind an edge. Blur is circular.
 
-    It has no hologram and none of its faults. How far it is from the target is what a picture with depth leaves open.
+    It has no hologram and none of its faults, but guesses nothing of what is hidden: a network may do better.
     """
     height, width = depth.shape
     light = amplitude.square()
     layer = (depth * RGBD_BLUR_LAYERS).long().clamp(0, RGBD_BLUR_LAYERS - 1)
-    centres = (torch.arange(RGBD_BLUR_LAYERS, device=depth.device) + 0.5) / RGBD_BLUR_LAYERS
-    blurs = coc_px(optics, centres[None].to(depth.dtype), focus_dpt, pupil_mm)[:, 0]
+    centres = (torch.arange(RGBD_BLUR_LAYERS, dtype=depth.dtype, device=depth.device) + 0.5) / RGBD_BLUR_LAYERS
+    blurs_px = coc_px(optics, centres[None], focus_dpt, pupil_mm)[:, 0]
     fy = frequencies(height, 1.0, depth.device)[:, None]
     fx = torch.fft.rfftfreq(width, dtype=torch.float64, device=depth.device)
-    turns = math.pi * torch.sqrt(fx**2 + fy**2)
+    turns = (math.pi * torch.sqrt(fx**2 + fy**2)).to(depth.dtype)
     # White and the three colours.
     seen = torch.zeros(len(focus_dpt), 4, height, width, dtype=depth.dtype, device=depth.device)
     for k in range(RGBD_BLUR_LAYERS):
-        # As in `layered.compose`: slanted surfaces show no seams.
-        inside = ((layer == k) | (layer == k + 1)).to(depth.dtype)
+        inside = (layer == k).to(depth.dtype)
         if not inside.any():
             continue
-        spectrum = torch.fft.rfft2(torch.cat((inside[None], light * inside)))
-        for plane, blur in zip(seen, blurs[:, k].tolist(), strict=True):
-            # A disc's spectrum, 2·J1(x)/x.
-            x = (blur * turns).clamp_min(1e-6)
-            disc = (2 * torch.special.bessel_j1(x) / x).to(depth.dtype)
-            blurred = torch.fft.irfft2(spectrum * disc, s=(height, width))
+        sharp = torch.cat((inside[None], light * inside))
+        spectrum = torch.fft.rfft2(sharp)
+        for plane, blur_px in zip(seen, blurs_px[:, k].tolist(), strict=True):
+            blurred = sharp
+            if blur_px > SHARP_PX:
+                # A disc's spectrum.
+                x = (blur_px * turns).clamp_min(1e-4)
+                blurred = torch.fft.irfft2(spectrum * (2 * torch.special.bessel_j1(x) / x), s=(height, width))
             plane.mul_(1 - blurred[0].clamp(0, 1)).add_(blurred)
-    return seen[:, 1:] / seen[:, :1].clamp_min(1e-3)
+    return seen[:, 1:].div_(seen[:, :1].clamp_min(1e-3))
 
 
 def flat_oracle(target: Tensor) -> Tensor:

@@ -358,15 +358,20 @@ def test_rgbd_blur_is_a_disc_of_confusion_that_nearer_things_hide() -> None:
     assert inside.mean().item() == pytest.approx(expected, rel=0.1)
     assert soft[0][radius > 0.5 * diameter + 1].abs().max() < 0.3 * expected
 
-    # A bright half in front of a dark one: in focus its edge is sharp, and it hides what is behind.
+    # A bright half in front of a dark one: where its disc covers the share α of a pixel, α of its light is there.
     depth = torch.full((64, 64), far)
     depth[:, :32] = near
     amplitude = torch.where(depth == near, 0.9, 0.1).expand(3, -1, -1)
-    for plane, picture in enumerate(rgbd_blur(amplitude, depth, OPTICS, focus, 2.0)):
-        assert (picture[:, :, 10:20] - 0.81).abs().max() < 0.02
-        assert (picture[:, :, 44:54] - 0.01).abs().max() < 0.02
-        edge = (picture[0, 32, 30] - picture[0, 32, 33]).item()
-        assert (edge > 0.7) == (plane == 0)
+    sharp, soft = rgbd_blur(amplitude, depth, OPTICS, focus, 2.0)
+    torch.testing.assert_close(sharp, amplitude.square(), atol=1e-3, rtol=0)
+    for column in (33, 35, 37):
+        t = (column + 0.5 - 32) / (0.5 * diameter)
+        cover = (math.acos(t) - t * math.sqrt(1 - t * t)) / math.pi
+        assert soft[0, 32, column].item() == pytest.approx(0.01 + 0.8 * cover, abs=0.02)
+
+    # A slope of one colour has no seams.
+    slope = torch.linspace(0.1, 0.9, 64).expand(64, -1)
+    assert (rgbd_blur(torch.full((3, 64, 64), 0.7), slope, OPTICS, focus, 3.0) - 0.49).abs().max() < 0.01
 
 
 def test_flat_oracle_shows_one_picture() -> None:

@@ -13,7 +13,15 @@ from holod_training.costs import operations_per_pixel
 from holod_training.layered import LayeredNetwork, blurred, carry, refocus
 from holod_training.metrics import focus_response
 from holod_training.network import DirectNetwork
-from holod_training.optics import Eye, half_band_mask, propagate, stop_half_band, upsample_half_band
+from holod_training.optics import (
+    Eye,
+    frequencies,
+    half_band_mask,
+    propagate,
+    pupil_mask,
+    stop_half_band,
+    upsample_half_band,
+)
 from holod_training.rivals import layered_asm
 from holod_training.shards import Stack
 from holod_training.variants import VARIANTS, build_network, network_amplitude, variant
@@ -79,6 +87,7 @@ def test_configs_that_do_not_fit_say_which_key() -> None:
         ({"architecture": "layered", "pupil_inputs": False}, "pupil_inputs: found False, expected true"),
         ({"architecture": "focal-stack", "frames": 2}, "frames: found 2"),
         ({"focus_feedback": True}, "focus_feedback: found True, expected false"),
+        ({"architecture": "layered", "grid": "full", "focus_feedback": True}, "focus_feedback: found True"),
         ({"specialists_mm": (3.0, 2.0)}, "specialists_mm: .* rising order"),
     ):
         with pytest.raises(ConfigError, match=message):
@@ -240,28 +249,54 @@ def test_half_band_without_learning_is_the_layered_rival_of_a_smooth_scene() -> 
 
 
 def test_refocusing_sets_right_what_an_eye_lacks_in_focus_through_its_pupil() -> None:
+    torch.manual_seed(3)
     optics, count, layer = OpticsConfig(), 8, 6
-    depth = torch.full((1, 64, 64), (layer + 0.5) / count)
+    depth = torch.full((2, 64, 64), (layer + 0.5) / count)
     distance_m = optics.distance_m(optics.dioptres((layer + 0.5) / count))
-    amplitude = F.interpolate(0.3 + 0.6 * torch.rand(1, 3, 4, 4), size=(32, 32), mode="bicubic").clamp(0.2, 1)
-    phase = F.interpolate(torch.rand(1, 3, 4, 4), size=(32, 32), mode="bicubic")
+    amplitude = F.interpolate(0.3 + 0.6 * torch.rand(2, 3, 4, 4), size=(32, 32), mode="bicubic").clamp(0.2, 1)
+    phase = F.interpolate(torch.rand(2, 3, 4, 4), size=(32, 32), mode="bicubic")
     there = torch.polar(amplitude, phase)
     wrong = there.clone()
     wrong[..., 10:20, 10:20] *= 0.7
     field = carry(wrong, optics, 2, -distance_m)
 
-    lack, change = refocus(field, amplitude, depth, torch.tensor([5.0]), optics, count, 2)
-    torch.testing.assert_close(lack, amplitude - wrong.abs(), atol=1e-4, rtol=0)
+    # The second eye's pupil lets but a part of the band through.
+    lack, change = refocus(field, amplitude, depth, torch.tensor([5.0, 1.0]), optics, count, 2)
+    torch.testing.assert_close(lack[0], amplitude[0] - wrong[0].abs(), atol=1e-4, rtol=0)
     mended = carry(field + change, optics, 2, distance_m)
-    torch.testing.assert_close(mended, there, atol=1e-3, rtol=0)
-    assert (carry(field, optics, 2, distance_m) - there).abs().max() > 0.1
-    # Of another depth it would be another change, and what a narrow pupil cuts off is no part of it.
-    elsewhere = refocus(field, amplitude, 0.5 * depth, torch.tensor([5.0]), optics, count, 2)[1]
-    assert (elsewhere - change).abs().max() > 0.02
-    narrow = refocus(field, amplitude, depth, torch.tensor([1.0]), optics, count, 2)[1]
-    spectrum = torch.fft.fft2(narrow).abs()
-    assert torch.fft.fft2(change).abs()[..., 0, 15:18].max() > 1e-3 * spectrum.max()
-    assert spectrum[..., 0, 15:18].max() < 1e-4 * spectrum.max()
+    torch.testing.assert_close(mended[0], there[0], atol=1e-3, rtol=0)
+    assert (carry(field, optics, 2, distance_m)[0] - there[0]).abs().max() > 0.1
+    fy = fx = frequencies(32, 16e-6)
+    narrow = torch.fft.ifft2(torch.fft.fft2(wrong[1]) * pupil_mask(optics, fx, fy, 1.0))
+    torch.testing.assert_close(lack[1], amplitude[1] - narrow.abs(), atol=1e-3, rtol=0)
+    beyond = torch.fft.fft2(change).abs()[..., 0, 15:18].amax(dim=(1, 2))
+    assert beyond[1] < 1e-3 * beyond[0]
+
+    # Half of the picture at another depth: each half is set right at its own.
+    depth[:, :, :32] = 1.5 / count
+    both = refocus(field, amplitude, depth, torch.tensor([5.0, 5.0]), optics, count, 2)[0]
+    far = carry(carry(field, optics, 2, 0), optics, 2, optics.distance_m(optics.dioptres(1.5 / count)))
+    torch.testing.assert_close(both[..., 16:], (amplitude - wrong.abs())[..., 16:], atol=1e-4, rtol=0)
+    torch.testing.assert_close(both[..., :16], (amplitude - far.abs())[..., :16], atol=1e-4, rtol=0)
+
+
+def test_feedback_adds_its_share_before_the_second_net_sees_the_field() -> None:
+    torch.manual_seed(4)
+    config = dataclasses.replace(variant("half-band-layered-feedback"), channels=4)
+    network = build_network(config)
+    amplitude, depth = scene(config, 1, 32)
+    pupil, trace = torch.tensor([3.0]), dict[str, torch.Tensor]()
+    with torch.no_grad():
+        found = network(amplitude, depth, pupil, trace)
+        light = F.avg_pool2d(amplitude, 2)
+        lack, change = refocus(trace["carried"], light, depth, pupil, config.optics, 8, 2)
+        field = trace["carried"] + 0.5 * change
+        real, imaginary = trace["correction.layer_9"].split(3, dim=1)
+    torch.testing.assert_close(found, field + 0.3 * torch.complex(real, imaginary), rtol=1e-5, atol=1e-5)
+    seen = trace["correction.encoded"]
+    torch.testing.assert_close(seen[:, :6], torch.cat((field.real, field.imag), dim=1))
+    torch.testing.assert_close(seen[:, -9:], torch.cat((change.real, change.imag, lack), dim=1))
+    assert change.abs().mean() > 0.01
 
 
 @pytest.mark.parametrize("grid", GRIDS)
