@@ -59,6 +59,10 @@ pub struct NetworkConfig {
     /// `layered`: 3x3 layers of the net that corrects what arrives at the SLM plane.
     #[serde(default = "default_correction_layers", skip_serializing_if = "is_default_correction_layers")]
     pub correction_layers: usize,
+    /// `layered`: whether the field takes a share of what would set each point right where it is in focus, which the
+    /// second net sees.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub focus_feedback: bool,
 }
 
 // The trainer leaves out what has its default, so that files of older networks stay as they are.
@@ -160,13 +164,25 @@ impl TrainedOptics {
 /// The stacks of layers that a family has.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Family {
-    Direct { layers: Vec<Layer> },
-    Layered { surface: Vec<Layer>, correction: Vec<Layer> },
+    Direct {
+        layers: Vec<Layer>,
+    },
+    Layered {
+        surface: Vec<Layer>,
+        correction: Vec<Layer>,
+        /// Of what would set each point right, where the network has it fed back.
+        feedback_share: Option<f32>,
+    },
 }
 
 impl Family {
-    /// Every stack with the name that its tensors begin with, as `config` asks for it.
-    fn read<E>(config: &NetworkConfig, mut layer: impl FnMut(&LayerShape) -> Result<Layer, E>) -> Result<Self, E> {
+    /// Every stack with the name that its tensors begin with, as `config` asks for it; `number` gives a tensor of one
+    /// value.
+    fn read<E>(
+        config: &NetworkConfig,
+        mut layer: impl FnMut(&LayerShape) -> Result<Layer, E>,
+        number: impl Fn(&str) -> Result<f32, E>,
+    ) -> Result<Self, E> {
         let mut stack = |name, inputs, outputs, count, adjustable: &[usize]| {
             (0..count)
                 .map(|index| {
@@ -192,11 +208,12 @@ impl Family {
                     surface: stack("surface", maps + 3 * prior, outputs, config.layers, adjustable)?,
                     correction: stack(
                         "correction",
-                        OUTPUT_CHANNELS + maps,
+                        OUTPUT_CHANNELS + maps + FEEDBACK_CHANNELS * usize::from(config.focus_feedback),
                         OUTPUT_CHANNELS,
                         config.correction_layers,
                         &[],
                     )?,
+                    feedback_share: config.focus_feedback.then(|| number(FEEDBACK_SHARE)).transpose()?,
                 }
             }
         })
@@ -373,7 +390,7 @@ impl Weights {
 
         let config = metadata.config()?;
         let file = TensorReader { name, tensors };
-        let family = Family::read(&config, |shape| file.layer(shape))?;
+        let family = Family::read(&config, |shape| file.layer(shape), |tensor| Ok(file.tensor(tensor, &[1])?[0]))?;
         Ok(Self { config, family, metrics: metadata.remark("metrics"), provenance: metadata.remark("provenance") })
     }
 
@@ -474,6 +491,12 @@ impl Metadata<'_> {
             format!("{:?}", config.grid),
             "\"half-band\" for `layered`",
         )?;
+        require(
+            config.architecture == Architecture::Layered || !config.focus_feedback,
+            "focus_feedback",
+            config.focus_feedback.to_string(),
+            "false; only `layered` can have it",
+        )?;
         require((1..=256).contains(channels), "channels", channels.to_string(), "1 to 256")?;
         let adjustable = &config.adjustable_layers;
         require(
@@ -571,6 +594,13 @@ impl TensorReader<'_> {
 /// Real and imaginary residual of three colours.
 pub(crate) const OUTPUT_CHANNELS: usize = 6;
 
+/// What the `layered` family's second net sees of a feedback: real and imaginary change, and what is lacking, of three
+/// colours.
+pub(crate) const FEEDBACK_CHANNELS: usize = 9;
+
+/// The name of the tensor with the share of the change that the field takes.
+const FEEDBACK_SHARE: &str = "feedback_share";
+
 /// Gaussian blurs between which the `layered` family's first net chooses.
 pub(crate) const LAYERED_BLURS: usize = 3;
 
@@ -606,7 +636,7 @@ pub(crate) mod tests {
         let mut tensor = |count: usize, scale: f32| -> Vec<f32> {
             (0..count).map(|_| random.random_range(-1.0f32..1.0) * scale).collect()
         };
-        let family = Family::read(&config, |shape| {
+        let layer = |shape: &LayerShape| {
             let &LayerShape { in_channels, out_channels, .. } = shape;
             let scale = (3.0 / (9 * in_channels) as f32).sqrt();
             let modulated = OFFSET_CHANNELS * in_channels + OFFSET_CHANNELS;
@@ -626,8 +656,8 @@ pub(crate) mod tests {
                 bias: tensor(out_channels, 0.1),
                 adjustable,
             })
-        })
-        .unwrap();
+        };
+        let family = Family::read(&config, layer, |_| Ok(0.6)).unwrap();
         Weights { config, family, metrics: serde_json::Value::Null, provenance: serde_json::Value::Null }
     }
 
@@ -635,7 +665,7 @@ pub(crate) mod tests {
     fn tensors(weights: &Weights) -> Vec<(String, Vec<usize>, Vec<f32>)> {
         let stacks = match &weights.family {
             Family::Direct { layers } => vec![("layers", layers)],
-            Family::Layered { surface, correction } => vec![("surface", surface), ("correction", correction)],
+            Family::Layered { surface, correction, .. } => vec![("surface", surface), ("correction", correction)],
         };
         let layers = stacks.into_iter().flat_map(|(stack, layers)| {
             layers.iter().enumerate().map(move |(index, layer)| (format!("{stack}.{index}"), layer))
@@ -656,6 +686,9 @@ pub(crate) mod tests {
                     add(&format!("modulation.{step}.bias"), vec![bias.len()], bias);
                 }
             }
+        }
+        if let Family::Layered { feedback_share: Some(share), .. } = weights.family {
+            tensors.push((FEEDBACK_SHARE.into(), vec![1], vec![share]));
         }
         tensors
     }
@@ -680,6 +713,7 @@ pub(crate) mod tests {
             depth_layers: default_depth_layers(),
             transport_prior: default_transport_prior(),
             correction_layers: default_correction_layers(),
+            focus_feedback: false,
         }
     }
 
@@ -728,9 +762,13 @@ pub(crate) mod tests {
         let layered = Weights::from_bytes(&file_of(layered_config(), |_, _| {}), "test").unwrap();
         let expected = random_weights(layered_config(), 1);
         assert_eq!((&layered.config, &layered.family), (&expected.config, &expected.family));
-        let without_prior = NetworkConfig { transport_prior: false, ..layered_config() };
-        let read = Weights::from_bytes(&file_of(without_prior.clone(), |_, _| {}), "test").unwrap();
-        assert_eq!((&read.config, &read.family), (&without_prior, &random_weights(without_prior.clone(), 1).family));
+        for other in [
+            NetworkConfig { transport_prior: false, ..layered_config() },
+            NetworkConfig { focus_feedback: true, ..layered_config() },
+        ] {
+            let read = Weights::from_bytes(&file_of(other.clone(), |_, _| {}), "test").unwrap();
+            assert_eq!((&read.config, &read.family), (&other, &random_weights(other.clone(), 1).family));
+        }
         let written = |config: NetworkConfig| serde_json::to_string(&config).unwrap();
         assert!(!written(config()).contains("depth_layers"));
         assert!(written(layered_config()).contains("\"depth_layers\":5,\"correction_layers\":4"));
@@ -758,6 +796,10 @@ pub(crate) mod tests {
         assert_mentions(&missing, &["test.safetensors", "`layers.2.offset.bias`", "absent", "[18]"]);
         let reshaped = error_of(|tensors, _| tensors[2].1 = vec![5, 5, 9, 1]);
         assert_mentions(&reshaped, &["`layers.1.weight`", "[5, 5, 9, 1]", "[5, 5, 3, 3]"]);
+        let fed_back = NetworkConfig { focus_feedback: true, ..layered_config() };
+        let no_share = file_of(fed_back, |tensors, _| tensors.retain(|(name, ..)| name != "feedback_share"));
+        let no_share = Weights::from_bytes(&no_share, "test").unwrap_err().to_string();
+        assert_mentions(&no_share, &["`feedback_share`", "absent", "[1]"]);
         let nan = error_of(|tensors, _| tensors[1].2[3] = f32::NAN);
         assert_mentions(&nan, &["`layers.0.bias`", "NaN at index 3", "finite"]);
     }
@@ -787,6 +829,7 @@ pub(crate) mod tests {
         assert_mentions(&full, &["config.grid", "Full", "half-band"]);
         assert_mentions(&configured(|c| c.correction_layers = 3), &["config.correction_layers", "3", "even"]);
         assert_mentions(&configured(|c| c.depth_layers = 1), &["config.depth_layers", "1"]);
+        assert_mentions(&configured(|c| c.focus_feedback = true), &["config.focus_feedback", "true", "`layered`"]);
         assert_mentions(&configured(|c| c.depth_layers = 65), &["config.depth_layers", "65", "2 to 64"]);
         assert_mentions(&configured(|c| c.version = 7), &["config.version", "7"]);
         assert_mentions(&configured(|c| c.layers = 5), &["config.layers", "5", "even"]);

@@ -214,6 +214,11 @@ fn a_narrow_layered_network_without_prior_matches_its_golden_vectors() {
 }
 
 #[test]
+fn a_narrow_layered_network_with_feedback_matches_its_golden_vectors() {
+    check("layered-narrow-feedback.safetensors");
+}
+
+#[test]
 fn a_narrow_layered_network_matches_its_golden_vectors() {
     check("layered-narrow.safetensors");
 }

@@ -3,6 +3,7 @@
 //! Maps are [channels, height, width].
 
 use std::f64::consts::{PI, TAU};
+use std::ops::RangeInclusive;
 
 use holod_calibration::Resolution;
 use num_complex::Complex64;
@@ -91,7 +92,7 @@ pub(crate) fn run(weights: &Weights, frame: &RgbdFrame, pupil_mm: f64) -> Trace 
             let base = block_means(weights.config.grid, frame);
             add(&base.values.iter().map(|&value| value.into()).collect::<Vec<_>>(), &residual, 1.0)
         }
-        Family::Layered { surface, correction } => {
+        Family::Layered { surface, correction, feedback_share } => {
             let maps = encode_layered(frame, pupil_mm);
             let light = block_means(Grid::HalfBand, frame);
             let soft = blurs(&light);
@@ -103,13 +104,26 @@ pub(crate) fn run(weights: &Weights, frame: &RgbdFrame, pupil_mm: f64) -> Trace 
             let out = trunk(&mut stages, "surface.", surface, weights, encoded, pupil_mm);
             let source = surface_light(weights, frame, &out, &light, &soft, &logs);
             let carried = carry_to_slm(weights, frame, &source, [light.height, light.width]);
-            let parts = [|value: &Complex64| value.re, |value: &Complex64| value.im]
-                .map(|part| Map { values: carried.iter().map(part).collect(), ..light.clone() });
             stages.push(Stage { name: "source".into(), value: Value::Light(source) });
             stages.push(Stage { name: "carried".into(), value: Value::Light(carried.clone()) });
-            let encoded = concatenate(&[&parts[0], &parts[1], &maps]);
+            let parts = |field: &[Complex64]| {
+                [|value: &Complex64| value.re, |value: &Complex64| value.im]
+                    .map(|part| Map { values: field.iter().map(part).collect(), ..light.clone() })
+            };
+            let (field, encoded) = match feedback_share {
+                None => {
+                    let [real, imaginary] = parts(&carried);
+                    (carried, concatenate(&[&real, &imaginary, &maps]))
+                }
+                Some(share) => {
+                    let (change, lack) = feed_back(weights, frame, &carried, &light, pupil_mm);
+                    let field: Vec<_> = carried.iter().zip(&change).map(|(f, c)| f + c * f64::from(*share)).collect();
+                    let ([real, imaginary], [change_real, change_imaginary]) = (parts(&field), parts(&change));
+                    (field, concatenate(&[&real, &imaginary, &maps, &change_real, &change_imaginary, &lack]))
+                }
+            };
             let residual = trunk(&mut stages, "correction.", correction, weights, encoded, pupil_mm);
-            add(&carried, &residual, 0.3)
+            add(&field, &residual, 0.3)
         }
     };
     let scale = scale_of(weights.config.grid);
@@ -319,46 +333,96 @@ fn surface_light(
     source
 }
 
-fn carry_to_slm(weights: &Weights, frame: &RgbdFrame, source: &[Complex64], size: [usize; 2]) -> Vec<Complex64> {
-    let (config, Resolution { width, height }) = (&weights.config, frame.resolution);
-    let [rows, columns] = size;
-    let optics = &config.optics;
-    let layers = config.depth_layers;
+/// Where the middle of a depth layer is imaged, metres from the SLM plane.
+fn centre_m(weights: &Weights, layer: usize) -> f64 {
+    let optics = &weights.config.optics;
+    let share = (layer as f64 + 0.5) / weights.config.depth_layers as f64;
+    let dioptres = optics.depth_far_dpt + share * (optics.depth_near_dpt - optics.depth_far_dpt);
+    (optics.eyepiece_focal_length_mm * 1e-3).powi(2) * dioptres
+}
+
+/// The share of block `index` whose pixels lie in one of `layers`.
+fn cover(weights: &Weights, frame: &RgbdFrame, columns: usize, index: usize, layers: RangeInclusive<usize>) -> f64 {
+    let Resolution { width, height } = frame.resolution;
+    let count = weights.config.depth_layers;
     let layer_of = |y: usize, x: usize| {
         let depth = frame.depth_normalised[y.min(height - 1) * width + x.min(width - 1)];
-        ((depth * layers as f32) as usize).min(layers - 1)
+        ((depth * count as f32) as usize).min(count - 1)
     };
-    let centre_m = |layer: usize| {
-        let share = (layer as f64 + 0.5) / layers as f64;
-        let dioptres = optics.depth_far_dpt + share * (optics.depth_near_dpt - optics.depth_far_dpt);
-        (optics.eyepiece_focal_length_mm * 1e-3).powi(2) * dioptres
-    };
+    let (y, x) = (2 * (index / columns), 2 * (index % columns));
+    let corners = [(y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)];
+    corners.iter().filter(|&&(y, x)| layers.contains(&layer_of(y, x))).count() as f64 / 4.0
+}
+
+/// The angular spectrum transfer function of one colour over the distance `u_m`, at cycles per sample of the grid.
+fn transfer(weights: &Weights, colour: usize, u_m: f64, [fx, fy]: [f64; 2]) -> Complex64 {
+    let optics = &weights.config.optics;
+    let per_m = 1.0 / (optics.wavelengths_nm[colour] * 1e-9);
+    let [fx, fy] = [fx, fy].map(|f| f / (2e-6 * optics.pixel_pitch_um));
+    let squared = per_m * per_m - fx * fx - fy * fy;
+    if squared > 0.0 { Complex64::cis(TAU * u_m * (squared.sqrt() - per_m)) } else { Complex64::ZERO }
+}
+
+fn carry_to_slm(weights: &Weights, frame: &RgbdFrame, source: &[Complex64], size: [usize; 2]) -> Vec<Complex64> {
+    let [rows, columns] = size;
+    let layers = weights.config.depth_layers;
+    let centre_m = |layer| centre_m(weights, layer);
     let mut carried = Vec::new();
-    for (source, wavelength_nm) in source.chunks_exact(rows * columns).zip(optics.wavelengths_nm) {
-        let carry = |field: &[Complex64], u_m: f64| {
-            let per_m = 1.0 / (wavelength_nm * 1e-9);
-            filtered(field, size, |fx, fy| {
-                let [fx, fy] = [fx, fy].map(|f| f / (2e-6 * optics.pixel_pitch_um));
-                let squared = per_m * per_m - fx * fx - fy * fy;
-                if squared > 0.0 { Complex64::cis(TAU * u_m * (squared.sqrt() - per_m)) } else { Complex64::ZERO }
-            })
-        };
+    for (colour, source) in source.chunks_exact(rows * columns).enumerate() {
+        let carry = |field: &[Complex64], u_m| filtered(field, size, |fx, fy| transfer(weights, colour, u_m, [fx, fy]));
         let mut field = vec![Complex64::ZERO; rows * columns];
         for layer in 0..layers {
             if layer > 0 {
                 field = carry(&field, centre_m(layer) - centre_m(layer - 1));
             }
             for (index, field) in field.iter_mut().enumerate() {
-                let (y, x) = (2 * (index / columns), 2 * (index % columns));
-                let corners = [(y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)];
-                let inside = corners.iter().filter(|&&(y, x)| (layer..=layer + 1).contains(&layer_of(y, x))).count();
-                let cover = inside as f64 / 4.0;
+                let cover = cover(weights, frame, columns, index, layer..=layer + 1);
                 *field = *field * (1.0 - cover) + source[index] * cover;
             }
         }
         carried.extend(carry(&field, -centre_m(layers - 1)));
     }
     carried
+}
+
+/// The change of the field at the SLM plane that would give each point the amplitude that it lacks in focus, and that
+/// lack.
+fn feed_back(
+    weights: &Weights,
+    frame: &RgbdFrame,
+    carried: &[Complex64],
+    light: &Map,
+    pupil_mm: f64,
+) -> (Vec<Complex64>, Map) {
+    let (optics, size) = (&weights.config.optics, [light.height, light.width]);
+    let pixels = light.height * light.width;
+    let mut change = vec![Complex64::ZERO; carried.len()];
+    let mut lack = light.clone().map(|_| 0.0);
+    for colour in 0..3 {
+        let plane = colour * pixels..(colour + 1) * pixels;
+        let per_mm = 1e-3 / (optics.wavelengths_nm[colour] * 1e-9 * optics.eyepiece_focal_length_mm * 1e-3);
+        let through = |field: &[Complex64], u_m| {
+            filtered(field, size, |fx, fy| {
+                let per_m = fx.hypot(fy) / (2e-6 * optics.pixel_pitch_um);
+                if per_m < 0.5 * pupil_mm * per_mm { transfer(weights, colour, u_m, [fx, fy]) } else { Complex64::ZERO }
+            })
+        };
+        for layer in 0..weights.config.depth_layers {
+            let u_m = centre_m(weights, layer);
+            let mut arriving = through(&carried[plane.clone()], u_m);
+            for (index, arriving) in arriving.iter_mut().enumerate() {
+                let amplitude = (arriving.norm_sqr() + 1e-6).sqrt();
+                let cover = cover(weights, frame, light.width, index, layer..=layer);
+                let here = cover * (light.values[plane.start + index] - amplitude);
+                lack.values[plane.start + index] += here;
+                *arriving *= here / amplitude;
+            }
+            for (change, back) in change[plane.clone()].iter_mut().zip(through(&arriving, -u_m)) {
+                *change += back;
+            }
+        }
+    }
+    (change, lack)
 }
 
 /// Multiplies the spectrum of `light` [rows, columns] by `factor`(fx, fy), in cycles per sample; by the definition of

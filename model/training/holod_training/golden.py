@@ -35,11 +35,12 @@ SHIPPED_FAMILIES = ("direct", "layered")
 
 
 class Narrow(NamedTuple):
-    """A random network and the size of the scene that it answers."""
+    """A random network, the size of the scene that it answers, and the pupil."""
 
     config: NetworkConfig
     height: int
     width: int
+    pupil_mm: float = 2.7
 
 
 # Depth and correction layers are left at their defaults, so that no engine has others.
@@ -69,6 +70,22 @@ NARROW: dict[str, Narrow] = {
         ),
         16,
         24,
+    ),
+    # A pupil that cuts the half band.
+    "layered-narrow-feedback": Narrow(
+        NetworkConfig(
+            architecture="layered",
+            layers=4,
+            channels=4,
+            adjustable_layers=(2,),
+            modulation_hidden=8,
+            transport_prior=False,
+            correction_layers=4,
+            focus_feedback=True,
+        ),
+        16,
+        24,
+        pupil_mm=1.6,
     ),
 }
 
@@ -162,12 +179,12 @@ def write_golden(out: Path, standard: Path | None, small: Path | None = None, se
     """Writes every golden file into `out`; `standard` and `small` are the weights that the product has, and a file of
     another family's in their place goes. Raises WeightsError."""
     written = []
-    for name, (config, height, width) in NARROW.items():
+    for name, (config, height, width, pupil_mm) in NARROW.items():
         weights = out / f"{name}.weights.safetensors"
         provenance = {"script": "python -m holod_training golden", "seed": seed}
         save_weights(weights, narrow_network(config, seed), {}, provenance)
         amplitude, depth = scene(height, width, seed)
-        result = vectors(load_weights(weights).double(), amplitude, depth, 2.7)
+        result = vectors(load_weights(weights).double(), amplitude, depth, pupil_mm)
         write_vectors(out / f"{name}.safetensors", result, {"seed": seed, "weights": weights.name})
         written += [weights, out / f"{name}.safetensors"]
     for suffix, shipped in (("", standard), ("-small", small)):

@@ -144,6 +144,16 @@ class LayeredNetwork(FieldNetwork):
         if config.focus_feedback:
             self.feedback_share = nn.Parameter(torch.tensor([FEEDBACK_SHARE]))
 
+    def without_feedback(self, weights: dict[str, Tensor]) -> dict[str, Tensor]:
+        """This network's weights out of those of the same network without `focus_feedback`: the share is 0 and net 2
+        does not look at it yet, so the fields are the same."""
+        first = "correction.0.weight"
+        blind = weights[first].new_zeros(self.config.channels, FEEDBACK_CHANNELS, 3, 3)
+        return weights | {
+            first: torch.cat((weights[first], blind), dim=1),
+            "feedback_share": torch.zeros_like(self.feedback_share),
+        }
+
     def forward(
         self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor, trace: dict[str, Tensor] | None = None
     ) -> Tensor:

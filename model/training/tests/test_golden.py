@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from holod_training.config import OpticsConfig
 from holod_training.export import WeightsError, save_weights, write_beside
 from holod_training.golden import NARROW, narrow_network, scene, vectors, write_golden
-from holod_training.optics import coc_px
+from holod_training.optics import coc_px, frequencies, pupil_mask
 from holod_training.shards import Shard
 from holod_training.variants import build_network, variant
 
@@ -70,6 +70,22 @@ def test_no_stage_of_the_layered_vectors_is_idle() -> None:
     assert (low - carried).abs().mean() > 5e-3
     assert (found["eye_field"][0] - found["eye_field"][1]).abs().mean() > 1e-2
     assert (found["eye_field"] - found["eye_panel"]).abs().mean() < 0.05
+
+
+def test_vectors_with_feedback_change_the_field_through_a_narrow_pupil() -> None:
+    found = load_file(COMMITTED / "layered-narrow-feedback.safetensors")
+    carried, low = (torch.complex(*found[name]) for name in ("carried", "low"))
+    seen = found["correction.encoded"]
+    real, imaginary, change_real, change_imaginary, lack = (*seen[:6].split(3), *seen[-9:].split(3))
+    assert seen.shape == (36, 8, 12) and found["pupil_mm"].item() == pytest.approx(1.6)
+    change = torch.complex(change_real, change_imaginary)
+    torch.testing.assert_close(torch.complex(real, imaginary), carried + 0.5 * change, rtol=1e-5, atol=1e-5)
+    assert change.abs().mean() > 0.01 and lack.abs().mean() > 0.01
+    residual = torch.complex(*found["correction.layer_3"].split(3))
+    torch.testing.assert_close(low, torch.complex(real, imaginary) + 0.3 * residual, rtol=1e-5, atol=1e-5)
+    inside = pupil_mask(OpticsConfig(), *(frequencies(n, 16e-6, "cpu") for n in (12, 8)), 1.6)
+    spectrum = torch.fft.fft2(change).abs()
+    assert not inside.all() and spectrum[~inside].max() < 1e-5 * spectrum.max()
 
 
 def test_layered_vectors_without_the_prior_have_their_own_phase_and_the_defaults() -> None:

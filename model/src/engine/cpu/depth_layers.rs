@@ -15,14 +15,15 @@ const SCALE: usize = scale_of(Grid::HalfBand);
 /// f ← f·(1 − m) + O·m from far to near, by ASM between layers and at last back to the SLM plane; m is the share of a
 /// block whose pixels lie in a layer or its next nearer one, so that slanted surfaces show no seams.
 pub(super) struct DepthLayers {
-    count: u8,
-    size: Resolution,
+    pub(super) count: u8,
+    pub(super) size: Resolution,
     /// The depth layer of each pixel of each block, [height, width, 4].
-    layer_of: Vec<[u8; BLOCK]>,
-    /// From one layer to the next nearer one, and from the nearest to the SLM plane; transposed spectra, of each colour.
-    step: [Vec<Complex32>; 3],
-    back: [Vec<Complex32>; 3],
-    fft: TransposedFft2d<f32>,
+    pub(super) layer_of: Vec<[u8; BLOCK]>,
+    /// From one layer to the next nearer one, and from the nearest to the SLM plane; transposed spectra, of each colour,
+    /// over the number of samples, for the inverse transform.
+    pub(super) step: [Vec<Complex32>; 3],
+    pub(super) back: [Vec<Complex32>; 3],
+    pub(super) fft: TransposedFft2d<f32>,
     /// [3, height, width]: what arrives at the SLM plane.
     pub(super) carried: Vec<Complex32>,
 }

@@ -1,5 +1,5 @@
 //! The `layered` family on the half-band grid: one net says what the objects' surfaces send out, physics carries it to
-//! the SLM plane, a second net corrects what arrives.
+//! the SLM plane and may feed back what an eye would miss in focus, a second net corrects what arrives.
 
 use std::f64::consts::PI;
 
@@ -9,6 +9,7 @@ use rayon::prelude::*;
 
 use super::blocks::{Blocks, scale_of};
 use super::depth_layers::DepthLayers;
+use super::focus_feedback::FocusFeedback;
 use super::simd::InstructionSet;
 use super::trunk::Trunk;
 use crate::RgbdFrame;
@@ -48,6 +49,7 @@ pub(super) struct Layered {
     /// What the surfaces send out, [3, height, width].
     source: Vec<Complex32>,
     depth_layers: DepthLayers,
+    feedback: Option<FocusFeedback>,
 }
 
 impl Layered {
@@ -55,6 +57,7 @@ impl Layered {
         config: &NetworkConfig,
         surface: &[Layer],
         correction: &[Layer],
+        feedback_share: Option<f32>,
         size @ (width, height): (usize, usize),
         set: InstructionSet,
     ) -> Self {
@@ -71,6 +74,7 @@ impl Layered {
             centred_depth: vec![0.0; pixels],
             source: vec![Complex32::ZERO; 3 * pixels],
             depth_layers: DepthLayers::new(config, resolution),
+            feedback: feedback_share.map(|share| FocusFeedback::new(config, share, resolution)),
         }
     }
 
@@ -78,19 +82,27 @@ impl Layered {
         std::iter::once(Stage::plain("encode, blur"))
             .chain(self.surface.stages("surface "))
             .chain([Stage::plain("surface light"), Stage::plain("depth layers")])
+            .chain(self.feedback.as_ref().map(|_| Stage::plain("focus feedback")))
             .chain(self.correction.stages("correction "))
             .collect()
     }
 
     pub(super) fn run_stage(&mut self, index: usize, frame: &RgbdFrame, pupil_mm: f32) {
-        let surface_light = 1 + self.surface.len();
+        let (surface_light, correction) = self.stages_between();
         match index {
             0 => self.encode(frame, pupil_mm),
             _ if index < surface_light => self.surface.run_layer(index - 1, pupil_mm),
             _ if index == surface_light => self.light_surfaces(),
             _ if index == surface_light + 1 => self.carry(frame),
-            _ => self.correction.run_layer(index - surface_light - 2, pupil_mm),
+            _ if index < correction => self.feed_back(pupil_mm),
+            _ => self.correction.run_layer(index - correction, pupil_mm),
         }
+    }
+
+    /// The stage that follows the first net, and the one with which the second begins.
+    fn stages_between(&self) -> (usize, usize) {
+        let surface_light = 1 + self.surface.len();
+        (surface_light, surface_light + 2 + usize::from(self.feedback.is_some()))
     }
 
     /// Writes the maps that both nets see, the means and their blurs.
@@ -173,17 +185,36 @@ impl Layered {
 
     /// Carries the light of the surfaces to the SLM plane, where the second net sees it.
     fn carry(&mut self, frame: &RgbdFrame) {
-        let Self { size, correction, source, depth_layers, .. } = self;
-        depth_layers.place(frame);
-        depth_layers.compose(source);
+        self.depth_layers.place(frame);
+        self.depth_layers.compose(&self.source);
+        self.show_field();
+    }
+
+    /// Feeds back to the field what an eye would miss in focus, which the second net sees too.
+    fn feed_back(&mut self, pupil_mm: f32) {
+        let Some(feedback) = &mut self.feedback else { return };
+        feedback.run(&mut self.depth_layers, &self.light, pupil_mm);
+        self.show_field();
+    }
+
+    /// Writes the field at the SLM plane, and what was fed back, for the second net.
+    fn show_field(&mut self) {
+        let Self { size, correction, depth_layers, .. } = self;
+        let feedback = self.feedback.as_ref();
         let (stride, columns, pixels) = (correction.input.stride, size.width, size.pixels());
         let carried = &depth_layers.carried;
         correction.input.rows_mut().enumerate().for_each(|(y, row)| {
             for (x, channels) in row[stride..][..columns * stride].chunks_exact_mut(stride).enumerate() {
                 for colour in 0..3 {
-                    let value = carried[colour * pixels + y * columns + x];
-                    channels[colour] = value.re;
-                    channels[3 + colour] = value.im;
+                    let index = colour * pixels + y * columns + x;
+                    channels[colour] = carried[index].re;
+                    channels[3 + colour] = carried[index].im;
+                    if let Some(FocusFeedback { change, lack, .. }) = feedback {
+                        let channels = &mut channels[6 + MAPS..];
+                        channels[colour] = change[index].re;
+                        channels[3 + colour] = change[index].im;
+                        channels[6 + colour] = lack[index];
+                    }
                 }
             }
         });
@@ -210,13 +241,14 @@ impl Layered {
 impl Layered {
     pub(super) fn after(&self, stage: usize) -> super::network::Seen<'_> {
         use super::network::Seen;
-        let surface_light = 1 + self.surface.len();
+        let (surface_light, correction) = self.stages_between();
         match stage {
             0 => Seen::Map(&self.surface.input, None),
             _ if stage < surface_light => self.surface.after(stage - 1),
             _ if stage == surface_light => Seen::Light(&self.source),
             _ if stage == surface_light + 1 => Seen::Light(&self.depth_layers.carried),
-            _ => self.correction.after(stage - surface_light - 2),
+            _ if stage < correction => Seen::Map(&self.correction.input, None),
+            _ => self.correction.after(stage - correction),
         }
     }
 }

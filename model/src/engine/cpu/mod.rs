@@ -4,6 +4,7 @@ mod blocks;
 mod conv;
 mod depth_layers;
 mod direct;
+mod focus_feedback;
 mod layered;
 mod network;
 mod peak;

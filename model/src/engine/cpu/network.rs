@@ -64,8 +64,8 @@ impl Network {
         let padded = Resolution { width: scale * width, height: scale * height };
         let predictor = match &weights.family {
             Family::Direct { layers } => Predictor::Direct(Box::new(Direct::new(config, layers, size, set))),
-            Family::Layered { surface, correction } => {
-                Predictor::Layered(Box::new(Layered::new(config, surface, correction, size, set)))
+            Family::Layered { surface, correction, feedback_share } => {
+                Predictor::Layered(Box::new(Layered::new(config, surface, correction, *feedback_share, size, set)))
             }
         };
         let stages = predictor.stages().into_iter().chain([Stage::plain("field")]);

@@ -1,0 +1,140 @@
+//! What an eye lacks where each point is in focus, fed back to the field at the SLM plane.
+
+use holod_calibration::{Colour, DisplayGeometry, Metres, Resolution};
+use num_complex::Complex32;
+use rayon::prelude::*;
+
+use super::blocks::scale_of;
+use super::depth_layers::DepthLayers;
+use super::layered::BLOCK;
+use crate::optics::{signed_bin, transfer_table};
+use crate::weights::{Grid, NetworkConfig};
+
+const SCALE: usize = scale_of(Grid::HalfBand);
+/// Keeps the phase of what is dark defined: |a| = sqrt(re² + im² + this).
+const DARK: f32 = 1e-6;
+
+/// One step of Gerchberg and Saxton (1972) at all depth layers at once: the field goes through the pupil to every layer,
+/// takes the wanted amplitude there on the points of that layer with the phase that it has, and the sum of these
+/// changes comes back. The layers change one another too; the second net mends that.
+pub(super) struct FocusFeedback {
+    share: f32,
+    optics: DisplayGeometry,
+    /// From the SLM plane to the farthest layer, as `DepthLayers::step`.
+    to_farthest: [Vec<Complex32>; 3],
+    /// Transposed spectra: what reaches the layer at hand, and the changes of the layers so far.
+    reaching: Vec<Complex32>,
+    changes: Vec<Complex32>,
+    /// [3, height, width]: the change of the field that would give what is lacking, and that lack of amplitude.
+    pub(super) change: Vec<Complex32>,
+    pub(super) lack: Vec<f32>,
+}
+
+impl FocusFeedback {
+    pub(super) fn new(config: &NetworkConfig, share: f32, size: Resolution) -> Self {
+        let optics = config.optics.geometry(size);
+        let far_m = optics.image_distance(optics.depth_far).0;
+        let volume_m = optics.image_distance(optics.depth_near).0 - far_m;
+        let farthest = Metres(far_m + volume_m / (2 * config.depth_layers) as f64);
+        let table = |colour| transfer_table(optics.wavelengths[colour], pitch(&optics), size, farthest);
+        let plane = || vec![Complex32::ZERO; size.pixels()];
+        Self {
+            share,
+            optics,
+            to_farthest: Colour::ALL.map(table),
+            reaching: plane(),
+            changes: plane(),
+            change: vec![Complex32::ZERO; 3 * size.pixels()],
+            lack: vec![0.0; 3 * size.pixels()],
+        }
+    }
+
+    /// Writes `change` and `lack` for the amplitude `light` [3, height, width] at the depths that `layers` has, and adds
+    /// the share to the field there.
+    pub(super) fn run(&mut self, layers: &mut DepthLayers, light: &[f32], pupil_mm: f32) {
+        let Self { share, optics, to_farthest, reaching, changes, change, lack } = self;
+        let DepthLayers { count, size, layer_of, step, back, fft, carried } = layers;
+        let pixels = size.pixels();
+        // The tables are over the number of samples.
+        let samples = pixels as f32;
+        for colour in Colour::ALL {
+            let index = colour.index();
+            let plane = index * pixels..(index + 1) * pixels;
+            let (field, light) = (&mut carried[plane.clone()], &light[plane.clone()]);
+            let (change, lack) = (&mut change[plane.clone()], &mut lack[plane]);
+            let pupil = Pupil::new(optics, colour, pupil_mm, *size);
+
+            change.copy_from_slice(field);
+            fft.forward(change);
+            reaching.copy_from_slice(&fft.spectrum);
+            pupil.stop(reaching, &to_farthest[index]);
+            changes.fill(Complex32::ZERO);
+            lack.fill(0.0);
+            for layer in 0..*count {
+                fft.spectrum.copy_from_slice(reaching);
+                fft.inverse(change);
+                change.par_iter_mut().zip(&mut *lack).zip(light).zip(&*layer_of).for_each(
+                    |(((arriving, lack), light), block)| {
+                        let inside = block.iter().filter(|&&of| of == layer).count();
+                        let amplitude = (arriving.norm_sqr() + DARK).sqrt();
+                        let here = (light - amplitude) * (inside as f32 / BLOCK as f32);
+                        *lack += here;
+                        *arriving *= here / amplitude;
+                    },
+                );
+                fft.forward(change);
+                let transformed = fft.spectrum.par_iter().zip(&step[index]);
+                changes.par_iter_mut().zip(&mut *reaching).zip(transformed).for_each(
+                    |((changes, reaching), (spectrum, step))| {
+                        // Horner's rule over the layers; `back` undoes the way to the nearest.
+                        let step = step * samples;
+                        *changes = *changes * step + spectrum;
+                        *reaching *= step;
+                    },
+                );
+            }
+            pupil.stop(changes, &back[index]);
+            fft.spectrum.copy_from_slice(changes);
+            fft.inverse(change);
+            field.par_iter_mut().zip(&*change).for_each(|(field, change)| *field += change * *share);
+        }
+    }
+}
+
+fn pitch(optics: &DisplayGeometry) -> Metres {
+    Metres(SCALE as f64 * optics.pixel_pitch.0)
+}
+
+/// The eye's pupil in the Fourier plane of the network's grid: a disc of radius (s/2)/(λ·f).
+struct Pupil {
+    radius_per_m: f64,
+    /// Cycles per metre from one bin to the next.
+    bin_per_m: [f64; 2],
+    size: Resolution,
+}
+
+impl Pupil {
+    fn new(optics: &DisplayGeometry, colour: Colour, pupil_mm: f32, size: Resolution) -> Self {
+        Self {
+            radius_per_m: 0.5e-3 * f64::from(pupil_mm)
+                / (optics.wavelengths[colour].0 * optics.eyepiece_focal_length.0),
+            bin_per_m: [size.width, size.height].map(|bins| 1.0 / (bins as f64 * pitch(optics).0)),
+            size,
+        }
+    }
+
+    /// Multiplies the transposed `spectrum` by `transfer` inside the pupil and sets it to 0 outside.
+    fn stop(&self, spectrum: &mut [Complex32], transfer: &[Complex32]) {
+        let Self { radius_per_m, bin_per_m, size: Resolution { width, height } } = *self;
+        let squared = |bin, bins, bin_per_m: f64| (signed_bin(bin, bins) as f64 * bin_per_m).powi(2);
+        spectrum.par_chunks_exact_mut(height).zip(transfer.par_chunks_exact(height)).enumerate().for_each(
+            |(kx, (spectrum, transfer))| {
+                let fx_squared = squared(kx, width, bin_per_m[0]);
+                for (ky, (value, transfer)) in spectrum.iter_mut().zip(transfer).enumerate() {
+                    let inside = fx_squared + squared(ky, height, bin_per_m[1]) < radius_per_m * radius_per_m;
+                    *value = if inside { *value * transfer } else { Complex32::ZERO };
+                }
+            },
+        );
+    }
+}
