@@ -34,7 +34,7 @@ pub struct NetworkConfig {
     pub version: u32,
     /// The grid on which the network predicts.
     pub grid: Grid,
-    /// 3x3 layers of `direct`'s net or `layered`'s first: the first, pairs of body layers, the last.
+    /// 3x3 layers of `direct`'s net or the others' first: the first, pairs of body layers, the last.
     pub layers: usize,
     /// Feature channels of the body.
     pub channels: usize,
@@ -50,19 +50,15 @@ pub struct NetworkConfig {
     pub pupil_range_mm: [f32; 2],
     /// Amplitude that double phase maps to 1.
     pub amplitude_constant: f32,
-    /// `layered`: into how many layers, equal in dioptres, the depth volume is divided.
+    /// `layered` and `expected-stack`: into how many layers, equal in dioptres, the depth volume is divided.
     #[serde(default = "default_depth_layers", skip_serializing_if = "is_default_depth_layers")]
     pub depth_layers: usize,
     /// `layered`: whether the surfaces' phase starts from the transport of intensity.
     #[serde(default = "default_transport_prior", skip_serializing_if = "is_default_transport_prior")]
     pub transport_prior: bool,
-    /// `layered`: 3x3 layers of the net that corrects what arrives at the SLM plane.
+    /// `layered` and `expected-stack`: 3x3 layers of the net that corrects what arrives at the SLM plane.
     #[serde(default = "default_correction_layers", skip_serializing_if = "is_default_correction_layers")]
     pub correction_layers: usize,
-    /// `layered`: whether the field takes a share of what would set each point right where it is in focus, which the
-    /// second net sees.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub focus_feedback: bool,
 }
 
 // The trainer leaves out what has its default, so that files of older networks stay as they are.
@@ -98,6 +94,9 @@ pub enum Architecture {
     Direct,
     /// Light on the objects' surfaces, carried by physics, and a residual to what arrives.
     Layered,
+    /// Light on every depth layer for what an eye should see there, carried by physics, what that lacks fed back, and a
+    /// residual.
+    ExpectedStack,
 }
 
 impl fmt::Display for Architecture {
@@ -105,6 +104,7 @@ impl fmt::Display for Architecture {
         f.write_str(match self {
             Self::Direct => "direct",
             Self::Layered => "layered",
+            Self::ExpectedStack => "expected-stack",
         })
     }
 }
@@ -164,15 +164,18 @@ impl TrainedOptics {
 /// The stacks of layers that a family has.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Family {
-    Direct {
-        layers: Vec<Layer>,
-    },
-    Layered {
-        surface: Vec<Layer>,
-        correction: Vec<Layer>,
-        /// Of what would set each point right, where the network has it fed back.
-        feedback_share: Option<f32>,
-    },
+    Direct { layers: Vec<Layer> },
+    Layered { surface: Vec<Layer>, correction: Vec<Layer> },
+    ExpectedStack { lighting: Vec<Layer>, correction: Vec<Layer>, feedback: Feedback },
+}
+
+/// How what is lacking is fed back to the field of `expected-stack`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Feedback {
+    /// Of the change that would give what is lacking.
+    pub(crate) share: f32,
+    /// By how much more what is in focus weighs.
+    pub(crate) sharpness: f32,
 }
 
 impl Family {
@@ -183,7 +186,7 @@ impl Family {
         mut layer: impl FnMut(&LayerShape) -> Result<Layer, E>,
         number: impl Fn(&str) -> Result<f32, E>,
     ) -> Result<Self, E> {
-        let mut stack = |name, inputs, outputs, count, adjustable: &[usize]| {
+        let mut stack_of = |name, inputs, outputs, count, adjustable: &[usize]| {
             (0..count)
                 .map(|index| {
                     layer(&LayerShape {
@@ -199,21 +202,34 @@ impl Family {
         let adjustable = &config.adjustable_layers;
         Ok(match config.architecture {
             Architecture::Direct => {
-                Self::Direct { layers: stack("layers", maps, OUTPUT_CHANNELS, config.layers, adjustable)? }
+                Self::Direct { layers: stack_of("layers", maps, OUTPUT_CHANNELS, config.layers, adjustable)? }
             }
             Architecture::Layered => {
                 let prior = usize::from(config.transport_prior);
                 let outputs = 3 * (2 + LAYERED_BLURS * (1 + prior));
                 Self::Layered {
-                    surface: stack("surface", maps + 3 * prior, outputs, config.layers, adjustable)?,
-                    correction: stack(
+                    surface: stack_of("surface", maps + 3 * prior, outputs, config.layers, adjustable)?,
+                    correction: stack_of(
                         "correction",
-                        OUTPUT_CHANNELS + maps + FEEDBACK_CHANNELS * usize::from(config.focus_feedback),
+                        OUTPUT_CHANNELS + maps,
                         OUTPUT_CHANNELS,
                         config.correction_layers,
                         &[],
                     )?,
-                    feedback_share: config.focus_feedback.then(|| number(FEEDBACK_SHARE)).transpose()?,
+                }
+            }
+            Architecture::ExpectedStack => {
+                let stack = 3 * config.depth_layers;
+                Self::ExpectedStack {
+                    lighting: stack_of("lighting", maps + stack, 4 * config.depth_layers, config.layers, adjustable)?,
+                    correction: stack_of(
+                        "correction",
+                        2 * OUTPUT_CHANNELS + maps + 2 * stack,
+                        OUTPUT_CHANNELS,
+                        config.correction_layers,
+                        &[],
+                    )?,
+                    feedback: Feedback { share: number(FEEDBACK_SHARE)?, sharpness: number(SHARPNESS)? },
                 }
             }
         })
@@ -390,7 +406,8 @@ impl Weights {
 
         let config = metadata.config()?;
         let file = TensorReader { name, tensors };
-        let family = Family::read(&config, |shape| file.layer(shape), |tensor| Ok(file.tensor(tensor, &[1])?[0]))?;
+        let number = |tensor: &str| Ok(file.tensor(tensor, &[1])?[0]);
+        let family = Family::read(&config, |shape| file.layer(shape), number)?;
         Ok(Self { config, family, metrics: metadata.remark("metrics"), provenance: metadata.remark("provenance") })
     }
 
@@ -489,13 +506,7 @@ impl Metadata<'_> {
             config.architecture == Architecture::Direct || config.grid == Grid::HalfBand,
             "grid",
             format!("{:?}", config.grid),
-            "\"half-band\" for `layered`",
-        )?;
-        require(
-            config.architecture == Architecture::Layered || !config.focus_feedback,
-            "focus_feedback",
-            config.focus_feedback.to_string(),
-            "false; only `layered` can have it",
+            "\"half-band\", but for `direct`",
         )?;
         require((1..=256).contains(channels), "channels", channels.to_string(), "1 to 256")?;
         let adjustable = &config.adjustable_layers;
@@ -594,12 +605,9 @@ impl TensorReader<'_> {
 /// Real and imaginary residual of three colours.
 pub(crate) const OUTPUT_CHANNELS: usize = 6;
 
-/// What the `layered` family's second net sees of a feedback: real and imaginary change, and what is lacking, of three
-/// colours.
-pub(crate) const FEEDBACK_CHANNELS: usize = 9;
-
-/// The name of the tensor with the share of the change that the field takes.
+/// The names of the tensors of [`Feedback`].
 const FEEDBACK_SHARE: &str = "feedback_share";
+const SHARPNESS: &str = "sharpness";
 
 /// Gaussian blurs between which the `layered` family's first net chooses.
 pub(crate) const LAYERED_BLURS: usize = 3;
@@ -609,7 +617,7 @@ impl NetworkConfig {
     pub fn layer_count(&self) -> usize {
         match self.architecture {
             Architecture::Direct => self.layers,
-            Architecture::Layered => self.layers + self.correction_layers,
+            Architecture::Layered | Architecture::ExpectedStack => self.layers + self.correction_layers,
         }
     }
 
@@ -657,7 +665,8 @@ pub(crate) mod tests {
                 adjustable,
             })
         };
-        let family = Family::read(&config, layer, |_| Ok(0.6)).unwrap();
+        let number = |name: &str| Ok(if name == SHARPNESS { 1.3 } else { 0.6 });
+        let family = Family::read(&config, layer, number).unwrap();
         Weights { config, family, metrics: serde_json::Value::Null, provenance: serde_json::Value::Null }
     }
 
@@ -665,7 +674,10 @@ pub(crate) mod tests {
     fn tensors(weights: &Weights) -> Vec<(String, Vec<usize>, Vec<f32>)> {
         let stacks = match &weights.family {
             Family::Direct { layers } => vec![("layers", layers)],
-            Family::Layered { surface, correction, .. } => vec![("surface", surface), ("correction", correction)],
+            Family::Layered { surface, correction } => vec![("surface", surface), ("correction", correction)],
+            Family::ExpectedStack { lighting, correction, .. } => {
+                vec![("lighting", lighting), ("correction", correction)]
+            }
         };
         let layers = stacks.into_iter().flat_map(|(stack, layers)| {
             layers.iter().enumerate().map(move |(index, layer)| (format!("{stack}.{index}"), layer))
@@ -687,8 +699,9 @@ pub(crate) mod tests {
                 }
             }
         }
-        if let Family::Layered { feedback_share: Some(share), .. } = weights.family {
+        if let Family::ExpectedStack { feedback: Feedback { share, sharpness }, .. } = weights.family {
             tensors.push((FEEDBACK_SHARE.into(), vec![1], vec![share]));
+            tensors.push((SHARPNESS.into(), vec![1], vec![sharpness]));
         }
         tensors
     }
@@ -713,12 +726,15 @@ pub(crate) mod tests {
             depth_layers: default_depth_layers(),
             transport_prior: default_transport_prior(),
             correction_layers: default_correction_layers(),
-            focus_feedback: false,
         }
     }
 
     pub(crate) fn layered_config() -> NetworkConfig {
         NetworkConfig { architecture: Architecture::Layered, depth_layers: 5, correction_layers: 4, ..config() }
+    }
+
+    pub(crate) fn expected_stack_config() -> NetworkConfig {
+        NetworkConfig { architecture: Architecture::ExpectedStack, ..layered_config() }
     }
 
     /// A file with small random weights, after `change` has changed it.
@@ -762,10 +778,7 @@ pub(crate) mod tests {
         let layered = Weights::from_bytes(&file_of(layered_config(), |_, _| {}), "test").unwrap();
         let expected = random_weights(layered_config(), 1);
         assert_eq!((&layered.config, &layered.family), (&expected.config, &expected.family));
-        for other in [
-            NetworkConfig { transport_prior: false, ..layered_config() },
-            NetworkConfig { focus_feedback: true, ..layered_config() },
-        ] {
+        for other in [NetworkConfig { transport_prior: false, ..layered_config() }, expected_stack_config()] {
             let read = Weights::from_bytes(&file_of(other.clone(), |_, _| {}), "test").unwrap();
             assert_eq!((&read.config, &read.family), (&other, &random_weights(other.clone(), 1).family));
         }
@@ -796,10 +809,9 @@ pub(crate) mod tests {
         assert_mentions(&missing, &["test.safetensors", "`layers.2.offset.bias`", "absent", "[18]"]);
         let reshaped = error_of(|tensors, _| tensors[2].1 = vec![5, 5, 9, 1]);
         assert_mentions(&reshaped, &["`layers.1.weight`", "[5, 5, 9, 1]", "[5, 5, 3, 3]"]);
-        let fed_back = NetworkConfig { focus_feedback: true, ..layered_config() };
-        let no_share = file_of(fed_back, |tensors, _| tensors.retain(|(name, ..)| name != "feedback_share"));
+        let no_share = file_of(expected_stack_config(), |tensors, _| tensors.retain(|(name, ..)| name != SHARPNESS));
         let no_share = Weights::from_bytes(&no_share, "test").unwrap_err().to_string();
-        assert_mentions(&no_share, &["`feedback_share`", "absent", "[1]"]);
+        assert_mentions(&no_share, &["`sharpness`", "absent", "[1]"]);
         let nan = error_of(|tensors, _| tensors[1].2[3] = f32::NAN);
         assert_mentions(&nan, &["`layers.0.bias`", "NaN at index 3", "finite"]);
     }
@@ -829,7 +841,6 @@ pub(crate) mod tests {
         assert_mentions(&full, &["config.grid", "Full", "half-band"]);
         assert_mentions(&configured(|c| c.correction_layers = 3), &["config.correction_layers", "3", "even"]);
         assert_mentions(&configured(|c| c.depth_layers = 1), &["config.depth_layers", "1"]);
-        assert_mentions(&configured(|c| c.focus_feedback = true), &["config.focus_feedback", "true", "`layered`"]);
         assert_mentions(&configured(|c| c.depth_layers = 65), &["config.depth_layers", "65", "2 to 64"]);
         assert_mentions(&configured(|c| c.version = 7), &["config.version", "7"]);
         assert_mentions(&configured(|c| c.layers = 5), &["config.layers", "5", "even"]);

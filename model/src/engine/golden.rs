@@ -214,13 +214,13 @@ fn a_narrow_layered_network_without_prior_matches_its_golden_vectors() {
 }
 
 #[test]
-fn a_narrow_layered_network_with_feedback_matches_its_golden_vectors() {
-    check("layered-narrow-feedback.safetensors");
+fn a_narrow_layered_network_matches_its_golden_vectors() {
+    check("layered-narrow.safetensors");
 }
 
 #[test]
-fn a_narrow_layered_network_matches_its_golden_vectors() {
-    check("layered-narrow.safetensors");
+fn a_narrow_expected_stack_network_matches_its_golden_vectors() {
+    check("expected-stack-narrow.safetensors");
 }
 
 #[test]

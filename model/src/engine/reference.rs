@@ -9,7 +9,7 @@ use holod_calibration::Resolution;
 use num_complex::Complex64;
 
 use crate::RgbdFrame;
-use crate::weights::{Adjustable, Dense, Family, Grid, LAYERED_BLURS, Layer, Weights};
+use crate::weights::{Adjustable, Dense, Family, Grid, LAYERED_BLURS, Layer, NetworkConfig, Weights};
 
 #[derive(Clone, Debug)]
 pub(crate) struct Map {
@@ -92,7 +92,7 @@ pub(crate) fn run(weights: &Weights, frame: &RgbdFrame, pupil_mm: f64) -> Trace 
             let base = block_means(weights.config.grid, frame);
             add(&base.values.iter().map(|&value| value.into()).collect::<Vec<_>>(), &residual, 1.0)
         }
-        Family::Layered { surface, correction, feedback_share } => {
+        Family::Layered { surface, correction } => {
             let maps = encode_layered(frame, pupil_mm);
             let light = block_means(Grid::HalfBand, frame);
             let soft = blurs(&light);
@@ -104,24 +104,26 @@ pub(crate) fn run(weights: &Weights, frame: &RgbdFrame, pupil_mm: f64) -> Trace 
             let out = trunk(&mut stages, "surface.", surface, weights, encoded, pupil_mm);
             let source = surface_light(weights, frame, &out, &light, &soft, &logs);
             let carried = carry_to_slm(weights, frame, &source, [light.height, light.width]);
+            let [real, imaginary] = parts(&carried, &light);
             stages.push(Stage { name: "source".into(), value: Value::Light(source) });
             stages.push(Stage { name: "carried".into(), value: Value::Light(carried.clone()) });
-            let parts = |field: &[Complex64]| {
-                [|value: &Complex64| value.re, |value: &Complex64| value.im]
-                    .map(|part| Map { values: field.iter().map(part).collect(), ..light.clone() })
-            };
-            let (field, encoded) = match feedback_share {
-                None => {
-                    let [real, imaginary] = parts(&carried);
-                    (carried, concatenate(&[&real, &imaginary, &maps]))
-                }
-                Some(share) => {
-                    let (change, lack) = feed_back(weights, frame, &carried, &light, pupil_mm);
-                    let field: Vec<_> = carried.iter().zip(&change).map(|(f, c)| f + c * f64::from(*share)).collect();
-                    let ([real, imaginary], [change_real, change_imaginary]) = (parts(&field), parts(&change));
-                    (field, concatenate(&[&real, &imaginary, &maps, &change_real, &change_imaginary, &lack]))
-                }
-            };
+            let encoded = concatenate(&[&real, &imaginary, &maps]);
+            let residual = trunk(&mut stages, "correction.", correction, weights, encoded, pupil_mm);
+            add(&carried, &residual, 0.3)
+        }
+        Family::ExpectedStack { lighting, correction, feedback } => {
+            let maps = encode_layered(frame, pupil_mm);
+            let wanted = expected_stack(weights, frame, [maps.height, maps.width], pupil_mm).map(f64::sqrt);
+            let maps = concatenate(&[&maps, &wanted.clone().map(|amplitude| amplitude - 0.4)]);
+            let out = trunk(&mut stages, "lighting.", lighting, weights, maps.clone(), pupil_mm);
+            let carried = light_layers(weights, &out, &wanted);
+            stages.push(Stage { name: "carried".into(), value: Value::Light(carried.clone()) });
+            let sharpness = f64::from(feedback.sharpness);
+            let (change, lack) = feed_back(weights, frame, &carried, &wanted, sharpness, pupil_mm);
+            let field: Vec<_> = carried.iter().zip(&change).map(|(f, c)| f + c * f64::from(feedback.share)).collect();
+            let [real, imaginary] = parts(&field, &maps);
+            let [change_real, change_imaginary] = parts(&change, &maps);
+            let encoded = concatenate(&[&real, &imaginary, &maps, &change_real, &change_imaginary, &lack]);
             let residual = trunk(&mut stages, "correction.", correction, weights, encoded, pupil_mm);
             add(&field, &residual, 0.3)
         }
@@ -169,6 +171,15 @@ fn add(base: &[Complex64], residual: &Map, share: f64) -> Vec<Complex64> {
     let (real, imaginary) = residual.values.split_at(base.len());
     let residual = real.iter().zip(imaginary).map(|(&re, &im)| Complex64::new(re, im));
     base.iter().zip(residual).map(|(base, residual)| base + residual * share).collect()
+}
+
+/// Real and imaginary parts of a field on the grid of `like`.
+fn parts(field: &[Complex64], like: &Map) -> [Map; 2] {
+    [|value: &Complex64| value.re, |value: &Complex64| value.im].map(|part| Map {
+        channels: 3,
+        values: field.iter().map(part).collect(),
+        ..*like
+    })
 }
 
 fn concatenate(maps: &[&Map]) -> Map {
@@ -341,17 +352,19 @@ fn centre_m(weights: &Weights, layer: usize) -> f64 {
     (optics.eyepiece_focal_length_mm * 1e-3).powi(2) * dioptres
 }
 
-/// The share of block `index` whose pixels lie in one of `layers`.
-fn cover(weights: &Weights, frame: &RgbdFrame, columns: usize, index: usize, layers: RangeInclusive<usize>) -> f64 {
+/// The depth layer of a pixel; beyond an odd edge the edge again.
+fn layer_of(weights: &Weights, frame: &RgbdFrame, y: usize, x: usize) -> usize {
     let Resolution { width, height } = frame.resolution;
     let count = weights.config.depth_layers;
-    let layer_of = |y: usize, x: usize| {
-        let depth = frame.depth_normalised[y.min(height - 1) * width + x.min(width - 1)];
-        ((depth * count as f32) as usize).min(count - 1)
-    };
+    let depth = frame.depth_normalised[y.min(height - 1) * width + x.min(width - 1)];
+    ((depth * count as f32) as usize).min(count - 1)
+}
+
+/// The share of block `index` whose pixels lie in one of `layers`.
+fn cover(weights: &Weights, frame: &RgbdFrame, columns: usize, index: usize, layers: RangeInclusive<usize>) -> f64 {
     let (y, x) = (2 * (index / columns), 2 * (index % columns));
     let corners = [(y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)];
-    corners.iter().filter(|&&(y, x)| layers.contains(&layer_of(y, x))).count() as f64 / 4.0
+    corners.iter().filter(|&&(y, x)| layers.contains(&layer_of(weights, frame, y, x))).count() as f64 / 4.0
 }
 
 /// The angular spectrum transfer function of one colour over the distance `u_m`, at cycles per sample of the grid.
@@ -385,41 +398,101 @@ fn carry_to_slm(weights: &Weights, frame: &RgbdFrame, source: &[Complex64], size
     carried
 }
 
-/// The change of the field at the SLM plane that would give each point the amplitude that it lacks in focus, and that
-/// lack.
+/// What an eye should see at each depth layer as far as the picture and its depth tell: intensities, colours within
+/// layers. Each layer is blurred by its disc of confusion; the sum is over that of a white scene.
+fn expected_stack(weights: &Weights, frame: &RgbdFrame, size: [usize; 2], pupil_mm: f64) -> Map {
+    let NetworkConfig { depth_layers: count, optics, .. } = &weights.config;
+    let [rows, columns] = size;
+    let Resolution { width, height } = frame.resolution;
+    // White and three colours of each layer.
+    let part = |layer: usize, channel: usize| -> Vec<Complex64> {
+        let sample = |index: usize| {
+            let (y, x) = (2 * (index / columns), 2 * (index % columns));
+            let corners = [(y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)].into_iter();
+            let light = corners.filter(|&(y, x)| layer_of(weights, frame, y, x) == layer).map(|(y, x)| match channel {
+                0 => 1.0,
+                _ => sample(&frame.amplitude[(channel - 1) * width * height..], frame.resolution, y, x).powi(2),
+            });
+            Complex64::from(light.sum::<f64>() / 4.0)
+        };
+        (0..rows * columns).map(sample).collect()
+    };
+    let layer_dpt = (optics.depth_near_dpt - optics.depth_far_dpt) / *count as f64;
+    let pixel_rad = optics.pixel_pitch_um * 1e-6 / (optics.eyepiece_focal_length_mm * 1e-3);
+    let mut seen = vec![vec![0.0; rows * columns]; 4 * count];
+    for (layer, channel) in (0..*count).flat_map(|layer| (0..4).map(move |channel| (layer, channel))) {
+        let part = part(layer, channel);
+        for focus in 0..*count {
+            let blur_dpt = layer.abs_diff(focus) as f64 * layer_dpt;
+            let diameter_samples = blur_dpt * pupil_mm * 1e-3 / pixel_rad / 2.0;
+            let blurred = filtered(&part, size, |fx, fy| {
+                let x = (PI * diameter_samples * fx.hypot(fy)).max(1e-3);
+                Complex64::from(2.0 * libm::j1(x) / x)
+            });
+            seen[4 * focus + channel].iter_mut().zip(blurred).for_each(|(sum, value)| *sum += value.re);
+        }
+    }
+    Map::from_fn([3 * count, rows, columns], |channel, y, x| {
+        let at = |plane: usize| seen[plane][y * columns + x];
+        let (focus, colour) = (channel / 3, channel % 3);
+        (at(4 * focus + 1 + colour) / at(4 * focus).max(0.02)).max(0.0)
+    })
+}
+
+/// The field at the SLM plane when the wanted amplitudes light the depth layers through the first net's masks, with its
+/// phases.
+fn light_layers(weights: &Weights, out: &Map, wanted: &Map) -> Vec<Complex64> {
+    let (count, size, pixels) = (weights.config.depth_layers, [out.height, out.width], out.height * out.width);
+    let offset = ((count - 1) as f64).ln();
+    let mut field = vec![Complex64::ZERO; 3 * pixels];
+    for (layer, colour) in (0..count).flat_map(|layer| (0..3).map(move |colour| (layer, colour))) {
+        let plane = |map: &Map, channel: usize| map.values[channel * pixels..][..pixels].to_vec();
+        let (phase, mask) = (plane(out, 4 * layer + colour), plane(out, 4 * layer + 3));
+        let light =
+            plane(wanted, 3 * layer + colour).into_iter().zip(phase).zip(mask).map(|((wanted, phase), mask)| {
+                Complex64::from_polar(wanted, PI * phase) / (1.0 + (offset - mask).exp())
+            });
+        let u_m = centre_m(weights, layer);
+        let carried = filtered(&light.collect::<Vec<_>>(), size, |fx, fy| transfer(weights, colour, -u_m, [fx, fy]));
+        field[colour * pixels..].iter_mut().zip(carried).for_each(|(sum, value)| *sum += value);
+    }
+    field
+}
+
+/// The mean over the depth layers of the changes of the field at the SLM plane that would give an eye what it lacks of
+/// the wanted amplitudes there, and these lacks.
 fn feed_back(
     weights: &Weights,
     frame: &RgbdFrame,
     carried: &[Complex64],
-    light: &Map,
+    wanted: &Map,
+    sharpness: f64,
     pupil_mm: f64,
 ) -> (Vec<Complex64>, Map) {
-    let (optics, size) = (&weights.config.optics, [light.height, light.width]);
-    let pixels = light.height * light.width;
+    let (NetworkConfig { depth_layers: count, optics, .. }, size) = (&weights.config, [wanted.height, wanted.width]);
+    let pixels = wanted.height * wanted.width;
     let mut change = vec![Complex64::ZERO; carried.len()];
-    let mut lack = light.clone().map(|_| 0.0);
-    for colour in 0..3 {
+    let mut lack = wanted.clone();
+    for (layer, colour) in (0..*count).flat_map(|layer| (0..3).map(move |colour| (layer, colour))) {
         let plane = colour * pixels..(colour + 1) * pixels;
         let per_mm = 1e-3 / (optics.wavelengths_nm[colour] * 1e-9 * optics.eyepiece_focal_length_mm * 1e-3);
-        let through = |field: &[Complex64], u_m| {
+        let through = |field: &[Complex64], u_m: f64| {
             filtered(field, size, |fx, fy| {
                 let per_m = fx.hypot(fy) / (2e-6 * optics.pixel_pitch_um);
                 if per_m < 0.5 * pupil_mm * per_mm { transfer(weights, colour, u_m, [fx, fy]) } else { Complex64::ZERO }
             })
         };
-        for layer in 0..weights.config.depth_layers {
-            let u_m = centre_m(weights, layer);
-            let mut arriving = through(&carried[plane.clone()], u_m);
-            for (index, arriving) in arriving.iter_mut().enumerate() {
-                let amplitude = (arriving.norm_sqr() + 1e-6).sqrt();
-                let cover = cover(weights, frame, light.width, index, layer..=layer);
-                let here = cover * (light.values[plane.start + index] - amplitude);
-                lack.values[plane.start + index] += here;
-                *arriving *= here / amplitude;
-            }
-            for (change, back) in change[plane.clone()].iter_mut().zip(through(&arriving, -u_m)) {
-                *change += back;
-            }
+        let u_m = centre_m(weights, layer);
+        let mut arriving = through(&carried[plane.clone()], u_m);
+        let lack = &mut lack.values[(3 * layer + colour) * pixels..][..pixels];
+        for (index, (arriving, lack)) in arriving.iter_mut().zip(lack).enumerate() {
+            let amplitude = (arriving.norm_sqr() + 1e-6).sqrt();
+            *lack -= amplitude;
+            let weight = 1.0 + sharpness * cover(weights, frame, wanted.width, index, layer..=layer);
+            *arriving *= weight * *lack / amplitude;
+        }
+        for (change, back) in change[plane].iter_mut().zip(through(&arriving, -u_m)) {
+            *change += back / *count as f64;
         }
     }
     (change, lack)

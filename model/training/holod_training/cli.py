@@ -182,7 +182,6 @@ def _network_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--correction-layers", type=int)
     sub.add_argument("--correction-dilations", type=_list_of(int), metavar="D,D,..")
     sub.add_argument("--transport-prior", action=argparse.BooleanOptionalAction)
-    sub.add_argument("--focus-feedback", action=argparse.BooleanOptionalAction)
     sub.add_argument("--planes", type=int)
 
 

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Any
 
 WEIGHTS_FORMAT = "holod-weights-1"
-ARCHITECTURES = ("direct", "layered", "focal-stack")
+ARCHITECTURES = ("direct", "layered", "expected-stack", "focal-stack")
 CONDITIONINGS = ("adjustable", "deformable", "modulated")
 
 
@@ -66,7 +66,8 @@ class NetworkConfig:
     """One network; `model/weights` carries this as JSON under the key `config`. `variants.py` has a table of them.
 
     direct: field at the SLM plane from amplitude and depth. layered: light on the objects' surfaces, carried by
-    physics. focal-stack: phases and masks for `planes` images, uniform in dioptres, carried back and summed.
+    physics. expected-stack: phases and masks for what an eye should see at each depth layer, carried by physics.
+    focal-stack: phases and masks for `planes` images, uniform in dioptres, carried back and summed.
     """
 
     architecture: str = "direct"
@@ -94,11 +95,9 @@ class NetworkConfig:
     specialists_mm: tuple[float, ...] = _optional(())
     depth_layers: int = _optional(8)
     transport_prior: bool = _optional(True)
-    # The second net of `layered`; dilations as above.
+    # The second net of `layered` and `expected-stack`; dilations as above.
     correction_layers: int = _optional(10)
     correction_dilations: tuple[int, ...] = _optional(())
-    # `layered`: the second net starts from, and is shown, what would set each point right where it is in focus.
-    focus_feedback: bool = _optional(False)
     planes: int = _optional(6)
 
     def __post_init__(self) -> None:
@@ -132,11 +131,10 @@ class NetworkConfig:
         direct = self.architecture == "direct"
         self._require("frames", self.frames >= 1 and (direct or self.frames == 1), "1; `direct` may have more")
         self._require("blur_input", direct or not self.blur_input, "false; only `direct` can have it")
-        fed_back = self.architecture == "layered" and self.grid == "half-band"
-        self._require(
-            "focus_feedback", fed_back or not self.focus_feedback, "false; only `layered` on `half-band` can have it"
-        )
-        self._require("pupil_inputs", self.architecture != "layered" or self.pupil_inputs, "true for `layered`")
+        expecting = self.architecture == "expected-stack"
+        self._require("grid", self.grid == "half-band" or not expecting, "'half-band' for `expected-stack`")
+        always_told = self.architecture in ("layered", "expected-stack")
+        self._require("pupil_inputs", self.pupil_inputs or not always_told, f"true for `{self.architecture}`")
         self._require(
             "correction_dilations",
             len(self.correction_dilations) in (0, self.correction_layers)

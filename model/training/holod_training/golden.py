@@ -16,8 +16,7 @@ from torch import Tensor
 from holod_training.config import NetworkConfig
 from holod_training.export import WeightsError, load_weights, save_weights, write_beside
 from holod_training.golden_evaluation import write_evaluation
-from holod_training.layered import LayeredNetwork
-from holod_training.network import AdjustableLayer, DirectNetwork, FieldNetwork, Trunk
+from holod_training.network import AdjustableLayer, FieldNetwork, Trunk
 from holod_training.optics import (
     Eye,
     double_phase,
@@ -31,7 +30,7 @@ from holod_training.variants import build_network
 GOLDEN_FORMAT = "holod-golden-1"
 FOCUS_DPT = (0.25, 2.5)
 ASM_DISTANCE_M = 0.0032
-SHIPPED_FAMILIES = ("direct", "layered")
+SHIPPED_FAMILIES = ("direct", "layered", "expected-stack")
 
 
 class Narrow(NamedTuple):
@@ -72,16 +71,14 @@ NARROW: dict[str, Narrow] = {
         24,
     ),
     # A pupil that cuts the half band.
-    "layered-narrow-feedback": Narrow(
+    "expected-stack-narrow": Narrow(
         NetworkConfig(
-            architecture="layered",
+            architecture="expected-stack",
             layers=4,
             channels=4,
             adjustable_layers=(2,),
             modulation_hidden=8,
-            transport_prior=False,
             correction_layers=4,
-            focus_feedback=True,
         ),
         16,
         24,
@@ -126,8 +123,9 @@ def complex_parts(field: Tensor) -> Tensor:
 def told_layers(config: NetworkConfig) -> set[str]:
     """The trace's names of what is kept of a large network: the first, the adjustable and the last layer of a net."""
     nets = {"": (config.layers, config.adjustable_layers)}
-    if config.architecture == "layered":
-        nets = {"surface.": nets[""], "correction.": (config.correction_layers, ())}
+    if config.architecture != "direct":
+        first = "surface" if config.architecture == "layered" else "lighting"
+        nets = {f"{first}.": nets[""], "correction.": (config.correction_layers, ())}
     return {
         f"{net}layer_{index}" for net, (layers, adjustable) in nets.items() for index in (0, *adjustable, layers - 1)
     }
@@ -191,9 +189,9 @@ def write_golden(out: Path, standard: Path | None, small: Path | None = None, se
         if not shipped:
             continue
         built_in = load_weights(shipped)
-        if not isinstance(built_in, DirectNetwork | LayeredNetwork):
-            raise WeightsError(f"{shipped}: found a {type(built_in).__name__}, expected a direct or layered network")
         family = built_in.config.architecture
+        if family not in SHIPPED_FAMILIES:
+            raise WeightsError(f"{shipped}: found a {family} network, expected one of {', '.join(SHIPPED_FAMILIES)}")
         path = out / f"{family}-shipped{suffix}.safetensors"
         amplitude, depth = scene(32, 48, seed)
         result = vectors(built_in.double(), amplitude, depth, 3.4, every_layer=False)

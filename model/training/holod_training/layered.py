@@ -7,11 +7,11 @@ from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from holod_training.config import NetworkConfig, OpticsConfig
-from holod_training.network import OUTPUT_CHANNELS, FieldNetwork, Trunk
-from holod_training.optics import frequencies, intensity, pupil_mask, stop_half_band, transfer
+from holod_training.network import OUTPUT_CHANNELS, FieldNetwork, Trunk, run_traced
+from holod_training.optics import frequencies, stop_half_band, transfer
 
 LOG_FLOOR = 0.03
 LOG_OFFSET = 1.66
@@ -19,9 +19,6 @@ SIGMAS_PX = (1.0, 2.5, 6.0)
 PRIOR_GAINS = (-0.5, -1.0, 0.0)
 REFERENCE_NM = 520.0
 CORRECTION_SHARE = 0.3
-FEEDBACK_SHARE = 0.5
-FEEDBACK_CHANNELS = 9
-DARK = 1e-6
 
 
 @lru_cache(maxsize=32)
@@ -73,29 +70,12 @@ def compose(source: Tensor, depth: Tensor, optics: OpticsConfig, count: int, sca
     return carry(field, optics, scale, -centres[-1])
 
 
-def refocus(
-    field: Tensor, light: Tensor, depth: Tensor, pupil_mm: Tensor, optics: OpticsConfig, count: int, scale: int = 1
-) -> tuple[Tensor, Tensor]:
-    """What an eye lacks of the amplitude `light` [N, 3, h, w] where each point is in focus, and the change of the field
-    at the SLM plane, both [N, 3, h, w], that would give it: one step of Gerchberg and Saxton (1972) at all `count`
-    layers of depth [N, H, W] at once, through pupils [N], of which only those below 2.3 mm cut the half band of the
-    default bench. It keeps the phases there; the layers change one another too.
-    """
-    height, width = field.shape[-2:]
-    fy, fx = (frequencies(size, scale * optics.pitch_m, field.device) for size in (height, width))
-    pupil = pupil_mask(optics, fx, fy, pupil_mm[:, None, None])
-    layer = (depth * count).long().clamp(0, count - 1)[:, None]
-    spectrum = torch.fft.fft2(field) * pupil
-    change, lack = torch.zeros_like(spectrum), torch.zeros_like(light)
-    for k in range(count):
-        distance_m = optics.distance_m(optics.dioptres((k + 0.5) / count))
-        kernel = carrier(optics, scale, height, width, distance_m, field.dtype, str(field.device))
-        arriving = torch.fft.ifft2(spectrum * kernel)
-        amplitude = torch.sqrt(intensity(arriving) + DARK)
-        here = (light - amplitude) * F.avg_pool2d((layer == k).to(light.dtype), scale)
-        change = change + torch.fft.fft2(arriving * (here / amplitude)) * kernel.conj()
-        lack = lack + here
-    return lack, torch.fft.ifft2(change * pupil)
+def encode(amplitude: Tensor, depth: Tensor, pupil_mm: Tensor, scale: int) -> Tensor:
+    """amplitude [N, 3, H, W], depth [N, H, W], pupil_mm [N] -> what nets are told of a scene, [N, maps, h, w]."""
+    s = pupil_mm[:, None, None, None]
+    centred = depth[:, None] - 0.5
+    x = F.pixel_unshuffle(torch.cat((amplitude - 0.4, 2 * centred, centred * s), dim=1), scale)
+    return torch.cat((x, ((s - 2.5) / 2).expand(-1, 1, *x.shape[2:])), dim=1)
 
 
 def drift_phase(centred: Tensor, logs: Tensor, optics: OpticsConfig, gates: Tensor | float = 0.0) -> Tensor:
@@ -111,8 +91,7 @@ def drift_phase(centred: Tensor, logs: Tensor, optics: OpticsConfig, gates: Tens
 class LayeredNetwork(FieldNetwork):
     """Net 1 (`surface`) gives each point of the network's grid and each colour a correction of amplitude, a phase, and
     gates of three blurs; `depth_layers` are composed far to near with occlusion and carried to the SLM plane; net 2
-    (`correction`) sees that field and adds a residual to it. With `focus_feedback` the field first takes a learned
-    share of what would set each point right where it is in focus (`refocus`), which net 2 sees too.
+    (`correction`) sees that field and adds a residual to it.
 
     With `transport_prior` the phase starts where light flows from bright to dark away from focus, as a wider pupil
     makes it: φ ∝ tanh(4·(½ − D)) · G_σ(log(I + 0.03)), from the transport of intensity I·∇φ ∝ −∇I.
@@ -134,58 +113,31 @@ class LayeredNetwork(FieldNetwork):
         )
         self.correction = Trunk(
             config,
-            inputs=OUTPUT_CHANNELS + maps + FEEDBACK_CHANNELS * config.focus_feedback,
+            inputs=OUTPUT_CHANNELS + maps,
             outputs=OUTPUT_CHANNELS,
             layers=config.correction_layers,
             dilations=config.correction_dilations,
             adjustable_layers=(),
             last_share=0.1,
         )
-        if config.focus_feedback:
-            self.feedback_share = nn.Parameter(torch.tensor([FEEDBACK_SHARE]))
-
-    def without_feedback(self, weights: dict[str, Tensor]) -> dict[str, Tensor]:
-        """This network's weights out of those of the same network without `focus_feedback`: the share is 0 and net 2
-        does not look at it yet, so the fields are the same."""
-        first = "correction.0.weight"
-        blind = weights[first].new_zeros(self.config.channels, FEEDBACK_CHANNELS, 3, 3)
-        return weights | {
-            first: torch.cat((weights[first], blind), dim=1),
-            "feedback_share": torch.zeros_like(self.feedback_share),
-        }
 
     def forward(
         self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor, trace: dict[str, Tensor] | None = None
     ) -> Tensor:
         """`trace`, where given, receives what each stage puts out: both nets' `encoded`, `layer_{i}` and `offsets_{i}`
-        under their names and a dot, the light of the surfaces under `source`, the carried field under `carried`
-        (before any feedback)."""
-
-        def run(name: str, trunk: Trunk, x: Tensor) -> Tensor:
-            inner: dict[str, Tensor] | None = None if trace is None else {"encoded": x}
-            out = trunk(x, pupil_mm, inner)
-            if trace is not None and inner is not None:
-                trace.update({f"{name}.{key}": value for key, value in inner.items()})
-            return out.to(amplitude.dtype)
-
-        maps = self.encode(amplitude, depth, pupil_mm)
+        under their names and a dot, the light of the surfaces under `source`, the carried field under `carried`."""
+        maps = encode(amplitude, depth, pupil_mm, self.scale)
         light = self.mean(amplitude)
         blurs = blurred(torch.cat((light, torch.log(light.square() + LOG_FLOOR)), dim=1), self.sigmas)
         soft, logs = blurs[:, :, :3], blurs[:, :, 3:] + LOG_OFFSET
         seen = torch.cat((maps, logs[:, 1]), dim=1) if self.config.transport_prior else maps
-        out = run("surface", self.surface, seen)
+        out = run_traced("surface", self.surface, seen, pupil_mm, trace)
         source = self.surface_light(out, light, self.mean(depth[:, None] - 0.5), soft, logs)
         field = compose(source, depth, self.config.optics, self.config.depth_layers, self.scale)
         if trace is not None:
             trace |= {"source": source, "carried": field}
-        seen = maps
-        if self.config.focus_feedback:
-            lack, change = refocus(
-                field, light, depth, pupil_mm, self.config.optics, self.config.depth_layers, self.scale
-            )
-            field = field + self.feedback_share * change
-            seen = torch.cat((maps, change.real, change.imag, lack), dim=1)
-        residual = run("correction", self.correction, torch.cat((field.real, field.imag, seen), dim=1))
+        seen = torch.cat((field.real, field.imag, maps), dim=1)
+        residual = run_traced("correction", self.correction, seen, pupil_mm, trace)
         field = field + CORRECTION_SHARE * torch.complex(residual[:, :3].contiguous(), residual[:, 3:].contiguous())
         return field if self.scale == 2 else stop_half_band(field)
 
@@ -196,13 +148,6 @@ class LayeredNetwork(FieldNetwork):
     def mean(self, x: Tensor) -> Tensor:
         """Onto the network's grid."""
         return F.avg_pool2d(x, self.scale)
-
-    def encode(self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor) -> Tensor:
-        """amplitude [N, 3, H, W], depth [N, H, W], pupil_mm [N] -> what both nets are told, [N, maps, h, w]."""
-        s = pupil_mm[:, None, None, None]
-        centred = depth[:, None] - 0.5
-        x = F.pixel_unshuffle(torch.cat((amplitude - 0.4, 2 * centred, centred * s), dim=1), self.scale)
-        return torch.cat((x, ((s - 2.5) / 2).expand(-1, 1, *x.shape[2:])), dim=1)
 
     def surface_light(self, out: Tensor, light: Tensor, centred: Tensor, soft: Tensor, logs: Tensor) -> Tensor:
         """What each surface point sends out, complex [N, 3, h, w], from net 1's output, amplitude [N, 3, h, w],

@@ -212,6 +212,15 @@ class Trunk(nn.ModuleList):
         return out
 
 
+def run_traced(name: str, trunk: Trunk, x: Tensor, pupil_mm: Tensor, trace: dict[str, Tensor] | None) -> Tensor:
+    """The trunk's output in the precision of `x`; `trace`, where given, receives its input and layers as `NAME.…`."""
+    inner: dict[str, Tensor] | None = None if trace is None else {"encoded": x}
+    out: Tensor = trunk(x, pupil_mm, inner)
+    if trace is not None and inner is not None:
+        trace.update({f"{name}.{key}": value for key, value in inner.items()})
+    return out.to(x.dtype)
+
+
 class FieldNetwork(nn.Module):
     """What all variants are: (amplitude, depth, pupil_mm) to complex fields on the grid of `config`.
 

@@ -27,7 +27,6 @@ from tqdm import tqdm
 from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.curves import plot_curves
 from holod_training.export import load_weights, save_weights, write_beside
-from holod_training.layered import LayeredNetwork
 from holod_training.loss import PERCEPTUAL_PLANES, LossWeights, focus_loss, inner
 from holod_training.lpips import Lpips
 from holod_training.metrics import Judgement, judge, psnr_db
@@ -151,11 +150,7 @@ class Run:
             self.validation = open_held_out(Path(config.validation), config.network.optics, config.validation_scenes)
 
     def _initial_weights(self, path: Path) -> dict[str, Tensor]:
-        loaded, wanted = load_weights(path), self.network.state_dict()
-        found = loaded.state_dict()
-        plain = dataclasses.replace(self.config.network, focus_feedback=False)
-        if isinstance(self.network, LayeredNetwork) and loaded.config == plain != self.config.network:
-            found = self.network.without_feedback(found)
+        found, wanted = load_weights(path).state_dict(), self.network.state_dict()
         if {k: v.shape for k, v in found.items()} != {k: v.shape for k, v in wanted.items()}:
             raise TrainingError(f"{path}: its network has other layers than this run's; start from the same variant")
         return found

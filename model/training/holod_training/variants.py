@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from holod_training.config import ConfigError, NetworkConfig
+from holod_training.expected_stack import ExpectedStackNetwork
 from holod_training.focal_stack import FocalStackNetwork, focal_amplitudes
 from holod_training.layered import LayeredNetwork
 from holod_training.network import DirectNetwork, FieldNetwork
@@ -48,7 +49,6 @@ VARIANTS: dict[str, NetworkConfig] = {
     "two-frames": replace(_HALF_BAND, frames=2),
     "half-band-layered": _HALF_BAND_LAYERED,
     "half-band-layered-no-prior": replace(_HALF_BAND_LAYERED, transport_prior=False),
-    "half-band-layered-feedback": replace(_HALF_BAND_LAYERED, transport_prior=False, focus_feedback=True),
     "half-band-layered-small": replace(
         _HALF_BAND_LAYERED, layers=4, channels=24, adjustable_layers=(2,), correction_layers=6
     ),
@@ -61,6 +61,7 @@ VARIANTS: dict[str, NetworkConfig] = {
     "layered-4-no-prior": replace(_LAYERED, depth_layers=4, transport_prior=False),
     "layered-8-no-prior": replace(_LAYERED, transport_prior=False),
     "layered-12-no-prior": replace(_LAYERED, depth_layers=12, transport_prior=False),
+    "expected-stack": replace(_HALF_BAND_LAYERED, architecture="expected-stack"),
     "focal-stack": replace(_HALF_BAND, architecture="focal-stack"),
     "ablation-three-plain": replace(
         _HALF_BAND, adjustable_layers=(), pupil_inputs=False, specialists_mm=ABLATION_PUPILS_MM
@@ -71,7 +72,12 @@ VARIANTS: dict[str, NetworkConfig] = {
     "ablation-modulated": replace(_HALF_BAND, conditioning="modulated"),
     "ablation-no-pupil": replace(_HALF_BAND, adjustable_layers=(), pupil_inputs=False),
 }
-_FAMILIES = {"direct": DirectNetwork, "layered": LayeredNetwork, "focal-stack": FocalStackNetwork}
+_FAMILIES = {
+    "direct": DirectNetwork,
+    "layered": LayeredNetwork,
+    "expected-stack": ExpectedStackNetwork,
+    "focal-stack": FocalStackNetwork,
+}
 
 
 def variant(name: str) -> NetworkConfig:

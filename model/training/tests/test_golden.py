@@ -72,18 +72,20 @@ def test_no_stage_of_the_layered_vectors_is_idle() -> None:
     assert (found["eye_field"] - found["eye_panel"]).abs().mean() < 0.05
 
 
-def test_vectors_with_feedback_change_the_field_through_a_narrow_pupil() -> None:
-    found = load_file(COMMITTED / "layered-narrow-feedback.safetensors")
+def test_no_stage_of_the_expected_stack_vectors_is_idle() -> None:
+    found = load_file(COMMITTED / "expected-stack-narrow.safetensors")
     carried, low = (torch.complex(*found[name]) for name in ("carried", "low"))
     seen = found["correction.encoded"]
-    real, imaginary, change_real, change_imaginary, lack = (*seen[:6].split(3), *seen[-9:].split(3))
-    assert seen.shape == (36, 8, 12) and found["pupil_mm"].item() == pytest.approx(1.6)
-    change = torch.complex(change_real, change_imaginary)
-    torch.testing.assert_close(torch.complex(real, imaginary), carried + 0.5 * change, rtol=1e-5, atol=1e-5)
-    assert change.abs().mean() > 0.01 and lack.abs().mean() > 0.01
+    assert seen.shape == (81, 8, 12) and found["lighting.encoded"].shape == (45, 8, 12)
+    torch.testing.assert_close(seen[6:51], found["lighting.encoded"])
+    field, change = (torch.complex(*seen[first : first + 6].split(3)) for first in (0, 51))
+    torch.testing.assert_close(field, carried + 0.5 * change, rtol=1e-5, atol=1e-5)
     residual = torch.complex(*found["correction.layer_3"].split(3))
-    torch.testing.assert_close(low, torch.complex(real, imaginary) + 0.3 * residual, rtol=1e-5, atol=1e-5)
-    inside = pupil_mask(OpticsConfig(), *(frequencies(n, 16e-6, "cpu") for n in (12, 8)), 1.6)
+    torch.testing.assert_close(low, field + 0.3 * residual, rtol=1e-5, atol=1e-5)
+    for part in (carried, change, seen[57:], residual):
+        assert part.abs().mean() > 0.01
+    assert found["pupil_mm"].item() == pytest.approx(1.6)
+    inside = pupil_mask(OpticsConfig(), *(frequencies(n, 16e-6) for n in (12, 8)), 1.6)
     spectrum = torch.fft.fft2(change).abs()
     assert not inside.all() and spectrum[~inside].max() < 1e-5 * spectrum.max()
 
@@ -127,7 +129,9 @@ def test_shipped_layered_weights_have_files_named_for_them(tmp_path: Path) -> No
     assert layers["surface"] == ["surface.layer_0", "surface.layer_2", "surface.layer_3"]
     assert layers["correction"] == ["correction.layer_0", "correction.layer_3"]
     save_weights(layered, build_network(variant("focal-stack")), {}, {})
-    with pytest.raises(WeightsError, match="found a FocalStackNetwork, expected a direct or layered network"):
+    with pytest.raises(
+        WeightsError, match="found a focal-stack network, expected one of direct, layered, expected-stack"
+    ):
         write_golden(tmp_path / "out", None, layered)
 
 

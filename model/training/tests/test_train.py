@@ -20,7 +20,7 @@ from holod_training.network import DirectNetwork
 from holod_training.sampling import AugmentConfig
 from holod_training.shards import ShardError
 from holod_training.train import Run, TrainConfig, TrainingError, train
-from holod_training.variants import build_network, variant
+from holod_training.variants import variant
 
 CPU = torch.device("cpu")
 TINY = NetworkConfig(layers=4, channels=8, adjustable_layers=(1,), modulation_hidden=4)
@@ -192,25 +192,6 @@ def test_a_teacher_is_compared_by_its_pictures(shards: Path, tmp_path: Path) -> 
     assert taught.train_step()["loss_teacher"] > 0
     with pytest.raises(TrainingError, match="its network has other layers"):
         Run(dataclasses.replace(started, initial_weights=str(tmp_path / "larger.safetensors")), CPU)
-
-
-def test_a_network_goes_on_with_feedback_from_the_same_fields(shards: Path, tmp_path: Path) -> None:
-    torch.manual_seed(3)
-    plain = dataclasses.replace(variant("half-band-layered-no-prior"), layers=4, channels=4, adjustable_layers=(2,))
-    fed_back = dataclasses.replace(plain, focus_feedback=True)
-    source = tmp_path / "plain.safetensors"
-    save_weights(source, build_network(plain), {}, {})
-    run = Run(tiny(shards, tmp_path / "run", network=fed_back, initial_weights=str(source)), CPU)
-    generator = torch.Generator().manual_seed(1)
-    scene = torch.rand(1, 3, 32, 32, generator=generator), torch.rand(1, 32, 32, generator=generator)
-    with torch.no_grad():
-        before = load_weights(source)(*scene, torch.tensor([3.0]))
-        torch.testing.assert_close(run.network(*scene, torch.tensor([3.0])), before)
-    run.train_step()
-    assert run.network.feedback_share.item() != 0
-    wider = dataclasses.replace(fed_back, channels=6)
-    with pytest.raises(TrainingError, match="its network has other layers"):
-        Run(tiny(shards, tmp_path / "run", network=wider, initial_weights=str(source)), CPU)
 
 
 def test_lpips_joins_the_loss_where_its_files_are_given(shards: Path, tmp_path: Path) -> None:

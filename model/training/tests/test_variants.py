@@ -5,20 +5,17 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.nn.functional as F
 from safetensors import safe_open
 
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
 from holod_training.costs import operations_per_pixel
-from holod_training.layered import LayeredNetwork, blurred, carry, refocus
+from holod_training.layered import LayeredNetwork, blurred
 from holod_training.metrics import focus_response
 from holod_training.network import DirectNetwork
 from holod_training.optics import (
     Eye,
-    frequencies,
     half_band_mask,
     propagate,
-    pupil_mask,
     stop_half_band,
     upsample_half_band,
 )
@@ -67,7 +64,7 @@ def test_the_table_is_what_it_says() -> None:
         ("half-band-layered", 178_818),
         ("half-band-layered-small", 68_698),
         ("half-band-layered-small-no-prior", 66_097),
-        ("half-band-layered-feedback", 177_946),
+        ("expected-stack", 202_732),
     ):
         assert sum(p.numel() for p in build_network(variant(name)).parameters()) == parameters, name
     # Two operations a weight of each 3x3 convolution, the offsets' too; taps and FFTs are a few per cent.
@@ -86,8 +83,8 @@ def test_configs_that_do_not_fit_say_which_key() -> None:
         ({"correction_dilations": (0,) * 10}, "correction_dilations: .* of at least 1"),
         ({"architecture": "layered", "pupil_inputs": False}, "pupil_inputs: found False, expected true"),
         ({"architecture": "focal-stack", "frames": 2}, "frames: found 2"),
-        ({"focus_feedback": True}, "focus_feedback: found True, expected false"),
-        ({"architecture": "layered", "grid": "full", "focus_feedback": True}, "focus_feedback: found True"),
+        ({"architecture": "expected-stack", "grid": "full"}, "grid: found 'full', expected 'half-band' for `expected"),
+        ({"architecture": "expected-stack", "pupil_inputs": False}, "pupil_inputs: found False, expected true"),
         ({"specialists_mm": (3.0, 2.0)}, "specialists_mm: .* rising order"),
     ):
         with pytest.raises(ConfigError, match=message):
@@ -246,57 +243,6 @@ def test_half_band_without_learning_is_the_layered_rival_of_a_smooth_scene() -> 
     assert error(unlearned("half-band", transport_prior=False)) < 0.03
     assert error(unlearned("half-band")) > 0.1
     assert error(unlearned("half-band", transport_prior=False), turned=True) > 0.1
-
-
-def test_refocusing_sets_right_what_an_eye_lacks_in_focus_through_its_pupil() -> None:
-    torch.manual_seed(3)
-    optics, count, layer = OpticsConfig(), 8, 6
-    depth = torch.full((2, 64, 64), (layer + 0.5) / count)
-    distance_m = optics.distance_m(optics.dioptres((layer + 0.5) / count))
-    amplitude = F.interpolate(0.3 + 0.6 * torch.rand(2, 3, 4, 4), size=(32, 32), mode="bicubic").clamp(0.2, 1)
-    phase = F.interpolate(torch.rand(2, 3, 4, 4), size=(32, 32), mode="bicubic")
-    there = torch.polar(amplitude, phase)
-    wrong = there.clone()
-    wrong[..., 10:20, 10:20] *= 0.7
-    field = carry(wrong, optics, 2, -distance_m)
-
-    # The second eye's pupil lets but a part of the band through.
-    lack, change = refocus(field, amplitude, depth, torch.tensor([5.0, 1.0]), optics, count, 2)
-    torch.testing.assert_close(lack[0], amplitude[0] - wrong[0].abs(), atol=1e-4, rtol=0)
-    mended = carry(field + change, optics, 2, distance_m)
-    torch.testing.assert_close(mended[0], there[0], atol=1e-3, rtol=0)
-    assert (carry(field, optics, 2, distance_m)[0] - there[0]).abs().max() > 0.1
-    fy = fx = frequencies(32, 16e-6)
-    narrow = torch.fft.ifft2(torch.fft.fft2(wrong[1]) * pupil_mask(optics, fx, fy, 1.0))
-    torch.testing.assert_close(lack[1], amplitude[1] - narrow.abs(), atol=1e-3, rtol=0)
-    beyond = torch.fft.fft2(change).abs()[..., 0, 15:18].amax(dim=(1, 2))
-    assert beyond[1] < 1e-3 * beyond[0]
-
-    # Half of the picture at another depth: each half is set right at its own.
-    depth[:, :, :32] = 1.5 / count
-    both = refocus(field, amplitude, depth, torch.tensor([5.0, 5.0]), optics, count, 2)[0]
-    far = carry(carry(field, optics, 2, 0), optics, 2, optics.distance_m(optics.dioptres(1.5 / count)))
-    torch.testing.assert_close(both[..., 16:], (amplitude - wrong.abs())[..., 16:], atol=1e-4, rtol=0)
-    torch.testing.assert_close(both[..., :16], (amplitude - far.abs())[..., :16], atol=1e-4, rtol=0)
-
-
-def test_feedback_adds_its_share_before_the_second_net_sees_the_field() -> None:
-    torch.manual_seed(4)
-    config = dataclasses.replace(variant("half-band-layered-feedback"), channels=4)
-    network = build_network(config)
-    amplitude, depth = scene(config, 1, 32)
-    pupil, trace = torch.tensor([3.0]), dict[str, torch.Tensor]()
-    with torch.no_grad():
-        found = network(amplitude, depth, pupil, trace)
-        light = F.avg_pool2d(amplitude, 2)
-        lack, change = refocus(trace["carried"], light, depth, pupil, config.optics, 8, 2)
-        field = trace["carried"] + 0.5 * change
-        real, imaginary = trace["correction.layer_9"].split(3, dim=1)
-    torch.testing.assert_close(found, field + 0.3 * torch.complex(real, imaginary), rtol=1e-5, atol=1e-5)
-    seen = trace["correction.encoded"]
-    torch.testing.assert_close(seen[:, :6], torch.cat((field.real, field.imag), dim=1))
-    torch.testing.assert_close(seen[:, -9:], torch.cat((change.real, change.imag, lack), dim=1))
-    assert change.abs().mean() > 0.01
 
 
 @pytest.mark.parametrize("grid", GRIDS)

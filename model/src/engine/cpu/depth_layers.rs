@@ -4,13 +4,11 @@ use holod_calibration::{Colour, Metres, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
-use super::blocks::{Blocks, scale_of};
-use super::layered::BLOCK;
+use super::blocks::Blocks;
+use super::maps::{BLOCK, SCALE};
 use crate::RgbdFrame;
 use crate::optics::{TransposedFft2d, transfer_table};
-use crate::weights::{Grid, NetworkConfig};
-
-const SCALE: usize = scale_of(Grid::HalfBand);
+use crate::weights::NetworkConfig;
 
 /// f ← f·(1 − m) + O·m from far to near, by ASM between layers and at last back to the SLM plane; m is the share of a
 /// block whose pixels lie in a layer or its next nearer one, so that slanted surfaces show no seams.
@@ -20,7 +18,7 @@ pub(super) struct DepthLayers {
     /// The depth layer of each pixel of each block, [height, width, 4].
     pub(super) layer_of: Vec<[u8; BLOCK]>,
     /// From one layer to the next nearer one, and from the nearest to the SLM plane; transposed spectra, of each colour,
-    /// over the number of samples, for the inverse transform.
+    /// over the number of samples.
     pub(super) step: [Vec<Complex32>; 3],
     pub(super) back: [Vec<Complex32>; 3],
     pub(super) fft: TransposedFft2d<f32>,

@@ -1,5 +1,5 @@
 //! The `layered` family on the half-band grid: one net says what the objects' surfaces send out, physics carries it to
-//! the SLM plane and may feed back what an eye would miss in focus, a second net corrects what arrives.
+//! the SLM plane, a second net corrects what arrives.
 
 use std::f64::consts::PI;
 
@@ -7,21 +7,15 @@ use holod_calibration::{Colour, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
-use super::blocks::{Blocks, scale_of};
 use super::depth_layers::DepthLayers;
-use super::focus_feedback::FocusFeedback;
+use super::maps::{BLOCK, MAPS, SCALE, write_maps};
 use super::simd::InstructionSet;
 use super::trunk::Trunk;
 use crate::RgbdFrame;
 use crate::engine::Stage;
 use crate::optics::{TransposedFft2d, signed_bin};
-use crate::weights::{Grid, LAYERED_BLURS, Layer, NetworkConfig};
+use crate::weights::{LAYERED_BLURS, Layer, NetworkConfig};
 
-const SCALE: usize = scale_of(Grid::HalfBand);
-/// Panel pixels to a sample of the grid.
-pub(super) const BLOCK: usize = SCALE * SCALE;
-/// Amplitude, two depth maps, each four times, and the pupil.
-const MAPS: usize = 5 * BLOCK + 1;
 /// Standard deviations of the blurs, panel pixels.
 const SIGMAS_PX: [f64; LAYERED_BLURS] = [1.0, 2.5, 6.0];
 /// The blur of the logarithm that the first net sees.
@@ -32,7 +26,7 @@ const LOG_OFFSET: f32 = 1.66;
 /// The transport-of-intensity prior: φ = (520 nm / λ)·Σ gain·tanh(4·(½ − D))·blurred log I, from I·∇φ ∝ −∇I.
 const PRIOR_GAINS: [f32; LAYERED_BLURS] = [-0.5, -1.0, 0.0];
 const REFERENCE_NM: f64 = 520.0;
-const CORRECTION_SHARE: f32 = 0.3;
+pub(super) const CORRECTION_SHARE: f32 = 0.3;
 
 /// Nothing is allocated after `new`.
 pub(super) struct Layered {
@@ -49,7 +43,6 @@ pub(super) struct Layered {
     /// What the surfaces send out, [3, height, width].
     source: Vec<Complex32>,
     depth_layers: DepthLayers,
-    feedback: Option<FocusFeedback>,
 }
 
 impl Layered {
@@ -57,7 +50,6 @@ impl Layered {
         config: &NetworkConfig,
         surface: &[Layer],
         correction: &[Layer],
-        feedback_share: Option<f32>,
         size @ (width, height): (usize, usize),
         set: InstructionSet,
     ) -> Self {
@@ -74,7 +66,6 @@ impl Layered {
             centred_depth: vec![0.0; pixels],
             source: vec![Complex32::ZERO; 3 * pixels],
             depth_layers: DepthLayers::new(config, resolution),
-            feedback: feedback_share.map(|share| FocusFeedback::new(config, share, resolution)),
         }
     }
 
@@ -82,52 +73,26 @@ impl Layered {
         std::iter::once(Stage::plain("encode, blur"))
             .chain(self.surface.stages("surface "))
             .chain([Stage::plain("surface light"), Stage::plain("depth layers")])
-            .chain(self.feedback.as_ref().map(|_| Stage::plain("focus feedback")))
             .chain(self.correction.stages("correction "))
             .collect()
     }
 
     pub(super) fn run_stage(&mut self, index: usize, frame: &RgbdFrame, pupil_mm: f32) {
-        let (surface_light, correction) = self.stages_between();
+        let surface_light = 1 + self.surface.len();
         match index {
             0 => self.encode(frame, pupil_mm),
             _ if index < surface_light => self.surface.run_layer(index - 1, pupil_mm),
             _ if index == surface_light => self.light_surfaces(),
             _ if index == surface_light + 1 => self.carry(frame),
-            _ if index < correction => self.feed_back(pupil_mm),
-            _ => self.correction.run_layer(index - correction, pupil_mm),
+            _ => self.correction.run_layer(index - surface_light - 2, pupil_mm),
         }
-    }
-
-    /// The stage that follows the first net, and the one with which the second begins.
-    fn stages_between(&self) -> (usize, usize) {
-        let surface_light = 1 + self.surface.len();
-        (surface_light, surface_light + 2 + usize::from(self.feedback.is_some()))
     }
 
     /// Writes the maps that both nets see, the means and their blurs.
     fn encode(&mut self, frame: &RgbdFrame, pupil_mm: f32) {
-        let blocks = Blocks { frame: frame.resolution, scale: SCALE };
-        let (columns, pixels) = (self.size.width, frame.resolution.pixels());
-        let pupil = (pupil_mm - 2.5) / 2.0;
-        for (map, first) in [(&mut self.surface.input, 0), (&mut self.correction.input, 6)] {
-            let stride = map.stride;
-            map.rows_mut().enumerate().for_each(|(y, row)| {
-                for (x, channels) in row[stride..][..columns * stride].chunks_exact_mut(stride).enumerate() {
-                    let maps = &mut channels[first..][..MAPS];
-                    for corner in 0..BLOCK {
-                        let source = blocks.index(x, y, corner);
-                        for colour in 0..3 {
-                            maps[colour * BLOCK + corner] = frame.amplitude[colour * pixels + source] - 0.4;
-                        }
-                        let centred = frame.depth_normalised[source] - 0.5;
-                        maps[3 * BLOCK + corner] = 2.0 * centred;
-                        maps[4 * BLOCK + corner] = centred * pupil_mm;
-                    }
-                    maps[5 * BLOCK] = pupil;
-                }
-            });
-        }
+        let columns = self.size.width;
+        write_maps(&mut self.surface.input, 0, frame, pupil_mm);
+        write_maps(&mut self.correction.input, 6, frame, pupil_mm);
 
         let Self { surface, blurs, light, centred_depth, .. } = self;
         let maps = &surface.input;
@@ -185,55 +150,16 @@ impl Layered {
 
     /// Carries the light of the surfaces to the SLM plane, where the second net sees it.
     fn carry(&mut self, frame: &RgbdFrame) {
-        self.depth_layers.place(frame);
-        self.depth_layers.compose(&self.source);
-        self.show_field();
-    }
-
-    /// Feeds back to the field what an eye would miss in focus, which the second net sees too.
-    fn feed_back(&mut self, pupil_mm: f32) {
-        let Some(feedback) = &mut self.feedback else { return };
-        feedback.run(&mut self.depth_layers, &self.light, pupil_mm);
-        self.show_field();
-    }
-
-    /// Writes the field at the SLM plane, and what was fed back, for the second net.
-    fn show_field(&mut self) {
-        let Self { size, correction, depth_layers, .. } = self;
-        let feedback = self.feedback.as_ref();
-        let (stride, columns, pixels) = (correction.input.stride, size.width, size.pixels());
-        let carried = &depth_layers.carried;
-        correction.input.rows_mut().enumerate().for_each(|(y, row)| {
-            for (x, channels) in row[stride..][..columns * stride].chunks_exact_mut(stride).enumerate() {
-                for colour in 0..3 {
-                    let index = colour * pixels + y * columns + x;
-                    channels[colour] = carried[index].re;
-                    channels[3 + colour] = carried[index].im;
-                    if let Some(FocusFeedback { change, lack, .. }) = feedback {
-                        let channels = &mut channels[6 + MAPS..];
-                        channels[colour] = change[index].re;
-                        channels[3 + colour] = change[index].im;
-                        channels[6 + colour] = lack[index];
-                    }
-                }
-            }
-        });
+        let Self { correction, source, depth_layers, .. } = self;
+        depth_layers.place(frame);
+        depth_layers.compose(source);
+        correction.input.write_fields(0, &depth_layers.carried);
     }
 
     /// The predicted field of one colour on the half-band grid.
     pub(super) fn write_field(&self, colour: Colour, field: &mut [Complex32]) {
-        let output = &self.correction.output;
         let carried = &self.depth_layers.carried[colour.index() * self.size.pixels()..];
-        let width = self.size.width;
-        field.par_chunks_exact_mut(width).zip(carried.par_chunks_exact(width)).enumerate().for_each(
-            |(y, (row, carried))| {
-                for (x, (value, carried)) in row.iter_mut().zip(carried).enumerate() {
-                    let residual = output.pixel(x, y);
-                    let residual = Complex32::new(residual[colour.index()], residual[3 + colour.index()]);
-                    *value = carried + residual * CORRECTION_SHARE;
-                }
-            },
-        );
+        self.correction.output.add_residual(carried, CORRECTION_SHARE, colour, field);
     }
 }
 
@@ -241,14 +167,13 @@ impl Layered {
 impl Layered {
     pub(super) fn after(&self, stage: usize) -> super::network::Seen<'_> {
         use super::network::Seen;
-        let (surface_light, correction) = self.stages_between();
+        let surface_light = 1 + self.surface.len();
         match stage {
             0 => Seen::Map(&self.surface.input, None),
             _ if stage < surface_light => self.surface.after(stage - 1),
             _ if stage == surface_light => Seen::Light(&self.source),
             _ if stage == surface_light + 1 => Seen::Light(&self.depth_layers.carried),
-            _ if stage < correction => Seen::Map(&self.correction.input, None),
-            _ => self.correction.after(stage - correction),
+            _ => self.correction.after(stage - surface_light - 2),
         }
     }
 }

@@ -2,10 +2,13 @@
 
 mod blocks;
 mod conv;
+mod defocus;
 mod depth_layers;
 mod direct;
-mod focus_feedback;
+mod expected_stack;
+mod feedback;
 mod layered;
+mod maps;
 mod network;
 mod peak;
 mod simd;

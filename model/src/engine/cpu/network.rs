@@ -7,8 +7,10 @@ use num_complex::Complex32;
 
 use super::blocks::scale_of;
 use super::direct::Direct;
+use super::expected_stack::ExpectedStack;
 use super::layered::Layered;
 use super::simd::InstructionSet;
+use super::trunk::Trunk;
 use crate::engine::{Stage, StageTiming, StageTimings};
 use crate::optics::FourierUpsampler;
 use crate::weights::{Family, Grid, Weights};
@@ -31,6 +33,7 @@ pub(super) struct Network {
 pub(super) enum Predictor {
     Direct(Box<Direct>),
     Layered(Box<Layered>),
+    ExpectedStack(Box<ExpectedStack>),
 }
 
 impl Predictor {
@@ -38,6 +41,7 @@ impl Predictor {
         match self {
             Self::Direct(direct) => direct.stages(),
             Self::Layered(layered) => layered.stages(),
+            Self::ExpectedStack(expected_stack) => expected_stack.stages(),
         }
     }
 
@@ -45,6 +49,7 @@ impl Predictor {
         match self {
             Self::Direct(direct) => direct.run_stage(index, frame, pupil_mm),
             Self::Layered(layered) => layered.run_stage(index, frame, pupil_mm),
+            Self::ExpectedStack(expected_stack) => expected_stack.run_stage(index, frame, pupil_mm),
         }
     }
 
@@ -52,6 +57,7 @@ impl Predictor {
         match self {
             Self::Direct(direct) => direct.write_field(colour, field),
             Self::Layered(layered) => layered.write_field(colour, field),
+            Self::ExpectedStack(expected_stack) => expected_stack.write_field(colour, field),
         }
     }
 }
@@ -64,8 +70,12 @@ impl Network {
         let padded = Resolution { width: scale * width, height: scale * height };
         let predictor = match &weights.family {
             Family::Direct { layers } => Predictor::Direct(Box::new(Direct::new(config, layers, size, set))),
-            Family::Layered { surface, correction, feedback_share } => {
-                Predictor::Layered(Box::new(Layered::new(config, surface, correction, *feedback_share, size, set)))
+            Family::Layered { surface, correction } => {
+                Predictor::Layered(Box::new(Layered::new(config, surface, correction, size, set)))
+            }
+            Family::ExpectedStack { lighting, correction, feedback } => {
+                let nets = [lighting, correction].map(|layers| Trunk::new(layers, config.leaky_slope, size, set));
+                Predictor::ExpectedStack(Box::new(ExpectedStack::new(config, nets, *feedback, size)))
             }
         };
         let stages = predictor.stages().into_iter().chain([Stage::plain("field")]);
@@ -128,6 +138,7 @@ impl Predictor {
         match self {
             Self::Direct(direct) => direct.after(stage),
             Self::Layered(layered) => layered.after(stage),
+            Self::ExpectedStack(expected_stack) => expected_stack.after(stage),
         }
     }
 }

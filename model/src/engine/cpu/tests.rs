@@ -10,7 +10,7 @@ use super::simd::InstructionSet;
 use super::*;
 use crate::engine::reference::{self, Value};
 use crate::weights::tests::{self as weights_tests, random_weights};
-use crate::weights::{Grid, NetworkConfig};
+use crate::weights::{Architecture, Grid, NetworkConfig};
 
 /// Largest difference allowed between a map and its reference, relative to the reference's largest value.
 const TOLERANCE: f64 = 2e-5;
@@ -63,9 +63,9 @@ fn check_all_stages(weights: &Weights, resolution: Resolution, pupil_mm: f32, se
     // The second time round, what the first left in the maps must not show.
     let mut hologram = ComplexHologram::dark(resolution);
     network.render(&self::frame(resolution, seed + 1), PupilDiameter::from_mm(2.0), &mut hologram);
-    // Without feedback the correction's input is written by the stage that carries the light, not by one of its own.
-    let own_stage = weights.config.focus_feedback;
-    let stages = expected.stages.iter_mut().filter(|stage| own_stage || stage.name != "correction.encoded");
+    // The input of `layered`'s correction is written by the stage that carries the light, not by one of its own.
+    let layered = weights.config.architecture == Architecture::Layered;
+    let stages = expected.stages.iter_mut().filter(|stage| !layered || stage.name != "correction.encoded");
     for (index, stage) in stages.enumerate() {
         network.predictor.run_stage(index, &frame, pupil_mm);
         let error = match (network.predictor.after(index), &stage.value) {
@@ -138,12 +138,29 @@ proptest! {
         channels in 1usize..20,
         depth_layers in 2usize..7,
         transport_prior in any::<bool>(),
-        focus_feedback in any::<bool>(),
         pupil_mm in 1.0f32..5.0,
         seed in 0u32..1000,
     ) {
-        let config =
-            NetworkConfig { channels, depth_layers, transport_prior, focus_feedback, ..weights_tests::layered_config() };
+        let config = NetworkConfig { channels, depth_layers, transport_prior, ..weights_tests::layered_config() };
+        let weights = random_weights(config, u64::from(seed));
+        for set in InstructionSet::available() {
+            check_all_stages(&weights, Resolution { width, height }, pupil_mm, seed, set);
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(16))]
+    #[test]
+    fn every_stage_of_an_expected_stack_network_matches_the_reference(
+        width in 1usize..40,
+        height in 1usize..14,
+        channels in 1usize..20,
+        depth_layers in 2usize..7,
+        pupil_mm in 1.0f32..5.0,
+        seed in 0u32..1000,
+    ) {
+        let config = NetworkConfig { channels, depth_layers, ..weights_tests::expected_stack_config() };
         let weights = random_weights(config, u64::from(seed));
         for set in InstructionSet::available() {
             check_all_stages(&weights, Resolution { width, height }, pupil_mm, seed, set);
@@ -155,9 +172,9 @@ proptest! {
 fn one_pixel_one_column_and_one_row_match_the_reference() {
     let direct = random_weights(config(Grid::HalfBand, 6, 12, vec![3, 4]), 5);
     let layered = random_weights(weights_tests::layered_config(), 5);
-    let fed_back = random_weights(NetworkConfig { focus_feedback: true, ..weights_tests::layered_config() }, 5);
+    let expected_stack = random_weights(weights_tests::expected_stack_config(), 5);
     for (width, height) in [(1, 1), (1, 33), (57, 1), (2, 2), (101, 5)] {
-        for weights in [&direct, &layered, &fed_back] {
+        for weights in [&direct, &layered, &expected_stack] {
             for set in InstructionSet::available() {
                 check_all_stages(weights, Resolution { width, height }, 3.3, 9, set);
             }

@@ -1,37 +1,34 @@
-//! What an eye lacks where each point is in focus, fed back to the field at the SLM plane.
+//! What an eye lacks when it focuses on each depth layer, fed back to the field at the SLM plane.
 
 use holod_calibration::{Colour, DisplayGeometry, Metres, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
-use super::blocks::scale_of;
 use super::depth_layers::DepthLayers;
-use super::layered::BLOCK;
+use super::maps::{BLOCK, SCALE};
 use crate::optics::{signed_bin, transfer_table};
-use crate::weights::{Grid, NetworkConfig};
+use crate::weights::{Feedback, NetworkConfig};
 
-const SCALE: usize = scale_of(Grid::HalfBand);
 /// Keeps the phase of what is dark defined: |a| = sqrt(re² + im² + this).
 const DARK: f32 = 1e-6;
 
 /// One step of Gerchberg and Saxton (1972) at all depth layers at once: the field goes through the pupil to every layer,
-/// takes the wanted amplitude there on the points of that layer with the phase that it has, and the sum of these
-/// changes comes back. The layers change one another too; the second net mends that.
-pub(super) struct FocusFeedback {
-    share: f32,
+/// takes the wanted amplitude there with the phase that it has, and the mean of these changes comes back. The layers
+/// change one another too; the second net mends that. Nothing is allocated after `new`.
+pub(super) struct LayerFeedback {
+    parameters: Feedback,
     optics: DisplayGeometry,
     /// From the SLM plane to the farthest layer, as `DepthLayers::step`.
     to_farthest: [Vec<Complex32>; 3],
     /// Transposed spectra: what reaches the layer at hand, and the changes of the layers so far.
     reaching: Vec<Complex32>,
     changes: Vec<Complex32>,
-    /// [3, height, width]: the change of the field that would give what is lacking, and that lack of amplitude.
+    /// The change of the field that would give what is lacking, [3, height, width].
     pub(super) change: Vec<Complex32>,
-    pub(super) lack: Vec<f32>,
 }
 
-impl FocusFeedback {
-    pub(super) fn new(config: &NetworkConfig, share: f32, size: Resolution) -> Self {
+impl LayerFeedback {
+    pub(super) fn new(config: &NetworkConfig, parameters: Feedback, size: Resolution) -> Self {
         let optics = config.optics.geometry(size);
         let far_m = optics.image_distance(optics.depth_far).0;
         let volume_m = optics.image_distance(optics.depth_near).0 - far_m;
@@ -39,20 +36,19 @@ impl FocusFeedback {
         let table = |colour| transfer_table(optics.wavelengths[colour], pitch(&optics), size, farthest);
         let plane = || vec![Complex32::ZERO; size.pixels()];
         Self {
-            share,
+            parameters,
             optics,
             to_farthest: Colour::ALL.map(table),
             reaching: plane(),
             changes: plane(),
             change: vec![Complex32::ZERO; 3 * size.pixels()],
-            lack: vec![0.0; 3 * size.pixels()],
         }
     }
 
-    /// Writes `change` and `lack` for the amplitude `light` [3, height, width] at the depths that `layers` has, and adds
-    /// the share to the field there.
-    pub(super) fn run(&mut self, layers: &mut DepthLayers, light: &[f32], pupil_mm: f32) {
-        let Self { share, optics, to_farthest, reaching, changes, change, lack } = self;
+    /// Changes the field that `layers` carried by what it lacks of the amplitudes `stack` [layers, 3, height, width],
+    /// which become that lack.
+    pub(super) fn run(&mut self, layers: &mut DepthLayers, stack: &mut [f32], pupil_mm: f32) {
+        let Self { parameters: Feedback { share, sharpness }, optics, to_farthest, reaching, changes, change } = self;
         let DepthLayers { count, size, layer_of, step, back, fft, carried } = layers;
         let pixels = size.pixels();
         // The tables are over the number of samples.
@@ -60,8 +56,7 @@ impl FocusFeedback {
         for colour in Colour::ALL {
             let index = colour.index();
             let plane = index * pixels..(index + 1) * pixels;
-            let (field, light) = (&mut carried[plane.clone()], &light[plane.clone()]);
-            let (change, lack) = (&mut change[plane.clone()], &mut lack[plane]);
+            let (field, change) = (&mut carried[plane.clone()], &mut change[plane.clone()]);
             let pupil = Pupil::new(optics, colour, pupil_mm, *size);
 
             change.copy_from_slice(field);
@@ -69,17 +64,15 @@ impl FocusFeedback {
             reaching.copy_from_slice(&fft.spectrum);
             pupil.stop(reaching, &to_farthest[index]);
             changes.fill(Complex32::ZERO);
-            lack.fill(0.0);
-            for layer in 0..*count {
+            for (layer, stack) in (0..*count).zip(stack.chunks_exact_mut(3 * pixels)) {
                 fft.spectrum.copy_from_slice(reaching);
                 fft.inverse(change);
-                change.par_iter_mut().zip(&mut *lack).zip(light).zip(&*layer_of).for_each(
-                    |(((arriving, lack), light), block)| {
-                        let inside = block.iter().filter(|&&of| of == layer).count();
+                change.par_iter_mut().zip(&mut stack[plane.clone()]).zip(&*layer_of).for_each(
+                    |((arriving, lack), block)| {
+                        let inside = block.iter().filter(|&&of| of == layer).count() as f32 / BLOCK as f32;
                         let amplitude = (arriving.norm_sqr() + DARK).sqrt();
-                        let here = (light - amplitude) * (inside as f32 / BLOCK as f32);
-                        *lack += here;
-                        *arriving *= here / amplitude;
+                        *lack -= amplitude;
+                        *arriving *= (1.0 + *sharpness * inside) * *lack / amplitude;
                     },
                 );
                 fft.forward(change);
@@ -96,7 +89,11 @@ impl FocusFeedback {
             pupil.stop(changes, &back[index]);
             fft.spectrum.copy_from_slice(changes);
             fft.inverse(change);
-            field.par_iter_mut().zip(&*change).for_each(|(field, change)| *field += change * *share);
+            let mean = 1.0 / f32::from(*count);
+            field.par_iter_mut().zip(change).for_each(|(field, change)| {
+                *change *= mean;
+                *field += *change * *share;
+            });
         }
     }
 }

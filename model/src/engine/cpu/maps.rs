@@ -1,0 +1,85 @@
+//! What the nets of the layered families are told of a frame on the half-band grid.
+
+use holod_calibration::Colour;
+use num_complex::Complex32;
+use rayon::prelude::*;
+
+use super::blocks::{Blocks, scale_of};
+use super::conv::FeatureMap;
+use crate::RgbdFrame;
+use crate::weights::Grid;
+
+pub(super) const SCALE: usize = scale_of(Grid::HalfBand);
+/// Panel pixels to a sample of the grid.
+pub(super) const BLOCK: usize = SCALE * SCALE;
+/// Amplitude, two depth maps, each four times, and the pupil.
+pub(super) const MAPS: usize = 5 * BLOCK + 1;
+
+/// Writes them to the channels of `map` from `first` on.
+pub(super) fn write_maps(map: &mut FeatureMap, first: usize, frame: &RgbdFrame, pupil_mm: f32) {
+    let blocks = Blocks { frame: frame.resolution, scale: SCALE };
+    let (columns, stride, pixels) = (map.width, map.stride, frame.resolution.pixels());
+    let pupil = (pupil_mm - 2.5) / 2.0;
+    map.rows_mut().enumerate().for_each(|(y, row)| {
+        for (x, channels) in row[stride..][..columns * stride].chunks_exact_mut(stride).enumerate() {
+            let maps = &mut channels[first..][..MAPS];
+            for corner in 0..BLOCK {
+                let source = blocks.index(x, y, corner);
+                for colour in 0..3 {
+                    maps[colour * BLOCK + corner] = frame.amplitude[colour * pixels + source] - 0.4;
+                }
+                let centred = frame.depth_normalised[source] - 0.5;
+                maps[3 * BLOCK + corner] = 2.0 * centred;
+                maps[4 * BLOCK + corner] = centred * pupil_mm;
+            }
+            maps[5 * BLOCK] = pupil;
+        }
+    });
+}
+
+impl FeatureMap {
+    /// Writes planes [height, width] to the channels from `first` on, each value through `change`.
+    pub(super) fn write_planes<'a>(
+        &mut self,
+        first: usize,
+        planes: impl Iterator<Item = &'a [f32]> + Clone + Sync,
+        change: impl Fn(f32) -> f32 + Sync,
+    ) {
+        let (width, stride) = (self.width, self.stride);
+        self.rows_mut().enumerate().for_each(|(y, row)| {
+            for (channel, plane) in planes.clone().enumerate() {
+                let pixels = row[stride + first + channel..].iter_mut().step_by(stride);
+                for (to, from) in pixels.zip(&plane[y * width..][..width]) {
+                    *to = change(*from);
+                }
+            }
+        });
+    }
+
+    /// Writes fields [3, height, width] to six channels from `first` on, the real parts first.
+    pub(super) fn write_fields(&mut self, first: usize, fields: &[Complex32]) {
+        let (width, height, stride) = (self.width, self.height, self.stride);
+        self.rows_mut().enumerate().for_each(|(y, row)| {
+            for (colour, field) in fields.chunks_exact(width * height).enumerate() {
+                let pixels = row[stride + first..].chunks_mut(stride);
+                for (to, from) in pixels.zip(&field[y * width..][..width]) {
+                    to[colour] = from.re;
+                    to[3 + colour] = from.im;
+                }
+            }
+        });
+    }
+
+    /// base + `share` times the residual of one colour, whose channels are three real parts and three imaginary ones;
+    /// `base` and `field` are [height, width].
+    pub(super) fn add_residual(&self, base: &[Complex32], share: f32, colour: Colour, field: &mut [Complex32]) {
+        let rows = field.par_chunks_exact_mut(self.width).zip(base.par_chunks_exact(self.width));
+        rows.enumerate().for_each(|(y, (row, base))| {
+            for (x, (value, base)) in row.iter_mut().zip(base).enumerate() {
+                let residual = self.pixel(x, y);
+                let residual = Complex32::new(residual[colour.index()], residual[3 + colour.index()]);
+                *value = base + residual * share;
+            }
+        });
+    }
+}
