@@ -62,6 +62,15 @@ VARIANTS: dict[str, NetworkConfig] = {
     "layered-8-no-prior": replace(_LAYERED, transport_prior=False),
     "layered-12-no-prior": replace(_LAYERED, depth_layers=12, transport_prior=False),
     "expected-stack": replace(_HALF_BAND_LAYERED, architecture="expected-stack"),
+    "expected-stack-small": replace(
+        _HALF_BAND_LAYERED,
+        architecture="expected-stack",
+        layers=4,
+        channels=24,
+        adjustable_layers=(2,),
+        correction_layers=6,
+        depth_layers=6,
+    ),
     "focal-stack": replace(_HALF_BAND, architecture="focal-stack"),
     "ablation-three-plain": replace(
         _HALF_BAND, adjustable_layers=(), pupil_inputs=False, specialists_mm=ABLATION_PUPILS_MM
