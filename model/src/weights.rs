@@ -12,6 +12,8 @@ use serde::{Deserialize, Serialize};
 const FORMAT: &str = "holod-weights-1";
 /// Larger files are refused before they are read.
 const LARGEST_FILE_BYTES: u64 = 256 << 20;
+/// No eye's is half as wide.
+const LARGEST_PUPIL_MM: f32 = 20.0;
 /// Relative difference below which two optical lengths are the same.
 const OPTICS_TOLERANCE: f64 = 1e-4;
 
@@ -172,9 +174,9 @@ pub(crate) enum Family {
 /// How what is lacking is fed back to the field of `expected-stack`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Feedback {
-    /// Of the change that would give what is lacking.
+    /// The share of the change that would give what is lacking which the field takes.
     pub(crate) share: f32,
-    /// By how much more what is in focus weighs.
+    /// How much more a layer's change weighs where that layer is in focus.
     pub(crate) sharpness: f32,
 }
 
@@ -505,8 +507,8 @@ impl Metadata<'_> {
         require(
             config.architecture == Architecture::Direct || config.grid == Grid::HalfBand,
             "grid",
-            format!("{:?}", config.grid),
-            "\"half-band\", but for `direct`",
+            "\"full\"".into(),
+            &format!("\"half-band\" for `{}`", config.architecture),
         )?;
         require((1..=256).contains(channels), "channels", channels.to_string(), "1 to 256")?;
         let adjustable = &config.adjustable_layers;
@@ -523,10 +525,10 @@ impl Metadata<'_> {
         require((0.0..1.0).contains(&slope), "leaky_slope", slope.to_string(), "at least 0 and below 1")?;
         let [smallest, largest] = config.pupil_range_mm;
         require(
-            smallest > 0.0 && largest >= smallest && largest.is_finite(),
+            smallest > 0.0 && largest >= smallest && largest <= LARGEST_PUPIL_MM,
             "pupil_range_mm",
             format!("[{smallest}, {largest}]"),
-            "two positive millimetre values in ascending order",
+            "two millimetre values above 0 and up to 20, in ascending order",
         )?;
         let constant = config.amplitude_constant;
         require(
@@ -809,9 +811,16 @@ pub(crate) mod tests {
         assert_mentions(&missing, &["test.safetensors", "`layers.2.offset.bias`", "absent", "[18]"]);
         let reshaped = error_of(|tensors, _| tensors[2].1 = vec![5, 5, 9, 1]);
         assert_mentions(&reshaped, &["`layers.1.weight`", "[5, 5, 9, 1]", "[5, 5, 3, 3]"]);
-        let no_share = file_of(expected_stack_config(), |tensors, _| tensors.retain(|(name, ..)| name != SHARPNESS));
-        let no_share = Weights::from_bytes(&no_share, "test").unwrap_err().to_string();
-        assert_mentions(&no_share, &["`sharpness`", "absent", "[1]"]);
+        let fed_back = |change: &dyn Fn(&mut Tensors)| {
+            let file = file_of(expected_stack_config(), |tensors, _| change(tensors));
+            Weights::from_bytes(&file, "test").unwrap_err().to_string()
+        };
+        for number in [FEEDBACK_SHARE, SHARPNESS] {
+            let absent = fed_back(&|tensors| tensors.retain(|(name, ..)| name != number));
+            assert_mentions(&absent, &[&format!("`{number}`"), "absent", "[1]"]);
+        }
+        let two = fed_back(&|tensors| *tensors.last_mut().unwrap() = (SHARPNESS.into(), vec![2], vec![1.0; 2]));
+        assert_mentions(&two, &["`sharpness`", "[2]", "[1]"]);
         let nan = error_of(|tensors, _| tensors[1].2[3] = f32::NAN);
         assert_mentions(&nan, &["`layers.0.bias`", "NaN at index 3", "finite"]);
     }
@@ -835,10 +844,12 @@ pub(crate) mod tests {
             let config = entries["config"].replace("\"direct\"", "\"diffusion\"");
             entries.insert("config".into(), config);
         });
-        assert_mentions(&unknown, &["`config`", "diffusion", "`direct`", "`layered`"]);
-        let full = file_of(NetworkConfig { grid: Grid::Full, ..layered_config() }, |_, _| {});
-        let full = Weights::from_bytes(&full, "test").unwrap_err().to_string();
-        assert_mentions(&full, &["config.grid", "Full", "half-band"]);
+        assert_mentions(&unknown, &["`config`", "diffusion", "`direct`", "`layered`", "`expected-stack`"]);
+        for family in [layered_config(), expected_stack_config()] {
+            let full = file_of(NetworkConfig { grid: Grid::Full, ..family.clone() }, |_, _| {});
+            let full = Weights::from_bytes(&full, "test").unwrap_err().to_string();
+            assert_mentions(&full, &["config.grid", "\"full\"", "half-band", &family.architecture.to_string()]);
+        }
         assert_mentions(&configured(|c| c.correction_layers = 3), &["config.correction_layers", "3", "even"]);
         assert_mentions(&configured(|c| c.depth_layers = 1), &["config.depth_layers", "1"]);
         assert_mentions(&configured(|c| c.depth_layers = 65), &["config.depth_layers", "65", "2 to 64"]);
@@ -847,6 +858,7 @@ pub(crate) mod tests {
         assert_mentions(&configured(|c| c.channels = 100_000), &["config.channels", "100000"]);
         assert_mentions(&configured(|c| c.adjustable_layers = vec![3]), &["config.adjustable_layers", "[3]"]);
         assert_mentions(&configured(|c| c.pupil_range_mm = [5.0, 1.0]), &["config.pupil_range_mm"]);
+        assert_mentions(&configured(|c| c.pupil_range_mm = [1.0, 21.0]), &["config.pupil_range_mm", "21", "up to 20"]);
         assert_mentions(&configured(|c| c.amplitude_constant = 0.0), &["config.amplitude_constant"]);
         assert_mentions(&configured(|c| c.optics.wavelengths_nm[1] = -1.0), &["config.optics", "-1"]);
     }

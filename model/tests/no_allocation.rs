@@ -32,7 +32,7 @@ static ALLOCATOR: Counting = Counting;
 #[test]
 fn frames_do_not_allocate() {
     let golden = concat!(env!("CARGO_MANIFEST_DIR"), "/golden/");
-    for name in ["direct-narrow", "layered-narrow"] {
+    for name in ["direct-narrow", "layered-narrow", "expected-stack-narrow"] {
         check(&Weights::load(&Path::new(golden).join(format!("{name}.weights.safetensors"))).unwrap());
     }
     check(&Weights::builtin());
@@ -45,7 +45,7 @@ fn check(weights: &Weights) {
     let frame = RgbdFrame {
         resolution,
         amplitude: vec![0.5; 3 * resolution.pixels()],
-        depth_normalised: vec![0.5; resolution.pixels()],
+        depth_normalised: (0..resolution.pixels()).map(|index| index as f32 / resolution.pixels() as f32).collect(),
     };
     let (mut hologram, mut pattern) = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
     let mut frames = |count: usize| {

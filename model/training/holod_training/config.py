@@ -128,6 +128,8 @@ class NetworkConfig:
             not self.dilations or all(self.dilations[i] == 1 for i in self.adjustable_layers),
             f"1 at the adjustable layers {self.adjustable_layers}",
         )
+        narrowest, widest = self.pupil_range_mm
+        self._require("pupil_range_mm", 0 < narrowest <= widest <= 20, "two of 0 to 20 mm in ascending order")
         direct = self.architecture == "direct"
         self._require("frames", self.frames >= 1 and (direct or self.frames == 1), "1; `direct` may have more")
         self._require("blur_input", direct or not self.blur_input, "false; only `direct` can have it")

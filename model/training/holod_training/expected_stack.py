@@ -4,34 +4,46 @@ it on every depth layer; what that lacks, fed back; a correction."""
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from holod_training.config import NetworkConfig, OpticsConfig
-from holod_training.layered import CORRECTION_SHARE, carrier, encode
-from holod_training.network import OUTPUT_CHANNELS, FieldNetwork, Trunk, run_traced
-from holod_training.optics import frequencies, intensity, pupil_mask
+from holod_training.layered import encode, layer_centres_m, layer_numbers
+from holod_training.network import CORRECTION_SHARE, OUTPUT_CHANNELS, FieldNetwork, Trunk, run_traced
+from holod_training.optics import frequencies, intensity, pupil_mask, transfer
 
+# The least share of a white scene's light by which what is seen is divided.
 LEAST_COVER = 0.02
-LEAST_BLUR = 1e-3
+# Below it a disc's spectrum is 1.
+LEAST_ARGUMENT = 1e-3
+# Keeps the phase of what is dark defined.
 DARK = 1e-6
 FEEDBACK_SHARE = 0.5
 SHARPNESS = 1.0
 
 
+def inside_layers(depth: Tensor, count: int) -> Tensor:
+    """Which points of depth [N, H, W] lie in each of `count` layers, bool [N, count, H, W]."""
+    layer = layer_numbers(depth, count)
+    return torch.stack([layer == k for k in range(count)], dim=1)
+
+
 def layer_cover(depth: Tensor, count: int, scale: int) -> Tensor:
     """The share of each block of depth [N, H, W] that lies in each of `count` layers, [N, count, h, w]."""
-    layer = (depth * count).long().clamp(0, count - 1)
-    inside = torch.stack([layer == k for k in range(count)], dim=1)
-    return F.avg_pool2d(inside.to(depth.dtype), scale)
+    return F.avg_pool2d(inside_layers(depth, count).to(depth.dtype), scale)
 
 
-def layer_carriers(optics: OpticsConfig, count: int, scale: int, size: torch.Size, like: Tensor) -> Tensor:
-    """Transfer functions [count, 3, h, w] from the SLM plane to where the middle of each depth layer is imaged."""
-    distances_m = [optics.distance_m(optics.dioptres((k + 0.5) / count)) for k in range(count)]
-    return torch.stack([carrier(optics, scale, *size, u, like.dtype, str(like.device)) for u in distances_m])
+@lru_cache(maxsize=8)
+def layer_carriers(
+    optics: OpticsConfig, count: int, scale: int, height: int, width: int, dtype: torch.dtype, device: str
+) -> Tensor:
+    """Transfer functions [count, 3, height, width] from the SLM plane to where the middle of each depth layer is
+    imaged, on a grid of `scale` times the panel's pitch."""
+    fy, fx = (frequencies(size, scale * optics.pitch_m, device) for size in (height, width))
+    return transfer(optics, fx, fy, layer_centres_m(optics, count)).to(dtype)
 
 
 def expected_stack(
@@ -41,9 +53,11 @@ def expected_stack(
     depth [N, H, W], focused at the middle of each of `count` layers of depth: each layer blurred by its disc of
     confusion, their sum over that of a white scene. Blur is circular, no layer hides another, and nothing is guessed
     of what is hidden.
+
+    The spectrum of a disc of diameter d that holds 1 is 2·J1(x)/x with x = π·d·|f| (Goodman, Introduction to Fourier
+    Optics: the circle function).
     """
-    layer = (depth * count).long().clamp(0, count - 1)[:, None]
-    inside = torch.stack([layer == k for k in range(count)], dim=1).to(amplitude.dtype)
+    inside = inside_layers(depth, count)[:, :, None].to(amplitude.dtype)
     parts = torch.cat((inside, amplitude.square()[:, None] * inside), dim=2)
     parts = F.avg_pool2d(parts.flatten(0, 1), scale).unflatten(0, (-1, count))
     height, width = parts.shape[-2:]
@@ -53,9 +67,9 @@ def expected_stack(
     turns = (math.pi * torch.sqrt(fx**2 + fy**2)).to(amplitude.dtype)
     layer_dpt = (optics.depth_near_dpt - optics.depth_far_dpt) / count
     apart = torch.arange(count, device=depth.device)
-    blur_per_mm = apart.to(amplitude.dtype) * (layer_dpt * 1e-3 / optics.pixel_angle_rad / scale)
-    # A disc's spectrum, [N, layers apart, h, w // 2 + 1].
-    x = ((pupil_mm[:, None] * blur_per_mm)[..., None, None] * turns).clamp_min(LEAST_BLUR)
+    samples_per_mm = apart.to(amplitude.dtype) * (layer_dpt * 1e-3 / optics.pixel_angle_rad / scale)
+    # [N, layers apart, h, w // 2 + 1]
+    x = ((pupil_mm[:, None] * samples_per_mm)[..., None, None] * turns).clamp_min(LEAST_ARGUMENT)
     disc = 2 * torch.special.bessel_j1(x) / x
     disc = disc[:, (apart[:, None] - apart).abs()]
     spectrum = torch.fft.rfft2(parts)
@@ -72,10 +86,10 @@ def feed_back(
     [N, layers, 1, h, w]: one step of Gerchberg and Saxton (1972) at all layers at once, with the phases that are there.
     Pupils of 2.3 mm and more cut nothing of the half band of the default bench.
     """
-    size = field.shape[-2:]
-    fy, fx = (frequencies(bins, scale * optics.pitch_m, field.device) for bins in size)
+    height, width = field.shape[-2:]
+    fy, fx = (frequencies(size, scale * optics.pitch_m, field.device) for size in (height, width))
     pupil = pupil_mask(optics, fx, fy, pupil_mm[:, None, None])
-    carriers = layer_carriers(optics, wanted.shape[1], scale, size, field)
+    carriers = layer_carriers(optics, wanted.shape[1], scale, height, width, field.dtype, str(field.device))
     arriving = torch.fft.ifft2((torch.fft.fft2(field) * pupil)[:, None] * carriers)
     amplitude = torch.sqrt(intensity(arriving) + DARK)
     lack = wanted - amplitude
@@ -143,5 +157,7 @@ class ExpectedStackNetwork(FieldNetwork):
         phase = math.pi * phase
         light = torch.sigmoid(mask - math.log(count - 1)) * wanted
         planes = torch.complex(light * torch.cos(phase), light * torch.sin(phase))
-        carriers = layer_carriers(self.config.optics, count, self.scale, planes.shape[-2:], planes)
+        height, width = planes.shape[-2:]
+        device = str(planes.device)
+        carriers = layer_carriers(self.config.optics, count, self.scale, height, width, planes.dtype, device)
         return torch.fft.ifft2((torch.fft.fft2(planes) * carriers.conj()).sum(dim=1))

@@ -42,7 +42,7 @@ class Narrow(NamedTuple):
     pupil_mm: float = 2.7
 
 
-# Depth and correction layers are left at their defaults, so that no engine has others.
+# Depth layers are left at their default, and correction layers in one, so that no engine has others.
 NARROW: dict[str, Narrow] = {
     "direct-narrow": Narrow(NetworkConfig(channels=8, modulation_hidden=8), 32, 48),
     "direct-narrow-full": Narrow(NetworkConfig(grid="full", channels=8, modulation_hidden=8), 12, 16),

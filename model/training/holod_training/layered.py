@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from holod_training.config import NetworkConfig, OpticsConfig
-from holod_training.network import OUTPUT_CHANNELS, FieldNetwork, Trunk, run_traced
+from holod_training.network import CORRECTION_SHARE, OUTPUT_CHANNELS, FieldNetwork, Trunk, run_traced
 from holod_training.optics import frequencies, stop_half_band, transfer
 
 LOG_FLOOR = 0.03
@@ -18,7 +18,6 @@ LOG_OFFSET = 1.66
 SIGMAS_PX = (1.0, 2.5, 6.0)
 PRIOR_GAINS = (-0.5, -1.0, 0.0)
 REFERENCE_NM = 520.0
-CORRECTION_SHARE = 0.3
 
 
 @lru_cache(maxsize=32)
@@ -52,6 +51,16 @@ def carry(field: Tensor, optics: OpticsConfig, scale: int, distance_m: float) ->
     return torch.fft.ifft2(torch.fft.fft2(field) * kernel)
 
 
+def layer_numbers(depth: Tensor, count: int) -> Tensor:
+    """Which of `count` layers of equal depth, 0 the farthest, each point of `depth` lies in."""
+    return (depth * count).long().clamp(0, count - 1)
+
+
+def layer_centres_m(optics: OpticsConfig, count: int) -> list[float]:
+    """Metres from the SLM plane to where the middle of each of `count` layers is imaged, far to near."""
+    return [optics.distance_m(optics.dioptres((k + 0.5) / count)) for k in range(count)]
+
+
 def compose(source: Tensor, depth: Tensor, optics: OpticsConfig, count: int, scale: int = 1) -> Tensor:
     """The field at the SLM plane, complex [N, 3, h, w], of `count` equal layers of depth [N, H, W] whose points send
     out `source` [N, 3, h, w]: f ← f·(1 − m) + O·m from far to near, by ASM between layers and at last back.
@@ -59,8 +68,8 @@ def compose(source: Tensor, depth: Tensor, optics: OpticsConfig, count: int, sca
     m covers a layer and its next nearer one: slanted surfaces show no seams. On a grid of `scale` times the panel's
     pitch it is the share of a block.
     """
-    centres = [optics.distance_m(optics.dioptres((k + 0.5) / count)) for k in range(count)]
-    layer = (depth * count).long().clamp(0, count - 1)[:, None]
+    centres = layer_centres_m(optics, count)
+    layer = layer_numbers(depth, count)[:, None]
     field = torch.zeros_like(source)
     for k in range(count):
         if k:

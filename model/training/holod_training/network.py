@@ -12,6 +12,8 @@ from holod_training.config import NetworkConfig
 
 TAPS = 9
 OUTPUT_CHANNELS = 6
+# Of a correcting net's output, in the field.
+CORRECTION_SHARE = 0.3
 
 
 def gather_conv3x3(x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor) -> Tensor:

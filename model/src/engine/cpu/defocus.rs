@@ -8,13 +8,15 @@ use rayon::prelude::*;
 
 use super::blocks::Blocks;
 use super::depth_layers::DepthLayers;
-use super::maps::{BLOCK, SCALE};
+use super::maps::{BLOCK, SCALE, sample_pitch};
 use crate::RgbdFrame;
 use crate::optics::{TransposedFft2d, signed_bin};
 use crate::weights::NetworkConfig;
 
 /// Entries of the disc's table to a unit of its argument: linear interpolation is then within 5e-7.
 const TABLE_DENSITY: f64 = 256.0;
+/// The largest argument of that table: beyond it a disc's spectrum is below 1e-5.
+const LARGEST_ARGUMENT: f64 = 4096.0;
 /// The least share of a white scene's light by which what is seen is divided.
 const LEAST_COVER: f32 = 0.02;
 /// White with red, and green with blue: real pictures, two to a complex transform.
@@ -23,7 +25,6 @@ const PAIRS: usize = 2;
 /// Blurs each depth layer by its disc of confusion at the focus on each other one, and divides the sum by that of a white
 /// scene. Blur is circular, and no layer hides another. Nothing is allocated after `new`.
 pub(super) struct Defocus {
-    count: usize,
     size: Resolution,
     /// 2·J1(x)/x, the spectrum of a disc, at x·TABLE_DENSITY.
     disc_table: Vec<f32>,
@@ -33,7 +34,7 @@ pub(super) struct Defocus {
     pupil_mm: f32,
     /// Over the number of samples: spectra, transposed, of the discs between layers that are 1, 2, .. apart.
     discs: Vec<Vec<f32>>,
-    /// For each layer that has a pixel its light's spectra, transposed.
+    /// Whether a layer has a pixel; if so, the spectra of its light, transposed.
     present: Vec<bool>,
     spectra: Vec<[Vec<Complex32>; PAIRS]>,
     seen: [Vec<Complex32>; PAIRS],
@@ -45,7 +46,7 @@ impl Defocus {
         let count = config.depth_layers;
         let optics = config.optics.geometry(size);
         let layer_dpt = (optics.depth_near.0 - optics.depth_far.0) / count as f64;
-        let sample_rad = SCALE as f64 * optics.pixel_pitch.0 / optics.eyepiece_focal_length.0;
+        let sample_rad = sample_pitch(&optics).0 / optics.eyepiece_focal_length.0;
         let argument_per_mm = PI * layer_dpt * 1e-3 / sample_rad;
         // No frequency is higher than half a cycle a sample each way.
         let largest = argument_per_mm * f64::from(config.pupil_range_mm[1]) * count as f64 * 0.5f64.sqrt();
@@ -55,12 +56,11 @@ impl Defocus {
         };
         let plane = || vec![Complex32::ZERO; size.pixels()];
         Self {
-            count,
             size,
-            disc_table: (0..(largest * TABLE_DENSITY) as usize + 2).map(disc).collect(),
+            disc_table: (0..(largest.min(LARGEST_ARGUMENT) * TABLE_DENSITY) as usize + 2).map(disc).collect(),
             argument_per_mm,
             pupil_mm: f32::NAN,
-            discs: vec![vec![1.0 / size.pixels() as f32; size.pixels()]; count],
+            discs: vec![vec![0.0; size.pixels()]; count],
             present: vec![false; count],
             spectra: (0..count).map(|_| [plane(), plane()]).collect(),
             seen: [plane(), plane()],
@@ -71,7 +71,7 @@ impl Defocus {
     /// Writes the expected amplitudes [layers, 3, height, width] of `frame`, whose depths `layers` has.
     pub(super) fn expect(&mut self, frame: &RgbdFrame, layers: &DepthLayers, pupil_mm: f32, amplitudes: &mut [f32]) {
         self.shape_discs(pupil_mm);
-        for layer in 0..self.count {
+        for layer in layers.numbers() {
             self.transform_layer(frame, layers, layer);
         }
         for (focus, amplitudes) in amplitudes.chunks_exact_mut(3 * self.size.pixels()).enumerate() {
@@ -94,8 +94,10 @@ impl Defocus {
                     let fy = signed_bin(ky, height) as f64 / height as f64;
                     let entry = scale * (fx * fx + fy * fy).sqrt();
                     let (below, share) = (entry as usize, entry.fract() as f32);
-                    let [low, high] = [disc_table[below], disc_table[below + 1]];
-                    *value = norm * (low + share * (high - low));
+                    *value = match disc_table.get(below..below + 2) {
+                        Some(&[low, high]) => norm * (low + share * (high - low)),
+                        _ => 0.0,
+                    };
                 }
             });
         }
@@ -103,20 +105,22 @@ impl Defocus {
     }
 
     /// The spectra of what lies in one layer.
-    fn transform_layer(&mut self, frame: &RgbdFrame, layers: &DepthLayers, layer: usize) {
+    fn transform_layer(&mut self, frame: &RgbdFrame, layers: &DepthLayers, layer: u8) {
         let Self { size, present, spectra, seen, fft, .. } = self;
         let (width, pixels) = (size.width, frame.resolution.pixels());
-        present[layer] = layers.layer_of.par_iter().any(|block| block.contains(&(layer as u8)));
-        if !present[layer] {
+        let present = &mut present[usize::from(layer)];
+        *present = layers.cover(layer).any(|cover| cover > 0.0);
+        if !*present {
             return;
         }
         let blocks = Blocks { frame: frame.resolution, scale: SCALE };
         let [white_red, green_blue] = seen;
         let rows = white_red.par_chunks_exact_mut(width).zip(green_blue.par_chunks_exact_mut(width));
-        rows.zip(layers.layer_of.par_chunks_exact(width)).enumerate().for_each(|(y, ((white_red, green_blue), of))| {
-            for (x, ((white_red, green_blue), block)) in white_red.iter_mut().zip(green_blue).zip(of).enumerate() {
+        rows.enumerate().for_each(|(y, (white_red, green_blue))| {
+            let row = white_red.iter_mut().zip(green_blue).zip(layers.row(y)).enumerate();
+            for (x, ((white_red, green_blue), layer_of)) in row {
                 let mut parts = [0.0f32; 4];
-                for corner in (0..BLOCK).filter(|&corner| block[corner] == layer as u8) {
+                for corner in (0..BLOCK).filter(|&corner| layer_of[corner] == layer) {
                     let index = blocks.index(x, y, corner);
                     parts[0] += 1.0;
                     for colour in 0..3 {
@@ -128,7 +132,7 @@ impl Defocus {
                 *green_blue = Complex32::new(green, blue);
             }
         });
-        for (pair, spectrum) in seen.iter_mut().zip(&mut spectra[layer]) {
+        for (pair, spectrum) in seen.iter_mut().zip(&mut spectra[usize::from(layer)]) {
             fft.forward(pair);
             spectrum.copy_from_slice(&fft.spectrum);
         }

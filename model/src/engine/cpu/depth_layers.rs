@@ -1,27 +1,31 @@
-//! Light of surfaces at many depths, composed far to near with occlusion and carried to the SLM plane.
+//! Layers of the depth volume: which of them each pixel lies in, and how light goes between them and the SLM plane.
 
 use holod_calibration::{Colour, Metres, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::blocks::Blocks;
-use super::maps::{BLOCK, SCALE};
+use super::maps::{BLOCK, SCALE, sample_pitch};
 use crate::RgbdFrame;
 use crate::optics::{TransposedFft2d, transfer_table};
 use crate::weights::NetworkConfig;
 
-/// f ← f·(1 − m) + O·m from far to near, by ASM between layers and at last back to the SLM plane; m is the share of a
-/// block whose pixels lie in a layer or its next nearer one, so that slanted surfaces show no seams.
+/// Layers equal in dioptres, far to near, by ASM on the half-band grid. Nothing is allocated after `new`.
+///
+/// Transfer functions are transposed spectra of each colour, over the number of samples.
 pub(super) struct DepthLayers {
-    pub(super) count: u8,
-    pub(super) size: Resolution,
+    count: u8,
+    size: Resolution,
     /// The depth layer of each pixel of each block, [height, width, 4].
-    pub(super) layer_of: Vec<[u8; BLOCK]>,
-    /// From one layer to the next nearer one, and from the nearest to the SLM plane; transposed spectra, of each colour,
-    /// over the number of samples.
-    pub(super) step: [Vec<Complex32>; 3],
-    pub(super) back: [Vec<Complex32>; 3],
+    layer_of: Vec<[u8; BLOCK]>,
+    /// From the SLM plane to the farthest layer, from one to the next nearer one, and from the nearest to the SLM plane.
+    pub(super) to_farthest: [Vec<Complex32>; 3],
+    step: [Vec<Complex32>; 3],
+    back: [Vec<Complex32>; 3],
+    /// What a forward transform leaves is the transposed spectrum of the light of the layer at hand.
     pub(super) fft: TransposedFft2d<f32>,
+    /// Transposed spectrum of the light of the layers so far, at the layer at hand.
+    pub(super) sum: Vec<Complex32>,
     /// [3, height, width]: what arrives at the SLM plane.
     pub(super) carried: Vec<Complex32>,
 }
@@ -29,20 +33,40 @@ pub(super) struct DepthLayers {
 impl DepthLayers {
     pub(super) fn new(config: &NetworkConfig, size: Resolution) -> Self {
         let optics = config.optics.geometry(size);
-        let pitch = Metres(SCALE as f64 * optics.pixel_pitch.0);
-        let volume_m = optics.image_distance(optics.depth_near).0 - optics.image_distance(optics.depth_far).0;
-        let layer_m = volume_m / config.depth_layers as f64;
-        let nearest_m = optics.image_distance(optics.depth_near).0 - layer_m / 2.0;
-        let table = |colour, u_m| transfer_table(optics.wavelengths[colour], pitch, size, Metres(u_m));
+        let far_m = optics.image_distance(optics.depth_far).0;
+        let near_m = optics.image_distance(optics.depth_near).0;
+        let layer_m = (near_m - far_m) / config.depth_layers as f64;
+        let tables = |u_m: f64| {
+            let table = |colour| transfer_table(optics.wavelengths[colour], sample_pitch(&optics), size, Metres(u_m));
+            Colour::ALL.map(table)
+        };
         Self {
             count: config.depth_layers as u8,
             size,
             layer_of: vec![[0; BLOCK]; size.pixels()],
-            step: Colour::ALL.map(|colour| table(colour, layer_m)),
-            back: Colour::ALL.map(|colour| table(colour, -nearest_m)),
+            to_farthest: tables(far_m + layer_m / 2.0),
+            step: tables(layer_m),
+            back: tables(layer_m / 2.0 - near_m),
             fft: TransposedFft2d::new(size.width, size.height),
+            sum: vec![Complex32::ZERO; size.pixels()],
             carried: vec![Complex32::ZERO; 3 * size.pixels()],
         }
+    }
+
+    /// The layers' numbers, far to near.
+    pub(super) fn numbers(&self) -> std::ops::Range<u8> {
+        0..self.count
+    }
+
+    /// Each block's share in one layer, [height, width].
+    pub(super) fn cover(&self, layer: u8) -> impl IndexedParallelIterator<Item = f32> {
+        let share = move |block: &[u8; BLOCK]| block.iter().filter(|&&of| of == layer).count() as f32 / BLOCK as f32;
+        self.layer_of.par_iter().map(share)
+    }
+
+    /// Which corners of each block of row `y` lie where.
+    pub(super) fn row(&self, y: usize) -> &[[u8; BLOCK]] {
+        &self.layer_of[y * self.size.width..][..self.size.width]
     }
 
     /// Takes the depths of `frame`.
@@ -60,9 +84,11 @@ impl DepthLayers {
         });
     }
 
-    /// Writes what `source` [3, height, width] sends to the SLM plane to `self.carried`.
+    /// Writes what `source` [3, height, width] sends to the SLM plane to `self.carried`: f ← f·(1 − m) + O·m from far to
+    /// near, by ASM between layers and at last back; m is the share of a block whose pixels lie in a layer or its next
+    /// nearer one, so that slanted surfaces show no seams.
     pub(super) fn compose(&mut self, source: &[Complex32]) {
-        let Self { count, size, layer_of, step, back, fft, carried } = self;
+        let Self { count, size, layer_of, step, back, fft, carried, .. } = self;
         let pixels = size.pixels();
         for ((field, source), (step, back)) in
             carried.chunks_exact_mut(pixels).zip(source.chunks_exact(pixels)).zip(step.iter().zip(back.iter()))
@@ -79,6 +105,36 @@ impl DepthLayers {
             }
             carry(fft, field, back);
         }
+    }
+}
+
+/// Light that all layers send out, summed by Horner's rule: far to near, `add_layer` after each one's transform.
+impl DepthLayers {
+    /// Forgets the light of earlier layers.
+    pub(super) fn begin_sum(&mut self) {
+        self.sum.fill(Complex32::ZERO);
+    }
+
+    /// Carries the sum to the next nearer layer and adds the light whose spectrum `fft` has.
+    pub(super) fn add_layer(&mut self, colour: Colour) {
+        let samples = self.size.pixels() as f32;
+        let transformed = self.fft.spectrum.par_iter().zip(&self.step[colour.index()]);
+        self.sum.par_iter_mut().zip(transformed).for_each(|(sum, (spectrum, step))| {
+            *sum = *sum * (step * samples) + spectrum;
+        });
+    }
+
+    /// Carries a transposed spectrum to the next nearer layer.
+    pub(super) fn step_nearer(&self, colour: Colour, spectrum: &mut [Complex32]) {
+        let samples = self.size.pixels() as f32;
+        spectrum.par_iter_mut().zip(&self.step[colour.index()]).for_each(|(value, step)| *value *= step * samples);
+    }
+
+    /// Writes the sum at the SLM plane to `field` [height, width].
+    pub(super) fn finish_sum(&mut self, colour: Colour, field: &mut [Complex32]) {
+        let summed = self.sum.par_iter().zip(&self.back[colour.index()]);
+        self.fft.spectrum.par_iter_mut().zip(summed).for_each(|(value, (sum, back))| *value = sum * back);
+        self.fft.inverse(field);
     }
 }
 

@@ -10,8 +10,7 @@ use rayon::prelude::*;
 use super::defocus::Defocus;
 use super::depth_layers::DepthLayers;
 use super::feedback::LayerFeedback;
-use super::layered::CORRECTION_SHARE;
-use super::maps::{MAPS, write_maps};
+use super::maps::{FIRST_MAP, MAPS, write_maps};
 use super::trunk::Trunk;
 use crate::RgbdFrame;
 use crate::engine::Stage;
@@ -20,13 +19,10 @@ use crate::weights::{Feedback, NetworkConfig, OUTPUT_CHANNELS};
 /// The first net's outputs for a layer: the phases of three colours and a mask.
 const LIT: usize = 4;
 const MASK: usize = 3;
-/// Where the second net's input has the maps: after the field.
-const FIRST_MAP: usize = OUTPUT_CHANNELS;
 
 /// Nothing is allocated after `new`.
 pub(super) struct ExpectedStack {
     size: Resolution,
-    layer_count: usize,
     lighting: Trunk,
     correction: Trunk,
     defocus: Defocus,
@@ -34,8 +30,8 @@ pub(super) struct ExpectedStack {
     feedback: LayerFeedback,
     /// [layers, 3, height, width]: the amplitudes that an eye should see; after the feedback, what is lacking of them.
     stack: Vec<f32>,
-    /// Transposed spectrum of the light of the layers so far, at the layer at hand.
-    arriving: Vec<Complex32>,
+    /// The light that one layer sends out in one colour.
+    light: Vec<Complex32>,
 }
 
 impl ExpectedStack {
@@ -48,14 +44,13 @@ impl ExpectedStack {
         let size = Resolution { width, height };
         Self {
             size,
-            layer_count: config.depth_layers,
             lighting,
             correction,
             defocus: Defocus::new(config, size),
             layers: DepthLayers::new(config, size),
             feedback: LayerFeedback::new(config, feedback, size),
             stack: vec![0.0; 3 * config.depth_layers * size.pixels()],
-            arriving: vec![Complex32::ZERO; size.pixels()],
+            light: vec![Complex32::ZERO; size.pixels()],
         }
     }
 
@@ -93,12 +88,9 @@ impl ExpectedStack {
     /// Lights every layer with what is expected there through the first net's masks, with its phases, and carries all of
     /// it to the SLM plane.
     fn light_layers(&mut self) {
-        let Self { size, layer_count, lighting, layers, stack, arriving, .. } = self;
-        let DepthLayers { step, back, fft, carried, .. } = layers;
-        let (width, pixels) = (size.width, size.pixels());
-        let samples = pixels as f32;
-        let offset = ((*layer_count - 1) as f32).ln();
-        let stride = lighting.output.stride;
+        let Self { size, lighting, layers, stack, light, .. } = self;
+        let (width, pixels, stride) = (size.width, size.pixels(), lighting.output.stride);
+        let offset = ((layers.numbers().len() - 1) as f32).ln();
         lighting.output.rows_mut().for_each(|row| {
             for channels in row[stride..][..width * stride].chunks_exact_mut(stride) {
                 for mask in channels[MASK..].iter_mut().step_by(LIT) {
@@ -106,28 +98,21 @@ impl ExpectedStack {
                 }
             }
         });
-        for (colour, field) in carried.chunks_exact_mut(pixels).enumerate() {
-            arriving.fill(Complex32::ZERO);
-            for layer in 0..*layer_count {
-                let wanted = &stack[(3 * layer + colour) * pixels..][..pixels];
-                field.par_chunks_exact_mut(width).zip(wanted.par_chunks_exact(width)).enumerate().for_each(
-                    |(y, (row, wanted))| {
-                        for (x, (light, wanted)) in row.iter_mut().zip(wanted).enumerate() {
-                            let out = &lighting.output.pixel(x, y)[LIT * layer..][..LIT];
-                            *light = Complex32::from_polar(out[MASK] * wanted, PI * out[colour]);
-                        }
-                    },
-                );
-                fft.forward(field);
-                let transformed = fft.spectrum.par_iter().zip(&step[colour]);
-                arriving.par_iter_mut().zip(transformed).for_each(|(arriving, (spectrum, step))| {
-                    // Horner's rule over the layers, as in the feedback.
-                    *arriving = *arriving * (step * samples) + spectrum;
+        for colour in Colour::ALL {
+            layers.begin_sum();
+            for (layer, wanted) in stack.chunks_exact(3 * pixels).enumerate() {
+                let wanted = wanted[colour.index() * pixels..][..pixels].par_chunks_exact(width);
+                light.par_chunks_exact_mut(width).zip(wanted).enumerate().for_each(|(y, (light, wanted))| {
+                    for (x, (light, wanted)) in light.iter_mut().zip(wanted).enumerate() {
+                        let out = &lighting.output.pixel(x, y)[LIT * layer..][..LIT];
+                        *light = Complex32::from_polar(out[MASK] * wanted, PI * out[colour.index()]);
+                    }
                 });
+                layers.fft.forward(light);
+                layers.add_layer(colour);
             }
-            let transformed = arriving.par_iter().zip(&back[colour]);
-            fft.spectrum.par_iter_mut().zip(transformed).for_each(|(value, (arriving, back))| *value = arriving * back);
-            fft.inverse(field);
+            layers.finish_sum(colour, light);
+            layers.carried[colour.index() * pixels..][..pixels].copy_from_slice(light);
         }
     }
 
@@ -135,7 +120,7 @@ impl ExpectedStack {
     fn feed_back(&mut self, pupil_mm: f32) {
         let Self { size, correction, layers, feedback, stack, .. } = self;
         feedback.run(layers, stack, pupil_mm);
-        let (pixels, stack_channels) = (size.pixels(), 3 * self.layer_count);
+        let (pixels, stack_channels) = (size.pixels(), 3 * layers.numbers().len());
         let map = &mut correction.input;
         map.write_fields(0, &layers.carried);
         map.write_fields(FIRST_MAP + MAPS + stack_channels, &feedback.change);
@@ -145,9 +130,8 @@ impl ExpectedStack {
 
     /// The predicted field of one colour on the half-band grid.
     pub(super) fn write_field(&self, colour: Colour, field: &mut [Complex32]) {
-        let output = &self.correction.output;
         let carried = &self.layers.carried[colour.index() * self.size.pixels()..];
-        output.add_residual(carried, CORRECTION_SHARE, colour, field);
+        self.correction.output.correct(carried, colour, field);
     }
 }
 

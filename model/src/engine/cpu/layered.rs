@@ -8,7 +8,7 @@ use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::depth_layers::DepthLayers;
-use super::maps::{BLOCK, MAPS, SCALE, write_maps};
+use super::maps::{BLOCK, FIRST_MAP, MAPS, SCALE, write_maps};
 use super::simd::InstructionSet;
 use super::trunk::Trunk;
 use crate::RgbdFrame;
@@ -26,7 +26,6 @@ const LOG_OFFSET: f32 = 1.66;
 /// The transport-of-intensity prior: φ = (520 nm / λ)·Σ gain·tanh(4·(½ − D))·blurred log I, from I·∇φ ∝ −∇I.
 const PRIOR_GAINS: [f32; LAYERED_BLURS] = [-0.5, -1.0, 0.0];
 const REFERENCE_NM: f64 = 520.0;
-pub(super) const CORRECTION_SHARE: f32 = 0.3;
 
 /// Nothing is allocated after `new`.
 pub(super) struct Layered {
@@ -92,7 +91,7 @@ impl Layered {
     fn encode(&mut self, frame: &RgbdFrame, pupil_mm: f32) {
         let columns = self.size.width;
         write_maps(&mut self.surface.input, 0, frame, pupil_mm);
-        write_maps(&mut self.correction.input, 6, frame, pupil_mm);
+        write_maps(&mut self.correction.input, FIRST_MAP, frame, pupil_mm);
 
         let Self { surface, blurs, light, centred_depth, .. } = self;
         let maps = &surface.input;
@@ -159,7 +158,7 @@ impl Layered {
     /// The predicted field of one colour on the half-band grid.
     pub(super) fn write_field(&self, colour: Colour, field: &mut [Complex32]) {
         let carried = &self.depth_layers.carried[colour.index() * self.size.pixels()..];
-        self.correction.output.add_residual(carried, CORRECTION_SHARE, colour, field);
+        self.correction.output.correct(carried, colour, field);
     }
 }
 

@@ -1,21 +1,30 @@
-//! What the nets of the layered families are told of a frame on the half-band grid.
+//! How a frame and fields become maps for the nets of `layered` and `expected-stack`, and maps a field again.
 
-use holod_calibration::Colour;
+use holod_calibration::{Colour, DisplayGeometry, Metres};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::blocks::{Blocks, scale_of};
 use super::conv::FeatureMap;
 use crate::RgbdFrame;
-use crate::weights::Grid;
+use crate::weights::{Grid, OUTPUT_CHANNELS};
 
 pub(super) const SCALE: usize = scale_of(Grid::HalfBand);
 /// Panel pixels to a sample of the grid.
 pub(super) const BLOCK: usize = SCALE * SCALE;
 /// Amplitude, two depth maps, each four times, and the pupil.
 pub(super) const MAPS: usize = 5 * BLOCK + 1;
+/// Where the second net's input has the maps: after the field.
+pub(super) const FIRST_MAP: usize = OUTPUT_CHANNELS;
+/// Of the second net's output, in the field.
+const CORRECTION_SHARE: f32 = 0.3;
 
-/// Writes them to the channels of `map` from `first` on.
+/// Between the centres of neighbouring samples of the grid.
+pub(super) fn sample_pitch(optics: &DisplayGeometry) -> Metres {
+    Metres(SCALE as f64 * optics.pixel_pitch.0)
+}
+
+/// Writes what a net is told of a frame to the channels of `map` from `first` on.
 pub(super) fn write_maps(map: &mut FeatureMap, first: usize, frame: &RgbdFrame, pupil_mm: f32) {
     let blocks = Blocks { frame: frame.resolution, scale: SCALE };
     let (columns, stride, pixels) = (map.width, map.stride, frame.resolution.pixels());
@@ -70,15 +79,15 @@ impl FeatureMap {
         });
     }
 
-    /// base + `share` times the residual of one colour, whose channels are three real parts and three imaginary ones;
-    /// `base` and `field` are [height, width].
-    pub(super) fn add_residual(&self, base: &[Complex32], share: f32, colour: Colour, field: &mut [Complex32]) {
+    /// Writes `base` and a share of this correction of one colour to `field`, both [height, width]; the map's channels are
+    /// three real parts and three imaginary ones.
+    pub(super) fn correct(&self, base: &[Complex32], colour: Colour, field: &mut [Complex32]) {
         let rows = field.par_chunks_exact_mut(self.width).zip(base.par_chunks_exact(self.width));
         rows.enumerate().for_each(|(y, (row, base))| {
             for (x, (value, base)) in row.iter_mut().zip(base).enumerate() {
                 let residual = self.pixel(x, y);
                 let residual = Complex32::new(residual[colour.index()], residual[3 + colour.index()]);
-                *value = base + residual * share;
+                *value = base + residual * CORRECTION_SHARE;
             }
         });
     }
