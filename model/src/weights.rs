@@ -379,7 +379,7 @@ impl Weights {
             .expect("the built-in weights are valid: a test loads them")
     }
 
-    /// The weights that ship with holod for weak machines: a third of the operations.
+    /// The weights that ship with holod for weak machines: little more than a third of the operations.
     pub fn builtin_small() -> Self {
         Self::from_bytes(include_bytes!("../weights/small.safetensors"), "small")
             .expect("the built-in weights are valid: a test loads them")

@@ -225,10 +225,10 @@ fn a_narrow_expected_stack_network_matches_its_golden_vectors() {
 
 #[test]
 fn the_built_in_network_matches_its_golden_vectors() {
-    check("layered-shipped.safetensors");
+    check("expected-stack-shipped.safetensors");
 }
 
 #[test]
 fn the_small_built_in_network_matches_its_golden_vectors() {
-    check("layered-shipped-small.safetensors");
+    check("expected-stack-shipped-small.safetensors");
 }

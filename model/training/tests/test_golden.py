@@ -28,7 +28,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(
     "name",
-    [*NARROW, "layered-shipped", "layered-shipped-small"],
+    [*NARROW, "expected-stack-shipped", "expected-stack-shipped-small"],
 )
 def test_committed_vectors_are_what_the_script_writes(name: str, written: Path) -> None:
     files = [f"{name}.safetensors"] + ([f"{name}.weights.safetensors"] if "narrow" in name else [])
