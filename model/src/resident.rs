@@ -32,7 +32,7 @@ enum Order {
 }
 
 impl<J: Send + 'static> Resident<J> {
-    /// Starts `threads` threads, 0 for as many as there are cores, named `name` and a number.
+    /// Starts `threads` threads, 0 for as many as there are cores, named `name` and a number, and waits until all run.
     pub(crate) fn new(
         name: &'static str,
         threads: usize,
@@ -43,6 +43,8 @@ impl<J: Send + 'static> Resident<J> {
             .num_threads(threads)
             .thread_name(move |index| format!("{name}-{index}"))
             .build()?;
+        // A thread allocates while it starts, which on a busy machine may be long after this.
+        pool.broadcast(|_| ());
         let state = Mutex::new(State { order: Order::Wait, job });
         let shared = Arc::new(Shared { state, changed: Condvar::new() });
         let for_worker = Arc::clone(&shared);

@@ -36,6 +36,7 @@ fn frames_do_not_allocate() {
         check(&Weights::load(&Path::new(golden).join(format!("{name}.weights.safetensors"))).unwrap());
     }
     check(&Weights::builtin());
+    check(&Weights::builtin_small());
 }
 
 fn check(weights: &Weights) {

@@ -129,7 +129,8 @@ class NetworkConfig:
             f"1 at the adjustable layers {self.adjustable_layers}",
         )
         narrowest, widest = self.pupil_range_mm
-        self._require("pupil_range_mm", 0 < narrowest <= widest <= 20, "two of 0 to 20 mm in ascending order")
+        in_range = 0 < narrowest <= widest <= 20
+        self._require("pupil_range_mm", in_range, "two above 0 and up to 20 mm, in ascending order")
         direct = self.architecture == "direct"
         self._require("frames", self.frames >= 1 and (direct or self.frames == 1), "1; `direct` may have more")
         self._require("blur_input", direct or not self.blur_input, "false; only `direct` can have it")

@@ -86,7 +86,7 @@ def test_configs_that_do_not_fit_say_which_key() -> None:
         ({"architecture": "focal-stack", "frames": 2}, "frames: found 2"),
         ({"architecture": "expected-stack", "grid": "full"}, "grid: found 'full', expected 'half-band' for `expected"),
         ({"architecture": "expected-stack", "pupil_inputs": False}, "pupil_inputs: found False, expected true"),
-        ({"pupil_range_mm": (1.0, 21.0)}, "pupil_range_mm: found .* expected two of 0 to 20 mm"),
+        ({"pupil_range_mm": (1.0, 21.0)}, "pupil_range_mm: found .* expected two above 0 and up to 20 mm"),
         ({"specialists_mm": (3.0, 2.0)}, "specialists_mm: .* rising order"),
     ):
         with pytest.raises(ConfigError, match=message):

@@ -32,7 +32,7 @@ pub(super) struct Defocus {
     argument_per_mm: f64,
     /// The pupil that `discs` is for.
     pupil_mm: f32,
-    /// Over the number of samples: spectra, transposed, of the discs between layers that are 1, 2, .. apart.
+    /// Over the number of samples: spectra, transposed, of the discs between layers that are 0, 1, 2, .. apart.
     discs: Vec<Vec<f32>>,
     /// Whether a layer has a pixel; if so, the spectra of its light, transposed.
     present: Vec<bool>,

@@ -18,14 +18,10 @@ pub(super) struct DepthLayers {
     size: Resolution,
     /// The depth layer of each pixel of each block, [height, width, 4].
     layer_of: Vec<[u8; BLOCK]>,
-    /// From the SLM plane to the farthest layer, from one to the next nearer one, and from the nearest to the SLM plane.
-    pub(super) to_farthest: [Vec<Complex32>; 3],
+    /// From one layer to the next nearer one, and from the nearest to the SLM plane.
     step: [Vec<Complex32>; 3],
     back: [Vec<Complex32>; 3],
-    /// What a forward transform leaves is the transposed spectrum of the light of the layer at hand.
-    pub(super) fft: TransposedFft2d<f32>,
-    /// Transposed spectrum of the light of the layers so far, at the layer at hand.
-    pub(super) sum: Vec<Complex32>,
+    fft: TransposedFft2d<f32>,
     /// [3, height, width]: what arrives at the SLM plane.
     pub(super) carried: Vec<Complex32>,
 }
@@ -44,11 +40,9 @@ impl DepthLayers {
             count: config.depth_layers as u8,
             size,
             layer_of: vec![[0; BLOCK]; size.pixels()],
-            to_farthest: tables(far_m + layer_m / 2.0),
             step: tables(layer_m),
             back: tables(layer_m / 2.0 - near_m),
             fft: TransposedFft2d::new(size.width, size.height),
-            sum: vec![Complex32::ZERO; size.pixels()],
             carried: vec![Complex32::ZERO; 3 * size.pixels()],
         }
     }
@@ -64,7 +58,7 @@ impl DepthLayers {
         self.layer_of.par_iter().map(share)
     }
 
-    /// Which corners of each block of row `y` lie where.
+    /// The layers of the corners of each block of row `y`.
     pub(super) fn row(&self, y: usize) -> &[[u8; BLOCK]] {
         &self.layer_of[y * self.size.width..][..self.size.width]
     }
@@ -106,35 +100,46 @@ impl DepthLayers {
             carry(fft, field, back);
         }
     }
-}
 
-/// Light that all layers send out, summed by Horner's rule: far to near, `add_layer` after each one's transform.
-impl DepthLayers {
-    /// Forgets the light of earlier layers.
-    pub(super) fn begin_sum(&mut self) {
-        self.sum.fill(Complex32::ZERO);
-    }
-
-    /// Carries the sum to the next nearer layer and adds the light whose spectrum `fft` has.
-    pub(super) fn add_layer(&mut self, colour: Colour) {
+    /// Adds the light [height, width] that one layer sends out, which is used up, to the transposed spectrum `sum` of the
+    /// light of farther ones: Horner's rule, far to near, from zeros on.
+    pub(super) fn add_light(&mut self, colour: Colour, light: &mut [Complex32], sum: &mut [Complex32]) {
+        self.fft.forward(light);
         let samples = self.size.pixels() as f32;
         let transformed = self.fft.spectrum.par_iter().zip(&self.step[colour.index()]);
-        self.sum.par_iter_mut().zip(transformed).for_each(|(sum, (spectrum, step))| {
+        sum.par_iter_mut().zip(transformed).for_each(|(sum, (spectrum, step))| {
             *sum = *sum * (step * samples) + spectrum;
         });
     }
 
-    /// Carries a transposed spectrum to the next nearer layer.
-    pub(super) fn step_nearer(&self, colour: Colour, spectrum: &mut [Complex32]) {
-        let samples = self.size.pixels() as f32;
-        spectrum.par_iter_mut().zip(&self.step[colour.index()]).for_each(|(value, step)| *value *= step * samples);
-    }
-
-    /// Writes the sum at the SLM plane to `field` [height, width].
-    pub(super) fn finish_sum(&mut self, colour: Colour, field: &mut [Complex32]) {
-        let summed = self.sum.par_iter().zip(&self.back[colour.index()]);
+    /// Writes to `field` [height, width] what arrives at the SLM plane of the light of all layers.
+    pub(super) fn bring_back(&mut self, colour: Colour, sum: &[Complex32], field: &mut [Complex32]) {
+        let summed = sum.par_iter().zip(&self.back[colour.index()]);
         self.fft.spectrum.par_iter_mut().zip(summed).for_each(|(value, (sum, back))| *value = sum * back);
         self.fft.inverse(field);
+    }
+
+    /// Writes the transposed spectrum of one colour of the carried field, times `transfer`, to `spectrum`; `scratch` is
+    /// [height, width].
+    pub(super) fn send(
+        &mut self,
+        colour: Colour,
+        transfer: &[Complex32],
+        spectrum: &mut [Complex32],
+        scratch: &mut [Complex32],
+    ) {
+        scratch.copy_from_slice(&self.carried[colour.index() * self.size.pixels()..][..self.size.pixels()]);
+        self.fft.forward(scratch);
+        let sent = self.fft.spectrum.par_iter().zip(transfer);
+        spectrum.par_iter_mut().zip(sent).for_each(|(value, (sent, transfer))| *value = sent * transfer);
+    }
+
+    /// Writes the light [height, width] of a transposed `spectrum`, and carries that to the next nearer layer.
+    pub(super) fn arrive(&mut self, colour: Colour, spectrum: &mut [Complex32], light: &mut [Complex32]) {
+        self.fft.spectrum.copy_from_slice(spectrum);
+        self.fft.inverse(light);
+        let samples = self.size.pixels() as f32;
+        spectrum.par_iter_mut().zip(&self.step[colour.index()]).for_each(|(value, step)| *value *= step * samples);
     }
 }
 

@@ -30,8 +30,9 @@ pub(super) struct ExpectedStack {
     feedback: LayerFeedback,
     /// [layers, 3, height, width]: the amplitudes that an eye should see; after the feedback, what is lacking of them.
     stack: Vec<f32>,
-    /// The light that one layer sends out in one colour.
+    /// The light that one layer sends out in one colour, and the transposed spectrum of that of the layers so far.
     light: Vec<Complex32>,
+    sum: Vec<Complex32>,
 }
 
 impl ExpectedStack {
@@ -51,6 +52,7 @@ impl ExpectedStack {
             feedback: LayerFeedback::new(config, feedback, size),
             stack: vec![0.0; 3 * config.depth_layers * size.pixels()],
             light: vec![Complex32::ZERO; size.pixels()],
+            sum: vec![Complex32::ZERO; size.pixels()],
         }
     }
 
@@ -88,7 +90,7 @@ impl ExpectedStack {
     /// Lights every layer with what is expected there through the first net's masks, with its phases, and carries all of
     /// it to the SLM plane.
     fn light_layers(&mut self) {
-        let Self { size, lighting, layers, stack, light, .. } = self;
+        let Self { size, lighting, layers, stack, light, sum, .. } = self;
         let (width, pixels, stride) = (size.width, size.pixels(), lighting.output.stride);
         let offset = ((layers.numbers().len() - 1) as f32).ln();
         lighting.output.rows_mut().for_each(|row| {
@@ -99,7 +101,7 @@ impl ExpectedStack {
             }
         });
         for colour in Colour::ALL {
-            layers.begin_sum();
+            sum.fill(Complex32::ZERO);
             for (layer, wanted) in stack.chunks_exact(3 * pixels).enumerate() {
                 let wanted = wanted[colour.index() * pixels..][..pixels].par_chunks_exact(width);
                 light.par_chunks_exact_mut(width).zip(wanted).enumerate().for_each(|(y, (light, wanted))| {
@@ -108,18 +110,17 @@ impl ExpectedStack {
                         *light = Complex32::from_polar(out[MASK] * wanted, PI * out[colour.index()]);
                     }
                 });
-                layers.fft.forward(light);
-                layers.add_layer(colour);
+                layers.add_light(colour, light, sum);
             }
-            layers.finish_sum(colour, light);
+            layers.bring_back(colour, sum, light);
             layers.carried[colour.index() * pixels..][..pixels].copy_from_slice(light);
         }
     }
 
     /// Feeds back what is lacking, and shows the second net the field, the change and the lack.
     fn feed_back(&mut self, pupil_mm: f32) {
-        let Self { size, correction, layers, feedback, stack, .. } = self;
-        feedback.run(layers, stack, pupil_mm);
+        let Self { size, correction, layers, feedback, stack, sum, .. } = self;
+        feedback.run(layers, stack, sum, pupil_mm);
         let (pixels, stack_channels) = (size.pixels(), 3 * layers.numbers().len());
         let map = &mut correction.input;
         map.write_fields(0, &layers.carried);

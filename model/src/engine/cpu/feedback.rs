@@ -1,12 +1,12 @@
 //! What an eye lacks when it focuses on each depth layer, fed back to the field at the SLM plane.
 
-use holod_calibration::{Colour, DisplayGeometry, Resolution};
+use holod_calibration::{Colour, DisplayGeometry, Metres, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::depth_layers::DepthLayers;
 use super::maps::sample_pitch;
-use crate::optics::signed_bin;
+use crate::optics::{signed_bin, transfer_table};
 use crate::weights::{Feedback, NetworkConfig};
 
 /// Keeps the phase of what is dark defined: |a| = sqrt(re² + im² + this).
@@ -19,6 +19,8 @@ pub(super) struct LayerFeedback {
     parameters: Feedback,
     optics: DisplayGeometry,
     size: Resolution,
+    /// From the SLM plane to the farthest layer: transposed spectra of each colour, over the number of samples.
+    to_farthest: [Vec<Complex32>; 3],
     /// Transposed spectrum of what reaches the layer at hand.
     reaching: Vec<Complex32>,
     /// The change of the field that would give what is lacking, [3, height, width].
@@ -27,35 +29,38 @@ pub(super) struct LayerFeedback {
 
 impl LayerFeedback {
     pub(super) fn new(config: &NetworkConfig, parameters: Feedback, size: Resolution) -> Self {
+        let optics = config.optics.geometry(size);
+        let far_m = optics.image_distance(optics.depth_far).0;
+        let volume_m = optics.image_distance(optics.depth_near).0 - far_m;
+        let farthest = Metres(far_m + volume_m / (2 * config.depth_layers) as f64);
+        let table = |colour| transfer_table(optics.wavelengths[colour], sample_pitch(&optics), size, farthest);
         Self {
             parameters,
-            optics: config.optics.geometry(size),
+            optics,
             size,
+            to_farthest: Colour::ALL.map(table),
             reaching: vec![Complex32::ZERO; size.pixels()],
             change: vec![Complex32::ZERO; 3 * size.pixels()],
         }
     }
 
     /// Changes the field that `layers` carried by what it lacks of the amplitudes `stack` [layers, 3, height, width],
-    /// which become that lack.
-    pub(super) fn run(&mut self, layers: &mut DepthLayers, stack: &mut [f32], pupil_mm: f32) {
-        let Self { parameters: Feedback { share, sharpness }, optics, size, reaching, change } = self;
+    /// which become that lack. `sum` is scratch for a spectrum.
+    pub(super) fn run(&mut self, layers: &mut DepthLayers, stack: &mut [f32], sum: &mut [Complex32], pupil_mm: f32) {
+        let Self { parameters: Feedback { share, sharpness }, optics, size, to_farthest, reaching, change } = self;
         let pixels = size.pixels();
         let mean = 1.0 / layers.numbers().len() as f32;
         for colour in Colour::ALL {
             let plane = colour.index() * pixels..(colour.index() + 1) * pixels;
-            let change = &mut change[plane.clone()];
             let pupil = Pupil::new(optics, colour, pupil_mm, *size);
+            // Until the last step it holds the light at one layer after another.
+            let change = &mut change[plane.clone()];
 
-            change.copy_from_slice(&layers.carried[plane.clone()]);
-            layers.fft.forward(change);
-            let sent = layers.fft.spectrum.par_iter().zip(&layers.to_farthest[colour.index()]);
-            reaching.par_iter_mut().zip(sent).for_each(|(value, (sent, transfer))| *value = sent * transfer);
+            layers.send(colour, &to_farthest[colour.index()], reaching, change);
             pupil.stop(reaching);
-            layers.begin_sum();
+            sum.fill(Complex32::ZERO);
             for (layer, stack) in layers.numbers().zip(stack.chunks_exact_mut(3 * pixels)) {
-                layers.fft.spectrum.copy_from_slice(reaching);
-                layers.fft.inverse(change);
+                layers.arrive(colour, reaching, change);
                 change.par_iter_mut().zip(&mut stack[plane.clone()]).zip(layers.cover(layer)).for_each(
                     |((arriving, lack), cover)| {
                         let amplitude = (arriving.norm_sqr() + DARK).sqrt();
@@ -63,12 +68,10 @@ impl LayerFeedback {
                         *arriving *= (1.0 + *sharpness * cover) * *lack / amplitude;
                     },
                 );
-                layers.fft.forward(change);
-                layers.add_layer(colour);
-                layers.step_nearer(colour, reaching);
+                layers.add_light(colour, change, sum);
             }
-            pupil.stop(&mut layers.sum);
-            layers.finish_sum(colour, change);
+            pupil.stop(sum);
+            layers.bring_back(colour, sum, change);
             layers.carried[plane].par_iter_mut().zip(change).for_each(|(field, change)| {
                 *change *= mean;
                 *field += *change * *share;

@@ -16,10 +16,10 @@ pub(super) const BLOCK: usize = SCALE * SCALE;
 pub(super) const MAPS: usize = 5 * BLOCK + 1;
 /// Where the second net's input has the maps: after the field.
 pub(super) const FIRST_MAP: usize = OUTPUT_CHANNELS;
-/// Of the second net's output, in the field.
+/// The share of the second net's output that is added to the field.
 const CORRECTION_SHARE: f32 = 0.3;
 
-/// Between the centres of neighbouring samples of the grid.
+/// The distance between the centres of neighbouring samples of the grid.
 pub(super) fn sample_pitch(optics: &DisplayGeometry) -> Metres {
     Metres(SCALE as f64 * optics.pixel_pitch.0)
 }

@@ -175,6 +175,14 @@ fn as_many_depth_layers_as_can_be_match_the_reference_at_the_widest_pupil() {
 }
 
 #[test]
+fn blurs_wider_than_the_table_of_the_disc_match_the_reference() {
+    let mut config = NetworkConfig { channels: 4, ..weights_tests::expected_stack_config() };
+    config.optics.pixel_pitch_um = 1.0;
+    config.optics.eyepiece_focal_length_mm = 2000.0;
+    check_all_stages(&random_weights(config, 4), Resolution { width: 12, height: 7 }, 5.0, 4, InstructionSet::best());
+}
+
+#[test]
 fn one_pixel_one_column_and_one_row_match_the_reference() {
     let direct = random_weights(config(Grid::HalfBand, 6, 12, vec![3, 4]), 5);
     let layered = random_weights(weights_tests::layered_config(), 5);
