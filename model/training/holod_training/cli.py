@@ -163,7 +163,7 @@ def _lpips_options(sub: argparse.ArgumentParser, effect: str) -> None:
 
 
 def _option_of(loss_key: str) -> str:
-    return f"--{loss_key.replace('_', '-')}" + ("" if loss_key.endswith("_px") else "-weight")
+    return f"--{loss_key.replace('_', '-')}" + ("" if loss_key.endswith(("_px", "_growth")) else "-weight")
 
 
 def _network_options(sub: argparse.ArgumentParser) -> None:

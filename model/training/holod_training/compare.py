@@ -22,7 +22,7 @@ from holod_training.optics import Eye, coc_px, double_phase, panel_field, throug
 from holod_training.report import NUMBERS
 from holod_training.rivals import flat_oracle
 from holod_training.shards import Shard, open_held_out
-from holod_training.train import VALIDATION_PUPILS_MM, Run, TrainConfig, nearest_pupil, train
+from holod_training.train import VALIDATION_PUPILS_MM, Run, TrainConfig, train
 from holod_training.variants import network_amplitude, variant
 
 WARM_STEPS, TIMED_STEPS = 2, 7
@@ -55,7 +55,7 @@ def judge_held_out(network: FieldNetwork, shards: list[Shard], border_px: int) -
     for pupil_mm in VALIDATION_PUPILS_MM:
         judged = []
         for shard in shards:
-            stack = nearest_pupil(shard, pupil_mm)
+            stack = shard.read(shard.nearest_pupil(pupil_mm))
             pupil = torch.tensor([stack.pupil_mm])
             field = network(network_amplitude(config, stack)[None], stack.depth[None], pupil)[0]
             if config.grid == "half-band":
@@ -72,7 +72,7 @@ def judge_held_out(network: FieldNetwork, shards: list[Shard], border_px: int) -
 def judge_flat_oracle(shards: list[Shard], optics: OpticsConfig, border_px: int) -> dict[str, dict[str, float]]:
     result = {}
     for pupil_mm in VALIDATION_PUPILS_MM:
-        stacks = [nearest_pupil(shard, pupil_mm) for shard in shards]
+        stacks = [shard.read(shard.nearest_pupil(pupil_mm)) for shard in shards]
         judged = [
             judge(
                 flat_oracle(s.target),

@@ -59,7 +59,7 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     learned_and_rivals = [*trained, *rivals(optics)]
     start = next(method for method in learned_and_rivals if method.name == config.solver_start)
     methods = [*learned_and_rivals, *_solvers(config, start, bench, min(config.solver_scenes, len(shards)))]
-    timed = min(range(len(shards[0].pupils_mm)), key=lambda i: abs(shards[0].pupils_mm[i] - TIMED_PUPIL_MM))
+    timed = shards[0].nearest_pupil(TIMED_PUPIL_MM)
 
     config.out.mkdir(parents=True, exist_ok=True)
     # Real pictures and cards first: they are few, and what is wrong with them is told before the long work.

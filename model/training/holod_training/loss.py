@@ -21,9 +21,9 @@ class LossWeights:
     """The weight of each term, and the CoC below which sharpness counts no more.
 
     `in_focus` is for a pupil of 2 mm: what is in focus is a share of a stack that falls as 1/s, so `for_pupil` lets its
-    weight grow in proportion. `absolute` and `gradient` are the paper's: |P − R| and |∇P − ∇R| weighted by W; so is a
-    perceptual error of some planes: `lpips` where a run has its weights, `structure` needs none. `teacher` counts only
-    where there is one.
+    weight grow in proportion, or by another power, `in_focus_growth`: with 2 wide pupils lose less of their sharpness.
+    `absolute` and `gradient` are the paper's: |P − R| and |∇P − ∇R| weighted by W; so is a perceptual error of some
+    planes: `lpips` where a run has its weights, `structure` needs none. `teacher` counts only where there is one.
     """
 
     absolute: float = 1.0
@@ -32,13 +32,14 @@ class LossWeights:
     focus: float = 15.0
     coc_floor_px: float = 0.2
     in_focus: float = 0.0
+    in_focus_growth: float = 1.0
     focus_absolute: float = 0.0
     structure: float = 0.0
     lpips: float = 1.0
     teacher: float = 8.0
 
     def for_pupil(self, pupil_mm: float) -> LossWeights:
-        return replace(self, in_focus=self.in_focus * pupil_mm / IN_FOCUS_PUPIL_MM)
+        return replace(self, in_focus=self.in_focus * (pupil_mm / IN_FOCUS_PUPIL_MM) ** self.in_focus_growth)
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,8 @@ def augment(stack: Stack, config: AugmentConfig, rng: np.random.Generator) -> St
 
 class Sampler:
     """Crops by (seed, step, rank): nothing is remembered between steps but the list of shards, so a run that is
-    resumed with that list goes on exactly as if it had never stopped."""
+    resumed with that list goes on exactly as if it had never stopped. Networks that are specialists for some pupils
+    are shown what is nearest to these."""
 
     def __init__(
         self,
@@ -79,6 +80,7 @@ class Sampler:
         seed: int,
         rank: int,
         augment_config: AugmentConfig,
+        specialists_mm: tuple[float, ...] = (),
     ) -> None:
         self.folder = folder
         self.optics = optics
@@ -86,6 +88,7 @@ class Sampler:
         self.seed = seed
         self.rank = rank
         self.augment_config = augment_config
+        self.specialists_mm = specialists_mm
         self.shards: list[Shard] = []
 
     @property
@@ -115,7 +118,7 @@ class Sampler:
         drawn = []
         for _ in range(count):
             shard = self.shards[rng.integers(len(self.shards))]
-            pupil = int(rng.integers(len(shard.pupils_mm)))
+            pupil = self._pupil(shard, rng)
             top = int(rng.integers(shard.height - self.crop + 1))
             left = int(rng.integers(shard.width - self.crop + 1))
             drawn.append(augment(shard.read(pupil, top, left, self.crop), self.augment_config, rng))
@@ -129,3 +132,10 @@ class Sampler:
                 for stack in drawn
             ]
         return drawn
+
+    def _pupil(self, shard: Shard, rng: np.random.Generator) -> int:
+        """Any of the shard's pupils; for specialists the one that is nearest to any of theirs."""
+        if not self.specialists_mm:
+            return int(rng.integers(len(shard.pupils_mm)))
+        wanted = self.specialists_mm[rng.integers(len(self.specialists_mm))]
+        return shard.nearest_pupil(wanted)

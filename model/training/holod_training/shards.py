@@ -133,6 +133,10 @@ class Shard:
             if abs(f - e) > 1e-4 * max(1e-3, abs(e)):
                 raise ShardError(f"{self.path}: {name} is {f}, the network is made for {e}")
 
+    def nearest_pupil(self, pupil_mm: float) -> int:
+        """The index of the stack whose pupil is nearest."""
+        return min(range(len(self.pupils_mm)), key=lambda i: abs(self.pupils_mm[i] - pupil_mm))
+
     def read(self, pupil_index: int, top: int = 0, left: int = 0, size: int | None = None) -> Stack:
         """The stack of one pupil, whole or a square crop."""
         rows = slice(top, self.height if size is None else top + size)

@@ -110,11 +110,6 @@ def see(config: NetworkConfig, field_: Tensor, stack: Stack, pupil_mm: float) ->
     return full_eye(config.optics, height, width, stack.focus_dpt, str(field_.device)).look(field_, pupil_mm)
 
 
-def nearest_pupil(shard: Shard, pupil_mm: float) -> Stack:
-    """The whole stack of a shard whose pupil is nearest."""
-    return shard.read(min(range(len(shard.pupils_mm)), key=lambda i: abs(shard.pupils_mm[i] - pupil_mm)))
-
-
 class Run:
     """One rank's share of a run; everything that a checkpoint holds is an attribute."""
 
@@ -143,7 +138,13 @@ class Run:
             unused = bool(config.network.specialists_mm)
             self.trained = DistributedDataParallel(self.network, find_unused_parameters=unused)
         self.sampler = Sampler(
-            Path(config.shards), config.network.optics, config.crop, config.seed, rank, config.augment
+            Path(config.shards),
+            config.network.optics,
+            config.crop,
+            config.seed,
+            rank,
+            config.augment,
+            config.network.specialists_mm,
         )
         self.validation: list[Shard] = []
         if config.validation:
@@ -245,7 +246,7 @@ class Run:
         for wanted in VALIDATION_PUPILS_MM:
             judged = []
             for shard in self.validation:
-                stack = nearest_pupil(shard, wanted).to(self.device)
+                stack = shard.read(shard.nearest_pupil(wanted)).to(self.device)
                 low = self._fields(self.average, self.config.network, [stack], [stack.depth])[0]
                 picture = see(self.config.network, low, stack, stack.pupil_mm)
                 blur = coc_px(self.config.network.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
@@ -262,7 +263,8 @@ class Run:
             return psnr_db(inner(flat_oracle(stack.target) - stack.target, border).square())
 
         scores = {
-            pupil: [score(nearest_pupil(shard, pupil)) for shard in self.validation] for pupil in VALIDATION_PUPILS_MM
+            pupil: [score(shard.read(shard.nearest_pupil(pupil))) for shard in self.validation]
+            for pupil in VALIDATION_PUPILS_MM
         }
         return {str(p): {"flat_oracle_db": sum(of) / len(of)} for p, of in scores.items() if of}
 

@@ -78,6 +78,7 @@ VARIANTS: dict[str, NetworkConfig] = {
     "ablation-three-deformable": replace(
         _HALF_BAND, conditioning="deformable", pupil_inputs=False, specialists_mm=ABLATION_PUPILS_MM
     ),
+    "deh-like": replace(_HALF_BAND, adjustable_layers=(), pupil_inputs=False, specialists_mm=(3.0,)),
     "ablation-modulated": replace(_HALF_BAND, conditioning="modulated"),
     "ablation-no-pupil": replace(_HALF_BAND, adjustable_layers=(), pupil_inputs=False),
 }
@@ -107,7 +108,8 @@ def network_amplitude(config: NetworkConfig, stack: Stack) -> Tensor:
 
 
 class SpecialistNetwork(FieldNetwork):
-    """One whole network for each pupil of `specialists_mm`; the nearest serves, and none is told its pupil."""
+    """One whole network for each pupil of `specialists_mm`; the nearest serves, and none is told its pupil. Of one
+    alone: as diffraction-engineered holography is trained (Yang et al. 2022), for one aperture."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)

@@ -120,6 +120,8 @@ def test_a_wider_pupil_weighs_the_in_focus_term_more_and_no_other() -> None:
     assert weights.for_pupil(2.0) == weights
     assert weights.for_pupil(4.0) == dataclasses.replace(weights, in_focus=14.0)
     assert weights.for_pupil(1.0).in_focus == pytest.approx(3.5)
+    squarely = dataclasses.replace(weights, in_focus_growth=2.0)
+    assert [squarely.for_pupil(s).in_focus for s in (1.0, 2.0, 4.0)] == pytest.approx([1.75, 7.0, 28.0])
     assert LossWeights().for_pupil(5.0) == LossWeights()
 
 

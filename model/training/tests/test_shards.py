@@ -86,6 +86,16 @@ def test_draws_depend_on_seed_and_step_alone(shards: Path) -> None:
     assert not torch.equal(sampler(shards, seed=2).draw(7, 1)[0].target, first[0].target)
 
 
+def test_specialists_are_shown_what_is_nearest_to_their_pupils(shards: Path) -> None:
+    pupils = Shard(shards / "scene_000000.safetensors").pupils_mm
+    assert len(pupils) > 1
+    free = sampler(shards)
+    assert {stack.pupil_mm for step in range(40) for stack in free.draw(step, 1)} == set(pupils)
+    bound = Sampler(shards, OpticsConfig(), 32, 1, 0, AugmentConfig(), specialists_mm=(pupils[-1] + 0.1,))
+    bound.rescan()
+    assert {stack.pupil_mm for step in range(40) for stack in bound.draw(step, 1)} == {pupils[-1]}
+
+
 def test_rescan_takes_in_new_shards_and_refuses_small_ones(shards: Path) -> None:
     growing = sampler(shards)
     write_shard(shards / "scene_000009.safetensors", seed=9)

@@ -25,7 +25,7 @@ from holod_training.variants import VARIANTS, build_network, network_amplitude, 
 
 SHIPPED = Path(__file__).parents[2] / "weights" / "standard.safetensors"
 SIZE = 16
-PUPIL_BLIND = {"ablation-no-pupil"}
+PUPIL_BLIND = {"ablation-no-pupil", "deh-like"}
 
 
 def scene(config: NetworkConfig, pictures: int, size: int = SIZE) -> tuple[torch.Tensor, torch.Tensor]:
