@@ -94,6 +94,9 @@ def test_specialists_are_shown_what_is_nearest_to_their_pupils(shards: Path) -> 
     bound = Sampler(shards, OpticsConfig(), 32, 1, 0, AugmentConfig(), specialists_mm=(pupils[-1] + 0.1,))
     bound.rescan()
     assert {stack.pupil_mm for step in range(40) for stack in bound.draw(step, 1)} == {pupils[-1]}
+    two = Sampler(shards, OpticsConfig(), 32, 1, 0, AugmentConfig(), specialists_mm=(pupils[0], pupils[-1]))
+    two.rescan()
+    assert {stack.pupil_mm for step in range(40) for stack in two.draw(step, 1)} == {pupils[0], pupils[-1]}
 
 
 def test_rescan_takes_in_new_shards_and_refuses_small_ones(shards: Path) -> None:

@@ -160,6 +160,10 @@ def test_other_networks_train_and_come_back_from_their_file(
     assert {"psnr_db", "psnr_in_focus_db", "slope", "correlation", "flat_oracle_db"} <= numbers.keys()
 
 
+def test_specialists_reach_the_sampler(shards: Path, tmp_path: Path) -> None:
+    assert Run(tiny(shards, tmp_path / "run", network=variant("deh-like")), CPU).sampler.specialists_mm == (3.0,)
+
+
 def test_a_focal_stack_network_refuses_scenes_with_other_planes(shards: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"planes: found focal images at 0\.000, 1\.429, 2\.857 dpt"):
         train(tiny(shards, tmp_path / "run", network=variant("focal-stack")), CPU)
@@ -235,9 +239,10 @@ def test_options_change_the_variant_that_they_name() -> None:
     assert (corrected.correction_layers, corrected.correction_dilations) == (4, (1, 2, 2, 1))
     dilated = network("--layers", "10", "--dilations", "1,1,2,4,8,1,8,4,2,1")
     assert dilated == variant("half-band-dilated")
-    options = cli._parser().parse_args([*common, "--in-focus-weight", "7", "--faulty-depth", "0.5", "--crop", "96"])
-    config = cli._train_config(options)
-    assert (config.loss.in_focus, config.augment.faulty_depth, config.crop) == (7, 0.5, 96)
+    chosen = ["--in-focus-weight", "7", "--in-focus-growth", "2", "--faulty-depth", "0.5", "--crop", "96"]
+    config = cli._train_config(cli._parser().parse_args([*common, *chosen]))
+    assert (config.loss.in_focus, config.loss.in_focus_growth) == (7, 2)
+    assert (config.augment.faulty_depth, config.crop) == (0.5, 96)
 
 
 @pytest.mark.usefixtures("no_plots")
