@@ -134,8 +134,8 @@ class Sampler:
         return drawn
 
     def _pupil(self, shard: Shard, rng: np.random.Generator) -> int:
-        """Any of the shard's pupils; for specialists the one nearest to a pupil of theirs. Whose that is may still be
-        another's to learn from, where a shard has no pupil near to it."""
+        """Any of the shard's pupils; for specialists the one nearest to a random one of theirs. In a shard without
+        one near, that may be nearer to another specialist, who then learns from it."""
         if not self.specialists_mm:
             return int(rng.integers(len(shard.pupils_mm)))
         wanted = self.specialists_mm[rng.integers(len(self.specialists_mm))]
