@@ -61,6 +61,9 @@ pub struct NetworkConfig {
     /// `layered` and `expected-stack`: 3x3 layers of the net that corrects what arrives at the SLM plane.
     #[serde(default = "default_correction_layers", skip_serializing_if = "is_default_correction_layers")]
     pub correction_layers: usize,
+    /// `expected-stack`: whether the first net also corrects the images that both nets are told.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub refined_stack: bool,
 }
 
 // The trainer leaves out what has its default, so that files of older networks stay as they are.
@@ -222,8 +225,9 @@ impl Family {
             }
             Architecture::ExpectedStack => {
                 let stack = 3 * config.depth_layers;
+                let outputs = (LIT + usize::from(config.refined_stack) * REFINED) * config.depth_layers;
                 Self::ExpectedStack {
-                    lighting: stack_of("lighting", maps + stack, 4 * config.depth_layers, config.layers, adjustable)?,
+                    lighting: stack_of("lighting", maps + stack, outputs, config.layers, adjustable)?,
                     correction: stack_of(
                         "correction",
                         2 * OUTPUT_CHANNELS + maps + 2 * stack,
@@ -510,6 +514,12 @@ impl Metadata<'_> {
             "\"full\"".into(),
             &format!("\"half-band\" for `{}`", config.architecture),
         )?;
+        require(
+            config.architecture == Architecture::ExpectedStack || !config.refined_stack,
+            "refined_stack",
+            "true".into(),
+            "false; only `expected-stack` can have it",
+        )?;
         require((1..=256).contains(channels), "channels", channels.to_string(), "1 to 256")?;
         let adjustable = &config.adjustable_layers;
         require(
@@ -610,6 +620,11 @@ pub(crate) const OUTPUT_CHANNELS: usize = 6;
 /// The names of the tensors of [`Feedback`].
 const FEEDBACK_SHARE: &str = "feedback_share";
 const SHARPNESS: &str = "sharpness";
+
+/// Outputs of the first net of `expected-stack` for each depth layer: the phases of three colours and a mask; then, after
+/// those of all layers, changes of three colours' amplitudes if it refines the stack.
+pub(crate) const LIT: usize = 4;
+pub(crate) const REFINED: usize = 3;
 
 /// Gaussian blurs between which the `layered` family's first net chooses.
 pub(crate) const LAYERED_BLURS: usize = 3;
@@ -728,6 +743,7 @@ pub(crate) mod tests {
             depth_layers: default_depth_layers(),
             transport_prior: default_transport_prior(),
             correction_layers: default_correction_layers(),
+            refined_stack: false,
         }
     }
 
@@ -780,12 +796,13 @@ pub(crate) mod tests {
         let layered = Weights::from_bytes(&file_of(layered_config(), |_, _| {}), "test").unwrap();
         let expected = random_weights(layered_config(), 1);
         assert_eq!((&layered.config, &layered.family), (&expected.config, &expected.family));
-        for other in [NetworkConfig { transport_prior: false, ..layered_config() }, expected_stack_config()] {
+        let refined = NetworkConfig { refined_stack: true, ..expected_stack_config() };
+        for other in [NetworkConfig { transport_prior: false, ..layered_config() }, expected_stack_config(), refined] {
             let read = Weights::from_bytes(&file_of(other.clone(), |_, _| {}), "test").unwrap();
             assert_eq!((&read.config, &read.family), (&other, &random_weights(other.clone(), 1).family));
         }
         let written = |config: NetworkConfig| serde_json::to_string(&config).unwrap();
-        assert!(!written(config()).contains("depth_layers"));
+        assert!(!written(config()).contains("depth_layers") && !written(config()).contains("refined_stack"));
         assert!(written(layered_config()).contains("\"depth_layers\":5,\"correction_layers\":4"));
         assert_eq!(weights.metrics()["psnr_db"], 29.0);
         assert!(weights.provenance().is_null());
@@ -853,6 +870,7 @@ pub(crate) mod tests {
         assert_mentions(&configured(|c| c.correction_layers = 3), &["config.correction_layers", "3", "even"]);
         assert_mentions(&configured(|c| c.depth_layers = 1), &["config.depth_layers", "1"]);
         assert_mentions(&configured(|c| c.depth_layers = 65), &["config.depth_layers", "65", "2 to 64"]);
+        assert_mentions(&configured(|c| c.refined_stack = true), &["config.refined_stack", "true", "`expected-stack`"]);
         assert_mentions(&configured(|c| c.version = 7), &["config.version", "7"]);
         assert_mentions(&configured(|c| c.layers = 5), &["config.layers", "5", "even"]);
         assert_mentions(&configured(|c| c.channels = 100_000), &["config.channels", "100000"]);

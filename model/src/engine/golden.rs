@@ -224,6 +224,11 @@ fn a_narrow_expected_stack_network_matches_its_golden_vectors() {
 }
 
 #[test]
+fn a_narrow_network_that_refines_its_stack_matches_its_golden_vectors() {
+    check("expected-stack-narrow-refined.safetensors");
+}
+
+#[test]
 fn the_built_in_network_matches_its_golden_vectors() {
     check("expected-stack-shipped.safetensors");
 }

@@ -116,6 +116,7 @@ pub(crate) fn run(weights: &Weights, frame: &RgbdFrame, pupil_mm: f64) -> Trace 
             let wanted = expected_stack(weights, frame, [maps.height, maps.width], pupil_mm).map(f64::sqrt);
             let maps = concatenate(&[&maps, &wanted.clone().map(|amplitude| amplitude - 0.4)]);
             let out = trunk(&mut stages, "lighting.", lighting, weights, maps.clone(), pupil_mm);
+            let wanted = if weights.config.refined_stack { refined(weights, &out, wanted) } else { wanted };
             let carried = light_layers(weights, &out, &wanted);
             stages.push(Stage { name: "carried".into(), value: Value::Light(carried.clone()) });
             let sharpness = f64::from(feedback.sharpness);
@@ -437,6 +438,13 @@ fn expected_stack(weights: &Weights, frame: &RgbdFrame, size: [usize; 2], pupil_
         let (focus, colour) = (channel / 3, channel % 3);
         (at(4 * focus + 1 + colour) / at(4 * focus).max(0.02)).max(0.0)
     })
+}
+
+/// The wanted amplitudes with the first net's changes of them.
+fn refined(weights: &Weights, out: &Map, wanted: Map) -> Map {
+    let changes = out.values[4 * weights.config.depth_layers * out.width * out.height..].iter();
+    let values = wanted.values.iter().zip(changes).map(|(wanted, change)| (wanted + 0.3 * change).max(0.0)).collect();
+    Map { values, ..wanted }
 }
 
 /// The field at the SLM plane when the wanted amplitudes light the depth layers through the first net's masks, with its

@@ -95,10 +95,14 @@ class NetworkConfig:
     specialists_mm: tuple[float, ...] = _optional(())
     depth_layers: int = _optional(8)
     transport_prior: bool = _optional(True)
-    # The second net of `layered` and `expected-stack`; dilations as above.
+    # The second net of `layered`, `expected-stack` and a fed back `focal-stack`; dilations as above.
     correction_layers: int = _optional(10)
     correction_dilations: tuple[int, ...] = _optional(())
+    # Whether the first net also corrects the images that it is told (`expected-stack` only).
+    refined_stack: bool = _optional(False)
     planes: int = _optional(6)
+    # Whether what the field lacks of the images is fed back and a second net corrects it (`focal-stack` only).
+    feedback: bool = _optional(False)
 
     def __post_init__(self) -> None:
         self._require("architecture", self.architecture in ARCHITECTURES, f"one of {', '.join(ARCHITECTURES)}")
@@ -136,6 +140,9 @@ class NetworkConfig:
         self._require("blur_input", direct or not self.blur_input, "false; only `direct` can have it")
         expecting = self.architecture == "expected-stack"
         self._require("grid", self.grid == "half-band" or not expecting, "'half-band' for `expected-stack`")
+        self._require("refined_stack", expecting or not self.refined_stack, "false; only `expected-stack` can have it")
+        fed_back = self.architecture == "focal-stack" and self.grid == "half-band"
+        self._require("feedback", fed_back or not self.feedback, "false; only a half-band `focal-stack` can have it")
         always_told = self.architecture in ("layered", "expected-stack")
         self._require("pupil_inputs", self.pupil_inputs or not always_told, f"true for `{self.architecture}`")
         self._require(

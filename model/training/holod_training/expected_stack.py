@@ -4,7 +4,6 @@ it on every depth layer; what that lacks, fed back; a correction."""
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
@@ -13,16 +12,17 @@ from torch import Tensor, nn
 from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.layered import encode, layer_centres_m, layer_numbers
 from holod_training.network import CORRECTION_SHARE, OUTPUT_CHANNELS, FieldNetwork, Trunk, run_traced
-from holod_training.optics import frequencies, intensity, pupil_mask, transfer
+from holod_training.optics import frequencies
+from holod_training.plane_light import FEEDBACK_SHARE, LIT, feed_back, light_planes
 
 # The least share of a white scene's light by which what is seen is divided.
 LEAST_COVER = 0.02
 # Below it a disc's spectrum is 1.
 LEAST_ARGUMENT = 1e-3
-# Keeps the phase of what is dark defined.
-DARK = 1e-6
-FEEDBACK_SHARE = 0.5
 SHARPNESS = 1.0
+# Net 1's further outputs for each depth layer of a refined stack: changes of three amplitudes.
+REFINED = 3
+REFINED_SHARE = 0.3
 
 
 def inside_layers(depth: Tensor, count: int) -> Tensor:
@@ -34,16 +34,6 @@ def inside_layers(depth: Tensor, count: int) -> Tensor:
 def layer_cover(depth: Tensor, count: int, scale: int) -> Tensor:
     """The share of each block of depth [N, H, W] that lies in each of `count` layers, [N, count, h, w]."""
     return F.avg_pool2d(inside_layers(depth, count).to(depth.dtype), scale)
-
-
-@lru_cache(maxsize=8)
-def layer_carriers(
-    optics: OpticsConfig, count: int, scale: int, height: int, width: int, dtype: torch.dtype, device: str
-) -> Tensor:
-    """Transfer functions [count, 3, height, width] from the SLM plane to where the middle of each depth layer is
-    imaged, on a grid of `scale` times the panel's pitch."""
-    fy, fx = (frequencies(size, scale * optics.pitch_m, device) for size in (height, width))
-    return transfer(optics, fx, fy, layer_centres_m(optics, count)).to(dtype)
 
 
 def expected_stack(
@@ -78,31 +68,23 @@ def expected_stack(
     return (light / white.clamp_min(LEAST_COVER)).clamp_min(0)
 
 
-def feed_back(
-    field: Tensor, wanted: Tensor, weight: Tensor, pupil_mm: Tensor, optics: OpticsConfig, scale: int
-) -> tuple[Tensor, Tensor]:
-    """What eyes with pupils [N] lack of the amplitudes `wanted` [N, layers, 3, h, w] when they focus on each layer, and
-    the mean of the changes of `field` [N, 3, h, w] at the SLM plane that would give it, each with its `weight`
-    [N, layers, 1, h, w]: one step of Gerchberg and Saxton (1972) at all layers at once, with the phases that are there.
-    Pupils of 2.3 mm and more cut nothing of the half band of the default bench.
-    """
-    height, width = field.shape[-2:]
-    fy, fx = (frequencies(size, scale * optics.pitch_m, field.device) for size in (height, width))
-    pupil = pupil_mask(optics, fx, fy, pupil_mm[:, None, None])
-    carriers = layer_carriers(optics, wanted.shape[1], scale, height, width, field.dtype, str(field.device))
-    arriving = torch.fft.ifft2((torch.fft.fft2(field) * pupil)[:, None] * carriers)
-    amplitude = torch.sqrt(intensity(arriving) + DARK)
-    lack = wanted - amplitude
-    changes = torch.fft.fft2(arriving * (weight * lack / amplitude)) * carriers.conj()
-    return lack, torch.fft.ifft2(changes.mean(dim=1) * pupil)
+def with_refined_stack(state: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The state of an `expected-stack` network as that of a refined one that refines nothing yet."""
+    last = max(int(key.split(".")[1]) for key in state if key.startswith("lighting."))
+    refined = dict(state)
+    for name in (f"lighting.{last}.weight", f"lighting.{last}.bias"):
+        rows = len(state[name]) // LIT * REFINED
+        refined[name] = torch.cat((state[name], state[name].new_zeros(rows, *state[name].shape[1:])))
+    return refined
 
 
 class ExpectedStackNetwork(FieldNetwork):
     """Both nets are told `expected_stack` at the `depth_layers`. Net 1 (`lighting`) gives each layer a mask of 0 to 1,
     which starts at one over their number, and a phase for each colour: what is expected there, through the mask, lights
-    the layer, and all of it is carried to the SLM plane. That field takes a learned share of what `feed_back` finds
-    lacking, of which what is in focus weighs more by a learned factor; net 2 (`correction`) sees the field, the change
-    and the lack, and adds a residual.
+    the layer, and all of it is carried to the SLM plane. With `refined_stack` it corrects what is expected before that,
+    for it can tell what a blur in which nothing hides anything cannot: what lies before what. The field takes a learned
+    share of what `feed_back` finds lacking, of which what is in focus weighs more by a learned factor; net 2
+    (`correction`) sees the field, the change and the lack, and adds a residual.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -113,7 +95,7 @@ class ExpectedStackNetwork(FieldNetwork):
         self.lighting = Trunk(
             config,
             inputs=maps,
-            outputs=4 * config.depth_layers,
+            outputs=(LIT + REFINED * config.refined_stack) * config.depth_layers,
             layers=config.layers,
             dilations=config.dilations,
             adjustable_layers=config.adjustable_layers,
@@ -140,24 +122,17 @@ class ExpectedStackNetwork(FieldNetwork):
         wanted = expected_stack(amplitude, depth, pupil_mm, optics, count, self.scale).sqrt()
         maps = encode(amplitude, depth, pupil_mm, self.scale)
         maps = torch.cat((maps, wanted.flatten(1, 2) - 0.4), dim=1)
-        field = self.light_layers(run_traced("lighting", self.lighting, maps, pupil_mm, trace), wanted)
+        out = run_traced("lighting", self.lighting, maps, pupil_mm, trace)
+        if self.config.refined_stack:
+            refined = out[:, LIT * count :].unflatten(1, (count, REFINED))
+            wanted = (wanted + REFINED_SHARE * refined).clamp_min(0)
+        distances_m = tuple(layer_centres_m(optics, count))
+        field = light_planes(out[:, : LIT * count], wanted, optics, distances_m, self.scale)
         if trace is not None:
             trace["carried"] = field
         weight = 1 + self.sharpness * layer_cover(depth, count, self.scale)[:, :, None]
-        lack, change = feed_back(field, wanted, weight, pupil_mm, optics, self.scale)
+        lack, change = feed_back(field, wanted, weight, pupil_mm, optics, distances_m, self.scale)
         field = field + self.feedback_share * change
         seen = torch.cat((field.real, field.imag, maps, change.real, change.imag, lack.flatten(1, 2)), dim=1)
         residual = run_traced("correction", self.correction, seen, pupil_mm, trace)
         return field + CORRECTION_SHARE * torch.complex(residual[:, :3].contiguous(), residual[:, 3:].contiguous())
-
-    def light_layers(self, out: Tensor, wanted: Tensor) -> Tensor:
-        """The field at the SLM plane, complex [N, 3, h, w], from net 1's output and amplitudes [N, layers, 3, h, w]."""
-        count = self.config.depth_layers
-        phase, mask = out.unflatten(1, (count, 4)).split((3, 1), dim=2)
-        phase = math.pi * phase
-        light = torch.sigmoid(mask - math.log(count - 1)) * wanted
-        planes = torch.complex(light * torch.cos(phase), light * torch.sin(phase))
-        height, width = planes.shape[-2:]
-        device = str(planes.device)
-        carriers = layer_carriers(self.config.optics, count, self.scale, height, width, planes.dtype, device)
-        return torch.fft.ifft2((torch.fft.fft2(planes) * carriers.conj()).sum(dim=1))

@@ -7,11 +7,12 @@ from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
-from holod_training.network import FieldNetwork, Trunk
+from holod_training.network import CORRECTION_SHARE, OUTPUT_CHANNELS, FieldNetwork, Trunk
 from holod_training.optics import frequencies, transfer
+from holod_training.plane_light import FEEDBACK_SHARE, LIT, feed_back, light_planes
 from holod_training.shards import Stack
 
 
@@ -43,6 +44,22 @@ def carriers_back(config: NetworkConfig, height: int, width: int, dtype: torch.d
     return (transfer(optics, fx, fy, [-optics.distance_m(d) for d in planes_dpt(config)]) * inside).to(dtype)
 
 
+def checked(amplitude: Tensor, config: NetworkConfig) -> Tensor:
+    """Raises ConfigError for what is no batch of focal images."""
+    if amplitude.dim() != 5 or amplitude.shape[1] != config.planes:
+        expected = f"[N, {config.planes}, 3, H, W]"
+        raise ConfigError(f"planes: found input of shape {list(amplitude.shape)}, expected {expected}")
+    return amplitude
+
+
+def with_pupil(x: Tensor, pupil_mm: Tensor, config: NetworkConfig) -> Tensor:
+    """x [N, C, h, w] and, where the network is told its pupil, one more map of it."""
+    if not config.pupil_inputs:
+        return x
+    constant = ((pupil_mm - 3) / 2)[:, None, None, None].expand(-1, 1, *x.shape[2:])
+    return torch.cat((x, constant), dim=1)
+
+
 class FocalStackNetwork(FieldNetwork):
     """Σ_n ASM(mask_n · A_n · exp(jφ_n), −u_n): each image lights its own plane, through a mask of 0 to 1.
 
@@ -65,20 +82,63 @@ class FocalStackNetwork(FieldNetwork):
     def forward(self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor) -> Tensor:
         """amplitude [N, planes, 3, H, W] from `focal_amplitudes`; depth is not looked at."""
         count = self.config.planes
-        if amplitude.dim() != 5 or amplitude.shape[1] != count:
-            raise ConfigError(f"planes: found input of shape {list(amplitude.shape)}, expected [N, {count}, 3, H, W]")
+        amplitude = checked(amplitude, self.config)
         n = len(amplitude)
         x = amplitude.flatten(1, 2)
         lit = amplitude
         if self.config.grid == "half-band":
             lit = F.avg_pool2d(x, 2).unflatten(1, (count, 3))
             x = F.pixel_unshuffle(x, 2)
-        if self.config.pupil_inputs:
-            constant = ((pupil_mm - 3) / 2)[:, None, None, None].expand(-1, 1, *x.shape[2:])
-            x = torch.cat((x, constant), dim=1)
+        x = with_pupil(x, pupil_mm, self.config)
         out = self.layers(x, pupil_mm).to(amplitude.dtype).view(n, count, 4, *x.shape[2:])
         phase = math.pi * out[:, :, :3]
         light = torch.sigmoid(out[:, :, 3:] - math.log(count - 1)) * lit
         planes = torch.complex(light * torch.cos(phase), light * torch.sin(phase))
         kernels = carriers_back(self.config, *x.shape[2:], planes.dtype, str(planes.device))
         return torch.fft.ifft2((torch.fft.fft2(planes) * kernels).sum(dim=1))
+
+
+class FedBackFocalStackNetwork(FieldNetwork):
+    """`expected-stack` with the true images: net 1 (`lighting`) gives phases and masks for their planes, the field
+    takes a learned share of what `feed_back` finds lacking of them, net 2 (`correction`) sees field, change and lack
+    and adds a residual. What is in focus is not known without depth, so no lack weighs more than another."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__(config)
+        self.scale = 2
+        images = 3 * config.planes
+        maps = images * self.scale**2 + config.pupil_inputs
+        self.lighting = Trunk(
+            config,
+            inputs=maps,
+            outputs=LIT * config.planes,
+            layers=config.layers,
+            dilations=config.dilations,
+            adjustable_layers=config.adjustable_layers,
+            last_share=0.15,
+        )
+        self.correction = Trunk(
+            config,
+            inputs=2 * OUTPUT_CHANNELS + maps + images,
+            outputs=OUTPUT_CHANNELS,
+            layers=config.correction_layers,
+            dilations=config.correction_dilations,
+            adjustable_layers=(),
+            last_share=0.1,
+        )
+        self.feedback_share = nn.Parameter(torch.tensor([FEEDBACK_SHARE]))
+
+    def forward(self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor) -> Tensor:
+        """amplitude [N, planes, 3, H, W] from `focal_amplitudes`; depth is not looked at."""
+        optics = self.config.optics
+        images = checked(amplitude, self.config).flatten(1, 2)
+        maps = with_pupil(F.pixel_unshuffle(images, self.scale) - 0.4, pupil_mm, self.config)
+        wanted = F.avg_pool2d(images.square(), self.scale).sqrt().unflatten(1, (-1, 3))
+        distances_m = tuple(optics.distance_m(d) for d in planes_dpt(self.config))
+        out = self.lighting(maps, pupil_mm).to(amplitude.dtype)
+        field = light_planes(out, wanted, optics, distances_m, self.scale)
+        lack, change = feed_back(field, wanted, 1.0, pupil_mm, optics, distances_m, self.scale)
+        field = field + self.feedback_share * change
+        seen = torch.cat((field.real, field.imag, maps, change.real, change.imag, lack.flatten(1, 2)), dim=1)
+        residual = self.correction(seen, pupil_mm).to(amplitude.dtype)
+        return field + CORRECTION_SHARE * torch.complex(residual[:, :3].contiguous(), residual[:, 3:].contiguous())

@@ -84,6 +84,19 @@ NARROW: dict[str, Narrow] = {
         24,
         pupil_mm=1.6,
     ),
+    "expected-stack-narrow-refined": Narrow(
+        NetworkConfig(
+            architecture="expected-stack",
+            layers=4,
+            channels=4,
+            adjustable_layers=(2,),
+            modulation_hidden=8,
+            correction_layers=4,
+            refined_stack=True,
+        ),
+        16,
+        24,
+    ),
 }
 
 

@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.curves import plot_curves
+from holod_training.expected_stack import with_refined_stack
 from holod_training.export import load_weights, save_weights, write_beside
 from holod_training.loss import PERCEPTUAL_PLANES, LossWeights, focus_loss, inner
 from holod_training.lpips import Lpips
@@ -151,7 +152,10 @@ class Run:
             self.validation = open_held_out(Path(config.validation), config.network.optics, config.validation_scenes)
 
     def _initial_weights(self, path: Path) -> dict[str, Tensor]:
-        found, wanted = load_weights(path).state_dict(), self.network.state_dict()
+        source = load_weights(path)
+        found, wanted = source.state_dict(), self.network.state_dict()
+        if self.config.network.refined_stack and not source.config.refined_stack:
+            found = with_refined_stack(found)
         if {k: v.shape for k, v in found.items()} != {k: v.shape for k, v in wanted.items()}:
             raise TrainingError(f"{path}: its network has other layers than this run's; start from the same variant")
         return found

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from holod_training.config import ConfigError, NetworkConfig
 from holod_training.expected_stack import ExpectedStackNetwork
-from holod_training.focal_stack import FocalStackNetwork, focal_amplitudes
+from holod_training.focal_stack import FedBackFocalStackNetwork, FocalStackNetwork, focal_amplitudes
 from holod_training.layered import LayeredNetwork
 from holod_training.network import DirectNetwork, FieldNetwork
 from holod_training.shards import Stack
@@ -29,6 +29,8 @@ _LAYERED = NetworkConfig(
     correction_dilations=(1, 1, 2, 4, 2, 1),
 )
 _HALF_BAND_LAYERED = NetworkConfig(architecture="layered", layers=8, adjustable_layers=(4,))
+_EXPECTED = replace(_HALF_BAND_LAYERED, architecture="expected-stack")
+_EXPECTED_SMALL = replace(_EXPECTED, layers=4, channels=24, adjustable_layers=(2,), correction_layers=6, depth_layers=6)
 
 
 def _direct(layers: int) -> NetworkConfig:
@@ -61,17 +63,12 @@ VARIANTS: dict[str, NetworkConfig] = {
     "layered-4-no-prior": replace(_LAYERED, depth_layers=4, transport_prior=False),
     "layered-8-no-prior": replace(_LAYERED, transport_prior=False),
     "layered-12-no-prior": replace(_LAYERED, depth_layers=12, transport_prior=False),
-    "expected-stack": replace(_HALF_BAND_LAYERED, architecture="expected-stack"),
-    "expected-stack-small": replace(
-        _HALF_BAND_LAYERED,
-        architecture="expected-stack",
-        layers=4,
-        channels=24,
-        adjustable_layers=(2,),
-        correction_layers=6,
-        depth_layers=6,
-    ),
+    "expected-stack": _EXPECTED,
+    "expected-stack-small": _EXPECTED_SMALL,
+    "refined-stack": replace(_EXPECTED, refined_stack=True),
+    "refined-stack-small": replace(_EXPECTED_SMALL, refined_stack=True),
     "focal-stack": replace(_HALF_BAND, architecture="focal-stack"),
+    "focal-stack-feedback": replace(_HALF_BAND_LAYERED, architecture="focal-stack", feedback=True),
     "ablation-three-plain": replace(
         _HALF_BAND, adjustable_layers=(), pupil_inputs=False, specialists_mm=ABLATION_PUPILS_MM
     ),
@@ -99,7 +96,9 @@ def variant(name: str) -> NetworkConfig:
 
 def build_network(config: NetworkConfig) -> FieldNetwork:
     """A network with new weights from torch's generator."""
-    return SpecialistNetwork(config) if config.specialists_mm else _FAMILIES[config.architecture](config)
+    if config.specialists_mm:
+        return SpecialistNetwork(config)
+    return FedBackFocalStackNetwork(config) if config.feedback else _FAMILIES[config.architecture](config)
 
 
 def network_amplitude(config: NetworkConfig, stack: Stack) -> Tensor:

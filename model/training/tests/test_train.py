@@ -145,10 +145,11 @@ def test_a_checkpoint_of_another_network_or_of_another_loss_is_refused(shards: P
         dataclasses.replace(variant("layered-4"), channels=4),
         dataclasses.replace(variant("half-band-layered-small"), channels=4),
         dataclasses.replace(variant("focal-stack"), channels=4, planes=3),
+        dataclasses.replace(variant("focal-stack-feedback"), channels=4, planes=3),
         dataclasses.replace(variant("two-frames"), layers=4, channels=4, adjustable_layers=(1,)),
         dataclasses.replace(variant("ablation-three-plain"), layers=4, channels=4),
     ],
-    ids=lambda network: f"{network.grid}-{network.architecture}",
+    ids=lambda network: f"{network.grid}-{network.architecture}" + "-feedback" * network.feedback,
 )
 @pytest.mark.usefixtures("no_plots")
 def test_other_networks_train_and_come_back_from_their_file(
@@ -196,6 +197,18 @@ def test_a_teacher_is_compared_by_its_pictures(shards: Path, tmp_path: Path) -> 
     assert taught.train_step()["loss_teacher"] > 0
     with pytest.raises(TrainingError, match="its network has other layers"):
         Run(dataclasses.replace(started, initial_weights=str(tmp_path / "larger.safetensors")), CPU)
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_a_run_that_refines_its_stack_starts_from_one_that_did_not(shards: Path, tmp_path: Path) -> None:
+    small = dataclasses.replace(variant("expected-stack-small"), channels=4)
+    weights = train(tiny(shards, tmp_path / "plain", steps=1, network=small), CPU)
+    network = dataclasses.replace(small, refined_stack=True)
+    run = Run(tiny(shards, tmp_path / "refined", network=network, initial_weights=str(weights)), CPU)
+    assert torch.isfinite(torch.tensor(run.train_step()["loss"]))
+    refined = train(tiny(shards, tmp_path / "refined-too", steps=1, network=network), CPU)
+    with pytest.raises(TrainingError, match="its network has other layers"):
+        Run(tiny(shards, tmp_path / "back", network=small, initial_weights=str(refined)), CPU)
 
 
 def test_lpips_joins_the_loss_where_its_files_are_given(shards: Path, tmp_path: Path) -> None:

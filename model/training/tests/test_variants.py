@@ -66,6 +66,8 @@ def test_the_table_is_what_it_says() -> None:
         ("half-band-layered-small-no-prior", 66_097),
         ("expected-stack", 202_732),
         ("expected-stack-small", 81_012),
+        ("refined-stack", 209_668),
+        ("refined-stack-small", 84_918),
     ):
         assert sum(p.numel() for p in build_network(variant(name)).parameters()) == parameters, name
     # Two operations a weight of each 3x3 convolution, the offsets' too; taps and FFTs are a few per cent.
@@ -86,6 +88,9 @@ def test_configs_that_do_not_fit_say_which_key() -> None:
         ({"architecture": "focal-stack", "frames": 2}, "frames: found 2"),
         ({"architecture": "expected-stack", "grid": "full"}, "grid: found 'full', expected 'half-band' for `expected"),
         ({"architecture": "expected-stack", "pupil_inputs": False}, "pupil_inputs: found False, expected true"),
+        ({"architecture": "layered", "refined_stack": True}, "refined_stack: found True, expected false"),
+        ({"architecture": "expected-stack", "feedback": True}, "feedback: found True, expected false"),
+        ({"architecture": "focal-stack", "grid": "full", "feedback": True}, "feedback: .* a half-band `focal-stack`"),
         ({"pupil_range_mm": (1.0, 21.0)}, "pupil_range_mm: found .* expected two above 0 and up to 20 mm"),
         ({"specialists_mm": (3.0, 2.0)}, "specialists_mm: .* rising order"),
     ):

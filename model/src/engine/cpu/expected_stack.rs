@@ -14,11 +14,12 @@ use super::maps::{FIRST_MAP, MAPS, write_maps};
 use super::trunk::Trunk;
 use crate::RgbdFrame;
 use crate::engine::Stage;
-use crate::weights::{Feedback, NetworkConfig, OUTPUT_CHANNELS};
+use crate::weights::{Feedback, LIT, NetworkConfig, OUTPUT_CHANNELS};
 
-/// The first net's outputs for a layer: the phases of three colours and a mask.
-const LIT: usize = 4;
+/// The mask's place among the first net's outputs for a layer.
 const MASK: usize = 3;
+/// Of the first net's changes, in the amplitudes.
+const REFINED_SHARE: f32 = 0.3;
 
 /// Nothing is allocated after `new`.
 pub(super) struct ExpectedStack {
@@ -28,6 +29,7 @@ pub(super) struct ExpectedStack {
     defocus: Defocus,
     layers: DepthLayers,
     feedback: LayerFeedback,
+    refines: bool,
     /// [layers, 3, height, width]: the amplitudes that an eye should see; after the feedback, what is lacking of them.
     stack: Vec<f32>,
     /// The light that one layer sends out in one colour, and the transposed spectrum of that of the layers so far.
@@ -50,6 +52,7 @@ impl ExpectedStack {
             defocus: Defocus::new(config, size),
             layers: DepthLayers::new(config, size),
             feedback: LayerFeedback::new(config, feedback, size),
+            refines: config.refined_stack,
             stack: vec![0.0; 3 * config.depth_layers * size.pixels()],
             light: vec![Complex32::ZERO; size.pixels()],
             sum: vec![Complex32::ZERO; size.pixels()],
@@ -87,15 +90,26 @@ impl ExpectedStack {
         }
     }
 
-    /// Lights every layer with what is expected there through the first net's masks, with its phases, and carries all of
-    /// it to the SLM plane.
+    /// Lights every layer with what is expected there, as far as the first net corrects it, through its masks and with
+    /// its phases, and carries all of it to the SLM plane.
     fn light_layers(&mut self) {
         let Self { size, lighting, layers, stack, light, sum, .. } = self;
         let (width, pixels, stride) = (size.width, size.pixels(), lighting.output.stride);
-        let offset = ((layers.numbers().len() - 1) as f32).ln();
+        let count = layers.numbers().len();
+        if self.refines {
+            for (channel, plane) in stack.chunks_exact_mut(pixels).enumerate() {
+                plane.par_chunks_exact_mut(width).enumerate().for_each(|(y, row)| {
+                    for (x, wanted) in row.iter_mut().enumerate() {
+                        let change = lighting.output.pixel(x, y)[LIT * count + channel];
+                        *wanted = (*wanted + REFINED_SHARE * change).max(0.0);
+                    }
+                });
+            }
+        }
+        let offset = ((count - 1) as f32).ln();
         lighting.output.rows_mut().for_each(|row| {
             for channels in row[stride..][..width * stride].chunks_exact_mut(stride) {
-                for mask in channels[MASK..].iter_mut().step_by(LIT) {
+                for mask in channels[..LIT * count].iter_mut().skip(MASK).step_by(LIT) {
                     *mask = 1.0 / (1.0 + (offset - *mask).exp());
                 }
             }

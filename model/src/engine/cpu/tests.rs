@@ -157,10 +157,11 @@ proptest! {
         height in 1usize..14,
         channels in 1usize..20,
         depth_layers in 2usize..7,
+        refined_stack in any::<bool>(),
         pupil_mm in 1.0f32..5.0,
         seed in 0u32..1000,
     ) {
-        let config = NetworkConfig { channels, depth_layers, ..weights_tests::expected_stack_config() };
+        let config = NetworkConfig { channels, depth_layers, refined_stack, ..weights_tests::expected_stack_config() };
         let weights = random_weights(config, u64::from(seed));
         for set in InstructionSet::available() {
             check_all_stages(&weights, Resolution { width, height }, pupil_mm, seed, set);
