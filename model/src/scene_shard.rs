@@ -335,7 +335,7 @@ impl Entries<'_> {
 mod tests {
     use super::*;
     use crate::scene_renderer::SceneKind;
-    use crate::scene_renderer::shard::{PupilPlan, ShardPlan, file_name};
+    use crate::scene_renderer::shard::{PlanePlan, PupilPlan, ShardPlan, file_name};
 
     const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
     const SIZE: Resolution = Resolution { width: 32, height: 24 };
@@ -348,7 +348,7 @@ mod tests {
             seed: 3,
             resolution: SIZE,
             pupils: PupilPlan::Fixed([1.5, 4.0].map(PupilDiameter::from_mm).to_vec()),
-            planes: 2,
+            planes: PlanePlan::Uniform(2),
             rays: 4,
         };
         plan.write(folder.path(), 5, &crate::scene_renderer::Tracer::cpu()).unwrap();

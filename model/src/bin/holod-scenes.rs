@@ -9,7 +9,7 @@ use std::time::Instant;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::Resolution;
 use holod_model::gpu::GpuError;
-use holod_model::scene_renderer::shard::{Outcome, Preview, PupilPlan, ShardError, ShardPlan};
+use holod_model::scene_renderer::shard::{Outcome, PlanePlan, Preview, PupilPlan, ShardError, ShardPlan};
 use holod_model::scene_renderer::{Scene, SceneKind, Tracer};
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -86,8 +86,8 @@ struct Look {
     /// Pupils in mm, or strata:N for one random pupil in each N-th of 1 to 5 mm.
     #[arg(long, default_value = "strata:4")]
     pupils: PupilPlan,
-    /// Focus planes, uniform in dioptres, both ends included; or `auto`: as many as keep the widest pupil's blur from
-    /// changing by a pixel between neighbours.
+    /// Focus planes, uniform in dioptres, both ends included; `auto`: as many as keep the widest pupil's blur from
+    /// changing by a pixel between neighbours; or strata:N for one at random in each N-th of the depth range.
     #[arg(long, default_value = "6", value_parser = planes)]
     planes: Planes,
     /// Rays for each pixel of each plane and pupil, at least.
@@ -106,8 +106,8 @@ impl Look {
             seed,
             resolution: self.size,
             planes: match self.planes {
-                Planes::Count(count) => count,
-                Planes::Auto => self.pupils.planes(),
+                Planes::Given(planes) => planes,
+                Planes::Auto => PlanePlan::Uniform(self.pupils.planes()),
             },
             pupils: self.pupils.clone(),
             rays: self.rays as usize,
@@ -166,15 +166,19 @@ fn even_size(text: &str) -> Result<Resolution, String> {
 
 #[derive(Clone, Copy)]
 enum Planes {
-    Count(usize),
+    Given(PlanePlan),
     Auto,
 }
 
 fn planes(text: &str) -> Result<Planes, String> {
-    match (text, text.parse()) {
+    let (plan, least, number): (fn(usize) -> PlanePlan, _, _) = match text.strip_prefix("strata:") {
+        Some(parts) => (PlanePlan::Strata, 1, parts),
+        None => (PlanePlan::Uniform, 2, text),
+    };
+    match (text, number.parse()) {
         ("auto", _) => Ok(Planes::Auto),
-        (_, Ok(count @ 2..=256)) => Ok(Planes::Count(count)),
-        _ => Err("expected a number from 2 to 256, or `auto`".to_owned()),
+        (_, Ok(count)) if (least..=256).contains(&count) => Ok(Planes::Given(plan(count))),
+        _ => Err("expected a number from 2 to 256, `auto`, or strata:N with N from 1 to 256".to_owned()),
     }
 }
 
@@ -273,7 +277,7 @@ fn bench(options: &Bench) -> Result<String, Failure> {
         let pupils = plan.pupils.pupils(plan.kind, plan.seed, index);
         for (tracer, (tracing_s, rates)) in tracers.iter().zip(tracing_s.iter_mut().zip(&mut rates)) {
             let begin = Instant::now();
-            let (_, rays) = scene.traced_focal_stacks(tracer, &pupils, &plan.focus(), plan.rays)?;
+            let (_, rays) = scene.traced_focal_stacks(tracer, &pupils, &plan.focus(index), plan.rays)?;
             let seconds = begin.elapsed().as_secs_f64();
             tracing_s.push(seconds);
             rates.push(rays as f64 * 1e-6 / seconds);
@@ -283,7 +287,7 @@ fn bench(options: &Bench) -> Result<String, Failure> {
     let mut report = format!(
         "{scenes} scenes of {}, {} planes; medians\n{:>8.2} s to compose a scene",
         plan.resolution,
-        plan.planes,
+        plan.planes.count(),
         median(&mut composing_s)
     );
     let of_cpu = median(&mut rates[0].clone());
@@ -318,7 +322,7 @@ fn noise(options: &Measure) -> Result<String, Failure> {
     for index in 0..options.scenes {
         let mut scene = Scene::random(plan.kind, plan.seed, index, plan.resolution);
         let pupils = plan.pupils.pupils(plan.kind, plan.seed, index);
-        let measured = scene.noise(&pupils, &plan.focus(), plan.rays);
+        let measured = scene.noise(&pupils, &plan.focus(index), plan.rays);
         sums.resize(measured.len(), (0.0, [(0.0, 0); 3]));
         for ((pupil_mm, sums), noise) in sums.iter_mut().zip(measured) {
             *pupil_mm += noise.pupil.mm() / options.scenes as f32;

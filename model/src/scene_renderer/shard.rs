@@ -89,6 +89,35 @@ impl FromStr for PupilPlan {
     }
 }
 
+/// At which focus planes a scene is rendered.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PlanePlan {
+    /// So many, at least two, uniform in dioptres, both ends of the depth range included.
+    Uniform(usize),
+    /// One at random in each of so many parts of the depth range, equal in dioptres, drawn anew for each scene: what
+    /// learns from them cannot be sharp at some focuses alone.
+    Strata(usize),
+}
+
+impl PlanePlan {
+    /// The number of planes of each scene.
+    pub fn count(self) -> usize {
+        match self {
+            Self::Uniform(count) | Self::Strata(count) => count,
+        }
+    }
+
+    /// The planes of one scene, far to near.
+    pub fn focus(self, kind: SceneKind, seed: u64, index: u64) -> Vec<Dioptres> {
+        let mut random = Random::new(mix(seed ^ 0x706c_616e_6573) ^ kind.stream(), index);
+        let mut position = |plane: usize| match self {
+            Self::Uniform(count) => plane as f64 / (count - 1) as f64,
+            Self::Strata(parts) => (plane as f64 + f64::from(random.unit())) / parts as f64,
+        };
+        (0..self.count()).map(|plane| DisplayGeometry::DEFAULT.depth_at(position(plane))).collect()
+    }
+}
+
 /// What the scenes of one shard folder have in common.
 #[derive(Clone, Debug)]
 pub struct ShardPlan {
@@ -100,8 +129,8 @@ pub struct ShardPlan {
     pub resolution: Resolution,
     /// Pupils of each scene.
     pub pupils: PupilPlan,
-    /// Focus planes, uniform in dioptres, both ends of the depth range included; at least two.
-    pub planes: usize,
+    /// Focus planes of each scene.
+    pub planes: PlanePlan,
     /// Rays for each pixel of each plane and pupil, at least.
     pub rays: usize,
 }
@@ -174,16 +203,15 @@ pub fn file_name(index: u64) -> String {
 }
 
 impl ShardPlan {
-    /// The focus planes.
-    pub fn focus(&self) -> Vec<Dioptres> {
-        let last = (self.planes - 1) as f64;
-        (0..self.planes).map(|plane| DisplayGeometry::DEFAULT.depth_at(plane as f64 / last)).collect()
+    /// The focus planes of scene `index`, far to near.
+    pub fn focus(&self, index: u64) -> Vec<Dioptres> {
+        self.planes.focus(self.kind, self.seed, index)
     }
 
     fn metadata(&self, index: u64) -> HashMap<String, String> {
         let geometry = DisplayGeometry::DEFAULT;
         let pupils_mm: Vec<f32> = self.pupils.pupils(self.kind, self.seed, index).iter().map(|p| p.mm()).collect();
-        let focus_dpt: Vec<f64> = self.focus().iter().map(|f| f.0).collect();
+        let focus_dpt: Vec<f64> = self.focus(index).iter().map(|f| f.0).collect();
         [
             ("format", FORMAT.to_owned()),
             ("generator", GENERATOR.to_string()),
@@ -214,7 +242,7 @@ impl ShardPlan {
         let picture = scene.picture();
         let pupils = self.pupils.pupils(self.kind, self.seed, index);
         let mut stacks = vec![Vec::new(); pupils.len()];
-        let rays_traced = tracer.trace(&scene, &pupils, &self.focus(), self.rays, |pupil, sums, share| {
+        let rays_traced = tracer.trace(&scene, &pupils, &self.focus(index), self.rays, |pupil, sums, share| {
             stacks[pupil] = half_bytes(sums.iter().map(|sum| sum * share));
         })?;
 
@@ -225,7 +253,7 @@ impl ShardPlan {
             ("depth".to_owned(), Dtype::F32, vec![height, width], depth),
         ];
         for (number, stack) in stacks.into_iter().enumerate() {
-            tensors.push((format!("stack_{number}"), Dtype::F16, vec![self.planes, 3, height, width], stack));
+            tensors.push((format!("stack_{number}"), Dtype::F16, vec![self.planes.count(), 3, height, width], stack));
         }
         let unwritable = |reason: String| ShardError::Write { path: path.clone(), reason };
         let views = tensors

@@ -3,7 +3,7 @@ use std::collections::HashSet;
 use proptest::prelude::*;
 
 use super::families::Family;
-use super::shard::{Outcome, Preview, PupilPlan, ShardError, ShardPlan, file_name};
+use super::shard::{Outcome, PlanePlan, Preview, PupilPlan, ShardError, ShardPlan, file_name};
 use super::surface::{Bounds, Mesh, Ray, Shape, Vertex};
 use super::view::{Aim, Grid, View, nearest_first};
 use super::*;
@@ -426,13 +426,35 @@ fn pupil_plans_are_read_and_refused() {
     }
 }
 
+#[test]
+fn strata_of_planes_hold_one_each_and_differ_between_scenes() {
+    let depth = |index| PlanePlan::Strata(6).focus(SceneKind::Train, 1, index);
+    let near_dpt = DisplayGeometry::DEFAULT.depth_near.0;
+    let mut ends = (near_dpt, 0.0f64);
+    for index in 0..200 {
+        let focus = depth(index);
+        assert_eq!(focus.len(), 6);
+        for (part, focus) in focus.iter().enumerate() {
+            let within = 6.0 * focus.0 / near_dpt - part as f64;
+            assert!((0.0..=1.0).contains(&within), "{index} {part}: {focus:?}");
+        }
+        assert_ne!(focus, depth(index + 1));
+        assert_eq!(focus, depth(index));
+        ends = (ends.0.min(focus[0].0), ends.1.max(focus[5].0));
+    }
+    assert!(ends.0 < 0.03 && ends.1 > near_dpt - 0.03, "{ends:?}");
+    assert_ne!(depth(0), PlanePlan::Strata(6).focus(SceneKind::Train, 2, 0));
+    let uniform = PlanePlan::Uniform(3).focus(SceneKind::Train, 1, 0);
+    assert_eq!(uniform, [0.0, 0.5 * near_dpt, near_dpt].map(Dioptres));
+}
+
 fn small_plan() -> ShardPlan {
     ShardPlan {
         kind: SceneKind::Train,
         seed: 11,
         resolution: Resolution { width: 32, height: 24 },
         pupils: PupilPlan::Fixed(vec![mm(1.0), mm(4.0)]),
-        planes: 3,
+        planes: PlanePlan::Uniform(3),
         rays: 4,
     }
 }
@@ -481,7 +503,8 @@ fn writing_again_keeps_whole_shards_mends_cut_ones_and_refuses_others() {
     let others = [
         ShardPlan { seed: 12, ..plan.clone() },
         ShardPlan { rays: 5, ..plan.clone() },
-        ShardPlan { planes: 4, ..plan.clone() },
+        ShardPlan { planes: PlanePlan::Uniform(4), ..plan.clone() },
+        ShardPlan { planes: PlanePlan::Strata(3), ..plan.clone() },
         ShardPlan { resolution: Resolution { width: 24, height: 32 }, ..plan.clone() },
     ];
     for other in others {

@@ -13,7 +13,7 @@ import platform
 import sys
 import time
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -90,14 +90,14 @@ class TrainConfig:
         return self.learning_rate * warm * (self.final_rate_share + (1 - self.final_rate_share) * cosine)
 
 
-@cache
+@lru_cache(maxsize=32)
 def half_band_eye(
     optics: OpticsConfig, height: int, width: int, focus_dpt: tuple[float, ...], device: str
 ) -> HalfBandEye:
     return HalfBandEye(optics, height, width, list(focus_dpt), device)
 
 
-@cache
+@lru_cache(maxsize=32)
 def full_eye(optics: OpticsConfig, height: int, width: int, focus_dpt: tuple[float, ...], device: str) -> Eye:
     return Eye(optics, height, width, list(focus_dpt), device)
 
