@@ -61,7 +61,8 @@ pub struct NetworkConfig {
     /// `layered` and `expected-stack`: 3x3 layers of the net that corrects what arrives at the SLM plane.
     #[serde(default = "default_correction_layers", skip_serializing_if = "is_default_correction_layers")]
     pub correction_layers: usize,
-    /// `expected-stack`: whether the first net also corrects the images that both nets are told.
+    /// `expected-stack`: whether the first net also corrects the expected images before they light the layers and are
+    /// asked for by the feedback. Both nets are told them uncorrected.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub refined_stack: bool,
 }

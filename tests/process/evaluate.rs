@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use holod_calibration::{PupilDiameter, Resolution};
 use holod_model::scene_renderer::SceneKind;
-use holod_model::scene_renderer::shard::{PupilPlan, ShardPlan, file_name};
+use holod_model::scene_renderer::shard::{PlanePlan, PupilPlan, ShardPlan, file_name};
 use holod_tests::daemon::run;
 use serde_json::Value;
 
@@ -124,7 +124,7 @@ fn render(folder: &Path, kind: SceneKind, count: u64) {
         seed: 11,
         resolution: SIZE,
         pupils: PupilPlan::Fixed([2.0, 4.0].map(PupilDiameter::from_mm).to_vec()),
-        planes: 2,
+        planes: PlanePlan::Uniform(2),
         rays: 8,
     };
     for index in 0..count {

@@ -145,8 +145,11 @@ fn open(folder: &Path, limit: Option<usize>, rig: &Rig) -> Result<Vec<SceneShard
                 let focus_dpt: Vec<f64> = shard.focuses().iter().map(|focus| focus.0).collect();
                 format!("{} at {focus_dpt:?} dpt", shard.resolution())
             };
-            let expected =
-                format!("{} as in {}: keep scenes of one kind in a folder", of(first), first.path().display());
+            let expected = format!(
+                "{} as in {}: keep scenes of one kind in a folder, rendered with `--planes N` or `auto`",
+                of(first),
+                first.path().display()
+            );
             return Err(wrong("the stacks' size", of(shard), expected));
         }
         if size.width > panel.width || size.height > panel.height {

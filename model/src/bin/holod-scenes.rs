@@ -87,7 +87,8 @@ struct Look {
     #[arg(long, default_value = "strata:4")]
     pupils: PupilPlan,
     /// Focus planes, uniform in dioptres, both ends included; `auto`: as many as keep the widest pupil's blur from
-    /// changing by a pixel between neighbours; or strata:N for one at random in each N-th of the depth range.
+    /// changing by a pixel between neighbours; or strata:N for one at random in each N-th of the depth range, as
+    /// training wants it.
     #[arg(long, default_value = "6", value_parser = planes)]
     planes: Planes,
     /// Rays for each pixel of each plane and pupil, at least.
@@ -171,15 +172,10 @@ enum Planes {
 }
 
 fn planes(text: &str) -> Result<Planes, String> {
-    let (plan, least, number): (fn(usize) -> PlanePlan, _, _) = match text.strip_prefix("strata:") {
-        Some(parts) => (PlanePlan::Strata, 1, parts),
-        None => (PlanePlan::Uniform, 2, text),
-    };
-    match (text, number.parse()) {
-        ("auto", _) => Ok(Planes::Auto),
-        (_, Ok(count)) if (least..=256).contains(&count) => Ok(Planes::Given(plan(count))),
-        _ => Err("expected a number from 2 to 256, `auto`, or strata:N with N from 1 to 256".to_owned()),
+    if text == "auto" {
+        return Ok(Planes::Auto);
     }
+    text.parse().map(Planes::Given).map_err(|error| format!("{error}, nor `auto`"))
 }
 
 /// Exit codes of sysexits.h.

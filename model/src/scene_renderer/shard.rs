@@ -3,7 +3,7 @@
 //! `scene_000123.safetensors` holds `image` F16 [3, H, W] (linear light, pinhole), `depth` F32 [H, W] (normalised, 0 far,
 //! 1 near) and `stack_0` … `stack_n` F16 [planes, 3, H, W] (linear light, one for each pupil). Its metadata are strings:
 //! `format` = "holod-scene-1", `generator` (see [`GENERATOR`]), `kind`, `seed`, `index`, `pupils_mm` and `focus_dpt` (JSON
-//! lists), `far_dpt`, `near_dpt`, `pixel_angle_rad`, `rays`, and `traced_by`: `cpu` or a device's name.
+//! lists, which other scenes of the folder need not share), `far_dpt`, `near_dpt`, `pixel_angle_rad`, `rays`, and `traced_by`: `cpu` or a device's name.
 //!
 //! While a shard is made, memory holds its stacks as F16 and, once, the F32 sums of one: at 1920x1080 12 MB and 25 MB a
 //! plane. It is written from there, and read for a sheet, without a copy of the whole.
@@ -94,8 +94,8 @@ impl FromStr for PupilPlan {
 pub enum PlanePlan {
     /// So many, at least two, uniform in dioptres, both ends of the depth range included.
     Uniform(usize),
-    /// One at random in each of so many parts of the depth range, equal in dioptres, drawn anew for each scene: what
-    /// learns from them cannot be sharp at some focuses alone.
+    /// One at random in each of so many parts, at least two, of the depth range, equal in dioptres, drawn anew for each
+    /// scene: so a network cannot learn to be sharp at a few focuses only.
     Strata(usize),
 }
 
@@ -115,6 +115,21 @@ impl PlanePlan {
             Self::Strata(parts) => (plane as f64 + f64::from(random.unit())) / parts as f64,
         };
         (0..self.count()).map(|plane| DisplayGeometry::DEFAULT.depth_at(position(plane))).collect()
+    }
+}
+
+impl FromStr for PlanePlan {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (plan, number): (fn(usize) -> Self, _) = match text.strip_prefix("strata:") {
+            Some(parts) => (Self::Strata, parts),
+            None => (Self::Uniform, text),
+        };
+        match number.parse() {
+            Ok(count @ 2..=256) => Ok(plan(count)),
+            _ => Err(format!("`{text}` is neither a number from 2 to 256 nor strata:N of such a number")),
+        }
     }
 }
 

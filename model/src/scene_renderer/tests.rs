@@ -428,22 +428,28 @@ fn pupil_plans_are_read_and_refused() {
 
 #[test]
 fn strata_of_planes_hold_one_each_and_differ_between_scenes() {
-    let depth = |index| PlanePlan::Strata(6).focus(SceneKind::Train, 1, index);
+    let of_scene = |index| PlanePlan::Strata(6).focus(SceneKind::Train, 1, index);
     let near_dpt = DisplayGeometry::DEFAULT.depth_near.0;
     let mut ends = (near_dpt, 0.0f64);
     for index in 0..200 {
-        let focus = depth(index);
+        let focus = of_scene(index);
         assert_eq!(focus.len(), 6);
         for (part, focus) in focus.iter().enumerate() {
             let within = 6.0 * focus.0 / near_dpt - part as f64;
             assert!((0.0..=1.0).contains(&within), "{index} {part}: {focus:?}");
         }
-        assert_ne!(focus, depth(index + 1));
-        assert_eq!(focus, depth(index));
+        assert_ne!(focus, of_scene(index + 1));
+        assert_eq!(focus, of_scene(index));
         ends = (ends.0.min(focus[0].0), ends.1.max(focus[5].0));
     }
     assert!(ends.0 < 0.03 && ends.1 > near_dpt - 0.03, "{ends:?}");
-    assert_ne!(depth(0), PlanePlan::Strata(6).focus(SceneKind::Train, 2, 0));
+    assert_ne!(of_scene(0), PlanePlan::Strata(6).focus(SceneKind::Train, 2, 0));
+    for (text, plan) in [("6", PlanePlan::Uniform(6)), ("strata:6", PlanePlan::Strata(6))] {
+        assert_eq!(text.parse(), Ok(plan));
+    }
+    for wrong in ["", "1", "257", "-3", "strata:", "strata:1", "strata:257", "strata:auto", "auto"] {
+        assert!(wrong.parse::<PlanePlan>().unwrap_err().contains(wrong), "{wrong}");
+    }
     let uniform = PlanePlan::Uniform(3).focus(SceneKind::Train, 1, 0);
     assert_eq!(uniform, [0.0, 0.5 * near_dpt, near_dpt].map(Dioptres));
 }
@@ -483,6 +489,25 @@ fn shards_hold_what_the_trainer_reads() {
     let picture = Scene::random(SceneKind::Train, 11, 7, small_plan().resolution).picture();
     assert_eq!(preview.depth, picture.depth);
     assert!(preview.image.iter().zip(&picture.image).all(|(a, b)| (a - b).abs() < 1e-3));
+}
+
+#[test]
+fn shards_of_random_planes_say_which_and_are_known_again() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let plan = ShardPlan { planes: PlanePlan::Strata(3), ..small_plan() };
+    assert!(matches!(plan.write(folder.path(), 7, &Tracer::cpu()), Ok(Outcome::Written { .. })));
+    assert!(matches!(plan.write(folder.path(), 7, &Tracer::cpu()), Ok(Outcome::Present)));
+    let bytes = std::fs::read(folder.path().join(file_name(7))).expect("the shard");
+    let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).expect("metadata");
+    let told: Vec<f64> =
+        serde_json::from_str(&header.metadata().as_ref().expect("strings")["focus_dpt"]).expect("a list");
+    let focuses = |index| plan.focus(index).iter().map(|focus| focus.0).collect::<Vec<_>>();
+    assert_eq!(told, focuses(7));
+    assert_ne!(told, focuses(0));
+    let preview = Preview::read(&folder.path().join(file_name(7))).expect("a preview");
+    let scene = Scene::random(SceneKind::Train, 11, 7, plan.resolution);
+    let traced = scene.focal_stacks(&[mm(1.0), mm(4.0)], &plan.focus(7), plan.rays).swap_remove(1);
+    assert!(preview.focused_far.iter().zip(&traced).all(|(a, b)| (a - b).abs() < 1e-3), "another focus");
 }
 
 #[test]

@@ -65,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     _training_options(training)
     training.add_argument("--steps", type=int, required=True)
     training.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
-    training.add_argument("--initial-weights", help="start from a weights file instead of random numbers")
+    training.add_argument("--initial-weights", help="start from a weights file of the same variant")
     training.add_argument("--stop-below-slope", type=float, default=TrainConfig("", "", 0).stop_below_slope)
     _network_options(training)
     training.set_defaults(run=_train)
@@ -182,7 +182,9 @@ def _network_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--correction-layers", type=int)
     sub.add_argument("--correction-dilations", type=_list_of(int), metavar="D,D,..")
     sub.add_argument("--transport-prior", action=argparse.BooleanOptionalAction)
+    sub.add_argument("--refined-stack", action=argparse.BooleanOptionalAction)
     sub.add_argument("--planes", type=int)
+    sub.add_argument("--feedback", action=argparse.BooleanOptionalAction)
 
 
 def _network(options: argparse.Namespace) -> NetworkConfig:

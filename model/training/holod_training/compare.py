@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from holod_training.config import ConfigError, OpticsConfig
+from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
 from holod_training.costs import operations_per_pixel
 from holod_training.curves import read_rows
 from holod_training.export import load_weights, write_beside
@@ -101,6 +101,7 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
     if not seconds > 0:
         raise ConfigError(f"minutes: found {seconds / 60}, expected more than 0")
     networks = {name: variant(name) for name in names}
+    key_defaults = json.loads(json.dumps(dataclasses.asdict(NetworkConfig())))
     out = Path(base.out)
     rows = []
     for name, network in networks.items():
@@ -109,6 +110,8 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
         terms = {"minutes": seconds / 60, **json.loads(json.dumps(dataclasses.asdict(config)))}
         if known.is_file():
             kept = json.loads(known.read_text())["terms"]
+            # A row may be from before a key of networks was there.
+            kept["network"] = {**key_defaults, **kept["network"]}
             other = [key for key in terms if kept.get(key) != terms[key]]
             if other:
                 raise ConfigError(

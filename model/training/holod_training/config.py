@@ -95,10 +95,11 @@ class NetworkConfig:
     specialists_mm: tuple[float, ...] = _optional(())
     depth_layers: int = _optional(8)
     transport_prior: bool = _optional(True)
-    # The second net of `layered`, `expected-stack` and a fed back `focal-stack`; dilations as above.
+    # The second net of `layered`, `expected-stack` and a fed-back `focal-stack`; dilations as above.
     correction_layers: int = _optional(10)
     correction_dilations: tuple[int, ...] = _optional(())
-    # Whether the first net also corrects the images that it is told (`expected-stack` only).
+    # Whether the first net also corrects the expected images before they light the layers and are asked for by the
+    # feedback (`expected-stack` only).
     refined_stack: bool = _optional(False)
     planes: int = _optional(6)
     # Whether what the field lacks of the images is fed back and a second net corrects it (`focal-stack` only).

@@ -81,9 +81,9 @@ def with_refined_stack(state: dict[str, Tensor]) -> dict[str, Tensor]:
 class ExpectedStackNetwork(FieldNetwork):
     """Both nets are told `expected_stack` at the `depth_layers`. Net 1 (`lighting`) gives each layer a mask of 0 to 1,
     which starts at one over their number, and a phase for each colour: what is expected there, through the mask, lights
-    the layer, and all of it is carried to the SLM plane. With `refined_stack` it corrects what is expected before that,
-    for it can tell what a blur in which nothing hides anything cannot: what lies before what. The field takes a learned
-    share of what `feed_back` finds lacking, of which what is in focus weighs more by a learned factor; net 2
+    the layer, and all of it is carried to the SLM plane. With `refined_stack` it first corrects these images for
+    the light and for the feedback: unlike a blur without occlusion, it can tell what lies before what. The field takes
+    a learned share of what `feed_back` finds lacking, of which what is in focus weighs more by a learned factor; net 2
     (`correction`) sees the field, the change and the lack, and adds a residual.
     """
 

@@ -13,7 +13,7 @@ from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
 from holod_training.network import CORRECTION_SHARE, OUTPUT_CHANNELS, FieldNetwork, Trunk
 from holod_training.optics import frequencies, transfer
 from holod_training.plane_light import FEEDBACK_SHARE, LIT, feed_back, light_planes
-from holod_training.shards import Stack
+from holod_training.shards import Stack, same_focuses
 
 
 def planes_dpt(config: NetworkConfig) -> list[float]:
@@ -25,7 +25,7 @@ def focal_amplitudes(config: NetworkConfig, stack: Stack) -> Tensor:
     """The focal images' amplitudes [planes, 3, H, W]. Raises ConfigError where a stack has other focuses."""
     expected = planes_dpt(config)
     found = stack.focus_dpt
-    if len(found) != len(expected) or max(abs(f - e) for f, e in zip(found, expected, strict=True)) > 1e-3:
+    if not same_focuses(found, expected):
         raise ConfigError(
             f"planes: found focal images at {', '.join(f'{f:.3f}' for f in found)} dpt, "
             f"the network takes {', '.join(f'{e:.3f}' for e in expected)}; render such scenes or change `planes`"
@@ -72,7 +72,7 @@ class FocalStackNetwork(FieldNetwork):
         self.layers = Trunk(
             config,
             inputs=spatial + config.pupil_inputs,
-            outputs=4 * config.planes,
+            outputs=LIT * config.planes,
             layers=config.layers,
             dilations=config.dilations,
             adjustable_layers=config.adjustable_layers,

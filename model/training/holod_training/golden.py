@@ -25,6 +25,7 @@ from holod_training.optics import (
     propagate_padded,
     upsample_half_band,
 )
+from holod_training.plane_light import LIT
 from holod_training.variants import build_network
 
 GOLDEN_FORMAT = "holod-golden-1"
@@ -112,6 +113,9 @@ def narrow_network(config: NetworkConfig, seed: int) -> FieldNetwork:
                     layer.offset.get_parameter("bias").uniform_(-1.5, 1.5)
                     layer.modulation.get_parameter("2.bias").uniform_(-0.3, 0.3)
             trunk[-1].get_parameter("weight").mul_(6)
+        if config.refined_stack:
+            # Some amplitudes would fall below 0.
+            network.get_parameter(f"lighting.{config.layers - 1}.bias")[LIT * config.depth_layers :].uniform_(-2.5, 0.5)
     return network
 
 

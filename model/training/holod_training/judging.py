@@ -151,7 +151,7 @@ def open_alike(folder: Path, optics: OpticsConfig, limit: int | None = None) -> 
             if found != expected:
                 raise ShardError(
                     f"{shard.path}: {what} is {found}, but {expected} in {first.path.name}; "
-                    "evaluate scenes that are alike, each kind in its own folder"
+                    "evaluate scenes that are alike, each kind in its own folder, rendered with `--planes N` or `auto`"
                 )
     if list(first.pupils_mm) != sorted(set(first.pupils_mm)):
         raise ShardError(f"{first.path}: pupils_mm is {first.pupils_mm}, expected rising values, each once")

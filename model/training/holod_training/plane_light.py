@@ -13,7 +13,7 @@ from holod_training.optics import frequencies, intensity, pupil_mask, transfer
 
 # What a net gives for each plane: the phases of three colours and a mask.
 LIT = 4
-# Of what would give what is lacking, at first, in the field.
+# The share of what is fed back that a field takes before training.
 FEEDBACK_SHARE = 0.5
 # Keeps the phase of what is dark defined.
 DARK = 1e-6
@@ -39,8 +39,8 @@ def light_planes(
     out: Tensor, wanted: Tensor, optics: OpticsConfig, distances_m: tuple[float, ...], scale: int
 ) -> Tensor:
     """The field at the SLM plane, complex [N, 3, h, w], when amplitudes `wanted` [N, planes, 3, h, w] light planes at
-    `distances_m` with the phases over π and through the masks' logits of `out` [N, LIT · planes, h, w]. Untrained masks
-    share the light evenly."""
+    `distances_m`. `out` [N, LIT · planes, h, w] holds for each plane three phases over π and a mask's logit; masks of
+    logit 0 share the light evenly."""
     count = len(distances_m)
     phase, mask = out.unflatten(1, (count, LIT)).split((3, 1), dim=2)
     phase = math.pi * phase

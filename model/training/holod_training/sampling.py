@@ -11,7 +11,7 @@ from torch import Tensor
 
 from holod_training.config import OpticsConfig
 from holod_training.depth_faults import faulty_depth
-from holod_training.shards import Shard, ShardError, Stack, shard_names
+from holod_training.shards import Shard, ShardError, Stack, same_focuses, shard_names
 
 FAULTS_STREAM = 1
 
@@ -81,7 +81,9 @@ class Sampler:
         rank: int,
         augment_config: AugmentConfig,
         specialists_mm: tuple[float, ...] = (),
+        focus_dpt: tuple[float, ...] = (),
     ) -> None:
+        """Where `focus_dpt` is given, shards with other focuses are refused."""
         self.folder = folder
         self.optics = optics
         self.crop = crop
@@ -89,6 +91,7 @@ class Sampler:
         self.rank = rank
         self.augment_config = augment_config
         self.specialists_mm = specialists_mm
+        self.focus_dpt = focus_dpt
         self.shards: list[Shard] = []
 
     @property
@@ -107,6 +110,11 @@ class Sampler:
         shard.require_optics(self.optics)
         if min(shard.height, shard.width) < self.crop:
             raise ShardError(f"{shard.path}: {shard.width}x{shard.height} pixels, smaller than the crop {self.crop}")
+        if self.focus_dpt and not same_focuses(shard.focus_dpt, self.focus_dpt):
+            raise ShardError(
+                f"{shard.path}: focus_dpt is {shard.focus_dpt}, expected those that a focal-stack network takes, "
+                f"{self.focus_dpt}; render such scenes with `holod-scenes generate --planes {len(self.focus_dpt)}`"
+            )
         return shard
 
     def rescan(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,11 @@ TRAINING_KIND = "train"
 
 class ShardError(ValueError):
     """A shard that cannot be used; the message names the file, what was found and what to do."""
+
+
+def same_focuses(found: Sequence[float], expected: Sequence[float]) -> bool:
+    """Whether two lists of focuses are one within a thousandth of a dioptre."""
+    return len(found) == len(expected) and all(abs(f - e) <= 1e-3 for f, e in zip(found, expected, strict=True))
 
 
 @dataclass(frozen=True)

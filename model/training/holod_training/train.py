@@ -28,6 +28,7 @@ from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.curves import plot_curves
 from holod_training.expected_stack import with_refined_stack
 from holod_training.export import load_weights, save_weights, write_beside
+from holod_training.focal_stack import planes_dpt
 from holod_training.loss import PERCEPTUAL_PLANES, LossWeights, focus_loss, inner
 from holod_training.lpips import Lpips
 from holod_training.metrics import Judgement, judge, psnr_db
@@ -90,14 +91,15 @@ class TrainConfig:
         return self.learning_rate * warm * (self.final_rate_share + (1 - self.final_rate_share) * cosine)
 
 
-@lru_cache(maxsize=32)
+# Scenes may each have their own focuses: only the eyes of scenes that have the same are worth keeping.
+@lru_cache(maxsize=8)
 def half_band_eye(
     optics: OpticsConfig, height: int, width: int, focus_dpt: tuple[float, ...], device: str
 ) -> HalfBandEye:
     return HalfBandEye(optics, height, width, list(focus_dpt), device)
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=8)
 def full_eye(optics: OpticsConfig, height: int, width: int, focus_dpt: tuple[float, ...], device: str) -> Eye:
     return Eye(optics, height, width, list(focus_dpt), device)
 
@@ -146,18 +148,28 @@ class Run:
             rank,
             config.augment,
             config.network.specialists_mm,
+            self._focal_stack_planes(),
         )
         self.validation: list[Shard] = []
         if config.validation:
             self.validation = open_held_out(Path(config.validation), config.network.optics, config.validation_scenes)
 
+    def _focal_stack_planes(self) -> tuple[float, ...]:
+        """The focuses that a network or teacher takes as its input."""
+        networks = [self.config.network, *([self.teacher.config] if self.teacher else [])]
+        return next((tuple(planes_dpt(n)) for n in networks if n.architecture == "focal-stack"), ())
+
     def _initial_weights(self, path: Path) -> dict[str, Tensor]:
         source = load_weights(path)
         found, wanted = source.state_dict(), self.network.state_dict()
-        if self.config.network.refined_stack and not source.config.refined_stack:
+        plain = source.config.architecture == "expected-stack" and not source.config.refined_stack
+        if self.config.network.refined_stack and plain and not source.config.specialists_mm:
             found = with_refined_stack(found)
         if {k: v.shape for k, v in found.items()} != {k: v.shape for k, v in wanted.items()}:
-            raise TrainingError(f"{path}: its network has other layers than this run's; start from the same variant")
+            raise TrainingError(
+                f"{path}: its network has other layers than this run's; start from the same variant, "
+                "or one that refines its stack from the same without"
+            )
         return found
 
     def _teacher(self, path: Path) -> FieldNetwork:

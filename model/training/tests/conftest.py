@@ -21,19 +21,22 @@ def write_shard(
     pupils_mm: tuple[float, ...] = (1.0, 2.0, 3.0),
     planes: int = 3,
     metadata: dict[str, str] | None = None,
+    places: tuple[float, ...] | None = None,
 ) -> Path:
-    """A flat picture with a brighter square that fades with |focus - depth|: enough for a loss to fall."""
+    """A flat picture with a brighter square that fades with |focus - depth|: enough for a loss to fall. `places`, where
+    given, are the focuses in place of uniform `planes`, 0 far .. 1 near."""
     optics = OpticsConfig()
     height, width = size if isinstance(size, tuple) else (size, size)
     generator = torch.Generator().manual_seed(seed)
     image = torch.rand(3, height, width, generator=generator) * 0.2 + 0.3
     image[:, height // 4 : height // 2, width // 4 : width // 2] += 0.4
     depth = torch.linspace(0, 1, width).expand(height, width).contiguous()
-    focus = [optics.dioptres(k / (planes - 1)) for k in range(planes)]
+    places = places or tuple(k / (planes - 1) for k in range(planes))
+    focus = [optics.dioptres(place) for place in places]
     tensors = {"image": image.half(), "depth": depth}
     for index, pupil in enumerate(pupils_mm):
         mean = image.mean(dim=(1, 2), keepdim=True)
-        share = torch.stack([(depth - k / (planes - 1)).abs() for k in range(planes)])[:, None] * pupil / 5
+        share = torch.stack([(depth - place).abs() for place in places])[:, None] * pupil / 5
         tensors[f"stack_{index}"] = (image * (1 - share) + mean * share).half()
     values = {
         "format": "holod-scene-1",

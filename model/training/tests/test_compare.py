@@ -46,6 +46,13 @@ def test_variants_compete_for_the_same_time(shards: Path, tmp_path: Path, capsys
     assert main([*command[:-5], "half-band-8,half-band-blur-input", *command[-4:]]) == 0
     again = json.loads((out / "comparison.json").read_text())["rows"]
     assert again[0] == small and again[1]["variant"] == "half-band-blur-input"
+    # So does a row from before a network had some of its keys.
+    known = out / "half-band-8" / "comparison.json"
+    older = json.loads(known.read_text())
+    for key in ("refined_stack", "feedback"):
+        del older["terms"]["network"][key]
+    known.write_text(json.dumps(older))
+    assert main([*command[:-5], "half-band-8", *command[-4:]]) == 0
     # Rows of other terms never share a table.
     assert main([*command, "--in-focus-weight", "7"]) == 65
     assert "half-band-8/comparison.json: found a row with another loss" in capsys.readouterr().err

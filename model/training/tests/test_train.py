@@ -17,10 +17,11 @@ from holod_training.config import ConfigError, NetworkConfig
 from holod_training.export import WeightsError, load_weights, read_metadata, save_weights
 from holod_training.loss import LossWeights
 from holod_training.network import DirectNetwork
+from holod_training.optics import HalfBandEye
 from holod_training.sampling import AugmentConfig
 from holod_training.shards import ShardError
-from holod_training.train import Run, TrainConfig, TrainingError, train
-from holod_training.variants import variant
+from holod_training.train import Run, TrainConfig, TrainingError, see, train
+from holod_training.variants import build_network, variant
 
 CPU = torch.device("cpu")
 TINY = NetworkConfig(layers=4, channels=8, adjustable_layers=(1,), modulation_hidden=4)
@@ -166,7 +167,7 @@ def test_specialists_reach_the_sampler(shards: Path, tmp_path: Path) -> None:
 
 
 def test_a_focal_stack_network_refuses_scenes_with_other_planes(shards: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"planes: found focal images at 0\.000, 1\.429, 2\.857 dpt"):
+    with pytest.raises(ShardError, match=r"scene_000000.*focus_dpt is .*1\.42.* expected those .*--planes 6"):
         train(tiny(shards, tmp_path / "run", network=variant("focal-stack")), CPU)
 
 
@@ -205,10 +206,38 @@ def test_a_run_that_refines_its_stack_starts_from_one_that_did_not(shards: Path,
     weights = train(tiny(shards, tmp_path / "plain", steps=1, network=small), CPU)
     network = dataclasses.replace(small, refined_stack=True)
     run = Run(tiny(shards, tmp_path / "refined", network=network, initial_weights=str(weights)), CPU)
-    assert torch.isfinite(torch.tensor(run.train_step()["loss"]))
+    scene = torch.rand(1, 3, 32, 32), torch.rand(1, 32, 32), torch.tensor([3.0])
+    with torch.no_grad():
+        torch.testing.assert_close(run.network(*scene), load_weights(weights)(*scene), rtol=1e-5, atol=1e-6)
+    before = run.network.lighting[-1].weight[-1].clone()
+    run.train_step()
+    assert not torch.equal(run.network.lighting[-1].weight[-1], before)
+    layered = tmp_path / "layered.safetensors"
+    save_weights(layered, build_network(dataclasses.replace(variant("half-band-layered"), channels=4)), {}, {})
+    with pytest.raises(TrainingError, match="its network has other layers"):
+        Run(tiny(shards, tmp_path / "other", network=network, initial_weights=str(layered)), CPU)
     refined = train(tiny(shards, tmp_path / "refined-too", steps=1, network=network), CPU)
     with pytest.raises(TrainingError, match="its network has other layers"):
         Run(tiny(shards, tmp_path / "back", network=small, initial_weights=str(refined)), CPU)
+
+
+def test_scenes_may_each_have_their_own_focuses_but_not_for_a_focal_stack(tmp_path: Path) -> None:
+    places = [(0.1, 0.5, 0.8), (0.2, 0.6, 1.0)]
+    for index, of in enumerate(places):
+        write_shard(tmp_path / "s" / f"scene_{index:06d}.safetensors", seed=1, places=of)
+    run = Run(tiny(tmp_path / "s", tmp_path / "run", batch=4), CPU)
+    run.sampler.rescan()
+    stacks = run.sampler.draw(0, 4)
+    assert len({s.focus_dpt for s in stacks}) == 2
+    field = torch.polar(torch.rand(3, 24, 24), torch.rand(3, 24, 24))
+    for stack in stacks:
+        found = see(TINY, field, stack, 3.0)
+        eye = HalfBandEye(TINY.optics, 48, 48, list(stack.focus_dpt), "cpu")
+        torch.testing.assert_close(found, eye.look(field, 3.0))
+    assert torch.isfinite(torch.tensor(run.train_step()["loss"]))
+    network = dataclasses.replace(variant("focal-stack-feedback"), channels=4, planes=3)
+    with pytest.raises(ShardError, match=r"scene_000000.*focus_dpt is .* expected those .*--planes 3"):
+        Run(tiny(tmp_path / "s", tmp_path / "focal", network=network), CPU).sampler.rescan()
 
 
 def test_lpips_joins_the_loss_where_its_files_are_given(shards: Path, tmp_path: Path) -> None:

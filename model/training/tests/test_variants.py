@@ -68,6 +68,7 @@ def test_the_table_is_what_it_says() -> None:
         ("expected-stack-small", 81_012),
         ("refined-stack", 209_668),
         ("refined-stack-small", 84_918),
+        ("focal-stack-feedback", 214_819),
     ):
         assert sum(p.numel() for p in build_network(variant(name)).parameters()) == parameters, name
     # Two operations a weight of each 3x3 convolution, the offsets' too; taps and FFTs are a few per cent.
@@ -338,6 +339,32 @@ def test_a_focal_stack_of_one_open_plane_is_its_image_carried_back(grid: str) ->
         spectrum[:, 8] = 0
         spectrum[:, :, 8] = 0
         torch.testing.assert_close(field, torch.fft.ifft2(spectrum), rtol=1e-4, atol=1e-4)
+
+
+def test_a_fed_back_focal_stack_of_one_open_plane_lacks_nothing_there() -> None:
+    config = dataclasses.replace(variant("focal-stack-feedback"), planes=3)
+    network = build_network(config)
+    amplitude = torch.full((1, 3, 3, 32, 32), 0.5)
+    amplitude[:, 1] = torch.nn.functional.interpolate(
+        0.4 + 0.3 * torch.rand(1, 3, 4, 4), size=(32, 32), mode="bilinear"
+    )
+    with torch.no_grad():
+        network.lighting[-1].weight.zero_()
+        network.lighting[-1].bias.copy_(torch.tensor([0.0, 0, 0, -90, 0, 0, 0, 90, 0, 0, 0, -90]))
+        seen: list[torch.Tensor] = []
+        network.correction.register_forward_hook(lambda _, inputs, out: seen.extend((inputs[0], out)))
+        field = network(amplitude, torch.rand(1, 32, 32), torch.tensor([5.0]))[0]
+    told, residual = seen
+    lack = told[0, -9:].unflatten(0, (3, 3))
+    assert lack[1].abs().max() < 1e-3 < 0.01 < lack[0].abs().mean()
+    wanted = torch.nn.functional.avg_pool2d(amplitude[0, 1].square(), 2).sqrt()
+    optics = dataclasses.replace(config.optics, pixel_pitch_um=16.0)
+    back = propagate(wanted.to(torch.complex64), optics, -optics.distance_m(optics.dioptres(0.5)))
+    change = torch.complex(*told[0, -15:-9].split(3))
+    assert change.abs().mean() > 1e-3
+    before = torch.complex(*told[0, :6].split(3))
+    torch.testing.assert_close(before, back + 0.5 * change, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(field, before + 0.3 * torch.complex(*residual[0].split(3)), rtol=1e-5, atol=1e-5)
 
 
 def test_focal_stacks_focused_elsewhere_are_refused() -> None:

@@ -14,7 +14,7 @@ use super::maps::{FIRST_MAP, MAPS, write_maps};
 use super::trunk::Trunk;
 use crate::RgbdFrame;
 use crate::engine::Stage;
-use crate::weights::{Feedback, LIT, NetworkConfig, OUTPUT_CHANNELS};
+use crate::weights::{Feedback, LIT, NetworkConfig, OUTPUT_CHANNELS, REFINED};
 
 /// The mask's place among the first net's outputs for a layer.
 const MASK: usize = 3;
@@ -30,7 +30,8 @@ pub(super) struct ExpectedStack {
     layers: DepthLayers,
     feedback: LayerFeedback,
     refines: bool,
-    /// [layers, 3, height, width]: the amplitudes that an eye should see; after the feedback, what is lacking of them.
+    /// [layers, 3, height, width]: the amplitudes that an eye should see, once the layers are lit as the first net
+    /// corrects them; after the feedback, what is lacking of them.
     stack: Vec<f32>,
     /// The light that one layer sends out in one colour, and the transposed spectrum of that of the layers so far.
     light: Vec<Complex32>,
@@ -93,19 +94,9 @@ impl ExpectedStack {
     /// Lights every layer with what is expected there, as far as the first net corrects it, through its masks and with
     /// its phases, and carries all of it to the SLM plane.
     fn light_layers(&mut self) {
-        let Self { size, lighting, layers, stack, light, sum, .. } = self;
+        let Self { size, lighting, layers, stack, light, sum, refines, .. } = self;
         let (width, pixels, stride) = (size.width, size.pixels(), lighting.output.stride);
-        let count = layers.numbers().len();
-        if self.refines {
-            for (channel, plane) in stack.chunks_exact_mut(pixels).enumerate() {
-                plane.par_chunks_exact_mut(width).enumerate().for_each(|(y, row)| {
-                    for (x, wanted) in row.iter_mut().enumerate() {
-                        let change = lighting.output.pixel(x, y)[LIT * count + channel];
-                        *wanted = (*wanted + REFINED_SHARE * change).max(0.0);
-                    }
-                });
-            }
-        }
+        let (count, refines) = (layers.numbers().len(), *refines);
         let offset = ((count - 1) as f32).ln();
         lighting.output.rows_mut().for_each(|row| {
             for channels in row[stride..][..width * stride].chunks_exact_mut(stride) {
@@ -116,12 +107,17 @@ impl ExpectedStack {
         });
         for colour in Colour::ALL {
             sum.fill(Complex32::ZERO);
-            for (layer, wanted) in stack.chunks_exact(3 * pixels).enumerate() {
-                let wanted = wanted[colour.index() * pixels..][..pixels].par_chunks_exact(width);
+            for (layer, wanted) in stack.chunks_exact_mut(3 * pixels).enumerate() {
+                let wanted = wanted[colour.index() * pixels..][..pixels].par_chunks_exact_mut(width);
+                let change = LIT * count + REFINED * layer + colour.index();
                 light.par_chunks_exact_mut(width).zip(wanted).enumerate().for_each(|(y, (light, wanted))| {
                     for (x, (light, wanted)) in light.iter_mut().zip(wanted).enumerate() {
-                        let out = &lighting.output.pixel(x, y)[LIT * layer..][..LIT];
-                        *light = Complex32::from_polar(out[MASK] * wanted, PI * out[colour.index()]);
+                        let outputs = lighting.output.pixel(x, y);
+                        if refines {
+                            *wanted = (*wanted + REFINED_SHARE * outputs[change]).max(0.0);
+                        }
+                        let out = &outputs[LIT * layer..][..LIT];
+                        *light = Complex32::from_polar(out[MASK] * *wanted, PI * out[colour.index()]);
                     }
                 });
                 layers.add_light(colour, light, sum);

@@ -188,8 +188,10 @@ fn one_pixel_one_column_and_one_row_match_the_reference() {
     let direct = random_weights(config(Grid::HalfBand, 6, 12, vec![3, 4]), 5);
     let layered = random_weights(weights_tests::layered_config(), 5);
     let expected_stack = random_weights(weights_tests::expected_stack_config(), 5);
+    let refined_stack =
+        random_weights(NetworkConfig { refined_stack: true, ..weights_tests::expected_stack_config() }, 5);
     for (width, height) in [(1, 1), (1, 33), (57, 1), (2, 2), (101, 5)] {
-        for weights in [&direct, &layered, &expected_stack] {
+        for weights in [&direct, &layered, &expected_stack, &refined_stack] {
             for set in InstructionSet::available() {
                 check_all_stages(weights, Resolution { width, height }, 3.3, 9, set);
             }
