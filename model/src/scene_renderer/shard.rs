@@ -3,7 +3,8 @@
 //! `scene_000123.safetensors` holds `image` F16 [3, H, W] (linear light, pinhole), `depth` F32 [H, W] (normalised, 0 far,
 //! 1 near) and `stack_0` … `stack_n` F16 [planes, 3, H, W] (linear light, one for each pupil). Its metadata are strings:
 //! `format` = "holod-scene-1", `generator` (see [`GENERATOR`]), `kind`, `seed`, `index`, `pupils_mm` and `focus_dpt` (JSON
-//! lists, which other scenes of the folder need not share), `far_dpt`, `near_dpt`, `pixel_angle_rad`, `rays`, and `traced_by`: `cpu` or a device's name.
+//! lists, which other scenes of the folder need not share), `far_dpt`, `near_dpt`, `pixel_angle_rad`, `rays`, and
+//! `traced_by`: `cpu` or a device's name.
 //!
 //! While a shard is made, memory holds its stacks as F16 and, once, the F32 sums of one: at 1920x1080 12 MB and 25 MB a
 //! plane. It is written from there, and read for a sheet, without a copy of the whole.
