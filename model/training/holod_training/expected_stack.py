@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.layered import encode, layer_centres_m, layer_numbers
-from holod_training.network import CORRECTION_SHARE, OUTPUT_CHANNELS, FieldNetwork, Trunk, run_traced
+from holod_training.network import OUTPUT_CHANNELS, FieldNetwork, corrected, first_net, run_traced, second_net
 from holod_training.optics import frequencies
 from holod_training.plane_light import FEEDBACK_SHARE, LIT, feed_back, light_planes
 
@@ -92,24 +92,8 @@ class ExpectedStackNetwork(FieldNetwork):
         self.scale = 2
         stack = 3 * config.depth_layers
         maps = 5 * self.scale**2 + 1 + stack
-        self.lighting = Trunk(
-            config,
-            inputs=maps,
-            outputs=(LIT + REFINED * config.refined_stack) * config.depth_layers,
-            layers=config.layers,
-            dilations=config.dilations,
-            adjustable_layers=config.adjustable_layers,
-            last_share=0.15,
-        )
-        self.correction = Trunk(
-            config,
-            inputs=2 * OUTPUT_CHANNELS + maps + stack,
-            outputs=OUTPUT_CHANNELS,
-            layers=config.correction_layers,
-            dilations=config.correction_dilations,
-            adjustable_layers=(),
-            last_share=0.1,
-        )
+        self.lighting = first_net(config, maps, (LIT + REFINED * config.refined_stack) * config.depth_layers)
+        self.correction = second_net(config, 2 * OUTPUT_CHANNELS + maps + stack)
         self.feedback_share = nn.Parameter(torch.tensor([FEEDBACK_SHARE]))
         self.sharpness = nn.Parameter(torch.tensor([SHARPNESS]))
 
@@ -135,4 +119,4 @@ class ExpectedStackNetwork(FieldNetwork):
         field = field + self.feedback_share * change
         seen = torch.cat((field.real, field.imag, maps, change.real, change.imag, lack.flatten(1, 2)), dim=1)
         residual = run_traced("correction", self.correction, seen, pupil_mm, trace)
-        return field + CORRECTION_SHARE * torch.complex(residual[:, :3].contiguous(), residual[:, 3:].contiguous())
+        return corrected(field, residual)

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
-from holod_training.network import CORRECTION_SHARE, OUTPUT_CHANNELS, FieldNetwork, Trunk
+from holod_training.network import OUTPUT_CHANNELS, FieldNetwork, Trunk, corrected, first_net, second_net
 from holod_training.optics import frequencies, transfer
 from holod_training.plane_light import FEEDBACK_SHARE, LIT, feed_back, light_planes
 from holod_training.shards import Stack, same_focuses
@@ -108,24 +108,8 @@ class FedBackFocalStackNetwork(FieldNetwork):
         self.scale = 2
         images = 3 * config.planes
         maps = images * self.scale**2 + config.pupil_inputs
-        self.lighting = Trunk(
-            config,
-            inputs=maps,
-            outputs=LIT * config.planes,
-            layers=config.layers,
-            dilations=config.dilations,
-            adjustable_layers=config.adjustable_layers,
-            last_share=0.15,
-        )
-        self.correction = Trunk(
-            config,
-            inputs=2 * OUTPUT_CHANNELS + maps + images,
-            outputs=OUTPUT_CHANNELS,
-            layers=config.correction_layers,
-            dilations=config.correction_dilations,
-            adjustable_layers=(),
-            last_share=0.1,
-        )
+        self.lighting = first_net(config, maps, LIT * config.planes)
+        self.correction = second_net(config, 2 * OUTPUT_CHANNELS + maps + images)
         self.feedback_share = nn.Parameter(torch.tensor([FEEDBACK_SHARE]))
 
     def forward(self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor) -> Tensor:
@@ -141,4 +125,4 @@ class FedBackFocalStackNetwork(FieldNetwork):
         field = field + self.feedback_share * change
         seen = torch.cat((field.real, field.imag, maps, change.real, change.imag, lack.flatten(1, 2)), dim=1)
         residual = self.correction(seen, pupil_mm).to(amplitude.dtype)
-        return field + CORRECTION_SHARE * torch.complex(residual[:, :3].contiguous(), residual[:, 3:].contiguous())
+        return corrected(field, residual)

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from holod_training.config import NetworkConfig, OpticsConfig
-from holod_training.network import CORRECTION_SHARE, OUTPUT_CHANNELS, FieldNetwork, Trunk, run_traced
+from holod_training.network import OUTPUT_CHANNELS, FieldNetwork, corrected, first_net, run_traced, second_net
 from holod_training.optics import frequencies, stop_half_band, transfer
 
 LOG_FLOOR = 0.03
@@ -111,24 +111,8 @@ class LayeredNetwork(FieldNetwork):
         self.scale = 2 if config.grid == "half-band" else 1
         maps = 5 * self.scale**2 + 1
         prior, blurs = 3 * config.transport_prior, len(SIGMAS_PX)
-        self.surface = Trunk(
-            config,
-            inputs=maps + prior,
-            outputs=3 * (2 + blurs * (1 + config.transport_prior)),
-            layers=config.layers,
-            dilations=config.dilations,
-            adjustable_layers=config.adjustable_layers,
-            last_share=0.15,
-        )
-        self.correction = Trunk(
-            config,
-            inputs=OUTPUT_CHANNELS + maps,
-            outputs=OUTPUT_CHANNELS,
-            layers=config.correction_layers,
-            dilations=config.correction_dilations,
-            adjustable_layers=(),
-            last_share=0.1,
-        )
+        self.surface = first_net(config, maps + prior, 3 * (2 + blurs * (1 + config.transport_prior)))
+        self.correction = second_net(config, OUTPUT_CHANNELS + maps)
 
     def forward(
         self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor, trace: dict[str, Tensor] | None = None
@@ -147,7 +131,7 @@ class LayeredNetwork(FieldNetwork):
             trace |= {"source": source, "carried": field}
         seen = torch.cat((field.real, field.imag, maps), dim=1)
         residual = run_traced("correction", self.correction, seen, pupil_mm, trace)
-        field = field + CORRECTION_SHARE * torch.complex(residual[:, :3].contiguous(), residual[:, 3:].contiguous())
+        field = corrected(field, residual)
         return field if self.scale == 2 else stop_half_band(field)
 
     @property

@@ -1,4 +1,5 @@
-"""The training loss: the paper's terms, plain and in-focus squared errors, focus errors, and a teacher's pictures."""
+"""The training loss: the paper's terms, squared errors plain, in focus and of what stays sharp out of it, focus errors,
+and a teacher's pictures."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ class LossWeights:
     `in_focus` is for a pupil of 2 mm: what is in focus is a share of a stack that falls as 1/s, so `for_pupil` lets its
     weight grow in proportion, or by another power, `in_focus_growth`: with 2 wide pupils lose less of their sharpness.
     `absolute` and `gradient` are the paper's: |P − R| and |∇P − ∇R| weighted by W; so is a perceptual error of some
-    planes: `lpips` where a run has its weights, `structure` needs none. `teacher` counts only where there is one.
+    planes: `lpips` where a run has its weights, `structure` needs none. `outlines` is |∇P − ∇R|² where the scene is out
+    of focus: what stands there of a mark is small in every other term. `teacher` counts only where there is one.
     """
 
     absolute: float = 1.0
@@ -34,6 +36,7 @@ class LossWeights:
     in_focus: float = 0.0
     in_focus_growth: float = 1.0
     focus_absolute: float = 0.0
+    outlines: float = 0.0
     structure: float = 0.0
     lpips: float = 1.0
     teacher: float = 8.0
@@ -128,6 +131,9 @@ def focus_loss(
         "focus": centred_error.square().mean(),
         "in_focus": (in_focus_weight(coc_px)[:, None] * squared_error).mean(),
     }
+    if weights.outlines:
+        blurred = 1 - in_focus_weight(coc_px)[:, None]
+        terms["outlines"] = (blurred[..., 1:] * dx.square()).mean() + (blurred[..., 1:, :] * dy.square()).mean()
     if weights.focus_absolute:
         terms["focus_absolute"] = centred_error.abs().mean()
     chosen = slice(None) if perceptual_planes is None else perceptual_planes

@@ -223,6 +223,38 @@ def run_traced(name: str, trunk: Trunk, x: Tensor, pupil_mm: Tensor, trace: dict
     return out.to(x.dtype)
 
 
+def first_net(config: NetworkConfig, inputs: int, outputs: int) -> Trunk:
+    """Of a network with two: what it gives is carried by physics to the SLM plane."""
+    return Trunk(
+        config,
+        inputs=inputs,
+        outputs=outputs,
+        layers=config.layers,
+        dilations=config.dilations,
+        adjustable_layers=config.adjustable_layers,
+        last_share=0.15,
+    )
+
+
+def second_net(config: NetworkConfig, inputs: int) -> Trunk:
+    """Of a network with two: it sees the field at the SLM plane and gives the residual for `corrected`."""
+    return Trunk(
+        config,
+        inputs=inputs,
+        outputs=OUTPUT_CHANNELS,
+        layers=config.correction_layers,
+        dilations=config.correction_dilations,
+        adjustable_layers=(),
+        last_share=0.1,
+    )
+
+
+def corrected(field: Tensor, residual: Tensor) -> Tensor:
+    """A field [N, 3, h, w] and its `second_net`'s residual [N, OUTPUT_CHANNELS, h, w]."""
+    real, imaginary = residual.split(3, dim=1)
+    return field + CORRECTION_SHARE * torch.complex(real.contiguous(), imaginary.contiguous())
+
+
 class FieldNetwork(nn.Module):
     """What all variants are: (amplitude, depth, pupil_mm) to complex fields on the grid of `config`.
 

@@ -5,7 +5,7 @@ import torch
 
 from holod_training.loss import LossWeights, focus_loss, in_focus_weight, inner, sharpness_weight, structure_loss
 
-TERMS = ("absolute", "gradient", "squared", "focus", "in_focus", "focus_absolute", "structure", "teacher")
+TERMS = ("absolute", "gradient", "squared", "focus", "in_focus", "outlines", "focus_absolute", "structure", "teacher")
 NONE = {name: 0.0 for name in TERMS}
 
 
@@ -49,6 +49,24 @@ def test_every_term_is_logged_and_the_total_is_their_weighted_sum() -> None:
     assert set(parts.terms) == set(TERMS)
     assert parts.total.item() == pytest.approx(sum(getattr(weights, k) * v for k, v in parts.terms.items()))
     assert "teacher" not in focus_loss(stack(2), stack(1), COC, weights).terms
+
+
+def test_outlines_are_edges_out_of_focus() -> None:
+    weights = LossWeights(**{**NONE, "outlines": 1.0})
+    target = torch.full((2, 3, 12, 12), 0.5, dtype=torch.float64)
+    coc = torch.zeros(2, 12, 12, dtype=torch.float64)
+    coc[1] = 20
+    edge = torch.zeros(12, 12, dtype=torch.float64)
+    edge[:, 6:] = 0.2
+
+    def outlines(plane: int, error: torch.Tensor) -> float:
+        picture = target.clone()
+        picture[plane] += error
+        return focus_loss(picture, target, coc, weights).total.item()
+
+    assert outlines(0, edge) == pytest.approx(0, abs=1e-12)
+    assert outlines(1, torch.full_like(edge, 0.2)) == pytest.approx(0, abs=1e-12)
+    assert outlines(1, edge) == pytest.approx(0.2**2 / 22, rel=1e-3)
 
 
 def test_structure_looks_at_the_chosen_planes_only() -> None:
