@@ -368,7 +368,7 @@ def _train(config: TrainConfig, device: torch.device, resume: bool, rank: int, w
         run.load_state(torch.load(checkpoint, map_location=device, weights_only=True))
     elif checkpoint.exists():
         raise TrainingError(f"{out}: holds a run already; go on with --resume or choose another --out")
-    log = RunLog(out, config, resume) if rank == 0 else None
+    log = RunLog(out, config, run.step) if rank == 0 else None
     weights = out / "weights.safetensors"
     progress = tqdm(
         total=config.steps,
@@ -423,14 +423,16 @@ def _stop_if_flat(run: Run, measured: dict[str, dict[str, float]]) -> None:
 
 
 class RunLog:
-    """config.json and metrics.jsonl of a run folder."""
+    """config.json and metrics.jsonl of a run folder. A run that goes on from a step writes anew what came after it."""
 
-    def __init__(self, out: Path, config: TrainConfig, resume: bool) -> None:
+    def __init__(self, out: Path, config: TrainConfig, step: int) -> None:
         out.mkdir(parents=True, exist_ok=True)
         write_beside(out / "config.json", json.dumps(dataclasses.asdict(config), indent=1).encode())
         self.path = out / "metrics.jsonl"
-        if not resume:
-            self.path.unlink(missing_ok=True)
+        rows = self.path.read_text().splitlines(keepends=True) if step and self.path.exists() else []
+        # A run that was killed may have left half a row.
+        kept = [row for row in rows if row.endswith("\n") and json.loads(row)["step"] <= step]
+        write_beside(self.path, "".join(kept).encode())
 
     def write(self, kind: str, run: Run, values: dict[str, Any]) -> None:
         row = {"kind": kind, "step": run.step, "seconds": round(run.seconds, 1), **values}

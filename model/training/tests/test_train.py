@@ -76,9 +76,15 @@ def test_the_full_grid_trains_too(shards: Path, tmp_path: Path) -> None:
     assert read_metadata(train(config, CPU))["config"].grid == "full"
 
 
+def rows_of(run: Path) -> list[dict[str, object]]:
+    """metrics.jsonl without the time that each row took."""
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
+
+
 @pytest.mark.usefixtures("no_plots")
 def test_resume_is_bit_exact(shards: Path, tmp_path: Path) -> None:
-    random = {"augment": AugmentConfig(faulty_depth=0.5), "loss": LossWeights(structure=1.0)}
+    random = {"augment": AugmentConfig(faulty_depth=0.5), "loss": LossWeights(structure=1.0), "log_every": 1}
     whole = load_file(train(tiny(shards, tmp_path / "whole", **random), CPU))
 
     class StopError(Exception):
@@ -101,7 +107,11 @@ def test_resume_is_bit_exact(shards: Path, tmp_path: Path) -> None:
     assert state["step"] == 3
     with pytest.raises(TrainingError, match="optimizer: found a checkpoint of 'muon', expected 'adam'"):
         train(tiny(shards, tmp_path / "cut", optimizer="adam", **random), CPU, resume=True)
+    assert [row["step"] for row in rows_of(tmp_path / "cut")] == [1, 2, 3, 4]
+    with (tmp_path / "cut" / "metrics.jsonl").open("a") as file:
+        file.write('{"kind": "tra')
     resumed = load_file(train(tiny(shards, tmp_path / "cut", **random), CPU, resume=True))
+    assert rows_of(tmp_path / "cut") == rows_of(tmp_path / "whole")
     assert resumed.keys() == whole.keys()
     for name, value in whole.items():
         assert torch.equal(value, resumed[name]), name
