@@ -67,6 +67,14 @@ def test_outlines_are_edges_out_of_focus() -> None:
     assert outlines(0, edge) == pytest.approx(0, abs=1e-12)
     assert outlines(1, torch.full_like(edge, 0.2)) == pytest.approx(0, abs=1e-12)
     assert outlines(1, edge) == pytest.approx(0.2**2 / 22, rel=1e-3)
+    assert outlines(1, edge.T) == pytest.approx(0.2**2 / 22, rel=1e-3)
+    # Of a plane that is sharp on its left, and then above, an edge counts where it lies in the blurred rest.
+    coc[1, :, :8] = 0
+    assert outlines(1, edge) == pytest.approx(0, abs=1e-12)
+    assert outlines(1, edge.roll(3, dims=1)) > 0.2**2 / 23
+    coc[1] = coc[1].T.clone()
+    assert outlines(1, edge.T) == pytest.approx(0, abs=1e-12)
+    assert outlines(1, edge.T.roll(3, dims=0)) > 0.2**2 / 23
 
 
 def test_structure_looks_at_the_chosen_planes_only() -> None:
