@@ -16,6 +16,7 @@ mod resident;
 pub mod scene;
 pub mod scene_renderer;
 pub mod scene_shard;
+mod simd;
 pub mod weights;
 
 pub use engine::CpuEngine;

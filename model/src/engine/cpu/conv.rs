@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::simd::{InstructionSet, Simd, Task};
+use crate::simd::{InstructionSet, Simd, Task};
 
 /// Pixels of a tile: the kernel's weights stay in the first-level cache while they serve one tile.
 const TILE_PX: usize = 24;
@@ -52,12 +52,17 @@ pub(super) enum Epilogue {
     ResidualLeaky,
 }
 
-/// A 3x3 convolution's parameters in the order in which the micro-kernel reads them: for each block of output channels
-/// [tap, input channel, channel of the block].
+/// A 3x3 convolution's parameters in the order in which the micro-kernel reads them: for each [`Block`] of output
+/// channels [tap, input channel, channel of the block], or, where it is paired, [tap, pair of input channels, channel of
+/// the block, input channel of the pair].
 pub(super) struct PackedConv {
     in_stride: usize,
     out_stride: usize,
+    /// Channels that are computed with: a map's stride may have more, all zero.
+    inputs: usize,
+    outputs: usize,
     weights: Vec<f32>,
+    /// Where a block's sums start: at the bias, in the first input of every pair.
     bias: Vec<f32>,
     epilogue: Epilogue,
     leaky_slope: f32,
@@ -75,11 +80,15 @@ impl PackedConv {
     ) -> Self {
         let in_stride = in_channels.next_multiple_of(set.lanes());
         let out_stride = out_channels.next_multiple_of(set.lanes());
+        let inputs = in_channels.next_multiple_of(PAIR);
+        let outputs = out_channels.next_multiple_of(set.lanes() / PAIR);
         Self {
             in_stride,
             out_stride,
-            weights: vec![0.0; TAPS * in_stride * out_stride],
-            bias: vec![0.0; out_stride],
+            inputs,
+            outputs,
+            weights: vec![0.0; TAPS * inputs * outputs],
+            bias: vec![0.0; PAIR * outputs],
             epilogue,
             leaky_slope,
             set,
@@ -93,14 +102,15 @@ impl PackedConv {
         bias: impl ExactSizeIterator<Item = f32>,
         weight: impl Fn(usize, usize, usize) -> f32,
     ) {
-        let depth = TAPS * self.in_stride;
         for (output, value) in bias.enumerate() {
-            self.bias[output] = value;
-            let block = block_of(output, self.out_stride, self.set.lanes());
+            let block = Block::of(output, self.outputs, self.set.lanes());
+            let (together, channel) = (block.inputs_together, output - block.first);
+            self.bias[block.first + channel * together] = value;
+            let weights = &mut self.weights[block.first * TAPS * self.inputs..];
             for (tap, input) in (0..TAPS).flat_map(|tap| (0..in_channels).map(move |input| (tap, input))) {
-                let row = tap * self.in_stride + input;
-                self.weights[block.first * depth + row * block.channels + output - block.first] =
-                    weight(output, input, tap);
+                let row = tap * self.inputs + input;
+                let place = (row - row % together) * block.channels + channel * together + row % together;
+                weights[place] = weight(output, input, tap);
             }
         }
     }
@@ -144,15 +154,26 @@ impl PackedConv {
     }
 }
 
-/// Which block an output channel falls in: blocks of two vectors, then, for an odd number of vectors, one of one.
-struct ChannelBlock {
+/// Input channels of a pair.
+const PAIR: usize = 2;
+
+/// Output channels that are computed together: two vectors of them, and of the last ones as many as there are, in half
+/// vectors. An odd number of halves fills whole vectors by pairs of inputs: lanes hold the part of a sum that even input
+/// channels give beside the part that odd ones give.
+struct Block {
     first: usize,
     channels: usize,
+    /// [`PAIR`] or 1.
+    inputs_together: usize,
 }
 
-fn block_of(output: usize, out_stride: usize, lanes: usize) -> ChannelBlock {
-    let first = output - output % (2 * lanes);
-    ChannelBlock { first, channels: (2 * lanes).min(out_stride - first) }
+impl Block {
+    /// The block in which an output channel falls.
+    fn of(output: usize, outputs: usize, lanes: usize) -> Self {
+        let first = output - output % (2 * lanes);
+        let channels = (2 * lanes).min(outputs - first);
+        Self { first, channels, inputs_together: if channels.is_multiple_of(lanes) { 1 } else { PAIR } }
+    }
 }
 
 /// One row of a plain convolution.
@@ -170,12 +191,8 @@ impl Task for PlainRow<'_> {
     fn run<S: Simd>(self, simd: S) {
         let Self { conv, rows, row_len, width, output_row } = self;
         for x in (0..width).step_by(TILE_PX) {
-            let source = Source {
-                values: &rows[x * conv.in_stride..],
-                segments: 3,
-                segment_stride: row_len,
-                pixel_stride: conv.in_stride,
-            };
+            let source =
+                Source { values: &rows[x * conv.in_stride..], row_stride: row_len, pixel_stride: conv.in_stride };
             tile(simd, conv, source, &mut output_row[(x + 1) * conv.out_stride..], (width - x).min(TILE_PX));
         }
         output_row[(width + 1) * conv.out_stride..].fill(0.0);
@@ -208,7 +225,7 @@ impl Task for DeformableRow<'_> {
                     sample(simd, input, tap_x, tap_y, tap);
                 }
             }
-            let source = Source { values: taps, segments: 1, segment_stride: 0, pixel_stride: pixel_len };
+            let source = Source { values: taps, row_stride: 3 * conv.in_stride, pixel_stride: pixel_len };
             tile(simd, conv, source, &mut output_row[(x + 1) * conv.out_stride..], pixels);
         }
         output_row[(input.width + 1) * conv.out_stride..].fill(0.0);
@@ -252,54 +269,56 @@ fn sample<S: Simd>(simd: S, map: &FeatureMap, x: f32, y: f32, channels: &mut [f3
     }
 }
 
-/// Where the kernel's input lies: pixel p's values are `segments` runs of equal length, run i beginning at
-/// p·pixel_stride + i·segment_stride, and together have the order of the packed weights' rows.
+/// Where the kernel's input lies: the channels of tap k of pixel p begin at
+/// p·pixel_stride + (k / 3)·row_stride + (k % 3)·in_stride.
 #[derive(Clone, Copy)]
 struct Source<'a> {
     values: &'a [f32],
-    segments: usize,
-    segment_stride: usize,
+    row_stride: usize,
     pixel_stride: usize,
 }
 
 /// Computes all output channels of the first `pixels` pixels of a tile, and possibly of some after them.
 #[inline(always)]
 fn tile<S: Simd>(simd: S, conv: &PackedConv, source: Source<'_>, output: &mut [f32], pixels: usize) {
-    let depth = TAPS * conv.in_stride;
-    for first in (0..conv.out_stride).step_by(2 * S::LANES) {
-        let block = block_of(first, conv.out_stride, S::LANES);
-        let weights = &conv.weights[first * depth..][..depth * block.channels];
-        let bias = &conv.bias[first..][..block.channels];
-        // Accumulators, weights and one input fit the registers: 16, or 32 with 16 lanes. All counts divide TILE_PX.
-        match (block.channels / S::LANES, S::LANES) {
-            (2, 16) => strip::<S, 2, 12>(simd, conv, source, weights, bias, &mut output[first..], pixels),
-            (2, _) => strip::<S, 2, 6>(simd, conv, source, weights, bias, &mut output[first..], pixels),
-            (_, 16) => strip::<S, 1, 24>(simd, conv, source, weights, bias, &mut output[first..], pixels),
-            (_, _) => strip::<S, 1, 12>(simd, conv, source, weights, bias, &mut output[first..], pixels),
+    for first in (0..conv.outputs).step_by(2 * S::LANES) {
+        let block = Block::of(first, conv.outputs, S::LANES);
+        let output = &mut output[first..];
+        // Sums, weights and one input fit the registers: 16, or 32 with 16 lanes. All counts divide TILE_PX.
+        match (block.channels * block.inputs_together / S::LANES, block.inputs_together, S::LANES) {
+            (2, 1, 16) => strip::<S, 2, 1, 12>(simd, conv, source, &block, output, pixels),
+            (2, 1, _) => strip::<S, 2, 1, 6>(simd, conv, source, &block, output, pixels),
+            (_, 1, 16) => strip::<S, 1, 1, 24>(simd, conv, source, &block, output, pixels),
+            (_, 1, _) => strip::<S, 1, 1, 12>(simd, conv, source, &block, output, pixels),
+            (3, _, 16) => strip::<S, 3, PAIR, 8>(simd, conv, source, &block, output, pixels),
+            (3, _, _) => strip::<S, 3, PAIR, 4>(simd, conv, source, &block, output, pixels),
+            (_, _, 16) => strip::<S, 1, PAIR, 24>(simd, conv, source, &block, output, pixels),
+            (_, _, _) => strip::<S, 1, PAIR, 12>(simd, conv, source, &block, output, pixels),
         }
     }
 }
 
-/// One block of V vectors of output channels over a tile, P pixels at a time.
+/// One block of V vectors of sums, of I input channels together, over a tile, P pixels at a time.
 #[inline(always)]
-fn strip<S: Simd, const V: usize, const P: usize>(
+fn strip<S: Simd, const V: usize, const I: usize, const P: usize>(
     simd: S,
     conv: &PackedConv,
     source: Source<'_>,
-    weights: &[f32],
-    bias: &[f32],
+    block: &Block,
     output: &mut [f32],
     pixels: usize,
 ) {
+    let weights = &conv.weights[block.first * TAPS * conv.inputs..][..block.channels * TAPS * conv.inputs];
+    let bias = &conv.bias[block.first..][..V * S::LANES];
     for x in (0..pixels).step_by(P) {
         let source = Source { values: &source.values[x * source.pixel_stride..], ..source };
-        micro_kernel::<S, V, P>(simd, conv, source, weights, bias, &mut output[x * conv.out_stride..]);
+        micro_kernel::<S, V, I, P>(simd, conv, source, weights, bias, &mut output[x * conv.out_stride..]);
     }
 }
 
-/// V·LANES output channels of P pixels: the sum over all rows of the packed weights, then the epilogue.
+/// V / I vectors of output channels of P pixels: the sum over all packed weights, then the epilogue.
 #[inline(always)]
-fn micro_kernel<S: Simd, const V: usize, const P: usize>(
+fn micro_kernel<S: Simd, const V: usize, const I: usize, const P: usize>(
     simd: S,
     conv: &PackedConv,
     source: Source<'_>,
@@ -307,28 +326,28 @@ fn micro_kernel<S: Simd, const V: usize, const P: usize>(
     bias: &[f32],
     output: &mut [f32],
 ) {
-    let channels = V * S::LANES;
-    let rows = weights.len() / channels;
-    let segment_len = rows / source.segments;
-    assert!(rows == segment_len * source.segments && weights.len() == rows * channels && bias.len() == channels);
-    let reach = (source.segments - 1) * source.segment_stride + (P - 1) * source.pixel_stride + segment_len;
-    assert!(source.values.len() >= reach && output.len() >= (P - 1) * conv.out_stride + channels);
+    let row = V * S::LANES;
+    assert!(conv.inputs.is_multiple_of(I) && weights.len() * I == TAPS * conv.inputs * row && bias.len() == row);
+    let reach = (P - 1) * source.pixel_stride + 2 * source.row_stride + 2 * conv.in_stride + conv.inputs;
+    let written = (P - 1) * conv.out_stride + V.div_ceil(I) * S::LANES;
+    assert!(source.values.len() >= reach && output.len() >= written);
 
     // Bounds checks in this loop would cost more than its arithmetic.
-    // SAFETY: `load` reads whole vectors below `bias.len()`, `weights.len()` (the rows are walked once, in order) and,
-    // in the output, (P - 1)·out_stride + channels; inputs are read below `reach`. All were asserted above.
+    // SAFETY: `load` reads whole vectors below `bias.len()`, `weights.len()` (its rows are walked once, in order) and,
+    // in the output, `written`; inputs are read below `reach`. All were asserted above.
     unsafe {
         let mut sums: [[S::Vector; V]; P] =
             [std::array::from_fn(|vector| simd.load(bias.as_ptr().add(vector * S::LANES))); P];
         let mut weight_row = weights.as_ptr();
-        for segment in 0..source.segments {
-            let begin = source.values.as_ptr().add(segment * source.segment_stride);
-            for index in 0..segment_len {
+        for tap in 0..TAPS {
+            let begin = source.values.as_ptr().add(tap / 3 * source.row_stride + tap % 3 * conv.in_stride);
+            for index in (0..conv.inputs).step_by(I) {
                 let weights: [S::Vector; V] =
                     std::array::from_fn(|vector| simd.load(weight_row.add(vector * S::LANES)));
-                weight_row = weight_row.add(channels);
+                weight_row = weight_row.add(row);
                 for (pixel, sums) in sums.iter_mut().enumerate() {
-                    let value = simd.splat(*begin.add(pixel * source.pixel_stride + index));
+                    let input = begin.add(pixel * source.pixel_stride + index);
+                    let value = if I == PAIR { simd.splat_pair(input) } else { simd.splat(*input) };
                     for (sum, weight) in sums.iter_mut().zip(weights) {
                         *sum = simd.mul_add(value, weight, *sum);
                     }
@@ -337,7 +356,13 @@ fn micro_kernel<S: Simd, const V: usize, const P: usize>(
         }
         let (half, slope) = (simd.splat(0.5), simd.splat(conv.leaky_slope));
         for (pixel, sums) in sums.into_iter().enumerate() {
-            for (vector, mut sum) in sums.into_iter().enumerate() {
+            for (vector, sums) in sums.chunks(I).enumerate() {
+                let mut sum = match *sums {
+                    [sum] if I == 1 => sum,
+                    [sum] => simd.add_pairs(sum, simd.splat(0.0)),
+                    [first, second, ..] => simd.add_pairs(first, second),
+                    [] => unreachable!("chunks are not empty"),
+                };
                 let place = output.as_mut_ptr().add(pixel * conv.out_stride + vector * S::LANES);
                 if conv.epilogue == Epilogue::ResidualLeaky {
                     sum = simd.mul_add(half, sum, simd.load(place));

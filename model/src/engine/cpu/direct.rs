@@ -5,10 +5,10 @@ use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::blocks::{Blocks, scale_of};
-use super::simd::InstructionSet;
 use super::trunk::Trunk;
 use crate::RgbdFrame;
 use crate::engine::Stage;
+use crate::simd::InstructionSet;
 use crate::weights::{Layer, NetworkConfig};
 
 /// Nothing is allocated after `new`.

@@ -9,11 +9,11 @@ use rayon::prelude::*;
 
 use super::depth_layers::DepthLayers;
 use super::maps::{BLOCK, FIRST_MAP, MAPS, SCALE, write_maps};
-use super::simd::InstructionSet;
 use super::trunk::Trunk;
 use crate::RgbdFrame;
 use crate::engine::Stage;
 use crate::optics::{TransposedFft2d, signed_bin};
+use crate::simd::InstructionSet;
 use crate::weights::{LAYERED_BLURS, Layer, NetworkConfig};
 
 /// Standard deviations of the blurs, panel pixels.

@@ -11,7 +11,6 @@ mod layered;
 mod maps;
 mod network;
 mod peak;
-mod simd;
 #[cfg(test)]
 mod tests;
 mod trunk;
@@ -19,9 +18,9 @@ mod trunk;
 use holod_calibration::{PupilDiameter, Resolution};
 
 use self::network::Network;
-use self::simd::InstructionSet;
 use crate::engine::{EngineError, StageTimings};
 use crate::resident::Resident;
+use crate::simd::InstructionSet;
 use crate::{ComplexHologram, RgbdFrame, Weights};
 
 pub use peak::fma_peak;

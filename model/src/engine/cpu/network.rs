@@ -9,10 +9,10 @@ use super::blocks::scale_of;
 use super::direct::Direct;
 use super::expected_stack::ExpectedStack;
 use super::layered::Layered;
-use super::simd::InstructionSet;
 use super::trunk::Trunk;
 use crate::engine::{Stage, StageTiming, StageTimings};
 use crate::optics::FourierUpsampler;
+use crate::simd::InstructionSet;
 use crate::weights::{Family, Grid, Weights};
 use crate::{ComplexHologram, RgbdFrame};
 

@@ -3,7 +3,7 @@
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
-use super::simd::{InstructionSet, Simd, Task};
+use crate::simd::{InstructionSet, Simd, Task};
 
 /// Independent chains of multiply-adds: enough to hide the latency of two units on every processor in sight.
 const CHAINS: usize = 12;

@@ -6,9 +6,9 @@ use proptest::prelude::*;
 
 use super::conv::FeatureMap;
 use super::network::{Network, Seen};
-use super::simd::InstructionSet;
 use super::*;
 use crate::engine::reference::{self, Value};
+use crate::simd::InstructionSet;
 use crate::weights::tests::{self as weights_tests, random_weights};
 use crate::weights::{Architecture, Grid, NetworkConfig};
 

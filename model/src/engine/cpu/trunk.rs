@@ -1,8 +1,8 @@
 //! A stack of 3x3 layers: convolutions in residual pairs, some of them adjustable, and the maps between them.
 
 use super::conv::{Epilogue, FeatureMap, PackedConv};
-use super::simd::InstructionSet;
 use crate::engine::Stage;
+use crate::simd::InstructionSet;
 use crate::weights::{Adjustable, Dense, Layer, OFFSET_CHANNELS};
 
 /// Nothing is allocated after `new`.

@@ -4,12 +4,17 @@
 //! instructions sound.
 
 /// One instruction set. Everything here is inlined into [`Simd::vectorise`], where the set's features are enabled.
-pub(super) trait Simd: Copy + Send + Sync {
+pub(crate) trait Simd: Copy + Send + Sync {
     /// A vector of `LANES` values.
     type Vector: Copy;
     const LANES: usize;
 
     fn splat(self, value: f32) -> Self::Vector;
+    /// Two values, in turn in all lanes.
+    ///
+    /// # Safety
+    /// `from` points to two readable values.
+    unsafe fn splat_pair(self, from: *const f32) -> Self::Vector;
     /// # Safety
     /// `from` points to `LANES` readable values.
     unsafe fn load(self, from: *const f32) -> Self::Vector;
@@ -20,19 +25,21 @@ pub(super) trait Simd: Copy + Send + Sync {
     fn mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
     fn mul(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
     fn max(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
+    /// The sums of lanes 0 and 1, 2 and 3 and so on of `a`, then those of `b`.
+    fn add_pairs(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
 
     /// Runs `task` with this set's instructions enabled.
     fn vectorise<T: Task>(self, task: T);
 }
 
 /// Work that is compiled once for each instruction set. `run` must be `#[inline(always)]`.
-pub(super) trait Task {
+pub(crate) trait Task {
     fn run<S: Simd>(self, simd: S);
 }
 
 /// The best instruction set of this processor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum InstructionSet {
+pub(crate) enum InstructionSet {
     #[cfg(target_arch = "x86_64")]
     Avx512(Avx512),
     #[cfg(target_arch = "x86_64")]
@@ -45,7 +52,7 @@ pub(super) enum InstructionSet {
 
 impl InstructionSet {
     /// Every set that this processor has, best first; never empty.
-    pub(super) fn available() -> impl Iterator<Item = Self> {
+    pub(crate) fn available() -> impl Iterator<Item = Self> {
         #[cfg(target_arch = "x86_64")]
         let special = [Avx512::detect().map(Self::Avx512), Avx2::detect().map(Self::Avx2)];
         #[cfg(not(target_arch = "x86_64"))]
@@ -57,11 +64,11 @@ impl InstructionSet {
         ])
     }
 
-    pub(super) fn best() -> Self {
+    pub(crate) fn best() -> Self {
         Self::available().next().unwrap_or(Self::Portable(Portable))
     }
 
-    pub(super) fn name(self) -> &'static str {
+    pub(crate) fn name(self) -> &'static str {
         match self {
             #[cfg(target_arch = "x86_64")]
             Self::Avx512(_) => "avx512",
@@ -73,7 +80,7 @@ impl InstructionSet {
         }
     }
 
-    pub(super) fn lanes(self) -> usize {
+    pub(crate) fn lanes(self) -> usize {
         match self {
             #[cfg(target_arch = "x86_64")]
             Self::Avx512(_) => Avx512::LANES,
@@ -85,7 +92,7 @@ impl InstructionSet {
         }
     }
 
-    pub(super) fn run(self, task: impl Task) {
+    pub(crate) fn run(self, task: impl Task) {
         match self {
             #[cfg(target_arch = "x86_64")]
             Self::Avx512(simd) => simd.vectorise(task),
@@ -100,7 +107,7 @@ impl InstructionSet {
 
 /// Lanes in plain Rust; four are what every compiler target has base vectors for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Portable<const N: usize>;
+pub(crate) struct Portable<const N: usize>;
 
 impl<const N: usize> Simd for Portable<N> {
     type Vector = [f32; N];
@@ -109,6 +116,13 @@ impl<const N: usize> Simd for Portable<N> {
     #[inline(always)]
     fn splat(self, value: f32) -> [f32; N] {
         [value; N]
+    }
+
+    #[inline(always)]
+    unsafe fn splat_pair(self, from: *const f32) -> [f32; N] {
+        // SAFETY: the caller promises two readable values.
+        let pair = unsafe { [*from, *from.add(1)] };
+        std::array::from_fn(|lane| pair[lane % 2])
     }
 
     #[inline(always)]
@@ -146,6 +160,14 @@ impl<const N: usize> Simd for Portable<N> {
     }
 
     #[inline(always)]
+    fn add_pairs(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
+        std::array::from_fn(|lane| {
+            let (pairs, first) = if lane < N / 2 { (a, 2 * lane) } else { (b, 2 * lane - N) };
+            pairs[first] + pairs[first + 1]
+        })
+    }
+
+    #[inline(always)]
     fn vectorise<T: Task>(self, task: T) {
         task.run(self);
     }
@@ -155,11 +177,12 @@ impl<const N: usize> Simd for Portable<N> {
 macro_rules! x86_instruction_set {
     (
         $(#[$doc:meta])* $name:ident, $lanes:literal, $vector:ident, $features:literal, detect $($feature:tt),+;
-        $set1:ident, $loadu:ident, $storeu:ident, $fmadd:ident, $mul:ident, $max:ident
+        $set1:ident, $loadu:ident, $storeu:ident, $fmadd:ident, $mul:ident, $max:ident;
+        $set1_pair:ident, $cast_pair:ident; add_pairs($a:ident, $b:ident) $add_pairs:expr
     ) => {
         $(#[$doc])*
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-        pub(super) struct $name(());
+        pub(crate) struct $name(());
 
         impl $name {
             fn detect() -> Option<Self> {
@@ -177,6 +200,14 @@ macro_rules! x86_instruction_set {
             #[inline(always)]
             fn splat(self, value: f32) -> Self::Vector {
                 unsafe { std::arch::x86_64::$set1(value) }
+            }
+
+            #[inline(always)]
+            unsafe fn splat_pair(self, from: *const f32) -> Self::Vector {
+                unsafe {
+                    let pair = from.cast::<f64>().read_unaligned();
+                    std::arch::x86_64::$cast_pair(std::arch::x86_64::$set1_pair(pair))
+                }
             }
 
             #[inline(always)]
@@ -204,6 +235,12 @@ macro_rules! x86_instruction_set {
                 unsafe { std::arch::x86_64::$max(a, b) }
             }
 
+            #[inline(always)]
+            fn add_pairs(self, $a: Self::Vector, $b: Self::Vector) -> Self::Vector {
+                use std::arch::x86_64::*;
+                unsafe { $add_pairs }
+            }
+
             fn vectorise<T: Task>(self, task: T) {
                 #[target_feature(enable = $features)]
                 fn with_features<T: Task>(simd: $name, task: T) {
@@ -219,12 +256,21 @@ macro_rules! x86_instruction_set {
 x86_instruction_set! {
     /// AVX2 with fused multiply-add: 16 registers of 8 lanes.
     Avx2, 8, __m256, "avx2,fma", detect "avx2", "fma";
-    _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_mul_ps, _mm256_max_ps
+    _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_mul_ps, _mm256_max_ps;
+    _mm256_set1_pd, _mm256_castpd_ps;
+    add_pairs(a, b) _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(_mm256_castps_pd(_mm256_hadd_ps(a, b))))
 }
 
 #[cfg(target_arch = "x86_64")]
 x86_instruction_set! {
     /// AVX-512: 32 registers of 16 lanes.
     Avx512, 16, __m512, "avx512f", detect "avx512f";
-    _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_mul_ps, _mm512_max_ps
+    _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_mul_ps, _mm512_max_ps;
+    _mm512_set1_pd, _mm512_castpd_ps;
+    add_pairs(a, b) {
+        // Lanes from 16 on are those of `b`.
+        let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+        let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+        _mm512_add_ps(_mm512_permutex2var_ps(a, even, b), _mm512_permutex2var_ps(a, odd, b))
+    }
 }
