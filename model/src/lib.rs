@@ -10,6 +10,7 @@ pub mod files;
 pub mod gpu;
 pub mod metrics;
 pub mod optics;
+mod phase_math;
 mod picture;
 pub mod refocus;
 mod resident;

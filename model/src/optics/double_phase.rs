@@ -7,7 +7,12 @@ use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::{ComplexHologram, PhasePattern};
+use crate::phase_math::{arc_cosine, argument};
 use crate::resident::Resident;
+use crate::simd::{InstructionSet, Simd, Task};
+
+/// Pixels that are encoded together.
+const RUN: usize = 64;
 
 /// Encodes complex holograms as phase patterns (Hsueh and Sawchuk 1978; Maimone et al. 2017).
 ///
@@ -29,6 +34,7 @@ struct Job {
     /// Weights of the 3-tap blur in each direction (side, centre), where there is one.
     blur: Option<[f32; 2]>,
     clipped_in_row: Vec<u32>,
+    set: InstructionSet,
 }
 
 /// What one encoding lost.
@@ -52,6 +58,7 @@ impl DoublePhase {
             amplitude_constant,
             blur: None,
             clipped_in_row: vec![0; 3 * resolution.height],
+            set: InstructionSet::best(),
         };
         let resident = Resident::new("holod-phase", 0, job, Job::encode).expect("threads can be started");
         Self { resident, resolution, amplitude_constant }
@@ -95,7 +102,7 @@ impl DoublePhase {
 
 impl Job {
     fn encode(&mut self) {
-        let Self { hologram: ComplexHologram { resolution, field }, pattern, blur, clipped_in_row, .. } = self;
+        let Self { hologram: ComplexHologram { resolution, field }, pattern, blur, clipped_in_row, set, .. } = self;
         let Resolution { width, height } = *resolution;
         let amplitude_scale = 1.0 / self.amplitude_constant;
         pattern.phase_rad.par_chunks_exact_mut(width).zip(clipped_in_row).enumerate().for_each(
@@ -103,28 +110,57 @@ impl Job {
                 let plane = &field[row / height * width * height..][..width * height];
                 let y = row % height;
                 *clipped = 0;
-                for (x, phase) in phases.iter_mut().enumerate() {
-                    let value = match *blur {
-                        None => plane[y * width + x],
-                        Some(taps) => blurred(plane, *resolution, x, y, taps),
-                    };
-                    let value = value * amplitude_scale;
-                    let amplitude = value.norm();
-                    let inside = amplitude <= 1.0;
-                    *clipped += u32::from(!inside);
-                    let (carrier, spread) = if amplitude.is_finite() {
-                        (value.im.atan2(value.re), amplitude.min(1.0).acos())
-                    } else {
-                        (0.0, FRAC_PI_2)
-                    };
-                    *phase = wrapped(if (x + y) % 2 == 1 { carrier + spread } else { carrier - spread });
+                for (run, phases) in phases.chunks_mut(RUN).enumerate() {
+                    let first = run * RUN;
+                    let mut values = [Complex32::ZERO; RUN];
+                    for (x, value) in (first..).zip(&mut values[..phases.len()]) {
+                        *value = match *blur {
+                            None => plane[y * width + x],
+                            Some(taps) => blurred(plane, *resolution, x, y, taps),
+                        };
+                    }
+                    set.run(EncodeRun { values, amplitude_scale, parity: (first + y) % 2, phases, clipped });
                 }
             },
         );
     }
 }
 
+/// The phases of neighbouring pixels of a row.
+struct EncodeRun<'a> {
+    values: [Complex32; RUN],
+    amplitude_scale: f32,
+    /// (x + y) % 2 of the first of them.
+    parity: usize,
+    phases: &'a mut [f32],
+    /// Grows by those whose amplitude exceeds what can be encoded.
+    clipped: &'a mut u32,
+}
+
+impl Task for EncodeRun<'_> {
+    /// No branch and no call: the compiler makes vectors of it.
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let Self { values, amplitude_scale, parity, phases, clipped } = self;
+        let mut encoded = [0.0; RUN];
+        let mut inside = [0u32; RUN];
+        for (index, ((value, phase), inside)) in values.iter().zip(&mut encoded).zip(&mut inside).enumerate() {
+            let (re, im) = (value.re * amplitude_scale, value.im * amplitude_scale);
+            let amplitude = (re * re + im * im).sqrt();
+            // NaN is neither finite nor inside.
+            let finite = amplitude < f32::INFINITY;
+            *inside = u32::from(amplitude <= 1.0);
+            let carrier = if finite { argument(re, im) } else { 0.0 };
+            let spread = if finite { arc_cosine(amplitude.min(1.0)) } else { FRAC_PI_2 };
+            *phase = wrapped(if (index + parity) % 2 == 1 { carrier + spread } else { carrier - spread });
+        }
+        phases.copy_from_slice(&encoded[..phases.len()]);
+        *clipped += phases.len() as u32 - inside[..phases.len()].iter().sum::<u32>();
+    }
+}
+
 /// `phase` in -2π..2π brought into [0, 2π).
+#[inline(always)]
 fn wrapped(phase: f32) -> f32 {
     let phase = if phase < 0.0 { phase + TAU } else { phase };
     if phase >= TAU { 0.0 } else { phase }

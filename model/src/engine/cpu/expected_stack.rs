@@ -1,8 +1,6 @@
 //! The `expected-stack` family: one net lights every depth layer for what an eye should see there, physics carries that
 //! light to the SLM plane and feeds back what it lacks, a second net corrects it.
 
-use std::f32::consts::PI;
-
 use holod_calibration::{Colour, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
@@ -14,12 +12,16 @@ use super::maps::{FIRST_MAP, MAPS, write_maps};
 use super::trunk::Trunk;
 use crate::RgbdFrame;
 use crate::engine::Stage;
+use crate::phase_math::cos_sin_pi;
+use crate::simd::{InstructionSet, Simd, Task};
 use crate::weights::{Feedback, LIT, NetworkConfig, OUTPUT_CHANNELS, REFINED};
 
 /// The mask's place among the first net's outputs for a layer.
 const MASK: usize = 3;
 /// Of the first net's changes, in the amplitudes.
 const REFINED_SHARE: f32 = 0.3;
+/// Samples that are lit together.
+const RUN: usize = 64;
 
 /// Nothing is allocated after `new`.
 pub(super) struct ExpectedStack {
@@ -30,6 +32,7 @@ pub(super) struct ExpectedStack {
     layers: DepthLayers,
     feedback: LayerFeedback,
     refines: bool,
+    set: InstructionSet,
     /// [layers, 3, height, width]: the amplitudes that an eye should see, once the layers are lit as the first net
     /// corrects them; after the feedback, what is lacking of them.
     stack: Vec<f32>,
@@ -44,6 +47,7 @@ impl ExpectedStack {
         [lighting, correction]: [Trunk; 2],
         feedback: Feedback,
         (width, height): (usize, usize),
+        set: InstructionSet,
     ) -> Self {
         let size = Resolution { width, height };
         Self {
@@ -54,6 +58,7 @@ impl ExpectedStack {
             layers: DepthLayers::new(config, size),
             feedback: LayerFeedback::new(config, feedback, size),
             refines: config.refined_stack,
+            set,
             stack: vec![0.0; 3 * config.depth_layers * size.pixels()],
             light: vec![Complex32::ZERO; size.pixels()],
             sum: vec![Complex32::ZERO; size.pixels()],
@@ -94,7 +99,7 @@ impl ExpectedStack {
     /// Lights every layer with what is expected there, as far as the first net corrects it, through its masks and with
     /// its phases, and carries all of it to the SLM plane.
     fn light_layers(&mut self) {
-        let Self { size, lighting, layers, stack, light, sum, refines, .. } = self;
+        let Self { size, lighting, layers, stack, light, sum, refines, set, .. } = self;
         let (width, pixels, stride) = (size.width, size.pixels(), lighting.output.stride);
         let (count, refines) = (layers.numbers().len(), *refines);
         let offset = ((count - 1) as f32).ln();
@@ -111,13 +116,20 @@ impl ExpectedStack {
                 let wanted = wanted[colour.index() * pixels..][..pixels].par_chunks_exact_mut(width);
                 let change = LIT * count + REFINED * layer + colour.index();
                 light.par_chunks_exact_mut(width).zip(wanted).enumerate().for_each(|(y, (light, wanted))| {
-                    for (x, (light, wanted)) in light.iter_mut().zip(wanted).enumerate() {
-                        let outputs = lighting.output.pixel(x, y);
-                        if refines {
-                            *wanted = (*wanted + REFINED_SHARE * outputs[change]).max(0.0);
+                    let runs = light.chunks_mut(RUN).zip(wanted.chunks_mut(RUN)).enumerate();
+                    for (run, (light, wanted)) in runs {
+                        let (mut amplitudes, mut half_turns) = ([0.0; RUN], [0.0; RUN]);
+                        let sent = amplitudes.iter_mut().zip(&mut half_turns);
+                        for ((x, wanted), (amplitude, half_turns)) in (run * RUN..).zip(wanted).zip(sent) {
+                            let outputs = lighting.output.pixel(x, y);
+                            if refines {
+                                *wanted = (*wanted + REFINED_SHARE * outputs[change]).max(0.0);
+                            }
+                            let out = &outputs[LIT * layer..][..LIT];
+                            *amplitude = out[MASK] * *wanted;
+                            *half_turns = out[colour.index()];
                         }
-                        let out = &outputs[LIT * layer..][..LIT];
-                        *light = Complex32::from_polar(out[MASK] * *wanted, PI * out[colour.index()]);
+                        set.run(Phasors { amplitudes, half_turns, light });
                     }
                 });
                 layers.add_light(colour, light, sum);
@@ -143,6 +155,29 @@ impl ExpectedStack {
     pub(super) fn write_field(&self, colour: Colour, field: &mut [Complex32]) {
         let carried = &self.layers.carried[colour.index() * self.size.pixels()..];
         self.correction.output.correct(carried, colour, field);
+    }
+}
+
+/// amplitude·exp(jπ·half_turns) of neighbouring samples.
+struct Phasors<'a> {
+    amplitudes: [f32; RUN],
+    half_turns: [f32; RUN],
+    light: &'a mut [Complex32],
+}
+
+impl Task for Phasors<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let Self { amplitudes, half_turns, light } = self;
+        let (mut real, mut imaginary) = ([0.0; RUN], [0.0; RUN]);
+        for index in 0..RUN {
+            let (cosine, sine) = cos_sin_pi(half_turns[index]);
+            real[index] = amplitudes[index] * cosine;
+            imaginary[index] = amplitudes[index] * sine;
+        }
+        for ((light, real), imaginary) in light.iter_mut().zip(real).zip(imaginary) {
+            *light = Complex32::new(real, imaginary);
+        }
     }
 }
 

@@ -75,7 +75,7 @@ impl Network {
             }
             Family::ExpectedStack { lighting, correction, feedback } => {
                 let nets = [lighting, correction].map(|layers| Trunk::new(layers, config.leaky_slope, size, set));
-                Predictor::ExpectedStack(Box::new(ExpectedStack::new(config, nets, *feedback, size)))
+                Predictor::ExpectedStack(Box::new(ExpectedStack::new(config, nets, *feedback, size, set)))
             }
         };
         let stages = predictor.stages().into_iter().chain([Stage::plain("field")]);
