@@ -226,9 +226,14 @@ impl Family {
             }
             Architecture::ExpectedStack => {
                 let stack = 3 * config.depth_layers;
-                let outputs = (LIT + usize::from(config.refined_stack) * REFINED) * config.depth_layers;
                 Self::ExpectedStack {
-                    lighting: stack_of("lighting", maps + stack, outputs, config.layers, adjustable)?,
+                    lighting: stack_of(
+                        "lighting",
+                        maps + stack,
+                        config.lighting_channels(),
+                        config.layers,
+                        adjustable,
+                    )?,
                     correction: stack_of(
                         "correction",
                         2 * OUTPUT_CHANNELS + maps + 2 * stack,
@@ -646,6 +651,11 @@ impl NetworkConfig {
             Grid::HalfBand => 4 * 5 + 1,
             Grid::Full => 5 + 1,
         }
+    }
+
+    /// Channels of what the first net of `expected-stack` gives.
+    pub(crate) fn lighting_channels(&self) -> usize {
+        (LIT + usize::from(self.refined_stack) * REFINED) * self.depth_layers
     }
 }
 

@@ -35,6 +35,12 @@ impl FeatureMap {
         self.data[self.row_len..].par_chunks_exact_mut(self.row_len).take(self.height)
     }
 
+    /// One channel of row `y`.
+    pub(super) fn channel(&self, channel: usize, y: usize) -> impl Iterator<Item = &f32> {
+        let begin = (y + 1) * self.row_len + self.stride;
+        self.data[begin..][..self.width * self.stride][channel..].iter().step_by(self.stride)
+    }
+
     /// The channels of one pixel.
     pub(super) fn pixel(&self, x: usize, y: usize) -> &[f32] {
         &self.data[(y + 1) * self.row_len + (x + 1) * self.stride..][..self.stride]

@@ -20,8 +20,6 @@ use crate::weights::{Feedback, LIT, NetworkConfig, OUTPUT_CHANNELS, REFINED};
 const MASK: usize = 3;
 /// Of the first net's changes, in the amplitudes.
 const REFINED_SHARE: f32 = 0.3;
-/// Samples that are lit together.
-const RUN: usize = 64;
 
 /// Nothing is allocated after `new`.
 pub(super) struct ExpectedStack {
@@ -36,6 +34,8 @@ pub(super) struct ExpectedStack {
     /// [layers, 3, height, width]: the amplitudes that an eye should see, once the layers are lit as the first net
     /// corrects them; after the feedback, what is lacking of them.
     stack: Vec<f32>,
+    /// [height, channels, width]: what the first net gives, masks as shares of the light.
+    outputs: Vec<f32>,
     /// The light that one layer sends out in one colour, and the transposed spectrum of that of the layers so far.
     light: Vec<Complex32>,
     sum: Vec<Complex32>,
@@ -60,6 +60,7 @@ impl ExpectedStack {
             refines: config.refined_stack,
             set,
             stack: vec![0.0; 3 * config.depth_layers * size.pixels()],
+            outputs: vec![0.0; config.lighting_channels() * size.pixels()],
             light: vec![Complex32::ZERO; size.pixels()],
             sum: vec![Complex32::ZERO; size.pixels()],
         }
@@ -99,14 +100,15 @@ impl ExpectedStack {
     /// Lights every layer with what is expected there, as far as the first net corrects it, through its masks and with
     /// its phases, and carries all of it to the SLM plane.
     fn light_layers(&mut self) {
-        let Self { size, lighting, layers, stack, light, sum, refines, set, .. } = self;
-        let (width, pixels, stride) = (size.width, size.pixels(), lighting.output.stride);
-        let (count, refines) = (layers.numbers().len(), *refines);
+        let Self { size, lighting, layers, stack, outputs, light, sum, refines, set, .. } = self;
+        let (width, pixels) = (size.width, size.pixels());
+        let (count, channels) = (layers.numbers().len(), outputs.len() / pixels);
         let offset = ((count - 1) as f32).ln();
-        lighting.output.rows_mut().for_each(|row| {
-            for channels in row[stride..][..width * stride].chunks_exact_mut(stride) {
-                for mask in channels[..LIT * count].iter_mut().skip(MASK).step_by(LIT) {
-                    *mask = 1.0 / (1.0 + (offset - *mask).exp());
+        outputs.par_chunks_exact_mut(channels * width).enumerate().for_each(|(y, rows)| {
+            for (channel, row) in rows.chunks_exact_mut(width).enumerate() {
+                row.iter_mut().zip(lighting.output.channel(channel, y)).for_each(|(to, from)| *to = *from);
+                if channel < LIT * count && channel % LIT == MASK {
+                    row.iter_mut().for_each(|mask| *mask = 1.0 / (1.0 + (offset - *mask).exp()));
                 }
             }
         });
@@ -114,23 +116,16 @@ impl ExpectedStack {
             sum.fill(Complex32::ZERO);
             for (layer, wanted) in stack.chunks_exact_mut(3 * pixels).enumerate() {
                 let wanted = wanted[colour.index() * pixels..][..pixels].par_chunks_exact_mut(width);
-                let change = LIT * count + REFINED * layer + colour.index();
-                light.par_chunks_exact_mut(width).zip(wanted).enumerate().for_each(|(y, (light, wanted))| {
-                    let runs = light.chunks_mut(RUN).zip(wanted.chunks_mut(RUN)).enumerate();
-                    for (run, (light, wanted)) in runs {
-                        let (mut amplitudes, mut half_turns) = ([0.0; RUN], [0.0; RUN]);
-                        let sent = amplitudes.iter_mut().zip(&mut half_turns);
-                        for ((x, wanted), (amplitude, half_turns)) in (run * RUN..).zip(wanted).zip(sent) {
-                            let outputs = lighting.output.pixel(x, y);
-                            if refines {
-                                *wanted = (*wanted + REFINED_SHARE * outputs[change]).max(0.0);
-                            }
-                            let out = &outputs[LIT * layer..][..LIT];
-                            *amplitude = out[MASK] * *wanted;
-                            *half_turns = out[colour.index()];
-                        }
-                        set.run(Phasors { amplitudes, half_turns, light });
-                    }
+                let rows = light.par_chunks_exact_mut(width).zip(wanted);
+                rows.zip(outputs.par_chunks_exact(channels * width)).for_each(|((light, wanted), outputs)| {
+                    let output = |channel: usize| &outputs[channel * width..][..width];
+                    set.run(LightRow {
+                        changes: refines.then(|| output(LIT * count + REFINED * layer + colour.index())),
+                        masks: output(LIT * layer + MASK),
+                        half_turns: output(LIT * layer + colour.index()),
+                        wanted,
+                        light,
+                    });
                 });
                 layers.add_light(colour, light, sum);
             }
@@ -158,25 +153,28 @@ impl ExpectedStack {
     }
 }
 
-/// amplitude·exp(jπ·half_turns) of neighbouring samples.
-struct Phasors<'a> {
-    amplitudes: [f32; RUN],
-    half_turns: [f32; RUN],
+/// What a row of one layer sends out in one colour.
+struct LightRow<'a> {
+    /// Of a refined stack: of the amplitudes, before they light the layer.
+    changes: Option<&'a [f32]>,
+    masks: &'a [f32],
+    /// Phases over π.
+    half_turns: &'a [f32],
+    wanted: &'a mut [f32],
     light: &'a mut [Complex32],
 }
 
-impl Task for Phasors<'_> {
+impl Task for LightRow<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
-        let Self { amplitudes, half_turns, light } = self;
-        let (mut real, mut imaginary) = ([0.0; RUN], [0.0; RUN]);
-        for index in 0..RUN {
-            let (cosine, sine) = cos_sin_pi(half_turns[index]);
-            real[index] = amplitudes[index] * cosine;
-            imaginary[index] = amplitudes[index] * sine;
+        let Self { changes, masks, half_turns, wanted, light } = self;
+        for (wanted, change) in wanted.iter_mut().zip(changes.into_iter().flatten()) {
+            *wanted = (*wanted + REFINED_SHARE * change).max(0.0);
         }
-        for ((light, real), imaginary) in light.iter_mut().zip(real).zip(imaginary) {
-            *light = Complex32::new(real, imaginary);
+        for (((light, wanted), mask), half_turns) in light.iter_mut().zip(wanted).zip(masks).zip(half_turns) {
+            let (cosine, sine) = cos_sin_pi(*half_turns);
+            let amplitude = mask * *wanted;
+            *light = Complex32::new(amplitude * cosine, amplitude * sine);
         }
     }
 }
