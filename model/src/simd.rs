@@ -32,12 +32,13 @@ pub(crate) trait Simd: Copy + Send + Sync {
     fn vectorise<T: Task>(self, task: T);
 }
 
-/// Work that is compiled once for each instruction set. `run` must be `#[inline(always)]`.
+/// Work that is compiled once for each instruction set: with its vectors, or in plain Rust of which the compiler makes
+/// vectors. `run` must be `#[inline(always)]`.
 pub(crate) trait Task {
     fn run<S: Simd>(self, simd: S);
 }
 
-/// The best instruction set of this processor.
+/// An instruction set that this processor has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum InstructionSet {
     #[cfg(target_arch = "x86_64")]
@@ -191,7 +192,7 @@ macro_rules! x86_instruction_set {
         }
 
         // SAFETY, for every block below: a value of this type exists only where `detect` found the features, so the
-        // instructions are there; `load` and `store` pass their callers' promises on.
+        // instructions are there; `splat_pair`, `load` and `store` pass their callers' promises on.
         #[allow(clippy::undocumented_unsafe_blocks, reason = "one reason for all, above")]
         impl Simd for $name {
             type Vector = std::arch::x86_64::$vector;
@@ -272,5 +273,42 @@ x86_instruction_set! {
         let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
         let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
         _mm512_add_ps(_mm512_permutex2var_ps(a, even, b), _mm512_permutex2var_ps(a, odd, b))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Writes a vector that `splat_pair` gives, and one that `add_pairs` gives.
+    struct Pairs<'a>(&'a mut Vec<f32>);
+
+    impl Task for Pairs<'_> {
+        #[inline(always)]
+        fn run<S: Simd>(self, simd: S) {
+            let values: Vec<f32> = (0..2 * S::LANES).map(|value| (value * value) as f32).collect();
+            self.0.resize(2 * S::LANES, 0.0);
+            // SAFETY: `values` and the output hold two vectors.
+            unsafe {
+                let (first, second) = (simd.load(values.as_ptr()), simd.load(values.as_ptr().add(S::LANES)));
+                simd.store(self.0.as_mut_ptr(), simd.splat_pair(values.as_ptr().add(3)));
+                simd.store(self.0.as_mut_ptr().add(S::LANES), simd.add_pairs(first, second));
+            }
+        }
+    }
+
+    #[test]
+    fn pairs_go_to_neighbouring_lanes_and_are_added_there_on_every_set() {
+        for set in InstructionSet::available() {
+            let mut found = Vec::new();
+            set.run(Pairs(&mut found));
+            let square = |value: usize| (value * value) as f32;
+            let pair = (0..set.lanes()).map(|lane| square(3 + lane % 2));
+            let sums = (0..set.lanes()).map(|lane| square(2 * lane) + square(2 * lane + 1));
+            let mut expected: Vec<f32> = pair.chain(sums).collect();
+            assert_eq!(found, expected, "{}", set.name());
+            expected.swap(set.lanes(), set.lanes() + 1);
+            assert_ne!(found, expected, "two lanes that changed places are seen");
+        }
     }
 }

@@ -9,6 +9,8 @@ const TILE_PX: usize = 24;
 /// Bands into which the rows of a deformable layer are divided; each has scratch of its own.
 const BANDS: usize = 32;
 const TAPS: usize = 9;
+/// Input channels of a pair.
+const PAIR: usize = 2;
 
 /// A feature map [height, width, channels] with a border of one zero pixel.
 ///
@@ -58,17 +60,19 @@ pub(super) enum Epilogue {
     ResidualLeaky,
 }
 
-/// A 3x3 convolution's parameters in the order in which the micro-kernel reads them: for each [`Block`] of output
-/// channels [tap, input channel, channel of the block], or, where it is paired, [tap, pair of input channels, channel of
-/// the block, input channel of the pair].
+/// A 3x3 convolution's parameters in the order in which the micro-kernel reads them: for each [`ChannelBlock`]
+/// [tap, input channel, channel of the block], or, where it is paired, [tap, pair of input channels, channel of the
+/// block, input channel of the pair].
 pub(super) struct PackedConv {
     in_stride: usize,
     out_stride: usize,
-    /// Channels that are computed with: a map's stride may have more, all zero.
+    /// Input channels, rounded up to whole pairs; a map's stride may have more, all zero.
     inputs: usize,
+    /// Output channels, rounded up to whole half vectors.
     outputs: usize,
     weights: Vec<f32>,
-    /// Where a block's sums start: at the bias, in the first input of every pair.
+    /// What a block's sums begin with, from `block.first` on; a paired one, always the last, takes twice its channels:
+    /// the bias of each, and a zero.
     bias: Vec<f32>,
     epilogue: Epilogue,
     leaky_slope: f32,
@@ -109,7 +113,7 @@ impl PackedConv {
         weight: impl Fn(usize, usize, usize) -> f32,
     ) {
         for (output, value) in bias.enumerate() {
-            let block = Block::of(output, self.outputs, self.set.lanes());
+            let block = ChannelBlock::of(output, self.outputs, self.set.lanes());
             let (together, channel) = (block.inputs_together, output - block.first);
             self.bias[block.first + channel * together] = value;
             let weights = &mut self.weights[block.first * TAPS * self.inputs..];
@@ -160,20 +164,19 @@ impl PackedConv {
     }
 }
 
-/// Input channels of a pair.
-const PAIR: usize = 2;
-
-/// Output channels that are computed together: two vectors of them, and of the last ones as many as there are, in half
-/// vectors. An odd number of halves fills whole vectors by pairs of inputs: lanes hold the part of a sum that even input
-/// channels give beside the part that odd ones give.
-struct Block {
+/// Output channels that are computed together: two vectors of them, or the rest, in half vectors.
+///
+/// An odd number of half vectors would leave lanes idle. There each output channel takes two neighbouring lanes, one for
+/// the sum over even input channels and one for that over odd ones: 24 channels fill three vectors of 16 lanes, each step
+/// takes two inputs, and `add_pairs` joins the two sums at the end. Only a layer's last block is such.
+struct ChannelBlock {
     first: usize,
     channels: usize,
     /// [`PAIR`] or 1.
     inputs_together: usize,
 }
 
-impl Block {
+impl ChannelBlock {
     /// The block in which an output channel falls.
     fn of(output: usize, outputs: usize, lanes: usize) -> Self {
         let first = output - output % (2 * lanes);
@@ -288,7 +291,7 @@ struct Source<'a> {
 #[inline(always)]
 fn tile<S: Simd>(simd: S, conv: &PackedConv, source: Source<'_>, output: &mut [f32], pixels: usize) {
     for first in (0..conv.outputs).step_by(2 * S::LANES) {
-        let block = Block::of(first, conv.outputs, S::LANES);
+        let block = ChannelBlock::of(first, conv.outputs, S::LANES);
         let output = &mut output[first..];
         // Sums, weights and one input fit the registers: 16, or 32 with 16 lanes. All counts divide TILE_PX.
         match (block.channels * block.inputs_together / S::LANES, block.inputs_together, S::LANES) {
@@ -310,7 +313,7 @@ fn strip<S: Simd, const V: usize, const I: usize, const P: usize>(
     simd: S,
     conv: &PackedConv,
     source: Source<'_>,
-    block: &Block,
+    block: &ChannelBlock,
     output: &mut [f32],
     pixels: usize,
 ) {
@@ -322,7 +325,7 @@ fn strip<S: Simd, const V: usize, const I: usize, const P: usize>(
     }
 }
 
-/// V / I vectors of output channels of P pixels: the sum over all packed weights, then the epilogue.
+/// V·LANES / I output channels of P pixels: the sum over all packed weights, then the epilogue.
 #[inline(always)]
 fn micro_kernel<S: Simd, const V: usize, const I: usize, const P: usize>(
     simd: S,
@@ -332,15 +335,18 @@ fn micro_kernel<S: Simd, const V: usize, const I: usize, const P: usize>(
     bias: &[f32],
     output: &mut [f32],
 ) {
-    let row = V * S::LANES;
-    assert!(conv.inputs.is_multiple_of(I) && weights.len() * I == TAPS * conv.inputs * row && bias.len() == row);
+    let row_len = V * S::LANES;
+    assert!(
+        conv.inputs.is_multiple_of(I) && weights.len() * I == TAPS * conv.inputs * row_len && bias.len() == row_len
+    );
     let reach = (P - 1) * source.pixel_stride + 2 * source.row_stride + 2 * conv.in_stride + conv.inputs;
     let written = (P - 1) * conv.out_stride + V.div_ceil(I) * S::LANES;
     assert!(source.values.len() >= reach && output.len() >= written);
 
     // Bounds checks in this loop would cost more than its arithmetic.
-    // SAFETY: `load` reads whole vectors below `bias.len()`, `weights.len()` (its rows are walked once, in order) and,
-    // in the output, `written`; inputs are read below `reach`. All were asserted above.
+    // SAFETY: whole vectors are loaded below `bias.len()` and `weights.len()` (its rows are walked once, in order), and
+    // loaded and stored below `written`. Inputs are read below `reach`: `inputs` is a multiple of I, so that no pair
+    // reaches beyond it. All was asserted above.
     unsafe {
         let mut sums: [[S::Vector; V]; P] =
             [std::array::from_fn(|vector| simd.load(bias.as_ptr().add(vector * S::LANES))); P];
@@ -350,7 +356,7 @@ fn micro_kernel<S: Simd, const V: usize, const I: usize, const P: usize>(
             for index in (0..conv.inputs).step_by(I) {
                 let weights: [S::Vector; V] =
                     std::array::from_fn(|vector| simd.load(weight_row.add(vector * S::LANES)));
-                weight_row = weight_row.add(row);
+                weight_row = weight_row.add(row_len);
                 for (pixel, sums) in sums.iter_mut().enumerate() {
                     let input = begin.add(pixel * source.pixel_stride + index);
                     let value = if I == PAIR { simd.splat_pair(input) } else { simd.splat(*input) };

@@ -34,7 +34,8 @@ pub(super) struct ExpectedStack {
     /// [layers, 3, height, width]: the amplitudes that an eye should see, once the layers are lit as the first net
     /// corrects them; after the feedback, what is lacking of them.
     stack: Vec<f32>,
-    /// [height, channels, width]: what the first net gives, masks as shares of the light.
+    /// [height, channels, width]: what the first net gives, masks as shares of the light; a copy of its map in which a
+    /// channel's row lies together, so that it is read as vectors.
     outputs: Vec<f32>,
     /// The light that one layer sends out in one colour, and the transposed spectrum of that of the layers so far.
     light: Vec<Complex32>,
@@ -155,11 +156,12 @@ impl ExpectedStack {
 
 /// What a row of one layer sends out in one colour.
 struct LightRow<'a> {
-    /// Of a refined stack: of the amplitudes, before they light the layer.
+    /// Where the stack is refined: what the first net adds to the amplitudes, before [`REFINED_SHARE`].
     changes: Option<&'a [f32]>,
     masks: &'a [f32],
     /// Phases over π.
     half_turns: &'a [f32],
+    /// The amplitudes that an eye should see, which are refined here.
     wanted: &'a mut [f32],
     light: &'a mut [Complex32],
 }
@@ -168,8 +170,10 @@ impl Task for LightRow<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
         let Self { changes, masks, half_turns, wanted, light } = self;
-        for (wanted, change) in wanted.iter_mut().zip(changes.into_iter().flatten()) {
-            *wanted = (*wanted + REFINED_SHARE * change).max(0.0);
+        if let Some(changes) = changes {
+            for (wanted, change) in wanted.iter_mut().zip(changes) {
+                *wanted = (*wanted + REFINED_SHARE * change).max(0.0);
+            }
         }
         for (((light, wanted), mask), half_turns) in light.iter_mut().zip(wanted).zip(masks).zip(half_turns) {
             let (cosine, sine) = cos_sin_pi(*half_turns);

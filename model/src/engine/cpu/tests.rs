@@ -53,6 +53,13 @@ fn light_error(actual: &[Complex32], expected: &[Complex64]) -> f64 {
     largest(actual.iter().zip(expected).map(difference)) / largest(expected.iter().map(|value| value.norm()))
 }
 
+/// The error of a map after one value of the expected one was changed.
+fn error_once_spoiled(map: &FeatureMap, expected: &mut reference::Map) -> f64 {
+    let middle = expected.values.len() / 2;
+    expected.values[middle] += 1e-3 * largest(expected.values.iter().copied()).max(1e-6);
+    map_error(map, expected)
+}
+
 /// Runs a network stage by stage against the reference; every comparison must also see one wrong value.
 fn check_all_stages(weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32, set: InstructionSet) {
     let frame = frame(resolution, seed);
@@ -80,10 +87,11 @@ fn check_all_stages(weights: &Weights, resolution: Resolution, pupil_mm: f32, se
         };
         assert!(error < TOLERANCE, "{context}: {}: {error}", stage.name);
         let spoiled = match (network.predictor.after(index), &mut stage.value) {
-            (Seen::Map(map, _), Value::Encoded(expected) | Value::Layer(expected, _)) => {
-                let middle = expected.values.len() / 2;
-                expected.values[middle] += 1e-3 * largest(expected.values.iter().copied()).max(1e-6);
-                map_error(map, expected)
+            (Seen::Map(map, _), Value::Encoded(expected)) => error_once_spoiled(map, expected),
+            (Seen::Map(map, offsets), Value::Layer(expected, expected_offsets)) => {
+                let offsets =
+                    offsets.iter().zip(expected_offsets).map(|(map, expected)| error_once_spoiled(map, expected));
+                offsets.fold(error_once_spoiled(map, expected), f64::min)
             }
             (Seen::Light(light), Value::Light(expected)) => {
                 let middle = expected.len() / 2;
