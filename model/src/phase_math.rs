@@ -3,6 +3,34 @@
 
 use std::f32::consts::{FRAC_PI_2, PI};
 
+/// Highest power first, of the square of a tangent.
+const ARC_TANGENT: [f32; 8] = [
+    0.002_866_226,
+    -0.016_165_737,
+    0.042_909_614,
+    -0.075_289_64,
+    0.106_562_64,
+    -0.142_089,
+    0.199_935_51,
+    -0.333_331_45,
+];
+/// Highest power first, of a cosine.
+const ARC_COSINE: [f32; 8] = [
+    -0.001_262_491_1,
+    0.006_670_09,
+    -0.017_088_126,
+    0.030_891_88,
+    -0.050_174_303,
+    0.088_978_99,
+    -0.214_598_8,
+    FRAC_PI_2,
+];
+
+#[inline(always)]
+fn polynomial<const N: usize>(coefficients: [f32; N], x: f32) -> f32 {
+    coefficients.into_iter().fold(0.0, |sum, coefficient| sum * x + coefficient)
+}
+
 /// arg(re + j·im) in [-π, π], and ±0 of 0. Where both parts are below `f32::MIN_POSITIVE` it may be π/4 off.
 ///
 /// The polynomial is Abramowitz and Stegun's 4.4.49, within 2e-8 of the arc tangent of 0..=1.
@@ -12,15 +40,7 @@ pub(crate) fn argument(re: f32, im: f32) -> f32 {
     let (short, long) = if steep { (re.abs(), im.abs()) } else { (im.abs(), re.abs()) };
     let tangent = short / long.max(f32::MIN_POSITIVE);
     let z = tangent * tangent;
-    let series = 0.002_866_226;
-    let series = series * z - 0.016_165_737;
-    let series = series * z + 0.042_909_614;
-    let series = series * z - 0.075_289_64;
-    let series = series * z + 0.106_562_64;
-    let series = series * z - 0.142_089;
-    let series = series * z + 0.199_935_51;
-    let series = series * z - 0.333_331_45;
-    let angle = tangent + tangent * z * series;
+    let angle = tangent + tangent * z * polynomial(ARC_TANGENT, z);
     let angle = if steep { FRAC_PI_2 - angle } else { angle };
     let angle = if re < 0.0 { PI - angle } else { angle };
     angle.copysign(im)
@@ -32,15 +52,7 @@ pub(crate) fn argument(re: f32, im: f32) -> f32 {
 /// 1.570 796 305, so that darkness gets exactly π/2.
 #[inline(always)]
 pub(crate) fn arc_cosine(a: f32) -> f32 {
-    let series = -0.001_262_491_1;
-    let series = series * a + 0.006_670_09;
-    let series = series * a - 0.017_088_126;
-    let series = series * a + 0.030_891_88;
-    let series = series * a - 0.050_174_303;
-    let series = series * a + 0.088_978_99;
-    let series = series * a - 0.214_598_8;
-    let series = series * a + FRAC_PI_2;
-    (1.0 - a).max(0.0).sqrt() * series
+    (1.0 - a).max(0.0).sqrt() * polynomial(ARC_COSINE, a)
 }
 
 /// (cos, sin) of π·`half_turns`, for |half_turns| < 2²⁰; beyond it they are wrong, and of what is not finite NaN.
