@@ -102,6 +102,11 @@ def _parser() -> argparse.ArgumentParser:
         default=judging.focus_curve_weights,
         help="in-focus weights, such as 0,30,100,300: adds the curve between sharp in focus and soft out of it",
     )
+    evaluate.add_argument(
+        "--judge-between",
+        action="store_true",
+        help="the solver is asked for every second focus, and everything is judged at those between",
+    )
     _lpips_options(evaluate, "adds its column")
     evaluate.add_argument("--timing-calls", type=int, default=judging.timing_calls)
     evaluate.set_defaults(run=_evaluate)
@@ -238,6 +243,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         solver_scenes=options.solver_scenes,
         solver_frames=options.solver_frames,
         focus_curve_weights=options.focus_curve_weights,
+        judge_between=options.judge_between,
         timing_calls=options.timing_calls,
         lpips_backbone=Path(options.lpips_backbone) if options.lpips_backbone else None,
         lpips_linear=Path(options.lpips_linear) if options.lpips_linear else None,

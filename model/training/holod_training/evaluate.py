@@ -50,11 +50,11 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     networks = _load(config, device)
     network = networks[OURS]
     optics = network.config.optics
-    shards = open_alike(config.test, optics, config.limit)
+    shards = open_alike(config.test, optics, config.limit, config.judge_between)
     cards = open_shards(config.cards, optics) if config.cards else []
     pictures = read_pictures(config.rgbd, optics) if config.rgbd else []
     lpips = Lpips.open(config.lpips_backbone, config.lpips_linear, device)
-    bench = Bench(optics, network.config.amplitude_constant, config.border_px, device, lpips)
+    bench = Bench(optics, network.config.amplitude_constant, config.border_px, device, lpips, config.judge_between)
     trained = [network_method(name, one) for name, one in networks.items()]
     learned_and_rivals = [*trained, *rivals(optics)]
     start = next(method for method in learned_and_rivals if method.name == config.solver_start)
@@ -73,7 +73,7 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "scenes": len(shards),
         "size": [shards[0].height, shards[0].width],
-        "focus_dpt": list(shards[0].focus_dpt),
+        "focus_dpt": list(bench.judged(bench.read(shards[0], 0)).focus_dpt),
         "border_px": config.border_px,
         "amplitude_constant": network.config.amplitude_constant,
         "pupils_mm": table_pupils(shards[0].pupils_mm),
@@ -83,6 +83,7 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
             "scenes": min(config.solver_scenes, len(shards)),
             "iterations": config.solver.iterations,
             "loss": dataclasses.asdict(config.solver.loss),
+            "focus_dpt": list(bench.asked(bench.read(shards[0], 0)).focus_dpt),
         },
         **judged.summary(),
     }
@@ -135,7 +136,13 @@ def _solvers(config: EvaluateConfig, start: Method, bench: Bench, scenes: int) -
         return Method(
             name,
             lambda stack, pupil: (
-                optimise(stack, start.field(stack, pupil), bench.optics, bench.amplitude_constant, solver_config).field
+                optimise(
+                    bench.asked(stack),
+                    start.field(stack, pupil),
+                    bench.optics,
+                    bench.amplitude_constant,
+                    solver_config,
+                ).field
             ),
             adapts=True,
             scenes=scenes,

@@ -38,6 +38,8 @@ BEFORE, AFTER = "before", "after"
 NUMBERS = tuple(f.name for f in fields(Judgement))
 KEPT_EYE_ELEMENTS = 2**23
 LEAST_AMPLITUDE_STRIDE = 7
+# Of a stack's focuses where it is judged between what a solver is asked for.
+ASKED, BETWEEN = slice(0, None, 2), slice(1, None, 2)
 MOST_AMPLITUDES = 2**16
 
 
@@ -77,7 +79,8 @@ def rivals(optics: OpticsConfig) -> list[Method]:
 
 
 class Bench:
-    """Looks at fields before and after double phase."""
+    """Looks at fields before and after double phase. With `between`, a solver is asked for every second focus of a
+    stack, from the first to the last, and everything is judged at those between, which nobody knew."""
 
     def __init__(
         self,
@@ -86,17 +89,28 @@ class Bench:
         border_px: int,
         device: torch.device | str = "cpu",
         lpips: Lpips | None = None,
+        between: bool = False,
     ) -> None:
         self.optics = optics
         self.amplitude_constant = amplitude_constant
         self.border_px = border_px
         self.device = device
         self.lpips = lpips
+        self.between = between
         self.eyes: dict[tuple[Any, ...], Eye] = {}
         self.widest_cut_mm = 1e3 * max(optics.wavelengths_m) * optics.focal_length_m / (2 * optics.pitch_m) * 2**0.5
 
     def read(self, shard: Shard, pupil_index: int) -> Stack:
+        """With all focuses."""
         return shard.read(pupil_index).to(self.device)
+
+    def asked(self, stack: Stack) -> Stack:
+        """What a solver may know."""
+        return stack.at(ASKED) if self.between else stack
+
+    def judged(self, stack: Stack) -> Stack:
+        """What pictures are judged by."""
+        return stack.at(BETWEEN) if self.between else stack
 
     def look(self, field: Tensor, pupil_mm: float, focus_dpt: Sequence[float]) -> Tensor:
         """Field [3, H, W] or frames [N, 3, H, W] -> linear intensity [K, 3, H, W], frames averaged."""
@@ -137,9 +151,9 @@ class Bench:
         return coc_px(self.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
 
 
-def open_alike(folder: Path, optics: OpticsConfig, limit: int | None = None) -> list[Shard]:
-    """The shards of one evaluation: held out, same size, pupils and focuses. Raises ShardError that names the odd
-    one."""
+def open_alike(folder: Path, optics: OpticsConfig, limit: int | None = None, between: bool = False) -> list[Shard]:
+    """The shards of one evaluation: held out, same size, pupils and focuses; for a bench that judges `between`, an odd
+    number of focuses. Raises ShardError that names the odd one."""
     shards = open_held_out(folder, optics, limit)
     first = shards[0]
     for shard in shards[1:]:
@@ -155,6 +169,11 @@ def open_alike(folder: Path, optics: OpticsConfig, limit: int | None = None) -> 
                 )
     if list(first.pupils_mm) != sorted(set(first.pupils_mm)):
         raise ShardError(f"{first.path}: pupils_mm is {first.pupils_mm}, expected rising values, each once")
+    if between and (len(first.focus_dpt) < 3 or len(first.focus_dpt) % 2 == 0):
+        raise ShardError(
+            f"{first.path}: {len(first.focus_dpt)} focuses, expected an odd number from 3 on to judge at those between "
+            "the others; render such scenes with `holod-scenes generate --planes 21`"
+        )
     return shards
 
 
@@ -251,7 +270,7 @@ def judge_scenes(shards: list[Shard], methods: list[Method], bench: Bench) -> Ju
     judged = Judged(pupils, table_pupils(pupils))
     for scene, shard in enumerate(tqdm(shards, unit="scene", disable=None)):
         for index in range(len(pupils)):
-            stack = bench.read(shard, index)
+            stack = bench.judged(bench.read(shard, index))
             blurred = rgbd_blur(stack.amplitude, stack.depth, bench.optics, list(stack.focus_dpt), stack.pupil_mm)
             judged.add(RGBD_BLUR, BEFORE, stack.pupil_mm, scene, bench.judge(blurred, stack))
             judged.add(FLAT_ORACLE, BEFORE, stack.pupil_mm, scene, bench.judge(flat_oracle(stack.target), stack))
@@ -278,7 +297,7 @@ def _judge_method(judged: Judged, scene: int, shard: Shard, method: Method, benc
             picture, seen_with = None, 0.0
             for index in sorted(wanted + crossed):
                 pupil = judged.pupils_mm[index]
-                stack = bench.read(shard, index)
+                stack = bench.judged(bench.read(shard, index))
                 if picture is None or bench.same_to_the_eye(pupil) != seen_with:
                     picture, seen_with = None, bench.same_to_the_eye(pupil)
                     picture = bench.look(shown, seen_with, stack.focus_dpt)

@@ -37,17 +37,23 @@ def markdown(result: dict[str, Any]) -> str:
 def _opening(result: dict[str, Any]) -> list[str]:
     height, width = result["size"]
     solver = result["solver"]
+    between = solver["focus_dpt"] != result["focus_dpt"]
+    planes = (
+        f"{len(result['focus_dpt'])} focal planes between the {len(solver['focus_dpt'])} that a solver is asked for"
+        if between
+        else f"all {len(result['focus_dpt'])} focal planes"
+    )
     optimised = (
         f" Rows named optimised: Adam on each field, {solver['iterations']} iterations from {solver['start']}'s, with "
-        "the target known, only on as many scenes as their row says."
+        f"the target known{' at its own planes' if between else ''}, only on as many scenes as their row says."
         if solver["scenes"]
         else ""
     )
     return [
         f"# Evaluation of {result['weights']}",
         "",
-        f"{result['date']}: {result['scenes']} held-out scenes of {width}x{height}, all {len(result['focus_dpt'])} "
-        f"focal planes, a border of {result['border_px']} px left out; linear light, peak 1. Means over scenes, in "
+        f"{result['date']}: {result['scenes']} held-out scenes of {width}x{height}, "
+        f"{planes}, a border of {result['border_px']} px left out; linear light, peak 1. Means over scenes, in "
         f"brackets their 95 % interval (Student's t). Amplitude constant {result['amplitude_constant']}. Slope and "
         "correlation: P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, 0 = one picture at all "
         f"depths). In focus: CoC < 2 px; out of focus: CoC > 8 px. Everything is after double phase.{optimised} Two "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,10 @@ class Stack:
     @property
     def amplitude(self) -> Tensor:
         return self.image.clamp_min(0).sqrt()
+
+    def at(self, focuses: slice) -> Stack:
+        """The same with only some of its focuses."""
+        return replace(self, target=self.target[focuses], focus_dpt=self.focus_dpt[focuses])
 
     def to(self, device: torch.device | str) -> Stack:
         return Stack(

@@ -27,13 +27,16 @@ def focus_curve(
         for shard in shards:
             for pupil in pupils:
                 stack = bench.read(shard, shard.pupils_mm.index(pupil))
+                judged = bench.judged(stack)
                 field = start.field(stack, pupil)
                 for weight in sorted(in_focus_weights):
                     loss = dataclasses.replace(config.loss, in_focus=weight)
                     weighted = dataclasses.replace(config, loss=loss, frames=1)
-                    optimum = optimise(stack, field, bench.optics, bench.amplitude_constant, weighted).field[0]
-                    picture = bench.look(bench.panel(optimum)[0], pupil, stack.focus_dpt)
-                    found.setdefault((weight, pupil), []).append(bench.judge(picture, stack))
+                    optimum = optimise(
+                        bench.asked(stack), field, bench.optics, bench.amplitude_constant, weighted
+                    ).field[0]
+                    picture = bench.look(bench.panel(optimum)[0], pupil, judged.focus_dpt)
+                    found.setdefault((weight, pupil), []).append(bench.judge(picture, judged))
                     progress.update()
     return [
         {"in_focus_weight": weight, "pupil_mm": pupil, "scenes": len(of), **Judgement.mean(of).known()}

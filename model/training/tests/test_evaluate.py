@@ -261,6 +261,49 @@ def test_scenes_must_be_alike(tmp_path: Path, evaluation: Path, capsys, odd: dic
     assert not (tmp_path / "out").exists()
 
 
+def test_judged_between_what_a_solver_is_asked_for(tmp_path: Path, evaluation: Path, capsys) -> None:
+    """Changes the pictures at the focuses that are asked for, or those between, and sees whose numbers change."""
+
+    def numbers(name: str, changed: slice) -> tuple[float, float]:
+        path = write_shard(tmp_path / name / "scene_000000.safetensors", pupils_mm=(2.0,), planes=7)
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata()
+        tensors = load_file(path)
+        tensors["stack_0"][changed] = tensors["stack_0"][changed].flip(-1)
+        save_file(tensors, path, metadata)
+        options = ["--test", str(path.parent), "--judge-between", "--solver-scenes", "1", "--solver-iterations", "4"]
+        options += ["--solver-frames", "1", "--focus-curve-weights", "50", "--timing-calls", "1"]
+        out = tmp_path / name / "out"
+        assert main(["evaluate", "--weights", str(evaluation / "w.safetensors"), *options, "--out", str(out)]) == 0
+        result = json.loads((out / "evaluation.json").read_text())
+        assert (len(result["focus_dpt"]), len(result["solver"]["focus_dpt"])) == (3, 4)
+        assert "3 focal planes between the 4 that a solver is asked for" in (out / "evaluation.md").read_text()
+        ours, optimised = (row_of(result, m, "after", 2.0)["psnr_db"] for m in ("holod", "optimised, 1 frame"))
+        assert optimised != ours
+        return ours, result["focus_curve"]["solver"][0]["psnr_db"]
+
+    none, asked, between = (
+        numbers(*of) for of in (("none", slice(0)), ("asked", slice(0, None, 2)), ("b", slice(1, None, 2)))
+    )
+    assert asked[0] == none[0] and asked[1] < none[1] - 0.01
+    assert between[0] < none[0] - 0.1 and between[1] < none[1] - 0.1
+
+    for planes in (2, 4):
+        folder = tmp_path / f"even-{planes}"
+        write_shard(folder / "scene_000000.safetensors", pupils_mm=(2.0,), planes=planes)
+        arguments = [
+            "--weights",
+            str(evaluation / "w.safetensors"),
+            "--test",
+            str(folder),
+            "--out",
+            str(folder / "out"),
+        ]
+        assert main(["evaluate", *arguments, "--judge-between"]) == 65
+        assert f"{planes} focuses, expected an odd number from 3 on" in capsys.readouterr().err
+        assert not (folder / "out").exists()
+
+
 def test_scenes_of_training_are_refused(tmp_path: Path, evaluation: Path, capsys) -> None:
     write_shard(tmp_path / "scene_000000.safetensors", metadata={"kind": "train"})
     for command in ("evaluate", "eyebox"):
