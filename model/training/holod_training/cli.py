@@ -105,7 +105,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument(
         "--judge-between",
         action="store_true",
-        help="the solver is asked for every second focus, and everything is judged at those between",
+        help="the solver knows the images at every second focus, and everything is judged at those between",
     )
     _lpips_options(evaluate, "adds its column")
     evaluate.add_argument("--timing-calls", type=int, default=judging.timing_calls)

@@ -13,6 +13,8 @@ from holod_training.costs import network_cost, time_methods
 from holod_training.evaluate_config import EvaluateConfig
 from holod_training.export import WeightsError, load_weights, read_metadata, write_beside
 from holod_training.judging import (
+    ASKED,
+    BETWEEN,
     OURS,
     Bench,
     Method,
@@ -73,7 +75,7 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "scenes": len(shards),
         "size": [shards[0].height, shards[0].width],
-        "focus_dpt": list(bench.judged(bench.read(shards[0], 0)).focus_dpt),
+        "focus_dpt": list(shards[0].focus_dpt[BETWEEN] if config.judge_between else shards[0].focus_dpt),
         "border_px": config.border_px,
         "amplitude_constant": network.config.amplitude_constant,
         "pupils_mm": table_pupils(shards[0].pupils_mm),
@@ -83,7 +85,7 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
             "scenes": min(config.solver_scenes, len(shards)),
             "iterations": config.solver.iterations,
             "loss": dataclasses.asdict(config.solver.loss),
-            "focus_dpt": list(bench.asked(bench.read(shards[0], 0)).focus_dpt),
+            "focus_dpt": list(shards[0].focus_dpt[ASKED] if config.judge_between else shards[0].focus_dpt),
         },
         **judged.summary(),
     }
@@ -136,13 +138,7 @@ def _solvers(config: EvaluateConfig, start: Method, bench: Bench, scenes: int) -
         return Method(
             name,
             lambda stack, pupil: (
-                optimise(
-                    bench.asked(stack),
-                    start.field(stack, pupil),
-                    bench.optics,
-                    bench.amplitude_constant,
-                    solver_config,
-                ).field
+                optimise(stack, start.field(stack, pupil), bench.optics, bench.amplitude_constant, solver_config).field
             ),
             adapts=True,
             scenes=scenes,

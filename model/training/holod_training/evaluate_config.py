@@ -14,8 +14,8 @@ class EvaluateConfig:
     """`also`: further weights files, each a method. `solver_scenes`: direct optimisation runs on the first so many
     scenes from the field of the method `solver_start`, once for each of `solver_frames`; 0 leaves it out.
     `focus_curve_weights`: in-focus weights of the curve between sharp in focus and soft out of it, on the same
-    scenes; none leaves it out. `judge_between`: the solver is asked for every second focus, and all is judged at those
-    between. `lpips_*`: files of LPIPS's weights, see `lpips.py`; both or none."""
+    scenes; none leaves it out. `judge_between`: methods, such as the solver, know every second focus, and all are
+    judged at those between. `lpips_*`: files of LPIPS's weights, see `lpips.py`; both or none."""
 
     weights: Path
     test: Path

@@ -28,6 +28,7 @@ from holod_training.rivals import (
     transport_of_intensity,
 )
 from holod_training.shards import Shard, ShardError, Stack, open_held_out
+from holod_training.solver import SolverConfig
 from holod_training.variants import network_amplitude
 
 OURS = "holod"
@@ -79,8 +80,8 @@ def rivals(optics: OpticsConfig) -> list[Method]:
 
 
 class Bench:
-    """Looks at fields before and after double phase. With `between`, a solver is asked for every second focus of a
-    stack, from the first to the last, and everything is judged at those between, which nobody knew."""
+    """Looks at fields before and after double phase. With `between`, methods know every second focus of a stack, from
+    the first to the last, and all of them are judged at those between."""
 
     def __init__(
         self,
@@ -101,15 +102,13 @@ class Bench:
         self.widest_cut_mm = 1e3 * max(optics.wavelengths_m) * optics.focal_length_m / (2 * optics.pitch_m) * 2**0.5
 
     def read(self, shard: Shard, pupil_index: int) -> Stack:
-        """With all focuses."""
-        return shard.read(pupil_index).to(self.device)
-
-    def asked(self, stack: Stack) -> Stack:
-        """What a solver may know."""
+        """What a method may know."""
+        stack = shard.read(pupil_index).to(self.device)
         return stack.at(ASKED) if self.between else stack
 
-    def judged(self, stack: Stack) -> Stack:
+    def read_judged(self, shard: Shard, pupil_index: int) -> Stack:
         """What pictures are judged by."""
+        stack = shard.read(pupil_index).to(self.device)
         return stack.at(BETWEEN) if self.between else stack
 
     def look(self, field: Tensor, pupil_mm: float, focus_dpt: Sequence[float]) -> Tensor:
@@ -169,10 +168,11 @@ def open_alike(folder: Path, optics: OpticsConfig, limit: int | None = None, bet
                 )
     if list(first.pupils_mm) != sorted(set(first.pupils_mm)):
         raise ShardError(f"{first.path}: pupils_mm is {first.pupils_mm}, expected rising values, each once")
-    if between and (len(first.focus_dpt) < 3 or len(first.focus_dpt) % 2 == 0):
+    most = 2 * SolverConfig().planes - 1
+    if between and (len(first.focus_dpt) % 2 == 0 or not 3 <= len(first.focus_dpt) <= most):
         raise ShardError(
-            f"{first.path}: {len(first.focus_dpt)} focuses, expected an odd number from 3 on to judge at those between "
-            "the others; render such scenes with `holod-scenes generate --planes 21`"
+            f"{first.path}: {len(first.focus_dpt)} focuses, expected an odd number from 3 to {most} to judge at those "
+            "between the others; render such scenes with `holod-scenes generate --planes 21`"
         )
     return shards
 
@@ -270,7 +270,7 @@ def judge_scenes(shards: list[Shard], methods: list[Method], bench: Bench) -> Ju
     judged = Judged(pupils, table_pupils(pupils))
     for scene, shard in enumerate(tqdm(shards, unit="scene", disable=None)):
         for index in range(len(pupils)):
-            stack = bench.judged(bench.read(shard, index))
+            stack = bench.read_judged(shard, index)
             blurred = rgbd_blur(stack.amplitude, stack.depth, bench.optics, list(stack.focus_dpt), stack.pupil_mm)
             judged.add(RGBD_BLUR, BEFORE, stack.pupil_mm, scene, bench.judge(blurred, stack))
             judged.add(FLAT_ORACLE, BEFORE, stack.pupil_mm, scene, bench.judge(flat_oracle(stack.target), stack))
@@ -297,7 +297,7 @@ def _judge_method(judged: Judged, scene: int, shard: Shard, method: Method, benc
             picture, seen_with = None, 0.0
             for index in sorted(wanted + crossed):
                 pupil = judged.pupils_mm[index]
-                stack = bench.judged(bench.read(shard, index))
+                stack = bench.read_judged(shard, index)
                 if picture is None or bench.same_to_the_eye(pupil) != seen_with:
                     picture, seen_with = None, bench.same_to_the_eye(pupil)
                     picture = bench.look(shown, seen_with, stack.focus_dpt)

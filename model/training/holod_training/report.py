@@ -39,13 +39,13 @@ def _opening(result: dict[str, Any]) -> list[str]:
     solver = result["solver"]
     between = solver["focus_dpt"] != result["focus_dpt"]
     planes = (
-        f"{len(result['focus_dpt'])} focal planes between the {len(solver['focus_dpt'])} that a solver is asked for"
+        f"{len(result['focus_dpt'])} focal planes between the {len(solver['focus_dpt'])} that methods may know"
         if between
         else f"all {len(result['focus_dpt'])} focal planes"
     )
     optimised = (
         f" Rows named optimised: Adam on each field, {solver['iterations']} iterations from {solver['start']}'s, with "
-        f"the target known{' at its own planes' if between else ''}, only on as many scenes as their row says."
+        f"the target known{' where methods may know it' if between else ''}, only on as many scenes as their row says."
         if solver["scenes"]
         else ""
     )

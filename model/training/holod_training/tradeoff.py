@@ -27,14 +27,12 @@ def focus_curve(
         for shard in shards:
             for pupil in pupils:
                 stack = bench.read(shard, shard.pupils_mm.index(pupil))
-                judged = bench.judged(stack)
+                judged = bench.read_judged(shard, shard.pupils_mm.index(pupil))
                 field = start.field(stack, pupil)
                 for weight in sorted(in_focus_weights):
                     loss = dataclasses.replace(config.loss, in_focus=weight)
                     weighted = dataclasses.replace(config, loss=loss, frames=1)
-                    optimum = optimise(
-                        bench.asked(stack), field, bench.optics, bench.amplitude_constant, weighted
-                    ).field[0]
+                    optimum = optimise(stack, field, bench.optics, bench.amplitude_constant, weighted).field[0]
                     picture = bench.look(bench.panel(optimum)[0], pupil, judged.focus_dpt)
                     found.setdefault((weight, pupil), []).append(bench.judge(picture, judged))
                     progress.update()

@@ -2,6 +2,7 @@ import copy
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,8 @@ from holod_training.rivals import (
     smooth_phase,
     transport_of_intensity,
 )
-from holod_training.shards import Shard
+from holod_training.shards import Shard, Stack
+from holod_training.solver import Solution, optimise
 
 PUPILS = (1.0, 2.0, 2.5, 4.0)
 TABLE_PUPILS = (1.0, 2.0, 4.0)
@@ -261,10 +263,21 @@ def test_scenes_must_be_alike(tmp_path: Path, evaluation: Path, capsys, odd: dic
     assert not (tmp_path / "out").exists()
 
 
-def test_judged_between_what_a_solver_is_asked_for(tmp_path: Path, evaluation: Path, capsys) -> None:
+def test_judged_between_what_methods_know(tmp_path: Path, evaluation: Path, capsys, monkeypatch) -> None:
     """Changes the pictures at the focuses that are asked for, or those between, and sees whose numbers change."""
+    known: dict[str, set[tuple[float, ...]]] = {"evaluate": set(), "tradeoff": set()}
 
-    def numbers(name: str, changed: slice) -> tuple[float, float]:
+    def watch(module: str) -> None:
+        def watched(stack: Stack, *rest: Any) -> Solution:
+            known[module].add(stack.focus_dpt)
+            return optimise(stack, *rest)
+
+        monkeypatch.setattr(f"holod_training.{module}.optimise", watched)
+
+    for module in known:
+        watch(module)
+
+    def numbers(name: str, changed: slice) -> tuple[float, float, float]:
         path = write_shard(tmp_path / name / "scene_000000.safetensors", pupils_mm=(2.0,), planes=7)
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata()
@@ -276,20 +289,22 @@ def test_judged_between_what_a_solver_is_asked_for(tmp_path: Path, evaluation: P
         out = tmp_path / name / "out"
         assert main(["evaluate", "--weights", str(evaluation / "w.safetensors"), *options, "--out", str(out)]) == 0
         result = json.loads((out / "evaluation.json").read_text())
-        assert (len(result["focus_dpt"]), len(result["solver"]["focus_dpt"])) == (3, 4)
-        assert "3 focal planes between the 4 that a solver is asked for" in (out / "evaluation.md").read_text()
+        whole = Shard(path).focus_dpt
+        assert result["focus_dpt"] == list(whole[1::2])
+        assert result["solver"]["focus_dpt"] == list(whole[0::2])
+        assert all(focuses == {whole[0::2]} for focuses in known.values())
+        assert "3 focal planes between the 4 that methods may know" in (out / "evaluation.md").read_text()
         ours, optimised = (row_of(result, m, "after", 2.0)["psnr_db"] for m in ("holod", "optimised, 1 frame"))
-        assert optimised != ours
-        return ours, result["focus_curve"]["solver"][0]["psnr_db"]
+        return ours, optimised, result["focus_curve"]["solver"][0]["psnr_db"]
 
-    none, asked, between = (
-        numbers(*of) for of in (("none", slice(0)), ("asked", slice(0, None, 2)), ("b", slice(1, None, 2)))
-    )
-    assert asked[0] == none[0] and asked[1] < none[1] - 0.01
-    assert between[0] < none[0] - 0.1 and between[1] < none[1] - 0.1
+    none = numbers("none", slice(0))
+    asked, between = numbers("asked", slice(0, None, 2)), numbers("between", slice(1, None, 2))
+    assert asked[0] == none[0]
+    assert all(changed < before - 0.01 for changed, before in zip(asked[1:], none[1:], strict=True))
+    assert all(changed < before - 0.1 for changed, before in zip(between, none, strict=True))
 
-    for planes in (2, 4):
-        folder = tmp_path / f"even-{planes}"
+    for planes in (2, 4, 25):
+        folder = tmp_path / f"wrong-{planes}"
         write_shard(folder / "scene_000000.safetensors", pupils_mm=(2.0,), planes=planes)
         arguments = [
             "--weights",
@@ -300,7 +315,7 @@ def test_judged_between_what_a_solver_is_asked_for(tmp_path: Path, evaluation: P
             str(folder / "out"),
         ]
         assert main(["evaluate", *arguments, "--judge-between"]) == 65
-        assert f"{planes} focuses, expected an odd number from 3 on" in capsys.readouterr().err
+        assert f"{planes} focuses, expected an odd number from 3 to 23" in capsys.readouterr().err
         assert not (folder / "out").exists()
 
 
