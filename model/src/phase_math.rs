@@ -14,17 +14,6 @@ const ARC_TANGENT: [f32; 8] = [
     0.199_935_51,
     -0.333_331_45,
 ];
-/// Highest power first, of a cosine.
-const ARC_COSINE: [f32; 8] = [
-    -0.001_262_491_1,
-    0.006_670_09,
-    -0.017_088_126,
-    0.030_891_88,
-    -0.050_174_303,
-    0.088_978_99,
-    -0.214_598_8,
-    FRAC_PI_2,
-];
 
 #[inline(always)]
 fn polynomial<const N: usize>(coefficients: [f32; N], x: f32) -> f32 {
@@ -44,15 +33,6 @@ pub(crate) fn argument(re: f32, im: f32) -> f32 {
     let angle = if steep { FRAC_PI_2 - angle } else { angle };
     let angle = if re < 0.0 { PI - angle } else { angle };
     angle.copysign(im)
-}
-
-/// acos of 0..=1, in [0, π/2].
-///
-/// The polynomial is Abramowitz and Stegun's 4.4.46, within 2e-8 before rounding; its constant is π/2 instead of
-/// 1.570 796 305, so that darkness gets exactly π/2.
-#[inline(always)]
-pub(crate) fn arc_cosine(a: f32) -> f32 {
-    (1.0 - a).max(0.0).sqrt() * polynomial(ARC_COSINE, a)
 }
 
 /// (cos, sin) of π·`half_turns`, for |half_turns| < 2²⁰; beyond it they are wrong, and of what is not finite NaN.
@@ -99,15 +79,6 @@ mod tests {
         }
         assert_eq!([argument(0.0, 0.0), argument(1.0, 0.0), argument(-1.0, 0.0)], [0.0, 0.0, PI]);
         assert_eq!([argument(0.0, 2.0), argument(0.0, -2.0)], [FRAC_PI_2, -FRAC_PI_2]);
-    }
-
-    #[test]
-    fn the_arc_cosine_is_right_up_to_its_ends() {
-        let at = |share: f64| (0.999_999 * share) as f32;
-        let ratio = |share| f64::from(arc_cosine(at(share))) / f64::from(at(share)).acos();
-        let error = largest_difference(100_000, ratio, |_| 1.0);
-        assert!(error < 3e-7, "{error} of it");
-        assert_eq!([arc_cosine(0.0), arc_cosine(1.0)], [FRAC_PI_2, 0.0]);
     }
 
     #[test]

@@ -103,6 +103,7 @@ impl Look {
                 Kind::Train => SceneKind::Train,
                 Kind::Test => SceneKind::Test,
                 Kind::Cards => SceneKind::Cards,
+                Kind::Marks => SceneKind::Marks,
             },
             seed,
             resolution: self.size,
@@ -124,6 +125,8 @@ enum Kind {
     Test,
     /// The refocus test: a near and a far card of fine marks.
     Cards,
+    /// Bright dots, lines and stars, near and far, on exact black.
+    Marks,
 }
 
 #[derive(Args)]

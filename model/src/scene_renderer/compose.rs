@@ -4,7 +4,7 @@ use holod_calibration::{DisplayGeometry, Resolution};
 
 use super::SceneKind;
 use super::families::{bright_and_dark, colour, marks, pattern};
-use super::random::{Random, mix};
+use super::random::{Random, hash_unit, mix};
 use super::surface::{Bounds, Paint, Shape, Surface};
 use super::texture::{Pattern, blend};
 use super::thin_lens::mean_light;
@@ -485,6 +485,70 @@ pub(super) fn refocus_cards(dark_on_bright: bool, seed: u64, resolution: Resolut
             let rim = (x - bounds.left).min(bounds.right - x).min(y - bounds.top).min(bounds.bottom - y) < 4.0;
             Some(if rim { ground } else { parts[part].colour(u, v) })
         }));
+    }
+    surfaces
+}
+
+/// What [`SceneKind::Marks`] are.
+#[derive(Clone, Copy)]
+pub(super) enum Marks {
+    Dots,
+    Lines,
+    Stars,
+}
+
+impl Marks {
+    pub(super) fn of_index(index: u64) -> Self {
+        [Self::Dots, Self::Lines, Self::Stars][(index % 3) as usize]
+    }
+}
+
+/// Bright marks in the lower half of a black picture: on the left they stand at 2.5 dioptres, on the right at 0.25.
+pub(super) fn bright_marks(marks: Marks, seed: u64, resolution: Resolution) -> Vec<Surface> {
+    const CELL_PX: f32 = 24.0;
+    let (half_width, half_height) = (0.5 * resolution.width as f32, 0.5 * resolution.height as f32);
+    let black = |left, top, right, bottom, depth, paint: &dyn Fn(f32, f32) -> f32| {
+        let shape = Shape::Plane { cx: 0.0, cy: 0.0, depth, gx: 0.0, gy: 0.0 };
+        Surface::bake(shape, Bounds { left, top, right, bottom }, |x, y| Some([paint(x, y); 3]))
+    };
+    let (across, down) = (half_width + OVERSCAN_PX, half_height + OVERSCAN_PX);
+    let mut surfaces = vec![black(-across, -down, across, down, 0.0, &|_, _| 0.0)];
+    let mut random = Random::new(mix(seed) ^ SceneKind::Marks.stream(), marks as u64);
+    // Nothing is cut off, and what is out of focus stays in the picture.
+    let margin = 0.5 * CELL_PX;
+    let (columns, rows) =
+        (((half_width - 2.0 * margin) / CELL_PX) as i32, ((half_height - 3.0 * margin) / CELL_PX) as i32);
+    for (side, depth) in [(-1.0, 2.5), (1.0, 0.25)] {
+        let inner = side * margin;
+        let left = inner.min(inner + side * columns as f32 * CELL_PX);
+        let (right, top) = (left + columns as f32 * CELL_PX, 2.0 * margin);
+        let seed = random.seed();
+        let paint = |x: f32, y: f32| {
+            let (u, v) = ((x - left) / CELL_PX, (y - top) / CELL_PX);
+            let (column, row) = (u.floor() as i32, v.floor() as i32);
+            let unit = |which: i32| hash_unit(8 * column + which, row, seed);
+            // From the mark's middle, which is somewhere in the middle of its cell.
+            let (dx, dy) = (u - column as f32 - 0.4 - 0.2 * unit(0), v - row as f32 - 0.4 - 0.2 * unit(1));
+            let (dx, dy) = (CELL_PX * dx, CELL_PX * dy);
+            match marks {
+                // As large as a pixel to as large as nine.
+                Marks::Dots => f32::from(dx.hypot(dy) < 0.6 + 1.1 * unit(2)),
+                // 1 to 2 px wide and 14 long; in every other cell on a diagonal.
+                Marks::Lines => {
+                    let turns =
+                        if (column + row) % 2 == 0 { 0.125 + 0.25 * (unit(2) * 2.0).floor() } else { 0.5 * unit(2) };
+                    let (sin, cos) = (std::f32::consts::TAU * turns).sin_cos();
+                    let (along, beside) = (dx * cos + dy * sin, dy * cos - dx * sin);
+                    f32::from(beside.abs() < 0.5 + 0.5 * unit(3) && along.abs() < 7.0)
+                }
+                // Of 2 to 100 % of the light, most of them faint.
+                Marks::Stars => {
+                    let light = 0.02 + 0.98 * unit(2) * unit(2);
+                    if dx.hypot(dy) < 3.0 { light * (-(dx * dx + dy * dy) / 1.3).exp() } else { 0.0 }
+                }
+            }
+        };
+        surfaces.push(black(left, top, right, top + rows as f32 * CELL_PX, depth, &paint));
     }
     surfaces
 }

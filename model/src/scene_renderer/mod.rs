@@ -44,6 +44,9 @@ pub enum SceneKind {
     /// The refocus test: fine marks on a near card at 2.5 dioptres and a far card at 0.25 dioptres; dark on bright
     /// where the index is even, bright on dark where it is odd.
     Cards,
+    /// What black stays: bright marks at 2.5 and at 0.25 dioptres in the lower half of a picture that is exactly black
+    /// else. By the index in turn dots of 1 to 3 px, thin lines, many of them diagonal, and stars.
+    Marks,
 }
 
 impl SceneKind {
@@ -53,6 +56,7 @@ impl SceneKind {
             Self::Train => "train",
             Self::Test => "test",
             Self::Cards => "cards",
+            Self::Marks => "marks",
         }
     }
 
@@ -61,6 +65,7 @@ impl SceneKind {
             Self::Train => 0x7472_6169_6e00,
             Self::Test => 0x7465_7374_0000,
             Self::Cards => 0x6361_7264_7300,
+            Self::Marks => 0x6d61_726b_7300,
         }
     }
 }
@@ -96,6 +101,10 @@ impl Scene {
             SceneKind::Cards => {
                 let cards = compose::refocus_cards(index.is_multiple_of(2), seed ^ (index / 2), resolution);
                 (cards, PixelSamples::Grid)
+            }
+            SceneKind::Marks => {
+                let marks = compose::bright_marks(compose::Marks::of_index(index), seed ^ (index / 3), resolution);
+                (marks, PixelSamples::Grid)
             }
             SceneKind::Train | SceneKind::Test => {
                 (compose::random_surfaces(kind, seed, index, resolution), PixelSamples::Lattice)

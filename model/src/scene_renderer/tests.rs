@@ -666,3 +666,28 @@ mod on_a_gpu {
         assert!(!agree(&stack, &one_wrong));
     }
 }
+
+#[test]
+fn marks_are_bright_near_and_far_and_all_else_is_exactly_black() {
+    let resolution = Resolution { width: 192, height: 160 };
+    for index in 0..3 {
+        let scene = Scene::random(SceneKind::Marks, 4, index, resolution);
+        let Picture { image, depth } = scene.picture();
+        let pixels = resolution.pixels();
+        let lit: Vec<usize> = (0..pixels).filter(|&pixel| image[pixel] > 0.0).collect();
+        assert!(lit.iter().all(|pixel| pixel / resolution.width >= resolution.height / 2), "marks {index}");
+        assert!((30..pixels / 20).contains(&lit.len()), "{} pixels of marks {index} are lit", lit.len());
+        assert!(lit.iter().any(|&pixel| image[pixel] > 0.3));
+        for dpt in [2.5, 0.25] {
+            let wanted = DisplayGeometry::DEFAULT.normalised_depth(Dioptres(dpt)) as f32;
+            let there = lit.iter().filter(|&&pixel| (depth[pixel] - wanted).abs() < 1e-3).count();
+            assert!(5 * there > lit.len(), "{there} of {} lit pixels at {dpt} dpt", lit.len());
+        }
+        let stack = scene.focal_stack(PupilDiameter::from_mm(2.0), &[Dioptres(2.5), Dioptres(0.25)], 64);
+        for (plane, view) in stack.chunks_exact(3 * pixels).enumerate() {
+            assert!(view[..pixels / 4].iter().all(|&light| light == 0.0), "the top of plane {plane}");
+            let (sharp, seen) = (image.iter().sum::<f32>(), view.iter().sum::<f32>());
+            assert!((seen / sharp - 1.0).abs() < 0.05, "blur keeps the light: {seen} of {sharp} in plane {plane}");
+        }
+    }
+}

@@ -83,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
         "--test", required=True, help="folder of held-out scenes of one size and with the same pupils"
     )
     evaluate.add_argument("--cards", help="folder of refocus cards")
+    evaluate.add_argument("--marks", help="folder of bright marks on exact black")
     evaluate.add_argument("--out", required=True)
     evaluate.add_argument("--limit", type=int, help="only so many scenes")
     evaluate.add_argument("--also", action="append", default=[], help="another weights file to judge too; repeatable")
@@ -234,6 +235,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         test=Path(options.test),
         out=Path(options.out),
         cards=Path(options.cards) if options.cards else None,
+        marks=Path(options.marks) if options.marks else None,
         rgbd=Path(options.rgbd) if options.rgbd else None,
         also=tuple(Path(path) for path in options.also),
         limit=options.limit,

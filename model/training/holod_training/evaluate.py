@@ -26,6 +26,7 @@ from holod_training.judging import (
     table_pupils,
 )
 from holod_training.lpips import Lpips
+from holod_training.marks import judge_marks
 from holod_training.network import FieldNetwork
 from holod_training.offsets import offset_statistics
 from holod_training.plots import write_plots
@@ -54,6 +55,7 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     optics = network.config.optics
     shards = open_alike(config.test, optics, config.limit, config.judge_between)
     cards = open_shards(config.cards, optics) if config.cards else []
+    marks = open_shards(config.marks, optics) if config.marks else []
     pictures = read_pictures(config.rgbd, optics) if config.rgbd else []
     lpips = Lpips.open(config.lpips_backbone, config.lpips_linear, device)
     bench = Bench(optics, network.config.amplitude_constant, config.border_px, device, lpips, config.judge_between)
@@ -68,6 +70,7 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     if pictures:
         write_rgbd_sheet(config.out / "rgbd.png", pictures, trained[0], bench)
     refocus = refocus_cards(cards, learned_and_rivals, bench, config.out / "cards.png") if cards else []
+    of_marks = judge_marks(marks, learned_and_rivals, bench, config.out / "marks.png") if marks else []
     judged = judge_scenes(shards, methods, bench)
     result: dict[str, Any] = {
         "weights": config.weights.name,
@@ -93,6 +96,8 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     write_beside(config.out / "scenes.json", (json.dumps(per_scene) + "\n").encode())
     if cards:
         result["refocus"] = refocus
+    if marks:
+        result["marks"] = of_marks
     result["run_time"] = {
         "pupil_mm": shards[0].pupils_mm[timed],
         "rows": time_methods(methods, bench.read(shards[0], timed), config.timing_calls),

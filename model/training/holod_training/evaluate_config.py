@@ -21,6 +21,7 @@ class EvaluateConfig:
     test: Path
     out: Path
     cards: Path | None = None
+    marks: Path | None = None
     rgbd: Path | None = None
     also: tuple[Path, ...] = ()
     limit: int | None = None

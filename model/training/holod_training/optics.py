@@ -8,9 +8,17 @@ from __future__ import annotations
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from holod_training.config import OpticsConfig
+
+# Of double phase. A pixel is dark below DARK_SHARE of the rms amplitude of its tile, at least below LEAST_DARK and at
+# most below MOST_DARK of the amplitude constant. model/src/optics/double_phase.rs has the same numbers.
+TILE_PX = 32
+DARK_SHARE = 0.5
+LEAST_DARK, MOST_DARK = 0.01, 0.08
+CORRECTION_GAIN = 2.0
 
 
 def frequencies(size: int, pitch_m: float, device: torch.device | str = "cpu") -> Tensor:
@@ -186,19 +194,78 @@ def intensity(field: Tensor) -> Tensor:
 
 
 def double_phase(field: Tensor, amplitude_constant: float) -> tuple[Tensor, float]:
-    """Phase pattern in [0, 2π) for a field [..., H, W], and the share of pixels whose amplitude was clipped.
+    """Phase pattern in [0, 2π) for a field [..., H, W], and the share of pixels whose amplitude was clipped."""
+    clipped = (field.abs() > amplitude_constant).float().mean().item()
+    phase = torch.remainder(double_phase_phasors(field, amplitude_constant).angle(), 2 * math.pi)
+    return torch.where(phase >= 2 * math.pi, torch.zeros_like(phase), phase), clipped
 
-    arg ∓ acos(min(|c|/K, 1)) in a checkerboard, minus where x + y is even (Hsueh and Sawchuk 1978; Maimone 2017).
+
+def double_phase_phasors(field: Tensor, amplitude_constant: float) -> Tensor:
+    """Phasors, not of unit length, whose angles are the double phase of a field [..., H, W]. Has a gradient.
+
+    With a field a = c/K, clipped to |a| ≤ 1, and a unit carrier u, the pair is u·(s ∓ j·sqrt(1 − s²)), s = Re(a·u*), in
+    a checkerboard, minus where x + y is even. With u = a/|a| that is arg c ∓ acos |a| (Hsueh and Sawchuk 1978; Maimone
+    2017), which throws light into the band wherever u changes from pixel to pixel, as it does where there is none. So
+    u is smooth where it is dark; then the error, a less the phasor, through a binomial filter, is added twice: one
+    step of Gerchberg and Saxton's (1972).
     """
-    amplitude = field.abs() / amplitude_constant
-    clipped = (amplitude > 1).float().mean().item()
+    a = field / amplitude_constant
+    a = a / a.abs().clamp_min(1)
+    carrier = smooth_carrier(a)
+    along = (a * carrier.conj()).real
+    across = torch.sqrt((1 - along * along).clamp_min(1e-12))
     height, width = field.shape[-2:]
     rows = torch.arange(height, device=field.device)[:, None]
     columns = torch.arange(width, device=field.device)
     sign = torch.where((rows + columns) % 2 == 0, -1.0, 1.0)
-    phase = field.angle() + sign * torch.acos(amplitude.clamp(max=1))
-    phase = torch.remainder(phase, 2 * math.pi)
-    return torch.where(phase >= 2 * math.pi, torch.zeros_like(phase), phase), clipped
+    pair = carrier * torch.complex(along, sign.to(across.dtype) * across)
+    return pair + CORRECTION_GAIN * _binomial(a - pair)
+
+
+def smooth_carrier(a: Tensor) -> Tensor:
+    """Unit phasors for a field [..., H, W] of amplitudes up to 1: its own where it is bright beside its surroundings,
+    those of its brighter neighbours where it is dark.
+
+    With weights of amplitude cubed, a block of 4x4 pixels has the phase of its mean, each quarter of it that of its own
+    mean and a little of the block's, each pixel its own and a little of its quarter's. A little: as much as a pixel of
+    half the rms amplitude of the tile of 32x32 around it has, within bounds.
+    """
+    light = intensity(a)
+    weighted = a * light
+    power = _spread(_tile_means(light, TILE_PX), TILE_PX, a)
+    floor = (DARK_SHARE**2 * power).clamp(LEAST_DARK**2, MOST_DARK**2) ** 1.5
+    block = _unit(_spread(_tile_means(weighted, 4), 4, a) + (LEAST_DARK / 2) ** 3)
+    quarter = _unit(_spread(_tile_means(weighted, 2), 2, a) + floor * block)
+    return _unit(weighted + floor * quarter)
+
+
+def _unit(value: Tensor) -> Tensor:
+    return value * torch.rsqrt(intensity(value).clamp_min(1e-30))
+
+
+def _tile_means(value: Tensor, size: int) -> Tensor:
+    """Means over tiles of size x size pixels, [..., ceil(H/size), ceil(W/size)]; beyond the edges there are zeros."""
+    height, width = value.shape[-2:]
+    padded = F.pad(value, (0, -width % size, 0, -height % size))
+    return padded.unflatten(-1, (-1, size)).unflatten(-3, (-1, size)).mean(dim=(-3, -1))
+
+
+def _spread(tiles: Tensor, size: int, like: Tensor) -> Tensor:
+    """Each tile's value at each of its pixels."""
+    spread = tiles.repeat_interleave(size, -2).repeat_interleave(size, -1)
+    return spread[..., : like.shape[-2], : like.shape[-1]]
+
+
+def _binomial(value: Tensor) -> Tensor:
+    """[..., H, W] through 1 4 6 4 1 in both directions. Beyond its edges it is mirrored about the outermost pixels,
+    which keeps a checkerboard one."""
+    for dim in (-1, -2):
+        size = value.shape[dim]
+        at = torch.arange(-2, size + 2, device=value.device).abs()
+        at = torch.where(at < size, at, 2 * (size - 1) - at).clamp(0, size - 1)
+        mirrored = value.index_select(dim, at)
+        value = sum(tap * mirrored.narrow(dim, k, size) for k, tap in enumerate((0.0625, 0.25, 0.375, 0.25, 0.0625)))
+    return value
 
 
 def through_levels(phase: Tensor, bit_depth: int = 8) -> Tensor:

@@ -30,7 +30,7 @@ PLOTS = {
 def markdown(result: dict[str, Any]) -> str:
     """Raises ReportError where the evaluation's parts do not belong together."""
     require_one_set_of_pupils(result)
-    parts = [_opening, _numbers, _paired, _matrix, _refocus, _costs, _double_phase, _plots, _goals]
+    parts = [_opening, _numbers, _paired, _matrix, _refocus, _marks, _costs, _double_phase, _plots, _goals]
     return "\n\n".join("\n".join(lines) for part in parts if (lines := part(result))) + "\n"
 
 
@@ -124,6 +124,30 @@ def _refocus(result: dict[str, Any]) -> list[str]:
         for card in ("near", "far"):
             found = [by_key[method, contrast, p][f"{card}_card"] for p in pupils]
             lines.append(_line([method, contrast, card, *(f"{v:.2f}" for v in found)]))
+    return lines
+
+
+def _marks(result: dict[str, Any]) -> list[str]:
+    if "marks" not in result:
+        return []
+    rows = result["marks"]
+    pupils = sorted({row["pupil_mm"] for row in rows})
+    lines = [
+        "## Bright marks on exact black",
+        "",
+        "All light that is seen over what was put in, before and after double phase, and the mean light after it, in "
+        "thousandths of white, more than 16 px from where any should be.",
+        "",
+    ]
+    lines += _header(["marks", "method", *(f"s = {p:g}" for p in pupils)])
+    by_key = {(row["marks"], row["method"], row["double_phase"], row["pupil_mm"]): row for row in rows}
+    for marks, method in dict.fromkeys((row["marks"], row["method"]) for row in rows):
+        cells = []
+        for pupil in pupils:
+            before, after = (by_key[marks, method, stage, pupil] for stage in ("before", "after"))
+            ratios = f"{before['light_ratio']:.2f} → {after['light_ratio']:.2f}"
+            cells.append(f"{ratios}, {1e3 * after['dark_mean']:.3f}")
+        lines.append(_line([marks, method, *cells]))
     return lines
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from holod_training.config import OpticsConfig
 from holod_training.loss import LossWeights, focus_loss
-from holod_training.optics import HalfBandEye, coc_px, frequencies, kept_bins, upsample_half_band
+from holod_training.optics import HalfBandEye, coc_px, double_phase_phasors, frequencies, kept_bins, upsample_half_band
 from holod_training.shards import Stack
 
 NOISE_SIGMA = 0.03
@@ -65,17 +65,9 @@ def smooth_noise(shape: tuple[int, ...], seed: int) -> Tensor:
 
 
 def shown_by_panel(low: Tensor, amplitude_constant: float) -> Tensor:
-    """The half band of what a panel shows of [..., h, w] after double phase, on the same grid, with a gradient.
-
-    exp(j·(φ ∓ acos a)) = (c/|c|)·(a ∓ j·sqrt(1 − a²)), a = min(|c|/K, 1).
-    """
-    field_ = upsample_half_band(low)
-    magnitude = field_.abs().clamp_min(1e-6)
-    a = (magnitude / amplitude_constant).clamp(max=1 - 1e-6)
-    rows = torch.arange(field_.shape[-2], device=low.device)[:, None]
-    columns = torch.arange(field_.shape[-1], device=low.device)
-    sign = torch.where((rows + columns) % 2 == 0, -1.0, 1.0)
-    shown = field_ / magnitude * torch.complex(a, sign * torch.sqrt(1 - a * a))
+    """The half band of what a panel shows of [..., h, w] after double phase, on the same grid, with a gradient."""
+    phasors = double_phase_phasors(upsample_half_band(low), amplitude_constant)
+    shown = phasors / phasors.abs().clamp_min(1e-6)
     return amplitude_constant * half_band_samples(shown)
 
 

@@ -12,6 +12,7 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from test_lpips import random_lpips_files
+from test_marks import write_marks
 from test_rgbd import write_pair
 
 from holod_training.cli import main
@@ -71,7 +72,9 @@ def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Path:
             Image.new("RGB", (65, 48), (200, 120, 60)).save(tmp_path / "real" / kind / name)
         else:
             Image.fromarray(millimetres.numpy().astype("uint16")).save(tmp_path / "real" / kind / name)
+    write_marks(tmp_path / "marks" / "scene_000000.safetensors")
     folders = ["--test", tmp_path / "test", "--cards", tmp_path / "cards", "--rgbd", tmp_path / "real"]
+    folders += ["--marks", tmp_path / "marks"]
     weights = ["--weights", tmp_path / "w.safetensors", "--also", tmp_path / "deeper.safetensors"]
     solver = [
         "--solver-start",
@@ -113,6 +116,7 @@ def test_evaluation_is_complete(evaluation: Path) -> None:
     assert "refocus ratio, near card, bright on dark, s = 5 mm" in text and "scenes are 80x64" in text
     assert Image.open(evaluation / "out" / "sheet.png").size == (4 * 84, 4 * 68)
     assert Image.open(evaluation / "out" / "cards.png").size == (5 * 132, 2 * 132)
+    assert Image.open(evaluation / "out" / "marks.png").size == (3 * 132, 132)
     assert Image.open(evaluation / "out" / "rgbd.png").size == (5 * 68, 52)
     assert result["plots"] == ["pupils", "focus_curve", "offsets", "capacity", "run_time"]
     for name in result["plots"]:

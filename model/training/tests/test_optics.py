@@ -9,6 +9,7 @@ from holod_training.optics import (
     HalfBandEye,
     coc_px,
     double_phase,
+    double_phase_phasors,
     frequencies,
     half_band_mask,
     intensity,
@@ -132,12 +133,62 @@ def test_double_phase_round_trip_through_the_stop() -> None:
 
 
 def test_double_phase_sign_and_clipping() -> None:
+    a = math.acos(0.5)
+    phase, clipped = double_phase(torch.full((1, 2, 3), 0.7, dtype=torch.complex64), 1.4)
+    minus = 2 * math.pi - a
+    torch.testing.assert_close(phase, torch.tensor([[[minus, a, minus], [a, minus, a]]]), atol=1e-5, rtol=0)
+    assert clipped == 0
     field = torch.full((1, 2, 2), 0.7, dtype=torch.complex64)
     field[0, 1, 1] = 3.0
-    phase, clipped = double_phase(field, 1.4)
-    a = math.acos(0.5)
-    torch.testing.assert_close(phase, torch.tensor([[[2 * math.pi - a, a], [a, 0.0]]]))
-    assert clipped == 0.25
+    assert double_phase(field, 1.4)[1] == 0.25
+
+
+def marks_on_black() -> torch.Tensor:
+    """Two dots of unlike phases and a diagonal line, and the noise that a network leaves on black."""
+    y, x = torch.meshgrid(torch.arange(96.0), torch.arange(128.0), indexing="ij")
+    line = torch.exp(-((x - y - 10) ** 2) / 4.5) * ((x > 30) & (x < 100))
+    dots = [torch.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 4.5) for cx, cy in ((20, 60), (100, 20))]
+    noise = torch.rand(96, 128, generator=torch.Generator().manual_seed(2)) * 2 * math.pi
+    field = torch.complex(dots[0] + line, dots[1]) + torch.polar(torch.full_like(noise, 0.004), noise)
+    return field.expand(3, -1, -1)
+
+
+def light_and_dark(phase: torch.Tensor, field: torch.Tensor) -> tuple[float, float]:
+    """As an eye sees a pattern: all light over the field's, and the mean where that is dark."""
+    eye = Eye(OPTICS, *field.shape[-2:], [0.0])
+    wanted, seen = eye.look(field, 3.0), eye.look(panel_field(phase), 3.0) * 1.25**2
+    return float(seen.sum() / wanted.sum()), float(seen[wanted < 1e-3].mean())
+
+
+def test_black_stays_black_around_bright_marks() -> None:
+    field = marks_on_black()
+    light, dark = light_and_dark(double_phase(field, 1.25)[0], field)
+    assert 0.85 < light < 1.15 and dark < 5e-4
+    spread = torch.acos((field.abs() / 1.25).clamp(max=1))
+    odd = (torch.arange(96)[:, None] + torch.arange(128)) % 2 == 1
+    light, dark = light_and_dark(field.angle() + torch.where(odd, spread, -spread), field)
+    assert light > 1.3 and dark > 5e-3, "the comparison does not tell the plain pair"
+
+
+def test_dim_pictures_keep_their_light() -> None:
+    """What is dark beside nothing bright is no darkness: a smooth field of 1 % of the light."""
+    y, x = torch.meshgrid(torch.arange(64.0), torch.arange(64.0), indexing="ij")
+    field = torch.polar(0.1 + 0.05 * torch.cos(x / 9), 0.2 * x - 0.15 * y + torch.sin(y / 7)).expand(3, -1, -1)
+    stop = half_band_mask(64, 64)
+    shown = torch.fft.ifft2(torch.fft.fft2(panel_field(double_phase(field, 1.25)[0]) * 1.25) * stop)
+    inside = (slice(None), slice(8, -8), slice(8, -8))
+    assert intensity(shown - field)[inside].mean() < 2e-3 * intensity(field)[inside].mean()
+    assert intensity(shown - 0.95 * field)[inside].mean() > 2e-3 * intensity(field)[inside].mean()
+
+
+def test_double_phase_has_a_gradient_everywhere() -> None:
+    field = marks_on_black()[:1].clone()
+    field[:, :40] = 0
+    field[:, 50:60] *= 20
+    field.requires_grad_()
+    double_phase_phasors(field, 1.25).angle().square().sum().backward()
+    assert field.grad is not None and torch.view_as_real(field.grad).isfinite().all()
+    assert field.grad.abs().max() > 0
 
 
 def test_coc_of_the_default_bench() -> None:

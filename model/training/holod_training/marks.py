@@ -1,0 +1,80 @@
+"""Bright marks on exact black: how much light is seen of what was put in, and how much where there is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch.nn.functional as F
+from torch import Tensor
+
+from holod_training.judging import AFTER, BEFORE, OURS, Bench, Method
+from holod_training.shards import Shard, ShardError, Stack
+from holod_training.sheets import save_sheet
+
+KINDS = ("dots", "lines", "stars")
+# Marks are faint at the edges of their discs; black is exactly 0.
+LEAST_LIGHT = 1e-6
+AWAY_PX = 16
+LEAST_AREA_PX = 256
+
+
+def dark_area(stack: Stack) -> Tensor:
+    """Where a stack is black at every focus and so is all within 16 px each way, [H, W] bool."""
+    lit = (stack.target.amax(dim=(0, 1)) > LEAST_LIGHT).float()
+    return F.max_pool2d(lit[None, None], 2 * AWAY_PX + 1, stride=1, padding=AWAY_PX)[0, 0] == 0
+
+
+def light_ratio(picture: Tensor, target: Tensor) -> float:
+    """All light of a stack [K, 3, H, W] over that of its target."""
+    return float(picture.double().sum() / target.double().sum())
+
+
+def judge_marks(shards: list[Shard], methods: list[Method], bench: Bench, sheet: Path) -> list[dict[str, Any]]:
+    """A row for each kind of marks, method and pupil, before and after double phase, means over scenes; and a sheet of
+    ours, focused near and far at the widest pupil. Raises ShardError for scenes of another kind."""
+    rows, pictures = [], []
+    for shard in shards:
+        if shard.kind != "marks":
+            raise ShardError(
+                f"{shard.path}: a scene of kind {shard.kind!r}, expected marks; write it with --kind marks"
+            )
+        for index, pupil in enumerate(shard.pupils_mm):
+            stack = bench.read(shard, index)
+            dark = dark_area(stack)
+            if int(dark.sum()) < LEAST_AREA_PX:
+                raise ShardError(f"{shard.path}: nothing of it stays black; write larger ones with --kind marks")
+            for method in methods:
+                field = method.field(stack, pupil)
+                for stage, shown in ((BEFORE, field), (AFTER, bench.panel(field)[0])):
+                    seen = bench.look(shown, bench.same_to_the_eye(pupil), stack.focus_dpt)
+                    rows.append(
+                        {
+                            "marks": KINDS[shard.index % len(KINDS)],
+                            "method": method.name,
+                            "double_phase": stage,
+                            "pupil_mm": pupil,
+                            "light_ratio": light_ratio(seen, stack.target),
+                            "dark_mean": float(seen[..., dark].double().mean()),
+                        }
+                    )
+                    if method.name == OURS and stage == AFTER and index == len(shard.pupils_mm) - 1:
+                        pictures.append([stack.image, seen[-1], seen[0]])
+    save_sheet(sheet, pictures)
+    return _means(rows)
+
+
+def _means(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Means over the scenes of each kind of marks, method, stage and pupil."""
+    keys = ("marks", "method", "double_phase", "pupil_mm")
+    grouped: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        grouped.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return [
+        {
+            **dict(zip(keys, of, strict=True)),
+            "scenes": len(found),
+            **{name: sum(row[name] for row in found) / len(found) for name in ("light_ratio", "dark_mean")},
+        }
+        for of, found in grouped.items()
+    ]
