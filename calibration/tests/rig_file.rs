@@ -5,10 +5,11 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::rig::{
-    Eye, Fault, LaserDriver, PanelMode, PanelProfile, PhaseSign, Provenance, Rig, RigError, WeightsChoice,
+    Eye, Fault, LaserDriver, LevelPhase, OutOfStroke, Packing, PanelMode, PanelProfile, PhaseSign, Provenance, Rig,
+    RigError, TextLaserProfile, WeightsChoice,
 };
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, Resolution, TimeNs};
-use image::{GrayImage, ImageBuffer, Luma, RgbImage};
+use image::{GrayImage, ImageBuffer, ImageFormat, Luma, Rgb, RgbImage, RgbaImage};
 use proptest::prelude::*;
 
 const EXAMPLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/rigs/example.toml");
@@ -70,8 +71,9 @@ fn the_example_rig_says_what_its_comments_say() {
     assert_eq!(rig.panel.stroke_rad, PerColour([TAU * 255.0 / 256.0; 3]));
     assert_eq!((rig.panel.settle, rig.panel.field_period()), (TimeNs(2_000_000), TimeNs(5_555_556)));
     assert_eq!(rig.geometry.depth_near, DisplayGeometry::DEFAULT.depth_near);
-    assert_eq!(rig.lasers.driver, LaserDriver::Serial { path: "/dev/holod-lasers".into() });
+    assert_eq!(rig.lasers.driver, LaserDriver::Serial { path: "/dev/holod-lasers".into(), sync_wire: false });
     assert_eq!(rig.lasers.power_mw, PerColour([1.2, 0.8, 1.0]));
+    assert_eq!(rig.lasers.power_limit_mw, PerColour([2.0; 3]));
     assert_eq!(rig.tracker.spec.as_deref(), Some("serial:/dev/holod-tracker"));
     assert!(!rig.model.allow_optics_mismatch);
 
@@ -91,7 +93,10 @@ fn the_example_comments_name_every_profile_and_its_own_figures() {
     for profile in PanelProfile::all() {
         assert!(text.contains(profile.name), "{} is not in the example's comments", profile.name);
     }
-    let spelled_out = ["width_px", "height_px", "pixel_pitch_um", "refresh_hz", "bit_depth"]
+    for name in TextLaserProfile::names() {
+        assert!(text.contains(name), "{name} is not in the example's comments");
+    }
+    let spelled_out = ["width_px", "height_px", "pixel_pitch_um", "refresh_hz", "bit_depth", "packing"]
         .iter()
         .fold(text.clone(), |text, key| text.replace(&format!("# {key} = "), &format!("{key} = ")))
         .replace("profile = \"holoeye-pluto\"", "");
@@ -172,7 +177,7 @@ fn figures_out_of_range_are_refused() {
         ("height_px = 1080", "height_px = -1080", "panel.height_px"),
         ("pixel_pitch_um = 8.0", "pixel_pitch_um = nan", "panel.pixel_pitch_um"),
         ("refresh_hz = 60.0", "refresh_hz = inf", "panel.refresh_hz"),
-        ("bit_depth = 8", "bit_depth = 12", "panel.bit_depth"),
+        ("bit_depth = 8", "bit_depth = 32", "panel.bit_depth"),
         ("settle_ms = 2.0", "settle_ms = -1", "panel.settle_ms"),
         ("eyepiece_focal_length_mm = 40.0", "eyepiece_focal_length_mm = 1", "optics.eyepiece_focal_length_mm"),
         ("depth_near_m = 0.35", "depth_near_m = 0", "optics.depth_near_m"),
@@ -202,7 +207,7 @@ fn wrong_types_are_named() {
     );
     check("width_px = 1920", "width_px = 1920.5", "panel.width_px", "1920.5", "a whole number", "without a fraction");
     check("width_px = 1920", "width_px = 1921", "panel.width_px", "1921", "an even number", "leave out");
-    check("bit_depth = 8", "bit_depth = 9", "panel.bit_depth", "9", "8 or 10", "");
+    check("bit_depth = 8", "bit_depth = 9", "panel.bit_depth", "9", "8, 10 or 16", "");
     check("bit_depth = 8", "bit_depth = true", "panel.bit_depth", "a boolean true", "a number", "");
     check("mode = ", "mode = 3 #", "panel.mode", "an integer 3", "\"channel-packed\"", "in double quotes");
     check("eye = \"both\"", "eye = \"\"", "tracker.eye", "an empty text", "\"left\"", "");
@@ -402,6 +407,35 @@ fn timings_that_do_not_fit_into_the_field_state_the_numbers() {
 }
 
 #[test]
+fn panel_modes_say_how_many_fields_a_colour_frame_has() {
+    let fields = |changes: &[(&str, &str)]| {
+        let panel = Rig::parse(&changed(changes), Path::new("")).unwrap().panel;
+        (0..panel.fields()).map(|field| panel.colour_of_field(field)).collect::<Vec<_>>()
+    };
+    assert_eq!(fields(&[]), Colour::ALL);
+    let sequential = ("mode = \"channel-packed\"", "mode = \"field-sequential\"\nframes_per_colour = 2");
+    let fast = ("refresh_hz = 60.0", "refresh_hz = 180.0");
+    let [red, green, blue] = Colour::ALL;
+    assert_eq!(fields(&[fast, sequential]), [red, red, green, green, blue, blue]);
+    let monochrome = ("mode = \"channel-packed\"", "mode = \"monochrome\"\ncolour = \"green\"");
+    assert_eq!(fields(&[fast, monochrome]), [green]);
+}
+
+#[test]
+fn keys_of_one_panel_mode_are_refused_in_another() {
+    let fault = |mode: &str| fault_of("mode = \"channel-packed\"", mode);
+    let line = |below_mode: usize| line_of("mode").map(|line| line + below_mode);
+    let missing = fault("mode = \"monochrome\"");
+    assert_fault(&missing, "panel.colour", line_of("[panel]"), "nothing", "\"green\"", "add colour");
+    let colour = fault("mode = \"channel-packed\"\ncolour = \"green\"");
+    assert_fault(&colour, "panel.colour", line(1), "channel-packed", "monochrome mode only", "take colour out");
+    let frames = fault("mode = \"channel-packed\"\nframes_per_colour = 2");
+    assert_fault(&frames, "panel.frames_per_colour", line(1), "2 in channel-packed", "1 outside", "field-sequential");
+    let many = fault("mode = \"channel-packed\"\nframes_per_colour = 9");
+    assert_fault(&many, "panel.frames_per_colour", line(1), "9", "8 video frames", "");
+}
+
+#[test]
 fn depths_are_given_once_and_in_order() {
     let inverted = fault_of("depth_far_m = inf", "depth_far_m = 0.2");
     assert_fault(&inverted, "optics.depth_near", line_of("depth_near_m"), "near 2.857 and far 5", "nearer", "exchange");
@@ -449,9 +483,89 @@ fn a_laser_box_needs_its_port() {
         "lasers.device",
         line_of("driver").map(|line| line + 1),
         "simulated",
-        "\"serial\"",
-        "take device out",
+        "chosen driver",
+        "take device out, or write driver = \"serial\" or \"ready-beam\"",
     );
+}
+
+/// The driver's line with other lines in its place.
+fn with_driver(lines: &str) -> Result<Rig, RigError> {
+    Rig::parse(&changed(&[("driver = \"simulated\"", lines)]), Path::new("bench/rig.toml"))
+}
+
+const ACCEPTED: &str = "accept_no_heartbeat = \"these lasers stay lit when holod dies\"";
+
+#[test]
+fn lasers_without_a_heartbeat_are_taken_only_where_the_rig_accepts_that_in_words() {
+    let ready_beam =
+        "driver = \"ready-beam\"\ndevice = \"/dev/x\"\nfull_power_mw = { red = 40, green = 30, blue = 50.5 }";
+    let text = "driver = \"text\"\nprofile = \"cobolt\"\ndevices = { green = \"/dev/g\", blue = \"/dev/b\" }";
+    for lines in [ready_beam, text] {
+        for words in ["", "\naccept_no_heartbeat = \"yes\""] {
+            let error = with_driver(&format!("{lines}{words}")).unwrap_err();
+            let [fault] = error.faults.as_slice() else { panic!("{error}") };
+            assert_eq!(fault.key, "lasers.accept_no_heartbeat");
+            assert!(fault.advice.contains("these lasers stay lit when holod dies"), "{fault}");
+        }
+        let rig = with_driver(&format!("{lines}\n{ACCEPTED}\ngated_by_panel = true")).unwrap();
+        assert!(!rig.lasers.driver.has_heartbeat() && rig.lasers.accept_no_heartbeat && rig.lasers.gated_by_panel);
+        match rig.lasers.driver {
+            LaserDriver::ReadyBeam { path, full_power_uw } => {
+                assert_eq!((path.to_str(), full_power_uw), (Some("/dev/x"), PerColour([40_000, 30_000, 50_500])));
+            }
+            LaserDriver::Text { profile, paths } => {
+                assert_eq!(profile.as_ref(), TextLaserProfile::named("cobolt").unwrap());
+                assert_eq!(paths, PerColour([None, Some("/dev/g".into()), Some("/dev/b".into())]));
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+}
+
+#[test]
+fn keys_of_another_laser_driver_and_keys_that_lack_are_named() {
+    for (lines, key, words) in [
+        ("driver = \"serial\"\ndevice = \"/dev/x\"\ngated_by_panel = true", "gated_by_panel", "ready-beam"),
+        ("driver = \"simulated\"\nsync_wire = true", "sync_wire", "serial"),
+        ("driver = \"ready-beam\"\ndevice = \"/dev/x\"", "full_power_mw", "full_power_mw = {"),
+        ("driver = \"text\"\nprofile = \"cobolt\"", "devices", "devices = {"),
+        ("driver = \"text\"\ndevices = { red = \"/dev/x\" }", "profile", "profile = "),
+        ("driver = \"text\"\nprofile = \"cobold\"\ndevices = { red = \"/dev/x\" }", "profile", "did you mean"),
+        (
+            "driver = \"text\"\nprofile = \"cobolt\"\ndevices = { red = \"/dev/x\", blue = \"/dev/x\" }",
+            "devices.blue",
+            "own port",
+        ),
+        ("driver = \"text\"\nprofile_file = \"none.toml\"\ndevices = { red = \"/dev/x\" }", "profile_file", "path"),
+    ] {
+        let error = with_driver(&format!("{lines}\n{ACCEPTED}")).unwrap_err();
+        let fault = error.faults.iter().find(|fault| fault.key == format!("lasers.{key}"));
+        let fault = fault.unwrap_or_else(|| panic!("{lines}: {error}"));
+        assert!(fault.line.is_some() && fault.advice.contains(words), "{fault}");
+    }
+}
+
+#[test]
+fn a_power_above_the_benchs_limit_is_refused() {
+    let limited = "driver = \"simulated\"\npower_limit_mw = { red = 2.0, green = 0.5 }";
+    let error = with_driver(limited).unwrap_err();
+    let [fault] = error.faults.as_slice() else { panic!("{error}") };
+    assert_eq!((fault.key.as_str(), fault.line.is_some()), ("lasers.power_mw.green", true));
+    assert!(fault.expected.contains("0.5 mW"), "{fault}");
+    let rig = with_driver("driver = \"simulated\"\npower_limit_mw = { red = 2.0 }").unwrap();
+    assert_eq!(rig.lasers.power_limit_mw, PerColour([2.0, 500.0, 500.0]));
+}
+
+#[test]
+fn faults_of_a_laser_profile_are_told_with_its_own_lines() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("mine.toml"), "description = \"mine\"\n[line]\nbaud = 3\n").unwrap();
+    let lines =
+        format!("driver = \"text\"\nprofile_file = \"mine.toml\"\ndevices = {{ red = \"/dev/x\" }}\n{ACCEPTED}");
+    let text = changed(&[("driver = \"simulated\"", &lines)]);
+    let error = Rig::parse(&text, &folder.path().join("rig.toml")).unwrap_err();
+    assert!(error.faults.len() > 3 && error.faults.iter().all(|fault| fault.key == "lasers.profile_file"), "{error}");
+    assert!(error.faults.iter().any(|fault| fault.found.contains("mine.toml line 3, line.baud: 3")), "{error}");
 }
 
 #[test]
@@ -520,7 +634,8 @@ fn every_profile_makes_a_rig() {
             .replace("height_px = 1080", "")
             .replace("pixel_pitch_um = 8.0", "")
             .replace("refresh_hz = 60.0", "")
-            .replace("bit_depth = 8", "");
+            .replace("bit_depth = 8", "")
+            .replace("channel-packed", "field-sequential");
         let rig = Rig::parse(&text, Path::new("")).unwrap_or_else(|error| panic!("{}: {error}", profile.name));
         assert_eq!(rig.meaning().panel_profile.as_deref(), Some(profile.name));
     }
@@ -571,26 +686,148 @@ fn straight(level: usize) -> f64 {
 #[test]
 fn a_lut_is_read_and_named_among_the_active_files() {
     let rig = load_lut(&lut_csv(|level| 0.1 + straight(level))).unwrap();
-    let lut_rad = rig.panel.lut_rad[Colour::Green].as_ref().unwrap();
-    assert_eq!((lut_rad.len(), lut_rad[0], lut_rad[7]), (256, 0.1, 0.1 + straight(7)));
+    let lut = rig.panel.lut[Colour::Green].as_ref().unwrap();
+    assert_eq!((lut.len(), lut[0], lut[7]), (256, entry(0, 0.1), entry(7, 0.1 + straight(7))));
     assert!((rig.panel.stroke_rad[Colour::Green] - straight(255)).abs() < 1e-12);
-    assert!(rig.panel.lut_rad[Colour::Red].is_none());
+    assert!(rig.panel.lut[Colour::Red].is_none());
     let files = rig.meaning().files;
     assert_eq!((files.len(), files[0].kind.as_str(), files[0].colour.as_str()), (1, "lut", "green"));
     assert!(files[0].path.is_absolute() && files[0].path.ends_with("green.csv"));
     let one_column: String = (0..256).map(|level| format!("{}\n", straight(level))).collect();
-    assert_eq!(load_lut(&one_column).unwrap().panel.lut_rad[Colour::Green].as_ref().unwrap()[255], straight(255));
+    assert_eq!(
+        load_lut(&one_column).unwrap().panel.lut[Colour::Green].as_ref().unwrap()[255],
+        entry(255, straight(255))
+    );
+}
+
+fn entry(level: u16, phase_rad: f64) -> LevelPhase {
+    LevelPhase { level, phase_rad }
+}
+
+/// The built-in rig whose green may have a stroke of any size, with a table of its own.
+fn load_sparse_lut(csv: &str) -> Result<Rig, RigError> {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("green.csv"), csv).unwrap();
+    let text = changed(&[(", green = 1.9921875", ""), ("settle_ms", "lut_file.green = \"green.csv\"\nsettle_ms")]);
+    Rig::parse(&text, &folder.path().join("rig.toml"))
+}
+
+#[test]
+fn a_lut_may_name_few_levels_with_phases_in_any_order() {
+    let table = [entry(3, 0.5), entry(17, 0.1), entry(200, 5.0), entry(255, 2.25)];
+    let csv: String = table.iter().map(|row| format!("{},{}\n", row.level, row.phase_rad)).collect();
+    let rig = load_sparse_lut(&csv).unwrap();
+    assert_eq!(rig.panel.lut[Colour::Green].as_deref(), Some(&table[..]));
+    assert!((rig.panel.stroke_rad[Colour::Green] - 4.9).abs() < 1e-12);
+    let notes = rig.meaning().notes;
+    assert!(
+        notes.iter().any(|note| note.contains("green: of 256 levels only the 4 in the table are used")),
+        "{notes:?}"
+    );
+
+    for (csv, found) in [
+        ("3,0.5\n2,5.0\n", "row 2 `2,5.0` should be level 4 or higher"),
+        ("3,0.5\n3,5.0\n", "row 2 `3,5.0` should be level 4 or higher"),
+        ("3,0.5\n256,5.0\n", "row 2 `256,5.0` has no level of 0 to 255"),
+        ("3,0.5\n4.5,5.0\n", "row 2 `4.5,5.0` has no level"),
+        ("3,0.5\n5.0\n", "2 rows"),
+        ("3,0.5\n", "1 rows"),
+        ("", "0 rows"),
+        ("# nothing\n", "0 rows"),
+        ("3,0.5\n200,0.6\n", "changes by 0.032 π"),
+    ] {
+        let error = load_sparse_lut(csv).expect_err(csv);
+        assert!(error.to_string().contains(found), "{csv:?}: {error}");
+    }
+    let falling = load_sparse_lut("0,5.0\n100,2.0\n200,0.0\n").unwrap_err();
+    assert!(falling.to_string().contains("a rising table, as phase_sign"), "{falling}");
+}
+
+#[test]
+fn sixteen_bits_have_a_table_of_65536_levels_at_most() {
+    let rows: String = (0..=65536).map(|level| format!("{}\n", f64::from(level) * 1e-4)).collect();
+    let folder = tempfile::tempdir().unwrap();
+    let parse = |csv: &str| {
+        fs::write(folder.path().join("green.csv"), csv).unwrap();
+        let text = changed(&[
+            (", green = 1.9921875", ""),
+            ("settle_ms", "lut_file.green = \"green.csv\"\nsettle_ms"),
+            ("bit_depth = 8", "bit_depth = 16\npacking = \"red8-green8\""),
+            ("channel-packed", "field-sequential"),
+        ]);
+        Rig::parse(&text, &folder.path().join("rig.toml"))
+    };
+    let one_too_many = parse(&rows).unwrap_err();
+    assert!(one_too_many.to_string().contains("row 65537 `6.5536"), "{one_too_many}");
+    let rig = parse(rows.rsplit_once("6.5536").unwrap().0).unwrap();
+    assert_eq!((rig.panel.packing, rig.panel.lut[Colour::Green].as_ref().unwrap().len()), (Packing::Red8Green8, 65536));
+}
+
+#[test]
+fn a_packing_fits_the_bits_and_the_mode() {
+    let ten = |packing: &str| fault_of("bit_depth = 8", &format!("bit_depth = 10\n{packing}"));
+    let (bits, packing) = (line_of("bit_depth"), line_of("bit_depth").map(|line| line + 1));
+    let either = "\"gray10\" or \"red8-blue2\" or \"red3-green3-blue4\", as bit_depth is 10";
+    assert_fault(&ten(""), "panel.packing", bits, "nothing", either, "add packing");
+    assert_fault(&ten("packing = \"gray\""), "panel.packing", packing, "carries 8 bits", either, "correct packing");
+    assert_fault(
+        &ten("packing = \"red8blue2\""),
+        "panel.packing",
+        packing,
+        "red8blue2",
+        "",
+        "did you mean \"red8-blue2\"?",
+    );
+    let packed = ten("packing = \"red8-blue2\"");
+    let found = "\"red8-blue2\" in mode \"channel-packed\"";
+    assert_fault(&packed, "panel.packing", packing, found, "\"gray\" or \"gray10\"", "\"field-sequential\"");
+    let deep = changed(&[("bit_depth = 8", "bit_depth = 10\npacking = \"gray10\"")]);
+    assert_eq!(Rig::parse(&deep, Path::new("")).unwrap().panel.packing, Packing::Gray10);
+    let wide = fault_of("bit_depth = 8", "bit_depth = 8\npacking = \"red8-green8\"");
+    assert_fault(&wide, "panel.packing", packing, "carries 16 bits", "\"gray\", as bit_depth is 8", "");
+    let sequential = changed(&[
+        ("bit_depth = 8", "bit_depth = 10\npacking = \"red8-blue2\""),
+        ("channel-packed", "field-sequential"),
+    ]);
+    let rig = Rig::parse(&sequential, Path::new("")).unwrap();
+    assert_eq!((rig.panel.bit_depth, rig.panel.packing), (10, Packing::Red8Blue2));
+    assert!(rig.meaning().to_string().contains("levels         10 bits, packing red8-blue2"), "{}", rig.meaning());
+}
+
+#[test]
+fn what_becomes_of_phases_out_of_stroke_is_chosen() {
+    for way in OutOfStroke::ALL {
+        let text = changed(&[
+            ("blue = 1.9921875", "blue = 1.5"),
+            ("settle_ms", &format!("out_of_stroke = \"{}\"\nsettle_ms", way.name())),
+        ]);
+        let rig = Rig::parse(&text, Path::new("")).unwrap();
+        assert_eq!(rig.panel.out_of_stroke, way);
+        let notes = rig.meaning().notes;
+        assert!(notes.iter().any(|note| note.starts_with("blue") && note.ends_with(way.meaning())), "{notes:?}");
+    }
+    let line = line_of("settle_ms");
+    let wrong = fault_of("settle_ms", "out_of_stroke = \"compress\"\nsettle_ms");
+    assert_fault(
+        &wrong,
+        "panel.out_of_stroke",
+        line,
+        "\"compress\"",
+        "\"nearest\", \"clip\", \"zero\", \"scale\"",
+        "choose one",
+    );
 }
 
 #[test]
 fn a_faulty_lut_names_its_file_and_row() {
     let good = lut_csv(straight);
     assert_lut_fault(&good.replacen("\n3,", "\n3;", 1), "green.csv: row 6 `3;0.07", "256 rows");
-    assert_lut_fault(&good.replacen("\n5,", "\n6,", 1), "row 8", "");
+    assert_lut_fault(&good.replacen("\n5,", "\n6,", 1), "row 9 `6,0.14", "");
     assert_lut_fault(&good.replacen("\n5,", "\n5,nan #", 1), "row 8 `5,nan #", "");
     assert_lut_fault(&good.replacen("\n9,", "\n9,9e9\n#", 1), "row 12 `9,9e9` has no phase in radians", "");
     assert_lut_fault(&good.replacen("\n9,", "\n9,1,", 1), "has more than two columns", "");
-    assert_lut_fault(&good.replacen("255,", "#", 1), "255 rows", "256 rows");
+    let one_column: String = (0..255).map(|level| format!("{}\n", straight(level))).collect();
+    assert_lut_fault(&one_column, "255 rows", "256 rows");
     assert_lut_fault(
         &lut_csv(|level| straight(level) + if level == 40 { 0.1 } else { 0.0 }),
         "at level 40",
@@ -640,10 +877,20 @@ fn a_flatness_picture_is_read_at_either_depth() {
 #[test]
 fn a_faulty_flatness_picture_is_named() {
     type Write = fn(&Path);
-    let cases: [(Write, &str); 4] = [
+    let cases: [(Write, &str); 7] = [
         (|path| GrayImage::new(66, 64).save(path).unwrap(), "66x64 pixels"),
-        (|path| RgbImage::new(64, 66).save(path).unwrap(), "Rgb8 pixels"),
-        (|path| fs::write(path, b"no picture").unwrap(), "flat.png: "),
+        (
+            |path| {
+                let mut picture = RgbImage::new(64, 66);
+                picture.put_pixel(5, 40, Rgb([7, 7, 8]));
+                picture.save(path).unwrap();
+            },
+            "the colour 7, 7, 8 at column 5 of row 40",
+        ),
+        (|path| RgbaImage::new(64, 66).save(path).unwrap(), "Rgba8 pixels"),
+        (|path| RgbImage::new(64, 66).save_with_format(path, ImageFormat::Jpeg).unwrap(), "neither PNG nor BMP"),
+        (|path| GrayImage::new(66, 64).save_with_format(path, ImageFormat::Bmp).unwrap(), "66x64 pixels"),
+        (|path| fs::write(path, b"no picture").unwrap(), "neither PNG nor BMP"),
         (
             |path| {
                 GrayImage::from_fn(64, 66, |x, y| Luma([(x * y) as u8])).save(path).unwrap();
@@ -659,6 +906,89 @@ fn a_faulty_flatness_picture_is_named() {
         let line = line_of("settle_ms").map(|line| line + 1);
         assert_fault(&error.faults[0], "panel.flatness_file.green", line, found, "64x66 pixels", "");
     }
+}
+
+/// A BMP of 64x66 pixels as vendors write them: 8 bits with a palette, rows from the bottom up. Byte `x + 64 y` from the
+/// top is `index`; `palette` gives red, green and blue of an index.
+fn paletted_bmp(index: impl Fn(usize) -> u8, palette: impl Fn(u8) -> [u8; 3]) -> Vec<u8> {
+    const HEADERS: u32 = 14 + 40;
+    const PALETTE: u32 = 4 * 256;
+    let pixels = 64 * 66;
+    let mut file = b"BM".to_vec();
+    for word in [HEADERS + PALETTE + pixels, 0, HEADERS + PALETTE, 40, 64, 66] {
+        file.extend(word.to_le_bytes());
+    }
+    file.extend(1u16.to_le_bytes());
+    file.extend(8u16.to_le_bytes());
+    for word in [0, pixels, 2835, 2835, 256, 0] {
+        file.extend(word.to_le_bytes());
+    }
+    for entry in 0..=255 {
+        let [red, green, blue] = palette(entry);
+        file.extend([blue, green, red, 0]);
+    }
+    for row in (0..66).rev() {
+        file.extend((0..64).map(|column| index(64 * row + column)));
+    }
+    file
+}
+
+fn load_flatness(bmp: &[u8], keys: &str) -> Result<Rig, RigError> {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("vendor.bmp"), bmp).unwrap();
+    let text = changed(&[
+        ("settle_ms = 2.0", &format!("settle_ms = 2.0\nflatness_file.green = \"vendor.bmp\"\n{keys}")),
+        ("width_px = 1920", "width_px = 64"),
+        ("height_px = 1080", "height_px = 66"),
+    ]);
+    Rig::parse(&text, &folder.path().join("rig.toml"))
+}
+
+#[test]
+fn a_vendors_bmp_is_read_right_side_up_with_its_own_gray_of_2pi_and_sign() {
+    let bmp = paletted_bmp(|pixel| (pixel / 64) as u8, |gray| [gray; 3]);
+    let flatness = |keys| {
+        let rig = load_flatness(&bmp, keys).unwrap();
+        let flatness_rad = rig.panel.flatness_rad[Colour::Green].clone().unwrap();
+        // Row 0 is gray 0, row 65 gray 65.
+        [flatness_rad[63], flatness_rad[64], flatness_rad[64 * 65]].map(f64::from)
+    };
+    let close = |found: [f64; 3], expected: [f64; 3]| {
+        found.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-6)
+    };
+    let step = TAU / 256.0;
+    assert!(close(flatness(""), [0.0, step, 65.0 * step]), "{:?}", flatness(""));
+    let hamamatsu = TAU / 105.0;
+    let scaled = flatness("flatness_2pi_gray = { green = 105 }");
+    assert!(close(scaled, [0.0, hamamatsu, 65.0 * hamamatsu]), "{scaled:?}");
+    let taken_off = flatness("flatness_sign = \"subtract\"");
+    assert!(close(taken_off, [0.0, -step, -65.0 * step]), "{taken_off:?}");
+    assert!(close(flatness("flatness_sign = \"add\""), flatness("")));
+    // Canary: a picture that is upside down is another one.
+    let upside_down = paletted_bmp(|pixel| 65 - (pixel / 64) as u8, |gray| [gray; 3]);
+    let rig = load_flatness(&upside_down, "").unwrap();
+    assert!(rig.panel.flatness_rad[Colour::Green].as_ref().unwrap()[63] > 1.0);
+}
+
+#[test]
+fn flatness_keys_that_contradict_each_other_are_refused() {
+    let bmp = paletted_bmp(|_| 1, |gray| [gray; 3]);
+    let one = |error: RigError| {
+        assert_eq!(error.faults.len(), 1, "{error}");
+        error.faults.into_iter().next().unwrap()
+    };
+    let line = |below: usize| line_of("settle_ms").map(|line| line + below);
+    let many = one(load_flatness(&bmp, "flatness_2pi_gray = { green = 300 }").unwrap_err());
+    assert_fault(&many, "panel.flatness_file.green", line(1), "256 grays, of which 300", "", "flatness_2pi_gray");
+    let none = one(load_flatness(&bmp, "flatness_2pi_gray = { green = 213, red = 213 }").unwrap_err());
+    assert_fault(&none, "panel.flatness_2pi_gray.red", line(2), "no picture", "", "name red's picture");
+    let sign = fault_of("settle_ms = 2.0", "settle_ms = 2.0\nflatness_sign = \"subtract\"");
+    assert_fault(&sign, "panel.flatness_sign", line(1), "a sign of no picture", "flatness_file", "");
+    let coloured = paletted_bmp(|_| 1, |gray| [gray, gray, 0]);
+    let coloured = one(load_flatness(&coloured, "").unwrap_err());
+    assert_fault(&coloured, "panel.flatness_file.green", line(1), "the colour 1, 1, 0 at column 0 of row 0", "", "");
+    let cut = one(load_flatness(&bmp[..2000], "").unwrap_err());
+    assert_fault(&cut, "panel.flatness_file.green", line(1), "vendor.bmp: ", "64x66 pixels", "");
 }
 
 #[test]
@@ -779,4 +1109,19 @@ proptest! {
         characters.splice(start..end, put.chars());
         assert_sound(Rig::parse(&characters.into_iter().collect::<String>(), Path::new("rig.toml")));
     }
+}
+
+#[test]
+fn a_file_that_says_nothing_of_the_bench_is_of_the_built_in_one() {
+    let parse = |text: &str| Rig::parse(text, Path::new("alone.toml"));
+    let rig = parse("[tracker]\nspec = \"replay:log.asc\"\nscale_mm_per_unit = 0.0125\n").expect("reads");
+    let built_in = Rig::default();
+    assert_eq!((rig.tracker.scale, rig.name.as_str()), (Some(0.0125), "alone"));
+    assert_eq!((&rig.panel, &rig.geometry, &rig.lasers), (&built_in.panel, &built_in.geometry, &built_in.lasers));
+    assert_eq!(parse("[model]\nnetwork = \"small\"\n").expect("reads").panel, built_in.panel);
+    // Its own faults are found, and a bench that is begun is described whole.
+    assert!(parse("[tracker]\nscael = 1.0\n").unwrap_err().to_string().contains("scael"));
+    let begun = parse("[tracker]\n[lasers]\n").unwrap_err().to_string();
+    assert!(begun.contains("panel") && begun.contains("optics"), "{begun}");
+    assert!(parse("name = \"nothing else\"\n").is_err());
 }

@@ -1,13 +1,16 @@
 //! The command line, as clap sees it.
 
-use std::convert::Infallible;
-use std::path::PathBuf;
+mod pattern;
+
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::rig::WeightsChoice;
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_pupil_input::UsbIds;
+
+pub use self::pattern::{ColourArg, PatternKind, PatternTarget, ProfileArg};
 
 /// Drives a holographic near-eye display in real time, closed loop with an eye tracker.
 ///
@@ -41,6 +44,9 @@ pub enum Command {
     Bench(BenchArgs),
     /// Judge weights by what an eye sees of the panel's levels, on held-out scenes with known thin-lens pictures.
     Evaluate(EvaluateArgs),
+    /// Draw a test pattern for the panel, say what is to be seen on the bench, show it.
+    #[command(subcommand)]
+    Pattern(PatternKind),
     /// Say what the running daemon is doing.
     Status(StatusArgs),
     /// List trackers, or try one out.
@@ -49,9 +55,33 @@ pub enum Command {
     /// Look into logs of pupil diameters, or convert them.
     #[command(subcommand)]
     Log(LogCommand),
-    /// Put the lasers out (for a service's ExecStopPost).
-    #[command(hide = true)]
-    Dark(DarkArgs),
+    /// Look at the laser box, try out that it goes dark by itself, or put the lasers out.
+    #[command(subcommand)]
+    Laser(LaserCommand),
+    /// Put the lasers out, also while a holod that hangs has their port open.
+    Dark(LaserArgs),
+}
+
+/// What can be done with the laser box.
+#[derive(Subcommand, Debug)]
+pub enum LaserCommand {
+    /// Say who the box is and how it is, without arming it.
+    Status(LaserArgs),
+    /// Arm the box with no laser lit, fall silent, and see that it goes dark by itself.
+    Arm(LaserArgs),
+    /// Put the lasers out.
+    Dark(LaserArgs),
+}
+
+/// Where the laser box is.
+#[derive(Args, Debug, Clone)]
+pub struct LaserArgs {
+    /// The rig.
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// The serial port of a box that speaks holod's laser protocol, in place of a rig file.
+    #[arg(long, value_name = "PATH", conflicts_with = "config")]
+    pub port: Option<PathBuf>,
 }
 
 /// What can be done with trackers.
@@ -91,9 +121,19 @@ pub struct NetworkArgs {
     pub weights: Option<WeightsChoice>,
 }
 
-fn parse_weights(text: &str) -> Result<WeightsChoice, Infallible> {
-    let built_in = WeightsChoice::BUILT_IN.into_iter().find(|(name, _)| *name == text);
-    Ok(built_in.map_or_else(|| WeightsChoice::File(text.into()), |(_, choice)| choice))
+fn parse_weights(text: &str) -> Result<WeightsChoice, String> {
+    if let Some((_, choice)) = WeightsChoice::BUILT_IN.into_iter().find(|(name, _)| *name == text) {
+        return Ok(choice);
+    }
+    // A bare word that is no file is a name that is mistyped.
+    if text.contains(['/', '.']) || Path::new(text).exists() {
+        return Ok(WeightsChoice::File(text.into()));
+    }
+    let names = WeightsChoice::BUILT_IN.map(|(name, _)| name);
+    let near = names.into_iter().max_by(|a, b| strsim::jaro_winkler(a, text).total_cmp(&strsim::jaro_winkler(b, text)));
+    let meant = near.filter(|near| strsim::jaro_winkler(near, text) > 0.7);
+    let meant = meant.map_or(String::new(), |name| format!("; did you mean `{name}`?"));
+    Err(format!("found `{text}`, neither {} nor a file{meant}", names.join(" nor ")))
 }
 
 /// Where pictures with depth come from.
@@ -161,21 +201,33 @@ pub struct RunArgs {
     /// The scene.
     #[command(flatten)]
     pub scene: SceneArgs,
-    /// Where patterns go: headless (a virtual panel that records what it showed).
-    #[arg(long, value_name = "SPEC", default_value = "headless")]
+    /// Where patterns go.
+    #[arg(
+        long,
+        value_name = "SPEC",
+        default_value = "headless",
+        help = "Where patterns go: headless (a virtual panel), drm:CONNECTOR (a graphics card's connector, without a \
+                desktop), or window:MONITOR[,allow_primary] (a window that covers a monitor of the desktop)"
+    )]
     pub output: String,
     /// Engine for the network.
     #[arg(long, value_enum, default_value_t = Backend::Auto)]
     pub backend: Backend,
+    /// Millimetres for one unit of the tracker's figure, in place of the rig's tracker.scale_mm_per_unit.
+    #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
+    pub scale: Option<f64>,
     /// Stop after this many frames.
     #[arg(long, value_name = "N", conflicts_with = "duration")]
     pub frames: Option<u64>,
-    /// Stop after this long, for example 10s or 2m.
+    /// Stop after this long, for example 10s or 2m; a log that is replayed and ends sooner ends the run.
     #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration)]
     pub duration: Option<Duration>,
     /// Write frames.csv, summary.json, and what the tracker sent (tracker.holodraw, samples.csv) into this directory.
     #[arg(long, value_name = "DIR")]
     pub record: Option<PathBuf>,
+    /// Overwrite an earlier record.
+    #[arg(long, requires = "record")]
+    pub force: bool,
     /// Print the summary as JSON.
     #[arg(long)]
     pub json: bool,
@@ -184,9 +236,18 @@ pub struct RunArgs {
 /// Options of `demo`.
 #[derive(Args, Debug, Clone)]
 pub struct DemoArgs {
-    /// Directory for the pictures.
-    #[arg(long, value_name = "DIR", default_value = "holod-demo")]
-    pub out: PathBuf,
+    /// The network.
+    #[command(flatten)]
+    pub network: NetworkArgs,
+    /// Size of the hologram in panel pixels; 512x512 when left out.
+    #[arg(long, value_name = "WxH", value_parser = parse_resolution)]
+    pub resolution: Option<Resolution>,
+    /// Directory for the pictures; holod-demo when left out, or holod-demo-2 and so on where that is there already.
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Overwrite what is there already.
+    #[arg(long, requires = "out")]
+    pub force: bool,
     /// How long the loop runs.
     #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration, default_value = "10s")]
     pub duration: Duration,
@@ -213,6 +274,9 @@ pub struct RenderArgs {
     /// Directory for field.safetensors, phase_{red,green,blue}.png and report.json.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
+    /// Overwrite what is there already.
+    #[arg(long)]
+    pub force: bool,
     /// Print the report as JSON.
     #[arg(long)]
     pub json: bool,
@@ -245,9 +309,12 @@ pub struct ViewArgs {
     /// Diameter of the pupil that looks, in millimetres; the one that the hologram was made for when left out.
     #[arg(long, value_name = "MM", value_parser = parse_pupil)]
     pub eye_pupil: Option<PupilDiameter>,
-    /// PNG to write.
+    /// PNG to write; - is standard output.
     #[arg(long, value_name = "FILE.png")]
     pub out: PathBuf,
+    /// Overwrite what is there already.
+    #[arg(long)]
+    pub force: bool,
     /// Print what was done as JSON.
     #[arg(long)]
     pub json: bool,
@@ -259,6 +326,18 @@ pub struct CheckArgs {
     /// The rig.
     #[command(flatten)]
     pub rig: RigArgs,
+    /// The network.
+    #[command(flatten)]
+    pub network: NetworkArgs,
+    /// Eye tracker's spec, as `run` takes it; the rig's own when left out.
+    #[arg(long, value_name = "SPEC")]
+    pub tracker: Option<String>,
+    /// Size of the hologram whose frames a second are estimated; that of the built-in scene and the panel's when left out.
+    #[arg(long, value_name = "WxH", value_parser = parse_resolution)]
+    pub resolution: Option<Resolution>,
+    /// The panel, as `run` takes it: opened, looked at with the flat pattern on it, and closed.
+    #[arg(long, value_name = "SPEC")]
+    pub output: Option<String>,
     /// Print the findings as JSON.
     #[arg(long)]
     pub json: bool,
@@ -320,11 +399,17 @@ pub struct EvaluateArgs {
     /// Write evaluation.json and sheet.png into this directory.
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
+    /// Overwrite what is there already.
+    #[arg(long, requires = "out")]
+    pub force: bool,
 }
 
 /// Options of `status`.
 #[derive(Args, Debug, Clone)]
 pub struct StatusArgs {
+    /// Of several that run, the one of this process number.
+    #[arg(long, value_name = "PID")]
+    pub pid: Option<u32>,
     /// Print the status as JSON.
     #[arg(long)]
     pub json: bool,
@@ -365,6 +450,9 @@ pub struct TryArgs {
     /// the first.
     #[arg(long, value_name = "DIR")]
     pub record: Option<PathBuf>,
+    /// Overwrite an earlier record.
+    #[arg(long, requires = "record")]
+    pub force: bool,
     /// Print what was found as JSON, and show nothing meanwhile.
     #[arg(long)]
     pub json: bool,
@@ -379,9 +467,13 @@ pub struct LogInfoArgs {
     /// Millimetres for one unit of the log's figure, where it is not in millimetres.
     #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
     pub scale: Option<f64>,
-    /// Write a plot of raw, rejected and believed samples as SVG.
+    /// Write a plot of raw, rejected and believed samples as SVG; - is standard output. Without millimetres it shows the
+    /// raw samples in the log's own unit.
     #[arg(long, value_name = "FILE.svg")]
     pub plot: Option<PathBuf>,
+    /// Overwrite the plot where it is there already.
+    #[arg(long, requires = "plot")]
+    pub force: bool,
     /// Print what was found as JSON.
     #[arg(long)]
     pub json: bool,
@@ -405,20 +497,15 @@ pub struct LogConvertArgs {
     /// The format to write.
     #[arg(long, value_enum)]
     pub to: LogFormatArg,
-    /// The file to write; one that is there already is never overwritten.
+    /// The file to write; - is standard output.
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
+    /// Overwrite what is there already.
+    #[arg(long)]
+    pub force: bool,
     /// Millimetres for one unit of the log's figure, where it is not in millimetres; for lines only.
     #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
     pub scale: Option<f64>,
-}
-
-/// Options of `dark`.
-#[derive(Args, Debug, Clone)]
-pub struct DarkArgs {
-    /// The rig.
-    #[command(flatten)]
-    pub rig: RigArgs,
 }
 
 fn parse_scale(text: &str) -> Result<f64, String> {
@@ -481,6 +568,16 @@ mod tests {
         assert!(cli.command.is_none());
         assert_eq!(cli.run.tracker.as_deref(), Some("/dev/ttyUSB0"));
         assert_eq!(cli.run.duration, Some(Duration::from_secs(2)));
+    }
+
+    #[test]
+    fn a_mistyped_network_is_told_from_a_file() {
+        assert_eq!(parse_weights("small"), Ok(WeightsChoice::Small));
+        assert_eq!(parse_weights("./smal"), Ok(WeightsChoice::File("./smal".into())));
+        assert_eq!(parse_weights("x.safetensors"), Ok(WeightsChoice::File("x.safetensors".into())));
+        assert!(parse_weights("smal").unwrap_err().contains("did you mean `small`?"));
+        assert!(parse_weights("standart").unwrap_err().contains("did you mean `standard`?"));
+        assert!(!parse_weights("xyz").unwrap_err().contains("did you mean"));
     }
 
     #[test]

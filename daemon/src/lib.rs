@@ -2,13 +2,20 @@
 
 pub mod cli;
 pub mod commands;
+pub mod destination;
 pub mod evaluation;
+pub mod exposure;
 pub mod failure;
+#[cfg(feature = "fault-injection")]
+mod fault;
+pub mod logging;
 pub mod pictures;
+pub mod progress;
 pub mod record;
 pub mod report;
 pub mod session;
 pub mod setup;
+pub mod speed;
 pub mod staging;
 pub mod status;
 pub mod terminal;

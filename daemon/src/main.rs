@@ -4,8 +4,7 @@ use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use clap::Parser;
-use holod_daemon::{cli::Cli, commands};
-use tracing_subscriber::EnvFilter;
+use holod_daemon::{cli::Cli, commands, logging};
 
 fn main() -> ExitCode {
     let cli = Cli::try_parse().unwrap_or_else(|error| {
@@ -13,13 +12,17 @@ fn main() -> ExitCode {
         let _ = error.print();
         std::process::exit(code)
     });
-    let filter = EnvFilter::try_from_env("HOLOD_LOG").unwrap_or_else(|_| EnvFilter::new("info"));
+    let asked = std::env::var_os("HOLOD_LOG").map(|asked| asked.to_string_lossy().into_owned());
+    let (filter, complaint) = logging::filter(asked.as_deref());
     tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .with_target(false)
         .init();
+    if let Some(complaint) = complaint {
+        tracing::warn!("{complaint}");
+    }
     match commands::dispatch(cli) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {

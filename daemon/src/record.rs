@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 use std::fs::{self, File, OpenOptions};
 use std::io::{BufWriter, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::{Colour, PupilDiameter, TimeNs};
@@ -59,6 +60,30 @@ pub struct FieldRecord {
 pub const HEADER: &str = "frame,field,colour,t_sample_ns,pupil_raw_mm,pupil_mm,pupil_state,t_wake_ns,t_render_begin_ns,\
 t_render_end_ns,t_submit_ns,t_present_ns,present_provenance,laser_on_ns,laser_off_ns,deadline_missed";
 
+/// The files of a record whose names are always the same.
+const FILES: [&str; 4] = ["frames.csv", "summary.json", "samples.csv", "tracker.holodraw"];
+/// How the names of the levels that were shown begin and end.
+const SHOWN: (&str, &str) = ("shown_pupil_", ".png");
+
+/// Takes an earlier record out of `folder`, for a run that is to overwrite it; other files stay.
+///
+/// # Errors
+/// One of them cannot be removed.
+pub fn remove_earlier(folder: &Path) -> Result<(), Failure> {
+    let cannot = |error: std::io::Error| {
+        Failure::new(Exit::CannotCreate, format!("cannot overwrite the record in {}: {error}", folder.display()))
+    };
+    let Ok(entries) = fs::read_dir(folder) else { return Ok(()) };
+    for entry in entries {
+        let entry = entry.map_err(cannot)?;
+        let name = entry.file_name().to_string_lossy().into_owned();
+        if FILES.contains(&name.as_str()) || (name.starts_with(SHOWN.0) && name.ends_with(SHOWN.1)) {
+            fs::remove_file(entry.path()).map_err(cannot)?;
+        }
+    }
+    Ok(())
+}
+
 /// Writes `frames.csv` as the run goes; what a crash can cost is what came since the last [`FrameLog::flush`].
 pub struct FrameLog {
     file: BufWriter<File>,
@@ -83,7 +108,10 @@ impl FrameLog {
         let file = OpenOptions::new().write(true).create_new(true).open(&path).map_err(|error| match error.kind() {
             std::io::ErrorKind::AlreadyExists => Failure::new(
                 Exit::CannotCreate,
-                format!("{} holds an earlier record; name another directory with --record", path.display()),
+                format!(
+                    "{} holds an earlier record; name another directory with --record, or overwrite it with --force",
+                    path.display()
+                ),
             ),
             _ => cannot(error),
         })?;
@@ -136,7 +164,13 @@ impl FrameLog {
     /// # Errors
     /// The disk's, with the file's name.
     pub fn flush(&mut self) -> Result<(), Failure> {
-        self.file.flush().map_err(|error| self.lost(&error))
+        let links = self.file.flush().and_then(|()| self.file.get_ref().metadata()).map(|metadata| metadata.nlink());
+        match links {
+            // What is written into a file without a name is lost when it is closed.
+            Ok(0) => Err(self.lost(&std::io::Error::new(std::io::ErrorKind::NotFound, "the file was deleted"))),
+            Ok(_) => Ok(()),
+            Err(error) => Err(self.lost(&error)),
+        }
     }
 
     /// Takes the file away again where no frame was ever made, so that the same directory may be named again.
@@ -208,6 +242,32 @@ mod tests {
         fs::write(folder.path().join("frames.csv"), "precious").unwrap();
         assert_eq!(FrameLog::create(folder.path()).err().unwrap().exit, Exit::CannotCreate);
         assert_eq!(fs::read_to_string(folder.path().join("frames.csv")).unwrap(), "precious");
+    }
+
+    #[test]
+    fn a_record_that_is_deleted_is_noticed_when_it_is_flushed() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = FrameLog::create(&folder.path().join("record")).unwrap();
+        log.flush().unwrap();
+        fs::remove_dir_all(folder.path().join("record")).unwrap();
+        let failure = log.flush().unwrap_err();
+        assert_eq!(failure.exit, Exit::CannotCreate);
+        assert!(failure.to_string().contains("frames.csv: the file was deleted"), "{failure}");
+    }
+
+    #[test]
+    fn force_takes_an_earlier_record_away_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let names =
+            ["frames.csv", "summary.json", "samples.csv", "tracker.holodraw", "shown_pupil_3.00mm_frame_000001.png"];
+        for name in names.into_iter().chain(["notes.txt", "shown.png"]) {
+            fs::write(folder.path().join(name), "old").unwrap();
+        }
+        remove_earlier(folder.path()).unwrap();
+        let mut left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        left.sort();
+        assert_eq!(left, ["notes.txt", "shown.png"]);
+        remove_earlier(&folder.path().join("absent")).unwrap();
     }
 
     #[test]

@@ -54,11 +54,19 @@ pub fn summary_text(summary: &Summary) -> String {
         summary.frames_by_pupil_state.iter().map(|(state, count)| format!("{count} {state}")).collect();
     let pupils = summary.pupil_range_mm.map_or("none".to_owned(), |[a, b]| format!("{a:.2} to {b:.2} mm"));
     let lasers = &summary.lasers;
+    let slow = summary.speed_advice.as_ref().map_or(String::new(), |advice| format!("\n          {advice}"));
+    let mut trouble =
+        summary.tracker_trouble.as_ref().map_or(String::new(), |trouble| format!("\n          {trouble}"));
+    if summary.tracker_records_lost > 0 {
+        let lost = summary.tracker_records_lost;
+        trouble.push_str(&format!("\n          the recording lost {lost} pieces: the disk is too slow for it"));
+    }
     format!(
         "ended by {} after {:.1} s\n\
-         frames    {} made, {} shown ({} late); {} colour fields shown, {} of them repetitions\n\
+         frames    {} made, {} shown ({} late), {:.1} a second of the panel's {:.1}; {} colour fields shown, {} of them \
+         repetitions{slow}\n\
          pupil     {pupils}; frames: {}\n\
-         tracker   {}: link {}, {} samples, {} rejected\n\
+         tracker   {}: link {}, {} samples, {} rejected{trouble}\n\
          time      per frame {}; tracker sample to photons {}\n\
          lasers    {} fields judged: {} lit by their own colour, {} kept dark, {} faults of which {} unsafe\n\
          shutdown  lasers dark: {}; flat pattern on the panel: {}",
@@ -67,6 +75,8 @@ pub fn summary_text(summary: &Summary) -> String {
         summary.frames_made,
         summary.frames_shown,
         summary.deadline_misses,
+        summary.frames_shown_hz,
+        summary.panel_frames_hz,
         summary.fields_shown,
         summary.fields_repeated,
         states.join(", "),
@@ -81,7 +91,7 @@ pub fn summary_text(summary: &Summary) -> String {
         lasers.dark,
         lasers.findings_in_all,
         lasers.unsafe_findings,
-        summary.lasers_dark_at_end,
+        summary.lasers_not_dark.as_ref().map_or("true".to_owned(), |why| format!("false ({why})")),
         summary.flat_at_end,
     )
 }

@@ -1,8 +1,8 @@
 //! From names on the command line to the parts of a run: rig, weights, scene.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use holod_calibration::rig::{LaserDriver, Rig, WeightsChoice};
+use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_calibration::{DisplayGeometry, Resolution};
 use holod_model::scene::{DepthEncoding, Fit, FrameReport, Scene, SceneError};
 use holod_model::{CpuEngine, RgbdFrame, Weights, scene_renderer};
@@ -20,7 +20,10 @@ const SEQUENCE_BYTES_MAX: usize = 4 << 30;
 pub fn rig(args: &RigArgs) -> Result<Rig, Failure> {
     match &args.config {
         None => Ok(Rig::default()),
-        Some(path) => Rig::load(path).map_err(Failure::because(Exit::Config)),
+        Some(path) => {
+            let exit = if path.exists() { Exit::Config } else { Exit::NoInput };
+            Rig::load(path).map_err(Failure::because(exit))
+        }
     }
 }
 
@@ -128,6 +131,7 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
             ));
         }
         warn_of_odd_depth(spec, &frame, &report, geometry);
+        warn_of_clipped_colours(spec, &frame, &report);
         loaded.frames.push(frame);
         loaded.reports.push(report);
     }
@@ -149,6 +153,18 @@ fn warn_of_odd_depth(name: &str, frame: &RgbdFrame, report: &FrameReport, geomet
     }
 }
 
+/// Colours that are nearly all brighter than white are most often scene-linear light that was never exposed.
+fn warn_of_clipped_colours(name: &str, frame: &RgbdFrame, report: &FrameReport) {
+    let pixels = frame.resolution.pixels();
+    if 2 * report.colour_clipped_px > pixels {
+        tracing::warn!(
+            "{name}: {} of {pixels} pixels are brighter than white and were clipped: scale the picture's light so that \
+             white is 1",
+            report.colour_clipped_px
+        );
+    }
+}
+
 fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
     if args.depth_encoding.is_some() {
         return Err(Failure::new(Exit::Usage, "--depth-encoding says how to read a depth file: name one with --scene"));
@@ -166,10 +182,7 @@ fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames,
 
 /// Ports that belong to something else than the tracker: the laser box's.
 pub fn ports_of_others(rig: &Rig) -> Vec<PathBuf> {
-    match &rig.lasers.driver {
-        LaserDriver::Simulated => Vec::new(),
-        LaserDriver::Serial { path } => vec![path.clone()],
-    }
+    rig.lasers.driver.paths().into_iter().map(Path::to_path_buf).collect()
 }
 
 /// The built-in scene as the network reads it.

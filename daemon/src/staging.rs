@@ -2,20 +2,27 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, Once, PoisonError};
 
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use tempfile::TempDir;
 
+use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
 
-/// Files on their way into a directory: written beside it, moved in by rename when all are whole.
+/// Files on their way into a directory: written beside it, moved in by rename when all are whole. What is half done when a
+/// signal ends the process is taken away first.
 pub struct Staging {
     target: PathBuf,
     beside: TempDir,
+    force: bool,
 }
 
 impl Staging {
-    /// Prepares to fill `target`, which may exist; its parent is created where it is missing.
-    pub fn new(target: &Path) -> Result<Self, Failure> {
+    /// Prepares to fill `target`, which may exist, but holds none of `files` unless with `force`; its parent is created
+    /// where it is missing.
+    pub fn new(target: &Path, files: &[&str], force: bool) -> Result<Self, Failure> {
         let cannot = |error: std::io::Error| {
             Failure::new(
                 Exit::CannotCreate,
@@ -31,13 +38,16 @@ impl Staging {
                 format!("cannot write into {}: it is a file; name a directory with --out", target.display()),
             ));
         }
+        refuse_existing(files.iter().map(|file| target.join(file)), "--out", force)?;
         let parent = match target.parent() {
             Some(parent) if !parent.as_os_str().is_empty() => parent,
             _ => Path::new("."),
         };
         fs::create_dir_all(parent).map_err(cannot)?;
+        take_away_on_signals();
         let beside = tempfile::Builder::new().prefix(".holod-partial-").tempdir_in(parent).map_err(cannot)?;
-        Ok(Self { target: target.to_owned(), beside })
+        half_done(|folders| folders.push(beside.path().to_owned()));
+        Ok(Self { target: target.to_owned(), beside, force })
     }
 
     /// Where to write the file that will be called `name`.
@@ -50,13 +60,54 @@ impl Staging {
         let cannot = |error: std::io::Error| {
             Failure::new(Exit::CannotCreate, format!("cannot move results into {}: {error}", self.target.display()))
         };
-        fs::create_dir_all(&self.target).map_err(cannot)?;
+        let mut names = Vec::new();
         for entry in fs::read_dir(self.beside.path()).map_err(cannot)? {
-            let entry = entry.map_err(cannot)?;
-            fs::rename(entry.path(), self.target.join(entry.file_name())).map_err(cannot)?;
+            names.push(entry.map_err(cannot)?.file_name());
+        }
+        // Looked for again: it may have come meanwhile.
+        refuse_existing(names.iter().map(|name| self.target.join(name)), "--out", self.force)?;
+        fs::create_dir_all(&self.target).map_err(cannot)?;
+        for name in names {
+            fs::rename(self.beside.path().join(&name), self.target.join(&name)).map_err(cannot)?;
         }
         Ok(())
     }
+}
+
+impl Drop for Staging {
+    fn drop(&mut self) {
+        half_done(|folders| folders.retain(|folder| folder != self.beside.path()));
+    }
+}
+
+static HALF_DONE: Mutex<Vec<PathBuf>> = Mutex::new(Vec::new());
+/// A run obeys signals itself, and puts its lasers out first.
+static OBEYED_ELSEWHERE: AtomicBool = AtomicBool::new(false);
+
+fn half_done<T>(with: impl FnOnce(&mut Vec<PathBuf>) -> T) -> T {
+    with(&mut HALF_DONE.lock().unwrap_or_else(PoisonError::into_inner))
+}
+
+/// Leaves signals to a run, or takes them back from it.
+pub(crate) fn leave_signals_to_a_run(left: bool) {
+    OBEYED_ELSEWHERE.store(left, Ordering::Release);
+}
+
+/// Starts the thread that waits for signals, once. Where there can be none, signals end the process as ever.
+fn take_away_on_signals() {
+    static STARTED: Once = Once::new();
+    STARTED.call_once(|| {
+        let Ok(mut signals) = signal_hook::iterator::Signals::new([SIGINT, SIGTERM, SIGHUP]) else { return };
+        let wait = move || {
+            for signal in signals.forever() {
+                if !OBEYED_ELSEWHERE.load(Ordering::Acquire) {
+                    half_done(|folders| folders.iter().for_each(|folder| drop(fs::remove_dir_all(folder))));
+                    std::process::exit(128 + signal);
+                }
+            }
+        };
+        let _ = std::thread::Builder::new().name("holod-signals".into()).spawn(wait);
+    });
 }
 
 #[cfg(test)]
@@ -67,12 +118,12 @@ mod tests {
     fn nothing_appears_before_the_commit_and_nothing_stays_beside() {
         let root = tempfile::tempdir().unwrap();
         let target = root.path().join("a/out");
-        let abandoned = Staging::new(&target).unwrap();
+        let abandoned = Staging::new(&target, &["x"], false).unwrap();
         fs::write(abandoned.path("x"), "half").unwrap();
         drop(abandoned);
         assert!(!target.exists());
 
-        let staging = Staging::new(&target).unwrap();
+        let staging = Staging::new(&target, &["x"], false).unwrap();
         fs::write(staging.path("x"), "whole").unwrap();
         assert!(!target.exists());
         staging.commit().unwrap();
@@ -81,11 +132,29 @@ mod tests {
     }
 
     #[test]
+    fn what_is_there_is_overwritten_by_force_only() {
+        let root = tempfile::tempdir().unwrap();
+        let target = root.path().join("out");
+        fs::create_dir(&target).unwrap();
+        let early = Staging::new(&target, &["x"], false).unwrap();
+        fs::write(early.path("x"), "new").unwrap();
+        fs::write(target.join("x"), "precious").unwrap();
+        assert_eq!(Staging::new(&target, &["x"], false).err().unwrap().exit, Exit::CannotCreate);
+        assert_eq!(early.commit().unwrap_err().exit, Exit::CannotCreate, "it has come meanwhile");
+        assert_eq!(fs::read_to_string(target.join("x")).unwrap(), "precious");
+        assert!(Staging::new(&target, &["y"], false).is_ok(), "other files are in nobody's way");
+        let forced = Staging::new(&target, &["x"], true).unwrap();
+        fs::write(forced.path("x"), "new").unwrap();
+        forced.commit().unwrap();
+        assert_eq!(fs::read_to_string(target.join("x")).unwrap(), "new");
+    }
+
+    #[test]
     fn a_file_in_the_place_of_the_directory_is_refused() {
         let root = tempfile::tempdir().unwrap();
         let file = root.path().join("file");
         fs::write(&file, "precious").unwrap();
-        let failure = Staging::new(&file).err().unwrap();
+        let failure = Staging::new(&file, &[], true).err().unwrap();
         assert_eq!(failure.exit, Exit::CannotCreate);
         assert_eq!(fs::read_to_string(&file).unwrap(), "precious");
     }

@@ -1,8 +1,10 @@
-//! What a running holod says of itself: a small JSON file that it writes anew each second and takes away at its end.
+//! What a running holod says of itself: a small JSON file of its own that it writes anew each second and takes away at its
+//! end.
 
 use std::collections::BTreeMap;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use holod_model::files;
 use serde::{Deserialize, Serialize};
@@ -25,16 +27,32 @@ pub struct Status {
     pub tracker: String,
     /// How the tracker's link is.
     pub tracker_link: String,
-    /// Why a lost link does not come back.
+    /// Why a lost link does not come back, or why nothing that the tracker sends is believed.
     pub tracker_trouble: Option<String>,
     /// What the pupil's estimate rests on.
     pub pupil_state: String,
     /// The pupil that the newest frame was made for.
     pub pupil_mm: Option<f32>,
+    /// The panel's spec.
+    pub panel: String,
+    /// Why the panel is lost, where it is.
+    pub panel_trouble: Option<String>,
+    /// Refreshes of the panel a second, as it reports them; 0 until it has.
+    pub panel_refresh_hz: f64,
+    /// Whether lasers may be lit: armed or dark.
+    pub lasers: String,
+    /// What is wrong with the laser box, where something is.
+    pub lasers_trouble: Option<String>,
     /// Frames that were made.
     pub frames_made: u64,
     /// Of those, frames that came on the panel.
     pub frames_shown: u64,
+    /// Frames that came on the panel in the last second.
+    pub frames_shown_hz: f64,
+    /// Frames of all colours that the panel could show in a second.
+    pub panel_frames_hz: f64,
+    /// What would bring the first of these two nearer to the second, where that is needed.
+    pub speed_advice: Option<String>,
     /// Frames that came on the panel later than planned.
     pub deadline_misses: u64,
     /// From waking to the submitted levels.
@@ -45,16 +63,34 @@ pub struct Status {
     pub tracker_counts: BTreeMap<String, u64>,
 }
 
-const NAME: &str = "status.json";
 /// The folder that the service's unit asks systemd for.
 const SERVICE_FOLDER: &str = "/run/holod";
 /// A file older than this was not written by a loop that still turns.
 const STALE: Duration = Duration::from_secs(5);
 
-/// Where this process puts its status: the folder that systemd made for it, or one in the user's own runtime folder.
-fn own_folder() -> Option<PathBuf> {
-    let service = std::env::var_os("RUNTIME_DIRECTORY").map(PathBuf::from);
-    service.or_else(|| std::env::var_os("XDG_RUNTIME_DIR").map(|folder| Path::new(&folder).join("holod")))
+/// The file of one process: each has its own, so that two holods know nothing of each other's.
+fn file_name(pid: u32) -> String {
+    format!("status-{pid}.json")
+}
+
+/// Where this process may put its status, the best place first: the folder that systemd made for it, one in the user's own
+/// runtime folder, one of this user's in the folder for temporary files.
+fn own_folders() -> Vec<PathBuf> {
+    let named = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let uid = rustix::process::getuid().as_raw();
+    let login = PathBuf::from(format!("/run/user/{uid}"));
+    let runtime =
+        named("XDG_RUNTIME_DIR").or_else(|| login.is_dir().then_some(login)).map(|folder| folder.join("holod"));
+    let temporary = std::env::temp_dir().join(format!("holod-{uid}"));
+    named("RUNTIME_DIRECTORY").into_iter().chain(runtime).chain([temporary]).collect()
+}
+
+/// Makes a folder that only this user can write to; false where it cannot be, or is somebody else's.
+fn prepare(folder: &Path) -> bool {
+    let made = std::fs::DirBuilder::new().recursive(true).mode(0o700).create(folder).is_ok();
+    let own = std::fs::symlink_metadata(folder)
+        .is_ok_and(|metadata| metadata.is_dir() && metadata.uid() == rustix::process::geteuid().as_raw());
+    made && own
 }
 
 /// The file of a running process. Dropping it takes the file away.
@@ -64,11 +100,10 @@ pub struct StatusFile {
 }
 
 impl StatusFile {
-    /// The file, in its folder; a process without a runtime folder has none, which is no fault.
+    /// The file, in the first folder that takes it; a process without any has none, which is no fault.
     pub fn create() -> Self {
-        let path =
-            own_folder().filter(|folder| std::fs::create_dir_all(folder).is_ok()).map(|folder| folder.join(NAME));
-        Self { path }
+        let folder = own_folders().into_iter().find(|folder| prepare(folder));
+        Self { path: folder.map(|folder| folder.join(file_name(std::process::id()))) }
     }
 
     /// Writes the file anew. A disk that refuses is told once.
@@ -86,48 +121,52 @@ impl StatusFile {
 
 impl Drop for StatusFile {
     fn drop(&mut self) {
-        let own = |path: &Path| read(path).is_some_and(|(status, _)| status.pid == std::process::id());
-        if let Some(path) = self.path.take().filter(|path| own(path)) {
+        if let Some(path) = self.path.take() {
             let _ = std::fs::remove_file(path);
         }
     }
 }
 
-fn read(path: &Path) -> Option<(Status, SystemTime)> {
-    let written = std::fs::metadata(path).ok()?.modified().ok()?;
-    Some((serde_json::from_slice(&std::fs::read(path).ok()?).ok()?, written))
+/// What a running holod wrote last.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Found {
+    /// It.
+    pub status: Status,
+    /// How long ago that was, where it is too long.
+    pub stale: Option<Duration>,
 }
 
-/// The status of the holod that runs as a service, or else of this user's own, and how long ago it was written where that
-/// is too long.
+/// Every holod that runs, that of the service first, else in the order of their numbers.
 ///
 /// # Errors
 /// None runs, or what it says may not be read.
-pub fn of_running() -> Result<(Status, Option<Duration>), Failure> {
+pub fn of_running() -> Result<Vec<Found>, Failure> {
     let mut folders = vec![PathBuf::from(SERVICE_FOLDER)];
-    folders.extend(own_folder());
+    folders.extend(own_folders());
+    folders.dedup();
     of_running_in(&folders)
 }
 
-fn of_running_in(folders: &[PathBuf]) -> Result<(Status, Option<Duration>), Failure> {
+fn of_running_in(folders: &[PathBuf]) -> Result<Vec<Found>, Failure> {
+    let mut running: Vec<Found> = Vec::new();
     for folder in folders {
-        let path = folder.join(NAME);
-        match std::fs::File::open(&path) {
+        let entries = match std::fs::read_dir(folder) {
             Err(error) if error.kind() == std::io::ErrorKind::PermissionDenied => {
                 return Err(Failure::new(
                     Exit::NoInput,
-                    format!("{}: {error}; ask as root, or as a member of the group `holod`", path.display()),
+                    format!("{}: {error}; ask as root, or as a member of the group `holod`", folder.display()),
                 ));
             }
             Err(_) => continue,
-            Ok(_) => {}
-        }
-        let Some((status, written)) = read(&path) else { continue };
-        if !Path::new("/proc").join(status.pid.to_string()).exists() {
-            continue;
-        }
-        let age = written.elapsed().unwrap_or_default();
-        return Ok((status, (age > STALE).then_some(age)));
+            Ok(entries) => entries,
+        };
+        let mut found: Vec<Found> = entries.flatten().filter_map(|entry| read(&entry.path())).collect();
+        found.sort_by_key(|found| found.status.pid);
+        found.retain(|one| running.iter().all(|other| other.status.pid != one.status.pid));
+        running.extend(found);
+    }
+    if !running.is_empty() {
+        return Ok(running);
     }
     let folders: Vec<_> = folders.iter().map(|folder| folder.display().to_string()).collect();
     Err(Failure::new(
@@ -139,8 +178,21 @@ fn of_running_in(folders: &[PathBuf]) -> Result<(Status, Option<Duration>), Fail
     ))
 }
 
+/// The status of a process that lives, out of its own file.
+fn read(path: &Path) -> Option<Found> {
+    let written = std::fs::metadata(path).ok()?.modified().ok()?;
+    let name = path.file_name()?.to_str()?;
+    name.strip_prefix("status-")?.strip_suffix(".json")?;
+    let status: Status = serde_json::from_slice(&std::fs::read(path).ok()?).ok()?;
+    let lives = name == file_name(status.pid) && Path::new("/proc").join(status.pid.to_string()).exists();
+    let age = written.elapsed().unwrap_or_default();
+    lives.then_some(Found { status, stale: (age > STALE).then_some(age) })
+}
+
 #[cfg(test)]
 mod tests {
+    use std::time::SystemTime;
+
     use super::*;
 
     fn status() -> Status {
@@ -152,9 +204,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let folders = [folder.path().join("absent"), folder.path().to_owned()];
         assert_eq!(of_running_in(&folders).unwrap_err().exit, Exit::Unavailable);
-        let mut file = StatusFile { path: Some(folder.path().join(NAME)) };
+        let mut file = StatusFile { path: Some(folder.path().join(file_name(std::process::id()))) };
         file.write(&status());
-        assert_eq!(of_running_in(&folders).unwrap(), (status(), None));
+        assert_eq!(of_running_in(&folders).unwrap(), [Found { status: status(), stale: None }]);
         drop(file);
         assert!(of_running_in(&folders).is_err());
     }
@@ -162,17 +214,48 @@ mod tests {
     #[test]
     fn the_file_of_a_dead_or_a_stalled_process_is_told_from_that_of_a_running_one() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join(NAME);
+        let own = folder.path().join(file_name(std::process::id()));
         let folders = [folder.path().to_owned()];
         // No process has this number: the kernel's greatest is 2^22.
-        std::fs::write(&path, serde_json::to_vec(&Status { pid: u32::MAX, ..status() }).unwrap()).unwrap();
+        let dead = serde_json::to_vec(&Status { pid: u32::MAX, ..status() }).unwrap();
+        std::fs::write(folder.path().join(file_name(u32::MAX)), &dead).unwrap();
         assert!(of_running_in(&folders).is_err());
-        std::fs::write(&path, serde_json::to_vec(&status()).unwrap()).unwrap();
+        std::fs::write(&own, dead).unwrap();
+        assert!(of_running_in(&folders).is_err(), "another's status in this one's file");
+        std::fs::write(&own, serde_json::to_vec(&status()).unwrap()).unwrap();
         let long_ago = SystemTime::now() - Duration::from_secs(60);
-        std::fs::File::options().write(true).open(&path).unwrap().set_modified(long_ago).unwrap();
-        let (_, age) = of_running_in(&folders).unwrap();
-        assert!(age.unwrap() > Duration::from_secs(50));
-        std::fs::write(&path, "{").unwrap();
+        std::fs::File::options().write(true).open(&own).unwrap().set_modified(long_ago).unwrap();
+        let found = of_running_in(&folders).unwrap();
+        assert!(found[0].stale.unwrap() > Duration::from_secs(50));
+        std::fs::write(&own, "{").unwrap();
         assert!(of_running_in(&folders).is_err());
+    }
+
+    #[test]
+    fn two_that_run_are_both_found_and_the_end_of_one_leaves_the_other() {
+        let folder = tempfile::tempdir().unwrap();
+        let folders = [folder.path().to_owned(), folder.path().to_owned()];
+        // The first process of all lives, whoever runs this.
+        let [one, other] = [1, std::process::id()].map(|pid| {
+            let mut file = StatusFile { path: Some(folder.path().join(file_name(pid))) };
+            file.write(&Status { pid, ..status() });
+            file
+        });
+        let pids = || of_running_in(&folders).unwrap().iter().map(|found| found.status.pid).collect::<Vec<_>>();
+        assert_eq!(pids(), [1, std::process::id()]);
+        drop(other);
+        assert_eq!(pids(), [1]);
+        drop(one);
+        assert!(of_running_in(&folders).is_err());
+    }
+
+    #[test]
+    fn a_folder_of_ones_own_is_made_and_a_link_is_none() {
+        let root = tempfile::tempdir().unwrap();
+        let own = root.path().join("own");
+        assert!(prepare(&own) && prepare(&own));
+        assert_eq!(std::fs::metadata(&own).unwrap().mode() & 0o777, 0o700);
+        std::os::unix::fs::symlink(&own, root.path().join("link")).unwrap();
+        assert!(!prepare(&root.path().join("link")));
     }
 }

@@ -32,6 +32,11 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
+/// Allocations of this thread so far.
+pub fn allocations() -> u64 {
+    ALLOCATIONS.get()
+}
+
 /// More than any decoder makes of `bytes`, so that what it does can be written down without an allocation.
 const fn most_events(bytes: usize) -> usize {
     4 * bytes + 16

@@ -144,6 +144,11 @@ pub struct CounterSnapshot {
 }
 
 impl CounterSnapshot {
+    /// The counts before anything was counted.
+    pub(crate) const fn zero() -> Self {
+        Self { counts: [0; COUNTERS], rejected: [0; REJECTIONS], faults: [0; FAULTS] }
+    }
+
     /// One count.
     pub const fn of(&self, counter: Counter) -> u64 {
         self.counts[counter as usize]

@@ -41,6 +41,7 @@ mod gate;
 mod import;
 mod profile;
 mod record;
+mod refusals;
 mod sample;
 mod sequence;
 mod simulate;
@@ -63,6 +64,7 @@ pub use import::{
 };
 pub use profile::{Command, DEFAULT_PROFILE, HidSettings, NetworkSettings, Profile, ProfileError, SerialSettings};
 pub use record::{RecordError, RecordFiles, RecordStatus};
+pub use refusals::{Refusal, RefusalChange, RefusalWatch};
 pub use sample::{PupilSample, SampleEye};
 pub use simulate::{MOCK_SEED, MockSample, MockSource, Scenario, Script, ScriptError};
 
@@ -76,4 +78,5 @@ pub use source::tcp::NetworkError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
 pub use tracker::{
     DecisionTap, EstimateReader, Link, Tracker, TrackerControl, TrackerError, TrackerHandle, TrackerOptions, host_now,
+    scaled_millimetres,
 };

@@ -12,7 +12,7 @@ use crate::simulate::Scenario;
 pub enum TrackerSpec {
     /// A path by itself: a log if it is a regular file, else a serial port.
     Path(PathBuf),
-    /// `serial:PATH[,profile=NAME][,baud=N]`
+    /// `serial:PATH[,profile=NAME][,baud=N]`, or without `serial:` where there is an option
     Serial {
         /// The port.
         path: PathBuf,
@@ -48,7 +48,7 @@ pub enum TrackerSpec {
     Core(HostPort),
     /// `neon[:HOST[:PORT]]`: Pupil Labs Neon, its Companion's REST port
     Neon(HostPort),
-    /// `replay:FILE[,speed=X][,loop]`
+    /// `replay:FILE[,speed=X][,loop]`, or without `replay:` where there is an option
     Replay {
         /// The log.
         path: PathBuf,
@@ -163,7 +163,20 @@ fn parse(spec: &str) -> Result<TrackerSpec, String> {
         (scheme, Some(_)) if !scheme.contains('/') && !scheme.contains('.') => {
             Err(format!("unknown kind `{scheme}:`; expected {FORMS}"))
         }
-        _ => Ok(TrackerSpec::Path(spec.into())),
+        _ => parse_path(spec),
+    }
+}
+
+/// A path by itself, or one with the options that `serial:` or `replay:` has.
+fn parse_path(spec: &str) -> Result<TrackerSpec, String> {
+    let (path, options) = split_options(spec)?;
+    let keys = || options.iter().map(|option| option.split_once('=').map_or(*option, |(key, _)| key));
+    let any = |of: &[&str]| keys().any(|key| of.contains(&key));
+    match (any(&["profile", "baud"]), any(&["speed", "loop"])) {
+        (false, false) => Ok(TrackerSpec::Path(spec.into())),
+        (true, false) => parse_serial(spec),
+        (false, true) => parse_replay(spec),
+        (true, true) => Err(format!("`{path}` has options of a port and of a log; expected {FORMS}")),
     }
 }
 
@@ -354,6 +367,11 @@ mod tests {
             parsed("replay:a.csv,speed=max"),
             TrackerSpec::Replay { path: "a.csv".into(), speed: ReplaySpeed::Fastest, repeat: false }
         );
+        assert_eq!(parsed("/dev/ttyS0,profile=iscan"), parsed("serial:/dev/ttyS0,profile=iscan"));
+        assert_eq!(parsed("/dev/ttyS0,baud=9600,profile=iscan"), parsed("serial:/dev/ttyS0,profile=iscan,baud=9600"));
+        assert_eq!(parsed("a.csv,speed=max"), parsed("replay:a.csv,speed=max"));
+        assert_eq!(parsed("./b,loop"), parsed("replay:./b,loop"));
+        assert_eq!(parsed("./a,b.csv"), TrackerSpec::Path("./a,b.csv".into()));
         assert_eq!(parsed("mock"), TrackerSpec::Mock(Scenario::default()));
         assert_eq!(parsed("mock:blinks"), TrackerSpec::Mock(Scenario::Blinks));
         let address = HostPort { host: "host".into(), port: 4242 };
@@ -407,6 +425,8 @@ mod tests {
             ("replay:x,speed=-1", "speed `-1`"),
             ("replay:x,repeat", "unknown option `repeat`"),
             ("replay:x,speed=max,loop", "never end"),
+            ("/dev/ttyS0,baud=fast", "baud `fast`"),
+            ("./x,baud=9600,loop", "options of a port and of a log"),
             ("mock:lights", "no scenario `lights`; there are light-steps"),
         ];
         for (spec, told) in cases {

@@ -352,6 +352,32 @@ fn smi_in_pixels_gives_the_disc_of_the_ellipse_and_counts_bad_rows() {
 }
 
 #[test]
+fn smi_with_fewer_samples_than_its_header_promises_says_so() {
+    let dir = TempDir::new().expect("a folder");
+    let rows = "1000\tSMP\t3.1\n5000\tSMP\t3.2\n9000\tMSG\tend\n";
+    let notes = |promised: u32| {
+        let header =
+            format!("## Sample Rate:\t250\n## Number of Samples:\t{promised}\nTime\tType\tL Pupil Diameter [mm]\n");
+        info(&written(&dir, "log", format!("{header}{rows}"))).1.notes
+    };
+    assert_eq!(notes(2), [""; 0]);
+    assert!(notes(3)[0].contains("promises 3 samples and there are 2"), "{:?}", notes(3));
+}
+
+#[test]
+fn neon_in_parts_names_the_other_ones() {
+    let dir = TempDir::new().expect("a folder");
+    let (states, times) = formats::neon_native(200.0);
+    for part in [1, 2] {
+        written(&dir, &format!("eye_state ps{part}.raw"), &states);
+        written(&dir, &format!("eye_state ps{part}.time"), &times);
+    }
+    let (recording, info) = info(&dir.path().join("eye_state ps2.raw"));
+    assert!(!recording.format().name().contains("ps1"), "{}", recording.format());
+    assert!(info.notes.iter().any(|note| note.contains("one part") && note.contains("eye_state ps1.raw")), "{info:?}");
+}
+
+#[test]
 fn neon_of_the_phone_is_read_with_its_companions() {
     let dir = TempDir::new().expect("a folder");
     let (states, times) = formats::neon_native(200.0);

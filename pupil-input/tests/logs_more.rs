@@ -136,6 +136,43 @@ fn tobii_studio_reads_with_its_names_and_validity_codes() {
     assert!(noted(&recording, "2 times an eye is valid and has no diameter"), "{:?}", recording.notes());
 }
 
+#[test]
+fn tobii_whole_milliseconds_give_way_to_the_trackers_microseconds() {
+    // 250 Hz in whole milliseconds, and the tracker's own clock a little off; a gyroscope's row has no tracker's time.
+    let log = |finer: &str, at: &dyn Fn(i64) -> String| {
+        let mut text = format!("Recording timestamp [ms]\t{finer}\tSensor\tPupil diameter left [mm]\tValidity left\n");
+        for row in 0..100 {
+            writeln!(text, "{}\t{}\tEye Tracker\t3.1\tValid", row * 3333 / 1000, at(row)).expect("writes");
+            writeln!(text, "{}\t\tGyroscope\t\t", row * 3333 / 1000).expect("writes");
+        }
+        text
+    };
+    let us = |row: i64| (7_000_000_123 + row * 3333).to_string();
+    for name in ["Eyetracker timestamp [\u{3bc}s]", "EyeTrackerTimestamp", "Computer timestamp [\u{3bc}s]"] {
+        let recording = read(log(name, &us));
+        let left = of_eye(&recording, Left);
+        assert_eq!((left[0].0, left[99].0), (7_000_000_123_000, (7_000_000_123 + 99 * 3333) * 1000), "{name}");
+        assert!(noted(&recording, "in microseconds"), "{:?}", recording.notes());
+    }
+    // Not those of a clock that counts something else, stands, or is not there in every row.
+    let odd: [&dyn Fn(i64) -> String; 3] =
+        [&|row| row.to_string(), &|_| "7".into(), &|row| if row == 50 { String::new() } else { us(row) }];
+    for at in odd {
+        assert_eq!(of_eye(&read(log("Eyetracker timestamp", at)), Left)[99].0, 329 * MS);
+    }
+}
+
+#[test]
+fn tobii_pixels_are_no_millimetres() {
+    let header = "Recording timestamp [ms]\tPupil diameter left [px]\tPupil diameter left [mm]\tValidity left\n";
+    let rows = "0\t31.5\t3.1\tValid\n4\t31.6\t3.2\tValid\n";
+    assert_eq!(read(format!("{header}{rows}")).unit(), SizeUnit::Millimetres);
+    assert_eq!(of_eye(&read(format!("{header}{rows}")), Left)[1].1, Some(3.2));
+    let recording = read(format!("{header}{rows}").replace("left [mm]", "of the glasses"));
+    assert_eq!((recording.unit(), of_eye(&recording, Left)[1].1), (SizeUnit::Pixels, Some(31.6)));
+    assert!(noted(&recording, "pixels"), "{:?}", recording.notes());
+}
+
 // Gazepoint.
 
 const GAZEPOINT_EYES: &str = "LPCX,LPCY,LPD,LPS,LPV,RPCX,RPCY,RPD,RPS,RPV";
@@ -212,6 +249,30 @@ fn gazepoint_blinks_are_told_by_length_where_there_is_no_number() {
     assert_eq!(recording.blinks(), [blink(200, 400), blink(650, 800)]);
 }
 
+#[test]
+fn a_table_of_fixations_is_told_from_one_of_samples() {
+    let log = |step_s: f64| {
+        let mut text = String::from("MEDIA_ID,CNT,TIME,FPOGX,FPOGD,FPOGID,LPMM,LPMMV,RPMM,RPMMV\n");
+        for row in 0..40 {
+            writeln!(text, "0,{row},{:.5},0.5,0.3,{row},3.1,1,3.2,1", f64::from(row) * step_s).expect("writes");
+        }
+        read(text)
+    };
+    let fixations = log(0.385);
+    assert!(noted(&fixations, "2.6 samples a second") && noted(&fixations, "all_gaze"), "{:?}", fixations.notes());
+    assert_eq!(log(1.0 / 60.0).notes(), [""; 0]);
+}
+
+#[test]
+fn a_log_that_is_cut_off_says_so() {
+    let whole = gazepoint(true);
+    assert!(!noted(&read(&whole), "cut off"));
+    let cut = read(&whole[..whole.len() - 40]);
+    assert!(noted(&cut, "line 61, the last one") && noted(&cut, "copy"), "{:?}", cut.notes());
+    // A whole last line without its ending is none.
+    assert!(!noted(&read(whole.trim_end()), "cut off"));
+}
+
 // PupilEXT.
 
 const PUPILEXT: &str = "filename,timestamp_ms,algorithm,diameter_px,undistortedDiameter_px,physicalDiameter_mm,width_px,height_px,\
@@ -270,6 +331,22 @@ fn pupilext_with_two_views_is_one_pupil_and_with_two_pupils_two() {
     assert_eq!(recording.samples().map(|s| s.confidence).collect::<Vec<_>>(), [0.9, 0.7]);
     let nobodys = late.replace("_R_", "_U_").replace("_L_", "_x_");
     assert_eq!(samples(&read(nobodys)), [(10 * MS, Both, Some(3.5))]);
+}
+
+#[test]
+fn pupilext_of_the_first_versions_reads_with_its_brackets() {
+    let one = "filename,timestamp[ms],algorithm,diameter[px],physicaldiameter[mm],width[px],height[px],axis_ratio,center_x,center_y,angle[deg],circumference[px],confidence,outline_confidence\n\
+               1.bmp,10,PuRe,40.5,4.25,40,41,0.97,1,2,3,130,0.9,0.8\n2.bmp,18,PuRe,41,4.5,40,41,0.97,1,2,3,130,-1,0.7\n";
+    let recording = read(one);
+    assert_eq!((recording.format(), recording.unit()), (LogFormat::PupilExt, SizeUnit::Millimetres));
+    assert_eq!(samples(&recording), [(10 * MS, Both, Some(4.25)), (18 * MS, Both, Some(4.5))]);
+    assert_eq!(recording.samples().map(|s| s.confidence).collect::<Vec<_>>(), [0.9, 0.7]);
+    let pixels = read(one.replace("4.25", "-1").replace("4.5,", "-1,"));
+    assert_eq!((pixels.unit(), samples(&pixels)[1].2), (SizeUnit::Pixels, Some(41.0)));
+    let two = "filename,timestamp[ms],algorithm,diameter[px],diameterSec[px],physicaldiameter[mm],confidence,outline_confidence,confidenceSec\nx,10,PuRe,40,44,4.5,0.9,0.8,0.7\n";
+    let recording = read(two);
+    assert_eq!(samples(&recording), [(10 * MS, Both, Some(4.5))]);
+    assert!(noted(&recording, "two cameras"), "{:?}", recording.notes());
 }
 
 // BIDS.

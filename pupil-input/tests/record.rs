@@ -220,3 +220,89 @@ fn a_recording_without_bytes_says_so() {
     let error = Tracker::start(&spec, &rig::Rig::default().tracker, TimeNs(0)).expect_err("empty").to_string();
     assert!(error.contains("no bytes came"), "{error}");
 }
+
+/// A minute of two eyes at 500 Hz in holod's own CSV: more than any ring holds.
+fn long_log(folder: &Path) -> usize {
+    let mut text = String::new();
+    let count = 60_000;
+    for k in 0..count {
+        let line = LineSample {
+            sequence: k / 2,
+            device_us: (k / 2 * 2000) as i64,
+            eye: if k % 2 == 0 { SampleEye::Left } else { SampleEye::Right },
+            diameter_mm: 4.0,
+            confidence: 1.0,
+        };
+        encode_line(&line, &mut text);
+    }
+    fs::write(folder.join("long.lines"), text).expect("writes");
+    count as usize
+}
+
+#[test]
+fn a_log_that_is_played_as_fast_as_it_can_be_is_recorded_whole() {
+    let folder = TempDir::new().expect("a folder");
+    let count = long_log(folder.path());
+    let files = RecordFiles { raw: None, samples: Some(folder.path().join("samples.csv")) };
+    let spec = format!("replay:{},speed=max", folder.path().join("long.lines").display());
+    let mut handle = start(&spec, Some(files));
+    let mut taken = 0;
+    eventually("the end", || {
+        taken += decisions(&mut handle).len();
+        handle.finished()
+    });
+    handle.stop();
+    taken += decisions(&mut handle).len();
+    let status = handle.recording().expect("records");
+    assert_eq!((status.decisions_lost, status.failure), (0, None));
+    assert_eq!(fs::read_to_string(folder.path().join("samples.csv")).expect("reads").lines().count(), count + 1);
+    assert_eq!(taken, count, "the tap has them all, too");
+}
+
+#[test]
+fn a_tap_that_nobody_reads_stops_no_log() {
+    let folder = TempDir::new().expect("a folder");
+    long_log(folder.path());
+    let path = folder.path().join("long.lines");
+    let text = fs::read_to_string(&path).expect("reads");
+    // Twice as long, so that the tap is full before its end.
+    let later = |line: &str| line.split(',').nth(2).and_then(|us| us.parse::<i64>().ok()).map(|us| us + 120_000_000);
+    let again = text.lines().filter_map(|line| {
+        let eye = if line.contains(",L,") { SampleEye::Left } else { SampleEye::Right };
+        let mut text = String::new();
+        let line = LineSample { sequence: 0, device_us: later(line)?, eye, diameter_mm: 4.0, confidence: 1.0 };
+        encode_line(&line, &mut text);
+        Some(text)
+    });
+    let again: String = again.collect();
+    fs::write(&path, text.clone() + &again).expect("writes");
+    let handle = start(&format!("replay:{},speed=max", path.display()), None);
+    eventually("the end", || handle.finished());
+    assert_eq!(handle.counters().of(Counter::Samples), 120_000);
+    assert!(handle.counters().of(Counter::DecisionsDropped) > 0);
+}
+
+#[test]
+fn files_that_are_deleted_under_a_recording_are_noticed_while_it_runs() {
+    let folder = TempDir::new().expect("a folder");
+    let record = folder.path().join("record");
+    fs::create_dir(&record).expect("makes");
+    let handle = start("mock", Some(RecordFiles::in_folder(&record)));
+    eventually("samples", || handle.counters().of(Counter::Samples) > 10);
+    assert_eq!(handle.recording().expect("records").failure, None);
+    fs::remove_dir_all(&record).expect("deletes");
+    eventually("the failure", || handle.recording().expect("records").failure.is_some());
+    let failure = handle.recording().expect("records").failure.expect("a failure");
+    assert!(failure.contains("samples.csv") && failure.contains("deleted"), "{failure}");
+}
+
+#[test]
+fn a_scale_on_millimetres_is_warned_of() {
+    let warnings = |scale: Option<f64>| {
+        let settings = rig::Tracker { scale, ..rig::Rig::default().tracker };
+        let handle = Tracker::start(&"mock".parse().expect("a spec"), &settings, host_now()).expect("starts");
+        handle.warnings().join("; ")
+    };
+    assert!(warnings(Some(0.0125)).contains("millimetres already") && warnings(Some(0.0125)).contains("0.0125"));
+    assert_eq!([warnings(None), warnings(Some(1.0))], ["", ""]);
+}

@@ -1,9 +1,9 @@
-//! The three colour fields of a frame as the panel is sent them, and back again.
+//! The levels of a colour frame as the panel is sent them, and back again.
 
-use holod_calibration::rig::{Panel, PanelMode};
+use holod_calibration::rig::{Packing, Panel, PanelMode};
 use holod_calibration::{Colour, Resolution};
 
-/// Fields in a colour frame: one for each laser.
+/// Patterns in a colour frame: one for each laser.
 pub const FIELDS: usize = 3;
 
 /// How a panel wants the levels of a colour frame.
@@ -13,21 +13,58 @@ pub struct FrameLayout {
     pub resolution: Resolution,
     /// How the fields are carried.
     pub mode: PanelMode,
-    /// The colour of each field, in the order in which they are shown.
+    /// The order in which the colours are shown; it is that of the patterns in a frame's samples.
     pub field_order: [Colour; FIELDS],
+    /// Video frames in a row that show one colour's pattern in field-sequential mode; 1 in the other modes.
+    pub frames_per_colour: u8,
+    /// Where the bits of a level travel on the video link.
+    pub packing: Packing,
 }
 
 impl FrameLayout {
     /// The layout for `panel` with `resolution` pixels.
     pub fn new(panel: &Panel, resolution: Resolution) -> Self {
-        Self { resolution, mode: panel.mode, field_order: panel.field_order }
+        let Panel { mode, field_order, frames_per_colour, packing, .. } = *panel;
+        Self { resolution, mode, field_order, frames_per_colour, packing }
+    }
+
+    /// Colour fields from the start of one colour frame to the start of the next.
+    pub fn fields(&self) -> usize {
+        match self.mode {
+            PanelMode::ChannelPacked => FIELDS,
+            PanelMode::FieldSequential => FIELDS * usize::from(self.frames_per_colour),
+            PanelMode::Monochrome(_) => 1,
+        }
+    }
+
+    /// Video frames from the start of one colour frame to the start of the next.
+    pub fn refreshes(&self) -> usize {
+        self.fields() / self.fields_per_refresh()
+    }
+
+    /// Colour fields that the panel shows in one video frame.
+    pub fn fields_per_refresh(&self) -> usize {
+        if self.mode == PanelMode::ChannelPacked { FIELDS } else { 1 }
+    }
+
+    /// The colour whose pattern is shown as the `field`-th field of a colour frame.
+    ///
+    /// # Panics
+    /// Where `field` is not below [`Self::fields`].
+    pub fn colour_of_field(&self, field: usize) -> Colour {
+        assert!(field < self.fields(), "a colour frame has {} fields", self.fields());
+        match self.mode {
+            PanelMode::ChannelPacked => self.field_order[field],
+            PanelMode::FieldSequential => self.field_order[field / usize::from(self.frames_per_colour)],
+            PanelMode::Monochrome(colour) => colour,
+        }
     }
 
     /// The position of `colour` in the field order.
     ///
     /// # Panics
     /// Where the order lacks the colour, which the rig file's validation excludes.
-    pub fn field_of(&self, colour: Colour) -> usize {
+    pub fn position_of(&self, colour: Colour) -> usize {
         self.field_order.iter().position(|&shown| shown == colour).expect("a field order holds each colour once")
     }
 
@@ -35,15 +72,15 @@ impl FrameLayout {
     const fn stride(&self) -> usize {
         match self.mode {
             PanelMode::ChannelPacked => FIELDS,
-            PanelMode::FieldSequential => 1,
+            PanelMode::FieldSequential | PanelMode::Monochrome(_) => 1,
         }
     }
 
-    /// Index of the first sample of `field`.
-    const fn offset(&self, field: usize) -> usize {
+    /// Index of the first sample of the pattern at `position` in the field order.
+    const fn offset(&self, position: usize) -> usize {
         match self.mode {
-            PanelMode::ChannelPacked => field,
-            PanelMode::FieldSequential => field * self.resolution.pixels(),
+            PanelMode::ChannelPacked => position,
+            PanelMode::FieldSequential | PanelMode::Monochrome(_) => position * self.resolution.pixels(),
         }
     }
 }
@@ -52,8 +89,8 @@ impl FrameLayout {
 ///
 /// - Channel-packed: one video frame `[height, width, 3]`, row-major; the video's R, G and B channels carry the first,
 ///   second and third *shown* field, whatever their colours are.
-/// - Field-sequential: three gray video frames `[3 (shown order), height, width]`; whoever sends one to a colour video
-///   link repeats each level in R, G and B.
+/// - Field-sequential and monochrome: three gray video frames `[3 (shown order), height, width]`; whoever sends one to
+///   a colour video link repeats each level in R, G and B. In monochrome mode the panel shows one of them only.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct LevelsFrame {
     pub(crate) tag: FrameTag,
@@ -95,36 +132,51 @@ impl LevelsFrame {
         &self.samples
     }
 
+    /// The samples of one colour's pattern, `[height, width]` row-major.
+    ///
+    /// # Panics
+    /// In channel-packed mode, where the samples of the colours alternate.
+    pub fn plane(&self, colour: Colour) -> &[u16] {
+        assert_eq!(self.layout.stride(), 1, "the samples of a channel-packed frame alternate");
+        &self.samples[self.layout.offset(self.layout.position_of(colour))..][..self.layout.resolution.pixels()]
+    }
+
+    /// The samples of one row of the video frame that begins with the `first_field`-th field of a colour frame, for
+    /// [`crate::packing::pack_row`].
+    ///
+    /// # Panics
+    /// Where there is no such field or row.
+    pub fn video_row(&self, first_field: usize, row: usize) -> &[u16] {
+        let Resolution { width, height } = self.layout.resolution;
+        assert!(row < height, "a frame has {height} rows");
+        let stride = self.layout.stride();
+        let first = match self.layout.mode {
+            PanelMode::ChannelPacked => 0,
+            _ => self.layout.offset(self.layout.position_of(self.layout.colour_of_field(first_field))),
+        };
+        &self.samples[first + row * width * stride..][..width * stride]
+    }
+
     /// The levels of `colour`, to be written.
     pub fn field_mut(&mut self, colour: Colour) -> FieldMut<'_> {
-        let (stride, offset) = (self.layout.stride(), self.layout.offset(self.layout.field_of(colour)));
+        let (stride, offset) = (self.layout.stride(), self.layout.offset(self.layout.position_of(colour)));
         FieldMut { samples: &mut self.samples[offset..], stride, resolution: self.layout.resolution }
     }
 
-    /// Takes out of the frame what the panel shows as its `field`-th field: the colour it is shown in and its levels,
-    /// `[height, width]`, row-major.
-    ///
-    /// # Panics
-    /// Where `field` is not below [`FIELDS`].
-    pub fn unpack(&self, field: usize) -> ColourField {
-        let samples = self.samples[self.layout.offset(field)..].iter().step_by(self.layout.stride());
+    /// Takes the levels of `colour` out of the frame.
+    pub fn unpack_colour(&self, colour: Colour) -> ColourField {
+        let samples = self.samples[self.layout.offset(self.layout.position_of(colour))..].iter();
         ColourField {
             frame_id: self.tag.frame_id,
-            field,
-            colour: self.layout.field_order[field],
+            colour,
             resolution: self.layout.resolution,
-            levels: samples.take(self.layout.resolution.pixels()).copied().collect(),
+            levels: samples.step_by(self.layout.stride()).take(self.layout.resolution.pixels()).copied().collect(),
         }
-    }
-
-    /// The field in which `colour` is shown.
-    pub fn unpack_colour(&self, colour: Colour) -> ColourField {
-        self.unpack(self.layout.field_of(colour))
     }
 
     /// Overwrites samples and tag with those of `other`, which has the same layout, without allocating.
     pub(crate) fn copy_from(&mut self, other: &Self) {
-        debug_assert_eq!(self.layout, other.layout);
+        assert_eq!(self.layout, other.layout, "frames of one output have one layout");
         self.tag = other.tag;
         self.samples.copy_from_slice(&other.samples);
     }
@@ -135,8 +187,6 @@ impl LevelsFrame {
 pub struct ColourField {
     /// The frame it belongs to.
     pub frame_id: u64,
-    /// Its position in the panel's field order.
-    pub field: usize,
     /// The laser that belongs to it.
     pub colour: Colour,
     /// Panel pixels.
@@ -194,7 +244,8 @@ mod tests {
     }
 
     fn modes() -> impl Strategy<Value = PanelMode> {
-        prop_oneof![Just(PanelMode::ChannelPacked), Just(PanelMode::FieldSequential)]
+        let monochrome = PanelMode::Monochrome(Colour::Green);
+        prop_oneof![Just(PanelMode::ChannelPacked), Just(PanelMode::FieldSequential), Just(monochrome)]
     }
 
     fn levels() -> impl Strategy<Value = Vec<u16>> {
@@ -206,18 +257,20 @@ mod tests {
         fn unpacking_gives_back_each_colour_in_its_place(
             field_order in orders(), mode in modes(), red in levels(), green in levels(), blue in levels(),
         ) {
-            let layout = FrameLayout { resolution: SMALL, mode, field_order };
+            let layout =
+                FrameLayout { resolution: SMALL, mode, field_order, frames_per_colour: 1, packing: Packing::Gray };
             let mut frame = LevelsFrame::new(layout);
             let given = [red, green, blue];
             for colour in Colour::ALL {
                 frame.field_mut(colour).write(&given[colour.index()]);
             }
-            for (position, &colour) in field_order.iter().enumerate() {
-                let field = frame.unpack(position);
+            for colour in Colour::ALL {
+                let field = frame.unpack_colour(colour);
                 prop_assert_eq!(field.colour, colour);
-                prop_assert_eq!(field.field, position);
                 prop_assert_eq!(&field.levels, &given[colour.index()]);
-                prop_assert_eq!(&frame.unpack_colour(colour), &field);
+                if mode != PanelMode::ChannelPacked {
+                    prop_assert_eq!(frame.plane(colour), &given[colour.index()][..]);
+                }
             }
         }
     }
@@ -225,13 +278,19 @@ mod tests {
     #[test]
     fn channel_packed_puts_the_first_shown_field_in_the_first_channel() {
         let field_order = [Colour::Green, Colour::Red, Colour::Blue];
-        let layout =
-            FrameLayout { resolution: Resolution { width: 2, height: 1 }, mode: PanelMode::ChannelPacked, field_order };
+        let layout = FrameLayout {
+            resolution: Resolution { width: 2, height: 1 },
+            mode: PanelMode::ChannelPacked,
+            field_order,
+            frames_per_colour: 1,
+            packing: Packing::Gray,
+        };
         let mut frame = LevelsFrame::new(layout);
         frame.field_mut(Colour::Red).write(&[10, 11]);
         frame.field_mut(Colour::Green).write(&[20, 21]);
         frame.field_mut(Colour::Blue).write(&[30, 31]);
         assert_eq!(frame.samples(), [20, 10, 30, 21, 11, 31]);
+        assert_eq!(frame.video_row(0, 0), frame.samples());
     }
 
     #[test]
@@ -241,11 +300,18 @@ mod tests {
             resolution: Resolution { width: 2, height: 1 },
             mode: PanelMode::FieldSequential,
             field_order,
+            frames_per_colour: 2,
+            packing: Packing::Gray,
         };
+        let [blue, red, green] = field_order;
+        let shown: Vec<_> = (0..layout.fields()).map(|field| layout.colour_of_field(field)).collect();
+        assert_eq!(shown, [blue, blue, red, red, green, green]);
         let mut frame = LevelsFrame::new(layout);
         frame.field_mut(Colour::Red).write(&[10, 11]);
         frame.field_mut(Colour::Green).write(&[20, 21]);
         frame.field_mut(Colour::Blue).write(&[30, 31]);
         assert_eq!(frame.samples(), [30, 31, 10, 11, 20, 21]);
+        let rows: Vec<_> = (0..layout.fields()).map(|field| frame.video_row(field, 0)).collect();
+        assert_eq!(rows, [[30, 31], [30, 31], [10, 11], [10, 11], [20, 21], [20, 21]]);
     }
 }

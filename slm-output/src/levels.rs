@@ -7,27 +7,32 @@
 //! panel of L levels whose stroke is 2π·(L−1)/L has its levels 2π/L apart all the way round, and a phase just below 2π
 //! rounds up to level 0. A stroke of exactly 2π makes the top level a second name of level 0; it is then not used.
 //!
-//! **Other strokes.** Below 2π·(L−1)/L there is a gap on the circle that no level reaches: a phase in it goes to the
-//! nearer rim, and [`EncodeReport`] counts the pixels whose phase lies farther from every level than half of the
-//! widest step elsewhere. Above 2π only the first full turn of levels is used, so that neighbouring pixels differ by as
-//! little drive as possible.
+//! **Other strokes.** Below 2π·(L−1)/L there is a gap on the circle that no level reaches; the panel's `out_of_stroke`
+//! says where a phase in it goes, and [`EncodeReport`] counts the pixels whose phase lies farther from every level than
+//! half of the widest step elsewhere. Above 2π only the first full turn of levels is used, so that neighbouring pixels
+//! differ by as little drive as possible.
+//!
+//! **Few levels.** A table may name some of the panel's levels only, as irregular as they are and with phases in any
+//! order: a phase goes to the nearest of them on the circle, and the others are never sent.
 //!
 //! **Speed.** A table of 16 entries for each level (4096 for 8 bits) maps phase to level. Each entry holds the best
 //! level for the middle of its range, so the level found may be farther from the phase than the nearest one by at most
 //! the width of an entry, 2π/(16·L), a sixteenth of a level's step; where levels are 2π/L apart the steps' borders fall
-//! on the entries' borders and it is the nearest one.
+//! on the entries' borders and it is the nearest one. With 16 bits there is one entry for each level.
 
 use std::f64::consts::TAU;
 
-use holod_calibration::rig::{Panel, PhaseSign};
+use holod_calibration::rig::{LevelPhase, OutOfStroke, Panel, PanelMode, PhaseSign};
 use holod_calibration::{Colour, PerColour, Resolution};
 
 use crate::fields::{FieldMut, LevelsFrame};
 
-/// Table entries for each level.
+/// Table entries for each level, as far as [`ENTRIES_MAX`] allows.
 const ENTRIES_PER_LEVEL: usize = 16;
+/// Table entries at most, so that 16 bits number them.
+const ENTRIES_MAX: usize = 1 << 16;
 /// Marks table entries whose phase no level reaches.
-const UNREACHABLE: u16 = 1 << 15;
+const UNREACHABLE: u32 = 1 << 16;
 /// Pixels whose table indices are computed together, so that the arithmetic is vectorised apart from the look-ups.
 const BLOCK: usize = 256;
 /// Adding 1.5·2²³ to a small `f32` leaves its nearest integer, in two's complement, in the low bits of the sum.
@@ -36,11 +41,25 @@ const TO_INTEGER: f32 = 12_582_912.0;
 /// Why a panel's description cannot be used for encoding.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum LevelsError {
-    /// A bit depth that no supported panel has.
-    #[error("panel.bit_depth is {found}; expected 8 or 10: correct the rig file")]
+    /// A bit depth that the panel's packing does not carry.
+    #[error(
+        "panel.bit_depth is {found}, but panel.packing = \"{packing}\" carries {carried} bits: correct one of the two in the rig file"
+    )]
     BitDepth {
         /// What was found.
         found: u8,
+        /// The packing's name.
+        packing: &'static str,
+        /// The bits that it carries.
+        carried: u8,
+    },
+    /// Levels that need several channels where each channel of the video carries a field of its own.
+    #[error(
+        "panel.packing is \"{packing}\" in mode channel-packed; expected gray or gray10, as red, green and blue each carry a field of their own: use mode field-sequential, or 8 bits"
+    )]
+    PackedDepth {
+        /// What was found.
+        packing: &'static str,
     },
     /// A stroke that is no positive number.
     #[error("the {colour} stroke is {found} rad; expected a positive number: correct panel.stroke of the rig file")]
@@ -50,25 +69,29 @@ pub enum LevelsError {
         /// What was found.
         found: f64,
     },
-    /// A look-up table with the wrong number of entries.
+    /// A look-up table with too few entries, or with a level that is out of order or that the panel does not have.
     #[error(
-        "the {colour} look-up table has {found} entries; expected {expected}, one for each level: measure it again at the panel's bit depth"
+        "the {colour} look-up table has level {found} as its entry {entry}; expected levels that rise, two at least, all below {levels}: write the table again"
     )]
-    LutLength {
+    LutLevel {
         /// Whose table.
         colour: Colour,
-        /// What was found.
-        found: usize,
+        /// Position of the first entry that is wrong, from 0; the number of entries where they are too few.
+        entry: usize,
+        /// Its level.
+        found: u16,
         /// Levels of the panel.
-        expected: usize,
+        levels: usize,
     },
     /// A look-up table that turns round, is flat, or is not finite.
-    #[error("the {colour} look-up table is not monotonic at level {level}: smooth or measure it again")]
+    #[error(
+        "the {colour} look-up table is flat, not monotonic or not finite at level {level}: smooth or measure it again"
+    )]
     LutShape {
         /// Whose table.
         colour: Colour,
         /// The first level at which it goes wrong.
-        level: usize,
+        level: u16,
     },
     /// A falling look-up table on a panel that is said to rise.
     #[error(
@@ -120,8 +143,9 @@ pub struct PanelEncoder {
 #[derive(Clone, Debug)]
 struct ColourEncoder {
     /// The level of each phase bin, with [`UNREACHABLE`] set where it is not near.
-    table: Vec<u16>,
-    /// Phase in [0, 2π) that each level shows on a flat panel.
+    table: Vec<u32>,
+    /// Phase that each level shows on a flat panel, with its whole turns; not a number where the panel's table leaves it
+    /// out.
     phase_of_level_rad: Vec<f32>,
     /// Phase to add at each panel pixel, in table entries, [0, table length).
     flatness_entries: Option<Vec<f32>>,
@@ -141,8 +165,12 @@ impl PanelEncoder {
         panel_resolution: Resolution,
         pattern_resolution: Resolution,
     ) -> Result<Self, LevelsError> {
-        if !matches!(panel.bit_depth, 8 | 10) {
-            return Err(LevelsError::BitDepth { found: panel.bit_depth });
+        let (found, carried) = (panel.bit_depth, panel.packing.bit_depth());
+        if found != carried {
+            return Err(LevelsError::BitDepth { found, packing: panel.packing.name(), carried });
+        }
+        if panel.mode == PanelMode::ChannelPacked && !panel.packing.fits_a_channel() {
+            return Err(LevelsError::PackedDepth { packing: panel.packing.name() });
         }
         if pattern_resolution.width > panel_resolution.width || pattern_resolution.height > panel_resolution.height {
             return Err(LevelsError::PatternSize { pattern: pattern_resolution, panel: panel_resolution });
@@ -163,7 +191,7 @@ impl PanelEncoder {
     }
 
     /// Encodes three patterns into `frame`: each phase in radians `[height, width]`, row-major, nominally in [0, 2π);
-    /// phases within ±100 turns are wrapped. Neither allocates nor locks.
+    /// phases within ±50 turns are wrapped. Neither allocates nor locks.
     ///
     /// # Panics
     /// Where a pattern or the frame has another size than the encoder was made for.
@@ -213,10 +241,12 @@ impl PanelEncoder {
     /// own unflatness (which the flatness picture cancels) taken into account.
     ///
     /// # Panics
-    /// Where `levels` has another number of pixels than the panel, or holds a level that the panel does not have.
+    /// Where `levels` has another number of pixels than the panel, or holds a level that the panel, or the table of
+    /// `colour`, does not have.
     pub fn decode(&self, colour: Colour, levels: &[u16]) -> Vec<f32> {
         assert_eq!(levels.len(), self.panel.pixels(), "a field has one level for each panel pixel");
-        (0..levels.len()).map(|pixel| self.colours[colour.index()].phase_shown(pixel, levels[pixel])).collect()
+        let encoder = &self.colours[colour.index()];
+        (0..levels.len()).map(|pixel| wrapped_f32(encoder.phase_shown(pixel, levels[pixel]))).collect()
     }
 
     /// As [`Self::decode`], for the part of the panel that carries the pattern: `[pattern height, pattern width]`.
@@ -224,9 +254,26 @@ impl PanelEncoder {
     /// # Panics
     /// As [`Self::decode`].
     pub fn decode_pattern(&self, colour: Colour, levels: &[u16]) -> Vec<f32> {
-        let shown = self.decode(colour, levels);
+        self.of_pattern(&self.decode(colour, levels))
+    }
+
+    /// As [`Self::decode_pattern`], with the whole turns of each level's phase: what the liquid crystal does, which light
+    /// of another wavelength meets too. The panel's own unflatness is known to a turn only.
+    ///
+    /// # Panics
+    /// As [`Self::decode`].
+    pub fn decode_unwrapped(&self, colour: Colour, levels: &[u16]) -> Vec<f32> {
+        assert_eq!(levels.len(), self.panel.pixels(), "a field has one level for each panel pixel");
+        let encoder = &self.colours[colour.index()];
+        let shown: Vec<f32> =
+            levels.iter().enumerate().map(|(pixel, &level)| encoder.phase_shown(pixel, level) as f32).collect();
+        self.of_pattern(&shown)
+    }
+
+    /// The part of a panel's values that carries the pattern.
+    fn of_pattern(&self, values: &[f32]) -> Vec<f32> {
         let (left, top) = self.pattern_origin();
-        let rows = shown.chunks_exact(self.panel.width).skip(top).take(self.pattern.height);
+        let rows = values.chunks_exact(self.panel.width).skip(top).take(self.pattern.height);
         rows.flat_map(|row| &row[left..left + self.pattern.width]).copied().collect()
     }
 
@@ -237,8 +284,8 @@ impl PanelEncoder {
 
 impl ColourEncoder {
     fn new(panel: &Panel, resolution: Resolution, colour: Colour) -> Result<Self, LevelsError> {
-        let signed_rad = signed_phases(panel, colour)?;
-        let table = nearest_level_table(&signed_rad);
+        let signed = signed_phases(panel, colour)?;
+        let table = level_table(&signed, panel.bit_depth, panel.out_of_stroke);
         let entries = table.len() as f64;
         let flatness_entries = match &panel.flatness_rad[colour] {
             None => None,
@@ -256,7 +303,10 @@ impl ColourEncoder {
                 Some(flatness_rad.iter().map(to_entries).collect())
             }
         };
-        let phase_of_level_rad = signed_rad.iter().map(|&phase| wrapped_f32(phase)).collect();
+        let mut phase_of_level_rad = vec![f32::NAN; 1 << panel.bit_depth];
+        for LevelPhase { level, phase_rad } in signed {
+            phase_of_level_rad[usize::from(level)] = phase_rad as f32;
+        }
         Ok(Self { table, phase_of_level_rad, flatness_entries })
     }
 
@@ -305,18 +355,20 @@ impl ColourEncoder {
             let samples = samples[start * STRIDE..].iter_mut().step_by(STRIDE);
             for (sample, &index) in samples.zip(&indices[..phases_rad.len()]) {
                 let entry = self.table[usize::from(index)];
-                unreachable += usize::from(entry / UNREACHABLE);
-                *sample = entry % UNREACHABLE;
+                unreachable += (entry / UNREACHABLE) as usize;
+                *sample = entry as u16;
             }
         }
         unreachable
     }
 
-    fn phase_shown(&self, pixel: usize, level: u16) -> f32 {
+    /// The phase that `level` shows at `pixel`, with its whole turns.
+    fn phase_shown(&self, pixel: usize, level: u16) -> f64 {
         let level_rad = f64::from(self.phase_of_level_rad[usize::from(level)]);
+        assert!(level_rad.is_finite(), "level {level} is not in the panel's table");
         let entries = self.table.len() as f64;
         let flat_rad = self.flatness_entries.as_ref().map_or(0.0, |flat| f64::from(flat[pixel]) / entries * TAU);
-        wrapped_f32(level_rad - flat_rad)
+        level_rad - flat_rad
     }
 }
 
@@ -332,70 +384,143 @@ fn wrapped_f32(phase_rad: f64) -> f32 {
     if f64::from(wrapped) < TAU { wrapped } else { 0.0 }
 }
 
-/// Phase at each level, unwrapped, with the panel's sign.
-fn signed_phases(panel: &Panel, colour: Colour) -> Result<Vec<f64>, LevelsError> {
+/// The levels that may be used, rising, with the phase at each and the panel's sign; unwrapped where the levels are all
+/// there.
+fn signed_phases(panel: &Panel, colour: Colour) -> Result<Vec<LevelPhase>, LevelsError> {
     let levels = 1usize << panel.bit_depth;
     let sign = match panel.phase_sign {
         PhaseSign::Positive => 1.0,
         PhaseSign::Negative => -1.0,
     };
-    let Some(lut_rad) = &panel.lut_rad[colour] else {
+    let Some(lut) = &panel.lut[colour] else {
         let stroke_rad = panel.stroke_rad[colour];
         if !(stroke_rad.is_finite() && stroke_rad > 0.0) {
             return Err(LevelsError::Stroke { colour, found: stroke_rad });
         }
-        return Ok((0..levels).map(|level| sign * stroke_rad * level as f64 / (levels - 1) as f64).collect());
+        let phase_rad = |level| sign * stroke_rad * level as f64 / (levels - 1) as f64;
+        return Ok((0..levels).map(|level| LevelPhase { level: level as u16, phase_rad: phase_rad(level) }).collect());
     };
-    if lut_rad.len() != levels {
-        return Err(LevelsError::LutLength { colour, found: lut_rad.len(), expected: levels });
+    let wrong_level = |entry: usize| {
+        let found = lut.get(entry).or(lut.last()).map_or(0, |last| last.level);
+        LevelsError::LutLevel { colour, entry, found, levels }
+    };
+    if lut.len() < 2 {
+        return Err(wrong_level(lut.len()));
     }
-    if let Some(level) = lut_rad.iter().position(|phase| !phase.is_finite()) {
-        return Err(LevelsError::LutShape { colour, level });
+    if let Some(entry) = lut.iter().position(|entry| usize::from(entry.level) >= levels) {
+        return Err(wrong_level(entry));
     }
-    let falls = lut_rad[levels - 1] < lut_rad[0];
-    let wrong = |pair: &[f64]| if falls { pair[1] > pair[0] } else { pair[1] < pair[0] };
-    if let Some(level) = lut_rad.windows(2).position(wrong) {
-        return Err(LevelsError::LutShape { colour, level: level + 1 });
+    if let Some(before) = lut.windows(2).position(|pair| pair[1].level <= pair[0].level) {
+        return Err(wrong_level(before + 1));
     }
-    if lut_rad[levels - 1] == lut_rad[0] {
-        return Err(LevelsError::LutShape { colour, level: levels - 1 });
+    if let Some(entry) = lut.iter().find(|entry| !entry.phase_rad.is_finite()) {
+        return Err(LevelsError::LutShape { colour, level: entry.level });
+    }
+    let [first, last] = [lut[0], lut[lut.len() - 1]];
+    if lut.iter().all(|entry| entry.phase_rad == first.phase_rad) {
+        return Err(LevelsError::LutShape { colour, level: last.level });
+    }
+    let falls = last.phase_rad < first.phase_rad;
+    let turns_round = |pair: &[LevelPhase]| {
+        if falls { pair[1].phase_rad > pair[0].phase_rad } else { pair[1].phase_rad < pair[0].phase_rad }
+    };
+    if let Some(before) = lut.windows(2).position(turns_round) {
+        if lut.len() == levels {
+            return Err(LevelsError::LutShape { colour, level: lut[before + 1].level });
+        }
+        // Levels in no order: their phases stand as they are.
+        return Ok(lut.clone());
     }
     match (falls, panel.phase_sign) {
         (true, PhaseSign::Positive) => Err(LevelsError::LutSign { colour }),
-        (true, PhaseSign::Negative) => Ok(lut_rad.clone()),
-        (false, _) => Ok(lut_rad.iter().map(|phase| sign * phase).collect()),
+        (true, PhaseSign::Negative) => Ok(lut.clone()),
+        (false, _) => Ok(lut.iter().map(|&entry| LevelPhase { phase_rad: sign * entry.phase_rad, ..entry }).collect()),
     }
 }
 
-/// For each of `16·L` equal ranges of the circle, the level nearest to its middle among the first turn of levels.
-fn nearest_level_table(signed_rad: &[f64]) -> Vec<u16> {
-    // Rounding noise of the levels' own arithmetic, so that a stroke of exactly 2π closes on level 0.
-    const CLOSES_RAD: f64 = 1e-9;
-    let in_first_turn = |level: &usize| (signed_rad[*level] - signed_rad[0]).abs() < TAU - CLOSES_RAD;
-    let mut around: Vec<(f64, u16)> = (0..signed_rad.len())
-        .filter(in_first_turn)
-        .map(|level| (signed_rad[level].rem_euclid(TAU), level as u16))
-        .collect();
-    around.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-    // Equal phases are one place on the circle; the lowest level stands for it.
-    around.dedup_by(|later, earlier| later.0 == earlier.0);
+/// The levels on the circle, in the order in which one meets them from the beginning of the stroke on.
+struct Arc {
+    /// Phase at the beginning.
+    start_rad: f64,
+    /// The sense of going round: 1 or −1.
+    sense: f64,
+    /// How far round each level is, rising from 0, below 2π; and the level.
+    levels: Vec<(f64, u16)>,
+}
 
-    let turn_levels = (0..signed_rad.len()).take_while(in_first_turn).count();
-    let widest_step_rad =
-        signed_rad[..turn_levels].windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max);
+impl Arc {
+    fn of(signed: &[LevelPhase]) -> Self {
+        // Rounding noise of the levels' own arithmetic, so that a stroke of exactly 2π closes on level 0.
+        const CLOSES_RAD: f64 = 1e-9;
+        let phases = || signed.iter().map(|entry| entry.phase_rad);
+        let rises = phases().is_sorted();
+        let mut arc = if rises || phases().is_sorted_by(|a, b| a >= b) {
+            let start_rad = signed[0].phase_rad;
+            let from_start = signed.iter().map(|entry| ((entry.phase_rad - start_rad).abs(), entry.level));
+            let levels = from_start.take_while(|(round_rad, _)| *round_rad < TAU - CLOSES_RAD).collect();
+            Self { start_rad, sense: if rises { 1.0 } else { -1.0 }, levels }
+        } else {
+            let mut levels: Vec<_> =
+                signed.iter().map(|entry| (entry.phase_rad.rem_euclid(TAU), entry.level)).collect();
+            levels.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            let gap_before = |index: usize| {
+                let before = levels[(index + levels.len() - 1) % levels.len()].0;
+                if index == 0 { levels[0].0 + TAU - before } else { levels[index].0 - before }
+            };
+            let widest = |best: usize, next: usize| if gap_before(next) > gap_before(best) { next } else { best };
+            let first = (0..levels.len()).fold(0, widest);
+            let start_rad = levels[first].0;
+            levels.rotate_left(first);
+            let levels =
+                levels.into_iter().map(|(phase, level)| ((phase - start_rad).rem_euclid(TAU), level)).collect();
+            Self { start_rad, sense: 1.0, levels }
+        };
+        // Equal phases are one place on the circle; the lowest level stands for it.
+        arc.levels.dedup_by(|later, earlier| later.0 == earlier.0);
+        arc
+    }
 
-    let entries = signed_rad.len() * ENTRIES_PER_LEVEL;
+    /// How far round the last level is.
+    fn length_rad(&self) -> f64 {
+        self.levels[self.levels.len() - 1].0
+    }
+
+    fn widest_step_rad(&self) -> f64 {
+        self.levels.windows(2).map(|pair| pair[1].0 - pair[0].0).fold(0.0, f64::max)
+    }
+
+    /// The level that is nearest on the circle to the place `round_rad`, in 0..2π, and its distance.
+    fn nearest(&self, round_rad: f64) -> (u16, f64) {
+        let above = self.levels.partition_point(|&(level_rad, _)| level_rad < round_rad);
+        let candidates = [(above + self.levels.len() - 1) % self.levels.len(), above % self.levels.len()];
+        let [before, after] =
+            candidates.map(|index| (self.levels[index].1, circle_distance(round_rad, self.levels[index].0)));
+        if after.1 < before.1 { after } else { before }
+    }
+}
+
+/// For each of the equal ranges of the circle, the level for its middle, and whether that is out of reach.
+fn level_table(signed: &[LevelPhase], bit_depth: u8, out_of_stroke: OutOfStroke) -> Vec<u32> {
+    let arc = Arc::of(signed);
+    let entries = (ENTRIES_PER_LEVEL << bit_depth).min(ENTRIES_MAX);
     let entry_rad = TAU / entries as f64;
-    let level_near = |entry: usize| {
+    let reach_rad = 0.5 * (arc.widest_step_rad() + entry_rad);
+    let (length_rad, last) = (arc.length_rad(), arc.levels[arc.levels.len() - 1].1);
+    let has_gap = TAU - length_rad > 2.0 * reach_rad;
+    let level_of = |entry: usize| {
         let phase_rad = (entry as f64 + 0.5) * entry_rad;
-        let above = around.partition_point(|&(level_rad, _)| level_rad < phase_rad);
-        let candidates = [around[(above + around.len() - 1) % around.len()], around[above % around.len()]];
-        let distances = candidates.map(|(level_rad, _)| circle_distance(phase_rad, level_rad));
-        let nearer = usize::from(distances[1] < distances[0]);
-        let out_of_reach = distances[nearer] > 0.5 * widest_step_rad + 0.5 * entry_rad;
-        candidates[nearer].1 | if out_of_reach { UNREACHABLE } else { 0 }
+        let round_rad = (arc.sense * (phase_rad - arc.start_rad)).rem_euclid(TAU);
+        let (nearest, distance_rad) = arc.nearest(round_rad);
+        let out_of_reach = distance_rad > reach_rad;
+        let level = match out_of_stroke {
+            OutOfStroke::Scale if has_gap => arc.nearest(round_rad * length_rad / TAU).0,
+            OutOfStroke::Clip if out_of_reach => last,
+            OutOfStroke::Zero if out_of_reach => arc.levels[0].1,
+            _ => nearest,
+        };
+        u32::from(level) | if out_of_reach { UNREACHABLE } else { 0 }
     };
-    (0..entries).map(level_near).collect()
+    (0..entries).map(level_of).collect()
 }
 
 /// The shorter way round between two phases, 0..=π.
@@ -408,7 +533,7 @@ fn circle_distance(a_rad: f64, b_rad: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::fields::FrameLayout;
-    use holod_calibration::rig::{PanelMode, Rig};
+    use holod_calibration::rig::{Packing, Rig};
     use proptest::prelude::*;
 
     const FULL_STROKE_RAD: f64 = TAU * 255.0 / 256.0;
@@ -437,7 +562,20 @@ mod tests {
 
     fn nearest_by_search(panel: &Panel, phase_rad: f64) -> f64 {
         let levels = signed_phases(panel, Colour::Green).unwrap();
-        levels.iter().map(|&level_rad| circle_distance(level_rad, phase_rad)).fold(f64::MAX, f64::min)
+        levels.iter().map(|entry| circle_distance(entry.phase_rad, phase_rad)).fold(f64::MAX, f64::min)
+    }
+
+    /// A table for green with a phase for each level from 0 up.
+    fn green_lut(phases_rad: &[f64]) -> PerColour<Option<Vec<LevelPhase>>> {
+        let entries = phases_rad.iter().enumerate();
+        let table = entries.map(|(level, &phase_rad)| LevelPhase { level: level as u16, phase_rad }).collect();
+        PerColour([None, Some(table), None])
+    }
+
+    /// Seven levels of 256 as irregularly spaced as those of a panel of piston mirrors.
+    fn few_levels() -> Vec<LevelPhase> {
+        let turns = [(3, 0.0), (40, 0.01), (77, 0.10), (90, 0.31), (130, 0.36), (200, 0.62), (255, 0.81)];
+        turns.map(|(level, turns)| LevelPhase { level, phase_rad: turns * TAU }).to_vec()
     }
 
     #[test]
@@ -478,6 +616,110 @@ mod tests {
     }
 
     #[test]
+    fn phases_out_of_stroke_go_where_the_rig_says() {
+        // A stroke of 0.75 turns over 256 levels: 0.9 turns is nearer to the beginning, 0.85 to the far end.
+        let turns = [0.31, 0.74, 0.85, 0.9, 0.9999].map(|turns: f32| turns * TAU as f32);
+        let level = |turns: f64| (turns / 0.75 * 255.0).round() as u16;
+        let (asked, near_end) = (level(0.31), level(0.74));
+        for (out_of_stroke, negative, expected) in [
+            (OutOfStroke::Nearest, false, [asked, near_end, 255, 0, 0]),
+            (OutOfStroke::Clip, false, [asked, near_end, 255, 255, 0]),
+            (OutOfStroke::Zero, false, [asked, near_end, 0, 0, 0]),
+            (OutOfStroke::Scale, false, [level(0.2325), level(0.555), level(0.6375), level(0.675), 255]),
+            // The levels run the other way: 0.69, 0.26, 0.15, 0.1 and 0.0001 turns round are 0.31, 0.74, 0.85, 0.9 and 0.9999.
+            (OutOfStroke::Clip, true, [level(0.69), level(0.26), level(0.15), level(0.1), 0]),
+        ] {
+            let panel = Panel {
+                stroke_rad: PerColour([0.75 * TAU; 3]),
+                out_of_stroke,
+                phase_sign: if negative { PhaseSign::Negative } else { PhaseSign::Positive },
+                ..panel()
+            };
+            let (levels, unreachable) = encoded(&panel, &turns);
+            assert_eq!(levels, expected, "{out_of_stroke:?}");
+            assert_eq!(unreachable, if negative { 0.0 } else { 0.4 }, "{out_of_stroke:?}");
+        }
+        let beyond = [0.2, 0.1].map(|turns: f32| turns * TAU as f32);
+        let panel = Panel {
+            stroke_rad: PerColour([0.75 * TAU; 3]),
+            out_of_stroke: OutOfStroke::Clip,
+            phase_sign: PhaseSign::Negative,
+            ..panel()
+        };
+        assert_eq!(encoded(&panel, &beyond), (vec![255, 255], 1.0));
+    }
+
+    #[test]
+    fn a_stroke_without_a_gap_is_never_changed() {
+        let circle: Vec<f32> = (0..3000).map(|part| (TAU * f64::from(part) / 3000.0) as f32).collect();
+        for stroke_rad in [FULL_STROKE_RAD, TAU, 1.4 * TAU] {
+            let plain = Panel { stroke_rad: PerColour([stroke_rad; 3]), ..panel() };
+            let expected = encoded(&plain, &circle);
+            for out_of_stroke in OutOfStroke::ALL {
+                assert_eq!(encoded(&Panel { out_of_stroke, ..plain.clone() }, &circle), expected, "{out_of_stroke:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn few_irregular_levels_are_chosen_by_their_phase() {
+        let panel = Panel { lut: PerColour([None, Some(few_levels()), None]), ..panel() };
+        let phases = [0.0, 0.05, 0.06, 0.2, 0.5, 0.71, 0.72, 0.95].map(|turns: f32| turns * TAU as f32);
+        let (levels, unreachable) = encoded(&panel, &phases);
+        assert_eq!(levels, [3, 40, 77, 77, 200, 200, 255, 3]);
+        assert_eq!(unreachable, 0.0);
+        let shown = PanelEncoder::new(&panel, row(8), row(8)).unwrap().decode(Colour::Green, &levels);
+        let expected = [0.0, 0.01, 0.1, 0.1, 0.62, 0.62, 0.81, 0.0].map(|turns: f32| turns * TAU as f32);
+        assert_eq!(first_wrong(&expected, &shown, 1e-6), None);
+    }
+
+    #[test]
+    fn levels_in_no_order_are_chosen_all_the_same() {
+        let rising = few_levels();
+        let mut shuffled = rising.clone();
+        for (index, entry) in shuffled.iter_mut().enumerate() {
+            // A permutation of the phases, each moved by whole turns.
+            let turns = rising[index * 3 % rising.len()].phase_rad / TAU + (index % 3) as f64 - 1.0;
+            entry.phase_rad = turns * TAU;
+        }
+        let panel_of = |table| Panel { lut: PerColour([None, Some(table), None]), ..panel() };
+        let circle: Vec<f32> = (0..2000).map(|part| (TAU * (f64::from(part) + 0.5) / 2000.0) as f32).collect();
+        let shown = |panel: &Panel| {
+            let levels = encoded(panel, &circle).0;
+            let encoder = PanelEncoder::new(panel, row(2000), row(2000)).unwrap();
+            encoder.decode(Colour::Green, &levels)
+        };
+        let (ordered, unordered) = (shown(&panel_of(rising)), shown(&panel_of(shuffled)));
+        assert_eq!(first_wrong(&ordered, &unordered, 1e-5), None);
+    }
+
+    #[test]
+    #[should_panic(expected = "level 5 is not in the panel's table")]
+    fn a_level_outside_the_table_has_no_phase() {
+        let panel = Panel { lut: PerColour([None, Some(few_levels()), None]), ..panel() };
+        PanelEncoder::new(&panel, row(1), row(1)).unwrap().decode(Colour::Green, &[5]);
+    }
+
+    #[test]
+    fn sixteen_bits_are_as_fine_as_their_table() {
+        let levels = 65536.0;
+        let panel = Panel {
+            bit_depth: 16,
+            packing: Packing::Red8Green8,
+            mode: PanelMode::FieldSequential,
+            stroke_rad: PerColour([TAU * (levels - 1.0) / levels; 3]),
+            ..panel()
+        };
+        let phases: Vec<f32> = (0..5000).map(|part| (TAU * f64::from(part) / 5000.0) as f32).collect();
+        let (levels_sent, unreachable) = encoded(&panel, &phases);
+        assert_eq!(unreachable, 0.0);
+        let size = row(phases.len());
+        let shown = PanelEncoder::new(&panel, size, size).unwrap().decode(Colour::Green, &levels_sent);
+        assert_eq!(first_wrong(&phases, &shown, TAU / levels + 2e-6), None);
+        assert_eq!(levels_sent.iter().max(), Some(&65522));
+    }
+
+    #[test]
     fn a_long_stroke_uses_its_first_turn_only() {
         let long = Panel { stroke_rad: PerColour([1.5 * TAU; 3]), ..panel() };
         let circle: Vec<f32> = (0..8192).map(|part| (TAU * (f64::from(part) + 0.5) / 8192.0) as f32).collect();
@@ -504,10 +746,10 @@ mod tests {
     #[test]
     fn a_falling_table_is_signed_already() {
         let falling: Vec<f64> = (0..256).map(|level| -FULL_STROKE_RAD * f64::from(level) / 255.0).collect();
-        let lut_rad = PerColour([None, Some(falling), None]);
-        let negative = Panel { phase_sign: PhaseSign::Negative, lut_rad: lut_rad.clone(), ..panel() };
+        let lut = green_lut(&falling);
+        let negative = Panel { phase_sign: PhaseSign::Negative, lut: lut.clone(), ..panel() };
         assert_eq!(encoded(&negative, &[0.25 * TAU as f32]).0, [192]);
-        let positive = Panel { lut_rad, ..panel() };
+        let positive = Panel { lut, ..panel() };
         let refused = PanelEncoder::new(&positive, row(4), row(4)).unwrap_err();
         assert_eq!(refused, LevelsError::LutSign { colour: Colour::Green });
     }
@@ -545,22 +787,59 @@ mod tests {
     }
 
     #[test]
+    fn whole_turns_are_kept_where_they_are_asked_for() {
+        let flatness = vec![0.0, 0.25 * TAU as f32, 0.0];
+        let panel = Panel {
+            stroke_rad: PerColour([1.5 * TAU; 3]),
+            phase_sign: PhaseSign::Negative,
+            flatness_rad: PerColour([None, Some(flatness), None]),
+            ..panel()
+        };
+        let encoder = PanelEncoder::new(&panel, row(3), row(3)).unwrap();
+        let levels = [0, 170, 255];
+        let turns = |phases_rad: Vec<f32>| -> Vec<f64> {
+            phases_rad.into_iter().map(|phase_rad| f64::from(phase_rad) / TAU).collect()
+        };
+        let unwrapped = turns(encoder.decode_unwrapped(Colour::Green, &levels));
+        for (turns, expected) in unwrapped.iter().zip([0.0, -1.25, -1.5]) {
+            assert!((turns - expected).abs() < 1e-6, "{unwrapped:?}");
+        }
+        let wrapped = turns(encoder.decode(Colour::Green, &levels));
+        for (turns, expected) in wrapped.iter().zip([0.0, 0.75, 0.5]) {
+            assert!((turns - expected).abs() < 1e-6, "{wrapped:?}");
+        }
+    }
+
+    #[test]
     fn bad_descriptions_are_refused_with_what_is_wrong() {
-        let green = |lut: Vec<f64>| PerColour([None, Some(lut), None]);
         let colour = Colour::Green;
         let mut bent: Vec<f64> = (0..256).map(f64::from).collect();
         bent[100] = 0.0;
         let mut hole = bent.clone();
         hole[7] = f64::NAN;
+        let few = |levels: &[u16]| {
+            let table = levels.iter().map(|&level| LevelPhase { level, phase_rad: f64::from(level) }).collect();
+            Panel { lut: PerColour([None, Some(table), None]), ..panel() }
+        };
+        let wrong_level = |entry, found| LevelsError::LutLevel { colour, entry, found, levels: 256 };
         let cases = [
-            (Panel { bit_depth: 12, ..panel() }, LevelsError::BitDepth { found: 12 }),
+            (Panel { bit_depth: 12, ..panel() }, LevelsError::BitDepth { found: 12, packing: "gray", carried: 8 }),
             (
-                Panel { lut_rad: green(vec![0.0; 255]), ..panel() },
-                LevelsError::LutLength { colour, found: 255, expected: 256 },
+                Panel { bit_depth: 10, packing: Packing::Red8Green8, ..panel() },
+                LevelsError::BitDepth { found: 10, packing: "red8-green8", carried: 16 },
             ),
-            (Panel { lut_rad: green(bent), ..panel() }, LevelsError::LutShape { colour, level: 100 }),
-            (Panel { lut_rad: green(hole), ..panel() }, LevelsError::LutShape { colour, level: 7 }),
-            (Panel { lut_rad: green(vec![1.0; 256]), ..panel() }, LevelsError::LutShape { colour, level: 255 }),
+            (
+                Panel { bit_depth: 10, packing: Packing::Red8Blue2, ..panel() },
+                LevelsError::PackedDepth { packing: "red8-blue2" },
+            ),
+            (few(&[]), wrong_level(0, 0)),
+            (few(&[9]), wrong_level(1, 9)),
+            (few(&[1, 256, 300]), wrong_level(1, 256)),
+            (few(&[1, 7, 7]), wrong_level(2, 7)),
+            (few(&[1, 7, 6]), wrong_level(2, 6)),
+            (Panel { lut: green_lut(&bent), ..panel() }, LevelsError::LutShape { colour, level: 100 }),
+            (Panel { lut: green_lut(&hole), ..panel() }, LevelsError::LutShape { colour, level: 7 }),
+            (Panel { lut: green_lut(&[1.0; 256]), ..panel() }, LevelsError::LutShape { colour, level: 255 }),
             (
                 Panel { flatness_rad: PerColour([None, Some(vec![0.0; 3]), None]), ..panel() },
                 LevelsError::Flatness { colour, found: 3, expected: 4, panel: row(4) },
@@ -581,23 +860,39 @@ mod tests {
         ];
         (prop::bool::ANY, prop::bool::ANY, prop::bool::ANY, lut, 0.2f64..1.6).prop_map(
             |(ten_bits, negative, packed, exponent, turns)| {
-                let bit_depth = if ten_bits { 10 } else { 8 };
-                let top = (1u32 << bit_depth) - 1;
-                let bent = exponent.map(|exponent| {
-                    (0..=top)
-                        .map(|level| 0.3 + turns * TAU * (f64::from(level) / f64::from(top)).powf(exponent))
-                        .collect()
+                let top = if ten_bits { 1023 } else { 255 };
+                let bent = exponent.map(|exponent| -> Vec<f64> {
+                    let share = |level| f64::from(level) / f64::from(top);
+                    (0..=top).map(|level| 0.3 + turns * TAU * share(level).powf(exponent)).collect()
                 });
                 Panel {
-                    bit_depth,
                     phase_sign: if negative { PhaseSign::Negative } else { PhaseSign::Positive },
-                    mode: if packed { PanelMode::ChannelPacked } else { PanelMode::FieldSequential },
                     stroke_rad: PerColour([turns * TAU; 3]),
-                    lut_rad: PerColour([None, bent, None]),
-                    ..panel()
+                    lut: bent.map_or(PerColour([None, None, None]), |bent| green_lut(&bent)),
+                    ..driven(ten_bits, packed)
                 }
             },
         )
+    }
+
+    /// The default panel with ten bits, or with eight in either mode.
+    fn driven(ten_bits: bool, packed: bool) -> Panel {
+        match (ten_bits, packed) {
+            (true, _) => {
+                Panel { bit_depth: 10, packing: Packing::Red3Green3Blue4, mode: PanelMode::FieldSequential, ..panel() }
+            }
+            (false, true) => panel(),
+            (false, false) => Panel { mode: PanelMode::FieldSequential, ..panel() },
+        }
+    }
+
+    /// Tables of 2 to 40 levels at phases of any kind.
+    fn few_level_panels() -> impl Strategy<Value = Panel> {
+        let table = prop::collection::btree_map(0u16..256, -7.0f64..7.0, 2..40);
+        table.prop_map(|table| {
+            let table = table.into_iter().map(|(level, phase_rad)| LevelPhase { level, phase_rad }).collect();
+            Panel { phase_sign: PhaseSign::Negative, lut: PerColour([None, Some(table), None]), ..panel() }
+        })
     }
 
     proptest! {
@@ -614,8 +909,28 @@ mod tests {
             let entry_rad = TAU / (ENTRIES_PER_LEVEL << panel.bit_depth) as f64;
             // In a long stroke a level of the second turn may be nearer: those are left out on purpose.
             let longest = signed_phases(&panel, Colour::Green).unwrap();
-            let one_turn = (longest[longest.len() - 1] - longest[0]).abs() < TAU;
+            let one_turn = (longest[longest.len() - 1].phase_rad - longest[0].phase_rad).abs() < TAU;
             for (&asked, &shown) in phases.iter().zip(&shown).filter(|_| one_turn) {
+                let reached = circle_distance(f64::from(asked), f64::from(shown));
+                let best = nearest_by_search(&panel, f64::from(asked));
+                prop_assert!(reached <= best + entry_rad + 2e-6, "asked {} shown {} best {}", asked, shown, best);
+            }
+        }
+
+        /// The same with few levels: only those of the table are sent, and the nearest of them.
+        #[test]
+        fn every_phase_goes_to_the_nearest_of_few_levels(
+            panel in few_level_panels(), phases in prop::collection::vec(0.0f32..TAU as f32, 1..600),
+        ) {
+            let signed = signed_phases(&panel, Colour::Green).unwrap();
+            let turns = signed[signed.len() - 1].phase_rad - signed[0].phase_rad;
+            let monotonic = signed.is_sorted_by(|a, b| (b.phase_rad - a.phase_rad) * turns >= 0.0);
+            prop_assume!(!monotonic || turns.abs() < TAU);
+            let levels = encoded(&panel, &phases).0;
+            let shown = PanelEncoder::new(&panel, row(phases.len()), row(phases.len())).unwrap()
+                .decode(Colour::Green, &levels);
+            let entry_rad = TAU / (ENTRIES_PER_LEVEL << panel.bit_depth) as f64;
+            for (&asked, &shown) in phases.iter().zip(&shown) {
                 let reached = circle_distance(f64::from(asked), f64::from(shown));
                 let best = nearest_by_search(&panel, f64::from(asked));
                 prop_assert!(reached <= best + entry_rad + 2e-6, "asked {} shown {} best {}", asked, shown, best);
@@ -637,12 +952,10 @@ mod tests {
             let phases: Vec<f32> = (0..pattern.pixels()).map(|index| noise(index) * TAU as f32).collect();
             let flatness: Vec<f32> = (0..size.pixels()).map(|index| (noise(index + 7) - 0.5) * 40.0).collect();
             let panel = Panel {
-                bit_depth,
-                mode: if packed { PanelMode::ChannelPacked } else { PanelMode::FieldSequential },
                 phase_sign: if negative { PhaseSign::Negative } else { PhaseSign::Positive },
                 stroke_rad: PerColour([TAU * (levels - 1.0) / levels; 3]),
                 flatness_rad: PerColour([Some(flatness), None, None]),
-                ..panel()
+                ..driven(ten_bits, packed)
             };
             let encoder = PanelEncoder::new(&panel, size, pattern).unwrap();
             let mut frame = LevelsFrame::new(FrameLayout::new(&panel, size));

@@ -1,26 +1,35 @@
-//! The laser box over a pseudo-terminal: the real serial client at one end, the simulated box at the other.
+//! The laser box over a pseudo-terminal: the host's client at one end, the reference firmware at the other.
 
 use std::fs;
 use std::io::{ErrorKind, Read, Write};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::Duration;
 
 use holod_calibration::rig::{LaserDriver, Lasers, PanelMode, Rig};
-use holod_calibration::{PerColour, Resolution, TimeNs};
-use holod_slm_output::laser::gate::Gate;
-use holod_slm_output::laser::protocol::Line;
-use holod_slm_output::laser::simulated_box::{LOG_HEADER, SimulatedBox, SimulatedTerminal, read_log};
+use holod_calibration::{Colour, PerColour, Resolution, TimeNs};
+use holod_laser_firmware::Line;
+use holod_slm_output::PanelEncoder;
+use holod_slm_output::laser::edge_log::{LOG_HEADER, read_log};
+use holod_slm_output::laser::simulator::{Faults, SimulatedBox, SimulatedTerminal};
 use holod_slm_output::laser::verify::verify_edges;
-use holod_slm_output::laser::{BoxEvent, DarkReason, LaserBox, LaserEdge, LaserError, LaserProgram, SerialBox};
+use holod_slm_output::laser::{
+    BoxEvent, DarkReason, LaserBox, LaserEdge, LaserError, LaserProgram, LitWindow, Refusal, SerialBox, SerialOptions,
+    make_dark, open_laser,
+};
 use holod_slm_output::output::{FieldEvent, Output, OutputOptions, monotonic_now, pacing_config};
 use holod_slm_output::pacing::{Pacer, Point};
-use holod_slm_output::present::{HeadlessPanel, PanelTiming};
-use holod_slm_output::{FrameLayout, LevelsFrame, PanelEncoder};
+use holod_slm_output::present::{PanelSetup, open_panel};
+use holod_slm_output::schedule::Gate;
+use proptest::prelude::*;
 
 const MS: i64 = 1_000_000;
+
+/// A clock that is not the host's.
+const OTHER_CLOCK: [&str; 4] = ["--clock-offset-us", "987654321", "--clock-drift-ppm", "80"];
 
 /// The simulated box as a process.
 struct BoxProcess {
@@ -31,11 +40,12 @@ struct BoxProcess {
 }
 
 impl BoxProcess {
-    fn start() -> Self {
+    fn start(options: &[&str]) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let log = folder.path().join("box.csv");
         let mut process = Command::new(env!("CARGO_BIN_EXE_holod-simulated-laser"))
             .arg(&log)
+            .args(options)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .spawn()
@@ -50,11 +60,51 @@ impl BoxProcess {
         Self { process, port, log, _folder: folder }
     }
 
+    /// A host that has armed it and closes its port without a last word, as a killed process does.
+    fn armed_by_a_host_that_will_not_say_goodbye(&self) -> fs::File {
+        let mut port = fs::OpenOptions::new().read(true).write(true).open(&self.port).unwrap();
+        for command in [
+            "SEQ RGB 30000 HOST",
+            "FLD 0 1 1",
+            "FLD 1 9 1",
+            "FLD 2 99 1",
+            "MAX 9 9 9",
+            "POW 9 9 9",
+            "TMO 500000",
+            "ARM LIGHT",
+        ] {
+            port.write_all(Line::new(format_args!("1 {command}")).unwrap().as_bytes()).unwrap();
+        }
+        eventually("arming", || matches!(self.events().last(), Some(BoxEvent::Armed { .. })));
+        port
+    }
+
+    /// Puts a fault into it.
+    fn tell(&mut self, command: &str) {
+        writeln!(self.process.stdin.as_mut().unwrap(), "{command}").unwrap();
+    }
+
+    fn open(&self, options: SerialOptions) -> SerialBox {
+        SerialBox::open(&self.port, options, monotonic_now).unwrap()
+    }
+
+    /// A host that has armed it.
+    fn armed(&self, program: &LaserProgram) -> SerialBox {
+        let mut host = self.open(SerialOptions::default());
+        host.program(program, monotonic_now()).unwrap();
+        host.arm(monotonic_now()).unwrap();
+        host
+    }
+
+    fn events(&self) -> Vec<BoxEvent> {
+        read_log(&fs::read_to_string(&self.log).unwrap()).unwrap()
+    }
+
     /// Waits until the box's log ends with darkness, and reads it.
     fn dark_log(&self) -> Vec<BoxEvent> {
         let mut events = Vec::new();
         eventually("darkness", || {
-            events = read_log(&fs::read_to_string(&self.log).unwrap()).unwrap();
+            events = self.events();
             matches!(events.last(), Some(BoxEvent::Dark { .. }))
         });
         events
@@ -94,7 +144,7 @@ fn rig(mode: PanelMode, port: &Path) -> Rig {
     let mut rig = Rig::default();
     rig.panel.mode = mode;
     rig.panel.refresh_hz = if mode == PanelMode::ChannelPacked { 60.0 } else { 100.0 };
-    rig.lasers = Lasers { driver: LaserDriver::Serial { path: port.into() }, ..rig.lasers };
+    rig.lasers = Lasers { driver: LaserDriver::Serial { path: port.into(), sync_wire: false }, ..rig.lasers };
     rig
 }
 
@@ -102,7 +152,10 @@ fn rig(mode: PanelMode, port: &Path) -> Rig {
 fn run(rig: &Rig) -> (Output, Vec<FieldEvent>) {
     let size = Resolution { width: 4, height: 2 };
     let encoder = PanelEncoder::new(&rig.panel, size, size).unwrap();
-    let mut output = Output::headless(rig, &encoder, OutputOptions::default(), monotonic_now).unwrap();
+    let panel = open_panel(&"headless".parse().unwrap(), &PanelSetup::new(&rig.panel, &encoder), monotonic_now());
+    let laser = open_laser(&rig.lasers, monotonic_now).unwrap();
+    let options = OutputOptions::default();
+    let mut output = Output::start(rig, &encoder, panel.unwrap(), laser, options, monotonic_now).unwrap();
     let mut pacer = Pacer::new(pacing_config(rig, TimeNs(2 * MS)).unwrap(), monotonic_now());
     let mut fields: Vec<FieldEvent> = Vec::new();
     for _ in 0..1000 {
@@ -123,10 +176,30 @@ fn run(rig: &Rig) -> (Output, Vec<FieldEvent>) {
     (output, fields)
 }
 
+/// Polls until the client says that the box is dark, and why; errors on the way are left out.
+fn dark_reason(host: &mut dyn LaserBox) -> DarkReason {
+    let mut dark = None;
+    eventually("darkness at the host", || {
+        let _on_the_way = host.poll(monotonic_now(), &mut |event| {
+            if let BoxEvent::Dark { reason, .. } = event {
+                dark.get_or_insert(reason);
+            }
+        });
+        std::thread::sleep(Duration::from_millis(1));
+        dark.is_some()
+    });
+    dark.unwrap()
+}
+
+/// The host's trigger, and windows that leave time for a slow machine.
+fn host_program() -> LaserProgram {
+    LaserProgram { heartbeat_timeout: TimeNs(950 * MS), ..program(&rig(PanelMode::FieldSequential, Path::new("x"))) }
+}
+
 #[test]
-fn a_whole_run_is_lit_by_the_box_and_ends_dark_and_acknowledged() {
+fn a_whole_run_is_lit_by_a_box_with_another_clock_and_ends_dark_and_acknowledged() {
     for mode in [PanelMode::ChannelPacked, PanelMode::FieldSequential] {
-        let laser = BoxProcess::start();
+        let laser = BoxProcess::start(&OTHER_CLOCK);
         let rig = rig(mode, &laser.port);
         let (output, mut fields) = run(&rig);
         let mut events = output.events;
@@ -147,65 +220,248 @@ fn a_whole_run_is_lit_by_the_box_and_ends_dark_and_acknowledged() {
 
 #[test]
 fn a_host_that_falls_silent_leaves_a_box_that_goes_dark_by_its_heartbeat_timeout() {
-    let laser = BoxProcess::start();
-    let mut rig = rig(PanelMode::FieldSequential, &laser.port);
-    rig.lasers.heartbeat_timeout = TimeNs(60 * MS);
-    let mut host = SerialBox::open(&laser.port, monotonic_now).unwrap();
-    host.program(&program(&rig), monotonic_now()).unwrap();
-    host.arm(monotonic_now()).unwrap();
+    let laser = BoxProcess::start(&OTHER_CLOCK);
+    let program = LaserProgram { heartbeat_timeout: TimeNs(60 * MS), ..host_program() };
+    let mut host = laser.armed(&program);
     host.heartbeat(monotonic_now()).unwrap();
     // Lines are answered in order: with this answer the heartbeat has been heard.
-    host.arm(monotonic_now()).unwrap();
+    host.report().unwrap();
     let t_silent = monotonic_now();
-    // Neither a word nor a closed line: like a killed process whose port somebody else holds.
+    // Neither a word nor a closed line: like a process that hangs.
     std::mem::forget(host);
     let log = laser.dark_log();
     let &BoxEvent::Dark { t, reason } = log.last().unwrap() else { panic!("{log:?}") };
     assert_eq!(reason, DarkReason::Heartbeat);
-    assert!(t - t_silent <= rig.lasers.heartbeat_timeout, "its own time, however late it is looked at");
+    assert!(t - t_silent <= program.heartbeat_timeout + TimeNs(2000), "its own time, however late it is looked at");
+}
+
+#[test]
+fn a_line_that_hangs_up_makes_dark_at_once_where_it_can_be_seen() {
+    for (options, reason) in [(&[][..], DarkReason::HangUp), (&["--no-hang-up"], DarkReason::Heartbeat)] {
+        let laser = BoxProcess::start(options);
+        drop(laser.armed_by_a_host_that_will_not_say_goodbye());
+        let log = laser.dark_log();
+        assert!(matches!(log.last(), Some(BoxEvent::Dark { reason: found, .. }) if *found == reason), "{log:?}");
+    }
+}
+
+#[test]
+fn faults_of_the_box_are_heard_of_by_their_own_names() {
+    let cases = [
+        ("interlock open", DarkReason::Interlock),
+        ("corrupt received", DarkReason::Line),
+        ("reset", DarkReason::BoxFault),
+        ("freeze 400", DarkReason::Heartbeat),
+    ];
+    for (fault, reason) in cases {
+        let mut laser = BoxProcess::start(&OTHER_CLOCK);
+        let program = LaserProgram { heartbeat_timeout: TimeNs(200 * MS), ..host_program() };
+        let mut host = laser.armed(&program);
+        laser.tell(fault);
+        let mut dark = None;
+        eventually(fault, || {
+            let now = monotonic_now();
+            let _refused_once_dark = host.heartbeat(now);
+            let _on_the_way = host.poll(now, &mut |event| {
+                if let BoxEvent::Dark { reason, .. } = event {
+                    dark.get_or_insert(reason);
+                }
+            });
+            std::thread::sleep(Duration::from_millis(5));
+            dark.is_some() || (fault.starts_with("freeze") && !laser.events().is_empty())
+        });
+        if !fault.starts_with("freeze") {
+            assert_eq!(dark, Some(reason), "{fault}");
+        }
+        // Whatever the host knows, the box is dark.
+        assert!(laser.dark_log().len() >= 2);
+    }
+}
+
+#[test]
+fn a_box_whose_interlock_is_open_is_not_armed() {
+    let mut laser = BoxProcess::start(&[]);
+    laser.tell("interlock open");
+    let mut host = laser.open(SerialOptions::default());
+    host.program(&host_program(), monotonic_now()).unwrap();
+    eventually("the interlock", || !host.report().unwrap().state.interlock_closed);
+    let refused = host.arm(monotonic_now()).unwrap_err();
+    assert!(matches!(refused, LaserError::Refused { command: "ARM", refusal: Refusal::Interlock }), "{refused}");
+    laser.tell("interlock closed");
+    eventually("arming", || host.arm(monotonic_now()).is_ok());
 }
 
 #[test]
 fn a_second_host_finds_a_box_that_answers() {
-    let laser = BoxProcess::start();
-    let rig = rig(PanelMode::ChannelPacked, &laser.port);
+    let laser = BoxProcess::start(&[]);
     fs::OpenOptions::new().write(true).open(&laser.port).unwrap().write_all(b"17 POW 1 2").unwrap();
     for _ in 0..2 {
-        let mut host = SerialBox::open(&laser.port, monotonic_now).unwrap();
-        host.program(&program(&rig), monotonic_now()).unwrap();
-        host.arm(monotonic_now()).unwrap();
+        let mut host = laser.armed(&host_program());
         host.dark(DarkReason::Asked, monotonic_now()).unwrap();
     }
 }
 
-/// A box that gives itself out for one with lasers.
-fn real_box(stream: UnixStream) {
-    let mut simulated = SimulatedBox::new(monotonic_now());
-    let mut bytes = [0; 256];
-    while let Ok(count @ 1..) = (&stream).read(&mut bytes) {
-        simulated.receive(&bytes[..count], monotonic_now(), |line| {
-            let text = String::from_utf8_lossy(line.as_bytes()).into_owned();
-            let text = text.split('*').next().unwrap().replace(" simulated", " bench-4");
-            let _gone = (&stream).write_all(Line::new(format_args!("{text}")).as_bytes());
+#[test]
+fn two_programs_do_not_drive_one_box_but_anybody_may_make_it_dark() {
+    let laser = BoxProcess::start(&[]);
+    let mut host = laser.armed(&LaserProgram { heartbeat_timeout: TimeNs(900 * MS), ..host_program() });
+    let in_use = SerialBox::open(&laser.port, SerialOptions::default(), monotonic_now).unwrap_err();
+    assert!(matches!(&in_use, LaserError::InUse { path } if laser.port == Path::new(path)), "{in_use}");
+    let in_use = SerialBox::inspect(&laser.port, monotonic_now).unwrap_err();
+    assert!(matches!(in_use, LaserError::InUse { .. }), "{in_use}");
+
+    // The host's listener goes on reading beside it, as that of a program does whose other threads hang.
+    let driver = LaserDriver::Serial { path: laser.port.clone(), sync_wire: false };
+    make_dark(&driver, monotonic_now).unwrap();
+    let log = laser.dark_log();
+    assert!(matches!(log.last(), Some(BoxEvent::Dark { reason: DarkReason::Asked, .. })), "{log:?}");
+    let mut dark = None;
+    eventually("the host to notice", || {
+        let _refused_once_dark = host.heartbeat(monotonic_now());
+        // It may have missed an answer that the other program took.
+        let _missed = host.poll(monotonic_now(), &mut |event| {
+            if let BoxEvent::Dark { reason, .. } = event {
+                dark = Some(reason);
+            }
         });
+        std::thread::sleep(Duration::from_millis(5));
+        dark.is_some()
+    });
+    assert_eq!(dark, Some(DarkReason::Asked));
+    assert!(matches!(host.arm(monotonic_now()), Err(LaserError::MadeDark)), "nobody arms it against that");
+    drop(host);
+
+    let report = SerialBox::inspect(&laser.port, monotonic_now).unwrap();
+    assert!(!report.state.armed && report.name == "simulated" && report.state.interlock_closed, "{report:?}");
+    assert!(report.clock_error_ns < 100 * MS);
+}
+
+#[test]
+fn windows_are_inside_what_was_asked_for_whatever_the_clocks_and_dark_where_nothing_is_left() {
+    let laser = BoxProcess::start(&OTHER_CLOCK);
+    let mut host = laser.armed(&host_program());
+    let mut asked = Vec::new();
+    for colour in Colour::ALL {
+        let now = monotonic_now();
+        host.heartbeat(now).unwrap();
+        let window = LitWindow { colour, t_on: now + TimeNs(30 * MS), t_off: now + TimeNs(70 * MS) };
+        host.light(window, now).unwrap();
+        asked.push(window);
+        // Too narrow for what is known of the clocks: nobody knows them to 2 µs here.
+        host.light(LitWindow { t_on: now + TimeNs(80 * MS), t_off: now + TimeNs(80 * MS + 2000), ..window }, now)
+            .unwrap();
+        std::thread::sleep(Duration::from_millis(100));
+        host.poll(monotonic_now(), &mut |_| ()).unwrap();
+    }
+    host.dark(DarkReason::Asked, monotonic_now()).unwrap();
+    let found = edges(&laser.dark_log());
+    assert_eq!(found.len(), 6, "{found:?}");
+    for (pair, window) in found.chunks(2).zip(asked) {
+        assert_eq!((pair[0].colour, pair[0].on, pair[1].on), (window.colour, true, false));
+        assert!(pair[0].t >= window.t_on && pair[1].t <= window.t_off, "{pair:?} {window:?}");
     }
 }
 
 #[test]
-fn real_lasers_stay_dark_over_a_virtual_panel() {
-    let (host, far) = UnixStream::pair().unwrap();
+fn a_box_on_the_panels_wire_lights_after_its_edges_and_a_wire_that_disagrees_makes_dark() {
+    let mut laser = BoxProcess::start(&OTHER_CLOCK);
+    let rig = rig(PanelMode::ChannelPacked, &laser.port);
+    let program = LaserProgram { heartbeat_timeout: TimeNs(950 * MS), ..program(&rig) };
+    let without = SerialOptions::default();
+    let mut host = laser.open(SerialOptions { sync_wire: true, ..without });
+    host.program(&program, monotonic_now()).unwrap();
+    laser.tell("sync 60");
+    eventually("an edge", || host.report().unwrap().state.sync.count > 2);
+    // What this host believes of the panel: frames at the same rate, in a phase of their own.
+    let t_first = monotonic_now();
+    let frame = |index: i64| TimeNs(t_first.0 + index * program.frame_period.0);
+    host.arm(monotonic_now()).unwrap();
+    let mut dark = None;
+    let run = |host: &mut SerialBox, until: &dyn Fn(i64) -> bool, dark: &mut Option<DarkReason>| {
+        for index in 0.. {
+            if dark.is_some() || until(index) {
+                return;
+            }
+            let now = monotonic_now();
+            let known = (now.0 - t_first.0) / program.frame_period.0;
+            let _once_dark = host.heartbeat(now);
+            let _once_dark = host.sync(frame(known), now);
+            let mut late = false;
+            // A box on a busy machine may be slow to answer.
+            let _slow = host.poll(now, &mut |event| {
+                // A busy machine may tell the host's own model of a frame too late.
+                match event {
+                    BoxEvent::Dark { reason: DarkReason::SyncLost, .. } => late = true,
+                    BoxEvent::Dark { reason, .. } => *dark = Some(reason),
+                    _ => {}
+                }
+            });
+            if late {
+                let _once_dark = host.arm(now);
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    };
+    run(&mut host, &|index| index == 60, &mut dark);
+    assert_eq!(dark, None, "{:?}", laser.events().last());
+    assert!(edges(&laser.events()).len() > 20);
+    // Another panel on the wire: 2 ms a frame slower.
+    laser.tell("sync 53");
+    run(&mut host, &|index| index == 6000, &mut dark);
+    assert!(matches!(dark, Some(DarkReason::SyncDisagrees | DarkReason::SyncRate)), "{dark:?}");
+    let log = laser.dark_log();
+    drop(host);
+
+    let mut host = laser.open(SerialOptions { sync_wire: true, ..without });
+    host.program(&program, monotonic_now()).unwrap();
+    laser.tell("sync 0");
+    host.arm(monotonic_now()).unwrap();
+    assert_eq!(dark_reason(&mut host), DarkReason::SyncLost);
+    assert!(laser.dark_log().len() > log.len());
+}
+
+/// A box that says of itself what `lie` makes of it.
+fn lying_box(stream: UnixStream, lie: fn(&str) -> String) {
+    struct Liar(UnixStream, fn(&str) -> String);
+    impl Write for Liar {
+        fn write(&mut self, line: &[u8]) -> std::io::Result<usize> {
+            let text = String::from_utf8_lossy(line).into_owned();
+            let text = self.1(text.split('*').next().unwrap());
+            self.0.write_all(Line::new(text).unwrap().as_bytes())?;
+            Ok(line.len())
+        }
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+    stream.set_nonblocking(true).unwrap();
+    let liar = Liar(stream.try_clone().unwrap(), lie);
+    SimulatedBox::new(monotonic_now()).serve(stream, liar, std::io::sink(), &Faults::default(), monotonic_now).unwrap();
+}
+
+/// The host's end of a line to it.
+fn line_to(far: impl FnOnce(UnixStream) + Send + 'static) -> (UnixStream, UnixStream, std::thread::JoinHandle<()>) {
+    let (host, other) = UnixStream::pair().unwrap();
     host.set_nonblocking(true).unwrap();
-    let served = std::thread::spawn(move || real_box(far));
-    let laser = SerialBox::identify(host, "bench", monotonic_now).unwrap();
+    (host.try_clone().unwrap(), host, std::thread::spawn(move || far(other)))
+}
+
+fn identify(reader: UnixStream, writer: UnixStream, name: &str) -> Result<SerialBox, LaserError> {
+    SerialBox::identify(reader, writer, name, SerialOptions::default(), monotonic_now)
+}
+
+#[test]
+fn real_lasers_stay_dark_over_a_virtual_panel() {
+    let (reader, writer, served) = line_to(|far| lying_box(far, |text| text.replace(" simulated", " bench-4")));
+    let laser = identify(reader, writer, "bench").unwrap();
     assert!(!laser.is_simulated());
     let rig = Rig::default();
     let size = Resolution { width: 4, height: 2 };
     let encoder = PanelEncoder::new(&rig.panel, size, size).unwrap();
-    let timing = PanelTiming::new(&rig.panel);
-    let flat = LevelsFrame::new(FrameLayout::new(&rig.panel, size));
-    let panel = HeadlessPanel::new(timing, flat, monotonic_now(), 0);
+    let setup = PanelSetup::new(&rig.panel, &encoder);
+    let panel = open_panel(&"headless".parse().unwrap(), &setup, monotonic_now()).unwrap();
     let options = OutputOptions::default();
-    let mut output = Output::start(&rig, &encoder, Box::new(panel), Box::new(laser), options, monotonic_now).unwrap();
+    let mut output = Output::start(&rig, &encoder, panel, Box::new(laser), options, monotonic_now).unwrap();
     let plan = Pacer::new(pacing_config(&rig, TimeNs(MS)).unwrap(), monotonic_now()).predict(monotonic_now());
     output.frames.submit(&plan, None, monotonic_now());
     let mut dark = 0;
@@ -222,16 +478,148 @@ fn real_lasers_stay_dark_over_a_virtual_panel() {
 }
 
 #[test]
+fn a_box_of_another_version_is_refused_and_both_versions_named() {
+    let (reader, writer, served) =
+        line_to(|far| lying_box(far, |text| text.replace("holod-laser-box 2", "holod-laser-box 1")));
+    let other = identify(reader, writer, "/dev/ttyACM0").unwrap_err();
+    assert!(matches!(&other, LaserError::Version { found: 1, expected: 2, .. }), "{other}");
+    let text = other.to_string();
+    assert!(text.contains("/dev/ttyACM0") && text.contains("version 1") && text.contains("version 2"), "{text}");
+    served.join().unwrap();
+}
+
+#[test]
 fn a_port_that_is_no_laser_box_is_refused_by_name() {
-    let nothing = SerialBox::open(Path::new("/dev/no-such-port"), monotonic_now).unwrap_err();
+    let nothing = SerialBox::open(Path::new("/dev/no-such-port"), SerialOptions::default(), monotonic_now).unwrap_err();
     assert!(matches!(&nothing, LaserError::Open { path, .. } if path == "/dev/no-such-port"), "{nothing}");
-    let (host, mut tracker) = UnixStream::pair().unwrap();
-    host.set_nonblocking(true).unwrap();
-    tracker.write_all(b"P1,1,1000,L,3.1,0.9*00\n").unwrap();
-    let wrong = SerialBox::identify(host, "/dev/ttyUSB0", monotonic_now).unwrap_err();
+    let (reader, writer, tracker) = line_to(|mut far| {
+        far.write_all(b"P1,1,1000,L,3.1,0.9*00\n").unwrap();
+        let mut heard = Vec::new();
+        far.read_to_end(&mut heard).unwrap();
+        assert_eq!(heard[0], b'\n');
+        assert!(heard[1..].starts_with(b"1 ID?*"), "nothing but a question: {:?}", String::from_utf8_lossy(&heard));
+        assert_eq!(heard.iter().filter(|&&byte| byte == b'\n').count(), 3, "and a DISARM at the end");
+    });
+    let wrong = identify(reader, writer, "/dev/ttyUSB0").unwrap_err();
     assert!(
         matches!(&wrong, LaserError::NotABox { path, found, .. } if path == "/dev/ttyUSB0" && found.starts_with("P1"))
     );
+    tracker.join().unwrap();
+}
+
+#[test]
+fn powers_beyond_the_rigs_limit_or_the_boxs_own_never_reach_it() {
+    let laser = BoxProcess::start(&[]);
+    let power_limit_uw = PerColour([1000, 500, 1000]);
+    let mut host = laser.open(SerialOptions { power_limit_uw, ..SerialOptions::default() });
+    let strong = LaserProgram { power_uw: PerColour([1000, 501, 1]), ..host_program() };
+    let refused = host.program(&strong, monotonic_now()).unwrap_err();
+    assert!(matches!(refused, LaserError::Figure { what: "power_mw", .. }), "{refused}");
+    host.program(&LaserProgram { power_uw: power_limit_uw, ..strong }, monotonic_now()).unwrap();
+    drop(host);
+    let mut host = laser.open(SerialOptions::default());
+    let stronger = LaserProgram { power_uw: PerColour([1, 1, 600_000]), ..host_program() };
+    let refused = host.program(&stronger, monotonic_now()).unwrap_err();
+    assert!(matches!(refused, LaserError::BeyondBox { what: "power", limit: 500_000, .. }), "{refused}");
+}
+
+#[test]
+fn a_box_that_was_unplugged_is_found_again_under_the_same_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let link = folder.path().join("lasers");
+    let plug_in = |laser: &BoxProcess| {
+        let _the_old_one = fs::remove_file(&link);
+        std::os::unix::fs::symlink(&laser.port, &link).unwrap();
+    };
+    let first = BoxProcess::start(&OTHER_CLOCK);
+    plug_in(&first);
+    let rig = rig(PanelMode::FieldSequential, &link);
+    let mut laser = open_laser(&rig.lasers, monotonic_now).unwrap();
+    let watch = laser.watch().unwrap();
+    laser.program(&host_program(), monotonic_now()).unwrap();
+    laser.arm(monotonic_now()).unwrap();
+    assert_eq!(watch.trouble(), None);
+
+    drop(first);
+    fs::remove_file(&link).unwrap();
+    let t_pulled = monotonic_now();
+    assert_eq!(dark_reason(laser.as_mut()), DarkReason::BoxFault);
+    assert!(monotonic_now() - t_pulled < TimeNs(10_000 * MS));
+    eventually("its name", || watch.trouble().is_some_and(|trouble| trouble.contains("lasers.device")));
+    // Nobody waits for it meanwhile.
+    let t_asked = monotonic_now();
+    for _ in 0..100 {
+        assert!(matches!(laser.arm(monotonic_now()), Err(LaserError::Lost)));
+        assert!(
+            matches!(laser.dark(DarkReason::Shutdown, monotonic_now()), Err(LaserError::Lost)),
+            "no acknowledgement"
+        );
+        laser.poll(monotonic_now(), &mut |event| panic!("{event:?}")).unwrap();
+    }
+    // Waiting for an answer would take ten seconds and more.
+    assert!(monotonic_now() - t_asked < TimeNs(5000 * MS));
+
+    let second = BoxProcess::start(&["--clock-offset-us", "5"]);
+    plug_in(&second);
+    eventually("the box", || {
+        laser.poll(monotonic_now(), &mut |event| panic!("{event:?}")).unwrap();
+        laser.arm(monotonic_now()).is_ok()
+    });
+    assert_eq!(watch.trouble(), None);
+    eventually("its own log", || matches!(second.events().last(), Some(BoxEvent::Armed { .. })));
+    let now = monotonic_now();
+    laser
+        .light(LitWindow { colour: Colour::Red, t_on: now + TimeNs(20 * MS), t_off: now + TimeNs(60 * MS) }, now)
+        .unwrap();
+    eventually("light", || edges(&second.events()).len() == 2);
+    laser.dark(DarkReason::Shutdown, monotonic_now()).unwrap();
+}
+
+#[test]
+fn real_lasers_do_not_take_the_place_of_a_simulated_box() {
+    let folder = tempfile::tempdir().unwrap();
+    let link = folder.path().join("lasers");
+    let first = BoxProcess::start(&[]);
+    std::os::unix::fs::symlink(&first.port, &link).unwrap();
+    let rig = rig(PanelMode::FieldSequential, &link);
+    let mut laser = open_laser(&rig.lasers, monotonic_now).unwrap();
+    laser.program(&host_program(), monotonic_now()).unwrap();
+    drop(first);
+    let real = BoxProcess::start(&["--name", "bench-4"]);
+    fs::remove_file(&link).unwrap();
+    std::os::unix::fs::symlink(&real.port, &link).unwrap();
+    let watch = laser.watch().unwrap();
+    eventually("refusal", || {
+        let _lost = laser.poll(monotonic_now(), &mut |_| ());
+        watch.trouble().is_some_and(|trouble| trouble.contains("another kind"))
+    });
+    assert!(laser.arm(monotonic_now()).is_err());
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    /// The firmware behind its terminal hears anything: it lights nothing, never ends, and answers the next host.
+    #[test]
+    fn random_bytes_on_the_terminal_light_nothing(
+        chunks in prop::collection::vec(prop::collection::vec(any::<u8>(), 0..300), 1..12),
+        armed in prop::bool::ANY,
+    ) {
+        let laser = BoxProcess::start(&[]);
+        if armed {
+            drop(laser.armed_by_a_host_that_will_not_say_goodbye());
+        }
+        let mut port = fs::OpenOptions::new().write(true).open(&laser.port).unwrap();
+        for chunk in &chunks {
+            port.write_all(chunk).unwrap();
+        }
+        drop(port);
+        let mut host = laser.open(SerialOptions::default());
+        prop_assert!(!host.report().unwrap().state.armed);
+        prop_assert_eq!(edges(&laser.events()), vec![]);
+        host.program(&host_program(), monotonic_now()).unwrap();
+        host.arm(monotonic_now()).unwrap();
+    }
 }
 
 /// What a bad wire does with what is written to it.
@@ -240,15 +628,9 @@ const DAMAGES: u8 = 1;
 const SWALLOWS: u8 = 2;
 
 /// A wire that can go bad.
-struct BadWire<'a>(UnixStream, &'a AtomicU8);
+struct BadWire(UnixStream, Arc<AtomicU8>);
 
-impl Read for BadWire<'_> {
-    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
-        self.0.read(bytes)
-    }
-}
-
-impl Write for BadWire<'_> {
+impl Write for BadWire {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
         let mut sent = bytes.to_vec();
         match self.1.load(Ordering::Relaxed) {
@@ -264,52 +646,43 @@ impl Write for BadWire<'_> {
     }
 }
 
-fn box_on_a_bad_wire() -> (UnixStream, std::thread::JoinHandle<Vec<u8>>) {
+/// A host on a wire that can go bad, and the log of the box behind it.
+fn host_on_a_bad_wire() -> (SerialBox, Arc<AtomicU8>, std::thread::JoinHandle<Vec<u8>>) {
     let (host, far) = UnixStream::pair().unwrap();
     host.set_nonblocking(true).unwrap();
     far.set_nonblocking(true).unwrap();
     let serve = move || {
         let mut log = Vec::new();
-        holod_slm_output::laser::simulated_box::serve(&far, &far, &mut log, monotonic_now).unwrap();
+        let simulated = SimulatedBox::new(monotonic_now());
+        simulated.serve(&far, &far, &mut log, &Faults::default(), monotonic_now).unwrap();
         log
     };
-    (host, std::thread::spawn(serve))
+    let served = std::thread::spawn(serve);
+    let state = Arc::new(AtomicU8::new(SOUND));
+    let wire = BadWire(host.try_clone().unwrap(), Arc::clone(&state));
+    let host = SerialBox::identify(host, wire, "wire", SerialOptions::default(), monotonic_now).unwrap();
+    (host, state, served)
 }
 
 #[test]
 fn a_damaged_line_makes_the_box_dark_and_the_host_hears_of_it() {
-    let (stream, served) = box_on_a_bad_wire();
-    let wire = AtomicU8::new(SOUND);
-    let rig = Rig::default();
-    let mut host = SerialBox::identify(BadWire(stream, &wire), "wire", monotonic_now).unwrap();
-    host.program(&program(&rig), monotonic_now()).unwrap();
+    let (mut host, wire, served) = host_on_a_bad_wire();
+    host.program(&host_program(), monotonic_now()).unwrap();
     host.arm(monotonic_now()).unwrap();
     wire.store(DAMAGES, Ordering::Relaxed);
     host.heartbeat(monotonic_now()).unwrap();
     wire.store(SOUND, Ordering::Relaxed);
-    let mut dark = None;
-    eventually("the box's word", || {
-        // The unanswered heartbeat may become an error first; the box's own word comes all the same.
-        let _unanswered = host.poll(monotonic_now(), &mut |event| {
-            if let BoxEvent::Dark { reason, .. } = event {
-                dark = Some(reason);
-            }
-        });
-        dark.is_some()
-    });
-    assert!(matches!(dark, Some(DarkReason::BoxFault | DarkReason::SyncLost)), "{dark:?}");
+    // The unanswered heartbeat may become an error first; the box's own word comes all the same.
+    assert_eq!(dark_reason(&mut host), DarkReason::Line);
     drop(host);
     let log = String::from_utf8(served.join().unwrap()).unwrap();
-    assert!(log.starts_with(LOG_HEADER));
-    assert!(log.contains("box-fault") || log.contains("sync-lost"), "{log}");
+    assert!(log.starts_with(LOG_HEADER) && log.contains("dark,,line"), "{log}");
 }
 
 #[test]
 fn a_box_that_does_not_answer_is_an_error_and_never_an_acknowledgement() {
-    let (stream, served) = box_on_a_bad_wire();
-    let wire = AtomicU8::new(SOUND);
-    let mut host = SerialBox::identify(BadWire(stream, &wire), "wire", monotonic_now).unwrap();
-    host.program(&program(&Rig::default()), monotonic_now()).unwrap();
+    let (mut host, wire, served) = host_on_a_bad_wire();
+    host.program(&host_program(), monotonic_now()).unwrap();
     wire.store(SWALLOWS, Ordering::Relaxed);
     let unheard = host.dark(DarkReason::Shutdown, monotonic_now()).unwrap_err();
     assert!(matches!(unheard, LaserError::NoAnswer { command: "DISARM", .. }), "{unheard}");

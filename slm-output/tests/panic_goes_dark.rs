@@ -5,16 +5,20 @@ use std::time::Duration;
 use holod_calibration::rig::Rig;
 use holod_calibration::{PerColour, Resolution, TimeNs};
 use holod_slm_output::PanelEncoder;
-use holod_slm_output::laser::{BoxEvent, DarkReason};
+use holod_slm_output::laser::{BoxEvent, DarkReason, open_laser};
 use holod_slm_output::output::{Output, OutputOptions, monotonic_now, pacing_config};
 use holod_slm_output::pacing::Pacer;
+use holod_slm_output::present::{PanelSetup, open_panel};
 
 #[test]
 fn a_panic_in_any_thread_goes_dark_for_good() {
     let rig = Rig::default();
     let size = Resolution { width: 4, height: 2 };
     let encoder = PanelEncoder::new(&rig.panel, size, size).unwrap();
-    let mut output = Output::headless(&rig, &encoder, OutputOptions::default(), monotonic_now).unwrap();
+    let panel = open_panel(&"headless".parse().unwrap(), &PanelSetup::new(&rig.panel, &encoder), monotonic_now());
+    let laser = open_laser(&rig.lasers, monotonic_now).unwrap();
+    let mut output =
+        Output::start(&rig, &encoder, panel.unwrap(), laser, OutputOptions::default(), monotonic_now).unwrap();
     let switch = output.control.dark_switch();
     switch.install_panic_hook(monotonic_now);
     let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(1_000_000)).unwrap(), monotonic_now());

@@ -2,10 +2,12 @@
 
 use std::fs;
 use std::path::Path;
+use std::time::Duration;
 
-use holod_tests::daemon::run;
+use holod_tests::daemon::{Daemon, run, wait_until};
 use holod_tests::small_rig;
 use image::{ImageBuffer, Luma, Rgb, RgbImage};
+use rustix::process::Signal;
 
 const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
 
@@ -85,7 +87,7 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
             says: &["directory", "field.safetensors", "holod render"],
         },
         Case { args: &["view", "--focus", "1", "--out", "v.png"], exit: 64, says: &["--hologram", "--pupil"] },
-        Case { args: &["check", "--config", "nowhere.toml"], exit: 78, says: &["nowhere.toml"] },
+        Case { args: &["check", "--config", "nowhere.toml"], exit: 66, says: &["nowhere.toml"] },
         Case { args: &["check", "--config", "junk.toml"], exit: 78, says: &["junk.toml"] },
         Case {
             args: &["check", "--config", "three.toml"],
@@ -110,7 +112,7 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
         Case {
             args: &["view", "--pupil", "3", "--focus", "1", "--out", "directory"],
             exit: 73,
-            says: &["directory", "PNG"],
+            says: &["directory", "name of a file"],
         },
         Case { args: &["--tracker", "empty.csv"], exit: 65, says: &["empty.csv"] },
         Case { args: &["--tracker", "mock:nosuch"], exit: 64, says: &["nosuch", "light-steps"] },
@@ -119,7 +121,12 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
         Case { args: &["--tracker", "tcp:127.0.0.1:1,profile=open-gaze"], exit: 69, says: &["127.0.0.1:1"] },
         Case { args: &["--tracker", "serial:/dev/null,profile=neon"], exit: 64, says: &["neon:HOST"] },
         Case { args: &["--tracker", "serial:/dev/null,profile=nosuch"], exit: 64, says: &["nosuch", "holod-hid"] },
-        Case { args: &["--output", "window"], exit: 69, says: &["window", "headless"] },
+        Case { args: &["--weights", "smal"], exit: 64, says: &["smal", "did you mean `small`?"] },
+        Case { args: &["--weights", "./smal"], exit: 65, says: &["smal"] },
+        Case { args: &["check", "--tracker", "/dev/nothing-here"], exit: 69, says: &["/dev/nothing-here"] },
+        Case { args: &["--tracker", "/dev/null,profile=nosuch"], exit: 64, says: &["nosuch", "holod-hid"] },
+        Case { args: &["--force"], exit: 64, says: &["--record"] },
+        Case { args: &["--output", "screen"], exit: 64, says: &["screen", "headless"] },
         Case { args: &["--backend", "gpu"], exit: 69, says: &["gpu", "cpu"] },
         Case { args: &["--frames", "many"], exit: 64, says: &["many"] },
         Case { args: &["--no-such-option"], exit: 64, says: &["--no-such-option"] },
@@ -144,6 +151,84 @@ fn listing(folder: &Path) -> Vec<(String, u64)> {
         .collect();
     names.sort();
     names
+}
+
+#[test]
+fn results_are_overwritten_by_force_only_and_by_the_same_rule_everywhere() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let rig = small_rig(64, 64, "driver = \"simulated\"");
+    fs::write(at("rig.toml"), rig).unwrap();
+    let lines: String = (0..20).map(|k| format!("{},left,3.5,1,,1\n", k * 5_000_000)).collect();
+    fs::write(at("log.csv"), format!("t_ns,eye,diameter_mm,confidence,aperture_mm,valid\n{lines}")).unwrap();
+    let small = ["--config", "rig.toml", "--resolution", "64x64"];
+    let with = |args: &[&'static str]| [args, &small[..]].concat();
+    let cases = [
+        (with(&["render", "--pupil", "3", "--out", "out"]), "out/report.json"),
+        (with(&["view", "--pupil", "3", "--focus", "1", "--out", "v.png"]), "v.png"),
+        (vec!["log", "convert", "log.csv", "--to", "lines", "--out", "out.lines"], "out.lines"),
+        (vec!["log", "info", "log.csv", "--plot", "plot.svg"], "plot.svg"),
+        (with(&["run", "--tracker", "mock", "--frames", "2", "--record", "record"]), "record/frames.csv"),
+        (
+            vec!["demo", "--duration", "8s", "--resolution", "128x128", "--weights", "small", "--out", "demo"],
+            "demo/eye.png",
+        ),
+    ];
+    for (args, result) in cases {
+        fs::create_dir_all(at(result).parent().unwrap()).unwrap();
+        fs::write(at(result), "precious").unwrap();
+        let ended = run(HOLOD, &args, folder.path());
+        assert_eq!(ended.status.code(), Some(73), "{args:?}: {}", ended.stderr);
+        assert!(ended.stderr.contains("--force"), "{args:?}: {}", ended.stderr);
+        assert_eq!(fs::read_to_string(at(result)).unwrap(), "precious", "{args:?}");
+        let ended = run(HOLOD, &[&args[..], &["--force"]].concat(), folder.path());
+        assert!(ended.status.success(), "{args:?}: {}", ended.stderr);
+        assert_ne!(fs::read(at(result)).unwrap(), b"precious", "{args:?}");
+    }
+    // The demo finds a folder of its own each time.
+    for name in ["holod-demo", "holod-demo-2"] {
+        let ended =
+            run(HOLOD, &["demo", "--duration", "8s", "--resolution", "128x128", "--weights", "small"], folder.path());
+        assert!(ended.status.success() && at(name).join("eye.png").is_file(), "{}", ended.stderr);
+        assert!(ended.stdout.contains(name), "{}", ended.stdout);
+    }
+}
+
+#[test]
+fn a_dash_writes_to_standard_output() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let to_stdout = |args: &[&str]| {
+        let output = std::process::Command::new(HOLOD).args(args).current_dir(folder.path()).output().unwrap();
+        assert!(output.status.success(), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
+        output.stdout
+    };
+    let picture =
+        ["view", "--config", "rig.toml", "--resolution", "64x64", "--pupil", "3", "--focus", "1", "--out", "-"];
+    let png = to_stdout(&picture);
+    assert_eq!(image::load_from_memory(&png).unwrap().width(), 64);
+    fs::write(folder.path().join("log.csv"), "t_ns,eye,diameter_mm,confidence,aperture_mm,valid\n0,left,3.5,1,,1\n")
+        .unwrap();
+    let lines = String::from_utf8(to_stdout(&["log", "convert", "log.csv", "--to", "lines", "--out", "-"])).unwrap();
+    assert!(lines.lines().all(|line| line.starts_with("# ") || line.starts_with("P1,")), "{lines}");
+    assert!(lines.contains("P1,0,0,L,3.5"), "{lines}");
+    let svg = String::from_utf8(to_stdout(&["log", "info", "log.csv", "--plot", "-"])).unwrap();
+    assert!(svg.starts_with("<svg") && svg.trim_end().ends_with("</svg>"), "{svg}");
+    let both = run(HOLOD, &[&picture[..], &["--json"]].concat(), folder.path());
+    assert_eq!(both.status.code(), Some(64));
+    assert_eq!(listing(folder.path()).len(), 2, "nothing is left behind");
+}
+
+#[test]
+fn a_signal_takes_what_is_half_done_away() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["render", "--pupil", "3", "--resolution", "1920x1080", "--out", "out"];
+    let daemon = Daemon::start(HOLOD, &args, folder.path());
+    assert!(wait_until(Duration::from_secs(60), || !listing(folder.path()).is_empty()));
+    daemon.signal(Signal::INT);
+    let ended = daemon.wait(Duration::from_secs(60));
+    assert_eq!(ended.status.code(), Some(130), "{ended:?}");
+    assert_eq!(listing(folder.path()), []);
 }
 
 #[test]

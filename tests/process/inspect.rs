@@ -97,7 +97,7 @@ fn a_tracker_that_says_nothing_or_nonsense_is_told_from_one_that_works() {
     }
     let ended = tried.wait(PATIENCE);
     assert_eq!(ended.status.code(), Some(69));
-    assert!(ended.stderr.contains("no sample was in them"), "{ended:?}");
+    assert!(ended.stderr.contains("wire_malformed") && ended.stderr.contains("profile and baud rate"), "{ended:?}");
     assert!(ended.stdout.contains("wire_malformed"), "{ended:?}");
 }
 
@@ -112,6 +112,25 @@ fn a_tracker_is_never_looked_for_at_the_laser_boxs_port() {
     let ended = run(HOLOD, &["tracker", "try", "ttyOther", "--config", "rig.toml", "--duration", "1s"], folder.path());
     assert!(!ended.status.success());
     assert!(ended.stderr.contains("ttyOther") && ended.stderr.contains("laser"), "{ended:?}");
+}
+
+#[test]
+fn check_estimates_the_frames_a_second_and_takes_a_tracker() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let ended = run(HOLOD, &["check", "--config", "rig.toml", "--tracker", "mock", "--json"], folder.path());
+    let check = |ended: &Ended, name: &str| {
+        let checks = json(ended)["checks"].as_array().unwrap().clone();
+        checks.into_iter().find(|check| check["name"] == name).unwrap()["says"].as_str().unwrap().to_owned()
+    };
+    let speed = check(&ended, "speed");
+    assert!(speed.contains("estimated from a frame of 64x64") && speed.contains("frames a second of 64x64"), "{speed}");
+    assert!(speed.contains("the panel could show 60.0"), "{speed}");
+    assert!(check(&ended, "tracker").contains("a simulated eye"));
+    // A panel of many pixels is slow on any processor, and what helps is said.
+    let ended = run(HOLOD, &["check", "--resolution", "1920x1080", "--json"], folder.path());
+    let speed = check(&ended, "speed");
+    assert!(speed.contains("--weights small") && speed.contains("--resolution"), "{speed}");
 }
 
 #[test]
@@ -186,7 +205,9 @@ fn a_running_holod_says_how_it_is_and_a_stopped_one_is_not_found() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     let runtime = folder.path().join("runtime");
-    let environment = [("RUNTIME_DIRECTORY", runtime.as_path())];
+    // None of the other places in which a holod of another test may write its status.
+    let elsewhere = folder.path();
+    let environment = [("RUNTIME_DIRECTORY", runtime.as_path()), ("XDG_RUNTIME_DIR", elsewhere), ("TMPDIR", elsewhere)];
     let args = ["--config", "rig.toml", "--tracker", "mock:blinks", "--resolution", "64x64"];
     let daemon = Daemon::start_with(HOLOD, &args, folder.path(), &environment);
     let ask = || Daemon::start_with(HOLOD, &["status", "--json"], folder.path(), &environment).wait(PATIENCE);
@@ -201,6 +222,107 @@ fn a_running_holod_says_how_it_is_and_a_stopped_one_is_not_found() {
     let ended = ask();
     assert_eq!(ended.status.code(), Some(69));
     assert!(ended.stderr.contains("no holod is running"), "{ended:?}");
+}
+
+#[test]
+fn two_holods_are_told_apart_and_found_without_a_runtime_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let environment = [("XDG_RUNTIME_DIR", Path::new("")), ("TMPDIR", folder.path())];
+    let start = |tracker| {
+        let args = ["--config", "rig.toml", "--tracker", tracker, "--resolution", "64x64"];
+        Daemon::start_with(HOLOD, &args, folder.path(), &environment)
+    };
+    let (first, second) = (start("mock:blinks"), start("mock:steady"));
+    let pid = |daemon: &Daemon| daemon.pid().to_string();
+    let ask = |args: &[&str]| {
+        Daemon::start_with(HOLOD, &[&["status"], args].concat(), folder.path(), &environment).wait(PATIENCE)
+    };
+    let of = |pid: &str| ask(&["--json", "--pid", pid]);
+    for daemon in [&first, &second] {
+        assert!(wait_until(PATIENCE, || of(&pid(daemon)).status.success()));
+    }
+    assert_eq!(json(&of(&pid(&first)))["tracker"], "mock:blinks");
+    assert_eq!(json(&of(&pid(&second)))["tracker"], "mock:steady");
+    let both = ask(&[]);
+    assert!(both.stdout.contains("mock:blinks") && both.stdout.contains("mock:steady"), "{both:?}");
+    let unclear = ask(&["--json"]);
+    assert_eq!(unclear.status.code(), Some(64), "{unclear:?}");
+    assert!(unclear.stderr.contains(&pid(&first)) && unclear.stderr.contains("--pid"), "{unclear:?}");
+    let ended_pid = pid(&second);
+    second.signal(Signal::TERM);
+    assert!(second.wait(PATIENCE).status.success());
+    assert!(!of(&ended_pid).status.success());
+    let status = json(&of(&pid(&first)));
+    assert_eq!(status["tracker"], "mock:blinks", "the end of one is none of the other's");
+    assert!((status["panel_frames_hz"].as_f64().unwrap() - 60.0).abs() < 1e-6, "{status}");
+}
+
+#[test]
+fn a_replay_that_ends_ends_the_run_and_a_record_that_is_deleted_does() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let text: Vec<u8> = lines(800).into_iter().flat_map(|line| line.bytes).collect();
+    fs::write(folder.path().join("log"), text).unwrap();
+    let with = |more: &[&'static str]| [&["--config", "rig.toml", "--resolution", "64x64"], more].concat();
+    let ended = run(HOLOD, &with(&["--tracker", "log", "--duration", "100s", "--json"]), folder.path());
+    let summary = json(&ended);
+    assert_eq!(summary["ended_by"], "the end of the pupil log", "{summary}");
+    assert!(summary["frames_by_pupil_state"]["fallback"].as_u64().unwrap_or(0) < 200, "{summary}");
+
+    let daemon = Daemon::start(HOLOD, &with(&["--tracker", "mock", "--record", "record"]), folder.path());
+    assert!(wait_until(PATIENCE, || folder.path().join("record/samples.csv").exists()));
+    fs::remove_dir_all(folder.path().join("record")).unwrap();
+    let ended = daemon.wait(PATIENCE);
+    assert_eq!(ended.status.code(), Some(73), "{ended:?}");
+    assert!(ended.stderr.contains("deleted"), "{ended:?}");
+}
+
+#[test]
+fn a_log_that_is_not_in_millimetres_is_plotted_in_its_own_unit_and_replayed_with_a_scale() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut text = String::from("SAMPLES\tGAZE\tLEFT\tRATE\t1000.00\nPUPIL\tDIAMETER\nSTART\t1000 \tLEFT\tSAMPLES\n");
+    for t_ms in 1000..3000 {
+        text.push_str(&format!("{t_ms}\t  964.3\t  541.5\t  320.0\t...\n"));
+    }
+    fs::write(folder.path().join("log.asc"), text).unwrap();
+    let ended = run(HOLOD, &["log", "info", "log.asc", "--plot", "raw.svg"], folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    let svg = fs::read_to_string(folder.path().join("raw.svg")).unwrap();
+    assert!(svg.contains("pupil diameter / arbitrary units") && !svg.contains("rejected"));
+
+    // A rig file that has a tracker alone is of the built-in bench.
+    fs::write(folder.path().join("rig.toml"), "[tracker]\nspec = \"log.asc\"\nscale_mm_per_unit = 1.0\n").unwrap();
+    let run_with = |more: &[&str]| {
+        let args = [&["--config", "rig.toml", "--resolution", "64x64", "--json"], more].concat();
+        run(HOLOD, &args, folder.path())
+    };
+    let summary = json(&run_with(&["--scale", "0.0125"]));
+    let [_, widest] = [0, 1].map(|end| summary["pupil_range_mm"][end].as_f64().unwrap());
+    assert!((widest - 4.0).abs() < 0.3, "{summary}");
+    assert!(summary["tracker_trouble"].is_null(), "{summary}");
+    let wrong = run_with(&[]);
+    assert!(wrong.stderr.contains("rejected_out_of_range"), "{wrong:?}");
+    assert!(json(&wrong)["tracker_trouble"].as_str().unwrap().contains("320"), "{wrong:?}");
+}
+
+#[test]
+fn the_log_says_more_when_asked_and_a_typo_silences_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let logged = |level: &str| {
+        let args = ["--config", "rig.toml", "--tracker", "mock", "--resolution", "64x64", "--duration", "3s"];
+        Daemon::start_with(HOLOD, &args, folder.path(), &[("HOLOD_LOG", Path::new(level))]).wait(PATIENCE).stderr
+    };
+    let count = |text: &str, level: &str| text.lines().filter(|line| line.contains(level)).count();
+    let info = logged("info");
+    assert!(info.contains("frames a second of the panel's 60.0"), "{info}");
+    assert_eq!((count(&info, "DEBUG"), count(&info, "TRACE")), (0, 0));
+    let debug = logged("debug");
+    assert!(count(&debug, "DEBUG") > 4 && count(&debug, "TRACE") == 0, "{debug}");
+    assert!(count(&logged("trace"), "TRACE") > 100);
+    let typo = logged("debgu");
+    assert!(typo.contains("HOLOD_LOG: found `debgu`") && typo.contains("stopping"), "{typo}");
 }
 
 #[test]

@@ -151,6 +151,44 @@ fn the_display_follows_the_eye_and_holds_through_blinks() {
 }
 
 #[test]
+fn samples_that_are_all_refused_are_told_with_their_cure() {
+    type Spoil = fn(&mut LineSample);
+    let cases: [(Spoil, &str); 3] = [
+        (|line| line.diameter_mm *= 1000.0, "looks like micrometres; scale_mm_per_unit = 0.001"),
+        (|line| line.diameter_mm *= 0.1, "looks like centimetres; scale_mm_per_unit = 10"),
+        (|line| line.device_us /= 1000, "such as milliseconds in the place of microseconds"),
+    ];
+    for (spoil, cure) in cases {
+        let bench = Bench::new();
+        let mut tracker = PtyTracker::plug_in(&bench.link).unwrap();
+        let daemon = bench.start(&[]);
+        let lines: Vec<_> = (0..600_i64)
+            .map(|k| {
+                let mut line = LineSample {
+                    sequence: k as u64,
+                    device_us: k * 5000,
+                    eye: SampleEye::Left,
+                    diameter_mm: 3.5,
+                    confidence: 1.0,
+                };
+                spoil(&mut line);
+                let mut text = String::new();
+                encode_line(&line, &mut text);
+                TimedLine { due: Duration::from_millis(5 * k as u64), bytes: text.into_bytes() }
+            })
+            .collect();
+        tracker.feed(&lines, Instant::now()).unwrap();
+        daemon.signal(Signal::TERM);
+        let ended = daemon.wait(Duration::from_secs(20));
+        assert_eq!(ended.stderr.matches(cure).count(), 1, "{cure}: {}", ended.stderr);
+        let summary = fs::read_to_string(bench.record.join("summary.json")).unwrap();
+        let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
+        assert!(summary["tracker_trouble"].as_str().unwrap().contains(cure), "{summary:#}");
+        assert!(ended.stdout.contains(cure), "{}", ended.stdout);
+    }
+}
+
+#[test]
 fn unplugging_garbage_and_silence_are_survived_and_counted() {
     let bench = Bench::new();
     let mut tracker = PtyTracker::plug_in(&bench.link).unwrap();

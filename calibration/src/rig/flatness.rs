@@ -1,6 +1,8 @@
 //! A picture of the phase that flattens a panel.
 
-use std::f32::consts::TAU;
+use std::f64::consts::TAU;
+use std::fs::File;
+use std::io::BufReader;
 use std::path::Path;
 
 use image::{DynamicImage, ImageFormat, ImageReader};
@@ -8,26 +10,32 @@ use image::{DynamicImage, ImageFormat, ImageReader};
 use super::files::{FileFault, plain_file};
 use crate::Resolution;
 
+/// What the grays of a picture mean.
+#[derive(Clone, Copy)]
+pub(super) struct GrayScale {
+    /// The gray that means 2π, where it is not one more than the picture's highest.
+    pub(super) gray_of_2pi: Option<f64>,
+    /// Whether the picture shows what is to be taken off instead of what is to be added.
+    pub(super) subtracted: bool,
+}
+
 /// Reads the phase in radians to add at each panel pixel, row-major.
 ///
-/// The picture is a gray PNG of the panel's size; its full range is 2π: level g of n (256 or 65536) is 2π·g/n.
+/// The picture is a PNG or BMP of the panel's size, recognised by its content: gray of 8 or 16 bits, or with a palette
+/// or colours that are all grays. Gray g is 2π·g/n; n is 256 or 65536, or the gray of 2π that `scale` states.
 ///
 /// # Errors
-/// [`FileFault`] where the file cannot be read, is no gray PNG, or has another size than the panel.
-pub(super) fn read(path: &Path, panel: Resolution) -> Result<Vec<f32>, FileFault> {
+/// [`FileFault`] where the file cannot be read, is neither format or damaged, has colours, transparency or another size
+/// than the panel, or fewer grays than `scale` says.
+pub(super) fn read(path: &Path, panel: Resolution, scale: GrayScale) -> Result<Vec<f32>, FileFault> {
     plain_file(path)?;
     let fault = |found: String, advice: &str| FileFault {
         found: format!("{}: {found}", path.display()),
-        expected: format!("a gray PNG of 8 or 16 bits, {panel} pixels, full range 2π"),
+        expected: format!("a gray PNG or BMP, {panel} pixels"),
         advice: advice.into(),
     };
-    let open = || -> Result<ImageReader<_>, FileFault> {
-        let mut reader = ImageReader::open(path).map_err(|why| FileFault::unreadable(path, &why))?;
-        reader.set_format(ImageFormat::Png);
-        Ok(reader)
-    };
-    let damaged = |why: image::ImageError| fault(why.to_string(), "save it as a gray PNG again");
-    let (width, height) = open()?.into_dimensions().map_err(damaged)?;
+    let damaged = |why: image::ImageError| fault(why.to_string(), "save it as a gray PNG or BMP again");
+    let (width, height) = open(path, &fault)?.into_dimensions().map_err(damaged)?;
     let size = Resolution { width: width as usize, height: height as usize };
     if size != panel {
         return Err(fault(
@@ -35,9 +43,43 @@ pub(super) fn read(path: &Path, panel: Resolution) -> Result<Vec<f32>, FileFault
             "make it at the panel's own size, or correct panel.width_px and height_px",
         ));
     }
-    match open()?.decode().map_err(damaged)? {
-        DynamicImage::ImageLuma8(gray) => Ok(gray.as_raw().iter().map(|&g| f32::from(g) * (TAU / 256.0)).collect()),
-        DynamicImage::ImageLuma16(gray) => Ok(gray.as_raw().iter().map(|&g| f32::from(g) * (TAU / 65536.0)).collect()),
-        other => Err(fault(format!("{:?} pixels", other.color()), "save it with one gray channel, without alpha")),
+    let picture = open(path, &fault)?.decode().map_err(damaged)?;
+    let (grays, full_range) = match picture {
+        DynamicImage::ImageLuma8(gray) => (gray.into_raw().into_iter().map(f64::from).collect(), 256.0),
+        DynamicImage::ImageLuma16(gray) => (gray.into_raw().into_iter().map(f64::from).collect(), 65536.0),
+        // How palettes are decoded.
+        DynamicImage::ImageRgb8(colours) => {
+            let mut grays: Vec<f64> = Vec::with_capacity(panel.pixels());
+            for (x, y, pixel) in colours.enumerate_pixels() {
+                let [red, green, blue] = pixel.0;
+                if red != green || green != blue {
+                    let found = format!("the colour {red}, {green}, {blue} at column {x} of row {y}");
+                    return Err(fault(found, "save it with one gray channel"));
+                }
+                grays.push(red.into());
+            }
+            (grays, 256.0)
+        }
+        other => {
+            return Err(fault(format!("{:?} pixels", other.color()), "save it with one gray channel, without alpha"));
+        }
+    };
+    let gray_of_2pi = scale.gray_of_2pi.unwrap_or(full_range);
+    if gray_of_2pi > full_range {
+        let found = format!("a picture of {full_range} grays, of which {gray_of_2pi} should be 2π");
+        return Err(fault(found, "correct panel.flatness_2pi_gray, or save the picture with 16 bits"));
+    }
+    let sign = if scale.subtracted { -1.0 } else { 1.0 };
+    Ok(grays.into_iter().map(|gray: f64| (sign * TAU * gray / gray_of_2pi) as f32).collect())
+}
+
+/// The file as a picture of one of the two formats.
+fn open(path: &Path, fault: &impl Fn(String, &str) -> FileFault) -> Result<ImageReader<BufReader<File>>, FileFault> {
+    let unreadable = |why| FileFault::unreadable(path, &why);
+    let file = BufReader::new(File::open(path).map_err(unreadable)?);
+    let reader = ImageReader::new(file).with_guessed_format().map_err(unreadable)?;
+    match reader.format() {
+        Some(ImageFormat::Png | ImageFormat::Bmp) => Ok(reader),
+        _ => Err(fault("neither PNG nor BMP".into(), "save it as a gray PNG or BMP")),
     }
 }

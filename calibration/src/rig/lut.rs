@@ -1,27 +1,34 @@
-//! A measured table from a panel's level to the phase that it gives.
+//! A measured table from a panel's levels to the phases that they give.
 
 use std::f64::consts::PI;
 use std::path::Path;
 
+use super::LevelPhase;
 use super::files::{FileFault, read_text};
 
 /// Rows that are quoted when several are wrong.
 const ROWS_QUOTED_MAX: usize = 3;
 /// No panel's stroke is this large: above it the table is in degrees.
 const PHASE_MAX_RAD: f64 = 16.0 * PI;
+/// A panel of one level shows nothing.
+const LEVELS_MIN: usize = 2;
 
-/// Reads the phase in radians at each of the `2^bit_depth` levels.
+/// Reads the phase in radians at levels of a panel that has `2^bit_depth` of them.
 ///
-/// The file is CSV: a row for each level from 0 up, either `level,phase_rad` or `phase_rad` alone, with an optional
-/// header line and `#` comments. The phase may rise or fall with the level but not both.
+/// The file is CSV, with an optional header line and `#` comments, in one of two forms:
+/// - every level: a row for each from 0 up, `level,phase_rad` or `phase_rad` alone. The phase may rise or fall with the
+///   level but not both.
+/// - some levels, for a panel with few and irregular ones: a row `level,phase_rad` for each that may be used, the levels
+///   rising, the phases in any order.
 ///
 /// # Errors
-/// [`FileFault`] where the file cannot be read, has a row that is no number, has too few or too many rows, or is not
-/// monotonic.
-pub(super) fn read(path: &Path, bit_depth: u8) -> Result<Vec<f64>, FileFault> {
+/// [`FileFault`] where the file cannot be read, has a row that is no number or out of order, has too few or too many
+/// rows, or names every level and is not monotonic.
+pub(super) fn read(path: &Path, bit_depth: u8) -> Result<Vec<LevelPhase>, FileFault> {
     let levels = 1usize << bit_depth;
     let text = read_text(path)?;
-    let mut phases_rad = Vec::with_capacity(levels);
+    let mut table: Vec<LevelPhase> = Vec::new();
+    let mut all_named = true;
     let mut wrong = Vec::new();
     let rows = text.lines().enumerate().map(|(index, row)| (index + 1, row.trim()));
     let rows = rows.filter(|(_, row)| !row.is_empty() && !row.starts_with('#'));
@@ -30,17 +37,21 @@ pub(super) fn read(path: &Path, bit_depth: u8) -> Result<Vec<f64>, FileFault> {
         if header {
             continue;
         }
-        match phase_in(row, phases_rad.len()) {
-            Ok(phase_rad) => phases_rad.push(phase_rad),
-            Err(why) => {
-                wrong.push(format!("row {line} `{}` {why}", shortened(row)));
-                phases_rad.push(0.0);
-            }
-        }
+        let next = table.last().map_or(0, |last| usize::from(last.level) + 1);
+        let read = level_and_phase(row, next, levels);
+        let (level, phase_rad) = read.unwrap_or_else(|why| {
+            wrong.push(format!("row {line} `{}` {why}", shortened(row)));
+            (None, 0.0)
+        });
+        all_named &= level.is_some();
+        let level = level.unwrap_or(next).min(levels - 1);
+        table.push(LevelPhase { level: level as u16, phase_rad });
     }
     let fault = |found: String, advice: &str| FileFault {
         found: format!("{}: {found}", path.display()),
-        expected: format!("a CSV file of {levels} rows `level,phase_rad`, monotonic"),
+        expected: format!(
+            "a CSV file of {levels} rows `level,phase_rad`, monotonic, or of the levels that may be used"
+        ),
         advice: advice.into(),
     };
     if !wrong.is_empty() {
@@ -51,30 +62,39 @@ pub(super) fn read(path: &Path, bit_depth: u8) -> Result<Vec<f64>, FileFault> {
         }
         return Err(fault(found, "correct the rows, with a decimal point and phases in radians"));
     }
-    if phases_rad.len() != levels {
-        let advice = format!("measure the panel at each of its {bit_depth}-bit levels");
-        return Err(fault(format!("{} rows", phases_rad.len()), &advice));
+    let complete = table.len() == levels;
+    if !complete && (!all_named || table.len() < LEVELS_MIN) {
+        let advice = format!("measure the panel at each of its {bit_depth}-bit levels, or name the level in each row");
+        return Err(fault(format!("{} rows", table.len()), &advice));
     }
-    let falls = phases_rad[levels - 1] < phases_rad[0];
-    let broken = phases_rad.windows(2).position(|pair| if falls { pair[1] > pair[0] } else { pair[1] < pair[0] });
-    if let Some(level) = broken {
-        let turn =
-            format!("phase {} at level {}, {} at level {}", phases_rad[level], level, phases_rad[level + 1], level + 1);
-        return Err(fault(turn, "smooth the measurement or unwrap its phase"));
+    let falls = table[table.len() - 1].phase_rad < table[0].phase_rad;
+    let turns_round = |pair: &[LevelPhase]| {
+        if falls { pair[1].phase_rad > pair[0].phase_rad } else { pair[1].phase_rad < pair[0].phase_rad }
+    };
+    if let Some(broken) = table.windows(2).find(|pair| complete && turns_round(pair)) {
+        let [before, after] =
+            [broken[0], broken[1]].map(|LevelPhase { level, phase_rad }| format!("phase {phase_rad} at level {level}"));
+        return Err(fault(format!("{before}, {after}"), "smooth the measurement or unwrap its phase"));
     }
-    Ok(phases_rad)
+    Ok(table)
 }
 
-fn phase_in(row: &str, level: usize) -> Result<f64, String> {
+/// The level where the row names it, and the phase. `next` is the lowest level that may come.
+fn level_and_phase(row: &str, next: usize, levels: usize) -> Result<(Option<usize>, f64), String> {
     let cells: Vec<&str> = row.split(',').map(str::trim).collect();
-    let phase = match cells.as_slice() {
-        [phase] => phase,
-        [given, phase] if given.parse() == Ok(level) => phase,
-        [_, _] => return Err(format!("should be level {level}")),
+    let (level, phase) = match cells.as_slice() {
+        [phase] => (None, phase),
+        [level, phase] => (Some(level.parse::<usize>().map_err(|_| "has no level")?), phase),
         _ => return Err("has more than two columns".into()),
     };
+    match level {
+        Some(level) if level >= levels => return Err(format!("has no level of 0 to {}", levels - 1)),
+        Some(level) if level < next => return Err(format!("should be level {next} or higher")),
+        None if next >= levels => return Err(format!("is one more than the panel's {levels} levels")),
+        _ => {}
+    }
     match phase.parse::<f64>() {
-        Ok(phase_rad) if phase_rad.is_finite() && phase_rad.abs() <= PHASE_MAX_RAD => Ok(phase_rad),
+        Ok(phase_rad) if phase_rad.is_finite() && phase_rad.abs() <= PHASE_MAX_RAD => Ok((level, phase_rad)),
         Ok(_) => Err("has no phase in radians".into()),
         Err(_) => Err("is not a number".into()),
     }

@@ -60,6 +60,10 @@ pub struct Meaning {
     pub blurs: Vec<BlurMeaning>,
     /// How one colour field passes.
     pub field: FieldMeaning,
+    /// Bits of one level.
+    pub bit_depth: u8,
+    /// Where these bits travel on the video link.
+    pub packing: String,
     /// The calibration files in use, each applied once.
     pub files: Vec<ActiveFile>,
     /// What a person should know before the lasers are armed.
@@ -88,8 +92,8 @@ pub struct FieldMeaning {
     pub refresh_hz: f64,
     /// Complete colour frames a second.
     pub colour_frames_hz: f64,
-    /// The colours in the order in which the panel shows them.
-    pub order: [String; 3],
+    /// The colour of each field of a colour frame, in the order in which the panel shows them.
+    pub order: Vec<String>,
     /// Length of one field.
     pub period_ms: f64,
     /// When the phase has settled.
@@ -157,6 +161,8 @@ impl Meaning {
             panel_half_angle_mrad: panel_half_angle.map(|angle_rad| angle_rad * 1e3).into(),
             blurs: blurs.to_vec(),
             field: FieldMeaning::of(rig),
+            bit_depth: rig.panel.bit_depth,
+            packing: rig.panel.packing.name().into(),
             files: active_files(rig),
             notes: notes(rig),
         }
@@ -173,8 +179,8 @@ impl FieldMeaning {
         Self {
             mode: panel.mode.name().into(),
             refresh_hz: panel.refresh_hz,
-            colour_frames_hz: 1e3 / (3.0 * period_ms),
-            order: panel.field_order.map(|colour| colour.name().to_owned()),
+            colour_frames_hz: 1e3 / (panel.fields() as f64 * period_ms),
+            order: (0..panel.fields()).map(|field| panel.colour_of_field(field).name().to_owned()).collect(),
             period_ms,
             settled_ms,
             laser_on_ms,
@@ -201,9 +207,17 @@ fn notes(rig: &Rig) -> Vec<String> {
         // The top level of a 2π panel stands one step short of 2π.
         if stroke_rad < TAU * (levels - 1.5) / levels {
             notes.push(format!(
-                "{colour}: the panel's stroke is {:.3} π; phases between that and 2 π cannot be shown",
-                stroke_rad / PI
+                "{colour}: the panel's stroke is {:.3} π; phases between that and 2 π cannot be shown and {}",
+                stroke_rad / PI,
+                rig.panel.out_of_stroke.meaning()
             ));
+        }
+    }
+    for (colour, table) in rig.panel.lut.iter() {
+        if let Some(table) = table
+            && table.len() < 1 << rig.panel.bit_depth
+        {
+            notes.push(format!("{colour}: of {levels} levels only the {} in the table are used", table.len()));
         }
     }
     for (colour, power_mw) in rig.lasers.power_mw.iter() {
@@ -294,6 +308,7 @@ impl fmt::Display for Meaning {
             field.laser_off_ms,
             field.lit_share * 100.0
         )?;
+        writeln!(f, "levels         {} bits, packing {}", self.bit_depth, self.packing)?;
         if self.files.is_empty() {
             writeln!(f, "files          none: phase is linear in the level, and the panel is taken as flat")?;
         }

@@ -1,5 +1,6 @@
 //! The rig: everything that is true of one bench, as one validated value.
 
+mod drive;
 mod error;
 mod files;
 mod flatness;
@@ -8,12 +9,15 @@ mod meaning;
 mod parse;
 mod profile;
 mod reader;
+mod text_laser;
 
 use std::path::{Path, PathBuf};
 
+pub use drive::{LevelPhase, OutOfStroke, Packing};
 pub use error::{Fault, RigError};
 pub use meaning::{ActiveFile, BlurMeaning, FieldMeaning, Meaning, PerColourFigures};
 pub use profile::PanelProfile;
+pub use text_laser::{Expected, Question, TextLaserProfile};
 
 use crate::{Colour, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
 
@@ -45,7 +49,7 @@ pub struct Provenance {
     pub text_hash: Option<u64>,
     /// The panel profile that the rig file names.
     pub panel_profile: Option<&'static str>,
-    /// The file behind each table of [`Panel::lut_rad`].
+    /// The file behind each table of [`Panel::lut`].
     pub lut_files: PerColour<Option<PathBuf>>,
     /// The file behind each picture of [`Panel::flatness_rad`].
     pub flatness_files: PerColour<Option<PathBuf>>,
@@ -54,21 +58,28 @@ pub struct Provenance {
 /// The phase panel as a display.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Panel {
-    /// Colour frames a second in channel-packed mode; fields a second in field-sequential mode.
+    /// Video frames a second: colour frames in channel-packed mode, single fields in the other modes.
     pub refresh_hz: f64,
     /// How three colour fields reach the panel.
     pub mode: PanelMode,
     /// The order in which the panel shows the colours.
     pub field_order: [Colour; 3],
-    /// Bits of one level, 8 or 10.
+    /// Video frames in a row that show one colour's pattern in field-sequential mode; 1 in the other modes.
+    pub frames_per_colour: u8,
+    /// Bits of one level: 8, 10 or 16.
     pub bit_depth: u8,
+    /// Where these bits travel on the video link.
+    pub packing: Packing,
     /// Whether a higher level retards or advances the phase.
     pub phase_sign: PhaseSign,
     /// Phase at the top level of each colour, radians; 2π where a pattern can be shown without loss.
     pub stroke_rad: PerColour<f64>,
-    /// Phase in radians at each level (2^bit_depth entries), where it was measured; else it is linear. It rises where
-    /// `phase_sign` is positive and falls where it is negative.
-    pub lut_rad: PerColour<Option<Vec<f64>>>,
+    /// What becomes of a phase that a stroke under 2π cannot show.
+    pub out_of_stroke: OutOfStroke,
+    /// The levels that may be used and their phases, where they were measured; else every level is used and phase is
+    /// linear in it. Levels rise. Where all 2^bit_depth are there, the phase rises where `phase_sign` is positive and
+    /// falls where it is negative.
+    pub lut: PerColour<Option<Vec<LevelPhase>>>,
     /// Phase in radians to add at each panel pixel, row-major, to flatten the panel.
     pub flatness_rad: PerColour<Option<Vec<f32>>>,
     /// Time from the panel's update to a settled phase.
@@ -80,8 +91,10 @@ pub struct Panel {
 pub enum PanelMode {
     /// In the R, G and B channels of one video frame; the panel's sequencer shows them one after another.
     ChannelPacked,
-    /// Each field is a video frame of its own.
+    /// Each field is a video frame of its own, or several in a row ([`Panel::frames_per_colour`]).
     FieldSequential,
+    /// Every video frame shows the pattern of this one colour, for alignment.
+    Monochrome(Colour),
 }
 
 /// Sign of d(phase)/d(level).
@@ -100,12 +113,18 @@ pub struct Lasers {
     pub driver: LaserDriver,
     /// Optical power of each colour while it is lit, milliwatts at the panel.
     pub power_mw: PerColour<f64>,
+    /// Greatest optical power that this bench allows each colour, milliwatts at the panel; not less than `power_mw`.
+    pub power_limit_mw: PerColour<f64>,
     /// From the field's settled phase to the laser's on edge.
     pub on_delay: TimeNs,
     /// Length of the lit window within a field.
     pub width: TimeNs,
     /// The box goes dark by itself when it has heard nothing for this long.
     pub heartbeat_timeout: TimeNs,
+    /// The panel's own hardware gates each laser to its own field, so that a box that cannot may have all of them on.
+    pub gated_by_panel: bool,
+    /// Whoever wrote the rig file knows that these lasers stay lit when holod dies.
+    pub accept_no_heartbeat: bool,
 }
 
 /// Which laser box is on the bench.
@@ -117,7 +136,39 @@ pub enum LaserDriver {
     Serial {
         /// The port, for example `/dev/holod-lasers`.
         path: PathBuf,
+        /// The panel's sync output is wired to the box.
+        sync_wire: bool,
     },
+    /// FISBA READYBeam: power and on or off only, and it stays lit when holod dies.
+    ReadyBeam {
+        /// The port.
+        path: PathBuf,
+        /// Optical power of each colour at the panel when the box is set to 100 %, milliwatts, rounded to microwatts.
+        full_power_uw: PerColour<u32>,
+    },
+    /// Lasers that take commands in text, one to a port; they stay lit when holod dies.
+    Text {
+        /// How they are spoken to.
+        profile: Box<TextLaserProfile>,
+        /// The port of each colour that has a laser.
+        paths: PerColour<Option<PathBuf>>,
+    },
+}
+
+impl LaserDriver {
+    /// The ports that it uses.
+    pub fn paths(&self) -> Vec<&Path> {
+        match self {
+            Self::Simulated => Vec::new(),
+            Self::Serial { path, .. } | Self::ReadyBeam { path, .. } => vec![path],
+            Self::Text { paths, .. } => paths.0.iter().flatten().map(PathBuf::as_path).collect(),
+        }
+    }
+
+    /// Whether its lasers go dark by themselves when holod dies.
+    pub const fn has_heartbeat(&self) -> bool {
+        matches!(self, Self::Simulated | Self::Serial { .. })
+    }
 }
 
 /// The eye tracker.
@@ -184,10 +235,13 @@ impl Default for Rig {
                 refresh_hz: 60.0,
                 mode: PanelMode::ChannelPacked,
                 field_order: Colour::ALL,
+                frames_per_colour: 1,
                 bit_depth: 8,
+                packing: Packing::Gray,
                 phase_sign: PhaseSign::Positive,
                 stroke_rad: PerColour([std::f64::consts::TAU * 255.0 / 256.0; 3]),
-                lut_rad: PerColour([None, None, None]),
+                out_of_stroke: OutOfStroke::Nearest,
+                lut: PerColour([None, None, None]),
                 flatness_rad: PerColour([None, None, None]),
                 settle: TimeNs(2_000_000),
             },
@@ -195,9 +249,12 @@ impl Default for Rig {
             lasers: Lasers {
                 driver: LaserDriver::Simulated,
                 power_mw: PerColour([1.0; 3]),
+                power_limit_mw: PerColour([500.0; 3]),
                 on_delay: TimeNs(100_000),
                 width: TimeNs(3_000_000),
                 heartbeat_timeout: TimeNs(100_000_000),
+                gated_by_panel: false,
+                accept_no_heartbeat: false,
             },
             tracker: Tracker {
                 spec: None,
@@ -218,6 +275,7 @@ impl PanelMode {
         match self {
             Self::ChannelPacked => "channel-packed",
             Self::FieldSequential => "field-sequential",
+            Self::Monochrome(_) => "monochrome",
         }
     }
 
@@ -225,12 +283,30 @@ impl PanelMode {
     pub const fn fields_per_refresh(self) -> f64 {
         match self {
             Self::ChannelPacked => 3.0,
-            Self::FieldSequential => 1.0,
+            Self::FieldSequential | Self::Monochrome(_) => 1.0,
         }
     }
 }
 
 impl Panel {
+    /// Colour fields from the start of one colour frame to the start of the next.
+    pub fn fields(&self) -> usize {
+        match self.mode {
+            PanelMode::ChannelPacked => self.field_order.len(),
+            PanelMode::FieldSequential => self.field_order.len() * usize::from(self.frames_per_colour),
+            PanelMode::Monochrome(_) => 1,
+        }
+    }
+
+    /// The colour of a field, counted from the start of a colour frame; fields beyond its end begin anew.
+    pub fn colour_of_field(&self, field: usize) -> Colour {
+        match self.mode {
+            PanelMode::ChannelPacked => self.field_order[field % 3],
+            PanelMode::FieldSequential => self.field_order[field / usize::from(self.frames_per_colour.max(1)) % 3],
+            PanelMode::Monochrome(colour) => colour,
+        }
+    }
+
     /// Time for which one colour field is on the panel.
     pub fn field_period(&self) -> TimeNs {
         TimeNs::from_seconds(1.0 / (self.refresh_hz * self.mode.fields_per_refresh()))

@@ -3,12 +3,13 @@
 use std::f64::consts::PI;
 use std::path::Path;
 
-use super::files::plain_file;
+use super::files::{plain_file, read_text};
+use super::flatness::GrayScale;
 use super::profile::PanelProfile;
 use super::reader::{Found, Reader, Section, Span};
 use super::{
-    Eye, LaserDriver, Lasers, Model, Panel, PanelMode, PhaseSign, Provenance, Rig, RigError, Tracker, WeightsChoice,
-    flatness, lut,
+    Eye, LaserDriver, Lasers, LevelPhase, Model, OutOfStroke, Packing, Panel, PanelMode, PhaseSign, Provenance, Rig,
+    RigError, TextLaserProfile, Tracker, WeightsChoice, flatness, lut,
 };
 use crate::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
 
@@ -25,12 +26,18 @@ const LAYOUT: [(&str, &[&str]); 6] = [
             "refresh_hz",
             "mode",
             "field_order",
+            "frames_per_colour",
+            "colour",
             "bit_depth",
+            "packing",
             "phase_sign",
             "stroke_pi",
+            "out_of_stroke",
             "settle_ms",
             "lut_file",
             "flatness_file",
+            "flatness_2pi_gray",
+            "flatness_sign",
         ],
     ),
     (
@@ -44,19 +51,39 @@ const LAYOUT: [(&str, &[&str]); 6] = [
             "depth_near_dpt",
         ],
     ),
-    ("lasers", &["driver", "device", "power_mw", "on_delay_ms", "lit_ms", "heartbeat_timeout_ms"]),
+    (
+        "lasers",
+        &[
+            "driver",
+            "device",
+            "devices",
+            "profile",
+            "profile_file",
+            "sync_wire",
+            "full_power_mw",
+            "power_mw",
+            "power_limit_mw",
+            "on_delay_ms",
+            "lit_ms",
+            "heartbeat_timeout_ms",
+            "gated_by_panel",
+            "accept_no_heartbeat",
+        ],
+    ),
     ("tracker", &["spec", "eye", "scale_mm_per_unit", "fallback_mm", "hold_ms"]),
     ("model", &["network", "weights_file", "allow_optics_mismatch"]),
 ];
 
 /// The keys that a panel profile gives.
-const PROFILE_KEYS: [&str; 5] = ["width_px", "height_px", "pixel_pitch_um", "refresh_hz", "bit_depth"];
+const PROFILE_KEYS: [&str; 6] = ["width_px", "height_px", "pixel_pitch_um", "refresh_hz", "bit_depth", "packing"];
 
 const PIXELS: Span = Span::new(64.0, 16384.0, "px");
 const PITCH: Span = Span::new(1.0, 50.0, "µm").slips(&[("metres", 1e6), ("millimetres", 1e3), ("nanometres", 1e-3)]);
 const REFRESH: Span = Span::new(10.0, 2000.0, "Hz").slips(&[("millihertz", 1e-3)]);
-const BIT_DEPTH: Span = Span::new(8.0, 10.0, "bits");
+const FRAMES_PER_COLOUR: Span = Span::new(1.0, 8.0, "video frames");
+const BIT_DEPTH: Span = Span::new(8.0, 16.0, "bits");
 const STROKE: Span = Span::new(0.5, 6.0, "π").slips(&[("radians", 1.0 / PI), ("degrees", 1.0 / 180.0)]);
+const GRAY_OF_2PI: Span = Span::new(16.0, 65536.0, "");
 const SETTLE: Span = Span::new(0.0, 100.0, "ms").slips(&[("microseconds", 1e-3)]);
 const WAVELENGTH: Span = Span::new(380.0, 780.0, "nm").slips(&[("metres", 1e9), ("micrometres", 1e3)]);
 const FOCAL_LENGTH: Span = Span::new(5.0, 500.0, "mm").slips(&[("metres", 1e3), ("micrometres", 1e-3)]);
@@ -65,6 +92,9 @@ const DEPTH_DPT: Span = Span::new(0.0, 20.0, "dioptres");
 /// Below this a volume's two ends look alike to any eye.
 const DEPTH_RANGE_MIN_DPT: f64 = 0.1;
 const POWER: Span = Span::new(0.0, 500.0, "mW");
+const FULL_POWER: Span = Span::new(0.001, 4000.0, "mW");
+/// What accepts lasers without a heartbeat.
+const ACCEPTANCE: &str = "these lasers stay lit when holod dies";
 const ON_DELAY: Span = Span::new(0.0, 100.0, "ms");
 const LIT: Span = Span::new(0.001, 100.0, "ms").slips(&[("microseconds", 1e-3)]);
 const HEARTBEAT: Span = Span::new(5.0, 1000.0, "ms").slips(&[("seconds", 1e3)]);
@@ -97,9 +127,12 @@ fn read_rig<'a>(reader: &mut Reader<'a>, root: Section<'a>, text: &str, origin: 
         Some(name) => name.value.to_owned(),
         None => origin.file_stem().map_or_else(|| "rig".into(), |stem| stem.to_string_lossy().into_owned()),
     };
+    // A file that says nothing of the bench is of the built-in one: all of it, since its parts belong together.
+    let built_in = !["panel", "optics", "lasers"].into_iter().any(|name| root.has(name))
+        && ["tracker", "model"].into_iter().any(|name| root.has(name));
     let [panel, optics, lasers, tracker, model] =
         [("panel", true), ("optics", true), ("lasers", true), ("tracker", false), ("model", false)]
-            .map(|(name, required)| reader.section(root, name, required));
+            .map(|(name, required)| reader.section(root, name, required && !built_in));
     for section in [panel, optics, lasers, tracker, model] {
         reader.reject_unknown(section, &LAYOUT);
     }
@@ -107,6 +140,10 @@ fn read_rig<'a>(reader: &mut Reader<'a>, root: Section<'a>, text: &str, origin: 
     let mut provenance =
         Provenance { origin: origin.display().to_string(), text_hash: Some(fnv1a(text)), ..Provenance::default() };
 
+    if built_in {
+        let (tracker, model) = (read_tracker(reader, tracker), read_model(reader, model, folder));
+        return Some(Rig { name, tracker: tracker?, model: model?, provenance, ..Rig::default() });
+    }
     // Each part is read whatever became of the others, so that one report holds all the faults.
     let profile = read_profile(reader, panel);
     provenance.panel_profile = profile.map(|profile| profile.name);
@@ -116,22 +153,26 @@ fn read_rig<'a>(reader: &mut Reader<'a>, root: Section<'a>, text: &str, origin: 
     }
     let pixels = read_pixels(reader, panel);
     let timing = read_field_timing(reader, panel);
-    let phase = read_phase(reader, panel, pixels.map(|(resolution, _)| resolution), folder, &mut provenance);
+    let levels = read_levels(reader, panel, timing.map(|timing| timing.mode));
+    let phase = read_phase(reader, panel, levels, pixels.map(|(resolution, _)| resolution), folder, &mut provenance);
     let geometry = read_optics(reader, optics, pixels);
-    let lasers = read_lasers(reader, lasers, timing);
+    let lasers = read_lasers(reader, lasers, timing, folder);
     let tracker = read_tracker(reader, tracker);
     let model = read_model(reader, model, folder);
 
-    let (timing, phase) = (timing?, phase?);
+    let (timing, (bit_depth, packing), phase) = (timing?, levels?, phase?);
     let panel = Panel {
         refresh_hz: timing.refresh_hz,
         mode: timing.mode,
         field_order: timing.field_order,
+        frames_per_colour: timing.frames_per_colour,
         settle: milliseconds(timing.settle_ms.value),
-        bit_depth: phase.bit_depth,
+        bit_depth,
+        packing,
         phase_sign: phase.sign,
         stroke_rad: phase.stroke_rad,
-        lut_rad: phase.lut_rad,
+        out_of_stroke: phase.out_of_stroke,
+        lut: phase.lut,
         flatness_rad: phase.flatness_rad,
     };
     Some(Rig { name, panel, geometry: geometry?, lasers: lasers?, tracker: tracker?, model: model?, provenance })
@@ -162,6 +203,7 @@ struct FieldTiming {
     refresh_hz: f64,
     mode: PanelMode,
     field_order: [Colour; 3],
+    frames_per_colour: u8,
     settle_ms: Found<f64>,
     field_ms: f64,
 }
@@ -171,17 +213,31 @@ impl FieldTiming {
         let mode = self.mode.name();
         format!("{} ms of one field ({} Hz, {mode})", shown(self.field_ms), self.refresh_hz)
     }
+
+    fn colour_frame_ms(&self) -> f64 {
+        let fields = match self.mode {
+            PanelMode::ChannelPacked => 3,
+            PanelMode::FieldSequential => 3 * u32::from(self.frames_per_colour),
+            PanelMode::Monochrome(_) => 1,
+        };
+        f64::from(fields) * self.field_ms
+    }
 }
 
 fn read_field_timing<'a>(reader: &mut Reader<'a>, panel: Section<'a>) -> Option<FieldTiming> {
-    let modes = [PanelMode::ChannelPacked, PanelMode::FieldSequential].map(|mode| (mode.name(), mode));
     let refresh_hz = reader.required_number(panel, "refresh_hz", REFRESH);
-    let mode = reader.choice(panel, "mode", &modes, true);
-    let field_order = reader.colour_order(panel, "field_order");
+    let mode = read_mode(reader, panel);
+    let field_order = match mode {
+        Some(PanelMode::Monochrome(_)) if !panel.has("field_order") => Some(Colour::ALL),
+        _ => reader.colour_order(panel, "field_order"),
+    };
+    let frames_per_colour = read_frames_per_colour(reader, panel, mode);
     let settle_ms = reader.required_number(panel, "settle_ms", SETTLE);
-    let (refresh_hz, mode, settle_ms) = (refresh_hz?.value, mode?.value, settle_ms?);
+    let (refresh_hz, mode, settle_ms) = (refresh_hz?.value, mode?, settle_ms?);
     let field_ms = 1e3 / (refresh_hz * mode.fields_per_refresh());
-    let timing = FieldTiming { refresh_hz, mode, field_order: field_order?, settle_ms, field_ms };
+    let field_order = field_order?;
+    let timing =
+        FieldTiming { refresh_hz, mode, field_order, frames_per_colour: frames_per_colour?, settle_ms, field_ms };
     if settle_ms.value >= field_ms {
         let expected = format!("less than the {}", timing.describe_field());
         let advice = "no phase would ever settle: correct the settle time or lower refresh_hz".into();
@@ -190,62 +246,182 @@ fn read_field_timing<'a>(reader: &mut Reader<'a>, panel: Section<'a>) -> Option<
     Some(timing)
 }
 
+/// `mode`, with the colour that monochrome mode shows.
+fn read_mode<'a>(reader: &mut Reader<'a>, panel: Section<'a>) -> Option<PanelMode> {
+    let modes = ["channel-packed", "field-sequential", "monochrome"].map(|name| (name, name));
+    let mode = reader.choice(panel, "mode", &modes, true);
+    let monochrome = mode.is_some_and(|mode| mode.value == "monochrome");
+    let colours = Colour::ALL.map(|colour| (colour.name(), colour));
+    let colour = reader.choice(panel, "colour", &colours, monochrome);
+    match (mode?.value, colour) {
+        ("monochrome", colour) => Some(PanelMode::Monochrome(colour?.value)),
+        (other, Some(colour)) => {
+            let found = format!("a single colour in {other} mode");
+            let advice = "take colour out, or write mode = \"monochrome\"".into();
+            reader.fault_in(panel, "colour", colour.line, &found, "colour in monochrome mode only", advice);
+            None
+        }
+        ("field-sequential", None) => Some(PanelMode::FieldSequential),
+        (_, None) => Some(PanelMode::ChannelPacked),
+    }
+}
+
+fn read_frames_per_colour<'a>(reader: &mut Reader<'a>, panel: Section<'a>, mode: Option<PanelMode>) -> Option<u8> {
+    if !panel.has("frames_per_colour") {
+        return Some(1);
+    }
+    let frames = reader.required_integer(panel, "frames_per_colour", FRAMES_PER_COLOUR)?;
+    if frames.value > 1
+        && let Some(mode) = mode.filter(|&mode| mode != PanelMode::FieldSequential)
+    {
+        let found = format!("{} in {} mode", frames.value, mode.name());
+        let advice = "take it out, or write mode = \"field-sequential\"".into();
+        reader.fault_in(panel, "frames_per_colour", frames.line, &found, "1 outside field-sequential mode", advice);
+        return None;
+    }
+    u8::try_from(frames.value).ok()
+}
+
+/// The bits of a level and where they travel on the video link.
+fn read_levels<'a>(reader: &mut Reader<'a>, panel: Section<'a>, mode: Option<PanelMode>) -> Option<(u8, Packing)> {
+    let bits = reader.required_integer(panel, "bit_depth", BIT_DEPTH);
+    let packings = Packing::ALL.map(|packing| (packing.name(), packing));
+    let packing = reader.choice(panel, "packing", &packings, false);
+    let bits = bits?;
+    let fitting: Vec<Packing> =
+        Packing::ALL.into_iter().filter(|packing| usize::from(packing.bit_depth()) == bits.value).collect();
+    let names = fitting.iter().map(|packing| format!("\"{}\"", packing.name())).collect::<Vec<_>>().join(" or ");
+    let Some(&first) = fitting.first() else {
+        let advice = "holod sends levels of 8, 10 or 16 bits".into();
+        reader.fault_in(panel, "bit_depth", bits.line, &bits.value.to_string(), "8, 10 or 16", advice);
+        return None;
+    };
+    let bit_depth = first.bit_depth();
+    let line = packing.and_then(|packing| packing.line);
+    let packing = match packing {
+        Some(packing) if packing.value.bit_depth() == bit_depth => packing.value,
+        Some(packing) => {
+            let found = format!("\"{}\", which carries {} bits", packing.value.name(), packing.value.bit_depth());
+            let expected = format!("{names}, as bit_depth is {bit_depth}");
+            let advice = "correct packing or bit_depth: the panel's manual says which bits it reads".into();
+            reader.fault_in(panel, "packing", line.or(bits.line), &found, &expected, advice);
+            return None;
+        }
+        None if bit_depth == Packing::Gray.bit_depth() => Packing::Gray,
+        // A packing that is there and faulty has been reported.
+        None if panel.has("packing") => return None,
+        None => {
+            let expected = format!("{names}, as bit_depth is {bit_depth}");
+            let advice = "add packing to [panel]: the panel's manual says which bits it reads".into();
+            reader.fault_in(panel, "packing", bits.line, "nothing", &expected, advice);
+            return None;
+        }
+    };
+    if mode == Some(PanelMode::ChannelPacked) && !packing.fits_a_channel() {
+        let found = format!("\"{}\" in mode \"{}\"", packing.name(), PanelMode::ChannelPacked.name());
+        let advice = format!("write mode = \"{}\", or 8 bits with \"gray\"", PanelMode::FieldSequential.name());
+        let expected = "\"gray\" or \"gray10\", as red, green and blue each carry a field of their own";
+        reader.fault_in(panel, "packing", line.or(bits.line), &found, expected, advice);
+        return None;
+    }
+    Some((bit_depth, packing))
+}
+
 /// The panel as a phase modulator.
 struct Phase {
-    bit_depth: u8,
     sign: PhaseSign,
     stroke_rad: PerColour<f64>,
-    lut_rad: PerColour<Option<Vec<f64>>>,
+    out_of_stroke: OutOfStroke,
+    lut: PerColour<Option<Vec<LevelPhase>>>,
     flatness_rad: PerColour<Option<Vec<f32>>>,
 }
 
 fn read_phase<'a>(
     reader: &mut Reader<'a>,
     panel: Section<'a>,
+    levels: Option<(u8, Packing)>,
     resolution: Option<Resolution>,
     folder: &Path,
     provenance: &mut Provenance,
 ) -> Option<Phase> {
-    let bit_depth = reader.required_integer(panel, "bit_depth", BIT_DEPTH).and_then(|bits| match bits.value {
-        8 => Some(8),
-        10 => Some(10),
-        other => {
-            let advice = "holod sends levels of 8 or 10 bits".into();
-            reader.fault_in(panel, "bit_depth", bits.line, &other.to_string(), "8 or 10", advice);
-            None
-        }
-    });
     let signs = [("positive", PhaseSign::Positive), ("negative", PhaseSign::Negative)];
     let sign = reader.choice(panel, "phase_sign", &signs, true);
     let lut_paths = reader.texts(panel, "lut_file", "a CSV file's path");
     let needs_stroke = PerColour(lut_paths.0.map(|path| path.is_none()));
     let stroke_pi = reader.numbers(panel, "stroke_pi", STROKE, needs_stroke);
-    let flatness_paths = reader.texts(panel, "flatness_file", "a PNG file's path");
+    let ways = OutOfStroke::ALL.map(|way| (way.name(), way));
+    let out_of_stroke = reader.choice(panel, "out_of_stroke", &ways, false);
+    let flatness_paths = reader.texts(panel, "flatness_file", "a PNG or BMP file's path");
+    let grays_of_2pi = reader.numbers(panel, "flatness_2pi_gray", GRAY_OF_2PI, PerColour([false; 3]));
+    let subtracted = read_flatness_sign(reader, panel);
 
-    let mut lut_rad = PerColour([const { None }; 3]);
+    let mut lut = PerColour([const { None }; 3]);
     let mut flatness_rad = PerColour([const { None }; 3]);
     let mut stroke_rad = stroke_pi.map(|stroke| stroke.map(|stroke| stroke.value * PI));
     for colour in Colour::ALL {
-        if let (Some(path), Some(bit_depth)) = (lut_paths[colour], bit_depth) {
+        if let (Some(path), Some((bit_depth, _))) = (lut_paths[colour], levels) {
             let key = format!("lut_file.{colour}");
             let file = folder.join(path.value);
-            lut_rad[colour] = reader.of_file(panel, &key, path.line, lut::read(&file, bit_depth));
-            if let Some(lut_rad) = &lut_rad[colour] {
-                let range_rad = lut_rad[lut_rad.len() - 1] - lut_rad[0];
-                check_lut(reader, panel, &key, path.line, range_rad, sign.map(|sign| sign.value), stroke_pi[colour]);
-                stroke_rad[colour] = Some(range_rad.abs());
+            lut[colour] = reader.of_file(panel, &key, path.line, lut::read(&file, bit_depth));
+            if let Some(table) = &lut[colour] {
+                let range = table_range(table);
+                check_lut(reader, panel, &key, path.line, range, sign.map(|sign| sign.value), stroke_pi[colour]);
+                stroke_rad[colour] = Some(range.either().abs());
             }
             provenance.lut_files[colour] = Some(file);
         }
         if let (Some(path), Some(resolution)) = (flatness_paths[colour], resolution) {
             let file = folder.join(path.value);
-            let read = flatness::read(&file, resolution);
+            let gray_of_2pi = grays_of_2pi[colour].map(|gray| gray.value);
+            let read = flatness::read(&file, resolution, GrayScale { gray_of_2pi, subtracted });
             flatness_rad[colour] = reader.of_file(panel, &format!("flatness_file.{colour}"), path.line, read);
             provenance.flatness_files[colour] = Some(file);
         }
+        if let (None, Some(gray)) = (flatness_paths[colour], grays_of_2pi[colour]) {
+            let advice = format!("name {colour}'s picture in flatness_file, or take this out");
+            let key = format!("flatness_2pi_gray.{colour}");
+            reader.fault_in(panel, &key, gray.line, "a gray of no picture", "a flatness_file for it", advice);
+        }
     }
     let stroke_rad = PerColour([stroke_rad.0[0]?, stroke_rad.0[1]?, stroke_rad.0[2]?]);
-    Some(Phase { bit_depth: bit_depth?, sign: sign?.value, stroke_rad, lut_rad, flatness_rad })
+    let out_of_stroke = out_of_stroke.map_or(OutOfStroke::default(), |way| way.value);
+    Some(Phase { sign: sign?.value, stroke_rad, out_of_stroke, lut, flatness_rad })
+}
+
+/// Whether the flatness pictures show what is to be taken off.
+fn read_flatness_sign<'a>(reader: &mut Reader<'a>, panel: Section<'a>) -> bool {
+    let signs = [("add", false), ("subtract", true)];
+    let sign = reader.choice(panel, "flatness_sign", &signs, false);
+    if let Some(sign) = sign.filter(|_| !panel.has("flatness_file")) {
+        let advice = "name the pictures in flatness_file, or take this out".into();
+        reader.fault_in(panel, "flatness_sign", sign.line, "a sign of no picture", "a flatness_file for it", advice);
+    }
+    sign.is_some_and(|sign| sign.value)
+}
+
+/// By how much the phases of a table differ.
+#[derive(Clone, Copy)]
+enum TableRange {
+    /// The phase rises or falls throughout, by this much from the lowest level to the highest.
+    Signed(f64),
+    /// The phases come in no order; the lowest and the highest are this far apart.
+    Unordered(f64),
+}
+
+impl TableRange {
+    fn either(self) -> f64 {
+        match self {
+            Self::Signed(range_rad) | Self::Unordered(range_rad) => range_rad,
+        }
+    }
+}
+
+fn table_range(table: &[LevelPhase]) -> TableRange {
+    let phases = || table.iter().map(|entry| entry.phase_rad);
+    if phases().is_sorted() || phases().is_sorted_by(|a, b| a >= b) {
+        return TableRange::Signed(table[table.len() - 1].phase_rad - table[0].phase_rad);
+    }
+    TableRange::Unordered(phases().fold(f64::MIN, f64::max) - phases().fold(f64::MAX, f64::min))
 }
 
 /// Judges a measured table against what the rig file says in words.
@@ -254,11 +430,11 @@ fn check_lut<'a>(
     panel: Section<'a>,
     key: &str,
     line: Option<usize>,
-    range_rad: f64,
+    range: TableRange,
     sign: Option<PhaseSign>,
     stroke_pi: Option<Found<f64>>,
 ) {
-    let range_pi = range_rad / PI;
+    let range_pi = range.either() / PI;
     if range_pi.abs() < STROKE.min || range_pi.abs() > STROKE.max {
         let expected = format!("a range of {} to {} π", STROKE.min, STROKE.max);
         let found = format!("a table whose phase changes by {} π", shown(range_pi));
@@ -277,6 +453,7 @@ fn check_lut<'a>(
         let expected = format!("the {} π that stroke_pi states", shown(stroke.value));
         reader.fault_in(panel, key, line, &found, &expected, "take stroke_pi out: the table says it".into());
     }
+    let TableRange::Signed(range_rad) = range else { return };
     let (expected, other) = match sign {
         Some(PhaseSign::Positive) if range_rad < 0.0 => ("a rising table, as phase_sign is \"positive\"", "negative"),
         Some(PhaseSign::Negative) if range_rad > 0.0 => ("a falling table, as phase_sign is \"negative\"", "positive"),
@@ -350,9 +527,27 @@ fn read_depth<'a>(
     metres.or(dioptres.map(|found| Found { value: Dioptres(found.value), line: found.line }))
 }
 
-fn read_lasers<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, timing: Option<FieldTiming>) -> Option<Lasers> {
-    let driver = read_driver(reader, lasers);
+fn read_lasers<'a>(
+    reader: &mut Reader<'a>,
+    lasers: Section<'a>,
+    timing: Option<FieldTiming>,
+    folder: &Path,
+) -> Option<Lasers> {
+    let driver = read_driver(reader, lasers, folder);
+    let gated_by_panel = reader.flag(lasers, "gated_by_panel", false);
+    let accept_no_heartbeat = read_acceptance(reader, lasers, driver.as_ref());
     let power_mw = reader.numbers(lasers, "power_mw", POWER, PerColour([true; 3]));
+    let power_limit_mw = reader.numbers(lasers, "power_limit_mw", POWER, PerColour([false; 3]));
+    for colour in Colour::ALL {
+        if let (Some(power), Some(limit)) = (power_mw[colour], power_limit_mw[colour])
+            && power.value > limit.value
+        {
+            let expected = format!("{} mW at most, as power_limit_mw says", limit.value);
+            let advice = "lower it; power_limit_mw is what this bench's optics allow an eye".into();
+            let found = format!("{} mW", power.value);
+            reader.fault_in(lasers, &format!("power_mw.{colour}"), power.line, &found, &expected, advice);
+        }
+    }
     let on_delay_ms = reader.required_number(lasers, "on_delay_ms", ON_DELAY);
     let lit_ms = reader.required_number(lasers, "lit_ms", LIT);
     let heartbeat_ms = reader.required_number(lasers, "heartbeat_timeout_ms", HEARTBEAT);
@@ -379,7 +574,7 @@ fn read_lasers<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, timing: Option<
         }
     }
     if let (Some(timing), Some(heartbeat_ms)) = (timing, heartbeat_ms) {
-        let least_ms = 2.0 * 3.0 * timing.field_ms;
+        let least_ms = 2.0 * timing.colour_frame_ms();
         if heartbeat_ms.value < least_ms {
             let expected = format!("at least two colour frames, {} ms", shown(least_ms));
             let advice = "lengthen it, or the box goes dark between two frames".into();
@@ -391,30 +586,127 @@ fn read_lasers<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, timing: Option<
     Some(Lasers {
         driver: driver?,
         power_mw: PerColour([red.value, green.value, blue.value]),
+        power_limit_mw: power_limit_mw.map(|limit| limit.map_or(POWER.max, |limit| limit.value)),
         on_delay: milliseconds(on_delay_ms?.value),
         width: milliseconds(lit_ms?.value),
         heartbeat_timeout: milliseconds(heartbeat_ms?.value),
+        gated_by_panel,
+        accept_no_heartbeat,
     })
 }
 
-fn read_driver<'a>(reader: &mut Reader<'a>, lasers: Section<'a>) -> Option<LaserDriver> {
-    const EXPECTED: &str = "a serial port's path";
-    let driver = reader.choice(lasers, "driver", &[("simulated", false), ("serial", true)], true);
-    let device = reader.text(lasers, "device", EXPECTED);
+/// The drivers, each with the keys of `[lasers]` that only some of them have.
+const DRIVERS: [(&str, &[&str]); 4] = [
+    ("simulated", &[]),
+    ("serial", &["device", "sync_wire"]),
+    ("ready-beam", &["device", "full_power_mw", "gated_by_panel", "accept_no_heartbeat"]),
+    ("text", &["devices", "profile", "profile_file", "gated_by_panel", "accept_no_heartbeat"]),
+];
+
+fn read_driver<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, folder: &Path) -> Option<LaserDriver> {
+    const PORT: &str = "a serial port's path";
+    let drivers: Vec<_> = DRIVERS.iter().map(|driver| (driver.0, driver)).collect();
+    let driver = reader.choice(lasers, "driver", &drivers, true);
+    // Each key is read whatever the driver is, so that all its own faults are reported.
+    let device = reader.text(lasers, "device", PORT);
+    let devices = reader.texts(lasers, "devices", PORT);
+    let sync_wire = reader.flag(lasers, "sync_wire", false);
+    let full_power = reader.numbers(lasers, "full_power_mw", FULL_POWER, PerColour([lasers.has("full_power_mw"); 3]));
+    let profile = read_text_laser(reader, lasers, folder);
     let driver = driver?;
-    match (driver.value, device) {
-        (false, None) => Some(LaserDriver::Simulated),
-        (true, Some(device)) => Some(LaserDriver::Serial { path: device.value.into() }),
-        (false, Some(device)) => {
-            let advice = "write driver = \"serial\", or take device out".into();
-            let found = "a device for simulated lasers";
-            reader.fault_in(lasers, "device", device.line, found, "no device, or the driver \"serial\"", advice);
-            None
+    let (name, own) = *driver.value;
+    for key in DRIVERS.iter().flat_map(|(_, keys)| *keys) {
+        if lasers.has(key) && !own.contains(key) {
+            let of: Vec<_> = DRIVERS.iter().filter(|(_, keys)| keys.contains(key)).map(|(name, _)| *name).collect();
+            let found = format!("a key that the driver \"{name}\" does not have");
+            let advice = format!("take {key} out, or write driver = \"{}\"", of.join("\" or \""));
+            let line = reader.line_of_key(lasers, key);
+            // A key of several drivers is one fault.
+            if !reader.faults.iter().any(|fault| fault.line == line && fault.found == found) {
+                reader.fault_in(lasers, key, line, &found, "only keys of the chosen driver", advice);
+            }
         }
-        (true, None) => {
-            if !lasers.has("device") {
-                let advice = "write for example device = \"/dev/holod-lasers\"".into();
-                reader.fault_in(lasers, "device", driver.line, "nothing", EXPECTED, advice);
+    }
+    let mut missing = |key: &str, expected: &str, example: &str| {
+        if !lasers.has(key) {
+            let advice = format!("write for example {example}");
+            reader.fault_in(lasers, key, driver.line, "nothing", expected, advice);
+        }
+    };
+    match name {
+        "simulated" => Some(LaserDriver::Simulated),
+        "serial" => {
+            missing("device", PORT, "device = \"/dev/holod-lasers\"");
+            Some(LaserDriver::Serial { path: device?.value.into(), sync_wire })
+        }
+        "ready-beam" => {
+            missing("device", PORT, "device = \"/dev/holod-lasers\"");
+            missing(
+                "full_power_mw",
+                "each colour's power at the panel at 100 %",
+                "full_power_mw = { red = 40.0, green = 30.0, blue = 50.0 }",
+            );
+            let [Some(red), Some(green), Some(blue)] = full_power.0 else { return None };
+            let full_power_uw = PerColour([red, green, blue]).map(|power| (power.value * 1e3).round() as u32);
+            Some(LaserDriver::ReadyBeam { path: device?.value.into(), full_power_uw })
+        }
+        _ => {
+            missing("devices", "a serial port for each laser", "devices = { green = \"/dev/holod-green\" }");
+            if !lasers.has("profile_file") {
+                missing("profile", "how the lasers are spoken to", "profile = \"cobolt\", or profile_file");
+            }
+            for (index, colour) in Colour::ALL.into_iter().enumerate() {
+                let Some(path) = devices[colour] else { continue };
+                if devices.0[..index].iter().flatten().any(|other| other.value == path.value) {
+                    let advice = "give each laser its own port".into();
+                    let key = format!("devices.{colour}");
+                    reader.fault_in(lasers, &key, path.line, "a port named twice", "one laser to a port", advice);
+                }
+            }
+            let paths = devices.map(|path| path.map(|path| path.value.into()));
+            paths.0.iter().any(Option::is_some).then_some(())?;
+            Some(LaserDriver::Text { profile: Box::new(profile?), paths })
+        }
+    }
+}
+
+/// Whether the rig file accepts, in words, lasers that stay lit when holod dies.
+fn read_acceptance<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, driver: Option<&LaserDriver>) -> bool {
+    let expected = format!("the words {ACCEPTANCE:?}");
+    let words = reader.text(lasers, "accept_no_heartbeat", &expected);
+    let accepted = words.is_some_and(|words| words.value == ACCEPTANCE);
+    let needed = driver.is_some_and(|driver| !driver.has_heartbeat());
+    if needed && !accepted {
+        let found = words.map_or("nothing".into(), |words| format!("{:?}", words.value));
+        let advice = format!(
+            "these lasers have no heartbeat: they stay lit when holod is killed or the computer hangs. Where the bench is \
+             safe with that, write accept_no_heartbeat = {ACCEPTANCE:?}"
+        );
+        let line = words.and_then(|words| words.line);
+        reader.fault_in(lasers, "accept_no_heartbeat", line, &found, &expected, advice);
+    }
+    accepted
+}
+
+/// The profile that `profile` or `profile_file` names.
+fn read_text_laser<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, folder: &Path) -> Option<TextLaserProfile> {
+    let choices: Vec<_> = TextLaserProfile::names().map(|name| (name, name)).collect();
+    let named = reader.choice(lasers, "profile", &choices, false);
+    let file = reader.text(lasers, "profile_file", "a TOML file's path");
+    if let (Some(_), Some(file)) = (named, file) {
+        let advice = "remove profile, or profile_file".into();
+        reader.fault_in(lasers, "profile_file", file.line, "a second profile", "one profile", advice);
+    }
+    let Some(file) = file else { return TextLaserProfile::named(named?.value).cloned() };
+    let path = folder.join(file.value);
+    let text = reader.of_file(lasers, "profile_file", file.line, read_text(&path))?;
+    match TextLaserProfile::parse(&text, &path) {
+        Ok(profile) => Some(profile),
+        Err(error) => {
+            for fault in error.faults {
+                let place = fault.line.map_or(String::new(), |line| format!(" line {line}"));
+                let found = format!("{}{place}, {}: {}", path.display(), fault.key, fault.found);
+                reader.fault_in(lasers, "profile_file", file.line, &found, &fault.expected, fault.advice);
             }
             None
         }

@@ -228,6 +228,11 @@ impl<'a> Reader<'a> {
         Some(Found { value: item, line: None })
     }
 
+    /// The line of `key`, where it is there.
+    pub(super) fn line_of_key(&self, section: Section<'a>, key: &str) -> Option<usize> {
+        self.lookup(section, key)?.line
+    }
+
     fn missing(&mut self, section: Section<'a>, key: &str, expected: &str) {
         // A missing table is one fault, not one for each of its keys.
         if section.table.is_some() && !section.excused.contains(&key) {
@@ -360,6 +365,92 @@ impl<'a> Reader<'a> {
     pub(super) fn text(&mut self, section: Section<'a>, key: &str, expected: &str) -> Option<Found<&'a str>> {
         let found = self.lookup(section, key)?;
         self.text_of(section, key, found, expected)
+    }
+
+    /// A text that is not empty; a fault where the key is missing.
+    pub(super) fn required_text(&mut self, section: Section<'a>, key: &str, expected: &str) -> Option<Found<&'a str>> {
+        if self.lookup(section, key).is_none() {
+            self.missing(section, key, expected);
+        }
+        self.text(section, key, expected)
+    }
+
+    /// A text of any characters; a fault where the key is missing.
+    pub(super) fn required_raw_text(
+        &mut self,
+        section: Section<'a>,
+        key: &str,
+        expected: &str,
+    ) -> Option<Found<&'a str>> {
+        let Some(found) = self.lookup(section, key) else {
+            self.missing(section, key, expected);
+            return None;
+        };
+        let Some(text) = found.value.as_str() else {
+            self.wrong_type(section, key, found, expected, "write it in double quotes".into());
+            return None;
+        };
+        Some(Found { value: text, line: found.line })
+    }
+
+    /// A list of texts that are not empty; an empty list where the key is missing and not required.
+    pub(super) fn text_list(
+        &mut self,
+        section: Section<'a>,
+        key: &str,
+        required: bool,
+        count_max: usize,
+    ) -> Option<Found<Vec<&'a str>>> {
+        let expected = format!("a list of {} to {count_max} texts", usize::from(required));
+        let Some(found) = self.lookup(section, key) else {
+            if required {
+                self.missing(section, key, &expected);
+                return None;
+            }
+            return Some(Found { value: Vec::new(), line: None });
+        };
+        let Some(array) = found.value.as_array() else {
+            self.wrong_type(section, key, found, &expected, "write the texts in square brackets".into());
+            return None;
+        };
+        let texts: Option<Vec<&str>> = array.iter().map(|item| item.as_str().filter(|text| !text.is_empty())).collect();
+        match texts {
+            Some(texts) if texts.len() <= count_max && !(required && texts.is_empty()) => {
+                Some(Found { value: texts, line: found.line })
+            }
+            Some(texts) => {
+                let advice = if texts.is_empty() { "write at least one" } else { "write fewer" };
+                self.fault_in(section, key, found.line, &format!("{} texts", texts.len()), &expected, advice.into());
+                None
+            }
+            None => {
+                self.wrong_type(section, key, found, &expected, "write each text in double quotes, none empty".into());
+                None
+            }
+        }
+    }
+
+    /// The tables `[[name]]`, at most `count_max` of them.
+    pub(super) fn sections(
+        &mut self,
+        root: Section<'a>,
+        name: &'static str,
+        count_max: usize,
+    ) -> Option<Vec<Section<'a>>> {
+        let Some(found) = self.lookup(root, name) else { return Some(Vec::new()) };
+        let Some(tables) = found.value.as_array_of_tables().filter(|tables| tables.len() <= count_max) else {
+            let expected = format!("1 to {count_max} tables");
+            self.wrong_type(root, name, found, &expected, format!("begin each table with a line [[{name}]]"));
+            return None;
+        };
+        let section = |table: &'a Table| Section {
+            name,
+            table: Some(table as &dyn TableLike),
+            line: self.line_of(table.span()),
+            profile: None,
+            excused: &[],
+        };
+        Some(tables.iter().map(section).collect())
     }
 
     fn text_of(

@@ -1,14 +1,18 @@
 //! `holod check`: what the rig file means, and whether this bench is ready.
 
+mod output;
+
 use std::path::Path;
 
-use holod_calibration::rig::{LaserDriver, Meaning, Rig};
+use holod_calibration::Resolution;
+use holod_calibration::rig::{Meaning, Rig};
 use holod_pupil_input::{Profile, TrackerSpec, serial_port_warnings};
 use serde::Serialize;
 
 use crate::cli::CheckArgs;
 use crate::failure::{Exit, Failure};
-use crate::{report, setup};
+use crate::speed::{self, Estimate};
+use crate::{progress, report, setup};
 
 #[derive(Serialize)]
 struct Findings {
@@ -25,8 +29,14 @@ struct Check {
 }
 
 pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
-    let rig = setup::rig(&args.rig)?;
-    let checks = vec![weights(&rig), tracker(&rig), lasers(&rig), panel(&rig)];
+    let mut rig = setup::rig_with_network(&args.rig, &args.network)?;
+    if let Some(spec) = &args.tracker {
+        rig.tracker.spec = Some(spec.clone());
+    }
+    let output = args.output.as_deref().map(str::parse).transpose().map_err(Failure::because(Exit::Usage))?;
+    let mut checks = vec![weights(&rig), frames_hz(&rig, args.resolution), tracker(&rig)];
+    checks.extend(output::lasers(&rig));
+    checks.extend(output::panel(&rig, output.as_ref()));
     let findings = Findings { ready: checks.iter().all(|check| check.passed), checks, meaning: rig.meaning() };
     if args.json {
         report::print_json(&findings)?;
@@ -35,7 +45,7 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
         text.push_str("\n\nChecks\n");
         for check in &findings.checks {
             text.push_str(&format!(
-                "  {} {:8} {}\n",
+                "  {} {:10} {}\n",
                 if check.passed { "ok  " } else { "FAIL" },
                 check.name,
                 check.says
@@ -69,6 +79,39 @@ fn weights(rig: &Rig) -> Check {
         Err(failure) => (false, failure.to_string()),
     };
     Check { name: "weights", passed, says }
+}
+
+/// Frames a second, estimated from a small frame: slow is no fault of the bench.
+fn frames_hz(rig: &Rig, resolution: Option<Resolution>) -> Check {
+    let name = "speed";
+    let panel = rig.resolution();
+    let sizes = match resolution {
+        Some(size) => vec![size],
+        None => vec![setup::SAMPLE_RESOLUTION, panel],
+    };
+    let fits = |size: &Resolution| size.width <= panel.width && size.height <= panel.height;
+    let sizes: Vec<Resolution> = sizes.into_iter().filter(fits).collect();
+    let estimated = setup::weights(rig)
+        .and_then(|weights| progress::during("estimating the frames a second", || Estimate::of(&weights, panel)));
+    let (passed, says) = match (estimated, &sizes[..]) {
+        // Why is said above, of the weights.
+        (Err(_), _) => (true, "not estimated without weights".into()),
+        (Ok(_), []) => (false, format!("--resolution is larger than the panel of {panel}")),
+        (Ok(estimate), [first, ..]) => {
+            let rates = sizes.iter().map(|&size| format!("{:.2} frames a second of {size}", estimate.frames_hz(size)));
+            let rates: Vec<String> = rates.collect();
+            let advice = speed::advice(estimate.frames_hz(*first), rig, *first);
+            let says = format!(
+                "estimated from a frame of {}: {}; the panel could show {:.1}{}",
+                estimate.timed,
+                rates.join(", "),
+                speed::panel_frames_hz(&rig.panel),
+                advice.map_or(String::new(), |advice| format!("; {advice}"))
+            );
+            (true, says)
+        }
+    };
+    Check { name, passed, says }
 }
 
 fn tracker(rig: &Rig) -> Check {
@@ -112,26 +155,6 @@ fn reachable(spec: &TrackerSpec) -> (bool, String) {
         | TrackerSpec::Core(_)
         | TrackerSpec::Neon(_) => (true, format!("{spec}: not tried; `holod tracker try {spec}` does")),
     }
-}
-
-fn lasers(rig: &Rig) -> Check {
-    let (passed, says) = match &rig.lasers.driver {
-        LaserDriver::Simulated => (true, "simulated: no light leaves this bench".to_owned()),
-        LaserDriver::Serial { path } => {
-            let (passed, says) = present(path, "plug the laser box in or correct lasers.device");
-            (passed, format!("{says}; this version's panel is virtual, over which a real laser is never lit"))
-        }
-    };
-    Check { name: "lasers", passed, says }
-}
-
-fn panel(rig: &Rig) -> Check {
-    let says = format!(
-        "{} at {} Hz; this version shows patterns on a virtual panel only",
-        rig.resolution(),
-        rig.panel.refresh_hz
-    );
-    Check { name: "panel", passed: true, says }
 }
 
 fn present(path: &Path, otherwise: &str) -> (bool, String) {

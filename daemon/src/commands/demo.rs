@@ -1,17 +1,20 @@
 //! `holod demo`: the whole loop on built-in inputs, and pictures of what happened.
 
-use holod_calibration::rig::Rig;
+use std::path::PathBuf;
+
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, PupilDiameter, TimeNs};
 use holod_model::optics::{Eye, PhasePattern, SimulatedEye};
-use holod_model::{LinearImage, RgbdFrame, Weights, metrics};
+use holod_model::{LinearImage, RgbdFrame, metrics};
 use holod_pupil_input::{Decision, MOCK_SEED, MockSource, Scenario, TrackerSpec, Verdict};
-use holod_slm_output::FieldEvent;
+use holod_slm_output::present::ReportFaults;
+use holod_slm_output::{FieldEvent, LevelsFrame, OutputSpec};
 
-use crate::cli::{Backend, DemoArgs, SceneArgs};
+use crate::cli::{Backend, DemoArgs, RigArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
 use crate::pictures::{
     Area, LatencyPlot, PupilPlot, PupilSampleMark, Sheet, Tile, phase_picture, screen_picture, shown_pattern,
 };
+use crate::progress;
 use crate::record::{FieldRecord, FrameLog, FrameRecord};
 use crate::session::{self, Observer, SessionPlan, SessionReport};
 use crate::staging::Staging;
@@ -23,13 +26,27 @@ const FAR: Dioptres = Dioptres(0.25);
 /// The cards' rims are left out of the figures: in front of them and behind them other things blur.
 const INSET_PX: usize = 12;
 const SCENARIO: Scenario = Scenario::Sweep;
+const FOLDER: &str = "holod-demo";
+const FILES: [&str; 9] = [
+    "eye.png",
+    "phase_red.png",
+    "phase_green.png",
+    "phase_blue.png",
+    "pupil.svg",
+    "latency.svg",
+    "frames.csv",
+    "summary.json",
+    "summary.txt",
+];
 
 pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
-    let staging = Staging::new(&args.out)?;
-    let rig = Rig::default();
-    let weights = Weights::builtin();
+    let out = args.out.clone().unwrap_or_else(free_folder);
+    let staging = Staging::new(&out, &FILES, args.force)?;
+    let rig = setup::rig_with_network(&RigArgs::default(), &args.network)?;
+    let weights = progress::during("loading the network", || setup::weights(&rig))?;
     let constant = weights.config().amplitude_constant;
-    let frames = setup::frames(&SceneArgs::default(), &rig.geometry)?;
+    let scene = SceneArgs { resolution: args.resolution, ..SceneArgs::default() };
+    let frames = setup::frames(&scene, &rig.geometry)?;
     let scene = frames.frames[0].clone();
     let geometry = rig.geometry;
     eprintln!("running the loop for {:?}: {} px, tracker {}", args.duration, frames.resolution(), SCENARIO.name());
@@ -45,6 +62,7 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
             weights,
             backend: Backend::Auto,
             frames,
+            output: OutputSpec::Headless(ReportFaults::NONE),
             tracker: TrackerSpec::Mock(SCENARIO),
             record_tracker: None,
             frame_limit: None,
@@ -62,14 +80,14 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
         ));
     };
     eprintln!("computing what an eye sees of the recorded panel levels");
-    let mut eye = SimulatedEye::new(&geometry, scene.resolution);
-    let views: Vec<EyeView> = [narrow, wide]
-        .into_iter()
-        .flat_map(|(pupil, levels)| {
+    let views: Vec<EyeView> = progress::during("computing what the eye sees", || {
+        let mut eye = SimulatedEye::new(&geometry, scene.resolution);
+        let of_frame = |(pupil, levels): &(PupilDiameter, LevelsFrame)| {
             let pattern = shown_pattern(&session.encoder, levels);
             [NEAR, FAR].map(|focus| EyeView::new(&mut eye, &pattern, constant, *pupil, focus, &scene))
-        })
-        .collect();
+        };
+        [narrow, wide].into_iter().flat_map(of_frame).collect()
+    });
     report::save_png(&eye_sheet(&views).draw(), &staging.path("eye.png"))?;
     let pattern = shown_pattern(&session.encoder, &wide.1);
     for colour in Colour::ALL {
@@ -82,7 +100,13 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
     std::fs::write(staging.path("summary.txt"), format!("{text}\n")).map_err(Failure::because(Exit::CannotCreate))?;
     staging.commit()?;
     report::print(&text)?;
-    report::print(&format!("\nThe pictures are in {}; begin with eye.png.", args.out.display()))
+    report::print(&format!("\nThe pictures are in {}; begin with eye.png.", out.display()))
+}
+
+/// `holod-demo`, or the first of `holod-demo-2` and so on that is not there yet.
+fn free_folder() -> PathBuf {
+    let names = std::iter::once(FOLDER.to_owned()).chain((2..).map(|number| format!("{FOLDER}-{number}")));
+    names.map(PathBuf::from).find(|name| !name.exists()).expect("numbers without end")
 }
 
 /// What an eye sees of one presented frame at one focus.
@@ -222,7 +246,7 @@ impl Log {
                 (eyes[0].sample.t_sample.seconds(), f64::from(mean_mm))
             })
             .collect();
-        PupilPlot { samples: &samples, estimate: &estimate, truth: &truth }.save(&staging.path("pupil.svg"))
+        PupilPlot { unit: None, samples: &samples, estimate: &estimate, truth: &truth }.save(&staging.path("pupil.svg"))
     }
 
     fn latency_plot(&self, session: &SessionReport, staging: &Staging) -> Result<(), Failure> {

@@ -70,7 +70,8 @@ pub(super) fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
     let cards = args.cards.as_deref().map(|folder| open(folder, None, &rig)).transpose()?.unwrap_or_default();
     let pupils = judged_pupils(&shards, &args.pupil)?;
     warn_of_untrained_pupils(&weights, &pupils);
-    let staging = args.out.as_deref().map(Staging::new).transpose()?;
+    let staging =
+        args.out.as_deref().map(|out| Staging::new(out, &["evaluation.json", "sheet.png"], args.force)).transpose()?;
 
     let progress = progress_bar(shards.len() + cards.len());
     // Cards first: they are few, and what is wrong with them is told before the long work.

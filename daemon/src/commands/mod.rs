@@ -2,10 +2,11 @@
 
 mod bench;
 mod check;
-mod dark;
 mod demo;
 mod evaluate;
+mod laser;
 mod log;
+mod pattern;
 mod render;
 mod run;
 mod status;
@@ -29,9 +30,11 @@ pub fn dispatch(cli: Cli) -> Result<(), Failure> {
         Some(Command::Check(args)) => check::check(&args),
         Some(Command::Bench(args)) => bench::bench(&args),
         Some(Command::Evaluate(args)) => evaluate::evaluate(&args),
+        Some(Command::Pattern(kind)) => pattern::pattern(&kind),
         Some(Command::Status(args)) => status::status(&args),
         Some(Command::Tracker(command)) => tracker::tracker(&command),
         Some(Command::Log(command)) => log::log(&command),
-        Some(Command::Dark(args)) => dark::dark(&args),
+        Some(Command::Laser(command)) => laser::laser(&command),
+        Some(Command::Dark(args)) => laser::dark(&args),
     }
 }

@@ -1,5 +1,7 @@
 //! `holod render`: one hologram and its phase patterns.
 
+use std::time::Instant;
+
 use holod_calibration::rig::Rig;
 use holod_calibration::{Colour, DisplayGeometry, PupilDiameter};
 use holod_model::files::{self, StoredHologram};
@@ -10,6 +12,7 @@ use serde::Serialize;
 
 use crate::cli::{Backend, RenderArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
+use crate::progress;
 use crate::staging::Staging;
 use crate::{report, setup};
 
@@ -30,6 +33,8 @@ struct Report {
     depth_least_dpt: f64,
     depth_greatest_dpt: f64,
     network_ms: f64,
+    /// From the command's beginning until everything but this report was written.
+    total_ms: f64,
     files: [&'static str; 5],
 }
 
@@ -37,23 +42,28 @@ const FILES: [&str; 5] = ["field.safetensors", "phase_red.png", "phase_green.png
 
 pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
-    let staging = Staging::new(&args.out)?;
+    let began = Instant::now();
+    let staging = Staging::new(&args.out, &FILES, args.force)?;
     let (hologram, mut report) = compute(&rig, &args.scene, args.pupil, args.backend)?;
     let mut double_phase = DoublePhase::new(hologram.hologram.resolution, hologram.amplitude_constant);
     let mut pattern = PhasePattern::flat(hologram.hologram.resolution);
     report.clipped_share = double_phase.encode(&hologram.hologram, &mut pattern).clipped_share;
-    let cannot = Failure::because(Exit::CannotCreate);
-    hologram.save(&staging.path(FILES[0])).map_err(&cannot)?;
-    for (colour, name) in Colour::ALL.into_iter().zip(&FILES[1..4]) {
-        files::save_phase(&pattern, colour, &staging.path(name)).map_err(&cannot)?;
-    }
+    progress::during("writing the hologram", || {
+        let cannot = Failure::because(Exit::CannotCreate);
+        hologram.save(&staging.path(FILES[0])).map_err(&cannot)?;
+        for (colour, name) in Colour::ALL.into_iter().zip(&FILES[1..4]) {
+            files::save_phase(&pattern, colour, &staging.path(name)).map_err(&cannot)?;
+        }
+        Ok::<_, Failure>(())
+    })?;
+    report.total_ms = began.elapsed().as_secs_f64() * 1e3;
     report::save_json(&report, &staging.path(FILES[4]))?;
     staging.commit()?;
     if args.json {
         return report::print_json(&report);
     }
     report::print(&format!(
-        "{}: hologram of {}x{} for a pupil of {} mm in {:.0} ms; {:.3} % of amplitudes clipped\n\
+        "{}: hologram of {}x{} for a pupil of {} mm in {:.0} ms, {:.1} s with all else; {:.3} % of amplitudes clipped\n\
          depth {:.2} to {:.2} dpt; pixels filled {}, clamped to the far end {}, to the near end {}, padded {}\n\
          in {}: {}",
         report.scene,
@@ -61,6 +71,7 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
         report.height_px,
         report.pupil_mm,
         report.network_ms,
+        report.total_ms / 1e3,
         report.clipped_share * 100.0,
         report.depth_least_dpt,
         report.depth_greatest_dpt,
@@ -80,14 +91,18 @@ fn compute(
     pupil: PupilDiameter,
     backend: Backend,
 ) -> Result<(StoredHologram, Report), Failure> {
-    let weights = setup::weights(rig)?;
+    let weights = progress::during("loading the network", || setup::weights(rig))?;
     check_pupil(&weights, pupil)?;
-    let frames = setup::frames(scene, &rig.geometry)?;
+    let frames = progress::during("loading the scene", || setup::frames(scene, &rig.geometry))?;
     let resolution = frames.resolution();
-    let mut engine = setup::engine(backend, &weights, resolution)?;
+    let mut engine = progress::during(&format!("preparing the network for {resolution}"), || {
+        setup::engine(backend, &weights, resolution)
+    })?;
     let mut hologram = ComplexHologram::dark(resolution);
-    let began = std::time::Instant::now();
-    engine.render(&frames.frames[0], pupil, &mut hologram).map_err(Failure::because(Exit::Software))?;
+    let began = Instant::now();
+    progress::during(&format!("computing the hologram of {resolution}"), || {
+        engine.render(&frames.frames[0], pupil, &mut hologram).map_err(Failure::because(Exit::Software))
+    })?;
     let network_ms = began.elapsed().as_secs_f64() * 1e3;
     let amplitude_constant = weights.config().amplitude_constant;
     let done = &frames.reports[0];
@@ -110,6 +125,7 @@ fn compute(
         depth_least_dpt: depth_at(f32::MAX, f32::min),
         depth_greatest_dpt: depth_at(f32::MIN, f32::max),
         network_ms,
+        total_ms: 0.0,
         files: FILES,
     };
     let geometry = DisplayGeometry { resolution, ..rig.geometry };

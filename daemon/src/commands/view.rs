@@ -15,9 +15,10 @@ use serde::Serialize;
 
 use super::render;
 use crate::cli::ViewArgs;
+use crate::destination::Destination;
 use crate::failure::{Exit, Failure};
 use crate::pictures::shown_pattern;
-use crate::{report, setup};
+use crate::{progress, report, setup};
 
 #[derive(Serialize)]
 struct Report<'a> {
@@ -29,10 +30,11 @@ struct Report<'a> {
 }
 
 pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
-    if args.out.is_dir() {
+    let out = Destination::new(&args.out, "--out", args.force)?;
+    if out.is_stdout() && args.json {
         return Err(Failure::new(
-            Exit::CannotCreate,
-            format!("--out {}: found a directory, expected the name of a PNG file to write", args.out.display()),
+            Exit::Usage,
+            "--out - and --json would both write to standard output: give one of them",
         ));
     }
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
@@ -50,9 +52,14 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
     let resolution = hologram.hologram.resolution;
     let geometry = hologram.optics.geometry(resolution);
     let eye = Eye { pupil: args.eye_pupil.unwrap_or(hologram.pupil), focus: args.focus };
-    let pattern = through_the_panel(&rig, &hologram)?;
-    let seen = SimulatedEye::new(&geometry, resolution).view(&pattern, hologram.amplitude_constant, eye);
-    files::save_picture(&seen, &args.out).map_err(Failure::because(Exit::CannotCreate))?;
+    let pattern = progress::during("computing the panel's levels", || through_the_panel(&rig, &hologram))?;
+    let seen = progress::during("computing what the eye sees", || {
+        SimulatedEye::new(&geometry, resolution).view(&pattern, hologram.amplitude_constant, eye)
+    });
+    out.write(|path| files::save_picture(&seen, path).map_err(Failure::because(Exit::CannotCreate)))?;
+    if out.is_stdout() {
+        return Ok(());
+    }
     let said = Report {
         out: &args.out,
         hologram_pupil_mm: hologram.pupil.mm(),

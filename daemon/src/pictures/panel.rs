@@ -1,8 +1,10 @@
 //! From the panel's levels back to pictures and phases.
 
+use holod_calibration::rig::PanelMode;
 use holod_calibration::{Colour, Resolution};
 use holod_model::LinearImage;
 use holod_model::optics::PhasePattern;
+use holod_slm_output::packing::channels;
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 use image::RgbImage;
 
@@ -20,6 +22,34 @@ pub fn shown_pattern(encoder: &PanelEncoder, levels: &LevelsFrame) -> PhasePatte
 pub fn levels_picture(levels: &LevelsFrame) -> RgbImage {
     let fields = Colour::ALL.map(|colour| levels.unpack_colour(colour).levels);
     from_planes(levels.layout().resolution, |colour, pixel| fields[colour][pixel] as u8)
+}
+
+/// What travels to the panel for `levels`, bit for bit on a link of eight bits a channel: each different video frame of the colour frame, with the colour
+/// whose field it carries where it carries one.
+pub fn video_pictures(levels: &LevelsFrame) -> Vec<(Option<Colour>, RgbImage)> {
+    let layout = levels.layout();
+    let Resolution { width, height } = layout.resolution;
+    // A picture's channels have eight bits: of ten, the high ones.
+    let byte = |channel: u16| (channel >> (layout.packing.channel_bits() - 8)) as u8;
+    let picture = |first_field: usize| {
+        let samples = (0..height).map(|row| levels.video_row(first_field, row));
+        let bytes = match layout.mode {
+            PanelMode::ChannelPacked => samples.flatten().map(|&level| byte(level)).collect(),
+            _ => samples.flatten().flat_map(|&level| channels(layout.packing, level).map(byte)).collect(),
+        };
+        RgbImage::from_raw(width as u32, height as u32, bytes).expect("three bytes for each pixel")
+    };
+    if layout.mode == PanelMode::ChannelPacked {
+        return vec![(None, picture(0))];
+    }
+    let mut pictures: Vec<(Option<Colour>, RgbImage)> = Vec::new();
+    for field in 0..layout.fields() {
+        let colour = Some(layout.colour_of_field(field));
+        if pictures.last().is_none_or(|(last, _)| *last != colour) {
+            pictures.push((colour, picture(field)));
+        }
+    }
+    pictures
 }
 
 /// A phase pattern as a picture: 0 black, 2π white.

@@ -12,7 +12,7 @@ use crate::failure::{Exit, Failure};
 pub struct PupilSampleMark {
     /// Seconds since the run began.
     pub t_s: f64,
-    /// Raw diameter.
+    /// Raw diameter; in the plot's unit where that is not millimetres.
     pub raw_mm: f64,
     /// Whether the gate let it through.
     pub accepted: bool,
@@ -20,6 +20,8 @@ pub struct PupilSampleMark {
 
 /// The pupil's trace.
 pub struct PupilPlot<'a> {
+    /// The unit of all figures; millimetres where there is none. Samples in another unit were not judged.
+    pub unit: Option<&'static str>,
     /// Every raw sample.
     pub samples: &'a [PupilSampleMark],
     /// (seconds, millimetres) that each frame was rendered for.
@@ -39,6 +41,8 @@ pub struct LatencyPlot<'a> {
 }
 
 const SIZE: (u32, u32) = (1100, 480);
+/// What the axis of millimetres shows, and no pupil exceeds.
+const GREATEST_MM: f64 = 9.0;
 
 impl PupilPlot<'_> {
     /// Writes the plot as SVG.
@@ -50,27 +54,30 @@ impl PupilPlot<'_> {
     fn draw(&self, root: &DrawingArea<SVGBackend<'_>, Shift>) -> Result<(), Box<dyn std::error::Error>> {
         root.fill(&WHITE)?;
         let end_s = last_time(&[self.estimate, self.truth]).max(self.samples.last().map_or(0.0, |s| s.t_s));
+        let greatest = self.samples.iter().map(|mark| mark.raw_mm).fold(f64::MIN_POSITIVE, f64::max);
+        let top = if self.unit.is_none() { GREATEST_MM } else { 1.1 * greatest };
+        let caption = match self.unit {
+            None => "Pupil diameter: what the tracker said, what the gate kept, what the display used",
+            Some(_) => "Pupil size: what the tracker said, in its own unit",
+        };
+        let y_name = format!("pupil diameter / {}", self.unit.unwrap_or("mm"));
         let mut chart = ChartBuilder::on(root)
-            .caption(
-                "Pupil diameter: what the tracker said, what the gate kept, what the display used",
-                ("sans-serif", 20),
-            )
+            .caption(caption, ("sans-serif", 20))
             .margin(12)
             .x_label_area_size(42)
             .y_label_area_size(56)
-            .build_cartesian_2d(0.0..end_s.max(0.1), 0.0..9.0)?;
-        chart
-            .configure_mesh()
-            .x_desc("time since start / s")
-            .y_desc("pupil diameter / mm")
-            .light_line_style(WHITE)
-            .draw()?;
+            .build_cartesian_2d(0.0..end_s.max(0.1), 0.0..top)?;
+        chart.configure_mesh().x_desc("time since start / s").y_desc(y_name).light_line_style(WHITE).draw()?;
         let (good, bad) = (RGBColor(150, 170, 200), RGBColor(214, 60, 40));
-        for (kept, colour, name) in [(true, good, "raw sample, kept"), (false, bad, "raw sample, rejected")] {
+        let kept_name = if self.unit.is_none() { "raw sample, kept" } else { "raw sample" };
+        for (kept, colour, name) in [(true, good, kept_name), (false, bad, "raw sample, rejected")] {
+            if !kept && self.unit.is_some() {
+                continue;
+            }
             let marks = self.samples.iter().filter(|mark| mark.accepted == kept);
             chart
                 .draw_series(
-                    marks.map(|mark| Circle::new((mark.t_s, mark.raw_mm.clamp(0.0, 9.0)), 1.5, colour.filled())),
+                    marks.map(|mark| Circle::new((mark.t_s, mark.raw_mm.clamp(0.0, top)), 1.5, colour.filled())),
                 )?
                 .label(name)
                 .legend(move |(x, y)| Circle::new((x + 8, y), 3, colour.filled()));
@@ -83,10 +90,12 @@ impl PupilPlot<'_> {
                 .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], truth.stroke_width(1)));
         }
         let used = RGBColor(16, 96, 48);
-        chart
-            .draw_series(LineSeries::new(self.estimate.iter().copied(), used.stroke_width(2)))?
-            .label("estimate at the photons' time, per frame")
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], used.stroke_width(2)));
+        if !self.estimate.is_empty() {
+            chart
+                .draw_series(LineSeries::new(self.estimate.iter().copied(), used.stroke_width(2)))?
+                .label("estimate at the photons' time, per frame")
+                .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], used.stroke_width(2)));
+        }
         chart.configure_series_labels().background_style(WHITE.mix(0.85)).border_style(BLACK.mix(0.3)).draw()?;
         Ok(())
     }
@@ -149,10 +158,16 @@ mod tests {
             PupilSampleMark { t_s: 0.0, raw_mm: 3.5, accepted: true },
             PupilSampleMark { t_s: 0.5, raw_mm: 1.1, accepted: false },
         ];
-        PupilPlot { samples: &marks, estimate: &[(0.0, 3.5), (0.5, 3.5)], truth: &[] }.save(&path).unwrap();
+        PupilPlot { unit: None, samples: &marks, estimate: &[(0.0, 3.5), (0.5, 3.5)], truth: &[] }.save(&path).unwrap();
         let svg = std::fs::read_to_string(&path).unwrap();
         assert!(svg.contains("#D63C28") && svg.contains("#96AAC8"));
         assert!(!svg.contains("simulated eye itself"));
+        // Figures that are no millimetres have their own axis, and nobody judged them.
+        let marks = [PupilSampleMark { t_s: 0.5, raw_mm: 964.0, accepted: true }];
+        PupilPlot { unit: Some("arbitrary units"), samples: &marks, estimate: &[], truth: &[] }.save(&path).unwrap();
+        let svg = std::fs::read_to_string(&path).unwrap();
+        assert!(svg.contains("arbitrary units") && svg.contains("#96AAC8"));
+        assert!(!svg.contains("rejected") && !svg.contains("estimate") && !svg.contains(" mm"));
 
         let path = folder.path().join("latency.svg");
         let series = [(0.0, 20.0), (0.5, 40.0)];
@@ -162,7 +177,7 @@ mod tests {
 
     #[test]
     fn a_plot_that_cannot_be_written_says_where() {
-        let plot = PupilPlot { samples: &[], estimate: &[], truth: &[] };
+        let plot = PupilPlot { unit: None, samples: &[], estimate: &[], truth: &[] };
         let failure = plot.save(Path::new("no/such/folder/pupil.svg")).unwrap_err();
         assert!(failure.to_string().contains("no/such/folder"));
     }

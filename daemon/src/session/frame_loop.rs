@@ -7,10 +7,11 @@ use std::time::Duration;
 use holod_calibration::{Colour, PerColour, PupilDiameter, TimeNs};
 use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::{ComplexHologram, CpuEngine};
-use holod_pupil_input::{EstimateReader, PupilState, host_now};
+use holod_pupil_input::{EstimateReader, PupilState};
 use holod_slm_output::pacing::Point;
 use holod_slm_output::{FramePlan, FramePort, Pacer, PanelEncoder};
 
+use super::host_now;
 use super::keep::keep_slot;
 use crate::record::FrameRecord;
 use crate::setup::Frames;

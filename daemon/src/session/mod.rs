@@ -2,10 +2,14 @@
 
 mod frame_loop;
 mod keep;
+mod laser_watch;
 mod ledger;
+mod output_watch;
+mod rate_watch;
 mod scheduling;
 mod service;
 mod stats;
+mod tracker_watch;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
@@ -14,28 +18,42 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use holod_calibration::rig::Rig;
-use holod_calibration::{PupilDiameter, TimeNs};
+use holod_calibration::{PupilDiameter, Resolution, TimeNs};
 use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::{ComplexHologram, CpuEngine, Weights};
 use holod_pupil_input::{
-    Decision, DecisionTap, Link, PupilState, RecordFiles, ReplayError, SourceError, Tracker, TrackerControl,
-    TrackerError, TrackerOptions, TrackerSpec, host_now,
+    Counter, Decision, DecisionTap, Link, PupilState, RecordFiles, ReplayError, ReplaySpeed, SourceError, Tracker,
+    TrackerControl, TrackerError, TrackerOptions, TrackerSpec,
 };
-use holod_slm_output::laser::{BoxEvent, DarkReason};
-use holod_slm_output::output::pacing_config;
-use holod_slm_output::{FieldEvent, LevelsFrame, Output, OutputControl, OutputOptions, Pacer, PanelEncoder};
+use holod_slm_output::laser::{BoxEvent, DarkReason, open_laser};
+use holod_slm_output::output::{OutputCounts, OutputError, pacing_config};
+use holod_slm_output::present::{PanelSetup, open_panel};
+use holod_slm_output::{
+    FieldEvent, LevelsFrame, Output, OutputControl, OutputOptions, OutputSpec, Pacer, PanelEncoder,
+};
 use serde::Serialize;
 
 use self::frame_loop::{FrameLoop, LoopRecord, TrainedPupils};
 use self::keep::{KEEP_SLOTS, keep_slot};
+use self::laser_watch::LaserBoxWatch;
 use self::ledger::LaserLedger;
+use self::output_watch::OutputWatch;
+use self::rate_watch::RateWatch;
 use self::service::Service;
-use self::stats::Recent;
+use self::stats::{FrameRate, Recent};
+use self::tracker_watch::TrackerWatch;
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
+use crate::progress;
 use crate::record::{FieldRecord, FrameRecord};
 use crate::setup::{self, Frames};
+use crate::speed;
 use crate::status::{Status, StatusFile};
+
+#[cfg(feature = "fault-injection")]
+use crate::fault::host_now;
+#[cfg(not(feature = "fault-injection"))]
+use holod_pupil_input::host_now;
 
 pub use self::ledger::LaserSummary;
 pub(crate) use self::service::Signals;
@@ -51,6 +69,8 @@ pub struct SessionPlan {
     pub backend: Backend,
     /// What to show.
     pub frames: Frames,
+    /// Where to show it.
+    pub output: OutputSpec,
     /// Where samples come from.
     pub tracker: TrackerSpec,
     /// Where the tracker's bytes and samples are written down.
@@ -118,6 +138,14 @@ pub struct Summary {
     pub fields_shown: u64,
     /// Fields of a frame that had been shown before.
     pub fields_repeated: u64,
+    /// Frames that came on the panel a second, over the whole run.
+    pub frames_shown_hz: f64,
+    /// Frames of all colours that the panel could show in a second.
+    pub panel_frames_hz: f64,
+    /// What would bring the first of these two nearer to the second, where that is needed.
+    pub speed_advice: Option<String>,
+    /// Refreshes of the panel a second, as it reported them; 0 where it reported none.
+    pub panel_refresh_hz: f64,
     /// Frames that came on the panel later than planned.
     pub deadline_misses: u64,
     /// From waking to the submitted levels.
@@ -130,6 +158,8 @@ pub struct Summary {
     pub pupil_range_mm: Option<[f32; 2]>,
     /// Frames whose pupil lay outside those that the network was trained for, and was moved to the nearest one.
     pub frames_beyond_trained_pupils: u64,
+    /// Why the tracker's link did not come back, or why nothing that it sent was believed, at the end.
+    pub tracker_trouble: Option<String>,
     /// How the tracker's link was at the end.
     pub tracker_link: &'static str,
     /// Samples and log rows that were not believed, for any reason.
@@ -148,6 +178,8 @@ pub struct Summary {
     pub lasers: LaserSummary,
     /// The lasers acknowledged darkness before the end.
     pub lasers_dark_at_end: bool,
+    /// Why they did not, where they did not: they are left to the box's own heartbeat timeout, if it has one.
+    pub lasers_not_dark: Option<String>,
     /// A flat pattern was on the panel at the end.
     pub flat_at_end: bool,
     /// Records that were lost because the control thread was late.
@@ -190,12 +222,29 @@ impl State {
 /// What could not be started, or the observer's failure; in both cases everything has been taken down.
 pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionReport, Failure> {
     let signals = Signals::install()?;
+    #[cfg(feature = "fault-injection")]
+    crate::fault::install()?;
     let resolution = plan.frames.resolution();
     let rig = &plan.rig;
-    let mut engine = scheduling::patient(|| setup::engine(plan.backend, &plan.weights, resolution))?;
-    let frame_time = first_frame_time(&mut engine, &plan)?;
-    let encoder =
-        PanelEncoder::new(&rig.panel, rig.resolution(), resolution).map_err(Failure::because(Exit::Config))?;
+    let (engine, frame_time) = progress::during(&format!("preparing the network for {resolution}"), || {
+        let mut engine = scheduling::patient(|| setup::engine(plan.backend, &plan.weights, resolution))?;
+        let frame_time = first_frame_time(&mut engine, &plan)?;
+        Ok::<_, Failure>((engine, frame_time))
+    })?;
+    let encoder = progress::during(&format!("preparing the levels of the panel of {}", rig.resolution()), || {
+        PanelEncoder::new(&rig.panel, rig.resolution(), resolution).map_err(Failure::because(Exit::Config))
+    })?;
+    let panel_hz = speed::panel_frames_hz(&rig.panel);
+    let first_hz = 1.0 / frame_time.seconds();
+    let first_frame = format!(
+        "the first frame took {:.0} ms, so about {first_hz:.2} frames a second of the panel's {panel_hz:.1}",
+        frame_time.seconds() * 1e3
+    );
+    let advice = speed::advice(first_hz, rig, resolution);
+    match &advice {
+        None => tracing::info!("{first_frame}"),
+        Some(advice) => tracing::warn!("{first_frame}: {advice}"),
+    }
     let pacing = pacing_config(rig, frame_time).map_err(Failure::because(Exit::Config))?;
     let t_origin = host_now();
     let tracker_options = TrackerOptions {
@@ -209,12 +258,15 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
     for warning in tracker.warnings() {
         tracing::warn!("{warning}");
     }
+    tracing::debug!("tracker `{}` is open, link {}", plan.tracker, tracker.link().name());
     let options = OutputOptions {
         keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 },
         stall_timeout: stall_timeout(frame_time),
     };
-    let output = scheduling::prompt(|| Output::headless(rig, &encoder, options, host_now))
-        .map_err(Failure::because(Exit::Unavailable))?;
+    let output = progress::during("opening panel and lasers", || {
+        scheduling::prompt(|| open_output(&plan, &encoder, options)).map_err(Failure::because(Exit::Unavailable))
+    })?;
+    tracing::debug!("panel `{}` is open; lasers by {:?}", plan.output, rig.lasers.driver);
     output.control.dark_switch().install_panic_hook(host_now);
 
     let stop = Arc::new(AtomicBool::new(false));
@@ -246,31 +298,40 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         .name("holod-frame".into())
         .spawn(move || frame_loop.run())
         .map_err(Failure::because(Exit::Unavailable))?;
-    let replay_ends_run = plan.frame_limit.is_none()
-        && plan.duration.is_none()
-        && match &plan.tracker {
-            TrackerSpec::Replay { repeat, .. } => !repeat,
-            TrackerSpec::Path(path) => path.is_file(),
-            _ => false,
-        };
+    // A log that is played in no time says nothing of when a run is over that was asked to last.
+    let is_bounded = plan.frame_limit.is_some() || plan.duration.is_some();
+    let replay_ends_run = match &plan.tracker {
+        TrackerSpec::Replay { repeat: true, .. } => false,
+        TrackerSpec::Replay { speed: ReplaySpeed::Fastest, .. } => !is_bounded,
+        TrackerSpec::Replay { .. } => true,
+        TrackerSpec::Path(path) => path.is_file(),
+        _ => false,
+    };
 
     let mut watch = Watch {
         records,
         events: output.events,
         fields_over: Vec::new(),
         box_events: output.box_events,
+        output: OutputWatch::new(output.panel_events, rig.panel.refresh_hz),
+        laser_box: LaserBoxWatch::new(output.laser_faults, output.laser_watch),
+        tracker_watch: TrackerWatch::new(&rig.tracker, t_origin),
+        rate: RateWatch::default(),
+        advised: advice.is_some(),
+        resolution,
         tap,
         tracker,
         signals,
         service: Service::connect(),
         status: StatusFile::create(),
-        rig: plan.rig.name.clone(),
+        rig,
         spec: plan.tracker.to_string(),
+        panel: plan.output.to_string(),
+        frame_rate: FrameRate::default(),
         t_origin,
-        trouble: None,
         state: State::Dark,
+        told: String::new(),
         tally: Tally::default(),
-        t_dark_untold: TimeNs(i64::MIN),
         observer,
     };
     let limits = Limits { t_origin, duration: plan.duration, replay_ends_run };
@@ -284,7 +345,13 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
     let tracker_link = watch.tracker.link().name();
     watch.tracker.stop();
     let observed = watch.drain();
-    let Watch { tracker, tally, .. } = watch;
+    watch.laser_box.drain(false);
+    let lasers_not_dark = (!down.lasers_dark).then(|| {
+        let silent = "the laser box did not acknowledge in time";
+        watch.laser_box.trouble().unwrap_or(silent).to_owned()
+    });
+    watch.tracker_watch.judge(&watch.tracker, host_now());
+    let Watch { tracker, tally, tracker_watch, .. } = watch;
     let recorded = tracker.recording();
     if let Some(failure) = recorded.as_ref().and_then(|status| status.failure.as_deref()) {
         tracing::error!("the tracker's recording is not whole: {failure}");
@@ -308,9 +375,10 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         .filter_map(|levels| Some((tally.pupil_of_kept(levels.tag().frame_id)?, levels)))
         .collect();
     shown.sort_by(|(a, _), (b, _)| a.mm().total_cmp(&b.mm()));
+    let duration_s = (host_now() - t_origin).seconds();
     let summary = Summary {
         ended_by,
-        duration_s: (host_now() - t_origin).seconds(),
+        duration_s,
         rig: plan.rig.name.clone(),
         scene: frames.name.clone(),
         tracker: plan.tracker.to_string(),
@@ -319,12 +387,20 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         frames_shown: tally.frames_shown,
         fields_shown: tally.fields_shown,
         fields_repeated: tally.fields_repeated,
+        frames_shown_hz: tally.frames_shown as f64 / duration_s,
+        panel_frames_hz: panel_hz,
+        speed_advice: tally
+            .frame_time
+            .spread()
+            .and_then(|time| speed::advice(1e3 / f64::from(time.median_ms), &plan.rig, resolution)),
+        panel_refresh_hz: down.counts.refresh_hz,
         deadline_misses: tally.deadline_misses,
         frame_time: tally.frame_time.spread(),
         sample_to_photon: tally.sample_to_photon.spread(),
         frames_by_pupil_state: tally.by_state,
         pupil_range_mm: tally.pupil_range_mm,
         frames_beyond_trained_pupils: tally.beyond_trained,
+        tracker_trouble: tracker_watch.trouble(),
         tracker_link,
         samples_rejected: tracker.counters().rejected_in_all() + tracker.counters().faults_in_all(),
         tracker_counts: tracker.counters().entries().collect(),
@@ -334,10 +410,20 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         unreachable_share_max: tally.unreachable_share_max,
         lasers: tally.lasers.finish(),
         lasers_dark_at_end: down.lasers_dark,
+        lasers_not_dark,
         flat_at_end: down.flat_presented,
         records_lost: down.counts.lost + records_lost.load(Ordering::Relaxed),
     };
     Ok(SessionReport { summary, t_origin, shown, encoder })
+}
+
+fn open_output(plan: &SessionPlan, encoder: &PanelEncoder, options: OutputOptions) -> Result<Output, OutputError> {
+    let rig = &plan.rig;
+    let panel = open_panel(&plan.output, &PanelSetup::new(&rig.panel, encoder), host_now())?;
+    #[cfg(feature = "fault-injection")]
+    let panel = Box::new(crate::fault::FaultyPanel(panel));
+    let laser = open_laser(&rig.lasers, host_now)?;
+    Output::start(rig, encoder, panel, laser, options, host_now)
 }
 
 /// How long the network takes for a frame, measured before anything is shown.
@@ -367,18 +453,27 @@ struct Watch<'a> {
     events: rtrb::Consumer<FieldEvent>,
     fields_over: Vec<FieldEvent>,
     box_events: rtrb::Consumer<BoxEvent>,
+    output: OutputWatch,
+    laser_box: LaserBoxWatch,
+    tracker_watch: TrackerWatch,
+    rate: RateWatch,
+    /// What would bring more frames a second has been said.
+    advised: bool,
+    resolution: Resolution,
     tap: DecisionTap,
     tracker: TrackerControl,
     signals: Signals,
     service: Service,
     status: StatusFile,
-    rig: String,
+    rig: &'a Rig,
     spec: String,
+    panel: String,
+    frame_rate: FrameRate,
     t_origin: TimeNs,
-    trouble: Option<String>,
     state: State,
+    /// What was said last of the states.
+    told: String,
     tally: Tally,
-    t_dark_untold: TimeNs,
     observer: &'a mut dyn Observer,
 }
 
@@ -400,11 +495,27 @@ impl Watch<'_> {
             ticks = ticks.wrapping_add(1);
             if ticks.is_multiple_of(TICKS_PER_REPORT) {
                 self.tell_state(output);
+                self.tell_rate(now);
+                self.tracker_watch.look(&mut self.tracker, now)?;
+                self.output.judge_rate(&output.counts(), now);
+                self.laser_box.drain(output.counts().armed);
                 self.observer.tick()?;
             }
             if ticks.is_multiple_of(TICKS_PER_STATUS) {
-                let status = self.status_at(now);
+                let status = self.status_at(now, &output.counts());
                 self.status.write(&status);
+                tracing::debug!(
+                    "{}: {} frames made, {} shown, {:.1} a second; pupil {:?} mm, {}; {} samples, {} rejected; lasers {}",
+                    status.state,
+                    status.frames_made,
+                    status.frames_shown,
+                    status.frames_shown_hz,
+                    status.pupil_mm,
+                    status.pupil_state,
+                    self.tracker.counters().of(Counter::Samples),
+                    self.tracker.counters().rejected_in_all(),
+                    status.lasers
+                );
             }
             if let Some(signal) = self.signals.caught() {
                 return Ok(signal.to_owned());
@@ -421,6 +532,12 @@ impl Watch<'_> {
                 return Err(Failure::new(
                     Exit::Software,
                     "a thread failed (its message stands above); the lasers were put out first",
+                ));
+            }
+            if let Some(fault) = self.output.lost().filter(|fault| !fault.is_recoverable()) {
+                return Err(Failure::new(
+                    Exit::Unavailable,
+                    format!("the panel: {fault}; the lasers were put out first"),
                 ));
             }
             if frame_thread.is_finished() {
@@ -442,72 +559,91 @@ impl Watch<'_> {
         }
         while let Ok(record) = self.records.pop() {
             self.tally.frame(&record);
+            tracing::trace!("{:?}", record.frame);
             self.observer.frame(&record.frame)?;
         }
         while let Ok(event) = self.box_events.pop() {
             self.tally.lasers.box_event(&event);
             if let BoxEvent::Dark { t, reason } = event {
-                self.tell_dark(t, reason);
+                self.output.went_dark(t, reason);
             }
         }
+        self.output.drain();
         for event in self.fields_over.drain(..) {
             self.tally.field(&event);
             self.observer.field(&event)?;
         }
         while let Some(decision) = self.tap.pop() {
+            self.tracker_watch.note(&decision);
+            tracing::trace!("{decision:?}");
             self.observer.decision(&decision)?;
         }
         Ok(())
     }
 
-    /// One line at most a second: lasers that flicker must not flood the log.
-    fn tell_dark(&mut self, t: TimeNs, reason: DarkReason) {
-        if t >= self.t_dark_untold {
-            tracing::info!("lasers dark: {}", reason.name());
-            self.t_dark_untold = t + TimeNs(1_000_000_000);
-        }
-    }
-
     fn tell_state(&mut self, output: &OutputControl) {
         let lit = output.counts().armed && self.tally.frames_shown > 0;
         let link = self.tracker.link();
-        let trouble = self.tracker.trouble();
-        if trouble != self.trouble.as_deref() {
-            self.trouble = trouble.map(str::to_owned);
-            if let Some(trouble) = &self.trouble {
-                tracing::warn!("the tracker is not found again: {trouble}");
-            }
-        }
         let follows = link == Link::Up && self.tally.newest_state != PupilState::Fallback.name();
         let state = match (lit, follows) {
             (false, _) => State::Dark,
             (true, false) => State::Degraded,
             (true, true) => State::Running,
         };
-        if state != self.state {
-            let text = format!("{}: tracker {}, pupil {}", state.name(), link.name(), self.tally.newest_state);
+        self.state = state;
+        // A blink is no news; what the pupil falls back to is.
+        let pupil = match self.tally.newest_state {
+            "" => "not known yet",
+            fallback if fallback == PupilState::Fallback.name() => fallback,
+            _ => "followed",
+        };
+        let text = format!("{}: tracker {}, pupil {pupil}", state.name(), link.name());
+        if text != self.told {
             tracing::info!("{text}");
             self.service.status(&text);
-            self.state = state;
+            self.told = text;
+        }
+    }
+
+    /// Says once how many frames a second are really reached.
+    fn tell_rate(&mut self, now: TimeNs) {
+        let Some(reached_hz) = self.rate.reached_hz(self.tally.frames_shown, now) else { return };
+        let panel_hz = speed::panel_frames_hz(&self.rig.panel);
+        let reached = format!("{reached_hz:.2} frames a second are shown, of the panel's {panel_hz:.1}");
+        match speed::advice(reached_hz, self.rig, self.resolution).filter(|_| !self.advised) {
+            None => tracing::info!("{reached}"),
+            Some(advice) => tracing::warn!("{reached}: {advice}"),
         }
     }
 }
 
 impl Watch<'_> {
-    fn status_at(&self, now: TimeNs) -> Status {
+    fn status_at(&mut self, now: TimeNs, output: &OutputCounts) -> Status {
+        let frames_hz = self.frame_rate.at(self.tally.frames_shown, now);
         let tally = &self.tally;
         Status {
             pid: std::process::id(),
             state: self.state.name().to_owned(),
             uptime_s: (now - self.t_origin).seconds(),
-            rig: self.rig.clone(),
+            rig: self.rig.name.clone(),
             tracker: self.spec.clone(),
             tracker_link: self.tracker.link().name().to_owned(),
-            tracker_trouble: self.trouble.clone(),
+            tracker_trouble: self.tracker_watch.trouble(),
             pupil_state: tally.newest_state.to_owned(),
             pupil_mm: tally.recent.back().map(|frame| frame.pupil.mm()),
+            panel: self.panel.clone(),
+            panel_trouble: self.output.lost().map(|fault| fault.to_string()),
+            panel_refresh_hz: output.refresh_hz,
+            lasers: if output.armed { "armed" } else { "dark" }.to_owned(),
+            lasers_trouble: self.laser_box.trouble().map(str::to_owned),
             frames_made: tally.frames_made,
             frames_shown: tally.frames_shown,
+            frames_shown_hz: frames_hz,
+            panel_frames_hz: speed::panel_frames_hz(&self.rig.panel),
+            speed_advice: tally
+                .frame_time
+                .spread()
+                .and_then(|time| speed::advice(1e3 / f64::from(time.median_ms), self.rig, self.resolution)),
             deadline_misses: tally.deadline_misses,
             frame_time: tally.frame_time.spread(),
             sample_to_photon: tally.sample_to_photon.spread(),

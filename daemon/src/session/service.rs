@@ -6,12 +6,17 @@ use std::time::Duration;
 
 use holod_calibration::TimeNs;
 use sd_notify::NotifyState;
+use signal_hook::SigId;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::failure::{Exit, Failure};
+use crate::staging::leave_signals_to_a_run;
 
-/// SIGINT, SIGTERM and SIGHUP, as a flag.
-pub(crate) struct Signals(Arc<AtomicUsize>);
+/// SIGINT, SIGTERM and SIGHUP, as a flag, for as long as this lives.
+pub(crate) struct Signals {
+    caught: Arc<AtomicUsize>,
+    registered: Vec<SigId>,
+}
 
 impl Signals {
     /// Takes the signals over. A second one while the first is being obeyed ends the process at once: the laser box's
@@ -19,23 +24,38 @@ impl Signals {
     pub(crate) fn install() -> Result<Self, Failure> {
         let caught = Arc::new(AtomicUsize::new(0));
         let again = Arc::new(AtomicBool::new(false));
+        let mut signals = Self { caught, registered: Vec::new() };
+        leave_signals_to_a_run(true);
         for signal in [SIGINT, SIGTERM, SIGHUP] {
-            signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&again))
-                .and_then(|_| signal_hook::flag::register(signal, Arc::clone(&again)))
-                .and_then(|_| signal_hook::flag::register_usize(signal, Arc::clone(&caught), signal as usize))
-                .map_err(Failure::because(Exit::Software))?;
+            let caught = Arc::clone(&signals.caught);
+            for registered in [
+                signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&again)),
+                signal_hook::flag::register(signal, Arc::clone(&again)),
+                signal_hook::flag::register_usize(signal, caught, signal as usize),
+            ] {
+                signals.registered.push(registered.map_err(Failure::because(Exit::Software))?);
+            }
         }
-        Ok(Self(caught))
+        Ok(signals)
     }
 
     /// The name of the signal that came.
     pub(crate) fn caught(&self) -> Option<&'static str> {
-        match self.0.load(Ordering::Acquire) as i32 {
+        match self.caught.load(Ordering::Acquire) as i32 {
             0 => None,
             SIGINT => Some("SIGINT"),
             SIGTERM => Some("SIGTERM"),
             _ => Some("SIGHUP"),
         }
+    }
+}
+
+impl Drop for Signals {
+    fn drop(&mut self) {
+        for id in self.registered.drain(..) {
+            signal_hook::low_level::unregister(id);
+        }
+        leave_signals_to_a_run(false);
     }
 }
 

@@ -1,5 +1,6 @@
 //! Medians of what came lately.
 
+use holod_calibration::TimeNs;
 use serde::{Deserialize, Serialize};
 
 const WINDOW: usize = 1 << 14;
@@ -43,6 +44,20 @@ impl Recent {
     }
 }
 
+/// How many frames come on the panel a second, from one look to the next.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct FrameRate {
+    before: Option<(u64, TimeNs)>,
+}
+
+impl FrameRate {
+    /// Frames a second since the last call, of which `frames_shown` there are by `now`; 0 at the first call.
+    pub(super) fn at(&mut self, frames_shown: u64, now: TimeNs) -> f64 {
+        let before = self.before.replace((frames_shown, now));
+        before.map_or(0.0, |(frames, t)| (frames_shown - frames) as f64 / (now - t).seconds())
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -55,6 +70,13 @@ mod tests {
             recent.push(value as f32);
         }
         assert_eq!(recent.spread(), Some(Spread { median_ms: 50.0, p99_ms: 99.0, max_ms: 100.0 }));
+    }
+
+    #[test]
+    fn the_frame_rate_is_that_since_the_last_look() {
+        let mut rate = FrameRate::default();
+        let looks = [(0, 0), (60, 1_000), (90, 2_000), (90, 3_000)];
+        assert_eq!(looks.map(|(frames, ms)| rate.at(frames, TimeNs(ms * 1_000_000))), [0.0, 60.0, 30.0, 0.0]);
     }
 
     #[test]

@@ -79,7 +79,7 @@ impl LogFormat {
             Self::PupilExt => "PupilEXT CSV",
             Self::Xdf => "XDF (Lab Streaming Layer)",
             Self::Bids => "BIDS eye tracking _physio.tsv.gz",
-            Self::NeonNative => "Pupil Labs Neon eye_state ps1.raw",
+            Self::NeonNative => "Pupil Labs Neon eye_state raw",
             Self::Core => "Pupil Labs Core pupil_positions.csv",
             Self::EyeLink => "EyeLink .asc",
             Self::Smi => "SMI BeGaze text",
@@ -457,6 +457,8 @@ pub(crate) struct LogBuilder {
     /// Lines or rows whose time could be read.
     times: u64,
     first_backwards: Option<u64>,
+    /// The last line, where the file ends within it, and how many malformed ones there were before it.
+    unended: Option<(u64, u64)>,
     /// Of each eye: the cameras of two eyes may run free of each other.
     latest_ns: [Option<i64>; 3],
 }
@@ -504,6 +506,11 @@ impl LogBuilder {
         } else {
             self.rows.insert(self.rows.len() - behind, row);
         }
+    }
+
+    /// The file ends within line `line`, which is handed out next.
+    pub(crate) const fn ends_within(&mut self, line: u64) {
+        self.unended = Some((line, self.faults.of(LogFault::Malformed)));
     }
 
     /// The latest time of any eye.
@@ -556,6 +563,19 @@ impl LogBuilder {
             self.rows.sort_by_key(|row| row.t_ns);
         }
         self.rows.shrink_to_fit();
+        if let Some((line, malformed)) = self.unended
+            && self.faults.of(LogFault::Malformed) > malformed
+        {
+            self.notes.push(format!(
+                "line {line}, the last one, ends before its columns do: the file is cut off; copy or export it again"
+            ));
+        }
+        if let Some(rate_hz) = slow_rate_hz(&self.rows) {
+            self.notes.push(format!(
+                "{rate_hz:.1} samples a second is no eye tracker's rate: this looks like a table of fixations or of means; \
+                 export every sample instead (with Gazepoint: `..._all_gaze.csv`)"
+            ));
+        }
         self.blinks.sort_by_key(|blink| blink.begins);
         let Self { rows, faults, unit, stated_rate_hz, blinks, notes, .. } = self;
         Ok(Recording { format, unit, rows, blinks, faults, stated_rate_hz, notes })
@@ -680,6 +700,19 @@ impl Recording {
         let instants = 1 + self.rows.windows(2).filter(|pair| pair[0].t_ns != pair[1].t_ns).count() as i64;
         length + TimeNs((length.0 / instants.max(1)).max(1_000_000))
     }
+}
+
+/// Rows of one eye that must be as far apart as no tracker's samples before that is said.
+const SLOW_ROWS: usize = 8;
+/// An eye tracker takes a sample at least this often.
+const LEAST_RATE_HZ: f64 = 8.0;
+
+/// Samples a second of the first eye of `rows`, by the median interval, where they are fewer than a tracker takes.
+fn slow_rate_hz(rows: &[Row]) -> Option<f64> {
+    let eye = rows.first()?.eye;
+    let times: Vec<f64> = rows.iter().filter(|row| row.eye == eye).map(|row| row.t_ns as f64 * 1e-9).collect();
+    let rate_hz = 1.0 / table::usual_step(&times)?;
+    (times.len() >= SLOW_ROWS && rate_hz < LEAST_RATE_HZ).then_some(rate_hz)
 }
 
 fn known_formats() -> String {

@@ -226,10 +226,32 @@ fn read_native(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayE
     }
     let mut cut_off = [0; 1];
     if states.read(&mut cut_off).is_ok_and(|count| count > 0) {
+        log.note("the file ends within a record: it is cut off; copy it again");
         log.count(LogFault::Malformed);
+    }
+    let parts = other_parts(input.path);
+    if !parts.is_empty() {
+        log.note(format!("this is one part of its recording; beside it lie {}", parts.join(", ")));
     }
     read_native_blinks(input.path, log);
     Ok(())
+}
+
+/// The other parts of a recording that the phone cut: `eye_state ps2.raw` beside `eye_state ps1.raw`.
+fn other_parts(path: &Path) -> Vec<String> {
+    let own = name_of(path);
+    let Some((begin, _)) = own.split_once(" ps") else { return Vec::new() };
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let is_part = |name: &String| {
+        let rest = name.strip_prefix(begin).and_then(|rest| rest.strip_prefix(" ps")?.strip_suffix(".raw"));
+        *name != own
+            && rest.is_some_and(|number| !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit()))
+    };
+    let names = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut parts: Vec<_> =
+        names.map(|entry| entry.file_name().to_string_lossy().into_owned()).filter(is_part).collect();
+    parts.sort();
+    parts
 }
 
 /// As `eye_state.dtype` says; as usual where there is none.

@@ -3,8 +3,9 @@
 //! Names are `diameter_px`, `physicalDiameter_mm`, `confidence` and so on up to version 0.1.2, with `A` or `B` behind the
 //! first word where there are two pupils and `Main` or `Sec` where there are two views (`diameterAMain_px`), and later
 //! `pupilDiameter_px_R_M` (eye, camera). `A` is the right eye: later versions put R in its place. Of two views the main one
-//! counts; a lone pupil without an eye's letter is [`SampleEye::Both`]. (Open-PupilEXT, `eyeDataSerializer` and
-//! `pDataTypes`.)
+//! counts; a lone pupil without an eye's letter is [`SampleEye::Both`]. The first versions had their units in brackets
+//! (`timestamp[ms]`, `diameter[px]`, `physicaldiameter[mm]`, `outline_confidence`), and one pupil only, with `Sec` behind
+//! the second view's. (Open-PupilEXT, `eyeDataSerializer`, `pDataTypes` and `dataWriter`.)
 
 use holod_calibration::TimeNs;
 
@@ -15,7 +16,7 @@ use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, Repl
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::PupilExt, recognises, read };
 
-const TIME: &str = "timestamp_ms";
+const TIMES: [&str; 2] = ["timestamp_ms", "timestamp[ms]"];
 /// Eyes, and what stands for each in the names of earlier and of later versions; other letters of later ones are no eye's.
 const PUPILS: [(SampleEye, &str, Option<&str>); 3] =
     [(SampleEye::Both, "", None), (SampleEye::Right, "A", Some("R")), (SampleEye::Left, "B", Some("L"))];
@@ -27,10 +28,11 @@ fn recognises(input: &LogInput<'_>) -> bool {
 fn is_header(line: &[u8]) -> bool {
     let has = |is: &dyn Fn(&[u8]) -> bool| cells(line, separator(line)).any(is);
     let is_size = |name: &[u8]| {
-        let begins = [&b"diameter"[..], b"physicalDiameter", b"pupilDiameter", b"pupilPhysicalDiameter"];
-        begins.iter().any(|begin| name.starts_with(begin)) && memchr::memchr(b'_', name).is_some()
+        let begins =
+            [&b"diameter"[..], b"physicalDiameter", b"physicaldiameter", b"pupilDiameter", b"pupilPhysicalDiameter"];
+        begins.iter().any(|begin| name.starts_with(begin)) && memchr::memchr2(b'_', b'[', name).is_some()
     };
-    has(&|name| name == TIME.as_bytes()) && has(&is_size)
+    has(&|name| TIMES.iter().any(|time| name == time.as_bytes())) && has(&is_size)
 }
 
 /// The columns of one pupil.
@@ -48,7 +50,13 @@ impl Pupil {
     fn find(table: &Table, (eye, early, late): (SampleEye, &str, Option<&str>)) -> Option<Self> {
         let is_late = |letter: &str| late.map_or(!matches!(letter, "R" | "L"), |late| letter == late);
         let column = |word: &str, unit: &str| {
-            let names = [format!("{word}{early}{unit}"), format!("{word}{early}Main{unit}")];
+            let first = match (early, unit.strip_prefix('_')) {
+                ("", Some(unit)) => format!("{}[{unit}]", word.to_lowercase()),
+                // `outlineConfidence` was `outline_confidence`.
+                ("", None) => word.replace('C', "_c"),
+                _ => String::new(),
+            };
+            let names = [format!("{word}{early}{unit}"), format!("{word}{early}Main{unit}"), first];
             let (first, rest) = word.split_at(1);
             let begin = format!("pupil{}{rest}{unit}_", first.to_uppercase());
             let letter = |name: &str| name.strip_prefix(&begin)?.strip_suffix("_M").map(is_late);
@@ -73,13 +81,18 @@ impl Pupil {
 fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let Some(size) = choose_size(input)? else { return Ok(()) };
     let Some(mut table) = Table::open(input, log, is_header)? else { return Ok(()) };
-    let Some(time) = table.column(|name| name == TIME) else { return Ok(()) };
+    let Some(time) = table.column(|name| TIMES.contains(&name)) else { return Ok(()) };
     let pupils = PUPILS.map(|names| Pupil::find(&table, names));
     if size > 0 {
         log.unit = SizeUnit::Pixels;
         log.note("PupilEXT was not calibrated: there is no diameter in millimetres");
     }
-    if table.column(|name| name.contains("Sec_") || name.starts_with("pupil") && name.ends_with("_S")).is_some() {
+    if table
+        .column(|name| {
+            name.contains("Sec_") || name.contains("Sec[") || name.starts_with("pupil") && name.ends_with("_S")
+        })
+        .is_some()
+    {
         log.note("two cameras looked at each pupil; pixels and confidence are the main one's");
     }
     while let Some(row) = table.next_row(log) {

@@ -59,12 +59,14 @@ fn recognises(input: &LogInput<'_>) -> bool {
 
 fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let mut lines = input.lines()?;
+    let mut stated_samples = None;
     let header = loop {
         let Some(line) = lines.next(log) else { return Ok(()) };
         let text = line.bytes.trim_ascii();
-        if let Some(rate_hz) = stated_rate(text) {
+        if let Some(rate_hz) = stated(text, b"Sample Rate").filter(|rate_hz| (1.0..=1e5).contains(rate_hz)) {
             log.stated_rate_hz.get_or_insert(rate_hz);
         }
+        stated_samples = stated_samples.or_else(|| stated(text, b"Number of Samples"));
         if !text.is_empty() && text[0] != b'#' {
             match header_of(text) {
                 Some(header) => break header,
@@ -87,6 +89,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let has_type = header.has("Type");
 
     let mut blinks = [Shut::default(), Shut::default()];
+    let mut rows = 0_u64;
     while let Some(line) = lines.next(log) {
         if line.bytes.is_empty() || line.bytes[0] == b'#' {
             continue;
@@ -96,6 +99,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         if has_type && kind.is_some_and(|kind| kind != b"SMP") {
             continue;
         }
+        rows += 1;
         let Some(t) = t else {
             log.count(LogFault::Malformed);
             continue;
@@ -130,6 +134,11 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     for (shut, names) in blinks.iter_mut().zip(&EYES) {
         shut.end(names.eye, log);
     }
+    if let Some(stated) = stated_samples.filter(|stated| (rows as f64) < *stated) {
+        log.note(format!(
+            "the header promises {stated} samples and there are {rows}: the file is cut off; copy it again"
+        ));
+    }
     if !in_mm {
         log.unit = SizeUnit::Pixels;
         log.note("there are no diameters in millimetres: sizes are in pixels of the eye camera, √(width·height)");
@@ -137,11 +146,10 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     Ok(())
 }
 
-/// The rate of `## Sample Rate: 250`.
-fn stated_rate(line: &[u8]) -> Option<f64> {
-    let rest = line.strip_prefix(b"##")?.trim_ascii_start().strip_prefix(b"Sample Rate")?;
-    let rate_hz = number(rest.strip_prefix(b":")?.trim_ascii())?;
-    (1.0..=1e5).contains(&rate_hz).then_some(rate_hz)
+/// The figure of a header line such as `## Sample Rate: 250`.
+fn stated(line: &[u8], name: &[u8]) -> Option<f64> {
+    let rest = line.strip_prefix(b"##")?.trim_ascii_start().strip_prefix(name)?;
+    number(rest.strip_prefix(b":")?.trim_ascii())
 }
 
 /// A size, or 0 where the eye is lost.

@@ -50,7 +50,10 @@ impl Lines {
                     continue;
                 }
                 None if self.from == self.to && !overlong => return None,
-                None => (self.to, self.to),
+                None => {
+                    log.ends_within(self.number + 1);
+                    (self.to, self.to)
+                }
             };
             let begin = std::mem::replace(&mut self.from, next);
             self.number += 1;

@@ -2,19 +2,22 @@
 //!
 //! Names of columns came and went with versions, with and without a unit behind them (`Recording timestamp [μs]`,
 //! `Pupil diameter left [mm]`, Studio's `RecordingTimestamp`, `PupilLeft`): they are compared without case, spaces and
-//! unit. Diameters are millimetres in all.
+//! unit. Diameters are millimetres, except where the header says pixels. Where the recording's times are whole
+//! milliseconds and the tracker's own are there in microseconds, those are taken.
 
 use holod_calibration::TimeNs;
 
 use crate::SampleEye;
 
 use super::table::{Row, Table, cells, is_missing, ns_per_unit, number, separator, time_ns, usual_step};
-use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError};
+use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError, SizeUnit};
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Tobii, recognises, read };
 
 /// Recording times, the finer first; `Timestamp` is that of old versions of Studio.
 const TIMES: [&str; 2] = ["recordingtimestamp", "timestamp"];
+/// Clocks that may be finer than the recording's.
+const FINER_TIMES: [&str; 2] = ["eyetrackertimestamp", "computertimestamp"];
 const EYES: [(&[&str], &str, SampleEye); 2] = [
     (&["pupildiameterleft", "pupilleft"], "validityleft", SampleEye::Left),
     (&["pupildiameterright", "pupilright"], "validityright", SampleEye::Right),
@@ -60,6 +63,8 @@ struct Columns {
     /// What tells recordings apart that were exported into one file.
     recording: [Option<usize>; 2],
     eyes: [Option<Eye>; 2],
+    /// What the diameters are, by the header; millimetres where it says nothing.
+    unit: SizeUnit,
 }
 
 #[derive(Clone, Copy)]
@@ -81,12 +86,21 @@ impl Columns {
         let (_, _, time, ns_per_unit) = times.min_by(|one, other| {
             (one.0, one.1).partial_cmp(&(other.0, other.1)).unwrap_or(std::cmp::Ordering::Equal)
         })?;
-        let eyes = EYES.map(|(names, validity, eye)| {
-            let diameter = names.iter().find_map(|name| column(name))?;
-            Some(Eye { eye, diameter, validity: column(validity) })
-        });
+        // An export may have both units, in either order.
+        let in_pixels = |name: &str| plain_name(name).1.is_some_and(|unit| unit.trim().eq_ignore_ascii_case("px"));
+        let sizes = |pixels: bool| {
+            EYES.map(|(names, validity, eye)| {
+                let of = |wanted: &str, name: &str| plain_name(name).0 == wanted && in_pixels(name) == pixels;
+                let diameter = names.iter().find_map(|wanted| table.column(|name| of(wanted, name)))?;
+                Some(Eye { eye, diameter, validity: column(validity) })
+            })
+        };
+        let (eyes, unit) = match sizes(false) {
+            [None, None] => (sizes(true), SizeUnit::Pixels),
+            eyes => (eyes, SizeUnit::Millimetres),
+        };
         let recording = [column("recordingname"), column("participantname")];
-        Some(Self { time, ns_per_unit, sensor: column("sensor"), event: column("event"), recording, eyes })
+        Some(Self { time, ns_per_unit, sensor: column("sensor"), event: column("event"), recording, eyes, unit })
     }
 
     /// Whether the row is of the eye tracker: other sensors and events have rows of their own.
@@ -115,7 +129,23 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
             if us { 1e3 } else { 1e6 }
         }
     };
-    let Some((mut table, columns)) = open(input, log)? else { return Ok(()) };
+    let finer = match open(input, &mut LogBuilder::default())? {
+        Some((table, columns)) if ns_per_unit >= 1e6 => finer_clock(table, &columns, ns_per_unit),
+        _ => None,
+    };
+    let Some((mut table, mut columns)) = open(input, log)? else { return Ok(()) };
+    log.unit = columns.unit;
+    if columns.unit == SizeUnit::Pixels {
+        log.note("the header says that the diameters are pixels of the eye camera");
+    }
+    let ns_per_unit = match finer {
+        None => ns_per_unit,
+        Some(column) => {
+            log.note(format!("times are those of `{}`, in microseconds", table.names[column].escape_debug()));
+            columns.time = column;
+            1e3
+        }
+    };
 
     let mut first: Option<[Vec<u8>; 2]> = None;
     let (mut of_others, mut unmeasured) = (0_u64, 0_u64);
@@ -173,8 +203,32 @@ fn open(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<Option<(Table, Col
     let Some(columns) = Columns::of(&table) else { return Ok(None) };
     let eyes = columns.eyes.iter().flatten().flat_map(|eye| [Some(eye.diameter), eye.validity]);
     let others = [Some(columns.time), columns.sensor, columns.event];
-    table.keep_to(eyes.chain(others).chain(columns.recording).flatten());
+    let finer = FINER_TIMES.map(|wanted| table.column(|name| plain_name(name).0 == wanted));
+    table.keep_to(eyes.chain(others).chain(columns.recording).chain(finer).flatten());
     Ok(Some((table, columns)))
+}
+
+/// The column of a clock that counts microseconds, beside one of `ns_per_unit` nanoseconds: it advances with that one, and
+/// each of the first rows with a pupil has it.
+fn finer_clock(mut table: Table, columns: &Columns, ns_per_unit: f64) -> Option<usize> {
+    let candidates = FINER_TIMES.map(|wanted| table.column(|name| plain_name(name).0 == wanted));
+    let mut times = Vec::with_capacity(UNIT_ROWS);
+    while times.len() < UNIT_ROWS {
+        let Some(row) = table.next_row(&mut LogBuilder::default()) else { break };
+        if columns.is_of_eyes(&row)
+            && columns.eyes.iter().flatten().any(|eye| row.cell(eye.diameter).is_ok_and(|cell| !is_missing(cell)))
+        {
+            let at = |column: usize| row.cell(column).and_then(number).ok();
+            times.push((at(columns.time), candidates.map(|column| column.and_then(at))));
+        }
+    }
+    let (first, last) = times.first().zip(times.last())?;
+    let by_recording_ns = (last.0? - first.0?) * ns_per_unit;
+    candidates.into_iter().enumerate().find_map(|(index, column)| {
+        let whole = times.windows(2).all(|pair| pair[0].1[index].zip(pair[1].1[index]).is_some_and(|(a, b)| b > a));
+        let by_candidate_ns = (last.1[index]? - first.1[index]?) * 1e3;
+        (whole && (by_candidate_ns / by_recording_ns - 1.0).abs() < 0.02).then_some(column?)
+    })
 }
 
 /// Whether the first times are microseconds rather than milliseconds.

@@ -17,7 +17,7 @@ pub(crate) use container::RECORD_HEAD_BYTES;
 pub(crate) use container::{Ending, Header, HeaderFault, Kind, MAGIC, RawReader};
 #[cfg(fuzzing)]
 pub(crate) use crc32::crc32;
-pub(crate) use writer::{Recorder, Taps, start};
+pub(crate) use writer::{ROOM, Recorder, Taps, start};
 
 /// Where a run is written down.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

@@ -2,6 +2,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, BufWriter, ErrorKind, Write};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -19,6 +20,8 @@ use crate::estimator::Decision;
 const RING_BYTES: usize = 1 << 22;
 /// Decisions on their way to the disk: 16 s at 1 kHz.
 const RING_DECISIONS: usize = 1 << 14;
+/// Decisions that one piece of a log may bring: the samples of one read of a link, and those that waited for them.
+pub(crate) const ROOM: usize = 1 << 13;
 /// How often the rings are emptied and what they held is handed to the system.
 const WRITE_INTERVAL: Duration = Duration::from_millis(100);
 /// How often it is forced to the disk; with the time that takes, a second at most.
@@ -112,6 +115,11 @@ impl Taps {
         }
     }
 
+    /// Whether what one piece of a log brings will find room; always where nothing is written any more.
+    pub(crate) fn has_room(&self) -> bool {
+        self.decisions.as_ref().is_none_or(|ring| ring.slots() >= ROOM || ring.is_abandoned())
+    }
+
     fn put(&mut self, kind: Kind, t: TimeNs, payload: &[u8]) {
         let Some(ring) = &mut self.raw else { return };
         let connection = self.connection;
@@ -188,7 +196,10 @@ impl Output {
     }
 
     fn failed(&self, error: &io::Error) -> String {
-        format!("recording {}: {error}; what was written before is kept", self.path.display())
+        match error.kind() {
+            ErrorKind::NotFound => format!("recording {}: {error}", self.path.display()),
+            _ => format!("recording {}: {error}; what was written before is kept", self.path.display()),
+        }
     }
 }
 
@@ -227,7 +238,11 @@ impl Writer {
             if over {
                 return;
             }
-            thread::park_timeout(WRITE_INTERVAL);
+            // A log that is played as fast as it can be read fills the ring in less.
+            let busy = self.decisions.as_ref().is_some_and(|(ring, _)| ring.slots() > RING_DECISIONS / 8);
+            if !busy {
+                thread::park_timeout(WRITE_INTERVAL);
+            }
         }
     }
 
@@ -258,6 +273,10 @@ impl Writer {
 /// Hands what is buffered to the system, and forces it to the disk if asked.
 fn hand_over(out: &mut Output, sync: bool) -> io::Result<()> {
     out.file.flush()?;
+    // What is written into a file without a name is lost when it is closed.
+    if out.file.get_ref().metadata()?.nlink() == 0 {
+        return Err(io::Error::new(ErrorKind::NotFound, "the file was deleted while it was written"));
+    }
     if sync { out.file.get_ref().sync_data() } else { Ok(()) }
 }
 

@@ -73,6 +73,14 @@ pub enum TrackerError {
     Thread(std::io::Error),
 }
 
+/// That `whose` figures are millimetres already, and are multiplied all the same.
+pub fn scaled_millimetres(whose: &str, scale: f64) -> String {
+    format!(
+        "{whose} gives millimetres already, and each is multiplied by scale_mm_per_unit = {scale}; where they are right, \
+         take that key out of the rig file, or give --scale 1"
+    )
+}
+
 /// How the link to the tracker is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Link {
@@ -144,6 +152,9 @@ impl Tracker {
             return Err(TrackerError::NoScale { spec: spec.to_string(), unit: job.unit().name() });
         }
         let mut warnings = job.warnings();
+        if let Some(scale) = settings.scale.filter(|scale| job.unit() == SizeUnit::Millimetres && *scale != 1.0) {
+            warnings.push(scaled_millimetres(&format!("tracker `{spec}`"), scale));
+        }
         let header = job.link().map(|(profile, datagrams)| Header {
             spec: spec.to_string(),
             profile: profile.name.clone(),
@@ -176,6 +187,7 @@ impl Tracker {
             troubles,
             record: taps,
             arrivals_of_stream: false,
+            tap_is_read: true,
             shared: Arc::clone(&shared),
         };
         let thread = thread::Builder::new()

@@ -16,7 +16,7 @@ use crate::gate::Verdict;
 use crate::import::raw::RawLog;
 use crate::import::{LogFault, Recording};
 use crate::profile::Profile;
-use crate::record::{Kind, Taps};
+use crate::record::{Kind, ROOM, Taps};
 use crate::sequence::{SequenceEvent, SequenceTracker};
 use crate::simulate::{MockSource, Script};
 use crate::source::{ByteSource, Feed, ReadEvent};
@@ -30,6 +30,8 @@ const SILENCE: TimeNs = TimeNs(500_000_000);
 const FIRST_SILENCE: TimeNs = TimeNs(2_500_000_000);
 const FIRST_BACK_OFF: Duration = Duration::from_millis(100);
 const LONGEST_BACK_OFF: Duration = Duration::from_secs(2);
+/// Whoever reads decisions, and has taken none for this long, reads none.
+const UNREAD: TimeNs = TimeNs(1_000_000_000);
 /// The longest datagram there is.
 const BUFFER_BYTES: usize = 1 << 16;
 
@@ -44,6 +46,8 @@ pub(super) struct Worker {
     pub(super) record: Option<Taps>,
     /// Times of arrival are the stream's too.
     pub(super) arrivals_of_stream: bool,
+    /// Somebody takes decisions out of the tap.
+    pub(super) tap_is_read: bool,
     pub(super) shared: Arc<Shared>,
 }
 
@@ -163,7 +167,7 @@ impl Worker {
                     }
                     // The newest bytes always come now.
                     ReplaySpeed::Fastest => {
-                        if self.stopping() {
+                        if !self.wait_for_room() {
                             return;
                         }
                         self.clock = StreamClock { host: host_now(), stream: arrival, rate: 1.0 };
@@ -210,7 +214,7 @@ impl Worker {
                     }
                     // The newest sample is always now.
                     ReplaySpeed::Fastest => {
-                        if self.stopping() {
+                        if !self.wait_for_room() {
                             return;
                         }
                         self.clock = StreamClock { host: host_now(), stream: sample.t_sample, rate: 1.0 };
@@ -273,6 +277,27 @@ impl Worker {
                 return true;
             }
             thread::park_timeout(Duration::from_nanos(left.0.unsigned_abs()));
+        }
+    }
+
+    /// Waits until recording and tap have room for what one piece of a log brings, since a log can be read faster than a
+    /// disk is written; false if the tracker is to stop. A tap that nobody reads is not waited for.
+    fn wait_for_room(&mut self) -> bool {
+        let mut waiting_since = None;
+        loop {
+            if self.stopping() {
+                return false;
+            }
+            let recorded = self.record.as_ref().is_none_or(Taps::has_room);
+            let read = !self.tap_is_read || self.tap.slots() >= ROOM.min(self.tap.buffer().capacity());
+            if recorded && read {
+                return true;
+            }
+            let now = host_now();
+            if recorded && now - *waiting_since.get_or_insert(now) > UNREAD {
+                self.tap_is_read = false;
+            }
+            thread::park_timeout(Duration::from_millis(1));
         }
     }
 

@@ -1,21 +1,38 @@
 //! Lasers: who may be lit, when, and what makes them dark.
 //!
-//! [`gate`] cuts the lit windows out of the fields; [`interlock`] decides from what is reported of the panel whether any
-//! laser may be lit; a [`LaserBox`] does it, and goes dark by itself when it hears nothing more; [`verify`] judges
-//! afterwards, from the edges that the box logged, whether the rule was kept.
+//! [`crate::schedule`] decides from what is reported of the panel which laser may be lit; a [`LaserBox`] does it;
+//! [`verify`] judges afterwards, from the edges that the box logged, whether the rule was kept.
+//!
+//! | Box | File |
+//! |---|---|
+//! | none: the edges are logged | `simulated.rs` |
+//! | any that speaks holod's protocol, as `holod-laser-firmware` does | `serial_box.rs`; how its clock goes with the host's: `box_clock.rs`; its line: `line_link.rs` |
+//! | FISBA READYBeam | `ready_beam.rs`, on `power_box.rs`; its frames: `mecom.rs` |
+//! | lasers that take commands in text | `text_laser.rs`, on `power_box.rs`; their profiles: `calibration/profiles/lasers/` |
+//!
+//! [`open_laser`] opens the one that the rig names; `reconnect.rs` finds it again when it is lost. Another box is a file
+//! here, a variant of [`LaserDriver`](holod_calibration::rig::LaserDriver) and a line in `open.rs`. [`simulator`] is the other end of the protocol's line: the firmware itself, on a pseudo-terminal.
 
-pub mod gate;
-pub mod interlock;
-pub mod protocol;
+pub mod box_clock;
+pub mod edge_log;
+mod line_link;
+mod mecom;
+mod open;
+mod power_box;
+mod program;
+mod ready_beam;
+mod reconnect;
 mod serial_box;
 mod simulated;
-pub mod simulated_box;
+pub mod simulator;
+mod text_laser;
 pub mod verify;
 
-pub use serial_box::SerialBox;
+pub use holod_laser_firmware::{DarkReason, Refusal};
+pub use open::{make_dark, open_laser};
+pub use reconnect::LaserWatch;
+pub use serial_box::{BoxReport, SerialBox, SerialOptions};
 pub use simulated::SimulatedLaser;
-
-use std::fmt;
 
 use holod_calibration::{Colour, PerColour, TimeNs};
 
@@ -60,87 +77,6 @@ pub enum BoxEvent {
         /// Why.
         reason: DarkReason,
     },
-}
-
-/// Why lasers are dark.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum DarkReason {
-    /// The box has heard no heartbeat for its timeout.
-    Heartbeat,
-    /// The box has seen no sync from the panel for two refreshes.
-    SyncLost,
-    /// No present report for two refreshes.
-    MissingReport,
-    /// A present report came when its field had gone by.
-    Late,
-    /// The time of presentation is a guess.
-    Untrusted,
-    /// The pattern is of another colour than the panel's field.
-    WrongColour,
-    /// The flat pattern is on the panel.
-    Flat,
-    /// No new frame for the stall timeout.
-    Stall,
-    /// The box reported a fault or does not answer.
-    BoxFault,
-    /// An orderly end.
-    Shutdown,
-    /// The program panicked.
-    Panic,
-    /// Somebody asked for it.
-    Asked,
-}
-
-impl DarkReason {
-    /// The name in files, logs and the line protocol.
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Heartbeat => "heartbeat",
-            Self::SyncLost => "sync-lost",
-            Self::MissingReport => "missing-report",
-            Self::Late => "late",
-            Self::Untrusted => "untrusted",
-            Self::WrongColour => "wrong-colour",
-            Self::Flat => "flat",
-            Self::Stall => "stall",
-            Self::BoxFault => "box-fault",
-            Self::Shutdown => "shutdown",
-            Self::Panic => "panic",
-            Self::Asked => "asked",
-        }
-    }
-
-    /// Every reason.
-    pub const ALL: [Self; 12] = [
-        Self::Heartbeat,
-        Self::SyncLost,
-        Self::MissingReport,
-        Self::Late,
-        Self::Untrusted,
-        Self::WrongColour,
-        Self::Flat,
-        Self::Stall,
-        Self::BoxFault,
-        Self::Shutdown,
-        Self::Panic,
-        Self::Asked,
-    ];
-
-    /// Whether a field that is dark for this reason must have been dark from its first moment on.
-    pub const fn forbids_light(self) -> bool {
-        matches!(self, Self::Untrusted | Self::WrongColour)
-    }
-
-    /// The reason called `name`.
-    pub fn from_name(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|reason| reason.name() == name)
-    }
-}
-
-impl fmt::Display for DarkReason {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
 }
 
 /// Who starts a lit window.
@@ -223,6 +159,85 @@ pub enum LaserError {
         /// How a box answers.
         expected: &'static str,
     },
+    /// A laser box of another version of the protocol.
+    #[error(
+        "{path}: a laser box that speaks version {found} of the laser protocol; this holod speaks version {expected}: flash the firmware that came with this holod"
+    )]
+    Version {
+        /// The port.
+        path: String,
+        /// The box's version.
+        found: u32,
+        /// The version spoken here.
+        expected: u32,
+    },
+    /// Another holod has the port.
+    #[error("{path} is in use by another program: end that one first (`holod dark` works beside it)")]
+    InUse {
+        /// The port.
+        path: String,
+    },
+    /// The rig wants the panel's sync wire, which the box cannot take.
+    #[error("the laser box has no input for the panel's sync output: take lasers.sync_wire out of the rig file")]
+    NoSyncInput,
+    /// The box is not built for what the rig asks of it.
+    #[error("the laser box takes {limit} {unit} of {what} at most; the rig asks for {asked}: correct the rig file")]
+    BeyondBox {
+        /// Which figure.
+        what: &'static str,
+        /// The box's limit.
+        limit: u32,
+        /// What the rig asks for.
+        asked: u32,
+        /// Of both.
+        unit: &'static str,
+    },
+    /// The box has booted while it was in use.
+    #[error("the laser box has reset itself: check its supply and its watchdog")]
+    Reset,
+    /// The box's clock does not go with the host's.
+    #[error("the laser box's clock jumped by {jump_us} µs or more: it has reset itself, or the computer was suspended")]
+    ClockJump {
+        /// By how much more than drift allows, microseconds.
+        jump_us: i64,
+    },
+    /// The box is lost and is being looked for.
+    #[error("the laser box is lost and is being looked for")]
+    Lost,
+    /// Another kind of box is in the place of the one that was lost.
+    #[error("another kind of laser box is in the place of the one that was lost: restart holod to use it")]
+    AnotherKind,
+    /// The device answered something else than it should.
+    #[error("{path}: answered `{found}` to `{sent}`; expected {expected}")]
+    Complaint {
+        /// The port.
+        path: String,
+        /// What it was told or asked.
+        sent: String,
+        /// What it answered.
+        found: String,
+        /// What it should have answered.
+        expected: String,
+    },
+    /// The rig does not accept lasers without a heartbeat.
+    #[error(
+        "these lasers have no heartbeat and stay lit when holod dies: the rig file must accept that with lasers.accept_no_heartbeat"
+    )]
+    NotAccepted,
+    /// The box cannot light one field and not the next.
+    #[error(
+        "these lasers cannot be switched for single fields: show one colour only (panel.mode = \"monochrome\"), or write lasers.gated_by_panel = true where the panel's own hardware gates them"
+    )]
+    CannotGate,
+    /// The bench has no laser of a colour that is to be shown.
+    #[error("there is no {colour} laser on this bench: name its port in lasers.devices, or show other colours")]
+    NoLaser {
+        /// The colour.
+        colour: Colour,
+    },
+    /// Somebody else made the box dark.
+    #[error("somebody made the laser box dark with `holod dark`: restart holod to light lasers again")]
+    MadeDark,
     /// The line to the box failed.
     #[error("the laser box's line failed: {0}")]
     Line(#[from] std::io::Error),
@@ -244,41 +259,54 @@ pub enum LaserError {
     },
 }
 
-/// Why a box does not do what it is told.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Refusal {
-    /// It lacks a sequence, a window or a power.
-    #[error("it is not programmed")]
-    NotProgrammed,
-    /// It is not armed.
-    #[error("it is not armed")]
-    NotArmed,
-    /// A program may change only in the dark.
-    #[error("it is armed")]
-    Armed,
-    /// Another laser is or would be lit.
-    #[error("two lasers would be lit at once")]
-    Overlap,
-    /// The window is over, or has no length.
-    #[error("the window has gone by")]
-    Late,
-    /// The window is for the other kind of trigger.
-    #[error("the program has another trigger")]
-    Trigger,
-    /// The line was damaged or no command.
-    #[error("the line was not understood")]
-    Malformed,
+impl LaserError {
+    /// Whether the box has to be opened anew after it.
+    pub const fn means_lost(&self) -> bool {
+        matches!(
+            self,
+            Self::Line(_)
+                | Self::NoAnswer { .. }
+                | Self::Reset
+                | Self::ClockJump { .. }
+                | Self::Complaint { .. }
+                | Self::NotABox { .. }
+        )
+    }
+}
+
+/// What a box can do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Capability {
+    /// It has no lasers. Only such a box is lit over a panel that is not there.
+    pub simulated: bool,
+    /// It lights each field by itself, at times that it keeps. Otherwise its lasers are simply on while it is armed, and
+    /// it reports no edges.
+    pub gates_fields: bool,
+    /// It goes dark by itself when its host dies.
+    pub has_heartbeat: bool,
+    /// The panel's sync output is wired to it, and it times its windows by the wire's edges.
+    pub sync_wire: bool,
 }
 
 /// A box that lights lasers.
 ///
 /// It boots dark, lights nothing until it is armed, is armed only when it is programmed, and goes dark by itself:
-/// without heartbeats for its timeout, and, where the panel's sync starts its windows, without sync for two refreshes.
+/// without heartbeats for its timeout, and, where the panel's sync starts its windows, without sync for two colour frames.
 /// Once dark it stays dark until it is armed again. No method waits but [`Self::program`], [`Self::arm`] and
 /// [`Self::dark`], which wait for the box's answer for a bounded time.
 pub trait LaserBox: Send {
+    /// What it can do.
+    fn capability(&self) -> Capability;
+
     /// Whether it has no lasers. Only such a box is lit over a panel that is not there.
-    fn is_simulated(&self) -> bool;
+    fn is_simulated(&self) -> bool {
+        self.capability().simulated
+    }
+
+    /// What tells a thread that may wait why the box is lost, where it can be.
+    fn watch(&self) -> Option<LaserWatch> {
+        None
+    }
 
     /// Sets sequence, windows and powers; only in the dark.
     ///
@@ -292,17 +320,19 @@ pub trait LaserBox: Send {
     /// As [`Self::program`].
     fn arm(&mut self, now: TimeNs) -> Result<(), LaserError>;
 
-    /// Says that a colour frame began at `t_sync`. A box with a wire to the panel sees that itself.
+    /// Says that a colour frame began at `t_sync`. A box with a wire to the panel sees that itself. Why the frame stays
+    /// dark all the same, if it does.
     ///
     /// # Errors
     /// As [`Self::program`].
-    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<(), LaserError>;
+    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError>;
 
-    /// Lights one window, where the host is the trigger. What has gone by of it is left out.
+    /// Lights one window, where the host is the trigger. What has gone by of it is left out. Why it stays dark all the
+    /// same, if it does.
     ///
     /// # Errors
     /// As [`Self::program`].
-    fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<(), LaserError>;
+    fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<Option<DarkReason>, LaserError>;
 
     /// Keeps it from going dark by itself.
     ///

@@ -1,36 +1,101 @@
-//! A laser box at the other end of a serial line.
+//! A laser box at the other end of a serial line, spoken to by the protocol of `holod-laser-firmware`.
 
-use std::io::{self, ErrorKind, Read, Write};
+use std::io::{Read, Write};
 use std::path::Path;
 use std::time::Duration;
 
-use holod_calibration::TimeNs;
-use serialport::TTYPort;
+use holod_calibration::{PerColour, TimeNs};
+use holod_laser_firmware::command::{Answer, Message, SIMULATED};
+use holod_laser_firmware::line::checked;
+use holod_laser_firmware::{
+    Command, Limits, Line, LineBuffer, PROTOCOL_VERSION, Refusal, State, SyncSeen, TimeUs, Trigger as BoxTrigger,
+};
 
-use super::protocol::{ARM_TOKEN, IDENTITY, Line, LineBuffer, SIMULATED, checked, letter, refusal};
-use super::{BoxEvent, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow, Refusal, SimulatedLaser, Trigger};
+use super::box_clock::{BoxClock, Offset};
+use super::line_link::{Arrival, Link, Sharing, open_port};
+use super::program::{ceil_us, commands, floor_us, laser_of};
+use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow, SimulatedLaser, Trigger};
 
 const BAUD: u32 = 115_200;
-/// A box that does not answer for this long is at fault.
-const ANSWER_WAIT: TimeNs = TimeNs(100_000_000);
+/// A box that does not answer for this long is at fault. It makes itself dark much sooner.
+const ANSWER_WAIT: TimeNs = TimeNs(250_000_000);
+/// How long the answer to a question or a setting is waited for, where nothing is lit and a thread may wait.
+const SET_UP_WAIT: TimeNs = TimeNs(1_000_000_000);
+/// How long the answer to `ARM`, and to each of two `DISARM`, is waited for.
+const SWITCH_WAIT: TimeNs = TimeNs(200_000_000);
 /// A box may take this long to answer the first line, while its USB wakes up.
 const IDENTIFY_WAIT: TimeNs = TimeNs(2_000_000_000);
-/// Commands that may wait for an answer: half a second of frames.
-const UNANSWERED_MAX: usize = 128;
+/// How long an identity is still waited for after a line that is no box's: it may be the end of an answer to somebody
+/// else, whose beginning they have read.
+const STRANGER_WAIT: TimeNs = TimeNs(500_000_000);
+/// A box that is not spoken to otherwise is asked for its time this often, so that a pulled cable is noticed in the dark.
+const ASK_TIME_EVERY: TimeNs = TimeNs(250_000_000);
+/// Commands that may wait for an answer: a quarter of a second of fields at 1000 Hz.
+const UNANSWERED_MAX: usize = 512;
+/// Exchanges at the beginning, of which the quickest says best how the clocks go together.
+const CLOCK_EXCHANGES: usize = 8;
+/// How often darkness is asked for beside a program that reads the same line and may take the answer.
+const DARK_TRIES: usize = 40;
 
-/// Drives a laser box through the lines of [`super::protocol`].
+/// How an identity is expected to begin, for messages.
+const IDENTITY: &str = "holod-laser-box 2";
+
+/// What the rig says of a box.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SerialOptions {
+    /// The panel's sync output is wired to the box, which then lights its windows after the wire's own edges.
+    pub sync_wire: bool,
+    /// Greatest power of each colour, microwatts at the panel.
+    pub power_limit_uw: PerColour<u32>,
+}
+
+impl Default for SerialOptions {
+    /// No wire, and no limit but the box's own.
+    fn default() -> Self {
+        Self { sync_wire: false, power_limit_uw: PerColour([u32::MAX; 3]) }
+    }
+}
+
+/// What a box says of itself, without being armed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BoxReport {
+    /// Its name; `simulated` where it has no lasers.
+    pub name: String,
+    /// What it is built for.
+    pub limits: Limits,
+    /// How it is.
+    pub state: State,
+    /// By how much its time may be mistaken from here, nanoseconds either way.
+    pub clock_error_ns: i64,
+}
+
+/// Drives a laser box.
+///
+/// Time points are the host's; a box has a clock of its own. How the two go together is learned from the time in each
+/// answer ([`BoxClock`]), windows are cut by what is not known of it, and where nothing is left of one the field stays
+/// dark.
 ///
 /// The box does not tell its edges, so the ones reported here are those of a model that is told the same as the box: what
 /// it does if it keeps its rules. Once it contradicts the model (it went dark, it refuses, it does not answer) that is
 /// an event or an error.
 #[derive(Debug)]
-pub struct SerialBox<S: Read + Write> {
-    stream: S,
+pub struct SerialBox {
+    link: Link,
     received: LineBuffer,
     model: SimulatedLaser,
-    simulated: bool,
+    name: String,
+    options: SerialOptions,
+    limits: Limits,
+    box_clock: BoxClock,
+    wire: Option<WireCheck>,
+    made_dark: bool,
+    /// Length of the program's narrowest window.
+    narrowest: TimeNs,
     last_number: u32,
+    t_sent: TimeNs,
     unanswered: [Option<Sent>; UNANSWERED_MAX],
+    /// The command whose answer is waited for, and the answer.
+    awaited: Option<(u32, Option<Result<Answer<'static>, Refusal>>)>,
     clock: fn() -> TimeNs,
 }
 
@@ -41,153 +106,313 @@ struct Sent {
     t: TimeNs,
 }
 
-impl SerialBox<TTYPort> {
+impl SerialBox {
     /// Opens the box at `path` and asks who it is before anything else is said.
     ///
     /// # Errors
-    /// [`LaserError::Open`], [`LaserError::NotABox`], [`LaserError::NoAnswer`].
-    pub fn open(path: &Path, clock: fn() -> TimeNs) -> Result<Self, LaserError> {
-        let name = path.display().to_string();
-        let port = serialport::new(name.as_str(), BAUD).timeout(Duration::ZERO).open_native();
-        let port = port.map_err(|why| LaserError::Open { path: name.clone(), why: why.to_string() })?;
-        Self::identify(port, &name, clock)
+    /// [`LaserError::Open`], [`LaserError::InUse`], [`LaserError::NotABox`], [`LaserError::Version`],
+    /// [`LaserError::NoSyncInput`], [`LaserError::NoAnswer`], [`LaserError::Line`].
+    pub fn open(path: &Path, options: SerialOptions, clock: fn() -> TimeNs) -> Result<Self, LaserError> {
+        let [reader, writer] = open_port(path, BAUD, Sharing::Alone)?;
+        Self::identify(reader, writer, &path.display().to_string(), options, clock)
     }
-}
 
-impl<S: Read + Write> SerialBox<S> {
-    /// Talks to the box on `stream`, whose reads must return at once, with [`ErrorKind::WouldBlock`] or
-    /// [`ErrorKind::TimedOut`] where nothing is there. `name` is for messages.
+    /// Makes the box at `path` dark, whoever else has its port open, and waits for the acknowledgement. Darkness comes
+    /// first: the box is not asked who it is, and to any other device the words mean nothing.
     ///
     /// # Errors
-    /// [`LaserError::NotABox`], [`LaserError::NoAnswer`], [`LaserError::Line`].
-    pub fn identify(stream: S, name: &str, clock: fn() -> TimeNs) -> Result<Self, LaserError> {
-        let mut this = Self {
-            stream,
-            received: LineBuffer::default(),
-            model: SimulatedLaser::new(clock()),
-            simulated: false,
-            last_number: 0,
-            unanswered: [None; UNANSWERED_MAX],
-            clock,
-        };
-        // Ends whatever an earlier host left half said; the box answers it with an error of number 0.
-        this.stream.write_all(b"\n")?;
-        let number = this.send("ID?", format_args!("ID?"), clock())?;
-        let t_end = clock() + IDENTIFY_WAIT;
-        let mut answer = None;
-        while answer.is_none() && clock() < t_end {
-            this.read_lines(|line| {
-                // What a box still had to say to an earlier host, a killed one say, is no answer to us.
-                let text = String::from_utf8_lossy(line).trim_end().to_owned();
-                let ours = format!("OK {number} {IDENTITY} ");
-                if let Some(name) = checked(line).and_then(|text| text.strip_prefix(&ours)) {
-                    answer = Some(Ok(name == SIMULATED));
-                } else if !text.is_empty() && !["!", "OK ", "ERR "].iter().any(|known| text.starts_with(known)) {
-                    answer.get_or_insert(Err(text));
+    /// As [`Self::open`], without [`LaserError::InUse`].
+    pub fn make_dark(path: &Path, reason: DarkReason, clock: fn() -> TimeNs) -> Result<(), LaserError> {
+        let [reader, writer] = open_port(path, BAUD, Sharing::Beside)?;
+        let link = Link::new(reader, writer, clock)?;
+        // Numbers that the other program does not wait for.
+        let first = std::process::id().wrapping_mul(0x1_0000) | 0x8000_0000;
+        let mut this = Self::on(link, &path.display().to_string(), SerialOptions::default(), first, clock);
+        // No LF comes first: it would make an armed box dark as a line that is no command, and its host would arm it again.
+        // Where somebody has left half a line, the first try completes and the second one follows it.
+        for _ in 0..DARK_TRIES {
+            let number = this.send(&Command::Disarm(reason))?;
+            this.awaited = Some((number, None));
+            let t_end = clock() + TimeNs(50_000_000);
+            while clock() < t_end {
+                // What else the box has to say is for whoever drives it.
+                if let Err(failed @ LaserError::Line(_)) = this.hear(clock()) {
+                    return Err(failed);
                 }
-            })?;
-            std::thread::sleep(Duration::from_micros(500));
-        }
-        match answer {
-            Some(Ok(simulated)) => {
-                this.simulated = simulated;
-                this.unanswered = [None; UNANSWERED_MAX];
-                Ok(this)
+                if matches!(this.awaited, Some((_, Some(Ok(_))))) {
+                    return Ok(());
+                }
+                std::thread::sleep(Duration::from_micros(200));
             }
-            Some(Err(found)) => Err(LaserError::NotABox {
-                path: name.into(),
-                found: found.chars().take(40).collect(),
-                expected: IDENTITY,
-            }),
-            None => Err(LaserError::NoAnswer { command: "ID?", waited_ms: IDENTIFY_WAIT.0 / 1_000_000 }),
+            this.unanswered = [None; UNANSWERED_MAX];
+        }
+        Err(LaserError::NoAnswer { command: "DISARM", waited_ms: 50 * DARK_TRIES as i64 })
+    }
+
+    /// Asks the box at `path` how it is; it is not armed and nobody else must be driving it.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn inspect(path: &Path, clock: fn() -> TimeNs) -> Result<BoxReport, LaserError> {
+        Self::open(path, SerialOptions::default(), clock)?.report()
+    }
+
+    /// How the box is.
+    ///
+    /// # Errors
+    /// [`LaserError::NoAnswer`], [`LaserError::Line`].
+    pub fn report(&mut self) -> Result<BoxReport, LaserError> {
+        let Answer::State { state, .. } = self.ask(&Command::State, SET_UP_WAIT)? else {
+            return Err(LaserError::Refused { command: "STAT?", refusal: Refusal::Malformed });
+        };
+        let clock_error_ns = self.box_clock.offset_at((self.clock)()).map_or(i64::MAX, Offset::error_ns);
+        Ok(BoxReport { name: self.name.clone(), limits: self.limits, state, clock_error_ns })
+    }
+
+    /// Talks to the box on `reader` and `writer`; `name` is for messages. Reads return within some tens of milliseconds,
+    /// with [`std::io::ErrorKind::WouldBlock`] or [`std::io::ErrorKind::TimedOut`] where nothing is there.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn identify(
+        reader: impl Read + Send + 'static,
+        writer: impl Write + Send + 'static,
+        name: &str,
+        options: SerialOptions,
+        clock: fn() -> TimeNs,
+    ) -> Result<Self, LaserError> {
+        let mut this = Self::on(Link::new(reader, writer, clock)?, name, options, 0, clock);
+        // Ends whatever an earlier host left half said; the box answers it with an error of number 0.
+        this.link.send(b"\n")?;
+        let number = this.send(&Command::Identify)?;
+        let (version, box_name) = this.hear_identity(number, name)?;
+        if version != PROTOCOL_VERSION {
+            return Err(LaserError::Version { path: name.into(), found: version, expected: PROTOCOL_VERSION });
+        }
+        this.name = box_name;
+        this.unanswered = [None; UNANSWERED_MAX];
+        if let Answer::Limits { limits, .. } = this.ask(&Command::Limits, SET_UP_WAIT)? {
+            this.limits = limits;
+        }
+        if options.sync_wire && !this.limits.sync_input {
+            return Err(LaserError::NoSyncInput);
+        }
+        for _ in 0..CLOCK_EXCHANGES {
+            this.ask(&Command::Now, SET_UP_WAIT)?;
+        }
+        Ok(this)
+    }
+
+    fn on(link: Link, name: &str, options: SerialOptions, first_number: u32, clock: fn() -> TimeNs) -> Self {
+        let now = clock();
+        Self {
+            link,
+            received: LineBuffer::default(),
+            model: SimulatedLaser::new(now),
+            name: name.into(),
+            options,
+            limits: Limits { power_uw: [0; 3], timeout_us: 0, lit_us: 0, jitter_us: 0, sync_input: false },
+            box_clock: BoxClock::default(),
+            wire: None,
+            made_dark: false,
+            narrowest: TimeNs(0),
+            last_number: first_number,
+            t_sent: now,
+            unanswered: [None; UNANSWERED_MAX],
+            awaited: None,
+            clock,
         }
     }
 
-    fn send(&mut self, command: &'static str, text: std::fmt::Arguments<'_>, now: TimeNs) -> Result<u32, LaserError> {
+    /// The version and the name in the answer to the command `number`.
+    fn hear_identity(&mut self, number: u32, path: &str) -> Result<(u32, String), LaserError> {
+        let mut t_end = (self.clock)() + IDENTIFY_WAIT;
+        let mut stranger = None;
+        while (self.clock)() < t_end {
+            while let Some(arrival) = self.link.next()? {
+                let Arrival::Bytes { count, bytes, .. } = arrival else { continue };
+                for &byte in &bytes[..count] {
+                    let Some(line) = self.received.push(byte) else { continue };
+                    match checked(line).and_then(Message::parse) {
+                        Some(Message::Done { number: ours, answer: Answer::Identity { version, name } })
+                            if ours == number =>
+                        {
+                            return Ok((version, name.to_owned()));
+                        }
+                        // What a box still had to say to an earlier host, a killed one say, is no answer to us.
+                        Some(_) => {}
+                        None => {
+                            let text = String::from_utf8_lossy(line).trim_end().to_owned();
+                            // The rest of such a line, whose beginning somebody else has read, or a later box's words.
+                            let a_boxs = ["!", "OK ", "ERR "].iter().any(|known| text.starts_with(known));
+                            if !text.is_empty() && !a_boxs && stranger.is_none() {
+                                stranger = Some(text.chars().take(40).collect::<String>());
+                                t_end = t_end.min((self.clock)() + STRANGER_WAIT);
+                            }
+                        }
+                    }
+                }
+            }
+            std::thread::sleep(Duration::from_micros(500));
+        }
+        Err(match stranger {
+            Some(found) => LaserError::NotABox { path: path.into(), found, expected: IDENTITY },
+            None => LaserError::NoAnswer { command: "ID?", waited_ms: IDENTIFY_WAIT.0 / 1_000_000 },
+        })
+    }
+
+    fn send(&mut self, command: &Command) -> Result<u32, LaserError> {
         let number = self.last_number.wrapping_add(1);
+        let t = (self.clock)();
         let place = &mut self.unanswered[number as usize % UNANSWERED_MAX];
         if let Some(oldest) = place {
-            return Err(LaserError::NoAnswer { command: oldest.command, waited_ms: (now.0 - oldest.t.0) / 1_000_000 });
+            return Err(LaserError::NoAnswer { command: oldest.command, waited_ms: (t.0 - oldest.t.0) / 1_000_000 });
         }
-        *place = Some(Sent { number, command, t: now });
+        *place = Some(Sent { number, command: command.word(), t });
         self.last_number = number;
-        self.stream.write_all(Line::new(format_args!("{number} {text}")).as_bytes())?;
+        self.t_sent = t;
+        let line = Line::new(format_args!("{number} {command}")).expect("every command fits into a line");
+        self.link.send(line.as_bytes())?;
         Ok(number)
     }
 
-    /// Sends and waits for the answer.
-    fn ask(&mut self, command: &'static str, text: std::fmt::Arguments<'_>, now: TimeNs) -> Result<(), LaserError> {
-        let number = self.send(command, text, now)?;
-        let t_end = (self.clock)() + ANSWER_WAIT;
+    /// Sends and waits for the answer, `patience` at most.
+    fn ask(&mut self, command: &Command, patience: TimeNs) -> Result<Answer<'static>, LaserError> {
+        let number = self.send(command)?;
+        self.awaited = Some((number, None));
+        let t_end = (self.clock)() + patience;
         loop {
             self.hear((self.clock)())?;
-            if self.unanswered[number as usize % UNANSWERED_MAX].is_none_or(|sent| sent.number != number) {
-                return Ok(());
+            if let Some((_, Some(answer))) = self.awaited {
+                self.awaited = None;
+                return answer.map_err(|refusal| LaserError::Refused { command: command.word(), refusal });
             }
             if (self.clock)() >= t_end {
-                return Err(LaserError::NoAnswer { command, waited_ms: ANSWER_WAIT.0 / 1_000_000 });
+                self.awaited = None;
+                self.unanswered[number as usize % UNANSWERED_MAX] = None;
+                return Err(LaserError::NoAnswer { command: command.word(), waited_ms: patience.0 / 1_000_000 });
             }
             std::thread::sleep(Duration::from_micros(200));
         }
     }
 
-    /// Takes in what the box has said.
+    /// Takes in what the box has said; the first thing in it that is at fault.
     fn hear(&mut self, now: TimeNs) -> Result<(), LaserError> {
-        let mut first_refusal = None;
-        let mut went_dark = None;
-        let unanswered = &mut self.unanswered;
-        let mut stream_lines = |line: &[u8]| {
-            let Some(text) = checked(line) else { return };
-            let mut words = text.split(' ');
-            match words.next() {
-                Some("!HBLOST") => went_dark = Some(DarkReason::Heartbeat),
-                Some("!SYNCLOST") => went_dark = Some(DarkReason::SyncLost),
-                Some(fault) if fault.starts_with('!') => went_dark = Some(DarkReason::BoxFault),
-                Some(verdict @ ("OK" | "ERR")) => {
-                    let Some(number) = words.next().and_then(|number| number.parse::<u32>().ok()) else { return };
-                    let place = &mut unanswered[number as usize % UNANSWERED_MAX];
-                    let Some(sent) = place.filter(|sent| sent.number == number) else { return };
-                    *place = None;
-                    if verdict == "ERR" {
-                        first_refusal.get_or_insert((sent.command, refusal(words.next().unwrap_or_default())));
-                    }
+        let mut first_fault = Ok(());
+        while let Some(arrival) = self.link.next()? {
+            let Arrival::Bytes { t, count, bytes } = arrival else { continue };
+            for &byte in &bytes[..count] {
+                let message = self.received.push(byte).and_then(checked).and_then(Message::parse).map(owned);
+                if let Some(message) = message {
+                    let understood = self.understand(message, t, now);
+                    first_fault = first_fault.and(understood);
                 }
-                _ => {}
-            }
-        };
-        let mut bytes = [0; 256];
-        loop {
-            match self.stream.read(&mut bytes) {
-                Ok(0) => return Err(io::Error::from(ErrorKind::BrokenPipe).into()),
-                Ok(count) => self.received.feed(&bytes[..count], &mut stream_lines),
-                Err(why) if matches!(why.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => break,
-                Err(why) if why.kind() == ErrorKind::Interrupted => {}
-                Err(why) => return Err(why.into()),
             }
         }
-        if let Some(reason) = went_dark {
-            self.model.set_dark(reason, now);
-        }
-        match first_refusal {
-            // A window that came too late stays dark, no more.
-            Some((_, Refusal::Late)) | None => Ok(()),
-            Some((command, refusal)) => Err(LaserError::Refused { command, refusal }),
+        first_fault
+    }
+
+    fn understand(&mut self, message: Message<'static>, t_heard: TimeNs, now: TimeNs) -> Result<(), LaserError> {
+        match message {
+            Message::Done { number, answer } => {
+                let Some(sent) = self.take_sent(number) else { return Ok(()) };
+                if let Some(t) = answer.t() {
+                    self.learn(sent.t, t_heard, t)?;
+                }
+                match answer {
+                    Answer::Sync { sync, .. } => self.compare_with_wire(sync, t_heard, now)?,
+                    Answer::State { state, .. } if !state.armed && self.model.is_armed() => {
+                        self.made_dark = state.reason == DarkReason::Asked;
+                        self.model.set_dark(state.reason, now);
+                    }
+                    _ => {}
+                }
+                self.give(number, Ok(answer));
+                Ok(())
+            }
+            Message::Refused { number, refusal } => {
+                let Some(sent) = self.take_sent(number) else { return Ok(()) };
+                if self.give(number, Err(refusal)) {
+                    return Ok(());
+                }
+                match refusal {
+                    // A window that came too late stays dark, no more.
+                    Refusal::Late => Ok(()),
+                    // It went dark by itself and has said so; or somebody else made it dark.
+                    Refusal::NotArmed if !self.model.is_armed() => Ok(()),
+                    Refusal::NotArmed => self.send(&Command::State).map(|_| ()),
+                    refusal => Err(LaserError::Refused { command: sent.command, refusal }),
+                }
+            }
+            Message::Dark { reason, .. } => {
+                self.model.set_dark(reason, now);
+                Ok(())
+            }
+            Message::Booted => {
+                self.model.set_dark(DarkReason::BoxFault, now);
+                self.box_clock.forget();
+                Err(LaserError::Reset)
+            }
         }
     }
 
-    fn read_lines(&mut self, line: impl FnMut(&[u8])) -> Result<(), LaserError> {
-        let mut bytes = [0; 256];
-        match self.stream.read(&mut bytes) {
-            Ok(0) => Err(io::Error::from(ErrorKind::BrokenPipe).into()),
-            Ok(count) => {
-                self.received.feed(&bytes[..count], line);
-                Ok(())
+    fn take_sent(&mut self, number: u32) -> Option<Sent> {
+        self.unanswered[number as usize % UNANSWERED_MAX].take_if(|sent| sent.number == number)
+    }
+
+    /// Gives the answer to whoever waits for it; whether somebody does.
+    fn give(&mut self, number: u32, answer: Result<Answer<'static>, Refusal>) -> bool {
+        match &mut self.awaited {
+            Some((awaited, place)) if *awaited == number => {
+                *place = Some(answer);
+                true
             }
-            Err(why) if matches!(why.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted) => {
-                Ok(())
-            }
-            Err(why) => Err(why.into()),
+            _ => false,
         }
+    }
+
+    fn learn(&mut self, t_asked: TimeNs, t_heard: TimeNs, t_box: TimeUs) -> Result<(), LaserError> {
+        self.box_clock
+            .learn(t_asked, t_heard, t_box)
+            .map_err(|apart_ns| LaserError::ClockJump { jump_us: apart_ns / 1000 })
+    }
+
+    fn compare_with_wire(&mut self, sync: SyncSeen, t_heard: TimeNs, now: TimeNs) -> Result<(), LaserError> {
+        let (Some(wire), Some(offset)) = (&mut self.wire, self.box_clock.offset_at(t_heard)) else { return Ok(()) };
+        if wire.agrees(sync, offset) {
+            return Ok(());
+        }
+        self.wire = None;
+        self.send(&Command::Disarm(DarkReason::SyncDisagrees))?;
+        self.model.set_dark(DarkReason::SyncDisagrees, now);
+        Ok(())
+    }
+
+    fn trigger(&self, program: &LaserProgram) -> BoxTrigger {
+        match program.trigger {
+            Trigger::Host => BoxTrigger::Host,
+            Trigger::PanelSync if self.options.sync_wire => BoxTrigger::Sync,
+            Trigger::PanelSync => BoxTrigger::Frame,
+        }
+    }
+}
+
+/// A message without the name in it, which only an identity has.
+fn owned(message: Message<'_>) -> Message<'static> {
+    match message {
+        Message::Done { number, answer } => Message::Done {
+            number,
+            answer: match answer {
+                Answer::Identity { version, .. } => Answer::Identity { version, name: "" },
+                Answer::Done { t } => Answer::Done { t },
+                Answer::Sync { t, sync } => Answer::Sync { t, sync },
+                Answer::Limits { t, limits } => Answer::Limits { t, limits },
+                Answer::State { t, state } => Answer::State { t, state },
+            },
+        },
+        Message::Refused { number, refusal } => Message::Refused { number, refusal },
+        Message::Booted => Message::Booted,
+        Message::Dark { t, reason } => Message::Dark { t, reason },
     }
 }
 
@@ -195,55 +420,101 @@ fn refused(command: &'static str) -> impl Fn(Refusal) -> LaserError {
     move |refusal| LaserError::Refused { command, refusal }
 }
 
-impl<S: Read + Write + Send> LaserBox for SerialBox<S> {
-    fn is_simulated(&self) -> bool {
-        self.simulated
+impl LaserBox for SerialBox {
+    fn capability(&self) -> Capability {
+        Capability {
+            simulated: self.name == SIMULATED,
+            gates_fields: true,
+            has_heartbeat: true,
+            sync_wire: self.options.sync_wire,
+        }
     }
 
     fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
-        let [a, b, c] = program.sequence.map(letter);
-        let trigger = match program.trigger {
-            Trigger::PanelSync => "SYNC",
-            Trigger::Host => "HOST",
-        };
-        self.ask("SEQ", format_args!("SEQ {a}{b}{c} {} {trigger}", program.frame_period.0), now)?;
-        for (field, window) in program.windows.iter().enumerate() {
-            self.ask("FLD", format_args!("FLD {field} {} {}", window.delay.0, window.width.0), now)?;
+        let limits = self.limits;
+        let power_limit_uw = PerColour([0, 1, 2].map(|i| self.options.power_limit_uw.0[i].min(limits.power_uw[i])));
+        for (&asked, &limit) in program.power_uw.0.iter().zip(&limits.power_uw) {
+            if asked > limit {
+                return Err(LaserError::BeyondBox { what: "power", limit, asked, unit: "µW" });
+            }
         }
-        let [red, green, blue] = program.power_uw.0;
-        self.ask("POW", format_args!("POW {red} {green} {blue}"), now)?;
-        self.ask("TMO", format_args!("TMO {}", program.heartbeat_timeout.0), now)?;
-        self.model.set_program(program, now).map_err(refused("SEQ"))
+        let timeout_us = u32::try_from(program.heartbeat_timeout.0 / 1000).unwrap_or(u32::MAX);
+        if timeout_us > limits.timeout_us {
+            let limit = limits.timeout_us;
+            return Err(LaserError::BeyondBox { what: "heartbeat timeout", limit, asked: timeout_us, unit: "µs" });
+        }
+        let trigger = self.trigger(program);
+        for command in commands(program, trigger, power_limit_uw, limits.jitter_us)? {
+            self.ask(&command, SET_UP_WAIT)?;
+            // The model has no wire: it is told of the frames.
+            let command = match command {
+                Command::Sequence { sequence, period_us, trigger: BoxTrigger::Sync } => {
+                    Command::Sequence { sequence, period_us, trigger: BoxTrigger::Frame }
+                }
+                command => command,
+            };
+            self.model.obey(&command, now).map_err(refused(command.word()))?;
+        }
+        self.narrowest = program.windows.iter().map(|window| window.width).min().unwrap_or(TimeNs(0));
+        self.wire = (trigger == BoxTrigger::Sync).then(|| WireCheck::new(program.frame_period));
+        Ok(())
     }
 
     fn arm(&mut self, now: TimeNs) -> Result<(), LaserError> {
-        self.ask("ARM", format_args!("ARM {ARM_TOKEN}"), now)?;
-        self.model.set_armed(now).map_err(refused("ARM"))
+        if self.made_dark {
+            return Err(LaserError::MadeDark);
+        }
+        self.ask(&Command::Arm, SWITCH_WAIT)?;
+        if let Some(wire) = &mut self.wire {
+            *wire = WireCheck::new(wire.period);
+        }
+        self.model.obey(&Command::Arm, now).map_err(refused("ARM"))
     }
 
-    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<(), LaserError> {
-        self.send("SYN", format_args!("SYN {}", t_sync.0), now)?;
-        self.model.see_sync(t_sync, now).map_err(refused("SYN"))
+    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        if let Some(wire) = &mut self.wire {
+            wire.frame_began(t_sync);
+            return self.model.see_frame(t_sync, 0, now).map(|()| None).map_err(refused("FRM"));
+        }
+        let Some(offset) = self.box_clock.offset_at(now) else { return Ok(Some(DarkReason::ClockUnsure)) };
+        let t = floor_us(t_sync + TimeNs(offset.middle_ns()));
+        let error_us = u32::try_from(offset.error_ns() / 1000 + 1).unwrap_or(u32::MAX);
+        self.send(&Command::Frame { t, error_us })?;
+        self.model.see_frame(t_sync, error_us, now).map_err(refused("FRM"))?;
+        // What is not known of the frame's start is cut off its windows at both ends.
+        Ok((2 * i64::from(error_us) * 1000 >= self.narrowest.0).then_some(DarkReason::ClockUnsure))
     }
 
-    fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<(), LaserError> {
-        let (colour, t_on, t_off) = (letter(window.colour), window.t_on.0, window.t_off.0);
-        self.send("LIT", format_args!("LIT {colour} {t_on} {t_off}"), now)?;
-        self.model.take_window(window, now).map_err(refused("LIT"))
+    fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        let Some(offset) = self.box_clock.offset_at(now) else { return Ok(Some(DarkReason::ClockUnsure)) };
+        // Wherever the truth lies within the bounds, the box lights inside the window.
+        let t_on = ceil_us(window.t_on + TimeNs(offset.greatest_ns));
+        let t_off = floor_us(window.t_off + TimeNs(offset.least_ns)).before(self.limits.jitter_us);
+        if t_off <= t_on {
+            return Ok(Some(DarkReason::ClockUnsure));
+        }
+        self.send(&Command::Light { laser: laser_of(window.colour), t_on, t_off })?;
+        let cut = TimeNs(offset.error_ns());
+        let window = LitWindow { t_on: window.t_on + cut, t_off: window.t_off - cut, ..window };
+        match self.model.take_window(window, now) {
+            Ok(()) => Ok(None),
+            Err(Refusal::Late) => Ok(Some(DarkReason::Late)),
+            Err(refusal) => Err(LaserError::Refused { command: "LIT", refusal }),
+        }
     }
 
     fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
-        self.send("HB", format_args!("HB"), now)?;
-        self.model.hear_heartbeat(now).map_err(refused("HB"))
+        self.send(&Command::Heartbeat)?;
+        self.model.obey(&Command::Heartbeat, now).map_err(refused("HB"))
     }
 
     fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
         // Answers to earlier commands no longer matter.
         self.unanswered = [None; UNANSWERED_MAX];
-        match self.ask("DISARM", format_args!("DISARM {reason}"), now) {
-            Ok(()) => {}
+        match self.ask(&Command::Disarm(reason), SWITCH_WAIT) {
+            Ok(_) => {}
             // The line may have swallowed the first one.
-            Err(_) => self.ask("DISARM", format_args!("DISARM {reason}"), (self.clock)())?,
+            Err(_) => drop(self.ask(&Command::Disarm(reason), SWITCH_WAIT)?),
         }
         self.model.set_dark(reason, (self.clock)().max(now));
         Ok(())
@@ -257,21 +528,90 @@ impl<S: Read + Write + Send> LaserBox for SerialBox<S> {
         }
         heard?;
         let overdue = |sent: &&Sent| now.0 - sent.t.0 > ANSWER_WAIT.0;
-        match self.unanswered.iter().flatten().find(overdue) {
-            None => Ok(()),
-            Some(sent) => {
-                let error = LaserError::NoAnswer { command: sent.command, waited_ms: (now.0 - sent.t.0) / 1_000_000 };
-                self.unanswered = [None; UNANSWERED_MAX];
-                Err(error)
-            }
+        if let Some(sent) = self.unanswered.iter().flatten().find(overdue) {
+            let error = LaserError::NoAnswer { command: sent.command, waited_ms: (now.0 - sent.t.0) / 1_000_000 };
+            self.unanswered = [None; UNANSWERED_MAX];
+            return Err(error);
         }
+        if now.0 - self.t_sent.0 > ASK_TIME_EVERY.0 {
+            self.send(&Command::Now)?;
+        }
+        Ok(())
     }
 }
 
-impl<S: Read + Write> Drop for SerialBox<S> {
+impl Drop for SerialBox {
     /// A last word, in case nobody said it; the box's heartbeat timeout does the rest.
     fn drop(&mut self) {
         self.unanswered = [None; UNANSWERED_MAX];
-        let _nobody_listens = self.send("DISARM", format_args!("DISARM {}", DarkReason::Shutdown), TimeNs(0));
+        let _nobody_listens = self.send(&Command::Disarm(DarkReason::Shutdown));
+    }
+}
+
+/// Compares the edges on the box's sync wire with the frames that the host knows of. The wire may come at any constant
+/// delay, which is learned from the first edge after arming; it must not wander, and no frame may be missing.
+#[derive(Clone, Copy, Debug)]
+struct WireCheck {
+    period: TimeNs,
+    /// Start of the last colour frame that the host knows of.
+    t_frame: Option<TimeNs>,
+    /// The first comparison: start of a frame, count of edges, and from that start to the edge.
+    first: Option<(TimeNs, u32, i64)>,
+}
+
+impl WireCheck {
+    const fn new(period: TimeNs) -> Self {
+        Self { period, t_frame: None, first: None }
+    }
+
+    fn frame_began(&mut self, t: TimeNs) {
+        self.t_frame = Some(t);
+    }
+
+    fn agrees(&mut self, sync: SyncSeen, offset: Offset) -> bool {
+        let (Some(t_frame), Some(t_edge)) = (self.t_frame, sync.t_last) else { return true };
+        let t_edge_ns = i64::try_from(t_edge.0).unwrap_or(i64::MAX / 2000) * 1000 - offset.middle_ns();
+        let since_frame_ns = t_edge_ns - t_frame.0;
+        let Some((t_first, first_count, first_ns)) = self.first else {
+            self.first = Some((t_frame, sync.count, since_frame_ns));
+            return true;
+        };
+        let wander_ns = (since_frame_ns - first_ns + self.period.0 / 2).rem_euclid(self.period.0) - self.period.0 / 2;
+        let tolerance_ns = self.period.0 / 16 + offset.error_ns();
+        let frames = (t_edge_ns - t_first.0 - first_ns + self.period.0 / 2).div_euclid(self.period.0);
+        let edges = i64::from(sync.count.wrapping_sub(first_count));
+        wander_ns.abs() <= tolerance_ns && edges == frames
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const EXACT: Offset = Offset { least_ns: 0, greatest_ns: 0 };
+    const PERIOD: TimeNs = TimeNs(16_000_000);
+
+    /// Feeds frames at `frames` (ms) and edges at `edges` (ms), one each in turn; whether they agree all along.
+    fn agree(frames: &[i64], edges: &[i64]) -> bool {
+        let mut check = WireCheck::new(PERIOD);
+        frames.iter().zip(edges).zip(1..).all(|((&frame, &edge), count)| {
+            check.frame_began(TimeNs(frame * 1_000_000));
+            check.agrees(SyncSeen { count, t_last: Some(TimeUs(edge as u64 * 1000)) }, EXACT)
+        })
+    }
+
+    #[test]
+    fn a_wire_that_comes_at_a_constant_delay_agrees() {
+        for delay in [0, 3, 11, 40] {
+            assert!(agree(&[16, 32, 48, 64, 80], &[16, 32, 48, 64, 80].map(|t| t + delay)), "{delay}");
+        }
+        assert!(agree(&[16, 32, 48], &[20, 37, 51]), "jitter of 1 ms");
+    }
+
+    #[test]
+    fn canary_a_wire_that_wanders_doubles_or_misses_disagrees() {
+        assert!(!agree(&[16, 32, 48], &[20, 38, 52]), "2 ms later");
+        assert!(!agree(&[16, 32, 48], &[20, 28, 36]), "twice the rate");
+        assert!(!agree(&[16, 32, 48], &[20, 52, 84]), "half the rate");
     }
 }

@@ -1,19 +1,36 @@
-//! Putting frames on a panel and saying when each field was really shown.
+//! Putting frames on a panel and saying when each was really shown.
+//!
+//! A [`Presenter`] knows one way to a panel. It reports refreshes, each a video frame that has come on the panel; what
+//! that means for colours and lasers is worked out in [`crate::schedule`], alike for all of them.
 
+pub mod drm;
 mod headless;
+mod recorder;
+mod spec;
+#[cfg(feature = "window")]
+pub mod window;
 
-pub use headless::HeadlessPanel;
+pub use headless::{HeadlessPanel, ReportFaults};
+pub use recorder::Recorder;
+pub use spec::{OutputSpec, SpecError, WindowSpec};
 
-use holod_calibration::rig::Panel;
-use holod_calibration::{Colour, TimeNs};
+use std::os::fd::BorrowedFd;
 
-use crate::fields::{FIELDS, FrameTag, LevelsFrame};
+use holod_calibration::TimeNs;
+use holod_calibration::rig::{Panel, PanelMode};
+use rustix::io::Errno;
+
+use self::drm::DisplayCheck;
+use crate::fields::{FrameLayout, FrameTag, LevelsFrame};
+use crate::levels::PanelEncoder;
 
 /// Where the time of a presentation comes from, and so how far it can be trusted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Provenance {
     /// The display controller stamped it.
     Hardware,
+    /// The display server or driver reported it, from the controller's stamp as far as it says so.
+    Driver,
     /// A sync input that sees the panel itself.
     External,
     /// Software took the time, near the event but not from it. Of a virtual panel it is exact.
@@ -27,6 +44,7 @@ impl Provenance {
     pub const fn name(self) -> &'static str {
         match self {
             Self::Hardware => "hardware",
+            Self::Driver => "driver",
             Self::External => "external",
             Self::Software => "software",
             Self::Estimated => "estimated",
@@ -34,38 +52,176 @@ impl Provenance {
     }
 }
 
-/// The panel's clockwork.
+/// The panel's nominal periods.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PanelTiming {
-    /// How long one field is on the panel.
+    /// How long one colour field is on the panel.
     pub field_period: TimeNs,
-    /// From one colour frame's first field to the next one's: three fields.
+    /// From one video frame to the next: three fields in channel-packed mode, one field in the other modes.
+    pub refresh_period: TimeNs,
+    /// From one colour frame's first field to the next one's.
     pub frame_period: TimeNs,
+    /// Fields in a colour frame.
+    pub fields: usize,
 }
 
 impl PanelTiming {
     /// The nominal timing of `panel`, whole nanoseconds: within 1 ns a field of the refresh rate.
     pub fn new(panel: &Panel) -> Self {
-        let field_period = panel.field_period();
-        Self { field_period, frame_period: TimeNs(field_period.0 * FIELDS as i64) }
+        let (field_period, fields) = (panel.field_period(), panel.fields());
+        let frame_period = TimeNs(field_period.0 * fields as i64);
+        let refresh_period = if panel.mode == PanelMode::ChannelPacked { frame_period } else { field_period };
+        Self { field_period, refresh_period, frame_period, fields }
     }
 }
 
-/// One colour field that has come on the panel.
+/// A video frame that has come on the panel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct PresentedField {
-    /// The frame whose pattern is shown; `None` for the flat pattern before the first and after the last frame.
+pub struct PresentedRefresh {
+    /// The frame whose pattern is shown; `None` for the flat pattern.
     pub frame: Option<FrameTag>,
-    /// Position in the field order.
+    /// The first field of the colour frame that this refresh carries: 0 in channel-packed mode.
     pub field: usize,
-    /// The colour whose pattern is shown.
-    pub colour: Colour,
+    /// Whether the colour frame had been shown before, because no newer one was there in time.
+    pub repeated: bool,
     /// When the pattern came on the panel.
     pub t_present: TimeNs,
     /// Where `t_present` comes from.
     pub provenance: Provenance,
-    /// Whether the frame had been shown before, because no newer one was there in time.
-    pub repeated: bool,
+    /// The display controller's own count of refreshes, where it has one.
+    pub refresh_count: Option<u64>,
+}
+
+/// What goes wrong at a panel that was open. Lasers are dark until the panel is back.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum PanelFault {
+    /// The connector has no panel any more.
+    #[error("the panel was unplugged: plug it in again, holod takes it back")]
+    Unplugged,
+    /// Another program drives the display.
+    #[error("another program took the display over: switch back to holod's terminal or end that program")]
+    MastershipLost,
+    /// The graphics device is gone or was reset.
+    #[error("the graphics device was lost")]
+    DeviceLost,
+    /// The window was closed, hidden or moved off its monitor.
+    #[error("the window is not on its monitor any more")]
+    WindowLost,
+    /// The panel no longer takes its own mode.
+    #[error("the display refused the panel's own size or rate: check the cable and the monitor settings")]
+    ModeRefused,
+    /// The system refused something else.
+    #[error("the display failed: {0}")]
+    System(Errno),
+}
+
+impl PanelFault {
+    /// Whether [`Presenter::recover`] can mend it.
+    pub const fn is_recoverable(self) -> bool {
+        !matches!(self, Self::System(_))
+    }
+}
+
+/// A panel, real or virtual, driven from one thread.
+pub trait Presenter: Send {
+    /// Whether there is no panel but this program, so that its software times are the truth.
+    fn is_virtual(&self) -> bool;
+
+    /// A descriptor that becomes readable when [`Self::tick`] has something to do; without one only time wakes it.
+    fn wake_fd(&self) -> Option<BorrowedFd<'_>> {
+        None
+    }
+
+    /// The next time at which [`Self::tick`] has something to do, whatever [`Self::wake_fd`] says.
+    fn t_next(&self) -> TimeNs;
+
+    /// Brings the panel to `now`: takes the newest frame when the next video frame is chosen, and calls `presented` for
+    /// each refresh that has come on the panel since the last call, in order; also for one that shows what was shown
+    /// before. Neither allocates, locks nor logs, and waits for nothing but the panel.
+    ///
+    /// # Errors
+    /// [`PanelFault`]; nothing more is presented until [`Self::recover`] has succeeded.
+    fn tick(
+        &mut self,
+        now: TimeNs,
+        frames: &mut FrameSource,
+        presented: &mut dyn FnMut(PresentedRefresh),
+    ) -> Result<(), PanelFault>;
+
+    /// From the next colour frame on, shows the flat pattern and takes no more frames.
+    fn show_flat(&mut self);
+
+    /// Takes the panel back after a fault; called some times a second while it is lost. May allocate and may wait for
+    /// the system, since lasers are dark.
+    ///
+    /// # Errors
+    /// [`PanelFault`] while the panel is not to be had.
+    fn recover(&mut self, now: TimeNs) -> Result<(), PanelFault>;
+
+    /// What was looked at on the way to the panel when it was opened or last taken back, where it says.
+    fn checks(&self) -> &[DisplayCheck] {
+        &[]
+    }
+
+    /// The levels of the frame that was reported last; `None` for the flat pattern.
+    fn shown(&self) -> Option<&LevelsFrame>;
+}
+
+/// What a presenter must know of the panel.
+#[derive(Clone, Debug)]
+pub struct PanelSetup {
+    /// The panel, as the rig describes it.
+    pub panel: Panel,
+    /// The flat pattern; its layout is that of every frame.
+    pub flat: LevelsFrame,
+}
+
+impl PanelSetup {
+    /// The setup for `panel`, whose frames `encoder` makes.
+    pub fn new(panel: &Panel, encoder: &PanelEncoder) -> Self {
+        let mut flat = LevelsFrame::new(FrameLayout::new(panel, encoder.panel_resolution()));
+        encoder.encode_flat(&mut flat);
+        Self { panel: panel.clone(), flat }
+    }
+}
+
+/// Why a panel could not be opened.
+#[derive(Debug, thiserror::Error)]
+pub enum OpenError {
+    /// The figures of a virtual panel.
+    #[error(transparent)]
+    Spec(#[from] SpecError),
+    /// A connector of a graphics card.
+    #[error(transparent)]
+    Drm(#[from] drm::DrmError),
+    /// The panel's window.
+    #[cfg(feature = "window")]
+    #[error("--output window: {0}")]
+    Window(#[from] window::WindowError),
+    /// The program holds no code for it.
+    #[error("this program was built without --output {kind}; build it with `--features {kind}`")]
+    NotBuilt {
+        /// The presenter, which is also the feature's name.
+        kind: &'static str,
+    },
+}
+
+/// Opens the panel that `spec` names.
+///
+/// # Errors
+/// [`OpenError`]: there is no such panel, it is not the one that the rig describes, or it may not be opened.
+pub fn open_panel(spec: &OutputSpec, setup: &PanelSetup, now: TimeNs) -> Result<Box<dyn Presenter>, OpenError> {
+    Ok(match spec {
+        OutputSpec::Headless(faults) => Box::new(HeadlessPanel::new(setup, now, *faults)),
+        OutputSpec::Drm(target) => Box::new(drm::DrmPanel::open(target, setup)?),
+        #[cfg(feature = "window")]
+        OutputSpec::Window(spec) => {
+            let server = window::DisplayServer::from_environment()?;
+            Box::new(window::WindowPanel::open(server, window::Road::best(), spec, setup)?)
+        }
+        #[cfg(not(feature = "window"))]
+        OutputSpec::Window(_) => return Err(OpenError::NotBuilt { kind: "window" }),
+    })
 }
 
 /// The way of frames to the panel: three buffers, of which the newest complete one is shown; wait-free at both ends.
@@ -106,29 +262,4 @@ impl FrameSource {
     pub fn current_mut(&mut self) -> &mut LevelsFrame {
         self.0.output_buffer_mut()
     }
-}
-
-/// A panel, real or virtual, driven from one thread.
-pub trait Presenter: Send {
-    /// The panel's clockwork.
-    fn timing(&self) -> PanelTiming;
-
-    /// Whether there is no panel but this program, so that its software times are the truth.
-    fn is_virtual(&self) -> bool;
-
-    /// The next time at which [`Self::tick`] has something to do.
-    fn t_next(&self) -> TimeNs;
-
-    /// Brings the panel to `now`: takes the newest frame at each colour frame's start and calls `presented` for each
-    /// field that has come on the panel since the last call, in order. Neither allocates, locks nor logs.
-    fn tick(&mut self, now: TimeNs, frames: &mut FrameSource, presented: &mut dyn FnMut(PresentedField));
-
-    /// From the next colour frame on, shows the flat pattern and takes no more frames.
-    fn show_flat(&mut self);
-
-    /// The last frame whose levels were shown; `None` before the first one, and where it cannot say.
-    fn last_frame(&self) -> Option<&LevelsFrame>;
-
-    /// Takes the levels that were shown and kept, by slot (see [`FrameTag::keep`]).
-    fn take_kept(&mut self) -> Vec<Option<LevelsFrame>>;
 }

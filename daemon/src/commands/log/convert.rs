@@ -2,18 +2,14 @@
 
 use holod_pupil_input::export;
 
-use super::read;
+use super::{odd_scale, read};
 use crate::cli::{LogConvertArgs, LogFormatArg};
+use crate::destination::Destination;
 use crate::failure::{Exit, Failure};
 use crate::report;
 
 pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
-    if args.out.exists() {
-        return Err(Failure::new(
-            Exit::CannotCreate,
-            format!("{} exists already; name another file with --out, or remove it", args.out.display()),
-        ));
-    }
+    let out = Destination::new(&args.out, "--out", args.force)?;
     if args.to == LogFormatArg::Csv && args.scale.is_some() {
         return Err(Failure::new(Exit::Usage, "--scale is for --to lines: CSV keeps the log's own unit"));
     }
@@ -21,16 +17,21 @@ pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
     for note in recording.notes() {
         tracing::info!("{note}");
     }
-    let written = match args.to {
-        LogFormatArg::Lines => export::write_lines(&recording, args.scale, &args.out),
-        LogFormatArg::Csv => export::write_csv(&recording, &args.out),
-    };
-    written.map_err(|error| {
-        let exit = match error {
-            export::ExportError::Io { .. } => Exit::CannotCreate,
-            _ => Exit::Usage,
+    if let Some(warning) = odd_scale(&args.log, &recording, args.scale) {
+        tracing::warn!("{warning}");
+    }
+    out.write(|path| {
+        let written = match args.to {
+            LogFormatArg::Lines => export::write_lines(&recording, args.scale, path),
+            LogFormatArg::Csv => export::write_csv(&recording, path),
         };
-        Failure::because(exit)(error)
+        written.map_err(|error| {
+            let exit = match error {
+                export::ExportError::Io { .. } => Exit::CannotCreate,
+                _ => Exit::Usage,
+            };
+            Failure::because(exit)(error)
+        })
     })?;
     if args.to == LogFormatArg::Lines && recording.samples().any(|sample| sample.aperture_mm.is_some()) {
         tracing::warn!(
@@ -38,6 +39,9 @@ pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
         );
     }
     let rejected = recording.faults().total();
+    if out.is_stdout() {
+        return Ok(());
+    }
     report::print(&format!(
         "{}: {} samples of {} written to {}; {rejected} lines or cells held none",
         args.log.display(),

@@ -9,8 +9,9 @@ use holod_pupil_input::{Decision, Estimator, EstimatorSettings, LogInfo, Recordi
 use ratatui::style::Color;
 use serde::Serialize;
 
-use super::read;
+use super::{odd_scale, read};
 use crate::cli::LogInfoArgs;
+use crate::destination::Destination;
 use crate::failure::{Exit, Failure};
 use crate::pictures::{PupilPlot, PupilSampleMark};
 use crate::report;
@@ -39,21 +40,32 @@ struct Judged {
 }
 
 pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
+    let plot = args.plot.as_deref().map(|path| Destination::new(path, "--plot", args.force)).transpose()?;
+    let plots_to_stdout = plot.as_ref().is_some_and(Destination::is_stdout);
+    if plots_to_stdout && args.json {
+        return Err(Failure::new(
+            Exit::Usage,
+            "--plot - and --json would both write to standard output: give one of them",
+        ));
+    }
     let recording = read(&args.log)?;
+    if let Some(warning) = odd_scale(&args.log, &recording, args.scale) {
+        tracing::warn!("{warning}");
+    }
     let info = LogInfo::of(&recording, args.scale);
     let in_mm = recording.unit() == SizeUnit::Millimetres || args.scale.is_some();
     let judged = in_mm.then(|| judge(&recording, args.scale));
-    if args.plot.is_some() && judged.is_none() {
-        return Err(Failure::new(
-            Exit::Usage,
-            format!(
-                "--plot shows millimetres, and the log is in {}: give --scale MM_PER_UNIT",
-                recording.unit().name()
-            ),
-        ));
+    if let Some(plot) = &plot {
+        let raw = raw_marks(&recording);
+        let drawn = match &judged {
+            Some(judged) => PupilPlot { unit: None, samples: &judged.marks, estimate: &judged.estimate, truth: &[] },
+            // The gate judges millimetres only.
+            None => PupilPlot { unit: Some(recording.unit().name()), samples: &raw, estimate: &[], truth: &[] },
+        };
+        plot.write(|path| drawn.save(path))?;
     }
-    if let (Some(path), Some(judged)) = (&args.plot, &judged) {
-        PupilPlot { samples: &judged.marks, estimate: &judged.estimate, truth: &[] }.save(path)?;
+    if plots_to_stdout {
+        return Ok(());
     }
     if args.json {
         let gate = judged.as_ref().map(|judged| &judged.counts);
@@ -104,6 +116,21 @@ fn judge(recording: &Recording, scale: Option<f64>) -> Judged {
     }
     estimator.finish(&mut note);
     Judged { counts, marks, estimate }
+}
+
+/// What a plot can show of the samples as the log has them.
+fn raw_marks(recording: &Recording) -> Vec<PupilSampleMark> {
+    let begins = recording.begins();
+    recording
+        .samples()
+        .step_by(step(recording))
+        .filter(|sample| sample.valid && sample.diameter_mm.is_finite())
+        .map(|sample| PupilSampleMark {
+            t_s: (sample.t_sample - begins).seconds(),
+            raw_mm: f64::from(sample.diameter_mm),
+            accepted: true,
+        })
+        .collect()
 }
 
 /// More points than this say no more in a plot.

@@ -5,7 +5,7 @@ mod info;
 
 use std::path::Path;
 
-use holod_pupil_input::{Recording, ReplayError};
+use holod_pupil_input::{Recording, ReplayError, SizeUnit, scaled_millimetres};
 
 use crate::cli::LogCommand;
 use crate::failure::{Exit, Failure};
@@ -22,4 +22,10 @@ fn read(path: &Path) -> Result<Recording, Failure> {
         let exit = if matches!(error, ReplayError::Io { .. }) { Exit::NoInput } else { Exit::Data };
         Failure::because(exit)(error)
     })
+}
+
+/// That the log is in millimetres already, and is scaled all the same.
+fn odd_scale(path: &Path, recording: &Recording, scale: Option<f64>) -> Option<String> {
+    let scale = scale.filter(|scale| recording.unit() == SizeUnit::Millimetres && *scale != 1.0)?;
+    Some(scaled_millimetres(&format!("pupil log {}", path.display()), scale))
 }

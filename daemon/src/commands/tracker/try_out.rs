@@ -7,13 +7,16 @@ use std::time::Duration;
 
 use holod_calibration::TimeNs;
 use holod_calibration::rig::Rig;
-use holod_pupil_input::{RecordFiles, Tracker, TrackerHandle, TrackerOptions, TrackerSpec, Verdict, host_now};
+use holod_pupil_input::{
+    RecordFiles, RefusalWatch, Tracker, TrackerHandle, TrackerOptions, TrackerSpec, Verdict, host_now,
+};
 use ratatui::style::Color;
 use serde::Serialize;
 
 use super::observed::{EyeFigures, Observed, Quantiles};
 use crate::cli::TryArgs;
 use crate::failure::{Exit, Failure};
+use crate::record;
 use crate::session::{Signals, tracker_failure};
 use crate::terminal::{Axes, LiveText, Series, TextSize, plot};
 use crate::{report, setup};
@@ -53,6 +56,9 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     if let Some(scale) = args.scale {
         rig.tracker.scale = Some(scale);
     }
+    if let Some(folder) = args.record.as_deref().filter(|_| args.force) {
+        record::remove_earlier(folder)?;
+    }
     let signals = Signals::install()?;
     let began = host_now();
     let options = TrackerOptions {
@@ -67,6 +73,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         }
     }
     let mut observed = Observed::default();
+    let mut refusals = RefusalWatch::new(&rig.tracker, began);
     let mut live = LiveText::default();
     let mut redrawn = began;
     let ended_by = loop {
@@ -74,6 +81,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         let now = host_now();
         while let Some(decision) = tracker.decisions().pop() {
             observed.take(&decision);
+            refusals.note(&decision);
         }
         if let Some(signal) = signals.caught() {
             break signal.to_owned();
@@ -96,6 +104,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     tracker.stop();
     while let Some(decision) = tracker.decisions().pop() {
         observed.take(&decision);
+        refusals.note(&decision);
     }
     // Counts and figures are of all samples; link and pupil as they were before the tracker was stopped.
     let Report { link, pupil_mm, pupil_state, trouble, .. } = last;
@@ -120,10 +129,11 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         return Ok(());
     }
     let bytes = report.counts.get("bytes").copied().unwrap_or(0);
-    let heard = match (bytes, observed.eyes().next()) {
-        (_, Some(_)) => "samples came, and the gate believed none: see the reasons above".to_owned(),
-        (0, None) => "nothing was heard; is it switched on, and does it send without being asked?".to_owned(),
-        (bytes, None) => format!("{bytes} bytes came, and no sample was in them: is it this profile and baud rate?"),
+    refusals.judge(now, &tracker.counters(), true);
+    let heard = match refusals.current().filter(|refusal| refusal.refused > 0) {
+        Some(refusal) => refusal.to_string(),
+        None if bytes == 0 => "nothing was heard; is it switched on, and does it send without being asked?".to_owned(),
+        None => format!("{bytes} bytes came, and no sample was in them: is it this profile and baud rate?"),
     };
     Err(Failure::new(Exit::Unavailable, format!("tracker {spec}: {heard}")))
 }

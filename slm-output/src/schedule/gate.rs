@@ -3,8 +3,13 @@
 use holod_calibration::rig::{Lasers, Panel, PanelMode};
 use holod_calibration::{PerColour, TimeNs};
 
-use super::{FieldWindow, LaserError, LaserProgram, LitWindow, Trigger};
-use crate::present::{PanelTiming, PresentedField};
+use super::ShownField;
+use crate::laser::{FieldWindow, LaserError, LaserProgram, LitWindow, Trigger};
+use crate::present::PanelTiming;
+
+/// A report may lie off the panel's rhythm by this much whatever the rig says: display controllers stamp to the
+/// microsecond, and rounding to whole scan lines is below it.
+const TOLERANCE_MIN: TimeNs = TimeNs(20_000);
 
 /// Cuts a window out of each colour field: after the panel's settle time and the laser's on delay, and never past the
 /// field's end.
@@ -45,6 +50,34 @@ impl Gate {
         Ok(Self { timing, delay, width: lasers.width.min(room), settle: panel.settle })
     }
 
+    /// Who starts the windows: the panel's own sync where its sequencer shows the colours of a refresh, else the host.
+    pub fn trigger(panel: &Panel) -> Trigger {
+        match panel.mode {
+            PanelMode::ChannelPacked => Trigger::PanelSync,
+            PanelMode::FieldSequential | PanelMode::Monochrome(_) => Trigger::Host,
+        }
+    }
+
+    /// How far the reported time of a refresh may be wrong without light where it must not be.
+    ///
+    /// Where the host starts the windows that is half of the time that the rig leaves free at both ends of a window, on
+    /// delay and the rest of the field; the other half is for what the rhythm itself is off by. Where the panel's sync starts them the reports only say that the panel runs.
+    pub fn time_tolerance(&self, trigger: Trigger) -> TimeNs {
+        match trigger {
+            Trigger::PanelSync => TimeNs(self.timing.refresh_period.0 / 16),
+            Trigger::Host => {
+                let before = self.delay - self.settle;
+                let after = self.timing.field_period - self.delay - self.width;
+                TimeNs(before.min(after).0 / 2).max(TOLERANCE_MIN)
+            }
+        }
+    }
+
+    /// Length of a window.
+    pub fn width(&self) -> TimeNs {
+        self.width
+    }
+
     /// From a field's presentation to the middle of its lit window.
     pub fn middle(&self) -> TimeNs {
         TimeNs(self.delay.0 + self.width.0 / 2)
@@ -61,12 +94,12 @@ impl Gate {
     }
 
     /// When `field` makes way for the next one.
-    pub fn t_end(&self, field: &PresentedField) -> TimeNs {
+    pub fn t_end(&self, field: &ShownField) -> TimeNs {
         field.t_present + self.timing.field_period
     }
 
     /// The window in which `field`'s own laser may be lit.
-    pub fn window(&self, field: &PresentedField) -> LitWindow {
+    pub fn window(&self, field: &ShownField) -> LitWindow {
         let t_on = field.t_present + self.delay;
         LitWindow { colour: field.colour, t_on, t_off: t_on + self.width }
     }
@@ -93,13 +126,13 @@ impl Gate {
             width: self.width,
         };
         Ok(LaserProgram {
-            trigger: match panel.mode {
-                PanelMode::ChannelPacked => Trigger::PanelSync,
-                PanelMode::FieldSequential => Trigger::Host,
+            trigger: Self::trigger(panel),
+            sequence: match panel.mode {
+                PanelMode::ChannelPacked | PanelMode::FieldSequential => panel.field_order,
+                PanelMode::Monochrome(colour) => [colour; 3],
             },
-            sequence: panel.field_order,
             windows: [window(0), window(1), window(2)],
-            frame_period: self.timing.frame_period,
+            frame_period: TimeNs(3 * self.timing.field_period.0),
             power_uw,
             heartbeat_timeout: lasers.heartbeat_timeout,
         })
@@ -121,13 +154,14 @@ mod tests {
         let long = Lasers { width: TimeNs(50 * MS), ..rig.lasers.clone() };
         for (lasers, t_off) in [(&rig.lasers, TimeNs(105_100_000)), (&long, TimeNs(105_555_556))] {
             let gate = Gate::new(&rig.panel, lasers).unwrap();
-            let field = PresentedField {
+            let field = ShownField {
                 frame: None,
                 field: 1,
                 colour: Colour::Blue,
                 t_present: TimeNs(100 * MS),
                 provenance: Provenance::Hardware,
                 repeated: false,
+                reported: true,
             };
             let window = LitWindow { colour: Colour::Blue, t_on: TimeNs(102_100_000), t_off };
             assert_eq!(gate.window(&field), window);

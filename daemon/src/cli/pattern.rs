@@ -1,0 +1,224 @@
+//! The options of `holod pattern`.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::{Args, Subcommand, ValueEnum};
+use holod_calibration::Colour;
+
+use super::RigArgs;
+
+/// What is drawn, each kind with its own figures.
+#[derive(Subcommand, Debug, Clone)]
+pub enum PatternKind {
+    /// One level everywhere, as it is: without look-up table and flatness.
+    Level {
+        /// The level.
+        #[arg(value_name = "LEVEL")]
+        level: u16,
+        /// Where to.
+        #[command(flatten)]
+        to: PatternTarget,
+    },
+    /// Squares of two phases: with π between them no light is left in the middle.
+    Checkerboard {
+        /// Pixels across two squares; 2 sends all light beyond the relay's stop.
+        #[arg(long, value_name = "PX", default_value_t = 16)]
+        period: usize,
+        /// Difference of phase between the squares, in multiples of π.
+        #[arg(long, value_name = "PI", default_value_t = 1.0)]
+        depth: f64,
+        /// Where to.
+        #[command(flatten)]
+        to: PatternTarget,
+    },
+    /// Parallel lines, which send the light to one side.
+    Grating {
+        /// Pixels across one line.
+        #[arg(long, value_name = "PX", default_value_t = 8.0)]
+        period: f64,
+        /// Where the first order goes: 0 to the right, 90 up.
+        #[arg(long, value_name = "DEGREES", default_value_t = 0.0, allow_negative_numbers = true)]
+        angle: f64,
+        /// The lines' shape.
+        #[arg(long, value_enum, default_value_t = ProfileArg::Blazed)]
+        profile: ProfileArg,
+        /// Largest less smallest phase in multiples of π; what sends most light into the first order when left out.
+        #[arg(long, value_name = "PI")]
+        depth: Option<f64>,
+        /// Where to.
+        #[command(flatten)]
+        to: PatternTarget,
+    },
+    /// A lens around the optical axis.
+    Lens {
+        /// From the panel to the focus; negative for a lens that diverges.
+        #[arg(long, value_name = "MM", allow_negative_numbers = true)]
+        focal_length: f64,
+        /// Its diameter; the largest that does not alias when left out.
+        #[arg(long, value_name = "MM")]
+        diameter: Option<f64>,
+        /// Where to.
+        #[command(flatten)]
+        to: PatternTarget,
+    },
+    /// A grid of bright dots on black, for a camera focused at infinity: the middle one is twice as wide, one to the
+    /// right of it and one two above it are left out.
+    Dots {
+        /// Pixels from dot to dot.
+        #[arg(long, value_name = "PX", default_value_t = 60)]
+        spacing: usize,
+        /// A dot's diameter.
+        #[arg(long, value_name = "PX", default_value_t = 16)]
+        dot: usize,
+        /// Where to.
+        #[command(flatten)]
+        to: PatternTarget,
+    },
+    /// Bright lines on black that cross at the optical axis, with a square in the upper right quarter.
+    CrossHair {
+        /// A line's width.
+        #[arg(long, value_name = "PX", default_value_t = 6)]
+        line: usize,
+        /// Where to.
+        #[command(flatten)]
+        to: PatternTarget,
+    },
+    /// A blaze of another direction in each colour's field: shows which laser lights which field.
+    FieldIdentity {
+        /// From the axis to the spots, in the eyepiece's focal plane; three quarters of what passes the relay's stop
+        /// when left out.
+        #[arg(long, value_name = "MM")]
+        radius: Option<f64>,
+        /// Where to.
+        #[command(flatten)]
+        to: PatternTarget,
+    },
+}
+
+impl PatternKind {
+    /// Where the pattern goes.
+    pub fn target(&self) -> &PatternTarget {
+        match self {
+            Self::Level { to, .. }
+            | Self::Checkerboard { to, .. }
+            | Self::Grating { to, .. }
+            | Self::Lens { to, .. }
+            | Self::Dots { to, .. }
+            | Self::CrossHair { to, .. }
+            | Self::FieldIdentity { to, .. } => to,
+        }
+    }
+}
+
+/// Where a pattern goes.
+#[derive(Args, Debug, Clone)]
+pub struct PatternTarget {
+    /// The rig.
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// Colours that have the pattern, the others are flat; all of them when left out.
+    #[arg(long, value_enum, value_name = "COLOUR", num_args = 1.., value_delimiter = ',')]
+    pub colour: Vec<ColourArg>,
+    /// The optical axis in pixels from the panel's centre, right and up: the middle of lens, dots and cross-hair.
+    #[arg(long, value_name = "X,Y", default_value = "0,0", value_parser = parse_axis, allow_hyphen_values = true)]
+    pub axis: [f64; 2],
+    /// PNG of what travels to the panel; where the fields travel one after another, one for each (FILE-1-red.png and
+    /// so on).
+    #[arg(long, value_name = "FILE.png")]
+    pub out: Option<PathBuf>,
+    /// Show it, as after `run --output`, with each field's own laser lit.
+    #[arg(long, value_name = "SPEC")]
+    pub output: Option<String>,
+    /// Show it for so long, for example 10s; until a signal comes when left out.
+    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration, requires = "output")]
+    pub duration: Option<Duration>,
+    /// Show it with every laser dark.
+    #[arg(long, requires = "output")]
+    pub dark: bool,
+    /// Print what is to be seen as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// The shape of a grating's lines.
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ProfileArg {
+    /// Two phases, half a period each.
+    Binary,
+    /// Rising evenly.
+    Blazed,
+    /// A sine.
+    Sinusoidal,
+}
+
+/// A colour by name.
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+#[expect(missing_docs, reason = "the names say it")]
+pub enum ColourArg {
+    Red,
+    Green,
+    Blue,
+}
+
+impl From<ColourArg> for Colour {
+    fn from(colour: ColourArg) -> Self {
+        match colour {
+            ColourArg::Red => Self::Red,
+            ColourArg::Green => Self::Green,
+            ColourArg::Blue => Self::Blue,
+        }
+    }
+}
+
+fn parse_axis(text: &str) -> Result<[f64; 2], String> {
+    let place = |text: &str| text.trim().parse().ok().filter(|place_px: &f64| place_px.is_finite());
+    let axis_px = text.split_once(',').and_then(|(x, y)| Some([place(x)?, place(y)?]));
+    axis_px
+        .ok_or_else(|| format!("found '{text}', expected pixels right and up from the panel's centre such as 12,-3.5"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::{Cli, Command};
+    use clap::Parser;
+
+    fn parsed(line: &str) -> Result<PatternKind, clap::Error> {
+        let cli = Cli::try_parse_from(line.split_whitespace())?;
+        let Some(Command::Pattern(kind)) = cli.command else { panic!("{line}") };
+        Ok(kind)
+    }
+
+    #[test]
+    fn places_and_angles_may_be_negative() {
+        let PatternKind::Grating { angle, to, .. } =
+            parsed("holod pattern grating --angle -30 --axis -3,4.5 --colour red,blue").unwrap()
+        else {
+            panic!()
+        };
+        assert_eq!(
+            (angle, to.axis, to.colour.as_slice()),
+            (-30.0, [-3.0, 4.5], &[ColourArg::Red, ColourArg::Blue][..])
+        );
+        assert!(parsed("holod pattern lens --focal-length -20").is_ok());
+    }
+
+    #[test]
+    fn what_makes_no_sense_is_refused() {
+        for line in [
+            "holod pattern",
+            "holod pattern stripes",
+            "holod pattern level",
+            "holod pattern level 70000",
+            "holod pattern lens",
+            "holod pattern dots --axis 3",
+            "holod pattern dots --axis nan,0",
+            "holod pattern dots --duration 3s",
+            "holod pattern dots --dark",
+            "holod pattern dots --colour violet",
+        ] {
+            assert!(parsed(line).is_err(), "{line}");
+        }
+    }
+}

@@ -1,0 +1,144 @@
+//! `holod laser` and `holod dark`: the laser box by itself.
+
+use std::time::Duration;
+
+use holod_calibration::rig::{LaserDriver, Rig};
+use holod_calibration::{Colour, TimeNs};
+use holod_pupil_input::host_now;
+use holod_slm_output::laser::{
+    BoxEvent, BoxReport, DarkReason, LaserBox, LaserError, LaserProgram, SerialBox, SerialOptions, Trigger, make_dark,
+    open_laser,
+};
+use holod_slm_output::schedule::Gate;
+
+use crate::cli::{LaserArgs, LaserCommand};
+use crate::failure::{Exit, Failure};
+use crate::{report, setup};
+
+/// How long beyond its own timeout a box is waited for that should go dark by itself.
+const PATIENCE: TimeNs = TimeNs(2_000_000_000);
+
+pub(super) fn laser(command: &LaserCommand) -> Result<(), Failure> {
+    match command {
+        LaserCommand::Status(args) => status(&bench(args)?),
+        LaserCommand::Arm(args) => arm(&bench(args)?),
+        LaserCommand::Dark(args) => dark(args),
+    }
+}
+
+/// Puts the lasers out, whoever else has their ports open.
+pub(super) fn dark(args: &LaserArgs) -> Result<(), Failure> {
+    let rig = bench(args)?;
+    let driver = &rig.lasers.driver;
+    if *driver == LaserDriver::Simulated {
+        return report::print("no laser box on this bench: its simulated lasers ended with the daemon");
+    }
+    make_dark(driver, host_now).map_err(Failure::because(Exit::Unavailable))?;
+    report::print(&format!("{}: the lasers acknowledged that they are dark", ports(driver)))
+}
+
+/// The rig that was named, or the built-in one with a laser box at the port that was named.
+fn bench(args: &LaserArgs) -> Result<Rig, Failure> {
+    let mut rig = setup::rig(&args.rig)?;
+    if let Some(path) = &args.port {
+        rig.lasers.driver = LaserDriver::Serial { path: path.clone(), sync_wire: false };
+    }
+    Ok(rig)
+}
+
+fn ports(driver: &LaserDriver) -> String {
+    driver.paths().iter().map(|path| path.display().to_string()).collect::<Vec<_>>().join(", ")
+}
+
+fn status(rig: &Rig) -> Result<(), Failure> {
+    let unavailable = Failure::because(Exit::Unavailable);
+    let text = match &rig.lasers.driver {
+        LaserDriver::Simulated => "simulated: no light leaves this bench".to_owned(),
+        LaserDriver::Serial { path, .. } => {
+            let found = SerialBox::inspect(path, host_now).map_err(unavailable)?;
+            format!("{}: {}", path.display(), text_of(&found))
+        }
+        // These say who they are when they are opened, and are told to be dark when they are closed.
+        driver => {
+            drop(open_laser(&rig.lasers, host_now).map_err(unavailable)?);
+            format!(
+                "{}: recognised, dark; it cannot time single fields and stays lit when its host dies",
+                ports(driver)
+            )
+        }
+    };
+    report::print(&text)
+}
+
+fn text_of(found: &BoxReport) -> String {
+    let BoxReport { name, limits, state, clock_error_ns } = found;
+    let lit = state.lit.map_or("none".to_owned(), |laser| Colour::ALL[laser as usize].name().to_owned());
+    let [red, green, blue] = limits.power_uw.map(|uw| f64::from(uw) / 1e3);
+    let sync = match (limits.sync_input, state.sync.t_last) {
+        (false, _) => "it has none".to_owned(),
+        (true, None) => "no edge since it booted".to_owned(),
+        (true, Some(_)) => format!("{} edges since it booted", state.sync.count),
+    };
+    format!(
+        "a laser box called {name}\n\
+         state      {}; laser lit: {lit}; dark last because of {} ({})\n\
+         interlock  {}\n\
+         sync wire  {sync}\n\
+         limits     red {red}, green {green}, blue {blue} mW; heartbeat timeout up to {} ms; gates up to {} µs late\n\
+         clock      known to {:.0} µs from here",
+        if state.armed { "armed" } else { "dark" },
+        state.reason.name(),
+        state.reason.meaning(),
+        if state.interlock_closed { "closed" } else { "open: the box cannot be armed" },
+        limits.timeout_us / 1000,
+        limits.jitter_us,
+        *clock_error_ns as f64 / 1e3,
+    )
+}
+
+/// Programs the box, arms it, lights nothing, falls silent, and sees whether it goes dark by itself.
+fn arm(rig: &Rig) -> Result<(), Failure> {
+    let LaserDriver::Serial { path, .. } = &rig.lasers.driver else {
+        return Err(Failure::new(
+            Exit::Unavailable,
+            "holod laser arm tries out whether a box goes dark by itself, which only one with a heartbeat does: name \
+             its port with --port, or a rig whose lasers have driver = \"serial\"",
+        ));
+    };
+    let unavailable = Failure::because(Exit::Unavailable);
+    let program = Gate::new(&rig.panel, &rig.lasers).and_then(|gate| gate.program(&rig.panel, &rig.lasers));
+    // Windows that the host asks for, of which it asks for none: whatever is on the sync wire, nothing is lit.
+    let program = LaserProgram { trigger: Trigger::Host, ..program.map_err(Failure::because(Exit::Config))? };
+    let options = SerialOptions { sync_wire: false, ..SerialOptions::default() };
+    let mut laser = SerialBox::open(path, options, host_now).map_err(&unavailable)?;
+    let silent = silence(&mut laser, &program);
+    let acknowledged = laser.dark(DarkReason::Asked, host_now());
+    let (t_dark, reason) = silent.map_err(&unavailable)?;
+    acknowledged.map_err(unavailable)?;
+    let timeout_ms = program.heartbeat_timeout.seconds() * 1e3;
+    report::print(&format!(
+        "{}: armed with no laser lit, and dark by itself after {:.0} ms of silence ({}; its timeout is {timeout_ms:.0} ms)",
+        path.display(),
+        t_dark.seconds() * 1e3,
+        reason.name(),
+    ))
+}
+
+/// After which silence the armed box is dark, and why.
+fn silence(laser: &mut SerialBox, program: &LaserProgram) -> Result<(TimeNs, DarkReason), LaserError> {
+    laser.dark(DarkReason::Asked, host_now())?;
+    laser.program(program, host_now())?;
+    laser.arm(host_now())?;
+    let t_armed = host_now();
+    let t_end = t_armed + program.heartbeat_timeout + PATIENCE;
+    while host_now() < t_end {
+        // The box's own word, not what the host supposes of it.
+        let state = laser.report()?.state;
+        if !state.armed {
+            return Ok((host_now() - t_armed, state.reason));
+        }
+        laser.poll(host_now(), &mut |_: BoxEvent| {})?;
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    Err(LaserError::NoAnswer { command: "silence", waited_ms: PATIENCE.0 / 1_000_000 })
+}

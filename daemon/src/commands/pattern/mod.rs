@@ -1,0 +1,98 @@
+//! `holod pattern`: test patterns as pictures, in words, and on the panel.
+
+mod show;
+mod sight;
+
+use std::f64::consts::PI;
+use std::path::{Path, PathBuf};
+
+use holod_calibration::{Colour, Metres, PerColour};
+use holod_slm_output::patterns::{Pattern, Placement, Profile};
+use holod_slm_output::{FrameLayout, LevelsFrame, OutputSpec, PanelEncoder};
+
+use self::sight::Sight;
+use crate::cli::{PatternKind, PatternTarget, ProfileArg};
+use crate::failure::{Exit, Failure};
+use crate::pictures::video_pictures;
+use crate::{report, setup};
+
+pub(super) fn pattern(kind: &PatternKind) -> Result<(), Failure> {
+    let to = kind.target();
+    let output =
+        to.output.as_deref().map(str::parse::<OutputSpec>).transpose().map_err(Failure::because(Exit::Usage))?;
+    let rig = setup::rig(&to.rig)?;
+    let resolution = rig.resolution();
+    let encoder = PanelEncoder::new(&rig.panel, resolution, resolution).map_err(Failure::because(Exit::Config))?;
+    let (pattern, placement) = (of_arguments(kind), placement(to));
+    let mut levels = LevelsFrame::new(FrameLayout::new(&rig.panel, resolution));
+    let usage = Failure::because(Exit::Usage);
+    pattern.draw(&placement, &encoder, &rig.geometry, &mut levels).map_err(&usage)?;
+    let mut sight = Sight::of(&pattern, &placement, &rig).map_err(usage)?;
+    if let Some(out) = &to.out {
+        sight.files = save(&levels, out)?;
+    }
+    if to.json {
+        report::print_json(&sight)?;
+    } else {
+        report::print(sight.to_string().trim_end())?;
+    }
+    let Some(output) = output else { return Ok(()) };
+    let shown = show::show(&output, &rig, &encoder, &levels, to)?;
+    report::print(&shown.to_string())
+}
+
+fn of_arguments(kind: &PatternKind) -> Pattern {
+    let metres = |mm: f64| Metres(mm / 1e3);
+    match *kind {
+        PatternKind::Level { level, .. } => Pattern::Level { level },
+        PatternKind::Checkerboard { period, depth, .. } => {
+            Pattern::Checkerboard { period_px: period, depth_rad: depth * PI }
+        }
+        PatternKind::Grating { period, angle, profile, depth, .. } => Pattern::Grating {
+            period_px: period,
+            angle_deg: angle,
+            profile: match profile {
+                ProfileArg::Binary => Profile::Binary,
+                ProfileArg::Blazed => Profile::Blazed,
+                ProfileArg::Sinusoidal => Profile::Sinusoidal,
+            },
+            depth_rad: depth.map(|depth| depth * PI),
+        },
+        PatternKind::Lens { focal_length, diameter, .. } => {
+            Pattern::Lens { focal_length: metres(focal_length), diameter: diameter.map(metres) }
+        }
+        PatternKind::Dots { spacing, dot, .. } => Pattern::Dots { spacing_px: spacing, diameter_px: dot },
+        PatternKind::CrossHair { line, .. } => Pattern::CrossHair { line_px: line },
+        PatternKind::FieldIdentity { radius, .. } => Pattern::FieldIdentity { radius: radius.map(metres) },
+    }
+}
+
+fn placement(to: &PatternTarget) -> Placement {
+    let named = |colour| to.colour.is_empty() || to.colour.iter().any(|&named| Colour::from(named) == colour);
+    Placement { axis_px: to.axis, colours: PerColour(Colour::ALL.map(named)) }
+}
+
+/// Writes each video frame that carries `levels`: to `out`, or to a file beside it for each field.
+fn save(levels: &LevelsFrame, out: &Path) -> Result<Vec<PathBuf>, Failure> {
+    if out.is_dir() || out.file_stem().is_none() {
+        return Err(Failure::new(
+            Exit::CannotCreate,
+            format!("--out {}: expected the name of a PNG file to write", out.display()),
+        ));
+    }
+    let pictures = video_pictures(levels);
+    let single = pictures.len() == 1;
+    let mut files = Vec::with_capacity(pictures.len());
+    for (position, (colour, picture)) in pictures.iter().enumerate() {
+        let file = match colour {
+            Some(colour) if !single => {
+                let stem = out.file_stem().unwrap_or_default().to_string_lossy();
+                out.with_file_name(format!("{stem}-{}-{colour}.png", position + 1))
+            }
+            _ => out.to_path_buf(),
+        };
+        report::save_png(picture, &file)?;
+        files.push(file);
+    }
+    Ok(files)
+}

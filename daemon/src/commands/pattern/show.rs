@@ -1,0 +1,143 @@
+//! A test pattern on the panel.
+
+use std::fmt;
+use std::time::Duration;
+
+use holod_calibration::rig::{LaserDriver, Rig};
+use holod_calibration::{Colour, PerColour, TimeNs};
+use holod_pupil_input::host_now;
+use holod_slm_output::laser::{DarkReason, open_laser};
+use holod_slm_output::output::{OutputError, pacing_config};
+use holod_slm_output::pacing::Point;
+use holod_slm_output::present::{PanelSetup, open_panel};
+use holod_slm_output::{LevelsFrame, Output, OutputOptions, OutputSpec, Pacer, PanelEncoder, PanelEvent};
+
+use crate::cli::PatternTarget;
+use crate::failure::{Exit, Failure};
+use crate::session::Signals;
+
+/// Time that a frame may take before it has been measured.
+const FIRST_COPY: TimeNs = TimeNs(5_000_000);
+/// Signals and the end of the asked time are seen within this.
+const LONGEST_SLEEP: TimeNs = TimeNs(20_000_000);
+
+/// What came of showing a pattern.
+#[derive(Default)]
+pub(super) struct Shown {
+    ended_by: String,
+    duration_s: f64,
+    refresh_hz: f64,
+    fields: PerColour<u64>,
+    lit: PerColour<u64>,
+    /// Why the last field that was not lit was not.
+    dark: Option<DarkReason>,
+    lasers_dark: bool,
+    flat_presented: bool,
+}
+
+/// Shows `levels` on the panel that `spec` names until the asked time is over or a signal comes; lasers are dark when
+/// it returns. Each colour frame is submitted anew, so that lasers go dark where this program stalls.
+pub(super) fn show(
+    spec: &OutputSpec,
+    rig: &Rig,
+    encoder: &PanelEncoder,
+    levels: &LevelsFrame,
+    to: &PatternTarget,
+) -> Result<Shown, Failure> {
+    let signals = Signals::install()?;
+    let pacing = pacing_config(rig, FIRST_COPY).map_err(Failure::because(Exit::Config))?;
+    let mut output = open(spec, rig, encoder).map_err(Failure::because(Exit::Unavailable))?;
+    let switch = output.control.dark_switch();
+    switch.install_panic_hook(host_now);
+    if to.dark {
+        switch.dark(DarkReason::Asked);
+    } else if rig.lasers.driver != LaserDriver::Simulated {
+        tracing::warn!(
+            "lasers will be lit: an eye in the display may get all of their light in one spot; use a camera"
+        );
+    }
+    let planes = Colour::ALL.map(|colour| levels.unpack_colour(colour).levels);
+    let t_begin = host_now();
+    let duration = to.duration.map(|duration| TimeNs(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)));
+    let mut pacer = Pacer::new(pacing, t_begin);
+    let mut shown = Shown::default();
+    'frames: loop {
+        let plan = pacer.predict(host_now());
+        loop {
+            let now = host_now();
+            if let Some(signal) = signals.caught() {
+                shown.ended_by = signal.into();
+                break 'frames;
+            }
+            if duration.is_some_and(|duration| now - t_begin >= duration) {
+                shown.ended_by = "the asked duration".into();
+                break 'frames;
+            }
+            if now >= plan.t_wake {
+                break;
+            }
+            let sleep = (plan.t_wake - now).min(LONGEST_SLEEP);
+            std::thread::sleep(Duration::from_nanos(sleep.0 as u64));
+        }
+        pacer.mark(Point::WakeUp, plan.frame_id, host_now());
+        let frame = output.frames.acquire();
+        for colour in Colour::ALL {
+            frame.field_mut(colour).write(&planes[colour.index()]);
+        }
+        let now = host_now();
+        output.frames.submit(&plan, None, now);
+        pacer.mark(Point::Submit, plan.frame_id, now);
+        output.frames.feed(&mut pacer, |_| ());
+        while let Ok(field) = output.events.pop() {
+            shown.fields[field.colour] += 1;
+            shown.lit[field.colour] += u64::from(field.laser_on.is_some());
+            shown.dark = field.dark.or(shown.dark);
+        }
+        while output.box_events.pop().is_ok() {}
+        while let Ok(fault) = output.laser_faults.pop() {
+            tracing::error!("lasers: {fault}");
+        }
+        while let Ok(event) = output.panel_events.pop() {
+            match event {
+                PanelEvent::Lost { fault, .. } if fault.is_recoverable() => {
+                    tracing::error!("the panel is lost, lasers dark: {fault}");
+                }
+                PanelEvent::Lost { fault, .. } => {
+                    return Err(Failure::new(
+                        Exit::Unavailable,
+                        format!("the panel: {fault}; the lasers were put out first"),
+                    ));
+                }
+                PanelEvent::Back { .. } => tracing::info!("the panel is back"),
+            }
+        }
+    }
+    shown.duration_s = (host_now() - t_begin).seconds();
+    shown.refresh_hz = output.control.counts().refresh_hz;
+    let down = output.control.shutdown();
+    (shown.lasers_dark, shown.flat_presented) = (down.lasers_dark, down.flat_presented);
+    Ok(shown)
+}
+
+fn open(spec: &OutputSpec, rig: &Rig, encoder: &PanelEncoder) -> Result<Output, OutputError> {
+    let panel = open_panel(spec, &PanelSetup::new(&rig.panel, encoder), host_now())?;
+    let laser = open_laser(&rig.lasers, host_now)?;
+    Output::start(rig, encoder, panel, laser, OutputOptions::default(), host_now)
+}
+
+impl fmt::Display for Shown {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(
+            f,
+            "shown for {:.1} s at {:.3} video frames a second, ended by {}",
+            self.duration_s, self.refresh_hz, self.ended_by
+        )?;
+        for (colour, fields) in self.fields.iter().filter(|(_, fields)| **fields > 0) {
+            writeln!(f, "{colour}: {fields} fields, {} of them lit", self.lit[colour])?;
+        }
+        if let Some(reason) = self.dark {
+            writeln!(f, "not lit, last: {reason}")?;
+        }
+        write!(f, "lasers dark at the end: {}; flat pattern on the panel: {}", self.lasers_dark, self.flat_presented)
+    }
+}

@@ -1,0 +1,209 @@
+//! What is to be seen on the bench while a test pattern is shown.
+
+use std::fmt;
+use std::path::PathBuf;
+
+use holod_calibration::rig::{PanelMode, Rig};
+use holod_calibration::{Colour, Metres};
+use holod_slm_output::patterns::{Order, Pattern, PatternError, Placement};
+use serde::Serialize;
+
+/// Orders with less light are left out, but for the middle.
+const SHARE_MIN: f64 = 5e-4;
+
+/// What a person with a camera or a photodiode sees.
+#[derive(Serialize)]
+pub(super) struct Sight {
+    /// The pattern in words.
+    pattern: String,
+    /// The rig's name.
+    rig: String,
+    /// The files that were written.
+    pub(super) files: Vec<PathBuf>,
+    /// Where light goes.
+    spots: Vec<Spot>,
+    /// What else there is to know.
+    notes: Vec<String>,
+}
+
+/// One spot in the eyepiece's focal plane.
+#[derive(Serialize)]
+struct Spot {
+    laser: &'static str,
+    order: [i32; 2],
+    share: f64,
+    angle_deg: f64,
+    x_mm: f64,
+    y_mm: f64,
+    passes_stop: bool,
+}
+
+impl Sight {
+    pub(super) fn of(pattern: &Pattern, placement: &Placement, rig: &Rig) -> Result<Self, PatternError> {
+        let optics = &rig.geometry;
+        let shown = |colour: Colour| {
+            placement.colours[colour] && !matches!(rig.panel.mode, PanelMode::Monochrome(only) if only != colour)
+        };
+        let fields: Vec<Colour> = Colour::ALL.into_iter().filter(|&colour| shown(colour)).collect();
+        let mut spots = Vec::new();
+        for &field in &fields {
+            let orders = pattern.orders(optics, field, field)?;
+            let seen = orders.iter().filter(|order| order.share >= SHARE_MIN || order.number == [0, 0]);
+            spots.extend(seen.map(|order| Spot::of(field, order)));
+        }
+        let mut notes = Vec::new();
+        let largest_mm = rig.geometry.eyebox().map(|width| width.0 * 1e3 / 4.0);
+        match *pattern {
+            Pattern::Level { .. } => notes.push("no pattern of phases: all light stays in the middle".into()),
+            Pattern::Checkerboard { .. } => notes.push(
+                "turn --depth until the middle is darkest: there the panel's own depth is π, and any other figure is the \
+                 stroke's error"
+                    .into(),
+            ),
+            Pattern::Grating { .. } => notes.push("light on the opposite side means that phase_sign is wrong or the relay inverts".into()),
+            Pattern::Lens { focal_length: Metres(f_m), .. } => {
+                for &field in &fields {
+                    let diameter_m = pattern.lens_diameter(optics, field)?.0;
+                    let spot_um = 1.22e6 * optics.wavelengths[field].0 * f_m.abs() / diameter_m;
+                    notes.push(format!(
+                        "{field}: a lens of {:.3} mm; its focus has a radius of {spot_um:.1} µm",
+                        diameter_m * 1e3
+                    ));
+                }
+                let eyepiece_m = optics.eyepiece_focal_length.0;
+                let (side, focus_dpt) = (if f_m > 0.0 { "in front of" } else { "behind" }, f_m / (eyepiece_m * eyepiece_m));
+                notes.push(format!(
+                    "the focus is {:.2} mm {side} the panel's image: a camera in the display sees it sharp at {focus_dpt:.2} dioptres",
+                    1e3 * f_m.abs()
+                ));
+            }
+            Pattern::Dots { spacing_px, .. } => {
+                let spacing_mrad = spacing_px as f64 * optics.pixel_angle_rad() * 1e3;
+                notes.push(format!("focus the camera at infinity: dots {spacing_mrad:.2} mrad apart, bright on black"));
+                notes.push("the middle dot is twice as wide; the one right of it and the second above it are left out".into());
+            }
+            Pattern::CrossHair { line_px } => {
+                let width_mrad = line_px as f64 * optics.pixel_angle_rad() * 1e3;
+                let [x_px, y_px] = placement.axis_px;
+                notes.push(format!(
+                    "focus the camera at infinity: lines {width_mrad:.2} mrad wide cross {x_px} px right of the panel's centre \
+                     and {y_px} px above it; the square is up and to the right"
+                ));
+            }
+            Pattern::FieldIdentity { .. } => notes.extend(identity_notes(pattern, rig, &fields)?),
+        }
+        if !spots.is_empty() {
+            notes.push(format!(
+                "the stop of the relay lets spots up to {:.3} mm (red), {:.3} mm (green) and {:.3} mm (blue) right, left, up and \
+                 down through",
+                largest_mm[Colour::Red],
+                largest_mm[Colour::Green],
+                largest_mm[Colour::Blue]
+            ));
+        }
+        Ok(Self { pattern: in_words(pattern), rig: rig.name.clone(), files: Vec::new(), spots, notes })
+    }
+}
+
+/// Where the diode goes, and what it sees when lasers and fields are exchanged.
+fn identity_notes(pattern: &Pattern, rig: &Rig, fields: &[Colour]) -> Result<Vec<String>, PatternError> {
+    let optics = &rig.geometry;
+    let mut notes = Vec::new();
+    for &field in fields {
+        let own = pattern.orders(optics, field, field)?[0];
+        let radius_mm = radius_m(&own) * 1e3;
+        let mut nearest_mm = f64::INFINITY;
+        let mut strays = Vec::new();
+        for laser in Colour::ALL.into_iter().filter(|&laser| laser != field) {
+            let stray = pattern.orders(optics, field, laser)?[0];
+            let stray_mm = radius_m(&stray) * 1e3;
+            nearest_mm = nearest_mm.min((stray_mm - radius_mm).abs());
+            strays.push(format!("{laser} light would be {stray_mm:.3} mm from the axis, {:.0} %", stray.share * 100.0));
+        }
+        let way = match field {
+            Colour::Red => "right of",
+            Colour::Green => "above",
+            Colour::Blue => "left of",
+        };
+        notes.push(format!(
+            "{field}'s field: put the photodiode {radius_mm:.3} mm {way} the axis, behind a hole of less than {:.3} mm: only \
+             {field} light on {field}'s field meets it; {}, beside the hole",
+            2.0 * nearest_mm,
+            strays.join(" and ")
+        ));
+    }
+    notes.push(
+        "with a wider hole, look at the diode and at the laser's drive on one oscilloscope: the diode's pulse must lie within \
+         that of its own colour's laser, once in each colour frame"
+            .into(),
+    );
+    notes.push("a spot on the opposite side, or up where it should be down, means that the relay inverts or phase_sign is wrong".into());
+    Ok(notes)
+}
+
+fn radius_m(order: &Order) -> f64 {
+    order.position[0].0.hypot(order.position[1].0)
+}
+
+impl Spot {
+    fn of(laser: Colour, order: &Order) -> Self {
+        // Whole micrometres and no negative zero.
+        let rounded_mm = |place: Metres| (place.0 * 1e6).round() / 1e3 + 0.0;
+        Self {
+            laser: laser.name(),
+            order: order.number,
+            share: order.share,
+            angle_deg: order.angle_deg,
+            x_mm: rounded_mm(order.position[0]),
+            y_mm: rounded_mm(order.position[1]),
+            passes_stop: order.passes_stop,
+        }
+    }
+}
+
+fn in_words(pattern: &Pattern) -> String {
+    let pi = std::f64::consts::PI;
+    match *pattern {
+        Pattern::Level { level } => format!("level {level} everywhere"),
+        Pattern::Checkerboard { period_px, depth_rad } => {
+            format!("checkerboard, {period_px} px across two squares, {:.3} π deep", depth_rad / pi)
+        }
+        Pattern::Grating { period_px, angle_deg, profile, depth_rad } => format!(
+            "{} grating, {period_px} px a line, first order at {angle_deg}°, {:.3} π deep",
+            format!("{profile:?}").to_lowercase(),
+            depth_rad.unwrap_or(profile.depth_rad()) / pi
+        ),
+        Pattern::Lens { focal_length, .. } => format!("lens, f = {} mm", focal_length.0 * 1e3),
+        Pattern::Dots { spacing_px, diameter_px } => format!("dots of {diameter_px} px, {spacing_px} px apart"),
+        Pattern::CrossHair { line_px } => format!("cross-hair, lines of {line_px} px"),
+        Pattern::FieldIdentity { .. } => "field identity: red to the right, green up, blue to the left".into(),
+    }
+}
+
+impl fmt::Display for Sight {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{}, on {}", self.pattern, self.rig)?;
+        for file in &self.files {
+            writeln!(f, "written: {}", file.display())?;
+        }
+        if !self.spots.is_empty() {
+            writeln!(f, "in the eyepiece's focal plane, from the axis, x to the viewer's right and y up:")?;
+            writeln!(f, "  laser   order   light      angle         x          y")?;
+        }
+        for spot in &self.spots {
+            writeln!(
+                f,
+                "  {:6} {:+},{:+}  {:5.1} %  {:7.3}°  {:+.3} mm  {:+.3} mm{}",
+                spot.laser,
+                spot.order[0],
+                spot.order[1],
+                spot.share * 100.0,
+                spot.angle_deg,
+                spot.x_mm,
+                spot.y_mm,
+                if spot.passes_stop { "" } else { "  stopped" }
+            )?;
+        }
+        self.notes.iter().try_for_each(|note| writeln!(f, "- {note}"))
+    }
+}

@@ -1,0 +1,47 @@
+//! The rate that the run really reaches, said once it is known.
+
+use holod_calibration::TimeNs;
+
+/// So long, and so many frames, after the first frame the rate is known well enough to be said.
+const WATCHED: TimeNs = TimeNs(3_000_000_000);
+const FRAMES: u64 = 2;
+
+/// Waits for the rate of the first seconds.
+#[derive(Debug, Default)]
+pub(super) struct RateWatch {
+    first: Option<(u64, TimeNs)>,
+    told: bool,
+}
+
+impl RateWatch {
+    /// Frames a second since the first one came on the panel; once, when that is known. `frames_shown` have come by `now`.
+    pub(super) fn reached_hz(&mut self, frames_shown: u64, now: TimeNs) -> Option<f64> {
+        if frames_shown == 0 || self.told {
+            return None;
+        }
+        let (frames, t) = *self.first.get_or_insert((frames_shown, now));
+        self.told = now - t >= WATCHED && frames_shown - frames >= FRAMES;
+        self.told.then(|| (frames_shown - frames) as f64 / (now - t).seconds())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rate_is_told_once_and_late_enough_to_be_right() {
+        let told = |every_ms: i64| {
+            let mut watch = RateWatch::default();
+            let look = |k: i64| {
+                let t_ms = k * 100;
+                watch.reached_hz((t_ms / every_ms) as u64, TimeNs(t_ms * 1_000_000)).map(|hz| (t_ms, hz))
+            };
+            (0..200).filter_map(look).collect::<Vec<_>>()
+        };
+        let fast = told(20);
+        assert!(matches!(fast[..], [(3_100, hz)] if (hz - 50.0).abs() < 0.1), "{fast:?}");
+        let slow = told(4_000);
+        assert!(matches!(slow[..], [(12_000, hz)] if (hz - 0.25).abs() < 1e-9), "{slow:?}");
+    }
+}

@@ -1,0 +1,58 @@
+//! What a person should hear of the tracker while the loop runs.
+
+use holod_calibration::{TimeNs, rig};
+use holod_pupil_input::{Decision, RefusalChange, RefusalWatch, TrackerControl};
+
+use crate::failure::{Exit, Failure};
+
+/// Follows the tracker, and says in the log what changes.
+pub(super) struct TrackerWatch {
+    refusals: RefusalWatch,
+    /// Why a lost link does not come back.
+    lost: Option<String>,
+}
+
+impl TrackerWatch {
+    pub(super) fn new(settings: &rig::Tracker, began: TimeNs) -> Self {
+        Self { refusals: RefusalWatch::new(settings, began), lost: None }
+    }
+
+    /// The gate decided on a sample.
+    pub(super) fn note(&mut self, decision: &Decision) {
+        self.refusals.note(decision);
+    }
+
+    /// Looks at the tracker, ten times a second.
+    ///
+    /// # Errors
+    /// Its recording is not written any more.
+    pub(super) fn look(&mut self, tracker: &mut TrackerControl, now: TimeNs) -> Result<(), Failure> {
+        if let Some(failure) = tracker.recording().and_then(|recording| recording.failure) {
+            return Err(Failure::new(Exit::CannotCreate, format!("cannot go on {failure}")));
+        }
+        let lost = tracker.trouble();
+        if lost != self.lost.as_deref() {
+            self.lost = lost.map(str::to_owned);
+            match &self.lost {
+                Some(lost) => tracing::warn!("the tracker is not found again: {lost}"),
+                None => tracing::info!("the tracker is found again"),
+            }
+        }
+        self.judge(tracker, now);
+        Ok(())
+    }
+
+    /// Finds out whether everything that has come is refused.
+    pub(super) fn judge(&mut self, tracker: &TrackerControl, now: TimeNs) {
+        match self.refusals.judge(now, &tracker.counters(), tracker.finished()) {
+            Some(RefusalChange::Refused(refusal)) => tracing::warn!("the tracker: {refusal}"),
+            Some(RefusalChange::Believed) => tracing::info!("the tracker: samples are believed"),
+            None => {}
+        }
+    }
+
+    /// What is wrong now, for the status and the summary.
+    pub(super) fn trouble(&self) -> Option<String> {
+        self.lost.clone().or_else(|| self.refusals.current().map(ToString::to_string))
+    }
+}

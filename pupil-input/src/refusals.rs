@@ -1,0 +1,518 @@
+//! Why nothing that a tracker sends is believed, and what would most likely cure it.
+
+use std::fmt;
+
+use holod_calibration::{TimeNs, rig};
+
+use crate::counters::{Counter, CounterSnapshot};
+use crate::estimator::Decision;
+use crate::gate::{GateSettings, Rejection, Verdict};
+use crate::import::LogFault;
+use crate::wire::WireFault;
+use crate::{PupilSample, SampleEye};
+
+/// For so long everything must have been refused before it is said.
+const REFUSED_FOR: TimeNs = TimeNs(1_000_000_000);
+/// So many messages at least.
+const LEAST_MESSAGES: u64 = 5;
+/// For so long a tracker may say nothing at all before that is said.
+const UNHEARD_FOR: TimeNs = TimeNs(1_800_000_000);
+/// Samples of which the figures are looked at.
+const KEPT: usize = 64;
+/// Diameters at which an eye is likely to be, in millimetres: narrower than what the gate allows, so that a guess at the
+/// unit is seldom wrong.
+const LIKELY_MM: std::ops::RangeInclusive<f64> = 1.5..=9.0;
+/// No tracker's samples of one eye are nearer to each other, or, while they come, farther apart.
+const LIKELY_INTERVAL: std::ops::RangeInclusive<TimeNs> = TimeNs(100_000)..=TimeNs(1_000_000_000);
+/// Units that are mistaken for millimetres: their name, and millimetres for one of them.
+const MISTAKEN_UNITS: [(&str, f64); 3] = [("micrometres", 1e-3), ("centimetres", 10.0), ("metres", 1e3)];
+
+/// That nothing is believed, the most frequent reason, and what to do.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Refusal {
+    /// Messages and samples that were refused in a row, none that was believed between them.
+    pub refused: u64,
+    /// The counter's name of the most frequent reason; nothing where nothing was heard.
+    pub reason: String,
+    /// What was found, and the likely cure.
+    pub advice: String,
+}
+
+impl fmt::Display for Refusal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.refused {
+            0 => f.write_str(&self.advice),
+            refused => write!(f, "none of {refused} samples is believed, {}: {}", self.reason, self.advice),
+        }
+    }
+}
+
+/// What has changed since the last look.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum RefusalChange {
+    /// Everything is refused.
+    Refused(Refusal),
+    /// A sample was believed after everything had been refused.
+    Believed,
+}
+
+/// Follows a tracker's decisions and counts, and finds out when everything is refused. Pure: it reads no clock.
+#[derive(Clone, Debug)]
+pub struct RefusalWatch {
+    scale: f64,
+    eye: rig::Eye,
+    limits: GateSettings,
+    began: TimeNs,
+    /// The newest samples that were refused.
+    samples: Vec<PupilSample>,
+    /// The counts when a sample was believed last.
+    believed: Option<CounterSnapshot>,
+    refused_since: Option<TimeNs>,
+    current: Option<Refusal>,
+}
+
+impl RefusalWatch {
+    /// A watch over a tracker that was started with `settings` at host time `began`.
+    pub fn new(settings: &rig::Tracker, began: TimeNs) -> Self {
+        Self {
+            scale: settings.scale.unwrap_or(1.0),
+            eye: settings.eye,
+            limits: GateSettings::default(),
+            began,
+            samples: Vec::with_capacity(KEPT),
+            believed: None,
+            refused_since: None,
+            current: None,
+        }
+    }
+
+    /// Takes note of a decision.
+    pub fn note(&mut self, decision: &Decision) {
+        if decision.verdict != Verdict::Accepted {
+            if self.samples.len() == KEPT {
+                self.samples.remove(0);
+            }
+            self.samples.push(decision.sample);
+        }
+    }
+
+    /// What stands in the way now, as it was found; nothing while samples are believed.
+    pub const fn current(&self) -> Option<&Refusal> {
+        self.current.as_ref()
+    }
+
+    /// Looks at the counts of host time `now`; `over` where no sample comes any more. Tells each change once.
+    pub fn judge(&mut self, now: TimeNs, counts: &CounterSnapshot, over: bool) -> Option<RefusalChange> {
+        let before = *self.believed.get_or_insert_with(CounterSnapshot::zero);
+        if counts.of(Counter::Accepted) > before.of(Counter::Accepted) {
+            self.believed = Some(*counts);
+            self.refused_since = None;
+            self.samples.clear();
+            return self.current.take().map(|_| RefusalChange::Believed);
+        }
+        // What was said once holds until a sample is believed; that nothing was heard, until something is.
+        if self.current.as_ref().is_some_and(|current| current.refused > 0 || counts.of(Counter::Bytes) == 0) {
+            return None;
+        }
+        let refusal = self.refusal(now, counts, &before, over)?;
+        self.current = Some(refusal.clone());
+        Some(RefusalChange::Refused(refusal))
+    }
+
+    fn refusal(
+        &mut self,
+        now: TimeNs,
+        counts: &CounterSnapshot,
+        before: &CounterSnapshot,
+        over: bool,
+    ) -> Option<Refusal> {
+        let faults = WireFault::ALL.into_iter().map(|fault| {
+            let of = |counts: &CounterSnapshot| counts.fault(LogFault::Wire(fault));
+            (Cause::Wire(fault), of(counts) - of(before))
+        });
+        let rejections = Rejection::ALL
+            .into_iter()
+            .map(|reason| (Cause::Gate(reason), counts.rejected(reason) - before.rejected(reason)));
+        let causes: Vec<_> = faults.chain(rejections).filter(|(_, count)| *count > 0).collect();
+        let refused: u64 = causes.iter().map(|(_, count)| count).sum();
+        if refused == 0 {
+            let unheard = counts.of(Counter::Connects) > 0 && counts.of(Counter::Bytes) == 0;
+            return (unheard && self.current.is_none() && now - self.began >= UNHEARD_FOR).then(|| Refusal {
+                refused: 0,
+                reason: String::new(),
+                advice:
+                    "nothing has been heard of the tracker: is it switched on, and does it send without being asked?"
+                        .into(),
+            });
+        }
+        let since = *self.refused_since.get_or_insert(now);
+        if !over && (now - since < REFUSED_FOR || refused < LEAST_MESSAGES) {
+            return None;
+        }
+        // A sample beside a bad one is refused, too, and says nothing of the reason; nor does a time that came twice.
+        let weight = |cause: &Cause| match cause {
+            Cause::Gate(Rejection::Guard | Rejection::Repeated) => 0,
+            _ => 1,
+        };
+        let (cause, _) = causes.into_iter().max_by_key(|(cause, count)| (weight(cause), *count))?;
+        // Once a tracker has worked, an eye that is shut or away for a while is no fault of its settings.
+        let worked = before.of(Counter::Accepted) > 0;
+        if worked && cause.is_of_the_viewer() {
+            return None;
+        }
+        Some(Refusal { refused, reason: cause.name(), advice: self.advice(cause) })
+    }
+
+    fn advice(&self, cause: Cause) -> String {
+        match cause {
+            Cause::Wire(fault) => wire_advice(fault),
+            Cause::Gate(reason) => self.gate_advice(reason),
+        }
+    }
+
+    fn gate_advice(&self, reason: Rejection) -> String {
+        let newest = |figure: fn(&PupilSample) -> f64| median(self.samples.iter().map(figure).collect());
+        match reason {
+            Rejection::OutOfRange => self.range_advice(),
+            Rejection::Lost => {
+                "the tracker says that it sees no pupil: is an eye before its camera, lit and in focus?".into()
+            }
+            Rejection::NotFinite => {
+                "the tracker sends NaN or infinity in the place of a figure: does it see the pupil, and \
+                                     is it calibrated?"
+                    .into()
+            }
+            Rejection::LowConfidence => format!(
+                "the tracker's confidence is {:.2}, and {} is needed: set up its camera and its pupil detection anew; \
+                 where it counts confidence in another way, give a profile that says how",
+                newest(|sample| f64::from(sample.confidence)).unwrap_or(f64::NAN),
+                self.limits.least_confidence
+            ),
+            Rejection::LidsClosed => format!(
+                "the lids are {:.2} mm apart: is the eye open, and is the aperture in millimetres?",
+                newest(|sample| sample.aperture_mm.map_or(f64::NAN, f64::from)).unwrap_or(f64::NAN)
+            ),
+            Rejection::OtherEye => {
+                let eye = self.samples.last().map_or("other", |sample| match sample.eye {
+                    SampleEye::Left => "left",
+                    SampleEye::Right => "right",
+                    SampleEye::Both => "both",
+                });
+                format!(
+                    "its samples are of the {eye} eye, and the rig follows the {}: set tracker.eye = \"{eye}\"",
+                    eye_name(self.eye)
+                )
+            }
+            Rejection::Backwards | Rejection::Repeated | Rejection::Guard | Rejection::Slew | Rejection::OutOfReach => {
+                self.motion_advice()
+            }
+        }
+    }
+
+    /// Diameters that are none: most often another unit.
+    fn range_advice(&self) -> String {
+        let figures = self.samples.iter().filter(|sample| sample.valid && sample.diameter_mm.is_finite());
+        let Some(mm) = median(figures.map(|sample| f64::from(sample.diameter_mm)).collect()) else {
+            return "the figures are no diameters of a pupil".into();
+        };
+        let figure = mm / self.scale;
+        let shown = significant(figure);
+        if self.scale != 1.0 && LIKELY_MM.contains(&figure) {
+            return format!(
+                "{shown}: looks like millimetres, which scale_mm_per_unit = {} makes {} mm; take that key out of the rig \
+                 file, or give --scale 1",
+                self.scale,
+                significant(mm)
+            );
+        }
+        // The figure as it came, or, where a scale that was measured has slipped, after the scale.
+        let slips = [1.0, self.scale].map(|scale| MISTAKEN_UNITS.map(|(unit, factor)| (unit, scale * factor)));
+        if let Some((unit, scale)) = slips.concat().into_iter().find(|(_, scale)| LIKELY_MM.contains(&(figure * scale)))
+        {
+            return format!(
+                "{shown}: looks like {unit}; scale_mm_per_unit = {scale} in the rig file, or --scale {scale}",
+                scale = significant(scale)
+            );
+        }
+        if figure == 0.0 {
+            return "the tracker sends 0: does it see the pupil?".into();
+        }
+        format!(
+            "{shown}: no pupil's millimetres ({} to {}), and no other unit of length; if it is camera pixels or the \
+             tracker's own unit, measure an artificial pupil and set scale_mm_per_unit = its millimetres / its figure",
+            self.limits.least_mm, self.limits.greatest_mm
+        )
+    }
+
+    /// Figures or times that jump.
+    fn motion_advice(&self) -> String {
+        let steps = |step: fn(&PupilSample, &PupilSample) -> f64| {
+            let pairs = SampleEye::ALL.into_iter().flat_map(|eye| {
+                let of_eye: Vec<_> = self.samples.iter().filter(|sample| sample.eye == eye).collect();
+                of_eye.windows(2).map(|pair| step(pair[0], pair[1])).collect::<Vec<_>>()
+            });
+            median(pairs.collect())
+        };
+        let interval = steps(|before, after| (after.t_device.0.saturating_sub(before.t_device.0)).abs() as f64);
+        match interval.map(|ns| TimeNs(ns as i64)) {
+            Some(TimeNs(0)) => "its times do not advance: does the tracker's clock run?".into(),
+            Some(interval) if !LIKELY_INTERVAL.contains(&interval) => format!(
+                "its times advance by {} from sample to sample, as no tracker's do: they look like another unit than the \
+                 one that is expected, such as milliseconds in the place of microseconds; correct the sender, or the \
+                 profile's unit of time",
+                span(interval)
+            ),
+            _ => format!(
+                "the figures jump by {:.2} mm from one to the next, as no pupil does: are they a pupil's diameter, of one \
+                 eye?",
+                steps(|before, after| f64::from((after.diameter_mm - before.diameter_mm).abs())).unwrap_or(f64::NAN)
+            ),
+        }
+    }
+}
+
+/// Why a message or a sample was refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Cause {
+    Wire(WireFault),
+    Gate(Rejection),
+}
+
+impl Cause {
+    fn name(self) -> String {
+        match self {
+            Self::Wire(fault) => fault.name().to_owned(),
+            Self::Gate(reason) => format!("rejected_{}", reason.name()),
+        }
+    }
+
+    /// Whether shut eyes, or a viewer who is not there, do this.
+    const fn is_of_the_viewer(self) -> bool {
+        matches!(
+            self,
+            Self::Gate(
+                Rejection::Lost
+                    | Rejection::LowConfidence
+                    | Rejection::LidsClosed
+                    | Rejection::NotFinite
+                    | Rejection::Guard
+                    | Rejection::Slew
+                    | Rejection::OutOfReach
+            ) | Self::Wire(WireFault::NotFinite)
+        )
+    }
+}
+
+/// As the rig file has it.
+const fn eye_name(eye: rig::Eye) -> &'static str {
+    match eye {
+        rig::Eye::Left => "left",
+        rig::Eye::Right => "right",
+        rig::Eye::Both => "both",
+        rig::Eye::Better => "better",
+    }
+}
+
+fn wire_advice(fault: WireFault) -> String {
+    match fault {
+        WireFault::BadChecksum => "no message has the checksum that its profile expects: compare how the sender computes it \
+                                   (holod's lines: CRC-8, polynomial 0x07, initial value 0, two hexadecimal digits, over \
+                                   the bytes before `*`), or lower the baud rate if the line is noisy"
+            .into(),
+        WireFault::NotFinite => {
+            "the tracker sends NaN or infinity in the place of a figure: does it see the pupil, and is it calibrated?".into()
+        }
+        WireFault::Negative => "the tracker sends negative diameters: does it see the pupil, and is this its profile?".into(),
+        WireFault::BadConfidence => {
+            "the confidence is not between 0 and 1: let the sender divide it, or give a profile that does".into()
+        }
+        WireFault::BadEye => "the eye is named otherwise than the profile expects: is this the tracker's profile?".into(),
+        _ => "no message is of the form that the profile expects: is it this tracker's profile and baud rate? (`holod \
+              tracker list` names the profiles, profile=NAME chooses one)"
+            .into(),
+    }
+}
+
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.retain(|value| value.is_finite());
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
+}
+
+/// Four significant digits, without zeros behind them.
+fn significant(value: f64) -> f64 {
+    format!("{value:.3e}").parse().unwrap_or(value)
+}
+
+fn span(t: TimeNs) -> String {
+    let (unit, ns) = [("s", 1e9), ("ms", 1e6), ("µs", 1e3), ("ns", 1.0)]
+        .into_iter()
+        .find(|(_, ns)| t.0 as f64 >= *ns)
+        .unwrap_or(("ns", 1.0));
+    format!("{} {unit}", significant(t.0 as f64 / ns))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::counters::Counters;
+    use crate::estimator::{Estimator, EstimatorSettings};
+
+    const MS: i64 = 1_000_000;
+
+    fn settings() -> rig::Tracker {
+        rig::Rig::default().tracker
+    }
+
+    fn sample(k: i64) -> PupilSample {
+        let t = TimeNs(k * 5 * MS);
+        PupilSample {
+            t_device: t,
+            t_sample: t,
+            t_arrival: t,
+            eye: SampleEye::Left,
+            diameter_mm: 3.5,
+            confidence: 1.0,
+            aperture_mm: None,
+            sequence: None,
+            valid: true,
+        }
+    }
+
+    /// Sends `count` samples at 200 Hz through gate and watch and looks ten times a second, as the daemon does; what was
+    /// told, and when.
+    fn told(settings: &rig::Tracker, count: i64, of: impl Fn(i64) -> PupilSample) -> Vec<(TimeNs, RefusalChange)> {
+        let counters = Counters::new();
+        let mut estimator = Estimator::new(EstimatorSettings::from(settings));
+        let mut watch = RefusalWatch::new(settings, TimeNs(0));
+        let mut told = Vec::new();
+        for k in 0..count {
+            counters.add(Counter::Samples, 1);
+            estimator.push(of(k), |decision: Decision| {
+                match decision.verdict {
+                    Verdict::Accepted => counters.add(Counter::Accepted, 1),
+                    Verdict::Rejected(reason) => counters.add_rejected(reason),
+                }
+                watch.note(&decision);
+            });
+            let now = TimeNs(k * 5 * MS);
+            if k % 20 == 0 {
+                told.extend(watch.judge(now, &counters.snapshot(), false).map(|change| (now, change)));
+            }
+        }
+        told
+    }
+
+    /// What is said of samples that are all refused, once and within two seconds.
+    fn advice(settings: &rig::Tracker, of: impl Fn(i64) -> PupilSample) -> String {
+        let told = told(settings, 2000, of);
+        let [(t, RefusalChange::Refused(refusal))] = &told[..] else { panic!("told once: {told:?}") };
+        assert!(*t <= TimeNs(2_000 * MS), "{t:?}");
+        refusal.to_string()
+    }
+
+    #[test]
+    fn samples_that_are_believed_are_no_matter() {
+        assert_eq!(told(&settings(), 2000, sample), []);
+        // A blink of half a second, with the eye lost, and a pause of three seconds.
+        let lost = |k: i64| PupilSample { valid: !(400..500).contains(&k) && !(800..1400).contains(&k), ..sample(k) };
+        assert_eq!(told(&settings(), 2000, lost), []);
+    }
+
+    #[test]
+    fn each_unit_that_is_mistaken_for_millimetres_is_named_with_its_scale() {
+        let cases = [
+            (3500.0, None, "3500: looks like micrometres; scale_mm_per_unit = 0.001"),
+            (0.35, None, "0.35: looks like centimetres; scale_mm_per_unit = 10 "),
+            (0.0035, None, "0.0035: looks like metres; scale_mm_per_unit = 1000 "),
+            (3.5, Some(0.0125), "3.5: looks like millimetres, which scale_mm_per_unit = 0.0125 makes 0.04375 mm"),
+            (3500.0, Some(2.0), "3500: looks like micrometres; scale_mm_per_unit = 0.001"),
+            (70.0, Some(50.0), "70: looks like micrometres; scale_mm_per_unit = 0.05"),
+            (41.3, None, "41.3: no pupil's millimetres"),
+            (0.0, None, "sends 0"),
+        ];
+        for (figure, scale, expected) in cases {
+            let settings = rig::Tracker { scale, ..settings() };
+            let said = advice(&settings, |k| PupilSample { diameter_mm: figure, ..sample(k) });
+            assert!(said.contains(expected) && said.contains("rejected_out_of_range"), "{said}");
+        }
+    }
+
+    #[test]
+    fn each_other_reason_is_named_with_its_cure() {
+        type Spoil = fn(i64, &mut PupilSample);
+        let cases: [(Spoil, &str); 8] = [
+            (|_, s| s.diameter_mm = f32::NAN, "NaN"),
+            (|_, s| s.valid = false, "sees no pupil"),
+            (|_, s| s.confidence = 0.3, "confidence is 0.30"),
+            (|_, s| s.aperture_mm = Some(0.4), "lids are 0.40 mm apart"),
+            (|_, s| s.eye = SampleEye::Right, "tracker.eye = \"right\""),
+            // A clock that seems to stand is found to have been reset again and again.
+            (|k, s| (s.t_device, s.t_sample) = (TimeNs(5_000 * k), TimeNs(k / 60 * 300 * MS + k % 60)), "5 µs"),
+            (|k, s| (s.t_device, s.t_sample) = (TimeNs(5_000 * MS * k), TimeNs(5_000 * MS * k)), "5 s"),
+            (|k, s| s.diameter_mm = if k % 2 == 0 { 2.0 } else { 6.0 }, "jump by 4.00 mm"),
+        ];
+        for (spoil, expected) in cases {
+            let settings = rig::Tracker { eye: rig::Eye::Left, ..settings() };
+            let said = advice(&settings, |k| {
+                let mut sample = sample(k);
+                spoil(k, &mut sample);
+                sample
+            });
+            assert!(said.contains(expected), "{expected}: {said}");
+        }
+    }
+
+    #[test]
+    fn messages_that_are_no_samples_are_told_with_their_fault() {
+        for (fault, expected) in [
+            (WireFault::BadChecksum, "CRC-8"),
+            (WireFault::Malformed, "profile and baud"),
+            (WireFault::NotFinite, "NaN"),
+        ] {
+            let counters = Counters::new();
+            let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+            counters.add(Counter::Connects, 1);
+            counters.add(Counter::Bytes, 30);
+            counters.add_fault(LogFault::Wire(fault), 4);
+            assert_eq!(watch.judge(TimeNs(0), &counters.snapshot(), false), None);
+            assert_eq!(watch.judge(TimeNs(1_500 * MS), &counters.snapshot(), false), None, "too few to tell");
+            counters.add_fault(LogFault::Wire(fault), 40);
+            let said = watch.judge(TimeNs(1_500 * MS), &counters.snapshot(), false);
+            let Some(RefusalChange::Refused(refusal)) = said else { panic!("{said:?}") };
+            assert_eq!((refusal.refused, refusal.reason.as_str()), (44, fault.name()));
+            assert!(refusal.to_string().contains(expected), "{refusal}");
+            // And once a sample is believed, that.
+            counters.add(Counter::Accepted, 1);
+            let said = watch.judge(TimeNs(1_600 * MS), &counters.snapshot(), false);
+            assert_eq!(said, Some(RefusalChange::Believed));
+            assert_eq!(watch.current(), None);
+        }
+    }
+
+    #[test]
+    fn silence_is_told_and_what_is_heard_after_it() {
+        let counters = Counters::new();
+        let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+        counters.add(Counter::Connects, 1);
+        assert_eq!(watch.judge(TimeNs(1_000 * MS), &counters.snapshot(), false), None);
+        let said = watch.judge(TimeNs(2_000 * MS), &counters.snapshot(), false);
+        assert!(
+            matches!(said, Some(RefusalChange::Refused(refusal)) if refusal.to_string().contains("nothing has been heard"))
+        );
+        assert_eq!(watch.judge(TimeNs(3_000 * MS), &counters.snapshot(), false), None);
+        counters.add(Counter::Bytes, 300);
+        counters.add_fault(LogFault::Wire(WireFault::BadChecksum), 40);
+        assert_eq!(watch.judge(TimeNs(4_000 * MS), &counters.snapshot(), false), None);
+        let said = watch.judge(TimeNs(5_000 * MS), &counters.snapshot(), false);
+        assert!(matches!(said, Some(RefusalChange::Refused(refusal)) if refusal.reason == "wire_bad_checksum"));
+    }
+
+    #[test]
+    fn a_log_that_has_ended_is_judged_at_once() {
+        let counters = Counters::new();
+        let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+        counters.add_rejected(Rejection::Lost);
+        assert!(watch.judge(TimeNs(0), &counters.snapshot(), true).is_some());
+    }
+}

@@ -1,0 +1,404 @@
+//! Boxes that can set a power and switch it, and nothing more: neither do they gate single fields, nor do they go dark by
+//! themselves when their host dies.
+//!
+//! Such devices take milliseconds to answer, so a thread of their own speaks to them. It also puts them out when the laser
+//! thread has not been heard of for the heartbeat timeout; a process that is killed leaves them lit.
+
+use std::io::{ErrorKind, Read, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use holod_calibration::rig::Lasers;
+use holod_calibration::{Colour, PerColour, TimeNs};
+use rtrb::{Consumer, Producer, RingBuffer};
+use serialport::TTYPort;
+
+use super::line_link::{Sharing, open_port};
+use super::open::power_limit_uw;
+use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow};
+
+/// How often a device is asked whether it is still there and healthy.
+const PROBE_EVERY: TimeNs = TimeNs(500_000_000);
+/// How long the thread rests where nothing is asked of it.
+const REST: Duration = Duration::from_millis(5);
+/// How long a program is waited for: some lines to each of three lasers.
+const PROGRAM_WAIT: TimeNs = TimeNs(5_000_000_000);
+/// How long darkness is waited for.
+const DARK_WAIT: TimeNs = TimeNs(450_000_000);
+/// Orders and reports on their way.
+const RING: usize = 64;
+
+/// A device that sets powers and switches lasers; each call waits for its answer.
+pub(super) trait PowerDevice: Send + 'static {
+    /// Whether it has a laser of `colour`.
+    fn has(&self, colour: Colour) -> bool;
+
+    /// Sets the power of each laser for when it is lit, microwatts at the panel. Lights nothing.
+    fn set_power(&mut self, power_uw: PerColour<u32>) -> Result<(), LaserError>;
+
+    /// Lights the lasers of `lit` and puts out all others, and has made sure of both when it returns.
+    fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError>;
+
+    /// Asks whether it is there and healthy.
+    fn probe(&mut self) -> Result<(), LaserError>;
+}
+
+const NONE_LIT: PerColour<bool> = PerColour([false; 3]);
+
+#[derive(Clone, Copy, Debug)]
+enum Order {
+    Power { power_uw: PerColour<u32>, timeout: TimeNs },
+    Lit(PerColour<bool>),
+}
+
+#[derive(Debug)]
+enum Report {
+    /// The order has been carried out.
+    Done(u32),
+    /// A device that was lit was put out for want of a heartbeat.
+    TimedOut { t: TimeNs },
+    /// It failed, at an order or by itself.
+    Failed(LaserError),
+}
+
+/// Drives a [`PowerDevice`] as a [`LaserBox`].
+#[derive(Debug)]
+pub(super) struct PowerBox {
+    has: PerColour<bool>,
+    power_limit_uw: PerColour<u32>,
+    gated_by_panel: bool,
+    /// The lasers of the program, once there is one.
+    sequence: Option<PerColour<bool>>,
+    armed: bool,
+    orders: Producer<(u32, Order)>,
+    reports: Consumer<Report>,
+    last_order: u32,
+    /// The order that arms, until it has been carried out.
+    arming: Option<u32>,
+    /// What has happened and has not been fetched.
+    event: Option<BoxEvent>,
+    t_heartbeat: Arc<AtomicI64>,
+    stop: Arc<AtomicBool>,
+    worker: Option<JoinHandle<()>>,
+    clock: fn() -> TimeNs,
+}
+
+impl PowerBox {
+    /// Drives `device`, which has been recognised, as `lasers` says.
+    ///
+    /// # Errors
+    /// [`LaserError::NotAccepted`] where the rig does not accept lasers without a heartbeat; [`LaserError::Line`] where no
+    /// thread can be started.
+    pub(super) fn new(device: impl PowerDevice, lasers: &Lasers, clock: fn() -> TimeNs) -> Result<Self, LaserError> {
+        require_acceptance(lasers)?;
+        let (orders, order_consumer) = RingBuffer::new(RING);
+        let (report_producer, reports) = RingBuffer::new(RING);
+        let t_heartbeat = Arc::new(AtomicI64::new(clock().0));
+        let stop = Arc::new(AtomicBool::new(false));
+        let has = PerColour(Colour::ALL.map(|colour| device.has(colour)));
+        let worker = Worker {
+            device,
+            orders: order_consumer,
+            reports: report_producer,
+            t_heartbeat: Arc::clone(&t_heartbeat),
+            stop: Arc::clone(&stop),
+            timeout: lasers.heartbeat_timeout,
+            lit: NONE_LIT,
+            t_probe: clock(),
+            failed: false,
+            clock,
+        };
+        let worker = std::thread::Builder::new().name("holod-laser-dev".into()).spawn(move || worker.run())?;
+        Ok(Self {
+            has,
+            power_limit_uw: power_limit_uw(lasers),
+            gated_by_panel: lasers.gated_by_panel,
+            sequence: None,
+            armed: false,
+            orders,
+            reports,
+            last_order: 0,
+            arming: None,
+            event: None,
+            t_heartbeat,
+            stop,
+            worker: Some(worker),
+            clock,
+        })
+    }
+
+    fn order(&mut self, order: Order) -> Result<u32, LaserError> {
+        self.last_order = self.last_order.wrapping_add(1).max(1);
+        // Orders come from arming and darkness only; a device that lets 64 of them wait is at fault.
+        let full = LaserError::NoAnswer { command: "power and switch", waited_ms: DARK_WAIT.0 / 1_000_000 };
+        self.orders.push((self.last_order, order)).map_err(|_| full)?;
+        if let Some(worker) = &self.worker {
+            worker.thread().unpark();
+        }
+        Ok(self.last_order)
+    }
+
+    /// Takes in what the worker has said; whether `awaited` has been carried out.
+    fn hear(&mut self, awaited: u32) -> Result<bool, LaserError> {
+        let mut done = false;
+        while let Ok(report) = self.reports.pop() {
+            match report {
+                Report::Done(number) => {
+                    done |= number == awaited;
+                    if self.arming.take_if(|arming| *arming == number).is_some() && self.armed {
+                        self.event = Some(BoxEvent::Armed { t: (self.clock)() });
+                    }
+                }
+                Report::TimedOut { t } => self.went_dark(DarkReason::Heartbeat, t),
+                Report::Failed(error) => {
+                    self.went_dark(DarkReason::BoxFault, (self.clock)());
+                    return Err(error);
+                }
+            }
+        }
+        Ok(done)
+    }
+
+    fn went_dark(&mut self, reason: DarkReason, t: TimeNs) {
+        if std::mem::take(&mut self.armed) {
+            self.event = Some(BoxEvent::Dark { t, reason });
+        }
+    }
+
+    fn wait_for(&mut self, number: u32, patience: TimeNs, command: &'static str) -> Result<(), LaserError> {
+        let t_end = (self.clock)() + patience;
+        while !self.hear(number)? {
+            if (self.clock)() >= t_end {
+                return Err(LaserError::NoAnswer { command, waited_ms: patience.0 / 1_000_000 });
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        Ok(())
+    }
+}
+
+/// Fails unless the rig accepts, in words, lasers without a heartbeat.
+pub(super) fn require_acceptance(lasers: &Lasers) -> Result<(), LaserError> {
+    if lasers.accept_no_heartbeat { Ok(()) } else { Err(LaserError::NotAccepted) }
+}
+
+impl LaserBox for PowerBox {
+    fn capability(&self) -> Capability {
+        Capability { simulated: false, gates_fields: false, has_heartbeat: false, sync_wire: false }
+    }
+
+    fn program(&mut self, program: &LaserProgram, _now: TimeNs) -> Result<(), LaserError> {
+        let lit = PerColour(Colour::ALL.map(|colour| program.sequence.contains(&colour)));
+        if lit.0.iter().filter(|&&lit| lit).count() > 1 && !self.gated_by_panel {
+            return Err(LaserError::CannotGate);
+        }
+        for colour in Colour::ALL.into_iter().filter(|&colour| lit[colour]) {
+            if !self.has[colour] {
+                return Err(LaserError::NoLaser { colour });
+            }
+            if program.power_uw[colour] > self.power_limit_uw[colour] {
+                let found = format!("{} mW for {colour}", f64::from(program.power_uw[colour]) / 1e3);
+                return Err(LaserError::Figure { what: "power_mw", found, expected: "not more than power_limit_mw" });
+            }
+        }
+        self.sequence = None;
+        let order = Order::Power { power_uw: program.power_uw, timeout: program.heartbeat_timeout };
+        let number = self.order(order)?;
+        self.wait_for(number, PROGRAM_WAIT, "power")?;
+        self.sequence = Some(lit);
+        Ok(())
+    }
+
+    fn arm(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        let not_programmed = LaserError::Refused { command: "arm", refusal: super::Refusal::NotProgrammed };
+        let lit = self.sequence.ok_or(not_programmed)?;
+        self.t_heartbeat.store(now.0, Ordering::Release);
+        if !self.armed {
+            self.arming = Some(self.order(Order::Lit(lit))?);
+            self.armed = true;
+        }
+        Ok(())
+    }
+
+    fn sync(&mut self, _t_sync: TimeNs, _now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        Ok(None)
+    }
+
+    fn light(&mut self, _window: LitWindow, _now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        Ok(None)
+    }
+
+    fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        self.t_heartbeat.store(now.0, Ordering::Release);
+        Ok(())
+    }
+
+    fn dark(&mut self, reason: DarkReason, _now: TimeNs) -> Result<(), LaserError> {
+        self.arming = None;
+        let number = self.order(Order::Lit(NONE_LIT))?;
+        // What was said to earlier orders, a failure say, is no answer to this one.
+        let answered = match self.wait_for(number, DARK_WAIT, "off") {
+            Err(error @ LaserError::NoAnswer { .. }) => Err(error),
+            Err(_) => self.wait_for(number, DARK_WAIT, "off"),
+            Ok(()) => Ok(()),
+        };
+        if answered.is_ok() {
+            self.went_dark(reason, (self.clock)());
+        }
+        answered
+    }
+
+    fn poll(&mut self, _now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
+        let heard = self.hear(0);
+        if let Some(happened) = self.event.take() {
+            event(happened);
+        }
+        heard.map(|_| ())
+    }
+}
+
+impl Drop for PowerBox {
+    /// The worker puts the lasers out before it ends.
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Release);
+        if let Some(worker) = self.worker.take() {
+            worker.thread().unpark();
+            // Its panic, if there was one, has been reported by the panic hook.
+            let _ended = worker.join();
+        }
+    }
+}
+
+/// The thread that speaks to the device.
+struct Worker<D> {
+    device: D,
+    orders: Consumer<(u32, Order)>,
+    reports: Producer<Report>,
+    t_heartbeat: Arc<AtomicI64>,
+    stop: Arc<AtomicBool>,
+    timeout: TimeNs,
+    lit: PerColour<bool>,
+    t_probe: TimeNs,
+    /// It failed and was not heard of since.
+    failed: bool,
+    clock: fn() -> TimeNs,
+}
+
+impl<D: PowerDevice> Worker<D> {
+    fn run(mut self) {
+        while !self.stop.load(Ordering::Acquire) {
+            while let Ok((number, order)) = self.orders.pop() {
+                let done = self.obey(order);
+                self.report(number, done);
+            }
+            let now = (self.clock)();
+            if self.lit != NONE_LIT && now.0 - self.t_heartbeat.load(Ordering::Acquire) > self.timeout.0 {
+                let put_out = self.set_lit(NONE_LIT);
+                match put_out {
+                    Ok(()) => drop(self.reports.push(Report::TimedOut { t: (self.clock)() })),
+                    failed => self.report(0, failed),
+                }
+            }
+            if now.0 - self.t_probe.0 > PROBE_EVERY.0 {
+                self.t_probe = now;
+                let probed = self.device.probe();
+                let news = probed.is_err() && !self.failed;
+                self.failed = probed.is_err();
+                if news {
+                    // Whatever it is, it is not lit any longer than it must be.
+                    let _reported_below = self.set_lit(NONE_LIT);
+                    self.report(0, probed);
+                }
+            }
+            std::thread::park_timeout(REST);
+        }
+        // Nobody listens any more.
+        let _put_out = self.device.set_lit(NONE_LIT);
+    }
+
+    fn obey(&mut self, order: Order) -> Result<(), LaserError> {
+        match order {
+            Order::Power { power_uw, timeout } => {
+                self.timeout = timeout;
+                self.set_lit(NONE_LIT)?;
+                self.device.set_power(power_uw)
+            }
+            Order::Lit(lit) => self.set_lit(lit),
+        }
+    }
+
+    fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError> {
+        let done = self.device.set_lit(lit);
+        if done.is_err() && lit != NONE_LIT {
+            // It may have done half of it.
+            let _first_error_counts = self.device.set_lit(NONE_LIT);
+        }
+        self.lit = if done.is_ok() { lit } else { NONE_LIT };
+        done
+    }
+
+    fn report(&mut self, number: u32, done: Result<(), LaserError>) {
+        let report = match done {
+            Ok(()) => Report::Done(number),
+            Err(error) => Report::Failed(error),
+        };
+        // Where nobody has listened for 64 reports nobody will.
+        let _full = self.reports.push(report);
+    }
+}
+
+/// A port for questions and answers, each of which waits.
+#[derive(Debug)]
+pub(super) struct Conversation {
+    path: PathBuf,
+    reader: TTYPort,
+    writer: TTYPort,
+    clock: fn() -> TimeNs,
+}
+
+impl Conversation {
+    /// Opens the port at `path`.
+    pub(super) fn open(path: &Path, baud: u32, sharing: Sharing, clock: fn() -> TimeNs) -> Result<Self, LaserError> {
+        let [reader, mut writer] = open_port(path, baud, sharing)?;
+        // This thread may wait for a slow device's buffer.
+        let patience = serialport::SerialPort::set_timeout(&mut writer, Duration::from_millis(500));
+        patience.map_err(|why| LaserError::Open { path: path.display().to_string(), why: why.to_string() })?;
+        Ok(Self { path: path.into(), reader, writer, clock })
+    }
+
+    /// The port, for messages.
+    pub(super) fn path(&self) -> String {
+        self.path.display().to_string()
+    }
+
+    /// Sends `bytes`, after whatever has come unasked is thrown away.
+    pub(super) fn send(&mut self, bytes: &[u8]) -> Result<(), LaserError> {
+        let cleared = serialport::SerialPort::clear(&self.reader, serialport::ClearBuffer::Input);
+        cleared.map_err(std::io::Error::from)?;
+        Ok(self.writer.write_all(bytes)?)
+    }
+
+    /// The next line that is not empty, without CR and LF; nothing where none is complete after `patience`.
+    pub(super) fn line(&mut self, patience: TimeNs) -> Result<Option<Vec<u8>>, LaserError> {
+        const LINE_BYTES_MAX: usize = 1024;
+        let t_end = (self.clock)() + patience;
+        let mut line = Vec::new();
+        while (self.clock)() < t_end {
+            let mut byte = [0];
+            match self.reader.read(&mut byte) {
+                Ok(0) => return Err(std::io::Error::from(ErrorKind::BrokenPipe).into()),
+                Ok(_) if matches!(byte[0], b'\r' | b'\n') && line.is_empty() => {}
+                Ok(_) if matches!(byte[0], b'\r' | b'\n') => return Ok(Some(line)),
+                Ok(_) if line.len() == LINE_BYTES_MAX => return Ok(Some(line)),
+                Ok(_) => line.push(byte[0]),
+                Err(why) if matches!(why.kind(), ErrorKind::TimedOut | ErrorKind::WouldBlock) => {}
+                Err(why) if why.kind() == ErrorKind::Interrupted => {}
+                Err(why) => return Err(why.into()),
+            }
+        }
+        Ok(None)
+    }
+}

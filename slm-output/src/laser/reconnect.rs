@@ -1,0 +1,264 @@
+//! A laser box that is looked for again when it is lost.
+//!
+//! Opening a box takes seconds, and even closing a port may wait, so a thread of its own does both. Whoever drives the
+//! lasers only hands the lost box over and finds a new one in its place: opened, recognised, dark and programmed, to be
+//! armed by the same rules as ever.
+
+use std::collections::VecDeque;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::Thread;
+use std::time::Duration;
+
+use holod_calibration::{Colour, TimeNs};
+use rtrb::{Consumer, Producer, RingBuffer};
+
+use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserEdge, LaserError, LaserProgram, LitWindow};
+
+/// How long a box that was not found is left alone.
+const RETRY_EVERY: Duration = Duration::from_millis(250);
+/// Events that wait between a loss and the next [`LaserBox::poll`].
+const EVENTS_MAX: usize = 64;
+
+/// What is wrong with the link to a laser box, for a thread that may wait.
+#[derive(Clone, Debug, Default)]
+pub struct LaserWatch(Arc<Mutex<Option<String>>>);
+
+impl LaserWatch {
+    /// Why the box is lost, or was not found again the last time that it was looked for; nothing while it is there.
+    pub fn trouble(&self) -> Option<String> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn set(&self, trouble: Option<String>) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = trouble;
+    }
+}
+
+/// A box on its way to the thread that closes it and looks for another.
+struct Lost {
+    laser: Box<dyn LaserBox>,
+    why: LaserError,
+    program: Option<LaserProgram>,
+}
+
+/// Drives a box that may be lost and found.
+pub(super) struct Reconnecting {
+    current: Option<Box<dyn LaserBox>>,
+    capability: Capability,
+    program: Option<LaserProgram>,
+    /// The box was found again and nothing has gone wrong since: it has its program.
+    fresh: bool,
+    lit: Option<Colour>,
+    armed: bool,
+    events: VecDeque<BoxEvent>,
+    lost: Producer<Lost>,
+    found: Consumer<Box<dyn LaserBox>>,
+    watch: LaserWatch,
+    stop: Arc<AtomicBool>,
+    seeker: Thread,
+}
+
+impl Reconnecting {
+    /// Drives `laser`, and one that `open` opens when that is lost.
+    ///
+    /// # Errors
+    /// [`LaserError::Line`] where no thread can be started.
+    pub(super) fn new(
+        laser: Box<dyn LaserBox>,
+        open: impl Fn() -> Result<Box<dyn LaserBox>, LaserError> + Send + 'static,
+        clock: fn() -> TimeNs,
+    ) -> Result<Self, LaserError> {
+        let (lost, lost_consumer) = RingBuffer::new(2);
+        let (found_producer, found) = RingBuffer::new(2);
+        let (watch, stop) = (LaserWatch::default(), Arc::new(AtomicBool::new(false)));
+        let capability = laser.capability();
+        let seeker = Seeker {
+            open,
+            capability,
+            lost: lost_consumer,
+            found: found_producer,
+            watch: watch.clone(),
+            stop: Arc::clone(&stop),
+            clock,
+        };
+        let seeker = std::thread::Builder::new().name("holod-laser-find".into()).spawn(move || seeker.run())?;
+        Ok(Self {
+            current: Some(laser),
+            capability,
+            program: None,
+            fresh: false,
+            lit: None,
+            armed: false,
+            events: VecDeque::with_capacity(EVENTS_MAX),
+            lost,
+            found,
+            watch,
+            stop,
+            seeker: seeker.thread().clone(),
+        })
+    }
+
+    /// Does something with the box that is there; a box that fails at it is lost.
+    fn with_box<T>(
+        &mut self,
+        now: TimeNs,
+        act: impl FnOnce(&mut dyn LaserBox) -> Result<T, LaserError>,
+    ) -> Result<T, LaserError> {
+        let laser = self.current.as_mut().ok_or(LaserError::Lost)?;
+        match act(laser.as_mut()) {
+            Err(why) if why.means_lost() => {
+                self.lose(why, now);
+                Err(LaserError::Lost)
+            }
+            Err(why) => {
+                self.fresh = false;
+                Err(why)
+            }
+            Ok(done) => Ok(done),
+        }
+    }
+
+    fn lose(&mut self, why: LaserError, now: TimeNs) {
+        let Some(mut laser) = self.current.take() else { return };
+        // What its model knows up to now is all that will ever be known.
+        let _lost_anyway = laser.poll(now, &mut |event| self.note(event));
+        if let Some(colour) = self.lit {
+            self.note(BoxEvent::Edge(LaserEdge { t: now, colour, on: false }));
+        }
+        if self.armed {
+            self.note(BoxEvent::Dark { t: now, reason: DarkReason::BoxFault });
+        }
+        self.fresh = false;
+        // Two boxes cannot be lost before the first has been found again.
+        let _never_full = self.lost.push(Lost { laser, why, program: self.program });
+        self.seeker.unpark();
+    }
+
+    fn note(&mut self, event: BoxEvent) {
+        match event {
+            BoxEvent::Armed { .. } => self.armed = true,
+            BoxEvent::Edge(edge) => self.lit = edge.on.then_some(edge.colour),
+            BoxEvent::Dark { .. } => (self.armed, self.lit) = (false, None),
+        }
+        if self.events.len() < EVENTS_MAX {
+            self.events.push_back(event);
+        }
+    }
+}
+
+impl LaserBox for Reconnecting {
+    fn capability(&self) -> Capability {
+        self.capability
+    }
+
+    fn watch(&self) -> Option<LaserWatch> {
+        Some(self.watch.clone())
+    }
+
+    fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
+        if self.fresh && self.program == Some(*program) && self.current.is_some() {
+            return Ok(());
+        }
+        self.program = Some(*program);
+        self.with_box(now, |laser| laser.program(program, now))
+    }
+
+    fn arm(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        self.with_box(now, |laser| laser.arm(now))
+    }
+
+    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        self.with_box(now, |laser| laser.sync(t_sync, now))
+    }
+
+    fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        self.with_box(now, |laser| laser.light(window, now))
+    }
+
+    fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        self.with_box(now, |laser| laser.heartbeat(now))
+    }
+
+    fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
+        self.with_box(now, |laser| laser.dark(reason, now))
+    }
+
+    fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
+        if self.current.is_none()
+            && let Ok(laser) = self.found.pop()
+        {
+            self.current = Some(laser);
+            self.fresh = true;
+        }
+        let mut polled = Ok(());
+        if let Some(mut laser) = self.current.take() {
+            polled = laser.poll(now, &mut |event| self.note(event));
+            self.current = Some(laser);
+            if let Err(why) = polled {
+                polled = self.with_box(now, |_| Err(why));
+            }
+        }
+        while let Some(next) = self.events.pop_front() {
+            event(next);
+        }
+        polled
+    }
+}
+
+impl Drop for Reconnecting {
+    /// Does not wait for the seeker, which may be waiting for a device that does not answer.
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Release);
+        self.seeker.unpark();
+    }
+}
+
+/// The thread that closes lost boxes and looks for them again.
+struct Seeker<F> {
+    open: F,
+    capability: Capability,
+    lost: Consumer<Lost>,
+    found: Producer<Box<dyn LaserBox>>,
+    watch: LaserWatch,
+    stop: Arc<AtomicBool>,
+    clock: fn() -> TimeNs,
+}
+
+impl<F: Fn() -> Result<Box<dyn LaserBox>, LaserError>> Seeker<F> {
+    fn run(mut self) {
+        while !self.stop.load(Ordering::Acquire) {
+            let Ok(Lost { laser, why, program }) = self.lost.pop() else {
+                std::thread::park();
+                continue;
+            };
+            self.watch.set(Some(why.to_string()));
+            drop(laser);
+            while !self.stop.load(Ordering::Acquire) {
+                match self.find(program.as_ref()) {
+                    Ok(laser) => {
+                        // The last one was popped before this one was lost.
+                        let _never_full = self.found.push(laser);
+                        self.watch.set(None);
+                        break;
+                    }
+                    Err(why) => self.watch.set(Some(why.to_string())),
+                }
+                std::thread::park_timeout(RETRY_EVERY);
+            }
+        }
+    }
+
+    fn find(&self, program: Option<&LaserProgram>) -> Result<Box<dyn LaserBox>, LaserError> {
+        let mut laser = (self.open)()?;
+        // What the rules made of the first one holds for its successors: real lasers never take a simulated box's place.
+        if laser.capability() != self.capability {
+            return Err(LaserError::AnotherKind);
+        }
+        laser.dark(DarkReason::Asked, (self.clock)())?;
+        if let Some(program) = program {
+            laser.program(program, (self.clock)())?;
+        }
+        Ok(laser)
+    }
+}

@@ -1,0 +1,181 @@
+//! Lasers that take commands in text (SCPI and its like), one to a port, as a [`TextLaserProfile`] describes them.
+//!
+//! They are switched in tens of milliseconds, so they never gate single fields, and they stay as they are when their host
+//! dies.
+
+use std::path::{Path, PathBuf};
+
+use holod_calibration::rig::{Lasers, Question, TextLaserProfile};
+use holod_calibration::{Colour, PerColour, TimeNs};
+
+use super::line_link::Sharing;
+use super::power_box::{Conversation, PowerBox, PowerDevice, require_acceptance};
+use super::{LaserBox, LaserError};
+
+/// How long an acknowledgement after the answer to a question is waited for, so that it is not taken for the next one's.
+const TRAIL_WAIT: TimeNs = TimeNs(30_000_000);
+
+/// One laser on its port.
+struct TextLaser {
+    port: Conversation,
+    profile: TextLaserProfile,
+    answer_wait: TimeNs,
+}
+
+/// The lasers of a bench.
+struct TextLasers(PerColour<Option<TextLaser>>);
+
+/// Opens the lasers at `paths`. Each is recognised before anything else is said to it.
+///
+/// # Errors
+/// [`LaserError::Open`], [`LaserError::InUse`], [`LaserError::NotABox`], [`LaserError::NoAnswer`],
+/// [`LaserError::Complaint`], [`LaserError::NotAccepted`].
+pub(super) fn open(
+    profile: &TextLaserProfile,
+    paths: &PerColour<Option<PathBuf>>,
+    lasers: &Lasers,
+    clock: fn() -> TimeNs,
+) -> Result<Box<dyn LaserBox>, LaserError> {
+    require_acceptance(lasers)?;
+    let mut open = TextLasers(PerColour([None, None, None]));
+    for colour in Colour::ALL {
+        if let Some(path) = &paths[colour] {
+            let mut laser = TextLaser::open(profile, path, Sharing::Alone, clock)?;
+            laser.recognise()?;
+            open.0[colour] = Some(laser);
+        }
+    }
+    for laser in open.0.0.iter_mut().flatten() {
+        laser.put_out()?;
+        for command in &profile.prepare {
+            laser.command(command)?;
+        }
+        laser.check()?;
+    }
+    Ok(Box::new(PowerBox::new(open, lasers, clock)?))
+}
+
+/// Puts out the laser at `path`, whoever else has its port open.
+///
+/// # Errors
+/// As [`open`].
+pub(super) fn make_dark(profile: &TextLaserProfile, path: &Path, clock: fn() -> TimeNs) -> Result<(), LaserError> {
+    let mut laser = TextLaser::open(profile, path, Sharing::Beside, clock)?;
+    laser.recognise()?;
+    laser.put_out()
+}
+
+impl TextLaser {
+    fn open(
+        profile: &TextLaserProfile,
+        path: &Path,
+        sharing: Sharing,
+        clock: fn() -> TimeNs,
+    ) -> Result<Self, LaserError> {
+        let port = Conversation::open(path, profile.baud, sharing, clock)?;
+        let answer_wait = TimeNs(i64::from(profile.answer_timeout_ms) * 1_000_000);
+        Ok(Self { port, profile: profile.clone(), answer_wait })
+    }
+
+    fn send(&mut self, text: &str) -> Result<(), LaserError> {
+        self.port.send(format!("{text}{}", self.profile.end_of_command).as_bytes())
+    }
+
+    fn ask(&mut self, question: &str) -> Result<String, LaserError> {
+        self.send(question)?;
+        let Some(answer) = self.port.line(self.answer_wait)? else {
+            return Err(LaserError::NoAnswer { command: "question", waited_ms: self.answer_wait.0 / 1_000_000 });
+        };
+        let answer = String::from_utf8_lossy(&answer).trim().to_owned();
+        if answer != self.profile.acknowledge {
+            let _acknowledged_or_not = self.port.line(TRAIL_WAIT)?;
+        }
+        Ok(answer)
+    }
+
+    fn recognise(&mut self) -> Result<(), LaserError> {
+        for Question { ask, expect } in self.profile.identify.clone() {
+            let answer = self.ask(&ask)?;
+            if !expect.accepts(&answer) {
+                let found = answer.chars().take(40).collect();
+                let expected = "what the laser's profile says that it answers";
+                return Err(LaserError::NotABox { path: self.port.path(), found, expected });
+            }
+        }
+        Ok(())
+    }
+
+    fn check(&mut self) -> Result<(), LaserError> {
+        for Question { ask, expect } in self.profile.healthy.clone() {
+            let found = self.ask(&ask)?;
+            if !expect.accepts(&found) {
+                let expected = format!("{expect:?}: check its interlock and its faults");
+                return Err(LaserError::Complaint { path: self.port.path(), sent: ask, found, expected });
+            }
+        }
+        Ok(())
+    }
+
+    fn command(&mut self, command: &str) -> Result<(), LaserError> {
+        self.send(command)?;
+        while let Some(line) = self.port.line(self.answer_wait)? {
+            let answer = String::from_utf8_lossy(&line).trim().to_owned();
+            if answer == self.profile.acknowledge {
+                return Ok(());
+            }
+            if self.profile.error.as_ref().is_some_and(|error| answer.starts_with(error.as_str())) {
+                let (path, expected) = (self.port.path(), self.profile.acknowledge.clone());
+                return Err(LaserError::Complaint { path, sent: command.into(), found: answer, expected });
+            }
+        }
+        Err(LaserError::NoAnswer { command: "command", waited_ms: self.answer_wait.0 / 1_000_000 })
+    }
+
+    fn put_out(&mut self) -> Result<(), LaserError> {
+        self.profile.off.clone().iter().try_for_each(|command| self.command(command))
+    }
+}
+
+impl PowerDevice for TextLasers {
+    fn has(&self, colour: Colour) -> bool {
+        self.0[colour].is_some()
+    }
+
+    fn set_power(&mut self, power_uw: PerColour<u32>) -> Result<(), LaserError> {
+        for colour in Colour::ALL {
+            let Some(laser) = &mut self.0[colour] else { continue };
+            let uw = power_uw[colour];
+            let watts = format!("{}.{:06}", uw / 1_000_000, uw % 1_000_000);
+            let milliwatts = format!("{}.{:03}", uw / 1000, uw % 1000);
+            let command = laser.profile.power.replace("{power_w}", &watts).replace("{power_mw}", &milliwatts);
+            laser.command(&command)?;
+        }
+        Ok(())
+    }
+
+    fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError> {
+        // Out before on, and all that can be put out is, even where one of them does not answer.
+        let mut put_out = Ok(());
+        for colour in Colour::ALL.into_iter().filter(|&colour| !lit[colour]) {
+            if let Some(laser) = &mut self.0[colour] {
+                put_out = put_out.and(laser.put_out());
+            }
+        }
+        put_out?;
+        for colour in Colour::ALL.into_iter().filter(|&colour| lit[colour]) {
+            let Some(laser) = &mut self.0[colour] else { return Err(LaserError::NoLaser { colour }) };
+            laser.profile.on.clone().iter().try_for_each(|command| laser.command(command))?;
+        }
+        Ok(())
+    }
+
+    fn probe(&mut self) -> Result<(), LaserError> {
+        for laser in self.0.0.iter_mut().flatten() {
+            laser.check()?;
+            if laser.profile.healthy.is_empty() {
+                laser.recognise()?;
+            }
+        }
+        Ok(())
+    }
+}

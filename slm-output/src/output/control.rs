@@ -1,0 +1,150 @@
+//! How the output is ended, and made dark.
+
+use std::os::fd::OwnedFd;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::thread::{JoinHandle, Thread};
+use std::time::Duration;
+
+use holod_calibration::TimeNs;
+
+use super::panel_thread::ring;
+use super::shared::{DARK, NOT_YET, OutputCounts, Shared};
+use super::{Clock, SLEEP_MAX};
+use crate::fields::LevelsFrame;
+use crate::laser::DarkReason;
+use crate::present::Recorder;
+
+/// How long shutdown waits for the lasers' acknowledgement.
+const DARK_WAIT: TimeNs = TimeNs(500_000_000);
+/// How long a panic waits for it.
+const PANIC_WAIT: TimeNs = TimeNs(20_000_000);
+
+/// How the output ended.
+#[derive(Debug)]
+pub struct ShutdownReport {
+    /// The laser box acknowledged that it is dark.
+    pub lasers_dark: bool,
+    /// The flat pattern was on the panel before the threads ended.
+    pub flat_presented: bool,
+    /// Levels of the frames that were shown and kept, by slot.
+    pub kept: Vec<Option<LevelsFrame>>,
+    /// Counters at the end.
+    pub counts: OutputCounts,
+}
+
+#[derive(Debug)]
+pub(super) struct Threads {
+    pub(super) panel: JoinHandle<Recorder>,
+    pub(super) laser: JoinHandle<()>,
+}
+
+/// Ends the output; dropped, it ends it too.
+#[derive(Debug)]
+pub struct OutputControl {
+    pub(super) switch: DarkSwitch,
+    pub(super) doorbell: Arc<OwnedFd>,
+    pub(super) frame_period: TimeNs,
+    pub(super) threads: Option<Threads>,
+    pub(super) clock: Clock,
+}
+
+impl OutputControl {
+    /// The switch that makes the lasers dark for good.
+    pub fn dark_switch(&self) -> DarkSwitch {
+        self.switch.clone()
+    }
+
+    /// Counters so far.
+    pub fn counts(&self) -> OutputCounts {
+        self.switch.shared.counts()
+    }
+
+    /// Ends the output in order: lasers dark and acknowledged, flat pattern on the panel, threads joined. The waits for
+    /// darkness and for the flat pattern are bounded; a box that does not answer is left to its heartbeat timeout.
+    pub fn shutdown(mut self) -> ShutdownReport {
+        self.end()
+    }
+
+    fn end(&mut self) -> ShutdownReport {
+        let shared = &self.switch.shared;
+        self.switch.dark(DarkReason::Shutdown);
+        let wait_for = |done: &dyn Fn() -> bool, patience: TimeNs| {
+            let t_end = (self.clock)() + patience;
+            while !done() && (self.clock)() < t_end {
+                std::thread::sleep(Duration::from_micros(500));
+            }
+            done()
+        };
+        let answered = wait_for(&|| shared.acknowledged.load(Ordering::Acquire) != NOT_YET, DARK_WAIT);
+        let lasers_dark = answered && shared.acknowledged.load(Ordering::Acquire) == DARK;
+        shared.flat_wanted.store(true, Ordering::Release);
+        ring(&self.doorbell);
+        let flat_patience = TimeNs(4 * self.frame_period.0 + SLEEP_MAX.0 + 200_000_000);
+        // A panel that is lost shows nothing any more.
+        let flat = || shared.flat_shown.load(Ordering::Acquire);
+        let flat_presented = wait_for(&|| flat() || shared.panel_lost.load(Ordering::Acquire), flat_patience) && flat();
+        shared.stop.store(true, Ordering::Release);
+        ring(&self.doorbell);
+        let mut report =
+            ShutdownReport { lasers_dark, flat_presented, kept: Vec::new(), counts: OutputCounts::default() };
+        if let Some(Threads { panel, laser }) = self.threads.take() {
+            if let Ok(recorder) = panel.join() {
+                report.kept = recorder.into_kept();
+            }
+            laser.thread().unpark();
+            report.lasers_dark &= laser.join().is_ok();
+        }
+        report.counts = self.counts();
+        report
+    }
+}
+
+impl Drop for OutputControl {
+    fn drop(&mut self) {
+        if self.threads.is_some() {
+            self.end();
+        }
+    }
+}
+
+/// Makes the lasers dark for good, from any thread.
+#[derive(Clone, Debug)]
+pub struct DarkSwitch {
+    pub(super) shared: Arc<Shared>,
+    pub(super) laser: Thread,
+}
+
+impl DarkSwitch {
+    /// Asks the laser thread for darkness; the first reason stays. Does not wait.
+    pub fn dark(&self, reason: DarkReason) {
+        let code = 1 + DarkReason::ALL.iter().position(|&known| known == reason).unwrap_or_default() as u8;
+        let _first = self.shared.latch.compare_exchange(0, code, Ordering::AcqRel, Ordering::Acquire);
+        self.laser.unpark();
+    }
+
+    /// Why the lasers are dark for good, if they are.
+    pub fn reason(&self) -> Option<DarkReason> {
+        self.shared.latched()
+    }
+
+    /// Whether the box has acknowledged.
+    pub fn is_dark(&self) -> bool {
+        self.shared.acknowledged.load(Ordering::Acquire) == DARK
+    }
+
+    /// From now on any panic of the program first makes the lasers dark, and waits a moment for the acknowledgement.
+    pub fn install_panic_hook(&self, clock: Clock) {
+        let switch = self.clone();
+        let before = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |info| {
+            switch.dark(DarkReason::Panic);
+            let t_end = clock() + PANIC_WAIT;
+            let on_laser_thread = std::thread::current().id() == switch.laser.id();
+            while !on_laser_thread && !switch.is_dark() && clock() < t_end {
+                std::thread::sleep(Duration::from_micros(200));
+            }
+            before(info);
+        }));
+    }
+}

@@ -1,0 +1,176 @@
+//! The thread of the lasers.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use holod_calibration::TimeNs;
+use rtrb::{Consumer, Producer};
+
+use super::ledger::Ledger;
+use super::panel_thread::PanelNews;
+use super::shared::{DARK, FAILED, NOT_YET, Shared, count};
+use super::{Clock, SLEEP_MAX};
+use crate::laser::{BoxEvent, DarkReason, LaserBox, LaserError, LaserProgram};
+use crate::schedule::{FieldDecision, FieldScheduler, Orders};
+
+/// How long a laser box that failed is left alone.
+const RETRY_AFTER: TimeNs = TimeNs(1_000_000_000);
+
+pub(super) struct LaserThread {
+    pub(super) laser: Box<dyn LaserBox>,
+    pub(super) program: LaserProgram,
+    pub(super) scheduler: FieldScheduler,
+    pub(super) news: Consumer<PanelNews>,
+    pub(super) ledger: Ledger,
+    /// What went wrong with the box, for whoever tells people.
+    pub(super) faults: Producer<LaserError>,
+    /// A box that failed is left alone until then.
+    pub(super) t_retry: TimeNs,
+    /// The box failed and may have lost its program.
+    pub(super) program_lost: bool,
+    pub(super) shared: Arc<Shared>,
+    pub(super) clock: Clock,
+}
+
+impl LaserThread {
+    pub(super) fn run(mut self) {
+        loop {
+            let stop = self.shared.stop.load(Ordering::Acquire);
+            let clock = self.clock;
+            let now = self.step(clock);
+            if stop {
+                self.ledger.flush(TimeNs(i64::MAX), &self.shared);
+                return;
+            }
+            let t_next = self.scheduler.t_next().map_or(SLEEP_MAX, |t| (t - now).max(TimeNs(0)));
+            let rest = t_next.min(self.scheduler.gate().timing().field_period).min(SLEEP_MAX);
+            std::thread::park_timeout(Duration::from_nanos(rest.0 as u64));
+        }
+    }
+
+    /// Does all that is to be done at the time that `clock` says, which is handed back. The clock is read again for each
+    /// field: a field that came since the last reading is not one that was reported before it was shown.
+    pub(super) fn step(&mut self, clock: impl Fn() -> TimeNs) -> TimeNs {
+        let now = clock();
+        self.poll(now);
+        if let Some(reason) = self.shared.latched() {
+            self.latch(reason, now);
+        }
+        self.decide_fields(clock());
+        while let Ok(news) = self.news.pop() {
+            match news {
+                PanelNews::Refresh(refresh) => {
+                    // What the panel showed before is over by then, however late this thread is.
+                    self.decide_fields(refresh.t_present.min(clock()));
+                    self.scheduler.on_refresh(&refresh);
+                    self.decide_fields(clock());
+                }
+                PanelNews::Lost => {
+                    let orders = self.scheduler.panel_lost();
+                    self.obey(orders, clock());
+                }
+            }
+        }
+        let now = clock();
+        let orders = self.scheduler.watch(now);
+        self.obey(orders, now);
+        self.poll(now);
+        self.shared.armed.store(self.scheduler.is_armed(), Ordering::Relaxed);
+        self.shared.refresh_millihz.store((self.scheduler.refresh_hz() * 1e3).round() as u64, Ordering::Relaxed);
+        self.ledger.flush(now, &self.shared);
+        now
+    }
+
+    /// Does what is to be done about the fields that have begun by `now`.
+    fn decide_fields(&mut self, now: TimeNs) {
+        while let Some(FieldDecision { shown, orders, mut dark }) = self.scheduler.next_field(now) {
+            if orders.arm && now < self.t_retry {
+                self.scheduler.box_went_dark();
+                dark = Some(DarkReason::BoxFault);
+            } else {
+                dark = self.obey(orders, now).or(dark);
+            }
+            self.ledger.field(&shown, dark, &self.shared);
+        }
+    }
+
+    /// Does what the scheduler says. Why the box does not light the field all the same, if so.
+    fn obey(&mut self, orders: Orders, now: TimeNs) -> Option<DarkReason> {
+        self.try_obey(orders, now).unwrap_or_else(|error| {
+            self.fault(error, now);
+            Some(DarkReason::BoxFault)
+        })
+    }
+
+    fn try_obey(&mut self, orders: Orders, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        if let Some(reason) = orders.dark {
+            return self.laser.dark(reason, now).map(|()| None);
+        }
+        if orders.arm {
+            if std::mem::take(&mut self.program_lost) {
+                self.laser.program(&self.program, now)?;
+            }
+            self.laser.arm(now)?;
+        }
+        if orders.heartbeat {
+            self.laser.heartbeat(now)?;
+        }
+        let unsynced = match orders.sync {
+            Some(t_sync) => self.laser.sync(t_sync, now)?,
+            None => None,
+        };
+        let unlit = match orders.light {
+            Some(window) => self.laser.light(window, now)?,
+            None => None,
+        };
+        Ok(unsynced.or(unlit))
+    }
+
+    fn fault(&mut self, error: LaserError, now: TimeNs) {
+        self.note(error);
+        self.scheduler.box_went_dark();
+        self.program_lost = true;
+        self.t_retry = now + RETRY_AFTER;
+        if let Err(error) = self.laser.dark(DarkReason::BoxFault, now) {
+            self.note(error);
+        }
+    }
+
+    /// Counts a fault of the box and hands it over to whoever tells people; where nobody has listened it is only counted.
+    fn note(&mut self, error: LaserError) {
+        count(&self.shared.box_faults);
+        let _counted = self.faults.push(error);
+    }
+
+    pub(super) fn latch(&mut self, reason: DarkReason, now: TimeNs) {
+        if self.shared.acknowledged.load(Ordering::Acquire) != NOT_YET {
+            return;
+        }
+        let orders = self.scheduler.latch(reason);
+        let answer = match self.try_obey(orders, now) {
+            Ok(_) => DARK,
+            Err(error) => {
+                self.note(error);
+                FAILED
+            }
+        };
+        self.shared.acknowledged.store(answer, Ordering::Release);
+    }
+
+    fn poll(&mut self, now: TimeNs) {
+        let Self { laser, ledger, scheduler, shared, .. } = self;
+        let polled = laser.poll(now, &mut |event| {
+            if matches!(event, BoxEvent::Dark { .. }) {
+                scheduler.box_went_dark();
+                count(&shared.went_dark);
+            }
+            ledger.box_event(event, shared);
+        });
+        if let Err(error) = polled
+            && now >= self.t_retry
+        {
+            self.fault(error, now);
+        }
+    }
+}

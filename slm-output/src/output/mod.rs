@@ -1,0 +1,217 @@
+//! The output's threads: the panel, and the lasers that follow it.
+//!
+//! | Thread | Does |
+//! |---|---|
+//! | the caller's frame thread | fills a frame from [`FramePort::acquire`], hands it over with [`FramePort::submit`] |
+//! | `holod-panel` | runs the [`Presenter`]; tells the laser thread of each refresh of the panel |
+//! | `holod-laser` | asks the [`FieldScheduler`], drives the [`LaserBox`], publishes a [`FieldEvent`] when a field is over |
+//!
+//! After their start they neither allocate, lock nor log; what they have to say goes through wait-free rings and
+//! counters, and where nobody reads a ring its newest entries are dropped and counted.
+
+mod control;
+mod laser_thread;
+mod ledger;
+mod panel_thread;
+mod port;
+mod shared;
+#[cfg(test)]
+mod tests;
+
+pub use self::control::{DarkSwitch, OutputControl, ShutdownReport};
+pub use self::ledger::FieldEvent;
+pub use self::panel_thread::PanelEvent;
+pub use self::port::{FramePort, PresentReport};
+pub use self::shared::OutputCounts;
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use holod_calibration::TimeNs;
+use holod_calibration::rig::Rig;
+use rtrb::{Consumer, RingBuffer};
+use rustix::event::{EventfdFlags, eventfd};
+
+use self::control::Threads;
+use self::laser_thread::LaserThread;
+use self::ledger::Ledger;
+use self::panel_thread::PanelThread;
+use self::shared::Shared;
+use crate::laser::{BoxEvent, DarkReason, LaserBox, LaserError, LaserWatch, Trigger};
+use crate::levels::PanelEncoder;
+use crate::pacing::PacingConfig;
+use crate::present::{OpenError, PanelSetup, Presenter, Recorder, frame_channel};
+use crate::schedule::{Evidence, FieldScheduler, Gate};
+
+/// A monotonic clock. The threads read it; nothing below them does.
+pub type Clock = fn() -> TimeNs;
+
+/// The system's monotonic clock, which a simulated laser box in another process shares.
+pub fn monotonic_now() -> TimeNs {
+    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
+    TimeNs(now.tv_sec * 1_000_000_000 + now.tv_nsec)
+}
+
+/// Refreshes on their way to the laser thread, and reports on their way to the frame thread.
+const SHORT_RING: usize = 256;
+/// Events on their way to whoever records them: some 20 s of fields at 180 Hz.
+const LONG_RING: usize = 4096;
+/// Longest sleep of a thread, so that it sees an order to stop.
+const SLEEP_MAX: TimeNs = TimeNs(20_000_000);
+
+/// What may be chosen about the output.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OutputOptions {
+    /// Frames whose presented levels can be kept in memory (see [`FramePort::submit`]).
+    pub keep_slots: usize,
+    /// Lasers go dark when one frame has stayed on the panel for this long. Not less than a few times the slowest frame.
+    pub stall_timeout: TimeNs,
+}
+
+impl Default for OutputOptions {
+    /// Nothing is kept; 2 s.
+    fn default() -> Self {
+        Self { keep_slots: 0, stall_timeout: TimeNs(2_000_000_000) }
+    }
+}
+
+/// Why the output could not be started.
+#[derive(Debug, thiserror::Error)]
+pub enum OutputError {
+    /// The panel.
+    #[error(transparent)]
+    Panel(#[from] OpenError),
+    /// The lasers.
+    #[error(transparent)]
+    Laser(#[from] LaserError),
+    /// A thread could not be started.
+    #[error("cannot start a thread: {0}; check the limits on threads and memory")]
+    Thread(#[from] std::io::Error),
+}
+
+/// The running output, by the threads that hold its parts.
+#[derive(Debug)]
+pub struct Output {
+    /// For the frame thread.
+    pub frames: FramePort,
+    /// For whoever records: each field that was on the panel, in order, once it is over.
+    pub events: Consumer<FieldEvent>,
+    /// For whoever records: what the laser box did.
+    pub box_events: Consumer<BoxEvent>,
+    /// For whoever tells people: the panel was lost or came back.
+    pub panel_events: Consumer<PanelEvent>,
+    /// For whoever tells people: what went wrong with the laser box.
+    pub laser_faults: Consumer<LaserError>,
+    /// For whoever tells people: why the laser box is lost, where it can be.
+    pub laser_watch: Option<LaserWatch>,
+    /// For whoever ends it.
+    pub control: OutputControl,
+}
+
+impl Output {
+    /// Starts on any panel with any laser box. Over a virtual panel real lasers stay dark: nothing is on any panel.
+    ///
+    /// # Errors
+    /// [`OutputError`] where the rig leaves no time for light, the box refuses its program or a thread does not start.
+    pub fn start(
+        rig: &Rig,
+        encoder: &PanelEncoder,
+        panel: Box<dyn Presenter>,
+        mut laser: Box<dyn LaserBox>,
+        options: OutputOptions,
+        clock: Clock,
+    ) -> Result<Self, OutputError> {
+        let flat = PanelSetup::new(&rig.panel, encoder).flat;
+        let virtual_bench = panel.is_virtual() && laser.is_simulated();
+        // A box with a wire to the panel's sync times its own windows, and in channel-packed mode the panel's own sequence
+        // says which colour each of them is for: that frames go by is all that must be known here.
+        let wired =
+            !panel.is_virtual() && laser.capability().sync_wire && Gate::trigger(&rig.panel) == Trigger::PanelSync;
+        let evidence = if virtual_bench || wired { Evidence::Seen } else { Evidence::Stamped };
+        let scheduler = FieldScheduler::new(&rig.panel, flat.layout(), &rig.lasers, evidence, options.stall_timeout)?;
+        let program = scheduler.program(&rig.panel, &rig.lasers)?;
+        laser.dark(DarkReason::Asked, clock())?;
+        laser.program(&program, clock())?;
+
+        let (sink, source) = frame_channel(&flat);
+        let (news_producer, news_consumer) = RingBuffer::new(SHORT_RING);
+        let (report_producer, report_consumer) = RingBuffer::new(SHORT_RING);
+        let (event_producer, event_consumer) = RingBuffer::new(LONG_RING);
+        let (box_producer, box_consumer) = RingBuffer::new(LONG_RING);
+        let (panel_producer, panel_consumer) = RingBuffer::new(SHORT_RING);
+        let (fault_producer, fault_consumer) = RingBuffer::new(SHORT_RING);
+        let laser_watch = laser.watch();
+        let shared = Arc::new(Shared::default());
+        let doorbell =
+            Arc::new(eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(std::io::Error::from)?);
+        let gate = scheduler.gate();
+
+        let laser_thread = LaserThread {
+            laser,
+            program,
+            scheduler,
+            news: news_consumer,
+            ledger: Ledger::new(gate, event_producer, box_producer),
+            faults: fault_producer,
+            t_retry: TimeNs(i64::MIN),
+            program_lost: false,
+            shared: Arc::clone(&shared),
+            clock,
+        };
+        let laser = std::thread::Builder::new().name("holod-laser".into()).spawn(move || laser_thread.run())?;
+        let panel_thread = PanelThread {
+            panel: Recorder::new(panel, &flat, options.keep_slots),
+            frames: source,
+            news: news_producer,
+            reports: report_producer,
+            events: panel_producer,
+            laser: laser.thread().clone(),
+            doorbell: Arc::clone(&doorbell),
+            shared: Arc::clone(&shared),
+            clock,
+        };
+        let spawned = std::thread::Builder::new().name("holod-panel".into()).spawn(move || panel_thread.run());
+        let panel = match spawned {
+            Ok(panel) => panel,
+            Err(why) => {
+                shared.stop.store(true, Ordering::Release);
+                laser.thread().unpark();
+                // A panic over there has been reported by the panic hook.
+                let _ended = laser.join();
+                return Err(why.into());
+            }
+        };
+        Ok(Self {
+            frames: FramePort { sink, reports: report_consumer },
+            events: event_consumer,
+            box_events: box_consumer,
+            panel_events: panel_consumer,
+            laser_faults: fault_consumer,
+            laser_watch,
+            control: OutputControl {
+                switch: DarkSwitch { shared, laser: laser.thread().clone() },
+                doorbell,
+                frame_period: gate.timing().frame_period,
+                threads: Some(Threads { panel, laser }),
+                clock,
+            },
+        })
+    }
+}
+
+/// What a pacer must know to make frames for the output of `rig`.
+///
+/// # Errors
+/// As [`Gate::new`].
+pub fn pacing_config(rig: &Rig, first_frame_time: TimeNs) -> Result<PacingConfig, LaserError> {
+    let gate = Gate::new(&rig.panel, &rig.lasers)?;
+    let timing = gate.timing();
+    // The middle of the fields stands for all of them.
+    let middle_field_ns = timing.field_period.0 * (timing.fields as i64 - 1) / 2;
+    Ok(PacingConfig {
+        refresh_period: timing.frame_period,
+        photon_delay: TimeNs(middle_field_ns) + gate.middle(),
+        submit_margin: TimeNs(timing.refresh_period.0 / 16),
+        first_frame_time,
+    })
+}

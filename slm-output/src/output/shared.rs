@@ -1,0 +1,82 @@
+//! What the output's threads share: orders, acknowledgements and counters, all of them atomic.
+
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
+
+use crate::laser::DarkReason;
+
+/// Counters of the output's threads.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct OutputCounts {
+    /// Colour fields of frames that came on the panel.
+    pub fields: u64,
+    /// Of those, fields of a frame that had been shown before.
+    pub repeated: u64,
+    /// Fields that were not lit.
+    pub dark_fields: u64,
+    /// Times that the lasers went dark while they were armed.
+    pub went_dark: u64,
+    /// Commands that the laser box failed or refused.
+    pub box_faults: u64,
+    /// Reports and events lost because nobody read them.
+    pub lost: u64,
+    /// Refreshes a second, as the panel reports them; 0 until it has.
+    pub refresh_hz: f64,
+    /// Whether the panel is lost.
+    pub panel_lost: bool,
+    /// Whether lasers may be lit now.
+    pub armed: bool,
+}
+
+pub(super) const NOT_YET: u8 = 0;
+pub(super) const DARK: u8 = 1;
+pub(super) const FAILED: u8 = 2;
+
+/// What the threads share.
+#[derive(Debug, Default)]
+pub(super) struct Shared {
+    /// 0, or 1 + the index of the reason for which lasers are dark for good.
+    pub(super) latch: AtomicU8,
+    /// What the box said to that.
+    pub(super) acknowledged: AtomicU8,
+    pub(super) flat_wanted: AtomicBool,
+    pub(super) flat_shown: AtomicBool,
+    pub(super) stop: AtomicBool,
+    pub(super) armed: AtomicBool,
+    /// The panel is lost, or never came back.
+    pub(super) panel_lost: AtomicBool,
+    /// Refreshes that the panel reports, thousandths a second.
+    pub(super) refresh_millihz: AtomicU64,
+    pub(super) fields: AtomicU64,
+    pub(super) repeated: AtomicU64,
+    pub(super) dark_fields: AtomicU64,
+    pub(super) went_dark: AtomicU64,
+    pub(super) box_faults: AtomicU64,
+    pub(super) lost: AtomicU64,
+}
+
+impl Shared {
+    pub(super) fn counts(&self) -> OutputCounts {
+        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        OutputCounts {
+            fields: get(&self.fields),
+            repeated: get(&self.repeated),
+            dark_fields: get(&self.dark_fields),
+            went_dark: get(&self.went_dark),
+            box_faults: get(&self.box_faults),
+            lost: get(&self.lost),
+            refresh_hz: get(&self.refresh_millihz) as f64 / 1e3,
+            panel_lost: self.panel_lost.load(Ordering::Relaxed),
+            armed: self.armed.load(Ordering::Relaxed),
+        }
+    }
+
+    pub(super) fn latched(&self) -> Option<DarkReason> {
+        let code = self.latch.load(Ordering::Acquire);
+        DarkReason::ALL.get(usize::from(code).wrapping_sub(1)).copied()
+    }
+}
+
+/// One more.
+pub(super) fn count(counter: &AtomicU64) {
+    counter.fetch_add(1, Ordering::Relaxed);
+}

@@ -1,0 +1,488 @@
+//! The panel, the laser thread's work and the real threads together.
+
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
+
+use holod_calibration::rig::{Panel, PanelMode};
+use holod_calibration::{Colour, PerColour, Resolution};
+use proptest::prelude::*;
+use rtrb::Producer;
+
+use super::panel_thread::PanelNews;
+use super::shared::DARK;
+use super::*;
+use crate::fields::{FrameLayout, FrameTag};
+use crate::laser::verify::{EdgeReport, Finding, verify_edges};
+use crate::laser::{Capability, LaserEdge, LaserProgram, LitWindow, Refusal, SimulatedLaser};
+use crate::pacing::Pacer;
+use crate::present::{FrameSink, FrameSource, HeadlessPanel, PresentedRefresh, Provenance, ReportFaults};
+
+const SIZE: Resolution = Resolution { width: 8, height: 4 };
+const MS: i64 = 1_000_000;
+/// When the panel begins its first colour frame.
+const T_FIRST: TimeNs = TimeNs(10 * MS);
+
+fn scheduler(rig: &Rig, evidence: Evidence) -> FieldScheduler {
+    let layout = FrameLayout::new(&rig.panel, SIZE);
+    FieldScheduler::new(&rig.panel, layout, &rig.lasers, evidence, TimeNs(500 * MS)).unwrap()
+}
+
+fn rig(mode: PanelMode) -> Rig {
+    let rig = Rig::default();
+    Rig {
+        panel: Panel { mode, refresh_hz: if mode == PanelMode::ChannelPacked { 60.0 } else { 180.0 }, ..rig.panel },
+        ..rig
+    }
+}
+
+fn headless(rig: &Rig, encoder: &PanelEncoder, options: OutputOptions) -> Output {
+    let panel = HeadlessPanel::new(&PanelSetup::new(&rig.panel, encoder), monotonic_now(), ReportFaults::NONE);
+    let laser = Box::new(SimulatedLaser::new(monotonic_now()));
+    Output::start(rig, encoder, Box::new(panel), laser, options, monotonic_now).unwrap()
+}
+
+/// The panel and the laser thread's work, in a time of its own.
+struct Bench {
+    panel: HeadlessPanel,
+    sink: FrameSink,
+    source: FrameSource,
+    news: Producer<PanelNews>,
+    laser: LaserThread,
+    events: Consumer<FieldEvent>,
+    box_events: Consumer<BoxEvent>,
+    /// What is made of the panel's reports on their way.
+    falsify: fn(PresentedRefresh) -> Option<PresentedRefresh>,
+    now: TimeNs,
+    /// The next field's nominal start.
+    t_field: TimeNs,
+    last_frame_id: u64,
+    all_events: Vec<FieldEvent>,
+    edges: Vec<LaserEdge>,
+    darks: Vec<(TimeNs, DarkReason)>,
+}
+
+impl Bench {
+    fn new(mode: PanelMode) -> Self {
+        Self::with_box(mode, Box::new(SimulatedLaser::new(TimeNs(0))))
+    }
+
+    fn with_box(mode: PanelMode, mut laser: Box<dyn LaserBox>) -> Self {
+        let rig = rig(mode);
+        let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
+        let setup = PanelSetup::new(&rig.panel, &encoder);
+        let scheduler = scheduler(&rig, Evidence::Seen);
+        let gate = scheduler.gate();
+        let program = scheduler.program(&rig.panel, &rig.lasers).unwrap();
+        laser.program(&program, TimeNs(0)).unwrap();
+        let (sink, source) = frame_channel(&setup.flat);
+        let (news, news_consumer) = RingBuffer::new(SHORT_RING);
+        let (event_producer, events) = RingBuffer::new(LONG_RING);
+        let (box_producer, box_events) = RingBuffer::new(LONG_RING);
+        let laser = LaserThread {
+            laser,
+            program,
+            scheduler,
+            news: news_consumer,
+            ledger: Ledger::new(gate, event_producer, box_producer),
+            faults: RingBuffer::new(SHORT_RING).0,
+            t_retry: TimeNs(i64::MIN),
+            program_lost: false,
+            shared: Arc::default(),
+            clock: || TimeNs(0),
+        };
+        let t_open = T_FIRST - gate.timing().frame_period;
+        let panel = HeadlessPanel::new(&setup, t_open, ReportFaults::NONE);
+        Self {
+            panel,
+            sink,
+            source,
+            news,
+            laser,
+            events,
+            box_events,
+            falsify: Some,
+            now: TimeNs(0),
+            t_field: T_FIRST,
+            last_frame_id: 0,
+            all_events: Vec::new(),
+            edges: Vec::new(),
+            darks: Vec::new(),
+        }
+    }
+
+    fn submit(&mut self) {
+        self.last_frame_id += 1;
+        self.sink.submit(FrameTag {
+            frame_id: self.last_frame_id,
+            t_submit: self.now,
+            t_desired_present: self.now,
+            keep: None,
+        });
+    }
+
+    /// Both threads wake up at `now` and do what they find.
+    fn wake(&mut self, now: TimeNs) {
+        self.now = now;
+        let Self { panel, source, news, falsify, .. } = self;
+        let ticked = panel.tick(now, source, &mut |refresh| {
+            if let Some(refresh) = falsify(refresh) {
+                news.push(PanelNews::Refresh(refresh)).unwrap();
+            }
+        });
+        assert_eq!(ticked, Ok(()));
+        self.laser.step(|| now);
+        while let Ok(event) = self.events.pop() {
+            self.all_events.push(event);
+        }
+        while let Ok(event) = self.box_events.pop() {
+            match event {
+                BoxEvent::Edge(edge) => self.edges.push(edge),
+                BoxEvent::Dark { t, reason } => self.darks.push((t, reason)),
+                BoxEvent::Armed { .. } => {}
+            }
+        }
+    }
+
+    /// Wakes up at every field, `late` after it, with a new frame for every colour frame.
+    fn run(&mut self, until: TimeNs, late: TimeNs) {
+        let timing = self.laser.scheduler.gate().timing();
+        while self.t_field + late < until {
+            if (self.t_field - T_FIRST).0 % timing.frame_period.0 == 0 {
+                self.now = self.t_field - TimeNs(MS);
+                self.submit();
+            }
+            self.wake(self.t_field + late);
+            self.t_field = self.t_field + timing.field_period;
+        }
+    }
+
+    fn verdict(&mut self) -> EdgeReport {
+        // Everything that was begun is over.
+        self.laser.ledger.flush(TimeNs(i64::MAX), &self.laser.shared);
+        while let Ok(event) = self.events.pop() {
+            self.all_events.push(event);
+        }
+        let spans: Vec<_> = self.all_events.iter().map(FieldEvent::span).collect();
+        verify_edges(&spans, &self.edges)
+    }
+}
+
+const MODES: [PanelMode; 2] = [PanelMode::ChannelPacked, PanelMode::FieldSequential];
+
+#[test]
+fn every_field_is_lit_once_by_its_own_laser() {
+    for mode in MODES {
+        for late_ns in [0, 100_000, 1_900_000] {
+            let mut bench = Bench::new(mode);
+            bench.run(TimeNs(1000 * MS), TimeNs(late_ns));
+            bench.wake(TimeNs(1000 * MS));
+            bench.laser.latch(DarkReason::Shutdown, TimeNs(1000 * MS));
+            bench.wake(TimeNs(1001 * MS));
+            let report = bench.verdict();
+            assert_eq!(report.unsafe_findings().collect::<Vec<_>>(), Vec::<&Finding>::new());
+            assert!(report.fields >= 170, "{report:?}");
+            assert!(report.lit >= report.fields - 8, "{mode:?} late {late_ns}: {report:?}");
+            assert!(bench.all_events.iter().any(|event| !event.repeated && event.laser_on.is_some()));
+        }
+    }
+}
+
+#[test]
+fn events_carry_the_edges_of_their_own_field() {
+    let mut bench = Bench::new(PanelMode::ChannelPacked);
+    bench.run(TimeNs(300 * MS), TimeNs(50_000));
+    let lit: Vec<_> = bench.all_events.iter().filter(|event| event.dark.is_none()).collect();
+    assert!(lit.len() > 30);
+    for event in lit {
+        let (on, off) = (event.laser_on.unwrap(), event.laser_off.unwrap());
+        // Rounded inwards to the box's microseconds.
+        let (late, early) = (on - event.t_present - TimeNs(2_100_000), event.t_present + TimeNs(5_100_000) - off);
+        assert!((0..3000).contains(&late.0) && (0..3000).contains(&early.0), "{late:?} {early:?}");
+        assert!(on >= event.t_settled && off <= event.t_end);
+    }
+}
+
+#[test]
+fn nothing_is_lit_over_the_flat_pattern_or_before_the_first_frame() {
+    let mut bench = Bench::new(PanelMode::ChannelPacked);
+    for tick in 0..100 {
+        bench.wake(TimeNs(tick * 5 * MS));
+    }
+    assert_eq!((bench.edges.len(), bench.all_events.len()), (0, 0));
+}
+
+#[test]
+fn times_that_nobody_saw_light_nothing() {
+    for mode in MODES {
+        let mut bench = Bench::new(mode);
+        bench.falsify = |refresh| Some(PresentedRefresh { provenance: Provenance::Estimated, ..refresh });
+        bench.run(TimeNs(500 * MS), TimeNs(0));
+        assert_eq!(bench.edges, []);
+        // Of a real panel, software's word is not enough either.
+        let mut bench = Bench::new(mode);
+        bench.laser.scheduler = scheduler(&rig(mode), Evidence::Stamped);
+        bench.run(TimeNs(500 * MS), TimeNs(0));
+        assert_eq!(bench.edges, []);
+        assert!(bench.all_events.iter().all(|event| event.dark == Some(DarkReason::Untrusted)));
+        bench.falsify = |refresh| Some(PresentedRefresh { provenance: Provenance::Hardware, ..refresh });
+        bench.run(TimeNs(1000 * MS), TimeNs(0));
+        assert_ne!(bench.edges, []);
+    }
+}
+
+#[test]
+fn a_field_that_the_colour_frame_does_not_have_lights_nothing() {
+    for mode in MODES {
+        let mut bench = Bench::new(mode);
+        bench.falsify = |refresh| Some(PresentedRefresh { field: refresh.field + 3, ..refresh });
+        bench.run(TimeNs(500 * MS), TimeNs(0));
+        assert_eq!(bench.edges, []);
+        assert!(bench.all_events.iter().all(|event| event.dark == Some(DarkReason::WrongColour)));
+    }
+}
+
+#[test]
+fn a_lost_panel_is_dark_at_once_and_lit_again_when_it_is_back() {
+    for mode in MODES {
+        let mut bench = Bench::new(mode);
+        bench.run(TimeNs(300 * MS), TimeNs(0));
+        bench.falsify = |_| None;
+        bench.news.push(PanelNews::Lost).unwrap();
+        let t_lost = bench.now + TimeNs(MS);
+        bench.wake(t_lost);
+        // The box's time is in whole microseconds.
+        let &[(t_dark, DarkReason::PanelLost)] = bench.darks.as_slice() else { panic!("{:?}", bench.darks) };
+        assert!((0..1000).contains(&(t_lost.0 - t_dark.0)), "{t_dark:?} {t_lost:?}");
+        let edges = bench.edges.len();
+        bench.run(TimeNs(600 * MS), TimeNs(0));
+        assert_eq!(bench.edges.len(), edges);
+        bench.falsify = Some;
+        bench.run(TimeNs(900 * MS), TimeNs(0));
+        assert!(bench.edges.len() > edges);
+        assert_eq!(bench.verdict().unsafe_findings().count(), 0);
+    }
+}
+
+#[test]
+fn missing_reports_make_dark_and_fields_that_return_make_light() {
+    for mode in MODES {
+        let mut bench = Bench::new(mode);
+        bench.run(TimeNs(500 * MS), TimeNs(0));
+        bench.falsify = |_| None;
+        let t_lost = bench.now;
+        bench.run(TimeNs(900 * MS), TimeNs(0));
+        let &(t_dark, _) = bench.darks.last().unwrap();
+        let refresh_ms = if mode == PanelMode::ChannelPacked { 17 } else { 6 };
+        assert!(t_dark - t_lost <= TimeNs(3 * refresh_ms * MS + 6 * MS), "{mode:?}: {t_dark:?} {t_lost:?}");
+        let edges = bench.edges.len();
+        assert!(bench.edges.iter().all(|edge| edge.t <= t_dark));
+        bench.falsify = Some;
+        bench.run(TimeNs(1200 * MS), TimeNs(0));
+        assert!(bench.edges.len() > edges);
+    }
+}
+
+#[test]
+fn a_frame_that_nobody_renews_goes_dark_after_the_stall_timeout() {
+    for mode in MODES {
+        let mut bench = Bench::new(mode);
+        bench.submit();
+        for tick in 0..2000 {
+            bench.wake(TimeNs(tick * MS));
+        }
+        let last = bench.edges.last().unwrap();
+        assert!(!last.on && last.t > TimeNs(480 * MS) && last.t < TimeNs(540 * MS), "{last:?}");
+        assert_eq!(bench.all_events.last().unwrap().dark, Some(DarkReason::Stall));
+        assert_eq!(bench.verdict().findings, []);
+    }
+}
+
+#[test]
+fn a_latched_dark_stays_dark() {
+    let mut bench = Bench::new(PanelMode::ChannelPacked);
+    bench.run(TimeNs(300 * MS), TimeNs(0));
+    bench.laser.shared.latch.store(1, Ordering::Release);
+    bench.run(TimeNs(305 * MS), TimeNs(0));
+    assert_eq!(bench.laser.shared.acknowledged.load(Ordering::Acquire), DARK);
+    let edges = bench.edges.len();
+    bench.run(TimeNs(2000 * MS), TimeNs(0));
+    assert_eq!(bench.edges.len(), edges);
+    assert_eq!(bench.verdict().unsafe_findings().count(), 0);
+}
+
+/// A box that fails when it is told so.
+struct Faulty {
+    inner: SimulatedLaser,
+    fails: Arc<AtomicBool>,
+}
+
+impl Faulty {
+    fn check(&self) -> Result<(), LaserError> {
+        let refused = LaserError::Refused { command: "test", refusal: Refusal::Malformed };
+        if self.fails.load(Ordering::Relaxed) { Err(refused) } else { Ok(()) }
+    }
+}
+
+impl LaserBox for Faulty {
+    fn capability(&self) -> Capability {
+        Capability { simulated: true, gates_fields: true, has_heartbeat: true, sync_wire: false }
+    }
+    fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
+        self.check().and_then(|()| self.inner.program(program, now))
+    }
+    fn arm(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        self.check().and_then(|()| self.inner.arm(now))
+    }
+    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        self.check().and_then(|()| self.inner.sync(t_sync, now))
+    }
+    fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        self.check().and_then(|()| self.inner.light(window, now))
+    }
+    fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        self.check().and_then(|()| self.inner.heartbeat(now))
+    }
+    fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
+        self.check().and_then(|()| self.inner.dark(reason, now))
+    }
+    fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
+        self.inner.poll(now, event)
+    }
+}
+
+#[test]
+fn a_box_that_fails_goes_dark_by_itself_and_is_tried_again_later() {
+    for mode in MODES {
+        let fails = Arc::new(AtomicBool::new(false));
+        let laser = Faulty { inner: SimulatedLaser::new(TimeNs(0)), fails: Arc::clone(&fails) };
+        let mut bench = Bench::with_box(mode, Box::new(laser));
+        bench.run(TimeNs(300 * MS), TimeNs(0));
+        fails.store(true, Ordering::Relaxed);
+        let t_failed = bench.now;
+        bench.run(TimeNs(800 * MS), TimeNs(0));
+        let &(t_dark, _) = bench.darks.last().unwrap();
+        assert!(t_dark - t_failed <= TimeNs(100 * MS), "the heartbeat timeout");
+        assert!(bench.edges.iter().all(|edge| edge.t <= t_dark));
+        assert!(bench.all_events.last().unwrap().dark.is_some());
+        fails.store(false, Ordering::Relaxed);
+        bench.run(TimeNs(2500 * MS), TimeNs(0));
+        assert!(bench.edges.last().unwrap().t > TimeNs(2400 * MS));
+        assert_eq!(bench.verdict().unsafe_findings().count(), 0);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(96))]
+
+    /// However late the threads wake up, and whenever frames come, no light goes where it must not, every field
+    /// without light has a reason, and when everything stops the box goes dark by itself.
+    #[test]
+    fn no_jitter_and_no_stall_lights_what_it_must_not(
+        packed in prop::bool::ANY,
+        wakes in prop::collection::vec((prop_oneof![6 => 1i64..6000, 2 => 6000i64..40_000, 1 => 40_000i64..900_000], 0u8..4), 50..400),
+    ) {
+        let mut bench = Bench::new(if packed { PanelMode::ChannelPacked } else { PanelMode::FieldSequential });
+        let mut now = TimeNs(0);
+        for (later_us, frames) in wakes {
+            if frames == 0 {
+                bench.now = now;
+                bench.submit();
+            }
+            now = now + TimeNs(later_us * 1000);
+            bench.wake(now);
+        }
+        // The host hangs for good; only the box's own time goes on.
+        let t_hang = now;
+        let mut left = Vec::new();
+        bench.laser.laser.poll(now + TimeNs(10_000 * MS), &mut |event| left.push(event)).unwrap();
+        for event in left {
+            match event {
+                BoxEvent::Edge(edge) => {
+                    prop_assert!(edge.t - t_hang <= TimeNs(100 * MS));
+                    bench.edges.push(edge);
+                }
+                BoxEvent::Dark { t, .. } => prop_assert!(t - t_hang <= TimeNs(100 * MS)),
+                BoxEvent::Armed { .. } => prop_assert!(false),
+            }
+        }
+        // The panel shows on what it has, and a panel would say so.
+        let mut fields = Vec::new();
+        bench.panel.tick(t_hang + TimeNs(60 * MS), &mut bench.source, &mut |field| fields.push(field)).unwrap();
+        let decide = |laser: &mut LaserThread| {
+            while let Some(decision) = laser.scheduler.next_field(TimeNs(i64::MAX / 2)) {
+                laser.ledger.field(&decision.shown, Some(DarkReason::Heartbeat), &laser.shared);
+            }
+        };
+        decide(&mut bench.laser);
+        for refresh in fields {
+            bench.laser.scheduler.on_refresh(&refresh);
+            decide(&mut bench.laser);
+        }
+        let report = bench.verdict();
+        prop_assert_eq!(report.findings, vec![], "edges {:?}", bench.edges.len());
+    }
+}
+
+#[test]
+fn the_real_threads_show_light_and_end_in_order() {
+    for mode in MODES {
+        let rig = rig(mode);
+        let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
+        let options = OutputOptions { keep_slots: 1, ..OutputOptions::default() };
+        let mut output = headless(&rig, &encoder, options);
+        let config = pacing_config(&rig, TimeNs(2 * MS)).unwrap();
+        let mut pacer = Pacer::new(config, monotonic_now());
+        let pattern = vec![1.0f32; SIZE.pixels()];
+        let mut last_plan = None;
+        let mut reports = 0;
+        for frame in 0..30 {
+            output.frames.feed(&mut pacer, |_| reports += 1);
+            let plan = pacer.predict(monotonic_now());
+            let rest = plan.t_wake - monotonic_now();
+            std::thread::sleep(Duration::from_nanos(rest.0.max(0) as u64));
+            encoder.encode(PerColour([&pattern; 3]), output.frames.acquire());
+            let now = monotonic_now();
+            output.frames.submit(&plan, Some(0), now);
+            pacer.mark(crate::pacing::Point::Submit, plan.frame_id, now);
+            last_plan = Some(plan);
+            assert_eq!(plan.frame_id, frame + 1);
+        }
+        let report = output.control.shutdown();
+        assert!(report.lasers_dark && report.flat_presented, "{report:?}");
+        assert!(reports > 0);
+        let kept = report.kept[0].as_ref().unwrap();
+        assert_eq!(kept.unpack_colour(Colour::Blue).levels, [41; SIZE.pixels()]);
+        assert!(kept.tag().frame_id <= last_plan.unwrap().frame_id);
+
+        let mut events = Vec::new();
+        while let Ok(event) = output.events.pop() {
+            events.push(event);
+        }
+        let mut edges = Vec::new();
+        let mut t_dark = None;
+        while let Ok(event) = output.box_events.pop() {
+            match event {
+                BoxEvent::Edge(edge) => edges.push(edge),
+                BoxEvent::Dark { t, .. } => t_dark = Some(t),
+                BoxEvent::Armed { .. } => t_dark = None,
+            }
+        }
+        assert!(t_dark.is_some(), "the box ends dark");
+        let spans: Vec<_> = events.iter().map(FieldEvent::span).collect();
+        let verdict = verify_edges(&spans, &edges);
+        assert_eq!(verdict.findings, [], "{:?}", report.counts);
+        assert!(verdict.lit > 0);
+        assert_eq!((report.counts.fields, report.counts.lost), (events.len() as u64, 0));
+    }
+}
+
+#[test]
+fn a_control_that_is_dropped_ends_the_output() {
+    let rig = rig(PanelMode::ChannelPacked);
+    let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
+    let output = headless(&rig, &encoder, OutputOptions::default());
+    let switch = output.control.dark_switch();
+    drop(output);
+    assert!(switch.is_dark());
+    assert!(switch.shared.flat_shown.load(Ordering::Acquire));
+}

@@ -1,0 +1,782 @@
+//! Test patterns for a bench: what a panel can be sent to see that it, its lasers and its optics do what they should.
+//!
+//! **Frame of reference.** x runs to the right and y up, from the panel's centre, as an eye in the display sees the
+//! panel; angles run from x to y. A relay of lenses that inverts turns all of it round, which the first pattern shows.
+//!
+//! **Where light goes.** A pattern of period Λ sends the light of wavelength λ into orders m at the angles
+//! asin(m·λ/Λ). In the focal plane of the eyepiece, where the viewer's pupil is, order m is a spot f·tan(asin(m·λ/Λ))
+//! from the axis. The stop of the display's relay lets frequencies below 1/4p through, p the pixels' pitch: periods
+//! above four pixels.
+//!
+//! **Light and dark.** A phase panel has neither. Where a pattern shall look bright ([`Pattern::Dots`],
+//! [`Pattern::CrossHair`]) its phase is 0; where it shall look dark, neighbouring pixels stand π apart as on a
+//! chessboard, and their light goes to the corners of the spectrum, which the stop takes away. A camera that looks
+//! through the eyepiece, focused at infinity, sees it.
+
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
+
+use holod_calibration::{Colour, DisplayGeometry, Metres, PerColour};
+
+use crate::fields::LevelsFrame;
+use crate::levels::PanelEncoder;
+
+/// Depth of a sinusoidal grating, crest to trough, that sends most light into its first orders: J₁ is largest at half
+/// of it.
+const SINUSOIDAL_DEPTH_RAD: f64 = 3.6824;
+/// Radius of the circle of [`Pattern::FieldIdentity`]'s spots as a share of the largest that passes the stop.
+const IDENTITY_RADIUS_SHARE: f64 = 0.75;
+/// Pixels across the smallest lens.
+const LENS_DIAMETER_MIN_PX: f64 = 16.0;
+/// Samples of a period from which the light in its orders is worked out.
+const ORDER_SAMPLES: usize = 4096;
+
+/// A test pattern.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Pattern {
+    /// One level everywhere, as it is: neither table nor flatness is applied.
+    Level {
+        /// The level.
+        level: u16,
+    },
+    /// Squares of two phases.
+    Checkerboard {
+        /// Pixels across two squares, even.
+        period_px: usize,
+        /// The squares' difference of phase in radians; π leaves no light in the zero order.
+        depth_rad: f64,
+    },
+    /// Parallel lines.
+    Grating {
+        /// Pixels across one line.
+        period_px: f64,
+        /// Where the first order goes, degrees from x to y.
+        angle_deg: f64,
+        /// The lines' shape.
+        profile: Profile,
+        /// Largest less smallest phase, radians; the profile's own ([`Profile::depth_rad`]) when left out.
+        depth_rad: Option<f64>,
+    },
+    /// A lens within a circle, in a flat surround.
+    Lens {
+        /// Distance from the panel to the focus; negative for a lens that diverges.
+        focal_length: Metres,
+        /// Diameter; the largest that neither aliases nor leaves the panel when left out.
+        diameter: Option<Metres>,
+    },
+    /// A grid of bright dots on black, for a camera: to find its focus, scale, rotation and distortion. The dot at the
+    /// centre is twice as wide; those next to it on the right and two above it are left out, so that a picture that is
+    /// turned or mirrored is known.
+    Dots {
+        /// Pixels from dot to dot.
+        spacing_px: usize,
+        /// A dot's diameter.
+        diameter_px: usize,
+    },
+    /// Bright lines on black that cross at the optical axis, with a square in the upper right quarter.
+    CrossHair {
+        /// A line's width.
+        line_px: usize,
+    },
+    /// A blaze of another direction in each colour's field: red to the right, green up, blue to the left, with periods
+    /// that put the three lasers' spots on one circle. A laser that meets another colour's field lands in that field's
+    /// direction, and nearer to the axis or farther from it by the ratio of the wavelengths.
+    FieldIdentity {
+        /// The circle's radius in the eyepiece's focal plane; three quarters of what passes the stop when left out.
+        radius: Option<Metres>,
+    },
+}
+
+/// The shape of a grating's lines.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Profile {
+    /// Half at one phase, half at the other.
+    Binary,
+    /// Rising evenly.
+    Blazed,
+    /// A sine.
+    Sinusoidal,
+}
+
+/// Where and in which colours a pattern is drawn.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Placement {
+    /// The optical axis in pixels from the panel's centre, x and y: the middle of lens, dots and cross-hair.
+    pub axis_px: [f64; 2],
+    /// The colours that have the pattern; the others are flat.
+    pub colours: PerColour<bool>,
+}
+
+/// Light that leaves the panel in one direction.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Order {
+    /// Orders across and up; a grating's own order is the first.
+    pub number: [i32; 2],
+    /// Angle to the axis.
+    pub angle_deg: f64,
+    /// Where it meets the eyepiece's focal plane, x and y.
+    pub position: [Metres; 2],
+    /// Its share of the light, 0..=1, without the envelope of the single pixels.
+    pub share: f64,
+    /// Whether the stop of the relay lets it through.
+    pub passes_stop: bool,
+}
+
+/// Why a pattern cannot be drawn on a bench.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("the pattern's {what} is {found}; expected {expected}")]
+pub struct PatternError {
+    what: &'static str,
+    found: String,
+    expected: String,
+}
+
+impl Profile {
+    /// Depth in radians that sends most light into the first order.
+    pub const fn depth_rad(self) -> f64 {
+        match self {
+            Self::Binary => PI,
+            Self::Blazed => TAU,
+            Self::Sinusoidal => SINUSOIDAL_DEPTH_RAD,
+        }
+    }
+
+    /// Phase in radians at the place `lines`, counted in lines.
+    fn phase_rad(self, lines: f64, depth_rad: f64) -> f64 {
+        let part = lines.rem_euclid(1.0);
+        match self {
+            Self::Binary => f64::from(part >= 0.5) * depth_rad,
+            Self::Blazed => part * depth_rad,
+            Self::Sinusoidal => 0.5 * depth_rad * (TAU * part).sin(),
+        }
+    }
+
+    /// Share of the light in order `order` of lines that are finely sampled.
+    fn share(self, depth_rad: f64, order: i32) -> f64 {
+        let (mut re, mut im) = (0.0, 0.0);
+        for sample in 0..ORDER_SAMPLES {
+            let lines = (sample as f64 + 0.5) / ORDER_SAMPLES as f64;
+            let phase_rad = self.phase_rad(lines, depth_rad) - TAU * f64::from(order) * lines;
+            re += phase_rad.cos();
+            im += phase_rad.sin();
+        }
+        (re * re + im * im) / (ORDER_SAMPLES * ORDER_SAMPLES) as f64
+    }
+}
+
+impl Default for Placement {
+    /// The panel's centre, every colour.
+    fn default() -> Self {
+        Self { axis_px: [0.0; 2], colours: PerColour([true; 3]) }
+    }
+}
+
+impl Pattern {
+    /// Draws the pattern into every colour of `placement`, and a flat phase into the others. Patterns of phases go
+    /// through `encoder`, whose patterns have the size that is drawn, and `optics` are the bench's.
+    ///
+    /// # Errors
+    /// [`PatternError`] where it cannot be drawn on this bench; the frame is then as it was.
+    ///
+    /// # Panics
+    /// Where the frame has another size than the encoder was made for.
+    pub fn draw(
+        &self,
+        placement: &Placement,
+        encoder: &PanelEncoder,
+        optics: &DisplayGeometry,
+        frame: &mut LevelsFrame,
+    ) -> Result<(), PatternError> {
+        let optics = DisplayGeometry { resolution: encoder.pattern_resolution(), ..*optics };
+        if let Self::Level { level } = *self {
+            let top = ((1u32 << frame.layout().packing.bit_depth()) - 1) as u16;
+            if level > top {
+                return Err(wrong("level", level.to_string(), format!("0 to {top}, the panel's levels")));
+            }
+            encoder.encode_flat(frame);
+            let levels = vec![level; encoder.panel_resolution().pixels()];
+            for (colour, _) in placement.colours.iter().filter(|(_, drawn)| **drawn) {
+                frame.field_mut(colour).write(&levels);
+            }
+            return Ok(());
+        }
+        let flat = vec![0.0; optics.resolution.pixels()];
+        let [red, green, blue] = Colour::ALL.map(|colour| match placement.colours[colour] {
+            true => self.phase_rad(placement.axis_px, &optics, colour),
+            false => Ok(flat.clone()),
+        });
+        let phases_rad = [red?, green?, blue?];
+        encoder.encode(PerColour([&phases_rad[0], &phases_rad[1], &phases_rad[2]]), frame);
+        Ok(())
+    }
+
+    /// The phase in [0, 2π) of each pixel of `optics.resolution` in `colour`'s field, row-major from the upper left.
+    ///
+    /// # Errors
+    /// [`PatternError`] where it cannot be drawn on this bench, and for [`Pattern::Level`], which has no phases.
+    pub fn phase_rad(
+        &self,
+        axis_px: [f64; 2],
+        optics: &DisplayGeometry,
+        colour: Colour,
+    ) -> Result<Vec<f32>, PatternError> {
+        let pitch_m = optics.pixel_pitch.0;
+        let wavelength_m = optics.wavelengths[colour].0;
+        match *self {
+            Self::Level { level } => Err(wrong("level", level.to_string(), "a pattern of phases".into())),
+            Self::Checkerboard { period_px, depth_rad } => {
+                checked_checkerboard(period_px, depth_rad, optics)?;
+                let square_px = period_px / 2;
+                let of_pixel = |row: usize, column: usize| (row / square_px + column / square_px) % 2;
+                Ok(by_pixel(optics, |row, column| of_pixel(row, column) as f64 * depth_rad))
+            }
+            Self::Grating { period_px, angle_deg, profile, depth_rad } => {
+                checked_period(period_px, optics)?;
+                let depth_rad = checked_depth(depth_rad.unwrap_or(profile.depth_rad()))?;
+                let (sine, cosine) = angle_deg.to_radians().sin_cos();
+                let lines = |x_px: f64, y_px: f64| (x_px * cosine + y_px * sine) / period_px;
+                Ok(by_place(optics, [0.0; 2], |x_px, y_px| profile.phase_rad(lines(x_px, y_px), depth_rad)))
+            }
+            Self::Lens { focal_length: Metres(focal_length_m), .. } => {
+                let radius_px = 0.5 * self.lens_diameter(optics, colour)?.0 / pitch_m;
+                let bend = -PI * pitch_m * pitch_m / (wavelength_m * focal_length_m);
+                Ok(by_place(optics, axis_px, |x_px, y_px| {
+                    let squared = x_px * x_px + y_px * y_px;
+                    if squared <= radius_px * radius_px { bend * squared } else { 0.0 }
+                }))
+            }
+            Self::Dots { spacing_px, diameter_px } => {
+                checked_size("dots' diameter", diameter_px, 4, spacing_px / 2)?;
+                let spacing_px = spacing_px as f64;
+                Ok(light_and_dark(optics, axis_px, |x_px, y_px| {
+                    let [across, up] = [x_px, y_px].map(|place_px| (place_px / spacing_px).round());
+                    let (dx_px, dy_px) = (x_px - across * spacing_px, y_px - up * spacing_px);
+                    let left_out = [(1.0, 0.0), (0.0, 2.0)].contains(&(across, up));
+                    let wide = if (across, up) == (0.0, 0.0) { 2.0 } else { 1.0 };
+                    !left_out && dx_px.hypot(dy_px) <= 0.5 * wide * diameter_px as f64
+                }))
+            }
+            Self::CrossHair { line_px } => {
+                let shorter_px = optics.resolution.width.min(optics.resolution.height);
+                checked_size("line's width", line_px, 2, shorter_px / 16)?;
+                let line_px = line_px as f64;
+                let in_mark = |place_px: f64| (2.0 * line_px..4.0 * line_px).contains(&place_px);
+                Ok(light_and_dark(optics, axis_px, |x_px, y_px| {
+                    x_px.abs() <= 0.5 * line_px || y_px.abs() <= 0.5 * line_px || in_mark(x_px) && in_mark(y_px)
+                }))
+            }
+            Self::FieldIdentity { .. } => self.identity_grating(optics, colour)?.phase_rad([0.0; 2], optics, colour),
+        }
+    }
+
+    /// Where the light of `laser` goes that meets the pattern of `field`, strongest orders of the pattern first. Empty
+    /// for [`Pattern::Lens`], [`Pattern::Dots`] and [`Pattern::CrossHair`], which are no gratings.
+    ///
+    /// The panel's stroke in wavelengths is taken to shrink as the wavelength grows.
+    ///
+    /// # Errors
+    /// As [`Self::phase_rad`].
+    pub fn orders(&self, optics: &DisplayGeometry, field: Colour, laser: Colour) -> Result<Vec<Order>, PatternError> {
+        let pitch_m = optics.pixel_pitch.0;
+        let [field_m, laser_m] = [field, laser].map(|colour| optics.wavelengths[colour].0);
+        let order = |number: [i32; 2], per_px: [f64; 2], share| {
+            Order::at(optics, laser, number, per_px.map(|frequency| frequency / pitch_m), share)
+        };
+        match *self {
+            Self::Level { .. } => Ok(vec![order([0, 0], [0.0; 2], 1.0)]),
+            Self::Checkerboard { period_px, depth_rad } => {
+                checked_checkerboard(period_px, depth_rad, optics)?;
+                let half_rad = 0.5 * depth_rad * field_m / laser_m;
+                let per_px = 1.0 / period_px as f64;
+                let diagonals = [[1, 1], [-1, 1], [-1, -1], [1, -1]].map(|number| {
+                    let share = (4.0 / (PI * PI) * half_rad.sin()).powi(2);
+                    order(number, number.map(|number| f64::from(number) * per_px), share)
+                });
+                Ok(std::iter::once(order([0, 0], [0.0; 2], half_rad.cos().powi(2))).chain(diagonals).collect())
+            }
+            Self::Grating { period_px, angle_deg, profile, depth_rad } => {
+                checked_period(period_px, optics)?;
+                let depth_rad = checked_depth(depth_rad.unwrap_or(profile.depth_rad()))? * field_m / laser_m;
+                let (sine, cosine) = angle_deg.to_radians().sin_cos();
+                let orders = [1, 0, -1, 2, -2].map(|number| {
+                    let per_px = f64::from(number) / period_px;
+                    order([number, 0], [per_px * cosine, per_px * sine], profile.share(depth_rad, number))
+                });
+                Ok(orders.to_vec())
+            }
+            Self::Lens { .. } | Self::Dots { .. } | Self::CrossHair { .. } => Ok(Vec::new()),
+            Self::FieldIdentity { .. } => self.identity_grating(optics, field)?.orders(optics, field, laser),
+        }
+    }
+
+    /// The diameter of a lens in `colour`'s field.
+    ///
+    /// # Errors
+    /// [`PatternError`] where it would alias, leave the panel or be too small, and for patterns that are no lens.
+    pub fn lens_diameter(&self, optics: &DisplayGeometry, colour: Colour) -> Result<Metres, PatternError> {
+        let Self::Lens { focal_length: Metres(focal_length_m), diameter } = *self else {
+            return Err(wrong("kind", format!("{self:?}"), "a lens".into()));
+        };
+        if !(focal_length_m.is_finite() && focal_length_m != 0.0) {
+            return Err(wrong("focal length", format!("{focal_length_m} m"), "a length other than 0".into()));
+        }
+        let pitch_m = optics.pixel_pitch.0;
+        let panel_m = optics.resolution.width.min(optics.resolution.height) as f64 * pitch_m;
+        // Beyond it neighbouring pixels would differ by more than half a wave.
+        let unaliased_m = optics.wavelengths[colour].0 * focal_length_m.abs() / pitch_m;
+        let least_m = LENS_DIAMETER_MIN_PX * pitch_m;
+        if unaliased_m < least_m {
+            let shortest_mm = 1e3 * least_m * pitch_m / optics.wavelengths[colour].0;
+            let expected = format!("{shortest_mm:.2} mm at least in {colour}, for {LENS_DIAMETER_MIN_PX} px of lens");
+            return Err(wrong("focal length", format!("{:.2} mm", 1e3 * focal_length_m), expected));
+        }
+        let largest_m = unaliased_m.min(panel_m);
+        match diameter {
+            None => Ok(Metres(largest_m)),
+            Some(Metres(diameter_m)) if (least_m..=largest_m).contains(&diameter_m) => Ok(Metres(diameter_m)),
+            Some(Metres(diameter_m)) => {
+                let why = if unaliased_m < panel_m { "beyond which it aliases" } else { "the panel's own size" };
+                let expected = format!("{:.3} to {:.3} mm in {colour}, {why}", 1e3 * least_m, 1e3 * largest_m);
+                Err(wrong("lens diameter", format!("{:.3} mm", 1e3 * diameter_m), expected))
+            }
+        }
+    }
+
+    /// The blaze of [`Pattern::FieldIdentity`] in `colour`'s field.
+    fn identity_grating(&self, optics: &DisplayGeometry, colour: Colour) -> Result<Self, PatternError> {
+        let Self::FieldIdentity { radius } = *self else {
+            return Err(wrong("kind", format!("{self:?}"), "the field identity".into()));
+        };
+        let (pitch_m, focal_length_m) = (optics.pixel_pitch.0, optics.eyepiece_focal_length.0);
+        let shortest_m = optics.wavelengths.0.map(|wavelength| wavelength.0).into_iter().fold(f64::MAX, f64::min);
+        let largest_m = radius_of(shortest_m / (4.0 * pitch_m), focal_length_m);
+        let radius_m = radius.map_or(IDENTITY_RADIUS_SHARE * largest_m, |radius| radius.0);
+        if !(radius_m > 0.0 && radius_m < largest_m) {
+            let expected =
+                format!("above 0 and below the {:.3} mm that pass the stop in every colour", 1e3 * largest_m);
+            return Err(wrong("radius", format!("{:.3} mm", 1e3 * radius_m), expected));
+        }
+        let sine = (radius_m / focal_length_m).atan().sin();
+        let angle_deg = match colour {
+            Colour::Red => 0.0,
+            Colour::Green => 90.0,
+            Colour::Blue => 180.0,
+        };
+        let period_px = optics.wavelengths[colour].0 / (sine * pitch_m);
+        Ok(Self::Grating { period_px, angle_deg, profile: Profile::Blazed, depth_rad: None })
+    }
+}
+
+impl Order {
+    /// The order with `frequencies` in cycles per metre, x and y.
+    fn at(optics: &DisplayGeometry, laser: Colour, number: [i32; 2], frequencies: [f64; 2], share: f64) -> Self {
+        let [fx, fy] = frequencies;
+        let sine = (optics.wavelengths[laser].0 * fx.hypot(fy)).min(1.0);
+        let radius_m = radius_of(sine, optics.eyepiece_focal_length.0);
+        let direction = if fx.hypot(fy) > 0.0 { frequencies.map(|along| along / fx.hypot(fy)) } else { [0.0; 2] };
+        let stop = 1.0 / (4.0 * optics.pixel_pitch.0);
+        Self {
+            number,
+            angle_deg: sine.asin().to_degrees(),
+            position: direction.map(|along| Metres(along * radius_m)),
+            share,
+            passes_stop: fx.abs() < stop && fy.abs() < stop,
+        }
+    }
+}
+
+/// Distance from the axis, in the focal plane of a lens, of light whose angle to the axis has this sine.
+fn radius_of(sine: f64, focal_length_m: f64) -> f64 {
+    focal_length_m * sine.asin().tan()
+}
+
+fn wrong(what: &'static str, found: String, expected: String) -> PatternError {
+    PatternError { what, found, expected }
+}
+
+fn checked_period(period_px: f64, optics: &DisplayGeometry) -> Result<f64, PatternError> {
+    let longest_px = optics.resolution.width.max(optics.resolution.height) as f64;
+    if (2.0..=longest_px).contains(&period_px) {
+        return Ok(period_px);
+    }
+    Err(wrong("period", format!("{period_px} px"), format!("2 to {longest_px} px")))
+}
+
+fn checked_depth(depth_rad: f64) -> Result<f64, PatternError> {
+    if depth_rad > 0.0 && depth_rad <= TAU {
+        return Ok(depth_rad);
+    }
+    Err(wrong("depth", format!("{:.3} π", depth_rad / PI), "above 0 and up to 2 π".into()))
+}
+
+fn checked_size(what: &'static str, found_px: usize, min_px: usize, max_px: usize) -> Result<(), PatternError> {
+    if (min_px..=max_px).contains(&found_px) {
+        return Ok(());
+    }
+    Err(wrong(what, format!("{found_px} px"), format!("{min_px} to {max_px} px")))
+}
+
+fn checked_checkerboard(period_px: usize, depth_rad: f64, optics: &DisplayGeometry) -> Result<(), PatternError> {
+    checked_period(period_px as f64, optics)?;
+    checked_depth(depth_rad)?;
+    if period_px.is_multiple_of(2) {
+        return Ok(());
+    }
+    Err(wrong("period", format!("{period_px} px"), "an even number of pixels".into()))
+}
+
+fn by_pixel(optics: &DisplayGeometry, phase_rad: impl Fn(usize, usize) -> f64) -> Vec<f32> {
+    let width = optics.resolution.width;
+    let phase = |pixel: usize| phase_rad(pixel / width, pixel % width).rem_euclid(TAU) as f32;
+    (0..optics.resolution.pixels()).map(phase).collect()
+}
+
+/// Phases by the pixels' places, x and y from `axis_px`.
+fn by_place(optics: &DisplayGeometry, axis_px: [f64; 2], phase_rad: impl Fn(f64, f64) -> f64) -> Vec<f32> {
+    let middle = |pixels: usize| 0.5 * (pixels as f64 - 1.0);
+    let (middle_x, middle_y) = (middle(optics.resolution.width), middle(optics.resolution.height));
+    by_pixel(optics, |row, column| phase_rad(column as f64 - middle_x - axis_px[0], middle_y - row as f64 - axis_px[1]))
+}
+
+/// Phases that look bright through the stop where `bright` says so, and dark elsewhere.
+fn light_and_dark(optics: &DisplayGeometry, axis_px: [f64; 2], bright: impl Fn(f64, f64) -> bool) -> Vec<f32> {
+    let mut phases_rad = by_place(optics, axis_px, |x_px, y_px| if bright(x_px, y_px) { 0.0 } else { FRAC_PI_2 });
+    let width = optics.resolution.width;
+    for (pixel, phase_rad) in phases_rad.iter_mut().enumerate() {
+        if (pixel / width + pixel % width) % 2 == 1 && *phase_rad > 0.0 {
+            *phase_rad = (TAU - FRAC_PI_2) as f32;
+        }
+    }
+    phases_rad
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fields::FrameLayout;
+    use holod_calibration::Resolution;
+    use holod_calibration::rig::Rig;
+    use rustfft::num_complex::Complex64;
+    use rustfft::{FftDirection, FftPlanner};
+
+    const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
+    const SIZE: Resolution = Resolution { width: 192, height: 160 };
+
+    fn bench(resolution: Resolution) -> DisplayGeometry {
+        DisplayGeometry { resolution, ..BENCH }
+    }
+
+    /// What the default panel shows of a pattern: phase to levels and back.
+    fn shown(pattern: &Pattern, placement: &Placement, size: Resolution, colour: Colour) -> Vec<Complex64> {
+        let panel = Rig::default().panel;
+        let encoder = PanelEncoder::new(&panel, size, size).unwrap();
+        let mut frame = LevelsFrame::new(FrameLayout::new(&panel, size));
+        pattern.draw(placement, &encoder, &bench(size), &mut frame).unwrap();
+        let phases_rad = encoder.decode(colour, &frame.unpack_colour(colour).levels);
+        phases_rad.into_iter().map(|phase_rad| Complex64::cis(f64::from(phase_rad))).collect()
+    }
+
+    /// The spectrum [height, width] with a sum of squares of 1 for a field of amplitude 1.
+    fn spectrum(mut field: Vec<Complex64>, size: Resolution) -> Vec<Complex64> {
+        transform(&mut field, size, FftDirection::Forward);
+        let pixels = size.pixels() as f64;
+        field.into_iter().map(|value| value / pixels).collect()
+    }
+
+    fn transform(field: &mut [Complex64], size: Resolution, direction: FftDirection) {
+        let mut planner = FftPlanner::new();
+        planner.plan_fft(size.width, direction).process(field);
+        let columns = planner.plan_fft(size.height, direction);
+        for column in 0..size.width {
+            let mut values: Vec<_> = field.iter().skip(column).step_by(size.width).copied().collect();
+            columns.process(&mut values);
+            for (row, value) in values.into_iter().enumerate() {
+                field[row * size.width + column] = value;
+            }
+        }
+    }
+
+    /// Share of the light at the frequency `per_px`, x and y up: Fourier's integral there, between the bins too.
+    fn share_at(field: &[Complex64], size: Resolution, per_px: [f64; 2]) -> f64 {
+        let turn = |index: usize| {
+            let (row, column) = (index / size.width, index % size.width);
+            Complex64::cis(-TAU * (column as f64 * per_px[0] - row as f64 * per_px[1]))
+        };
+        let sum: Complex64 = field.iter().enumerate().map(|(index, &value)| value * turn(index)).sum();
+        (sum / size.pixels() as f64).norm_sqr()
+    }
+
+    fn grating(period_px: f64, angle_deg: f64, profile: Profile) -> Pattern {
+        Pattern::Grating { period_px, angle_deg, profile, depth_rad: None }
+    }
+
+    #[test]
+    fn a_blaze_sends_its_light_into_the_first_order_in_its_direction() {
+        for (period_px, angle_deg) in [(8.0, 0.0), (8.0, 90.0), (8.0, 180.0), (16.0, -90.0), (7.3, 30.0), (12.0, 225.0)]
+        {
+            let pattern = grating(period_px, angle_deg, Profile::Blazed);
+            let seen = shown(&pattern, &Placement::default(), SIZE, Colour::Green);
+            let at =
+                |degrees: f64| [degrees.to_radians().cos(), degrees.to_radians().sin()].map(|part| part / period_px);
+            let first = share_at(&seen, SIZE, at(angle_deg));
+            assert!(first >= 0.95, "{period_px} px at {angle_deg}: {first}");
+            // Canary: the other side is dark.
+            assert!(share_at(&seen, SIZE, at(angle_deg + 180.0)) < 0.01);
+            let own = pattern.orders(&BENCH, Colour::Green, Colour::Green).unwrap()[0];
+            assert!((own.share - 1.0).abs() < 1e-6 && own.number == [1, 0]);
+            let direction_deg = own.position[1].0.atan2(own.position[0].0).to_degrees();
+            let turned_deg = (direction_deg - angle_deg + 180.0).rem_euclid(360.0) - 180.0;
+            assert!(turned_deg.abs() < 1e-6, "{direction_deg}");
+        }
+        // Eight pixels are bin 192/8 from the left, upwards bin 160/8 from the bottom of the transform.
+        for (angle_deg, bin) in [(0.0, 24), (90.0, (160 - 20) * 192)] {
+            let pattern = grating(8.0, angle_deg, Profile::Blazed);
+            let seen = spectrum(shown(&pattern, &Placement::default(), SIZE, Colour::Green), SIZE);
+            assert!(seen[bin].norm_sqr() >= 0.95, "{angle_deg}: {}", seen[bin].norm_sqr());
+        }
+    }
+
+    #[test]
+    fn gratings_share_their_light_as_their_orders_say() {
+        let sinusoidal = grating(32.0, 0.0, Profile::Sinusoidal);
+        let shallow =
+            Pattern::Grating { period_px: 32.0, angle_deg: 90.0, profile: Profile::Blazed, depth_rad: Some(PI) };
+        for pattern in [grating(32.0, 0.0, Profile::Binary), sinusoidal, shallow] {
+            let seen = shown(&pattern, &Placement::default(), SIZE, Colour::Red);
+            for order in pattern.orders(&BENCH, Colour::Red, Colour::Red).unwrap() {
+                let per_px = order.position.map(|place| {
+                    let sine = order.angle_deg.to_radians().sin();
+                    let radius = order.position[0].0.hypot(order.position[1].0).max(1e-12);
+                    place.0 / radius * sine * BENCH.pixel_pitch.0 / BENCH.wavelengths[Colour::Red].0
+                });
+                let share = share_at(&seen, SIZE, per_px);
+                assert!((share - order.share).abs() < 0.012, "{pattern:?} {:?}: {share} {}", order.number, order.share);
+            }
+        }
+        // The textbook's figures: (2/π)², J₁² at its largest, and half of the first order for half a blaze.
+        let first = |pattern: &Pattern| pattern.orders(&BENCH, Colour::Red, Colour::Red).unwrap()[0].share;
+        assert!((first(&grating(32.0, 0.0, Profile::Binary)) - 0.4053).abs() < 1e-3);
+        assert!((first(&sinusoidal) - 0.3386).abs() < 1e-3);
+        assert!((first(&shallow) - 0.4053).abs() < 1e-3);
+    }
+
+    #[test]
+    fn a_checkerboard_has_four_diagonal_orders_and_no_middle() {
+        let pattern = Pattern::Checkerboard { period_px: 32, depth_rad: PI };
+        let seen = shown(&pattern, &Placement::default(), SIZE, Colour::Blue);
+        let orders = pattern.orders(&BENCH, Colour::Blue, Colour::Blue).unwrap();
+        assert!(orders[0].share < 1e-9 && share_at(&seen, SIZE, [0.0; 2]) < 1e-3);
+        assert_eq!(orders.len(), 5);
+        for order in &orders[1..] {
+            let share = share_at(&seen, SIZE, order.number.map(|number| f64::from(number) / 32.0));
+            assert!((share - order.share).abs() < 0.004 && (order.share - 0.1643).abs() < 1e-3, "{share}");
+        }
+        // With squares of one pixel all of it is beyond the stop.
+        let finest = Pattern::Checkerboard { period_px: 2, depth_rad: PI };
+        let orders = finest.orders(&BENCH, Colour::Blue, Colour::Blue).unwrap();
+        assert!(orders[1..].iter().all(|order| !order.passes_stop) && orders[0].passes_stop);
+        // A stroke that is too short for the laser leaves light in the middle: half of π leaves half.
+        let half = Pattern::Checkerboard { period_px: 32, depth_rad: FRAC_PI_2 };
+        let seen = shown(&half, &Placement::default(), SIZE, Colour::Blue);
+        assert!((share_at(&seen, SIZE, [0.0; 2]) - 0.5).abs() < 1e-3);
+    }
+
+    #[test]
+    fn orders_are_where_the_grating_equation_puts_them() {
+        // 8 px of 8 µm and 520 nm: 8.125 mrad, 0.325 mm at f = 40 mm.
+        let green = grating(8.0, 0.0, Profile::Blazed).orders(&BENCH, Colour::Green, Colour::Green).unwrap();
+        assert!((green[0].angle_deg - (520e-9f64 / 64e-6).asin().to_degrees()).abs() < 1e-9);
+        assert!((green[0].position[0].0 - 0.325e-3).abs() < 1e-7 && green[0].position[1].0.abs() < 1e-15);
+        assert!((green[2].position[0].0 + 0.325e-3).abs() < 1e-7, "order -1 is on the other side");
+        assert!(green[0].passes_stop && !green[3].passes_stop, "the second order is at the stop's edge");
+        // The same field lit by red light goes farther out, and no longer all into the first order.
+        let red = grating(8.0, 0.0, Profile::Blazed).orders(&BENCH, Colour::Green, Colour::Red).unwrap();
+        assert!((red[0].position[0].0 / green[0].position[0].0 - 638.0 / 520.0).abs() < 1e-3);
+        let sinc = |x: f64| (PI * x).sin() / (PI * x);
+        assert!((red[0].share - sinc(1.0 - 520.0 / 638.0).powi(2)).abs() < 1e-3, "{}", red[0].share);
+    }
+
+    /// Share of the light within `radius_px` of the middle after propagation over `u_m`, of that within the lens.
+    fn focused(
+        field: &[Complex64],
+        size: Resolution,
+        u_m: f64,
+        wavelength_m: f64,
+        lens_px: f64,
+        radius_px: f64,
+    ) -> f64 {
+        let place = |index: usize| {
+            let x = (index % size.width) as f64 - 0.5 * (size.width as f64 - 1.0);
+            let y = (index / size.width) as f64 - 0.5 * (size.height as f64 - 1.0);
+            x.hypot(y)
+        };
+        let mut field: Vec<_> = field
+            .iter()
+            .enumerate()
+            .map(|(index, &value)| if place(index) <= lens_px { value } else { Complex64::ZERO })
+            .collect();
+        let all: f64 = field.iter().map(|value| value.norm_sqr()).sum();
+        transform(&mut field, size, FftDirection::Forward);
+        let frequency = |bin: usize, bins: usize| {
+            let signed = if 2 * bin < bins { bin as f64 } else { bin as f64 - bins as f64 };
+            signed / (bins as f64 * BENCH.pixel_pitch.0)
+        };
+        for (index, value) in field.iter_mut().enumerate() {
+            let fx = frequency(index % size.width, size.width);
+            let fy = frequency(index / size.width, size.height);
+            *value *= Complex64::cis(-PI * wavelength_m * u_m * (fx * fx + fy * fy));
+        }
+        transform(&mut field, size, FftDirection::Inverse);
+        let near = field.iter().enumerate().filter(|(index, _)| place(*index) <= radius_px);
+        near.map(|(_, value)| value.norm_sqr()).sum::<f64>() / (all * (size.pixels() * size.pixels()) as f64)
+    }
+
+    #[test]
+    fn a_lens_focuses_at_its_focal_length() {
+        let size = Resolution { width: 256, height: 256 };
+        let lens = Pattern::Lens { focal_length: Metres(25e-3), diameter: None };
+        for colour in [Colour::Red, Colour::Blue] {
+            let wavelength_m = BENCH.wavelengths[colour].0;
+            let diameter_px = lens.lens_diameter(&bench(size), colour).unwrap().0 / BENCH.pixel_pitch.0;
+            let unaliased_px = wavelength_m * 25e-3 / (8e-6 * 8e-6);
+            assert!((diameter_px - unaliased_px).abs() < 1e-6, "{diameter_px}");
+            let field = shown(&lens, &Placement::default(), size, colour);
+            // Airy: 84 % within 1.22 λf/D, here a little more than one pixel.
+            let radius_px = 1.3 * 1.22 * 25e-3 / diameter_px * wavelength_m / (8e-6 * 8e-6);
+            let light = |u_m| focused(&field, size, u_m, wavelength_m, 0.5 * diameter_px, radius_px);
+            assert!(light(25e-3) > 0.7, "{colour}: {}", light(25e-3));
+            assert!(light(20e-3) < 0.2 && light(-25e-3) < 0.05, "{colour}: {} {}", light(20e-3), light(-25e-3));
+        }
+    }
+
+    #[test]
+    fn lenses_that_alias_or_leave_the_panel_are_refused() {
+        let error = |focal_mm: f64, diameter_mm: Option<f64>| {
+            let diameter = diameter_mm.map(|mm| Metres(mm / 1e3));
+            let lens = Pattern::Lens { focal_length: Metres(focal_mm / 1e3), diameter };
+            lens.phase_rad([0.0; 2], &BENCH, Colour::Green).expect_err("a fault").to_string()
+        };
+        assert_eq!(
+            error(1.0, None),
+            "the pattern's focal length is 1.00 mm; expected 1.97 mm at least in green, for 16 px of lens"
+        );
+        assert_eq!(
+            error(50.0, Some(4.0)),
+            "the pattern's lens diameter is 4.000 mm; expected 0.128 to 3.250 mm in green, beyond which it aliases"
+        );
+        assert!(error(5e3, Some(9.0)).ends_with("0.128 to 8.640 mm in green, the panel's own size"));
+        assert!(error(0.0, None).contains("other than 0"));
+    }
+
+    /// What passes the stop of the relay.
+    fn through_the_stop(field: Vec<Complex64>, size: Resolution) -> Vec<f64> {
+        let mut seen = spectrum(field, size);
+        let inside = |bin: usize, bins: usize| bin.min(bins - bin) * 4 < bins;
+        for (index, value) in seen.iter_mut().enumerate() {
+            if !(inside(index % size.width, size.width) && inside(index / size.width, size.height)) {
+                *value = Complex64::ZERO;
+            }
+        }
+        transform(&mut seen, size, FftDirection::Inverse);
+        seen.into_iter().map(|value| value.norm_sqr()).collect()
+    }
+
+    #[test]
+    fn dots_are_bright_where_they_are_and_dark_where_they_are_left_out() {
+        let placement = Placement { axis_px: [0.5, 0.5], ..Placement::default() };
+        let dots = Pattern::Dots { spacing_px: 32, diameter_px: 12 };
+        let seen = through_the_stop(shown(&dots, &placement, SIZE, Colour::Green), SIZE);
+        // The axis is pixel (96, 79) from the upper left.
+        let at = |across: isize, up: isize| seen[((79 - 32 * up) * 192 + 96 + 32 * across) as usize];
+        let mut left_out = Vec::new();
+        for (across, up) in (-2..=2).flat_map(|across| (-2..=2).map(move |up| (across, up))) {
+            let bright = at(across, up);
+            if bright < 0.1 {
+                left_out.push((across, up));
+            } else {
+                assert!(bright > 0.7, "{across} {up}: {bright}");
+            }
+        }
+        assert_eq!(left_out, [(0, 2), (1, 0)]);
+        let between = seen[(79 - 16) * 192 + 96 + 16];
+        assert!(between < 0.02, "{between}");
+        // The middle dot is 12 pixels in radius, the others 6.
+        assert!(seen[79 * 192 + 96 + 9] > 0.5 && seen[79 * 192 + 96 - 32 + 9] < 0.3);
+    }
+
+    #[test]
+    fn a_cross_hair_crosses_at_the_axis_and_marks_the_upper_right() {
+        let placement = Placement { axis_px: [20.5, -10.5], ..Placement::default() };
+        let cross = Pattern::CrossHair { line_px: 6 };
+        let seen = through_the_stop(shown(&cross, &placement, SIZE, Colour::Red), SIZE);
+        let (column, row) = (96 + 20, 79 + 11);
+        let at = |right: isize, up: isize| seen[((row - up) * 192 + column + right) as usize];
+        assert!(at(0, 0) > 0.7 && at(-80, 0) > 0.6 && at(0, 60) > 0.6);
+        assert!(at(18, 18) > 0.6, "the mark: {}", at(18, 18));
+        assert!(at(-18, 18) < 0.05 && at(18, -18) < 0.05 && at(-18, -18) < 0.05);
+    }
+
+    #[test]
+    fn each_field_has_a_direction_and_each_laser_a_place() {
+        let identity = Pattern::FieldIdentity { radius: None };
+        let radius_m = 0.75 * 450e-9 / 32e-6 * 40e-3;
+        let expected = [(Colour::Red, [1.0, 0.0]), (Colour::Green, [0.0, 1.0]), (Colour::Blue, [-1.0, 0.0])];
+        for (field, direction) in expected {
+            let own = identity.orders(&BENCH, field, field).unwrap()[0];
+            for (place, part) in own.position.iter().zip(direction) {
+                assert!((place.0 - part * radius_m).abs() < 1e-7, "{field} {own:?}");
+            }
+            assert!(own.passes_stop && (own.share - 1.0).abs() < 1e-6);
+            for laser in Colour::ALL {
+                let order = identity.orders(&BENCH, field, laser).unwrap()[0];
+                let ratio = BENCH.wavelengths[laser].0 / BENCH.wavelengths[field].0;
+                let reached_m = order.position[0].0 * direction[0] + order.position[1].0 * direction[1];
+                assert!((reached_m / radius_m - ratio).abs() < 1e-3, "{field} lit by {laser}");
+                assert!(order.passes_stop && order.share > 0.5, "{field} lit by {laser}: {order:?}");
+            }
+            // What the panel shows: nearly all in one order, at the frequency that puts it there.
+            let seen = shown(&identity, &Placement::default(), SIZE, field);
+            let per_px = direction.map(|part| part * radius_m / 40e-3 * 8e-6 / BENCH.wavelengths[field].0);
+            let share = share_at(&seen, SIZE, per_px);
+            assert!(share >= 0.95, "{field}: {share}");
+        }
+        let too_far = Pattern::FieldIdentity { radius: Some(Metres(0.57e-3)) };
+        let error = too_far.orders(&BENCH, Colour::Red, Colour::Red).unwrap_err().to_string();
+        assert!(error.contains("below the 0.563 mm that pass the stop"), "{error}");
+    }
+
+    #[test]
+    fn a_level_is_sent_as_it_is_and_other_colours_stay_flat() {
+        let mut panel = Rig::default().panel;
+        let size = Resolution { width: 6, height: 4 };
+        panel.flatness_rad[Colour::Blue] = Some(vec![1.0; size.pixels()]);
+        let encoder = PanelEncoder::new(&panel, size, size).unwrap();
+        let mut frame = LevelsFrame::new(FrameLayout::new(&panel, size));
+        let placement = Placement { colours: PerColour([true, false, false]), ..Placement::default() };
+        Pattern::Level { level: 200 }.draw(&placement, &encoder, &BENCH, &mut frame).unwrap();
+        let levels = Colour::ALL.map(|colour| frame.unpack_colour(colour).levels);
+        assert_eq!(levels, [vec![200; 24], vec![0; 24], vec![41; 24]]);
+        let before = frame.clone();
+        let error = Pattern::Level { level: 256 }.draw(&placement, &encoder, &BENCH, &mut frame).unwrap_err();
+        assert_eq!(error.to_string(), "the pattern's level is 256; expected 0 to 255, the panel's levels");
+        assert_eq!(frame, before);
+    }
+
+    #[test]
+    fn figures_that_no_panel_can_show_are_refused() {
+        let gratings = [
+            (grating(1.9, 0.0, Profile::Binary), "period is 1.9 px; expected 2 to 1920 px"),
+            (grating(f64::NAN, 0.0, Profile::Binary), "period is NaN px"),
+            (Pattern::Checkerboard { period_px: 7, depth_rad: PI }, "period is 7 px; expected an even number"),
+            (
+                Pattern::Checkerboard { period_px: 8, depth_rad: 7.0 },
+                "depth is 2.228 π; expected above 0 and up to 2 π",
+            ),
+            (Pattern::Dots { spacing_px: 16, diameter_px: 9 }, "dots' diameter is 9 px; expected 4 to 8 px"),
+            (Pattern::CrossHair { line_px: 1 }, "line's width is 1 px; expected 2 to 67 px"),
+        ];
+        for (pattern, part) in gratings {
+            let error = pattern.phase_rad([0.0; 2], &BENCH, Colour::Green).unwrap_err().to_string();
+            assert!(error.contains(part), "{error}");
+        }
+    }
+}

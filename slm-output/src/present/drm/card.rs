@@ -1,0 +1,329 @@
+//! A graphics card as its master sees it: the way to one connector, scan-out buffers, flips.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, ErrorKind};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::fs::{MetadataExt as _, OpenOptionsExt as _};
+use std::path::{Path, PathBuf};
+
+use drm::buffer::{Buffer as _, DrmFourcc};
+use drm::control::atomic::AtomicModeReq;
+use drm::control::dumbbuffer::DumbBuffer;
+use drm::control::{
+    AtomicCommitFlags, Device as ControlDevice, Mode, PlaneType, ResourceHandles, connector, crtc, framebuffer, plane,
+    property,
+};
+use drm::{ClientCapability, Device, DriverCapability, VblankWaitFlags, VblankWaitTarget};
+use holod_calibration::Resolution;
+use memmap2::{MmapMut, MmapOptions};
+use rustix::fs::OFlags;
+
+use super::error::DrmError;
+use super::find::SeenConnector;
+use super::settings::{PipeProperties, Properties};
+
+/// An open card.
+#[derive(Debug)]
+pub(crate) struct Card {
+    file: File,
+    path: PathBuf,
+    driver: String,
+}
+
+impl AsFd for Card {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.file.as_fd()
+    }
+}
+
+impl Device for Card {}
+impl ControlDevice for Card {}
+
+impl Card {
+    /// Opens the card at `path` and becomes its master.
+    pub(crate) fn open(path: &Path) -> Result<Self, DrmError> {
+        let flags = (OFlags::NONBLOCK | OFlags::CLOEXEC).bits() as i32;
+        let file = match OpenOptions::new().read(true).write(true).custom_flags(flags).open(path) {
+            Ok(file) => file,
+            Err(why) if why.kind() == ErrorKind::PermissionDenied => return Err(permission(path)),
+            Err(source) => return Err(DrmError::Refused { what: "opening", card: path.to_owned(), source }),
+        };
+        let mut card = Self { file, path: path.to_owned(), driver: "unknown".to_owned() };
+        if let Ok(driver) = card.get_driver() {
+            card.driver = driver.name().to_string_lossy().into_owned();
+        }
+        card.become_master().map_err(|_| DrmError::OtherMaster { card: path.to_owned(), who: users_of(path) })?;
+        for (capability, lacks) in [
+            (ClientCapability::UniversalPlanes, "universal planes"),
+            (ClientCapability::Atomic, "atomic mode setting (nvidia-drm needs `modeset=1`)"),
+        ] {
+            card.set_client_capability(capability, true).map_err(|_| card.unsupported(lacks))?;
+        }
+        if card.get_driver_capability(DriverCapability::DumbBuffer).unwrap_or(0) == 0 {
+            return Err(card.unsupported("dumb buffers"));
+        }
+        Ok(card)
+    }
+
+    /// The card's node.
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Its driver's name.
+    pub(crate) fn driver(&self) -> &str {
+        &self.driver
+    }
+
+    /// Who opens a card that has no master is its master; after mastership was lost it must be asked for.
+    pub(crate) fn become_master(&self) -> io::Result<()> {
+        self.acquire_master_lock()
+    }
+
+    /// Whether flips are stamped by the monotonic clock.
+    pub(crate) fn is_monotonic(&self) -> bool {
+        self.get_driver_capability(DriverCapability::MonotonicTimestamp).is_ok_and(|value| value == 1)
+    }
+
+    pub(crate) fn unsupported(&self, lacks: impl Into<String>) -> DrmError {
+        DrmError::Unsupported { card: self.path.clone(), driver: self.driver.clone(), lacks: lacks.into() }
+    }
+
+    pub(crate) fn refused(&self, what: &'static str) -> impl Fn(io::Error) -> DrmError {
+        move |source| DrmError::Refused { what, card: self.path.clone(), source }
+    }
+
+    /// Asks the monitor at `connector` anew; takes no memory.
+    pub(crate) fn is_connected(&self, connector: connector::Handle) -> io::Result<bool> {
+        let found = drm_ffi::mode::get_connector(self.as_fd(), connector.into(), None, None, None, None, true)?;
+        Ok(connector::State::from(found.connection) != connector::State::Disconnected)
+    }
+
+    /// The counter of refreshes once it has risen; waits up to two refreshes.
+    pub(crate) fn next_refresh(&self, pipe: &Pipe) -> io::Result<u32> {
+        let target = VblankWaitTarget::Relative(1);
+        self.wait_vblank(target, VblankWaitFlags::empty(), pipe.crtc_index, 0).map(|reply| reply.frame())
+    }
+}
+
+/// Who may open `path` instead.
+fn permission(path: &Path) -> DrmError {
+    let metadata = fs::metadata(path).ok();
+    let id = metadata.as_ref().map_or(0, |metadata| metadata.gid());
+    let groups = fs::read_to_string("/etc/group").unwrap_or_default();
+    let name = groups.lines().find_map(|line| {
+        let mut fields = line.split(':');
+        let name = fields.next()?;
+        (fields.nth(1)?.parse() == Ok(id)).then(|| name.to_owned())
+    });
+    DrmError::Permission {
+        card: path.to_owned(),
+        group: name.unwrap_or_else(|| id.to_string()),
+        mode: metadata.map_or(0, |metadata| metadata.mode() & 0o7777),
+        kernel: path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
+    }
+}
+
+/// Processes that have the card at `path` open, other than this one. Root sees all of them and which one is its master,
+/// others only their own.
+fn users_of(path: &Path) -> Vec<String> {
+    let own = std::process::id();
+    let master = master_by_debugfs(path);
+    let mut users = Vec::new();
+    for entry in fs::read_dir("/proc").into_iter().flatten().flatten() {
+        let Some(id) = entry.file_name().to_str().and_then(|name| name.parse::<u32>().ok()) else { continue };
+        let open = fs::read_dir(entry.path().join("fd")).into_iter().flatten().flatten();
+        if id == own || !open.into_iter().any(|fd| fs::read_link(fd.path()).is_ok_and(|target| target == path)) {
+            continue;
+        }
+        let name = fs::read_to_string(entry.path().join("comm")).unwrap_or_default();
+        let user = format!("{} (process {id})", name.trim());
+        let place = if master == Some(id) { 0 } else { users.len() };
+        users.insert(place, user);
+    }
+    users
+}
+
+/// The master's process, from the kernel's table of a card's clients.
+fn master_by_debugfs(path: &Path) -> Option<u32> {
+    let minor = rustix::fs::minor(fs::metadata(path).ok()?.rdev());
+    let table = fs::read_to_string(format!("/sys/kernel/debug/dri/{minor}/clients")).ok()?;
+    let mut lines = table.lines();
+    let titles: Vec<_> = lines.next()?.split_whitespace().collect();
+    let master = titles.iter().position(|&title| title == "master")?;
+    lines.find_map(|line| {
+        let fields: Vec<_> = line.split_whitespace().collect();
+        // The command comes first and may hold blanks; the process comes second.
+        let blanks = fields.len().checked_sub(titles.len())?;
+        (fields[master + blanks] == "y").then(|| fields[1 + blanks].parse().ok())?
+    })
+}
+
+/// The objects on the way from a buffer to the connector.
+#[derive(Clone, Debug)]
+pub(crate) struct Pipe {
+    pub(crate) connector: connector::Handle,
+    pub(crate) crtc: crtc::Handle,
+    /// The controller's number, by which its refreshes are asked for.
+    pub(crate) crtc_index: u32,
+    pub(crate) plane: plane::Handle,
+    /// Cursor and overlay planes that the controller may blend over the picture.
+    pub(crate) other_planes: Vec<plane::Handle>,
+}
+
+impl Pipe {
+    /// The way to the connector `seen`, with what it says of its modes now.
+    pub(crate) fn find(
+        card: &Card,
+        seen: &SeenConnector,
+        format: DrmFourcc,
+    ) -> Result<(Self, connector::Info), DrmError> {
+        let resources = card.resource_handles().map_err(card.refused("listing connectors"))?;
+        let mut connectors = resources.connectors().iter().filter_map(|&handle| card.get_connector(handle, false).ok());
+        let named = connectors.find(|info| info.to_string() == seen.name).map(|info| info.handle());
+        let named = named.ok_or_else(|| card.unsupported(format!("its connector {} is gone", seen.name)))?;
+        let connector = card.get_connector(named, true).map_err(card.refused("asking the monitor"))?;
+        let (index, crtc) = free_controller(card, &resources, &connector)?.ok_or_else(|| {
+            card.unsupported(format!("every controller that {} can use drives another one", seen.name))
+        })?;
+        let (mut primary, mut other_planes) = (None, Vec::new());
+        for handle in card.plane_handles().map_err(card.refused("listing planes"))? {
+            let info = card.get_plane(handle).map_err(card.refused("listing planes"))?;
+            if !resources.filter_crtcs(info.possible_crtcs()).contains(&crtc) {
+                continue;
+            }
+            let properties = Properties::of(card, handle).map_err(card.refused("listing planes"))?;
+            let usable = info.formats().contains(&(format as u32)) && info.crtc().is_none_or(|user| user == crtc);
+            let is_primary = properties.value("type") == Some(PlaneType::Primary as u64);
+            if is_primary && usable && primary.is_none() {
+                primary = Some(handle);
+            } else if info.crtc() == Some(crtc) {
+                other_planes.push(handle);
+            }
+        }
+        let plane =
+            primary.ok_or_else(|| card.unsupported(format!("{} has no primary plane for {format:?}", seen.name)))?;
+        Ok((Self { connector: named, crtc, crtc_index: index as u32, plane, other_planes }, connector))
+    }
+
+    /// A request that shows `buffer` on the whole of the connector in `mode`, and nothing else.
+    pub(crate) fn mode_request(
+        &self,
+        properties: &PipeProperties,
+        mode: &Mode,
+        mode_blob: u64,
+        buffer: framebuffer::Handle,
+        card: &Card,
+    ) -> Result<AtomicModeReq, DrmError> {
+        let mut request = AtomicModeReq::new();
+        let need = |found: Option<property::Handle>, name: &str| {
+            found.ok_or_else(|| card.unsupported(format!("its property `{name}`")))
+        };
+        let (width, height) = mode.size();
+        let crtc = u64::from(u32::from(self.crtc));
+        request.add_raw_property(self.connector.into(), need(properties.connector.handle("CRTC_ID"), "CRTC_ID")?, crtc);
+        for (name, value) in [("MODE_ID", mode_blob), ("ACTIVE", 1)] {
+            request.add_raw_property(self.crtc.into(), need(properties.crtc.handle(name), name)?, value);
+        }
+        for (name, value) in [
+            ("FB_ID", u64::from(u32::from(buffer))),
+            ("CRTC_ID", crtc),
+            ("SRC_X", 0),
+            ("SRC_Y", 0),
+            ("SRC_W", u64::from(width) << 16),
+            ("SRC_H", u64::from(height) << 16),
+            ("CRTC_X", 0),
+            ("CRTC_Y", 0),
+            ("CRTC_W", u64::from(width)),
+            ("CRTC_H", u64::from(height)),
+        ] {
+            request.add_raw_property(self.plane.into(), need(properties.plane.handle(name), name)?, value);
+        }
+        for &other in &self.other_planes {
+            let other_properties = Properties::of(card, other).map_err(card.refused("listing planes"))?;
+            for name in ["FB_ID", "CRTC_ID"] {
+                request.add_raw_property(other.into(), need(other_properties.handle(name), name)?, 0);
+            }
+        }
+        Ok(request)
+    }
+}
+
+/// A controller for `connector` that drives no other one; the one that drives it already, where there is one.
+fn free_controller(
+    card: &Card,
+    resources: &ResourceHandles,
+    connector: &connector::Info,
+) -> Result<Option<(usize, crtc::Handle)>, DrmError> {
+    let driven = |handle: connector::Handle| {
+        let properties = Properties::of(card, handle).map_err(card.refused("reading a connector"))?;
+        Ok::<_, DrmError>(properties.value("CRTC_ID").unwrap_or(0))
+    };
+    let own = driven(connector.handle())?;
+    let mut taken = Vec::new();
+    for &other in resources.connectors() {
+        if other != connector.handle() {
+            taken.push(driven(other)?);
+        }
+    }
+    let mut possible = Vec::new();
+    for &encoder in connector.encoders() {
+        let encoder = card.get_encoder(encoder).map_err(card.refused("reading an encoder"))?;
+        possible.extend(resources.filter_crtcs(encoder.possible_crtcs()));
+    }
+    let id = |crtc: crtc::Handle| u64::from(u32::from(crtc));
+    possible.sort_by_key(|&crtc| id(crtc) != own);
+    let free = possible.into_iter().find(|&crtc| !taken.contains(&id(crtc)));
+    Ok(free.and_then(|crtc| Some((resources.crtcs().iter().position(|&other| other == crtc)?, crtc))))
+}
+
+/// A buffer that the controller scans out, in the processor's memory.
+#[derive(Debug)]
+pub(crate) struct ScanBuffer {
+    pub(crate) framebuffer: framebuffer::Handle,
+    dumb: DumbBuffer,
+    pixels: MmapMut,
+}
+
+impl ScanBuffer {
+    /// A black buffer of 32 bits a pixel. The card frees it when it is closed.
+    pub(crate) fn new(card: &Card, size: Resolution, format: DrmFourcc) -> Result<Self, DrmError> {
+        let refused = card.refused("making a scan-out buffer");
+        let dumb = card.create_dumb_buffer((size.width as u32, size.height as u32), format, 32).map_err(&refused)?;
+        let depth = if format == DrmFourcc::Xrgb2101010 { 30 } else { 24 };
+        let framebuffer = card.add_framebuffer(&dumb, depth, 32).map_err(&refused)?;
+        let place = drm_ffi::mode::dumbbuffer::map(card.as_fd(), u32::from(dumb.handle()), 0, 0).map_err(&refused)?;
+        let length = dumb.pitch() as usize * size.height;
+        // SAFETY: the memory belongs to the buffer, which nobody else has a handle of, and stays mapped until it is dropped;
+        // the display controller only reads it.
+        let pixels = unsafe { MmapOptions::new().offset(place.offset).len(length).map_mut(&card.file) };
+        let mut pixels = pixels.map_err(&refused)?;
+        pixels.fill(0);
+        Ok(Self { framebuffer, dumb, pixels })
+    }
+
+    /// The rows, and how many bytes lie from one to the next.
+    pub(crate) fn rows(&mut self) -> (&mut [u8], usize) {
+        (&mut self.pixels, self.dumb.pitch() as usize)
+    }
+}
+
+/// Asks for another buffer at the next refresh, and for the event that says when it came. Takes no memory.
+pub(crate) fn flip(
+    card: &Card,
+    plane: plane::Handle,
+    buffer_property: property::Handle,
+    buffer: framebuffer::Handle,
+) -> Result<(), rustix::io::Errno> {
+    let flags = AtomicCommitFlags::PAGE_FLIP_EVENT | AtomicCommitFlags::NONBLOCK;
+    let mut value = [u64::from(u32::from(buffer))];
+    drm_ffi::mode::atomic_commit(
+        card.as_fd(),
+        flags.bits(),
+        &mut [plane.into()],
+        &mut [1],
+        &mut [buffer_property.into()],
+        &mut value,
+    )
+    .map_err(|why| rustix::io::Errno::from_io_error(&why).unwrap_or(rustix::io::Errno::IO))
+}

@@ -1,0 +1,296 @@
+//! What must be true of a connector for levels to reach the panel as they are: set where the driver lets it be set, and
+//! read back.
+
+use std::fmt;
+use std::io;
+
+use drm::control::atomic::AtomicModeReq;
+use drm::control::property::{self, ValueType};
+use drm::control::{AtomicCommitFlags, Device as _, RawResourceHandle, ResourceHandle};
+
+use super::card::{Card, Pipe};
+
+/// One thing that was looked at on the way to the panel.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DisplayCheck {
+    /// What was looked at.
+    pub name: String,
+    /// What it is.
+    pub found: String,
+    /// What it must be.
+    pub wanted: String,
+    /// What follows.
+    pub verdict: Verdict,
+}
+
+/// Whether a thing is as it must be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// It was read back, and it is.
+    Right,
+    /// It was read back, and it is not.
+    Wrong,
+    /// The driver does not tell.
+    Unverified,
+}
+
+impl fmt::Display for DisplayCheck {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let verdict = match self.verdict {
+            Verdict::Right => "right",
+            Verdict::Wrong => "WRONG",
+            Verdict::Unverified => "not verified",
+        };
+        write!(f, "{}: {}, wanted {} ({verdict})", self.name, self.found, self.wanted)
+    }
+}
+
+impl DisplayCheck {
+    /// A check whose found and wanted are texts that must be equal.
+    pub(crate) fn equal(name: &str, found: impl ToString, wanted: impl ToString) -> Self {
+        let (found, wanted) = (found.to_string(), wanted.to_string());
+        let verdict = if found == wanted { Verdict::Right } else { Verdict::Wrong };
+        Self { name: name.to_owned(), found, wanted, verdict }
+    }
+
+    /// A check that could not be made.
+    pub(crate) fn unverified(name: &str, found: &str, wanted: impl ToString) -> Self {
+        Self {
+            name: name.to_owned(),
+            found: found.to_owned(),
+            wanted: wanted.to_string(),
+            verdict: Verdict::Unverified,
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum On {
+    Connector,
+    Crtc,
+    Plane,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Want {
+    /// The enumeration value of this name.
+    Named(&'static str),
+    Number(u64),
+    /// No table: the values pass as they are.
+    NoBlob,
+    /// The bits of one channel.
+    ChannelBits,
+}
+
+struct Setting {
+    name: &'static str,
+    on: On,
+    property: &'static str,
+    want: Want,
+    /// Whether a driver that lacks the property leaves the matter open.
+    essential: bool,
+}
+
+const fn setting(name: &'static str, on: On, property: &'static str, want: Want, essential: bool) -> Setting {
+    Setting { name, on, property, want, essential }
+}
+
+/// Every property that can change levels between the buffer and the panel, by the names of the kernel's documentation and
+/// of the drivers i915, xe, amdgpu, radeon, nouveau, nvidia-drm and vc4.
+const SETTINGS: &[Setting] = &[
+    setting("range of RGB", On::Connector, "Broadcast RGB", Want::Named("Full"), true),
+    setting("bits of a channel on the link", On::Connector, "max bpc", Want::ChannelBits, true),
+    setting("gamma table", On::Crtc, "GAMMA_LUT", Want::NoBlob, true),
+    setting("degamma table", On::Crtc, "DEGAMMA_LUT", Want::NoBlob, false),
+    setting("colour matrix", On::Crtc, "CTM", Want::NoBlob, true),
+    setting("dithering", On::Connector, "dithering mode", Want::Named("off"), false),
+    setting("dithering", On::Connector, "dither", Want::Named("off"), false),
+    setting("scaling by the controller", On::Connector, "scaling mode", Want::Named("None"), false),
+    setting("underscan", On::Connector, "underscan", Want::Named("off"), false),
+    setting("margin", On::Connector, "left margin", Want::Number(0), false),
+    setting("margin", On::Connector, "right margin", Want::Number(0), false),
+    setting("margin", On::Connector, "top margin", Want::Number(0), false),
+    setting("margin", On::Connector, "bottom margin", Want::Number(0), false),
+    setting("colour space", On::Connector, "Colorspace", Want::Named("Default"), false),
+    setting("high dynamic range", On::Connector, "HDR_OUTPUT_METADATA", Want::NoBlob, false),
+    setting("contrast by the backlight", On::Connector, "abm level", Want::Number(0), false),
+    setting("state of the link", On::Connector, "link-status", Want::Named("Good"), false),
+    setting("variable refresh", On::Crtc, "VRR_ENABLED", Want::Number(0), false),
+    setting("sharpening", On::Crtc, "SHARPNESS_STRENGTH", Want::Number(0), false),
+    // Bit 0 is no rotation and no reflection.
+    setting("rotation", On::Plane, "rotation", Want::Number(1), false),
+    setting("opacity", On::Plane, "alpha", Want::Number(0xffff), false),
+    setting("blending", On::Plane, "pixel blend mode", Want::Named("None"), false),
+];
+
+/// The properties of one object, by name.
+pub(crate) struct Properties(Vec<(property::Info, u64)>);
+
+impl Properties {
+    pub(crate) fn of<H: ResourceHandle>(card: &Card, object: H) -> io::Result<Self> {
+        let values = card.get_properties(object)?;
+        let read = |(&handle, &value)| card.get_property(handle).map(|info| (info, value));
+        values.iter().map(read).collect::<io::Result<_>>().map(Self)
+    }
+
+    pub(crate) fn find(&self, name: &str) -> Option<&(property::Info, u64)> {
+        self.0.iter().find(|(info, _)| info.name().to_bytes() == name.as_bytes())
+    }
+
+    pub(crate) fn handle(&self, name: &str) -> Option<property::Handle> {
+        self.find(name).map(|(info, _)| info.handle())
+    }
+
+    pub(crate) fn value(&self, name: &str) -> Option<u64> {
+        self.find(name).map(|&(_, value)| value)
+    }
+}
+
+/// The properties of the three objects on the way to the panel.
+pub(crate) struct PipeProperties {
+    pub(crate) connector: Properties,
+    pub(crate) crtc: Properties,
+    pub(crate) plane: Properties,
+}
+
+impl PipeProperties {
+    pub(crate) fn of(card: &Card, pipe: &Pipe) -> io::Result<Self> {
+        Ok(Self {
+            connector: Properties::of(card, pipe.connector)?,
+            crtc: Properties::of(card, pipe.crtc)?,
+            plane: Properties::of(card, pipe.plane)?,
+        })
+    }
+
+    fn on(&self, on: On) -> &Properties {
+        match on {
+            On::Connector => &self.connector,
+            On::Crtc => &self.crtc,
+            On::Plane => &self.plane,
+        }
+    }
+}
+
+/// A property's value before and after.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Change {
+    object: RawResourceHandle,
+    property: property::Handle,
+    new: u64,
+    old: u64,
+}
+
+fn object(pipe: &Pipe, on: On) -> RawResourceHandle {
+    match on {
+        On::Connector => pipe.connector.into(),
+        On::Crtc => pipe.crtc.into(),
+        On::Plane => pipe.plane.into(),
+    }
+}
+
+/// The value that is wanted, as the property writes it; `None` where it has no such value.
+fn wanted(info: &property::Info, want: Want, channel_bits: u8) -> Option<u64> {
+    match (want, info.value_type()) {
+        (Want::Named(name), ValueType::Enum(values)) => {
+            let named = |value: &&property::EnumValue| value.name().to_bytes().eq_ignore_ascii_case(name.as_bytes());
+            values.values().1.iter().find(named).map(property::EnumValue::value)
+        }
+        (Want::ChannelBits, ValueType::UnsignedRange(least, most)) => {
+            Some(u64::from(channel_bits).clamp(*least, *most))
+        }
+        (Want::Number(number), _) => Some(number),
+        (Want::NoBlob, _) => Some(0),
+        _ => None,
+    }
+}
+
+fn words(info: &property::Info, want: Want, value: u64) -> String {
+    if let (Want::NoBlob, value) = (want, value) {
+        return if value == 0 { "none" } else { "one" }.to_owned();
+    }
+    match info.value_type() {
+        ValueType::Enum(values) => values
+            .get_value_from_raw_value(value)
+            .map_or_else(|| value.to_string(), |value| value.name().to_string_lossy().into_owned()),
+        _ => value.to_string(),
+    }
+}
+
+fn wanted_words(want: Want, channel_bits: u8) -> String {
+    match want {
+        Want::Named(name) => name.to_owned(),
+        Want::Number(number) => number.to_string(),
+        Want::NoBlob => "none".to_owned(),
+        Want::ChannelBits => channel_bits.to_string(),
+    }
+}
+
+/// Which properties are to be changed to what.
+pub(crate) fn plan(pipe: &Pipe, properties: &PipeProperties, channel_bits: u8) -> Vec<Change> {
+    let change = |setting: &Setting| {
+        let (info, old) = properties.on(setting.on).find(setting.property)?;
+        let new = wanted(info, setting.want, channel_bits)?;
+        let change = Change { object: object(pipe, setting.on), property: info.handle(), new, old: *old };
+        info.mutable().then_some(change)
+    };
+    SETTINGS.iter().filter_map(change).collect()
+}
+
+/// Adds to `request` what the driver takes of `changes`: all of them, or else one after another.
+pub(crate) fn add_accepted(card: &Card, request: &mut AtomicModeReq, changes: &[Change]) {
+    let flags = AtomicCommitFlags::TEST_ONLY | AtomicCommitFlags::ALLOW_MODESET;
+    let mut whole = request.clone();
+    for change in changes {
+        whole.add_raw_property(change.object, change.property, change.new);
+    }
+    if card.atomic_commit(flags, whole.clone()).is_ok() {
+        *request = whole;
+        return;
+    }
+    for change in changes {
+        let mut tried = request.clone();
+        tried.add_raw_property(change.object, change.property, change.new);
+        if card.atomic_commit(flags, tried.clone()).is_ok() {
+            *request = tried;
+        }
+    }
+}
+
+/// Puts back what [`plan`] changed, as far as the driver lets it: the next user of the connector may not know these
+/// properties.
+pub(crate) fn restore(card: &Card, changes: &[Change]) {
+    let mut request = AtomicModeReq::new();
+    let back: Vec<_> = changes
+        .iter()
+        .filter(|change| change.old != change.new)
+        .map(|change| Change { new: change.old, old: change.new, ..*change })
+        .collect();
+    if !back.is_empty() {
+        add_accepted(card, &mut request, &back);
+        // At the end there is nobody who could do anything about it.
+        let _ = card.atomic_commit(AtomicCommitFlags::ALLOW_MODESET, request);
+    }
+}
+
+/// What the properties are now, beside what they must be.
+pub(crate) fn read_back(properties: &PipeProperties, channel_bits: u8) -> Vec<DisplayCheck> {
+    let check = |setting: &Setting| {
+        let must = wanted_words(setting.want, channel_bits);
+        let name = format!("{} ({})", setting.name, setting.property);
+        let Some((info, value)) = properties.on(setting.on).find(setting.property) else {
+            let silent = || DisplayCheck::unverified(&name, "the driver does not say", must);
+            return setting.essential.then(silent);
+        };
+        let found = words(info, setting.want, *value);
+        Some(match wanted(info, setting.want, channel_bits) {
+            Some(wanted) => DisplayCheck::equal(&name, found, words(info, setting.want, wanted)),
+            // Such as a laptop's panel whose scaler cannot be switched off, and has nothing to do in the panel's own mode.
+            None => DisplayCheck::unverified(&name, &format!("{found}, and the driver offers nothing else"), must),
+        })
+    };
+    let mut checks: Vec<_> = SETTINGS.iter().filter_map(check).collect();
+    if !checks.iter().any(|check| check.name.starts_with("dithering")) {
+        checks.push(DisplayCheck::unverified("dithering", "the driver does not say", "off"));
+    }
+    checks
+}

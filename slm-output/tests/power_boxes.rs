@@ -1,0 +1,359 @@
+//! Boxes that only set a power and switch it, spoken to over pseudo-terminals by devices that answer in real bytes.
+
+use std::collections::HashMap;
+use std::io::{ErrorKind, Read, Write};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use crc::{CRC_16_XMODEM, Crc};
+use holod_calibration::rig::{LaserDriver, Lasers, PanelMode, Rig, TextLaserProfile};
+use holod_calibration::{Colour, PerColour, TimeNs};
+use holod_slm_output::laser::{
+    BoxEvent, DarkReason, LaserBox, LaserError, LaserProgram, Refusal, make_dark, open_laser,
+};
+use holod_slm_output::output::monotonic_now;
+use holod_slm_output::schedule::Gate;
+use serialport::{SerialPort, TTYPort};
+
+const MS: i64 = 1_000_000;
+
+/// What a device was told and how it is, for both its thread and the test.
+#[derive(Debug, Default)]
+struct Device {
+    /// Everything that it was sent, in order.
+    heard: Vec<String>,
+    /// Parameters of a MeCom device by (parameter, instance); a text laser's state by name.
+    values: HashMap<(u16, u8), u32>,
+    lit: bool,
+    power_w: String,
+    interlock: &'static str,
+    mute: bool,
+}
+
+/// A device behind a pseudo-terminal.
+struct Bench {
+    device: Arc<Mutex<Device>>,
+    path: PathBuf,
+    stop: Arc<AtomicBool>,
+    /// Held open, so that the terminal outlives its hosts.
+    _port: TTYPort,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Bench {
+    fn plug_in(end: u8, answer: impl Fn(&mut Device, &str) -> Vec<u8> + Send + 'static) -> Self {
+        let (mut terminal, port) = TTYPort::pair().unwrap();
+        terminal.set_timeout(Duration::from_millis(5)).unwrap();
+        let path = PathBuf::from(port.name().unwrap());
+        let device = Arc::new(Mutex::new(Device { interlock: "0", ..Device::default() }));
+        let stop = Arc::new(AtomicBool::new(false));
+        let (its_device, stopped) = (Arc::clone(&device), Arc::clone(&stop));
+        let serve = move || {
+            let mut line = Vec::new();
+            while !stopped.load(Ordering::Relaxed) {
+                let mut byte = [0];
+                match terminal.read(&mut byte) {
+                    Ok(1) if byte[0] == end => {
+                        let text = String::from_utf8_lossy(&std::mem::take(&mut line)).trim().to_owned();
+                        let mut device = its_device.lock().unwrap();
+                        device.heard.push(text.clone());
+                        let answer = answer(&mut device, &text);
+                        if !device.mute {
+                            terminal.write_all(&answer).unwrap();
+                        }
+                    }
+                    Ok(1) => line.push(byte[0]),
+                    Ok(_) => {}
+                    Err(why) if why.kind() == ErrorKind::TimedOut => {}
+                    Err(_) => return,
+                }
+            }
+        };
+        Self { device, path, stop, _port: port, thread: Some(std::thread::spawn(serve)) }
+    }
+
+    fn heard(&self) -> Vec<String> {
+        self.device.lock().unwrap().heard.clone()
+    }
+
+    fn with<T>(&self, look: impl FnOnce(&mut Device) -> T) -> T {
+        look(&mut self.device.lock().unwrap())
+    }
+}
+
+impl Drop for Bench {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            thread.join().unwrap();
+        }
+    }
+}
+
+fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
+    let t_end = monotonic_now() + TimeNs(30_000 * MS);
+    while !holds() {
+        assert!(monotonic_now() < t_end, "never came: {what}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// A READYBeam, or a MeCom device of another type.
+fn ready_beam(device_type: u32) -> Bench {
+    let bench = Bench::plug_in(b'\r', |device, frame| {
+        const CRC: Crc<u16> = Crc::<u16>::new(&CRC_16_XMODEM);
+        let (text, crc) = frame.split_at(frame.len().saturating_sub(4));
+        if !text.starts_with('#') || format!("{:04X}", CRC.checksum(text.as_bytes())) != crc {
+            return Vec::new();
+        }
+        let hex = |from: usize, to: usize| u32::from_str_radix(&text[from..to], 16).unwrap();
+        let with_crc = |text: String| format!("{text}{:04X}\r", CRC.checksum(text.as_bytes())).into_bytes();
+        let begin = format!("!{}", &text[1..7]);
+        if &text[7..10] == "?VR" {
+            let key = (hex(10, 14) as u16, hex(14, 16) as u8);
+            return with_crc(match device.values.get(&key) {
+                Some(value) => format!("{begin}{value:08X}"),
+                None => format!("{begin}+06"),
+            });
+        }
+        device.values.insert((hex(9, 13) as u16, hex(13, 15) as u8), hex(15, 23));
+        // The acknowledgement carries the request's own CRC.
+        format!("{begin}{crc}\r").into_bytes()
+    });
+    bench.with(|device| {
+        device.values.insert((100, 1), device_type);
+        device.values.insert((104, 1), 2);
+        for instance in 1..=3 {
+            device.values.insert((7006, instance), 1);
+        }
+    });
+    bench
+}
+
+/// A Cobolt laser, which begins lit.
+fn cobolt() -> Bench {
+    let bench = Bench::plug_in(b'\r', |device, line| {
+        let answer = match line {
+            "sn?" => "12034".to_owned(),
+            "ilk?" => device.interlock.to_owned(),
+            "f?" => "0".to_owned(),
+            "l1" | "l0" => {
+                device.lit = line == "l1";
+                "OK".to_owned()
+            }
+            "@cobas 0" => "OK".to_owned(),
+            _ => match line.strip_prefix("p ") {
+                Some(watts) => {
+                    watts.clone_into(&mut device.power_w);
+                    "OK".to_owned()
+                }
+                None => "Syntax error: illegal command".to_owned(),
+            },
+        };
+        format!("{answer}\r\n").into_bytes()
+    });
+    bench.with(|device| device.lit = true);
+    bench
+}
+
+/// A Coherent OBIS laser with its handshake, which acknowledges questions, too.
+fn obis() -> Bench {
+    Bench::plug_in(b'\n', |device, line| {
+        let answer = match line {
+            "*IDN?" => "Coherent, Inc-OBIS 520nm 40mW C-V2.3\r\nOK".to_owned(),
+            "SOUR:AM:STATE ON" | "SOUR:AM:STATE OFF" => {
+                device.lit = line.ends_with("ON");
+                "OK".to_owned()
+            }
+            _ => match line.strip_prefix("SOUR:POW:LEV:IMM:AMPL ") {
+                Some(watts) => {
+                    watts.clone_into(&mut device.power_w);
+                    "OK".to_owned()
+                }
+                None => "ERR-100".to_owned(),
+            },
+        };
+        format!("{answer}\r\n").into_bytes()
+    })
+}
+
+fn text_lasers(profile: &str, paths: [Option<&Bench>; 3]) -> LaserDriver {
+    LaserDriver::Text {
+        profile: Box::new(TextLaserProfile::named(profile).unwrap().clone()),
+        paths: PerColour(paths.map(|bench| bench.map(|bench| bench.path.clone()))),
+    }
+}
+
+fn lasers(driver: LaserDriver) -> Lasers {
+    Lasers { driver, accept_no_heartbeat: true, heartbeat_timeout: TimeNs(150 * MS), ..Rig::default().lasers }
+}
+
+fn program(mode: PanelMode) -> LaserProgram {
+    let mut rig = Rig::default();
+    rig.panel.mode = mode;
+    rig.lasers.heartbeat_timeout = TimeNs(150 * MS);
+    Gate::new(&rig.panel, &rig.lasers).unwrap().program(&rig.panel, &rig.lasers).unwrap()
+}
+
+const GREEN: PanelMode = PanelMode::Monochrome(Colour::Green);
+
+/// Polls with heartbeats until `holds`; the events on the way.
+fn alive_until(laser: &mut dyn LaserBox, mut holds: impl FnMut() -> bool) -> Vec<BoxEvent> {
+    let mut events = Vec::new();
+    eventually("what was waited for", || {
+        laser.heartbeat(monotonic_now()).unwrap();
+        laser.poll(monotonic_now(), &mut |event| events.push(event)).unwrap();
+        holds()
+    });
+    events
+}
+
+#[test]
+fn a_ready_beam_is_recognised_set_lit_in_one_colour_and_put_out() {
+    let bench = ready_beam(1171);
+    let full_power_uw = PerColour([40_000, 20_000, 50_000]);
+    let driver = LaserDriver::ReadyBeam { path: bench.path.clone(), full_power_uw };
+    let mut laser = open_laser(&lasers(driver.clone()), monotonic_now).unwrap();
+    let capability = laser.capability();
+    assert!(!capability.simulated && !capability.gates_fields && !capability.has_heartbeat);
+    let heard = bench.heard();
+    assert!(heard[0].contains("?VR006401"), "the device type before anything else: {heard:?}");
+
+    let refused = laser.arm(monotonic_now()).unwrap_err();
+    assert!(matches!(refused, LaserError::Refused { refusal: Refusal::NotProgrammed, .. }), "{refused}");
+    laser.program(&program(GREEN), monotonic_now()).unwrap();
+    let on = |bench: &Bench| bench.with(|device| [1, 2, 3].map(|instance| device.values[&(7006, instance)]));
+    assert_eq!(on(&bench), [0, 0, 0]);
+    // 1 mW of 20 mW.
+    assert_eq!(bench.with(|device| f32::from_bits(device.values[&(7013, 2)])), 5.0);
+    laser.arm(monotonic_now()).unwrap();
+    let events = alive_until(laser.as_mut(), || on(&bench) == [0, 1, 0]);
+    assert!(
+        events.iter().all(|event| matches!(event, BoxEvent::Armed { .. })),
+        "no edges of single fields: {events:?}"
+    );
+    laser.dark(DarkReason::Shutdown, monotonic_now()).unwrap();
+    assert_eq!(on(&bench), [0, 0, 0]);
+
+    // It is somebody else's in the eyes of a second program, but anybody may put it out.
+    let in_use = open_laser(&lasers(driver.clone()), monotonic_now).err().unwrap();
+    assert!(matches!(in_use, LaserError::InUse { .. }), "{in_use}");
+    laser.arm(monotonic_now()).unwrap();
+    alive_until(laser.as_mut(), || on(&bench) == [0, 1, 0]);
+    drop(laser);
+    assert_eq!(on(&bench), [0, 0, 0], "put out before its port is closed");
+    bench.with(|device| device.values.insert((7006, 3), 1));
+    make_dark(&driver, monotonic_now).unwrap();
+    assert_eq!(on(&bench), [0, 0, 0]);
+}
+
+#[test]
+fn another_device_on_the_port_is_refused_before_anything_is_set() {
+    for (bench, found) in
+        [(ready_beam(1089), "1089"), (Bench::plug_in(b'\r', |_, _| b"P1,1,1000,L,3.1,0.9*00\r\n".to_vec()), "P1,1")]
+    {
+        let driver = LaserDriver::ReadyBeam { path: bench.path.clone(), full_power_uw: PerColour([1000; 3]) };
+        let error = open_laser(&lasers(driver), monotonic_now).err().unwrap();
+        assert!(matches!(&error, LaserError::NotABox { found: text, .. } if text.contains(found)), "{error}");
+        assert!(bench.heard().iter().all(|frame| frame.contains("?VR")), "reads only: {:?}", bench.heard());
+    }
+    let bench = ready_beam(1171);
+    let error = open_laser(&lasers(text_lasers("cobolt", [None, Some(&bench), None])), monotonic_now).err().unwrap();
+    assert!(matches!(error, LaserError::NoAnswer { .. }), "{error}");
+    assert_eq!(bench.heard(), ["sn?"]);
+    let bench = cobolt();
+    let error = open_laser(&lasers(text_lasers("coherent-obis", [Some(&bench), None, None])), monotonic_now).err();
+    let error = error.unwrap();
+    assert!(matches!(&error, LaserError::NoAnswer { .. } | LaserError::NotABox { .. }), "{error}");
+    assert!(bench.heard().iter().all(|line| line == "*IDN?"), "{:?}", bench.heard());
+}
+
+#[test]
+fn text_lasers_are_recognised_put_out_set_lit_and_put_out() {
+    for (name, bench) in [("cobolt", cobolt()), ("coherent-obis", obis())] {
+        let driver = text_lasers(name, [None, Some(&bench), None]);
+        let mut laser = open_laser(&lasers(driver.clone()), monotonic_now).unwrap();
+        assert!(!bench.with(|device| device.lit), "{name}: out from the first moment on");
+        laser.program(&program(GREEN), monotonic_now()).unwrap();
+        assert_eq!(bench.with(|device| device.power_w.clone()), "0.001000", "{name}");
+        laser.arm(monotonic_now()).unwrap();
+        alive_until(laser.as_mut(), || bench.with(|device| device.lit));
+        laser.dark(DarkReason::Asked, monotonic_now()).unwrap();
+        assert!(!bench.with(|device| device.lit), "{name}");
+
+        let missing = laser.program(&program(PanelMode::Monochrome(Colour::Red)), monotonic_now()).unwrap_err();
+        assert!(matches!(missing, LaserError::NoLaser { colour: Colour::Red }), "{missing}");
+        bench.with(|device| device.lit = true);
+        make_dark(&driver, monotonic_now).unwrap();
+        assert!(!bench.with(|device| device.lit), "{name}");
+    }
+}
+
+#[test]
+fn lasers_that_cannot_gate_fields_light_several_colours_only_where_the_panel_gates_them() {
+    let benches = [cobolt(), cobolt(), cobolt()];
+    let driver = text_lasers("cobolt", [Some(&benches[0]), Some(&benches[1]), Some(&benches[2])]);
+    let mut laser = open_laser(&lasers(driver.clone()), monotonic_now).unwrap();
+    for mode in [PanelMode::ChannelPacked, PanelMode::FieldSequential] {
+        let refused = laser.program(&program(mode), monotonic_now()).unwrap_err();
+        assert!(matches!(refused, LaserError::CannotGate), "{refused}");
+        assert!(laser.arm(monotonic_now()).is_err());
+    }
+    drop(laser);
+    let gated = Lasers { gated_by_panel: true, ..lasers(driver.clone()) };
+    let mut laser = open_laser(&gated, monotonic_now).unwrap();
+    laser.program(&program(PanelMode::ChannelPacked), monotonic_now()).unwrap();
+    laser.arm(monotonic_now()).unwrap();
+    alive_until(laser.as_mut(), || benches.iter().all(|bench| bench.with(|device| device.lit)));
+    drop(laser);
+    let unaccepted = Lasers { accept_no_heartbeat: false, ..gated };
+    let heard = benches[0].heard().len();
+    assert!(matches!(open_laser(&unaccepted, monotonic_now).err(), Some(LaserError::NotAccepted)));
+    assert_eq!(benches[0].heard().len(), heard, "not even opened");
+}
+
+#[test]
+fn a_host_that_falls_silent_and_a_laser_that_complains_end_in_darkness() {
+    let bench = cobolt();
+    let mut laser = open_laser(&lasers(text_lasers("cobolt", [None, Some(&bench), None])), monotonic_now).unwrap();
+    laser.program(&program(GREEN), monotonic_now()).unwrap();
+    laser.arm(monotonic_now()).unwrap();
+    alive_until(laser.as_mut(), || bench.with(|device| device.lit));
+    // No heartbeat any more.
+    let mut dark = None;
+    eventually("darkness", || {
+        laser
+            .poll(monotonic_now(), &mut |event| {
+                if let BoxEvent::Dark { reason, .. } = event {
+                    dark = Some(reason);
+                }
+            })
+            .unwrap();
+        dark.is_some()
+    });
+    assert_eq!(dark, Some(DarkReason::Heartbeat));
+    assert!(!bench.with(|device| device.lit));
+
+    laser.arm(monotonic_now()).unwrap();
+    alive_until(laser.as_mut(), || bench.with(|device| device.lit));
+    let watch = laser.watch().unwrap();
+    bench.with(|device| device.interlock = "1");
+    eventually("the interlock", || {
+        let _lost = laser.heartbeat(monotonic_now());
+        let _lost = laser.poll(monotonic_now(), &mut |_| ());
+        watch.trouble().is_some_and(|trouble| trouble.contains("ilk?") && trouble.contains("interlock"))
+    });
+    eventually("darkness", || !bench.with(|device| device.lit));
+    bench.with(|device| device.interlock = "0");
+    eventually("the laser", || {
+        laser.poll(monotonic_now(), &mut |_| ()).unwrap();
+        laser.arm(monotonic_now()).is_ok()
+    });
+    alive_until(laser.as_mut(), || bench.with(|device| device.lit));
+    bench.with(|device| device.mute = true);
+    let unheard = laser.dark(DarkReason::Shutdown, monotonic_now()).unwrap_err();
+    assert!(matches!(unheard, LaserError::Lost), "no acknowledgement: {unheard}");
+}

@@ -1,0 +1,138 @@
+//! Whatever happens to the window, the lasers go dark: the real threads, and a laser box on a terminal with a log of its
+//! own.
+//!
+//! No display server here scans a window out directly, so none stamps a time that a laser may be lit by. A decorator
+//! passes the times of copies off as stamped ones; all else is what a bench runs.
+
+use std::fs::{self, File};
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
+
+use holod_calibration::rig::{LaserDriver, PanelMode, Rig};
+use holod_calibration::{PerColour, TimeNs};
+use holod_slm_output::laser::edge_log::read_log;
+use holod_slm_output::laser::simulator::{SimulatedBox, SimulatedTerminal};
+use holod_slm_output::laser::{BoxEvent, open_laser};
+use holod_slm_output::output::{Output, OutputOptions, monotonic_now, pacing_config};
+use holod_slm_output::pacing::Pacer;
+use holod_slm_output::present::window::{DisplayServer, Road, WindowPanel};
+use holod_slm_output::present::{FrameSource, PanelFault, PanelSetup, PresentedRefresh, Presenter, Provenance};
+use holod_slm_output::{LevelsFrame, PanelEncoder};
+
+use super::bench::{SIZE, named, panel};
+use super::x11::cover;
+use super::x11_server::{Desktop, PANEL};
+
+/// Longest time from a fault to darkness: the box's own timeout, and what a machine under load adds to it.
+const DARK_WITHIN: TimeNs = TimeNs(130_000_000);
+
+/// A panel whose times pass for the driver's.
+struct Stamped(WindowPanel);
+
+impl Presenter for Stamped {
+    fn is_virtual(&self) -> bool {
+        self.0.is_virtual()
+    }
+
+    fn wake_fd(&self) -> Option<BorrowedFd<'_>> {
+        self.0.wake_fd()
+    }
+
+    fn t_next(&self) -> TimeNs {
+        self.0.t_next()
+    }
+
+    fn tick(
+        &mut self,
+        now: TimeNs,
+        frames: &mut FrameSource,
+        presented: &mut dyn FnMut(PresentedRefresh),
+    ) -> Result<(), PanelFault> {
+        self.0.tick(now, frames, &mut |refresh| {
+            presented(PresentedRefresh { provenance: Provenance::Driver, ..refresh });
+        })
+    }
+
+    fn show_flat(&mut self) {
+        self.0.show_flat();
+    }
+
+    fn recover(&mut self, now: TimeNs) -> Result<(), PanelFault> {
+        self.0.recover(now)
+    }
+
+    fn shown(&self) -> Option<&LevelsFrame> {
+        self.0.shown()
+    }
+}
+
+/// Lights lasers over a window on an X server, lets `strike` happen, and reads how long after it the box was dark.
+fn dark_after(server: DisplayServer, strike: impl FnOnce()) -> TimeNs {
+    let folder = tempfile::tempdir().unwrap();
+    let terminal = SimulatedTerminal::open().unwrap();
+    let mut rig = Rig { panel: panel(PanelMode::ChannelPacked), ..Rig::default() };
+    rig.lasers.driver = LaserDriver::Serial { path: terminal.path().to_owned(), sync_wire: false };
+    let log = File::create(folder.path().join("box.csv")).unwrap();
+    std::thread::spawn(move || {
+        terminal.serve(SimulatedBox::new(monotonic_now()), log, &std::sync::Arc::default(), monotonic_now)
+    });
+    let events = || read_log(&fs::read_to_string(folder.path().join("box.csv")).unwrap()).unwrap();
+
+    let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
+    let setup = PanelSetup::new(&rig.panel, &encoder);
+    let window = WindowPanel::open(server, Road::Copies, &named(PANEL), &setup).unwrap();
+    let laser = open_laser(&rig.lasers, monotonic_now).unwrap();
+    let options = OutputOptions::default();
+    let mut output = Output::start(&rig, &encoder, Box::new(Stamped(window)), laser, options, monotonic_now).unwrap();
+    let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(1_000_000)).unwrap(), monotonic_now());
+    let pattern = vec![1.0; SIZE.pixels()];
+    let mut frame = || {
+        output.frames.feed(&mut pacer, |_| ());
+        let plan = pacer.predict(monotonic_now());
+        encoder.encode(PerColour([&pattern; 3]), output.frames.acquire());
+        output.frames.submit(&plan, None, monotonic_now());
+        std::thread::sleep(Duration::from_millis(10));
+    };
+    let is_lit = |event: &&BoxEvent| matches!(event, BoxEvent::Edge(edge) if edge.on);
+    let t_end = monotonic_now() + TimeNs(30_000_000_000);
+    while events().iter().filter(is_lit).count() < 60 {
+        assert!(monotonic_now() < t_end, "never lit: {:?} {:?}", output.control.counts(), events().last());
+        frame();
+    }
+    let t_strike = monotonic_now();
+    strike();
+    let t_end = monotonic_now() + TimeNs(1_000_000_000);
+    while monotonic_now() < t_end
+        && !events().iter().any(|event| matches!(event, BoxEvent::Dark { t, .. } if *t > t_strike))
+    {
+        frame();
+    }
+    let events = events();
+    let t_dark = events.iter().find_map(|event| match event {
+        BoxEvent::Dark { t, .. } if *t > t_strike => Some(*t),
+        _ => None,
+    });
+    t_dark.unwrap_or_else(|| panic!("not dark at all: {:?}", events.last())) - t_strike
+}
+
+fn assert_dark_in_time(what: &str, dark_after: TimeNs) {
+    eprintln!("{what}: dark after {:.1} ms", dark_after.seconds() * 1e3);
+    assert!(dark_after < DARK_WITHIN, "{what}: dark after {} ms", dark_after.seconds() * 1e3);
+}
+
+#[test]
+fn the_death_of_the_x_server_is_darkness() {
+    let mut desktop = Desktop::with_two_monitors();
+    let server = DisplayServer::X11(desktop.name.clone());
+    assert_dark_in_time("X server killed", dark_after(server, || desktop.kill()));
+}
+
+#[test]
+fn a_monitor_that_goes_and_a_window_that_is_covered_are_darkness() {
+    let after = |strike: fn(&Desktop)| {
+        let desktop = Desktop::with_two_monitors();
+        dark_after(DisplayServer::X11(desktop.name.clone()), || strike(&desktop))
+    };
+    assert_dark_in_time("monitor switched off", after(|desktop| desktop.switch_off(PANEL)));
+    assert_dark_in_time("window covered", after(|desktop| cover(desktop, false)));
+}

@@ -1,0 +1,214 @@
+"""Says whether the display guest's results are what they must be: judge_display.py RESULT_LOG.
+
+Exits with 1 and a line for each mismatch. Before it judges, it shows that it can refuse: each figure of a made-up result
+that is right is made wrong in turn, and each time there must be a mismatch.
+"""
+
+import copy
+import json
+import sys
+from pathlib import Path
+
+PERIOD_US = 16667
+INTERVAL_TOLERANCE_US = 100
+# Refreshes of each run, and how many different pictures its patterns make.
+RUNS = {"flips": (1003, 7), "fields": (303, 21), "monochrome": (103, 7)}
+# Refreshes after the panel came back.
+AFTER_LOSS = 120
+# Until the counter and times of flips have agreed three times.
+BEFORE_BELIEVED = 2
+CHECKS_READ_BACK = {
+    "mode": "160 by 120 at 60.000 Hz, pixel clock 1500 kHz",
+    "panel's own pixels (EDID)": "160 by 120",
+    "pixels taken from the buffer": "160 by 120 from 0, 0",
+    "pixels shown": "160 by 120 from 0, 0",
+    "range of RGB (Broadcast RGB)": "Full",
+    "bits of a channel on the link (max bpc)": "8",
+    "gamma table (GAMMA_LUT)": "none",
+    "cursor and overlay planes": "0",
+    "clock of flip events": "monotonic",
+    "refresh counter of driver `vkms`": "counts",
+}
+LOSSES = {
+    "mastership": "another program took the display over",
+    "unplug": "the panel was unplugged",
+    "removal": "the graphics device was lost",
+}
+REFUSALS = {
+    "no_such_connector": ["no connector and no monitor is `DP-9`", "Virtual-1 on /dev/dri/card0", "HOLOD TEST"],
+    "other_size": ["has 160 by 120 pixels", "the rig says 640 by 480"],
+    "other_rate": ["at 75.000 Hz", "it offers: 160 by 120 at 60.000 Hz"],
+    "other_master": ["another program is master of /dev/dri/card0: drm_panel (process "],
+    "no_permission": ["/dev/dri/card0 does not open: permission denied", "group `video` (mode 0660)", "62-holod-panel.rules"],
+    "disconnected": ["Virtual-1 on /dev/dri/card0 is disconnected", "Plug the panel in"],
+}
+
+
+def parse(log: str) -> dict:
+    """Each section: its exit code, and what its lines of JSON hold; raises where one cannot be read."""
+    sections: dict[str, dict] = {}
+    section: dict = {}
+    for line in log.replace("\r", "").splitlines():
+        if line.startswith("== "):
+            section = sections.setdefault(line[3:], {"back": 0})
+        elif line.startswith("exit "):
+            section["exit"] = int(line[5:])
+        elif line.startswith("{"):
+            found = json.loads(line)
+            section["back"] += int("back_t_ms" in found)
+            section |= found
+    return sections
+
+
+def mismatches(result: dict) -> list[str]:
+    """What is not as it must be."""
+    wrong = []
+
+    def expect(what: str, found: object, expected: object) -> None:
+        if found != expected:
+            wrong.append(f"{what}: found {found}, expected {expected}")
+
+    def expect_clean(name: str, run: dict, refreshes: int, believed: int) -> None:
+        expect(f"{name}: exit", run["exit"], 0)
+        expect(f"{name}: refreshes", run["refreshes"], refreshes)
+        expect(f"{name}: before they are believed", run["before_believed"], BEFORE_BELIEVED)
+        expect(f"{name}: hardware times", run["hardware"], believed)
+        for fault in [
+            "repeated",
+            "not_counted_on_by_one",
+            "not_the_next_field_of_the_next_frame",
+            "reported_before_their_time",
+            "allocations_in_tick",
+        ]:
+            expect(f"{name}: {fault}", run[fault], 0)
+        for interval_us in run["interval_us"]:
+            if not abs(interval_us - PERIOD_US) <= INTERVAL_TOLERANCE_US:
+                wrong.append(f"{name}: an interval of {interval_us} us")
+
+    for name, (refreshes, patterns) in RUNS.items():
+        run = result[name]
+        believed = refreshes - BEFORE_BELIEVED
+        expect_clean(name, run, refreshes, believed)
+        sums = run["crc"]
+        expect(f"{name}: different patterns", sums["patterns"], patterns)
+        expect(f"{name}: pictures that are not those that were meant", sums["different"], 0)
+        # The check sums begin a little after the panel.
+        if not sums["equal"] >= believed - 5:
+            wrong.append(f"{name}: only {sums['equal']} pictures were compared")
+        expect(f"{name}: wrong checks", run["wrong"], 0)
+        checks = {name: (found, verdict) for name, found, _, verdict in run["checks"]}
+        for check, found in CHECKS_READ_BACK.items():
+            expect(f"{name}: {check}", checks.get(check), (found, "right"))
+    for name, said in LOSSES.items():
+        run = result[name]
+        expect_clean(name, run, AFTER_LOSS, AFTER_LOSS - BEFORE_BELIEVED)
+        expect(f"{name}: times that it came back", run["back"], 1)
+        for word in ["lost", "not_yet"]:
+            if said not in run[word]:
+                wrong.append(f"{name}: `{said}` is not in `{run[word]}`")
+    expect("descriptors of the card that were taken", result["thief"]["taken"], 1)
+    expect("thief: exit", result["thief"]["exit"], 0)
+    for name, parts in REFUSALS.items():
+        expect(f"{name}: exit", result[name]["exit"], 1)
+        for part in parts:
+            if part not in result[name]["refused"]:
+                wrong.append(f"{name}: `{part}` is not in `{result[name]['refused']}`")
+    # The program's own comparison can fail, too.
+    if not result["wrong_level"]["crc"]["different"] >= 5:
+        wrong.append(f"another level in one pattern of seven went unseen: {result['wrong_level']['crc']}")
+    if not result["wrong_submission"]["repeated"] >= 2:
+        wrong.append(f"frames that were left out went unseen: {result['wrong_submission']}")
+    return wrong
+
+
+def right_run(refreshes: int) -> dict:
+    """What a run without a fault tells."""
+    run = {"exit": 0, "back": 0, "refreshes": refreshes, "before_believed": 2, "hardware": refreshes - 2}
+    for fault in ["repeated", "not_counted_on_by_one", "not_the_next_field_of_the_next_frame"]:
+        run[fault] = 0
+    run |= {"reported_before_their_time": 0, "allocations_in_tick": 0, "interval_us": [16666, 16668], "wrong": 0}
+    run["checks"] = [[name, found, found, "right"] for name, found in CHECKS_READ_BACK.items()]
+    return run
+
+
+def right_result() -> dict:
+    """A made-up result that is right."""
+    result = {}
+    for name, (refreshes, patterns) in RUNS.items():
+        crc = {"equal": refreshes - 4, "different": 0, "missing": 2, "patterns": patterns}
+        result[name] = right_run(refreshes) | {"crc": crc}
+    for name, said in LOSSES.items():
+        result[name] = right_run(AFTER_LOSS) | {"back": 1, "lost": said, "not_yet": said}
+    result["thief"] = {"taken": 1, "exit": 0}
+    for name, parts in REFUSALS.items():
+        result[name] = {"exit": 1, "refused": " ".join(parts)}
+    result["wrong_level"] = {"crc": {"equal": 50, "different": 8}}
+    result["wrong_submission"] = {"repeated": 4}
+    return result
+
+
+def check_the_judge() -> list[str]:
+    """The wrong results that were not refused."""
+    failures = [f"a right result was refused: {wrong}" for wrong in mismatches(right_result())]
+
+    def try_wrong(what: str, change) -> None:
+        result = copy.deepcopy(right_result())
+        change(result)
+        if not mismatches(result):
+            failures.append(f"a wrong result was not refused: {what}")
+
+    def put(section: str, key: str, value: object):
+        return lambda result: result[section].__setitem__(key, value)
+
+    for section in [*RUNS, *LOSSES]:
+        for key in ["exit", "refreshes", "before_believed", "hardware", "repeated", "allocations_in_tick"]:
+            try_wrong(f"{section} {key}", put(section, key, 1))
+        for key in ["not_counted_on_by_one", "not_the_next_field_of_the_next_frame", "reported_before_their_time"]:
+            try_wrong(f"{section} {key}", put(section, key, 1))
+        for interval in [[16500, 16667], [16667, 33334]]:
+            try_wrong(f"{section} interval", put(section, "interval_us", interval))
+    for section in RUNS:
+        try_wrong(f"{section} wrong", put(section, "wrong", 1))
+        for key, value in {"equal": 20, "different": 1, "patterns": 1}.items():
+            try_wrong(f"{section} {key}", lambda result, s=section, k=key, v=value: result[s]["crc"].__setitem__(k, v))
+        for index in range(len(CHECKS_READ_BACK)):
+            for place, word in {1: "other", 3: "unverified"}.items():
+
+                def change(result: dict, s: str = section, i: int = index, p: int = place, w: str = word) -> None:
+                    result[s]["checks"][i][p] = w
+
+                try_wrong(f"{section} check {index}", change)
+    for section in LOSSES:
+        try_wrong(f"{section} back", put(section, "back", 0))
+        for key in ["lost", "not_yet"]:
+            try_wrong(f"{section} {key}", put(section, key, "something else"))
+    try_wrong("thief taken", put("thief", "taken", 0))
+    for section in REFUSALS:
+        try_wrong(f"{section} exit", put(section, "exit", 0))
+        try_wrong(f"{section} refused", put(section, "refused", "no"))
+    try_wrong("wrong_level", put("wrong_level", "crc", {"different": 0}))
+    try_wrong("wrong_submission", put("wrong_submission", "repeated", 0))
+    return failures
+
+
+def main() -> int:
+    """Judges the log that is named on the command line."""
+    wrong = check_the_judge()
+    try:
+        result = parse(Path(sys.argv[1]).read_text(errors="replace"))
+        wrong += mismatches(result)
+    except (KeyError, IndexError, ValueError, TypeError) as error:
+        wrong.append(f"the result cannot be read: {error!r}")
+    for line in wrong:
+        print(f"wrong: {line}")
+    if not wrong:
+        flips = result["flips"]
+        print(
+            f"{flips['hardware']} flips, none missed or doubled, {flips['crc']['equal']} pictures as they were meant; "
+            f"fields and monochrome too; mastership, monitor and card lost and back; {len(REFUSALS)} wrong wishes refused"
+        )
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
