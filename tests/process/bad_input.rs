@@ -9,7 +9,7 @@ use holod_tests::small_rig;
 use image::{ImageBuffer, Luma, Rgb, RgbImage};
 use rustix::process::Signal;
 
-const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+use crate::HOLOD;
 
 struct Case<'a> {
     args: &'a [&'a str],

@@ -9,7 +9,8 @@ use holod_model::scene_renderer::shard::{PlanePlan, PupilPlan, ShardPlan, file_n
 use holod_tests::daemon::run;
 use serde_json::Value;
 
-const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+use crate::HOLOD;
+
 const SIZE: Resolution = Resolution { width: 64, height: 48 };
 
 /// How far the two evaluations may be apart.

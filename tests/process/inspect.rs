@@ -12,7 +12,8 @@ use holod_tests::tracker::{PtyTracker, TimedLine};
 use rustix::process::Signal;
 use serde_json::Value;
 
-const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+use crate::HOLOD;
+
 /// Room for a machine that does something else, too.
 const PATIENCE: Duration = Duration::from_secs(60);
 

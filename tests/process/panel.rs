@@ -5,7 +5,7 @@ use std::fs;
 use holod_tests::daemon::{Ended, run};
 use holod_tests::small_rig;
 
-const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+use crate::HOLOD;
 
 /// Runs for `duration` over `output`, with one field for each refresh where `sequential`; the end, and its summary.
 fn run_over(output: &str, sequential: bool, duration: &str) -> (Ended, serde_json::Value) {

@@ -8,7 +8,7 @@ use holod_tests::daemon::{Ended, run};
 use holod_tests::small_rig;
 use image::RgbImage;
 
-const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+use crate::HOLOD;
 
 fn pattern(folder: &Path, rig: &str, args: &str) -> Ended {
     fs::write(folder.join("rig.toml"), rig).unwrap();

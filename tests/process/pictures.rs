@@ -13,7 +13,8 @@ use holod_slm_output::PanelEncoder;
 use holod_tests::daemon::run;
 use holod_tests::small_rig;
 
-const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+use crate::HOLOD;
+
 const SIZE: Resolution = Resolution { width: 256, height: 256 };
 const NEAR: Dioptres = Dioptres(2.5);
 const FAR: Dioptres = Dioptres(0.25);

@@ -15,7 +15,7 @@ use holod_tests::daemon::{Daemon, run, wait_until};
 use holod_tests::{FIELD_ORDER, frames, small_rig};
 use rustix::process::Signal;
 
-const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+use crate::HOLOD;
 
 /// A laser box on a pseudo-terminal, outside the daemon's process, with a clock of its own, that logs what its lasers do.
 struct LaserBench {

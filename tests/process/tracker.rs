@@ -14,7 +14,7 @@ use holod_tests::tracker::{PtyTracker, TimedLine};
 use holod_tests::{FIELD_ORDER, small_rig};
 use rustix::process::Signal;
 
-const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
+use crate::HOLOD;
 
 /// Lines of the line protocol, as a bridge between a tracker and holod sends them: no lid apertures, full confidence.
 fn lines(samples: &[PupilSample]) -> Vec<TimedLine> {

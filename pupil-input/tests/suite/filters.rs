@@ -1,19 +1,17 @@
 //! The shipped filter against two others, on simulated eyes whose truth is known and on a real recording.
 //!
-//! `cargo test -p holod-pupil-input --test filters -- --ignored --nocapture shared_data_print_the_comparison` prints the table of
+//! `cargo test -p holod-pupil-input --test suite -- --ignored --nocapture shared_data_print_the_comparison` prints the table of
 //! `doc/estimate.md`. The others live here only.
-
-mod support;
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
+use crate::support::settings;
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::{
     Decision, Estimator, EstimatorSettings, MockSource, PupilSample, PupilState, Recording, SampleEye, Scenario,
     Script, Verdict,
 };
-use support::settings;
 
 /// Blur in pixels of the default bench for a millimetre of pupil, from one end of the depth range to the other: 2.857
 /// dioptres over 0.2 mrad a pixel.

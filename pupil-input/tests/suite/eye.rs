@@ -1,7 +1,6 @@
 //! The estimate against the true diameter of a made-up eye.
 
-mod support;
-
+use crate::support::settings;
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::{
     Decision, Estimator, EstimatorSettings, MockSource, PupilSample, PupilState, Rejection, STATED_LAG, SampleEye,
@@ -9,7 +8,6 @@ use holod_pupil_input::{
 };
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use support::settings;
 
 /// (time, true, estimated, state) of the left eye at each of its samples.
 fn followed(

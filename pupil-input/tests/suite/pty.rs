@@ -1,12 +1,11 @@
 //! Trackers that run: on real PTYs that are unplugged, fall silent and send rubbish, and on logs.
 
-mod support;
-
 use std::io::{Read as _, Write as _};
 use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use crate::support::{NEON_BLINKS_S, neon_like_csv};
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::wire::WireFault;
 use holod_pupil_input::wire::line::{LineSample, crc8, encode_line};
@@ -15,7 +14,6 @@ use holod_pupil_input::{
     Verdict, host_now,
 };
 use serialport::{SerialPort, TTYPort};
-use support::{NEON_BLINKS_S, neon_like_csv};
 use tempfile::TempDir;
 
 /// A tracker at the far end of a PTY. Dropping it unplugs it.

@@ -1,7 +1,5 @@
 //! A log like those of a Neon tracker, made from a seed, and the judge of estimates; shared by the tests.
 
-#![allow(dead_code, reason = "each test crate uses a part")]
-
 use std::fmt::Write;
 
 use holod_calibration::{TimeNs, rig};

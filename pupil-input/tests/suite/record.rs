@@ -1,7 +1,5 @@
 //! Runs that are written down and played again.
 
-mod support;
-
 use std::fs;
 use std::io::Write as _;
 use std::path::Path;

@@ -1,9 +1,6 @@
 //! Pupil Labs Neon over its network interface: a Companion of our own tells its status by HTTP and streams by RTSP, as
 //! datagrams or interleaved, loses and swaps packets, restarts, falls silent and sends rubbish.
 
-#[path = "support/network.rs"]
-mod network;
-
 use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream, UdpSocket};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -11,9 +8,9 @@ use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use crate::network::{eventually, refused, start, tracks};
 use holod_pupil_input::wire::WireFault;
 use holod_pupil_input::{Counter, Link, LogFault, Rejection, TrackerHandle};
-use network::{eventually, refused, start, tracks};
 
 const SOURCE: u32 = 0x1234_5678;
 /// RTP ticks a second.

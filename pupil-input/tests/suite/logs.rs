@@ -1,11 +1,10 @@
 //! Logs: recognised by content, read whole or refused with a reason, and held through blinks.
 
-mod formats;
-mod support;
-
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
+use crate::made_up_logs;
+use crate::support::{estimates, first_below, least_raw, neon_like_csv, settings};
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::wire::WireFault;
 use holod_pupil_input::wire::line::{LineSample, crc8, encode_line};
@@ -13,7 +12,6 @@ use holod_pupil_input::{
     Blink, LogFault, LogFormat, LogInfo, PupilSample, PupilState, Recording, ReplayError, SampleEye, SizeUnit,
 };
 use proptest::prelude::*;
-use support::{estimates, first_below, least_raw, neon_like_csv, settings};
 use tempfile::TempDir;
 
 fn written(dir: &TempDir, name: &str, content: impl AsRef<[u8]>) -> PathBuf {
@@ -174,11 +172,11 @@ fn info(path: &Path) -> (Recording, LogInfo) {
     (recording, info)
 }
 
-/// What a log of [`formats::diameter_mm`] must be found to hold.
+/// What a log of [`made_up_logs::diameter_mm`] must be found to hold.
 fn assert_truth(info: &LogInfo, eyes: &[&str], rate_hz: f64, unit_mm: f32) {
     assert_eq!(info.eyes.iter().map(|eye| eye.eye).collect::<Vec<_>>(), eyes);
-    assert_eq!(info.blinks.found, formats::BLINKS_S.len() as u64, "{info:?}");
-    assert!((info.duration_s - formats::LENGTH_S).abs() < 0.1, "{info:?}");
+    assert_eq!(info.blinks.found, made_up_logs::BLINKS_S.len() as u64, "{info:?}");
+    assert!((info.duration_s - made_up_logs::LENGTH_S).abs() < 0.1, "{info:?}");
     for eye in &info.eyes {
         let found = eye.rate_hz.expect("a rate");
         assert!((found / rate_hz - 1.0).abs() < 0.01, "{found} for {rate_hz}: {eye:?}");
@@ -194,14 +192,14 @@ fn assert_truth(info: &LogInfo, eyes: &[&str], rate_hz: f64, unit_mm: f32) {
 #[should_panic(expected = "for 123")]
 fn the_judge_of_what_a_log_holds_sees_a_wrong_rate() {
     let dir = TempDir::new().expect("a folder");
-    let (_, info) = info(&written(&dir, "log", formats::core(130.0, true)));
+    let (_, info) = info(&written(&dir, "log", made_up_logs::core(130.0, true)));
     assert_truth(&info, &["left", "right"], 123.0, 1.0);
 }
 
 #[test]
 fn core_takes_the_3d_rows_of_both_eyes() {
     let dir = TempDir::new().expect("a folder");
-    let (recording, info) = info(&written(&dir, "log", formats::core(123.0, true)));
+    let (recording, info) = info(&written(&dir, "log", made_up_logs::core(123.0, true)));
     assert_eq!((recording.format(), recording.unit()), (LogFormat::Core, SizeUnit::Millimetres));
     assert_truth(&info, &["left", "right"], 123.0, 1.0);
     assert!(recording.begins().0 < 0);
@@ -217,7 +215,7 @@ fn core_takes_the_3d_rows_of_both_eyes() {
 #[test]
 fn core_without_3d_rows_is_in_pixels() {
     let dir = TempDir::new().expect("a folder");
-    let (recording, info) = info(&written(&dir, "log", formats::core(123.0, false)));
+    let (recording, info) = info(&written(&dir, "log", made_up_logs::core(123.0, false)));
     assert_eq!(recording.unit(), SizeUnit::Pixels);
     assert_truth(&info, &["left", "right"], 123.0, 10.0);
     assert!(info.notes[0].contains("pixels"), "{:?}", info.notes);
@@ -257,7 +255,7 @@ fn eyelink_areas_and_diameters_are_read_of_one_eye_and_of_two() {
         (1000.0, "R", false, vec!["right"]),
         (2000.0, "LR", false, vec!["left", "right"]),
     ] {
-        let (recording, info) = info(&written(&dir, "log", formats::eyelink(rate_hz, eyes, area)));
+        let (recording, info) = info(&written(&dir, "log", made_up_logs::eyelink(rate_hz, eyes, area)));
         assert_eq!((recording.format(), recording.unit()), (LogFormat::EyeLink, SizeUnit::Arbitrary));
         assert_truth(&info, &named, rate_hz, 100.0);
         assert_eq!((info.stated_rate_hz, info.blinks.told), (Some(rate_hz), info.blinks.found));
@@ -324,7 +322,7 @@ fn eyelink_whole_milliseconds_at_2_khz_and_remote_columns_are_read() {
 fn smi_is_read_whatever_sets_its_columns_apart() {
     let dir = TempDir::new().expect("a folder");
     for (separator, comma) in [(';', false), (';', true), ('\t', false), ('\t', true), (',', false)] {
-        let text = formats::smi(60.0, separator, comma);
+        let text = made_up_logs::smi(60.0, separator, comma);
         let utf16: Vec<u8> = format!("\u{feff}{text}").encode_utf16().flat_map(u16::to_le_bytes).collect();
         for bytes in [text.into_bytes(), utf16] {
             let (recording, info) = info(&written(&dir, "log", bytes));
@@ -367,7 +365,7 @@ fn smi_with_fewer_samples_than_its_header_promises_says_so() {
 #[test]
 fn neon_in_parts_names_the_other_ones() {
     let dir = TempDir::new().expect("a folder");
-    let (states, times) = formats::neon_native(200.0);
+    let (states, times) = made_up_logs::neon_native(200.0);
     for part in [1, 2] {
         written(&dir, &format!("eye_state ps{part}.raw"), &states);
         written(&dir, &format!("eye_state ps{part}.time"), &times);
@@ -380,7 +378,7 @@ fn neon_in_parts_names_the_other_ones() {
 #[test]
 fn neon_of_the_phone_is_read_with_its_companions() {
     let dir = TempDir::new().expect("a folder");
-    let (states, times) = formats::neon_native(200.0);
+    let (states, times) = made_up_logs::neon_native(200.0);
     let path = written(&dir, "eye_state ps1.raw", &states);
     let refused = || Recording::read(&path).expect_err("refused").to_string();
     assert!(refused().contains("no file `eye_state ps1.time`"), "{}", refused());
@@ -415,13 +413,13 @@ fn neon_of_the_phone_is_read_with_its_companions() {
 /// An example of each format, short enough to be spoilt often.
 fn examples() -> Vec<Vec<u8>> {
     let short = |text: String| text.into_bytes()[..2500].to_vec();
-    let (states, _) = formats::neon_native(200.0);
+    let (states, _) = made_up_logs::neon_native(200.0);
     vec![
         short(neon_like_csv(3)),
         short(as_lines(&neon_like()[..80])),
-        short(formats::core(123.0, true)),
-        short(formats::eyelink(500.0, "LR", true)),
-        short(formats::smi(60.0, ';', true)),
+        short(made_up_logs::core(123.0, true)),
+        short(made_up_logs::eyelink(500.0, "LR", true)),
+        short(made_up_logs::smi(60.0, ';', true)),
         states[..1600].to_vec(),
     ]
 }

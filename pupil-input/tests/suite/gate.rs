@@ -1,13 +1,11 @@
 //! The gate on simulated trackers that blink, lose and misread as real ones do: what is shown stays with the true pupil.
 
-mod support;
-
+use crate::support::settings;
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::{
     Decision, Estimator, EstimatorSettings, GateSettings, MockSource, PupilSample, PupilState, Rejection, SampleEye,
     Scenario, Script, Verdict,
 };
-use support::settings;
 
 /// What a viewer would have been shown, from the second second on.
 struct Shown {

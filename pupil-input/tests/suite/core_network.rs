@@ -1,9 +1,6 @@
 //! Pupil Labs Core over its network interface: a Pupil Capture of our own speaks ZMTP 3.1 as libzmq does, restarts,
 //! falls silent and sends rubbish.
 
-#[path = "support/network.rs"]
-mod network;
-
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -11,10 +8,10 @@ use std::sync::{Arc, Mutex};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use crate::network::{eventually, refused, start, tracks};
 use holod_calibration::TimeNs;
 use holod_pupil_input::wire::WireFault;
 use holod_pupil_input::{Counter, Link, LogFault, PupilState, Rejection, host_now};
-use network::{eventually, refused, start, tracks};
 
 /// What Capture needs from an image to its pupil.
 const PIPELINE_S: f64 = 0.04;

@@ -1,0 +1,12 @@
+//! holod as a process, in one test program, which is linked once. `fail_dark`, which measures, has its own.
+
+mod bad_input;
+mod evaluate;
+mod inspect;
+mod panel;
+mod pattern;
+mod pictures;
+mod shutdown;
+mod tracker;
+
+const HOLOD: &str = env!("CARGO_BIN_EXE_holod");
