@@ -6,6 +6,7 @@
 
 use std::path::Path;
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::time::Duration;
 
 use holod_calibration::rig::Rig;
@@ -64,7 +65,7 @@ fn run(out: &Path) -> Result<(), Failure> {
         weights,
         backend: Backend::Cpu,
         frames: Frames {
-            frames: vec![setup::sample_frame(SIZE)],
+            frames: vec![Arc::new(setup::sample_frame(SIZE))],
             fps: None,
             reports: Vec::new(),
             name: "the built-in scene".into(),

@@ -12,6 +12,7 @@ pub mod logging;
 pub mod pictures;
 pub mod progress;
 pub mod record;
+pub mod renderer;
 pub mod report;
 pub mod session;
 pub mod setup;

@@ -1,13 +1,14 @@
 //! From names on the command line to the parts of a run: rig, weights, scene.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_calibration::{DisplayGeometry, Resolution};
 use holod_model::scene::{DepthEncoding, Fit, FrameReport, Scene, SceneError};
-use holod_model::{CpuEngine, RgbdFrame, Weights, scene_renderer};
+use holod_model::{RgbdFrame, Weights, scene_renderer};
 
-use crate::cli::{Backend, FitArg, NetworkArgs, RigArgs, SceneArgs};
+use crate::cli::{FitArg, NetworkArgs, RigArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
 
 /// Size of a hologram of the built-in scene on a processor.
@@ -52,23 +53,10 @@ pub fn weights(rig: &Rig) -> Result<Weights, Failure> {
     Ok(weights)
 }
 
-/// The engine for frames of one size.
-pub fn engine(backend: Backend, weights: &Weights, resolution: Resolution) -> Result<CpuEngine, Failure> {
-    match backend {
-        Backend::Auto | Backend::Cpu => {
-            CpuEngine::new(weights, resolution, 0).map_err(Failure::because(Exit::Unavailable))
-        }
-        Backend::Gpu => Err(Failure::new(
-            Exit::Unavailable,
-            "--backend gpu: this version computes on the processor only; use --backend cpu or leave it out",
-        )),
-    }
-}
-
 /// The frames to show, all of one size.
 pub struct Frames {
     /// At least one.
-    pub frames: Vec<RgbdFrame>,
+    pub frames: Vec<Arc<RgbdFrame>>,
     /// Frames a second of a sequence, which is shown over and over.
     pub fps: Option<f64>,
     /// What was done to each frame when it was read.
@@ -132,7 +120,7 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
         }
         warn_of_odd_depth(spec, &frame, &report, geometry);
         warn_of_clipped_colours(spec, &frame, &report);
-        loaded.frames.push(frame);
+        loaded.frames.push(Arc::new(frame));
         loaded.reports.push(report);
     }
     Ok(loaded)
@@ -173,7 +161,7 @@ fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames,
     check_fits(resolution, geometry, "--resolution")?;
     let frame = sample_frame(resolution);
     Ok(Frames {
-        frames: vec![frame],
+        frames: vec![Arc::new(frame)],
         fps: None,
         reports: vec![FrameReport::default()],
         name: "the built-in scene".into(),

@@ -1,14 +1,16 @@
 //! How many frames a second there are, how many the panel could show, and what would bring more.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use holod_calibration::rig::{Panel, Rig, WeightsChoice};
-use holod_calibration::{PupilDiameter, Resolution};
-use holod_model::{ComplexHologram, Weights};
+use holod_calibration::{PerColour, PupilDiameter, Resolution};
+use holod_model::Weights;
+use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
-use crate::setup;
+use crate::{renderer, setup};
 
 /// A display that shows less than this share of the panel's frames is called slow.
 const ENOUGH: f64 = 0.9;
@@ -55,19 +57,23 @@ pub struct Estimate {
 }
 
 impl Estimate {
-    /// Times the network on a small frame, after one that warms it up.
+    /// Times a small frame on the rig's panel, after one that warms up.
     ///
     /// # Errors
-    /// The engine cannot be had.
-    pub fn of(weights: &Weights, panel: Resolution) -> Result<Self, Failure> {
+    /// The backend is not to be had, or the rig contradicts itself.
+    pub fn of(rig: &Rig, weights: &Weights) -> Result<Self, Failure> {
+        let panel = rig.resolution();
         let timed = Resolution { width: TIMED_PX.min(panel.width), height: TIMED_PX.min(panel.height) };
-        let mut engine = setup::engine(Backend::Auto, weights, timed)?;
-        let (frame, mut hologram) = (setup::sample_frame(timed), ComplexHologram::dark(timed));
+        // A panel of the frame's size: what surrounds the frame would be timed, too, and does not go with its pixels.
+        let panel = Panel { flatness_rad: PerColour([None, None, None]), ..rig.panel.clone() };
+        let encoder = PanelEncoder::new(&panel, timed, timed).map(Arc::new).map_err(Failure::because(Exit::Config))?;
+        let mut renderer = renderer::open(Backend::Auto, weights, &encoder)?;
+        let (frame, mut levels) = (Arc::new(setup::sample_frame(timed)), LevelsFrame::new(encoder.layout()));
         let pupil = PupilDiameter::from_mm(weights.config().pupil_range_mm[0]);
         let mut seconds = f64::MAX;
         for _ in 0..2 {
             let began = Instant::now();
-            engine.render(&frame, pupil, &mut hologram).map_err(Failure::because(Exit::Software))?;
+            renderer.render(&frame, pupil, &mut levels).map_err(Failure::because(Exit::Software))?;
             seconds = seconds.min(began.elapsed().as_secs_f64());
         }
         Ok(Self { timed, seconds })

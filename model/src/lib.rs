@@ -13,15 +13,16 @@ pub mod optics;
 mod phase_math;
 mod picture;
 pub mod refocus;
-mod resident;
 pub mod scene;
 pub mod scene_renderer;
 pub mod scene_shard;
 mod simd;
 pub mod weights;
+mod worker_pool;
 
 pub use engine::CpuEngine;
 pub use optics::{ComplexHologram, PhasePattern};
 pub use picture::LinearImage;
 pub use scene::RgbdFrame;
 pub use weights::Weights;
+pub use worker_pool::{WorkerPool, WorkerPoolError};

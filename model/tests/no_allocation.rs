@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use holod_calibration::{PupilDiameter, Resolution};
 use holod_model::optics::DoublePhase;
-use holod_model::{ComplexHologram, CpuEngine, PhasePattern, RgbdFrame, Weights};
+use holod_model::{ComplexHologram, CpuEngine, PhasePattern, RgbdFrame, Weights, WorkerPool};
 
 struct Counting;
 
@@ -41,20 +41,26 @@ fn frames_do_not_allocate() {
 
 fn check(weights: &Weights) {
     let resolution = Resolution { width: 10, height: 7 };
-    let mut engine = CpuEngine::new(weights, resolution, 2).unwrap();
-    let mut double_phase = DoublePhase::new(resolution, weights.config().amplitude_constant);
+    let engine = CpuEngine::new(weights, resolution).unwrap();
+    let double_phase = DoublePhase::new(resolution, weights.config().amplitude_constant);
     let frame = RgbdFrame {
         resolution,
         amplitude: vec![0.5; 3 * resolution.pixels()],
         depth_normalised: (0..resolution.pixels()).map(|index| index as f32 / resolution.pixels() as f32).collect(),
     };
-    let (mut hologram, mut pattern) = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
+    let buffers = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
+    let job = (engine, double_phase, buffers, PupilDiameter::from_mm(3.0));
+    let mut pool = WorkerPool::new("test", 2, job, move |(engine, double_phase, (hologram, pattern), pupil)| {
+        engine.render(&frame, *pupil, hologram).unwrap();
+        double_phase.encode(hologram, pattern);
+    })
+    .unwrap();
     let mut frames = |count: usize| {
         for index in 0..count {
             // The pupil changes with every frame, so the modulation is computed anew.
             let pupil = PupilDiameter::from_mm(2.0 + index as f32 / count as f32);
-            engine.render(&frame, pupil, &mut hologram).unwrap();
-            double_phase.encode(&hologram, &mut pattern);
+            pool.with(|job| job.3 = pupil);
+            pool.run();
         }
     };
     // As many as are judged: each worker has waited for work by then, which takes memory the first time.

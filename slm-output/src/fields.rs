@@ -2,6 +2,7 @@
 
 use holod_calibration::rig::{Packing, Panel, PanelMode};
 use holod_calibration::{Colour, Resolution};
+use rayon::prelude::*;
 
 /// Patterns in a colour frame: one for each laser.
 pub const FIELDS: usize = 3;
@@ -163,6 +164,20 @@ impl LevelsFrame {
         FieldMut { samples: &mut self.samples[offset..], stride, resolution: self.layout.resolution }
     }
 
+    /// All rows of samples, to be written by the threads of the pool that this is called in.
+    pub(crate) fn par_rows_mut(&mut self) -> impl IndexedParallelIterator<Item = RowMut<'_>> {
+        let Self { layout, samples, .. } = self;
+        let FrameLayout { resolution: Resolution { width, height }, field_order, .. } = *layout;
+        let stride = layout.stride();
+        samples.par_chunks_exact_mut((width * stride).max(1)).enumerate().map(move |(index, samples)| {
+            let (mut colours, count) = (field_order, stride);
+            if count == 1 {
+                colours[0] = field_order[index / height];
+            }
+            RowMut { row: index % height, colours, count, samples }
+        })
+    }
+
     /// Takes the levels of `colour` out of the frame.
     pub fn unpack_colour(&self, colour: Colour) -> ColourField {
         let samples = self.samples[self.layout.offset(self.layout.position_of(colour))..].iter();
@@ -195,6 +210,40 @@ pub struct ColourField {
     pub levels: Vec<u16>,
 }
 
+/// One row of the panel's samples: of all colours in turn, or of one.
+#[derive(Debug)]
+pub(crate) struct RowMut<'a> {
+    /// The row, from the top.
+    pub(crate) row: usize,
+    colours: [Colour; FIELDS],
+    count: usize,
+    samples: &'a mut [u16],
+}
+
+impl RowMut<'_> {
+    /// Each colour of the row with its samples from its first one on, as many apart as there are colours in the row.
+    pub(crate) fn for_each(&mut self, mut write: impl FnMut(Colour, Strided<'_>)) {
+        for (offset, &colour) in self.colours[..self.count].iter().enumerate() {
+            write(colour, Strided { samples: &mut self.samples[offset..], stride: self.count });
+        }
+    }
+}
+
+/// Samples of one colour, some apart.
+#[derive(Debug)]
+pub(crate) struct Strided<'a> {
+    pub(crate) samples: &'a mut [u16],
+    pub(crate) stride: usize,
+}
+
+impl Strided<'_> {
+    /// Those from the `first`-th pixel on.
+    pub(crate) fn from(&mut self, first: usize) -> Strided<'_> {
+        let begin = (first * self.stride).min(self.samples.len());
+        Strided { samples: &mut self.samples[begin..], stride: self.stride }
+    }
+}
+
 /// The samples of one field inside a frame.
 #[derive(Debug)]
 pub struct FieldMut<'a> {
@@ -207,17 +256,6 @@ impl FieldMut<'_> {
     /// Panel pixels.
     pub fn resolution(&self) -> Resolution {
         self.resolution
-    }
-
-    /// Distance in samples between neighbouring pixels.
-    pub(crate) fn stride(&self) -> usize {
-        self.stride
-    }
-
-    /// The samples of pixels `first..first + count` in row-major order, beginning with pixel `first`, `stride` apart.
-    pub(crate) fn run(&mut self, first: usize, count: usize) -> &mut [u16] {
-        let begin = first * self.stride;
-        &mut self.samples[begin..begin + (count * self.stride).saturating_sub(self.stride - 1)]
     }
 
     /// Copies `levels` `[height, width]`, row-major, into the field.

@@ -24,8 +24,9 @@ use std::f64::consts::TAU;
 
 use holod_calibration::rig::{LevelPhase, OutOfStroke, Panel, PanelMode, PhaseSign};
 use holod_calibration::{Colour, PerColour, Resolution};
+use rayon::prelude::*;
 
-use crate::fields::{FieldMut, LevelsFrame};
+use crate::fields::{FrameLayout, LevelsFrame, Strided};
 
 /// Table entries for each level, as far as [`ENTRIES_MAX`] allows.
 const ENTRIES_PER_LEVEL: usize = 16;
@@ -135,7 +136,7 @@ pub struct EncodeReport {
 /// Turns phase patterns into one panel's levels, and levels back into the phase shown.
 #[derive(Clone, Debug)]
 pub struct PanelEncoder {
-    panel: Resolution,
+    layout: FrameLayout,
     pattern: Resolution,
     colours: [ColourEncoder; 3],
 }
@@ -177,7 +178,7 @@ impl PanelEncoder {
         }
         let of = |colour| ColourEncoder::new(panel, panel_resolution, colour);
         let colours = [of(Colour::Red)?, of(Colour::Green)?, of(Colour::Blue)?];
-        Ok(Self { panel: panel_resolution, pattern: pattern_resolution, colours })
+        Ok(Self { layout: FrameLayout::new(panel, panel_resolution), pattern: pattern_resolution, colours })
     }
 
     /// Pixels of the patterns that are encoded.
@@ -187,43 +188,53 @@ impl PanelEncoder {
 
     /// Pixels of the panel.
     pub fn panel_resolution(&self) -> Resolution {
-        self.panel
+        self.layout.resolution
+    }
+
+    /// The layout of the frames that are written.
+    pub fn layout(&self) -> FrameLayout {
+        self.layout
     }
 
     /// Encodes three patterns into `frame`: each phase in radians `[height, width]`, row-major, nominally in [0, 2π);
-    /// phases within ±50 turns are wrapped. Neither allocates nor locks.
+    /// phases within ±50 turns are wrapped. The threads of the rayon pool that this is called in share the rows; called
+    /// from one of them it does not allocate.
     ///
     /// # Panics
     /// Where a pattern or the frame has another size than the encoder was made for.
     pub fn encode(&self, phase_rad: PerColour<&[f32]>, frame: &mut LevelsFrame) -> EncodeReport {
-        let mut report = EncodeReport::default();
-        for (colour, phase_rad) in phase_rad.iter() {
-            report.unreachable_share[colour] = self.encode_colour(colour, phase_rad, &mut frame.field_mut(colour));
+        assert_eq!(frame.layout(), self.layout, "a frame has the panel's layout");
+        for (_, phase_rad) in phase_rad.iter() {
+            assert_eq!(phase_rad.len(), self.pattern.pixels(), "a pattern has one phase for each pixel");
         }
-        report
+        let rows = frame.par_rows_mut().map(|mut row| {
+            let mut unreachable = [0; 3];
+            let y = row.row;
+            row.for_each(|colour, samples| {
+                unreachable[colour.index()] = self.encode_row(colour, y, phase_rad[colour], samples);
+            });
+            unreachable
+        });
+        let unreachable = rows.reduce(|| [0; 3], |one, other| [0, 1, 2].map(|colour| one[colour] + other[colour]));
+        let share = |count| count as f32 / self.pattern.pixels().max(1) as f32;
+        EncodeReport { unreachable_share: PerColour(unreachable.map(share)) }
     }
 
-    /// Encodes one colour's pattern into `field`, as [`Self::encode`]; returns the share of pixels out of reach.
-    fn encode_colour(&self, colour: Colour, phase_rad: &[f32], field: &mut FieldMut<'_>) -> f32 {
-        assert_eq!(phase_rad.len(), self.pattern.pixels(), "a pattern has one phase for each pixel");
-        assert_eq!(field.resolution(), self.panel, "a frame has the panel's size");
+    /// Encodes what `colour` shows in row `y` of the panel; returns how many of its pixels are out of reach.
+    fn encode_row(&self, colour: Colour, y: usize, phase_rad: &[f32], mut samples: Strided<'_>) -> usize {
         let encoder = &self.colours[colour.index()];
         let (left, top) = self.pattern_origin();
-        let mut unreachable = 0;
-        for row in 0..self.panel.height {
-            let row_start = row * self.panel.width;
-            if row < top || row >= top + self.pattern.height {
-                encoder.encode_flat(row_start, self.panel.width, field);
-                continue;
-            }
-            let pattern_start = (row - top) * self.pattern.width;
-            let phases_rad = &phase_rad[pattern_start..pattern_start + self.pattern.width];
-            let right = left + self.pattern.width;
-            encoder.encode_flat(row_start, left, field);
-            unreachable += encoder.encode_run(row_start + left, phases_rad, field);
-            encoder.encode_flat(row_start + right, self.panel.width - right, field);
+        let first = y * self.layout.resolution.width;
+        if y < top || y >= top + self.pattern.height {
+            encoder.encode_flat(first, self.layout.resolution.width, &mut samples);
+            return 0;
         }
-        unreachable as f32 / self.pattern.pixels().max(1) as f32
+        let phases_rad = &phase_rad[(y - top) * self.pattern.width..][..self.pattern.width];
+        let right = left + self.pattern.width;
+        encoder.encode_flat(first, left, &mut samples);
+        let unreachable = encoder.encode_run(first + left, phases_rad, &mut samples.from(left));
+        encoder.encode_flat(first + right, self.layout.resolution.width - right, &mut samples.from(right));
+        unreachable
     }
 
     /// Encodes the flat pattern, phase 0 everywhere, in every colour.
@@ -231,10 +242,13 @@ impl PanelEncoder {
     /// # Panics
     /// Where the frame has another size than the encoder was made for.
     pub fn encode_flat(&self, frame: &mut LevelsFrame) {
-        assert_eq!(frame.layout().resolution, self.panel, "a frame has the panel's size");
-        for colour in Colour::ALL {
-            self.colours[colour.index()].encode_flat(0, self.panel.pixels(), &mut frame.field_mut(colour));
-        }
+        assert_eq!(frame.layout(), self.layout, "a frame has the panel's layout");
+        frame.par_rows_mut().for_each(|mut row| {
+            let first = row.row * self.layout.resolution.width;
+            row.for_each(|colour, mut samples| {
+                self.colours[colour.index()].encode_flat(first, self.layout.resolution.width, &mut samples);
+            });
+        });
     }
 
     /// The phase in [0, 2π) that the panel really shows for `levels` `[panel height, panel width]`, with the panel's
@@ -244,7 +258,7 @@ impl PanelEncoder {
     /// Where `levels` has another number of pixels than the panel, or holds a level that the panel, or the table of
     /// `colour`, does not have.
     pub fn decode(&self, colour: Colour, levels: &[u16]) -> Vec<f32> {
-        assert_eq!(levels.len(), self.panel.pixels(), "a field has one level for each panel pixel");
+        assert_eq!(levels.len(), self.layout.resolution.pixels(), "a field has one level for each panel pixel");
         let encoder = &self.colours[colour.index()];
         (0..levels.len()).map(|pixel| wrapped_f32(encoder.phase_shown(pixel, levels[pixel]))).collect()
     }
@@ -263,7 +277,7 @@ impl PanelEncoder {
     /// # Panics
     /// As [`Self::decode`].
     pub fn decode_unwrapped(&self, colour: Colour, levels: &[u16]) -> Vec<f32> {
-        assert_eq!(levels.len(), self.panel.pixels(), "a field has one level for each panel pixel");
+        assert_eq!(levels.len(), self.layout.resolution.pixels(), "a field has one level for each panel pixel");
         let encoder = &self.colours[colour.index()];
         let shown: Vec<f32> =
             levels.iter().enumerate().map(|(pixel, &level)| encoder.phase_shown(pixel, level) as f32).collect();
@@ -273,12 +287,15 @@ impl PanelEncoder {
     /// The part of a panel's values that carries the pattern.
     fn of_pattern(&self, values: &[f32]) -> Vec<f32> {
         let (left, top) = self.pattern_origin();
-        let rows = values.chunks_exact(self.panel.width).skip(top).take(self.pattern.height);
+        let rows = values.chunks_exact(self.layout.resolution.width).skip(top).take(self.pattern.height);
         rows.flat_map(|row| &row[left..left + self.pattern.width]).copied().collect()
     }
 
     fn pattern_origin(&self) -> (usize, usize) {
-        ((self.panel.width - self.pattern.width) / 2, (self.panel.height - self.pattern.height) / 2)
+        (
+            (self.layout.resolution.width - self.pattern.width) / 2,
+            (self.layout.resolution.height - self.pattern.height) / 2,
+        )
     }
 }
 
@@ -310,21 +327,20 @@ impl ColourEncoder {
         Ok(Self { table, phase_of_level_rad, flatness_entries })
     }
 
-    /// Encodes `phases_rad` into the panel pixels from `first` on; returns how many are out of reach.
-    fn encode_run(&self, first: usize, phases_rad: &[f32], field: &mut FieldMut<'_>) -> usize {
-        let stride = field.stride();
-        let samples = field.run(first, phases_rad.len());
+    /// Encodes `phases_rad` into the panel pixels from `first` on, of which `samples` are; returns how many are out of
+    /// reach.
+    fn encode_run(&self, first: usize, phases_rad: &[f32], samples: &mut Strided<'_>) -> usize {
         let flatness = self.flatness_entries.as_ref().map(|all| &all[first..first + phases_rad.len()]);
-        match stride {
-            1 => self.encode_strided::<1>(phases_rad, flatness, samples),
-            _ => self.encode_strided::<{ crate::fields::FIELDS }>(phases_rad, flatness, samples),
+        match samples.stride {
+            1 => self.encode_strided::<1>(phases_rad, flatness, samples.samples),
+            _ => self.encode_strided::<{ crate::fields::FIELDS }>(phases_rad, flatness, samples.samples),
         }
     }
 
-    fn encode_flat(&self, first: usize, count: usize, field: &mut FieldMut<'_>) {
+    fn encode_flat(&self, first: usize, count: usize, samples: &mut Strided<'_>) {
         const ZEROS: [f32; BLOCK] = [0.0; BLOCK];
         for start in (0..count).step_by(BLOCK) {
-            self.encode_run(first + start, &ZEROS[..BLOCK.min(count - start)], field);
+            self.encode_run(first + start, &ZEROS[..BLOCK.min(count - start)], &mut samples.from(start));
         }
     }
 

@@ -272,7 +272,9 @@ fn a_replay_that_ends_ends_the_run_and_a_record_that_is_deleted_does() {
     assert!(summary["frames_by_pupil_state"]["fallback"].as_u64().unwrap_or(0) < 200, "{summary}");
 
     let daemon = Daemon::start(HOLOD, &with(&["--tracker", "mock", "--record", "record"]), folder.path());
-    assert!(wait_until(PATIENCE, || folder.path().join("record/samples.csv").exists()));
+    // Deleted under a run, not while its files are made.
+    let samples = folder.path().join("record/samples.csv");
+    assert!(wait_until(PATIENCE, || fs::metadata(&samples).is_ok_and(|samples| samples.len() > 1000)));
     fs::remove_dir_all(folder.path().join("record")).unwrap();
     let ended = daemon.wait(PATIENCE);
     assert_eq!(ended.status.code(), Some(73), "{ended:?}");

@@ -92,7 +92,7 @@ fn frames_hz(rig: &Rig, resolution: Option<Resolution>) -> Check {
     let fits = |size: &Resolution| size.width <= panel.width && size.height <= panel.height;
     let sizes: Vec<Resolution> = sizes.into_iter().filter(fits).collect();
     let estimated = setup::weights(rig)
-        .and_then(|weights| progress::during("estimating the frames a second", || Estimate::of(&weights, panel)));
+        .and_then(|weights| progress::during("estimating the frames a second", || Estimate::of(rig, &weights)));
     let (passed, says) = match (estimated, &sizes[..]) {
         // Why is said above, of the weights.
         (Err(_), _) => (true, "not estimated without weights".into()),

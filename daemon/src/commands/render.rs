@@ -1,29 +1,31 @@
 //! `holod render`: one hologram and its phase patterns.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{Colour, DisplayGeometry, PupilDiameter};
+use holod_model::Weights;
 use holod_model::files::{self, StoredHologram};
-use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::weights::TrainedOptics;
-use holod_model::{ComplexHologram, Weights};
+use holod_slm_output::{LevelsFrame, PanelEncoder};
 use serde::Serialize;
 
 use crate::cli::{Backend, RenderArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
 use crate::progress;
+use crate::renderer::{self, Renderer};
 use crate::staging::Staging;
 use crate::{report, setup};
 
 /// What was done, and what the reader should know of it; `report.json`.
 #[derive(Serialize)]
-struct Report {
+pub(super) struct Report {
     scene: String,
     pupil_mm: f32,
-    width_px: usize,
-    height_px: usize,
-    amplitude_constant: f32,
+    pub(super) width_px: usize,
+    pub(super) height_px: usize,
+    pub(super) amplitude_constant: f32,
     clipped_share: f32,
     depth_missing_px: usize,
     depth_clamped_far_px: usize,
@@ -32,7 +34,8 @@ struct Report {
     padded_px: usize,
     depth_least_dpt: f64,
     depth_greatest_dpt: f64,
-    network_ms: f64,
+    /// From picture to panel levels.
+    frame_ms: f64,
     /// From the command's beginning until everything but this report was written.
     total_ms: f64,
     files: [&'static str; 5],
@@ -44,15 +47,18 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let began = Instant::now();
     let staging = Staging::new(&args.out, &FILES, args.force)?;
-    let (hologram, mut report) = compute(&rig, &args.scene, args.pupil, args.backend)?;
-    let mut double_phase = DoublePhase::new(hologram.hologram.resolution, hologram.amplitude_constant);
-    let mut pattern = PhasePattern::flat(hologram.hologram.resolution);
-    report.clipped_share = double_phase.encode(&hologram.hologram, &mut pattern).clipped_share;
+    let Computed { renderer, mut report, optics, .. } = compute(&rig, &args.scene, args.pupil, args.backend)?;
+    let hologram = StoredHologram {
+        hologram: renderer.hologram().clone(),
+        pupil: args.pupil,
+        optics,
+        amplitude_constant: report.amplitude_constant,
+    };
     progress::during("writing the hologram", || {
         let cannot = Failure::because(Exit::CannotCreate);
         hologram.save(&staging.path(FILES[0])).map_err(&cannot)?;
         for (colour, name) in Colour::ALL.into_iter().zip(&FILES[1..4]) {
-            files::save_phase(&pattern, colour, &staging.path(name)).map_err(&cannot)?;
+            files::save_phase(renderer.pattern(), colour, &staging.path(name)).map_err(&cannot)?;
         }
         Ok::<_, Failure>(())
     })?;
@@ -70,7 +76,7 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
         report.width_px,
         report.height_px,
         report.pupil_mm,
-        report.network_ms,
+        report.frame_ms,
         report.total_ms / 1e3,
         report.clipped_share * 100.0,
         report.depth_least_dpt,
@@ -84,27 +90,37 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
     ))
 }
 
-/// The hologram of the scene's first frame.
-fn compute(
+/// A scene's first frame on its way to the panel.
+pub(super) struct Computed {
+    /// Holds the hologram and its phases.
+    renderer: Box<dyn Renderer>,
+    pub(super) encoder: Arc<PanelEncoder>,
+    pub(super) levels: LevelsFrame,
+    pub(super) optics: TrainedOptics,
+    pub(super) report: Report,
+}
+
+/// Computes the scene's first frame, for other commands too.
+pub(super) fn compute(
     rig: &Rig,
     scene: &SceneArgs,
     pupil: PupilDiameter,
     backend: Backend,
-) -> Result<(StoredHologram, Report), Failure> {
+) -> Result<Computed, Failure> {
     let weights = progress::during("loading the network", || setup::weights(rig))?;
     check_pupil(&weights, pupil)?;
     let frames = progress::during("loading the scene", || setup::frames(scene, &rig.geometry))?;
     let resolution = frames.resolution();
-    let mut engine = progress::during(&format!("preparing the network for {resolution}"), || {
-        setup::engine(backend, &weights, resolution)
+    let encoder = renderer::panel_encoder(rig, resolution)?;
+    let mut renderer = progress::during(&format!("preparing the network for {resolution}"), || {
+        renderer::open(backend, &weights, &encoder)
     })?;
-    let mut hologram = ComplexHologram::dark(resolution);
+    let mut levels = LevelsFrame::new(encoder.layout());
     let began = Instant::now();
-    progress::during(&format!("computing the hologram of {resolution}"), || {
-        engine.render(&frames.frames[0], pupil, &mut hologram).map_err(Failure::because(Exit::Software))
+    let rendered = progress::during(&format!("computing the hologram of {resolution}"), || {
+        renderer.render(&frames.frames[0], pupil, &mut levels).map_err(Failure::because(Exit::Software))
     })?;
-    let network_ms = began.elapsed().as_secs_f64() * 1e3;
-    let amplitude_constant = weights.config().amplitude_constant;
+    let frame_ms = began.elapsed().as_secs_f64() * 1e3;
     let done = &frames.reports[0];
     let depths = &frames.frames[0].depth_normalised;
     let depth_at = |start: f32, pick: fn(f32, f32) -> f32| {
@@ -115,8 +131,8 @@ fn compute(
         pupil_mm: pupil.mm(),
         width_px: resolution.width,
         height_px: resolution.height,
-        amplitude_constant,
-        clipped_share: 0.0,
+        amplitude_constant: weights.config().amplitude_constant,
+        clipped_share: rendered.clipped_share,
         depth_missing_px: done.depth_missing_px,
         depth_clamped_far_px: done.depth_clamped_far_px,
         depth_clamped_near_px: done.depth_clamped_near_px,
@@ -124,22 +140,12 @@ fn compute(
         padded_px: done.padded_px,
         depth_least_dpt: depth_at(f32::MAX, f32::min),
         depth_greatest_dpt: depth_at(f32::MIN, f32::max),
-        network_ms,
+        frame_ms,
         total_ms: 0.0,
         files: FILES,
     };
-    let geometry = DisplayGeometry { resolution, ..rig.geometry };
-    Ok((StoredHologram { hologram, pupil, optics: TrainedOptics::of(&geometry), amplitude_constant }, report))
-}
-
-/// The hologram of the scene's first frame, for other commands.
-pub(super) fn hologram(
-    rig: &Rig,
-    scene: &SceneArgs,
-    pupil: PupilDiameter,
-    backend: Backend,
-) -> Result<StoredHologram, Failure> {
-    compute(rig, scene, pupil, backend).map(|(hologram, _)| hologram)
+    let optics = TrainedOptics::of(&DisplayGeometry { resolution, ..rig.geometry });
+    Ok(Computed { renderer, encoder, levels, optics, report })
 }
 
 fn check_pupil(weights: &Weights, pupil: PupilDiameter) -> Result<(), Failure> {

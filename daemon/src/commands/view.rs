@@ -6,19 +6,19 @@
 use std::path::Path;
 
 use holod_calibration::rig::Rig;
-use holod_calibration::{Colour, PerColour};
+use holod_calibration::{Colour, PerColour, PupilDiameter};
 use holod_model::files::{self, StoredHologram};
 use holod_model::optics::{DoublePhase, Eye, PhasePattern, SimulatedEye};
-use holod_slm_output::fields::FrameLayout;
-use holod_slm_output::{LevelsFrame, PanelEncoder};
+use holod_model::weights::TrainedOptics;
+use holod_slm_output::LevelsFrame;
 use serde::Serialize;
 
-use super::render;
-use crate::cli::ViewArgs;
+use super::render::{self, Computed};
+use crate::cli::{Backend, SceneArgs, ViewArgs};
 use crate::destination::Destination;
 use crate::failure::{Exit, Failure};
 use crate::pictures::shown_pattern;
-use crate::{progress, report, setup};
+use crate::{progress, renderer, report, setup};
 
 #[derive(Serialize)]
 struct Report<'a> {
@@ -27,6 +27,15 @@ struct Report<'a> {
     eye_pupil_mm: f32,
     focus_dpt: f64,
     focus_u_mm: f64,
+}
+
+/// Phases on a panel, and what they are a hologram of.
+struct LookedAt {
+    pattern: PhasePattern,
+    /// The pupil that it was made for.
+    pupil: PupilDiameter,
+    optics: TrainedOptics,
+    amplitude_constant: f32,
 }
 
 pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
@@ -38,9 +47,12 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
         ));
     }
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
-    let hologram = match (&args.hologram, args.pupil) {
-        (Some(folder), _) => load(folder)?,
-        (None, Some(pupil)) => render::hologram(&rig, &args.scene, pupil, args.backend)?,
+    let looked_at = match (&args.hologram, args.pupil) {
+        (Some(folder), _) => {
+            let hologram = load(folder)?;
+            progress::during("computing the panel's levels", || of_hologram(&rig, hologram))?
+        }
+        (None, Some(pupil)) => of_scene(&rig, &args.scene, pupil, args.backend)?,
         (None, None) => {
             return Err(Failure::new(
                 Exit::Usage,
@@ -49,12 +61,12 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
             ));
         }
     };
-    let resolution = hologram.hologram.resolution;
-    let geometry = hologram.optics.geometry(resolution);
-    let eye = Eye { pupil: args.eye_pupil.unwrap_or(hologram.pupil), focus: args.focus };
-    let pattern = progress::during("computing the panel's levels", || through_the_panel(&rig, &hologram))?;
+    let LookedAt { pattern, pupil, optics, amplitude_constant } = looked_at;
+    let resolution = pattern.resolution;
+    let geometry = optics.geometry(resolution);
+    let eye = Eye { pupil: args.eye_pupil.unwrap_or(pupil), focus: args.focus };
     let seen = progress::during("computing what the eye sees", || {
-        SimulatedEye::new(&geometry, resolution).view(&pattern, hologram.amplitude_constant, eye)
+        SimulatedEye::new(&geometry, resolution).view(&pattern, amplitude_constant, eye)
     });
     out.write(|path| files::save_picture(&seen, path).map_err(Failure::because(Exit::CannotCreate)))?;
     if out.is_stdout() {
@@ -62,7 +74,7 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
     }
     let said = Report {
         out: &args.out,
-        hologram_pupil_mm: hologram.pupil.mm(),
+        hologram_pupil_mm: pupil.mm(),
         eye_pupil_mm: eye.pupil.mm(),
         focus_dpt: eye.focus.0,
         focus_u_mm: geometry.image_distance(eye.focus).0 * 1e3,
@@ -95,14 +107,20 @@ fn load(folder: &Path) -> Result<StoredHologram, Failure> {
     StoredHologram::load(&path).map_err(Failure::because(Exit::Data))
 }
 
-/// Double phase, the panel's levels, and what those levels show.
-fn through_the_panel(rig: &Rig, hologram: &StoredHologram) -> Result<PhasePattern, Failure> {
-    let resolution = hologram.hologram.resolution;
-    let mut pattern = PhasePattern::flat(resolution);
-    DoublePhase::new(resolution, hologram.amplitude_constant).encode(&hologram.hologram, &mut pattern);
-    let encoder =
-        PanelEncoder::new(&rig.panel, rig.resolution(), resolution).map_err(Failure::because(Exit::Config))?;
-    let mut levels = LevelsFrame::new(FrameLayout::new(&rig.panel, rig.resolution()));
+/// The phases that the panel shows of a scene's first frame.
+fn of_scene(rig: &Rig, scene: &SceneArgs, pupil: PupilDiameter, backend: Backend) -> Result<LookedAt, Failure> {
+    let Computed { encoder, levels, optics, report, .. } = render::compute(rig, scene, pupil, backend)?;
+    let pattern = shown_pattern(&encoder, &levels);
+    Ok(LookedAt { pattern, pupil, optics, amplitude_constant: report.amplitude_constant })
+}
+
+/// The phases that the panel shows of a hologram: double phase, the panel's levels, and what those levels show.
+fn of_hologram(rig: &Rig, stored: StoredHologram) -> Result<LookedAt, Failure> {
+    let StoredHologram { hologram, pupil, optics, amplitude_constant } = stored;
+    let mut pattern = PhasePattern::flat(hologram.resolution);
+    DoublePhase::new(hologram.resolution, amplitude_constant).encode(&hologram, &mut pattern);
+    let encoder = renderer::panel_encoder(rig, hologram.resolution)?;
+    let mut levels = LevelsFrame::new(encoder.layout());
     encoder.encode(PerColour(Colour::ALL.map(|colour| pattern.plane(colour))), &mut levels);
-    Ok(shown_pattern(&encoder, &levels))
+    Ok(LookedAt { pattern: shown_pattern(&encoder, &levels), pupil, optics, amplitude_constant })
 }

@@ -7,14 +7,15 @@
 
 mod statistics;
 
+use std::sync::Arc;
+
 use holod_calibration::rig::Rig;
-use holod_calibration::{Colour, Dioptres, DisplayGeometry, PerColour, PupilDiameter, Resolution};
+use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 use holod_model::metrics::{self, StackScore};
-use holod_model::optics::{DoublePhase, Eye, PhasePattern, SimulatedEye};
+use holod_model::optics::{Eye, PhasePattern, SimulatedEye};
 use holod_model::refocus::{CardArea, FAR_CARD, NEAR_CARD};
 use holod_model::scene_shard::SceneShard;
-use holod_model::{ComplexHologram, CpuEngine, LinearImage, RgbdFrame, Weights};
-use holod_slm_output::fields::FrameLayout;
+use holod_model::{LinearImage, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 use serde::Serialize;
 
@@ -23,7 +24,7 @@ pub use statistics::Estimate;
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
 use crate::pictures::shown_pattern;
-use crate::setup;
+use crate::renderer::{self, Renderer};
 
 /// PSNR of a picture that is exactly right, so that means over scenes stay finite.
 const HIGHEST_PSNR_DB: f64 = 120.0;
@@ -33,13 +34,10 @@ pub struct Judge {
     geometry: DisplayGeometry,
     amplitude_constant: f32,
     border_px: usize,
-    engine: CpuEngine,
-    double_phase: DoublePhase,
-    encoder: PanelEncoder,
+    renderer: Box<dyn Renderer>,
+    encoder: Arc<PanelEncoder>,
     levels: LevelsFrame,
     eye: SimulatedEye,
-    hologram: ComplexHologram,
-    encoded: PhasePattern,
 }
 
 /// One scene: its figures, and pictures to look at.
@@ -91,21 +89,15 @@ impl Judge {
         resolution: Resolution,
         border_px: usize,
     ) -> Result<Self, Failure> {
-        let engine = setup::engine(backend, weights, resolution)?;
-        let encoder =
-            PanelEncoder::new(&rig.panel, rig.resolution(), resolution).map_err(Failure::because(Exit::Config))?;
-        let amplitude_constant = weights.config().amplitude_constant;
+        let encoder = renderer::panel_encoder(rig, resolution)?;
         Ok(Self {
             geometry: rig.geometry,
-            amplitude_constant,
+            amplitude_constant: weights.config().amplitude_constant,
             border_px,
-            engine,
-            double_phase: DoublePhase::new(resolution, amplitude_constant),
+            renderer: renderer::open(backend, weights, &encoder)?,
+            levels: LevelsFrame::new(encoder.layout()),
             encoder,
-            levels: LevelsFrame::new(FrameLayout::new(&rig.panel, rig.resolution())),
             eye: SimulatedEye::repeating(&rig.geometry, resolution),
-            hologram: ComplexHologram::dark(resolution),
-            encoded: PhasePattern::flat(resolution),
         })
     }
 
@@ -115,7 +107,7 @@ impl Judge {
     /// Where the shard cannot be read.
     pub fn scene(&mut self, shard: &SceneShard, pupil_indices: &[usize]) -> Result<JudgedScene, Failure> {
         let unreadable = Failure::because(Exit::Data);
-        let frame = shard.frame().map_err(&unreadable)?;
+        let frame = Arc::new(shard.frame().map_err(&unreadable)?);
         let pupils: Vec<PupilDiameter> = pupil_indices.iter().map(|&index| shard.pupils()[index]).collect();
         let mut shown = Vec::new();
         for &pupil in &pupils {
@@ -154,7 +146,7 @@ impl Judge {
         shard: &SceneShard,
         pupils: &[PupilDiameter],
     ) -> Result<Vec<(Refocus, [LinearImage; 2])>, Failure> {
-        let frame = shard.frame().map_err(Failure::because(Exit::Data))?;
+        let frame = Arc::new(shard.frame().map_err(Failure::because(Exit::Data))?);
         let area = |name: &str, card: Dioptres| {
             CardArea::find(&frame.depth_normalised, shard.resolution(), &self.geometry, card, self.border_px)
                 .ok_or_else(|| {
@@ -186,12 +178,10 @@ impl Judge {
     }
 
     /// The phases that the panel's levels show of the hologram of `frame` for `pupil`, and the share that was clipped.
-    fn shown(&mut self, frame: &RgbdFrame, pupil: PupilDiameter) -> Result<(PhasePattern, f32), Failure> {
-        self.engine.render(frame, pupil, &mut self.hologram).map_err(Failure::because(Exit::Software))?;
-        let report = self.double_phase.encode(&self.hologram, &mut self.encoded);
-        let phases = PerColour(Colour::ALL.map(|colour| self.encoded.plane(colour)));
-        self.encoder.encode(phases, &mut self.levels);
-        Ok((shown_pattern(&self.encoder, &self.levels), report.clipped_share))
+    fn shown(&mut self, frame: &Arc<RgbdFrame>, pupil: PupilDiameter) -> Result<(PhasePattern, f32), Failure> {
+        let rendered =
+            self.renderer.render(frame, pupil, &mut self.levels).map_err(Failure::because(Exit::Software))?;
+        Ok((shown_pattern(&self.encoder, &self.levels), rendered.clipped_share))
     }
 
     fn look(&mut self, pattern: &PhasePattern, pupil: PupilDiameter, focuses: &[Dioptres]) -> Vec<LinearImage> {

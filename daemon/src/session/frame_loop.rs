@@ -1,19 +1,18 @@
-//! The frame thread: wake, ask for the pupil, compute the hologram, encode it, submit it.
+//! The frame thread: wake, ask for the pupil, render the panel's levels, submit them.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
-use holod_calibration::{Colour, PerColour, PupilDiameter, TimeNs};
-use holod_model::optics::{DoublePhase, PhasePattern};
-use holod_model::{ComplexHologram, CpuEngine};
+use holod_calibration::{PupilDiameter, TimeNs};
 use holod_pupil_input::{EstimateReader, PupilState};
 use holod_slm_output::pacing::Point;
-use holod_slm_output::{FramePlan, FramePort, Pacer, PanelEncoder};
+use holod_slm_output::{FramePlan, FramePort, Pacer};
 
 use super::host_now;
 use super::keep::keep_slot;
 use crate::record::FrameRecord;
+use crate::renderer::Renderer;
 use crate::setup::Frames;
 
 /// An order to stop is seen within this time.
@@ -26,12 +25,8 @@ const FARTHEST_PREDICTION: TimeNs = TimeNs(200_000_000);
 pub(super) struct FrameLoop {
     /// The tracker's newest estimate.
     pub pupil: EstimateReader,
-    /// The network.
-    pub engine: CpuEngine,
-    /// Hologram to phase.
-    pub double_phase: DoublePhase,
-    /// Phase to levels.
-    pub encoder: PanelEncoder,
+    /// Frame and pupil to levels.
+    pub renderer: Box<dyn Renderer>,
     /// Levels to the panel.
     pub port: FramePort,
     /// Which refresh each frame is for.
@@ -42,10 +37,6 @@ pub(super) struct FrameLoop {
     pub trained: TrainedPupils,
     /// When the run began.
     pub t_origin: TimeNs,
-    /// Buffer between network and double phase.
-    pub hologram: ComplexHologram,
-    /// Buffer between double phase and levels.
-    pub pattern: PhasePattern,
     /// To whoever records.
     pub records: rtrb::Producer<LoopRecord>,
     /// Records that found no room.
@@ -108,12 +99,10 @@ impl FrameLoop {
         let hologram_pupil = self.trained.clamp(estimate.pupil);
 
         let t_render_begin = self.mark(Point::RenderBegin, plan);
-        self.engine
-            .render(&self.frames.frames[scene], hologram_pupil, &mut self.hologram)
-            .expect("engine, scene and hologram were made for one size, and the estimator gives positive diameters");
-        let double_phase = self.double_phase.encode(&self.hologram, &mut self.pattern);
-        let phase_rad = PerColour(Colour::ALL.map(|colour| self.pattern.plane(colour)));
-        let levels = self.encoder.encode(phase_rad, self.port.acquire());
+        let rendered = self
+            .renderer
+            .render(&self.frames.frames[scene], hologram_pupil, self.port.acquire())
+            .expect("renderer and scene were made for one size, and the estimator gives positive diameters");
         let t_render_end = self.mark(Point::RenderEnd, plan);
 
         let keep = if self.keep_levels && state != PupilState::Fallback { keep_slot(hologram_pupil) } else { None };
@@ -132,8 +121,8 @@ impl FrameLoop {
                 t_submit,
                 t_desired_present: plan.t_desired_present,
             },
-            clipped_share: double_phase.clipped_share,
-            unreachable_share: levels.unreachable_share.0.into_iter().fold(0.0, f32::max),
+            clipped_share: rendered.clipped_share,
+            unreachable_share: rendered.unreachable_share.0.into_iter().fold(0.0, f32::max),
         };
         // A full ring means that nobody records; the frame is shown all the same.
         if self.records.push(record).is_err() {

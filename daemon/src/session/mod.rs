@@ -19,8 +19,7 @@ use std::time::Duration;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{PupilDiameter, Resolution, TimeNs};
-use holod_model::optics::{DoublePhase, PhasePattern};
-use holod_model::{ComplexHologram, CpuEngine, Weights};
+use holod_model::Weights;
 use holod_pupil_input::{
     Counter, Decision, DecisionTap, Link, PupilState, RecordFiles, ReplayError, ReplaySpeed, SourceError, Tracker,
     TrackerControl, TrackerError, TrackerOptions, TrackerSpec,
@@ -46,6 +45,7 @@ use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
 use crate::progress;
 use crate::record::{FieldRecord, FrameRecord};
+use crate::renderer::{self, Renderer};
 use crate::setup::{self, Frames};
 use crate::speed;
 use crate::status::{Status, StatusFile};
@@ -112,7 +112,7 @@ pub struct SessionReport {
     /// Levels that the panel showed, with the pupil that each frame was made for, narrowest first.
     pub shown: Vec<(PupilDiameter, LevelsFrame)>,
     /// Turns levels back into phase.
-    pub encoder: PanelEncoder,
+    pub encoder: Arc<PanelEncoder>,
 }
 
 /// The numbers of a run; `summary.json`.
@@ -226,14 +226,15 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
     crate::fault::install()?;
     let resolution = plan.frames.resolution();
     let rig = &plan.rig;
-    let (engine, frame_time) = progress::during(&format!("preparing the network for {resolution}"), || {
-        let mut engine = scheduling::patient(|| setup::engine(plan.backend, &plan.weights, resolution))?;
-        let frame_time = first_frame_time(&mut engine, &plan)?;
-        Ok::<_, Failure>((engine, frame_time))
-    })?;
     let encoder = progress::during(&format!("preparing the levels of the panel of {}", rig.resolution()), || {
-        PanelEncoder::new(&rig.panel, rig.resolution(), resolution).map_err(Failure::because(Exit::Config))
+        renderer::panel_encoder(rig, resolution)
     })?;
+    let (renderer, frame_time) = progress::during(&format!("preparing the network for {resolution}"), || {
+        let mut renderer = scheduling::patient(|| renderer::open(plan.backend, &plan.weights, &encoder))?;
+        let frame_time = first_frame_time(&mut *renderer, &plan, LevelsFrame::new(encoder.layout()))?;
+        Ok::<_, Failure>((renderer, frame_time))
+    })?;
+    tracing::debug!("holograms are computed by {}", renderer.description());
     let panel_hz = speed::panel_frames_hz(&rig.panel);
     let first_hz = 1.0 / frame_time.seconds();
     let first_frame = format!(
@@ -274,9 +275,7 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
     let frames = Arc::new(plan.frames);
     let frame_loop = FrameLoop {
         pupil: estimates,
-        engine,
-        double_phase: DoublePhase::new(resolution, plan.weights.config().amplitude_constant),
-        encoder: encoder.clone(),
+        renderer,
         port: output.frames,
         pacer: Pacer::new(pacing, host_now()),
         frames: Arc::clone(&frames),
@@ -285,8 +284,6 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
             widest: PupilDiameter::from_mm(plan.weights.config().pupil_range_mm[1]),
         },
         t_origin,
-        hologram: ComplexHologram::dark(resolution),
-        pattern: PhasePattern::flat(resolution),
         records: record_producer,
         records_lost: Arc::new(AtomicU64::new(0)),
         keep_levels: plan.keep_levels,
@@ -426,13 +423,15 @@ fn open_output(plan: &SessionPlan, encoder: &PanelEncoder, options: OutputOption
     Output::start(rig, encoder, panel, laser, options, host_now)
 }
 
-/// How long the network takes for a frame, measured before anything is shown.
-fn first_frame_time(engine: &mut CpuEngine, plan: &SessionPlan) -> Result<TimeNs, Failure> {
-    let scene = &plan.frames.frames[0];
-    let mut hologram = ComplexHologram::dark(scene.resolution);
+/// How long a frame takes, measured before anything is shown.
+fn first_frame_time(
+    renderer: &mut dyn Renderer,
+    plan: &SessionPlan,
+    mut levels: LevelsFrame,
+) -> Result<TimeNs, Failure> {
     let pupil = PupilDiameter::from_mm(plan.weights.config().pupil_range_mm[0]);
     let began = host_now();
-    engine.render(scene, pupil, &mut hologram).map_err(Failure::because(Exit::Software))?;
+    renderer.render(&plan.frames.frames[0], pupil, &mut levels).map_err(Failure::because(Exit::Software))?;
     Ok(host_now() - began)
 }
 

@@ -135,7 +135,7 @@ fn check(name: &str) {
     let field = golden.complex("field").unwrap();
     assert_matches(&format!("{name} field"), &trace.field, &field, REFERENCE_TOLERANCE);
 
-    let mut engine = CpuEngine::new(&weights, frame.resolution, 2).unwrap();
+    let mut engine = CpuEngine::new(&weights, frame.resolution).unwrap();
     let mut hologram = ComplexHologram::dark(frame.resolution);
     engine.render(&frame, PupilDiameter::from_mm(pupil_mm as f32), &mut hologram).unwrap();
     assert_matches(&format!("{name} engine"), &widen(&hologram.field), &field, ENGINE_TOLERANCE);

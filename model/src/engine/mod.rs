@@ -37,14 +37,6 @@ pub enum EngineError {
         /// What was given.
         pupil_mm: f32,
     },
-    /// Threads could not be started.
-    #[error("cannot start {threads} threads for the CPU engine: {detail}")]
-    Threads {
-        /// How many were asked for.
-        threads: usize,
-        /// What the system said.
-        detail: String,
-    },
 }
 
 /// One step of a frame, before it is timed.

@@ -8,7 +8,6 @@ use rayon::prelude::*;
 
 use super::{ComplexHologram, PhasePattern};
 use crate::phase_math::argument;
-use crate::resident::Resident;
 use crate::simd::{InstructionSet, Simd, Task};
 
 /// Edge of the tiles of which the rms amplitude is taken, in pixels.
@@ -40,18 +39,14 @@ const CORRECTION_GAIN: f32 = 2.0;
 /// K is fixed, so brightness does not flicker from frame to frame; what exceeds it is clipped and counted. An eye behind
 /// the 4f stop sees c/K, so intensities are multiplied by K² to compare.
 ///
-/// An encoder has a thread pool of its own.
+/// The threads that it works on are those of the [`WorkerPool`](crate::WorkerPool) that it is called in, elsewhere
+/// rayon's own.
 pub struct DoublePhase {
-    resident: Resident<Job>,
     resolution: Resolution,
-}
-
-struct Job {
-    /// The hologram, which becomes a while it is encoded.
-    hologram: ComplexHologram,
-    error: PairErrors,
-    pattern: PhasePattern,
     amplitude_constant: f32,
+    /// a, `[3, height, width]`.
+    clipped: Vec<Complex32>,
+    error: PairErrors,
     /// Sum of intensities of each tile; of each row of tiles, how many samples were clipped.
     tile_power: Vec<f32>,
     clipped_in_tile_row: Vec<u32>,
@@ -75,16 +70,27 @@ impl DoublePhase {
     /// An encoder for one resolution with a fixed amplitude constant K > 0.
     ///
     /// # Panics
-    ///
-    /// Where the system cannot start threads, and where K is not positive.
+    /// Where K is not positive.
     pub fn new(resolution: Resolution, amplitude_constant: f32) -> Self {
-        assert!(amplitude_constant > 0.0, "the amplitude constant is positive");
-        let job = Job::new(ComplexHologram::dark(resolution), amplitude_constant, InstructionSet::best());
-        let resident = Resident::new("holod-phase", 0, job, Job::encode).expect("threads can be started");
-        Self { resident, resolution }
+        Self::with_instructions(resolution, amplitude_constant, InstructionSet::best())
     }
 
-    /// Writes the phases of `hologram` to `pattern`, both of this encoder's resolution. Does not allocate.
+    fn with_instructions(resolution: Resolution, amplitude_constant: f32, set: InstructionSet) -> Self {
+        assert!(amplitude_constant > 0.0, "the amplitude constant is positive");
+        let (samples, tile_rows) = (3 * resolution.pixels(), 3 * resolution.height.div_ceil(TILE));
+        Self {
+            resolution,
+            amplitude_constant,
+            clipped: vec![Complex32::ZERO; samples],
+            error: PairErrors { re: vec![0.0; samples], im: vec![0.0; samples] },
+            tile_power: vec![0.0; tile_rows * resolution.width.div_ceil(TILE)],
+            clipped_in_tile_row: vec![0; tile_rows],
+            set,
+        }
+    }
+
+    /// Writes the phases of `hologram` to `pattern`, both of this encoder's resolution. Does not allocate in a
+    /// [`WorkerPool`](crate::WorkerPool).
     ///
     /// A sample that is not finite, or so large that its square is not, is encoded as darkness and counted as clipped.
     pub fn encode(&mut self, hologram: &ComplexHologram, pattern: &mut PhasePattern) -> DoublePhaseReport {
@@ -95,61 +101,32 @@ impl DoublePhase {
             pattern.resolution,
             self.resolution
         );
-        let mut clipped = 0;
-        self.resident.run(
-            |job| job.hologram.field.copy_from_slice(&hologram.field),
-            |job| {
-                // The old content, swapped in, is overwritten by the next frame.
-                std::mem::swap(&mut pattern.phase_rad, &mut job.pattern.phase_rad);
-                clipped = job.clipped_in_tile_row.iter().map(|&clipped| u64::from(clipped)).sum();
-            },
-        );
-        DoublePhaseReport { clipped_share: (clipped as f64 / pattern.phase_rad.len().max(1) as f64) as f32 }
-    }
-}
-
-impl Job {
-    fn new(hologram: ComplexHologram, amplitude_constant: f32, set: InstructionSet) -> Self {
-        let resolution = hologram.resolution;
-        let tile_rows = 3 * resolution.height.div_ceil(TILE);
-        Self {
-            error: PairErrors { re: vec![0.0; hologram.field.len()], im: vec![0.0; hologram.field.len()] },
-            hologram,
-            pattern: PhasePattern::flat(resolution),
-            amplitude_constant,
-            tile_power: vec![0.0; tile_rows * resolution.width.div_ceil(TILE)],
-            clipped_in_tile_row: vec![0; tile_rows],
-            set,
-        }
-    }
-
-    fn encode(&mut self) {
-        let Self { hologram, error, pattern, amplitude_constant, tile_power, clipped_in_tile_row, set } = self;
-        let Resolution { width, height } = hologram.resolution;
+        let Self { clipped, error, tile_power, clipped_in_tile_row, set, .. } = self;
+        let Resolution { width, height } = self.resolution;
         let (plane, tiles_across) = (width * height, width.div_ceil(TILE));
-        let amplitude_scale = 1.0 / *amplitude_constant;
-        let planes = hologram.field.par_chunks_exact_mut(plane);
+        let amplitude_scale = 1.0 / self.amplitude_constant;
+        let planes = hologram.field.par_chunks_exact(plane).zip(clipped.par_chunks_exact_mut(plane));
         let errors = error.re.par_chunks_exact_mut(plane).zip(error.im.par_chunks_exact_mut(plane));
         let tiles = tile_power
             .par_chunks_exact_mut(height.div_ceil(TILE) * tiles_across)
             .zip(clipped_in_tile_row.par_chunks_exact_mut(height.div_ceil(TILE)));
-        planes.zip(errors).zip(tiles).for_each(|((field, (error_re, error_im)), (power, clipped))| {
-            let fields = field.par_chunks_mut(TILE * width);
+        planes.zip(errors).zip(tiles).for_each(|(((field, clipped), (error_re, error_im)), (power, counts))| {
+            let fields = field.par_chunks(TILE * width).zip(clipped.par_chunks_mut(TILE * width));
             let errors = error_re.par_chunks_mut(TILE * width).zip(error_im.par_chunks_mut(TILE * width));
-            let tiles = power.par_chunks_exact_mut(tiles_across).zip(clipped);
-            fields.zip(errors).zip(tiles).for_each(|((field, (error_re, error_im)), (power, clipped))| {
+            let tiles = power.par_chunks_exact_mut(tiles_across).zip(counts);
+            fields.zip(errors).zip(tiles).for_each(|(((field, clipped), (error_re, error_im)), (power, count))| {
                 power.fill(0.0);
-                *clipped = 0;
-                for field in field.chunks_exact_mut(width) {
-                    set.run(ClippedRow { field, power, clipped, amplitude_scale });
+                *count = 0;
+                for (field, clipped) in field.chunks_exact(width).zip(clipped.chunks_exact_mut(width)) {
+                    set.run(ClippedRow { field, clipped, power, count, amplitude_scale });
                 }
                 let errors = error_re.chunks_mut(4 * width).zip(error_im.chunks_mut(4 * width));
-                for (field, (error_re, error_im)) in field.chunks(4 * width).zip(errors) {
+                for (field, (error_re, error_im)) in clipped.chunks(4 * width).zip(errors) {
                     set.run(BlockRow { field, error_re, error_im, power, width });
                 }
             });
         });
-        let field = &hologram.field;
+        let field = &*clipped;
         pattern.phase_rad.par_chunks_exact_mut(width).enumerate().for_each(|(row, phases)| {
             let (plane, y) = (row / height * width * height, row % height);
             let field = &field[row * width..][..width];
@@ -158,6 +135,8 @@ impl Job {
             let lines_im = lines.map(|line| &error.im[line..][..width]);
             set.run(CorrectedRow { field, lines_re, lines_im, phases });
         });
+        let clipped = clipped_in_tile_row.iter().map(|&count| u64::from(count)).sum::<u64>();
+        DoublePhaseReport { clipped_share: (clipped as f64 / pattern.phase_rad.len().max(1) as f64) as f32 }
     }
 }
 
@@ -168,34 +147,39 @@ fn mirrored(padded: usize, count: usize) -> usize {
     if inside < count { inside } else { (2 * (count - 1)).saturating_sub(inside).min(count - 1) }
 }
 
-/// A row of samples: c becomes a.
+/// A row of samples: a of c.
 struct ClippedRow<'a> {
-    field: &'a mut [Complex32],
+    /// c.
+    field: &'a [Complex32],
+    /// Becomes a.
+    clipped: &'a mut [Complex32],
     /// Of each tile that the row crosses; its intensities are added.
     power: &'a mut [f32],
     /// Grows by the samples whose amplitude exceeds what can be encoded.
-    clipped: &'a mut u32,
+    count: &'a mut u32,
     amplitude_scale: f32,
 }
 
 impl Task for ClippedRow<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, _: S) {
-        let Self { field, power, clipped, amplitude_scale } = self;
+        let Self { field, clipped, power, count, amplitude_scale } = self;
         let mut inside = 0;
-        let (tiles, rest) = field.as_chunks_mut::<TILE>();
-        for (samples, power) in tiles.iter_mut().zip(&mut *power) {
+        let (tiles, rest) = clipped.as_chunks_mut::<TILE>();
+        let (given, given_rest) = field.as_chunks::<TILE>();
+        for ((samples, given), power) in tiles.iter_mut().zip(given).zip(&mut *power) {
+            *samples = *given;
             clip(samples, power, &mut inside, amplitude_scale);
         }
         if let ([.., power], 1..) = (power, rest.len()) {
             let mut samples = [Complex32::ZERO; TILE];
-            samples[..rest.len()].copy_from_slice(rest);
+            samples[..rest.len()].copy_from_slice(given_rest);
             clip(&mut samples, power, &mut inside, amplitude_scale);
             rest.copy_from_slice(&samples[..rest.len()]);
             // Of what lies beyond the edge nothing was clipped.
             inside -= (TILE - rest.len()) as u32;
         }
-        *clipped += field.len() as u32 - inside;
+        *count += field.len() as u32 - inside;
     }
 }
 
@@ -563,15 +547,16 @@ mod tests {
             let with_direction = expected.iter().filter(|phasor| phasor.norm() > 0.05).count();
             assert!(100 * with_direction > 95 * expected.len(), "{with_direction} of {}", expected.len());
             for set in InstructionSet::available() {
-                let mut job = Job::new(hologram.clone(), 1.3, set);
-                job.clipped_in_tile_row.fill(u32::MAX);
-                job.tile_power.fill(f32::NAN);
-                job.encode();
-                let found = &mut job.pattern.phase_rad;
+                let mut encoder = DoublePhase::with_instructions(resolution, 1.3, set);
+                encoder.clipped_in_tile_row.fill(u32::MAX);
+                encoder.tile_power.fill(f32::NAN);
+                let mut pattern = PhasePattern::flat(resolution);
+                encoder.encode(&hologram, &mut pattern);
+                let found = &mut pattern.phase_rad;
                 let worst = worst_phasor(found, &expected);
                 // At an amplitude of 1 a rounding of 1e-7 turns a phasor by 5e-4.
                 assert!(worst < 1e-3, "{worst} of {resolution} on {}", set.name());
-                assert_eq!(job.clipped_in_tile_row.iter().sum::<u32>() as usize, above, "on {}", set.name());
+                assert_eq!(encoder.clipped_in_tile_row.iter().sum::<u32>() as usize, above, "on {}", set.name());
                 for place in [0, found.len() / 2, found.len() - 1] {
                     if expected[place].norm() > 0.05 {
                         let right = found[place];

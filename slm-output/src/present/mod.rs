@@ -21,7 +21,7 @@ use holod_calibration::rig::{Panel, PanelMode};
 use rustix::io::Errno;
 
 use self::drm::DisplayCheck;
-use crate::fields::{FrameLayout, FrameTag, LevelsFrame};
+use crate::fields::{FrameTag, LevelsFrame};
 use crate::levels::PanelEncoder;
 
 /// Where the time of a presentation comes from, and so how far it can be trusted.
@@ -179,7 +179,7 @@ pub struct PanelSetup {
 impl PanelSetup {
     /// The setup for `panel`, whose frames `encoder` makes.
     pub fn new(panel: &Panel, encoder: &PanelEncoder) -> Self {
-        let mut flat = LevelsFrame::new(FrameLayout::new(panel, encoder.panel_resolution()));
+        let mut flat = LevelsFrame::new(encoder.layout());
         encoder.encode_flat(&mut flat);
         Self { panel: panel.clone(), flat }
     }

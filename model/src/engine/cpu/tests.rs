@@ -224,7 +224,7 @@ fn the_built_in_network_matches_the_reference_at_both_ends_of_the_pupil_range() 
 fn an_engine_renders_as_its_network_does_and_clamps_the_pupil() {
     let weights = random_weights(config(Grid::HalfBand, 4, 8, vec![1]), 2);
     let resolution = Resolution { width: 31, height: 18 };
-    let mut engine = CpuEngine::new(&weights, resolution, 2).unwrap();
+    let mut engine = CpuEngine::new(&weights, resolution).unwrap();
     let frame = frame(resolution, 4);
     let mut hologram = ComplexHologram::dark(resolution);
     for (given_mm, meant_mm) in [(5.0, 5.0), (1.5, 1.5), (9.0, 5.0), (0.2, 1.0)] {
@@ -242,7 +242,7 @@ fn an_engine_renders_as_its_network_does_and_clamps_the_pupil() {
 fn wrong_sizes_and_pupils_are_refused() {
     let weights = random_weights(config(Grid::HalfBand, 4, 8, vec![]), 2);
     let (right, wrong) = (Resolution { width: 8, height: 6 }, Resolution { width: 6, height: 8 });
-    let mut engine = CpuEngine::new(&weights, right, 1).unwrap();
+    let mut engine = CpuEngine::new(&weights, right).unwrap();
     let pupil = PupilDiameter::from_mm(3.0);
     let mut render = |frame_size, pupil, hologram_size| {
         engine.render(&frame(frame_size, 0), pupil, &mut ComplexHologram::dark(hologram_size))
@@ -254,5 +254,5 @@ fn wrong_sizes_and_pupils_are_refused() {
         assert!(matches!(render(right, PupilDiameter::from_mm(pupil_mm), right), Err(EngineError::Pupil { .. })));
     }
     let empty = Resolution { width: 0, height: 4 };
-    assert!(matches!(CpuEngine::new(&weights, empty, 1), Err(EngineError::Empty { .. })));
+    assert!(matches!(CpuEngine::new(&weights, empty), Err(EngineError::Empty { .. })));
 }

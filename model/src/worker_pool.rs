@@ -1,14 +1,15 @@
-//! A thread pool that is handed work without allocating.
+//! Threads that work on a frame together, and are handed it without allocating.
 //!
-//! Handing work to a rayon pool from outside allocates now and then, which a frame loop must not. So one worker of the
+//! [`CpuEngine`](crate::CpuEngine), [`DoublePhase`](crate::optics::DoublePhase) and whatever else splits its work by
+//! rayon share the threads of the pool that they are called in. Handing work to a rayon pool from outside allocates now and then, which a frame loop must not. So one worker of the
 //! pool stays inside it, waits for work and runs it there; the caller waits meanwhile.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
-use rayon::{ThreadPool, ThreadPoolBuildError, ThreadPoolBuilder};
+use rayon::{ThreadPool, ThreadPoolBuilder};
 
-/// A job with all that it works on, which stays with its own thread pool and is run again and again.
-pub(crate) struct Resident<J> {
+/// A job with all that it works on, which stays with its own threads and is run again and again.
+pub struct WorkerPool<J> {
     shared: Arc<Shared<J>>,
     /// Its workers end after `Drop` has told the waiting one to.
     pool: ThreadPool,
@@ -24,6 +25,16 @@ struct State<J> {
     job: J,
 }
 
+/// Threads could not be started.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("cannot start {threads} threads to compute frames with: {detail}; check the limits on threads and memory")]
+pub struct WorkerPoolError {
+    /// How many were asked for; 0 for as many as there are cores.
+    pub threads: usize,
+    /// What the system said.
+    pub detail: String,
+}
+
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Order {
     Wait,
@@ -31,18 +42,22 @@ enum Order {
     Quit,
 }
 
-impl<J: Send + 'static> Resident<J> {
+impl<J: Send + 'static> WorkerPool<J> {
     /// Starts `threads` threads, 0 for as many as there are cores, named `name` and a number, and waits until all run.
-    pub(crate) fn new(
+    ///
+    /// # Errors
+    /// The threads could not be started.
+    pub fn new(
         name: &'static str,
         threads: usize,
         job: J,
         run: impl Fn(&mut J) + Send + 'static,
-    ) -> Result<Self, ThreadPoolBuildError> {
+    ) -> Result<Self, WorkerPoolError> {
         let pool = ThreadPoolBuilder::new()
             .num_threads(threads)
             .thread_name(move |index| format!("{name}-{index}"))
-            .build()?;
+            .build()
+            .map_err(|error| WorkerPoolError { threads, detail: error.to_string() })?;
         // A thread allocates while it starts, which on a busy machine may be long after this.
         pool.broadcast(|_| ());
         let state = Mutex::new(State { order: Order::Wait, job });
@@ -52,26 +67,27 @@ impl<J: Send + 'static> Resident<J> {
         Ok(Self { shared, pool })
     }
 
-    /// Prepares the job, has the pool run it and collects what it made. Does not allocate.
-    pub(crate) fn run(&mut self, prepare: impl FnOnce(&mut J), collect: impl FnOnce(&mut J)) {
-        let mut state = self.shared.lock();
-        prepare(&mut state.job);
-        state.order = Order::Run;
-        self.shared.changed.notify_all();
-        let mut state = self
-            .shared
-            .changed
-            .wait_while(state, |state| state.order == Order::Run)
-            .unwrap_or_else(PoisonError::into_inner);
-        collect(&mut state.job);
+    /// Hands the job out, to give it what it works on and to take what it made. Does not allocate.
+    pub fn with<R>(&mut self, look: impl FnOnce(&mut J) -> R) -> R {
+        look(&mut self.shared.lock().job)
     }
 
-    pub(crate) fn threads(&self) -> usize {
+    /// Has the threads run the job, and waits for them. Does not allocate.
+    pub fn run(&mut self) {
+        let mut state = self.shared.lock();
+        state.order = Order::Run;
+        self.shared.changed.notify_all();
+        let running = self.shared.changed.wait_while(state, |state| state.order == Order::Run);
+        drop(running.unwrap_or_else(PoisonError::into_inner));
+    }
+
+    /// How many threads there are.
+    pub fn threads(&self) -> usize {
         self.pool.current_num_threads()
     }
 }
 
-impl<J> Drop for Resident<J> {
+impl<J> Drop for WorkerPool<J> {
     fn drop(&mut self) {
         self.shared.lock().order = Order::Quit;
         self.shared.changed.notify_all();
@@ -108,15 +124,19 @@ mod tests {
     #[test]
     fn a_job_runs_once_for_each_order_inside_its_pool() {
         let seen = Vec::<(u32, Option<usize>)>::new();
-        let mut resident = Resident::new("test", 2, (0, seen), |(input, seen)| {
+        let mut pool = WorkerPool::new("test", 2, (0, seen), |(input, seen)| {
             seen.push((*input * 2, rayon::current_thread_index()));
         })
         .unwrap();
-        assert_eq!(resident.threads(), 2);
+        assert_eq!(pool.threads(), 2);
         for input in 1..=3 {
-            resident.run(|job| job.0 = input, |job| assert_eq!(job.1.len(), input as usize));
+            pool.with(|job| job.0 = input);
+            pool.run();
+            assert_eq!(pool.with(|job| job.1.len()), input as usize);
         }
-        resident.run(|_| (), |job| assert_eq!(job.1.iter().map(|entry| entry.0).collect::<Vec<_>>(), [2, 4, 6, 6]));
-        resident.run(|_| (), |job| assert!(job.1.iter().all(|entry| entry.1.is_some())));
+        pool.run();
+        let seen = pool.with(|job| job.1.clone());
+        assert_eq!(seen.iter().map(|entry| entry.0).collect::<Vec<_>>(), [2, 4, 6, 6]);
+        assert!(seen.iter().all(|entry| entry.1.is_some()));
     }
 }
