@@ -190,6 +190,8 @@ def mismatches(result: dict) -> list[str]:
                 wrong.append(f"{name}: none of {words} is in `{run[word]}`")
     for name in SEATED:
         expect(f"{name}: card opened by", opened_by(result[name]), "seat `seat0`")
+    expect("not_seated: exit", result["not_seated"]["exit"], 0)
+    expect("not_seated: card opened by", opened_by(result["not_seated"]), "holod itself")
     expect_clean("terminal", result["terminal"], AFTER_LOSS, AFTER_LOSS - BEFORE_BELIEVED)
     expect("terminal: times that it came back", result["terminal"]["back"], 0)
     for name in SWITCHED:
@@ -241,6 +243,7 @@ def right_result() -> dict:
         result[name] = right_run(AFTER_LOSS) | {"back": 1, "lost": said, "not_yet": said}
     for name in SEATED:
         result[name]["checks"] = [["card opened by", "seat `seat0`", "", "right"]]
+    result["not_seated"] = {"exit": 0, "checks": [["card opened by", "holod itself", "", "right"]]}
     result["terminal"] = right_run(AFTER_LOSS)
     for name in SWITCHED:
         result[f"terminals_of_{name}"] = {"terminals": "tty2 tty1"}
@@ -301,7 +304,9 @@ def check_the_judge() -> list[str]:
         for key in ["lost", "not_yet"]:
             try_wrong(f"{section} {key}", put(section, key, "something else"))
     for section in SEATED:
-        try_wrong(f"{section} opened by", put(section, "checks", [["card opened by", "holod itself", "", "right"]]))
+        try_wrong(f"{section} opened by", put(section, "checks", right_result()["not_seated"]["checks"]))
+    try_wrong("not_seated exit", put("not_seated", "exit", 1))
+    try_wrong("not_seated opened by", put("not_seated", "checks", right_result()["seat"]["checks"]))
     try_wrong("terminal back", put("terminal", "back", 1))
     for section in SWITCHED:
         try_wrong(f"{section} terminals", put(f"terminals_of_{section}", "terminals", "tty1 tty1"))

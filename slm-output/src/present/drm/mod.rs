@@ -1,10 +1,10 @@
 //! A panel on a connector of a graphics card, without a display server: atomic kernel mode setting.
 //!
-//! [`DrmPanel`] rules the card while it runs. It finds the connector by its name or its monitor ([`find`](self)), sets
-//! the panel's own mode and everything that keeps levels from being changed on the way ([`DisplayCheck`]), and then
-//! flips once every refresh between four buffers, also where no newer frame has come, so that each refresh is proven
-//! by an event of its own. What an event says is judged by [`FlipClock`]; the frame for the next refresh is chosen as
-//! late as [`CommitMargin`] thinks safe.
+//! [`DrmPanel`] rules the card while it runs; where there is a seat manager, that opens it ([`seat`](self)). It finds the
+//! connector by its name or its monitor ([`find`](self)), sets the panel's own mode and everything that keeps levels
+//! from being changed on the way ([`DisplayCheck`]), and then flips once every refresh between four buffers, also where
+//! no newer frame has come, so that each refresh is proven by an event of its own. What an event says is judged by
+//! [`FlipClock`]; the frame for the next refresh is chosen as late as [`CommitMargin`] thinks safe.
 //!
 //! `slm-output/doc/drm.md` says how to give holod a connector and which drivers are known to tell wrong times.
 
