@@ -101,6 +101,9 @@ pub enum PanelFault {
     /// Another program drives the display.
     #[error("another program took the display over: switch back to holod's terminal or end that program")]
     MastershipLost,
+    /// The seat that the display belongs to shows another session.
+    #[error("the display was switched to another session: switch back to holod's terminal")]
+    SwitchedAway,
     /// The graphics device is gone or was reset.
     #[error("the graphics device was lost")]
     DeviceLost,

@@ -20,11 +20,14 @@ use rustix::fs::OFlags;
 
 use super::error::DrmError;
 use super::find::SeenConnector;
+use super::seat::{Seat, SeatLease};
 use super::settings::{PipeProperties, Properties};
 
 /// An open card.
 #[derive(Debug)]
 pub(crate) struct Card {
+    /// Given back before the file is closed.
+    lease: Option<SeatLease>,
     file: File,
     path: PathBuf,
     driver: String,
@@ -40,15 +43,17 @@ impl Device for Card {}
 impl ControlDevice for Card {}
 
 impl Card {
-    /// Opens the card at `path` and becomes its master.
-    pub(crate) fn open(path: &Path) -> Result<Self, DrmError> {
-        let flags = (OFlags::NONBLOCK | OFlags::CLOEXEC).bits() as i32;
-        let file = match OpenOptions::new().read(true).write(true).custom_flags(flags).open(path) {
-            Ok(file) => file,
-            Err(why) if why.kind() == ErrorKind::PermissionDenied => return Err(permission(path)),
-            Err(source) => return Err(DrmError::Refused { what: "opening", card: path.to_owned(), source }),
+    /// Opens the card at `path`, through `seat` where there is one, and becomes its master.
+    pub(crate) fn open(path: &Path, seat: Option<&Seat>) -> Result<Self, DrmError> {
+        let (file, lease) = match seat {
+            Some(seat) => {
+                let not_given = |source| DrmError::NotOfSeat { card: path.to_owned(), source };
+                let (file, lease) = seat.open_card(path).map_err(not_given)?;
+                (file.into(), Some(lease))
+            }
+            None => (open_file(path)?, None),
         };
-        let mut card = Self { file, path: path.to_owned(), driver: "unknown".to_owned() };
+        let mut card = Self { lease, file, path: path.to_owned(), driver: "unknown".to_owned() };
         if let Ok(driver) = card.get_driver() {
             card.driver = driver.name().to_string_lossy().into_owned();
         }
@@ -75,9 +80,23 @@ impl Card {
         &self.driver
     }
 
-    /// Who opens a card that has no master is its master; after mastership was lost it must be asked for.
+    /// Who opened the card: the seat's manager, or holod itself.
+    pub(crate) fn opened_by(&self) -> String {
+        self.lease.as_ref().map_or("holod itself".to_owned(), |lease| format!("seat `{}`", lease.seat()))
+    }
+
+    /// Who opens a card that has no master is its master; after mastership was lost it must be asked for. Of a card that a
+    /// seat has opened its manager makes the file master when it opens it and when the session comes to the front; then it
+    /// can only be seen whether it did.
     pub(crate) fn become_master(&self) -> io::Result<()> {
-        self.acquire_master_lock()
+        if self.lease.is_none() {
+            return self.acquire_master_lock();
+        }
+        // Only a master may be asked to vouch for another client; nobody has the number 0.
+        match drm_ffi::auth::auth_magic_token(self.as_fd(), 0) {
+            Err(why) if why.kind() == ErrorKind::PermissionDenied => Err(why),
+            _ => Ok(()),
+        }
     }
 
     /// Whether flips are stamped by the monotonic clock.
@@ -104,6 +123,14 @@ impl Card {
         let target = VblankWaitTarget::Relative(1);
         self.wait_vblank(target, VblankWaitFlags::empty(), pipe.crtc_index, 0).map(|reply| reply.frame())
     }
+}
+
+fn open_file(path: &Path) -> Result<File, DrmError> {
+    let flags = (OFlags::NONBLOCK | OFlags::CLOEXEC).bits() as i32;
+    OpenOptions::new().read(true).write(true).custom_flags(flags).open(path).map_err(|source| match source.kind() {
+        ErrorKind::PermissionDenied => permission(path),
+        _ => DrmError::Refused { what: "opening", card: path.to_owned(), source },
+    })
 }
 
 /// Who may open `path` instead.

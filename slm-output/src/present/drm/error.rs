@@ -67,6 +67,14 @@ pub enum DrmError {
         /// Its name in the kernel.
         kernel: String,
     },
+    /// The seat's manager does not open the card: its node is gone, or it belongs to another seat.
+    #[error("the seat's manager does not open {card}: {source}")]
+    NotOfSeat {
+        /// The card's node.
+        card: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
     /// Another program rules the card.
     #[error(
         "another program is master of {card}: {}. One program at a time may set a card's modes: end it, or give the \

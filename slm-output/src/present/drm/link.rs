@@ -15,6 +15,7 @@ use super::event::{Uevent, for_each_flip};
 use super::find::{NotFound, SYS_CLASS_DRM, SeenConnector, choose, seen_connectors};
 use super::hotplug::Hotplug;
 use super::mode;
+use super::seat::Seat;
 use super::settings::{self, Change, DisplayCheck, PipeProperties, Verdict};
 use super::timing::FlipStamp;
 
@@ -56,15 +57,19 @@ pub(crate) struct Link {
 impl Link {
     /// Finds the connector, becomes master of its card and makes it ready: the first buffer, written by `write_flat`, is on
     /// the screen.
-    pub(crate) fn open(wanted: &Wanted, write_flat: impl Fn(&mut ScanBuffer)) -> Result<Self, DrmError> {
+    pub(crate) fn open(
+        wanted: &Wanted,
+        seat: Option<&Seat>,
+        write_flat: impl Fn(&mut ScanBuffer),
+    ) -> Result<Self, DrmError> {
         let seen = find(wanted, Path::new(SYS_CLASS_DRM))?;
-        let card = Card::open(&seen.card)?;
+        let card = Card::open(&seen.card, seat)?;
         let format = format(wanted.channel_bits);
         let buffer = || ScanBuffer::new(&card, wanted.size, format);
         let mut buffers = [buffer()?, buffer()?, buffer()?, buffer()?];
         buffers.iter_mut().for_each(write_flat);
         let hotplug = Hotplug::open().ok();
-        let wake = wake_fd(&card, hotplug.as_ref()).map_err(|why| card.refused("waiting for it")(why.into()))?;
+        let wake = wake_fd(&card, hotplug.as_ref(), seat).map_err(|why| card.refused("waiting for it")(why.into()))?;
         let node = seen.card.file_name().map(|name| name.as_encoded_bytes().to_vec()).unwrap_or_default();
         let ready = Ready::make(&card, &seen, wanted, &buffers[0])?;
         let Ready { pipe, mode, buffer_property, changes, mut checks } = ready;
@@ -196,12 +201,15 @@ fn find(wanted: &Wanted, class: &Path) -> Result<SeenConnector, DrmError> {
     })
 }
 
-/// One descriptor that is readable when the card or the hotplug socket is.
-fn wake_fd(card: &Card, hotplug: Option<&Hotplug>) -> Result<OwnedFd, Errno> {
+/// One descriptor that is readable when the card, the hotplug socket or the seat's bell is.
+fn wake_fd(card: &Card, hotplug: Option<&Hotplug>, seat: Option<&Seat>) -> Result<OwnedFd, Errno> {
     let wake = epoll::create(epoll::CreateFlags::CLOEXEC)?;
     epoll::add(&wake, card, epoll::EventData::new_u64(0), epoll::EventFlags::IN)?;
     if let Some(hotplug) = hotplug {
         epoll::add(&wake, hotplug, epoll::EventData::new_u64(1), epoll::EventFlags::IN)?;
+    }
+    if let Some(seat) = seat {
+        epoll::add(&wake, seat.bell(), epoll::EventData::new_u64(2), epoll::EventFlags::IN)?;
     }
     Ok(wake)
 }
@@ -269,7 +277,14 @@ impl Ready {
             format!("{} at {hz:.3} Hz, pixel clock {} kHz", size(mode::resolution(mode)), mode.clock())
         };
         let found = crtc.mode().filter(|_| properties.crtc.value("ACTIVE") == Some(1));
+        let opened_by = DisplayCheck {
+            name: "card opened by".to_owned(),
+            found: card.opened_by(),
+            wanted: "a seat, or else holod itself".to_owned(),
+            verdict: Verdict::Right,
+        };
         let mut checks = vec![
+            opened_by,
             DisplayCheck::equal("mode", found.as_ref().map_or("off".to_owned(), mode_words), mode_words(&self.mode)),
             match seen.edid.as_ref().and_then(|edid| edid.native) {
                 Some(native) => DisplayCheck::equal("panel's own pixels (EDID)", size(native), size(wanted.size)),

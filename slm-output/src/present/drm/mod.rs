@@ -1,10 +1,10 @@
 //! A panel on a connector of a graphics card, without a display server: atomic kernel mode setting.
 //!
-//! [`DrmPanel`] rules the card while it runs. It finds the connector by its name or its monitor ([`find`](self)), sets
-//! the panel's own mode and everything that keeps levels from being changed on the way ([`DisplayCheck`]), and then
-//! flips once every refresh between four buffers, also where no newer frame has come, so that each refresh is proven
-//! by an event of its own. What an event says is judged by [`FlipClock`]; the frame for the next refresh is chosen as
-//! late as [`CommitMargin`] thinks safe.
+//! [`DrmPanel`] rules the card while it runs; where there is a seat manager, that opens it ([`seat`](self)). It finds the
+//! connector by its name or its monitor ([`find`](self)), sets the panel's own mode and everything that keeps levels
+//! from being changed on the way ([`DisplayCheck`]), and then flips once every refresh between four buffers, also where
+//! no newer frame has come, so that each refresh is proven by an event of its own. What an event says is judged by
+//! [`FlipClock`]; the frame for the next refresh is chosen as late as [`CommitMargin`] thinks safe.
 //!
 //! `slm-output/doc/drm.md` says how to give holod a connector and which drivers are known to tell wrong times.
 
@@ -17,6 +17,11 @@ mod hotplug;
 mod link;
 mod margin;
 mod mode;
+#[cfg(feature = "seat")]
+mod seat;
+#[cfg(not(feature = "seat"))]
+#[path = "no_seat.rs"]
+mod seat;
 mod settings;
 mod timing;
 
@@ -40,6 +45,7 @@ use crate::packing::{PixelFormat, write_frame};
 use card::ScanBuffer;
 use event::Uevent;
 use link::{BUFFERS, Link, Wanted};
+use seat::{Seat, Standing};
 
 /// A flip that has not come after this time never will.
 const FLIP_WAIT: TimeNs = TimeNs(500_000_000);
@@ -60,7 +66,10 @@ pub struct DrmTarget {
 #[derive(Debug)]
 pub struct DrmPanel {
     wanted: Wanted,
+    /// Closed before the seat is.
     link: Option<Link>,
+    /// Whose manager opened the card.
+    seat: Option<Seat>,
     period: TimeNs,
     clock: FlipClock,
     margin: CommitMargin,
@@ -108,7 +117,15 @@ impl DrmPanel {
             refresh_hz: setup.panel.refresh_hz,
             channel_bits: layout.packing.channel_bits(),
         };
-        let link = Link::open(&wanted, |buffer| write(buffer, &setup.flat, 0))?;
+        let write_flat = |buffer: &mut ScanBuffer| write(buffer, &setup.flat, 0);
+        let mut seat = Seat::open();
+        let mut link = Link::open(&wanted, seat.as_ref(), write_flat);
+        if matches!(link, Err(DrmError::NotOfSeat { .. })) {
+            // The card of another seat is one like any other.
+            seat = None;
+            link = Link::open(&wanted, None, write_flat);
+        }
+        let link = link?;
         let (period, blank) = (link.period(), link.blank());
         Ok(Self {
             wanted,
@@ -116,6 +133,7 @@ impl DrmPanel {
             clock: FlipClock::new(period, blank, link.is_monotonic()),
             margin: CommitMargin::new(period, blank),
             link: Some(link),
+            seat,
             flat: setup.flat.clone(),
             flat_wanted: false,
             shown: setup.flat.clone(),
@@ -146,6 +164,11 @@ impl DrmPanel {
         presented: &mut dyn FnMut(PresentedRefresh),
     ) -> Result<(), PanelFault> {
         self.report_held(now, presented);
+        match self.seat.as_ref().map(Seat::standing) {
+            None | Some(Standing::InFront) => {}
+            Some(Standing::Gone) => return Err(PanelFault::DeviceLost),
+            Some(Standing::Leaving | Standing::Behind) => return Err(PanelFault::SwitchedAway),
+        }
         match self.link()?.hotplug() {
             Uevent::Removed => return Err(PanelFault::DeviceLost),
             Uevent::Changed if !self.link()?.is_connected().map_err(fault_of)? => return Err(PanelFault::Unplugged),
@@ -250,15 +273,38 @@ impl DrmPanel {
         Ok(next)
     }
 
+    /// Whether the panel may be taken back as far as the seat goes. Lasers have been told of the loss by now, so the seat
+    /// may be left to another session.
+    fn follow_seat(&mut self) -> Result<(), PanelFault> {
+        match self.seat.as_ref().map(Seat::standing) {
+            None | Some(Standing::InFront) => Ok(()),
+            Some(Standing::Leaving | Standing::Behind) => {
+                self.seat.as_ref().inspect(|seat| seat.leave());
+                Err(PanelFault::SwitchedAway)
+            }
+            Some(Standing::Gone) => {
+                self.lost = Some(PanelFault::DeviceLost);
+                Ok(())
+            }
+        }
+    }
+
     fn take_back(&mut self) -> Result<(), DrmError> {
-        let Self { wanted, link, flat, .. } = self;
+        let Self { wanted, link, seat, flat, .. } = self;
         let write_flat = |buffer: &mut ScanBuffer| write(buffer, flat, 0);
         match link {
             Some(link) if self.lost != Some(PanelFault::DeviceLost) => link.reopen(wanted, write_flat),
             _ => {
                 // Closed first: a card has one master.
                 *link = None;
-                *link = Some(Link::open(wanted, write_flat)?);
+                let is_there = |seat: &&Seat| seat.standing() != Standing::Gone;
+                if seat.as_ref().is_some_and(|seat| !is_there(&seat)) {
+                    // Of a seat manager that was started anew. Until there is one the card is tried as it is.
+                    *seat = Seat::open().or(seat.take());
+                }
+                let manager = seat.as_ref().filter(is_there);
+                *link = Some(Link::open(wanted, manager, write_flat)?);
+                *seat = seat.take().filter(|seat| is_there(&seat));
                 Ok(())
             }
         }
@@ -299,11 +345,13 @@ impl Presenter for DrmPanel {
     }
 
     fn recover(&mut self, now: TimeNs) -> Result<(), PanelFault> {
+        self.follow_seat()?;
         if let Err(why) = self.take_back() {
             let fault = why.fault();
-            // What is gone is opened anew from now on.
-            if fault == PanelFault::DeviceLost {
-                self.lost = Some(fault);
+            // What is gone is opened anew from now on; and so is what another program is master of where only the seat's
+            // manager can ask for it, which it does when it opens it.
+            if fault == PanelFault::DeviceLost || (fault == PanelFault::MastershipLost && self.seat.is_some()) {
+                self.lost = Some(PanelFault::DeviceLost);
             }
             return Err(fault);
         }
@@ -361,7 +409,9 @@ impl DrmError {
             Self::OtherMaster { .. } => PanelFault::MastershipLost,
             Self::Disconnected { .. } | Self::NoSuchConnector { .. } | Self::Ambiguous { .. } => PanelFault::Unplugged,
             Self::OtherSize { .. } | Self::NoSuchMode { .. } | Self::NotAsSent { .. } => PanelFault::ModeRefused,
-            Self::NoCard { .. } | Self::Permission { .. } | Self::Unsupported { .. } => PanelFault::DeviceLost,
+            Self::NoCard { .. } | Self::Permission { .. } | Self::NotOfSeat { .. } | Self::Unsupported { .. } => {
+                PanelFault::DeviceLost
+            }
             Self::Refused { source, .. } => match Errno::from_io_error(source).map(fault_of) {
                 Some(fault) if fault.is_recoverable() => fault,
                 _ => PanelFault::DeviceLost,
