@@ -5,7 +5,7 @@ use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::blocks::{Blocks, scale_of};
-use super::conv::FeatureMap;
+use super::feature_map::FeatureMap;
 use crate::RgbdFrame;
 use crate::weights::{Grid, OUTPUT_CHANNELS};
 

@@ -4,7 +4,7 @@ use holod_calibration::{PupilDiameter, Resolution};
 use num_complex::{Complex32, Complex64};
 use proptest::prelude::*;
 
-use super::conv::FeatureMap;
+use super::feature_map::FeatureMap;
 use super::network::{Network, Seen};
 use super::*;
 use crate::engine::reference::{self, Value};
