@@ -340,3 +340,132 @@ impl TileRow<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use rayon::iter::ParallelIterator;
+
+    use super::*;
+
+    /// Largest error allowed, over the output's root mean square: a quarter of what stages of whole networks may have, which
+    /// are judged by their largest value.
+    const TOLERANCE: f64 = 2e-5;
+    const SLOPE: f32 = 0.1;
+
+    fn noise(index: usize) -> f32 {
+        let mixed = (index as u32 ^ 0x5bd1_e995).wrapping_mul(0x9e37_79b9);
+        ((mixed ^ (mixed >> 15)).wrapping_mul(0x2c1b_3c6d) >> 8) as f32 / (1 << 23) as f32 - 1.0
+    }
+
+    fn weight(output: usize, input: usize, tap: usize) -> f32 {
+        noise((output * 100 + input) * TAPS + tap)
+    }
+
+    fn value(x: usize, y: usize, channel: usize) -> f32 {
+        noise(1_000_000 + (y * 300 + x) * 100 + channel)
+    }
+
+    /// A layer of `inputs` to `outputs` channels with the maps that it reads and writes, both filled.
+    fn layer(
+        [width, height, inputs, outputs]: [usize; 4],
+        epilogue: Epilogue,
+        set: InstructionSet,
+    ) -> (PlainConv, FeatureMap, FeatureMap) {
+        let mut conv = PlainConv::new(inputs, outputs, epilogue, SLOPE, set);
+        conv.fill(inputs, (0..outputs).map(|output| noise(output + 9_000_000)), weight);
+        let map = |channels: usize| {
+            let mut map = FeatureMap::new(width, height, channels, set);
+            for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {
+                let pixel = pixel_mut(&mut map, x, y);
+                pixel.iter_mut().take(channels).enumerate().for_each(|(channel, to)| *to = value(x, y, channel));
+            }
+            map
+        };
+        (conv, map(inputs), map(outputs))
+    }
+
+    fn pixel_mut(map: &mut FeatureMap, x: usize, y: usize) -> &mut [f32] {
+        let stride = map.stride;
+        let row = map.rows_mut().collect::<Vec<_>>().remove(y);
+        &mut row[(x + 1) * stride..][..stride]
+    }
+
+    fn run(conv: &PlainConv, input: &FeatureMap, output: &mut FeatureMap) {
+        conv.run(input, &mut Scratch::new(std::iter::once(conv)), output);
+    }
+
+    /// The sum over taps in double precision.
+    fn expected([width, height, inputs, _]: [usize; 4], epilogue: Epilogue, [x, y, output]: [usize; 3]) -> f64 {
+        let mut sum = f64::from(noise(output + 9_000_000));
+        for (tap, input) in (0..TAPS).flat_map(|tap| (0..inputs).map(move |input| (tap, input))) {
+            let (x, y) = ((x + tap % 3).wrapping_sub(1), (y + tap / 3).wrapping_sub(1));
+            if x < width && y < height {
+                sum += f64::from(weight(output, input, tap)) * f64::from(value(x, y, input));
+            }
+        }
+        if epilogue == Epilogue::ResidualLeaky {
+            sum = 0.5 * sum + f64::from(value(x, y, output));
+        }
+        if epilogue == Epilogue::None || sum >= 0.0 { sum } else { f64::from(SLOPE) * sum }
+    }
+
+    #[test]
+    fn a_layer_is_the_sum_over_taps_at_every_size_and_width_of_channels() {
+        let sizes = [[1, 1, 1, 1], [9, 5, 24, 24], [13, 6, 32, 32], [101, 3, 45, 56], [97, 4, 82, 32], [6, 10, 33, 6]];
+        for (set, size) in InstructionSet::available().flat_map(|set| sizes.map(|size| (set, size))) {
+            for epilogue in [Epilogue::None, Epilogue::Leaky, Epilogue::ResidualLeaky] {
+                let (conv, input, mut output) = layer(size, epilogue, set);
+                run(&conv, &input, &mut output);
+                let [width, height, _, outputs] = size;
+                let mut found = Vec::new();
+                for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {
+                    let place = |channel| (f64::from(output.pixel(x, y)[channel]), [x, y, channel]);
+                    found.extend((0..outputs).map(place));
+                }
+                let wanted: Vec<f64> = found.iter().map(|(_, at)| expected(size, epilogue, *at)).collect();
+                let rms = (wanted.iter().map(|value| value * value).sum::<f64>() / wanted.len() as f64).sqrt();
+                let worst = |spoiled: f64| {
+                    let first = std::iter::once(found[0].0 + spoiled);
+                    let values = first.chain(found[1..].iter().map(|(value, _)| *value));
+                    let errors = values.zip(&wanted).map(|(value, wanted)| (value - wanted).abs() / rms);
+                    errors.fold(0.0, |worst, error| if error.is_nan() { f64::INFINITY } else { f64::max(worst, error) })
+                };
+                let context = format!("{size:?} {epilogue:?} on {}", set.name());
+                assert!(worst(0.0) < TOLERANCE, "{context}: {}", worst(0.0));
+                assert!(worst(2.0 * TOLERANCE * rms) > TOLERANCE, "{context}: the comparison is blind");
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_no_number_stays_in_its_tiles_and_in_its_frame() {
+        let size @ [width, height, _, outputs] = [19, 14, 24, 24];
+        for (set, spoiler) in InstructionSet::available().flat_map(|set| [f32::NAN, f32::INFINITY].map(|v| (set, v))) {
+            let (conv, mut input, mut output) = layer(size, Epilogue::Leaky, set);
+            run(&conv, &input, &mut output);
+            let values = |map: &FeatureMap, x, y| map.pixel(x, y)[..outputs].to_vec();
+            let all = |map: &FeatureMap| -> Vec<_> {
+                (0..width * height).flat_map(|index| values(map, index % width, index / width)).collect()
+            };
+            let clean = all(&output);
+            for (x, y) in [(0, 0), (18, 13), (7, 8), (11, 3)] {
+                let before = pixel_mut(&mut input, x, y)[5];
+                pixel_mut(&mut input, x, y)[5] = spoiler;
+                run(&conv, &input, &mut output);
+                for (place, (value, clean)) in all(&output).into_iter().zip(&clean).enumerate() {
+                    let (at_x, at_y) = (place / outputs % width, place / outputs / width);
+                    let reads =
+                        |at: usize, from: usize| (at / TILE * TILE..at / TILE * TILE + POINTS).contains(&(from + 1));
+                    if at_x.abs_diff(x) <= 1 && at_y.abs_diff(y) <= 1 {
+                        assert!(!value.is_finite(), "({at_x}, {at_y}) hides what ({x}, {y}) is");
+                    } else if !(reads(at_x, x) && reads(at_y, y)) {
+                        assert_eq!(value, *clean, "({at_x}, {at_y}) shows what ({x}, {y}) is");
+                    }
+                }
+                pixel_mut(&mut input, x, y)[5] = before;
+                run(&conv, &input, &mut output);
+                assert_eq!(all(&output), clean, "({x}, {y}) left a trace");
+            }
+        }
+    }
+}
