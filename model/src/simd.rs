@@ -23,6 +23,8 @@ pub(crate) trait Simd: Copy + Send + Sync {
     unsafe fn store(self, to: *mut f32, vector: Self::Vector);
     /// a·b + c
     fn mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
+    fn add(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
+    fn sub(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
     fn mul(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
     fn max(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
     /// The sums of lanes 0 and 1, 2 and 3 and so on of `a`, then those of `b`.
@@ -151,6 +153,16 @@ impl<const N: usize> Simd for Portable<N> {
     }
 
     #[inline(always)]
+    fn add(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
+        std::array::from_fn(|lane| a[lane] + b[lane])
+    }
+
+    #[inline(always)]
+    fn sub(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
+        std::array::from_fn(|lane| a[lane] - b[lane])
+    }
+
+    #[inline(always)]
     fn mul(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
         std::array::from_fn(|lane| a[lane] * b[lane])
     }
@@ -178,7 +190,8 @@ impl<const N: usize> Simd for Portable<N> {
 macro_rules! x86_instruction_set {
     (
         $(#[$doc:meta])* $name:ident, $lanes:literal, $vector:ident, $features:literal, detect $($feature:tt),+;
-        $set1:ident, $loadu:ident, $storeu:ident, $fmadd:ident, $mul:ident, $max:ident;
+        $set1:ident, $loadu:ident, $storeu:ident, $fmadd:ident, $add:ident, $sub:ident, $mul:ident,
+        $max:ident;
         $set1_pair:ident, $cast_pair:ident; add_pairs($a:ident, $b:ident) $add_pairs:expr
     ) => {
         $(#[$doc])*
@@ -227,6 +240,16 @@ macro_rules! x86_instruction_set {
             }
 
             #[inline(always)]
+            fn add(self, a: Self::Vector, b: Self::Vector) -> Self::Vector {
+                unsafe { std::arch::x86_64::$add(a, b) }
+            }
+
+            #[inline(always)]
+            fn sub(self, a: Self::Vector, b: Self::Vector) -> Self::Vector {
+                unsafe { std::arch::x86_64::$sub(a, b) }
+            }
+
+            #[inline(always)]
             fn mul(self, a: Self::Vector, b: Self::Vector) -> Self::Vector {
                 unsafe { std::arch::x86_64::$mul(a, b) }
             }
@@ -257,7 +280,8 @@ macro_rules! x86_instruction_set {
 x86_instruction_set! {
     /// AVX2 with fused multiply-add: 16 registers of 8 lanes.
     Avx2, 8, __m256, "avx2,fma", detect "avx2", "fma";
-    _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_mul_ps, _mm256_max_ps;
+    _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_add_ps, _mm256_sub_ps,
+    _mm256_mul_ps, _mm256_max_ps;
     _mm256_set1_pd, _mm256_castpd_ps;
     add_pairs(a, b) _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(_mm256_castps_pd(_mm256_hadd_ps(a, b))))
 }
@@ -266,7 +290,8 @@ x86_instruction_set! {
 x86_instruction_set! {
     /// AVX-512: 32 registers of 16 lanes.
     Avx512, 16, __m512, "avx512f", detect "avx512f";
-    _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_mul_ps, _mm512_max_ps;
+    _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_add_ps, _mm512_sub_ps,
+    _mm512_mul_ps, _mm512_max_ps;
     _mm512_set1_pd, _mm512_castpd_ps;
     add_pairs(a, b) {
         // Lanes from 16 on are those of `b`.

@@ -513,7 +513,12 @@ impl Metadata<'_> {
                 "an even number from 4 to 64 (a first, a last and pairs between)",
             )?;
         }
-        require((2..=64).contains(depth_layers), "depth_layers", depth_layers.to_string(), "2 to 64")?;
+        require(
+            (2..=MOST_DEPTH_LAYERS).contains(depth_layers),
+            "depth_layers",
+            depth_layers.to_string(),
+            &format!("2 to {MOST_DEPTH_LAYERS}"),
+        )?;
         require(
             config.architecture == Architecture::Direct || config.grid == Grid::HalfBand,
             "grid",
@@ -632,6 +637,8 @@ const SHARPNESS: &str = "sharpness";
 pub(crate) const LIT: usize = 4;
 pub(crate) const REFINED: usize = 3;
 
+/// Depth layers that a network may have.
+pub(crate) const MOST_DEPTH_LAYERS: usize = 64;
 /// Gaussian blurs between which the `layered` family's first net chooses.
 pub(crate) const LAYERED_BLURS: usize = 3;
 

@@ -10,8 +10,9 @@ use super::blocks::Blocks;
 use super::depth_layers::DepthLayers;
 use super::maps::{BLOCK, SCALE, sample_pitch};
 use crate::RgbdFrame;
-use crate::optics::{TransposedFft2d, signed_bin};
-use crate::weights::NetworkConfig;
+use crate::optics::{PlanesFft, signed_bin};
+use crate::simd::{InstructionSet, Simd, Task};
+use crate::weights::{MOST_DEPTH_LAYERS, NetworkConfig};
 
 /// Entries of the disc's table to a unit of its argument: linear interpolation is then within 5e-7.
 const TABLE_DENSITY: f64 = 256.0;
@@ -19,6 +20,8 @@ const TABLE_DENSITY: f64 = 256.0;
 const LARGEST_ARGUMENT: f64 = 4096.0;
 /// The least share of a white scene's light by which what is seen is divided.
 const LEAST_COVER: f32 = 0.02;
+/// Bins of a spectrum that are blurred together.
+const BINS: usize = 16;
 /// White with red, and green with blue: real pictures, two to a complex transform.
 const PAIRS: usize = 2;
 
@@ -32,17 +35,18 @@ pub(super) struct Defocus {
     argument_per_mm: f64,
     /// The pupil that `discs` is for.
     pupil_mm: f32,
-    /// Over the number of samples: spectra, transposed, of the discs between layers that are 0, 1, 2, .. apart.
-    discs: Vec<Vec<f32>>,
-    /// Whether a layer has a pixel; if so, the spectra of its light, transposed.
+    /// [width, layers, height], over the number of samples: spectra of the discs between layers that are 0, 1, 2, .. apart.
+    discs: Vec<f32>,
+    /// Whether a layer has a pixel.
     present: Vec<bool>,
-    spectra: Vec<[Vec<Complex32>; PAIRS]>,
     seen: [Vec<Complex32>; PAIRS],
-    fft: TransposedFft2d<f32>,
+    /// For each layer its light's pairs, and then those seen at the focus on it.
+    fft: PlanesFft,
+    set: InstructionSet,
 }
 
 impl Defocus {
-    pub(super) fn new(config: &NetworkConfig, size: Resolution) -> Self {
+    pub(super) fn new(config: &NetworkConfig, size: Resolution, set: InstructionSet) -> Self {
         let count = config.depth_layers;
         let optics = config.optics.geometry(size);
         let layer_dpt = (optics.depth_near.0 - optics.depth_far.0) / count as f64;
@@ -60,11 +64,11 @@ impl Defocus {
             disc_table: (0..(largest.min(LARGEST_ARGUMENT) * TABLE_DENSITY) as usize + 2).map(disc).collect(),
             argument_per_mm,
             pupil_mm: f32::NAN,
-            discs: vec![vec![0.0; size.pixels()]; count],
+            discs: vec![0.0; count * size.pixels()],
             present: vec![false; count],
-            spectra: (0..count).map(|_| [plane(), plane()]).collect(),
             seen: [plane(), plane()],
-            fft: TransposedFft2d::new(size.width, size.height),
+            fft: PlanesFft::new(size.width, size.height, PAIRS * count),
+            set,
         }
     }
 
@@ -72,8 +76,9 @@ impl Defocus {
     pub(super) fn expect(&mut self, frame: &RgbdFrame, layers: &DepthLayers, pupil_mm: f32, amplitudes: &mut [f32]) {
         self.shape_discs(pupil_mm);
         for layer in layers.numbers() {
-            self.transform_layer(frame, layers, layer);
+            self.take_layer(frame, layers, layer);
         }
+        self.blur();
         for (focus, amplitudes) in amplitudes.chunks_exact_mut(3 * self.size.pixels()).enumerate() {
             self.see(focus, amplitudes);
         }
@@ -86,27 +91,28 @@ impl Defocus {
         }
         let Self { size: Resolution { width, height }, disc_table, argument_per_mm, discs, .. } = self;
         let (width, height, norm) = (*width, *height, 1.0 / (*width * *height) as f32);
-        for (apart, disc) in discs.iter_mut().enumerate() {
-            let scale = *argument_per_mm * f64::from(pupil_mm) * apart as f64 * TABLE_DENSITY;
-            disc.par_chunks_exact_mut(height).enumerate().for_each(|(kx, disc)| {
-                let fx = signed_bin(kx, width) as f64 / width as f64;
+        let scale = *argument_per_mm * f64::from(pupil_mm) * TABLE_DENSITY;
+        let count = discs.len() / (width * height);
+        discs.par_chunks_exact_mut(count * height).enumerate().for_each(|(kx, discs)| {
+            let fx = signed_bin(kx, width) as f64 / width as f64;
+            for (apart, disc) in discs.chunks_exact_mut(height).enumerate() {
                 for (ky, value) in disc.iter_mut().enumerate() {
                     let fy = signed_bin(ky, height) as f64 / height as f64;
-                    let entry = scale * (fx * fx + fy * fy).sqrt();
+                    let entry = scale * apart as f64 * (fx * fx + fy * fy).sqrt();
                     let (below, share) = (entry as usize, entry.fract() as f32);
                     *value = match disc_table.get(below..below + 2) {
                         Some(&[low, high]) => norm * (low + share * (high - low)),
                         _ => 0.0,
                     };
                 }
-            });
-        }
+            }
+        });
         self.pupil_mm = pupil_mm;
     }
 
-    /// The spectra of what lies in one layer.
-    fn transform_layer(&mut self, frame: &RgbdFrame, layers: &DepthLayers, layer: u8) {
-        let Self { size, present, spectra, seen, fft, .. } = self;
+    /// Takes what lies in one layer.
+    fn take_layer(&mut self, frame: &RgbdFrame, layers: &DepthLayers, layer: u8) {
+        let Self { size, present, seen, fft, .. } = self;
         let (width, pixels) = (size.width, frame.resolution.pixels());
         let present = &mut present[usize::from(layer)];
         *present = layers.cover(layer).any(|cover| cover > 0.0);
@@ -132,37 +138,105 @@ impl Defocus {
                 *green_blue = Complex32::new(green, blue);
             }
         });
-        for (pair, spectrum) in seen.iter_mut().zip(&mut spectra[usize::from(layer)]) {
-            fft.forward(pair);
-            spectrum.copy_from_slice(&fft.spectrum);
+        for (pair, seen) in seen.iter_mut().enumerate() {
+            fft.take(PAIRS * usize::from(layer) + pair, seen);
         }
+    }
+
+    /// Turns the layers' light into what is seen at the focus on each.
+    fn blur(&mut self) {
+        let Self { size, discs, present, fft, set, .. } = self;
+        let discs_len = discs.len() / size.width;
+        fft.for_each_column(|kx, mut column| {
+            let planes = (0..PAIRS * present.len()).filter(|plane| present[plane / PAIRS]);
+            planes.for_each(|plane| column.transform(plane));
+            let discs = &discs[kx * discs_len..][..discs_len];
+            set.run(BlurColumn { values: column.values, discs, present, height: size.height });
+            column.transform_back();
+        });
     }
 
     /// Amplitudes [3, height, width] at the focus on one layer.
     fn see(&mut self, focus: usize, amplitudes: &mut [f32]) {
-        let Self { size, discs, present, spectra, seen, fft, .. } = self;
+        let Self { size, seen, fft, set, .. } = self;
         for (pair, seen) in seen.iter_mut().enumerate() {
-            fft.spectrum.par_chunks_exact_mut(size.height).enumerate().for_each(|(kx, sum)| {
-                sum.fill(Complex32::ZERO);
-                let column = kx * size.height..(kx + 1) * size.height;
-                for (layer, spectra) in spectra.iter().enumerate().filter(|&(layer, _)| present[layer]) {
-                    let disc = &discs[layer.abs_diff(focus)][column.clone()];
-                    for ((sum, value), disc) in sum.iter_mut().zip(&spectra[pair][column.clone()]).zip(disc) {
-                        *sum += value * disc;
-                    }
-                }
-            });
-            fft.inverse(seen);
+            fft.give(PAIRS * focus + pair, seen);
         }
-        let [white_red, green_blue] = &self.seen;
-        let [red, green, blue] = split_planes(amplitudes, size.pixels());
-        let colours = red.par_iter_mut().zip(green).zip(blue);
-        colours.zip(white_red).zip(green_blue).for_each(|((((red, green), blue), white_red), green_blue)| {
+        let ([white_red, green_blue], width) = (&self.seen, size.width);
+        let [red, green, blue] = split_planes(amplitudes, size.pixels()).map(|plane| plane.par_chunks_exact_mut(width));
+        let seen = white_red.par_chunks_exact(width).zip(green_blue.par_chunks_exact(width));
+        red.zip(green).zip(blue).zip(seen).for_each(|(((red, green), blue), (white_red, green_blue))| {
+            set.run(SeenRow { white_red, green_blue, amplitudes: [red, green, blue] });
+        });
+    }
+}
+
+/// One column of all layers' spectra, which become those of what is seen.
+struct BlurColumn<'a> {
+    /// [layers, pairs, height]
+    values: &'a mut [Complex32],
+    /// [layers, height]
+    discs: &'a [f32],
+    present: &'a [bool],
+    height: usize,
+}
+
+impl Task for BlurColumn<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(mut self, _: S) {
+        let mut seen = [[Complex32::ZERO; BINS]; MOST_DEPTH_LAYERS];
+        let in_whole_blocks = self.height - self.height % BINS;
+        for pair in 0..PAIRS {
+            for bin in (0..in_whole_blocks).step_by(BINS) {
+                self.blur::<BINS>(pair, bin, &mut seen);
+            }
+            for bin in in_whole_blocks..self.height {
+                self.blur::<1>(pair, bin, &mut seen);
+            }
+        }
+    }
+}
+
+impl BlurColumn<'_> {
+    /// N bins from `bin` on; `seen` is scratch.
+    #[inline(always)]
+    fn blur<const N: usize>(&mut self, pair: usize, bin: usize, seen: &mut [[Complex32; BINS]]) {
+        let Self { values, discs, present, height } = self;
+        let place = |layer: usize| (layer * PAIRS + pair) * *height + bin;
+        for (focus, seen) in seen.iter_mut().enumerate().take(present.len()) {
+            let mut sum = [Complex32::ZERO; N];
+            for layer in (0..present.len()).filter(|&layer| present[layer]) {
+                let disc = &discs[layer.abs_diff(focus) * *height + bin..][..N];
+                for ((sum, value), disc) in sum.iter_mut().zip(&values[place(layer)..][..N]).zip(disc) {
+                    *sum += value * disc;
+                }
+            }
+            seen[..N].copy_from_slice(&sum);
+        }
+        for (focus, seen) in seen.iter().enumerate().take(present.len()) {
+            values[place(focus)..][..N].copy_from_slice(&seen[..N]);
+        }
+    }
+}
+
+/// One row of the amplitudes seen, of all colours.
+struct SeenRow<'a> {
+    white_red: &'a [Complex32],
+    green_blue: &'a [Complex32],
+    amplitudes: [&'a mut [f32]; 3],
+}
+
+impl Task for SeenRow<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let Self { white_red, green_blue, amplitudes: [red, green, blue] } = self;
+        let colours = red.iter_mut().zip(green).zip(blue);
+        for (((red, green), blue), (white_red, green_blue)) in colours.zip(white_red.iter().zip(green_blue)) {
             let amplitude = |light: f32| (light / white_red.re.max(LEAST_COVER)).max(0.0).sqrt();
             *red = amplitude(white_red.im);
             *green = amplitude(green_blue.re);
             *blue = amplitude(green_blue.im);
-        });
+        }
     }
 }
 

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::defocus::Defocus;
 use super::depth_layers::DepthLayers;
 use super::feedback::LayerFeedback;
-use super::maps::{FIRST_MAP, MAPS, write_maps};
+use super::maps::{FIRST_MAP, MAPS, RUN_PX, write_maps};
 use super::trunk::Trunk;
 use crate::RgbdFrame;
 use crate::engine::Stage;
@@ -55,7 +55,7 @@ impl ExpectedStack {
             size,
             lighting,
             correction,
-            defocus: Defocus::new(config, size),
+            defocus: Defocus::new(config, size, set),
             layers: DepthLayers::new(config, size),
             feedback: LayerFeedback::new(config, feedback, size),
             refines: config.refined_stack,
@@ -106,8 +106,13 @@ impl ExpectedStack {
         let (count, channels) = (layers.numbers().len(), outputs.len() / pixels);
         let offset = ((count - 1) as f32).ln();
         outputs.par_chunks_exact_mut(channels * width).enumerate().for_each(|(y, rows)| {
+            for x in (0..width).step_by(RUN_PX) {
+                for (channel, row) in rows.chunks_exact_mut(width).enumerate() {
+                    let run = row[x..].iter_mut().take(RUN_PX);
+                    run.zip(lighting.output.channel(channel, y).skip(x)).for_each(|(to, from)| *to = *from);
+                }
+            }
             for (channel, row) in rows.chunks_exact_mut(width).enumerate() {
-                row.iter_mut().zip(lighting.output.channel(channel, y)).for_each(|(to, from)| *to = *from);
                 if channel < LIT * count && channel % LIT == MASK {
                     row.iter_mut().for_each(|mask| *mask = 1.0 / (1.0 + (offset - *mask).exp()));
                 }

@@ -5,7 +5,7 @@ use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::blocks::{Blocks, scale_of};
-use super::conv::FeatureMap;
+use super::feature_map::FeatureMap;
 use crate::RgbdFrame;
 use crate::weights::{Grid, OUTPUT_CHANNELS};
 
@@ -16,6 +16,8 @@ pub(super) const BLOCK: usize = SCALE * SCALE;
 pub(super) const MAPS: usize = 5 * BLOCK + 1;
 /// Where the second net's input has the maps: after the field.
 pub(super) const FIRST_MAP: usize = OUTPUT_CHANNELS;
+/// Pixels whose channels stay in the first-level cache while one plane after another is read or written.
+pub(super) const RUN_PX: usize = 16;
 /// The share of the second net's output that is added to the field.
 const CORRECTION_SHARE: f32 = 0.3;
 
@@ -56,10 +58,13 @@ impl FeatureMap {
     ) {
         let (width, stride) = (self.width, self.stride);
         self.rows_mut().enumerate().for_each(|(y, row)| {
-            for (channel, plane) in planes.clone().enumerate() {
-                let pixels = row[stride + first + channel..].iter_mut().step_by(stride);
-                for (to, from) in pixels.zip(&plane[y * width..][..width]) {
-                    *to = change(*from);
+            let runs = row[stride..][..width * stride].chunks_mut(RUN_PX * stride);
+            for (x, pixels) in (0..width).step_by(RUN_PX).zip(runs) {
+                for (channel, plane) in planes.clone().enumerate() {
+                    let pixels = pixels[first + channel..].iter_mut().step_by(stride);
+                    for (to, from) in pixels.zip(&plane[y * width + x..]) {
+                        *to = change(*from);
+                    }
                 }
             }
         });

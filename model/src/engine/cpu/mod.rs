@@ -3,14 +3,17 @@
 mod blocks;
 mod conv;
 mod defocus;
+mod deformable;
 mod depth_layers;
 mod direct;
 mod expected_stack;
+mod feature_map;
 mod feedback;
 mod layered;
 mod maps;
 mod network;
 mod peak;
+mod product;
 #[cfg(test)]
 mod tests;
 mod trunk;

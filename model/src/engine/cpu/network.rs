@@ -127,7 +127,7 @@ impl Network {
 #[cfg(test)]
 pub(super) enum Seen<'a> {
     /// A layer's map, and the offsets of an adjustable one; or what the first layer reads.
-    Map(&'a super::conv::FeatureMap, Option<&'a super::conv::FeatureMap>),
+    Map(&'a super::feature_map::FeatureMap, Option<&'a super::feature_map::FeatureMap>),
     /// A field on the network's grid, [3, height, width].
     Light(&'a [Complex32]),
 }

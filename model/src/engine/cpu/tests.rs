@@ -4,7 +4,7 @@ use holod_calibration::{PupilDiameter, Resolution};
 use num_complex::{Complex32, Complex64};
 use proptest::prelude::*;
 
-use super::conv::FeatureMap;
+use super::feature_map::FeatureMap;
 use super::network::{Network, Seen};
 use super::*;
 use crate::engine::reference::{self, Value};
@@ -236,6 +236,31 @@ fn an_engine_renders_as_its_network_does_and_clamps_the_pupil() {
     assert_eq!(timings.stages.len(), last + 3);
     assert_eq!(timings.stages[2].name, "layer 1 (adjustable)");
     assert_eq!(timings.stages[2].flop, 2 * 9 * 8 * (8 + 18) * 16 * 9);
+}
+
+#[test]
+fn what_is_no_number_at_the_border_leaves_no_trace_in_the_next_frame() {
+    let resolution = Resolution { width: 31, height: 18 };
+    for weights in [random_weights(config(Grid::HalfBand, 4, 8, vec![1]), 2), Weights::builtin_small()] {
+        let pupil = PupilDiameter::from_mm(3.0);
+        let render = |engine: &mut CpuEngine, frame: &RgbdFrame| {
+            let mut hologram = ComplexHologram::dark(resolution);
+            engine.render(frame, pupil, &mut hologram).unwrap();
+            hologram.field
+        };
+        let mut engine = CpuEngine::new(&weights, resolution, 2).unwrap();
+        let clean = render(&mut engine, &frame(resolution, 4));
+        for (pixel, spoiler) in [(0, f32::NAN), (30, f32::INFINITY), (31 * 18 - 1, f32::NEG_INFINITY)] {
+            let mut spoiled = frame(resolution, 4);
+            spoiled.amplitude[pixel] = spoiler;
+            assert!(render(&mut engine, &spoiled).iter().any(|value| !value.is_finite()), "pixel {pixel} is not seen");
+            assert_eq!(render(&mut engine, &frame(resolution, 4)), clean, "pixel {pixel} left a trace");
+            let mut spoiled = frame(resolution, 4);
+            spoiled.depth_normalised[pixel] = spoiler;
+            render(&mut engine, &spoiled);
+            assert_eq!(render(&mut engine, &frame(resolution, 4)), clean, "the depth of pixel {pixel} left a trace");
+        }
+    }
 }
 
 #[test]

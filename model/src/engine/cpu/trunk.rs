@@ -1,6 +1,8 @@
 //! A stack of 3x3 layers: convolutions in residual pairs, some of them adjustable, and the maps between them.
 
-use super::conv::{Epilogue, FeatureMap, PackedConv};
+use super::conv::{Epilogue, PlainConv, Scratch};
+use super::deformable::DeformableConv;
+use super::feature_map::FeatureMap;
 use crate::engine::Stage;
 use crate::simd::InstructionSet;
 use crate::weights::{Adjustable, Dense, Layer, OFFSET_CHANNELS};
@@ -13,6 +15,7 @@ pub(super) struct Trunk {
     /// The map between the two convolutions of a residual pair.
     between: FeatureMap,
     pub(super) output: FeatureMap,
+    scratch: Scratch,
 }
 
 impl Trunk {
@@ -30,16 +33,18 @@ impl Trunk {
             _ if index > 0 && index % 2 == 0 => Epilogue::ResidualLeaky,
             _ => Epilogue::Leaky,
         };
+        let cpu_layers: Vec<_> = layers
+            .iter()
+            .enumerate()
+            .map(|(index, layer)| CpuLayer::new(layer, epilogue(index), leaky_slope, (width, height), set))
+            .collect();
         Self {
             input: map(layers[0].in_channels),
             features: map(layers[0].out_channels),
             between: map(layers[0].out_channels),
             output: map(layers[last].out_channels),
-            layers: layers
-                .iter()
-                .enumerate()
-                .map(|(index, layer)| CpuLayer::new(layer, epilogue(index), leaky_slope, (width, height), set))
-                .collect(),
+            scratch: Scratch::new(cpu_layers.iter().map(CpuLayer::plain)),
+            layers: cpu_layers,
         }
     }
 
@@ -51,7 +56,7 @@ impl Trunk {
     /// What each layer is called and costs.
     pub(super) fn stages(&self, prefix: &str) -> impl Iterator<Item = Stage> {
         self.layers.iter().enumerate().map(move |(index, layer)| {
-            let adjustable = if layer.adjustable.is_some() { " (adjustable)" } else { "" };
+            let adjustable = if matches!(layer.conv, Conv::Adjustable(_)) { " (adjustable)" } else { "" };
             Stage { name: format!("{prefix}layer {index}{adjustable}"), flop: layer.flop }
         })
     }
@@ -59,12 +64,12 @@ impl Trunk {
     /// One layer from the map that it reads to the map that it writes.
     pub(super) fn run_layer(&mut self, index: usize, pupil_mm: f32) {
         let last = index + 1 == self.layers.len();
-        let layer = &mut self.layers[index];
+        let (layer, scratch) = (&mut self.layers[index], &mut self.scratch);
         match index {
-            0 => layer.run(&self.input, pupil_mm, &mut self.features),
-            _ if last => layer.run(&self.features, pupil_mm, &mut self.output),
-            _ if index % 2 == 1 => layer.run(&self.features, pupil_mm, &mut self.between),
-            _ => layer.run(&self.between, pupil_mm, &mut self.features),
+            0 => layer.run(&self.input, pupil_mm, scratch, &mut self.features),
+            _ if last => layer.run(&self.features, pupil_mm, scratch, &mut self.output),
+            _ if index % 2 == 1 => layer.run(&self.features, pupil_mm, scratch, &mut self.between),
+            _ => layer.run(&self.between, pupil_mm, scratch, &mut self.features),
         }
     }
 
@@ -76,29 +81,37 @@ impl Trunk {
             _ if index % 2 == 1 => &self.between,
             _ => &self.features,
         };
-        super::network::Seen::Map(map, self.layers[index].adjustable.as_ref().map(|adjustable| &adjustable.offsets))
+        let offsets = match &self.layers[index].conv {
+            Conv::Plain(_) => None,
+            Conv::Adjustable(adjustable) => Some(&adjustable.offsets),
+        };
+        super::network::Seen::Map(map, offsets)
     }
 }
 
 struct CpuLayer {
-    conv: PackedConv,
+    conv: Conv,
     flop: u64,
-    adjustable: Option<CpuAdjustable>,
 }
 
-/// The offset prediction of an adjustable deformable layer, modulated for one pupil at a time.
+enum Conv {
+    Plain(PlainConv),
+    Adjustable(Box<CpuAdjustable>),
+}
+
+/// An adjustable deformable layer; its offset prediction is modulated for one pupil at a time.
 struct CpuAdjustable {
+    conv: DeformableConv,
     parameters: Adjustable,
     leaky_slope: f32,
     channels: usize,
-    /// The pupil that `conv` is modulated for.
+    /// The pupil that `offset_conv` is modulated for.
     pupil_mm: f32,
     hidden: [Vec<f32>; 2],
     /// γ [18, channels], then β [18].
     modulation: Vec<f32>,
-    conv: PackedConv,
+    offset_conv: PlainConv,
     offsets: FeatureMap,
-    scratch: Vec<f32>,
 }
 
 impl CpuLayer {
@@ -110,35 +123,44 @@ impl CpuLayer {
         set: InstructionSet,
     ) -> Self {
         let Layer { in_channels, out_channels, weight, bias, adjustable } = layer;
-        let mut conv = PackedConv::new(*in_channels, *out_channels, epilogue, leaky_slope, set);
-        conv.fill(*in_channels, bias.iter().copied(), |output, input, tap| {
-            weight[(output * in_channels + input) * 9 + tap]
-        });
-        let outputs = out_channels + adjustable.as_ref().map_or(0, |_| OFFSET_CHANNELS);
-        Self {
-            flop: (2 * 9 * in_channels * outputs * width * height) as u64,
-            adjustable: adjustable.as_ref().map(|parameters| CpuAdjustable {
+        let (channels, outputs) = (*in_channels, out_channels + adjustable.as_ref().map_or(0, |_| OFFSET_CHANNELS));
+        let weight = |output, input, tap| weight[(output * channels + input) * 9 + tap];
+        let conv = match adjustable {
+            None => {
+                let mut conv = PlainConv::new(channels, *out_channels, epilogue, leaky_slope, set);
+                conv.fill(channels, bias.iter().copied(), weight);
+                Conv::Plain(conv)
+            }
+            Some(parameters) => Conv::Adjustable(Box::new(CpuAdjustable {
+                conv: DeformableConv::new(channels, bias, weight, epilogue, leaky_slope, set),
                 leaky_slope,
-                channels: *in_channels,
+                channels,
                 pupil_mm: f32::NAN,
                 hidden: [0, 1].map(|index| vec![0.0; parameters.modulation[index].bias.len()]),
                 modulation: vec![0.0; parameters.modulation[2].bias.len()],
-                conv: PackedConv::new(*in_channels, OFFSET_CHANNELS, Epilogue::None, leaky_slope, set),
+                offset_conv: PlainConv::new(channels, OFFSET_CHANNELS, Epilogue::None, leaky_slope, set),
                 offsets: FeatureMap::new(width, height, OFFSET_CHANNELS, set),
-                scratch: conv.deformable_scratch(),
                 parameters: parameters.clone(),
-            }),
-            conv,
+            })),
+        };
+        Self { conv, flop: (2 * 9 * channels * outputs * width * height) as u64 }
+    }
+
+    /// The convolution of which each place is computed alike.
+    fn plain(&self) -> &PlainConv {
+        match &self.conv {
+            Conv::Plain(conv) => conv,
+            Conv::Adjustable(adjustable) => &adjustable.offset_conv,
         }
     }
 
-    fn run(&mut self, input: &FeatureMap, pupil_mm: f32, output: &mut FeatureMap) {
-        match &mut self.adjustable {
-            None => self.conv.run(input, output),
-            Some(adjustable) => {
+    fn run(&mut self, input: &FeatureMap, pupil_mm: f32, scratch: &mut Scratch, output: &mut FeatureMap) {
+        match &mut self.conv {
+            Conv::Plain(conv) => conv.run(input, scratch, output),
+            Conv::Adjustable(adjustable) => {
                 adjustable.modulate(pupil_mm);
-                adjustable.conv.run(input, &mut adjustable.offsets);
-                self.conv.run_deformable(input, &adjustable.offsets, &mut adjustable.scratch, output);
+                adjustable.offset_conv.run(input, scratch, &mut adjustable.offsets);
+                adjustable.conv.run(input, &adjustable.offsets, output);
             }
         }
     }
@@ -150,7 +172,7 @@ impl CpuAdjustable {
         if self.pupil_mm == pupil_mm {
             return;
         }
-        let Self { parameters, leaky_slope, channels, hidden: [first, second], modulation, conv, .. } = self;
+        let Self { parameters, leaky_slope, channels, hidden: [first, second], modulation, offset_conv, .. } = self;
         let [to_first, to_second, to_modulation] = &parameters.modulation;
         let leaky = |values: &mut [f32]| values.iter_mut().for_each(|value| *value = value.max(*value * *leaky_slope));
         to_first.run(&[(pupil_mm - 3.0) / 2.0], first);
@@ -161,7 +183,7 @@ impl CpuAdjustable {
 
         let (gamma, beta) = modulation.split_at(OFFSET_CHANNELS * *channels);
         let bias = parameters.offset_bias.iter().zip(beta).map(|(bias, beta)| bias + beta);
-        conv.fill(*channels, bias, |output, input, tap| {
+        offset_conv.fill(*channels, bias, |output, input, tap| {
             let place = output * *channels + input;
             parameters.offset_weight[place * 9 + tap] * (1.0 + gamma[place])
         });

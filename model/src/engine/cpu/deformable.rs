@@ -1,0 +1,158 @@
+//! Deformable 3x3 convolutions: every tap of every pixel is read at a place of its own.
+
+use super::conv::{Activation, Epilogue, TAPS};
+use super::feature_map::{FeatureMap, WORKERS};
+use super::product::{ROWS, Shape, panel_place, panels_len};
+use crate::simd::{InstructionSet, Simd, Task};
+
+/// A deformable convolution of maps.
+pub(super) struct DeformableConv {
+    in_stride: usize,
+    out_stride: usize,
+    /// A group for each tap.
+    shape: Shape,
+    weights: Vec<f32>,
+    activation: Activation,
+    set: InstructionSet,
+    workers: Vec<Scratch>,
+}
+
+/// The panels of what [`ROWS`] pixels read at each tap, and those of their sums.
+struct Scratch {
+    taps: Vec<f32>,
+    sums: Vec<f32>,
+}
+
+impl DeformableConv {
+    /// `weight(output, input, tap)`, taps row-major over the kernel, and the bias of each output.
+    pub(super) fn new(
+        in_channels: usize,
+        bias: &[f32],
+        weight: impl Fn(usize, usize, usize) -> f32,
+        epilogue: Epilogue,
+        leaky_slope: f32,
+        set: InstructionSet,
+    ) -> Self {
+        let shape = Shape::new(TAPS, in_channels, bias.len());
+        let mut weights = vec![0.0; shape.weights_len()];
+        for (output, tap) in (0..bias.len()).flat_map(|output| (0..TAPS).map(move |tap| (output, tap))) {
+            for input in 0..in_channels {
+                weights[shape.place(tap, input, output, set)] = weight(output, input, tap);
+            }
+        }
+        let out_stride = bias.len().next_multiple_of(set.lanes());
+        let mut padded_bias = bias.to_vec();
+        padded_bias.resize(out_stride, 0.0);
+        Self {
+            in_stride: in_channels.next_multiple_of(set.lanes()),
+            out_stride,
+            shape,
+            weights,
+            activation: Activation { bias: padded_bias, epilogue, leaky_slope },
+            set,
+            workers: (0..WORKERS)
+                .map(|_| Scratch { taps: vec![0.0; shape.inputs_len()], sums: vec![0.0; shape.outputs_len()] })
+                .collect(),
+        }
+    }
+
+    /// Runs the convolution over `input` into `output`, each tap k of each pixel being read at its place plus
+    /// (`offsets[2k]`, `offsets[2k + 1]`) = (dy, dx) by bilinear interpolation, zero outside.
+    pub(super) fn run(&mut self, input: &FeatureMap, offsets: &FeatureMap, output: &mut FeatureMap) {
+        let Self { in_stride, out_stride, shape, weights, activation, set, workers } = self;
+        debug_assert_eq!((input.stride, output.stride), (*in_stride, *out_stride));
+        let row_len = output.row_len;
+        output.for_each_tile_row(workers, |scratch, first, rows| {
+            for (y, output_row) in (first..).zip(rows.chunks_exact_mut(row_len)) {
+                set.run(Row { shape: *shape, weights, activation, input, offsets, y, scratch, output_row });
+            }
+        });
+    }
+}
+
+/// One row.
+struct Row<'a> {
+    shape: Shape,
+    weights: &'a [f32],
+    activation: &'a Activation,
+    input: &'a FeatureMap,
+    offsets: &'a FeatureMap,
+    y: usize,
+    scratch: &'a mut Scratch,
+    /// With its border.
+    output_row: &'a mut [f32],
+}
+
+impl Task for Row<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { shape, weights, activation, input, offsets, y, scratch: Scratch { taps, sums }, output_row } = self;
+        let out_stride = activation.bias.len();
+        let group_len = shape.inputs_len() / TAPS;
+        assert!(group_len >= panels_len(input.stride) && out_stride.is_multiple_of(S::LANES));
+        for x in (0..input.width).step_by(ROWS) {
+            let pixels = (input.width - x).min(ROWS);
+            for (index, x) in (x..x + pixels).enumerate() {
+                let offsets = offsets.pixel(x, y);
+                for (k, tap) in taps.chunks_exact_mut(group_len).enumerate() {
+                    let tap_y = (y + k / 3) as f32 - 1.0 + offsets[2 * k];
+                    let tap_x = (x + k % 3) as f32 - 1.0 + offsets[2 * k + 1];
+                    sample(simd, input, tap_x, tap_y, index, tap);
+                }
+            }
+            shape.multiply(simd, pixels, taps, weights, sums);
+            for (index, output) in
+                output_row[(x + 1) * out_stride..].chunks_exact_mut(out_stride).take(pixels).enumerate()
+            {
+                for channel in (0..out_stride).step_by(S::LANES) {
+                    let sum = &sums[panel_place(index, channel)..][..S::LANES];
+                    let bias = &activation.bias[channel..][..S::LANES];
+                    let place = &mut output[channel..][..S::LANES];
+                    // SAFETY: each of the three slices has LANES values.
+                    unsafe {
+                        let (sum, bias) = (simd.load(sum.as_ptr()), simd.load(bias.as_ptr()));
+                        activation.store(simd, sum, bias, place.as_mut_ptr());
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Reads `map` at (x, y) by bilinear interpolation into `row` of panels, zero outside.
+#[inline(always)]
+fn sample<S: Simd>(simd: S, map: &FeatureMap, x: f32, y: f32, row: usize, panels: &mut [f32]) {
+    let (width, height) = (map.width as f32, map.height as f32);
+    assert!(panels.len() >= panels_len(map.stride) && row < ROWS && map.stride.is_multiple_of(S::LANES));
+    // NaN is outside too.
+    if !(x > -1.0 && x < width && y > -1.0 && y < height) {
+        for channel in (0..map.stride).step_by(S::LANES) {
+            panels[panel_place(row, channel)..][..S::LANES].fill(0.0);
+        }
+        return;
+    }
+    let (left, top) = (x.floor(), y.floor());
+    let (right_share, lower_share) = (x - left, y - top);
+    // The border makes all four neighbours readable: left + 1 is in 0..=width.
+    let rows = &map.rows_from_above((top + 1.0) as usize)[(left + 1.0) as usize * map.stride..];
+    let (upper, lower) = (&rows[..2 * map.stride], &rows[map.row_len..][..2 * map.stride]);
+    let share = |value: f32| simd.splat(value);
+    let shares = [
+        share((1.0 - lower_share) * (1.0 - right_share)),
+        share((1.0 - lower_share) * right_share),
+        share(lower_share * (1.0 - right_share)),
+        share(lower_share * right_share),
+    ];
+    for channel in (0..map.stride).step_by(S::LANES) {
+        // SAFETY: channel + LANES ≤ stride; `upper` and `lower` hold two strides and the panels a row of one.
+        unsafe {
+            let upper = upper.as_ptr().add(channel);
+            let lower = lower.as_ptr().add(channel);
+            let mut sum = simd.mul(shares[0], simd.load(upper));
+            sum = simd.mul_add(shares[1], simd.load(upper.add(map.stride)), sum);
+            sum = simd.mul_add(shares[2], simd.load(lower), sum);
+            sum = simd.mul_add(shares[3], simd.load(lower.add(map.stride)), sum);
+            simd.store(panels.as_mut_ptr().add(panel_place(row, channel)), sum);
+        }
+    }
+}

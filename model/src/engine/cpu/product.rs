@@ -1,0 +1,171 @@
+//! Products of rows of channels with packed weights, with as many sums as fit the registers.
+
+use crate::simd::{InstructionSet, Simd};
+
+/// Rows that are multiplied together at most; each kernel's number of rows divides it.
+pub(super) const ROWS: usize = 24;
+/// Channels are kept in panels [panel, row, channel of the panel] of this many: the distance between rows is then a
+/// constant of the kernel.
+const PANEL: usize = 32;
+/// Input channels of a pair.
+const PAIR: usize = 2;
+/// Output channels are rounded up to a multiple of this.
+const OUTPUTS_STEP: usize = 8;
+
+/// The shape of a product: each row has `groups` times `inputs` values, each group in panels of its own.
+#[derive(Clone, Copy)]
+pub(super) struct Shape {
+    groups: usize,
+    /// Inputs of a group, rounded up to whole pairs; rows have zeros there.
+    inputs: usize,
+    /// Rounded up to [`OUTPUTS_STEP`].
+    outputs: usize,
+}
+
+impl Shape {
+    pub(super) fn new(groups: usize, inputs: usize, outputs: usize) -> Self {
+        Self { groups, inputs: inputs.next_multiple_of(PAIR), outputs: outputs.next_multiple_of(OUTPUTS_STEP) }
+    }
+
+    /// Values of the packed weights: for each [`Block`] [group, input, channel of the block], or, where it is paired,
+    /// [group, pair of inputs, channel of the block, input of the pair].
+    pub(super) fn weights_len(self) -> usize {
+        self.groups * self.inputs * self.outputs
+    }
+
+    /// Where the packed weights have that of one input and output.
+    pub(super) fn place(self, group: usize, input: usize, output: usize, set: InstructionSet) -> usize {
+        let block = Block::of(output, self.outputs, set.lanes());
+        let (row, together) = (group * self.inputs + input, block.inputs_together);
+        block.first * self.groups * self.inputs
+            + (row - row % together) * block.channels
+            + (output - block.first) * together
+            + row % together
+    }
+
+    /// Values of the panels that a product of up to [`ROWS`] rows reads.
+    pub(super) fn inputs_len(self) -> usize {
+        self.groups * panels_len(self.inputs)
+    }
+
+    /// Values of the panels that it writes.
+    pub(super) fn outputs_len(self) -> usize {
+        panels_len(self.outputs)
+    }
+
+    /// Writes the products of the first `rows` rows of the panels `inputs`, and possibly of some after them, to the
+    /// panels `outputs`.
+    #[inline(always)]
+    pub(super) fn multiply<S: Simd>(self, simd: S, rows: usize, inputs: &[f32], weights: &[f32], outputs: &mut [f32]) {
+        assert!(rows <= ROWS && inputs.len() == self.inputs_len());
+        assert!(weights.len() == self.weights_len() && outputs.len() == self.outputs_len());
+        for first in (0..self.outputs).step_by(Block::most_channels(S::LANES)) {
+            let block = Block::of(first, self.outputs, S::LANES);
+            let depth = self.groups * self.inputs;
+            let weights = &weights[first * depth..][..block.channels * depth];
+            let outputs = &mut outputs[first / PANEL * ROWS * PANEL + first % PANEL..];
+            // Sums, weights and one input fit the registers: 16, or 32 with 16 lanes.
+            match (block.channels * block.inputs_together / S::LANES, block.inputs_together, S::LANES) {
+                (4, 1, _) => kernel::<S, 4, 1, 2>(simd, self, rows, inputs, weights, outputs),
+                (3, 1, _) => kernel::<S, 3, 1, 3>(simd, self, rows, inputs, weights, outputs),
+                (2, 1, 16) => kernel::<S, 2, 1, 8>(simd, self, rows, inputs, weights, outputs),
+                (2, 1, _) => kernel::<S, 2, 1, 4>(simd, self, rows, inputs, weights, outputs),
+                (_, 1, _) => kernel::<S, 1, 1, 8>(simd, self, rows, inputs, weights, outputs),
+                (3, _, _) => kernel::<S, 3, PAIR, 8>(simd, self, rows, inputs, weights, outputs),
+                (_, _, _) => kernel::<S, 1, PAIR, 12>(simd, self, rows, inputs, weights, outputs),
+            }
+        }
+    }
+}
+
+/// Values of the panels of [`ROWS`] rows of `channels`.
+pub(super) const fn panels_len(channels: usize) -> usize {
+    channels.div_ceil(PANEL) * ROWS * PANEL
+}
+
+/// Where panels have a channel of a row.
+#[inline(always)]
+pub(super) const fn panel_place(row: usize, channel: usize) -> usize {
+    (channel / PANEL * ROWS + row) * PANEL + channel % PANEL
+}
+
+/// Output channels that are computed together: four vectors of them, or two of 16 lanes, or the rest.
+///
+/// An odd number of half vectors, which a rest has at 16 lanes only, would leave lanes idle. There each output channel
+/// takes two neighbouring lanes, one for the sum over even inputs and one for that over odd ones: 24 channels fill three
+/// vectors of 16 lanes, each step takes two inputs, and `add_pairs` joins the two sums at the end.
+struct Block {
+    first: usize,
+    channels: usize,
+    /// [`PAIR`] or 1.
+    inputs_together: usize,
+}
+
+impl Block {
+    const fn most_channels(lanes: usize) -> usize {
+        if 4 * lanes < PANEL { 4 * lanes } else { PANEL }
+    }
+
+    /// The block in which an output channel falls.
+    fn of(output: usize, outputs: usize, lanes: usize) -> Self {
+        let most = Self::most_channels(lanes);
+        let first = output - output % most;
+        let channels = most.min(outputs - first);
+        Self { first, channels, inputs_together: if channels.is_multiple_of(lanes) { 1 } else { PAIR } }
+    }
+}
+
+/// One block of V vectors of sums, of I inputs together, P rows at a time.
+#[inline(always)]
+fn kernel<S: Simd, const V: usize, const I: usize, const P: usize>(
+    simd: S,
+    shape: Shape,
+    rows: usize,
+    inputs: &[f32],
+    weights: &[f32],
+    outputs: &mut [f32],
+) {
+    let Shape { groups, inputs: group_inputs, .. } = shape;
+    let panels = group_inputs.div_ceil(PANEL);
+    let rows = rows.next_multiple_of(P);
+    assert!(rows <= ROWS && group_inputs.is_multiple_of(I) && inputs.len() == groups * panels * ROWS * PANEL);
+    assert!(weights.len() * I == groups * group_inputs * V * S::LANES);
+    assert!(outputs.len() >= (rows - P.min(rows)) * PANEL + (P - 1) * PANEL + V.div_ceil(I) * S::LANES);
+    for row in (0..rows).step_by(P) {
+        // Bounds checks in this loop would cost more than its arithmetic.
+        // SAFETY: the panels hold ROWS rows, of which `row + P - 1` is one, and a panel is read below its width, of which
+        // I is a divisor; the weights' rows are walked once, in order, and are as many as inputs. What is written lies
+        // below `outputs.len()`. All was asserted above.
+        unsafe {
+            let mut sums = [[simd.splat(0.0); V]; P];
+            let mut weight_row = weights.as_ptr();
+            for panel in 0..groups * panels {
+                let from = inputs.as_ptr().add((panel * ROWS + row) * PANEL);
+                let used = (group_inputs - panel % panels * PANEL).min(PANEL);
+                for input in (0..used).step_by(I) {
+                    let weights: [S::Vector; V] =
+                        std::array::from_fn(|vector| simd.load(weight_row.add(vector * S::LANES)));
+                    weight_row = weight_row.add(V * S::LANES);
+                    for (row, sums) in sums.iter_mut().enumerate() {
+                        let input = from.add(row * PANEL + input);
+                        let value = if I == PAIR { simd.splat_pair(input) } else { simd.splat(*input) };
+                        for (sum, weight) in sums.iter_mut().zip(weights) {
+                            *sum = simd.mul_add(value, weight, *sum);
+                        }
+                    }
+                }
+            }
+            for (index, sums) in sums.into_iter().enumerate() {
+                for (vector, sums) in sums.chunks(I).enumerate() {
+                    let sum = match *sums {
+                        [sum] if I == 1 => sum,
+                        [sum] => simd.add_pairs(sum, simd.splat(0.0)),
+                        [first, second, ..] => simd.add_pairs(first, second),
+                        [] => unreachable!("chunks are not empty"),
+                    };
+                    simd.store(outputs.as_mut_ptr().add((row + index) * PANEL + vector * S::LANES), sum);
+                }
+            }
+        }
+    }
+}
