@@ -248,7 +248,7 @@ fn what_is_no_number_at_the_border_leaves_no_trace_in_the_next_frame() {
             engine.render(frame, pupil, &mut hologram).unwrap();
             hologram.field
         };
-        let mut engine = CpuEngine::new(&weights, resolution, 2).unwrap();
+        let mut engine = CpuEngine::new(&weights, resolution).unwrap();
         let clean = render(&mut engine, &frame(resolution, 4));
         for (pixel, spoiler) in [(0, f32::NAN), (30, f32::INFINITY), (31 * 18 - 1, f32::NEG_INFINITY)] {
             let mut spoiled = frame(resolution, 4);
