@@ -33,7 +33,7 @@ pub fn advice(frames_hz: f64, rig: &Rig, size: Resolution) -> Option<String> {
     }
     let mut cures = Vec::new();
     if rig.model.weights == WeightsChoice::Standard {
-        cures.push("--weights small takes about half the time".to_owned());
+        cures.push("--weights small takes about two thirds of the time".to_owned());
     }
     // Time goes with the number of pixels.
     let shrunk = |side: usize| {
