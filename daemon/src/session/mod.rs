@@ -262,7 +262,7 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
     tracing::debug!("tracker `{}` is open, link {}", plan.tracker, tracker.link().name());
     let options = OutputOptions {
         keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 },
-        stall_timeout: stall_timeout(frame_time),
+        stall_timeout: rig.lasers.stall_timeout.unwrap_or_else(|| stall_timeout(frame_time)),
     };
     let output = progress::during("opening panel and lasers", || {
         scheduling::prompt(|| open_output(&plan, &encoder, options)).map_err(Failure::because(Exit::Unavailable))
