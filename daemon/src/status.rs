@@ -149,24 +149,31 @@ pub fn of_running() -> Result<Vec<Found>, Failure> {
 
 fn of_running_in(folders: &[PathBuf]) -> Result<Vec<Found>, Failure> {
     let mut running: Vec<Found> = Vec::new();
+    let mut closed = None;
     for folder in folders {
         let entries = match std::fs::read_dir(folder) {
-            Err(error) if error.kind() == std::io::ErrorKind::PermissionDenied => {
-                return Err(Failure::new(
-                    Exit::NoInput,
-                    format!("{}: {error}; ask as root, or as a member of the group `holod`", folder.display()),
-                ));
+            Err(error) => {
+                note_closed(&mut closed, folder, error);
+                continue;
             }
-            Err(_) => continue,
             Ok(entries) => entries,
         };
-        let mut found: Vec<Found> = entries.flatten().filter_map(|entry| read(&entry.path())).collect();
+        let mut found = Vec::new();
+        for path in entries.flatten().map(|entry| entry.path()) {
+            match read(&path) {
+                Ok(one) => found.extend(one),
+                Err(error) => note_closed(&mut closed, &path, error),
+            }
+        }
         found.sort_by_key(|found| found.status.pid);
         found.retain(|one| running.iter().all(|other| other.status.pid != one.status.pid));
         running.extend(found);
     }
     if !running.is_empty() {
         return Ok(running);
+    }
+    if let Some(closed) = closed {
+        return Err(closed);
     }
     let folders: Vec<_> = folders.iter().map(|folder| folder.display().to_string()).collect();
     Err(Failure::new(
@@ -178,15 +185,25 @@ fn of_running_in(folders: &[PathBuf]) -> Result<Vec<Found>, Failure> {
     ))
 }
 
+/// The first place that may not be read, which matters where no other holod is found.
+fn note_closed(closed: &mut Option<Failure>, place: &Path, error: std::io::Error) {
+    if error.kind() == std::io::ErrorKind::PermissionDenied {
+        let said = format!("{}: {error}; ask as root, or as a member of the group `holod`", place.display());
+        closed.get_or_insert(Failure::new(Exit::NoInput, said));
+    }
+}
+
 /// The status of a process that lives, out of its own file.
-fn read(path: &Path) -> Option<Found> {
-    let written = std::fs::metadata(path).ok()?.modified().ok()?;
-    let name = path.file_name()?.to_str()?;
-    name.strip_prefix("status-")?.strip_suffix(".json")?;
-    let status: Status = serde_json::from_slice(&std::fs::read(path).ok()?).ok()?;
+fn read(path: &Path) -> std::io::Result<Option<Found>> {
+    let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    if !(name.starts_with("status-") && name.ends_with(".json")) {
+        return Ok(None);
+    }
+    let written = std::fs::metadata(path)?.modified()?;
+    let Ok(status) = serde_json::from_slice::<Status>(&std::fs::read(path)?) else { return Ok(None) };
     let lives = name == file_name(status.pid) && Path::new("/proc").join(status.pid.to_string()).exists();
     let age = written.elapsed().unwrap_or_default();
-    lives.then_some(Found { status, stale: (age > STALE).then_some(age) })
+    Ok(lives.then_some(Found { status, stale: (age > STALE).then_some(age) }))
 }
 
 #[cfg(test)]

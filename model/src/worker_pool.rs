@@ -1,8 +1,9 @@
 //! Threads that work on a frame together, and are handed it without allocating.
 //!
 //! [`CpuEngine`](crate::CpuEngine), [`DoublePhase`](crate::optics::DoublePhase) and whatever else splits its work by
-//! rayon share the threads of the pool that they are called in. Handing work to a rayon pool from outside allocates now and then, which a frame loop must not. So one worker of the
-//! pool stays inside it, waits for work and runs it there; the caller waits meanwhile.
+//! rayon share the threads of the pool that they are called in. Handing work to a rayon pool from outside allocates now
+//! and then, which a frame loop must not. So one worker of the pool stays inside it, waits for work and runs it there;
+//! the caller waits meanwhile.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 

@@ -232,7 +232,7 @@ impl Pattern {
             Self::Grating { period_px, angle_deg, profile, depth_rad } => {
                 checked_period(period_px, optics)?;
                 let depth_rad = checked_depth(depth_rad.unwrap_or(profile.depth_rad()))?;
-                let (sine, cosine) = angle_deg.to_radians().sin_cos();
+                let (sine, cosine) = checked_angle(angle_deg)?.to_radians().sin_cos();
                 let lines = |x_px: f64, y_px: f64| (x_px * cosine + y_px * sine) / period_px;
                 Ok(by_place(optics, [0.0; 2], |x_px, y_px| profile.phase_rad(lines(x_px, y_px), depth_rad)))
             }
@@ -296,7 +296,7 @@ impl Pattern {
             Self::Grating { period_px, angle_deg, profile, depth_rad } => {
                 checked_period(period_px, optics)?;
                 let depth_rad = checked_depth(depth_rad.unwrap_or(profile.depth_rad()))? * field_m / laser_m;
-                let (sine, cosine) = angle_deg.to_radians().sin_cos();
+                let (sine, cosine) = checked_angle(angle_deg)?.to_radians().sin_cos();
                 let orders = [1, 0, -1, 2, -2].map(|number| {
                     let per_px = f64::from(number) / period_px;
                     order([number, 0], [per_px * cosine, per_px * sine], profile.share(depth_rad, number))
@@ -406,6 +406,13 @@ fn checked_depth(depth_rad: f64) -> Result<f64, PatternError> {
         return Ok(depth_rad);
     }
     Err(wrong("depth", format!("{:.3} π", depth_rad / PI), "above 0 and up to 2 π".into()))
+}
+
+fn checked_angle(angle_deg: f64) -> Result<f64, PatternError> {
+    if angle_deg.is_finite() {
+        return Ok(angle_deg);
+    }
+    Err(wrong("angle", format!("{angle_deg}°"), "a number of degrees".into()))
 }
 
 fn checked_size(what: &'static str, found_px: usize, min_px: usize, max_px: usize) -> Result<(), PatternError> {

@@ -31,6 +31,10 @@ struct Device {
     power_w: String,
     interlock: &'static str,
     mute: bool,
+    /// So many commands to go out are not heard.
+    deaf_to_off: usize,
+    /// A write that a MeCom device refuses.
+    refused: Option<(u16, u8)>,
 }
 
 /// A device behind a pseudo-terminal.
@@ -119,7 +123,11 @@ fn ready_beam(device_type: u32) -> Bench {
                 None => format!("{begin}+06"),
             });
         }
-        device.values.insert((hex(9, 13) as u16, hex(13, 15) as u8), hex(15, 23));
+        let key = (hex(9, 13) as u16, hex(13, 15) as u8);
+        if device.refused == Some(key) {
+            return with_crc(format!("{begin}+07"));
+        }
+        device.values.insert(key, hex(15, 23));
         // The acknowledgement carries the request's own CRC.
         format!("{begin}{crc}\r").into_bytes()
     });
@@ -140,6 +148,10 @@ fn cobolt() -> Bench {
             "sn?" => "12034".to_owned(),
             "ilk?" => device.interlock.to_owned(),
             "f?" => "0".to_owned(),
+            "l0" if device.deaf_to_off > 0 => {
+                device.deaf_to_off -= 1;
+                return Vec::new();
+            }
             "l1" | "l0" => {
                 device.lit = line == "l1";
                 "OK".to_owned()
@@ -356,4 +368,27 @@ fn a_host_that_falls_silent_and_a_laser_that_complains_end_in_darkness() {
     bench.with(|device| device.mute = true);
     let unheard = laser.dark(DarkReason::Shutdown, monotonic_now()).unwrap_err();
     assert!(matches!(unheard, LaserError::Lost), "no acknowledgement: {unheard}");
+}
+
+#[test]
+fn a_laser_that_does_not_hear_that_it_must_go_out_is_told_again_beside_a_host_that_hangs() {
+    let bench = cobolt();
+    let mut laser = open_laser(&lasers(text_lasers("cobolt", [None, Some(&bench), None])), monotonic_now).unwrap();
+    laser.program(&program(GREEN), monotonic_now()).unwrap();
+    laser.arm(monotonic_now()).unwrap();
+    alive_until(laser.as_mut(), || bench.with(|device| device.lit));
+    bench.with(|device| device.deaf_to_off = 3);
+    // The host neither polls nor sends heartbeats from here on.
+    eventually("darkness", || !bench.with(|device| device.lit));
+    assert_eq!(bench.with(|device| device.deaf_to_off), 0);
+}
+
+#[test]
+fn a_ready_beam_of_which_one_colour_does_not_obey_is_dark_in_the_others() {
+    let bench = ready_beam(1171);
+    let driver = LaserDriver::ReadyBeam { path: bench.path.clone(), full_power_uw: PerColour([40_000; 3]) };
+    bench.with(|device| device.refused = Some((7006, 1)));
+    let error = make_dark(&driver, monotonic_now).unwrap_err();
+    assert!(matches!(error, LaserError::Complaint { .. }), "{error}");
+    assert_eq!(bench.with(|device| [1, 2, 3].map(|instance| device.values[&(7006, instance)])), [1, 0, 0]);
 }

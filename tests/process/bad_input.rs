@@ -168,6 +168,7 @@ fn results_are_overwritten_by_force_only_and_by_the_same_rule_everywhere() {
         (with(&["view", "--pupil", "3", "--focus", "1", "--out", "v.png"]), "v.png"),
         (vec!["log", "convert", "log.csv", "--to", "lines", "--out", "out.lines"], "out.lines"),
         (vec!["log", "info", "log.csv", "--plot", "plot.svg"], "plot.svg"),
+        (vec!["pattern", "level", "37", "--config", "rig.toml", "--out", "level.png"], "level.png"),
         (with(&["run", "--tracker", "mock", "--frames", "2", "--record", "record"]), "record/frames.csv"),
         (
             vec!["demo", "--duration", "8s", "--resolution", "128x128", "--weights", "small", "--out", "demo"],

@@ -2,7 +2,8 @@
 //! `cargo test -p holod --features fault-injection --test fail_dark -- --nocapture`
 //!
 //! The real daemon drives the reference firmware over a pseudo-terminal. The fault is let happen, and the firmware's own
-//! log, written by a process that the fault does not touch, says when it went dark and that nothing was lit afterwards.
+//! log, written by a process that the fault does not touch, says when it went dark, and that nothing was lit that was not
+//! armed anew.
 
 use std::fmt::Write as _;
 use std::fs::{self, File};
@@ -110,15 +111,24 @@ fn dark_after(name: &str, sequential: bool, cause: Cause) -> (f64, String) {
         BoxEvent::Dark { t, reason } if *t >= t_fault => Some((*t, reason.name().to_owned())),
         _ => None,
     };
+    let was_lit = armed_at_the_end(&events());
     let _is_dark = wait_until(Duration::from_secs(20), || events().iter().any(|event| dark(event).is_some()));
-    // On a busy machine it may have been dark when the fault struck.
-    let Some((t_dark, reason)) = events().iter().find_map(dark) else { return (f64::INFINITY, "never".to_owned()) };
+    let Some((t_dark, reason)) = events().iter().find_map(dark) else {
+        // On a busy machine it may have been dark when the fault struck.
+        assert!(!was_lit, "{name}: never dark");
+        return (f64::INFINITY, "dark before".to_owned());
+    };
     // Faults of a moment may be over: then the box is armed again by the rules. What must not be is light in between.
     thread::sleep(Duration::from_millis(300));
     assert_eq!(light_in_the_dark(&events()), None, "{name}");
     daemon.signal(Signal::CONT);
     daemon.signal(Signal::KILL);
     ((t_dark - t_fault).seconds() * 1e3, reason)
+}
+
+fn armed_at_the_end(events: &[BoxEvent]) -> bool {
+    let last = events.iter().rev().find(|event| matches!(event, BoxEvent::Armed { .. } | BoxEvent::Dark { .. }));
+    matches!(last, Some(BoxEvent::Armed { .. }))
 }
 
 /// The first thing in a box's log that must not be: light that was not armed, two lasers at once, darkness with one lit.

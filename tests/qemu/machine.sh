@@ -88,7 +88,8 @@ pack_guest() {
 
 # boot KERNEL GUEST_FILE LOGS LIMIT_S OPTION...: runs the guest; what it says goes to LOGS.console and LOGS.result.
 #
-# The guest's clock counts its instructions (icount): a busy host makes the test slower, never the guest late.
+# The guest's clock counts its instructions (icount): a busy host makes the test slower, and the guest late only now
+# and then.
 boot() {
     local kernel="$1" guest="$2" logs="$3" limit_s="$4"
     rm -f "$logs.console" "$logs.result"

@@ -127,6 +127,9 @@ pub struct PatternTarget {
     /// so on).
     #[arg(long, value_name = "FILE.png")]
     pub out: Option<PathBuf>,
+    /// Overwrite files that are there already.
+    #[arg(long)]
+    pub force: bool,
     /// Show it, as after `run --output`, with each field's own laser lit.
     #[arg(long, value_name = "SPEC")]
     pub output: Option<String>,

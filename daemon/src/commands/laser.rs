@@ -113,9 +113,20 @@ fn arm(rig: &Rig) -> Result<(), Failure> {
     let mut laser = SerialBox::open(path, options, host_now).map_err(&unavailable)?;
     let silent = silence(&mut laser, &program);
     let acknowledged = laser.dark(DarkReason::Asked, host_now());
-    let (t_dark, reason) = silent.map_err(&unavailable)?;
+    let silent = silent.map_err(&unavailable)?;
     acknowledged.map_err(unavailable)?;
     let timeout_ms = program.heartbeat_timeout.seconds() * 1e3;
+    let Some((t_dark, reason)) = silent else {
+        return Err(Failure::new(
+            Exit::Unavailable,
+            format!(
+                "{}: the box was still armed {:.0} ms after it had heard its last heartbeat, and its timeout is \
+                 {timeout_ms:.0} ms: lasers would stay lit when holod dies; do not use this box, look at its firmware",
+                path.display(),
+                timeout_ms + PATIENCE.seconds() * 1e3
+            ),
+        ));
+    };
     report::print(&format!(
         "{}: armed with no laser lit, and dark by itself after {:.0} ms of silence ({}; its timeout is {timeout_ms:.0} ms)",
         path.display(),
@@ -124,8 +135,8 @@ fn arm(rig: &Rig) -> Result<(), Failure> {
     ))
 }
 
-/// After which silence the armed box is dark, and why.
-fn silence(laser: &mut SerialBox, program: &LaserProgram) -> Result<(TimeNs, DarkReason), LaserError> {
+/// After which silence the armed box is dark, and why; `None` where it stays armed.
+fn silence(laser: &mut SerialBox, program: &LaserProgram) -> Result<Option<(TimeNs, DarkReason)>, LaserError> {
     laser.dark(DarkReason::Asked, host_now())?;
     laser.program(program, host_now())?;
     laser.arm(host_now())?;
@@ -135,10 +146,10 @@ fn silence(laser: &mut SerialBox, program: &LaserProgram) -> Result<(TimeNs, Dar
         // The box's own word, not what the host supposes of it.
         let state = laser.report()?.state;
         if !state.armed {
-            return Ok((host_now() - t_armed, state.reason));
+            return Ok(Some((host_now() - t_armed, state.reason)));
         }
         laser.poll(host_now(), &mut |_: BoxEvent| {})?;
         std::thread::sleep(Duration::from_millis(2));
     }
-    Err(LaserError::NoAnswer { command: "silence", waited_ms: PATIENCE.0 / 1_000_000 })
+    Ok(None)
 }

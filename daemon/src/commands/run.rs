@@ -11,7 +11,7 @@ use crate::pictures::levels_picture;
 use crate::progress;
 use crate::record::{self, FieldRecord, FrameLog, FrameRecord};
 use crate::report;
-use crate::session::{self, Observer, SessionPlan, SessionReport};
+use crate::session::{self, Observer, SessionPlan, SessionReport, not_dark};
 use crate::setup;
 
 /// Scenario of the built-in tracker.
@@ -72,12 +72,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     }
     match &session.summary.lasers_not_dark {
         None => Ok(()),
-        Some(why) => Err(Failure::new(
-            Exit::Unavailable,
-            format!(
-                "the lasers did not acknowledge darkness at the end: {why}; look at them, and switch them off by hand"
-            ),
-        )),
+        Some(why) => Err(Failure::new(Exit::Unavailable, not_dark(why))),
     }
 }
 

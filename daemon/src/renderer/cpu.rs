@@ -100,6 +100,7 @@ impl Renderer for CpuRenderer {
     ) -> Result<Rendered, EngineError> {
         let Self { pool, hologram, pattern, timings, .. } = self;
         pool.with(|job| {
+            assert_eq!(levels.layout(), job.levels.layout(), "a renderer is made for one panel");
             job.swap(hologram, pattern, levels);
             (job.frame, job.pupil) = (Arc::clone(frame), pupil);
         });
@@ -128,5 +129,62 @@ impl Renderer for CpuRenderer {
 
     fn description(&self) -> &str {
         &self.description
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use holod_calibration::rig::Rig;
+
+    use super::*;
+    use crate::setup;
+
+    const SIZE: Resolution = Resolution { width: 34, height: 22 };
+    const PANEL: Resolution = Resolution { width: 40, height: 25 };
+
+    fn encoder() -> Arc<PanelEncoder> {
+        Arc::new(PanelEncoder::new(&Rig::default().panel, PANEL, SIZE).unwrap())
+    }
+
+    /// The levels of one stage after the other.
+    fn stage_by_stage(weights: &Weights, frame: &RgbdFrame, pupil: PupilDiameter) -> LevelsFrame {
+        let (mut hologram, mut pattern) = (ComplexHologram::dark(SIZE), PhasePattern::flat(SIZE));
+        CpuEngine::new(weights, SIZE).unwrap().render(frame, pupil, &mut hologram).unwrap();
+        DoublePhase::new(SIZE, weights.config().amplitude_constant).encode(&hologram, &mut pattern);
+        let encoder = encoder();
+        let mut levels = LevelsFrame::new(encoder.layout());
+        encoder.encode(PerColour(Colour::ALL.map(|colour| pattern.plane(colour))), &mut levels);
+        levels
+    }
+
+    #[test]
+    fn levels_are_those_of_the_stages_for_each_pupil_in_whatever_buffer() {
+        let weights = Weights::builtin_small();
+        let mut renderer = CpuRenderer::new(&weights, &encoder()).unwrap();
+        let frame = Arc::new(setup::sample_frame(SIZE));
+        let mut buffers = [(); 2].map(|()| LevelsFrame::new(encoder().layout()));
+        let mut shown = Vec::new();
+        for (pupil_mm, buffer) in [(2.0, 0), (4.0, 1), (2.0, 0)] {
+            let pupil = PupilDiameter::from_mm(pupil_mm);
+            renderer.render(&frame, pupil, &mut buffers[buffer]).unwrap();
+            assert_eq!(buffers[buffer].samples(), stage_by_stage(&weights, &frame, pupil).samples());
+            assert_eq!(renderer.hologram().resolution, SIZE);
+            shown.push(buffers[buffer].samples().to_vec());
+        }
+        assert_ne!(shown[0], shown[1], "pupils are told apart");
+        assert_eq!(renderer.timings().last().unwrap().name, "panel levels");
+    }
+
+    #[test]
+    fn a_frame_of_another_size_is_refused_and_the_next_one_rendered() {
+        let weights = Weights::builtin_small();
+        let mut renderer = CpuRenderer::new(&weights, &encoder()).unwrap();
+        let mut levels = LevelsFrame::new(encoder().layout());
+        let pupil = PupilDiameter::from_mm(3.0);
+        let wrong = Arc::new(setup::sample_frame(PANEL));
+        assert!(matches!(renderer.render(&wrong, pupil, &mut levels), Err(EngineError::Resolution { .. })));
+        let right = Arc::new(setup::sample_frame(SIZE));
+        renderer.render(&right, pupil, &mut levels).unwrap();
+        assert_eq!(levels.samples(), stage_by_stage(&weights, &right, pupil).samples());
     }
 }

@@ -353,13 +353,15 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
     if let Some(failure) = recorded.as_ref().and_then(|status| status.failure.as_deref()) {
         tracing::error!("the tracker's recording is not whole: {failure}");
     }
+    if let Some(why) = &lasers_not_dark
+        && (ended.is_err() || observed.is_err() || frame_loop_failed)
+    {
+        tracing::error!("{}", not_dark(why));
+    }
     let ended_by = ended?;
     observed?;
     if frame_loop_failed {
-        return Err(Failure::new(
-            Exit::Software,
-            "the frame loop failed (its message stands above); the lasers were put out first",
-        ));
+        return Err(Failure::new(Exit::Software, "the frame loop failed (its message stands above)"));
     }
 
     if tally.frames_shown == 0 {
@@ -433,6 +435,11 @@ fn first_frame_time(
     let began = host_now();
     renderer.render(&plan.frames.frames[0], pupil, &mut levels).map_err(Failure::because(Exit::Software))?;
     Ok(host_now() - began)
+}
+
+/// What a person must do where a laser box did not acknowledge darkness, for the reason `why`.
+pub fn not_dark(why: &str) -> String {
+    format!("the lasers did not acknowledge darkness at the end: {why}; look at them, and switch them off by hand")
 }
 
 fn stall_timeout(frame_time: TimeNs) -> TimeNs {
@@ -528,16 +535,10 @@ impl Watch<'_> {
                 return Ok("the end of the pupil log".to_owned());
             }
             if output.dark_switch().reason() == Some(DarkReason::Panic) {
-                return Err(Failure::new(
-                    Exit::Software,
-                    "a thread failed (its message stands above); the lasers were put out first",
-                ));
+                return Err(Failure::new(Exit::Software, "a thread failed (its message stands above)"));
             }
             if let Some(fault) = self.output.lost().filter(|fault| !fault.is_recoverable()) {
-                return Err(Failure::new(
-                    Exit::Unavailable,
-                    format!("the panel: {fault}; the lasers were put out first"),
-                ));
+                return Err(Failure::new(Exit::Unavailable, format!("the panel: {fault}")));
             }
             if frame_thread.is_finished() {
                 let t_end = *t_give_up.get_or_insert(now + LAST_FRAME_WAIT);

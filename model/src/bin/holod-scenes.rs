@@ -242,7 +242,16 @@ fn main() -> ExitCode {
     }
 }
 
+/// The smallest picture that has room for a row of marks near and far.
+const LEAST_MARKS: Resolution = Resolution { width: 96, height: 120 };
+
 fn generate(options: &Generate) -> Result<String, Failure> {
+    let size = options.look.size;
+    if matches!(options.look.kind, Kind::Marks) && (size.width < LEAST_MARKS.width || size.height < LEAST_MARKS.height)
+    {
+        let message = format!("--size: found {size}, expected {LEAST_MARKS} or more with --kind marks");
+        return Err(Failure { code: exit::USAGE, message });
+    }
     let plan = options.look.plan(options.seed);
     let style = ProgressStyle::with_template("{bar:40} {pos}/{len} scenes by {msg}, {eta} left")
         .expect("the template is constant");

@@ -67,6 +67,7 @@ pub struct StageTiming {
     pub name: String,
     /// Wall-clock time.
     pub duration: Duration,
-    /// Floating-point operations done in matrix-like work (two to a multiply-add), 0 for other stages.
+    /// Floating-point operations of matrix-like work as its definition has them, two to a multiply-add; 0 for other
+    /// stages. Winograd's filtering does with a quarter of those of a plain layer.
     pub flop: u64,
 }

@@ -44,6 +44,11 @@ def judge_marks(shards: list[Shard], methods: list[Method], bench: Bench, sheet:
             dark = dark_area(stack)
             if int(dark.sum()) < LEAST_AREA_PX:
                 raise ShardError(f"{shard.path}: nothing of it stays black; write larger ones with --kind marks")
+            if not float(stack.target.amax()) > LEAST_LIGHT:
+                raise ShardError(
+                    f"{shard.path}: {stack.target.shape[-1]}x{stack.target.shape[-2]} has no room for marks, expected "
+                    "96x120 or more; write larger ones with --kind marks"
+                )
             for method in methods:
                 field = method.field(stack, pupil)
                 for stage, shown in ((BEFORE, field), (AFTER, bench.panel(field)[0])):

@@ -58,6 +58,17 @@ def test_black_is_what_is_far_from_light_at_every_focus(tmp_path: Path) -> None:
     assert light_ratio(0.5 * stack.target, stack.target) == pytest.approx(0.5)
 
 
+def test_scenes_without_marks_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "scene_000000.safetensors"
+    write_marks(path)
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    tensors = load_file(path)
+    save_file({**tensors, **{name: 0 * tensors[name] for name in ("image", "stack_0", "stack_1")}}, path, metadata)
+    with pytest.raises(ShardError, match="128x128 has no room for marks"):
+        judge_marks([Shard(path)], rivals(OPTICS), BENCH, tmp_path / "sheet.png")
+
+
 def test_scenes_of_another_kind_are_refused(tmp_path: Path) -> None:
     shard = write_marks(tmp_path / "scene_000000.safetensors", kind="test")
     with pytest.raises(ShardError, match="kind 'test', expected marks"):

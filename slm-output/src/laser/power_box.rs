@@ -106,7 +106,7 @@ impl PowerBox {
             t_heartbeat: Arc::clone(&t_heartbeat),
             stop: Arc::clone(&stop),
             timeout: lasers.heartbeat_timeout,
-            lit: NONE_LIT,
+            maybe_lit: false,
             t_probe: clock(),
             failed: false,
             clock,
@@ -280,7 +280,8 @@ struct Worker<D> {
     t_heartbeat: Arc<AtomicI64>,
     stop: Arc<AtomicBool>,
     timeout: TimeNs,
-    lit: PerColour<bool>,
+    /// Not known to be out.
+    maybe_lit: bool,
     t_probe: TimeNs,
     /// It failed and was not heard of since.
     failed: bool,
@@ -295,11 +296,18 @@ impl<D: PowerDevice> Worker<D> {
                 self.report(number, done);
             }
             let now = (self.clock)();
-            if self.lit != NONE_LIT && now.0 - self.t_heartbeat.load(Ordering::Acquire) > self.timeout.0 {
+            let silent = now.0 - self.t_heartbeat.load(Ordering::Acquire) > self.timeout.0;
+            // Again and again, until the device says that they are out.
+            if self.maybe_lit && (silent || self.failed) {
                 let put_out = self.set_lit(NONE_LIT);
                 match put_out {
-                    Ok(()) => drop(self.reports.push(Report::TimedOut { t: (self.clock)() })),
-                    failed => self.report(0, failed),
+                    Ok(()) if silent => drop(self.reports.push(Report::TimedOut { t: (self.clock)() })),
+                    Ok(()) => {}
+                    Err(_) if self.failed => {}
+                    failed => {
+                        self.failed = true;
+                        self.report(0, failed);
+                    }
                 }
             }
             if now.0 - self.t_probe.0 > PROBE_EVERY.0 {
@@ -332,11 +340,11 @@ impl<D: PowerDevice> Worker<D> {
 
     fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError> {
         let done = self.device.set_lit(lit);
-        if done.is_err() && lit != NONE_LIT {
+        self.maybe_lit = match &done {
+            Ok(()) => lit != NONE_LIT,
             // It may have done half of it.
-            let _first_error_counts = self.device.set_lit(NONE_LIT);
-        }
-        self.lit = if done.is_ok() { lit } else { NONE_LIT };
+            Err(_) => lit == NONE_LIT || self.device.set_lit(NONE_LIT).is_err(),
+        };
         done
     }
 
@@ -381,10 +389,14 @@ impl Conversation {
         Ok(self.writer.write_all(bytes)?)
     }
 
-    /// The next line that is not empty, without CR and LF; nothing where none is complete after `patience`.
-    pub(super) fn line(&mut self, patience: TimeNs) -> Result<Option<Vec<u8>>, LaserError> {
+    /// The end of `patience` from now on.
+    pub(super) fn t_end(&self, patience: TimeNs) -> TimeNs {
+        (self.clock)() + patience
+    }
+
+    /// The next line that is not empty, without CR and LF; nothing where none is complete at `t_end`.
+    pub(super) fn line_until(&mut self, t_end: TimeNs) -> Result<Option<Vec<u8>>, LaserError> {
         const LINE_BYTES_MAX: usize = 1024;
-        let t_end = (self.clock)() + patience;
         let mut line = Vec::new();
         while (self.clock)() < t_end {
             let mut byte = [0];

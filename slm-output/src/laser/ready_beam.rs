@@ -83,7 +83,8 @@ impl ReadyBeam {
             self.sequence = self.sequence.wrapping_add(1);
             let sent = frame(self.sequence, request);
             self.port.send(sent.as_bytes())?;
-            while let Some(line) = self.port.line(ANSWER_WAIT)? {
+            let t_end = self.port.t_end(ANSWER_WAIT);
+            while let Some(line) = self.port.line_until(t_end)? {
                 match reply(&sent, &line) {
                     Some(reply) => return Ok(reply),
                     // A frame that was damaged, or the answer to somebody else's; whatever is no frame is a stranger's.
@@ -117,6 +118,17 @@ impl ReadyBeam {
         }
     }
 
+    fn switch(&mut self, colour: Colour, on: bool) -> Result<(), LaserError> {
+        self.write(LASER_ON, colour, u32::from(on))?;
+        let found = self.read(LASER_ON, instance(colour))?;
+        if found == u32::from(on) {
+            return Ok(());
+        }
+        let sent = format!("{colour} {}", if on { "on" } else { "off" });
+        let (found, expected) = (found.to_string(), u32::from(on).to_string());
+        Err(LaserError::Complaint { path: self.port.path(), sent, found, expected })
+    }
+
     fn complaint(&self, sent: String, reply: &Reply) -> LaserError {
         let found = match reply {
             Reply::Error(code) => format!("error {code}"),
@@ -148,25 +160,15 @@ impl PowerDevice for ReadyBeam {
     }
 
     fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError> {
-        // Out before on.
-        for on in [false, true] {
-            for colour in Colour::ALL.into_iter().filter(|&colour| lit[colour] == on) {
-                if on {
-                    self.write(DIGITAL_CONTROL, colour, 1)?;
-                }
-                self.write(LASER_ON, colour, u32::from(on))?;
-                let found = self.read(LASER_ON, instance(colour))?;
-                if found != u32::from(on) {
-                    let sent = format!("{colour} {}", if on { "on" } else { "off" });
-                    let expected = u32::from(on).to_string();
-                    return Err(LaserError::Complaint {
-                        path: self.port.path(),
-                        sent,
-                        found: found.to_string(),
-                        expected,
-                    });
-                }
-            }
+        // Out before on, and all that can be put out is, even where one of them does not obey.
+        let mut put_out = Ok(());
+        for colour in Colour::ALL.into_iter().filter(|&colour| !lit[colour]) {
+            put_out = put_out.and(self.switch(colour, false));
+        }
+        put_out?;
+        for colour in Colour::ALL.into_iter().filter(|&colour| lit[colour]) {
+            self.write(DIGITAL_CONTROL, colour, 1)?;
+            self.switch(colour, true)?;
         }
         Ok(())
     }

@@ -13,7 +13,7 @@ use holod_laser_firmware::{
 
 use super::box_clock::{BoxClock, Offset};
 use super::line_link::{Arrival, Link, Sharing, open_port};
-use super::program::{ceil_us, commands, floor_us, laser_of};
+use super::program::{ceil_us, commands, floor_us, laser_of, nanoseconds};
 use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow, SimulatedLaser, Trigger};
 
 const BAUD: u32 = 115_200;
@@ -570,15 +570,16 @@ impl WireCheck {
 
     fn agrees(&mut self, sync: SyncSeen, offset: Offset) -> bool {
         let (Some(t_frame), Some(t_edge)) = (self.t_frame, sync.t_last) else { return true };
-        let t_edge_ns = i64::try_from(t_edge.0).unwrap_or(i64::MAX / 2000) * 1000 - offset.middle_ns();
-        let since_frame_ns = t_edge_ns - t_frame.0;
+        let t_edge_ns = nanoseconds(t_edge).0.saturating_sub(offset.middle_ns());
+        let since_frame_ns = t_edge_ns.saturating_sub(t_frame.0);
         let Some((t_first, first_count, first_ns)) = self.first else {
             self.first = Some((t_frame, sync.count, since_frame_ns));
             return true;
         };
         let wander_ns = (since_frame_ns - first_ns + self.period.0 / 2).rem_euclid(self.period.0) - self.period.0 / 2;
         let tolerance_ns = self.period.0 / 16 + offset.error_ns();
-        let frames = (t_edge_ns - t_first.0 - first_ns + self.period.0 / 2).div_euclid(self.period.0);
+        let frames = (since_frame_ns.saturating_sub(first_ns) + t_frame.0 - t_first.0 + self.period.0 / 2)
+            .div_euclid(self.period.0);
         let edges = i64::from(sync.count.wrapping_sub(first_count));
         wander_ns.abs() <= tolerance_ns && edges == frames
     }

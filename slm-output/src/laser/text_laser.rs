@@ -83,12 +83,12 @@ impl TextLaser {
 
     fn ask(&mut self, question: &str) -> Result<String, LaserError> {
         self.send(question)?;
-        let Some(answer) = self.port.line(self.answer_wait)? else {
+        let Some(answer) = self.port.line_until(self.port.t_end(self.answer_wait))? else {
             return Err(LaserError::NoAnswer { command: "question", waited_ms: self.answer_wait.0 / 1_000_000 });
         };
         let answer = String::from_utf8_lossy(&answer).trim().to_owned();
         if answer != self.profile.acknowledge {
-            let _acknowledged_or_not = self.port.line(TRAIL_WAIT)?;
+            let _acknowledged_or_not = self.port.line_until(self.port.t_end(TRAIL_WAIT))?;
         }
         Ok(answer)
     }
@@ -118,7 +118,8 @@ impl TextLaser {
 
     fn command(&mut self, command: &str) -> Result<(), LaserError> {
         self.send(command)?;
-        while let Some(line) = self.port.line(self.answer_wait)? {
+        let t_end = self.port.t_end(self.answer_wait);
+        while let Some(line) = self.port.line_until(t_end)? {
             let answer = String::from_utf8_lossy(&line).trim().to_owned();
             if answer == self.profile.acknowledge {
                 return Ok(());

@@ -4,6 +4,7 @@ use std::os::fd::BorrowedFd;
 
 use holod_calibration::TimeNs;
 
+use super::drm::DisplayCheck;
 use super::{FrameSource, PanelFault, PresentedRefresh, Presenter};
 use crate::fields::{FrameTag, LevelsFrame};
 
@@ -73,6 +74,10 @@ impl Presenter for Recorder {
 
     fn recover(&mut self, now: TimeNs) -> Result<(), PanelFault> {
         self.panel.recover(now)
+    }
+
+    fn checks(&self) -> &[DisplayCheck] {
+        self.panel.checks()
     }
 
     fn shown(&self) -> Option<&LevelsFrame> {

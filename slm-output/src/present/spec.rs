@@ -96,6 +96,9 @@ fn window(rest: &str) -> Result<WindowSpec, Mismatch> {
     Ok(WindowSpec { monitor, allow_primary })
 }
 
+/// Of a virtual panel's faults.
+const LONGEST: Duration = Duration::from_secs(86_400);
+
 fn report_faults(text: &str) -> Result<ReportFaults, Mismatch> {
     let mut faults = ReportFaults::NONE;
     for option in text.split(',').filter(|option| !option.is_empty()) {
@@ -110,14 +113,16 @@ fn report_faults(text: &str) -> Result<ReportFaults, Mismatch> {
                 let refresh_hz = value.parse().ok().filter(|hz: &f64| (1.0..=2000.0).contains(hz));
                 faults.refresh_hz = Some(refresh_hz.ok_or_else(|| wrong("1 to 2000 Hz"))?);
             }
-            "jitter" => faults.jitter = time(value).ok_or_else(|| wrong("a time such as 0.2ms"))?,
+            "jitter" => faults.jitter = time(value).ok_or_else(|| wrong("a time such as 0.2ms, a day at most"))?,
             "late" => faults.late = share()?,
             "early" => faults.early = share()?,
             "doubled" => faults.doubled = share()?,
             "dropped" => faults.dropped = share()?,
             "unplug" => {
                 let times = value.split_once('+').and_then(|(after, length)| Some((time(after)?, time(length)?)));
-                faults.unplug = Some(times.ok_or_else(|| wrong("two times such as 5s+2s: after which, for how long"))?);
+                faults.unplug = Some(
+                    times.ok_or_else(|| wrong("two times such as 5s+2s, a day at most: after which, for how long"))?,
+                );
             }
             "seed" => faults.seed = value.parse().map_err(|_| wrong("a whole number"))?,
             _ => {
@@ -155,7 +160,7 @@ fn time(text: &str) -> Option<TimeNs> {
         _ => return None,
     };
     let duration = Duration::try_from_secs_f64(number.parse::<f64>().ok()? * unit_s).ok()?;
-    i64::try_from(duration.as_nanos()).ok().map(TimeNs)
+    (duration <= LONGEST).then_some(TimeNs(duration.as_nanos() as i64))
 }
 
 #[cfg(test)]

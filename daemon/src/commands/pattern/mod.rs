@@ -12,8 +12,10 @@ use holod_slm_output::{FrameLayout, LevelsFrame, OutputSpec, PanelEncoder};
 
 use self::sight::Sight;
 use crate::cli::{PatternKind, PatternTarget, ProfileArg};
+use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
 use crate::pictures::video_pictures;
+use crate::session::not_dark;
 use crate::{report, setup};
 
 pub(super) fn pattern(kind: &PatternKind) -> Result<(), Failure> {
@@ -29,7 +31,7 @@ pub(super) fn pattern(kind: &PatternKind) -> Result<(), Failure> {
     pattern.draw(&placement, &encoder, &rig.geometry, &mut levels).map_err(&usage)?;
     let mut sight = Sight::of(&pattern, &placement, &rig).map_err(usage)?;
     if let Some(out) = &to.out {
-        sight.files = save(&levels, out)?;
+        sight.files = save(&levels, out, to.force)?;
     }
     if to.json {
         report::print_json(&sight)?;
@@ -38,7 +40,11 @@ pub(super) fn pattern(kind: &PatternKind) -> Result<(), Failure> {
     }
     let Some(output) = output else { return Ok(()) };
     let shown = show::show(&output, &rig, &encoder, &levels, to)?;
-    report::print(&shown.to_string())
+    report::print(&shown.to_string())?;
+    match shown.lasers_dark {
+        true => Ok(()),
+        false => Err(Failure::new(Exit::Unavailable, not_dark("the laser box did not acknowledge in time"))),
+    }
 }
 
 fn of_arguments(kind: &PatternKind) -> Pattern {
@@ -73,8 +79,8 @@ fn placement(to: &PatternTarget) -> Placement {
 }
 
 /// Writes each video frame that carries `levels`: to `out`, or to a file beside it for each field.
-fn save(levels: &LevelsFrame, out: &Path) -> Result<Vec<PathBuf>, Failure> {
-    if out.is_dir() || out.file_stem().is_none() {
+fn save(levels: &LevelsFrame, out: &Path, force: bool) -> Result<Vec<PathBuf>, Failure> {
+    if out.is_dir() || out.file_stem().is_none() || out == Path::new("-") {
         return Err(Failure::new(
             Exit::CannotCreate,
             format!("--out {}: expected the name of a PNG file to write", out.display()),
@@ -82,17 +88,18 @@ fn save(levels: &LevelsFrame, out: &Path) -> Result<Vec<PathBuf>, Failure> {
     }
     let pictures = video_pictures(levels);
     let single = pictures.len() == 1;
-    let mut files = Vec::with_capacity(pictures.len());
-    for (position, (colour, picture)) in pictures.iter().enumerate() {
-        let file = match colour {
-            Some(colour) if !single => {
-                let stem = out.file_stem().unwrap_or_default().to_string_lossy();
-                out.with_file_name(format!("{stem}-{}-{colour}.png", position + 1))
-            }
-            _ => out.to_path_buf(),
-        };
-        report::save_png(picture, &file)?;
-        files.push(file);
+    let name = |position: usize, colour: Option<Colour>| match colour {
+        Some(colour) if !single => {
+            let stem = out.file_stem().unwrap_or_default().to_string_lossy();
+            out.with_file_name(format!("{stem}-{}-{colour}.png", position + 1))
+        }
+        _ => out.to_path_buf(),
+    };
+    let files: Vec<PathBuf> =
+        pictures.iter().enumerate().map(|(position, (colour, _))| name(position, *colour)).collect();
+    refuse_existing(files.iter().cloned(), "--out", force)?;
+    for ((_, picture), file) in pictures.iter().zip(&files) {
+        report::save_png(picture, file)?;
     }
     Ok(files)
 }

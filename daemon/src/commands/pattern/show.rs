@@ -31,7 +31,7 @@ pub(super) struct Shown {
     lit: PerColour<u64>,
     /// Why the last field that was not lit was not.
     dark: Option<DarkReason>,
-    lasers_dark: bool,
+    pub(super) lasers_dark: bool,
     flat_presented: bool,
 }
 
@@ -51,7 +51,7 @@ pub(super) fn show(
     switch.install_panic_hook(host_now);
     if to.dark {
         switch.dark(DarkReason::Asked);
-    } else if rig.lasers.driver != LaserDriver::Simulated {
+    } else if rig.lasers.driver != LaserDriver::Simulated && !matches!(spec, OutputSpec::Headless(_)) {
         tracing::warn!(
             "lasers will be lit: an eye in the display may get all of their light in one spot; use a camera"
         );
@@ -68,6 +68,9 @@ pub(super) fn show(
             if let Some(signal) = signals.caught() {
                 shown.ended_by = signal.into();
                 break 'frames;
+            }
+            if switch.reason() == Some(DarkReason::Panic) {
+                return Err(Failure::new(Exit::Software, "a thread failed (its message stands above)"));
             }
             if duration.is_some_and(|duration| now - t_begin >= duration) {
                 shown.ended_by = "the asked duration".into();
@@ -103,10 +106,7 @@ pub(super) fn show(
                     tracing::error!("the panel is lost, lasers dark: {fault}");
                 }
                 PanelEvent::Lost { fault, .. } => {
-                    return Err(Failure::new(
-                        Exit::Unavailable,
-                        format!("the panel: {fault}; the lasers were put out first"),
-                    ));
+                    return Err(Failure::new(Exit::Unavailable, format!("the panel: {fault}")));
                 }
                 PanelEvent::Back { .. } => tracing::info!("the panel is back"),
             }
@@ -122,7 +122,9 @@ pub(super) fn show(
 fn open(spec: &OutputSpec, rig: &Rig, encoder: &PanelEncoder) -> Result<Output, OutputError> {
     let panel = open_panel(spec, &PanelSetup::new(&rig.panel, encoder), host_now())?;
     let laser = open_laser(&rig.lasers, host_now)?;
-    Output::start(rig, encoder, panel, laser, OutputOptions::default(), host_now)
+    let options = OutputOptions::default();
+    let stall_timeout = rig.lasers.stall_timeout.unwrap_or(options.stall_timeout);
+    Output::start(rig, encoder, panel, laser, OutputOptions { stall_timeout, ..options }, host_now)
 }
 
 impl fmt::Display for Shown {

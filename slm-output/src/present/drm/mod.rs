@@ -38,7 +38,7 @@ use std::path::PathBuf;
 use holod_calibration::TimeNs;
 use rustix::io::Errno;
 
-use super::{FrameSource, PanelFault, PanelSetup, PresentedRefresh, Presenter};
+use super::{FrameSource, PanelFault, PanelSetup, PresentedRefresh, Presenter, Provenance};
 use crate::fields::{FrameTag, LevelsFrame};
 use crate::output::monotonic_now;
 use crate::packing::{PixelFormat, write_frame};
@@ -199,6 +199,10 @@ impl DrmPanel {
             self.margin.missed();
         }
         self.t_choose = self.margin.t_choose(refresh.t_present + self.period).max(t_sent);
+        if refresh.provenance != Provenance::Hardware {
+            // Of two flips within half a refresh the clock takes the second for the first one's event, once more.
+            self.t_choose = self.t_choose.max(TimeNs(refresh.t_present.0 + 5 * self.period.0 / 8));
+        }
         if let Some(held) = self.held.take() {
             presented(held);
         }

@@ -86,7 +86,8 @@ impl Copies {
             any_monitor,
             no_fence,
             no_fence,
-            present::Option::NONE.into(),
+            // Never scanned out as it is: it is written again.
+            present::Option::COPY.into(),
             next_refresh,
             0,
             0,
