@@ -3,6 +3,8 @@
 mod cpu;
 #[cfg(test)]
 mod golden;
+#[cfg(feature = "gpu")]
+mod gpu;
 #[cfg(test)]
 mod reference;
 
