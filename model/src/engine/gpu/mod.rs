@@ -1,5 +1,11 @@
 //! The network on the GPU: a plan of shaders, and the engine that runs it.
 
+mod direct;
+mod double_phase;
+mod levels;
+mod loaded_plan;
 mod map;
 mod network;
 mod plan;
+#[cfg(test)]
+mod tests;
