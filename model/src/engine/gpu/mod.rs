@@ -1,5 +1,6 @@
 //! The network on the GPU: a plan of shaders, and the engine that runs it.
 
+mod conv;
 mod direct;
 mod double_phase;
 mod levels;
@@ -9,3 +10,5 @@ mod network;
 mod plan;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod trial;
