@@ -12,7 +12,10 @@ use std::time::Duration;
 
 use holod_calibration::Resolution;
 
+use crate::gpu::GpuError;
+
 pub use cpu::{CpuEngine, fma_peak};
+// pub use gpu::{EncodedCounts, GpuEngine};
 
 /// A frame that an engine refuses.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -39,6 +42,9 @@ pub enum EngineError {
         /// What was given.
         pupil_mm: f32,
     },
+    /// The device cannot do it, or failed at it.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
 }
 
 /// One step of a frame, before it is timed.
