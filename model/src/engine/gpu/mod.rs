@@ -2,8 +2,14 @@
 
 mod conv;
 mod deformable;
+mod direct;
+mod double_phase;
+mod levels;
+mod loaded_plan;
 mod map;
 mod network;
 mod plan;
+#[cfg(test)]
+mod tests;
 #[cfg(test)]
 mod trial;
