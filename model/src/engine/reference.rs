@@ -43,7 +43,7 @@ impl Map {
         self.values[(channel * self.height + y as usize) * self.width + x as usize]
     }
 
-    fn bilinear(&self, channel: usize, y: f64, x: f64) -> f64 {
+    pub(crate) fn bilinear(&self, channel: usize, y: f64, x: f64) -> f64 {
         let (top, left) = (y.floor(), x.floor());
         let (lower, right) = (y - top, x - left);
         let at = |dy: isize, dx: isize| self.at(channel, top as isize + dy, left as isize + dx);

@@ -1,6 +1,7 @@
 //! The network on the GPU: a plan of shaders, and the engine that runs it.
 
 mod conv;
+mod deformable;
 mod direct;
 mod double_phase;
 mod levels;
