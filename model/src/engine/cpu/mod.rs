@@ -9,7 +9,6 @@ mod direct;
 mod expected_stack;
 mod feature_map;
 mod feedback;
-mod layered;
 mod maps;
 mod network;
 mod peak;

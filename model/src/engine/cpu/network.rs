@@ -8,7 +8,6 @@ use num_complex::Complex32;
 use super::blocks::scale_of;
 use super::direct::Direct;
 use super::expected_stack::ExpectedStack;
-use super::layered::Layered;
 use super::trunk::Trunk;
 use crate::engine::{Stage, StageTiming, StageTimings};
 use crate::optics::FourierUpsampler;
@@ -32,7 +31,6 @@ pub(super) struct Network {
 /// A family's way to the field on the network's grid.
 pub(super) enum Predictor {
     Direct(Box<Direct>),
-    Layered(Box<Layered>),
     ExpectedStack(Box<ExpectedStack>),
 }
 
@@ -40,7 +38,6 @@ impl Predictor {
     fn stages(&self) -> Vec<Stage> {
         match self {
             Self::Direct(direct) => direct.stages(),
-            Self::Layered(layered) => layered.stages(),
             Self::ExpectedStack(expected_stack) => expected_stack.stages(),
         }
     }
@@ -48,7 +45,6 @@ impl Predictor {
     pub(super) fn run_stage(&mut self, index: usize, frame: &RgbdFrame, pupil_mm: f32) {
         match self {
             Self::Direct(direct) => direct.run_stage(index, frame, pupil_mm),
-            Self::Layered(layered) => layered.run_stage(index, frame, pupil_mm),
             Self::ExpectedStack(expected_stack) => expected_stack.run_stage(index, frame, pupil_mm),
         }
     }
@@ -56,7 +52,6 @@ impl Predictor {
     fn write_field(&self, colour: Colour, field: &mut [Complex32]) {
         match self {
             Self::Direct(direct) => direct.write_field(colour, field),
-            Self::Layered(layered) => layered.write_field(colour, field),
             Self::ExpectedStack(expected_stack) => expected_stack.write_field(colour, field),
         }
     }
@@ -70,9 +65,6 @@ impl Network {
         let padded = Resolution { width: scale * width, height: scale * height };
         let predictor = match &weights.family {
             Family::Direct { layers } => Predictor::Direct(Box::new(Direct::new(config, layers, size, set))),
-            Family::Layered { surface, correction } => {
-                Predictor::Layered(Box::new(Layered::new(config, surface, correction, size, set)))
-            }
             Family::ExpectedStack { lighting, correction, feedback } => {
                 let nets = [lighting, correction].map(|layers| Trunk::new(layers, config.leaky_slope, size, set));
                 Predictor::ExpectedStack(Box::new(ExpectedStack::new(config, nets, *feedback, size, set)))
@@ -137,7 +129,6 @@ impl Predictor {
     pub(super) fn after(&self, stage: usize) -> Seen<'_> {
         match self {
             Self::Direct(direct) => direct.after(stage),
-            Self::Layered(layered) => layered.after(stage),
             Self::ExpectedStack(expected_stack) => expected_stack.after(stage),
         }
     }

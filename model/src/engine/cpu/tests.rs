@@ -10,7 +10,7 @@ use super::*;
 use crate::engine::reference::{self, Value};
 use crate::simd::InstructionSet;
 use crate::weights::tests::{self as weights_tests, random_weights};
-use crate::weights::{Architecture, Grid, NetworkConfig};
+use crate::weights::{Grid, NetworkConfig};
 
 /// Largest difference allowed between a map and its reference, relative to the reference's largest value.
 const TOLERANCE: f64 = 2e-5;
@@ -70,10 +70,7 @@ fn check_all_stages(weights: &Weights, resolution: Resolution, pupil_mm: f32, se
     // The second time round, what the first left in the maps must not show.
     let mut hologram = ComplexHologram::dark(resolution);
     network.render(&self::frame(resolution, seed + 1), PupilDiameter::from_mm(2.0), &mut hologram);
-    // The input of `layered`'s correction is written by the stage that carries the light, not by one of its own.
-    let layered = weights.config.architecture == Architecture::Layered;
-    let stages = expected.stages.iter_mut().filter(|stage| !layered || stage.name != "correction.encoded");
-    for (index, stage) in stages.enumerate() {
+    for (index, stage) in expected.stages.iter_mut().enumerate() {
         network.predictor.run_stage(index, &frame, pupil_mm);
         let error = match (network.predictor.after(index), &stage.value) {
             (Seen::Map(map, _), Value::Encoded(expected)) => map_error(map, expected),
@@ -140,26 +137,6 @@ proptest! {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(16))]
     #[test]
-    fn every_stage_of_a_layered_network_matches_the_reference(
-        width in 1usize..40,
-        height in 1usize..14,
-        channels in 1usize..20,
-        depth_layers in 2usize..7,
-        transport_prior in any::<bool>(),
-        pupil_mm in 1.0f32..5.0,
-        seed in 0u32..1000,
-    ) {
-        let config = NetworkConfig { channels, depth_layers, transport_prior, ..weights_tests::layered_config() };
-        let weights = random_weights(config, u64::from(seed));
-        for set in InstructionSet::available() {
-            check_all_stages(&weights, Resolution { width, height }, pupil_mm, seed, set);
-        }
-    }
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig::with_cases(16))]
-    #[test]
     fn every_stage_of_an_expected_stack_network_matches_the_reference(
         width in 1usize..40,
         height in 1usize..14,
@@ -194,12 +171,11 @@ fn blurs_wider_than_the_table_of_the_disc_match_the_reference() {
 #[test]
 fn one_pixel_one_column_and_one_row_match_the_reference() {
     let direct = random_weights(config(Grid::HalfBand, 6, 12, vec![3, 4]), 5);
-    let layered = random_weights(weights_tests::layered_config(), 5);
     let expected_stack = random_weights(weights_tests::expected_stack_config(), 5);
     let refined_stack =
         random_weights(NetworkConfig { refined_stack: true, ..weights_tests::expected_stack_config() }, 5);
     for (width, height) in [(1, 1), (1, 33), (57, 1), (2, 2), (101, 5)] {
-        for weights in [&direct, &layered, &expected_stack, &refined_stack] {
+        for weights in [&direct, &expected_stack, &refined_stack] {
             for set in InstructionSet::available() {
                 check_all_stages(weights, Resolution { width, height }, 3.3, 9, set);
             }
