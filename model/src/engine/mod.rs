@@ -3,6 +3,7 @@
 mod cpu;
 #[cfg(test)]
 mod golden;
+mod modulation;
 #[cfg(test)]
 mod reference;
 
@@ -37,20 +38,6 @@ pub enum EngineError {
         /// What was given.
         pupil_mm: f32,
     },
-}
-
-/// One step of a frame, before it is timed.
-struct Stage {
-    name: String,
-    /// As in [`StageTiming`].
-    flop: u64,
-}
-
-impl Stage {
-    /// A step that is not matrix-like work.
-    fn plain(name: &str) -> Self {
-        Self { name: name.into(), flop: 0 }
-    }
 }
 
 /// Where the time of one frame went.

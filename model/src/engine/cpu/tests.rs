@@ -5,7 +5,8 @@ use num_complex::{Complex32, Complex64};
 use proptest::prelude::*;
 
 use super::feature_map::FeatureMap;
-use super::network::{Network, Seen};
+use super::network::Network;
+use super::stage::{Job, Seen};
 use super::*;
 use crate::engine::reference::{self, Value};
 use crate::simd::InstructionSet;
@@ -60,54 +61,70 @@ fn error_once_spoiled(map: &FeatureMap, expected: &mut reference::Map) -> f64 {
     map_error(map, expected)
 }
 
+/// What the engine calls a stage of the reference.
+fn name_of(stage: &reference::Stage) -> String {
+    let adjustable = if matches!(stage.value, Value::Layer(_, Some(_))) { " (adjustable)" } else { "" };
+    match stage.name.as_str() {
+        "encoded" => "encode".into(),
+        "lighting.encoded" => "expected stack".into(),
+        "carried" => "light of the layers".into(),
+        "correction.encoded" => "feedback".into(),
+        layer_or_field => layer_or_field.replace(['.', '_'], " ") + adjustable,
+    }
+}
+
 /// Runs a network stage by stage against the reference; every comparison must also see one wrong value.
 fn check_all_stages(weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32, set: InstructionSet) {
     let frame = frame(resolution, seed);
-    let mut expected = reference::run(weights, &frame, f64::from(pupil_mm));
+    let reference::Trace { mut stages, field } = reference::run(weights, &frame, f64::from(pupil_mm));
+    stages.push(reference::Stage { name: "field".into(), value: Value::Light(field.clone()) });
     let mut network = Network::new(weights, resolution, set);
     let context = format!("{resolution}, {} on {}", weights.config().channels, set.name());
 
     // The second time round, what the first left in the maps must not show.
     let mut hologram = ComplexHologram::dark(resolution);
     network.render(&self::frame(resolution, seed + 1), PupilDiameter::from_mm(2.0), &mut hologram);
-    for (index, stage) in expected.stages.iter_mut().enumerate() {
-        network.predictor.run_stage(index, &frame, pupil_mm);
-        let error = match (network.predictor.after(index), &stage.value) {
-            (Seen::Map(map, _), Value::Encoded(expected)) => map_error(map, expected),
-            (Seen::Map(map, offsets), Value::Layer(expected, expected_offsets)) => {
-                assert_eq!(offsets.is_some(), expected_offsets.is_some());
-                let errors = offsets.iter().zip(expected_offsets).map(|(map, expected)| map_error(map, expected));
-                largest(errors.chain([map_error(map, expected)]))
-            }
-            (Seen::Light(light), Value::Light(expected)) => light_error(light, expected),
-            _ => panic!("{context}: stage {index} is not {}", stage.name),
-        };
-        assert!(error < TOLERANCE, "{context}: {}: {error}", stage.name);
-        let spoiled = match (network.predictor.after(index), &mut stage.value) {
-            (Seen::Map(map, _), Value::Encoded(expected)) => error_once_spoiled(map, expected),
-            (Seen::Map(map, offsets), Value::Layer(expected, expected_offsets)) => {
-                let offsets =
-                    offsets.iter().zip(expected_offsets).map(|(map, expected)| error_once_spoiled(map, expected));
-                offsets.fold(error_once_spoiled(map, expected), f64::min)
-            }
-            (Seen::Light(light), Value::Light(expected)) => {
-                let middle = expected.len() / 2;
-                expected[middle].im += 1e-3 * largest(expected.iter().map(|value| value.norm()));
-                light_error(light, expected)
-            }
-            _ => unreachable!("the same kinds as above"),
-        };
-        assert!(spoiled > TOLERANCE, "{context}: the comparison of {} is blind", stage.name);
-    }
+    let mut remaining = stages.iter_mut();
+    let mut job = Job { frame: &frame, pupil_mm, hologram: &mut hologram };
+    network.stages.run_seen(&mut job, &mut |name, seen| {
+        let stage = remaining.next().unwrap_or_else(|| panic!("{context}: {name} is not in the reference"));
+        assert_eq!(name, name_of(stage), "{context}");
+        check_stage(&format!("{context}: {name}"), &seen, &mut stage.value);
+    });
+    assert!(remaining.next().is_none(), "{context}: a stage of the reference is missing");
+
+    hologram.field.fill(Complex32::ZERO);
     network.render(&frame, PupilDiameter::from_mm(pupil_mm), &mut hologram);
-    let error = light_error(&hologram.field, &expected.field);
-    assert!(error < TOLERANCE, "{context}: field: {error}");
-    let middle = expected.field.len() / 2;
-    expected.field[middle].im += 1e-3 * largest(expected.field.iter().map(|value| value.norm()));
-    assert!(
-        light_error(&hologram.field, &expected.field) > TOLERANCE,
-        "{context}: the comparison of the field is blind"
-    );
+    check_stage(&format!("{context}: rendered"), &Seen::Light(&hologram.field), &mut Value::Light(field));
+}
+
+/// Compares what a stage wrote with what it should have written, and again after `expected` was spoiled.
+fn check_stage(what: &str, seen: &Seen<'_>, expected: &mut Value) {
+    let error = match (seen, &*expected) {
+        (Seen::Map(map, None), Value::Encoded(expected)) => map_error(map, expected),
+        (Seen::Map(map, offsets), Value::Layer(expected, expected_offsets)) => {
+            assert_eq!(offsets.is_some(), expected_offsets.is_some(), "{what}");
+            let errors = offsets.iter().zip(expected_offsets).map(|(map, expected)| map_error(map, expected));
+            largest(errors.chain([map_error(map, expected)]))
+        }
+        (Seen::Light(light), Value::Light(expected)) => light_error(light, expected),
+        _ => panic!("{what} wrote something else"),
+    };
+    assert!(error < TOLERANCE, "{what}: {error}");
+    let spoiled = match (seen, expected) {
+        (Seen::Map(map, _), Value::Encoded(expected)) => error_once_spoiled(map, expected),
+        (Seen::Map(map, offsets), Value::Layer(expected, expected_offsets)) => {
+            let offsets = offsets.iter().zip(expected_offsets).map(|(map, expected)| error_once_spoiled(map, expected));
+            offsets.fold(error_once_spoiled(map, expected), f64::min)
+        }
+        (Seen::Light(light), Value::Light(expected)) => {
+            let middle = expected.len() / 2;
+            expected[middle].im += 1e-3 * largest(expected.iter().map(|value| value.norm()));
+            light_error(light, expected)
+        }
+        _ => unreachable!("the same kinds as above"),
+    };
+    assert!(spoiled > TOLERANCE, "{what}: the comparison is blind");
 }
 
 fn config(grid: Grid, layers: usize, channels: usize, adjustable_layers: Vec<usize>) -> NetworkConfig {
