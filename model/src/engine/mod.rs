@@ -5,6 +5,7 @@ mod cpu;
 mod golden;
 #[cfg(feature = "gpu")]
 mod gpu;
+mod modulation;
 #[cfg(test)]
 mod reference;
 
@@ -45,20 +46,6 @@ pub enum EngineError {
     /// The device cannot do it, or failed at it.
     #[error(transparent)]
     Gpu(#[from] GpuError),
-}
-
-/// One step of a frame, before it is timed.
-struct Stage {
-    name: String,
-    /// As in [`StageTiming`].
-    flop: u64,
-}
-
-impl Stage {
-    /// A step that is not matrix-like work.
-    fn plain(name: &str) -> Self {
-        Self { name: name.into(), flop: 0 }
-    }
 }
 
 /// Where the time of one frame went.

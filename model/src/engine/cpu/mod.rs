@@ -9,11 +9,12 @@ mod direct;
 mod expected_stack;
 mod feature_map;
 mod feedback;
-mod layered;
+mod field;
 mod maps;
 mod network;
 mod peak;
 mod product;
+mod stage;
 #[cfg(test)]
 mod tests;
 mod trunk;
