@@ -16,6 +16,8 @@ use holod_calibration::Resolution;
 use crate::gpu::GpuError;
 
 pub use cpu::{CpuEngine, fma_peak};
+#[cfg(feature = "gpu-cost")]
+pub use gpu::cost as gpu_cost;
 // pub use gpu::{EncodedCounts, GpuEngine};
 
 /// A frame that an engine refuses.

@@ -53,6 +53,12 @@ impl ConvLayer<'_> {
         constants
     }
 
+    /// Values of `output` that are read and written.
+    pub(super) fn output_values(&self, output: &Map) -> usize {
+        let times = if self.epilogue == Epilogue::ResidualLeaky { 2 } else { 1 };
+        times * output.groups * GROUP * output.width * output.height
+    }
+
     /// Whether the layer can read the first `input_groups` of `input` and write `output`.
     pub(super) fn check(&self, (input, input_groups): (&Map, usize), output: &Map) {
         assert_eq!((input.width, input.height), (output.width, output.height));
@@ -61,6 +67,11 @@ impl ConvLayer<'_> {
         assert!(self.bias.len() <= output.groups * GROUP);
         assert_eq!(self.weight.len(), self.bias.len() * self.inputs.len() * TAPS);
     }
+}
+
+/// Bytes of so many values.
+pub(super) fn bytes(values: &[usize]) -> u64 {
+    (values.iter().sum::<usize>() * size_of::<f32>()) as u64
 }
 
 /// How a layer's parameters lie in their buffer.
@@ -152,7 +163,9 @@ pub(crate) fn convolve(
     let shader = Shader::new(label, &constants, source, "convolve");
     let workgroups = [output.width.div_ceil(WORKGROUP) * packing.parts, output.height.div_ceil(ROWS), 1];
     let stage = plan.stages.last_mut().expect("a stage was added for the layer");
-    stage.dispatch(shader, &[input.buffer, parameters, output.buffer], workgroups);
+    let dispatch = stage.dispatch(shader, &[input.buffer, parameters, output.buffer], workgroups);
+    let input_values = input_groups * GROUP * input.width * input.height;
+    dispatch.bytes = Some(bytes(&[input_values, packing.len(), layer.output_values(output)]));
     (parameters, packing)
 }
 

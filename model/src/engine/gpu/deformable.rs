@@ -1,6 +1,6 @@
 //! Deformable 3x3 convolutions on the GPU: every tap of every pixel is read at a place of its own.
 
-use super::conv::{ConvLayer, TAPS};
+use super::conv::{ConvLayer, TAPS, bytes};
 use super::map::{GROUP, Map};
 use super::plan::{Plan, Shader};
 use crate::weights::OFFSET_CHANNELS;
@@ -22,8 +22,8 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
 
     let parts = output.groups.div_ceil(MOST_PART_GROUPS);
     let part_groups = output.groups.div_ceil(parts);
-    let parameters = pack(layer, input.groups, [parts, part_groups]);
-    let parameters = plan.table("a deformable convolution's parameters", &parameters);
+    let values = pack(layer, input.groups, [parts, part_groups]);
+    let parameters = plan.table("a deformable convolution's parameters", &values);
     let mut constants = vec![
         ("WORKGROUP", WORKGROUP.into()),
         ("PIXELS", PIXELS.into()),
@@ -38,7 +38,9 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
     let shader = Shader::new(label, &constants, source, "convolve");
     let workgroups = [output.width.div_ceil(WORKGROUP) * parts, output.height.div_ceil(PIXELS), 1];
     let stage = plan.stages.last_mut().expect("a stage was added for the layer");
-    stage.dispatch(shader, &[input.buffer, offsets.buffer, parameters, output.buffer], workgroups);
+    let dispatch = stage.dispatch(shader, &[input.buffer, offsets.buffer, parameters, output.buffer], workgroups);
+    let read = (input.groups + offsets.groups) * GROUP * input.width * input.height;
+    dispatch.bytes = Some(bytes(&[read, values.len(), layer.output_values(output)]));
 }
 
 /// The parameters of `layer` as the shader has them.

@@ -1,6 +1,8 @@
 //! The network on the GPU: a plan of shaders, and the engine that runs it.
 
 mod conv;
+#[cfg(feature = "gpu-cost")]
+pub mod cost;
 mod deformable;
 mod direct;
 mod double_phase;

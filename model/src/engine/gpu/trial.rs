@@ -70,7 +70,7 @@ impl Trial {
     /// What a buffer holds; the guard behind it is as it was.
     pub(super) fn read(&self, buffer: BufferId) -> Vec<f32> {
         let buffer = &self.buffers[buffer.0];
-        let mut values = vec![0.0; (buffer.size() / 4) as usize];
+        let mut values = vec![0.0_f32; (buffer.size() / 4) as usize];
         self.gpu.read(buffer, &mut values).expect("the buffer's values");
         let guard = values.split_off(values.len() - GUARD);
         assert!(guard.iter().all(|value| value.is_nan()), "a shader wrote behind a buffer");
