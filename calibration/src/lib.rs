@@ -5,8 +5,10 @@
 //! literature give it.
 
 mod geometry;
+mod level_tables;
 pub mod rig;
 mod units;
 
 pub use geometry::DisplayGeometry;
+pub use level_tables::LevelTables;
 pub use units::{Colour, Dioptres, Metres, PerColour, PupilDiameter, Resolution, TimeNs};

@@ -133,6 +133,11 @@ impl LevelsFrame {
         &self.samples
     }
 
+    /// All samples, to be written as a whole by whoever has made them as the panel takes them.
+    pub fn samples_mut(&mut self) -> &mut [u16] {
+        &mut self.samples
+    }
+
     /// The samples of one colour's pattern, `[height, width]` row-major.
     ///
     /// # Panics

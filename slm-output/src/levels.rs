@@ -23,7 +23,7 @@
 use std::f64::consts::TAU;
 
 use holod_calibration::rig::{LevelPhase, OutOfStroke, Panel, PanelMode, PhaseSign};
-use holod_calibration::{Colour, PerColour, Resolution};
+use holod_calibration::{Colour, LevelTables, PerColour, Resolution};
 use rayon::prelude::*;
 
 use crate::fields::{FrameLayout, LevelsFrame, Strided};
@@ -33,7 +33,7 @@ const ENTRIES_PER_LEVEL: usize = 16;
 /// Table entries at most, so that 16 bits number them.
 const ENTRIES_MAX: usize = 1 << 16;
 /// Marks table entries whose phase no level reaches.
-const UNREACHABLE: u32 = 1 << 16;
+const UNREACHABLE: u32 = LevelTables::UNREACHABLE;
 /// Pixels whose table indices are computed together, so that the arithmetic is vectorised apart from the look-ups.
 const BLOCK: usize = 256;
 /// Adding 1.5·2²³ to a small `f32` leaves its nearest integer, in two's complement, in the low bits of the sum.
@@ -194,6 +194,21 @@ impl PanelEncoder {
     /// The layout of the frames that are written.
     pub fn layout(&self) -> FrameLayout {
         self.layout
+    }
+
+    /// The encoder as plain data.
+    pub fn tables(&self) -> LevelTables {
+        let (left, top) = self.pattern_origin();
+        let of = |colour: Colour| &self.colours[colour.index()];
+        LevelTables {
+            panel: self.layout.resolution,
+            pattern: self.pattern,
+            origin: [left, top],
+            interleaved: self.layout.mode == PanelMode::ChannelPacked,
+            field_order: self.layout.field_order,
+            levels: PerColour(Colour::ALL.map(|colour| of(colour).table.clone())),
+            flatness: PerColour(Colour::ALL.map(|colour| of(colour).flatness_entries.clone())),
+        }
     }
 
     /// Encodes three patterns into `frame`: each phase in radians `[height, width]`, row-major, nominally in [0, 2π);

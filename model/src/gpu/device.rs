@@ -5,16 +5,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use super::GpuError;
-
-/// Which devices will do.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Adapters {
-    /// Graphics processors.
-    Hardware,
-    /// A processor that plays one: right, and slow.
-    Software,
-}
+use super::{Adapters, GpuError};
 
 /// A device and its queue.
 pub(crate) struct Gpu {
@@ -24,6 +15,10 @@ pub(crate) struct Gpu {
     fault: Arc<OnceLock<String>>,
     /// The most bytes that a shader can see as one buffer.
     pub(crate) largest_buffer: u64,
+    /// The memory that the threads of a workgroup share, bytes.
+    pub(crate) workgroup_bytes: u32,
+    /// Nanoseconds to a tick of the timestamps, where the device has them.
+    pub(crate) timestamp_ns: Option<f32>,
 }
 
 /// Bytes that are read back at a time.
@@ -59,8 +54,10 @@ impl Gpu {
             return Err(GpuError::None { wanted, passed_over });
         };
         let name = adapter.get_info().name;
+        let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("holod"),
+            required_features: timestamps,
             required_limits: adapter.limits(),
             memory_hints: wgpu::MemoryHints::Performance,
             ..wgpu::DeviceDescriptor::default()
@@ -79,7 +76,9 @@ impl Gpu {
         });
         let limits = device.limits();
         let largest_buffer = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
-        Ok(Self { device, queue, name, fault, largest_buffer })
+        let workgroup_bytes = limits.max_compute_workgroup_storage_size;
+        let timestamp_ns = (!timestamps.is_empty()).then(|| queue.get_timestamp_period());
+        Ok(Self { device, queue, name, fault, largest_buffer, workgroup_bytes, timestamp_ns })
     }
 
     /// The device's name, as its driver has it.
@@ -92,7 +91,7 @@ impl Gpu {
         self.fault.get().map_or(Ok(()), |reason| Err(self.failed(reason)))
     }
 
-    fn failed(&self, reason: impl ToString) -> GpuError {
+    pub(crate) fn failed(&self, reason: impl ToString) -> GpuError {
         GpuError::Failed { name: self.name.clone(), reason: reason.to_string() }
     }
 
@@ -132,11 +131,42 @@ impl Gpu {
     pub(crate) fn pipeline(&self, label: &str, wgsl: &str) -> Result<wgpu::ComputePipeline, GpuError> {
         let source = wgpu::ShaderSource::Wgsl(wgsl.into());
         let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor { label: Some(label), source });
+        self.pipeline_of(label, &module, None)
+    }
+
+    /// An entry point of a shader of this crate, whose accesses and loops are checked in debug builds only: the checks
+    /// cost up to a hundred times the work (gfx-rs/wgpu#7698).
+    pub(crate) fn trusted_pipeline(
+        &self,
+        label: &str,
+        wgsl: &str,
+        entry: &str,
+    ) -> Result<wgpu::ComputePipeline, GpuError> {
+        let source = wgpu::ShaderSource::Wgsl(wgsl.into());
+        let descriptor = wgpu::ShaderModuleDescriptor { label: Some(label), source };
+        let checks = match cfg!(debug_assertions) {
+            true => wgpu::ShaderRuntimeChecks::checked(),
+            false => wgpu::ShaderRuntimeChecks::unchecked(),
+        };
+        // SAFETY: the crate's shaders end their loops and stay inside their buffers, whose sizes are made from the same
+        // constants; the tests run them with the checks and compare what they write.
+        let module = unsafe { self.device.create_shader_module_trusted(descriptor, checks) };
+        self.pipeline_of(label, &module, Some(entry))
+    }
+
+    fn pipeline_of(
+        &self,
+        label: &str,
+        module: &wgpu::ShaderModule,
+        entry_point: Option<&str>,
+    ) -> Result<wgpu::ComputePipeline, GpuError> {
+        // A shader that is none already has a fault, and none of it would be found by a layout.
+        self.check()?;
         let pipeline = self.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some(label),
             layout: None,
-            module: &module,
-            entry_point: None,
+            module,
+            entry_point,
             compilation_options: wgpu::PipelineCompilationOptions::default(),
             cache: None,
         });
@@ -146,9 +176,18 @@ impl Gpu {
 
     /// The buffers as a pipeline's bindings 0, 1, …
     pub(crate) fn bind(&self, pipeline: &wgpu::ComputePipeline, buffers: &[&wgpu::Buffer]) -> wgpu::BindGroup {
-        let entries: Vec<_> = (0..)
-            .zip(buffers)
-            .map(|(binding, buffer)| wgpu::BindGroupEntry { binding, resource: buffer.as_entire_binding() })
+        self.bind_at(pipeline, &(0..).zip(buffers.iter().copied()).collect::<Vec<_>>())
+    }
+
+    /// Each buffer as the binding of a pipeline that is named with it.
+    pub(crate) fn bind_at(
+        &self,
+        pipeline: &wgpu::ComputePipeline,
+        buffers: &[(u32, &wgpu::Buffer)],
+    ) -> wgpu::BindGroup {
+        let entries: Vec<_> = buffers
+            .iter()
+            .map(|&(binding, buffer)| wgpu::BindGroupEntry { binding, resource: buffer.as_entire_binding() })
             .collect();
         let layout = pipeline.get_bind_group_layout(0);
         self.device.create_bind_group(&wgpu::BindGroupDescriptor { label: None, layout: &layout, entries: &entries })
@@ -169,11 +208,11 @@ impl Gpu {
     }
 
     /// Copies a buffer that was made with `COPY_SRC` to `values`, once all work before is done.
-    pub(crate) fn read(&self, buffer: &wgpu::Buffer, values: &mut [f32]) -> Result<(), GpuError> {
+    pub(crate) fn read<T: bytemuck::Pod>(&self, buffer: &wgpu::Buffer, values: &mut [T]) -> Result<(), GpuError> {
         let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
         let staging = self.buffer("reading back", READ_BYTES.min(size_of_val(values) as u64), usage)?;
         let mut offset = 0;
-        for part in values.chunks_mut((staging.size() / 4) as usize) {
+        for part in values.chunks_mut(staging.size() as usize / size_of::<T>()) {
             let bytes = size_of_val(part) as u64;
             let mut encoder = self.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
             encoder.copy_buffer_to_buffer(buffer, offset, &staging, 0, bytes);

@@ -4,7 +4,16 @@
 mod device;
 
 #[cfg(feature = "gpu")]
-pub(crate) use device::{Adapters, Gpu};
+pub(crate) use device::Gpu;
+
+/// Which devices will do.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Adapters {
+    /// Graphics processors.
+    Hardware,
+    /// A processor that plays one: right, and slow.
+    Software,
+}
 
 /// Why the graphics processor cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]

@@ -18,19 +18,12 @@ const SAMPLE_BYTES: usize = size_of::<Complex32>();
 const MOST_LINES: usize = 8;
 /// More of the memory of workgroups than this for one leaves too few beside it.
 const MOST_BYTES: usize = 32 << 10;
-/// The same of threads.
-const MOST_THREADS: usize = 512;
+/// Threads of a workgroup that every device runs.
+const MOST_THREADS: usize = 256;
 /// Threads come in whole multiples of this.
 const WAVE: usize = 64;
 /// Samples of short rows that one workgroup takes.
 const SAMPLES_OF_ROWS: usize = 1024;
-
-/// What a device lets one workgroup have.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct WorkgroupLimits {
-    pub(crate) bytes: usize,
-    pub(crate) threads: usize,
-}
 
 /// A line does not fit in the memory of a workgroup.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -55,20 +48,21 @@ pub(crate) struct LineFft {
     radices: Vec<usize>,
     /// `turns` of `fft.wgsl`.
     turns: BufferId,
-    limits: WorkgroupLimits,
+    workgroup_bytes: usize,
 }
 
 impl LineFft {
-    /// For lines of `length` samples.
+    /// For lines of `length` samples, on a device whose workgroups have `workgroup_bytes` of memory.
     ///
     /// # Errors
     /// Not even one such line fits in a workgroup.
-    pub(crate) fn new(plan: &mut Plan, length: usize, limits: WorkgroupLimits) -> Result<Self, LineTooLong> {
+    pub(crate) fn new(plan: &mut Plan, length: usize, workgroup_bytes: u32) -> Result<Self, LineTooLong> {
         let smooth = |span: &usize| radices(*span).is_some();
         let span = if smooth(&length) { length } else { (2 * length - 1..).find(smooth).expect("powers of 2 are") };
         let bytes = span * SAMPLE_BYTES;
-        if bytes > limits.bytes {
-            return Err(LineTooLong { samples: length, bytes, limit: limits.bytes });
+        let workgroup_bytes = workgroup_bytes as usize;
+        if bytes > workgroup_bytes {
+            return Err(LineTooLong { samples: length, bytes, limit: workgroup_bytes });
         }
         let mut turns: Vec<_> = (0..span).map(|turn| Complex64::cis(-TAU * turn as f64 / span as f64)).collect();
         if span != length {
@@ -77,7 +71,7 @@ impl LineFft {
         }
         let turns: Vec<_> = turns.iter().map(|turn| [turn.re as f32, turn.im as f32]).collect();
         let turns = plan.table("turns of a transform", &turns);
-        Ok(Self { length, span, radices: radices(span).expect("found so"), turns, limits })
+        Ok(Self { length, span, radices: radices(span).expect("found so"), turns, workgroup_bytes })
     }
 
     /// Workgroups for rows, whose threads hold `items` samples, or more where there are not threads enough.
@@ -87,18 +81,17 @@ impl LineFft {
 
     /// The same for columns, of which neighbours are taken together as far as their memory and threads go.
     pub(crate) fn columns(&self, items: usize) -> Lines {
-        let threads = self.limits.threads.min(MOST_THREADS);
-        self.lines(items, |lines| lines * self.length <= items * threads)
+        self.lines(items, |lines| lines * self.length <= items * MOST_THREADS)
     }
 
     fn lines(&self, items: usize, suits: impl Fn(usize) -> bool) -> Lines {
-        let fits = |lines: usize| lines * self.span * SAMPLE_BYTES <= self.limits.bytes.min(MOST_BYTES);
+        let fits = |lines: usize| lines * self.span * SAMPLE_BYTES <= self.workgroup_bytes.min(MOST_BYTES);
         let mut lines = MOST_LINES;
         while lines > 1 && !(fits(lines) && suits(lines)) {
             lines /= 2;
         }
         let threads = (lines * self.length).div_ceil(items).next_multiple_of(WAVE);
-        Lines { fft: self.clone(), lines, threads: threads.min(self.limits.threads).min(MOST_THREADS) }
+        Lines { fft: self.clone(), lines, threads: threads.min(MOST_THREADS) }
     }
 }
 
@@ -190,11 +183,10 @@ impl Lines {
 
 #[cfg(test)]
 mod tests {
-    use super::super::run::{Runner, complex, largest_difference};
+    use super::super::trial::{Trial, complex, largest_difference};
     use super::*;
-    use crate::gpu::{Adapters, Gpu};
 
-    const LIMITS: WorkgroupLimits = WorkgroupLimits { bytes: 32 << 10, threads: 256 };
+    const WORKGROUP_BYTES: u32 = 32 << 10;
 
     /// Transforms rows from binding 1 to binding 2.
     const ROWS: &str = "
@@ -226,24 +218,23 @@ mod tests {
 
     /// Transforms noise of `height` rows on the device; returns that and the exact transform.
     fn transformed(
-        gpu: &Gpu,
         (length, height): (usize, usize),
         lines: impl Fn(&LineFft) -> Lines,
         direction: f32,
     ) -> [Vec<Complex64>; 2] {
         let mut plan = Plan::default();
-        let lines = lines(&LineFft::new(&mut plan, length, LIMITS).expect("it fits"));
+        let lines = lines(&LineFft::new(&mut plan, length, WORKGROUP_BYTES).expect("it fits"));
         let (from, to) =
             (plan.buffer::<[f32; 2]>("from", length * height), plan.buffer::<[f32; 2]>("to", length * height));
         let constants = [("HEIGHT", height.into()), ("DIRECTION", direction.into())];
         let shader = lines.shader("rows", &constants, &[ROWS], "rows");
         let workgroups = [lines.workgroups(height), 1, 1];
         plan.stage("rows", 0).dispatch_with(shader, &[lines.turns(), (1, from), (2, to)], workgroups);
-        let mut runner = Runner::new(gpu, plan);
+        let trial = Trial::new(&plan);
         let mut values = noise(length * height);
-        runner.write(from, &values.iter().flat_map(|value| [value.re as f32, value.im as f32]).collect::<Vec<_>>());
-        runner.run("rows");
-        let found = complex(&runner.read(to));
+        trial.write(from, &values.iter().flat_map(|value| [value.re as f32, value.im as f32]).collect::<Vec<_>>());
+        trial.run();
+        let found = complex(&trial.read(to));
         let direction = if direction > 0.0 { rustfft::FftDirection::Forward } else { rustfft::FftDirection::Inverse };
         FftPlanner::new().plan_fft(length, direction).process(&mut values);
         [found, values]
@@ -255,8 +246,8 @@ mod tests {
 
     #[test]
     fn lines_of_any_length_are_transformed_and_back() {
-        let gpu = Gpu::open(Adapters::Software).expect("Mesa's software device; install mesa-vulkan-drivers");
-        let lengths = [1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 16, 25, 30, 31, 64, 97, 128, 135, 480, 541, 683, 1080, 1021, 3840];
+        let lengths =
+            [1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 16, 25, 30, 31, 64, 97, 128, 135, 480, 541, 683, 1080, 1021, 3840];
         for (index, length) in lengths.into_iter().enumerate() {
             for direction in [1.0, -1.0] {
                 let lines = |fft: &LineFft| match index % 3 {
@@ -264,7 +255,7 @@ mod tests {
                     1 => fft.columns(5),
                     _ => fft.columns(9),
                 };
-                let mut both = transformed(&gpu, (length, 11), lines, direction);
+                let mut both = transformed((length, 11), lines, direction);
                 let found = error(&both);
                 assert!(found < 1e-6, "{length}, direction {direction}: {found}");
                 let largest = both[1].iter().map(|value| value.norm()).fold(0.0, f64::max);
@@ -276,8 +267,7 @@ mod tests {
 
     #[test]
     fn what_does_not_fit_is_told_with_its_size_and_the_limit() {
-        let limits = WorkgroupLimits { bytes: 16 << 10, threads: 128 };
-        let new = |length| LineFft::new(&mut Plan::default(), length, limits).map(drop);
+        let new = |length| LineFft::new(&mut Plan::default(), length, 16 << 10).map(drop);
         assert_eq!(new(2048), Ok(()));
         assert_eq!(new(1021), Ok(()));
         // Of 2053 samples, a prime, the chirps need 4105 at least, and 4320 has no factor but 2, 3 and 5.
@@ -285,23 +275,18 @@ mod tests {
             let error = new(samples).expect_err("too long");
             assert_eq!(error, LineTooLong { samples, bytes, limit: 16384 });
             let text = error.to_string();
-            assert!(
-                [&samples.to_string(), "16384", "--backend cpu"].iter().all(|part| text.contains(*part)),
-                "{text}"
-            );
+            assert!([&samples.to_string(), "16384", "--backend cpu"].iter().all(|part| text.contains(*part)), "{text}");
         }
     }
 
     #[test]
     fn workgroups_keep_within_their_limits() {
-        for threads in [128, 256, 1024] {
-            let limits = WorkgroupLimits { bytes: 32 << 10, threads };
-            for length in 1..=2048 {
-                let fft = LineFft::new(&mut Plan::default(), length, limits).expect("it fits");
-                for lines in [fft.rows(4), fft.columns(5), fft.columns(9)] {
-                    assert!(lines.lines * fft.span * SAMPLE_BYTES <= limits.bytes && lines.threads <= threads);
-                    assert!(lines.threads.is_multiple_of(WAVE) && lines.lines.is_power_of_two());
-                }
+        for length in 1..=2048 {
+            let fft = LineFft::new(&mut Plan::default(), length, WORKGROUP_BYTES).expect("it fits");
+            for lines in [fft.rows(4), fft.columns(5), fft.columns(9)] {
+                assert!(lines.lines * fft.span * SAMPLE_BYTES <= WORKGROUP_BYTES as usize);
+                assert!(lines.threads <= MOST_THREADS && lines.threads.is_multiple_of(WAVE));
+                assert!(lines.lines.is_power_of_two());
             }
         }
     }

@@ -1,0 +1,312 @@
+//! 3x3 convolutions on the GPU, as sums over taps.
+
+use super::map::{GROUP, Map, ROWS};
+use super::plan::{BufferId, Plan, Shader};
+
+const TAPS: usize = 9;
+/// Threads of a workgroup, along x.
+const WORKGROUP: usize = 64;
+/// Groups of output channels that a thread holds sums of, at most: with [`ROWS`] rows of five groups a shader has registers
+/// left for what it multiplies.
+const MOST_PART_GROUPS: usize = 5;
+
+/// What is done with a sum before it is stored.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Epilogue {
+    /// sum
+    None,
+    /// leaky(sum)
+    Leaky,
+    /// leaky(½·sum + what the output map holds)
+    ResidualLeaky,
+}
+
+/// A convolution's parameters, and what is done with its sums.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ConvLayer<'a> {
+    /// [outputs, inputs, 3, 3]
+    pub(crate) weight: &'a [f32],
+    /// [outputs]
+    pub(crate) bias: &'a [f32],
+    /// [inputs]: which channel of the map each one is. Channels of the map that are none of them have no weight.
+    pub(crate) inputs: &'a [usize],
+    pub(crate) epilogue: Epilogue,
+    pub(crate) leaky_slope: f32,
+}
+
+/// How a layer's parameters lie in their buffer.
+///
+/// Threads make the output channels in parts of a few whole groups; those beyond the map's groups are zero and not stored.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Packing {
+    input_groups: usize,
+    parts: usize,
+    part_groups: usize,
+}
+
+impl Packing {
+    /// For a layer that reads the first `input_groups` of a map and writes a map of `output_groups`.
+    pub(crate) fn new(input_groups: usize, output_groups: usize) -> Self {
+        let parts = output_groups.div_ceil(MOST_PART_GROUPS);
+        Self { input_groups, parts, part_groups: output_groups.div_ceil(parts) }
+    }
+
+    /// Numbers in the buffer.
+    pub(crate) fn len(&self) -> usize {
+        self.biases() + self.parts * self.input_groups * TAPS * GROUP * self.part_groups * GROUP
+    }
+
+    fn biases(&self) -> usize {
+        self.parts * self.part_groups * GROUP
+    }
+
+    /// The place of the weight by which `input`, a channel of the map, is multiplied at `tap` for `output`.
+    fn place(&self, output: usize, input: usize, tap: usize) -> usize {
+        let (group, lane) = (output / GROUP, output % GROUP);
+        let (part, group) = (group / self.part_groups, group % self.part_groups);
+        let column = (part * self.input_groups + input / GROUP) * 3 + tap % 3;
+        let channel = (column * 3 + tap / 3) * GROUP + input % GROUP;
+        self.biases() + (channel * self.part_groups + group) * GROUP + lane
+    }
+
+    /// Writes the parameters of a layer to `parameters`, of [`Self::len`] zeros or of the same layer at other values: the bias
+    /// of each output, and `weight(output, input, tap)`, taps row-major over the kernel, for those of the map's channels
+    /// that `inputs` lists.
+    pub(crate) fn fill(
+        &self,
+        parameters: &mut [f32],
+        inputs: &[usize],
+        bias: impl ExactSizeIterator<Item = f32>,
+        weight: impl Fn(usize, usize, usize) -> f32,
+    ) {
+        for (output, value) in bias.enumerate() {
+            parameters[output] = value;
+            for (input, channel) in inputs.iter().enumerate() {
+                for tap in 0..TAPS {
+                    parameters[self.place(output, *channel, tap)] = weight(output, input, tap);
+                }
+            }
+        }
+    }
+
+    /// The parameters of `layer`.
+    pub(crate) fn pack(&self, layer: &ConvLayer) -> Vec<f32> {
+        let mut parameters = vec![0.0; self.len()];
+        let inputs = layer.inputs.len();
+        self.fill(&mut parameters, layer.inputs, layer.bias.iter().copied(), |output, input, tap| {
+            layer.weight[(output * inputs + input) * TAPS + tap]
+        });
+        parameters
+    }
+}
+
+/// Adds to the plan's last stage the convolution of the first `input_groups` of `input` into `output`, a map of the same size in
+/// another buffer. Gives the buffer of the parameters, and how they lie there.
+pub(crate) fn convolve(
+    plan: &mut Plan,
+    label: &str,
+    layer: &ConvLayer,
+    (input, input_groups): (&Map, usize),
+    output: &Map,
+) -> (BufferId, Packing) {
+    assert_eq!((input.width, input.height), (output.width, output.height));
+    assert!(input.buffer != output.buffer && input_groups <= input.groups);
+    assert!(layer.inputs.iter().all(|&channel| channel < input_groups * GROUP));
+    assert!(layer.bias.len() <= output.groups * GROUP);
+
+    let packing = Packing::new(input_groups, output.groups);
+    let parameters = plan.table("a convolution's parameters", &packing.pack(layer));
+    let mut constants = vec![
+        ("WIDTH", output.width.into()),
+        ("HEIGHT", output.height.into()),
+        ("ROWS", ROWS.into()),
+        ("WORKGROUP", WORKGROUP.into()),
+        ("INPUT_GROUPS", input_groups.into()),
+        ("PARTS", packing.parts.into()),
+        ("PART_GROUPS", packing.part_groups.into()),
+        ("RESIDUAL", (layer.epilogue == Epilogue::ResidualLeaky).into()),
+        ("LEAKY", (layer.epilogue != Epilogue::None).into()),
+        ("LEAKY_SLOPE", layer.leaky_slope.into()),
+    ];
+    constants.extend(input.constants(["IN_GROUPS", "IN_PITCH"]));
+    constants.extend(output.constants(["OUT_GROUPS", "OUT_PITCH"]));
+    let shader = Shader::new(label, &constants, include_str!("conv.wgsl"), "convolve");
+    let workgroups = [output.width.div_ceil(WORKGROUP) * packing.parts, output.height.div_ceil(ROWS), 1];
+    let stage = plan.stages.last_mut().expect("a stage was added for the layer");
+    stage.dispatch(shader, &[input.buffer, parameters, output.buffer], workgroups);
+    (parameters, packing)
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::super::trial::Trial;
+    use super::*;
+    use crate::engine::reference;
+
+    /// Largest error allowed, over the output's root mean square.
+    const TOLERANCE: f64 = 1e-5;
+    pub(in super::super) const SLOPE: f32 = 0.1;
+
+    /// In −1..1.
+    pub(in super::super) fn noise(index: usize) -> f32 {
+        let mixed = (index as u32 ^ 0x5bd1_e995).wrapping_mul(0x9e37_79b9);
+        ((mixed ^ (mixed >> 15)).wrapping_mul(0x2c1b_3c6d) >> 8) as f32 / (1 << 23) as f32 - 1.0
+    }
+
+    pub(in super::super) fn value(channel: usize, y: usize, x: usize) -> f32 {
+        noise(1_000_000 + (y * 300 + x) * 100 + channel)
+    }
+
+    fn skip(channel: usize, y: usize, x: usize) -> f32 {
+        3.0 * value(channel + 50, y, x)
+    }
+
+    /// Whether both are alike.
+    pub(in super::super) fn judge(found: &[f32], expected: &[f64]) -> Result<(), String> {
+        assert_eq!(found.len(), expected.len());
+        let rms = (expected.iter().map(|value| value * value).sum::<f64>() / expected.len() as f64).sqrt();
+        for (place, (found, expected)) in found.iter().zip(expected).enumerate() {
+            // NaN is not near.
+            let near = (f64::from(*found) - expected).abs() <= TOLERANCE * rms;
+            if !near {
+                return Err(format!("value {place} is {found}; expected {expected}, of which the rms is {rms}"));
+            }
+        }
+        Ok(())
+    }
+
+    pub(in super::super) fn finish(epilogue: Epilogue, sum: f64, skip: f32) -> f64 {
+        let leaky = |value: f64| value.max(value * f64::from(SLOPE));
+        match epilogue {
+            Epilogue::None => sum,
+            Epilogue::Leaky => leaky(sum),
+            Epilogue::ResidualLeaky => leaky(0.5 * sum + f64::from(skip)),
+        }
+    }
+
+    /// A layer of `outputs` that reads `inputs`, channels of the first groups of a wider map.
+    struct Case {
+        size: (usize, usize),
+        inputs: Vec<usize>,
+        input_groups: usize,
+        outputs: usize,
+        epilogue: Epilogue,
+    }
+
+    impl Case {
+        fn new(size: (usize, usize), inputs: usize, outputs: usize, epilogue: Epilogue) -> Self {
+            Self { size, inputs: (0..inputs).collect(), input_groups: inputs.div_ceil(GROUP), outputs, epilogue }
+        }
+
+        fn found(&self) -> Vec<f32> {
+            let Self { size, ref inputs, input_groups, outputs, epilogue } = *self;
+            let mut plan = Plan::default();
+            let input = Map::new(&mut plan, "input", size, (input_groups + 1) * GROUP);
+            let output = Map::new(&mut plan, "output", size, outputs);
+            let weight: Vec<_> = (0..outputs * inputs.len() * TAPS).map(noise).collect();
+            let bias: Vec<_> = (0..outputs).map(|output| noise(9_000_000 + output)).collect();
+            let layer = ConvLayer { weight: &weight, bias: &bias, inputs, epilogue, leaky_slope: SLOPE };
+            plan.stage("layer", 0);
+            convolve(&mut plan, "convolution", &layer, (&input, input_groups), &output);
+            let trial = Trial::new(&plan);
+            // What no layer reads is not finite.
+            let shown = |channel, y, x| if channel < input_groups * GROUP { value(channel, y, x) } else { f32::NAN };
+            trial.write(input.buffer, &input.values(shown));
+            trial.write(
+                output.buffer,
+                &output.values(|channel, y, x| skip(channel, y, x) * f32::from(channel < outputs)),
+            );
+            trial.run();
+            output.planes(&trial.read(output.buffer), outputs)
+        }
+
+        fn expected(&self) -> Vec<f64> {
+            let Self { size: (width, height), ref inputs, outputs, epilogue, .. } = *self;
+            let shape = [inputs.len(), height, width];
+            let input = reference::Map::from_fn(shape, |channel, y, x| value(inputs[channel], y, x).into());
+            let sum = |output: usize, y: usize, x: usize| {
+                let mut sum = f64::from(noise(9_000_000 + output));
+                for (channel, tap) in (0..inputs.len()).flat_map(|channel| (0..TAPS).map(move |tap| (channel, tap))) {
+                    let weight = f64::from(noise((output * inputs.len() + channel) * TAPS + tap));
+                    let (y, x) = ((y + tap / 3) as isize - 1, (x + tap % 3) as isize - 1);
+                    sum += weight * input.at(channel, y, x);
+                }
+                finish(epilogue, sum, skip(output, y, x))
+            };
+            reference::Map::from_fn([outputs, height, width], sum).values
+        }
+
+        fn check(&self) {
+            let Self { size, ref inputs, outputs, epilogue, .. } = *self;
+            judge(&self.found(), &self.expected())
+                .unwrap_or_else(|error| panic!("{size:?}, {} to {outputs}, {epilogue:?}: {error}", inputs.len()));
+        }
+    }
+
+    #[test]
+    fn sums_are_right_for_all_layers_of_both_networks() {
+        for (inputs, outputs, epilogue) in [
+            (32, 32, Epilogue::Leaky),
+            (32, 32, Epilogue::ResidualLeaky),
+            (32, 6, Epilogue::None),
+            (32, 18, Epilogue::None),
+            (24, 24, Epilogue::Leaky),
+            (24, 24, Epilogue::ResidualLeaky),
+            (24, 6, Epilogue::None),
+            (24, 18, Epilogue::None),
+        ] {
+            Case::new((37, 11), inputs, outputs, epilogue).check();
+        }
+    }
+
+    #[test]
+    fn sums_are_right_for_sizes_around_those_of_workgroups() {
+        for size in [(1, 1), (1, 33), (33, 1), (64, 4), (65, 5), (63, 3), (129, 2)] {
+            Case::new(size, 5, 7, Epilogue::ResidualLeaky).check();
+        }
+    }
+
+    #[test]
+    fn sums_are_right_for_few_and_for_many_channels() {
+        for (inputs, outputs) in [(1, 1), (4, 4), (21, 56), (84, 32)] {
+            Case::new((9, 7), inputs, outputs, Epilogue::Leaky).check();
+        }
+    }
+
+    /// As a first layer does, whose weights have another order of channels than the map, and not all of them.
+    #[test]
+    fn inputs_are_found_where_the_map_has_them() {
+        let inputs: Vec<_> = (48..84).chain(0..45).collect();
+        let case = Case { size: (13, 9), inputs, input_groups: 21, outputs: 32, epilogue: Epilogue::Leaky };
+        case.check();
+    }
+
+    #[test]
+    fn parameters_are_replaced_in_place() {
+        let packing = Packing::new(2, 5);
+        let bias = |factor: f32| (0..18).map(move |output| factor * noise(output));
+        let mut parameters = vec![0.0; packing.len()];
+        packing.fill(&mut parameters, &[0, 5], bias(1.0), |output, input, tap| noise(100 + output + input + tap));
+        packing.fill(&mut parameters, &[0, 5], bias(2.0), |output, input, tap| noise(output + input + tap));
+        let weight: Vec<_> =
+            (0..18 * 2 * TAPS).map(|place| noise(place / 18 + place / TAPS % 2 + place % TAPS)).collect();
+        let bias: Vec<_> = bias(2.0).collect();
+        let layer =
+            ConvLayer { weight: &weight, bias: &bias, inputs: &[0, 5], epilogue: Epilogue::None, leaky_slope: SLOPE };
+        assert_eq!(parameters, packing.pack(&layer));
+    }
+
+    /// Canary: what is a little off, or not finite, is not right.
+    #[test]
+    fn a_wrong_value_is_seen() {
+        let case = Case::new((9, 7), 5, 7, Epilogue::ResidualLeaky);
+        let expected = case.expected();
+        for wrong in [1e-3, f32::NAN] {
+            let mut found = case.found();
+            found[100] += wrong;
+            judge(&found, &expected).expect_err("one wrong value");
+        }
+        let plain = Case { epilogue: Epilogue::Leaky, ..case };
+        judge(&plain.found(), &expected).expect_err("another epilogue");
+    }
+}

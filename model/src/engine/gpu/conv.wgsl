@@ -1,0 +1,68 @@
+// A 3x3 convolution of maps [row, group, column, 4], with bias, skip and leaky rectifier; twin of ../cpu/conv.rs.
+//
+// A thread makes ROWS rows of one column by PART_GROUPS groups of output channels, which it holds in registers. Threads of a
+// workgroup lie along x and multiply by the same weights at the same time.
+
+@group(0) @binding(0) var<storage, read> input: array<vec4f>;
+// The bias of each group of outputs, then the weights: [part, input group, column, row, input channel, output group].
+@group(0) @binding(1) var<storage, read> parameters: array<vec4f>;
+@group(0) @binding(2) var<storage, read_write> output: array<vec4f>;
+
+@compute @workgroup_size(WORKGROUP)
+fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) lane: u32) {
+    let part = workgroup.x % PARTS;
+    let x = workgroup.x / PARTS * WORKGROUP + lane;
+    let y = workgroup.y * ROWS;
+
+    var sums: array<array<vec4f, PART_GROUPS>, ROWS>;
+    for (var group = 0u; group < PART_GROUPS; group++) {
+        let bias = parameters[part * PART_GROUPS + group];
+        for (var row = 0u; row < ROWS; row++) {
+            sums[row][group] = bias;
+        }
+    }
+
+    // The pixel above and to the left; threads beyond the last column read what that one reads.
+    var pixel = y * IN_GROUPS * IN_PITCH + min(x, WIDTH - 1u);
+    var weight = PARTS * PART_GROUPS + part * INPUT_GROUPS * 36u * PART_GROUPS;
+    for (var input_group = 0u; input_group < INPUT_GROUPS; input_group++) {
+        for (var column = 0u; column < 3u; column++) {
+            var values: array<vec4f, ROWS + 2u>;
+            for (var row = 0u; row < ROWS + 2u; row++) {
+                values[row] = input[pixel + column + row * IN_GROUPS * IN_PITCH];
+            }
+            for (var tap = 0u; tap < 3u; tap++) {
+                for (var channel = 0u; channel < 4u; channel++) {
+                    for (var group = 0u; group < PART_GROUPS; group++) {
+                        let factors = parameters[weight + (tap * 4u + channel) * PART_GROUPS + group];
+                        for (var row = 0u; row < ROWS; row++) {
+                            sums[row][group] = fma(vec4f(values[row + tap][channel]), factors, sums[row][group]);
+                        }
+                    }
+                }
+            }
+            weight += 12u * PART_GROUPS;
+        }
+        pixel += IN_PITCH;
+    }
+
+    if x >= WIDTH {
+        return;
+    }
+    for (var row = 0u; row < ROWS; row++) {
+        for (var group = 0u; group < PART_GROUPS; group++) {
+            let output_group = part * PART_GROUPS + group;
+            if y + row < HEIGHT && output_group < OUT_GROUPS {
+                let place = ((y + row + 1u) * OUT_GROUPS + output_group) * OUT_PITCH + x + 1u;
+                var value = sums[row][group];
+                if RESIDUAL {
+                    value = fma(vec4f(0.5), value, output[place]);
+                }
+                if LEAKY {
+                    value = max(value, value * LEAKY_SLOPE);
+                }
+                output[place] = value;
+            }
+        }
+    }
+}

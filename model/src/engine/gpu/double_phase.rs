@@ -1,0 +1,34 @@
+//! Double phase on the GPU; [`DoublePhase`](crate::optics::DoublePhase) is its twin.
+
+use std::sync::Arc;
+
+use super::network::Shared;
+use super::plan::{BufferId, Plan, Shader};
+
+const SOURCE: &str = concat!(include_str!("phase_math.wgsl"), include_str!("double_phase.wgsl"));
+/// Edges of what a workgroup of each entry point does, as the shader has them.
+const TILE: usize = 32;
+const SIDE: usize = 16;
+
+/// Adds the stage `double phase`: the phases [3, height, width] of the hologram, of which `clipped` counts the samples
+/// that exceed `amplitude_constant`. Returns the phases' buffer, radians in [0, 2π).
+pub(crate) fn encode(plan: &mut Plan, shared: &Shared, amplitude_constant: f32, clipped: BufferId) -> BufferId {
+    let (width, height) = (shared.resolution.width, shared.resolution.height);
+    let errors = plan.buffer::<[f32; 2]>("errors of double phase", 3 * shared.resolution.pixels());
+    let phases = plan.buffer::<f32>("phases", 3 * shared.resolution.pixels());
+    let constants =
+        [("WIDTH", width.into()), ("HEIGHT", height.into()), ("AMPLITUDE_SCALE", (1.0 / amplitude_constant).into())];
+    let shader = |entry| Arc::new(Shader::new(format!("double phase: {entry}"), &constants, SOURCE, entry));
+    let stage = plan.stage("double phase", 0);
+    stage.dispatch_with(
+        shader("pair_errors"),
+        &[(0, shared.field), (1, errors), (2, clipped)],
+        [width.div_ceil(TILE), height.div_ceil(TILE), 3],
+    );
+    stage.dispatch_with(
+        shader("phases"),
+        &[(0, shared.field), (1, errors), (3, phases)],
+        [width.div_ceil(SIDE), height.div_ceil(SIDE), 3],
+    );
+    phases
+}
