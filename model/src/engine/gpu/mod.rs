@@ -1,15 +1,21 @@
 //! The network on the GPU: a plan of shaders, and the engine that runs it.
 
 mod conv;
+mod defocus;
+mod depth_layers;
 mod direct;
 mod double_phase;
+mod expected_stack;
+mod feedback;
 mod fft;
 mod levels;
 mod loaded_plan;
 mod map;
+mod maps;
 mod network;
 mod plan;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
 mod trial;
+mod upsample;
