@@ -6,6 +6,7 @@ pub mod cost;
 mod deformable;
 mod direct;
 mod double_phase;
+mod fft;
 mod levels;
 mod loaded_plan;
 mod map;
