@@ -171,12 +171,12 @@ pub enum FitArg {
 /// Which engine computes the network.
 #[derive(ValueEnum, Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Backend {
-    /// The best that this build and machine have.
+    /// A GPU where there is one that will do, else the processor's cores.
     #[default]
     Auto,
     /// Native code on the processor's cores.
     Cpu,
-    /// WebGPU compute.
+    /// A GPU by Vulkan; where there is none, a processor that plays one, which is slow.
     Gpu,
 }
 

@@ -34,9 +34,11 @@ enum Fault {
     DoubledReports,
     /// The panel is unplugged.
     Unplug,
+    /// The GPU is lost, once.
+    GpuLost,
 }
 
-const FAULTS: [(&str, Fault); 13] = [
+const FAULTS: [(&str, Fault); 14] = [
     ("panic-frame", Fault::Panic("holod-frame")),
     ("panic-panel", Fault::Panic("holod-panel")),
     ("panic-laser", Fault::Panic("holod-laser")),
@@ -50,6 +52,7 @@ const FAULTS: [(&str, Fault); 13] = [
     ("no-reports", Fault::NoReports),
     ("doubled-reports", Fault::DoubledReports),
     ("unplug", Fault::Unplug),
+    ("gpu-lost", Fault::GpuLost),
 ];
 
 struct Plan {
@@ -86,6 +89,12 @@ fn now_happening() -> Option<Fault> {
 
 fn first_panic() -> bool {
     PLAN.get().is_some_and(|plan| !plan.panicked.swap(true, Ordering::AcqRel))
+}
+
+/// Whether the GPU is lost now: once it happens, and once only.
+#[cfg(feature = "gpu")]
+pub(crate) fn gpu_is_lost() -> bool {
+    now_happening() == Some(Fault::GpuLost) && first_panic()
 }
 
 /// The clock of the run's threads, which is where the fault finds them.

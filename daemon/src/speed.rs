@@ -14,8 +14,8 @@ use crate::{renderer, setup};
 
 /// A display that shows less than this share of the panel's frames is called slow.
 const ENOUGH: f64 = 0.9;
-/// The side of the frame that is timed.
-const TIMED_PX: usize = 256;
+/// The sides of the frames that are timed.
+const TIMED_PX: [usize; 2] = [256, 512];
 /// A side that is advised is a multiple of this, and not less than [`LEAST_SIDE_PX`].
 const SIDE_STEP_PX: usize = 16;
 const LEAST_SIDE_PX: usize = 64;
@@ -44,45 +44,57 @@ pub fn advice(frames_hz: f64, rig: &Rig, size: Resolution) -> Option<String> {
     if small.width < size.width && small.height < size.height {
         cures.push(format!("--resolution {small} (with --fit contain where a scene is named) is about what keeps up"));
     }
-    cures.push("more or faster cores help; this version does not compute on a GPU".to_owned());
+    cures.push("a GPU helps, or more or faster cores".to_owned());
     Some(cures.join("; "))
 }
 
-/// The time of one small frame, from which those of others are estimated.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// The times of two small frames, from which those of others are estimated.
+#[derive(Clone, Debug, PartialEq)]
 pub struct Estimate {
-    /// Size of the frame that was timed.
-    pub timed: Resolution,
-    seconds: f64,
+    /// How the frames were computed.
+    pub engine: String,
+    /// Their sizes, the smaller first.
+    pub timed: [Resolution; 2],
+    seconds: [f64; 2],
 }
 
 impl Estimate {
-    /// Times a small frame on the rig's panel, after one that warms up.
+    /// Times small frames on the rig's panel, each after one that warms up.
     ///
     /// # Errors
     /// The backend is not to be had, or the rig contradicts itself.
     pub fn of(rig: &Rig, weights: &Weights) -> Result<Self, Failure> {
         let panel = rig.resolution();
-        let timed = Resolution { width: TIMED_PX.min(panel.width), height: TIMED_PX.min(panel.height) };
-        // A panel of the frame's size: what surrounds the frame would be timed, too, and does not go with its pixels.
-        let panel = Panel { flatness_rad: PerColour([None, None, None]), ..rig.panel.clone() };
-        let encoder = PanelEncoder::new(&panel, timed, timed).map(Arc::new).map_err(Failure::because(Exit::Config))?;
-        let mut renderer = renderer::open(Backend::Auto, weights, &encoder)?;
-        let (frame, mut levels) = (Arc::new(setup::sample_frame(timed)), LevelsFrame::new(encoder.layout()));
-        let pupil = PupilDiameter::from_mm(weights.config().pupil_range_mm[0]);
-        let mut seconds = f64::MAX;
-        for _ in 0..2 {
-            let began = Instant::now();
-            renderer.render(&frame, pupil, &mut levels).map_err(Failure::because(Exit::Software))?;
-            seconds = seconds.min(began.elapsed().as_secs_f64());
-        }
-        Ok(Self { timed, seconds })
+        let timed = TIMED_PX.map(|side| Resolution { width: side.min(panel.width), height: side.min(panel.height) });
+        let [(_, smaller_s), (engine, larger_s)] = [time(rig, weights, timed[0])?, time(rig, weights, timed[1])?];
+        Ok(Self { engine, timed, seconds: [smaller_s, larger_s] })
     }
 
-    /// Frames of `size` a second: time goes with the number of pixels.
+    /// Frames of `size` a second: a GPU takes some of the time for each frame, the rest goes with the pixels.
     pub fn frames_hz(&self, size: Resolution) -> f64 {
-        self.timed.pixels() as f64 / size.pixels() as f64 / self.seconds
+        let ([smaller, larger], [smaller_s, larger_s]) = (self.timed.map(|size| size.pixels() as f64), self.seconds);
+        // Not less for a frame that took longer, nor more for each pixel than all of them took.
+        let by_pixel = if larger > smaller { (larger_s - smaller_s) / (larger - smaller) } else { f64::INFINITY };
+        let by_pixel = by_pixel.clamp(0.0, larger_s / larger);
+        1.0 / (larger_s + by_pixel * (size.pixels() as f64 - larger))
     }
+}
+
+/// How a frame of `size` is computed, and the seconds that it takes.
+fn time(rig: &Rig, weights: &Weights, size: Resolution) -> Result<(String, f64), Failure> {
+    // A panel of the frame's size: what surrounds the frame would be timed, too, and does not go with its pixels.
+    let panel = Panel { flatness_rad: PerColour([None, None, None]), ..rig.panel.clone() };
+    let encoder = PanelEncoder::new(&panel, size, size).map(Arc::new).map_err(Failure::because(Exit::Config))?;
+    let mut renderer = renderer::open(Backend::Auto, weights, &encoder)?;
+    let (frame, mut levels) = (Arc::new(setup::sample_frame(size)), LevelsFrame::new(encoder.layout()));
+    let pupil = PupilDiameter::from_mm(weights.config().pupil_range_mm[0]);
+    let mut seconds = f64::MAX;
+    for _ in 0..2 {
+        let began = Instant::now();
+        renderer.render(&frame, pupil, &mut levels).map_err(Failure::because(Exit::Software))?;
+        seconds = seconds.min(began.elapsed().as_secs_f64());
+    }
+    Ok((renderer.description().to_owned(), seconds))
 }
 
 #[cfg(test)]
@@ -120,9 +132,19 @@ mod tests {
     }
 
     #[test]
-    fn the_estimate_goes_with_the_pixels() {
-        let estimate = Estimate { timed: Resolution { width: 256, height: 256 }, seconds: 0.25 };
-        assert_eq!(estimate.frames_hz(Resolution { width: 256, height: 256 }), 4.0);
-        assert_eq!(estimate.frames_hz(Resolution { width: 512, height: 512 }), 1.0);
+    fn the_estimate_goes_with_the_pixels_and_leaves_out_what_each_frame_takes() {
+        let square = |side| Resolution { width: side, height: side };
+        let estimate = |seconds| Estimate { engine: "cpu".into(), timed: [square(256), square(512)], seconds };
+        let frames_hz = |seconds, side| estimate(seconds).frames_hz(square(side));
+        let near = |found: f64, expected: f64| assert!((found / expected - 1.0).abs() < 1e-9, "{found} for {expected}");
+        near(frames_hz([0.25, 1.0], 256), 4.0);
+        near(frames_hz([0.25, 1.0], 1024), 0.25);
+        // 2 ms, and 1 ms for each 256x256.
+        near(frames_hz([0.003, 0.006], 1024), 1.0 / 0.018);
+        // A lap that something disturbed.
+        near(frames_hz([0.5, 0.4], 1024), 1.0 / 0.4);
+        near(frames_hz([0.0, 0.4], 1024), 1.0 / 1.6);
+        let same = Estimate { engine: "cpu".into(), timed: [square(64); 2], seconds: [0.1, 0.1] };
+        near(same.frames_hz(square(128)), 2.5);
     }
 }

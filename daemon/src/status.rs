@@ -33,6 +33,8 @@ pub struct Status {
     pub pupil_state: String,
     /// The pupil that the newest frame was made for.
     pub pupil_mm: Option<f32>,
+    /// How holograms are computed.
+    pub engine: String,
     /// The panel's spec.
     pub panel: String,
     /// Why the panel is lost, where it is.

@@ -36,7 +36,7 @@ pub struct NetworkConfig {
     pub version: u32,
     /// The grid on which the network predicts.
     pub grid: Grid,
-    /// 3x3 layers of `direct`'s net or the others' first: the first, pairs of body layers, the last.
+    /// 3x3 layers of `direct`'s net or of `expected-stack`'s first: the first, pairs of body layers, the last.
     pub layers: usize,
     /// Feature channels of the body.
     pub channels: usize,
@@ -52,13 +52,10 @@ pub struct NetworkConfig {
     pub pupil_range_mm: [f32; 2],
     /// Amplitude that double phase maps to 1.
     pub amplitude_constant: f32,
-    /// `layered` and `expected-stack`: into how many layers, equal in dioptres, the depth volume is divided.
+    /// `expected-stack`: into how many layers, equal in dioptres, the depth volume is divided.
     #[serde(default = "default_depth_layers", skip_serializing_if = "is_default_depth_layers")]
     pub depth_layers: usize,
-    /// `layered`: whether the surfaces' phase starts from the transport of intensity.
-    #[serde(default = "default_transport_prior", skip_serializing_if = "is_default_transport_prior")]
-    pub transport_prior: bool,
-    /// `layered` and `expected-stack`: 3x3 layers of the net that corrects what arrives at the SLM plane.
+    /// `expected-stack`: 3x3 layers of the net that corrects what arrives at the SLM plane.
     #[serde(default = "default_correction_layers", skip_serializing_if = "is_default_correction_layers")]
     pub correction_layers: usize,
     /// `expected-stack`: whether the first net also corrects the expected images before they light the layers and are
@@ -76,14 +73,6 @@ fn is_default_depth_layers(count: &usize) -> bool {
     *count == default_depth_layers()
 }
 
-const fn default_transport_prior() -> bool {
-    true
-}
-
-fn is_default_transport_prior(prior: &bool) -> bool {
-    *prior == default_transport_prior()
-}
-
 const fn default_correction_layers() -> usize {
     10
 }
@@ -98,8 +87,6 @@ fn is_default_correction_layers(count: &usize) -> bool {
 pub enum Architecture {
     /// The field is a residual to the amplitude.
     Direct,
-    /// Light on the objects' surfaces, carried by physics, and a residual to what arrives.
-    Layered,
     /// Light on every depth layer for what an eye should see there, carried by physics, what that lacks fed back, and a
     /// residual.
     ExpectedStack,
@@ -109,7 +96,6 @@ impl fmt::Display for Architecture {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Direct => "direct",
-            Self::Layered => "layered",
             Self::ExpectedStack => "expected-stack",
         })
     }
@@ -171,7 +157,6 @@ impl TrainedOptics {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Family {
     Direct { layers: Vec<Layer> },
-    Layered { surface: Vec<Layer>, correction: Vec<Layer> },
     ExpectedStack { lighting: Vec<Layer>, correction: Vec<Layer>, feedback: Feedback },
 }
 
@@ -209,20 +194,6 @@ impl Family {
         Ok(match config.architecture {
             Architecture::Direct => {
                 Self::Direct { layers: stack_of("layers", maps, OUTPUT_CHANNELS, config.layers, adjustable)? }
-            }
-            Architecture::Layered => {
-                let prior = usize::from(config.transport_prior);
-                let outputs = 3 * (2 + LAYERED_BLURS * (1 + prior));
-                Self::Layered {
-                    surface: stack_of("surface", maps + 3 * prior, outputs, config.layers, adjustable)?,
-                    correction: stack_of(
-                        "correction",
-                        OUTPUT_CHANNELS + maps,
-                        OUTPUT_CHANNELS,
-                        config.correction_layers,
-                        &[],
-                    )?,
-                }
             }
             Architecture::ExpectedStack => {
                 let stack = 3 * config.depth_layers;
@@ -639,15 +610,13 @@ pub(crate) const REFINED: usize = 3;
 
 /// Depth layers that a network may have.
 pub(crate) const MOST_DEPTH_LAYERS: usize = 64;
-/// Gaussian blurs between which the `layered` family's first net chooses.
-pub(crate) const LAYERED_BLURS: usize = 3;
 
 impl NetworkConfig {
     /// 3x3 layers of all its nets.
     pub fn layer_count(&self) -> usize {
         match self.architecture {
             Architecture::Direct => self.layers,
-            Architecture::Layered | Architecture::ExpectedStack => self.layers + self.correction_layers,
+            Architecture::ExpectedStack => self.layers + self.correction_layers,
         }
     }
 
@@ -709,7 +678,6 @@ pub(crate) mod tests {
     fn tensors(weights: &Weights) -> Vec<(String, Vec<usize>, Vec<f32>)> {
         let stacks = match &weights.family {
             Family::Direct { layers } => vec![("layers", layers)],
-            Family::Layered { surface, correction } => vec![("surface", surface), ("correction", correction)],
             Family::ExpectedStack { lighting, correction, .. } => {
                 vec![("lighting", lighting), ("correction", correction)]
             }
@@ -759,18 +727,13 @@ pub(crate) mod tests {
             pupil_range_mm: [1.0, 5.0],
             amplitude_constant: 1.4,
             depth_layers: default_depth_layers(),
-            transport_prior: default_transport_prior(),
             correction_layers: default_correction_layers(),
             refined_stack: false,
         }
     }
 
-    pub(crate) fn layered_config() -> NetworkConfig {
-        NetworkConfig { architecture: Architecture::Layered, depth_layers: 5, correction_layers: 4, ..config() }
-    }
-
     pub(crate) fn expected_stack_config() -> NetworkConfig {
-        NetworkConfig { architecture: Architecture::ExpectedStack, ..layered_config() }
+        NetworkConfig { architecture: Architecture::ExpectedStack, depth_layers: 5, correction_layers: 4, ..config() }
     }
 
     /// A file with small random weights, after `change` has changed it.
@@ -811,17 +774,14 @@ pub(crate) mod tests {
         let weights = Weights::from_bytes(&file(|_, _| {}), "test").unwrap();
         let expected = random_weights(config(), 1);
         assert_eq!((&weights.config, &weights.family), (&expected.config, &expected.family));
-        let layered = Weights::from_bytes(&file_of(layered_config(), |_, _| {}), "test").unwrap();
-        let expected = random_weights(layered_config(), 1);
-        assert_eq!((&layered.config, &layered.family), (&expected.config, &expected.family));
         let refined = NetworkConfig { refined_stack: true, ..expected_stack_config() };
-        for other in [NetworkConfig { transport_prior: false, ..layered_config() }, expected_stack_config(), refined] {
+        for other in [expected_stack_config(), refined] {
             let read = Weights::from_bytes(&file_of(other.clone(), |_, _| {}), "test").unwrap();
             assert_eq!((&read.config, &read.family), (&other, &random_weights(other.clone(), 1).family));
         }
         let written = |config: NetworkConfig| serde_json::to_string(&config).unwrap();
         assert!(!written(config()).contains("depth_layers") && !written(config()).contains("refined_stack"));
-        assert!(written(layered_config()).contains("\"depth_layers\":5,\"correction_layers\":4"));
+        assert!(written(expected_stack_config()).contains("\"depth_layers\":5,\"correction_layers\":4"));
         assert_eq!(weights.metrics()["psnr_db"], 29.0);
         assert!(weights.provenance().is_null());
 
@@ -875,16 +835,17 @@ pub(crate) mod tests {
                 entries.insert("config".into(), serde_json::to_string(&changed).unwrap());
             })
         };
-        let unknown = error_of(|_, entries| {
-            let config = entries["config"].replace("\"direct\"", "\"diffusion\"");
-            entries.insert("config".into(), config);
-        });
-        assert_mentions(&unknown, &["`config`", "diffusion", "`direct`", "`layered`", "`expected-stack`"]);
-        for family in [layered_config(), expected_stack_config()] {
-            let full = file_of(NetworkConfig { grid: Grid::Full, ..family.clone() }, |_, _| {});
-            let full = Weights::from_bytes(&full, "test").unwrap_err().to_string();
-            assert_mentions(&full, &["config.grid", "\"full\"", "half-band", &family.architecture.to_string()]);
+        // `layered` is a family that the trainer knows and no engine runs.
+        for family in ["diffusion", "layered"] {
+            let unknown = error_of(|_, entries| {
+                let config = entries["config"].replace("\"direct\"", &format!("\"{family}\""));
+                entries.insert("config".into(), config);
+            });
+            assert_mentions(&unknown, &["`config`", family, "`direct`", "`expected-stack`"]);
         }
+        let full = file_of(NetworkConfig { grid: Grid::Full, ..expected_stack_config() }, |_, _| {});
+        let full = Weights::from_bytes(&full, "test").unwrap_err().to_string();
+        assert_mentions(&full, &["config.grid", "\"full\"", "half-band", "`expected-stack`"]);
         assert_mentions(&configured(|c| c.correction_layers = 3), &["config.correction_layers", "3", "even"]);
         assert_mentions(&configured(|c| c.depth_layers = 1), &["config.depth_layers", "1"]);
         assert_mentions(&configured(|c| c.depth_layers = 65), &["config.depth_layers", "65", "2 to 64"]);

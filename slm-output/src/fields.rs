@@ -194,8 +194,11 @@ impl LevelsFrame {
         }
     }
 
-    /// Overwrites samples and tag with those of `other`, which has the same layout, without allocating.
-    pub(crate) fn copy_from(&mut self, other: &Self) {
+    /// Overwrites samples and tag with those of `other`, without allocating.
+    ///
+    /// # Panics
+    /// Where `other` has another layout.
+    pub fn copy_from(&mut self, other: &Self) {
         assert_eq!(self.layout, other.layout, "frames of one output have one layout");
         self.tag = other.tag;
         self.samples.copy_from_slice(&other.samples);

@@ -102,8 +102,10 @@ fn frames_hz(rig: &Rig, resolution: Option<Resolution>) -> Check {
             let rates: Vec<String> = rates.collect();
             let advice = speed::advice(estimate.frames_hz(*first), rig, *first);
             let says = format!(
-                "estimated from a frame of {}: {}; the panel could show {:.1}{}",
-                estimate.timed,
+                "{}; estimated from frames of {} and {}: {}; the panel could show {:.1}{}",
+                estimate.engine,
+                estimate.timed[0],
+                estimate.timed[1],
                 rates.join(", "),
                 speed::panel_frames_hz(&rig.panel),
                 advice.map_or(String::new(), |advice| format!("; {advice}"))

@@ -47,18 +47,19 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let began = Instant::now();
     let staging = Staging::new(&args.out, &FILES, args.force)?;
-    let Computed { renderer, mut report, optics, .. } = compute(&rig, &args.scene, args.pupil, args.backend)?;
+    let Computed { mut renderer, mut report, optics, .. } = compute(&rig, &args.scene, args.pupil, args.backend)?;
     let hologram = StoredHologram {
-        hologram: renderer.hologram().clone(),
+        hologram: renderer.hologram().map_err(Failure::because(Exit::Unavailable))?.clone(),
         pupil: args.pupil,
         optics,
         amplitude_constant: report.amplitude_constant,
     };
+    let pattern = renderer.pattern().map_err(Failure::because(Exit::Unavailable))?;
     progress::during("writing the hologram", || {
         let cannot = Failure::because(Exit::CannotCreate);
         hologram.save(&staging.path(FILES[0])).map_err(&cannot)?;
         for (colour, name) in Colour::ALL.into_iter().zip(&FILES[1..4]) {
-            files::save_phase(renderer.pattern(), colour, &staging.path(name)).map_err(&cannot)?;
+            files::save_phase(pattern, colour, &staging.path(name)).map_err(&cannot)?;
         }
         Ok::<_, Failure>(())
     })?;

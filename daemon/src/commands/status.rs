@@ -51,6 +51,7 @@ fn text_of(status: &Status) -> String {
          \x20        {}\n\
          panel    {}: {:.2} refreshes a second{}\n\
          lasers   {}{}\n\
+         engine   {}\n\
          frames   {:.1} a second of the panel's {:.1}{}; {} made, {} shown, {} late\n\
          time     per frame {}; tracker sample to photons {}",
         status.state,
@@ -68,6 +69,7 @@ fn text_of(status: &Status) -> String {
         status.panel_trouble.as_ref().map_or(String::new(), |trouble| format!("; lost: {trouble}")),
         status.lasers,
         status.lasers_trouble.as_ref().map_or(String::new(), |trouble| format!("; {trouble}")),
+        status.engine,
         status.frames_shown_hz,
         status.panel_frames_hz,
         status.speed_advice.as_ref().map_or(String::new(), |advice| format!(" ({advice})")),

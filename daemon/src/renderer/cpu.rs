@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use holod_calibration::{Colour, PerColour, PupilDiameter, Resolution};
 use holod_model::engine::{EngineError, StageTiming};
+use holod_model::gpu::GpuError;
 use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::{ComplexHologram, CpuEngine, RgbdFrame, Weights, WorkerPool};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
@@ -39,7 +40,12 @@ struct Job {
 }
 
 impl CpuRenderer {
-    pub(super) fn new(weights: &Weights, encoder: &Arc<PanelEncoder>) -> Result<Self, Failure> {
+    /// `no_gpu` is why the processor has to do it, where it is not what was asked for.
+    pub(super) fn new(
+        weights: &Weights,
+        encoder: &Arc<PanelEncoder>,
+        no_gpu: Option<&GpuError>,
+    ) -> Result<Self, Failure> {
         let resolution = encoder.pattern_resolution();
         let engine = CpuEngine::new(weights, resolution).map_err(Failure::because(Exit::Unavailable))?;
         let after_network =
@@ -61,7 +67,12 @@ impl CpuRenderer {
         };
         let pool = WorkerPool::new("holod-cpu", 0, job, Job::run).map_err(Failure::because(Exit::Unavailable))?;
         Ok(Self {
-            description: format!("cpu, {instruction_set}, {} threads", pool.threads()),
+            description: match no_gpu {
+                None => format!("cpu, {instruction_set}, {} threads", pool.threads()),
+                Some(error) => {
+                    format!("cpu, {instruction_set}, {} threads, as {}", pool.threads(), error.reason())
+                }
+            },
             pool,
             hologram: ComplexHologram::dark(resolution),
             pattern: PhasePattern::flat(resolution),
@@ -80,7 +91,7 @@ impl Job {
             let phase_rad = PerColour(Colour::ALL.map(|colour| pattern.plane(colour)));
             let unreachable_share = encoder.encode(phase_rad, levels).unreachable_share;
             self.durations = [encoded - began, encoded.elapsed()];
-            Rendered { clipped_share, unreachable_share }
+            Rendered { clipped_share, unreachable_share, engine_changed: false }
         });
     }
 
@@ -115,12 +126,12 @@ impl Renderer for CpuRenderer {
         })
     }
 
-    fn hologram(&self) -> &ComplexHologram {
-        &self.hologram
+    fn hologram(&mut self) -> Result<&ComplexHologram, EngineError> {
+        Ok(&self.hologram)
     }
 
-    fn pattern(&self) -> &PhasePattern {
-        &self.pattern
+    fn pattern(&mut self) -> Result<&PhasePattern, EngineError> {
+        Ok(&self.pattern)
     }
 
     fn timings(&self) -> &[StageTiming] {
@@ -160,7 +171,7 @@ mod tests {
     #[test]
     fn levels_are_those_of_the_stages_for_each_pupil_in_whatever_buffer() {
         let weights = Weights::builtin_small();
-        let mut renderer = CpuRenderer::new(&weights, &encoder()).unwrap();
+        let mut renderer = CpuRenderer::new(&weights, &encoder(), None).unwrap();
         let frame = Arc::new(setup::sample_frame(SIZE));
         let mut buffers = [(); 2].map(|()| LevelsFrame::new(encoder().layout()));
         let mut shown = Vec::new();
@@ -168,7 +179,7 @@ mod tests {
             let pupil = PupilDiameter::from_mm(pupil_mm);
             renderer.render(&frame, pupil, &mut buffers[buffer]).unwrap();
             assert_eq!(buffers[buffer].samples(), stage_by_stage(&weights, &frame, pupil).samples());
-            assert_eq!(renderer.hologram().resolution, SIZE);
+            assert_eq!(renderer.hologram().unwrap().resolution, SIZE);
             shown.push(buffers[buffer].samples().to_vec());
         }
         assert_ne!(shown[0], shown[1], "pupils are told apart");
@@ -178,7 +189,7 @@ mod tests {
     #[test]
     fn a_frame_of_another_size_is_refused_and_the_next_one_rendered() {
         let weights = Weights::builtin_small();
-        let mut renderer = CpuRenderer::new(&weights, &encoder()).unwrap();
+        let mut renderer = CpuRenderer::new(&weights, &encoder(), None).unwrap();
         let mut levels = LevelsFrame::new(encoder().layout());
         let pupil = PupilDiameter::from_mm(3.0);
         let wrong = Arc::new(setup::sample_frame(PANEL));

@@ -1,12 +1,15 @@
 //! From picture, depth and pupil to the levels that a panel is sent: the one way from a scene to the panel.
 
 mod cpu;
+#[cfg(feature = "gpu")]
+mod gpu;
 
 use std::sync::Arc;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{PerColour, PupilDiameter, Resolution};
 use holod_model::engine::{EngineError, StageTiming};
+use holod_model::gpu::{Adapters, GpuError};
 use holod_model::optics::PhasePattern;
 use holod_model::{ComplexHologram, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
@@ -18,12 +21,13 @@ use crate::failure::{Exit, Failure};
 /// Makes panel levels of frames of one size for one panel.
 pub trait Renderer: Send {
     /// Writes the levels of the hologram of `frame` for an eye with `pupil` to `levels`, which has the panel's layout.
-    /// Does not allocate, once some frames have been rendered.
+    /// On the processor it does not allocate, once some frames have been rendered; what a GPU's driver does is its own.
     ///
     /// A pupil outside the range that the weights were trained for is taken as the nearest one inside.
     ///
     /// # Errors
-    /// [`EngineError`] for a frame of another size than the renderer was made for, and a pupil that is no positive length.
+    /// [`EngineError`] for a frame of another size than the renderer was made for, a pupil that is no positive length, and
+    /// a device that failed where no other engine could take its place.
     ///
     /// # Panics
     /// Where `levels` is not of the panel's size.
@@ -34,40 +38,72 @@ pub trait Renderer: Send {
         levels: &mut LevelsFrame,
     ) -> Result<Rendered, EngineError>;
 
-    /// The hologram of the last frame, before double phase.
-    fn hologram(&self) -> &ComplexHologram;
+    /// The hologram of the last frame, before double phase. It is brought to the host when it is asked for.
+    ///
+    /// # Errors
+    /// The device that has it failed.
+    fn hologram(&mut self) -> Result<&ComplexHologram, EngineError>;
 
-    /// Its phases after double phase, before they become levels.
-    fn pattern(&self) -> &PhasePattern;
+    /// Its phases after double phase, before they become levels; as [`Self::hologram`].
+    ///
+    /// # Errors
+    /// The device that has them failed.
+    fn pattern(&mut self) -> Result<&PhasePattern, EngineError>;
 
     /// Where the time of the last frame went, in the order in which it went there.
     fn timings(&self) -> &[StageTiming];
 
-    /// How it computes, for people: such as `cpu, avx512, 2 threads`.
+    /// How it computes, for people: such as `cpu, avx512, 2 threads`, and why not on a GPU where that was wanted.
     fn description(&self) -> &str;
 }
 
-/// What was lost between hologram and levels.
+/// What was lost between hologram and levels, and how it was computed.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Rendered {
     /// Share of samples whose amplitude exceeded the double phase's constant, 0..=1.
     pub clipped_share: f32,
     /// Share of each colour's pixels whose phase the panel cannot reach, 0..=1.
     pub unreachable_share: PerColour<f32>,
+    /// Whether another engine had to take the place of one that failed: its description is another one now.
+    pub engine_changed: bool,
 }
 
 /// A renderer of frames of the pattern's size of `encoder`.
+///
+/// `Auto` takes a GPU where there is one that will do, else the processor; `Gpu` a GPU, or where there is none a processor
+/// that plays one.
 ///
 /// # Errors
 /// The backend is not to be had.
 pub fn open(backend: Backend, weights: &Weights, encoder: &Arc<PanelEncoder>) -> Result<Box<dyn Renderer>, Failure> {
     match backend {
-        Backend::Auto | Backend::Cpu => Ok(Box::new(CpuRenderer::new(weights, encoder)?)),
-        Backend::Gpu => Err(Failure::new(
-            Exit::Unavailable,
-            "--backend gpu: this version computes on the processor only; use --backend cpu or leave it out",
-        )),
+        Backend::Cpu => Ok(Box::new(CpuRenderer::new(weights, encoder, None)?)),
+        Backend::Auto => match on_gpu(weights, encoder, Adapters::Hardware) {
+            Ok(renderer) => Ok(renderer),
+            Err(EngineError::Gpu(error)) => Ok(Box::new(CpuRenderer::new(weights, encoder, Some(&error))?)),
+            Err(other) => Err(Failure::because(Exit::Unavailable)(other)),
+        },
+        Backend::Gpu => on_gpu(weights, encoder, Adapters::Hardware)
+            .or_else(|error| match error {
+                EngineError::Gpu(GpuError::None { .. }) => on_gpu(weights, encoder, Adapters::Software),
+                other => Err(other),
+            })
+            .map_err(|error| Failure::new(Exit::Unavailable, format!("--backend gpu: {error}"))),
     }
+}
+
+#[cfg(feature = "gpu")]
+fn on_gpu(
+    weights: &Weights,
+    encoder: &Arc<PanelEncoder>,
+    adapters: Adapters,
+) -> Result<Box<dyn Renderer>, EngineError> {
+    Ok(Box::new(gpu::GpuRenderer::new(weights, encoder, adapters)?))
+}
+
+#[cfg(not(feature = "gpu"))]
+fn on_gpu(_: &Weights, _: &Arc<PanelEncoder>, _: Adapters) -> Result<Box<dyn Renderer>, EngineError> {
+    Err(GpuError::NotBuilt.into())
 }
 
 /// What turns patterns of `resolution` into levels of the rig's panel.

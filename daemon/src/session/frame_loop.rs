@@ -1,18 +1,19 @@
 //! The frame thread: wake, ask for the pupil, render the panel's levels, submit them.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use holod_calibration::{PupilDiameter, TimeNs};
+use holod_model::engine::EngineError;
 use holod_pupil_input::{EstimateReader, PupilState};
 use holod_slm_output::pacing::Point;
 use holod_slm_output::{FramePlan, FramePort, Pacer};
 
 use super::host_now;
 use super::keep::keep_slot;
+use super::last_hologram::{LastHologram, Shown};
 use crate::record::FrameRecord;
-use crate::renderer::Renderer;
 use crate::setup::Frames;
 
 /// An order to stop is seen within this time.
@@ -26,7 +27,7 @@ pub(super) struct FrameLoop {
     /// The tracker's newest estimate.
     pub pupil: EstimateReader,
     /// Frame and pupil to levels.
-    pub renderer: Box<dyn Renderer>,
+    pub holograms: LastHologram,
     /// Levels to the panel.
     pub port: FramePort,
     /// Which refresh each frame is for.
@@ -45,6 +46,8 @@ pub(super) struct FrameLoop {
     pub keep_levels: bool,
     /// Frames to make; without end where absent.
     pub limit: Option<u64>,
+    /// How holograms are computed, for the status.
+    pub engine: Arc<Mutex<String>>,
     /// Set by the control thread.
     pub stop: Arc<AtomicBool>,
 }
@@ -78,31 +81,37 @@ pub(super) struct LoopRecord {
 
 impl FrameLoop {
     /// Makes frames until told to stop or the limit is reached.
-    pub(super) fn run(mut self) {
+    ///
+    /// # Errors
+    /// The engine failed and nothing could take its place.
+    pub(super) fn run(mut self) -> Result<(), EngineError> {
         let mut made = 0;
         while !self.stop.load(Ordering::Acquire) && self.limit.is_none_or(|limit| made < limit) {
             let plan = self.pacer.predict(host_now());
             if !self.sleep_until(plan.t_wake) {
                 break;
             }
-            self.frame(plan);
+            self.frame(plan)?;
             made += 1;
         }
+        Ok(())
     }
 
     /// One frame, top to bottom.
-    fn frame(&mut self, plan: FramePlan) {
+    fn frame(&mut self, plan: FramePlan) -> Result<(), EngineError> {
         let t_wake = self.mark(Point::WakeUp, plan);
         let state = self.pupil.pupil_at(t_wake).state;
         let estimate = self.pupil.pupil_at(plan.t_predicted_photon.min(t_wake + FARTHEST_PREDICTION));
         let scene = self.frames.index_at((plan.t_predicted_photon - self.t_origin).seconds());
-        let hologram_pupil = self.trained.clamp(estimate.pupil);
+        let pupil = self.trained.clamp(estimate.pupil);
 
         let t_render_begin = self.mark(Point::RenderBegin, plan);
-        let rendered = self
-            .renderer
-            .render(&self.frames.frames[scene], hologram_pupil, self.port.acquire())
-            .expect("renderer and scene were made for one size, and the estimator gives positive diameters");
+        let Shown { rendered, pupil: hologram_pupil } =
+            self.holograms.show(&self.frames.frames[scene], pupil, self.port.acquire())?;
+        if rendered.engine_changed {
+            // It happens when a device is lost, which took longer than any lock.
+            self.holograms.description().clone_into(&mut self.engine.lock().unwrap_or_else(PoisonError::into_inner));
+        }
         let t_render_end = self.mark(Point::RenderEnd, plan);
 
         let keep = if self.keep_levels && state != PupilState::Fallback { keep_slot(hologram_pupil) } else { None };
@@ -131,6 +140,7 @@ impl FrameLoop {
         self.port.submit(&plan, keep, t_submit);
         self.pacer.mark(Point::Submit, plan.frame_id, t_submit);
         self.port.feed(&mut self.pacer, |_| ());
+        Ok(())
     }
 
     fn mark(&mut self, point: Point, plan: FramePlan) -> TimeNs {

@@ -3,6 +3,7 @@
 mod frame_loop;
 mod keep;
 mod laser_watch;
+mod last_hologram;
 mod ledger;
 mod output_watch;
 mod rate_watch;
@@ -12,14 +13,15 @@ mod stats;
 mod tracker_watch;
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{PupilDiameter, Resolution, TimeNs};
 use holod_model::Weights;
+use holod_model::engine::EngineError;
 use holod_pupil_input::{
     Counter, Decision, DecisionTap, Link, PupilState, RecordFiles, ReplayError, ReplaySpeed, SourceError, Tracker,
     TrackerControl, TrackerError, TrackerOptions, TrackerSpec,
@@ -35,6 +37,7 @@ use serde::Serialize;
 use self::frame_loop::{FrameLoop, LoopRecord, TrainedPupils};
 use self::keep::{KEEP_SLOTS, keep_slot};
 use self::laser_watch::LaserBoxWatch;
+use self::last_hologram::LastHologram;
 use self::ledger::LaserLedger;
 use self::output_watch::OutputWatch;
 use self::rate_watch::RateWatch;
@@ -128,6 +131,8 @@ pub struct Summary {
     pub scene: String,
     /// The tracker spec.
     pub tracker: String,
+    /// How holograms were computed at the end.
+    pub engine: String,
     /// Hologram size in pixels.
     pub hologram: String,
     /// Frames that were made.
@@ -234,7 +239,8 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         let frame_time = first_frame_time(&mut *renderer, &plan, LevelsFrame::new(encoder.layout()))?;
         Ok::<_, Failure>((renderer, frame_time))
     })?;
-    tracing::debug!("holograms are computed by {}", renderer.description());
+    tracing::info!("holograms are computed by {}", renderer.description());
+    let engine = Arc::new(Mutex::new(renderer.description().to_owned()));
     let panel_hz = speed::panel_frames_hz(&rig.panel);
     let first_hz = 1.0 / frame_time.seconds();
     let first_frame = format!(
@@ -275,7 +281,7 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
     let frames = Arc::new(plan.frames);
     let frame_loop = FrameLoop {
         pupil: estimates,
-        renderer,
+        holograms: LastHologram::new(renderer, rig.geometry, LevelsFrame::new(encoder.layout())),
         port: output.frames,
         pacer: Pacer::new(pacing, host_now()),
         frames: Arc::clone(&frames),
@@ -288,6 +294,7 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         records_lost: Arc::new(AtomicU64::new(0)),
         keep_levels: plan.keep_levels,
         limit: plan.frame_limit,
+        engine: Arc::clone(&engine),
         stop: Arc::clone(&stop),
     };
     let records_lost = Arc::clone(&frame_loop.records_lost);
@@ -323,6 +330,7 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         status: StatusFile::create(),
         rig,
         spec: plan.tracker.to_string(),
+        engine: Arc::clone(&engine),
         panel: plan.output.to_string(),
         frame_rate: FrameRate::default(),
         t_origin,
@@ -338,7 +346,7 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
     tracing::info!("stopping: {}", ended.as_deref().unwrap_or("a failure"));
     stop.store(true, Ordering::Release);
     let down = output.control.shutdown();
-    let frame_loop_failed = frame_thread.join().is_err();
+    let frame_loop = frame_thread.join();
     let tracker_link = watch.tracker.link().name();
     watch.tracker.stop();
     let observed = watch.drain();
@@ -354,14 +362,15 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         tracing::error!("the tracker's recording is not whole: {failure}");
     }
     if let Some(why) = &lasers_not_dark
-        && (ended.is_err() || observed.is_err() || frame_loop_failed)
+        && (ended.is_err() || observed.is_err() || !matches!(frame_loop, Ok(Ok(()))))
     {
         tracing::error!("{}", not_dark(why));
     }
     let ended_by = ended?;
     observed?;
-    if frame_loop_failed {
-        return Err(Failure::new(Exit::Software, "the frame loop failed (its message stands above)"));
+    match frame_loop {
+        Err(_panic) => return Err(Failure::new(Exit::Software, "the frame loop failed (its message stands above)")),
+        Ok(rendered) => rendered.map_err(Failure::because(Exit::Unavailable))?,
     }
 
     if tally.frames_shown == 0 {
@@ -381,6 +390,7 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         rig: plan.rig.name.clone(),
         scene: frames.name.clone(),
         tracker: plan.tracker.to_string(),
+        engine: engine.lock().unwrap_or_else(PoisonError::into_inner).clone(),
         hologram: resolution.to_string(),
         frames_made: tally.frames_made,
         frames_shown: tally.frames_shown,
@@ -473,6 +483,7 @@ struct Watch<'a> {
     status: StatusFile,
     rig: &'a Rig,
     spec: String,
+    engine: Arc<Mutex<String>>,
     panel: String,
     frame_rate: FrameRate,
     t_origin: TimeNs,
@@ -489,7 +500,7 @@ impl Watch<'_> {
         &mut self,
         limits: &Limits,
         output: &OutputControl,
-        frame_thread: &JoinHandle<()>,
+        frame_thread: &JoinHandle<Result<(), EngineError>>,
     ) -> Result<String, Failure> {
         let mut t_give_up = None;
         let mut ticks = 0_u32;
@@ -631,6 +642,7 @@ impl Watch<'_> {
             tracker_trouble: self.tracker_watch.trouble(),
             pupil_state: tally.newest_state.to_owned(),
             pupil_mm: tally.recent.back().map(|frame| frame.pupil.mm()),
+            engine: self.engine.lock().unwrap_or_else(PoisonError::into_inner).clone(),
             panel: self.panel.clone(),
             panel_trouble: self.output.lost().map(|fault| fault.to_string()),
             panel_refresh_hz: output.refresh_hz,

@@ -5,6 +5,7 @@ mod cpu;
 mod golden;
 #[cfg(feature = "gpu")]
 mod gpu;
+mod modulation;
 #[cfg(test)]
 mod reference;
 
@@ -12,7 +13,12 @@ use std::time::Duration;
 
 use holod_calibration::Resolution;
 
+use crate::gpu::GpuError;
+
 pub use cpu::{CpuEngine, fma_peak};
+#[cfg(feature = "gpu-cost")]
+pub use gpu::cost as gpu_cost;
+// pub use gpu::{EncodedCounts, GpuEngine};
 
 /// A frame that an engine refuses.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -39,20 +45,9 @@ pub enum EngineError {
         /// What was given.
         pupil_mm: f32,
     },
-}
-
-/// One step of a frame, before it is timed.
-struct Stage {
-    name: String,
-    /// As in [`StageTiming`].
-    flop: u64,
-}
-
-impl Stage {
-    /// A step that is not matrix-like work.
-    fn plain(name: &str) -> Self {
-        Self { name: name.into(), flop: 0 }
-    }
+    /// The device cannot do it, or failed at it.
+    #[error(transparent)]
+    Gpu(#[from] GpuError),
 }
 
 /// Where the time of one frame went.

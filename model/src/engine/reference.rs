@@ -3,13 +3,12 @@
 //! Maps are [channels, height, width].
 
 use std::f64::consts::{PI, TAU};
-use std::ops::RangeInclusive;
 
 use holod_calibration::Resolution;
 use num_complex::Complex64;
 
 use crate::RgbdFrame;
-use crate::weights::{Adjustable, Dense, Family, Grid, LAYERED_BLURS, Layer, NetworkConfig, Weights};
+use crate::weights::{Adjustable, Dense, Family, Grid, Layer, NetworkConfig, Weights};
 
 #[derive(Clone, Debug)]
 pub(crate) struct Map {
@@ -43,7 +42,7 @@ impl Map {
         self.values[(channel * self.height + y as usize) * self.width + x as usize]
     }
 
-    fn bilinear(&self, channel: usize, y: f64, x: f64) -> f64 {
+    pub(crate) fn bilinear(&self, channel: usize, y: f64, x: f64) -> f64 {
         let (top, left) = (y.floor(), x.floor());
         let (lower, right) = (y - top, x - left);
         let at = |dy: isize, dx: isize| self.at(channel, top as isize + dy, left as isize + dx);
@@ -92,27 +91,8 @@ pub(crate) fn run(weights: &Weights, frame: &RgbdFrame, pupil_mm: f64) -> Trace 
             let base = block_means(weights.config.grid, frame);
             add(&base.values.iter().map(|&value| value.into()).collect::<Vec<_>>(), &residual, 1.0)
         }
-        Family::Layered { surface, correction } => {
-            let maps = encode_layered(frame, pupil_mm);
-            let light = block_means(Grid::HalfBand, frame);
-            let soft = blurs(&light);
-            let logs = blurs(&light.clone().map(|a| (a * a + 0.03).ln())).map(|blur| blur.map(|value| value + 1.66));
-            let encoded = match weights.config.transport_prior {
-                true => concatenate(&[&maps, &logs[1]]),
-                false => maps.clone(),
-            };
-            let out = trunk(&mut stages, "surface.", surface, weights, encoded, pupil_mm);
-            let source = surface_light(weights, frame, &out, &light, &soft, &logs);
-            let carried = carry_to_slm(weights, frame, &source, [light.height, light.width]);
-            let [real, imaginary] = parts(&carried, &light);
-            stages.push(Stage { name: "source".into(), value: Value::Light(source) });
-            stages.push(Stage { name: "carried".into(), value: Value::Light(carried.clone()) });
-            let encoded = concatenate(&[&real, &imaginary, &maps]);
-            let residual = trunk(&mut stages, "correction.", correction, weights, encoded, pupil_mm);
-            add(&carried, &residual, 0.3)
-        }
         Family::ExpectedStack { lighting, correction, feedback } => {
-            let maps = encode_layered(frame, pupil_mm);
+            let maps = encode_for_light(frame, pupil_mm);
             let wanted = expected_stack(weights, frame, [maps.height, maps.width], pupil_mm).map(f64::sqrt);
             let maps = concatenate(&[&maps, &wanted.clone().map(|amplitude| amplitude - 0.4)]);
             let out = trunk(&mut stages, "lighting.", lighting, weights, maps.clone(), pupil_mm);
@@ -286,7 +266,8 @@ fn block_means(grid: Grid, frame: &RgbdFrame) -> Map {
     })
 }
 
-fn encode_layered(frame: &RgbdFrame, pupil_mm: f64) -> Map {
+/// What both nets of `expected-stack` are told of a frame, centred around zero.
+fn encode_for_light(frame: &RgbdFrame, pupil_mm: f64) -> Map {
     let mut maps = encode(Grid::HalfBand, frame, pupil_mm);
     let plane = maps.width * maps.height;
     for (channel, values) in maps.values.chunks_exact_mut(plane).enumerate() {
@@ -300,49 +281,6 @@ fn encode_layered(frame: &RgbdFrame, pupil_mm: f64) -> Map {
         }
     }
     maps
-}
-
-/// Circular Gaussian blurs of 1, 2.5 and 6 panel pixels on the half-band grid.
-fn blurs(map: &Map) -> [Map; LAYERED_BLURS] {
-    [0.5, 1.25, 3.0].map(|sigma: f64| {
-        let plane = map.width * map.height;
-        let values = map.values.chunks_exact(plane).flat_map(|plane| {
-            let light: Vec<_> = plane.iter().map(|&value| Complex64::from(value)).collect();
-            filtered(&light, [map.height, map.width], |fx, fy| {
-                Complex64::from((-2.0 * (PI * sigma).powi(2) * (fx * fx + fy * fy)).exp())
-            })
-        });
-        Map { values: values.map(|value| value.re).collect(), ..*map }
-    })
-}
-
-fn surface_light(
-    weights: &Weights,
-    frame: &RgbdFrame,
-    out: &Map,
-    light: &Map,
-    soft: &[Map; LAYERED_BLURS],
-    logs: &[Map; LAYERED_BLURS],
-) -> Vec<Complex64> {
-    let maps = encode(Grid::HalfBand, frame, 0.0);
-    let mut source = Vec::new();
-    for colour in 0..3 {
-        for (y, x) in (0..light.height as isize).flat_map(|y| (0..light.width as isize).map(move |x| (y, x))) {
-            let out = |channel: usize| out.at(3 * channel + colour, y, x);
-            let centred = (12..16).map(|channel| maps.at(channel, y, x)).sum::<f64>() / 4.0;
-            let light = light.at(colour, y, x);
-            let blurs = 0..LAYERED_BLURS;
-            let softened: f64 = blurs.clone().map(|j| out(2 + j) * (soft[j].at(colour, y, x) - light)).sum();
-            let mut phase = out(1);
-            if weights.config.transport_prior {
-                let gain = |j: usize| [-0.5, -1.0, 0.0][j] * (4.0 * -centred).tanh() + out(2 + LAYERED_BLURS + j);
-                let drift: f64 = blurs.map(|j| gain(j) * logs[j].at(colour, y, x)).sum();
-                phase += 520.0 / weights.config.optics.wavelengths_nm[colour] * drift;
-            }
-            source.push(Complex64::from_polar(1.0, phase) * (light + 0.5 * out(0) + softened));
-        }
-    }
-    source
 }
 
 /// Where the middle of a depth layer is imaged, metres from the SLM plane.
@@ -361,11 +299,11 @@ fn layer_of(weights: &Weights, frame: &RgbdFrame, y: usize, x: usize) -> usize {
     ((depth * count as f32) as usize).min(count - 1)
 }
 
-/// The share of block `index` whose pixels lie in one of `layers`.
-fn cover(weights: &Weights, frame: &RgbdFrame, columns: usize, index: usize, layers: RangeInclusive<usize>) -> f64 {
+/// The share of block `index` whose pixels lie in `layer`.
+fn cover(weights: &Weights, frame: &RgbdFrame, columns: usize, index: usize, layer: usize) -> f64 {
     let (y, x) = (2 * (index / columns), 2 * (index % columns));
     let corners = [(y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)];
-    corners.iter().filter(|&&(y, x)| layers.contains(&layer_of(weights, frame, y, x))).count() as f64 / 4.0
+    corners.iter().filter(|&&(y, x)| layer_of(weights, frame, y, x) == layer).count() as f64 / 4.0
 }
 
 /// The angular spectrum transfer function of one colour over the distance `u_m`, at cycles per sample of the grid.
@@ -375,28 +313,6 @@ fn transfer(weights: &Weights, colour: usize, u_m: f64, [fx, fy]: [f64; 2]) -> C
     let [fx, fy] = [fx, fy].map(|f| f / (2e-6 * optics.pixel_pitch_um));
     let squared = per_m * per_m - fx * fx - fy * fy;
     if squared > 0.0 { Complex64::cis(TAU * u_m * (squared.sqrt() - per_m)) } else { Complex64::ZERO }
-}
-
-fn carry_to_slm(weights: &Weights, frame: &RgbdFrame, source: &[Complex64], size: [usize; 2]) -> Vec<Complex64> {
-    let [rows, columns] = size;
-    let layers = weights.config.depth_layers;
-    let centre_m = |layer| centre_m(weights, layer);
-    let mut carried = Vec::new();
-    for (colour, source) in source.chunks_exact(rows * columns).enumerate() {
-        let carry = |field: &[Complex64], u_m| filtered(field, size, |fx, fy| transfer(weights, colour, u_m, [fx, fy]));
-        let mut field = vec![Complex64::ZERO; rows * columns];
-        for layer in 0..layers {
-            if layer > 0 {
-                field = carry(&field, centre_m(layer) - centre_m(layer - 1));
-            }
-            for (index, field) in field.iter_mut().enumerate() {
-                let cover = cover(weights, frame, columns, index, layer..=layer + 1);
-                *field = *field * (1.0 - cover) + source[index] * cover;
-            }
-        }
-        carried.extend(carry(&field, -centre_m(layers - 1)));
-    }
-    carried
 }
 
 /// What an eye should see at each depth layer as far as the picture and its depth tell: intensities, colours within
@@ -496,7 +412,7 @@ fn feed_back(
         for (index, (arriving, lack)) in arriving.iter_mut().zip(lack).enumerate() {
             let amplitude = (arriving.norm_sqr() + 1e-6).sqrt();
             *lack -= amplitude;
-            let weight = 1.0 + sharpness * cover(weights, frame, wanted.width, index, layer..=layer);
+            let weight = 1.0 + sharpness * cover(weights, frame, wanted.width, index, layer);
             *arriving *= weight * *lack / amplitude;
         }
         for (change, back) in change[plane].iter_mut().zip(through(&arriving, -u_m)) {

@@ -11,6 +11,8 @@ from typing import Any
 
 WEIGHTS_FORMAT = "holod-weights-1"
 ARCHITECTURES = ("direct", "layered", "expected-stack", "focal-stack")
+# Those of them that the engines run.
+ENGINE_ARCHITECTURES = ("direct", "expected-stack")
 CONDITIONINGS = ("adjustable", "deformable", "modulated")
 
 

@@ -13,7 +13,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
-from holod_training.config import WEIGHTS_FORMAT, ConfigError, NetworkConfig
+from holod_training.config import ENGINE_ARCHITECTURES, WEIGHTS_FORMAT, ConfigError, NetworkConfig
 from holod_training.network import FieldNetwork
 from holod_training.variants import build_network
 
@@ -78,6 +78,13 @@ def load_weights(path: Path) -> FieldNetwork:
     return network.eval()
 
 
+def check_engines_run(config: NetworkConfig, source: Path) -> None:
+    """Raises WeightsError for a network of a family that no engine runs."""
+    if config.architecture not in ENGINE_ARCHITECTURES:
+        known = " and ".join(f"`{name}`" for name in ENGINE_ARCHITECTURES)
+        raise WeightsError(f"{source}: found a `{config.architecture}` network; the engines run {known} networks only")
+
+
 def export(
     source: Path,
     out: Path,
@@ -85,12 +92,14 @@ def export(
     evaluation: Path | None,
     method: str = "holod",
 ) -> Path:
-    """Writes `out` from a run's checkpoint or a weights file; raises WeightsError."""
+    """Writes `out`, for the engines, from a run's checkpoint or a weights file; raises WeightsError, also for a network
+    of a family that they do not run."""
     if source.suffix == ".pt":
         network, metrics, provenance = _from_checkpoint(source)
     else:
         metadata = read_metadata(source)
         network, metrics, provenance = load_weights(source), metadata["metrics"], metadata["provenance"]
+    check_engines_run(network.config, source)
     if amplitude_constant is not None:
         if not amplitude_constant > 0:
             raise WeightsError(f"amplitude constant: found {amplitude_constant}, expected a number above 0")

@@ -13,8 +13,8 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from holod_training.config import NetworkConfig
-from holod_training.export import WeightsError, load_weights, save_weights, write_beside
+from holod_training.config import ENGINE_ARCHITECTURES, NetworkConfig
+from holod_training.export import check_engines_run, load_weights, save_weights, write_beside
 from holod_training.golden_evaluation import write_evaluation
 from holod_training.network import AdjustableLayer, FieldNetwork, Trunk
 from holod_training.optics import (
@@ -31,7 +31,6 @@ from holod_training.variants import build_network
 GOLDEN_FORMAT = "holod-golden-1"
 FOCUS_DPT = (0.25, 2.5)
 ASM_DISTANCE_M = 0.0032
-SHIPPED_FAMILIES = ("direct", "layered", "expected-stack")
 
 
 class Narrow(NamedTuple):
@@ -43,34 +42,10 @@ class Narrow(NamedTuple):
     pupil_mm: float = 2.7
 
 
-# Depth layers are left at their default, and correction layers in one, so that no engine has others.
+# Depth layers are left at their default, so that no engine has another.
 NARROW: dict[str, Narrow] = {
     "direct-narrow": Narrow(NetworkConfig(channels=8, modulation_hidden=8), 32, 48),
     "direct-narrow-full": Narrow(NetworkConfig(grid="full", channels=8, modulation_hidden=8), 12, 16),
-    "layered-narrow": Narrow(
-        NetworkConfig(
-            architecture="layered",
-            layers=4,
-            channels=8,
-            adjustable_layers=(2,),
-            modulation_hidden=8,
-            correction_layers=4,
-        ),
-        32,
-        48,
-    ),
-    "layered-narrow-no-prior": Narrow(
-        NetworkConfig(
-            architecture="layered",
-            layers=4,
-            channels=4,
-            adjustable_layers=(2,),
-            modulation_hidden=8,
-            transport_prior=False,
-        ),
-        16,
-        24,
-    ),
     # A pupil that cuts the half band.
     "expected-stack-narrow": Narrow(
         NetworkConfig(
@@ -141,8 +116,7 @@ def told_layers(config: NetworkConfig) -> set[str]:
     """The trace's names of what is kept of a large network: the first, the adjustable and the last layer of a net."""
     nets = {"": (config.layers, config.adjustable_layers)}
     if config.architecture != "direct":
-        first = "surface" if config.architecture == "layered" else "lighting"
-        nets = {f"{first}.": nets[""], "correction.": (config.correction_layers, ())}
+        nets = {"lighting.": nets[""], "correction.": (config.correction_layers, ())}
     return {
         f"{net}layer_{index}" for net, (layers, adjustable) in nets.items() for index in (0, *adjustable, layers - 1)
     }
@@ -206,15 +180,14 @@ def write_golden(out: Path, standard: Path | None, small: Path | None = None, se
         if not shipped:
             continue
         built_in = load_weights(shipped)
+        check_engines_run(built_in.config, shipped)
         family = built_in.config.architecture
-        if family not in SHIPPED_FAMILIES:
-            raise WeightsError(f"{shipped}: found a {family} network, expected one of {', '.join(SHIPPED_FAMILIES)}")
         path = out / f"{family}-shipped{suffix}.safetensors"
         amplitude, depth = scene(32, 48, seed)
         result = vectors(built_in.double(), amplitude, depth, 3.4, every_layer=False)
         write_vectors(path, result, {"seed": seed, "weights": shipped.name})
         written.append(path)
-        for other in SHIPPED_FAMILIES:
+        for other in ENGINE_ARCHITECTURES:
             if other != family:
                 (out / f"{other}-shipped{suffix}.safetensors").unlink(missing_ok=True)
     if standard:

@@ -36,6 +36,7 @@ from holod_training.rivals import (
 )
 from holod_training.shards import Shard, Stack
 from holod_training.solver import Solution, optimise
+from holod_training.variants import build_network, variant
 
 PUPILS = (1.0, 2.0, 2.5, 4.0)
 TABLE_PUPILS = (1.0, 2.0, 4.0)
@@ -347,6 +348,18 @@ def test_export_stamps_the_constant_and_the_evaluation(evaluation: Path) -> None
     assert main(["export", *arguments, *judged, "layered ASM"]) == 0
     assert "matrix_psnr_db" not in read_metadata(out)["metrics"]
     assert main(["export", *arguments, *judged, "nobody"]) == 65
+
+
+@pytest.mark.parametrize("name", ["focal-stack", "half-band-layered-small"])
+def test_networks_that_no_engine_runs_are_not_exported(name: str, tmp_path: Path, capsys) -> None:
+    source, out = tmp_path / "w.safetensors", tmp_path / "out.safetensors"
+    save_weights(source, build_network(variant(name)), {}, {})
+    assert main(["export", "--source", str(source), "--out", str(out)]) == 65
+    found = (
+        f"found a `{variant(name).architecture}` network; the engines run `direct` and `expected-stack` networks only"
+    )
+    assert found in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_card_areas_leave_out_border_and_seam() -> None:

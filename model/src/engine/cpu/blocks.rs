@@ -12,6 +12,12 @@ pub(super) const fn scale_of(grid: Grid) -> usize {
     }
 }
 
+/// Samples of `grid` on a panel of `resolution`, which may be odd.
+pub(super) const fn grid_size(grid: Grid, resolution: Resolution) -> Resolution {
+    let Resolution { width, height } = resolution;
+    Resolution { width: width.div_ceil(scale_of(grid)), height: height.div_ceil(scale_of(grid)) }
+}
+
 /// Squares of `scale` by `scale` pixels of a frame; one of odd size repeats its edge.
 #[derive(Clone, Copy)]
 pub(super) struct Blocks {

@@ -181,6 +181,7 @@ pub(super) struct Scratch {
 }
 
 /// What one worker makes of a strip of up to [`ROWS`] tiles side by side.
+#[derive(Default)]
 struct WorkerScratch {
     /// Six rows of the input at its vertical points [point, pixel, channel].
     inputs: Vec<f32>,
@@ -192,16 +193,23 @@ struct WorkerScratch {
 }
 
 impl Scratch {
-    /// Enough for each of `layers`.
-    pub(super) fn new<'a>(layers: impl Iterator<Item = &'a PlainConv> + Clone) -> Self {
-        let most = |len: fn(&PlainConv) -> usize| vec![0.0; layers.clone().map(len).max().unwrap_or(0)];
-        let worker = || WorkerScratch {
-            inputs: most(|conv| POINTS * conv.inputs_row_len()),
-            points: most(|conv| POINTS * conv.shape.inputs_len()),
-            products: most(|conv| POINTS * conv.shape.outputs_len()),
-            sums: most(|conv| POINTS * conv.sums_row_len()),
-        };
-        Self { workers: (0..WORKERS).map(|_| worker()).collect() }
+    /// Room for no layer.
+    pub(super) fn new() -> Self {
+        Self { workers: (0..WORKERS).map(|_| WorkerScratch::default()).collect() }
+    }
+
+    /// Makes room for `layer` too.
+    pub(super) fn fit(&mut self, layer: &PlainConv) {
+        for WorkerScratch { inputs, points, products, sums } in &mut self.workers {
+            for (buffer, row_len) in [
+                (inputs, layer.inputs_row_len()),
+                (points, layer.shape.inputs_len()),
+                (products, layer.shape.outputs_len()),
+                (sums, layer.sums_row_len()),
+            ] {
+                buffer.resize(buffer.len().max(POINTS * row_len), 0.0);
+            }
+        }
     }
 }
 
@@ -391,7 +399,9 @@ mod tests {
     }
 
     fn run(conv: &PlainConv, input: &FeatureMap, output: &mut FeatureMap) {
-        conv.run(input, &mut Scratch::new(std::iter::once(conv)), output);
+        let mut scratch = Scratch::new();
+        scratch.fit(conv);
+        conv.run(input, &mut scratch, output);
     }
 
     /// The sum over taps in double precision.

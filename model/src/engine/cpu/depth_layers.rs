@@ -78,29 +78,6 @@ impl DepthLayers {
         });
     }
 
-    /// Writes what `source` [3, height, width] sends to the SLM plane to `self.carried`: f ← f·(1 − m) + O·m from far to
-    /// near, by ASM between layers and at last back; m is the share of a block whose pixels lie in a layer or its next
-    /// nearer one, so that slanted surfaces show no seams.
-    pub(super) fn compose(&mut self, source: &[Complex32]) {
-        let Self { count, size, layer_of, step, back, fft, carried, .. } = self;
-        let pixels = size.pixels();
-        for ((field, source), (step, back)) in
-            carried.chunks_exact_mut(pixels).zip(source.chunks_exact(pixels)).zip(step.iter().zip(back.iter()))
-        {
-            field.fill(Complex32::ZERO);
-            for layer in 0..*count {
-                if layer > 0 {
-                    carry(fft, field, step);
-                }
-                field.par_iter_mut().zip(source).zip(layer_of.par_iter()).for_each(|((field, source), block)| {
-                    let inside = block.iter().filter(|&&of| of == layer || of == layer + 1).count();
-                    *field += (source - *field) * (inside as f32 / BLOCK as f32);
-                });
-            }
-            carry(fft, field, back);
-        }
-    }
-
     /// Adds the light [height, width] that one layer sends out, which is used up, to the transposed spectrum `sum` of the
     /// light of farther ones: Horner's rule, far to near, from zeros on.
     pub(super) fn add_light(&mut self, colour: Colour, light: &mut [Complex32], sum: &mut [Complex32]) {
@@ -141,11 +118,4 @@ impl DepthLayers {
         let samples = self.size.pixels() as f32;
         spectrum.par_iter_mut().zip(&self.step[colour.index()]).for_each(|(value, step)| *value *= step * samples);
     }
-}
-
-/// Multiplies the spectrum of `field` by `transfer`.
-fn carry(fft: &mut TransposedFft2d<f32>, field: &mut [Complex32], transfer: &[Complex32]) {
-    fft.forward(field);
-    fft.spectrum.par_iter_mut().zip(transfer).for_each(|(value, transfer)| *value *= transfer);
-    fft.inverse(field);
 }

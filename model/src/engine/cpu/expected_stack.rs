@@ -5,111 +5,135 @@ use holod_calibration::{Colour, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
+use super::blocks::grid_size;
 use super::defocus::Defocus;
 use super::depth_layers::DepthLayers;
+use super::feature_map::FeatureMap;
 use super::feedback::LayerFeedback;
+use super::field::{Field, UncorrectedField};
 use super::maps::{FIRST_MAP, MAPS, RUN_PX, write_maps};
+use super::network::StageList;
+use super::stage::{Buffers, Job, MapId, Maps, Stage};
 use super::trunk::Trunk;
-use crate::RgbdFrame;
-use crate::engine::Stage;
 use crate::phase_math::cos_sin_pi;
 use crate::simd::{InstructionSet, Simd, Task};
-use crate::weights::{Feedback, LIT, NetworkConfig, OUTPUT_CHANNELS, REFINED};
+use crate::weights::{Feedback, LIT, Layer, NetworkConfig, OUTPUT_CHANNELS, REFINED};
 
 /// The mask's place among the first net's outputs for a layer.
 const MASK: usize = 3;
 /// Of the first net's changes, in the amplitudes.
 const REFINED_SHARE: f32 = 0.3;
 
-/// Nothing is allocated after `new`.
-pub(super) struct ExpectedStack {
-    size: Resolution,
-    lighting: Trunk,
-    correction: Trunk,
-    defocus: Defocus,
-    layers: DepthLayers,
-    feedback: LayerFeedback,
-    refines: bool,
+/// For frames of `resolution`; the layers are those of the first and of the second net.
+pub(super) fn stages(
+    config: &NetworkConfig,
+    [lighting, correction]: [&[Layer]; 2],
+    feedback: Feedback,
+    resolution: Resolution,
     set: InstructionSet,
+) -> StageList<DepthVolume> {
+    let size = grid_size(config.grid, resolution);
+    let mut maps = Maps::new(size, set);
+    let lighting = Trunk::new(&mut maps, "lighting ", lighting, config.leaky_slope);
+    let correction = Trunk::new(&mut maps, "correction ", correction, config.leaky_slope);
+    let volume = DepthVolume {
+        layers: DepthLayers::new(config, size),
+        stack: vec![0.0; 3 * config.depth_layers * size.pixels()],
+        sum: vec![Complex32::ZERO; size.pixels()],
+    };
+    StageList::new(maps, volume)
+        .then(Expect {
+            defocus: Defocus::new(config, size, set),
+            lighting_input: lighting.input,
+            correction_input: correction.input,
+        })
+        .then_each(lighting.layers)
+        .then(LightLayers {
+            output: lighting.output,
+            refines: config.refined_stack,
+            rows: vec![0.0; config.lighting_channels() * size.pixels()],
+            light: vec![Complex32::ZERO; size.pixels()],
+        })
+        .then(FeedBack { feedback: LayerFeedback::new(config, feedback, size), correction_input: correction.input })
+        .then_each(correction.layers)
+        .then(Field::new(config.grid, resolution, correction.output))
+}
+
+/// What the stages share besides maps.
+pub(super) struct DepthVolume {
+    layers: DepthLayers,
     /// [layers, 3, height, width]: the amplitudes that an eye should see, once the layers are lit as the first net
     /// corrects them; after the feedback, what is lacking of them.
     stack: Vec<f32>,
-    /// [height, channels, width]: what the first net gives, masks as shares of the light; a copy of its map in which a
-    /// channel's row lies together, so that it is read as vectors.
-    outputs: Vec<f32>,
-    /// The light that one layer sends out in one colour, and the transposed spectrum of that of the layers so far.
-    light: Vec<Complex32>,
+    /// Scratch: the transposed spectrum of the light of the layers so far.
     sum: Vec<Complex32>,
 }
 
-impl ExpectedStack {
-    pub(super) fn new(
-        config: &NetworkConfig,
-        [lighting, correction]: [Trunk; 2],
-        feedback: Feedback,
-        (width, height): (usize, usize),
-        set: InstructionSet,
-    ) -> Self {
-        let size = Resolution { width, height };
-        Self {
-            size,
-            lighting,
-            correction,
-            defocus: Defocus::new(config, size, set),
-            layers: DepthLayers::new(config, size),
-            feedback: LayerFeedback::new(config, feedback, size),
-            refines: config.refined_stack,
-            set,
-            stack: vec![0.0; 3 * config.depth_layers * size.pixels()],
-            outputs: vec![0.0; config.lighting_channels() * size.pixels()],
-            light: vec![Complex32::ZERO; size.pixels()],
-            sum: vec![Complex32::ZERO; size.pixels()],
-        }
+impl UncorrectedField for DepthVolume {
+    fn write_corrected(&self, residual: &FeatureMap, colour: Colour, field: &mut [Complex32]) {
+        residual.correct(&self.layers.carried[colour.index() * field.len()..], colour, field);
+    }
+}
+
+/// Writes what an eye should see, and with the maps of the frame shows it to both nets.
+struct Expect {
+    defocus: Defocus,
+    lighting_input: MapId,
+    correction_input: MapId,
+}
+
+impl Stage<DepthVolume> for Expect {
+    fn name(&self) -> &str {
+        "expected stack"
     }
 
-    pub(super) fn stages(&self) -> Vec<Stage> {
-        std::iter::once(Stage::plain("expected stack"))
-            .chain(self.lighting.stages("lighting "))
-            .chain([Stage::plain("light of the layers"), Stage::plain("feedback")])
-            .chain(self.correction.stages("correction "))
-            .collect()
-    }
-
-    pub(super) fn run_stage(&mut self, index: usize, frame: &RgbdFrame, pupil_mm: f32) {
-        let light_layers = 1 + self.lighting.len();
-        match index {
-            0 => self.expect(frame, pupil_mm),
-            _ if index < light_layers => self.lighting.run_layer(index - 1, pupil_mm),
-            _ if index == light_layers => self.light_layers(),
-            _ if index == light_layers + 1 => self.feed_back(pupil_mm),
-            _ => self.correction.run_layer(index - light_layers - 2, pupil_mm),
-        }
-    }
-
-    /// Writes what an eye should see, and with the maps of the frame shows it to both nets.
-    fn expect(&mut self, frame: &RgbdFrame, pupil_mm: f32) {
-        let Self { size, lighting, correction, defocus, layers, stack, .. } = self;
-        layers.place(frame);
-        defocus.expect(frame, layers, pupil_mm, stack);
-        let pixels = size.pixels();
-        for (map, first) in [(&mut lighting.input, 0), (&mut correction.input, FIRST_MAP)] {
-            write_maps(map, first, frame, pupil_mm);
+    fn run(&mut self, buffers: &mut Buffers<DepthVolume>, job: &mut Job<'_>) {
+        let Buffers { maps, family: DepthVolume { layers, stack, .. } } = buffers;
+        layers.place(job.frame);
+        self.defocus.expect(job.frame, layers, job.pupil_mm, stack);
+        let pixels = maps.size.pixels();
+        for (input, first) in [(self.lighting_input, 0), (self.correction_input, FIRST_MAP)] {
+            let map = &mut maps[input];
+            write_maps(map, first, job.frame, job.pupil_mm);
             map.write_planes(first + MAPS, stack.chunks_exact(pixels), |amplitude| amplitude - 0.4);
         }
     }
 
-    /// Lights every layer with what is expected there, as far as the first net corrects it, through its masks and with
-    /// its phases, and carries all of it to the SLM plane.
-    fn light_layers(&mut self) {
-        let Self { size, lighting, layers, stack, outputs, light, sum, refines, set, .. } = self;
-        let (width, pixels) = (size.width, size.pixels());
-        let (count, channels) = (layers.numbers().len(), outputs.len() / pixels);
+    #[cfg(test)]
+    fn seen<'a>(&'a self, buffers: &'a Buffers<DepthVolume>, _: &'a Job<'_>) -> super::stage::Seen<'a> {
+        super::stage::Seen::Map(&buffers.maps[self.lighting_input], None)
+    }
+}
+
+/// Lights every layer with what is expected there, as far as the first net corrects it, through its masks and with its
+/// phases, and carries all of it to the SLM plane.
+struct LightLayers {
+    /// The first net's.
+    output: MapId,
+    refines: bool,
+    /// [height, channels, width]: what the first net gives, masks as shares of the light; a copy of its map in which a
+    /// channel's row lies together, so that it is read as vectors.
+    rows: Vec<f32>,
+    /// What one layer sends out in one colour.
+    light: Vec<Complex32>,
+}
+
+impl Stage<DepthVolume> for LightLayers {
+    fn name(&self) -> &str {
+        "light of the layers"
+    }
+
+    fn run(&mut self, buffers: &mut Buffers<DepthVolume>, _: &mut Job<'_>) {
+        let Self { output, refines, rows: output_rows, light } = self;
+        let Buffers { maps, family: DepthVolume { layers, stack, sum } } = buffers;
+        let (output, set, width, pixels) = (&maps[*output], maps.set, maps.size.width, maps.size.pixels());
+        let (count, channels) = (layers.numbers().len(), output_rows.len() / pixels);
         let offset = ((count - 1) as f32).ln();
-        outputs.par_chunks_exact_mut(channels * width).enumerate().for_each(|(y, rows)| {
+        output_rows.par_chunks_exact_mut(channels * width).enumerate().for_each(|(y, rows)| {
             for x in (0..width).step_by(RUN_PX) {
                 for (channel, row) in rows.chunks_exact_mut(width).enumerate() {
                     let run = row[x..].iter_mut().take(RUN_PX);
-                    run.zip(lighting.output.channel(channel, y).skip(x)).for_each(|(to, from)| *to = *from);
+                    run.zip(output.channel(channel, y).skip(x)).for_each(|(to, from)| *to = *from);
                 }
             }
             for (channel, row) in rows.chunks_exact_mut(width).enumerate() {
@@ -123,7 +147,7 @@ impl ExpectedStack {
             for (layer, wanted) in stack.chunks_exact_mut(3 * pixels).enumerate() {
                 let wanted = wanted[colour.index() * pixels..][..pixels].par_chunks_exact_mut(width);
                 let rows = light.par_chunks_exact_mut(width).zip(wanted);
-                rows.zip(outputs.par_chunks_exact(channels * width)).for_each(|((light, wanted), outputs)| {
+                rows.zip(output_rows.par_chunks_exact(channels * width)).for_each(|((light, wanted), outputs)| {
                     let output = |channel: usize| &outputs[channel * width..][..width];
                     set.run(LightRow {
                         changes: refines.then(|| output(LIT * count + REFINED * layer + colour.index())),
@@ -140,22 +164,9 @@ impl ExpectedStack {
         }
     }
 
-    /// Feeds back what is lacking, and shows the second net the field, the change and the lack.
-    fn feed_back(&mut self, pupil_mm: f32) {
-        let Self { size, correction, layers, feedback, stack, sum, .. } = self;
-        feedback.run(layers, stack, sum, pupil_mm);
-        let (pixels, stack_channels) = (size.pixels(), 3 * layers.numbers().len());
-        let map = &mut correction.input;
-        map.write_fields(0, &layers.carried);
-        map.write_fields(FIRST_MAP + MAPS + stack_channels, &feedback.change);
-        let first_lack = FIRST_MAP + MAPS + stack_channels + OUTPUT_CHANNELS;
-        map.write_planes(first_lack, stack.chunks_exact(pixels), |lack| lack);
-    }
-
-    /// The predicted field of one colour on the half-band grid.
-    pub(super) fn write_field(&self, colour: Colour, field: &mut [Complex32]) {
-        let carried = &self.layers.carried[colour.index() * self.size.pixels()..];
-        self.correction.output.correct(carried, colour, field);
+    #[cfg(test)]
+    fn seen<'a>(&'a self, buffers: &'a Buffers<DepthVolume>, _: &'a Job<'_>) -> super::stage::Seen<'a> {
+        super::stage::Seen::Light(&buffers.family.layers.carried)
     }
 }
 
@@ -188,17 +199,30 @@ impl Task for LightRow<'_> {
     }
 }
 
-#[cfg(test)]
-impl ExpectedStack {
-    pub(super) fn after(&self, stage: usize) -> super::network::Seen<'_> {
-        use super::network::Seen;
-        let light_layers = 1 + self.lighting.len();
-        match stage {
-            0 => Seen::Map(&self.lighting.input, None),
-            _ if stage < light_layers => self.lighting.after(stage - 1),
-            _ if stage == light_layers => Seen::Light(&self.layers.carried),
-            _ if stage == light_layers + 1 => Seen::Map(&self.correction.input, None),
-            _ => self.correction.after(stage - light_layers - 2),
-        }
+/// Feeds back what is lacking, and shows the second net the field, the change and the lack.
+struct FeedBack {
+    feedback: LayerFeedback,
+    correction_input: MapId,
+}
+
+impl Stage<DepthVolume> for FeedBack {
+    fn name(&self) -> &str {
+        "feedback"
+    }
+
+    fn run(&mut self, buffers: &mut Buffers<DepthVolume>, job: &mut Job<'_>) {
+        let Buffers { maps, family: DepthVolume { layers, stack, sum } } = buffers;
+        self.feedback.run(layers, stack, sum, job.pupil_mm);
+        let (pixels, stack_channels) = (maps.size.pixels(), 3 * layers.numbers().len());
+        let map = &mut maps[self.correction_input];
+        map.write_fields(0, &layers.carried);
+        map.write_fields(FIRST_MAP + MAPS + stack_channels, &self.feedback.change);
+        let first_lack = FIRST_MAP + MAPS + stack_channels + OUTPUT_CHANNELS;
+        map.write_planes(first_lack, stack.chunks_exact(pixels), |lack| lack);
+    }
+
+    #[cfg(test)]
+    fn seen<'a>(&'a self, buffers: &'a Buffers<DepthVolume>, _: &'a Job<'_>) -> super::stage::Seen<'a> {
+        super::stage::Seen::Map(&buffers.maps[self.correction_input], None)
     }
 }

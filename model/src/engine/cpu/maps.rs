@@ -1,4 +1,4 @@
-//! How a frame and fields become maps for the nets of `layered` and `expected-stack`, and maps a field again.
+//! How a frame and fields become maps for the nets of `expected-stack`, and maps a field again.
 
 use holod_calibration::{Colour, DisplayGeometry, Metres};
 use num_complex::Complex32;

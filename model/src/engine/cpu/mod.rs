@@ -9,13 +9,14 @@ mod direct;
 mod expected_stack;
 mod feature_map;
 mod feedback;
-mod layered;
+mod field;
 mod maps;
 mod network;
 mod peak;
 mod product;
+mod stage;
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;
 mod trunk;
 
 use holod_calibration::{PupilDiameter, Resolution};

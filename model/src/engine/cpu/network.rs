@@ -2,143 +2,101 @@
 
 use std::time::{Duration, Instant};
 
-use holod_calibration::{Colour, PupilDiameter, Resolution};
-use num_complex::Complex32;
+use holod_calibration::{PupilDiameter, Resolution};
 
-use super::blocks::scale_of;
-use super::direct::Direct;
-use super::expected_stack::ExpectedStack;
-use super::layered::Layered;
-use super::trunk::Trunk;
-use crate::engine::{Stage, StageTiming, StageTimings};
-use crate::optics::FourierUpsampler;
+use super::stage::{Buffers, Job, Maps, Stage};
+use super::{direct, expected_stack};
+use crate::engine::{StageTiming, StageTimings};
 use crate::simd::InstructionSet;
-use crate::weights::{Family, Grid, Weights};
+use crate::weights::{Family, Weights};
 use crate::{ComplexHologram, RgbdFrame};
 
 /// Everything that one frame needs; nothing is allocated after `new`.
 pub(super) struct Network {
     pupil_range_mm: [f32; 2],
-    /// The frame's size, and that rounded up to what the grid needs.
-    resolution: Resolution,
-    padded: Resolution,
-    pub(super) predictor: Predictor,
-    upsampler: Option<FourierUpsampler>,
-    /// One colour at `padded`, where that differs from `resolution`.
-    uncropped: Vec<Complex32>,
+    pub(super) stages: Box<dyn Stages>,
     pub(super) timings: StageTimings,
-}
-
-/// A family's way to the field on the network's grid.
-pub(super) enum Predictor {
-    Direct(Box<Direct>),
-    Layered(Box<Layered>),
-    ExpectedStack(Box<ExpectedStack>),
-}
-
-impl Predictor {
-    fn stages(&self) -> Vec<Stage> {
-        match self {
-            Self::Direct(direct) => direct.stages(),
-            Self::Layered(layered) => layered.stages(),
-            Self::ExpectedStack(expected_stack) => expected_stack.stages(),
-        }
-    }
-
-    pub(super) fn run_stage(&mut self, index: usize, frame: &RgbdFrame, pupil_mm: f32) {
-        match self {
-            Self::Direct(direct) => direct.run_stage(index, frame, pupil_mm),
-            Self::Layered(layered) => layered.run_stage(index, frame, pupil_mm),
-            Self::ExpectedStack(expected_stack) => expected_stack.run_stage(index, frame, pupil_mm),
-        }
-    }
-
-    fn write_field(&self, colour: Colour, field: &mut [Complex32]) {
-        match self {
-            Self::Direct(direct) => direct.write_field(colour, field),
-            Self::Layered(layered) => layered.write_field(colour, field),
-            Self::ExpectedStack(expected_stack) => expected_stack.write_field(colour, field),
-        }
-    }
 }
 
 impl Network {
     pub(super) fn new(weights: &Weights, resolution: Resolution, set: InstructionSet) -> Self {
         let config = &weights.config;
-        let scale = scale_of(config.grid);
-        let size @ (width, height) = (resolution.width.div_ceil(scale), resolution.height.div_ceil(scale));
-        let padded = Resolution { width: scale * width, height: scale * height };
-        let predictor = match &weights.family {
-            Family::Direct { layers } => Predictor::Direct(Box::new(Direct::new(config, layers, size, set))),
-            Family::Layered { surface, correction } => {
-                Predictor::Layered(Box::new(Layered::new(config, surface, correction, size, set)))
-            }
+        let stages: Box<dyn Stages> = match &weights.family {
+            Family::Direct { layers } => Box::new(direct::stages(config, layers, resolution, set)),
             Family::ExpectedStack { lighting, correction, feedback } => {
-                let nets = [lighting, correction].map(|layers| Trunk::new(layers, config.leaky_slope, size, set));
-                Predictor::ExpectedStack(Box::new(ExpectedStack::new(config, nets, *feedback, size, set)))
+                Box::new(expected_stack::stages(config, [lighting, correction], *feedback, resolution, set))
             }
         };
-        let stages = predictor.stages().into_iter().chain([Stage::plain("field")]);
-        let timed = |Stage { name, flop }| StageTiming { name, duration: Duration::ZERO, flop };
-        Self {
-            pupil_range_mm: config.pupil_range_mm,
-            resolution,
-            padded,
-            timings: StageTimings { stages: stages.map(timed).collect() },
-            predictor,
-            upsampler: (config.grid == Grid::HalfBand).then(|| FourierUpsampler::new(padded)),
-            uncropped: if padded == resolution { Vec::new() } else { vec![Complex32::ZERO; padded.pixels()] },
-        }
+        Self { pupil_range_mm: config.pupil_range_mm, timings: stages.untimed(), stages }
     }
 
     /// One frame; `frame` and `hologram` have the network's resolution. Pupils outside the range that the weights were
     /// trained for are taken as the nearest one inside.
     pub(super) fn render(&mut self, frame: &RgbdFrame, pupil: PupilDiameter, hologram: &mut ComplexHologram) {
         let pupil_mm = pupil.mm().clamp(self.pupil_range_mm[0], self.pupil_range_mm[1]);
+        self.stages.run(&mut Job { frame, pupil_mm, hologram }, &mut self.timings);
+    }
+}
+
+/// The stages of a network in the order in which they run, and what they share.
+pub(super) struct StageList<F> {
+    stages: Vec<Box<dyn Stage<F>>>,
+    buffers: Buffers<F>,
+}
+
+impl<F> StageList<F> {
+    pub(super) fn new(maps: Maps, family: F) -> Self {
+        Self { stages: Vec::new(), buffers: Buffers { maps, family } }
+    }
+
+    pub(super) fn then(mut self, stage: impl Stage<F> + 'static) -> Self {
+        self.stages.push(Box::new(stage));
+        self
+    }
+
+    pub(super) fn then_each(self, stages: impl IntoIterator<Item = impl Stage<F> + 'static>) -> Self {
+        stages.into_iter().fold(self, Self::then)
+    }
+}
+
+/// A [`StageList`] of some family.
+pub(super) trait Stages: Send + Sync {
+    /// What the stages are called and cost.
+    fn untimed(&self) -> StageTimings;
+
+    /// Renders a frame and writes how long each stage took.
+    fn run(&mut self, job: &mut Job<'_>, timings: &mut StageTimings);
+
+    /// Renders a frame and shows what each stage has written, by its name.
+    #[cfg(test)]
+    fn run_seen(&mut self, job: &mut Job<'_>, look: &mut dyn FnMut(&str, super::stage::Seen<'_>));
+}
+
+impl<F: Send + Sync> Stages for StageList<F> {
+    fn untimed(&self) -> StageTimings {
+        let stages = self.stages.iter().map(|stage| StageTiming {
+            name: stage.name().into(),
+            duration: Duration::ZERO,
+            flop: stage.flop(),
+        });
+        StageTimings { stages: stages.collect() }
+    }
+
+    fn run(&mut self, job: &mut Job<'_>, timings: &mut StageTimings) {
         let mut stage_begin = Instant::now();
-        for index in 0..self.timings.stages.len() {
-            if index + 1 < self.timings.stages.len() {
-                self.predictor.run_stage(index, frame, pupil_mm);
-            } else {
-                Colour::ALL.into_iter().for_each(|colour| self.write_field(colour, hologram.plane_mut(colour)));
-            }
+        for (stage, timing) in self.stages.iter_mut().zip(&mut timings.stages) {
+            stage.run(&mut self.buffers, job);
             let now = Instant::now();
-            self.timings.stages[index].duration = now - stage_begin;
+            timing.duration = now - stage_begin;
             stage_begin = now;
         }
     }
 
-    /// The predicted field of one colour at the frame's resolution.
-    fn write_field(&mut self, colour: Colour, plane: &mut [Complex32]) {
-        let Some(upsampler) = &mut self.upsampler else { return self.predictor.write_field(colour, plane) };
-        self.predictor.write_field(colour, upsampler.input());
-        if self.padded == self.resolution {
-            return upsampler.upsample(plane);
-        }
-        upsampler.upsample(&mut self.uncropped);
-        let cropped_rows = self.uncropped.chunks_exact(self.padded.width);
-        for (row, from) in plane.chunks_exact_mut(self.resolution.width).zip(cropped_rows) {
-            row.copy_from_slice(&from[..self.resolution.width]);
-        }
-    }
-}
-
-/// What a stage has just written, for tests that look inside.
-#[cfg(test)]
-pub(super) enum Seen<'a> {
-    /// A layer's map, and the offsets of an adjustable one; or what the first layer reads.
-    Map(&'a super::feature_map::FeatureMap, Option<&'a super::feature_map::FeatureMap>),
-    /// A field on the network's grid, [3, height, width].
-    Light(&'a [Complex32]),
-}
-
-#[cfg(test)]
-impl Predictor {
-    pub(super) fn after(&self, stage: usize) -> Seen<'_> {
-        match self {
-            Self::Direct(direct) => direct.after(stage),
-            Self::Layered(layered) => layered.after(stage),
-            Self::ExpectedStack(expected_stack) => expected_stack.after(stage),
+    #[cfg(test)]
+    fn run_seen(&mut self, job: &mut Job<'_>, look: &mut dyn FnMut(&str, super::stage::Seen<'_>)) {
+        for stage in &mut self.stages {
+            stage.run(&mut self.buffers, job);
+            look(stage.name(), stage.seen(&self.buffers, job));
         }
     }
 }

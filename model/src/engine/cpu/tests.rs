@@ -5,17 +5,18 @@ use num_complex::{Complex32, Complex64};
 use proptest::prelude::*;
 
 use super::feature_map::FeatureMap;
-use super::network::{Network, Seen};
+use super::network::Network;
+use super::stage::{Job, Seen};
 use super::*;
 use crate::engine::reference::{self, Value};
 use crate::simd::InstructionSet;
 use crate::weights::tests::{self as weights_tests, random_weights};
-use crate::weights::{Architecture, Grid, NetworkConfig};
+use crate::weights::{Grid, NetworkConfig};
 
 /// Largest difference allowed between a map and its reference, relative to the reference's largest value.
 const TOLERANCE: f64 = 2e-5;
 
-fn frame(resolution: Resolution, seed: u32) -> RgbdFrame {
+pub(in crate::engine) fn frame(resolution: Resolution, seed: u32) -> RgbdFrame {
     let noise = |index: usize| {
         let mixed = (index as u32).wrapping_mul(0x9E37_79B9) ^ seed.wrapping_mul(0x85EB_CA6B);
         f64::from((mixed ^ (mixed >> 15)).wrapping_mul(0x2C1B_3C6D) >> 8) / f64::from(1 << 24)
@@ -60,57 +61,70 @@ fn error_once_spoiled(map: &FeatureMap, expected: &mut reference::Map) -> f64 {
     map_error(map, expected)
 }
 
+/// What the engine calls a stage of the reference.
+fn name_of(stage: &reference::Stage) -> String {
+    let adjustable = if matches!(stage.value, Value::Layer(_, Some(_))) { " (adjustable)" } else { "" };
+    match stage.name.as_str() {
+        "encoded" => "encode".into(),
+        "lighting.encoded" => "expected stack".into(),
+        "carried" => "light of the layers".into(),
+        "correction.encoded" => "feedback".into(),
+        layer_or_field => layer_or_field.replace(['.', '_'], " ") + adjustable,
+    }
+}
+
 /// Runs a network stage by stage against the reference; every comparison must also see one wrong value.
 fn check_all_stages(weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32, set: InstructionSet) {
     let frame = frame(resolution, seed);
-    let mut expected = reference::run(weights, &frame, f64::from(pupil_mm));
+    let reference::Trace { mut stages, field } = reference::run(weights, &frame, f64::from(pupil_mm));
+    stages.push(reference::Stage { name: "field".into(), value: Value::Light(field.clone()) });
     let mut network = Network::new(weights, resolution, set);
     let context = format!("{resolution}, {} on {}", weights.config().channels, set.name());
 
     // The second time round, what the first left in the maps must not show.
     let mut hologram = ComplexHologram::dark(resolution);
     network.render(&self::frame(resolution, seed + 1), PupilDiameter::from_mm(2.0), &mut hologram);
-    // The input of `layered`'s correction is written by the stage that carries the light, not by one of its own.
-    let layered = weights.config.architecture == Architecture::Layered;
-    let stages = expected.stages.iter_mut().filter(|stage| !layered || stage.name != "correction.encoded");
-    for (index, stage) in stages.enumerate() {
-        network.predictor.run_stage(index, &frame, pupil_mm);
-        let error = match (network.predictor.after(index), &stage.value) {
-            (Seen::Map(map, _), Value::Encoded(expected)) => map_error(map, expected),
-            (Seen::Map(map, offsets), Value::Layer(expected, expected_offsets)) => {
-                assert_eq!(offsets.is_some(), expected_offsets.is_some());
-                let errors = offsets.iter().zip(expected_offsets).map(|(map, expected)| map_error(map, expected));
-                largest(errors.chain([map_error(map, expected)]))
-            }
-            (Seen::Light(light), Value::Light(expected)) => light_error(light, expected),
-            _ => panic!("{context}: stage {index} is not {}", stage.name),
-        };
-        assert!(error < TOLERANCE, "{context}: {}: {error}", stage.name);
-        let spoiled = match (network.predictor.after(index), &mut stage.value) {
-            (Seen::Map(map, _), Value::Encoded(expected)) => error_once_spoiled(map, expected),
-            (Seen::Map(map, offsets), Value::Layer(expected, expected_offsets)) => {
-                let offsets =
-                    offsets.iter().zip(expected_offsets).map(|(map, expected)| error_once_spoiled(map, expected));
-                offsets.fold(error_once_spoiled(map, expected), f64::min)
-            }
-            (Seen::Light(light), Value::Light(expected)) => {
-                let middle = expected.len() / 2;
-                expected[middle].im += 1e-3 * largest(expected.iter().map(|value| value.norm()));
-                light_error(light, expected)
-            }
-            _ => unreachable!("the same kinds as above"),
-        };
-        assert!(spoiled > TOLERANCE, "{context}: the comparison of {} is blind", stage.name);
-    }
+    let mut remaining = stages.iter_mut();
+    let mut job = Job { frame: &frame, pupil_mm, hologram: &mut hologram };
+    network.stages.run_seen(&mut job, &mut |name, seen| {
+        let stage = remaining.next().unwrap_or_else(|| panic!("{context}: {name} is not in the reference"));
+        assert_eq!(name, name_of(stage), "{context}");
+        check_stage(&format!("{context}: {name}"), &seen, &mut stage.value);
+    });
+    assert!(remaining.next().is_none(), "{context}: a stage of the reference is missing");
+
+    hologram.field.fill(Complex32::ZERO);
     network.render(&frame, PupilDiameter::from_mm(pupil_mm), &mut hologram);
-    let error = light_error(&hologram.field, &expected.field);
-    assert!(error < TOLERANCE, "{context}: field: {error}");
-    let middle = expected.field.len() / 2;
-    expected.field[middle].im += 1e-3 * largest(expected.field.iter().map(|value| value.norm()));
-    assert!(
-        light_error(&hologram.field, &expected.field) > TOLERANCE,
-        "{context}: the comparison of the field is blind"
-    );
+    check_stage(&format!("{context}: rendered"), &Seen::Light(&hologram.field), &mut Value::Light(field));
+}
+
+/// Compares what a stage wrote with what it should have written, and again after `expected` was spoiled.
+fn check_stage(what: &str, seen: &Seen<'_>, expected: &mut Value) {
+    let error = match (seen, &*expected) {
+        (Seen::Map(map, None), Value::Encoded(expected)) => map_error(map, expected),
+        (Seen::Map(map, offsets), Value::Layer(expected, expected_offsets)) => {
+            assert_eq!(offsets.is_some(), expected_offsets.is_some(), "{what}");
+            let errors = offsets.iter().zip(expected_offsets).map(|(map, expected)| map_error(map, expected));
+            largest(errors.chain([map_error(map, expected)]))
+        }
+        (Seen::Light(light), Value::Light(expected)) => light_error(light, expected),
+        _ => panic!("{what} wrote something else"),
+    };
+    assert!(error < TOLERANCE, "{what}: {error}");
+    let spoiled = match (seen, expected) {
+        (Seen::Map(map, _), Value::Encoded(expected)) => error_once_spoiled(map, expected),
+        (Seen::Map(map, offsets), Value::Layer(expected, expected_offsets)) => {
+            let offsets = offsets.iter().zip(expected_offsets).map(|(map, expected)| error_once_spoiled(map, expected));
+            offsets.fold(error_once_spoiled(map, expected), f64::min)
+        }
+        (Seen::Light(light), Value::Light(expected)) => {
+            let middle = expected.len() / 2;
+            expected[middle].im += 1e-3 * largest(expected.iter().map(|value| value.norm()));
+            light_error(light, expected)
+        }
+        _ => unreachable!("the same kinds as above"),
+    };
+    assert!(spoiled > TOLERANCE, "{what}: the comparison is blind");
 }
 
 fn config(grid: Grid, layers: usize, channels: usize, adjustable_layers: Vec<usize>) -> NetworkConfig {
@@ -131,26 +145,6 @@ proptest! {
     ) {
         let grid = if half_band { Grid::HalfBand } else { Grid::Full };
         let weights = random_weights(config(grid, 4, channels, vec![adjustable]), u64::from(seed));
-        for set in InstructionSet::available() {
-            check_all_stages(&weights, Resolution { width, height }, pupil_mm, seed, set);
-        }
-    }
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig::with_cases(16))]
-    #[test]
-    fn every_stage_of_a_layered_network_matches_the_reference(
-        width in 1usize..40,
-        height in 1usize..14,
-        channels in 1usize..20,
-        depth_layers in 2usize..7,
-        transport_prior in any::<bool>(),
-        pupil_mm in 1.0f32..5.0,
-        seed in 0u32..1000,
-    ) {
-        let config = NetworkConfig { channels, depth_layers, transport_prior, ..weights_tests::layered_config() };
-        let weights = random_weights(config, u64::from(seed));
         for set in InstructionSet::available() {
             check_all_stages(&weights, Resolution { width, height }, pupil_mm, seed, set);
         }
@@ -194,12 +188,11 @@ fn blurs_wider_than_the_table_of_the_disc_match_the_reference() {
 #[test]
 fn one_pixel_one_column_and_one_row_match_the_reference() {
     let direct = random_weights(config(Grid::HalfBand, 6, 12, vec![3, 4]), 5);
-    let layered = random_weights(weights_tests::layered_config(), 5);
     let expected_stack = random_weights(weights_tests::expected_stack_config(), 5);
     let refined_stack =
         random_weights(NetworkConfig { refined_stack: true, ..weights_tests::expected_stack_config() }, 5);
     for (width, height) in [(1, 1), (1, 33), (57, 1), (2, 2), (101, 5)] {
-        for weights in [&direct, &layered, &expected_stack, &refined_stack] {
+        for weights in [&direct, &expected_stack, &refined_stack] {
             for set in InstructionSet::available() {
                 check_all_stages(weights, Resolution { width, height }, 3.3, 9, set);
             }

@@ -1,9 +1,9 @@
 //! 3x3 convolutions on the GPU, as sums over taps.
 
 use super::map::{GROUP, Map, ROWS};
-use super::plan::{BufferId, Plan, Shader};
+use super::plan::{BufferId, Constant, Plan, Shader};
 
-const TAPS: usize = 9;
+pub(super) const TAPS: usize = 9;
 /// Threads of a workgroup, along x.
 const WORKGROUP: usize = 64;
 /// Groups of output channels that a thread holds sums of, at most: with [`ROWS`] rows of five groups a shader has registers
@@ -32,6 +32,46 @@ pub(crate) struct ConvLayer<'a> {
     pub(crate) inputs: &'a [usize],
     pub(crate) epilogue: Epilogue,
     pub(crate) leaky_slope: f32,
+}
+
+impl ConvLayer<'_> {
+    /// The weight by which `input`, in the order of the weights, is multiplied at `tap` for `output`.
+    pub(super) fn weight(&self, output: usize, input: usize, tap: usize) -> f32 {
+        self.weight[(output * self.inputs.len() + input) * TAPS + tap]
+    }
+
+    /// The constants of `epilogue.wgsl` for the map `output`.
+    pub(super) fn epilogue_constants(&self, output: &Map) -> Vec<(&'static str, Constant)> {
+        let mut constants = vec![
+            ("WIDTH", output.width.into()),
+            ("HEIGHT", output.height.into()),
+            ("RESIDUAL", (self.epilogue == Epilogue::ResidualLeaky).into()),
+            ("LEAKY", (self.epilogue != Epilogue::None).into()),
+            ("LEAKY_SLOPE", self.leaky_slope.into()),
+        ];
+        constants.extend(output.constants(["OUT_GROUPS", "OUT_PITCH"]));
+        constants
+    }
+
+    /// Values of `output` that are read and written.
+    pub(super) fn output_values(&self, output: &Map) -> usize {
+        let times = if self.epilogue == Epilogue::ResidualLeaky { 2 } else { 1 };
+        times * output.groups * GROUP * output.width * output.height
+    }
+
+    /// Whether the layer can read the first `input_groups` of `input` and write `output`.
+    pub(super) fn check(&self, (input, input_groups): (&Map, usize), output: &Map) {
+        assert_eq!((input.width, input.height), (output.width, output.height));
+        assert!(input.buffer != output.buffer && input_groups <= input.groups);
+        assert!(self.inputs.iter().all(|&channel| channel < input_groups * GROUP));
+        assert!(self.bias.len() <= output.groups * GROUP);
+        assert_eq!(self.weight.len(), self.bias.len() * self.inputs.len() * TAPS);
+    }
+}
+
+/// Bytes of so many values.
+pub(super) fn bytes(values: &[usize]) -> u64 {
+    (values.iter().sum::<usize>() * size_of::<f32>()) as u64
 }
 
 /// How a layer's parameters lie in their buffer.
@@ -92,10 +132,8 @@ impl Packing {
     /// The parameters of `layer`.
     pub(crate) fn pack(&self, layer: &ConvLayer) -> Vec<f32> {
         let mut parameters = vec![0.0; self.len()];
-        let inputs = layer.inputs.len();
-        self.fill(&mut parameters, layer.inputs, layer.bias.iter().copied(), |output, input, tap| {
-            layer.weight[(output * inputs + input) * TAPS + tap]
-        });
+        let weight = |output, input, tap| layer.weight(output, input, tap);
+        self.fill(&mut parameters, layer.inputs, layer.bias.iter().copied(), weight);
         parameters
     }
 }
@@ -109,31 +147,25 @@ pub(crate) fn convolve(
     (input, input_groups): (&Map, usize),
     output: &Map,
 ) -> (BufferId, Packing) {
-    assert_eq!((input.width, input.height), (output.width, output.height));
-    assert!(input.buffer != output.buffer && input_groups <= input.groups);
-    assert!(layer.inputs.iter().all(|&channel| channel < input_groups * GROUP));
-    assert!(layer.bias.len() <= output.groups * GROUP);
-
+    layer.check((input, input_groups), output);
     let packing = Packing::new(input_groups, output.groups);
     let parameters = plan.table("a convolution's parameters", &packing.pack(layer));
     let mut constants = vec![
-        ("WIDTH", output.width.into()),
-        ("HEIGHT", output.height.into()),
-        ("ROWS", ROWS.into()),
         ("WORKGROUP", WORKGROUP.into()),
+        ("ROWS", ROWS.into()),
         ("INPUT_GROUPS", input_groups.into()),
         ("PARTS", packing.parts.into()),
         ("PART_GROUPS", packing.part_groups.into()),
-        ("RESIDUAL", (layer.epilogue == Epilogue::ResidualLeaky).into()),
-        ("LEAKY", (layer.epilogue != Epilogue::None).into()),
-        ("LEAKY_SLOPE", layer.leaky_slope.into()),
     ];
+    constants.extend(layer.epilogue_constants(output));
     constants.extend(input.constants(["IN_GROUPS", "IN_PITCH"]));
-    constants.extend(output.constants(["OUT_GROUPS", "OUT_PITCH"]));
-    let shader = Shader::new(label, &constants, include_str!("conv.wgsl"), "convolve");
+    let source = concat!(include_str!("epilogue.wgsl"), include_str!("conv.wgsl"));
+    let shader = Shader::new(label, &constants, source, "convolve");
     let workgroups = [output.width.div_ceil(WORKGROUP) * packing.parts, output.height.div_ceil(ROWS), 1];
     let stage = plan.stages.last_mut().expect("a stage was added for the layer");
-    stage.dispatch(shader, &[input.buffer, parameters, output.buffer], workgroups);
+    let dispatch = stage.dispatch(shader, &[input.buffer, parameters, output.buffer], workgroups);
+    let input_values = input_groups * GROUP * input.width * input.height;
+    dispatch.bytes = Some(bytes(&[input_values, packing.len(), layer.output_values(output)]));
     (parameters, packing)
 }
 

@@ -46,22 +46,10 @@ fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_i
         pixel += IN_PITCH;
     }
 
-    if x >= WIDTH {
-        return;
-    }
-    for (var row = 0u; row < ROWS; row++) {
-        for (var group = 0u; group < PART_GROUPS; group++) {
-            let output_group = part * PART_GROUPS + group;
-            if y + row < HEIGHT && output_group < OUT_GROUPS {
-                let place = ((y + row + 1u) * OUT_GROUPS + output_group) * OUT_PITCH + x + 1u;
-                var value = sums[row][group];
-                if RESIDUAL {
-                    value = fma(vec4f(0.5), value, output[place]);
-                }
-                if LEAKY {
-                    value = max(value, value * LEAKY_SLOPE);
-                }
-                output[place] = value;
+    if x < WIDTH {
+        for (var row = 0u; row < ROWS; row++) {
+            for (var group = 0u; group < PART_GROUPS; group++) {
+                store(sums[row][group], part * PART_GROUPS + group, x, y + row);
             }
         }
     }

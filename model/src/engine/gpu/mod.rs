@@ -1,7 +1,10 @@
 //! The network on the GPU: a plan of shaders, and the engine that runs it.
 
 mod conv;
+#[cfg(feature = "gpu-cost")]
+pub mod cost;
 mod defocus;
+mod deformable;
 mod depth_layers;
 mod direct;
 mod double_phase;

@@ -40,6 +40,8 @@ pub(crate) struct Dispatch {
     /// The bindings that the entry point uses, in group 0.
     pub(crate) bindings: Vec<(u32, BufferId)>,
     pub(crate) workgroups: [u32; 3],
+    /// The fewest bytes that have to be read and written, where that is not each buffer once.
+    pub(crate) bytes: Option<u64>,
 }
 
 /// WGSL with its constants filled in.
@@ -128,13 +130,19 @@ impl Plan {
 
 impl Stage {
     /// Adds a dispatch of `workgroups` with `buffers` bound as 0, 1, 2, ….
-    pub(crate) fn dispatch(&mut self, shader: Shader, buffers: &[BufferId], workgroups: [usize; 3]) {
-        self.dispatch_with(Arc::new(shader), &(0..).zip(buffers.iter().copied()).collect::<Vec<_>>(), workgroups);
+    pub(crate) fn dispatch(&mut self, shader: Shader, buffers: &[BufferId], workgroups: [usize; 3]) -> &mut Dispatch {
+        self.dispatch_with(Arc::new(shader), &(0..).zip(buffers.iter().copied()).collect::<Vec<_>>(), workgroups)
     }
 
     /// As [`Self::dispatch`], for an entry point that leaves out some bindings of its file.
-    pub(crate) fn dispatch_with(&mut self, shader: Arc<Shader>, bindings: &[(u32, BufferId)], workgroups: [usize; 3]) {
+    pub(crate) fn dispatch_with(
+        &mut self,
+        shader: Arc<Shader>,
+        bindings: &[(u32, BufferId)],
+        workgroups: [usize; 3],
+    ) -> &mut Dispatch {
         let workgroups = workgroups.map(|count| u32::try_from(count).expect("a grid on a device fits in 32 bits"));
-        self.dispatches.push(Dispatch { shader, bindings: bindings.to_vec(), workgroups });
+        self.dispatches.push(Dispatch { shader, bindings: bindings.to_vec(), workgroups, bytes: None });
+        self.dispatches.last_mut().expect("one was added")
     }
 }

@@ -1,0 +1,193 @@
+//! The renderer on the GPU. Where its device fails, that is opened anew; where it fails again and again, or is gone, the
+//! processor takes over, so that the display goes on.
+
+use std::sync::Arc;
+
+use holod_calibration::{PerColour, PupilDiameter};
+use holod_model::engine::{EngineError, GpuEngine, StageTiming};
+use holod_model::gpu::{Adapters, GpuError};
+use holod_model::optics::PhasePattern;
+use holod_model::{ComplexHologram, RgbdFrame, Weights};
+use holod_slm_output::{LevelsFrame, PanelEncoder};
+
+use super::cpu::CpuRenderer;
+use super::{Rendered, Renderer};
+
+/// A device that failed is opened anew so often, in one renderer's life.
+const REOPENINGS: u32 = 3;
+
+pub(super) struct GpuRenderer {
+    weights: Weights,
+    encoder: Arc<PanelEncoder>,
+    adapters: Adapters,
+    engine: Engine,
+    reopenings_left: u32,
+    description: String,
+    /// What has been read back of the last frame; made when it is first asked for.
+    hologram: ReadBack<ComplexHologram>,
+    pattern: ReadBack<PhasePattern>,
+}
+
+enum Engine {
+    Gpu(Box<GpuEngine>),
+    Cpu(CpuRenderer),
+    /// The device failed, and the processor's threads could not be started.
+    None(EngineError),
+}
+
+/// A copy on the host, and whether it is of the last frame.
+struct ReadBack<T> {
+    copy: Option<T>,
+    is_current: bool,
+}
+
+impl<T> ReadBack<T> {
+    const NONE: Self = Self { copy: None, is_current: false };
+
+    fn get(
+        &mut self,
+        make: impl FnOnce() -> T,
+        read: impl FnOnce(&mut T) -> Result<(), GpuError>,
+    ) -> Result<&T, EngineError> {
+        let copy = self.copy.get_or_insert_with(make);
+        if !self.is_current {
+            read(copy)?;
+            self.is_current = true;
+        }
+        Ok(copy)
+    }
+}
+
+impl GpuRenderer {
+    /// On the best device of the kind `adapters`.
+    ///
+    /// # Errors
+    /// There is none, or it lacks what the network needs at the pattern's size.
+    pub(super) fn new(weights: &Weights, encoder: &Arc<PanelEncoder>, adapters: Adapters) -> Result<Self, EngineError> {
+        let engine = Box::new(GpuEngine::open(weights, &encoder.tables(), adapters)?);
+        Ok(Self {
+            description: described(&engine, adapters),
+            weights: weights.clone(),
+            encoder: Arc::clone(encoder),
+            adapters,
+            engine: Engine::Gpu(engine),
+            reopenings_left: REOPENINGS,
+            hologram: ReadBack::NONE,
+            pattern: ReadBack::NONE,
+        })
+    }
+
+    /// Puts another engine in the place of the one whose device failed.
+    fn replace(&mut self, error: &GpuError) {
+        tracing::error!("{error}");
+        // The failed one's memory is given back before the next one asks for as much.
+        self.engine = Engine::None(EngineError::Gpu(error.clone()));
+        if self.reopenings_left > 0 {
+            self.reopenings_left -= 1;
+            match GpuEngine::open(&self.weights, &self.encoder.tables(), self.adapters) {
+                Ok(engine) => {
+                    self.description = described(&engine, self.adapters);
+                    tracing::warn!("the GPU was opened again: holograms are computed by {}", self.description);
+                    self.engine = Engine::Gpu(Box::new(engine));
+                    return;
+                }
+                Err(again) => tracing::error!("the GPU cannot be opened again: {again}"),
+            }
+        }
+        match CpuRenderer::new(&self.weights, &self.encoder, Some(error)) {
+            Ok(cpu) => {
+                self.description = cpu.description().to_owned();
+                tracing::warn!("holograms are computed by {}", self.description);
+                self.engine = Engine::Cpu(cpu);
+            }
+            Err(failure) => tracing::error!("the processor cannot take over: {failure}"),
+        }
+    }
+
+    /// As if the driver had lost the device.
+    #[cfg(any(test, feature = "fault-injection"))]
+    pub(super) fn lose_device(&self) {
+        if let Engine::Gpu(engine) = &self.engine {
+            engine.lose_device();
+        }
+    }
+}
+
+fn described(engine: &GpuEngine, adapters: Adapters) -> String {
+    let slow = if adapters == Adapters::Software { ", a processor that plays a GPU" } else { "" };
+    format!("gpu, {}{slow}", engine.device())
+}
+
+impl Renderer for GpuRenderer {
+    fn render(
+        &mut self,
+        frame: &Arc<RgbdFrame>,
+        pupil: PupilDiameter,
+        levels: &mut LevelsFrame,
+    ) -> Result<Rendered, EngineError> {
+        assert_eq!(levels.layout(), self.encoder.layout(), "a renderer is made for one panel");
+        #[cfg(feature = "fault-injection")]
+        if crate::fault::gpu_is_lost() {
+            self.lose_device();
+        }
+        (self.hologram.is_current, self.pattern.is_current) = (false, false);
+        let mut engine_changed = false;
+        loop {
+            let failed = match &mut self.engine {
+                Engine::Gpu(engine) => match engine.render(frame, pupil, levels.samples_mut()) {
+                    Ok(counts) => {
+                        let pixels = self.encoder.pattern_resolution().pixels() as f32;
+                        return Ok(Rendered {
+                            clipped_share: counts.clipped as f32 / (3.0 * pixels),
+                            unreachable_share: PerColour(counts.unreachable.map(|count| count as f32 / pixels)),
+                            engine_changed,
+                        });
+                    }
+                    Err(EngineError::Gpu(error)) => error,
+                    Err(other) => return Err(other),
+                },
+                Engine::Cpu(renderer) => {
+                    let rendered = renderer.render(frame, pupil, levels)?;
+                    return Ok(Rendered { engine_changed, ..rendered });
+                }
+                Engine::None(error) => return Err(error.clone()),
+            };
+            self.replace(&failed);
+            engine_changed = true;
+        }
+    }
+
+    fn hologram(&mut self) -> Result<&ComplexHologram, EngineError> {
+        let resolution = self.encoder.pattern_resolution();
+        match &mut self.engine {
+            Engine::Gpu(engine) => {
+                self.hologram.get(|| ComplexHologram::dark(resolution), |hologram| engine.read_hologram(hologram))
+            }
+            Engine::Cpu(renderer) => renderer.hologram(),
+            Engine::None(error) => Err(error.clone()),
+        }
+    }
+
+    fn pattern(&mut self) -> Result<&PhasePattern, EngineError> {
+        let resolution = self.encoder.pattern_resolution();
+        match &mut self.engine {
+            Engine::Gpu(engine) => {
+                self.pattern.get(|| PhasePattern::flat(resolution), |pattern| engine.read_pattern(pattern))
+            }
+            Engine::Cpu(renderer) => renderer.pattern(),
+            Engine::None(error) => Err(error.clone()),
+        }
+    }
+
+    fn timings(&self) -> &[StageTiming] {
+        match &self.engine {
+            Engine::Gpu(engine) => &engine.last_timings().stages,
+            Engine::Cpu(renderer) => renderer.timings(),
+            Engine::None(_) => &[],
+        }
+    }
+
+    fn description(&self) -> &str {
+        &self.description
+    }
+}

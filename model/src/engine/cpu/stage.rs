@@ -1,0 +1,97 @@
+//! The steps of a frame, and the buffers through which they pass on what they make.
+
+use std::ops::{Index, IndexMut};
+
+use holod_calibration::Resolution;
+
+use super::conv::Scratch;
+use super::feature_map::FeatureMap;
+use crate::simd::InstructionSet;
+use crate::{ComplexHologram, RgbdFrame};
+
+/// A frame to render; picture and hologram have the network's resolution.
+pub(super) struct Job<'a> {
+    pub(super) frame: &'a RgbdFrame,
+    /// In the range that the weights were trained for.
+    pub(super) pupil_mm: f32,
+    pub(super) hologram: &'a mut ComplexHologram,
+}
+
+/// One step of a frame, with its parameters and what it alone needs to run. `F` is what the stages of its family share
+/// besides maps.
+pub(super) trait Stage<F>: Send + Sync {
+    /// As in [`StageTiming`](crate::engine::StageTiming).
+    fn name(&self) -> &str;
+
+    /// As in [`StageTiming`](crate::engine::StageTiming).
+    fn flop(&self) -> u64 {
+        0
+    }
+
+    /// Does the step; allocates nothing.
+    fn run(&mut self, buffers: &mut Buffers<F>, job: &mut Job<'_>);
+
+    /// What the step has just written, for tests that look inside.
+    #[cfg(test)]
+    fn seen<'a>(&'a self, buffers: &'a Buffers<F>, job: &'a Job<'_>) -> Seen<'a>;
+}
+
+#[cfg(test)]
+pub(super) enum Seen<'a> {
+    /// A layer's map, and the offsets of an adjustable one; or what the first layer reads.
+    Map(&'a FeatureMap, Option<&'a FeatureMap>),
+    /// A field, [3, height, width].
+    Light(&'a [num_complex::Complex32]),
+}
+
+/// What stages write for later ones.
+pub(super) struct Buffers<F> {
+    pub(super) maps: Maps,
+    pub(super) family: F,
+}
+
+/// The maps of a network, all of one size, and the scratch of the layers between them.
+pub(super) struct Maps {
+    /// Width and height of each map.
+    pub(super) size: Resolution,
+    pub(super) set: InstructionSet,
+    pub(super) scratch: Scratch,
+    maps: Vec<FeatureMap>,
+}
+
+/// One of [`Maps`].
+#[derive(Clone, Copy)]
+pub(super) struct MapId(usize);
+
+impl Maps {
+    pub(super) fn new(size: Resolution, set: InstructionSet) -> Self {
+        Self { size, set, scratch: Scratch::new(), maps: Vec::new() }
+    }
+
+    /// A further map.
+    pub(super) fn add(&mut self, channels: usize) -> MapId {
+        self.maps.push(FeatureMap::new(self.size.width, self.size.height, channels, self.set));
+        MapId(self.maps.len() - 1)
+    }
+
+    /// What a layer needs that reads one map and writes another.
+    pub(super) fn for_layer(&mut self, input: MapId, output: MapId) -> (&FeatureMap, &mut FeatureMap, &mut Scratch) {
+        let [input, output] =
+            self.maps.get_disjoint_mut([input.0, output.0]).expect("a layer reads another map than it writes");
+        (input, output, &mut self.scratch)
+    }
+}
+
+impl Index<MapId> for Maps {
+    type Output = FeatureMap;
+
+    fn index(&self, id: MapId) -> &FeatureMap {
+        &self.maps[id.0]
+    }
+}
+
+impl IndexMut<MapId> for Maps {
+    fn index_mut(&mut self, id: MapId) -> &mut FeatureMap {
+        &mut self.maps[id.0]
+    }
+}

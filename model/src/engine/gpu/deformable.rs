@@ -1,0 +1,187 @@
+//! Deformable 3x3 convolutions on the GPU: every tap of every pixel is read at a place of its own.
+
+use super::conv::{ConvLayer, TAPS, bytes};
+use super::map::{GROUP, Map};
+use super::plan::{Plan, Shader};
+use crate::weights::OFFSET_CHANNELS;
+
+/// Threads of a workgroup, along x.
+const WORKGROUP: usize = 64;
+/// Rows that one thread makes.
+const PIXELS: usize = 2;
+/// Groups of output channels that a thread holds sums of, at most. With all of them in one thread no place is read twice.
+const MOST_PART_GROUPS: usize = 8;
+
+/// Adds to the plan's last stage the deformable convolution of `input` into `output`, a map of the same size in another buffer:
+/// each tap k of each pixel is read at its place plus (`offsets[2k]`, `offsets[2k + 1]`) = (dy, dx) by bilinear
+/// interpolation, zero outside.
+pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &Map, offsets: &Map, output: &Map) {
+    layer.check((input, input.groups), output);
+    assert_eq!((offsets.width, offsets.height), (output.width, output.height));
+    assert!(offsets.groups >= OFFSET_CHANNELS.div_ceil(GROUP) && offsets.buffer != output.buffer);
+
+    let parts = output.groups.div_ceil(MOST_PART_GROUPS);
+    let part_groups = output.groups.div_ceil(parts);
+    let values = pack(layer, input.groups, [parts, part_groups]);
+    let parameters = plan.table("a deformable convolution's parameters", &values);
+    let mut constants = vec![
+        ("WORKGROUP", WORKGROUP.into()),
+        ("PIXELS", PIXELS.into()),
+        ("INPUT_GROUPS", input.groups.into()),
+        ("PARTS", parts.into()),
+        ("PART_GROUPS", part_groups.into()),
+    ];
+    constants.extend(layer.epilogue_constants(output));
+    constants.extend(input.constants(["IN_GROUPS", "IN_PITCH"]));
+    constants.extend(offsets.constants(["OFFSET_GROUPS", "OFFSET_PITCH"]));
+    let source = concat!(include_str!("epilogue.wgsl"), include_str!("deformable.wgsl"));
+    let shader = Shader::new(label, &constants, source, "convolve");
+    let workgroups = [output.width.div_ceil(WORKGROUP) * parts, output.height.div_ceil(PIXELS), 1];
+    let stage = plan.stages.last_mut().expect("a stage was added for the layer");
+    let dispatch = stage.dispatch(shader, &[input.buffer, offsets.buffer, parameters, output.buffer], workgroups);
+    let read = (input.groups + offsets.groups) * GROUP * input.width * input.height;
+    dispatch.bytes = Some(bytes(&[read, values.len(), layer.output_values(output)]));
+}
+
+/// The parameters of `layer` as the shader has them.
+fn pack(layer: &ConvLayer, input_groups: usize, [parts, part_groups]: [usize; 2]) -> Vec<f32> {
+    let biases = parts * part_groups * GROUP;
+    let mut parameters = vec![0.0; biases * (1 + TAPS * input_groups * GROUP)];
+    for (output, bias) in layer.bias.iter().enumerate() {
+        parameters[output] = *bias;
+        let (part, group) = (output / GROUP / part_groups, output / GROUP % part_groups);
+        for (input, channel) in layer.inputs.iter().enumerate() {
+            for tap in 0..TAPS {
+                let row = (part * TAPS + tap) * input_groups * GROUP + channel;
+                let place = (row * part_groups + group) * GROUP + output % GROUP;
+                parameters[biases + place] = layer.weight(output, input, tap);
+            }
+        }
+    }
+    parameters
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::conv::Epilogue;
+    use super::super::conv::tests::{SLOPE, finish, judge, noise, value};
+    use super::super::trial::Trial;
+    use super::*;
+    use crate::engine::reference;
+
+    type Offset = fn(usize, usize, usize) -> f32;
+
+    fn skip(channel: usize, y: usize, x: usize) -> f32 {
+        3.0 * value(channel + 50, y, x)
+    }
+
+    /// A layer of `inputs` to `outputs` channels that reads where `offset` leads.
+    struct Case {
+        size: (usize, usize),
+        inputs: usize,
+        outputs: usize,
+        epilogue: Epilogue,
+        offset: Offset,
+    }
+
+    impl Case {
+        fn found(&self) -> Vec<f32> {
+            let Self { size, inputs, outputs, epilogue, offset } = *self;
+            let mut plan = Plan::default();
+            let input = Map::new(&mut plan, "input", size, inputs);
+            let offsets = Map::new(&mut plan, "offsets", size, OFFSET_CHANNELS);
+            let output = Map::new(&mut plan, "output", size, outputs);
+            let weight: Vec<_> = (0..outputs * inputs * TAPS).map(noise).collect();
+            let bias: Vec<_> = (0..outputs).map(|output| noise(9_000_000 + output)).collect();
+            let channels: Vec<_> = (0..inputs).rev().collect();
+            let layer = ConvLayer { weight: &weight, bias: &bias, inputs: &channels, epilogue, leaky_slope: SLOPE };
+            plan.stage("layer", 0);
+            convolve(&mut plan, "convolution", &layer, &input, &offsets, &output);
+            let trial = Trial::new(&plan);
+            trial.write(input.buffer, &input.values(value));
+            trial.write(offsets.buffer, &offsets.values(|channel, y, x| offset(channel.min(17), y, x)));
+            trial.write(
+                output.buffer,
+                &output.values(|channel, y, x| skip(channel, y, x) * f32::from(channel < outputs)),
+            );
+            trial.run();
+            output.planes(&trial.read(output.buffer), outputs)
+        }
+
+        fn expected(&self) -> Vec<f64> {
+            let Self { size: (width, height), inputs, outputs, epilogue, offset } = *self;
+            let input = reference::Map::from_fn([inputs, height, width], |channel, y, x| value(channel, y, x).into());
+            let sum = |output: usize, y: usize, x: usize| {
+                let mut sum = f64::from(noise(9_000_000 + output));
+                for tap in 0..TAPS {
+                    let at_y = (y + tap / 3) as f64 - 1.0 + f64::from(offset(2 * tap, y, x));
+                    let at_x = (x + tap % 3) as f64 - 1.0 + f64::from(offset(2 * tap + 1, y, x));
+                    if !at_y.is_finite() || !at_x.is_finite() {
+                        continue;
+                    }
+                    for channel in 0..inputs {
+                        let weight = f64::from(noise((output * inputs + channel) * TAPS + tap));
+                        sum += weight * input.bilinear(inputs - 1 - channel, at_y, at_x);
+                    }
+                }
+                finish(epilogue, sum, skip(output, y, x))
+            };
+            reference::Map::from_fn([outputs, height, width], sum).values
+        }
+
+        fn check(&self) {
+            judge(&self.found(), &self.expected()).unwrap_or_else(|error| {
+                panic!("{:?}, {} to {}, {:?}: {error}", self.size, self.inputs, self.outputs, self.epilogue);
+            });
+        }
+    }
+
+    /// Up to three pixels, some of them whole or half ones.
+    fn moderate(channel: usize, y: usize, x: usize) -> f32 {
+        let offset = 3.0 * value(channel, y, x + 7);
+        if (x + channel).is_multiple_of(3) { (2.0 * offset).round() / 2.0 } else { offset }
+    }
+
+    /// Onto the border, over it, and nowhere.
+    fn wild(channel: usize, y: usize, x: usize) -> f32 {
+        match (channel + 3 * x + 5 * y) % 7 {
+            0 => f32::NAN,
+            1 => f32::INFINITY,
+            2 => -1e30,
+            3 => -(x as f32) - 0.25,
+            4 => 40.0 * value(channel, y, x),
+            5 => 1.0,
+            _ => -2.0,
+        }
+    }
+
+    #[test]
+    fn sums_are_right_for_both_networks_layers() {
+        for (channels, epilogue) in
+            [(32, Epilogue::ResidualLeaky), (24, Epilogue::ResidualLeaky), (24, Epilogue::Leaky)]
+        {
+            let size = (37, 11);
+            Case { size, inputs: channels, outputs: channels, epilogue, offset: moderate }.check();
+        }
+    }
+
+    #[test]
+    fn sums_are_right_for_odd_sizes_and_channels_and_all_places() {
+        for offset in [moderate as Offset, wild] {
+            for size in [(1, 1), (1, 33), (33, 1), (64, 2), (65, 3)] {
+                Case { size, inputs: 5, outputs: 7, epilogue: Epilogue::None, offset }.check();
+            }
+            Case { size: (9, 7), inputs: 21, outputs: 40, epilogue: Epilogue::Leaky, offset }.check();
+        }
+    }
+
+    /// Canary: one offset that is a little off is not right.
+    #[test]
+    fn a_wrong_offset_is_seen() {
+        let case = Case { size: (9, 7), inputs: 5, outputs: 7, epilogue: Epilogue::None, offset: moderate };
+        let expected = case.expected();
+        judge(&case.found(), &expected).expect("the same offsets");
+        let offset = |channel, y, x| moderate(channel, y, x) + if (channel, y, x) == (4, 3, 2) { 1e-3 } else { 0.0 };
+        judge(&Case { offset, ..case }.found(), &expected).expect_err("one other offset");
+    }
+}
