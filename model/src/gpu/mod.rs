@@ -63,6 +63,21 @@ pub enum GpuError {
     },
 }
 
+impl GpuError {
+    /// What is so, without what to do about it: for those who go on without a GPU.
+    pub fn reason(&self) -> String {
+        match self {
+            Self::NotBuilt => "this program was built without the GPU".to_owned(),
+            Self::None { passed_over, .. } => format!("Vulkan shows {} and no GPU", found(passed_over)),
+            Self::Refused { name, reason } => format!("the GPU {name} could not be opened: {reason}"),
+            Self::TooLarge { what, bytes, name, limit } => {
+                format!("{what} takes {bytes} bytes, of which the GPU {name} can see {limit} as one")
+            }
+            Self::Failed { name, reason } => format!("the GPU {name} failed: {reason}"),
+        }
+    }
+}
+
 fn found(passed_over: &[String]) -> String {
     if passed_over.is_empty() { "nothing".to_owned() } else { passed_over.join(", ") }
 }

@@ -3,15 +3,22 @@
 mod conv;
 #[cfg(feature = "gpu-cost")]
 pub mod cost;
+mod defocus;
 mod deformable;
+mod depth_layers;
 mod direct;
 mod double_phase;
+mod expected_stack;
+mod feedback;
+mod fft;
 mod levels;
 mod loaded_plan;
 mod map;
+mod maps;
 mod network;
 mod plan;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
 mod trial;
+mod upsample;
