@@ -18,7 +18,8 @@ use crate::gpu::GpuError;
 pub use cpu::{CpuEngine, fma_peak};
 #[cfg(feature = "gpu-cost")]
 pub use gpu::cost as gpu_cost;
-// pub use gpu::{EncodedCounts, GpuEngine};
+#[cfg(feature = "gpu")]
+pub use gpu::{EncodedCounts, GpuEngine};
 
 /// A frame that an engine refuses.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

@@ -4,10 +4,11 @@
 use super::defocus;
 use super::depth_layers::DepthLayers;
 use super::feedback;
-use super::fft::{LineFft, LineTooLong};
+use super::fft::LineFft;
 use super::map::Map;
 use super::network::Shared;
 use super::plan::{BufferId, Plan};
+use crate::gpu::GpuError;
 use crate::weights::{Feedback, NetworkConfig};
 
 /// Transforms on the network's grid.
@@ -43,7 +44,7 @@ impl<'a> ExpectedStack<'a> {
         shared: &Shared,
         inputs: &Map,
         workgroup_bytes: u32,
-    ) -> Result<Self, LineTooLong> {
+    ) -> Result<Self, GpuError> {
         let (size, count) = (shared.size, config.depth_layers);
         let planes = defocus::scratch_planes(count).max(3 * count);
         let grid = Grid {

@@ -8,6 +8,7 @@ use num_complex::{Complex32, Complex64};
 use rustfft::FftPlanner;
 
 use super::plan::{BufferId, Constant, Plan, Shader};
+use crate::gpu::GpuError;
 
 /// Radices of the passes, in the order in which they are taken: odd strides spread a pass's stores over the banks of a
 /// workgroup's memory.
@@ -24,20 +25,6 @@ const MOST_THREADS: usize = 256;
 const WAVE: usize = 64;
 /// Samples of short rows that one workgroup takes.
 const SAMPLES_OF_ROWS: usize = 1024;
-
-/// A line does not fit in the memory of a workgroup.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error(
-    "a line of {samples} samples needs {bytes} bytes of a workgroup's memory, and this GPU has {limit}; choose --backend cpu, or a smaller size"
-)]
-pub(crate) struct LineTooLong {
-    /// Samples of the line.
-    pub(crate) samples: usize,
-    /// What it needs.
-    pub(crate) bytes: usize,
-    /// What there is.
-    pub(crate) limit: usize,
-}
 
 /// Transforms of lines of one length.
 #[derive(Clone)]
@@ -56,13 +43,13 @@ impl LineFft {
     ///
     /// # Errors
     /// Not even one such line fits in a workgroup.
-    pub(crate) fn new(plan: &mut Plan, length: usize, workgroup_bytes: u32) -> Result<Self, LineTooLong> {
+    pub(crate) fn new(plan: &mut Plan, length: usize, workgroup_bytes: u32) -> Result<Self, GpuError> {
         let smooth = |span: &usize| radices(*span).is_some();
         let span = if smooth(&length) { length } else { (2 * length - 1..).find(smooth).expect("powers of 2 are") };
         let bytes = span * SAMPLE_BYTES;
         let workgroup_bytes = workgroup_bytes as usize;
         if bytes > workgroup_bytes {
-            return Err(LineTooLong { samples: length, bytes, limit: workgroup_bytes });
+            return Err(GpuError::LineTooLong { samples: length, bytes, limit: workgroup_bytes });
         }
         let mut turns: Vec<_> = (0..span).map(|turn| Complex64::cis(-TAU * turn as f64 / span as f64)).collect();
         if span != length {
@@ -273,7 +260,7 @@ mod tests {
         // Of 2053 samples, a prime, the chirps need 4105 at least, and 4320 has no factor but 2, 3 and 5.
         for (samples, bytes) in [(2160, 17280), (2053, 34560)] {
             let error = new(samples).expect_err("too long");
-            assert_eq!(error, LineTooLong { samples, bytes, limit: 16384 });
+            assert_eq!(error, GpuError::LineTooLong { samples, bytes, limit: 16384 });
             let text = error.to_string();
             assert!([&samples.to_string(), "16384", "--backend cpu"].iter().all(|part| text.contains(*part)), "{text}");
         }

@@ -8,6 +8,7 @@ mod deformable;
 mod depth_layers;
 mod direct;
 mod double_phase;
+mod engine;
 mod expected_stack;
 mod feedback;
 mod fft;
@@ -18,7 +19,10 @@ mod maps;
 mod network;
 mod plan;
 #[cfg(test)]
-mod tests;
+pub(in crate::engine) mod tests;
 #[cfg(test)]
 mod trial;
+mod trunk;
 mod upsample;
+
+pub use self::engine::{EncodedCounts, GpuEngine};

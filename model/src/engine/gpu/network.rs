@@ -67,8 +67,7 @@ impl NetworkPlan {
             Grid::HalfBand => 2,
             Grid::Full => 1,
         };
-        let size =
-            Resolution { width: resolution.width.div_ceil(scale), height: resolution.height.div_ceil(scale) };
+        let size = Resolution { width: resolution.width.div_ceil(scale), height: resolution.height.div_ceil(scale) };
         let mut plan = Plan::default();
         let shared = Shared::new(&mut plan, resolution, size);
         let mut modulated = Vec::new();

@@ -4,11 +4,12 @@ use std::f64::consts::PI;
 
 use num_complex::Complex64;
 
-use super::fft::{LineFft, LineTooLong, Lines};
+use super::fft::{LineFft, Lines};
 use super::map::Map;
 use super::maps::grid_constants;
 use super::network::Shared;
 use super::plan::{BufferId, Constant, Plan};
+use crate::gpu::GpuError;
 use crate::optics::signed_bin;
 use crate::weights::Grid;
 
@@ -38,7 +39,7 @@ pub(crate) fn field(
     grid: Grid,
     low: Low<'_>,
     workgroup_bytes: u32,
-) -> Result<(), LineTooLong> {
+) -> Result<(), GpuError> {
     let Shared { resolution: frame, size, .. } = *shared;
     if let Low::Corrected(..) = low {
         plan.stage("field", 0);
