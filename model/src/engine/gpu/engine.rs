@@ -7,6 +7,7 @@ use holod_calibration::{LevelTables, PupilDiameter};
 use wgpu::{BufferUsages, QuerySet};
 
 use super::loaded_plan::LoadedPlan;
+use super::map::Precision;
 use super::network::NetworkPlan;
 use super::plan::{BufferId, Stage};
 use crate::engine::{EngineError, StageTiming, StageTimings};
@@ -65,7 +66,7 @@ impl GpuEngine {
     }
 
     pub(super) fn on(gpu: Gpu, weights: &Weights, tables: &LevelTables) -> Result<Self, EngineError> {
-        let network = NetworkPlan::new(weights, tables, gpu.workgroup_bytes)?;
+        let network = NetworkPlan::new(weights, tables, Precision::F32, gpu.workgroup_bytes)?;
         let plan = &network.plan;
         let loaded = LoadedPlan::new(&gpu, plan)?;
         let timestamps = match gpu.timestamp_ns {
