@@ -34,7 +34,7 @@ impl Trial {
                 device_buffer
             })
             .collect();
-        let work = |Dispatch { shader, bindings, workgroups }: &Dispatch| {
+        let work = |Dispatch { shader, bindings, workgroups, .. }: &Dispatch| {
             let pipeline = gpu.trusted_pipeline(&shader.label, &shader.source, shader.entry).expect("a shader");
             let bound: Vec<_> = bindings.iter().map(|&(binding, id)| (binding, &buffers[id.0])).collect();
             let group = gpu.bind_at(&pipeline, &bound);
