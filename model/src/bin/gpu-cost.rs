@@ -20,6 +20,9 @@ use serde::Serialize;
 ///
 /// Nothing is run or measured: the model knows neither latency nor caches nor the time between dispatches. It compares
 /// kernels and finds registers that spill; it does not replace a measurement.
+///
+/// Needs Mesa 22.3 to 25 with RADV (Debian: mesa-vulkan-drivers), or that which VK_DRIVER_FILES names. Exit code 70: a register
+/// spills or a shader does not compile; 69: there is no such driver.
 #[derive(Parser)]
 #[command(version)]
 struct Cli {

@@ -10,6 +10,9 @@ const WORKGROUP: usize = 64;
 /// left for what it multiplies.
 const MOST_PART_GROUPS: usize = 5;
 
+/// Vectors that the shaders load at once.
+pub(super) const ELEMENT: usize = 4;
+
 /// What is done with a sum before it is stored.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Epilogue {
@@ -97,7 +100,7 @@ impl Packing {
     }
 
     fn biases(&self) -> usize {
-        self.parts * self.part_groups * GROUP
+        (self.parts * self.part_groups).next_multiple_of(ELEMENT) * GROUP
     }
 
     /// The place of the weight by which `input`, a channel of the map, is multiplied at `tap` for `output`.

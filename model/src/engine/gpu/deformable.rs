@@ -1,6 +1,6 @@
 //! Deformable 3x3 convolutions on the GPU: every tap of every pixel is read at a place of its own.
 
-use super::conv::{ConvLayer, TAPS, bytes};
+use super::conv::{ConvLayer, ELEMENT, TAPS, bytes};
 use super::map::{GROUP, Map};
 use super::plan::{Plan, Shader};
 use crate::weights::OFFSET_CHANNELS;
@@ -45,8 +45,8 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
 
 /// The parameters of `layer` as the shader has them.
 fn pack(layer: &ConvLayer, input_groups: usize, [parts, part_groups]: [usize; 2]) -> Vec<f32> {
-    let biases = parts * part_groups * GROUP;
-    let mut parameters = vec![0.0; biases * (1 + TAPS * input_groups * GROUP)];
+    let biases = (parts * part_groups).next_multiple_of(ELEMENT) * GROUP;
+    let mut parameters = vec![0.0; biases + parts * part_groups * GROUP * TAPS * input_groups * GROUP];
     for (output, bias) in layer.bias.iter().enumerate() {
         parameters[output] = *bias;
         let (part, group) = (output / GROUP / part_groups, output / GROUP % part_groups);

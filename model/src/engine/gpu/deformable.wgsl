@@ -6,8 +6,9 @@
 @group(0) @binding(0) var<storage, read> input: array<vec4f>;
 // (dy, dx) of the nine taps, two to a group of channels.
 @group(0) @binding(1) var<storage, read> offsets: array<vec2f>;
-// The bias of each group of outputs, then the weights: [part, tap, input group, input channel, output group].
-@group(0) @binding(2) var<storage, read> parameters: array<vec4f>;
+// The bias of each group of outputs, filled up to whole elements, then the weights: [part, tap, input group, input channel,
+// output group]. Four vectors are an element because they are then loaded at once.
+@group(0) @binding(2) var<storage, read> parameters: array<array<vec4f, 4>>;
 @group(0) @binding(3) var<storage, read_write> output: array<vec4f>;
 
 // Where one pixel reads at one tap: the upper left of four neighbours, and the share of each.
@@ -19,19 +20,16 @@ struct Place {
 fn place_of(tap: u32, x: u32, y: u32) -> Place {
     let offset = offsets[(((y + 1u) * OFFSET_GROUPS + tap / 2u) * OFFSET_PITCH + x + 1u) * 2u + tap % 2u];
     let at = vec2f(f32(x + tap % 3u), f32(y + tap / 3u)) - 1.0 + offset.yx;
-    // NaN is outside too; there the border's zeros are read, with no share.
-    if !(at.x > -1.0 && at.x < f32(WIDTH) && at.y > -1.0 && at.y < f32(HEIGHT)) {
-        return Place(0u, vec4f());
-    }
     let corner = floor(at);
     let share = at - corner;
     let horizontal = vec2f(1.0 - share.x, share.x);
-    // The border makes all four neighbours readable: corner + 1 is in 0..=WIDTH and 0..=HEIGHT.
-    let first = vec2u(corner + 1.0);
-    return Place(
-        first.y * IN_GROUPS * IN_PITCH + first.x,
-        vec4f((1.0 - share.y) * horizontal, share.y * horizontal),
-    );
+    // In −1..WIDTH and −1..HEIGHT. NaN is outside too, where something is read without a share.
+    let size = vec2f(f32(WIDTH), f32(HEIGHT));
+    let inside = all(abs(at + 0.5 - 0.5 * size) < 0.5 + 0.5 * size);
+    let shares = select(vec4f(), vec4f((1.0 - share.y) * horizontal, share.y * horizontal), inside);
+    // The border makes all four neighbours readable.
+    let first = min(vec2u(corner + 1.0), vec2u(WIDTH, HEIGHT));
+    return Place(first.y * (IN_GROUPS * IN_PITCH) + first.x, shares);
 }
 
 @compute @workgroup_size(WORKGROUP)
@@ -42,13 +40,14 @@ fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_i
 
     var sums: array<array<vec4f, PART_GROUPS>, PIXELS>;
     for (var group = 0u; group < PART_GROUPS; group++) {
-        let bias = parameters[part * PART_GROUPS + group];
+        let place = part * PART_GROUPS + group;
+        let bias = parameters[place / 4u][place % 4u];
         for (var pixel = 0u; pixel < PIXELS; pixel++) {
             sums[pixel][group] = bias;
         }
     }
 
-    var weight = PARTS * PART_GROUPS + part * 9u * INPUT_GROUPS * 4u * PART_GROUPS;
+    var weight = (PARTS * PART_GROUPS + 3u) / 4u + part * 9u * INPUT_GROUPS * PART_GROUPS;
     for (var tap = 0u; tap < 9u; tap++) {
         var places: array<Place, PIXELS>;
         for (var pixel = 0u; pixel < PIXELS; pixel++) {
@@ -68,13 +67,14 @@ fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_i
             }
             for (var channel = 0u; channel < 4u; channel++) {
                 for (var group = 0u; group < PART_GROUPS; group++) {
-                    let factors = parameters[weight + channel * PART_GROUPS + group];
+                    let place = channel * PART_GROUPS + group;
+                    let factors = parameters[weight + place / 4u][place % 4u];
                     for (var pixel = 0u; pixel < PIXELS; pixel++) {
                         sums[pixel][group] = fma(vec4f(values[pixel][channel]), factors, sums[pixel][group]);
                     }
                 }
             }
-            weight += 4u * PART_GROUPS;
+            weight += PART_GROUPS;
         }
     }
 

@@ -336,3 +336,52 @@ impl Compiler {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn dispatch(spilled_registers: u64, vector_s: f64, bytes_s: f64) -> DispatchCost {
+        DispatchCost {
+            shader: "layer 1".into(),
+            vector_registers: 100,
+            spilled_registers,
+            waves_per_simd: 8,
+            wave_threads: 64,
+            multiply_add_share: 0.9,
+            counted_by: CountedBy::Assembly,
+            vector_s,
+            workgroup_memory_s: 0.0,
+            bytes: 1,
+            bytes_s,
+        }
+    }
+
+    /// Canary: one shader that spills among others is named.
+    #[test]
+    fn a_spill_is_seen() {
+        let frame = |spilled| {
+            let dispatches = vec![dispatch(0, 1.0, 2.0), dispatch(spilled, 3.0, 1.0)];
+            FrameCost { card: "a card", stages: vec![StageCost { name: "layer".into(), flop: 1, dispatches }] }
+        };
+        assert_eq!(frame(0).spills().count(), 0);
+        assert_eq!(frame(3).spills().collect::<Vec<_>>(), [("layer 1", 3)]);
+        assert_eq!(frame(0).seconds(), 5.0);
+    }
+
+    #[test]
+    fn what_is_no_shader_is_an_error() {
+        let module = |source: &str| spirv::Module::new(&Shader::new("broken", &[], source, "main"));
+        let error = module("@compute @workgroup_size(1) fn main() { nonsense(); }").err().expect("nonsense");
+        assert!(error.to_string().contains("broken") && error.to_string().contains("nonsense"), "{error}");
+        let error = module("@compute @workgroup_size(1) fn other() {}").err().expect("another entry point");
+        assert!(error.to_string().contains("main"), "{error}");
+        let good = "@group(0) @binding(2) var<storage, read_write> to: array<u32>;
+            @compute @workgroup_size(8, 4) fn main() { to[1] = 2u; }";
+        let module = module(good).expect("a shader");
+        assert_eq!(module.threads, 32);
+        let [spirv::Binding { number: 2, read: false, written: true }] = module.bindings.as_slice() else {
+            panic!("one binding, written");
+        };
+    }
+}

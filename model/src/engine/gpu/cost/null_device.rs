@@ -107,8 +107,11 @@ impl Drop for NullDevice {
     }
 }
 
-/// The file by which RADV is found.
+/// The file by which RADV is found: the one that the environment names, or else the installed one.
 fn driver() -> Option<PathBuf> {
+    if let Some(named) = std::env::var_os("VK_DRIVER_FILES") {
+        return Some(named.into());
+    }
     let files = DRIVER_FOLDERS.iter().filter_map(|folder| std::fs::read_dir(folder).ok()).flatten();
     let mut files: Vec<_> = files.filter_map(|entry| Some(entry.ok()?.path())).collect();
     files.retain(|path| {
