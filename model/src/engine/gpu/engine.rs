@@ -6,6 +6,7 @@ use std::time::Duration;
 use holod_calibration::{LevelTables, PupilDiameter};
 use wgpu::{BufferUsages, QuerySet};
 
+use super::fft::WorkgroupLimits;
 use super::loaded_plan::LoadedPlan;
 use super::network::NetworkPlan;
 use super::plan::{BufferId, Stage};
@@ -65,7 +66,8 @@ impl GpuEngine {
     }
 
     pub(super) fn on(gpu: Gpu, weights: &Weights, tables: &LevelTables) -> Result<Self, EngineError> {
-        let network = NetworkPlan::new(weights, tables, gpu.workgroup_bytes)?;
+        let limits = WorkgroupLimits { bytes: gpu.workgroup_bytes, threads: gpu.workgroup_threads };
+        let network = NetworkPlan::new(weights, tables, limits)?;
         let plan = &network.plan;
         let loaded = LoadedPlan::new(&gpu, plan)?;
         let timestamps = match gpu.timestamp_ns {
