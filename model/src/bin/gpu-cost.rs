@@ -35,6 +35,9 @@ struct Cli {
     /// Only frames of this size; 512x512, 1920x1080 and 3840x2160 otherwise.
     #[arg(long, value_name = "WxH", value_parser = parse_resolution)]
     resolution: Option<Resolution>,
+    /// With features in half precision: two products at once.
+    #[arg(long)]
+    half_precision: bool,
     /// Print the costs of each dispatch as JSON.
     #[arg(long)]
     json: bool,
@@ -164,7 +167,7 @@ fn run(cli: &Cli, say: impl Fn(&str)) -> Result<(), Failure> {
         for network in &networks {
             let weights = network.weights();
             for &resolution in &resolutions {
-                let plan = NetworkPlan::new(&weights, resolution);
+                let plan = NetworkPlan::new(&weights, resolution, cli.half_precision);
                 if let Some(label) = &cli.assembly {
                     let texts = compiler.assembly(&plan, label)?;
                     if texts.is_empty() {

@@ -57,9 +57,10 @@ impl Gpu {
         };
         let name = adapter.get_info().name;
         let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
+        let half_precision = adapter.features() & wgpu::Features::SHADER_F16;
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("holod"),
-            required_features: timestamps,
+            required_features: timestamps | half_precision,
             required_limits: adapter.limits(),
             memory_hints: wgpu::MemoryHints::Performance,
             ..wgpu::DeviceDescriptor::default()

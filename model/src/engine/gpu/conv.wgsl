@@ -3,11 +3,11 @@
 // A thread makes ROWS rows of one column by PART_GROUPS groups of output channels, which it holds in registers. Threads of a
 // workgroup lie along x and multiply by the same weights at the same time.
 
-@group(0) @binding(0) var<storage, read> input: array<vec4f>;
+@group(0) @binding(0) var<storage, read> input: array<InVector>;
 // The bias of each group of outputs, filled up to whole elements, then the weights: [part, input group, column, row, input
 // channel, output group]. Four vectors are an element because they are then loaded at once.
 @group(0) @binding(1) var<storage, read> parameters: array<array<vec4f, 4>>;
-@group(0) @binding(2) var<storage, read_write> output: array<vec4f>;
+@group(0) @binding(2) var<storage, read_write> output: array<OutVector>;
 
 @compute @workgroup_size(WORKGROUP)
 fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -31,7 +31,7 @@ fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_i
         for (var column = 0u; column < 3u; column++) {
             var values: array<vec4f, ROWS + 2u>;
             for (var row = 0u; row < ROWS + 2u; row++) {
-                values[row] = input[pixel + column + row * IN_GROUPS * IN_PITCH];
+                values[row] = vec4f(input[pixel + column + row * IN_GROUPS * IN_PITCH]);
             }
             for (var tap = 0u; tap < 3u; tap++) {
                 for (var channel = 0u; channel < 4u; channel++) {

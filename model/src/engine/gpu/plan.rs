@@ -5,6 +5,9 @@
 use std::fmt::Write;
 use std::sync::Arc;
 
+/// What a shader begins with that has numbers of half precision.
+pub(crate) const ENABLE_F16: &str = "enable f16;\n";
+
 /// Buffers and stages of one network for frames of one size.
 #[derive(Default)]
 pub(crate) struct Plan {
@@ -54,14 +57,19 @@ pub(crate) struct Shader {
 }
 
 impl Shader {
-    /// The entry point `entry` of `source` after the constants that `source` uses without declaring them.
+    /// The entry point `entry` of `source` after the constants that `source` uses without declaring them. Where `source`
+    /// begins with [`ENABLE_F16`], so does the shader.
     pub(crate) fn new(
         label: impl Into<String>,
         constants: &[(&str, Constant)],
         source: &str,
         entry: &'static str,
     ) -> Self {
-        let mut text = String::new();
+        let (directive, source) = match source.strip_prefix(ENABLE_F16) {
+            Some(rest) => (ENABLE_F16, rest),
+            None => ("", source),
+        };
+        let mut text = String::from(directive);
         for (name, value) in constants {
             let (kind, value) = match value {
                 Constant::U32(value) => ("u32", format!("{value}u")),

@@ -1,8 +1,9 @@
 //! Runs a plan on Mesa's software device, for tests.
 
+use half::f16;
 use num_complex::Complex64;
 
-use super::map::{GROUP, Map};
+use super::map::{GROUP, Map, Precision};
 use super::plan::{BufferId, Dispatch, Plan};
 use crate::gpu::{Adapters, Gpu};
 
@@ -94,12 +95,18 @@ impl Map {
         (((y + 1) * self.groups + channel / GROUP) * self.pitch() + x + 1) * GROUP + channel % GROUP
     }
 
-    /// What the map's buffer holds where channel c of pixel (x, y) is `value(c, y, x)`.
+    /// What the map's buffer holds, as 32-bit words, where channel c of pixel (x, y) is `value(c, y, x)`.
     pub(super) fn values(&self, value: impl Fn(usize, usize, usize) -> f32) -> Vec<f32> {
         let rows = self.height.next_multiple_of(super::map::ROWS) + 2;
         let mut values = vec![0.0; rows * self.groups * self.pitch() * GROUP];
         self.for_each(|channel, y, x| values[self.place(channel, y, x)] = value(channel, y, x));
-        values
+        match self.precision {
+            Precision::F32 => values,
+            Precision::F16 => {
+                let half: Vec<_> = values.iter().map(|&value| f16::from_f32(value).to_bits()).collect();
+                bytemuck::cast_slice(&half).to_vec()
+            }
+        }
     }
 
     fn for_each(&self, mut visit: impl FnMut(usize, usize, usize)) {
@@ -110,7 +117,13 @@ impl Map {
 
     /// [channels, height, width] of the first `channels` of `values`; the border and the rows below are zero.
     pub(super) fn planes(&self, values: &[f32], channels: usize) -> Vec<f32> {
-        let mut rest = values.to_vec();
+        let mut rest = match self.precision {
+            Precision::F32 => values.to_vec(),
+            Precision::F16 => {
+                let half: &[u16] = bytemuck::cast_slice(values);
+                half.iter().map(|&bits| f16::from_bits(bits).to_f32()).collect()
+            }
+        };
         let mut planes = Vec::new();
         self.for_each(|channel, y, x| {
             let value = std::mem::take(&mut rest[self.place(channel, y, x)]);

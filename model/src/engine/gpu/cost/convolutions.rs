@@ -5,11 +5,11 @@ use holod_calibration::Resolution;
 use crate::Weights;
 use crate::engine::gpu::conv::{ConvLayer, Epilogue, convolve};
 use crate::engine::gpu::deformable;
-use crate::engine::gpu::map::{GROUP, Map};
+use crate::engine::gpu::map::{GROUP, Map, Precision};
 use crate::engine::gpu::plan::Plan;
 use crate::weights::{Family, Grid, Layer, OFFSET_CHANNELS};
 
-pub(super) fn plan(weights: &Weights, resolution: Resolution) -> Plan {
+pub(super) fn plan(weights: &Weights, resolution: Resolution, precision: Precision) -> Plan {
     let mut plan = Plan::default();
     let scale = if weights.config.grid == Grid::HalfBand { 2 } else { 1 };
     let size = (resolution.width.div_ceil(scale), resolution.height.div_ceil(scale));
@@ -20,8 +20,8 @@ pub(super) fn plan(weights: &Weights, resolution: Resolution) -> Plan {
     for (prefix, layers) in nets {
         let map = |plan: &mut Plan, channels| Map::new(plan, "map", size, channels);
         let inputs = map(&mut plan, layers[0].in_channels.next_multiple_of(GROUP));
-        let features = map(&mut plan, layers[0].out_channels);
-        let between = map(&mut plan, layers[0].out_channels);
+        let features = Map::with(precision, &mut plan, "features", size, layers[0].out_channels);
+        let between = Map::with(precision, &mut plan, "features", size, layers[0].out_channels);
         let outputs = map(&mut plan, layers.last().expect("there are layers").out_channels);
         let offsets = map(&mut plan, OFFSET_CHANNELS);
         for (index, layer) in layers.iter().enumerate() {

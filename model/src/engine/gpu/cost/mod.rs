@@ -24,6 +24,7 @@ use serde::Serialize;
 
 use self::assembly::{Assembly, Work};
 use self::null_device::{Binary, NullDevice, Request};
+use super::map::Precision;
 use super::plan::{Dispatch, Plan, Shader};
 use crate::Weights;
 
@@ -218,9 +219,10 @@ struct Compiled {
 pub struct NetworkPlan(Plan);
 
 impl NetworkPlan {
-    /// The plan of `weights` at `resolution`.
-    pub fn new(weights: &Weights, resolution: Resolution) -> Self {
-        Self(convolutions::plan(weights, resolution))
+    /// The plan of `weights` at `resolution`; `half_precision` that of features, and so of most products.
+    pub fn new(weights: &Weights, resolution: Resolution, half_precision: bool) -> Self {
+        let precision = if half_precision { Precision::F16 } else { Precision::F32 };
+        Self(convolutions::plan(weights, resolution, precision))
     }
 
     /// Labels of the shaders, each once.
