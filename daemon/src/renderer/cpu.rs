@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use holod_calibration::{Colour, PerColour, PupilDiameter, Resolution};
 use holod_model::engine::{EngineError, StageTiming};
+use holod_model::gpu::GpuError;
 use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::{ComplexHologram, CpuEngine, RgbdFrame, Weights, WorkerPool};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
@@ -43,7 +44,7 @@ impl CpuRenderer {
     pub(super) fn new(
         weights: &Weights,
         encoder: &Arc<PanelEncoder>,
-        no_gpu: Option<&EngineError>,
+        no_gpu: Option<&GpuError>,
     ) -> Result<Self, Failure> {
         let resolution = encoder.pattern_resolution();
         let engine = CpuEngine::new(weights, resolution).map_err(Failure::because(Exit::Unavailable))?;
@@ -76,7 +77,9 @@ impl CpuRenderer {
         Ok(Self {
             description: match no_gpu {
                 None => format!("cpu, {instruction_set}, {} threads", pool.threads()),
-                Some(reason) => format!("cpu, {instruction_set}, {} threads, as {reason}", pool.threads()),
+                Some(error) => {
+                    format!("cpu, {instruction_set}, {} threads, as {}", pool.threads(), error.reason())
+                }
             },
             pool,
             hologram,

@@ -94,7 +94,7 @@ impl GpuRenderer {
                 Err(again) => tracing::error!("the GPU cannot be opened again: {again}"),
             }
         }
-        match CpuRenderer::new(&self.weights, &self.encoder, Some(&EngineError::Gpu(error.clone()))) {
+        match CpuRenderer::new(&self.weights, &self.encoder, Some(error)) {
             Ok(cpu) => {
                 self.description = cpu.description().to_owned();
                 tracing::warn!("holograms are computed by {}", self.description);

@@ -83,7 +83,8 @@ pub fn open(backend: Backend, weights: &Weights, encoder: &Arc<PanelEncoder>) ->
         Backend::Cpu => Ok(Box::new(CpuRenderer::new(weights, encoder, None)?)),
         Backend::Auto => match on_gpu(weights, encoder, Adapters::Hardware) {
             Ok(renderer) => Ok(renderer),
-            Err(error) => Ok(Box::new(CpuRenderer::new(weights, encoder, Some(&error))?)),
+            Err(EngineError::Gpu(error)) => Ok(Box::new(CpuRenderer::new(weights, encoder, Some(&error))?)),
+            Err(other) => Err(Failure::because(Exit::Unavailable)(other)),
         },
         Backend::Gpu => on_gpu(weights, encoder, Adapters::Hardware)
             .or_else(|error| match error {

@@ -139,6 +139,11 @@ fn check(name: &str) {
     let mut hologram = ComplexHologram::dark(frame.resolution);
     engine.render(&frame, PupilDiameter::from_mm(pupil_mm as f32), &mut hologram).unwrap();
     assert_matches(&format!("{name} engine"), &widen(&hologram.field), &field, ENGINE_TOLERANCE);
+    #[cfg(feature = "gpu")]
+    {
+        let on_gpu = super::gpu::tests::hologram_of(&weights, &frame, pupil_mm as f32);
+        assert_matches(&format!("{name} engine on the GPU"), &widen(&on_gpu.field), &field, ENGINE_TOLERANCE);
+    }
 
     let golden_hologram = ComplexHologram {
         resolution: frame.resolution,

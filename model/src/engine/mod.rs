@@ -16,7 +16,10 @@ use holod_calibration::Resolution;
 use crate::gpu::GpuError;
 
 pub use cpu::{CpuEngine, fma_peak, stream_bandwidth};
-// pub use gpu::{EncodedCounts, GpuEngine};
+#[cfg(feature = "gpu-cost")]
+pub use gpu::cost as gpu_cost;
+#[cfg(feature = "gpu")]
+pub use gpu::{EncodedCounts, GpuEngine};
 
 /// A frame that an engine refuses.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]

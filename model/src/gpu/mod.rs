@@ -51,6 +51,18 @@ pub enum GpuError {
         /// What fits.
         limit: u64,
     },
+    /// A row or a column of the network's grid does not fit in the memory that a workgroup's threads share.
+    #[error(
+        "a line of {samples} samples needs {bytes} bytes of a workgroup's memory, and this GPU has {limit}; choose --backend cpu, or a smaller size"
+    )]
+    LineTooLong {
+        /// Samples of the line.
+        samples: usize,
+        /// What it needs.
+        bytes: usize,
+        /// What there is.
+        limit: usize,
+    },
     /// The device failed at work.
     #[error(
         "the GPU {name} failed: {reason}; start again, choose a smaller size if its memory was full, or --backend cpu"
@@ -61,6 +73,24 @@ pub enum GpuError {
         /// What its driver said.
         reason: String,
     },
+}
+
+impl GpuError {
+    /// What is so, without what to do about it: for those who go on without a GPU.
+    pub fn reason(&self) -> String {
+        match self {
+            Self::NotBuilt => "this program was built without the GPU".to_owned(),
+            Self::None { passed_over, .. } => format!("Vulkan shows {} and no GPU", found(passed_over)),
+            Self::Refused { name, reason } => format!("the GPU {name} could not be opened: {reason}"),
+            Self::TooLarge { what, bytes, name, limit } => {
+                format!("{what} takes {bytes} bytes, of which the GPU {name} can see {limit} as one")
+            }
+            Self::LineTooLong { samples, bytes, limit } => format!(
+                "a line of {samples} samples needs {bytes} bytes of a workgroup's memory, and the GPU has {limit}"
+            ),
+            Self::Failed { name, reason } => format!("the GPU {name} failed: {reason}"),
+        }
+    }
 }
 
 fn found(passed_over: &[String]) -> String {

@@ -16,7 +16,7 @@ mod peak;
 mod product;
 mod stage;
 #[cfg(test)]
-mod tests;
+pub(super) mod tests;
 mod trunk;
 
 use holod_calibration::{PupilDiameter, Resolution};

@@ -16,7 +16,7 @@ use crate::weights::{Grid, NetworkConfig};
 /// Largest difference allowed between a map and its reference, relative to the reference's largest value.
 const TOLERANCE: f64 = 2e-5;
 
-fn frame(resolution: Resolution, seed: u32) -> RgbdFrame {
+pub(in crate::engine) fn frame(resolution: Resolution, seed: u32) -> RgbdFrame {
     let noise = |index: usize| {
         let mixed = (index as u32).wrapping_mul(0x9E37_79B9) ^ seed.wrapping_mul(0x85EB_CA6B);
         f64::from((mixed ^ (mixed >> 15)).wrapping_mul(0x2C1B_3C6D) >> 8) / f64::from(1 << 24)

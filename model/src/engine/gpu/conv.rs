@@ -1,14 +1,45 @@
 //! 3x3 convolutions on the GPU, as sums over taps.
+//!
+//! Layers that write a map of half precision multiply in half precision, two products at once, and sum up what each group of
+//! input channels gives in single precision. All others multiply in single precision, whatever they read.
 
-use super::map::{GROUP, Map, ROWS};
-use super::plan::{BufferId, Constant, Plan, Shader};
+use half::f16;
+
+use super::map::{GROUP, Map, Precision, ROWS};
+use super::plan::{BufferId, Constant, ENABLE_F16, Plan, Shader};
 
 pub(super) const TAPS: usize = 9;
 /// Threads of a workgroup, along x.
 const WORKGROUP: usize = 64;
-/// Groups of output channels that a thread holds sums of, at most: with [`ROWS`] rows of five groups a shader has registers
-/// left for what it multiplies.
-const MOST_PART_GROUPS: usize = 5;
+/// Bytes of parameters that the shaders load at once.
+const ELEMENT_BYTES: usize = 64;
+
+impl Precision {
+    /// Groups of output channels that a thread of a layer that multiplies so holds sums of, at most: with [`ROWS`] rows of
+    /// so many a shader has registers left for what it multiplies.
+    fn most_part_groups(self) -> usize {
+        match self {
+            Self::F32 => 5,
+            Self::F16 => 4,
+        }
+    }
+
+    /// Vectors of parameters in an element.
+    pub(super) fn element_vectors(self) -> usize {
+        ELEMENT_BYTES / (GROUP * self.bytes())
+    }
+
+    /// A buffer of parameters.
+    pub(super) fn table(self, plan: &mut Plan, what: &'static str, parameters: &[f32]) -> BufferId {
+        match self {
+            Self::F32 => plan.table(what, parameters),
+            Self::F16 => {
+                let half: Vec<_> = parameters.iter().map(|&value| f16::from_f32(value).to_bits()).collect();
+                plan.table(what, &half)
+            }
+        }
+    }
+}
 
 /// What is done with a sum before it is stored.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -53,6 +84,19 @@ impl ConvLayer<'_> {
         constants
     }
 
+    /// `epilogue.wgsl` and `text` for the vectors of two maps.
+    pub(super) fn source(&self, input: &Map, output: &Map, text: &str) -> String {
+        let half = [input, output].iter().any(|map| map.precision == Precision::F16);
+        let (directive, epilogue) = (if half { ENABLE_F16 } else { "" }, include_str!("epilogue.wgsl"));
+        let [input, output] = [input, output].map(|map| map.precision.vector());
+        format!("{directive}alias InVector = {input};\nalias OutVector = {output};\n\n{epilogue}\n{text}")
+    }
+
+    /// Bytes of `output` that are read and written.
+    pub(super) fn output_bytes(&self, output: &Map) -> u64 {
+        output.inner_bytes() * if self.epilogue == Epilogue::ResidualLeaky { 2 } else { 1 }
+    }
+
     /// Whether the layer can read the first `input_groups` of `input` and write `output`.
     pub(super) fn check(&self, (input, input_groups): (&Map, usize), output: &Map) {
         assert_eq!((input.width, input.height), (output.width, output.height));
@@ -68,34 +112,40 @@ impl ConvLayer<'_> {
 /// Threads make the output channels in parts of a few whole groups; those beyond the map's groups are zero and not stored.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Packing {
+    precision: Precision,
     input_groups: usize,
     parts: usize,
     part_groups: usize,
 }
 
 impl Packing {
-    /// For a layer that reads the first `input_groups` of a map and writes a map of `output_groups`.
-    pub(crate) fn new(input_groups: usize, output_groups: usize) -> Self {
-        let parts = output_groups.div_ceil(MOST_PART_GROUPS);
-        Self { input_groups, parts, part_groups: output_groups.div_ceil(parts) }
+    /// For a layer that multiplies in `precision`, reads the first `input_groups` of a map and writes a map of `output_groups`.
+    pub(crate) fn new(precision: Precision, input_groups: usize, output_groups: usize) -> Self {
+        let parts = output_groups.div_ceil(precision.most_part_groups());
+        Self { precision, input_groups, parts, part_groups: output_groups.div_ceil(parts) }
     }
 
     /// Numbers in the buffer.
     pub(crate) fn len(&self) -> usize {
-        self.biases() + self.parts * self.input_groups * TAPS * GROUP * self.part_groups * GROUP
+        self.biases() + self.parts * self.input_groups * self.group_len()
     }
 
     fn biases(&self) -> usize {
-        self.parts * self.part_groups * GROUP
+        (self.parts * self.part_groups).next_multiple_of(self.precision.element_vectors()) * GROUP
+    }
+
+    /// Weights of one part for one group of inputs.
+    fn group_len(&self) -> usize {
+        (TAPS * GROUP * self.part_groups).next_multiple_of(self.precision.element_vectors()) * GROUP
     }
 
     /// The place of the weight by which `input`, a channel of the map, is multiplied at `tap` for `output`.
     fn place(&self, output: usize, input: usize, tap: usize) -> usize {
         let (group, lane) = (output / GROUP, output % GROUP);
         let (part, group) = (group / self.part_groups, group % self.part_groups);
-        let column = (part * self.input_groups + input / GROUP) * 3 + tap % 3;
-        let channel = (column * 3 + tap / 3) * GROUP + input % GROUP;
-        self.biases() + (channel * self.part_groups + group) * GROUP + lane
+        let first = self.biases() + (part * self.input_groups + input / GROUP) * self.group_len();
+        let channel = (tap % 3 * 3 + tap / 3) * GROUP + input % GROUP;
+        first + (channel * self.part_groups + group) * GROUP + lane
     }
 
     /// Writes the parameters of a layer to `parameters`, of [`Self::len`] zeros or of the same layer at other values: the bias
@@ -137,8 +187,9 @@ pub(crate) fn convolve(
     output: &Map,
 ) -> (BufferId, Packing) {
     layer.check((input, input_groups), output);
-    let packing = Packing::new(input_groups, output.groups);
-    let parameters = plan.table("a convolution's parameters", &packing.pack(layer));
+    let precision = output.precision;
+    let packing = Packing::new(precision, input_groups, output.groups);
+    let parameters = precision.table(plan, "a convolution's parameters", &packing.pack(layer));
     let mut constants = vec![
         ("WORKGROUP", WORKGROUP.into()),
         ("ROWS", ROWS.into()),
@@ -148,11 +199,16 @@ pub(crate) fn convolve(
     ];
     constants.extend(layer.epilogue_constants(output));
     constants.extend(input.constants(["IN_GROUPS", "IN_PITCH"]));
-    let source = concat!(include_str!("epilogue.wgsl"), include_str!("conv.wgsl"));
-    let shader = Shader::new(label, &constants, source, "convolve");
+    let text = match precision {
+        Precision::F32 => include_str!("conv.wgsl"),
+        Precision::F16 => include_str!("conv_f16.wgsl"),
+    };
+    let shader = Shader::new(label, &constants, &layer.source(input, output, text), "convolve");
     let workgroups = [output.width.div_ceil(WORKGROUP) * packing.parts, output.height.div_ceil(ROWS), 1];
     let stage = plan.stages.last_mut().expect("a stage was added for the layer");
-    stage.dispatch(shader, &[input.buffer, parameters, output.buffer], workgroups);
+    let dispatch = stage.dispatch(shader, &[input.buffer, parameters, output.buffer], workgroups);
+    let input_bytes = input.inner_bytes() / input.groups as u64 * input_groups as u64;
+    dispatch.bytes = Some(input_bytes + (packing.len() * precision.bytes()) as u64 + layer.output_bytes(output));
     (parameters, packing)
 }
 
@@ -162,8 +218,10 @@ pub(super) mod tests {
     use super::*;
     use crate::engine::reference;
 
-    /// Largest error allowed, over the output's root mean square.
+    /// Largest error allowed, over the output's root mean square: of sums in single precision, and of products and sums in
+    /// half precision.
     const TOLERANCE: f64 = 1e-5;
+    const HALF_TOLERANCE: f64 = 1e-2;
     pub(in super::super) const SLOPE: f32 = 0.1;
 
     /// In −1..1.
@@ -181,12 +239,16 @@ pub(super) mod tests {
     }
 
     /// Whether both are alike.
-    pub(in super::super) fn judge(found: &[f32], expected: &[f64]) -> Result<(), String> {
+    pub(in super::super) fn judge(precision: Precision, found: &[f32], expected: &[f64]) -> Result<(), String> {
+        let tolerance = match precision {
+            Precision::F32 => TOLERANCE,
+            Precision::F16 => HALF_TOLERANCE,
+        };
         assert_eq!(found.len(), expected.len());
         let rms = (expected.iter().map(|value| value * value).sum::<f64>() / expected.len() as f64).sqrt();
         for (place, (found, expected)) in found.iter().zip(expected).enumerate() {
             // NaN is not near.
-            let near = (f64::from(*found) - expected).abs() <= TOLERANCE * rms;
+            let near = (f64::from(*found) - expected).abs() <= tolerance * rms;
             if !near {
                 return Err(format!("value {place} is {found}; expected {expected}, of which the rms is {rms}"));
             }
@@ -204,7 +266,10 @@ pub(super) mod tests {
     }
 
     /// A layer of `outputs` that reads `inputs`, channels of the first groups of a wider map.
+    #[derive(Clone)]
     struct Case {
+        /// Of the input map and of the output map.
+        precisions: [Precision; 2],
         size: (usize, usize),
         inputs: Vec<usize>,
         input_groups: usize,
@@ -214,14 +279,22 @@ pub(super) mod tests {
 
     impl Case {
         fn new(size: (usize, usize), inputs: usize, outputs: usize, epilogue: Epilogue) -> Self {
-            Self { size, inputs: (0..inputs).collect(), input_groups: inputs.div_ceil(GROUP), outputs, epilogue }
+            let precisions = [Precision::F32; 2];
+            Self {
+                precisions,
+                size,
+                inputs: (0..inputs).collect(),
+                input_groups: inputs.div_ceil(GROUP),
+                outputs,
+                epilogue,
+            }
         }
 
         fn found(&self) -> Vec<f32> {
-            let Self { size, ref inputs, input_groups, outputs, epilogue } = *self;
+            let Self { precisions, size, ref inputs, input_groups, outputs, epilogue } = *self;
             let mut plan = Plan::default();
-            let input = Map::new(&mut plan, "input", size, (input_groups + 1) * GROUP);
-            let output = Map::new(&mut plan, "output", size, outputs);
+            let input = Map::with(precisions[0], &mut plan, "input", size, (input_groups + 1) * GROUP);
+            let output = Map::with(precisions[1], &mut plan, "output", size, outputs);
             let weight: Vec<_> = (0..outputs * inputs.len() * TAPS).map(noise).collect();
             let bias: Vec<_> = (0..outputs).map(|output| noise(9_000_000 + output)).collect();
             let layer = ConvLayer { weight: &weight, bias: &bias, inputs, epilogue, leaky_slope: SLOPE };
@@ -256,9 +329,11 @@ pub(super) mod tests {
         }
 
         fn check(&self) {
-            let Self { size, ref inputs, outputs, epilogue, .. } = *self;
-            judge(&self.found(), &self.expected())
-                .unwrap_or_else(|error| panic!("{size:?}, {} to {outputs}, {epilogue:?}: {error}", inputs.len()));
+            let Self { precisions, size, ref inputs, outputs, epilogue, .. } = *self;
+            let worse = if precisions.contains(&Precision::F16) { Precision::F16 } else { Precision::F32 };
+            judge(worse, &self.found(), &self.expected()).unwrap_or_else(|error| {
+                panic!("{precisions:?}, {size:?}, {} to {outputs}, {epilogue:?}: {error}", inputs.len())
+            });
         }
     }
 
@@ -285,6 +360,18 @@ pub(super) mod tests {
         }
     }
 
+    /// Between maps of both precisions; an odd number of groups does not fill its elements.
+    #[test]
+    fn sums_are_right_in_half_precision() {
+        let (single, half) = (Precision::F32, Precision::F16);
+        for precisions in [[half, half], [single, half], [half, single]] {
+            for (size, inputs, outputs) in [((65, 5), 5, 7), ((9, 7), 9, 24)] {
+                Case { precisions, ..Case::new(size, inputs, outputs, Epilogue::ResidualLeaky) }.check();
+            }
+        }
+        Case { precisions: [half, half], ..Case::new((1, 1), 4, 4, Epilogue::Leaky) }.check();
+    }
+
     #[test]
     fn sums_are_right_for_few_and_for_many_channels() {
         for (inputs, outputs) in [(1, 1), (4, 4), (21, 56), (84, 32)] {
@@ -296,13 +383,13 @@ pub(super) mod tests {
     #[test]
     fn inputs_are_found_where_the_map_has_them() {
         let inputs: Vec<_> = (48..84).chain(0..45).collect();
-        let case = Case { size: (13, 9), inputs, input_groups: 21, outputs: 32, epilogue: Epilogue::Leaky };
-        case.check();
+        let case = Case::new((13, 9), inputs.len(), 32, Epilogue::Leaky);
+        Case { inputs, input_groups: 21, ..case }.check();
     }
 
     #[test]
     fn parameters_are_replaced_in_place() {
-        let packing = Packing::new(2, 5);
+        let packing = Packing::new(Precision::F32, 2, 5);
         let bias = |factor: f32| (0..18).map(move |output| factor * noise(output));
         let mut parameters = vec![0.0; packing.len()];
         packing.fill(&mut parameters, &[0, 5], bias(1.0), |output, input, tap| noise(100 + output + input + tap));
@@ -320,12 +407,16 @@ pub(super) mod tests {
     fn a_wrong_value_is_seen() {
         let case = Case::new((9, 7), 5, 7, Epilogue::ResidualLeaky);
         let expected = case.expected();
-        for wrong in [1e-3, f32::NAN] {
-            let mut found = case.found();
-            found[100] += wrong;
-            judge(&found, &expected).expect_err("one wrong value");
+        for (precision, little) in [(Precision::F32, 1e-3), (Precision::F16, 0.1)] {
+            let case = Case { precisions: [precision; 2], ..case.clone() };
+            for wrong in [little, f32::NAN] {
+                let mut found = case.found();
+                judge(precision, &found, &expected).expect("what is right");
+                found[100] += wrong;
+                judge(precision, &found, &expected).expect_err("one wrong value");
+            }
+            let plain = Case { epilogue: Epilogue::Leaky, ..case };
+            judge(precision, &plain.found(), &expected).expect_err("another epilogue");
         }
-        let plain = Case { epilogue: Epilogue::Leaky, ..case };
-        judge(&plain.found(), &expected).expect_err("another epilogue");
     }
 }

@@ -1,7 +1,10 @@
 //! Deformable 3x3 convolutions on the GPU: every tap of every pixel is read at a place of its own.
+//!
+//! Layers that write a map of half precision interpolate and multiply in half precision, two products at once, and sum up what
+//! each tap gives in single precision.
 
 use super::conv::{ConvLayer, TAPS};
-use super::map::{GROUP, Map};
+use super::map::{GROUP, Map, Precision};
 use super::plan::{Plan, Shader};
 use crate::weights::OFFSET_CHANNELS;
 
@@ -19,11 +22,13 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
     layer.check((input, input.groups), output);
     assert_eq!((offsets.width, offsets.height), (output.width, output.height));
     assert!(offsets.groups >= OFFSET_CHANNELS.div_ceil(GROUP) && offsets.buffer != output.buffer);
+    assert_eq!(offsets.precision, Precision::F32);
 
     let parts = output.groups.div_ceil(MOST_PART_GROUPS);
     let part_groups = output.groups.div_ceil(parts);
-    let parameters = pack(layer, input.groups, [parts, part_groups]);
-    let parameters = plan.table("a deformable convolution's parameters", &parameters);
+    let precision = output.precision;
+    let values = pack(layer, precision, input.groups, [parts, part_groups]);
+    let parameters = precision.table(plan, "a deformable convolution's parameters", &values);
     let mut constants = vec![
         ("WORKGROUP", WORKGROUP.into()),
         ("PIXELS", PIXELS.into()),
@@ -34,25 +39,31 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
     constants.extend(layer.epilogue_constants(output));
     constants.extend(input.constants(["IN_GROUPS", "IN_PITCH"]));
     constants.extend(offsets.constants(["OFFSET_GROUPS", "OFFSET_PITCH"]));
-    let source = concat!(include_str!("epilogue.wgsl"), include_str!("deformable.wgsl"));
-    let shader = Shader::new(label, &constants, source, "convolve");
+    let text = match precision {
+        Precision::F32 => concat!(include_str!("deformable_places.wgsl"), include_str!("deformable.wgsl")),
+        Precision::F16 => concat!(include_str!("deformable_places.wgsl"), include_str!("deformable_f16.wgsl")),
+    };
+    let shader = Shader::new(label, &constants, &layer.source(input, output, text), "convolve");
     let workgroups = [output.width.div_ceil(WORKGROUP) * parts, output.height.div_ceil(PIXELS), 1];
     let stage = plan.stages.last_mut().expect("a stage was added for the layer");
-    stage.dispatch(shader, &[input.buffer, offsets.buffer, parameters, output.buffer], workgroups);
+    let dispatch = stage.dispatch(shader, &[input.buffer, offsets.buffer, parameters, output.buffer], workgroups);
+    let parameter_bytes = (values.len() * precision.bytes()) as u64;
+    dispatch.bytes = Some(input.inner_bytes() + offsets.inner_bytes() + parameter_bytes + layer.output_bytes(output));
 }
 
 /// The parameters of `layer` as the shader has them.
-fn pack(layer: &ConvLayer, input_groups: usize, [parts, part_groups]: [usize; 2]) -> Vec<f32> {
-    let biases = parts * part_groups * GROUP;
-    let mut parameters = vec![0.0; biases * (1 + TAPS * input_groups * GROUP)];
+fn pack(layer: &ConvLayer, precision: Precision, input_groups: usize, [parts, part_groups]: [usize; 2]) -> Vec<f32> {
+    let elements = |vectors: usize| vectors.next_multiple_of(precision.element_vectors()) * GROUP;
+    let (biases, tap_len) = (elements(parts * part_groups), elements(input_groups * GROUP * part_groups));
+    let mut parameters = vec![0.0; biases + parts * TAPS * tap_len];
     for (output, bias) in layer.bias.iter().enumerate() {
         parameters[output] = *bias;
         let (part, group) = (output / GROUP / part_groups, output / GROUP % part_groups);
         for (input, channel) in layer.inputs.iter().enumerate() {
             for tap in 0..TAPS {
-                let row = (part * TAPS + tap) * input_groups * GROUP + channel;
-                let place = (row * part_groups + group) * GROUP + output % GROUP;
-                parameters[biases + place] = layer.weight(output, input, tap);
+                let first = biases + (part * TAPS + tap) * tap_len;
+                let place = (channel * part_groups + group) * GROUP + output % GROUP;
+                parameters[first + place] = layer.weight(output, input, tap);
             }
         }
     }
@@ -74,7 +85,10 @@ mod tests {
     }
 
     /// A layer of `inputs` to `outputs` channels that reads where `offset` leads.
+    #[derive(Clone)]
     struct Case {
+        /// Of the input map and of the output map.
+        precisions: [Precision; 2],
         size: (usize, usize),
         inputs: usize,
         outputs: usize,
@@ -84,11 +98,11 @@ mod tests {
 
     impl Case {
         fn found(&self) -> Vec<f32> {
-            let Self { size, inputs, outputs, epilogue, offset } = *self;
+            let Self { precisions, size, inputs, outputs, epilogue, offset } = *self;
             let mut plan = Plan::default();
-            let input = Map::new(&mut plan, "input", size, inputs);
+            let input = Map::with(precisions[0], &mut plan, "input", size, inputs);
             let offsets = Map::new(&mut plan, "offsets", size, OFFSET_CHANNELS);
-            let output = Map::new(&mut plan, "output", size, outputs);
+            let output = Map::with(precisions[1], &mut plan, "output", size, outputs);
             let weight: Vec<_> = (0..outputs * inputs * TAPS).map(noise).collect();
             let bias: Vec<_> = (0..outputs).map(|output| noise(9_000_000 + output)).collect();
             let channels: Vec<_> = (0..inputs).rev().collect();
@@ -107,7 +121,7 @@ mod tests {
         }
 
         fn expected(&self) -> Vec<f64> {
-            let Self { size: (width, height), inputs, outputs, epilogue, offset } = *self;
+            let Self { size: (width, height), inputs, outputs, epilogue, offset, .. } = *self;
             let input = reference::Map::from_fn([inputs, height, width], |channel, y, x| value(channel, y, x).into());
             let sum = |output: usize, y: usize, x: usize| {
                 let mut sum = f64::from(noise(9_000_000 + output));
@@ -127,9 +141,15 @@ mod tests {
             reference::Map::from_fn([outputs, height, width], sum).values
         }
 
+        fn new(size: (usize, usize), inputs: usize, outputs: usize, epilogue: Epilogue, offset: Offset) -> Self {
+            Self { precisions: [Precision::F32; 2], size, inputs, outputs, epilogue, offset }
+        }
+
         fn check(&self) {
-            judge(&self.found(), &self.expected()).unwrap_or_else(|error| {
-                panic!("{:?}, {} to {}, {:?}: {error}", self.size, self.inputs, self.outputs, self.epilogue);
+            let Self { precisions, size, inputs, outputs, epilogue, .. } = *self;
+            let worse = if precisions.contains(&Precision::F16) { Precision::F16 } else { Precision::F32 };
+            judge(worse, &self.found(), &self.expected()).unwrap_or_else(|error| {
+                panic!("{precisions:?}, {size:?}, {inputs} to {outputs}, {epilogue:?}: {error}")
             });
         }
     }
@@ -158,8 +178,7 @@ mod tests {
         for (channels, epilogue) in
             [(32, Epilogue::ResidualLeaky), (24, Epilogue::ResidualLeaky), (24, Epilogue::Leaky)]
         {
-            let size = (37, 11);
-            Case { size, inputs: channels, outputs: channels, epilogue, offset: moderate }.check();
+            Case::new((37, 11), channels, channels, epilogue, moderate).check();
         }
     }
 
@@ -167,19 +186,29 @@ mod tests {
     fn sums_are_right_for_odd_sizes_and_channels_and_all_places() {
         for offset in [moderate as Offset, wild] {
             for size in [(1, 1), (1, 33), (33, 1), (64, 2), (65, 3)] {
-                Case { size, inputs: 5, outputs: 7, epilogue: Epilogue::None, offset }.check();
+                Case::new(size, 5, 7, Epilogue::None, offset).check();
             }
-            Case { size: (9, 7), inputs: 21, outputs: 40, epilogue: Epilogue::Leaky, offset }.check();
+            Case::new((9, 7), 21, 40, Epilogue::Leaky, offset).check();
+        }
+    }
+
+    /// Between maps of both precisions; an odd number of groups does not fill its elements.
+    #[test]
+    fn sums_are_right_in_half_precision() {
+        let (single, half) = (Precision::F32, Precision::F16);
+        for (precisions, offset) in [([half, half], wild as Offset), ([single, half], moderate), ([half, single], wild)]
+        {
+            Case { precisions, ..Case::new((65, 3), 5, 12, Epilogue::ResidualLeaky, offset) }.check();
         }
     }
 
     /// Canary: one offset that is a little off is not right.
     #[test]
     fn a_wrong_offset_is_seen() {
-        let case = Case { size: (9, 7), inputs: 5, outputs: 7, epilogue: Epilogue::None, offset: moderate };
+        let case = Case::new((9, 7), 5, 7, Epilogue::None, moderate);
         let expected = case.expected();
-        judge(&case.found(), &expected).expect("the same offsets");
+        judge(Precision::F32, &case.found(), &expected).expect("the same offsets");
         let offset = |channel, y, x| moderate(channel, y, x) + if (channel, y, x) == (4, 3, 2) { 1e-3 } else { 0.0 };
-        judge(&Case { offset, ..case }.found(), &expected).expect_err("one other offset");
+        judge(Precision::F32, &Case { offset, ..case }.found(), &expected).expect_err("one other offset");
     }
 }

@@ -3,36 +3,11 @@
 //
 // A thread makes PIXELS rows of one column by PART_GROUPS groups of output channels, which it holds in registers.
 
-@group(0) @binding(0) var<storage, read> input: array<vec4f>;
-// (dy, dx) of the nine taps, two to a group of channels.
-@group(0) @binding(1) var<storage, read> offsets: array<vec2f>;
-// The bias of each group of outputs, then the weights: [part, tap, input group, input channel, output group].
-@group(0) @binding(2) var<storage, read> parameters: array<vec4f>;
-@group(0) @binding(3) var<storage, read_write> output: array<vec4f>;
-
-// Where one pixel reads at one tap: the upper left of four neighbours, and the share of each.
-struct Place {
-    corner: u32,
-    shares: vec4f,
-}
-
-fn place_of(tap: u32, x: u32, y: u32) -> Place {
-    let offset = offsets[(((y + 1u) * OFFSET_GROUPS + tap / 2u) * OFFSET_PITCH + x + 1u) * 2u + tap % 2u];
-    let at = vec2f(f32(x + tap % 3u), f32(y + tap / 3u)) - 1.0 + offset.yx;
-    // NaN is outside too; there the border's zeros are read, with no share.
-    if !(at.x > -1.0 && at.x < f32(WIDTH) && at.y > -1.0 && at.y < f32(HEIGHT)) {
-        return Place(0u, vec4f());
-    }
-    let corner = floor(at);
-    let share = at - corner;
-    let horizontal = vec2f(1.0 - share.x, share.x);
-    // The border makes all four neighbours readable: corner + 1 is in 0..=WIDTH and 0..=HEIGHT.
-    let first = vec2u(corner + 1.0);
-    return Place(
-        first.y * IN_GROUPS * IN_PITCH + first.x,
-        vec4f((1.0 - share.y) * horizontal, share.y * horizontal),
-    );
-}
+@group(0) @binding(0) var<storage, read> input: array<InVector>;
+// The bias of each group of outputs, filled up to whole elements, then the weights: [part, tap, input group, input channel,
+// output group]. Four vectors are an element because they are then loaded at once.
+@group(0) @binding(2) var<storage, read> parameters: array<array<vec4f, 4>>;
+@group(0) @binding(3) var<storage, read_write> output: array<OutVector>;
 
 @compute @workgroup_size(WORKGROUP)
 fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) lane: u32) {
@@ -42,13 +17,14 @@ fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_i
 
     var sums: array<array<vec4f, PART_GROUPS>, PIXELS>;
     for (var group = 0u; group < PART_GROUPS; group++) {
-        let bias = parameters[part * PART_GROUPS + group];
+        let place = part * PART_GROUPS + group;
+        let bias = parameters[place / 4u][place % 4u];
         for (var pixel = 0u; pixel < PIXELS; pixel++) {
             sums[pixel][group] = bias;
         }
     }
 
-    var weight = PARTS * PART_GROUPS + part * 9u * INPUT_GROUPS * 4u * PART_GROUPS;
+    var weight = (PARTS * PART_GROUPS + 3u) / 4u + part * 9u * INPUT_GROUPS * PART_GROUPS;
     for (var tap = 0u; tap < 9u; tap++) {
         var places: array<Place, PIXELS>;
         for (var pixel = 0u; pixel < PIXELS; pixel++) {
@@ -61,20 +37,21 @@ fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_i
                 let corner = places[pixel].corner + input_group * IN_PITCH;
                 let below = corner + IN_GROUPS * IN_PITCH;
                 let shares = places[pixel].shares;
-                var value = shares.x * input[corner];
-                value = fma(vec4f(shares.y), input[corner + 1u], value);
-                value = fma(vec4f(shares.z), input[below], value);
-                values[pixel] = fma(vec4f(shares.w), input[below + 1u], value);
+                var value = shares.x * vec4f(input[corner]);
+                value = fma(vec4f(shares.y), vec4f(input[corner + 1u]), value);
+                value = fma(vec4f(shares.z), vec4f(input[below]), value);
+                values[pixel] = fma(vec4f(shares.w), vec4f(input[below + 1u]), value);
             }
             for (var channel = 0u; channel < 4u; channel++) {
                 for (var group = 0u; group < PART_GROUPS; group++) {
-                    let factors = parameters[weight + channel * PART_GROUPS + group];
+                    let place = channel * PART_GROUPS + group;
+                    let factors = parameters[weight + place / 4u][place % 4u];
                     for (var pixel = 0u; pixel < PIXELS; pixel++) {
                         sums[pixel][group] = fma(vec4f(values[pixel][channel]), factors, sums[pixel][group]);
                     }
                 }
             }
-            weight += 4u * PART_GROUPS;
+            weight += PART_GROUPS;
         }
     }
 

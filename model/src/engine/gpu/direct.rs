@@ -24,10 +24,13 @@ pub(super) fn encode(plan: &mut Plan, config: &NetworkConfig, shared: &Shared) -
 }
 
 /// Adds the first part of the stage `field`: the field on the network's grid, [3, height, width], whose buffer it
-/// returns.
+/// returns. On the full grid that is the hologram's.
 pub(super) fn add_residual(plan: &mut Plan, grid: Grid, shared: &Shared, output: &Map) -> BufferId {
     let size = shared.size;
-    let low = plan.buffer::<[f32; 2]>("the field on the network's grid", 3 * size.pixels());
+    let low = match grid {
+        Grid::HalfBand => plan.buffer::<[f32; 2]>("the field on the network's grid", 3 * size.pixels()),
+        Grid::Full => shared.field,
+    };
     let shader = shader(grid, shared, output, "add_residual");
     plan.stage("field", 0).dispatch_with(
         shader,

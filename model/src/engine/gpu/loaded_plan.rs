@@ -74,7 +74,7 @@ fn stages(gpu: &Gpu, plan: &Plan, buffers: &[wgpu::Buffer]) -> Result<Vec<Vec<Lo
     let mut ready = Vec::new();
     for stage in &plan.stages {
         let mut dispatches = Vec::new();
-        for Dispatch { shader, bindings, workgroups } in &stage.dispatches {
+        for Dispatch { shader, bindings, workgroups, .. } in &stage.dispatches {
             let pipeline = match pipelines.entry(shader) {
                 Entry::Occupied(compiled) => compiled.into_mut(),
                 Entry::Vacant(place) => {

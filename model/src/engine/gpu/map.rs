@@ -7,6 +7,14 @@ pub(crate) const GROUP: usize = 4;
 /// Rows that one thread of a convolution makes.
 pub(crate) const ROWS: usize = 4;
 
+/// What a map's numbers are.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Precision {
+    F32,
+    /// Half precision, which the device has to offer.
+    F16,
+}
+
 /// A feature map [row, group of channels, column, 4] with a border of zeros, one pixel wide, and below it as many rows as
 /// fill the last [`ROWS`]. Nothing but zeros is ever written there.
 ///
@@ -18,13 +26,34 @@ pub(crate) struct Map {
     pub(crate) height: usize,
     /// Groups of channels in each row.
     pub(crate) groups: usize,
+    pub(crate) precision: Precision,
 }
 
 impl Map {
-    pub(crate) fn new(plan: &mut Plan, what: &'static str, (width, height): (usize, usize), channels: usize) -> Self {
+    /// A map of single precision.
+    pub(crate) fn new(plan: &mut Plan, what: &'static str, size: (usize, usize), channels: usize) -> Self {
+        Self::with(Precision::F32, plan, what, size, channels)
+    }
+
+    pub(crate) fn with(
+        precision: Precision,
+        plan: &mut Plan,
+        what: &'static str,
+        (width, height): (usize, usize),
+        channels: usize,
+    ) -> Self {
         let groups = channels.div_ceil(GROUP);
-        let rows = height.next_multiple_of(ROWS) + 2;
-        Self { buffer: plan.buffer::<[f32; GROUP]>(what, rows * groups * (width + 2)), width, height, groups }
+        let vectors = (height.next_multiple_of(ROWS) + 2) * groups * (width + 2);
+        let buffer = match precision {
+            Precision::F32 => plan.buffer::<[f32; GROUP]>(what, vectors),
+            Precision::F16 => plan.buffer::<[u16; GROUP]>(what, vectors),
+        };
+        Self { buffer, width, height, groups, precision }
+    }
+
+    /// Bytes of the numbers inside the border.
+    pub(crate) fn inner_bytes(&self) -> u64 {
+        (self.groups * GROUP * self.width * self.height * self.precision.bytes()) as u64
     }
 
     /// Vectors from one group of a row to the next: that of channel group g of pixel (x, y) is
@@ -36,5 +65,22 @@ impl Map {
     /// The constants `{prefix}_GROUPS` and `{prefix}_PITCH` of a shader.
     pub(crate) fn constants<'a>(&self, [groups, pitch]: [&'a str; 2]) -> [(&'a str, Constant); 2] {
         [(groups, self.groups.into()), (pitch, self.pitch().into())]
+    }
+}
+
+impl Precision {
+    pub(crate) fn bytes(self) -> usize {
+        match self {
+            Self::F32 => 4,
+            Self::F16 => 2,
+        }
+    }
+
+    /// A group of channels in a shader.
+    pub(crate) fn vector(self) -> &'static str {
+        match self {
+            Self::F32 => "vec4<f32>",
+            Self::F16 => "vec4<f16>",
+        }
     }
 }

@@ -1,15 +1,28 @@
 //! The network on the GPU: a plan of shaders, and the engine that runs it.
 
 mod conv;
+#[cfg(feature = "gpu-cost")]
+pub mod cost;
+mod defocus;
 mod deformable;
+mod depth_layers;
 mod direct;
 mod double_phase;
+mod engine;
+mod expected_stack;
+mod feedback;
+mod fft;
 mod levels;
 mod loaded_plan;
 mod map;
+mod maps;
 mod network;
 mod plan;
 #[cfg(test)]
-mod tests;
+pub(in crate::engine) mod tests;
 #[cfg(test)]
 mod trial;
+mod trunk;
+mod upsample;
+
+pub use self::engine::{EncodedCounts, GpuEngine};

@@ -1,8 +1,16 @@
 //! A network's plan: what its stages share, and their order.
 
-use holod_calibration::Resolution;
+use holod_calibration::{LevelTables, Resolution};
 
+use super::expected_stack::ExpectedStack;
+use super::fft::WorkgroupLimits;
+use super::maps::InputChannels;
 use super::plan::{BufferId, Plan};
+use super::trunk::{self, Modulated};
+use super::upsample::Low;
+use super::{direct, double_phase, levels, upsample};
+use crate::engine::EngineError;
+use crate::weights::{Family, Grid, Weights};
 
 /// What every stage may read or write.
 #[derive(Clone, Copy, Debug)]
@@ -28,5 +36,71 @@ impl Shared {
             pupil: plan.buffer::<[f32; 4]>("the pupil", 1),
             field: plan.buffer::<[f32; 2]>("the hologram", 3 * resolution.pixels()),
         }
+    }
+}
+
+/// A network with double phase and one panel's levels.
+pub(crate) struct NetworkPlan {
+    pub(crate) plan: Plan,
+    pub(super) shared: Shared,
+    pub(super) pupil_range_mm: [f32; 2],
+    pub(super) modulated: Vec<Modulated>,
+    /// [3, height, width], radians.
+    pub(super) phases: BufferId,
+    /// The panel's samples, two to 32 bits.
+    pub(super) samples: BufferId,
+    /// How many samples were clipped, and how many are out of the panel's reach in each colour: zero before a frame.
+    pub(super) clipped: BufferId,
+    pub(super) unreachable: BufferId,
+}
+
+impl NetworkPlan {
+    /// For frames of the pattern's size of `tables`, on a device of these limits.
+    ///
+    /// # Errors
+    /// The size is nothing, or too large for that memory.
+    pub(crate) fn new(weights: &Weights, tables: &LevelTables, limits: WorkgroupLimits) -> Result<Self, EngineError> {
+        let (resolution, config) = (tables.pattern, &weights.config);
+        if resolution.pixels() == 0 {
+            return Err(EngineError::Empty { resolution });
+        }
+        let scale: usize = match config.grid {
+            Grid::HalfBand => 2,
+            Grid::Full => 1,
+        };
+        let size = Resolution { width: resolution.width.div_ceil(scale), height: resolution.height.div_ceil(scale) };
+        let mut plan = Plan::default();
+        let shared = Shared::new(&mut plan, resolution, size);
+        let mut modulated = Vec::new();
+        let mut net = |plan: &mut Plan, prefix: &str, layers: &[_], input: &_, channels: Vec<usize>| {
+            let (output, more) = trunk::run(plan, prefix, layers, config.leaky_slope, input, &channels);
+            modulated.extend(more);
+            output
+        };
+        match &weights.family {
+            Family::Direct { layers } => {
+                let input = direct::encode(&mut plan, config, &shared);
+                let output = net(&mut plan, "", layers, &input, (0..config.map_channels()).collect());
+                let low = Low::Field(direct::add_residual(&mut plan, config.grid, &shared, &output));
+                upsample::field(&mut plan, &shared, config.grid, low, limits)?;
+            }
+            Family::ExpectedStack { lighting, correction, feedback } => {
+                let channels = InputChannels::new(config.depth_layers);
+                let inputs = channels.map(&mut plan, size);
+                let stack = ExpectedStack::expect(&mut plan, config, &shared, &inputs, limits)?;
+                let lights = net(&mut plan, "lighting ", lighting, &inputs, channels.lighting());
+                stack.light(&mut plan, &lights);
+                stack.feed_back(&mut plan, *feedback, &inputs);
+                let residual = net(&mut plan, "correction ", correction, &inputs, channels.correction());
+                let low = Low::Corrected(stack.carried(), &residual);
+                upsample::field(&mut plan, &shared, config.grid, low, limits)?;
+            }
+        }
+        let clipped = plan.buffer::<u32>("clipped samples", 1);
+        let unreachable = plan.buffer::<u32>("samples out of reach", 3);
+        let phases = double_phase::encode(&mut plan, &shared, config.amplitude_constant, clipped);
+        let samples = levels::encode(&mut plan, tables, phases, unreachable);
+        let pupil_range_mm = config.pupil_range_mm;
+        Ok(Self { plan, shared, pupil_range_mm, modulated, phases, samples, clipped, unreachable })
     }
 }

@@ -5,6 +5,9 @@
 use std::fmt::Write;
 use std::sync::Arc;
 
+/// What a shader begins with that has numbers of half precision.
+pub(crate) const ENABLE_F16: &str = "enable f16;\n";
+
 /// Buffers and stages of one network for frames of one size.
 #[derive(Default)]
 pub(crate) struct Plan {
@@ -40,6 +43,8 @@ pub(crate) struct Dispatch {
     /// The bindings that the entry point uses, in group 0.
     pub(crate) bindings: Vec<(u32, BufferId)>,
     pub(crate) workgroups: [u32; 3],
+    /// The fewest bytes that have to be read and written, where that is not each buffer once.
+    pub(crate) bytes: Option<u64>,
 }
 
 /// WGSL with its constants filled in.
@@ -52,14 +57,19 @@ pub(crate) struct Shader {
 }
 
 impl Shader {
-    /// The entry point `entry` of `source` after the constants that `source` uses without declaring them.
+    /// The entry point `entry` of `source` after the constants that `source` uses without declaring them. Where `source`
+    /// begins with [`ENABLE_F16`], so does the shader.
     pub(crate) fn new(
         label: impl Into<String>,
         constants: &[(&str, Constant)],
         source: &str,
         entry: &'static str,
     ) -> Self {
-        let mut text = String::new();
+        let (directive, source) = match source.strip_prefix(ENABLE_F16) {
+            Some(rest) => (ENABLE_F16, rest),
+            None => ("", source),
+        };
+        let mut text = String::from(directive);
         for (name, value) in constants {
             let (kind, value) = match value {
                 Constant::U32(value) => ("u32", format!("{value}u")),
@@ -128,13 +138,19 @@ impl Plan {
 
 impl Stage {
     /// Adds a dispatch of `workgroups` with `buffers` bound as 0, 1, 2, ….
-    pub(crate) fn dispatch(&mut self, shader: Shader, buffers: &[BufferId], workgroups: [usize; 3]) {
-        self.dispatch_with(Arc::new(shader), &(0..).zip(buffers.iter().copied()).collect::<Vec<_>>(), workgroups);
+    pub(crate) fn dispatch(&mut self, shader: Shader, buffers: &[BufferId], workgroups: [usize; 3]) -> &mut Dispatch {
+        self.dispatch_with(Arc::new(shader), &(0..).zip(buffers.iter().copied()).collect::<Vec<_>>(), workgroups)
     }
 
     /// As [`Self::dispatch`], for an entry point that leaves out some bindings of its file.
-    pub(crate) fn dispatch_with(&mut self, shader: Arc<Shader>, bindings: &[(u32, BufferId)], workgroups: [usize; 3]) {
+    pub(crate) fn dispatch_with(
+        &mut self,
+        shader: Arc<Shader>,
+        bindings: &[(u32, BufferId)],
+        workgroups: [usize; 3],
+    ) -> &mut Dispatch {
         let workgroups = workgroups.map(|count| u32::try_from(count).expect("a grid on a device fits in 32 bits"));
-        self.dispatches.push(Dispatch { shader, bindings: bindings.to_vec(), workgroups });
+        self.dispatches.push(Dispatch { shader, bindings: bindings.to_vec(), workgroups, bytes: None });
+        self.dispatches.last_mut().expect("one was added")
     }
 }

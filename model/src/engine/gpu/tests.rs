@@ -1,30 +1,25 @@
 //! The GPU's stages on Mesa's software device, against their twins on the processor.
 
 use std::f32::consts::TAU;
+use std::sync::Arc;
 
-use holod_calibration::{Colour, LevelTables, PerColour, Resolution};
-use num_complex::Complex32;
+use holod_calibration::{Colour, LevelTables, PerColour, PupilDiameter, Resolution};
+use num_complex::{Complex32, Complex64};
 use proptest::prelude::*;
 
-use super::loaded_plan::LoadedPlan;
+use super::engine::GpuEngine;
+use super::fft::WorkgroupLimits;
 use super::network::Shared;
 use super::plan::Plan;
+use super::trial::Trial;
 use super::{double_phase, levels};
-use crate::gpu::{Adapters, Gpu};
+use crate::engine::cpu::tests::frame;
+use crate::engine::{CpuEngine, EngineError, reference};
+use crate::gpu::{Adapters, GpuError};
 use crate::optics::DoublePhase;
-use crate::{ComplexHologram, PhasePattern};
-
-pub(super) fn gpu() -> Gpu {
-    Gpu::open(Adapters::Software).expect("Mesa's software device; install mesa-vulkan-drivers")
-}
-
-/// Runs all stages of a plan once.
-pub(super) fn run(gpu: &Gpu, loaded: &LoadedPlan) {
-    let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
-    loaded.encode(&mut encoder, |_| None);
-    let submission = gpu.queue.submit([encoder.finish()]);
-    gpu.wait(submission).expect("the work is done");
-}
+use crate::weights::tests::{self as weights_tests, random_weights};
+use crate::weights::{Grid, NetworkConfig};
+use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
 
 /// Numbers that look random, in 0..1.
 fn noise(index: usize, seed: u32) -> f32 {
@@ -62,30 +57,26 @@ fn phase_error(actual: &[f32], expected: &[f32], tolerance_rad: f32) -> (f32, us
 }
 
 /// Phases and count of clipped samples, on the device.
-fn encoded_on(gpu: &Gpu, hologram: &ComplexHologram, constant: f32) -> (Vec<f32>, u32) {
+fn encoded_on_gpu(hologram: &ComplexHologram, constant: f32) -> (Vec<f32>, u32) {
     let mut plan = Plan::default();
     let shared = Shared::new(&mut plan, hologram.resolution, hologram.resolution);
     let clipped = plan.buffer::<u32>("clipped samples", 1);
     let phases = double_phase::encode(&mut plan, &shared, constant, clipped);
-    let loaded = LoadedPlan::new(gpu, &plan).unwrap();
-    let pairs: Vec<[f32; 2]> = hologram.field.iter().map(|value| [value.re, value.im]).collect();
-    gpu.queue.write_buffer(loaded.buffer(shared.field), 0, bytemuck::cast_slice(&pairs));
-    run(gpu, &loaded);
-    let (mut phases_rad, mut count) = (vec![0.0; pairs.len()], [0]);
-    gpu.read(loaded.buffer(phases), &mut phases_rad).unwrap();
-    gpu.read(loaded.buffer(clipped), &mut count).unwrap();
-    (phases_rad, count[0])
+    let trial = Trial::new(&plan);
+    let parts: Vec<f32> = hologram.field.iter().flat_map(|value| [value.re, value.im]).collect();
+    trial.write(shared.field, &parts);
+    trial.run();
+    (trial.read(phases), trial.read(clipped)[0].to_bits())
 }
 
 #[test]
 fn double_phase_is_the_processors() {
     const TOLERANCE_RAD: f32 = 2e-3;
-    let gpu = gpu();
     for (width, height) in [(1, 1), (2, 1), (1, 37), (5, 3), (64, 64), (33, 35), (101, 67), (130, 97)] {
         let hologram = hologram(Resolution { width, height }, 3);
         let mut pattern = PhasePattern::flat(hologram.resolution);
         let report = DoublePhase::new(hologram.resolution, 1.25).encode(&hologram, &mut pattern);
-        let (phases_rad, clipped) = encoded_on(&gpu, &hologram, 1.25);
+        let (phases_rad, clipped) = encoded_on_gpu(&hologram, 1.25);
         let share = clipped as f32 / phases_rad.len() as f32;
         assert!((share - report.clipped_share).abs() < 1e-6, "{width}x{height}: {share} of {}", report.clipped_share);
         assert!(phases_rad.iter().all(|phase| (0.0..TAU).contains(phase)));
@@ -159,29 +150,234 @@ proptest! {
         };
         let phases_rad: Vec<f32> = (0..3 * pattern.pixels()).map(|index| TAU * noise(index, seed)).collect();
 
-        let gpu = gpu();
         let mut plan = Plan::default();
         let phases = plan.table("phases", &phases_rad);
         let unreachable = plan.buffer::<u32>("samples out of reach", 3);
         let written = levels::encode(&mut plan, &tables, phases, unreachable);
-        let loaded = LoadedPlan::new(&gpu, &plan).unwrap();
-        run(&gpu, &loaded);
-        let mut words = vec![0u32; (3 * panel.pixels()).div_ceil(2)];
-        let mut counts = [0u32; 3];
-        gpu.read(loaded.buffer(written), &mut words).unwrap();
-        gpu.read(loaded.buffer(unreachable), &mut counts).unwrap();
-        let found: Vec<u16> = words.iter().flat_map(|word| [*word as u16, (word >> 16) as u16]).collect();
+        let trial = Trial::new(&plan);
+        trial.run();
+        let words = trial.read(written).into_iter().map(f32::to_bits);
+        let found: Vec<u16> = words.flat_map(|word| [word as u16, (word >> 16) as u16]).collect();
+        let counts = trial.read(unreachable).into_iter().map(f32::to_bits);
 
         let (expected, expected_counts) = samples(&tables, &phases_rad);
         // A phase on the border of an entry may fall on either side of it.
         let tolerated = 1 + expected.len() / 500;
         let different = |expected: &[u16]| found.iter().zip(expected).filter(|(f, e)| f != e).count();
         prop_assert!(different(&expected) <= tolerated, "{} of {}", different(&expected), expected.len());
-        for (count, expected) in counts.into_iter().zip(expected_counts) {
-            prop_assert!(count.abs_diff(expected) <= 1 + expected / 20, "{counts:?} for {expected_counts:?}");
+        for (count, expected) in counts.zip(expected_counts) {
+            prop_assert!(count.abs_diff(expected) <= 1 + expected / 20, "{count} for {expected}");
         }
         let mut spoiled = expected;
         spoiled.iter_mut().for_each(|sample| *sample ^= 1);
         prop_assert!(found.len() < 8 || different(&spoiled) > tolerated, "the comparison is blind");
     }
+}
+
+/// Tables of a panel of 8 bits whose levels go evenly round the circle.
+fn linear_tables(resolution: Resolution) -> LevelTables {
+    const ENTRIES: usize = 4096;
+    let table = || (0..ENTRIES).map(|entry| ((entry + 8) / 16 % 256) as u32).collect();
+    LevelTables {
+        panel: resolution,
+        pattern: resolution,
+        origin: [0, 0],
+        interleaved: true,
+        field_order: Colour::ALL,
+        levels: PerColour([table(), table(), table()]),
+        flatness: PerColour([None, None, None]),
+    }
+}
+
+fn engine(weights: &Weights, resolution: Resolution) -> GpuEngine {
+    GpuEngine::open(weights, &linear_tables(resolution), Adapters::Software).expect("an engine")
+}
+
+/// Samples and hologram of a frame.
+fn rendered(engine: &mut GpuEngine, frame: &Arc<RgbdFrame>, pupil_mm: f32) -> (Vec<u16>, ComplexHologram) {
+    let mut samples = vec![9; 3 * frame.resolution.pixels()];
+    engine.render(frame, PupilDiameter::from_mm(pupil_mm), &mut samples).expect("a frame");
+    let mut hologram = ComplexHologram::dark(frame.resolution);
+    engine.read_hologram(&mut hologram).expect("its hologram");
+    (samples, hologram)
+}
+
+/// The hologram of a frame by an engine of its own.
+pub(in crate::engine) fn hologram_of(weights: &Weights, frame: &RgbdFrame, pupil_mm: f32) -> ComplexHologram {
+    rendered(&mut engine(weights, frame.resolution), &Arc::new(frame.clone()), pupil_mm).1
+}
+
+/// The largest difference relative to the largest value.
+fn field_error(actual: &[Complex32], expected: &[Complex64]) -> f64 {
+    assert_eq!(actual.len(), expected.len());
+    let largest = expected.iter().map(|value| value.norm()).fold(0.0, f64::max);
+    let differences = actual.iter().zip(expected).map(|(a, e)| (Complex64::new(a.re.into(), a.im.into()) - e).norm());
+    differences.fold(0.0, |worst, value| if value.is_nan() { f64::INFINITY } else { f64::max(worst, value) }) / largest
+}
+
+/// How many levels of a circle of 256 are farther apart than one.
+fn levels_apart(actual: &[u16], expected: &[u16]) -> usize {
+    assert_eq!(actual.len(), expected.len());
+    let apart = |(a, e): (&u16, &u16)| (2..255).contains(&(a.wrapping_sub(*e) & 0xff));
+    actual.iter().zip(expected).filter(|&pair| apart(pair)).count()
+}
+
+/// Largest difference of a hologram, relative to its largest value.
+const FIELD_TOLERANCE: f64 = 5e-5;
+
+/// The whole way on the device, against the reference in double precision and the processor's levels.
+fn check(weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32) {
+    let context = format!("{resolution} at {pupil_mm} mm");
+    let mut engine = engine(weights, resolution);
+    // What another frame and pupil leave behind must not show.
+    rendered(&mut engine, &Arc::new(frame(resolution, seed + 1)), 2.0);
+    let frame = Arc::new(frame(resolution, seed));
+    let (samples, hologram) = rendered(&mut engine, &frame, pupil_mm);
+
+    let mut expected = reference::run(weights, &frame, f64::from(pupil_mm)).field;
+    let error = field_error(&hologram.field, &expected);
+    assert!(error < FIELD_TOLERANCE, "{context}: {error}");
+    let middle = expected.len() / 2;
+    expected[middle].im += 1e-3 * expected.iter().map(|value| value.norm()).fold(0.0, f64::max);
+    assert!(field_error(&hologram.field, &expected) > FIELD_TOLERANCE, "{context}: the comparison is blind");
+
+    let mut on_cpu = ComplexHologram::dark(resolution);
+    CpuEngine::new(weights, resolution).unwrap().render(&frame, PupilDiameter::from_mm(pupil_mm), &mut on_cpu).unwrap();
+    let mut pattern = PhasePattern::flat(resolution);
+    DoublePhase::new(resolution, weights.config().amplitude_constant).encode(&on_cpu, &mut pattern);
+    let (mut expected, _) = self::samples(&linear_tables(resolution), &pattern.phase_rad);
+    let tolerated = expected.len() / 1000;
+    let apart = levels_apart(&samples, &expected);
+    assert!(apart <= tolerated, "{context}: {apart} of {} levels are more than one apart", samples.len());
+    expected.iter_mut().take(tolerated + 1).for_each(|level| *level ^= 0x80);
+    assert!(levels_apart(&samples, &expected) > tolerated, "{context}: the comparison of levels is blind");
+}
+
+#[test]
+fn the_built_in_networks_match_the_reference_at_both_ends_of_the_pupil_range() {
+    for weights in [Weights::builtin(), Weights::builtin_small()] {
+        for (width, height, pupil_mm) in [(64, 48, 1.0), (37, 61, 5.0)] {
+            check(&weights, Resolution { width, height }, pupil_mm, 3);
+        }
+    }
+}
+
+/// The reference would take a minute.
+#[test]
+fn a_frame_of_256_pixels_each_way_is_the_processors() {
+    let (weights, resolution) = (Weights::builtin(), Resolution { width: 256, height: 256 });
+    let frame = frame(resolution, 5);
+    let mut on_cpu = ComplexHologram::dark(resolution);
+    CpuEngine::new(&weights, resolution).unwrap().render(&frame, PupilDiameter::from_mm(3.3), &mut on_cpu).unwrap();
+    let mut expected: Vec<Complex64> =
+        on_cpu.field.iter().map(|value| Complex64::new(value.re.into(), value.im.into())).collect();
+    let found = hologram_of(&weights, &frame, 3.3);
+    assert!(field_error(&found.field, &expected) < FIELD_TOLERANCE, "{}", field_error(&found.field, &expected));
+    expected[777].re += 1e-3;
+    assert!(field_error(&found.field, &expected) > FIELD_TOLERANCE, "the comparison is blind");
+}
+
+#[test]
+fn sizes_that_are_tiny_narrow_or_prime_match_the_reference() {
+    let expected_stack = random_weights(weights_tests::expected_stack_config(), 5);
+    let refined = NetworkConfig { refined_stack: true, ..weights_tests::expected_stack_config() };
+    let refined = random_weights(refined, 5);
+    let direct = random_weights(NetworkConfig { channels: 12, ..weights_tests::config() }, 5);
+    for (weights, width, height) in
+        [(&expected_stack, 1, 1), (&direct, 1, 1), (&refined, 1, 33), (&direct, 101, 5), (&expected_stack, 74, 22)]
+    {
+        check(weights, Resolution { width, height }, 3.3, 9);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(3))]
+    #[test]
+    fn networks_of_any_shape_match_the_reference(
+        width in 1usize..60,
+        height in 1usize..14,
+        channels in 1usize..40,
+        depth_layers in 2usize..7,
+        family in 0usize..4,
+        pupil_mm in 1.0f32..5.0,
+        seed in 0u32..1000,
+    ) {
+        let config = match family {
+            0 => NetworkConfig { channels, depth_layers, ..weights_tests::expected_stack_config() },
+            1 => NetworkConfig { channels, depth_layers, refined_stack: true, ..weights_tests::expected_stack_config() },
+            2 => NetworkConfig { channels, ..weights_tests::config() },
+            _ => NetworkConfig { channels, grid: Grid::Full, ..weights_tests::config() },
+        };
+        check(&random_weights(config, u64::from(seed)), Resolution { width, height }, pupil_mm, seed);
+    }
+}
+
+#[test]
+fn pupils_beyond_the_trained_ones_are_the_nearest_and_a_frame_is_the_same_each_time() {
+    let weights = random_weights(weights_tests::expected_stack_config(), 2);
+    let resolution = Resolution { width: 31, height: 18 };
+    let mut engine = engine(&weights, resolution);
+    let frame = Arc::new(frame(resolution, 4));
+    let first = rendered(&mut engine, &frame, 5.0);
+    for (given_mm, same) in [(1.5, false), (9.0, true), (0.2, false), (5.0, true)] {
+        assert_eq!(rendered(&mut engine, &frame, given_mm) == first, same, "{given_mm} mm");
+    }
+    assert_eq!(rendered(&mut engine, &frame, 0.2), rendered(&mut engine, &frame, 1.0));
+    let names: Vec<&str> = engine.last_timings().stages.iter().map(|stage| stage.name.as_str()).collect();
+    assert_eq!((names[0], names[names.len() - 1]), ("expected stack", "panel levels"));
+}
+
+#[test]
+fn what_is_no_number_leaves_no_trace_in_the_next_frame() {
+    let resolution = Resolution { width: 31, height: 18 };
+    let direct = random_weights(NetworkConfig { channels: 8, ..weights_tests::config() }, 2);
+    for weights in [direct, Weights::builtin_small()] {
+        let mut engine = engine(&weights, resolution);
+        let given = |spoil: &dyn Fn(&mut RgbdFrame)| {
+            let mut frame = frame(resolution, 4);
+            spoil(&mut frame);
+            Arc::new(frame)
+        };
+        let clean = rendered(&mut engine, &given(&|_| ()), 3.0);
+        for (pixel, spoiler) in [(0, f32::NAN), (30, f32::INFINITY), (31 * 18 - 1, f32::NEG_INFINITY)] {
+            let spoilt = rendered(&mut engine, &given(&|frame| frame.amplitude[pixel] = spoiler), 3.0);
+            assert_ne!(spoilt.0, clean.0, "pixel {pixel} is not seen");
+            assert_eq!(rendered(&mut engine, &given(&|_| ()), 3.0), clean, "pixel {pixel} left a trace");
+            rendered(&mut engine, &given(&|frame| frame.depth_normalised[pixel] = spoiler), 3.0);
+            assert_eq!(rendered(&mut engine, &given(&|_| ()), 3.0), clean, "the depth of pixel {pixel} left a trace");
+        }
+    }
+}
+
+#[test]
+fn wrong_sizes_and_pupils_are_refused_and_a_lost_device_is_told() {
+    let weights = random_weights(weights_tests::config(), 2);
+    let resolution = Resolution { width: 8, height: 6 };
+    let mut engine = engine(&weights, resolution);
+    let mut samples = vec![0; 3 * resolution.pixels()];
+    let pupil = PupilDiameter::from_mm(3.0);
+    let wrong = Arc::new(frame(Resolution { width: 6, height: 8 }, 0));
+    assert!(matches!(engine.render(&wrong, pupil, &mut samples), Err(EngineError::Resolution { .. })));
+    let right = Arc::new(frame(resolution, 0));
+    for pupil_mm in [f32::NAN, f32::INFINITY, 0.0, -2.0] {
+        let refused = engine.render(&right, PupilDiameter::from_mm(pupil_mm), &mut samples);
+        assert!(matches!(refused, Err(EngineError::Pupil { .. })));
+    }
+    engine.render(&right, pupil, &mut samples).unwrap();
+    engine.lose_device();
+    let lost = engine.render(&right, pupil, &mut samples);
+    assert!(matches!(lost, Err(EngineError::Gpu(GpuError::Failed { .. }))), "{lost:?}");
+
+    let nothing = linear_tables(Resolution { width: 0, height: 4 });
+    let refused = GpuEngine::open(&weights, &nothing, Adapters::Software);
+    assert!(matches!(refused.err(), Some(EngineError::Empty { .. })));
+}
+
+#[test]
+fn a_size_whose_lines_do_not_fit_on_the_device_is_told_before_anything_is_made() {
+    let resolution = Resolution { width: 40_000, height: 2 };
+    let limits = WorkgroupLimits { bytes: 16 << 10, threads: 256 };
+    let refused = super::network::NetworkPlan::new(&Weights::builtin_small(), &linear_tables(resolution), limits);
+    let text = refused.err().expect("no workgroup holds such a line").to_string();
+    assert!(text.contains("20000") && text.contains("16384") && text.contains("--backend cpu"), "{text}");
 }

@@ -1,7 +1,10 @@
 //! Runs a plan on Mesa's software device, for tests.
 
-use super::map::{GROUP, Map};
-use super::plan::{BufferId, Plan};
+use half::f16;
+use num_complex::Complex64;
+
+use super::map::{GROUP, Map, Precision};
+use super::plan::{BufferId, Dispatch, Plan};
 use crate::gpu::{Adapters, Gpu};
 
 /// Numbers behind each buffer, not finite, which no shader may read or write.
@@ -12,8 +15,10 @@ pub(super) struct Trial {
     gpu: Gpu,
     /// Each with a guard behind it.
     buffers: Vec<wgpu::Buffer>,
-    work: Vec<(wgpu::ComputePipeline, wgpu::BindGroup, [u32; 3])>,
+    stages: Vec<(String, Vec<Work>)>,
 }
+
+type Work = (wgpu::ComputePipeline, wgpu::BindGroup, [u32; 3]);
 
 impl Trial {
     pub(super) fn new(plan: &Plan) -> Self {
@@ -30,21 +35,16 @@ impl Trial {
                 device_buffer
             })
             .collect();
-        let dispatches = plan.stages.iter().flat_map(|stage| &stage.dispatches);
-        let work = dispatches.map(|dispatch| {
-            let pipeline = gpu.pipeline(&dispatch.shader.label, &dispatch.shader.source).expect("a shader");
-            let entries: Vec<_> = dispatch
-                .bindings
-                .iter()
-                .map(|&(binding, id)| wgpu::BindGroupEntry { binding, resource: buffers[id.0].as_entire_binding() })
-                .collect();
-            let layout = pipeline.get_bind_group_layout(0);
-            let descriptor = wgpu::BindGroupDescriptor { label: None, layout: &layout, entries: &entries };
-            let group = gpu.device.create_bind_group(&descriptor);
-            (pipeline, group, dispatch.workgroups)
-        });
-        let work = work.collect();
-        Self { gpu, buffers, work }
+        let work = |Dispatch { shader, bindings, workgroups, .. }: &Dispatch| {
+            let pipeline = gpu.trusted_pipeline(&shader.label, &shader.source, shader.entry).expect("a shader");
+            let bound: Vec<_> = bindings.iter().map(|&(binding, id)| (binding, &buffers[id.0])).collect();
+            let group = gpu.bind_at(&pipeline, &bound);
+            gpu.check().expect("buffers that the shader takes");
+            (pipeline, group, *workgroups)
+        };
+        let stages = plan.stages.iter();
+        let stages = stages.map(|stage| (stage.name.clone(), stage.dispatches.iter().map(work).collect())).collect();
+        Self { gpu, buffers, stages }
     }
 
     pub(super) fn write(&self, buffer: BufferId, values: &[f32]) {
@@ -53,24 +53,36 @@ impl Trial {
         self.gpu.queue.write_buffer(buffer, 0, bytemuck::cast_slice(values));
     }
 
-    /// Runs all dispatches and waits for them.
+    /// Runs all stages and waits for them.
     pub(super) fn run(&self) {
+        self.run_stages(|_| true);
+    }
+
+    /// Runs one stage and waits for it.
+    pub(super) fn run_stage(&self, name: &str) {
+        assert!(self.stages.iter().any(|(stage, _)| stage == name), "no stage {name}");
+        self.run_stages(|stage| stage == name);
+    }
+
+    fn run_stages(&self, chosen: impl Fn(&str) -> bool) {
         let mut encoder = self.gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
         {
             let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
-            for (pipeline, group, [x, y, z]) in &self.work {
+            let stages = self.stages.iter().filter(|(name, _)| chosen(name));
+            for (pipeline, group, [x, y, z]) in stages.flat_map(|(_, work)| work) {
                 pass.set_pipeline(pipeline);
                 pass.set_bind_group(0, group, &[]);
                 pass.dispatch_workgroups(*x, *y, *z);
             }
         }
         self.gpu.wait(self.gpu.queue.submit([encoder.finish()])).expect("work that ends");
+        self.gpu.check().expect("a device without faults");
     }
 
     /// What a buffer holds; the guard behind it is as it was.
     pub(super) fn read(&self, buffer: BufferId) -> Vec<f32> {
         let buffer = &self.buffers[buffer.0];
-        let mut values = vec![0.0; (buffer.size() / 4) as usize];
+        let mut values = vec![0.0f32; (buffer.size() / 4) as usize];
         self.gpu.read(buffer, &mut values).expect("the buffer's values");
         let guard = values.split_off(values.len() - GUARD);
         assert!(guard.iter().all(|value| value.is_nan()), "a shader wrote behind a buffer");
@@ -83,12 +95,18 @@ impl Map {
         (((y + 1) * self.groups + channel / GROUP) * self.pitch() + x + 1) * GROUP + channel % GROUP
     }
 
-    /// What the map's buffer holds where channel c of pixel (x, y) is `value(c, y, x)`.
+    /// What the map's buffer holds, as 32-bit words, where channel c of pixel (x, y) is `value(c, y, x)`.
     pub(super) fn values(&self, value: impl Fn(usize, usize, usize) -> f32) -> Vec<f32> {
         let rows = self.height.next_multiple_of(super::map::ROWS) + 2;
         let mut values = vec![0.0; rows * self.groups * self.pitch() * GROUP];
         self.for_each(|channel, y, x| values[self.place(channel, y, x)] = value(channel, y, x));
-        values
+        match self.precision {
+            Precision::F32 => values,
+            Precision::F16 => {
+                let half: Vec<_> = values.iter().map(|&value| f16::from_f32(value).to_bits()).collect();
+                bytemuck::cast_slice(&half).to_vec()
+            }
+        }
     }
 
     fn for_each(&self, mut visit: impl FnMut(usize, usize, usize)) {
@@ -99,7 +117,13 @@ impl Map {
 
     /// [channels, height, width] of the first `channels` of `values`; the border and the rows below are zero.
     pub(super) fn planes(&self, values: &[f32], channels: usize) -> Vec<f32> {
-        let mut rest = values.to_vec();
+        let mut rest = match self.precision {
+            Precision::F32 => values.to_vec(),
+            Precision::F16 => {
+                let half: &[u16] = bytemuck::cast_slice(values);
+                half.iter().map(|&bits| f16::from_bits(bits).to_f32()).collect()
+            }
+        };
         let mut planes = Vec::new();
         self.for_each(|channel, y, x| {
             let value = std::mem::take(&mut rest[self.place(channel, y, x)]);
@@ -110,4 +134,19 @@ impl Map {
         assert!(rest.iter().all(|&value| value == 0.0), "a shader wrote to a map's border");
         planes
     }
+}
+
+/// What a buffer of complex numbers holds.
+pub(super) fn complex(values: &[f32]) -> Vec<Complex64> {
+    values.chunks_exact(2).map(|parts| Complex64::new(parts[0].into(), parts[1].into())).collect()
+}
+
+/// The largest difference relative to the largest value expected; infinite where anything is no number.
+pub(super) fn largest_difference(found: &[Complex64], expected: &[Complex64]) -> f64 {
+    assert_eq!(found.len(), expected.len());
+    let largest = |values: &mut dyn Iterator<Item = f64>| {
+        values.fold(0.0, |worst: f64, value| if value.is_nan() { f64::INFINITY } else { worst.max(value) })
+    };
+    let difference = largest(&mut found.iter().zip(expected).map(|(found, expected)| (found - expected).norm()));
+    difference / largest(&mut expected.iter().map(|value| value.norm())).max(1e-6)
 }

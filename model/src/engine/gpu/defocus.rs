@@ -1,0 +1,98 @@
+//! What an eye should see at each depth layer, for `defocus.wgsl`.
+
+use std::f64::consts::PI;
+
+use super::expected_stack::Grid;
+use super::fft::Lines;
+use super::map::{GROUP, Map};
+use super::maps::{InputChannels, grid_constants, plane_bytes, sample_pitch};
+use super::network::Shared;
+use super::plan::{BufferId, Constant, Plan};
+use crate::weights::NetworkConfig;
+
+/// Entries of the disc's table to a unit of its argument: linear interpolation is then within 5e-7.
+const TABLE_DENSITY: f64 = 256.0;
+/// The largest argument of that table: beyond it a disc's spectrum is below 1e-5.
+const LARGEST_ARGUMENT: f64 = 4096.0;
+/// White with red, and green with blue: real pictures, two to a complex transform.
+const PAIRS: usize = 2;
+/// Foci whose spectra a thread holds at once; where there are more layers, these are transformed anew for each so many.
+const MOST_FOCI: usize = 8;
+/// Samples of each of these that a thread holds.
+const BLUR_ITEMS: usize = 5;
+/// Samples that a thread holds of the rows of a frame, and of the colours at four foci.
+const ROW_ITEMS: usize = 4;
+
+/// Planes of complex numbers on the network's grid that the stage needs as scratch.
+pub(super) fn scratch_planes(depth_layers: usize) -> usize {
+    let buffers = if depth_layers > MOST_FOCI { 2 } else { 1 };
+    buffers * PAIRS * depth_layers
+}
+
+/// Adds the stage `expected stack`, which writes the layers of each block's corners, the stack, and to `inputs` the frame's
+/// maps and the stack.
+pub(super) fn expect(
+    plan: &mut Plan,
+    config: &NetworkConfig,
+    shared: &Shared,
+    grid: &Grid,
+    layer_of: BufferId,
+    stack: BufferId,
+    inputs: &Map,
+) {
+    let (count, size) = (config.depth_layers, shared.size);
+    let optics = config.optics.geometry(size);
+    let layer_dpt = (optics.depth_near.0 - optics.depth_far.0) / count as f64;
+    let sample_rad = sample_pitch(&optics).0 / optics.eyepiece_focal_length.0;
+    // π times the diameter of the disc that blurs a layer's neighbour, samples to a millimetre of pupil.
+    let argument_per_mm = PI * layer_dpt * 1e-3 / sample_rad;
+    // No frequency is higher than half a cycle a sample each way.
+    let largest = argument_per_mm * f64::from(config.pupil_range_mm[1]) * count as f64 * 0.5f64.sqrt();
+    let disc = |entry: usize| match entry as f64 / TABLE_DENSITY {
+        0.0 => 1.0,
+        x => (2.0 * libm::j1(x) / x) as f32,
+    };
+    let entries = (largest.min(LARGEST_ARGUMENT) * TABLE_DENSITY) as usize + 2;
+    let disc_table = plan.table("the spectrum of a disc", &(0..entries).map(disc).collect::<Vec<f32>>());
+
+    let foci = count.min(MOST_FOCI);
+    let first_part = InputChannels::new(count).field;
+    let constants: Vec<(&str, Constant)> = grid_constants(shared.resolution, size)
+        .into_iter()
+        .chain(inputs.constants(["INPUT_GROUPS", "INPUT_PITCH"]))
+        .chain([
+            ("LAYERS", count.into()),
+            ("FOCI", foci.into()),
+            ("FIRST_SEEN", (scratch_planes(count) - PAIRS * count).into()),
+            ("FIRST_PART_GROUPS", (first_part / GROUP).into()),
+            ("DISC_ENTRIES", entries.into()),
+            ("ENTRIES_PER_MM", ((argument_per_mm * TABLE_DENSITY) as f32).into()),
+        ])
+        .collect();
+    let files = [include_str!("blocks.wgsl"), include_str!("maps.wgsl"), include_str!("defocus.wgsl")];
+    let shader = |lines: &Lines, entry| lines.shader(&format!("defocus: {entry}"), &constants, &files, entry);
+    let (rows, columns) = (grid.rows.rows(ROW_ITEMS), grid.columns.columns(BLUR_ITEMS));
+    let (row_groups, column_groups) = (rows.workgroups(size.height), columns.workgroups(size.width));
+    let [complex, real, group] = plane_bytes(size);
+    let (chunks, spectra) = (count.div_ceil(foci), (PAIRS * count) as u64 * complex);
+    let frame_bytes = (4 * size_of::<f32>() * shared.resolution.pixels()) as u64;
+    let stage = plan.stage("expected stack", 0);
+    let take_layers = stage.dispatch_with(
+        shader(&rows, "take_layers"),
+        &[rows.turns(), (1, shared.frame), (2, shared.pupil), (3, layer_of), (4, grid.spectra), (7, inputs.buffer)],
+        [row_groups, 1, 1],
+    );
+    take_layers.bytes = Some(frame_bytes + real + spectra + 5 * group);
+    let blur = stage.dispatch_with(
+        shader(&columns, "blur"),
+        &[columns.turns(), (2, shared.pupil), (4, grid.spectra), (5, disc_table)],
+        [column_groups, PAIRS, chunks],
+    );
+    blur.bytes = Some((chunks as u64 + 1) * spectra);
+    let see = stage.dispatch_with(
+        shader(&rows, "see"),
+        &[rows.turns(), (2, shared.pupil), (4, grid.spectra), (6, stack), (7, inputs.buffer)],
+        [row_groups, 1 + (count - 1).div_ceil(4), 1],
+    );
+    see.bytes = Some(spectra + 3 * count as u64 * real + (first_part / GROUP - 5) as u64 * group);
+}

@@ -1,0 +1,147 @@
+// The light of the depth layers, and how it goes to the SLM plane, as depth_layers.rs and expected_stack.rs have it.
+//
+// Before this file: fft.wgsl, phase_math.wgsl, pupil.wgsl and the constants of depth_layers.rs.
+
+const PIXELS = WIDTH * HEIGHT;
+// Of the first net's changes, in the amplitudes.
+const REFINED_SHARE = 0.3f;
+
+// The first net's: for each layer a group of three phases over π and a mask, then the changes of the amplitudes.
+@group(0) @binding(1) var<storage, read> outputs: array<vec4f>;
+// [layers, 3, height, width]: the amplitudes that an eye should see, which are refined here.
+@group(0) @binding(2) var<storage, read_write> stack: array<f32>;
+@group(0) @binding(3) var<storage, read_write> spectra: array<vec2f>; // [layers, 3, height, width]
+// [3, height, width]: transfer functions from one layer to the next nearer one, and from the nearest to the SLM plane,
+// the latter over the number of samples.
+@group(0) @binding(4) var<storage, read> step_nearer: array<vec2f>;
+@group(0) @binding(5) var<storage, read> back: array<vec2f>;
+@group(0) @binding(6) var<storage, read> pupil_mm: f32;
+// [3, height, width]: the spectrum of what arrives at the SLM plane, over the number of samples, and that itself.
+@group(0) @binding(7) var<storage, read_write> carried_spectrum: array<vec2f>;
+@group(0) @binding(8) var<storage, read_write> carried: array<vec2f>;
+
+fn output_place(group: u32, x: u32, y: u32) -> u32 {
+    return ((y + 1u) * OUTPUT_GROUPS + group) * OUTPUT_PITCH + x + 1u;
+}
+
+// Rows of the light that one layer sends out, to spectra along x.
+@compute @workgroup_size(THREADS)
+fn light(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
+    thread = index;
+    let layer = group.y;
+    var half_turns: array<vec3f, ITEMS>;
+    var masks: array<f32, ITEMS>;
+    for (var item = 0u; item < ITEMS; item++) {
+        let place = item * THREADS + thread;
+        let y = group.x * LINES + place % LINES;
+        if (place < PLACES && y < HEIGHT) {
+            let lit = outputs[output_place(layer, place / LINES, y)];
+            half_turns[item] = lit.xyz;
+            masks[item] = 1f / (1f + exp(MASK_OFFSET - lit.w));
+        }
+    }
+    for (var colour = 0u; colour < 3u; colour++) {
+        let channel = 3u * layer + colour;
+        for (var item = 0u; item < ITEMS; item++) {
+            let place = item * THREADS + thread;
+            let x = place / LINES;
+            let y = group.x * LINES + place % LINES;
+            if (place < PLACES && y < HEIGHT) {
+                var wanted = stack[(channel * HEIGHT + y) * WIDTH + x];
+                if (REFINES) {
+                    let change = outputs[output_place(LAYERS + channel / 4u, x, y)][channel % 4u];
+                    wanted = max(wanted + REFINED_SHARE * change, 0f);
+                    stack[(channel * HEIGHT + y) * WIDTH + x] = wanted;
+                }
+                line[place] = masks[item] * wanted * cos_sin_pi(half_turns[item][colour]);
+            }
+        }
+        transform(FORWARD);
+        for (var item = 0u; item < ITEMS; item++) {
+            let place = item * THREADS + thread;
+            let y = group.x * LINES + place % LINES;
+            if (place < PLACES && y < HEIGHT) {
+                spectra[(channel * HEIGHT + y) * WIDTH + place / LINES] = line[place];
+            }
+        }
+    }
+}
+
+// Columns of one colour: from spectra along x of all layers' light to that, along x too, of what arrives of it at the SLM
+// plane, in the place of the farthest layer's. Where STOPS, it has gone through the pupil.
+@compute @workgroup_size(THREADS)
+fn bring_back(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
+    thread = index;
+    let colour = group.y;
+    var steps: array<vec2f, ITEMS>;
+    for (var item = 0u; item < ITEMS; item++) {
+        let place = item * THREADS + thread;
+        let x = group.x * LINES + place % LINES;
+        if (place < PLACES && x < WIDTH) {
+            steps[item] = step_nearer[(colour * HEIGHT + place / LINES) * WIDTH + x];
+        }
+    }
+    // Horner's rule, far to near.
+    var sums: array<vec2f, ITEMS>;
+    for (var layer = 0u; layer < LAYERS; layer++) {
+        for (var item = 0u; item < ITEMS; item++) {
+            let place = item * THREADS + thread;
+            let x = group.x * LINES + place % LINES;
+            if (place < PLACES && x < WIDTH) {
+                line[place] = spectra[((3u * layer + colour) * HEIGHT + place / LINES) * WIDTH + x];
+            }
+        }
+        transform(FORWARD);
+        for (var item = 0u; item < ITEMS; item++) {
+            let place = item * THREADS + thread;
+            if (place < PLACES) {
+                sums[item] = times(sums[item], steps[item]) + line[place];
+            }
+        }
+    }
+    for (var item = 0u; item < ITEMS; item++) {
+        let place = item * THREADS + thread;
+        let x = group.x * LINES + place % LINES;
+        let y = place / LINES;
+        if (place < PLACES && x < WIDTH) {
+            let there = (colour * HEIGHT + y) * WIDTH + x;
+            var arriving = times(sums[item], back[there]);
+            if (STOPS) {
+                arriving = select(vec2f(), arriving, passes_pupil(x, y, colour, pupil_mm));
+            } else {
+                carried_spectrum[there] = arriving;
+            }
+            line[place] = arriving;
+        }
+    }
+    transform(INVERSE);
+    for (var item = 0u; item < ITEMS; item++) {
+        let place = item * THREADS + thread;
+        let x = group.x * LINES + place % LINES;
+        if (place < PLACES && x < WIDTH) {
+            spectra[(colour * HEIGHT + place / LINES) * WIDTH + x] = line[place];
+        }
+    }
+}
+
+// Rows of what arrives at the SLM plane in one colour, from spectra along x.
+@compute @workgroup_size(THREADS)
+fn arrive(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
+    thread = index;
+    let colour = group.y;
+    for (var item = 0u; item < ITEMS; item++) {
+        let place = item * THREADS + thread;
+        let y = group.x * LINES + place % LINES;
+        if (place < PLACES && y < HEIGHT) {
+            line[place] = spectra[(colour * HEIGHT + y) * WIDTH + place / LINES];
+        }
+    }
+    transform(INVERSE);
+    for (var item = 0u; item < ITEMS; item++) {
+        let place = item * THREADS + thread;
+        let y = group.x * LINES + place % LINES;
+        if (place < PLACES && y < HEIGHT) {
+            carried[(colour * HEIGHT + y) * WIDTH + place / LINES] = line[place];
+        }
+    }
+}

@@ -1,0 +1,278 @@
+//! A plan on a device, frame after frame.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use holod_calibration::{LevelTables, PupilDiameter};
+use wgpu::{BufferUsages, QuerySet};
+
+use super::fft::WorkgroupLimits;
+use super::loaded_plan::LoadedPlan;
+use super::network::NetworkPlan;
+use super::plan::{BufferId, Stage};
+use crate::engine::{EngineError, StageTiming, StageTimings};
+use crate::gpu::{Adapters, Gpu, GpuError};
+use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
+
+/// Network, double phase and levels on the GPU, for frames of one size and one panel.
+pub struct GpuEngine {
+    gpu: Gpu,
+    network: NetworkPlan,
+    loaded: LoadedPlan,
+    timestamps: Option<Timestamps>,
+    timings: StageTimings,
+    readback: Readback,
+    /// The frame that the device has.
+    uploaded: Option<Arc<RgbdFrame>>,
+    /// The pupil that its weights are modulated for.
+    pupil_mm: f32,
+}
+
+/// What was lost between hologram and levels.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct EncodedCounts {
+    /// Samples of the hologram whose amplitude exceeded the double phase's constant.
+    pub clipped: u32,
+    /// Of each colour, pixels whose phase the panel cannot reach.
+    pub unreachable: [u32; 3],
+}
+
+/// When each stage began and ended, on the device.
+struct Timestamps {
+    queries: QuerySet,
+    resolved: wgpu::Buffer,
+    tick_ns: f32,
+}
+
+/// What comes back to the host with each frame: timestamps, counts and samples, one after the other.
+struct Readback {
+    staging: wgpu::Buffer,
+    timestamps_bytes: u64,
+    samples_bytes: u64,
+}
+
+/// Bytes of the counts.
+const COUNTS_BYTES: u64 = 16;
+const TIMESTAMP_BYTES: u64 = 8;
+
+impl GpuEngine {
+    /// An engine for frames of the pattern's size of `tables`, which may be odd.
+    ///
+    /// # Errors
+    /// There is no device, it lacks what the network needs at this size, or the size is nothing.
+    pub fn open(weights: &Weights, tables: &LevelTables, adapters: Adapters) -> Result<Self, EngineError> {
+        let gpu = Gpu::open(adapters)?;
+        Self::on(gpu, weights, tables)
+    }
+
+    pub(super) fn on(gpu: Gpu, weights: &Weights, tables: &LevelTables) -> Result<Self, EngineError> {
+        let limits = WorkgroupLimits { bytes: gpu.workgroup_bytes, threads: gpu.workgroup_threads };
+        let network = NetworkPlan::new(weights, tables, limits)?;
+        let plan = &network.plan;
+        let loaded = LoadedPlan::new(&gpu, plan)?;
+        let timestamps = match gpu.timestamp_ns {
+            Some(tick_ns) => Some(Timestamps::new(&gpu, plan.stages.len(), tick_ns)?),
+            None => None,
+        };
+        let samples_bytes = loaded.buffer(network.samples).size();
+        let timestamps_bytes = timestamps.as_ref().map_or(0, |timestamps| timestamps.resolved.size());
+        let staging = gpu.buffer(
+            "what comes back",
+            timestamps_bytes + COUNTS_BYTES + samples_bytes,
+            BufferUsages::MAP_READ | BufferUsages::COPY_DST,
+        )?;
+        let timing = |stage: &Stage| StageTiming {
+            name: stage.name.clone(),
+            duration: Duration::ZERO,
+            flop: stage.flop,
+            bytes: 0,
+        };
+        Ok(Self {
+            timings: StageTimings { stages: plan.stages.iter().map(timing).collect() },
+            readback: Readback { staging, timestamps_bytes, samples_bytes },
+            gpu,
+            network,
+            loaded,
+            timestamps,
+            uploaded: None,
+            pupil_mm: f32::NAN,
+        })
+    }
+
+    /// The device's name, as its driver has it.
+    pub fn device(&self) -> &str {
+        self.gpu.name()
+    }
+
+    /// Writes the samples of the hologram of `frame` for an eye with `pupil` to `samples`, as the panel takes them.
+    ///
+    /// A pupil outside the range that the weights were trained for is taken as the nearest one inside. The frame is sent
+    /// to the device once, however often it is rendered.
+    ///
+    /// # Errors
+    /// [`EngineError`] for a frame of another size than the engine's, a pupil that is no positive length, and a device
+    /// that fails; that engine will not render again.
+    ///
+    /// # Panics
+    /// Where `samples` is not of the panel's size.
+    pub fn render(
+        &mut self,
+        frame: &Arc<RgbdFrame>,
+        pupil: PupilDiameter,
+        samples: &mut [u16],
+    ) -> Result<EncodedCounts, EngineError> {
+        let expected = self.network.shared.resolution;
+        if frame.resolution != expected {
+            return Err(EngineError::Resolution { what: "the frame", found: frame.resolution, expected });
+        }
+        if !(pupil.mm() > 0.0 && pupil.mm().is_finite()) {
+            return Err(EngineError::Pupil { pupil_mm: pupil.mm() });
+        }
+        self.send(frame, pupil);
+        let submission = self.submit();
+        Ok(self.receive(submission, samples)?)
+    }
+
+    /// Sends what has changed since the last frame.
+    fn send(&mut self, frame: &Arc<RgbdFrame>, pupil: PupilDiameter) {
+        let Self { gpu, network, loaded, uploaded, .. } = self;
+        if uploaded.as_ref().is_none_or(|uploaded| !Arc::ptr_eq(uploaded, frame)) {
+            let on_device = loaded.buffer(network.shared.frame);
+            let amplitude: &[u8] = bytemuck::cast_slice(&frame.amplitude);
+            gpu.queue.write_buffer(on_device, 0, amplitude);
+            gpu.queue.write_buffer(on_device, amplitude.len() as u64, bytemuck::cast_slice(&frame.depth_normalised));
+            *uploaded = Some(Arc::clone(frame));
+        }
+        let [least_mm, most_mm] = network.pupil_range_mm;
+        let pupil_mm = pupil.mm().clamp(least_mm, most_mm);
+        if self.pupil_mm != pupil_mm {
+            gpu.queue.write_buffer(loaded.buffer(network.shared.pupil), 0, bytemuck::bytes_of(&pupil_mm));
+            for modulated in &mut network.modulated {
+                let buffer = loaded.buffer(modulated.buffer);
+                if let Some(parameters) = modulated.change_to(pupil_mm) {
+                    gpu.queue.write_buffer(buffer, 0, bytemuck::cast_slice(parameters));
+                }
+            }
+            self.pupil_mm = pupil_mm;
+        }
+    }
+
+    /// Hands one frame's work to the device.
+    fn submit(&mut self) -> wgpu::SubmissionIndex {
+        let Self { gpu, network, loaded, timestamps, timings, readback, .. } = self;
+        let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let [clipped, unreachable] = [network.clipped, network.unreachable].map(|id| loaded.buffer(id));
+        encoder.clear_buffer(clipped, 0, None);
+        encoder.clear_buffer(unreachable, 0, None);
+        loaded.encode(&mut encoder, |stage| timestamps.as_ref().map(|timestamps| timestamps.of_stage(stage)));
+        let Readback { staging, timestamps_bytes, samples_bytes } = readback;
+        if let Some(Timestamps { queries, resolved, .. }) = timestamps {
+            encoder.resolve_query_set(queries, 0..2 * timings.stages.len() as u32, resolved, 0);
+            encoder.copy_buffer_to_buffer(resolved, 0, staging, 0, *timestamps_bytes);
+        }
+        encoder.copy_buffer_to_buffer(clipped, 0, staging, *timestamps_bytes, 4);
+        encoder.copy_buffer_to_buffer(unreachable, 0, staging, *timestamps_bytes + 4, 12);
+        let place = *timestamps_bytes + COUNTS_BYTES;
+        encoder.copy_buffer_to_buffer(loaded.buffer(network.samples), 0, staging, place, *samples_bytes);
+        gpu.queue.submit([encoder.finish()])
+    }
+
+    /// Waits for a frame, and takes what it has written.
+    fn receive(&mut self, submission: wgpu::SubmissionIndex, samples: &mut [u16]) -> Result<EncodedCounts, GpuError> {
+        let Self { gpu, timestamps, timings, readback: Readback { staging, timestamps_bytes, .. }, .. } = self;
+        // Whether it can be read is asked below.
+        staging.map_async(wgpu::MapMode::Read, .., |_| ());
+        gpu.wait(submission)?;
+        let view = staging.get_mapped_range(..).map_err(|error| gpu.failed(error))?;
+        let (ticks, rest) = view.split_at(*timestamps_bytes as usize);
+        let (counts, written) = rest.split_at(COUNTS_BYTES as usize);
+        // Of an odd number of samples the last word holds one only.
+        let written: &[u16] = bytemuck::cast_slice(written);
+        assert_eq!(samples.len().next_multiple_of(2), written.len(), "the samples of one panel");
+        samples.copy_from_slice(&written[..samples.len()]);
+        let counts: &[u32] = bytemuck::cast_slice(counts);
+        let counts = EncodedCounts { clipped: counts[0], unreachable: [counts[1], counts[2], counts[3]] };
+        if let Some(Timestamps { tick_ns, .. }) = timestamps {
+            let ticks: &[u64] = bytemuck::cast_slice(ticks);
+            for (timing, ticks) in timings.stages.iter_mut().zip(ticks.chunks_exact(2)) {
+                let elapsed = ticks[1].saturating_sub(ticks[0]) as f64 * f64::from(*tick_ns);
+                timing.duration = Duration::from_nanos(elapsed as u64);
+            }
+        }
+        drop(view);
+        staging.unmap();
+        Ok(counts)
+    }
+
+    /// Where the device's time for the last frame went; zeros where it has no timestamps.
+    pub fn last_timings(&self) -> &StageTimings {
+        &self.timings
+    }
+
+    /// Copies the last frame's hologram, before double phase, to the host.
+    ///
+    /// # Errors
+    /// The device fails.
+    ///
+    /// # Panics
+    /// Where `hologram` has another size.
+    pub fn read_hologram(&self, hologram: &mut ComplexHologram) -> Result<(), GpuError> {
+        assert_eq!(hologram.resolution, self.network.shared.resolution, "a hologram of the engine's size");
+        self.read_complex(self.network.shared.field, &mut hologram.field)
+    }
+
+    /// Copies the last frame's phases, after double phase, to the host.
+    ///
+    /// # Errors
+    /// The device fails.
+    ///
+    /// # Panics
+    /// Where `pattern` has another size.
+    pub fn read_pattern(&self, pattern: &mut PhasePattern) -> Result<(), GpuError> {
+        assert_eq!(pattern.resolution, self.network.shared.resolution, "a pattern of the engine's size");
+        self.gpu.read(self.loaded.buffer(self.network.phases), &mut pattern.phase_rad)
+    }
+
+    pub(super) fn read_complex(&self, id: BufferId, values: &mut [num_complex::Complex32]) -> Result<(), GpuError> {
+        let mut pairs = vec![[0.0f32; 2]; values.len()];
+        self.gpu.read(self.loaded.buffer(id), &mut pairs)?;
+        for (value, [re, im]) in values.iter_mut().zip(pairs) {
+            *value = num_complex::Complex32::new(re, im);
+        }
+        Ok(())
+    }
+
+    /// As if the driver had lost the device: what a test of recovery asks for.
+    #[doc(hidden)]
+    pub fn lose_device(&self) {
+        self.gpu.device.destroy();
+    }
+
+    /// As many bytes as the engine's buffers have on the device.
+    pub fn device_bytes(&self) -> u64 {
+        self.loaded.bytes()
+    }
+}
+
+impl Timestamps {
+    fn new(gpu: &Gpu, stages: usize, tick_ns: f32) -> Result<Self, GpuError> {
+        let count = 2 * stages as u32;
+        let queries = gpu.device.create_query_set(&wgpu::QuerySetDescriptor {
+            label: Some("stages"),
+            ty: wgpu::QueryType::Timestamp,
+            count,
+        });
+        let bytes = u64::from(count) * TIMESTAMP_BYTES;
+        let resolved = gpu.buffer("timestamps", bytes, BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC)?;
+        Ok(Self { queries, resolved, tick_ns })
+    }
+
+    fn of_stage(&self, index: usize) -> wgpu::ComputePassTimestampWrites<'_> {
+        let first = 2 * index as u32;
+        wgpu::ComputePassTimestampWrites {
+            query_set: &self.queries,
+            beginning_of_pass_write_index: Some(first),
+            end_of_pass_write_index: Some(first + 1),
+        }
+    }
+}

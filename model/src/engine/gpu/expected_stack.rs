@@ -1,0 +1,321 @@
+//! The stages of the `expected-stack` family that are no nets: what an eye should see, its light carried to the SLM plane,
+//! and what that lacks fed back.
+
+use super::defocus;
+use super::depth_layers::DepthLayers;
+use super::feedback;
+use super::fft::{LineFft, WorkgroupLimits};
+use super::map::Map;
+use super::network::Shared;
+use super::plan::{BufferId, Plan};
+use crate::gpu::GpuError;
+use crate::weights::{Feedback, NetworkConfig};
+
+/// Transforms on the network's grid.
+pub(super) struct Grid {
+    pub(super) rows: LineFft,
+    pub(super) columns: LineFft,
+    /// Scratch: planes of complex numbers.
+    pub(super) spectra: BufferId,
+}
+
+/// What these stages have in common.
+pub(crate) struct ExpectedStack<'a> {
+    config: &'a NetworkConfig,
+    shared: Shared,
+    grid: Grid,
+    layers: DepthLayers,
+    /// The depth layers of each block's corners, a byte each, [height, width].
+    layer_of: BufferId,
+    /// [layers, 3, height, width]: the amplitudes that an eye should see, once the layers are lit as the first net corrects
+    /// them.
+    stack: BufferId,
+}
+
+impl<'a> ExpectedStack<'a> {
+    /// Adds the stage `expected stack`, which writes the maps of the frame and what an eye should see to the channels of
+    /// `inputs` that the first net reads.
+    ///
+    /// # Errors
+    /// A row or a column does not fit in a workgroup's memory.
+    pub(crate) fn expect(
+        plan: &mut Plan,
+        config: &'a NetworkConfig,
+        shared: &Shared,
+        inputs: &Map,
+        limits: WorkgroupLimits,
+    ) -> Result<Self, GpuError> {
+        let (size, count) = (shared.size, config.depth_layers);
+        let planes = defocus::scratch_planes(count).max(3 * count);
+        let grid = Grid {
+            rows: LineFft::new(plan, size.width, limits)?,
+            columns: LineFft::new(plan, size.height, limits)?,
+            spectra: plan.buffer::<[f32; 2]>("spectra of the layers", planes * size.pixels()),
+        };
+        let layers = DepthLayers::new(plan, config, shared);
+        let layer_of = plan.buffer::<u32>("depth layers of the pixels", size.pixels());
+        let stack = plan.buffer::<f32>("expected amplitudes", 3 * count * size.pixels());
+        defocus::expect(plan, config, shared, &grid, layer_of, stack, inputs);
+        Ok(Self { config, shared: *shared, grid, layers, layer_of, stack })
+    }
+
+    /// Adds the stage `light of the layers`; `outputs` is what the first net gives.
+    pub(crate) fn light(&self, plan: &mut Plan, outputs: &Map) {
+        self.layers.light(plan, self.config, &self.shared, &self.grid, self.stack, outputs);
+    }
+
+    /// Adds the stage `feedback`, which writes the other channels of `inputs`.
+    pub(crate) fn feed_back(&self, plan: &mut Plan, feedback: Feedback, inputs: &Map) {
+        let Self { config, shared, grid, layers, layer_of, stack } = self;
+        feedback::feed_back(plan, config, feedback, shared, grid, layers, [*layer_of, *stack], inputs);
+    }
+
+    /// [3, height, width]: the field at the SLM plane, after each of the last two stages.
+    pub(crate) fn carried(&self) -> BufferId {
+        self.layers.carried
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use holod_calibration::Resolution;
+    use num_complex::Complex64;
+    use proptest::prelude::*;
+
+    use super::super::map::GROUP;
+    use super::super::maps::InputChannels;
+    use super::super::trial::{Trial, complex, largest_difference};
+    use super::super::upsample::{self, Low};
+    use super::*;
+    use crate::RgbdFrame;
+    use crate::engine::reference::{self, Trace, Value};
+    use crate::weights::tests::{expected_stack_config, random_weights};
+    use crate::weights::{Family, Grid, Weights};
+
+    const LIMITS: WorkgroupLimits = WorkgroupLimits { bytes: 32 << 10, threads: 512 };
+    /// Largest difference allowed from the reference, relative to the reference's largest value.
+    const TOLERANCE: f64 = 2e-5;
+
+    /// All stages but the nets, whose maps are written from outside.
+    struct Stages {
+        trial: Trial,
+        shared: Shared,
+        channels: InputChannels,
+        inputs: Map,
+        outputs: Map,
+        correction: Map,
+        carried: BufferId,
+    }
+
+    impl Stages {
+        fn new(weights: &Weights, resolution: Resolution, limits: WorkgroupLimits) -> Self {
+            let Family::ExpectedStack { feedback, .. } = weights.family else { panic!("weights of another family") };
+            let (config, plan) = (&weights.config, &mut Plan::default());
+            let size = Resolution { width: resolution.width.div_ceil(2), height: resolution.height.div_ceil(2) };
+            let shared = Shared::new(plan, resolution, size);
+            let channels = InputChannels::new(config.depth_layers);
+            let inputs = channels.map(plan, size);
+            let net = |plan: &mut Plan, what, channels| Map::new(plan, what, (size.width, size.height), channels);
+            let stages = ExpectedStack::expect(plan, config, &shared, &inputs, limits).expect("it fits");
+            let outputs = net(plan, "the first net's", config.lighting_channels());
+            stages.light(plan, &outputs);
+            stages.feed_back(plan, feedback, &inputs);
+            let correction = net(plan, "the second net's", 6);
+            let low = Low::Corrected(stages.carried(), &correction);
+            upsample::field(plan, &shared, Grid::HalfBand, low, limits).expect("it fits");
+            let carried = stages.carried();
+            Self { trial: Trial::new(plan), shared, channels, inputs, outputs, correction, carried }
+        }
+
+        fn show(&self, frame: &RgbdFrame, pupil_mm: f32) {
+            let planes = [&frame.amplitude[..], &frame.depth_normalised].concat();
+            self.trial.write(self.shared.frame, &planes);
+            self.trial.write(self.shared.pupil, &[pupil_mm]);
+        }
+
+        /// Channels of the nets' map, each zero where nothing is told in it.
+        fn told(&self, channels: &[usize]) -> Vec<Complex64> {
+            let all = self.inputs.groups * GROUP;
+            let planes = self.inputs.planes(&self.trial.read(self.inputs.buffer), all);
+            let pixels = self.shared.size.pixels();
+            let plane = |channel: usize| &planes[channel * pixels..][..pixels];
+            let used = self.channels.correction();
+            let mut padding = (0..all).filter(|channel| !used.contains(channel));
+            assert!(padding.all(|channel| plane(channel).iter().all(|&value| value == 0.0)), "padding is not zero");
+            channels.iter().flat_map(|&channel| plane(channel)).map(|&value| f64::from(value).into()).collect()
+        }
+
+        /// Writes what a net gives.
+        fn give(&self, map: &Map, given: &reference::Map) {
+            let value = |channel: usize, y: usize, x: usize| match channel < given.channels {
+                true => given.at(channel, y as isize, x as isize) as f32,
+                false => 0.0,
+            };
+            self.trial.write(map.buffer, &map.values(value));
+        }
+
+        fn complex(&self, buffer: BufferId) -> Vec<Complex64> {
+            complex(&self.trial.read(buffer))
+        }
+
+        /// The hologram, when the nets give what `trace` has.
+        fn run(&self, frame: &RgbdFrame, pupil_mm: f32, trace: &Trace) -> Vec<Complex64> {
+            self.show(frame, pupil_mm);
+            self.trial.run_stage("expected stack");
+            self.give(&self.outputs, given(trace, "lighting.layer_"));
+            self.trial.run_stage("light of the layers");
+            self.trial.run_stage("feedback");
+            self.give(&self.correction, given(trace, "correction.layer_"));
+            self.trial.run_stage("field");
+            self.complex(self.shared.field)
+        }
+    }
+
+    /// The last map whose name begins so.
+    fn given<'a>(trace: &'a Trace, name: &str) -> &'a reference::Map {
+        let map = |stage: &'a reference::Stage| match &stage.value {
+            Value::Encoded(map) | Value::Layer(map, _) if stage.name.starts_with(name) => Some(map),
+            _ => None,
+        };
+        trace.stages.iter().rev().find_map(map).expect("a stage of that name")
+    }
+
+    fn frame(resolution: Resolution, seed: u32) -> RgbdFrame {
+        let noise = |index: usize| {
+            let mixed = (index as u32).wrapping_mul(0x9E37_79B9) ^ seed.wrapping_mul(0x85EB_CA6B);
+            f64::from((mixed ^ (mixed >> 15)).wrapping_mul(0x2C1B_3C6D) >> 8) / f64::from(1 << 24)
+        };
+        // A little is outside 0 to 1, and both ends are met exactly.
+        let depth = |index: usize| match index % 7 {
+            3 => 1.0,
+            5 => 0.0,
+            _ => (1.2 * noise(index + 77_777) - 0.1) as f32,
+        };
+        RgbdFrame {
+            resolution,
+            amplitude: (0..3 * resolution.pixels()).map(|index| noise(index) as f32).collect(),
+            depth_normalised: (0..resolution.pixels()).map(depth).collect(),
+        }
+    }
+
+    /// Asserts that `found` is `expected`, and that one wrong value would have been seen.
+    fn assert_is(what: &str, found: &[Complex64], mut expected: Vec<Complex64>) {
+        let error = largest_difference(found, &expected);
+        assert!(error < TOLERANCE, "{what}: {error}");
+        let middle = expected.len() / 2;
+        expected[middle].re += 1e-3 * expected.iter().map(|value| value.norm()).fold(1e-6, f64::max);
+        assert!(largest_difference(found, &expected) > TOLERANCE, "{what}: the comparison is blind");
+    }
+
+    fn check(weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32) {
+        check_within(LIMITS, weights, resolution, pupil_mm, seed);
+    }
+
+    fn check_within(limits: WorkgroupLimits, weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32) {
+        let shown = frame(resolution, seed);
+        let trace = reference::run(weights, &shown, f64::from(pupil_mm));
+        let stages = Stages::new(weights, resolution, limits);
+        let context = |what: &str| format!("{resolution}, {} layers: {what}", weights.config.depth_layers);
+        let real = |map: &reference::Map| map.values.iter().map(|&value| value.into()).collect::<Vec<Complex64>>();
+
+        // The second time round, what the first left behind must not show.
+        stages.run(&frame(resolution, seed + 1), 2.0, &trace);
+        stages.show(&shown, pupil_mm);
+        stages.trial.run_stage("expected stack");
+        let encoded = given(&trace, "lighting.encoded");
+        assert_is(&context("expected stack"), &stages.told(&stages.channels.lighting()), real(encoded));
+        stages.give(&stages.outputs, given(&trace, "lighting.layer_"));
+        stages.trial.run_stage("light of the layers");
+        let carried = trace.stages.iter().find_map(|stage| match &stage.value {
+            Value::Light(light) if stage.name == "carried" => Some(light.clone()),
+            _ => None,
+        });
+        assert_is(&context("light"), &stages.complex(stages.carried), carried.expect("a carried field"));
+        stages.trial.run_stage("feedback");
+        let encoded = given(&trace, "correction.encoded");
+        assert_is(&context("feedback"), &stages.told(&stages.channels.correction()), real(encoded));
+        stages.give(&stages.correction, given(&trace, "correction.layer_"));
+        stages.trial.run_stage("field");
+        assert_is(&context("field"), &stages.complex(stages.shared.field), trace.field);
+    }
+
+    fn config(depth_layers: usize, refined_stack: bool) -> NetworkConfig {
+        NetworkConfig { channels: 4, depth_layers, refined_stack, ..expected_stack_config() }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(8))]
+        #[test]
+        fn every_stage_matches_the_reference(
+            width in 1usize..40,
+            height in 1usize..30,
+            depth_layers in 2usize..7,
+            refined_stack in any::<bool>(),
+            pupil_mm in 1.0f32..5.0,
+            seed in 0u32..1000,
+        ) {
+            let weights = random_weights(config(depth_layers, refined_stack), u64::from(seed));
+            check(&weights, Resolution { width, height }, pupil_mm, seed);
+        }
+    }
+
+    #[test]
+    fn one_pixel_one_column_and_one_row_match_the_reference() {
+        let weights = random_weights(config(5, true), 5);
+        for (width, height) in [(1, 1), (1, 33), (57, 1), (2, 2)] {
+            check(&weights, Resolution { width, height }, 3.3, 9);
+        }
+    }
+
+    #[test]
+    fn long_lines_and_several_workgroups_match_the_reference() {
+        let weights = random_weights(config(2, false), 6);
+        for (width, height) in [(290, 3), (5, 271), (101, 34)] {
+            check(&weights, Resolution { width, height }, 4.1, 2);
+        }
+        let little = WorkgroupLimits { bytes: 150 * 8, threads: 128 };
+        // In so little memory a workgroup has one line, as it has of a long one.
+        check_within(little, &weights, Resolution { width: 299, height: 5 }, 4.1, 2);
+    }
+
+    #[test]
+    fn as_many_depth_layers_as_can_be_match_the_reference_at_the_widest_pupil() {
+        for depth_layers in [8, 9, 64] {
+            check(&random_weights(config(depth_layers, true), 4), Resolution { width: 12, height: 7 }, 5.0, 4);
+        }
+    }
+
+    #[test]
+    fn blurs_wider_than_the_table_of_the_disc_match_the_reference() {
+        let mut config = config(5, false);
+        config.optics.pixel_pitch_um = 1.0;
+        config.optics.eyepiece_focal_length_mm = 2000.0;
+        check(&random_weights(config, 4), Resolution { width: 12, height: 7 }, 5.0, 4);
+    }
+
+    #[test]
+    fn what_is_no_number_leaves_no_trace_in_the_next_frame() {
+        let resolution = Resolution { width: 31, height: 18 };
+        let weights = random_weights(config(5, true), 2);
+        let stages = Stages::new(&weights, resolution, LIMITS);
+        let trace = reference::run(&weights, &frame(resolution, 4), 3.0);
+        let clean = stages.run(&frame(resolution, 4), 3.0, &trace);
+        assert!(clean.iter().all(|value| value.is_finite()));
+        for (pixel, spoiler) in [(0, f32::NAN), (30, f32::INFINITY), (31 * 18 - 1, f32::NEG_INFINITY)] {
+            let mut spoiled = frame(resolution, 4);
+            spoiled.amplitude[pixel] = spoiler;
+            stages.run(&spoiled, 3.0, &trace);
+            let told = stages.told(&stages.channels.lighting());
+            assert!(told.iter().any(|value| !value.is_finite()), "pixel {pixel} is not seen");
+            assert_eq!(stages.run(&frame(resolution, 4), 3.0, &trace), clean, "pixel {pixel} left a trace");
+            let mut spoiled = frame(resolution, 4);
+            spoiled.depth_normalised[pixel] = spoiler;
+            stages.run(&spoiled, 3.0, &trace);
+            assert_eq!(
+                stages.run(&frame(resolution, 4), 3.0, &trace),
+                clean,
+                "the depth of pixel {pixel} left a trace"
+            );
+        }
+    }
+}

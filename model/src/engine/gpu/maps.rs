@@ -1,0 +1,73 @@
+//! How a frame and fields become the map that both nets of `expected-stack` read, for `maps.wgsl` and its users.
+
+use holod_calibration::{DisplayGeometry, Metres, Resolution};
+
+use super::map::{GROUP, Map};
+use super::plan::{Constant, Plan};
+use crate::weights::OUTPUT_CHANNELS;
+
+/// Amplitude, two depth maps, each four times, and the pupil.
+const MAPS: usize = 4 * 5 + 1;
+
+/// Which channels of the map are what.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct InputChannels {
+    /// From here on the expected amplitudes less 0.4, [layers, 3]; before them the frame's maps.
+    pub(crate) stack: usize,
+    /// From here on what the second net alone reads, in whole groups: three real parts of the field, then three imaginary
+    /// ones. Channels between the stack and this are zero.
+    pub(crate) field: usize,
+    /// The same of the field's change.
+    pub(crate) change: usize,
+    /// From here on what is lacking of the expected amplitudes, [layers, 3].
+    pub(crate) lack: usize,
+    depth_layers: usize,
+}
+
+impl InputChannels {
+    pub(crate) fn new(depth_layers: usize) -> Self {
+        let field = (MAPS + 3 * depth_layers).next_multiple_of(GROUP);
+        let change = field + OUTPUT_CHANNELS;
+        Self { stack: MAPS, field, change, lack: change + OUTPUT_CHANNELS, depth_layers }
+    }
+
+    /// Channels of the map.
+    fn count(self) -> usize {
+        self.lack + 3 * self.depth_layers
+    }
+
+    /// The channel of each input of the first net, in its weights' order.
+    pub(crate) fn lighting(self) -> Vec<usize> {
+        (0..self.stack + 3 * self.depth_layers).collect()
+    }
+
+    /// The same of the second net.
+    pub(crate) fn correction(self) -> Vec<usize> {
+        (self.field..self.change).chain(self.lighting()).chain(self.change..self.count()).collect()
+    }
+
+    /// The map that both nets read, on the network's grid.
+    pub(crate) fn map(self, plan: &mut Plan, size: Resolution) -> Map {
+        Map::new(plan, "what the nets read", (size.width, size.height), self.count())
+    }
+}
+
+/// The distance between the centres of neighbouring samples of the half-band grid.
+pub(super) fn sample_pitch(optics: &DisplayGeometry) -> Metres {
+    Metres(2.0 * optics.pixel_pitch.0)
+}
+
+/// Bytes of a plane of complex numbers on a grid of `size`, of a plane of real ones, and of a map's group.
+pub(super) fn plane_bytes(size: Resolution) -> [u64; 3] {
+    [8, 4, 16].map(|bytes| bytes * size.pixels() as u64)
+}
+
+/// The constants of a grid and the frame on it.
+pub(super) fn grid_constants(frame: Resolution, size: Resolution) -> [(&'static str, Constant); 4] {
+    [
+        ("FRAME_WIDTH", frame.width.into()),
+        ("FRAME_HEIGHT", frame.height.into()),
+        ("WIDTH", size.width.into()),
+        ("HEIGHT", size.height.into()),
+    ]
+}

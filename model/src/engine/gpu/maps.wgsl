@@ -1,0 +1,18 @@
+// What the nets of `expected-stack` are told of a frame, as maps.rs writes it. Before this file: WIDTH, HEIGHT, blocks.wgsl,
+// INPUT_GROUPS and INPUT_PITCH of the nets' map.
+
+// Where that map has group `group` of pixel (x, y).
+fn input_place(group: u32, x: u32, y: u32) -> u32 {
+    return ((y + 1u) * INPUT_GROUPS + group) * INPUT_PITCH + x + 1u;
+}
+
+// One of the frame's planes at the corners of block (x, y).
+fn corners(plane: u32, x: u32, y: u32) -> vec4f {
+    let first = plane * FRAME_WIDTH * FRAME_HEIGHT;
+    return vec4f(
+        frame[first + block_pixel(x, y, 0u)],
+        frame[first + block_pixel(x, y, 1u)],
+        frame[first + block_pixel(x, y, 2u)],
+        frame[first + block_pixel(x, y, 3u)],
+    );
+}

@@ -1,0 +1,82 @@
+//! The program `gpu-cost`, with Mesa's compiler: `mesa-vulkan-drivers` is installed where the tests run.
+
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+fn gpu_cost() -> Command {
+    Command::new(env!("CARGO_BIN_EXE_gpu-cost"))
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// The costs of both networks on both cards, with the least share of multiply-adds that a hot loop of products may have. The
+/// program's exit code is not 0 where a register spills or a shader does not compile.
+fn judge_frames(more: &[&str], least_share: f64) -> Vec<f64> {
+    let output = gpu_cost().args(["--resolution", "1920x1080", "--json"]).args(more).output().expect("it starts");
+    assert!(output.status.success(), "{}", said(&output));
+    let frames: Vec<Value> = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(frames.len(), 4, "two networks on two cards");
+    let judge = |frame: &Value| {
+        let mut seconds = 0.0;
+        for stage in frame["stages"].as_array().expect("stages") {
+            for dispatch in stage["dispatches"].as_array().expect("dispatches") {
+                let number = |key: &str| dispatch[key].as_f64().unwrap_or_else(|| panic!("{key} in {dispatch}"));
+                assert_eq!(number("spilled_registers"), 0.0, "{dispatch}");
+                if stage["flop"].as_u64() > Some(0) {
+                    assert_eq!(dispatch["counted_by"], "assembly", "{dispatch}");
+                    assert!(
+                        number("multiply_add_share") >= least_share && number("waves_per_simd") >= 8.0,
+                        "{dispatch}"
+                    );
+                }
+                seconds += number("vector_s").max(number("workgroup_memory_s")).max(number("bytes_s"));
+            }
+        }
+        let told = frame["seconds"].as_f64().expect("seconds");
+        assert!((told - seconds).abs() < 1e-9 && told > 1e-4 && told < 0.1, "{told} {seconds}");
+        told
+    };
+    frames.iter().map(judge).collect()
+}
+
+#[test]
+fn no_shader_spills_and_what_convolves_multiplies_and_adds() {
+    let single = judge_frames(&[], 0.87);
+    let half = judge_frames(&["--half-precision"], 0.75);
+    assert!(single.iter().zip(&half).all(|(single, half)| *half < 0.75 * single), "{single:?} {half:?}");
+}
+
+/// More pixels take longer, and so does the slower card.
+#[test]
+fn costs_follow_pixels_and_cards() {
+    let seconds = |card: &str, resolution: &str| {
+        let arguments = ["--json", "--network", "small", "--card", card, "--resolution", resolution];
+        let output = gpu_cost().args(arguments).output().expect("it starts");
+        let frames: Vec<Value> = serde_json::from_slice(&output.stdout).expect("JSON");
+        frames[0]["seconds"].as_f64().expect("seconds")
+    };
+    let fast = ["1920x1080", "3840x2160"].map(|resolution| seconds("rx-7900-xtx", resolution));
+    assert!(fast[1] > 3.5 * fast[0] && fast[1] < 4.5 * fast[0], "{fast:?}");
+    assert!(seconds("rx-6800-xt", "1920x1080") > 1.2 * fast[0]);
+}
+
+#[test]
+fn instructions_are_printed_and_an_unknown_shader_is_told_the_known_ones() {
+    let only = ["--network", "small", "--card", "rx-6800-xt", "--resolution", "512x512", "--assembly"];
+    let output = gpu_cost().args(only).arg("correction layer 1").output().expect("it starts");
+    assert!(output.status.success(), "{}", said(&output));
+    assert!(String::from_utf8_lossy(&output.stdout).contains("v_fmac_f32"));
+    let output = gpu_cost().args(only).arg("no layer").output().expect("it starts");
+    assert_eq!(output.status.code(), Some(64));
+    assert!(said(&output).contains("correction layer 1"), "{}", said(&output));
+}
+
+#[test]
+fn a_driver_that_is_not_there_is_told_with_what_to_install() {
+    let missing = gpu_cost().env("VK_DRIVER_FILES", "/nowhere/radeon_icd.json").output().expect("it starts");
+    assert_eq!(missing.status.code(), Some(69), "{}", said(&missing));
+    assert!(said(&missing).contains("mesa-vulkan-drivers"), "{}", said(&missing));
+}
