@@ -187,6 +187,13 @@ impl Renderer for GpuRenderer {
         }
     }
 
+    fn cpu_threads(&self) -> Option<usize> {
+        match &self.engine {
+            Engine::Cpu(renderer) => renderer.cpu_threads(),
+            Engine::Gpu(_) | Engine::None(_) => None,
+        }
+    }
+
     fn description(&self) -> &str {
         &self.description
     }

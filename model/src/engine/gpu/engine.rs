@@ -81,8 +81,12 @@ impl GpuEngine {
             timestamps_bytes + COUNTS_BYTES + samples_bytes,
             BufferUsages::MAP_READ | BufferUsages::COPY_DST,
         )?;
-        let timing =
-            |stage: &Stage| StageTiming { name: stage.name.clone(), duration: Duration::ZERO, flop: stage.flop };
+        let timing = |stage: &Stage| StageTiming {
+            name: stage.name.clone(),
+            duration: Duration::ZERO,
+            flop: stage.flop,
+            bytes: 0,
+        };
         Ok(Self {
             timings: StageTimings { stages: plan.stages.iter().map(timing).collect() },
             readback: Readback { staging, timestamps_bytes, samples_bytes },
