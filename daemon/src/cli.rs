@@ -40,7 +40,7 @@ pub enum Command {
     View(ViewArgs),
     /// Say what the rig file means and whether this bench is ready.
     Check(CheckArgs),
-    /// Measure the median time of each stage, beside the machine's arithmetic peak.
+    /// Time each stage and the frame, beside what the cores compute and their memory moves, and tracker sample to photons.
     Bench(BenchArgs),
     /// Judge weights by what an eye sees of the panel's levels, on held-out scenes with known thin-lens pictures.
     Evaluate(EvaluateArgs),
@@ -358,9 +358,13 @@ pub struct BenchArgs {
     /// Size of the hologram.
     #[arg(long, value_name = "WxH", value_parser = parse_resolution, default_value = "512x512")]
     pub resolution: Resolution,
-    /// Repetitions of which the medians are taken.
+    /// Frames of which medians and quartiles are taken.
     #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u32).range(1..))]
     pub repeat: u32,
+    /// How long the loop then runs with a simulated eye and a virtual panel, for the time from tracker sample to photons;
+    /// 0s leaves it out.
+    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration, default_value = "5s")]
+    pub duration: Duration,
     /// Print the figures as JSON.
     #[arg(long)]
     pub json: bool,

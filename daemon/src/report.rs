@@ -9,7 +9,7 @@ use serde::Serialize;
 use holod_model::files;
 
 use crate::failure::{Exit, Failure};
-use crate::session::Summary;
+use crate::session::{Spread, Summary};
 
 /// Prints lines on standard output. A reader that has gone away is no failure.
 pub fn print(text: &str) -> Result<(), Failure> {
@@ -45,11 +45,13 @@ fn to_json(value: &impl Serialize) -> Result<String, Failure> {
     serde_json::to_string_pretty(value).map_err(Failure::because(Exit::Software))
 }
 
+/// Median and tail in words.
+pub fn spread_text(spread: Option<Spread>) -> String {
+    spread.map_or("not measured".to_owned(), |s| format!("median {:.1} ms, p99 {:.1} ms", s.median_ms, s.p99_ms))
+}
+
 /// A run in a few lines.
 pub fn summary_text(summary: &Summary) -> String {
-    let spread = |spread: Option<crate::session::Spread>| {
-        spread.map_or("not measured".to_owned(), |s| format!("median {:.1} ms, p99 {:.1} ms", s.median_ms, s.p99_ms))
-    };
     let states: Vec<String> =
         summary.frames_by_pupil_state.iter().map(|(state, count)| format!("{count} {state}")).collect();
     let pupils = summary.pupil_range_mm.map_or("none".to_owned(), |[a, b]| format!("{a:.2} to {b:.2} mm"));
@@ -84,8 +86,8 @@ pub fn summary_text(summary: &Summary) -> String {
         summary.tracker_link,
         summary.tracker_counts.get("samples").copied().unwrap_or(0),
         summary.samples_rejected,
-        spread(summary.frame_time),
-        spread(summary.sample_to_photon),
+        spread_text(summary.frame_time),
+        spread_text(summary.sample_to_photon),
         lasers.fields,
         lasers.lit,
         lasers.dark,

@@ -53,6 +53,15 @@ pub fn weights(rig: &Rig) -> Result<Weights, Failure> {
     Ok(weights)
 }
 
+/// What weights are called in reports.
+pub fn weights_name(weights: &WeightsChoice) -> String {
+    match weights {
+        WeightsChoice::Standard => "standard".into(),
+        WeightsChoice::Small => "small".into(),
+        WeightsChoice::File(path) => path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
+    }
+}
+
 /// The frames to show, all of one size.
 pub struct Frames {
     /// At least one.

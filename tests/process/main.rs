@@ -1,6 +1,7 @@
 //! holod as a process, in one test program, which is linked once. `fail_dark`, which measures, has its own.
 
 mod bad_input;
+mod bench;
 mod evaluate;
 mod inspect;
 mod panel;

@@ -1,142 +1,368 @@
-//! `holod bench`: medians per stage, beside the arithmetic peak of the machine's cores measured in the same run.
+//! `holod bench`: how long each stage and the frame take, beside the machine's ceilings measured in the same run, and how
+//! long the loop takes from tracker sample to photons.
 
+use std::fmt::Write;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use holod_calibration::{PupilDiameter, Resolution};
-use holod_model::engine::{StageTiming, fma_peak};
-use holod_slm_output::LevelsFrame;
+use holod_calibration::PupilDiameter;
+use holod_calibration::rig::{LaserDriver, Lasers, Rig};
+use holod_model::engine::{StageTiming, fma_peak, stream_bandwidth};
+use holod_model::{RgbdFrame, Weights};
+use holod_pupil_input::{Scenario, TrackerSpec};
+use holod_slm_output::present::ReportFaults;
+use holod_slm_output::{LevelsFrame, OutputSpec};
 use serde::Serialize;
 
-use crate::cli::BenchArgs;
+use crate::cli::{BenchArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
-use crate::{renderer, report, setup};
+use crate::session::{self, Observer, SessionPlan, Spread, Summary};
+use crate::{progress, renderer, report, setup};
+
+/// How often the memory's bandwidth is measured before the frames, and again after them: between them, it would empty
+/// the caches.
+const STREAMS: usize = 3;
 
 #[derive(Serialize)]
 struct Report {
     resolution: String,
+    weights: String,
     renderer: String,
-    threads: usize,
-    peak_gflop_per_s: f64,
-    stages: Vec<Stage>,
-    frame_ms: f64,
-    network_gflop: f64,
-    network_share_of_peak: f64,
+    frames: u32,
+    /// Where the processor computes.
+    ceilings: Option<Ceilings>,
+    stages: Vec<Measured>,
+    /// The stages together that are of matrix-like work, where there are any.
+    layers: Option<Measured>,
+    frame: Measured,
+    /// Where the loop was run.
+    closed_loop: Option<ClosedLoop>,
 }
 
+/// What the machine can do at most, on as many threads as compute frames.
+#[derive(Clone, Copy, Serialize)]
+struct Ceilings {
+    threads: usize,
+    /// Fused multiply-adds, 10⁹ operations a second.
+    gflop_per_s: f64,
+    /// Read and written memory beyond the caches, 10⁹ bytes a second.
+    gb_per_s: f64,
+}
+
+/// A part of the frame, or all of it.
 #[derive(Serialize)]
-struct Stage {
+struct Measured {
     name: String,
+    #[serde(flatten)]
+    time: Quartiles,
+    /// Of operations and bytes as the definition has them; nothing where they are not known.
+    gflop: Option<f64>,
+    mb: Option<f64>,
+    share_of_arithmetic_peak: Option<f64>,
+    share_of_bandwidth: Option<f64>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+struct Quartiles {
+    lower_quartile_ms: f64,
     median_ms: f64,
-    gflop: f64,
-    /// Of operations as the definition has them.
-    share_of_peak: Option<f64>,
+    upper_quartile_ms: f64,
+}
+
+/// A run of the loop with a simulated eye and a virtual panel.
+#[derive(Serialize)]
+struct ClosedLoop {
+    duration_s: f64,
+    frames_shown: u64,
+    frames_shown_hz: f64,
+    panel_frames_hz: f64,
+    /// From waking to the submitted levels.
+    frame_time: Option<Spread>,
+    /// From the newest tracker sample behind a frame to the middle of its first light.
+    sample_to_photon: Option<Spread>,
+}
+
+/// What was measured.
+struct Laps {
+    renderer: String,
+    ceilings: Option<Ceilings>,
+    frames: Vec<Lap>,
+}
+
+struct Lap {
+    frame: Duration,
+    stages: Vec<StageTiming>,
 }
 
 pub(super) fn bench(args: &BenchArgs) -> Result<(), Failure> {
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let weights = setup::weights(&rig)?;
-    let resolution = args.resolution;
-    if resolution.width > rig.resolution().width || resolution.height > rig.resolution().height {
-        return Err(Failure::new(
-            Exit::Usage,
-            format!("--resolution: found {resolution}, expected at most the panel's {}", rig.resolution()),
-        ));
+    let scene = SceneArgs { resolution: Some(args.resolution), ..SceneArgs::default() };
+    let frames = setup::frames(&scene, &rig.geometry)?;
+    let laps = progress::during("timing frames", || Laps::run(args, &rig, &weights, &frames.frames[0]))?;
+    let mut report = laps.report(args.resolution.to_string(), setup::weights_name(&rig.model.weights));
+    if !args.duration.is_zero() {
+        report.closed_loop = Some(closed_loop(args, rig, weights, frames)?);
     }
-    let encoder = renderer::panel_encoder(&rig, resolution)?;
-    let mut renderer = renderer::open(args.backend, &weights, &encoder)?;
-    let frame = Arc::new(setup::sample_frame(resolution));
-    let mut levels = LevelsFrame::new(encoder.layout());
-    let threads = std::thread::available_parallelism().map_or(1, usize::from);
-
-    let pupil = PupilDiameter::from_mm(3.0);
-    let mut laps: Vec<Vec<StageTiming>> = Vec::new();
-    let (mut frames, mut peaks) = (Vec::new(), Vec::new());
-    // The first lap warms caches and is thrown away.
-    for _ in 0..=args.repeat {
-        peaks.push(fma_peak(threads));
-        let began = Instant::now();
-        renderer.render(&frame, pupil, &mut levels).map_err(Failure::because(Exit::Software))?;
-        frames.push(began.elapsed());
-        laps.push(renderer.timings().to_vec());
-        peaks.push(fma_peak(threads));
-    }
-    let report =
-        summarise(resolution, renderer.description(), threads, &laps[1..], &frames[1..], greatest(&peaks) / 1e9);
     if args.json { report::print_json(&report) } else { report::print(&table(&report)) }
 }
 
-fn summarise(
-    resolution: Resolution,
-    renderer: &str,
-    threads: usize,
-    laps: &[Vec<StageTiming>],
-    frames: &[Duration],
-    peak_gflop_per_s: f64,
-) -> Report {
-    let stages: Vec<Stage> = laps[0]
-        .iter()
-        .enumerate()
-        .map(|(index, StageTiming { name, flop, .. })| {
-            let median_ms = median(laps.iter().map(|lap| lap[index].duration.as_secs_f64() * 1e3));
-            let gflop = *flop as f64 / 1e9;
-            let share_of_peak = (*flop > 0).then(|| gflop / (median_ms / 1e3) / peak_gflop_per_s);
-            Stage { name: name.clone(), median_ms, gflop, share_of_peak }
-        })
-        .collect();
-    let layers = || stages.iter().filter(|stage| stage.gflop > 0.0);
-    let network_gflop: f64 = layers().map(|stage| stage.gflop).sum();
-    let layers_s: f64 = layers().map(|stage| stage.median_ms / 1e3).sum();
-    Report {
-        resolution: resolution.to_string(),
-        renderer: renderer.to_owned(),
-        threads,
-        peak_gflop_per_s,
-        frame_ms: median(frames.iter().map(|frame| frame.as_secs_f64() * 1e3)),
-        network_gflop,
-        network_share_of_peak: network_gflop / layers_s / peak_gflop_per_s,
-        stages,
+impl Laps {
+    fn run(args: &BenchArgs, rig: &Rig, weights: &Weights, frame: &Arc<RgbdFrame>) -> Result<Self, Failure> {
+        let encoder = renderer::panel_encoder(rig, args.resolution)?;
+        let mut renderer = renderer::open(args.backend, weights, &encoder)?;
+        let threads = renderer.cpu_threads();
+        let mut levels = LevelsFrame::new(encoder.layout());
+        let pupil = PupilDiameter::from_mm(3.0);
+
+        let (mut peaks, mut bandwidths, mut frames) = (Vec::new(), Vec::new(), Vec::new());
+        let mut stream = || bandwidths.extend(threads.map(stream_bandwidth));
+        (0..STREAMS).for_each(|_| stream());
+        // The first lap warms caches and is thrown away.
+        for _ in 0..=args.repeat {
+            peaks.extend(threads.map(fma_peak));
+            let began = Instant::now();
+            let rendered = renderer.render(frame, pupil, &mut levels).map_err(Failure::because(Exit::Software))?;
+            frames.push(Lap { frame: began.elapsed(), stages: renderer.timings().to_vec() });
+            if rendered.engine_changed {
+                let now = renderer.description();
+                let said = format!("the engine failed while it was timed, frames are now computed by {now}");
+                return Err(Failure::new(Exit::Unavailable, said));
+            }
+            peaks.extend(threads.map(fma_peak));
+        }
+        (0..STREAMS).for_each(|_| stream());
+        frames.remove(0);
+        let ceilings = threads.map(|threads| Ceilings {
+            threads,
+            gflop_per_s: greatest(&peaks) / 1e9,
+            gb_per_s: greatest(&bandwidths) / 1e9,
+        });
+        Ok(Self { renderer: renderer.description().to_owned(), ceilings, frames })
+    }
+
+    fn report(self, resolution: String, weights: String) -> Report {
+        let Self { renderer, ceilings, frames } = self;
+        // A part's time in each lap, and what it does there.
+        let measured = |name: &str, of: &dyn Fn(&Lap) -> Duration, is_part: &dyn Fn(&StageTiming) -> bool| {
+            let parts = || frames[0].stages.iter().filter(|stage| is_part(stage));
+            let (flop, bytes) = (parts().map(|stage| stage.flop).sum(), parts().map(|stage| stage.bytes).sum());
+            let time = Quartiles::of(frames.iter().map(|lap| of(lap).as_secs_f64() * 1e3));
+            Measured::new(name, time, flop, bytes, ceilings)
+        };
+        let stage = |(index, stage): (usize, &StageTiming)| {
+            measured(&stage.name, &|lap| lap.stages[index].duration, &|other| other.name == stage.name)
+        };
+        let is_layer = |stage: &StageTiming| stage.flop > 0;
+        let in_layers = |lap: &Lap| lap.stages.iter().filter(|stage| is_layer(stage)).map(|stage| stage.duration).sum();
+        Report {
+            resolution,
+            weights,
+            renderer,
+            frames: frames.len() as u32,
+            ceilings,
+            stages: frames[0].stages.iter().enumerate().map(stage).collect(),
+            layers: frames[0].stages.iter().any(is_layer).then(|| measured("all layers", &in_layers, &is_layer)),
+            frame: measured("whole frame", &|lap| lap.frame, &|_| true),
+            closed_loop: None,
+        }
     }
 }
 
-/// The peak is what the cores can do: the best lap, since whatever else runs only takes from it.
-fn greatest(peaks: &[f64]) -> f64 {
-    peaks.iter().copied().fold(0.0, f64::max)
+impl Measured {
+    fn new(name: &str, time: Quartiles, flop: u64, bytes: u64, ceilings: Option<Ceilings>) -> Self {
+        let known = |count: u64| (count > 0).then_some(count as f64);
+        let (gflop, mb) = (known(flop).map(|flop| flop / 1e9), known(bytes).map(|bytes| bytes / 1e6));
+        let seconds = time.median_ms / 1e3;
+        let share = |done: Option<f64>, per_s: Option<f64>| Some(done? / seconds / per_s?);
+        Self {
+            name: name.to_owned(),
+            time,
+            gflop,
+            mb,
+            share_of_arithmetic_peak: share(gflop, ceilings.map(|ceilings| ceilings.gflop_per_s)),
+            share_of_bandwidth: share(mb, ceilings.map(|ceilings| ceilings.gb_per_s * 1e3)),
+        }
+    }
 }
 
-fn median(values: impl Iterator<Item = f64>) -> f64 {
-    let mut sorted: Vec<f64> = values.collect();
-    sorted.sort_by(f64::total_cmp);
-    sorted[sorted.len() / 2]
+impl Quartiles {
+    /// Of at least one value; between two of them by linear interpolation.
+    fn of(values_ms: impl Iterator<Item = f64>) -> Self {
+        let mut sorted: Vec<f64> = values_ms.collect();
+        sorted.sort_by(f64::total_cmp);
+        let at = |share: f64| {
+            let place = share * (sorted.len() - 1) as f64;
+            let (below, above) = (sorted[place.floor() as usize], sorted[place.ceil() as usize]);
+            below + (above - below) * place.fract()
+        };
+        Self { lower_quartile_ms: at(0.25), median_ms: at(0.5), upper_quartile_ms: at(0.75) }
+    }
+}
+
+/// A ceiling is what the machine can do: the best of several looks, since whatever else runs only takes from it.
+fn greatest(looks: &[f64]) -> f64 {
+    looks.iter().copied().fold(0.0, f64::max)
+}
+
+/// Runs the loop as `demo` does. Whatever the rig has is left alone: no laser is lit.
+fn closed_loop(args: &BenchArgs, rig: Rig, weights: Weights, frames: setup::Frames) -> Result<ClosedLoop, Failure> {
+    struct Nobody;
+    impl Observer for Nobody {}
+
+    let plan = SessionPlan {
+        rig: Rig { lasers: Lasers { driver: LaserDriver::Simulated, ..rig.lasers }, ..rig },
+        weights,
+        backend: args.backend,
+        frames,
+        output: OutputSpec::Headless(ReportFaults::NONE),
+        tracker: TrackerSpec::Mock(Scenario::Sweep),
+        record_tracker: None,
+        frame_limit: None,
+        duration: Some(args.duration),
+        keep_levels: false,
+    };
+    let Summary { duration_s, frames_shown, frames_shown_hz, panel_frames_hz, frame_time, sample_to_photon, .. } =
+        session::run(plan, &mut Nobody)?.summary;
+    Ok(ClosedLoop { duration_s, frames_shown, frames_shown_hz, panel_frames_hz, frame_time, sample_to_photon })
 }
 
 fn table(report: &Report) -> String {
-    let mut text = format!(
-        "{} by {}; fused multiply-add peak of {} threads, same run: {:.0} GFLOP/s\n\n{:<24}{:>12}{:>12}{:>12}\n",
-        report.resolution,
-        report.renderer,
-        report.threads,
-        report.peak_gflop_per_s,
-        "stage",
-        "median ms",
-        "GFLOP",
-        "direct/peak"
-    );
-    for stage in &report.stages {
-        let share = stage.share_of_peak.map_or(String::new(), |share| format!("{:.0} %", share * 100.0));
-        let gflop = if stage.gflop > 0.0 { format!("{:.3}", stage.gflop) } else { String::new() };
-        text.push_str(&format!("{:<24}{:>12.2}{gflop:>12}{share:>12}\n", stage.name, stage.median_ms));
+    let Report { resolution, weights, renderer, frames, ceilings, stages, layers, frame, closed_loop } = report;
+    let mut text = format!("{resolution}, {weights}, by {renderer}; {frames} frames\n");
+    if let Some(Ceilings { threads, gflop_per_s, gb_per_s }) = ceilings {
+        writeln!(
+            text,
+            "ceilings of {threads} threads, same run: {gflop_per_s:.0} GFLOP/s of fused multiply-adds, {gb_per_s:.1} GB/s \
+             read and written"
+        )
+        .expect(GROWS);
     }
-    text.push_str(&format!(
-        "{:<24}{:>12.2}{:>12.3}{:>12}",
-        "whole frame",
-        report.frame_ms,
-        report.network_gflop,
-        format!("{:.0} %", report.network_share_of_peak * 100.0)
-    ));
-    text.push_str(
-        "\n\ndirect/peak: operations as the definition has them over time, beside the peak; a plain layer does a quarter of \
-         them (Winograd), so it may exceed 100 %",
-    );
+    let mut row = |cells: [&str; 7]| {
+        let [name, median, quartiles, gflop, of_peak, mb, of_bandwidth] = cells;
+        let line = format!("{name:<30}{median:>10}{quartiles:>18}{gflop:>10}{of_peak:>9}{mb:>9}{of_bandwidth:>9}");
+        writeln!(text, "{}", line.trim_end()).expect(GROWS);
+    };
+    row([""; 7]);
+    row(match ceilings {
+        Some(_) => ["stage", "median ms", "quartiles", "GFLOP", "of peak", "MB", "of GB/s"],
+        None => ["stage", "median ms", "quartiles", "GFLOP", "", "MB", ""],
+    });
+    for Measured { name, time, gflop, mb, share_of_arithmetic_peak, share_of_bandwidth } in
+        stages.iter().chain(layers).chain([frame])
+    {
+        let figure = |value: &Option<f64>, digits| value.map_or(String::new(), |value| format!("{value:.digits$}"));
+        let percent = |share: &Option<f64>| share.map_or(String::new(), |share| format!("{:.0} %", share * 100.0));
+        row([
+            name,
+            &format!("{:.2}", time.median_ms),
+            &format!("{:.2} to {:.2}", time.lower_quartile_ms, time.upper_quartile_ms),
+            &figure(gflop, 3),
+            &percent(share_of_arithmetic_peak),
+            &figure(mb, 1),
+            &percent(share_of_bandwidth),
+        ]);
+    }
+    if ceilings.is_some() {
+        text.push_str(
+            "\nof peak: operations as the definition has them over time, beside the peak; a plain layer does a quarter of \
+             them (Winograd), so it may exceed 100 %\n\
+             of GB/s: the bytes that come in and go out, once each, over time, beside the bandwidth; what stays in caches \
+             may exceed 100 %\n",
+        );
+    }
+    if let Some(ClosedLoop {
+        duration_s,
+        frames_shown,
+        frames_shown_hz,
+        panel_frames_hz,
+        frame_time,
+        sample_to_photon,
+    }) = closed_loop
+    {
+        write!(
+            text,
+            "\nclosed loop, a simulated eye and a virtual panel, {duration_s:.1} s: {frames_shown} frames shown, \
+             {frames_shown_hz:.1} a second of the panel's {panel_frames_hz:.1}\n\
+             time per frame {}; tracker sample to photons {}\n",
+            report::spread_text(*frame_time),
+            report::spread_text(*sample_to_photon)
+        )
+        .expect(GROWS);
+    }
+    text.truncate(text.trim_end().len());
     text
+}
+
+const GROWS: &str = "text grows";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn laps(ceilings: Option<Ceilings>) -> Laps {
+        let lap = |[net, other, frame]: [u64; 3]| Lap {
+            frame: Duration::from_millis(frame),
+            stages: vec![
+                StageTiming {
+                    name: "layer 0".into(),
+                    duration: Duration::from_millis(net),
+                    flop: 3_000_000,
+                    bytes: 500_000,
+                },
+                StageTiming { name: "field".into(), duration: Duration::from_millis(other), flop: 0, bytes: 1_000_000 },
+            ],
+        };
+        let frames = [[9, 40, 50], [1, 20, 30], [5, 30, 20], [3, 10, 10], [2, 50, 40]].map(lap).into();
+        Laps { renderer: "cpu, avx2, 2 threads".into(), ceilings, frames }
+    }
+
+    fn report(ceilings: Option<Ceilings>) -> Report {
+        laps(ceilings).report("64x48".into(), "small".into())
+    }
+
+    const CEILINGS: Ceilings = Ceilings { threads: 2, gflop_per_s: 2.0, gb_per_s: 0.5 };
+
+    #[test]
+    fn quartiles_of_a_known_series() {
+        let of = |values: &[f64]| {
+            let Quartiles { lower_quartile_ms, median_ms, upper_quartile_ms } = Quartiles::of(values.iter().copied());
+            [lower_quartile_ms, median_ms, upper_quartile_ms]
+        };
+        assert_eq!(of(&[7.0]), [7.0; 3]);
+        assert_eq!(of(&[5.0, 1.0, 4.0, 2.0, 3.0]), [2.0, 3.0, 4.0]);
+        assert_eq!(of(&[4.0, 1.0, 3.0, 2.0]), [1.75, 2.5, 3.25]);
+    }
+
+    #[test]
+    fn shares_are_of_medians_and_ceilings() {
+        let Report { stages, layers, frame, .. } = report(Some(CEILINGS));
+        let figures = |part: &Measured| {
+            [part.gflop, part.mb, part.share_of_arithmetic_peak, part.share_of_bandwidth]
+                .map(|figure| figure.map(|figure| (figure * 1e9).round() / 1e9))
+        };
+        // 3 MFLOP in 3 ms of 2 GFLOP/s; 0.5 MB in 3 ms of 0.5 GB/s.
+        assert_eq!((&*stages[0].name, stages[0].time.median_ms), ("layer 0", 3.0));
+        assert_eq!(figures(&stages[0]), [Some(0.003), Some(0.5), Some(0.5), Some(0.333_333_333)]);
+        assert_eq!(stages[1].time, Quartiles { lower_quartile_ms: 20.0, median_ms: 30.0, upper_quartile_ms: 40.0 });
+        assert_eq!(figures(&stages[1]), [None, Some(1.0), None, Some(0.066_666_667)]);
+        assert_eq!(figures(&layers.unwrap()), figures(&stages[0]));
+        assert_eq!(figures(&frame), [Some(0.003), Some(1.5), Some(0.05), Some(0.1)]);
+    }
+
+    #[test]
+    fn a_gpu_is_not_held_against_the_processors_ceilings() {
+        let [cpu, gpu] = [Some(CEILINGS), None].map(|ceilings| table(&report(ceilings)));
+        assert!(
+            cpu.contains("2 threads, same run: 2 GFLOP/s") && cpu.contains("of peak") && cpu.contains("50 %"),
+            "{cpu}"
+        );
+        assert!(!gpu.contains("ceilings") && !gpu.contains("of peak") && !gpu.contains('%'), "{gpu}");
+        for table in [cpu, gpu] {
+            for line in ["layer 0", "field", "all layers", "whole frame"] {
+                assert!(table.contains(&format!("\n{line} ")), "{table}");
+            }
+            assert!(table.contains("20.00 to 40.00"), "{table}");
+        }
+    }
 }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use holod_calibration::rig::{Rig, WeightsChoice};
+use holod_calibration::rig::Rig;
 use holod_calibration::{PupilDiameter, Resolution};
 use holod_model::metrics::StackScore;
 use holod_model::scene_shard::{SceneShard, SceneShardError};
@@ -102,7 +102,7 @@ pub(super) fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
     progress.finish_and_clear();
 
     let evaluation = Evaluation {
-        weights: name_of(&rig.model.weights),
+        weights: setup::weights_name(&rig.model.weights),
         scenes: shards.len(),
         width_px: shards[0].resolution().width,
         height_px: shards[0].resolution().height,
@@ -204,14 +204,6 @@ fn judge(rig: &Rig, weights: &Weights, args: &EvaluateArgs, shard: &SceneShard) 
         return Err(Failure::new(Exit::Usage, said));
     }
     Judge::new(rig, weights, args.backend, size, args.border_px)
-}
-
-fn name_of(weights: &WeightsChoice) -> String {
-    match weights {
-        WeightsChoice::Standard => "standard".into(),
-        WeightsChoice::Small => "small".into(),
-        WeightsChoice::File(path) => path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
-    }
 }
 
 fn progress_bar(scenes: usize) -> ProgressBar {

@@ -48,8 +48,16 @@ impl CpuRenderer {
     ) -> Result<Self, Failure> {
         let resolution = encoder.pattern_resolution();
         let engine = CpuEngine::new(weights, resolution).map_err(Failure::because(Exit::Unavailable))?;
-        let after_network =
-            AFTER_NETWORK.map(|name| StageTiming { name: name.to_owned(), duration: Duration::ZERO, flop: 0 });
+        let levels = LevelsFrame::new(encoder.layout());
+        let (hologram, pattern) = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
+        let pattern_bytes: usize = Colour::ALL.map(|colour| size_of_val(pattern.plane(colour))).iter().sum();
+        let moved = [size_of_val(&*hologram.field) + pattern_bytes, pattern_bytes + size_of_val(levels.samples())];
+        let after_network = AFTER_NETWORK.into_iter().zip(moved).map(|(name, bytes)| StageTiming {
+            name: name.to_owned(),
+            duration: Duration::ZERO,
+            flop: 0,
+            bytes: bytes as u64,
+        });
         let timings = engine.last_timings().stages.iter().cloned().chain(after_network).collect();
         let instruction_set = engine.instruction_set();
         let nothing = Resolution { width: 0, height: 0 };
@@ -61,7 +69,7 @@ impl CpuRenderer {
             pupil: PupilDiameter::from_mm(weights.config().pupil_range_mm[0]),
             hologram: ComplexHologram::dark(nothing),
             pattern: PhasePattern::flat(nothing),
-            levels: LevelsFrame::new(encoder.layout()),
+            levels,
             rendered: Ok(Rendered::default()),
             durations: Default::default(),
         };
@@ -74,8 +82,8 @@ impl CpuRenderer {
                 }
             },
             pool,
-            hologram: ComplexHologram::dark(resolution),
-            pattern: PhasePattern::flat(resolution),
+            hologram,
+            pattern,
             timings,
         })
     }
@@ -138,6 +146,10 @@ impl Renderer for CpuRenderer {
         &self.timings
     }
 
+    fn cpu_threads(&self) -> Option<usize> {
+        Some(self.pool.threads())
+    }
+
     fn description(&self) -> &str {
         &self.description
     }
@@ -183,7 +195,9 @@ mod tests {
             shown.push(buffers[buffer].samples().to_vec());
         }
         assert_ne!(shown[0], shown[1], "pupils are told apart");
-        assert_eq!(renderer.timings().last().unwrap().name, "panel levels");
+        let [.., double_phase, panel_levels] = renderer.timings() else { panic!("two stages follow the network") };
+        assert_eq!((&*double_phase.name, double_phase.bytes), ("double phase", 3 * (8 + 4) * 34 * 22));
+        assert_eq!((&*panel_levels.name, panel_levels.bytes), ("panel levels", 3 * (4 * 34 * 22 + 2 * 40 * 25)));
     }
 
     #[test]

@@ -53,6 +53,9 @@ pub trait Renderer: Send {
     /// Where the time of the last frame went, in the order in which it went there.
     fn timings(&self) -> &[StageTiming];
 
+    /// How many of the processor's threads compute; nothing where a GPU does.
+    fn cpu_threads(&self) -> Option<usize>;
+
     /// How it computes, for people: such as `cpu, avx512, 2 threads`, and why not on a GPU where that was wanted.
     fn description(&self) -> &str;
 }

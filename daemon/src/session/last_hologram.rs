@@ -121,6 +121,10 @@ mod tests {
             &[]
         }
 
+        fn cpu_threads(&self) -> Option<usize> {
+            None
+        }
+
         fn description(&self) -> &str {
             "counting"
         }

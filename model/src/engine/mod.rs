@@ -15,7 +15,7 @@ use holod_calibration::Resolution;
 
 use crate::gpu::GpuError;
 
-pub use cpu::{CpuEngine, fma_peak};
+pub use cpu::{CpuEngine, fma_peak, stream_bandwidth};
 #[cfg(feature = "gpu-cost")]
 pub use gpu::cost as gpu_cost;
 #[cfg(feature = "gpu")]
@@ -68,4 +68,8 @@ pub struct StageTiming {
     /// Floating-point operations of matrix-like work as its definition has them, two to a multiply-add; 0 for other
     /// stages. Winograd's filtering does with a quarter of those of a plain layer.
     pub flop: u64,
+    /// The least that its definition moves: each map, plane or field that it is given, read once, and each that it hands
+    /// on, written once, without padding. What it makes on the way, parameters and tables do not count. 0 where it is not
+    /// known.
+    pub bytes: u64,
 }

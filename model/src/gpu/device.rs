@@ -17,6 +17,8 @@ pub(crate) struct Gpu {
     pub(crate) largest_buffer: u64,
     /// The memory that the threads of a workgroup share, bytes.
     pub(crate) workgroup_bytes: u32,
+    /// The most threads of a workgroup, all along x.
+    pub(crate) workgroup_threads: u32,
     /// Nanoseconds to a tick of the timestamps, where the device has them.
     pub(crate) timestamp_ns: Option<f32>,
 }
@@ -78,8 +80,9 @@ impl Gpu {
         let limits = device.limits();
         let largest_buffer = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
         let workgroup_bytes = limits.max_compute_workgroup_storage_size;
+        let workgroup_threads = limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x);
         let timestamp_ns = (!timestamps.is_empty()).then(|| queue.get_timestamp_period());
-        Ok(Self { device, queue, name, fault, largest_buffer, workgroup_bytes, timestamp_ns })
+        Ok(Self { device, queue, name, fault, largest_buffer, workgroup_bytes, workgroup_threads, timestamp_ns })
     }
 
     /// The device's name, as its driver has it.

@@ -1,4 +1,4 @@
-"""python -m holod_training {train,compare,evaluate,eyebox,export,golden}"""
+"""python -m holod_training {train,compare,evaluate,eyebox,export,golden,bench-engines}"""
 
 from __future__ import annotations
 

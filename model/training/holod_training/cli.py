@@ -1,9 +1,10 @@
-"""The command line: python -m holod_training {train,compare,evaluate,eyebox,export,golden}."""
+"""The command line: python -m holod_training {train,compare,evaluate,eyebox,export,golden,bench-engines}."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import os
 import sys
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from typing import Any
 
 import torch
 
+from holod_training.bench_engines import BenchError, Plan, bench_engines, markdown
 from holod_training.config import CONDITIONINGS, ConfigError, NetworkConfig
 from holod_training.evaluate_config import EvaluateConfig
 from holod_training.export import WeightsError
@@ -41,11 +43,12 @@ def choose_device(name: str) -> torch.device:
 
 def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
+    options.arguments = sys.argv[1:] if arguments is None else arguments
     if options.threads:
         torch.set_num_threads(options.threads)
     try:
         options.run(options)
-    except (ConfigError, ReportError, RgbdError, ShardError, TrainingError, WeightsError) as error:
+    except (BenchError, ConfigError, ReportError, RgbdError, ShardError, TrainingError, WeightsError) as error:
         print(f"error: {error}", file=sys.stderr)
         return EX_DATAERR
     return 0
@@ -135,6 +138,15 @@ def _parser() -> argparse.ArgumentParser:
     golden.add_argument("--small-weights", help="the shipped small weights, likewise")
     golden.add_argument("--seed", type=int, default=20)
     golden.set_defaults(run=_golden)
+
+    engines = command("bench-engines", "Times a weights file in holod and in PyTorch, in turn, to panel levels")
+    engines.add_argument("--weights", required=True)
+    engines.add_argument("--holod", required=True, help="the program, built with --release")
+    engines.add_argument("--resolution", type=_resolution, default=(512, 512), metavar="WxH")
+    engines.add_argument("--rounds", type=int, default=7, help="how often the engines take turns")
+    engines.add_argument("--calls", type=int, default=5, help="frames of each engine in each round")
+    engines.add_argument("--json", action="store_true", help="print the figures as JSON")
+    engines.set_defaults(run=_bench_engines)
     return parser
 
 
@@ -276,6 +288,29 @@ def _golden(options: argparse.Namespace) -> None:
     standard, small = (Path(path) if path else None for path in (options.weights, options.small_weights))
     for path in write_golden(Path(options.out), standard, small, options.seed):
         print(path)
+
+
+def _resolution(text: str) -> tuple[int, int]:
+    width, height = text.split("x")
+    return int(width), int(height)
+
+
+_resolution.__name__ = "WxH"
+
+
+def _bench_engines(options: argparse.Namespace) -> None:
+    width, height = options.resolution
+    plan = Plan(
+        weights=Path(options.weights),
+        holod=Path(options.holod),
+        width=width,
+        height=height,
+        rounds=options.rounds,
+        calls=options.calls,
+        device=choose_device(options.device),
+    )
+    result = bench_engines(plan, ["python", "-m", "holod_training", *options.arguments])
+    print(json.dumps(result, indent=1) if options.json else markdown(result), end="\n" if options.json else "")
 
 
 def _train(options: argparse.Namespace) -> None:

@@ -268,10 +268,14 @@ def _binomial(value: Tensor) -> Tensor:
     return value
 
 
+def levels(phase: Tensor, bit_depth: int = 8) -> Tensor:
+    """The levels, 0 to 2^bit_depth − 1, of a linear panel with a stroke of a full turn that are nearest to phases."""
+    return torch.remainder(torch.round(phase / (2 * math.pi / 2**bit_depth)), 2**bit_depth)
+
+
 def through_levels(phase: Tensor, bit_depth: int = 8) -> Tensor:
-    """The phases that a linear panel with a stroke of a full turn shows: each goes to the nearest of 2^bit_depth."""
-    step = 2 * math.pi / 2**bit_depth
-    return torch.remainder(torch.round(phase / step), 2**bit_depth) * step
+    """The phases that such a panel shows of them."""
+    return levels(phase, bit_depth) * (2 * math.pi / 2**bit_depth)
 
 
 def panel_field(phase: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ use super::blocks::{Blocks, grid_size, scale_of};
 use super::feature_map::FeatureMap;
 use super::field::{Field, UncorrectedField};
 use super::network::StageList;
-use super::stage::{Buffers, Job, MapId, Maps, Stage};
+use super::stage::{Buffers, Job, MapId, Maps, Stage, frame_bytes, plane_bytes};
 use super::trunk::Trunk;
 use crate::simd::InstructionSet;
 use crate::weights::{Layer, NetworkConfig};
@@ -24,7 +24,11 @@ pub(super) fn stages(
     let mut maps = Maps::new(size, set);
     let trunk = Trunk::new(&mut maps, "", layers, config.leaky_slope);
     StageList::new(maps, BlockMeans { size, amplitude: vec![0.0; 3 * size.pixels()] })
-        .then(Encode { scale: scale_of(config.grid), input: trunk.input })
+        .then(Encode {
+            bytes: frame_bytes(resolution) + plane_bytes(layers[0].in_channels + BlockMeans::PLANES, size),
+            scale: scale_of(config.grid),
+            input: trunk.input,
+        })
         .then_each(trunk.layers)
         .then(Field::new(config.grid, resolution, trunk.output))
 }
@@ -38,6 +42,7 @@ pub(super) struct BlockMeans {
 
 /// Writes the first layer's input, and the amplitude to which the last layer's output is a residual.
 struct Encode {
+    bytes: u64,
     /// Panel pixels to a sample of the network's grid, each way.
     scale: usize,
     input: MapId,
@@ -46,6 +51,10 @@ struct Encode {
 impl Stage<BlockMeans> for Encode {
     fn name(&self) -> &str {
         "encode"
+    }
+
+    fn bytes(&self) -> u64 {
+        self.bytes
     }
 
     fn run(&mut self, buffers: &mut Buffers<BlockMeans>, job: &mut Job<'_>) {
@@ -84,6 +93,8 @@ impl Stage<BlockMeans> for Encode {
 }
 
 impl UncorrectedField for BlockMeans {
+    const PLANES: usize = 3;
+
     fn write_corrected(&self, residual: &FeatureMap, colour: Colour, field: &mut [Complex32]) {
         let Self { size: Resolution { width, height }, amplitude } = self;
         field.par_chunks_exact_mut(*width).enumerate().for_each(|(y, row)| {

@@ -11,9 +11,9 @@ use super::depth_layers::DepthLayers;
 use super::feature_map::FeatureMap;
 use super::feedback::LayerFeedback;
 use super::field::{Field, UncorrectedField};
-use super::maps::{FIRST_MAP, MAPS, RUN_PX, write_maps};
+use super::maps::{BLOCK, FIRST_MAP, MAPS, RUN_PX, write_maps};
 use super::network::StageList;
-use super::stage::{Buffers, Job, MapId, Maps, Stage};
+use super::stage::{Buffers, Job, MapId, Maps, Stage, frame_bytes, plane_bytes};
 use super::trunk::Trunk;
 use crate::phase_math::cos_sin_pi;
 use crate::simd::{InstructionSet, Simd, Task};
@@ -41,20 +41,35 @@ pub(super) fn stages(
         stack: vec![0.0; 3 * config.depth_layers * size.pixels()],
         sum: vec![Complex32::ZERO; size.pixels()],
     };
+    let stack_planes = 3 * config.depth_layers;
+    let layer_numbers = (BLOCK * size.pixels()) as u64;
     StageList::new(maps, volume)
         .then(Expect {
+            bytes: frame_bytes(resolution)
+                + layer_numbers
+                + plane_bytes(stack_planes + 2 * (MAPS + stack_planes), size),
             defocus: Defocus::new(config, size, set),
             lighting_input: lighting.input,
             correction_input: correction.input,
         })
         .then_each(lighting.layers)
         .then(LightLayers {
+            bytes: plane_bytes(
+                // The stack is written where it is refined.
+                config.lighting_channels() + stack_planes * (1 + usize::from(config.refined_stack)) + OUTPUT_CHANNELS,
+                size,
+            ),
             output: lighting.output,
             refines: config.refined_stack,
             rows: vec![0.0; config.lighting_channels() * size.pixels()],
             light: vec![Complex32::ZERO; size.pixels()],
         })
-        .then(FeedBack { feedback: LayerFeedback::new(config, feedback, size), correction_input: correction.input })
+        .then(FeedBack {
+            // The field before and after, for the net the field and its change, and the stack and what is lacking of it.
+            bytes: layer_numbers + plane_bytes(4 * OUTPUT_CHANNELS + 2 * stack_planes, size),
+            feedback: LayerFeedback::new(config, feedback, size),
+            correction_input: correction.input,
+        })
         .then_each(correction.layers)
         .then(Field::new(config.grid, resolution, correction.output))
 }
@@ -70,6 +85,8 @@ pub(super) struct DepthVolume {
 }
 
 impl UncorrectedField for DepthVolume {
+    const PLANES: usize = OUTPUT_CHANNELS;
+
     fn write_corrected(&self, residual: &FeatureMap, colour: Colour, field: &mut [Complex32]) {
         residual.correct(&self.layers.carried[colour.index() * field.len()..], colour, field);
     }
@@ -77,6 +94,7 @@ impl UncorrectedField for DepthVolume {
 
 /// Writes what an eye should see, and with the maps of the frame shows it to both nets.
 struct Expect {
+    bytes: u64,
     defocus: Defocus,
     lighting_input: MapId,
     correction_input: MapId,
@@ -85,6 +103,10 @@ struct Expect {
 impl Stage<DepthVolume> for Expect {
     fn name(&self) -> &str {
         "expected stack"
+    }
+
+    fn bytes(&self) -> u64 {
+        self.bytes
     }
 
     fn run(&mut self, buffers: &mut Buffers<DepthVolume>, job: &mut Job<'_>) {
@@ -108,6 +130,7 @@ impl Stage<DepthVolume> for Expect {
 /// Lights every layer with what is expected there, as far as the first net corrects it, through its masks and with its
 /// phases, and carries all of it to the SLM plane.
 struct LightLayers {
+    bytes: u64,
     /// The first net's.
     output: MapId,
     refines: bool,
@@ -123,8 +146,12 @@ impl Stage<DepthVolume> for LightLayers {
         "light of the layers"
     }
 
+    fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
     fn run(&mut self, buffers: &mut Buffers<DepthVolume>, _: &mut Job<'_>) {
-        let Self { output, refines, rows: output_rows, light } = self;
+        let Self { output, refines, rows: output_rows, light, .. } = self;
         let Buffers { maps, family: DepthVolume { layers, stack, sum } } = buffers;
         let (output, set, width, pixels) = (&maps[*output], maps.set, maps.size.width, maps.size.pixels());
         let (count, channels) = (layers.numbers().len(), output_rows.len() / pixels);
@@ -201,6 +228,7 @@ impl Task for LightRow<'_> {
 
 /// Feeds back what is lacking, and shows the second net the field, the change and the lack.
 struct FeedBack {
+    bytes: u64,
     feedback: LayerFeedback,
     correction_input: MapId,
 }
@@ -208,6 +236,10 @@ struct FeedBack {
 impl Stage<DepthVolume> for FeedBack {
     fn name(&self) -> &str {
         "feedback"
+    }
+
+    fn bytes(&self) -> u64 {
+        self.bytes
     }
 
     fn run(&mut self, buffers: &mut Buffers<DepthVolume>, job: &mut Job<'_>) {

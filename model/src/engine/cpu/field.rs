@@ -5,12 +5,15 @@ use num_complex::Complex32;
 
 use super::blocks::{grid_size, scale_of};
 use super::feature_map::FeatureMap;
-use super::stage::{Buffers, Job, MapId, Stage};
+use super::stage::{Buffers, Job, MapId, Stage, plane_bytes};
 use crate::optics::FourierUpsampler;
-use crate::weights::Grid;
+use crate::weights::{Grid, OUTPUT_CHANNELS};
 
 /// The field on the network's grid that the last net corrects.
 pub(super) trait UncorrectedField {
+    /// Planes of real numbers that it is kept in.
+    const PLANES: usize;
+
     /// Writes one colour of it with the last net's output `residual` to `field` [height, width].
     fn write_corrected(&self, residual: &FeatureMap, colour: Colour, field: &mut [Complex32]);
 }
@@ -18,6 +21,8 @@ pub(super) trait UncorrectedField {
 /// Corrects the field, and upsamples it on the half-band grid.
 pub(super) struct Field {
     residual: MapId,
+    /// The network's grid.
+    size: Resolution,
     /// The panel's size, and that rounded up to what the grid needs.
     resolution: Resolution,
     padded: Resolution,
@@ -28,10 +33,11 @@ pub(super) struct Field {
 
 impl Field {
     pub(super) fn new(grid: Grid, resolution: Resolution, residual: MapId) -> Self {
-        let (scale, Resolution { width, height }) = (scale_of(grid), grid_size(grid, resolution));
-        let padded = Resolution { width: scale * width, height: scale * height };
+        let (scale, size) = (scale_of(grid), grid_size(grid, resolution));
+        let padded = Resolution { width: scale * size.width, height: scale * size.height };
         Self {
             residual,
+            size,
             resolution,
             padded,
             upsampler: (grid == Grid::HalfBand).then(|| FourierUpsampler::new(padded)),
@@ -45,8 +51,13 @@ impl<F: UncorrectedField> Stage<F> for Field {
         "field"
     }
 
+    fn bytes(&self) -> u64 {
+        let Self { size, resolution, .. } = self;
+        plane_bytes(F::PLANES + OUTPUT_CHANNELS, *size) + plane_bytes(OUTPUT_CHANNELS, *resolution)
+    }
+
     fn run(&mut self, Buffers { maps, family }: &mut Buffers<F>, job: &mut Job<'_>) {
-        let Self { residual, resolution, padded, upsampler, uncropped } = self;
+        let Self { residual, resolution, padded, upsampler, uncropped, .. } = self;
         let residual = &maps[*residual];
         for colour in Colour::ALL {
             let plane = job.hologram.plane_mut(colour);

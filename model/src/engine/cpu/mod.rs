@@ -26,7 +26,7 @@ use crate::engine::{EngineError, StageTimings};
 use crate::simd::InstructionSet;
 use crate::{ComplexHologram, RgbdFrame, Weights};
 
-pub use peak::fma_peak;
+pub use peak::{fma_peak, stream_bandwidth};
 
 /// The network on the CPU, for frames of one size. It works on the threads of the [`WorkerPool`](crate::WorkerPool) that
 /// it is called in, elsewhere on rayon's own.

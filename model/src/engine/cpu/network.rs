@@ -78,6 +78,7 @@ impl<F: Send + Sync> Stages for StageList<F> {
             name: stage.name().into(),
             duration: Duration::ZERO,
             flop: stage.flop(),
+            bytes: stage.bytes(),
         });
         StageTimings { stages: stages.collect() }
     }

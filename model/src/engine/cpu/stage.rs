@@ -28,12 +28,25 @@ pub(super) trait Stage<F>: Send + Sync {
         0
     }
 
+    /// As in [`StageTiming`](crate::engine::StageTiming).
+    fn bytes(&self) -> u64;
+
     /// Does the step; allocates nothing.
     fn run(&mut self, buffers: &mut Buffers<F>, job: &mut Job<'_>);
 
     /// What the step has just written, for tests that look inside.
     #[cfg(test)]
     fn seen<'a>(&'a self, buffers: &'a Buffers<F>, job: &'a Job<'_>) -> Seen<'a>;
+}
+
+/// Bytes of `count` planes of real numbers of `size`; a field has [`OUTPUT_CHANNELS`](crate::weights::OUTPUT_CHANNELS).
+pub(super) const fn plane_bytes(count: usize, size: Resolution) -> u64 {
+    (count * size.width * size.height * size_of::<f32>()) as u64
+}
+
+/// Bytes of a picture and its depth.
+pub(super) const fn frame_bytes(resolution: Resolution) -> u64 {
+    plane_bytes(3 + 1, resolution)
 }
 
 #[cfg(test)]

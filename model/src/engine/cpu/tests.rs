@@ -232,6 +232,54 @@ fn an_engine_renders_as_its_network_does_and_clamps_the_pupil() {
 }
 
 #[test]
+fn stages_tell_the_least_that_they_move() {
+    let resolution = Resolution { width: 31, height: 18 };
+    let stages = |config| {
+        let engine = CpuEngine::new(&random_weights(config, 2), resolution).unwrap();
+        engine.last_timings().stages.iter().map(|stage| (stage.name.clone(), stage.bytes)).collect::<Vec<_>>()
+    };
+    // Picture and depth; planes on the network's grid; what comes out.
+    let frame = 4 * 4 * 31 * 18;
+    let planes = |count: u64| count * 4 * 16 * 9;
+    let hologram = 3 * 8 * 31 * 18;
+    let numbers = 4 * 16 * 9;
+    let named =
+        |stages: &[(&str, u64)]| stages.iter().map(|&(name, bytes)| (name.to_owned(), bytes)).collect::<Vec<_>>();
+    assert_eq!(
+        stages(config(Grid::HalfBand, 4, 8, vec![1])),
+        named(&[
+            ("encode", frame + planes(21 + 3)),
+            ("layer 0", planes(21 + 8)),
+            ("layer 1 (adjustable)", planes(8 + 8)),
+            ("layer 2", planes(8 + 8 + 8)),
+            ("layer 3", planes(8 + 6)),
+            ("field", planes(6 + 3) + hologram),
+        ])
+    );
+    // Five layers of three amplitudes; 4 outputs light each layer, 3 refine it.
+    for (refined_stack, lighting, stack) in [(false, 4 * 5, 15), (true, 7 * 5, 15 + 15)] {
+        let config = NetworkConfig { refined_stack, channels: 8, ..weights_tests::expected_stack_config() };
+        assert_eq!(
+            stages(config),
+            named(&[
+                ("expected stack", frame + numbers + planes(15 + 2 * (21 + 15))),
+                ("lighting layer 0", planes(21 + 15 + 8)),
+                ("lighting layer 1", planes(8 + 8)),
+                ("lighting layer 2 (adjustable)", planes(8 + 8 + 8)),
+                ("lighting layer 3", planes(8 + lighting)),
+                ("light of the layers", planes(lighting + stack + 6)),
+                ("feedback", numbers + planes(6 + 15 + 6 + 6 + 6 + 15)),
+                ("correction layer 0", planes(6 + 21 + 15 + 6 + 15 + 8)),
+                ("correction layer 1", planes(8 + 8)),
+                ("correction layer 2", planes(8 + 8 + 8)),
+                ("correction layer 3", planes(8 + 6)),
+                ("field", planes(6 + 6) + hologram),
+            ])
+        );
+    }
+}
+
+#[test]
 fn what_is_no_number_at_the_border_leaves_no_trace_in_the_next_frame() {
     let resolution = Resolution { width: 31, height: 18 };
     for weights in [random_weights(config(Grid::HalfBand, 4, 8, vec![1]), 2), Weights::builtin_small()] {

@@ -3,7 +3,7 @@
 use super::conv::{Epilogue, PlainConv};
 use super::deformable::DeformableConv;
 use super::feature_map::FeatureMap;
-use super::stage::{Buffers, Job, MapId, Maps, Stage};
+use super::stage::{Buffers, Job, MapId, Maps, Stage, plane_bytes};
 use crate::engine::modulation::Modulation;
 use crate::weights::{Layer, OFFSET_CHANNELS};
 
@@ -33,10 +33,13 @@ impl Trunk {
             };
             let conv = Conv::new(maps, layer, epilogue, leaky_slope);
             let adjustable = if layer.adjustable.is_some() { " (adjustable)" } else { "" };
+            // What is there already is read, too.
+            let skipped = if epilogue == Epilogue::ResidualLeaky { layer.out_channels } else { 0 };
             let outputs = layer.out_channels + layer.adjustable.as_ref().map_or(0, |_| OFFSET_CHANNELS);
             LayerStage {
                 name: format!("{prefix}layer {index}{adjustable}"),
                 flop: (2 * 9 * layer.in_channels * outputs * maps.size.pixels()) as u64,
+                bytes: plane_bytes(layer.in_channels + skipped + layer.out_channels, maps.size),
                 from,
                 to,
                 conv,
@@ -50,6 +53,7 @@ impl Trunk {
 pub(super) struct LayerStage {
     name: String,
     flop: u64,
+    bytes: u64,
     from: MapId,
     to: MapId,
     conv: Conv,
@@ -62,6 +66,10 @@ impl<F> Stage<F> for LayerStage {
 
     fn flop(&self) -> u64 {
         self.flop
+    }
+
+    fn bytes(&self) -> u64 {
+        self.bytes
     }
 
     fn run(&mut self, buffers: &mut Buffers<F>, job: &mut Job<'_>) {

@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 use super::expected_stack::Grid;
 use super::fft::Lines;
 use super::map::{GROUP, Map};
-use super::maps::{InputChannels, grid_constants, sample_pitch};
+use super::maps::{InputChannels, grid_constants, plane_bytes, sample_pitch};
 use super::network::Shared;
 use super::plan::{BufferId, Constant, Plan};
 use crate::weights::NetworkConfig;
@@ -73,20 +73,26 @@ pub(super) fn expect(
     let shader = |lines: &Lines, entry| lines.shader(&format!("defocus: {entry}"), &constants, &files, entry);
     let (rows, columns) = (grid.rows.rows(ROW_ITEMS), grid.columns.columns(BLUR_ITEMS));
     let (row_groups, column_groups) = (rows.workgroups(size.height), columns.workgroups(size.width));
+    let [complex, real, group] = plane_bytes(size);
+    let (chunks, spectra) = (count.div_ceil(foci), (PAIRS * count) as u64 * complex);
+    let frame_bytes = (4 * size_of::<f32>() * shared.resolution.pixels()) as u64;
     let stage = plan.stage("expected stack", 0);
-    stage.dispatch_with(
+    let take_layers = stage.dispatch_with(
         shader(&rows, "take_layers"),
-        &[rows.turns(), (1, shared.frame), (3, layer_of), (4, grid.spectra)],
+        &[rows.turns(), (1, shared.frame), (2, shared.pupil), (3, layer_of), (4, grid.spectra), (7, inputs.buffer)],
         [row_groups, 1, 1],
     );
-    stage.dispatch_with(
+    take_layers.bytes = Some(frame_bytes + real + spectra + 5 * group);
+    let blur = stage.dispatch_with(
         shader(&columns, "blur"),
         &[columns.turns(), (2, shared.pupil), (4, grid.spectra), (5, disc_table)],
-        [column_groups, PAIRS, count.div_ceil(foci)],
+        [column_groups, PAIRS, chunks],
     );
-    stage.dispatch_with(
+    blur.bytes = Some((chunks as u64 + 1) * spectra);
+    let see = stage.dispatch_with(
         shader(&rows, "see"),
-        &[rows.turns(), (1, shared.frame), (2, shared.pupil), (4, grid.spectra), (6, stack), (7, inputs.buffer)],
+        &[rows.turns(), (2, shared.pupil), (4, grid.spectra), (6, stack), (7, inputs.buffer)],
         [row_groups, 1 + (count - 1).div_ceil(4), 1],
     );
+    see.bytes = Some(spectra + 3 * count as u64 * real + (first_part / GROUP - 5) as u64 * group);
 }

@@ -24,7 +24,8 @@ fn depth_layer(depth: f32) -> u32 {
     return u32(min(select(0f, layer, layer > 0f), f32(LAYERS - 1u)));
 }
 
-// Rows of each layer's light, to spectra along x. A workgroup reads its rows of the frame once.
+// Rows of each layer's light, to spectra along x. A workgroup reads its rows of the frame once, and also writes what the map
+// has of them.
 @compute @workgroup_size(THREADS)
 fn take_layers(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;
@@ -37,12 +38,15 @@ fn take_layers(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
         let y = group.x * LINES + place % LINES;
         if (place < PLACES && y < HEIGHT) {
             let depths = corners(3u, x, y);
+            inputs[input_place(3u, x, y)] = 2f * (depths - 0.5f);
+            inputs[input_place(4u, x, y)] = (depths - 0.5f) * pupil_mm;
             for (var corner = 0u; corner < BLOCK; corner++) {
                 layers[item] |= depth_layer(depths[corner]) << (8u * corner);
             }
             layer_of[y * WIDTH + x] = layers[item];
             for (var colour = 0u; colour < 3u; colour++) {
                 let amplitudes = corners(colour, x, y);
+                inputs[input_place(colour, x, y)] = amplitudes - 0.4f;
                 light[item][colour] = amplitudes * amplitudes;
             }
         }
@@ -139,14 +143,13 @@ fn blur(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) in
 }
 
 // Rows of what is seen at the foci 4·b - 3 to 4·b of workgroup b along y: to the stack, and to the channels 12·(b + 1) to
-// 12·(b + 2) of the map, of which the first workgroup also writes those of the frame.
+// 12·(b + 2) of the map. Of the first workgroup's only the last focus is one, and its channels share a group with the pupil.
 @compute @workgroup_size(THREADS)
 fn see(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;
     var shown: array<array<vec3f, 4>, ITEMS>;
     for (var slot = 0u; slot < 4u; slot++) {
         let focus = 4u * group.y + slot - 3u;
-        // The first workgroup's first ones are below zero.
         if (focus < LAYERS) {
             var white_red: array<vec2f, ITEMS>;
             for (var pair = 0u; pair < PAIRS; pair++) {
@@ -188,17 +191,11 @@ fn see(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) ind
             let b = shown[item][1];
             let c = shown[item][2];
             let d = shown[item][3];
-            var channels = array(vec4f(a, b.x), vec4f(b.yz, c.xy), vec4f(c.z, d));
-            if (group.y == 0u) {
-                for (var colour = 0u; colour < 3u; colour++) {
-                    inputs[input_place(colour, x, y)] = corners(colour, x, y) - 0.4f;
-                }
-                let centred = corners(3u, x, y) - 0.5f;
-                channels = array(2f * centred, centred * pupil_mm, vec4f((pupil_mm - 2.5f) / 2f, d));
-            }
+            let pupil = (pupil_mm - 2.5f) / 2f;
+            let channels = array(vec4f(a, b.x), vec4f(b.yz, c.xy), vec4f(select(c.z, pupil, group.y == 0u), d));
             for (var part = 0u; part < 3u; part++) {
                 let map_group = 3u * (group.y + 1u) + part;
-                if (map_group < FIRST_PART_GROUPS) {
+                if (map_group < FIRST_PART_GROUPS && (part == 2u || group.y > 0u)) {
                     inputs[input_place(map_group, x, y)] = channels[part];
                 }
             }

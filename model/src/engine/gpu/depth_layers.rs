@@ -1,13 +1,15 @@
 //! The light of the depth layers, and how it goes to the SLM plane, for `depth_layers.wgsl`.
 
+use std::sync::Arc;
+
 use holod_calibration::{Colour, Metres};
 
 use super::expected_stack::Grid;
 use super::fft::Lines;
 use super::map::Map;
-use super::maps::sample_pitch;
+use super::maps::{plane_bytes, sample_pitch};
 use super::network::Shared;
-use super::plan::{BufferId, Constant, Plan, Stage};
+use super::plan::{BufferId, Constant, Plan, Shader, Stage};
 use crate::optics::transfer_table;
 use crate::weights::NetworkConfig;
 
@@ -77,23 +79,32 @@ impl DepthLayers {
         stack: BufferId,
         outputs: &Map,
     ) {
-        let own: [(&str, Constant); 2] =
-            [("REFINES", config.refined_stack.into()), ("MASK_OFFSET", ((self.count - 1) as f32).ln().into())];
+        let own: [(&str, Constant); 3] = [
+            ("REFINES", config.refined_stack.into()),
+            ("MASK_OFFSET", ((self.count - 1) as f32).ln().into()),
+            ("STOPS", false.into()),
+        ];
         let constants = [&own[..], &outputs.constants(["OUTPUT_GROUPS", "OUTPUT_PITCH"])].concat();
         let rows = grid.rows.rows(ROW_ITEMS);
         let row_groups = rows.workgroups(shared.size.height);
+        let [complex, real, group] = plane_bytes(shared.size);
+        let (count, planes) = (self.count as u64, 3 * self.count as u64);
         let stage = plan.stage("light of the layers", 0);
-        stage.dispatch_with(
-            self.shader(&rows, &[&constants[..], &[("STOPS", false.into())]].concat(), "light"),
+        let light = stage.dispatch_with(
+            self.shader(&rows, &constants, "light"),
             &[rows.turns(), (1, outputs.buffer), (2, stack), (3, grid.spectra)],
             [row_groups, self.count, 1],
         );
+        // Where the stack is refined, the changes are read and it is written.
+        let refined = if config.refined_stack { 2 * planes * real } else { 0 };
+        light.bytes = Some(count * group + planes * (real + complex) + refined);
         self.bring_back(stage, shared, grid, false);
-        stage.dispatch_with(
-            self.shader(&rows, &[&constants[..], &[("STOPS", false.into())]].concat(), "arrive"),
+        let arrive = stage.dispatch_with(
+            self.shader(&rows, &constants, "arrive"),
             &[rows.turns(), (3, grid.spectra), (8, self.carried)],
             [row_groups, 3, 1],
         );
+        arrive.bytes = Some(6 * complex);
     }
 
     /// Adds what carries the light of the layers in `grid.spectra`, along x, to the SLM plane, and through the pupil where
@@ -108,7 +119,8 @@ impl DepthLayers {
             ("OUTPUT_PITCH", 1.into()),
             ("STOPS", stops.into()),
         ];
-        stage.dispatch_with(
+        let [complex, ..] = plane_bytes(shared.size);
+        let bring_back = stage.dispatch_with(
             self.shader(&columns, &constants, "bring_back"),
             &[
                 columns.turns(),
@@ -120,14 +132,12 @@ impl DepthLayers {
             ],
             [columns.workgroups(shared.size.width), 3, 1],
         );
+        // The layers' spectra, two tables, and what is made of them.
+        let made = if stops { 3 } else { 6 };
+        bring_back.bytes = Some((3 * self.count as u64 + 6 + made) * complex);
     }
 
-    fn shader(
-        &self,
-        lines: &Lines,
-        constants: &[(&str, Constant)],
-        entry: &'static str,
-    ) -> std::sync::Arc<super::plan::Shader> {
+    fn shader(&self, lines: &Lines, constants: &[(&str, Constant)], entry: &'static str) -> Arc<Shader> {
         let files = [include_str!("phase_math.wgsl"), include_str!("pupil.wgsl"), include_str!("depth_layers.wgsl")];
         let constants = [&self.constants[..], constants].concat();
         lines.shader(&format!("depth layers: {entry}"), &constants, &files, entry)

@@ -6,6 +6,7 @@ use std::time::Duration;
 use holod_calibration::{LevelTables, PupilDiameter};
 use wgpu::{BufferUsages, QuerySet};
 
+use super::fft::WorkgroupLimits;
 use super::loaded_plan::LoadedPlan;
 use super::map::Precision;
 use super::network::NetworkPlan;
@@ -66,7 +67,8 @@ impl GpuEngine {
     }
 
     pub(super) fn on(gpu: Gpu, weights: &Weights, tables: &LevelTables) -> Result<Self, EngineError> {
-        let network = NetworkPlan::new(weights, tables, Precision::F32, gpu.workgroup_bytes)?;
+        let limits = WorkgroupLimits { bytes: gpu.workgroup_bytes, threads: gpu.workgroup_threads };
+        let network = NetworkPlan::new(weights, tables, Precision::F32, limits)?;
         let plan = &network.plan;
         let loaded = LoadedPlan::new(&gpu, plan)?;
         let timestamps = match gpu.timestamp_ns {
@@ -80,8 +82,12 @@ impl GpuEngine {
             timestamps_bytes + COUNTS_BYTES + samples_bytes,
             BufferUsages::MAP_READ | BufferUsages::COPY_DST,
         )?;
-        let timing =
-            |stage: &Stage| StageTiming { name: stage.name.clone(), duration: Duration::ZERO, flop: stage.flop };
+        let timing = |stage: &Stage| StageTiming {
+            name: stage.name.clone(),
+            duration: Duration::ZERO,
+            flop: stage.flop,
+            bytes: 0,
+        };
         Ok(Self {
             timings: StageTimings { stages: plan.stages.iter().map(timing).collect() },
             readback: Readback { staging, timestamps_bytes, samples_bytes },

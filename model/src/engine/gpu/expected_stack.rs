@@ -4,7 +4,7 @@
 use super::defocus;
 use super::depth_layers::DepthLayers;
 use super::feedback;
-use super::fft::LineFft;
+use super::fft::{LineFft, WorkgroupLimits};
 use super::map::Map;
 use super::network::Shared;
 use super::plan::{BufferId, Plan};
@@ -37,19 +37,19 @@ impl<'a> ExpectedStack<'a> {
     /// `inputs` that the first net reads.
     ///
     /// # Errors
-    /// A row or a column does not fit in `workgroup_bytes`.
+    /// A row or a column does not fit in a workgroup's memory.
     pub(crate) fn expect(
         plan: &mut Plan,
         config: &'a NetworkConfig,
         shared: &Shared,
         inputs: &Map,
-        workgroup_bytes: u32,
+        limits: WorkgroupLimits,
     ) -> Result<Self, GpuError> {
         let (size, count) = (shared.size, config.depth_layers);
         let planes = defocus::scratch_planes(count).max(3 * count);
         let grid = Grid {
-            rows: LineFft::new(plan, size.width, workgroup_bytes)?,
-            columns: LineFft::new(plan, size.height, workgroup_bytes)?,
+            rows: LineFft::new(plan, size.width, limits)?,
+            columns: LineFft::new(plan, size.height, limits)?,
             spectra: plan.buffer::<[f32; 2]>("spectra of the layers", planes * size.pixels()),
         };
         let layers = DepthLayers::new(plan, config, shared);
@@ -92,7 +92,7 @@ mod tests {
     use crate::weights::tests::{expected_stack_config, random_weights};
     use crate::weights::{Family, Grid, Weights};
 
-    const WORKGROUP_BYTES: u32 = 32 << 10;
+    const LIMITS: WorkgroupLimits = WorkgroupLimits { bytes: 32 << 10, threads: 512 };
     /// Largest difference allowed from the reference, relative to the reference's largest value.
     const TOLERANCE: f64 = 2e-5;
 
@@ -108,7 +108,7 @@ mod tests {
     }
 
     impl Stages {
-        fn new(weights: &Weights, resolution: Resolution, workgroup_bytes: u32) -> Self {
+        fn new(weights: &Weights, resolution: Resolution, limits: WorkgroupLimits) -> Self {
             let Family::ExpectedStack { feedback, .. } = weights.family else { panic!("weights of another family") };
             let (config, plan) = (&weights.config, &mut Plan::default());
             let size = Resolution { width: resolution.width.div_ceil(2), height: resolution.height.div_ceil(2) };
@@ -116,13 +116,13 @@ mod tests {
             let channels = InputChannels::new(config.depth_layers);
             let inputs = channels.map(plan, size);
             let net = |plan: &mut Plan, what, channels| Map::new(plan, what, (size.width, size.height), channels);
-            let stages = ExpectedStack::expect(plan, config, &shared, &inputs, workgroup_bytes).expect("it fits");
+            let stages = ExpectedStack::expect(plan, config, &shared, &inputs, limits).expect("it fits");
             let outputs = net(plan, "the first net's", config.lighting_channels());
             stages.light(plan, &outputs);
             stages.feed_back(plan, feedback, &inputs);
             let correction = net(plan, "the second net's", 6);
             let low = Low::Corrected(stages.carried(), &correction);
-            upsample::field(plan, &shared, Grid::HalfBand, low, workgroup_bytes).expect("it fits");
+            upsample::field(plan, &shared, Grid::HalfBand, low, limits).expect("it fits");
             let carried = stages.carried();
             Self { trial: Trial::new(plan), shared, channels, inputs, outputs, correction, carried }
         }
@@ -208,13 +208,13 @@ mod tests {
     }
 
     fn check(weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32) {
-        check_within(WORKGROUP_BYTES, weights, resolution, pupil_mm, seed);
+        check_within(LIMITS, weights, resolution, pupil_mm, seed);
     }
 
-    fn check_within(workgroup_bytes: u32, weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32) {
+    fn check_within(limits: WorkgroupLimits, weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32) {
         let shown = frame(resolution, seed);
         let trace = reference::run(weights, &shown, f64::from(pupil_mm));
-        let stages = Stages::new(weights, resolution, workgroup_bytes);
+        let stages = Stages::new(weights, resolution, limits);
         let context = |what: &str| format!("{resolution}, {} layers: {what}", weights.config.depth_layers);
         let real = |map: &reference::Map| map.values.iter().map(|&value| value.into()).collect::<Vec<Complex64>>();
 
@@ -273,8 +273,9 @@ mod tests {
         for (width, height) in [(290, 3), (5, 271), (101, 34)] {
             check(&weights, Resolution { width, height }, 4.1, 2);
         }
+        let little = WorkgroupLimits { bytes: 150 * 8, threads: 128 };
         // In so little memory a workgroup has one line, as it has of a long one.
-        check_within(150 * 8, &weights, Resolution { width: 299, height: 5 }, 4.1, 2);
+        check_within(little, &weights, Resolution { width: 299, height: 5 }, 4.1, 2);
     }
 
     #[test]
@@ -296,7 +297,7 @@ mod tests {
     fn what_is_no_number_leaves_no_trace_in_the_next_frame() {
         let resolution = Resolution { width: 31, height: 18 };
         let weights = random_weights(config(5, true), 2);
-        let stages = Stages::new(&weights, resolution, WORKGROUP_BYTES);
+        let stages = Stages::new(&weights, resolution, LIMITS);
         let trace = reference::run(&weights, &frame(resolution, 4), 3.0);
         let clean = stages.run(&frame(resolution, 4), 3.0, &trace);
         assert!(clean.iter().all(|value| value.is_finite()));

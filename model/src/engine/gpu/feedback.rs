@@ -6,7 +6,7 @@ use super::depth_layers::{DepthLayers, transfer_tables};
 use super::expected_stack::Grid;
 use super::fft::Lines;
 use super::map::{GROUP, Map};
-use super::maps::InputChannels;
+use super::maps::{InputChannels, plane_bytes};
 use super::network::Shared;
 use super::plan::{BufferId, Constant, Plan};
 use crate::weights::{Feedback, NetworkConfig};
@@ -51,8 +51,10 @@ pub(super) fn feed_back(
     let shader = |lines: &Lines, entry| lines.shader(&format!("feedback: {entry}"), &constants, &files, entry);
     let (rows, columns) = (grid.rows.rows(ROW_ITEMS), grid.columns.columns(COLUMN_ITEMS));
     let row_groups = rows.workgroups(size.height);
+    let [complex, real, group] = plane_bytes(size);
+    let (planes, batches) = (3 * count as u64, count.div_ceil(4));
     let stage = plan.stage("feedback", 0);
-    stage.dispatch_with(
+    let send = stage.dispatch_with(
         shader(&columns, "send"),
         &[
             columns.turns(),
@@ -64,15 +66,19 @@ pub(super) fn feed_back(
         ],
         [columns.workgroups(size.width), 3, 1],
     );
-    stage.dispatch_with(
+    send.bytes = Some((9 + planes) * complex);
+    let compare = stage.dispatch_with(
         shader(&rows, "compare"),
         &[rows.turns(), (5, grid.spectra), (6, stack), (7, layer_of), (9, inputs.buffer)],
-        [row_groups, count.div_ceil(4), 1],
+        [row_groups, batches, 1],
     );
+    let lack_groups = (inputs.groups - channels.lack / GROUP) as u64;
+    compare.bytes = Some(2 * planes * complex + (planes + batches as u64) * real + lack_groups * group);
     layers.bring_back(stage, shared, grid, true);
-    stage.dispatch_with(
+    let change = stage.dispatch_with(
         shader(&rows, "change"),
         &[rows.turns(), (5, grid.spectra), (8, layers.carried), (9, inputs.buffer)],
         [row_groups, 1, 1],
     );
+    change.bytes = Some(9 * complex + 3 * group);
 }

@@ -19,12 +19,21 @@ const SAMPLE_BYTES: usize = size_of::<Complex32>();
 const MOST_LINES: usize = 8;
 /// More of the memory of workgroups than this for one leaves too few beside it.
 const MOST_BYTES: usize = 32 << 10;
-/// Threads of a workgroup that every device runs.
-const MOST_THREADS: usize = 256;
+/// The same of threads.
+const MOST_THREADS: usize = 512;
 /// Threads come in whole multiples of this.
 const WAVE: usize = 64;
 /// Samples of short rows that one workgroup takes.
 const SAMPLES_OF_ROWS: usize = 1024;
+
+/// What a device lets one workgroup have.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct WorkgroupLimits {
+    /// Memory that its threads share.
+    pub(crate) bytes: u32,
+    /// Threads, all along x.
+    pub(crate) threads: u32,
+}
 
 /// Transforms of lines of one length.
 #[derive(Clone)]
@@ -35,21 +44,20 @@ pub(crate) struct LineFft {
     radices: Vec<usize>,
     /// `turns` of `fft.wgsl`.
     turns: BufferId,
-    workgroup_bytes: usize,
+    limits: WorkgroupLimits,
 }
 
 impl LineFft {
-    /// For lines of `length` samples, on a device whose workgroups have `workgroup_bytes` of memory.
+    /// For lines of `length` samples, on a device with these `limits`.
     ///
     /// # Errors
     /// Not even one such line fits in a workgroup.
-    pub(crate) fn new(plan: &mut Plan, length: usize, workgroup_bytes: u32) -> Result<Self, GpuError> {
+    pub(crate) fn new(plan: &mut Plan, length: usize, limits: WorkgroupLimits) -> Result<Self, GpuError> {
         let smooth = |span: &usize| radices(*span).is_some();
         let span = if smooth(&length) { length } else { (2 * length - 1..).find(smooth).expect("powers of 2 are") };
         let bytes = span * SAMPLE_BYTES;
-        let workgroup_bytes = workgroup_bytes as usize;
-        if bytes > workgroup_bytes {
-            return Err(GpuError::LineTooLong { samples: length, bytes, limit: workgroup_bytes });
+        if bytes > limits.bytes as usize {
+            return Err(GpuError::LineTooLong { samples: length, bytes, limit: limits.bytes as usize });
         }
         let mut turns: Vec<_> = (0..span).map(|turn| Complex64::cis(-TAU * turn as f64 / span as f64)).collect();
         if span != length {
@@ -58,7 +66,7 @@ impl LineFft {
         }
         let turns: Vec<_> = turns.iter().map(|turn| [turn.re as f32, turn.im as f32]).collect();
         let turns = plan.table("turns of a transform", &turns);
-        Ok(Self { length, span, radices: radices(span).expect("found so"), turns, workgroup_bytes })
+        Ok(Self { length, span, radices: radices(span).expect("found so"), turns, limits })
     }
 
     /// Workgroups for rows, whose threads hold `items` samples, or more where there are not threads enough.
@@ -68,17 +76,21 @@ impl LineFft {
 
     /// The same for columns, of which neighbours are taken together as far as their memory and threads go.
     pub(crate) fn columns(&self, items: usize) -> Lines {
-        self.lines(items, |lines| lines * self.length <= items * MOST_THREADS)
+        self.lines(items, |lines| lines * self.length <= items * self.most_threads())
+    }
+
+    fn most_threads(&self) -> usize {
+        (self.limits.threads as usize).min(MOST_THREADS)
     }
 
     fn lines(&self, items: usize, suits: impl Fn(usize) -> bool) -> Lines {
-        let fits = |lines: usize| lines * self.span * SAMPLE_BYTES <= self.workgroup_bytes.min(MOST_BYTES);
+        let fits = |lines: usize| lines * self.span * SAMPLE_BYTES <= (self.limits.bytes as usize).min(MOST_BYTES);
         let mut lines = MOST_LINES;
         while lines > 1 && !(fits(lines) && suits(lines)) {
             lines /= 2;
         }
         let threads = (lines * self.length).div_ceil(items).next_multiple_of(WAVE);
-        Lines { fft: self.clone(), lines, threads: threads.min(MOST_THREADS) }
+        Lines { fft: self.clone(), lines, threads: threads.min(self.most_threads()) }
     }
 }
 
@@ -173,7 +185,7 @@ mod tests {
     use super::super::trial::{Trial, complex, largest_difference};
     use super::*;
 
-    const WORKGROUP_BYTES: u32 = 32 << 10;
+    const LIMITS: WorkgroupLimits = WorkgroupLimits { bytes: 32 << 10, threads: 1024 };
 
     /// Transforms rows from binding 1 to binding 2.
     const ROWS: &str = "
@@ -210,7 +222,7 @@ mod tests {
         direction: f32,
     ) -> [Vec<Complex64>; 2] {
         let mut plan = Plan::default();
-        let lines = lines(&LineFft::new(&mut plan, length, WORKGROUP_BYTES).expect("it fits"));
+        let lines = lines(&LineFft::new(&mut plan, length, LIMITS).expect("it fits"));
         let (from, to) =
             (plan.buffer::<[f32; 2]>("from", length * height), plan.buffer::<[f32; 2]>("to", length * height));
         let constants = [("HEIGHT", height.into()), ("DIRECTION", direction.into())];
@@ -254,7 +266,8 @@ mod tests {
 
     #[test]
     fn what_does_not_fit_is_told_with_its_size_and_the_limit() {
-        let new = |length| LineFft::new(&mut Plan::default(), length, 16 << 10).map(drop);
+        let limits = WorkgroupLimits { bytes: 16 << 10, threads: 128 };
+        let new = |length| LineFft::new(&mut Plan::default(), length, limits).map(drop);
         assert_eq!(new(2048), Ok(()));
         assert_eq!(new(1021), Ok(()));
         // Of 2053 samples, a prime, the chirps need 4105 at least, and 4320 has no factor but 2, 3 and 5.
@@ -268,12 +281,15 @@ mod tests {
 
     #[test]
     fn workgroups_keep_within_their_limits() {
-        for length in 1..=2048 {
-            let fft = LineFft::new(&mut Plan::default(), length, WORKGROUP_BYTES).expect("it fits");
-            for lines in [fft.rows(4), fft.columns(5), fft.columns(9)] {
-                assert!(lines.lines * fft.span * SAMPLE_BYTES <= WORKGROUP_BYTES as usize);
-                assert!(lines.threads <= MOST_THREADS && lines.threads.is_multiple_of(WAVE));
-                assert!(lines.lines.is_power_of_two());
+        for threads in [128, 256, 1024] {
+            let limits = WorkgroupLimits { threads, ..LIMITS };
+            for length in 1..=2048 {
+                let fft = LineFft::new(&mut Plan::default(), length, limits).expect("it fits");
+                for lines in [fft.rows(4), fft.columns(5), fft.columns(9)] {
+                    assert!(lines.lines * fft.span * SAMPLE_BYTES <= limits.bytes as usize);
+                    assert!(lines.threads <= threads as usize && lines.threads.is_multiple_of(WAVE));
+                    assert!(lines.lines.is_power_of_two());
+                }
             }
         }
     }

@@ -57,6 +57,11 @@ pub(super) fn sample_pitch(optics: &DisplayGeometry) -> Metres {
     Metres(2.0 * optics.pixel_pitch.0)
 }
 
+/// Bytes of a plane of complex numbers on a grid of `size`, of a plane of real ones, and of a map's group.
+pub(super) fn plane_bytes(size: Resolution) -> [u64; 3] {
+    [8, 4, 16].map(|bytes| bytes * size.pixels() as u64)
+}
+
 /// The constants of a grid and the frame on it.
 pub(super) fn grid_constants(frame: Resolution, size: Resolution) -> [(&'static str, Constant); 4] {
     [

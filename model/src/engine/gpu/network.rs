@@ -3,6 +3,7 @@
 use holod_calibration::{LevelTables, Resolution};
 
 use super::expected_stack::ExpectedStack;
+use super::fft::WorkgroupLimits;
 use super::map::Precision;
 use super::maps::InputChannels;
 use super::plan::{BufferId, Plan};
@@ -55,8 +56,7 @@ pub(crate) struct NetworkPlan {
 }
 
 impl NetworkPlan {
-    /// For frames of the pattern's size of `tables`, with features in `precision`, on a device whose workgroups share
-    /// `workgroup_bytes`.
+    /// For frames of the pattern's size of `tables`, with features in `precision`, on a device of these limits.
     ///
     /// # Errors
     /// The size is nothing, or too large for that memory.
@@ -64,7 +64,7 @@ impl NetworkPlan {
         weights: &Weights,
         tables: &LevelTables,
         precision: Precision,
-        workgroup_bytes: u32,
+        limits: WorkgroupLimits,
     ) -> Result<Self, EngineError> {
         let (resolution, config) = (tables.pattern, &weights.config);
         if resolution.pixels() == 0 {
@@ -88,18 +88,18 @@ impl NetworkPlan {
                 let input = direct::encode(&mut plan, config, &shared);
                 let output = net(&mut plan, "", layers, &input, (0..config.map_channels()).collect());
                 let low = Low::Field(direct::add_residual(&mut plan, config.grid, &shared, &output));
-                upsample::field(&mut plan, &shared, config.grid, low, workgroup_bytes)?;
+                upsample::field(&mut plan, &shared, config.grid, low, limits)?;
             }
             Family::ExpectedStack { lighting, correction, feedback } => {
                 let channels = InputChannels::new(config.depth_layers);
                 let inputs = channels.map(&mut plan, size);
-                let stack = ExpectedStack::expect(&mut plan, config, &shared, &inputs, workgroup_bytes)?;
+                let stack = ExpectedStack::expect(&mut plan, config, &shared, &inputs, limits)?;
                 let lights = net(&mut plan, "lighting ", lighting, &inputs, channels.lighting());
                 stack.light(&mut plan, &lights);
                 stack.feed_back(&mut plan, *feedback, &inputs);
                 let residual = net(&mut plan, "correction ", correction, &inputs, channels.correction());
                 let low = Low::Corrected(stack.carried(), &residual);
-                upsample::field(&mut plan, &shared, config.grid, low, workgroup_bytes)?;
+                upsample::field(&mut plan, &shared, config.grid, low, limits)?;
             }
         }
         let clipped = plan.buffer::<u32>("clipped samples", 1);

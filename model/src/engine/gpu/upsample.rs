@@ -4,7 +4,7 @@ use std::f64::consts::PI;
 
 use num_complex::Complex64;
 
-use super::fft::{LineFft, Lines};
+use super::fft::{LineFft, Lines, WorkgroupLimits};
 use super::map::Map;
 use super::maps::grid_constants;
 use super::network::Shared;
@@ -32,13 +32,13 @@ pub(crate) enum Low<'a> {
 /// the plan's last one, and on the full grid is already the hologram.
 ///
 /// # Errors
-/// A row or a column of the network's grid does not fit in `workgroup_bytes`.
+/// A row or a column of the network's grid does not fit in a workgroup's memory.
 pub(crate) fn field(
     plan: &mut Plan,
     shared: &Shared,
     grid: Grid,
     low: Low<'_>,
-    workgroup_bytes: u32,
+    limits: WorkgroupLimits,
 ) -> Result<(), GpuError> {
     let Shared { resolution: frame, size, .. } = *shared;
     if let Low::Corrected(..) = low {
@@ -47,8 +47,8 @@ pub(crate) fn field(
     if grid == Grid::Full {
         return Ok(());
     }
-    let rows = LineFft::new(plan, size.width, workgroup_bytes)?.rows(ROW_ITEMS);
-    let columns = LineFft::new(plan, size.height, workgroup_bytes)?.columns(COLUMN_ITEMS);
+    let rows = LineFft::new(plan, size.width, limits)?.rows(ROW_ITEMS);
+    let columns = LineFft::new(plan, size.height, limits)?.columns(COLUMN_ITEMS);
     let [quarter_x, quarter_y] =
         [size.width, size.height].map(|bins| plan.table("quarters of a sample", &quarters(bins)));
     let small = plan.buffer::<[f32; 2]>("rows of the field", 3 * size.pixels());
@@ -68,7 +68,7 @@ pub(crate) fn field(
     stage.dispatch_with(
         shader(&rows, "correct"),
         &[rows.turns(), (1, base), (2, correction), (3, small)],
-        [rows.workgroups(size.height), 3, 1],
+        [rows.workgroups(size.height), 1, 1],
     );
     stage.dispatch_with(
         shader(&columns, "double_columns"),

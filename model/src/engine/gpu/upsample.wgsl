@@ -25,28 +25,37 @@ fn to_pixel(bin: u32, second: u32) -> vec2f {
 @compute @workgroup_size(THREADS)
 fn correct(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;
-    let colour = group.y;
-    for (var item = 0u; item < ITEMS; item++) {
-        let place = item * THREADS + thread;
-        let x = place / LINES;
-        let y = group.x * LINES + place % LINES;
-        if (place < PLACES && y < HEIGHT) {
-            var value = base[(colour * HEIGHT + y) * WIDTH + x];
-            if (CORRECTS) {
-                let first = (y + 1u) * CORRECTION_GROUPS * CORRECTION_PITCH + x + 1u;
-                let real = correction[first][colour];
-                let imaginary = correction[first + (colour + 3u) / 4u * CORRECTION_PITCH][(colour + 3u) % 4u];
-                value += CORRECTION_SHARE * vec2f(real, imaginary);
+    var real: array<vec3f, ITEMS>;
+    var imaginary: array<vec3f, ITEMS>;
+    if (CORRECTS) {
+        for (var item = 0u; item < ITEMS; item++) {
+            let place = item * THREADS + thread;
+            let y = group.x * LINES + place % LINES;
+            if (place < PLACES && y < HEIGHT) {
+                let first = (y + 1u) * CORRECTION_GROUPS * CORRECTION_PITCH + place / LINES + 1u;
+                let head = correction[first];
+                let tail = correction[first + CORRECTION_PITCH];
+                real[item] = CORRECTION_SHARE * head.xyz;
+                imaginary[item] = CORRECTION_SHARE * vec3f(head.w, tail.xy);
             }
-            line[place] = value;
         }
     }
-    transform(FORWARD);
-    for (var item = 0u; item < ITEMS; item++) {
-        let place = item * THREADS + thread;
-        let y = group.x * LINES + place % LINES;
-        if (place < PLACES && y < HEIGHT) {
-            small[(colour * HEIGHT + y) * WIDTH + place / LINES] = line[place];
+    for (var colour = 0u; colour < 3u; colour++) {
+        for (var item = 0u; item < ITEMS; item++) {
+            let place = item * THREADS + thread;
+            let y = group.x * LINES + place % LINES;
+            if (place < PLACES && y < HEIGHT) {
+                let there = (colour * HEIGHT + y) * WIDTH + place / LINES;
+                line[place] = base[there] + vec2f(real[item][colour], imaginary[item][colour]);
+            }
+        }
+        transform(FORWARD);
+        for (var item = 0u; item < ITEMS; item++) {
+            let place = item * THREADS + thread;
+            let y = group.x * LINES + place % LINES;
+            if (place < PLACES && y < HEIGHT) {
+                small[(colour * HEIGHT + y) * WIDTH + place / LINES] = line[place];
+            }
         }
     }
 }

@@ -23,6 +23,7 @@ use serde::Serialize;
 
 use self::assembly::{Assembly, Work};
 use self::null_device::{Binary, NullDevice, Request};
+use super::fft::WorkgroupLimits;
 use super::map::Precision;
 use super::network::NetworkPlan;
 use super::plan::{Dispatch, Plan, Shader};
@@ -62,8 +63,8 @@ pub const CARDS: [Card; 2] = [
 /// What a compute unit reads or writes of the workgroup's memory in a cycle.
 const WORKGROUP_BYTES_PER_CYCLE: f64 = 128.0;
 
-/// What the workgroups of both cards' driver share.
-const WORKGROUP_BYTES: u32 = 65536;
+/// As the driver tells them of both cards.
+const LIMITS: WorkgroupLimits = WorkgroupLimits { bytes: 65536, threads: 1024 };
 
 /// Why there is no cost, or none that may be.
 #[derive(Debug, thiserror::Error)]
@@ -240,7 +241,7 @@ impl FramePlan {
             levels: PerColour(levels),
             flatness: PerColour([None, None, None]),
         };
-        Ok(Self(NetworkPlan::new(weights, &tables, precision, WORKGROUP_BYTES)?.plan))
+        Ok(Self(NetworkPlan::new(weights, &tables, precision, LIMITS)?.plan))
     }
 
     /// Labels of the shaders, each once.

@@ -1,0 +1,70 @@
+//! `holod bench`: what it measures and prints, at a size that is measured in no time. No speed is asserted.
+
+use holod_tests::daemon::run;
+use serde_json::Value;
+
+use crate::HOLOD;
+
+#[test]
+fn bench_measures_stages_the_frame_both_ceilings_and_the_loop() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = [
+        "bench",
+        "--backend",
+        "cpu",
+        "--weights",
+        "small",
+        "--resolution",
+        "64x48",
+        "--repeat",
+        "3",
+        "--duration",
+        "2s",
+    ];
+    let ended = run(HOLOD, &[&args[..], &["--json"]].concat(), folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    let report: Value = serde_json::from_str(&ended.stdout).unwrap_or_else(|error| panic!("{error}: {ended:?}"));
+    let above_zero = |value: &Value| value.as_f64().is_some_and(|figure| figure.is_finite() && figure > 0.0);
+    assert!(!above_zero(&report["absent"]) && !above_zero(&Value::from(0.0)));
+
+    assert_eq!(
+        (&report["resolution"], &report["weights"], &report["frames"]),
+        (&"64x48".into(), &"small".into(), &3.into())
+    );
+    assert!(report["renderer"].as_str().unwrap().starts_with("cpu, "), "{report}");
+    for ceiling in ["threads", "gflop_per_s", "gb_per_s"] {
+        assert!(above_zero(&report["ceilings"][ceiling]), "{ceiling}: {report}");
+    }
+    let stages = report["stages"].as_array().unwrap();
+    assert_eq!(stages.last().unwrap()["name"], "panel levels");
+    for part in stages.iter().chain([&report["layers"], &report["frame"]]) {
+        let quartiles =
+            ["lower_quartile_ms", "median_ms", "upper_quartile_ms"].map(|name| part[name].as_f64().unwrap());
+        assert!(quartiles.is_sorted() && quartiles[1] > 0.0, "{part}");
+        assert!(above_zero(&part["mb"]) && above_zero(&part["share_of_bandwidth"]), "{part}");
+        let parts = ["lighting layer", "correction layer", "all layers", "whole frame"];
+        let computes = parts.iter().any(|name| part["name"].as_str().unwrap().starts_with(name));
+        assert_eq!(above_zero(&part["gflop"]), computes, "{part}");
+        assert_eq!(above_zero(&part["share_of_arithmetic_peak"]), computes, "{part}");
+    }
+    let in_loop = &report["closed_loop"];
+    assert!(above_zero(&in_loop["frames_shown"]), "{report}");
+    for time in ["frame_time", "sample_to_photon"] {
+        assert!(above_zero(&in_loop[time]["median_ms"]), "{time}: {report}");
+    }
+}
+
+#[test]
+fn bench_leaves_the_loop_out_and_refuses_what_is_larger_than_the_panel() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["bench", "--backend", "cpu", "--weights", "small", "--repeat", "1", "--duration", "0s", "--resolution"];
+    let ended = run(HOLOD, &[&args[..], &["64x48"]].concat(), folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    for part in ["same run: ", "expected stack", "panel levels", "all layers", "whole frame"] {
+        assert!(ended.stdout.contains(part), "{part}: {ended:?}");
+    }
+    assert!(!ended.stdout.contains("closed loop"), "{ended:?}");
+    let ended = run(HOLOD, &[&args[..], &["4000x48"]].concat(), folder.path());
+    assert_eq!(ended.status.code(), Some(64));
+    assert!(ended.stderr.contains("found 4000x48"), "{ended:?}");
+}
