@@ -34,6 +34,8 @@ pub(super) struct Report {
     padded_px: usize,
     depth_least_dpt: f64,
     depth_greatest_dpt: f64,
+    /// How the hologram was computed.
+    engine: String,
     /// From picture to panel levels.
     frame_ms: f64,
     /// From the command's beginning until everything but this report was written.
@@ -116,6 +118,7 @@ pub(super) fn compute(
     let mut renderer = progress::during(&format!("preparing the network for {resolution}"), || {
         renderer::open(backend, &weights, &encoder)
     })?;
+    tracing::info!("holograms are computed by {}", renderer.description());
     let mut levels = LevelsFrame::new(encoder.layout());
     let began = Instant::now();
     let rendered = progress::during(&format!("computing the hologram of {resolution}"), || {
@@ -141,6 +144,7 @@ pub(super) fn compute(
         padded_px: done.padded_px,
         depth_least_dpt: depth_at(f32::MAX, f32::min),
         depth_greatest_dpt: depth_at(f32::MIN, f32::max),
+        engine: renderer.description().to_owned(),
         frame_ms,
         total_ms: 0.0,
         files: FILES,

@@ -90,11 +90,13 @@ impl Judge {
         border_px: usize,
     ) -> Result<Self, Failure> {
         let encoder = renderer::panel_encoder(rig, resolution)?;
+        let renderer = renderer::open(backend, weights, &encoder)?;
+        tracing::info!("holograms are computed by {}", renderer.description());
         Ok(Self {
             geometry: rig.geometry,
             amplitude_constant: weights.config().amplitude_constant,
             border_px,
-            renderer: renderer::open(backend, weights, &encoder)?,
+            renderer,
             levels: LevelsFrame::new(encoder.layout()),
             encoder,
             eye: SimulatedEye::repeating(&rig.geometry, resolution),
