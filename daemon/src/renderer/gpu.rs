@@ -198,3 +198,71 @@ impl Renderer for GpuRenderer {
         &self.description
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use holod_calibration::Resolution;
+    use holod_calibration::rig::Rig;
+
+    use super::*;
+    use crate::setup;
+
+    const SIZE: Resolution = Resolution { width: 34, height: 22 };
+    const PANEL: Resolution = Resolution { width: 41, height: 25 };
+
+    fn renderer(encoder: &Arc<PanelEncoder>) -> GpuRenderer {
+        GpuRenderer::new(&Weights::builtin_small(), encoder, Adapters::Software)
+            .expect("Mesa's software device; install mesa-vulkan-drivers")
+    }
+
+    /// Samples that are more than one level of 256 apart on the circle.
+    fn apart(one: &LevelsFrame, other: &LevelsFrame) -> usize {
+        let pairs = one.samples().iter().zip(other.samples());
+        pairs.filter(|(one, other)| (2..255).contains(&(one.wrapping_sub(**other) & 0xff))).count()
+    }
+
+    #[test]
+    fn levels_are_the_processors_whatever_becomes_of_the_device() {
+        let encoder = Arc::new(PanelEncoder::new(&Rig::default().panel, PANEL, SIZE).unwrap());
+        let pupil = PupilDiameter::from_mm(3.0);
+        let frame = Arc::new(setup::sample_frame(SIZE));
+        let levels = || LevelsFrame::new(encoder.layout());
+        let (mut expected, mut flat) = (levels(), levels());
+        let mut cpu = CpuRenderer::new(&Weights::builtin_small(), &encoder, None).unwrap();
+        let on_cpu = cpu.render(&frame, pupil, &mut expected).unwrap();
+        encoder.encode_flat(&mut flat);
+        assert!(apart(&expected, &flat) > 100, "the comparison is blind");
+
+        let mut gpu = renderer(&encoder);
+        let mut render = |gpu: &mut GpuRenderer| {
+            let mut found = levels();
+            let rendered = gpu.render(&frame, pupil, &mut found).unwrap();
+            assert!(apart(&found, &expected) <= 2, "{} levels by {}", apart(&found, &expected), gpu.description());
+            assert!((rendered.clipped_share - on_cpu.clipped_share).abs() < 2e-3);
+            let (hologram, of_cpu) = (gpu.hologram().unwrap(), cpu.hologram().unwrap());
+            let error = hologram.field.iter().zip(&of_cpu.field).map(|(a, b)| (a - b).norm()).fold(0.0, f32::max);
+            assert!(error < 1e-4, "{error} by {}", gpu.description());
+            assert_eq!(gpu.pattern().unwrap().resolution, SIZE);
+            rendered.engine_changed
+        };
+        assert!(!render(&mut gpu) && gpu.description().starts_with("gpu, "));
+        gpu.lose_device();
+        assert!(render(&mut gpu) && gpu.description().starts_with("gpu, "), "{}", gpu.description());
+        assert!(!render(&mut gpu));
+        gpu.reopenings_left = 0;
+        gpu.lose_device();
+        assert!(render(&mut gpu) && gpu.description().starts_with("cpu, "), "{}", gpu.description());
+        assert!(gpu.description().contains("failed") && !render(&mut gpu));
+    }
+
+    #[test]
+    fn a_frame_of_another_size_is_refused_and_is_no_fault_of_the_device() {
+        let encoder = Arc::new(PanelEncoder::new(&Rig::default().panel, PANEL, SIZE).unwrap());
+        let mut gpu = renderer(&encoder);
+        let wrong = Arc::new(setup::sample_frame(PANEL));
+        let mut levels = LevelsFrame::new(encoder.layout());
+        let refused = gpu.render(&wrong, PupilDiameter::from_mm(3.0), &mut levels);
+        assert!(matches!(refused, Err(EngineError::Resolution { .. })));
+        assert!(matches!(gpu.engine, Engine::Gpu(_)));
+    }
+}

@@ -7,9 +7,7 @@ use std::process::ExitCode;
 use clap::{Parser, ValueEnum};
 use holod_calibration::Resolution;
 use holod_model::Weights;
-use holod_model::engine::gpu_cost::{
-    CARDS, Card, Compiler, CostError, CountedBy, FrameCost, NetworkPlan, SERVE, serve,
-};
+use holod_model::engine::gpu_cost::{CARDS, Card, Compiler, CostError, CountedBy, FrameCost, FramePlan, SERVE, serve};
 use serde::Serialize;
 
 /// What one frame of the built-in networks costs on graphics cards that are not there, by a model.
@@ -167,7 +165,8 @@ fn run(cli: &Cli, say: impl Fn(&str)) -> Result<(), Failure> {
         for network in &networks {
             let weights = network.weights();
             for &resolution in &resolutions {
-                let plan = NetworkPlan::new(&weights, resolution, cli.half_precision);
+                let plan = FramePlan::new(&weights, resolution, cli.half_precision)
+                    .map_err(|error| Failure { code: exit::USAGE, message: error.to_string() })?;
                 if let Some(label) = &cli.assembly {
                     let texts = compiler.assembly(&plan, label)?;
                     if texts.is_empty() {

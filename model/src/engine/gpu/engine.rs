@@ -8,6 +8,7 @@ use wgpu::{BufferUsages, QuerySet};
 
 use super::fft::WorkgroupLimits;
 use super::loaded_plan::LoadedPlan;
+use super::map::Precision;
 use super::network::NetworkPlan;
 use super::plan::{BufferId, Stage};
 use crate::engine::{EngineError, StageTiming, StageTimings};
@@ -67,7 +68,7 @@ impl GpuEngine {
 
     pub(super) fn on(gpu: Gpu, weights: &Weights, tables: &LevelTables) -> Result<Self, EngineError> {
         let limits = WorkgroupLimits { bytes: gpu.workgroup_bytes, threads: gpu.workgroup_threads };
-        let network = NetworkPlan::new(weights, tables, limits)?;
+        let network = NetworkPlan::new(weights, tables, Precision::F32, limits)?;
         let plan = &network.plan;
         let loaded = LoadedPlan::new(&gpu, plan)?;
         let timestamps = match gpu.timestamp_ns {

@@ -4,6 +4,7 @@ use holod_calibration::{LevelTables, Resolution};
 
 use super::expected_stack::ExpectedStack;
 use super::fft::WorkgroupLimits;
+use super::map::Precision;
 use super::maps::InputChannels;
 use super::plan::{BufferId, Plan};
 use super::trunk::{self, Modulated};
@@ -55,11 +56,16 @@ pub(crate) struct NetworkPlan {
 }
 
 impl NetworkPlan {
-    /// For frames of the pattern's size of `tables`, on a device of these limits.
+    /// For frames of the pattern's size of `tables`, with features in `precision`, on a device of these limits.
     ///
     /// # Errors
     /// The size is nothing, or too large for that memory.
-    pub(crate) fn new(weights: &Weights, tables: &LevelTables, limits: WorkgroupLimits) -> Result<Self, EngineError> {
+    pub(crate) fn new(
+        weights: &Weights,
+        tables: &LevelTables,
+        precision: Precision,
+        limits: WorkgroupLimits,
+    ) -> Result<Self, EngineError> {
         let (resolution, config) = (tables.pattern, &weights.config);
         if resolution.pixels() == 0 {
             return Err(EngineError::Empty { resolution });
@@ -73,7 +79,7 @@ impl NetworkPlan {
         let shared = Shared::new(&mut plan, resolution, size);
         let mut modulated = Vec::new();
         let mut net = |plan: &mut Plan, prefix: &str, layers: &[_], input: &_, channels: Vec<usize>| {
-            let (output, more) = trunk::run(plan, prefix, layers, config.leaky_slope, input, &channels);
+            let (output, more) = trunk::run(plan, prefix, layers, config.leaky_slope, precision, input, &channels);
             modulated.extend(more);
             output
         };

@@ -9,6 +9,7 @@ use proptest::prelude::*;
 
 use super::engine::GpuEngine;
 use super::fft::WorkgroupLimits;
+use super::map::Precision;
 use super::network::Shared;
 use super::plan::Plan;
 use super::trial::Trial;
@@ -377,7 +378,8 @@ fn wrong_sizes_and_pupils_are_refused_and_a_lost_device_is_told() {
 fn a_size_whose_lines_do_not_fit_on_the_device_is_told_before_anything_is_made() {
     let resolution = Resolution { width: 40_000, height: 2 };
     let limits = WorkgroupLimits { bytes: 16 << 10, threads: 256 };
-    let refused = super::network::NetworkPlan::new(&Weights::builtin_small(), &linear_tables(resolution), limits);
+    let refused =
+        super::network::NetworkPlan::new(&Weights::builtin_small(), &linear_tables(resolution), Precision::F32, limits);
     let text = refused.err().expect("no workgroup holds such a line").to_string();
     assert!(text.contains("20000") && text.contains("16384") && text.contains("--backend cpu"), "{text}");
 }

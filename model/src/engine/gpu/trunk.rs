@@ -2,7 +2,7 @@
 
 use super::conv::{self, ConvLayer, Epilogue, Packing};
 use super::deformable;
-use super::map::{GROUP, Map};
+use super::map::{GROUP, Map, Precision};
 use super::plan::{BufferId, Plan};
 use crate::engine::modulation::{Modulation, OffsetParameters};
 use crate::weights::{Layer, OFFSET_CHANNELS};
@@ -32,19 +32,20 @@ impl Modulated {
 }
 
 /// Adds a stage for each of `layers`, called `{prefix}layer 0` and so on. The first one reads the channels `inputs` of
-/// `input`. Returns the last one's map, and what depends on the pupil.
+/// `input`, and features are in `precision`. Returns the last one's map, and what depends on the pupil.
 pub(super) fn run(
     plan: &mut Plan,
     prefix: &str,
     layers: &[Layer],
     leaky_slope: f32,
+    precision: Precision,
     input: &Map,
     inputs: &[usize],
 ) -> (Map, Vec<Modulated>) {
     let size = (input.width, input.height);
     let last = layers.len() - 1;
-    let features = Map::new(plan, "features", size, layers[0].out_channels);
-    let between = Map::new(plan, "features between two layers", size, layers[0].out_channels);
+    let features = Map::with(precision, plan, "features", size, layers[0].out_channels);
+    let between = Map::with(precision, plan, "features between two layers", size, layers[0].out_channels);
     let output = Map::new(plan, "what a net gives", size, layers[last].out_channels);
     let in_order: Vec<usize> = (0..layers[0].out_channels).collect();
     let mut modulated = Vec::new();

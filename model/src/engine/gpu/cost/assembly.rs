@@ -242,7 +242,15 @@ impl Counter<'_> {
             };
             let compares = |index: &usize| self.single(*index).is_some_and(|(name, _)| comparison(name).is_some());
             let compare = (body.first..index).rev().find(compares)?;
-            self.count(body, compare, leaves_on)
+            // Threads whose condition is true are taken out of those that go on; the loop is left when there are none.
+            let takes_out = (compare..index).any(|index| {
+                let found = self.single(index);
+                found.is_some_and(|(name, operands)| {
+                    let removes = name.starts_with("s_and_not1_b") || name.starts_with("s_andn2_b");
+                    removes && operands.last().is_some_and(|operand| operand.starts_with("exec"))
+                })
+            });
+            self.count(body, compare, leaves_on ^ takes_out)
         })
     }
 
@@ -414,6 +422,9 @@ BB5:
         // A thread's number, in steps of a workgroup: the last threads make one trip less.
         let lanes = ["v_and_b32_e32 v3, 0x3ff, v0", "v_cmpx_gt_u32_e32 0x12c, v3", "s_cbranch_execz"];
         assert_eq!(trips(lanes[0], lanes[1], lanes[2], "v_add_nc_u32_e32 v3, 64, v3"), Some(5));
+        let removed = "s_andn2_b64 s[4:5], s[4:5], exec\n\ts_cbranch_scc0";
+        let compare = "v_cmpx_le_u32_e32 0x12c, v3";
+        assert_eq!(trips(lanes[0], compare, removed, "v_add_nc_u32_e32 v3, 64, v3"), Some(5));
         assert_eq!(trips("s_mov_b32 s4, s9", "s_cmp_ge_u32 s4, 8", "s_cbranch_scc1", up), None);
         assert_eq!(trips("s_mov_b32 s4, 0", "s_cmp_ge_u32 s4, s8", "s_cbranch_scc1", up), None);
     }

@@ -11,7 +11,6 @@
 //! is not counted here.
 
 mod assembly;
-mod convolutions;
 mod null_device;
 mod spirv;
 
@@ -19,14 +18,17 @@ use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use std::path::{Path, PathBuf};
 
-use holod_calibration::Resolution;
+use holod_calibration::{Colour, LevelTables, PerColour, Resolution};
 use serde::Serialize;
 
 use self::assembly::{Assembly, Work};
 use self::null_device::{Binary, NullDevice, Request};
+use super::fft::WorkgroupLimits;
 use super::map::Precision;
+use super::network::NetworkPlan;
 use super::plan::{Dispatch, Plan, Shader};
 use crate::Weights;
+use crate::engine::EngineError;
 
 pub use self::null_device::serve;
 
@@ -60,6 +62,9 @@ pub const CARDS: [Card; 2] = [
 
 /// What a compute unit reads or writes of the workgroup's memory in a cycle.
 const WORKGROUP_BYTES_PER_CYCLE: f64 = 128.0;
+
+/// As the driver tells them of both cards.
+const LIMITS: WorkgroupLimits = WorkgroupLimits { bytes: 65536, threads: 1024 };
 
 /// Why there is no cost, or none that may be.
 #[derive(Debug, thiserror::Error)]
@@ -215,14 +220,28 @@ struct Compiled {
     bindings: Vec<spirv::Binding>,
 }
 
-/// A network's plan for frames of one size.
-pub struct NetworkPlan(Plan);
+/// What is done for one frame: a network, double phase and levels.
+pub struct FramePlan(Plan);
 
-impl NetworkPlan {
-    /// The plan of `weights` at `resolution`; `half_precision` that of features, and so of most products.
-    pub fn new(weights: &Weights, resolution: Resolution, half_precision: bool) -> Self {
+impl FramePlan {
+    /// The plan of `weights` at `resolution`; `half_precision` is that of features, and so of most products.
+    ///
+    /// # Errors
+    /// The size is nothing, or too large.
+    pub fn new(weights: &Weights, resolution: Resolution, half_precision: bool) -> Result<Self, EngineError> {
         let precision = if half_precision { Precision::F16 } else { Precision::F32 };
-        Self(convolutions::plan(weights, resolution, precision))
+        // A panel of 8 bits.
+        let levels = [0; 3].map(|_| (0..256).collect());
+        let tables = LevelTables {
+            panel: resolution,
+            pattern: resolution,
+            origin: [0, 0],
+            interleaved: false,
+            field_order: Colour::ALL,
+            levels: PerColour(levels),
+            flatness: PerColour([None, None, None]),
+        };
+        Ok(Self(NetworkPlan::new(weights, &tables, precision, LIMITS)?.plan))
     }
 
     /// Labels of the shaders, each once.
@@ -256,8 +275,8 @@ impl Compiler {
     ///
     /// # Errors
     /// A shader does not compile.
-    pub fn cost(&mut self, plan: &NetworkPlan) -> Result<FrameCost, CostError> {
-        let NetworkPlan(plan) = plan;
+    pub fn cost(&mut self, plan: &FramePlan) -> Result<FrameCost, CostError> {
+        let FramePlan(plan) = plan;
         let mut stages = Vec::new();
         for stage in &plan.stages {
             let dispatches = stage.dispatches.iter().map(|dispatch| self.dispatch_cost(plan, dispatch));
@@ -271,7 +290,7 @@ impl Compiler {
     ///
     /// # Errors
     /// One does not compile.
-    pub fn assembly(&mut self, plan: &NetworkPlan, label: &str) -> Result<Vec<String>, CostError> {
+    pub fn assembly(&mut self, plan: &FramePlan, label: &str) -> Result<Vec<String>, CostError> {
         let mut texts = Vec::new();
         for dispatch in plan.dispatches().filter(|dispatch| dispatch.shader.label == label) {
             let text = &self.compile(&dispatch.shader)?.binary.assembly;
