@@ -41,6 +41,8 @@ LEVELS_APART, SHARE_FARTHER_APART = 1, 1e-3
 # Outputs of the nets, over the largest one.
 NETS_TOLERANCE = 1e-3
 REASON_CHARACTERS = 160
+# With more of the CPUs' time taken by other programs, threads that wait for each other wait for those.
+QUIET_SHARE = 0.05
 
 
 class BenchError(ValueError):
@@ -136,12 +138,16 @@ def bench_engines(plan: Plan, command: list[str]) -> dict[str, Any]:
 
     This process and holod's are kept to as many CPUs as torch has threads.
     """
-    with _on_cpus(torch.get_num_threads()):
-        rows, renderer = _rows(plan)
+    with _on_cpus(torch.get_num_threads()) as cpus:
+        works = _torch_engines(plan)
+        before = _CpuTime.now(cpus)
+        rows, renderer = _rows(plan, works)
+        others_share = _CpuTime.now(cpus).taken_by_others_since(before)
     return {
         "date": datetime.date.today().isoformat(),
         "machine": _machine(plan.device),
         "threads": torch.get_num_threads(),
+        "cpu_share_of_other_programs": others_share,
         "versions": _versions(plan.holod),
         "renderer": renderer,
         "weights": plan.weights.name,
@@ -153,8 +159,7 @@ def bench_engines(plan: Plan, command: list[str]) -> dict[str, Any]:
     }
 
 
-def _rows(plan: Plan) -> tuple[list[Row], str]:
-    works = _torch_engines(plan)
+def _rows(plan: Plan, works: dict[tuple[str, str], Work | str]) -> tuple[list[Row], str]:
     found: dict[tuple[str, str], list[float]] = {key: [] for key, work in works.items() if callable(work)}
     of_holod: list[HolodTimes] = []
     for _ in range(plan.rounds):
@@ -369,8 +374,8 @@ def _silence() -> Iterator[None]:
 
 
 @contextmanager
-def _on_cpus(count: int) -> Iterator[None]:
-    """Keeps all threads of this process, and processes that it starts, to the first `count` of its CPUs."""
+def _on_cpus(count: int) -> Iterator[set[int]]:
+    """Keeps all threads of this process, and processes that it starts, to the first `count` of its CPUs: these."""
     before = os.sched_getaffinity(0)
     if count > len(before):
         raise BenchError(f"--threads: found {count}, expected at most the {len(before)} CPUs that there are")
@@ -379,11 +384,43 @@ def _on_cpus(count: int) -> Iterator[None]:
         for thread in Path("/proc/self/task").iterdir():
             os.sched_setaffinity(int(thread.name), cpus)
 
-    keep_to(set(sorted(before)[:count]))
+    cpus = set(sorted(before)[:count])
+    keep_to(cpus)
     try:
-        yield
+        yield cpus
     finally:
         keep_to(before)
+
+
+def busy_s(proc_stat: str, cpus: set[int], ticks_per_s: int) -> float:
+    """Seconds that some CPUs were busy, by the text of /proc/stat: all but idle, waiting for disks, and guests, which
+    are counted among the others."""
+    of_cpu = {}
+    for line in proc_stat.splitlines():
+        name, *ticks = line.split()
+        if re.fullmatch(r"cpu\d+", name):
+            user, nice, system, _idle, _iowait, irq, softirq, steal = map(int, ticks[:8])
+            of_cpu[int(name[3:])] = user + nice + system + irq + softirq + steal
+    return sum(of_cpu[cpu] for cpu in cpus) / ticks_per_s
+
+
+@dataclass(frozen=True)
+class _CpuTime:
+    """Seconds so far: the clock's times the CPUs, when these were busy, and what this process and its children took."""
+
+    available: float
+    busy: float
+    own: float
+
+    @staticmethod
+    def now(cpus: set[int]) -> _CpuTime:
+        busy = busy_s(Path("/proc/stat").read_text(), cpus, os.sysconf("SC_CLK_TCK"))
+        return _CpuTime(time.monotonic() * len(cpus), busy, sum(os.times()[:4]))
+
+    def taken_by_others_since(self, before: _CpuTime) -> float:
+        """The share of the CPUs' time, 0 to 1: what engines lose to it differs, so that their ratios say little."""
+        others = (self.busy - before.busy) - (self.own - before.own)
+        return min(max(others / (self.available - before.available), 0.0), 1.0)
 
 
 def _machine(device: torch.device) -> str:
@@ -417,10 +454,14 @@ def _as_json(row: Row, rows: list[Row]) -> dict[str, Any]:
 def markdown(result: dict[str, Any]) -> str:
     """The table, and on what, when and by which command it was measured."""
     engines = result["engines"]
+    warning = ""
+    if result["cpu_share_of_other_programs"] > QUIET_SHARE:
+        warning = ". **That is no quiet machine: the ratios below cannot be relied on**"
     lines = [
         f"{result['resolution']}, `{result['weights']}`, {result['machine']}, {result['threads']} threads, "
         f"{result['date']}; holod by {result['renderer']}; {', '.join(result['versions'])}. Medians of "
-        f"{result['rounds']} rounds of {result['calls']} frames each, the engines in turn:",
+        f"{result['rounds']} rounds of {result['calls']} frames each, the engines in turn; other programs took "
+        f"{result['cpu_share_of_other_programs']:.0%} of the CPUs' time{warning}:",
         "",
         "```",
         result["command"],

@@ -14,12 +14,15 @@ from holod_training.bench_engines import (
     EAGER,
     HOLOD,
     NETS,
+    QUIET_SHARE,
     WHOLE,
     BenchError,
     HolodTimes,
     PanelLevels,
     Plan,
     Row,
+    _CpuTime,
+    busy_s,
     levels_agree,
     markdown,
     nets_agree,
@@ -92,6 +95,16 @@ def test_holod_is_asked_for_the_same_frames_and_must_do_them_on_the_same_threads
 def test_plans_that_cannot_be_timed_are_refused(changes: dict[str, int]) -> None:
     with pytest.raises(BenchError, match="expected"):
         plan(Path("holod"), **changes)
+
+
+def test_what_other_programs_take_of_the_cpus_is_found() -> None:
+    """Two CPUs, of which the first alone is looked at; the sum of all comes first, as the kernel has it."""
+    stat = "cpu  30 2 20 100 9 2 2 1 7 7\ncpu0 20 1 10 50 4 1 1 1 7 7\ncpu1 10 1 10 50 5 1 1 0 0 0\nintr 5 6\n"
+    assert busy_s(stat, {0}, 100) == pytest.approx(0.34)
+    assert busy_s(stat, {0, 1}, 100) == pytest.approx(0.57)
+    before = _CpuTime(available=100.0, busy=40.0, own=10.0)
+    for busy, own, share in ((60.0, 30.0, 0.0), (59.9, 30.0, 0.0), (60.0, 25.0, 0.25), (99.0, 10.0, 1.0)):
+        assert _CpuTime(120.0, busy, own).taken_by_others_since(before) == pytest.approx(share)
 
 
 def test_each_round_is_compared_with_itself() -> None:
@@ -172,6 +185,10 @@ def test_engines_are_timed_in_turn_and_put_into_a_table(
         assert rows[part, "PyTorch, torch.compile"]["skipped"] == "RuntimeError: no C++ compiler"
         assert "onnxruntime" in rows[part, "ONNX Runtime"]["skipped"]
 
+    assert 0.0 <= result["cpu_share_of_other_programs"] <= 1.0
+    quiet, busy = ({**result, "cpu_share_of_other_programs": QUIET_SHARE + extra} for extra in (0.0, 0.2))
+    assert "took 5% of the CPUs' time:" in markdown(quiet) and "cannot be relied on" not in markdown(quiet)
+    assert "took 25% of the CPUs' time. **That is no quiet machine" in markdown(busy)
     table = markdown(result)
     assert "16x12, `tiny.safetensors`, " in table and ", 1 threads, " in table
     assert f"\n{result['command']}\n" in table
