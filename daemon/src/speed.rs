@@ -91,7 +91,7 @@ fn time(rig: &Rig, weights: &Weights, size: Resolution) -> Result<(String, f64),
     let mut seconds = f64::MAX;
     for _ in 0..2 {
         let began = Instant::now();
-        renderer.render(&frame, pupil, &mut levels).map_err(Failure::because(Exit::Software))?;
+        renderer.render(&frame, pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))?;
         seconds = seconds.min(began.elapsed().as_secs_f64());
     }
     Ok((renderer.description().to_owned(), seconds))

@@ -1,5 +1,6 @@
 //! A panic anywhere in the program makes the lasers dark. Alone in its process, since a panic hook is global.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use holod_calibration::rig::Rig;
@@ -9,6 +10,9 @@ use holod_slm_output::laser::{BoxEvent, DarkReason, open_laser};
 use holod_slm_output::output::{Output, OutputOptions, monotonic_now, pacing_config};
 use holod_slm_output::pacing::Pacer;
 use holod_slm_output::present::{PanelSetup, open_panel};
+
+/// Whether a panic is one that is caught.
+static IS_CAUGHT: AtomicBool = AtomicBool::new(false);
 
 #[test]
 fn a_panic_in_any_thread_goes_dark_for_good() {
@@ -20,7 +24,7 @@ fn a_panic_in_any_thread_goes_dark_for_good() {
     let mut output =
         Output::start(&rig, &encoder, panel.unwrap(), laser, OutputOptions::default(), monotonic_now).unwrap();
     let switch = output.control.dark_switch();
-    switch.install_panic_hook(monotonic_now);
+    switch.install_panic_hook(monotonic_now, || IS_CAUGHT.load(Ordering::Acquire));
     let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(1_000_000)).unwrap(), monotonic_now());
     let mut show = |frames: &mut holod_slm_output::FramePort| {
         encoder.encode(PerColour([&[1.0; 8]; 3]), frames.acquire());
@@ -33,6 +37,11 @@ fn a_panic_in_any_thread_goes_dark_for_good() {
         show(&mut output.frames);
     }
     assert!(!switch.is_dark());
+    IS_CAUGHT.store(true, Ordering::Release);
+    assert!(std::thread::spawn(|| panic!("caught")).join().is_err());
+    IS_CAUGHT.store(false, Ordering::Release);
+    show(&mut output.frames);
+    assert!(!switch.is_dark() && switch.reason().is_none(), "a panic that is caught changes nothing");
     assert!(std::thread::spawn(|| panic!("meant")).join().is_err());
     while !switch.is_dark() {
         assert!(monotonic_now() < t_end, "never dark");

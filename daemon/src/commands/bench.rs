@@ -122,7 +122,7 @@ impl Laps {
         for _ in 0..=args.repeat {
             peaks.extend(threads.map(fma_peak));
             let began = Instant::now();
-            let rendered = renderer.render(frame, pupil, &mut levels).map_err(Failure::because(Exit::Software))?;
+            let rendered = renderer.render(frame, pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))?;
             frames.push(Lap { frame: began.elapsed(), stages: renderer.timings().to_vec() });
             if rendered.engine_changed {
                 let now = renderer.description();
@@ -240,7 +240,7 @@ fn table(report: &Report) -> String {
     }
     let mut row = |cells: [&str; 7]| {
         let [name, median, quartiles, gflop, of_peak, mb, of_bandwidth] = cells;
-        let line = format!("{name:<30}{median:>10}{quartiles:>18}{gflop:>10}{of_peak:>9}{mb:>9}{of_bandwidth:>9}");
+        let line = format!("{name:<30}{median:>10}{quartiles:>22}{gflop:>10}{of_peak:>9}{mb:>9}{of_bandwidth:>9}");
         writeln!(text, "{}", line.trim_end()).expect(GROWS);
     };
     row([""; 7]);

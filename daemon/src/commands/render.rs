@@ -122,7 +122,7 @@ pub(super) fn compute(
     let mut levels = LevelsFrame::new(encoder.layout());
     let began = Instant::now();
     let rendered = progress::during(&format!("computing the hologram of {resolution}"), || {
-        renderer.render(&frames.frames[0], pupil, &mut levels).map_err(Failure::because(Exit::Software))
+        renderer.render(&frames.frames[0], pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))
     })?;
     let frame_ms = began.elapsed().as_secs_f64() * 1e3;
     let done = &frames.reports[0];

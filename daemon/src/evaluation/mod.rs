@@ -182,7 +182,7 @@ impl Judge {
     /// The phases that the panel's levels show of the hologram of `frame` for `pupil`, and the share that was clipped.
     fn shown(&mut self, frame: &Arc<RgbdFrame>, pupil: PupilDiameter) -> Result<(PhasePattern, f32), Failure> {
         let rendered =
-            self.renderer.render(frame, pupil, &mut self.levels).map_err(Failure::because(Exit::Software))?;
+            self.renderer.render(frame, pupil, &mut self.levels).map_err(Failure::because(Exit::Unavailable))?;
         Ok((shown_pattern(&self.encoder, &self.levels), rendered.clipped_share))
     }
 

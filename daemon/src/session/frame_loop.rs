@@ -12,8 +12,8 @@ use holod_slm_output::{FramePlan, FramePort, Pacer};
 
 use super::host_now;
 use super::keep::keep_slot;
-use super::last_hologram::{LastHologram, Shown};
 use crate::record::FrameRecord;
+use crate::renderer::Renderer;
 use crate::setup::Frames;
 
 /// An order to stop is seen within this time.
@@ -27,7 +27,7 @@ pub(super) struct FrameLoop {
     /// The tracker's newest estimate.
     pub pupil: EstimateReader,
     /// Frame and pupil to levels.
-    pub holograms: LastHologram,
+    pub renderer: Box<dyn Renderer>,
     /// Levels to the panel.
     pub port: FramePort,
     /// Which refresh each frame is for.
@@ -103,14 +103,13 @@ impl FrameLoop {
         let state = self.pupil.pupil_at(t_wake).state;
         let estimate = self.pupil.pupil_at(plan.t_predicted_photon.min(t_wake + FARTHEST_PREDICTION));
         let scene = self.frames.index_at((plan.t_predicted_photon - self.t_origin).seconds());
-        let pupil = self.trained.clamp(estimate.pupil);
+        let hologram_pupil = self.trained.clamp(estimate.pupil);
 
         let t_render_begin = self.mark(Point::RenderBegin, plan);
-        let Shown { rendered, pupil: hologram_pupil } =
-            self.holograms.show(&self.frames.frames[scene], pupil, self.port.acquire())?;
+        let rendered = self.renderer.render(&self.frames.frames[scene], hologram_pupil, self.port.acquire())?;
         if rendered.engine_changed {
             // It happens when a device is lost, which took longer than any lock.
-            self.holograms.description().clone_into(&mut self.engine.lock().unwrap_or_else(PoisonError::into_inner));
+            self.renderer.description().clone_into(&mut self.engine.lock().unwrap_or_else(PoisonError::into_inner));
         }
         let t_render_end = self.mark(Point::RenderEnd, plan);
 

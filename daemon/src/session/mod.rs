@@ -3,7 +3,6 @@
 mod frame_loop;
 mod keep;
 mod laser_watch;
-mod last_hologram;
 mod ledger;
 mod output_watch;
 mod rate_watch;
@@ -37,7 +36,6 @@ use serde::Serialize;
 use self::frame_loop::{FrameLoop, LoopRecord, TrainedPupils};
 use self::keep::{KEEP_SLOTS, keep_slot};
 use self::laser_watch::LaserBoxWatch;
-use self::last_hologram::LastHologram;
 use self::ledger::LaserLedger;
 use self::output_watch::OutputWatch;
 use self::rate_watch::RateWatch;
@@ -276,14 +274,14 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         scheduling::prompt(|| open_output(&plan, &encoder, options)).map_err(Failure::because(Exit::Unavailable))
     })?;
     tracing::debug!("panel `{}` is open; lasers by {:?}", plan.output, rig.lasers.driver);
-    output.control.dark_switch().install_panic_hook(host_now);
+    output.control.dark_switch().install_panic_hook(host_now, holod_model::gpu::panic_is_caught);
 
     let stop = Arc::new(AtomicBool::new(false));
     let (record_producer, records) = rtrb::RingBuffer::new(RECORDS);
     let frames = Arc::new(plan.frames);
     let frame_loop = FrameLoop {
         pupil: estimates,
-        holograms: LastHologram::new(renderer, rig.geometry, LevelsFrame::new(encoder.layout())),
+        renderer,
         port: output.frames,
         pacer: Pacer::new(pacing, host_now()),
         frames: Arc::clone(&frames),
@@ -341,7 +339,7 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         tally: Tally::default(),
         observer,
     };
-    let limits = Limits { t_origin, duration: plan.duration, replay_ends_run };
+    let limits = Limits { t_origin, frames: plan.frame_limit, duration: plan.duration, replay_ends_run };
     let ended = watch.until_the_end(&limits, &output.control, &frame_thread);
 
     watch.service.stopping();
@@ -466,6 +464,7 @@ fn stall_timeout(frame_time: TimeNs) -> TimeNs {
 /// When a run is over.
 struct Limits {
     t_origin: TimeNs,
+    frames: Option<u64>,
     duration: Option<Duration>,
     replay_ends_run: bool,
 }
@@ -560,6 +559,10 @@ impl Watch<'_> {
             }
             if frame_thread.is_finished() {
                 let t_end = *t_give_up.get_or_insert(now + LAST_FRAME_WAIT);
+                let is_whole = limits.frames.is_some_and(|frames| self.tally.frames_made >= frames);
+                if !is_whole {
+                    return Ok("the engine's failure".to_owned());
+                }
                 if self.tally.newest_frame_shown() || now >= t_end {
                     return Ok("the asked number of frames".to_owned());
                 }

@@ -1,11 +1,10 @@
 //! One device with its queue. Faults that the driver tells late, between calls, are kept and given by the next call that
 //! can fail, so that none is missed.
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use super::{Adapters, GpuError};
+use super::{Adapters, GpuError, caught};
 
 /// A device and its queue.
 pub(crate) struct Gpu {
@@ -206,7 +205,7 @@ impl Gpu {
     /// What was told late comes first: it is the cause. wgpu panics where a device is lost in `poll`, after it has told
     /// the callback.
     fn guarded<E: ToString>(&self, poll: impl FnOnce() -> Result<(), E>) -> Result<(), GpuError> {
-        let polled = catch_unwind(AssertUnwindSafe(poll));
+        let polled = caught(poll);
         self.check()?;
         polled.map_err(|_| self.failed("it was lost"))?.map_err(|error| self.failed(error))
     }
@@ -237,6 +236,7 @@ impl Gpu {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu::panic_is_caught;
 
     fn gpu() -> Gpu {
         Gpu::open(Adapters::Software).expect("Mesa's software device; install mesa-vulkan-drivers")
@@ -278,7 +278,12 @@ mod tests {
         let gpu = gpu();
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
         let buffer = gpu.buffer("numbers", 12, usage).expect("a buffer");
-        let panicked = gpu.guarded::<String>(|| panic!("as wgpu does")).expect_err("a panic");
+        let panicked = gpu.guarded::<String>(|| {
+            assert!(panic_is_caught());
+            panic!("as wgpu does")
+        });
+        assert!(!panic_is_caught());
+        let panicked = panicked.expect_err("a panic");
         assert!(panicked.to_string().contains("it was lost"), "{panicked}");
         gpu.device.destroy();
         assert!(matches!(gpu.read(&buffer, &mut [0.0; 3]), Err(GpuError::Failed { .. })));

@@ -3,6 +3,8 @@
 #[cfg(feature = "gpu")]
 mod device;
 
+use std::cell::Cell;
+
 #[cfg(feature = "gpu")]
 pub(crate) use device::Gpu;
 
@@ -13,6 +15,25 @@ pub enum Adapters {
     Hardware,
     /// A processor that plays one: right, and slow.
     Software,
+}
+
+thread_local! {
+    static CATCHES: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Whether a panic of this thread would be caught and become a [`GpuError`]: wgpu panics where it finds a device lost. A
+/// panic hook leaves such a one alone.
+pub fn panic_is_caught() -> bool {
+    CATCHES.get()
+}
+
+/// What `work` gives, or the panic that it ended with.
+#[cfg(feature = "gpu")]
+fn caught<T>(work: impl FnOnce() -> T) -> std::thread::Result<T> {
+    CATCHES.set(true);
+    let done = std::panic::catch_unwind(std::panic::AssertUnwindSafe(work));
+    CATCHES.set(false);
+    done
 }
 
 /// Why the graphics processor cannot be used.

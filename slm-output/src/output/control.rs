@@ -133,11 +133,15 @@ impl DarkSwitch {
         self.shared.acknowledged.load(Ordering::Acquire) == DARK
     }
 
-    /// From now on any panic of the program first makes the lasers dark, and waits a moment for the acknowledgement.
-    pub fn install_panic_hook(&self, clock: Clock) {
+    /// From now on any panic of the program first makes the lasers dark, and waits a moment for the acknowledgement. One of
+    /// which `is_caught` says, on the thread that panics, that it is caught and is an error like any other, does nothing.
+    pub fn install_panic_hook(&self, clock: Clock, is_caught: fn() -> bool) {
         let switch = self.clone();
         let before = std::panic::take_hook();
         std::panic::set_hook(Box::new(move |info| {
+            if is_caught() {
+                return;
+            }
             switch.dark(DarkReason::Panic);
             let t_end = clock() + PANIC_WAIT;
             let on_laser_thread = std::thread::current().id() == switch.laser.id();

@@ -48,7 +48,7 @@ pub(super) fn show(
     let pacing = pacing_config(rig, FIRST_COPY).map_err(Failure::because(Exit::Config))?;
     let mut output = open(spec, rig, encoder).map_err(Failure::because(Exit::Unavailable))?;
     let switch = output.control.dark_switch();
-    switch.install_panic_hook(host_now);
+    switch.install_panic_hook(host_now, || false);
     if to.dark {
         switch.dark(DarkReason::Asked);
     } else if rig.lasers.driver != LaserDriver::Simulated && !matches!(spec, OutputSpec::Headless(_)) {

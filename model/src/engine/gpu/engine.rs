@@ -10,7 +10,7 @@ use super::fft::WorkgroupLimits;
 use super::loaded_plan::LoadedPlan;
 use super::map::Precision;
 use super::network::NetworkPlan;
-use super::plan::{BufferId, Stage};
+use super::plan::{BufferId, Plan, Stage};
 use crate::engine::{EngineError, StageTiming, StageTimings};
 use crate::gpu::{Adapters, Gpu, GpuError};
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
@@ -68,7 +68,7 @@ impl GpuEngine {
 
     pub(super) fn on(gpu: Gpu, weights: &Weights, tables: &LevelTables) -> Result<Self, EngineError> {
         let limits = WorkgroupLimits { bytes: gpu.workgroup_bytes, threads: gpu.workgroup_threads };
-        let network = NetworkPlan::new(weights, tables, Precision::F32, limits)?;
+        let mut network = NetworkPlan::new(weights, tables, Precision::F32, limits)?;
         let plan = &network.plan;
         let loaded = LoadedPlan::new(&gpu, plan)?;
         let timestamps = match gpu.timestamp_ns {
@@ -88,8 +88,11 @@ impl GpuEngine {
             flop: stage.flop,
             bytes: 0,
         };
+        let timings = StageTimings { stages: plan.stages.iter().map(timing).collect() };
+        // What the tables hold is on the device now.
+        network.plan = Plan::default();
         Ok(Self {
-            timings: StageTimings { stages: plan.stages.iter().map(timing).collect() },
+            timings,
             readback: Readback { staging, timestamps_bytes, samples_bytes },
             gpu,
             network,

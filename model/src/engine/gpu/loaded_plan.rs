@@ -75,7 +75,7 @@ fn stages(gpu: &Gpu, plan: &Plan, buffers: &[wgpu::Buffer]) -> Result<Vec<Vec<Lo
     for stage in &plan.stages {
         let mut dispatches = Vec::new();
         for Dispatch { shader, bindings, workgroups, .. } in &stage.dispatches {
-            let pipeline = match pipelines.entry(shader) {
+            let pipeline = match pipelines.entry((&shader.source, shader.entry)) {
                 Entry::Occupied(compiled) => compiled.into_mut(),
                 Entry::Vacant(place) => {
                     place.insert(gpu.trusted_pipeline(&shader.label, &shader.source, shader.entry)?)

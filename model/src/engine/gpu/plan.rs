@@ -48,7 +48,7 @@ pub(crate) struct Dispatch {
 }
 
 /// WGSL with its constants filled in.
-#[derive(Debug, PartialEq, Eq, Hash)]
+#[derive(Debug)]
 pub(crate) struct Shader {
     /// For errors, captures and tables of costs.
     pub(crate) label: String,

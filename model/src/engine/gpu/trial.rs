@@ -77,6 +77,23 @@ impl Trial {
         }
         self.gpu.wait(self.gpu.queue.submit([encoder.finish()])).expect("work that ends");
         self.gpu.check().expect("a device without faults");
+        self.check_guards();
+    }
+
+    /// The guards behind all buffers are as they were.
+    fn check_guards(&self) {
+        let bytes = 4 * GUARD as u64;
+        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
+        let guards = self.gpu.buffer("guards", bytes * self.buffers.len() as u64, usage).expect("a buffer");
+        let mut encoder = self.gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        for (place, buffer) in (0..).step_by(4 * GUARD).zip(&self.buffers) {
+            encoder.copy_buffer_to_buffer(buffer, buffer.size() - bytes, &guards, place, bytes);
+        }
+        self.gpu.queue.submit([encoder.finish()]);
+        let mut values = vec![0.0_f32; GUARD * self.buffers.len()];
+        self.gpu.read(&guards, &mut values).expect("the guards' values");
+        let touched = values.iter().position(|value| !value.is_nan());
+        assert_eq!(touched.map(|value| value / GUARD), None, "a shader wrote behind the buffer of this number");
     }
 
     /// What a buffer holds; the guard behind it is as it was.

@@ -122,7 +122,7 @@ fn driver() -> Option<PathBuf> {
     files.into_iter().min()
 }
 
-/// Tells the device's name, then answers one [`Request`] after another with what the driver made of it.
+/// Tells the device's name, then answers one request after another with what the driver made of it.
 ///
 /// # Errors
 /// Standard input or output fail.
