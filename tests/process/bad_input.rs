@@ -127,7 +127,6 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
         Case { args: &["--tracker", "/dev/null,profile=nosuch"], exit: 64, says: &["nosuch", "holod-hid"] },
         Case { args: &["--force"], exit: 64, says: &["--record"] },
         Case { args: &["--output", "screen"], exit: 64, says: &["screen", "headless"] },
-        Case { args: &["--backend", "gpu"], exit: 69, says: &["gpu", "cpu"] },
         Case { args: &["--frames", "many"], exit: 64, says: &["many"] },
         Case { args: &["--no-such-option"], exit: 64, says: &["--no-such-option"] },
     ];

@@ -102,9 +102,8 @@ fn frames_hz(rig: &Rig, resolution: Option<Resolution>) -> Check {
             let rates: Vec<String> = rates.collect();
             let advice = speed::advice(estimate.frames_hz(*first), rig, *first);
             let says = format!(
-                "{}; estimated from frames of {} and {}: {}; the panel could show {:.1}{}",
+                "{}; estimated from frames of up to {}: {}; the panel could show {:.1}{}",
                 estimate.engine,
-                estimate.timed[0],
                 estimate.timed[1],
                 rates.join(", "),
                 speed::panel_frames_hz(&rig.panel),

@@ -1,0 +1,68 @@
+//! Holograms on a GPU: Mesa's software device plays one, and where there is none that is said.
+
+use std::path::Path;
+use std::time::Duration;
+
+use holod_tests::daemon::{Daemon, Ended, run};
+use serde_json::Value;
+
+use crate::HOLOD;
+
+const RENDER: [&str; 8] = ["render", "--weights", "small", "--resolution", "48x32", "--pupil", "3", "--force"];
+
+fn rendered(folder: &Path, backend: &str, out: &str) -> Ended {
+    run(HOLOD, &[&RENDER[..], &["--backend", backend, "--out", out]].concat(), folder)
+}
+
+/// Where Vulkan has no driver.
+fn rendered_without_vulkan(folder: &Path, backend: &str) -> Ended {
+    let nowhere = Path::new("/nowhere.json");
+    let environment = [("VK_DRIVER_FILES", nowhere), ("VK_ICD_FILENAMES", nowhere)];
+    let args = [&RENDER[..], &["--backend", backend, "--out", "without"]].concat();
+    Daemon::start_with(HOLOD, &args, folder, &environment).wait(Duration::from_secs(60))
+}
+
+fn engine(folder: &Path, out: &str) -> String {
+    let report = std::fs::read(folder.join(out).join("report.json")).unwrap();
+    serde_json::from_slice::<Value>(&report).unwrap()["engine"].as_str().unwrap().to_owned()
+}
+
+/// Share of two patterns' pixels that are more than one of 256 levels apart on the circle.
+fn share_apart(folder: &Path, one: &str, other: &str) -> f64 {
+    let load = |out: &str| image::open(folder.join(out).join("phase_green.png")).unwrap().into_luma16().into_raw();
+    let (one, other) = (load(one), load(other));
+    assert_eq!(one.len(), other.len());
+    let apart = |(one, other): (&u16, &u16)| (2 * 257..u16::MAX - 2 * 257).contains(&one.wrapping_sub(*other));
+    one.iter().zip(&other).filter(|&pair| apart(pair)).count() as f64 / one.len() as f64
+}
+
+#[test]
+fn a_gpu_gives_the_processors_hologram_and_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    for backend in ["gpu", "cpu"] {
+        let ended = rendered(folder.path(), backend, backend);
+        assert!(ended.status.success(), "{ended:?}");
+        let engine = engine(folder.path(), backend);
+        assert!(engine.starts_with(&format!("{backend}, ")) && ended.stderr.contains(&engine), "{engine}: {ended:?}");
+    }
+    assert!(share_apart(folder.path(), "gpu", "cpu") < 1e-2);
+    let wider = [&RENDER[..5], &["5", "--force", "--backend", "cpu", "--out", "wider"]].concat();
+    let wider: Vec<&str> = wider.iter().map(|&arg| if arg == "5" { "--pupil=5" } else { arg }).collect();
+    assert!(run(HOLOD, &wider, folder.path()).status.success());
+    assert!(share_apart(folder.path(), "gpu", "wider") > 1e-2, "the comparison is blind");
+}
+
+#[test]
+fn without_a_gpu_the_processor_computes_and_one_that_is_asked_for_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let ended = rendered_without_vulkan(folder.path(), "auto");
+    assert!(ended.status.success(), "{ended:?}");
+    let engine = engine(folder.path(), "without");
+    assert!(engine.starts_with("cpu, ") && engine.contains("Vulkan shows nothing and no GPU"), "{engine}");
+
+    let ended = rendered_without_vulkan(folder.path(), "gpu");
+    assert_eq!(ended.status.code(), Some(69), "{ended:?}");
+    for part in ["--backend gpu", "Vulkan shows nothing", "mesa-vulkan-drivers", "--backend cpu"] {
+        assert!(ended.stderr.contains(part), "{part}: {ended:?}");
+    }
+}
