@@ -248,7 +248,7 @@ mod tests {
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
         let buffer = gpu.buffer("numbers", 12, usage).expect("a buffer");
         gpu.queue.write_buffer(&buffer, 0, bytemuck::cast_slice(&[1.5f32, -2.0, 1e-30]));
-        let mut values = [0.0; 3];
+        let mut values = [0.0_f32; 3];
         gpu.read(&buffer, &mut values).expect("the numbers");
         assert_eq!(values, [1.5, -2.0, 1e-30]);
     }
@@ -286,7 +286,7 @@ mod tests {
         let panicked = panicked.expect_err("a panic");
         assert!(panicked.to_string().contains("it was lost"), "{panicked}");
         gpu.device.destroy();
-        assert!(matches!(gpu.read(&buffer, &mut [0.0; 3]), Err(GpuError::Failed { .. })));
+        assert!(matches!(gpu.read(&buffer, &mut [0.0_f32; 3]), Err(GpuError::Failed { .. })));
     }
 
     #[test]
