@@ -61,14 +61,38 @@ impl DisplayGeometry {
         pupil.metres().0 * (depth.0 - focus.0).abs() / self.pixel_angle_rad()
     }
 
-    /// The largest circle of confusion, between the two ends of the depth range, in panel pixels.
+    /// The largest circle of confusion s·(f/p)·V, between the two ends of the depth range V, in panel pixels: what a
+    /// weights file calls `volume_blur_px`.
     pub fn largest_coc_px(&self, pupil: PupilDiameter) -> f64 {
         self.coc_px(pupil, self.depth_far, self.depth_near)
+    }
+
+    /// The pupil for which [`Self::largest_coc_px`] is `blur_px`.
+    pub fn pupil_of_largest_coc(&self, blur_px: f64) -> PupilDiameter {
+        PupilDiameter::from_mm((blur_px * self.pixel_angle_rad() / self.volume().0 * 1e3) as f32)
+    }
+
+    /// The depth range V, from its far end to its near end.
+    pub fn volume(&self) -> Dioptres {
+        self.depth_near - self.depth_far
+    }
+
+    /// λ·(f/p)²·V of each colour, in squared panel pixels: the distance f²·V that the depth range's images span, times
+    /// the wavelength. Its root is how far light spreads by diffraction from one end of the range to the other.
+    pub fn volume_fresnel_px2(&self) -> PerColour<f64> {
+        self.wavelengths.map(|wavelength| wavelength.0 * self.volume().0 / self.pixel_angle_rad().powi(2))
     }
 
     /// Width of the eyebox λf/p of each colour: the separation of the panel's diffraction orders at the eye.
     pub fn eyebox(&self) -> PerColour<Metres> {
         self.wavelengths.map(|wavelength| Metres(wavelength.0 * self.eyepiece_focal_length.0 / self.pixel_pitch.0))
+    }
+
+    /// Width λf/2p of the part of the eyebox that the 4f stop's half band fills. Light with a smooth phase goes no farther than
+    /// that, so it is blurred over the depth range as by a pupil of this width at most:
+    /// λ·(f/p)²·V/2, half of [`Self::volume_fresnel_px2`], whatever the width of the eye's own.
+    pub fn half_band_eyebox(&self) -> PerColour<Metres> {
+        self.eyebox().map(|width| Metres(width.0 / 2.0))
     }
 
     /// Half-angle s/2f that light must leave the panel with to fill the pupil, in radians: the band that a physically
@@ -111,6 +135,34 @@ mod tests {
         let needed = BENCH.blur_half_angle_rad(PupilDiameter::from_mm(green_eyebox_mm));
         // A pupil is an f32, so seven digits.
         assert!(close(needed, BENCH.panel_half_angle_rad().0[1], 1e-8));
+    }
+
+    #[test]
+    fn blur_and_diffraction_over_the_volume_are_those_of_the_definitions() {
+        // 638 nm · (40 mm / 8 µm)² / 0.35 m.
+        for (found, expected_px2) in BENCH.volume_fresnel_px2().0.into_iter().zip([45.571_429, 37.142_857, 32.142_857])
+        {
+            assert!(close(found, expected_px2, 1e-6));
+        }
+        let bench = DisplayGeometry { depth_far: Dioptres(0.5), depth_near: Dioptres(2.5), ..BENCH };
+        let pupil = PupilDiameter::from_mm(3.0);
+        assert!(close(bench.volume().0, 2.0, 1e-12));
+        assert!(close(bench.largest_coc_px(pupil), 30.0, 1e-5));
+        assert!(close(bench.volume_fresnel_px2().0[1], 26.0, 1e-9));
+        assert!(close(f64::from(bench.pupil_of_largest_coc(30.0).mm()), 3.0, 1e-6));
+        // Both are in pixels: a panel that is finer, behind an eyepiece that is shorter, is the same bench to them.
+        let same = DisplayGeometry { pixel_pitch: Metres(6.4e-6), eyepiece_focal_length: Metres(32e-3), ..bench };
+        assert!(close(same.largest_coc_px(pupil), bench.largest_coc_px(pupil), 1e-9));
+        assert!(close(same.volume_fresnel_px2().0[0], bench.volume_fresnel_px2().0[0], 1e-9));
+    }
+
+    #[test]
+    fn a_pupil_as_wide_as_the_half_band_fills_is_blurred_by_half_the_diffraction() {
+        let widths = BENCH.half_band_eyebox();
+        for ((_, width), fresnel_px2) in widths.iter().zip(BENCH.volume_fresnel_px2().0) {
+            let pupil = PupilDiameter::from_mm((width.0 * 1e3) as f32);
+            assert!(close(BENCH.largest_coc_px(pupil), fresnel_px2 / 2.0, 1e-5));
+        }
     }
 
     #[test]

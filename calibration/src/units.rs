@@ -11,6 +11,13 @@ pub struct Metres(pub f64);
 #[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
 pub struct Dioptres(pub f64);
 
+impl Sub for Dioptres {
+    type Output = Self;
+    fn sub(self, other: Self) -> Self {
+        Self(self.0 - other.0)
+    }
+}
+
 /// Entrance pupil diameter of an eye, in millimetres.
 #[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
 pub struct PupilDiameter(f32);

@@ -75,7 +75,7 @@ fn the_example_rig_says_what_its_comments_say() {
     assert_eq!(rig.lasers.power_mw, PerColour([1.2, 0.8, 1.0]));
     assert_eq!(rig.lasers.power_limit_mw, PerColour([2.0; 3]));
     assert_eq!(rig.tracker.spec.as_deref(), Some("serial:/dev/holod-tracker"));
-    assert!(!rig.model.allow_optics_mismatch);
+    assert_eq!(rig.model.weights, WeightsChoice::Standard);
 
     let meaning = rig.meaning();
     assert!((meaning.pixel_angle_mrad - 0.2).abs() < 1e-12);
@@ -84,7 +84,6 @@ fn the_example_rig_says_what_its_comments_say() {
     assert!((meaning.blurs[0].largest_blur_px - 2.0 / 0.35 / 0.2).abs() < 1e-3);
     assert!((meaning.field.laser_on_ms - 2.1).abs() < 1e-9 && (meaning.field.laser_off_ms - 5.1).abs() < 1e-9);
     assert!(meaning.files.is_empty());
-    assert!(!meaning.notes.iter().any(|note| note.contains("other optics")), "{:?}", meaning.notes);
 }
 
 #[test]
@@ -157,17 +156,13 @@ fn figures_in_another_unit_are_recognised() {
     ] {
         check(from, to, key, "", "a number from", advice);
     }
+    for (slip, unit) in [("638e-9", "metres"), ("0.638", "micrometres"), ("6380", "ångströms")] {
+        let fault = fault_of("red = 638.0", &format!("red = {slip}"));
+        let advice = format!("looks like {unit}: write 638 for 638 nm");
+        assert_fault(&fault, "optics.wavelengths_nm.red", line_of("wavelengths_nm"), "", "380 to 780 nm", &advice);
+    }
     let degrees = fault_of("red = 1.9921875", "red = 360");
     assert_fault(&degrees, "panel.stroke_pi.red", line_of("stroke_pi"), "360", "π", "looks like degrees: write 2 ");
-    let metres = fault_of("red = 638.0", "red = 638e-9");
-    assert_fault(
-        &metres,
-        "optics.wavelengths_nm.red",
-        line_of("wavelengths_nm"),
-        "0.000000638",
-        "380 to 780 nm",
-        "write 638",
-    );
 }
 
 #[test]
@@ -212,15 +207,8 @@ fn wrong_types_are_named() {
     check("mode = ", "mode = 3 #", "panel.mode", "an integer 3", "\"channel-packed\"", "in double quotes");
     check("eye = \"both\"", "eye = \"\"", "tracker.eye", "an empty text", "\"left\"", "");
     check("eye = \"both\"", "eye = \"best\"", "tracker.eye", "", "\"better\"", "");
-    let flag = "allow_optics_mismatch = ";
-    check(
-        flag,
-        "allow_optics_mismatch = \"no\" #",
-        "model.allow_optics_mismatch",
-        "a string",
-        "true or false",
-        "without quotes",
-    );
+    let flag = faults_of(&changed(&[("lit_ms = 3.0", "lit_ms = 3.0\ngated_by_panel = \"no\"")]));
+    assert!(flag.iter().any(|fault| fault.expected == "true or false" && fault.advice.contains("without quotes")));
     let stroke = fault_of("stroke_pi = {", "stroke_pi = 2.0 # {");
     assert_fault(
         &stroke,
@@ -335,7 +323,7 @@ fn missing_tables_and_keys_are_named_once() {
     let blue = fault_of(", blue = 450.0", "");
     assert_fault(&blue, "optics.wavelengths_nm.blue", line_of("wavelengths_nm"), "nothing", "380", "add blue");
     let optional = changed(&[("[tracker]", "#"), ("eye =", "#"), ("fallback_mm", "#"), ("hold_ms", "#")]);
-    let optional = optional.replace("[model]", "").replace("allow_optics", "#").replace("depth_", "# depth_");
+    let optional = optional.replace("[model]", "").replace("network", "#").replace("depth_", "# depth_");
     let rig = Rig::parse(&optional, Path::new("")).unwrap();
     assert_eq!(
         (rig.tracker, rig.model, rig.geometry),
@@ -1001,9 +989,21 @@ fn flatness_keys_that_contradict_each_other_are_refused() {
 }
 
 #[test]
+fn a_key_that_is_gone_is_told_with_what_to_do() {
+    check(
+        "network = \"standard\"",
+        "allow_optics_mismatch = true",
+        "model.allow_optics_mismatch",
+        "an unknown key",
+        "one of network, weights_file",
+        "remove it: networks compute with the rig's own optics",
+    );
+}
+
+#[test]
 fn a_weights_file_must_be_there() {
     check(
-        "allow_optics_mismatch = false",
+        "network = \"standard\"",
         "weights_file = \"none.safetensors\"",
         "model.weights_file",
         "No such file",
@@ -1015,14 +1015,14 @@ fn a_weights_file_must_be_there() {
 #[test]
 fn a_network_is_built_in_or_a_file_and_never_both() {
     check(
-        "allow_optics_mismatch = false",
+        "network = \"standard\"",
         "network = \"smal\"",
         "model.network",
         "\"smal\"",
         "one of \"standard\", \"small\"",
         "did you mean \"small\"?",
     );
-    let flag = "allow_optics_mismatch = false";
+    let flag = "network = \"standard\"";
     let both = faults_of(&changed(&[(flag, "network = \"small\"\nweights_file = \".\"")]));
     assert!(both.iter().any(|fault| fault.advice.contains("remove network, or weights_file")), "{both:#?}");
     let small = Rig::parse(&changed(&[(flag, "network = \"small\"")]), Path::new("rig.toml")).unwrap();

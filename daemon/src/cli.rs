@@ -115,7 +115,7 @@ pub struct RigArgs {
 /// Which network computes the holograms.
 #[derive(Args, Debug, Clone, Default)]
 pub struct NetworkArgs {
-    /// The network's weights: standard or small (built in), or a file that the trainer exported (./small is a file); what the rig names
+    /// The network's weights: standard, small or fast (built in), or a file that the trainer exported (./small is a file); what the rig names
     /// when left out.
     #[arg(long, value_name = "NAME|FILE", value_parser = parse_weights)]
     pub weights: Option<WeightsChoice>,

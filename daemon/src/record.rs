@@ -19,10 +19,8 @@ pub struct FrameRecord {
     pub t_sample: Option<TimeNs>,
     /// That sample's diameter as the tracker gave it.
     pub pupil_raw_mm: Option<f32>,
-    /// The estimate for the time at which the frame's light arrives.
+    /// The estimate for the time at which the frame's light arrives, for which the hologram was computed.
     pub pupil: PupilDiameter,
-    /// The diameter that the hologram was computed for: the estimate, within what the network was trained for.
-    pub hologram_pupil: PupilDiameter,
     /// Name of the estimator's state.
     pub pupil_state: &'static str,
     /// The loop woke for this frame.
@@ -199,7 +197,6 @@ mod tests {
             t_sample: Some(TimeNs(5)),
             pupil_raw_mm: Some(3.25),
             pupil: PupilDiameter::from_mm(3.3),
-            hologram_pupil: PupilDiameter::from_mm(3.3),
             pupil_state: "tracking",
             t_wake: TimeNs(10),
             t_render_begin: TimeNs(11),

@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use holod_calibration::rig::{Rig, WeightsChoice};
-use holod_calibration::{DisplayGeometry, Resolution};
+use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
+use holod_model::conditions::BenchFit;
 use holod_model::scene::{DepthEncoding, Fit, FrameReport, Scene, SceneError};
 use holod_model::{RgbdFrame, Weights, scene_renderer};
 
@@ -13,6 +14,9 @@ use crate::failure::{Exit, Failure};
 
 /// Size of a hologram of the built-in scene on a processor.
 pub const SAMPLE_RESOLUTION: Resolution = Resolution { width: 512, height: 512 };
+
+/// What eyes' pupils mostly are.
+const MOST_EYES_MM: [f32; 2] = [2.0, 6.0];
 
 /// Frames of a sequence that are kept in memory, in bytes.
 const SEQUENCE_BYTES_MAX: usize = 4 << 30;
@@ -37,20 +41,41 @@ pub fn rig_with_network(args: &RigArgs, network: &NetworkArgs) -> Result<Rig, Fa
     Ok(rig)
 }
 
-/// The rig's weights, checked against its optics.
+/// The rig's weights, for whatever bench they were trained.
+pub fn load_weights(rig: &Rig) -> Result<Weights, Failure> {
+    match &rig.model.weights {
+        WeightsChoice::Standard => Ok(Weights::builtin()),
+        WeightsChoice::Small => Ok(Weights::builtin_small()),
+        WeightsChoice::Fast => Ok(Weights::builtin_fast()),
+        WeightsChoice::File(path) => Weights::load(path).map_err(Failure::because(Exit::Data)),
+    }
+}
+
+/// The rig's weights, which must have been trained for benches such as this; what they know less well is warned of.
 pub fn weights(rig: &Rig) -> Result<Weights, Failure> {
-    let weights = match &rig.model.weights {
-        WeightsChoice::Standard => Weights::builtin(),
-        WeightsChoice::Small => Weights::builtin_small(),
-        WeightsChoice::File(path) => Weights::load(path).map_err(Failure::because(Exit::Data))?,
-    };
-    if let Err(mismatch) = weights.check_optics(&rig.geometry) {
-        if !rig.model.allow_optics_mismatch {
-            return Err(Failure::because(Exit::Config)(mismatch));
-        }
-        tracing::warn!("{mismatch}");
+    let weights = load_weights(rig)?;
+    match weights.fit(&rig.geometry) {
+        BenchFit::Inside => {}
+        BenchFit::Near(outside) => tracing::warn!("{outside}"),
+        BenchFit::Far(outside) => return Err(Failure::because(Exit::Config)(outside)),
+    }
+    if let Some(few) = few_pupils(&weights, &rig.geometry) {
+        tracing::warn!("{few}");
     }
     Ok(weights)
+}
+
+/// Why the pupils that `weights` were trained for are too few on `bench`, where they are.
+pub fn few_pupils(weights: &Weights, bench: &DisplayGeometry) -> Option<String> {
+    let [narrowest, widest] = weights.trained_pupils(bench).map(PupilDiameter::mm);
+    let [least, most] = MOST_EYES_MM;
+    // A range that ends there but for rounding is whole.
+    (narrowest > least * 1.0001 || widest < most * 0.9999).then(|| {
+        format!(
+            "on this bench the network was trained for pupils of {narrowest:.2} to {widest:.2} mm, and eyes' are mostly \
+             {least} to {most} mm: of others it is told the nearest of these, and the picture is worse"
+        )
+    })
 }
 
 /// What weights are called in reports.
@@ -58,6 +83,7 @@ pub fn weights_name(weights: &WeightsChoice) -> String {
     match weights {
         WeightsChoice::Standard => "standard".into(),
         WeightsChoice::Small => "small".into(),
+        WeightsChoice::Fast => "fast".into(),
         WeightsChoice::File(path) => path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned(),
     }
 }

@@ -6,14 +6,14 @@ use std::fs::File;
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 
-use holod_calibration::{Colour, PupilDiameter, Resolution};
+use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution};
 use image::{ImageBuffer, ImageFormat, Luma, PixelWithColorType, Rgb};
 use num_complex::Complex32;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
+use serde::{Deserialize, Serialize};
 
 use crate::picture::linear_to_srgb;
-use crate::weights::TrainedOptics;
 use crate::{ComplexHologram, LinearImage, PhasePattern};
 
 /// The value of the metadata key `format` of a hologram file.
@@ -29,9 +29,50 @@ pub struct StoredHologram {
     /// The pupil that it was made for.
     pub pupil: PupilDiameter,
     /// The optics that it was made for.
-    pub optics: TrainedOptics,
+    pub optics: BenchOptics,
     /// Amplitude that double phase maps to 1.
     pub amplitude_constant: f32,
+}
+
+/// The optics of a bench, as files state them.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BenchOptics {
+    /// Red, green, blue.
+    pub wavelengths_nm: [f64; 3],
+    /// Distance between the centres of neighbouring pixels.
+    pub pixel_pitch_um: f64,
+    /// Focal length of the eyepiece.
+    pub eyepiece_focal_length_mm: f64,
+    /// Vergence of normalised depth 0.
+    pub depth_far_dpt: f64,
+    /// Vergence of normalised depth 1.
+    pub depth_near_dpt: f64,
+}
+
+impl BenchOptics {
+    /// The same optics with a panel of `resolution`.
+    pub fn geometry(&self, resolution: Resolution) -> DisplayGeometry {
+        DisplayGeometry {
+            resolution,
+            pixel_pitch: Metres(self.pixel_pitch_um * 1e-6),
+            wavelengths: PerColour(self.wavelengths_nm.map(|wavelength_nm| Metres(wavelength_nm * 1e-9))),
+            eyepiece_focal_length: Metres(self.eyepiece_focal_length_mm * 1e-3),
+            depth_far: Dioptres(self.depth_far_dpt),
+            depth_near: Dioptres(self.depth_near_dpt),
+        }
+    }
+
+    /// The optics of `geometry` in this type's units.
+    pub fn of(geometry: &DisplayGeometry) -> Self {
+        Self {
+            wavelengths_nm: geometry.wavelengths.0.map(|wavelength| wavelength.0 * 1e9),
+            pixel_pitch_um: geometry.pixel_pitch.0 * 1e6,
+            eyepiece_focal_length_mm: geometry.eyepiece_focal_length.0 * 1e3,
+            depth_far_dpt: geometry.depth_far.0,
+            depth_near_dpt: geometry.depth_near.0,
+        }
+    }
 }
 
 /// A file that cannot be written or read.
@@ -210,7 +251,6 @@ where
 #[cfg(test)]
 mod tests {
     use super::*;
-    use holod_calibration::DisplayGeometry;
 
     const SIZE: Resolution = Resolution { width: 5, height: 3 };
 
@@ -219,7 +259,7 @@ mod tests {
         StoredHologram {
             hologram: ComplexHologram { resolution: SIZE, field },
             pupil: PupilDiameter::from_mm(3.25),
-            optics: TrainedOptics::of(&DisplayGeometry::DEFAULT),
+            optics: BenchOptics::of(&DisplayGeometry::DEFAULT),
             amplitude_constant: 1.4,
         }
     }

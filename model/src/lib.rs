@@ -5,6 +5,7 @@
 //! what an eye sees of it. [`metrics`] and [`refocus`] judge pictures against those of [`scene_shard`], and [`files`] keeps
 //! holograms and pictures on disk. [`scene_renderer`] makes scenes, on the processor or by [`gpu`].
 
+pub mod conditions;
 pub mod engine;
 pub mod files;
 pub mod gpu;

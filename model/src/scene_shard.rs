@@ -347,6 +347,7 @@ mod tests {
             kind: SceneKind::Test,
             seed: 3,
             resolution: SIZE,
+            bench: BENCH,
             pupils: PupilPlan::Fixed([1.5, 4.0].map(PupilDiameter::from_mm).to_vec()),
             planes: PlanePlan::Uniform(2),
             rays: 4,

@@ -4,18 +4,20 @@ use std::collections::HashMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use holod_calibration::DisplayGeometry;
+use holod_calibration::{DisplayGeometry, PupilDiameter};
 use safetensors::{Dtype, SafeTensors};
 use serde::{Deserialize, Serialize};
 
+use crate::conditions::{BenchFit, TrainedRange};
+
 /// The value of the metadata key `format` that this crate reads.
-const FORMAT: &str = "holod-weights-1";
+const FORMAT: &str = "holod-weights-2";
+/// Its value in files for one bench, of networks that were told the pupil in millimetres.
+const OLD_FORMAT: &str = "holod-weights-1";
+/// The version of the families that this crate runs.
+const VERSION: u32 = 2;
 /// Larger files are refused before they are read.
 const LARGEST_FILE_BYTES: u64 = 256 << 20;
-/// No eye's is half as wide.
-const LARGEST_PUPIL_MM: f32 = 20.0;
-/// Relative difference below which two optical lengths are the same.
-const OPTICS_TOLERANCE: f64 = 1e-4;
 
 /// Weights that were checked as a whole: every tensor is there, finite, and of the shape that the configuration asks for.
 #[derive(Clone, Debug, PartialEq)]
@@ -32,7 +34,7 @@ pub struct Weights {
 pub struct NetworkConfig {
     /// The family.
     pub architecture: Architecture,
-    /// Version of the family; 1 is known.
+    /// Version of the family; 2 is known.
     pub version: u32,
     /// The grid on which the network predicts.
     pub grid: Grid,
@@ -42,14 +44,12 @@ pub struct NetworkConfig {
     pub channels: usize,
     /// Which body layers are adjustable deformable ones.
     pub adjustable_layers: Vec<usize>,
-    /// Width of the hidden layers of the network that turns the pupil into a modulation.
+    /// Width of the hidden layers of the network that turns what is told of bench and pupil into a modulation.
     pub modulation_hidden: usize,
     /// Slope of the leaky rectifier below zero.
     pub leaky_slope: f32,
-    /// Optics trained for.
-    pub optics: TrainedOptics,
-    /// Smallest and largest pupil trained, millimetres.
-    pub pupil_range_mm: [f32; 2],
+    /// Benches and pupils trained for.
+    pub trained: TrainedRange,
     /// Amplitude that double phase maps to 1.
     pub amplitude_constant: f32,
     /// `expected-stack`: into how many layers, equal in dioptres, the depth volume is divided.
@@ -109,48 +109,6 @@ pub enum Grid {
     HalfBand,
     /// The panel's own.
     Full,
-}
-
-/// The optics that weights were trained for, in the units of their file.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TrainedOptics {
-    /// Red, green, blue.
-    pub wavelengths_nm: [f64; 3],
-    /// Distance between the centres of neighbouring pixels.
-    pub pixel_pitch_um: f64,
-    /// Focal length of the eyepiece.
-    pub eyepiece_focal_length_mm: f64,
-    /// Vergence of normalised depth 0.
-    pub depth_far_dpt: f64,
-    /// Vergence of normalised depth 1.
-    pub depth_near_dpt: f64,
-}
-
-impl TrainedOptics {
-    /// The same optics with a panel of `resolution`.
-    pub fn geometry(&self, resolution: holod_calibration::Resolution) -> DisplayGeometry {
-        use holod_calibration::{Dioptres, Metres, PerColour};
-        DisplayGeometry {
-            resolution,
-            pixel_pitch: Metres(self.pixel_pitch_um * 1e-6),
-            wavelengths: PerColour(self.wavelengths_nm.map(|wavelength_nm| Metres(wavelength_nm * 1e-9))),
-            eyepiece_focal_length: Metres(self.eyepiece_focal_length_mm * 1e-3),
-            depth_far: Dioptres(self.depth_far_dpt),
-            depth_near: Dioptres(self.depth_near_dpt),
-        }
-    }
-
-    /// The optics of `geometry` in this type's units.
-    pub fn of(geometry: &DisplayGeometry) -> Self {
-        Self {
-            wavelengths_nm: geometry.wavelengths.0.map(|wavelength| wavelength.0 * 1e9),
-            pixel_pitch_um: geometry.pixel_pitch.0 * 1e6,
-            eyepiece_focal_length_mm: geometry.eyepiece_focal_length.0 * 1e3,
-            depth_far_dpt: geometry.depth_far.0,
-            depth_near_dpt: geometry.depth_near.0,
-        }
-    }
 }
 
 /// The stacks of layers that a family has.
@@ -248,7 +206,7 @@ pub(crate) struct Adjustable {
     pub(crate) offset_weight: Vec<f32>,
     /// b0, [18]
     pub(crate) offset_bias: Vec<f32>,
-    /// g_m: 1 → hidden → hidden → 18·in + 18
+    /// g_m: 2 → hidden → hidden → 18·in + 18
     pub(crate) modulation: [Dense; 3],
 }
 
@@ -308,6 +266,16 @@ pub enum WeightsError {
         /// What was expected.
         expected: String,
     },
+    /// The file is of a format that this version no longer runs.
+    #[error(
+        "weights {name}: found format \"{OLD_FORMAT}\", of a network for one bench that is told the pupil in millimetres; \
+         expected \"{FORMAT}\"; convert it with `python -m holod_training export --source FILE --out NEW`; it then needs a \
+         short training: model/training/README.md"
+    )]
+    OldFormat {
+        /// Which weights.
+        name: String,
+    },
     /// One tensor is missing or cannot be used.
     #[error("weights {name}: tensor `{tensor}` is {found}; expected {expected}")]
     Tensor {
@@ -322,36 +290,36 @@ pub enum WeightsError {
     },
 }
 
-/// Every optical value in which weights and bench differ.
+/// What weights reached on a bench that they were judged on.
 #[derive(Clone, Debug, PartialEq)]
-pub struct OpticsMismatch {
-    /// At least one.
-    pub differences: Vec<OpticsDifference>,
+pub struct JudgedBench {
+    /// The bench's name in the evaluation.
+    pub name: String,
+    /// At one pupil.
+    pub judged: Judged,
 }
 
-/// One optical value in which weights and bench differ.
-#[derive(Clone, Debug, PartialEq)]
-pub struct OpticsDifference {
-    /// Name with unit, as in a rig file.
-    pub name: &'static str,
-    /// The value that the weights were trained for.
-    pub weights: f64,
-    /// The value of the bench.
-    pub bench: f64,
+/// Means over held-out scenes, after double phase and rounding to levels.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+pub struct Judged {
+    /// Blur over the depth range for the pupil at which this was judged.
+    pub volume_blur_px: f64,
+    /// Over all focuses and pixels.
+    pub psnr_db: f64,
+    /// Where the circle of confusion is less than 2 px.
+    pub psnr_in_focus_db: f64,
+    /// 1 for the full refocus of the true images, 0 for one picture at every focus.
+    pub slope: f64,
+    /// PSNR over that of a hologram of smooth phase.
+    pub over_smooth_phase_db: f64,
 }
 
-impl fmt::Display for OpticsMismatch {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "the weights were trained for other optics than this bench has:")?;
-        for (index, OpticsDifference { name, weights, bench }) in self.differences.iter().enumerate() {
-            let separator = if index == 0 { "" } else { "," };
-            write!(f, "{separator} {name} {weights:.6} in the weights and {bench:.6} on the bench")?;
-        }
-        write!(f, "; use weights trained for this bench, or allow the mismatch in the rig file")
-    }
+#[derive(Deserialize)]
+struct BenchMetrics {
+    bench: String,
+    volume_fresnel_px2: [f64; 3],
+    rows: Vec<Judged>,
 }
-
-impl std::error::Error for OpticsMismatch {}
 
 impl Weights {
     /// The weights that ship with holod, of the best quality.
@@ -363,6 +331,12 @@ impl Weights {
     /// The weights that ship with holod for weak machines: little more than a third of the operations.
     pub fn builtin_small() -> Self {
         Self::from_bytes(include_bytes!("../weights/small.safetensors"), "small")
+            .expect("the built-in weights are valid: a test loads them")
+    }
+
+    /// The weights that ship with holod for processors: less than a sixth of the operations.
+    pub fn builtin_fast() -> Self {
+        Self::from_bytes(include_bytes!("../weights/fast.safetensors"), "fast")
             .expect("the built-in weights are valid: a test loads them")
     }
 
@@ -399,6 +373,20 @@ impl Weights {
         &self.config
     }
 
+    /// What the weights reached, when they were judged on several benches, on the one that is most like `bench` in its
+    /// diffraction, at the blur there that is most like that of `pupil` on `bench`. Nothing where the file does not say.
+    pub fn judged_on_the_like_of(&self, bench: &DisplayGeometry, pupil: PupilDiameter) -> Option<JudgedBench> {
+        let apart = |found: f64, wanted: f64| (found / wanted).ln().abs();
+        let mean = |fresnel_px2: &[f64; 3]| fresnel_px2.iter().sum::<f64>() / 3.0;
+        let (fresnel_px2, blur_px) = (mean(&bench.volume_fresnel_px2().0), bench.largest_coc_px(pupil));
+        let benches: Vec<BenchMetrics> = serde_json::from_value(self.metrics.get("benches")?.clone()).ok()?;
+        let distance = |of: &BenchMetrics| apart(mean(&of.volume_fresnel_px2), fresnel_px2);
+        let nearest = benches.into_iter().min_by(|a, b| distance(a).total_cmp(&distance(b)))?;
+        let distance = |of: &Judged| apart(of.volume_blur_px, blur_px);
+        let judged = nearest.rows.into_iter().min_by(|a, b| distance(a).total_cmp(&distance(b)))?;
+        Some(JudgedBench { name: nearest.bench, judged })
+    }
+
     /// What the weights reached when they were evaluated, as the trainer wrote it.
     pub fn metrics(&self) -> &serde_json::Value {
         &self.metrics
@@ -409,28 +397,14 @@ impl Weights {
         &self.provenance
     }
 
-    /// Whether `bench` has the optics that the weights were trained for. The panel's resolution is free.
-    pub fn check_optics(&self, bench: &DisplayGeometry) -> Result<(), OpticsMismatch> {
-        let (ours, theirs) = (&self.config.optics, TrainedOptics::of(bench));
-        let [red, green, blue] = ours.wavelengths_nm;
-        let [bench_red, bench_green, bench_blue] = theirs.wavelengths_nm;
-        let differences: Vec<_> = [
-            ("wavelengths_nm.red", red, bench_red),
-            ("wavelengths_nm.green", green, bench_green),
-            ("wavelengths_nm.blue", blue, bench_blue),
-            ("pixel_pitch_um", ours.pixel_pitch_um, theirs.pixel_pitch_um),
-            ("eyepiece_focal_length_mm", ours.eyepiece_focal_length_mm, theirs.eyepiece_focal_length_mm),
-            ("depth_far_dpt", ours.depth_far_dpt, theirs.depth_far_dpt),
-            ("depth_near_dpt", ours.depth_near_dpt, theirs.depth_near_dpt),
-        ]
-        .into_iter()
-        .filter(|&(_, weights, bench)| {
-            let difference = (weights - bench).abs();
-            difference.is_nan() || difference > OPTICS_TOLERANCE * weights.abs().max(bench.abs()).max(1e-3)
-        })
-        .map(|(name, weights, bench)| OpticsDifference { name, weights, bench })
-        .collect();
-        if differences.is_empty() { Ok(()) } else { Err(OpticsMismatch { differences }) }
+    /// Where `bench` lies in what the weights were trained for. Its resolution is free.
+    pub fn fit(&self, bench: &DisplayGeometry) -> BenchFit {
+        self.config.trained.fit(bench)
+    }
+
+    /// The narrowest and the widest pupil that the weights were trained for, on `bench`.
+    pub fn trained_pupils(&self, bench: &DisplayGeometry) -> [PupilDiameter; 2] {
+        self.config.trained.pupils(bench)
     }
 }
 
@@ -459,6 +433,7 @@ impl Metadata<'_> {
     fn config(&self) -> Result<NetworkConfig, WeightsError> {
         match self.entries.get("format").map(String::as_str) {
             Some(FORMAT) => {}
+            Some(OLD_FORMAT) => return Err(WeightsError::OldFormat { name: self.name.into() }),
             Some(other) => return Err(self.error("format", format!("\"{other}\""), format!("\"{FORMAT}\""))),
             None => return Err(self.error("format", "absent", format!("\"{FORMAT}\""))),
         }
@@ -475,7 +450,7 @@ impl Metadata<'_> {
             if holds { Ok(()) } else { Err(self.error(&format!("config.{key}"), found, expected)) }
         };
         let NetworkConfig { version, layers, channels, correction_layers, depth_layers, .. } = config;
-        require(*version == 1, "version", version.to_string(), "1")?;
+        require(*version == VERSION, "version", version.to_string(), &VERSION.to_string())?;
         for (key, layers) in [("layers", layers), ("correction_layers", correction_layers)] {
             require(
                 (4..=64).contains(layers) && layers % 2 == 0,
@@ -515,31 +490,17 @@ impl Metadata<'_> {
         require((1..=1024).contains(&hidden), "modulation_hidden", hidden.to_string(), "1 to 1024")?;
         let slope = config.leaky_slope;
         require((0.0..1.0).contains(&slope), "leaky_slope", slope.to_string(), "at least 0 and below 1")?;
-        let [smallest, largest] = config.pupil_range_mm;
-        require(
-            smallest > 0.0 && largest >= smallest && largest <= LARGEST_PUPIL_MM,
-            "pupil_range_mm",
-            format!("[{smallest}, {largest}]"),
-            "two millimetre values above 0 and up to 20, in ascending order",
-        )?;
+        let TrainedRange { volume_blur_px, volume_fresnel_px2 } = config.trained;
+        for (key, [least, most]) in [("volume_blur_px", volume_blur_px), ("volume_fresnel_px2", volume_fresnel_px2)] {
+            require(
+                least > 0.0 && most >= least && most.is_finite(),
+                &format!("trained.{key}"),
+                format!("[{least}, {most}]"),
+                "two numbers above 0, in ascending order",
+            )?;
+        }
         let constant = config.amplitude_constant;
-        require(
-            constant > 0.0 && constant.is_finite(),
-            "amplitude_constant",
-            constant.to_string(),
-            "a positive number",
-        )?;
-        let optics = &config.optics;
-        let lengths = [optics.pixel_pitch_um, optics.eyepiece_focal_length_mm];
-        require(
-            lengths.iter().chain(&optics.wavelengths_nm).all(|&length| length > 0.0 && length.is_finite())
-                && optics.depth_far_dpt.is_finite()
-                && optics.depth_near_dpt.is_finite()
-                && optics.depth_near_dpt > optics.depth_far_dpt,
-            "optics",
-            format!("{optics:?}"),
-            "positive lengths, and a near end with more dioptres than the far end",
-        )
+        require(constant > 0.0 && constant.is_finite(), "amplitude_constant", constant.to_string(), "a positive number")
     }
 }
 
@@ -573,7 +534,7 @@ impl TensorReader<'_> {
         Ok(Adjustable {
             offset_weight: self.tensor(&format!("{prefix}.offset.weight"), &[OFFSET_CHANNELS, channels, 3, 3])?,
             offset_bias: self.tensor(&format!("{prefix}.offset.bias"), &[OFFSET_CHANNELS])?,
-            modulation: [dense(0, 1, hidden)?, dense(1, hidden, hidden)?, dense(2, hidden, outputs)?],
+            modulation: [dense(0, CONDITIONS, hidden)?, dense(1, hidden, hidden)?, dense(2, hidden, outputs)?],
         })
     }
 
@@ -595,6 +556,9 @@ impl TensorReader<'_> {
         }
     }
 }
+
+/// What networks are told of a bench and a pupil, as maps and as inputs: [`Conditions`](crate::conditions::Conditions).
+pub(crate) const CONDITIONS: usize = 2;
 
 /// Real and imaginary residual of three colours.
 pub(crate) const OUTPUT_CHANNELS: usize = 6;
@@ -620,12 +584,12 @@ impl NetworkConfig {
         }
     }
 
-    /// Channels that describe the frame: amplitude, two depth channels (each four times after the unshuffle on the
-    /// half-band grid), and the pupil.
+    /// Channels that describe the frame: amplitude and two depth channels, each four times after the unshuffle on the
+    /// half-band grid, and what is told of bench and pupil.
     pub(crate) fn map_channels(&self) -> usize {
         match self.grid {
-            Grid::HalfBand => 4 * 5 + 1,
-            Grid::Full => 5 + 1,
+            Grid::HalfBand => 4 * 5 + CONDITIONS,
+            Grid::Full => 5 + CONDITIONS,
         }
     }
 
@@ -638,6 +602,7 @@ impl NetworkConfig {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use holod_calibration::Metres;
     use rand::RngExt;
     use safetensors::tensor::TensorView;
 
@@ -655,10 +620,12 @@ pub(crate) mod tests {
             let adjustable = shape.modulation_hidden.map(|hidden| Adjustable {
                 offset_weight: tensor(OFFSET_CHANNELS * in_channels * 9, 4.0 * scale),
                 offset_bias: tensor(OFFSET_CHANNELS, 1.0),
-                modulation: [(1, hidden), (hidden, hidden), (hidden, modulated)].map(|(inputs, outputs)| Dense {
-                    inputs,
-                    weight: tensor(inputs * outputs, (1.0 / inputs as f32).sqrt()),
-                    bias: tensor(outputs, 0.1),
+                modulation: [(CONDITIONS, hidden), (hidden, hidden), (hidden, modulated)].map(|(inputs, outputs)| {
+                    Dense {
+                        inputs,
+                        weight: tensor(inputs * outputs, (1.0 / inputs as f32).sqrt()),
+                        bias: tensor(outputs, 0.1),
+                    }
                 }),
             });
             Ok::<_, std::convert::Infallible>(Layer {
@@ -713,18 +680,17 @@ pub(crate) mod tests {
     type Entries = HashMap<String, String>;
 
     pub(crate) fn config() -> NetworkConfig {
-        let optics = TrainedOptics::of(&DisplayGeometry::DEFAULT);
         NetworkConfig {
             architecture: Architecture::Direct,
-            version: 1,
+            version: VERSION,
             grid: Grid::HalfBand,
             layers: 4,
             channels: 5,
             adjustable_layers: vec![2],
             modulation_hidden: 3,
             leaky_slope: 0.1,
-            optics,
-            pupil_range_mm: [1.0, 5.0],
+            // On the default bench pupils of 1 to 5 mm.
+            trained: TrainedRange { volume_blur_px: [100.0 / 7.0, 500.0 / 7.0], volume_fresnel_px2: [32.0, 46.0] },
             amplitude_constant: 1.4,
             depth_layers: default_depth_layers(),
             correction_layers: default_correction_layers(),
@@ -795,8 +761,52 @@ pub(crate) mod tests {
         assert_eq!((weights.config().layer_count(), weights.config().channels), (18, 32));
         let small = Weights::builtin_small();
         assert_eq!((small.config().layer_count(), small.config().channels), (10, 24));
-        for weights in [weights, small] {
-            weights.check_optics(&DisplayGeometry::DEFAULT).unwrap();
+        let fast = Weights::builtin_fast();
+        assert_eq!((fast.config().layer_count(), fast.config().channels), (8, 16));
+        // 3.74 µm with 40 mm has the most diffraction of the benches that networks are judged on, 12.5 µm with 50 mm the
+        // least.
+        let gaea = DisplayGeometry { pixel_pitch: Metres(3.74e-6), ..DisplayGeometry::DEFAULT };
+        let x15213 = DisplayGeometry {
+            pixel_pitch: Metres(12.5e-6),
+            eyepiece_focal_length: Metres(50e-3),
+            ..DisplayGeometry::DEFAULT
+        };
+        for weights in [weights, small, fast] {
+            for bench in [DisplayGeometry::DEFAULT, gaea, x15213] {
+                assert_eq!(weights.fit(&bench), BenchFit::Inside);
+            }
+            let [narrowest, widest] = weights.trained_pupils(&DisplayGeometry::DEFAULT).map(PupilDiameter::mm);
+            assert!(narrowest <= 1.0 && widest >= 8.0, "{narrowest} to {widest} mm");
+        }
+    }
+
+    #[test]
+    fn the_bench_that_is_most_alike_is_quoted() {
+        let bench = |name: &str, fresnel: f64, blurs: [f64; 2]| {
+            let row = |blur: f64| {
+                serde_json::json!({"volume_blur_px": blur, "psnr_db": fresnel + blur, "psnr_in_focus_db": 24.0,
+                    "slope": 0.5, "over_smooth_phase_db": 4.0})
+            };
+            serde_json::json!({"bench": name, "volume_fresnel_px2": [fresnel, fresnel, fresnel], "rows": blurs.map(row)})
+        };
+        let metrics = serde_json::json!({"benches": [
+            bench("coarse", 20.0, [10.0, 30.0]), bench("alike", 36.0, [28.0, 57.0]), bench("fine", 170.0, [60.0, 90.0]),
+        ]});
+        let told = file(|_, entries| drop(entries.insert("metrics".into(), metrics.to_string())));
+        let weights = Weights::from_bytes(&told, "test").unwrap();
+        let quoted = |bench: &DisplayGeometry, pupil_mm| {
+            weights
+                .judged_on_the_like_of(bench, PupilDiameter::from_mm(pupil_mm))
+                .map(|of| (of.name, of.judged.psnr_db))
+        };
+        assert_eq!(quoted(&DisplayGeometry::DEFAULT, 2.0), Some(("alike".into(), 64.0)));
+        assert_eq!(quoted(&DisplayGeometry::DEFAULT, 5.0), Some(("alike".into(), 93.0)));
+        let gaea = DisplayGeometry { pixel_pitch: Metres(3.74e-6), ..DisplayGeometry::DEFAULT };
+        assert_eq!(quoted(&gaea, 3.0), Some(("fine".into(), 260.0)));
+        for silent in ["{}", "{\"benches\": 3}", "{\"benches\": []}"] {
+            let silent = file(|_, entries| drop(entries.insert("metrics".into(), silent.into())));
+            let weights = Weights::from_bytes(&silent, "test").unwrap();
+            assert_eq!(weights.judged_on_the_like_of(&gaea, PupilDiameter::from_mm(3.0)), None);
         }
     }
 
@@ -825,11 +835,11 @@ pub(crate) mod tests {
         let set = |key: &'static str, value: &'static str| {
             error_of(move |_, entries| drop(entries.insert(key.into(), value.into())))
         };
-        assert_mentions(&set("format", "holod-weights-9"), &["`format`", "holod-weights-9", "holod-weights-1"]);
+        assert_mentions(&set("format", "holod-weights-9"), &["`format`", "holod-weights-9", "holod-weights-2"]);
         assert_mentions(&error_of(|_, entries| entries.clear()), &["`format`", "absent"]);
         assert_mentions(&set("config", "{}"), &["`config`", "missing field"]);
-        let configured = |change: fn(&mut NetworkConfig)| {
-            error_of(move |_, entries| {
+        let configured = |change: &dyn Fn(&mut NetworkConfig)| {
+            error_of(|_, entries| {
                 let mut changed = config();
                 change(&mut changed);
                 entries.insert("config".into(), serde_json::to_string(&changed).unwrap());
@@ -846,18 +856,24 @@ pub(crate) mod tests {
         let full = file_of(NetworkConfig { grid: Grid::Full, ..expected_stack_config() }, |_, _| {});
         let full = Weights::from_bytes(&full, "test").unwrap_err().to_string();
         assert_mentions(&full, &["config.grid", "\"full\"", "half-band", "`expected-stack`"]);
-        assert_mentions(&configured(|c| c.correction_layers = 3), &["config.correction_layers", "3", "even"]);
-        assert_mentions(&configured(|c| c.depth_layers = 1), &["config.depth_layers", "1"]);
-        assert_mentions(&configured(|c| c.depth_layers = 65), &["config.depth_layers", "65", "2 to 64"]);
-        assert_mentions(&configured(|c| c.refined_stack = true), &["config.refined_stack", "true", "`expected-stack`"]);
-        assert_mentions(&configured(|c| c.version = 7), &["config.version", "7"]);
-        assert_mentions(&configured(|c| c.layers = 5), &["config.layers", "5", "even"]);
-        assert_mentions(&configured(|c| c.channels = 100_000), &["config.channels", "100000"]);
-        assert_mentions(&configured(|c| c.adjustable_layers = vec![3]), &["config.adjustable_layers", "[3]"]);
-        assert_mentions(&configured(|c| c.pupil_range_mm = [5.0, 1.0]), &["config.pupil_range_mm"]);
-        assert_mentions(&configured(|c| c.pupil_range_mm = [1.0, 21.0]), &["config.pupil_range_mm", "21", "up to 20"]);
-        assert_mentions(&configured(|c| c.amplitude_constant = 0.0), &["config.amplitude_constant"]);
-        assert_mentions(&configured(|c| c.optics.wavelengths_nm[1] = -1.0), &["config.optics", "-1"]);
+        assert_mentions(&configured(&|c| c.correction_layers = 3), &["config.correction_layers", "3", "even"]);
+        assert_mentions(&configured(&|c| c.depth_layers = 1), &["config.depth_layers", "1"]);
+        assert_mentions(&configured(&|c| c.depth_layers = 65), &["config.depth_layers", "65", "2 to 64"]);
+        assert_mentions(
+            &configured(&|c| c.refined_stack = true),
+            &["config.refined_stack", "true", "`expected-stack`"],
+        );
+        assert_mentions(&configured(&|c| c.version = 7), &["config.version", "7"]);
+        assert_mentions(&configured(&|c| c.layers = 5), &["config.layers", "5", "even"]);
+        assert_mentions(&configured(&|c| c.channels = 100_000), &["config.channels", "100000"]);
+        assert_mentions(&configured(&|c| c.adjustable_layers = vec![3]), &["config.adjustable_layers", "[3]"]);
+        for unusable in [[5.0, 1.0], [0.0, 5.0], [-1.0, 5.0]] {
+            let blur = configured(&|c| c.trained.volume_blur_px = unusable);
+            assert_mentions(&blur, &["config.trained.volume_blur_px", "ascending"]);
+            let fresnel = configured(&|c| c.trained.volume_fresnel_px2 = unusable);
+            assert_mentions(&fresnel, &["config.trained.volume_fresnel_px2", "ascending"]);
+        }
+        assert_mentions(&configured(&|c| c.amplitude_constant = 0.0), &["config.amplitude_constant"]);
     }
 
     #[test]
@@ -875,15 +891,24 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn every_difference_in_optics_is_listed() {
-        let weights = random_weights(config(), 1);
-        let mut bench = DisplayGeometry::DEFAULT;
-        weights.check_optics(&bench).unwrap();
-        bench.pixel_pitch.0 = 6.4e-6;
-        bench.wavelengths.0[2].0 = 455e-9;
-        let mismatch = weights.check_optics(&bench).unwrap_err();
-        let names: Vec<_> = mismatch.differences.iter().map(|difference| difference.name).collect();
-        assert_eq!(names, ["wavelengths_nm.blue", "pixel_pitch_um"]);
-        assert_mentions(&mismatch.to_string(), &["450.0", "455.0", "8.0", "6.4", "allow"]);
+    fn a_file_of_the_old_format_is_told_what_it_is_and_what_to_do() {
+        let old = set_format(OLD_FORMAT);
+        assert_mentions(
+            &old,
+            &[
+                "test.safetensors",
+                "holod-weights-1",
+                "one bench",
+                "holod-weights-2",
+                "`python -m holod_training export --source FILE --out NEW`",
+                "short training",
+                "model/training/README.md",
+            ],
+        );
+        assert!(!set_format("holod-weights-9").contains("holod_training export"));
+    }
+
+    fn set_format(format: &str) -> String {
+        error_of(|_, entries| drop(entries.insert("format".into(), format.into())))
     }
 }

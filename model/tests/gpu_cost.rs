@@ -12,13 +12,13 @@ fn said(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// The costs of both networks on both cards, with the least share of multiply-adds that a hot loop of products may have. The
+/// The costs of all networks on both cards, with the least share of multiply-adds that a hot loop of products may have. The
 /// program's exit code is not 0 where a register spills or a shader does not compile.
 fn judge_frames(more: &[&str], least_share: f64) -> Vec<f64> {
     let output = gpu_cost().arg("--json").args(more).output().expect("it starts");
     assert!(output.status.success(), "{}", said(&output));
     let frames: Vec<Value> = serde_json::from_slice(&output.stdout).expect("JSON");
-    assert!(frames.len() >= 4 && frames.len().is_multiple_of(4), "two networks on two cards");
+    assert!(frames.len() >= 6 && frames.len().is_multiple_of(6), "three networks on two cards");
     let judge = |frame: &Value| {
         let mut seconds = 0.0;
         for stage in frame["stages"].as_array().expect("stages") {

@@ -4,7 +4,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use holod_calibration::{PupilDiameter, Resolution};
+use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
 use holod_model::optics::DoublePhase;
 use holod_model::{ComplexHologram, CpuEngine, PhasePattern, RgbdFrame, Weights, WorkerPool};
 
@@ -41,7 +41,7 @@ fn frames_do_not_allocate() {
 
 fn check(weights: &Weights) {
     let resolution = Resolution { width: 10, height: 7 };
-    let engine = CpuEngine::new(weights, resolution).unwrap();
+    let engine = CpuEngine::new(weights, &DisplayGeometry::DEFAULT, resolution).unwrap();
     let double_phase = DoublePhase::new(resolution, weights.config().amplitude_constant);
     let frame = RgbdFrame {
         resolution,

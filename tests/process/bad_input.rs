@@ -43,7 +43,7 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
         .replace("refresh_hz = 60.0", "refesh_hz = 60.0")
         .replace("fallback_mm = 3.0", "fallback_mm = \"wide\"");
     fs::write(at("three.toml"), three).unwrap();
-    fs::write(at("other_optics.toml"), rig.replace("pixel_pitch_um = 8.0", "pixel_pitch_um = 6.4")).unwrap();
+    fs::write(at("other_optics.toml"), rig.replace("pixel_pitch_um = 8.0", "pixel_pitch_um = 2.0")).unwrap();
     fs::write(at("junk.toml"), [0xff, 0xfe, 0x00]).unwrap();
     fs::write(at("weights.safetensors"), "no weights").unwrap();
     fs::write(at("bad_weights.toml"), format!("{rig}[model]\nweights_file = \"weights.safetensors\"\n")).unwrap();
@@ -79,7 +79,7 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
         },
         Case { args: &["render", "--pupil", "wide", "--out", "out"], exit: 64, says: &["wide", "--pupil"] },
         Case { args: &["render", "--pupil", "12", "--out", "out"], exit: 64, says: &["12"] },
-        Case { args: &["render", "--pupil", "7", "--out", "out"], exit: 64, says: &["7", "trained"] },
+        Case { args: &["render", "--pupil", "8.5", "--out", "out"], exit: 64, says: &["8.5", "trained"] },
         Case { args: &["render", "--pupil", "3", "--out", "colour.png"], exit: 73, says: &["colour.png", "file"] },
         Case {
             args: &["view", "--hologram", "directory", "--focus", "1", "--out", "v.png"],
@@ -103,7 +103,11 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
                 "line 6",
             ],
         },
-        Case { args: &["--config", "other_optics.toml"], exit: 78, says: &["pitch", "6.4", "8"] },
+        Case {
+            args: &["--config", "other_optics.toml"],
+            exit: 78,
+            says: &["729.14 px² in red", "8.00 to 240.00", "model/training/README.md"],
+        },
         Case { args: &["--config", "bad_weights.toml"], exit: 65, says: &["weights.safetensors"] },
         Case { args: &["--tracker", "/dev/nothing-here"], exit: 66, says: &["/dev/nothing-here", "does not exist"] },
         Case { args: &["--tracker", "directory"], exit: 66, says: &["directory"] },

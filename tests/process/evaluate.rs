@@ -124,6 +124,7 @@ fn render(folder: &Path, kind: SceneKind, count: u64) {
         kind,
         seed: 11,
         resolution: SIZE,
+        bench: holod_calibration::DisplayGeometry::DEFAULT,
         pupils: PupilPlan::Fixed([2.0, 4.0].map(PupilDiameter::from_mm).to_vec()),
         planes: PlanePlan::Uniform(2),
         rays: 8,

@@ -138,6 +138,32 @@ fn check_estimates_the_frames_a_second_and_takes_a_tracker() {
 }
 
 #[test]
+fn check_says_where_a_bench_lies_in_what_the_network_was_trained_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let rig = small_rig(64, 64, "driver = \"simulated\"");
+    let fine = rig.replace("pixel_pitch_um = 8.0", "pixel_pitch_um = 1.0");
+    fs::write(folder.path().join("default.toml"), rig).unwrap();
+    fs::write(folder.path().join("fine.toml"), fine).unwrap();
+    let check = |name: &str| run(HOLOD, &["check", "--config", name], folder.path());
+    let says = |ended: &Ended, parts: &[&str]| {
+        for part in parts {
+            assert!(ended.stdout.contains(part), "`{part}` is not in: {}", ended.stdout);
+        }
+    };
+    let known = check("default.toml");
+    assert!(known.status.success(), "{known:?}");
+    says(&known, &["42.9 px over the depth range at a pupil of 3 mm", "red 45.57, green 37.14, blue 32.14 px²"]);
+    says(&known, &["half band", "green 1.30, blue 1.1", "at most red 22.79, green 18.57, blue 16.07 px"]);
+    // 64 times the diffraction: more than any network was trained for.
+    let unknown = check("fine.toml");
+    assert_eq!(unknown.status.code(), Some(69));
+    says(&unknown, &["FAIL spread", "2916.57 px² in red", "would bring it inside", "not estimated without weights"]);
+    let refused = run(HOLOD, &["render", "--config", "fine.toml", "--pupil", "1", "--out", "out"], folder.path());
+    assert_eq!(refused.status.code(), Some(78), "{refused:?}");
+    assert!(refused.stderr.contains("2916.57 px² in red") && refused.stderr.contains("model/training/README.md"));
+}
+
+#[test]
 fn check_names_a_profile_that_is_not_there() {
     let folder = tempfile::tempdir().unwrap();
     let rig = |profile: &str| {

@@ -54,6 +54,11 @@ pub struct Meaning {
     pub u_near_mm: f64,
     /// Width λf/p of the eyebox.
     pub eyebox_mm: PerColourFigures,
+    /// Width λf/2p of the part of the eyebox that light with a smooth phase fills: the half band that the 4f stop lets
+    /// through.
+    pub half_band_eyebox_mm: PerColourFigures,
+    /// The largest blur over the depth range that such light can show, λ·(f/p)²·V/2.
+    pub smooth_phase_blur_px: PerColourFigures,
     /// Half-angle λ/2p to which the panel can send light.
     pub panel_half_angle_mrad: PerColourFigures,
     /// The blur of a point at one end of the depth range for an eye focused at the other.
@@ -158,6 +163,8 @@ impl Meaning {
             u_far_mm: geometry.image_distance(geometry.depth_far).0 * 1e3,
             u_near_mm: geometry.image_distance(geometry.depth_near).0 * 1e3,
             eyebox_mm: geometry.eyebox().map(|width| width.0 * 1e3).into(),
+            half_band_eyebox_mm: geometry.half_band_eyebox().map(|width| width.0 * 1e3).into(),
+            smooth_phase_blur_px: geometry.volume_fresnel_px2().map(|px2| px2 / 2.0).into(),
             panel_half_angle_mrad: panel_half_angle.map(|angle_rad| angle_rad * 1e3).into(),
             blurs: blurs.to_vec(),
             field: FieldMeaning::of(rig),
@@ -246,9 +253,6 @@ fn notes(rig: &Rig) -> Vec<String> {
     if rig.lasers.driver == LaserDriver::Simulated {
         notes.push("the lasers are simulated: no light will be lit".into());
     }
-    if rig.model.allow_optics_mismatch {
-        notes.push("weights that were trained for other optics are allowed: expect a worse picture".into());
-    }
     notes
 }
 
@@ -282,6 +286,12 @@ impl fmt::Display for Meaning {
             self.depth_far_dpt, self.depth_near_dpt, self.depth_near_m, self.u_far_mm, self.u_near_mm
         )?;
         writeln!(f, "eyebox         {} mm", self.eyebox_mm)?;
+        writeln!(f, "half band      fills {} mm of the eyebox", self.half_band_eyebox_mm)?;
+        writeln!(
+            f,
+            "               so light with a smooth phase is blurred by at most {} px",
+            self.smooth_phase_blur_px
+        )?;
         writeln!(f, "panel's band   {} mrad either side", self.panel_half_angle_mrad)?;
         for blur in &self.blurs {
             writeln!(

@@ -208,8 +208,6 @@ pub enum Eye {
 pub struct Model {
     /// Which network computes the holograms.
     pub weights: WeightsChoice,
-    /// Run weights that were trained for other optics.
-    pub allow_optics_mismatch: bool,
 }
 
 /// A network's weights by name or by file.
@@ -218,15 +216,18 @@ pub enum WeightsChoice {
     /// The built-in network of the best quality.
     #[default]
     Standard,
-    /// The built-in network for weak machines.
+    /// The built-in network of little more than a third of the operations.
     Small,
+    /// The built-in network for processors: less than a sixth of the operations.
+    Fast,
     /// A file that the trainer exported.
     File(PathBuf),
 }
 
 impl WeightsChoice {
     /// The names of the built-in networks in a rig file and on the command line.
-    pub const BUILT_IN: [(&'static str, Self); 2] = [("standard", Self::Standard), ("small", Self::Small)];
+    pub const BUILT_IN: [(&'static str, Self); 3] =
+        [("standard", Self::Standard), ("small", Self::Small), ("fast", Self::Fast)];
 }
 
 impl Default for Rig {
@@ -267,7 +268,7 @@ impl Default for Rig {
                 fallback: PupilDiameter::from_mm(3.0),
                 hold: TimeNs(1_000_000_000),
             },
-            model: Model { weights: WeightsChoice::Standard, allow_optics_mismatch: false },
+            model: Model { weights: WeightsChoice::Standard },
             provenance: Provenance::default(),
         }
     }

@@ -72,8 +72,12 @@ const LAYOUT: [(&str, &[&str]); 6] = [
         ],
     ),
     ("tracker", &["spec", "eye", "scale_mm_per_unit", "fallback_mm", "hold_ms"]),
-    ("model", &["network", "weights_file", "allow_optics_mismatch"]),
+    ("model", &["network", "weights_file"]),
 ];
+
+/// Keys that earlier rig files had, with what to do about them.
+const RETIRED: [(&str, &str, &str); 1] =
+    [("model", "allow_optics_mismatch", "remove it: networks compute with the rig's own optics")];
 
 /// The keys that a panel profile gives.
 const PROFILE_KEYS: [&str; 6] = ["width_px", "height_px", "pixel_pitch_um", "refresh_hz", "bit_depth", "packing"];
@@ -86,7 +90,8 @@ const BIT_DEPTH: Span = Span::new(8.0, 16.0, "bits");
 const STROKE: Span = Span::new(0.5, 6.0, "π").slips(&[("radians", 1.0 / PI), ("degrees", 1.0 / 180.0)]);
 const GRAY_OF_2PI: Span = Span::new(16.0, 65536.0, "");
 const SETTLE: Span = Span::new(0.0, 100.0, "ms").slips(&[("microseconds", 1e-3)]);
-const WAVELENGTH: Span = Span::new(380.0, 780.0, "nm").slips(&[("metres", 1e9), ("micrometres", 1e3)]);
+const WAVELENGTH: Span =
+    Span::new(380.0, 780.0, "nm").slips(&[("metres", 1e9), ("micrometres", 1e3), ("ångströms", 0.1)]);
 const FOCAL_LENGTH: Span = Span::new(5.0, 500.0, "mm").slips(&[("metres", 1e3), ("micrometres", 1e-3)]);
 const DEPTH_M: Span = Span::new(0.05, f64::INFINITY, "m");
 const DEPTH_DPT: Span = Span::new(0.0, 20.0, "dioptres");
@@ -124,7 +129,7 @@ pub(super) fn parse(text: &str, origin: &Path) -> Result<Rig, RigError> {
 }
 
 fn read_rig<'a>(reader: &mut Reader<'a>, root: Section<'a>, text: &str, origin: &Path) -> Option<Rig> {
-    reader.reject_unknown(root, &LAYOUT);
+    reader.reject_unknown(root, &LAYOUT, &RETIRED);
     let name = match reader.text(root, "name", "a name for logs and reports") {
         Some(name) => name.value.to_owned(),
         None => origin.file_stem().map_or_else(|| "rig".into(), |stem| stem.to_string_lossy().into_owned()),
@@ -136,7 +141,7 @@ fn read_rig<'a>(reader: &mut Reader<'a>, root: Section<'a>, text: &str, origin: 
         [("panel", true), ("optics", true), ("lasers", true), ("tracker", false), ("model", false)]
             .map(|(name, required)| reader.section(root, name, required && !built_in));
     for section in [panel, optics, lasers, tracker, model] {
-        reader.reject_unknown(section, &LAYOUT);
+        reader.reject_unknown(section, &LAYOUT, &RETIRED);
     }
     let folder = origin.parent().unwrap_or(Path::new(""));
     let mut provenance =
@@ -746,12 +751,11 @@ fn read_model<'a>(reader: &mut Reader<'a>, model: Section<'a>, folder: &Path) ->
         let advice = "remove network, or weights_file".into();
         reader.fault_in(model, "weights_file", file.line, "a second network", expected, advice);
     }
-    let allow_optics_mismatch = reader.flag(model, "allow_optics_mismatch", false);
     let weights = match file.and_then(|file| file.value) {
         Some(file) => WeightsChoice::File(file),
         None => network.map_or(WeightsChoice::Standard, |network| network.value),
     };
-    Some(Model { weights, allow_optics_mismatch })
+    Some(Model { weights })
 }
 
 fn milliseconds(ms: f64) -> TimeNs {

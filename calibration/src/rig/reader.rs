@@ -199,8 +199,14 @@ impl<'a> Reader<'a> {
     }
 
     /// Notes every key of `section` that is not in the section's part of `layout`, which holds the keys of every
-    /// section, to tell where a misplaced one belongs.
-    pub(super) fn reject_unknown(&mut self, section: Section<'a>, layout: &[(&'static str, &[&'static str])]) {
+    /// section, to tell where a misplaced one belongs; `retired` are sections' keys that there were once, each with what
+    /// to do about it.
+    pub(super) fn reject_unknown(
+        &mut self,
+        section: Section<'a>,
+        layout: &[(&'static str, &[&'static str])],
+        retired: &[(&str, &str, &str)],
+    ) {
         let Some(table) = section.table else { return };
         let known = layout.iter().find(|(name, _)| *name == section.name).map_or(&[][..], |(_, keys)| keys);
         for (key, item) in table.iter() {
@@ -209,11 +215,13 @@ impl<'a> Reader<'a> {
             }
             let line = self.line_of(table.key(key).and_then(|key| key.span()).or_else(|| item.span()));
             let home = layout.iter().find(|(name, keys)| *name != section.name && keys.contains(&key));
-            let advice = match (home, nearest(key, known)) {
-                (Some(("", _)), _) => format!("move `{key}` above the first table"),
-                (Some((home, _)), _) => format!("move `{key}` to [{home}]"),
-                (None, Some(name)) => format!("did you mean `{name}`?"),
-                (None, None) => "take it out".into(),
+            let once = retired.iter().find(|(name, once, _)| (*name, *once) == (section.name, key));
+            let advice = match (once, home, nearest(key, known)) {
+                (Some((.., advice)), ..) => (*advice).into(),
+                (_, Some(("", _)), _) => format!("move `{key}` above the first table"),
+                (_, Some((home, _)), _) => format!("move `{key}` to [{home}]"),
+                (_, None, Some(name)) => format!("did you mean `{name}`?"),
+                (_, None, None) => "take it out".into(),
             };
             let found = if item.is_table() { "an unknown table" } else { "an unknown key" };
             self.fault_in(section, key, line, found, &format!("one of {}", known.join(", ")), advice);

@@ -126,12 +126,12 @@ impl TextLaserProfile {
 }
 
 fn read<'a>(reader: &mut Reader<'a>, root: Section<'a>) -> Option<TextLaserProfile> {
-    reader.reject_unknown(root, &LAYOUT);
+    reader.reject_unknown(root, &LAYOUT, &[]);
     let description = reader.required_text(root, "description", "maker and model");
     let _for_people = reader.text(root, "source", "where the commands come from");
     let [line, commands] = ["line", "commands"].map(|name| reader.section(root, name, true));
     for section in [line, commands] {
-        reader.reject_unknown(section, &LAYOUT);
+        reader.reject_unknown(section, &LAYOUT, &[]);
     }
     let baud = reader.required_integer(line, "baud", BAUD);
     let end_of_command = read_end_of_command(reader, line);
@@ -215,7 +215,7 @@ fn command_list<'a>(
 fn questions<'a>(reader: &mut Reader<'a>, root: Section<'a>, name: &'static str) -> Option<Vec<Question>> {
     let mut questions = Vec::new();
     for section in reader.sections(root, name, LIST_MAX)? {
-        reader.reject_unknown(section, &LAYOUT);
+        reader.reject_unknown(section, &LAYOUT, &[]);
         let ask = reader.required_text(section, "ask", "a harmless question");
         let contains = reader.text(section, "contains", "a part of the right answer");
         let one_of = if section.has("one_of") { reader.text_list(section, "one_of", false, LIST_MAX) } else { None };

@@ -110,7 +110,7 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), Failure> {
 impl Laps {
     fn run(args: &BenchArgs, rig: &Rig, weights: &Weights, frame: &Arc<RgbdFrame>) -> Result<Self, Failure> {
         let encoder = renderer::panel_encoder(rig, args.resolution)?;
-        let mut renderer = renderer::open(args.backend, weights, &encoder)?;
+        let mut renderer = renderer::open(args.backend, weights, &rig.geometry, &encoder)?;
         let threads = renderer.cpu_threads();
         let mut levels = LevelsFrame::new(encoder.layout());
         let pupil = PupilDiameter::from_mm(3.0);

@@ -4,8 +4,11 @@ mod output;
 
 use std::path::Path;
 
-use holod_calibration::Resolution;
 use holod_calibration::rig::{Meaning, Rig};
+use holod_calibration::{PupilDiameter, Resolution};
+use holod_model::Weights;
+use holod_model::conditions::BenchFit;
+use holod_model::weights::JudgedBench;
 use holod_pupil_input::{Profile, TrackerSpec, serial_port_warnings};
 use serde::Serialize;
 
@@ -34,7 +37,11 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
         rig.tracker.spec = Some(spec.clone());
     }
     let output = args.output.as_deref().map(str::parse).transpose().map_err(Failure::because(Exit::Usage))?;
-    let mut checks = vec![weights(&rig), frames_hz(&rig, args.resolution), tracker(&rig)];
+    let network = setup::load_weights(&rig);
+    let mut checks = weights_checks(&rig, &network);
+    let runs = checks.iter().all(|check| check.passed);
+    checks.push(frames_hz(&rig, network.as_ref().ok().filter(|_| runs), args.resolution));
+    checks.push(tracker(&rig));
     checks.extend(output::lasers(&rig));
     checks.extend(output::panel(&rig, output.as_ref()));
     let findings = Findings { ready: checks.iter().all(|check| check.passed), checks, meaning: rig.meaning() };
@@ -61,28 +68,51 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
     }
 }
 
-fn weights(rig: &Rig) -> Check {
-    let (passed, says) = match setup::weights(rig) {
-        Ok(weights) => {
-            let config = weights.config();
-            let [narrowest, widest] = config.pupil_range_mm;
-            (
-                true,
-                format!(
-                    "{} {} with {} layers, trained for these optics and pupils of {narrowest} to {widest} mm",
-                    config.architecture,
-                    config.version,
-                    config.layer_count()
-                ),
-            )
-        }
-        Err(failure) => (false, failure.to_string()),
+/// The network, and where this bench lies in what it was trained for.
+fn weights_checks(rig: &Rig, weights: &Result<Weights, Failure>) -> Vec<Check> {
+    let check = |name, passed, says| Check { name, passed, says };
+    let weights = match weights {
+        Ok(weights) => weights,
+        Err(failure) => return vec![check("weights", false, failure.to_string())],
     };
-    Check { name: "weights", passed, says }
+    let (config, bench) = (weights.config(), &rig.geometry);
+    let network = format!("{} {} with {} layers", config.architecture, config.version, config.layer_count());
+    let [least_px, most_px] = config.trained.volume_blur_px;
+    let [narrowest, widest] = weights.trained_pupils(bench).map(PupilDiameter::mm);
+    let mut blur = format!(
+        "{:.1} px over the depth range at a pupil of 3 mm; the network was trained for {least_px:.1} to {most_px:.1} px, on \
+         this bench pupils of {narrowest:.2} to {widest:.2} mm",
+        bench.largest_coc_px(PupilDiameter::from_mm(3.0))
+    );
+    if setup::few_pupils(weights, bench).is_some() {
+        blur.push_str("; warning: of other pupils it is told the nearest of these, and the picture is worse");
+    }
+    let figures: Vec<_> = bench.volume_fresnel_px2().iter().map(|(colour, px2)| format!("{colour} {px2:.2}")).collect();
+    let [least_px2, most_px2] = config.trained.volume_fresnel_px2;
+    let diffraction = format!(
+        "{} px² over the depth range; the network was trained for {least_px2:.2} to {most_px2:.2} px²",
+        figures.join(", ")
+    );
+    let (fits, diffraction) = match weights.fit(bench) {
+        BenchFit::Inside => (true, diffraction),
+        BenchFit::Near(outside) => (true, format!("{diffraction}; warning: {outside}")),
+        BenchFit::Far(outside) => (false, outside.to_string()),
+    };
+    let mut checks =
+        vec![check("weights", true, network), check("blur", true, blur), check("spread", fits, diffraction)];
+    if let Some(JudgedBench { name, judged }) = weights.judged_on_the_like_of(bench, PupilDiameter::from_mm(3.0)) {
+        let quality = format!(
+            "{:.1} dB over all ({:+.1} to smooth phase), {:.1} dB in focus and a focus slope of {:.2} on the bench most \
+             alike that the network was judged on, {name}, at {:.0} px of blur",
+            judged.psnr_db, judged.over_smooth_phase_db, judged.psnr_in_focus_db, judged.slope, judged.volume_blur_px
+        );
+        checks.push(check("quality", true, quality));
+    }
+    checks
 }
 
 /// Frames a second, estimated from a small frame: slow is no fault of the bench.
-fn frames_hz(rig: &Rig, resolution: Option<Resolution>) -> Check {
+fn frames_hz(rig: &Rig, weights: Option<&Weights>, resolution: Option<Resolution>) -> Check {
     let name = "speed";
     let panel = rig.resolution();
     let sizes = match resolution {
@@ -91,13 +121,14 @@ fn frames_hz(rig: &Rig, resolution: Option<Resolution>) -> Check {
     };
     let fits = |size: &Resolution| size.width <= panel.width && size.height <= panel.height;
     let sizes: Vec<Resolution> = sizes.into_iter().filter(fits).collect();
-    let estimated = setup::weights(rig)
-        .and_then(|weights| progress::during("estimating the frames a second", || Estimate::of(rig, &weights)));
+    let estimated =
+        weights.map(|weights| progress::during("estimating the frames a second", || Estimate::of(rig, weights)));
     let (passed, says) = match (estimated, &sizes[..]) {
         // Why is said above, of the weights.
-        (Err(_), _) => (true, "not estimated without weights".into()),
-        (Ok(_), []) => (false, format!("--resolution is larger than the panel of {panel}")),
-        (Ok(estimate), [first, ..]) => {
+        (None, _) => (true, "not estimated without weights that fit".into()),
+        (Some(Err(failure)), _) => (true, format!("not estimated: {failure}")),
+        (Some(Ok(_)), []) => (false, format!("--resolution is larger than the panel of {panel}")),
+        (Some(Ok(estimate)), [first, ..]) => {
             let rates = sizes.iter().map(|&size| format!("{:.2} frames a second of {size}", estimate.frames_hz(size)));
             let rates: Vec<String> = rates.collect();
             let advice = speed::advice(estimate.frames_hz(*first), rig, *first);

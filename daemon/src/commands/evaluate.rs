@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use holod_calibration::rig::Rig;
-use holod_calibration::{PupilDiameter, Resolution};
+use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
 use holod_model::metrics::StackScore;
 use holod_model::scene_shard::{SceneShard, SceneShardError};
 use holod_model::{LinearImage, Weights};
@@ -69,7 +69,7 @@ pub(super) fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
     let shards = open(&args.scenes, args.limit, &rig)?;
     let cards = args.cards.as_deref().map(|folder| open(folder, None, &rig)).transpose()?.unwrap_or_default();
     let pupils = judged_pupils(&shards, &args.pupil)?;
-    warn_of_untrained_pupils(&weights, &pupils);
+    warn_of_untrained_pupils(&weights, &rig.geometry, &pupils);
     let staging =
         args.out.as_deref().map(|out| Staging::new(out, &["evaluation.json", "sheet.png"], args.force)).transpose()?;
 
@@ -185,12 +185,12 @@ fn pupil_indices(shard: &SceneShard, pupils: &[PupilDiameter]) -> Result<Vec<usi
     pupils.iter().map(position).collect()
 }
 
-fn warn_of_untrained_pupils(weights: &Weights, pupils: &[PupilDiameter]) {
-    let [narrowest, widest] = weights.config().pupil_range_mm;
+fn warn_of_untrained_pupils(weights: &Weights, bench: &DisplayGeometry, pupils: &[PupilDiameter]) {
+    let [narrowest, widest] = weights.trained_pupils(bench).map(PupilDiameter::mm);
     for pupil in pupils.iter().filter(|pupil| !(narrowest..=widest).contains(&pupil.mm())) {
         tracing::warn!(
-            "the weights were trained for pupils of {narrowest} to {widest} mm: for {} mm the network is given the \
-             nearest of these, as it would be on the display",
+            "on this bench the weights were trained for pupils of {narrowest:.2} to {widest:.2} mm: of {} mm the network \
+             is told the nearest of these, as it would be on the display",
             pupil.mm()
         );
     }

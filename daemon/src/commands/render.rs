@@ -6,8 +6,7 @@ use std::time::Instant;
 use holod_calibration::rig::Rig;
 use holod_calibration::{Colour, DisplayGeometry, PupilDiameter};
 use holod_model::Weights;
-use holod_model::files::{self, StoredHologram};
-use holod_model::weights::TrainedOptics;
+use holod_model::files::{self, BenchOptics, StoredHologram};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 use serde::Serialize;
 
@@ -99,7 +98,7 @@ pub(super) struct Computed {
     renderer: Box<dyn Renderer>,
     pub(super) encoder: Arc<PanelEncoder>,
     pub(super) levels: LevelsFrame,
-    pub(super) optics: TrainedOptics,
+    pub(super) optics: BenchOptics,
     pub(super) report: Report,
 }
 
@@ -111,12 +110,12 @@ pub(super) fn compute(
     backend: Backend,
 ) -> Result<Computed, Failure> {
     let weights = progress::during("loading the network", || setup::weights(rig))?;
-    check_pupil(&weights, pupil)?;
+    check_pupil(&weights, &rig.geometry, pupil)?;
     let frames = progress::during("loading the scene", || setup::frames(scene, &rig.geometry))?;
     let resolution = frames.resolution();
     let encoder = renderer::panel_encoder(rig, resolution)?;
     let mut renderer = progress::during(&format!("preparing the network for {resolution}"), || {
-        renderer::open(backend, &weights, &encoder)
+        renderer::open(backend, &weights, &rig.geometry, &encoder)
     })?;
     tracing::info!("holograms are computed by {}", renderer.description());
     let mut levels = LevelsFrame::new(encoder.layout());
@@ -149,20 +148,23 @@ pub(super) fn compute(
         total_ms: 0.0,
         files: FILES,
     };
-    let optics = TrainedOptics::of(&DisplayGeometry { resolution, ..rig.geometry });
+    let optics = BenchOptics::of(&DisplayGeometry { resolution, ..rig.geometry });
     Ok(Computed { renderer, encoder, levels, optics, report })
 }
 
-fn check_pupil(weights: &Weights, pupil: PupilDiameter) -> Result<(), Failure> {
-    let [narrowest, widest] = weights.config().pupil_range_mm;
-    if (narrowest..=widest).contains(&pupil.mm()) {
+fn check_pupil(weights: &Weights, bench: &DisplayGeometry, pupil: PupilDiameter) -> Result<(), Failure> {
+    let [narrowest, widest] = weights.trained_pupils(bench);
+    if (narrowest..=widest).contains(&pupil) {
         return Ok(());
     }
     Err(Failure::new(
         Exit::Usage,
         format!(
-            "--pupil: found {} mm, expected {narrowest} to {widest} mm, the pupils that these weights were trained for",
-            pupil.mm()
+            "--pupil: found {} mm, expected {:.2} to {:.2} mm, the pupils that these weights were trained for on this \
+             bench",
+            pupil.mm(),
+            narrowest.mm(),
+            widest.mm()
         ),
     ))
 }

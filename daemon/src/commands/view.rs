@@ -7,9 +7,8 @@ use std::path::Path;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{Colour, PerColour, PupilDiameter};
-use holod_model::files::{self, StoredHologram};
+use holod_model::files::{self, BenchOptics, StoredHologram};
 use holod_model::optics::{DoublePhase, Eye, PhasePattern, SimulatedEye};
-use holod_model::weights::TrainedOptics;
 use holod_slm_output::LevelsFrame;
 use serde::Serialize;
 
@@ -34,7 +33,7 @@ struct LookedAt {
     pattern: PhasePattern,
     /// The pupil that it was made for.
     pupil: PupilDiameter,
-    optics: TrainedOptics,
+    optics: BenchOptics,
     amplitude_constant: f32,
 }
 

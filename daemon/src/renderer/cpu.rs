@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use holod_calibration::{Colour, PerColour, PupilDiameter, Resolution};
+use holod_calibration::{Colour, DisplayGeometry, PerColour, PupilDiameter, Resolution};
 use holod_model::engine::{EngineError, StageTiming};
 use holod_model::gpu::GpuError;
 use holod_model::optics::{DoublePhase, PhasePattern};
@@ -43,11 +43,12 @@ impl CpuRenderer {
     /// `no_gpu` is why the processor has to do it, where it is not what was asked for.
     pub(super) fn new(
         weights: &Weights,
+        bench: &DisplayGeometry,
         encoder: &Arc<PanelEncoder>,
         no_gpu: Option<&GpuError>,
     ) -> Result<Self, Failure> {
         let resolution = encoder.pattern_resolution();
-        let engine = CpuEngine::new(weights, resolution).map_err(Failure::because(Exit::Unavailable))?;
+        let engine = CpuEngine::new(weights, bench, resolution).map_err(Failure::because(Exit::Unavailable))?;
         let levels = LevelsFrame::new(encoder.layout());
         let (hologram, pattern) = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
         let pattern_bytes: usize = Colour::ALL.map(|colour| size_of_val(pattern.plane(colour))).iter().sum();
@@ -66,7 +67,7 @@ impl CpuRenderer {
             double_phase: DoublePhase::new(resolution, weights.config().amplitude_constant),
             encoder: Arc::clone(encoder),
             frame: Arc::new(RgbdFrame { resolution: nothing, amplitude: Vec::new(), depth_normalised: Vec::new() }),
-            pupil: PupilDiameter::from_mm(weights.config().pupil_range_mm[0]),
+            pupil: weights.trained_pupils(bench)[0],
             hologram: ComplexHologram::dark(nothing),
             pattern: PhasePattern::flat(nothing),
             levels,
@@ -172,7 +173,7 @@ mod tests {
     /// The levels of one stage after the other.
     fn stage_by_stage(weights: &Weights, frame: &RgbdFrame, pupil: PupilDiameter) -> LevelsFrame {
         let (mut hologram, mut pattern) = (ComplexHologram::dark(SIZE), PhasePattern::flat(SIZE));
-        CpuEngine::new(weights, SIZE).unwrap().render(frame, pupil, &mut hologram).unwrap();
+        CpuEngine::new(weights, &DisplayGeometry::DEFAULT, SIZE).unwrap().render(frame, pupil, &mut hologram).unwrap();
         DoublePhase::new(SIZE, weights.config().amplitude_constant).encode(&hologram, &mut pattern);
         let encoder = encoder();
         let mut levels = LevelsFrame::new(encoder.layout());
@@ -183,7 +184,7 @@ mod tests {
     #[test]
     fn levels_are_those_of_the_stages_for_each_pupil_in_whatever_buffer() {
         let weights = Weights::builtin_small();
-        let mut renderer = CpuRenderer::new(&weights, &encoder(), None).unwrap();
+        let mut renderer = CpuRenderer::new(&weights, &DisplayGeometry::DEFAULT, &encoder(), None).unwrap();
         let frame = Arc::new(setup::sample_frame(SIZE));
         let mut buffers = [(); 2].map(|()| LevelsFrame::new(encoder().layout()));
         let mut shown = Vec::new();
@@ -203,7 +204,7 @@ mod tests {
     #[test]
     fn a_frame_of_another_size_is_refused_and_the_next_one_rendered() {
         let weights = Weights::builtin_small();
-        let mut renderer = CpuRenderer::new(&weights, &encoder(), None).unwrap();
+        let mut renderer = CpuRenderer::new(&weights, &DisplayGeometry::DEFAULT, &encoder(), None).unwrap();
         let mut levels = LevelsFrame::new(encoder().layout());
         let pupil = PupilDiameter::from_mm(3.0);
         let wrong = Arc::new(setup::sample_frame(PANEL));

@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use holod_calibration::{PerColour, PupilDiameter};
+use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter};
 use holod_model::engine::{EngineError, GpuEngine, StageTiming};
 use holod_model::gpu::{Adapters, GpuError};
 use holod_model::optics::PhasePattern;
@@ -18,6 +18,7 @@ const REOPENINGS: u32 = 3;
 
 pub(super) struct GpuRenderer {
     weights: Weights,
+    bench: DisplayGeometry,
     encoder: Arc<PanelEncoder>,
     adapters: Adapters,
     engine: Engine,
@@ -63,11 +64,17 @@ impl GpuRenderer {
     ///
     /// # Errors
     /// There is none, or it lacks what the network needs at the pattern's size.
-    pub(super) fn new(weights: &Weights, encoder: &Arc<PanelEncoder>, adapters: Adapters) -> Result<Self, EngineError> {
-        let engine = Box::new(GpuEngine::open(weights, &encoder.tables(), adapters)?);
+    pub(super) fn new(
+        weights: &Weights,
+        bench: &DisplayGeometry,
+        encoder: &Arc<PanelEncoder>,
+        adapters: Adapters,
+    ) -> Result<Self, EngineError> {
+        let engine = Box::new(GpuEngine::open(weights, bench, &encoder.tables(), adapters)?);
         Ok(Self {
             description: described(&engine, adapters),
             weights: weights.clone(),
+            bench: *bench,
             encoder: Arc::clone(encoder),
             adapters,
             engine: Engine::Gpu(engine),
@@ -84,7 +91,7 @@ impl GpuRenderer {
         self.engine = Engine::None(EngineError::Gpu(error.clone()));
         if self.reopenings_left > 0 {
             self.reopenings_left -= 1;
-            match GpuEngine::open(&self.weights, &self.encoder.tables(), self.adapters) {
+            match GpuEngine::open(&self.weights, &self.bench, &self.encoder.tables(), self.adapters) {
                 Ok(engine) => {
                     self.description = described(&engine, self.adapters);
                     tracing::warn!("the GPU was opened again: holograms are computed by {}", self.description);
@@ -94,7 +101,7 @@ impl GpuRenderer {
                 Err(again) => tracing::error!("the GPU cannot be opened again: {again}"),
             }
         }
-        match CpuRenderer::new(&self.weights, &self.encoder, Some(error)) {
+        match CpuRenderer::new(&self.weights, &self.bench, &self.encoder, Some(error)) {
             Ok(cpu) => {
                 self.description = cpu.description().to_owned();
                 tracing::warn!("holograms are computed by {}", self.description);
@@ -211,7 +218,7 @@ mod tests {
     const PANEL: Resolution = Resolution { width: 41, height: 25 };
 
     fn renderer(encoder: &Arc<PanelEncoder>) -> GpuRenderer {
-        GpuRenderer::new(&Weights::builtin_small(), encoder, Adapters::Software)
+        GpuRenderer::new(&Weights::builtin_small(), &DisplayGeometry::DEFAULT, encoder, Adapters::Software)
             .expect("Mesa's software device; install mesa-vulkan-drivers")
     }
 
@@ -228,7 +235,7 @@ mod tests {
         let frame = Arc::new(setup::sample_frame(SIZE));
         let levels = || LevelsFrame::new(encoder.layout());
         let (mut expected, mut flat) = (levels(), levels());
-        let mut cpu = CpuRenderer::new(&Weights::builtin_small(), &encoder, None).unwrap();
+        let mut cpu = CpuRenderer::new(&Weights::builtin_small(), &DisplayGeometry::DEFAULT, &encoder, None).unwrap();
         let on_cpu = cpu.render(&frame, pupil, &mut expected).unwrap();
         encoder.encode_flat(&mut flat);
         assert!(apart(&expected, &flat) > 100, "the comparison is blind");

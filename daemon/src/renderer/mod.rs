@@ -7,7 +7,7 @@ mod gpu;
 use std::sync::Arc;
 
 use holod_calibration::rig::Rig;
-use holod_calibration::{PerColour, PupilDiameter, Resolution};
+use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter, Resolution};
 use holod_model::engine::{EngineError, StageTiming};
 use holod_model::gpu::{Adapters, GpuError};
 use holod_model::optics::PhasePattern;
@@ -23,10 +23,10 @@ pub trait Renderer: Send {
     /// Writes the levels of the hologram of `frame` for an eye with `pupil` to `levels`, which has the panel's layout.
     /// On the processor it does not allocate, once some frames have been rendered; what a GPU's driver does is its own.
     ///
-    /// A pupil outside the range that the weights were trained for is taken as the nearest one inside.
+    /// Of a pupil beyond those that the weights were trained for, the network is told the nearest; blur and stop are its own.
     ///
     /// # Errors
-    /// [`EngineError`] for a frame of another size than the renderer was made for, a pupil that is no positive length, and
+    /// [`EngineError`] for a frame of another size than the renderer was made for, a pupil that is none, and
     /// a device that failed where no other engine could take its place.
     ///
     /// # Panics
@@ -71,24 +71,29 @@ pub struct Rendered {
     pub engine_changed: bool,
 }
 
-/// A renderer of frames of the pattern's size of `encoder`.
+/// A renderer of frames of the pattern's size of `encoder`, on the optics of `bench`.
 ///
 /// `Auto` takes a GPU where there is one that will do, else the processor; `Gpu` a GPU, or where there is none a processor
 /// that plays one.
 ///
 /// # Errors
 /// The backend is not to be had.
-pub fn open(backend: Backend, weights: &Weights, encoder: &Arc<PanelEncoder>) -> Result<Box<dyn Renderer>, Failure> {
+pub fn open(
+    backend: Backend,
+    weights: &Weights,
+    bench: &DisplayGeometry,
+    encoder: &Arc<PanelEncoder>,
+) -> Result<Box<dyn Renderer>, Failure> {
     match backend {
-        Backend::Cpu => Ok(Box::new(CpuRenderer::new(weights, encoder, None)?)),
-        Backend::Auto => match on_gpu(weights, encoder, Adapters::Hardware) {
+        Backend::Cpu => Ok(Box::new(CpuRenderer::new(weights, bench, encoder, None)?)),
+        Backend::Auto => match on_gpu(weights, bench, encoder, Adapters::Hardware) {
             Ok(renderer) => Ok(renderer),
-            Err(EngineError::Gpu(error)) => Ok(Box::new(CpuRenderer::new(weights, encoder, Some(&error))?)),
+            Err(EngineError::Gpu(error)) => Ok(Box::new(CpuRenderer::new(weights, bench, encoder, Some(&error))?)),
             Err(other) => Err(Failure::because(Exit::Unavailable)(other)),
         },
-        Backend::Gpu => on_gpu(weights, encoder, Adapters::Hardware)
+        Backend::Gpu => on_gpu(weights, bench, encoder, Adapters::Hardware)
             .or_else(|error| match error {
-                EngineError::Gpu(GpuError::None { .. }) => on_gpu(weights, encoder, Adapters::Software),
+                EngineError::Gpu(GpuError::None { .. }) => on_gpu(weights, bench, encoder, Adapters::Software),
                 other => Err(other),
             })
             .map_err(|error| Failure::new(Exit::Unavailable, format!("--backend gpu: {error}"))),
@@ -98,14 +103,20 @@ pub fn open(backend: Backend, weights: &Weights, encoder: &Arc<PanelEncoder>) ->
 #[cfg(feature = "gpu")]
 fn on_gpu(
     weights: &Weights,
+    bench: &DisplayGeometry,
     encoder: &Arc<PanelEncoder>,
     adapters: Adapters,
 ) -> Result<Box<dyn Renderer>, EngineError> {
-    Ok(Box::new(gpu::GpuRenderer::new(weights, encoder, adapters)?))
+    Ok(Box::new(gpu::GpuRenderer::new(weights, bench, encoder, adapters)?))
 }
 
 #[cfg(not(feature = "gpu"))]
-fn on_gpu(_: &Weights, _: &Arc<PanelEncoder>, _: Adapters) -> Result<Box<dyn Renderer>, EngineError> {
+fn on_gpu(
+    _: &Weights,
+    _: &DisplayGeometry,
+    _: &Arc<PanelEncoder>,
+    _: Adapters,
+) -> Result<Box<dyn Renderer>, EngineError> {
     Err(GpuError::NotBuilt.into())
 }
 

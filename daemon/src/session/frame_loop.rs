@@ -52,19 +52,20 @@ pub(super) struct FrameLoop {
     pub stop: Arc<AtomicBool>,
 }
 
-/// The pupils that a network was trained for.
+/// The pupils that a network was trained for, on one bench.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct TrainedPupils {
-    /// The narrowest.
-    pub narrowest: PupilDiameter,
-    /// The widest.
-    pub widest: PupilDiameter,
+    narrowest: PupilDiameter,
+    widest: PupilDiameter,
 }
 
 impl TrainedPupils {
-    /// The nearest pupil that the network knows.
-    fn clamp(self, pupil: PupilDiameter) -> PupilDiameter {
-        PupilDiameter::from_mm(pupil.mm().clamp(self.narrowest.mm(), self.widest.mm()))
+    pub(super) fn of([narrowest, widest]: [PupilDiameter; 2]) -> Self {
+        Self { narrowest, widest }
+    }
+
+    fn contain(self, pupil: PupilDiameter) -> bool {
+        (self.narrowest..=self.widest).contains(&pupil)
     }
 }
 
@@ -73,6 +74,8 @@ impl TrainedPupils {
 pub(super) struct LoopRecord {
     /// Times and pupil.
     pub frame: FrameRecord,
+    /// Whether the pupil is one that the network was not trained for.
+    pub beyond_trained: bool,
     /// Share of amplitudes above the double phase's constant.
     pub clipped_share: f32,
     /// Share of phases that the panel cannot reach.
@@ -103,17 +106,16 @@ impl FrameLoop {
         let state = self.pupil.pupil_at(t_wake).state;
         let estimate = self.pupil.pupil_at(plan.t_predicted_photon.min(t_wake + FARTHEST_PREDICTION));
         let scene = self.frames.index_at((plan.t_predicted_photon - self.t_origin).seconds());
-        let hologram_pupil = self.trained.clamp(estimate.pupil);
 
         let t_render_begin = self.mark(Point::RenderBegin, plan);
-        let rendered = self.renderer.render(&self.frames.frames[scene], hologram_pupil, self.port.acquire())?;
+        let rendered = self.renderer.render(&self.frames.frames[scene], estimate.pupil, self.port.acquire())?;
         if rendered.engine_changed {
             // It happens when a device is lost, which took longer than any lock.
             self.renderer.description().clone_into(&mut self.engine.lock().unwrap_or_else(PoisonError::into_inner));
         }
         let t_render_end = self.mark(Point::RenderEnd, plan);
 
-        let keep = if self.keep_levels && state != PupilState::Fallback { keep_slot(hologram_pupil) } else { None };
+        let keep = if self.keep_levels && state != PupilState::Fallback { keep_slot(estimate.pupil) } else { None };
         let t_submit = host_now();
         let record = LoopRecord {
             frame: FrameRecord {
@@ -121,7 +123,6 @@ impl FrameLoop {
                 t_sample: estimate.t_sample,
                 pupil_raw_mm: estimate.raw_mm,
                 pupil: estimate.pupil,
-                hologram_pupil,
                 pupil_state: state.name(),
                 t_wake,
                 t_render_begin,
@@ -129,6 +130,7 @@ impl FrameLoop {
                 t_submit,
                 t_desired_present: plan.t_desired_present,
             },
+            beyond_trained: !self.trained.contain(estimate.pupil),
             clipped_share: rendered.clipped_share,
             unreachable_share: rendered.unreachable_share.0.into_iter().fold(0.0, f32::max),
         };

@@ -159,7 +159,7 @@ pub struct Summary {
     pub frames_by_pupil_state: BTreeMap<&'static str, u64>,
     /// The narrowest and the widest pupil that a frame was made for.
     pub pupil_range_mm: Option<[f32; 2]>,
-    /// Frames whose pupil lay outside those that the network was trained for, and was moved to the nearest one.
+    /// Frames whose pupil lay outside those that the network was trained for on this bench: it was told the nearest.
     pub frames_beyond_trained_pupils: u64,
     /// Why the tracker's link did not come back, or why nothing that it sent was believed, at the end.
     pub tracker_trouble: Option<String>,
@@ -235,7 +235,8 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         renderer::panel_encoder(rig, resolution)
     })?;
     let (renderer, frame_time) = progress::during(&format!("preparing the network for {resolution}"), || {
-        let mut renderer = scheduling::patient(|| renderer::open(plan.backend, &plan.weights, &encoder))?;
+        let mut renderer =
+            scheduling::patient(|| renderer::open(plan.backend, &plan.weights, &rig.geometry, &encoder))?;
         let frame_time = first_frame_time(&mut *renderer, &plan, LevelsFrame::new(encoder.layout()))?;
         Ok::<_, Failure>((renderer, frame_time))
     })?;
@@ -285,10 +286,7 @@ pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionRepo
         port: output.frames,
         pacer: Pacer::new(pacing, host_now()),
         frames: Arc::clone(&frames),
-        trained: TrainedPupils {
-            narrowest: PupilDiameter::from_mm(plan.weights.config().pupil_range_mm[0]),
-            widest: PupilDiameter::from_mm(plan.weights.config().pupil_range_mm[1]),
-        },
+        trained: TrainedPupils::of(plan.weights.trained_pupils(&rig.geometry)),
         t_origin,
         records: record_producer,
         records_lost: Arc::new(AtomicU64::new(0)),
@@ -442,7 +440,7 @@ fn first_frame_time(
     plan: &SessionPlan,
     mut levels: LevelsFrame,
 ) -> Result<TimeNs, Failure> {
-    let pupil = PupilDiameter::from_mm(plan.weights.config().pupil_range_mm[0]);
+    let [pupil, _] = plan.weights.trained_pupils(&plan.rig.geometry);
     let mut time = || {
         let began = host_now();
         renderer.render(&plan.frames.frames[0], pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))?;
@@ -709,7 +707,7 @@ impl Tally {
         *self.by_state.entry(frame.pupil_state).or_default() += 1;
         self.frame_time.push((frame.t_submit - frame.t_wake).seconds() as f32 * 1e3);
         let pupil_mm = frame.pupil.mm();
-        self.beyond_trained += u64::from(frame.pupil != frame.hologram_pupil);
+        self.beyond_trained += u64::from(record.beyond_trained);
         let [narrowest, widest] = self.pupil_range_mm.unwrap_or([pupil_mm; 2]);
         self.pupil_range_mm = Some([narrowest.min(pupil_mm), widest.max(pupil_mm)]);
         self.clipped_share_max = self.clipped_share_max.max(record.clipped_share);
@@ -731,8 +729,8 @@ impl Tally {
         self.frames_shown += 1;
         self.deadline_misses += u64::from(event.deadline_missed);
         let Some(frame) = self.recent.iter().find(|frame| frame.frame == event.frame_id) else { return };
-        if let Some(slot) = keep_slot(frame.hologram_pupil) {
-            self.kept[slot] = Some((frame.frame, frame.hologram_pupil));
+        if let Some(slot) = keep_slot(frame.pupil) {
+            self.kept[slot] = Some((frame.frame, frame.pupil));
         }
         if let (Some(t_sample), Some(on), Some(off)) = (frame.t_sample, event.laser_on, event.laser_off) {
             let middle = TimeNs(on.0 / 2 + off.0 / 2);

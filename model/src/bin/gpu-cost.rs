@@ -58,6 +58,7 @@ enum CardName {
 enum Network {
     Standard,
     Small,
+    Fast,
 }
 
 impl Network {
@@ -65,6 +66,7 @@ impl Network {
         match self {
             Self::Standard => "standard",
             Self::Small => "small",
+            Self::Fast => "fast",
         }
     }
 
@@ -72,6 +74,7 @@ impl Network {
         match self {
             Self::Standard => Weights::builtin(),
             Self::Small => Weights::builtin_small(),
+            Self::Fast => Weights::builtin_fast(),
         }
     }
 }
@@ -148,7 +151,7 @@ fn main() -> ExitCode {
 fn run(cli: &Cli, say: impl Fn(&str)) -> Result<(), Failure> {
     let program = std::env::current_exe()
         .map_err(|error| Failure { code: exit::UNAVAILABLE, message: format!("this program's own file: {error}") })?;
-    let networks = [Network::Standard, Network::Small].into_iter();
+    let networks = [Network::Standard, Network::Small, Network::Fast].into_iter();
     let networks: Vec<_> = networks.filter(|network| cli.network.is_none_or(|wanted| wanted == *network)).collect();
     let names = [CardName::Rx7900Xtx, CardName::Rx6800Xt];
     let cards: Vec<Card> = names

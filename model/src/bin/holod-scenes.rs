@@ -7,10 +7,11 @@ use std::process::ExitCode;
 use std::time::Instant;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use holod_calibration::Resolution;
+use holod_calibration::rig::{Rig, RigError};
+use holod_calibration::{DisplayGeometry, Resolution};
 use holod_model::gpu::GpuError;
-use holod_model::scene_renderer::shard::{Outcome, PlanePlan, Preview, PupilPlan, ShardError, ShardPlan};
-use holod_model::scene_renderer::{Scene, SceneKind, Tracer};
+use holod_model::scene_renderer::shard::{Outcome, PlanePlan, PlannedScene, Preview, PupilPlan, ShardError, ShardPlan};
+use holod_model::scene_renderer::{SceneKind, Tracer};
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// Random scenes and their thin-lens focal stacks.
@@ -83,7 +84,11 @@ struct Look {
     /// Pixels: one number for a square, or WIDTHxHEIGHT.
     #[arg(long, default_value = "256", value_parser = even_size)]
     size: Resolution,
-    /// Pupils in mm, or strata:N for one random pupil in each N-th of 1 to 5 mm.
+    /// The bench on which the scenes are seen: a rig file. The default bench where left out.
+    #[arg(long, alias = "config")]
+    rig: Option<PathBuf>,
+    /// Pupils in mm; strata:N for one random pupil in each N-th of 1 to 5 mm; or log-strata:N for one in each N-th, by
+    /// logarithm, of those that blur by 5 to 114 px over the depth volume, as networks for many benches want them.
     #[arg(long, default_value = "strata:4")]
     pupils: PupilPlan,
     /// Focus planes, uniform in dioptres, both ends included; `auto`: as many as keep the widest pupil's blur from
@@ -97,8 +102,15 @@ struct Look {
 }
 
 impl Look {
-    fn plan(&self, seed: u64) -> ShardPlan {
-        ShardPlan {
+    fn plan(&self, seed: u64) -> Result<ShardPlan, Failure> {
+        let bench = match &self.rig {
+            Some(path) => Rig::load(path)?.geometry,
+            None => DisplayGeometry::DEFAULT,
+        };
+        self.pupils
+            .check(&bench)
+            .map_err(|fault| Failure { code: exit::USAGE, message: format!("--pupils: {fault}") })?;
+        Ok(ShardPlan {
             kind: match self.kind {
                 Kind::Train => SceneKind::Train,
                 Kind::Test => SceneKind::Test,
@@ -109,11 +121,12 @@ impl Look {
             resolution: self.size,
             planes: match self.planes {
                 Planes::Given(planes) => planes,
-                Planes::Auto => PlanePlan::Uniform(self.pupils.planes()),
+                Planes::Auto => PlanePlan::Uniform(self.pupils.planes(&bench)),
             },
+            bench,
             pupils: self.pupils.clone(),
             rays: self.rays as usize,
-        }
+        })
     }
 }
 
@@ -189,6 +202,7 @@ mod exit {
     pub(super) const UNAVAILABLE: u8 = 69;
     pub(super) const CANNOT_CREATE: u8 = 73;
     pub(super) const IO: u8 = 74;
+    pub(super) const CONFIG: u8 = 78;
 }
 
 struct Failure {
@@ -206,6 +220,12 @@ impl From<ShardError> for Failure {
             ShardError::Gpu(_) => exit::UNAVAILABLE,
         };
         Self { code, message: error.to_string() }
+    }
+}
+
+impl From<RigError> for Failure {
+    fn from(error: RigError) -> Self {
+        Self { code: exit::CONFIG, message: error.to_string() }
     }
 }
 
@@ -252,7 +272,7 @@ fn generate(options: &Generate) -> Result<String, Failure> {
         let message = format!("--size: found {size}, expected {LEAST_MARKS} or more with --kind marks");
         return Err(Failure { code: exit::USAGE, message });
     }
-    let plan = options.look.plan(options.seed);
+    let plan = options.look.plan(options.seed)?;
     let style = ProgressStyle::with_template("{bar:40} {pos}/{len} scenes by {msg}, {eta} left")
         .expect("the template is constant");
     let tracer = options.backend.open()?;
@@ -271,7 +291,7 @@ fn generate(options: &Generate) -> Result<String, Failure> {
 
 fn bench(options: &Bench) -> Result<String, Failure> {
     let Measure { scenes, look } = &options.measure;
-    let plan = look.plan(1);
+    let plan = look.plan(1)?;
     let mut tracers = vec![Tracer::cpu()];
     if !matches!(options.backend, Backend::Cpu) {
         tracers.push(options.backend.open()?);
@@ -280,12 +300,11 @@ fn bench(options: &Bench) -> Result<String, Failure> {
     let (mut tracing_s, mut rates) = (vec![Vec::new(); tracers.len()], vec![Vec::new(); tracers.len()]);
     for index in 0..*scenes {
         let begin = Instant::now();
-        let scene = Scene::random(plan.kind, plan.seed, index, plan.resolution);
+        let PlannedScene { scene, pupils, focus } = plan.scene(index);
         composing_s.push(begin.elapsed().as_secs_f64());
-        let pupils = plan.pupils.pupils(plan.kind, plan.seed, index);
         for (tracer, (tracing_s, rates)) in tracers.iter().zip(tracing_s.iter_mut().zip(&mut rates)) {
             let begin = Instant::now();
-            let (_, rays) = scene.traced_focal_stacks(tracer, &pupils, &plan.focus(index), plan.rays)?;
+            let (_, rays) = scene.traced_focal_stacks(tracer, &pupils, &focus, plan.rays)?;
             let seconds = begin.elapsed().as_secs_f64();
             tracing_s.push(seconds);
             rates.push(rays as f64 * 1e-6 / seconds);
@@ -323,17 +342,16 @@ fn median(values: &mut [f64]) -> f64 {
 
 /// Noise is averaged as power over the scenes.
 fn noise(options: &Measure) -> Result<String, Failure> {
-    let plan = options.look.plan(1);
+    let plan = options.look.plan(1)?;
     let power = |db: f64| 10f64.powf(0.1 * db);
     let mut sums: Vec<(f32, [(f64, u32); 3])> = Vec::new();
     let begin = Instant::now();
     for index in 0..options.scenes {
-        let mut scene = Scene::random(plan.kind, plan.seed, index, plan.resolution);
-        let pupils = plan.pupils.pupils(plan.kind, plan.seed, index);
-        let measured = scene.noise(&pupils, &plan.focus(index), plan.rays);
+        let PlannedScene { mut scene, pupils, focus } = plan.scene(index);
+        let measured = scene.noise(&pupils, &focus, plan.rays);
         sums.resize(measured.len(), (0.0, [(0.0, 0); 3]));
-        for ((pupil_mm, sums), noise) in sums.iter_mut().zip(measured) {
-            *pupil_mm += noise.pupil.mm() / options.scenes as f32;
+        for ((pupil, (pupil_mm, sums)), noise) in plan.pupils(index).iter().zip(&mut sums).zip(measured) {
+            *pupil_mm += pupil.mm() / options.scenes as f32;
             for (sum, db) in sums.iter_mut().zip([noise.all_db, noise.in_focus_db, noise.out_of_focus_db]) {
                 if !db.is_nan() {
                     *sum = (sum.0 + power(db), sum.1 + 1);

@@ -3,11 +3,12 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use holod_calibration::{Colour, Dioptres, Metres, PupilDiameter, Resolution};
+use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PupilDiameter, Resolution};
 use num_complex::{Complex32, Complex64};
 use safetensors::SafeTensors;
 
 use super::{CpuEngine, reference};
+use crate::files::BenchOptics;
 use crate::optics::{DoublePhase, Eye, Propagator, SimulatedEye};
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
 
@@ -66,6 +67,11 @@ impl Golden {
         Weights::load(&path).unwrap()
     }
 
+    /// The bench that the vectors are for.
+    fn bench(&self, resolution: Resolution) -> DisplayGeometry {
+        serde_json::from_str::<BenchOptics>(&self.metadata("optics")).unwrap().geometry(resolution)
+    }
+
     fn frame(&self) -> RgbdFrame {
         let tensors = SafeTensors::deserialize(&self.bytes).unwrap();
         let shape = tensors.tensor("depth").unwrap().shape().to_vec();
@@ -107,9 +113,10 @@ fn real(values: &[f64]) -> Vec<Complex64> {
 fn check(name: &str) {
     let golden = Golden::open(name);
     let (weights, frame) = (golden.weights(), golden.frame());
-    let pupil_mm = golden.values("pupil_mm").unwrap()[0];
+    let bench = golden.bench(frame.resolution);
+    let pupil = PupilDiameter::from_mm(golden.values("pupil_mm").unwrap()[0] as f32);
 
-    let trace = reference::run(&weights, &frame, pupil_mm);
+    let trace = reference::run(&weights, &bench, &frame, pupil);
     let mut unused = golden.stages();
     let mut stage = |what: &str, actual: &[Complex64], expected: Option<Vec<Complex64>>| {
         if let Some(expected) = expected {
@@ -135,13 +142,13 @@ fn check(name: &str) {
     let field = golden.complex("field").unwrap();
     assert_matches(&format!("{name} field"), &trace.field, &field, REFERENCE_TOLERANCE);
 
-    let mut engine = CpuEngine::new(&weights, frame.resolution).unwrap();
+    let mut engine = CpuEngine::new(&weights, &bench, frame.resolution).unwrap();
     let mut hologram = ComplexHologram::dark(frame.resolution);
-    engine.render(&frame, PupilDiameter::from_mm(pupil_mm as f32), &mut hologram).unwrap();
+    engine.render(&frame, pupil, &mut hologram).unwrap();
     assert_matches(&format!("{name} engine"), &widen(&hologram.field), &field, ENGINE_TOLERANCE);
     #[cfg(feature = "gpu")]
     {
-        let on_gpu = super::gpu::tests::hologram_of(&weights, &frame, pupil_mm as f32);
+        let on_gpu = super::gpu::tests::hologram_of(&weights, &bench, &frame, pupil);
         assert_matches(&format!("{name} engine on the GPU"), &widen(&on_gpu.field), &field, ENGINE_TOLERANCE);
     }
 
@@ -151,11 +158,10 @@ fn check(name: &str) {
     };
     check_phase(name, &golden, &golden_hologram, weights.config().amplitude_constant);
 
-    let geometry = weights.config().optics.geometry(frame.resolution);
     let distance_m: f64 = golden.metadata("asm_distance_m").parse().unwrap();
     for (what, mut propagator) in [
-        ("asm_padded", Propagator::new(&geometry, frame.resolution)),
-        ("asm_circular", Propagator::repeating(&geometry, frame.resolution)),
+        ("asm_padded", Propagator::new(&bench, frame.resolution)),
+        ("asm_circular", Propagator::repeating(&bench, frame.resolution)),
     ] {
         let mut propagated = golden_hologram.clone();
         for colour in Colour::ALL {
@@ -166,13 +172,11 @@ fn check(name: &str) {
     }
 
     let focus_dpt: Vec<f64> = serde_json::from_str(&golden.metadata("focus_dpt")).unwrap();
-    let eyes = focus_dpt
-        .into_iter()
-        .map(|focus_dpt| Eye { pupil: PupilDiameter::from_mm(pupil_mm as f32), focus: Dioptres(focus_dpt) });
+    let eyes = focus_dpt.into_iter().map(|focus_dpt| Eye { pupil, focus: Dioptres(focus_dpt) });
     let phases = golden.values("phase").unwrap().into_iter().map(|phase| phase as f32).collect();
     let pattern = PhasePattern { resolution: frame.resolution, phase_rad: phases };
     let constant = weights.config().amplitude_constant;
-    let mut simulated = SimulatedEye::repeating(&geometry, frame.resolution);
+    let mut simulated = SimulatedEye::repeating(&bench, frame.resolution);
     for (planes_before, eye) in eyes.enumerate() {
         let (field, panel) = (simulated.view_field(&golden_hologram, eye), simulated.view(&pattern, constant, eye));
         for (what, seen) in [("eye_field", field), ("eye_panel", panel)] {
@@ -230,4 +234,9 @@ fn the_built_in_network_matches_its_golden_vectors() {
 #[test]
 fn the_small_built_in_network_matches_its_golden_vectors() {
     check("expected-stack-shipped-small.safetensors");
+}
+
+#[test]
+fn the_fast_built_in_network_matches_its_golden_vectors() {
+    check("expected-stack-shipped-fast.safetensors");
 }

@@ -1,6 +1,7 @@
 //! Engines run the network on frames.
 
 mod cpu;
+mod disc;
 #[cfg(test)]
 mod golden;
 #[cfg(feature = "gpu")]
@@ -11,7 +12,7 @@ mod reference;
 
 use std::time::Duration;
 
-use holod_calibration::Resolution;
+use holod_calibration::{PupilDiameter, Resolution};
 
 use crate::gpu::GpuError;
 
@@ -20,6 +21,10 @@ pub use cpu::{CpuEngine, fma_peak, stream_bandwidth};
 pub use gpu::cost as gpu_cost;
 #[cfg(feature = "gpu")]
 pub use gpu::{EncodedCounts, GpuEngine};
+
+/// The widest pupil that engines take. No eye's is half as wide; but scenes of wider ones on one bench stand for those of
+/// eyes on another, whose pixels are finer.
+pub const WIDEST_PUPIL: PupilDiameter = PupilDiameter::from_mm(20.0);
 
 /// A frame that an engine refuses.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -40,8 +45,8 @@ pub enum EngineError {
         /// The size asked for.
         resolution: Resolution,
     },
-    /// The pupil is not a positive length.
-    #[error("pupil diameter {pupil_mm} mm; expected a positive number")]
+    /// The pupil is not a positive length, or wider than [`WIDEST_PUPIL`].
+    #[error("pupil diameter {pupil_mm} mm; expected a positive number up to {widest_mm}", widest_mm = WIDEST_PUPIL.mm())]
     Pupil {
         /// What was given.
         pupil_mm: f32,
@@ -49,6 +54,12 @@ pub enum EngineError {
     /// The device cannot do it, or failed at it.
     #[error(transparent)]
     Gpu(#[from] GpuError),
+}
+
+/// Refuses what is no pupil.
+fn check_pupil(pupil: PupilDiameter) -> Result<(), EngineError> {
+    let pupil_mm = pupil.mm();
+    if pupil_mm > 0.0 && pupil_mm <= WIDEST_PUPIL.mm() { Ok(()) } else { Err(EngineError::Pupil { pupil_mm }) }
 }
 
 /// Where the time of one frame went.

@@ -1,14 +1,15 @@
-//! How the pupil changes the offset prediction of an adjustable layer.
+//! How bench and pupil change the offset prediction of an adjustable layer.
 
+use crate::conditions::Conditions;
 use crate::weights::{Adjustable, Dense, OFFSET_CHANNELS};
 
-/// The offset prediction's parameters W0 ⊙ (1 + γ(s)) and b0 + β(s), for one pupil s at a time. Nothing is allocated
-/// after `new`.
+/// The offset prediction's parameters W0 ⊙ (1 + γ(c)) and b0 + β(c), for the conditions c of one bench and pupil at a
+/// time. Nothing is allocated after `new`.
 pub(super) struct Modulation {
     parameters: Adjustable,
     leaky_slope: f32,
-    /// The pupil that `weight` and `bias` are for.
-    pupil_mm: f32,
+    /// What `weight` and `bias` are for, once there is something in them.
+    conditions: Option<Conditions>,
     hidden: [Vec<f32>; 2],
     /// γ [18, in], then β [18].
     gamma_beta: Vec<f32>,
@@ -16,7 +17,7 @@ pub(super) struct Modulation {
     bias: Vec<f32>,
 }
 
-/// The 3x3 convolution that predicts offsets, for one pupil.
+/// The 3x3 convolution that predicts offsets, for one bench and pupil.
 pub(super) struct OffsetParameters<'a> {
     /// [18, in, 3, 3]
     pub(super) weight: &'a [f32],
@@ -29,7 +30,7 @@ impl Modulation {
         let [first, second, last] = &parameters.modulation;
         Self {
             leaky_slope,
-            pupil_mm: f32::NAN,
+            conditions: None,
             hidden: [first, second].map(|layer| vec![0.0; layer.bias.len()]),
             gamma_beta: vec![0.0; last.bias.len()],
             weight: vec![0.0; parameters.offset_weight.len()],
@@ -38,15 +39,15 @@ impl Modulation {
         }
     }
 
-    /// The parameters for a pupil; `None` if they are those that were given last.
-    pub(super) fn change_to(&mut self, pupil_mm: f32) -> Option<OffsetParameters<'_>> {
-        if self.pupil_mm == pupil_mm {
+    /// The parameters for a bench and a pupil; `None` if they are those that were given last.
+    pub(super) fn change_to(&mut self, conditions: Conditions) -> Option<OffsetParameters<'_>> {
+        if self.conditions == Some(conditions) {
             return None;
         }
         let Self { parameters, leaky_slope, hidden: [first, second], gamma_beta, weight, bias, .. } = self;
         let [to_first, to_second, to_gamma_beta] = &parameters.modulation;
         let leaky = |values: &mut [f32]| values.iter_mut().for_each(|value| *value = value.max(*value * *leaky_slope));
-        to_first.run(&[(pupil_mm - 3.0) / 2.0], first);
+        to_first.run(&conditions.told().map(|value| value as f32), first);
         leaky(first);
         to_second.run(first, second);
         leaky(second);
@@ -60,7 +61,7 @@ impl Modulation {
         for ((bias, unmodulated), beta) in bias.iter_mut().zip(&parameters.offset_bias).zip(beta) {
             *bias = unmodulated + beta;
         }
-        self.pupil_mm = pupil_mm;
+        self.conditions = Some(conditions);
         Some(OffsetParameters { weight: &self.weight, bias: &self.bias })
     }
 }
@@ -79,16 +80,17 @@ mod tests {
 
     const SLOPE: f32 = 0.1;
 
-    /// For two input channels, with one hidden value each time: s' = (s − 3)/2, h = leaky(2·leaky(s')), γ and β by the
+    /// For two input channels, with one hidden value each time: h = leaky(2·leaky(blur + 4·fresnel)), γ and β by the
     /// number of their place.
     fn parameters() -> Adjustable {
-        let dense = |inputs, weight: Vec<f32>, bias: f32| Dense { inputs, bias: vec![bias; weight.len()], weight };
+        let dense =
+            |inputs, weight: Vec<f32>, bias: f32| Dense { inputs, bias: vec![bias; weight.len() / inputs], weight };
         let places = OFFSET_CHANNELS * 2;
         Adjustable {
             offset_weight: (0..places * 9).map(|index| index as f32).collect(),
             offset_bias: (0..OFFSET_CHANNELS).map(|output| -(output as f32)).collect(),
             modulation: [
-                dense(1, vec![1.0], 0.0),
+                dense(2, vec![1.0, 4.0], 0.0),
                 dense(1, vec![2.0], 0.0),
                 dense(1, (0..places + OFFSET_CHANNELS).map(|index| index as f32).collect(), 0.25),
             ],
@@ -107,13 +109,14 @@ mod tests {
     }
 
     #[test]
-    fn parameters_are_given_once_for_each_pupil() {
+    fn parameters_are_given_once_for_each_bench_and_pupil() {
         let mut modulation = Modulation::new(&parameters(), SLOPE);
-        for (pupil_mm, hidden) in [(5.0, 2.0), (4.0, 1.0), (1.0, -0.02), (5.0, 2.0)] {
-            let found = modulation.change_to(pupil_mm).unwrap();
-            assert!(largest_difference(&found, hidden) < 1e-3, "{pupil_mm} mm");
-            assert!(largest_difference(&found, hidden + 0.01) > 1e-3, "{pupil_mm} mm: the comparison is blind");
-            assert!(modulation.change_to(pupil_mm).is_none(), "{pupil_mm} mm");
+        for (blur, fresnel, hidden) in [(1.0, 0.0, 2.0), (0.5, 0.0, 1.0), (-1.0, 0.0, -0.02), (1.0, 0.25, 4.0)] {
+            let conditions = Conditions { blur, fresnel };
+            let found = modulation.change_to(conditions).unwrap();
+            assert!(largest_difference(&found, hidden) < 1e-3, "{conditions:?}");
+            assert!(largest_difference(&found, hidden + 0.01) > 1e-3, "{conditions:?}: the comparison is blind");
+            assert!(modulation.change_to(conditions).is_none(), "{conditions:?}");
         }
     }
 }

@@ -4,10 +4,11 @@
 
 use std::f64::consts::{PI, TAU};
 
-use holod_calibration::Resolution;
+use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
 use num_complex::Complex64;
 
 use crate::RgbdFrame;
+use crate::conditions::Conditions;
 use crate::weights::{Adjustable, Dense, Family, Grid, Layer, NetworkConfig, Weights};
 
 #[derive(Clone, Debug)]
@@ -82,30 +83,32 @@ pub(crate) enum Value {
     Light(Vec<Complex64>),
 }
 
-pub(crate) fn run(weights: &Weights, frame: &RgbdFrame, pupil_mm: f64) -> Trace {
+pub(crate) fn run(weights: &Weights, bench: &DisplayGeometry, frame: &RgbdFrame, pupil: PupilDiameter) -> Trace {
+    let conditions = Conditions::of(&weights.config.trained, bench, pupil);
+    let pupil_mm = f64::from(pupil.mm());
     let mut stages = Vec::new();
     let low = match &weights.family {
         Family::Direct { layers } => {
-            let encoded = encode(weights.config.grid, frame, pupil_mm);
-            let residual = trunk(&mut stages, "", layers, weights, encoded, pupil_mm);
+            let encoded = encode(weights.config.grid, frame, conditions);
+            let residual = trunk(&mut stages, "", layers, weights, encoded, conditions);
             let base = block_means(weights.config.grid, frame);
             add(&base.values.iter().map(|&value| value.into()).collect::<Vec<_>>(), &residual, 1.0)
         }
         Family::ExpectedStack { lighting, correction, feedback } => {
-            let maps = encode_for_light(frame, pupil_mm);
-            let wanted = expected_stack(weights, frame, [maps.height, maps.width], pupil_mm).map(f64::sqrt);
+            let maps = encode_for_light(frame, conditions);
+            let wanted = expected_stack(weights, bench, frame, [maps.height, maps.width], pupil_mm).map(f64::sqrt);
             let maps = concatenate(&[&maps, &wanted.clone().map(|amplitude| amplitude - 0.4)]);
-            let out = trunk(&mut stages, "lighting.", lighting, weights, maps.clone(), pupil_mm);
+            let out = trunk(&mut stages, "lighting.", lighting, weights, maps.clone(), conditions);
             let wanted = if weights.config.refined_stack { refined(weights, &out, wanted) } else { wanted };
-            let carried = light_layers(weights, &out, &wanted);
+            let carried = light_layers(weights, bench, &out, &wanted);
             stages.push(Stage { name: "carried".into(), value: Value::Light(carried.clone()) });
             let sharpness = f64::from(feedback.sharpness);
-            let (change, lack) = feed_back(weights, frame, &carried, &wanted, sharpness, pupil_mm);
+            let (change, lack) = feed_back(weights, bench, frame, &carried, &wanted, sharpness, pupil_mm);
             let field: Vec<_> = carried.iter().zip(&change).map(|(f, c)| f + c * f64::from(feedback.share)).collect();
             let [real, imaginary] = parts(&field, &maps);
             let [change_real, change_imaginary] = parts(&change, &maps);
             let encoded = concatenate(&[&real, &imaginary, &maps, &change_real, &change_imaginary, &lack]);
-            let residual = trunk(&mut stages, "correction.", correction, weights, encoded, pupil_mm);
+            let residual = trunk(&mut stages, "correction.", correction, weights, encoded, conditions);
             add(&field, &residual, 0.3)
         }
     };
@@ -121,14 +124,14 @@ fn trunk(
     layers: &[Layer],
     weights: &Weights,
     encoded: Map,
-    pupil_mm: f64,
+    conditions: Conditions,
 ) -> Map {
     let slope = f64::from(weights.config.leaky_slope);
     let mut maps = Vec::<Map>::new();
     stages.push(Stage { name: format!("{prefix}encoded"), value: Value::Encoded(encoded.clone()) });
     for (index, layer) in layers.iter().enumerate() {
         let input = maps.last().unwrap_or(&encoded);
-        let offsets = layer.adjustable.as_ref().map(|adjustable| predict_offsets(adjustable, input, pupil_mm, slope));
+        let offsets = layer.adjustable.as_ref().map(|adjustable| predict_offsets(adjustable, input, conditions, slope));
         let sum = convolve(layer, input, offsets.as_ref());
         let output = if index + 1 == layers.len() {
             sum
@@ -184,18 +187,18 @@ fn scale_of(grid: Grid) -> usize {
     }
 }
 
-fn encode(grid: Grid, frame: &RgbdFrame, pupil_mm: f64) -> Map {
+fn encode(grid: Grid, frame: &RgbdFrame, conditions: Conditions) -> Map {
     let scale = scale_of(grid);
     let Resolution { width, height } = frame.resolution;
     let block = scale * scale;
-    Map::from_fn([5 * block + 1, height.div_ceil(scale), width.div_ceil(scale)], |channel, y, x| {
+    Map::from_fn([5 * block + 2, height.div_ceil(scale), width.div_ceil(scale)], |channel, y, x| {
         let (plane, dy, dx) = (channel / block, channel % block / scale, channel % scale);
         let at = |values: &[f32]| sample(values, frame.resolution, scale * y + dy, scale * x + dx);
         match plane {
             0..3 => at(&frame.amplitude[plane * width * height..]),
             3 => at(&frame.depth_normalised) - 0.5,
-            4 => pupil_mm * (at(&frame.depth_normalised) - 0.5),
-            _ => (pupil_mm - 3.0) / 2.0,
+            4 => conditions.blur_scale() * (at(&frame.depth_normalised) - 0.5),
+            _ => conditions.told()[channel - 5 * block],
         }
     })
 }
@@ -236,10 +239,10 @@ fn dense(layer: &Dense, inputs: &[f64]) -> Vec<f64> {
     layer.weight.chunks(layer.inputs).zip(&layer.bias).map(|(weights, &bias)| f64::from(bias) + row(weights)).collect()
 }
 
-fn predict_offsets(adjustable: &Adjustable, input: &Map, pupil_mm: f64, slope: f64) -> Map {
+fn predict_offsets(adjustable: &Adjustable, input: &Map, conditions: Conditions, slope: f64) -> Map {
     let [first, second, last] = &adjustable.modulation;
     let rectified = |values: Vec<f64>| values.into_iter().map(|value| leaky(value, slope)).collect::<Vec<_>>();
-    let hidden = rectified(dense(first, &[(pupil_mm - 3.0) / 2.0]));
+    let hidden = rectified(dense(first, &conditions.told()));
     let modulation = dense(last, &rectified(dense(second, &hidden)));
     let (gamma, beta) = modulation.split_at(18 * input.channels);
     Map::from_fn([18, input.height, input.width], |output, y, x| {
@@ -267,15 +270,14 @@ fn block_means(grid: Grid, frame: &RgbdFrame) -> Map {
 }
 
 /// What both nets of `expected-stack` are told of a frame, centred around zero.
-fn encode_for_light(frame: &RgbdFrame, pupil_mm: f64) -> Map {
-    let mut maps = encode(Grid::HalfBand, frame, pupil_mm);
+fn encode_for_light(frame: &RgbdFrame, conditions: Conditions) -> Map {
+    let mut maps = encode(Grid::HalfBand, frame, conditions);
     let plane = maps.width * maps.height;
     for (channel, values) in maps.values.chunks_exact_mut(plane).enumerate() {
         for value in values {
             *value = match channel {
                 0..12 => *value - 0.4,
                 12..16 => 2.0 * *value,
-                20 => (pupil_mm - 2.5) / 2.0,
                 _ => *value,
             };
         }
@@ -284,11 +286,10 @@ fn encode_for_light(frame: &RgbdFrame, pupil_mm: f64) -> Map {
 }
 
 /// Where the middle of a depth layer is imaged, metres from the SLM plane.
-fn centre_m(weights: &Weights, layer: usize) -> f64 {
-    let optics = &weights.config.optics;
+fn centre_m(weights: &Weights, bench: &DisplayGeometry, layer: usize) -> f64 {
     let share = (layer as f64 + 0.5) / weights.config.depth_layers as f64;
-    let dioptres = optics.depth_far_dpt + share * (optics.depth_near_dpt - optics.depth_far_dpt);
-    (optics.eyepiece_focal_length_mm * 1e-3).powi(2) * dioptres
+    let dioptres = bench.depth_far.0 + share * (bench.depth_near.0 - bench.depth_far.0);
+    bench.eyepiece_focal_length.0.powi(2) * dioptres
 }
 
 /// The depth layer of a pixel; beyond an odd edge the edge again.
@@ -307,18 +308,23 @@ fn cover(weights: &Weights, frame: &RgbdFrame, columns: usize, index: usize, lay
 }
 
 /// The angular spectrum transfer function of one colour over the distance `u_m`, at cycles per sample of the grid.
-fn transfer(weights: &Weights, colour: usize, u_m: f64, [fx, fy]: [f64; 2]) -> Complex64 {
-    let optics = &weights.config.optics;
-    let per_m = 1.0 / (optics.wavelengths_nm[colour] * 1e-9);
-    let [fx, fy] = [fx, fy].map(|f| f / (2e-6 * optics.pixel_pitch_um));
+fn transfer(bench: &DisplayGeometry, colour: usize, u_m: f64, [fx, fy]: [f64; 2]) -> Complex64 {
+    let per_m = 1.0 / bench.wavelengths.0[colour].0;
+    let [fx, fy] = [fx, fy].map(|f| f / (2.0 * bench.pixel_pitch.0));
     let squared = per_m * per_m - fx * fx - fy * fy;
     if squared > 0.0 { Complex64::cis(TAU * u_m * (squared.sqrt() - per_m)) } else { Complex64::ZERO }
 }
 
 /// What an eye should see at each depth layer as far as the picture and its depth tell: intensities, colours within
 /// layers. Each layer is blurred by its disc of confusion; the sum is over that of a white scene.
-fn expected_stack(weights: &Weights, frame: &RgbdFrame, size: [usize; 2], pupil_mm: f64) -> Map {
-    let NetworkConfig { depth_layers: count, optics, .. } = &weights.config;
+fn expected_stack(
+    weights: &Weights,
+    bench: &DisplayGeometry,
+    frame: &RgbdFrame,
+    size: [usize; 2],
+    pupil_mm: f64,
+) -> Map {
+    let NetworkConfig { depth_layers: count, .. } = &weights.config;
     let [rows, columns] = size;
     let Resolution { width, height } = frame.resolution;
     // White and three colours of each layer.
@@ -334,8 +340,8 @@ fn expected_stack(weights: &Weights, frame: &RgbdFrame, size: [usize; 2], pupil_
         };
         (0..rows * columns).map(sample).collect()
     };
-    let layer_dpt = (optics.depth_near_dpt - optics.depth_far_dpt) / *count as f64;
-    let pixel_rad = optics.pixel_pitch_um * 1e-6 / (optics.eyepiece_focal_length_mm * 1e-3);
+    let layer_dpt = (bench.depth_near.0 - bench.depth_far.0) / *count as f64;
+    let pixel_rad = bench.pixel_pitch.0 / bench.eyepiece_focal_length.0;
     let mut seen = vec![vec![0.0; rows * columns]; 4 * count];
     for (layer, channel) in (0..*count).flat_map(|layer| (0..4).map(move |channel| (layer, channel))) {
         let part = part(layer, channel);
@@ -365,7 +371,7 @@ fn refined(weights: &Weights, out: &Map, wanted: Map) -> Map {
 
 /// The field at the SLM plane when the wanted amplitudes light the depth layers through the first net's masks, with its
 /// phases.
-fn light_layers(weights: &Weights, out: &Map, wanted: &Map) -> Vec<Complex64> {
+fn light_layers(weights: &Weights, bench: &DisplayGeometry, out: &Map, wanted: &Map) -> Vec<Complex64> {
     let (count, size, pixels) = (weights.config.depth_layers, [out.height, out.width], out.height * out.width);
     let offset = ((count - 1) as f64).ln();
     let mut field = vec![Complex64::ZERO; 3 * pixels];
@@ -376,8 +382,8 @@ fn light_layers(weights: &Weights, out: &Map, wanted: &Map) -> Vec<Complex64> {
             plane(wanted, 3 * layer + colour).into_iter().zip(phase).zip(mask).map(|((wanted, phase), mask)| {
                 Complex64::from_polar(wanted, PI * phase) / (1.0 + (offset - mask).exp())
             });
-        let u_m = centre_m(weights, layer);
-        let carried = filtered(&light.collect::<Vec<_>>(), size, |fx, fy| transfer(weights, colour, -u_m, [fx, fy]));
+        let u_m = centre_m(weights, bench, layer);
+        let carried = filtered(&light.collect::<Vec<_>>(), size, |fx, fy| transfer(bench, colour, -u_m, [fx, fy]));
         field[colour * pixels..].iter_mut().zip(carried).for_each(|(sum, value)| *sum += value);
     }
     field
@@ -387,26 +393,27 @@ fn light_layers(weights: &Weights, out: &Map, wanted: &Map) -> Vec<Complex64> {
 /// the wanted amplitudes there, and these lacks.
 fn feed_back(
     weights: &Weights,
+    bench: &DisplayGeometry,
     frame: &RgbdFrame,
     carried: &[Complex64],
     wanted: &Map,
     sharpness: f64,
     pupil_mm: f64,
 ) -> (Vec<Complex64>, Map) {
-    let (NetworkConfig { depth_layers: count, optics, .. }, size) = (&weights.config, [wanted.height, wanted.width]);
+    let (NetworkConfig { depth_layers: count, .. }, size) = (&weights.config, [wanted.height, wanted.width]);
     let pixels = wanted.height * wanted.width;
     let mut change = vec![Complex64::ZERO; carried.len()];
     let mut lack = wanted.clone();
     for (layer, colour) in (0..*count).flat_map(|layer| (0..3).map(move |colour| (layer, colour))) {
         let plane = colour * pixels..(colour + 1) * pixels;
-        let per_mm = 1e-3 / (optics.wavelengths_nm[colour] * 1e-9 * optics.eyepiece_focal_length_mm * 1e-3);
+        let per_mm = 1e-3 / (bench.wavelengths.0[colour].0 * bench.eyepiece_focal_length.0);
         let through = |field: &[Complex64], u_m: f64| {
             filtered(field, size, |fx, fy| {
-                let per_m = fx.hypot(fy) / (2e-6 * optics.pixel_pitch_um);
-                if per_m < 0.5 * pupil_mm * per_mm { transfer(weights, colour, u_m, [fx, fy]) } else { Complex64::ZERO }
+                let per_m = fx.hypot(fy) / (2.0 * bench.pixel_pitch.0);
+                if per_m < 0.5 * pupil_mm * per_mm { transfer(bench, colour, u_m, [fx, fy]) } else { Complex64::ZERO }
             })
         };
-        let u_m = centre_m(weights, layer);
+        let u_m = centre_m(weights, bench, layer);
         let mut arriving = through(&carried[plane.clone()], u_m);
         let lack = &mut lack.values[(3 * layer + colour) * pixels..][..pixels];
         for (index, (arriving, lack)) in arriving.iter_mut().zip(lack).enumerate() {

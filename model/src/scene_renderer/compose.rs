@@ -1,21 +1,37 @@
 //! Random scenes, drawn from a seed: what the network learns from and is tested on.
 
-use holod_calibration::{DisplayGeometry, Resolution};
+use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
 
 use super::SceneKind;
 use super::families::{bright_and_dark, colour, marks, pattern};
 use super::random::{Random, hash_unit, mix};
 use super::surface::{Bounds, Paint, Shape, Surface};
 use super::texture::{Pattern, blend};
-use super::thin_lens::mean_light;
+use super::thin_lens::{Lens, mean_light};
 use super::{meshes, rooms, shadow};
 
-/// Surfaces reach this far beyond the picture, so that a wide pupil's rays never miss the background.
-pub(super) const OVERSCAN_PX: f32 = 60.0;
-/// Steepest plane, in dioptres per pixel: beyond it an aperture ray could meet the plane from behind.
-const STEEPEST: f32 = 0.03;
-/// The same for walls and grounds: an 8 mm pupil's outermost ray goes 20 px a dioptre.
-pub(super) const STEEPEST_WALL: f32 = 0.045;
+/// Room for the outermost rays of the widest pupil for which a scene is laid out.
+#[derive(Clone, Copy)]
+pub(super) struct Reach {
+    /// Surfaces reach this far beyond the picture, so that rays never miss the background.
+    pub(super) overscan_px: f32,
+    /// Steepest plane, in dioptres per pixel: beyond it an aperture ray could meet the plane from behind.
+    steepest: f32,
+    /// The same for walls and grounds.
+    pub(super) steepest_wall: f32,
+}
+
+impl Reach {
+    /// For pupils of up to 8 mm on the default bench, whose outermost ray goes 20 px a dioptre.
+    pub(super) const USUAL: Self = Self { overscan_px: 60.0, steepest: 0.03, steepest_wall: 0.045 };
+
+    /// For a pupil of so many pixels of radius a dioptre: the usual where that is enough.
+    fn of_radius(radius_px_per_dpt: f32) -> Self {
+        let wider = (radius_px_per_dpt / 20.0).max(1.0);
+        let Self { overscan_px, steepest, steepest_wall } = Self::USUAL;
+        Self { overscan_px: overscan_px * wider, steepest: steepest / wider, steepest_wall: steepest_wall / wider }
+    }
+}
 
 /// The picture's extent and the size that random lengths scale with.
 pub(super) struct Stage {
@@ -25,11 +41,18 @@ pub(super) struct Stage {
     scale: f32,
     pub(super) near: f32,
     pub(super) kind: SceneKind,
+    pub(super) reach: Reach,
 }
 
 /// A random scene: a background or a room, cards with print, and 15 to 40 primitives, more in a picture larger than 256
 /// by 256 pixels.
-pub(super) fn random_surfaces(kind: SceneKind, seed: u64, index: u64, resolution: Resolution) -> Vec<Surface> {
+pub(super) fn random_surfaces(
+    kind: SceneKind,
+    seed: u64,
+    index: u64,
+    resolution: Resolution,
+    widest: PupilDiameter,
+) -> Vec<Surface> {
     let mut random = Random::new(mix(seed) ^ kind.stream(), index);
     let area = resolution.pixels() as f32 / (256.0 * 256.0);
     let stage = Stage {
@@ -38,6 +61,7 @@ pub(super) fn random_surfaces(kind: SceneKind, seed: u64, index: u64, resolution
         scale: if area < 1.0 { area.sqrt() } else { area.powf(0.25) },
         near: DisplayGeometry::DEFAULT.depth_near.0 as f32,
         kind,
+        reach: Reach::of_radius(Lens::radius(widest)),
     };
     let more = area.sqrt().max(1.0);
     let mut surfaces = Vec::new();
@@ -100,7 +124,7 @@ fn plane(random: &mut Random, stage: &Stage, (cx, cy): (f32, f32), depth: f32, r
     // One in four runs through most of the depth that there is around it.
     let most = if random.chance(0.25) { 1.4 } else { 0.7 };
     let half_span = random.between(0.05, most).min(depth).min(stage.near - depth);
-    let slope = (half_span / radius).min(STEEPEST);
+    let slope = (half_span / radius).min(stage.reach.steepest);
     let (sin, cos) = random.between(0.0, std::f32::consts::TAU).sin_cos();
     Shape::Plane { cx, cy, depth, gx: slope * cos, gy: slope * sin }
 }
@@ -175,7 +199,7 @@ fn boxed(random: &mut Random, stage: &Stage, (cx, cy): (f32, f32), depth: f32, s
     // The side through an edge at e holds the world's X = e/depth, so its depth at x is depth·x/e.
     for edge in [cx - hw, cx + hw] {
         let faces_axis = (edge < cx) == (edge > 0.0);
-        if faces_axis && (depth / edge).abs() < STEEPEST {
+        if faces_axis && (depth / edge).abs() < stage.reach.steepest {
             let other = edge * back / depth;
             let shape = Shape::Plane { cx: 0.0, cy: 0.0, depth: 0.0, gx: depth / edge, gy: 0.0 };
             let bounds = Bounds { left: edge.min(other), right: edge.max(other), ..rectangle };
@@ -193,7 +217,7 @@ fn boxed(random: &mut Random, stage: &Stage, (cx, cy): (f32, f32), depth: f32, s
     }
     for edge in [cy - hh, cy + hh] {
         let faces_axis = (edge < cy) == (edge > 0.0);
-        if faces_axis && (depth / edge).abs() < STEEPEST {
+        if faces_axis && (depth / edge).abs() < stage.reach.steepest {
             let other = edge * back / depth;
             let shape = Shape::Plane { cx: 0.0, cy: 0.0, depth: 0.0, gx: 0.0, gy: depth / edge };
             let bounds = Bounds {
@@ -306,10 +330,10 @@ fn background(random: &mut Random, stage: &Stage) -> Surface {
     let dim = random.between(0.35, 1.0);
     let shape = Shape::Plane { cx: 0.0, cy: 0.0, depth, gx: 0.0, gy: 0.0 };
     let bounds = Bounds {
-        left: -stage.half_width - OVERSCAN_PX,
-        right: stage.half_width + OVERSCAN_PX,
-        top: -stage.half_height - OVERSCAN_PX,
-        bottom: stage.half_height + OVERSCAN_PX,
+        left: -stage.half_width - stage.reach.overscan_px,
+        right: stage.half_width + stage.reach.overscan_px,
+        top: -stage.half_height - stage.reach.overscan_px,
+        bottom: stage.half_height + stage.reach.overscan_px,
     };
     Surface::bake(shape, bounds, |x, y| Some(paint.colour(x, y).map(|c| c * dim)))
 }
@@ -325,53 +349,59 @@ fn ground(random: &mut Random, stage: &Stage) -> Surface {
     let nearest = random.between(0.6, 1.0) * stage.near;
     let pattern = pattern(random, stage.kind);
     let dim = random.between(0.5, 1.0);
-    slope(pattern, side, half_along, half_across, horizon, nearest, dim)
+    Slope { pattern, side, half_along, half_across, horizon, nearest, dim }.surface(stage.reach)
 }
 
-/// A plane seen in perspective. `side`: 0 to 2 below, 3 right, 4 left; depth grows from 0 at `horizon` to `nearest` at
-/// the picture's edge.
-pub(super) fn slope(
-    pattern: Pattern,
-    side: u32,
-    half_along: f32,
-    half_across: f32,
-    horizon: f32,
-    nearest: f32,
-    dim: f32,
-) -> Surface {
-    const FARTHEST: f32 = 0.12;
-    let rate = (nearest / (half_along - horizon)).min(STEEPEST_WALL);
-    let start = horizon + FARTHEST / rate;
-    let end = half_along + OVERSCAN_PX;
-    let across = half_across + OVERSCAN_PX;
-    let (gx, gy, cx, cy) = match side {
-        3 => (rate, 0.0, horizon, 0.0),
-        4 => (-rate, 0.0, -horizon, 0.0),
-        _ => (0.0, rate, 0.0, horizon),
-    };
-    let bounds = match side {
-        3 => Bounds { left: start, right: end, top: -across, bottom: across },
-        4 => Bounds { left: -end, right: -start, top: -across, bottom: across },
-        _ => Bounds { left: -across, right: across, top: start, bottom: end },
-    };
-    let average = (0..400).fold([0.0; 3], |sum, k| {
-        let colour = pattern.colour((k % 20) as f32 * 7.3, (k / 20) as f32 * 9.1);
-        std::array::from_fn(|c| sum[c] + colour[c] / 400.0)
-    });
-    // The pattern's own scale holds at 2 dioptres; where it shrinks below the texels it fades into its average.
-    let paint = move |x: f32, y: f32| {
-        let (along, across) = match side {
-            3 => (x, y),
-            4 => (-x, y),
-            _ => (y, x),
+/// A plane seen in perspective.
+pub(super) struct Slope {
+    pub(super) pattern: Pattern,
+    /// 0 to 2 below, 3 right, 4 left.
+    pub(super) side: u32,
+    pub(super) half_along: f32,
+    pub(super) half_across: f32,
+    /// Where its depth is 0, and whence it grows to `nearest` at the picture's edge.
+    pub(super) horizon: f32,
+    pub(super) nearest: f32,
+    pub(super) dim: f32,
+}
+
+impl Slope {
+    pub(super) fn surface(self, reach: Reach) -> Surface {
+        let Self { pattern, side, half_along, half_across, horizon, nearest, dim } = self;
+        const FARTHEST: f32 = 0.12;
+        let rate = (nearest / (half_along - horizon)).min(reach.steepest_wall);
+        let start = horizon + FARTHEST / rate;
+        let end = half_along + reach.overscan_px;
+        let across = half_across + reach.overscan_px;
+        let (gx, gy, cx, cy) = match side {
+            3 => (rate, 0.0, horizon, 0.0),
+            4 => (-rate, 0.0, -horizon, 0.0),
+            _ => (0.0, rate, 0.0, horizon),
         };
-        let depth = rate * (along - horizon);
-        let shrunk = 2.0 / depth;
-        let colour = pattern.colour(across * shrunk, -4.0 / (rate * depth));
-        let fade = (1.6 / (shrunk * shrunk)).clamp(0.0, 1.0);
-        Some(blend(average, colour, fade).map(|c| c * dim))
-    };
-    Surface::bake(Shape::Plane { cx, cy, depth: 0.0, gx, gy }, bounds, paint)
+        let bounds = match side {
+            3 => Bounds { left: start, right: end, top: -across, bottom: across },
+            4 => Bounds { left: -end, right: -start, top: -across, bottom: across },
+            _ => Bounds { left: -across, right: across, top: start, bottom: end },
+        };
+        let average = (0..400).fold([0.0; 3], |sum, k| {
+            let colour = pattern.colour((k % 20) as f32 * 7.3, (k / 20) as f32 * 9.1);
+            std::array::from_fn(|c| sum[c] + colour[c] / 400.0)
+        });
+        // The pattern's own scale holds at 2 dioptres; where it shrinks below the texels it fades into its average.
+        let paint = move |x: f32, y: f32| {
+            let (along, across) = match side {
+                3 => (x, y),
+                4 => (-x, y),
+                _ => (y, x),
+            };
+            let depth = rate * (along - horizon);
+            let shrunk = 2.0 / depth;
+            let colour = pattern.colour(across * shrunk, -4.0 / (rate * depth));
+            let fade = (1.6 / (shrunk * shrunk)).clamp(0.0, 1.0);
+            Some(blend(average, colour, fade).map(|c| c * dim))
+        };
+        Surface::bake(Shape::Plane { cx, cy, depth: 0.0, gx, gy }, bounds, paint)
+    }
 }
 
 /// The cut of a card around its centre.
@@ -446,15 +476,21 @@ impl Outline {
 }
 
 /// The refocus test: two cards of fine marks, one near on the left and one far on the right.
-pub(super) fn refocus_cards(dark_on_bright: bool, seed: u64, resolution: Resolution) -> Vec<Surface> {
+pub(super) fn refocus_cards(
+    dark_on_bright: bool,
+    seed: u64,
+    resolution: Resolution,
+    widest: PupilDiameter,
+) -> Vec<Surface> {
+    let Reach { overscan_px, .. } = Reach::of_radius(Lens::radius(widest));
     let (half_width, half_height) = (0.5 * resolution.width as f32, 0.5 * resolution.height as f32);
     let scale = resolution.width.min(resolution.height) as f32 / 256.0;
     let backdrop = [0.12, 0.12, 0.12];
     let wall = Bounds {
-        left: -half_width - OVERSCAN_PX,
-        right: half_width + OVERSCAN_PX,
-        top: -half_height - OVERSCAN_PX,
-        bottom: half_height + OVERSCAN_PX,
+        left: -half_width - overscan_px,
+        right: half_width + overscan_px,
+        top: -half_height - overscan_px,
+        bottom: half_height + overscan_px,
     };
     let flat = |depth| Shape::Plane { cx: 0.0, cy: 0.0, depth, gx: 0.0, gy: 0.0 };
     let mut surfaces = vec![Surface::bake(flat(0.0), wall, |_, _| Some(backdrop))];
@@ -504,14 +540,15 @@ impl Marks {
 }
 
 /// Bright marks in the lower half of a black picture: on the left they stand at 2.5 dioptres, on the right at 0.25.
-pub(super) fn bright_marks(marks: Marks, seed: u64, resolution: Resolution) -> Vec<Surface> {
+pub(super) fn bright_marks(marks: Marks, seed: u64, resolution: Resolution, widest: PupilDiameter) -> Vec<Surface> {
+    let Reach { overscan_px, .. } = Reach::of_radius(Lens::radius(widest));
     const CELL_PX: f32 = 24.0;
     let (half_width, half_height) = (0.5 * resolution.width as f32, 0.5 * resolution.height as f32);
     let black = |left, top, right, bottom, depth, paint: &dyn Fn(f32, f32) -> f32| {
         let shape = Shape::Plane { cx: 0.0, cy: 0.0, depth, gx: 0.0, gy: 0.0 };
         Surface::bake(shape, Bounds { left, top, right, bottom }, |x, y| Some([paint(x, y); 3]))
     };
-    let (across, down) = (half_width + OVERSCAN_PX, half_height + OVERSCAN_PX);
+    let (across, down) = (half_width + overscan_px, half_height + overscan_px);
     let mut surfaces = vec![black(-across, -down, across, down, 0.0, &|_, _| 0.0)];
     let mut random = Random::new(mix(seed) ^ SceneKind::Marks.stream(), marks as u64);
     // Nothing is cut off, and what is out of focus stays in the picture.

@@ -2,7 +2,7 @@
 
 use holod_calibration::Resolution;
 
-use super::compose::{OVERSCAN_PX, slope};
+use super::compose::{Reach, Slope};
 use super::surface::{Bounds, Paint, Shape, Surface};
 use super::texture::{Pattern, Rgb, fractal_noise};
 
@@ -55,7 +55,8 @@ fn sky(stage: &Stage) -> Surface {
         presence: 0.7,
         seed: 5,
     };
-    let bounds = around(0.0, 0.0, stage.half_width + OVERSCAN_PX, stage.half_height + OVERSCAN_PX);
+    let bounds =
+        around(0.0, 0.0, stage.half_width + Reach::USUAL.overscan_px, stage.half_height + Reach::USUAL.overscan_px);
     let (low, high): (Rgb, Rgb) = ([0.55, 0.26, 0.16], [0.03, 0.06, 0.18]);
     Surface::bake(facing(0.0), bounds, |x, y| {
         let height = (0.45 - y / stage.half_height).clamp(0.0, 1.4) / 1.4;
@@ -74,7 +75,7 @@ fn hills(stage: &Stage) -> Vec<Surface> {
     [(0.08, 0.05, [0.10, 0.07, 0.14], 3), (0.16, 0.16, [0.05, 0.06, 0.07], 8)]
         .map(|(depth, level, colour, seed): (f32, f32, Rgb, u32)| {
             let middle = 0.25 * stage.half_height;
-            let bounds = around(0.0, middle, stage.half_width + OVERSCAN_PX, 0.45 * stage.half_height);
+            let bounds = around(0.0, middle, stage.half_width + Reach::USUAL.overscan_px, 0.45 * stage.half_height);
             Surface::bake(facing(depth), bounds, |x, y| {
                 let ridge =
                     level * stage.half_height - 90.0 * unit * (fractal_noise(x / (130.0 * unit), 0.5, 4, seed) - 0.5);
@@ -88,7 +89,16 @@ fn hills(stage: &Stage) -> Vec<Surface> {
 /// A checkered floor from the hills to the viewer's feet.
 fn floor(stage: &Stage) -> Surface {
     let pattern = Pattern::Checker { a: [0.50, 0.46, 0.38], b: [0.07, 0.10, 0.11], period: 62.0 * stage.unit };
-    slope(pattern, 0, stage.half_height, stage.half_width, 0.22 * stage.half_height, 2.7, 0.9)
+    Slope {
+        pattern,
+        side: 0,
+        half_along: stage.half_height,
+        half_across: stage.half_width,
+        horizon: 0.22 * stage.half_height,
+        nearest: 2.7,
+        dim: 0.9,
+    }
+    .surface(Reach::USUAL)
 }
 
 /// Paper with print at 2.5 dioptres, on the left.

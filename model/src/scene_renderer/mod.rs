@@ -79,6 +79,9 @@ pub struct Picture {
     pub depth: Vec<f32>,
 }
 
+/// What scenes are laid out for where nobody asks for more.
+const USUAL_PUPIL: PupilDiameter = PupilDiameter::from_mm(8.0);
+
 /// Textured surfaces between infinity and the near end of [`DisplayGeometry::DEFAULT`]'s depth range, laid out for one
 /// resolution.
 pub struct Scene {
@@ -95,19 +98,25 @@ pub fn sample_scene(resolution: Resolution) -> Scene {
 }
 
 impl Scene {
-    /// A scene that depends on its arguments alone.
+    /// A scene that depends on its arguments alone, for pupils of up to 8 mm.
     pub fn random(kind: SceneKind, seed: u64, index: u64, resolution: Resolution) -> Self {
+        Self::random_for(kind, seed, index, resolution, USUAL_PUPIL)
+    }
+
+    /// The same for pupils of up to `widest`. A pupil wider than 8 mm meets gentler slopes and a larger background, for
+    /// its rays reach farther.
+    pub fn random_for(kind: SceneKind, seed: u64, index: u64, resolution: Resolution, widest: PupilDiameter) -> Self {
         let (surfaces, pixel_samples) = match kind {
             SceneKind::Cards => {
-                let cards = compose::refocus_cards(index.is_multiple_of(2), seed ^ (index / 2), resolution);
+                let cards = compose::refocus_cards(index.is_multiple_of(2), seed ^ (index / 2), resolution, widest);
                 (cards, PixelSamples::Grid)
             }
             SceneKind::Marks => {
-                let marks = compose::bright_marks(compose::Marks::of_index(index), seed ^ (index / 3), resolution);
-                (marks, PixelSamples::Grid)
+                let marks = compose::Marks::of_index(index);
+                (compose::bright_marks(marks, seed ^ (index / 3), resolution, widest), PixelSamples::Grid)
             }
             SceneKind::Train | SceneKind::Test => {
-                (compose::random_surfaces(kind, seed, index, resolution), PixelSamples::Lattice)
+                (compose::random_surfaces(kind, seed, index, resolution, widest), PixelSamples::Lattice)
             }
         };
         let ray_key = random::mix(random::mix(seed) ^ kind.stream() ^ index);

@@ -1,6 +1,6 @@
 //! A room in true perspective: a back wall, and side walls, floor and ceiling that run from it to the viewer.
 
-use super::compose::{OVERSCAN_PX, STEEPEST_WALL, Stage};
+use super::compose::Stage;
 use super::families::pattern;
 use super::random::Random;
 use super::surface::{Bounds, Shape, Surface};
@@ -15,10 +15,10 @@ pub(super) fn room(random: &mut Random, stage: &Stage) -> Vec<Surface> {
     let back = if random.chance(0.3) { 0.0 } else { random.log_between(0.1, 0.8) };
     let mut surfaces = Vec::new();
     let everywhere = Bounds {
-        left: -stage.half_width - OVERSCAN_PX,
-        right: stage.half_width + OVERSCAN_PX,
-        top: -stage.half_height - OVERSCAN_PX,
-        bottom: stage.half_height + OVERSCAN_PX,
+        left: -stage.half_width - stage.reach.overscan_px,
+        right: stage.half_width + stage.reach.overscan_px,
+        top: -stage.half_height - stage.reach.overscan_px,
+        bottom: stage.half_height + stage.reach.overscan_px,
     };
     let wall = pattern(random, stage.kind);
     let (turn, dim) = (if random.chance(0.6) { 0.0f32 } else { random.between(-0.3, 0.3) }, random.between(0.3, 1.0));
@@ -56,14 +56,15 @@ fn side_wall(
         (vanishing.0, vanishing.1, stage.half_width)
     };
     // Depth grows in proportion to the distance from the vanishing point: a plane of the world beside the viewer.
-    let rate = (nearest / (half_along - sign * centre_along)).min(STEEPEST_WALL);
+    let rate = (nearest / (half_along - sign * centre_along)).min(stage.reach.steepest_wall);
     let slope = sign * rate;
     let (gx, gy) = if upright { (0.0, slope) } else { (slope, 0.0) };
     let shape = Shape::Plane { cx: vanishing.0, cy: vanishing.1, depth: 0.0, gx, gy };
     let start = centre_along + sign * back.max(FARTHEST) / rate;
-    let end = sign * (half_along + OVERSCAN_PX);
+    let end = sign * (half_along + stage.reach.overscan_px);
     let (low, high) = (start.min(end), start.max(end));
-    let (across_x, across_y) = (stage.half_width + OVERSCAN_PX, stage.half_height + OVERSCAN_PX);
+    let (across_x, across_y) =
+        (stage.half_width + stage.reach.overscan_px, stage.half_height + stage.reach.overscan_px);
     let bounds = if upright {
         Bounds { left: -across_x, right: across_x, top: low, bottom: high }
     } else {

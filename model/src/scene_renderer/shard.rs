@@ -3,8 +3,9 @@
 //! `scene_000123.safetensors` holds `image` F16 [3, H, W] (linear light, pinhole), `depth` F32 [H, W] (normalised, 0 far,
 //! 1 near) and `stack_0` … `stack_n` F16 [planes, 3, H, W] (linear light, one for each pupil). Its metadata are strings:
 //! `format` = "holod-scene-1", `generator` (see [`GENERATOR`]), `kind`, `seed`, `index`, `pupils_mm` and `focus_dpt` (JSON
-//! lists, which other scenes of the folder need not share), `far_dpt`, `near_dpt`, `pixel_angle_rad`, `rays`, and
-//! `traced_by`: `cpu` or a device's name.
+//! lists, which other scenes of the folder need not share), those of the bench on which the scene is seen: `far_dpt`,
+//! `near_dpt`, `pixel_angle_rad`, `wavelengths_nm` (JSON list), `pixel_pitch_um`; `rays`, and `traced_by`: `cpu` or a
+//! device's name.
 //!
 //! While a shard is made, memory holds its stacks as F16 and, once, the F32 sums of one: at 1920x1080 12 MB and 25 MB a
 //! plane. It is written from there, and read for a sheet, without a copy of the whole.
@@ -28,62 +29,117 @@ pub const FORMAT: &str = "holod-scene-1";
 /// The generation of the random scenes: the same kind, seed and index give the same scene within one generation only.
 /// Shards that name none are of the first.
 pub const GENERATOR: u32 = 2;
-/// Pupils outside this range are no human's; rays of wider ones would pass the background's edge.
-const PUPIL_RANGE_MM: (f32, f32) = (0.5, 8.0);
+/// Blur over the depth volume, in panel pixels, that scenes are made for: less is hardly any, and more would be as large
+/// as the objects.
+pub const BLUR_RANGE_PX: (f64, f64) = (5.0, 250.0);
+/// No eye's is wider; of small displays whose pixels subtend much, a wider one may be asked for all the same.
+const WIDEST_MM: f32 = 20.0;
 /// The range that [`PupilPlan::Strata`] divides.
 const STRATA_RANGE_MM: (f32, f32) = (1.0, 5.0);
+/// The range that [`PupilPlan::LogStrata`] divides: the blur of 0.35 to 8 mm on the default bench.
+const LOG_STRATA_BLUR_PX: (f64, f64) = (5.0, 800.0 / 7.0);
 
 /// Which pupils a scene is rendered for.
 #[derive(Clone, Debug, PartialEq)]
 pub enum PupilPlan {
     /// One random pupil in each of so many equal parts of 1 to 5 mm, drawn anew for each scene.
     Strata(usize),
+    /// One random pupil in each of so many parts, equal in logarithm, of those that blur by 5 to 114 pixels over the
+    /// depth volume: for networks that serve many benches, on which eyes see such blurs.
+    LogStrata(usize),
     /// These, in every scene.
     Fixed(Vec<PupilDiameter>),
 }
 
 impl PupilPlan {
-    /// The pupils of one scene.
-    pub fn pupils(&self, kind: SceneKind, seed: u64, index: u64) -> Vec<PupilDiameter> {
+    /// The pupils of one scene on a bench.
+    pub fn pupils(&self, bench: &DisplayGeometry, kind: SceneKind, seed: u64, index: u64) -> Vec<PupilDiameter> {
+        let in_strata = |parts: usize, mm_at: &dyn Fn(f32) -> f32| {
+            let mut random = Random::new(mix(seed ^ 0x7075_7069_6c73) ^ kind.stream(), index);
+            (0..parts).map(|part| PupilDiameter::from_mm(mm_at((part as f32 + random.unit()) / parts as f32))).collect()
+        };
         match self {
             Self::Fixed(pupils) => pupils.clone(),
             Self::Strata(parts) => {
-                let mut random = Random::new(mix(seed ^ 0x7075_7069_6c73) ^ kind.stream(), index);
                 let (low, high) = STRATA_RANGE_MM;
-                let width = (high - low) / *parts as f32;
-                (0..*parts).map(|part| PupilDiameter::from_mm(low + width * (part as f32 + random.unit()))).collect()
+                in_strata(*parts, &|share| low + (high - low) * share)
+            }
+            Self::LogStrata(parts) => {
+                let [low, high] = log_strata_mm(bench);
+                in_strata(*parts, &|share| low * (high / low).powf(share))
             }
         }
     }
-}
 
-impl PupilPlan {
-    /// The least number of planes, uniform in dioptres over the depth range, between any two neighbours of which the
-    /// widest pupil's circle of confusion changes by less than one pixel.
-    pub fn planes(&self) -> usize {
-        let widest_mm = match self {
+    /// The widest pupil that any scene has on a bench.
+    pub fn widest(&self, bench: &DisplayGeometry) -> PupilDiameter {
+        PupilDiameter::from_mm(match self {
             Self::Fixed(pupils) => pupils.iter().map(|pupil| pupil.mm()).fold(0.0, f32::max),
             Self::Strata(_) => STRATA_RANGE_MM.1,
-        };
-        DisplayGeometry::DEFAULT.largest_coc_px(PupilDiameter::from_mm(widest_mm)) as usize + 2
+            Self::LogStrata(_) => log_strata_mm(bench)[1],
+        })
     }
+
+    /// The narrowest, likewise.
+    fn narrowest(&self, bench: &DisplayGeometry) -> PupilDiameter {
+        PupilDiameter::from_mm(match self {
+            Self::Fixed(pupils) => pupils.iter().map(|pupil| pupil.mm()).fold(f32::INFINITY, f32::min),
+            Self::Strata(_) => STRATA_RANGE_MM.0,
+            Self::LogStrata(_) => log_strata_mm(bench)[0],
+        })
+    }
+
+    /// The least number of planes, uniform in dioptres over the depth range, between any two neighbours of which the
+    /// widest pupil's circle of confusion changes by less than one pixel.
+    pub fn planes(&self, bench: &DisplayGeometry) -> usize {
+        bench.largest_coc_px(self.widest(bench)) as usize + 2
+    }
+
+    /// Whether scenes are made for such pupils on a bench.
+    ///
+    /// # Errors
+    /// What was found and expected, in millimetres and pixels.
+    pub fn check(&self, bench: &DisplayGeometry) -> Result<(), String> {
+        let (least_px, most_px) = BLUR_RANGE_PX;
+        let per_mm = bench.largest_coc_px(PupilDiameter::from_mm(1.0));
+        for pupil in [self.narrowest(bench), self.widest(bench)] {
+            let blur_px = bench.largest_coc_px(pupil);
+            // A pupil is an f32.
+            if blur_px < least_px * 0.999 || blur_px > most_px * 1.001 {
+                return Err(format!(
+                    "a pupil of {} mm blurs by {blur_px:.1} px over this bench's depth volume; expected {least_px} to \
+                     {most_px} px, which are pupils of {:.2} to {:.2} mm here",
+                    pupil.mm(),
+                    least_px / per_mm,
+                    most_px / per_mm,
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn log_strata_mm(bench: &DisplayGeometry) -> [f32; 2] {
+    let per_mm = bench.largest_coc_px(PupilDiameter::from_mm(1.0));
+    [LOG_STRATA_BLUR_PX.0, LOG_STRATA_BLUR_PX.1].map(|blur_px| (blur_px / per_mm) as f32)
 }
 
 impl FromStr for PupilPlan {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        if let Some(parts) = text.strip_prefix("strata:") {
+        if let Some((kind @ ("strata" | "log-strata"), parts)) = text.split_once(':') {
             return match parts.parse() {
-                Ok(parts @ 1..=64) => Ok(Self::Strata(parts)),
-                _ => Err(format!("`{parts}` after `strata:` is not a whole number from 1 to 64")),
+                Ok(parts @ 1..=64) if kind == "strata" => Ok(Self::Strata(parts)),
+                Ok(parts @ 1..=64) => Ok(Self::LogStrata(parts)),
+                _ => Err(format!("`{parts}` after `{kind}:` is not a whole number from 1 to 64")),
             };
         }
         let pupil = |item: &str| match item.trim().parse::<f32>() {
-            Ok(mm) if (PUPIL_RANGE_MM.0..=PUPIL_RANGE_MM.1).contains(&mm) => Ok(PupilDiameter::from_mm(mm)),
+            Ok(mm) if mm > 0.0 && mm <= WIDEST_MM => Ok(PupilDiameter::from_mm(mm)),
             _ => Err(format!(
-                "`{item}` is not a pupil diameter of {} to {} mm; give a list such as 1,2,3,4,5 or strata:4",
-                PUPIL_RANGE_MM.0, PUPIL_RANGE_MM.1
+                "`{item}` is not a pupil diameter of up to {WIDEST_MM} mm; give a list such as 1,2,3,4,5, strata:4 or \
+                 log-strata:4"
             )),
         };
         Ok(Self::Fixed(text.split(',').map(pupil).collect::<Result<_, _>>()?))
@@ -109,13 +165,13 @@ impl PlanePlan {
     }
 
     /// The planes of one scene, far to near.
-    pub fn focus(self, kind: SceneKind, seed: u64, index: u64) -> Vec<Dioptres> {
+    pub fn focus(self, bench: &DisplayGeometry, kind: SceneKind, seed: u64, index: u64) -> Vec<Dioptres> {
         let mut random = Random::new(mix(seed ^ 0x706c_616e_6573) ^ kind.stream(), index);
         let mut position = |plane: usize| match self {
             Self::Uniform(count) => plane as f64 / (count - 1) as f64,
             Self::Strata(parts) => (plane as f64 + f64::from(random.unit())) / parts as f64,
         };
-        (0..self.count()).map(|plane| DisplayGeometry::DEFAULT.depth_at(position(plane))).collect()
+        (0..self.count()).map(|plane| bench.depth_at(position(plane))).collect()
     }
 }
 
@@ -143,12 +199,24 @@ pub struct ShardPlan {
     pub seed: u64,
     /// Pixels of each picture.
     pub resolution: Resolution,
+    /// The bench on which the scenes are seen; its resolution does not matter.
+    pub bench: DisplayGeometry,
     /// Pupils of each scene.
     pub pupils: PupilPlan,
     /// Focus planes of each scene.
     pub planes: PlanePlan,
     /// Rays for each pixel of each plane and pupil, at least.
     pub rays: usize,
+}
+
+/// A scene, and what is asked of it in the terms of the bench that it is laid out for.
+pub struct PlannedScene {
+    /// The scene.
+    pub scene: Scene,
+    /// On the default bench.
+    pub pupils: Vec<PupilDiameter>,
+    /// On the default bench, far to near.
+    pub focus: Vec<Dioptres>,
 }
 
 /// Why a shard could not be written.
@@ -221,12 +289,33 @@ pub fn file_name(index: u64) -> String {
 impl ShardPlan {
     /// The focus planes of scene `index`, far to near.
     pub fn focus(&self, index: u64) -> Vec<Dioptres> {
-        self.planes.focus(self.kind, self.seed, index)
+        self.planes.focus(&self.bench, self.kind, self.seed, index)
+    }
+
+    /// The pupils of scene `index`.
+    pub fn pupils(&self, index: u64) -> Vec<PupilDiameter> {
+        self.pupils.pupils(&self.bench, self.kind, self.seed, index)
+    }
+
+    /// Scene `index` with the pupils and focuses that see of it, on the default bench for which scenes are laid out,
+    /// what the plan's see on its own: how a scene blurs depends on the blur over its depth volume in pixels alone.
+    pub fn scene(&self, index: u64) -> PlannedScene {
+        let (bench, laid_out) = (&self.bench, &DisplayGeometry::DEFAULT);
+        let one_mm = PupilDiameter::from_mm(1.0);
+        let mm_per_mm = bench.largest_coc_px(one_mm) / laid_out.largest_coc_px(one_mm);
+        let moved = |pupil: PupilDiameter| PupilDiameter::from_mm((f64::from(pupil.mm()) * mm_per_mm) as f32);
+        let widest = moved(self.pupils.widest(bench));
+        PlannedScene {
+            scene: Scene::random_for(self.kind, self.seed, index, self.resolution, widest),
+            pupils: self.pupils(index).into_iter().map(moved).collect(),
+            focus: self.focus(index).into_iter().map(|f| laid_out.depth_at(bench.normalised_depth(f))).collect(),
+        }
     }
 
     fn metadata(&self, index: u64) -> HashMap<String, String> {
-        let geometry = DisplayGeometry::DEFAULT;
-        let pupils_mm: Vec<f32> = self.pupils.pupils(self.kind, self.seed, index).iter().map(|p| p.mm()).collect();
+        let bench = &self.bench;
+        let pupils_mm: Vec<f32> = self.pupils(index).iter().map(|p| p.mm()).collect();
+        let wavelengths_nm = bench.wavelengths.0.map(|wavelength| wavelength.0 * 1e9);
         let focus_dpt: Vec<f64> = self.focus(index).iter().map(|f| f.0).collect();
         [
             ("format", FORMAT.to_owned()),
@@ -236,9 +325,11 @@ impl ShardPlan {
             ("index", index.to_string()),
             ("pupils_mm", format!("{pupils_mm:?}")),
             ("focus_dpt", format!("{focus_dpt:?}")),
-            ("far_dpt", geometry.depth_far.0.to_string()),
-            ("near_dpt", geometry.depth_near.0.to_string()),
-            ("pixel_angle_rad", geometry.pixel_angle_rad().to_string()),
+            ("far_dpt", bench.depth_far.0.to_string()),
+            ("near_dpt", bench.depth_near.0.to_string()),
+            ("pixel_angle_rad", bench.pixel_angle_rad().to_string()),
+            ("wavelengths_nm", format!("{wavelengths_nm:?}")),
+            ("pixel_pitch_um", (bench.pixel_pitch.0 * 1e6).to_string()),
             ("rays", self.rays.to_string()),
         ]
         .map(|(key, value)| (key.to_owned(), value))
@@ -254,11 +345,10 @@ impl ShardPlan {
         }
         fs::create_dir_all(folder).map_err(|source| ShardError::Folder { path: folder.to_owned(), source })?;
 
-        let scene = Scene::random(self.kind, self.seed, index, self.resolution);
+        let PlannedScene { scene, pupils, focus } = self.scene(index);
         let picture = scene.picture();
-        let pupils = self.pupils.pupils(self.kind, self.seed, index);
         let mut stacks = vec![Vec::new(); pupils.len()];
-        let rays_traced = tracer.trace(&scene, &pupils, &self.focus(index), self.rays, |pupil, sums, share| {
+        let rays_traced = tracer.trace(&scene, &pupils, &focus, self.rays, |pupil, sums, share| {
             stacks[pupil] = half_bytes(sums.iter().map(|sum| sum * share));
         })?;
 

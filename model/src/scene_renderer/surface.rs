@@ -165,6 +165,14 @@ impl Surface {
         }
     }
 
+    /// Makes every colour white.
+    #[cfg(test)]
+    pub(super) fn whiten(&mut self) {
+        for texel in &mut self.texels {
+            texel[..3].fill(1.0);
+        }
+    }
+
     /// The colour at a place on the surface, (x, y) or a mesh's (u, v); nothing where it is cut away.
     #[inline(always)]
     pub(super) fn texel_at(&self, x: f32, y: f32) -> Option<&[f32; 4]> {

@@ -1,14 +1,24 @@
 use std::collections::HashSet;
 
+use holod_calibration::{Metres, PerColour};
 use proptest::prelude::*;
 
 use super::families::Family;
-use super::shard::{Outcome, PlanePlan, Preview, PupilPlan, ShardError, ShardPlan, file_name};
+use super::shard::{Outcome, PlanePlan, PlannedScene, Preview, PupilPlan, ShardError, ShardPlan, file_name};
 use super::surface::{Bounds, Mesh, Ray, Shape, Vertex};
 use super::view::{Aim, Grid, View, nearest_first};
 use super::*;
 
 const SIZE: Resolution = Resolution { width: 96, height: 96 };
+const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
+/// 10.7 px a dioptre and millimetre of pupil over 3 dioptres, where the default has 5 over 2.86.
+const GAEA: DisplayGeometry = DisplayGeometry {
+    pixel_pitch: Metres(3.74e-6),
+    wavelengths: PerColour([Metres(633e-9), Metres(532e-9), Metres(473e-9)]),
+    depth_far: Dioptres(0.5),
+    depth_near: Dioptres(3.5),
+    ..DisplayGeometry::DEFAULT
+};
 
 fn mm(pupil_mm: f32) -> PupilDiameter {
     PupilDiameter::from_mm(pupil_mm)
@@ -244,7 +254,7 @@ fn trace(surfaces: &[Surface], ray: &Ray) -> ([f32; 3], f32) {
 fn views_show_what_each_of_their_rays_meets_first() {
     let grid = Grid { left: -40.3, top: -39.6, step: 1.0, columns: 80, rows: 81 };
     for (index, (ax, ay)) in [(0.0, 0.0), (11.0, -4.0), (-3.0, 9.5)].into_iter().enumerate() {
-        let surfaces = compose::random_surfaces(SceneKind::Train, 4, index as u64, SIZE);
+        let surfaces = compose::random_surfaces(SceneKind::Train, 4, index as u64, SIZE, mm(8.0));
         let flat: Vec<Surface> =
             surfaces.into_iter().filter(|surface| !matches!(surface.shape, Shape::Mesh(_))).collect();
         let mut view = View::new(grid);
@@ -265,7 +275,7 @@ fn views_show_what_each_of_their_rays_meets_first() {
 #[test]
 fn planes_differ_by_less_than_a_pixel_of_blur() {
     let largest = |plan: &str, mm: f32| {
-        let planes = plan.parse::<PupilPlan>().expect("a plan").planes();
+        let planes = plan.parse::<PupilPlan>().expect("a plan").planes(&BENCH);
         (planes, DisplayGeometry::DEFAULT.largest_coc_px(self::mm(mm)) / (planes - 1) as f64)
     };
     for (plan, mm, expected) in [("2", 2.0, 30), ("1,3", 3.0, 44), ("4,2", 4.0, 59), ("strata:2", 5.0, 73)] {
@@ -416,19 +426,102 @@ proptest! {
 fn pupil_plans_are_read_and_refused() {
     assert_eq!("1, 2.5".parse(), Ok(PupilPlan::Fixed(vec![mm(1.0), mm(2.5)])));
     for index in 0..20 {
-        let pupils = "strata:4".parse::<PupilPlan>().expect("a plan").pupils(SceneKind::Train, 1, index);
+        let pupils = "strata:4".parse::<PupilPlan>().expect("a plan").pupils(&BENCH, SceneKind::Train, 1, index);
         for (part, pupil) in pupils.iter().enumerate() {
             assert!((1.0 + part as f32..2.0 + part as f32).contains(&pupil.mm()));
         }
     }
-    for wrong in ["", "strata:0", "strata:x", "2,,3", "0.1", "12", "NaN", "-3"] {
+    for wrong in ["", "strata:0", "strata:x", "log-strata:0", "2,,3", "0", "21", "NaN", "-3"] {
         assert!(wrong.parse::<PupilPlan>().is_err(), "{wrong}");
     }
 }
 
 #[test]
+fn strata_of_blur_are_equal_in_logarithm_on_any_bench() {
+    let plan = "log-strata:4".parse::<PupilPlan>().expect("a plan");
+    for bench in [BENCH, GAEA] {
+        for index in 0..20 {
+            for (part, pupil) in plan.pupils(&bench, SceneKind::Train, 1, index).into_iter().enumerate() {
+                let place = 4.0 * (bench.largest_coc_px(pupil) / 5.0).ln() / (800.0f64 / 7.0 / 5.0).ln();
+                assert!((part as f64 - 1e-3..part as f64 + 1.001).contains(&place), "{part}: {place}");
+            }
+        }
+    }
+}
+
+#[test]
+fn pupils_for_which_no_scenes_are_made_are_refused_by_their_blur() {
+    let check = |pupils: &str, bench| pupils.parse::<PupilPlan>().expect("a plan").check(&bench);
+    assert_eq!(check("0.35,8", BENCH), Ok(()));
+    assert_eq!(check("0.17,7.7", GAEA), Ok(()));
+    assert_eq!(check("log-strata:4", GAEA), Ok(()));
+    let wide = check("1,8", GAEA).expect_err("257 px");
+    for part in ["8 mm", "256.7 px", "5 to 250 px", "0.16 to 7.79 mm"] {
+        assert!(wide.contains(part), "{wide}");
+    }
+    assert!(check("0.3,8", BENCH).is_err());
+}
+
+/// How a scene blurs depends on the blur over its depth volume in pixels: another bench's pupils see the same.
+#[test]
+fn a_scene_on_another_bench_is_the_same_scene_to_other_pupils() {
+    let default = ShardPlan { pupils: PupilPlan::Fixed(vec![mm(2.0), mm(4.0)]), ..small_plan() };
+    let mm_per_mm = BENCH.largest_coc_px(mm(1.0)) / GAEA.largest_coc_px(mm(1.0));
+    let theirs = [2.0, 4.0].map(|pupil_mm| mm((pupil_mm * mm_per_mm) as f32));
+    let gaea = ShardPlan { bench: GAEA, pupils: PupilPlan::Fixed(theirs.to_vec()), ..small_plan() };
+    let stacks = |plan: &ShardPlan| {
+        let PlannedScene { scene, pupils, focus } = plan.scene(3);
+        scene.focal_stacks(&pupils, &focus, 24).concat()
+    };
+    let same = |a: &[f32], b: &[f32]| {
+        let squared: f64 = a.iter().zip(b).map(|(a, b)| f64::from(a - b).powi(2)).sum();
+        squared / (a.len() as f64) < 1e-8
+    };
+    let expected = stacks(&default);
+    assert!(same(&stacks(&gaea), &expected));
+    assert!(!same(&stacks(&ShardPlan { bench: GAEA, ..default.clone() }), &expected), "the comparison is blind");
+
+    let folder = tempfile::tempdir().expect("a folder");
+    gaea.write(folder.path(), 3, &Tracer::cpu()).expect("a shard");
+    let bytes = std::fs::read(folder.path().join(file_name(3))).expect("the shard");
+    let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).expect("metadata");
+    let metadata = header.metadata().clone().expect("strings");
+    for (key, value) in [
+        ("far_dpt", "0.5"),
+        ("near_dpt", "3.5"),
+        ("pixel_pitch_um", "3.74"),
+        ("wavelengths_nm", "[633.0, 532.0, 473.0]"),
+        ("focus_dpt", "[0.5, 2.0, 3.5]"),
+    ] {
+        assert_eq!(metadata[key], value, "{key}");
+    }
+}
+
+/// A pupil that goes farther than usual misses nothing: a ray that met no surface would bring darkness, and a white
+/// scene a grey border.
+#[test]
+fn scenes_have_room_for_the_widest_pupils() {
+    let size = Resolution { width: 96, height: 64 };
+    let widest = mm(17.5);
+    for index in 0..4 {
+        let mut scene = Scene::random_for(SceneKind::Train, 5, index, size, widest);
+        scene.surfaces.iter_mut().for_each(Surface::whiten);
+        let stack = scene.focal_stack(widest, &[BENCH.depth_near, BENCH.depth_far], 64);
+        assert!(stack.iter().all(|light| (light - 1.0).abs() < 1e-4), "scene {index}");
+    }
+    let mut usual = Scene::random(SceneKind::Train, 5, 0, size);
+    usual.surfaces.iter_mut().for_each(Surface::whiten);
+    let stack = usual.focal_stack(widest, &[BENCH.depth_near], 64);
+    assert!(stack.iter().any(|light| *light < 0.99), "the comparison is blind");
+    assert!(
+        Scene::random_for(SceneKind::Train, 5, 0, size, mm(3.0)).picture()
+            == Scene::random(SceneKind::Train, 5, 0, size).picture()
+    );
+}
+
+#[test]
 fn strata_of_planes_hold_one_each_and_differ_between_scenes() {
-    let of_scene = |index| PlanePlan::Strata(6).focus(SceneKind::Train, 1, index);
+    let of_scene = |index| PlanePlan::Strata(6).focus(&BENCH, SceneKind::Train, 1, index);
     let near_dpt = DisplayGeometry::DEFAULT.depth_near.0;
     let mut ends = (near_dpt, 0.0f64);
     for index in 0..200 {
@@ -443,14 +536,14 @@ fn strata_of_planes_hold_one_each_and_differ_between_scenes() {
         ends = (ends.0.min(focus[0].0), ends.1.max(focus[5].0));
     }
     assert!(ends.0 < 0.03 && ends.1 > near_dpt - 0.03, "{ends:?}");
-    assert_ne!(of_scene(0), PlanePlan::Strata(6).focus(SceneKind::Train, 2, 0));
+    assert_ne!(of_scene(0), PlanePlan::Strata(6).focus(&BENCH, SceneKind::Train, 2, 0));
     for (text, plan) in [("6", PlanePlan::Uniform(6)), ("strata:6", PlanePlan::Strata(6))] {
         assert_eq!(text.parse(), Ok(plan));
     }
     for wrong in ["", "1", "257", "-3", "strata:", "strata:1", "strata:257", "strata:auto", "auto"] {
         assert!(wrong.parse::<PlanePlan>().unwrap_err().contains(wrong), "{wrong}");
     }
-    let uniform = PlanePlan::Uniform(3).focus(SceneKind::Train, 1, 0);
+    let uniform = PlanePlan::Uniform(3).focus(&BENCH, SceneKind::Train, 1, 0);
     assert_eq!(uniform, [0.0, 0.5 * near_dpt, near_dpt].map(Dioptres));
 }
 
@@ -459,6 +552,7 @@ fn small_plan() -> ShardPlan {
         kind: SceneKind::Train,
         seed: 11,
         resolution: Resolution { width: 32, height: 24 },
+        bench: BENCH,
         pupils: PupilPlan::Fixed(vec![mm(1.0), mm(4.0)]),
         planes: PlanePlan::Uniform(3),
         rays: 4,

@@ -123,8 +123,8 @@ class Nets(nn.Module):
         super().__init__()
         self.nets = nn.ModuleList(nets)
 
-    def forward(self, pupil_mm: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
-        return tuple(net(x, pupil_mm) for net, x in zip(self.nets, inputs, strict=True))
+    def forward(self, told: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+        return tuple(net(x, told) for net, x in zip(self.nets, inputs, strict=True))
 
 
 # Does the work once, and gives its levels or its nets' outputs.
@@ -228,7 +228,8 @@ def _torch_engines(plan: Plan) -> dict[tuple[str, str], Work | str]:
     frame = (amplitude, depth, pupil_mm)
     frame_channels_last = (_channels_last(amplitude), depth, pupil_mm)
     nets, seen = _nets(network, frame)
-    inputs, inputs_channels_last = (pupil_mm, *seen), (pupil_mm, *(_channels_last(x) for x in seen))
+    told = network.told(pupil_mm)
+    inputs, inputs_channels_last = (told, *seen), (told, *(_channels_last(x) for x in seen))
 
     def compiled_nets() -> Work:
         partly = copy.deepcopy(whole)

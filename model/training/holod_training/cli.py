@@ -1,4 +1,4 @@
-"""The command line: python -m holod_training {train,compare,evaluate,eyebox,export,golden,bench-engines}."""
+"""The command line: `python -m holod_training COMMAND`, where each command is a file of that name."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from typing import Any
 import torch
 
 from holod_training.bench_engines import BenchError, Plan, bench_engines, markdown
-from holod_training.config import CONDITIONINGS, ConfigError, NetworkConfig
+from holod_training.benches import ANY_BENCH, BenchDraw
+from holod_training.config import CONDITIONINGS, ConfigError, NetworkConfig, TrainedRange
 from holod_training.evaluate_config import EvaluateConfig
 from holod_training.export import WeightsError
 from holod_training.goals import ReportError
@@ -115,6 +116,16 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--timing-calls", type=int, default=judging.timing_calls)
     evaluate.set_defaults(run=_evaluate)
 
+    across = command("across-benches", "Judges weights files on several benches beside smooth phase, in one table")
+    across.add_argument("--weights", action="append", required=True, help="repeatable")
+    across.add_argument(
+        "--test", action="append", required=True, help="folder of held-out scenes, rendered for one bench; repeatable"
+    )
+    across.add_argument("--out", required=True)
+    across.add_argument("--border-px", type=int, default=judging.border_px, help="left out on every side")
+    across.add_argument("--limit", type=int, help="only so many scenes")
+    across.set_defaults(run=_across_benches)
+
     eyebox = command("eyebox", "Shows where the light is in the pupil's plane, and how far an eye may move")
     eyebox.add_argument("--weights", required=True)
     eyebox.add_argument("--test", required=True, help="folder of held-out scenes")
@@ -130,12 +141,15 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--amplitude-constant", type=float, help="double phase's K; the source's own where left out")
     export.add_argument("--evaluation", help="evaluation.json whose numbers the file is to carry")
     export.add_argument("--evaluation-method", default="holod", help="whose rows of it: another file named by --also")
+    export.add_argument("--benches", help="benches.json of across-benches, whose numbers the file is to carry")
+    export.add_argument("--benches-method", default="", help="whose rows of it; the name of --out where left out")
     export.set_defaults(run=_export)
 
     golden = command("golden", "Writes the golden vectors that the engines are tested against")
     golden.add_argument("--out", required=True, help="folder, model/golden")
     golden.add_argument("--weights", help="the shipped standard weights, for vectors of them too")
     golden.add_argument("--small-weights", help="the shipped small weights, likewise")
+    golden.add_argument("--fast-weights", help="the shipped fast weights, likewise")
     golden.add_argument("--seed", type=int, default=20)
     golden.set_defaults(run=_golden)
 
@@ -155,6 +169,14 @@ def _training_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--shards", required=True, help="folder of training scenes; may grow while training")
     sub.add_argument("--validation", help="folder of held-out scenes")
     sub.add_argument("--out", required=True, help="run folder")
+    sub.add_argument(
+        "--benches",
+        choices=("scenes", "any"),
+        default="scenes",
+        help="those that the scenes were rendered for, or any: each crop on a random one; see benches.py",
+    )
+    sub.add_argument("--volume-blur-px", type=_list_of(float), metavar="LOW,HIGH", help="what the network is for")
+    sub.add_argument("--volume-fresnel-px2", type=_list_of(float), metavar="LOW,HIGH", help="likewise")
     sub.add_argument("--crop", type=int, default=defaults.crop)
     sub.add_argument("--border-px", type=int, default=defaults.border_px, help="left out of the loss on every side")
     sub.add_argument("--validation-border-px", type=int, default=defaults.validation_border_px)
@@ -217,9 +239,15 @@ def _network(options: argparse.Namespace) -> NetworkConfig:
 def _train_config(options: argparse.Namespace, **changes: Any) -> TrainConfig:
     values = {f.name: getattr(options, f.name) for f in dataclasses.fields(TrainConfig) if hasattr(options, f.name)}
     loss = LossWeights(**{f.name: getattr(options, f"loss_{f.name}") for f in dataclasses.fields(LossWeights)})
-    return TrainConfig(
-        **{**values, "loss": loss, "augment": AugmentConfig(faulty_depth=options.faulty_depth), **changes}
+    augment = AugmentConfig(faulty_depth=options.faulty_depth)
+    config = TrainConfig(**{**values, "loss": loss, "augment": augment, **changes})
+    ranges = {f.name: getattr(options, f.name) for f in dataclasses.fields(TrainedRange)}
+    trained = dataclasses.replace(
+        ANY_BENCH if options.benches == "any" else config.network.trained,
+        **{key: value for key, value in ranges.items() if value is not None},
     )
+    benches = BenchDraw(trained) if options.benches == "any" else None
+    return dataclasses.replace(config, benches=benches, network=dataclasses.replace(config.network, trained=trained))
 
 
 def _compare(options: argparse.Namespace) -> None:
@@ -274,10 +302,16 @@ def _eyebox(options: argparse.Namespace) -> None:
 def _export(options: argparse.Namespace) -> None:
     from holod_training.export import export
 
-    evaluation = Path(options.evaluation) if options.evaluation else None
+    evaluation, benches = (Path(path) if path else None for path in (options.evaluation, options.benches))
     print(
         export(
-            Path(options.source), Path(options.out), options.amplitude_constant, evaluation, options.evaluation_method
+            Path(options.source),
+            Path(options.out),
+            options.amplitude_constant,
+            evaluation,
+            options.evaluation_method,
+            benches,
+            options.benches_method,
         )
     )
 
@@ -285,8 +319,9 @@ def _export(options: argparse.Namespace) -> None:
 def _golden(options: argparse.Namespace) -> None:
     from holod_training.golden import write_golden
 
-    standard, small = (Path(path) if path else None for path in (options.weights, options.small_weights))
-    for path in write_golden(Path(options.out), standard, small, options.seed):
+    named = (options.weights, options.small_weights, options.fast_weights)
+    standard, small, fast = (Path(path) if path else None for path in named)
+    for path in write_golden(Path(options.out), standard, small, fast, options.seed):
         print(path)
 
 
@@ -296,6 +331,13 @@ def _resolution(text: str) -> tuple[int, int]:
 
 
 _resolution.__name__ = "WxH"
+
+
+def _across_benches(options: argparse.Namespace) -> None:
+    from holod_training.across_benches import across_benches
+
+    weights, folders = ([Path(path) for path in paths] for paths in (options.weights, options.test))
+    print(across_benches(weights, folders, Path(options.out), options.border_px, options.limit))
 
 
 def _bench_engines(options: argparse.Namespace) -> None:

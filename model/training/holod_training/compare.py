@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
+from holod_training.config import ConfigError, NetworkConfig
 from holod_training.costs import operations_per_pixel
 from holod_training.curves import read_rows
 from holod_training.export import load_weights, write_beside
@@ -57,19 +57,19 @@ def judge_held_out(network: FieldNetwork, shards: list[Shard], border_px: int) -
         for shard in shards:
             stack = shard.read(shard.nearest_pupil(pupil_mm))
             pupil = torch.tensor([stack.pupil_mm])
-            field = network(network_amplitude(config, stack)[None], stack.depth[None], pupil)[0]
+            field = network.on(stack.optics)(network_amplitude(config, stack)[None], stack.depth[None], pupil)[0]
             if config.grid == "half-band":
                 field = upsample_half_band(field)
             phase, _ = double_phase(field, config.amplitude_constant)
-            eye = Eye(config.optics, shard.height, shard.width, list(stack.focus_dpt))
+            eye = Eye(stack.optics, shard.height, shard.width, list(stack.focus_dpt))
             picture = eye.look(panel_field(through_levels(phase)), stack.pupil_mm) * config.amplitude_constant**2
-            blur = coc_px(config.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
+            blur = coc_px(stack.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
             judged.append(judge(picture, stack.target, blur, border_px, with_ssim=False))
         result[str(pupil_mm)] = Judgement.mean(judged).known()
     return result
 
 
-def judge_flat_oracle(shards: list[Shard], optics: OpticsConfig, border_px: int) -> dict[str, dict[str, float]]:
+def judge_flat_oracle(shards: list[Shard], border_px: int) -> dict[str, dict[str, float]]:
     result = {}
     for pupil_mm in VALIDATION_PUPILS_MM:
         stacks = [shard.read(shard.nearest_pupil(pupil_mm)) for shard in shards]
@@ -77,7 +77,7 @@ def judge_flat_oracle(shards: list[Shard], optics: OpticsConfig, border_px: int)
             judge(
                 flat_oracle(s.target),
                 s.target,
-                coc_px(optics, s.depth, list(s.focus_dpt), s.pupil_mm),
+                coc_px(s.optics, s.depth, list(s.focus_dpt), s.pupil_mm),
                 border_px,
                 with_ssim=False,
             )
@@ -106,6 +106,7 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
     rows = []
     for name, network in networks.items():
         known = out / name / "comparison.json"
+        network = dataclasses.replace(network, trained=base.network.trained)
         config = dataclasses.replace(base, network=network, out=str(out / name), stop_below_slope=NO_STOP)
         terms = {"minutes": seconds / 60, **json.loads(json.dumps(dataclasses.asdict(config)))}
         if known.is_file():
@@ -123,8 +124,8 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
             row = {"variant": name, "terms": terms, **_contest(config, seconds, device)}
             write_beside(known, (json.dumps(row, indent=1) + "\n").encode())
         rows.append(json.loads(known.read_text()))
-    shards = open_held_out(Path(base.validation), base.network.optics, base.validation_scenes)
-    flat = judge_flat_oracle(shards, base.network.optics, base.validation_border_px)
+    shards = open_held_out(Path(base.validation), limit=base.validation_scenes)
+    flat = judge_flat_oracle(shards, base.validation_border_px)
     table = markdown(rows, flat, len(shards))
     result = {"rows": rows, FLAT_ORACLE: flat, "scenes": [s.path.name for s in shards]}
     write_beside(out / "comparison.json", (json.dumps(result, indent=1) + "\n").encode())
@@ -137,7 +138,7 @@ def _contest(config: TrainConfig, seconds: float, device: torch.device) -> dict[
     steps = max(1, round(seconds / step_seconds))
     config = dataclasses.replace(config, steps=steps, validate_every=steps, checkpoint_every=steps)
     network = load_weights(train(config, device))
-    shards = open_held_out(Path(config.validation or ""), config.network.optics, config.validation_scenes)
+    shards = open_held_out(Path(config.validation or ""), limit=config.validation_scenes)
     return {
         "parameters": sum(p.numel() for p in network.parameters()),
         "operations_per_pixel": operations_per_pixel(config.network),

@@ -1,4 +1,4 @@
-"""What a network and the bench it is made for are, as the weights file states them."""
+"""What a network is and which benches it was trained for, as the weights file states it; and what a bench is."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
-WEIGHTS_FORMAT = "holod-weights-1"
+WEIGHTS_FORMAT = "holod-weights-2"
 ARCHITECTURES = ("direct", "layered", "expected-stack", "focal-stack")
 # Those of them that the engines run.
 ENGINE_ARCHITECTURES = ("direct", "expected-stack")
@@ -46,12 +46,40 @@ class OpticsConfig:
     def pixel_angle_rad(self) -> float:
         return self.pitch_m / self.focal_length_m
 
+    @property
+    def volume_dpt(self) -> float:
+        return self.depth_near_dpt - self.depth_far_dpt
+
+    def volume_blur_px(self, pupil_mm: float) -> float:
+        """s·(f/p)·V: the circle of confusion of one end of the depth volume, in panel pixels, for an eye with a pupil
+        of s that is focused on the other."""
+        return 1e-3 * pupil_mm / self.pixel_angle_rad * self.volume_dpt
+
+    def pupil_mm(self, volume_blur_px: float) -> float:
+        """The pupil for which `volume_blur_px` is so much."""
+        return volume_blur_px * 1e3 * self.pixel_angle_rad / self.volume_dpt
+
+    @property
+    def volume_fresnel_px2(self) -> tuple[float, ...]:
+        """λ·(f/p)²·V of each colour: the distance u = f²·V that the volume's images span, times the wavelength, in
+        squared panel pixels. Its root is how far light of that colour spreads by diffraction over the volume."""
+        return tuple(w / self.pixel_angle_rad**2 * self.volume_dpt for w in self.wavelengths_m)
+
     def distance_m(self, depth_dpt: float) -> float:
         """u = f² · dioptres: metres from the SLM plane to the image plane of a depth."""
         return self.focal_length_m**2 * depth_dpt
 
     def dioptres(self, normalised: float) -> float:
         return self.depth_far_dpt + normalised * (self.depth_near_dpt - self.depth_far_dpt)
+
+
+@dataclass(frozen=True)
+class TrainedRange:
+    """The least and the most, of all benches and pupils that a network was trained for, of `OpticsConfig`'s
+    `volume_blur_px` and of its `volume_fresnel_px2`; as they stand, of the default bench and pupils of 1 to 5 mm."""
+
+    volume_blur_px: tuple[float, float] = (14.0, 72.0)
+    volume_fresnel_px2: tuple[float, float] = (32.0, 46.0)
 
 
 def _optional(default: Any) -> Any:
@@ -73,15 +101,14 @@ class NetworkConfig:
     """
 
     architecture: str = "direct"
-    version: int = 1
+    version: int = 2
     grid: str = "half-band"
     layers: int = 14
     channels: int = 32
     adjustable_layers: tuple[int, ...] = (7,)
     modulation_hidden: int = 32
     leaky_slope: float = 0.1
-    optics: OpticsConfig = field(default_factory=OpticsConfig)
-    pupil_range_mm: tuple[float, float] = (1.0, 5.0)
+    trained: TrainedRange = field(default_factory=TrainedRange)
     amplitude_constant: float = 1.4
     # One for each layer; none stands for all 1.
     dilations: tuple[int, ...] = _optional(())
@@ -109,7 +136,7 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         self._require("architecture", self.architecture in ARCHITECTURES, f"one of {', '.join(ARCHITECTURES)}")
-        self._require("version", self.version == 1, "version 1, which this trainer builds")
+        self._require("version", self.version == 2, "version 2, which this trainer builds")
         self._require("grid", self.grid in ("half-band", "full"), "'half-band' or 'full'")
         # The bounds are those of the engines.
         for key in ("layers", "correction_layers"):
@@ -135,9 +162,9 @@ class NetworkConfig:
             not self.dilations or all(self.dilations[i] == 1 for i in self.adjustable_layers),
             f"1 at the adjustable layers {self.adjustable_layers}",
         )
-        narrowest, widest = self.pupil_range_mm
-        in_range = 0 < narrowest <= widest <= 20
-        self._require("pupil_range_mm", in_range, "two above 0 and up to 20 mm, in ascending order")
+        for key, found in dataclasses.asdict(self.trained).items():
+            if len(found) != 2 or not 0 < found[0] <= found[1]:
+                raise ConfigError(f"trained.{key}: found {list(found)}, expected two above 0, in ascending order")
         direct = self.architecture == "direct"
         self._require("frames", self.frames >= 1 and (direct or self.frames == 1), "1; `direct` may have more")
         self._require("blur_input", direct or not self.blur_input, "false; only `direct` can have it")
@@ -176,7 +203,7 @@ class NetworkConfig:
         except json.JSONDecodeError as error:
             raise ConfigError(f"network config is not JSON: {error}") from error
         values = _checked(cls, found, "network config")
-        values["optics"] = OpticsConfig(**_checked(OpticsConfig, values["optics"], "network config, optics"))
+        values["trained"] = TrainedRange(**_checked(TrainedRange, values["trained"], "network config, trained"))
         return cls(**values)
 
 

@@ -52,8 +52,10 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     metadata = read_metadata(config.weights)
     networks = _load(config, device)
     network = networks[OURS]
-    optics = network.config.optics
-    shards = open_alike(config.test, optics, config.limit, config.judge_between)
+    shards = open_alike(config.test, config.limit, config.judge_between)
+    optics = shards[0].optics
+    for one in networks.values():
+        one.on(optics)
     cards = open_shards(config.cards, optics) if config.cards else []
     marks = open_shards(config.marks, optics) if config.marks else []
     pictures = read_pictures(config.rgbd, optics) if config.rgbd else []
@@ -118,17 +120,12 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
 
 
 def _load(config: EvaluateConfig, device: torch.device | str) -> dict[str, FieldNetwork]:
-    """Ours and the further ones by file name. Raises WeightsError where one is for another bench or named twice."""
+    """Ours and the further ones by file name. Raises WeightsError where two have one name."""
     networks = {OURS: load_weights(config.weights).to(device)}
-    optics = networks[OURS].config.optics
     for path in config.also:
         if path.stem in networks:
             raise WeightsError(f"{path}: a second method named {path.stem!r}; give each file a name of its own")
         networks[path.stem] = load_weights(path).to(device)
-        if networks[path.stem].config.optics != optics:
-            raise WeightsError(
-                f"{path}: made for {networks[path.stem].config.optics}, {config.weights.name} for {optics}"
-            )
     return networks
 
 

@@ -11,7 +11,15 @@ from torch import Tensor, nn
 
 from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.layered import encode, layer_centres_m, layer_numbers
-from holod_training.network import OUTPUT_CHANNELS, FieldNetwork, corrected, first_net, run_traced, second_net
+from holod_training.network import (
+    CONDITIONS,
+    OUTPUT_CHANNELS,
+    FieldNetwork,
+    corrected,
+    first_net,
+    run_traced,
+    second_net,
+)
 from holod_training.optics import frequencies
 from holod_training.plane_light import FEEDBACK_SHARE, LIT, feed_back, light_planes
 
@@ -91,7 +99,7 @@ class ExpectedStackNetwork(FieldNetwork):
         super().__init__(config)
         self.scale = 2
         stack = 3 * config.depth_layers
-        maps = 5 * self.scale**2 + 1 + stack
+        maps = 5 * self.scale**2 + CONDITIONS + stack
         self.lighting = first_net(config, maps, (LIT + REFINED * config.refined_stack) * config.depth_layers)
         self.correction = second_net(config, 2 * OUTPUT_CHANNELS + maps + stack)
         self.feedback_share = nn.Parameter(torch.tensor([FEEDBACK_SHARE]))
@@ -102,11 +110,12 @@ class ExpectedStackNetwork(FieldNetwork):
     ) -> Tensor:
         """`trace`, where given, receives what each stage puts out: both nets' `encoded`, `layer_{i}` and `offsets_{i}`
         under their names and a dot, the field that arrives from the layers under `carried` (before any feedback)."""
-        optics, count = self.config.optics, self.config.depth_layers
+        optics, count = self.optics, self.config.depth_layers
+        told = self.told(pupil_mm)
         wanted = expected_stack(amplitude, depth, pupil_mm, optics, count, self.scale).sqrt()
-        maps = encode(amplitude, depth, pupil_mm, self.scale)
+        maps = encode(amplitude, depth, told, self.scale)
         maps = torch.cat((maps, wanted.flatten(1, 2) - 0.4), dim=1)
-        out = run_traced("lighting", self.lighting, maps, pupil_mm, trace)
+        out = run_traced("lighting", self.lighting, maps, told, trace)
         if self.config.refined_stack:
             refined = out[:, LIT * count :].unflatten(1, (count, REFINED))
             wanted = (wanted + REFINED_SHARE * refined).clamp_min(0)
@@ -118,5 +127,5 @@ class ExpectedStackNetwork(FieldNetwork):
         lack, change = feed_back(field, wanted, weight, pupil_mm, optics, distances_m, self.scale)
         field = field + self.feedback_share * change
         seen = torch.cat((field.real, field.imag, maps, change.real, change.imag, lack.flatten(1, 2)), dim=1)
-        residual = run_traced("correction", self.correction, seen, pupil_mm, trace)
+        residual = run_traced("correction", self.correction, seen, told, trace)
         return corrected(field, residual)

@@ -15,6 +15,7 @@ from safetensors.torch import save
 
 from holod_training.config import ENGINE_ARCHITECTURES, WEIGHTS_FORMAT, ConfigError, NetworkConfig
 from holod_training.network import FieldNetwork
+from holod_training.old_format import OLD_FORMAT, from_old_format, is_old
 from holod_training.variants import build_network
 
 
@@ -49,7 +50,10 @@ def read_metadata(path: Path) -> dict[str, Any]:
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: not a readable weights file ({error})") from error
     if metadata.get("format") != WEIGHTS_FORMAT:
-        raise WeightsError(f"{path}: metadata format is {metadata.get('format')!r}, expected {WEIGHTS_FORMAT!r}")
+        cure = (
+            "; convert it by `python -m holod_training export --source`" if metadata.get("format") == OLD_FORMAT else ""
+        )
+        raise WeightsError(f"{path}: metadata format is {metadata.get('format')!r}, expected {WEIGHTS_FORMAT!r}{cure}")
     try:
         return {
             "config": NetworkConfig.from_json(metadata.get("config", "")),
@@ -91,11 +95,15 @@ def export(
     amplitude_constant: float | None,
     evaluation: Path | None,
     method: str = "holod",
+    benches: Path | None = None,
+    benches_method: str = "",
 ) -> Path:
-    """Writes `out`, for the engines, from a run's checkpoint or a weights file; raises WeightsError, also for a network
-    of a family that they do not run."""
+    """Writes `out`, for the engines, from a run's checkpoint or a weights file, with what an `evaluate` and an
+    `across-benches` found of it; raises WeightsError, also for a network of a family that they do not run."""
     if source.suffix == ".pt":
         network, metrics, provenance = _from_checkpoint(source)
+    elif is_old(source):
+        network, metrics, provenance = from_old_format(source)
     else:
         metadata = read_metadata(source)
         network, metrics, provenance = load_weights(source), metadata["metrics"], metadata["provenance"]
@@ -106,6 +114,8 @@ def export(
         network.config = dataclasses.replace(network.config, amplitude_constant=amplitude_constant)
     if evaluation:
         metrics = _summary(evaluation, method)
+    if benches:
+        metrics = {**metrics, "benches": _of_benches(benches, benches_method or out.stem)}
     save_weights(out, network, metrics, provenance)
     return out
 
@@ -137,3 +147,35 @@ def _summary(evaluation: Path, method: str) -> dict[str, Any]:
         return {**found, "matrix_psnr_db": result["matrix_psnr_db"]} if method == "holod" else found
     except (OSError, json.JSONDecodeError, KeyError) as error:
         raise WeightsError(f"{evaluation}: not an evaluation ({error})") from error
+
+
+def _of_benches(benches: Path, method: str) -> list[dict[str, Any]]:
+    """What `holod check` quotes: for each bench where it lies, and what the network reached there at each blur."""
+    try:
+        found = json.loads(benches.read_text())["benches"]
+        result = []
+        for bench in found:
+            gains = bench["gain_over_rival"].get(method)
+            rows = [row for row in bench["rows"] if row["method"] == method]
+            if not (gains and rows):
+                there = ", ".join(sorted({row["method"] for row in bench["rows"]}))
+                raise WeightsError(f"{benches}: no method {method!r} on {bench['bench']}; found {there}")
+            result.append(
+                {
+                    "bench": bench["bench"],
+                    "volume_fresnel_px2": bench["volume_fresnel_px2"],
+                    "rows": [
+                        {
+                            "volume_blur_px": blur_px,
+                            "psnr_db": round(row["psnr_db"], 2),
+                            "psnr_in_focus_db": round(row["psnr_in_focus_db"], 2),
+                            "slope": round(row["slope"], 3),
+                            "over_smooth_phase_db": round(gain["psnr_db"]["mean"], 2),
+                        }
+                        for blur_px, row, gain in zip(bench["volume_blur_px"], rows, gains, strict=True)
+                    ],
+                }
+            )
+        return result
+    except (OSError, json.JSONDecodeError, KeyError) as error:
+        raise WeightsError(f"{benches}: not a table across benches ({error})") from error

@@ -132,8 +132,8 @@ def write_eyebox(weights: Path, test: Path, out: Path, limit: int | None) -> str
     Raises WeightsError, ShardError.
     """
     network = load_weights(weights)
-    optics = network.config.optics
-    shards = open_held_out(test, optics, limit)
+    shards = open_held_out(test, limit=limit)
+    optics = network.on(shards[0].optics).optics
     stacks = [shard.read(0) for shard in shards]
     methods: dict[str, Callable[[Stack], Tensor]] = {
         NETWORK: lambda stack: network_field(network, stack, NETWORK_PUPIL_MM),

@@ -10,20 +10,29 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
-from holod_training.network import OUTPUT_CHANNELS, FieldNetwork, Trunk, corrected, first_net, second_net
+from holod_training.network import (
+    CONDITIONS,
+    OUTPUT_CHANNELS,
+    FieldNetwork,
+    Trunk,
+    constant_maps,
+    corrected,
+    first_net,
+    second_net,
+)
 from holod_training.optics import frequencies, transfer
 from holod_training.plane_light import FEEDBACK_SHARE, LIT, feed_back, light_planes
 from holod_training.shards import Stack, same_focuses
 
 
-def planes_dpt(config: NetworkConfig) -> list[float]:
-    """Where the images are focused, far to near."""
-    return [config.optics.dioptres(k / (config.planes - 1)) for k in range(config.planes)]
+def planes_dpt(config: NetworkConfig, optics: OpticsConfig) -> list[float]:
+    """Where the images are focused on a bench, far to near."""
+    return [optics.dioptres(k / (config.planes - 1)) for k in range(config.planes)]
 
 
 def focal_amplitudes(config: NetworkConfig, stack: Stack) -> Tensor:
     """The focal images' amplitudes [planes, 3, H, W]. Raises ConfigError where a stack has other focuses."""
-    expected = planes_dpt(config)
+    expected = planes_dpt(config, stack.optics)
     found = stack.focus_dpt
     if not same_focuses(found, expected):
         raise ConfigError(
@@ -34,14 +43,15 @@ def focal_amplitudes(config: NetworkConfig, stack: Stack) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def carriers_back(config: NetworkConfig, height: int, width: int, dtype: torch.dtype, device: str) -> Tensor:
+def carriers_back(
+    config: NetworkConfig, optics: OpticsConfig, height: int, width: int, dtype: torch.dtype, device: str
+) -> Tensor:
     """Transfer functions [planes, 3, h, w] from every plane to the SLM plane on the network's grid, half band."""
-    optics: OpticsConfig = config.optics
     pitch_m = optics.pitch_m * (2 if config.grid == "half-band" else 1)
     fy, fx = (frequencies(size, pitch_m, device) for size in (height, width))
     limit = 0.25 / optics.pitch_m * (1 - 1e-9)
     inside = (fy.abs() < limit)[:, None] & (fx.abs() < limit)
-    return (transfer(optics, fx, fy, [-optics.distance_m(d) for d in planes_dpt(config)]) * inside).to(dtype)
+    return (transfer(optics, fx, fy, [-optics.distance_m(d) for d in planes_dpt(config, optics)]) * inside).to(dtype)
 
 
 def checked(amplitude: Tensor, config: NetworkConfig) -> Tensor:
@@ -52,12 +62,9 @@ def checked(amplitude: Tensor, config: NetworkConfig) -> Tensor:
     return amplitude
 
 
-def with_pupil(x: Tensor, pupil_mm: Tensor, config: NetworkConfig) -> Tensor:
-    """x [N, C, h, w] and, where the network is told its pupil, one more map of it."""
-    if not config.pupil_inputs:
-        return x
-    constant = ((pupil_mm - 3) / 2)[:, None, None, None].expand(-1, 1, *x.shape[2:])
-    return torch.cat((x, constant), dim=1)
+def with_conditions(x: Tensor, told: Tensor, config: NetworkConfig) -> Tensor:
+    """x [N, C, h, w] and, where the network is told its pupil, `constant_maps`."""
+    return torch.cat((x, constant_maps(told, x)), dim=1) if config.pupil_inputs else x
 
 
 class FocalStackNetwork(FieldNetwork):
@@ -71,7 +78,7 @@ class FocalStackNetwork(FieldNetwork):
         spatial = 3 * config.planes * (4 if config.grid == "half-band" else 1)
         self.layers = Trunk(
             config,
-            inputs=spatial + config.pupil_inputs,
+            inputs=spatial + CONDITIONS * config.pupil_inputs,
             outputs=LIT * config.planes,
             layers=config.layers,
             dilations=config.dilations,
@@ -89,12 +96,13 @@ class FocalStackNetwork(FieldNetwork):
         if self.config.grid == "half-band":
             lit = F.avg_pool2d(x, 2).unflatten(1, (count, 3))
             x = F.pixel_unshuffle(x, 2)
-        x = with_pupil(x, pupil_mm, self.config)
-        out = self.layers(x, pupil_mm).to(amplitude.dtype).view(n, count, 4, *x.shape[2:])
+        told = self.told(pupil_mm)
+        x = with_conditions(x, told, self.config)
+        out = self.layers(x, told).to(amplitude.dtype).view(n, count, 4, *x.shape[2:])
         phase = math.pi * out[:, :, :3]
         light = torch.sigmoid(out[:, :, 3:] - math.log(count - 1)) * lit
         planes = torch.complex(light * torch.cos(phase), light * torch.sin(phase))
-        kernels = carriers_back(self.config, *x.shape[2:], planes.dtype, str(planes.device))
+        kernels = carriers_back(self.config, self.optics, *x.shape[2:], planes.dtype, str(planes.device))
         return torch.fft.ifft2((torch.fft.fft2(planes) * kernels).sum(dim=1))
 
 
@@ -107,22 +115,22 @@ class FedBackFocalStackNetwork(FieldNetwork):
         super().__init__(config)
         self.scale = 2
         images = 3 * config.planes
-        maps = images * self.scale**2 + config.pupil_inputs
+        maps = images * self.scale**2 + CONDITIONS * config.pupil_inputs
         self.lighting = first_net(config, maps, LIT * config.planes)
         self.correction = second_net(config, 2 * OUTPUT_CHANNELS + maps + images)
         self.feedback_share = nn.Parameter(torch.tensor([FEEDBACK_SHARE]))
 
     def forward(self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor) -> Tensor:
         """amplitude [N, planes, 3, H, W] from `focal_amplitudes`; depth is not looked at."""
-        optics = self.config.optics
+        optics, told = self.optics, self.told(pupil_mm)
         images = checked(amplitude, self.config).flatten(1, 2)
-        maps = with_pupil(F.pixel_unshuffle(images, self.scale) - 0.4, pupil_mm, self.config)
+        maps = with_conditions(F.pixel_unshuffle(images, self.scale) - 0.4, told, self.config)
         wanted = F.avg_pool2d(images.square(), self.scale).sqrt().unflatten(1, (-1, 3))
-        distances_m = tuple(optics.distance_m(d) for d in planes_dpt(self.config))
-        out = self.lighting(maps, pupil_mm).to(amplitude.dtype)
+        distances_m = tuple(optics.distance_m(d) for d in planes_dpt(self.config, optics))
+        out = self.lighting(maps, told).to(amplitude.dtype)
         field = light_planes(out, wanted, optics, distances_m, self.scale)
         lack, change = feed_back(field, wanted, 1.0, pupil_mm, optics, distances_m, self.scale)
         field = field + self.feedback_share * change
         seen = torch.cat((field.real, field.imag, maps, change.real, change.imag, lack.flatten(1, 2)), dim=1)
-        residual = self.correction(seen, pupil_mm).to(amplitude.dtype)
+        residual = self.correction(seen, told).to(amplitude.dtype)
         return corrected(field, residual)

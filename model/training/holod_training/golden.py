@@ -5,6 +5,7 @@ Everything is computed in double precision from the float32 weights and inputs, 
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +14,7 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from holod_training.config import ENGINE_ARCHITECTURES, NetworkConfig
+from holod_training.config import ENGINE_ARCHITECTURES, NetworkConfig, OpticsConfig
 from holod_training.export import check_engines_run, load_weights, save_weights, write_beside
 from holod_training.golden_evaluation import write_evaluation
 from holod_training.network import AdjustableLayer, FieldNetwork, Trunk
@@ -34,12 +35,13 @@ ASM_DISTANCE_M = 0.0032
 
 
 class Narrow(NamedTuple):
-    """A random network, the size of the scene that it answers, and the pupil."""
+    """A random network, the size of the scene that it answers, the pupil and the bench."""
 
     config: NetworkConfig
     height: int
     width: int
     pupil_mm: float = 2.7
+    optics: OpticsConfig = OpticsConfig()
 
 
 # Depth layers are left at their default, so that no engine has another.
@@ -59,6 +61,8 @@ NARROW: dict[str, Narrow] = {
         16,
         24,
         pupil_mm=1.6,
+        # Another bench: more diffraction than was trained, and a volume that does not begin at infinity.
+        optics=OpticsConfig((633.0, 532.0, 473.0), 4.5, 32.0, 0.5, 3.25),
     ),
     "expected-stack-narrow-refined": Narrow(
         NetworkConfig(
@@ -134,7 +138,7 @@ def vectors(
     low = network(amplitude[None].double(), depth[None].double(), pupil, trace)[0]
     field = upsample_half_band(low) if config.grid == "half-band" else low
     phase, clipped = double_phase(field, config.amplitude_constant)
-    eye = Eye(config.optics, height, width, list(FOCUS_DPT))
+    eye = Eye(network.optics, height, width, list(FOCUS_DPT))
     result = {"amplitude": amplitude, "depth": depth, "pupil_mm": pupil}
     told = told_layers(config)
     for name, value in trace.items():
@@ -147,8 +151,8 @@ def vectors(
     result["phase"] = phase
     result["eye_field"] = eye.look(field, pupil_mm)
     result["eye_panel"] = eye.look(panel_field(phase), pupil_mm) * config.amplitude_constant**2
-    result["asm_circular"] = complex_parts(propagate(field, config.optics, ASM_DISTANCE_M))
-    result["asm_padded"] = complex_parts(propagate_padded(field, config.optics, ASM_DISTANCE_M))
+    result["asm_circular"] = complex_parts(propagate(field, network.optics, ASM_DISTANCE_M))
+    result["asm_padded"] = complex_parts(propagate_padded(field, network.optics, ASM_DISTANCE_M))
     return result
 
 
@@ -164,19 +168,22 @@ def write_vectors(path: Path, result: dict[str, Tensor], about: dict[str, Any]) 
     write_beside(path, save(tensors, metadata))
 
 
-def write_golden(out: Path, standard: Path | None, small: Path | None = None, seed: int = 20) -> list[Path]:
-    """Writes every golden file into `out`; `standard` and `small` are the weights that the product has, and a file of
-    another family's in their place goes. Raises WeightsError."""
+def write_golden(
+    out: Path, standard: Path | None, small: Path | None = None, fast: Path | None = None, seed: int = 20
+) -> list[Path]:
+    """Writes every golden file into `out`; `standard`, `small` and `fast` are the weights that the product has, and a
+    file of another family's in their place goes. Raises WeightsError."""
     written = []
-    for name, (config, height, width, pupil_mm) in NARROW.items():
+    for name, (config, height, width, pupil_mm, optics) in NARROW.items():
         weights = out / f"{name}.weights.safetensors"
         provenance = {"script": "python -m holod_training golden", "seed": seed}
         save_weights(weights, narrow_network(config, seed), {}, provenance)
         amplitude, depth = scene(height, width, seed)
-        result = vectors(load_weights(weights).double(), amplitude, depth, pupil_mm)
-        write_vectors(out / f"{name}.safetensors", result, {"seed": seed, "weights": weights.name})
+        result = vectors(load_weights(weights).double().on(optics), amplitude, depth, pupil_mm)
+        about = {"seed": seed, "weights": weights.name, "optics": dataclasses.asdict(optics)}
+        write_vectors(out / f"{name}.safetensors", result, about)
         written += [weights, out / f"{name}.safetensors"]
-    for suffix, shipped in (("", standard), ("-small", small)):
+    for suffix, shipped in (("", standard), ("-small", small), ("-fast", fast)):
         if not shipped:
             continue
         built_in = load_weights(shipped)
@@ -185,7 +192,8 @@ def write_golden(out: Path, standard: Path | None, small: Path | None = None, se
         path = out / f"{family}-shipped{suffix}.safetensors"
         amplitude, depth = scene(32, 48, seed)
         result = vectors(built_in.double(), amplitude, depth, 3.4, every_layer=False)
-        write_vectors(path, result, {"seed": seed, "weights": shipped.name})
+        about = {"seed": seed, "weights": shipped.name, "optics": dataclasses.asdict(built_in.optics)}
+        write_vectors(path, result, about)
         written.append(path)
         for other in ENGINE_ARCHITECTURES:
             if other != family:

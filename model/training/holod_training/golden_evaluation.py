@@ -97,13 +97,13 @@ def found(shard: Shard, weights: Path) -> dict[str, Any]:
     config = network.config
     stacks = list(shard.stacks())
     areas = {name: card_area(columns) for name, columns in (("near", COLUMNS[0]), ("far", COLUMNS[2]))}
-    eye = Eye(config.optics, shard.height, shard.width, list(shard.focus_dpt))
-    card_eye = Eye(config.optics, shard.height, shard.width, [NEAR_DPT, FAR_DPT])
+    eye = Eye(network.optics, shard.height, shard.width, list(shard.focus_dpt))
+    card_eye = Eye(network.optics, shard.height, shard.width, [NEAR_DPT, FAR_DPT])
     rows, matrix = [], []
     for stack in stacks:
         phase, clipped = double_phase(network_field(network, stack, stack.pupil_mm), config.amplitude_constant)
         shown = panel_field(through_levels(phase)) * config.amplitude_constant
-        blur = coc_px(config.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
+        blur = coc_px(network.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
         near_focus, far_focus = card_eye.look(shown, stack.pupil_mm)
         near, far = ([gradient_energy(p, areas[name]) for p in (near_focus, far_focus)] for name in ("near", "far"))
         rows.append(
@@ -123,7 +123,7 @@ def found(shard: Shard, weights: Path) -> dict[str, Any]:
 
 def write_evaluation(path: Path, weights: Path, seed: int) -> None:
     """A shard of kind cards, whose metadata has `weights`, `border_px` and what is to be `found` besides."""
-    optics = load_weights(weights).config.optics
+    optics = OpticsConfig()
     image, depth, stacks = scene(optics, seed)
     tensors = {"image": image.half(), "depth": depth.float()}
     tensors |= {f"stack_{index}": stack.half() for index, stack in enumerate(stacks)}

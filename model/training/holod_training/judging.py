@@ -150,10 +150,10 @@ class Bench:
         return coc_px(self.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
 
 
-def open_alike(folder: Path, optics: OpticsConfig, limit: int | None = None, between: bool = False) -> list[Shard]:
-    """The shards of one evaluation: held out, same size, pupils and focuses; for a bench that judges `between`, an odd
+def open_alike(folder: Path, limit: int | None = None, between: bool = False) -> list[Shard]:
+    """The shards of one evaluation: held out, of one bench, same size, pupils and focuses; to judge `between`, an odd
     number of focuses. Raises ShardError that names the odd one."""
-    shards = open_held_out(folder, optics, limit)
+    shards = open_held_out(folder, limit=limit)
     first = shards[0]
     for shard in shards[1:]:
         for what, found, expected in (

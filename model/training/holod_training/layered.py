@@ -10,7 +10,17 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from holod_training.config import NetworkConfig, OpticsConfig
-from holod_training.network import OUTPUT_CHANNELS, FieldNetwork, corrected, first_net, run_traced, second_net
+from holod_training.network import (
+    CONDITIONS,
+    OUTPUT_CHANNELS,
+    FieldNetwork,
+    blur_scale,
+    constant_maps,
+    corrected,
+    first_net,
+    run_traced,
+    second_net,
+)
 from holod_training.optics import frequencies, stop_half_band, transfer
 
 LOG_FLOOR = 0.03
@@ -79,12 +89,11 @@ def compose(source: Tensor, depth: Tensor, optics: OpticsConfig, count: int, sca
     return carry(field, optics, scale, -centres[-1])
 
 
-def encode(amplitude: Tensor, depth: Tensor, pupil_mm: Tensor, scale: int) -> Tensor:
-    """amplitude [N, 3, H, W], depth [N, H, W], pupil_mm [N] -> what nets are told of a scene, [N, maps, h, w]."""
-    s = pupil_mm[:, None, None, None]
+def encode(amplitude: Tensor, depth: Tensor, told: Tensor, scale: int) -> Tensor:
+    """amplitude [N, 3, H, W], depth [N, H, W], told [N, CONDITIONS] -> what nets know of a scene, [N, maps, h, w]."""
     centred = depth[:, None] - 0.5
-    x = F.pixel_unshuffle(torch.cat((amplitude - 0.4, 2 * centred, centred * s), dim=1), scale)
-    return torch.cat((x, ((s - 2.5) / 2).expand(-1, 1, *x.shape[2:])), dim=1)
+    x = F.pixel_unshuffle(torch.cat((amplitude - 0.4, 2 * centred, centred * blur_scale(told)), dim=1), scale)
+    return torch.cat((x, constant_maps(told, x)), dim=1)
 
 
 def drift_phase(centred: Tensor, logs: Tensor, optics: OpticsConfig, gates: Tensor | float = 0.0) -> Tensor:
@@ -109,7 +118,7 @@ class LayeredNetwork(FieldNetwork):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__(config)
         self.scale = 2 if config.grid == "half-band" else 1
-        maps = 5 * self.scale**2 + 1
+        maps = 5 * self.scale**2 + CONDITIONS
         prior, blurs = 3 * config.transport_prior, len(SIGMAS_PX)
         self.surface = first_net(config, maps + prior, 3 * (2 + blurs * (1 + config.transport_prior)))
         self.correction = second_net(config, OUTPUT_CHANNELS + maps)
@@ -119,18 +128,19 @@ class LayeredNetwork(FieldNetwork):
     ) -> Tensor:
         """`trace`, where given, receives what each stage puts out: both nets' `encoded`, `layer_{i}` and `offsets_{i}`
         under their names and a dot, the light of the surfaces under `source`, the carried field under `carried`."""
-        maps = encode(amplitude, depth, pupil_mm, self.scale)
+        told = self.told(pupil_mm)
+        maps = encode(amplitude, depth, told, self.scale)
         light = self.mean(amplitude)
         blurs = blurred(torch.cat((light, torch.log(light.square() + LOG_FLOOR)), dim=1), self.sigmas)
         soft, logs = blurs[:, :, :3], blurs[:, :, 3:] + LOG_OFFSET
         seen = torch.cat((maps, logs[:, 1]), dim=1) if self.config.transport_prior else maps
-        out = run_traced("surface", self.surface, seen, pupil_mm, trace)
+        out = run_traced("surface", self.surface, seen, told, trace)
         source = self.surface_light(out, light, self.mean(depth[:, None] - 0.5), soft, logs)
-        field = compose(source, depth, self.config.optics, self.config.depth_layers, self.scale)
+        field = compose(source, depth, self.optics, self.config.depth_layers, self.scale)
         if trace is not None:
             trace |= {"source": source, "carried": field}
         seen = torch.cat((field.real, field.imag, maps), dim=1)
-        residual = run_traced("correction", self.correction, seen, pupil_mm, trace)
+        residual = run_traced("correction", self.correction, seen, told, trace)
         field = corrected(field, residual)
         return field if self.scale == 2 else stop_half_band(field)
 
@@ -150,5 +160,5 @@ class LayeredNetwork(FieldNetwork):
         correction, phase, gates = out[:, 0], out[:, 1], out[:, 2:]
         strength = light + 0.5 * correction + (gates[:, :count] * (soft - light[:, None])).sum(dim=1)
         if self.config.transport_prior:
-            phase = phase + drift_phase(centred, logs, self.config.optics, gates[:, count:])
+            phase = phase + drift_phase(centred, logs, self.optics, gates[:, count:])
         return torch.complex(strength * torch.cos(phase), strength * torch.sin(phase))

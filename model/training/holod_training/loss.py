@@ -11,8 +11,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 IN_FOCUS_PX = 2.0
-IN_FOCUS_PUPIL_MM = 2.0
+# Blur over the depth volume for which the weight of what is in focus is meant, and above which it grows no more: a
+# pupil of 2 mm and one of 5 mm on the default bench.
+IN_FOCUS_BLUR_PX = 200 / 7
+MOST_IN_FOCUS_BLUR_PX = 500 / 7
 PERCEPTUAL_PLANES = 5
+# Linear light below which a target is black.
+BLACK = 1e-3
 STRUCTURE_SCALES = 3
 WINDOW_PX = 8
 
@@ -21,11 +26,13 @@ WINDOW_PX = 8
 class LossWeights:
     """The weight of each term, and the CoC below which sharpness counts no more.
 
-    `in_focus` is for a pupil of 2 mm: what is in focus is a share of a stack that falls as 1/s, so `for_pupil` lets its
-    weight grow in proportion, or by another power, `in_focus_growth`: with 2 wide pupils lose less of their sharpness.
+    `in_focus` is for a pupil of 2 mm on the default bench: what is in focus is a share of a stack that falls as the
+    blur over the depth volume grows, so `for_blur` lets its weight grow in proportion, or by another power,
+    `in_focus_growth`: with 2 wide pupils lose less of their sharpness.
     `absolute` and `gradient` are the paper's: |P − R| and |∇P − ∇R| weighted by W; so is a perceptual error of some
     planes: `lpips` where a run has its weights, `structure` needs none. `outlines` is |∇P − ∇R|² where the scene is out
-    of focus: what stands there of a mark is small in every other term. `teacher` counts only where there is one.
+    of focus: what stands there of a mark is small in every other term. `black` is the light where there should be
+    none, which squares nearly to nothing and is seen all the same. `teacher` counts only where there is one.
     """
 
     absolute: float = 1.0
@@ -37,12 +44,14 @@ class LossWeights:
     in_focus_growth: float = 1.0
     focus_absolute: float = 0.0
     outlines: float = 0.0
+    black: float = 0.0
     structure: float = 0.0
     lpips: float = 1.0
     teacher: float = 8.0
 
-    def for_pupil(self, pupil_mm: float) -> LossWeights:
-        return replace(self, in_focus=self.in_focus * (pupil_mm / IN_FOCUS_PUPIL_MM) ** self.in_focus_growth)
+    def for_blur(self, volume_blur_px: float) -> LossWeights:
+        growth = min(volume_blur_px, MOST_IN_FOCUS_BLUR_PX) / IN_FOCUS_BLUR_PX
+        return replace(self, in_focus=self.in_focus * growth**self.in_focus_growth)
 
 
 @dataclass(frozen=True)
@@ -134,6 +143,8 @@ def focus_loss(
     if weights.outlines:
         blurred = 1 - in_focus_weight(coc_px)[:, None]
         terms["outlines"] = (blurred[..., 1:] * dx.square()).mean() + (blurred[..., 1:, :] * dy.square()).mean()
+    if weights.black:
+        terms["black"] = (picture * (target < BLACK)).mean()
     if weights.focus_absolute:
         terms["focus_absolute"] = centred_error.abs().mean()
     chosen = slice(None) if perceptual_planes is None else perceptual_planes

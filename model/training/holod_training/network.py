@@ -3,17 +3,46 @@
 from __future__ import annotations
 
 import math
+from typing import Self
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from holod_training.config import NetworkConfig
+from holod_training.config import NetworkConfig, OpticsConfig
 
 TAPS = 9
 OUTPUT_CHANNELS = 6
 # Of a correcting net's output, in the field.
 CORRECTION_SHARE = 0.3
+# What a network is told of a bench and a pupil: `Conditions`.
+CONDITIONS = 2
+REFERENCE_BLUR_PX = 40.0
+REFERENCE_FRESNEL_PX2 = 40.0
+
+
+def conditions(config: NetworkConfig, optics: OpticsConfig, pupil_mm: Tensor) -> Tensor:
+    """What networks are told of a bench and pupils [N], [N, CONDITIONS]: log2 of the blur over the depth volume in
+    panel pixels, of 40; and log2 of λ·(f/p)²·V, the mean of three colours, of 40. Both within what was trained."""
+
+    def told(value: Tensor, trained: tuple[float, float], reference: float) -> Tensor:
+        return torch.log2(value.clamp(*trained) / reference)
+
+    fresnel_px2 = sum(optics.volume_fresnel_px2) / len(optics.volume_fresnel_px2)
+    blur = told(pupil_mm * optics.volume_blur_px(1.0), config.trained.volume_blur_px, REFERENCE_BLUR_PX)
+    fresnel = torch.full_like(pupil_mm, fresnel_px2)
+    return torch.stack((blur, told(fresnel, config.trained.volume_fresnel_px2, REFERENCE_FRESNEL_PX2)), dim=1)
+
+
+def blur_scale(told: Tensor) -> Tensor:
+    """What D − ½ is multiplied by in the maps that networks are told, [N, 1, 1, 1]: by 3 at 40 px of blur, by 2 more
+    for each doubling. Near the pupil in millimetres on the default bench."""
+    return (3 + 2 * told[:, 0])[:, None, None, None]
+
+
+def constant_maps(told: Tensor, like: Tensor) -> Tensor:
+    """`conditions` as maps [N, CONDITIONS, h, w] of the size of `like` [N, C, h, w]."""
+    return told[:, :, None, None].expand(-1, -1, *like.shape[2:])
 
 
 def gather_conv3x3(x: Tensor, offsets: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -74,10 +103,10 @@ class ScaledConvolution(nn.Module):
 
 
 class Modulation(nn.ModuleList):
-    """g_m: the pupil to γ and β of a `ScaledConvolution`, a small MLP."""
+    """g_m: `conditions` to γ and β of a `ScaledConvolution`, a small MLP."""
 
     def __init__(self, channels: int, outputs: int, hidden: int, leaky_slope: float) -> None:
-        first, second = nn.Linear(1, hidden), nn.Linear(hidden, hidden)
+        first, second = nn.Linear(CONDITIONS, hidden), nn.Linear(hidden, hidden)
         last = nn.Linear(hidden, outputs * channels + outputs)
         # A weaker start leaves the conditioning on the pupil asleep.
         nn.init.normal_(last.weight, std=0.5 / math.sqrt(hidden))
@@ -86,10 +115,9 @@ class Modulation(nn.ModuleList):
         self.outputs = outputs
         self.leaky_slope = leaky_slope
 
-    def forward(self, pupil_mm: Tensor) -> tuple[Tensor, Tensor]:
-        """pupil_mm [N] -> gamma [N, O, C], beta [N, O]."""
-        h = ((pupil_mm - 3) / 2)[:, None]
-        h = F.leaky_relu(self[0](h), self.leaky_slope)
+    def forward(self, told: Tensor) -> tuple[Tensor, Tensor]:
+        """told [N, CONDITIONS] -> gamma [N, O, C], beta [N, O]."""
+        h = F.leaky_relu(self[0](told), self.leaky_slope)
         h = F.leaky_relu(self[1](h), self.leaky_slope)
         h = self[2](h)
         return h[:, : -self.outputs].view(len(h), self.outputs, -1), h[:, -self.outputs :]
@@ -112,11 +140,11 @@ class DeformableLayer(nn.Module):
                 parameter.mul_(share)
         return predictor
 
-    def offsets(self, x: Tensor, pupil_mm: Tensor) -> Tensor:
+    def offsets(self, x: Tensor, told: Tensor) -> Tensor:
         return self.offset(x)
 
-    def forward(self, x: Tensor, pupil_mm: Tensor) -> Tensor:
-        return deformable_conv3x3(x, self.offsets(x, pupil_mm), self.weight, self.bias)
+    def forward(self, x: Tensor, told: Tensor) -> Tensor:
+        return deformable_conv3x3(x, self.offsets(x, told), self.weight, self.bias)
 
 
 class AdjustableLayer(DeformableLayer):
@@ -129,8 +157,8 @@ class AdjustableLayer(DeformableLayer):
     def offset_predictor(self, channels: int) -> nn.Module:
         return ScaledConvolution(channels, 2 * TAPS, 0.5 / math.sqrt(9 * channels))
 
-    def offsets(self, x: Tensor, pupil_mm: Tensor) -> Tensor:
-        return self.offset(x, *self.modulation(pupil_mm))
+    def offsets(self, x: Tensor, told: Tensor) -> Tensor:
+        return self.offset(x, *self.modulation(told))
 
 
 class ModulatedLayer(nn.Module):
@@ -141,8 +169,8 @@ class ModulatedLayer(nn.Module):
         self.kernel = ScaledConvolution(channels, channels, 1 / math.sqrt(9 * channels))
         self.modulation = Modulation(channels, channels, hidden, leaky_slope)
 
-    def forward(self, x: Tensor, pupil_mm: Tensor) -> Tensor:
-        return self.kernel(x, *self.modulation(pupil_mm))
+    def forward(self, x: Tensor, told: Tensor) -> Tensor:
+        return self.kernel(x, *self.modulation(told))
 
 
 class Trunk(nn.ModuleList):
@@ -182,8 +210,8 @@ class Trunk(nn.ModuleList):
         super().__init__([first, *body, last])
         self.leaky_slope = config.leaky_slope
 
-    def forward(self, x: Tensor, pupil_mm: Tensor, trace: dict[str, Tensor] | None = None) -> Tensor:
-        """x [N, inputs, h, w], pupil_mm [N] -> [N, outputs, h, w].
+    def forward(self, x: Tensor, told: Tensor, trace: dict[str, Tensor] | None = None) -> Tensor:
+        """x [N, inputs, h, w], told [N, CONDITIONS] -> [N, outputs, h, w].
 
         `trace`, where given, receives every layer's output map (after its activation) under `layer_{i}` and a
         deformable layer's offsets under `offsets_{i}`.
@@ -194,8 +222,8 @@ class Trunk(nn.ModuleList):
             if isinstance(layer, nn.Conv2d):
                 return layer(x)
             if trace is not None and isinstance(layer, DeformableLayer):
-                trace[f"offsets_{index}"] = layer.offsets(x, pupil_mm)
-            return layer(x, pupil_mm)
+                trace[f"offsets_{index}"] = layer.offsets(x, told)
+            return layer(x, told)
 
         def activate(index: int, x: Tensor) -> Tensor:
             x = F.leaky_relu(x, self.leaky_slope)
@@ -214,10 +242,10 @@ class Trunk(nn.ModuleList):
         return out
 
 
-def run_traced(name: str, trunk: Trunk, x: Tensor, pupil_mm: Tensor, trace: dict[str, Tensor] | None) -> Tensor:
+def run_traced(name: str, trunk: Trunk, x: Tensor, told: Tensor, trace: dict[str, Tensor] | None) -> Tensor:
     """The trunk's output in the precision of `x`; `trace`, where given, receives its input and layers as `NAME.…`."""
     inner: dict[str, Tensor] | None = None if trace is None else {"encoded": x}
-    out: Tensor = trunk(x, pupil_mm, inner)
+    out: Tensor = trunk(x, told, inner)
     if trace is not None and inner is not None:
         trace.update({f"{name}.{key}": value for key, value in inner.items()})
     return out.to(x.dtype)
@@ -256,7 +284,8 @@ def corrected(field: Tensor, residual: Tensor) -> Tensor:
 
 
 class FieldNetwork(nn.Module):
-    """What all variants are: (amplitude, depth, pupil_mm) to complex fields on the grid of `config`.
+    """What all variants are: (amplitude, depth, pupil_mm) to complex fields on the grid of `config`, for the bench that
+    `on` chose: the default one before it is called.
 
     amplitude [N, 3, H, W] (focal-stack: [N, planes, 3, H, W]), depth [N, H, W] 0 far .. 1 near, pupil_mm [N] ->
     [N, 3, h, w], or [N, frames, 3, h, w] for time-multiplexed frames. half-band: h = H/2, samples at block centres.
@@ -265,6 +294,15 @@ class FieldNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
+        self.optics = OpticsConfig()
+
+    def on(self, optics: OpticsConfig) -> Self:
+        """The same network, which from now on makes fields for this bench."""
+        self.optics = optics
+        return self
+
+    def told(self, pupil_mm: Tensor) -> Tensor:
+        return conditions(self.config, self.optics, pupil_mm)
 
 
 class DirectNetwork(FieldNetwork):
@@ -275,7 +313,7 @@ class DirectNetwork(FieldNetwork):
         spatial = 4 + config.pupil_inputs + config.blur_input
         self.layers = Trunk(
             config,
-            inputs=spatial * (4 if config.grid == "half-band" else 1) + config.pupil_inputs,
+            inputs=spatial * (4 if config.grid == "half-band" else 1) + CONDITIONS * config.pupil_inputs,
             outputs=OUTPUT_CHANNELS * config.frames,
             layers=config.layers,
             dilations=config.dilations,
@@ -283,32 +321,30 @@ class DirectNetwork(FieldNetwork):
             last_share=0.1,
         )
 
-    def encode(self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor) -> Tensor:
-        """amplitude [N, 3, H, W], depth [N, H, W], pupil_mm [N] -> the first layer's input."""
-        s = pupil_mm[:, None, None, None]
+    def encode(self, amplitude: Tensor, depth: Tensor, told: Tensor) -> Tensor:
+        """amplitude [N, 3, H, W], depth [N, H, W], told [N, CONDITIONS] -> the first layer's input."""
         centred = depth[:, None] - 0.5
+        blur = blur_scale(told)
         maps = [amplitude, centred]
         if self.config.pupil_inputs:
-            maps.append(s * centred)
+            maps.append(blur * centred)
         if self.config.blur_input:
-            # s·∫|D − t| dt over all focuses t of the volume.
-            maps.append(s * (centred.square() + 0.25))
+            # ∫|D − t| dt over all focuses t of the volume.
+            maps.append(blur * (centred.square() + 0.25))
         x = torch.cat(maps, dim=1)
         if self.config.grid == "half-band":
             x = F.pixel_unshuffle(x, 2)
-        if not self.config.pupil_inputs:
-            return x
-        constant = ((s - 3) / 2).expand(-1, 1, *x.shape[2:])
-        return torch.cat((x, constant), dim=1)
+        return torch.cat((x, constant_maps(told, x)), dim=1) if self.config.pupil_inputs else x
 
     def forward(
         self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor, trace: dict[str, Tensor] | None = None
     ) -> Tensor:
         """`trace`, where given, receives the first layer's input under `encoded` and what `Trunk` puts there."""
-        x = self.encode(amplitude, depth, pupil_mm)
+        told = self.told(pupil_mm)
+        x = self.encode(amplitude, depth, told)
         if trace is not None:
             trace["encoded"] = x
-        out = self.layers(x, pupil_mm, trace).to(amplitude.dtype)
+        out = self.layers(x, told, trace).to(amplitude.dtype)
         base = F.avg_pool2d(amplitude, 2) if self.config.grid == "half-band" else amplitude
         frames = [
             torch.complex(base + part[:, :3], part[:, 3:].contiguous()) for part in out.split(OUTPUT_CHANNELS, dim=1)

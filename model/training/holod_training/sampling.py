@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from holod_training.config import OpticsConfig
+from holod_training.benches import BenchDraw
 from holod_training.depth_faults import faulty_depth
 from holod_training.shards import Shard, ShardError, Stack, same_focuses, shard_names
 
@@ -58,12 +58,11 @@ def augment(stack: Stack, config: AugmentConfig, rng: np.random.Generator) -> St
         mixed = mix @ light.reshape(*light.shape[:-2], -1) + offset
         return mixed.reshape(light.shape)
 
-    return Stack(
+    return replace(
+        stack,
         image=recoloured(turned(stack.image)).clamp_min(0).contiguous(),
         depth=turned(stack.depth).contiguous(),
         target=recoloured(turned(stack.target)).contiguous(),
-        pupil_mm=stack.pupil_mm,
-        focus_dpt=stack.focus_dpt,
     )
 
 
@@ -75,23 +74,24 @@ class Sampler:
     def __init__(
         self,
         folder: Path,
-        optics: OpticsConfig,
         crop: int,
         seed: int,
         rank: int,
         augment_config: AugmentConfig,
         specialists_mm: tuple[float, ...] = (),
         focus_dpt: tuple[float, ...] = (),
+        benches: BenchDraw | None = None,
     ) -> None:
-        """Where `focus_dpt` is given, shards with other focuses are refused."""
+        """Where `focus_dpt` is given, shards with other focuses are refused. With `benches` each crop is shown on a
+        bench of its own, drawn for its blur, in place of that which its scene was rendered for."""
         self.folder = folder
-        self.optics = optics
         self.crop = crop
         self.seed = seed
         self.rank = rank
         self.augment_config = augment_config
         self.specialists_mm = specialists_mm
         self.focus_dpt = focus_dpt
+        self.benches = benches
         self.shards: list[Shard] = []
 
     @property
@@ -107,7 +107,6 @@ class Sampler:
 
     def _open(self, name: str) -> Shard:
         shard = Shard(self.folder / name)
-        shard.require_optics(self.optics)
         if min(shard.height, shard.width) < self.crop:
             raise ShardError(f"{shard.path}: {shard.width}x{shard.height} pixels, smaller than the crop {self.crop}")
         if self.focus_dpt and not same_focuses(shard.focus_dpt, self.focus_dpt):
@@ -127,6 +126,8 @@ class Sampler:
         for _ in range(count):
             shard = self.shards[rng.integers(len(self.shards))]
             pupil = self._pupil(shard, rng)
+            if self.benches:
+                shard = shard.on(self.benches.draw(shard.optics.volume_blur_px(shard.pupils_mm[pupil]), rng))
             top = int(rng.integers(shard.height - self.crop + 1))
             left = int(rng.integers(shard.width - self.crop + 1))
             drawn.append(augment(shard.read(pupil, top, left, self.crop), self.augment_config, rng))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from holod_training.config import OpticsConfig
 
 SHARD_FORMAT = "holod-scene-1"
 TRAINING_KIND = "train"
+DEFAULT_BENCH = OpticsConfig()
 
 
 class ShardError(ValueError):
@@ -27,12 +29,26 @@ def same_focuses(found: Sequence[float], expected: Sequence[float]) -> bool:
     return len(found) == len(expected) and all(abs(f - e) <= 1e-3 for f, e in zip(found, expected, strict=True))
 
 
+def _same_bench(one: OpticsConfig, other: OpticsConfig) -> bool:
+    """Whether benches are alike to 1e-4 in everything."""
+    pairs = zip((*one.wavelengths_nm, one.pixel_pitch_um), (*other.wavelengths_nm, other.pixel_pitch_um), strict=True)
+    return _same_blur(one, other) and all(abs(a - b) <= 1e-4 * b for a, b in pairs)
+
+
+def _same_blur(one: OpticsConfig, other: OpticsConfig) -> bool:
+    """Whether benches have the same depth volume and pixel angle to 1e-4: then pupils and focuses stay as written."""
+    keys = ("depth_far_dpt", "depth_near_dpt", "pixel_angle_rad")
+    pairs = [(getattr(one, key), getattr(other, key)) for key in keys]
+    return all(abs(a - b) <= 1e-4 * max(1e-3, abs(b)) for a, b in pairs)
+
+
 @dataclass(frozen=True)
 class Stack:
     """One scene, or a crop of it, for one pupil. Linear light, 0 .. 1; float32.
 
-    image [3, H, W] all in focus; depth [H, W], 0 far .. 1 near; target [K, 3, H, W] thin-lens pictures;
-    faulty_depth [H, W] what a poor depth camera would give the network in place of `depth`, where that was drawn.
+    image [3, H, W] all in focus; depth [H, W], 0 far .. 1 near; target [K, 3, H, W] thin-lens pictures; pupil_mm and
+    focus_dpt are those that show it on the bench of `optics`; faulty_depth [H, W] what a poor depth camera would give
+    the network in place of `depth`, where that was drawn.
     """
 
     image: Tensor
@@ -41,6 +57,7 @@ class Stack:
     pupil_mm: float
     focus_dpt: tuple[float, ...]
     faulty_depth: Tensor | None = None
+    optics: OpticsConfig = DEFAULT_BENCH
 
     @property
     def given_depth(self) -> Tensor:
@@ -56,20 +73,25 @@ class Stack:
         return replace(self, target=self.target[focuses], focus_dpt=self.focus_dpt[focuses])
 
     def to(self, device: torch.device | str) -> Stack:
-        return Stack(
-            self.image.to(device),
-            self.depth.to(device),
-            self.target.to(device),
-            self.pupil_mm,
-            self.focus_dpt,
-            None if self.faulty_depth is None else self.faulty_depth.to(device),
+        return replace(
+            self,
+            image=self.image.to(device),
+            depth=self.depth.to(device),
+            target=self.target.to(device),
+            faulty_depth=None if self.faulty_depth is None else self.faulty_depth.to(device),
         )
 
 
 class Shard:
-    """A checked header; pixels are read (memory-mapped) only when they are asked for."""
+    """A checked header; pixels are read (memory-mapped) only when they are asked for.
+
+    How a scene blurs depends on the circle of confusion over its depth volume in pixels, s·(f/p)·V, and on nothing else
+    of a bench: so one file shows what eyes see on every bench, with other pupils and focuses. `pupils_mm` and
+    `focus_dpt` are those of the bench of `optics`.
+    """
 
     def __init__(self, path: Path) -> None:
+        """Raises ShardError for a file that is no complete shard."""
         self.path = path
         try:
             with safe_open(path, framework="pt") as file:
@@ -81,9 +103,7 @@ class Shard:
                 self.index = int(self._number(metadata, "index"))
                 self.pupils_mm: tuple[float, ...] = tuple(self._list(metadata, "pupils_mm"))
                 self.focus_dpt: tuple[float, ...] = tuple(self._list(metadata, "focus_dpt"))
-                self.far_dpt = self._number(metadata, "far_dpt")
-                self.near_dpt = self._number(metadata, "near_dpt")
-                self.pixel_angle_rad = self._number(metadata, "pixel_angle_rad")
+                self.optics = self._rendered_for(metadata)
                 for index in range(len(self.pupils_mm)):
                     self._check_shape(file, names, f"stack_{index}", [len(self.focus_dpt), 3, self.height, self.width])
                 self._check_shape(file, names, "depth", [self.height, self.width])
@@ -134,13 +154,38 @@ class Shard:
             raise ShardError(f"{self.path}: metadata {key} = {value!r}, expected a list of numbers")
         return [float(v) for v in value]
 
-    def require_optics(self, optics: OpticsConfig) -> None:
-        """Raises ShardError where the shard was rendered for another bench."""
-        found = (self.far_dpt, self.near_dpt, self.pixel_angle_rad)
-        expected = (optics.depth_far_dpt, optics.depth_near_dpt, optics.pixel_angle_rad)
-        for name, f, e in zip(("far_dpt", "near_dpt", "pixel_angle_rad"), found, expected, strict=True):
-            if abs(f - e) > 1e-4 * max(1e-3, abs(e)):
-                raise ShardError(f"{self.path}: {name} is {f}, the network is made for {e}")
+    def _rendered_for(self, metadata: dict[str, str]) -> OpticsConfig:
+        """The bench on which the scene is seen. Older shards do not name wavelengths and pitch, which do
+        not matter to a scene: they have those of the default bench."""
+        far, near, angle = (self._number(metadata, key) for key in ("far_dpt", "near_dpt", "pixel_angle_rad"))
+        pitch_um = self._number(metadata, "pixel_pitch_um") if "pixel_pitch_um" in metadata else None
+        wavelengths_nm = self._list(metadata, "wavelengths_nm") if "wavelengths_nm" in metadata else None
+        if wavelengths_nm and (len(wavelengths_nm) != 3 or not all(200 < nm < 2000 for nm in wavelengths_nm)):
+            raise ShardError(
+                f"{self.path}: metadata wavelengths_nm = {wavelengths_nm}, expected those of three colours in "
+                "nanometres"
+            )
+        if not (0 <= far < near and angle > 0):
+            raise ShardError(
+                f"{self.path}: metadata far_dpt = {far}, near_dpt = {near}, pixel_angle_rad = {angle}, expected a "
+                "depth volume of rising dioptres and an angle above 0"
+            )
+        pitch_um = pitch_um or DEFAULT_BENCH.pixel_pitch_um
+        red, green, blue = wavelengths_nm or DEFAULT_BENCH.wavelengths_nm
+        # As the rig had it: the angle is what is left of a division.
+        focal_length_mm = float(f"{pitch_um * 1e-3 / angle:.9g}")
+        found = OpticsConfig((red, green, blue), pitch_um, focal_length_mm, far, near)
+        return DEFAULT_BENCH if _same_bench(found, DEFAULT_BENCH) else found
+
+    def on(self, optics: OpticsConfig) -> Shard:
+        """The same scene with the pupils and focuses that show its pictures on another bench."""
+        theirs, volume = self.optics, self.optics.volume_dpt
+        shard = copy.copy(self)
+        shard.optics = optics
+        if not _same_blur(theirs, optics):
+            shard.pupils_mm = tuple(optics.pupil_mm(theirs.volume_blur_px(mm)) for mm in self.pupils_mm)
+            shard.focus_dpt = tuple(optics.dioptres((dpt - theirs.depth_far_dpt) / volume) for dpt in self.focus_dpt)
+        return shard
 
     def nearest_pupil(self, pupil_mm: float) -> int:
         """The index of the stack whose pupil is nearest."""
@@ -157,6 +202,7 @@ class Shard:
                 target=file.get_slice(f"stack_{pupil_index}")[:, :, rows, columns].float(),
                 pupil_mm=self.pupils_mm[pupil_index],
                 focus_dpt=self.focus_dpt,
+                optics=self.optics,
             )
 
     def stacks(self) -> Iterator[Stack]:
@@ -171,18 +217,25 @@ def shard_names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.glob("scene_*.safetensors"))
 
 
-def open_shards(folder: Path, optics: OpticsConfig, limit: int | None = None) -> list[Shard]:
-    """Every shard of a folder, headers checked. Raises ShardError for none at all and for the first bad one."""
+def open_shards(folder: Path, optics: OpticsConfig | None = None, limit: int | None = None) -> list[Shard]:
+    """Every shard of a folder, headers checked, as they look on a bench; without one on that which they were
+    rendered for. Raises ShardError for none at all, for the first bad one and for shards of several benches."""
     names = shard_names(folder)[:limit]
     if not names:
         raise ShardError(f"{folder}: no scene_*.safetensors in it; write some with `holod-scenes generate`")
     shards = [Shard(folder / name) for name in names]
-    for shard in shards:
-        shard.require_optics(optics)
+    if optics is not None:
+        return [shard.on(optics) for shard in shards]
+    for shard in shards[1:]:
+        if not _same_bench(shard.optics, shards[0].optics):
+            raise ShardError(
+                f"{shard.path}: rendered for {shard.optics}, but {shards[0].path.name} for {shards[0].optics}; "
+                "expected one bench: keep the scenes of each in a folder of its own"
+            )
     return shards
 
 
-def open_held_out(folder: Path, optics: OpticsConfig, limit: int | None = None) -> list[Shard]:
+def open_held_out(folder: Path, optics: OpticsConfig | None = None, limit: int | None = None) -> list[Shard]:
     """`open_shards` for judging. Raises ShardError for a scene that was rendered for training, too."""
     shards = open_shards(folder, optics, limit)
     for shard in shards:

@@ -15,7 +15,7 @@ import time
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
+from holod_training.benches import BenchDraw
 from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.curves import plot_curves
 from holod_training.expected_stack import with_refined_stack
@@ -56,6 +57,8 @@ class TrainConfig:
     steps: int
     validation: str | None = None
     network: NetworkConfig = field(default_factory=NetworkConfig)
+    # Each crop on a random bench; without, on that which its scene was rendered for.
+    benches: BenchDraw | None = None
     loss: LossWeights = field(default_factory=LossWeights)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     crop: int = 160
@@ -104,13 +107,11 @@ def full_eye(optics: OpticsConfig, height: int, width: int, focus_dpt: tuple[flo
     return Eye(optics, height, width, list(focus_dpt), device)
 
 
-def see(config: NetworkConfig, field_: Tensor, stack: Stack, pupil_mm: float) -> Tensor:
+def see(field_: Tensor, stack: Stack) -> Tensor:
     """The pictures [K, 3, H, W] that the stack's focuses show of one network output [3, h, w]."""
     height, width = stack.depth.shape
-    if config.grid == "half-band":
-        eye = half_band_eye(config.optics, height, width, stack.focus_dpt, str(field_.device))
-        return eye.look(field_, pupil_mm)
-    return full_eye(config.optics, height, width, stack.focus_dpt, str(field_.device)).look(field_, pupil_mm)
+    eye_of = full_eye if field_.shape[-2:] == stack.depth.shape else half_band_eye
+    return eye_of(stack.optics, height, width, stack.focus_dpt, str(field_.device)).look(field_, stack.pupil_mm)
 
 
 class Run:
@@ -126,6 +127,10 @@ class Run:
         torch.manual_seed(config.seed)
         if config.precision not in PRECISIONS:
             raise TrainingError(f"precision: found {config.precision!r}, expected one of {', '.join(PRECISIONS)}")
+        if config.benches and config.batch != 1:
+            raise TrainingError(
+                f"batch: found {config.batch}, expected 1 where each crop has a bench of its own; torchrun adds more"
+            )
         if config.optimizer not in OPTIMIZERS:
             raise TrainingError(f"optimizer: found {config.optimizer!r}, expected one of {', '.join(OPTIMIZERS)}")
         self.network = build_network(config.network).to(device)
@@ -142,22 +147,22 @@ class Run:
             self.trained = DistributedDataParallel(self.network, find_unused_parameters=unused)
         self.sampler = Sampler(
             Path(config.shards),
-            config.network.optics,
             config.crop,
             config.seed,
             rank,
             config.augment,
             config.network.specialists_mm,
             self._focal_stack_planes(),
+            config.benches,
         )
         self.validation: list[Shard] = []
         if config.validation:
-            self.validation = open_held_out(Path(config.validation), config.network.optics, config.validation_scenes)
+            self.validation = open_held_out(Path(config.validation), limit=config.validation_scenes)
 
     def _focal_stack_planes(self) -> tuple[float, ...]:
         """The focuses that a network or teacher takes as its input."""
         networks = [self.config.network, *([self.teacher.config] if self.teacher else [])]
-        return next((tuple(planes_dpt(n)) for n in networks if n.architecture == "focal-stack"), ())
+        return next((tuple(planes_dpt(n, OpticsConfig())) for n in networks if n.architecture == "focal-stack"), ())
 
     def _initial_weights(self, path: Path) -> dict[str, Tensor]:
         source = load_weights(path)
@@ -173,14 +178,13 @@ class Run:
         return found
 
     def _teacher(self, path: Path) -> FieldNetwork:
-        teacher = load_weights(path).to(self.device).requires_grad_(False)
-        if teacher.config.optics != self.config.network.optics:
-            raise TrainingError(f"{path}: the teacher was trained for other optics than this run's")
-        return teacher
+        return load_weights(path).to(self.device).requires_grad_(False)
 
     def _fields(self, network: nn.Module, config: NetworkConfig, stacks: list[Stack], depths: list[Tensor]) -> Tensor:
         pupils = torch.tensor([s.pupil_mm for s in stacks], device=self.device)
         amplitudes = torch.stack([network_amplitude(config, s) for s in stacks])
+        bare = network.module if isinstance(network, DistributedDataParallel) else network
+        cast(FieldNetwork, bare).on(stacks[0].optics)
         return network(amplitudes, torch.stack(depths), pupils)
 
     def _precision(self) -> torch.autocast:
@@ -194,7 +198,7 @@ class Run:
         with torch.no_grad(), self._precision():
             fields = self._fields(self.teacher, config, stacks, [s.depth for s in stacks])
         with torch.no_grad():
-            return [see(config, f, stack, stack.pupil_mm) for f, stack in zip(fields, stacks, strict=True)]
+            return [see(f, stack) for f, stack in zip(fields, stacks, strict=True)]
 
     def _perceptual_planes(self, stacks: list[Stack]) -> list[Tensor]:
         """Five random planes of each stack."""
@@ -217,14 +221,14 @@ class Run:
         parts = []
         for index, (low, stack) in enumerate(zip(fields, stacks, strict=True)):
             border = config.border_px
-            picture = see(config.network, low, stack, stack.pupil_mm)
-            blur = coc_px(config.network.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
+            picture = see(low, stack)
+            blur = coc_px(stack.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
             parts.append(
                 focus_loss(
                     inner(picture, border),
                     inner(stack.target, border),
                     inner(blur, border),
-                    config.loss.for_pupil(stack.pupil_mm),
+                    config.loss.for_blur(stack.optics.volume_blur_px(stack.pupil_mm)),
                     perceptual_planes[index],
                     self.lpips,
                     inner(taught[index], border) if taught else None,
@@ -264,8 +268,8 @@ class Run:
             for shard in self.validation:
                 stack = shard.read(shard.nearest_pupil(wanted)).to(self.device)
                 low = self._fields(self.average, self.config.network, [stack], [stack.depth])[0]
-                picture = see(self.config.network, low, stack, stack.pupil_mm)
-                blur = coc_px(self.config.network.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
+                picture = see(low, stack)
+                blur = coc_px(stack.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
                 judged.append(judge(picture, stack.target, blur, self.config.validation_border_px, with_ssim=False))
             result[str(wanted)] = Judgement.mean(judged).known() | self.flat_oracle_db.get(str(wanted), {})
         return result

@@ -67,6 +67,9 @@ VARIANTS: dict[str, NetworkConfig] = {
     "expected-stack-small": _EXPECTED_SMALL,
     "refined-stack": replace(_EXPECTED, refined_stack=True),
     "refined-stack-small": replace(_EXPECTED_SMALL, refined_stack=True),
+    "refined-stack-fast": replace(
+        _EXPECTED_SMALL, channels=16, adjustable_layers=(), correction_layers=4, depth_layers=4, refined_stack=True
+    ),
     "focal-stack": replace(_HALF_BAND, architecture="focal-stack"),
     "focal-stack-feedback": replace(_HALF_BAND_LAYERED, architecture="focal-stack", feedback=True),
     "ablation-three-plain": replace(

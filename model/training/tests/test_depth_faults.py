@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from holod_training.config import OpticsConfig
 from holod_training.depth_faults import STEPS, coarse_steps, faulty_depth, fill_holes, holes, move_edges
 from holod_training.sampling import AugmentConfig, Sampler
 
 
 def sampler(shards: Path, chance: float) -> Sampler:
-    made = Sampler(shards, OpticsConfig(), 32, 1, 0, AugmentConfig(faulty_depth=chance))
+    made = Sampler(shards, 32, 1, 0, AugmentConfig(faulty_depth=chance))
     made.rescan()
     return made
 

@@ -78,7 +78,7 @@ def test_the_field_takes_its_share_before_the_second_net_sees_it(refined: bool) 
         real, imaginary = trace["correction.layer_9"].split(3, dim=1)
     torch.testing.assert_close(found, field + 0.3 * torch.complex(real, imaginary), rtol=1e-5, atol=1e-5)
     told, seen = trace["lighting.encoded"], trace["correction.encoded"]
-    torch.testing.assert_close(told[:, 21:], told_amplitude.flatten(1, 2) - 0.4)
+    torch.testing.assert_close(told[:, 22:], told_amplitude.flatten(1, 2) - 0.4)
     expected = (field.real, field.imag, told, change.real, change.imag, lack.flatten(1, 2))
     torch.testing.assert_close(seen, torch.cat(expected, dim=1))
     assert change.abs().mean() > 0.005

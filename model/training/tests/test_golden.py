@@ -22,13 +22,13 @@ NETS = ("lighting", "correction")
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("golden")
-    write_golden(out, WEIGHTS / "standard.safetensors", WEIGHTS / "small.safetensors")
+    write_golden(out, *(WEIGHTS / f"{name}.safetensors" for name in ("standard", "small", "fast")))
     return out
 
 
 @pytest.mark.parametrize(
     "name",
-    [*NARROW, "expected-stack-shipped", "expected-stack-shipped-small"],
+    [*NARROW, *(f"expected-stack-shipped{suffix}" for suffix in ("", "-small", "-fast"))],
 )
 def test_committed_vectors_are_what_the_script_writes(name: str, written: Path) -> None:
     files = [f"{name}.safetensors"] + ([f"{name}.weights.safetensors"] if "narrow" in name else [])
@@ -62,16 +62,17 @@ def test_no_stage_of_the_expected_stack_vectors_is_idle() -> None:
     found = load_file(COMMITTED / "expected-stack-narrow.safetensors")
     carried, low = (torch.complex(*found[name]) for name in ("carried", "low"))
     seen = found["correction.encoded"]
-    assert seen.shape == (81, 8, 12) and found["lighting.encoded"].shape == (45, 8, 12)
-    torch.testing.assert_close(seen[6:51], found["lighting.encoded"])
-    field, change = (torch.complex(*seen[first : first + 6].split(3)) for first in (0, 51))
+    assert seen.shape == (82, 8, 12) and found["lighting.encoded"].shape == (46, 8, 12)
+    torch.testing.assert_close(seen[6:52], found["lighting.encoded"])
+    field, change = (torch.complex(*seen[first : first + 6].split(3)) for first in (0, 52))
     torch.testing.assert_close(field, carried + 0.5 * change, rtol=1e-5, atol=1e-5)
     residual = torch.complex(*found["correction.layer_3"].split(3))
     torch.testing.assert_close(low, field + 0.3 * residual, rtol=1e-5, atol=1e-5)
-    for part in (carried, change, seen[57:], residual):
+    for part in (carried, change, seen[58:], residual):
         assert part.abs().mean() > 0.01
     assert found["pupil_mm"].item() == pytest.approx(1.6)
-    inside = pupil_mask(OpticsConfig(), *(frequencies(n, 16e-6) for n in (12, 8)), 1.6)
+    optics = NARROW["expected-stack-narrow"].optics
+    inside = pupil_mask(optics, *(frequencies(n, 2 * optics.pitch_m) for n in (12, 8)), 1.6)
     spectrum = torch.fft.fft2(change).abs()
     assert not inside.all() and spectrum[~inside].max() < 1e-5 * spectrum.max()
 
@@ -79,7 +80,7 @@ def test_no_stage_of_the_expected_stack_vectors_is_idle() -> None:
 def test_the_vectors_of_a_refined_stack_change_what_is_told() -> None:
     found = load_file(COMMITTED / "expected-stack-narrow-refined.safetensors")
     assert found["lighting.layer_3"].shape == (56, 8, 12)
-    refined = found["lighting.encoded"][21:] + 0.4 + 0.3 * found["lighting.layer_3"][32:]
+    refined = found["lighting.encoded"][22:] + 0.4 + 0.3 * found["lighting.layer_3"][32:]
     assert 0.05 < (refined < 0).float().mean() < 0.5
 
 

@@ -3,6 +3,7 @@ import dataclasses
 import pytest
 import torch
 
+from holod_training.config import OpticsConfig
 from holod_training.loss import LossWeights, focus_loss, in_focus_weight, inner, sharpness_weight, structure_loss
 
 TERMS = ("absolute", "gradient", "squared", "focus", "in_focus", "outlines", "focus_absolute", "structure", "teacher")
@@ -143,12 +144,35 @@ def test_the_in_focus_term_sees_sharp_pixels_only() -> None:
 
 def test_a_wider_pupil_weighs_the_in_focus_term_more_and_no_other() -> None:
     weights = LossWeights(in_focus=7.0, squared=3.0)
-    assert weights.for_pupil(2.0) == weights
-    assert weights.for_pupil(4.0) == dataclasses.replace(weights, in_focus=14.0)
-    assert weights.for_pupil(1.0).in_focus == pytest.approx(3.5)
+
+    def of_pupil(of: LossWeights, mm: float) -> LossWeights:
+        return of.for_blur(OpticsConfig().volume_blur_px(mm))
+
+    assert of_pupil(weights, 2.0).in_focus == pytest.approx(7.0)
+    assert dataclasses.replace(of_pupil(weights, 4.0), in_focus=7.0) == weights
+    assert [of_pupil(weights, s).in_focus for s in (1.0, 4.0, 5.0, 8.0)] == pytest.approx([3.5, 14.0, 17.5, 17.5])
     squarely = dataclasses.replace(weights, in_focus_growth=2.0)
-    assert [squarely.for_pupil(s).in_focus for s in (1.0, 2.0, 4.0)] == pytest.approx([1.75, 7.0, 28.0])
-    assert LossWeights().for_pupil(5.0) == LossWeights()
+    assert [of_pupil(squarely, s).in_focus for s in (1.0, 2.0, 4.0)] == pytest.approx([1.75, 7.0, 28.0])
+    assert of_pupil(LossWeights(), 5.0) == LossWeights()
+
+
+def test_light_where_there_should_be_none_is_weighed_and_no_other() -> None:
+    """What is seen of it is its light, not its square: a thousandth of white everywhere counts as a thousandth."""
+    target = torch.zeros(2, 3, 16, 16)
+    target[..., 8:] = 0.5
+    picture, coc = target + 1e-3, torch.full((2, 16, 16), 9.0)
+    loss = focus_loss(picture, target, coc, LossWeights(black=30.0))
+    assert loss.terms["black"] == pytest.approx(0.5e-3, rel=1e-4)
+    assert float(loss.total - focus_loss(picture, target, coc, LossWeights()).total) == pytest.approx(0.015, rel=1e-3)
+    brighter = target.clone()
+    brighter[..., 8:] += 0.1
+    assert focus_loss(brighter, target, coc, LossWeights(black=30.0)).terms["black"] == 0
+    assert "black" not in loss_terms(LossWeights())
+
+
+def loss_terms(weights: LossWeights) -> set[str]:
+    ones = torch.ones(1, 3, 16, 16)
+    return set(focus_loss(ones, ones, torch.ones(1, 16, 16), weights).terms)
 
 
 def test_inner_leaves_out_the_border_on_every_side() -> None:

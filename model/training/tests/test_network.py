@@ -1,10 +1,12 @@
+import math
+
 import pytest
 import torch
 import torch.nn.functional as F
 from torchvision.ops import deform_conv2d
 
-from holod_training.config import ConfigError, NetworkConfig
-from holod_training.network import AdjustableLayer, DirectNetwork, gather_conv3x3
+from holod_training.config import ConfigError, NetworkConfig, OpticsConfig, TrainedRange
+from holod_training.network import AdjustableLayer, DirectNetwork, conditions, gather_conv3x3
 
 
 def random_layer(dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
@@ -41,10 +43,10 @@ def test_adjustable_layer_is_algorithm_1() -> None:
     torch.manual_seed(1)
     layer = AdjustableLayer(channels=6, hidden=5, leaky_slope=0.1).double()
     x = torch.randn(2, 6, 9, 10, dtype=torch.float64)
-    pupils = torch.tensor([1.5, 4.0], dtype=torch.float64)
-    together = layer(x, pupils)
+    told = torch.tensor([[-0.7, 0.2], [0.5, -1.0]], dtype=torch.float64)
+    together = layer(x, told)
     for n in range(2):
-        h = (pupils[n : n + 1] - 3) / 2
+        h = told[n]
         for index, linear in enumerate(layer.modulation):
             h = F.linear(h, linear.weight, linear.bias)
             h = F.leaky_relu(h, 0.1) if index < 2 else h
@@ -64,17 +66,19 @@ def test_direct_network_written_out(grid: str) -> None:
     a = torch.rand(1, 3, 12, 16, dtype=torch.float64)
     d = torch.rand(1, 12, 16, dtype=torch.float64)
     s = 2.2
-    x = torch.cat((a, d[:, None] - 0.5, s * (d[:, None] - 0.5)), 1)
+    # Pixels of blur between the ends of 0 to 20/7 dpt; the mean of λ·(f/p)²·V for 638, 520 and 450 nm.
+    blur, fresnel = math.log2(s * 100 / 7 / 40), math.log2(536e-9 * 5000**2 * 20 / 7 / 40)
+    x = torch.cat((a, d[:, None] - 0.5, (3 + 2 * blur) * (d[:, None] - 0.5)), 1)
     if grid == "half-band":
         blocks = x.view(1, 5, 6, 2, 8, 2).permute(0, 1, 3, 5, 2, 4)
         x = blocks.reshape(1, 20, 6, 8)
-    x = torch.cat((x, torch.full_like(x[:, :1], (s - 3) / 2)), 1)
+    x = torch.cat((x, torch.full_like(x[:, :1], blur), torch.full_like(x[:, :1], fresnel)), 1)
 
     def conv(i: int, t: torch.Tensor) -> torch.Tensor:
         weight, bias = state[f"layers.{i}.weight"], state[f"layers.{i}.bias"]
         if i != 3:
             return F.conv2d(t, weight, bias, padding=1)
-        offsets = network.layers[3].offsets(t, torch.tensor([s], dtype=torch.float64))
+        offsets = network.layers[3].offsets(t, torch.tensor([[blur, fresnel]], dtype=torch.float64))
         return deform_conv2d(t, offsets, weight, bias, padding=1)
 
     h = F.leaky_relu(conv(0, x), 0.1)
@@ -86,6 +90,22 @@ def test_direct_network_written_out(grid: str) -> None:
         network(a, d, torch.tensor([s], dtype=torch.float64)),
         torch.complex(base + out[:, :3], out[:, 3:].contiguous()),
     )
+
+
+def test_benches_that_are_alike_in_pixels_are_told_alike() -> None:
+    """6.4 um with 32 mm has the same pixels a dioptre as 8 um with 40 mm; what lies outside the trained range is told
+    as its nearest end."""
+    config = NetworkConfig(trained=TrainedRange((20.0, 80.0), (10.0, 160.0)))
+    pupils = torch.tensor([1.0, 2.8, 5.0, 8.0], dtype=torch.float64)
+    default = conditions(config, OpticsConfig(), pupils)
+    torch.testing.assert_close(default[:, 0].exp2() * 40, torch.tensor([20.0, 40, 500 / 7, 80]).double())
+    torch.testing.assert_close(default[:, 1].exp2() * 40, torch.full((4,), 268 / 7).double())
+    alike = conditions(config, OpticsConfig(pixel_pitch_um=6.4, eyepiece_focal_length_mm=32.0), pupils)
+    torch.testing.assert_close(alike, default)
+    gaea = conditions(config, OpticsConfig(pixel_pitch_um=3.74), pupils)
+    assert (gaea[:, 1] == 2.0).all() and (gaea[:, 0] > default[:, 0])[1:3].all()
+    with pytest.raises(AssertionError):
+        torch.testing.assert_close(conditions(config, OpticsConfig(pixel_pitch_um=7.0), pupils), default)
 
 
 def test_pupil_changes_the_field() -> None:

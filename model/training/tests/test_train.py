@@ -12,8 +12,9 @@ from safetensors.torch import load_file
 from test_lpips import random_lpips_files
 
 from holod_training import cli
+from holod_training.benches import ANY_BENCH, BenchDraw
 from holod_training.cli import main
-from holod_training.config import ConfigError, NetworkConfig
+from holod_training.config import ConfigError, NetworkConfig, OpticsConfig, TrainedRange
 from holod_training.export import WeightsError, load_weights, read_metadata, save_weights
 from holod_training.loss import LossWeights
 from holod_training.network import DirectNetwork
@@ -241,9 +242,8 @@ def test_scenes_may_each_have_their_own_focuses_but_not_for_a_focal_stack(tmp_pa
     assert len({s.focus_dpt for s in stacks}) == 2
     field = torch.polar(torch.rand(3, 24, 24), torch.rand(3, 24, 24))
     for stack in stacks:
-        found = see(TINY, field, stack, 3.0)
-        eye = HalfBandEye(TINY.optics, 48, 48, list(stack.focus_dpt), "cpu")
-        torch.testing.assert_close(found, eye.look(field, 3.0))
+        eye = HalfBandEye(OpticsConfig(), 48, 48, list(stack.focus_dpt), "cpu")
+        torch.testing.assert_close(see(field, stack), eye.look(field, stack.pupil_mm))
     assert torch.isfinite(torch.tensor(run.train_step()["loss"]))
     network = dataclasses.replace(variant("focal-stack-feedback"), channels=4, planes=3)
     with pytest.raises(ShardError, match=r"scene_000000.*focus_dpt is .* expected those .*--planes 3"):
@@ -295,6 +295,33 @@ def test_options_change_the_variant_that_they_name() -> None:
     config = cli._train_config(cli._parser().parse_args([*common, *chosen]))
     assert (config.loss.in_focus, config.loss.in_focus_growth) == (7, 2)
     assert (config.augment.faulty_depth, config.crop) == (0.5, 96)
+    assert config.benches is None and config.network.trained == TrainedRange()
+
+    def benches(*options: str) -> TrainConfig:
+        return cli._train_config(cli._parser().parse_args([*common, *options]))
+
+    assert benches("--benches", "any").network.trained == ANY_BENCH == BenchDraw().trained
+    wide = benches("--benches", "any", "--volume-fresnel-px2", "150,400")
+    assert wide.network.trained == TrainedRange((5.0, 115.0), (150.0, 400.0)) == (wide.benches or BenchDraw()).trained
+    assert benches("--volume-blur-px", "20,250").network.trained.volume_blur_px == (20.0, 250.0)
+    with pytest.raises(ConfigError, match=r"trained\.volume_blur_px: found \[20\.0\], expected two above 0"):
+        benches("--volume-blur-px", "20")
+
+
+def test_each_step_has_a_bench_of_its_own(shards: Path, tmp_path: Path) -> None:
+    """The network makes its field for the bench that the crop was drawn for."""
+    network = dataclasses.replace(TINY, trained=ANY_BENCH)
+    run = Run(tiny(shards, tmp_path / "run", network=network, benches=BenchDraw()), CPU)
+    run.sampler.rescan()
+    seen = []
+    for step in range(3):
+        drawn = run.sampler.draw(step, 1)[0].optics
+        assert torch.isfinite(torch.tensor(run.train_step()["loss"]))
+        assert run.network.optics == drawn
+        seen.append(drawn)
+    assert len(set(seen)) > 1
+    with pytest.raises(TrainingError, match="batch: found 2, expected 1 where each crop has a bench of its own"):
+        Run(tiny(shards, tmp_path / "two", network=network, benches=BenchDraw(), batch=2), CPU)
 
 
 @pytest.mark.usefixtures("no_plots")
@@ -377,7 +404,7 @@ def test_weights_round_trip_and_errors(tmp_path: Path) -> None:
         assert torch.equal(value, back[name])
     network.layers[0] = torch.nn.Conv2d(20, 8, 3, padding=1)
     save_weights(path, network, {}, {})
-    with pytest.raises(WeightsError, match=r"layers\.0\.weight has shape \[8, 20, 3, 3\], expected \[8, 21, 3, 3\]"):
+    with pytest.raises(WeightsError, match=r"layers\.0\.weight has shape \[8, 20, 3, 3\], expected \[8, 22, 3, 3\]"):
         load_weights(path)
     path.write_bytes(b"garbage")
     with pytest.raises(WeightsError, match="not a readable weights file"):

@@ -7,7 +7,7 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from holod_training.config import ConfigError, NetworkConfig, OpticsConfig
+from holod_training.config import ConfigError, NetworkConfig, OpticsConfig, TrainedRange
 from holod_training.costs import operations_per_pixel
 from holod_training.layered import LayeredNetwork, blurred
 from holod_training.metrics import focus_response
@@ -60,20 +60,22 @@ def test_the_table_is_what_it_says() -> None:
     assert variant("half-band-14") == NetworkConfig()
     assert [variant(f"direct-{n}").layers for n in (26, 20, 14)] == [26, 20, 14]
     for name, parameters in (
-        ("layered-8", 103_882),
-        ("half-band-layered", 178_818),
-        ("half-band-layered-small", 68_698),
-        ("half-band-layered-small-no-prior", 66_097),
-        ("expected-stack", 202_732),
-        ("expected-stack-small", 81_012),
-        ("refined-stack", 209_668),
-        ("refined-stack-small", 84_918),
-        ("focal-stack-feedback", 214_819),
+        ("layered-8", 104_346),
+        ("half-band-layered", 179_426),
+        ("half-band-layered-small", 69_162),
+        ("half-band-layered-small-no-prior", 66_561),
+        ("expected-stack", 203_340),
+        ("expected-stack-small", 81_476),
+        ("refined-stack", 210_276),
+        ("refined-stack-small", 85_382),
+        ("refined-stack-fast", 27_492),
+        ("focal-stack-feedback", 215_427),
     ):
         assert sum(p.numel() for p in build_network(variant(name)).parameters()) == parameters, name
     # Two operations a weight of each 3x3 convolution, the offsets' too; taps and FFTs are a few per cent.
     convolutions = 2 * 9 * (9 * 24 + 10 * 24 * 24 + 24 * 24 + 24 * 18 + 12 * 24 + 4 * 24 * 24 + 24 * 6)
     assert convolutions < operations_per_pixel(variant("layered-8")) < 1.06 * convolutions
+    assert operations_per_pixel(variant("refined-stack-fast")) < 15_000
     with pytest.raises(ConfigError, match="variant: found 'layered-5'"):
         variant("layered-5")
 
@@ -92,7 +94,8 @@ def test_configs_that_do_not_fit_say_which_key() -> None:
         ({"architecture": "layered", "refined_stack": True}, "refined_stack: found True, expected false"),
         ({"architecture": "expected-stack", "feedback": True}, "feedback: found True, expected false"),
         ({"architecture": "focal-stack", "grid": "full", "feedback": True}, "feedback: .* a half-band `focal-stack`"),
-        ({"pupil_range_mm": (1.0, 21.0)}, "pupil_range_mm: found .* expected two above 0 and up to 20 mm"),
+        ({"trained": TrainedRange((9.0, 5.0))}, r"trained\.volume_blur_px: found \[9.0, 5.0\], expected two"),
+        ({"trained": TrainedRange((5.0, 9.0), (0.0, 5.0))}, r"trained\.volume_fresnel_px2: .* two above 0"),
         ({"specialists_mm": (3.0, 2.0)}, "specialists_mm: .* rising order"),
     ):
         with pytest.raises(ConfigError, match=message):
@@ -146,7 +149,7 @@ def test_dilations_reach_the_convolutions() -> None:
 def test_blur_input_is_the_mean_blur_over_all_focuses() -> None:
     network = DirectNetwork(NetworkConfig(grid="full", layers=4, adjustable_layers=(1,), blur_input=True))
     depth = torch.linspace(0, 1, 16).expand(1, 16, 16)
-    encoded = network.encode(torch.zeros(1, 3, 16, 16), depth, torch.tensor([4.0]))
+    encoded = network.encode(torch.zeros(1, 3, 16, 16), depth, torch.tensor([[0.5, 0.1]]))
     focus = (torch.arange(1000) + 0.5) / 1000
     mean = 4 * (depth[0, 0, :, None] - focus).abs().mean(dim=1)
     torch.testing.assert_close(encoded[0, 5, 0], mean, rtol=1e-4, atol=1e-4)
@@ -325,7 +328,7 @@ def test_a_focal_stack_of_one_open_plane_is_its_image_carried_back(grid: str) ->
         # Of each plane's four outputs the last is the mask.
         network.layers[-1].bias.copy_(torch.tensor([0.0, 0, 0, -90, 0, 0, 0, 90, 0, 0, 0, -90]))
         field = network(amplitude, depth, torch.tensor([3.0]))[0]
-    optics, shown = config.optics, amplitude[0, 1]
+    optics, shown = network.optics, amplitude[0, 1]
     if grid == "half-band":
         shown = torch.nn.functional.avg_pool2d(shown, 2)
         optics = dataclasses.replace(optics, pixel_pitch_um=16.0)
@@ -358,7 +361,7 @@ def test_a_fed_back_focal_stack_of_one_open_plane_lacks_nothing_there() -> None:
     lack = told[0, -9:].unflatten(0, (3, 3))
     assert lack[1].abs().max() < 1e-3 < 0.01 < lack[0].abs().mean()
     wanted = torch.nn.functional.avg_pool2d(amplitude[0, 1].square(), 2).sqrt()
-    optics = dataclasses.replace(config.optics, pixel_pitch_um=16.0)
+    optics = dataclasses.replace(network.optics, pixel_pitch_um=16.0)
     back = propagate(wanted.to(torch.complex64), optics, -optics.distance_m(optics.dioptres(0.5)))
     change = torch.complex(*told[0, -15:-9].split(3))
     assert change.abs().mean() > 1e-3

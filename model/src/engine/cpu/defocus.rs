@@ -1,8 +1,6 @@
 //! What an eye should see at each depth layer, as far as a picture and its depth tell.
 
-use std::f64::consts::PI;
-
-use holod_calibration::Resolution;
+use holod_calibration::{DisplayGeometry, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
@@ -10,14 +8,11 @@ use super::blocks::Blocks;
 use super::depth_layers::DepthLayers;
 use super::maps::{BLOCK, SCALE, sample_pitch};
 use crate::RgbdFrame;
+use crate::engine::disc::DiscTable;
 use crate::optics::{PlanesFft, signed_bin};
 use crate::simd::{InstructionSet, Simd, Task};
 use crate::weights::{MOST_DEPTH_LAYERS, NetworkConfig};
 
-/// Entries of the disc's table to a unit of its argument: linear interpolation is then within 5e-7.
-const TABLE_DENSITY: f64 = 256.0;
-/// The largest argument of that table: beyond it a disc's spectrum is below 1e-5.
-const LARGEST_ARGUMENT: f64 = 4096.0;
 /// The least share of a white scene's light by which what is seen is divided.
 const LEAST_COVER: f32 = 0.02;
 /// Bins of a spectrum that are blurred together.
@@ -29,10 +24,7 @@ const PAIRS: usize = 2;
 /// scene. Blur is circular, and no layer hides another. Nothing is allocated after `new`.
 pub(super) struct Defocus {
     size: Resolution,
-    /// 2·J1(x)/x, the spectrum of a disc, at x·TABLE_DENSITY.
-    disc_table: Vec<f32>,
-    /// π times the diameter of the disc that blurs a layer's neighbour, samples to a millimetre of pupil.
-    argument_per_mm: f64,
+    disc: DiscTable,
     /// The pupil that `discs` is for.
     pupil_mm: f32,
     /// [width, layers, height], over the number of samples: spectra of the discs between layers that are 0, 1, 2, .. apart.
@@ -46,23 +38,13 @@ pub(super) struct Defocus {
 }
 
 impl Defocus {
-    pub(super) fn new(config: &NetworkConfig, size: Resolution, set: InstructionSet) -> Self {
+    pub(super) fn new(config: &NetworkConfig, bench: &DisplayGeometry, size: Resolution, set: InstructionSet) -> Self {
         let count = config.depth_layers;
-        let optics = config.optics.geometry(size);
-        let layer_dpt = (optics.depth_near.0 - optics.depth_far.0) / count as f64;
-        let sample_rad = sample_pitch(&optics).0 / optics.eyepiece_focal_length.0;
-        let argument_per_mm = PI * layer_dpt * 1e-3 / sample_rad;
-        // No frequency is higher than half a cycle a sample each way.
-        let largest = argument_per_mm * f64::from(config.pupil_range_mm[1]) * count as f64 * 0.5f64.sqrt();
-        let disc = |entry: usize| match entry as f64 / TABLE_DENSITY {
-            0.0 => 1.0,
-            x => (2.0 * libm::j1(x) / x) as f32,
-        };
+        let sample_rad = sample_pitch(bench).0 / bench.eyepiece_focal_length.0;
         let plane = || vec![Complex32::ZERO; size.pixels()];
         Self {
             size,
-            disc_table: (0..(largest.min(LARGEST_ARGUMENT) * TABLE_DENSITY) as usize + 2).map(disc).collect(),
-            argument_per_mm,
+            disc: DiscTable::new(bench, count, sample_rad),
             pupil_mm: f32::NAN,
             discs: vec![0.0; count * size.pixels()],
             present: vec![false; count],
@@ -89,18 +71,18 @@ impl Defocus {
         if self.pupil_mm == pupil_mm {
             return;
         }
-        let Self { size: Resolution { width, height }, disc_table, argument_per_mm, discs, .. } = self;
+        let Self { size: Resolution { width, height }, disc, discs, .. } = self;
         let (width, height, norm) = (*width, *height, 1.0 / (*width * *height) as f32);
-        let scale = *argument_per_mm * f64::from(pupil_mm) * TABLE_DENSITY;
+        let scale = disc.entries_per_mm * f64::from(pupil_mm);
         let count = discs.len() / (width * height);
         discs.par_chunks_exact_mut(count * height).enumerate().for_each(|(kx, discs)| {
             let fx = signed_bin(kx, width) as f64 / width as f64;
-            for (apart, disc) in discs.chunks_exact_mut(height).enumerate() {
-                for (ky, value) in disc.iter_mut().enumerate() {
+            for (apart, values) in discs.chunks_exact_mut(height).enumerate() {
+                for (ky, value) in values.iter_mut().enumerate() {
                     let fy = signed_bin(ky, height) as f64 / height as f64;
                     let entry = scale * apart as f64 * (fx * fx + fy * fy).sqrt();
                     let (below, share) = (entry as usize, entry.fract() as f32);
-                    *value = match disc_table.get(below..below + 2) {
+                    *value = match disc.values.get(below..below + 2) {
                         Some(&[low, high]) => norm * (low + share * (high - low)),
                         _ => 0.0,
                     };

@@ -1,6 +1,6 @@
 //! Layers of the depth volume: which of them each pixel lies in, and how light goes between them and the SLM plane.
 
-use holod_calibration::{Colour, Metres, Resolution};
+use holod_calibration::{Colour, DisplayGeometry, Metres, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
@@ -27,13 +27,12 @@ pub(super) struct DepthLayers {
 }
 
 impl DepthLayers {
-    pub(super) fn new(config: &NetworkConfig, size: Resolution) -> Self {
-        let optics = config.optics.geometry(size);
-        let far_m = optics.image_distance(optics.depth_far).0;
-        let near_m = optics.image_distance(optics.depth_near).0;
+    pub(super) fn new(config: &NetworkConfig, bench: &DisplayGeometry, size: Resolution) -> Self {
+        let far_m = bench.image_distance(bench.depth_far).0;
+        let near_m = bench.image_distance(bench.depth_near).0;
         let layer_m = (near_m - far_m) / config.depth_layers as f64;
         let tables = |u_m: f64| {
-            let table = |colour| transfer_table(optics.wavelengths[colour], sample_pitch(&optics), size, Metres(u_m));
+            let table = |colour| transfer_table(bench.wavelengths[colour], sample_pitch(bench), size, Metres(u_m));
             Colour::ALL.map(table)
         };
         Self {

@@ -11,7 +11,7 @@ use super::network::StageList;
 use super::stage::{Buffers, Job, MapId, Maps, Stage, frame_bytes, plane_bytes};
 use super::trunk::Trunk;
 use crate::simd::InstructionSet;
-use crate::weights::{Layer, NetworkConfig};
+use crate::weights::{CONDITIONS, Layer, NetworkConfig};
 
 /// For frames of `resolution`.
 pub(super) fn stages(
@@ -58,7 +58,8 @@ impl Stage<BlockMeans> for Encode {
     }
 
     fn run(&mut self, buffers: &mut Buffers<BlockMeans>, job: &mut Job<'_>) {
-        let (input, Job { frame, pupil_mm, .. }) = (&mut buffers.maps[self.input], job);
+        let (input, Job { frame, conditions, .. }) = (&mut buffers.maps[self.input], job);
+        let (told, blur_scale) = (conditions.told().map(|value| value as f32), conditions.blur_scale() as f32);
         let (pixels, block) = (frame.resolution.pixels(), self.scale * self.scale);
         let blocks = Blocks { frame: frame.resolution, scale: self.scale };
         let (map_width, stride) = (input.width, input.stride);
@@ -71,9 +72,9 @@ impl Stage<BlockMeans> for Encode {
                     }
                     let depth = frame.depth_normalised[source] - 0.5;
                     channels[3 * block + corner] = depth;
-                    channels[4 * block + corner] = *pupil_mm * depth;
+                    channels[4 * block + corner] = blur_scale * depth;
                 }
-                channels[5 * block] = (*pupil_mm - 3.0) / 2.0;
+                channels[5 * block..][..CONDITIONS].copy_from_slice(&told);
             }
         });
         let input = &*input;

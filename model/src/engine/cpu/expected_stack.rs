@@ -1,7 +1,7 @@
 //! The `expected-stack` family: one net lights every depth layer for what an eye should see there, physics carries that
 //! light to the SLM plane and feeds back what it lacks, a second net corrects it.
 
-use holod_calibration::{Colour, Resolution};
+use holod_calibration::{Colour, DisplayGeometry, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
@@ -27,6 +27,7 @@ const REFINED_SHARE: f32 = 0.3;
 /// For frames of `resolution`; the layers are those of the first and of the second net.
 pub(super) fn stages(
     config: &NetworkConfig,
+    bench: &DisplayGeometry,
     [lighting, correction]: [&[Layer]; 2],
     feedback: Feedback,
     resolution: Resolution,
@@ -37,7 +38,7 @@ pub(super) fn stages(
     let lighting = Trunk::new(&mut maps, "lighting ", lighting, config.leaky_slope);
     let correction = Trunk::new(&mut maps, "correction ", correction, config.leaky_slope);
     let volume = DepthVolume {
-        layers: DepthLayers::new(config, size),
+        layers: DepthLayers::new(config, bench, size),
         stack: vec![0.0; 3 * config.depth_layers * size.pixels()],
         sum: vec![Complex32::ZERO; size.pixels()],
     };
@@ -48,7 +49,7 @@ pub(super) fn stages(
             bytes: frame_bytes(resolution)
                 + layer_numbers
                 + plane_bytes(stack_planes + 2 * (MAPS + stack_planes), size),
-            defocus: Defocus::new(config, size, set),
+            defocus: Defocus::new(config, bench, size, set),
             lighting_input: lighting.input,
             correction_input: correction.input,
         })
@@ -67,7 +68,7 @@ pub(super) fn stages(
         .then(FeedBack {
             // The field before and after, for the net the field and its change, and the stack and what is lacking of it.
             bytes: layer_numbers + plane_bytes(4 * OUTPUT_CHANNELS + 2 * stack_planes, size),
-            feedback: LayerFeedback::new(config, feedback, size),
+            feedback: LayerFeedback::new(config, bench, feedback, size),
             correction_input: correction.input,
         })
         .then_each(correction.layers)
@@ -116,7 +117,7 @@ impl Stage<DepthVolume> for Expect {
         let pixels = maps.size.pixels();
         for (input, first) in [(self.lighting_input, 0), (self.correction_input, FIRST_MAP)] {
             let map = &mut maps[input];
-            write_maps(map, first, job.frame, job.pupil_mm);
+            write_maps(map, first, job.frame, job.conditions);
             map.write_planes(first + MAPS, stack.chunks_exact(pixels), |amplitude| amplitude - 0.4);
         }
     }

@@ -17,7 +17,7 @@ const DARK: f32 = 1e-6;
 /// in focus weighs more. The layers change one another too; the second net mends that. Nothing is allocated after `new`.
 pub(super) struct LayerFeedback {
     parameters: Feedback,
-    optics: DisplayGeometry,
+    bench: DisplayGeometry,
     size: Resolution,
     /// From the SLM plane to the farthest layer: transposed spectra of each colour, over the number of samples.
     to_farthest: [Vec<Complex32>; 3],
@@ -28,15 +28,14 @@ pub(super) struct LayerFeedback {
 }
 
 impl LayerFeedback {
-    pub(super) fn new(config: &NetworkConfig, parameters: Feedback, size: Resolution) -> Self {
-        let optics = config.optics.geometry(size);
-        let far_m = optics.image_distance(optics.depth_far).0;
-        let volume_m = optics.image_distance(optics.depth_near).0 - far_m;
+    pub(super) fn new(config: &NetworkConfig, bench: &DisplayGeometry, parameters: Feedback, size: Resolution) -> Self {
+        let far_m = bench.image_distance(bench.depth_far).0;
+        let volume_m = bench.image_distance(bench.depth_near).0 - far_m;
         let farthest = Metres(far_m + volume_m / (2 * config.depth_layers) as f64);
-        let table = |colour| transfer_table(optics.wavelengths[colour], sample_pitch(&optics), size, farthest);
+        let table = |colour| transfer_table(bench.wavelengths[colour], sample_pitch(bench), size, farthest);
         Self {
             parameters,
-            optics,
+            bench: *bench,
             size,
             to_farthest: Colour::ALL.map(table),
             reaching: vec![Complex32::ZERO; size.pixels()],
@@ -47,12 +46,12 @@ impl LayerFeedback {
     /// Changes the field that `layers` carried by what it lacks of the amplitudes `stack` [layers, 3, height, width],
     /// which become that lack. `sum` is scratch for a spectrum.
     pub(super) fn run(&mut self, layers: &mut DepthLayers, stack: &mut [f32], sum: &mut [Complex32], pupil_mm: f32) {
-        let Self { parameters: Feedback { share, sharpness }, optics, size, to_farthest, reaching, change } = self;
+        let Self { parameters: Feedback { share, sharpness }, bench, size, to_farthest, reaching, change } = self;
         let pixels = size.pixels();
         let mean = 1.0 / layers.numbers().len() as f32;
         for colour in Colour::ALL {
             let plane = colour.index() * pixels..(colour.index() + 1) * pixels;
-            let pupil = Pupil::new(optics, colour, pupil_mm, *size);
+            let pupil = Pupil::new(bench, colour, pupil_mm, *size);
             // Until the last step it holds the light at one layer after another.
             let change = &mut change[plane.clone()];
 
@@ -89,11 +88,10 @@ struct Pupil {
 }
 
 impl Pupil {
-    fn new(optics: &DisplayGeometry, colour: Colour, pupil_mm: f32, size: Resolution) -> Self {
+    fn new(bench: &DisplayGeometry, colour: Colour, pupil_mm: f32, size: Resolution) -> Self {
         Self {
-            radius_per_m: 0.5e-3 * f64::from(pupil_mm)
-                / (optics.wavelengths[colour].0 * optics.eyepiece_focal_length.0),
-            bin_per_m: [size.width, size.height].map(|bins| 1.0 / (bins as f64 * sample_pitch(optics).0)),
+            radius_per_m: 0.5e-3 * f64::from(pupil_mm) / (bench.wavelengths[colour].0 * bench.eyepiece_focal_length.0),
+            bin_per_m: [size.width, size.height].map(|bins| 1.0 / (bins as f64 * sample_pitch(bench).0)),
             size,
         }
     }

@@ -7,13 +7,14 @@ use rayon::prelude::*;
 use super::blocks::{Blocks, scale_of};
 use super::feature_map::FeatureMap;
 use crate::RgbdFrame;
-use crate::weights::{Grid, OUTPUT_CHANNELS};
+use crate::conditions::Conditions;
+use crate::weights::{CONDITIONS, Grid, OUTPUT_CHANNELS};
 
 pub(super) const SCALE: usize = scale_of(Grid::HalfBand);
 /// Panel pixels to a sample of the grid.
 pub(super) const BLOCK: usize = SCALE * SCALE;
-/// Amplitude, two depth maps, each four times, and the pupil.
-pub(super) const MAPS: usize = 5 * BLOCK + 1;
+/// Amplitude and two depth maps, each four times, and what is told of bench and pupil.
+pub(super) const MAPS: usize = 5 * BLOCK + CONDITIONS;
 /// Where the second net's input has the maps: after the field.
 pub(super) const FIRST_MAP: usize = OUTPUT_CHANNELS;
 /// Pixels whose channels stay in the first-level cache while one plane after another is read or written.
@@ -22,15 +23,15 @@ pub(super) const RUN_PX: usize = 16;
 const CORRECTION_SHARE: f32 = 0.3;
 
 /// The distance between the centres of neighbouring samples of the grid.
-pub(super) fn sample_pitch(optics: &DisplayGeometry) -> Metres {
-    Metres(SCALE as f64 * optics.pixel_pitch.0)
+pub(super) fn sample_pitch(bench: &DisplayGeometry) -> Metres {
+    Metres(SCALE as f64 * bench.pixel_pitch.0)
 }
 
-/// Writes what a net is told of a frame to the channels of `map` from `first` on.
-pub(super) fn write_maps(map: &mut FeatureMap, first: usize, frame: &RgbdFrame, pupil_mm: f32) {
+/// Writes what a net is told of a frame, bench and pupil to the channels of `map` from `first` on.
+pub(super) fn write_maps(map: &mut FeatureMap, first: usize, frame: &RgbdFrame, conditions: Conditions) {
     let blocks = Blocks { frame: frame.resolution, scale: SCALE };
     let (columns, stride, pixels) = (map.width, map.stride, frame.resolution.pixels());
-    let pupil = (pupil_mm - 2.5) / 2.0;
+    let (told, blur_scale) = (conditions.told().map(|value| value as f32), conditions.blur_scale() as f32);
     map.rows_mut().enumerate().for_each(|(y, row)| {
         for (x, channels) in row[stride..][..columns * stride].chunks_exact_mut(stride).enumerate() {
             let maps = &mut channels[first..][..MAPS];
@@ -41,9 +42,9 @@ pub(super) fn write_maps(map: &mut FeatureMap, first: usize, frame: &RgbdFrame, 
                 }
                 let centred = frame.depth_normalised[source] - 0.5;
                 maps[3 * BLOCK + corner] = 2.0 * centred;
-                maps[4 * BLOCK + corner] = centred * pupil_mm;
+                maps[4 * BLOCK + corner] = centred * blur_scale;
             }
-            maps[5 * BLOCK] = pupil;
+            maps[5 * BLOCK..].copy_from_slice(&told);
         }
     });
 }

@@ -19,10 +19,10 @@ mod stage;
 pub(super) mod tests;
 mod trunk;
 
-use holod_calibration::{PupilDiameter, Resolution};
+use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
 
 use self::network::Network;
-use crate::engine::{EngineError, StageTimings};
+use crate::engine::{EngineError, StageTimings, check_pupil};
 use crate::simd::InstructionSet;
 use crate::{ComplexHologram, RgbdFrame, Weights};
 
@@ -37,25 +37,26 @@ pub struct CpuEngine {
 }
 
 impl CpuEngine {
-    /// An engine for frames of `resolution`, which may be odd.
+    /// An engine for frames of `resolution`, which may be odd, on the optics of `bench`, whose own resolution does not
+    /// matter.
     ///
     /// # Errors
     /// [`EngineError::Empty`].
-    pub fn new(weights: &Weights, resolution: Resolution) -> Result<Self, EngineError> {
+    pub fn new(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) -> Result<Self, EngineError> {
         if resolution.pixels() == 0 {
             return Err(EngineError::Empty { resolution });
         }
         let set = InstructionSet::best();
-        Ok(Self { network: Network::new(weights, resolution, set), resolution, set })
+        Ok(Self { network: Network::new(weights, bench, resolution, set), resolution, set })
     }
 
     /// Writes the hologram of `frame` for an eye with `pupil` to `hologram`. Does not allocate in a
     /// [`WorkerPool`](crate::WorkerPool).
     ///
-    /// A pupil outside the range that the weights were trained for is taken as the nearest one inside.
+    /// Of a pupil beyond those that the weights were trained for, the network is told the nearest; blur and stop are its own.
     ///
     /// # Errors
-    /// [`EngineError`] for buffers of another size than the engine's, and a pupil that is no positive length.
+    /// [`EngineError`] for buffers of another size than the engine's, and a pupil that is none.
     pub fn render(
         &mut self,
         frame: &RgbdFrame,
@@ -67,9 +68,7 @@ impl CpuEngine {
                 return Err(EngineError::Resolution { what, found, expected: self.resolution });
             }
         }
-        if !(pupil.mm() > 0.0 && pupil.mm().is_finite()) {
-            return Err(EngineError::Pupil { pupil_mm: pupil.mm() });
-        }
+        check_pupil(pupil)?;
         self.network.render(frame, pupil, hologram);
         Ok(())
     }

@@ -2,10 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use holod_calibration::{PupilDiameter, Resolution};
+use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
 
 use super::stage::{Buffers, Job, Maps, Stage};
 use super::{direct, expected_stack};
+use crate::conditions::{Conditions, TrainedRange};
 use crate::engine::{StageTiming, StageTimings};
 use crate::simd::InstructionSet;
 use crate::weights::{Family, Weights};
@@ -13,28 +14,33 @@ use crate::{ComplexHologram, RgbdFrame};
 
 /// Everything that one frame needs; nothing is allocated after `new`.
 pub(super) struct Network {
-    pupil_range_mm: [f32; 2],
+    trained: TrainedRange,
+    bench: DisplayGeometry,
     pub(super) stages: Box<dyn Stages>,
     pub(super) timings: StageTimings,
 }
 
 impl Network {
-    pub(super) fn new(weights: &Weights, resolution: Resolution, set: InstructionSet) -> Self {
+    pub(super) fn new(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution, set: InstructionSet) -> Self {
         let config = &weights.config;
         let stages: Box<dyn Stages> = match &weights.family {
             Family::Direct { layers } => Box::new(direct::stages(config, layers, resolution, set)),
             Family::ExpectedStack { lighting, correction, feedback } => {
-                Box::new(expected_stack::stages(config, [lighting, correction], *feedback, resolution, set))
+                Box::new(expected_stack::stages(config, bench, [lighting, correction], *feedback, resolution, set))
             }
         };
-        Self { pupil_range_mm: config.pupil_range_mm, timings: stages.untimed(), stages }
+        Self { trained: config.trained, bench: *bench, timings: stages.untimed(), stages }
     }
 
-    /// One frame; `frame` and `hologram` have the network's resolution. Pupils outside the range that the weights were
-    /// trained for are taken as the nearest one inside.
+    /// One frame; `frame` and `hologram` have the network's resolution.
     pub(super) fn render(&mut self, frame: &RgbdFrame, pupil: PupilDiameter, hologram: &mut ComplexHologram) {
-        let pupil_mm = pupil.mm().clamp(self.pupil_range_mm[0], self.pupil_range_mm[1]);
-        self.stages.run(&mut Job { frame, pupil_mm, hologram }, &mut self.timings);
+        let conditions = self.conditions(pupil);
+        self.stages.run(&mut Job { frame, pupil_mm: pupil.mm(), conditions, hologram }, &mut self.timings);
+    }
+
+    /// What the network is told of the bench and a pupil.
+    pub(super) fn conditions(&self, pupil: PupilDiameter) -> Conditions {
+        Conditions::of(&self.trained, &self.bench, pupil)
     }
 }
 

@@ -6,14 +6,15 @@ use holod_calibration::Resolution;
 
 use super::conv::Scratch;
 use super::feature_map::FeatureMap;
+use crate::conditions::Conditions;
 use crate::simd::InstructionSet;
 use crate::{ComplexHologram, RgbdFrame};
 
 /// A frame to render; picture and hologram have the network's resolution.
 pub(super) struct Job<'a> {
     pub(super) frame: &'a RgbdFrame,
-    /// In the range that the weights were trained for.
     pub(super) pupil_mm: f32,
+    pub(super) conditions: Conditions,
     pub(super) hologram: &'a mut ComplexHologram,
 }
 

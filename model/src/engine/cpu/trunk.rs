@@ -4,6 +4,7 @@ use super::conv::{Epilogue, PlainConv};
 use super::deformable::DeformableConv;
 use super::feature_map::FeatureMap;
 use super::stage::{Buffers, Job, MapId, Maps, Stage, plane_bytes};
+use crate::conditions::Conditions;
 use crate::engine::modulation::Modulation;
 use crate::weights::{Layer, OFFSET_CHANNELS};
 
@@ -77,7 +78,7 @@ impl<F> Stage<F> for LayerStage {
         match &mut self.conv {
             Conv::Plain(conv) => conv.run(input, scratch, output),
             Conv::Adjustable(adjustable) => {
-                adjustable.modulate(job.pupil_mm);
+                adjustable.modulate(job.conditions);
                 adjustable.offset_conv.run(input, scratch, &mut adjustable.offsets);
                 adjustable.conv.run(input, &adjustable.offsets, output);
             }
@@ -99,7 +100,7 @@ enum Conv {
     Adjustable(Box<AdjustableConv>),
 }
 
-/// A deformable convolution whose offsets are predicted by a plain one, which is modulated for the pupil.
+/// A deformable convolution whose offsets are predicted by a plain one, which is modulated for bench and pupil.
 struct AdjustableConv {
     conv: DeformableConv,
     channels: usize,
@@ -136,10 +137,10 @@ impl Conv {
 }
 
 impl AdjustableConv {
-    /// Sets the offset prediction to that for a pupil, unless it is already.
-    fn modulate(&mut self, pupil_mm: f32) {
+    /// Sets the offset prediction to that for a bench and a pupil, unless it is already.
+    fn modulate(&mut self, conditions: Conditions) {
         let Self { channels, modulation, offset_conv, .. } = self;
-        if let Some(parameters) = modulation.change_to(pupil_mm) {
+        if let Some(parameters) = modulation.change_to(conditions) {
             offset_conv.fill(*channels, parameters.bias.iter().copied(), |output, input, tap| {
                 parameters.weight[(output * *channels + input) * 9 + tap]
             });

@@ -1,6 +1,6 @@
 //! What an eye should see at each depth layer, for `defocus.wgsl`.
 
-use std::f64::consts::PI;
+use holod_calibration::DisplayGeometry;
 
 use super::expected_stack::Grid;
 use super::fft::Lines;
@@ -8,12 +8,9 @@ use super::map::{GROUP, Map};
 use super::maps::{InputChannels, grid_constants, plane_bytes, sample_pitch};
 use super::network::Shared;
 use super::plan::{BufferId, Constant, Plan};
+use crate::engine::disc::DiscTable;
 use crate::weights::NetworkConfig;
 
-/// Entries of the disc's table to a unit of its argument: linear interpolation is then within 5e-7.
-const TABLE_DENSITY: f64 = 256.0;
-/// The largest argument of that table: beyond it a disc's spectrum is below 1e-5.
-const LARGEST_ARGUMENT: f64 = 4096.0;
 /// White with red, and green with blue: real pictures, two to a complex transform.
 const PAIRS: usize = 2;
 /// Foci whose spectra a thread holds at once; where there are more layers, these are transformed anew for each so many.
@@ -31,9 +28,11 @@ pub(super) fn scratch_planes(depth_layers: usize) -> usize {
 
 /// Adds the stage `expected stack`, which writes the layers of each block's corners, the stack, and to `inputs` the frame's
 /// maps and the stack.
+#[expect(clippy::too_many_arguments)]
 pub(super) fn expect(
     plan: &mut Plan,
     config: &NetworkConfig,
+    bench: &DisplayGeometry,
     shared: &Shared,
     grid: &Grid,
     layer_of: BufferId,
@@ -41,19 +40,8 @@ pub(super) fn expect(
     inputs: &Map,
 ) {
     let (count, size) = (config.depth_layers, shared.size);
-    let optics = config.optics.geometry(size);
-    let layer_dpt = (optics.depth_near.0 - optics.depth_far.0) / count as f64;
-    let sample_rad = sample_pitch(&optics).0 / optics.eyepiece_focal_length.0;
-    // π times the diameter of the disc that blurs a layer's neighbour, samples to a millimetre of pupil.
-    let argument_per_mm = PI * layer_dpt * 1e-3 / sample_rad;
-    // No frequency is higher than half a cycle a sample each way.
-    let largest = argument_per_mm * f64::from(config.pupil_range_mm[1]) * count as f64 * 0.5f64.sqrt();
-    let disc = |entry: usize| match entry as f64 / TABLE_DENSITY {
-        0.0 => 1.0,
-        x => (2.0 * libm::j1(x) / x) as f32,
-    };
-    let entries = (largest.min(LARGEST_ARGUMENT) * TABLE_DENSITY) as usize + 2;
-    let disc_table = plan.table("the spectrum of a disc", &(0..entries).map(disc).collect::<Vec<f32>>());
+    let disc = DiscTable::new(bench, count, sample_pitch(bench).0 / bench.eyepiece_focal_length.0);
+    let disc_table = plan.table("the spectrum of a disc", &disc.values);
 
     let foci = count.min(MOST_FOCI);
     let first_part = InputChannels::new(count).field;
@@ -65,8 +53,8 @@ pub(super) fn expect(
             ("FOCI", foci.into()),
             ("FIRST_SEEN", (scratch_planes(count) - PAIRS * count).into()),
             ("FIRST_PART_GROUPS", (first_part / GROUP).into()),
-            ("DISC_ENTRIES", entries.into()),
-            ("ENTRIES_PER_MM", ((argument_per_mm * TABLE_DENSITY) as f32).into()),
+            ("DISC_ENTRIES", disc.values.len().into()),
+            ("ENTRIES_PER_MM", (disc.entries_per_mm as f32).into()),
         ])
         .collect();
     let files = [include_str!("blocks.wgsl"), include_str!("maps.wgsl"), include_str!("defocus.wgsl")];
@@ -92,7 +80,7 @@ pub(super) fn expect(
     let see = stage.dispatch_with(
         shader(&rows, "see"),
         &[rows.turns(), (2, shared.pupil), (4, grid.spectra), (6, stack), (7, inputs.buffer)],
-        [row_groups, 1 + (count - 1).div_ceil(4), 1],
+        [row_groups, 1 + (count - 2).div_ceil(4), 1],
     );
     see.bytes = Some(spectra + 3 * count as u64 * real + (first_part / GROUP - 5) as u64 * group);
 }

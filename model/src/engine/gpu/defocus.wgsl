@@ -10,7 +10,7 @@ const PAIRS = 2u;
 const LEAST_COVER = 0.02f;
 
 @group(0) @binding(1) var<storage, read> frame: array<f32>; // [4, frame height, frame width]
-@group(0) @binding(2) var<storage, read> pupil_mm: f32;
+@group(0) @binding(2) var<storage, read> pupil: Pupil;
 // The depth layers of each block's corners, a byte each, [height, width].
 @group(0) @binding(3) var<storage, read_write> layer_of: array<u32>;
 // Of each layer and pair, [layers, PAIRS, height, width]; what is seen at each focus follows from plane FIRST_SEEN on.
@@ -39,7 +39,7 @@ fn take_layers(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
         if (place < PLACES && y < HEIGHT) {
             let depths = corners(3u, x, y);
             inputs[input_place(3u, x, y)] = 2f * (depths - 0.5f);
-            inputs[input_place(4u, x, y)] = (depths - 0.5f) * pupil_mm;
+            inputs[input_place(4u, x, y)] = (depths - 0.5f) * (3f + 2f * pupil.blur);
             for (var corner = 0u; corner < BLOCK; corner++) {
                 layers[item] |= depth_layer(depths[corner]) << (8u * corner);
             }
@@ -94,7 +94,7 @@ fn blur(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) in
     thread = index;
     let pair = group.y;
     let first_focus = group.z * FOCI;
-    let entries_apart = ENTRIES_PER_MM * pupil_mm;
+    let entries_apart = ENTRIES_PER_MM * pupil.mm;
     var seen: array<array<vec2f, FOCI>, ITEMS>;
     for (var layer = 0u; layer < LAYERS; layer++) {
         for (var item = 0u; item < ITEMS; item++) {
@@ -142,14 +142,15 @@ fn blur(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) in
     }
 }
 
-// Rows of what is seen at the foci 4·b - 3 to 4·b of workgroup b along y: to the stack, and to the channels 12·(b + 1) to
-// 12·(b + 2) of the map. Of the first workgroup's only the last focus is one, and its channels share a group with the pupil.
+// Rows of what is seen at the foci 4·b - 2 to 4·b + 1 of workgroup b along y: to the stack, and to the twelve channels from
+// 12·b + 16 on of the map. The first workgroup has only the last two foci, whose channels share a group with blur and
+// diffraction.
 @compute @workgroup_size(THREADS)
 fn see(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;
     var shown: array<array<vec3f, 4>, ITEMS>;
     for (var slot = 0u; slot < 4u; slot++) {
-        let focus = 4u * group.y + slot - 3u;
+        let focus = 4u * group.y + slot - 2u;
         if (focus < LAYERS) {
             var white_red: array<vec2f, ITEMS>;
             for (var pair = 0u; pair < PAIRS; pair++) {
@@ -191,11 +192,11 @@ fn see(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) ind
             let b = shown[item][1];
             let c = shown[item][2];
             let d = shown[item][3];
-            let pupil = (pupil_mm - 2.5f) / 2f;
-            let channels = array(vec4f(a, b.x), vec4f(b.yz, c.xy), vec4f(select(c.z, pupil, group.y == 0u), d));
+            let told = vec2f(pupil.blur, pupil.fresnel);
+            let channels = array(vec4f(a, b.x), vec4f(select(b.yz, told, group.y == 0u), c.xy), vec4f(c.z, d));
             for (var part = 0u; part < 3u; part++) {
-                let map_group = 3u * (group.y + 1u) + part;
-                if (map_group < FIRST_PART_GROUPS && (part == 2u || group.y > 0u)) {
+                let map_group = 3u * group.y + 4u + part;
+                if (map_group < FIRST_PART_GROUPS && (part > 0u || group.y > 0u)) {
                     inputs[input_place(map_group, x, y)] = channels[part];
                 }
             }

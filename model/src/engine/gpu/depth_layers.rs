@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use holod_calibration::{Colour, Metres};
+use holod_calibration::{Colour, DisplayGeometry, Metres};
 
 use super::expected_stack::Grid;
 use super::fft::Lines;
@@ -33,19 +33,18 @@ pub(super) struct DepthLayers {
 }
 
 impl DepthLayers {
-    pub(super) fn new(plan: &mut Plan, config: &NetworkConfig, shared: &Shared) -> Self {
+    pub(super) fn new(plan: &mut Plan, config: &NetworkConfig, bench: &DisplayGeometry, shared: &Shared) -> Self {
         let (count, size) = (config.depth_layers, shared.size);
-        let optics = config.optics.geometry(size);
-        let far_m = optics.image_distance(optics.depth_far).0;
-        let near_m = optics.image_distance(optics.depth_near).0;
+        let far_m = bench.image_distance(bench.depth_far).0;
+        let near_m = bench.image_distance(bench.depth_near).0;
         let layer_m = (near_m - far_m) / count as f64;
         let samples = size.pixels() as f32;
-        let step = transfer_tables(config, shared, Metres(layer_m)).map(|[re, im]| [re * samples, im * samples]);
+        let step = transfer_tables(bench, shared, Metres(layer_m)).map(|[re, im]| [re * samples, im * samples]);
         let step = plan.table("the way to the next layer", &step.collect::<Vec<_>>());
-        let back: Vec<_> = transfer_tables(config, shared, Metres(layer_m / 2.0 - near_m)).collect();
-        let pitch_m = sample_pitch(&optics).0;
+        let back: Vec<_> = transfer_tables(bench, shared, Metres(layer_m / 2.0 - near_m)).collect();
+        let pitch_m = sample_pitch(bench).0;
         let radius_per_mm =
-            |colour| (0.5e-3 / (optics.wavelengths[colour].0 * optics.eyepiece_focal_length.0) * pitch_m) as f32;
+            |colour| (0.5e-3 / (bench.wavelengths[colour].0 * bench.eyepiece_focal_length.0) * pitch_m) as f32;
         Self {
             count,
             step,
@@ -145,11 +144,10 @@ impl DepthLayers {
 }
 
 /// The transfer functions of all colours over the distance `u`, over the number of samples, [3, height, width].
-pub(super) fn transfer_tables(config: &NetworkConfig, shared: &Shared, u: Metres) -> impl Iterator<Item = [f32; 2]> {
+pub(super) fn transfer_tables(bench: &DisplayGeometry, shared: &Shared, u: Metres) -> impl Iterator<Item = [f32; 2]> {
     let size = shared.size;
-    let optics = config.optics.geometry(size);
     Colour::ALL.into_iter().flat_map(move |colour| {
-        let transposed = transfer_table(optics.wavelengths[colour], sample_pitch(&optics), size, u);
+        let transposed = transfer_table(bench.wavelengths[colour], sample_pitch(bench), size, u);
         let place = move |index: usize| index % size.width * size.height + index / size.width;
         (0..size.pixels()).map(move |index| transposed[place(index)]).map(|value| [value.re, value.im])
     })

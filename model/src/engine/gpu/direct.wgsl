@@ -1,8 +1,15 @@
 // What the `direct` family's net reads, and the field that it gives. After these constants:
 // FRAME_WIDTH, FRAME_HEIGHT, WIDTH, HEIGHT (of the network's grid), SCALE (panel pixels to a sample, each way), MAP_GROUPS, MAP_PITCH.
 
+// The eye's pupil in millimetres, and what networks are told of it and the bench (conditions.rs).
+struct Pupil {
+    mm: f32,
+    blur: f32,
+    fresnel: f32,
+}
+
 @group(0) @binding(0) var<storage, read> frame: array<f32>; // [4, frame height, frame width]
-@group(0) @binding(1) var<storage, read> pupil_mm: f32;
+@group(0) @binding(1) var<storage, read> pupil: Pupil;
 @group(0) @binding(2) var<storage, read_write> map: array<vec4f>;
 @group(0) @binding(3) var<storage, read_write> low: array<vec2f>; // [3, height, width]
 
@@ -25,9 +32,12 @@ fn channel(index: u32, x: u32, y: u32) -> f32 {
         return at(3u, x, y, corner) - 0.5;
     }
     if plane == 4u {
-        return pupil_mm * (at(3u, x, y, corner) - 0.5);
+        return (3.0 + 2.0 * pupil.blur) * (at(3u, x, y, corner) - 0.5);
     }
-    return select(0.0, (pupil_mm - 3.0) / 2.0, index == 5u * BLOCK);
+    if index == 5u * BLOCK {
+        return pupil.blur;
+    }
+    return select(0.0, pupil.fresnel, index == 5u * BLOCK + 1u);
 }
 
 @compute @workgroup_size(64)

@@ -3,15 +3,15 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use holod_calibration::{LevelTables, PupilDiameter};
+use holod_calibration::{DisplayGeometry, LevelTables, PupilDiameter};
 use wgpu::{BufferUsages, QuerySet};
 
 use super::fft::WorkgroupLimits;
 use super::loaded_plan::LoadedPlan;
 use super::map::Precision;
-use super::network::NetworkPlan;
+use super::network::{NetworkPlan, pupil_values};
 use super::plan::{BufferId, Plan, Stage};
-use crate::engine::{EngineError, StageTiming, StageTimings};
+use crate::engine::{EngineError, StageTiming, StageTimings, check_pupil};
 use crate::gpu::{Adapters, Gpu, GpuError};
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
 
@@ -25,8 +25,8 @@ pub struct GpuEngine {
     readback: Readback,
     /// The frame that the device has.
     uploaded: Option<Arc<RgbdFrame>>,
-    /// The pupil that its weights are modulated for.
-    pupil_mm: f32,
+    /// The pupil that it has, and that its weights are modulated for.
+    pupil: Option<PupilDiameter>,
 }
 
 /// What was lost between hologram and levels.
@@ -57,18 +57,29 @@ const COUNTS_BYTES: u64 = 16;
 const TIMESTAMP_BYTES: u64 = 8;
 
 impl GpuEngine {
-    /// An engine for frames of the pattern's size of `tables`, which may be odd.
+    /// An engine for frames of the pattern's size of `tables`, which may be odd, on the optics of `bench`, whose own
+    /// resolution does not matter.
     ///
     /// # Errors
     /// There is no device, it lacks what the network needs at this size, or the size is nothing.
-    pub fn open(weights: &Weights, tables: &LevelTables, adapters: Adapters) -> Result<Self, EngineError> {
+    pub fn open(
+        weights: &Weights,
+        bench: &DisplayGeometry,
+        tables: &LevelTables,
+        adapters: Adapters,
+    ) -> Result<Self, EngineError> {
         let gpu = Gpu::open(adapters)?;
-        Self::on(gpu, weights, tables)
+        Self::on(gpu, weights, bench, tables)
     }
 
-    pub(super) fn on(gpu: Gpu, weights: &Weights, tables: &LevelTables) -> Result<Self, EngineError> {
+    pub(super) fn on(
+        gpu: Gpu,
+        weights: &Weights,
+        bench: &DisplayGeometry,
+        tables: &LevelTables,
+    ) -> Result<Self, EngineError> {
         let limits = WorkgroupLimits { bytes: gpu.workgroup_bytes, threads: gpu.workgroup_threads };
-        let mut network = NetworkPlan::new(weights, tables, Precision::F32, limits)?;
+        let mut network = NetworkPlan::new(weights, bench, tables, Precision::F32, limits)?;
         let plan = &network.plan;
         let loaded = LoadedPlan::new(&gpu, plan)?;
         let timestamps = match gpu.timestamp_ns {
@@ -99,7 +110,7 @@ impl GpuEngine {
             loaded,
             timestamps,
             uploaded: None,
-            pupil_mm: f32::NAN,
+            pupil: None,
         })
     }
 
@@ -110,11 +121,11 @@ impl GpuEngine {
 
     /// Writes the samples of the hologram of `frame` for an eye with `pupil` to `samples`, as the panel takes them.
     ///
-    /// A pupil outside the range that the weights were trained for is taken as the nearest one inside. The frame is sent
-    /// to the device once, however often it is rendered.
+    /// Of a pupil beyond those that the weights were trained for, the network is told the nearest; blur and stop are its
+    /// own. The frame is sent to the device once, however often it is rendered.
     ///
     /// # Errors
-    /// [`EngineError`] for a frame of another size than the engine's, a pupil that is no positive length, and a device
+    /// [`EngineError`] for a frame of another size than the engine's, a pupil that is none, and a device
     /// that fails; that engine will not render again.
     ///
     /// # Panics
@@ -129,9 +140,7 @@ impl GpuEngine {
         if frame.resolution != expected {
             return Err(EngineError::Resolution { what: "the frame", found: frame.resolution, expected });
         }
-        if !(pupil.mm() > 0.0 && pupil.mm().is_finite()) {
-            return Err(EngineError::Pupil { pupil_mm: pupil.mm() });
-        }
+        check_pupil(pupil)?;
         self.send(frame, pupil);
         let submission = self.submit();
         Ok(self.receive(submission, samples)?)
@@ -147,17 +156,17 @@ impl GpuEngine {
             gpu.queue.write_buffer(on_device, amplitude.len() as u64, bytemuck::cast_slice(&frame.depth_normalised));
             *uploaded = Some(Arc::clone(frame));
         }
-        let [least_mm, most_mm] = network.pupil_range_mm;
-        let pupil_mm = pupil.mm().clamp(least_mm, most_mm);
-        if self.pupil_mm != pupil_mm {
-            gpu.queue.write_buffer(loaded.buffer(network.shared.pupil), 0, bytemuck::bytes_of(&pupil_mm));
+        if self.pupil != Some(pupil) {
+            let conditions = network.conditions(pupil);
+            let values = pupil_values(pupil, conditions);
+            gpu.queue.write_buffer(loaded.buffer(network.shared.pupil), 0, bytemuck::bytes_of(&values));
             for modulated in &mut network.modulated {
                 let buffer = loaded.buffer(modulated.buffer);
-                if let Some(parameters) = modulated.change_to(pupil_mm) {
+                if let Some(parameters) = modulated.change_to(conditions) {
                     gpu.queue.write_buffer(buffer, 0, bytemuck::cast_slice(parameters));
                 }
             }
-            self.pupil_mm = pupil_mm;
+            self.pupil = Some(pupil);
         }
     }
 

@@ -1,6 +1,8 @@
 //! The stages of the `expected-stack` family that are no nets: what an eye should see, its light carried to the SLM plane,
 //! and what that lacks fed back.
 
+use holod_calibration::DisplayGeometry;
+
 use super::defocus;
 use super::depth_layers::DepthLayers;
 use super::feedback;
@@ -22,6 +24,7 @@ pub(super) struct Grid {
 /// What these stages have in common.
 pub(crate) struct ExpectedStack<'a> {
     config: &'a NetworkConfig,
+    bench: &'a DisplayGeometry,
     shared: Shared,
     grid: Grid,
     layers: DepthLayers,
@@ -41,6 +44,7 @@ impl<'a> ExpectedStack<'a> {
     pub(crate) fn expect(
         plan: &mut Plan,
         config: &'a NetworkConfig,
+        bench: &'a DisplayGeometry,
         shared: &Shared,
         inputs: &Map,
         limits: WorkgroupLimits,
@@ -52,11 +56,11 @@ impl<'a> ExpectedStack<'a> {
             columns: LineFft::new(plan, size.height, limits)?,
             spectra: plan.buffer::<[f32; 2]>("spectra of the layers", planes * size.pixels()),
         };
-        let layers = DepthLayers::new(plan, config, shared);
+        let layers = DepthLayers::new(plan, config, bench, shared);
         let layer_of = plan.buffer::<u32>("depth layers of the pixels", size.pixels());
         let stack = plan.buffer::<f32>("expected amplitudes", 3 * count * size.pixels());
-        defocus::expect(plan, config, shared, &grid, layer_of, stack, inputs);
-        Ok(Self { config, shared: *shared, grid, layers, layer_of, stack })
+        defocus::expect(plan, config, bench, shared, &grid, layer_of, stack, inputs);
+        Ok(Self { config, bench, shared: *shared, grid, layers, layer_of, stack })
     }
 
     /// Adds the stage `light of the layers`; `outputs` is what the first net gives.
@@ -66,8 +70,8 @@ impl<'a> ExpectedStack<'a> {
 
     /// Adds the stage `feedback`, which writes the other channels of `inputs`.
     pub(crate) fn feed_back(&self, plan: &mut Plan, feedback: Feedback, inputs: &Map) {
-        let Self { config, shared, grid, layers, layer_of, stack } = self;
-        feedback::feed_back(plan, config, feedback, shared, grid, layers, [*layer_of, *stack], inputs);
+        let Self { config, bench, shared, grid, layers, layer_of, stack } = self;
+        feedback::feed_back(plan, config, bench, feedback, shared, grid, layers, [*layer_of, *stack], inputs);
     }
 
     /// [3, height, width]: the field at the SLM plane, after each of the last two stages.
@@ -78,16 +82,19 @@ impl<'a> ExpectedStack<'a> {
 
 #[cfg(test)]
 mod tests {
-    use holod_calibration::Resolution;
+    use holod_calibration::{Metres, PupilDiameter, Resolution};
     use num_complex::Complex64;
     use proptest::prelude::*;
 
     use super::super::map::GROUP;
     use super::super::maps::InputChannels;
+    use super::super::network::pupil_values;
     use super::super::trial::{Trial, complex, largest_difference};
     use super::super::upsample::{self, Low};
     use super::*;
     use crate::RgbdFrame;
+    use crate::conditions::{Conditions, TrainedRange};
+    use crate::engine::cpu::tests::OTHER_BENCH;
     use crate::engine::reference::{self, Trace, Value};
     use crate::weights::tests::{expected_stack_config, random_weights};
     use crate::weights::{Family, Grid, Weights};
@@ -99,6 +106,8 @@ mod tests {
     /// All stages but the nets, whose maps are written from outside.
     struct Stages {
         trial: Trial,
+        trained: TrainedRange,
+        bench: DisplayGeometry,
         shared: Shared,
         channels: InputChannels,
         inputs: Map,
@@ -108,7 +117,7 @@ mod tests {
     }
 
     impl Stages {
-        fn new(weights: &Weights, resolution: Resolution, limits: WorkgroupLimits) -> Self {
+        fn new(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution, limits: WorkgroupLimits) -> Self {
             let Family::ExpectedStack { feedback, .. } = weights.family else { panic!("weights of another family") };
             let (config, plan) = (&weights.config, &mut Plan::default());
             let size = Resolution { width: resolution.width.div_ceil(2), height: resolution.height.div_ceil(2) };
@@ -116,7 +125,7 @@ mod tests {
             let channels = InputChannels::new(config.depth_layers);
             let inputs = channels.map(plan, size);
             let net = |plan: &mut Plan, what, channels| Map::new(plan, what, (size.width, size.height), channels);
-            let stages = ExpectedStack::expect(plan, config, &shared, &inputs, limits).expect("it fits");
+            let stages = ExpectedStack::expect(plan, config, bench, &shared, &inputs, limits).expect("it fits");
             let outputs = net(plan, "the first net's", config.lighting_channels());
             stages.light(plan, &outputs);
             stages.feed_back(plan, feedback, &inputs);
@@ -124,13 +133,16 @@ mod tests {
             let low = Low::Corrected(stages.carried(), &correction);
             upsample::field(plan, &shared, Grid::HalfBand, low, limits).expect("it fits");
             let carried = stages.carried();
-            Self { trial: Trial::new(plan), shared, channels, inputs, outputs, correction, carried }
+            let (trained, bench) = (config.trained, *bench);
+            Self { trial: Trial::new(plan), trained, bench, shared, channels, inputs, outputs, correction, carried }
         }
 
         fn show(&self, frame: &RgbdFrame, pupil_mm: f32) {
             let planes = [&frame.amplitude[..], &frame.depth_normalised].concat();
             self.trial.write(self.shared.frame, &planes);
-            self.trial.write(self.shared.pupil, &[pupil_mm]);
+            let pupil = PupilDiameter::from_mm(pupil_mm);
+            let conditions = Conditions::of(&self.trained, &self.bench, pupil);
+            self.trial.write(self.shared.pupil, &pupil_values(pupil, conditions));
         }
 
         /// Channels of the nets' map, each zero where nothing is told in it.
@@ -208,13 +220,20 @@ mod tests {
     }
 
     fn check(weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32) {
-        check_within(LIMITS, weights, resolution, pupil_mm, seed);
+        check_on(&DisplayGeometry::DEFAULT, LIMITS, weights, resolution, pupil_mm, seed);
     }
 
-    fn check_within(limits: WorkgroupLimits, weights: &Weights, resolution: Resolution, pupil_mm: f32, seed: u32) {
+    fn check_on(
+        bench: &DisplayGeometry,
+        limits: WorkgroupLimits,
+        weights: &Weights,
+        resolution: Resolution,
+        pupil_mm: f32,
+        seed: u32,
+    ) {
         let shown = frame(resolution, seed);
-        let trace = reference::run(weights, &shown, f64::from(pupil_mm));
-        let stages = Stages::new(weights, resolution, limits);
+        let trace = reference::run(weights, bench, &shown, PupilDiameter::from_mm(pupil_mm));
+        let stages = Stages::new(weights, bench, resolution, limits);
         let context = |what: &str| format!("{resolution}, {} layers: {what}", weights.config.depth_layers);
         let real = |map: &reference::Map| map.values.iter().map(|&value| value.into()).collect::<Vec<Complex64>>();
 
@@ -275,7 +294,7 @@ mod tests {
         }
         let little = WorkgroupLimits { bytes: 150 * 8, threads: 128 };
         // In so little memory a workgroup has one line, as it has of a long one.
-        check_within(little, &weights, Resolution { width: 299, height: 5 }, 4.1, 2);
+        check_on(&DisplayGeometry::DEFAULT, little, &weights, Resolution { width: 299, height: 5 }, 4.1, 2);
     }
 
     #[test]
@@ -287,18 +306,30 @@ mod tests {
 
     #[test]
     fn blurs_wider_than_the_table_of_the_disc_match_the_reference() {
-        let mut config = config(5, false);
-        config.optics.pixel_pitch_um = 1.0;
-        config.optics.eyepiece_focal_length_mm = 2000.0;
-        check(&random_weights(config, 4), Resolution { width: 12, height: 7 }, 5.0, 4);
+        let bench = DisplayGeometry {
+            pixel_pitch: Metres(1e-6),
+            eyepiece_focal_length: Metres(2.0),
+            ..DisplayGeometry::DEFAULT
+        };
+        let size = Resolution { width: 12, height: 7 };
+        check_on(&bench, LIMITS, &random_weights(config(5, false), 4), size, 5.0, 4);
+    }
+
+    #[test]
+    fn another_bench_matches_the_reference() {
+        for (depth_layers, pupil_mm) in [(2, 0.5), (3, 3.0), (4, 9.0), (6, 20.0)] {
+            let weights = random_weights(config(depth_layers, true), 7);
+            check_on(&OTHER_BENCH, LIMITS, &weights, Resolution { width: 31, height: 18 }, pupil_mm, 4);
+        }
     }
 
     #[test]
     fn what_is_no_number_leaves_no_trace_in_the_next_frame() {
         let resolution = Resolution { width: 31, height: 18 };
         let weights = random_weights(config(5, true), 2);
-        let stages = Stages::new(&weights, resolution, LIMITS);
-        let trace = reference::run(&weights, &frame(resolution, 4), 3.0);
+        let stages = Stages::new(&weights, &DisplayGeometry::DEFAULT, resolution, LIMITS);
+        let trace =
+            reference::run(&weights, &DisplayGeometry::DEFAULT, &frame(resolution, 4), PupilDiameter::from_mm(3.0));
         let clean = stages.run(&frame(resolution, 4), 3.0, &trace);
         assert!(clean.iter().all(|value| value.is_finite()));
         for (pixel, spoiler) in [(0, f32::NAN), (30, f32::INFINITY), (31 * 18 - 1, f32::NEG_INFINITY)] {

@@ -1,6 +1,6 @@
 //! What an eye lacks when it focuses on each depth layer, fed back to the field at the SLM plane, for `feedback.wgsl`.
 
-use holod_calibration::Metres;
+use holod_calibration::{DisplayGeometry, Metres};
 
 use super::depth_layers::{DepthLayers, transfer_tables};
 use super::expected_stack::Grid;
@@ -21,6 +21,7 @@ const COLUMN_ITEMS: usize = 9;
 pub(super) fn feed_back(
     plan: &mut Plan,
     config: &NetworkConfig,
+    bench: &DisplayGeometry,
     Feedback { share, sharpness }: Feedback,
     shared: &Shared,
     grid: &Grid,
@@ -29,14 +30,13 @@ pub(super) fn feed_back(
     inputs: &Map,
 ) {
     let (count, size) = (config.depth_layers, shared.size);
-    let optics = config.optics.geometry(size);
-    let far_m = optics.image_distance(optics.depth_far).0;
-    let volume_m = optics.image_distance(optics.depth_near).0 - far_m;
+    let far_m = bench.image_distance(bench.depth_far).0;
+    let volume_m = bench.image_distance(bench.depth_near).0 - far_m;
     let farthest = Metres(far_m + volume_m / (2 * count) as f64);
     let samples = size.pixels() as f32;
     // The carried spectrum is already over the number of samples.
     let to_farthest: Vec<_> =
-        transfer_tables(config, shared, farthest).map(|[re, im]| [re * samples, im * samples]).collect();
+        transfer_tables(bench, shared, farthest).map(|[re, im]| [re * samples, im * samples]).collect();
     let to_farthest = plan.table("the way to the farthest layer", &to_farthest);
 
     let channels = InputChannels::new(count);

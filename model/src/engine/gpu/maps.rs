@@ -4,10 +4,10 @@ use holod_calibration::{DisplayGeometry, Metres, Resolution};
 
 use super::map::{GROUP, Map};
 use super::plan::{Constant, Plan};
-use crate::weights::OUTPUT_CHANNELS;
+use crate::weights::{CONDITIONS, OUTPUT_CHANNELS};
 
-/// Amplitude, two depth maps, each four times, and the pupil.
-const MAPS: usize = 4 * 5 + 1;
+/// Amplitude and two depth maps, each four times, and what is told of bench and pupil.
+const MAPS: usize = 4 * 5 + CONDITIONS;
 
 /// Which channels of the map are what.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,8 +53,8 @@ impl InputChannels {
 }
 
 /// The distance between the centres of neighbouring samples of the half-band grid.
-pub(super) fn sample_pitch(optics: &DisplayGeometry) -> Metres {
-    Metres(2.0 * optics.pixel_pitch.0)
+pub(super) fn sample_pitch(bench: &DisplayGeometry) -> Metres {
+    Metres(2.0 * bench.pixel_pitch.0)
 }
 
 /// Bytes of a plane of complex numbers on a grid of `size`, of a plane of real ones, and of a map's group.

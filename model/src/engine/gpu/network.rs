@@ -1,6 +1,6 @@
 //! A network's plan: what its stages share, and their order.
 
-use holod_calibration::{LevelTables, Resolution};
+use holod_calibration::{DisplayGeometry, LevelTables, PupilDiameter, Resolution};
 
 use super::expected_stack::ExpectedStack;
 use super::fft::WorkgroupLimits;
@@ -10,6 +10,7 @@ use super::plan::{BufferId, Plan};
 use super::trunk::{self, Modulated};
 use super::upsample::Low;
 use super::{direct, double_phase, levels, upsample};
+use crate::conditions::{Conditions, TrainedRange};
 use crate::engine::EngineError;
 use crate::weights::{Family, Grid, Weights};
 
@@ -22,10 +23,16 @@ pub(crate) struct Shared {
     pub(crate) size: Resolution,
     /// [4, height, width] at the frame's resolution: amplitudes of red, green and blue, then normalised depth.
     pub(crate) frame: BufferId,
-    /// One number: the pupil's diameter in millimetres, inside the range that the weights were trained for.
+    /// The pupil's diameter in millimetres; then what is told of it and the bench: blur and diffraction.
     pub(crate) pupil: BufferId,
     /// [3, height, width] of complex numbers at the frame's resolution: the hologram.
     pub(crate) field: BufferId,
+}
+
+/// What [`Shared::pupil`] holds for a pupil.
+pub(super) fn pupil_values(pupil: PupilDiameter, conditions: Conditions) -> [f32; 3] {
+    let [blur, fresnel] = conditions.told();
+    [pupil.mm(), blur as f32, fresnel as f32]
 }
 
 impl Shared {
@@ -44,7 +51,8 @@ impl Shared {
 pub(crate) struct NetworkPlan {
     pub(crate) plan: Plan,
     pub(super) shared: Shared,
-    pub(super) pupil_range_mm: [f32; 2],
+    trained: TrainedRange,
+    bench: DisplayGeometry,
     pub(super) modulated: Vec<Modulated>,
     /// [3, height, width], radians.
     pub(super) phases: BufferId,
@@ -56,12 +64,13 @@ pub(crate) struct NetworkPlan {
 }
 
 impl NetworkPlan {
-    /// For frames of the pattern's size of `tables`, with features in `precision`, on a device of these limits.
+    /// On `bench`, for frames of the pattern's size of `tables`, with features in `precision`, on a device of these limits.
     ///
     /// # Errors
     /// The size is nothing, or too large for that memory.
     pub(crate) fn new(
         weights: &Weights,
+        bench: &DisplayGeometry,
         tables: &LevelTables,
         precision: Precision,
         limits: WorkgroupLimits,
@@ -93,7 +102,7 @@ impl NetworkPlan {
             Family::ExpectedStack { lighting, correction, feedback } => {
                 let channels = InputChannels::new(config.depth_layers);
                 let inputs = channels.map(&mut plan, size);
-                let stack = ExpectedStack::expect(&mut plan, config, &shared, &inputs, limits)?;
+                let stack = ExpectedStack::expect(&mut plan, config, bench, &shared, &inputs, limits)?;
                 let lights = net(&mut plan, "lighting ", lighting, &inputs, channels.lighting());
                 stack.light(&mut plan, &lights);
                 stack.feed_back(&mut plan, *feedback, &inputs);
@@ -106,7 +115,12 @@ impl NetworkPlan {
         let unreachable = plan.buffer::<u32>("samples out of reach", 3);
         let phases = double_phase::encode(&mut plan, &shared, config.amplitude_constant, clipped);
         let samples = levels::encode(&mut plan, tables, phases, unreachable);
-        let pupil_range_mm = config.pupil_range_mm;
-        Ok(Self { plan, shared, pupil_range_mm, modulated, phases, samples, clipped, unreachable })
+        let (trained, bench) = (config.trained, *bench);
+        Ok(Self { plan, shared, trained, bench, modulated, phases, samples, clipped, unreachable })
+    }
+
+    /// What the network is told of the bench and a pupil.
+    pub(super) fn conditions(&self, pupil: PupilDiameter) -> Conditions {
+        Conditions::of(&self.trained, &self.bench, pupil)
     }
 }

@@ -4,10 +4,11 @@ use super::conv::{self, ConvLayer, Epilogue, Packing};
 use super::deformable;
 use super::map::{GROUP, Map, Precision};
 use super::plan::{BufferId, Plan};
+use crate::conditions::Conditions;
 use crate::engine::modulation::{Modulation, OffsetParameters};
 use crate::weights::{Layer, OFFSET_CHANNELS};
 
-/// The offset prediction of an adjustable layer, whose parameters depend on the pupil.
+/// The offset prediction of an adjustable layer, whose parameters depend on bench and pupil.
 pub(super) struct Modulated {
     modulation: Modulation,
     /// The map's channel of each input.
@@ -19,10 +20,10 @@ pub(super) struct Modulated {
 }
 
 impl Modulated {
-    /// The parameters for a pupil, as the device takes them; `None` if it has them.
-    pub(super) fn change_to(&mut self, pupil_mm: f32) -> Option<&[f32]> {
+    /// The parameters for a bench and a pupil, as the device takes them; `None` if it has them.
+    pub(super) fn change_to(&mut self, conditions: Conditions) -> Option<&[f32]> {
         let Self { modulation, inputs, packing, parameters, .. } = self;
-        let OffsetParameters { weight, bias } = modulation.change_to(pupil_mm)?;
+        let OffsetParameters { weight, bias } = modulation.change_to(conditions)?;
         let count = inputs.len();
         packing.fill(parameters, inputs, bias.iter().copied(), |output, input, tap| {
             weight[(output * count + input) * 9 + tap]

@@ -18,7 +18,7 @@ use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use std::path::{Path, PathBuf};
 
-use holod_calibration::{Colour, LevelTables, PerColour, Resolution};
+use holod_calibration::{Colour, DisplayGeometry, LevelTables, PerColour, Resolution};
 use serde::Serialize;
 
 use self::assembly::{Assembly, Work};
@@ -224,7 +224,7 @@ struct Compiled {
 pub struct FramePlan(Plan);
 
 impl FramePlan {
-    /// The plan of `weights` at `resolution`; `half_precision` is that of features, and so of most products.
+    /// The plan of `weights` on the default bench at `resolution`; `half_precision` is that of features, and so of most products.
     ///
     /// # Errors
     /// The size is nothing, or too large.
@@ -241,7 +241,7 @@ impl FramePlan {
             levels: PerColour(levels),
             flatness: PerColour([None, None, None]),
         };
-        Ok(Self(NetworkPlan::new(weights, &tables, precision, LIMITS)?.plan))
+        Ok(Self(NetworkPlan::new(weights, &DisplayGeometry::DEFAULT, &tables, precision, LIMITS)?.plan))
     }
 
     /// Labels of the shaders, each once.

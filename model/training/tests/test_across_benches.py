@@ -1,0 +1,79 @@
+"""The table across benches, from tiny networks and made-up scenes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import write_shard
+
+from holod_training.cli import main
+from holod_training.config import NetworkConfig
+from holod_training.export import read_metadata, save_weights
+from holod_training.variants import build_network
+
+TINY = NetworkConfig(layers=4, channels=4, adjustable_layers=(1,), modulation_hidden=4)
+GAEA = {"pixel_angle_rad": str(3.74e-6 / 40e-3), "pixel_pitch_um": "3.74", "wavelengths_nm": "[633.0, 532.0, 473.0]"}
+
+
+def test_each_bench_has_a_row_for_each_network_and_one_for_the_rival(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torch.manual_seed(1)
+    command = ["across-benches", "--out", str(tmp_path / "out"), "--border-px", "8"]
+    for name in ("one", "other"):
+        save_weights(tmp_path / f"{name}.safetensors", build_network(TINY), {}, {})
+        command += ["--weights", str(tmp_path / f"{name}.safetensors")]
+    for folder, metadata in (("default", {}), ("gaea-40", GAEA)):
+        for index in range(2):
+            write_shard(tmp_path / folder / f"scene_{index:06}.safetensors", seed=index, metadata=metadata)
+        command += ["--test", str(tmp_path / folder)]
+    assert main(command) == 0
+    table = capsys.readouterr().out
+    found = json.loads((tmp_path / "out" / "benches.json").read_text())["benches"]
+    assert [bench["bench"] for bench in found] == ["default", "gaea-40"]
+    for bench in found:
+        assert len(bench["rows"]) == 3 * 3 and bench["scenes"] == 2
+        assert {row["method"] for row in bench["rows"]} == {"one", "other", "smooth phase"}
+        assert bench["gain_over_rival"].keys() == bench["matrix_psnr_db"].keys() == {"one", "other"}
+        at_two = {row["method"]: row["psnr_db"] for row in bench["rows"] if row["pupil_mm"] == 2.0}
+        gain = bench["gain_over_rival"]["one"][1]["psnr_db"]["mean"]
+        assert gain == pytest.approx(at_two["one"] - at_two["smooth phase"], abs=1e-4)
+        assert bench["matrix_psnr_db"]["one"][1][1] == pytest.approx(at_two["one"], abs=1e-3)
+        assert at_two["one"] != at_two["other"]
+    default, gaea = found
+    assert default["volume_fresnel_px2"] == pytest.approx([45.57, 37.14, 32.14])
+    assert gaea["volume_fresnel_px2"][1] == pytest.approx(532e-9 * (40e-3 / 3.74e-6) ** 2 / 0.35, abs=0.01)
+    assert gaea["volume_blur_px"][1] / default["volume_blur_px"][1] == pytest.approx(8 / 3.74, rel=1e-3)
+    assert default["rows"][0]["psnr_db"] != gaea["rows"][0]["psnr_db"]
+    assert "**gaea-40**: 3.74 um, 40 mm, 633/532/473 nm, 0 to 2.86 dpt" in table
+    assert table.count("| smooth phase | ") == 2 and table.count(" of 3 |") == 4
+
+
+def test_a_folder_without_scenes_is_said_before_the_long_work(tmp_path: Path) -> None:
+    save_weights(tmp_path / "one.safetensors", build_network(TINY), {}, {})
+    command = ["across-benches", "--weights", str(tmp_path / "one.safetensors"), "--out", str(tmp_path / "out")]
+    assert main([*command, "--test", str(tmp_path / "none")]) == 65
+    assert not (tmp_path / "out").exists()
+
+
+def test_export_carries_what_a_network_reached_on_each_bench(tmp_path: Path) -> None:
+    torch.manual_seed(1)
+    source, out = tmp_path / "one.safetensors", tmp_path / "exported.safetensors"
+    save_weights(source, build_network(TINY), {"seed": 1}, {})
+    write_shard(tmp_path / "gaea-40" / "scene_000000.safetensors", metadata=GAEA)
+    command = ["across-benches", "--weights", str(source), "--test", str(tmp_path / "gaea-40"), "--border-px", "8"]
+    assert main([*command, "--out", str(tmp_path)]) == 0
+    export = ["export", "--source", str(source), "--out", str(out), "--benches", str(tmp_path / "benches.json")]
+    assert main(export) == 65 and not out.exists(), "nothing of that name was judged"
+    assert main([*export, "--benches-method", "one"]) == 0
+    metrics = read_metadata(out)["metrics"]
+    (bench,) = metrics["benches"]
+    judged = json.loads((tmp_path / "benches.json").read_text())["benches"][0]
+    assert metrics["seed"] == 1 and bench["bench"] == "gaea-40"
+    assert [row["volume_blur_px"] for row in bench["rows"]] == judged["volume_blur_px"]
+    assert bench["rows"][1]["psnr_db"] == pytest.approx(judged["rows"][1]["psnr_db"], abs=0.006)
+    gain = judged["gain_over_rival"]["one"][1]["psnr_db"]["mean"]
+    assert bench["rows"][1]["over_smooth_phase_db"] == pytest.approx(gain, abs=0.006)
