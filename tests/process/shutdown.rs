@@ -82,6 +82,14 @@ impl LaserBench {
 
 #[test]
 fn a_killed_daemon_leaves_the_laser_box_dark_within_its_heartbeat_timeout() {
+    // On a machine that is busy with other work a daemon may have lost its panel's rhythm just before it is killed, and the
+    // lasers are dark by that. Only a box that was lit shows that a closed port puts it out, so it is tried again.
+    let hung_up = (0..5).any(|_| kill_a_daemon_and_judge_its_lasers() == DarkReason::HangUp);
+    assert!(hung_up, "the kernel closes the port of a killed process");
+}
+
+/// Why the box is dark after its daemon was killed.
+fn kill_a_daemon_and_judge_its_lasers() -> DarkReason {
     let laser_box = LaserBench::plug_in();
     let daemon = laser_box.lit_daemon();
     let t_killed = host_now();
@@ -89,7 +97,6 @@ fn a_killed_daemon_leaves_the_laser_box_dark_within_its_heartbeat_timeout() {
     let dark = wait_until(Duration::from_secs(2), || matches!(laser_box.events().last(), Some(BoxEvent::Dark { .. })));
     assert!(dark, "{:?}", laser_box.events().last());
     let Some(BoxEvent::Dark { t, reason }) = laser_box.events().last().copied() else { unreachable!() };
-    assert_eq!(reason, DarkReason::HangUp, "the kernel closes the port of a killed process");
     assert!(t - t_killed < TimeNs(130_000_000), "dark {} ms after the kill", (t - t_killed).seconds() * 1e3);
     laser_box.assert_dark();
 
@@ -100,6 +107,7 @@ fn a_killed_daemon_leaves_the_laser_box_dark_within_its_heartbeat_timeout() {
     let ended = run(HOLOD, &["dark", "--config", "rig.toml"], laser_box.folder.path());
     assert!(ended.status.success(), "{}", ended.stderr);
     assert!(ended.stdout.contains("acknowledged"));
+    reason
 }
 
 #[test]
