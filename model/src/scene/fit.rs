@@ -41,6 +41,16 @@ impl Placement {
         (0.0..size).contains(&source).then_some(source)
     }
 
+    /// Whether each pixel of the frame shows one of the picture, or none.
+    pub(super) fn is_unscaled(&self) -> bool {
+        self.scale == 1.0
+    }
+
+    /// Whether the frame is the picture.
+    pub(super) fn is_identity(&self) -> bool {
+        self.is_unscaled() && self.source == self.target
+    }
+
     /// Frame pixels that the picture does not reach.
     pub(super) fn padded_px(&self) -> usize {
         let reached = |axis, size| (0..size).filter(|&position| self.source_position(axis, position).is_some()).count();

@@ -1,4 +1,4 @@
-//! Scenes: RGB-D frames from files.
+//! Scenes: RGB-D frames from files, and from programs that hand them over while holod runs.
 //!
 //! A scene is a directory with a `scene.toml`:
 //!
@@ -21,6 +21,7 @@ mod depth;
 mod description;
 mod error;
 mod fit;
+mod live;
 mod openexr;
 mod raster;
 
@@ -30,6 +31,7 @@ use self::description::Description;
 use self::fit::Placement;
 
 pub use self::error::SceneError;
+pub use self::live::{LiveColour, LiveDepth, LiveError, LiveFormat, LivePart, LiveReader};
 
 /// Normalised depths this little outside 0..=1 are rounding, not clamping.
 const ROUNDING: f32 = 1e-5;
@@ -43,6 +45,19 @@ pub struct RgbdFrame {
     pub amplitude: Vec<f32>,
     /// 0 at the far end of the display's depth range and 1 at the near end, uniform in dioptres, [height, width].
     pub depth_normalised: Vec<f32>,
+}
+
+impl RgbdFrame {
+    /// A black frame at the far end of the depth range.
+    pub fn black(resolution: Resolution) -> Self {
+        let pixels = resolution.pixels();
+        Self { resolution, amplitude: vec![0.0; 3 * pixels], depth_normalised: vec![0.0; pixels] }
+    }
+
+    /// A frame without a pixel, which takes the place of another for a while.
+    const fn empty() -> Self {
+        Self { resolution: Resolution { width: 0, height: 0 }, amplitude: Vec::new(), depth_normalised: Vec::new() }
+    }
 }
 
 /// What happened to a frame between its files and the network.
