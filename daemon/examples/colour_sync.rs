@@ -17,7 +17,8 @@ use holod_daemon::failure::{Exit, Failure};
 use holod_daemon::pictures::{Sheet, Tile, screen_picture};
 use holod_daemon::report;
 use holod_daemon::session::{self, Observer, SessionPlan};
-use holod_daemon::setup::{self, Frames};
+use holod_daemon::source::Pictures;
+use holod_daemon::source::scene::{self, Frames};
 use holod_model::Weights;
 use holod_model::optics::{Eye, SimulatedEye};
 use holod_pupil_input::{Scenario, TrackerSpec};
@@ -64,12 +65,12 @@ fn run(out: &Path) -> Result<(), Failure> {
         rig: rig.clone(),
         weights,
         backend: Backend::Cpu,
-        frames: Frames {
-            frames: vec![Arc::new(setup::sample_frame(SIZE))],
+        pictures: Pictures::Scene(Arc::new(Frames {
+            frames: vec![Arc::new(scene::sample_frame(SIZE))],
             fps: None,
             reports: Vec::new(),
             name: "the built-in scene".into(),
-        },
+        })),
         output: OutputSpec::Headless(ReportFaults::NONE),
         tracker: TrackerSpec::Mock(Scenario::Steady),
         record_tracker: None,

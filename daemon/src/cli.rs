@@ -139,7 +139,8 @@ fn parse_weights(text: &str) -> Result<WeightsChoice, String> {
 /// Where pictures with depth come from.
 #[derive(Args, Debug, Clone, Default)]
 pub struct SceneArgs {
-    /// A scene directory with scene.toml, or COLOUR,DEPTH (or one OpenEXR file that holds both).
+    /// A scene directory with scene.toml, or COLOUR,DEPTH (or one OpenEXR file that holds both); for `run` also feed or
+    /// feed:SOCKET, the pictures that other programs hand over.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<String>,
     /// What the depth file's numbers are; required for COLOUR,DEPTH: metres, millimetres, dioptres, or

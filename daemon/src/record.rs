@@ -7,8 +7,10 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::{Colour, PupilDiameter, TimeNs};
+use holod_slm_output::FieldEvent;
 
 use crate::failure::{Exit, Failure};
+use crate::source::PictureTag;
 
 /// What the frame loop did for one frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -33,6 +35,8 @@ pub struct FrameRecord {
     pub t_submit: TimeNs,
     /// The refresh that the pacing aimed at.
     pub t_desired_present: TimeNs,
+    /// The picture that was shown.
+    pub picture: PictureTag,
 }
 
 /// One colour field that the panel showed.
@@ -54,9 +58,24 @@ pub struct FieldRecord {
     pub deadline_missed: bool,
 }
 
+impl FieldRecord {
+    /// The row of a field that was shown.
+    pub fn of(event: &FieldEvent) -> Self {
+        Self {
+            frame: event.frame_id,
+            field: event.field as u8,
+            colour: event.colour,
+            t_present: event.t_present,
+            provenance: event.provenance.name(),
+            laser_window: event.laser_on.zip(event.laser_off),
+            deadline_missed: event.deadline_missed && !event.repeated,
+        }
+    }
+}
+
 /// The columns of `frames.csv`.
 pub const HEADER: &str = "frame,field,colour,t_sample_ns,pupil_raw_mm,pupil_mm,pupil_state,t_wake_ns,t_render_begin_ns,\
-t_render_end_ns,t_submit_ns,t_present_ns,present_provenance,laser_on_ns,laser_off_ns,deadline_missed";
+t_render_end_ns,t_submit_ns,t_present_ns,present_provenance,laser_on_ns,laser_off_ns,deadline_missed,picture,t_picture_ns";
 
 /// The files of a record whose names are always the same.
 const FILES: [&str; 4] = ["frames.csv", "summary.json", "samples.csv", "tracker.holodraw"];
@@ -136,7 +155,7 @@ impl FrameLog {
         let (on, off) = (field.laser_window.map(|w| w.0), field.laser_window.map(|w| w.1));
         writeln!(
             self.file,
-            "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
             field.frame,
             field.field,
             field.colour,
@@ -153,6 +172,8 @@ impl FrameLog {
             time(on),
             time(off),
             u8::from(field.deadline_missed),
+            frame.map(|f| f.picture.number.to_string()).unwrap_or_default(),
+            time(frame.and_then(|f| f.picture.t_taken)),
         )
         .map_err(|error| self.lost(&error))
     }
@@ -203,6 +224,7 @@ mod tests {
             t_render_end: TimeNs(20),
             t_submit: TimeNs(21),
             t_desired_present: TimeNs(30),
+            picture: PictureTag { number: 4, t_taken: Some(TimeNs(3)) },
         }
     }
 
@@ -228,8 +250,8 @@ mod tests {
         log.flush().unwrap();
         let text = fs::read_to_string(folder.path().join("frames.csv")).unwrap();
         let rows: Vec<&str> = text.lines().collect();
-        assert_eq!(rows[1], "7,1,green,5,3.2500,3.3000,tracking,10,11,20,21,30,software,33,36,0");
-        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0");
+        assert_eq!(rows[1], "7,1,green,5,3.2500,3.3000,tracking,10,11,20,21,30,software,33,36,0,4,3");
+        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0,,");
         assert!(rows.iter().all(|row| row.split(',').count() == HEADER.split(',').count()));
     }
 

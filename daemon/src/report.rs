@@ -10,6 +10,7 @@ use holod_model::files;
 
 use crate::failure::{Exit, Failure};
 use crate::session::{Spread, Summary};
+use crate::source::feed::FeedStatus;
 
 /// Prints lines on standard output. A reader that has gone away is no failure.
 pub fn print(text: &str) -> Result<(), Failure> {
@@ -50,44 +51,57 @@ pub fn spread_text(spread: Option<Spread>) -> String {
     spread.map_or("not measured".to_owned(), |s| format!("median {:.1} ms, p99 {:.1} ms", s.median_ms, s.p99_ms))
 }
 
+/// The live feed in one line.
+pub fn feed_text(feed: &FeedStatus) -> String {
+    let refusal = feed.last_refusal.as_ref().map_or(String::new(), |why| format!("; refused last: {why}"));
+    format!(
+        "feed      {} pictures taken, {} overtaken, {} refused, {} of clients not shown, {} left out by clients; {} \
+         connections refused{refusal}",
+        feed.taken, feed.overtaken, feed.refused, feed.not_shown, feed.left_out, feed.connections_refused,
+    )
+}
+
 /// A run in a few lines.
 pub fn summary_text(summary: &Summary) -> String {
     let states: Vec<String> =
         summary.frames_by_pupil_state.iter().map(|(state, count)| format!("{count} {state}")).collect();
     let pupils = summary.pupil_range_mm.map_or("none".to_owned(), |[a, b]| format!("{a:.2} to {b:.2} mm"));
-    let lasers = &summary.lasers;
-    let slow = summary.speed_advice.as_ref().map_or(String::new(), |advice| format!("\n          {advice}"));
+    let (figures, lasers) = (&summary.figures, &summary.lasers);
+    let slow = figures.speed_advice.as_ref().map_or(String::new(), |advice| format!("\n          {advice}"));
     let mut trouble =
-        summary.tracker_trouble.as_ref().map_or(String::new(), |trouble| format!("\n          {trouble}"));
+        figures.tracker_trouble.as_ref().map_or(String::new(), |trouble| format!("\n          {trouble}"));
     if summary.tracker_records_lost > 0 {
         let lost = summary.tracker_records_lost;
         trouble.push_str(&format!("\n          the recording lost {lost} pieces: the disk is too slow for it"));
     }
+    let feed = figures.feed.as_ref().map_or(String::new(), |feed| {
+        format!("\n{}; picture to photons {}", feed_text(feed), spread_text(figures.picture_to_photon))
+    });
     format!(
         "ended by {} after {:.1} s\n\
          frames    {} made, {} shown ({} late), {:.1} a second of the panel's {:.1}; {} colour fields shown, {} of them \
          repetitions{slow}\n\
          pupil     {pupils}; frames: {}\n\
-         tracker   {}: link {}, {} samples, {} rejected{trouble}\n\
+         tracker   {}: link {}, {} samples, {} rejected{trouble}{feed}\n\
          time      per frame {}; tracker sample to photons {}\n\
          lasers    {} fields judged: {} lit by their own colour, {} kept dark, {} faults of which {} unsafe\n\
          shutdown  lasers dark: {}; flat pattern on the panel: {}",
         summary.ended_by,
         summary.duration_s,
-        summary.frames_made,
-        summary.frames_shown,
-        summary.deadline_misses,
+        figures.frames_made,
+        figures.frames_shown,
+        figures.deadline_misses,
         summary.frames_shown_hz,
-        summary.panel_frames_hz,
+        figures.panel_frames_hz,
         summary.fields_shown,
         summary.fields_repeated,
         states.join(", "),
-        summary.tracker,
-        summary.tracker_link,
-        summary.tracker_counts.get("samples").copied().unwrap_or(0),
+        figures.tracker,
+        figures.tracker_link,
+        figures.tracker_counts.get("samples").copied().unwrap_or(0),
         summary.samples_rejected,
-        spread_text(summary.frame_time),
-        spread_text(summary.sample_to_photon),
+        spread_text(figures.frame_time),
+        spread_text(figures.sample_to_photon),
         lasers.fields,
         lasers.lit,
         lasers.dark,

@@ -10,7 +10,8 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
-use crate::{renderer, setup};
+use crate::renderer;
+use crate::source::scene;
 
 /// A display that shows less than this share of the panel's frames is called slow.
 const ENOUGH: f64 = 0.9;
@@ -90,7 +91,7 @@ fn time(rig: &Rig, weights: &Weights, size: Resolution) -> Result<(String, f64),
     let panel = Panel { flatness_rad: PerColour([None, None, None]), ..rig.panel.clone() };
     let encoder = PanelEncoder::new(&panel, size, size).map(Arc::new).map_err(Failure::because(Exit::Config))?;
     let mut renderer = renderer::open(Backend::Auto, weights, &rig.geometry, &encoder)?;
-    let (frame, mut levels) = (Arc::new(setup::sample_frame(size)), LevelsFrame::new(encoder.layout()));
+    let (frame, mut levels) = (Arc::new(scene::sample_frame(size)), LevelsFrame::new(encoder.layout()));
     let pupil = weights.trained_pupils(&rig.geometry)[0];
     let mut seconds = f64::MAX;
     for _ in 0..2 {

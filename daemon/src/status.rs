@@ -1,69 +1,13 @@
 //! What a running holod says of itself: a small JSON file of its own that it writes anew each second and takes away at its
 //! end.
 
-use std::collections::BTreeMap;
-use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use holod_model::files;
-use serde::{Deserialize, Serialize};
-
 use crate::failure::{Exit, Failure};
-use crate::session::Spread;
-
-/// The state of a run at one moment.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Status {
-    /// The process.
-    pub pid: u32,
-    /// Dark, running or degraded.
-    pub state: String,
-    /// How long it has run.
-    pub uptime_s: f64,
-    /// The rig's name.
-    pub rig: String,
-    /// The tracker spec.
-    pub tracker: String,
-    /// How the tracker's link is.
-    pub tracker_link: String,
-    /// Why a lost link does not come back, or why nothing that the tracker sends is believed.
-    pub tracker_trouble: Option<String>,
-    /// What the pupil's estimate rests on.
-    pub pupil_state: String,
-    /// The pupil that the newest frame was made for.
-    pub pupil_mm: Option<f32>,
-    /// How holograms are computed.
-    pub engine: String,
-    /// The panel's spec.
-    pub panel: String,
-    /// Why the panel is lost, where it is.
-    pub panel_trouble: Option<String>,
-    /// Refreshes of the panel a second, as it reports them; 0 until it has.
-    pub panel_refresh_hz: f64,
-    /// Whether lasers may be lit: armed or dark.
-    pub lasers: String,
-    /// What is wrong with the laser box, where something is.
-    pub lasers_trouble: Option<String>,
-    /// Frames that were made.
-    pub frames_made: u64,
-    /// Of those, frames that came on the panel.
-    pub frames_shown: u64,
-    /// Frames that came on the panel in the last second.
-    pub frames_shown_hz: f64,
-    /// Frames of all colours that the panel could show in a second.
-    pub panel_frames_hz: f64,
-    /// What would bring the first of these two nearer to the second, where that is needed.
-    pub speed_advice: Option<String>,
-    /// Frames that came on the panel later than planned.
-    pub deadline_misses: u64,
-    /// From waking to the submitted levels.
-    pub frame_time: Option<Spread>,
-    /// From the newest tracker sample behind a frame to the middle of its first light.
-    pub sample_to_photon: Option<Spread>,
-    /// Counters of the tracker: samples, connections, rejections by reason.
-    pub tracker_counts: BTreeMap<String, u64>,
-}
+use crate::runtime_folder;
+use crate::snapshot::Snapshot;
+use holod_model::files;
 
 /// The folder that the service's unit asks systemd for.
 const SERVICE_FOLDER: &str = "/run/holod";
@@ -75,26 +19,6 @@ fn file_name(pid: u32) -> String {
     format!("status-{pid}.json")
 }
 
-/// Where this process may put its status, the best place first: the folder that systemd made for it, one in the user's own
-/// runtime folder, one of this user's in the folder for temporary files.
-fn own_folders() -> Vec<PathBuf> {
-    let named = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
-    let uid = rustix::process::getuid().as_raw();
-    let login = PathBuf::from(format!("/run/user/{uid}"));
-    let runtime =
-        named("XDG_RUNTIME_DIR").or_else(|| login.is_dir().then_some(login)).map(|folder| folder.join("holod"));
-    let temporary = std::env::temp_dir().join(format!("holod-{uid}"));
-    named("RUNTIME_DIRECTORY").into_iter().chain(runtime).chain([temporary]).collect()
-}
-
-/// Makes a folder that only this user can write to; false where it cannot be, or is somebody else's.
-fn prepare(folder: &Path) -> bool {
-    let made = std::fs::DirBuilder::new().recursive(true).mode(0o700).create(folder).is_ok();
-    let own = std::fs::symlink_metadata(folder)
-        .is_ok_and(|metadata| metadata.is_dir() && metadata.uid() == rustix::process::geteuid().as_raw());
-    made && own
-}
-
 /// The file of a running process. Dropping it takes the file away.
 #[derive(Debug)]
 pub struct StatusFile {
@@ -104,12 +28,11 @@ pub struct StatusFile {
 impl StatusFile {
     /// The file, in the first folder that takes it; a process without any has none, which is no fault.
     pub fn create() -> Self {
-        let folder = own_folders().into_iter().find(|folder| prepare(folder));
-        Self { path: folder.map(|folder| folder.join(file_name(std::process::id()))) }
+        Self { path: runtime_folder::own().map(|folder| folder.join(file_name(std::process::id()))) }
     }
 
     /// Writes the file anew. A disk that refuses is told once.
-    pub fn write(&mut self, status: &Status) {
+    pub fn write(&mut self, status: &Snapshot) {
         let Some(path) = &self.path else { return };
         let written = serde_json::to_vec(status)
             .map_err(|error| error.to_string())
@@ -133,7 +56,7 @@ impl Drop for StatusFile {
 #[derive(Clone, Debug, PartialEq)]
 pub struct Found {
     /// It.
-    pub status: Status,
+    pub status: Snapshot,
     /// How long ago that was, where it is too long.
     pub stale: Option<Duration>,
 }
@@ -144,7 +67,7 @@ pub struct Found {
 /// None runs, or what it says may not be read.
 pub fn of_running() -> Result<Vec<Found>, Failure> {
     let mut folders = vec![PathBuf::from(SERVICE_FOLDER)];
-    folders.extend(own_folders());
+    folders.extend(runtime_folder::candidates());
     folders.dedup();
     of_running_in(&folders)
 }
@@ -202,7 +125,7 @@ fn read(path: &Path) -> std::io::Result<Option<Found>> {
         return Ok(None);
     }
     let written = std::fs::metadata(path)?.modified()?;
-    let Ok(status) = serde_json::from_slice::<Status>(&std::fs::read(path)?) else { return Ok(None) };
+    let Ok(status) = serde_json::from_slice::<Snapshot>(&std::fs::read(path)?) else { return Ok(None) };
     let lives = name == file_name(status.pid) && Path::new("/proc").join(status.pid.to_string()).exists();
     let age = written.elapsed().unwrap_or_default();
     Ok(lives.then_some(Found { status, stale: (age > STALE).then_some(age) }))
@@ -214,8 +137,8 @@ mod tests {
 
     use super::*;
 
-    fn status() -> Status {
-        Status { pid: std::process::id(), state: "running".into(), tracker: "mock".into(), ..Status::default() }
+    fn status() -> Snapshot {
+        Snapshot { pid: std::process::id(), state: "running".into(), ..Snapshot::default() }
     }
 
     #[test]
@@ -236,7 +159,7 @@ mod tests {
         let own = folder.path().join(file_name(std::process::id()));
         let folders = [folder.path().to_owned()];
         // No process has this number: the kernel's greatest is 2^22.
-        let dead = serde_json::to_vec(&Status { pid: u32::MAX, ..status() }).unwrap();
+        let dead = serde_json::to_vec(&Snapshot { pid: u32::MAX, ..status() }).unwrap();
         std::fs::write(folder.path().join(file_name(u32::MAX)), &dead).unwrap();
         assert!(of_running_in(&folders).is_err());
         std::fs::write(&own, dead).unwrap();
@@ -257,7 +180,7 @@ mod tests {
         // The first process of all lives, whoever runs this.
         let [one, other] = [1, std::process::id()].map(|pid| {
             let mut file = StatusFile { path: Some(folder.path().join(file_name(pid))) };
-            file.write(&Status { pid, ..status() });
+            file.write(&Snapshot { pid, ..status() });
             file
         });
         let pids = || of_running_in(&folders).unwrap().iter().map(|found| found.status.pid).collect::<Vec<_>>();
@@ -266,15 +189,5 @@ mod tests {
         assert_eq!(pids(), [1]);
         drop(one);
         assert!(of_running_in(&folders).is_err());
-    }
-
-    #[test]
-    fn a_folder_of_ones_own_is_made_and_a_link_is_none() {
-        let root = tempfile::tempdir().unwrap();
-        let own = root.path().join("own");
-        assert!(prepare(&own) && prepare(&own));
-        assert_eq!(std::fs::metadata(&own).unwrap().mode() & 0o777, 0o700);
-        std::os::unix::fs::symlink(&own, root.path().join("link")).unwrap();
-        assert!(!prepare(&root.path().join("link")));
     }
 }

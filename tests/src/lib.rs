@@ -1,6 +1,7 @@
 //! A simulated bench: the daemon as a process, a tracker on a pseudo-terminal, a judge of `frames.csv`.
 
 pub mod daemon;
+pub mod feed;
 pub mod frames;
 pub mod tracker;
 

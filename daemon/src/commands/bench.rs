@@ -17,6 +17,8 @@ use serde::Serialize;
 use crate::cli::{BenchArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
 use crate::session::{self, Observer, SessionPlan, Spread, Summary};
+use crate::snapshot::Figures;
+use crate::source::{Pictures, scene};
 use crate::{progress, renderer, report, setup};
 
 /// How often the memory's bandwidth is measured before the frames, and again after them: between them, it would empty
@@ -97,8 +99,8 @@ struct Lap {
 pub(super) fn bench(args: &BenchArgs) -> Result<(), Failure> {
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let weights = setup::weights(&rig)?;
-    let scene = SceneArgs { resolution: Some(args.resolution), ..SceneArgs::default() };
-    let frames = setup::frames(&scene, &rig.geometry)?;
+    let named = SceneArgs { resolution: Some(args.resolution), ..SceneArgs::default() };
+    let frames = scene::frames(&named, &rig.geometry)?;
     let laps = progress::during("timing frames", || Laps::run(args, &rig, &weights, &frames.frames[0]))?;
     let mut report = laps.report(args.resolution.to_string(), setup::weights_name(&rig.model.weights));
     if !args.duration.is_zero() {
@@ -206,7 +208,7 @@ fn greatest(looks: &[f64]) -> f64 {
 }
 
 /// Runs the loop as `demo` does. Whatever the rig has is left alone: no laser is lit.
-fn closed_loop(args: &BenchArgs, rig: Rig, weights: Weights, frames: setup::Frames) -> Result<ClosedLoop, Failure> {
+fn closed_loop(args: &BenchArgs, rig: Rig, weights: Weights, frames: scene::Frames) -> Result<ClosedLoop, Failure> {
     struct Nobody;
     impl Observer for Nobody {}
 
@@ -214,7 +216,7 @@ fn closed_loop(args: &BenchArgs, rig: Rig, weights: Weights, frames: setup::Fram
         rig: Rig { lasers: Lasers { driver: LaserDriver::Simulated, ..rig.lasers }, ..rig },
         weights,
         backend: args.backend,
-        frames,
+        pictures: Pictures::Scene(Arc::new(frames)),
         output: OutputSpec::Headless(ReportFaults::NONE),
         tracker: TrackerSpec::Mock(Scenario::Sweep),
         record_tracker: None,
@@ -222,8 +224,8 @@ fn closed_loop(args: &BenchArgs, rig: Rig, weights: Weights, frames: setup::Fram
         duration: Some(args.duration),
         keep_levels: false,
     };
-    let Summary { duration_s, frames_shown, frames_shown_hz, panel_frames_hz, frame_time, sample_to_photon, .. } =
-        session::run(plan, &mut Nobody)?.summary;
+    let Summary { duration_s, frames_shown_hz, figures, .. } = session::run(plan, &mut Nobody)?.summary;
+    let Figures { frames_shown, panel_frames_hz, frame_time, sample_to_photon, .. } = figures;
     Ok(ClosedLoop { duration_s, frames_shown, frames_shown_hz, panel_frames_hz, frame_time, sample_to_photon })
 }
 

@@ -14,6 +14,7 @@ use serde::Serialize;
 
 use crate::cli::CheckArgs;
 use crate::failure::{Exit, Failure};
+use crate::source::scene;
 use crate::speed::{self, Estimate};
 use crate::{progress, report, setup};
 
@@ -117,7 +118,7 @@ fn frames_hz(rig: &Rig, weights: Option<&Weights>, resolution: Option<Resolution
     let panel = rig.resolution();
     let sizes = match resolution {
         Some(size) => vec![size],
-        None => vec![setup::SAMPLE_RESOLUTION, panel],
+        None => vec![scene::SAMPLE_RESOLUTION, panel],
     };
     let fits = |size: &Resolution| size.width <= panel.width && size.height <= panel.height;
     let sizes: Vec<Resolution> = sizes.into_iter().filter(fits).collect();

@@ -1,6 +1,7 @@
 //! `holod demo`: the whole loop on built-in inputs, and pictures of what happened.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, PupilDiameter, TimeNs};
 use holod_model::optics::{Eye, PhasePattern, SimulatedEye};
@@ -17,6 +18,7 @@ use crate::pictures::{
 use crate::progress;
 use crate::record::{FieldRecord, FrameLog, FrameRecord};
 use crate::session::{self, Observer, SessionPlan, SessionReport};
+use crate::source::{Pictures, scene};
 use crate::staging::Staging;
 use crate::{report, setup};
 
@@ -45,8 +47,8 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
     let rig = setup::rig_with_network(&RigArgs::default(), &args.network)?;
     let weights = progress::during("loading the network", || setup::weights(&rig))?;
     let constant = weights.config().amplitude_constant;
-    let scene = SceneArgs { resolution: args.resolution, ..SceneArgs::default() };
-    let frames = setup::frames(&scene, &rig.geometry)?;
+    let named = SceneArgs { resolution: args.resolution, ..SceneArgs::default() };
+    let frames = scene::frames(&named, &rig.geometry)?;
     let scene = frames.frames[0].clone();
     let geometry = rig.geometry;
     eprintln!("running the loop for {:?}: {} px, tracker {}", args.duration, frames.resolution(), SCENARIO.name());
@@ -61,7 +63,7 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
             rig,
             weights,
             backend: Backend::Auto,
-            frames,
+            pictures: Pictures::Scene(Arc::new(frames)),
             output: OutputSpec::Headless(ReportFaults::NONE),
             tracker: TrackerSpec::Mock(SCENARIO),
             record_tracker: None,

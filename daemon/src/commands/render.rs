@@ -14,6 +14,7 @@ use crate::cli::{Backend, RenderArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
 use crate::progress;
 use crate::renderer::{self, Renderer};
+use crate::source::scene;
 use crate::staging::Staging;
 use crate::{report, setup};
 
@@ -105,13 +106,13 @@ pub(super) struct Computed {
 /// Computes the scene's first frame, for other commands too.
 pub(super) fn compute(
     rig: &Rig,
-    scene: &SceneArgs,
+    named: &SceneArgs,
     pupil: PupilDiameter,
     backend: Backend,
 ) -> Result<Computed, Failure> {
     let weights = progress::during("loading the network", || setup::weights(rig))?;
     check_pupil(&weights, &rig.geometry, pupil)?;
-    let frames = progress::during("loading the scene", || setup::frames(scene, &rig.geometry))?;
+    let frames = progress::during("loading the scene", || scene::frames(named, &rig.geometry))?;
     let resolution = frames.resolution();
     let encoder = renderer::panel_encoder(rig, resolution)?;
     let mut renderer = progress::during(&format!("preparing the network for {resolution}"), || {

@@ -12,7 +12,7 @@ use crate::progress;
 use crate::record::{self, FieldRecord, FrameLog, FrameRecord};
 use crate::report;
 use crate::session::{self, Observer, SessionPlan, SessionReport, not_dark};
-use crate::setup;
+use crate::{setup, source};
 
 /// Scenario of the built-in tracker.
 const SAMPLE_TRACKER: &str = "mock";
@@ -27,7 +27,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let tracker: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
     tracing::info!("{}: tracker {tracker}, panel {output} of {}", rig.name, rig.resolution());
     let weights = progress::during("loading the network", || setup::weights(&rig))?;
-    let frames = progress::during("loading the scene", || setup::frames(&args.scene, &rig.geometry))?;
+    let pictures = progress::during("loading the scene", || source::named(&args.scene, &rig.geometry))?;
     if let Some(folder) = args.record.as_deref().filter(|_| args.force) {
         record::remove_earlier(folder)?;
     }
@@ -35,8 +35,8 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let network = weights.config();
     tracing::info!(
         "{} of {} by network {} {}",
-        frames.resolution(),
-        frames.name,
+        pictures.resolution(),
+        pictures.name(),
         network.architecture,
         network.version
     );
@@ -44,7 +44,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         rig,
         weights,
         backend: args.backend,
-        frames,
+        pictures,
         output,
         tracker,
         record_tracker: args.record.as_deref().map(RecordFiles::in_folder),

@@ -3,8 +3,8 @@
 use crate::cli::StatusArgs;
 use crate::failure::{Exit, Failure};
 use crate::report;
-use crate::session::Spread;
-use crate::status::{self, Found, Status};
+use crate::snapshot::Snapshot;
+use crate::status::{self, Found};
 
 pub(super) fn status(args: &StatusArgs) -> Result<(), Failure> {
     let mut running = status::of_running()?;
@@ -34,16 +34,28 @@ pub(super) fn status(args: &StatusArgs) -> Result<(), Failure> {
     }
 }
 
-fn text_of(status: &Status) -> String {
-    let spread = |spread: Option<Spread>| {
-        spread.map_or("not measured".to_owned(), |s| format!("median {:.1} ms, p99 {:.1} ms", s.median_ms, s.p99_ms))
-    };
-    let counts: Vec<_> = status
+fn text_of(status: &Snapshot) -> String {
+    let figures = &status.figures;
+    let counts: Vec<_> = figures
         .tracker_counts
         .iter()
         .filter(|(_, count)| **count > 0)
         .map(|(name, count)| format!("{name} {count}"))
         .collect();
+    let feed = figures.feed.as_ref().map_or(String::new(), |feed| {
+        let shown = match &feed.shown {
+            Some(name) => format!("`{name}` is shown, of {}", feed.clients.len()),
+            None => format!("nobody is shown, {} connected", feed.clients.len()),
+        };
+        let age = feed.newest_age_s.map_or(String::new(), |age_s| format!("; newest {age_s:.1} s ago"));
+        format!(
+            "\nfeed     {}: {shown}{age}\n\
+             {}; picture to photons {}",
+            feed.socket.display(),
+            report::feed_text(feed),
+            report::spread_text(figures.picture_to_photon)
+        )
+    });
     format!(
         "{} for {:.0} s, process {}, {}\n\
          pupil    {}, {}\n\
@@ -53,30 +65,30 @@ fn text_of(status: &Status) -> String {
          lasers   {}{}\n\
          engine   {}\n\
          frames   {:.1} a second of the panel's {:.1}{}; {} made, {} shown, {} late\n\
-         time     per frame {}; tracker sample to photons {}",
+         time     per frame {}; tracker sample to photons {}{feed}",
         status.state,
         status.uptime_s,
         status.pid,
-        status.rig,
+        figures.rig,
         status.pupil_mm.map_or("none yet".to_owned(), |mm| format!("{mm:.2} mm")),
         status.pupil_state,
-        status.tracker,
-        status.tracker_link,
-        status.tracker_trouble.as_ref().map_or(String::new(), |trouble| format!("; {trouble}")),
+        figures.tracker,
+        figures.tracker_link,
+        figures.tracker_trouble.as_ref().map_or(String::new(), |trouble| format!("; {trouble}")),
         counts.join(", "),
         status.panel,
-        status.panel_refresh_hz,
+        figures.panel_refresh_hz,
         status.panel_trouble.as_ref().map_or(String::new(), |trouble| format!("; lost: {trouble}")),
         status.lasers,
         status.lasers_trouble.as_ref().map_or(String::new(), |trouble| format!("; {trouble}")),
-        status.engine,
+        figures.engine,
         status.frames_shown_hz,
-        status.panel_frames_hz,
-        status.speed_advice.as_ref().map_or(String::new(), |advice| format!(" ({advice})")),
-        status.frames_made,
-        status.frames_shown,
-        status.deadline_misses,
-        spread(status.frame_time),
-        spread(status.sample_to_photon),
+        figures.panel_frames_hz,
+        figures.speed_advice.as_ref().map_or(String::new(), |advice| format!(" ({advice})")),
+        figures.frames_made,
+        figures.frames_shown,
+        figures.deadline_misses,
+        report::spread_text(figures.frame_time),
+        report::spread_text(figures.sample_to_photon),
     )
 }

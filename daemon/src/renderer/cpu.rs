@@ -161,7 +161,7 @@ mod tests {
     use holod_calibration::rig::Rig;
 
     use super::*;
-    use crate::setup;
+    use crate::source::scene;
 
     const SIZE: Resolution = Resolution { width: 34, height: 22 };
     const PANEL: Resolution = Resolution { width: 40, height: 25 };
@@ -185,7 +185,7 @@ mod tests {
     fn levels_are_those_of_the_stages_for_each_pupil_in_whatever_buffer() {
         let weights = Weights::builtin_small();
         let mut renderer = CpuRenderer::new(&weights, &DisplayGeometry::DEFAULT, &encoder(), None).unwrap();
-        let frame = Arc::new(setup::sample_frame(SIZE));
+        let frame = Arc::new(scene::sample_frame(SIZE));
         let mut buffers = [(); 2].map(|()| LevelsFrame::new(encoder().layout()));
         let mut shown = Vec::new();
         for (pupil_mm, buffer) in [(2.0, 0), (4.0, 1), (2.0, 0)] {
@@ -207,9 +207,9 @@ mod tests {
         let mut renderer = CpuRenderer::new(&weights, &DisplayGeometry::DEFAULT, &encoder(), None).unwrap();
         let mut levels = LevelsFrame::new(encoder().layout());
         let pupil = PupilDiameter::from_mm(3.0);
-        let wrong = Arc::new(setup::sample_frame(PANEL));
+        let wrong = Arc::new(scene::sample_frame(PANEL));
         assert!(matches!(renderer.render(&wrong, pupil, &mut levels), Err(EngineError::Resolution { .. })));
-        let right = Arc::new(setup::sample_frame(SIZE));
+        let right = Arc::new(scene::sample_frame(SIZE));
         renderer.render(&right, pupil, &mut levels).unwrap();
         assert_eq!(levels.samples(), stage_by_stage(&weights, &right, pupil).samples());
     }

@@ -212,7 +212,7 @@ mod tests {
     use holod_calibration::rig::Rig;
 
     use super::*;
-    use crate::setup;
+    use crate::source::scene;
 
     const SIZE: Resolution = Resolution { width: 34, height: 22 };
     const PANEL: Resolution = Resolution { width: 41, height: 25 };
@@ -232,7 +232,7 @@ mod tests {
     fn levels_are_the_processors_whatever_becomes_of_the_device() {
         let encoder = Arc::new(PanelEncoder::new(&Rig::default().panel, PANEL, SIZE).unwrap());
         let pupil = PupilDiameter::from_mm(3.0);
-        let frame = Arc::new(setup::sample_frame(SIZE));
+        let frame = Arc::new(scene::sample_frame(SIZE));
         let levels = || LevelsFrame::new(encoder.layout());
         let (mut expected, mut flat) = (levels(), levels());
         let mut cpu = CpuRenderer::new(&Weights::builtin_small(), &DisplayGeometry::DEFAULT, &encoder, None).unwrap();
@@ -266,7 +266,7 @@ mod tests {
     fn a_frame_of_another_size_is_refused_and_is_no_fault_of_the_device() {
         let encoder = Arc::new(PanelEncoder::new(&Rig::default().panel, PANEL, SIZE).unwrap());
         let mut gpu = renderer(&encoder);
-        let wrong = Arc::new(setup::sample_frame(PANEL));
+        let wrong = Arc::new(scene::sample_frame(PANEL));
         let mut levels = LevelsFrame::new(encoder.layout());
         let refused = gpu.render(&wrong, PupilDiameter::from_mm(3.0), &mut levels);
         assert!(matches!(refused, Err(EngineError::Resolution { .. })));

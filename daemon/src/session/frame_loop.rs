@@ -14,7 +14,7 @@ use super::host_now;
 use super::keep::keep_slot;
 use crate::record::FrameRecord;
 use crate::renderer::Renderer;
-use crate::setup::Frames;
+use crate::source::PictureSource;
 
 /// An order to stop is seen within this time.
 const LONGEST_SLEEP: Duration = Duration::from_millis(20);
@@ -33,11 +33,9 @@ pub(super) struct FrameLoop {
     /// Which refresh each frame is for.
     pub pacer: Pacer,
     /// What to show.
-    pub frames: Arc<Frames>,
+    pub pictures: PictureSource,
     /// The pupils that the network knows.
     pub trained: TrainedPupils,
-    /// When the run began.
-    pub t_origin: TimeNs,
     /// To whoever records.
     pub records: rtrb::Producer<LoopRecord>,
     /// Records that found no room.
@@ -105,10 +103,10 @@ impl FrameLoop {
         let t_wake = self.mark(Point::WakeUp, plan);
         let state = self.pupil.pupil_at(t_wake).state;
         let estimate = self.pupil.pupil_at(plan.t_predicted_photon.min(t_wake + FARTHEST_PREDICTION));
-        let scene = self.frames.index_at((plan.t_predicted_photon - self.t_origin).seconds());
 
         let t_render_begin = self.mark(Point::RenderBegin, plan);
-        let rendered = self.renderer.render(&self.frames.frames[scene], estimate.pupil, self.port.acquire())?;
+        let (frame, picture) = self.pictures.at(plan.t_predicted_photon);
+        let rendered = self.renderer.render(frame, estimate.pupil, self.port.acquire())?;
         if rendered.engine_changed {
             // It happens when a device is lost, which took longer than any lock.
             self.renderer.description().clone_into(&mut self.engine.lock().unwrap_or_else(PoisonError::into_inner));
@@ -129,6 +127,7 @@ impl FrameLoop {
                 t_render_end,
                 t_submit,
                 t_desired_present: plan.t_desired_present,
+                picture,
             },
             beyond_trained: !self.trained.contain(estimate.pupil),
             clipped_share: rendered.clipped_share,

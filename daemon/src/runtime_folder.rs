@@ -1,0 +1,44 @@
+//! The folder for what belongs to a run and not to a disk: its status, its sockets.
+
+use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+use std::path::{Path, PathBuf};
+
+/// The best folder that this process may write to, made where it is missing; nothing where there is none.
+pub fn own() -> Option<PathBuf> {
+    candidates().into_iter().find(|folder| prepare(folder))
+}
+
+/// Where such a folder may be, the best place first: the folder that systemd made for it, one in the user's own
+/// runtime folder, one of this user's in the folder for temporary files.
+pub fn candidates() -> Vec<PathBuf> {
+    let named = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let uid = rustix::process::getuid().as_raw();
+    let login = PathBuf::from(format!("/run/user/{uid}"));
+    let runtime =
+        named("XDG_RUNTIME_DIR").or_else(|| login.is_dir().then_some(login)).map(|folder| folder.join("holod"));
+    let temporary = std::env::temp_dir().join(format!("holod-{uid}"));
+    named("RUNTIME_DIRECTORY").into_iter().chain(runtime).chain([temporary]).collect()
+}
+
+/// Makes a folder that only this user can write to; false where it cannot be, or is somebody else's.
+fn prepare(folder: &Path) -> bool {
+    let made = std::fs::DirBuilder::new().recursive(true).mode(0o700).create(folder).is_ok();
+    let own = std::fs::symlink_metadata(folder)
+        .is_ok_and(|metadata| metadata.is_dir() && metadata.uid() == rustix::process::geteuid().as_raw());
+    made && own
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_of_ones_own_is_made_and_a_link_is_none() {
+        let root = tempfile::tempdir().unwrap();
+        let own = root.path().join("own");
+        assert!(prepare(&own) && prepare(&own));
+        assert_eq!(std::fs::metadata(&own).unwrap().mode() & 0o777, 0o700);
+        std::os::unix::fs::symlink(&own, root.path().join("link")).unwrap();
+        assert!(!prepare(&root.path().join("link")));
+    }
+}

@@ -1,0 +1,216 @@
+//! The beginning of a run: every part is opened, then the frame thread starts.
+
+use std::sync::atomic::{AtomicBool, AtomicU64};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+
+use holod_calibration::TimeNs;
+use holod_model::engine::EngineError;
+use holod_pupil_input::{ReplaySpeed, Tracker, TrackerOptions, TrackerSpec};
+use holod_slm_output::laser::open_laser;
+use holod_slm_output::output::{OutputError, pacing_config};
+use holod_slm_output::present::{PanelSetup, open_panel};
+use holod_slm_output::{LevelsFrame, Output, OutputControl, OutputOptions, Pacer, PanelEncoder};
+
+use super::frame_loop::{FrameLoop, TrainedPupils};
+use super::keep::KEEP_SLOTS;
+use super::laser_watch::LaserBoxWatch;
+use super::output_watch::OutputWatch;
+use super::service::Service;
+use super::stats::FrameRate;
+use super::tally::Tally;
+use super::tracker_watch::TrackerWatch;
+use super::watch::{Limits, Names, Rings, Told, Watch};
+use super::{Observer, RECORDS, SessionPlan, Signals, host_now, scheduling, tracker_failure};
+use crate::failure::{Exit, Failure};
+use crate::renderer::{self, Renderer};
+use crate::status::StatusFile;
+use crate::{progress, setup, source, speed};
+
+/// Lasers go dark when one frame has stayed on the panel for so many frame times, within these limits.
+const STALL_FRAMES: i64 = 6;
+const STALL_TIMEOUT_MIN: TimeNs = TimeNs(2_000_000_000);
+const STALL_TIMEOUT_MAX: TimeNs = TimeNs(10_000_000_000);
+/// A first frame that takes longer is not made twice to be timed.
+const LONG_FRAME: TimeNs = TimeNs(5_000_000_000);
+
+/// A run whose threads are at work.
+pub(super) struct Session<'a> {
+    /// The control thread's view of it.
+    pub(super) watch: Watch<'a>,
+    /// Ends panel and lasers.
+    pub(super) output: OutputControl,
+    /// Makes frames.
+    pub(super) frame_thread: JoinHandle<Result<(), EngineError>>,
+    /// Ends the frame thread.
+    pub(super) stop: Arc<AtomicBool>,
+    /// Frame records that found no room.
+    pub(super) records_lost: Arc<AtomicU64>,
+    /// When it is over.
+    pub(super) limits: Limits,
+    /// Turns levels back into phase.
+    pub(super) encoder: Arc<PanelEncoder>,
+}
+
+/// Starts everything. What has been started is taken down again where a later part cannot be.
+pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Observer) -> Result<Session<'_>, Failure> {
+    let resolution = plan.pictures.resolution();
+    let rig = &plan.rig;
+    let encoder = progress::during(&format!("preparing the levels of the panel of {}", rig.resolution()), || {
+        renderer::panel_encoder(rig, resolution)
+    })?;
+    let (renderer, frame_time) = progress::during(&format!("preparing the network for {resolution}"), || {
+        let mut renderer =
+            scheduling::patient(|| renderer::open(plan.backend, &plan.weights, &rig.geometry, &encoder))?;
+        let frame_time = first_frame_time(&mut *renderer, &plan, LevelsFrame::new(encoder.layout()))?;
+        Ok::<_, Failure>((renderer, frame_time))
+    })?;
+    tracing::info!("holograms are computed by {}", renderer.description());
+    let engine = Arc::new(Mutex::new(renderer.description().to_owned()));
+    let advised = tell_frame_time(&plan, frame_time);
+    let pacing = pacing_config(rig, frame_time).map_err(Failure::because(Exit::Config))?;
+
+    let t_origin = host_now();
+    let tracker_options = TrackerOptions {
+        origin: t_origin,
+        record: plan.record_tracker.clone(),
+        forbidden: setup::ports_of_others(rig),
+    };
+    let (estimates, tap, tracker) = scheduling::prompt(|| Tracker::start(&plan.tracker, &rig.tracker, tracker_options))
+        .map_err(tracker_failure)?
+        .split();
+    for warning in tracker.warnings() {
+        tracing::warn!("{warning}");
+    }
+    tracing::debug!("tracker `{}` is open, link {}", plan.tracker, tracker.link().name());
+
+    let scene = plan.pictures.name().to_owned();
+    let (pictures, feed) =
+        source::open(&plan.pictures, &rig.geometry, t_origin).map_err(Failure::because(Exit::Unavailable))?;
+    let options = OutputOptions {
+        keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 },
+        stall_timeout: rig.lasers.stall_timeout.unwrap_or_else(|| stall_timeout(frame_time)),
+    };
+    let output = progress::during("opening panel and lasers", || {
+        scheduling::prompt(|| open_output(&plan, &encoder, options)).map_err(Failure::because(Exit::Unavailable))
+    })?;
+    tracing::debug!("panel `{}` is open; lasers by {:?}", plan.output, rig.lasers.driver);
+    output.control.dark_switch().install_panic_hook(host_now, holod_model::gpu::panic_is_caught);
+
+    let stop = Arc::new(AtomicBool::new(false));
+    let records_lost = Arc::new(AtomicU64::new(0));
+    let (record_producer, records) = rtrb::RingBuffer::new(RECORDS);
+    let frame_loop = FrameLoop {
+        pupil: estimates,
+        renderer,
+        port: output.frames,
+        pacer: Pacer::new(pacing, host_now()),
+        pictures,
+        trained: TrainedPupils::of(plan.weights.trained_pupils(&rig.geometry)),
+        records: record_producer,
+        records_lost: Arc::clone(&records_lost),
+        keep_levels: plan.keep_levels,
+        limit: plan.frame_limit,
+        engine: Arc::clone(&engine),
+        stop: Arc::clone(&stop),
+    };
+    let frame_thread = std::thread::Builder::new()
+        .name("holod-frame".into())
+        .spawn(move || frame_loop.run())
+        .map_err(Failure::because(Exit::Unavailable))?;
+
+    let limits =
+        Limits { t_origin, frames: plan.frame_limit, duration: plan.duration, replay_ends_run: replay_ends_run(&plan) };
+    let names = Names {
+        scene,
+        tracker: plan.tracker.to_string(),
+        panel: plan.output.to_string(),
+        engine,
+        hologram: resolution,
+    };
+    let rings = Rings {
+        records,
+        fields: output.events,
+        fields_over: Vec::new(),
+        box_events: output.box_events,
+        decisions: tap,
+    };
+    let watch = Watch {
+        names,
+        rings,
+        panel: OutputWatch::new(output.panel_events, rig.panel.refresh_hz),
+        laser_box: LaserBoxWatch::new(output.laser_faults, output.laser_watch),
+        tracker,
+        tracker_watch: TrackerWatch::new(&rig.tracker, t_origin),
+        feed,
+        signals,
+        service: Service::connect(),
+        status: StatusFile::create(),
+        t_origin,
+        told: Told::new(advised),
+        tally: Tally::default(),
+        frame_rate: FrameRate::default(),
+        rig: plan.rig,
+        observer,
+    };
+    Ok(Session { watch, output: output.control, frame_thread, stop, records_lost, limits, encoder })
+}
+
+/// Says how many frames a second are to be expected. Whether it has said what would bring more.
+fn tell_frame_time(plan: &SessionPlan, frame_time: TimeNs) -> bool {
+    let panel_hz = speed::panel_frames_hz(&plan.rig.panel);
+    let frames_hz = 1.0 / frame_time.seconds();
+    let first_frame = format!(
+        "a frame takes {:.0} ms, so about {frames_hz:.2} frames a second of the panel's {panel_hz:.1}",
+        frame_time.seconds() * 1e3
+    );
+    let advice = speed::advice(frames_hz, &plan.rig, plan.pictures.resolution());
+    match &advice {
+        None => tracing::info!("{first_frame}"),
+        Some(advice) => tracing::warn!("{first_frame}: {advice}"),
+    }
+    advice.is_some()
+}
+
+/// A log that is played in no time says nothing of when a run is over that was asked to last.
+fn replay_ends_run(plan: &SessionPlan) -> bool {
+    let is_bounded = plan.frame_limit.is_some() || plan.duration.is_some();
+    match &plan.tracker {
+        TrackerSpec::Replay { repeat: true, .. } => false,
+        TrackerSpec::Replay { speed: ReplaySpeed::Fastest, .. } => !is_bounded,
+        TrackerSpec::Replay { .. } => true,
+        TrackerSpec::Path(path) => path.is_file(),
+        _ => false,
+    }
+}
+
+fn open_output(plan: &SessionPlan, encoder: &PanelEncoder, options: OutputOptions) -> Result<Output, OutputError> {
+    let rig = &plan.rig;
+    let panel = open_panel(&plan.output, &PanelSetup::new(&rig.panel, encoder), host_now())?;
+    #[cfg(feature = "fault-injection")]
+    let panel = Box::new(crate::fault::FaultyPanel(panel));
+    let laser = open_laser(&rig.lasers, host_now)?;
+    Output::start(rig, encoder, panel, laser, options, host_now)
+}
+
+/// How long a frame takes, measured before anything is shown: the second one, unless the first took very long. A GPU's
+/// driver still prepares things while it does the first.
+fn first_frame_time(
+    renderer: &mut dyn Renderer,
+    plan: &SessionPlan,
+    mut levels: LevelsFrame,
+) -> Result<TimeNs, Failure> {
+    let [pupil, _] = plan.weights.trained_pupils(&plan.rig.geometry);
+    let frame = plan.pictures.first_frame();
+    let mut time = || {
+        let began = host_now();
+        renderer.render(&frame, pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))?;
+        Ok(host_now() - began)
+    };
+    let first = time()?;
+    if first > LONG_FRAME { Ok(first) } else { time() }
+}
+
+fn stall_timeout(frame_time: TimeNs) -> TimeNs {
+    TimeNs(STALL_FRAMES * frame_time.0).clamp(STALL_TIMEOUT_MIN, STALL_TIMEOUT_MAX)
+}

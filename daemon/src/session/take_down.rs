@@ -1,0 +1,92 @@
+//! The end of a run: lasers dark, flat pattern, threads joined, and what it all came to.
+
+use std::sync::atomic::Ordering;
+
+use holod_calibration::PupilDiameter;
+use holod_slm_output::LevelsFrame;
+
+use super::build::Session;
+use super::host_now;
+use super::summary::{SessionReport, Summary};
+use crate::failure::{Exit, Failure};
+use crate::snapshot::Figures;
+
+/// Ends every part in order, whatever `ended` says, and then says what the run came to.
+///
+/// # Errors
+/// What ended the run early, or went wrong at its end.
+pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) -> Result<SessionReport, Failure> {
+    let Session { mut watch, output, frame_thread, stop, records_lost, limits, encoder } = session;
+    watch.service.stopping();
+    tracing::info!("stopping: {}", ended.as_deref().unwrap_or("a failure"));
+    stop.store(true, Ordering::Release);
+    let down = output.shutdown();
+    let frame_loop = frame_thread.join();
+    let tracker_link = watch.tracker.link().name().to_owned();
+    watch.tracker.stop();
+    let observed = watch.drain();
+    watch.laser_box.drain(false);
+    let lasers_not_dark = (!down.lasers_dark).then(|| {
+        let silent = "the laser box did not acknowledge in time";
+        watch.laser_box.trouble().unwrap_or(silent).to_owned()
+    });
+    watch.tracker_watch.judge(&watch.tracker, host_now());
+    let figures = Figures { tracker_link, ..watch.figures(&down.counts, host_now()) };
+    watch.feed = None;
+    let recorded = watch.tracker.recording();
+    if let Some(failure) = recorded.as_ref().and_then(|status| status.failure.as_deref()) {
+        tracing::error!("the tracker's recording is not whole: {failure}");
+    }
+    if let Some(why) = &lasers_not_dark
+        && (ended.is_err() || observed.is_err() || !matches!(frame_loop, Ok(Ok(()))))
+    {
+        tracing::error!("{}", not_dark(why));
+    }
+    let ended_by = ended?;
+    observed?;
+    match frame_loop {
+        Err(_panic) => return Err(Failure::new(Exit::Software, "the frame loop failed (its message stands above)")),
+        Ok(rendered) => rendered.map_err(Failure::because(Exit::Unavailable))?,
+    }
+
+    let tally = watch.tally;
+    if tally.frames_shown == 0 {
+        tracing::warn!("no frame was shown: the run ended before the first one was ready; give it longer");
+    }
+    let mut shown: Vec<(PupilDiameter, LevelsFrame)> = down
+        .kept
+        .into_iter()
+        .flatten()
+        .filter_map(|levels| Some((tally.pupil_of_kept(levels.tag().frame_id)?, levels)))
+        .collect();
+    shown.sort_by(|(a, _), (b, _)| a.mm().total_cmp(&b.mm()));
+    let duration_s = (host_now() - limits.t_origin).seconds();
+    let counters = watch.tracker.counters();
+    let summary = Summary {
+        ended_by,
+        duration_s,
+        figures,
+        fields_shown: tally.fields_shown,
+        fields_repeated: tally.fields_repeated,
+        frames_shown_hz: tally.frames_shown as f64 / duration_s,
+        frames_by_pupil_state: tally.by_state,
+        pupil_range_mm: tally.pupil_range_mm,
+        frames_beyond_trained_pupils: tally.beyond_trained,
+        samples_rejected: counters.rejected_in_all() + counters.faults_in_all(),
+        tracker_clock_drift_ppm: watch.tracker.clock().map(|clock| clock.drift_ppm),
+        tracker_records_lost: recorded.as_ref().map_or(0, |status| status.chunks_lost + status.decisions_lost),
+        clipped_share_max: tally.clipped_share_max,
+        unreachable_share_max: tally.unreachable_share_max,
+        lasers: tally.lasers.finish(),
+        lasers_dark_at_end: down.lasers_dark,
+        lasers_not_dark,
+        flat_at_end: down.flat_presented,
+        records_lost: down.counts.lost + records_lost.load(Ordering::Relaxed),
+    };
+    Ok(SessionReport { summary, t_origin: limits.t_origin, shown, encoder })
+}
+
+/// What a person must do where a laser box did not acknowledge darkness, for the reason `why`.
+pub fn not_dark(why: &str) -> String {
+    format!("the lasers did not acknowledge darkness at the end: {why}; look at them, and switch them off by hand")
+}

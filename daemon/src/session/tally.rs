@@ -1,0 +1,108 @@
+//! Running numbers of a run.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use holod_calibration::{PupilDiameter, TimeNs};
+use holod_slm_output::FieldEvent;
+
+use super::RECORDS;
+use super::frame_loop::LoopRecord;
+use super::keep::{KEEP_SLOTS, keep_slot};
+use super::ledger::LaserLedger;
+use super::stats::Recent;
+use crate::record::FrameRecord;
+
+/// Frames whose fields may still come: all that the ring of records can hold at once, and some more.
+const REMEMBERED: usize = RECORDS + 64;
+
+/// Running numbers of a run.
+#[derive(Default)]
+pub(super) struct Tally {
+    recent: VecDeque<FrameRecord>,
+    kept: [Option<(u64, PupilDiameter)>; KEEP_SLOTS],
+    pub(super) lasers: LaserLedger,
+    pub(super) frames_made: u64,
+    pub(super) frames_shown: u64,
+    pub(super) fields_shown: u64,
+    pub(super) fields_repeated: u64,
+    pub(super) deadline_misses: u64,
+    newest_made: u64,
+    newest_shown: u64,
+    pub(super) newest_state: &'static str,
+    pub(super) frame_time: Recent,
+    pub(super) sample_to_photon: Recent,
+    pub(super) picture_to_photon: Recent,
+    newest_picture: Option<TimeNs>,
+    pub(super) by_state: BTreeMap<&'static str, u64>,
+    pub(super) pupil_range_mm: Option<[f32; 2]>,
+    pub(super) beyond_trained: u64,
+    pub(super) clipped_share_max: f32,
+    pub(super) unreachable_share_max: f32,
+}
+
+impl Tally {
+    /// A frame was made.
+    pub(super) fn frame(&mut self, record: &LoopRecord) {
+        let frame = &record.frame;
+        self.frames_made += 1;
+        self.newest_made = frame.frame;
+        self.newest_state = frame.pupil_state;
+        *self.by_state.entry(frame.pupil_state).or_default() += 1;
+        self.frame_time.push((frame.t_submit - frame.t_wake).seconds() as f32 * 1e3);
+        let pupil_mm = frame.pupil.mm();
+        self.beyond_trained += u64::from(record.beyond_trained);
+        let [narrowest, widest] = self.pupil_range_mm.unwrap_or([pupil_mm; 2]);
+        self.pupil_range_mm = Some([narrowest.min(pupil_mm), widest.max(pupil_mm)]);
+        self.clipped_share_max = self.clipped_share_max.max(record.clipped_share);
+        self.unreachable_share_max = self.unreachable_share_max.max(record.unreachable_share);
+        if self.recent.len() == REMEMBERED {
+            self.recent.pop_front();
+        }
+        self.recent.push_back(*frame);
+    }
+
+    /// A field was shown and is over.
+    pub(super) fn field(&mut self, event: &FieldEvent) {
+        self.lasers.field(event);
+        self.fields_shown += 1;
+        self.fields_repeated += u64::from(event.repeated);
+        if event.repeated || event.frame_id == self.newest_shown {
+            return;
+        }
+        self.newest_shown = event.frame_id;
+        self.frames_shown += 1;
+        self.deadline_misses += u64::from(event.deadline_missed);
+        let Some(frame) = self.recent.iter().find(|frame| frame.frame == event.frame_id) else { return };
+        if let Some(slot) = keep_slot(frame.pupil) {
+            self.kept[slot] = Some((frame.frame, frame.pupil));
+        }
+        let Some((on, off)) = event.laser_on.zip(event.laser_off) else { return };
+        let middle = TimeNs(on.0 / 2 + off.0 / 2);
+        let since = |t: TimeNs| (middle - t).seconds() as f32 * 1e3;
+        if let Some(t_sample) = frame.t_sample {
+            self.sample_to_photon.push(since(t_sample));
+        }
+        // A picture that is shown for another pupil is no newer for that.
+        if let Some(t_taken) = frame.picture.t_taken
+            && self.newest_picture != Some(t_taken)
+        {
+            self.newest_picture = Some(t_taken);
+            self.picture_to_photon.push(since(t_taken));
+        }
+    }
+
+    /// The pupil that the newest frame was made for.
+    pub(super) fn newest_pupil(&self) -> Option<PupilDiameter> {
+        self.recent.back().map(|frame| frame.pupil)
+    }
+
+    /// Whether the newest frame has come on the panel.
+    pub(super) fn newest_frame_shown(&self) -> bool {
+        self.newest_shown == self.newest_made
+    }
+
+    /// The pupil that a frame was made for whose levels were kept.
+    pub(super) fn pupil_of_kept(&self, frame: u64) -> Option<PupilDiameter> {
+        self.kept.iter().flatten().find(|(kept, _)| *kept == frame).map(|(_, pupil)| *pupil)
+    }
+}

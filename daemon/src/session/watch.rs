@@ -1,0 +1,315 @@
+//! The control thread while a run goes on: takes note of what the other threads say, and tells people.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use holod_calibration::rig::Rig;
+use holod_calibration::{Resolution, TimeNs};
+use holod_model::engine::EngineError;
+use holod_pupil_input::{Counter, DecisionTap, Link, PupilState, TrackerControl};
+use holod_slm_output::laser::{BoxEvent, DarkReason};
+use holod_slm_output::output::OutputCounts;
+use holod_slm_output::{FieldEvent, OutputControl};
+
+use super::frame_loop::LoopRecord;
+use super::laser_watch::LaserBoxWatch;
+use super::output_watch::OutputWatch;
+use super::rate_watch::RateWatch;
+use super::service::Service;
+use super::stats::FrameRate;
+use super::tally::Tally;
+use super::tracker_watch::TrackerWatch;
+use super::{Observer, Signals, host_now};
+use crate::failure::{Exit, Failure};
+use crate::snapshot::{Figures, Snapshot};
+use crate::source::feed::Feed;
+use crate::speed;
+use crate::status::StatusFile;
+
+const TICK: Duration = Duration::from_millis(10);
+const TICKS_PER_REPORT: u32 = 10;
+const TICKS_PER_STATUS: u32 = 100;
+/// How long the end of a run waits for its last frame to be shown.
+const LAST_FRAME_WAIT: TimeNs = TimeNs(1_000_000_000);
+
+/// The control thread's view of a run.
+pub(super) struct Watch<'a> {
+    pub(super) rig: Rig,
+    pub(super) names: Names,
+    pub(super) rings: Rings,
+    pub(super) panel: OutputWatch,
+    pub(super) laser_box: LaserBoxWatch,
+    pub(super) tracker: TrackerControl,
+    pub(super) tracker_watch: TrackerWatch,
+    pub(super) feed: Option<Feed>,
+    pub(super) signals: Signals,
+    pub(super) service: Service,
+    pub(super) status: StatusFile,
+    pub(super) t_origin: TimeNs,
+    pub(super) told: Told,
+    pub(super) tally: Tally,
+    pub(super) frame_rate: FrameRate,
+    pub(super) observer: &'a mut dyn Observer,
+}
+
+/// What the parts of a run are called.
+pub(super) struct Names {
+    pub(super) scene: String,
+    pub(super) tracker: String,
+    pub(super) panel: String,
+    /// How holograms are computed; another engine may take the place of the first.
+    pub(super) engine: Arc<Mutex<String>>,
+    pub(super) hologram: Resolution,
+}
+
+/// What the other threads say.
+pub(super) struct Rings {
+    pub(super) records: rtrb::Consumer<LoopRecord>,
+    pub(super) fields: rtrb::Consumer<FieldEvent>,
+    pub(super) fields_over: Vec<FieldEvent>,
+    pub(super) box_events: rtrb::Consumer<BoxEvent>,
+    pub(super) decisions: DecisionTap,
+}
+
+/// What has been said to people.
+#[derive(Default)]
+pub(super) struct Told {
+    /// What would bring more frames a second has been said.
+    advised: bool,
+    rate: RateWatch,
+    state: State,
+    text: String,
+}
+
+impl Told {
+    pub(super) fn new(advised: bool) -> Self {
+        Self { advised, ..Self::default() }
+    }
+}
+
+/// The daemon's state, as `systemctl status` shows it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum State {
+    #[default]
+    Dark,
+    Running,
+    Degraded,
+}
+
+impl State {
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Dark => "dark",
+            Self::Running => "running",
+            Self::Degraded => "degraded",
+        }
+    }
+}
+
+/// When a run is over.
+pub(super) struct Limits {
+    pub(super) t_origin: TimeNs,
+    pub(super) frames: Option<u64>,
+    pub(super) duration: Option<Duration>,
+    pub(super) replay_ends_run: bool,
+}
+
+impl Watch<'_> {
+    /// Watches until something ends the run, and says what.
+    pub(super) fn until_the_end(
+        &mut self,
+        limits: &Limits,
+        output: &OutputControl,
+        frame_thread: &JoinHandle<Result<(), EngineError>>,
+    ) -> Result<String, Failure> {
+        let mut t_give_up = None;
+        let mut ticks = 0_u32;
+        loop {
+            std::thread::sleep(TICK);
+            let now = host_now();
+            self.drain()?;
+            self.service.progress(self.tally.frames_shown, now);
+            ticks = ticks.wrapping_add(1);
+            if ticks.is_multiple_of(TICKS_PER_REPORT) {
+                self.report(&output.counts(), now)?;
+            }
+            if ticks.is_multiple_of(TICKS_PER_STATUS) {
+                self.write_status(&output.counts(), now);
+            }
+            if let Some(signal) = self.signals.caught() {
+                return Ok(signal.to_owned());
+            }
+            if let Some(ended) = self.over(limits, now) {
+                return Ok(ended.to_owned());
+            }
+            if output.dark_switch().reason() == Some(DarkReason::Panic) {
+                return Err(Failure::new(Exit::Software, "a thread failed (its message stands above)"));
+            }
+            if let Some(fault) = self.panel.lost().filter(|fault| !fault.is_recoverable()) {
+                return Err(Failure::new(Exit::Unavailable, format!("the panel: {fault}")));
+            }
+            if frame_thread.is_finished() {
+                let t_end = *t_give_up.get_or_insert(now + LAST_FRAME_WAIT);
+                let is_whole = limits.frames.is_some_and(|frames| self.tally.frames_made >= frames);
+                if !is_whole {
+                    return Ok("the engine's failure".to_owned());
+                }
+                if self.tally.newest_frame_shown() || now >= t_end {
+                    return Ok("the asked number of frames".to_owned());
+                }
+            }
+        }
+    }
+
+    /// Which limit has been reached.
+    fn over(&self, limits: &Limits, now: TimeNs) -> Option<&'static str> {
+        let lasted =
+            |duration: Duration| (now - limits.t_origin).0 >= i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX);
+        if limits.duration.is_some_and(lasted) {
+            return Some("the asked duration");
+        }
+        let replayed = limits.replay_ends_run && self.tracker.finished() && self.tally.frames_shown > 0;
+        replayed.then_some("the end of the pupil log")
+    }
+
+    /// Takes note of everything that the other threads have said.
+    ///
+    /// A frame's record is written before the frame is submitted, so the records of all fields that are taken first are
+    /// there when records are taken next.
+    pub(super) fn drain(&mut self) -> Result<(), Failure> {
+        let Rings { records, fields, fields_over, box_events, decisions } = &mut self.rings;
+        while let Ok(event) = fields.pop() {
+            fields_over.push(event);
+        }
+        while let Ok(record) = records.pop() {
+            self.tally.frame(&record);
+            tracing::trace!("{:?}", record.frame);
+            self.observer.frame(&record.frame)?;
+        }
+        while let Ok(event) = box_events.pop() {
+            self.tally.lasers.box_event(&event);
+            if let BoxEvent::Dark { t, reason } = event {
+                self.panel.went_dark(t, reason);
+            }
+        }
+        self.panel.drain();
+        for event in fields_over.drain(..) {
+            self.tally.field(&event);
+            self.observer.field(&event)?;
+        }
+        while let Some(decision) = decisions.pop() {
+            self.tracker_watch.note(&decision);
+            tracing::trace!("{decision:?}");
+            self.observer.decision(&decision)?;
+        }
+        Ok(())
+    }
+
+    /// What is looked at ten times a second.
+    fn report(&mut self, output: &OutputCounts, now: TimeNs) -> Result<(), Failure> {
+        self.tell_state(output);
+        self.tell_rate(now);
+        self.tracker_watch.look(&mut self.tracker, now)?;
+        self.panel.judge_rate(output, now);
+        self.laser_box.drain(output.armed);
+        self.observer.tick()
+    }
+
+    fn tell_state(&mut self, output: &OutputCounts) {
+        let lit = output.armed && self.tally.frames_shown > 0;
+        let link = self.tracker.link();
+        let follows = link == Link::Up && self.tally.newest_state != PupilState::Fallback.name();
+        let state = match (lit, follows) {
+            (false, _) => State::Dark,
+            (true, false) => State::Degraded,
+            (true, true) => State::Running,
+        };
+        self.told.state = state;
+        // A blink is no news; what the pupil falls back to is.
+        let pupil = match self.tally.newest_state {
+            "" => "not known yet",
+            fallback if fallback == PupilState::Fallback.name() => fallback,
+            _ => "followed",
+        };
+        let text = format!("{}: tracker {}, pupil {pupil}", state.name(), link.name());
+        if text != self.told.text {
+            tracing::info!("{text}");
+            self.service.status(&text);
+            self.told.text = text;
+        }
+    }
+
+    /// Says once how many frames a second are really reached.
+    fn tell_rate(&mut self, now: TimeNs) {
+        let Some(reached_hz) = self.told.rate.reached_hz(self.tally.frames_shown, now) else { return };
+        let panel_hz = speed::panel_frames_hz(&self.rig.panel);
+        let reached = format!("{reached_hz:.2} frames a second are shown, of the panel's {panel_hz:.1}");
+        match speed::advice(reached_hz, &self.rig, self.names.hologram).filter(|_| !self.told.advised) {
+            None => tracing::info!("{reached}"),
+            Some(advice) => tracing::warn!("{reached}: {advice}"),
+        }
+    }
+
+    fn write_status(&mut self, output: &OutputCounts, now: TimeNs) {
+        let snapshot = self.snapshot(output, now);
+        self.status.write(&snapshot);
+        let figures = &snapshot.figures;
+        tracing::debug!(
+            "{}: {} frames made, {} shown, {:.1} a second; pupil {:?} mm, {}; {} samples, {} rejected; lasers {}",
+            snapshot.state,
+            figures.frames_made,
+            figures.frames_shown,
+            snapshot.frames_shown_hz,
+            snapshot.pupil_mm,
+            snapshot.pupil_state,
+            self.tracker.counters().of(Counter::Samples),
+            self.tracker.counters().rejected_in_all(),
+            snapshot.lasers
+        );
+    }
+
+    /// What can be said of the run now.
+    fn snapshot(&mut self, output: &OutputCounts, now: TimeNs) -> Snapshot {
+        Snapshot {
+            pid: std::process::id(),
+            state: self.told.state.name().to_owned(),
+            uptime_s: (now - self.t_origin).seconds(),
+            frames_shown_hz: self.frame_rate.at(self.tally.frames_shown, now),
+            pupil_state: self.tally.newest_state.to_owned(),
+            pupil_mm: self.tally.newest_pupil().map(|pupil| pupil.mm()),
+            panel: self.names.panel.clone(),
+            panel_trouble: self.panel.lost().map(|fault| fault.to_string()),
+            lasers: if output.armed { "armed" } else { "dark" }.to_owned(),
+            lasers_trouble: self.laser_box.trouble().map(str::to_owned),
+            figures: self.figures(output, now),
+        }
+    }
+
+    /// What holds of the run now, and at its end.
+    pub(super) fn figures(&self, output: &OutputCounts, now: TimeNs) -> Figures {
+        let Self { tally, names, .. } = self;
+        let frame_time = tally.frame_time.spread();
+        Figures {
+            rig: self.rig.name.clone(),
+            scene: names.scene.clone(),
+            tracker: names.tracker.clone(),
+            engine: names.engine.lock().unwrap_or_else(PoisonError::into_inner).clone(),
+            hologram: names.hologram.to_string(),
+            frames_made: tally.frames_made,
+            frames_shown: tally.frames_shown,
+            deadline_misses: tally.deadline_misses,
+            panel_frames_hz: speed::panel_frames_hz(&self.rig.panel),
+            panel_refresh_hz: output.refresh_hz,
+            speed_advice: frame_time
+                .and_then(|time| speed::advice(1e3 / f64::from(time.median_ms), &self.rig, names.hologram)),
+            frame_time,
+            sample_to_photon: tally.sample_to_photon.spread(),
+            picture_to_photon: tally.picture_to_photon.spread(),
+            tracker_link: self.tracker.link().name().to_owned(),
+            tracker_trouble: self.tracker_watch.trouble(),
+            tracker_counts: self.tracker.counters().entries().collect(),
+            feed: self.feed.as_ref().map(|feed| feed.status(now)),
+        }
+    }
+}

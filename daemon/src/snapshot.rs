@@ -1,0 +1,77 @@
+//! What can be said of a run at one moment: the one thing from which status, summary and answers are made.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::session::Spread;
+use crate::source::feed::FeedStatus;
+
+/// What holds of a run that goes on and of one that is over alike.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Figures {
+    /// The rig's name.
+    pub rig: String,
+    /// The scene's name.
+    pub scene: String,
+    /// The tracker spec.
+    pub tracker: String,
+    /// How holograms are computed.
+    pub engine: String,
+    /// Hologram size in pixels.
+    pub hologram: String,
+    /// Frames that were made.
+    pub frames_made: u64,
+    /// Of those, frames that came on the panel.
+    pub frames_shown: u64,
+    /// Frames that came on the panel later than planned.
+    pub deadline_misses: u64,
+    /// Frames of all colours that the panel could show in a second.
+    pub panel_frames_hz: f64,
+    /// Refreshes of the panel a second, as it reports them; 0 where it has reported none.
+    pub panel_refresh_hz: f64,
+    /// What would bring the frames shown nearer to those that the panel could show, where that is needed.
+    pub speed_advice: Option<String>,
+    /// From waking to the submitted levels.
+    pub frame_time: Option<Spread>,
+    /// From the newest tracker sample behind a frame to the middle of its first light.
+    pub sample_to_photon: Option<Spread>,
+    /// From when a feed's client took a picture to the middle of its first light.
+    pub picture_to_photon: Option<Spread>,
+    /// How the tracker's link is.
+    pub tracker_link: String,
+    /// Why a lost link does not come back, or why nothing that the tracker sends is believed.
+    pub tracker_trouble: Option<String>,
+    /// Counters of the tracker: samples, connections, rejections by reason.
+    pub tracker_counts: BTreeMap<String, u64>,
+    /// The live feed, where there is one.
+    pub feed: Option<FeedStatus>,
+}
+
+/// A run at one moment.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Snapshot {
+    /// The process.
+    pub pid: u32,
+    /// Dark, running or degraded.
+    pub state: String,
+    /// How long it has run.
+    pub uptime_s: f64,
+    /// What holds at the end, too.
+    #[serde(flatten)]
+    pub figures: Figures,
+    /// Frames that came on the panel in the last second.
+    pub frames_shown_hz: f64,
+    /// What the pupil's estimate rests on.
+    pub pupil_state: String,
+    /// The pupil that the newest frame was made for.
+    pub pupil_mm: Option<f32>,
+    /// The panel's spec.
+    pub panel: String,
+    /// Why the panel is lost, where it is.
+    pub panel_trouble: Option<String>,
+    /// Whether lasers may be lit: armed or dark.
+    pub lasers: String,
+    /// What is wrong with the laser box, where something is.
+    pub lasers_trouble: Option<String>,
+}

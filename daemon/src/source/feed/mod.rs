@@ -1,0 +1,408 @@
+//! The live feed: programs that hand pictures over while holod runs. The protocol's page is `daemon/doc/feed.md`.
+//!
+//! One ordinary thread listens, reads what clients send, and turns the newest picture of the one that is shown into a
+//! frame. Pictures are copied out of the shared memory by the kernel and never looked at in place, so a client that breaks
+//! the rules harms its own picture only.
+
+mod client;
+mod message;
+mod slots;
+
+use std::fs;
+use std::os::fd::OwnedFd;
+use std::os::unix::fs::FileTypeExt;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+
+use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
+use holod_model::RgbdFrame;
+use holod_model::scene::Fit;
+use holod_pupil_input::host_now;
+use rustix::event::{EventfdFlags, PollFd, PollFlags, eventfd, poll};
+use rustix::fs::{Mode, fchmod};
+use rustix::io::Errno;
+use rustix::net::{
+    AddressFamily, SocketAddrUnix, SocketFlags, SocketType, accept_with, bind, connect, listen, socket_with,
+};
+use serde::{Deserialize, Serialize};
+
+use self::client::{Client, Gone, Target};
+use self::message::Outcome;
+use self::slots::Picture;
+use super::{PictureSink, PictureTag, Shown, scene};
+
+/// Clients that may be connected at once.
+const CLIENTS: usize = 8;
+/// A client that has sent nothing for so long gives way to one that sends.
+const SILENCE: TimeNs = TimeNs(2_000_000_000);
+/// Three on their way to the frame thread, one that the renderer keeps, and one that is written.
+const FRAMES: usize = 5;
+/// Clocks of one machine agree better than this.
+const LONGEST_FUTURE: TimeNs = TimeNs(1_000_000_000);
+/// The name of the socket in the runtime folder.
+const SOCKET: &str = "feed";
+
+/// What to listen for.
+#[derive(Clone, Debug)]
+pub struct FeedPlan {
+    /// Where.
+    pub socket: PathBuf,
+    /// Size of the frames.
+    pub resolution: Resolution,
+    /// How pictures of another size are brought to it.
+    pub fit: Fit,
+}
+
+/// What can be said of the feed.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct FeedStatus {
+    /// The socket.
+    pub socket: PathBuf,
+    /// Who is connected.
+    pub clients: Vec<String>,
+    /// Whose pictures are shown.
+    pub shown: Option<String>,
+    /// Pictures that were taken.
+    pub taken: u64,
+    /// Pictures that a newer one overtook before they were read.
+    pub overtaken: u64,
+    /// Pictures that could not be shown.
+    pub refused: u64,
+    /// Pictures of clients that were not shown.
+    pub not_shown: u64,
+    /// Pictures that clients left out, by their numbers.
+    pub left_out: u64,
+    /// Connections that were refused or broken off for what they sent.
+    pub connections_refused: u64,
+    /// Why a picture or a connection was refused last.
+    pub last_refusal: Option<String>,
+    /// Seconds since the newest picture was taken over.
+    pub newest_age_s: Option<f64>,
+    #[serde(skip)]
+    t_newest: Option<TimeNs>,
+}
+
+/// Why there is no feed.
+#[derive(Debug, thiserror::Error)]
+pub enum FeedError {
+    /// There is no place for the socket.
+    #[error("no folder for the feed's socket: name one with --scene feed:PATH")]
+    NoFolder,
+    /// The name is taken.
+    #[error("{}: {found}; name another socket with --scene feed:PATH", .socket.display())]
+    Taken {
+        /// The socket.
+        socket: PathBuf,
+        /// By what.
+        found: &'static str,
+    },
+    /// The socket cannot be made.
+    #[error("{}: cannot listen there: {error}", .socket.display())]
+    Listen {
+        /// The socket.
+        socket: PathBuf,
+        /// Why.
+        error: std::io::Error,
+    },
+}
+
+/// The socket that is meant by `feed` alone.
+///
+/// # Errors
+/// This process has no runtime folder.
+pub fn default_socket() -> Result<PathBuf, FeedError> {
+    crate::runtime_folder::own().map(|folder| folder.join(SOCKET)).ok_or(FeedError::NoFolder)
+}
+
+/// A feed that is listening. Dropping it ends its clients' connections and takes the socket away.
+pub struct Feed {
+    socket: PathBuf,
+    stop: OwnedFd,
+    thread: Option<JoinHandle<()>>,
+    status: Arc<Mutex<FeedStatus>>,
+}
+
+impl Feed {
+    /// Listens as planned, for the depth range of `geometry`, and shows the pictures through `sink`.
+    ///
+    /// # Errors
+    /// The socket cannot be made.
+    pub fn listen(plan: FeedPlan, geometry: &DisplayGeometry, sink: PictureSink) -> Result<Self, FeedError> {
+        let FeedPlan { socket, resolution, fit } = plan;
+        let cannot = |error: std::io::Error| FeedError::Listen { socket: socket.clone(), error };
+        let listener = listen_on(&socket)?;
+        let stop = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(|error| cannot(error.into()))?;
+        let status = Arc::new(Mutex::new(FeedStatus { socket: socket.clone(), ..FeedStatus::default() }));
+        let mut server = Server {
+            listener,
+            stop: stop.try_clone().map_err(cannot)?,
+            target: Target { geometry: *geometry, resolution, fit },
+            clients: Vec::new(),
+            connections: 0,
+            frames: (0..FRAMES).map(|_| Arc::new(RgbdFrame::black(resolution))).collect(),
+            sink,
+            shared: Arc::clone(&status),
+            status: FeedStatus { socket: socket.clone(), ..FeedStatus::default() },
+            left_out_of_gone: 0,
+        };
+        let thread =
+            std::thread::Builder::new().name("holod-feed".into()).spawn(move || server.serve()).map_err(cannot)?;
+        tracing::info!("waiting for pictures on {}", socket.display());
+        Ok(Self { socket, stop, thread: Some(thread), status })
+    }
+
+    /// How it is at host time `now`.
+    pub fn status(&self, now: TimeNs) -> FeedStatus {
+        let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        status.newest_age_s = status.t_newest.map(|t| (now - t).seconds());
+        status
+    }
+}
+
+impl Drop for Feed {
+    fn drop(&mut self) {
+        let _told = rustix::io::write(&self.stop, &1_u64.to_ne_bytes());
+        if let Some(thread) = self.thread.take() {
+            let _ended = thread.join();
+        }
+        let _gone = fs::remove_file(&self.socket);
+    }
+}
+
+/// A socket at `path` that this user and its group may connect to; one that a dead process left there is replaced.
+fn listen_on(path: &Path) -> Result<OwnedFd, FeedError> {
+    let cannot = |error: Errno| FeedError::Listen { socket: path.to_owned(), error: error.into() };
+    let new_socket = || {
+        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+        socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None).map_err(cannot)
+    };
+    let address = SocketAddrUnix::new(path).map_err(cannot)?;
+    if let Ok(found) = fs::symlink_metadata(path) {
+        let taken = |found| FeedError::Taken { socket: path.to_owned(), found };
+        if !found.file_type().is_socket() {
+            return Err(taken("a file that is no socket is there"));
+        }
+        match connect(new_socket()?, &address) {
+            Err(Errno::CONNREFUSED) => {
+                fs::remove_file(path).map_err(|error| FeedError::Listen { socket: path.to_owned(), error })?;
+            }
+            Err(Errno::PROTOTYPE) => return Err(taken("another program's socket is there")),
+            _ => return Err(taken("another holod listens there")),
+        }
+    }
+    let listener = new_socket()?;
+    fchmod(&listener, Mode::RUSR | Mode::WUSR | Mode::RGRP | Mode::WGRP).map_err(cannot)?;
+    bind(&listener, &address).map_err(cannot)?;
+    listen(&listener, CLIENTS as i32).map_err(cannot)?;
+    Ok(listener)
+}
+
+/// The feed's thread.
+struct Server {
+    listener: OwnedFd,
+    stop: OwnedFd,
+    target: Target,
+    /// In the order in which they came.
+    clients: Vec<(u64, Client)>,
+    connections: u64,
+    frames: Vec<Arc<RgbdFrame>>,
+    sink: PictureSink,
+    shared: Arc<Mutex<FeedStatus>>,
+    status: FeedStatus,
+    left_out_of_gone: u64,
+}
+
+impl Server {
+    fn serve(&mut self) {
+        let mut shown = None;
+        while let Some(ready) = self.wait() {
+            let now = host_now();
+            if ready.connects {
+                self.accept();
+            }
+            for number in ready.clients {
+                self.with(number, &mut shown, |client, target, status| {
+                    client.receive(target, now, |outcome| note(status, outcome))
+                });
+            }
+            self.choose(&mut shown, now);
+            let waiting: Vec<u64> =
+                self.clients.iter().filter(|(_, client)| client.has_picture()).map(|(number, _)| *number).collect();
+            for number in waiting {
+                if shown == Some(number) {
+                    self.show(number, &mut shown, now);
+                } else {
+                    self.with(number, &mut shown, |client, _, status| {
+                        let Some(picture) = client.take() else { return Ok(()) };
+                        note(status, &Outcome::NotShown);
+                        client.free(&picture, &Outcome::NotShown)
+                    });
+                }
+            }
+            self.publish(shown);
+        }
+    }
+
+    /// Waits until somebody has something to say; nothing where it is time to end.
+    fn wait(&self) -> Option<Ready> {
+        let mut waited: Vec<PollFd<'_>> = [&self.stop, &self.listener]
+            .into_iter()
+            .chain(self.clients.iter().map(|(_, client)| &client.socket))
+            .map(|descriptor| PollFd::new(descriptor, PollFlags::IN))
+            .collect();
+        match poll(&mut waited, None) {
+            Ok(_) | Err(Errno::INTR) => {}
+            Err(error) => {
+                tracing::error!("the feed has ended: {error}");
+                return None;
+            }
+        }
+        let is_ready = |index: usize| !waited[index].revents().is_empty();
+        let clients =
+            (2..waited.len()).filter(|&index| is_ready(index)).map(|index| self.clients[index - 2].0).collect();
+        (!is_ready(0)).then(|| Ready { connects: is_ready(1), clients })
+    }
+
+    fn accept(&mut self) {
+        let Ok(socket) = accept_with(&self.listener, SocketFlags::CLOEXEC) else { return };
+        self.connections += 1;
+        let client = Client::new(socket, self.connections);
+        if self.clients.len() == CLIENTS {
+            let full = format!("{CLIENTS} clients are connected already; end one of them");
+            self.refuse(&client.name, &client.show_out(&full));
+            return;
+        }
+        self.clients.push((self.connections, client));
+    }
+
+    /// Does something with a client, and lets it go where that shows that it is to go.
+    fn with(
+        &mut self,
+        number: u64,
+        shown: &mut Option<u64>,
+        act: impl FnOnce(&mut Client, &Target, &mut FeedStatus) -> Result<(), Gone>,
+    ) {
+        let Some(index) = self.clients.iter().position(|(one, _)| *one == number) else { return };
+        let client = &mut self.clients[index].1;
+        let Err(gone) = act(client, &self.target, &mut self.status) else { return };
+        let (_, client) = self.clients.remove(index);
+        self.left_out_of_gone += client.left_out();
+        match gone {
+            Gone::Closed => tracing::info!("the feed's client `{}` is gone", client.name),
+            Gone::Refused(_) => self.refuse(&client.name, &gone),
+        }
+        if *shown == Some(number) {
+            tracing::info!("the last picture of `{}` stays", client.name);
+            *shown = None;
+        }
+    }
+
+    fn refuse(&mut self, name: &str, gone: &Gone) {
+        if let Gone::Refused(why) = gone {
+            tracing::warn!("the feed's client `{name}` is refused: {why}");
+            self.status.connections_refused += 1;
+            self.status.last_refusal = Some(why.clone());
+        }
+    }
+
+    /// Whose pictures are shown: the one that is, while it sends; else the first that does.
+    fn choose(&self, shown: &mut Option<u64>, now: TimeNs) {
+        let of = |number: u64| self.clients.iter().find(|(one, _)| *one == number).map(|(_, client)| client);
+        if shown.and_then(of).is_some_and(|client| now - client.t_last < SILENCE) {
+            return;
+        }
+        if let Some((number, client)) = self.clients.iter().find(|(_, client)| client.has_picture())
+            && *shown != Some(*number)
+        {
+            tracing::info!("the feed's client `{}` is shown", client.name);
+            *shown = Some(*number);
+        }
+    }
+
+    /// Turns the newest picture of a client into a frame, and hands that over.
+    fn show(&mut self, number: u64, shown: &mut Option<u64>, now: TimeNs) {
+        let free =
+            self.frames.iter().position(|frame| Arc::strong_count(frame) == 1).expect("one frame more than are used");
+        let mut frame = self.frames.swap_remove(free);
+        let mut tag = None;
+        self.with(number, shown, |client, target, status| {
+            let Some(picture) = client.take() else { return Ok(()) };
+            let outcome = match take_over(client, &picture, target, &mut frame, now) {
+                Ok(taken) => {
+                    tag = Some(taken);
+                    Outcome::Taken
+                }
+                Err(why) => Outcome::Refused(why),
+            };
+            note(status, &outcome);
+            client.free(&picture, &outcome)
+        });
+        if let Some(tag) = tag {
+            self.sink.show(Shown::Live { frame: Arc::clone(&frame), tag });
+            self.status.t_newest = Some(now);
+        }
+        self.frames.push(frame);
+    }
+
+    fn publish(&mut self, shown: Option<u64>) {
+        let name = |number: u64| self.clients.iter().find(|(one, _)| *one == number).map(|(_, one)| one.name.clone());
+        self.status.shown = shown.and_then(name);
+        self.status.clients = self.clients.iter().map(|(_, client)| client.name.clone()).collect();
+        self.status.left_out =
+            self.left_out_of_gone + self.clients.iter().map(|(_, client)| client.left_out()).sum::<u64>();
+        self.shared.lock().unwrap_or_else(PoisonError::into_inner).clone_from(&self.status);
+    }
+}
+
+/// Who has said something.
+struct Ready {
+    connects: bool,
+    clients: Vec<u64>,
+}
+
+/// Reads a picture into `frame`, or says why it cannot be shown.
+fn take_over(
+    client: &mut Client,
+    picture: &Picture,
+    target: &Target,
+    frame: &mut Arc<RgbdFrame>,
+    now: TimeNs,
+) -> Result<PictureTag, String> {
+    let t_taken = picture.t_taken.unwrap_or(now);
+    if t_taken > now + LONGEST_FUTURE {
+        let ahead_s = (t_taken - now).seconds();
+        return Err(format!(
+            "a picture taken {ahead_s:.0} s from now was found, expected nanoseconds of CLOCK_MONOTONIC (not of the \
+             calendar's clock), or 0"
+        ));
+    }
+    let frame = Arc::get_mut(frame).expect("the frame is nobody else's");
+    let report = client.read(picture, frame).map_err(|error| error.to_string())?;
+    if !client.is_known {
+        client.is_known = true;
+        let name = format!("the feed's client `{}`", client.name);
+        scene::warn_of_oddities(&name, frame, &report, &target.geometry, client.sends_planes());
+    }
+    Ok(PictureTag { number: picture.sequence, t_taken: Some(t_taken) })
+}
+
+/// Counts what became of a picture.
+fn note(status: &mut FeedStatus, outcome: &Outcome) {
+    match outcome {
+        Outcome::Taken => status.taken += 1,
+        Outcome::Overtaken => status.overtaken += 1,
+        Outcome::NotShown => status.not_shown += 1,
+        Outcome::Refused(why) => {
+            // A client that goes on sending the same must not flood the log.
+            if status.last_refusal.as_ref() != Some(why) {
+                tracing::warn!("a picture of the feed is refused: {why}");
+                status.last_refusal = Some(why.clone());
+            }
+            status.refused += 1;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,219 @@
+//! Whose turn it is with each slot of a client's shared memory.
+//!
+//! A slot belongs to the client until it hands it over, and to holod until it is freed. What goes through the socket is
+//! the order of both, so no picture is read while it is written.
+
+use holod_calibration::TimeNs;
+
+use super::message::{Outcome, SLOTS, Wrong};
+
+/// A picture that waits to be read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Picture {
+    /// Where it is.
+    pub(super) slot: usize,
+    /// Its number.
+    pub(super) sequence: u64,
+    /// When it was taken, where the client said so.
+    pub(super) t_taken: Option<TimeNs>,
+}
+
+/// The slots of one client.
+#[derive(Debug, Default)]
+pub(super) struct Slots {
+    held: [bool; SLOTS],
+    waiting: Option<Picture>,
+    newest_sequence: Option<u64>,
+    /// Pictures that the client left out, by their sequences.
+    pub(super) left_out: u64,
+}
+
+impl Slots {
+    /// The client hands a picture over. Returns what is to be freed for it, and why: the one that waited, which it has
+    /// overtaken, or itself, where its sequence does not rise.
+    ///
+    /// # Errors
+    /// [`Wrong`] where the slot is none, or is not the client's to hand over.
+    pub(super) fn hand_over(
+        &mut self,
+        slot: u32,
+        sequence: u64,
+        t_taken: Option<TimeNs>,
+    ) -> Result<Option<(Picture, Outcome)>, Wrong> {
+        let picture = Picture { slot: slot as usize, sequence, t_taken };
+        match self.held.get_mut(picture.slot) {
+            None => {
+                let last = SLOTS - 1;
+                return Err(Wrong(format!("FRAM: slot {slot} was found, expected 0 to {last}")));
+            }
+            Some(true) => {
+                return Err(Wrong(format!(
+                    "FRAM: slot {slot} was found, which has been handed over already; wait for its FREE"
+                )));
+            }
+            Some(held) => *held = true,
+        }
+        if let Some(newest) = self.newest_sequence {
+            if sequence <= newest {
+                let why = format!("sequence {sequence} was found after {newest}, expected it to rise");
+                return Ok(Some((picture, Outcome::Refused(why))));
+            }
+            self.left_out += sequence - newest - 1;
+        }
+        self.newest_sequence = Some(sequence);
+        Ok(self.waiting.replace(picture).map(|overtaken| (overtaken, Outcome::Overtaken)))
+    }
+
+    /// The newest picture, to be read now and freed then.
+    pub(super) fn take(&mut self) -> Option<Picture> {
+        self.waiting.take()
+    }
+
+    /// Whether a picture waits.
+    pub(super) fn has_picture(&self) -> bool {
+        self.waiting.is_some()
+    }
+
+    /// The slot is the client's again; it must hear of it after this.
+    pub(super) fn free(&mut self, picture: &Picture) {
+        self.held[picture.slot] = false;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use loom::cell::UnsafeCell;
+    use loom::sync::{Arc, mpsc};
+    use loom::thread;
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn the_newest_is_read_and_the_others_come_back() {
+        let mut slots = Slots::default();
+        assert_eq!(slots.hand_over(0, 5, None), Ok(None));
+        let (overtaken, outcome) = slots.hand_over(2, 8, Some(TimeNs(3))).unwrap().unwrap();
+        assert_eq!((overtaken.slot, overtaken.sequence, outcome), (0, 5, Outcome::Overtaken));
+        slots.free(&overtaken);
+        let newest = slots.take().unwrap();
+        assert_eq!((newest.slot, newest.sequence, newest.t_taken), (2, 8, Some(TimeNs(3))));
+        assert_eq!((slots.take(), slots.left_out), (None, 2));
+        assert!(slots.hand_over(2, 9, None).unwrap_err().0.contains("wait for its FREE"));
+        assert_eq!(slots.hand_over(0, 9, None), Ok(None));
+        assert!(slots.hand_over(3, 10, None).unwrap_err().0.contains("expected 0 to 2"));
+    }
+
+    #[test]
+    fn a_sequence_that_does_not_rise_is_refused_and_nothing_else() {
+        let mut slots = Slots::default();
+        slots.hand_over(0, 5, None).unwrap();
+        let (refused, outcome) = slots.hand_over(1, 5, None).unwrap().unwrap();
+        assert_eq!(refused.slot, 1);
+        assert_eq!(outcome, Outcome::Refused("sequence 5 was found after 5, expected it to rise".into()));
+        slots.free(&refused);
+        assert_eq!(slots.take().unwrap().sequence, 5);
+    }
+
+    proptest! {
+        /// Whatever a client does, each slot that it hands over is freed once, and no newer picture is passed over.
+        #[test]
+        fn every_slot_comes_back(orders in prop::collection::vec((0_u32..4, 0_u64..30, any::<bool>()), 0..60)) {
+            let mut slots = Slots::default();
+            let mut with_holod = [false; SLOTS];
+            for (slot, sequence, read) in orders {
+                let was_free = with_holod.get(slot as usize) == Some(&false);
+                match slots.hand_over(slot, sequence, None) {
+                    Ok(freed) => {
+                        prop_assert!(was_free);
+                        with_holod[slot as usize] = true;
+                        if let Some((freed, _)) = freed {
+                            prop_assert!(std::mem::take(&mut with_holod[freed.slot]));
+                            slots.free(&freed);
+                        }
+                    }
+                    Err(_) => prop_assert!(!was_free),
+                }
+                if read && let Some(picture) = slots.take() {
+                    prop_assert!(std::mem::take(&mut with_holod[picture.slot]));
+                    slots.free(&picture);
+                }
+                prop_assert!(with_holod.iter().filter(|held| **held).count() <= 1, "only the one that waits is kept");
+            }
+        }
+    }
+
+    /// A client and holod with two words of a picture in each slot. loom runs every order of their steps, and objects where
+    /// one writes what the other may be reading.
+    fn conversation(waits_for_free: bool) {
+        const PICTURES: u64 = 6;
+        let memory = Arc::new([(); SLOTS].map(|()| [UnsafeCell::new(0_u64), UnsafeCell::new(0)]));
+        let (to_holod, from_client) = mpsc::channel::<(u32, u64)>();
+        let (to_client, from_holod) = mpsc::channel::<u32>();
+        let clients_memory = Arc::clone(&memory);
+        let client = thread::spawn(move || {
+            let (mut own, mut freed) = ((0..SLOTS as u32).collect::<Vec<_>>(), 0);
+            for sequence in 1..=PICTURES {
+                while own.is_empty() {
+                    freed += u32::from(waits_for_free);
+                    own.push(if waits_for_free { from_holod.recv().unwrap() } else { 0 });
+                }
+                let slot = own.remove(0);
+                for word in &clients_memory[slot as usize] {
+                    // SAFETY: loom checks that nobody else has the cell meanwhile, which is what is tested.
+                    word.with_mut(|word| unsafe { *word = sequence });
+                }
+                to_holod.send((slot, sequence)).unwrap();
+            }
+            (from_holod, freed)
+        });
+        let mut freed = 0;
+        let mut free = |slots: &mut Slots, picture: &Picture| {
+            slots.free(picture);
+            freed += 1;
+            to_client.send(picture.slot as u32).unwrap();
+        };
+        let mut slots = Slots::default();
+        let mut seen = 0;
+        while seen < PICTURES {
+            let (slot, sequence) = from_client.recv().unwrap();
+            // A client that waits for nothing is thrown out here, but may have written by then.
+            let Ok(freed) = slots.hand_over(slot, sequence, None) else { break };
+            if let Some((freed, _)) = freed {
+                free(&mut slots, &freed);
+            }
+            // It reads at once, or lets some pictures pass first.
+            if sequence != 2
+                && let Some(picture) = slots.take()
+            {
+                // SAFETY: as above.
+                let words = [0, 1].map(|word| memory[picture.slot][word].with(|word| unsafe { *word }));
+                assert_eq!(words, [picture.sequence; 2], "a torn picture");
+                seen = picture.sequence;
+                free(&mut slots, &picture);
+            }
+        }
+        // loom wants every message to be taken.
+        let (from_holod, heard) = client.join().unwrap();
+        for _ in heard..freed {
+            from_holod.recv().unwrap();
+        }
+    }
+
+    fn in_every_order(check: impl Fn() + Sync + Send + 'static) {
+        let mut model = loom::model::Builder::new();
+        model.preemption_bound = Some(3);
+        model.check(check);
+    }
+
+    #[test]
+    fn no_order_of_steps_tears_a_picture() {
+        in_every_order(|| conversation(true));
+    }
+
+    #[test]
+    #[should_panic(expected = "Causality violation")]
+    fn a_client_that_does_not_wait_is_seen_to_tear_one() {
+        in_every_order(|| conversation(false));
+    }
+}

@@ -1,0 +1,318 @@
+//! The feed with clients in this process: what they hand over, what they do wrong, and a load.
+
+use std::thread;
+use std::time::{Duration, Instant};
+
+use holod_model::scene::LiveColour;
+use holod_tests::feed::{Answer, FeedClient, hello};
+
+use super::super::{PictureSource, newest_picture};
+use super::*;
+
+const SIZE: Resolution = Resolution { width: 16, height: 8 };
+const PIXELS: usize = SIZE.pixels();
+const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
+const TAKEN: u32 = 0;
+const OVERTAKEN: u32 = 1;
+const REFUSED: u32 = 2;
+const NOT_SHOWN: u32 = 3;
+
+struct Bench {
+    _folder: tempfile::TempDir,
+    socket: PathBuf,
+    feed: Feed,
+    pictures: PictureSource,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let socket = folder.path().join("feed");
+        let black = Shown::Live { frame: Arc::new(RgbdFrame::black(SIZE)), tag: PictureTag::default() };
+        let (sink, pictures) = newest_picture(black);
+        let plan = FeedPlan { socket: socket.clone(), resolution: SIZE, fit: Fit::Native };
+        let feed = Feed::listen(plan, &BENCH, sink).unwrap();
+        Self { _folder: folder, socket, feed, pictures }
+    }
+
+    /// A client that has been told where to write.
+    fn client(&self, name: &str) -> FeedClient {
+        let mut client = FeedClient::connect(&self.socket).unwrap();
+        client.say(&hello(SIZE.width as u32, SIZE.height as u32, None, name)).unwrap();
+        assert_eq!(client.answer(), Answer::Ring);
+        client
+    }
+
+    fn shown(&mut self) -> (RgbdFrame, PictureTag) {
+        let (frame, tag) = self.pictures.at(TimeNs(0));
+        (RgbdFrame::clone(frame), tag)
+    }
+
+    fn status(&self) -> FeedStatus {
+        self.feed.status(host_now())
+    }
+
+    fn until(&self, what: &str, mut done: impl FnMut(&FeedStatus) -> bool) {
+        let began = Instant::now();
+        while !done(&self.status()) {
+            assert!(began.elapsed() < Duration::from_secs(10), "{what}: {:?}", self.status());
+            thread::sleep(Duration::from_millis(2));
+        }
+    }
+}
+
+/// A picture of one colour at one depth.
+fn picture(grey: u8, depth_mm: u16) -> (Vec<u8>, Vec<u8>) {
+    (vec![grey; LiveColour::Rgba8.pixel_bytes() * PIXELS], depth_mm.to_ne_bytes().repeat(PIXELS))
+}
+
+fn send(client: &mut FeedClient, slot: u32, sequence: u64, grey: u8) -> (u32, String) {
+    let (colour, depth) = picture(grey, 1000);
+    client.write(slot, &colour, &depth);
+    client.hand_over(slot, sequence, 0).unwrap();
+    match client.answer() {
+        Answer::Free { slot: freed, sequence: of, outcome, text } => {
+            assert_eq!((freed, of), (slot, sequence));
+            (outcome, text)
+        }
+        other => panic!("{other:?}"),
+    }
+}
+
+/// Whether every pixel is of one picture.
+fn is_whole(frame: &RgbdFrame) -> bool {
+    let one = |values: &[f32]| values.iter().all(|value| *value == values[0]);
+    one(&frame.amplitude) && one(&frame.depth_normalised)
+}
+
+#[test]
+fn what_is_handed_over_is_shown_until_something_newer_is() {
+    let mut bench = Bench::new();
+    assert_eq!(bench.shown(), (RgbdFrame::black(SIZE), PictureTag::default()));
+    let mut client = bench.client("camera");
+    let t_before = host_now();
+    assert_eq!(send(&mut client, 1, 7, 255), (TAKEN, String::new()));
+    let (frame, tag) = bench.shown();
+    assert_eq!(frame.amplitude, [1.0; 3 * PIXELS]);
+    assert!((frame.depth_normalised[0] - BENCH.normalised_depth(holod_calibration::Dioptres(1.0)) as f32).abs() < 1e-6);
+    assert_eq!(tag.number, 7);
+    assert!((t_before..=host_now()).contains(&tag.t_taken.unwrap()), "when it came, where the client does not say");
+    bench.until("the status", |status| status.taken == 1);
+    let status = bench.status();
+    assert_eq!((status.clients, status.shown), (vec!["camera".to_owned()], Some("camera".to_owned())));
+    assert!(status.newest_age_s.unwrap() < 10.0);
+    drop(client);
+    bench.until("the client is gone", |status| status.clients.is_empty());
+    assert_eq!((bench.shown().1.number, bench.status().shown), (7, None), "the last picture stays");
+}
+
+#[test]
+fn pictures_that_wait_are_overtaken_and_slots_come_back() {
+    let mut bench = Bench::new();
+    let mut client = bench.client("hasty");
+    for sequence in 0..300 {
+        let slot = (sequence % 3) as u32;
+        let (colour, depth) = picture(sequence as u8, 1000);
+        if sequence >= 3 {
+            let Answer::Free { outcome, .. } = client.answer() else { panic!() };
+            assert!([TAKEN, OVERTAKEN].contains(&outcome), "{outcome}");
+        }
+        client.write(slot, &colour, &depth);
+        client.hand_over(slot, 2 * sequence, 0).unwrap();
+    }
+    bench.until("all are done with", |status| status.taken + status.overtaken == 300);
+    assert_eq!((bench.shown().1.number, bench.status().left_out), (598, 299), "the newest is shown");
+}
+
+#[test]
+fn no_picture_is_torn_while_two_clients_send_as_fast_as_they_can() {
+    let mut bench = Bench::new();
+    let stop = Arc::new(std::sync::atomic::AtomicBool::new(false));
+    let clients = ["one", "other"].map(|name| {
+        let (mut client, stop) = (bench.client(name), Arc::clone(&stop));
+        thread::spawn(move || {
+            let mut own = vec![0, 1, 2];
+            for sequence in 1.. {
+                if stop.load(std::sync::atomic::Ordering::Relaxed) {
+                    return;
+                }
+                while own.is_empty() {
+                    if let Some(Answer::Free { slot, .. }) = client.answer_within(Duration::from_secs(10)) {
+                        own.push(slot);
+                    }
+                }
+                let slot = own.remove(0);
+                let (colour, depth) = picture(sequence as u8, 400 + sequence as u16 % 5000);
+                client.write(slot, &colour, &depth);
+                client.hand_over(slot, sequence, 0).unwrap();
+            }
+        })
+    });
+    let (mut looks, mut changes, mut newest) = (0, 0, 0);
+    while looks < 20_000 || changes < 200 {
+        let (frame, tag) = bench.pictures.at(TimeNs(0));
+        assert!(is_whole(frame), "a torn picture");
+        assert!(tag.number >= newest, "{} after {newest}", tag.number);
+        changes += usize::from(tag.number > newest);
+        newest = tag.number;
+        looks += 1;
+    }
+    stop.store(true, std::sync::atomic::Ordering::Relaxed);
+    for client in clients {
+        client.join().unwrap();
+    }
+    let status = bench.status();
+    assert!(status.not_shown > 0, "the other one is not shown: {status:?}");
+    assert_eq!((status.refused, status.connections_refused), (0, 0));
+}
+
+#[test]
+fn one_pixel_of_another_picture_is_a_tear() {
+    let mut frame = RgbdFrame::black(SIZE);
+    assert!(is_whole(&frame));
+    frame.amplitude[77] = 0.5;
+    assert!(!is_whole(&frame));
+}
+
+#[test]
+fn pictures_that_cannot_be_shown_are_refused_in_words_and_the_last_good_one_stays() {
+    let mut bench = Bench::new();
+    let mut client = bench.client("faulty");
+    assert_eq!(send(&mut client, 0, 5, 255).0, TAKEN);
+    let (outcome, text) = send(&mut client, 0, 5, 9);
+    assert_eq!((outcome, text.as_str()), (REFUSED, "sequence 5 was found after 5, expected it to rise"));
+    let (colour, _) = picture(9, 1000);
+    client.write(0, &colour, &[0; 2 * PIXELS]);
+    client.hand_over(0, 6, 0).unwrap();
+    let Answer::Free { outcome, text, .. } = client.answer() else { panic!() };
+    assert_eq!((outcome, text.as_str()), (REFUSED, "found no pixel with a valid depth, expected millimetres above 0"));
+    let (colour, depth) = picture(9, 1000);
+    client.write(0, &colour, &depth);
+    client.hand_over(0, 7, 1_790_000_000_000_000_000).unwrap();
+    let Answer::Free { outcome, text, .. } = client.answer() else { panic!() };
+    assert_eq!(outcome, REFUSED);
+    assert!(text.contains("expected nanoseconds of CLOCK_MONOTONIC"), "{text}");
+    assert_eq!((bench.shown().0.amplitude[0], bench.shown().1.number), (1.0, 5));
+    bench.until("three are counted", |status| status.refused == 3);
+    assert_eq!(send(&mut client, 0, 8, 0).0, TAKEN, "it may go on");
+}
+
+#[test]
+fn a_client_that_breaks_the_rules_is_told_and_shown_out() {
+    let bench = Bench::new();
+    let told = |say: &dyn Fn(&mut FeedClient), expected: &str| {
+        let mut client = FeedClient::connect(&bench.socket).unwrap();
+        say(&mut client);
+        let answer = std::iter::repeat_with(|| client.answer()).find(|answer| *answer != Answer::Ring);
+        let Some(Answer::Nope(text)) = answer else { panic!("{answer:?}") };
+        assert!(text.contains(expected), "{text}");
+        assert_eq!(client.answer(), Answer::Closed);
+    };
+    let good = hello(SIZE.width as u32, SIZE.height as u32, None, "x");
+    told(&|client| client.say(b"GET / HTTP/1.1\r\n").unwrap(), "expected HELO or FRAM");
+    told(&|client| client.hand_over(0, 1, 0).unwrap(), "FRAM: was found first, expected HELO");
+    told(&|client| client.say(&[0; 4000]).unwrap(), "expected HELO or FRAM");
+    told(
+        &|client| client.say(&hello(17, 8, None, "x")).unwrap(),
+        "found pictures of 17x8, larger than the hologram of 16x8",
+    );
+    let twice = |client: &mut FeedClient| {
+        client.say(&good).unwrap();
+        client.say(&good).unwrap();
+    };
+    told(&twice, "HELO: a second one was found");
+    let foreign = |client: &mut FeedClient| {
+        client.say(&good).unwrap();
+        client.hand_over(3, 1, 0).unwrap();
+    };
+    told(&foreign, "slot 3 was found, expected 0 to 2");
+    bench.until("all are counted", |status| status.connections_refused == 6 && status.clients.is_empty());
+    assert!(bench.status().last_refusal.is_some());
+}
+
+#[test]
+fn the_ninth_client_is_refused_and_takes_a_place_that_is_given_up() {
+    let bench = Bench::new();
+    let clients: Vec<_> = (0..CLIENTS).map(|number| bench.client(&number.to_string())).collect();
+    let mut late = FeedClient::connect(&bench.socket).unwrap();
+    assert_eq!(late.answer(), Answer::Nope("8 clients are connected already; end one of them".into()));
+    drop(clients);
+    bench.until("they are gone", |status| status.clients.is_empty());
+    bench.client("late");
+}
+
+#[test]
+fn another_client_is_shown_once_the_first_is_gone_or_silent() {
+    let mut bench = Bench::new();
+    let (mut first, mut second) = (bench.client("first"), bench.client("second"));
+    assert_eq!(send(&mut first, 0, 1, 255).0, TAKEN);
+    assert_eq!(send(&mut second, 0, 10, 0).0, NOT_SHOWN);
+    assert_eq!(bench.shown().1.number, 1);
+    let began = Instant::now();
+    let mut sequence = 10;
+    while bench.shown().1.number < 10 {
+        sequence += 1;
+        send(&mut second, 0, sequence, 0);
+        assert!(began.elapsed() < Duration::from_secs(10));
+        thread::sleep(Duration::from_millis(50));
+    }
+    assert!(began.elapsed() > Duration::from_millis(1500), "two seconds of silence");
+    assert_eq!(send(&mut first, 0, 2, 255).0, NOT_SHOWN);
+    drop(second);
+    bench.until("the second is gone", |status| status.clients.len() == 1);
+    assert_eq!(send(&mut first, 0, 3, 255).0, TAKEN);
+}
+
+#[test]
+fn shared_memory_cannot_be_made_shorter_under_holod() {
+    let bench = Bench::new();
+    let client = bench.client("hostile");
+    assert!(rustix::fs::ftruncate(client.memory().unwrap(), 0).is_err());
+}
+
+#[test]
+fn a_client_that_never_reads_is_shown_out_and_nobody_waits_for_it() {
+    let mut bench = Bench::new();
+    let deaf = bench.client("deaf");
+    let mut sequence = 0;
+    // It hands over whatever is free by now, and reads nothing.
+    while deaf.hand_over((sequence % 3) as u32, sequence, 0).is_ok() && sequence < 100_000 {
+        sequence += 1;
+        if sequence % 3 == 0 {
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
+    bench.until("it is gone", |status| status.clients.is_empty());
+    let mut other = bench.client("other");
+    assert_eq!(send(&mut other, 0, 1, 255).0, TAKEN);
+    assert_eq!(bench.shown().0.amplitude[0], 1.0);
+}
+
+#[test]
+fn a_socket_of_the_dead_is_replaced_and_one_of_the_living_is_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let socket = folder.path().join("feed");
+    let dead = listen_on(&socket).unwrap();
+    let mode = std::os::unix::fs::PermissionsExt::mode(&fs::metadata(&socket).unwrap().permissions());
+    assert_eq!(mode & 0o007, 0, "others may not connect");
+    assert!(matches!(listen_on(&socket), Err(FeedError::Taken { found: "another holod listens there", .. })));
+    drop(dead);
+    let living = listen_on(&socket).unwrap();
+    drop(living);
+    fs::remove_file(&socket).unwrap();
+    fs::write(&socket, "precious").unwrap();
+    assert!(matches!(listen_on(&socket), Err(FeedError::Taken { .. })));
+    assert_eq!(fs::read_to_string(&socket).unwrap(), "precious");
+    let long = folder.path().join("x".repeat(200));
+    assert!(listen_on(&long).unwrap_err().to_string().contains("cannot listen there"));
+}
+
+#[test]
+fn the_socket_goes_with_the_feed() {
+    let bench = Bench::new();
+    let mut client = bench.client("left alone");
+    let Bench { feed, socket, _folder, .. } = bench;
+    drop(feed);
+    assert_eq!(client.answer(), Answer::Closed);
+    assert!(!socket.exists());
+}

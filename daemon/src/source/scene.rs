@@ -1,0 +1,186 @@
+//! Scenes from files, read whole before they are shown.
+
+use std::sync::Arc;
+
+use holod_calibration::{DisplayGeometry, Resolution};
+use holod_model::scene::{DepthEncoding, Fit, FrameReport, Scene, SceneError};
+use holod_model::{RgbdFrame, scene_renderer};
+
+use crate::cli::{FitArg, SceneArgs};
+use crate::failure::{Exit, Failure};
+
+/// Size of a hologram of the built-in scene on a processor.
+pub const SAMPLE_RESOLUTION: Resolution = Resolution { width: 512, height: 512 };
+
+/// Frames of a sequence that are kept in memory, in bytes.
+const SEQUENCE_BYTES_MAX: usize = 4 << 30;
+
+/// The frames to show, all of one size.
+pub struct Frames {
+    /// At least one.
+    pub frames: Vec<Arc<RgbdFrame>>,
+    /// Frames a second of a sequence, which is shown over and over.
+    pub fps: Option<f64>,
+    /// What was done to each frame when it was read.
+    pub reports: Vec<FrameReport>,
+    /// The scene's name for reports.
+    pub name: String,
+}
+
+impl Frames {
+    /// Size of every frame.
+    pub fn resolution(&self) -> Resolution {
+        self.frames[0].resolution
+    }
+
+    /// Which frame is shown `seconds` after the start.
+    pub fn index_at(&self, seconds: f64) -> usize {
+        match self.fps {
+            Some(fps) if self.frames.len() > 1 => (seconds.max(0.0) * fps) as usize % self.frames.len(),
+            _ => 0,
+        }
+    }
+}
+
+/// Loads every frame of the scene that was named, or renders the built-in one.
+pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
+    let Some(spec) = &args.scene else { return sample_frames(args, geometry) };
+    if super::feed_socket(spec).is_some() {
+        let only = "--scene feed is for `holod run` alone; for a folder of that name write ./feed";
+        return Err(Failure::new(Exit::Usage, only));
+    }
+    let encoding = args
+        .depth_encoding
+        .as_deref()
+        .map(|text| DepthEncoding::parse(text, geometry))
+        .transpose()
+        .map_err(Failure::because(Exit::Usage))?;
+    let scene = Scene::open(spec, encoding).map_err(scene_failure)?;
+    let mut loaded = Frames { frames: Vec::new(), fps: scene.fps(), reports: Vec::new(), name: spec.clone() };
+    for index in 0..scene.frames() {
+        let (frame, report) = scene.load(index, geometry, args.resolution, fit(args.fit)).map_err(scene_failure)?;
+        check_fits(frame.resolution, geometry, spec)?;
+        if let Some(first) = loaded.frames.first()
+            && first.resolution != frame.resolution
+        {
+            return Err(Failure::new(
+                Exit::Data,
+                format!(
+                    "{spec}: frame {index} is {}, the first one {}; give every frame one size with --resolution and --fit",
+                    frame.resolution, first.resolution
+                ),
+            ));
+        }
+        let bytes = scene.frames() * frame.resolution.pixels() * 4 * size_of::<f32>();
+        if bytes > SEQUENCE_BYTES_MAX {
+            return Err(Failure::new(
+                Exit::Data,
+                format!(
+                    "{spec}: {} frames of {} need {} GiB of memory, more than 4; name fewer frames or a smaller \
+                     --resolution",
+                    scene.frames(),
+                    frame.resolution,
+                    bytes >> 30
+                ),
+            ));
+        }
+        warn_of_oddities(spec, &frame, &report, geometry, false);
+        loaded.frames.push(Arc::new(frame));
+        loaded.reports.push(report);
+    }
+    Ok(loaded)
+}
+
+/// What is most often a mistake in a picture called `name`.
+/// `is_plane`: one depth for all of it is meant.
+pub(super) fn warn_of_oddities(
+    name: &str,
+    frame: &RgbdFrame,
+    report: &FrameReport,
+    geometry: &DisplayGeometry,
+    is_plane: bool,
+) {
+    warn_of_odd_depth(name, frame, report, geometry, is_plane);
+    warn_of_clipped_colours(name, frame, report);
+}
+
+/// Depth that is nearly all clamped, or all one, is most often a wrong encoding.
+fn warn_of_odd_depth(name: &str, frame: &RgbdFrame, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) {
+    let pixels = frame.resolution.pixels();
+    let clamped = report.depth_clamped_far_px + report.depth_clamped_near_px;
+    let ends = frame.depth_normalised.iter().fold((f32::MAX, f32::MIN), |(a, b), &d| (a.min(d), b.max(d)));
+    let spread_dpt = geometry.depth_at(f64::from(ends.1)).0 - geometry.depth_at(f64::from(ends.0)).0;
+    if 2 * clamped > pixels {
+        tracing::warn!(
+            "{name}: {clamped} of {pixels} pixels lie outside the display's depth range: is the depth encoding right?"
+        );
+    } else if spread_dpt < 0.05 && pixels > 1 && !is_plane {
+        tracing::warn!("{name}: all depths lie within {spread_dpt:.3} dpt: is the depth encoding right?");
+    }
+}
+
+/// Colours that are nearly all brighter than white are most often scene-linear light that was never exposed.
+fn warn_of_clipped_colours(name: &str, frame: &RgbdFrame, report: &FrameReport) {
+    let pixels = frame.resolution.pixels();
+    if 2 * report.colour_clipped_px > pixels {
+        tracing::warn!(
+            "{name}: {} of {pixels} pixels are brighter than white and were clipped: scale the picture's light so that \
+             white is 1",
+            report.colour_clipped_px
+        );
+    }
+}
+
+fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
+    if args.depth_encoding.is_some() {
+        return Err(Failure::new(Exit::Usage, "--depth-encoding says how to read a depth file: name one with --scene"));
+    }
+    let resolution = args.resolution.unwrap_or(SAMPLE_RESOLUTION);
+    check_fits(resolution, geometry, "--resolution")?;
+    let frame = sample_frame(resolution);
+    Ok(Frames {
+        frames: vec![Arc::new(frame)],
+        fps: None,
+        reports: vec![FrameReport::default()],
+        name: "the built-in scene".into(),
+    })
+}
+
+/// The built-in scene as the network reads it.
+pub fn sample_frame(resolution: Resolution) -> RgbdFrame {
+    let picture = scene_renderer::sample_scene(resolution).picture();
+    let amplitude = picture.image.into_iter().map(f32::sqrt).collect();
+    RgbdFrame { resolution, amplitude, depth_normalised: picture.depth }
+}
+
+pub(super) fn check_fits(resolution: Resolution, geometry: &DisplayGeometry, name: &str) -> Result<(), Failure> {
+    let panel = geometry.resolution;
+    if resolution.width <= panel.width && resolution.height <= panel.height {
+        return Ok(());
+    }
+    Err(Failure::new(
+        Exit::Usage,
+        format!(
+            "{name}: found {resolution}, larger than the panel of {panel}; bring it to the panel's size with \
+             --resolution {panel} --fit contain (or cover, or crop)"
+        ),
+    ))
+}
+
+pub(super) fn fit(arg: FitArg) -> Fit {
+    match arg {
+        FitArg::Native => Fit::Native,
+        FitArg::Contain => Fit::Contain,
+        FitArg::Cover => Fit::Cover,
+        FitArg::Crop => Fit::Crop,
+    }
+}
+
+fn scene_failure(error: SceneError) -> Failure {
+    let exit = match &error {
+        SceneError::Read { .. } | SceneError::Kind { .. } => Exit::NoInput,
+        SceneError::DepthEncoding { .. } => Exit::Usage,
+        _ => Exit::Data,
+    };
+    Failure::because(exit)(error)
+}
