@@ -82,8 +82,11 @@ impl Slots {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::VecDeque;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
     use loom::cell::UnsafeCell;
-    use loom::sync::{Arc, mpsc};
+    use loom::sync::{Arc, Mutex};
     use loom::thread;
     use proptest::prelude::*;
 
@@ -143,72 +146,92 @@ mod tests {
         }
     }
 
-    /// A client and holod with two words of a picture in each slot. loom runs every order of their steps, and objects where
-    /// one writes what the other may be reading.
-    fn conversation(waits_for_free: bool) {
-        const PICTURES: u64 = 6;
-        let memory = Arc::new([(); SLOTS].map(|()| [UnsafeCell::new(0_u64), UnsafeCell::new(0)]));
-        let (to_holod, from_client) = mpsc::channel::<(u32, u64)>();
-        let (to_client, from_holod) = mpsc::channel::<u32>();
-        let clients_memory = Arc::clone(&memory);
-        let client = thread::spawn(move || {
-            let (mut own, mut freed) = ((0..SLOTS as u32).collect::<Vec<_>>(), 0);
-            for sequence in 1..=PICTURES {
-                while own.is_empty() {
-                    freed += u32::from(waits_for_free);
-                    own.push(if waits_for_free { from_holod.recv().unwrap() } else { 0 });
-                }
-                let slot = own.remove(0);
-                for word in &clients_memory[slot as usize] {
-                    // SAFETY: loom checks that nobody else has the cell meanwhile, which is what is tested.
-                    word.with_mut(|word| unsafe { *word = sequence });
-                }
-                to_holod.send((slot, sequence)).unwrap();
-            }
-            (from_holod, freed)
-        });
-        let mut freed = 0;
-        let mut free = |slots: &mut Slots, picture: &Picture| {
-            slots.free(picture);
-            freed += 1;
-            to_client.send(picture.slot as u32).unwrap();
-        };
-        let mut slots = Slots::default();
-        let mut seen = 0;
-        while seen < PICTURES {
-            let (slot, sequence) = from_client.recv().unwrap();
-            // A client that waits for nothing is thrown out here, but may have written by then.
-            let Ok(freed) = slots.hand_over(slot, sequence, None) else { break };
-            if let Some((freed, _)) = freed {
-                free(&mut slots, &freed);
-            }
-            // It reads at once, or lets some pictures pass first.
-            if sequence != 2
-                && let Some(picture) = slots.take()
-            {
-                // SAFETY: as above.
-                let words = [0, 1].map(|word| memory[picture.slot][word].with(|word| unsafe { *word }));
-                assert_eq!(words, [picture.sequence; 2], "a torn picture");
-                seen = picture.sequence;
-                free(&mut slots, &picture);
-            }
+    /// One direction of a socket.
+    struct Way<T>(Mutex<VecDeque<T>>);
+
+    impl<T> Way<T> {
+        fn new() -> Arc<Self> {
+            Arc::new(Self(Mutex::new(VecDeque::new())))
         }
-        // loom wants every message to be taken.
-        let (from_holod, heard) = client.join().unwrap();
-        for _ in heard..freed {
-            from_holod.recv().unwrap();
+
+        fn send(&self, message: T) {
+            self.0.lock().unwrap().push_back(message);
+        }
+
+        fn received(&self) -> Option<T> {
+            self.0.lock().unwrap().pop_front()
         }
     }
 
-    fn in_every_order(check: impl Fn() + Sync + Send + 'static) {
+    /// A client and holod with two words of a picture in each slot. loom runs every order of their steps, and objects where
+    /// one writes what the other may be reading. holod hears all that has come before it reads the newest, as it does.
+    fn conversation(waits_for_free: bool) {
+        const PICTURES: u64 = 5;
+        let memory = Arc::new([(); SLOTS].map(|()| [UnsafeCell::new(0_u64), UnsafeCell::new(0)]));
+        let (to_holod, to_client) = (Way::new(), Way::new());
+        let client = {
+            let (memory, to_holod, to_client) = (Arc::clone(&memory), Arc::clone(&to_holod), Arc::clone(&to_client));
+            thread::spawn(move || {
+                let mut own: VecDeque<u32> = (0..SLOTS as u32).collect();
+                for sequence in 1..=PICTURES {
+                    let slot = loop {
+                        own.extend(to_client.received());
+                        match own.pop_front() {
+                            Some(slot) => break slot,
+                            None if waits_for_free => thread::yield_now(),
+                            None => break 0,
+                        }
+                    };
+                    for word in &memory[slot as usize] {
+                        // SAFETY: loom checks that nobody else has the cell meanwhile, which is what is tested.
+                        word.with_mut(|word| unsafe { *word = sequence });
+                    }
+                    to_holod.send((slot, sequence));
+                }
+            })
+        };
+        let mut slots = Slots::default();
+        let mut seen = 0;
+        'turns: while seen < PICTURES {
+            while let Some((slot, sequence)) = to_holod.received() {
+                // A client that breaks the rules is shown out, but may have written by then.
+                let Ok(freed) = slots.hand_over(slot, sequence, None) else { break 'turns };
+                if let Some((freed, _)) = freed {
+                    slots.free(&freed);
+                    to_client.send(freed.slot as u32);
+                }
+            }
+            let Some(picture) = slots.take() else {
+                thread::yield_now();
+                continue;
+            };
+            // SAFETY: as above.
+            let words = [0, 1].map(|word| memory[picture.slot][word].with(|word| unsafe { *word }));
+            assert_eq!(words, [picture.sequence; 2], "a torn picture");
+            seen = picture.sequence;
+            slots.free(&picture);
+            to_client.send(picture.slot as u32);
+        }
+        client.join().unwrap();
+    }
+
+    /// How many there were.
+    fn in_every_order(check: impl Fn() + Sync + Send + 'static) -> usize {
+        let orders = std::sync::Arc::new(AtomicUsize::new(0));
+        let counted = std::sync::Arc::clone(&orders);
         let mut model = loom::model::Builder::new();
-        model.preemption_bound = Some(3);
-        model.check(check);
+        model.preemption_bound = Some(4);
+        model.check(move || {
+            counted.fetch_add(1, Ordering::Relaxed);
+            check();
+        });
+        orders.load(Ordering::Relaxed)
     }
 
     #[test]
     fn no_order_of_steps_tears_a_picture() {
-        in_every_order(|| conversation(true));
+        let orders = in_every_order(|| conversation(true));
+        assert!(orders > 1000, "{orders} orders are none to speak of");
     }
 
     #[test]
