@@ -1,0 +1,15 @@
+"""Hands live pictures with depth to a running holod.
+
+holod must listen (`holod run --scene feed`). Then:
+
+    import holod_client
+
+    with holod_client.Feed(640, 480, colour="rgba8", depth="u16_mm", name="my camera") as feed:
+        for rgb, depth_mm in camera:
+            feed.send(rgb, depth_mm)
+"""
+
+from holod_client.feed import Feed, FeedError, FeedTimeoutError, Outcomes, Slot, default_path
+from holod_client.formats import Colour, Depth
+
+__all__ = ["Colour", "Depth", "Feed", "FeedError", "FeedTimeoutError", "Outcomes", "Slot", "default_path"]

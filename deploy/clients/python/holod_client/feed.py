@@ -1,0 +1,434 @@
+"""The connection to holod."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import math
+import mmap
+import os
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from holod_client import messages
+from holod_client.formats import Colour, Depth
+
+ANSWER_TIMEOUT_S = 5.0
+MOST_MESSAGE_BYTES = 16384
+SERVICE_PATH = Path("/run/holod/feed")
+
+_log = logging.getLogger("holod_client")
+
+
+class FeedError(Exception):
+    """holod is not there, has gone, or refused the connection. The feed is closed."""
+
+
+class FeedTimeoutError(FeedError, TimeoutError):
+    """holod did not give a slot back in time. An open feed is as good as before."""
+
+
+@dataclass
+class Outcomes:
+    """How many pictures were sent, and what became of them as far as holod has said."""
+
+    sent: int = 0
+    taken: int = 0
+    overtaken: int = 0
+    """a newer one came before holod needed them"""
+    refused: int = 0
+    """the last good one stays on the panel"""
+    not_shown: int = 0
+    """another client is shown"""
+
+    @property
+    def unknown(self) -> int:
+        return self.sent - self.taken - self.overtaken - self.refused - self.not_shown
+
+    def __str__(self) -> str:
+        return (
+            f"{self.sent} sent: {self.taken} taken, {self.overtaken} overtaken, {self.refused} refused, "
+            f"{self.not_shown} while another client was shown"
+        )
+
+
+_OUTCOMES = ("taken", "overtaken", "refused", "not_shown")
+
+
+@dataclass
+class Slot:
+    """Shared memory for one picture. What it holds at first is an old one, or 0."""
+
+    colour: NDArray[Any]
+    """of the shape and type of the feed's `Colour`"""
+    depth: NDArray[Any]
+    """(height, width) of the type of the feed's `Depth`; (0, 0) where that is NONE"""
+    t_capture_ns: int = 0
+    """when the picture was taken, as time.monotonic_ns() tells it; 0 where that is not known"""
+
+
+class Feed:
+    """Pictures of one size and format on their way to holod.
+
+    `colour` and `depth` are formats or their names. Without depth ("none") a picture is a plane at `plane_dpt`
+    dioptres. `name` is for holod's log and status, which keep 32 bytes of it. `path` is the socket; without one it is
+    `default_path()`.
+
+    All calls wait for holod up to `timeout_s` seconds, which may be changed at any time: 0 does not wait, and None
+    waits for ever. They raise FeedTimeoutError.
+
+    A picture that holod refuses raises nothing, because the feed goes on: it is counted in `outcomes`, `refusal` says
+    why, and a new reason is logged as a warning by the logger "holod_client", which prints it where a program has not
+    set up logging. As holod answers later, all this is up to date after the next call; `wait()` waits for it.
+
+    As a context manager it waits for all answers and closes. One feed must not be used by two threads at the same time.
+
+    Raises ValueError for an unknown format, FeedError where no holod listens or where it refuses the connection.
+    """
+
+    def __init__(
+        self,
+        width_px: int,
+        height_px: int,
+        *,
+        colour: Colour | str = Colour.RGBA8,
+        depth: Depth | str,
+        plane_dpt: float | None = None,
+        name: str = "Python",
+        path: str | os.PathLike[str] | None = None,
+        timeout_s: float | None = 5.0,
+    ) -> None:
+        self.width_px = width_px
+        self.height_px = height_px
+        self.colour = Colour(colour)
+        self.depth = Depth(depth)
+        self.path = default_path() if path is None else Path(path)
+        self.timeout_s = timeout_s
+        self.outcomes = Outcomes()
+        self.refusal: str | None = None
+        """why holod refused a picture last"""
+        if (self.depth is Depth.NONE) != (plane_dpt is not None):
+            raise ValueError(f"plane_dpt: found {plane_dpt} with depth {str(self.depth)!r}, expected one of the two")
+        for label, size in (("width_px", width_px), ("height_px", height_px)):
+            if not 0 < size < 2**32:
+                raise ValueError(f"{label}: found {size}, expected more than 0")
+
+        self._sequence = 0
+        self._memory: mmap.mmap | None = None
+        self._closed_because = "the feed is closed"
+        self._socket: socket.socket | None = self._connect()
+        try:
+            self._say(messages.helo(width_px, height_px, self.colour.number, self.depth.number, plane_dpt or 0.0, name))
+            self._ring, self._memory = self._receive_ring()
+        except BaseException:
+            self.close()
+            raise
+        self._free = set(range(self._ring.slots))
+        self._sent: set[int] = set()
+
+    def send(self, colour: NDArray[Any], depth: NDArray[Any] | None = None, t_capture_ns: int = 0) -> None:
+        """Copies one picture into shared memory and hands it over.
+
+        `colour` and `depth` have the shape and type of the feed's formats; (height, width, 3) does for the formats
+        with A. Nothing is converted. `t_capture_ns` is when the picture was taken, as time.monotonic_ns() tells it; 0
+        where that is not known.
+
+        Raises ValueError for a wrong shape, TypeError for a wrong type, FeedTimeoutError, FeedError.
+        """
+        self._check_colour(colour)
+        self._check_depth(depth)
+        with self.slot() as slot:
+            slot.t_capture_ns = t_capture_ns
+            slot.colour[..., : colour.shape[-1]] = colour
+            if depth is not None:
+                slot.depth[...] = depth
+
+    @contextmanager
+    def slot(self) -> Iterator[Slot]:
+        """Gives the memory for a picture to write into, and hands it over at the end of the block; not where that
+        raises. The slot's arrays are read-only afterwards; their slices must not be written to either.
+
+        Raises FeedTimeoutError, FeedError.
+        """
+        index = self._begin()
+        slot = self._slot(index)
+        try:
+            yield slot
+        except BaseException:
+            self._free.add(index)
+            raise
+        finally:
+            slot.colour.flags.writeable = False
+            slot.depth.flags.writeable = False
+        self._say(messages.fram(index, self._sequence + 1, slot.t_capture_ns))
+        self._sent.add(index)
+        self._sequence += 1
+        self.outcomes.sent += 1
+
+    def leave_out(self, pictures: int = 1) -> None:
+        """Tells holod, with the next picture, that some were left out before it: for a program that does not wait."""
+        self._sequence += pictures
+
+    def wait(self) -> None:
+        """Waits until it is known of every picture sent what became of it. Raises FeedTimeoutError, FeedError."""
+        deadline = self._deadline()
+        self._receive_what_is_there()
+        while self.outcomes.unknown > 0:
+            if not self._receive_free(deadline):
+                raise FeedTimeoutError(
+                    f"holod has not said in {self.timeout_s} s what became of {self.outcomes.unknown} pictures: "
+                    "is it busy?"
+                )
+
+    def close(self) -> None:
+        """Does not wait. The last picture stays on the panel. May be called again."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+            # Not closed: arrays of a slot may still look into it.
+            self._memory = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            if error is None and self._socket is not None:
+                self.wait()
+        finally:
+            self.close()
+
+    def _check_colour(self, colour: NDArray[Any]) -> None:
+        shapes = [self.colour.shape(self.width_px, self.height_px)]
+        if self.colour is not Colour.RGB32F:
+            shapes.append((self.height_px, self.width_px, 3))
+        _check("colour", colour, shapes, self.colour.dtype)
+
+    def _check_depth(self, depth: NDArray[Any] | None) -> None:
+        if self.depth is Depth.NONE:
+            if depth is not None:
+                raise ValueError("depth: found an array, expected none: the feed was opened without depth")
+        elif depth is None:
+            raise ValueError(f"depth: found none, expected {self.depth.dtype}: the feed was opened with depth")
+        else:
+            _check("depth", depth, [self.depth.shape(self.width_px, self.height_px)], self.depth.dtype)
+
+    def _begin(self) -> int:
+        deadline = self._deadline()
+        self._receive_what_is_there()
+        while not self._free:
+            if not self._receive_free(deadline):
+                raise FeedTimeoutError(
+                    f"holod has kept all {self._ring.slots} slots for {self.timeout_s} s: is it busy?"
+                )
+        return self._free.pop()
+
+    def _slot(self, index: int) -> Slot:
+        start = self._ring.distance * index
+
+        def plane(format: Colour | Depth, offset: int) -> NDArray[Any]:
+            return np.ndarray(format.shape(self.width_px, self.height_px), format.dtype, self._memory, start + offset)
+
+        return Slot(plane(self.colour, self._ring.colour_offset), plane(self.depth, self._ring.depth_offset))
+
+    def _connect(self) -> socket.socket:
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        connection.settimeout(ANSWER_TIMEOUT_S)
+        try:
+            connection.connect(str(self.path))
+        except OSError as error:
+            connection.close()
+            raise FeedError(_why_not_connected(self.path, error)) from error
+        return connection
+
+    def _receive_ring(self) -> tuple[messages.Ring, mmap.mmap]:
+        descriptors: list[int] = []
+        try:
+            message = self._receive(time.monotonic() + ANSWER_TIMEOUT_S, descriptors)
+            if message is None:
+                raise FeedTimeoutError(f"holod said nothing on {self.path} for {ANSWER_TIMEOUT_S:.0f} s: see its log")
+            try:
+                ring = messages.ring(message)
+            except messages.MessageError as error:
+                raise self._unexpected(error) from error
+            return ring, self._map(ring, descriptors)
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+
+    def _map(self, ring: messages.Ring, descriptors: list[int]) -> mmap.mmap:
+        """Maps what holod sent, where it has room for this feed's pictures. Raises FeedError."""
+        if ring.slots < 1:
+            raise FeedError("holod offers 0 slots, expected some: report this")
+        for label, format, offset, found in (
+            ("colour", self.colour, ring.colour_offset, ring.colour_bytes),
+            ("depth", self.depth, ring.depth_offset, ring.depth_bytes),
+        ):
+            expected = math.prod(format.shape(self.width_px, self.height_px)) * format.dtype.itemsize
+            if found != expected:
+                raise FeedError(f"holod has room for {found} bytes of {label}, expected {expected}: report this")
+            if offset % messages.ALIGNMENT or ring.distance % messages.ALIGNMENT or offset + found > ring.distance:
+                raise FeedError(
+                    f"holod put {label} at {offset} in slots of {ring.distance} bytes: not multiples of "
+                    f"{messages.ALIGNMENT}, or outside; report this"
+                )
+        if not descriptors:
+            raise FeedError("holod sent no memory, or this program has too many files open")
+        try:
+            return mmap.mmap(descriptors[0], ring.slots * ring.distance)
+        except (OSError, ValueError) as error:
+            raise FeedError(f"cannot map {ring.slots * ring.distance} bytes of holod's memory: {error}") from error
+
+    def _deadline(self) -> float | None:
+        return None if self.timeout_s is None else time.monotonic() + self.timeout_s
+
+    def _receive_what_is_there(self) -> None:
+        while self._receive_free(deadline=0):
+            pass
+
+    def _receive_free(self, deadline: float | None) -> bool:
+        """Takes one slot back; False where holod gives none back in time."""
+        message = self._receive(deadline)
+        if message is None:
+            return False
+        try:
+            free = messages.free(message)
+        except messages.MessageError as error:
+            raise self._unexpected(error) from error
+        if free.slot not in self._sent or free.outcome >= len(_OUTCOMES):
+            raise self._lost(
+                f"holod gave back slot {free.slot} with outcome {free.outcome}, which was not to be: report this"
+            )
+        outcome = _OUTCOMES[free.outcome]
+        setattr(self.outcomes, outcome, getattr(self.outcomes, outcome) + 1)
+        if outcome == "refused":
+            if free.text != self.refusal:
+                _log.warning("holod refused a picture: %s", free.text)
+            self.refusal = free.text
+        self._sent.remove(free.slot)
+        self._free.add(free.slot)
+        return True
+
+    def _receive(self, deadline: float | None, descriptors: list[int] | None = None) -> bytes | None:
+        """One message; None where none comes until the deadline. Raises FeedError where holod has closed."""
+        connection = self._open_socket()
+        was_reset = False
+        while True:
+            connection.settimeout(None if deadline is None else max(0.0, deadline - time.monotonic()))
+            try:
+                if descriptors is None:
+                    message = connection.recv(MOST_MESSAGE_BYTES)
+                else:
+                    message, received, _, _ = socket.recv_fds(
+                        connection, MOST_MESSAGE_BYTES, 1, socket.MSG_CMSG_CLOEXEC
+                    )
+                    descriptors += received
+            except (BlockingIOError, TimeoutError):
+                return None
+            except ConnectionResetError:
+                # Linux reports once that holod closed without reading everything, before what it wrote.
+                if not was_reset:
+                    was_reset = True
+                    continue
+                message = b""
+            except OSError as error:
+                raise self._lost(f"cannot read from {self.path}: {error.strerror}") from error
+            break
+        if not message:
+            raise self._lost(
+                f"holod closed the connection on {self.path}: it was stopped or has crashed; see its log, start it and "
+                "open the feed again"
+            )
+        refusal = messages.nope(message)
+        if refusal is not None:
+            raise self._lost(f"holod refused the connection on {self.path}: {refusal}")
+        return message
+
+    def _say(self, message: bytes) -> None:
+        connection = self._open_socket()
+        connection.settimeout(ANSWER_TIMEOUT_S)
+        try:
+            connection.send(message)
+        except TimeoutError as error:
+            raise self._lost(
+                f"holod read nothing from {self.path} for {ANSWER_TIMEOUT_S:.0f} s: see its log"
+            ) from error
+        except ConnectionError as error:
+            # holod has closed, and may have said why. What it said before that is of no use any more.
+            deadline = time.monotonic() + ANSWER_TIMEOUT_S
+            while self._receive(deadline) is not None:
+                pass
+            raise self._lost(f"holod reads no more from {self.path}: see its log, start it again") from error
+        except OSError as error:
+            raise self._lost(f"cannot send to {self.path}: {error.strerror}") from error
+
+    def _open_socket(self) -> socket.socket:
+        if self._socket is None:
+            raise FeedError(self._closed_because)
+        return self._socket
+
+    def _unexpected(self, error: messages.MessageError) -> FeedError:
+        return self._lost(
+            f"{self.path} sent {error}: is it holod, of a version that speaks version {messages.VERSION} of the feed?"
+        )
+
+    def _lost(self, reason: str) -> FeedError:
+        """Closes the feed, which says the same from now on."""
+        self._closed_because = reason
+        self.close()
+        return FeedError(reason)
+
+
+def default_path() -> Path:
+    """Where holod listens by itself: `feed` in its runtime folder, or that of the service where nothing is there."""
+    runtime, xdg_runtime = os.environ.get("RUNTIME_DIRECTORY"), os.environ.get("XDG_RUNTIME_DIR")
+    user_runtime = Path(f"/run/user/{os.getuid()}")
+    if runtime:
+        folder = Path(runtime)
+    elif xdg_runtime:
+        folder = Path(xdg_runtime) / "holod"
+    elif user_runtime.exists():
+        folder = user_runtime / "holod"
+    else:
+        folder = Path(f"/tmp/holod-{os.getuid()}")
+    path = folder / "feed"
+    return SERVICE_PATH if SERVICE_PATH.exists() and not path.exists() else path
+
+
+def _check(label: str, array: NDArray[Any], shapes: list[tuple[int, ...]], dtype: np.dtype) -> None:
+    if not isinstance(array, np.ndarray):
+        raise TypeError(f"{label}: found {type(array).__name__}, expected a numpy array")
+    if array.dtype != dtype:
+        raise TypeError(f"{label}: found {array.dtype}, expected {dtype}; nothing is converted silently")
+    if array.shape not in shapes:
+        raise ValueError(f"{label}: found shape {array.shape}, expected {' or '.join(map(str, shapes))}")
+
+
+def _why_not_connected(path: Path, error: OSError) -> str:
+    if error.errno in (errno.ENOENT, errno.ENOTDIR, errno.ECONNREFUSED):
+        return (
+            f"no holod listens on {path}: start it with `holod run --scene feed`, or give the path that its log names"
+        )
+    if error.errno == errno.EACCES:
+        return (
+            f"this user may not open {path}: run as the user that holod runs as, or as one who may write to that socket"
+        )
+    if error.errno == errno.EPROTOTYPE:
+        return (
+            f"{path} is a socket of another type than holod's (SOCK_SEQPACKET): it belongs to another program; give "
+            "the path that holod's log names"
+        )
+    if isinstance(error, BlockingIOError | TimeoutError):
+        return f"holod lets nobody in on {path}: see its log, start it again"
+    return f"cannot connect to {path}: {error.strerror or error}"
