@@ -51,11 +51,11 @@ pub fn spread_text(spread: Option<Spread>) -> String {
     spread.map_or("not measured".to_owned(), |s| format!("median {:.1} ms, p99 {:.1} ms", s.median_ms, s.p99_ms))
 }
 
-/// The live feed in one line.
+/// What became of a feed's pictures.
 pub fn feed_text(feed: &FeedStatus) -> String {
     let refusal = feed.last_refusal.as_ref().map_or(String::new(), |why| format!("; refused last: {why}"));
     format!(
-        "feed      {} pictures taken, {} overtaken, {} refused, {} of clients not shown, {} left out by clients; {} \
+        "{} pictures taken, {} overtaken, {} refused, {} of clients not shown, {} left out by clients; {} \
          connections refused{refusal}",
         feed.taken, feed.overtaken, feed.refused, feed.not_shown, feed.left_out, feed.connections_refused,
     )
@@ -75,7 +75,7 @@ pub fn summary_text(summary: &Summary) -> String {
         trouble.push_str(&format!("\n          the recording lost {lost} pieces: the disk is too slow for it"));
     }
     let feed = figures.feed.as_ref().map_or(String::new(), |feed| {
-        format!("\n{}; picture to photons {}", feed_text(feed), spread_text(figures.picture_to_photon))
+        format!("\nfeed      {}; picture to photons {}", feed_text(feed), spread_text(figures.picture_to_photon))
     });
     format!(
         "ended by {} after {:.1} s\n\

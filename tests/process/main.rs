@@ -3,6 +3,7 @@
 mod bad_input;
 mod bench;
 mod evaluate;
+mod feed;
 mod gpu;
 mod inspect;
 mod panel;

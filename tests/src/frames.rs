@@ -24,6 +24,8 @@ pub struct FieldRow {
     pub laser_on_ns: Option<i64>,
     pub laser_off_ns: Option<i64>,
     pub deadline_missed: bool,
+    pub picture: u64,
+    pub t_picture_ns: Option<i64>,
 }
 
 /// Reads every row of a record.
@@ -71,6 +73,8 @@ fn row(cells: &HashMap<&str, &str>) -> Result<FieldRow, String> {
         laser_on_ns: cell(cells, "laser_on_ns")?,
         laser_off_ns: cell(cells, "laser_off_ns")?,
         deadline_missed: needed::<u8>(cells, "deadline_missed")? == 1,
+        picture: needed(cells, "picture")?,
+        t_picture_ns: cell(cells, "t_picture_ns")?,
     })
 }
 
@@ -154,6 +158,8 @@ mod tests {
                     laser_on_ns: Some(t_ns + 20),
                     laser_off_ns: Some(t_ns + 90),
                     deadline_missed: false,
+                    picture: 0,
+                    t_picture_ns: None,
                 }
             })
             .collect()

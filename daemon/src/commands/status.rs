@@ -50,7 +50,7 @@ fn text_of(status: &Snapshot) -> String {
         let age = feed.newest_age_s.map_or(String::new(), |age_s| format!("; newest {age_s:.1} s ago"));
         format!(
             "\nfeed     {}: {shown}{age}\n\
-             {}; picture to photons {}",
+             \x20        {}; picture to photons {}",
             feed.socket.display(),
             report::feed_text(feed),
             report::spread_text(figures.picture_to_photon)

@@ -76,12 +76,15 @@ impl Client {
     /// Reads what it has sent. Pictures that are overtaken or refused by their numbers are freed, with `note` told of each.
     pub(super) fn receive(&mut self, target: &Target, now: TimeNs, mut note: impl FnMut(&Outcome)) -> Result<(), Gone> {
         let mut bytes = [0; LONGEST + 1];
+        let mut was_reset = false;
         for _ in 0..MESSAGES_AT_ONCE {
             let length = match recv(&self.socket, &mut bytes, RecvFlags::DONTWAIT) {
                 Ok((0, _)) => return Err(Gone::Closed),
                 Ok((length, _)) => length,
                 Err(Errno::AGAIN) => break,
                 Err(Errno::INTR) => continue,
+                // Said once of a client that closed before it had read everything; what it sent before that comes next.
+                Err(Errno::CONNRESET) if !std::mem::replace(&mut was_reset, true) => continue,
                 Err(error) => return Err(error.into()),
             };
             let heard = Message::parse(&bytes[..length]).and_then(|message| self.hear(message, target, now, &mut note));

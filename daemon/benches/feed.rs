@@ -1,0 +1,84 @@
+//! What it costs to hand a 1920x1080 picture over through the live feed, beside a copy of its bytes in the same run:
+//! `cargo bench -p holod --bench feed`.
+
+#![allow(clippy::print_stdout, reason = "it prints what it measured")]
+
+use std::hint::black_box;
+use std::time::{Duration, Instant};
+
+use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
+use holod_daemon::source::feed::{Feed, FeedPlan};
+use holod_daemon::source::{PictureTag, Shown, newest_picture};
+use holod_model::RgbdFrame;
+use holod_model::scene::{Fit, LiveColour, LiveDepth, LiveFormat, LivePart, LiveReader};
+use holod_tests::feed::{Answer, FeedClient, hello};
+
+const SIZE: Resolution = Resolution { width: 1920, height: 1080 };
+const ROUNDS: usize = 31;
+
+fn main() {
+    let format = LiveFormat { resolution: SIZE, colour: LiveColour::Rgba8, depth: LiveDepth::MillimetresU16 };
+    let colour: Vec<u8> = (0..format.colour_bytes()).map(|at| (at * 7) as u8).collect();
+    let depth: Vec<u8> = (0..SIZE.pixels()).flat_map(|at| (400 + (at % 3000) as u16).to_ne_bytes()).collect();
+    let (mut colour_copy, mut depth_copy) = (colour.clone(), depth.clone());
+
+    let folder = tempfile::tempdir().expect("a folder for the socket");
+    let socket = folder.path().join("feed");
+    let black = Shown::Live { frame: RgbdFrame::black(SIZE).into(), tag: PictureTag::default() };
+    let (sink, mut source) = newest_picture(black);
+    let plan = FeedPlan { socket: socket.clone(), resolution: SIZE, fit: Fit::Native };
+    let _feed = Feed::listen(plan, &DisplayGeometry::DEFAULT, sink).expect("a feed");
+    let mut client = FeedClient::connect(&socket).expect("a connection");
+    client.say(&hello(SIZE.width as u32, SIZE.height as u32, None, "bench")).expect("the feed listens");
+    assert_eq!(client.answer(), Answer::Ring);
+    let mut reader =
+        LiveReader::new(format, &DisplayGeometry::DEFAULT, SIZE, Fit::Native).expect("the picture is the frame");
+    let mut frame = RgbdFrame::black(SIZE);
+
+    let mut times = [const { Vec::new() }; 4];
+    for round in 0..ROUNDS {
+        times[0].push(timed(|| {
+            colour_copy.copy_from_slice(black_box(&colour));
+            depth_copy.copy_from_slice(black_box(&depth));
+        }));
+        times[1].push(timed(|| client.write(0, &colour, &depth)));
+        times[2].push(timed(|| {
+            client.hand_over(0, 1 + round as u64, 0).expect("the feed listens");
+            assert!(matches!(client.answer(), Answer::Free { outcome: 0, .. }));
+        }));
+        let read_at = |part, bytes: &mut [u8], at: usize| {
+            let all = if part == LivePart::Colour { &colour } else { &depth };
+            bytes.copy_from_slice(&all[at..at + bytes.len()]);
+            Ok(())
+        };
+        times[3].push(timed(|| {
+            reader.read(read_at, &mut frame).expect("a picture");
+        }));
+        black_box((&colour_copy, &depth_copy, source.at(TimeNs(0)).1));
+    }
+    let [copied, others @ ..] = times.map(median_ms);
+    let bytes = format.colour_bytes() + format.depth_bytes();
+    let out = size_of_val(&*frame.amplitude) + size_of_val(&*frame.depth_normalised);
+    println!("{SIZE}, RGBA8 and 16-bit millimetres: {:.1} MB in, {:.1} MB of frame out", mb(bytes), mb(out));
+    println!("a copy of the bytes in memory          {copied:6.2} ms");
+    let names =
+        ["written into the shared memory", "handed over, until the slot is free", "made a frame, without the feed"];
+    for (name, ms) in names.into_iter().zip(others) {
+        println!("{name:36}   {ms:6.2} ms, {:5.2} of a copy", ms / copied);
+    }
+}
+
+fn mb(bytes: usize) -> f64 {
+    bytes as f64 / 1e6
+}
+
+fn timed(work: impl FnOnce()) -> Duration {
+    let began = Instant::now();
+    work();
+    began.elapsed()
+}
+
+fn median_ms(mut times: Vec<Duration>) -> f64 {
+    times.sort();
+    times[times.len() / 2].as_secs_f64() * 1e3
+}

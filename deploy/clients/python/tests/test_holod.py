@@ -1,0 +1,102 @@
+"""The clients against a real holod, which $HOLOD names."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from holod_client import Feed, FeedError
+
+HERE = Path(__file__).parent
+SIZE = 64
+
+
+class Holod:
+    """A holod that listens on `socket` until `end()`, which returns its summary."""
+
+    def __init__(self, binary: str, folder: Path) -> None:
+        self.socket = folder / "pictures"
+        options = ["--resolution", f"{SIZE}x{SIZE}", "--fit", "contain", "--weights", "fast", "--backend", "cpu"]
+        self.process = subprocess.Popen(
+            [binary, "run", "--scene", f"feed:{self.socket}", *options, "--json"],
+            env={**os.environ, "XDG_RUNTIME_DIR": str(folder)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        patience_s = time.monotonic() + 60
+        while not self.socket.exists():
+            assert self.process.poll() is None, self.process.communicate()[1]
+            assert time.monotonic() < patience_s, "holod does not listen"
+            time.sleep(0.02)
+
+    def end(self) -> dict:
+        self.process.terminate()
+        said, log = self.process.communicate(timeout=60)
+        assert self.process.returncode == 0, log
+        return json.loads(said)
+
+
+@pytest.fixture
+def holod(tmp_path: Path) -> Iterator[Holod]:
+    binary = os.environ.get("HOLOD")
+    if binary is None:
+        assert "CI" not in os.environ, "HOLOD must name the daemon: its clients are tested against it"
+        pytest.skip("HOLOD does not name the daemon, such as target/release/holod")
+    running = Holod(binary, tmp_path)
+    yield running
+    running.process.kill()
+    running.process.wait()
+
+
+def test_pictures_from_python_are_taken_and_faults_are_told(holod: Holod) -> None:
+    rgb = np.full((SIZE, SIZE, 3), 90, np.uint8)
+    depth_mm = np.full((SIZE, SIZE), 800, np.uint16)
+    with Feed(SIZE, SIZE, depth="u16_mm", name="arrays", path=holod.socket) as feed:
+        for _ in range(20):
+            feed.send(rgb, depth_mm, t_capture_ns=time.monotonic_ns())
+            feed.wait()
+        feed.send(rgb, np.zeros_like(depth_mm))
+        feed.wait()
+        assert feed.refusal == "found no pixel with a valid depth, expected millimetres above 0"
+        feed.send(rgb, depth_mm, t_capture_ns=time.time_ns())
+        feed.wait()
+        assert "not of the calendar's clock" in feed.refusal
+        assert (feed.outcomes.taken, feed.outcomes.refused) == (20, 2)
+    with pytest.raises(FeedError, match="plane_dpt 300 was found, expected 0 to 20 dioptres"):
+        Feed(SIZE, SIZE, depth="none", plane_dpt=300.0, path=holod.socket)
+    told = holod.end()["feed"]
+    assert (told["taken"], told["refused"], told["connections_refused"]) == (20, 2, 1)
+
+
+@pytest.mark.parametrize("colour", ["rgba8", "rgba16f", "rgb32f"])
+@pytest.mark.parametrize("depth", ["u16_mm", "f16_m", "f16_dpt", "f32_m", "f32_dpt"])
+def test_every_format_is_taken(holod: Holod, colour: str, depth: str) -> None:
+    with Feed(2 * SIZE, SIZE, colour=colour, depth=depth, path=holod.socket) as feed:
+        with feed.slot() as slot:
+            slot.colour[...] = 0.5 if slot.colour.dtype.kind == "f" else 128
+            slot.depth[...] = 1000 if depth == "u16_mm" else 1
+        feed.wait()
+        assert feed.outcomes.taken == 1, feed.refusal
+
+
+def test_the_c_example_and_a_pipe_are_shown(holod: Holod, tmp_path: Path) -> None:
+    c = HERE.parents[1] / "c"
+    example = tmp_path / "example"
+    subprocess.run(["cc", "-O2", "-o", example, c / "example.c", c / "holod_feed.c"], check=True, timeout=120)
+    done = subprocess.run([example, holod.socket, "320x240", "1"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    command = [sys.executable, "-m", "holod_client", "stdin", "--size", "320x240", "--plane", "1", "--socket"]
+    pictures = bytes(320 * 240 * 4 * 3)
+    done = subprocess.run([*command, holod.socket], input=pictures, capture_output=True, timeout=60, cwd=HERE.parent)
+    assert done.returncode == 0, done.stderr
+    told = holod.end()["feed"]
+    assert told["taken"] >= 4 and told["refused"] == told["connections_refused"] == 0, told
