@@ -55,6 +55,13 @@ impl OutputControl {
         self.switch.clone()
     }
 
+    /// Keeps the lasers dark until this is taken back; then they are lit again by the rules. Does not wait: the box has
+    /// acknowledged when [`OutputCounts::armed`] is false and it has no new fault.
+    pub fn keep_dark(&self, dark: bool) {
+        self.switch.shared.dark_wanted.store(dark, Ordering::Release);
+        self.switch.laser.unpark();
+    }
+
     /// Counters so far.
     pub fn counts(&self) -> OutputCounts {
         self.switch.shared.counts()

@@ -25,6 +25,8 @@ pub(super) struct LaserThread {
     pub(super) ledger: Ledger,
     /// What went wrong with the box, for whoever tells people.
     pub(super) faults: Producer<LaserError>,
+    /// A person asks for darkness.
+    pub(super) held: bool,
     /// A box that failed is left alone until then.
     pub(super) t_retry: TimeNs,
     /// The box failed and may have lost its program.
@@ -56,6 +58,11 @@ impl LaserThread {
         self.poll(now);
         if let Some(reason) = self.shared.latched() {
             self.latch(reason, now);
+        }
+        let held = self.shared.dark_wanted.load(Ordering::Acquire);
+        if held != std::mem::replace(&mut self.held, held) {
+            let orders = self.scheduler.hold(held);
+            self.obey(orders, now);
         }
         self.decide_fields(clock());
         while let Ok(news) = self.news.pop() {

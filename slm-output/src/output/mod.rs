@@ -155,6 +155,7 @@ impl Output {
             faults: fault_producer,
             t_retry: TimeNs(i64::MIN),
             program_lost: false,
+            held: false,
             shared: Arc::clone(&shared),
             clock,
         };

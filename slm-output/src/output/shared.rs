@@ -38,6 +38,8 @@ pub(super) struct Shared {
     pub(super) latch: AtomicU8,
     /// What the box said to that.
     pub(super) acknowledged: AtomicU8,
+    /// A person asks for darkness, until that is taken back.
+    pub(super) dark_wanted: AtomicBool,
     pub(super) flat_wanted: AtomicBool,
     pub(super) flat_shown: AtomicBool,
     pub(super) stop: AtomicBool,

@@ -87,6 +87,7 @@ impl Bench {
             faults: RingBuffer::new(SHORT_RING).0,
             t_retry: TimeNs(i64::MIN),
             program_lost: false,
+            held: false,
             shared: Arc::default(),
             clock: || TimeNs(0),
         };
@@ -227,6 +228,27 @@ fn times_that_nobody_saw_light_nothing() {
         bench.falsify = |refresh| Some(PresentedRefresh { provenance: Provenance::Hardware, ..refresh });
         bench.run(TimeNs(1000 * MS), TimeNs(0));
         assert_ne!(bench.edges, []);
+    }
+}
+
+#[test]
+fn lasers_that_are_kept_dark_stay_so_until_that_is_taken_back() {
+    for mode in MODES {
+        let mut bench = Bench::new(mode);
+        bench.run(TimeNs(300 * MS), TimeNs(0));
+        bench.laser.shared.dark_wanted.store(true, Ordering::Release);
+        let t_asked = bench.now + TimeNs(MS);
+        bench.wake(t_asked);
+        let &[(t_dark, DarkReason::Asked)] = bench.darks.as_slice() else { panic!("{:?}", bench.darks) };
+        assert!((0..1000).contains(&(t_asked.0 - t_dark.0)), "{t_dark:?} {t_asked:?}");
+        let edges = bench.edges.len();
+        bench.run(TimeNs(600 * MS), TimeNs(0));
+        assert_eq!(bench.edges.len(), edges);
+        assert_eq!(bench.all_events.last().unwrap().dark, Some(DarkReason::Asked));
+        bench.laser.shared.dark_wanted.store(false, Ordering::Release);
+        bench.run(TimeNs(900 * MS), TimeNs(0));
+        assert!(bench.edges.len() > edges + 10, "lit again by the rules");
+        assert_eq!(bench.verdict().unsafe_findings().collect::<Vec<_>>(), Vec::<&Finding>::new());
     }
 }
 

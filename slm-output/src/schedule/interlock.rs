@@ -58,6 +58,8 @@ pub(super) struct Interlock {
     armed: bool,
     /// Set for good by shutdown and panic.
     latched: Option<DarkReason>,
+    /// A person has asked for darkness, and not taken that back.
+    held: bool,
     /// The last refresh known to be shown.
     t_known: Option<TimeNs>,
     /// When the frame that is shown was new.
@@ -74,6 +76,7 @@ impl Interlock {
             stall_timeout,
             armed: false,
             latched: None,
+            held: false,
             t_known: None,
             t_new_frame: TimeNs(i64::MIN),
         }
@@ -145,6 +148,12 @@ impl Interlock {
         Orders { dark: Some(reason), ..Orders::default() }
     }
 
+    /// A person asks for darkness, or takes that back: lasers are lit again by the rules then.
+    pub(super) fn hold(&mut self, held: bool) -> Orders {
+        self.held = held;
+        if held { self.dark(DarkReason::Asked) } else { Orders::default() }
+    }
+
     /// Puts the lasers out for `reason` if they are armed.
     pub(super) fn dark(&mut self, reason: DarkReason) -> Orders {
         let was_armed = std::mem::replace(&mut self.armed, false);
@@ -159,6 +168,9 @@ impl Interlock {
     ) -> Result<(), DarkReason> {
         if let Some(reason) = self.latched {
             return Err(reason);
+        }
+        if self.held {
+            return Err(DarkReason::Asked);
         }
         if field.frame.is_none() {
             return Err(DarkReason::Flat);

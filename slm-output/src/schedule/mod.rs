@@ -178,6 +178,11 @@ impl FieldScheduler {
         self.interlock.box_went_dark();
     }
 
+    /// A person asks for darkness, or takes that back.
+    pub fn hold(&mut self, held: bool) -> Orders {
+        self.interlock.hold(held)
+    }
+
     /// Dark for good: shutdown, panic.
     pub fn latch(&mut self, reason: DarkReason) -> Orders {
         self.interlock.latch(reason)
