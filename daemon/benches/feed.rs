@@ -7,8 +7,8 @@ use std::hint::black_box;
 use std::time::{Duration, Instant};
 
 use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
-use holod_daemon::source::feed::{Feed, FeedPlan};
-use holod_daemon::source::{PictureTag, Shown, newest_picture};
+use holod_daemon::source::feed::FeedPlan;
+use holod_daemon::source::{self, Pictures};
 use holod_model::RgbdFrame;
 use holod_model::scene::{Fit, LiveColour, LiveDepth, LiveFormat, LivePart, LiveReader};
 use holod_tests::feed::{Answer, FeedClient, hello};
@@ -24,10 +24,9 @@ fn main() {
 
     let folder = tempfile::tempdir().expect("a folder for the socket");
     let socket = folder.path().join("feed");
-    let black = Shown::Live { frame: RgbdFrame::black(SIZE).into(), tag: PictureTag::default() };
-    let (sink, mut source) = newest_picture(black);
     let plan = FeedPlan { socket: socket.clone(), resolution: SIZE, fit: Fit::Native };
-    let _feed = Feed::listen(plan, &DisplayGeometry::DEFAULT, sink).expect("a feed");
+    let pictures = Pictures::Feed(plan);
+    let (_sink, mut source, _feed) = source::open(&pictures, &DisplayGeometry::DEFAULT, TimeNs(0)).expect("a feed");
     let mut client = FeedClient::connect(&socket).expect("a connection");
     client.say(&hello(SIZE.width as u32, SIZE.height as u32, None, "bench")).expect("the feed listens");
     assert_eq!(client.answer(), Answer::Ring);

@@ -73,6 +73,7 @@ fn run(out: &Path) -> Result<(), Failure> {
         })),
         output: OutputSpec::Headless(ReportFaults::NONE),
         tracker: TrackerSpec::Mock(Scenario::Steady),
+        pupil: None,
         record_tracker: None,
         frame_limit: None,
         duration: Some(DURATION),

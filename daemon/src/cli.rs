@@ -8,6 +8,7 @@ use std::time::Duration;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::rig::WeightsChoice;
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
+use holod_model::scene::Fit;
 use holod_pupil_input::UsbIds;
 
 pub use self::pattern::{ColourArg, PatternKind, PatternTarget, ProfileArg};
@@ -49,6 +50,8 @@ pub enum Command {
     Pattern(PatternKind),
     /// Say what the running daemon is doing.
     Status(StatusArgs),
+    /// Change what the running daemon does: scene, weights, pupil, lasers.
+    Ctl(CtlArgs),
     /// List trackers, or try one out.
     #[command(subcommand)]
     Tracker(TrackerCommand),
@@ -121,7 +124,7 @@ pub struct NetworkArgs {
     pub weights: Option<WeightsChoice>,
 }
 
-fn parse_weights(text: &str) -> Result<WeightsChoice, String> {
+pub(crate) fn parse_weights(text: &str) -> Result<WeightsChoice, String> {
     if let Some((_, choice)) = WeightsChoice::BUILT_IN.into_iter().find(|(name, _)| *name == text) {
         return Ok(choice);
     }
@@ -169,6 +172,28 @@ pub enum FitArg {
     Crop,
 }
 
+impl From<FitArg> for Fit {
+    fn from(arg: FitArg) -> Self {
+        match arg {
+            FitArg::Native => Self::Native,
+            FitArg::Contain => Self::Contain,
+            FitArg::Cover => Self::Cover,
+            FitArg::Crop => Self::Crop,
+        }
+    }
+}
+
+impl From<Fit> for FitArg {
+    fn from(fit: Fit) -> Self {
+        match fit {
+            Fit::Native => Self::Native,
+            Fit::Contain => Self::Contain,
+            Fit::Cover => Self::Cover,
+            Fit::Crop => Self::Crop,
+        }
+    }
+}
+
 /// Which engine computes the network.
 #[derive(ValueEnum, Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum Backend {
@@ -214,6 +239,9 @@ pub struct RunArgs {
     /// Engine for the network.
     #[arg(long, value_enum, default_value_t = Backend::Auto)]
     pub backend: Backend,
+    /// Compute for one pupil, in millimetres, whatever the tracker says.
+    #[arg(long, value_name = "MM", value_parser = parse_pupil)]
+    pub pupil: Option<PupilDiameter>,
     /// Millimetres for one unit of the tracker's figure, in place of the rig's tracker.scale_mm_per_unit.
     #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
     pub scale: Option<f64>,
@@ -223,7 +251,8 @@ pub struct RunArgs {
     /// Stop after this long, for example 10s or 2m; a log that is replayed and ends sooner ends the run.
     #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration)]
     pub duration: Option<Duration>,
-    /// Write frames.csv, summary.json, and what the tracker sent (tracker.holodraw, samples.csv) into this directory.
+    /// Write frames.csv, summary.json, what the tracker sent (tracker.holodraw, samples.csv) and what `holod ctl` changed
+    /// (orders.jsonl) into this directory.
     #[arg(long, value_name = "DIR")]
     pub record: Option<PathBuf>,
     /// Overwrite an earlier record.
@@ -409,6 +438,85 @@ pub struct EvaluateArgs {
     pub force: bool,
 }
 
+/// Options of `ctl`.
+#[derive(Args, Debug, Clone)]
+pub struct CtlArgs {
+    /// Of several that run, the one of this process number.
+    #[arg(long, value_name = "PID", global = true)]
+    pub pid: Option<u32>,
+    /// Its control socket, in place of the one that it wrote into its status.
+    #[arg(long, value_name = "SOCKET", global = true, conflicts_with = "pid")]
+    pub socket: Option<PathBuf>,
+    /// What to do.
+    #[command(subcommand)]
+    pub order: CtlOrder,
+}
+
+/// What can be changed in a running daemon.
+#[derive(Subcommand, Debug, Clone)]
+pub enum CtlOrder {
+    /// Print how the run is at this moment, as JSON.
+    Status,
+    /// Show another scene, brought to the size of the hologram; or the live feed again.
+    Scene {
+        /// A scene directory with scene.toml, COLOUR,DEPTH, one OpenEXR file, or feed.
+        #[arg(value_name = "PATH")]
+        scene: String,
+        /// What the depth file's numbers are, as `run` takes it.
+        #[arg(long, value_name = "ENCODING")]
+        depth_encoding: Option<String>,
+        /// How a picture of another size is brought to that of the hologram.
+        #[arg(long, value_enum, default_value_t = FitArg::Native)]
+        fit: FitArg,
+    },
+    /// Compute with other weights: standard, small, fast, or a file.
+    Weights {
+        /// Their name or file.
+        #[arg(value_name = "NAME|FILE", value_parser = parse_weights)]
+        weights: WeightsChoice,
+    },
+    /// Let the picture stand still; the pupil is followed.
+    Pause,
+    /// Let it go on.
+    Resume,
+    /// Compute for one pupil, whatever the tracker says, or follow the tracker again.
+    Pupil {
+        /// Its diameter in millimetres, or follow.
+        #[arg(value_name = "MM|follow", value_parser = parse_pupil_or_follow)]
+        pupil: PupilOrder,
+    },
+    /// Keep the lasers dark, or let them be lit by the rules again.
+    Lasers {
+        /// Which.
+        #[arg(value_enum)]
+        lasers: LasersArg,
+    },
+    /// End the run in order: lasers dark, flat pattern on the panel.
+    Stop,
+}
+
+/// The pupil that holograms are computed for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum PupilOrder {
+    /// The tracker's.
+    Follow,
+    /// This one.
+    Fixed(PupilDiameter),
+}
+
+/// What the lasers are to do.
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LasersArg {
+    /// Stay dark.
+    Dark,
+    /// Be lit by the rules.
+    Arm,
+}
+
+fn parse_pupil_or_follow(text: &str) -> Result<PupilOrder, String> {
+    if text == "follow" { Ok(PupilOrder::Follow) } else { parse_pupil(text).map(PupilOrder::Fixed) }
+}
+
 /// Options of `status`.
 #[derive(Args, Debug, Clone)]
 pub struct StatusArgs {
@@ -540,6 +648,11 @@ fn parse_resolution(text: &str) -> Result<Resolution, String> {
 fn parse_pupil(text: &str) -> Result<PupilDiameter, String> {
     let mm: f32 =
         text.parse().map_err(|_| format!("found '{text}', expected a diameter in millimetres such as 3.5"))?;
+    human_pupil(mm)
+}
+
+/// A pupil that a human eye can have.
+pub(crate) fn human_pupil(mm: f32) -> Result<PupilDiameter, String> {
     if (0.5..=9.0).contains(&mm) {
         Ok(PupilDiameter::from_mm(mm))
     } else {

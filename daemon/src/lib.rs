@@ -2,12 +2,14 @@
 
 pub mod cli;
 pub mod commands;
+pub mod control;
 pub mod destination;
 pub mod evaluation;
 pub mod exposure;
 pub mod failure;
 #[cfg(feature = "fault-injection")]
 mod fault;
+pub mod local_socket;
 pub mod logging;
 pub mod pictures;
 pub mod progress;

@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use holod_calibration::{Colour, PupilDiameter, TimeNs};
 use holod_slm_output::FieldEvent;
 
+use crate::control::Request;
 use crate::failure::{Exit, Failure};
 use crate::source::PictureTag;
 
@@ -78,7 +79,7 @@ pub const HEADER: &str = "frame,field,colour,t_sample_ns,pupil_raw_mm,pupil_mm,p
 t_render_end_ns,t_submit_ns,t_present_ns,present_provenance,laser_on_ns,laser_off_ns,deadline_missed,picture,t_picture_ns";
 
 /// The files of a record whose names are always the same.
-const FILES: [&str; 4] = ["frames.csv", "summary.json", "samples.csv", "tracker.holodraw"];
+const FILES: [&str; 5] = ["frames.csv", "orders.jsonl", "summary.json", "samples.csv", "tracker.holodraw"];
 /// How the names of the levels that were shown begin and end.
 const SHOWN: (&str, &str) = ("shown_pupil_", ".png");
 
@@ -178,6 +179,18 @@ impl FrameLog {
         .map_err(|error| self.lost(&error))
     }
 
+    /// Writes down beside it, in `orders.jsonl`, that a person changed something at host time `t`. The file is there once
+    /// there is something in it.
+    ///
+    /// # Errors
+    /// The disk's, with the file's name.
+    pub fn order(&self, t: TimeNs, request: &Request) -> Result<(), Failure> {
+        let path = self.path.with_file_name("orders.jsonl");
+        let line = serde_json::json!({ "t_ns": t.0, "request": request });
+        let file = OpenOptions::new().create(true).append(true).open(&path);
+        file.and_then(|mut file| writeln!(file, "{line}")).map_err(|error| lost(&path, &error))
+    }
+
     /// Hands everything to the operating system.
     ///
     /// # Errors
@@ -204,8 +217,12 @@ impl FrameLog {
     }
 
     fn lost(&self, error: &std::io::Error) -> Failure {
-        Failure::new(Exit::CannotCreate, format!("cannot go on recording into {}: {error}", self.path.display()))
+        lost(&self.path, error)
     }
+}
+
+fn lost(path: &Path, error: &std::io::Error) -> Failure {
+    Failure::new(Exit::CannotCreate, format!("cannot go on recording into {}: {error}", path.display()))
 }
 
 #[cfg(test)]
@@ -264,6 +281,18 @@ mod tests {
     }
 
     #[test]
+    fn orders_stand_beside_the_frames_one_to_a_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let log = FrameLog::create(folder.path()).unwrap();
+        log.order(TimeNs(5), &Request::Pupil { mm: Some(3.5) }).unwrap();
+        log.order(TimeNs(6), &Request::LasersDark).unwrap();
+        let text = fs::read_to_string(folder.path().join("orders.jsonl")).unwrap();
+        let expected =
+            [r#"{"request":{"do":"pupil","mm":3.5},"t_ns":5}"#, r#"{"request":{"do":"lasers-dark"},"t_ns":6}"#];
+        assert_eq!(text.lines().collect::<Vec<_>>(), expected);
+    }
+
+    #[test]
     fn a_record_that_is_deleted_is_noticed_when_it_is_flushed() {
         let folder = tempfile::tempdir().unwrap();
         let mut log = FrameLog::create(&folder.path().join("record")).unwrap();
@@ -277,8 +306,14 @@ mod tests {
     #[test]
     fn force_takes_an_earlier_record_away_and_nothing_else() {
         let folder = tempfile::tempdir().unwrap();
-        let names =
-            ["frames.csv", "summary.json", "samples.csv", "tracker.holodraw", "shown_pupil_3.00mm_frame_000001.png"];
+        let names = [
+            "frames.csv",
+            "orders.jsonl",
+            "summary.json",
+            "samples.csv",
+            "tracker.holodraw",
+            "shown_pupil_3.00mm_frame_000001.png",
+        ];
         for name in names.into_iter().chain(["notes.txt", "shown.png"]) {
             fs::write(folder.path().join(name), "old").unwrap();
         }

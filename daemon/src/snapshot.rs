@@ -1,6 +1,7 @@
 //! What can be said of a run at one moment: the one thing from which status, summary and answers are made.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
@@ -40,6 +41,8 @@ pub struct Figures {
     pub picture_to_photon: Option<Spread>,
     /// How the tracker's link is.
     pub tracker_link: String,
+    /// What the weights are called.
+    pub weights: String,
     /// Why a lost link does not come back, or why nothing that the tracker sends is believed.
     pub tracker_trouble: Option<String>,
     /// Counters of the tracker: samples, connections, rejections by reason.
@@ -57,6 +60,12 @@ pub struct Snapshot {
     pub state: String,
     /// How long it has run.
     pub uptime_s: f64,
+    /// Where `holod ctl` may ask it.
+    pub control: Option<PathBuf>,
+    /// The picture stands still.
+    pub paused: bool,
+    /// A person keeps the lasers dark.
+    pub lasers_kept_dark: bool,
     /// What holds at the end, too.
     #[serde(flatten)]
     pub figures: Figures,

@@ -72,6 +72,34 @@ pub fn of_running() -> Result<Vec<Found>, Failure> {
     of_running_in(&folders)
 }
 
+/// Those that run and are meant: all, or the one of process `pid`.
+///
+/// # Errors
+/// As [`of_running`], or that process is no holod.
+pub fn of_running_as(pid: Option<u32>) -> Result<Vec<Found>, Failure> {
+    let mut running = of_running()?;
+    if let Some(pid) = pid {
+        running.retain(|found| found.status.pid == pid);
+    }
+    if running.is_empty() {
+        return Err(Failure::new(Exit::Unavailable, "no holod of that process number is running"));
+    }
+    Ok(running)
+}
+
+/// The only one.
+///
+/// # Errors
+/// There are several.
+pub fn only(running: &[Found]) -> Result<&Snapshot, Failure> {
+    if let [one] = running {
+        return Ok(&one.status);
+    }
+    let pids: Vec<_> = running.iter().map(|found| found.status.pid.to_string()).collect();
+    let several = format!("{} holods are running, {}: name one with --pid", pids.len(), pids.join(" and "));
+    Err(Failure::new(Exit::Usage, several))
+}
+
 fn of_running_in(folders: &[PathBuf]) -> Result<Vec<Found>, Failure> {
     let mut running: Vec<Found> = Vec::new();
     let mut closed = None;

@@ -2,6 +2,7 @@
 
 mod bad_input;
 mod bench;
+mod control;
 mod evaluate;
 mod feed;
 mod gpu;

@@ -219,6 +219,7 @@ fn closed_loop(args: &BenchArgs, rig: Rig, weights: Weights, frames: scene::Fram
         pictures: Pictures::Scene(Arc::new(frames)),
         output: OutputSpec::Headless(ReportFaults::NONE),
         tracker: TrackerSpec::Mock(Scenario::Sweep),
+        pupil: None,
         record_tracker: None,
         frame_limit: None,
         duration: Some(args.duration),

@@ -66,6 +66,7 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
             pictures: Pictures::Scene(Arc::new(frames)),
             output: OutputSpec::Headless(ReportFaults::NONE),
             tracker: TrackerSpec::Mock(SCENARIO),
+            pupil: None,
             record_tracker: None,
             frame_limit: None,
             duration: Some(args.duration),

@@ -2,6 +2,7 @@
 
 mod bench;
 mod check;
+mod ctl;
 mod demo;
 mod evaluate;
 mod laser;
@@ -32,6 +33,7 @@ pub fn dispatch(cli: Cli) -> Result<(), Failure> {
         Some(Command::Evaluate(args)) => evaluate::evaluate(&args),
         Some(Command::Pattern(kind)) => pattern::pattern(&kind),
         Some(Command::Status(args)) => status::status(&args),
+        Some(Command::Ctl(args)) => ctl::ctl(&args),
         Some(Command::Tracker(command)) => tracker::tracker(&command),
         Some(Command::Log(command)) => log::log(&command),
         Some(Command::Laser(command)) => laser::laser(&command),

@@ -2,10 +2,12 @@
 
 use std::path::Path;
 
+use holod_calibration::TimeNs;
 use holod_pupil_input::{RecordFiles, TrackerSpec};
 use holod_slm_output::{FieldEvent, OutputSpec};
 
 use crate::cli::RunArgs;
+use crate::control::Request;
 use crate::failure::{Exit, Failure};
 use crate::pictures::levels_picture;
 use crate::progress;
@@ -47,6 +49,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         pictures,
         output,
         tracker,
+        pupil: args.pupil,
         record_tracker: args.record.as_deref().map(RecordFiles::in_folder),
         frame_limit: args.frames,
         duration: args.duration,
@@ -103,6 +106,10 @@ impl Observer for Recorder {
             Some(log) => log.field(&FieldRecord::of(event)),
             None => Ok(()),
         }
+    }
+
+    fn order(&mut self, t: TimeNs, request: &Request) -> Result<(), Failure> {
+        self.log.as_ref().map_or(Ok(()), |log| log.order(t, request))
     }
 
     fn tick(&mut self) -> Result<(), Failure> {

@@ -1,37 +1,24 @@
 //! `holod status`: what the running daemon says of itself.
 
 use crate::cli::StatusArgs;
-use crate::failure::{Exit, Failure};
+use crate::failure::Failure;
 use crate::report;
 use crate::snapshot::Snapshot;
 use crate::status::{self, Found};
 
 pub(super) fn status(args: &StatusArgs) -> Result<(), Failure> {
-    let mut running = status::of_running()?;
-    if let Some(pid) = args.pid {
-        running.retain(|found| found.status.pid == pid);
-    }
+    let running = status::of_running_as(args.pid)?;
     for Found { status, stale } in &running {
         if let Some(age) = stale {
             let (pid, age_s) = (status.pid, age.as_secs_f64());
             tracing::warn!("process {pid} wrote its status {age_s:.0} s ago: its loop does not turn");
         }
     }
-    match (&running[..], args.json) {
-        ([], _) => Err(Failure::new(Exit::Unavailable, "no holod of that process number is running")),
-        ([one], true) => report::print_json(&one.status),
-        (several, true) => {
-            let pids: Vec<_> = several.iter().map(|found| found.status.pid.to_string()).collect();
-            Err(Failure::new(
-                Exit::Usage,
-                format!("{} holods are running, {}: name one with --pid", pids.len(), pids.join(" and ")),
-            ))
-        }
-        (several, false) => {
-            let texts: Vec<_> = several.iter().map(|found| text_of(&found.status)).collect();
-            report::print(&texts.join("\n\n"))
-        }
+    if args.json {
+        return report::print_json(status::only(&running)?);
     }
+    let texts: Vec<_> = running.iter().map(|found| text_of(&found.status)).collect();
+    report::print(&texts.join("\n\n"))
 }
 
 fn text_of(status: &Snapshot) -> String {
@@ -63,7 +50,7 @@ fn text_of(status: &Snapshot) -> String {
          \x20        {}\n\
          panel    {}: {:.2} refreshes a second{}\n\
          lasers   {}{}\n\
-         engine   {}\n\
+         engine   {}; weights {}\n\
          frames   {:.1} a second of the panel's {:.1}{}; {} made, {} shown, {} late\n\
          time     per frame {}; tracker sample to photons {}{feed}",
         status.state,
@@ -79,9 +66,10 @@ fn text_of(status: &Snapshot) -> String {
         status.panel,
         figures.panel_refresh_hz,
         status.panel_trouble.as_ref().map_or(String::new(), |trouble| format!("; lost: {trouble}")),
-        status.lasers,
+        if status.lasers_kept_dark { "kept dark by `holod ctl lasers dark`" } else { &status.lasers },
         status.lasers_trouble.as_ref().map_or(String::new(), |trouble| format!("; {trouble}")),
         figures.engine,
+        figures.weights,
         status.frames_shown_hz,
         figures.panel_frames_hz,
         figures.speed_advice.as_ref().map_or(String::new(), |advice| format!(" ({advice})")),

@@ -12,6 +12,7 @@ use holod_slm_output::output::{OutputError, pacing_config};
 use holod_slm_output::present::{PanelSetup, open_panel};
 use holod_slm_output::{LevelsFrame, Output, OutputControl, OutputOptions, Pacer, PanelEncoder};
 
+use super::desk::{Changes, Desk};
 use super::frame_loop::{FrameLoop, TrainedPupils};
 use super::keep::KEEP_SLOTS;
 use super::laser_watch::LaserBoxWatch;
@@ -22,6 +23,7 @@ use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
 use super::watch::{Limits, Names, Rings, Told, Watch};
 use super::{Observer, RECORDS, SessionPlan, Signals, host_now, scheduling, tracker_failure};
+use crate::control::{Preparer, Steering};
 use crate::failure::{Exit, Failure};
 use crate::renderer::{self, Renderer};
 use crate::status::StatusFile;
@@ -85,7 +87,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
     tracing::debug!("tracker `{}` is open, link {}", plan.tracker, tracker.link().name());
 
     let scene = plan.pictures.name().to_owned();
-    let (pictures, feed) =
+    let (sink, pictures, feed) =
         source::open(&plan.pictures, &rig.geometry, t_origin).map_err(Failure::because(Exit::Unavailable))?;
     let options = OutputOptions {
         keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 },
@@ -100,6 +102,17 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
     let stop = Arc::new(AtomicBool::new(false));
     let records_lost = Arc::new(AtomicU64::new(0));
     let (record_producer, records) = rtrb::RingBuffer::new(RECORDS);
+    let (engines, engine_consumer) = rtrb::RingBuffer::new(1);
+    let (retired_producer, retired) = rtrb::RingBuffer::new(2);
+    let steering = Arc::new(Steering::new(plan.pupil));
+    let preparer = Preparer {
+        rig: rig.clone(),
+        resolution,
+        backend: plan.backend,
+        encoder: Arc::clone(&encoder),
+        has_feed: feed.is_some(),
+        stall_timeout: options.stall_timeout,
+    };
     let frame_loop = FrameLoop {
         pupil: estimates,
         renderer,
@@ -107,6 +120,9 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         pacer: Pacer::new(pacing, host_now()),
         pictures,
         trained: TrainedPupils::of(plan.weights.trained_pupils(&rig.geometry)),
+        steering: Arc::clone(&steering),
+        engines: engine_consumer,
+        retired: retired_producer,
         records: record_producer,
         records_lost: Arc::clone(&records_lost),
         keep_levels: plan.keep_levels,
@@ -123,6 +139,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         Limits { t_origin, frames: plan.frame_limit, duration: plan.duration, replay_ends_run: replay_ends_run(&plan) };
     let names = Names {
         scene,
+        weights: setup::weights_name(&rig.model.weights),
         tracker: plan.tracker.to_string(),
         panel: plan.output.to_string(),
         engine,
@@ -143,6 +160,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         tracker,
         tracker_watch: TrackerWatch::new(&rig.tracker, t_origin),
         feed,
+        desk: Desk::open(preparer, Changes { steering, sink, engines, retired }),
         signals,
         service: Service::connect(),
         status: StatusFile::create(),
@@ -150,6 +168,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         told: Told::new(advised),
         tally: Tally::default(),
         frame_rate: FrameRate::default(),
+        frames_shown_hz: 0.0,
         rig: plan.rig,
         observer,
     };

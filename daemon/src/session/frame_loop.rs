@@ -12,6 +12,7 @@ use holod_slm_output::{FramePlan, FramePort, Pacer};
 
 use super::host_now;
 use super::keep::keep_slot;
+use crate::control::Steering;
 use crate::record::FrameRecord;
 use crate::renderer::Renderer;
 use crate::source::PictureSource;
@@ -21,6 +22,9 @@ const LONGEST_SLEEP: Duration = Duration::from_millis(20);
 
 /// A pupil is not predicted farther ahead than this; slower frames use the prediction for this time.
 const FARTHEST_PREDICTION: TimeNs = TimeNs(200_000_000);
+
+/// What stands in place of the estimator's state where a person has fixed the pupil.
+pub(super) const FIXED_PUPIL: &str = "fixed";
 
 /// Everything that a frame needs, allocated before the first one.
 pub(super) struct FrameLoop {
@@ -36,6 +40,12 @@ pub(super) struct FrameLoop {
     pub pictures: PictureSource,
     /// The pupils that the network knows.
     pub trained: TrainedPupils,
+    /// What a person changes.
+    pub steering: Arc<Steering>,
+    /// Engines that take the place of the one that computes.
+    pub engines: rtrb::Consumer<(Box<dyn Renderer>, TrainedPupils)>,
+    /// Those whose place was taken: giving back what they have is nothing for this thread.
+    pub retired: rtrb::Producer<Box<dyn Renderer>>,
     /// To whoever records.
     pub records: rtrb::Producer<LoopRecord>,
     /// Records that found no room.
@@ -100,12 +110,25 @@ impl FrameLoop {
 
     /// One frame, top to bottom.
     fn frame(&mut self, plan: FramePlan) -> Result<(), EngineError> {
+        if let Ok((renderer, trained)) = self.engines.pop() {
+            let retired = std::mem::replace(&mut self.renderer, renderer);
+            self.trained = trained;
+            self.retired.push(retired).expect("there is room for as many as are sent");
+        }
         let t_wake = self.mark(Point::WakeUp, plan);
         let state = self.pupil.pupil_at(t_wake).state;
-        let estimate = self.pupil.pupil_at(plan.t_predicted_photon.min(t_wake + FARTHEST_PREDICTION));
+        let mut estimate = self.pupil.pupil_at(plan.t_predicted_photon.min(t_wake + FARTHEST_PREDICTION));
+        let fixed = self.steering.fixed_pupil();
+        if let Some(pupil) = fixed {
+            (estimate.pupil, estimate.t_sample, estimate.raw_mm) = (pupil, None, None);
+        }
 
         let t_render_begin = self.mark(Point::RenderBegin, plan);
-        let (frame, picture) = self.pictures.at(plan.t_predicted_photon);
+        let (frame, picture) = if self.steering.is_paused() {
+            self.pictures.same_again()
+        } else {
+            self.pictures.at(plan.t_predicted_photon)
+        };
         let rendered = self.renderer.render(frame, estimate.pupil, self.port.acquire())?;
         if rendered.engine_changed {
             // It happens when a device is lost, which took longer than any lock.
@@ -113,7 +136,8 @@ impl FrameLoop {
         }
         let t_render_end = self.mark(Point::RenderEnd, plan);
 
-        let keep = if self.keep_levels && state != PupilState::Fallback { keep_slot(estimate.pupil) } else { None };
+        let is_meant = fixed.is_some() || state != PupilState::Fallback;
+        let keep = if self.keep_levels && is_meant { keep_slot(estimate.pupil) } else { None };
         let t_submit = host_now();
         let record = LoopRecord {
             frame: FrameRecord {
@@ -121,7 +145,7 @@ impl FrameLoop {
                 t_sample: estimate.t_sample,
                 pupil_raw_mm: estimate.raw_mm,
                 pupil: estimate.pupil,
-                pupil_state: state.name(),
+                pupil_state: if fixed.is_some() { FIXED_PUPIL } else { state.name() },
                 t_wake,
                 t_render_begin,
                 t_render_end,

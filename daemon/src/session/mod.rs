@@ -1,13 +1,14 @@
 //! One run of the whole loop: starts the threads, watches them, takes them down in the right order.
 
 mod build;
+mod desk;
 mod frame_loop;
 mod keep;
 mod laser_watch;
 mod ledger;
 mod output_watch;
 mod rate_watch;
-mod scheduling;
+pub(crate) mod scheduling;
 mod service;
 mod stats;
 mod summary;
@@ -19,11 +20,13 @@ mod watch;
 use std::time::Duration;
 
 use holod_calibration::rig::Rig;
+use holod_calibration::{PupilDiameter, TimeNs};
 use holod_model::Weights;
 use holod_pupil_input::{Decision, RecordFiles, ReplayError, SourceError, TrackerError, TrackerSpec};
 use holod_slm_output::{FieldEvent, OutputSpec};
 
 use crate::cli::Backend;
+use crate::control::Request;
 use crate::failure::{Exit, Failure};
 use crate::record::FrameRecord;
 use crate::source::Pictures;
@@ -51,6 +54,8 @@ pub struct SessionPlan {
     pub pictures: Pictures,
     /// Where to show it.
     pub output: OutputSpec,
+    /// The pupil that holograms are made for, where it is not the tracker's.
+    pub pupil: Option<PupilDiameter>,
     /// Where samples come from.
     pub tracker: TrackerSpec,
     /// Where the tracker's bytes and samples are written down.
@@ -75,6 +80,10 @@ pub trait Observer {
     }
     /// The gate decided on a sample.
     fn decision(&mut self, _decision: &Decision) -> Result<(), Failure> {
+        Ok(())
+    }
+    /// A person has changed something, at host time `t`.
+    fn order(&mut self, _t: TimeNs, _request: &Request) -> Result<(), Failure> {
         Ok(())
     }
     /// About ten times a second.

@@ -20,7 +20,7 @@ pub(super) fn prompt<T: Send>(make: impl FnOnce() -> T + Send) -> T {
 }
 
 /// Creates a part whose threads give way to ordinary ones.
-pub(super) fn patient<T: Send>(make: impl FnOnce() -> T + Send) -> T {
+pub(crate) fn patient<T: Send>(make: impl FnOnce() -> T + Send) -> T {
     let give_way = || {
         if let Err(error) = setpriority_process(None, WORKER_NICENESS) {
             tracing::debug!("the network's threads stay at ordinary priority: {error}");

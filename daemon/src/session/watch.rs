@@ -12,7 +12,8 @@ use holod_slm_output::laser::{BoxEvent, DarkReason};
 use holod_slm_output::output::OutputCounts;
 use holod_slm_output::{FieldEvent, OutputControl};
 
-use super::frame_loop::LoopRecord;
+use super::desk::Desk;
+use super::frame_loop::{FIXED_PUPIL, LoopRecord};
 use super::laser_watch::LaserBoxWatch;
 use super::output_watch::OutputWatch;
 use super::rate_watch::RateWatch;
@@ -43,6 +44,7 @@ pub(super) struct Watch<'a> {
     pub(super) tracker: TrackerControl,
     pub(super) tracker_watch: TrackerWatch,
     pub(super) feed: Option<Feed>,
+    pub(super) desk: Desk,
     pub(super) signals: Signals,
     pub(super) service: Service,
     pub(super) status: StatusFile,
@@ -50,12 +52,15 @@ pub(super) struct Watch<'a> {
     pub(super) told: Told,
     pub(super) tally: Tally,
     pub(super) frame_rate: FrameRate,
+    /// In the last second.
+    pub(super) frames_shown_hz: f64,
     pub(super) observer: &'a mut dyn Observer,
 }
 
 /// What the parts of a run are called.
 pub(super) struct Names {
     pub(super) scene: String,
+    pub(super) weights: String,
     pub(super) tracker: String,
     pub(super) panel: String,
     /// How holograms are computed; another engine may take the place of the first.
@@ -129,12 +134,16 @@ impl Watch<'_> {
             std::thread::sleep(TICK);
             let now = host_now();
             self.drain()?;
+            if self.obey(output, now)? {
+                return Ok("holod ctl stop".to_owned());
+            }
             self.service.progress(self.tally.frames_shown, now);
             ticks = ticks.wrapping_add(1);
             if ticks.is_multiple_of(TICKS_PER_REPORT) {
                 self.report(&output.counts(), now)?;
             }
             if ticks.is_multiple_of(TICKS_PER_STATUS) {
+                self.frames_shown_hz = self.frame_rate.at(self.tally.frames_shown, now);
                 self.write_status(&output.counts(), now);
             }
             if let Some(signal) = self.signals.caught() {
@@ -219,7 +228,8 @@ impl Watch<'_> {
     fn tell_state(&mut self, output: &OutputCounts) {
         let lit = output.armed && self.tally.frames_shown > 0;
         let link = self.tracker.link();
-        let follows = link == Link::Up && self.tally.newest_state != PupilState::Fallback.name();
+        let is_fixed = self.tally.newest_state == FIXED_PUPIL;
+        let follows = is_fixed || link == Link::Up && self.tally.newest_state != PupilState::Fallback.name();
         let state = match (lit, follows) {
             (false, _) => State::Dark,
             (true, false) => State::Degraded,
@@ -229,6 +239,7 @@ impl Watch<'_> {
         // A blink is no news; what the pupil falls back to is.
         let pupil = match self.tally.newest_state {
             "" => "not known yet",
+            FIXED_PUPIL => FIXED_PUPIL,
             fallback if fallback == PupilState::Fallback.name() => fallback,
             _ => "followed",
         };
@@ -251,7 +262,7 @@ impl Watch<'_> {
         }
     }
 
-    fn write_status(&mut self, output: &OutputCounts, now: TimeNs) {
+    pub(super) fn write_status(&mut self, output: &OutputCounts, now: TimeNs) {
         let snapshot = self.snapshot(output, now);
         self.status.write(&snapshot);
         let figures = &snapshot.figures;
@@ -270,12 +281,15 @@ impl Watch<'_> {
     }
 
     /// What can be said of the run now.
-    fn snapshot(&mut self, output: &OutputCounts, now: TimeNs) -> Snapshot {
+    pub(super) fn snapshot(&self, output: &OutputCounts, now: TimeNs) -> Snapshot {
         Snapshot {
             pid: std::process::id(),
             state: self.told.state.name().to_owned(),
             uptime_s: (now - self.t_origin).seconds(),
-            frames_shown_hz: self.frame_rate.at(self.tally.frames_shown, now),
+            control: self.desk.socket(),
+            paused: self.desk.is_paused(),
+            lasers_kept_dark: self.desk.keeps_dark(),
+            frames_shown_hz: self.frames_shown_hz,
             pupil_state: self.tally.newest_state.to_owned(),
             pupil_mm: self.tally.newest_pupil().map(|pupil| pupil.mm()),
             panel: self.names.panel.clone(),
@@ -293,6 +307,7 @@ impl Watch<'_> {
         Figures {
             rig: self.rig.name.clone(),
             scene: names.scene.clone(),
+            weights: names.weights.clone(),
             tracker: names.tracker.clone(),
             engine: names.engine.lock().unwrap_or_else(PoisonError::into_inner).clone(),
             hologram: names.hologram.to_string(),

@@ -1,12 +1,12 @@
 //! Pictures for the frame thread: a scene from files, or what a live feed has handed over last.
 //!
-//! The newest picture wins. Whoever has one puts it in with [`PictureSink::show`]; the frame thread takes it out with
-//! [`PictureSource::at`], wait-free, and never gives memory back: that is left to the sink.
+//! The newest picture wins. Whoever has one puts it into the [`PictureSink`]; the frame thread takes it out of the
+//! [`PictureSource`], wait-free, and never gives memory back: that is left to the sink.
 
 pub mod feed;
 pub mod scene;
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
 use holod_model::RgbdFrame;
@@ -75,10 +75,10 @@ pub fn named(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Pictures, F
         Some(path) => path.into(),
         None => feed::default_socket().map_err(Failure::because(Exit::Unavailable))?,
     };
-    Ok(Pictures::Feed(FeedPlan { socket, resolution, fit: scene::fit(args.fit) }))
+    Ok(Pictures::Feed(FeedPlan { socket, resolution, fit: args.fit.into() }))
 }
 
-/// The frame thread's end of `pictures`, which begin at host time `t_start`, and the feed where there is one.
+/// Both ends of `pictures`, which begin at host time `t_start`, and the feed where there is one.
 ///
 /// # Errors
 /// The feed cannot listen.
@@ -86,37 +86,23 @@ pub fn open(
     pictures: &Pictures,
     geometry: &DisplayGeometry,
     t_start: TimeNs,
-) -> Result<(PictureSource, Option<Feed>), FeedError> {
-    match pictures {
-        Pictures::Scene(frames) => {
-            let (_, source) = newest_picture(Shown::Scene { frames: Arc::clone(frames), t_start });
-            Ok((source, None))
-        }
-        Pictures::Feed(plan) => {
-            let black = Shown::Live { frame: pictures.first_frame(), tag: PictureTag::default() };
-            let (sink, source) = newest_picture(black);
-            Ok((source, Some(Feed::listen(plan.clone(), geometry, sink)?)))
-        }
-    }
+) -> Result<(Arc<Mutex<PictureSink>>, PictureSource, Option<Feed>), FeedError> {
+    let (sink, source) = newest_picture(pictures, t_start);
+    let sink = Arc::new(Mutex::new(sink));
+    let feed = match pictures {
+        Pictures::Scene(_) => None,
+        Pictures::Feed(plan) => Some(Feed::listen(plan.clone(), geometry, Arc::clone(&sink))?),
+    };
+    Ok((sink, source, feed))
 }
 
 /// Something to show until there is something newer.
 #[derive(Clone)]
-pub enum Shown {
+enum Shown {
     /// A scene, from the time at which it begins.
-    Scene {
-        /// Its frames.
-        frames: Arc<Frames>,
-        /// When the first one is shown.
-        t_start: TimeNs,
-    },
+    Scene { frames: Arc<Frames>, t_start: TimeNs },
     /// One picture of a live feed.
-    Live {
-        /// It.
-        frame: Arc<RgbdFrame>,
-        /// Which it is.
-        tag: PictureTag,
-    },
+    Live { frame: Arc<RgbdFrame>, tag: PictureTag },
 }
 
 /// Which picture a hologram was made of.
@@ -128,21 +114,16 @@ pub struct PictureTag {
     pub t_taken: Option<TimeNs>,
 }
 
-impl Shown {
-    fn frame(&self) -> &Arc<RgbdFrame> {
-        match self {
-            Self::Scene { frames, .. } => &frames.frames[0],
-            Self::Live { frame, .. } => frame,
-        }
-    }
-}
-
 /// The two ends, with what is to be shown first.
-pub fn newest_picture(first: Shown) -> (PictureSink, PictureSource) {
+pub fn newest_picture(pictures: &Pictures, t_start: TimeNs) -> (PictureSink, PictureSource) {
+    let (first, scenes) = match pictures {
+        Pictures::Scene(frames) => (Shown::Scene { frames: Arc::clone(frames), t_start }, vec![Arc::clone(frames)]),
+        Pictures::Feed(_) => (Shown::Live { frame: pictures.first_frame(), tag: PictureTag::default() }, Vec::new()),
+    };
     let (input, output) = triple_buffer::triple_buffer(&first);
-    let mut sink = PictureSink { input, size: first.frame().resolution, scenes: Vec::new() };
-    sink.remember(first);
-    (sink, PictureSource { output })
+    let is_live = matches!(pictures, Pictures::Feed(_));
+    let sink = PictureSink { input, size: pictures.resolution(), scenes, is_live };
+    (sink, PictureSource { output, t: t_start })
 }
 
 /// Where pictures are put in; for ordinary threads.
@@ -151,41 +132,67 @@ pub struct PictureSink {
     size: Resolution,
     /// Scenes of which the other side may still hold a frame: the last of it is dropped here.
     scenes: Vec<Arc<Frames>>,
+    is_live: bool,
 }
 
 impl PictureSink {
-    /// Shows `newer` from the next frame on. Whoever shows a live picture keeps its frame alive.
+    /// Shows a scene from the next frame on, which begins at host time `t_start`, and no live picture any more.
     ///
     /// # Panics
     /// Where it is of another size than what was shown before: a renderer is made for one.
-    pub fn show(&mut self, newer: Shown) {
-        assert_eq!(newer.frame().resolution, self.size, "every picture has the hologram's size");
-        self.input.write(newer.clone());
-        self.remember(newer);
-    }
-
-    fn remember(&mut self, newer: Shown) {
+    pub fn show_scene(&mut self, frames: Arc<Frames>, t_start: TimeNs) {
+        assert_eq!(frames.resolution(), self.size, "every picture has the hologram's size");
+        self.is_live = false;
+        self.input.write(Shown::Scene { frames: Arc::clone(&frames), t_start });
         let is_in_use = |scene: &Arc<Frames>| {
             Arc::strong_count(scene) > 1 || scene.frames.iter().any(|frame| Arc::strong_count(frame) > 1)
         };
         self.scenes.retain(is_in_use);
-        if let Shown::Scene { frames, .. } = newer {
-            self.scenes.push(frames);
+        self.scenes.push(frames);
+    }
+
+    /// Shows a live picture from the next frame on, where those are shown. Whoever has it keeps its frame alive.
+    ///
+    /// # Panics
+    /// As [`Self::show_scene`].
+    pub fn show_live(&mut self, frame: Arc<RgbdFrame>, tag: PictureTag) {
+        assert_eq!(frame.resolution, self.size, "every picture has the hologram's size");
+        if self.is_live {
+            self.input.write(Shown::Live { frame, tag });
         }
+    }
+
+    /// Whether live pictures are shown, and no scene.
+    pub fn is_live(&self) -> bool {
+        self.is_live
+    }
+
+    /// Shows live pictures again, from the next one on.
+    pub fn go_live(&mut self) {
+        self.is_live = true;
     }
 }
 
 /// Where the frame thread takes pictures out.
 pub struct PictureSource {
     output: triple_buffer::Output<Shown>,
+    /// The time for which a picture was taken out last.
+    t: TimeNs,
 }
 
 impl PictureSource {
     /// The picture to be shown at host time `t`, and which it is: wait-free, no allocation.
     pub fn at(&mut self, t: TimeNs) -> (&Arc<RgbdFrame>, PictureTag) {
-        match self.output.read() {
+        self.output.update();
+        self.t = t;
+        self.same_again()
+    }
+
+    /// The picture that was taken out last.
+    pub fn same_again(&self) -> (&Arc<RgbdFrame>, PictureTag) {
+        match self.output.output_buffer() {
             Shown::Scene { frames, t_start } => {
-                let index = frames.index_at((t - *t_start).seconds());
+                let index = frames.index_at((self.t - *t_start).seconds());
                 (&frames.frames[index], PictureTag { number: index as u64, t_taken: None })
             }
             Shown::Live { frame, tag } => (frame, *tag),
@@ -195,57 +202,78 @@ impl PictureSource {
 
 #[cfg(test)]
 mod tests {
+    use holod_model::scene::Fit;
+
     use super::*;
 
     const SIZE: Resolution = Resolution { width: 4, height: 2 };
 
-    fn live(number: u64) -> Shown {
-        let tag = PictureTag { number, t_taken: Some(TimeNs(number as i64)) };
-        Shown::Live { frame: Arc::new(RgbdFrame::black(SIZE)), tag }
+    fn feed() -> Pictures {
+        Pictures::Feed(FeedPlan { socket: "feed".into(), resolution: SIZE, fit: Fit::Native })
     }
 
-    fn sequence(count: usize) -> Shown {
+    fn show(sink: &mut PictureSink, number: u64) {
+        let tag = PictureTag { number, t_taken: Some(TimeNs(number as i64)) };
+        sink.show_live(Arc::new(RgbdFrame::black(SIZE)), tag);
+    }
+
+    fn sequence(count: usize) -> Arc<Frames> {
         let frames = (0..count).map(|_| Arc::new(RgbdFrame::black(SIZE))).collect();
-        let frames = Frames { frames, fps: Some(10.0), reports: Vec::new(), name: String::new() };
-        Shown::Scene { frames: Arc::new(frames), t_start: TimeNs(1_000_000_000) }
+        Arc::new(Frames { frames, fps: Some(10.0), reports: Vec::new(), name: String::new() })
     }
 
     #[test]
     fn the_newest_wins_and_stays() {
-        let (mut sink, mut source) = newest_picture(live(1));
-        assert_eq!(source.at(TimeNs(0)).1.number, 1);
-        sink.show(live(2));
-        sink.show(live(3));
+        let (mut sink, mut source) = newest_picture(&feed(), TimeNs(0));
+        assert_eq!(source.at(TimeNs(0)).1, PictureTag::default());
+        show(&mut sink, 2);
+        show(&mut sink, 3);
+        assert_eq!(source.same_again().1.number, 0, "a loop that is paused sees nothing new");
         assert_eq!([source.at(TimeNs(0)).1.number, source.at(TimeNs(9)).1.number], [3, 3]);
     }
 
     #[test]
-    fn a_scene_begins_when_it_is_shown_and_goes_round() {
-        let (_sink, mut source) = newest_picture(sequence(3));
+    fn a_scene_begins_when_it_is_shown_goes_round_and_stands_still() {
+        let (_sink, mut source) = newest_picture(&Pictures::Scene(sequence(3)), TimeNs(1_000_000_000));
         let numbers = [900, 1_000, 1_150, 1_299, 1_300].map(|ms| source.at(TimeNs(ms * 1_000_000)).1.number);
         assert_eq!(numbers, [0, 0, 1, 2, 0]);
+        source.at(TimeNs(1_150_000_000));
+        assert_eq!(source.same_again().1.number, 1);
+    }
+
+    #[test]
+    fn a_scene_takes_the_place_of_live_pictures_until_they_are_wanted_again() {
+        let (mut sink, mut source) = newest_picture(&feed(), TimeNs(0));
+        show(&mut sink, 7);
+        sink.show_scene(sequence(2), TimeNs(0));
+        show(&mut sink, 8);
+        assert_eq!(source.at(TimeNs(0)).1, PictureTag { number: 0, t_taken: None });
+        sink.go_live();
+        assert_eq!(source.at(TimeNs(0)).1.t_taken, None, "until there is a picture");
+        show(&mut sink, 9);
+        assert_eq!(source.at(TimeNs(0)).1.number, 9);
     }
 
     #[test]
     fn a_scene_is_given_back_by_the_sink_and_never_by_the_frame_thread() {
-        let (mut sink, mut source) = newest_picture(sequence(1));
+        let (mut sink, mut source) = newest_picture(&Pictures::Scene(sequence(1)), TimeNs(0));
         let held = Arc::clone(source.at(TimeNs(0)).0);
         for _ in 0..100 {
-            sink.show(sequence(1));
+            sink.show_scene(sequence(1), TimeNs(0));
             source.at(TimeNs(0));
             assert!(Arc::strong_count(&held) > 1, "the renderer's is never the last");
         }
         assert!(sink.scenes.len() <= 5, "{}", sink.scenes.len());
         drop(held);
-        sink.show(sequence(1));
+        sink.show_scene(sequence(1), TimeNs(0));
         assert!(sink.scenes.len() <= 4, "{}", sink.scenes.len());
     }
 
     #[test]
     #[should_panic(expected = "the hologram's size")]
     fn a_picture_of_another_size_is_no_picture() {
-        let (mut sink, _source) = newest_picture(live(0));
+        let (mut sink, _source) = newest_picture(&feed(), TimeNs(0));
         let size = Resolution { width: 2, height: 2 };
-        sink.show(Shown::Live { frame: Arc::new(RgbdFrame::black(size)), tag: PictureTag::default() });
+        sink.show_live(Arc::new(RgbdFrame::black(size)), PictureTag::default());
     }
 }

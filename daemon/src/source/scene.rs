@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use holod_calibration::{DisplayGeometry, Resolution};
-use holod_model::scene::{DepthEncoding, Fit, FrameReport, Scene, SceneError};
+use holod_model::scene::{DepthEncoding, FrameReport, Scene, SceneError};
 use holod_model::{RgbdFrame, scene_renderer};
 
-use crate::cli::{FitArg, SceneArgs};
+use crate::cli::SceneArgs;
 use crate::failure::{Exit, Failure};
 
 /// Size of a hologram of the built-in scene on a processor.
@@ -58,7 +58,7 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
     let scene = Scene::open(spec, encoding).map_err(scene_failure)?;
     let mut loaded = Frames { frames: Vec::new(), fps: scene.fps(), reports: Vec::new(), name: spec.clone() };
     for index in 0..scene.frames() {
-        let (frame, report) = scene.load(index, geometry, args.resolution, fit(args.fit)).map_err(scene_failure)?;
+        let (frame, report) = scene.load(index, geometry, args.resolution, args.fit.into()).map_err(scene_failure)?;
         check_fits(frame.resolution, geometry, spec)?;
         if let Some(first) = loaded.frames.first()
             && first.resolution != frame.resolution
@@ -165,15 +165,6 @@ pub(super) fn check_fits(resolution: Resolution, geometry: &DisplayGeometry, nam
              --resolution {panel} --fit contain (or cover, or crop)"
         ),
     ))
-}
-
-pub(super) fn fit(arg: FitArg) -> Fit {
-    match arg {
-        FitArg::Native => Fit::Native,
-        FitArg::Contain => Fit::Contain,
-        FitArg::Cover => Fit::Cover,
-        FitArg::Crop => Fit::Crop,
-    }
 }
 
 fn scene_failure(error: SceneError) -> Failure {

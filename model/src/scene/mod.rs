@@ -26,6 +26,7 @@ mod openexr;
 mod raster;
 
 use holod_calibration::{DisplayGeometry, Resolution};
+use serde::{Deserialize, Serialize};
 
 use self::description::Description;
 use self::fit::Placement;
@@ -96,7 +97,8 @@ pub enum DepthEncoding {
 }
 
 /// How a picture of another size is brought to the wanted one.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Fit {
     /// Unscaled and centred; a smaller picture is padded, a larger one is an error.
     #[default]

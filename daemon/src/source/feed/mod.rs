@@ -9,9 +9,9 @@ mod message;
 mod slots;
 
 use std::fs;
+use std::io;
 use std::os::fd::OwnedFd;
-use std::os::unix::fs::FileTypeExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
@@ -20,17 +20,15 @@ use holod_model::RgbdFrame;
 use holod_model::scene::Fit;
 use holod_pupil_input::host_now;
 use rustix::event::{EventfdFlags, PollFd, PollFlags, eventfd, poll};
-use rustix::fs::{Mode, fchmod};
 use rustix::io::Errno;
-use rustix::net::{
-    AddressFamily, SocketAddrUnix, SocketFlags, SocketType, accept_with, bind, connect, listen, socket_with,
-};
+use rustix::net::{SocketFlags, SocketType, accept_with};
 use serde::{Deserialize, Serialize};
 
 use self::client::{Client, Gone, Target};
 use self::message::Outcome;
 use self::slots::Picture;
-use super::{PictureSink, PictureTag, Shown, scene};
+use super::{PictureSink, PictureTag, scene};
+use crate::local_socket::{self, SocketError};
 
 /// Clients that may be connected at once.
 const CLIENTS: usize = 8;
@@ -69,7 +67,7 @@ pub struct FeedStatus {
     pub overtaken: u64,
     /// Pictures that could not be shown.
     pub refused: u64,
-    /// Pictures of clients that were not shown.
+    /// Pictures of clients that were not shown, as another client or a scene was.
     pub not_shown: u64,
     /// Pictures that clients left out, by their numbers.
     pub left_out: u64,
@@ -89,22 +87,12 @@ pub enum FeedError {
     /// There is no place for the socket.
     #[error("no folder for the feed's socket: name one with --scene feed:PATH")]
     NoFolder,
-    /// The name is taken.
-    #[error("{}: {found}; name another socket with --scene feed:PATH", .socket.display())]
-    Taken {
-        /// The socket.
-        socket: PathBuf,
-        /// By what.
-        found: &'static str,
-    },
     /// The socket cannot be made.
-    #[error("{}: cannot listen there: {error}", .socket.display())]
-    Listen {
-        /// The socket.
-        socket: PathBuf,
-        /// Why.
-        error: std::io::Error,
-    },
+    #[error("{0}; name another socket with --scene feed:PATH")]
+    Socket(#[from] SocketError),
+    /// Its thread cannot be started.
+    #[error("the feed's thread cannot be started: {0}")]
+    Thread(io::Error),
 }
 
 /// The socket that is meant by `feed` alone.
@@ -128,15 +116,19 @@ impl Feed {
     ///
     /// # Errors
     /// The socket cannot be made.
-    pub fn listen(plan: FeedPlan, geometry: &DisplayGeometry, sink: PictureSink) -> Result<Self, FeedError> {
+    pub fn listen(
+        plan: FeedPlan,
+        geometry: &DisplayGeometry,
+        sink: Arc<Mutex<PictureSink>>,
+    ) -> Result<Self, FeedError> {
         let FeedPlan { socket, resolution, fit } = plan;
-        let cannot = |error: std::io::Error| FeedError::Listen { socket: socket.clone(), error };
-        let listener = listen_on(&socket)?;
-        let stop = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(|error| cannot(error.into()))?;
+        let listener = local_socket::listen(&socket, SocketType::SEQPACKET)?;
+        let stop = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)
+            .map_err(|error| FeedError::Thread(error.into()))?;
         let status = Arc::new(Mutex::new(FeedStatus { socket: socket.clone(), ..FeedStatus::default() }));
         let mut server = Server {
             listener,
-            stop: stop.try_clone().map_err(cannot)?,
+            stop: stop.try_clone().map_err(FeedError::Thread)?,
             target: Target { geometry: *geometry, resolution, fit },
             clients: Vec::new(),
             connections: 0,
@@ -146,8 +138,10 @@ impl Feed {
             status: FeedStatus { socket: socket.clone(), ..FeedStatus::default() },
             left_out_of_gone: 0,
         };
-        let thread =
-            std::thread::Builder::new().name("holod-feed".into()).spawn(move || server.serve()).map_err(cannot)?;
+        let thread = std::thread::Builder::new()
+            .name("holod-feed".into())
+            .spawn(move || server.serve())
+            .map_err(FeedError::Thread)?;
         tracing::info!("waiting for pictures on {}", socket.display());
         Ok(Self { socket, stop, thread: Some(thread), status })
     }
@@ -170,34 +164,6 @@ impl Drop for Feed {
     }
 }
 
-/// A socket at `path` that this user and its group may connect to; one that a dead process left there is replaced.
-fn listen_on(path: &Path) -> Result<OwnedFd, FeedError> {
-    let cannot = |error: Errno| FeedError::Listen { socket: path.to_owned(), error: error.into() };
-    let new_socket = || {
-        let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-        socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags, None).map_err(cannot)
-    };
-    let address = SocketAddrUnix::new(path).map_err(cannot)?;
-    if let Ok(found) = fs::symlink_metadata(path) {
-        let taken = |found| FeedError::Taken { socket: path.to_owned(), found };
-        if !found.file_type().is_socket() {
-            return Err(taken("a file that is no socket is there"));
-        }
-        match connect(new_socket()?, &address) {
-            Err(Errno::CONNREFUSED) => {
-                fs::remove_file(path).map_err(|error| FeedError::Listen { socket: path.to_owned(), error })?;
-            }
-            Err(Errno::PROTOTYPE) => return Err(taken("another program's socket is there")),
-            _ => return Err(taken("another holod listens there")),
-        }
-    }
-    let listener = new_socket()?;
-    fchmod(&listener, Mode::RUSR | Mode::WUSR | Mode::RGRP | Mode::WGRP).map_err(cannot)?;
-    bind(&listener, &address).map_err(cannot)?;
-    listen(&listener, CLIENTS as i32).map_err(cannot)?;
-    Ok(listener)
-}
-
 /// The feed's thread.
 struct Server {
     listener: OwnedFd,
@@ -207,7 +173,7 @@ struct Server {
     clients: Vec<(u64, Client)>,
     connections: u64,
     frames: Vec<Arc<RgbdFrame>>,
-    sink: PictureSink,
+    sink: Arc<Mutex<PictureSink>>,
     shared: Arc<Mutex<FeedStatus>>,
     status: FeedStatus,
     left_out_of_gone: u64,
@@ -226,7 +192,11 @@ impl Server {
                     client.receive(target, now, |outcome| note(status, outcome))
                 });
             }
-            self.choose(&mut shown, now);
+            if self.sink.lock().unwrap_or_else(PoisonError::into_inner).is_live() {
+                self.choose(&mut shown, now);
+            } else {
+                shown = None;
+            }
             let waiting: Vec<u64> =
                 self.clients.iter().filter(|(_, client)| client.has_picture()).map(|(number, _)| *number).collect();
             for number in waiting {
@@ -339,7 +309,7 @@ impl Server {
             client.free(&picture, &outcome)
         });
         if let Some(tag) = tag {
-            self.sink.show(Shown::Live { frame: Arc::clone(&frame), tag });
+            self.sink.lock().unwrap_or_else(PoisonError::into_inner).show_live(Arc::clone(&frame), tag);
             self.status.t_newest = Some(now);
         }
         self.frames.push(frame);

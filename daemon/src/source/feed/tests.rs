@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use holod_model::scene::LiveColour;
 use holod_tests::feed::{Answer, FeedClient, hello};
 
-use super::super::{PictureSource, newest_picture};
+use super::super::{PictureSource, Pictures, open};
 use super::*;
 
 const SIZE: Resolution = Resolution { width: 16, height: 8 };
@@ -21,6 +21,7 @@ struct Bench {
     _folder: tempfile::TempDir,
     socket: PathBuf,
     feed: Feed,
+    sink: Arc<Mutex<PictureSink>>,
     pictures: PictureSource,
 }
 
@@ -28,11 +29,9 @@ impl Bench {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let socket = folder.path().join("feed");
-        let black = Shown::Live { frame: Arc::new(RgbdFrame::black(SIZE)), tag: PictureTag::default() };
-        let (sink, pictures) = newest_picture(black);
         let plan = FeedPlan { socket: socket.clone(), resolution: SIZE, fit: Fit::Native };
-        let feed = Feed::listen(plan, &BENCH, sink).unwrap();
-        Self { _folder: folder, socket, feed, pictures }
+        let (sink, pictures, feed) = open(&Pictures::Feed(plan), &BENCH, TimeNs(0)).unwrap();
+        Self { _folder: folder, socket, feed: feed.unwrap(), sink, pictures }
     }
 
     /// A client that has been told where to write.
@@ -264,6 +263,21 @@ fn another_client_is_shown_once_the_first_is_gone_or_silent() {
 }
 
 #[test]
+fn while_a_scene_is_shown_no_client_is() {
+    let mut bench = Bench::new();
+    let mut client = bench.client("camera");
+    assert_eq!(send(&mut client, 0, 1, 255).0, TAKEN);
+    let frames = vec![Arc::new(RgbdFrame::black(SIZE))];
+    let scene = scene::Frames { frames, fps: None, reports: Vec::new(), name: "scene".into() };
+    bench.sink.lock().unwrap().show_scene(Arc::new(scene), TimeNs(0));
+    assert_eq!(send(&mut client, 0, 2, 255).0, NOT_SHOWN);
+    assert_eq!((bench.shown().0.amplitude[0], bench.status().not_shown), (0.0, 1));
+    bench.sink.lock().unwrap().go_live();
+    assert_eq!(send(&mut client, 0, 3, 255).0, TAKEN);
+    assert_eq!(bench.shown().1.number, 3);
+}
+
+#[test]
 fn shared_memory_cannot_be_made_shorter_under_holod() {
     let bench = Bench::new();
     let client = bench.client("hostile");
@@ -286,25 +300,6 @@ fn a_client_that_never_reads_is_shown_out_and_nobody_waits_for_it() {
     let mut other = bench.client("other");
     assert_eq!(send(&mut other, 0, 1, 255).0, TAKEN);
     assert_eq!(bench.shown().0.amplitude[0], 1.0);
-}
-
-#[test]
-fn a_socket_of_the_dead_is_replaced_and_one_of_the_living_is_not() {
-    let folder = tempfile::tempdir().unwrap();
-    let socket = folder.path().join("feed");
-    let dead = listen_on(&socket).unwrap();
-    let mode = std::os::unix::fs::PermissionsExt::mode(&fs::metadata(&socket).unwrap().permissions());
-    assert_eq!(mode & 0o007, 0, "others may not connect");
-    assert!(matches!(listen_on(&socket), Err(FeedError::Taken { found: "another holod listens there", .. })));
-    drop(dead);
-    let living = listen_on(&socket).unwrap();
-    drop(living);
-    fs::remove_file(&socket).unwrap();
-    fs::write(&socket, "precious").unwrap();
-    assert!(matches!(listen_on(&socket), Err(FeedError::Taken { .. })));
-    assert_eq!(fs::read_to_string(&socket).unwrap(), "precious");
-    let long = folder.path().join("x".repeat(200));
-    assert!(listen_on(&long).unwrap_err().to_string().contains("cannot listen there"));
 }
 
 #[test]

@@ -1,0 +1,123 @@
+//! What a person or a program may ask of a running holod: one line of JSON for each request, one for each answer, over a
+//! Unix socket. The page is `daemon/doc/control.md`.
+//!
+//! Everything here is on the control side. A request is made ready by ordinary threads, which may take their time; what
+//! then changes in the loop is handed over by the control thread, wait-free.
+
+mod client;
+mod prepare;
+mod server;
+mod steering;
+
+use holod_calibration::PupilDiameter;
+use holod_model::scene::Fit;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+pub use self::client::ask;
+pub(crate) use self::prepare::{NewEngine, Preparer};
+pub(crate) use self::server::ControlServer;
+pub(crate) use self::steering::Steering;
+
+use crate::source::scene::Frames;
+
+/// A request.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum Request {
+    /// Say how the run is: the same as `holod status --json`, at this moment.
+    Status,
+    /// Show a scene from files, or the live feed again.
+    Scene {
+        /// As after `--scene`, with absolute paths; `feed` for the live feed.
+        scene: String,
+        /// As after `--depth-encoding`.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        depth_encoding: Option<String>,
+        /// As after `--fit`.
+        #[serde(default)]
+        fit: Fit,
+    },
+    /// Compute with other weights.
+    Weights {
+        /// As after `--weights`, a file with its absolute path.
+        weights: String,
+    },
+    /// Show the picture that is shown until further notice; the pupil is followed.
+    Pause,
+    /// Take that back.
+    Resume,
+    /// Compute for one pupil, whatever the tracker says.
+    Pupil {
+        /// Its diameter; nothing follows the tracker again.
+        #[serde(default)]
+        mm: Option<f32>,
+    },
+    /// Keep the lasers dark.
+    LasersDark,
+    /// Take that back: lasers are lit again by the rules.
+    LasersArm,
+    /// End the run in order.
+    Stop,
+}
+
+impl Request {
+    /// Whether the run is another one after it.
+    pub(crate) fn changes_something(&self) -> bool {
+        *self != Self::Status
+    }
+}
+
+/// An answer.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Answer {
+    /// It is done; with what was asked for.
+    Ok(Value),
+    /// It is not, and nothing has changed: what was found, what was expected, what to do.
+    Error(String),
+}
+
+/// A request that is ready to be obeyed by the control thread.
+pub(crate) enum Order {
+    Status,
+    Scene(std::sync::Arc<Frames>),
+    Feed,
+    Engine(NewEngine),
+    Pause(bool),
+    Pupil(Option<PupilDiameter>),
+    KeepDark(bool),
+    Stop,
+}
+
+/// An order, the request that it was made of, and where the answer goes.
+pub(crate) struct Ordered {
+    pub(crate) order: Order,
+    pub(crate) request: Request,
+    pub(crate) answer: tokio::sync::oneshot::Sender<Answer>,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn requests_are_lines_of_json() {
+        for (line, request) in [
+            (r#"{"do":"status"}"#, Request::Status),
+            (r#"{"do":"pupil","mm":3.5}"#, Request::Pupil { mm: Some(3.5) }),
+            (r#"{"do":"pupil"}"#, Request::Pupil { mm: None }),
+            (r#"{"do":"lasers-dark"}"#, Request::LasersDark),
+            (
+                r#"{"do":"scene","scene":"/a,/b","depth_encoding":"metres","fit":"cover"}"#,
+                Request::Scene { scene: "/a,/b".into(), depth_encoding: Some("metres".into()), fit: Fit::Cover },
+            ),
+        ] {
+            assert_eq!(serde_json::from_str::<Request>(line).unwrap(), request);
+        }
+        for wrong in [r#"{"do":"pupil","cm":1}"#, r#"{"do":"dance"}"#, r#"{}"#, "[]", "status"] {
+            assert!(serde_json::from_str::<Request>(wrong).is_err(), "{wrong}");
+        }
+        assert_eq!(serde_json::to_string(&Answer::Error("no".into())).unwrap(), r#"{"error":"no"}"#);
+    }
+}

@@ -1,0 +1,114 @@
+//! From a request to an order: files are read and engines opened here, while the loop goes on.
+
+use std::sync::Arc;
+
+use holod_calibration::rig::Rig;
+use holod_calibration::{PupilDiameter, Resolution, TimeNs};
+use holod_model::scene::Fit;
+use holod_model::{RgbdFrame, Weights};
+use holod_pupil_input::host_now;
+use holod_slm_output::{LevelsFrame, PanelEncoder};
+
+use super::{Order, Request};
+use crate::cli::{self, Backend, SceneArgs};
+use crate::failure::Failure;
+use crate::renderer::{self, Renderer};
+use crate::session::scheduling;
+use crate::setup;
+use crate::source::scene;
+
+/// Lasers go dark where frames come so much slower.
+const FRAMES_BEFORE_STALL: i64 = 3;
+
+/// What a request is made ready with.
+pub(crate) struct Preparer {
+    pub(crate) rig: Rig,
+    pub(crate) resolution: Resolution,
+    pub(crate) backend: Backend,
+    pub(crate) encoder: Arc<PanelEncoder>,
+    pub(crate) has_feed: bool,
+    pub(crate) stall_timeout: TimeNs,
+}
+
+/// An engine that has made a frame.
+pub(crate) struct NewEngine {
+    pub(crate) renderer: Box<dyn Renderer>,
+    /// The pupils that its network was trained for, on this bench.
+    pub(crate) trained: [PupilDiameter; 2],
+    /// What its weights are called.
+    pub(crate) weights: String,
+}
+
+impl Preparer {
+    /// Makes a request ready.
+    ///
+    /// # Errors
+    /// Why it cannot be done: in words, for whoever asked.
+    pub(crate) fn prepare(&self, request: &Request) -> Result<Order, String> {
+        match request {
+            Request::Status => Ok(Order::Status),
+            Request::Pause => Ok(Order::Pause(true)),
+            Request::Resume => Ok(Order::Pause(false)),
+            Request::LasersDark => Ok(Order::KeepDark(true)),
+            Request::LasersArm => Ok(Order::KeepDark(false)),
+            Request::Stop => Ok(Order::Stop),
+            Request::Pupil { mm: None } => Ok(Order::Pupil(None)),
+            Request::Pupil { mm: Some(mm) } => cli::human_pupil(*mm).map(|pupil| Order::Pupil(Some(pupil))),
+            Request::Scene { scene, .. } if scene == "feed" => self.feed(),
+            Request::Scene { scene, depth_encoding, fit } => self.scene(scene, depth_encoding.as_ref(), *fit),
+            Request::Weights { weights } => self.engine(weights).map(Order::Engine),
+        }
+    }
+
+    fn feed(&self) -> Result<Order, String> {
+        let hint = "this holod has no live feed: start it with --scene feed";
+        if self.has_feed { Ok(Order::Feed) } else { Err(hint.into()) }
+    }
+
+    fn scene(&self, scene: &str, depth_encoding: Option<&String>, fit: Fit) -> Result<Order, String> {
+        let named = SceneArgs {
+            scene: Some(scene.to_owned()),
+            depth_encoding: depth_encoding.cloned(),
+            fit: fit.into(),
+            resolution: Some(self.resolution),
+        };
+        let frames = scene::frames(&named, &self.rig.geometry).map_err(in_words)?;
+        Ok(Order::Scene(Arc::new(frames)))
+    }
+
+    fn engine(&self, weights: &str) -> Result<NewEngine, String> {
+        let mut rig = self.rig.clone();
+        rig.model.weights = cli::parse_weights(weights)?;
+        let name = setup::weights_name(&rig.model.weights);
+        let weights = setup::weights(&rig).map_err(in_words)?;
+        let renderer = scheduling::patient(|| renderer::open(self.backend, &weights, &rig.geometry, &self.encoder));
+        let mut renderer = renderer.map_err(in_words)?;
+        let frame_time = self.warm_up(&mut *renderer, &weights)?;
+        if FRAMES_BEFORE_STALL * frame_time.0 > self.stall_timeout.0 {
+            return Err(format!(
+                "a frame with these weights takes {:.1} s, and lasers go dark after {:.1} s of one same frame: start \
+                 holod with them",
+                frame_time.seconds(),
+                self.stall_timeout.seconds()
+            ));
+        }
+        Ok(NewEngine { renderer, trained: weights.trained_pupils(&rig.geometry), weights: name })
+    }
+
+    /// Makes two frames, of which the first may be slow, beside those of the loop; how long the second took.
+    fn warm_up(&self, renderer: &mut dyn Renderer, weights: &Weights) -> Result<TimeNs, String> {
+        let (frame, mut levels) =
+            (Arc::new(RgbdFrame::black(self.resolution)), LevelsFrame::new(self.encoder.layout()));
+        let [pupil, _] = weights.trained_pupils(&self.rig.geometry);
+        let mut began = host_now();
+        for _ in 0..2 {
+            began = host_now();
+            renderer.render(&frame, pupil, &mut levels).map_err(|error| error.to_string())?;
+        }
+        Ok(host_now() - began)
+    }
+}
+
+fn in_words(failure: Failure) -> String {
+    failure.to_string()
+}

@@ -1,0 +1,145 @@
+//! The control socket. tokio lives here and nowhere else, with one thread of its own and one for what takes long; no
+//! real-time thread waits for either.
+
+use std::collections::VecDeque;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, mpsc};
+use std::time::Duration;
+
+use rustix::net::SocketType;
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::net::{UnixListener, UnixStream};
+use tokio::runtime::Runtime;
+use tokio::sync::oneshot;
+use tokio::task::AbortHandle;
+
+use super::{Answer, Ordered, Preparer, Request};
+use crate::local_socket;
+
+/// Connections at once. A further one takes the place of the oldest, so that nobody who only holds on keeps others out.
+const CONNECTIONS: usize = 32;
+/// The longest request, in bytes.
+const LONGEST: u64 = 1 << 16;
+const STACK_BYTES: usize = 1 << 20;
+/// Longer than the control thread takes for anything.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// A control socket that listens. Dropping it ends that.
+pub(crate) struct ControlServer {
+    socket: PathBuf,
+    runtime: Option<Runtime>,
+}
+
+impl ControlServer {
+    /// Listens at `socket`; what is asked for comes out of the receiver, ready to be obeyed.
+    ///
+    /// # Errors
+    /// Why there is no socket.
+    pub(crate) fn listen(
+        socket: PathBuf,
+        preparer: Preparer,
+    ) -> Result<(Self, mpsc::Receiver<Ordered>), Box<dyn std::error::Error>> {
+        let listener = local_socket::listen(&socket, SocketType::STREAM)?;
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .max_blocking_threads(1)
+            .thread_name("holod-control")
+            .thread_stack_size(STACK_BYTES)
+            .enable_io()
+            .enable_time()
+            .build()?;
+        let (orders, receiver) = mpsc::channel();
+        let listener = {
+            let _inside = runtime.enter();
+            UnixListener::from_std(listener.into())?
+        };
+        runtime.spawn(serve(listener, Arc::new(preparer), orders));
+        Ok((Self { socket, runtime: Some(runtime) }, receiver))
+    }
+
+    /// Where it listens.
+    pub(crate) fn socket(&self) -> &Path {
+        &self.socket
+    }
+}
+
+impl Drop for ControlServer {
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            // What is still being made ready ends with the process.
+            runtime.shutdown_background();
+        }
+        let _gone = std::fs::remove_file(&self.socket);
+    }
+}
+
+async fn serve(listener: UnixListener, preparer: Arc<Preparer>, orders: mpsc::Sender<Ordered>) {
+    let mut connections: VecDeque<AbortHandle> = VecDeque::new();
+    loop {
+        let Ok((stream, _)) = listener.accept().await else {
+            // Too many open files, most likely.
+            tokio::time::sleep(Duration::from_millis(100)).await;
+            continue;
+        };
+        connections.retain(|connection| !connection.is_finished());
+        if connections.len() == CONNECTIONS
+            && let Some(oldest) = connections.pop_front()
+        {
+            oldest.abort();
+        }
+        let (preparer, orders) = (Arc::clone(&preparer), orders.clone());
+        let connection = tokio::spawn(async move {
+            // A client that has gone away is no fault.
+            let _gone = converse(stream, &preparer, &orders).await;
+        });
+        connections.push_back(connection.abort_handle());
+    }
+}
+
+async fn converse(stream: UnixStream, preparer: &Arc<Preparer>, orders: &mpsc::Sender<Ordered>) -> io::Result<()> {
+    let (read, mut write) = stream.into_split();
+    let mut read = BufReader::new(read);
+    loop {
+        let mut line = Vec::new();
+        (&mut read).take(LONGEST).read_until(b'\n', &mut line).await?;
+        if line.is_empty() {
+            return Ok(());
+        }
+        let is_whole = line.ends_with(b"\n");
+        let answer = if is_whole {
+            answer(&line, preparer, orders).await
+        } else {
+            Answer::Error(format!("a request without an end was found, expected a line of at most {LONGEST} bytes"))
+        };
+        let mut bytes = serde_json::to_vec(&answer).map_err(io::Error::other)?;
+        bytes.push(b'\n');
+        write.write_all(&bytes).await?;
+        if !is_whole {
+            return Ok(());
+        }
+    }
+}
+
+async fn answer(line: &[u8], preparer: &Arc<Preparer>, orders: &mpsc::Sender<Ordered>) -> Answer {
+    let request: Request = match serde_json::from_slice(line) {
+        Ok(request) => request,
+        Err(error) => return Answer::Error(format!("the request is not understood: {error}")),
+    };
+    let (preparer, asked) = (Arc::clone(preparer), request.clone());
+    let order = match tokio::task::spawn_blocking(move || preparer.prepare(&asked)).await {
+        Ok(Ok(order)) => order,
+        Ok(Err(why)) => return Answer::Error(why),
+        Err(_panic) => return Answer::Error("holod failed over this request: see its log".into()),
+    };
+    let (answer, answered) = oneshot::channel();
+    let ending = || Answer::Error("holod is ending".into());
+    if orders.send(Ordered { order, request, answer }).is_err() {
+        return ending();
+    }
+    match tokio::time::timeout(PATIENCE, answered).await {
+        Ok(Ok(answer)) => answer,
+        Ok(Err(_dropped)) => ending(),
+        Err(_elapsed) => Answer::Error("holod's control thread does not answer: see its log".into()),
+    }
+}

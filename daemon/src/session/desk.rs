@@ -1,0 +1,162 @@
+//! Where a person's orders are obeyed, by the control thread: what they change is handed over to the other threads.
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::time::Duration;
+
+use holod_calibration::{PupilDiameter, TimeNs};
+use holod_slm_output::OutputControl;
+use serde_json::Value;
+
+use super::frame_loop::TrainedPupils;
+use super::host_now;
+use super::watch::Watch;
+use crate::control::{Answer, ControlServer, NewEngine, Order, Ordered, Preparer, Steering};
+use crate::failure::Failure;
+use crate::renderer::Renderer;
+use crate::runtime_folder;
+use crate::source::PictureSink;
+
+/// How long lasers may take to go dark before that is called a fault.
+const DARK_WAIT: TimeNs = TimeNs(300_000_000);
+
+/// The ways into the other threads.
+pub(super) struct Changes {
+    pub(super) steering: Arc<Steering>,
+    pub(super) sink: Arc<Mutex<PictureSink>>,
+    pub(super) engines: rtrb::Producer<(Box<dyn Renderer>, TrainedPupils)>,
+    pub(super) retired: rtrb::Consumer<Box<dyn Renderer>>,
+}
+
+/// The control socket, and what it may change.
+pub(super) struct Desk {
+    server: Option<(ControlServer, mpsc::Receiver<Ordered>)>,
+    changes: Changes,
+    keeps_dark: bool,
+}
+
+impl Desk {
+    /// A run goes on without one where it cannot be had, and says so.
+    pub(super) fn open(preparer: Preparer, changes: Changes) -> Self {
+        let server = runtime_folder::own()
+            .ok_or_else(|| "no folder for it".into())
+            .and_then(|folder| ControlServer::listen(folder.join(format!("control-{}", std::process::id())), preparer));
+        let server = match server {
+            Ok(server) => Some(server),
+            Err(error) => {
+                tracing::warn!("`holod ctl` cannot reach this run: {error}");
+                None
+            }
+        };
+        Self { server, changes, keeps_dark: false }
+    }
+
+    pub(super) fn socket(&self) -> Option<PathBuf> {
+        self.server.as_ref().map(|(server, _)| server.socket().to_owned())
+    }
+
+    pub(super) fn is_paused(&self) -> bool {
+        self.changes.steering.is_paused()
+    }
+
+    pub(super) fn keeps_dark(&self) -> bool {
+        self.keeps_dark
+    }
+
+    fn next(&self) -> Option<Ordered> {
+        self.server.as_ref()?.1.try_recv().ok()
+    }
+}
+
+impl Watch<'_> {
+    /// Obeys what has been asked for; whether that is to end.
+    pub(super) fn obey(&mut self, output: &OutputControl, now: TimeNs) -> Result<bool, Failure> {
+        while self.desk.changes.retired.pop().is_ok() {}
+        while let Some(Ordered { order, request, answer }) = self.desk.next() {
+            let ends = matches!(order, Order::Stop);
+            let done = self.carry_out(order, output, now);
+            if done.is_ok() && request.changes_something() {
+                let request_text = serde_json::to_string(&request).unwrap_or_default();
+                tracing::info!("asked by holod ctl: {request_text}");
+                self.observer.order(now, &request)?;
+                self.write_status(&output.counts(), now);
+            }
+            let done = done.map_or_else(Answer::Error, Answer::Ok);
+            // Whoever asked may have gone.
+            let _gone = answer.send(done);
+            if ends {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
+    fn carry_out(&mut self, order: Order, output: &OutputControl, now: TimeNs) -> Result<Value, String> {
+        let sink = |desk: &Desk| Arc::clone(&desk.changes.sink);
+        match order {
+            Order::Status => {
+                let snapshot = self.snapshot(&output.counts(), now);
+                serde_json::to_value(snapshot).map_err(|error| error.to_string())
+            }
+            Order::Scene(frames) => {
+                self.names.scene.clone_from(&frames.name);
+                let said = format!("{} is shown", frames.name);
+                sink(&self.desk).lock().unwrap_or_else(PoisonError::into_inner).show_scene(frames, now);
+                Ok(said.into())
+            }
+            Order::Feed => {
+                self.names.scene = "the live feed".into();
+                sink(&self.desk).lock().unwrap_or_else(PoisonError::into_inner).go_live();
+                Ok("the live feed is shown from its next picture on".into())
+            }
+            Order::Engine(engine) => self.change_engine(engine),
+            Order::Pause(paused) => {
+                self.desk.changes.steering.pause(paused);
+                Ok(if paused { "the picture stands still" } else { "the picture goes on" }.into())
+            }
+            Order::Pupil(pupil) => {
+                self.desk.changes.steering.fix_pupil(pupil);
+                Ok(match pupil.map(PupilDiameter::mm) {
+                    Some(mm) => format!("the pupil is {mm} mm until further notice").into(),
+                    None => "the tracker is followed".into(),
+                })
+            }
+            Order::KeepDark(dark) => self.keep_dark(dark, output),
+            Order::Stop => Ok("holod ends".into()),
+        }
+    }
+
+    fn change_engine(&mut self, engine: NewEngine) -> Result<Value, String> {
+        let NewEngine { renderer, trained, weights } = engine;
+        let description = renderer.description().to_owned();
+        let busy = |_| "the engine is being changed at this moment: ask again".to_owned();
+        self.desk.changes.engines.push((renderer, TrainedPupils::of(trained))).map_err(busy)?;
+        *self.names.engine.lock().unwrap_or_else(PoisonError::into_inner) = description;
+        let said = format!("holograms are computed with the weights {weights}");
+        self.names.weights = weights;
+        Ok(said.into())
+    }
+
+    /// Waits until the box has acknowledged darkness.
+    fn keep_dark(&mut self, dark: bool, output: &OutputControl) -> Result<Value, String> {
+        let faults = output.counts().box_faults;
+        output.keep_dark(dark);
+        self.desk.keeps_dark = dark;
+        if !dark {
+            return Ok("lasers are lit again by the rules".into());
+        }
+        let t_end = host_now() + DARK_WAIT;
+        while output.counts().armed && host_now() < t_end {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let counts = output.counts();
+        if counts.armed || counts.box_faults != faults {
+            return Err(
+                "the laser box did not acknowledge darkness: look at the lasers, switch them off by hand, and \
+                        see holod's log"
+                    .into(),
+            );
+        }
+        Ok("the lasers are dark, and stay so until `holod ctl lasers arm`".into())
+    }
+}

@@ -1,0 +1,213 @@
+//! A running holod is changed by `holod ctl` and by lines of JSON.
+
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use holod_tests::daemon::{Daemon, Ended, wait_until};
+use holod_tests::{frames, small_rig};
+use serde_json::{Value, json};
+
+use crate::HOLOD;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+
+struct Bench {
+    folder: tempfile::TempDir,
+    daemon: Option<Daemon>,
+}
+
+impl Bench {
+    fn start(more: &[&str]) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+        let args = ["--config", "rig.toml", "--tracker", "mock:sweep", "--resolution", "64x64", "--record", "record"];
+        let args = [&args[..], &["--backend", "cpu", "--json"], more].concat();
+        let environment = [("XDG_RUNTIME_DIR", folder.path())];
+        let daemon = Daemon::start_with(HOLOD, &args, folder.path(), &environment);
+        let bench = Self { folder, daemon: Some(daemon) };
+        assert!(wait_until(PATIENCE, || bench.status()["frames_shown"].as_u64() > Some(20)), "{}", bench.status());
+        bench
+    }
+
+    fn path(&self) -> &Path {
+        self.folder.path()
+    }
+
+    fn holod(&self, args: &[&str]) -> Ended {
+        Daemon::start_with(HOLOD, args, self.path(), &[("XDG_RUNTIME_DIR", self.path())]).wait(PATIENCE)
+    }
+
+    fn ctl(&self, args: &[&str]) -> String {
+        let ended = self.holod(&[&["ctl"], args].concat());
+        assert!(ended.status.success(), "{args:?}: {}", ended.stderr);
+        ended.stdout
+    }
+
+    fn refused(&self, args: &[&str]) -> String {
+        let ended = self.holod(&[&["ctl"], args].concat());
+        assert!(!ended.status.success(), "{args:?}: {}", ended.stdout);
+        ended.stderr
+    }
+
+    fn status(&self) -> Value {
+        serde_json::from_str(&self.holod(&["ctl", "status"]).stdout).unwrap_or_default()
+    }
+
+    fn until(&self, what: &str, done: impl Fn(&Value) -> bool) {
+        assert!(wait_until(PATIENCE, || done(&self.status())), "{what}: {}", self.status());
+    }
+
+    fn socket(&self) -> PathBuf {
+        self.status()["control"].as_str().unwrap().into()
+    }
+
+    /// Ends it by `holod ctl stop`; its summary.
+    fn stop(mut self) -> (Value, tempfile::TempDir) {
+        assert!(self.ctl(&["stop"]).contains("ends"));
+        let ended = self.daemon.take().unwrap().wait(PATIENCE);
+        assert!(ended.status.success(), "{}", ended.stderr);
+        (serde_json::from_str(&ended.stdout).unwrap(), self.folder)
+    }
+}
+
+#[test]
+fn pupil_weights_and_lasers_are_changed_while_frames_go_on() {
+    let bench = Bench::start(&["--weights", "fast"]);
+    assert_eq!(bench.status()["weights"], "fast");
+    bench.ctl(&["pupil", "4.25"]);
+    bench.until("the pupil is fixed", |status| status["pupil_state"] == "fixed" && status["pupil_mm"] == 4.25);
+    bench.ctl(&["weights", "small"]);
+    let before = bench.status()["frames_shown"].as_u64();
+    bench.until("frames go on", |status| status["weights"] == "small" && status["frames_shown"].as_u64() > before);
+    assert!(bench.ctl(&["lasers", "dark"]).contains("the lasers are dark"));
+    let status = bench.status();
+    assert_eq!((&status["lasers"], &status["lasers_kept_dark"]), (&json!("dark"), &json!(true)));
+    assert!(bench.holod(&["status"]).stdout.contains("holod ctl lasers dark"));
+    let dark_since = status["frames_shown"].as_u64().unwrap();
+    bench.until("frames go on in the dark", |status| {
+        assert_eq!(status["lasers"], "dark");
+        status["frames_shown"].as_u64() > Some(dark_since + 30)
+    });
+    let lit_after = bench.status()["frames_shown"].as_u64().unwrap();
+    bench.ctl(&["lasers", "arm"]);
+    bench.until("the lasers are lit again", |status| status["lasers"] == "armed");
+    bench.ctl(&["pupil", "follow"]);
+    bench.until("the tracker is followed", |status| status["pupil_state"] == "tracking");
+
+    let (summary, folder) = bench.stop();
+    assert_eq!(summary["ended_by"], "holod ctl stop");
+    assert_eq!(summary["lasers"]["unsafe_findings"], 0, "{summary:#}");
+    let rows = frames::read(&folder.path().join("record/frames.csv")).unwrap();
+    assert!(rows.iter().any(|row| row.pupil_state == "fixed" && (row.pupil_mm - 4.25).abs() < 1e-6));
+    let kept_dark = rows.iter().filter(|row| (dark_since + 10..lit_after).contains(&row.frame));
+    assert!(
+        kept_dark.clone().count() > 0 && kept_dark.clone().all(|row| row.laser_on_ns.is_none()),
+        "light in between"
+    );
+    let orders = fs::read_to_string(folder.path().join("record/orders.jsonl")).unwrap();
+    let orders: Vec<Value> = orders.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let done: Vec<_> = orders.iter().map(|order| order["request"]["do"].as_str().unwrap()).collect();
+    assert_eq!(done, ["pupil", "weights", "lasers-dark", "lasers-arm", "pupil", "stop"]);
+    assert!(orders.is_sorted_by_key(|order| order["t_ns"].as_i64()));
+}
+
+#[test]
+fn scenes_come_and_go_and_stand_still() {
+    let bench = Bench::start(&["--scene", "feed:pictures"]);
+    assert_eq!(bench.status()["scene"], "the live feed");
+    let folder = bench.path().join("sequence");
+    fs::create_dir(&folder).unwrap();
+    for frame in 0..4_u8 {
+        let colour = image::RgbImage::from_pixel(64, 64, image::Rgb([60 * frame; 3]));
+        colour.save(folder.join(format!("colour{frame}.png"))).unwrap();
+        let depth = image::ImageBuffer::from_fn(64, 64, |x, _| image::Luma([500_u16 + 10 * x as u16]));
+        depth.save(folder.join(format!("depth{frame}.png"))).unwrap();
+    }
+    let description =
+        "colour = \"colour{}.png\"\ndepth = \"depth{}.png\"\ndepth_encoding = \"millimetres\"\nfps = 20.0\n";
+    fs::write(folder.join("scene.toml"), description).unwrap();
+    // Its name is understood where it is given, not where holod was started.
+    bench.ctl(&["scene", "sequence"]);
+    bench.until("the scene is shown", |status| status["scene"].as_str().unwrap_or_default().ends_with("/sequence"));
+    bench.ctl(&["pause"]);
+    let paused = bench.status();
+    assert_eq!(paused["paused"], true);
+    let first = paused["frames_made"].as_u64().unwrap() + 3;
+    bench.until("some frames", |status| status["frames_made"].as_u64() > Some(first + 30));
+    bench.ctl(&["resume"]);
+    let last = bench.status()["frames_made"].as_u64().unwrap();
+    bench.until("some frames", |status| status["frames_made"].as_u64() > Some(last + 60));
+    bench.ctl(&["scene", "feed"]);
+    assert_eq!(bench.status()["scene"], "the live feed");
+
+    let (_, folder) = bench.stop();
+    let rows = frames::read(&folder.path().join("record/frames.csv")).unwrap();
+    let pictures = |frames: std::ops::Range<u64>| {
+        let mut seen: Vec<_> = rows.iter().filter(|row| frames.contains(&row.frame)).map(|row| row.picture).collect();
+        seen.sort_unstable();
+        seen.dedup();
+        seen
+    };
+    assert_eq!(pictures(first..first + 25).len(), 1, "it stood still");
+    assert_eq!(pictures(last + 3..last + 60), [0, 1, 2, 3], "it goes round");
+}
+
+#[test]
+fn what_cannot_be_done_is_said_and_changes_nothing() {
+    let bench = Bench::start(&[]);
+    let before = bench.status();
+    for (args, said) in [
+        (&["scene", "absent"][..], "absent"),
+        (&["scene", "feed"], "start it with --scene feed"),
+        (&["weights", "./absent.safetensors"], "absent.safetensors"),
+        (&["pupil", "12"], "expected a human pupil of 0.5 to 9 mm"),
+        (&["weights", "smal"], "did you mean `small`?"),
+        (&["status", "--pid", "1"], "no holod of that process number"),
+        (&["status", "--socket", "nowhere"], "nowhere: holod does not answer there"),
+    ] {
+        let refused = bench.refused(args);
+        assert!(refused.contains(said), "{args:?}: {refused}");
+    }
+    for key in ["scene", "weights", "pupil_state", "lasers_kept_dark", "paused"] {
+        let now = bench.status();
+        assert!(now[key] == before[key] || key == "pupil_state" && now[key] != "fixed", "{key}");
+    }
+    let (_, folder) = bench.stop();
+    let orders = fs::read_to_string(folder.path().join("record/orders.jsonl")).unwrap();
+    assert_eq!(orders.lines().count(), 1, "only the stop: {orders}");
+}
+
+#[test]
+fn strangers_on_the_socket_are_answered_and_the_loop_goes_on() {
+    let bench = Bench::start(&[]);
+    let socket = bench.socket();
+    let answer = |bytes: &[u8]| {
+        let mut stream = UnixStream::connect(&socket).unwrap();
+        stream.write_all(bytes).unwrap();
+        stream.shutdown(std::net::Shutdown::Write).unwrap();
+        let mut answer = String::new();
+        BufReader::new(stream).read_line(&mut answer).unwrap();
+        serde_json::from_str::<Value>(&answer).unwrap()["error"].as_str().unwrap().to_owned()
+    };
+    assert!(answer(b"GET / HTTP/1.1\r\n\r\n").contains("the request is not understood"));
+    assert!(answer(b"{\"do\":\"dance\"}\n").contains("unknown variant `dance`"));
+    assert!(answer(b"{\"do\":\"pupil\",\"cm\":0.3}\n").contains("cm"));
+    assert!(answer(b"{\"do\":\"pupil\",\"mm\":300}\n").contains("expected a human pupil"));
+    assert!(answer(b"\xff\xfe\n").contains("not understood"));
+    assert!(answer(&[b'x'; 70_000]).contains("at most 65536 bytes"));
+    // As many as may be connected, and more, say nothing.
+    let _silent: Vec<_> = (0..40).map(|_| UnixStream::connect(&socket).unwrap()).collect();
+    let mut one = UnixStream::connect(&socket).unwrap();
+    let mut several = BufReader::new(one.try_clone().unwrap()).lines();
+    for mm in [3.0, 4.0] {
+        writeln!(one, "{}", json!({ "do": "pupil", "mm": mm })).unwrap();
+        let answer: Value = serde_json::from_str(&several.next().unwrap().unwrap()).unwrap();
+        assert!(answer["ok"].as_str().unwrap().contains("until further notice"), "{answer}");
+    }
+    bench.until("the last one holds", |status| status["pupil_mm"] == 4.0);
+    bench.stop();
+    assert!(!socket.exists());
+}
