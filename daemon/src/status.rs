@@ -69,7 +69,8 @@ pub fn of_running() -> Result<Vec<Found>, Failure> {
     let mut folders = vec![PathBuf::from(SERVICE_FOLDER)];
     folders.extend(runtime_folder::candidates());
     folders.dedup();
-    of_running_in(&folders)
+    // A listing that is read while a file is renamed may miss it.
+    of_running_in(&folders).or_else(|_| of_running_in(&folders))
 }
 
 /// Those that run and are meant: all, or the one of process `pid`.
