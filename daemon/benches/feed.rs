@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
 use holod_daemon::source::feed::FeedPlan;
-use holod_daemon::source::{self, Pictures};
+use holod_daemon::source::{self, OpenPictures, Pictures};
 use holod_model::RgbdFrame;
 use holod_model::scene::{Fit, LiveColour, LiveDepth, LiveFormat, LivePart, LiveReader};
 use holod_tests::feed::{Answer, FeedClient, hello};
@@ -26,7 +26,8 @@ fn main() {
     let socket = folder.path().join("feed");
     let plan = FeedPlan { socket: socket.clone(), resolution: SIZE, fit: Fit::Native };
     let pictures = Pictures::Feed(plan);
-    let (_sink, mut source, _feed) = source::open(&pictures, &DisplayGeometry::DEFAULT, TimeNs(0)).expect("a feed");
+    let OpenPictures { mut source, feed: _feed, .. } =
+        source::open(&pictures, &DisplayGeometry::DEFAULT, TimeNs(0)).expect("a feed");
     let mut client = FeedClient::connect(&socket).expect("a connection");
     client.say(&hello(SIZE.width as u32, SIZE.height as u32, None, "bench")).expect("the feed listens");
     assert_eq!(client.answer(), Answer::Ring);

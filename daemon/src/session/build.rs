@@ -26,6 +26,7 @@ use super::{Observer, RECORDS, SessionPlan, Signals, host_now, scheduling, track
 use crate::control::{Preparer, Steering};
 use crate::failure::{Exit, Failure};
 use crate::renderer::{self, Renderer};
+use crate::source::OpenPictures;
 use crate::status::StatusFile;
 use crate::{progress, setup, source, speed};
 
@@ -87,7 +88,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
     tracing::debug!("tracker `{}` is open, link {}", plan.tracker, tracker.link().name());
 
     let scene = plan.pictures.name().to_owned();
-    let (sink, pictures, feed) =
+    let OpenPictures { sink, source: pictures, feed } =
         source::open(&plan.pictures, &rig.geometry, t_origin).map_err(Failure::because(Exit::Unavailable))?;
     let options = OutputOptions {
         keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 },

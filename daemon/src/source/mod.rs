@@ -78,22 +78,28 @@ pub fn named(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Pictures, F
     Ok(Pictures::Feed(FeedPlan { socket, resolution, fit: args.fit.into() }))
 }
 
-/// Both ends of `pictures`, which begin at host time `t_start`, and the feed where there is one.
+/// Pictures on their way, by the threads that hold their parts.
+pub struct OpenPictures {
+    /// Where other scenes are put in.
+    pub sink: Arc<Mutex<PictureSink>>,
+    /// For the frame thread.
+    pub source: PictureSource,
+    /// The feed, where there is one.
+    pub feed: Option<Feed>,
+}
+
+/// Both ends of `pictures`, which begin at host time `t_start`.
 ///
 /// # Errors
 /// The feed cannot listen.
-pub fn open(
-    pictures: &Pictures,
-    geometry: &DisplayGeometry,
-    t_start: TimeNs,
-) -> Result<(Arc<Mutex<PictureSink>>, PictureSource, Option<Feed>), FeedError> {
+pub fn open(pictures: &Pictures, geometry: &DisplayGeometry, t_start: TimeNs) -> Result<OpenPictures, FeedError> {
     let (sink, source) = newest_picture(pictures, t_start);
     let sink = Arc::new(Mutex::new(sink));
     let feed = match pictures {
         Pictures::Scene(_) => None,
         Pictures::Feed(plan) => Some(Feed::listen(plan.clone(), geometry, Arc::clone(&sink))?),
     };
-    Ok((sink, source, feed))
+    Ok(OpenPictures { sink, source, feed })
 }
 
 /// Something to show until there is something newer.

@@ -208,6 +208,8 @@ pub(super) fn nope(why: &str) -> Vec<u8> {
 
 #[cfg(test)]
 pub(super) mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     const FORMAT: LiveFormat = LiveFormat {
@@ -272,6 +274,31 @@ pub(super) mod tests {
         let mut frame = frame_of(0, 0, 0);
         frame[39] = 1;
         assert!(Message::parse(&frame).is_err());
+    }
+
+    proptest! {
+        /// Whatever bytes come, they are a message that holod can obey, or are refused in words that fit into an answer.
+        #[test]
+        fn no_bytes_are_too_odd(
+            kind in 0..3, noise in prop::collection::vec(any::<u8>(), 0..80), at in 0_usize..64, byte: u8,
+        ) {
+            let mut bytes = match kind {
+                0 => noise,
+                1 => hello_with(&[]).to_vec(),
+                _ => frame_of(1, 2, 3).to_vec(),
+            };
+            if let Some(cell) = bytes.get_mut(at) {
+                *cell = byte;
+            }
+            match Message::parse(&bytes) {
+                Ok(Message::Hello { format, name }) => {
+                    prop_assert!(format.resolution.pixels() > 0 && Layout::of(&format).bytes() < 1 << 32);
+                    prop_assert!(!name.is_empty() && !name.contains(char::is_control));
+                }
+                Ok(Message::Frame { .. }) => prop_assert_eq!(&bytes[..4], b"FRAM"),
+                Err(Wrong(why)) => prop_assert!(!why.is_empty() && nope(&why).len() <= 1024, "{}", why),
+            }
+        }
     }
 
     #[test]

@@ -295,12 +295,14 @@ impl Server {
         let free =
             self.frames.iter().position(|frame| Arc::strong_count(frame) == 1).expect("one frame more than are used");
         let mut frame = self.frames.swap_remove(free);
-        let mut tag = None;
+        let sink = Arc::clone(&self.sink);
         self.with(number, shown, |client, target, status| {
             let Some(picture) = client.take() else { return Ok(()) };
             let outcome = match take_over(client, &picture, target, &mut frame, now) {
-                Ok(taken) => {
-                    tag = Some(taken);
+                Ok(tag) => {
+                    // Whoever hears that it was taken may count on it.
+                    sink.lock().unwrap_or_else(PoisonError::into_inner).show_live(Arc::clone(&frame), tag);
+                    status.t_newest = Some(now);
                     Outcome::Taken
                 }
                 Err(why) => Outcome::Refused(why),
@@ -308,10 +310,6 @@ impl Server {
             note(status, &outcome);
             client.free(&picture, &outcome)
         });
-        if let Some(tag) = tag {
-            self.sink.lock().unwrap_or_else(PoisonError::into_inner).show_live(Arc::clone(&frame), tag);
-            self.status.t_newest = Some(now);
-        }
         self.frames.push(frame);
     }
 

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use holod_model::scene::LiveColour;
 use holod_tests::feed::{Answer, FeedClient, hello};
 
-use super::super::{PictureSource, Pictures, open};
+use super::super::{OpenPictures, PictureSource, Pictures, open};
 use super::*;
 
 const SIZE: Resolution = Resolution { width: 16, height: 8 };
@@ -30,8 +30,8 @@ impl Bench {
         let folder = tempfile::tempdir().unwrap();
         let socket = folder.path().join("feed");
         let plan = FeedPlan { socket: socket.clone(), resolution: SIZE, fit: Fit::Native };
-        let (sink, pictures, feed) = open(&Pictures::Feed(plan), &BENCH, TimeNs(0)).unwrap();
-        Self { _folder: folder, socket, feed: feed.unwrap(), sink, pictures }
+        let OpenPictures { sink, source, feed } = open(&Pictures::Feed(plan), &BENCH, TimeNs(0)).unwrap();
+        Self { _folder: folder, socket, feed: feed.unwrap(), sink, pictures: source }
     }
 
     /// A client that has been told where to write.

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from holod_client import Feed, FeedError
+from holod_client import Control, ControlError, Feed, FeedError
 
 HERE = Path(__file__).parent
 SIZE = 64
@@ -33,7 +33,8 @@ class Holod:
             text=True,
         )
         patience_s = time.monotonic() + 60
-        while not self.socket.exists():
+        # The control socket comes last.
+        while not self.socket.exists() or not list(folder.glob("holod/control-*")):
             assert self.process.poll() is None, self.process.communicate()[1]
             assert time.monotonic() < patience_s, "holod does not listen"
             time.sleep(0.02)
@@ -100,3 +101,35 @@ def test_the_c_example_and_a_pipe_are_shown(holod: Holod, tmp_path: Path) -> Non
     assert done.returncode == 0, done.stderr
     told = holod.end()["feed"]
     assert told["taken"] >= 4 and told["refused"] == told["connections_refused"] == 0, told
+
+
+def test_a_running_holod_is_changed(holod: Holod, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(holod.socket.parent))
+    with Control() as control:
+        assert control.pupil(3.5) == "the pupil is 3.5 mm until further notice"
+        patience_s = time.monotonic() + 60
+        while (status := control.status())["pupil_mm"] != 3.5:
+            assert time.monotonic() < patience_s, status
+        assert (status["pupil_state"], status["scene"]) == ("fixed", "the live feed")
+        assert "dark" in control.lasers_dark()
+        assert control.status()["lasers_kept_dark"]
+        control.lasers_arm()
+        control.pause()
+        control.resume()
+        control.weights("small")
+        control.scene("feed")
+        control.pupil(None)
+        for order, fault in [
+            (lambda: control.pupil(0.35), "expected a human pupil"),
+            (lambda: control.scene("absent", depth_encoding="metres"), str(Path("absent").absolute())),
+            (lambda: control.weights("smal"), "did you mean `small`"),
+            (lambda: control.ask("dance"), "unknown variant `dance`"),
+        ]:
+            with pytest.raises(ControlError, match=fault):
+                order()
+        assert control.status()["weights"] == "small"
+        control.stop()
+    assert json.loads(holod.process.communicate(timeout=60)[0])["ended_by"] == "holod ctl stop"
+    with pytest.raises(ControlError, match="no holod runs that has a control socket"):
+        Control()

@@ -1,0 +1,127 @@
+"""Changes a running holod, as `holod ctl` does."""
+
+from __future__ import annotations
+
+import glob
+import json
+import os
+import socket
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from holod_client.feed import default_path
+
+LONGEST_ANSWER_BYTES = 1 << 20
+
+
+class ControlError(Exception):
+    """holod is not there, or refuses the order; nothing has changed then."""
+
+
+class Control:
+    """A connection to the control socket of a running holod, for orders one after the other.
+
+    `path` is the socket; without one it is that of the only holod in this user's runtime folder, or else of the
+    service. Each order waits for holod up to `timeout_s` seconds: weights and long sequences take a while to read.
+
+    Raises ControlError where no holod is found, or several are.
+    """
+
+    def __init__(self, path: str | os.PathLike[str] | None = None, timeout_s: float = 60.0) -> None:
+        self.path = _only_socket() if path is None else Path(path)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._socket.settimeout(timeout_s)
+        try:
+            self._socket.connect(str(self.path))
+        except OSError as error:
+            self._socket.close()
+            raise ControlError(f"no holod answers on {self.path}: {error.strerror or error}; is it running?") from error
+        self._answers = self._socket.makefile("rb")
+
+    def ask(self, do: str, **details: Any) -> Any:
+        """Gives the order `do` of daemon/doc/control.md, and returns the answer. Raises ControlError."""
+        request = json.dumps({"do": do, **details}).encode() + b"\n"
+        try:
+            self._socket.sendall(request)
+            line = self._answers.readline(LONGEST_ANSWER_BYTES)
+        except OSError as error:
+            raise ControlError(f"holod does not answer on {self.path}: {error.strerror or error}") from error
+        if not line.endswith(b"\n"):
+            raise ControlError(f"holod closed the connection on {self.path}: see its log")
+        answer = json.loads(line)
+        if "error" in answer:
+            raise ControlError(answer["error"])
+        return answer["ok"]
+
+    def status(self) -> dict[str, Any]:
+        """How the run is at this moment, as `holod status --json` prints it."""
+        return self.ask("status")
+
+    def scene(self, scene: str | os.PathLike[str], depth_encoding: str | None = None, fit: str = "native") -> str:
+        """Shows another scene (a folder, or "COLOUR,DEPTH"), or the live feed again ("feed")."""
+        named = os.fspath(scene)
+        if named != "feed":
+            parts = [named] if os.path.exists(named) else named.split(",")
+            named = ",".join(os.path.abspath(part) for part in parts)
+        details = {} if depth_encoding is None else {"depth_encoding": depth_encoding}
+        return self.ask("scene", scene=named, fit=fit, **details)
+
+    def weights(self, weights: str | os.PathLike[str]) -> str:
+        """Computes with other weights: "standard", "small", "fast", or a file."""
+        named = os.fspath(weights)
+        return self.ask("weights", weights=os.path.abspath(named) if os.path.exists(named) else named)
+
+    def pause(self) -> str:
+        """Lets the picture stand still; the pupil is followed."""
+        return self.ask("pause")
+
+    def resume(self) -> str:
+        """Lets it go on."""
+        return self.ask("resume")
+
+    def pupil(self, mm: float | None) -> str:
+        """Computes for one pupil, in millimetres, whatever the tracker says; None follows the tracker again."""
+        return self.ask("pupil", mm=mm)
+
+    def lasers_dark(self) -> str:
+        """Keeps the lasers dark. Raises ControlError where the box does not acknowledge that."""
+        return self.ask("lasers-dark")
+
+    def lasers_arm(self) -> str:
+        """Lets the lasers be lit by the rules again."""
+        return self.ask("lasers-arm")
+
+    def stop(self) -> str:
+        """Ends the run in order."""
+        return self.ask("stop")
+
+    def close(self) -> None:
+        """May be called again."""
+        self._answers.close()
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _listens(path: str) -> bool:
+    """Whether there is more than the socket of a holod that was killed."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as trial:
+        return trial.connect_ex(path) == 0
+
+
+def _only_socket() -> Path:
+    own = default_path().parent
+    for folder in (own, Path("/run/holod")):
+        found = [path for path in sorted(glob.glob(glob.escape(str(folder)) + "/control-*")) if _listens(path)]
+        if len(found) > 1:
+            raise ControlError(f"several holods run: {', '.join(found)}; give the path of one")
+        if found:
+            return Path(found[0])
+    raise ControlError(f"no holod runs that has a control socket in {own} or /run/holod: start it, or give the path")
