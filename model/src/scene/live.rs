@@ -518,7 +518,7 @@ mod tests {
         for wrong in [f32::NAN, 1e-4] {
             let mut frame = right.clone();
             frame.depth_normalised[5] += wrong;
-            assert!(!(difference(&frame, &right) < 1e-6));
+            assert!(difference(&frame, &right).total_cmp(&1e-6).is_gt());
         }
     }
 

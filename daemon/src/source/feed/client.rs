@@ -74,7 +74,12 @@ impl Client {
     }
 
     /// Reads what it has sent. Pictures that are overtaken or refused by their numbers are freed, with `note` told of each.
-    pub(super) fn receive(&mut self, target: &Target, now: TimeNs, mut note: impl FnMut(&Outcome)) -> Result<(), Gone> {
+    pub(super) fn receive(
+        &mut self,
+        target: &Target,
+        clock: impl Fn() -> TimeNs,
+        mut note: impl FnMut(&Outcome),
+    ) -> Result<(), Gone> {
         let mut bytes = [0; LONGEST + 1];
         let mut was_reset = false;
         for _ in 0..MESSAGES_AT_ONCE {
@@ -87,7 +92,8 @@ impl Client {
                 Err(Errno::CONNRESET) if !std::mem::replace(&mut was_reset, true) => continue,
                 Err(error) => return Err(error.into()),
             };
-            let heard = Message::parse(&bytes[..length]).and_then(|message| self.hear(message, target, now, &mut note));
+            let heard =
+                Message::parse(&bytes[..length]).and_then(|message| self.hear(message, target, clock(), &mut note));
             heard.map_err(|Wrong(why)| self.show_out(&why))??;
         }
         Ok(())
@@ -115,7 +121,7 @@ impl Client {
             }
             (Message::Frame { slot, sequence, t_taken }, Some(stream)) => {
                 self.t_last = now;
-                match stream.slots.hand_over(slot, sequence, t_taken)? {
+                match stream.slots.hand_over(slot, sequence, t_taken.unwrap_or(now))? {
                     None => Ok(Ok(())),
                     Some((picture, outcome)) => {
                         note(&outcome);

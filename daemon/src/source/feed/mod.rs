@@ -189,7 +189,7 @@ impl Server {
             }
             for number in ready.clients {
                 self.with(number, &mut shown, |client, target, status| {
-                    client.receive(target, now, |outcome| note(status, outcome))
+                    client.receive(target, host_now, |outcome| note(status, outcome))
                 });
             }
             if self.sink.lock().unwrap_or_else(PoisonError::into_inner).is_live() {
@@ -337,9 +337,8 @@ fn take_over(
     frame: &mut Arc<RgbdFrame>,
     now: TimeNs,
 ) -> Result<PictureTag, String> {
-    let t_taken = picture.t_taken.unwrap_or(now);
-    if t_taken > now + LONGEST_FUTURE {
-        let ahead_s = (t_taken - now).seconds();
+    if picture.t_taken > now + LONGEST_FUTURE {
+        let ahead_s = (picture.t_taken - now).seconds();
         return Err(format!(
             "a picture taken {ahead_s:.0} s from now was found, expected nanoseconds of CLOCK_MONOTONIC (not of the \
              calendar's clock), or 0"
@@ -352,7 +351,7 @@ fn take_over(
         let name = format!("the feed's client `{}`", client.name);
         scene::warn_of_oddities(&name, frame, &report, &target.geometry, client.sends_planes());
     }
-    Ok(PictureTag { number: picture.sequence, t_taken: Some(t_taken) })
+    Ok(PictureTag { number: picture.sequence, t_taken: Some(picture.t_taken) })
 }
 
 /// Counts what became of a picture.

@@ -14,8 +14,8 @@ pub(super) struct Picture {
     pub(super) slot: usize,
     /// Its number.
     pub(super) sequence: u64,
-    /// When it was taken, where the client said so.
-    pub(super) t_taken: Option<TimeNs>,
+    /// When it was taken, or else when it came.
+    pub(super) t_taken: TimeNs,
 }
 
 /// The slots of one client.
@@ -38,7 +38,7 @@ impl Slots {
         &mut self,
         slot: u32,
         sequence: u64,
-        t_taken: Option<TimeNs>,
+        t_taken: TimeNs,
     ) -> Result<Option<(Picture, Outcome)>, Wrong> {
         let picture = Picture { slot: slot as usize, sequence, t_taken };
         match self.held.get_mut(picture.slot) {
@@ -95,23 +95,23 @@ mod tests {
     #[test]
     fn the_newest_is_read_and_the_others_come_back() {
         let mut slots = Slots::default();
-        assert_eq!(slots.hand_over(0, 5, None), Ok(None));
-        let (overtaken, outcome) = slots.hand_over(2, 8, Some(TimeNs(3))).unwrap().unwrap();
+        assert_eq!(slots.hand_over(0, 5, TimeNs(0)), Ok(None));
+        let (overtaken, outcome) = slots.hand_over(2, 8, TimeNs(3)).unwrap().unwrap();
         assert_eq!((overtaken.slot, overtaken.sequence, outcome), (0, 5, Outcome::Overtaken));
         slots.free(&overtaken);
         let newest = slots.take().unwrap();
-        assert_eq!((newest.slot, newest.sequence, newest.t_taken), (2, 8, Some(TimeNs(3))));
+        assert_eq!((newest.slot, newest.sequence, newest.t_taken), (2, 8, TimeNs(3)));
         assert_eq!((slots.take(), slots.left_out), (None, 2));
-        assert!(slots.hand_over(2, 9, None).unwrap_err().0.contains("wait for its FREE"));
-        assert_eq!(slots.hand_over(0, 9, None), Ok(None));
-        assert!(slots.hand_over(3, 10, None).unwrap_err().0.contains("expected 0 to 2"));
+        assert!(slots.hand_over(2, 9, TimeNs(0)).unwrap_err().0.contains("wait for its FREE"));
+        assert_eq!(slots.hand_over(0, 9, TimeNs(0)), Ok(None));
+        assert!(slots.hand_over(3, 10, TimeNs(0)).unwrap_err().0.contains("expected 0 to 2"));
     }
 
     #[test]
     fn a_sequence_that_does_not_rise_is_refused_and_nothing_else() {
         let mut slots = Slots::default();
-        slots.hand_over(0, 5, None).unwrap();
-        let (refused, outcome) = slots.hand_over(1, 5, None).unwrap().unwrap();
+        slots.hand_over(0, 5, TimeNs(0)).unwrap();
+        let (refused, outcome) = slots.hand_over(1, 5, TimeNs(0)).unwrap().unwrap();
         assert_eq!(refused.slot, 1);
         assert_eq!(outcome, Outcome::Refused("sequence 5 was found after 5, expected it to rise".into()));
         slots.free(&refused);
@@ -126,7 +126,7 @@ mod tests {
             let mut with_holod = [false; SLOTS];
             for (slot, sequence, read) in orders {
                 let was_free = with_holod.get(slot as usize) == Some(&false);
-                match slots.hand_over(slot, sequence, None) {
+                match slots.hand_over(slot, sequence, TimeNs(0)) {
                     Ok(freed) => {
                         prop_assert!(was_free);
                         with_holod[slot as usize] = true;
@@ -195,7 +195,7 @@ mod tests {
         'turns: while seen < PICTURES {
             while let Some((slot, sequence)) = to_holod.received() {
                 // A client that breaks the rules is shown out, but may have written by then.
-                let Ok(freed) = slots.hand_over(slot, sequence, None) else { break 'turns };
+                let Ok(freed) = slots.hand_over(slot, sequence, TimeNs(0)) else { break 'turns };
                 if let Some((freed, _)) = freed {
                     slots.free(&freed);
                     to_client.send(freed.slot as u32);
