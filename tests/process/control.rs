@@ -40,20 +40,27 @@ impl Bench {
         Daemon::start_with(HOLOD, args, self.path(), &[("XDG_RUNTIME_DIR", self.path())]).wait(PATIENCE)
     }
 
+    /// Orders for this one: other tests have holods, too.
+    fn asked(&self, args: &[&str]) -> Ended {
+        let pid = self.daemon.as_ref().expect("it runs").pid().to_string();
+        self.holod(&[&["ctl"], args, &["--pid", &pid]].concat())
+    }
+
     fn ctl(&self, args: &[&str]) -> String {
-        let ended = self.holod(&[&["ctl"], args].concat());
+        let ended = self.asked(args);
         assert!(ended.status.success(), "{args:?}: {}", ended.stderr);
         ended.stdout
     }
 
     fn refused(&self, args: &[&str]) -> String {
-        let ended = self.holod(&[&["ctl"], args].concat());
+        let names_one = args.iter().any(|arg| ["--pid", "--socket"].contains(arg));
+        let ended = if names_one { self.holod(&[&["ctl"], args].concat()) } else { self.asked(args) };
         assert!(!ended.status.success(), "{args:?}: {}", ended.stdout);
         ended.stderr
     }
 
     fn status(&self) -> Value {
-        serde_json::from_str(&self.holod(&["ctl", "status"]).stdout).unwrap_or_default()
+        serde_json::from_str(&self.asked(&["status"]).stdout).unwrap_or_default()
     }
 
     fn until(&self, what: &str, done: impl Fn(&Value) -> bool) {
@@ -85,7 +92,8 @@ fn pupil_weights_and_lasers_are_changed_while_frames_go_on() {
     assert!(bench.ctl(&["lasers", "dark"]).contains("the lasers are dark"));
     let status = bench.status();
     assert_eq!((&status["lasers"], &status["lasers_kept_dark"]), (&json!("dark"), &json!(true)));
-    assert!(bench.holod(&["status"]).stdout.contains("holod ctl lasers dark"));
+    let pid = bench.daemon.as_ref().unwrap().pid().to_string();
+    assert!(bench.holod(&["status", "--pid", &pid]).stdout.contains("holod ctl lasers dark"));
     let dark_since = status["frames_shown"].as_u64().unwrap();
     bench.until("frames go on in the dark", |status| {
         assert_eq!(status["lasers"], "dark");

@@ -54,9 +54,15 @@ fn send(client: &mut FeedClient, sequence: u64, (colour, depth): &(Vec<u8>, Vec<
     assert!(matches!(client.answer(), Answer::Free { outcome: 0, .. }));
 }
 
-fn status(folder: &Path) -> Value {
-    let asked = Daemon::start_with(HOLOD, &["status", "--json"], folder, &[("XDG_RUNTIME_DIR", folder)]);
-    serde_json::from_str(&asked.wait(PATIENCE).stdout).unwrap_or_default()
+/// What `holod status` says of one, with `more` options.
+fn said_of(daemon: &Daemon, folder: &Path, more: &[&str]) -> String {
+    let pid = daemon.pid().to_string();
+    let args = [&["status", "--pid", &pid], more].concat();
+    Daemon::start_with(HOLOD, &args, folder, &[("XDG_RUNTIME_DIR", folder)]).wait(PATIENCE).stdout
+}
+
+fn status(daemon: &Daemon, folder: &Path) -> Value {
+    serde_json::from_str(&said_of(daemon, folder, &["--json"])).unwrap_or_default()
 }
 
 /// The one picture of the panel's levels in a record.
@@ -109,22 +115,21 @@ fn a_client_that_dies_leaves_its_picture_and_the_loop_goes_on() {
     let daemon = holod_with_feed(folder.path(), &["--json"]);
     let mut client = connect(folder.path());
     send(&mut client, 1, &picture(0));
-    assert!(wait_until(PATIENCE, || status(folder.path())["feed"]["shown"] == "test camera"));
+    assert!(wait_until(PATIENCE, || status(&daemon, folder.path())["feed"]["shown"] == "test camera"));
     client.write(1, &[7; 400], &[]);
     drop(client);
     let mut frames_shown = None;
     let nobody_is_shown = || {
-        let status = status(folder.path());
+        let status = status(&daemon, folder.path());
         frames_shown = status["frames_shown"].as_u64();
         status["feed"].is_object() && status["feed"]["shown"].is_null()
     };
     assert!(wait_until(PATIENCE, nobody_is_shown));
-    assert!(wait_until(PATIENCE, || status(folder.path())["frames_shown"].as_u64() > frames_shown));
+    assert!(wait_until(PATIENCE, || status(&daemon, folder.path())["frames_shown"].as_u64() > frames_shown));
     let mut next = connect(folder.path());
     send(&mut next, 1, &picture(5));
-    assert!(wait_until(PATIENCE, || status(folder.path())["feed"]["taken"] == 2));
-    let text = Daemon::start_with(HOLOD, &["status"], folder.path(), &[("XDG_RUNTIME_DIR", folder.path())]);
-    let text = text.wait(PATIENCE).stdout;
+    assert!(wait_until(PATIENCE, || status(&daemon, folder.path())["feed"]["taken"] == 2));
+    let text = said_of(&daemon, folder.path(), &[]);
     assert!(text.contains("`test camera` is shown, of 1") && text.contains("2 pictures taken"), "{text}");
     daemon.signal(Signal::TERM);
     let ended = daemon.wait(PATIENCE);
