@@ -44,7 +44,7 @@ fn text_of(status: &Snapshot) -> String {
         )
     });
     format!(
-        "{} for {:.0} s, process {}, {}\n\
+        "{} for {:.0} s, process {}, {}{}\n\
          pupil    {}, {}\n\
          tracker  {}: link {}{}\n\
          \x20        {}\n\
@@ -57,6 +57,7 @@ fn text_of(status: &Snapshot) -> String {
         status.uptime_s,
         status.pid,
         figures.rig,
+        if status.paused { "; the picture stands still" } else { "" },
         status.pupil_mm.map_or("none yet".to_owned(), |mm| format!("{mm:.2} mm")),
         status.pupil_state,
         figures.tracker,

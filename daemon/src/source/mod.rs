@@ -150,10 +150,7 @@ impl PictureSink {
         assert_eq!(frames.resolution(), self.size, "every picture has the hologram's size");
         self.is_live = false;
         self.input.write(Shown::Scene { frames: Arc::clone(&frames), t_start });
-        let is_in_use = |scene: &Arc<Frames>| {
-            Arc::strong_count(scene) > 1 || scene.frames.iter().any(|frame| Arc::strong_count(frame) > 1)
-        };
-        self.scenes.retain(is_in_use);
+        self.drop_old_scenes();
         self.scenes.push(frames);
     }
 
@@ -165,7 +162,15 @@ impl PictureSink {
         assert_eq!(frame.resolution, self.size, "every picture has the hologram's size");
         if self.is_live {
             self.input.write(Shown::Live { frame, tag });
+            self.drop_old_scenes();
         }
+    }
+
+    fn drop_old_scenes(&mut self) {
+        let is_in_use = |scene: &Arc<Frames>| {
+            Arc::strong_count(scene) > 1 || scene.frames.iter().any(|frame| Arc::strong_count(frame) > 1)
+        };
+        self.scenes.retain(is_in_use);
     }
 
     /// Whether live pictures are shown, and no scene.
@@ -273,6 +278,12 @@ mod tests {
         drop(held);
         sink.show_scene(sequence(1), TimeNs(0));
         assert!(sink.scenes.len() <= 4, "{}", sink.scenes.len());
+        sink.go_live();
+        for number in 0..4 {
+            show(&mut sink, number);
+            source.at(TimeNs(0));
+        }
+        assert!(sink.scenes.is_empty(), "live pictures need none");
     }
 
     #[test]

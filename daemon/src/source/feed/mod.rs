@@ -34,7 +34,7 @@ use crate::local_socket::{self, SocketError};
 const CLIENTS: usize = 8;
 /// A client that has sent nothing for so long gives way to one that sends.
 const SILENCE: TimeNs = TimeNs(2_000_000_000);
-/// Three on their way to the frame thread, one that the renderer keeps, and one that is written.
+/// At first: three on their way to the frame thread, one that the renderer keeps, and one that is written.
 const FRAMES: usize = 5;
 /// Clocks of one machine agree better than this.
 const LONGEST_FUTURE: TimeNs = TimeNs(1_000_000_000);
@@ -292,9 +292,10 @@ impl Server {
 
     /// Turns the newest picture of a client into a frame, and hands that over.
     fn show(&mut self, number: u64, shown: &mut Option<u64>, now: TimeNs) {
-        let free =
-            self.frames.iter().position(|frame| Arc::strong_count(frame) == 1).expect("one frame more than are used");
-        let mut frame = self.frames.swap_remove(free);
+        // While engines are changed both hold a frame.
+        let free = self.frames.iter().position(|frame| Arc::strong_count(frame) == 1);
+        let mut frame = free
+            .map_or_else(|| Arc::new(RgbdFrame::black(self.target.resolution)), |free| self.frames.swap_remove(free));
         let sink = Arc::clone(&self.sink);
         self.with(number, shown, |client, target, status| {
             let Some(picture) = client.take() else { return Ok(()) };

@@ -279,6 +279,19 @@ fn while_a_scene_is_shown_no_client_is() {
 }
 
 #[test]
+fn frames_that_others_keep_are_replaced_by_new_ones() {
+    let mut bench = Bench::new();
+    let mut client = bench.client("camera");
+    let kept: Vec<_> = (0..20)
+        .map(|sequence| {
+            assert_eq!(send(&mut client, 0, sequence, sequence as u8).0, TAKEN);
+            Arc::clone(bench.pictures.at(TimeNs(0)).0)
+        })
+        .collect();
+    assert!(kept.is_sorted_by(|a, b| a.amplitude[0] < b.amplitude[0]), "none was written to again");
+}
+
+#[test]
 fn shared_memory_cannot_be_made_shorter_under_holod() {
     let bench = Bench::new();
     let client = bench.client("hostile");
