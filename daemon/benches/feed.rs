@@ -4,6 +4,7 @@
 #![allow(clippy::print_stdout, reason = "it prints what it measured")]
 
 use std::hint::black_box;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
@@ -24,7 +25,7 @@ fn main() {
 
     let folder = tempfile::tempdir().expect("a folder for the socket");
     let socket = folder.path().join("feed");
-    let plan = FeedPlan { socket: socket.clone(), resolution: SIZE, fit: Fit::Native };
+    let plan = Arc::new(FeedPlan::new(socket.clone(), SIZE, Fit::Native));
     let pictures = Pictures::Feed(plan);
     let OpenPictures { mut source, feed: _feed, .. } =
         source::open(&pictures, &DisplayGeometry::DEFAULT, TimeNs(0)).expect("a feed");

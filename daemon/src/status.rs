@@ -69,8 +69,7 @@ pub fn of_running() -> Result<Vec<Found>, Failure> {
     let mut folders = vec![PathBuf::from(SERVICE_FOLDER)];
     folders.extend(runtime_folder::candidates());
     folders.dedup();
-    // A listing that is read while a file is renamed may miss it.
-    of_running_in(&folders).or_else(|_| of_running_in(&folders))
+    of_running_in(&folders)
 }
 
 /// Those that run and are meant: all, or the one of process `pid`.
@@ -78,14 +77,16 @@ pub fn of_running() -> Result<Vec<Found>, Failure> {
 /// # Errors
 /// As [`of_running`], or that process is no holod.
 pub fn of_running_as(pid: Option<u32>) -> Result<Vec<Found>, Failure> {
-    let mut running = of_running()?;
-    if let Some(pid) = pid {
-        running.retain(|found| found.status.pid == pid);
-    }
-    if running.is_empty() {
-        return Err(Failure::new(Exit::Unavailable, "no holod of that process number is running"));
-    }
-    Ok(running)
+    let look = || {
+        let mut running = of_running()?;
+        running.retain(|found| pid.is_none_or(|pid| found.status.pid == pid));
+        if running.is_empty() {
+            return Err(Failure::new(Exit::Unavailable, "no holod of that process number is running"));
+        }
+        Ok(running)
+    };
+    // A listing that is read while a file is renamed may miss it.
+    look().or_else(|_| look())
 }
 
 /// The only one.

@@ -49,7 +49,7 @@ fn text_of(status: &Snapshot) -> String {
          tracker  {}: link {}{}\n\
          \x20        {}\n\
          panel    {}: {:.2} refreshes a second{}\n\
-         lasers   {}{}\n\
+         lasers   {}{}{}\n\
          engine   {}; weights {}\n\
          frames   {:.1} a second of the panel's {:.1}{}; {} made, {} shown, {} late\n\
          time     per frame {}; tracker sample to photons {}{feed}",
@@ -67,7 +67,8 @@ fn text_of(status: &Snapshot) -> String {
         status.panel,
         figures.panel_refresh_hz,
         status.panel_trouble.as_ref().map_or(String::new(), |trouble| format!("; lost: {trouble}")),
-        if status.lasers_kept_dark { "kept dark by `holod ctl lasers dark`" } else { &status.lasers },
+        status.lasers,
+        if status.lasers_kept_dark { ", kept dark by `holod ctl lasers dark`" } else { "" },
         status.lasers_trouble.as_ref().map_or(String::new(), |trouble| format!("; {trouble}")),
         figures.engine,
         figures.weights,

@@ -3,11 +3,15 @@
 use std::io::{BufRead, BufReader, Write};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
+use std::time::Duration;
 
 use serde_json::Value;
 
 use super::{Answer, Request};
 use crate::failure::{Exit, Failure};
+
+/// Longer than a scene of the largest size takes to read.
+const PATIENCE: Duration = Duration::from_secs(120);
 
 /// Asks the holod that listens at `socket`, and waits for its answer.
 ///
@@ -15,9 +19,16 @@ use crate::failure::{Exit, Failure};
 /// It is not there, or refuses.
 pub fn ask(socket: &Path, request: &Request) -> Result<Value, Failure> {
     let gone = |error: std::io::Error| {
-        Failure::new(Exit::Unavailable, format!("{}: holod does not answer there: {error}", socket.display()))
+        Failure::new(
+            Exit::Unavailable,
+            format!(
+                "{}: holod does not answer there: {error}; `holod dark` puts the lasers out beside it",
+                socket.display()
+            ),
+        )
     };
     let mut stream = UnixStream::connect(socket).map_err(gone)?;
+    stream.set_read_timeout(Some(PATIENCE)).map_err(gone)?;
     let mut line = serde_json::to_vec(request).map_err(Failure::because(Exit::Software))?;
     line.push(b'\n');
     stream.write_all(&line).map_err(gone)?;

@@ -16,7 +16,7 @@ use serde_json::Value;
 
 pub use self::client::ask;
 pub(crate) use self::prepare::{NewEngine, Preparer};
-pub(crate) use self::server::ControlServer;
+pub(crate) use self::server::{ControlServer, panic_is_caught};
 pub(crate) use self::steering::Steering;
 
 use crate::source::scene::Frames;
@@ -65,6 +65,11 @@ impl Request {
     /// Whether the run is another one after it.
     pub(crate) fn changes_something(&self) -> bool {
         *self != Self::Status
+    }
+
+    /// Whether files must be read or an engine opened for it, which takes a while.
+    fn takes_long(&self) -> bool {
+        matches!(self, Self::Scene { .. } | Self::Weights { .. })
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use holod_calibration::rig::Rig;
+use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_calibration::{PupilDiameter, Resolution, TimeNs};
 use holod_model::scene::Fit;
 use holod_model::{RgbdFrame, Weights};
@@ -24,6 +24,8 @@ const FRAMES_BEFORE_STALL: i64 = 3;
 pub(crate) struct Preparer {
     pub(crate) rig: Rig,
     pub(crate) resolution: Resolution,
+    /// What engines are tried out with. It lives as long as the run: an engine keeps the last frame that it has seen.
+    pub(crate) frame: Arc<RgbdFrame>,
     pub(crate) backend: Backend,
     pub(crate) encoder: Arc<PanelEncoder>,
     pub(crate) has_feed: bool,
@@ -35,8 +37,8 @@ pub(crate) struct NewEngine {
     pub(crate) renderer: Box<dyn Renderer>,
     /// The pupils that its network was trained for, on this bench.
     pub(crate) trained: [PupilDiameter; 2],
-    /// What its weights are called.
-    pub(crate) weights: String,
+    /// Its weights.
+    pub(crate) weights: WeightsChoice,
 }
 
 impl Preparer {
@@ -54,18 +56,24 @@ impl Preparer {
             Request::Stop => Ok(Order::Stop),
             Request::Pupil { mm: None } => Ok(Order::Pupil(None)),
             Request::Pupil { mm: Some(mm) } => cli::human_pupil(*mm).map(|pupil| Order::Pupil(Some(pupil))),
-            Request::Scene { scene, .. } if scene == "feed" => self.feed(),
+            Request::Scene { scene, depth_encoding, .. } if scene == "feed" => self.feed(depth_encoding.is_some()),
             Request::Scene { scene, depth_encoding, fit } => self.scene(scene, depth_encoding.as_ref(), *fit),
             Request::Weights { weights } => self.engine(weights).map(Order::Engine),
         }
     }
 
-    fn feed(&self) -> Result<Order, String> {
-        let hint = "this holod has no live feed: start it with --scene feed";
-        if self.has_feed { Ok(Order::Feed) } else { Err(hint.into()) }
+    fn feed(&self, says_encoding: bool) -> Result<Order, String> {
+        match (self.has_feed, says_encoding) {
+            (false, _) => Err("this holod has no live feed: start it with --scene feed".into()),
+            (true, true) => Err("depth_encoding is for files: a feed's clients say what their depths are".into()),
+            (true, false) => Ok(Order::Feed),
+        }
     }
 
     fn scene(&self, scene: &str, depth_encoding: Option<&String>, fit: Fit) -> Result<Order, String> {
+        if !scene.starts_with('/') {
+            return Err(format!("scene \"{scene}\" was found, expected an absolute path, or feed"));
+        }
         let named = SceneArgs {
             scene: Some(scene.to_owned()),
             depth_encoding: depth_encoding.cloned(),
@@ -79,7 +87,10 @@ impl Preparer {
     fn engine(&self, weights: &str) -> Result<NewEngine, String> {
         let mut rig = self.rig.clone();
         rig.model.weights = cli::parse_weights(weights)?;
-        let name = setup::weights_name(&rig.model.weights);
+        if matches!(&rig.model.weights, WeightsChoice::File(path) if path.is_relative()) {
+            return Err(format!("weights \"{weights}\" were found, expected a name or an absolute path"));
+        }
+        let choice = rig.model.weights.clone();
         let weights = setup::weights(&rig).map_err(in_words)?;
         let renderer = scheduling::patient(|| renderer::open(self.backend, &weights, &rig.geometry, &self.encoder));
         let mut renderer = renderer.map_err(in_words)?;
@@ -92,18 +103,17 @@ impl Preparer {
                 self.stall_timeout.seconds()
             ));
         }
-        Ok(NewEngine { renderer, trained: weights.trained_pupils(&rig.geometry), weights: name })
+        Ok(NewEngine { renderer, trained: weights.trained_pupils(&rig.geometry), weights: choice })
     }
 
     /// Makes two frames, of which the first may be slow, beside those of the loop; how long the second took.
     fn warm_up(&self, renderer: &mut dyn Renderer, weights: &Weights) -> Result<TimeNs, String> {
-        let (frame, mut levels) =
-            (Arc::new(RgbdFrame::black(self.resolution)), LevelsFrame::new(self.encoder.layout()));
+        let mut levels = LevelsFrame::new(self.encoder.layout());
         let [pupil, _] = weights.trained_pupils(&self.rig.geometry);
         let mut began = host_now();
         for _ in 0..2 {
             began = host_now();
-            renderer.render(&frame, pupil, &mut levels).map_err(|error| error.to_string())?;
+            renderer.render(&self.frame, pupil, &mut levels).map_err(|error| error.to_string())?;
         }
         Ok(host_now() - began)
     }

@@ -1,8 +1,10 @@
 //! The control socket. tokio lives here and nowhere else, with one thread of its own and one for what takes long; no
 //! real-time thread waits for either.
 
+use std::cell::Cell;
 use std::collections::VecDeque;
 use std::io;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, mpsc};
 use std::time::Duration;
@@ -11,10 +13,10 @@ use rustix::net::SocketType;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{UnixListener, UnixStream};
 use tokio::runtime::Runtime;
-use tokio::sync::oneshot;
+use tokio::sync::{Semaphore, oneshot};
 use tokio::task::AbortHandle;
 
-use super::{Answer, Ordered, Preparer, Request};
+use super::{Answer, Order, Ordered, Preparer, Request};
 use crate::local_socket;
 
 /// Connections at once. A further one takes the place of the oldest, so that nobody who only holds on keeps others out.
@@ -22,7 +24,7 @@ const CONNECTIONS: usize = 32;
 /// The longest request, in bytes.
 const LONGEST: u64 = 1 << 16;
 const STACK_BYTES: usize = 1 << 20;
-/// Longer than the control thread takes for anything.
+/// Longer than the control thread takes for anything; an order that nobody waits for any more is not obeyed.
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// A control socket that listens. Dropping it ends that.
@@ -54,7 +56,8 @@ impl ControlServer {
             let _inside = runtime.enter();
             UnixListener::from_std(listener.into())?
         };
-        runtime.spawn(serve(listener, Arc::new(preparer), orders));
+        let waiting = Waiting { preparer, orders, long_work: Semaphore::new(1) };
+        runtime.spawn(serve(listener, Arc::new(waiting)));
         Ok((Self { socket, runtime: Some(runtime) }, receiver))
     }
 
@@ -74,7 +77,7 @@ impl Drop for ControlServer {
     }
 }
 
-async fn serve(listener: UnixListener, preparer: Arc<Preparer>, orders: mpsc::Sender<Ordered>) {
+async fn serve(listener: UnixListener, desk: Arc<Waiting>) {
     let mut connections: VecDeque<AbortHandle> = VecDeque::new();
     loop {
         let Ok((stream, _)) = listener.accept().await else {
@@ -88,16 +91,16 @@ async fn serve(listener: UnixListener, preparer: Arc<Preparer>, orders: mpsc::Se
         {
             oldest.abort();
         }
-        let (preparer, orders) = (Arc::clone(&preparer), orders.clone());
+        let desk = Arc::clone(&desk);
         let connection = tokio::spawn(async move {
             // A client that has gone away is no fault.
-            let _gone = converse(stream, &preparer, &orders).await;
+            let _gone = converse(stream, &desk).await;
         });
         connections.push_back(connection.abort_handle());
     }
 }
 
-async fn converse(stream: UnixStream, preparer: &Arc<Preparer>, orders: &mpsc::Sender<Ordered>) -> io::Result<()> {
+async fn converse(stream: UnixStream, desk: &Arc<Waiting>) -> io::Result<()> {
     let (read, mut write) = stream.into_split();
     let mut read = BufReader::new(read);
     loop {
@@ -108,7 +111,7 @@ async fn converse(stream: UnixStream, preparer: &Arc<Preparer>, orders: &mpsc::S
         }
         let is_whole = line.ends_with(b"\n");
         let answer = if is_whole {
-            answer(&line, preparer, orders).await
+            answer(&line, desk).await
         } else {
             Answer::Error(format!("a request without an end was found, expected a line of at most {LONGEST} bytes"))
         };
@@ -121,25 +124,60 @@ async fn converse(stream: UnixStream, preparer: &Arc<Preparer>, orders: &mpsc::S
     }
 }
 
-async fn answer(line: &[u8], preparer: &Arc<Preparer>, orders: &mpsc::Sender<Ordered>) -> Answer {
+async fn answer(line: &[u8], desk: &Arc<Waiting>) -> Answer {
     let request: Request = match serde_json::from_slice(line) {
         Ok(request) => request,
         Err(error) => return Answer::Error(format!("the request is not understood: {error}")),
     };
-    let (preparer, asked) = (Arc::clone(preparer), request.clone());
-    let order = match tokio::task::spawn_blocking(move || preparer.prepare(&asked)).await {
+    // Nothing that takes long stands before darkness.
+    let prepared = if request.takes_long() {
+        let Ok(_alone) = desk.long_work.try_acquire() else {
+            return Answer::Error("holod is busy with another scene or other weights: ask again".into());
+        };
+        let (waiting, asked) = (Arc::clone(desk), request.clone());
+        tokio::task::spawn_blocking(move || waiting.prepare_long(&asked)).await
+    } else {
+        Ok(desk.preparer.prepare(&request))
+    };
+    let order = match prepared {
         Ok(Ok(order)) => order,
         Ok(Err(why)) => return Answer::Error(why),
-        Err(_panic) => return Answer::Error("holod failed over this request: see its log".into()),
+        Err(_panic) => return Answer::Error("holod failed over this request, and goes on: see its log".into()),
     };
     let (answer, answered) = oneshot::channel();
     let ending = || Answer::Error("holod is ending".into());
-    if orders.send(Ordered { order, request, answer }).is_err() {
+    if desk.orders.send(Ordered { order, request, answer }).is_err() {
         return ending();
     }
     match tokio::time::timeout(PATIENCE, answered).await {
         Ok(Ok(answer)) => answer,
         Ok(Err(_dropped)) => ending(),
         Err(_elapsed) => Answer::Error("holod's control thread does not answer: see its log".into()),
+    }
+}
+
+/// What every connection needs.
+struct Waiting {
+    preparer: Preparer,
+    orders: mpsc::Sender<Ordered>,
+    /// Of what takes long, one at a time.
+    long_work: Semaphore,
+}
+
+thread_local! {
+    static CATCHES_PANICS: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Whether a panic of this thread is caught and is an error like any other: a decoder's, over somebody's file.
+pub(crate) fn panic_is_caught() -> bool {
+    CATCHES_PANICS.get()
+}
+
+impl Waiting {
+    fn prepare_long(&self, request: &Request) -> Result<Order, String> {
+        CATCHES_PANICS.set(true);
+        let order = catch_unwind(AssertUnwindSafe(|| self.preparer.prepare(request)));
+        CATCHES_PANICS.set(false);
+        order.unwrap_or_else(|panic| resume_unwind(panic))
     }
 }

@@ -23,7 +23,7 @@ use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
 use super::watch::{Limits, Names, Rings, Told, Watch};
 use super::{Observer, RECORDS, SessionPlan, Signals, host_now, scheduling, tracker_failure};
-use crate::control::{Preparer, Steering};
+use crate::control::{self, Preparer, Steering};
 use crate::failure::{Exit, Failure};
 use crate::renderer::{self, Renderer};
 use crate::source::OpenPictures;
@@ -98,7 +98,10 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         scheduling::prompt(|| open_output(&plan, &encoder, options)).map_err(Failure::because(Exit::Unavailable))
     })?;
     tracing::debug!("panel `{}` is open; lasers by {:?}", plan.output, rig.lasers.driver);
-    output.control.dark_switch().install_panic_hook(host_now, holod_model::gpu::panic_is_caught);
+    output
+        .control
+        .dark_switch()
+        .install_panic_hook(host_now, || holod_model::gpu::panic_is_caught() || control::panic_is_caught());
 
     let stop = Arc::new(AtomicBool::new(false));
     let records_lost = Arc::new(AtomicU64::new(0));
@@ -109,6 +112,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
     let preparer = Preparer {
         rig: rig.clone(),
         resolution,
+        frame: plan.pictures.first_frame(),
         backend: plan.backend,
         encoder: Arc::clone(&encoder),
         has_feed: feed.is_some(),
@@ -140,7 +144,6 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         Limits { t_origin, frames: plan.frame_limit, duration: plan.duration, replay_ends_run: replay_ends_run(&plan) };
     let names = Names {
         scene,
-        weights: setup::weights_name(&rig.model.weights),
         tracker: plan.tracker.to_string(),
         panel: plan.output.to_string(),
         engine,

@@ -2,7 +2,6 @@
 
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
-use std::time::Duration;
 
 use holod_calibration::{PupilDiameter, TimeNs};
 use holod_slm_output::OutputControl;
@@ -15,10 +14,11 @@ use crate::control::{Answer, ControlServer, NewEngine, Order, Ordered, Preparer,
 use crate::failure::Failure;
 use crate::renderer::Renderer;
 use crate::runtime_folder;
+use crate::setup;
 use crate::source::PictureSink;
 
-/// How long lasers may take to go dark before that is called a fault.
-const DARK_WAIT: TimeNs = TimeNs(300_000_000);
+/// Orders between two looks at everything else.
+const ORDERS_AT_ONCE: usize = 4;
 
 /// The ways into the other threads.
 pub(super) struct Changes {
@@ -70,12 +70,20 @@ impl Desk {
 
 impl Watch<'_> {
     /// Obeys what has been asked for; whether that is to end.
-    pub(super) fn obey(&mut self, output: &OutputControl, now: TimeNs) -> Result<bool, Failure> {
-        while self.desk.changes.retired.pop().is_ok() {}
-        while let Some(Ordered { order, request, answer }) = self.desk.next() {
+    pub(super) fn obey(&mut self, output: &OutputControl) -> Result<bool, Failure> {
+        for _ in 0..ORDERS_AT_ONCE {
+            while self.desk.changes.retired.pop().is_ok() {}
+            let Some(Ordered { order, request, answer }) = self.desk.next() else { break };
             let ends = matches!(order, Order::Stop);
+            let is_urgent = ends || matches!(order, Order::KeepDark(true));
+            // Whoever asked was told that it is not done.
+            if answer.is_closed() && !is_urgent {
+                continue;
+            }
+            let now = host_now();
             let done = self.carry_out(order, output, now);
-            if done.is_ok() && request.changes_something() {
+            // Lasers are kept dark even where the box did not acknowledge it.
+            if (done.is_ok() || is_urgent) && request.changes_something() {
                 let request_text = serde_json::to_string(&request).unwrap_or_default();
                 tracing::info!("asked by holod ctl: {request_text}");
                 self.observer.order(now, &request)?;
@@ -100,7 +108,8 @@ impl Watch<'_> {
             }
             Order::Scene(frames) => {
                 self.names.scene.clone_from(&frames.name);
-                let said = format!("{} is shown", frames.name);
+                let later = if self.desk.is_paused() { " once the picture goes on: `holod ctl resume`" } else { "" };
+                let said = format!("{} is shown{later}", frames.name);
                 sink(&self.desk).lock().unwrap_or_else(PoisonError::into_inner).show_scene(frames, now);
                 Ok(said.into())
             }
@@ -131,32 +140,22 @@ impl Watch<'_> {
         let description = renderer.description().to_owned();
         let busy = |_| "the engine is being changed at this moment: ask again".to_owned();
         self.desk.changes.engines.push((renderer, TrainedPupils::of(trained))).map_err(busy)?;
+        let said = format!("holograms are computed with the weights {}, {description}", setup::weights_name(&weights));
         *self.names.engine.lock().unwrap_or_else(PoisonError::into_inner) = description;
-        let said = format!("holograms are computed with the weights {weights}");
-        self.names.weights = weights;
+        self.rig.model.weights = weights;
         Ok(said.into())
     }
 
-    /// Waits until the box has acknowledged darkness.
     fn keep_dark(&mut self, dark: bool, output: &OutputControl) -> Result<Value, String> {
-        let faults = output.counts().box_faults;
-        output.keep_dark(dark);
         self.desk.keeps_dark = dark;
-        if !dark {
-            return Ok("lasers are lit again by the rules".into());
+        match (output.keep_dark(dark), dark) {
+            (_, false) => Ok("lasers are lit again by the rules".into()),
+            (true, true) => Ok("the lasers are dark, and stay so until `holod ctl lasers arm`".into()),
+            (false, true) => {
+                Err("the laser box did not acknowledge darkness: look at the lasers, and switch them off by \
+                                  hand. holod lights none until `holod ctl lasers arm`"
+                    .into())
+            }
         }
-        let t_end = host_now() + DARK_WAIT;
-        while output.counts().armed && host_now() < t_end {
-            std::thread::sleep(Duration::from_millis(1));
-        }
-        let counts = output.counts();
-        if counts.armed || counts.box_faults != faults {
-            return Err(
-                "the laser box did not acknowledge darkness: look at the lasers, switch them off by hand, and \
-                        see holod's log"
-                    .into(),
-            );
-        }
-        Ok("the lasers are dark, and stay so until `holod ctl lasers arm`".into())
     }
 }

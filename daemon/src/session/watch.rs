@@ -25,8 +25,8 @@ use super::{Observer, Signals, host_now};
 use crate::failure::{Exit, Failure};
 use crate::snapshot::{Figures, Snapshot};
 use crate::source::feed::Feed;
-use crate::speed;
 use crate::status::StatusFile;
+use crate::{setup, speed};
 
 const TICK: Duration = Duration::from_millis(10);
 const TICKS_PER_REPORT: u32 = 10;
@@ -60,7 +60,6 @@ pub(super) struct Watch<'a> {
 /// What the parts of a run are called.
 pub(super) struct Names {
     pub(super) scene: String,
-    pub(super) weights: String,
     pub(super) tracker: String,
     pub(super) panel: String,
     /// How holograms are computed; another engine may take the place of the first.
@@ -134,7 +133,7 @@ impl Watch<'_> {
             std::thread::sleep(TICK);
             let now = host_now();
             self.drain()?;
-            if self.obey(output, now)? {
+            if self.obey(output)? {
                 return Ok("holod ctl stop".to_owned());
             }
             self.service.progress(self.tally.frames_shown, now);
@@ -307,7 +306,7 @@ impl Watch<'_> {
         Figures {
             rig: self.rig.name.clone(),
             scene: names.scene.clone(),
-            weights: names.weights.clone(),
+            weights: setup::weights_name(&self.rig.model.weights),
             tracker: names.tracker.clone(),
             engine: names.engine.lock().unwrap_or_else(PoisonError::into_inner).clone(),
             hologram: names.hologram.to_string(),

@@ -23,7 +23,7 @@ pub enum Pictures {
     /// A scene from files, or the built-in one.
     Scene(Arc<Frames>),
     /// What clients of a live feed hand over.
-    Feed(FeedPlan),
+    Feed(Arc<FeedPlan>),
 }
 
 impl Pictures {
@@ -47,7 +47,7 @@ impl Pictures {
     pub fn first_frame(&self) -> Arc<RgbdFrame> {
         match self {
             Self::Scene(frames) => Arc::clone(&frames.frames[0]),
-            Self::Feed(plan) => Arc::new(RgbdFrame::black(plan.resolution)),
+            Self::Feed(plan) => Arc::clone(&plan.black),
         }
     }
 }
@@ -75,7 +75,7 @@ pub fn named(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Pictures, F
         Some(path) => path.into(),
         None => feed::default_socket().map_err(Failure::because(Exit::Unavailable))?,
     };
-    Ok(Pictures::Feed(FeedPlan { socket, resolution, fit: args.fit.into() }))
+    Ok(Pictures::Feed(Arc::new(FeedPlan::new(socket, resolution, args.fit.into()))))
 }
 
 /// Pictures on their way, by the threads that hold their parts.
@@ -97,7 +97,7 @@ pub fn open(pictures: &Pictures, geometry: &DisplayGeometry, t_start: TimeNs) ->
     let sink = Arc::new(Mutex::new(sink));
     let feed = match pictures {
         Pictures::Scene(_) => None,
-        Pictures::Feed(plan) => Some(Feed::listen(plan.clone(), geometry, Arc::clone(&sink))?),
+        Pictures::Feed(plan) => Some(Feed::listen(plan, geometry, Arc::clone(&sink))?),
     };
     Ok(OpenPictures { sink, source, feed })
 }
@@ -154,16 +154,18 @@ impl PictureSink {
         self.scenes.push(frames);
     }
 
-    /// Shows a live picture from the next frame on, where those are shown. Whoever has it keeps its frame alive.
+    /// Shows a live picture from the next frame on, where those are shown, and says whether they are. Whoever has it keeps
+    /// its frame alive.
     ///
     /// # Panics
     /// As [`Self::show_scene`].
-    pub fn show_live(&mut self, frame: Arc<RgbdFrame>, tag: PictureTag) {
+    pub fn show_live(&mut self, frame: Arc<RgbdFrame>, tag: PictureTag) -> bool {
         assert_eq!(frame.resolution, self.size, "every picture has the hologram's size");
         if self.is_live {
             self.input.write(Shown::Live { frame, tag });
             self.drop_old_scenes();
         }
+        self.is_live
     }
 
     fn drop_old_scenes(&mut self) {
@@ -220,7 +222,7 @@ mod tests {
     const SIZE: Resolution = Resolution { width: 4, height: 2 };
 
     fn feed() -> Pictures {
-        Pictures::Feed(FeedPlan { socket: "feed".into(), resolution: SIZE, fit: Fit::Native })
+        Pictures::Feed(Arc::new(FeedPlan::new("feed".into(), SIZE, Fit::Native)))
     }
 
     fn show(sink: &mut PictureSink, number: u64) {

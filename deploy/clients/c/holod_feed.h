@@ -79,7 +79,7 @@ enum holod_feed_outcome {
     HOLOD_FEED_TAKEN = 0,
     HOLOD_FEED_OVERTAKEN = 1, /* a newer picture came before holod needed this one */
     HOLOD_FEED_REFUSED = 2,   /* the last good picture stays on the panel */
-    HOLOD_FEED_NOT_SHOWN = 3  /* another client is shown */
+    HOLOD_FEED_NOT_SHOWN = 3  /* another client or a scene is shown */
 };
 
 struct holod_feed_outcomes {

@@ -17,6 +17,8 @@ use crate::present::Recorder;
 
 /// How long shutdown waits for the lasers' acknowledgement.
 const DARK_WAIT: TimeNs = TimeNs(500_000_000);
+/// Boxes that are asked twice take a second.
+const KEEP_DARK_WAIT: TimeNs = TimeNs(2_000_000_000);
 /// How long a panic waits for it.
 const PANIC_WAIT: TimeNs = TimeNs(20_000_000);
 
@@ -55,11 +57,25 @@ impl OutputControl {
         self.switch.clone()
     }
 
-    /// Keeps the lasers dark until this is taken back; then they are lit again by the rules. Does not wait: the box has
-    /// acknowledged when [`OutputCounts::armed`] is false and it has no new fault.
-    pub fn keep_dark(&self, dark: bool) {
-        self.switch.shared.dark_wanted.store(dark, Ordering::Release);
+    /// Keeps the lasers dark until this is taken back; then they are lit again by the rules. Waits for the box, some two
+    /// seconds at most; whether it has acknowledged. They are kept dark also where it has not.
+    pub fn keep_dark(&self, dark: bool) -> bool {
+        let shared = &self.switch.shared;
+        let before = shared.dark_request.load(Ordering::Acquire);
+        let request = ((before >> 1) + 1) << 1 | u64::from(dark);
+        shared.dark_request.store(request, Ordering::Release);
         self.switch.laser.unpark();
+        let t_end = (self.clock)() + KEEP_DARK_WAIT;
+        loop {
+            let answer = shared.dark_answer.load(Ordering::Acquire);
+            if answer >> 2 == request {
+                return answer & 3 == u64::from(DARK);
+            }
+            if (self.clock)() > t_end {
+                return false;
+            }
+            std::thread::sleep(Duration::from_micros(500));
+        }
     }
 
     /// Counters so far.

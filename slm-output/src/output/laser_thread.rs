@@ -25,8 +25,8 @@ pub(super) struct LaserThread {
     pub(super) ledger: Ledger,
     /// What went wrong with the box, for whoever tells people.
     pub(super) faults: Producer<LaserError>,
-    /// A person asks for darkness.
-    pub(super) held: bool,
+    /// The last of a person's requests for darkness, or to take it back.
+    pub(super) dark_request: u64,
     /// A box that failed is left alone until then.
     pub(super) t_retry: TimeNs,
     /// The box failed and may have lost its program.
@@ -59,10 +59,11 @@ impl LaserThread {
         if let Some(reason) = self.shared.latched() {
             self.latch(reason, now);
         }
-        let held = self.shared.dark_wanted.load(Ordering::Acquire);
-        if held != std::mem::replace(&mut self.held, held) {
-            let orders = self.scheduler.hold(held);
-            self.obey(orders, now);
+        let request = self.shared.dark_request.load(Ordering::Acquire);
+        if request != std::mem::replace(&mut self.dark_request, request) {
+            let orders = self.scheduler.hold(request & 1 == 1);
+            let answer = self.darkness(orders, now);
+            self.shared.dark_answer.store(request << 2 | u64::from(answer), Ordering::Release);
         }
         self.decide_fields(clock());
         while let Ok(news) = self.news.pop() {
@@ -155,14 +156,19 @@ impl LaserThread {
             return;
         }
         let orders = self.scheduler.latch(reason);
-        let answer = match self.try_obey(orders, now) {
+        let answer = self.darkness(orders, now);
+        self.shared.acknowledged.store(answer, Ordering::Release);
+    }
+
+    /// Orders darkness; what the box says to it.
+    fn darkness(&mut self, orders: Orders, now: TimeNs) -> u8 {
+        match self.try_obey(orders, now) {
             Ok(_) => DARK,
             Err(error) => {
                 self.note(error);
                 FAILED
             }
-        };
-        self.shared.acknowledged.store(answer, Ordering::Release);
+        }
     }
 
     fn poll(&mut self, now: TimeNs) {

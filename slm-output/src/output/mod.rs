@@ -155,7 +155,7 @@ impl Output {
             faults: fault_producer,
             t_retry: TimeNs(i64::MIN),
             program_lost: false,
-            held: false,
+            dark_request: 0,
             shared: Arc::clone(&shared),
             clock,
         };

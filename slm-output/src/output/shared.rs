@@ -38,8 +38,10 @@ pub(super) struct Shared {
     pub(super) latch: AtomicU8,
     /// What the box said to that.
     pub(super) acknowledged: AtomicU8,
-    /// A person asks for darkness, until that is taken back.
-    pub(super) dark_wanted: AtomicBool,
+    /// Whether a person asks for darkness, in the lowest bit; above it the number of the request.
+    pub(super) dark_request: AtomicU64,
+    /// The request that has been obeyed, and the box's answer in the two lowest bits.
+    pub(super) dark_answer: AtomicU64,
     pub(super) flat_wanted: AtomicBool,
     pub(super) flat_shown: AtomicBool,
     pub(super) stop: AtomicBool,

@@ -87,7 +87,7 @@ impl Bench {
             faults: RingBuffer::new(SHORT_RING).0,
             t_retry: TimeNs(i64::MIN),
             program_lost: false,
-            held: false,
+            dark_request: 0,
             shared: Arc::default(),
             clock: || TimeNs(0),
         };
@@ -236,7 +236,7 @@ fn lasers_that_are_kept_dark_stay_so_until_that_is_taken_back() {
     for mode in MODES {
         let mut bench = Bench::new(mode);
         bench.run(TimeNs(300 * MS), TimeNs(0));
-        bench.laser.shared.dark_wanted.store(true, Ordering::Release);
+        bench.laser.shared.dark_request.store(3, Ordering::Release);
         let t_asked = bench.now + TimeNs(MS);
         bench.wake(t_asked);
         let &[(t_dark, DarkReason::Asked)] = bench.darks.as_slice() else { panic!("{:?}", bench.darks) };
@@ -245,7 +245,8 @@ fn lasers_that_are_kept_dark_stay_so_until_that_is_taken_back() {
         bench.run(TimeNs(600 * MS), TimeNs(0));
         assert_eq!(bench.edges.len(), edges);
         assert_eq!(bench.all_events.last().unwrap().dark, Some(DarkReason::Asked));
-        bench.laser.shared.dark_wanted.store(false, Ordering::Release);
+        assert_eq!(bench.laser.shared.dark_answer.load(Ordering::Acquire), 3 << 2 | u64::from(DARK));
+        bench.laser.shared.dark_request.store(4, Ordering::Release);
         bench.run(TimeNs(900 * MS), TimeNs(0));
         assert!(bench.edges.len() > edges + 10, "lit again by the rules");
         assert_eq!(bench.verdict().unsafe_findings().collect::<Vec<_>>(), Vec::<&Finding>::new());
@@ -496,6 +497,24 @@ fn the_real_threads_show_light_and_end_in_order() {
         assert!(verdict.lit > 0);
         assert_eq!((report.counts.fields, report.counts.lost), (events.len() as u64, 0));
     }
+}
+
+#[test]
+fn darkness_that_is_asked_for_is_acknowledged_each_time_or_said_not_to_be() {
+    let rig = rig(PanelMode::ChannelPacked);
+    let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
+    let output = headless(&rig, &encoder, OutputOptions::default());
+    assert!(output.control.keep_dark(true) && output.control.keep_dark(true) && output.control.keep_dark(false));
+    // A box that fails is not dark because nothing new is heard of it.
+    let panel = HeadlessPanel::new(&PanelSetup::new(&rig.panel, &encoder), monotonic_now(), ReportFaults::NONE);
+    let fails = Arc::new(AtomicBool::new(false));
+    let laser = Faulty { inner: SimulatedLaser::new(monotonic_now()), fails: Arc::clone(&fails) };
+    let options = OutputOptions::default();
+    let failing = Output::start(&rig, &encoder, Box::new(panel), Box::new(laser), options, monotonic_now).unwrap();
+    fails.store(true, Ordering::Relaxed);
+    assert!(!failing.control.keep_dark(true) && !failing.control.keep_dark(true));
+    fails.store(false, Ordering::Relaxed);
+    assert!(failing.control.keep_dark(true));
 }
 
 #[test]

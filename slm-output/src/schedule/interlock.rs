@@ -149,9 +149,14 @@ impl Interlock {
     }
 
     /// A person asks for darkness, or takes that back: lasers are lit again by the rules then.
+    /// The box is told even where it should be dark already, so that its answer says that it is.
     pub(super) fn hold(&mut self, held: bool) -> Orders {
         self.held = held;
-        if held { self.dark(DarkReason::Asked) } else { Orders::default() }
+        if !held {
+            return Orders::default();
+        }
+        self.armed = false;
+        Orders { dark: Some(DarkReason::Asked), ..Orders::default() }
     }
 
     /// Puts the lasers out for `reason` if they are armed.
@@ -169,15 +174,15 @@ impl Interlock {
         if let Some(reason) = self.latched {
             return Err(reason);
         }
-        if self.held {
-            return Err(DarkReason::Asked);
-        }
         if field.frame.is_none() {
             return Err(DarkReason::Flat);
         }
         // A frame is new when it is new, whether or not its first refresh is believed.
         if !field.repeated && field.reported {
             self.t_new_frame = field.t_present.min(now);
+        }
+        if self.held {
+            return Err(DarkReason::Asked);
         }
         if !self.evidence.accepts(field.provenance) {
             return Err(DarkReason::Untrusted);

@@ -84,12 +84,14 @@ impl Client {
         let mut was_reset = false;
         for _ in 0..MESSAGES_AT_ONCE {
             let length = match recv(&self.socket, &mut bytes, RecvFlags::DONTWAIT) {
+                // Said once of a client that closed before it had read everything; what it sent before that comes next.
+                Err(Errno::CONNRESET) if !std::mem::replace(&mut was_reset, true) => continue,
+                // What it handed over before is shown first.
+                Ok((0, _)) | Err(Errno::CONNRESET) if self.has_picture() => break,
                 Ok((0, _)) => return Err(Gone::Closed),
                 Ok((length, _)) => length,
                 Err(Errno::AGAIN) => break,
                 Err(Errno::INTR) => continue,
-                // Said once of a client that closed before it had read everything; what it sent before that comes next.
-                Err(Errno::CONNRESET) if !std::mem::replace(&mut was_reset, true) => continue,
                 Err(error) => return Err(error.into()),
             };
             let heard =
@@ -125,7 +127,11 @@ impl Client {
                     None => Ok(Ok(())),
                     Some((picture, outcome)) => {
                         note(&outcome);
-                        Ok(self.free(&picture, &outcome))
+                        match self.free(&picture, &outcome) {
+                            // There may be more that it has said before its end.
+                            Err(Gone::Closed) => Ok(Ok(())),
+                            freed => Ok(freed),
+                        }
                     }
                 }
             }

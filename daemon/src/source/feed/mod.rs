@@ -14,6 +14,7 @@ use std::os::fd::OwnedFd;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
 use holod_model::RgbdFrame;
@@ -38,6 +39,10 @@ const SILENCE: TimeNs = TimeNs(2_000_000_000);
 const FRAMES: usize = 5;
 /// Clocks of one machine agree better than this.
 const LONGEST_FUTURE: TimeNs = TimeNs(1_000_000_000);
+/// Rest after a connection that could not be accepted.
+const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
+/// Clients that go on doing wrong make one line in the log in this time.
+const REFUSAL_EVERY: TimeNs = TimeNs(1_000_000_000);
 /// The name of the socket in the runtime folder.
 const SOCKET: &str = "feed";
 
@@ -50,6 +55,15 @@ pub struct FeedPlan {
     pub resolution: Resolution,
     /// How pictures of another size are brought to it.
     pub fit: Fit,
+    /// What is shown until there is a picture. It lives as long as the plan: an engine keeps the last frame that it has seen.
+    pub black: Arc<RgbdFrame>,
+}
+
+impl FeedPlan {
+    /// Listens at `socket` for pictures to be brought to `resolution`.
+    pub fn new(socket: PathBuf, resolution: Resolution, fit: Fit) -> Self {
+        Self { socket, resolution, fit, black: Arc::new(RgbdFrame::black(resolution)) }
+    }
 }
 
 /// What can be said of the feed.
@@ -79,6 +93,18 @@ pub struct FeedStatus {
     pub newest_age_s: Option<f64>,
     #[serde(skip)]
     t_newest: Option<TimeNs>,
+    #[serde(skip)]
+    t_told: Option<TimeNs>,
+}
+
+impl FeedStatus {
+    fn tell_refusal(&mut self, what: &str, why: &str, now: TimeNs) {
+        if self.t_told.is_none_or(|t| now - t >= REFUSAL_EVERY) {
+            tracing::warn!("{what} is refused: {why}");
+            self.t_told = Some(now);
+        }
+        self.last_refusal = Some(why.to_owned());
+    }
 }
 
 /// Why there is no feed.
@@ -105,7 +131,8 @@ pub fn default_socket() -> Result<PathBuf, FeedError> {
 
 /// A feed that is listening. Dropping it ends its clients' connections and takes the socket away.
 pub struct Feed {
-    socket: PathBuf,
+    plan: Arc<FeedPlan>,
+    sink: Arc<Mutex<PictureSink>>,
     stop: OwnedFd,
     thread: Option<JoinHandle<()>>,
     status: Arc<Mutex<FeedStatus>>,
@@ -117,15 +144,16 @@ impl Feed {
     /// # Errors
     /// The socket cannot be made.
     pub fn listen(
-        plan: FeedPlan,
+        plan: &Arc<FeedPlan>,
         geometry: &DisplayGeometry,
         sink: Arc<Mutex<PictureSink>>,
     ) -> Result<Self, FeedError> {
-        let FeedPlan { socket, resolution, fit } = plan;
+        let FeedPlan { socket, resolution, fit, .. } = FeedPlan::clone(plan);
         let listener = local_socket::listen(&socket, SocketType::SEQPACKET)?;
         let stop = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)
             .map_err(|error| FeedError::Thread(error.into()))?;
         let status = Arc::new(Mutex::new(FeedStatus { socket: socket.clone(), ..FeedStatus::default() }));
+        let shown = Arc::clone(&sink);
         let mut server = Server {
             listener,
             stop: stop.try_clone().map_err(FeedError::Thread)?,
@@ -143,13 +171,16 @@ impl Feed {
             .spawn(move || server.serve())
             .map_err(FeedError::Thread)?;
         tracing::info!("waiting for pictures on {}", socket.display());
-        Ok(Self { socket, stop, thread: Some(thread), status })
+        Ok(Self { plan: Arc::clone(plan), sink: shown, stop, thread: Some(thread), status })
     }
 
     /// How it is at host time `now`.
     pub fn status(&self, now: TimeNs) -> FeedStatus {
         let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner).clone();
         status.newest_age_s = status.t_newest.map(|t| (now - t).seconds());
+        if !self.sink.lock().unwrap_or_else(PoisonError::into_inner).is_live() {
+            status.shown = None;
+        }
         status
     }
 }
@@ -160,7 +191,7 @@ impl Drop for Feed {
         if let Some(thread) = self.thread.take() {
             let _ended = thread.join();
         }
-        let _gone = fs::remove_file(&self.socket);
+        let _gone = fs::remove_file(&self.plan.socket);
     }
 }
 
@@ -235,7 +266,11 @@ impl Server {
     }
 
     fn accept(&mut self) {
-        let Ok(socket) = accept_with(&self.listener, SocketFlags::CLOEXEC) else { return };
+        let Ok(socket) = accept_with(&self.listener, SocketFlags::CLOEXEC) else {
+            // Too many open files, most likely, which the next look would find again at once.
+            std::thread::sleep(ACCEPT_AGAIN);
+            return;
+        };
         self.connections += 1;
         let client = Client::new(socket, self.connections);
         if self.clients.len() == CLIENTS {
@@ -257,7 +292,7 @@ impl Server {
         let client = &mut self.clients[index].1;
         let Err(gone) = act(client, &self.target, &mut self.status) else { return };
         let (_, client) = self.clients.remove(index);
-        self.left_out_of_gone += client.left_out();
+        self.left_out_of_gone = self.left_out_of_gone.saturating_add(client.left_out());
         match gone {
             Gone::Closed => tracing::info!("the feed's client `{}` is gone", client.name),
             Gone::Refused(_) => self.refuse(&client.name, &gone),
@@ -270,9 +305,8 @@ impl Server {
 
     fn refuse(&mut self, name: &str, gone: &Gone) {
         if let Gone::Refused(why) = gone {
-            tracing::warn!("the feed's client `{name}` is refused: {why}");
             self.status.connections_refused += 1;
-            self.status.last_refusal = Some(why.clone());
+            self.status.tell_refusal(&format!("the feed's client `{name}`"), why, host_now());
         }
     }
 
@@ -302,9 +336,10 @@ impl Server {
             let outcome = match take_over(client, &picture, target, &mut frame, now) {
                 Ok(tag) => {
                     // Whoever hears that it was taken may count on it.
-                    sink.lock().unwrap_or_else(PoisonError::into_inner).show_live(Arc::clone(&frame), tag);
                     status.t_newest = Some(now);
-                    Outcome::Taken
+                    let is_shown =
+                        sink.lock().unwrap_or_else(PoisonError::into_inner).show_live(Arc::clone(&frame), tag);
+                    if is_shown { Outcome::Taken } else { Outcome::NotShown }
                 }
                 Err(why) => Outcome::Refused(why),
             };
@@ -319,7 +354,7 @@ impl Server {
         self.status.shown = shown.and_then(name);
         self.status.clients = self.clients.iter().map(|(_, client)| client.name.clone()).collect();
         self.status.left_out =
-            self.left_out_of_gone + self.clients.iter().map(|(_, client)| client.left_out()).sum::<u64>();
+            self.clients.iter().fold(self.left_out_of_gone, |sum, (_, client)| sum.saturating_add(client.left_out()));
         self.shared.lock().unwrap_or_else(PoisonError::into_inner).clone_from(&self.status);
     }
 }
@@ -362,12 +397,8 @@ fn note(status: &mut FeedStatus, outcome: &Outcome) {
         Outcome::Overtaken => status.overtaken += 1,
         Outcome::NotShown => status.not_shown += 1,
         Outcome::Refused(why) => {
-            // A client that goes on sending the same must not flood the log.
-            if status.last_refusal.as_ref() != Some(why) {
-                tracing::warn!("a picture of the feed is refused: {why}");
-                status.last_refusal = Some(why.clone());
-            }
             status.refused += 1;
+            status.tell_refusal("a picture of the feed", why, host_now());
         }
     }
 }

@@ -58,7 +58,7 @@ impl Slots {
                 let why = format!("sequence {sequence} was found after {newest}, expected it to rise");
                 return Ok(Some((picture, Outcome::Refused(why))));
             }
-            self.left_out += sequence - newest - 1;
+            self.left_out = self.left_out.saturating_add(sequence - newest - 1);
         }
         self.newest_sequence = Some(sequence);
         Ok(self.waiting.replace(picture).map(|overtaken| (overtaken, Outcome::Overtaken)))

@@ -29,7 +29,7 @@ impl Bench {
     fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let socket = folder.path().join("feed");
-        let plan = FeedPlan { socket: socket.clone(), resolution: SIZE, fit: Fit::Native };
+        let plan = Arc::new(FeedPlan::new(socket.clone(), SIZE, Fit::Native));
         let OpenPictures { sink, source, feed } = open(&Pictures::Feed(plan), &BENCH, TimeNs(0)).unwrap();
         Self { _folder: folder, socket, feed: feed.unwrap(), sink, pictures: source }
     }
@@ -156,12 +156,12 @@ fn no_picture_is_torn_while_two_clients_send_as_fast_as_they_can() {
         newest = tag.number;
         looks += 1;
     }
+    bench.until("the other one is not shown", |status| status.not_shown > 0);
     stop.store(true, std::sync::atomic::Ordering::Relaxed);
     for client in clients {
         client.join().unwrap();
     }
     let status = bench.status();
-    assert!(status.not_shown > 0, "the other one is not shown: {status:?}");
     assert_eq!((status.refused, status.connections_refused), (0, 0));
 }
 
@@ -279,6 +279,26 @@ fn while_a_scene_is_shown_no_client_is() {
 }
 
 #[test]
+fn a_picture_before_the_end_of_its_client_is_shown() {
+    let mut bench = Bench::new();
+    for round in 1..50_u64 {
+        let client = bench.client("hasty");
+        let (colour, depth) = picture(255, 1000);
+        // An answer that it has not read makes of its end a reset.
+        for slot in 0..2 {
+            client.write(slot, &colour, &depth);
+            client.hand_over(slot, 2 * round + u64::from(slot), 0).unwrap();
+        }
+        drop(client);
+        let began = Instant::now();
+        while bench.shown().1.number != 2 * round + 1 {
+            assert!(began.elapsed() < Duration::from_secs(10), "round {round}: {:?}", bench.shown().1);
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
+
+#[test]
 fn frames_that_others_keep_are_replaced_by_new_ones() {
     let mut bench = Bench::new();
     let mut client = bench.client("camera");
@@ -302,15 +322,17 @@ fn shared_memory_cannot_be_made_shorter_under_holod() {
 fn a_client_that_never_reads_is_shown_out_and_nobody_waits_for_it() {
     let mut bench = Bench::new();
     let deaf = bench.client("deaf");
-    let mut sequence = 0;
-    // It hands over whatever is free by now, and reads nothing.
-    while deaf.hand_over((sequence % 3) as u32, sequence, 0).is_ok() && sequence < 100_000 {
-        sequence += 1;
-        if sequence % 3 == 0 {
-            thread::sleep(Duration::from_millis(1));
+    for sequence in 0..10_000 {
+        // It knows what is free without having read it.
+        if deaf.hand_over((sequence % 3) as u32, sequence, 0).is_err() {
+            break;
         }
+        bench.until("its picture is done with", |status| {
+            status.taken + status.overtaken + status.refused > sequence || status.connections_refused > 0
+        });
     }
-    bench.until("it is gone", |status| status.clients.is_empty());
+    bench.until("it is gone", |status| status.connections_refused > 0 && status.clients.is_empty());
+    assert_eq!(bench.status().last_refusal.as_deref(), Some("it does not read what holod sends"));
     let mut other = bench.client("other");
     assert_eq!(send(&mut other, 0, 1, 255).0, TAKEN);
     assert_eq!(bench.shown().0.amplitude[0], 1.0);

@@ -48,7 +48,7 @@ class Outcomes:
     refused: int = 0
     """the last good one stays on the panel"""
     not_shown: int = 0
-    """another client is shown"""
+    """another client or a scene is shown"""
 
     @property
     def unknown(self) -> int:
