@@ -23,7 +23,8 @@ use crate::local_socket;
 const CONNECTIONS: usize = 32;
 /// The longest request, in bytes.
 const LONGEST: u64 = 1 << 16;
-const STACK_BYTES: usize = 1 << 20;
+/// As much as the main thread has, which reads scenes, too.
+const STACK_BYTES: usize = 8 << 20;
 /// Longer than the control thread takes for anything; an order that nobody waits for any more is not obeyed.
 const PATIENCE: Duration = Duration::from_secs(5);
 

@@ -63,6 +63,12 @@ impl Desk {
         self.keeps_dark
     }
 
+    /// Gives back what nobody needs any more.
+    pub(super) fn tidy(&mut self) {
+        while self.changes.retired.pop().is_ok() {}
+        self.changes.sink.lock().unwrap_or_else(PoisonError::into_inner).tidy();
+    }
+
     fn next(&self) -> Option<Ordered> {
         self.server.as_ref()?.1.try_recv().ok()
     }

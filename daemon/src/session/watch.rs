@@ -221,6 +221,7 @@ impl Watch<'_> {
         self.tracker_watch.look(&mut self.tracker, now)?;
         self.panel.judge_rate(output, now);
         self.laser_box.drain(output.armed);
+        self.desk.tidy();
         self.observer.tick()
     }
 

@@ -128,7 +128,7 @@ pub fn newest_picture(pictures: &Pictures, t_start: TimeNs) -> (PictureSink, Pic
     };
     let (input, output) = triple_buffer::triple_buffer(&first);
     let is_live = matches!(pictures, Pictures::Feed(_));
-    let sink = PictureSink { input, size: pictures.resolution(), scenes, is_live };
+    let sink = PictureSink { input, size: pictures.resolution(), scenes, t_start, is_live };
     (sink, PictureSource { output, t: t_start })
 }
 
@@ -136,8 +136,10 @@ pub fn newest_picture(pictures: &Pictures, t_start: TimeNs) -> (PictureSink, Pic
 pub struct PictureSink {
     input: triple_buffer::Input<Shown>,
     size: Resolution,
-    /// Scenes of which the other side may still hold a frame: the last of it is dropped here.
+    /// Scenes of which the other side may still hold a frame, the newest last: the last of it is dropped here.
     scenes: Vec<Arc<Frames>>,
+    /// When the newest of them begins.
+    t_start: TimeNs,
     is_live: bool,
 }
 
@@ -148,7 +150,7 @@ impl PictureSink {
     /// Where it is of another size than what was shown before: a renderer is made for one.
     pub fn show_scene(&mut self, frames: Arc<Frames>, t_start: TimeNs) {
         assert_eq!(frames.resolution(), self.size, "every picture has the hologram's size");
-        self.is_live = false;
+        (self.is_live, self.t_start) = (false, t_start);
         self.input.write(Shown::Scene { frames: Arc::clone(&frames), t_start });
         self.drop_old_scenes();
         self.scenes.push(frames);
@@ -166,6 +168,17 @@ impl PictureSink {
             self.drop_old_scenes();
         }
         self.is_live
+    }
+
+    /// Gives back the memory of scenes that are over, from time to time: the way to the frame thread keeps some.
+    pub fn tidy(&mut self) {
+        if !self.is_live
+            && self.input.consumed()
+            && let [_, .., newest] = &self.scenes[..]
+        {
+            self.input.write(Shown::Scene { frames: Arc::clone(newest), t_start: self.t_start });
+        }
+        self.drop_old_scenes();
     }
 
     fn drop_old_scenes(&mut self) {
@@ -278,8 +291,11 @@ mod tests {
         }
         assert!(sink.scenes.len() <= 5, "{}", sink.scenes.len());
         drop(held);
-        sink.show_scene(sequence(1), TimeNs(0));
-        assert!(sink.scenes.len() <= 4, "{}", sink.scenes.len());
+        for _ in 0..4 {
+            sink.tidy();
+            source.at(TimeNs(0));
+        }
+        assert_eq!(sink.scenes.len(), 1, "only the one that is shown");
         sink.go_live();
         for number in 0..4 {
             show(&mut sink, number);

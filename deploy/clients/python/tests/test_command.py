@@ -115,6 +115,8 @@ def test_an_interrupt_ends_it_between_pictures(path: Path) -> None:
             stdin=subprocess.PIPE,
             stderr=subprocess.PIPE,
             cwd=Path(__file__).parents[1],
+            # A program in the background may be started with it ignored.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         process.stdin.write(noise(0, 4) + b"the beginning of another")
         process.stdin.flush()
