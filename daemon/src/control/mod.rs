@@ -79,7 +79,8 @@ impl Request {
 pub enum Answer {
     /// It is done; with what was asked for.
     Ok(Value),
-    /// It is not, and nothing has changed: what was found, what was expected, what to do.
+    /// It is not, and nothing has changed, but that lasers which do not acknowledge darkness are kept dark all the same:
+    /// what was found, what was expected, what to do.
     Error(String),
 }
 

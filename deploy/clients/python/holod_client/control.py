@@ -16,7 +16,7 @@ LONGEST_ANSWER_BYTES = 1 << 20
 
 
 class ControlError(Exception):
-    """holod is not there, or refuses the order; nothing has changed then."""
+    """holod is not there, or refuses the order; nothing has changed then, but for `lasers_dark()`: it is in force."""
 
 
 class Control:
@@ -85,7 +85,7 @@ class Control:
         return self.ask("pupil", mm=mm)
 
     def lasers_dark(self) -> str:
-        """Keeps the lasers dark. Raises ControlError where the box does not acknowledge that."""
+        """Keeps the lasers dark. Raises ControlError where the box does not acknowledge that: look at the lasers."""
         return self.ask("lasers-dark")
 
     def lasers_arm(self) -> str:
