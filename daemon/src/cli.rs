@@ -11,6 +11,8 @@ use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_model::scene::Fit;
 use holod_pupil_input::UsbIds;
 
+pub use crate::page::PageAddress;
+
 pub use self::pattern::{ColourArg, PatternKind, PatternTarget, ProfileArg};
 
 /// Drives a holographic near-eye display in real time, closed loop with an eye tracker.
@@ -258,9 +260,24 @@ pub struct RunArgs {
     /// Overwrite an earlier record.
     #[arg(long, requires = "record")]
     pub force: bool,
+    /// The status page.
+    #[command(flatten)]
+    pub page: PageArgs,
     /// Print the summary as JSON.
     #[arg(long)]
     pub json: bool,
+}
+
+/// Where the status page is served.
+#[derive(Args, Debug, Clone, Default)]
+pub struct PageArgs {
+    /// Serve a status page for browsers, and figures for Prometheus: a port of this machine such as 8420, ADDRESS:PORT
+    /// (with --page-token where other machines reach it), or unix:PATH.
+    #[arg(long, value_name = "ADDRESS")]
+    pub page: Option<PageAddress>,
+    /// A file with the token that opens the page, on one line; only you may be able to read it.
+    #[arg(long, value_name = "FILE", requires = "page")]
+    pub page_token: Option<PathBuf>,
 }
 
 /// Options of `demo`.
@@ -663,6 +680,11 @@ pub(crate) fn human_pupil(mm: f32) -> Result<PupilDiameter, String> {
 fn parse_focus(text: &str) -> Result<Dioptres, String> {
     let dpt: f64 =
         text.parse().map_err(|_| format!("found '{text}', expected dioptres such as 2.5 (0 is infinity)"))?;
+    focus_of_an_eye(dpt)
+}
+
+/// A focus that an eye can have, with glasses or without.
+pub(crate) fn focus_of_an_eye(dpt: f64) -> Result<Dioptres, String> {
     if (-1.0..=10.0).contains(&dpt) {
         Ok(Dioptres(dpt))
     } else {

@@ -11,6 +11,8 @@ pub mod failure;
 mod fault;
 pub mod local_socket;
 pub mod logging;
+mod memory;
+pub mod page;
 pub mod pictures;
 pub mod progress;
 pub mod record;

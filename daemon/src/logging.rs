@@ -1,6 +1,15 @@
-//! What the log on standard error says, by `HOLOD_LOG`.
+//! What the log on standard error says, by `HOLOD_LOG`, and its newest lines for the status page.
 
+use std::collections::VecDeque;
+use std::fmt::{self, Write};
+use std::sync::{Mutex, PoisonError};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use serde::Serialize;
+use tracing::field::{Field, Visit};
+use tracing::{Event, Level, Subscriber};
 use tracing_subscriber::EnvFilter;
+use tracing_subscriber::layer::{Context, Layer};
 
 const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
 const DEFAULT: &str = "info";
@@ -29,10 +38,94 @@ pub fn filter(asked: Option<&str>) -> (EnvFilter, Option<String>) {
     (EnvFilter::new(directives.join(",")), complaint)
 }
 
+/// A line of the log.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Line {
+    /// Milliseconds since 1970.
+    pub unix_ms: u64,
+    /// `INFO`, `WARN` or `ERROR`.
+    pub level: &'static str,
+    /// What it says.
+    pub text: String,
+}
+
+/// Keeps the newest lines in memory, from `info` up. Real-time threads do not log, so none of them waits here.
+pub struct KeepRecent;
+
+/// Lines that are kept.
+const KEPT: usize = 200;
+
+struct Kept {
+    lines: VecDeque<Line>,
+    /// How many there ever were.
+    ever: u64,
+}
+
+static RECENT: Mutex<Kept> = Mutex::new(Kept { lines: VecDeque::new(), ever: 0 });
+
+impl<S: Subscriber> Layer<S> for KeepRecent {
+    fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
+        let level = *event.metadata().level();
+        if level > Level::INFO {
+            return;
+        }
+        let mut text = Text(String::new());
+        event.record(&mut text);
+        let unix_ms = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64);
+        let mut kept = RECENT.lock().unwrap_or_else(PoisonError::into_inner);
+        if kept.lines.len() == KEPT {
+            kept.lines.pop_front();
+        }
+        kept.lines.push_back(Line { unix_ms, level: level.as_str(), text: text.0 });
+        kept.ever += 1;
+    }
+}
+
+struct Text(String);
+
+impl Visit for Text {
+    fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+        let gap = if self.0.is_empty() { "" } else { " " };
+        let written = match field.name() {
+            "message" => write!(self.0, "{gap}{value:?}"),
+            name => write!(self.0, "{gap}{name}={value:?}"),
+        };
+        written.expect("a string takes everything");
+    }
+}
+
+/// The lines that are kept of those after the first `seen` ever, which then are all.
+pub fn recent_since(seen: &mut u64) -> Vec<Line> {
+    let kept = RECENT.lock().unwrap_or_else(PoisonError::into_inner);
+    let new = (kept.ever - *seen).min(kept.lines.len() as u64) as usize;
+    *seen = kept.ever;
+    kept.lines.range(kept.lines.len() - new..).cloned().collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use tracing_subscriber::filter::LevelFilter;
+
+    #[test]
+    fn the_newest_lines_are_kept() {
+        use tracing_subscriber::layer::SubscriberExt;
+        tracing::subscriber::with_default(tracing_subscriber::registry().with(KeepRecent), || {
+            let mut seen = 0;
+            recent_since(&mut seen);
+            tracing::info!(channel = 3, "first {}", 1);
+            tracing::debug!("not kept");
+            tracing::error!("second");
+            let lines: Vec<_> = recent_since(&mut seen).into_iter().map(|line| (line.level, line.text)).collect();
+            assert_eq!(lines, [("INFO", "first 1 channel=3".to_owned()), ("ERROR", "second".to_owned())]);
+            assert!(recent_since(&mut seen).is_empty());
+            for number in 0..KEPT + 10 {
+                tracing::warn!("{number}");
+            }
+            let lines = recent_since(&mut seen);
+            assert_eq!((lines.len(), lines[0].text.as_str()), (KEPT, "10"));
+        });
+    }
 
     fn most(asked: &str) -> (Option<LevelFilter>, bool) {
         let (filter, complaint) = filter(Some(asked));

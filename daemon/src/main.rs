@@ -5,6 +5,8 @@ use std::process::ExitCode;
 
 use clap::Parser;
 use holod_daemon::{cli::Cli, commands, logging};
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 
 fn main() -> ExitCode {
     let cli = Cli::try_parse().unwrap_or_else(|error| {
@@ -14,12 +16,11 @@ fn main() -> ExitCode {
     });
     let asked = std::env::var_os("HOLOD_LOG").map(|asked| asked.to_string_lossy().into_owned());
     let (filter, complaint) = logging::filter(asked.as_deref());
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
-        .with_target(false)
-        .init();
+        .with_target(false);
+    tracing_subscriber::registry().with(filter).with(lines).with(logging::KeepRecent).init();
     if let Some(complaint) = complaint {
         tracing::warn!("{complaint}");
     }

@@ -38,6 +38,8 @@ pub struct FrameRecord {
     pub t_desired_present: TimeNs,
     /// The picture that was shown.
     pub picture: PictureTag,
+    /// The amplitude that double phase took as 1.
+    pub amplitude_constant: f32,
 }
 
 /// One colour field that the panel showed.
@@ -242,6 +244,7 @@ mod tests {
             t_submit: TimeNs(21),
             t_desired_present: TimeNs(30),
             picture: PictureTag { number: 4, t_taken: Some(TimeNs(3)) },
+            amplitude_constant: 1.0,
         }
     }
 

@@ -9,6 +9,7 @@ use holod_slm_output::{FieldEvent, OutputSpec};
 use crate::cli::RunArgs;
 use crate::control::Request;
 use crate::failure::{Exit, Failure};
+use crate::page::Page;
 use crate::pictures::levels_picture;
 use crate::progress;
 use crate::record::{self, FieldRecord, FrameLog, FrameRecord};
@@ -33,7 +34,9 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     if let Some(folder) = args.record.as_deref().filter(|_| args.force) {
         record::remove_earlier(folder)?;
     }
-    let mut recorder = Recorder { log: args.record.as_deref().map(FrameLog::create).transpose()? };
+    let page = Page::open(&args.page)?;
+    let log = args.record.as_deref().map(FrameLog::create).transpose()?;
+    let mut observers = (log.map(Recorder), page);
     let network = weights.config();
     tracing::info!(
         "{} of {} by network {} {}",
@@ -55,16 +58,16 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         duration: args.duration,
         keep_levels: args.record.is_some(),
     };
-    let session = match session::run(plan, &mut recorder) {
+    let session = match session::run(plan, &mut observers) {
         Ok(session) => session,
         Err(failure) => {
-            if let Some(log) = recorder.log {
+            if let (Some(Recorder(log)), _) = observers {
                 log.discard_if_empty();
             }
             return Err(failure);
         }
     };
-    if let (Some(log), Some(folder)) = (&mut recorder.log, &args.record) {
+    if let ((Some(Recorder(log)), _), Some(folder)) = (&mut observers, &args.record) {
         log.flush()?;
         save(&session, folder)?;
     }
@@ -89,30 +92,23 @@ fn save(session: &SessionReport, folder: &Path) -> Result<(), Failure> {
     Ok(())
 }
 
-struct Recorder {
-    log: Option<FrameLog>,
-}
+struct Recorder(FrameLog);
 
 impl Observer for Recorder {
     fn frame(&mut self, record: &FrameRecord) -> Result<(), Failure> {
-        if let Some(log) = &mut self.log {
-            log.frame(*record);
-        }
+        self.0.frame(*record);
         Ok(())
     }
 
     fn field(&mut self, event: &FieldEvent) -> Result<(), Failure> {
-        match &mut self.log {
-            Some(log) => log.field(&FieldRecord::of(event)),
-            None => Ok(()),
-        }
+        self.0.field(&FieldRecord::of(event))
     }
 
     fn order(&mut self, t: TimeNs, request: &Request) -> Result<(), Failure> {
-        self.log.as_ref().map_or(Ok(()), |log| log.order(t, request))
+        self.0.order(t, request)
     }
 
     fn tick(&mut self) -> Result<(), Failure> {
-        self.log.as_mut().map_or(Ok(()), FrameLog::flush)
+        self.0.flush()
     }
 }

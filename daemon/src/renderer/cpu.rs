@@ -21,6 +21,7 @@ pub(super) struct CpuRenderer {
     hologram: ComplexHologram,
     pattern: PhasePattern,
     timings: Vec<StageTiming>,
+    amplitude_constant: f32,
     description: String,
 }
 
@@ -76,6 +77,7 @@ impl CpuRenderer {
         };
         let pool = WorkerPool::new("holod-cpu", 0, job, Job::run).map_err(Failure::because(Exit::Unavailable))?;
         Ok(Self {
+            amplitude_constant: weights.config().amplitude_constant,
             description: match no_gpu {
                 None => format!("cpu, {instruction_set}, {} threads", pool.threads()),
                 Some(error) => {
@@ -149,6 +151,10 @@ impl Renderer for CpuRenderer {
 
     fn cpu_threads(&self) -> Option<usize> {
         Some(self.pool.threads())
+    }
+
+    fn amplitude_constant(&self) -> f32 {
+        self.amplitude_constant
     }
 
     fn description(&self) -> &str {

@@ -201,6 +201,10 @@ impl Renderer for GpuRenderer {
         }
     }
 
+    fn amplitude_constant(&self) -> f32 {
+        self.weights.config().amplitude_constant
+    }
+
     fn description(&self) -> &str {
         &self.description
     }

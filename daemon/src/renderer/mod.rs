@@ -56,6 +56,9 @@ pub trait Renderer: Send {
     /// How many of the processor's threads compute; nothing where a GPU does.
     fn cpu_threads(&self) -> Option<usize>;
 
+    /// The amplitude that double phase takes as 1: that of its weights.
+    fn amplitude_constant(&self) -> f32;
+
     /// How it computes, for people: such as `cpu, avx512, 2 threads`, and why not on a GPU where that was wanted.
     fn description(&self) -> &str;
 }

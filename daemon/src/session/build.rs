@@ -22,7 +22,7 @@ use super::stats::FrameRate;
 use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
 use super::watch::{Limits, Names, Rings, Told, Watch};
-use super::{Observer, RECORDS, SessionPlan, Signals, host_now, scheduling, tracker_failure};
+use super::{Began, Observer, RECORDS, SessionPlan, Signals, host_now, scheduling, tracker_failure};
 use crate::control::{self, Preparer, Steering};
 use crate::failure::{Exit, Failure};
 use crate::renderer::{self, Renderer};
@@ -93,6 +93,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
     let options = OutputOptions {
         keep_slots: if plan.keep_levels { KEEP_SLOTS } else { 0 },
         stall_timeout: rig.lasers.stall_timeout.unwrap_or_else(|| stall_timeout(frame_time)),
+        look: observer.wants_look(),
     };
     let output = progress::during("opening panel and lasers", || {
         scheduling::prompt(|| open_output(&plan, &encoder, options)).map_err(Failure::because(Exit::Unavailable))
@@ -140,6 +141,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         .spawn(move || frame_loop.run())
         .map_err(Failure::because(Exit::Unavailable))?;
 
+    observer.began(&mut Began { t_origin, rig: plan.rig.clone(), encoder: Arc::clone(&encoder), look: output.look });
     let limits =
         Limits { t_origin, frames: plan.frame_limit, duration: plan.duration, replay_ends_run: replay_ends_run(&plan) };
     let names = Names {

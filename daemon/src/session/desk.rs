@@ -12,6 +12,7 @@ use super::host_now;
 use super::watch::Watch;
 use crate::control::{Answer, ControlServer, NewEngine, Order, Ordered, Preparer, Steering};
 use crate::failure::Failure;
+use crate::memory;
 use crate::renderer::Renderer;
 use crate::runtime_folder;
 use crate::setup;
@@ -65,8 +66,16 @@ impl Desk {
 
     /// Gives back what nobody needs any more.
     pub(super) fn tidy(&mut self) {
-        while self.changes.retired.pop().is_ok() {}
+        self.give_back_engines();
         self.changes.sink.lock().unwrap_or_else(PoisonError::into_inner).tidy();
+    }
+
+    /// An engine's buffers are most of what holod has.
+    fn give_back_engines(&mut self) {
+        while let Ok(engine) = self.changes.retired.pop() {
+            drop(engine);
+            memory::give_back();
+        }
     }
 
     fn next(&self) -> Option<Ordered> {
@@ -78,7 +87,7 @@ impl Watch<'_> {
     /// Obeys what has been asked for; whether that is to end.
     pub(super) fn obey(&mut self, output: &OutputControl) -> Result<bool, Failure> {
         for _ in 0..ORDERS_AT_ONCE {
-            while self.desk.changes.retired.pop().is_ok() {}
+            self.desk.give_back_engines();
             let Some(Ordered { order, request, answer }) = self.desk.next() else { break };
             let ends = matches!(order, Order::Stop);
             let is_urgent = ends || matches!(order, Order::KeepDark(true));

@@ -152,6 +152,7 @@ impl FrameLoop {
                 t_submit,
                 t_desired_present: plan.t_desired_present,
                 picture,
+                amplitude_constant: self.renderer.amplitude_constant(),
             },
             beyond_trained: !self.trained.contain(estimate.pupil),
             clipped_share: rendered.clipped_share,

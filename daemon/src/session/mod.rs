@@ -6,6 +6,7 @@ mod frame_loop;
 mod keep;
 mod laser_watch;
 mod ledger;
+mod observer;
 mod output_watch;
 mod rate_watch;
 pub(crate) mod scheduling;
@@ -19,16 +20,14 @@ mod watch;
 
 use std::time::Duration;
 
+use holod_calibration::PupilDiameter;
 use holod_calibration::rig::Rig;
-use holod_calibration::{PupilDiameter, TimeNs};
 use holod_model::Weights;
-use holod_pupil_input::{Decision, RecordFiles, ReplayError, SourceError, TrackerError, TrackerSpec};
-use holod_slm_output::{FieldEvent, OutputSpec};
+use holod_pupil_input::{RecordFiles, ReplayError, SourceError, TrackerError, TrackerSpec};
+use holod_slm_output::OutputSpec;
 
 use crate::cli::Backend;
-use crate::control::Request;
 use crate::failure::{Exit, Failure};
-use crate::record::FrameRecord;
 use crate::source::Pictures;
 
 #[cfg(feature = "fault-injection")]
@@ -37,6 +36,7 @@ use crate::fault::host_now;
 use holod_pupil_input::host_now;
 
 pub use self::ledger::LaserSummary;
+pub use self::observer::{Began, FirstLight, Observer};
 pub(crate) use self::service::Signals;
 pub use self::stats::Spread;
 pub use self::summary::{SessionReport, Summary};
@@ -66,30 +66,6 @@ pub struct SessionPlan {
     pub duration: Option<Duration>,
     /// Keep the levels that the panel showed, the newest for each half millimetre of pupil.
     pub keep_levels: bool,
-}
-
-/// Hears of everything in the run, on the control thread.
-pub trait Observer {
-    /// A frame was made.
-    fn frame(&mut self, _record: &FrameRecord) -> Result<(), Failure> {
-        Ok(())
-    }
-    /// A field was shown and is over.
-    fn field(&mut self, _event: &FieldEvent) -> Result<(), Failure> {
-        Ok(())
-    }
-    /// The gate decided on a sample.
-    fn decision(&mut self, _decision: &Decision) -> Result<(), Failure> {
-        Ok(())
-    }
-    /// A person has changed something, at host time `t`.
-    fn order(&mut self, _t: TimeNs, _request: &Request) -> Result<(), Failure> {
-        Ok(())
-    }
-    /// About ten times a second.
-    fn tick(&mut self) -> Result<(), Failure> {
-        Ok(())
-    }
 }
 
 /// Frame records on their way to the control thread.

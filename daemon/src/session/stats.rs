@@ -34,6 +34,13 @@ impl Recent {
         self.next = (self.next + 1) % WINDOW;
     }
 
+    /// The same, where there is one.
+    pub(super) fn extend(&mut self, value_ms: Option<f32>) {
+        if let Some(value_ms) = value_ms {
+            self.push(value_ms);
+        }
+    }
+
     /// Nothing where there are no values.
     pub(super) fn spread(&self) -> Option<Spread> {
         let mut sorted = self.values.clone();

@@ -5,11 +5,11 @@ use std::collections::{BTreeMap, VecDeque};
 use holod_calibration::{PupilDiameter, TimeNs};
 use holod_slm_output::FieldEvent;
 
-use super::RECORDS;
 use super::frame_loop::LoopRecord;
 use super::keep::{KEEP_SLOTS, keep_slot};
 use super::ledger::LaserLedger;
 use super::stats::Recent;
+use super::{FirstLight, RECORDS};
 use crate::record::FrameRecord;
 
 /// Frames whose fields may still come: all that the ring of records can hold at once, and some more.
@@ -61,34 +61,36 @@ impl Tally {
         self.recent.push_back(*frame);
     }
 
-    /// A field was shown and is over.
-    pub(super) fn field(&mut self, event: &FieldEvent) {
+    /// A field was shown and is over. What its light is the first of.
+    pub(super) fn field(&mut self, event: &FieldEvent) -> Option<FirstLight> {
         self.lasers.field(event);
         self.fields_shown += 1;
         self.fields_repeated += u64::from(event.repeated);
         if event.repeated || event.frame_id == self.newest_shown {
-            return;
+            return None;
         }
         self.newest_shown = event.frame_id;
         self.frames_shown += 1;
         self.deadline_misses += u64::from(event.deadline_missed);
-        let Some(frame) = self.recent.iter().find(|frame| frame.frame == event.frame_id) else { return };
+        let frame = self.recent.iter().find(|frame| frame.frame == event.frame_id)?;
         if let Some(slot) = keep_slot(frame.pupil) {
             self.kept[slot] = Some((frame.frame, frame.pupil));
         }
-        let Some((on, off)) = event.laser_on.zip(event.laser_off) else { return };
-        let middle = TimeNs(on.0 / 2 + off.0 / 2);
-        let since = |t: TimeNs| (middle - t).seconds() as f32 * 1e3;
-        if let Some(t_sample) = frame.t_sample {
-            self.sample_to_photon.push(since(t_sample));
-        }
+        let (on, off) = event.laser_on.zip(event.laser_off)?;
+        let t = TimeNs(on.0 / 2 + off.0 / 2);
         // A picture that is shown for another pupil is no newer for that.
-        if let Some(t_taken) = frame.picture.t_taken
-            && self.newest_picture != Some(t_taken)
-        {
-            self.newest_picture = Some(t_taken);
-            self.picture_to_photon.push(since(t_taken));
-        }
+        let new_picture = frame.picture.t_taken.filter(|_| self.newest_picture != frame.picture.t_taken);
+        self.newest_picture = new_picture.or(self.newest_picture);
+        let light = FirstLight {
+            frame: frame.frame,
+            t,
+            sample_to_photon: frame.t_sample.map(|t_sample| t - t_sample),
+            picture_to_photon: new_picture.map(|t_taken| t - t_taken),
+        };
+        let milliseconds = |time: TimeNs| time.seconds() as f32 * 1e3;
+        self.sample_to_photon.extend(light.sample_to_photon.map(milliseconds));
+        self.picture_to_photon.extend(light.picture_to_photon.map(milliseconds));
+        Some(light)
     }
 
     /// The pupil that the newest frame was made for.

@@ -84,6 +84,7 @@ pub(super) struct Told {
     rate: RateWatch,
     state: State,
     text: String,
+    armed: bool,
 }
 
 impl Told {
@@ -203,7 +204,9 @@ impl Watch<'_> {
         }
         self.panel.drain();
         for event in fields_over.drain(..) {
-            self.tally.field(&event);
+            if let Some(light) = self.tally.field(&event) {
+                self.observer.first_light(&light);
+            }
             self.observer.field(&event)?;
         }
         while let Some(decision) = decisions.pop() {
@@ -216,7 +219,10 @@ impl Watch<'_> {
 
     /// What is looked at ten times a second.
     fn report(&mut self, output: &OutputCounts, now: TimeNs) -> Result<(), Failure> {
-        self.tell_state(output);
+        let is_new = self.tell_state(output);
+        if is_new | (std::mem::replace(&mut self.told.armed, output.armed) != output.armed) {
+            self.write_status(output, now);
+        }
         self.tell_rate(now);
         self.tracker_watch.look(&mut self.tracker, now)?;
         self.panel.judge_rate(output, now);
@@ -225,7 +231,8 @@ impl Watch<'_> {
         self.observer.tick()
     }
 
-    fn tell_state(&mut self, output: &OutputCounts) {
+    /// Says how the run is, where that has changed; whether it has.
+    fn tell_state(&mut self, output: &OutputCounts) -> bool {
         let lit = output.armed && self.tally.frames_shown > 0;
         let link = self.tracker.link();
         let is_fixed = self.tally.newest_state == FIXED_PUPIL;
@@ -244,11 +251,13 @@ impl Watch<'_> {
             _ => "followed",
         };
         let text = format!("{}: tracker {}, pupil {pupil}", state.name(), link.name());
-        if text != self.told.text {
-            tracing::info!("{text}");
-            self.service.status(&text);
-            self.told.text = text;
+        if text == self.told.text {
+            return false;
         }
+        tracing::info!("{text}");
+        self.service.status(&text);
+        self.told.text = text;
+        true
     }
 
     /// Says once how many frames a second are really reached.
@@ -265,6 +274,7 @@ impl Watch<'_> {
     pub(super) fn write_status(&mut self, output: &OutputCounts, now: TimeNs) {
         let snapshot = self.snapshot(output, now);
         self.status.write(&snapshot);
+        self.observer.snapshot(&snapshot);
         let figures = &snapshot.figures;
         tracing::debug!(
             "{}: {} frames made, {} shown, {:.1} a second; pupil {:?} mm, {}; {} samples, {} rejected; lasers {}",

@@ -40,7 +40,7 @@ use self::shared::Shared;
 use crate::laser::{BoxEvent, DarkReason, LaserBox, LaserError, LaserWatch, Trigger};
 use crate::levels::PanelEncoder;
 use crate::pacing::PacingConfig;
-use crate::present::{OpenError, PanelSetup, Presenter, Recorder, frame_channel};
+use crate::present::{OpenError, PanelLook, PanelSetup, Presenter, Recorder, frame_channel, look};
 use crate::schedule::{Evidence, FieldScheduler, Gate};
 
 /// A monotonic clock. The threads read it; nothing below them does.
@@ -66,12 +66,14 @@ pub struct OutputOptions {
     pub keep_slots: usize,
     /// Lasers go dark when one frame has stayed on the panel for this long. Not less than a few times the slowest frame.
     pub stall_timeout: TimeNs,
+    /// Whether somebody may look at what is shown ([`Output::look`]).
+    pub look: bool,
 }
 
 impl Default for OutputOptions {
-    /// Nothing is kept; 2 s.
+    /// Nothing is kept, nobody looks; 2 s.
     fn default() -> Self {
-        Self { keep_slots: 0, stall_timeout: TimeNs(2_000_000_000) }
+        Self { keep_slots: 0, stall_timeout: TimeNs(2_000_000_000), look: false }
     }
 }
 
@@ -104,6 +106,8 @@ pub struct Output {
     pub laser_faults: Consumer<LaserError>,
     /// For whoever tells people: why the laser box is lost, where it can be.
     pub laser_watch: Option<LaserWatch>,
+    /// For whoever wants to see what is on the panel.
+    pub look: Option<PanelLook>,
     /// For whoever ends it.
     pub control: OutputControl,
 }
@@ -160,8 +164,9 @@ impl Output {
             clock,
         };
         let laser = std::thread::Builder::new().name("holod-laser".into()).spawn(move || laser_thread.run())?;
+        let (looked_at, look) = options.look.then(|| look(&flat)).unzip();
         let panel_thread = PanelThread {
-            panel: Recorder::new(panel, &flat, options.keep_slots),
+            panel: Recorder::new(panel, &flat, options.keep_slots).looked_at(looked_at),
             frames: source,
             news: news_producer,
             reports: report_producer,
@@ -189,6 +194,7 @@ impl Output {
             panel_events: panel_consumer,
             laser_faults: fault_consumer,
             laser_watch,
+            look,
             control: OutputControl {
                 switch: DarkSwitch { shared, laser: laser.thread().clone() },
                 doorbell,

@@ -5,12 +5,15 @@
 
 pub mod drm;
 mod headless;
+mod look;
 mod recorder;
 mod spec;
 #[cfg(feature = "window")]
 pub mod window;
 
 pub use headless::{HeadlessPanel, ReportFaults};
+pub use look::PanelLook;
+pub(crate) use look::look;
 pub use recorder::Recorder;
 pub use spec::{OutputSpec, SpecError, WindowSpec};
 

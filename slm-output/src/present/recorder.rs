@@ -5,13 +5,15 @@ use std::os::fd::BorrowedFd;
 use holod_calibration::TimeNs;
 
 use super::drm::DisplayCheck;
+use super::look::LookedAt;
 use super::{FrameSource, PanelFault, PresentedRefresh, Presenter};
 use crate::fields::{FrameTag, LevelsFrame};
 
 /// Any presenter, with memory for the levels that it showed: each frame whose [`FrameTag::keep`] names a slot is copied
-/// there when it comes on the panel, over what was there.
+/// there when it comes on the panel, over what was there; and so is one for each [`PanelLook`](super::PanelLook).
 pub struct Recorder {
     panel: Box<dyn Presenter>,
+    looked_at: Option<LookedAt>,
     kept: Vec<Option<LevelsFrame>>,
     spare: Vec<LevelsFrame>,
 }
@@ -19,7 +21,12 @@ pub struct Recorder {
 impl Recorder {
     /// Wraps `panel`. Memory for `slots` frames like `blank` is taken now.
     pub fn new(panel: Box<dyn Presenter>, blank: &LevelsFrame, slots: usize) -> Self {
-        Self { panel, kept: vec![None; slots], spare: vec![blank.clone(); slots] }
+        Self { panel, looked_at: None, kept: vec![None; slots], spare: vec![blank.clone(); slots] }
+    }
+
+    /// The same, where somebody may look at what is shown.
+    pub(crate) fn looked_at(self, looked_at: Option<LookedAt>) -> Self {
+        Self { looked_at, ..self }
     }
 
     /// The levels that were shown and kept, by slot.
@@ -28,9 +35,17 @@ impl Recorder {
     }
 
     fn keep(&mut self, tag: FrameTag) {
-        let Some(slot) = tag.keep.and_then(|slot| self.kept.get_mut(slot)) else { return };
+        let looked_at = self.looked_at.as_mut().filter(|looked_at| looked_at.is_wanted());
+        let slot = tag.keep.and_then(|slot| self.kept.get_mut(slot));
+        if looked_at.is_none() && slot.is_none() {
+            return;
+        }
         // A presenter that has gone on to a later frame since cannot say any more what this one was.
         let Some(shown) = self.panel.shown().filter(|shown| shown.tag().frame_id == tag.frame_id) else { return };
+        if let Some(looked_at) = looked_at {
+            looked_at.show(shown);
+        }
+        let Some(slot) = slot else { return };
         if let Some(mut buffer) = slot.take().or_else(|| self.spare.pop()) {
             buffer.copy_from(shown);
             *slot = Some(buffer);
@@ -89,9 +104,41 @@ impl Presenter for Recorder {
 mod tests {
     use super::*;
     use crate::fields::FrameLayout;
-    use crate::present::{HeadlessPanel, PanelSetup, ReportFaults, frame_channel};
+    use crate::present::{HeadlessPanel, PanelLook, PanelSetup, ReportFaults, frame_channel};
     use holod_calibration::rig::Rig;
     use holod_calibration::{Colour, Resolution};
+
+    #[test]
+    fn a_look_sees_the_next_new_frame_once() {
+        let panel = Rig::default().panel;
+        let blank = LevelsFrame::new(FrameLayout::new(&panel, Resolution { width: 2, height: 1 }));
+        let (mut sink, mut source) = frame_channel(&blank);
+        let setup = PanelSetup { panel, flat: blank.clone() };
+        let headless = HeadlessPanel::new(&setup, TimeNs(0), ReportFaults::NONE);
+        let (looked_at, mut look) = crate::present::look(&blank);
+        let mut recorder = Recorder::new(Box::new(headless), &blank, 0).looked_at(Some(looked_at));
+        let mut show = |frame_id: Option<u64>| {
+            if let Some(frame_id) = frame_id {
+                sink.acquire().field_mut(Colour::Red).write(&[frame_id as u16; 2]);
+                let t_submit = recorder.t_next() - TimeNs(1);
+                sink.submit(FrameTag { frame_id, t_submit, t_desired_present: t_submit, keep: None });
+            }
+            recorder.tick(recorder.t_next(), &mut source, &mut |_| {}).unwrap();
+        };
+        let seen = |look: &mut PanelLook| look.take().map(|frame| (frame.tag().frame_id, frame.samples()[3]));
+        show(Some(1));
+        assert_eq!(seen(&mut look), None, "nobody asked");
+        look.ask();
+        show(None);
+        assert_eq!(seen(&mut look), None, "a frame that is shown again is none that comes on");
+        show(Some(2));
+        show(Some(3));
+        assert_eq!(seen(&mut look), Some((2, 2)));
+        assert_eq!(seen(&mut look), None, "it was taken");
+        look.ask();
+        show(Some(4));
+        assert_eq!(seen(&mut look), Some((4, 4)));
+    }
 
     #[test]
     fn kept_levels_are_those_that_were_shown() {

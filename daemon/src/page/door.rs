@@ -1,0 +1,184 @@
+//! Who may come in: whoever has the token, or, where there is none, whoever really asked for this machine.
+
+use std::fs;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use axum::extract::{Request, State};
+use axum::http::header::{AUTHORIZATION, COOKIE, HOST, LOCATION, SET_COOKIE, WWW_AUTHENTICATE};
+use axum::http::{HeaderMap, HeaderValue, StatusCode};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use subtle::ConstantTimeEq;
+
+use super::live::Live;
+
+const SHORTEST: usize = 16;
+const COOKIE_NAME: &str = "holod_token";
+
+/// The secret that opens the page to other machines.
+pub(super) struct Token(String);
+
+/// Why a file gives no token.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum TokenError {
+    #[error("--page-token {}: {error}", .file.display())]
+    Read { file: PathBuf, error: std::io::Error },
+    #[error(
+        "--page-token {}: others may read it (mode {mode:04o}), expected a file of yours alone: chmod 600 {}",
+        .file.display(), .file.display()
+    )]
+    Open { file: PathBuf, mode: u32 },
+    #[error(
+        "--page-token {}: {found}, expected one line of at least {SHORTEST} letters, digits, - or _, such as \
+         `openssl rand -hex 16` makes",
+        .file.display()
+    )]
+    Content { file: PathBuf, found: String },
+}
+
+impl Token {
+    /// The one line of `file`.
+    pub(super) fn read(file: &Path) -> Result<Self, TokenError> {
+        let cannot = |error| TokenError::Read { file: file.to_owned(), error };
+        let mode = fs::metadata(file).map_err(cannot)?.mode() & 0o7777;
+        if mode & 0o077 != 0 {
+            return Err(TokenError::Open { file: file.to_owned(), mode });
+        }
+        let text = fs::read_to_string(file).map_err(cannot)?;
+        let token = text.trim();
+        let wrong = |found: String| Err(TokenError::Content { file: file.to_owned(), found });
+        if let Some(wrong_one) = token.chars().find(|c| !(c.is_ascii_alphanumeric() || "-_".contains(*c))) {
+            return wrong(format!("found {wrong_one:?} in it"));
+        }
+        if token.len() < SHORTEST {
+            return wrong(format!("found {} characters", token.len()));
+        }
+        Ok(Self(token.to_owned()))
+    }
+
+    fn is(&self, offered: &str) -> bool {
+        self.0.as_bytes().ct_eq(offered.as_bytes()).into()
+    }
+}
+
+/// What is asked of everybody who comes.
+pub(super) enum Door {
+    /// The token.
+    Token(Token),
+    /// That the browser asked for this machine by one of its own names: a page from elsewhere whose name was made to lead
+    /// here has another.
+    OwnName,
+    /// Nothing: the file system has asked.
+    Open,
+}
+
+/// A door, and who counts those that it stops.
+pub(super) struct Doorkeeper {
+    pub(super) door: Door,
+    pub(super) live: Arc<Live>,
+}
+
+pub(super) async fn admit(State(keeper): State<Arc<Doorkeeper>>, request: Request, next: Next) -> Response {
+    let refused = match &keeper.door {
+        Door::Open => None,
+        Door::OwnName => {
+            let host = text(request.headers(), HOST.as_str());
+            (!is_own_name(host)).then(|| {
+                let said = format!(
+                    "found the name `{host}`, expected localhost: holod's page is for this machine alone. From another \
+                     machine use `ssh -L 8420:localhost:8420`, or give holod an address and --page-token\n"
+                );
+                (StatusCode::MISDIRECTED_REQUEST, said).into_response()
+            })
+        }
+        Door::Token(token) => {
+            if let Some(offered) = in_query(request.uri().query())
+                && token.is(offered)
+            {
+                return let_in(offered);
+            }
+            let offered = bearer(request.headers()).or_else(|| in_cookies(request.headers()));
+            (!offered.is_some_and(|offered| token.is(offered))).then(|| {
+                let said = "a token is needed, the content of the file that holod was given with --page-token: open \
+                            /?token=TOKEN once in a browser, or send the header `Authorization: Bearer TOKEN`\n";
+                (StatusCode::UNAUTHORIZED, [(WWW_AUTHENTICATE, "Bearer")], said).into_response()
+            })
+        }
+    };
+    match refused {
+        None => next.run(request).await,
+        Some(refused) => {
+            keeper.live.refused.fetch_add(1, Ordering::Relaxed);
+            refused
+        }
+    }
+}
+
+/// Takes the token out of the address bar into a cookie.
+fn let_in(token: &str) -> Response {
+    let cookie = format!("{COOKIE_NAME}={token}; HttpOnly; SameSite=Strict; Path=/");
+    let cookie = HeaderValue::from_str(&cookie).expect("a token has letters, digits, - and _");
+    (StatusCode::SEE_OTHER, [(LOCATION, HeaderValue::from_static("/")), (SET_COOKIE, cookie)]).into_response()
+}
+
+fn in_query(query: Option<&str>) -> Option<&str> {
+    query?.split('&').find_map(|pair| pair.strip_prefix("token="))
+}
+
+fn bearer(headers: &HeaderMap) -> Option<&str> {
+    text(headers, AUTHORIZATION.as_str()).strip_prefix("Bearer ").map(str::trim)
+}
+
+fn in_cookies(headers: &HeaderMap) -> Option<&str> {
+    let cookies = text(headers, COOKIE.as_str()).split(';').map(str::trim);
+    cookies.filter_map(|cookie| cookie.split_once('=')).find(|(name, _)| *name == COOKIE_NAME).map(|(_, value)| value)
+}
+
+fn text<'a>(headers: &'a HeaderMap, name: &str) -> &'a str {
+    headers.get(name).and_then(|value| value.to_str().ok()).unwrap_or_default()
+}
+
+fn is_own_name(host: &str) -> bool {
+    let name = match host.strip_prefix('[') {
+        Some(rest) => rest.split_once(']').map_or("", |(name, _)| name),
+        None => host.rsplit_once(':').map_or(host, |(name, _)| name),
+    };
+    name.eq_ignore_ascii_case("localhost") || name.parse::<std::net::IpAddr>().is_ok_and(|ip| ip.is_loopback())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::fs::PermissionsExt;
+
+    #[test]
+    fn names_of_this_machine_are_known_from_others() {
+        for own in ["localhost", "localhost:8420", "LOCALHOST:1", "127.0.0.1:8420", "[::1]:8420", "127.0.0.1"] {
+            assert!(is_own_name(own), "{own}");
+        }
+        for other in ["", "example.org", "localhost.example.org:8420", "192.168.1.5:8420", "[fe80::1]:80", "[::1"] {
+            assert!(!is_own_name(other), "{other}");
+        }
+    }
+
+    #[test]
+    fn a_token_is_one_line_that_nobody_else_may_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("token");
+        let read = |text: &str, mode| {
+            fs::write(&file, text).unwrap();
+            fs::set_permissions(&file, fs::Permissions::from_mode(mode)).unwrap();
+            Token::read(&file).map_err(|error| error.to_string())
+        };
+        let token = read("0123456789abcdef\n", 0o600).unwrap();
+        assert!(token.is("0123456789abcdef"));
+        assert!(!token.is("0123456789abcdeF") && !token.is("") && !token.is("0123456789abcdef0"));
+        assert!(read("0123456789abcdef", 0o640).err().unwrap().contains("chmod 600"));
+        assert!(read("short", 0o400).err().unwrap().contains("found 5 characters"));
+        assert!(read("0123456789abcdef 0", 0o400).err().unwrap().contains("found ' '"));
+        assert!(Token::read(&folder.path().join("none")).is_err());
+    }
+}

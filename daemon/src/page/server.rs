@@ -1,0 +1,322 @@
+//! HTTP.
+
+use std::io;
+use std::net::SocketAddr;
+use std::os::fd::AsFd;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use axum::body::{Body, Bytes};
+use axum::extract::rejection::QueryRejection;
+use axum::extract::{Query, State};
+use axum::http::header::{
+    CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, REFERRER_POLICY, X_CONTENT_TYPE_OPTIONS,
+};
+use axum::http::{HeaderName, HeaderValue, StatusCode};
+use axum::middleware::{from_fn_with_state, map_response};
+use axum::response::{IntoResponse, Response};
+use axum::routing::get;
+use axum::{Json, Router};
+use holod_calibration::Dioptres;
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use prometheus_client::registry::Registry;
+use rustix::net::SocketType;
+use rustix::net::sockopt::set_tcp_user_timeout;
+use serde::Deserialize;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::net::{TcpListener, UnixListener};
+use tokio::runtime::Runtime;
+use tokio::sync::Semaphore;
+use tokio_stream::StreamExt;
+use tokio_stream::wrappers::BroadcastStream;
+use tokio_stream::wrappers::errors::BroadcastStreamRecvError;
+
+use super::address::PageAddress;
+use super::door::{Door, Doorkeeper, Token, admit};
+use super::eye::{Blind, EyeDesk, Gaze};
+use super::live::{Live, Viewer};
+use super::metrics;
+use crate::cli::{focus_of_an_eye, human_pupil};
+use crate::local_socket;
+use crate::session::scheduling;
+
+/// Connections at once; further ones are closed. A browser has up to six.
+const CONNECTIONS: usize = 256;
+/// Browsers that watch at once; each further one is told so.
+const VIEWERS: usize = 64;
+/// A client says what it wants within this time, and takes what it is given.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// How long the end of a run waits for viewers to take the last event.
+const FAREWELL: Duration = Duration::from_millis(500);
+
+/// Why the page is not served.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum ServeError {
+    #[error("--page {address}: cannot listen there: {error}; {}", advice(.error))]
+    Listen { address: SocketAddr, error: io::Error },
+    #[error("--page unix: {0}")]
+    Socket(#[from] local_socket::SocketError),
+    #[error("--page: {0}")]
+    Runtime(#[from] io::Error),
+}
+
+fn advice(error: &io::Error) -> &'static str {
+    match error.kind() {
+        io::ErrorKind::AddrInUse => "another program has the port: end it, or name another one",
+        io::ErrorKind::PermissionDenied => "ports below 1024 are the administrator's: name a higher one",
+        _ => "name an address of this machine",
+    }
+}
+
+/// A page that is served. Dropping it ends that.
+pub(super) struct PageServer {
+    place: PageAddress,
+    socket: Option<PathBuf>,
+    live: Arc<Live>,
+    runtime: Option<Runtime>,
+}
+
+impl PageServer {
+    pub(super) fn start(
+        address: &PageAddress,
+        token: Option<Token>,
+        live: Arc<Live>,
+        eye: EyeDesk,
+    ) -> Result<Self, ServeError> {
+        let runtime = scheduling::patient(|| {
+            tokio::runtime::Builder::new_multi_thread()
+                .worker_threads(1)
+                .max_blocking_threads(1)
+                .thread_name("holod-page")
+                .enable_io()
+                .enable_time()
+                .build()
+        })?;
+        let _inside = runtime.enter();
+        let (listener, place) = Listener::bind(address)?;
+        let door = match (token, &place) {
+            (Some(token), _) => Door::Token(token),
+            (None, PageAddress::Tcp(_)) => Door::OwnName,
+            (None, PageAddress::Unix(_)) => Door::Open,
+        };
+        let router = router(door, Arc::clone(&live), eye);
+        runtime.spawn(serve(listener, router, Arc::clone(&live)));
+        let socket = match &place {
+            PageAddress::Unix(path) => Some(path.clone()),
+            PageAddress::Tcp(_) => None,
+        };
+        drop(_inside);
+        Ok(Self { place, socket, live, runtime: Some(runtime) })
+    }
+
+    /// Where it is.
+    pub(super) fn place(&self) -> &PageAddress {
+        &self.place
+    }
+}
+
+impl Drop for PageServer {
+    fn drop(&mut self) {
+        // Streams end with the run; viewers are given the time to hear of it.
+        let t_end = Instant::now() + FAREWELL;
+        while self.live.viewers.load(Ordering::Relaxed) > 0 && Instant::now() < t_end {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        if let Some(runtime) = self.runtime.take() {
+            runtime.shutdown_background();
+        }
+        if let Some(socket) = &self.socket {
+            let _gone = std::fs::remove_file(socket);
+        }
+    }
+}
+
+enum Listener {
+    Tcp(TcpListener),
+    Unix(UnixListener),
+}
+
+trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
+impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
+
+impl Listener {
+    /// With where it really is: port 0 is any port.
+    fn bind(address: &PageAddress) -> Result<(Self, PageAddress), ServeError> {
+        match address {
+            PageAddress::Tcp(address) => {
+                let cannot = |error| ServeError::Listen { address: *address, error };
+                let listener = std::net::TcpListener::bind(address).map_err(cannot)?;
+                listener.set_nonblocking(true).map_err(cannot)?;
+                let listener = TcpListener::from_std(listener).map_err(cannot)?;
+                let place = listener.local_addr().map_err(cannot)?;
+                Ok((Self::Tcp(listener), PageAddress::Tcp(place)))
+            }
+            PageAddress::Unix(path) => {
+                let listener = local_socket::listen(path, SocketType::STREAM)?;
+                Ok((Self::Unix(UnixListener::from_std(listener.into())?), address.clone()))
+            }
+        }
+    }
+
+    async fn accept(&self) -> io::Result<Box<dyn Stream>> {
+        match self {
+            Self::Tcp(listener) => {
+                let (stream, _) = listener.accept().await?;
+                stream.set_nodelay(true)?;
+                // A viewer that is gone without a word, or takes nothing.
+                set_tcp_user_timeout(stream.as_fd(), PATIENCE.as_millis() as u32)?;
+                Ok(Box::new(stream))
+            }
+            Self::Unix(listener) => Ok(Box::new(listener.accept().await?.0)),
+        }
+    }
+}
+
+async fn serve(listener: Listener, router: Router, live: Arc<Live>) {
+    let connections = Arc::new(Semaphore::new(CONNECTIONS));
+    loop {
+        let Ok(stream) = listener.accept().await else {
+            // Too many open files, most likely.
+            tokio::time::sleep(Duration::from_millis(100)).await;
+            continue;
+        };
+        let Ok(place) = Arc::clone(&connections).try_acquire_owned() else {
+            live.refused.fetch_add(1, Ordering::Relaxed);
+            continue;
+        };
+        let service = TowerToHyperService::new(router.clone());
+        tokio::spawn(async move {
+            let _place = place;
+            let mut server = http1::Builder::new();
+            server.timer(TokioTimer::new()).header_read_timeout(PATIENCE);
+            // A client that has gone away is no fault.
+            let _gone = server.serve_connection(TokioIo::new(stream), service).await;
+        });
+    }
+}
+
+/// What every handler needs.
+#[derive(Clone)]
+struct Shown {
+    live: Arc<Live>,
+    eye: EyeDesk,
+    registry: Arc<Registry>,
+}
+
+fn router(door: Door, live: Arc<Live>, eye: EyeDesk) -> Router {
+    let registry = Arc::new(metrics::registry(&live));
+    let keeper = Arc::new(Doorkeeper { door, live: Arc::clone(&live) });
+    Router::new()
+        .route("/", file("text/html; charset=utf-8", include_str!("assets/index.html")))
+        .route("/page.css", file("text/css; charset=utf-8", include_str!("assets/page.css")))
+        .route("/page.js", file("text/javascript; charset=utf-8", include_str!("assets/page.js")))
+        .route("/plots.js", file("text/javascript; charset=utf-8", include_str!("assets/plots.js")))
+        .route("/icon.svg", file("image/svg+xml", include_str!("assets/icon.svg")))
+        .route("/events", get(events))
+        .route("/eye.png", get(eye_picture))
+        .route("/status.json", get(status))
+        .route("/metrics", get(figures))
+        .fallback(async || (StatusCode::NOT_FOUND, "there is no such page: see /\n"))
+        .with_state(Shown { live, eye, registry })
+        .layer(from_fn_with_state(keeper, admit))
+        .layer(map_response(guarded))
+}
+
+fn file(kind: &'static str, content: &'static str) -> axum::routing::MethodRouter<Shown> {
+    get(async move || ([(CONTENT_TYPE, kind)], content))
+}
+
+/// Nothing from elsewhere is loaded, nothing is kept, no other site may frame the page.
+async fn guarded(mut response: Response) -> Response {
+    let policy =
+        "default-src 'self'; img-src 'self' blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'";
+    let headers: [(HeaderName, &'static str); 4] = [
+        (CONTENT_SECURITY_POLICY, policy),
+        (X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (REFERRER_POLICY, "no-referrer"),
+        (CACHE_CONTROL, "no-store"),
+    ];
+    for (name, value) in headers {
+        response.headers_mut().insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+async fn events(State(shown): State<Shown>) -> Response {
+    let Some(viewer) = Viewer::come(&shown.live, VIEWERS) else {
+        shown.live.refused.fetch_add(1, Ordering::Relaxed);
+        let said = format!("{VIEWERS} browsers watch already: close one of them\n");
+        return (StatusCode::SERVICE_UNAVAILABLE, said).into_response();
+    };
+    let Some((before, receiver)) = shown.live.watch() else { return over() };
+    let before = tokio_stream::iter(before.into_iter().map(Ok::<Bytes, io::Error>));
+    let from_now_on = BroadcastStream::new(receiver).map(move |event| {
+        let _as_long_as_it_watches = &viewer;
+        Ok(event.unwrap_or_else(|BroadcastStreamRecvError::Lagged(missed)| {
+            Bytes::from(format!("event: missed\ndata: {missed}\n\n"))
+        }))
+    });
+    ([(CONTENT_TYPE, "text/event-stream")], Body::from_stream(before.chain(from_now_on))).into_response()
+}
+
+/// What is asked of an eye.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct EyeQuery {
+    #[serde(default)]
+    focus_dpt: f64,
+    pupil_mm: Option<f32>,
+}
+
+async fn eye_picture(State(shown): State<Shown>, query: Result<Query<EyeQuery>, QueryRejection>) -> Response {
+    let gaze = query.map_err(|rejection| rejection.body_text()).and_then(|Query(EyeQuery { focus_dpt, pupil_mm })| {
+        let focus = focus_of_an_eye(focus_dpt).map_err(|why| format!("focus_dpt: {why}"))?;
+        let pupil = pupil_mm.map(human_pupil).transpose().map_err(|why| format!("pupil_mm: {why}"))?;
+        Ok(Gaze { focus, pupil })
+    });
+    let gaze = match gaze {
+        Ok(gaze) => gaze,
+        Err(why) => {
+            shown.live.refused.fetch_add(1, Ordering::Relaxed);
+            return (StatusCode::BAD_REQUEST, format!("{why}\n")).into_response();
+        }
+    };
+    let Gaze { focus: Dioptres(focus_dpt), .. } = gaze;
+    match shown.eye.look(gaze).await {
+        Ok(seen) => {
+            let header = |name, value: String| (HeaderName::from_static(name), value);
+            let headers = [
+                (CONTENT_TYPE, "image/png".to_owned()),
+                header("holod-frame", seen.frame.to_string()),
+                header("holod-made-for-mm", seen.made_for.mm().to_string()),
+                header("holod-pupil-mm", seen.pupil.mm().to_string()),
+                header("holod-focus-dpt", focus_dpt.to_string()),
+            ];
+            (headers, seen.png).into_response()
+        }
+        Err(why) => {
+            let status =
+                if why == Blind::Busy { StatusCode::TOO_MANY_REQUESTS } else { StatusCode::SERVICE_UNAVAILABLE };
+            (status, format!("{why}\n")).into_response()
+        }
+    }
+}
+
+async fn status(State(shown): State<Shown>) -> Response {
+    match shown.live.snapshot.load_full() {
+        Some(snapshot) => Json(&*snapshot).into_response(),
+        None => over(),
+    }
+}
+
+async fn figures(State(shown): State<Shown>) -> Response {
+    ([(CONTENT_TYPE, metrics::CONTENT_TYPE)], metrics::text(&shown.registry)).into_response()
+}
+
+fn over() -> Response {
+    (StatusCode::SERVICE_UNAVAILABLE, format!("{}\n", Blind::NoRun)).into_response()
+}
