@@ -13,7 +13,7 @@ use holod_pupil_input::UsbIds;
 
 pub use crate::page::PageAddress;
 
-pub use self::pattern::{ColourArg, PatternKind, PatternTarget, ProfileArg};
+pub use self::pattern::{ColourArg, PatternKind, PatternPlace, PatternTarget, ProfileArg};
 
 /// Drives a holographic near-eye display in real time, closed loop with an eye tracker.
 ///
@@ -49,7 +49,7 @@ pub enum Command {
     Evaluate(EvaluateArgs),
     /// Draw a test pattern for the panel, say what is to be seen on the bench, show it.
     #[command(subcommand)]
-    Pattern(PatternKind),
+    Pattern(PatternKind<PatternTarget>),
     /// Say what the running daemon is doing.
     Status(StatusArgs),
     /// Change what the running daemon does: scene, weights, pupil, lasers.
@@ -502,6 +502,13 @@ pub enum CtlOrder {
         #[arg(value_name = "MM|follow", value_parser = parse_pupil_or_follow)]
         pupil: PupilOrder,
     },
+    /// Show a test pattern in place of holograms.
+    #[command(subcommand)]
+    Pattern(PatternKind<PatternPlace>),
+    /// Show one phase everywhere in place of holograms.
+    Flat,
+    /// Show holograms again.
+    Hologram,
     /// Keep the lasers dark, or let them be lit by the rules again.
     Lasers {
         /// Which.

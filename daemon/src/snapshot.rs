@@ -66,6 +66,9 @@ pub struct Snapshot {
     pub paused: bool,
     /// A person keeps the lasers dark.
     pub lasers_kept_dark: bool,
+    /// The test pattern that is shown in place of holograms.
+    #[serde(default)]
+    pub pattern: Option<String>,
     /// What holds at the end, too.
     #[serde(flatten)]
     pub figures: Figures,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import io
 import json
 import socket
 import subprocess
@@ -11,8 +12,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import Holod, wait_for
+from PIL import Image
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 Start = Callable[..., Holod]
@@ -72,6 +75,29 @@ def test_pictures_are_of_the_frame_and_the_eye_that_is_asked_for(start: Start) -
     assert float(far.getheader("holod-pupil-mm", "0")) == 6
     assert int(far.getheader("holod-frame", "0")) > int(near.getheader("holod-frame", "0"))
     assert near_png != far_png
+
+
+def test_a_pattern_is_seen_in_place_of_the_hologram(start: Start) -> None:
+    holod = start()
+    holod.status()
+
+    def brightness() -> tuple[float, float, float]:
+        answer, png = holod.get("/eye.png?focus_dpt=0&pupil_mm=3")
+        assert answer.status == 200, png
+        pixels = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), float)
+        return tuple(pixels.mean(axis=(0, 1)))
+
+    red, green, blue = brightness()
+    assert 0.3 < green / red < 3 and 0.3 < green / blue < 3, "a hologram has all colours"
+    holod.ctl("pattern", "cross-hair", "--line", "2", "--colour", "green")
+
+    def lines_on_black() -> bool:
+        red, green, blue = brightness()
+        return green < 0.5 * min(red, blue)
+
+    wait_for("green is black but for lines, red and blue are flat", lines_on_black)
+    holod.ctl("hologram")
+    wait_for("a hologram again", lambda: not lines_on_black())
 
 
 @pytest.mark.parametrize(

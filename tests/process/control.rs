@@ -166,6 +166,47 @@ fn scenes_come_and_go_and_stand_still() {
 }
 
 #[test]
+fn patterns_take_the_place_of_holograms_and_make_way_again() {
+    let bench = Bench::start(&["--weights", "fast"]);
+    let shown = |frames: u64| {
+        let then = bench.status()["frames_shown"].as_u64().unwrap() + frames;
+        bench.until("frames go on", |status| status["frames_shown"].as_u64() > Some(then));
+    };
+    for (order, name) in [(&["pattern", "dots", "--spacing", "20", "--dot", "6"][..], "dots"), (&["flat"], "flat")] {
+        let said = bench.ctl(order);
+        assert!(said.contains(&format!("the pattern {name} is shown until `holod ctl hologram`")), "{said}");
+        assert_eq!(bench.status()["pattern"], name);
+        shown(20);
+    }
+    let pid = bench.daemon.as_ref().unwrap().pid().to_string();
+    bench.until("the status says so", |_| {
+        bench.holod(&["status", "--pid", &pid]).stdout.contains("the pattern flat is shown in place of holograms")
+    });
+    bench.ctl(&["hologram"]);
+    assert_eq!(bench.status()["pattern"], Value::Null);
+    shown(20);
+
+    let (summary, folder) = bench.stop();
+    assert_eq!(summary["lasers"]["unsafe_findings"], 0, "{summary:#}");
+    let rows = frames::read(&folder.path().join("record/frames.csv")).unwrap();
+    let orders = fs::read_to_string(folder.path().join("record/orders.jsonl")).unwrap();
+    let orders: Vec<Value> = orders.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let done: Vec<_> = orders.iter().map(|order| order["request"]["do"].as_str().unwrap()).collect();
+    assert_eq!(done, ["pattern", "flat", "hologram", "stop"]);
+    let [began, ended] = [0, 2].map(|order: usize| orders[order]["t_ns"].as_i64().unwrap());
+    let rests_on_a_sample = |t: std::ops::Range<i64>| {
+        let rows = rows.iter().filter(|row| t.contains(&row.t_wake_ns));
+        rows.map(|row| row.t_sample_ns.is_some()).collect::<Vec<_>>()
+    };
+    // The order's time is taken before the change is handed over.
+    const HANDED_OVER_NS: i64 = 100_000_000;
+    let during = rests_on_a_sample(began + HANDED_OVER_NS..ended);
+    assert!(!during.is_empty() && during.iter().all(|rests| !rests), "a pattern rests on no sample");
+    let before = rests_on_a_sample(0..began);
+    assert!(!before.is_empty() && before.iter().all(|rests| *rests));
+}
+
+#[test]
 fn what_cannot_be_done_is_said_and_changes_nothing() {
     let bench = Bench::start(&[]);
     let before = bench.status();
@@ -175,13 +216,15 @@ fn what_cannot_be_done_is_said_and_changes_nothing() {
         (&["weights", "./absent.safetensors"], "absent.safetensors"),
         (&["pupil", "12"], "expected a human pupil of 0.5 to 9 mm"),
         (&["weights", "smal"], "did you mean `small`?"),
+        (&["pattern", "level", "256"], "expected 0 to 255, the panel's levels"),
+        (&["pattern", "checkerboard", "--period", "0"], "period"),
         (&["status", "--pid", "1"], "no holod of that process number"),
         (&["status", "--socket", "nowhere"], "nowhere: holod does not answer there"),
     ] {
         let refused = bench.refused(args);
         assert!(refused.contains(said), "{args:?}: {refused}");
     }
-    for key in ["scene", "weights", "pupil_state", "lasers_kept_dark", "paused"] {
+    for key in ["scene", "weights", "pupil_state", "lasers_kept_dark", "paused", "pattern"] {
         let now = bench.status();
         assert!(now[key] == before[key] || key == "pupil_state" && now[key] != "fixed", "{key}");
     }

@@ -5,12 +5,13 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
 use holod_calibration::Colour;
+use serde::{Deserialize, Serialize};
 
 use super::RigArgs;
 
-/// What is drawn, each kind with its own figures.
+/// What is drawn, each kind with its own figures, and where it goes `to`.
 #[derive(Subcommand, Debug, Clone)]
-pub enum PatternKind {
+pub enum PatternKind<To: Args> {
     /// One level everywhere, as it is: without look-up table and flatness.
     Level {
         /// The level.
@@ -18,7 +19,7 @@ pub enum PatternKind {
         level: u16,
         /// Where to.
         #[command(flatten)]
-        to: PatternTarget,
+        to: To,
     },
     /// Squares of two phases: with π between them no light is left in the middle.
     Checkerboard {
@@ -30,7 +31,7 @@ pub enum PatternKind {
         depth: f64,
         /// Where to.
         #[command(flatten)]
-        to: PatternTarget,
+        to: To,
     },
     /// Parallel lines, which send the light to one side.
     Grating {
@@ -48,7 +49,7 @@ pub enum PatternKind {
         depth: Option<f64>,
         /// Where to.
         #[command(flatten)]
-        to: PatternTarget,
+        to: To,
     },
     /// A lens around the optical axis.
     Lens {
@@ -60,7 +61,7 @@ pub enum PatternKind {
         diameter: Option<f64>,
         /// Where to.
         #[command(flatten)]
-        to: PatternTarget,
+        to: To,
     },
     /// A grid of bright dots on black, for a camera focused at infinity: the middle one is twice as wide, one to the
     /// right of it and one two above it are left out.
@@ -73,7 +74,7 @@ pub enum PatternKind {
         dot: usize,
         /// Where to.
         #[command(flatten)]
-        to: PatternTarget,
+        to: To,
     },
     /// Bright lines on black that cross at the optical axis, with a square in the upper right quarter.
     CrossHair {
@@ -82,7 +83,7 @@ pub enum PatternKind {
         line: usize,
         /// Where to.
         #[command(flatten)]
-        to: PatternTarget,
+        to: To,
     },
     /// A blaze of another direction in each colour's field: shows which laser lights which field.
     FieldIdentity {
@@ -92,13 +93,13 @@ pub enum PatternKind {
         radius: Option<f64>,
         /// Where to.
         #[command(flatten)]
-        to: PatternTarget,
+        to: To,
     },
 }
 
-impl PatternKind {
+impl<To: Args> PatternKind<To> {
     /// Where the pattern goes.
-    pub fn target(&self) -> &PatternTarget {
+    pub fn target(&self) -> &To {
         match self {
             Self::Level { to, .. }
             | Self::Checkerboard { to, .. }
@@ -111,18 +112,26 @@ impl PatternKind {
     }
 }
 
-/// Where a pattern goes.
+/// Where a pattern is on the panel.
 #[derive(Args, Debug, Clone)]
-pub struct PatternTarget {
-    /// The rig.
-    #[command(flatten)]
-    pub rig: RigArgs,
+pub struct PatternPlace {
     /// Colours that have the pattern, the others are flat; all of them when left out.
     #[arg(long, value_enum, value_name = "COLOUR", num_args = 1.., value_delimiter = ',')]
     pub colour: Vec<ColourArg>,
     /// The optical axis in pixels from the panel's centre, right and up: the middle of lens, dots and cross-hair.
     #[arg(long, value_name = "X,Y", default_value = "0,0", value_parser = parse_axis, allow_hyphen_values = true)]
     pub axis: [f64; 2],
+}
+
+/// Where a pattern goes.
+#[derive(Args, Debug, Clone)]
+pub struct PatternTarget {
+    /// The rig.
+    #[command(flatten)]
+    pub rig: RigArgs,
+    /// On the panel.
+    #[command(flatten)]
+    pub place: PatternPlace,
     /// PNG of what travels to the panel; where the fields travel one after another, one for each (FILE-1-red.png and
     /// so on).
     #[arg(long, value_name = "FILE.png")]
@@ -145,7 +154,8 @@ pub struct PatternTarget {
 }
 
 /// The shape of a grating's lines.
-#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum ProfileArg {
     /// Two phases, half a period each.
     Binary,
@@ -156,7 +166,8 @@ pub enum ProfileArg {
 }
 
 /// A colour by name.
-#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 #[expect(missing_docs, reason = "the names say it")]
 pub enum ColourArg {
     Red,
@@ -187,7 +198,7 @@ mod tests {
     use crate::cli::{Cli, Command};
     use clap::Parser;
 
-    fn parsed(line: &str) -> Result<PatternKind, clap::Error> {
+    fn parsed(line: &str) -> Result<PatternKind<PatternTarget>, clap::Error> {
         let cli = Cli::try_parse_from(line.split_whitespace())?;
         let Some(Command::Pattern(kind)) = cli.command else { panic!("{line}") };
         Ok(kind)
@@ -201,7 +212,7 @@ mod tests {
             panic!()
         };
         assert_eq!(
-            (angle, to.axis, to.colour.as_slice()),
+            (angle, to.place.axis, to.place.colour.as_slice()),
             (-30.0, [-3.0, 4.5], &[ColourArg::Red, ColourArg::Blue][..])
         );
         assert!(parsed("holod pattern lens --focal-length -20").is_ok());

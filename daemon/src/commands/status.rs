@@ -57,7 +57,11 @@ fn text_of(status: &Snapshot) -> String {
         status.uptime_s,
         status.pid,
         figures.rig,
-        if status.paused { "; the picture stands still" } else { "" },
+        match &status.pattern {
+            Some(name) => format!("; the pattern {name} is shown in place of holograms"),
+            None if status.paused => "; the picture stands still".to_owned(),
+            None => String::new(),
+        },
         status.pupil_mm.map_or("none yet".to_owned(), |mm| format!("{mm:.2} mm")),
         status.pupil_state,
         figures.tracker,

@@ -5,20 +5,25 @@
 //! then changes in the loop is handed over by the control thread, wait-free.
 
 mod client;
+mod pattern;
 mod prepare;
 mod server;
 mod steering;
 
 use holod_calibration::PupilDiameter;
 use holod_model::scene::Fit;
+use holod_slm_output::LevelsFrame;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 pub use self::client::ask;
+pub use self::pattern::PatternRequest;
+pub(crate) use self::pattern::placement;
 pub(crate) use self::prepare::{NewEngine, Preparer};
 pub(crate) use self::server::{ControlServer, panic_is_caught};
 pub(crate) use self::steering::Steering;
 
+use crate::cli::ColourArg;
 use crate::source::scene::Frames;
 
 /// A request.
@@ -53,6 +58,21 @@ pub enum Request {
         #[serde(default)]
         mm: Option<f32>,
     },
+    /// Show a test pattern in place of holograms.
+    Pattern {
+        /// Which.
+        pattern: PatternRequest,
+        /// The optical axis in pixels from the panel's centre, right and up.
+        #[serde(default)]
+        axis_px: [f64; 2],
+        /// Colours that have it, the others are flat; all of them when left out.
+        #[serde(default, skip_serializing_if = "Vec::is_empty")]
+        colours: Vec<ColourArg>,
+    },
+    /// Show one phase everywhere in place of holograms.
+    Flat,
+    /// Show holograms again.
+    Hologram,
     /// Keep the lasers dark.
     LasersDark,
     /// Take that back: lasers are lit again by the rules.
@@ -69,7 +89,7 @@ impl Request {
 
     /// Whether files must be read or an engine opened for it, which takes a while.
     fn takes_long(&self) -> bool {
-        matches!(self, Self::Scene { .. } | Self::Weights { .. })
+        matches!(self, Self::Scene { .. } | Self::Weights { .. } | Self::Pattern { .. } | Self::Flat)
     }
 }
 
@@ -92,8 +112,15 @@ pub(crate) enum Order {
     Engine(NewEngine),
     Pause(bool),
     Pupil(Option<PupilDiameter>),
+    Pattern(Option<NewPattern>),
     KeepDark(bool),
     Stop,
+}
+
+/// Levels that take the place of holograms.
+pub(crate) struct NewPattern {
+    pub(crate) name: &'static str,
+    pub(crate) levels: Box<LevelsFrame>,
 }
 
 /// An order, the request that it was made of, and where the answer goes.
@@ -114,6 +141,14 @@ mod tests {
             (r#"{"do":"pupil","mm":3.5}"#, Request::Pupil { mm: Some(3.5) }),
             (r#"{"do":"pupil"}"#, Request::Pupil { mm: None }),
             (r#"{"do":"lasers-dark"}"#, Request::LasersDark),
+            (
+                r#"{"do":"pattern","pattern":{"kind":"cross-hair","line_px":4},"colours":["green"]}"#,
+                Request::Pattern {
+                    pattern: PatternRequest::CrossHair { line_px: 4 },
+                    axis_px: [0.0, 0.0],
+                    colours: vec![ColourArg::Green],
+                },
+            ),
             (
                 r#"{"do":"scene","scene":"/a,/b","depth_encoding":"metres","fit":"cover"}"#,
                 Request::Scene { scene: "/a,/b".into(), depth_encoding: Some("metres".into()), fit: Fit::Cover },

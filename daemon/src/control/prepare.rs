@@ -7,9 +7,10 @@ use holod_calibration::{PupilDiameter, Resolution, TimeNs};
 use holod_model::scene::Fit;
 use holod_model::{RgbdFrame, Weights};
 use holod_pupil_input::host_now;
+use holod_slm_output::patterns::{Pattern, PatternError};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 
-use super::{Order, Request};
+use super::{NewPattern, Order, Request, placement};
 use crate::cli::{self, Backend, SceneArgs};
 use crate::failure::Failure;
 use crate::renderer::{self, Renderer};
@@ -56,6 +57,18 @@ impl Preparer {
             Request::Stop => Ok(Order::Stop),
             Request::Pupil { mm: None } => Ok(Order::Pupil(None)),
             Request::Pupil { mm: Some(mm) } => cli::human_pupil(*mm).map(|pupil| Order::Pupil(Some(pupil))),
+            Request::Flat => self.pattern("flat", |encoder, levels| {
+                encoder.encode_flat(levels);
+                Ok(())
+            }),
+            Request::Pattern { pattern, axis_px, colours } => {
+                let placement = placement(*axis_px, colours);
+                let draw = |encoder: &PanelEncoder, levels: &mut LevelsFrame| {
+                    Pattern::from(*pattern).draw(&placement, encoder, &self.rig.geometry, levels)
+                };
+                self.pattern(pattern.name(), draw)
+            }
+            Request::Hologram => Ok(Order::Pattern(None)),
             Request::Scene { scene, depth_encoding, .. } if scene == "feed" => self.feed(depth_encoding.is_some()),
             Request::Scene { scene, depth_encoding, fit } => self.scene(scene, depth_encoding.as_ref(), *fit),
             Request::Weights { weights } => self.engine(weights).map(Order::Engine),
@@ -82,6 +95,18 @@ impl Preparer {
         };
         let frames = scene::frames(&named, &self.rig.geometry).map_err(in_words)?;
         Ok(Order::Scene(Arc::new(frames)))
+    }
+
+    /// What `draw` draws on the whole panel, as `holod pattern` does.
+    fn pattern(
+        &self,
+        name: &'static str,
+        draw: impl FnOnce(&PanelEncoder, &mut LevelsFrame) -> Result<(), PatternError>,
+    ) -> Result<Order, String> {
+        let encoder = renderer::panel_encoder(&self.rig, self.rig.resolution()).map_err(in_words)?;
+        let mut levels = Box::new(LevelsFrame::new(encoder.layout()));
+        draw(&encoder, &mut levels).map_err(|error| error.to_string())?;
+        Ok(Order::Pattern(Some(NewPattern { name, levels })))
     }
 
     fn engine(&self, weights: &str) -> Result<NewEngine, String> {

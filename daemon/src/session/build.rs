@@ -107,7 +107,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
     let stop = Arc::new(AtomicBool::new(false));
     let records_lost = Arc::new(AtomicU64::new(0));
     let (record_producer, records) = rtrb::RingBuffer::new(RECORDS);
-    let (engines, engine_consumer) = rtrb::RingBuffer::new(1);
+    let (places, change_consumer) = rtrb::RingBuffer::new(1);
     let (retired_producer, retired) = rtrb::RingBuffer::new(2);
     let steering = Arc::new(Steering::new(plan.pupil));
     let preparer = Preparer {
@@ -127,7 +127,8 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         pictures,
         trained: TrainedPupils::of(plan.weights.trained_pupils(&rig.geometry)),
         steering: Arc::clone(&steering),
-        engines: engine_consumer,
+        pattern: None,
+        changes: change_consumer,
         retired: retired_producer,
         records: record_producer,
         records_lost: Arc::clone(&records_lost),
@@ -166,7 +167,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         tracker,
         tracker_watch: TrackerWatch::new(&rig.tracker, t_origin),
         feed,
-        desk: Desk::open(preparer, Changes { steering, sink, engines, retired }),
+        desk: Desk::open(preparer, Changes { steering, sink, places, retired }),
         signals,
         service: Service::connect(),
         status: StatusFile::create(),

@@ -3,17 +3,17 @@
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
 
+use holod_calibration::rig::LaserDriver;
 use holod_calibration::{PupilDiameter, TimeNs};
 use holod_slm_output::OutputControl;
 use serde_json::Value;
 
-use super::frame_loop::TrainedPupils;
+use super::frame_loop::{Change, TrainedPupils};
 use super::host_now;
 use super::watch::Watch;
-use crate::control::{Answer, ControlServer, NewEngine, Order, Ordered, Preparer, Steering};
+use crate::control::{Answer, ControlServer, NewEngine, NewPattern, Order, Ordered, Preparer, Steering};
 use crate::failure::Failure;
 use crate::memory;
-use crate::renderer::Renderer;
 use crate::runtime_folder;
 use crate::setup;
 use crate::source::PictureSink;
@@ -25,8 +25,8 @@ const ORDERS_AT_ONCE: usize = 4;
 pub(super) struct Changes {
     pub(super) steering: Arc<Steering>,
     pub(super) sink: Arc<Mutex<PictureSink>>,
-    pub(super) engines: rtrb::Producer<(Box<dyn Renderer>, TrainedPupils)>,
-    pub(super) retired: rtrb::Consumer<Box<dyn Renderer>>,
+    pub(super) places: rtrb::Producer<Change>,
+    pub(super) retired: rtrb::Consumer<Change>,
 }
 
 /// The control socket, and what it may change.
@@ -34,6 +34,8 @@ pub(super) struct Desk {
     server: Option<(ControlServer, mpsc::Receiver<Ordered>)>,
     changes: Changes,
     keeps_dark: bool,
+    /// What is shown in place of holograms.
+    pattern: Option<&'static str>,
 }
 
 impl Desk {
@@ -49,7 +51,7 @@ impl Desk {
                 None
             }
         };
-        Self { server, changes, keeps_dark: false }
+        Self { server, changes, keeps_dark: false, pattern: None }
     }
 
     pub(super) fn socket(&self) -> Option<PathBuf> {
@@ -64,17 +66,24 @@ impl Desk {
         self.keeps_dark
     }
 
+    pub(super) fn pattern(&self) -> Option<&'static str> {
+        self.pattern
+    }
+
     /// Gives back what nobody needs any more.
     pub(super) fn tidy(&mut self) {
-        self.give_back_engines();
+        self.give_back();
         self.changes.sink.lock().unwrap_or_else(PoisonError::into_inner).tidy();
     }
 
     /// An engine's buffers are most of what holod has.
-    fn give_back_engines(&mut self) {
-        while let Ok(engine) = self.changes.retired.pop() {
-            drop(engine);
-            memory::give_back();
+    fn give_back(&mut self) {
+        while let Ok(retired) = self.changes.retired.pop() {
+            let is_large = matches!(retired, Change::Engine(..));
+            drop(retired);
+            if is_large {
+                memory::give_back();
+            }
         }
     }
 
@@ -87,7 +96,7 @@ impl Watch<'_> {
     /// Obeys what has been asked for; whether that is to end.
     pub(super) fn obey(&mut self, output: &OutputControl) -> Result<bool, Failure> {
         for _ in 0..ORDERS_AT_ONCE {
-            self.desk.give_back_engines();
+            self.desk.give_back();
             let Some(Ordered { order, request, answer }) = self.desk.next() else { break };
             let ends = matches!(order, Order::Stop);
             let is_urgent = ends || matches!(order, Order::KeepDark(true));
@@ -145,6 +154,7 @@ impl Watch<'_> {
                     None => "the tracker is followed".into(),
                 })
             }
+            Order::Pattern(pattern) => self.change_pattern(pattern, output),
             Order::KeepDark(dark) => self.keep_dark(dark, output),
             Order::Stop => Ok("holod ends".into()),
         }
@@ -153,12 +163,31 @@ impl Watch<'_> {
     fn change_engine(&mut self, engine: NewEngine) -> Result<Value, String> {
         let NewEngine { renderer, trained, weights } = engine;
         let description = renderer.description().to_owned();
-        let busy = |_| "the engine is being changed at this moment: ask again".to_owned();
-        self.desk.changes.engines.push((renderer, TrainedPupils::of(trained))).map_err(busy)?;
+        self.change(Change::Engine(renderer, TrainedPupils::of(trained)))?;
         let said = format!("holograms are computed with the weights {}, {description}", setup::weights_name(&weights));
         *self.names.engine.lock().unwrap_or_else(PoisonError::into_inner) = description;
         self.rig.model.weights = weights;
         Ok(said.into())
+    }
+
+    fn change_pattern(&mut self, pattern: Option<NewPattern>, output: &OutputControl) -> Result<Value, String> {
+        let (name, levels) = pattern.map(|NewPattern { name, levels }| (name, levels)).unzip();
+        self.change(Change::Pattern(levels))?;
+        self.desk.pattern = name;
+        let lit = self.rig.lasers.driver != LaserDriver::Simulated && output.counts().armed;
+        Ok(match name {
+            None => "holograms are shown".into(),
+            Some(name) if lit => format!(
+                "the pattern {name} is shown until `holod ctl hologram`; lasers are lit: an eye in the display may get                  all of their light in one spot, use a camera"
+            )
+            .into(),
+            Some(name) => format!("the pattern {name} is shown until `holod ctl hologram`").into(),
+        })
+    }
+
+    fn change(&mut self, change: Change) -> Result<(), String> {
+        let busy = |_| "the frame loop has not taken the last change yet: ask again".to_owned();
+        self.desk.changes.places.push(change).map_err(busy)
     }
 
     fn keep_dark(&mut self, dark: bool, output: &OutputControl) -> Result<Value, String> {

@@ -8,14 +8,14 @@ use holod_calibration::{PupilDiameter, TimeNs};
 use holod_model::engine::EngineError;
 use holod_pupil_input::{EstimateReader, PupilState};
 use holod_slm_output::pacing::Point;
-use holod_slm_output::{FramePlan, FramePort, Pacer};
+use holod_slm_output::{FramePlan, FramePort, LevelsFrame, Pacer};
 
 use super::host_now;
 use super::keep::keep_slot;
 use crate::control::Steering;
 use crate::record::FrameRecord;
-use crate::renderer::Renderer;
-use crate::source::PictureSource;
+use crate::renderer::{Rendered, Renderer};
+use crate::source::{PictureSource, PictureTag};
 
 /// An order to stop is seen within this time.
 const LONGEST_SLEEP: Duration = Duration::from_millis(20);
@@ -42,10 +42,12 @@ pub(super) struct FrameLoop {
     pub trained: TrainedPupils,
     /// What a person changes.
     pub steering: Arc<Steering>,
-    /// Engines that take the place of the one that computes.
-    pub engines: rtrb::Consumer<(Box<dyn Renderer>, TrainedPupils)>,
-    /// Those whose place was taken: giving back what they have is nothing for this thread.
-    pub retired: rtrb::Producer<Box<dyn Renderer>>,
+    /// Levels that take the place of what would be computed.
+    pub pattern: Option<Box<LevelsFrame>>,
+    /// What takes another's place.
+    pub changes: rtrb::Consumer<Change>,
+    /// Whose place was taken: giving back what it has is nothing for this thread.
+    pub retired: rtrb::Producer<Change>,
     /// To whoever records.
     pub records: rtrb::Producer<LoopRecord>,
     /// Records that found no room.
@@ -58,6 +60,14 @@ pub(super) struct FrameLoop {
     pub engine: Arc<Mutex<String>>,
     /// Set by the control thread.
     pub stop: Arc<AtomicBool>,
+}
+
+/// What takes another's place in the loop, and what has made way for it.
+pub(super) enum Change {
+    /// An engine, with the pupils that it knows.
+    Engine(Box<dyn Renderer>, TrainedPupils),
+    /// A pattern in place of holograms, or holograms again.
+    Pattern(Option<Box<LevelsFrame>>),
 }
 
 /// The pupils that a network was trained for, on one bench.
@@ -110,17 +120,16 @@ impl FrameLoop {
 
     /// One frame, top to bottom.
     fn frame(&mut self, plan: FramePlan) -> Result<(), EngineError> {
-        if let Ok((renderer, trained)) = self.engines.pop() {
-            let retired = std::mem::replace(&mut self.renderer, renderer);
-            self.trained = trained;
-            self.retired.push(retired).expect("there is room for as many as are sent");
-        }
+        self.make_changes();
         let t_wake = self.mark(Point::WakeUp, plan);
         let state = self.pupil.pupil_at(t_wake).state;
         let mut estimate = self.pupil.pupil_at(plan.t_predicted_photon.min(t_wake + FARTHEST_PREDICTION));
         let fixed = self.steering.fixed_pupil();
         if let Some(pupil) = fixed {
-            (estimate.pupil, estimate.t_sample, estimate.raw_mm) = (pupil, None, None);
+            estimate.pupil = pupil;
+        }
+        if fixed.is_some() || self.pattern.is_some() {
+            (estimate.t_sample, estimate.raw_mm) = (None, None);
         }
 
         let t_render_begin = self.mark(Point::RenderBegin, plan);
@@ -129,14 +138,20 @@ impl FrameLoop {
         } else {
             self.pictures.at(plan.t_predicted_photon)
         };
-        let rendered = self.renderer.render(frame, estimate.pupil, self.port.acquire())?;
+        let rendered = match &self.pattern {
+            None => self.renderer.render(frame, estimate.pupil, self.port.acquire())?,
+            Some(pattern) => {
+                self.port.acquire().copy_from(pattern);
+                Rendered::default()
+            }
+        };
         if rendered.engine_changed {
             // It happens when a device is lost, which took longer than any lock.
             self.renderer.description().clone_into(&mut self.engine.lock().unwrap_or_else(PoisonError::into_inner));
         }
         let t_render_end = self.mark(Point::RenderEnd, plan);
 
-        let is_meant = fixed.is_some() || state != PupilState::Fallback;
+        let is_meant = self.pattern.is_none() && (fixed.is_some() || state != PupilState::Fallback);
         let keep = if self.keep_levels && is_meant { keep_slot(estimate.pupil) } else { None };
         let t_submit = host_now();
         let record = LoopRecord {
@@ -151,7 +166,7 @@ impl FrameLoop {
                 t_render_end,
                 t_submit,
                 t_desired_present: plan.t_desired_present,
-                picture,
+                picture: if self.pattern.is_some() { PictureTag::default() } else { picture },
                 amplitude_constant: self.renderer.amplitude_constant(),
             },
             beyond_trained: !self.trained.contain(estimate.pupil),
@@ -166,6 +181,19 @@ impl FrameLoop {
         self.pacer.mark(Point::Submit, plan.frame_id, t_submit);
         self.port.feed(&mut self.pacer, |_| ());
         Ok(())
+    }
+
+    fn make_changes(&mut self) {
+        while let Ok(change) = self.changes.pop() {
+            let retired = match change {
+                Change::Engine(renderer, trained) => Change::Engine(
+                    std::mem::replace(&mut self.renderer, renderer),
+                    std::mem::replace(&mut self.trained, trained),
+                ),
+                Change::Pattern(pattern) => Change::Pattern(std::mem::replace(&mut self.pattern, pattern)),
+            };
+            assert!(self.retired.push(retired).is_ok(), "there is room for as many as are sent");
+        }
     }
 
     fn mark(&mut self, point: Point, plan: FramePlan) -> TimeNs {

@@ -299,6 +299,7 @@ impl Watch<'_> {
             control: self.desk.socket(),
             paused: self.desk.is_paused(),
             lasers_kept_dark: self.desk.keeps_dark(),
+            pattern: self.desk.pattern().map(str::to_owned),
             frames_shown_hz: self.frames_shown_hz,
             pupil_state: self.tally.newest_state.to_owned(),
             pupil_mm: self.tally.newest_pupil().map(|pupil| pupil.mm()),

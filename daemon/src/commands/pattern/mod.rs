@@ -3,29 +3,30 @@
 mod show;
 mod sight;
 
-use std::f64::consts::PI;
 use std::path::{Path, PathBuf};
 
-use holod_calibration::{Colour, Metres, PerColour};
-use holod_slm_output::patterns::{Pattern, Placement, Profile};
+use holod_calibration::Colour;
+use holod_slm_output::patterns::Pattern;
 use holod_slm_output::{FrameLayout, LevelsFrame, OutputSpec, PanelEncoder};
 
 use self::sight::Sight;
-use crate::cli::{PatternKind, PatternTarget, ProfileArg};
+use crate::cli::{PatternKind, PatternTarget};
+use crate::control::{PatternRequest, placement};
 use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
 use crate::pictures::video_pictures;
 use crate::session::not_dark;
 use crate::{report, setup};
 
-pub(super) fn pattern(kind: &PatternKind) -> Result<(), Failure> {
+pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> {
     let to = kind.target();
     let output =
         to.output.as_deref().map(str::parse::<OutputSpec>).transpose().map_err(Failure::because(Exit::Usage))?;
     let rig = setup::rig(&to.rig)?;
     let resolution = rig.resolution();
     let encoder = PanelEncoder::new(&rig.panel, resolution, resolution).map_err(Failure::because(Exit::Config))?;
-    let (pattern, placement) = (of_arguments(kind), placement(to));
+    let pattern = Pattern::from(PatternRequest::of_arguments(kind));
+    let placement = placement(to.place.axis, &to.place.colour);
     let mut levels = LevelsFrame::new(FrameLayout::new(&rig.panel, resolution));
     let usage = Failure::because(Exit::Usage);
     pattern.draw(&placement, &encoder, &rig.geometry, &mut levels).map_err(&usage)?;
@@ -45,37 +46,6 @@ pub(super) fn pattern(kind: &PatternKind) -> Result<(), Failure> {
         true => Ok(()),
         false => Err(Failure::new(Exit::Unavailable, not_dark("the laser box did not acknowledge in time"))),
     }
-}
-
-fn of_arguments(kind: &PatternKind) -> Pattern {
-    let metres = |mm: f64| Metres(mm / 1e3);
-    match *kind {
-        PatternKind::Level { level, .. } => Pattern::Level { level },
-        PatternKind::Checkerboard { period, depth, .. } => {
-            Pattern::Checkerboard { period_px: period, depth_rad: depth * PI }
-        }
-        PatternKind::Grating { period, angle, profile, depth, .. } => Pattern::Grating {
-            period_px: period,
-            angle_deg: angle,
-            profile: match profile {
-                ProfileArg::Binary => Profile::Binary,
-                ProfileArg::Blazed => Profile::Blazed,
-                ProfileArg::Sinusoidal => Profile::Sinusoidal,
-            },
-            depth_rad: depth.map(|depth| depth * PI),
-        },
-        PatternKind::Lens { focal_length, diameter, .. } => {
-            Pattern::Lens { focal_length: metres(focal_length), diameter: diameter.map(metres) }
-        }
-        PatternKind::Dots { spacing, dot, .. } => Pattern::Dots { spacing_px: spacing, diameter_px: dot },
-        PatternKind::CrossHair { line, .. } => Pattern::CrossHair { line_px: line },
-        PatternKind::FieldIdentity { radius, .. } => Pattern::FieldIdentity { radius: radius.map(metres) },
-    }
-}
-
-fn placement(to: &PatternTarget) -> Placement {
-    let named = |colour| to.colour.is_empty() || to.colour.iter().any(|&named| Colour::from(named) == colour);
-    Placement { axis_px: to.axis, colours: PerColour(Colour::ALL.map(named)) }
 }
 
 /// Writes each video frame that carries `levels`: to `out`, or to a file beside it for each field.

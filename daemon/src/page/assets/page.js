@@ -107,6 +107,7 @@ function tellFacts(snapshot) {
   const { feed } = snapshot;
   const facts = [
     ["Scene", snapshot.scene],
+    ["Pattern", snapshot.pattern && `${snapshot.pattern}, in place of holograms, until holod ctl hologram`],
     ["Weights", snapshot.weights],
     ["Engine", snapshot.engine],
     ["Hologram", snapshot.hologram],

@@ -6,6 +6,7 @@ import glob
 import json
 import os
 import socket
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -83,6 +84,24 @@ class Control:
     def pupil(self, mm: float | None) -> str:
         """Computes for one pupil, in millimetres, whatever the tracker says; None follows the tracker again."""
         return self.ask("pupil", mm=mm)
+
+    def flat(self) -> str:
+        """Shows one phase everywhere in place of holograms."""
+        return self.ask("flat")
+
+    def pattern(
+        self, kind: str, axis_px: tuple[float, float] = (0, 0), colours: Sequence[str] = (), **figures: Any
+    ) -> str:
+        """Shows a test pattern in place of holograms, such as pattern("grating", period_px=8, profile="blazed").
+
+        Kinds and figures are those of daemon/doc/control.md; `axis_px` is the optical axis right and up of the panel's
+        centre; `colours` that are not named are flat, and all have the pattern where none is.
+        """
+        return self.ask("pattern", pattern={"kind": kind, **figures}, axis_px=list(axis_px), colours=list(colours))
+
+    def hologram(self) -> str:
+        """Shows holograms again."""
+        return self.ask("hologram")
 
     def lasers_dark(self) -> str:
         """Keeps the lasers dark. Raises ControlError where the box does not acknowledge that: look at the lasers."""

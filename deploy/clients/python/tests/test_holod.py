@@ -117,6 +117,12 @@ def test_a_running_holod_is_changed(holod: Holod, monkeypatch: pytest.MonkeyPatc
         control.lasers_arm()
         control.pause()
         control.resume()
+        assert "grating" in control.pattern("grating", period_px=8, profile="blazed", colours=["red"])
+        assert control.status()["pattern"] == "grating"
+        control.flat()
+        assert control.status()["pattern"] == "flat"
+        control.hologram()
+        assert control.status()["pattern"] is None
         control.weights("small")
         control.scene("feed")
         control.pupil(None)
