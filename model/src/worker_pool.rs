@@ -5,6 +5,8 @@
 //! and then, which a frame loop must not. So one worker of the pool stays inside it, waits for work and runs it there;
 //! the caller waits meanwhile.
 
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 
 use rayon::{ThreadPool, ThreadPoolBuilder};
@@ -23,6 +25,8 @@ struct Shared<J> {
 
 struct State<J> {
     order: Order,
+    /// What the job panicked with, for whoever ordered it.
+    panic: Option<Box<dyn Any + Send>>,
     job: J,
 }
 
@@ -61,7 +65,7 @@ impl<J: Send + 'static> WorkerPool<J> {
             .map_err(|error| WorkerPoolError { threads, detail: error.to_string() })?;
         // A thread allocates while it starts, which on a busy machine may be long after this.
         pool.broadcast(|_| ());
-        let state = Mutex::new(State { order: Order::Wait, job });
+        let state = Mutex::new(State { order: Order::Wait, panic: None, job });
         let shared = Arc::new(Shared { state, changed: Condvar::new() });
         let for_worker = Arc::clone(&shared);
         pool.spawn(move || for_worker.serve(run));
@@ -74,12 +78,18 @@ impl<J: Send + 'static> WorkerPool<J> {
     }
 
     /// Has the threads run the job, and waits for them. Does not allocate.
+    ///
+    /// # Panics
+    /// Where the job does, with what it panicked with.
     pub fn run(&mut self) {
         let mut state = self.shared.lock();
         state.order = Order::Run;
         self.shared.changed.notify_all();
         let running = self.shared.changed.wait_while(state, |state| state.order == Order::Run);
-        drop(running.unwrap_or_else(PoisonError::into_inner));
+        let panic = running.unwrap_or_else(PoisonError::into_inner).panic.take();
+        if let Some(panic) = panic {
+            resume_unwind(panic);
+        }
     }
 
     /// How many threads there are.
@@ -96,7 +106,7 @@ impl<J> Drop for WorkerPool<J> {
 }
 
 impl<J> Shared<J> {
-    /// A job that panicked ends the process, so a poisoned lock only says that a caller's closure did.
+    /// A job's panic is caught, so a poisoned lock only says that a caller's closure did.
     fn lock(&self) -> MutexGuard<'_, State<J>> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -108,7 +118,8 @@ impl<J> Shared<J> {
             match state.order {
                 Order::Wait => state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
                 Order::Run => {
-                    run(&mut state.job);
+                    // Whoever ordered the job unwinds: what it left half done is seen by nobody else.
+                    state.panic = catch_unwind(AssertUnwindSafe(|| run(&mut state.job))).err();
                     state.order = Order::Wait;
                     self.changed.notify_all();
                 }
@@ -121,6 +132,16 @@ impl<J> Shared<J> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_job_that_panics_does_so_where_it_was_ordered() {
+        let mut pool = WorkerPool::new("test", 1, 0, |input| assert!(*input != 1, "found {input}")).unwrap();
+        pool.with(|job| *job = 1);
+        let panic = catch_unwind(AssertUnwindSafe(|| pool.run())).expect_err("it panicked");
+        assert_eq!(panic.downcast_ref::<String>().unwrap(), "found 1");
+        pool.with(|job| *job = 2);
+        pool.run();
+    }
 
     #[test]
     fn a_job_runs_once_for_each_order_inside_its_pool() {
