@@ -24,19 +24,25 @@ pub(super) struct DepthReading {
 impl DepthReading {
     /// Vergence of each number; NaN where there is none: the declared number, NaN, and lengths that are not positive.
     pub(super) fn dioptres(&self, numbers: &DepthNumbers) -> Vec<f32> {
-        let default_scale = match (self.encoding, numbers.full_scale) {
+        numbers.values.iter().copied().map(self.converter(numbers.full_scale)).collect()
+    }
+
+    /// What makes a vergence of each number; `full_scale` is the largest one that an integer can be.
+    pub(super) fn converter(self, full_scale: Option<f32>) -> impl Fn(f32) -> f32 {
+        let Self { encoding, missing, .. } = self;
+        let default_scale = match (encoding, full_scale) {
             (DepthEncoding::NormalisedDioptres { .. }, Some(full_scale)) => 1.0 / f64::from(full_scale),
             _ => 1.0,
         };
         let scale = self.scale.unwrap_or(default_scale);
-        let dioptres = |number: f32| {
+        let dioptres = move |number: f32| {
             let number = f64::from(number);
-            if number.is_nan() || self.missing == Some(number) {
+            if number.is_nan() || missing == Some(number) {
                 return f64::NAN;
             }
             let value = number * scale;
             let reciprocal = |length: f64| if length > 0.0 { 1.0 / length } else { f64::NAN };
-            match self.encoding {
+            match encoding {
                 DepthEncoding::Metres => reciprocal(value),
                 DepthEncoding::Millimetres => 1e3 * reciprocal(value),
                 DepthEncoding::Dioptres if value >= 0.0 && value.is_finite() => value,
@@ -47,7 +53,7 @@ impl DepthReading {
             }
         };
         // A denormal length has an infinite vergence, which is as near as can be.
-        numbers.values.iter().map(|&number| (dioptres(number) as f32).clamp(f32::MIN, f32::MAX)).collect()
+        move |number| (dioptres(number) as f32).clamp(f32::MIN, f32::MAX)
     }
 }
 

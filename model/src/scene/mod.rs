@@ -1,4 +1,4 @@
-//! Scenes: RGB-D frames from files, and from programs that hand them over while holod runs.
+//! Scenes: RGB-D frames from files, from a caller's arrays, and from programs that hand them over while holod runs.
 //!
 //! A scene is a directory with a `scene.toml`:
 //!
@@ -17,6 +17,7 @@
 //! PNG and JPEG are decoded from sRGB once; OpenEXR is linear already. NaN, lengths that are not positive and OpenEXR
 //! pixels outside the data window have no depth and are filled from their surroundings.
 
+mod array;
 mod depth;
 mod description;
 mod error;
@@ -25,12 +26,15 @@ mod live;
 mod openexr;
 mod raster;
 
-use holod_calibration::{DisplayGeometry, Resolution};
+use std::path::PathBuf;
+
+use holod_calibration::{Dioptres, DisplayGeometry, Resolution};
 use serde::{Deserialize, Serialize};
 
 use self::description::Description;
 use self::fit::Placement;
 
+pub use self::array::{ArrayColours, ArrayDepths, ArrayError, ArrayPicture};
 pub use self::error::SceneError;
 pub use self::live::{LiveColour, LiveDepth, LiveError, LiveFormat, LivePart, LiveReader};
 
@@ -111,6 +115,19 @@ pub enum Fit {
     Crop,
 }
 
+/// A picture of a scene before it is fitted to the depth range of a bench.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ScenePicture {
+    /// Width and height.
+    pub resolution: Resolution,
+    /// Linear light, 0..=1, [3, height, width].
+    pub linear: Vec<f32>,
+    /// Vergence of each pixel, [height, width].
+    pub depth_dpt: Vec<f32>,
+    /// What happened to it; whether its depths can be shown is not known here.
+    pub report: FrameReport,
+}
+
 /// A still picture or a sequence of them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scene {
@@ -147,12 +164,64 @@ impl Scene {
         resolution: Option<Resolution>,
         fit: Fit,
     ) -> Result<(RgbdFrame, FrameReport), SceneError> {
-        let Description { path, frames, first, step, .. } = &self.description;
+        let ScenePicture { resolution: size, linear, depth_dpt, mut report } = self.read(index, fit)?;
+        let (placement, target) = self.placement(index, size, resolution, fit)?;
+        report.padded_px = placement.padded_px();
+        let depth_normalised = normalised(&depth_dpt, geometry, &mut report);
+        let frame = RgbdFrame {
+            resolution: target,
+            amplitude: linear
+                .chunks_exact(size.pixels())
+                .flat_map(|plane| placement.light(plane))
+                .map(f32::sqrt)
+                .collect(),
+            depth_normalised: placement.nearest(&depth_normalised, 0.0),
+        };
+        Ok((frame, report))
+    }
+
+    /// Loads frame `index` as [`Self::load`] does, for any bench. What the picture does not reach is black, at infinity.
+    pub fn picture(&self, index: usize, resolution: Option<Resolution>, fit: Fit) -> Result<ScenePicture, SceneError> {
+        let ScenePicture { resolution: size, linear, depth_dpt, mut report } = self.read(index, fit)?;
+        let (placement, resolution) = self.placement(index, size, resolution, fit)?;
+        report.padded_px = placement.padded_px();
+        Ok(ScenePicture {
+            resolution,
+            linear: linear.chunks_exact(size.pixels()).flat_map(|plane| placement.light(plane)).collect(),
+            depth_dpt: placement.nearest(&depth_dpt, 0.0),
+            report,
+        })
+    }
+
+    fn colour_path(&self, index: usize) -> PathBuf {
+        self.description.colour.path(self.number(index))
+    }
+
+    /// The number of frame `index` in the names of files.
+    fn number(&self, index: usize) -> u64 {
+        self.description.first + index as u64 * self.description.step
+    }
+
+    /// How a picture of `size` comes to the size that is asked for, and that size.
+    fn placement(
+        &self,
+        index: usize,
+        size: Resolution,
+        resolution: Option<Resolution>,
+        fit: Fit,
+    ) -> Result<(Placement, Resolution), SceneError> {
+        let wanted = resolution.unwrap_or(size);
+        let too_large = || SceneError::TooLarge { path: self.colour_path(index), found: size, wanted };
+        Ok((Placement::new(size, wanted, fit).ok_or_else(too_large)?, wanted))
+    }
+
+    /// Reads frame `index` at the size of its colours.
+    fn read(&self, index: usize, fit: Fit) -> Result<ScenePicture, SceneError> {
+        let Description { path, frames, .. } = &self.description;
         if index >= *frames {
             return Err(SceneError::NoSuchFrame { path: path.clone(), index, frames: *frames });
         }
-        let number = first + index as u64 * step;
-        let (colour_path, depth_path) = (self.description.colour.path(number), self.description.depth.path(number));
+        let (colour_path, depth_path) = (self.colour_path(index), self.description.depth.path(self.number(index)));
         let colour = raster::read_colour(&colour_path)?;
         let mut report =
             FrameReport { source: Some(colour.size), colour_clipped_px: colour.clipped_px, ..FrameReport::default() };
@@ -181,33 +250,25 @@ impl Scene {
             };
             depth_dpt = placement.nearest(&depth_dpt, 0.0);
         }
-
-        let target = resolution.unwrap_or(colour.size);
-        let placement = Placement::new(colour.size, target, fit).ok_or(SceneError::TooLarge {
-            path: colour_path,
-            found: colour.size,
-            wanted: target,
-        })?;
-        report.padded_px = placement.padded_px();
-        let mut normalise = |depth_dpt: f32| {
-            let normalised = geometry.normalised_depth(holod_calibration::Dioptres(depth_dpt.into())) as f32;
-            report.depth_clamped_far_px += usize::from(normalised < -ROUNDING);
-            report.depth_clamped_near_px += usize::from(normalised > 1.0 + ROUNDING);
-            normalised.clamp(0.0, 1.0)
-        };
-        let depth_normalised: Vec<f32> = depth_dpt.into_iter().map(&mut normalise).collect();
-        let frame = RgbdFrame {
-            resolution: target,
-            amplitude: colour
-                .linear
-                .chunks_exact(colour.size.pixels())
-                .flat_map(|plane| placement.light(plane))
-                .map(f32::sqrt)
-                .collect(),
-            depth_normalised: placement.nearest(&depth_normalised, 0.0),
-        };
-        Ok((frame, report))
+        Ok(ScenePicture { resolution: colour.size, linear: colour.linear, depth_dpt, report })
     }
+}
+
+/// The place of each depth in the range of `geometry`, clamped to it; counts what was clamped.
+fn normalised(depth_dpt: &[f32], geometry: &DisplayGeometry, report: &mut FrameReport) -> Vec<f32> {
+    let normalise = |&depth_dpt: &f32| geometry.normalised_depth(Dioptres(depth_dpt.into())) as f32;
+    clamped(depth_dpt.iter().map(normalise), report)
+}
+
+/// Normalised depths clamped to the display's range; counts those that were outside.
+fn clamped(depths: impl Iterator<Item = f32>, report: &mut FrameReport) -> Vec<f32> {
+    depths
+        .map(|depth| {
+            report.depth_clamped_far_px += usize::from(depth < -ROUNDING);
+            report.depth_clamped_near_px += usize::from(depth > 1.0 + ROUNDING);
+            depth.clamp(0.0, 1.0)
+        })
+        .collect()
 }
 
 impl DepthEncoding {
