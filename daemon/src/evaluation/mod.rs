@@ -5,6 +5,7 @@
 //! and focus of a simulated eye. The scenes are pieces cut out of a wider view, so the eye takes the pattern as going on
 //! beyond its edges ([`SimulatedEye::repeating`]), as the trainer's own evaluation does.
 
+mod plan;
 mod statistics;
 
 use std::sync::Arc;
@@ -19,6 +20,7 @@ use holod_model::{LinearImage, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 use serde::Serialize;
 
+pub use plan::{Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, Matrix, Row, SceneViews};
 pub use statistics::Estimate;
 
 use crate::cli::Backend;

@@ -93,7 +93,7 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
 
 /// What is most often a mistake in a picture called `name`.
 /// `is_plane`: one depth for all of it is meant.
-pub(super) fn warn_of_oddities(
+pub fn warn_of_oddities(
     name: &str,
     frame: &RgbdFrame,
     report: &FrameReport,

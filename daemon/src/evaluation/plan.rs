@@ -1,0 +1,319 @@
+//! The judgement of weights on folders of scenes, from opening them to means over all.
+
+use std::path::Path;
+
+use holod_calibration::rig::Rig;
+use holod_calibration::{DisplayGeometry, PupilDiameter};
+use holod_model::metrics::StackScore;
+use holod_model::scene_shard::{SceneShard, SceneShardError};
+use holod_model::{LinearImage, Weights};
+use serde::Serialize;
+
+use super::{EndViews, Estimate, Judge, JudgedScene, Refocus};
+use crate::cli::Backend;
+use crate::failure::{Exit, Failure};
+use crate::setup;
+
+/// SSIM's window must fit between the borders.
+const SMALLEST_JUDGED_PX: usize = 11;
+
+/// What is judged, and how.
+#[derive(Clone, Copy)]
+pub struct EvaluationSettings<'a> {
+    /// The rig, whose panel the levels are for, and whose weights are judged.
+    pub rig: &'a Rig,
+    /// Engine for the network.
+    pub backend: Backend,
+    /// Folder of held-out scenes.
+    pub scenes: &'a Path,
+    /// Folder of refocus cards.
+    pub cards: Option<&'a Path>,
+    /// Pupils to judge, among those of the scenes; all of these where there are none.
+    pub pupils: &'a [PupilDiameter],
+    /// Judge only so many scenes.
+    pub limit: Option<usize>,
+    /// Pixels at each edge that are not judged.
+    pub border_px: usize,
+}
+
+/// Weights and scenes that are known to fit each other.
+pub struct EvaluationPlan<'a> {
+    settings: EvaluationSettings<'a>,
+    weights: Weights,
+    shards: Vec<SceneShard>,
+    cards: Vec<SceneShard>,
+    pupils: Vec<PupilDiameter>,
+}
+
+/// The figures, and pictures to look at.
+pub struct Evaluated {
+    /// The figures.
+    pub evaluation: Evaluation,
+    /// The pupils that were judged.
+    pub pupils: Vec<PupilDiameter>,
+    /// What is seen of the first scenes.
+    pub scene_views: Vec<SceneViews>,
+    /// What each pupil sees of each card, focused near and far.
+    pub card_views: Vec<(Refocus, [LinearImage; 2])>,
+}
+
+/// What is seen of one scene.
+pub struct SceneViews {
+    /// The scene's number.
+    pub index: u64,
+    /// One for each pupil.
+    pub views: Vec<EndViews>,
+}
+
+/// `evaluation.json`. Means are over scenes, of figures in each figure's own unit: dB are averaged as dB.
+#[derive(Serialize)]
+pub struct Evaluation {
+    /// The name of the weights.
+    pub weights: String,
+    /// How many scenes were judged.
+    pub scenes: usize,
+    /// Their width.
+    pub width_px: usize,
+    /// Their height.
+    pub height_px: usize,
+    /// Where their stacks are focused.
+    pub focus_dpt: Vec<f64>,
+    /// Pixels at each edge that were not judged.
+    pub border_px: usize,
+    /// Bits of the panel's levels.
+    pub panel_bit_depth: u8,
+    /// Amplitude that double phase maps to 1.
+    pub amplitude_constant: f32,
+    /// What the intervals of the figures are.
+    pub confidence: &'static str,
+    /// One for each pupil.
+    pub rows: Vec<Row>,
+    /// Holograms made for one pupil and seen by another.
+    pub matrix: Matrix,
+    /// Refocus ratios of the cards.
+    pub refocus: Vec<Refocus>,
+}
+
+/// One pupil: the hologram is made for it, and it looks. A figure that no scene has is `null`. [`StackScore`] says what
+/// the figures are.
+#[derive(Serialize)]
+pub struct Row {
+    /// The pupil.
+    pub pupil_mm: f32,
+    /// [`StackScore::psnr_db`].
+    pub psnr_db: Option<Estimate>,
+    /// [`StackScore::in_focus_psnr_db`].
+    pub psnr_in_focus_db: Option<Estimate>,
+    /// [`StackScore::out_of_focus_psnr_db`].
+    pub psnr_out_of_focus_db: Option<Estimate>,
+    /// [`StackScore::focus_slope`].
+    pub slope: Option<Estimate>,
+    /// [`StackScore::focus_correlation`].
+    pub correlation: Option<Estimate>,
+    /// [`StackScore::ssim`].
+    pub ssim: Option<Estimate>,
+    /// [`StackScore::flat_oracle_psnr_db`].
+    pub flat_oracle_psnr_db: Option<Estimate>,
+    /// Share of amplitudes above the double phase's constant, 0..=1.
+    pub clipped_share: Option<Estimate>,
+}
+
+/// Mean PSNR of what is made for the pupil of a row and seen by the pupil of a column.
+#[derive(Serialize)]
+pub struct Matrix {
+    /// The pupils of the rows.
+    pub given_pupil_mm: Vec<f32>,
+    /// The pupils of the columns.
+    pub judged_pupil_mm: Vec<f32>,
+    /// Row by row.
+    pub psnr_db: Vec<Vec<f64>>,
+}
+
+impl<'a> EvaluationPlan<'a> {
+    /// Opens weights and scenes.
+    ///
+    /// # Errors
+    /// They cannot be read, do not fit each other or the panel, or lack a pupil that is asked for.
+    pub fn new(settings: EvaluationSettings<'a>) -> Result<Self, Failure> {
+        let EvaluationSettings { rig, scenes, cards, limit, .. } = settings;
+        let weights = setup::weights(rig)?;
+        let shards = open(scenes, limit, rig)?;
+        let cards = cards.map(|folder| open(folder, None, rig)).transpose()?.unwrap_or_default();
+        let pupils = judged_pupils(&shards, settings.pupils)?;
+        warn_of_untrained_pupils(&weights, &rig.geometry, &pupils);
+        for shard in [shards.first(), cards.first()].into_iter().flatten() {
+            check_border(settings.border_px, shard)?;
+        }
+        Ok(Self { settings, weights, shards, cards, pupils })
+    }
+
+    /// How often [`Self::judge`] tells of a step.
+    pub fn steps(&self) -> usize {
+        self.shards.len() + self.cards.len()
+    }
+
+    /// Judges, with the views of the first `views_kept` scenes. `after_step` is called after each scene, and ends it all
+    /// where it fails.
+    ///
+    /// # Errors
+    /// The engine is not to be had, a scene cannot be read, or `after_step` failed.
+    pub fn judge(
+        self,
+        views_kept: usize,
+        mut after_step: impl FnMut() -> Result<(), Failure>,
+    ) -> Result<Evaluated, Failure> {
+        let Self { settings, weights, shards, cards, pupils } = self;
+        let EvaluationSettings { rig, backend, border_px, .. } = settings;
+        let judge_of = |shard: &SceneShard| Judge::new(rig, &weights, backend, shard.resolution(), border_px);
+        // Cards first: they are few, and what is wrong with them is told before the long work.
+        let mut card_views = Vec::new();
+        if let Some(first) = cards.first() {
+            let mut judge = judge_of(first)?;
+            for shard in &cards {
+                card_views.extend(judge.cards(shard, &pupils)?);
+                after_step()?;
+            }
+        }
+        let mut judge = judge_of(&shards[0])?;
+        let mut judged = Vec::new();
+        let mut scene_views = Vec::new();
+        for shard in &shards {
+            let mut scene = judge.scene(shard, &pupil_indices(shard, &pupils)?)?;
+            let views = std::mem::take(&mut scene.views);
+            if scene_views.len() < views_kept {
+                scene_views.push(SceneViews { index: shard.index(), views });
+            }
+            judged.push(scene);
+            after_step()?;
+        }
+        let evaluation = Evaluation {
+            weights: setup::weights_name(&rig.model.weights),
+            scenes: shards.len(),
+            width_px: shards[0].resolution().width,
+            height_px: shards[0].resolution().height,
+            focus_dpt: shards[0].focuses().iter().map(|focus| focus.0).collect(),
+            border_px,
+            panel_bit_depth: rig.panel.bit_depth,
+            amplitude_constant: weights.config().amplitude_constant,
+            confidence: "95 %, Student's t over scenes",
+            rows: pupils.iter().enumerate().map(|(number, &pupil)| row(pupil, number, &judged)).collect(),
+            matrix: matrix(&pupils, &judged),
+            refocus: card_views.iter().map(|(refocus, _)| refocus.clone()).collect(),
+        };
+        Ok(Evaluated { evaluation, pupils, scene_views, card_views })
+    }
+}
+
+/// The shards of a folder, which must have one size and the same planes.
+fn open(folder: &Path, limit: Option<usize>, rig: &Rig) -> Result<Vec<SceneShard>, Failure> {
+    let shards = SceneShard::open_folder(folder, limit, &rig.geometry).map_err(|error| {
+        let exit = match error {
+            SceneShardError::Read { .. } | SceneShardError::Empty { .. } => Exit::NoInput,
+            SceneShardError::Damaged { .. } | SceneShardError::Content { .. } => Exit::Data,
+        };
+        Failure::because(exit)(error)
+    })?;
+    let first = &shards[0];
+    let panel = rig.resolution();
+    for shard in &shards {
+        let wrong = |what: &str, found: String, expected: String| {
+            let path = shard.path().display();
+            Failure::new(Exit::Data, format!("{path}: {what} is {found}; expected {expected}"))
+        };
+        let size = shard.resolution();
+        if size != first.resolution() || shard.focuses() != first.focuses() {
+            let of = |shard: &SceneShard| {
+                let focus_dpt: Vec<f64> = shard.focuses().iter().map(|focus| focus.0).collect();
+                format!("{} at {focus_dpt:?} dpt", shard.resolution())
+            };
+            let expected = format!(
+                "{} as in {}: keep scenes of one kind in a folder, rendered with `--planes N` or `auto`",
+                of(first),
+                first.path().display()
+            );
+            return Err(wrong("the stacks' size", of(shard), expected));
+        }
+        if size.width > panel.width || size.height > panel.height {
+            return Err(wrong("the scene", size.to_string(), format!("at most the panel's {panel}")));
+        }
+    }
+    Ok(shards)
+}
+
+/// The pupils that were asked for, or those of the first scene.
+fn judged_pupils(shards: &[SceneShard], asked: &[PupilDiameter]) -> Result<Vec<PupilDiameter>, Failure> {
+    let pupils = if asked.is_empty() { shards[0].pupils().to_vec() } else { asked.to_vec() };
+    shards.iter().try_for_each(|shard| pupil_indices(shard, &pupils).map(drop))?;
+    Ok(pupils)
+}
+
+/// Where a scene's stacks for `pupils` are.
+fn pupil_indices(shard: &SceneShard, pupils: &[PupilDiameter]) -> Result<Vec<usize>, Failure> {
+    let there = shard.pupils();
+    let position = |wanted: &PupilDiameter| {
+        there.iter().position(|pupil| (pupil.mm() - wanted.mm()).abs() < 1e-4).ok_or_else(|| {
+            let there_mm: Vec<f32> = there.iter().map(|pupil| pupil.mm()).collect();
+            let said = format!(
+                "{}: found stacks for pupils of {there_mm:?} mm; expected one for {} mm in every scene: write the \
+                 scenes with `holod-scenes generate --pupils 1,2,3,4,5`, or choose among theirs with --pupil",
+                shard.path().display(),
+                wanted.mm()
+            );
+            Failure::new(Exit::Data, said)
+        })
+    };
+    pupils.iter().map(position).collect()
+}
+
+fn warn_of_untrained_pupils(weights: &Weights, bench: &DisplayGeometry, pupils: &[PupilDiameter]) {
+    let [narrowest, widest] = weights.trained_pupils(bench).map(PupilDiameter::mm);
+    for pupil in pupils.iter().filter(|pupil| !(narrowest..=widest).contains(&pupil.mm())) {
+        tracing::warn!(
+            "on this bench the weights were trained for pupils of {narrowest:.2} to {widest:.2} mm: of {} mm the network \
+             is told the nearest of these, as it would be on the display",
+            pupil.mm()
+        );
+    }
+}
+
+fn check_border(border_px: usize, shard: &SceneShard) -> Result<(), Failure> {
+    let size = shard.resolution();
+    let most = size.width.min(size.height).saturating_sub(SMALLEST_JUDGED_PX) / 2;
+    if border_px > most {
+        let said = format!("--border-px: found {border_px}, expected at most {most} for scenes of {size}");
+        return Err(Failure::new(Exit::Usage, said));
+    }
+    Ok(())
+}
+
+fn row(pupil: PupilDiameter, number: usize, judged: &[JudgedScene]) -> Row {
+    let over_scenes = |figure: &dyn Fn(&StackScore) -> Option<f64>| {
+        let figures: Vec<f64> = judged.iter().filter_map(|scene| figure(&scene.scores[number])).collect();
+        Estimate::of(&figures)
+    };
+    let clipped: Vec<f64> = judged.iter().map(|scene| f64::from(scene.clipped_share[number])).collect();
+    Row {
+        pupil_mm: pupil.mm(),
+        psnr_db: over_scenes(&|score| Some(score.psnr_db)),
+        psnr_in_focus_db: over_scenes(&|score| score.in_focus_psnr_db),
+        psnr_out_of_focus_db: over_scenes(&|score| score.out_of_focus_psnr_db),
+        slope: over_scenes(&|score| score.focus_slope),
+        correlation: over_scenes(&|score| score.focus_correlation),
+        ssim: over_scenes(&|score| score.ssim),
+        flat_oracle_psnr_db: over_scenes(&|score| Some(score.flat_oracle_psnr_db)),
+        clipped_share: Estimate::of(&clipped),
+    }
+}
+
+fn matrix(pupils: &[PupilDiameter], judged: &[JudgedScene]) -> Matrix {
+    let mean = |row: usize, column: usize| {
+        judged.iter().map(|scene| scene.matrix_psnr_db[row][column]).sum::<f64>() / judged.len() as f64
+    };
+    let pupils_mm: Vec<f32> = pupils.iter().map(|pupil| pupil.mm()).collect();
+    let all = 0..pupils.len();
+    Matrix {
+        given_pupil_mm: pupils_mm.clone(),
+        judged_pupil_mm: pupils_mm,
+        psnr_db: all.clone().map(|row| all.clone().map(|column| mean(row, column)).collect()).collect(),
+    }
+}
