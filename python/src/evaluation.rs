@@ -1,0 +1,73 @@
+//! How good weights are.
+
+use std::path::PathBuf;
+
+use holod_calibration::PupilDiameter;
+use holod_daemon::evaluation::{EvaluationPlan, EvaluationSettings};
+use holod_daemon::failure::{Exit, Failure};
+use pyo3::prelude::*;
+
+use crate::outcome::{HolodError, without_lock};
+use crate::renderer::backend_named;
+use crate::rig::Rig;
+use crate::view::pupil;
+
+/// Judges weights by what an eye sees of the panel's levels on held-out scenes, as `holod evaluate` does.
+///
+/// `scenes` is a folder that `holod-scenes generate --kind test` wrote, `cards` one of `--kind cards`. `rig` and `weights`
+/// are as those of `Renderer`. `pupils_mm` are among the scenes' own, all of these where it is left out; `limit` is the
+/// number of scenes to judge, `border_px` the pixels at each edge that are not judged.
+///
+/// Returns the dict that `holod evaluate --json` prints: "rows" (PSNR, slope, correlation, SSIM for each pupil, each with its
+/// "mean" and "ci95_half_width"), "matrix", "refocus". Takes minutes; other threads of Python run meanwhile, and Ctrl-C ends
+/// it after a scene.
+///
+/// Raises InputError, RigError, UnavailableError; warns (HolodWarning) of what the weights were not trained for.
+#[pyfunction]
+#[pyo3(signature = (
+    scenes, weights=None, *, rig=None, cards=None, pupils_mm=None, limit=None, border_px=24, backend="auto"
+))]
+#[allow(clippy::too_many_arguments, reason = "keywords in Python")]
+pub(crate) fn evaluate<'py>(
+    py: Python<'py>,
+    scenes: PathBuf,
+    weights: Option<PathBuf>,
+    rig: Option<&Bound<'py, Rig>>,
+    cards: Option<PathBuf>,
+    pupils_mm: Option<Vec<f32>>,
+    limit: Option<usize>,
+    border_px: usize,
+    backend: &str,
+) -> PyResult<Bound<'py, PyAny>> {
+    let rig = Rig::with_weights(rig, weights.as_deref())?;
+    let backend = backend_named(backend)?;
+    let pupils: Vec<PupilDiameter> = pupils_mm.unwrap_or_default().into_iter().map(pupil).collect::<PyResult<_>>()?;
+    let settings = EvaluationSettings {
+        rig: &rig,
+        backend,
+        scenes: &scenes,
+        cards: cards.as_deref(),
+        pupils: &pupils,
+        limit,
+        border_px,
+    };
+    let mut interrupt = None;
+    let judged = without_lock(py, || {
+        let evaluated = EvaluationPlan::new(settings)?.judge(0, || {
+            Python::attach(|py| py.check_signals()).map_err(|error| {
+                interrupt = Some(error);
+                Failure::new(Exit::Software, "interrupted")
+            })
+        })?;
+        serde_json::to_string(&evaluated.evaluation).map_err(Failure::because(Exit::Software))
+    });
+    match interrupt {
+        Some(interrupt) => Err(interrupt),
+        None => from_json(py, &judged?),
+    }
+}
+
+/// The Python value of a JSON text.
+pub(crate) fn from_json<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyAny>> {
+    py.import("json")?.call_method1("loads", (text,)).map_err(|error| HolodError::new_err(error.to_string()))
+}

@@ -1,0 +1,87 @@
+//! Long work without the interpreter's lock; errors, panics and warnings of Rust as Python's.
+
+use std::ffi::CString;
+use std::fmt::{self, Write as _};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use holod_daemon::failure::{Exit, Failure};
+use pyo3::prelude::*;
+use pyo3::{PyTypeInfo, import_exception};
+use tracing::field::{Field, Visit};
+use tracing::span;
+
+import_exception!(holod.errors, HolodError);
+import_exception!(holod.errors, InputError);
+import_exception!(holod.errors, RigError);
+import_exception!(holod.errors, UnavailableError);
+import_exception!(holod.errors, HolodWarning);
+
+/// Does `work` while other threads of Python run. What it warns of becomes Python's warnings, a panic an exception.
+pub(crate) fn without_lock<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T, Failure> + Send) -> PyResult<T> {
+    let told = Arc::<Mutex<Vec<String>>>::default();
+    let listener = Listener(Arc::clone(&told));
+    let done = py.detach(|| tracing::subscriber::with_default(listener, || catch_unwind(AssertUnwindSafe(work))));
+    let warnings = std::mem::take(&mut *told.lock().unwrap_or_else(PoisonError::into_inner));
+    for warning in warnings {
+        let text = CString::new(warning.replace('\0', " ")).expect("it has no zero byte any more");
+        PyErr::warn(py, &HolodWarning::type_object(py), &text, 1)?;
+    }
+    match done {
+        Ok(done) => done.map_err(|failure| exception(&failure)),
+        Err(panic) => {
+            let text = panic.downcast_ref::<String>().map(String::as_str);
+            let text = text.or(panic.downcast_ref::<&str>().copied()).unwrap_or("no message");
+            Err(HolodError::new_err(format!("a fault of holod itself: {text}; its place stands on standard error")))
+        }
+    }
+}
+
+/// A failure as an exception with its whole text.
+pub(crate) fn exception(failure: &Failure) -> PyErr {
+    let text = failure.to_string();
+    match failure.exit {
+        Exit::Config => RigError::new_err(text),
+        Exit::Unavailable => UnavailableError::new_err(text),
+        Exit::Software => HolodError::new_err(text),
+        Exit::Usage | Exit::Data | Exit::NoInput | Exit::CannotCreate => InputError::new_err(text),
+    }
+}
+
+/// Keeps what is warned of in the thread that it is set for.
+struct Listener(Arc<Mutex<Vec<String>>>);
+
+impl tracing::Subscriber for Listener {
+    fn enabled(&self, metadata: &tracing::Metadata<'_>) -> bool {
+        metadata.is_event() && *metadata.level() <= tracing::Level::WARN
+    }
+
+    fn event(&self, event: &tracing::Event<'_>) {
+        let mut message = Message(String::new());
+        event.record(&mut message);
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(message.0);
+    }
+
+    fn new_span(&self, _: &span::Attributes<'_>) -> span::Id {
+        span::Id::from_u64(1)
+    }
+
+    fn record(&self, _: &span::Id, _: &span::Record<'_>) {}
+
+    fn record_follows_from(&self, _: &span::Id, _: &span::Id) {}
+
+    fn enter(&self, _: &span::Id) {}
+
+    fn exit(&self, _: &span::Id) {}
+}
+
+/// An event's text.
+struct Message(String);
+
+impl Visit for Message {
+    fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
+        if field.name() == "message" {
+            write!(self.0, "{value:?}").expect("a String takes all");
+        }
+    }
+}

@@ -1,0 +1,97 @@
+//! Scenes from files and the built-in one, as arrays.
+
+use holod_calibration::Resolution;
+use holod_daemon::failure::{Exit, Failure};
+use holod_daemon::source::scene::SAMPLE_RESOLUTION;
+use holod_model::scene::{DepthEncoding, Fit, Scene};
+use holod_model::scene_renderer;
+use numpy::PyArrayMethods;
+use pyo3::prelude::*;
+
+use crate::arrays::{array, interleaved};
+use crate::outcome::{InputError, without_lock};
+use crate::rig::Rig;
+
+/// rgb, depth, frames, frames a second, pixels without a depth, pixels that were clipped.
+type Read<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>, usize, Option<f64>, usize, usize);
+
+/// `holod.load_scene` without its class: linear float32 (rows, columns, 3), float32 (rows, columns) of dioptres, and counts.
+#[pyfunction]
+#[allow(clippy::too_many_arguments, reason = "keywords in Python")]
+pub(crate) fn read_scene<'py>(
+    py: Python<'py>,
+    path: &str,
+    rig: Option<&Bound<'py, Rig>>,
+    depth_encoding: Option<&str>,
+    frame: usize,
+    width_px: Option<usize>,
+    height_px: Option<usize>,
+    fit: &str,
+) -> PyResult<Read<'py>> {
+    let geometry = Rig::given(rig).geometry;
+    let fit = match fit {
+        "native" => Fit::Native,
+        "contain" => Fit::Contain,
+        "cover" => Fit::Cover,
+        "crop" => Fit::Crop,
+        _ => {
+            return Err(InputError::new_err(format!(
+                "fit: found {fit:?}, expected \"native\", \"contain\", \"cover\" or \"crop\""
+            )));
+        }
+    };
+    let size = match (width_px, height_px) {
+        (None, None) => None,
+        (Some(width @ 1..), Some(height @ 1..)) => Some(Resolution { width, height }),
+        _ => {
+            return Err(InputError::new_err(
+                "width_px and height_px: found one of them or 0, expected both above 0, or none for the picture's own size",
+            ));
+        }
+    };
+    let (scene, picture) = without_lock(py, || {
+        let data = Failure::because(Exit::Data);
+        let encoding = depth_encoding.map(|text| DepthEncoding::parse(text, &geometry)).transpose().map_err(&data)?;
+        let scene = Scene::open(path, encoding).map_err(&data)?;
+        let mut picture = scene.picture(frame, size, fit).map_err(&data)?;
+        picture.linear = interleaved(&picture.linear);
+        Ok((scene, picture))
+    })?;
+    let Resolution { width, height } = picture.resolution;
+    Ok((
+        array(py, picture.linear, [height, width, 3])?,
+        numpy::PyArray1::from_vec(py, picture.depth_dpt).reshape([height, width])?.into_any(),
+        scene.frames(),
+        scene.fps(),
+        picture.report.depth_missing_px,
+        picture.report.colour_clipped_px,
+    ))
+}
+
+/// `holod.builtin_scene` without its class: linear float32 (rows, columns, 3), float32 (rows, columns) of normalised dioptres.
+#[pyfunction]
+pub(crate) fn render_builtin_scene(
+    py: Python<'_>,
+    width_px: Option<usize>,
+    height_px: Option<usize>,
+) -> PyResult<(Bound<'_, PyAny>, Bound<'_, PyAny>)> {
+    let width = width_px.unwrap_or(SAMPLE_RESOLUTION.width);
+    let height = height_px.unwrap_or(SAMPLE_RESOLUTION.height);
+    let size = Resolution { width, height };
+    if width == 0 || height == 0 || width.saturating_mul(height) > MOST_PIXELS {
+        return Err(InputError::new_err(format!(
+            "width_px and height_px: found {size}, expected at least one pixel and at most {MOST_PIXELS}"
+        )));
+    }
+    let (pixels, depth) = without_lock(py, || {
+        let picture = scene_renderer::sample_scene(size).picture();
+        Ok((interleaved(&picture.image), picture.depth))
+    })?;
+    Ok((
+        array(py, pixels, [height, width, 3])?,
+        numpy::PyArray1::from_vec(py, depth).reshape([height, width])?.into_any(),
+    ))
+}
+
+/// As many as an 8K frame has.
+const MOST_PIXELS: usize = 7680 * 4320;

@@ -1,0 +1,276 @@
+"""What is wrong is told in words, and nothing is guessed."""
+
+from __future__ import annotations
+
+import threading
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import holod
+import numpy as np
+import pytest
+from conftest import RIG, SIZE
+
+WIDTH, HEIGHT = SIZE
+RGB8 = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+LINEAR = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+METRES = np.full((HEIGHT, WIDTH), 0.5, np.float32)
+METRES[:, : WIDTH // 2] = 2.0
+
+
+def changed(array: np.ndarray, where: Any, value: float) -> np.ndarray:
+    array = array.copy()
+    array[where] = value
+    return array
+
+
+def wrong(said: str, rgb: Any = RGB8, depth: Any = METRES, pupil_mm: Any = 3.0, **options: Any) -> Any:
+    return pytest.param(rgb, depth, pupil_mm, {"depth_unit": "metres"} | options, said, id=said[:60])
+
+
+@pytest.mark.parametrize(
+    ("rgb", "depth", "pupil_mm", "options", "said"),
+    [
+        wrong("rgb: found list, expected a numpy array", rgb=[[0]]),
+        wrong("rgb: found an array of shape (3, 64, 96), expected (64, 96, 3)", rgb=np.moveaxis(RGB8, -1, 0)),
+        wrong(
+            "rgb: found an array of shape (64, 96, 4), expected (64, 96, 3)", rgb=np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+        ),
+        wrong("rgb: found an array of shape (64, 96), expected", rgb=METRES),
+        wrong("rgb: found an array of float64, expected uint8", rgb=LINEAR.astype(np.float64)),
+        wrong("rgb: found an array of >f4, expected uint8", rgb=LINEAR.astype(">f4")),
+        wrong("colour: found none for float32, expected", rgb=LINEAR),
+        wrong('colour: found "gamma" for float32', rgb=LINEAR, colour="gamma"),
+        wrong('colour: found "linear" for uint8, expected "srgb"', colour="linear"),
+        wrong(
+            "rgb: colours: 1 values are outside 0..=1 or not finite, the first NaN (green in row 2, column 3)",
+            rgb=changed(LINEAR, (2, 3, 1), np.nan),
+            colour="linear",
+        ),
+        wrong("the first 255 (red in row 0, column 0)", rgb=LINEAR * 510, colour="srgb"),
+        wrong("depth: found an array of shape (96, 64), expected (64, 96)", depth=METRES.T),
+        wrong("depth: found an array of float64, expected float32", depth=METRES.astype(np.float64)),
+        wrong("depth: found an array of uint16, expected float32, or uint16 with", depth=METRES.astype(np.uint16)),
+        wrong('depth_unit: found "m", expected "metres"', depth_unit="m"),
+        wrong(
+            "depths: 2 of 6144 pixels have none, the first NaN in row 4, column 5; expected metres above 0",
+            depth=changed(METRES, (4, slice(5, 7)), np.nan),
+        ),
+        wrong("the first 0 in row 0, column 0", depth=changed(METRES, (0, 0), 0)),
+        wrong("the first -1 in row 0, column 0", depth=changed(METRES, (0, 0), -1), depth_unit="dioptres"),
+        wrong("the first 2 in row 0, column 0", depth=METRES, depth_unit="normalised_dioptres"),
+        wrong("no pixel with a valid one; expected metres above 0", depth=METRES * 0, fill_missing=True),
+        wrong("pupil_mm: found 0.003, expected a human pupil of 0.5 to 9 millimetres", pupil_mm=0.003),
+        wrong("pupil_mm: found NaN", pupil_mm=float("nan")),
+        wrong(
+            "out_levels: found an array of shape (3, 2, 2), expected (3, 1080, 1920)",
+            out_levels=np.zeros((3, 2, 2), np.uint8),
+        ),
+        wrong("out_levels: found an array of uint16", out_levels=np.zeros((3, 1080, 1920), np.uint16)),
+        wrong(
+            "out_phase_rad: found a strided array", out_phase_rad=np.zeros((3, HEIGHT, 2 * WIDTH), np.float32)[..., ::2]
+        ),
+        wrong(
+            "out_phase_rad: found a read-only array",
+            out_phase_rad=np.broadcast_to(np.float32(0), (3, HEIGHT, WIDTH)).copy().view(),
+        ),
+    ],
+)
+def test_arrays_that_are_none_are_refused(
+    renderer: holod.Renderer, rgb: Any, depth: Any, pupil_mm: float, options: dict[str, Any], said: str
+) -> None:
+    if said.endswith("read-only array"):
+        options["out_phase_rad"].flags.writeable = False
+    with pytest.raises(holod.InputError) as raised:
+        renderer.render(rgb, depth, pupil_mm, **options)
+    assert said in str(raised.value)
+
+
+def test_what_is_refused_above_is_taken_when_it_is_right(renderer: holod.Renderer) -> None:
+    for rgb, colour in [(RGB8, None), (RGB8, "srgb"), (LINEAR, "srgb"), (LINEAR, "linear")]:
+        renderer.render(rgb, METRES, 3.0, colour=colour, depth_unit="metres")
+    expected = renderer.render(RGB8, METRES, 3.0, depth_unit="metres").levels
+    millimetres = (METRES * 1000).astype(np.uint16)
+    for depth, unit in [
+        (millimetres, "millimetres"),
+        (millimetres.astype(np.float32), "millimetres"),
+        (1 / METRES, "dioptres"),
+        ((1 / METRES) * np.float32(0.35), "normalised_dioptres"),
+    ]:
+        found = renderer.render(RGB8, depth, 3.0, depth_unit=unit).levels.astype(int)
+        assert np.mean(found != expected) < 1e-3, unit
+    other = renderer.render(RGB8, METRES, 3.0, depth_unit="dioptres").levels
+    assert np.mean(other != expected) > 1e-3
+    filled = renderer.render(RGB8, changed(METRES, (4, 5), np.nan), 3.0, depth_unit="metres", fill_missing=True)
+    assert filled.depth_missing_px == 1
+
+
+def test_infinity_is_a_distance_and_what_cannot_be_shown_is_counted(renderer: holod.Renderer) -> None:
+    depth = changed(changed(METRES, (0, slice(0, 5)), np.inf), (1, slice(0, 7)), 0.1)
+    hologram = renderer.render(RGB8, depth, 3.0, depth_unit="metres")
+    assert (hologram.depth_clamped_far_px, hologram.depth_clamped_near_px) == (0, 7)
+
+
+def test_depth_of_a_wrong_unit_is_warned_of(renderer: holod.Renderer) -> None:
+    with pytest.warns(
+        holod.HolodWarning, match=r"the picture: all depths lie within 0\.00. dpt: is the depth encoding"
+    ):
+        renderer.render(RGB8, METRES * 1000, 3.0, depth_unit="metres")
+    with pytest.warns(holod.HolodWarning, match="6144 of 6144 pixels lie outside the display's depth range"):
+        renderer.render(RGB8, METRES, 3.0, depth_unit="millimetres")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        renderer.render(RGB8, METRES, 3.0, depth_unit="metres")
+        with pytest.raises(holod.HolodWarning):
+            renderer.render(RGB8, METRES * 1000, 3.0, depth_unit="metres")
+
+
+def test_a_renderer_that_cannot_be_had_says_why(tmp_path: Path) -> None:
+    for said, options in [
+        ('weights: found "standart", expected one of standard, small, fast, or a file', {"weights": "standart"}),
+        ("found a pattern of 0x5, expected 1x1 to the panel's 1920x1080", {"width_px": 0, "height_px": 5}),
+        ("found a pattern of 1921x1080", {"width_px": 1921}),
+        ('backend: found "cuda", expected "auto", "cpu" or "gpu"', {"backend": "cuda"}),
+    ]:
+        with pytest.raises(holod.InputError) as raised:
+            holod.Renderer(**options)  # type: ignore[arg-type]
+        assert said in str(raised.value)
+    damaged = tmp_path / "weights.safetensors"
+    damaged.write_bytes(b"nothing")
+    with pytest.raises(holod.InputError, match=r"weights\.safetensors"):
+        holod.Renderer(weights=damaged)
+
+
+def test_all_faults_of_a_rig_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG.replace("bit_depth = 8", "bit_depth = 9").replace("settle_ms = 1.0", "settle_ms = -1.0"))
+    with pytest.raises(holod.RigError) as raised:
+        holod.Rig.load(path)
+    said = str(raised.value)
+    assert said.startswith(f"rig file {path}: 2 faults\n")
+    assert "line 11, panel.bit_depth: found 9" in said
+    assert "panel.settle_ms: found -1" in said
+    with pytest.raises(holod.RigError, match="No such file"):
+        holod.Rig.load(tmp_path / "absent.toml")
+    # Far from what the weights know: a rig that is right in itself.
+    path.write_text(RIG.replace("= 40.0", "= 500.0"))
+    with pytest.raises(holod.RigError, match="trained"):
+        holod.Renderer(holod.Rig.load(path), width_px=16, height_px=16)
+
+
+def test_a_rig_says_what_is_true_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG)
+    rig = holod.Rig.load(path)
+    assert (rig.name, rig.width_px, rig.height_px, rig.bit_depth) == ("a small bench", 160, 120, 8)
+    assert (rig.mode, rig.field_order, rig.refresh_hz) == ("field-sequential", ("green", "red", "blue"), 60.0)
+    assert rig.pixel_pitch_m == pytest.approx(8e-6)
+    assert rig.wavelengths_m == pytest.approx((638e-9, 520e-9, 450e-9))
+    assert rig.eyepiece_focal_length_m == pytest.approx(0.04)
+    assert (rig.depth_far_dpt, rig.depth_near_dpt) == pytest.approx((0.0, 1 / 0.35))
+    assert rig.stroke_rad == pytest.approx((1.9921875 * np.pi, 2.2 * np.pi, 2.6 * np.pi))
+    assert rig.weights == "fast"
+    assert rig.image_distance_m(2.0) == pytest.approx(0.0032)
+
+
+def test_views_of_what_is_no_phase_are_refused() -> None:
+    flat = np.zeros((3, 8, 8), np.float32)
+    for said, phase_rad, options in [
+        ("phase_rad: found an array of shape [8, 8]", flat[0], {}),
+        ("phase_rad: found an array of float64, expected float32", flat.astype(float), {}),
+        ("phase_rad: found NaN (blue, row 1, column 2)", changed(flat, (2, 1, 2), np.nan), {}),
+        ("phase_rad: found 1000", changed(flat, (0, 0, 0), 1000), {}),
+        ("pupil_mm: found 40", flat, {"pupil_mm": 40.0}),
+        ("focus_dpt: found 400", flat, {"focus_dpt": 400.0}),
+        ("amplitude_constant: found 0", flat, {"amplitude_constant": 0.0}),
+    ]:
+        with pytest.raises(holod.InputError) as raised:
+            holod.view(phase_rad, **({"pupil_mm": 3.0, "focus_dpt": 1.0} | options))
+        assert said in str(raised.value)
+    assert holod.view(flat, pupil_mm=3.0, focus_dpt=1.0).shape == (8, 8, 3)
+    with pytest.raises(holod.InputError, match=r"levels: found an array of shape \(3, 8, 8\)"):
+        holod.Rig.builtin().phase_of(flat.astype(np.uint8))
+
+
+def test_scenes_that_cannot_be_read_are_told(tmp_path: Path, picture_files: tuple[Path, Path]) -> None:
+    named = ",".join(map(str, picture_files))
+    for said, path, options in [
+        ("absent", tmp_path / "absent", {}),
+        ("depth encoding: found", named, {}),
+        ("found 1 frames; expected more than 3", named, {"frame": 3, "depth_encoding": "millimetres"}),
+        ("expected at most 8x8", named, {"width_px": 8, "height_px": 8, "depth_encoding": "millimetres"}),
+        ('fit: found "stretch"', named, {"fit": "stretch"}),
+        ("width_px and height_px: found one of them", named, {"width_px": 8}),
+    ]:
+        with pytest.raises(holod.InputError) as raised:
+            holod.load_scene(path, **options)  # type: ignore[arg-type]
+        assert said in str(raised.value)
+
+
+def test_other_threads_run_while_a_hologram_is_computed() -> None:
+    renderer = holod.Renderer(weights="fast", width_px=512, height_px=512, backend="cpu")
+    scene = holod.builtin_scene(512, 512)
+    rendered: list[holod.Hologram] = []
+
+    def work() -> None:
+        rendered.append(renderer.render(scene.rgb, scene.depth, 3.0, colour="linear", depth_unit="normalised_dioptres"))
+
+    thread = threading.Thread(target=work)
+    longest_s = 0.0
+    thread.start()
+    last = time.monotonic()
+    while thread.is_alive():
+        time.sleep(0.001)
+        now = time.monotonic()
+        longest_s, last = max(longest_s, now - last), now
+    assert rendered[0].frame_ms > 100, "too fast to tell"
+    # With the lock held, this thread would have waited for all of the frame.
+    assert longest_s < rendered[0].frame_ms / 1e3 / 2
+
+
+def test_threads_take_turns_at_one_renderer(renderer: holod.Renderer, scene: holod.Scene) -> None:
+    given = {"colour": scene.colour, "depth_unit": scene.depth_unit}
+    pupils_mm = (2.0, 3.0, 4.0, 5.0)
+    expected = [renderer.render(scene.rgb, scene.depth, pupil_mm, **given).phase_rad for pupil_mm in pupils_mm]
+    assert not np.array_equal(expected[0], expected[1])
+    found: dict[float, np.ndarray] = {}
+
+    def work(pupil_mm: float) -> None:
+        found[pupil_mm] = renderer.render(scene.rgb, scene.depth, pupil_mm, **given).phase_rad
+
+    threads = [threading.Thread(target=work, args=(pupil_mm,)) for pupil_mm in pupils_mm]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert all(np.array_equal(found[pupil_mm], phase) for pupil_mm, phase in zip(pupils_mm, expected, strict=True))
+
+
+def resident_bytes() -> int:
+    pages = Path("/proc/self/statm").read_text().split()[1]
+    return int(pages) * 4096
+
+
+def test_holograms_are_given_back(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.toml"
+    rig.write_text(RIG)
+    renderer = holod.Renderer(holod.Rig.load(rig), width_px=160, height_px=120, backend="cpu")
+    scene = holod.builtin_scene(160, 120)
+    given = {"colour": scene.colour, "depth_unit": scene.depth_unit}
+    kept = []
+
+    def grown_by(rounds: int, keep: bool) -> int:
+        before = resident_bytes()
+        for _ in range(rounds):
+            hologram = renderer.render(scene.rgb, scene.depth, 3.0, field=True, **given)
+            view = hologram.view(1.0)
+            if keep:
+                kept.append((hologram, view))
+        return resident_bytes() - before
+
+    grown_by(20, keep=False)
+    # A hologram with its arrays and its view is more than 1 MB.
+    assert grown_by(200, keep=False) < 40e6
+    assert grown_by(60, keep=True) > 50e6, "the measurement is blind"

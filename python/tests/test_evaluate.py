@@ -1,0 +1,61 @@
+"""`evaluate` finds what `holod evaluate` finds, and other threads and Ctrl-C are served meanwhile."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import threading
+import time
+from pathlib import Path
+
+import holod
+import pytest
+from conftest import Daemon
+
+GOLDEN = Path(__file__).parents[2] / "model/golden/evaluation.safetensors"
+
+
+@pytest.fixture
+def scenes(tmp_path: Path) -> Path:
+    """A folder with the scene that the trainer judged, which serves as cards too."""
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    shutil.copy(GOLDEN, folder / "scene_000000.safetensors")
+    return folder
+
+
+def test_the_figures_are_those_of_the_command(daemon: Daemon, scenes: Path) -> None:
+    options = {"cards": scenes, "border_px": 8, "backend": "cpu"}
+    found = holod.evaluate(scenes, "fast", **options)  # type: ignore[arg-type]
+    command = ["evaluate", "--scenes", scenes, "--cards", scenes, "--backend", "cpu", "--weights", "fast"]
+    assert found == daemon.json(*command, "--border-px", 8)
+    assert found != daemon.json(*command, "--border-px", 9)
+    assert found["rows"][0]["psnr_db"]["mean"] > 10
+    pupil_mm = found["rows"][0]["pupil_mm"]
+    one = holod.evaluate(scenes, "fast", pupils_mm=[pupil_mm], limit=1, **options)  # type: ignore[arg-type]
+    assert one["rows"] == found["rows"][:1]
+
+
+def test_what_cannot_be_judged_is_told(scenes: Path, tmp_path: Path) -> None:
+    for said, options in [
+        ("absent", {"scenes": tmp_path / "absent"}),
+        ("expected at most", {"border_px": 400}),
+        ("expected one for 8.25 mm in every scene", {"pupils_mm": [8.25]}),
+        ("pupil_mm: found 0", {"pupils_mm": [0.0]}),
+    ]:
+        with pytest.raises(holod.InputError) as raised:
+            holod.evaluate(**({"scenes": scenes, "weights": "fast"} | options))  # type: ignore[arg-type]
+        assert said in str(raised.value)
+
+
+def test_an_interrupt_ends_an_evaluation(scenes: Path) -> None:
+    for number in range(1, 200):
+        os.link(scenes / "scene_000000.safetensors", scenes / f"scene_{number:06}.safetensors")
+    began = time.monotonic()
+    interrupt = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+    interrupt.start()
+    with pytest.raises(KeyboardInterrupt):
+        holod.evaluate(scenes, "fast", border_px=8, backend="cpu")
+    interrupt.join()
+    assert time.monotonic() - began < 60
