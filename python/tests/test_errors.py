@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -209,25 +210,26 @@ def test_scenes_that_cannot_be_read_are_told(tmp_path: Path, picture_files: tupl
         assert said in str(raised.value)
 
 
-def test_other_threads_run_while_a_hologram_is_computed() -> None:
-    renderer = holod.Renderer(weights="fast", width_px=512, height_px=512, backend="cpu")
-    scene = holod.builtin_scene(512, 512)
-    rendered: list[holod.Hologram] = []
-
-    def work() -> None:
-        rendered.append(renderer.render(scene.rgb, scene.depth, 3.0, colour="linear", depth_unit="normalised_dioptres"))
-
+def wakeups_during(work: Callable[[], object]) -> int:
+    """How often this thread comes to its turn while another one does `work`."""
     thread = threading.Thread(target=work)
-    longest_s = 0.0
+    wakeups = 0
     thread.start()
-    last = time.monotonic()
     while thread.is_alive():
         time.sleep(0.001)
-        now = time.monotonic()
-        longest_s, last = max(longest_s, now - last), now
-    assert rendered[0].frame_ms > 100, "too fast to tell"
-    # With the lock held, this thread would have waited for all of the frame.
-    assert longest_s < rendered[0].frame_ms / 1e3 / 2
+        wakeups += 1
+    return wakeups
+
+
+def test_other_threads_run_while_a_hologram_is_computed() -> None:
+    renderer = holod.Renderer(weights="standard", width_px=512, height_px=512, backend="cpu")
+    scene = holod.builtin_scene(512, 512)
+    given = {"colour": scene.colour, "depth_unit": scene.depth_unit}
+    hologram = renderer.render(scene.rgb, scene.depth, 3.0, **given)
+    assert wakeups_during(lambda: renderer.render(scene.rgb, scene.depth, 3.0, **given)) >= 20
+    assert wakeups_during(lambda: [hologram.view(1.0) for _ in range(5)]) >= 20
+    # One long operation of Python's own keeps the lock, however long it takes.
+    assert wakeups_during(lambda: pow(7, 5_000_000)) < 20, "the measurement is blind"
 
 
 def test_threads_take_turns_at_one_renderer(renderer: holod.Renderer, scene: holod.Scene) -> None:
@@ -271,6 +273,6 @@ def test_holograms_are_given_back(tmp_path: Path) -> None:
         return resident_bytes() - before
 
     grown_by(20, keep=False)
-    # A hologram with its arrays and its view is more than 1 MB.
-    assert grown_by(200, keep=False) < 40e6
-    assert grown_by(60, keep=True) > 50e6, "the measurement is blind"
+    # A hologram with its arrays and its view is 0.8 MB: of 200, even the smallest array would be 12 MB.
+    assert grown_by(200, keep=False) < 10e6
+    assert grown_by(60, keep=True) > 30e6, "the measurement is blind"
