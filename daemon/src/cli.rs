@@ -20,7 +20,7 @@ pub use self::pattern::{ColourArg, PatternKind, PatternPlace, PatternTarget, Pro
 /// With no subcommand holod runs: tracker in, holograms out. Whatever is not named is built in: a sample scene, a
 /// simulated eye tracker, a headless panel and simulated lasers.
 #[derive(Parser, Debug)]
-#[command(name = "holod", version, args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
+#[command(name = "holod", version = env!("HOLOD_VERSION"), args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 pub struct Cli {
     /// What to do; `run` when it is left out.
     #[command(subcommand)]
