@@ -43,6 +43,8 @@ pub enum Command {
     View(ViewArgs),
     /// Say what the rig file means and whether this bench is ready.
     Check(CheckArgs),
+    /// Print the drop-in for the service's unit: these options of `run`, and the devices that they and the rig name.
+    Unit(UnitArgs),
     /// Time each stage and the frame, beside what the cores compute and their memory moves, and tracker sample to photons.
     Bench(BenchArgs),
     /// Judge weights by what an eye sees of the panel's levels, on held-out scenes with known thin-lens pictures.
@@ -385,9 +387,20 @@ pub struct CheckArgs {
     /// The panel, as `run` takes it: opened, looked at with the flat pattern on it, and closed.
     #[arg(long, value_name = "SPEC")]
     pub output: Option<String>,
+    /// Judge rights and files for the service's user, holod, and not for this one.
+    #[arg(long)]
+    pub service: bool,
     /// Print the findings as JSON.
     #[arg(long)]
     pub json: bool,
+}
+
+/// Options of `unit`.
+#[derive(Args, Debug, Clone)]
+pub struct UnitArgs {
+    /// The options of `run` with which the service is to run.
+    #[command(flatten)]
+    pub run: RunArgs,
 }
 
 /// Options of `bench`.

@@ -1,5 +1,6 @@
 //! `holod check`: what the rig file means, and whether this bench is ready.
 
+pub(super) mod access;
 mod output;
 
 use std::path::Path;
@@ -43,6 +44,7 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
     let runs = checks.iter().all(|check| check.passed);
     checks.push(frames_hz(&rig, network.as_ref().ok().filter(|_| runs), args.resolution));
     checks.push(tracker(&rig));
+    checks.extend(access::access(&rig, args.service, Path::new("/")));
     checks.extend(output::lasers(&rig));
     checks.extend(output::panel(&rig, output.as_ref()));
     let findings = Findings { ready: checks.iter().all(|check| check.passed), checks, meaning: rig.meaning() };

@@ -12,6 +12,7 @@ mod render;
 mod run;
 mod status;
 mod tracker;
+mod unit;
 mod view;
 
 use crate::cli::{Cli, Command};
@@ -29,6 +30,7 @@ pub fn dispatch(cli: Cli) -> Result<(), Failure> {
         Some(Command::Render(args)) => render::render(&args),
         Some(Command::View(args)) => view::view(&args),
         Some(Command::Check(args)) => check::check(&args),
+        Some(Command::Unit(args)) => unit::unit(&args),
         Some(Command::Bench(args)) => bench::bench(&args),
         Some(Command::Evaluate(args)) => evaluate::evaluate(&args),
         Some(Command::Pattern(kind)) => pattern::pattern(&kind),

@@ -1,0 +1,313 @@
+//! `holod unit`: the drop-in that opens the service's unit for one bench, and no further.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::net::IpAddr;
+use std::path::{Path, PathBuf};
+
+use holod_calibration::rig::Rig;
+use holod_pupil_input::TrackerSpec;
+use holod_slm_output::OutputSpec;
+use holod_slm_output::present::drm::DrmTarget;
+
+use super::check::access::{HIDDEN_FROM_SERVICE, files_of};
+use crate::cli::{Backend, RunArgs, UnitArgs};
+use crate::failure::{Exit, Failure};
+use crate::{report, setup};
+
+const BINARY: &str = "/usr/bin/holod";
+/// The rig that the unit itself names.
+const USUAL_RIG: &str = "/etc/holod/rig.toml";
+/// Where the unit lets holod write.
+const STATE_FOLDER: &str = "/var/lib/holod";
+/// Where a tracker may be that has a name and no address.
+const LOCAL_NETWORKS: &str = "link-local 192.168.0.0/16 10.0.0.0/8 172.16.0.0/12";
+
+pub(super) fn unit(args: &UnitArgs) -> Result<(), Failure> {
+    let words = std::env::args().skip_while(|word| word != "unit").skip(1).collect::<Vec<_>>();
+    let rig = setup::rig_with_network(&args.run.rig, &args.run.network)?;
+    report::print(drop_in(&rig, &args.run, &words, Path::new("/"))?.trim_end())
+}
+
+/// The drop-in for a run with these options, which `words` are; `/dev`, `/proc` and `/sys` are looked at below `root`.
+fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -> Result<String, Failure> {
+    let usage = |says: String| Failure::new(Exit::Usage, says);
+    let config = run.rig.config.as_deref().ok_or_else(|| usage(format!("name the rig: --config {USUAL_RIG}")))?;
+    visible_paths(rig, run).into_iter().try_for_each(|(what, path)| visible(what, &path))?;
+    if let Some(record) = run.record.as_deref().filter(|record| !record.starts_with(STATE_FOLDER)) {
+        let found = record.display();
+        return Err(usage(format!("--record {found}: the service may write below {STATE_FOLDER} only")));
+    }
+    let command: Vec<String> = words.iter().map(|word| quoted(word)).collect();
+    let mut text = format!(
+        "# Written by `holod unit`: what this bench needs of the unit. Write it anew when rig or devices change.\n\
+         [Service]\nExecStart=\nExecStart={BINARY} run {}\n",
+        command.join(" ")
+    );
+    if config != Path::new(USUAL_RIG) {
+        let rig = quoted(&config.to_string_lossy());
+        text.push_str(&format!("ExecStopPost=\nExecStopPost=-{BINARY} dark --config {rig}\n"));
+    }
+    let needs = needs(rig, run, root)?;
+    for device in &needs.devices {
+        text.push_str(&format!("DeviceAllow={device} rw\n"));
+    }
+    if let Some(hosts) = &needs.hosts {
+        text.push_str(&format!("RestrictAddressFamilies=AF_INET AF_INET6\nIPAddressAllow=localhost {hosts}\n"));
+    }
+    Ok(text)
+}
+
+/// What the run opens beyond files.
+#[derive(Debug, Default)]
+struct Needs {
+    devices: BTreeSet<String>,
+    /// Addresses, as systemd writes them.
+    hosts: Option<String>,
+}
+
+fn needs(rig: &Rig, run: &RunArgs, root: &Path) -> Result<Needs, Failure> {
+    let mut needs = Needs::default();
+    for port in rig.lasers.driver.paths() {
+        needs.devices.extend(serial_class(port, "the laser box", root)?);
+    }
+    if let Some(spec) = run.tracker.as_ref().or(rig.tracker.spec.as_ref()) {
+        match spec.parse().map_err(Failure::because(Exit::Usage))? {
+            TrackerSpec::Serial { path, .. } => needs.devices.extend(serial_class(&path, "the tracker", root)?),
+            TrackerSpec::Path(path) if path.starts_with("/dev") => {
+                needs.devices.extend(serial_class(&path, "the tracker", root)?);
+            }
+            TrackerSpec::Hid { .. } => needs.devices.extend(["char-hidraw".to_owned()]),
+            TrackerSpec::Tcp { address, .. } | TrackerSpec::Core(address) | TrackerSpec::Neon(address) => {
+                let address = address.host.parse::<IpAddr>();
+                needs.hosts = Some(address.map_or(LOCAL_NETWORKS.to_owned(), |address| address.to_string()));
+            }
+            // The address is this machine's own; the tracker's is known when it sends.
+            TrackerSpec::Udp { .. } => needs.hosts = Some(LOCAL_NETWORKS.to_owned()),
+            TrackerSpec::Path(_) | TrackerSpec::Replay { .. } | TrackerSpec::Mock(_) | TrackerSpec::MockFile(_) => {}
+        }
+    }
+    match run.output.parse().map_err(Failure::because(Exit::Usage))? {
+        OutputSpec::Headless(_) => {}
+        OutputSpec::Drm(target) => {
+            needs.devices.insert(card(&target, root));
+        }
+        OutputSpec::Window(_) => {
+            let says = "--output window: the service has no desktop; give the panel a connector with --output drm:";
+            return Err(Failure::new(Exit::Usage, format!("{says}CONNECTOR")));
+        }
+    }
+    if run.backend != Backend::Cpu {
+        needs.devices.extend(gpus(root));
+    }
+    Ok(needs)
+}
+
+/// The class of a serial port: its number may be another after a replug, so that its own node would be too little.
+fn serial_class(port: &Path, what: &str, root: &Path) -> Result<Option<String>, Failure> {
+    let node = below(root, port).canonicalize().map_err(|error| {
+        let port = port.display();
+        Failure::new(Exit::Unavailable, format!("{port}: {error}: plug {what} in, its adapter says what to allow"))
+    })?;
+    let name = node.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    Ok(match name.trim_end_matches(|c: char| c.is_ascii_digit()) {
+        class @ ("ttyUSB" | "ttyACM") => Some(format!("char-{class}")),
+        // A pseudo-terminal, which the unit allows anyway.
+        "" => None,
+        _ => Some(format!("/dev/{name}")),
+    })
+}
+
+/// The card of a connector by a name that stays, or all of them where a monitor is named.
+fn card(target: &DrmTarget, root: &Path) -> String {
+    if let Some(card) = &target.card {
+        return stable_name(card, root);
+    }
+    let suffix = format!("-{}", target.connector);
+    let mut cards = names(&root.join("sys/class/drm"), "card").into_iter().filter_map(|name| {
+        let card = name.strip_suffix(&suffix)?;
+        card["card".len()..].bytes().all(|byte| byte.is_ascii_digit()).then(|| card.to_owned())
+    });
+    match (cards.next(), cards.next()) {
+        (Some(card), None) => stable_name(&Path::new("/dev/dri").join(card), root),
+        _ => "char-drm".to_owned(),
+    }
+}
+
+/// What a Vulkan driver opens: render nodes, and NVIDIA's own devices.
+fn gpus(root: &Path) -> Vec<String> {
+    let nodes = names(&root.join("dev/dri"), "renderD");
+    let mut devices: Vec<String> =
+        nodes.iter().map(|name| stable_name(&Path::new("/dev/dri").join(name), root)).collect();
+    let classes = fs::read_to_string(root.join("proc/devices")).unwrap_or_default();
+    let characters = classes.lines().take_while(|line| !line.starts_with("Block"));
+    let names = characters.filter_map(|line| line.split_whitespace().nth(1));
+    devices.extend(names.filter(|name| name.starts_with("nvidia")).map(|name| format!("char-{name}")));
+    devices
+}
+
+/// A card or render node by the place where it sits, since numbers change.
+fn stable_name(node: &Path, root: &Path) -> String {
+    let wanted = below(root, node).canonicalize().ok();
+    let by_path = Path::new("/dev/dri/by-path");
+    let mut links = names(&below(root, by_path), "").into_iter().map(|name| by_path.join(name));
+    let link = links.find(|link| wanted.is_some() && below(root, link).canonicalize().ok() == wanted);
+    link.unwrap_or_else(|| node.to_owned()).to_string_lossy().into_owned()
+}
+
+/// Names in a folder that begin so, in order; none where there is no such folder.
+fn names(folder: &Path, prefix: &str) -> Vec<String> {
+    let Ok(entries) = fs::read_dir(folder) else { return Vec::new() };
+    let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+    let mut names: Vec<String> = names.filter(|name| name.starts_with(prefix)).collect();
+    names.sort();
+    names
+}
+
+fn below(root: &Path, path: &Path) -> PathBuf {
+    root.join(path.strip_prefix("/").unwrap_or(path))
+}
+
+/// The files that the run reads, and what named them.
+fn visible_paths(rig: &Rig, run: &RunArgs) -> Vec<(&'static str, PathBuf)> {
+    let mut paths: Vec<(&str, PathBuf)> = Vec::new();
+    paths.extend(run.rig.config.clone().map(|path| ("--config", path)));
+    paths.extend(run.record.clone().map(|path| ("--record", path)));
+    if let Some(scene) = run.scene.scene.as_deref().filter(|scene| *scene != "feed" && !scene.starts_with("feed:")) {
+        paths.extend(scene.split(',').map(|path| ("--scene", PathBuf::from(path))));
+    }
+    paths.extend(files_of(rig).into_iter().map(|path| ("the rig", path)));
+    paths
+}
+
+/// Refuses a file that the service would not find.
+fn visible(what: &str, path: &Path) -> Result<(), Failure> {
+    let refused = |says: String| Err(Failure::new(Exit::Usage, says));
+    let shown = path.display();
+    if !path.is_absolute() {
+        return refused(format!("{what}: found {shown}; the service starts in /, write the whole path"));
+    }
+    match HIDDEN_FROM_SERVICE.into_iter().find(|folder| path.starts_with(folder)) {
+        Some(folder) => {
+            refused(format!("{what}: found {shown}; the service does not see {folder}, move it to /etc/holod or /srv"))
+        }
+        None => Ok(()),
+    }
+}
+
+/// A word of `ExecStart=`, in which systemd reads quotes, backslashes, `$` and `%`.
+fn quoted(word: &str) -> String {
+    let escaped = word.replace('\\', "\\\\").replace('"', "\\\"").replace('$', "$$").replace('%', "%%");
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_./:,=@+%$".contains(c);
+    if !escaped.is_empty() && escaped.chars().all(plain) { escaped } else { format!("\"{escaped}\"") }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::symlink;
+
+    use clap::Parser;
+    use holod_calibration::rig::{LaserDriver, WeightsChoice};
+
+    use super::*;
+    use crate::cli::{Cli, Command};
+
+    /// A machine with a tracker, a laser box, two cards and NVIDIA's driver.
+    fn machine() -> tempfile::TempDir {
+        let root = tempfile::tempdir().unwrap();
+        let path = |name: &str| root.path().join(name);
+        for folder in ["dev/dri/by-path", "sys/class/drm/card0-DP-1", "sys/class/drm/card1-DP-2", "proc"] {
+            fs::create_dir_all(path(folder)).unwrap();
+        }
+        for node in ["ttyUSB3", "ttyACM0", "ttyS0", "dri/card0", "dri/card1", "dri/renderD128"] {
+            fs::write(path("dev").join(node), "").unwrap();
+        }
+        symlink("ttyUSB3", path("dev/holod-tracker")).unwrap();
+        symlink("ttyACM0", path("dev/holod-lasers")).unwrap();
+        symlink("../card1", path("dev/dri/by-path/pci-0000:01:00.0-card")).unwrap();
+        fs::write(path("proc/devices"), "Character devices:\n195 nvidia\n\nBlock devices:\n  8 nvidiablock\n").unwrap();
+        root
+    }
+
+    fn drop_in_of(words: &[&str], rig: &Rig, root: &Path) -> Result<String, String> {
+        let cli = Cli::try_parse_from(["holod", "unit"].iter().chain(words)).unwrap();
+        let Some(Command::Unit(args)) = cli.command else { panic!("{cli:?}") };
+        let words: Vec<String> = words.iter().map(|&word| word.to_owned()).collect();
+        drop_in(rig, &args.run, &words, root).map_err(|failure| failure.to_string())
+    }
+
+    fn rig() -> Rig {
+        let mut rig = Rig::default();
+        rig.tracker.spec = Some("serial:/dev/holod-tracker".into());
+        rig.lasers.driver = LaserDriver::Serial { path: "/dev/holod-lasers".into(), sync_wire: false };
+        rig
+    }
+
+    fn allowed(text: &str) -> Vec<&str> {
+        text.lines().filter_map(|line| line.strip_prefix("DeviceAllow=")?.strip_suffix(" rw")).collect()
+    }
+
+    const RIG: [&str; 2] = ["--config", "/etc/holod/rig.toml"];
+
+    #[test]
+    fn the_devices_that_the_rig_names_are_allowed_and_no_others() {
+        let root = machine();
+        let text = drop_in_of(&[&RIG[..], &["--output", "drm:DP-2"]].concat(), &rig(), root.path()).unwrap();
+        let card = "/dev/dri/by-path/pci-0000:01:00.0-card";
+        let all = [card, "/dev/dri/renderD128", "char-nvidia", "char-ttyACM", "char-ttyUSB"];
+        assert_eq!(allowed(&text), all, "{text}");
+        assert!(
+            text.contains("ExecStart=\nExecStart=/usr/bin/holod run --config /etc/holod/rig.toml --output drm:DP-2\n")
+        );
+        assert!(!text.contains("ExecStopPost") && !text.contains("AF_INET"), "{text}");
+
+        let few =
+            drop_in_of(&[&RIG[..], &["--backend", "cpu", "--tracker", "/dev/ttyS0"]].concat(), &rig(), root.path());
+        assert_eq!(allowed(&few.unwrap()), ["/dev/ttyS0", "char-ttyACM"]);
+        let none = drop_in_of(&[&RIG[..], &["--backend", "cpu"]].concat(), &Rig::default(), root.path()).unwrap();
+        assert!(allowed(&none).is_empty(), "{none}");
+        // A monitor's name may be at any card.
+        let named = drop_in_of(&[&RIG[..], &["--output", "drm:PLUTO-2.1"]].concat(), &rig(), root.path()).unwrap();
+        assert!(allowed(&named).contains(&"char-drm"), "{named}");
+    }
+
+    #[test]
+    fn a_tracker_on_a_network_gets_its_own_address() {
+        let root = machine();
+        let with = |spec: &str| drop_in_of(&[&RIG[..], &["--tracker", spec]].concat(), &rig(), root.path()).unwrap();
+        assert!(with("core:192.0.2.7").contains("IPAddressAllow=localhost 192.0.2.7\n"));
+        assert!(with("neon").contains("IPAddressAllow=localhost link-local 192.168.0.0/16"));
+        assert!(with("hid:1209:0001").contains("DeviceAllow=char-hidraw rw"));
+    }
+
+    #[test]
+    fn what_the_service_could_not_do_is_refused() {
+        let root = machine();
+        let refused = |words: &[&str]| drop_in_of(words, &rig(), root.path()).unwrap_err();
+        assert!(refused(&[]).contains("name the rig"));
+        assert!(refused(&["--config", "rig.toml"]).contains("whole path"));
+        assert!(refused(&["--config", "/home/me/rig.toml"]).contains("does not see /home"));
+        assert!(refused(&[&RIG[..], &["--output", "window"]].concat()).contains("no desktop"));
+        assert!(refused(&[&RIG[..], &["--record", "/srv/run1"]].concat()).contains("/var/lib/holod only"));
+        assert!(refused(&[&RIG[..], &["--scene", "/srv/a.png,b.png"]].concat()).contains("found b.png"));
+        assert!(refused(&[&RIG[..], &["--tracker", "/dev/ttyUSB9"]].concat()).contains("plug the tracker in"));
+        let mut rig = rig();
+        rig.model.weights = WeightsChoice::File("/home/me/weights.safetensors".into());
+        assert!(drop_in_of(&RIG, &rig, root.path()).unwrap_err().contains("the rig: found /home"));
+    }
+
+    #[test]
+    fn words_reach_the_service_as_they_were_written() {
+        for (word, written) in [
+            ("--scene", "--scene"),
+            ("/srv/two cards", "\"/srv/two cards\""),
+            ("50%", "50%%"),
+            ("$HOME", "$$HOME"),
+            ("a\"b\\", "\"a\\\"b\\\\\""),
+            ("", "\"\""),
+            (";", "\";\""),
+        ] {
+            assert_eq!(quoted(word), written);
+        }
+    }
+}
