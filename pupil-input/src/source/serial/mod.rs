@@ -271,7 +271,7 @@ fn port_warnings(port: &SerialPortInfo, path: &Path) -> Vec<String> {
         let name = port.path.file_name().unwrap_or_default().display();
         warnings.push(format!(
             "the adapter of tracker port {shown} holds bytes back for up to {held_ms} ms (latency_timer); install \
-             deploy/udev/60-holod-tracker.rules, or write 1 into /sys/bus/usb-serial/devices/{name}/latency_timer after \
+             deploy/udev/60-holod-latency.rules, or write 1 into /sys/bus/usb-serial/devices/{name}/latency_timer after \
              each replug"
         ));
     }
@@ -623,7 +623,7 @@ mod tests {
         assert_eq!(warnings.len(), 2, "{warnings:?}");
         assert!(warnings[0].contains(&format!("write {} instead", by_id.display())), "{}", warnings[0]);
         assert!(warnings[1].contains("up to 16 ms"), "{}", warnings[1]);
-        assert!(warnings[1].contains("deploy/udev/60-holod-tracker.rules"), "{}", warnings[1]);
+        assert!(warnings[1].contains("deploy/udev/60-holod-latency.rules"), "{}", warnings[1]);
         assert_eq!(feed(&system, &by_id, holod(), &[]).warnings().len(), 1);
         let timer = system.path().join("sys/devices/1-1/1-1:1.0/ttyUSB0/latency_timer");
         std::fs::write(timer, "1\n").expect("writes");
