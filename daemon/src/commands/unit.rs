@@ -11,7 +11,7 @@ use holod_slm_output::OutputSpec;
 use holod_slm_output::present::drm::DrmTarget;
 
 use super::check::access::{HIDDEN_FROM_SERVICE, files_of};
-use crate::cli::{Backend, RunArgs, UnitArgs};
+use crate::cli::{Backend, PageAddress, RunArgs, UnitArgs};
 use crate::failure::{Exit, Failure};
 use crate::{report, setup};
 
@@ -52,8 +52,9 @@ fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -> Result<St
     for device in &needs.devices {
         text.push_str(&format!("DeviceAllow={device} rw\n"));
     }
-    if let Some(hosts) = &needs.hosts {
-        text.push_str(&format!("RestrictAddressFamilies=AF_INET AF_INET6\nIPAddressAllow=localhost {hosts}\n"));
+    if needs.network {
+        let hosts: String = needs.hosts.iter().map(|host| format!(" {host}")).collect();
+        text.push_str(&format!("RestrictAddressFamilies=AF_INET AF_INET6\nIPAddressAllow=localhost{hosts}\n"));
     }
     Ok(text)
 }
@@ -62,8 +63,17 @@ fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -> Result<St
 #[derive(Debug, Default)]
 struct Needs {
     devices: BTreeSet<String>,
-    /// Addresses, as systemd writes them.
-    hosts: Option<String>,
+    /// Whether it listens or connects on a network, if only this machine's own.
+    network: bool,
+    /// Other machines' addresses, as systemd writes them.
+    hosts: BTreeSet<String>,
+}
+
+impl Needs {
+    fn allow(&mut self, hosts: &str) {
+        self.network = true;
+        self.hosts.insert(hosts.to_owned());
+    }
 }
 
 fn needs(rig: &Rig, run: &RunArgs, root: &Path) -> Result<Needs, Failure> {
@@ -80,12 +90,17 @@ fn needs(rig: &Rig, run: &RunArgs, root: &Path) -> Result<Needs, Failure> {
             TrackerSpec::Hid { .. } => needs.devices.extend(["char-hidraw".to_owned()]),
             TrackerSpec::Tcp { address, .. } | TrackerSpec::Core(address) | TrackerSpec::Neon(address) => {
                 let address = address.host.parse::<IpAddr>();
-                needs.hosts = Some(address.map_or(LOCAL_NETWORKS.to_owned(), |address| address.to_string()));
+                needs.allow(&address.map_or(LOCAL_NETWORKS.to_owned(), |address| address.to_string()));
             }
             // The address is this machine's own; the tracker's is known when it sends.
-            TrackerSpec::Udp { .. } => needs.hosts = Some(LOCAL_NETWORKS.to_owned()),
+            TrackerSpec::Udp { .. } => needs.allow(LOCAL_NETWORKS),
             TrackerSpec::Path(_) | TrackerSpec::Replay { .. } | TrackerSpec::Mock(_) | TrackerSpec::MockFile(_) => {}
         }
+    }
+    match &run.page.page {
+        Some(PageAddress::Tcp(address)) if address.ip().is_loopback() => needs.network = true,
+        Some(PageAddress::Tcp(_)) => needs.allow(LOCAL_NETWORKS),
+        Some(PageAddress::Unix(_)) | None => {}
     }
     match run.output.parse().map_err(Failure::because(Exit::Usage))? {
         OutputSpec::Headless(_) => {}
@@ -173,6 +188,10 @@ fn visible_paths(rig: &Rig, run: &RunArgs) -> Vec<(&'static str, PathBuf)> {
     let mut paths: Vec<(&str, PathBuf)> = Vec::new();
     paths.extend(run.rig.config.clone().map(|path| ("--config", path)));
     paths.extend(run.record.clone().map(|path| ("--record", path)));
+    paths.extend(run.page.page_token.clone().map(|path| ("--page-token", path)));
+    if let Some(PageAddress::Unix(path)) = &run.page.page {
+        paths.push(("--page", path.clone()));
+    }
     if let Some(scene) = run.scene.scene.as_deref().filter(|scene| *scene != "feed" && !scene.starts_with("feed:")) {
         paths.extend(scene.split(',').map(|path| ("--scene", PathBuf::from(path))));
     }
@@ -278,6 +297,18 @@ mod tests {
         assert!(with("core:192.0.2.7").contains("IPAddressAllow=localhost 192.0.2.7\n"));
         assert!(with("neon").contains("IPAddressAllow=localhost link-local 192.168.0.0/16"));
         assert!(with("hid:1209:0001").contains("DeviceAllow=char-hidraw rw"));
+    }
+
+    #[test]
+    fn a_page_gets_the_network_that_it_is_for() {
+        let root = machine();
+        let with = |words: &[&str]| drop_in_of(&[&RIG[..], words].concat(), &rig(), root.path()).unwrap();
+        let here = with(&["--page", "8420"]);
+        assert!(here.contains("RestrictAddressFamilies=AF_INET AF_INET6\nIPAddressAllow=localhost\n"), "{here}");
+        let others =
+            with(&["--page", "0.0.0.0:8420", "--page-token", "/etc/holod/token", "--tracker", "core:192.0.2.7"]);
+        assert!(others.contains("IPAddressAllow=localhost 192.0.2.7 link-local 192.168.0.0/16"), "{others}");
+        assert!(!with(&["--page", "unix:/run/holod/page"]).contains("AF_INET"));
     }
 
     #[test]
