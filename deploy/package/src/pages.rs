@@ -79,14 +79,14 @@ mod tests {
     fn each_subcommand_has_a_page_that_says_what_it_is_for() {
         let pages = pages();
         let names: BTreeSet<&str> = pages.iter().map(|(name, _)| name.as_str()).collect();
-        let mut expected = vec!["holod.1".to_owned()];
-        for command in crate::command().get_subcommands() {
-            expected.push(format!("holod-{}.1", command.get_name()));
-            let below = command.get_subcommands().map(|below| below.get_name());
-            expected.extend(below.map(|below| format!("holod-{}-{below}.1", command.get_name())));
+        fn expected(name: &str, command: &Command) -> Vec<String> {
+            let below = command.get_subcommands();
+            let below = below.flat_map(|below| expected(&format!("{name}-{}", below.get_name()), below));
+            std::iter::once(format!("{name}.1")).chain(below).collect()
         }
+        let expected = expected("holod", &crate::command());
         assert_eq!(names, expected.iter().map(String::as_str).collect());
-        assert!(names.contains("holod-tracker-try.1"));
+        assert!(names.contains("holod-tracker-try.1") && names.contains("holod-ctl-pattern-lens.1"));
         for (name, page) in &pages {
             let text = String::from_utf8(page.clone()).unwrap();
             assert!(text.contains(".SH NAME") && text.contains(".SH SYNOPSIS"), "{name}: {text}");
