@@ -53,9 +53,14 @@ def test_an_interrupt_ends_an_evaluation(scenes: Path) -> None:
     for number in range(1, 200):
         os.link(scenes / "scene_000000.safetensors", scenes / f"scene_{number:06}.safetensors")
     began = time.monotonic()
+    # A shell's background jobs inherit that it is ignored.
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
     interrupt = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
     interrupt.start()
-    with pytest.raises(KeyboardInterrupt):
-        holod.evaluate(scenes, "fast", border_px=8, backend="cpu")
-    interrupt.join()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            holod.evaluate(scenes, "fast", border_px=8, backend="cpu")
+    finally:
+        interrupt.join()
+        signal.signal(signal.SIGINT, inherited)
     assert time.monotonic() - began < 60
