@@ -6,8 +6,9 @@ use std::collections::VecDeque;
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, mpsc};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rustix::net::SocketType;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
@@ -27,10 +28,14 @@ const LONGEST: u64 = 1 << 16;
 const STACK_BYTES: usize = 8 << 20;
 /// Longer than the control thread takes for anything; an order that nobody waits for any more is not obeyed.
 const PATIENCE: Duration = Duration::from_secs(5);
+/// How long the end of a run waits for answers to be sent.
+const FAREWELL: Duration = Duration::from_millis(500);
 
 /// A control socket that listens. Dropping it ends that.
 pub(crate) struct ControlServer {
     socket: PathBuf,
+    /// Requests that have no answer yet.
+    under_way: Arc<AtomicUsize>,
     runtime: Option<Runtime>,
 }
 
@@ -57,9 +62,10 @@ impl ControlServer {
             let _inside = runtime.enter();
             UnixListener::from_std(listener.into())?
         };
-        let waiting = Waiting { preparer, orders, long_work: Semaphore::new(1) };
+        let under_way = Arc::new(AtomicUsize::new(0));
+        let waiting = Waiting { preparer, orders, long_work: Semaphore::new(1), under_way: Arc::clone(&under_way) };
         runtime.spawn(serve(listener, Arc::new(waiting)));
-        Ok((Self { socket, runtime: Some(runtime) }, receiver))
+        Ok((Self { socket, under_way, runtime: Some(runtime) }, receiver))
     }
 
     /// Where it listens.
@@ -70,6 +76,11 @@ impl ControlServer {
 
 impl Drop for ControlServer {
     fn drop(&mut self) {
+        // Whoever asked for the end is told that it came.
+        let t_end = Instant::now() + FAREWELL;
+        while self.under_way.load(Ordering::Acquire) > 0 && Instant::now() < t_end {
+            std::thread::sleep(Duration::from_millis(1));
+        }
         if let Some(runtime) = self.runtime.take() {
             // What is still being made ready ends with the process.
             runtime.shutdown_background();
@@ -110,6 +121,7 @@ async fn converse(stream: UnixStream, desk: &Arc<Waiting>) -> io::Result<()> {
         if line.is_empty() {
             return Ok(());
         }
+        let _until_it_is_answered = UnderWay::count(&desk.under_way);
         let is_whole = line.ends_with(b"\n");
         let answer = if is_whole {
             answer(&line, desk).await
@@ -157,12 +169,29 @@ async fn answer(line: &[u8], desk: &Arc<Waiting>) -> Answer {
     }
 }
 
+/// Counts a request for as long as it lives.
+struct UnderWay<'a>(&'a AtomicUsize);
+
+impl<'a> UnderWay<'a> {
+    fn count(requests: &'a AtomicUsize) -> Self {
+        requests.fetch_add(1, Ordering::Release);
+        Self(requests)
+    }
+}
+
+impl Drop for UnderWay<'_> {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Release);
+    }
+}
+
 /// What every connection needs.
 struct Waiting {
     preparer: Preparer,
     orders: mpsc::Sender<Ordered>,
     /// Of what takes long, one at a time.
     long_work: Semaphore,
+    under_way: Arc<AtomicUsize>,
 }
 
 thread_local! {
