@@ -38,6 +38,8 @@ pub struct FrameRecord {
     pub t_desired_present: TimeNs,
     /// The picture that was shown.
     pub picture: PictureTag,
+    /// The memory slot for its levels, where they are kept.
+    pub keep: Option<usize>,
     /// The amplitude that double phase took as 1.
     pub amplitude_constant: f32,
 }
@@ -244,6 +246,7 @@ mod tests {
             t_submit: TimeNs(21),
             t_desired_present: TimeNs(30),
             picture: PictureTag { number: 4, t_taken: Some(TimeNs(3)) },
+            keep: None,
             amplitude_constant: 1.0,
         }
     }

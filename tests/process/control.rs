@@ -176,7 +176,7 @@ fn patterns_take_the_place_of_holograms_and_make_way_again() {
         let said = bench.ctl(order);
         assert!(said.contains(&format!("the pattern {name} is shown until `holod ctl hologram`")), "{said}");
         assert_eq!(bench.status()["pattern"], name);
-        shown(20);
+        shown(40);
     }
     let pid = bench.daemon.as_ref().unwrap().pid().to_string();
     bench.until("the status says so", |_| {
@@ -199,7 +199,7 @@ fn patterns_take_the_place_of_holograms_and_make_way_again() {
         rows.map(|row| row.t_sample_ns.is_some()).collect::<Vec<_>>()
     };
     // The order's time is taken before the change is handed over.
-    const HANDED_OVER_NS: i64 = 100_000_000;
+    const HANDED_OVER_NS: i64 = 300_000_000;
     let during = rests_on_a_sample(began + HANDED_OVER_NS..ended);
     assert!(!during.is_empty() && during.iter().all(|rests| !rests), "a pattern rests on no sample");
     let before = rests_on_a_sample(0..began);

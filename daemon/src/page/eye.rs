@@ -136,12 +136,20 @@ impl EyeThread {
         if let Err(error) = setpriority_process(None, NICENESS) {
             tracing::debug!("the page's pictures are made at ordinary priority: {error}");
         }
+        // Its one thread inherits that; the usual pool's would take all cores.
+        let pool = match rayon::ThreadPoolBuilder::new().num_threads(1).build() {
+            Ok(pool) => pool,
+            Err(error) => {
+                tracing::warn!("the page will show no picture: {error}");
+                return;
+            }
+        };
         loop {
             match questions.recv_timeout(IDLE) {
                 Ok(Question { gaze, answer }) => {
                     if !answer.is_closed() {
                         // Whoever asked may have gone.
-                        let _gone = answer.send(self.see(gaze));
+                        let _gone = answer.send(pool.install(|| self.see(gaze)));
                     }
                 }
                 Err(RecvTimeoutError::Timeout) => (self.eye, self.newest) = (None, None),

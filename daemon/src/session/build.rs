@@ -57,6 +57,8 @@ pub(super) struct Session<'a> {
 
 /// Starts everything. What has been started is taken down again where a later part cannot be.
 pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Observer) -> Result<Session<'_>, Failure> {
+    // Its threads keep the priority of whoever calls it first, which must not be the panel's.
+    scheduling::patient(rayon::current_num_threads);
     let resolution = plan.pictures.resolution();
     let rig = &plan.rig;
     let encoder = progress::during(&format!("preparing the levels of the panel of {}", rig.resolution()), || {
@@ -108,7 +110,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
     let records_lost = Arc::new(AtomicU64::new(0));
     let (record_producer, records) = rtrb::RingBuffer::new(RECORDS);
     let (places, change_consumer) = rtrb::RingBuffer::new(1);
-    let (retired_producer, retired) = rtrb::RingBuffer::new(2);
+    let (retired_producer, retired) = rtrb::RingBuffer::new(3);
     let steering = Arc::new(Steering::new(plan.pupil));
     let preparer = Preparer {
         rig: rig.clone(),

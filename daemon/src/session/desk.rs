@@ -174,15 +174,17 @@ impl Watch<'_> {
         let (name, levels) = pattern.map(|NewPattern { name, levels }| (name, levels)).unzip();
         self.change(Change::Pattern(levels))?;
         self.desk.pattern = name;
-        let lit = self.rig.lasers.driver != LaserDriver::Simulated && output.counts().armed;
-        Ok(match name {
-            None => "holograms are shown".into(),
-            Some(name) if lit => format!(
-                "the pattern {name} is shown until `holod ctl hologram`; lasers are lit: an eye in the display may get                  all of their light in one spot, use a camera"
-            )
-            .into(),
-            Some(name) => format!("the pattern {name} is shown until `holod ctl hologram`").into(),
-        })
+        let Some(name) = name else { return Ok("holograms are shown".into()) };
+        let warning = if output.counts().armed { self.pattern_warning() } else { "" };
+        Ok(format!("the pattern {name} is shown until `holod ctl hologram`{warning}").into())
+    }
+
+    /// What whoever lights a pattern must know.
+    fn pattern_warning(&self) -> &'static str {
+        if self.desk.pattern.is_none() || self.rig.lasers.driver == LaserDriver::Simulated {
+            return "";
+        }
+        "; lasers are lit over a pattern: an eye in the display may get all of their light in one spot, use a camera"
     }
 
     fn change(&mut self, change: Change) -> Result<(), String> {
@@ -193,7 +195,7 @@ impl Watch<'_> {
     fn keep_dark(&mut self, dark: bool, output: &OutputControl) -> Result<Value, String> {
         self.desk.keeps_dark = dark;
         match (output.keep_dark(dark), dark) {
-            (_, false) => Ok("lasers are lit again by the rules".into()),
+            (_, false) => Ok(format!("lasers are lit again by the rules{}", self.pattern_warning()).into()),
             (true, true) => Ok("the lasers are dark, and stay so until `holod ctl lasers arm`".into()),
             (false, true) => {
                 Err("the laser box did not acknowledge darkness: look at the lasers, and switch them off by \

@@ -167,6 +167,7 @@ impl FrameLoop {
                 t_submit,
                 t_desired_present: plan.t_desired_present,
                 picture: if self.pattern.is_some() { PictureTag::default() } else { picture },
+                keep,
                 amplitude_constant: self.renderer.amplitude_constant(),
             },
             beyond_trained: !self.trained.contain(estimate.pupil),

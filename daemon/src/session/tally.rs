@@ -6,7 +6,7 @@ use holod_calibration::{PupilDiameter, TimeNs};
 use holod_slm_output::FieldEvent;
 
 use super::frame_loop::LoopRecord;
-use super::keep::{KEEP_SLOTS, keep_slot};
+use super::keep::KEEP_SLOTS;
 use super::ledger::LaserLedger;
 use super::stats::Recent;
 use super::{FirstLight, RECORDS};
@@ -73,7 +73,7 @@ impl Tally {
         self.frames_shown += 1;
         self.deadline_misses += u64::from(event.deadline_missed);
         let frame = self.recent.iter().find(|frame| frame.frame == event.frame_id)?;
-        if let Some(slot) = keep_slot(frame.pupil) {
+        if let Some(slot) = frame.keep {
             self.kept[slot] = Some((frame.frame, frame.pupil));
         }
         let (on, off) = event.laser_on.zip(event.laser_off)?;

@@ -246,6 +246,9 @@ function drawStages() {
   plot.end();
 }
 
+/** Whether a field's mark says why it was dark. */
+const isReason = (mark) => !["", "repeated", "late"].includes(mark);
+
 function drawFields() {
   const plot = plots.fields;
   const t1 = seen.fields.at(-1)?.[3] ?? newest.t, t0 = t1 - FIELDS_S;
@@ -257,7 +260,7 @@ function drawFields() {
     const low = 2 - which;
     plot.box(from, until, low + 0.1, low + 0.9, "field");
     if (on !== null && off !== null) plot.box(on, off, low + 0.25, low + 0.75, COLOURS[which]);
-    else if (mark !== "" && mark !== "repeated" && mark !== "late") plot.box(from, until, low + 0.45, low + 0.55, "miss");
+    else if (isReason(mark)) plot.box(from, until, low + 0.45, low + 0.55, "miss");
   }
   plot.end();
 }
@@ -280,7 +283,7 @@ function tellFigures() {
   const late = new Set(fields.filter((field) => field[6] === "late").map(([frame]) => frame)).size;
   put(at("stages-text"), frames.length ? `${number(frames.length / WINDOW_S)} frames a second; the engine takes ${number(median(frames.map((frame) => frame[5])))} ms; ${late} late on the panel` : "no frame yet");
   const lit = fields.filter((field) => field[5] !== null);
-  const dark = [...new Set(fields.filter((field) => field[5] === null && field[6]).map((field) => field[6]))];
+  const dark = [...new Set(fields.filter((field) => field[5] === null).map((field) => field[6]).filter(isReason))];
   const share = fields.length ? lit.reduce((sum, field) => sum + field[5] - field[4], 0) / fields.reduce((sum, field) => sum + field[3] - field[2], 0) : 0;
   put(at("fields-text"), `${lit.length} of ${fields.length} fields lit in ${WINDOW_S} s, ${number(share * 100, 0)} % of the time${dark.length ? `; dark: ${dark.join(", ")}` : ""}`);
 }
