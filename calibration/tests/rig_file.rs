@@ -333,8 +333,8 @@ fn missing_tables_and_keys_are_named_once() {
 
 #[test]
 fn each_choice_of_eye_is_read() {
-    let eyes = [("left", Eye::Left), ("right", Eye::Right), ("both", Eye::Both), ("better", Eye::Better)];
-    for (name, eye) in eyes {
+    for (name, eye) in Eye::NAMES {
+        assert_eq!(eye.name(), name);
         let text = changed(&[("eye = \"both\"", &format!("eye = \"{name}\""))]);
         assert_eq!(Rig::parse(&text, Path::new("")).unwrap().tracker.eye, eye);
     }

@@ -63,6 +63,7 @@ fn run(out: &Path) -> Result<(), Failure> {
     let amplitude_constant = weights.config().amplitude_constant;
     let plan = SessionPlan {
         rig: rig.clone(),
+        rig_again: None,
         weights,
         backend: Backend::Cpu,
         pictures: Pictures::Scene(Arc::new(Frames {

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use holod_calibration::rig::WeightsChoice;
+use holod_calibration::rig::{Eye, WeightsChoice};
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_model::scene::Fit;
 use holod_pupil_input::UsbIds;
@@ -54,7 +54,7 @@ pub enum Command {
     Pattern(PatternKind<PatternTarget>),
     /// Say what the running daemon is doing.
     Status(StatusArgs),
-    /// Change what the running daemon does: scene, weights, pupil, lasers.
+    /// Change what the running daemon does: scene, weights, pupil, eye, patterns, lasers, or read the rig file again.
     Ctl(CtlArgs),
     /// List trackers, or try one out.
     #[command(subcommand)]
@@ -246,6 +246,9 @@ pub struct RunArgs {
     /// Compute for one pupil, in millimetres, whatever the tracker says.
     #[arg(long, value_name = "MM", value_parser = parse_pupil)]
     pub pupil: Option<PupilDiameter>,
+    /// Which eye looks into the display: left, right, both or better, in place of the rig's tracker.eye.
+    #[arg(long, value_name = "EYE", value_parser = parse_eye)]
+    pub eye: Option<Eye>,
     /// Millimetres for one unit of the tracker's figure, in place of the rig's tracker.scale_mm_per_unit.
     #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
     pub scale: Option<f64>,
@@ -515,6 +518,14 @@ pub enum CtlOrder {
         #[arg(value_name = "MM|follow", value_parser = parse_pupil_or_follow)]
         pupil: PupilOrder,
     },
+    /// Follow another eye: left, right, both (their mean) or better (the one of which the tracker is surer).
+    Eye {
+        /// Which.
+        #[arg(value_name = "EYE", value_parser = parse_eye)]
+        eye: Eye,
+    },
+    /// Read the rig file again. What needs panel, lasers or tracker to be opened anew is refused, and nothing changes.
+    Reload,
     /// Show a test pattern in place of holograms.
     #[command(subcommand)]
     Pattern(PatternKind<PatternPlace>),
@@ -656,6 +667,11 @@ pub struct LogConvertArgs {
     /// Millimetres for one unit of the log's figure, where it is not in millimetres; for lines only.
     #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
     pub scale: Option<f64>,
+}
+
+fn parse_eye(text: &str) -> Result<Eye, String> {
+    let named = Eye::NAMES.into_iter().find(|(name, _)| *name == text);
+    named.map(|(_, eye)| eye).ok_or_else(|| format!("found '{text}', expected left, right, both or better"))
 }
 
 fn parse_scale(text: &str) -> Result<f64, String> {

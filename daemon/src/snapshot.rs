@@ -62,6 +62,9 @@ pub struct Snapshot {
     pub uptime_s: f64,
     /// Where `holod ctl` may ask it.
     pub control: Option<PathBuf>,
+    /// The eye that is followed: left, right, both or better.
+    #[serde(default)]
+    pub eye: String,
     /// The picture stands still.
     pub paused: bool,
     /// A person keeps the lasers dark.

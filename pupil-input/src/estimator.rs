@@ -291,6 +291,19 @@ impl Estimator {
         }
     }
 
+    /// Goes on with other settings. Where they make something else of the samples, the eyes are learnt anew: what is
+    /// shown is held until one is believed again, and slides there. Another hold time or fallback is in force at once.
+    pub fn change(&mut self, settings: EstimatorSettings, on_decision: impl FnMut(Decision)) {
+        let before = std::mem::replace(&mut self.snapshot.settings, settings);
+        let EstimatorSettings { fallback, hold, fallback_mm_per_s, return_mm_per_s, silence, .. } = settings;
+        if settings == (EstimatorSettings { fallback, hold, fallback_mm_per_s, return_mm_per_s, silence, ..before }) {
+            return;
+        }
+        self.finish(on_decision);
+        self.channels = std::array::from_fn(|_| Channel::new(&settings));
+        (self.chosen, self.learnt, self.t_learnt) = (None, TimeNs(0), None);
+    }
+
     /// Takes the next sample and calls `on_decision` once for each sample on which the gate has now made up its mind:
     /// an accepted one comes [`GateSettings::lead`] late.
     pub fn push(&mut self, sample: PupilSample, mut on_decision: impl FnMut(Decision)) {

@@ -77,6 +77,6 @@ pub use source::server::ServerError;
 pub use source::tcp::NetworkError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
 pub use tracker::{
-    DecisionTap, EstimateReader, Link, Tracker, TrackerControl, TrackerError, TrackerHandle, TrackerOptions, host_now,
-    scaled_millimetres,
+    ChangeError, DecisionTap, EstimateReader, Link, Tracker, TrackerControl, TrackerError, TrackerHandle,
+    TrackerOptions, host_now, scaled_millimetres,
 };

@@ -86,6 +86,12 @@ impl RefusalWatch {
         }
     }
 
+    /// The tracker goes on with other settings: what was refused before says nothing of them.
+    pub fn change(&mut self, settings: &rig::Tracker) {
+        (self.scale, self.eye) = (settings.scale.unwrap_or(1.0), settings.eye);
+        self.samples.clear();
+    }
+
     /// Takes note of a decision.
     pub fn note(&mut self, decision: &Decision) {
         if decision.verdict != Verdict::Accepted {

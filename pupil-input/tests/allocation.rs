@@ -22,11 +22,13 @@ fn the_simulated_eye_its_clock_and_the_choice_of_an_eye_allocate_nothing() {
     let mut clock = ClockModel::new();
     let mut estimator =
         Estimator::new(EstimatorSettings::from(&rig::Tracker { eye: rig::Eye::Better, ..rig::Rig::default().tracker }));
+    let other = EstimatorSettings::from(&rig::Rig::default().tracker);
     let allocations = allocations_of(|| {
         for mock in source.by_ref().take(20_000) {
             let t_sample = clock.map(mock.sample.t_device, mock.sample.t_arrival);
             estimator.push(PupilSample { t_sample, ..mock.sample }, |_| {});
         }
+        estimator.change(other, |_| {});
     });
     assert_eq!(allocations, 0);
     assert!(clock.resets() > 3);

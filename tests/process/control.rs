@@ -14,6 +14,27 @@ use crate::HOLOD;
 
 const PATIENCE: Duration = Duration::from_secs(60);
 
+/// What a run is started with here.
+const ARGS: [&str; 11] = [
+    "--config",
+    "rig.toml",
+    "--tracker",
+    "mock:sweep",
+    "--resolution",
+    "64x64",
+    "--record",
+    "record",
+    "--backend",
+    "cpu",
+    "--json",
+];
+
+fn folder_with_rig() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    folder
+}
+
 struct Bench {
     folder: tempfile::TempDir,
     daemon: Option<Daemon>,
@@ -21,12 +42,11 @@ struct Bench {
 
 impl Bench {
     fn start(more: &[&str]) -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
-        let args = ["--config", "rig.toml", "--tracker", "mock:sweep", "--resolution", "64x64", "--record", "record"];
-        let args = [&args[..], &["--backend", "cpu", "--json"], more].concat();
+        let folder = folder_with_rig();
+        // As a service has it: without a terminal whose end would be the run's.
+        let args = [&[HOLOD][..], &ARGS, more].concat();
         let environment = [("XDG_RUNTIME_DIR", folder.path())];
-        let daemon = Daemon::start_with(HOLOD, &args, folder.path(), &environment);
+        let daemon = Daemon::start_with("setsid", &args, folder.path(), &environment);
         let bench = Self { folder, daemon: Some(daemon) };
         assert!(wait_until(PATIENCE, || bench.status()["frames_shown"].as_u64() > Some(20)), "{}", bench.status());
         bench
@@ -207,6 +227,72 @@ fn patterns_take_the_place_of_holograms_and_make_way_again() {
 }
 
 #[test]
+fn the_rig_file_is_read_again_and_taken_whole_or_not_at_all() {
+    let bench = Bench::start(&["--scale", "1"]);
+    let path = bench.path().join("rig.toml");
+    let rig = fs::read_to_string(&path).unwrap();
+    let write = |rig: &str, changes: &[(&str, &str)]| {
+        let changed = changes.iter().fold(rig.to_owned(), |rig, (from, to)| {
+            assert!(rig.contains(from), "{from}");
+            rig.replacen(from, to, 1)
+        });
+        fs::write(&path, &changed).unwrap();
+        changed
+    };
+    assert!(bench.ctl(&["reload"]).contains("rig.toml is read again: it says the same"));
+    assert_eq!(bench.status()["eye"], "left");
+    assert!(bench.ctl(&["eye", "right"]).contains("the right eye"));
+    assert_eq!(bench.status()["eye"], "right");
+    bench.until("the right eye is followed", |status| status["pupil_state"] == "tracking");
+
+    // Weights and eye could be taken, the lit window could not.
+    let hold = "hold_ms = 400.0\n[model]\nnetwork = \"fast\"";
+    let good = write(
+        &rig,
+        &[("\"left\"", "\"both\""), ("fallback_mm = 3.0", "fallback_mm = 4.2"), ("hold_ms = 1000.0", hold)],
+    );
+    write(&good, &[("lit_ms = 3.0", "lit_ms = 2.5"), ("width_px = 64", "width_px = 66")]);
+    let refused = bench.refused(&["reload"]);
+    assert!(refused.contains("panel.width_px, lasers.lit_ms than this run was started with"), "{refused}");
+    assert!(refused.contains("restart") && refused.contains("Nothing has changed"), "{refused}");
+    write(&good, &[("hold_ms", "hold")]);
+    let refused = bench.refused(&["reload"]);
+    assert!(refused.contains("hold: found an unknown key") && refused.contains("nothing has changed"), "{refused}");
+    let status = bench.status();
+    assert_eq!((&status["eye"], &status["weights"]), (&json!("right"), &json!("standard")));
+
+    write(&good, &[]);
+    bench.daemon.as_ref().unwrap().signal(rustix::process::Signal::HUP);
+    bench.until("SIGHUP is obeyed", |status| status["eye"] == "both" && status["weights"] == "fast");
+
+    let (summary, folder) = bench.stop();
+    assert_eq!(summary["ended_by"], "holod ctl stop");
+    let orders = fs::read_to_string(folder.path().join("record/orders.jsonl")).unwrap();
+    let orders: Vec<Value> = orders.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let requests: Vec<_> = orders.iter().map(|order| &order["request"]).collect();
+    let changed =
+        json!({"tracker.eye": "both", "tracker.fallback_mm": 4.2, "tracker.hold_ms": 400.0, "model.network": "fast"});
+    assert_eq!(requests[..2], [&json!({"do": "reload"}), &json!({"do": "eye", "eye": "right"})]);
+    assert_eq!(requests[2..], [&json!({"do": "reload", "changed": changed}), &json!({"do": "stop"})]);
+}
+
+#[test]
+fn a_terminal_that_goes_away_ends_the_run_in_order() {
+    let folder = folder_with_rig();
+    let command = format!("exec {HOLOD} {}", ARGS.join(" "));
+    let environment = [("XDG_RUNTIME_DIR", folder.path())];
+    let terminal = Daemon::start_with("script", &["-qec", &command, "/dev/null"], folder.path(), &environment);
+    let frames = folder.path().join("record/frames.csv");
+    let lit = || frames::read(&frames).is_ok_and(|rows| rows.iter().any(|row| row.laser_on_ns.is_some()));
+    assert!(wait_until(PATIENCE, lit), "no light");
+    terminal.signal(rustix::process::Signal::KILL);
+    let summary = folder.path().join("record/summary.json");
+    assert!(wait_until(PATIENCE, || summary.exists()), "the run goes on without its terminal");
+    let summary: Value = serde_json::from_str(&fs::read_to_string(summary).unwrap()).unwrap();
+    assert_eq!((&summary["ended_by"], &summary["lasers_dark_at_end"]), (&json!("SIGHUP"), &json!(true)));
+}
+
+#[test]
 fn what_cannot_be_done_is_said_and_changes_nothing() {
     let bench = Bench::start(&[]);
     let before = bench.status();
@@ -216,6 +302,7 @@ fn what_cannot_be_done_is_said_and_changes_nothing() {
         (&["weights", "./absent.safetensors"], "absent.safetensors"),
         (&["pupil", "12"], "expected a human pupil of 0.5 to 9 mm"),
         (&["weights", "smal"], "did you mean `small`?"),
+        (&["eye", "third"], "expected left, right, both or better"),
         (&["pattern", "level", "256"], "expected 0 to 255, the panel's levels"),
         (&["pattern", "checkerboard", "--period", "0"], "period"),
         (&["status", "--pid", "1"], "no holod of that process number"),

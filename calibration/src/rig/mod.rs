@@ -1,5 +1,6 @@
 //! The rig: everything that is true of one bench, as one validated value.
 
+mod differences;
 mod drive;
 mod error;
 mod files;
@@ -18,6 +19,8 @@ pub use error::{Fault, RigError};
 pub use meaning::{ActiveFile, BlurMeaning, FieldMeaning, Meaning, PerColourFigures};
 pub use profile::PanelProfile;
 pub use text_laser::{Expected, Question, TextLaserProfile};
+
+use serde::{Deserialize, Serialize};
 
 use crate::{Colour, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
 
@@ -191,7 +194,8 @@ pub struct Tracker {
 }
 
 /// Which eye's samples drive the display.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Eye {
     /// The viewer's left eye.
     Left,
@@ -222,6 +226,17 @@ pub enum WeightsChoice {
     Fast,
     /// A file that the trainer exported.
     File(PathBuf),
+}
+
+impl Eye {
+    /// Every choice, by its name in a rig file and on the command line.
+    pub const NAMES: [(&'static str, Self); 4] =
+        [("left", Self::Left), ("right", Self::Right), ("both", Self::Both), ("better", Self::Better)];
+
+    /// The choice's name.
+    pub fn name(self) -> &'static str {
+        Self::NAMES.into_iter().find(|(_, eye)| *eye == self).map_or("", |(name, _)| name)
+    }
 }
 
 impl WeightsChoice {

@@ -725,8 +725,7 @@ fn read_text_laser<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, folder: &Pa
 fn read_tracker<'a>(reader: &mut Reader<'a>, tracker: Section<'a>) -> Option<Tracker> {
     let default = Rig::default().tracker;
     let spec = reader.text(tracker, "spec", "a tracker spec, as on the command line");
-    let eyes = [("left", Eye::Left), ("right", Eye::Right), ("both", Eye::Both), ("better", Eye::Better)];
-    let eye = reader.choice(tracker, "eye", &eyes, false);
+    let eye = reader.choice(tracker, "eye", &Eye::NAMES, false);
     let scale = reader.number(tracker, "scale_mm_per_unit", SCALE);
     let fallback_mm = reader.number(tracker, "fallback_mm", FALLBACK);
     let hold_ms = reader.number(tracker, "hold_ms", HOLD);

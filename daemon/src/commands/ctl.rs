@@ -1,5 +1,6 @@
 //! `holod ctl`: changes what the running daemon does.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::rig::WeightsChoice;
@@ -51,6 +52,8 @@ fn request(order: &CtlOrder) -> Result<Request, Failure> {
             axis_px: kind.target().axis,
             colours: kind.target().colour.clone(),
         },
+        CtlOrder::Eye { eye } => Request::Eye { eye: *eye },
+        CtlOrder::Reload => Request::Reload { changed: BTreeMap::new() },
         CtlOrder::Flat => Request::Flat,
         CtlOrder::Hologram => Request::Hologram,
         CtlOrder::Lasers { lasers: LasersArg::Dark } => Request::LasersDark,

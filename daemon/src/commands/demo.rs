@@ -61,6 +61,7 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
     let session = session::run(
         SessionPlan {
             rig,
+            rig_again: None,
             weights,
             backend: Backend::Auto,
             pictures: Pictures::Scene(Arc::new(frames)),

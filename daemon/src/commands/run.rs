@@ -1,13 +1,15 @@
 //! `holod run`: the daemon.
 
 use std::path::Path;
+use std::sync::Arc;
 
 use holod_calibration::TimeNs;
+use holod_calibration::rig::Rig;
 use holod_pupil_input::{RecordFiles, TrackerSpec};
 use holod_slm_output::{FieldEvent, OutputSpec};
 
 use crate::cli::RunArgs;
-use crate::control::Request;
+use crate::control::{Request, RigReader};
 use crate::failure::{Exit, Failure};
 use crate::page::Page;
 use crate::pictures::levels_picture;
@@ -22,11 +24,8 @@ const SAMPLE_TRACKER: &str = "mock";
 
 pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let output: OutputSpec = args.output.parse().map_err(Failure::because(Exit::Usage))?;
-    let mut rig = setup::rig_with_network(&args.rig, &args.network)?;
-    if let Some(scale) = args.scale {
-        rig.tracker.scale = Some(scale);
-    }
-    let spec = args.tracker.clone().or_else(|| rig.tracker.spec.clone()).unwrap_or_else(|| SAMPLE_TRACKER.to_owned());
+    let rig = rig_of(args)?;
+    let spec = rig.tracker.spec.clone().unwrap_or_else(|| SAMPLE_TRACKER.to_owned());
     let tracker: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
     tracing::info!("{}: tracker {tracker}, panel {output} of {}", rig.name, rig.resolution());
     let weights = progress::during("loading the network", || setup::weights(&rig))?;
@@ -45,8 +44,10 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         network.architecture,
         network.version
     );
+    let again = args.clone();
     let plan = SessionPlan {
         rig,
+        rig_again: args.rig.config.is_some().then(|| Arc::new(move || rig_of(&again)) as RigReader),
         weights,
         backend: args.backend,
         pictures,
@@ -80,6 +81,16 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         None => Ok(()),
         Some(why) => Err(Failure::new(Exit::Unavailable, not_dark(why))),
     }
+}
+
+/// The rig with what the command line says in its place.
+fn rig_of(args: &RunArgs) -> Result<Rig, Failure> {
+    let mut rig = setup::rig_with_network(&args.rig, &args.network)?;
+    let tracker = &mut rig.tracker;
+    tracker.spec = args.tracker.clone().or(tracker.spec.take());
+    tracker.eye = args.eye.unwrap_or(tracker.eye);
+    tracker.scale = args.scale.or(tracker.scale);
+    Ok(rig)
 }
 
 /// Writes `summary.json` and the levels that the panel showed.

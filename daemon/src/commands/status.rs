@@ -45,7 +45,7 @@ fn text_of(status: &Snapshot) -> String {
     });
     format!(
         "{} for {:.0} s, process {}, {}{}\n\
-         pupil    {}, {}\n\
+         pupil    {}, {}; eye: {}\n\
          tracker  {}: link {}{}\n\
          \x20        {}\n\
          panel    {}: {:.2} refreshes a second{}\n\
@@ -64,6 +64,7 @@ fn text_of(status: &Snapshot) -> String {
         },
         status.pupil_mm.map_or("none yet".to_owned(), |mm| format!("{mm:.2} mm")),
         status.pupil_state,
+        status.eye,
         figures.tracker,
         figures.tracker_link,
         figures.tracker_trouble.as_ref().map_or(String::new(), |trouble| format!("; {trouble}")),

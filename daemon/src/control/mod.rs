@@ -10,7 +10,10 @@ mod prepare;
 mod server;
 mod steering;
 
+use std::collections::BTreeMap;
+
 use holod_calibration::PupilDiameter;
+use holod_calibration::rig::{Eye, Rig};
 use holod_model::scene::Fit;
 use holod_slm_output::LevelsFrame;
 use serde::{Deserialize, Serialize};
@@ -19,6 +22,7 @@ use serde_json::Value;
 pub use self::client::ask;
 pub use self::pattern::PatternRequest;
 pub(crate) use self::pattern::placement;
+pub use self::prepare::RigReader;
 pub(crate) use self::prepare::{NewEngine, Preparer};
 pub(crate) use self::server::{ControlServer, panic_is_caught};
 pub(crate) use self::steering::Steering;
@@ -58,6 +62,17 @@ pub enum Request {
         #[serde(default)]
         mm: Option<f32>,
     },
+    /// Follow another eye.
+    Eye {
+        /// Which.
+        eye: Eye,
+    },
+    /// Read the rig file again, and go on with what it says now.
+    Reload {
+        /// In a record: the keys of the rig file that say something else now, and what.
+        #[serde(default, skip_deserializing, skip_serializing_if = "BTreeMap::is_empty")]
+        changed: BTreeMap<&'static str, Value>,
+    },
     /// Show a test pattern in place of holograms.
     Pattern {
         /// Which.
@@ -89,7 +104,10 @@ impl Request {
 
     /// Whether files must be read or an engine opened for it, which takes a while.
     fn takes_long(&self) -> bool {
-        matches!(self, Self::Scene { .. } | Self::Weights { .. } | Self::Pattern { .. } | Self::Flat)
+        matches!(
+            self,
+            Self::Scene { .. } | Self::Weights { .. } | Self::Reload { .. } | Self::Pattern { .. } | Self::Flat
+        )
     }
 }
 
@@ -112,9 +130,18 @@ pub(crate) enum Order {
     Engine(NewEngine),
     Pause(bool),
     Pupil(Option<PupilDiameter>),
+    Eye(Eye),
+    Reload(Box<NewRig>),
     Pattern(Option<NewPattern>),
     KeepDark(bool),
     Stop,
+}
+
+/// A rig file that was read again, and can be obeyed.
+pub(crate) struct NewRig {
+    pub(crate) rig: Rig,
+    /// Where it names other weights than those that were in use when it was read.
+    pub(crate) engine: Option<NewEngine>,
 }
 
 /// Levels that take the place of holograms.
@@ -141,6 +168,8 @@ mod tests {
             (r#"{"do":"pupil","mm":3.5}"#, Request::Pupil { mm: Some(3.5) }),
             (r#"{"do":"pupil"}"#, Request::Pupil { mm: None }),
             (r#"{"do":"lasers-dark"}"#, Request::LasersDark),
+            (r#"{"do":"eye","eye":"better"}"#, Request::Eye { eye: Eye::Better }),
+            (r#"{"do":"reload"}"#, Request::Reload { changed: BTreeMap::new() }),
             (
                 r#"{"do":"pattern","pattern":{"kind":"cross-hair","line_px":4},"colours":["green"]}"#,
                 Request::Pattern {

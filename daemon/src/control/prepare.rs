@@ -1,6 +1,6 @@
 //! From a request to an order: files are read and engines opened here, while the loop goes on.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_calibration::{PupilDiameter, Resolution, TimeNs};
@@ -10,7 +10,7 @@ use holod_pupil_input::host_now;
 use holod_slm_output::patterns::{Pattern, PatternError};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 
-use super::{NewPattern, Order, Request, placement};
+use super::{NewPattern, NewRig, Order, Request, placement};
 use crate::cli::{self, Backend, SceneArgs};
 use crate::failure::Failure;
 use crate::renderer::{self, Renderer};
@@ -21,9 +21,22 @@ use crate::source::scene;
 /// Lasers go dark where frames come so much slower.
 const FRAMES_BEFORE_STALL: i64 = 3;
 
+/// What of a rig can change while holod runs, by the keys of the rig file: all that the tracker's thread and the engine
+/// take without anything being opened anew.
+const CHANGEABLE: [&str; 6] =
+    ["name", "tracker.eye", "tracker.scale_mm_per_unit", "tracker.fallback_mm", "tracker.hold_ms", "model.network"];
+
+/// Reads the rig again, as at the start.
+pub type RigReader = Arc<dyn Fn() -> Result<Rig, Failure> + Send + Sync>;
+
 /// What a request is made ready with.
 pub(crate) struct Preparer {
+    /// As it was at the start.
     pub(crate) rig: Rig,
+    /// Where there is a file to read it from again.
+    pub(crate) rig_again: Option<RigReader>,
+    /// The weights that are in use.
+    pub(crate) weights: Arc<Mutex<WeightsChoice>>,
     pub(crate) resolution: Resolution,
     /// What engines are tried out with. It lives as long as the run: an engine keeps the last frame that it has seen.
     pub(crate) frame: Arc<RgbdFrame>,
@@ -71,7 +84,9 @@ impl Preparer {
             Request::Hologram => Ok(Order::Pattern(None)),
             Request::Scene { scene, depth_encoding, .. } if scene == "feed" => self.feed(depth_encoding.is_some()),
             Request::Scene { scene, depth_encoding, fit } => self.scene(scene, depth_encoding.as_ref(), *fit),
-            Request::Weights { weights } => self.engine(weights).map(Order::Engine),
+            Request::Weights { weights } => self.weights(weights).map(Order::Engine),
+            Request::Eye { eye } => Ok(Order::Eye(*eye)),
+            Request::Reload { .. } => self.reload(),
         }
     }
 
@@ -109,13 +124,39 @@ impl Preparer {
         Ok(Order::Pattern(Some(NewPattern { name, levels })))
     }
 
-    fn engine(&self, weights: &str) -> Result<NewEngine, String> {
-        let mut rig = self.rig.clone();
-        rig.model.weights = cli::parse_weights(weights)?;
-        if matches!(&rig.model.weights, WeightsChoice::File(path) if path.is_relative()) {
+    fn reload(&self) -> Result<Order, String> {
+        let Some(rig_again) = &self.rig_again else {
+            return Err("this holod was started without --config, so there is no rig file to read again".into());
+        };
+        let rig = rig_again().map_err(|failure| format!("{failure}\nnothing has changed"))?;
+        let mut fixed = rig.differences(&self.rig);
+        fixed.retain(|key| !CHANGEABLE.contains(key));
+        if !fixed.is_empty() {
+            return Err(format!(
+                "the rig file has other figures for {} than this run was started with, which is a restart: panel, lasers \
+                 or tracker must be opened anew. Nothing has changed. While holod runs, these can: {}",
+                fixed.join(", "),
+                CHANGEABLE.join(", ")
+            ));
+        }
+        let same_weights = *self.weights.lock().unwrap_or_else(PoisonError::into_inner) == rig.model.weights;
+        // A file may hold others than when it was read last.
+        let stays = same_weights && !matches!(rig.model.weights, WeightsChoice::File(_));
+        let engine = if stays { None } else { Some(self.engine(rig.model.weights.clone())?) };
+        Ok(Order::Reload(Box::new(NewRig { rig, engine })))
+    }
+
+    fn weights(&self, weights: &str) -> Result<NewEngine, String> {
+        let choice = cli::parse_weights(weights)?;
+        if matches!(&choice, WeightsChoice::File(path) if path.is_relative()) {
             return Err(format!("weights \"{weights}\" were found, expected a name or an absolute path"));
         }
-        let choice = rig.model.weights.clone();
+        self.engine(choice)
+    }
+
+    fn engine(&self, choice: WeightsChoice) -> Result<NewEngine, String> {
+        let mut rig = self.rig.clone();
+        rig.model.weights = choice.clone();
         let weights = setup::weights(&rig).map_err(in_words)?;
         let renderer = scheduling::patient(|| renderer::open(self.backend, &weights, &rig.geometry, &self.encoder));
         let mut renderer = renderer.map_err(in_words)?;

@@ -34,8 +34,7 @@ const FAREWELL: Duration = Duration::from_millis(500);
 /// A control socket that listens. Dropping it ends that.
 pub(crate) struct ControlServer {
     socket: PathBuf,
-    /// Requests that have no answer yet.
-    under_way: Arc<AtomicUsize>,
+    waiting: Arc<Waiting>,
     runtime: Option<Runtime>,
 }
 
@@ -62,10 +61,21 @@ impl ControlServer {
             let _inside = runtime.enter();
             UnixListener::from_std(listener.into())?
         };
-        let under_way = Arc::new(AtomicUsize::new(0));
-        let waiting = Waiting { preparer, orders, long_work: Semaphore::new(1), under_way: Arc::clone(&under_way) };
-        runtime.spawn(serve(listener, Arc::new(waiting)));
-        Ok((Self { socket, under_way, runtime: Some(runtime) }, receiver))
+        let waiting = Waiting { preparer, orders, long_work: Semaphore::new(1), under_way: AtomicUsize::new(0) };
+        let waiting = Arc::new(waiting);
+        runtime.spawn(serve(listener, Arc::clone(&waiting)));
+        Ok((Self { socket, waiting, runtime: Some(runtime) }, receiver))
+    }
+
+    /// Asks for something as a client does; the answer goes into the log.
+    pub(crate) fn ask(&self, whose: &'static str, request: Request) {
+        let (Some(runtime), waiting) = (&self.runtime, Arc::clone(&self.waiting)) else { return };
+        runtime.spawn(async move {
+            match answer_to(request, &waiting).await {
+                Answer::Ok(said) => tracing::info!("{whose}: {}", said.as_str().unwrap_or_default()),
+                Answer::Error(why) => tracing::error!("{whose}: {why}"),
+            }
+        });
     }
 
     /// Where it listens.
@@ -78,7 +88,7 @@ impl Drop for ControlServer {
     fn drop(&mut self) {
         // Whoever asked for the end is told that it came.
         let t_end = Instant::now() + FAREWELL;
-        while self.under_way.load(Ordering::Acquire) > 0 && Instant::now() < t_end {
+        while self.waiting.under_way.load(Ordering::Acquire) > 0 && Instant::now() < t_end {
             std::thread::sleep(Duration::from_millis(1));
         }
         if let Some(runtime) = self.runtime.take() {
@@ -138,14 +148,17 @@ async fn converse(stream: UnixStream, desk: &Arc<Waiting>) -> io::Result<()> {
 }
 
 async fn answer(line: &[u8], desk: &Arc<Waiting>) -> Answer {
-    let request: Request = match serde_json::from_slice(line) {
-        Ok(request) => request,
-        Err(error) => return Answer::Error(format!("the request is not understood: {error}")),
-    };
+    match serde_json::from_slice(line) {
+        Ok(request) => answer_to(request, desk).await,
+        Err(error) => Answer::Error(format!("the request is not understood: {error}")),
+    }
+}
+
+async fn answer_to(request: Request, desk: &Arc<Waiting>) -> Answer {
     // Nothing that takes long stands before darkness.
     let prepared = if request.takes_long() {
         let Ok(_alone) = desk.long_work.try_acquire() else {
-            return Answer::Error("holod is busy with another scene or other weights: ask again".into());
+            return Answer::Error("holod is busy with another scene, other weights or the rig file: ask again".into());
         };
         let (waiting, asked) = (Arc::clone(desk), request.clone());
         tokio::task::spawn_blocking(move || waiting.prepare_long(&asked)).await
@@ -191,7 +204,8 @@ struct Waiting {
     orders: mpsc::Sender<Ordered>,
     /// Of what takes long, one at a time.
     long_work: Semaphore,
-    under_way: Arc<AtomicUsize>,
+    /// Requests that have no answer yet.
+    under_way: AtomicUsize,
 }
 
 thread_local! {

@@ -112,8 +112,11 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
     let (places, change_consumer) = rtrb::RingBuffer::new(1);
     let (retired_producer, retired) = rtrb::RingBuffer::new(3);
     let steering = Arc::new(Steering::new(plan.pupil));
+    let weights = Arc::new(Mutex::new(rig.model.weights.clone()));
     let preparer = Preparer {
         rig: rig.clone(),
+        rig_again: plan.rig_again.clone(),
+        weights: Arc::clone(&weights),
         resolution,
         frame: plan.pictures.first_frame(),
         backend: plan.backend,
@@ -169,7 +172,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         tracker,
         tracker_watch: TrackerWatch::new(&rig.tracker, t_origin),
         feed,
-        desk: Desk::open(preparer, Changes { steering, sink, places, retired }),
+        desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }),
         signals,
         service: Service::connect(),
         status: StatusFile::create(),

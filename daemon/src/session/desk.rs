@@ -1,17 +1,20 @@
 //! Where a person's orders are obeyed, by the control thread: what they change is handed over to the other threads.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError, mpsc};
 
-use holod_calibration::rig::LaserDriver;
-use holod_calibration::{PupilDiameter, TimeNs};
+use holod_calibration::rig::{Eye, LaserDriver, Rig, WeightsChoice};
+use holod_calibration::{PupilDiameter, TimeNs, rig};
 use holod_slm_output::OutputControl;
 use serde_json::Value;
 
 use super::frame_loop::{Change, TrainedPupils};
 use super::host_now;
 use super::watch::Watch;
-use crate::control::{Answer, ControlServer, NewEngine, NewPattern, Order, Ordered, Preparer, Steering};
+use crate::control::{
+    Answer, ControlServer, NewEngine, NewPattern, NewRig, Order, Ordered, Preparer, Request, Steering,
+};
 use crate::failure::Failure;
 use crate::memory;
 use crate::runtime_folder;
@@ -21,12 +24,16 @@ use crate::source::PictureSink;
 /// Orders between two looks at everything else.
 const ORDERS_AT_ONCE: usize = 4;
 
+const BUSY: &str = "the frame loop has not taken the last change yet: ask again";
+
 /// The ways into the other threads.
 pub(super) struct Changes {
     pub(super) steering: Arc<Steering>,
     pub(super) sink: Arc<Mutex<PictureSink>>,
     pub(super) places: rtrb::Producer<Change>,
     pub(super) retired: rtrb::Consumer<Change>,
+    /// The weights that are in use, for those who make requests ready.
+    pub(super) weights: Arc<Mutex<WeightsChoice>>,
 }
 
 /// The control socket, and what it may change.
@@ -70,6 +77,14 @@ impl Desk {
         self.pattern
     }
 
+    /// Has the rig file read again, because a signal asks for it.
+    pub(super) fn reload(&self) {
+        match &self.server {
+            Some((server, _)) => server.ask("SIGHUP", Request::Reload { changed: BTreeMap::new() }),
+            None => tracing::error!("SIGHUP: the rig file cannot be read again without a control socket"),
+        }
+    }
+
     /// Gives back what nobody needs any more.
     pub(super) fn tidy(&mut self) {
         self.give_back();
@@ -105,11 +120,15 @@ impl Watch<'_> {
                 continue;
             }
             let now = host_now();
+            let request = match &order {
+                Order::Reload(new) => Request::Reload { changed: changed_keys(&new.rig, &self.rig) },
+                _ => request,
+            };
             let done = self.carry_out(order, output, now);
             // Lasers are kept dark even where the box did not acknowledge it.
             if (done.is_ok() || is_urgent) && request.changes_something() {
                 let request_text = serde_json::to_string(&request).unwrap_or_default();
-                tracing::info!("asked by holod ctl: {request_text}");
+                tracing::info!("asked for: {request_text}");
                 self.observer.order(now, &request)?;
                 self.write_status(&output.counts(), now);
             }
@@ -154,6 +173,11 @@ impl Watch<'_> {
                     None => "the tracker is followed".into(),
                 })
             }
+            Order::Eye(eye) => {
+                self.follow(rig::Tracker { eye, ..self.rig.tracker.clone() })?;
+                Ok(format!("the pupil is that of {}", eye_in_words(eye)).into())
+            }
+            Order::Reload(new) => self.reload(*new),
             Order::Pattern(pattern) => self.change_pattern(pattern, output),
             Order::KeepDark(dark) => self.keep_dark(dark, output),
             Order::Stop => Ok("holod ends".into()),
@@ -166,8 +190,44 @@ impl Watch<'_> {
         self.change(Change::Engine(renderer, TrainedPupils::of(trained)))?;
         let said = format!("holograms are computed with the weights {}, {description}", setup::weights_name(&weights));
         *self.names.engine.lock().unwrap_or_else(PoisonError::into_inner) = description;
+        self.desk.changes.weights.lock().unwrap_or_else(PoisonError::into_inner).clone_from(&weights);
         self.rig.model.weights = weights;
         Ok(said.into())
+    }
+
+    /// Follows the same tracker with other settings.
+    fn follow(&mut self, settings: rig::Tracker) -> Result<(), String> {
+        if let Some(warning) = self.tracker.change(&settings).map_err(|error| error.to_string())? {
+            tracing::warn!("{warning}");
+        }
+        self.tracker_watch.change(&settings);
+        self.rig.tracker = settings;
+        Ok(())
+    }
+
+    /// Takes all of a rig that was read again, or nothing.
+    fn reload(&mut self, new: NewRig) -> Result<Value, String> {
+        let NewRig { rig, engine } = new;
+        let changed = changed_keys(&rig, &self.rig);
+        if engine.is_none() && rig.model.weights != self.rig.model.weights {
+            return Err("the weights were changed meanwhile: ask again".into());
+        }
+        if engine.is_some() && self.desk.changes.places.is_full() {
+            return Err(BUSY.into());
+        }
+        if rig.tracker != self.rig.tracker {
+            self.follow(rig.tracker.clone())?;
+        }
+        let weights_are_read = engine.map(|engine| self.change_engine(engine)).transpose()?.is_some();
+        self.rig = rig;
+        let origin = &self.rig.provenance.origin;
+        let said: Vec<_> = changed.iter().map(|(key, value)| format!("{key} is {value}")).collect();
+        Ok(match (said.is_empty(), weights_are_read) {
+            (false, _) => format!("{origin} is read again: {}", said.join(", ")),
+            (true, true) => format!("{origin} is read again: it says the same, and its weights file is read anew"),
+            (true, false) => format!("{origin} is read again: it says the same"),
+        }
+        .into())
     }
 
     fn change_pattern(&mut self, pattern: Option<NewPattern>, output: &OutputControl) -> Result<Value, String> {
@@ -188,8 +248,7 @@ impl Watch<'_> {
     }
 
     fn change(&mut self, change: Change) -> Result<(), String> {
-        let busy = |_| "the frame loop has not taken the last change yet: ask again".to_owned();
-        self.desk.changes.places.push(change).map_err(busy)
+        self.desk.changes.places.push(change).map_err(|_| BUSY.to_owned())
     }
 
     fn keep_dark(&mut self, dark: bool, output: &OutputControl) -> Result<Value, String> {
@@ -203,5 +262,29 @@ impl Watch<'_> {
                     .into())
             }
         }
+    }
+}
+
+/// What `new` says of the keys that it has changed, in the rig file's own units.
+fn changed_keys(new: &Rig, old: &Rig) -> BTreeMap<&'static str, Value> {
+    let value = |key| match key {
+        "name" => new.name.clone().into(),
+        "tracker.eye" => new.tracker.eye.name().into(),
+        "tracker.scale_mm_per_unit" => new.tracker.scale.into(),
+        "tracker.fallback_mm" => (f64::from(new.tracker.fallback.mm() * 1e4).round() / 1e4).into(),
+        "tracker.hold_ms" => (new.tracker.hold.0 as f64 / 1e6).into(),
+        "model.network" => setup::weights_name(&new.model.weights).into(),
+        // The preparer refuses all others.
+        _ => Value::Null,
+    };
+    new.differences(old).into_iter().map(|key| (key, value(key))).collect()
+}
+
+const fn eye_in_words(eye: Eye) -> &'static str {
+    match eye {
+        Eye::Left => "the left eye",
+        Eye::Right => "the right eye",
+        Eye::Both => "both eyes, their mean",
+        Eye::Better => "the eye of which the tracker is surer",
     }
 }

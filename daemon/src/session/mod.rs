@@ -27,6 +27,7 @@ use holod_pupil_input::{RecordFiles, ReplayError, SourceError, TrackerError, Tra
 use holod_slm_output::OutputSpec;
 
 use crate::cli::Backend;
+use crate::control::RigReader;
 use crate::failure::{Exit, Failure};
 use crate::source::Pictures;
 
@@ -37,7 +38,7 @@ use holod_pupil_input::host_now;
 
 pub use self::ledger::LaserSummary;
 pub use self::observer::{Began, FirstLight, Observer};
-pub(crate) use self::service::Signals;
+pub(crate) use self::service::{Hangup, Signals};
 pub use self::stats::Spread;
 pub use self::summary::{SessionReport, Summary};
 pub use self::take_down::not_dark;
@@ -46,6 +47,8 @@ pub use self::take_down::not_dark;
 pub struct SessionPlan {
     /// The bench.
     pub rig: Rig,
+    /// Reads it again, where there is a file to read it from.
+    pub rig_again: Option<RigReader>,
     /// The network.
     pub weights: Weights,
     /// Which engine runs it.
@@ -76,7 +79,8 @@ const RECORDS: usize = 1024;
 /// # Errors
 /// What could not be started, or the observer's failure; in both cases everything has been taken down.
 pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionReport, Failure> {
-    let signals = Signals::install()?;
+    let on_hangup = if plan.rig_again.is_some() { Hangup::for_a_daemon() } else { Hangup::Ends };
+    let signals = Signals::install(on_hangup)?;
     #[cfg(feature = "fault-injection")]
     crate::fault::install()?;
     let mut session = build::build(plan, signals, observer)?;

@@ -12,21 +12,46 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use crate::failure::{Exit, Failure};
 use crate::staging::leave_signals_to_a_run;
 
-/// SIGINT, SIGTERM and SIGHUP, as a flag, for as long as this lives.
+/// What SIGHUP says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Hangup {
+    /// The terminal has gone: end.
+    Ends,
+    /// Read the rig file again.
+    Reloads,
+}
+
+impl Hangup {
+    /// Where a terminal can go, the signal says that it has; a service has none.
+    pub(crate) fn for_a_daemon() -> Self {
+        if std::fs::File::open("/dev/tty").is_ok() { Self::Ends } else { Self::Reloads }
+    }
+}
+
+/// SIGINT, SIGTERM and SIGHUP, as flags, for as long as this lives.
 pub(crate) struct Signals {
     caught: Arc<AtomicUsize>,
+    reload: Arc<AtomicBool>,
     registered: Vec<SigId>,
 }
 
 impl Signals {
     /// Takes the signals over. A second one while the first is being obeyed ends the process at once: the laser box's
     /// heartbeat makes it dark.
-    pub(crate) fn install() -> Result<Self, Failure> {
+    pub(crate) fn install(on_hangup: Hangup) -> Result<Self, Failure> {
         let caught = Arc::new(AtomicUsize::new(0));
         let again = Arc::new(AtomicBool::new(false));
-        let mut signals = Self { caught, registered: Vec::new() };
+        let mut signals = Self { caught, reload: Arc::default(), registered: Vec::new() };
         leave_signals_to_a_run(true);
-        for signal in [SIGINT, SIGTERM, SIGHUP] {
+        let mut ending = vec![SIGINT, SIGTERM];
+        match on_hangup {
+            Hangup::Ends => ending.push(SIGHUP),
+            Hangup::Reloads => {
+                let registered = signal_hook::flag::register(SIGHUP, Arc::clone(&signals.reload));
+                signals.registered.push(registered.map_err(Failure::because(Exit::Software))?);
+            }
+        }
+        for signal in ending {
             let caught = Arc::clone(&signals.caught);
             for registered in [
                 signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&again)),
@@ -39,7 +64,12 @@ impl Signals {
         Ok(signals)
     }
 
-    /// The name of the signal that came.
+    /// Whether the rig file is to be read again; says so once.
+    pub(crate) fn hangup(&self) -> bool {
+        self.reload.swap(false, Ordering::AcqRel)
+    }
+
+    /// The name of the signal that ends the run, where it came.
     pub(crate) fn caught(&self) -> Option<&'static str> {
         match self.caught.load(Ordering::Acquire) as i32 {
             0 => None,

@@ -17,6 +17,11 @@ impl TrackerWatch {
         Self { refusals: RefusalWatch::new(settings, began), lost: None }
     }
 
+    /// The tracker goes on with other settings.
+    pub(super) fn change(&mut self, settings: &rig::Tracker) {
+        self.refusals.change(settings);
+    }
+
     /// The gate decided on a sample.
     pub(super) fn note(&mut self, decision: &Decision) {
         self.refusals.note(decision);

@@ -137,6 +137,9 @@ impl Watch<'_> {
             if self.obey(output)? {
                 return Ok("holod ctl stop".to_owned());
             }
+            if self.signals.hangup() {
+                self.desk.reload();
+            }
             self.service.progress(self.tally.frames_shown, now);
             ticks = ticks.wrapping_add(1);
             if ticks.is_multiple_of(TICKS_PER_REPORT) {
@@ -297,6 +300,7 @@ impl Watch<'_> {
             state: self.told.state.name().to_owned(),
             uptime_s: (now - self.t_origin).seconds(),
             control: self.desk.socket(),
+            eye: self.rig.tracker.eye.name().to_owned(),
             paused: self.desk.is_paused(),
             lasers_kept_dark: self.desk.keeps_dark(),
             pattern: self.desk.pattern().map(str::to_owned),

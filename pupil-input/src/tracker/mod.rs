@@ -81,6 +81,11 @@ pub fn scaled_millimetres(whose: &str, scale: f64) -> String {
     )
 }
 
+fn needless_scale(whose: &str, unit: SizeUnit, settings: &rig::Tracker) -> Option<String> {
+    let scale = settings.scale.filter(|scale| unit == SizeUnit::Millimetres && *scale != 1.0)?;
+    Some(scaled_millimetres(whose, scale))
+}
+
 /// How the link to the tracker is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Link {
@@ -131,6 +136,22 @@ impl From<TimeNs> for TrackerOptions {
     }
 }
 
+/// Why a running tracker does not go on with other settings.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ChangeError {
+    /// Its figures are no millimetres.
+    #[error(
+        "tracker.scale_mm_per_unit is missing: the tracker gives pupil sizes in {0}, and one must be said in millimetres"
+    )]
+    NoScale(&'static str),
+    /// Nobody reads samples any more.
+    #[error("the tracker's log has been played to its end")]
+    Finished,
+    /// The thread has not come to the last change.
+    #[error("the tracker's thread has not taken the last change yet: ask again")]
+    Busy,
+}
+
 /// Starts trackers.
 #[derive(Debug)]
 pub struct Tracker;
@@ -152,9 +173,7 @@ impl Tracker {
             return Err(TrackerError::NoScale { spec: spec.to_string(), unit: job.unit().name() });
         }
         let mut warnings = job.warnings();
-        if let Some(scale) = settings.scale.filter(|scale| job.unit() == SizeUnit::Millimetres && *scale != 1.0) {
-            warnings.push(scaled_millimetres(&format!("tracker `{spec}`"), scale));
-        }
+        warnings.extend(needless_scale(&format!("tracker `{spec}`"), job.unit(), settings));
         let header = job.link().map(|(profile, datagrams)| Header {
             spec: spec.to_string(),
             profile: profile.name.clone(),
@@ -173,6 +192,8 @@ impl Tracker {
         let (input, output) = triple_buffer::triple_buffer(&EstimateSnapshot::new(settings));
         let (producer, consumer) = rtrb::RingBuffer::new(TAP_DECISIONS);
         let (troubles, untold) = rtrb::RingBuffer::new(TROUBLES);
+        let (changes, change_consumer) = rtrb::RingBuffer::new(1);
+        let unit = job.unit();
         let shared = Arc::new(Shared {
             counters: Counters::new(),
             clock: ClockGauge::new(),
@@ -185,6 +206,7 @@ impl Tracker {
             published: input,
             tap: producer,
             troubles,
+            changes: change_consumer,
             record: taps,
             arrivals_of_stream: false,
             tap_is_read: true,
@@ -197,7 +219,16 @@ impl Tracker {
         Ok(TrackerHandle {
             reader: EstimateReader { output },
             tap: DecisionTap { consumer },
-            control: TrackerControl { shared, thread: Some(thread), recorder, warnings, untold, trouble: None },
+            control: TrackerControl {
+                shared,
+                thread: Some(thread),
+                recorder,
+                warnings,
+                untold,
+                trouble: None,
+                changes,
+                unit,
+            },
         })
     }
 }
@@ -302,6 +333,8 @@ pub struct TrackerControl {
     warnings: Vec<String>,
     untold: rtrb::Consumer<String>,
     trouble: Option<String>,
+    changes: rtrb::Producer<EstimatorSettings>,
+    unit: SizeUnit,
 }
 
 impl TrackerControl {
@@ -337,6 +370,25 @@ impl TrackerControl {
             self.trouble = Some(text).filter(|text| !text.is_empty());
         }
         self.trouble.as_deref()
+    }
+
+    /// Goes on with another eye, scale, fallback or hold time, from the next sample on ([`Estimator::change`]); what the
+    /// settings say of the spec is not looked at. What a user should know of it comes back.
+    ///
+    /// # Errors
+    /// [`ChangeError`]; nothing has changed then.
+    pub fn change(&mut self, settings: &rig::Tracker) -> Result<Option<String>, ChangeError> {
+        if self.unit != SizeUnit::Millimetres && settings.scale.is_none() {
+            return Err(ChangeError::NoScale(self.unit.name()));
+        }
+        if self.finished() {
+            return Err(ChangeError::Finished);
+        }
+        self.changes.push(settings.into()).map_err(|_| ChangeError::Busy)?;
+        if let Some(thread) = &self.thread {
+            thread.thread().unpark();
+        }
+        Ok(needless_scale("the tracker", self.unit, settings))
     }
 
     /// How the recording goes, where there is one.

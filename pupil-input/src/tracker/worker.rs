@@ -11,7 +11,7 @@ use super::job::{Job, Play};
 use super::{Link, Shared, host_now};
 use crate::PupilSample;
 use crate::counters::Counter;
-use crate::estimator::{Decision, EstimateSnapshot, Estimator, StreamClock};
+use crate::estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, StreamClock};
 use crate::gate::Verdict;
 use crate::import::raw::RawLog;
 use crate::import::{LogFault, Recording};
@@ -43,6 +43,7 @@ pub(super) struct Worker {
     pub(super) published: triple_buffer::Input<EstimateSnapshot>,
     pub(super) tap: rtrb::Producer<Decision>,
     pub(super) troubles: rtrb::Producer<String>,
+    pub(super) changes: rtrb::Consumer<EstimatorSettings>,
     pub(super) record: Option<Taps>,
     /// Times of arrival are the stream's too.
     pub(super) arrivals_of_stream: bool,
@@ -74,7 +75,7 @@ impl Worker {
         let mut back_off = FIRST_BACK_OFF;
         let mut silent_from = host_now() + FIRST_SILENCE;
         self.connected(host_now());
-        while !self.stopping() {
+        while self.goes_on() {
             let Some(open) = &mut link else {
                 if !self.wait_until(host_now() + TimeNs(back_off.as_nanos() as i64)) {
                     return;
@@ -247,17 +248,19 @@ impl Worker {
 
     fn take(&mut self, sample: PupilSample) {
         self.count(Counter::Samples, 1);
-        let Self { estimator, tap, shared, clock, record, arrivals_of_stream, .. } = self;
-        let mut tap = Tap { tap, record, clock: *clock, arrivals_of_stream: *arrivals_of_stream, shared };
-        estimator.push(sample, |decision| tap.note(decision));
+        self.note_decisions(|estimator, tap| estimator.push(sample, |decision| tap.note(decision)));
     }
 
     fn finish(&mut self) {
-        let Self { estimator, tap, shared, clock, record, arrivals_of_stream, .. } = self;
-        let mut tap = Tap { tap, record, clock: *clock, arrivals_of_stream: *arrivals_of_stream, shared };
-        estimator.finish(|decision| tap.note(decision));
+        self.note_decisions(|estimator, tap| estimator.finish(|decision| tap.note(decision)));
         self.publish();
         self.set_link(Link::Finished);
+    }
+
+    fn note_decisions(&mut self, decide: impl FnOnce(&mut Estimator, &mut Tap<'_>)) {
+        let Self { estimator, tap, shared, clock, record, arrivals_of_stream, .. } = self;
+        let mut tap = Tap { tap, record, clock: *clock, arrivals_of_stream: *arrivals_of_stream, shared };
+        decide(estimator, &mut tap);
     }
 
     fn publish(&mut self) {
@@ -267,9 +270,9 @@ impl Worker {
     }
 
     /// Waits until host time `t`; false if the tracker is to stop.
-    fn wait_until(&self, t: TimeNs) -> bool {
+    fn wait_until(&mut self, t: TimeNs) -> bool {
         loop {
-            if self.stopping() {
+            if !self.goes_on() {
                 return false;
             }
             let left = t - host_now();
@@ -285,7 +288,7 @@ impl Worker {
     fn wait_for_room(&mut self) -> bool {
         let mut waiting_since = None;
         loop {
-            if self.stopping() {
+            if !self.goes_on() {
                 return false;
             }
             let recorded = self.record.as_ref().is_none_or(Taps::has_room);
@@ -301,8 +304,13 @@ impl Worker {
         }
     }
 
-    fn stopping(&self) -> bool {
-        self.shared.stop.load(Ordering::Acquire)
+    /// Takes a change of settings; false if the tracker is to stop.
+    fn goes_on(&mut self) -> bool {
+        if let Ok(settings) = self.changes.pop() {
+            self.note_decisions(|estimator, tap| estimator.change(settings, |decision| tap.note(decision)));
+            self.publish();
+        }
+        !self.shared.stop.load(Ordering::Acquire)
     }
 
     fn count(&self, counter: Counter, count: u64) {

@@ -1,7 +1,7 @@
 //! The estimate against the true diameter of a made-up eye.
 
 use crate::support::settings;
-use holod_calibration::{TimeNs, rig};
+use holod_calibration::{PupilDiameter, TimeNs, rig};
 use holod_pupil_input::{
     Decision, Estimator, EstimatorSettings, MockSource, PupilSample, PupilState, Rejection, STATED_LAG, SampleEye,
     Scenario, Verdict,
@@ -231,6 +231,42 @@ fn the_better_eye_is_shown_and_a_change_of_eye_slides() {
     assert!(from(changed + 200).all(|row| (row.1 - 3.5).abs() < 1e-3));
     let fastest = shown.windows(2).skip(100).map(|pair| (pair[1].1 - pair[0].1).abs() / 5e-3).fold(0.0, f32::max);
     assert!(fastest < 5.5, "{fastest} mm/s");
+}
+
+#[test]
+fn another_eye_by_order_is_slid_to_and_every_sample_is_decided_upon() {
+    let mut estimator = Estimator::new(settings(rig::Eye::Left));
+    let (mut shown, mut pushed, mut decided) = (Vec::new(), 0, 0);
+    for t_ms in (0..4000).step_by(5) {
+        if t_ms == 2000 {
+            estimator.change(settings(rig::Eye::Right), |_| decided += 1);
+        }
+        for (eye, diameter_mm) in [(SampleEye::Left, 4.0), (SampleEye::Right, 3.4)] {
+            estimator.push(sample(t_ms, eye, diameter_mm), |_| decided += 1);
+            pushed += 1;
+        }
+        let (mm, state) = at(&estimator, t_ms);
+        shown.push((t_ms, mm, state));
+    }
+    estimator.finish(|_| decided += 1);
+    assert_eq!(decided, pushed);
+    let from = |t_ms: i64| shown.iter().filter(move |row| row.0 >= t_ms);
+    assert!(from(500).take_while(|row| row.0 < 2000).all(|row| (row.1 - 4.0).abs() < 1e-3));
+    assert!(from(2300).all(|row| (row.1 - 3.4).abs() < 1e-3 && row.2 == PupilState::Tracking));
+    let fastest = shown.windows(2).skip(100).map(|pair| (pair[1].1 - pair[0].1).abs() / 5e-3).fold(0.0, f32::max);
+    assert!(fastest < 5.5, "{fastest} mm/s");
+}
+
+#[test]
+fn another_hold_time_or_fallback_does_not_disturb_what_is_followed() {
+    let before = settings(rig::Eye::Both);
+    let after = EstimatorSettings { hold: TimeNs(100_000_000), fallback: PupilDiameter::from_mm(5.0), ..before };
+    let mut estimator = Estimator::new(before);
+    push_all(&mut estimator, SampleEye::Left, 0, &[3.5; 400]);
+    let followed = at(&estimator, 2000);
+    estimator.change(after, |decision| panic!("nothing is decided anew: {decision:?}"));
+    assert_eq!(at(&estimator, 2000), followed);
+    assert_eq!(at(&estimator, 9000), (5.0, PupilState::Fallback));
 }
 
 #[test]

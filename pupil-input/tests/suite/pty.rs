@@ -6,12 +6,12 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use crate::support::{NEON_BLINKS_S, neon_like_csv};
-use holod_calibration::{TimeNs, rig};
+use holod_calibration::{PupilDiameter, TimeNs, rig};
 use holod_pupil_input::wire::WireFault;
 use holod_pupil_input::wire::line::{LineSample, crc8, encode_line};
 use holod_pupil_input::{
-    Counter, Link, LogFault, PupilState, Recording, SampleEye, Tracker, TrackerHandle, TrackerOptions, TrackerSpec,
-    Verdict, host_now,
+    ChangeError, Counter, Link, LogFault, PupilState, Recording, SampleEye, Tracker, TrackerHandle, TrackerOptions,
+    TrackerSpec, Verdict, host_now,
 };
 use serialport::{SerialPort, TTYPort};
 use tempfile::TempDir;
@@ -301,6 +301,33 @@ fn what_is_no_port_is_refused_with_what_to_do() {
     let _first = start(&tracker.path());
     let message = refused(&tracker.path());
     assert!(message.contains("another program"), "{message}");
+}
+
+/// A running tracker takes another eye and another fallback while its link is silent, too.
+#[test]
+fn a_running_tracker_goes_on_with_other_settings() {
+    let mut tracker = Plug::new();
+    let (mut pupil, _tap, mut control) = start(&tracker.path()).split();
+    let settings = rig::Tracker { eye: rig::Eye::Left, ..rig::Rig::default().tracker };
+    let fallback_5 = rig::Tracker { fallback: PupilDiameter::from_mm(5.0), ..settings.clone() };
+    control.change(&fallback_5).expect("is taken");
+    eventually("the other fallback", || pupil.pupil_at(host_now()).pupil.mm() == 5.0);
+
+    control.change(&rig::Tracker { eye: rig::Eye::Right, ..settings }).expect("is taken");
+    let mut sequence = 0;
+    eventually("the right eye", || {
+        let mut text = String::new();
+        for (eye, diameter_mm) in [(SampleEye::Left, 4.0), (SampleEye::Right, 3.4)] {
+            let device_us = sequence as i64 * 2500;
+            encode_line(&LineSample { sequence, device_us, eye, diameter_mm, confidence: 1.0 }, &mut text);
+            sequence += 1;
+        }
+        tracker.send(text.as_bytes());
+        let estimate = pupil.pupil_at(host_now());
+        estimate.state == PupilState::Tracking && (estimate.pupil.mm() - 3.4).abs() < 0.05
+    });
+    control.stop();
+    assert_eq!(control.change(&fallback_5), Err(ChangeError::Finished));
 }
 
 /// Plays a Neon-like log in real time, as protocol lines of confidence 1, through a PTY.

@@ -17,7 +17,7 @@ use super::observed::{EyeFigures, Observed, Quantiles};
 use crate::cli::TryArgs;
 use crate::failure::{Exit, Failure};
 use crate::record;
-use crate::session::{Signals, tracker_failure};
+use crate::session::{Hangup, Signals, tracker_failure};
 use crate::terminal::{Axes, LiveText, Series, TextSize, plot};
 use crate::{report, setup};
 
@@ -59,7 +59,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     if let Some(folder) = args.record.as_deref().filter(|_| args.force) {
         record::remove_earlier(folder)?;
     }
-    let signals = Signals::install()?;
+    let signals = Signals::install(Hangup::Ends)?;
     let began = host_now();
     let options = TrackerOptions {
         origin: began,

@@ -116,7 +116,7 @@ function tellFacts(snapshot) {
     ["Lasers’ trouble", snapshot.lasers_trouble],
     ["Tracker", `${snapshot.tracker}, link ${snapshot.tracker_link}`],
     ["Tracker’s trouble", snapshot.tracker_trouble],
-    ["Pupil", `${number(snapshot.pupil_mm, 2)} mm, ${snapshot.pupil_state || "not known yet"}`],
+    ["Pupil", `${number(snapshot.pupil_mm, 2)} mm, ${snapshot.pupil_state || "not known yet"}; eye: ${snapshot.eye}`],
     ["Frames shown", `${snapshot.frames_shown}, ${number(snapshot.frames_shown_hz)} a second of ${number(snapshot.panel_frames_hz)}`],
     ["Late frames", String(snapshot.deadline_misses)],
     ["Advice", snapshot.speed_advice],

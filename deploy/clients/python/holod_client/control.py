@@ -85,6 +85,14 @@ class Control:
         """Computes for one pupil, in millimetres, whatever the tracker says; None follows the tracker again."""
         return self.ask("pupil", mm=mm)
 
+    def eye(self, eye: str) -> str:
+        """Follows another eye: "left", "right", "both" (their mean) or "better" (the one of which the tracker is surer)."""
+        return self.ask("eye", eye=eye)
+
+    def reload(self) -> str:
+        """Has the rig file read again. Raises ControlError, and nothing changes, where that needs a restart."""
+        return self.ask("reload")
+
     def flat(self) -> str:
         """Shows one phase everywhere in place of holograms."""
         return self.ask("flat")
