@@ -5,6 +5,8 @@
 //! then changes in the loop is handed over by the control thread, wait-free.
 
 mod client;
+#[cfg(fuzzing)]
+pub mod fuzzing;
 mod pattern;
 mod prepare;
 mod server;

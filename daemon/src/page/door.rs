@@ -19,7 +19,7 @@ const SHORTEST: usize = 16;
 const COOKIE_NAME: &str = "holod_token";
 
 /// The secret that opens the page to other machines.
-pub(super) struct Token(String);
+pub(super) struct Token(pub(super) String);
 
 /// Why a file gives no token.
 #[derive(Debug, thiserror::Error)]
@@ -81,38 +81,56 @@ pub(super) struct Doorkeeper {
     pub(super) live: Arc<Live>,
 }
 
-pub(super) async fn admit(State(keeper): State<Arc<Doorkeeper>>, request: Request, next: Next) -> Response {
-    let refused = match &keeper.door {
-        Door::Open => None,
-        Door::OwnName => {
-            let host = text(request.headers(), HOST.as_str());
-            (!is_own_name(host)).then(|| {
+/// What a door says to whoever comes.
+pub(super) enum Admission {
+    /// Come in.
+    In,
+    /// Come in by the cookie that this answer sets.
+    ByCookie(Response),
+    /// Stay out.
+    Refused(Response),
+}
+
+impl Door {
+    /// Decides by a request's query and headers.
+    pub(super) fn decide(&self, query: Option<&str>, headers: &HeaderMap) -> Admission {
+        match self {
+            Self::Open => Admission::In,
+            Self::OwnName => {
+                let host = text(headers, HOST.as_str());
+                if is_own_name(host) {
+                    return Admission::In;
+                }
                 let said = format!(
                     "found the name `{host}`, expected localhost: holod's page is for this machine alone. From another \
                      machine use `ssh -L 8420:localhost:8420`, or give holod an address and --page-token\n"
                 );
-                (StatusCode::MISDIRECTED_REQUEST, said).into_response()
-            })
-        }
-        Door::Token(token) => {
-            if let Some(offered) = in_query(request.uri().query())
-                && token.is(offered)
-            {
-                return let_in(offered);
+                Admission::Refused((StatusCode::MISDIRECTED_REQUEST, said).into_response())
             }
-            let offered = bearer(request.headers()).or_else(|| in_cookies(request.headers()));
-            (!offered.is_some_and(|offered| token.is(offered))).then(|| {
+            Self::Token(token) => {
+                if let Some(offered) = in_query(query).filter(|offered| token.is(offered)) {
+                    return Admission::ByCookie(let_in(offered));
+                }
+                let offered = bearer(headers).or_else(|| in_cookies(headers));
+                if offered.is_some_and(|offered| token.is(offered)) {
+                    return Admission::In;
+                }
                 let said = "a token is needed, the content of the file that holod was given with --page-token: open \
                             /?token=TOKEN once in a browser, or send the header `Authorization: Bearer TOKEN`\n";
-                (StatusCode::UNAUTHORIZED, [(WWW_AUTHENTICATE, "Bearer")], said).into_response()
-            })
+                let refused = (StatusCode::UNAUTHORIZED, [(WWW_AUTHENTICATE, "Bearer")], said);
+                Admission::Refused(refused.into_response())
+            }
         }
-    };
-    match refused {
-        None => next.run(request).await,
-        Some(refused) => {
+    }
+}
+
+pub(super) async fn admit(State(keeper): State<Arc<Doorkeeper>>, request: Request, next: Next) -> Response {
+    match keeper.door.decide(request.uri().query(), request.headers()) {
+        Admission::In => next.run(request).await,
+        Admission::ByCookie(answer) => answer,
+        Admission::Refused(answer) => {
             keeper.live.refused.fetch_add(1, Ordering::Relaxed);
-            refused
+            answer
         }
     }
 }
@@ -142,10 +160,13 @@ fn text<'a>(headers: &'a HeaderMap, name: &str) -> &'a str {
 }
 
 fn is_own_name(host: &str) -> bool {
-    let name = match host.strip_prefix('[') {
-        Some(rest) => rest.split_once(']').map_or("", |(name, _)| name),
-        None => host.rsplit_once(':').map_or(host, |(name, _)| name),
+    let (name, port) = match host.strip_prefix('[') {
+        Some(rest) => rest.split_once(']').unwrap_or_default(),
+        None => host.split_at(host.find(':').unwrap_or(host.len())),
     };
+    if !port.is_empty() && port.strip_prefix(':').and_then(|port| port.parse::<u16>().ok()).is_none() {
+        return false;
+    }
     name.eq_ignore_ascii_case("localhost") || name.parse::<std::net::IpAddr>().is_ok_and(|ip| ip.is_loopback())
 }
 
@@ -159,7 +180,16 @@ mod tests {
         for own in ["localhost", "localhost:8420", "LOCALHOST:1", "127.0.0.1:8420", "[::1]:8420", "127.0.0.1"] {
             assert!(is_own_name(own), "{own}");
         }
-        for other in ["", "example.org", "localhost.example.org:8420", "192.168.1.5:8420", "[fe80::1]:80", "[::1"] {
+        for other in [
+            "",
+            "example.org",
+            "localhost.example.org:8420",
+            "192.168.1.5:8420",
+            "[fe80::1]:80",
+            "[::1",
+            "[::1]@example.org",
+            "127.0.0.1:80@example.org",
+        ] {
             assert!(!is_own_name(other), "{other}");
         }
     }

@@ -13,6 +13,8 @@
 mod address;
 mod door;
 mod eye;
+#[cfg(fuzzing)]
+pub mod fuzzing;
 mod live;
 mod metrics;
 mod server;

@@ -266,19 +266,22 @@ async fn events(State(shown): State<Shown>) -> Response {
 /// What is asked of an eye.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct EyeQuery {
+pub(super) struct EyeQuery {
     #[serde(default)]
     focus_dpt: f64,
     pupil_mm: Option<f32>,
 }
 
+/// The gaze that is asked for, or what is wrong with the query.
+pub(super) fn gaze_of(query: Result<Query<EyeQuery>, QueryRejection>) -> Result<Gaze, String> {
+    let Query(EyeQuery { focus_dpt, pupil_mm }) = query.map_err(|rejection| rejection.body_text())?;
+    let focus = focus_of_an_eye(focus_dpt).map_err(|why| format!("focus_dpt: {why}"))?;
+    let pupil = pupil_mm.map(human_pupil).transpose().map_err(|why| format!("pupil_mm: {why}"))?;
+    Ok(Gaze { focus, pupil })
+}
+
 async fn eye_picture(State(shown): State<Shown>, query: Result<Query<EyeQuery>, QueryRejection>) -> Response {
-    let gaze = query.map_err(|rejection| rejection.body_text()).and_then(|Query(EyeQuery { focus_dpt, pupil_mm })| {
-        let focus = focus_of_an_eye(focus_dpt).map_err(|why| format!("focus_dpt: {why}"))?;
-        let pupil = pupil_mm.map(human_pupil).transpose().map_err(|why| format!("pupil_mm: {why}"))?;
-        Ok(Gaze { focus, pupil })
-    });
-    let gaze = match gaze {
+    let gaze = match gaze_of(query) {
         Ok(gaze) => gaze,
         Err(why) => {
             shown.live.refused.fetch_add(1, Ordering::Relaxed);

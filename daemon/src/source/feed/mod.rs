@@ -5,6 +5,8 @@
 //! the rules harms its own picture only.
 
 mod client;
+#[cfg(fuzzing)]
+pub mod fuzzing;
 mod message;
 mod slots;
 

@@ -1,0 +1,58 @@
+//! The control socket's requests, for the fuzzers.
+
+use std::sync::{Arc, LazyLock, Mutex};
+
+use holod_calibration::rig::Rig;
+use holod_calibration::{Resolution, TimeNs};
+use holod_model::RgbdFrame;
+
+use super::{NewPattern, Order, Preparer, Request};
+use crate::cli::Backend;
+use crate::renderer;
+
+const RESOLUTION: Resolution = Resolution { width: 64, height: 48 };
+
+static PREPARER: LazyLock<Preparer> = LazyLock::new(|| {
+    let mut rig = Rig::default();
+    rig.geometry.resolution = RESOLUTION;
+    let encoder = renderer::panel_encoder(&rig, RESOLUTION).expect("the built-in panel has levels");
+    Preparer {
+        weights: Arc::new(Mutex::new(rig.model.weights.clone())),
+        rig,
+        rig_again: None,
+        resolution: RESOLUTION,
+        frame: Arc::new(RgbdFrame::black(RESOLUTION)),
+        backend: Backend::Cpu,
+        encoder,
+        has_feed: true,
+        stall_timeout: TimeNs(2_000_000_000),
+    }
+});
+
+/// A line of JSON. It is understood and obeyed as far as no file is named, or refused in words.
+///
+/// # Panics
+/// Where a request is another one once it is written down and read, or a pupil is taken that no eye has.
+pub fn request(line: &[u8]) {
+    let request: Request = match serde_json::from_slice(line) {
+        Ok(request) => request,
+        Err(error) => {
+            assert!(!error.to_string().is_empty());
+            return;
+        }
+    };
+    let written = serde_json::to_vec(&request).expect("a request can be written");
+    let read: Request = serde_json::from_slice(&written).expect("what was written can be read");
+    assert_eq!(read, request);
+    if matches!(request, Request::Scene { .. } | Request::Weights { .. }) {
+        return;
+    }
+    match PREPARER.prepare(&request) {
+        Ok(Order::Pupil(Some(pupil))) => assert!((0.5..=9.0).contains(&pupil.mm()), "{pupil:?}"),
+        Ok(Order::Pattern(Some(NewPattern { levels, .. }))) => {
+            assert_eq!(levels.layout(), PREPARER.encoder.layout(), "a pattern of another panel");
+        }
+        Ok(_) => {}
+        Err(why) => assert!(!why.is_empty()),
+    }
+}
