@@ -172,15 +172,17 @@ fn patterns_take_the_place_of_holograms_and_make_way_again() {
         let then = bench.status()["frames_shown"].as_u64().unwrap() + frames;
         bench.until("frames go on", |status| status["frames_shown"].as_u64() > Some(then));
     };
-    for (order, name) in [(&["pattern", "dots", "--spacing", "20", "--dot", "6"][..], "dots"), (&["flat"], "flat")] {
+    for (order, name) in
+        [(&["pattern", "dots", "--spacing", "20", "--dot", "6"][..], "dots of 6 px, 20 px apart"), (&["flat"], "flat")]
+    {
         let said = bench.ctl(order);
-        assert!(said.contains(&format!("the pattern {name} is shown until `holod ctl hologram`")), "{said}");
+        assert!(said.contains(&format!("shown until `holod ctl hologram`: {name}")), "{said}");
         assert_eq!(bench.status()["pattern"], name);
         shown(40);
     }
     let pid = bench.daemon.as_ref().unwrap().pid().to_string();
     bench.until("the status says so", |_| {
-        bench.holod(&["status", "--pid", &pid]).stdout.contains("the pattern flat is shown in place of holograms")
+        bench.holod(&["status", "--pid", &pid]).stdout.contains("in place of holograms a pattern is shown: flat")
     });
     bench.ctl(&["hologram"]);
     assert_eq!(bench.status()["pattern"], Value::Null);
