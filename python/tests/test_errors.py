@@ -63,7 +63,7 @@ def wrong(said: str, rgb: Any = RGB8, depth: Any = METRES, pupil_mm: Any = 3.0, 
         wrong("the first -1 in row 0, column 0", depth=changed(METRES, (0, 0), -1), depth_unit="dioptres"),
         wrong("the first 2 in row 0, column 0", depth=METRES, depth_unit="normalised_dioptres"),
         wrong("no pixel with a valid one; expected metres above 0", depth=METRES * 0, fill_missing=True),
-        wrong("pupil_mm: found 0.003, expected a human pupil of 0.5 to 9 millimetres", pupil_mm=0.003),
+        wrong("pupil_mm: found 0.003 mm, expected a human pupil of 0.5 to 9 mm", pupil_mm=0.003),
         wrong("pupil_mm: found NaN", pupil_mm=float("nan")),
         wrong(
             "out_levels: found an array of shape (3, 2, 2), expected (3, 1080, 1920)",
@@ -202,8 +202,11 @@ def test_scenes_that_cannot_be_read_are_told(tmp_path: Path, picture_files: tupl
         ("depth encoding: found", named, {}),
         ("found 1 frames; expected more than 3", named, {"frame": 3, "depth_encoding": "millimetres"}),
         ("expected at most 8x8", named, {"width_px": 8, "height_px": 8, "depth_encoding": "millimetres"}),
-        ('fit: found "stretch"', named, {"fit": "stretch"}),
+        ("fit: unknown variant `stretch`, expected one of `native`, `contain`", named, {"fit": "stretch"}),
         ("width_px and height_px: found one of them", named, {"width_px": 8}),
+        ("width_px and height_px: found 0x8, expected at least one", named, {"width_px": 0, "height_px": 8}),
+        ("found 7680x4321, expected at least one pixel", named, {"width_px": 7680, "height_px": 4321}),
+        ("found 1x9223372036854775807", named, {"width_px": 1, "height_px": 2**63 - 1}),
     ]:
         with pytest.raises(holod.InputError) as raised:
             holod.load_scene(path, **options)  # type: ignore[arg-type]
