@@ -13,6 +13,7 @@
 mod address;
 mod door;
 mod eye;
+mod give_up;
 mod live;
 mod metrics;
 mod server;
