@@ -210,6 +210,23 @@ fn patterns_take_the_place_of_holograms_and_make_way_again() {
 }
 
 #[test]
+fn orders_that_come_within_one_frame_are_all_obeyed() {
+    let bench = Bench::start(&["--weights", "fast"]);
+    let stream = UnixStream::connect(bench.socket()).unwrap();
+    let mut answers = BufReader::new(stream.try_clone().unwrap()).lines();
+    for _ in 0..5 {
+        for order in ["flat", "hologram", "flat", "hologram"] {
+            writeln!(&stream, "{}", json!({ "do": order })).unwrap();
+            let answer: Value = serde_json::from_str(&answers.next().unwrap().unwrap()).unwrap();
+            assert!(answer["ok"].is_string(), "{order}: {answer}");
+        }
+        bench.frames_go_on(5);
+    }
+    assert_eq!(bench.status()["pattern"], Value::Null);
+    bench.stop();
+}
+
+#[test]
 fn levels_are_kept_of_holograms_and_of_no_pattern() {
     let bench = Bench::start(&["--weights", "fast"]);
     let pupil = |mm: f64| {
