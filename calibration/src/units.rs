@@ -3,8 +3,11 @@
 use std::fmt;
 use std::ops::{Add, Index, IndexMut, Sub};
 
+use serde::{Deserialize, Serialize};
+
 /// A length in metres.
-#[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
+#[derive(Clone, Copy, Debug, PartialEq, PartialOrd, Serialize, Deserialize)]
+#[serde(transparent)]
 pub struct Metres(pub f64);
 
 /// A vergence in dioptres (1/metre): the depth of a point or the focus of an eye. 0 is infinity.
@@ -92,7 +95,8 @@ impl fmt::Display for Resolution {
 }
 
 /// One of the three laser colours.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Colour {
     /// The longest wavelength.
     Red,

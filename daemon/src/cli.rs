@@ -704,8 +704,11 @@ fn parse_pupil(text: &str) -> Result<PupilDiameter, String> {
     human_pupil(mm)
 }
 
-/// A pupil that a human eye can have.
-pub(crate) fn human_pupil(mm: f32) -> Result<PupilDiameter, String> {
+/// A pupil that a human eye can have; what is outside is most often another unit.
+///
+/// # Errors
+/// What was found, and the range, in millimetres.
+pub fn human_pupil(mm: f32) -> Result<PupilDiameter, String> {
     if (0.5..=9.0).contains(&mm) {
         Ok(PupilDiameter::from_mm(mm))
     } else {
@@ -720,7 +723,10 @@ fn parse_focus(text: &str) -> Result<Dioptres, String> {
 }
 
 /// A focus that an eye can have, with glasses or without.
-pub(crate) fn focus_of_an_eye(dpt: f64) -> Result<Dioptres, String> {
+///
+/// # Errors
+/// What was found, and the range, in dioptres.
+pub fn focus_of_an_eye(dpt: f64) -> Result<Dioptres, String> {
     if (-1.0..=10.0).contains(&dpt) {
         Ok(Dioptres(dpt))
     } else {

@@ -69,16 +69,22 @@ impl<S: Subscriber> Layer<S> for KeepRecent {
         if level > Level::INFO {
             return;
         }
-        let mut text = Text(String::new());
-        event.record(&mut text);
+        let text = text_of(event);
         let unix_ms = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64);
         let mut kept = RECENT.lock().unwrap_or_else(PoisonError::into_inner);
         if kept.lines.len() == KEPT {
             kept.lines.pop_front();
         }
-        kept.lines.push_back(Line { unix_ms, level: level.as_str(), text: text.0 });
+        kept.lines.push_back(Line { unix_ms, level: level.as_str(), text });
         kept.ever += 1;
     }
+}
+
+/// What an event says: its message, and its fields by name.
+pub fn text_of(event: &Event<'_>) -> String {
+    let mut text = Text(String::new());
+    event.record(&mut text);
+    text.0
 }
 
 struct Text(String);

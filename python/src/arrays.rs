@@ -68,13 +68,18 @@ impl<'a, 'py> Given<'a, 'py> {
         Ok(Values(typed.try_readonly()?))
     }
 
-    /// Writes to it, who must be contiguous and writeable.
+    /// Writes to it, which must have as many values, be contiguous and writeable.
     pub(crate) fn write<T: Element + Copy>(&self, values: &[T]) -> PyResult<()> {
         let cannot =
             |found: &str| self.refusal(found.to_owned(), "one that can be written to as a whole, C-contiguous");
         let typed = self.array.as_any().cast::<PyArrayDyn<T>>()?;
         let mut borrowed = typed.try_readwrite().map_err(|_| cannot("an array that is read-only, or in use"))?;
-        borrowed.as_slice_mut().map_err(|_| cannot("a strided array"))?.copy_from_slice(values);
+        let place = borrowed.as_slice_mut().map_err(|_| cannot("a strided array"))?;
+        if place.len() != values.len() {
+            let found = format!("an array of {} values", place.len());
+            return Err(self.refusal(found, &format!("{} of them", values.len())));
+        }
+        place.copy_from_slice(values);
         Ok(())
     }
 }

@@ -1,14 +1,13 @@
 //! Long work without the interpreter's lock; errors, panics and warnings of Rust as Python's.
 
 use std::ffi::CString;
-use std::fmt::{self, Write as _};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use holod_daemon::failure::{Exit, Failure};
+use holod_daemon::logging::text_of;
 use pyo3::prelude::*;
 use pyo3::{PyTypeInfo, import_exception};
-use tracing::field::{Field, Visit};
 use tracing::span;
 
 import_exception!(holod.errors, HolodError);
@@ -57,9 +56,7 @@ impl tracing::Subscriber for Listener {
     }
 
     fn event(&self, event: &tracing::Event<'_>) {
-        let mut message = Message(String::new());
-        event.record(&mut message);
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(message.0);
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(text_of(event));
     }
 
     fn new_span(&self, _: &span::Attributes<'_>) -> span::Id {
@@ -73,15 +70,4 @@ impl tracing::Subscriber for Listener {
     fn enter(&self, _: &span::Id) {}
 
     fn exit(&self, _: &span::Id) {}
-}
-
-/// An event's text.
-struct Message(String);
-
-impl Visit for Message {
-    fn record_debug(&mut self, field: &Field, value: &dyn fmt::Debug) {
-        if field.name() == "message" {
-            write!(self.0, "{value:?}").expect("a String takes all");
-        }
-    }
 }

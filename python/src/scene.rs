@@ -3,7 +3,7 @@
 use holod_calibration::Resolution;
 use holod_daemon::failure::{Exit, Failure};
 use holod_daemon::source::scene::SAMPLE_RESOLUTION;
-use holod_model::scene::{DepthEncoding, Fit, Scene};
+use holod_model::scene::{DepthEncoding, Fit, MOST_PIXELS, Scene};
 use holod_model::scene_renderer;
 use numpy::PyArrayMethods;
 use pyo3::prelude::*;
@@ -29,23 +29,13 @@ pub(crate) fn read_scene<'py>(
     fit: &str,
 ) -> PyResult<Read<'py>> {
     let geometry = Rig::given(rig).geometry;
-    let fit = match fit {
-        "native" => Fit::Native,
-        "contain" => Fit::Contain,
-        "cover" => Fit::Cover,
-        "crop" => Fit::Crop,
-        _ => {
-            return Err(InputError::new_err(format!(
-                "fit: found {fit:?}, expected \"native\", \"contain\", \"cover\" or \"crop\""
-            )));
-        }
-    };
+    let fit: Fit = serde_json::from_value(fit.into()).map_err(|why| InputError::new_err(format!("fit: {why}")))?;
     let size = match (width_px, height_px) {
         (None, None) => None,
-        (Some(width @ 1..), Some(height @ 1..)) => Some(Resolution { width, height }),
+        (Some(width), Some(height)) => Some(checked(Resolution { width, height })?),
         _ => {
             return Err(InputError::new_err(
-                "width_px and height_px: found one of them or 0, expected both above 0, or none for the picture's own size",
+                "width_px and height_px: found one of them, expected both, or none for the picture's own size",
             ));
         }
     };
@@ -77,12 +67,7 @@ pub(crate) fn render_builtin_scene(
 ) -> PyResult<(Bound<'_, PyAny>, Bound<'_, PyAny>)> {
     let width = width_px.unwrap_or(SAMPLE_RESOLUTION.width);
     let height = height_px.unwrap_or(SAMPLE_RESOLUTION.height);
-    let size = Resolution { width, height };
-    if width == 0 || height == 0 || width.saturating_mul(height) > MOST_PIXELS {
-        return Err(InputError::new_err(format!(
-            "width_px and height_px: found {size}, expected at least one pixel and at most {MOST_PIXELS}"
-        )));
-    }
+    let size = checked(Resolution { width, height })?;
     let (pixels, depth) = without_lock(py, || {
         let picture = scene_renderer::sample_scene(size).picture();
         Ok((interleaved(&picture.image), picture.depth))
@@ -93,5 +78,12 @@ pub(crate) fn render_builtin_scene(
     ))
 }
 
-/// As many as an 8K frame has.
-const MOST_PIXELS: usize = 7680 * 4320;
+/// A size that a picture may have, of files as well.
+fn checked(size: Resolution) -> PyResult<Resolution> {
+    if size.width == 0 || size.height == 0 || size.width.saturating_mul(size.height) > MOST_PIXELS {
+        return Err(InputError::new_err(format!(
+            "width_px and height_px: found {size}, expected at least one pixel and at most {MOST_PIXELS}"
+        )));
+    }
+    Ok(size)
+}

@@ -1,7 +1,8 @@
 //! What an eye sees.
 
 use holod_calibration::rig as calibration;
-use holod_calibration::{Dioptres, PupilDiameter, Resolution};
+use holod_calibration::{PupilDiameter, Resolution};
+use holod_daemon::cli::{focus_of_an_eye, human_pupil};
 use holod_daemon::failure::Failure;
 use holod_model::LinearImage;
 use holod_model::optics::{Eye, PhasePattern, SimulatedEye};
@@ -10,11 +11,6 @@ use pyo3::prelude::*;
 use crate::arrays::{Given, array, interleaved};
 use crate::outcome::{InputError, without_lock};
 use crate::rig::{Rig, phases_of};
-
-/// Pupils of human eyes, as on the command line: what is outside is most often another unit.
-const PUPILS_MM: std::ops::RangeInclusive<f32> = 0.5..=9.0;
-/// The least and the greatest, as on the command line.
-const FOCUS_DPT: std::ops::RangeInclusive<f64> = -1.0..=10.0;
 
 /// What an eye sees of phases on the rig's panel, which pass its 4f stop, the eye's pupil and its focus.
 ///
@@ -68,25 +64,12 @@ pub(crate) fn to_srgb8<'py>(py: Python<'py>, rgb: &Bound<'py, PyAny>) -> PyResul
 /// An eye of figures that can be one's.
 pub(crate) fn eye(pupil_mm: f32, focus_dpt: f64) -> PyResult<Eye> {
     let pupil = pupil(pupil_mm)?;
-    if !FOCUS_DPT.contains(&focus_dpt) {
-        return Err(InputError::new_err(format!(
-            "focus_dpt: found {focus_dpt}, expected dioptres from {} to {} (0 is infinity, 2.857 is 35 cm)",
-            FOCUS_DPT.start(),
-            FOCUS_DPT.end()
-        )));
-    }
-    Ok(Eye { pupil, focus: Dioptres(focus_dpt) })
+    let focus = focus_of_an_eye(focus_dpt).map_err(|why| InputError::new_err(format!("focus_dpt: {why}")))?;
+    Ok(Eye { pupil, focus })
 }
 
 pub(crate) fn pupil(pupil_mm: f32) -> PyResult<PupilDiameter> {
-    if PUPILS_MM.contains(&pupil_mm) {
-        return Ok(PupilDiameter::from_mm(pupil_mm));
-    }
-    Err(InputError::new_err(format!(
-        "pupil_mm: found {pupil_mm}, expected a human pupil of {} to {} millimetres",
-        PUPILS_MM.start(),
-        PUPILS_MM.end()
-    )))
+    human_pupil(pupil_mm).map_err(|why| InputError::new_err(format!("pupil_mm: {why}")))
 }
 
 /// What `eye` sees of a pattern on the bench of `rig`, as an array.

@@ -14,8 +14,10 @@
 //! through the eyepiece, focused at infinity, sees it.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
+use std::fmt;
 
 use holod_calibration::{Colour, DisplayGeometry, Metres, PerColour};
+use serde::{Deserialize, Serialize};
 
 use crate::fields::LevelsFrame;
 use crate::levels::PanelEncoder;
@@ -30,8 +32,10 @@ const LENS_DIAMETER_MIN_PX: f64 = 16.0;
 /// Samples of a period from which the light in its orders is worked out.
 const ORDER_SAMPLES: usize = 4096;
 
-/// A test pattern.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// A test pattern. As JSON it is `{"kind":"grating","period_px":8,"profile":"blazed"}`: names carry their units, and a
+/// figure that has a usual value may be left out.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
 pub enum Pattern {
     /// One level everywhere, as it is: neither table nor flatness is applied.
     Level {
@@ -50,17 +54,21 @@ pub enum Pattern {
         /// Pixels across one line.
         period_px: f64,
         /// Where the first order goes, degrees from x to y.
+        #[serde(default)]
         angle_deg: f64,
         /// The lines' shape.
         profile: Profile,
         /// Largest less smallest phase, radians; the profile's own ([`Profile::depth_rad`]) when left out.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
         depth_rad: Option<f64>,
     },
     /// A lens within a circle, in a flat surround.
     Lens {
         /// Distance from the panel to the focus; negative for a lens that diverges.
+        #[serde(rename = "focal_length_m")]
         focal_length: Metres,
         /// Diameter; the largest that neither aliases nor leaves the panel when left out.
+        #[serde(rename = "diameter_m", default, skip_serializing_if = "Option::is_none")]
         diameter: Option<Metres>,
     },
     /// A grid of bright dots on black, for a camera: to find its focus, scale, rotation and distortion. The dot at the
@@ -82,12 +90,14 @@ pub enum Pattern {
     /// direction, and nearer to the axis or farther from it by the ratio of the wavelengths.
     FieldIdentity {
         /// The circle's radius in the eyepiece's focal plane; three quarters of what passes the stop when left out.
+        #[serde(rename = "radius_m", default, skip_serializing_if = "Option::is_none")]
         radius: Option<Metres>,
     },
 }
 
 /// The shape of a grating's lines.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Profile {
     /// Half at one phase, half at the other.
     Binary,
@@ -130,6 +140,14 @@ pub struct PatternError {
     expected: String,
 }
 
+impl Placement {
+    /// Around `axis_px`, in `colours`; in all of them where none is named.
+    pub fn new(axis_px: [f64; 2], colours: &[Colour]) -> Self {
+        let is_drawn = |colour| colours.is_empty() || colours.contains(&colour);
+        Self { axis_px, colours: PerColour(Colour::ALL.map(is_drawn)) }
+    }
+}
+
 impl Profile {
     /// Depth in radians that sends most light into the first order.
     pub const fn depth_rad(self) -> f64 {
@@ -137,6 +155,14 @@ impl Profile {
             Self::Binary => PI,
             Self::Blazed => TAU,
             Self::Sinusoidal => SINUSOIDAL_DEPTH_RAD,
+        }
+    }
+
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Binary => "binary",
+            Self::Blazed => "blazed",
+            Self::Sinusoidal => "sinusoidal",
         }
     }
 
@@ -166,7 +192,29 @@ impl Profile {
 impl Default for Placement {
     /// The panel's centre, every colour.
     fn default() -> Self {
-        Self { axis_px: [0.0; 2], colours: PerColour([true; 3]) }
+        Self::new([0.0; 2], &[])
+    }
+}
+
+/// The pattern in words, such as "dots of 16 px, 60 px apart".
+impl fmt::Display for Pattern {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::Level { level } => write!(f, "level {level} everywhere"),
+            Self::Checkerboard { period_px, depth_rad } => {
+                write!(f, "checkerboard, {period_px} px across two squares, {:.3} π deep", depth_rad / PI)
+            }
+            Self::Grating { period_px, angle_deg, profile, depth_rad } => {
+                let depth = depth_rad.unwrap_or(profile.depth_rad()) / PI;
+                let profile = profile.name();
+                write!(f, "{profile} grating, {period_px} px a line, first order at {angle_deg}°, {depth:.3} π deep")
+            }
+            // To a nanometre, beyond which millimetres of metres are rounding.
+            Self::Lens { focal_length, .. } => write!(f, "lens, f = {} mm", (focal_length.0 * 1e9).round() / 1e6),
+            Self::Dots { spacing_px, diameter_px } => write!(f, "dots of {diameter_px} px, {spacing_px} px apart"),
+            Self::CrossHair { line_px } => write!(f, "cross-hair, lines of {line_px} px"),
+            Self::FieldIdentity { .. } => f.write_str("field identity: red to the right, green up, blue to the left"),
+        }
     }
 }
 
@@ -689,7 +737,7 @@ mod tests {
 
     #[test]
     fn dots_are_bright_where_they_are_and_dark_where_they_are_left_out() {
-        let placement = Placement { axis_px: [0.5, 0.5], ..Placement::default() };
+        let placement = Placement::new([0.5, 0.5], &[]);
         let dots = Pattern::Dots { spacing_px: 32, diameter_px: 12 };
         let seen = through_the_stop(shown(&dots, &placement, SIZE, Colour::Green), SIZE);
         // The axis is pixel (96, 79) from the upper left.
@@ -712,7 +760,7 @@ mod tests {
 
     #[test]
     fn a_cross_hair_crosses_at_the_axis_and_marks_the_upper_right() {
-        let placement = Placement { axis_px: [20.5, -10.5], ..Placement::default() };
+        let placement = Placement::new([20.5, -10.5], &[]);
         let cross = Pattern::CrossHair { line_px: 6 };
         let seen = through_the_stop(shown(&cross, &placement, SIZE, Colour::Red), SIZE);
         let (column, row) = (96 + 20, 79 + 11);
@@ -758,7 +806,7 @@ mod tests {
         panel.flatness_rad[Colour::Blue] = Some(vec![1.0; size.pixels()]);
         let encoder = PanelEncoder::new(&panel, size, size).unwrap();
         let mut frame = LevelsFrame::new(FrameLayout::new(&panel, size));
-        let placement = Placement { colours: PerColour([true, false, false]), ..Placement::default() };
+        let placement = Placement::new([0.0; 2], &[Colour::Red]);
         Pattern::Level { level: 200 }.draw(&placement, &encoder, &BENCH, &mut frame).unwrap();
         let levels = Colour::ALL.map(|colour| frame.unpack_colour(colour).levels);
         assert_eq!(levels, [vec![200; 24], vec![0; 24], vec![41; 24]]);
@@ -785,5 +833,51 @@ mod tests {
             let error = pattern.phase_rad([0.0; 2], &BENCH, Colour::Green).unwrap_err().to_string();
             assert!(error.contains(part), "{error}");
         }
+    }
+
+    #[test]
+    fn figures_carry_their_units() {
+        for (json, pattern) in [
+            (
+                r#"{"kind":"lens","focal_length_m":-0.25}"#,
+                Pattern::Lens { focal_length: Metres(-0.25), diameter: None },
+            ),
+            (
+                r#"{"kind":"lens","focal_length_m":0.3,"diameter_m":0.002}"#,
+                Pattern::Lens { focal_length: Metres(0.3), diameter: Some(Metres(0.002)) },
+            ),
+            (r#"{"kind":"field-identity","radius_m":0.0005}"#, Pattern::FieldIdentity { radius: Some(Metres(5e-4)) }),
+            (
+                r#"{"kind":"grating","period_px":6.5,"angle_deg":90.0,"profile":"binary"}"#,
+                Pattern::Grating { period_px: 6.5, angle_deg: 90.0, profile: Profile::Binary, depth_rad: None },
+            ),
+        ] {
+            assert_eq!(serde_json::from_str::<Pattern>(json).unwrap(), pattern);
+            assert_eq!(serde_json::to_string(&pattern).unwrap(), json);
+        }
+        let short = r#"{"kind":"grating","period_px":8,"profile":"blazed"}"#;
+        let told = serde_json::from_str::<Pattern>(short).unwrap().to_string();
+        assert_eq!(told, "blazed grating, 8 px a line, first order at 0°, 2.000 π deep");
+        for wrong in [
+            r#"{"kind":"lens","focal_length_mm":300}"#,
+            r#"{"kind":"stripes"}"#,
+            r#"{"kind":"level","level":-1}"#,
+            r#"{"kind":"grating","period_px":8,"profile":"round"}"#,
+            "{}",
+        ] {
+            assert!(serde_json::from_str::<Pattern>(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn lengths_are_told_without_what_rounding_leaves() {
+        let lens = |mm: f64| Pattern::Lens { focal_length: Metres(mm / 1e3), diameter: None }.to_string();
+        assert_eq!([30.1, -250.0].map(lens), ["lens, f = 30.1 mm", "lens, f = -250 mm"]);
+    }
+
+    #[test]
+    fn all_colours_are_drawn_where_none_is_named() {
+        assert_eq!(Placement::new([1.0, 2.0], &[]).colours, PerColour([true; 3]));
+        assert_eq!(Placement::new([1.0, 2.0], &[Colour::Blue, Colour::Red]).colours, PerColour([true, false, true]));
     }
 }

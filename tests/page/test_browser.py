@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import http.client
 import os
 import signal
 import time
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import Holod, wait_for
+from conftest import PATIENCE_S, Holod, wait_for
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
@@ -141,6 +142,25 @@ def test_a_daemon_that_dies_is_told(page: Holod, browser: webdriver.Chrome) -> N
     wait_for("its death is told", lambda: "No connection to holod" in text(browser, "alert"))
     assert "Look at the lasers themselves" in text(browser, "alert")
     assert (text(browser, "state"), text(browser, "lasers")) == ("not connected", "lasers: not known")
+
+
+def test_one_viewer_too_many_is_told_why(start: Start, browser: webdriver.Chrome) -> None:
+    holod = start()
+    viewers = []
+    for _ in range(64):
+        viewer = http.client.HTTPConnection("127.0.0.1", holod.port, timeout=PATIENCE_S)
+        viewer.request("GET", "/events")
+        assert viewer.getresponse().status == 200
+        viewers.append(viewer)
+    browser.get(holod.place)
+    wait_for("the page says why", lambda: "64 browsers watch already" in text(browser, "alert"))
+    assert (text(browser, "state"), text(browser, "lasers")) == ("not connected", "lasers: not known")
+    for viewer in viewers:
+        viewer.close()
+    wait_for("there is room", lambda: b"holod_page_viewers 0" in holod.get("/metrics")[1])
+    browser.refresh()
+    wait_for("the page says that it runs", lambda: text(browser, "state") == "running")
+    assert not browser.find_element(By.ID, "alert").is_displayed()
 
 
 def test_a_run_that_ends_is_told(page: Holod, browser: webdriver.Chrome) -> None:

@@ -1,6 +1,8 @@
 //! What bad input gets: one clear error, the right exit code, and nothing half written.
 
+use std::ffi::OsStr;
 use std::fs;
+use std::os::unix::ffi::OsStrExt;
 use std::path::Path;
 use std::time::Duration;
 
@@ -243,4 +245,13 @@ fn a_record_is_never_overwritten() {
     let ended = run(HOLOD, &["--record", "record", "--frames", "1"], folder.path());
     assert_eq!(ended.status.code(), Some(73), "{}", ended.stderr);
     assert_eq!(fs::read_to_string(folder.path().join("record/frames.csv")).unwrap(), "precious");
+}
+
+#[test]
+fn a_name_that_a_unit_cannot_have_is_refused() {
+    let name = OsStr::from_bytes(b"/etc/rig-\xff.toml");
+    let output = std::process::Command::new(HOLOD).args(["unit", "--config"]).arg(name).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(64), "{said}");
+    assert!(said.contains("rig-\u{fffd}.toml, expected words in UTF-8"), "{said}");
 }

@@ -7,6 +7,7 @@ mod evaluate;
 mod feed;
 mod gpu;
 mod inspect;
+mod page;
 mod panel;
 mod pattern;
 mod pictures;

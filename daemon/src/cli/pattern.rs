@@ -1,11 +1,12 @@
 //! The options of `holod pattern`.
 
+use std::f64::consts::PI;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Subcommand, ValueEnum};
-use holod_calibration::Colour;
-use serde::{Deserialize, Serialize};
+use holod_calibration::{Colour, Metres};
+use holod_slm_output::patterns::{Pattern, Profile};
 
 use super::RigArgs;
 
@@ -112,6 +113,31 @@ impl<To: Args> PatternKind<To> {
     }
 }
 
+/// With millimetres and multiples of π as metres and radians.
+impl<To: Args> From<&PatternKind<To>> for Pattern {
+    fn from(kind: &PatternKind<To>) -> Self {
+        let metres = |mm: f64| Metres(mm / 1e3);
+        match *kind {
+            PatternKind::Level { level, .. } => Self::Level { level },
+            PatternKind::Checkerboard { period, depth, .. } => {
+                Self::Checkerboard { period_px: period, depth_rad: depth * PI }
+            }
+            PatternKind::Grating { period, angle, profile, depth, .. } => Self::Grating {
+                period_px: period,
+                angle_deg: angle,
+                profile: profile.into(),
+                depth_rad: depth.map(|depth| depth * PI),
+            },
+            PatternKind::Lens { focal_length, diameter, .. } => {
+                Self::Lens { focal_length: metres(focal_length), diameter: diameter.map(metres) }
+            }
+            PatternKind::Dots { spacing, dot, .. } => Self::Dots { spacing_px: spacing, diameter_px: dot },
+            PatternKind::CrossHair { line, .. } => Self::CrossHair { line_px: line },
+            PatternKind::FieldIdentity { radius, .. } => Self::FieldIdentity { radius: radius.map(metres) },
+        }
+    }
+}
+
 /// Where a pattern is on the panel.
 #[derive(Args, Debug, Clone)]
 pub struct PatternPlace {
@@ -121,6 +147,13 @@ pub struct PatternPlace {
     /// The optical axis in pixels from the panel's centre, right and up: the middle of lens, dots and cross-hair.
     #[arg(long, value_name = "X,Y", default_value = "0,0", value_parser = parse_axis, allow_hyphen_values = true)]
     pub axis: [f64; 2],
+}
+
+impl PatternPlace {
+    /// The colours that are named.
+    pub fn colours(&self) -> Vec<Colour> {
+        self.colour.iter().copied().map(Colour::from).collect()
+    }
 }
 
 /// Where a pattern goes.
@@ -154,8 +187,7 @@ pub struct PatternTarget {
 }
 
 /// The shape of a grating's lines.
-#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ProfileArg {
     /// Two phases, half a period each.
     Binary,
@@ -165,9 +197,18 @@ pub enum ProfileArg {
     Sinusoidal,
 }
 
+impl From<ProfileArg> for Profile {
+    fn from(profile: ProfileArg) -> Self {
+        match profile {
+            ProfileArg::Binary => Self::Binary,
+            ProfileArg::Blazed => Self::Blazed,
+            ProfileArg::Sinusoidal => Self::Sinusoidal,
+        }
+    }
+}
+
 /// A colour by name.
-#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
 #[expect(missing_docs, reason = "the names say it")]
 pub enum ColourArg {
     Red,
@@ -215,7 +256,8 @@ mod tests {
             (angle, to.place.axis, to.place.colour.as_slice()),
             (-30.0, [-3.0, 4.5], &[ColourArg::Red, ColourArg::Blue][..])
         );
-        assert!(parsed("holod pattern lens --focal-length -20").is_ok());
+        let lens = Pattern::from(&parsed("holod pattern lens --focal-length -20 --diameter 2").unwrap());
+        assert_eq!(lens, Pattern::Lens { focal_length: Metres(-0.02), diameter: Some(Metres(0.002)) });
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use holod_calibration::rig::WeightsChoice;
 
 use crate::cli::{CtlArgs, CtlOrder, LasersArg, PupilOrder};
-use crate::control::{PatternRequest, Request, ask};
+use crate::control::{Request, ask};
 use crate::failure::{Exit, Failure};
 use crate::report;
 use crate::setup;
@@ -47,11 +47,9 @@ fn request(order: &CtlOrder) -> Result<Request, Failure> {
         CtlOrder::Resume => Request::Resume,
         CtlOrder::Pupil { pupil: PupilOrder::Follow } => Request::Pupil { mm: None },
         CtlOrder::Pupil { pupil: PupilOrder::Fixed(pupil) } => Request::Pupil { mm: Some(pupil.mm()) },
-        CtlOrder::Pattern(kind) => Request::Pattern {
-            pattern: PatternRequest::of_arguments(kind),
-            axis_px: kind.target().axis,
-            colours: kind.target().colour.clone(),
-        },
+        CtlOrder::Pattern(kind) => {
+            Request::Pattern { pattern: kind.into(), axis_px: kind.target().axis, colours: kind.target().colours() }
+        }
         CtlOrder::Eye { eye } => Request::Eye { eye: *eye },
         CtlOrder::Reload => Request::Reload { changed: BTreeMap::new() },
         CtlOrder::Flat => Request::Flat,

@@ -58,7 +58,7 @@ fn text_of(status: &Snapshot) -> String {
         status.pid,
         figures.rig,
         match &status.pattern {
-            Some(name) => format!("; the pattern {name} is shown in place of holograms"),
+            Some(name) => format!("; in place of holograms a pattern is shown: {name}"),
             None if status.paused => "; the picture stands still".to_owned(),
             None => String::new(),
         },

@@ -1,6 +1,7 @@
 //! `holod unit`: the drop-in that opens the service's unit for one bench, and no further.
 
 use std::collections::BTreeSet;
+use std::ffi::OsString;
 use std::fs;
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
@@ -24,7 +25,14 @@ const STATE_FOLDER: &str = "/var/lib/holod";
 const LOCAL_NETWORKS: &str = "link-local 192.168.0.0/16 10.0.0.0/8 172.16.0.0/12";
 
 pub(super) fn unit(args: &UnitArgs) -> Result<(), Failure> {
-    let words = std::env::args().skip_while(|word| word != "unit").skip(1).collect::<Vec<_>>();
+    let words = std::env::args_os().skip_while(|word| word != "unit").skip(1).map(OsString::into_string);
+    let words = words.collect::<Result<Vec<_>, _>>().map_err(|word| {
+        let found = word.display();
+        Failure::new(
+            Exit::Usage,
+            format!("found {found}, expected words in UTF-8, as a unit's file has them: rename it"),
+        )
+    })?;
     let rig = setup::rig_with_network(&args.run.rig, &args.run.network)?;
     report::print(drop_in(&rig, &args.run, &words, Path::new("/"))?.trim_end())
 }

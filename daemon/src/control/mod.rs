@@ -7,29 +7,26 @@
 mod client;
 #[cfg(fuzzing)]
 pub mod fuzzing;
-mod pattern;
 mod prepare;
 mod server;
 mod steering;
 
 use std::collections::BTreeMap;
 
-use holod_calibration::PupilDiameter;
 use holod_calibration::rig::{Eye, Rig};
+use holod_calibration::{Colour, PupilDiameter};
 use holod_model::scene::Fit;
 use holod_slm_output::LevelsFrame;
+use holod_slm_output::patterns::Pattern;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 pub use self::client::ask;
-pub use self::pattern::PatternRequest;
-pub(crate) use self::pattern::placement;
 pub use self::prepare::RigReader;
 pub(crate) use self::prepare::{NewEngine, Preparer};
 pub(crate) use self::server::{ControlServer, panic_is_caught};
 pub(crate) use self::steering::Steering;
 
-use crate::cli::ColourArg;
 use crate::source::scene::Frames;
 
 /// A request.
@@ -78,13 +75,13 @@ pub enum Request {
     /// Show a test pattern in place of holograms.
     Pattern {
         /// Which.
-        pattern: PatternRequest,
+        pattern: Pattern,
         /// The optical axis in pixels from the panel's centre, right and up.
         #[serde(default)]
         axis_px: [f64; 2],
         /// Colours that have it, the others are flat; all of them when left out.
         #[serde(default, skip_serializing_if = "Vec::is_empty")]
-        colours: Vec<ColourArg>,
+        colours: Vec<Colour>,
     },
     /// Show one phase everywhere in place of holograms.
     Flat,
@@ -148,7 +145,8 @@ pub(crate) struct NewRig {
 
 /// Levels that take the place of holograms.
 pub(crate) struct NewPattern {
-    pub(crate) name: &'static str,
+    /// What it is called, in words.
+    pub(crate) name: String,
     pub(crate) levels: Box<LevelsFrame>,
 }
 
@@ -175,9 +173,9 @@ mod tests {
             (
                 r#"{"do":"pattern","pattern":{"kind":"cross-hair","line_px":4},"colours":["green"]}"#,
                 Request::Pattern {
-                    pattern: PatternRequest::CrossHair { line_px: 4 },
+                    pattern: Pattern::CrossHair { line_px: 4 },
                     axis_px: [0.0, 0.0],
-                    colours: vec![ColourArg::Green],
+                    colours: vec![Colour::Green],
                 },
             ),
             (

@@ -7,10 +7,10 @@ use holod_calibration::{PupilDiameter, Resolution, TimeNs};
 use holod_model::scene::Fit;
 use holod_model::{RgbdFrame, Weights};
 use holod_pupil_input::host_now;
-use holod_slm_output::patterns::{Pattern, PatternError};
+use holod_slm_output::patterns::{PatternError, Placement};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 
-use super::{NewPattern, NewRig, Order, Request, placement};
+use super::{NewPattern, NewRig, Order, Request};
 use crate::cli::{self, Backend, SceneArgs};
 use crate::failure::Failure;
 use crate::renderer::{self, Renderer};
@@ -70,16 +70,16 @@ impl Preparer {
             Request::Stop => Ok(Order::Stop),
             Request::Pupil { mm: None } => Ok(Order::Pupil(None)),
             Request::Pupil { mm: Some(mm) } => cli::human_pupil(*mm).map(|pupil| Order::Pupil(Some(pupil))),
-            Request::Flat => self.pattern("flat", |encoder, levels| {
+            Request::Flat => self.pattern("flat".into(), |encoder, levels| {
                 encoder.encode_flat(levels);
                 Ok(())
             }),
             Request::Pattern { pattern, axis_px, colours } => {
-                let placement = placement(*axis_px, colours);
+                let placement = Placement::new(*axis_px, colours);
                 let draw = |encoder: &PanelEncoder, levels: &mut LevelsFrame| {
-                    Pattern::from(*pattern).draw(&placement, encoder, &self.rig.geometry, levels)
+                    pattern.draw(&placement, encoder, &self.rig.geometry, levels)
                 };
-                self.pattern(pattern.name(), draw)
+                self.pattern(pattern.to_string(), draw)
             }
             Request::Hologram => Ok(Order::Pattern(None)),
             Request::Scene { scene, depth_encoding, .. } if scene == "feed" => self.feed(depth_encoding.is_some()),
@@ -115,7 +115,7 @@ impl Preparer {
     /// What `draw` draws on the whole panel, as `holod pattern` does.
     fn pattern(
         &self,
-        name: &'static str,
+        name: String,
         draw: impl FnOnce(&PanelEncoder, &mut LevelsFrame) -> Result<(), PatternError>,
     ) -> Result<Order, String> {
         let encoder = renderer::panel_encoder(&self.rig, self.rig.resolution()).map_err(in_words)?;

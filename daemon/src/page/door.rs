@@ -135,9 +135,10 @@ pub(super) async fn admit(State(keeper): State<Arc<Doorkeeper>>, request: Reques
     }
 }
 
-/// Takes the token out of the address bar into a cookie.
+/// Takes the token out of the address bar into a cookie. It comes with a link on another page, too, which the page can
+/// afford as it only tells; what another page loads by itself comes without.
 fn let_in(token: &str) -> Response {
-    let cookie = format!("{COOKIE_NAME}={token}; HttpOnly; SameSite=Strict; Path=/");
+    let cookie = format!("{COOKIE_NAME}={token}; HttpOnly; SameSite=Lax; Path=/");
     let cookie = HeaderValue::from_str(&cookie).expect("a token has letters, digits, - and _");
     (StatusCode::SEE_OTHER, [(LOCATION, HeaderValue::from_static("/")), (SET_COOKIE, cookie)]).into_response()
 }

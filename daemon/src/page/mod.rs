@@ -15,6 +15,7 @@ mod door;
 mod eye;
 #[cfg(fuzzing)]
 pub mod fuzzing;
+mod give_up;
 mod live;
 mod metrics;
 mod server;

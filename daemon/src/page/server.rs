@@ -38,6 +38,7 @@ use tokio_stream::wrappers::errors::BroadcastStreamRecvError;
 use super::address::PageAddress;
 use super::door::{Door, Doorkeeper, Token, admit};
 use super::eye::{Blind, EyeDesk, Gaze};
+use super::give_up::GivesUp;
 use super::live::{Live, Viewer};
 use super::metrics;
 use crate::cli::{focus_of_an_eye, human_pupil};
@@ -104,7 +105,7 @@ impl PageServer {
             (None, PageAddress::Unix(_)) => Door::Open,
         };
         let router = router(door, Arc::clone(&live), eye);
-        runtime.spawn(serve(listener, router, Arc::clone(&live)));
+        runtime.spawn(serve(listener, router, Arc::clone(&live), PATIENCE));
         let socket = match &place {
             PageAddress::Unix(path) => Some(path.clone()),
             PageAddress::Tcp(_) => None,
@@ -167,7 +168,7 @@ impl Listener {
             Self::Tcp(listener) => {
                 let (stream, _) = listener.accept().await?;
                 stream.set_nodelay(true)?;
-                // A viewer that is gone without a word, or takes nothing.
+                // A viewer that is gone without a word.
                 set_tcp_user_timeout(stream.as_fd(), PATIENCE.as_millis() as u32)?;
                 Ok(Box::new(stream))
             }
@@ -176,7 +177,7 @@ impl Listener {
     }
 }
 
-async fn serve(listener: Listener, router: Router, live: Arc<Live>) {
+async fn serve(listener: Listener, router: Router, live: Arc<Live>, patience: Duration) {
     let connections = Arc::new(Semaphore::new(CONNECTIONS));
     loop {
         let Ok(stream) = listener.accept().await else {
@@ -192,9 +193,9 @@ async fn serve(listener: Listener, router: Router, live: Arc<Live>) {
         tokio::spawn(async move {
             let _place = place;
             let mut server = http1::Builder::new();
-            server.timer(TokioTimer::new()).header_read_timeout(PATIENCE);
+            server.timer(TokioTimer::new()).header_read_timeout(patience);
             // A client that has gone away is no fault.
-            let _gone = server.serve_connection(TokioIo::new(stream), service).await;
+            let _gone = server.serve_connection(TokioIo::new(GivesUp::new(stream, patience)), service).await;
         });
     }
 }
@@ -322,4 +323,51 @@ async fn figures(State(shown): State<Shown>) -> Response {
 
 fn over() -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, format!("{}\n", Blind::NoRun)).into_response()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+    use std::os::unix::net::UnixStream;
+
+    use super::super::live::{Batch, Light};
+    use super::*;
+
+    /// Short, so that the test is; a viewer is never closed for being slow to read less than its socket takes.
+    const SHORT: Duration = Duration::from_millis(200);
+
+    fn until(what: &str, done: impl Fn() -> bool) {
+        let t_end = Instant::now() + Duration::from_secs(60);
+        while !done() {
+            assert!(Instant::now() < t_end, "{what}");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    #[test]
+    fn a_viewer_who_takes_nothing_loses_its_place() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("page");
+        let live = Arc::new(Live::default());
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_io().enable_time().build().unwrap();
+        let _inside = runtime.enter();
+        let (listener, _) = Listener::bind(&PageAddress::Unix(path.clone())).unwrap();
+        let router = router(Door::Open, Arc::clone(&live), EyeDesk::default());
+        runtime.spawn(serve(listener, router, Arc::clone(&live), SHORT));
+        let mut viewer = UnixStream::connect(&path).unwrap();
+        viewer.write_all(b"GET /events HTTP/1.1\r\nHost: x\r\n\r\n").unwrap();
+        let watching = || live.viewers.load(Ordering::Relaxed);
+        until("it watches", || watching() == 1);
+
+        live.hand_out(Batch::default());
+        std::thread::sleep(5 * SHORT);
+        assert_eq!(watching(), 1, "what its socket takes is taken");
+        until("its place comes free", || {
+            let light = (0..1000).map(|t| Light(f64::from(t), None, None)).collect();
+            live.hand_out(Batch { light, ..Batch::default() });
+            watching() == 0
+        });
+        drop(viewer);
+    }
 }

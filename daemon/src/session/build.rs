@@ -34,6 +34,8 @@ use crate::{progress, setup, source, speed};
 const STALL_FRAMES: i64 = 6;
 const STALL_TIMEOUT_MIN: TimeNs = TimeNs(2_000_000_000);
 const STALL_TIMEOUT_MAX: TimeNs = TimeNs(10_000_000_000);
+/// Orders that may wait for the next frame, such as a script's.
+const CHANGES: usize = 4;
 /// A first frame that takes longer is not made twice to be timed.
 const LONG_FRAME: TimeNs = TimeNs(5_000_000_000);
 
@@ -109,8 +111,9 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
     let stop = Arc::new(AtomicBool::new(false));
     let records_lost = Arc::new(AtomicU64::new(0));
     let (record_producer, records) = rtrb::RingBuffer::new(RECORDS);
-    let (places, change_consumer) = rtrb::RingBuffer::new(1);
-    let (retired_producer, retired) = rtrb::RingBuffer::new(3);
+    let (places, change_consumer) = rtrb::RingBuffer::new(CHANGES);
+    // Beside these, one that the loop has in hand, and one that is sent since the retired ones were last taken.
+    let (retired_producer, retired) = rtrb::RingBuffer::new(CHANGES + 2);
     let steering = Arc::new(Steering::new(plan.pupil));
     let weights = Arc::new(Mutex::new(rig.model.weights.clone()));
     let preparer = Preparer {

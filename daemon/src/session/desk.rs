@@ -42,7 +42,7 @@ pub(super) struct Desk {
     changes: Changes,
     keeps_dark: bool,
     /// What is shown in place of holograms.
-    pattern: Option<&'static str>,
+    pattern: Option<String>,
 }
 
 impl Desk {
@@ -73,8 +73,8 @@ impl Desk {
         self.keeps_dark
     }
 
-    pub(super) fn pattern(&self) -> Option<&'static str> {
-        self.pattern
+    pub(super) fn pattern(&self) -> Option<&str> {
+        self.pattern.as_deref()
     }
 
     /// Has the rig file read again, because a signal asks for it.
@@ -233,10 +233,11 @@ impl Watch<'_> {
     fn change_pattern(&mut self, pattern: Option<NewPattern>, output: &OutputControl) -> Result<Value, String> {
         let (name, levels) = pattern.map(|NewPattern { name, levels }| (name, levels)).unzip();
         self.change(Change::Pattern(levels))?;
+        let said = name.as_ref().map(|name| format!("shown until `holod ctl hologram`: {name}"));
         self.desk.pattern = name;
-        let Some(name) = name else { return Ok("holograms are shown".into()) };
+        let Some(said) = said else { return Ok("holograms are shown".into()) };
         let warning = if output.counts().armed { self.pattern_warning() } else { "" };
-        Ok(format!("the pattern {name} is shown until `holod ctl hologram`{warning}").into())
+        Ok(format!("{said}{warning}").into())
     }
 
     /// What whoever lights a pattern must know.

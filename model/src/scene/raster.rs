@@ -12,7 +12,7 @@ use super::{SceneError, openexr};
 use crate::picture::srgb_to_linear;
 
 /// More pixels than an 8K frame are refused before anything is allocated for them.
-pub(super) const MOST_PIXELS: usize = 7680 * 4320;
+pub const MOST_PIXELS: usize = 7680 * 4320;
 /// What is read, for errors.
 pub(super) const FORMATS: &str = "an 8- or 16-bit PNG, a JPEG or an OpenEXR picture";
 

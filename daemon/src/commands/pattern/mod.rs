@@ -6,12 +6,11 @@ mod sight;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::Colour;
-use holod_slm_output::patterns::Pattern;
+use holod_slm_output::patterns::{Pattern, Placement};
 use holod_slm_output::{FrameLayout, LevelsFrame, OutputSpec, PanelEncoder};
 
 use self::sight::Sight;
 use crate::cli::{PatternKind, PatternTarget};
-use crate::control::{PatternRequest, placement};
 use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
 use crate::pictures::video_pictures;
@@ -25,8 +24,8 @@ pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> 
     let rig = setup::rig(&to.rig)?;
     let resolution = rig.resolution();
     let encoder = PanelEncoder::new(&rig.panel, resolution, resolution).map_err(Failure::because(Exit::Config))?;
-    let pattern = Pattern::from(PatternRequest::of_arguments(kind));
-    let placement = placement(to.place.axis, &to.place.colour);
+    let pattern = Pattern::from(kind);
+    let placement = Placement::new(to.place.axis, &to.place.colours());
     let mut levels = LevelsFrame::new(FrameLayout::new(&rig.panel, resolution));
     let usage = Failure::because(Exit::Usage);
     pattern.draw(&placement, &encoder, &rig.geometry, &mut levels).map_err(&usage)?;

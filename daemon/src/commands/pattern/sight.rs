@@ -101,7 +101,7 @@ impl Sight {
                 largest_mm[Colour::Blue]
             ));
         }
-        Ok(Self { pattern: in_words(pattern), rig: rig.name.clone(), files: Vec::new(), spots, notes })
+        Ok(Self { pattern: pattern.to_string(), rig: rig.name.clone(), files: Vec::new(), spots, notes })
     }
 }
 
@@ -158,25 +158,6 @@ impl Spot {
             y_mm: rounded_mm(order.position[1]),
             passes_stop: order.passes_stop,
         }
-    }
-}
-
-fn in_words(pattern: &Pattern) -> String {
-    let pi = std::f64::consts::PI;
-    match *pattern {
-        Pattern::Level { level } => format!("level {level} everywhere"),
-        Pattern::Checkerboard { period_px, depth_rad } => {
-            format!("checkerboard, {period_px} px across two squares, {:.3} π deep", depth_rad / pi)
-        }
-        Pattern::Grating { period_px, angle_deg, profile, depth_rad } => format!(
-            "{} grating, {period_px} px a line, first order at {angle_deg}°, {:.3} π deep",
-            format!("{profile:?}").to_lowercase(),
-            depth_rad.unwrap_or(profile.depth_rad()) / pi
-        ),
-        Pattern::Lens { focal_length, .. } => format!("lens, f = {} mm", focal_length.0 * 1e3),
-        Pattern::Dots { spacing_px, diameter_px } => format!("dots of {diameter_px} px, {spacing_px} px apart"),
-        Pattern::CrossHair { line_px } => format!("cross-hair, lines of {line_px} px"),
-        Pattern::FieldIdentity { .. } => "field identity: red to the right, green up, blue to the left".into(),
     }
 }
 

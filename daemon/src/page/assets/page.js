@@ -35,6 +35,8 @@ stream.addEventListener("open", () => {
 stream.addEventListener("error", () => {
   if (over) {
     stream.close();
+  } else if (stream.readyState === EventSource.CLOSED) {
+    tellRefusal();
   } else {
     gone(`No connection to holod since ${clock(heardAt || Date.now())}: it has ended, was killed, or cannot be reached. ` +
       "What is below is what it said last. Look at the lasers themselves.");
@@ -58,6 +60,20 @@ stream.addEventListener("batch", ({ data }) => {
   newest.t = Math.max(newest.t, ...times.filter((t) => t !== undefined));
   tellLog(batch.log);
 });
+
+// A browser that is refused does not ask again, and does not say why.
+async function tellRefusal() {
+  try {
+    const answer = await fetch("events");
+    if (answer.ok) {
+      location.reload();
+    } else {
+      gone(`holod refuses to be watched: ${(await answer.text()).trim()}. Reload this page to ask again.`);
+    }
+  } catch {
+    gone("holod has refused to be watched, and cannot be reached any more. Look at the lasers themselves.");
+  }
+}
 
 function heard() {
   heardAt = Date.now();

@@ -102,8 +102,9 @@ class Control:
     ) -> str:
         """Shows a test pattern in place of holograms, such as pattern("grating", period_px=8, profile="blazed").
 
-        Kinds and figures are those of daemon/doc/control.md; `axis_px` is the optical axis right and up of the panel's
-        centre; `colours` that are not named are flat, and all have the pattern where none is.
+        Kinds and figures are those of daemon/doc/control.md, lengths in metres: pattern("lens", focal_length_m=0.3).
+        The status says in words which one is shown. `axis_px` is the optical axis right and up of the panel's centre;
+        `colours` that are not named are flat, and all have the pattern where none is.
         """
         return self.ask("pattern", pattern={"kind": kind, **figures}, axis_px=list(axis_px), colours=list(colours))
 

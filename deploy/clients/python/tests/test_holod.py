@@ -118,7 +118,8 @@ def test_a_running_holod_is_changed(holod: Holod, monkeypatch: pytest.MonkeyPatc
         control.pause()
         control.resume()
         assert "grating" in control.pattern("grating", period_px=8, profile="blazed", colours=["red"])
-        assert control.status()["pattern"] == "grating"
+        assert control.status()["pattern"].startswith("blazed grating, 8 px a line")
+        assert "lens, f = -150 mm" in control.pattern("lens", focal_length_m=-0.15)
         control.flat()
         assert control.status()["pattern"] == "flat"
         control.hologram()

@@ -1,0 +1,103 @@
+//! The status page's work gives way to the run's.
+
+use std::fs;
+use std::io::{Read, Write};
+use std::os::unix::net::UnixStream;
+use std::path::Path;
+use std::time::Duration;
+
+use holod_tests::daemon::{Daemon, wait_until};
+use rustix::process::{Signal, getpriority_process};
+
+use crate::HOLOD;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Of the threads that compute holograms, and of the one that computes the page's pictures.
+const WORKER_NICENESS: i32 = 5;
+const EYE_NICENESS: i32 = 15;
+/// Policies of the kernel: ordinary, and first in first out.
+const SCHED_OTHER: u32 = 0;
+const SCHED_FIFO: u32 = 1;
+
+#[derive(Debug, PartialEq)]
+struct Thread {
+    name: String,
+    is_main: bool,
+    nice: i32,
+    policy: u32,
+}
+
+impl Thread {
+    /// Of the text of /proc/PID/task/TID/stat, whose fields are counted from 1.
+    fn of(stat: &str, pid: u32) -> Self {
+        let (id, rest) = stat.split_once(" (").unwrap();
+        let (name, rest) = rest.rsplit_once(") ").unwrap();
+        let fields: Vec<&str> = rest.split_whitespace().collect();
+        let field = |number: usize| fields[number - 3];
+        Self {
+            name: name.to_owned(),
+            is_main: id.parse() == Ok(pid),
+            nice: field(19).parse().unwrap(),
+            policy: field(41).parse().unwrap(),
+        }
+    }
+
+    fn all_of(pid: u32) -> Vec<Self> {
+        let tasks = fs::read_dir(format!("/proc/{pid}/task")).unwrap();
+        // One that has ended meanwhile has no file any more.
+        let stats = tasks.filter_map(|task| fs::read_to_string(task.ok()?.path().join("stat")).ok());
+        stats.map(|stat| Self::of(&stat, pid)).collect()
+    }
+}
+
+#[test]
+fn fields_of_a_thread_are_told_apart() {
+    let stat = "4711 (a b) c) S 1 2 3 0 -1 4194304 5 0 0 0 6 7 0 0 -11 0 9 0 8 0 0 18446744073709551615 0 0 0 0 0 0 0 \
+                0 0 0 0 0 -1 1 10 1 0 0 0 0 0 0 0 0 0 0 0";
+    let expected = Thread { name: "a b) c".into(), is_main: true, nice: 0, policy: SCHED_FIFO };
+    assert_eq!(Thread::of(stat, 4711), expected);
+    assert!(!Thread::of(stat, 4712).is_main);
+}
+
+/// The first line of the answer.
+fn get(socket: &Path, path: &str) -> Option<String> {
+    let mut stream = UnixStream::connect(socket).ok()?;
+    write!(stream, "GET {path} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").ok()?;
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).ok()?;
+    String::from_utf8_lossy(&answer).lines().next().map(str::to_owned)
+}
+
+#[test]
+fn pictures_for_the_page_are_computed_behind_everything_else() {
+    let folder = tempfile::tempdir().unwrap();
+    let socket = folder.path().join("page");
+    let page = format!("unix:{}", socket.display());
+    let args = ["--resolution", "64x64", "--weights", "fast", "--backend", "cpu", "--tracker", "mock:sweep", "--page"];
+    let environment = [("XDG_RUNTIME_DIR", folder.path()), ("RAYON_NUM_THREADS", Path::new("3"))];
+    let daemon = Daemon::start_with(HOLOD, &[&args[..], &[&page]].concat(), folder.path(), &environment);
+    let seen = || get(&socket, "/eye.png").is_some_and(|status| status == "HTTP/1.1 200 OK");
+    assert!(wait_until(PATIENCE, seen), "no picture");
+
+    let threads = Thread::all_of(daemon.pid());
+    let of_name = |name: &'static str| threads.iter().filter(move |thread| thread.name == name && !thread.is_main);
+    // Where this program itself gives way already, so does what it starts.
+    let own = getpriority_process(None).unwrap();
+    let is_ordinary = |thread: &Thread, nice: i32| thread.policy == SCHED_OTHER && thread.nice == nice.max(own);
+    let eyes: Vec<_> = of_name("holod-eye").collect();
+    assert_eq!(eyes.len(), 2, "the thread that is asked, and the one that computes: {threads:#?}");
+    assert!(eyes.iter().all(|thread| is_ordinary(thread, EYE_NICENESS)), "{eyes:#?}");
+    assert!(eyes.iter().all(|thread| !is_ordinary(thread, WORKER_NICENESS)) || own > WORKER_NICENESS);
+    // The usual pool's threads have the name of the process.
+    let pool: Vec<_> = of_name("holod").collect();
+    assert_eq!(pool.len(), 3, "{threads:#?}");
+    assert!(pool.iter().all(|thread| is_ordinary(thread, WORKER_NICENESS)), "{pool:#?}");
+    assert!(of_name("holod-page").all(|thread| is_ordinary(thread, WORKER_NICENESS)), "{threads:#?}");
+
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(PATIENCE);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let may_be_prompt = !ended.stderr.contains("threads run at ordinary priority");
+    let panel: Vec<_> = of_name("holod-panel").map(|thread| thread.policy).collect();
+    assert_eq!(panel, [if may_be_prompt { SCHED_FIFO } else { SCHED_OTHER }], "{}", ended.stderr);
+}
