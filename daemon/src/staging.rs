@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, Once, PoisonError};
+use std::sync::{Mutex, Once, OnceLock, PoisonError};
 
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use tempfile::TempDir;
@@ -93,11 +93,24 @@ pub(crate) fn leave_signals_to_a_run(left: bool) {
     OBEYED_ELSEWHERE.store(left, Ordering::Release);
 }
 
+/// Whether holod was started so that its terminal's end is nothing to it, as `nohup` does.
+pub(crate) fn hangup_is_ignored() -> bool {
+    static IGNORED: OnceLock<bool> = OnceLock::new();
+    *IGNORED.get_or_init(|| {
+        let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+        let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+        let mask = mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+        mask.is_some_and(|mask| mask >> (SIGHUP - 1) & 1 == 1)
+    })
+}
+
 /// Starts the thread that waits for signals, once. Where there can be none, signals end the process as ever.
 fn take_away_on_signals() {
     static STARTED: Once = Once::new();
     STARTED.call_once(|| {
-        let Ok(mut signals) = signal_hook::iterator::Signals::new([SIGINT, SIGTERM, SIGHUP]) else { return };
+        let hangup = (!hangup_is_ignored()).then_some(SIGHUP);
+        let ending = [SIGINT, SIGTERM].into_iter().chain(hangup);
+        let Ok(mut signals) = signal_hook::iterator::Signals::new(ending) else { return };
         let wait = move || {
             for signal in signals.forever() {
                 if !OBEYED_ELSEWHERE.load(Ordering::Acquire) {

@@ -296,6 +296,32 @@ fn a_terminal_that_goes_away_ends_the_run_in_order() {
 }
 
 #[test]
+fn a_run_that_is_to_outlive_its_terminal_does() {
+    let folder = tempfile::tempdir().unwrap();
+    // Without a rig file the signal has nothing else to say than that the terminal is gone.
+    let args =
+        [HOLOD, "--resolution", "64x64", "--backend", "cpu", "--weights", "fast", "--record", "record", "--json"];
+    let environment = [("XDG_RUNTIME_DIR", folder.path())];
+    let frames = || frames::read(&folder.path().join("record/frames.csv")).map_or(0, |rows| rows.len());
+    for (program, outlives) in [("nohup", true), ("env", false)] {
+        let mut daemon = Daemon::start_with(program, &args, folder.path(), &environment);
+        assert!(wait_until(PATIENCE, || frames() > 100), "no frames");
+        daemon.signal(rustix::process::Signal::HUP);
+        if outlives {
+            let before = frames();
+            assert!(wait_until(PATIENCE, || frames() > before + 100), "no frames after the signal");
+            assert!(daemon.runs());
+            daemon.signal(rustix::process::Signal::TERM);
+        }
+        let ended = daemon.wait(PATIENCE);
+        assert!(ended.status.success(), "{}", ended.stderr);
+        let summary: Value = serde_json::from_str(&ended.stdout).unwrap();
+        assert_eq!(summary["ended_by"], if outlives { "SIGTERM" } else { "SIGHUP" });
+        fs::remove_dir_all(folder.path().join("record")).unwrap();
+    }
+}
+
+#[test]
 fn orders_that_come_within_one_frame_are_all_obeyed() {
     let bench = Bench::start(&["--weights", "fast"]);
     let stream = UnixStream::connect(bench.socket()).unwrap();

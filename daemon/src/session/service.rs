@@ -10,7 +10,7 @@ use signal_hook::SigId;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::failure::{Exit, Failure};
-use crate::staging::leave_signals_to_a_run;
+use crate::staging::{hangup_is_ignored, leave_signals_to_a_run};
 
 /// What SIGHUP says.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,7 +45,7 @@ impl Signals {
         leave_signals_to_a_run(true);
         let mut ending = vec![SIGINT, SIGTERM];
         match on_hangup {
-            Hangup::Ends => ending.push(SIGHUP),
+            Hangup::Ends => ending.extend((!hangup_is_ignored()).then_some(SIGHUP)),
             Hangup::Reloads => {
                 let registered = signal_hook::flag::register(SIGHUP, Arc::clone(&signals.reload));
                 signals.registered.push(registered.map_err(Failure::because(Exit::Software))?);
