@@ -416,6 +416,8 @@ fn strangers_on_the_socket_are_answered_and_the_loop_goes_on() {
     assert!(answer(b"{\"do\":\"dance\"}\n").contains("unknown variant `dance`"));
     assert!(answer(b"{\"do\":\"pupil\",\"cm\":0.3}\n").contains("cm"));
     assert!(answer(b"{\"do\":\"pupil\",\"mm\":300}\n").contains("expected a human pupil"));
+    assert!(answer(b"{\"do\":\"scene\",\"scene\":\"colour.png\"}\n").contains("expected an absolute path"));
+    assert!(answer(b"{\"do\":\"scene\",\"scene\":\"/a.png,b.png\"}\n").contains("expected an absolute path"));
     assert!(answer(b"\xff\xfe\n").contains("not understood"));
     assert!(answer(&[b'x'; 70_000]).contains("at most 65536 bytes"));
     // As many as may be connected, and more, say nothing.

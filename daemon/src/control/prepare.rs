@@ -1,5 +1,6 @@
 //! From a request to an order: files are read and engines opened here, while the loop goes on.
 
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use holod_calibration::rig::{Rig, WeightsChoice};
@@ -99,8 +100,9 @@ impl Preparer {
     }
 
     fn scene(&self, scene: &str, depth_encoding: Option<&String>, fit: Fit) -> Result<Order, String> {
-        if !scene.starts_with('/') {
-            return Err(format!("scene \"{scene}\" was found, expected an absolute path, or feed"));
+        let is_absolute = Path::new(scene).exists() || scene.split(',').all(|part| part.starts_with('/'));
+        if !scene.starts_with('/') || !is_absolute {
+            return Err(format!("scene \"{scene}\" was found, expected an absolute path, two with a comma, or feed"));
         }
         let named = SceneArgs {
             scene: Some(scene.to_owned()),
