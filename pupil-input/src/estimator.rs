@@ -188,6 +188,27 @@ impl EstimateSnapshot {
         }
     }
 
+    /// Goes on with other settings from `t` on, from what is shown then; those before are handed back.
+    fn change(&mut self, settings: EstimatorSettings, t: TimeNs) -> EstimatorSettings {
+        let shown = self.shown_at(t);
+        let before = std::mem::replace(&mut self.settings, settings);
+        let t_believed = match (shown.state, self.motion) {
+            (PupilState::Tracking, _) => return before,
+            (PupilState::Holding, Some(motion)) => motion.t.max(t - settings.hold),
+            // What is not held any more is not held again.
+            _ => t - settings.hold - TimeNs(1),
+        };
+        self.motion = Some(Motion {
+            t: t_believed,
+            diameter_mm: shown.diameter_mm,
+            velocity_mm_per_s: 0.0,
+            velocity_lasts: settings.filter.velocity_lasts,
+        });
+        self.blend = Blend { t, excess_mm: 0.0 };
+        self.lost = true;
+        before
+    }
+
     pub(crate) const fn set_clock(&mut self, clock: StreamClock) {
         self.clock = clock;
     }
@@ -291,10 +312,11 @@ impl Estimator {
         }
     }
 
-    /// Goes on with other settings. Where they make something else of the samples, the eyes are learnt anew: what is
-    /// shown is held until one is believed again, and slides there. Another hold time or fallback is in force at once.
-    pub fn change(&mut self, settings: EstimatorSettings, on_decision: impl FnMut(Decision)) {
-        let before = std::mem::replace(&mut self.snapshot.settings, settings);
+    /// Goes on with other settings from `t` on; what is shown does not jump. Where they make something else of the samples,
+    /// the eyes are learnt anew: what is shown is held until one is believed again, and slides there. The slide to another
+    /// fallback begins from what is shown.
+    pub fn change(&mut self, settings: EstimatorSettings, t: TimeNs, on_decision: impl FnMut(Decision)) {
+        let before = self.snapshot.change(settings, t);
         let EstimatorSettings { fallback, hold, fallback_mm_per_s, return_mm_per_s, silence, .. } = settings;
         if settings == (EstimatorSettings { fallback, hold, fallback_mm_per_s, return_mm_per_s, silence, ..before }) {
             return;

@@ -86,10 +86,13 @@ impl RefusalWatch {
         }
     }
 
-    /// The tracker goes on with other settings: what was refused before says nothing of them.
-    pub fn change(&mut self, settings: &rig::Tracker) {
+    /// The tracker goes on with other settings, at these counts: what was refused before says nothing of them.
+    pub fn change(&mut self, settings: &rig::Tracker, counts: &CounterSnapshot) {
         (self.scale, self.eye) = (settings.scale.unwrap_or(1.0), settings.eye);
         self.samples.clear();
+        self.believed = Some(*counts);
+        self.refused_since = None;
+        self.current = None;
     }
 
     /// Takes note of a decision.
@@ -206,7 +209,7 @@ impl RefusalWatch {
                 });
                 format!(
                     "its samples are of the {eye} eye, and the rig follows the {}: set tracker.eye = \"{eye}\"",
-                    eye_name(self.eye)
+                    self.eye.name()
                 )
             }
             Rejection::Backwards | Rejection::Repeated | Rejection::Guard | Rejection::Slew | Rejection::OutOfReach => {
@@ -309,16 +312,6 @@ impl Cause {
     }
 }
 
-/// As the rig file has it.
-const fn eye_name(eye: rig::Eye) -> &'static str {
-    match eye {
-        rig::Eye::Left => "left",
-        rig::Eye::Right => "right",
-        rig::Eye::Both => "both",
-        rig::Eye::Better => "better",
-    }
-}
-
 fn wire_advice(fault: WireFault) -> String {
     match fault {
         WireFault::BadChecksum => "no message has the checksum that its profile expects: compare how the sender computes it \
@@ -415,6 +408,32 @@ mod tests {
         let [(t, RefusalChange::Refused(refusal))] = &told[..] else { panic!("told once: {told:?}") };
         assert!(*t <= TimeNs(2_000 * MS), "{t:?}");
         refusal.to_string()
+    }
+
+    #[test]
+    fn other_settings_are_judged_anew() {
+        let counters = Counters::new();
+        let of_scale = |scale| rig::Tracker { scale: Some(scale), ..settings() };
+        let mut watch = RefusalWatch::new(&of_scale(100.0), TimeNs(0));
+        let mut said = Vec::new();
+        for k in 0..80_i64 {
+            let scale = if k < 40 { 100.0 } else { 50.0 };
+            if k == 40 {
+                watch.change(&of_scale(scale), &counters.snapshot());
+                assert_eq!(watch.current(), None);
+            }
+            counters.add_rejected(Rejection::OutOfRange);
+            let sample = PupilSample { diameter_mm: 3.5 * scale as f32, ..sample(k) };
+            watch.note(&Decision { sample, verdict: Verdict::Rejected(Rejection::OutOfRange) });
+            if let Some(RefusalChange::Refused(refusal)) =
+                watch.judge(TimeNs(k * 100 * MS), &counters.snapshot(), false)
+            {
+                said.push(refusal.to_string());
+            }
+        }
+        let [before, after] = &said[..] else { panic!("each is told once: {said:?}") };
+        assert!(before.contains("scale_mm_per_unit = 100 makes 350 mm"), "{before}");
+        assert!(after.contains("scale_mm_per_unit = 50 makes 175 mm"), "{after}");
     }
 
     #[test]

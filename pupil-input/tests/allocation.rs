@@ -28,7 +28,7 @@ fn the_simulated_eye_its_clock_and_the_choice_of_an_eye_allocate_nothing() {
             let t_sample = clock.map(mock.sample.t_device, mock.sample.t_arrival);
             estimator.push(PupilSample { t_sample, ..mock.sample }, |_| {});
         }
-        estimator.change(other, |_| {});
+        estimator.change(other, TimeNs(0), |_| {});
     });
     assert_eq!(allocations, 0);
     assert!(clock.resets() > 3);

@@ -122,7 +122,7 @@ def test_lasers_that_are_kept_dark_are_seen_dark(page: Holod, browser: webdriver
 def test_orders_and_troubles_are_in_the_log(page: Holod, browser: webdriver.Chrome) -> None:
     page.ctl("pause")
     wait_for("the state says so", lambda: text(browser, "state") == "running, paused")
-    wait_for("the log has it", lambda: 'asked by holod ctl: {"do":"pause"}' in text(browser, "log"))
+    wait_for("the log has it", lambda: 'asked for: {"do":"pause"}' in text(browser, "log"))
     assert "Scene the built-in scene" in text(browser, "facts").replace("\n", " ")
     assert "samples" in text(browser, "counters")
 

@@ -200,7 +200,7 @@ impl Watch<'_> {
         if let Some(warning) = self.tracker.change(&settings).map_err(|error| error.to_string())? {
             tracing::warn!("{warning}");
         }
-        self.tracker_watch.change(&settings);
+        self.tracker_watch.change(&settings, &self.tracker);
         self.rig.tracker = settings;
         Ok(())
     }

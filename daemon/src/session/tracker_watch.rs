@@ -18,8 +18,8 @@ impl TrackerWatch {
     }
 
     /// The tracker goes on with other settings.
-    pub(super) fn change(&mut self, settings: &rig::Tracker) {
-        self.refusals.change(settings);
+    pub(super) fn change(&mut self, settings: &rig::Tracker, tracker: &TrackerControl) {
+        self.refusals.change(settings, &tracker.counters());
     }
 
     /// The gate decided on a sample.

@@ -119,6 +119,9 @@ const TAP_DECISIONS: usize = 1 << 16;
 /// Reasons why a link does not come back, on their way to the control thread.
 const TROUBLES: usize = 16;
 
+/// Changes of settings on their way to the thread, which looks for them several times a second while it waits for bytes.
+const CHANGES: usize = 16;
+
 /// What a tracker is started with beside its spec and the rig's settings.
 #[derive(Clone, Debug, Default)]
 pub struct TrackerOptions {
@@ -145,7 +148,7 @@ pub enum ChangeError {
     )]
     NoScale(&'static str),
     /// Nobody reads samples any more.
-    #[error("the tracker's log has been played to its end")]
+    #[error("the tracker's log has been played to its end, or the tracker was stopped: nothing follows it any more")]
     Finished,
     /// The thread has not come to the last change.
     #[error("the tracker's thread has not taken the last change yet: ask again")]
@@ -192,7 +195,7 @@ impl Tracker {
         let (input, output) = triple_buffer::triple_buffer(&EstimateSnapshot::new(settings));
         let (producer, consumer) = rtrb::RingBuffer::new(TAP_DECISIONS);
         let (troubles, untold) = rtrb::RingBuffer::new(TROUBLES);
-        let (changes, change_consumer) = rtrb::RingBuffer::new(1);
+        let (changes, change_consumer) = rtrb::RingBuffer::new(CHANGES);
         let unit = job.unit();
         let shared = Arc::new(Shared {
             counters: Counters::new(),

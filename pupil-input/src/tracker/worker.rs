@@ -306,8 +306,9 @@ impl Worker {
 
     /// Takes a change of settings; false if the tracker is to stop.
     fn goes_on(&mut self) -> bool {
-        if let Ok(settings) = self.changes.pop() {
-            self.note_decisions(|estimator, tap| estimator.change(settings, |decision| tap.note(decision)));
+        while let Ok(settings) = self.changes.pop() {
+            let t = self.clock.to_stream(host_now());
+            self.note_decisions(|estimator, tap| estimator.change(settings, t, |decision| tap.note(decision)));
             self.publish();
         }
         !self.shared.stop.load(Ordering::Acquire)

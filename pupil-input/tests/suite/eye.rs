@@ -239,7 +239,7 @@ fn another_eye_by_order_is_slid_to_and_every_sample_is_decided_upon() {
     let (mut shown, mut pushed, mut decided) = (Vec::new(), 0, 0);
     for t_ms in (0..4000).step_by(5) {
         if t_ms == 2000 {
-            estimator.change(settings(rig::Eye::Right), |_| decided += 1);
+            estimator.change(settings(rig::Eye::Right), TimeNs(t_ms * 1_000_000), |_| decided += 1);
         }
         for (eye, diameter_mm) in [(SampleEye::Left, 4.0), (SampleEye::Right, 3.4)] {
             estimator.push(sample(t_ms, eye, diameter_mm), |_| decided += 1);
@@ -257,16 +257,42 @@ fn another_eye_by_order_is_slid_to_and_every_sample_is_decided_upon() {
     assert!(fastest < 5.5, "{fastest} mm/s");
 }
 
-#[test]
-fn another_hold_time_or_fallback_does_not_disturb_what_is_followed() {
+/// What is shown from a change of hold time and fallback on, in steps of 5 ms: of an eye of 3.5 mm that was there from 0
+/// to 2 s where `believed` says so, with the fallback at 3 mm and held for 1 s before, at 5 mm and for `hold_ms` after.
+fn shown_after_a_change(believed: bool, t_change_ms: i64, hold_ms: i64) -> Vec<(f32, PupilState)> {
     let before = settings(rig::Eye::Both);
-    let after = EstimatorSettings { hold: TimeNs(100_000_000), fallback: PupilDiameter::from_mm(5.0), ..before };
+    let (hold, fallback) = (TimeNs(hold_ms * 1_000_000), PupilDiameter::from_mm(5.0));
     let mut estimator = Estimator::new(before);
-    push_all(&mut estimator, SampleEye::Left, 0, &[3.5; 400]);
-    let followed = at(&estimator, 2000);
-    estimator.change(after, |decision| panic!("nothing is decided anew: {decision:?}"));
-    assert_eq!(at(&estimator, 2000), followed);
-    assert_eq!(at(&estimator, 9000), (5.0, PupilState::Fallback));
+    if believed {
+        push_all(&mut estimator, SampleEye::Left, 0, &[3.5; 400]);
+    }
+    let mut shown = vec![at(&estimator, t_change_ms - 5)];
+    let t = TimeNs(t_change_ms * 1_000_000);
+    estimator.change(EstimatorSettings { hold, fallback, ..before }, t, |decision| {
+        panic!("nothing is decided anew: {decision:?}")
+    });
+    shown.extend((t_change_ms..t_change_ms + 15_000).step_by(5).map(|t_ms| at(&estimator, t_ms)));
+    let fastest = shown.windows(2).map(|pair| (pair[1].0 - pair[0].0).abs() / 5e-3).fold(0.0, f32::max);
+    assert!(fastest < 5.5, "{fastest} mm/s after {t_change_ms} ms with {hold_ms} ms");
+    assert_eq!(shown.last(), Some(&(5.0, PupilState::Fallback)));
+    shown
+}
+
+#[test]
+fn another_hold_time_or_fallback_slides_from_what_is_shown() {
+    // While the eye is followed, nothing is seen of it.
+    let shown = shown_after_a_change(true, 2000, 100);
+    assert!(shown[..10].iter().all(|shown| (shown.0 - 3.5).abs() < 0.01));
+    // Held for 0.5 s, and for longer now, or not any more.
+    let shown = shown_after_a_change(true, 2500, 4000);
+    assert!(shown[..600].iter().all(|shown| (shown.0 - 3.5).abs() < 0.01 && shown.1 == PupilState::Holding));
+    let shown = shown_after_a_change(true, 2500, 100);
+    assert!(shown[1..].iter().skip(1).all(|shown| shown.1 == PupilState::Fallback));
+    // What is at the fallback, or on the way to it, is not held again.
+    for (believed, t_change_ms) in [(true, 3100), (true, 8000), (false, 1000)] {
+        let shown = shown_after_a_change(believed, t_change_ms, 10_000);
+        assert!(shown.iter().all(|shown| shown.1 == PupilState::Fallback), "{t_change_ms}");
+    }
 }
 
 #[test]
