@@ -1,9 +1,12 @@
-//! What the log on standard error says, by `HOLOD_LOG`, and its newest lines for the status page.
+//! What the log on standard error says, by `HOLOD_LOG`; its newest lines for the status page, and a file of it.
 
 use std::collections::VecDeque;
 use std::fmt::{self, Write};
+use std::fs::File;
+use std::io::{self, Write as _};
+use std::path::Path;
 use std::sync::{Mutex, PoisonError};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::Serialize;
 use tracing::field::{Field, Visit};
@@ -66,16 +69,21 @@ static RECENT: Mutex<Kept> = Mutex::new(Kept { lines: VecDeque::new(), ever: 0 }
 impl<S: Subscriber> Layer<S> for KeepRecent {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
         let level = *event.metadata().level();
+        let text = text_of(event);
+        let unix_ms = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64);
+        let line = Line { unix_ms, level: level.as_str(), text };
+        if let Some(file) = &mut *FILE.lock().unwrap_or_else(PoisonError::into_inner) {
+            // A disk that refuses is told of by whoever records.
+            let _ = write_line(file, &line);
+        }
         if level > Level::INFO {
             return;
         }
-        let text = text_of(event);
-        let unix_ms = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64);
         let mut kept = RECENT.lock().unwrap_or_else(PoisonError::into_inner);
         if kept.lines.len() == KEPT {
             kept.lines.pop_front();
         }
-        kept.lines.push_back(Line { unix_ms, level: level.as_str(), text });
+        kept.lines.push_back(line);
         kept.ever += 1;
     }
 }
@@ -85,6 +93,45 @@ pub fn text_of(event: &Event<'_>) -> String {
     let mut text = Text(String::new());
     event.record(&mut text);
     text.0
+}
+
+/// The file that takes every line that the filter lets through.
+static FILE: Mutex<Option<File>> = Mutex::new(None);
+
+/// The log goes into a file for as long as this lives.
+#[derive(Debug)]
+pub struct LogFile(());
+
+impl LogFile {
+    /// Begins a file with the lines that are kept already.
+    ///
+    /// # Errors
+    /// The file cannot be created.
+    pub fn begin(path: &Path) -> io::Result<Self> {
+        let mut place = FILE.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut file = File::create(path)?;
+        for line in recent_since(&mut 0) {
+            write_line(&mut file, &line)?;
+        }
+        *place = Some(file);
+        Ok(Self(()))
+    }
+
+    /// Nothing goes into it any more.
+    pub fn end(&mut self) {
+        *FILE.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+}
+
+impl Drop for LogFile {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+fn write_line(file: &mut File, line: &Line) -> io::Result<()> {
+    let at = UNIX_EPOCH + Duration::from_millis(line.unix_ms);
+    writeln!(file, "{} {:5} {}", humantime::format_rfc3339_millis(at), line.level, line.text)
 }
 
 struct Text(String);

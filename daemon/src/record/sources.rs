@@ -1,0 +1,232 @@
+//! What a run was made of: the files of its bench and its scenes, so that its frames can be made again.
+
+use std::fs::{self, File};
+use std::hash::Hasher;
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+
+use holod_calibration::rig::{Rig, WeightsChoice};
+use holod_calibration::{Colour, DisplayGeometry};
+use holod_model::scene::{DepthEncoding, Fit, Scene};
+use serde::{Deserialize, Serialize};
+use toml_edit::{DocumentMut, value};
+use twox_hash::XxHash3_64;
+
+use crate::cli::SceneArgs;
+use crate::failure::{Exit, Failure};
+
+/// The folder in a record with the rig and the files that it names.
+pub const BENCH: &str = "bench";
+/// The rig in it.
+pub const RIG: &str = "rig.toml";
+/// The file that says what a scene is made of, in its folder.
+pub const SCENE: &str = "scene.toml";
+
+/// A file as it was when a run read it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SourceFile {
+    /// Where it was.
+    pub path: PathBuf,
+    /// What it is called in a report.
+    pub name: String,
+    /// Its length.
+    pub bytes: u64,
+    /// XXH3 of 64 bits of its content, hexadecimal.
+    pub xxh3: String,
+}
+
+impl SourceFile {
+    /// The file at `path`, read to its end.
+    ///
+    /// # Errors
+    /// It cannot be read.
+    pub fn of(path: &Path, name: String) -> io::Result<Self> {
+        let path = std::path::absolute(path)?;
+        let (bytes, xxh3) = content_xxh3(&mut File::open(&path)?)?;
+        Ok(Self { path, name, bytes, xxh3 })
+    }
+}
+
+/// Length and hash of all that `reader` brings.
+///
+/// # Errors
+/// The reader's.
+pub fn content_xxh3(reader: &mut impl Read) -> io::Result<(u64, String)> {
+    let mut hasher = XxHash3_64::new();
+    let mut buffer = vec![0; 1 << 18];
+    let mut bytes = 0;
+    loop {
+        match reader.read(&mut buffer) {
+            Ok(0) => return Ok((bytes, hash_text(hasher.finish()))),
+            Ok(count) => {
+                hasher.write(&buffer[..count]);
+                bytes += count as u64;
+            }
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
+        }
+    }
+}
+
+/// A hash as records write it.
+pub fn hash_text(hash: u64) -> String {
+    format!("{hash:016x}")
+}
+
+/// What a run shows.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+pub enum SceneSource {
+    /// The built-in scene.
+    BuiltIn,
+    /// Pictures of a live feed, which are not kept.
+    Feed,
+    /// Files.
+    Files {
+        /// How its pictures were brought to the hologram's size.
+        fit: Fit,
+        /// A `scene.toml` for them, with the names that they have in a report.
+        description: String,
+        /// The pictures.
+        files: Vec<SourceFile>,
+    },
+}
+
+impl SceneSource {
+    /// The scene that `args` name.
+    ///
+    /// # Errors
+    /// Its files cannot be read.
+    pub fn of(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Self, Failure> {
+        let Some(spec) = &args.scene else { return Ok(Self::BuiltIn) };
+        if crate::source::is_feed(spec) {
+            return Ok(Self::Feed);
+        }
+        let encoding = args.depth_encoding.as_deref().map(|text| DepthEncoding::parse(text, geometry)).transpose();
+        let encoding = encoding.map_err(Failure::because(Exit::Usage))?;
+        let scene = Scene::open(spec, encoding).map_err(Failure::because(Exit::NoInput))?;
+        let text = scene.file().map(fs::read_to_string).transpose().map_err(Failure::because(Exit::NoInput))?;
+        let mut document: DocumentMut = text.unwrap_or_default().parse().map_err(Failure::because(Exit::Data))?;
+        if scene.file().is_none() {
+            describe_encoding(&mut document, encoding);
+        }
+        let pictures: Vec<_> = (0..scene.frames()).map(|index| scene.pictures(index)).collect();
+        let has_depth_files = pictures.iter().any(|[colour, depth]| colour != depth);
+        let mut named = name_pictures(&mut document, "colour", pictures.iter().map(|[colour, _]| colour.clone()));
+        match has_depth_files {
+            true => {
+                named.extend(name_pictures(&mut document, "depth", pictures.iter().map(|[_, depth]| depth.clone())));
+            }
+            false => drop(document.remove("depth")),
+        }
+        for key in ["first", "step", "count"] {
+            document.remove(key);
+        }
+        if scene.frames() > 1 {
+            document["count"] = value(scene.frames() as i64);
+        }
+        let read = |(path, name): (PathBuf, String)| {
+            let shown = path.display().to_string();
+            SourceFile::of(&path, name).map_err(|error| Failure::new(Exit::NoInput, format!("{shown}: {error}")))
+        };
+        let files = named.into_iter().map(read).collect::<Result<_, _>>()?;
+        Ok(Self::Files { fit: args.fit.into(), description: document.to_string(), files })
+    }
+}
+
+/// Writes the encoding that was named beside two files as a scene file has it.
+fn describe_encoding(document: &mut DocumentMut, encoding: Option<DepthEncoding>) {
+    let name = match encoding {
+        None => return,
+        Some(DepthEncoding::Metres) => "metres",
+        Some(DepthEncoding::Millimetres) => "millimetres",
+        Some(DepthEncoding::Dioptres) => "dioptres",
+        Some(DepthEncoding::NormalisedDioptres { far_dpt, near_dpt }) => {
+            document["far_dpt"] = value(far_dpt);
+            document["near_dpt"] = value(near_dpt);
+            "normalised_dioptres"
+        }
+    };
+    document["depth_encoding"] = value(name);
+}
+
+/// Writes the names under which one part of a scene's pictures goes into a report; each file with its name.
+fn name_pictures(
+    document: &mut DocumentMut,
+    key: &str,
+    paths: impl Iterator<Item = PathBuf>,
+) -> Vec<(PathBuf, String)> {
+    let mut paths: Vec<_> = paths.collect();
+    let ending = extension(&paths[0]);
+    paths.dedup();
+    if let [path] = &paths[..] {
+        let name = format!("{key}{ending}");
+        document[key] = value(&name);
+        return vec![(path.clone(), name)];
+    }
+    document[key] = value(format!("{key}-{{:06}}{ending}"));
+    paths.into_iter().enumerate().map(|(index, path)| (path, format!("{key}-{index:06}{ending}"))).collect()
+}
+
+/// The ending of a file's name with its dot, where it is a plain one.
+fn extension(path: &Path) -> String {
+    let extension = path.extension().and_then(|extension| extension.to_str()).unwrap_or_default();
+    let is_plain = (1..=8).contains(&extension.len()) && extension.bytes().all(|byte| byte.is_ascii_alphanumeric());
+    if is_plain { format!(".{extension}") } else { String::new() }
+}
+
+/// Copies the rig at `config` (the built-in one where there is none) and the files that it names into the folder
+/// [`BENCH`] of `folder`, with names that hold there. `rig` is the rig as it runs: with its weights.
+///
+/// # Errors
+/// A file cannot be read or written, or the rig file is another one than what runs.
+pub(super) fn keep_bench(folder: &Path, config: Option<&Path>, rig: &Rig) -> Result<(), Failure> {
+    let bench = folder.join(BENCH);
+    let cannot = |path: &Path, error: io::Error| {
+        Failure::new(Exit::CannotCreate, format!("cannot record {}: {error}", path.display()))
+    };
+    fs::create_dir_all(&bench).map_err(|error| cannot(&bench, error))?;
+    let keep = |path: &Path, name: String| {
+        fs::copy(path, bench.join(&name)).map_err(|error| cannot(path, error))?;
+        Ok::<_, Failure>(value(name))
+    };
+    let text = match config {
+        None => Rig::BUILT_IN_TOML.to_owned(),
+        Some(path) => fs::read_to_string(path).map_err(|error| cannot(path, error))?,
+    };
+    let mut document: DocumentMut = text.parse().map_err(Failure::because(Exit::Config))?;
+    for colour in Colour::ALL {
+        for (key, what, files) in [
+            ("lut_file", "lut", &rig.provenance.lut_files),
+            ("flatness_file", "flatness", &rig.provenance.flatness_files),
+        ] {
+            if let Some(path) = &files[colour] {
+                document["panel"][key][colour.name()] = keep(path, format!("{what}-{colour}{}", extension(path)))?;
+            }
+        }
+    }
+    let profile = document.get("lasers").and_then(|lasers| lasers.get("profile_file")).and_then(|file| file.as_str());
+    if let (Some(profile), Some(config)) = (profile, config) {
+        let path = config.parent().unwrap_or(Path::new("")).join(profile);
+        document["lasers"]["profile_file"] = keep(&path, "lasers.toml".into())?;
+    }
+    let named = WeightsChoice::BUILT_IN.into_iter().find(|(_, choice)| *choice == rig.model.weights);
+    let (key, other, named) = match (&rig.model.weights, named) {
+        (WeightsChoice::File(path), _) => ("weights_file", "network", keep(path, "weights.safetensors".into())?),
+        (_, Some((name, _))) => ("network", "weights_file", value(name)),
+        (_, None) => return Err(Failure::new(Exit::Software, "weights without a name")),
+    };
+    let model = document.entry("model").or_insert(toml_edit::table());
+    model[key] = named;
+    if let Some(model) = model.as_table_like_mut() {
+        model.remove(other);
+    }
+    let path = bench.join(RIG);
+    fs::write(&path, document.to_string()).map_err(|error| cannot(&path, error))?;
+    let kept = Rig::load(&path).map_err(Failure::because(Exit::Software))?;
+    if (&kept.panel, &kept.geometry) == (&rig.panel, &rig.geometry) {
+        return Ok(());
+    }
+    Err(Failure::new(Exit::Config, "the rig file was changed while holod started: start it again"))
+}
