@@ -20,6 +20,7 @@ use crate::logging::LogFile;
 use crate::machine::Machine;
 use crate::report;
 use crate::session::{Began, Observer};
+use crate::source;
 
 /// What a run was started with; `run.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -167,7 +168,12 @@ impl Recorder {
         let order = self.orders;
         let (geometry, resolution) = (self.geometry, self.resolution);
         let request = request.clone();
-        if !matches!(request, Request::Scene { .. } | Request::Weights { .. }) {
+        let reads_files = match &request {
+            Request::Scene { scene, .. } => !source::is_feed(scene),
+            Request::Weights { weights } => matches!(cli::parse_weights(weights), Ok(WeightsChoice::File(_))),
+            _ => false,
+        };
+        if !reads_files {
             return;
         }
         let before = self.reading.take();

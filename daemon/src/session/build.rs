@@ -160,6 +160,8 @@ pub(super) fn build(
         records_lost: Arc::clone(&records_lost),
         keep_levels: plan.keep_levels,
         hash_levels: plan.hash_levels,
+        submitted: 0,
+        shown: 0,
         limit: plan.frame_limit,
         engine: Arc::clone(&engine),
         stop: Arc::clone(&stop),

@@ -19,6 +19,10 @@ use crate::source::PictureTag;
 /// An order to stop is seen within this time.
 const LONGEST_SLEEP: Duration = Duration::from_millis(20);
 
+/// How often the panel is asked whether it has shown a frame, and after which time it is not waited for any more.
+const PANEL_POLL: Duration = Duration::from_micros(500);
+const LONGEST_WAIT: TimeNs = TimeNs(1_000_000_000);
+
 /// Everything that a frame needs, allocated before the first one.
 pub(super) struct FrameLoop {
     /// Where pupils and pictures come from.
@@ -47,6 +51,9 @@ pub(super) struct FrameLoop {
     pub keep_levels: bool,
     /// Whether all levels are told by their hash.
     pub hash_levels: bool,
+    /// The newest frame that the panel was handed, and the newest that it has shown.
+    pub submitted: u64,
+    pub shown: u64,
     /// Frames to make; without end where absent.
     pub limit: Option<u64>,
     /// How holograms are computed, for the status.
@@ -151,6 +158,9 @@ impl FrameLoop {
 
         let levels_xxh3 = self.hash_levels.then(|| levels_xxh3(self.port.acquire()));
         let keep = if self.keep_levels && is_hologram && pupil.is_meant() { keep_slot(pupil.pupil) } else { None };
+        if matches!(self.inputs, Inputs::Recorded(_)) {
+            self.wait_for_the_panel();
+        }
         let t_submit = host_now();
         let record = LoopRecord {
             frame: FrameRecord {
@@ -180,8 +190,23 @@ impl FrameLoop {
         }
         self.port.submit(&plan, keep, t_submit);
         self.pacer.mark(Point::Submit, plan.frame_id, t_submit);
-        self.port.feed(&mut self.pacer, |_| ());
+        self.submitted = plan.frame_id;
+        self.hear_the_panel();
         Ok(())
+    }
+
+    fn hear_the_panel(&mut self) {
+        let shown = &mut self.shown;
+        self.port.feed(&mut self.pacer, |report| *shown = (*shown).max(report.frame_id));
+    }
+
+    /// Lets the panel show the last frame before another one takes its place: of a record all are to be seen.
+    fn wait_for_the_panel(&mut self) {
+        let t_give_up = host_now() + LONGEST_WAIT;
+        while self.shown < self.submitted && host_now() < t_give_up && !self.stop.load(Ordering::Acquire) {
+            std::thread::sleep(PANEL_POLL);
+            self.hear_the_panel();
+        }
     }
 
     fn make_changes(&mut self) {
