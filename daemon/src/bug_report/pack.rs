@@ -8,7 +8,7 @@ use std::time::{Duration, UNIX_EPOCH};
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use holod_calibration::rig::Rig;
-use holod_pupil_input::RecordFiles;
+use holod_pupil_input::{RecordFiles, with_header};
 use serde::de::DeserializeOwned;
 use tar::{Builder, EntryType, Header};
 
@@ -41,7 +41,7 @@ struct Entry {
 
 #[derive(Debug)]
 enum Content {
-    Text(String),
+    Bytes(Vec<u8>),
     File(PathBuf),
 }
 
@@ -117,7 +117,7 @@ impl Contents {
         }
         for name in ["summary.json", LOG] {
             if let Some(text) = contents.text_of(folder, name)? {
-                contents.entries.push(Entry { name: name.into(), content: Content::Text(scrubber.text(&text)) });
+                contents.add_text(name, scrubber.text(&text));
             }
         }
         contents.add_shown_levels(folder, with_scene)?;
@@ -147,6 +147,10 @@ impl Contents {
         self.entries.push(Entry { name: name.to_owned(), content: Content::File(path.to_owned()) });
     }
 
+    fn add_text(&mut self, name: &str, text: String) {
+        self.entries.push(Entry { name: name.to_owned(), content: Content::Bytes(text.into_bytes()) });
+    }
+
     /// Adds text that a program reads: where a name in it is a word that the program needs, the name stays.
     fn add_checked(&mut self, name: &str, text: &str, scrubber: &Scrubber, reads: impl Fn(&str) -> bool) {
         let scrubbed = scrubber.text(text);
@@ -156,7 +160,7 @@ impl Contents {
             self.left_out.push(format!("no name in {name}: one of them is a word of its format; look at it"));
             scrubber.paths(text)
         };
-        self.entries.push(Entry { name: name.to_owned(), content: Content::Text(text) });
+        self.add_text(name, text);
     }
 
     fn add_json<T: DeserializeOwned>(&mut self, name: &str, text: &str, scrubber: &Scrubber) {
@@ -187,7 +191,7 @@ impl Contents {
                     self.add_checked(&packed, &text, scrubber, reads);
                 }
                 Ok(text) if name.ends_with(".toml") || name.ends_with(".csv") => {
-                    self.entries.push(Entry { name: packed, content: Content::Text(scrubber.text(&text)) });
+                    self.add_text(&packed, scrubber.text(&text));
                 }
                 _ => self.add_file(&packed, path),
             }
@@ -208,8 +212,7 @@ impl Contents {
             self.left_out.push(left);
             return;
         }
-        let entry = Entry { name: format!("{folder}/{SCENE}"), content: Content::Text(description.clone()) };
-        self.entries.push(entry);
+        self.add_text(&format!("{folder}/{SCENE}"), description.clone());
         for file in files {
             self.add_source(folder, file);
         }
@@ -238,14 +241,22 @@ impl Contents {
 
     /// The bytes that the tracker sent, with a header without names. Where a name is among the bytes, they stay out.
     fn add_tracker_bytes(&mut self, path: &Path, scrubber: &Scrubber) -> Result<(), Failure> {
-        let bytes =
-            fs::read(path).map_err(|error| Failure::new(Exit::NoInput, format!("{}: {error}", path.display())))?;
-        if scrubber.finds(&bytes) {
-            let left = "tracker.holodraw: a name of a user or of this machine is among the tracker's bytes; \
-                        samples.csv has the samples";
-            self.left_out.push(left.into());
-        } else {
-            self.add_file("tracker.holodraw", path);
+        let name = "tracker.holodraw";
+        let cannot = |error: io::Error| Failure::new(Exit::NoInput, format!("{}: {error}", path.display()));
+        let bytes = path.metadata().map_err(cannot)?.len();
+        if bytes > LARGEST_TEXT {
+            self.left_out.push(format!("{name}: {} are too many; samples.csv has the samples", size(bytes)));
+            return Ok(());
+        }
+        let recording = fs::read(path).map_err(cannot)?;
+        match with_header(&recording, |header| scrubber.text(header)) {
+            Some((changed, records)) if !scrubber.finds(&changed[records..]) => {
+                self.entries.push(Entry { name: name.into(), content: Content::Bytes(changed) });
+            }
+            Some(_) => self.left_out.push(format!(
+                "{name}: a name of a user or of this machine is among the tracker's bytes; samples.csv has the samples"
+            )),
+            None => self.left_out.push(format!("{name}: it broke off within its header")),
         }
         Ok(())
     }
@@ -274,9 +285,9 @@ impl Contents {
         let t_s = manifest.packed_unix_ms / 1000;
         for Entry { name, content } in self.entries {
             let packed = match content {
-                Content::Text(text) => {
-                    append(&mut archive, &name, t_s, text.len() as u64, text.as_bytes()).map_err(cannot)?;
-                    Packed::of(&name, text.as_bytes())
+                Content::Bytes(bytes) => {
+                    append(&mut archive, &name, t_s, bytes.len() as u64, &bytes[..]).map_err(cannot)?;
+                    Packed::of(&name, &bytes)
                 }
                 Content::File(path) => add_file(&mut archive, &name, t_s, &path)
                     .map_err(|error| Failure::new(Exit::NoInput, format!("{}: {error}", path.display())))?,
@@ -358,5 +369,50 @@ impl Manifest {
             lines.extend(self.left_out.iter().map(|left| format!("  {left}")));
         }
         format!("in it, below {FOLDER}/:\n{}", lines.join("\n"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_name_says_when_the_run_began_and_no_more() {
+        let contents = Contents { started_unix_ms: Some(1_795_491_696_989), ..Contents::default() };
+        assert_eq!(default_name(&contents), Path::new("holod-report-20261124-034136.tar.gz"));
+        assert!(default_name(&Contents::default()).to_str().unwrap().starts_with("holod-report-20"));
+    }
+
+    #[test]
+    fn a_folder_that_is_no_record_is_refused_and_an_old_one_is_packed() {
+        let folder = tempfile::tempdir().unwrap();
+        let scrubber = Scrubber::default();
+        let failure = Contents::of_record(folder.path(), true, &scrubber).unwrap_err();
+        assert_eq!(failure.exit, Exit::NoInput);
+        fs::write(folder.path().join(record::FRAMES), "frame,field\n").unwrap();
+        fs::write(folder.path().join(LOG), "in /home/anna/lab\n").unwrap();
+        let contents = Contents::of_record(folder.path(), true, &scrubber).unwrap();
+        let names: Vec<_> = contents.entries.iter().map(|entry| entry.name.as_str()).collect();
+        assert_eq!(names, ["frames.csv", "log.txt"]);
+        assert!(contents.left_out[0].contains("an earlier holod"), "{:?}", contents.left_out);
+
+        let path = folder.path().join("report.tar.gz");
+        let manifest = contents.write(&path, &scrubber).unwrap();
+        assert!(manifest.text().contains("left out:\n  run.json"), "{}", manifest.text());
+        let unpacked = super::super::unpack(&path).unwrap();
+        assert_eq!(unpacked.manifest, manifest);
+        assert_eq!(unpacked.text(LOG).unwrap().unwrap(), "in ~/lab\n");
+        assert_eq!(unpacked.text("orders.jsonl").unwrap(), None);
+    }
+
+    #[test]
+    fn a_name_that_is_a_word_of_the_format_stays_and_is_told() {
+        let scrubber = Scrubber::new([("native".to_owned(), "/home/native".to_owned())], []);
+        let mut contents = Contents::default();
+        let reads = |text: &str| text.contains("native");
+        contents.add_checked("a", "fit native in /home/native/x", &scrubber, reads);
+        assert!(contents.left_out[0].contains("no name in a"), "{:?}", contents.left_out);
+        let Content::Bytes(bytes) = &contents.entries[0].content else { panic!() };
+        assert_eq!(bytes, b"fit native in ~/x");
     }
 }

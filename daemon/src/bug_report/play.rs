@@ -10,6 +10,7 @@ use holod_calibration::{Colour, Resolution, TimeNs};
 use holod_model::RgbdFrame;
 use holod_slm_output::FieldEvent;
 use serde::Serialize;
+use serde_json::Value;
 
 use super::recorded::{self, Made, RecordedFrame};
 use super::{SCENE_FOLDER, Unpacked, order_folder};
@@ -21,7 +22,7 @@ use crate::record::{
     hash_text,
 };
 use crate::renderer;
-use crate::session::{Cue, Observer, Playback, pupil_state_named};
+use crate::session::{Cue, Observer, Playback};
 use crate::source::Pictures;
 use crate::source::scene::{self, Frames};
 
@@ -54,7 +55,7 @@ pub struct Played {
 /// The report lacks what every frame needs, or none of its frames can be made again.
 pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     let data = |what: String| Failure::new(Exit::Data, what);
-    let facts = fs::read_to_string(report.path(RUN)).map_err(|_| {
+    let facts = report.text(RUN)?.ok_or_else(|| {
         data(
             "the report holds no run: its frames cannot be shown again; `holod report DIR` packs a record of one"
                 .into(),
@@ -69,6 +70,12 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     }
     let [width, height] = facts.hologram;
     let resolution = Resolution { width, height };
+    let panel = rig.resolution();
+    if width.min(height) == 0 || width > panel.width || height > panel.height {
+        return Err(data(format!(
+            "{RUN}: found a hologram of {resolution}, expected one that fits on the panel of {panel}"
+        )));
+    }
     let backend = match backend {
         Backend::Auto if facts.engine.starts_with("cpu") => Backend::Cpu,
         asked => asked,
@@ -143,8 +150,8 @@ fn black(resolution: Resolution) -> Arc<Frames> {
 
 /// The orders of a record.
 struct Orders {
-    /// By their lines; nothing where this holod does not know what it was.
-    requests: Vec<(TimeNs, Option<Request>)>,
+    /// By their lines, as they were written down.
+    requests: Vec<Value>,
     sources: HashMap<u32, OrderSource>,
     /// The first that changed something that is not carried out again, and what is said of it.
     foreign: Option<(TimeNs, String)>,
@@ -152,22 +159,22 @@ struct Orders {
 
 impl Orders {
     fn read(report: &Unpacked) -> Result<Self, Failure> {
-        let lines = |name: &str| fs::read_to_string(report.path(name)).unwrap_or_default();
+        let lines = |name: &str| Ok::<_, Failure>(report.text(name)?.unwrap_or_default());
         let mut orders = Self { requests: Vec::new(), sources: HashMap::new(), foreign: None };
-        for (index, line) in lines(ORDERS).lines().enumerate() {
+        for (index, line) in lines(ORDERS)?.lines().enumerate() {
             let number = index + 1;
             let wrong = |what: String| Failure::new(Exit::Data, format!("{ORDERS} line {number}: {what}"));
-            let order: serde_json::Value = serde_json::from_str(line).map_err(|error| wrong(error.to_string()))?;
+            let mut order: Value = serde_json::from_str(line).map_err(|error| wrong(error.to_string()))?;
             let t = order["t_ns"].as_i64().ok_or_else(|| wrong("found no t_ns".into()))?;
-            let request = serde_json::from_value::<Request>(order["request"].clone()).ok();
-            if request.is_none() && orders.foreign.is_none() {
-                let what = order["request"]["do"].as_str().unwrap_or("something");
+            let request = order["request"].take();
+            if parsed(&request).is_err() && orders.foreign.is_none() {
+                let what = request["do"].as_str().unwrap_or("something");
                 let why = format!("order {number}, `{what}`, is not carried out again");
                 orders.foreign = Some((TimeNs(t), why));
             }
-            orders.requests.push((TimeNs(t), request));
+            orders.requests.push(request);
         }
-        for line in lines(ORDER_FILES).lines() {
+        for line in lines(ORDER_FILES)?.lines() {
             // A line that was cut off with the run is none.
             if let Ok(source) = serde_json::from_str::<OrderSource>(line) {
                 orders.sources.insert(source.order, source);
@@ -176,11 +183,27 @@ impl Orders {
         Ok(orders)
     }
 
-    fn request(&self, order: u32) -> Result<&Request, String> {
+    fn request(&self, order: u32) -> Result<&Value, String> {
         let request = (order as usize).checked_sub(1).and_then(|index| self.requests.get(index));
-        let request = request.and_then(|(_, request)| request.as_ref());
         request.ok_or_else(|| format!("order {order}, which brought what they show, is not in the report"))
     }
+
+    /// The built-in weights that an order brought, by name or because the rig file was read again.
+    fn built_in_weights(&self, order: u32) -> Result<&str, String> {
+        let request = self.request(order)?;
+        let named = [&request["weights"], &request["changed"]["model.network"]].into_iter().find_map(Value::as_str);
+        let is_built_in = |named: &&str| WeightsChoice::BUILT_IN.iter().any(|(name, _)| name == named);
+        named.filter(is_built_in).ok_or_else(|| format!("the weights of order {order} are not in the report"))
+    }
+}
+
+/// A request out of a record, which also tells what of the rig file it changed.
+fn parsed(request: &Value) -> Result<Request, String> {
+    let mut request = request.clone();
+    if let Some(request) = request.as_object_mut() {
+        request.remove("changed");
+    }
+    serde_json::from_value(request).map_err(|error| error.to_string())
 }
 
 /// What frames are made of, read when the first frame needs it.
@@ -211,7 +234,7 @@ impl Material<'_> {
         Ok(Cue {
             frame,
             pupil: made.pupil,
-            pupil_state: pupil_state_named(&made.pupil_state),
+            pupil_state: made.pupil_state,
             picture,
             number: made.picture,
             engine,
@@ -309,27 +332,21 @@ impl Material<'_> {
     }
 
     fn open_engine(&mut self, order: u32) -> Result<usize, String> {
-        let Request::Weights { weights } = self.orders.request(order)? else {
-            return Err(format!("order {order} brought no weights"));
-        };
-        let request = match self.orders.sources.get(&order).and_then(|source| source.weights.as_ref()) {
+        let weights = match self.orders.sources.get(&order).and_then(|source| source.weights.as_ref()) {
             Some(file) => {
                 let path = self.report.path(&order_folder(order)).join(&file.name);
                 let found = fs::File::open(&path).and_then(|mut file| content_xxh3(&mut file)).ok();
                 if found != Some((file.bytes, file.xxh3.clone())) {
                     return Err(format!("the weights of order {order} are not in the report"));
                 }
-                Request::Weights { weights: path.to_string_lossy().into_owned() }
+                path.to_string_lossy().into_owned()
             }
-            None if WeightsChoice::BUILT_IN.iter().any(|(name, _)| name == weights) => {
-                Request::Weights { weights: weights.clone() }
-            }
-            None => return Err(format!("the weights of order {order} are not in the report")),
+            None => self.orders.built_in_weights(order)?.to_owned(),
         };
         if self.engines.len() == MOST_ENGINES {
             return Err(format!("more than {MOST_ENGINES} changes of weights"));
         }
-        match self.carry_out(&request)? {
+        match self.carry_out(&Request::Weights { weights })? {
             Order::Engine(engine) => self.engines.push(engine),
             _ => return Err(format!("order {order} brought no weights")),
         }
@@ -343,8 +360,7 @@ impl Material<'_> {
         if let Some(place) = self.pattern_places.get(&order) {
             return place.clone();
         }
-        let request = self.orders.request(order)?.clone();
-        let place = match self.carry_out(&request) {
+        let place = match parsed(self.orders.request(order)?).and_then(|request| self.carry_out(&request)) {
             Ok(Order::Pattern(pattern)) => Ok(pattern.map(|pattern| {
                 self.patterns.push(pattern.levels);
                 self.patterns.len() - 1
@@ -531,12 +547,165 @@ impl Outcome {
             first(&self.first_fields_different)
         ));
         let [[holod, engine], [holod_now, engine_now]] = [&self.made_by, &self.made_again_by];
-        if (holod, engine) != (holod_now, engine_now) {
+        // Why it is not a GPU may follow.
+        let same_engine = engine.starts_with(engine_now.as_str()) || engine_now.starts_with(engine.as_str());
+        if holod != holod_now || !same_engine {
+            let hint = if self.differs() { ": another version or engine may round in another way" } else { "" };
             text.push_str(&format!(
-                "\n          made by holod {holod}, {engine}; made again by holod {holod_now}, {engine_now}: another version \
-                 or engine may round in another way"
+                "\n          made by holod {holod}, {engine}; made again by holod {holod_now}, {engine_now}{hint}"
             ));
         }
         text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use holod_calibration::PupilDiameter;
+    use holod_slm_output::Provenance;
+
+    use super::*;
+    use crate::record::FrameOrders;
+    use crate::source::PictureTag;
+
+    const COLOURS: [(u8, Colour); 3] = [(0, Colour::Green), (1, Colour::Red), (2, Colour::Blue)];
+
+    fn made(levels_xxh3: u64) -> Made {
+        Made {
+            pupil: PupilDiameter::from_mm(3.0),
+            pupil_state: "tracking",
+            t_wake: TimeNs(1),
+            picture: 0,
+            is_live: false,
+            orders: FrameOrders::default(),
+            levels_xxh3,
+        }
+    }
+
+    fn comparison() -> Comparison {
+        let frame = |frame| RecordedFrame { frame, made: Some(made(100 + frame)), fields: COLOURS.to_vec() };
+        let frames: Vec<_> = [2, 3, 5].map(frame).into();
+        let cue = |recorded: &RecordedFrame| Cue {
+            frame: recorded.frame,
+            pupil: PupilDiameter::from_mm(3.0),
+            pupil_state: "tracking",
+            picture: 0,
+            number: 0,
+            engine: 0,
+            pattern: None,
+            orders: FrameOrders::default(),
+        };
+        let cues: Vec<_> = frames.iter().map(cue).collect();
+        let facts = RunFacts {
+            holod: env!("HOLOD_VERSION").into(),
+            started_unix_ms: 0,
+            t_origin_ns: 0,
+            scene: SceneSource::BuiltIn,
+            hologram: [64, 64],
+            tracker: String::new(),
+            scale_mm_per_unit: None,
+            panel: String::new(),
+            engine: "cpu, 2 threads, as there is no GPU".into(),
+            machine: crate::machine::Machine::default(),
+        };
+        Comparison::new(frames, &cues, BTreeMap::from([("a reason".to_owned(), 4)]), &facts)
+    }
+
+    fn record(frame: u64, levels_xxh3: Option<u64>) -> FrameRecord {
+        let t = TimeNs(0);
+        FrameRecord {
+            frame,
+            t_sample: None,
+            pupil_raw_mm: None,
+            pupil: PupilDiameter::from_mm(3.0),
+            pupil_state: "tracking",
+            t_wake: t,
+            t_render_begin: t,
+            t_render_end: t,
+            t_submit: t,
+            t_desired_present: t,
+            picture: PictureTag::default(),
+            keep: None,
+            amplitude_constant: 1.0,
+            orders: FrameOrders::default(),
+            levels_xxh3,
+        }
+    }
+
+    fn field(frame_id: u64, (field, colour): (u8, Colour)) -> FieldEvent {
+        FieldEvent {
+            frame_id,
+            field: field.into(),
+            colour,
+            t_submit: TimeNs(0),
+            t_desired_present: TimeNs(0),
+            t_present: TimeNs(1),
+            t_settled: TimeNs(2),
+            t_end: TimeNs(3),
+            provenance: Provenance::Software,
+            laser_on: None,
+            laser_off: None,
+            dark: None,
+            repeated: false,
+            deadline_missed: false,
+        }
+    }
+
+    fn outcome(frames: &[(u64, Option<u64>)], fields: &[(u64, (u8, Colour))]) -> Outcome {
+        let mut comparison = comparison();
+        for (frame, hash) in frames {
+            comparison.frame(&record(*frame, *hash)).unwrap();
+        }
+        for (frame, shown) in fields {
+            comparison.field(&field(*frame, *shown)).unwrap();
+        }
+        comparison.finish("cpu, 2 threads")
+    }
+
+    #[test]
+    fn frames_that_are_the_same_are_counted_and_no_others() {
+        let fields: Vec<_> = [2, 3].into_iter().flat_map(|frame| COLOURS.map(|shown| (frame, shown))).collect();
+        let same = outcome(&[(2, Some(102)), (3, Some(103))], &fields);
+        assert_eq!((same.frames_same, same.frames_different, same.frames_not_reached), (2, 0, 1));
+        assert_eq!((same.fields_same, same.fields_different, same.differs()), (2, 0, false));
+        assert!(!same.text().contains("made again by"), "why it is no GPU makes no other engine: {}", same.text());
+        assert!(same.text().contains("4 not shown again: a reason"));
+
+        let one = outcome(&[(2, Some(102)), (3, Some(104)), (9, Some(1))], &[]);
+        assert_eq!((one.frames_same, one.frames_different, one.first_different), (1, 1, vec![3]));
+        let unknown = outcome(&[(2, None)], &[]);
+        assert_eq!((unknown.frames_same, unknown.frames_different), (0, 0));
+    }
+
+    #[test]
+    fn fields_in_another_order_or_colour_are_found() {
+        let [green, red, blue] = COLOURS;
+        let differs = |fields: [(u8, Colour); 3]| outcome(&[], &fields.map(|shown| (5, shown))).first_fields_different;
+        assert_eq!(differs([green, red, blue]), [0_u64; 0]);
+        assert_eq!(differs([green, blue, red]), [5]);
+        assert_eq!(differs([green, red, (2, Colour::Red)]), [5]);
+        let cut_off = outcome(&[], &[(5, green), (5, red)]);
+        assert_eq!((cut_off.fields_same, cut_off.fields_different), (1, 0));
+    }
+
+    #[test]
+    fn orders_say_which_weights_they_brought() {
+        let order = |text: &str| serde_json::from_str::<Value>(text).unwrap();
+        let orders = Orders {
+            requests: vec![
+                order(r#"{"do":"weights","weights":"small"}"#),
+                order(r#"{"do":"reload","changed":{"tracker.eye":"left","model.network":"fast"}}"#),
+                order(r#"{"do":"reload","changed":{"model.network":"mine.safetensors"}}"#),
+                order(r#"{"do":"weights","weights":"/home/x/mine.safetensors"}"#),
+            ],
+            sources: HashMap::new(),
+            foreign: None,
+        };
+        assert_eq!([1, 2].map(|number| orders.built_in_weights(number)), [Ok("small"), Ok("fast")]);
+        for number in [0, 3, 4, 5] {
+            assert!(orders.built_in_weights(number).unwrap_err().contains("not in the report"), "{number}");
+        }
+        assert_eq!(parsed(&orders.requests[0]), Ok(Request::Weights { weights: "small".into() }));
+        assert!(parsed(&orders.requests[1]).is_ok() && parsed(&order(r#"{"do":"dance"}"#)).is_err());
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::fs::File;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 use std::str::FromStr;
 
@@ -10,6 +10,10 @@ use holod_calibration::{Colour, PupilDiameter, TimeNs};
 
 use crate::failure::{Exit, Failure};
 use crate::record::FrameOrders;
+use crate::session::pupil_state_named;
+
+/// Longer than any row.
+const LONGEST_ROW: u64 = 4096;
 
 /// A frame of a record.
 #[derive(Clone, Debug, PartialEq)]
@@ -25,7 +29,7 @@ pub(super) struct RecordedFrame {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Made {
     pub(super) pupil: PupilDiameter,
-    pub(super) pupil_state: String,
+    pub(super) pupil_state: &'static str,
     pub(super) t_wake: TimeNs,
     pub(super) picture: u64,
     /// Its picture came from a live feed.
@@ -44,7 +48,7 @@ pub(super) fn read(path: &Path) -> Result<Vec<RecordedFrame>, Failure> {
     let mut text = String::new();
     let mut next = |text: &mut String| {
         text.clear();
-        lines.read_line(text).map_err(Failure::because(Exit::Data))
+        (&mut lines).take(LONGEST_ROW).read_line(text).map_err(Failure::because(Exit::Data))
     };
     next(&mut text)?;
     let columns: HashMap<String, usize> =
@@ -53,6 +57,9 @@ pub(super) fn read(path: &Path) -> Result<Vec<RecordedFrame>, Failure> {
     let mut number = 1;
     while next(&mut text)? > 0 {
         number += 1;
+        if text.len() as u64 == LONGEST_ROW {
+            return Err(wrong(number, "found a row without an end"));
+        }
         // A run that broke off may have left half a row.
         let Some(row) = text.strip_suffix('\n') else { break };
         let row = Row { columns: &columns, cells: row.split(',').collect() };
@@ -95,7 +102,7 @@ impl Row<'_> {
         let levels_xxh3 = u64::from_str_radix(hash, 16).map_err(|_| format!("levels_xxh3 is `{hash}`"))?;
         Ok(Some(Made {
             pupil: PupilDiameter::from_mm(pupil_mm),
-            pupil_state: self.text("pupil_state")?.to_owned(),
+            pupil_state: pupil_state_named(self.text("pupil_state")?),
             t_wake: TimeNs(t_wake_ns),
             picture: self.needed("picture")?,
             is_live: !self.text("t_picture_ns")?.is_empty(),

@@ -23,6 +23,9 @@ const NOBODYS: [&str; 12] = [
 ];
 /// Shorter names are left: they would be found everywhere.
 const SHORTEST_NAME: usize = 3;
+/// How much is searched at once, and how much more where the next begins: longer than any name.
+const WINDOW_BYTES: usize = 1 << 20;
+const OVERLAP_BYTES: usize = 1 << 12;
 /// The first number of people's accounts, and the last one.
 const PEOPLE: std::ops::RangeInclusive<u32> = 1000..=60_000;
 
@@ -50,7 +53,10 @@ impl Scrubber {
     }
 
     /// For users with their home directories, and names of the machine.
-    fn new(users: impl IntoIterator<Item = (String, String)>, hosts: impl IntoIterator<Item = String>) -> Self {
+    pub(super) fn new(
+        users: impl IntoIterator<Item = (String, String)>,
+        hosts: impl IntoIterator<Item = String>,
+    ) -> Self {
         let (users, homes): (BTreeSet<String>, BTreeSet<String>) = users.into_iter().unzip();
         let is_ones_own = |home: &String| home.starts_with('/') && Path::new(home).components().count() > 2;
         let mut homes: Vec<_> = homes.into_iter().filter(|home| is_ones_own(home) || home == "/root").collect();
@@ -91,8 +97,12 @@ impl Scrubber {
 
     /// Whether bytes hold a name or a home directory.
     pub fn finds(&self, bytes: &[u8]) -> bool {
-        let text = String::from_utf8_lossy(bytes);
-        self.text(&text) != text
+        let starts = (0..bytes.len()).step_by(WINDOW_BYTES);
+        starts.into_iter().any(|start| {
+            let end = bytes.len().min(start + WINDOW_BYTES + OVERLAP_BYTES);
+            let text = String::from_utf8_lossy(&bytes[start..end]);
+            self.text(&text) != text
+        })
     }
 }
 

@@ -21,6 +21,8 @@ const USTAR: std::ops::Range<usize> = 257..262;
 const LARGEST: u64 = 64 << 30;
 const MOST_ENTRIES: usize = 1 << 20;
 const DEEPEST: usize = 4;
+/// Longest list, and longest text of orders.
+const LARGEST_TEXT: u64 = 64 << 20;
 /// What a program may say of a file before it; nothing of it is used.
 const LARGEST_REMARK: u64 = 1 << 16;
 
@@ -35,6 +37,15 @@ impl Unpacked {
     /// A file or folder in it.
     pub fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(FOLDER).join(name)
+    }
+
+    /// The text of a file in it; nothing where there is none.
+    ///
+    /// # Errors
+    /// It is longer than any that holod packs, or cannot be read.
+    pub fn text(&self, name: &str) -> Result<Option<String>, Failure> {
+        let read = read_text(&self.path(name));
+        read.map_err(|error| Failure::new(Exit::Data, format!("{name}: {error}")))
     }
 }
 
@@ -64,7 +75,7 @@ pub fn unpack(path: &Path) -> Result<Unpacked, Failure> {
         Fault::Entry { name, found } => refused(format!("found {found} (`{name}`), which no report of holod has")),
     })?;
     let manifest = folder.path().join(FOLDER).join(MANIFEST);
-    let text = fs::read_to_string(manifest).map_err(|_| {
+    let text = read_text(&manifest).map_err(|error| refused(format!("{MANIFEST}: {error}")))?.ok_or_else(|| {
         refused(format!("is no report of holod: found no {FOLDER}/{MANIFEST} in it; `holod report` makes one"))
     })?;
     let manifest: Manifest = serde_json::from_str(&text).map_err(|error| {
@@ -80,6 +91,20 @@ pub fn unpack(path: &Path) -> Result<Unpacked, Failure> {
         }
     }
     Ok(unpacked)
+}
+
+/// The text of a file, where there is one.
+fn read_text(path: &Path) -> io::Result<Option<String>> {
+    let file = match File::open(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        opened => opened?,
+    };
+    let mut text = String::new();
+    file.take(LARGEST_TEXT + 1).read_to_string(&mut text)?;
+    if text.len() as u64 > LARGEST_TEXT {
+        return Err(io::Error::other(format!("found more than the {LARGEST_TEXT} bytes that it may have")));
+    }
+    Ok(Some(text))
 }
 
 /// What is wrong with an archive.

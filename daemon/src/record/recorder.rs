@@ -13,14 +13,14 @@ use serde::{Deserialize, Serialize};
 
 use super::sources::{self, SceneSource, SourceFile};
 use super::{FieldRecord, FrameLog, FrameRecord};
-use crate::cli::{self, RunArgs, SceneArgs};
+use crate::cli::{self, NetworkArgs, RigArgs, RunArgs, SceneArgs};
 use crate::control::Request;
 use crate::failure::{Exit, Failure};
 use crate::logging::LogFile;
 use crate::machine::Machine;
 use crate::report;
 use crate::session::{Began, Observer};
-use crate::source;
+use crate::{setup, source};
 
 /// What a run was started with; `run.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -67,14 +67,22 @@ pub const LOG: &str = "log.txt";
 /// Name of the lines of [`OrderSource`] in a record.
 pub const ORDER_FILES: &str = "order-files.jsonl";
 
+/// What tells which files an order brings.
+#[derive(Clone)]
+struct Named {
+    rig: RigArgs,
+    network: NetworkArgs,
+    geometry: DisplayGeometry,
+    resolution: Resolution,
+}
+
 /// Writes down a run as it goes.
 pub struct Recorder {
     folder: PathBuf,
     frames: FrameLog,
     log: LogFile,
     facts: RunFacts,
-    geometry: DisplayGeometry,
-    resolution: Resolution,
+    named: Named,
     orders: u32,
     /// Reads the files of what an order brought.
     reading: Option<JoinHandle<()>>,
@@ -95,8 +103,12 @@ impl Recorder {
                 frames,
                 log,
                 facts,
-                geometry: rig.geometry,
-                resolution,
+                named: Named {
+                    rig: args.rig.clone(),
+                    network: args.network.clone(),
+                    geometry: rig.geometry,
+                    resolution,
+                },
                 orders: 0,
                 reading: None,
                 failed: None,
@@ -166,11 +178,12 @@ impl Recorder {
     /// Reads the files of what an order brought, beside the run: the control thread waits for no disk.
     fn note_files(&mut self, request: &Request) {
         let order = self.orders;
-        let (geometry, resolution) = (self.geometry, self.resolution);
+        let named = self.named.clone();
         let request = request.clone();
         let reads_files = match &request {
             Request::Scene { scene, .. } => !source::is_feed(scene),
             Request::Weights { weights } => matches!(cli::parse_weights(weights), Ok(WeightsChoice::File(_))),
+            Request::Reload { .. } => true,
             _ => false,
         };
         if !reads_files {
@@ -183,7 +196,7 @@ impl Recorder {
             if let Some(before) = before {
                 let _ = before.join();
             }
-            let noted = order_source(order, &request, &geometry, resolution).and_then(|source| append(&path, &source));
+            let noted = order_source(order, &request, &named).and_then(|source| append(&path, &source));
             if let Err(failure) = noted {
                 tracing::warn!("the record lacks the files of order {order}: {failure}");
             }
@@ -195,32 +208,33 @@ impl Recorder {
     }
 }
 
-fn order_source(
-    order: u32,
-    request: &Request,
-    geometry: &DisplayGeometry,
-    resolution: Resolution,
-) -> Result<OrderSource, Failure> {
+fn order_source(order: u32, request: &Request, named: &Named) -> Result<OrderSource, Failure> {
     let (mut scene, mut weights) = (None, None);
     match request {
         Request::Scene { scene: spec, depth_encoding, fit } => {
-            let named = SceneArgs {
+            let args = SceneArgs {
                 scene: Some(spec.clone()),
                 depth_encoding: depth_encoding.clone(),
                 fit: (*fit).into(),
-                resolution: Some(resolution),
+                resolution: Some(named.resolution),
             };
-            scene = Some(SceneSource::of(&named, geometry)?);
+            scene = Some(SceneSource::of(&args, &named.geometry)?);
         }
-        Request::Weights { weights: named } => {
-            if let Ok(WeightsChoice::File(path)) = cli::parse_weights(named) {
-                let file = SourceFile::of(&path, "weights.safetensors".into());
-                weights = Some(file.map_err(Failure::because(Exit::NoInput))?);
-            }
+        Request::Weights { weights: weights_named } => {
+            weights = weights_file(&cli::parse_weights(weights_named).map_err(|why| Failure::new(Exit::Usage, why))?)?;
+        }
+        Request::Reload { .. } => {
+            weights = weights_file(&setup::rig_with_network(&named.rig, &named.network)?.model.weights)?;
         }
         _ => {}
     }
     Ok(OrderSource { order, scene, weights })
+}
+
+/// The file that holds weights, where they are in a file.
+fn weights_file(weights: &WeightsChoice) -> Result<Option<SourceFile>, Failure> {
+    let WeightsChoice::File(path) = weights else { return Ok(None) };
+    SourceFile::of(path, "weights.safetensors".into()).map(Some).map_err(Failure::because(Exit::NoInput))
 }
 
 fn append(path: &Path, source: &OrderSource) -> Result<(), Failure> {

@@ -230,3 +230,107 @@ pub(super) fn keep_bench(folder: &Path, config: Option<&Path>, rig: &Rig) -> Res
     }
     Err(Failure::new(Exit::Config, "the rig file was changed while holod started: start it again"))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::FitArg;
+
+    fn files(folder: &Path, names: &[&str]) {
+        for name in names {
+            let path = folder.join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, name).unwrap();
+        }
+    }
+
+    fn source(scene: &str, depth_encoding: Option<&str>) -> SceneSource {
+        let args = SceneArgs {
+            scene: Some(scene.to_owned()),
+            depth_encoding: depth_encoding.map(str::to_owned),
+            fit: FitArg::Cover,
+            resolution: None,
+        };
+        SceneSource::of(&args, &DisplayGeometry::DEFAULT).unwrap()
+    }
+
+    /// What the scene is made of where its files have the names that they have in a report.
+    fn relocated(source: &SceneSource) -> (Scene, Vec<String>) {
+        let SceneSource::Files { fit, description, files } = source else { panic!("{source:?}") };
+        assert_eq!(*fit, Fit::Cover);
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join(SCENE), description).unwrap();
+        let scene = Scene::open(folder.path().to_str().unwrap(), None).unwrap();
+        let named = |path: &PathBuf| path.file_name().unwrap().to_string_lossy().into_owned();
+        let of_scene: Vec<_> = (0..scene.frames()).flat_map(|index| scene.pictures(index)).map(|p| named(&p)).collect();
+        assert!(of_scene.iter().all(|name| files.iter().any(|file| file.name == *name)), "{of_scene:?}");
+        (scene, files.iter().map(|file| file.name.clone()).collect())
+    }
+
+    #[test]
+    fn a_pair_becomes_a_scene_with_its_encoding() {
+        let folder = tempfile::tempdir().unwrap();
+        files(folder.path(), &["a b.JPG", "d.png"]);
+        let at = |name: &str| folder.path().join(name).display().to_string();
+        let pair = source(&format!("{},{}", at("a b.JPG"), at("d.png")), Some("normalised_dioptres:0.25,2.5"));
+        let (_, names) = relocated(&pair);
+        assert_eq!(names, ["colour.JPG", "depth.png"]);
+        let SceneSource::Files { description, files, .. } = &pair else { panic!() };
+        for key in ["far_dpt = 0.25", "near_dpt = 2.5", "depth_encoding = \"normalised_dioptres\""] {
+            assert!(description.contains(key), "{description}");
+        }
+        assert_eq!((files[1].bytes, files[1].path.clone()), (5, folder.path().join("d.png")));
+        assert_eq!(files[1].xxh3, content_xxh3(&mut &b"d.png"[..]).unwrap().1);
+        assert_ne!(files[1].xxh3, content_xxh3(&mut &b"e.png"[..]).unwrap().1);
+    }
+
+    #[test]
+    fn a_sequence_keeps_its_order_wherever_its_files_were() {
+        let folder = tempfile::tempdir().unwrap();
+        files(folder.path(), &["else/c7.exr", "else/c9.exr", "here/x"]);
+        let text = "colour = \"../else/c{}.exr\"\ndepth_encoding = \"metres\"\nfirst = 7\nstep = 2\nfps = 12.5\n";
+        fs::write(folder.path().join("here/scene.toml"), text).unwrap();
+        let (scene, names) = relocated(&source(folder.path().join("here").to_str().unwrap(), None));
+        assert_eq!(names, ["colour-000000.exr", "colour-000001.exr"]);
+        assert_eq!((scene.frames(), scene.fps()), (2, Some(12.5)));
+        assert_eq!(scene.pictures(1)[0], scene.pictures(1)[1], "colour and depth are one file");
+    }
+
+    #[test]
+    fn the_built_in_scene_and_a_feed_have_no_files() {
+        assert_eq!(source("feed", None), SceneSource::Feed);
+        assert_eq!(SceneSource::of(&SceneArgs::default(), &DisplayGeometry::DEFAULT).unwrap(), SceneSource::BuiltIn);
+        assert_eq!(extension(Path::new("a.tar.g\u{e4}")), "");
+    }
+
+    #[test]
+    fn a_bench_is_kept_with_its_files_and_means_the_same() {
+        let folder = tempfile::tempdir().unwrap();
+        let record = folder.path().join("record");
+        let lut: String = (0..256).map(|level| format!("{level},{}\n", f64::from(level) * 0.0246)).collect();
+        fs::create_dir(folder.path().join("luts")).unwrap();
+        fs::write(folder.path().join("luts/green"), lut).unwrap();
+        fs::write(folder.path().join("w.safetensors"), "weights").unwrap();
+        let text = Rig::BUILT_IN_TOML
+            .replace("settle_ms", "lut_file = { green = \"luts/green\" } # measured\nsettle_ms")
+            .replace("green = 1.9921875, ", "")
+            .replace("network = \"standard\"", "weights_file = \"w.safetensors\"");
+        let config = folder.path().join("lab.toml");
+        fs::write(&config, text).unwrap();
+        let rig = Rig::load(&config).unwrap();
+        keep_bench(&record, Some(&config), &rig).unwrap();
+        fs::remove_dir_all(folder.path().join("luts")).unwrap();
+        let kept = Rig::load(&record.join(BENCH).join(RIG)).unwrap();
+        assert_eq!((&kept.panel, &kept.geometry, &kept.lasers), (&rig.panel, &rig.geometry, &rig.lasers));
+        assert_eq!(kept.model.weights, WeightsChoice::File(record.join(BENCH).join("weights.safetensors")));
+        assert!(fs::read_to_string(record.join(BENCH).join(RIG)).unwrap().contains("# measured"));
+
+        let named = Rig { model: holod_calibration::rig::Model { weights: WeightsChoice::Fast }, ..Rig::default() };
+        keep_bench(&folder.path().join("other"), None, &named).unwrap();
+        let kept = Rig::load(&folder.path().join("other").join(BENCH).join(RIG)).unwrap();
+        assert_eq!(kept.model.weights, WeightsChoice::Fast);
+        // The file says something else than what runs.
+        let failure = keep_bench(&folder.path().join("third"), None, &rig).unwrap_err();
+        assert_eq!(failure.exit, Exit::CannotCreate, "{failure}");
+    }
+}
