@@ -10,6 +10,7 @@ use holod_calibration::rig::{Eye, WeightsChoice};
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_model::scene::Fit;
 use holod_pupil_input::UsbIds;
+use serde::{Deserialize, Serialize};
 
 pub use crate::page::PageAddress;
 
@@ -202,7 +203,8 @@ impl From<Fit> for FitArg {
 }
 
 /// Which engine computes the network.
-#[derive(ValueEnum, Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(ValueEnum, Serialize, Deserialize, Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[serde(rename_all = "kebab-case")]
 pub enum Backend {
     /// A GPU where there is one that will do, else the processor's cores.
     #[default]

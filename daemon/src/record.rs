@@ -235,7 +235,7 @@ impl FrameLog {
             u8::from(field.deadline_missed),
             frame.map(|f| f.picture.number.to_string()).unwrap_or_default(),
             time(frame.and_then(|f| f.picture.t_taken)),
-            frame.and_then(|f| f.levels_xxh3).map(|hash| hash_text(hash)).unwrap_or_default(),
+            frame.and_then(|f| f.levels_xxh3).map(hash_text).unwrap_or_default(),
             order(frame.map(|f| f.orders.scene)),
             order(frame.map(|f| f.orders.weights)),
             order(frame.map(|f| f.orders.pattern)),

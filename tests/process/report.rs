@@ -6,8 +6,10 @@ use std::process::Command;
 use std::time::Duration;
 
 use holod_tests::daemon::{Daemon, Ended, run, wait_until};
+use holod_tests::feed::{Answer, FeedClient, hello};
 use holod_tests::small_rig;
 use image::{ImageBuffer, Luma, Rgb, RgbImage};
+use rustix::process::Signal;
 use serde_json::Value;
 
 use crate::HOLOD;
@@ -285,6 +287,36 @@ fn what_orders_changed_is_changed_at_the_same_frame() {
         why.values().next().unwrap().as_u64().unwrap(),
     ];
     assert!(same + not_again == all && same > 20 && not_again > 16, "{outcome:#}");
+}
+
+#[test]
+fn pictures_of_a_live_feed_are_not_recorded_and_what_was_shown_before_them_is_shown_again() {
+    let bench = Bench::new();
+    let args = ["--config", "rig.toml", "--tracker", "mock:steady", "--record", "record", "--scene", "feed:pictures"];
+    let environment = [("XDG_RUNTIME_DIR", bench.0.path())];
+    let daemon = Daemon::start_with(HOLOD, &[&args[..], &SMALL].concat(), bench.0.path(), &environment);
+    let rows = |live: bool| {
+        let text = fs::read_to_string(bench.path("record/frames.csv")).unwrap_or_default();
+        let is_live = |row: &&str| row.split(',').nth(17).is_some_and(|t_picture| !t_picture.is_empty()) == live;
+        text.lines().skip(1).filter(is_live).count()
+    };
+    assert!(wait_until(PATIENCE, || rows(false) > 60));
+    let mut client = FeedClient::connect(&bench.path("pictures")).unwrap();
+    client.say(&hello(64, 64, Some(1.0), "test camera")).unwrap();
+    assert_eq!(client.answer(), Answer::Ring);
+    client.write(0, &[99; 4 * 64 * 64], &[]);
+    client.hand_over(0, 1, 0).unwrap();
+    assert!(wait_until(PATIENCE, || rows(true) > 60));
+    daemon.signal(Signal::TERM);
+    assert!(daemon.wait(PATIENCE).status.success());
+    assert!(bench.pack(&[]).stdout.contains("pictures of the live feed, which are not recorded"));
+    let ended = bench.send().show(&[]);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let outcome = outcome(&ended);
+    let not_again = outcome["frames_not_shown_again"]["pictures of a live feed are not recorded"].as_u64().unwrap();
+    let same = outcome["frames_same"].as_u64().unwrap();
+    assert!(not_again >= 20 && same >= 20, "{outcome:#}");
+    assert_eq!(outcome["frames_recorded"], same + not_again, "{outcome:#}");
 }
 
 #[test]

@@ -57,7 +57,7 @@ impl Contents {
     pub fn of_running(running: &[Snapshot], scrubber: &Scrubber) -> Result<Self, Failure> {
         let mut contents = Self::default();
         for status in running {
-            let text = serde_json::to_string_pretty(status).map_err(Failure::because(Exit::Software))?;
+            let text = serde_json::to_string_pretty(status).map_err(Failure::because(Exit::Software))? + "\n";
             contents.add_json::<Snapshot>(&format!("status-{}.json", status.pid), &text, scrubber);
         }
         if running.is_empty() {

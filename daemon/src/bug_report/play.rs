@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use holod_calibration::rig::{LaserDriver, Rig, WeightsChoice};
 use holod_calibration::{Colour, Resolution, TimeNs};
 use holod_model::RgbdFrame;
-use holod_slm_output::FieldEvent;
+use holod_slm_output::{FieldEvent, LevelsFrame};
 use serde::Serialize;
 use serde_json::Value;
 
@@ -78,6 +78,7 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     }
     let backend = match backend {
         Backend::Auto if facts.engine.starts_with("cpu") => Backend::Cpu,
+        Backend::Auto => facts.backend,
         asked => asked,
     };
     if facts.holod != env!("HOLOD_VERSION") {
@@ -217,7 +218,7 @@ struct Material<'a> {
     scenes: HashMap<u32, Result<Arc<Frames>, String>>,
     engines: Vec<crate::control::NewEngine>,
     engine_places: HashMap<u32, Result<usize, String>>,
-    patterns: Vec<Box<holod_slm_output::LevelsFrame>>,
+    patterns: Vec<LevelsFrame>,
     pattern_places: HashMap<u32, Result<Option<usize>, String>>,
     pictures: Vec<Arc<RgbdFrame>>,
     picture_places: HashMap<(u32, u64), usize>,
@@ -362,7 +363,7 @@ impl Material<'_> {
         }
         let place = match parsed(self.orders.request(order)?).and_then(|request| self.carry_out(&request)) {
             Ok(Order::Pattern(pattern)) => Ok(pattern.map(|pattern| {
-                self.patterns.push(pattern.levels);
+                self.patterns.push(*pattern.levels);
                 self.patterns.len() - 1
             })),
             Ok(_) => Err(format!("order {order} brought no pattern")),
@@ -605,6 +606,7 @@ mod tests {
             tracker: String::new(),
             scale_mm_per_unit: None,
             panel: String::new(),
+            backend: Backend::Auto,
             engine: "cpu, 2 threads, as there is no GPU".into(),
             machine: crate::machine::Machine::default(),
         };

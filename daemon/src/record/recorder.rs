@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 
 use super::sources::{self, SceneSource, SourceFile};
 use super::{FieldRecord, FrameLog, FrameRecord};
-use crate::cli::{self, NetworkArgs, RigArgs, RunArgs, SceneArgs};
+use crate::cli::{self, Backend, NetworkArgs, RigArgs, RunArgs, SceneArgs};
 use crate::control::Request;
 use crate::failure::{Exit, Failure};
 use crate::logging::LogFile;
@@ -41,6 +41,8 @@ pub struct RunFacts {
     pub scale_mm_per_unit: Option<f64>,
     /// The panel's spec.
     pub panel: String,
+    /// The engine that was asked for.
+    pub backend: Backend,
     /// How holograms are computed.
     pub engine: String,
     /// The machine.
@@ -135,6 +137,7 @@ impl Recorder {
             tracker: String::new(),
             scale_mm_per_unit: args.scale,
             panel: args.output.clone(),
+            backend: args.backend,
             engine: String::new(),
             machine: Machine::this(),
         };

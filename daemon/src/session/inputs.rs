@@ -136,7 +136,7 @@ pub(crate) struct Playback {
     /// Engines beside the first.
     pub(crate) engines: Vec<NewEngine>,
     /// The patterns that they show.
-    pub(crate) patterns: Vec<Box<LevelsFrame>>,
+    pub(crate) patterns: Vec<LevelsFrame>,
     /// The cue that is due.
     pub(crate) at: usize,
     /// The engine that is at work.
@@ -184,7 +184,7 @@ impl Playback {
         FrameContent {
             picture: &self.pictures[cue.picture],
             tag: PictureTag { number: cue.number, t_taken: None, order: cue.orders.scene },
-            pattern: cue.pattern.map(|pattern| &*self.patterns[pattern]),
+            pattern: cue.pattern.map(|pattern| &self.patterns[pattern]),
         }
     }
 
