@@ -347,6 +347,40 @@ fn a_picture_that_has_changed_since_the_run_is_left_out() {
 }
 
 #[test]
+fn a_report_names_no_file_outside_of_it() {
+    let bench = Bench::new();
+    bench.record(&["--frames", "30"]);
+    bench.pack(&[]);
+    let sent = bench.send();
+    let outside = sent.0.path().join("outside");
+    fs::create_dir(&outside).unwrap();
+    let refused = |says: &str| {
+        let ended = sent.show(&[]);
+        assert_eq!(ended.status.code(), Some(65), "{}", ended.stderr);
+        assert!(ended.stderr.contains(says), "{}", ended.stderr);
+    };
+    let rewrite = |path: PathBuf, from: &str, to: &str| {
+        let text = fs::read_to_string(&path).unwrap();
+        assert!(text.contains(from), "{text}");
+        fs::write(path, text.replace(from, to)).unwrap();
+    };
+    let elsewhere = |name: &str| outside.join(name).display().to_string();
+    sent.changed(|report| {
+        for index in 0..4 {
+            let name = format!("colour-00000{index}.png");
+            fs::copy(report.join("scene").join(&name), outside.join(name)).unwrap();
+        }
+        rewrite(report.join("scene/scene.toml"), "colour-{:06}.png", &elsewhere("colour-{:06}.png"));
+    });
+    refused("names pictures that are not in the report");
+    sent.changed(|report| {
+        fs::copy(report.join("bench/lut-green.csv"), outside.join("lut.csv")).unwrap();
+        rewrite(report.join("bench/rig.toml"), "lut-green.csv", &elsewhere("lut.csv"));
+    });
+    refused("lut.csv, which is not in the report");
+}
+
+#[test]
 fn what_is_no_report_is_said() {
     let bench = Bench::new();
     bench.record(&["--frames", "30"]);

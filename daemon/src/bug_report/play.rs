@@ -8,6 +8,7 @@ use std::sync::{Arc, Mutex};
 use holod_calibration::rig::{LaserDriver, Rig, WeightsChoice};
 use holod_calibration::{Colour, Resolution, TimeNs};
 use holod_model::RgbdFrame;
+use holod_model::scene::Scene;
 use holod_slm_output::{FieldEvent, LevelsFrame};
 use serde::Serialize;
 use serde_json::Value;
@@ -18,8 +19,8 @@ use crate::cli::{Backend, SceneArgs};
 use crate::control::{Order, Preparer, Request};
 use crate::failure::{Exit, Failure};
 use crate::record::{
-    BENCH, FRAMES, FrameRecord, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SceneSource, content_xxh3,
-    hash_text,
+    BENCH, FRAMES, FrameRecord, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SCENE, SceneSource, SourceFile,
+    content_xxh3, hash_text,
 };
 use crate::renderer;
 use crate::session::{Cue, Observer, Playback};
@@ -64,6 +65,16 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     let facts: RunFacts = serde_json::from_str(&facts).map_err(|error| data(format!("{RUN}: {error}")))?;
     let config = report.path(BENCH).join(RIG);
     let mut rig = Rig::load(&config).map_err(Failure::because(Exit::Data))?;
+    let provenance = &rig.provenance;
+    let tables = provenance.lut_files.0.iter().chain(&provenance.flatness_files.0).flatten();
+    let weights = match &rig.model.weights {
+        WeightsChoice::File(path) => Some(path),
+        _ => None,
+    };
+    if let Some(path) = tables.chain(weights).find(|path| !report.holds(path)) {
+        return Err(data(format!("{BENCH}/{RIG} names {}, which is not in the report", path.display())));
+    }
+    // Nothing that a report says lights a laser.
     rig.lasers.driver = LaserDriver::Simulated;
     if let Some(scale) = facts.scale_mm_per_unit {
         rig.tracker.scale = Some(scale);
@@ -281,18 +292,32 @@ impl Material<'_> {
         let missing = || "the scene is not in the report".to_owned();
         let mut named = SceneArgs { resolution: Some(self.resolution), ..SceneArgs::default() };
         if let SceneSource::Files { fit, files, .. } = source {
-            let folder = self.report.path(folder);
+            let path = self.report.path(folder);
             for file in files {
-                let found = fs::File::open(folder.join(&file.name)).and_then(|mut file| content_xxh3(&mut file));
-                if found.map_err(|_| missing())? != (file.bytes, file.xxh3.clone()) {
-                    return Err(format!("{} is another picture than was shown", file.name));
+                if !self.is_whole(folder, file) {
+                    return Err(missing());
                 }
             }
             named.fit = (*fit).into();
-            named.scene = Some(folder.to_str().ok_or_else(missing)?.to_owned());
+            let spec = path.to_str().ok_or_else(missing)?;
+            let scene = Scene::open(spec, None).map_err(|error| error.to_string())?;
+            if (0..scene.frames()).flat_map(|index| scene.pictures(index)).any(|path| !self.report.holds(&path)) {
+                return Err(format!("{folder}/{SCENE} names pictures that are not in the report"));
+            }
+            named.scene = Some(spec.to_owned());
         }
-        let loaded = scene::frames(&named, &self.rig.geometry).map_err(|failure| failure.to_string());
-        loaded.map(Arc::new)
+        let mut loaded = scene::frames(&named, &self.rig.geometry).map_err(|failure| failure.to_string())?;
+        if named.scene.is_some() {
+            loaded.name = format!("{folder}/ of the report");
+        }
+        Ok(Arc::new(loaded))
+    }
+
+    /// Whether a file that the run read is in the report as it was.
+    fn is_whole(&self, folder: &str, file: &SourceFile) -> bool {
+        let path = self.report.path(folder).join(&file.name);
+        let found = fs::File::open(&path).and_then(|mut file| content_xxh3(&mut file));
+        self.report.holds(&path) && found.is_ok_and(|found| found == (file.bytes, file.xxh3.clone()))
     }
 
     fn scene(&mut self, order: u32) -> Result<&Frames, String> {
@@ -335,12 +360,10 @@ impl Material<'_> {
     fn open_engine(&mut self, order: u32) -> Result<usize, String> {
         let weights = match self.orders.sources.get(&order).and_then(|source| source.weights.as_ref()) {
             Some(file) => {
-                let path = self.report.path(&order_folder(order)).join(&file.name);
-                let found = fs::File::open(&path).and_then(|mut file| content_xxh3(&mut file)).ok();
-                if found != Some((file.bytes, file.xxh3.clone())) {
+                if !self.is_whole(&order_folder(order), file) {
                     return Err(format!("the weights of order {order} are not in the report"));
                 }
-                path.to_string_lossy().into_owned()
+                self.report.path(&order_folder(order)).join(&file.name).to_string_lossy().into_owned()
             }
             None => self.orders.built_in_weights(order)?.to_owned(),
         };

@@ -64,15 +64,15 @@ pub(super) fn read(path: &Path) -> Result<Vec<RecordedFrame>, Failure> {
         let Some(row) = text.strip_suffix('\n') else { break };
         let row = Row { columns: &columns, cells: row.split(',').collect() };
         let (frame, field, colour, made) = row.read().map_err(|what| wrong(number, &what))?;
-        match frames.last_mut().filter(|last| last.frame >= frame) {
-            // A panel shows no older frame again.
-            Some(last) if last.frame > frame => return Err(wrong(number, "an older frame comes after a newer one")),
-            Some(last) => {
-                if last.fields.iter().all(|(known, _)| *known != field) {
-                    last.fields.push((field, colour));
+        // A panel that was lost may show an older frame again.
+        match frames.binary_search_by_key(&frame, |known| known.frame) {
+            Err(place) => frames.insert(place, RecordedFrame { frame, made, fields: vec![(field, colour)] }),
+            Ok(place) => {
+                let fields = &mut frames[place].fields;
+                if fields.iter().all(|(known, _)| *known != field) {
+                    fields.push((field, colour));
                 }
             }
-            None => frames.push(RecordedFrame { frame, made, fields: vec![(field, colour)] }),
         }
     }
     Ok(frames)
@@ -160,6 +160,8 @@ mod tests {
         assert_eq!((made.levels_xxh3, made.picture, made.is_live), (0xab, 4, false));
         assert_eq!(made.orders, FrameOrders { scene: 2, weights: 0, pattern: 1 });
         assert_eq!(frames[1].made, None);
+        let older = table(&[ROW, &ROW.replace("7,1", "6,1"), &ROW.replace("7,1,green", "6,2,red")].concat()).unwrap();
+        assert_eq!(older.iter().map(|frame| (frame.frame, frame.fields.len())).collect::<Vec<_>>(), [(6, 2), (7, 1)]);
         assert!(table(&ROW.replace(",4,,", ",4,9,")).unwrap()[0].made.as_ref().unwrap().is_live);
     }
 
@@ -169,7 +171,6 @@ mod tests {
             (ROW.replace("green", "mauve"), "line 2: found the colour `mauve`"),
             (ROW.replace("00000000000000ab", "xyz"), "levels_xxh3 is `xyz`"),
             (ROW.replace("3.3000002", "wide"), "pupil_mm is `wide`"),
-            ([ROW, &ROW.replace("7,1", "6,1")].concat(), "line 3: an older frame"),
             ("7,1,green\n".to_owned(), "found 3 cells"),
         ] {
             let said = table(&rows).unwrap_err();

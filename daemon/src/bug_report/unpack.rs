@@ -39,6 +39,12 @@ impl Unpacked {
         self.folder.path().join(FOLDER).join(name)
     }
 
+    /// Whether a path leads to something in it and nowhere else.
+    pub fn holds(&self, path: &Path) -> bool {
+        let inside = path.strip_prefix(self.path(""));
+        inside.is_ok_and(|inside| inside.components().all(|component| matches!(component, Component::Normal(_))))
+    }
+
     /// The text of a file in it; nothing where there is none.
     ///
     /// # Errors
@@ -325,6 +331,10 @@ mod tests {
         write(b"12345");
         let unpacked = unpack(&path).unwrap();
         let at = unpacked.path("frames.csv");
+        assert!(unpacked.holds(&at) && unpacked.holds(&unpacked.path("scene").join("colour.png")));
+        for outside in ["../x", "scene/../../../x", "/etc/hosts"] {
+            assert!(!unpacked.holds(&unpacked.path(outside)), "{outside}");
+        }
         assert_eq!(fs::read(&at).unwrap(), b"12345");
         drop(unpacked);
         assert!(!at.exists(), "the folder goes with it");
