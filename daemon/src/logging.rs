@@ -5,7 +5,7 @@ use std::fmt::{self, Write};
 use std::fs::File;
 use std::io::{self, Write as _};
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, Once, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::Serialize;
@@ -52,6 +52,13 @@ pub struct Line {
     pub text: String,
 }
 
+impl Line {
+    fn now(level: Level, text: String) -> Self {
+        let unix_ms = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64);
+        Self { unix_ms, level: level.as_str(), text }
+    }
+}
+
 /// Keeps the newest lines in memory, from `info` up. Real-time threads do not log, so none of them waits here.
 pub struct KeepRecent;
 
@@ -69,9 +76,7 @@ static RECENT: Mutex<Kept> = Mutex::new(Kept { lines: VecDeque::new(), ever: 0 }
 impl<S: Subscriber> Layer<S> for KeepRecent {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
         let level = *event.metadata().level();
-        let text = text_of(event);
-        let unix_ms = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64);
-        let line = Line { unix_ms, level: level.as_str(), text };
+        let line = Line::now(level, text_of(event));
         if let Some(file) = &mut *FILE.lock().unwrap_or_else(PoisonError::into_inner) {
             // A disk that refuses is told of by whoever records.
             let _ = write_line(file, &line);
@@ -114,7 +119,15 @@ impl LogFile {
             write_line(&mut file, &line)?;
         }
         *place = Some(file);
+        keep_panics();
         Ok(Self(()))
+    }
+
+    /// Writes down what ended the run, which is said elsewhere.
+    pub fn ended_by(&self, failure: &impl fmt::Display) {
+        if let Some(file) = &mut *FILE.lock().unwrap_or_else(PoisonError::into_inner) {
+            let _ = write_line(file, &Line::now(Level::ERROR, failure.to_string()));
+        }
     }
 
     /// Nothing goes into it any more.
@@ -127,6 +140,23 @@ impl Drop for LogFile {
     fn drop(&mut self) {
         self.end();
     }
+}
+
+/// Writes panics down, too, before whoever else hears of them.
+fn keep_panics() {
+    static KEPT: Once = Once::new();
+    KEPT.call_once(|| {
+        let before = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |panic| {
+            // Whoever panics may hold it.
+            if let Ok(mut file) = FILE.try_lock()
+                && let Some(file) = &mut *file
+            {
+                let _ = write_line(file, &Line::now(Level::ERROR, panic.to_string()));
+            }
+            before(panic);
+        }));
+    });
 }
 
 fn write_line(file: &mut File, line: &Line) -> io::Result<()> {
@@ -160,9 +190,13 @@ mod tests {
     use super::*;
     use tracing_subscriber::filter::LevelFilter;
 
+    /// The lines that are kept are those of the whole process.
+    static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+
     #[test]
     fn the_newest_lines_are_kept() {
         use tracing_subscriber::layer::SubscriberExt;
+        let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
         tracing::subscriber::with_default(tracing_subscriber::registry().with(KeepRecent), || {
             let mut seen = 0;
             recent_since(&mut seen);
@@ -178,6 +212,29 @@ mod tests {
             let lines = recent_since(&mut seen);
             assert_eq!((lines.len(), lines[0].text.as_str()), (KEPT, "10"));
         });
+    }
+
+    #[test]
+    fn a_file_has_what_was_said_before_it_and_how_the_run_ended() {
+        use tracing_subscriber::layer::SubscriberExt;
+        let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log.txt");
+        tracing::subscriber::with_default(tracing_subscriber::registry().with(KeepRecent), || {
+            tracing::warn!("said before the file");
+            let mut log = LogFile::begin(&path).unwrap();
+            tracing::debug!(frame = 4, "in it");
+            log.ended_by(&"the panel was pulled out");
+            let _ = std::panic::catch_unwind(|| panic!("a panic for the log"));
+            log.end();
+            tracing::warn!("said after its end");
+        });
+        let text = std::fs::read_to_string(path).unwrap();
+        for line in ["WARN  said before the file", "DEBUG in it frame=4", "ERROR the panel was pulled out"] {
+            assert!(text.contains(&format!("Z {line}\n")), "{line}: {text}");
+        }
+        assert!(text.contains("a panic for the log") && text.contains("logging.rs"), "{text}");
+        assert!(!text.contains("said after its end"), "{text}");
     }
 
     fn most(asked: &str) -> (Option<LevelFilter>, bool) {

@@ -22,7 +22,7 @@ use serde::{Deserialize, Serialize};
 pub use self::pack::{Contents, default_name};
 pub use self::play::{Comparison, Outcome, Played, prepare};
 pub use self::scrub::Scrubber;
-pub use self::unpack::{Unpacked, is_archive, unpack};
+pub use self::unpack::{Unpacked, is_archive, refuse_archive, unpack};
 use crate::machine::Machine;
 use crate::record::content_xxh3;
 

@@ -65,6 +65,24 @@ pub fn is_archive(path: &Path) -> bool {
     path.is_file() && first_block().is_ok_and(|block| block.get(USTAR).is_some_and(|magic| magic == b"ustar"))
 }
 
+/// Refuses an archive where a log of pupils is wanted.
+///
+/// # Errors
+/// It is one.
+pub fn refuse_archive(path: &Path) -> Result<(), Failure> {
+    if !is_archive(path) {
+        return Ok(());
+    }
+    let shown = path.display();
+    Err(Failure::new(
+        Exit::Data,
+        format!(
+            "{shown}: found a tar archive, expected a log; where it is a report, `holod --tracker replay:{shown}` shows it, \
+             and what the tracker sent is in it, {FOLDER}/tracker.holodraw"
+        ),
+    ))
+}
+
 /// Takes the report at `path` apart.
 ///
 /// # Errors

@@ -69,7 +69,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         Ok(session) => session,
         Err(failure) => {
             if let (Some(recorder), _) = observers {
-                recorder.discard_if_empty();
+                recorder.fail(&failure);
             }
             return Err(failure);
         }
@@ -131,7 +131,7 @@ fn replay(args: &RunArgs, output: OutputSpec, tracker: &TrackerSpec) -> Result<(
         Ok(session) => session,
         Err(failure) => {
             if let Some(recorder) = recorder {
-                recorder.discard_if_empty();
+                recorder.fail(&failure);
             }
             return Err(failure);
         }

@@ -161,9 +161,11 @@ impl Recorder {
         self.frames.flush()
     }
 
-    /// Takes the record away again where no frame was ever made, so that the same directory may be named again.
-    pub fn discard_if_empty(mut self) {
+    /// Ends the record of a run that failed. Where no frame was ever made it is taken away again, so that the same directory
+    /// may be named again.
+    pub fn fail(mut self, failure: &Failure) {
         self.wait_for_reading();
+        self.log.ended_by(failure);
         self.log.end();
         if self.frames.is_empty() {
             discard(&self.folder);
