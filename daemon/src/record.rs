@@ -129,10 +129,7 @@ pub fn remove_earlier(folder: &Path) -> Result<(), Failure> {
         Failure::new(Exit::CannotCreate, format!("cannot overwrite the record in {}: {error}", folder.display()))
     };
     let Ok(entries) = fs::read_dir(folder) else { return Ok(()) };
-    match fs::remove_dir_all(folder.join(BENCH)) {
-        Err(error) if error.kind() != std::io::ErrorKind::NotFound => return Err(cannot(error)),
-        _ => {}
-    }
+    sources::remove_bench(folder).map_err(cannot)?;
     for entry in entries {
         let entry = entry.map_err(cannot)?;
         let name = entry.file_name().to_string_lossy().into_owned();

@@ -350,6 +350,29 @@ fn a_picture_that_has_changed_since_the_run_is_left_out() {
 }
 
 #[test]
+fn a_record_takes_the_place_of_no_file_that_is_there() {
+    let bench = Bench::new();
+    let args = ["--config", "rig.toml", "--tracker", "log.csv", "--frames", "20", "--resolution", "64x64"];
+    let args = [&args[..], &SMALL, &["--record", "record"]].concat();
+    for name in ["log.txt", "run.json", "bench/mine.txt"] {
+        let path = bench.path("record").join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(&path, "precious").unwrap();
+        let ended = bench.holod(&args);
+        assert_eq!(ended.status.code(), Some(73), "{name}: {}", ended.stderr);
+        assert_eq!(fs::read_to_string(&path).unwrap(), "precious");
+        assert!(!bench.path("record/frames.csv").exists());
+        fs::remove_dir_all(bench.path("record")).unwrap();
+    }
+    for force in [&[][..], &["--force"]] {
+        let ended = bench.holod(&[&args[..], force].concat());
+        assert!(ended.status.success(), "{}", ended.stderr);
+    }
+    bench.pack(&[]);
+    assert!(bench.send().show(&[]).status.success());
+}
+
+#[test]
 fn a_report_names_no_file_outside_of_it() {
     let bench = Bench::new();
     bench.record(&["--frames", "30"]);

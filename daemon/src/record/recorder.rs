@@ -15,6 +15,7 @@ use super::sources::{self, SceneSource, SourceFile};
 use super::{FieldRecord, FrameLog, FrameRecord};
 use crate::cli::{self, Backend, NetworkArgs, RigArgs, RunArgs, SceneArgs};
 use crate::control::Request;
+use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
 use crate::logging::LogFile;
 use crate::machine::Machine;
@@ -97,6 +98,8 @@ impl Recorder {
     /// # Errors
     /// An earlier record is there, a file cannot be read or written.
     pub fn create(folder: &Path, args: &RunArgs, rig: &Rig, resolution: Resolution) -> Result<Self, Failure> {
+        let own = [LOG, RUN, ORDER_FILES, sources::BENCH].map(|name| folder.join(name));
+        refuse_existing(own, "--record", false)?;
         let frames = FrameLog::create(folder)?;
         let started = Self::start(folder, args, rig, resolution);
         match started {
@@ -239,7 +242,7 @@ fn order_source(order: u32, request: &Request, named: &Named) -> Result<OrderSou
 /// The file that holds weights, where they are in a file.
 fn weights_file(weights: &WeightsChoice) -> Result<Option<SourceFile>, Failure> {
     let WeightsChoice::File(path) = weights else { return Ok(None) };
-    SourceFile::of(path, "weights.safetensors".into()).map(Some).map_err(Failure::because(Exit::NoInput))
+    SourceFile::of(path, sources::WEIGHTS.into()).map(Some).map_err(Failure::because(Exit::NoInput))
 }
 
 fn append(path: &Path, source: &OrderSource) -> Result<(), Failure> {
@@ -253,7 +256,7 @@ fn discard(folder: &Path) {
     for name in [LOG, RUN, ORDER_FILES] {
         let _ = fs::remove_file(folder.join(name));
     }
-    let _ = fs::remove_dir_all(folder.join(sources::BENCH));
+    let _ = sources::remove_bench(folder);
 }
 
 impl Observer for Recorder {

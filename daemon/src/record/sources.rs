@@ -19,6 +19,11 @@ use crate::failure::{Exit, Failure};
 pub const BENCH: &str = "bench";
 /// The rig in it.
 pub const RIG: &str = "rig.toml";
+/// The profile of its lasers, and its weights.
+const LASERS: &str = "lasers.toml";
+pub(super) const WEIGHTS: &str = "weights.safetensors";
+/// How the names of its tables begin: look-up tables and pictures of flatness, each with its colour behind it.
+const TABLES: [&str; 2] = ["lut-", "flatness-"];
 /// The file that says what a scene is made of, in its folder.
 pub const SCENE: &str = "scene.toml";
 
@@ -169,6 +174,28 @@ fn name_pictures(
     paths.into_iter().enumerate().map(|(index, path)| (path, format!("{key}-{index:06}{ending}"))).collect()
 }
 
+/// Takes away what [`keep_bench`] has put into `folder`; what somebody else has put there stays.
+///
+/// # Errors
+/// One of the files cannot be removed.
+pub(super) fn remove_bench(folder: &Path) -> io::Result<()> {
+    let bench = folder.join(BENCH);
+    let entries = match fs::read_dir(&bench) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+        entries => entries?,
+    };
+    for entry in entries {
+        let entry = entry?;
+        let name = entry.file_name().to_string_lossy().into_owned();
+        if [RIG, LASERS, WEIGHTS].contains(&name.as_str()) || TABLES.iter().any(|table| name.starts_with(table)) {
+            fs::remove_file(entry.path())?;
+        }
+    }
+    // Fails where something else is in it, which then stays.
+    let _ = fs::remove_dir(&bench);
+    Ok(())
+}
+
 /// The ending of a file's name with its dot, where it is a plain one.
 fn extension(path: &Path) -> String {
     let extension = path.extension().and_then(|extension| extension.to_str()).unwrap_or_default();
@@ -186,7 +213,7 @@ pub(super) fn keep_bench(folder: &Path, config: Option<&Path>, rig: &Rig) -> Res
     let cannot = |path: &Path, error: io::Error| {
         Failure::new(Exit::CannotCreate, format!("cannot record {}: {error}", path.display()))
     };
-    fs::create_dir_all(&bench).map_err(|error| cannot(&bench, error))?;
+    fs::create_dir(&bench).map_err(|error| cannot(&bench, error))?;
     let keep = |path: &Path, name: String| {
         fs::copy(path, bench.join(&name)).map_err(|error| cannot(path, error))?;
         Ok::<_, Failure>(value(name))
@@ -198,22 +225,22 @@ pub(super) fn keep_bench(folder: &Path, config: Option<&Path>, rig: &Rig) -> Res
     let mut document: DocumentMut = text.parse().map_err(Failure::because(Exit::Config))?;
     for colour in Colour::ALL {
         for (key, what, files) in [
-            ("lut_file", "lut", &rig.provenance.lut_files),
-            ("flatness_file", "flatness", &rig.provenance.flatness_files),
+            ("lut_file", TABLES[0], &rig.provenance.lut_files),
+            ("flatness_file", TABLES[1], &rig.provenance.flatness_files),
         ] {
             if let Some(path) = &files[colour] {
-                document["panel"][key][colour.name()] = keep(path, format!("{what}-{colour}{}", extension(path)))?;
+                document["panel"][key][colour.name()] = keep(path, format!("{what}{colour}{}", extension(path)))?;
             }
         }
     }
     let profile = document.get("lasers").and_then(|lasers| lasers.get("profile_file")).and_then(|file| file.as_str());
     if let (Some(profile), Some(config)) = (profile, config) {
         let path = config.parent().unwrap_or(Path::new("")).join(profile);
-        document["lasers"]["profile_file"] = keep(&path, "lasers.toml".into())?;
+        document["lasers"]["profile_file"] = keep(&path, LASERS.into())?;
     }
     let named = WeightsChoice::BUILT_IN.into_iter().find(|(_, choice)| *choice == rig.model.weights);
     let (key, other, named) = match (&rig.model.weights, named) {
-        (WeightsChoice::File(path), _) => ("weights_file", "network", keep(path, "weights.safetensors".into())?),
+        (WeightsChoice::File(path), _) => ("weights_file", "network", keep(path, WEIGHTS.into())?),
         (_, Some((name, _))) => ("network", "weights_file", value(name)),
         (_, None) => return Err(Failure::new(Exit::Software, "weights without a name")),
     };
@@ -315,6 +342,7 @@ mod tests {
             .replace("settle_ms", "lut_file = { green = \"luts/green\" } # measured\nsettle_ms")
             .replace("green = 1.9921875, ", "")
             .replace("network = \"standard\"", "weights_file = \"w.safetensors\"");
+        fs::create_dir(&record).unwrap();
         let config = folder.path().join("lab.toml");
         fs::write(&config, text).unwrap();
         let rig = Rig::load(&config).unwrap();
@@ -326,11 +354,22 @@ mod tests {
         assert!(fs::read_to_string(record.join(BENCH).join(RIG)).unwrap().contains("# measured"));
 
         let named = Rig { model: holod_calibration::rig::Model { weights: WeightsChoice::Fast }, ..Rig::default() };
+        for name in ["other", "third"] {
+            fs::create_dir(folder.path().join(name)).unwrap();
+        }
         keep_bench(&folder.path().join("other"), None, &named).unwrap();
         let kept = Rig::load(&folder.path().join("other").join(BENCH).join(RIG)).unwrap();
         assert_eq!(kept.model.weights, WeightsChoice::Fast);
         // The file says something else than what runs.
         let failure = keep_bench(&folder.path().join("third"), None, &rig).unwrap_err();
         assert_eq!(failure.exit, Exit::CannotCreate, "{failure}");
+
+        fs::write(record.join(BENCH).join("notes.txt"), "mine").unwrap();
+        remove_bench(&record).unwrap();
+        let left: Vec<_> = fs::read_dir(record.join(BENCH)).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        assert_eq!(left, ["notes.txt"]);
+        remove_bench(&folder.path().join("other")).unwrap();
+        assert!(!folder.path().join("other").join(BENCH).exists());
+        remove_bench(&folder.path().join("absent")).unwrap();
     }
 }
