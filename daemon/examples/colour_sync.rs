@@ -79,6 +79,7 @@ fn run(out: &Path) -> Result<(), Failure> {
         frame_limit: None,
         duration: Some(DURATION),
         keep_levels: true,
+        hash_levels: false,
     };
     let mut fields = Fields::default();
     let session = session::run(plan, &mut fields)?;

@@ -10,6 +10,7 @@ use holod_calibration::rig::{Eye, WeightsChoice};
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_model::scene::Fit;
 use holod_pupil_input::UsbIds;
+use serde::{Deserialize, Serialize};
 
 pub use crate::page::PageAddress;
 
@@ -56,6 +57,9 @@ pub enum Command {
     Status(StatusArgs),
     /// Change what the running daemon does: scene, weights, pupil, eye, patterns, lasers, or read the rig file again.
     Ctl(CtlArgs),
+    /// Pack a record of a run with bench, scene, log and facts of this machine into one file, without names of people or
+    /// machines; `holod --tracker replay:FILE` shows its frames again.
+    Report(ReportArgs),
     /// List trackers, or try one out.
     #[command(subcommand)]
     Tracker(TrackerCommand),
@@ -199,7 +203,8 @@ impl From<Fit> for FitArg {
 }
 
 /// Which engine computes the network.
-#[derive(ValueEnum, Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[derive(ValueEnum, Serialize, Deserialize, Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[serde(rename_all = "kebab-case")]
 pub enum Backend {
     /// A GPU where there is one that will do, else the processor's cores.
     #[default]
@@ -225,7 +230,7 @@ pub struct RunArgs {
         value_name = "SPEC",
         help = "Eye tracker: /dev/ttyUSB0, serial:PATH[,profile=NAME][,baud=N], hid:VID:PID[,profile=NAME], \
                 tcp:HOST:PORT,profile=NAME, udp:HOST:PORT,profile=NAME, core[:HOST], neon[:HOST], \
-                replay:FILE[,speed=X|max][,loop], a log FILE, or mock[:SCENARIO or FILE]; `holod tracker list` names profiles"
+                replay:FILE[,speed=X|max][,loop], a log or report FILE, or mock[:SCENARIO or FILE]; `holod tracker list` names profiles"
     )]
     pub tracker: Option<String>,
     /// The scene.
@@ -258,8 +263,8 @@ pub struct RunArgs {
     /// Stop after this long, for example 10s or 2m; a log that is replayed and ends sooner ends the run.
     #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration)]
     pub duration: Option<Duration>,
-    /// Write frames.csv, summary.json, what the tracker sent (tracker.holodraw, samples.csv) and what `holod ctl` changed
-    /// (orders.jsonl) into this directory.
+    /// Write frames.csv, summary.json, what the tracker sent (tracker.holodraw, samples.csv), what `holod ctl` changed
+    /// (orders.jsonl), the log and the bench into this directory, for `holod report`.
     #[arg(long, value_name = "DIR")]
     pub record: Option<PathBuf>,
     /// Overwrite an earlier record.
@@ -572,6 +577,26 @@ pub struct StatusArgs {
     #[arg(long, value_name = "PID")]
     pub pid: Option<u32>,
     /// Print the status as JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Options of `report`.
+#[derive(Args, Debug, Clone)]
+pub struct ReportArgs {
+    /// What `holod run --record` wrote; without it, facts of this machine and the status of a holod that runs.
+    #[arg(value_name = "DIR")]
+    pub record: Option<PathBuf>,
+    /// The file to write; - is standard output. holod-report-TIME.tar.gz when left out.
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+    /// Overwrite what is there already.
+    #[arg(long)]
+    pub force: bool,
+    /// Leave out the pictures of the scene: then its frames cannot be shown again.
+    #[arg(long, requires = "record")]
+    pub without_scene: bool,
+    /// Print what is in it as JSON.
     #[arg(long)]
     pub json: bool,
 }

@@ -5,6 +5,8 @@ use std::fmt;
 /// Exit codes, after BSD's sysexits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Exit {
+    /// What was compared differs, as `cmp` says it.
+    Different = 1,
     /// The command line asks for something that cannot be had.
     Usage = 64,
     /// An input file's content is wrong.

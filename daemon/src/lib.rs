@@ -1,5 +1,6 @@
 //! The parts of the `holod` binary: command line, the frame loop, records and pictures.
 
+pub mod bug_report;
 pub mod cli;
 pub mod commands;
 pub mod control;
@@ -11,6 +12,7 @@ pub mod failure;
 mod fault;
 pub mod local_socket;
 pub mod logging;
+pub mod machine;
 mod memory;
 pub mod page;
 pub mod pictures;

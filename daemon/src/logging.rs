@@ -1,9 +1,12 @@
-//! What the log on standard error says, by `HOLOD_LOG`, and its newest lines for the status page.
+//! What the log on standard error says, by `HOLOD_LOG`; its newest lines for the status page, and a file of it.
 
 use std::collections::VecDeque;
 use std::fmt::{self, Write};
-use std::sync::{Mutex, PoisonError};
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::fs::File;
+use std::io::{self, Write as _};
+use std::path::Path;
+use std::sync::{Mutex, Once, PoisonError};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::Serialize;
 use tracing::field::{Field, Visit};
@@ -49,6 +52,13 @@ pub struct Line {
     pub text: String,
 }
 
+impl Line {
+    fn now(level: Level, text: String) -> Self {
+        let unix_ms = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64);
+        Self { unix_ms, level: level.as_str(), text }
+    }
+}
+
 /// Keeps the newest lines in memory, from `info` up. Real-time threads do not log, so none of them waits here.
 pub struct KeepRecent;
 
@@ -66,16 +76,19 @@ static RECENT: Mutex<Kept> = Mutex::new(Kept { lines: VecDeque::new(), ever: 0 }
 impl<S: Subscriber> Layer<S> for KeepRecent {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
         let level = *event.metadata().level();
+        let line = Line::now(level, text_of(event));
+        if let Some(file) = &mut *FILE.lock().unwrap_or_else(PoisonError::into_inner) {
+            // A disk that refuses is told of by whoever records.
+            let _ = write_line(file, &line);
+        }
         if level > Level::INFO {
             return;
         }
-        let text = text_of(event);
-        let unix_ms = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64);
         let mut kept = RECENT.lock().unwrap_or_else(PoisonError::into_inner);
         if kept.lines.len() == KEPT {
             kept.lines.pop_front();
         }
-        kept.lines.push_back(Line { unix_ms, level: level.as_str(), text });
+        kept.lines.push_back(line);
         kept.ever += 1;
     }
 }
@@ -85,6 +98,70 @@ pub fn text_of(event: &Event<'_>) -> String {
     let mut text = Text(String::new());
     event.record(&mut text);
     text.0
+}
+
+/// The file that takes every line that the filter lets through.
+static FILE: Mutex<Option<File>> = Mutex::new(None);
+
+/// The log goes into a file for as long as this lives.
+#[derive(Debug)]
+pub struct LogFile(());
+
+impl LogFile {
+    /// Begins a file with the lines that are kept already.
+    ///
+    /// # Errors
+    /// The file cannot be created.
+    pub fn begin(path: &Path) -> io::Result<Self> {
+        let mut place = FILE.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut file = File::create(path)?;
+        for line in recent_since(&mut 0) {
+            write_line(&mut file, &line)?;
+        }
+        *place = Some(file);
+        keep_panics();
+        Ok(Self(()))
+    }
+
+    /// Writes down what ended the run, which is said elsewhere.
+    pub fn ended_by(&self, failure: &impl fmt::Display) {
+        if let Some(file) = &mut *FILE.lock().unwrap_or_else(PoisonError::into_inner) {
+            let _ = write_line(file, &Line::now(Level::ERROR, failure.to_string()));
+        }
+    }
+
+    /// Nothing goes into it any more.
+    pub fn end(&mut self) {
+        *FILE.lock().unwrap_or_else(PoisonError::into_inner) = None;
+    }
+}
+
+impl Drop for LogFile {
+    fn drop(&mut self) {
+        self.end();
+    }
+}
+
+/// Writes panics down, too, before whoever else hears of them.
+fn keep_panics() {
+    static KEPT: Once = Once::new();
+    KEPT.call_once(|| {
+        let before = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |panic| {
+            // Whoever panics may hold it.
+            if let Ok(mut file) = FILE.try_lock()
+                && let Some(file) = &mut *file
+            {
+                let _ = write_line(file, &Line::now(Level::ERROR, panic.to_string()));
+            }
+            before(panic);
+        }));
+    });
+}
+
+fn write_line(file: &mut File, line: &Line) -> io::Result<()> {
+    let at = UNIX_EPOCH + Duration::from_millis(line.unix_ms);
+    writeln!(file, "{} {:5} {}", humantime::format_rfc3339_millis(at), line.level, line.text)
 }
 
 struct Text(String);
@@ -113,9 +190,13 @@ mod tests {
     use super::*;
     use tracing_subscriber::filter::LevelFilter;
 
+    /// The lines that are kept are those of the whole process.
+    static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+
     #[test]
     fn the_newest_lines_are_kept() {
         use tracing_subscriber::layer::SubscriberExt;
+        let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
         tracing::subscriber::with_default(tracing_subscriber::registry().with(KeepRecent), || {
             let mut seen = 0;
             recent_since(&mut seen);
@@ -131,6 +212,29 @@ mod tests {
             let lines = recent_since(&mut seen);
             assert_eq!((lines.len(), lines[0].text.as_str()), (KEPT, "10"));
         });
+    }
+
+    #[test]
+    fn a_file_has_what_was_said_before_it_and_how_the_run_ended() {
+        use tracing_subscriber::layer::SubscriberExt;
+        let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("log.txt");
+        tracing::subscriber::with_default(tracing_subscriber::registry().with(KeepRecent), || {
+            tracing::warn!("said before the file");
+            let mut log = LogFile::begin(&path).unwrap();
+            tracing::debug!(frame = 4, "in it");
+            log.ended_by(&"the panel was pulled out");
+            let _ = std::panic::catch_unwind(|| panic!("a panic for the log"));
+            log.end();
+            tracing::warn!("said after its end");
+        });
+        let text = std::fs::read_to_string(path).unwrap();
+        for line in ["WARN  said before the file", "DEBUG in it frame=4", "ERROR the panel was pulled out"] {
+            assert!(text.contains(&format!("Z {line}\n")), "{line}: {text}");
+        }
+        assert!(text.contains("a panic for the log") && text.contains("logging.rs"), "{text}");
+        assert!(!text.contains("said after its end"), "{text}");
     }
 
     fn most(asked: &str) -> (Option<LevelFilter>, bool) {

@@ -1,4 +1,8 @@
-//! The frame record: `frames.csv`, one row per colour field that the panel showed.
+//! A run written down: `frames.csv`, one row per colour field that the panel showed; with what it was made of, so that its
+//! frames can be made again.
+
+mod recorder;
+mod sources;
 
 use std::collections::HashMap;
 use std::fs::{self, File, OpenOptions};
@@ -7,11 +11,15 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::{Colour, PupilDiameter, TimeNs};
-use holod_slm_output::FieldEvent;
+use holod_slm_output::{FieldEvent, LevelsFrame};
+use twox_hash::XxHash3_64;
 
 use crate::control::Request;
 use crate::failure::{Exit, Failure};
 use crate::source::PictureTag;
+
+pub use self::recorder::{LOG, ORDER_FILES, OrderSource, RUN, Recorder, RunFacts};
+pub use self::sources::{BENCH, RIG, SCENE, SceneSource, SourceFile, content_xxh3, hash_text};
 
 /// What the frame loop did for one frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -42,6 +50,26 @@ pub struct FrameRecord {
     pub keep: Option<usize>,
     /// The amplitude that double phase took as 1.
     pub amplitude_constant: f32,
+    /// The orders that brought what it shows.
+    pub orders: FrameOrders,
+    /// [`levels_xxh3`] of its levels, where that is wanted.
+    pub levels_xxh3: Option<u64>,
+}
+
+/// The orders that brought what a frame shows: their lines in `orders.jsonl`, from 1; 0 for what the run began with.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FrameOrders {
+    /// The scene.
+    pub scene: u32,
+    /// The weights.
+    pub weights: u32,
+    /// The pattern, or holograms again.
+    pub pattern: u32,
+}
+
+/// XXH3 of 64 bits of a frame's levels: of its samples, each as two bytes, the low one first.
+pub fn levels_xxh3(levels: &LevelsFrame) -> u64 {
+    XxHash3_64::oneshot(bytemuck::cast_slice(levels.samples()))
 }
 
 /// One colour field that the panel showed.
@@ -80,10 +108,15 @@ impl FieldRecord {
 
 /// The columns of `frames.csv`.
 pub const HEADER: &str = "frame,field,colour,t_sample_ns,pupil_raw_mm,pupil_mm,pupil_state,t_wake_ns,t_render_begin_ns,\
-t_render_end_ns,t_submit_ns,t_present_ns,present_provenance,laser_on_ns,laser_off_ns,deadline_missed,picture,t_picture_ns";
+t_render_end_ns,t_submit_ns,t_present_ns,present_provenance,laser_on_ns,laser_off_ns,deadline_missed,picture,t_picture_ns,\
+levels_xxh3,scene_order,weights_order,pattern_order";
 
+/// Name of the table of fields in a record.
+pub const FRAMES: &str = "frames.csv";
+/// Name of the lines of orders in a record.
+pub const ORDERS: &str = "orders.jsonl";
 /// The files of a record whose names are always the same.
-const FILES: [&str; 5] = ["frames.csv", "orders.jsonl", "summary.json", "samples.csv", "tracker.holodraw"];
+const FILES: [&str; 8] = [FRAMES, ORDERS, "summary.json", "samples.csv", "tracker.holodraw", RUN, LOG, ORDER_FILES];
 /// How the names of the levels that were shown begin and end.
 const SHOWN: (&str, &str) = ("shown_pupil_", ".png");
 
@@ -96,14 +129,32 @@ pub fn remove_earlier(folder: &Path) -> Result<(), Failure> {
         Failure::new(Exit::CannotCreate, format!("cannot overwrite the record in {}: {error}", folder.display()))
     };
     let Ok(entries) = fs::read_dir(folder) else { return Ok(()) };
+    sources::remove_bench(folder).map_err(cannot)?;
     for entry in entries {
         let entry = entry.map_err(cannot)?;
         let name = entry.file_name().to_string_lossy().into_owned();
-        if FILES.contains(&name.as_str()) || (name.starts_with(SHOWN.0) && name.ends_with(SHOWN.1)) {
+        if FILES.contains(&name.as_str()) || is_shown_levels(&name) {
             fs::remove_file(entry.path()).map_err(cannot)?;
         }
     }
     Ok(())
+}
+
+fn is_shown_levels(name: &str) -> bool {
+    name.starts_with(SHOWN.0) && name.ends_with(SHOWN.1)
+}
+
+/// The names of the levels that were shown, in a record, in order.
+///
+/// # Errors
+/// The folder cannot be read.
+pub fn shown_levels(folder: &Path) -> std::io::Result<Vec<String>> {
+    let mut names = Vec::new();
+    for entry in fs::read_dir(folder)? {
+        names.extend(entry?.file_name().into_string().ok().filter(|name| is_shown_levels(name)));
+    }
+    names.sort();
+    Ok(names)
 }
 
 /// Writes `frames.csv` as the run goes; what a crash can cost is what came since the last [`FrameLog::flush`].
@@ -126,7 +177,7 @@ impl FrameLog {
             )
         };
         fs::create_dir_all(folder).map_err(cannot)?;
-        let path = folder.join("frames.csv");
+        let path = folder.join(FRAMES);
         let file = OpenOptions::new().write(true).create_new(true).open(&path).map_err(|error| match error.kind() {
             std::io::ErrorKind::AlreadyExists => Failure::new(
                 Exit::CannotCreate,
@@ -157,16 +208,18 @@ impl FrameLog {
     pub fn field(&mut self, field: &FieldRecord) -> Result<(), Failure> {
         let frame = self.frames.get(&field.frame);
         let time = |t: Option<TimeNs>| t.map(|t| t.0.to_string()).unwrap_or_default();
+        let order = |order: Option<u32>| order.map(|order| order.to_string()).unwrap_or_default();
         let (on, off) = (field.laser_window.map(|w| w.0), field.laser_window.map(|w| w.1));
         writeln!(
             self.file,
-            "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
             field.frame,
             field.field,
             field.colour,
             time(frame.and_then(|f| f.t_sample)),
             frame.and_then(|f| f.pupil_raw_mm).map(|mm| format!("{mm:.4}")).unwrap_or_default(),
-            frame.map(|f| format!("{:.4}", f.pupil.mm())).unwrap_or_default(),
+            // The shortest text that reads back as the same bits.
+            frame.map(|f| f.pupil.mm().to_string()).unwrap_or_default(),
             frame.map_or("", |f| f.pupil_state),
             time(frame.map(|f| f.t_wake)),
             time(frame.map(|f| f.t_render_begin)),
@@ -179,6 +232,10 @@ impl FrameLog {
             u8::from(field.deadline_missed),
             frame.map(|f| f.picture.number.to_string()).unwrap_or_default(),
             time(frame.and_then(|f| f.picture.t_taken)),
+            frame.and_then(|f| f.levels_xxh3).map(hash_text).unwrap_or_default(),
+            order(frame.map(|f| f.orders.scene)),
+            order(frame.map(|f| f.orders.weights)),
+            order(frame.map(|f| f.orders.pattern)),
         )
         .map_err(|error| self.lost(&error))
     }
@@ -189,7 +246,7 @@ impl FrameLog {
     /// # Errors
     /// The disk's, with the file's name.
     pub fn order(&self, t: TimeNs, request: &Request) -> Result<(), Failure> {
-        let path = self.path.with_file_name("orders.jsonl");
+        let path = self.path.with_file_name(ORDERS);
         let line = serde_json::json!({ "t_ns": t.0, "request": request });
         let file = OpenOptions::new().create(true).append(true).open(&path);
         file.and_then(|mut file| writeln!(file, "{line}")).map_err(|error| lost(&path, &error))
@@ -209,9 +266,14 @@ impl FrameLog {
         }
     }
 
+    /// Whether no frame was ever made.
+    pub fn is_empty(&self) -> bool {
+        self.frames.is_empty()
+    }
+
     /// Takes the file away again where no frame was ever made, so that the same directory may be named again.
     pub fn discard_if_empty(self) {
-        if self.frames.is_empty() {
+        if self.is_empty() {
             let _gone = fs::remove_file(&self.path);
             if let Some(folder) = self.path.parent() {
                 // Fails where something else is in it, which then stays.
@@ -245,9 +307,11 @@ mod tests {
             t_render_end: TimeNs(20),
             t_submit: TimeNs(21),
             t_desired_present: TimeNs(30),
-            picture: PictureTag { number: 4, t_taken: Some(TimeNs(3)) },
+            picture: PictureTag { number: 4, t_taken: Some(TimeNs(3)), order: 2 },
             keep: None,
             amplitude_constant: 1.0,
+            orders: FrameOrders { scene: 2, weights: 0, pattern: 1 },
+            levels_xxh3: Some(0xab),
         }
     }
 
@@ -273,8 +337,11 @@ mod tests {
         log.flush().unwrap();
         let text = fs::read_to_string(folder.path().join("frames.csv")).unwrap();
         let rows: Vec<&str> = text.lines().collect();
-        assert_eq!(rows[1], "7,1,green,5,3.2500,3.3000,tracking,10,11,20,21,30,software,33,36,0,4,3");
-        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0,,");
+        assert_eq!(
+            rows[1],
+            "7,1,green,5,3.2500,3.3,tracking,10,11,20,21,30,software,33,36,0,4,3,00000000000000ab,2,0,1"
+        );
+        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0,,,,,,");
         assert!(rows.iter().all(|row| row.split(',').count() == HEADER.split(',').count()));
     }
 

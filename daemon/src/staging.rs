@@ -1,4 +1,4 @@
-//! Output directories that are never seen half written.
+//! Output directories that are never seen half written, and folders that are taken away again.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -77,6 +77,33 @@ impl Staging {
 impl Drop for Staging {
     fn drop(&mut self) {
         half_done(|folders| folders.retain(|folder| folder != self.beside.path()));
+    }
+}
+
+/// A folder for files that are needed for a while; it goes with this, and when a signal ends the process.
+pub struct Temporary(TempDir);
+
+impl Temporary {
+    /// A new one in the folder for temporary files.
+    ///
+    /// # Errors
+    /// It cannot be made.
+    pub fn new(prefix: &str) -> std::io::Result<Self> {
+        take_away_on_signals();
+        let folder = tempfile::Builder::new().prefix(prefix).tempdir()?;
+        half_done(|folders| folders.push(folder.path().to_owned()));
+        Ok(Self(folder))
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        self.0.path()
+    }
+}
+
+impl Drop for Temporary {
+    fn drop(&mut self) {
+        half_done(|folders| folders.retain(|folder| folder != self.0.path()));
     }
 }
 

@@ -63,7 +63,7 @@ pub use import::{
     SizeUnit,
 };
 pub use profile::{Command, DEFAULT_PROFILE, HidSettings, NetworkSettings, Profile, ProfileError, SerialSettings};
-pub use record::{RecordError, RecordFiles, RecordStatus};
+pub use record::{RecordError, RecordFiles, RecordStatus, with_header};
 pub use refusals::{Refusal, RefusalChange, RefusalWatch};
 pub use sample::{PupilSample, SampleEye};
 pub use simulate::{MOCK_SEED, MockSample, MockSource, Scenario, Script, ScriptError};

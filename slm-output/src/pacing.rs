@@ -146,6 +146,11 @@ impl Pacer {
         }
     }
 
+    /// Gives the next frame this number, where it is above all that were given.
+    pub fn number_next(&mut self, frame_id: u64) {
+        self.last_frame_id = self.last_frame_id.max(frame_id.saturating_sub(1));
+    }
+
     /// Plans the next frame: the first refresh that it can reach and no other frame is for. Where a frame takes longer
     /// than a refresh, it keeps to every n-th.
     pub fn predict(&mut self, now: TimeNs) -> FramePlan {

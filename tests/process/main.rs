@@ -11,6 +11,7 @@ mod page;
 mod panel;
 mod pattern;
 mod pictures;
+mod report;
 mod shutdown;
 mod tracker;
 

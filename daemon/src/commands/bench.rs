@@ -225,6 +225,7 @@ fn closed_loop(args: &BenchArgs, rig: Rig, weights: Weights, frames: scene::Fram
         frame_limit: None,
         duration: Some(args.duration),
         keep_levels: false,
+        hash_levels: false,
     };
     let Summary { duration_s, frames_shown_hz, figures, .. } = session::run(plan, &mut Nobody)?.summary;
     let Figures { frames_shown, panel_frames_hz, frame_time, sample_to_photon, .. } = figures;

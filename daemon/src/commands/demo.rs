@@ -72,6 +72,7 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
             frame_limit: None,
             duration: Some(args.duration),
             keep_levels: true,
+            hash_levels: false,
         },
         &mut log,
     )?;

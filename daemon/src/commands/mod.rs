@@ -9,6 +9,7 @@ mod laser;
 mod log;
 mod pattern;
 mod render;
+mod report;
 mod run;
 mod status;
 mod tracker;
@@ -36,6 +37,7 @@ pub fn dispatch(cli: Cli) -> Result<(), Failure> {
         Some(Command::Pattern(kind)) => pattern::pattern(&kind),
         Some(Command::Status(args)) => status::status(&args),
         Some(Command::Ctl(args)) => ctl::ctl(&args),
+        Some(Command::Report(args)) => report::report(&args),
         Some(Command::Tracker(command)) => tracker::tracker(&command),
         Some(Command::Log(command)) => log::log(&command),
         Some(Command::Laser(command)) => laser::laser(&command),

@@ -1,22 +1,23 @@
-//! `holod run`: the daemon.
+//! `holod run`: the daemon, and a report that is shown again.
 
 use std::path::Path;
 use std::sync::Arc;
 
-use holod_calibration::TimeNs;
 use holod_calibration::rig::Rig;
-use holod_pupil_input::{RecordFiles, TrackerSpec};
-use holod_slm_output::{FieldEvent, OutputSpec};
+use holod_pupil_input::{RecordFiles, ReplaySpeed, TrackerSpec};
+use holod_slm_output::OutputSpec;
+use serde::Serialize;
 
-use crate::cli::RunArgs;
-use crate::control::{Request, RigReader};
+use crate::bug_report::{self, Outcome, Played};
+use crate::cli::{FitArg, RigArgs, RunArgs};
+use crate::control::RigReader;
 use crate::failure::{Exit, Failure};
 use crate::page::Page;
 use crate::pictures::levels_picture;
 use crate::progress;
-use crate::record::{self, FieldRecord, FrameLog, FrameRecord};
+use crate::record::{self, Recorder};
 use crate::report;
-use crate::session::{self, Observer, SessionPlan, SessionReport, not_dark};
+use crate::session::{self, SessionPlan, SessionReport, Summary, not_dark};
 use crate::{setup, source};
 
 /// Scenario of the built-in tracker.
@@ -24,18 +25,22 @@ const SAMPLE_TRACKER: &str = "mock";
 
 pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let output: OutputSpec = args.output.parse().map_err(Failure::because(Exit::Usage))?;
+    if let Some(spec) = &args.tracker
+        && let Some(report) = report_of(spec)?
+    {
+        return replay(args, output, &report);
+    }
     let rig = rig_of(args)?;
     let spec = rig.tracker.spec.clone().unwrap_or_else(|| SAMPLE_TRACKER.to_owned());
     let tracker: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
     tracing::info!("{}: tracker {tracker}, panel {output} of {}", rig.name, rig.resolution());
     let weights = progress::during("loading the network", || setup::weights(&rig))?;
     let pictures = progress::during("loading the scene", || source::named(&args.scene, &rig.geometry))?;
-    if let Some(folder) = args.record.as_deref().filter(|_| args.force) {
-        record::remove_earlier(folder)?;
-    }
+    remove_earlier_record(args)?;
     let page = Page::open(&args.page)?;
-    let log = args.record.as_deref().map(FrameLog::create).transpose()?;
-    let mut observers = (log.map(Recorder), page);
+    let recorder = |folder| Recorder::create(folder, args, &rig, pictures.resolution());
+    let recorder = args.record.as_deref().map(recorder).transpose()?;
+    let mut observers = (recorder.map(|recorder| recorder.with_tracker(tracker.to_string())), page);
     let network = weights.config();
     tracing::info!(
         "{} of {} by network {} {}",
@@ -58,26 +63,139 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         frame_limit: args.frames,
         duration: args.duration,
         keep_levels: args.record.is_some(),
+        hash_levels: args.record.is_some(),
     };
     let session = match session::run(plan, &mut observers) {
         Ok(session) => session,
         Err(failure) => {
-            if let (Some(Recorder(log)), _) = observers {
-                log.discard_if_empty();
+            if let (Some(recorder), _) = observers {
+                recorder.fail(&failure);
             }
             return Err(failure);
         }
     };
-    if let ((Some(Recorder(log)), _), Some(folder)) = (&mut observers, &args.record) {
-        log.flush()?;
+    if let ((Some(recorder), _), Some(folder)) = (&mut observers, &args.record) {
+        recorder.finish()?;
         save(&session, folder)?;
     }
-    if args.json {
-        report::print_json(&session.summary)?;
-    } else {
-        report::print(&report::summary_text(&session.summary))?;
+    tell(args, &session.summary, None)
+}
+
+/// Overwrites the record that is there, where that is asked for.
+fn remove_earlier_record(args: &RunArgs) -> Result<(), Failure> {
+    args.record.as_deref().filter(|_| args.force).map_or(Ok(()), record::remove_earlier)
+}
+
+/// The report that a tracker's spec names.
+fn report_of(spec: &str) -> Result<Option<TrackerSpec>, Failure> {
+    let spec: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
+    let (TrackerSpec::Path(path) | TrackerSpec::Replay { path, .. }) = &spec else { return Ok(None) };
+    Ok(bug_report::is_archive(path).then_some(spec))
+}
+
+/// Shows the frames of a report again.
+fn replay(args: &RunArgs, output: OutputSpec, tracker: &TrackerSpec) -> Result<(), Failure> {
+    refuse_options(args, tracker)?;
+    let (TrackerSpec::Path(path) | TrackerSpec::Replay { path, .. }) = tracker else { return Ok(()) };
+    let unpacked = progress::during("unpacking the report", || bug_report::unpack(path))?;
+    let Played { rig, pictures, backend, playback, comparison, config, scene } =
+        progress::during("reading what its frames are made of", || bug_report::prepare(&unpacked, args.backend))?;
+    let weights = progress::during("loading the network", || setup::weights(&rig))?;
+    remove_earlier_record(args)?;
+    let page = Page::open(&args.page)?;
+    let of_report = RunArgs { rig: RigArgs { config: Some(config) }, scene, ..args.clone() };
+    let recorder = |folder| Recorder::create(folder, &of_report, &rig, pictures.resolution());
+    let recorder = args.record.as_deref().map(recorder).transpose()?;
+    let recorder = recorder.map(|recorder| recorder.with_tracker(tracker.to_string()));
+    let frames = playback.frames();
+    tracing::info!("{frames} frames of {} are made again, with simulated lasers", path.display());
+    let plan = SessionPlan {
+        rig,
+        rig_again: None,
+        weights,
+        backend,
+        pictures,
+        output,
+        tracker: tracker.clone(),
+        pupil: None,
+        record_tracker: None,
+        frame_limit: Some(args.frames.map_or(frames, |asked| asked.min(frames))),
+        duration: args.duration,
+        keep_levels: args.record.is_some(),
+        hash_levels: true,
+    };
+    let mut observers = ((recorder, page), comparison);
+    let played = session::play(plan, playback, &mut observers);
+    let ((mut recorder, _), comparison) = observers;
+    let session = match played {
+        Ok(session) => session,
+        Err(failure) => {
+            if let Some(recorder) = recorder {
+                recorder.fail(&failure);
+            }
+            return Err(failure);
+        }
+    };
+    if let (Some(recorder), Some(folder)) = (&mut recorder, &args.record) {
+        recorder.finish()?;
+        save(&session, folder)?;
     }
-    match &session.summary.lasers_not_dark {
+    let outcome = comparison.finish(&session.summary.figures.engine);
+    tell(args, &session.summary, Some(&outcome))?;
+    if outcome.differs() {
+        let (frames, fields) = (outcome.frames_different, outcome.fields_different);
+        let differs = format!("{frames} frames have other levels than the report's, {fields} other colour fields");
+        return Err(Failure::new(Exit::Different, differs));
+    }
+    Ok(())
+}
+
+/// Refuses what a report brings itself.
+fn refuse_options(args: &RunArgs, tracker: &TrackerSpec) -> Result<(), Failure> {
+    let own_pace =
+        matches!(tracker, TrackerSpec::Replay { speed, repeat, .. } if *repeat || *speed != ReplaySpeed::Times(1.0));
+    let given = [
+        ("speed= and loop", own_pace),
+        ("--config", args.rig.config.is_some()),
+        ("--weights", args.network.weights.is_some()),
+        ("--scene", args.scene.scene.is_some()),
+        ("--depth-encoding", args.scene.depth_encoding.is_some()),
+        ("--fit", args.scene.fit != FitArg::Native),
+        ("--resolution", args.scene.resolution.is_some()),
+        ("--pupil", args.pupil.is_some()),
+        ("--eye", args.eye.is_some()),
+        ("--scale", args.scale.is_some()),
+    ];
+    match given.into_iter().find(|(_, is_given)| *is_given) {
+        None => Ok(()),
+        Some((option, _)) => Err(Failure::new(
+            Exit::Usage,
+            format!(
+                "{option}: a report brings its own rig, weights, scene and pupils, and is shown at the panel's pace; leave \
+                 the option out"
+            ),
+        )),
+    }
+}
+
+/// A run that is over, and how a report came out.
+#[derive(Serialize)]
+struct Told<'a> {
+    #[serde(flatten)]
+    summary: &'a Summary,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    report: Option<&'a Outcome>,
+}
+
+/// Says what the run came to.
+fn tell(args: &RunArgs, summary: &Summary, outcome: Option<&Outcome>) -> Result<(), Failure> {
+    if args.json {
+        report::print_json(&Told { summary, report: outcome })?;
+    } else {
+        report::print(&report::summary_text(summary))?;
+        outcome.map_or(Ok(()), |outcome| report::print(&outcome.text()))?;
+    }
+    match &summary.lasers_not_dark {
         None => Ok(()),
         Some(why) => Err(Failure::new(Exit::Unavailable, not_dark(why))),
     }
@@ -101,25 +219,4 @@ fn save(session: &SessionReport, folder: &Path) -> Result<(), Failure> {
         report::save_png(&levels_picture(levels), &folder.join(name))?;
     }
     Ok(())
-}
-
-struct Recorder(FrameLog);
-
-impl Observer for Recorder {
-    fn frame(&mut self, record: &FrameRecord) -> Result<(), Failure> {
-        self.0.frame(*record);
-        Ok(())
-    }
-
-    fn field(&mut self, event: &FieldEvent) -> Result<(), Failure> {
-        self.0.field(&FieldRecord::of(event))
-    }
-
-    fn order(&mut self, t: TimeNs, request: &Request) -> Result<(), Failure> {
-        self.0.order(t, request)
-    }
-
-    fn tick(&mut self) -> Result<(), Failure> {
-        self.0.flush()
-    }
 }

@@ -101,6 +101,11 @@ impl Request {
         *self != Self::Status
     }
 
+    /// Whether frames may have other levels after it.
+    fn changes_levels(&self) -> bool {
+        !matches!(self, Self::Status | Self::LasersDark | Self::LasersArm | Self::Stop)
+    }
+
     /// Whether files must be read or an engine opened for it, which takes a while.
     fn takes_long(&self) -> bool {
         matches!(

@@ -44,6 +44,8 @@ pub(crate) struct Preparer {
     pub(crate) backend: Backend,
     pub(crate) encoder: Arc<PanelEncoder>,
     pub(crate) has_feed: bool,
+    /// Frames of a record are made again, with what they were made of.
+    pub(crate) plays: bool,
     pub(crate) stall_timeout: TimeNs,
 }
 
@@ -62,6 +64,13 @@ impl Preparer {
     /// # Errors
     /// Why it cannot be done: in words, for whoever asked.
     pub(crate) fn prepare(&self, request: &Request) -> Result<Order, String> {
+        if self.plays && request.changes_levels() {
+            return Err(
+                "a report is shown again, with what its frames were made of: `status`, `lasers` and `stop` are \
+                        obeyed"
+                    .into(),
+            );
+        }
         match request {
             Request::Status => Ok(Order::Status),
             Request::Pause => Ok(Order::Pause(true)),

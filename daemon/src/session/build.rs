@@ -1,12 +1,12 @@
 //! The beginning of a run: every part is opened, then the frame thread starts.
 
 use std::sync::atomic::{AtomicBool, AtomicU64};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
 use holod_calibration::TimeNs;
 use holod_model::engine::EngineError;
-use holod_pupil_input::{ReplaySpeed, Tracker, TrackerOptions, TrackerSpec};
+use holod_pupil_input::{ReplaySpeed, Tracker, TrackerHandle, TrackerOptions, TrackerSpec};
 use holod_slm_output::laser::open_laser;
 use holod_slm_output::output::{OutputError, pacing_config};
 use holod_slm_output::present::{PanelSetup, open_panel};
@@ -14,6 +14,7 @@ use holod_slm_output::{LevelsFrame, Output, OutputControl, OutputOptions, Pacer,
 
 use super::desk::{Changes, Desk};
 use super::frame_loop::{FrameLoop, TrainedPupils};
+use super::inputs::{Followed, Inputs, Playback};
 use super::keep::KEEP_SLOTS;
 use super::laser_watch::LaserBoxWatch;
 use super::output_watch::OutputWatch;
@@ -25,6 +26,7 @@ use super::watch::{Limits, Names, Rings, Told, Watch};
 use super::{Began, Observer, RECORDS, SessionPlan, Signals, host_now, scheduling, tracker_failure};
 use crate::control::{self, Preparer, Steering};
 use crate::failure::{Exit, Failure};
+use crate::record::FrameOrders;
 use crate::renderer::{self, Renderer};
 use crate::source::OpenPictures;
 use crate::status::StatusFile;
@@ -58,9 +60,18 @@ pub(super) struct Session<'a> {
 }
 
 /// Starts everything. What has been started is taken down again where a later part cannot be.
-pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Observer) -> Result<Session<'_>, Failure> {
+/// Where there is a playback, no tracker is opened, and its frames are made.
+pub(super) fn build(
+    plan: SessionPlan,
+    playback: Option<Playback>,
+    signals: Signals,
+    observer: &mut dyn Observer,
+) -> Result<Session<'_>, Failure> {
     // Its threads keep the priority of whoever calls it first, which must not be the panel's.
     scheduling::patient(rayon::current_num_threads);
+    let plays = playback.is_some();
+    let is_all = playback.as_ref().is_some_and(|playback| plan.frame_limit == Some(playback.cues.len() as u64));
+    let frames_over = if is_all { "the end of the report" } else { "the asked number of frames" };
     let resolution = plan.pictures.resolution();
     let rig = &plan.rig;
     let encoder = progress::during(&format!("preparing the levels of the panel of {}", rig.resolution()), || {
@@ -83,9 +94,12 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         record: plan.record_tracker.clone(),
         forbidden: setup::ports_of_others(rig),
     };
-    let (estimates, tap, tracker) = scheduling::prompt(|| Tracker::start(&plan.tracker, &rig.tracker, tracker_options))
-        .map_err(tracker_failure)?
-        .split();
+    let tracker = if plays {
+        TrackerHandle::ended(&rig.tracker)
+    } else {
+        scheduling::prompt(|| Tracker::start(&plan.tracker, &rig.tracker, tracker_options)).map_err(tracker_failure)?
+    };
+    let (estimates, tap, tracker) = tracker.split();
     for warning in tracker.warnings() {
         tracing::warn!("{warning}");
     }
@@ -125,22 +139,29 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         backend: plan.backend,
         encoder: Arc::clone(&encoder),
         has_feed: feed.is_some(),
+        plays,
         stall_timeout: options.stall_timeout,
     };
+    let inputs = match playback {
+        Some(playback) => Inputs::Recorded(playback),
+        None => Inputs::Followed(Followed { pupil: estimates, pictures, steering: Arc::clone(&steering) }),
+    };
     let frame_loop = FrameLoop {
-        pupil: estimates,
+        inputs,
         renderer,
         port: output.frames,
         pacer: Pacer::new(pacing, host_now()),
-        pictures,
         trained: TrainedPupils::of(plan.weights.trained_pupils(&rig.geometry)),
-        steering: Arc::clone(&steering),
         pattern: None,
+        orders: FrameOrders::default(),
         changes: change_consumer,
         retired: retired_producer,
         records: record_producer,
         records_lost: Arc::clone(&records_lost),
         keep_levels: plan.keep_levels,
+        hash_levels: plan.hash_levels,
+        submitted: 0,
+        shown: 0,
         limit: plan.frame_limit,
         engine: Arc::clone(&engine),
         stop: Arc::clone(&stop),
@@ -150,9 +171,21 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
         .spawn(move || frame_loop.run())
         .map_err(Failure::because(Exit::Unavailable))?;
 
-    observer.began(&mut Began { t_origin, rig: plan.rig.clone(), encoder: Arc::clone(&encoder), look: output.look });
-    let limits =
-        Limits { t_origin, frames: plan.frame_limit, duration: plan.duration, replay_ends_run: replay_ends_run(&plan) };
+    let engine_now = engine.lock().unwrap_or_else(PoisonError::into_inner).clone();
+    observer.began(&mut Began {
+        t_origin,
+        rig: plan.rig.clone(),
+        encoder: Arc::clone(&encoder),
+        engine: engine_now,
+        look: output.look,
+    });
+    let limits = Limits {
+        t_origin,
+        frames: plan.frame_limit,
+        frames_over,
+        duration: plan.duration,
+        replay_ends_run: !plays && replay_ends_run(&plan),
+    };
     let names = Names {
         scene,
         tracker: plan.tracker.to_string(),
@@ -169,6 +202,7 @@ pub(super) fn build(plan: SessionPlan, signals: Signals, observer: &mut dyn Obse
     };
     let watch = Watch {
         names,
+        plays,
         rings,
         panel: OutputWatch::new(output.panel_events, rig.panel.refresh_hz),
         laser_box: LaserBoxWatch::new(output.laser_faults, output.laser_watch),

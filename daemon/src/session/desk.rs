@@ -30,7 +30,8 @@ const BUSY: &str = "the frame loop has not taken the last change yet: ask again"
 pub(super) struct Changes {
     pub(super) steering: Arc<Steering>,
     pub(super) sink: Arc<Mutex<PictureSink>>,
-    pub(super) places: rtrb::Producer<Change>,
+    /// With the number of the order that brings it.
+    pub(super) places: rtrb::Producer<(u32, Change)>,
     pub(super) retired: rtrb::Consumer<Change>,
     /// The weights that are in use, for those who make requests ready.
     pub(super) weights: Arc<Mutex<WeightsChoice>>,
@@ -41,6 +42,8 @@ pub(super) struct Desk {
     server: Option<(ControlServer, mpsc::Receiver<Ordered>)>,
     changes: Changes,
     keeps_dark: bool,
+    /// Orders that took effect: lines of `orders.jsonl`.
+    orders: u32,
     /// What is shown in place of holograms.
     pattern: Option<String>,
 }
@@ -58,7 +61,7 @@ impl Desk {
                 None
             }
         };
-        Self { server, changes, keeps_dark: false, pattern: None }
+        Self { server, changes, keeps_dark: false, orders: 0, pattern: None }
     }
 
     pub(super) fn socket(&self) -> Option<PathBuf> {
@@ -102,6 +105,11 @@ impl Desk {
         }
     }
 
+    /// The number of the order that is being carried out.
+    fn next_order(&self) -> u32 {
+        self.orders + 1
+    }
+
     fn next(&self) -> Option<Ordered> {
         self.server.as_ref()?.1.try_recv().ok()
     }
@@ -129,6 +137,7 @@ impl Watch<'_> {
             if (done.is_ok() || is_urgent) && request.changes_something() {
                 let request_text = serde_json::to_string(&request).unwrap_or_default();
                 tracing::info!("asked for: {request_text}");
+                self.desk.orders += 1;
                 self.observer.order(now, &request)?;
                 self.write_status(&output.counts(), now);
             }
@@ -144,6 +153,7 @@ impl Watch<'_> {
 
     fn carry_out(&mut self, order: Order, output: &OutputControl, now: TimeNs) -> Result<Value, String> {
         let sink = |desk: &Desk| Arc::clone(&desk.changes.sink);
+        let number = self.desk.next_order();
         match order {
             Order::Status => {
                 let snapshot = self.snapshot(&output.counts(), now);
@@ -153,7 +163,7 @@ impl Watch<'_> {
                 self.names.scene.clone_from(&frames.name);
                 let later = if self.desk.is_paused() { " once the picture goes on: `holod ctl resume`" } else { "" };
                 let said = format!("{} is shown{later}", frames.name);
-                sink(&self.desk).lock().unwrap_or_else(PoisonError::into_inner).show_scene(frames, now);
+                sink(&self.desk).lock().unwrap_or_else(PoisonError::into_inner).show_scene(frames, now, number);
                 Ok(said.into())
             }
             Order::Feed => {
@@ -249,7 +259,8 @@ impl Watch<'_> {
     }
 
     fn change(&mut self, change: Change) -> Result<(), String> {
-        self.desk.changes.places.push(change).map_err(|_| BUSY.to_owned())
+        let number = self.desk.next_order();
+        self.desk.changes.places.push((number, change)).map_err(|_| BUSY.to_owned())
     }
 
     fn keep_dark(&mut self, dark: bool, output: &OutputControl) -> Result<Value, String> {

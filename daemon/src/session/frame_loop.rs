@@ -6,46 +6,41 @@ use std::time::Duration;
 
 use holod_calibration::{PupilDiameter, TimeNs};
 use holod_model::engine::EngineError;
-use holod_pupil_input::{EstimateReader, PupilState};
 use holod_slm_output::pacing::Point;
 use holod_slm_output::{FramePlan, FramePort, LevelsFrame, Pacer};
 
 use super::host_now;
+use super::inputs::{FrameContent, Inputs};
 use super::keep::keep_slot;
-use crate::control::Steering;
-use crate::record::FrameRecord;
+use crate::record::{FrameOrders, FrameRecord, levels_xxh3};
 use crate::renderer::{Rendered, Renderer};
-use crate::source::{PictureSource, PictureTag};
+use crate::source::PictureTag;
 
 /// An order to stop is seen within this time.
 const LONGEST_SLEEP: Duration = Duration::from_millis(20);
 
-/// A pupil is not predicted farther ahead than this; slower frames use the prediction for this time.
-const FARTHEST_PREDICTION: TimeNs = TimeNs(200_000_000);
-
-/// What stands in place of the estimator's state where a person has fixed the pupil.
-pub(super) const FIXED_PUPIL: &str = "fixed";
+/// How often the panel is asked whether it has shown a frame, and after which time it is not waited for any more.
+const PANEL_POLL: Duration = Duration::from_micros(500);
+const LONGEST_WAIT: TimeNs = TimeNs(1_000_000_000);
 
 /// Everything that a frame needs, allocated before the first one.
 pub(super) struct FrameLoop {
-    /// The tracker's newest estimate.
-    pub pupil: EstimateReader,
+    /// Where pupils and pictures come from.
+    pub inputs: Inputs,
     /// Frame and pupil to levels.
     pub renderer: Box<dyn Renderer>,
     /// Levels to the panel.
     pub port: FramePort,
     /// Which refresh each frame is for.
     pub pacer: Pacer,
-    /// What to show.
-    pub pictures: PictureSource,
     /// The pupils that the network knows.
     pub trained: TrainedPupils,
-    /// What a person changes.
-    pub steering: Arc<Steering>,
     /// Levels that take the place of what would be computed.
     pub pattern: Option<Box<LevelsFrame>>,
-    /// What takes another's place.
-    pub changes: rtrb::Consumer<Change>,
+    /// The orders that brought engine and pattern.
+    pub orders: FrameOrders,
+    /// What takes another's place, with the order that brings it.
+    pub changes: rtrb::Consumer<(u32, Change)>,
     /// Whose place was taken: giving back what it has is nothing for this thread.
     pub retired: rtrb::Producer<Change>,
     /// To whoever records.
@@ -54,6 +49,11 @@ pub(super) struct FrameLoop {
     pub records_lost: Arc<AtomicU64>,
     /// Whether presented levels are kept by pupil.
     pub keep_levels: bool,
+    /// Whether all levels are told by their hash.
+    pub hash_levels: bool,
+    /// The newest frame that the panel was handed, and the newest that it has shown.
+    pub submitted: u64,
+    pub shown: u64,
     /// Frames to make; without end where absent.
     pub limit: Option<u64>,
     /// How holograms are computed, for the status.
@@ -82,6 +82,11 @@ impl TrainedPupils {
         Self { narrowest, widest }
     }
 
+    /// Their two ends.
+    pub(super) fn ends(self) -> [PupilDiameter; 2] {
+        [self.narrowest, self.widest]
+    }
+
     fn contain(self, pupil: PupilDiameter) -> bool {
         (self.narrowest..=self.widest).contains(&pupil)
     }
@@ -108,12 +113,18 @@ impl FrameLoop {
     pub(super) fn run(mut self) -> Result<(), EngineError> {
         let mut made = 0;
         while !self.stop.load(Ordering::Acquire) && self.limit.is_none_or(|limit| made < limit) {
+            if let Inputs::Recorded(playback) = &self.inputs {
+                self.pacer.number_next(playback.frame());
+            }
             let plan = self.pacer.predict(host_now());
             if !self.sleep_until(plan.t_wake) {
                 break;
             }
             self.frame(plan)?;
             made += 1;
+            if let Inputs::Recorded(playback) = &mut self.inputs {
+                playback.advance();
+            }
         }
         Ok(())
     }
@@ -122,55 +133,54 @@ impl FrameLoop {
     fn frame(&mut self, plan: FramePlan) -> Result<(), EngineError> {
         self.make_changes();
         let t_wake = self.mark(Point::WakeUp, plan);
-        let state = self.pupil.pupil_at(t_wake).state;
-        let mut estimate = self.pupil.pupil_at(plan.t_predicted_photon.min(t_wake + FARTHEST_PREDICTION));
-        let fixed = self.steering.fixed_pupil();
-        if let Some(pupil) = fixed {
-            estimate.pupil = pupil;
-        }
-        if fixed.is_some() || self.pattern.is_some() {
-            (estimate.t_sample, estimate.raw_mm) = (None, None);
-        }
+        let mut pupil = self.inputs.pupil(t_wake, plan.t_predicted_photon);
 
         let t_render_begin = self.mark(Point::RenderBegin, plan);
-        let (frame, picture) = if self.steering.is_paused() {
-            self.pictures.same_again()
-        } else {
-            self.pictures.at(plan.t_predicted_photon)
-        };
-        let rendered = match &self.pattern {
-            None => self.renderer.render(frame, estimate.pupil, self.port.acquire())?,
+        let FrameContent { picture, mut tag, pattern } = self.inputs.content(plan.t_predicted_photon);
+        let pattern = pattern.or(self.pattern.as_deref());
+        let rendered = match pattern {
+            None => self.renderer.render(picture, pupil.pupil, self.port.acquire())?,
             Some(pattern) => {
                 self.port.acquire().copy_from(pattern);
                 Rendered::default()
             }
         };
+        let is_hologram = pattern.is_none();
+        self.orders.scene = tag.order;
+        if !is_hologram {
+            (pupil.t_sample, pupil.raw_mm, tag) = (None, None, PictureTag::default());
+        }
         if rendered.engine_changed {
             // It happens when a device is lost, which took longer than any lock.
             self.renderer.description().clone_into(&mut self.engine.lock().unwrap_or_else(PoisonError::into_inner));
         }
         let t_render_end = self.mark(Point::RenderEnd, plan);
 
-        let is_meant = self.pattern.is_none() && (fixed.is_some() || state != PupilState::Fallback);
-        let keep = if self.keep_levels && is_meant { keep_slot(estimate.pupil) } else { None };
+        let levels_xxh3 = self.hash_levels.then(|| levels_xxh3(self.port.acquire()));
+        let keep = if self.keep_levels && is_hologram && pupil.is_meant() { keep_slot(pupil.pupil) } else { None };
+        if matches!(self.inputs, Inputs::Recorded(_)) {
+            self.wait_for_the_panel();
+        }
         let t_submit = host_now();
         let record = LoopRecord {
             frame: FrameRecord {
                 frame: plan.frame_id,
-                t_sample: estimate.t_sample,
-                pupil_raw_mm: estimate.raw_mm,
-                pupil: estimate.pupil,
-                pupil_state: if fixed.is_some() { FIXED_PUPIL } else { state.name() },
+                t_sample: pupil.t_sample,
+                pupil_raw_mm: pupil.raw_mm,
+                pupil: pupil.pupil,
+                pupil_state: pupil.state,
                 t_wake,
                 t_render_begin,
                 t_render_end,
                 t_submit,
                 t_desired_present: plan.t_desired_present,
-                picture: if self.pattern.is_some() { PictureTag::default() } else { picture },
+                picture: tag,
                 keep,
                 amplitude_constant: self.renderer.amplitude_constant(),
+                orders: self.orders,
+                levels_xxh3,
             },
-            beyond_trained: !self.trained.contain(estimate.pupil),
+            beyond_trained: !self.trained.contain(pupil.pupil),
             clipped_share: rendered.clipped_share,
             unreachable_share: rendered.unreachable_share.0.into_iter().fold(0.0, f32::max),
         };
@@ -180,18 +190,43 @@ impl FrameLoop {
         }
         self.port.submit(&plan, keep, t_submit);
         self.pacer.mark(Point::Submit, plan.frame_id, t_submit);
-        self.port.feed(&mut self.pacer, |_| ());
+        self.submitted = plan.frame_id;
+        self.hear_the_panel();
         Ok(())
     }
 
+    fn hear_the_panel(&mut self) {
+        let shown = &mut self.shown;
+        self.port.feed(&mut self.pacer, |report| *shown = (*shown).max(report.frame_id));
+    }
+
+    /// Lets the panel show the last frame before another one takes its place: of a record all are to be seen.
+    fn wait_for_the_panel(&mut self) {
+        let t_give_up = host_now() + LONGEST_WAIT;
+        while self.shown < self.submitted && host_now() < t_give_up && !self.stop.load(Ordering::Acquire) {
+            std::thread::sleep(PANEL_POLL);
+            self.hear_the_panel();
+        }
+    }
+
     fn make_changes(&mut self) {
-        while let Ok(change) = self.changes.pop() {
+        if let Inputs::Recorded(playback) = &mut self.inputs {
+            playback.change_engine(&mut self.renderer, &mut self.trained);
+            self.orders = playback.orders();
+        }
+        while let Ok((order, change)) = self.changes.pop() {
             let retired = match change {
-                Change::Engine(renderer, trained) => Change::Engine(
-                    std::mem::replace(&mut self.renderer, renderer),
-                    std::mem::replace(&mut self.trained, trained),
-                ),
-                Change::Pattern(pattern) => Change::Pattern(std::mem::replace(&mut self.pattern, pattern)),
+                Change::Engine(renderer, trained) => {
+                    self.orders.weights = order;
+                    Change::Engine(
+                        std::mem::replace(&mut self.renderer, renderer),
+                        std::mem::replace(&mut self.trained, trained),
+                    )
+                }
+                Change::Pattern(pattern) => {
+                    self.orders.pattern = order;
+                    Change::Pattern(std::mem::replace(&mut self.pattern, pattern))
+                }
             };
             assert!(self.retired.push(retired).is_ok(), "there is room for as many as are sent");
         }

@@ -3,6 +3,7 @@
 mod build;
 mod desk;
 mod frame_loop;
+mod inputs;
 mod keep;
 mod laser_watch;
 mod ledger;
@@ -36,6 +37,7 @@ use crate::fault::host_now;
 #[cfg(not(feature = "fault-injection"))]
 use holod_pupil_input::host_now;
 
+pub(crate) use self::inputs::{Cue, Playback, pupil_state_named};
 pub use self::ledger::LaserSummary;
 pub use self::observer::{Began, FirstLight, Observer};
 pub(crate) use self::service::{Hangup, Signals};
@@ -59,7 +61,7 @@ pub struct SessionPlan {
     pub output: OutputSpec,
     /// The pupil that holograms are made for, where it is not the tracker's.
     pub pupil: Option<PupilDiameter>,
-    /// Where samples come from.
+    /// Where samples come from; nothing is opened where a record is played.
     pub tracker: TrackerSpec,
     /// Where the tracker's bytes and samples are written down.
     pub record_tracker: Option<RecordFiles>,
@@ -69,6 +71,8 @@ pub struct SessionPlan {
     pub duration: Option<Duration>,
     /// Keep the levels that the panel showed, the newest for each half millimetre of pupil.
     pub keep_levels: bool,
+    /// Tell the levels of each frame by their hash.
+    pub hash_levels: bool,
 }
 
 /// Frame records on their way to the control thread.
@@ -79,11 +83,31 @@ const RECORDS: usize = 1024;
 /// # Errors
 /// What could not be started, or the observer's failure; in both cases everything has been taken down.
 pub fn run(plan: SessionPlan, observer: &mut dyn Observer) -> Result<SessionReport, Failure> {
+    run_with(plan, None, observer)
+}
+
+/// Runs the same loop with the frames of a record, in place of what tracker and pictures would bring.
+///
+/// # Errors
+/// As [`run`].
+pub(crate) fn play(
+    plan: SessionPlan,
+    playback: Playback,
+    observer: &mut dyn Observer,
+) -> Result<SessionReport, Failure> {
+    run_with(plan, Some(playback), observer)
+}
+
+fn run_with(
+    plan: SessionPlan,
+    playback: Option<Playback>,
+    observer: &mut dyn Observer,
+) -> Result<SessionReport, Failure> {
     let on_hangup = if plan.rig_again.is_some() { Hangup::for_a_daemon() } else { Hangup::Ends };
     let signals = Signals::install(on_hangup)?;
     #[cfg(feature = "fault-injection")]
     crate::fault::install()?;
-    let mut session = build::build(plan, signals, observer)?;
+    let mut session = build::build(plan, playback, signals, observer)?;
     let ended = session.watch.until_the_end(&session.limits, &session.output, &session.frame_thread);
     take_down::take_down(session, ended)
 }

@@ -55,6 +55,8 @@ pub struct Began {
     pub rig: Rig,
     /// Turns levels back into phase.
     pub encoder: Arc<PanelEncoder>,
+    /// How holograms are computed.
+    pub engine: String,
     /// Looks at the panel: for the first observer that takes it.
     pub look: Option<PanelLook>,
 }

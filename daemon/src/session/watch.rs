@@ -13,7 +13,8 @@ use holod_slm_output::output::OutputCounts;
 use holod_slm_output::{FieldEvent, OutputControl};
 
 use super::desk::Desk;
-use super::frame_loop::{FIXED_PUPIL, LoopRecord};
+use super::frame_loop::LoopRecord;
+use super::inputs::FIXED_PUPIL;
 use super::laser_watch::LaserBoxWatch;
 use super::output_watch::OutputWatch;
 use super::rate_watch::RateWatch;
@@ -38,6 +39,8 @@ const LAST_FRAME_WAIT: TimeNs = TimeNs(1_000_000_000);
 pub(super) struct Watch<'a> {
     pub(super) rig: Rig,
     pub(super) names: Names,
+    /// Frames of a record are made again.
+    pub(super) plays: bool,
     pub(super) rings: Rings,
     pub(super) panel: OutputWatch,
     pub(super) laser_box: LaserBoxWatch,
@@ -116,6 +119,8 @@ impl State {
 pub(super) struct Limits {
     pub(super) t_origin: TimeNs,
     pub(super) frames: Option<u64>,
+    /// What has ended a run that made them all.
+    pub(super) frames_over: &'static str,
     pub(super) duration: Option<Duration>,
     pub(super) replay_ends_run: bool,
 }
@@ -168,7 +173,7 @@ impl Watch<'_> {
                     return Ok("the engine's failure".to_owned());
                 }
                 if self.tally.newest_frame_shown() || now >= t_end {
-                    return Ok("the asked number of frames".to_owned());
+                    return Ok(limits.frames_over.to_owned());
                 }
             }
         }
@@ -239,7 +244,8 @@ impl Watch<'_> {
         let lit = output.armed && self.tally.frames_shown > 0;
         let link = self.tracker.link();
         let is_fixed = self.tally.newest_state == FIXED_PUPIL;
-        let follows = is_fixed || link == Link::Up && self.tally.newest_state != PupilState::Fallback.name();
+        let follows =
+            self.plays || is_fixed || link == Link::Up && self.tally.newest_state != PupilState::Fallback.name();
         let state = match (lit, follows) {
             (false, _) => State::Dark,
             (true, false) => State::Degraded,

@@ -57,6 +57,11 @@ fn feed_socket(spec: &str) -> Option<Option<&str>> {
     if spec == "feed" { Some(None) } else { spec.strip_prefix("feed:").map(Some) }
 }
 
+/// Whether a live feed is named.
+pub(crate) fn is_feed(spec: &str) -> bool {
+    feed_socket(spec).is_some()
+}
+
 /// The scene or the feed that was named.
 ///
 /// # Errors
@@ -106,7 +111,7 @@ pub fn open(pictures: &Pictures, geometry: &DisplayGeometry, t_start: TimeNs) ->
 #[derive(Clone)]
 enum Shown {
     /// A scene, from the time at which it begins.
-    Scene { frames: Arc<Frames>, t_start: TimeNs },
+    Scene { frames: Arc<Frames>, t_start: TimeNs, order: u32 },
     /// One picture of a live feed.
     Live { frame: Arc<RgbdFrame>, tag: PictureTag },
 }
@@ -118,17 +123,21 @@ pub struct PictureTag {
     pub number: u64,
     /// When a feed's client took it, or else when it came.
     pub t_taken: Option<TimeNs>,
+    /// The order that brought its scene, as [`FrameOrders`](crate::record::FrameOrders) counts.
+    pub order: u32,
 }
 
 /// The two ends, with what is to be shown first.
 pub fn newest_picture(pictures: &Pictures, t_start: TimeNs) -> (PictureSink, PictureSource) {
     let (first, scenes) = match pictures {
-        Pictures::Scene(frames) => (Shown::Scene { frames: Arc::clone(frames), t_start }, vec![Arc::clone(frames)]),
+        Pictures::Scene(frames) => {
+            (Shown::Scene { frames: Arc::clone(frames), t_start, order: 0 }, vec![Arc::clone(frames)])
+        }
         Pictures::Feed(_) => (Shown::Live { frame: pictures.first_frame(), tag: PictureTag::default() }, Vec::new()),
     };
     let (input, output) = triple_buffer::triple_buffer(&first);
     let is_live = matches!(pictures, Pictures::Feed(_));
-    let sink = PictureSink { input, size: pictures.resolution(), scenes, t_start, is_live };
+    let sink = PictureSink { input, size: pictures.resolution(), scenes, t_start, order: 0, is_live };
     (sink, PictureSource { output, t: t_start })
 }
 
@@ -140,18 +149,21 @@ pub struct PictureSink {
     scenes: Vec<Arc<Frames>>,
     /// When the newest of them begins.
     t_start: TimeNs,
+    /// The order that brought it.
+    order: u32,
     is_live: bool,
 }
 
 impl PictureSink {
-    /// Shows a scene from the next frame on, which begins at host time `t_start`, and no live picture any more.
+    /// Shows a scene from the next frame on, which begins at host time `t_start`, and no live picture any more. `order`
+    /// brought it.
     ///
     /// # Panics
     /// Where it is of another size than what was shown before: a renderer is made for one.
-    pub fn show_scene(&mut self, frames: Arc<Frames>, t_start: TimeNs) {
+    pub fn show_scene(&mut self, frames: Arc<Frames>, t_start: TimeNs, order: u32) {
         assert_eq!(frames.resolution(), self.size, "every picture has the hologram's size");
-        (self.is_live, self.t_start) = (false, t_start);
-        self.input.write(Shown::Scene { frames: Arc::clone(&frames), t_start });
+        (self.is_live, self.t_start, self.order) = (false, t_start, order);
+        self.input.write(Shown::Scene { frames: Arc::clone(&frames), t_start, order });
         self.drop_old_scenes();
         self.scenes.push(frames);
     }
@@ -176,7 +188,7 @@ impl PictureSink {
             && self.input.consumed()
             && let [_, .., newest] = &self.scenes[..]
         {
-            self.input.write(Shown::Scene { frames: Arc::clone(newest), t_start: self.t_start });
+            self.input.write(Shown::Scene { frames: Arc::clone(newest), t_start: self.t_start, order: self.order });
         }
         self.drop_old_scenes();
     }
@@ -217,9 +229,9 @@ impl PictureSource {
     /// The picture that was taken out last.
     pub fn same_again(&self) -> (&Arc<RgbdFrame>, PictureTag) {
         match self.output.output_buffer() {
-            Shown::Scene { frames, t_start } => {
+            Shown::Scene { frames, t_start, order } => {
                 let index = frames.index_at((self.t - *t_start).seconds());
-                (&frames.frames[index], PictureTag { number: index as u64, t_taken: None })
+                (&frames.frames[index], PictureTag { number: index as u64, t_taken: None, order: *order })
             }
             Shown::Live { frame, tag } => (frame, *tag),
         }
@@ -239,7 +251,7 @@ mod tests {
     }
 
     fn show(sink: &mut PictureSink, number: u64) {
-        let tag = PictureTag { number, t_taken: Some(TimeNs(number as i64)) };
+        let tag = PictureTag { number, t_taken: Some(TimeNs(number as i64)), order: 0 };
         sink.show_live(Arc::new(RgbdFrame::black(SIZE)), tag);
     }
 
@@ -271,9 +283,9 @@ mod tests {
     fn a_scene_takes_the_place_of_live_pictures_until_they_are_wanted_again() {
         let (mut sink, mut source) = newest_picture(&feed(), TimeNs(0));
         show(&mut sink, 7);
-        sink.show_scene(sequence(2), TimeNs(0));
+        sink.show_scene(sequence(2), TimeNs(0), 5);
         show(&mut sink, 8);
-        assert_eq!(source.at(TimeNs(0)).1, PictureTag { number: 0, t_taken: None });
+        assert_eq!(source.at(TimeNs(0)).1, PictureTag { number: 0, t_taken: None, order: 5 });
         sink.go_live();
         assert_eq!(source.at(TimeNs(0)).1.t_taken, None, "until there is a picture");
         show(&mut sink, 9);
@@ -285,7 +297,7 @@ mod tests {
         let (mut sink, mut source) = newest_picture(&Pictures::Scene(sequence(1)), TimeNs(0));
         let held = Arc::clone(source.at(TimeNs(0)).0);
         for _ in 0..100 {
-            sink.show_scene(sequence(1), TimeNs(0));
+            sink.show_scene(sequence(1), TimeNs(0), 1);
             source.at(TimeNs(0));
             assert!(Arc::strong_count(&held) > 1, "the renderer's is never the last");
         }

@@ -26,7 +26,7 @@ mod live;
 mod openexr;
 mod raster;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use holod_calibration::{Dioptres, DisplayGeometry, Resolution};
 use serde::{Deserialize, Serialize};
@@ -194,6 +194,17 @@ impl Scene {
         })
     }
 
+    /// The scene file, where there is one.
+    pub fn file(&self) -> Option<&Path> {
+        let path = &self.description.path;
+        path.extension().is_some_and(|extension| extension == "toml").then_some(path)
+    }
+
+    /// The files of frame `index`: colour and depth, which may be one file.
+    pub fn pictures(&self, index: usize) -> [PathBuf; 2] {
+        [self.colour_path(index), self.description.depth.path(self.number(index))]
+    }
+
     fn colour_path(&self, index: usize) -> PathBuf {
         self.description.colour.path(self.number(index))
     }
@@ -222,7 +233,7 @@ impl Scene {
         if index >= *frames {
             return Err(SceneError::NoSuchFrame { path: path.clone(), index, frames: *frames });
         }
-        let (colour_path, depth_path) = (self.colour_path(index), self.description.depth.path(self.number(index)));
+        let [colour_path, depth_path] = self.pictures(index);
         let colour = raster::read_colour(&colour_path)?;
         let mut report =
             FrameReport { source: Some(colour.size), colour_clipped_px: colour.clipped_px, ..FrameReport::default() };

@@ -139,13 +139,7 @@ impl Header {
         text["holod"] = value(env!("CARGO_PKG_VERSION"));
         text["t_started_ns"] = value(self.t_started.0);
         text["started_unix_ns"] = value(self.started_unix_ns);
-        let text = text.to_string();
-        let mut bytes = MAGIC.to_vec();
-        bytes.extend(VERSION.to_le_bytes());
-        bytes.extend((text.len() as u32).to_le_bytes());
-        bytes.extend(text.as_bytes());
-        bytes.extend(crc32(&bytes).to_le_bytes());
-        bytes
+        framed(&text.to_string())
     }
 
     fn parse(text: &str) -> Option<Self> {
@@ -165,6 +159,30 @@ impl Header {
             started_unix_ns: integer("started_unix_ns")?,
         })
     }
+}
+
+/// The text of a header with all that is around it.
+fn framed(text: &str) -> Vec<u8> {
+    let mut bytes = MAGIC.to_vec();
+    bytes.extend(VERSION.to_le_bytes());
+    bytes.extend((text.len() as u32).to_le_bytes());
+    bytes.extend(text.as_bytes());
+    bytes.extend(crc32(&bytes).to_le_bytes());
+    bytes
+}
+
+/// A recording whose header, TOML, reads as `change` makes it, with the place at which its records begin; these stay as
+/// they are. Nothing where `recording` begins with no header, or none would be left of it.
+pub fn with_header(recording: &[u8], change: impl FnOnce(&str) -> String) -> Option<(Vec<u8>, usize)> {
+    let before = RawReader::new(recording).ok()?;
+    let records = before.input;
+    let text = str::from_utf8(&recording[16..recording.len() - records.len() - 4]).ok()?;
+    let text = change(text);
+    Header::parse(&text)?;
+    let mut changed = framed(&text);
+    let begin = changed.len();
+    changed.extend(records);
+    Some((changed, begin))
 }
 
 fn bytes_of_hex(text: &str) -> Option<Vec<u8>> {
@@ -326,6 +344,19 @@ mod tests {
             records.push((head, payload.to_vec()));
         }
         Ok((records, reader.ending().expect("it has ended")))
+    }
+
+    #[test]
+    fn a_header_is_changed_and_the_records_stay() {
+        let records = vec![(RecordHead { kind: Kind::Bytes, t: TimeNs(3), connection: 1 }, b"odd".to_vec())];
+        let (bytes, _) = file(&records);
+        let (changed, begin) = with_header(&bytes, |text| text.replace("odd", "even")).expect("a header");
+        assert!(bytes.ends_with(&changed[begin..]));
+        let mut reader = RawReader::new(&changed[..]).expect("a header");
+        assert_eq!(reader.header().spec, "serial:/dev/\"even\"\nname");
+        assert_eq!(reader.next().expect("memory reads").map(|(_, payload)| payload.to_vec()), Some(b"odd".to_vec()));
+        assert!(with_header(&bytes, |_| "spec = 3".into()).is_none(), "no header is left");
+        assert!(with_header(&bytes[..40], str::to_owned).is_none(), "it is torn");
     }
 
     fn any_record() -> impl Strategy<Value = (RecordHead, Vec<u8>)> {

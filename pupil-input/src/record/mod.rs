@@ -14,6 +14,7 @@ use std::path::{Path, PathBuf};
 
 #[cfg(fuzzing)]
 pub(crate) use container::RECORD_HEAD_BYTES;
+pub use container::with_header;
 pub(crate) use container::{Ending, Header, HeaderFault, Kind, MAGIC, RawReader};
 #[cfg(fuzzing)]
 pub(crate) use crc32::crc32;

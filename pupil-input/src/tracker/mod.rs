@@ -236,6 +236,36 @@ impl Tracker {
     }
 }
 
+impl TrackerHandle {
+    /// A tracker that brings nothing and has ended, for a run whose pupils are known beforehand.
+    pub fn ended(settings: &rig::Tracker) -> Self {
+        let (_, output) = triple_buffer::triple_buffer(&EstimateSnapshot::new(settings.into()));
+        let (_, consumer) = rtrb::RingBuffer::new(1);
+        let (_, untold) = rtrb::RingBuffer::new(1);
+        let (changes, _) = rtrb::RingBuffer::new(1);
+        let shared = Arc::new(Shared {
+            counters: Counters::new(),
+            clock: ClockGauge::new(),
+            stop: AtomicBool::new(true),
+            link: AtomicU8::new(Link::Finished as u8),
+        });
+        Self {
+            reader: EstimateReader { output },
+            tap: DecisionTap { consumer },
+            control: TrackerControl {
+                shared,
+                thread: None,
+                recorder: None,
+                warnings: Vec::new(),
+                untold,
+                trouble: None,
+                changes,
+                unit: SizeUnit::Millimetres,
+            },
+        }
+    }
+}
+
 /// A running tracker.
 #[derive(Debug)]
 pub struct TrackerHandle {

@@ -7,6 +7,7 @@ use std::path::Path;
 
 use holod_pupil_input::{Recording, ReplayError, SizeUnit, scaled_millimetres};
 
+use crate::bug_report;
 use crate::cli::LogCommand;
 use crate::failure::{Exit, Failure};
 
@@ -18,6 +19,7 @@ pub(super) fn log(command: &LogCommand) -> Result<(), Failure> {
 }
 
 fn read(path: &Path) -> Result<Recording, Failure> {
+    bug_report::refuse_archive(path)?;
     Recording::read(path).map_err(|error| {
         let exit = if matches!(error, ReplayError::Io { .. }) { Exit::NoInput } else { Exit::Data };
         Failure::because(exit)(error)

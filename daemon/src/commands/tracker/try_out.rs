@@ -14,6 +14,7 @@ use ratatui::style::Color;
 use serde::Serialize;
 
 use super::observed::{EyeFigures, Observed, Quantiles};
+use crate::bug_report;
 use crate::cli::TryArgs;
 use crate::failure::{Exit, Failure};
 use crate::record;
@@ -149,7 +150,11 @@ fn spec_of(args: &TryArgs, rig: &Rig) -> Result<TrackerSpec, Failure> {
     let text = args.spec.as_ref().or(rig.tracker.spec.as_ref()).ok_or_else(|| {
         Failure::new(Exit::Usage, "which tracker? name its spec, or a rig file with tracker.spec by --config")
     })?;
-    text.parse().map_err(Failure::because(Exit::Usage))
+    let spec = text.parse().map_err(Failure::because(Exit::Usage))?;
+    if let TrackerSpec::Path(path) | TrackerSpec::Replay { path, .. } = &spec {
+        bug_report::refuse_archive(path)?;
+    }
+    Ok(spec)
 }
 
 fn report_of(

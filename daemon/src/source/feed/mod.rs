@@ -389,7 +389,7 @@ fn take_over(
         let name = format!("the feed's client `{}`", client.name);
         scene::warn_of_oddities(&name, frame, &report, &target.geometry, client.sends_planes());
     }
-    Ok(PictureTag { number: picture.sequence, t_taken: Some(picture.t_taken) })
+    Ok(PictureTag { number: picture.sequence, t_taken: Some(picture.t_taken), order: 0 })
 }
 
 /// Counts what became of a picture.

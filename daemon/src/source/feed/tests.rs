@@ -269,7 +269,7 @@ fn while_a_scene_is_shown_no_client_is() {
     assert_eq!(send(&mut client, 0, 1, 255).0, TAKEN);
     let frames = vec![Arc::new(RgbdFrame::black(SIZE))];
     let scene = scene::Frames { frames, fps: None, reports: Vec::new(), name: "scene".into() };
-    bench.sink.lock().unwrap().show_scene(Arc::new(scene), TimeNs(0));
+    bench.sink.lock().unwrap().show_scene(Arc::new(scene), TimeNs(0), 1);
     assert_eq!(send(&mut client, 0, 2, 255).0, NOT_SHOWN);
     assert_eq!(bench.shown().0.amplitude[0], 0.0);
     bench.until("it is counted", |status| status.not_shown == 1);

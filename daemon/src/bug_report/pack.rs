@@ -1,0 +1,418 @@
+//! What goes into a report.
+
+use std::fs::{self, File};
+use std::io::{self, Read};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, UNIX_EPOCH};
+
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use holod_calibration::rig::Rig;
+use holod_pupil_input::{RecordFiles, with_header};
+use serde::de::DeserializeOwned;
+use tar::{Builder, EntryType, Header};
+
+use super::{FOLDER, MANIFEST, Manifest, Packed, SCENE_FOLDER, Scrubber, order_folder, unix_ms};
+use crate::control::Request;
+use crate::failure::{Exit, Failure};
+use crate::record::{
+    self, BENCH, LOG, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SCENE, SceneSource, SourceFile,
+    content_xxh3,
+};
+use crate::snapshot::Snapshot;
+
+/// Text that is read as a whole to be scrubbed; more of a log is cut off.
+const LARGEST_TEXT: u64 = 256 << 20;
+
+/// What a report will hold.
+#[derive(Debug, Default)]
+pub struct Contents {
+    entries: Vec<Entry>,
+    left_out: Vec<String>,
+    /// When the run began, where there is one; milliseconds since 1970.
+    started_unix_ms: Option<u64>,
+}
+
+#[derive(Debug)]
+struct Entry {
+    name: String,
+    content: Content,
+}
+
+#[derive(Debug)]
+enum Content {
+    Bytes(Vec<u8>),
+    File(PathBuf),
+}
+
+/// The name of a report of `contents` where none is given: it tells when the run began and nothing else.
+pub fn default_name(contents: &Contents) -> PathBuf {
+    let began = UNIX_EPOCH + Duration::from_millis(contents.started_unix_ms.unwrap_or_else(unix_ms));
+    let began = humantime::format_rfc3339_seconds(began).to_string().replace(['-', ':', 'Z'], "").replace('T', "-");
+    PathBuf::from(format!("holod-report-{began}.tar.gz"))
+}
+
+impl Contents {
+    /// Without a record: what the holods that run say of themselves.
+    pub fn of_running(running: &[Snapshot], scrubber: &Scrubber) -> Result<Self, Failure> {
+        let mut contents = Self::default();
+        for status in running {
+            let text = serde_json::to_string_pretty(status).map_err(Failure::because(Exit::Software))? + "\n";
+            contents.add_json::<Snapshot>(&format!("status-{}.json", status.pid), &text, scrubber);
+        }
+        if running.is_empty() {
+            contents.left_out.push("a status: no holod is running".into());
+        }
+        contents.left_out.push(
+            "frames: no record was named; `holod run --record DIR` writes one, `holod report DIR` packs it".into(),
+        );
+        Ok(contents)
+    }
+
+    /// Of the record in `folder`, with the pictures that it shows or without.
+    ///
+    /// # Errors
+    /// The folder is no record, or cannot be read.
+    pub fn of_record(folder: &Path, with_scene: bool, scrubber: &Scrubber) -> Result<Self, Failure> {
+        let mut contents = Self::default();
+        if !folder.join(record::FRAMES).is_file() {
+            return Err(Failure::new(
+                Exit::NoInput,
+                format!(
+                    "{}: found no {}, expected a directory that `holod run --record` wrote",
+                    folder.display(),
+                    record::FRAMES
+                ),
+            ));
+        }
+        let samples = RecordFiles::in_folder(folder);
+        let facts = contents.text_of(folder, RUN)?;
+        match facts.as_deref().map(serde_json::from_str::<RunFacts>) {
+            Some(Ok(run)) => {
+                contents.started_unix_ms = Some(run.started_unix_ms);
+                contents.add_json::<RunFacts>(RUN, facts.as_deref().unwrap_or_default(), scrubber);
+                contents.add_bench(folder, scrubber)?;
+                contents.add_scene(SCENE_FOLDER, &run.scene, with_scene);
+            }
+            Some(Err(error)) => contents.left_out.push(format!("{RUN}, which is damaged: {error}; {NO_FRAMES}")),
+            None => contents.left_out.push(format!("{RUN}: an earlier holod, which wrote none, made it; {NO_FRAMES}")),
+        }
+        contents.add_file(record::FRAMES, &folder.join(record::FRAMES));
+        for path in samples.samples.iter().filter(|path| path.is_file()) {
+            contents.add_file("samples.csv", path);
+        }
+        for path in samples.raw.iter().filter(|path| path.is_file()) {
+            contents.add_tracker_bytes(path, scrubber)?;
+        }
+        if let Some(text) = contents.text_of(folder, ORDERS)? {
+            contents.add_lines::<OrderLine>(ORDERS, &text, scrubber);
+        }
+        if let Some(text) = contents.text_of(folder, ORDER_FILES)? {
+            contents.add_lines::<OrderSource>(ORDER_FILES, &text, scrubber);
+            for line in text.lines() {
+                if let Ok(source) = serde_json::from_str(line) {
+                    contents.add_order(&source, with_scene);
+                }
+            }
+        }
+        for name in ["summary.json", LOG] {
+            if let Some(text) = contents.text_of(folder, name)? {
+                contents.add_text(name, scrubber.text(&text));
+            }
+        }
+        contents.add_shown_levels(folder, with_scene)?;
+        Ok(contents)
+    }
+
+    fn text_of(&mut self, folder: &Path, name: &str) -> Result<Option<String>, Failure> {
+        let path = folder.join(name);
+        let read = File::open(&path).and_then(|file| {
+            let mut bytes = Vec::new();
+            file.take(LARGEST_TEXT).read_to_end(&mut bytes)?;
+            Ok(bytes)
+        });
+        match read {
+            Ok(bytes) => {
+                if bytes.len() as u64 == LARGEST_TEXT {
+                    self.left_out.push(format!("{name} behind its first {} MiB", LARGEST_TEXT >> 20));
+                }
+                Ok(Some(String::from_utf8_lossy(&bytes).into_owned()))
+            }
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(Failure::new(Exit::NoInput, format!("{}: {error}", path.display()))),
+        }
+    }
+
+    fn add_file(&mut self, name: &str, path: &Path) {
+        self.entries.push(Entry { name: name.to_owned(), content: Content::File(path.to_owned()) });
+    }
+
+    fn add_text(&mut self, name: &str, text: String) {
+        self.entries.push(Entry { name: name.to_owned(), content: Content::Bytes(text.into_bytes()) });
+    }
+
+    /// Adds text that a program reads: where a name in it is a word that the program needs, the name stays.
+    fn add_checked(&mut self, name: &str, text: &str, scrubber: &Scrubber, reads: impl Fn(&str) -> bool) {
+        let scrubbed = scrubber.text(text);
+        let text = if !reads(text) || reads(&scrubbed) {
+            scrubbed
+        } else {
+            self.left_out.push(format!("no name in {name}: one of them is a word of its format; look at it"));
+            scrubber.paths(text)
+        };
+        self.add_text(name, text);
+    }
+
+    fn add_json<T: DeserializeOwned>(&mut self, name: &str, text: &str, scrubber: &Scrubber) {
+        self.add_checked(name, text, scrubber, |text| serde_json::from_str::<T>(text).is_ok());
+    }
+
+    fn add_lines<T: DeserializeOwned>(&mut self, name: &str, text: &str, scrubber: &Scrubber) {
+        let reads = |text: &str| text.lines().all(|line| serde_json::from_str::<T>(line).is_ok());
+        self.add_checked(name, text, scrubber, reads);
+    }
+
+    /// The rig and its files.
+    fn add_bench(&mut self, folder: &Path, scrubber: &Scrubber) -> Result<(), Failure> {
+        let bench = folder.join(BENCH);
+        let cannot = |error: io::Error| Failure::new(Exit::NoInput, format!("{}: {error}", bench.display()));
+        let mut paths = Vec::new();
+        for entry in fs::read_dir(&bench).map_err(cannot)? {
+            paths.push(entry.map_err(cannot)?.path());
+        }
+        paths.sort();
+        for path in paths.iter().filter(|path| path.is_file()) {
+            let Some(name) = path.file_name().and_then(|name| name.to_str()) else { continue };
+            let packed = format!("{BENCH}/{name}");
+            match fs::read_to_string(path) {
+                Ok(text) if name == RIG => {
+                    // Its tables are found in its folder, whatever is in its text.
+                    let reads = |text: &str| Rig::parse(text, path).is_ok();
+                    self.add_checked(&packed, &text, scrubber, reads);
+                }
+                Ok(text) if name.ends_with(".toml") || name.ends_with(".csv") => {
+                    self.add_text(&packed, scrubber.text(&text));
+                }
+                _ => self.add_file(&packed, path),
+            }
+        }
+        Ok(())
+    }
+
+    fn add_scene(&mut self, folder: &str, scene: &SceneSource, with_scene: bool) {
+        let SceneSource::Files { description, files, .. } = scene else {
+            if *scene == SceneSource::Feed {
+                self.left_out.push("pictures of the live feed, which are not recorded".into());
+            }
+            return;
+        };
+        if !with_scene {
+            let bytes: u64 = files.iter().map(|file| file.bytes).sum();
+            let left = format!("{folder}/: {} files, {} of pictures, as asked; {NO_FRAMES}", files.len(), size(bytes));
+            self.left_out.push(left);
+            return;
+        }
+        self.add_text(&format!("{folder}/{SCENE}"), description.clone());
+        for file in files {
+            self.add_source(folder, file);
+        }
+    }
+
+    fn add_order(&mut self, source: &OrderSource, with_scene: bool) {
+        let folder = order_folder(source.order);
+        if let Some(scene) = &source.scene {
+            self.add_scene(&folder, scene, with_scene);
+        }
+        if let Some(weights) = &source.weights {
+            self.add_source(&folder, weights);
+        }
+    }
+
+    /// Adds a file that the run read, where it is still the same.
+    fn add_source(&mut self, folder: &str, file: &SourceFile) {
+        let name = format!("{folder}/{}", file.name);
+        let now = File::open(&file.path).and_then(|mut file| content_xxh3(&mut file));
+        match now {
+            Ok(now) if now == (file.bytes, file.xxh3.clone()) => self.add_file(&name, &file.path),
+            Ok(_) => self.left_out.push(format!("{name}: it has changed since the run; {NO_FRAMES}")),
+            Err(error) => self.left_out.push(format!("{name}: {error}; {NO_FRAMES}")),
+        }
+    }
+
+    /// The bytes that the tracker sent, with a header without names. Where a name is among the bytes, they stay out.
+    fn add_tracker_bytes(&mut self, path: &Path, scrubber: &Scrubber) -> Result<(), Failure> {
+        let name = "tracker.holodraw";
+        let cannot = |error: io::Error| Failure::new(Exit::NoInput, format!("{}: {error}", path.display()));
+        let bytes = path.metadata().map_err(cannot)?.len();
+        if bytes > LARGEST_TEXT {
+            self.left_out.push(format!("{name}: {} are too many; samples.csv has the samples", size(bytes)));
+            return Ok(());
+        }
+        let recording = fs::read(path).map_err(cannot)?;
+        match with_header(&recording, |header| scrubber.text(header)) {
+            Some((changed, records)) if !scrubber.finds(&changed[records..]) => {
+                self.entries.push(Entry { name: name.into(), content: Content::Bytes(changed) });
+            }
+            Some(_) => self.left_out.push(format!(
+                "{name}: a name of a user or of this machine is among the tracker's bytes; samples.csv has the samples"
+            )),
+            None => self.left_out.push(format!("{name}: it broke off within its header")),
+        }
+        Ok(())
+    }
+
+    /// Levels are the pictures in another form.
+    fn add_shown_levels(&mut self, folder: &Path, with_scene: bool) -> Result<(), Failure> {
+        let names = record::shown_levels(folder)
+            .map_err(|error| Failure::new(Exit::NoInput, format!("{}: {error}", folder.display())))?;
+        match with_scene {
+            true => names.iter().for_each(|name| self.add_file(name, &folder.join(name))),
+            false if names.is_empty() => {}
+            false => self.left_out.push(format!("{} pictures of levels that were shown, as asked", names.len())),
+        }
+        Ok(())
+    }
+
+    /// Writes the archive to `path` and says what is in it.
+    ///
+    /// # Errors
+    /// A file cannot be read, or the archive cannot be written.
+    pub fn write(self, path: &Path, scrubber: &Scrubber) -> Result<Manifest, Failure> {
+        let cannot = |error: io::Error| Failure::new(Exit::CannotCreate, format!("cannot write the report: {error}"));
+        let mut manifest = Manifest::now(self.left_out.iter().map(|left| scrubber.text(left)).collect());
+        let encoder = GzEncoder::new(File::create(path).map_err(cannot)?, Compression::default());
+        let mut archive = Builder::new(encoder);
+        let t_s = manifest.packed_unix_ms / 1000;
+        for Entry { name, content } in self.entries {
+            let packed = match content {
+                Content::Bytes(bytes) => {
+                    append(&mut archive, &name, t_s, bytes.len() as u64, &bytes[..]).map_err(cannot)?;
+                    Packed::of(&name, &bytes)
+                }
+                Content::File(path) => add_file(&mut archive, &name, t_s, &path)
+                    .map_err(|error| Failure::new(Exit::NoInput, format!("{}: {error}", path.display())))?,
+            };
+            manifest.files.push(packed);
+        }
+        let text = serde_json::to_string_pretty(&manifest).map_err(Failure::because(Exit::Software))? + "\n";
+        append(&mut archive, MANIFEST, t_s, text.len() as u64, text.as_bytes()).map_err(cannot)?;
+        archive.into_inner().and_then(GzEncoder::finish).and_then(|file| file.sync_all()).map_err(cannot)?;
+        Ok(manifest)
+    }
+}
+
+/// What is added where frames lack something.
+const NO_FRAMES: &str = "frames that need it cannot be shown again";
+
+/// A line of `orders.jsonl`.
+#[derive(serde::Deserialize)]
+struct OrderLine {
+    #[expect(dead_code, reason = "it is only looked whether it is there")]
+    request: Request,
+}
+
+/// Adds a file as long as it is now, whoever goes on writing it.
+fn add_file(archive: &mut Builder<GzEncoder<File>>, name: &str, t_s: u64, path: &Path) -> io::Result<Packed> {
+    let mut first = File::open(path)?;
+    let bytes = first.metadata()?.len();
+    let (bytes, xxh3) = content_xxh3(&mut Read::by_ref(&mut first).take(bytes))?;
+    append(archive, name, t_s, bytes, File::open(path)?.take(bytes))?;
+    Ok(Packed { name: name.to_owned(), bytes, xxh3 })
+}
+
+/// Adds a file without owner and rights.
+fn append(
+    archive: &mut Builder<GzEncoder<File>>,
+    name: &str,
+    t_s: u64,
+    bytes: u64,
+    content: impl Read,
+) -> io::Result<()> {
+    let mut header = Header::new_ustar();
+    header.set_entry_type(EntryType::Regular);
+    header.set_size(bytes);
+    header.set_mode(0o644);
+    header.set_mtime(t_s);
+    archive.append_data(&mut header, format!("{FOLDER}/{name}"), content)
+}
+
+/// A number of bytes for people.
+pub(super) fn size(bytes: u64) -> String {
+    match bytes {
+        0..10_000 => format!("{bytes} bytes"),
+        10_000..10_000_000 => format!("{} kB", bytes / 1000),
+        _ => format!("{} MB", bytes / 1_000_000),
+    }
+}
+
+impl Manifest {
+    /// What is in it and what is not, for whoever sends it.
+    pub fn text(&self) -> String {
+        let mut lines = Vec::new();
+        let mut folders: Vec<(&str, usize, u64)> = Vec::new();
+        for file in &self.files {
+            match file.name.split_once('/') {
+                None => lines.push(format!("  {:24} {:>12}", file.name, size(file.bytes))),
+                Some((folder, _)) => match folders.iter_mut().find(|(known, ..)| *known == folder) {
+                    Some((_, count, bytes)) => (*count, *bytes) = (*count + 1, *bytes + file.bytes),
+                    None => folders.push((folder, 1, file.bytes)),
+                },
+            }
+        }
+        let folders = folders.into_iter().map(|(folder, count, bytes)| {
+            format!("  {:24} {:>12}  in {count} files", format!("{folder}/"), size(bytes))
+        });
+        lines.extend(folders);
+        lines.push(format!("  {MANIFEST:24} {:>12}", "this list"));
+        if !self.left_out.is_empty() {
+            lines.push("left out:".into());
+            lines.extend(self.left_out.iter().map(|left| format!("  {left}")));
+        }
+        format!("in it, below {FOLDER}/:\n{}", lines.join("\n"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_name_says_when_the_run_began_and_no_more() {
+        let contents = Contents { started_unix_ms: Some(1_795_491_696_989), ..Contents::default() };
+        assert_eq!(default_name(&contents), Path::new("holod-report-20261124-034136.tar.gz"));
+        assert!(default_name(&Contents::default()).to_str().unwrap().starts_with("holod-report-20"));
+    }
+
+    #[test]
+    fn a_folder_that_is_no_record_is_refused_and_an_old_one_is_packed() {
+        let folder = tempfile::tempdir().unwrap();
+        let scrubber = Scrubber::default();
+        let failure = Contents::of_record(folder.path(), true, &scrubber).unwrap_err();
+        assert_eq!(failure.exit, Exit::NoInput);
+        fs::write(folder.path().join(record::FRAMES), "frame,field\n").unwrap();
+        fs::write(folder.path().join(LOG), "in /home/anna/lab\n").unwrap();
+        let contents = Contents::of_record(folder.path(), true, &scrubber).unwrap();
+        let names: Vec<_> = contents.entries.iter().map(|entry| entry.name.as_str()).collect();
+        assert_eq!(names, ["frames.csv", "log.txt"]);
+        assert!(contents.left_out[0].contains("an earlier holod"), "{:?}", contents.left_out);
+
+        let path = folder.path().join("report.tar.gz");
+        let manifest = contents.write(&path, &scrubber).unwrap();
+        assert!(manifest.text().contains("left out:\n  run.json"), "{}", manifest.text());
+        let unpacked = super::super::unpack(&path).unwrap();
+        assert_eq!(unpacked.manifest, manifest);
+        assert_eq!(unpacked.text(LOG).unwrap().unwrap(), "in ~/lab\n");
+        assert_eq!(unpacked.text("orders.jsonl").unwrap(), None);
+    }
+
+    #[test]
+    fn a_name_that_is_a_word_of_the_format_stays_and_is_told() {
+        let scrubber = Scrubber::new([("native".to_owned(), "/home/native".to_owned())], []);
+        let mut contents = Contents::default();
+        let reads = |text: &str| text.contains("native");
+        contents.add_checked("a", "fit native in /home/native/x", &scrubber, reads);
+        assert!(contents.left_out[0].contains("no name in a"), "{:?}", contents.left_out);
+        let Content::Bytes(bytes) = &contents.entries[0].content else { panic!() };
+        assert_eq!(bytes, b"fit native in ~/x");
+    }
+}

@@ -1,0 +1,195 @@
+//! Where the pupil and the picture of each frame come from: followed as they come, or as a record has them.
+
+use std::sync::Arc;
+
+use holod_calibration::{PupilDiameter, TimeNs};
+use holod_model::RgbdFrame;
+use holod_pupil_input::{EstimateReader, PupilState};
+use holod_slm_output::LevelsFrame;
+
+use super::frame_loop::TrainedPupils;
+use crate::control::{NewEngine, Steering};
+use crate::record::FrameOrders;
+use crate::renderer::Renderer;
+use crate::source::{PictureSource, PictureTag};
+
+/// A pupil is not predicted farther ahead than this; slower frames use the prediction for this time.
+const FARTHEST_PREDICTION: TimeNs = TimeNs(200_000_000);
+
+/// What stands in place of the estimator's state where a person has fixed the pupil.
+pub(super) const FIXED_PUPIL: &str = "fixed";
+
+/// What a record calls an estimator's state; one that nobody knows is just a recorded one.
+pub(crate) fn pupil_state_named(name: &str) -> &'static str {
+    let states = [PupilState::Tracking, PupilState::Holding, PupilState::Fallback].map(PupilState::name);
+    states.into_iter().chain([FIXED_PUPIL]).find(|state| *state == name).unwrap_or("recorded")
+}
+
+/// Where pupils and pictures come from.
+pub(super) enum Inputs {
+    /// The tracker, and whatever is to be shown.
+    Followed(Followed),
+    /// A record.
+    Recorded(Playback),
+}
+
+/// What is followed.
+pub(super) struct Followed {
+    /// The tracker's newest estimate.
+    pub(super) pupil: EstimateReader,
+    /// What to show.
+    pub(super) pictures: PictureSource,
+    /// What a person changes.
+    pub(super) steering: Arc<Steering>,
+}
+
+/// The pupil that a frame is made for.
+pub(super) struct FramePupil {
+    pub(super) pupil: PupilDiameter,
+    pub(super) t_sample: Option<TimeNs>,
+    pub(super) raw_mm: Option<f32>,
+    pub(super) state: &'static str,
+}
+
+impl FramePupil {
+    /// Whether it is anything but the fallback.
+    pub(super) fn is_meant(&self) -> bool {
+        self.state != PupilState::Fallback.name()
+    }
+}
+
+/// What a frame shows.
+pub(super) struct FrameContent<'a> {
+    pub(super) picture: &'a Arc<RgbdFrame>,
+    pub(super) tag: PictureTag,
+    /// In place of a hologram of the picture.
+    pub(super) pattern: Option<&'a LevelsFrame>,
+}
+
+impl Inputs {
+    /// The pupil of a frame that is begun at host time `t_wake` and whose light arrives at `t_photon`.
+    pub(super) fn pupil(&mut self, t_wake: TimeNs, t_photon: TimeNs) -> FramePupil {
+        match self {
+            Self::Followed(followed) => {
+                let state = followed.pupil.pupil_at(t_wake).state.name();
+                let estimate = followed.pupil.pupil_at(t_photon.min(t_wake + FARTHEST_PREDICTION));
+                match followed.steering.fixed_pupil() {
+                    Some(pupil) => FramePupil { pupil, t_sample: None, raw_mm: None, state: FIXED_PUPIL },
+                    None => FramePupil {
+                        pupil: estimate.pupil,
+                        t_sample: estimate.t_sample,
+                        raw_mm: estimate.raw_mm,
+                        state,
+                    },
+                }
+            }
+            Self::Recorded(playback) => {
+                let cue = playback.cue();
+                FramePupil { pupil: cue.pupil, t_sample: None, raw_mm: None, state: cue.pupil_state }
+            }
+        }
+    }
+
+    /// What a frame shows whose light arrives at host time `t_photon`.
+    pub(super) fn content(&mut self, t_photon: TimeNs) -> FrameContent<'_> {
+        match self {
+            Self::Followed(followed) => {
+                let (picture, tag) = if followed.steering.is_paused() {
+                    followed.pictures.same_again()
+                } else {
+                    followed.pictures.at(t_photon)
+                };
+                FrameContent { picture, tag, pattern: None }
+            }
+            Self::Recorded(playback) => playback.content(),
+        }
+    }
+}
+
+/// A frame to be made again.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Cue {
+    /// Its number in the record.
+    pub(crate) frame: u64,
+    /// The pupil that it was made for.
+    pub(crate) pupil: PupilDiameter,
+    /// The estimator's state.
+    pub(crate) pupil_state: &'static str,
+    /// The place of its picture in [`Playback::pictures`].
+    pub(crate) picture: usize,
+    /// The picture's number in its scene.
+    pub(crate) number: u64,
+    /// The place of its engine: 0 is the run's first one, others follow in [`Playback::engines`].
+    pub(crate) engine: usize,
+    /// The place of the pattern in [`Playback::patterns`] that it shows in place of a hologram.
+    pub(crate) pattern: Option<usize>,
+    /// The orders that brought all this.
+    pub(crate) orders: FrameOrders,
+}
+
+/// The frames of a record, to be made again, with all that they are made of.
+pub(crate) struct Playback {
+    /// At least one, by rising number.
+    pub(crate) cues: Vec<Cue>,
+    /// The pictures that they show.
+    pub(crate) pictures: Vec<Arc<RgbdFrame>>,
+    /// Engines beside the first.
+    pub(crate) engines: Vec<NewEngine>,
+    /// The patterns that they show.
+    pub(crate) patterns: Vec<LevelsFrame>,
+    /// The cue that is due.
+    pub(crate) at: usize,
+    /// The engine that is at work.
+    pub(crate) engine: usize,
+}
+
+impl Playback {
+    /// How many frames there are.
+    pub(crate) fn frames(&self) -> u64 {
+        self.cues.len() as u64
+    }
+
+    fn cue(&self) -> &Cue {
+        &self.cues[self.at]
+    }
+
+    /// The number of the frame that is due.
+    pub(super) fn frame(&self) -> u64 {
+        self.cue().frame
+    }
+
+    /// The orders that brought what it shows.
+    pub(super) fn orders(&self) -> FrameOrders {
+        self.cue().orders
+    }
+
+    /// Brings its engine to work; the one that worked takes its place here.
+    pub(super) fn change_engine(&mut self, renderer: &mut Box<dyn Renderer>, trained: &mut TrainedPupils) {
+        let wanted = self.cue().engine;
+        if wanted == self.engine {
+            return;
+        }
+        // Where the first one works, the others are in their places. Where another works, the first has its place.
+        for place in [self.engine, wanted].into_iter().filter(|place| *place > 0) {
+            let other = &mut self.engines[place - 1];
+            std::mem::swap(renderer, &mut other.renderer);
+            let theirs = std::mem::replace(&mut other.trained, trained.ends());
+            *trained = TrainedPupils::of(theirs);
+        }
+        self.engine = wanted;
+    }
+
+    fn content(&self) -> FrameContent<'_> {
+        let cue = self.cue();
+        FrameContent {
+            picture: &self.pictures[cue.picture],
+            tag: PictureTag { number: cue.number, t_taken: None, order: cue.orders.scene },
+            pattern: cue.pattern.map(|pattern| &self.patterns[pattern]),
+        }
+    }
+
+    /// Goes on to the next one, where there is one.
+    pub(super) fn advance(&mut self) {
+        self.at = (self.at + 1).min(self.cues.len() - 1);
+    }
+}
