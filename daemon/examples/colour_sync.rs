@@ -64,6 +64,7 @@ fn run(out: &Path) -> Result<(), Failure> {
     let plan = SessionPlan {
         rig: rig.clone(),
         rig_again: None,
+        hangups: None,
         weights,
         backend: Backend::Cpu,
         pictures: Pictures::Scene(Arc::new(Frames {

@@ -242,7 +242,7 @@ fn the_rig_file_is_read_again_and_taken_whole_or_not_at_all() {
         fs::write(&path, &changed).unwrap();
         changed
     };
-    assert!(bench.ctl(&["reload"]).contains("rig.toml is read again: it says the same"));
+    assert!(bench.ctl(&["reload"]).contains("rig.toml is read again: nothing that is in force has changed"));
     assert_eq!(bench.status()["eye"], "left");
     assert!(bench.ctl(&["eye", "right"]).contains("the right eye"));
     assert_eq!(bench.status()["eye"], "right");
@@ -284,7 +284,9 @@ fn a_terminal_that_goes_away_ends_the_run_in_order() {
     let folder = folder_with_rig();
     let command = format!("exec {HOLOD} {}", ARGS.join(" "));
     let environment = [("XDG_RUNTIME_DIR", folder.path())];
-    let terminal = Daemon::start_with("script", &["-qec", &command, "/dev/null"], folder.path(), &environment);
+    // Whoever runs the tests may ignore the signal, which programs inherit.
+    let args = ["--default-signal=HUP", "script", "-qec", &command, "/dev/null"];
+    let terminal = Daemon::start_with("env", &args, folder.path(), &environment);
     let frames = folder.path().join("record/frames.csv");
     let lit = || frames::read(&frames).is_ok_and(|rows| rows.iter().any(|row| row.laser_on_ns.is_some()));
     assert!(wait_until(PATIENCE, lit), "no light");
@@ -299,12 +301,12 @@ fn a_terminal_that_goes_away_ends_the_run_in_order() {
 fn a_run_that_is_to_outlive_its_terminal_does() {
     let folder = tempfile::tempdir().unwrap();
     // Without a rig file the signal has nothing else to say than that the terminal is gone.
-    let args =
-        [HOLOD, "--resolution", "64x64", "--backend", "cpu", "--weights", "fast", "--record", "record", "--json"];
+    let options = ["--resolution", "64x64", "--backend", "cpu", "--weights", "fast", "--record", "record", "--json"];
     let environment = [("XDG_RUNTIME_DIR", folder.path())];
     let frames = || frames::read(&folder.path().join("record/frames.csv")).map_or(0, |rows| rows.len());
-    for (program, outlives) in [("nohup", true), ("env", false)] {
-        let mut daemon = Daemon::start_with(program, &args, folder.path(), &environment);
+    for (program, outlives) in [("nohup", true), ("--default-signal=HUP", false)] {
+        let args = [&[program, HOLOD][..], &options].concat();
+        let mut daemon = Daemon::start_with("env", &args, folder.path(), &environment);
         assert!(wait_until(PATIENCE, || frames() > 100), "no frames");
         daemon.signal(rustix::process::Signal::HUP);
         if outlives {

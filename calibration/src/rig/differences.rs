@@ -5,8 +5,8 @@ use crate::DisplayGeometry;
 
 impl Rig {
     /// The keys, such as `tracker.hold_ms`, whose figures in `self` are not those in `other`. A panel profile counts as
-    /// the keys that it gives, a file as what was read from it; the comments of a rig file and its name's spelling are no
-    /// difference.
+    /// the keys that it gives, a file as what was read from it, `model.weights_file` as `model.network`, a depth's two
+    /// spellings as `optics.depth_far` and `optics.depth_near`. Comments are no difference.
     pub fn differences(&self, other: &Self) -> Vec<&'static str> {
         // Named one by one, so that a new field must be thought of here.
         let Self { name, panel, geometry, lasers, tracker, model, provenance: _ } = self;
@@ -58,8 +58,8 @@ impl Rig {
             ("panel.flatness_file", *flatness_rad == other.panel.flatness_rad),
             ("optics.wavelengths_nm", *wavelengths == other.geometry.wavelengths),
             ("optics.eyepiece_focal_length_mm", *eyepiece_focal_length == other.geometry.eyepiece_focal_length),
-            ("optics.depth_far_dpt", *depth_far == other.geometry.depth_far),
-            ("optics.depth_near_dpt", *depth_near == other.geometry.depth_near),
+            ("optics.depth_far", *depth_far == other.geometry.depth_far),
+            ("optics.depth_near", *depth_near == other.geometry.depth_near),
             ("lasers.driver", *driver == other.lasers.driver),
             ("lasers.power_mw", *power_mw == other.lasers.power_mw),
             ("lasers.power_limit_mw", *power_limit_mw == other.lasers.power_limit_mw),
@@ -99,7 +99,7 @@ mod tests {
             ("red = 638.0", "red = 633.0", &["optics.wavelengths_nm"]),
             ("eye = \"both\"", "eye = \"left\"", &["tracker.eye"]),
             ("network = \"standard\"", "network = \"small\"", &["model.network"]),
-            ("depth_near_m = 0.35", "depth_near_m = 0.25", &["optics.depth_near_dpt"]),
+            ("depth_near_m = 0.35", "depth_near_m = 0.25", &["optics.depth_near"]),
         ] {
             let text = Rig::BUILT_IN_TOML.replacen(found, instead, 1);
             let other = Rig::parse(&text, Path::new("bench.toml")).unwrap();

@@ -215,6 +215,7 @@ fn closed_loop(args: &BenchArgs, rig: Rig, weights: Weights, frames: scene::Fram
     let plan = SessionPlan {
         rig: Rig { lasers: Lasers { driver: LaserDriver::Simulated, ..rig.lasers }, ..rig },
         rig_again: None,
+        hangups: None,
         weights,
         backend: args.backend,
         pictures: Pictures::Scene(Arc::new(frames)),

@@ -62,6 +62,7 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
         SessionPlan {
             rig,
             rig_again: None,
+            hangups: None,
             weights,
             backend: Backend::Auto,
             pictures: Pictures::Scene(Arc::new(frames)),

@@ -17,7 +17,7 @@ use crate::pictures::levels_picture;
 use crate::progress;
 use crate::record::{self, Recorder};
 use crate::report;
-use crate::session::{self, SessionPlan, SessionReport, Summary, not_dark};
+use crate::session::{self, Hangups, SessionPlan, SessionReport, Summary, not_dark};
 use crate::{setup, source};
 
 /// Scenario of the built-in tracker.
@@ -30,6 +30,8 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     {
         return replay(args, output, &report);
     }
+    // From the first reading on, another may be asked for.
+    let hangups = if args.rig.config.is_some() { Hangups::take_over()? } else { None };
     let rig = rig_of(args)?;
     let spec = rig.tracker.spec.clone().unwrap_or_else(|| SAMPLE_TRACKER.to_owned());
     let tracker: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
@@ -53,6 +55,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let plan = SessionPlan {
         rig,
         rig_again: args.rig.config.is_some().then(|| Arc::new(move || rig_of(&again)) as RigReader),
+        hangups,
         weights,
         backend: args.backend,
         pictures,
@@ -112,6 +115,7 @@ fn replay(args: &RunArgs, output: OutputSpec, tracker: &TrackerSpec) -> Result<(
     let plan = SessionPlan {
         rig,
         rig_again: None,
+        hangups: None,
         weights,
         backend,
         pictures,

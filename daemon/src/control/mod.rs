@@ -22,6 +22,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 pub use self::client::ask;
+#[cfg(test)]
+pub(crate) use self::prepare::CHANGEABLE;
 pub use self::prepare::RigReader;
 pub(crate) use self::prepare::{NewEngine, Preparer};
 pub(crate) use self::server::{ControlServer, panic_is_caught};

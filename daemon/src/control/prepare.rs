@@ -24,7 +24,7 @@ const FRAMES_BEFORE_STALL: i64 = 3;
 
 /// What of a rig can change while holod runs, by the keys of the rig file: all that the tracker's thread and the engine
 /// take without anything being opened anew.
-const CHANGEABLE: [&str; 6] =
+pub(crate) const CHANGEABLE: [&str; 6] =
     ["name", "tracker.eye", "tracker.scale_mm_per_unit", "tracker.fallback_mm", "tracker.hold_ms", "model.network"];
 
 /// Reads the rig again, as at the start.

@@ -2,11 +2,11 @@
 //! real-time thread waits for either.
 
 use std::cell::Cell;
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
 
@@ -14,7 +14,7 @@ use rustix::net::SocketType;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::{UnixListener, UnixStream};
 use tokio::runtime::Runtime;
-use tokio::sync::{Semaphore, oneshot};
+use tokio::sync::{Semaphore, SemaphorePermit, oneshot};
 use tokio::task::AbortHandle;
 
 use super::{Answer, Order, Ordered, Preparer, Request};
@@ -61,19 +61,32 @@ impl ControlServer {
             let _inside = runtime.enter();
             UnixListener::from_std(listener.into())?
         };
-        let waiting = Waiting { preparer, orders, long_work: Semaphore::new(1), under_way: AtomicUsize::new(0) };
+        let waiting = Waiting {
+            preparer,
+            orders,
+            long_work: Semaphore::new(1),
+            signal_waits: AtomicBool::new(false),
+            under_way: AtomicUsize::new(0),
+        };
         let waiting = Arc::new(waiting);
         runtime.spawn(serve(listener, Arc::clone(&waiting)));
         Ok((Self { socket, waiting, runtime: Some(runtime) }, receiver))
     }
 
-    /// Asks for something as a client does; the answer goes into the log.
-    pub(crate) fn ask(&self, whose: &'static str, request: Request) {
+    /// Has the rig file read again for a signal, which cannot ask twice: after whatever takes long now. What came of it is
+    /// said in the log.
+    pub(crate) fn reload_by_signal(&self) {
         let (Some(runtime), waiting) = (&self.runtime, Arc::clone(&self.waiting)) else { return };
+        // One that waits will read the file as it is then.
+        if waiting.signal_waits.swap(true, Ordering::AcqRel) {
+            return;
+        }
         runtime.spawn(async move {
-            match answer_to(request, &waiting).await {
-                Answer::Ok(said) => tracing::info!("{whose}: {}", said.as_str().unwrap_or_default()),
-                Answer::Error(why) => tracing::error!("{whose}: {why}"),
+            let Ok(alone) = waiting.long_work.acquire().await else { return };
+            waiting.signal_waits.store(false, Ordering::Release);
+            match take_time(Request::Reload { changed: BTreeMap::new() }, &waiting, alone).await {
+                Answer::Ok(said) => tracing::info!("SIGHUP: {}", said.as_str().unwrap_or_default()),
+                Answer::Error(why) => tracing::error!("SIGHUP: {why}"),
             }
         });
     }
@@ -156,19 +169,32 @@ async fn answer(line: &[u8], desk: &Arc<Waiting>) -> Answer {
 
 async fn answer_to(request: Request, desk: &Arc<Waiting>) -> Answer {
     // Nothing that takes long stands before darkness.
-    let prepared = if request.takes_long() {
-        let Ok(_alone) = desk.long_work.try_acquire() else {
-            return Answer::Error("holod is busy with another scene, other weights or the rig file: ask again".into());
-        };
-        let (waiting, asked) = (Arc::clone(desk), request.clone());
-        tokio::task::spawn_blocking(move || waiting.prepare_long(&asked)).await
-    } else {
-        Ok(desk.preparer.prepare(&request))
-    };
+    if !request.takes_long() {
+        let prepared = desk.preparer.prepare(&request);
+        return hand_over(prepared, request, desk).await;
+    }
+    match desk.long_work.try_acquire() {
+        Ok(alone) => take_time(request, desk, alone).await,
+        Err(_) => Answer::Error("holod is busy with another scene, other weights or the rig file: ask again".into()),
+    }
+}
+
+/// Makes a request ready that takes long, for which one must be alone.
+async fn take_time(request: Request, desk: &Arc<Waiting>, alone: SemaphorePermit<'_>) -> Answer {
+    let (waiting, asked) = (Arc::clone(desk), request.clone());
+    let prepared = tokio::task::spawn_blocking(move || waiting.prepare_long(&asked)).await;
+    drop(alone);
+    match prepared {
+        Ok(prepared) => hand_over(prepared, request, desk).await,
+        Err(_panic) => Answer::Error("holod failed over this request, and goes on: see its log".into()),
+    }
+}
+
+/// Has a request obeyed that is ready.
+async fn hand_over(prepared: Result<Order, String>, request: Request, desk: &Waiting) -> Answer {
     let order = match prepared {
-        Ok(Ok(order)) => order,
-        Ok(Err(why)) => return Answer::Error(why),
-        Err(_panic) => return Answer::Error("holod failed over this request, and goes on: see its log".into()),
+        Ok(order) => order,
+        Err(why) => return Answer::Error(why),
     };
     let (answer, answered) = oneshot::channel();
     let ending = || Answer::Error("holod is ending".into());
@@ -204,6 +230,8 @@ struct Waiting {
     orders: mpsc::Sender<Ordered>,
     /// Of what takes long, one at a time.
     long_work: Semaphore,
+    /// A signal asks for the rig file, and waits for the rest.
+    signal_waits: AtomicBool,
     /// Requests that have no answer yet.
     under_way: AtomicUsize,
 }

@@ -211,6 +211,7 @@ pub(super) fn build(
         feed,
         desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }),
         signals,
+        hangups: plan.hangups,
         service: Service::connect(),
         status: StatusFile::create(),
         t_origin,

@@ -83,7 +83,7 @@ impl Desk {
     /// Has the rig file read again, because a signal asks for it.
     pub(super) fn reload(&self) {
         match &self.server {
-            Some((server, _)) => server.ask("SIGHUP", Request::Reload { changed: BTreeMap::new() }),
+            Some((server, _)) => server.reload_by_signal(),
             None => tracing::error!("SIGHUP: the rig file cannot be read again without a control socket"),
         }
     }
@@ -129,7 +129,7 @@ impl Watch<'_> {
             }
             let now = host_now();
             let request = match &order {
-                Order::Reload(new) => Request::Reload { changed: changed_keys(&new.rig, &self.rig) },
+                Order::Reload(new) => Request::Reload { changed: changed_keys(new, &self.rig) },
                 _ => request,
             };
             let done = self.carry_out(order, output, now);
@@ -217,8 +217,8 @@ impl Watch<'_> {
 
     /// Takes all of a rig that was read again, or nothing.
     fn reload(&mut self, new: NewRig) -> Result<Value, String> {
+        let changed = changed_keys(&new, &self.rig);
         let NewRig { rig, engine } = new;
-        let changed = changed_keys(&rig, &self.rig);
         if engine.is_none() && rig.model.weights != self.rig.model.weights {
             return Err("the weights were changed meanwhile: ask again".into());
         }
@@ -228,16 +228,19 @@ impl Watch<'_> {
         if rig.tracker != self.rig.tracker {
             self.follow(rig.tracker.clone())?;
         }
-        let weights_are_read = engine.map(|engine| self.change_engine(engine)).transpose()?.is_some();
-        self.rig = rig;
-        let origin = &self.rig.provenance.origin;
-        let said: Vec<_> = changed.iter().map(|(key, value)| format!("{key} is {value}")).collect();
-        Ok(match (said.is_empty(), weights_are_read) {
-            (false, _) => format!("{origin} is read again: {}", said.join(", ")),
-            (true, true) => format!("{origin} is read again: it says the same, and its weights file is read anew"),
-            (true, false) => format!("{origin} is read again: it says the same"),
+        if let Some(engine) = engine {
+            self.change_engine(engine)?;
         }
-        .into())
+        self.rig = rig;
+        let said: Vec<_> = changed
+            .iter()
+            .map(|(key, value)| match value {
+                Value::Null => format!("{key} is not given any more"),
+                value => format!("{key} is {value}"),
+            })
+            .collect();
+        let said = if said.is_empty() { "nothing that is in force has changed".to_owned() } else { said.join(", ") };
+        Ok(format!("{} is read again: {said}", self.rig.provenance.origin).into())
     }
 
     fn change_pattern(&mut self, pattern: Option<NewPattern>, output: &OutputControl) -> Result<Value, String> {
@@ -277,8 +280,9 @@ impl Watch<'_> {
     }
 }
 
-/// What `new` says of the keys that it has changed, in the rig file's own units.
-fn changed_keys(new: &Rig, old: &Rig) -> BTreeMap<&'static str, Value> {
+/// What `new` says of the keys that it changes, in the rig file's own units. A weights file that is read anew is a change.
+fn changed_keys(new: &NewRig, old: &Rig) -> BTreeMap<&'static str, Value> {
+    let NewRig { rig: new, engine } = new;
     let value = |key| match key {
         "name" => new.name.clone().into(),
         "tracker.eye" => new.tracker.eye.name().into(),
@@ -289,7 +293,8 @@ fn changed_keys(new: &Rig, old: &Rig) -> BTreeMap<&'static str, Value> {
         // The preparer refuses all others.
         _ => Value::Null,
     };
-    new.differences(old).into_iter().map(|key| (key, value(key))).collect()
+    let weights = engine.as_ref().map(|_| "model.network");
+    new.differences(old).into_iter().chain(weights).map(|key| (key, value(key))).collect()
 }
 
 const fn eye_in_words(eye: Eye) -> &'static str {
@@ -298,5 +303,36 @@ const fn eye_in_words(eye: Eye) -> &'static str {
         Eye::Right => "the right eye",
         Eye::Both => "both eyes, their mean",
         Eye::Better => "the eye of which the tracker is surer",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::control::CHANGEABLE;
+
+    #[test]
+    fn every_key_that_can_change_is_recorded_with_its_value() {
+        let old = Rig::default();
+        let mut rig = Rig { name: "other".into(), ..Rig::default() };
+        rig.tracker = rig::Tracker {
+            spec: None,
+            eye: Eye::Left,
+            scale: Some(0.0125),
+            fallback: PupilDiameter::from_mm(3.3),
+            hold: TimeNs(400_000_000),
+        };
+        rig.model.weights = WeightsChoice::File("/a/mine.safetensors".into());
+        let changed = serde_json::to_value(changed_keys(&NewRig { rig, engine: None }, &old)).unwrap();
+        let expected = serde_json::json!({
+            "name": "other", "tracker.eye": "left", "tracker.scale_mm_per_unit": 0.0125, "tracker.fallback_mm": 3.3,
+            "tracker.hold_ms": 400.0, "model.network": "mine.safetensors",
+        });
+        assert_eq!(changed, expected);
+        let mut keys: Vec<_> = expected.as_object().unwrap().keys().collect();
+        let mut changeable = CHANGEABLE.to_vec();
+        keys.sort();
+        changeable.sort_unstable();
+        assert_eq!(keys, changeable);
     }
 }

@@ -40,7 +40,8 @@ use holod_pupil_input::host_now;
 pub(crate) use self::inputs::{Cue, Playback, pupil_state_named};
 pub use self::ledger::LaserSummary;
 pub use self::observer::{Began, FirstLight, Observer};
-pub(crate) use self::service::{Hangup, Signals};
+pub use self::service::Hangups;
+pub(crate) use self::service::Signals;
 pub use self::stats::Spread;
 pub use self::summary::{SessionReport, Summary};
 pub use self::take_down::not_dark;
@@ -51,6 +52,8 @@ pub struct SessionPlan {
     pub rig: Rig,
     /// Reads it again, where there is a file to read it from.
     pub rig_again: Option<RigReader>,
+    /// What asks for that; where there is nothing, SIGHUP ends the run.
+    pub hangups: Option<Hangups>,
     /// The network.
     pub weights: Weights,
     /// Which engine runs it.
@@ -103,8 +106,7 @@ fn run_with(
     playback: Option<Playback>,
     observer: &mut dyn Observer,
 ) -> Result<SessionReport, Failure> {
-    let on_hangup = if plan.rig_again.is_some() { Hangup::for_a_daemon() } else { Hangup::Ends };
-    let signals = Signals::install(on_hangup)?;
+    let signals = Signals::install(plan.hangups.as_ref())?;
     #[cfg(feature = "fault-injection")]
     crate::fault::install()?;
     let mut session = build::build(plan, playback, signals, observer)?;

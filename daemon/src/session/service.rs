@@ -12,46 +12,64 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use crate::failure::{Exit, Failure};
 use crate::staging::{hangup_is_ignored, leave_signals_to_a_run};
 
-/// What SIGHUP says.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Hangup {
-    /// The terminal has gone: end.
-    Ends,
-    /// Read the rig file again.
-    Reloads,
+/// SIGHUPs that ask for the rig file to be read again, for as long as this lives.
+pub struct Hangups {
+    asked: Arc<AtomicBool>,
+    registered: SigId,
 }
 
-impl Hangup {
-    /// Where a terminal can go, the signal says that it has; a service has none.
-    pub(crate) fn for_a_daemon() -> Self {
-        if std::fs::File::open("/dev/tty").is_ok() { Self::Ends } else { Self::Reloads }
+impl Hangups {
+    /// Takes the signal over where holod has no terminal, as under systemd; where it has one, the signal says that the
+    /// terminal has gone, and nothing is taken over.
+    ///
+    /// # Errors
+    /// The system refuses.
+    pub(crate) fn take_over() -> Result<Option<Self>, Failure> {
+        if has_terminal() {
+            return Ok(None);
+        }
+        let asked = Arc::new(AtomicBool::new(false));
+        let registered = signal_hook::flag::register(SIGHUP, Arc::clone(&asked));
+        let registered = registered.map_err(Failure::because(Exit::Software))?;
+        Ok(Some(Self { asked, registered }))
+    }
+
+    /// Whether one came since the last call.
+    pub(crate) fn asked(&self) -> bool {
+        self.asked.swap(false, Ordering::AcqRel)
     }
 }
 
-/// SIGINT, SIGTERM and SIGHUP, as flags, for as long as this lives.
+impl Drop for Hangups {
+    fn drop(&mut self) {
+        signal_hook::low_level::unregister(self.registered);
+    }
+}
+
+/// Whether there is a controlling terminal. What cannot be found out counts as one: its end ends the run.
+fn has_terminal() -> bool {
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    // After the name, which may hold anything: state, parent, group, session, terminal.
+    let terminal = stat.rsplit_once(')').and_then(|(_, fields)| fields.split_whitespace().nth(4));
+    terminal != Some("0")
+}
+
+/// SIGINT, SIGTERM and, where it is not taken over for something else, SIGHUP, as a flag, for as long as this lives.
 pub(crate) struct Signals {
     caught: Arc<AtomicUsize>,
-    reload: Arc<AtomicBool>,
     registered: Vec<SigId>,
 }
 
 impl Signals {
     /// Takes the signals over. A second one while the first is being obeyed ends the process at once: the laser box's
     /// heartbeat makes it dark.
-    pub(crate) fn install(on_hangup: Hangup) -> Result<Self, Failure> {
+    pub(crate) fn install(hangups: Option<&Hangups>) -> Result<Self, Failure> {
         let caught = Arc::new(AtomicUsize::new(0));
         let again = Arc::new(AtomicBool::new(false));
-        let mut signals = Self { caught, reload: Arc::default(), registered: Vec::new() };
+        let mut signals = Self { caught, registered: Vec::new() };
         leave_signals_to_a_run(true);
-        let mut ending = vec![SIGINT, SIGTERM];
-        match on_hangup {
-            Hangup::Ends => ending.extend((!hangup_is_ignored()).then_some(SIGHUP)),
-            Hangup::Reloads => {
-                let registered = signal_hook::flag::register(SIGHUP, Arc::clone(&signals.reload));
-                signals.registered.push(registered.map_err(Failure::because(Exit::Software))?);
-            }
-        }
-        for signal in ending {
+        let ends_on_hangup = hangups.is_none() && !hangup_is_ignored();
+        for signal in [SIGINT, SIGTERM].into_iter().chain(ends_on_hangup.then_some(SIGHUP)) {
             let caught = Arc::clone(&signals.caught);
             for registered in [
                 signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&again)),
@@ -62,11 +80,6 @@ impl Signals {
             }
         }
         Ok(signals)
-    }
-
-    /// Whether the rig file is to be read again; says so once.
-    pub(crate) fn hangup(&self) -> bool {
-        self.reload.swap(false, Ordering::AcqRel)
     }
 
     /// The name of the signal that ends the run, where it came.

@@ -22,7 +22,7 @@ use super::service::Service;
 use super::stats::FrameRate;
 use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
-use super::{Observer, Signals, host_now};
+use super::{Hangups, Observer, Signals, host_now};
 use crate::failure::{Exit, Failure};
 use crate::snapshot::{Figures, Snapshot};
 use crate::source::feed::Feed;
@@ -49,6 +49,7 @@ pub(super) struct Watch<'a> {
     pub(super) feed: Option<Feed>,
     pub(super) desk: Desk,
     pub(super) signals: Signals,
+    pub(super) hangups: Option<Hangups>,
     pub(super) service: Service,
     pub(super) status: StatusFile,
     pub(super) t_origin: TimeNs,
@@ -142,7 +143,7 @@ impl Watch<'_> {
             if self.obey(output)? {
                 return Ok("holod ctl stop".to_owned());
             }
-            if self.signals.hangup() {
+            if self.hangups.as_ref().is_some_and(Hangups::asked) {
                 self.desk.reload();
             }
             self.service.progress(self.tally.frames_shown, now);

@@ -14,7 +14,7 @@ use holod_slm_output::{LevelsFrame, Output, OutputOptions, OutputSpec, Pacer, Pa
 
 use crate::cli::PatternTarget;
 use crate::failure::{Exit, Failure};
-use crate::session::{Hangup, Signals};
+use crate::session::Signals;
 
 /// Time that a frame may take before it has been measured.
 const FIRST_COPY: TimeNs = TimeNs(5_000_000);
@@ -44,7 +44,7 @@ pub(super) fn show(
     levels: &LevelsFrame,
     to: &PatternTarget,
 ) -> Result<Shown, Failure> {
-    let signals = Signals::install(Hangup::Ends)?;
+    let signals = Signals::install(None)?;
     let pacing = pacing_config(rig, FIRST_COPY).map_err(Failure::because(Exit::Config))?;
     let mut output = open(spec, rig, encoder).map_err(Failure::because(Exit::Unavailable))?;
     let switch = output.control.dark_switch();

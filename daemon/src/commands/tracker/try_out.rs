@@ -18,7 +18,7 @@ use crate::bug_report;
 use crate::cli::TryArgs;
 use crate::failure::{Exit, Failure};
 use crate::record;
-use crate::session::{Hangup, Signals, tracker_failure};
+use crate::session::{Signals, tracker_failure};
 use crate::terminal::{Axes, LiveText, Series, TextSize, plot};
 use crate::{report, setup};
 
@@ -60,7 +60,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     if let Some(folder) = args.record.as_deref().filter(|_| args.force) {
         record::remove_earlier(folder)?;
     }
-    let signals = Signals::install(Hangup::Ends)?;
+    let signals = Signals::install(None)?;
     let began = host_now();
     let options = TrackerOptions {
         origin: began,
