@@ -86,7 +86,7 @@ class Control:
         return self.ask("pupil", mm=mm)
 
     def eye(self, eye: str) -> str:
-        """Follows another eye: "left", "right", "both" (their mean) or "better" (the one of which the tracker is surer)."""
+        """Follows another eye: "left", "right", "both" (their mean) or "better" (of which the tracker is surer)."""
         return self.ask("eye", eye=eye)
 
     def reload(self) -> str:
