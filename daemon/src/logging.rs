@@ -76,11 +76,16 @@ static RECENT: Mutex<Kept> = Mutex::new(Kept { lines: VecDeque::new(), ever: 0 }
 impl<S: Subscriber> Layer<S> for KeepRecent {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
         let level = *event.metadata().level();
+        let mut file = FILE.lock().unwrap_or_else(PoisonError::into_inner);
+        if level > Level::INFO && file.is_none() {
+            return;
+        }
         let line = Line::now(level, text_of(event));
-        if let Some(file) = &mut *FILE.lock().unwrap_or_else(PoisonError::into_inner) {
+        if let Some(file) = &mut *file {
             // A disk that refuses is told of by whoever records.
             let _ = write_line(file, &line);
         }
+        drop(file);
         if level > Level::INFO {
             return;
         }

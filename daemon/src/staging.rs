@@ -141,13 +141,22 @@ fn take_away_on_signals() {
         let wait = move || {
             for signal in signals.forever() {
                 if !OBEYED_ELSEWHERE.load(Ordering::Acquire) {
-                    half_done(|folders| folders.iter().for_each(|folder| drop(fs::remove_dir_all(folder))));
+                    half_done(|folders| folders.iter().for_each(|folder| remove(folder)));
                     std::process::exit(128 + signal);
                 }
             }
         };
         let _ = std::thread::Builder::new().name("holod-signals".into()).spawn(wait);
     });
+}
+
+/// Removes a folder into which somebody may still be writing.
+fn remove(folder: &Path) {
+    for _ in 0..100 {
+        if fs::remove_dir_all(folder).is_ok() || !folder.exists() {
+            return;
+        }
+    }
 }
 
 #[cfg(test)]

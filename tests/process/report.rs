@@ -380,6 +380,8 @@ fn a_report_names_no_file_outside_of_it() {
     let sent = bench.send();
     let outside = sent.0.path().join("outside");
     fs::create_dir(&outside).unwrap();
+    let kept = outside.join("kept");
+    fs::copy(sent.path(), &kept).unwrap();
     let refused = |says: &str| {
         let ended = sent.show(&[]);
         assert_eq!(ended.status.code(), Some(65), "{}", ended.stderr);
@@ -403,7 +405,24 @@ fn a_report_names_no_file_outside_of_it() {
         fs::copy(report.join("bench/lut-green.csv"), outside.join("lut.csv")).unwrap();
         rewrite(report.join("bench/rig.toml"), "lut-green.csv", &elsewhere("lut.csv"));
     });
-    refused("lut.csv, which is not in the report");
+    refused("lut.csv`, which is not in the report");
+
+    let whole = |change: &dyn Fn(&Path)| {
+        fs::copy(&kept, sent.path()).unwrap();
+        sent.changed(change);
+    };
+    // Neither is read, which would never end, nor told of.
+    whole(&|report| rewrite(report.join("run.json"), "\"colour-000000.png\"", "\"/dev/zero\""));
+    refused("the scene is not in the report");
+    whole(&|report| rewrite(report.join("bench/rig.toml"), "[lasers]", "[lasers]\nprofile_file = \"/etc/passwd\""));
+    refused("lasers.profile_file names `/etc/passwd`, which is not in the report");
+    // Only what is asked of a pattern is carried out for a pattern.
+    whole(&|report| {
+        let order = format!("{{\"t_ns\":1,\"request\":{{\"do\":\"scene\",\"scene\":\"{}\"}}}}\n", outside.display());
+        fs::write(report.join("orders.jsonl"), order).unwrap();
+        rewrite(report.join("frames.csv"), ",0,0,0\n", ",0,0,1\n");
+    });
+    refused("order 1: it brought no pattern");
 }
 
 #[test]

@@ -1,8 +1,9 @@
 //! Makes the frames of a report again, in the loop that made them, and compares.
 
 use std::collections::{BTreeMap, HashMap};
+use std::ffi::OsStr;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 use holod_calibration::rig::{LaserDriver, Rig, WeightsChoice};
@@ -12,6 +13,7 @@ use holod_model::scene::Scene;
 use holod_slm_output::{FieldEvent, LevelsFrame};
 use serde::Serialize;
 use serde_json::Value;
+use toml_edit::DocumentMut;
 
 use super::recorded::{self, Made, RecordedFrame};
 use super::{SCENE_FOLDER, Unpacked, order_folder};
@@ -29,6 +31,9 @@ use crate::source::scene::{self, Frames};
 
 /// Engines that are held beside the first: each has the memory of a run's own.
 const MOST_ENGINES: usize = 4;
+/// Patterns that are held, each as large as the panel, and scenes beside the first.
+const MOST_PATTERNS: usize = 64;
+const MOST_SCENES: usize = 16;
 /// Differences that are told one by one.
 const TOLD: usize = 10;
 
@@ -64,16 +69,8 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     })?;
     let facts: RunFacts = serde_json::from_str(&facts).map_err(|error| data(format!("{RUN}: {error}")))?;
     let config = report.path(BENCH).join(RIG);
+    refuse_foreign_files(report)?;
     let mut rig = Rig::load(&config).map_err(Failure::because(Exit::Data))?;
-    let provenance = &rig.provenance;
-    let tables = provenance.lut_files.0.iter().chain(&provenance.flatness_files.0).flatten();
-    let weights = match &rig.model.weights {
-        WeightsChoice::File(path) => Some(path),
-        _ => None,
-    };
-    if let Some(path) = tables.chain(weights).find(|path| !report.holds(path)) {
-        return Err(data(format!("{BENCH}/{RIG} names {}, which is not in the report", path.display())));
-    }
     // Nothing that a report says lights a laser.
     rig.lasers.driver = LaserDriver::Simulated;
     if let Some(scale) = facts.scale_mm_per_unit {
@@ -111,6 +108,7 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
         engines: Vec::new(),
         engine_places: HashMap::new(),
         patterns: Vec::new(),
+        drawn: Vec::new(),
         pattern_places: HashMap::new(),
         pictures: Vec::new(),
         picture_places: HashMap::new(),
@@ -151,6 +149,28 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     Ok(Played { rig, pictures: Pictures::Scene(first), backend, playback, comparison, config, scene })
 }
 
+/// Refuses a rig that names files outside of the report, before any of them is opened.
+fn refuse_foreign_files(report: &Unpacked) -> Result<(), Failure> {
+    // A text that is no TOML is told with its line when it is loaded.
+    let Some(Ok(rig)) = report.text(&format!("{BENCH}/{RIG}"))?.map(|text| text.parse::<DocumentMut>()) else {
+        return Ok(());
+    };
+    let keys =
+        [("panel", "lut_file"), ("panel", "flatness_file"), ("lasers", "profile_file"), ("model", "weights_file")];
+    for (table, key) in keys {
+        let Some(found) = rig.get(table).and_then(|table| table.get(key)) else { continue };
+        let of_colours = found.as_table_like().into_iter().flat_map(|files| files.iter().map(|(_, file)| file));
+        for name in of_colours.chain([found]).filter_map(|file| file.as_str()) {
+            let is_plain = Path::new(name).file_name() == Some(OsStr::new(name));
+            if !is_plain || !report.holds(&report.path(BENCH).join(name)) {
+                let what = format!("{BENCH}/{RIG}: {table}.{key} names `{name}`, which is not in the report");
+                return Err(Failure::new(Exit::Data, what));
+            }
+        }
+    }
+    Ok(())
+}
+
 fn black(resolution: Resolution) -> Arc<Frames> {
     Arc::new(Frames {
         frames: vec![Arc::new(RgbdFrame::black(resolution))],
@@ -173,7 +193,10 @@ impl Orders {
     fn read(report: &Unpacked) -> Result<Self, Failure> {
         let lines = |name: &str| Ok::<_, Failure>(report.text(name)?.unwrap_or_default());
         let mut orders = Self { requests: Vec::new(), sources: HashMap::new(), foreign: None };
-        for (index, line) in lines(ORDERS)?.lines().enumerate() {
+        let text = lines(ORDERS)?;
+        // A run that broke off may have left half a line.
+        let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+        for (index, line) in whole.lines().enumerate() {
             let number = index + 1;
             let wrong = |what: String| Failure::new(Exit::Data, format!("{ORDERS} line {number}: {what}"));
             let mut order: Value = serde_json::from_str(line).map_err(|error| wrong(error.to_string()))?;
@@ -230,6 +253,8 @@ struct Material<'a> {
     engines: Vec<crate::control::NewEngine>,
     engine_places: HashMap<u32, Result<usize, String>>,
     patterns: Vec<LevelsFrame>,
+    /// What each of them was asked for with.
+    drawn: Vec<Request>,
     pattern_places: HashMap<u32, Result<Option<usize>, String>>,
     pictures: Vec<Arc<RgbdFrame>>,
     picture_places: HashMap<(u32, u64), usize>,
@@ -316,14 +341,18 @@ impl Material<'_> {
     /// Whether a file that the run read is in the report as it was.
     fn is_whole(&self, folder: &str, file: &SourceFile) -> bool {
         let path = self.report.path(folder).join(&file.name);
-        let found = fs::File::open(&path).and_then(|mut file| content_xxh3(&mut file));
-        self.report.holds(&path) && found.is_ok_and(|found| found == (file.bytes, file.xxh3.clone()))
+        // Asked first: a name may lead anywhere.
+        self.report.holds(&path)
+            && fs::File::open(&path)
+                .and_then(|mut file| content_xxh3(&mut file))
+                .is_ok_and(|found| found == (file.bytes, file.xxh3.clone()))
     }
 
     fn scene(&mut self, order: u32) -> Result<&Frames, String> {
         if !self.scenes.contains_key(&order) {
             let source = self.orders.sources.get(&order).and_then(|source| source.scene.as_ref());
             let scene = match source {
+                Some(_) if self.scenes.len() > MOST_SCENES => Err(format!("more than {MOST_SCENES} changes of scene")),
                 Some(source) => self.load(&order_folder(order), source),
                 None => Err(format!("the scene of order {order} is not in the report")),
             };
@@ -384,16 +413,29 @@ impl Material<'_> {
         if let Some(place) = self.pattern_places.get(&order) {
             return place.clone();
         }
-        let place = match parsed(self.orders.request(order)?).and_then(|request| self.carry_out(&request)) {
-            Ok(Order::Pattern(pattern)) => Ok(pattern.map(|pattern| {
-                self.patterns.push(*pattern.levels);
-                self.patterns.len() - 1
-            })),
-            Ok(_) => Err(format!("order {order} brought no pattern")),
+        let place = match parsed(self.orders.request(order)?) {
+            Ok(request) => self.draw(request).map_err(|why| format!("order {order}: {why}")),
             Err(why) => Err(format!("order {order}: {why}")),
         };
         self.pattern_places.insert(order, place.clone());
         place
+    }
+
+    /// The place of what a request for a pattern shows; nothing where that is holograms.
+    fn draw(&mut self, request: Request) -> Result<Option<usize>, String> {
+        if !matches!(request, Request::Flat | Request::Pattern { .. } | Request::Hologram) {
+            return Err("it brought no pattern".into());
+        }
+        if let Some(place) = self.drawn.iter().position(|drawn| *drawn == request) {
+            return Ok(Some(place));
+        }
+        if self.patterns.len() == MOST_PATTERNS {
+            return Err(format!("more than {MOST_PATTERNS} patterns"));
+        }
+        let Order::Pattern(Some(pattern)) = self.carry_out(&request)? else { return Ok(None) };
+        self.patterns.push(*pattern.levels);
+        self.drawn.push(request);
+        Ok(Some(self.patterns.len() - 1))
     }
 
     fn carry_out(&mut self, request: &Request) -> Result<Order, String> {
@@ -483,14 +525,13 @@ impl Comparison {
         self.outcome.made_again_by = [env!("HOLOD_VERSION").into(), engine.to_owned()];
         let mut shown: Vec<_> = self.shown.into_iter().collect();
         shown.sort_unstable_by_key(|(frame, _)| *frame);
+        // A run that ends in the middle of a frame has shown some of its fields.
+        let cut_off = [shown.last().map(|(frame, _)| *frame), self.fields.keys().max().copied()];
         for (frame, shown) in shown {
             let Some(recorded) = self.fields.get(&frame) else { continue };
-            // A run that ends in the middle of a frame has shown some of its fields.
-            let common = |one: &[(u8, Colour)], other: &[(u8, Colour)]| {
-                let is_in_other = |field: &&(u8, Colour)| other.iter().any(|(number, _)| *number == field.0);
-                one.iter().filter(is_in_other).copied().collect::<Vec<_>>()
-            };
-            if common(&shown, recorded) == common(recorded, &shown) {
+            let is_cut = cut_off.contains(&Some(frame)) && !shown.is_empty() && !recorded.is_empty();
+            let same = shown == *recorded || is_cut && (shown.starts_with(recorded) || recorded.starts_with(&shown));
+            if same {
                 self.outcome.fields_same += 1;
             } else {
                 self.outcome.fields_different += 1;
@@ -711,6 +752,8 @@ mod tests {
         assert_eq!(differs([green, red, (2, Colour::Red)]), [5]);
         let cut_off = outcome(&[], &[(5, green), (5, red)]);
         assert_eq!((cut_off.fields_same, cut_off.fields_different), (1, 0));
+        let nothing_in_common = outcome(&[], &[(5, (7, Colour::Red))]);
+        assert_eq!((nothing_in_common.fields_same, nothing_in_common.fields_different), (0, 1));
     }
 
     #[test]

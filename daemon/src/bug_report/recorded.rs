@@ -1,6 +1,6 @@
 //! Reads `frames.csv`: which frames a run made, of what, and how its fields were shown.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
@@ -53,7 +53,7 @@ pub(super) fn read(path: &Path) -> Result<Vec<RecordedFrame>, Failure> {
     next(&mut text)?;
     let columns: HashMap<String, usize> =
         text.trim_end().split(',').enumerate().map(|(index, name)| (name.to_owned(), index)).collect();
-    let mut frames: Vec<RecordedFrame> = Vec::new();
+    let mut frames: BTreeMap<u64, RecordedFrame> = BTreeMap::new();
     let mut number = 1;
     while next(&mut text)? > 0 {
         number += 1;
@@ -65,17 +65,12 @@ pub(super) fn read(path: &Path) -> Result<Vec<RecordedFrame>, Failure> {
         let row = Row { columns: &columns, cells: row.split(',').collect() };
         let (frame, field, colour, made) = row.read().map_err(|what| wrong(number, &what))?;
         // A panel that was lost may show an older frame again.
-        match frames.binary_search_by_key(&frame, |known| known.frame) {
-            Err(place) => frames.insert(place, RecordedFrame { frame, made, fields: vec![(field, colour)] }),
-            Ok(place) => {
-                let fields = &mut frames[place].fields;
-                if fields.iter().all(|(known, _)| *known != field) {
-                    fields.push((field, colour));
-                }
-            }
+        let known = frames.entry(frame).or_insert_with(|| RecordedFrame { frame, made, fields: Vec::new() });
+        if known.fields.iter().all(|(known, _)| *known != field) {
+            known.fields.push((field, colour));
         }
     }
-    Ok(frames)
+    Ok(frames.into_values().collect())
 }
 
 struct Row<'a> {
@@ -95,6 +90,9 @@ impl Row<'_> {
         let (Some(pupil_mm), Some(t_wake_ns)) = (self.cell::<f32>("pupil_mm")?, self.cell("t_wake_ns")?) else {
             return Ok(None);
         };
+        if !(0.1..=20.0).contains(&pupil_mm) {
+            return Err(format!("found a pupil of {pupil_mm} mm, expected one of an eye"));
+        }
         let hash = self.text("levels_xxh3")?;
         if hash.is_empty() {
             return Ok(None);

@@ -160,8 +160,9 @@ fn take_apart(path: &Path, folder: &Path) -> Result<(), Fault> {
         }
         match entry.header().entry_type() {
             EntryType::Regular => {
-                let target = folder.join(within(&name).map_err(refuse)?);
-                let written = create(&target).and_then(|mut file| {
+                let inside = within(&name).map_err(refuse)?;
+                let target = folder.join(&inside);
+                let written = create(folder, &inside).and_then(|mut file| {
                     let copied = copy(&mut entry, &mut file);
                     Ok((copied, file.flush()?))
                 });
@@ -216,11 +217,17 @@ fn copy(from: &mut impl Read, to: &mut impl Write) -> Result<u64, Copy> {
     }
 }
 
-fn create(target: &Path) -> io::Result<File> {
-    if let Some(parent) = target.parent() {
-        fs::create_dir_all(parent)?;
+/// Creates a file in `folder`, which must be there: a signal may have taken it away.
+fn create(folder: &Path, inside: &Path) -> io::Result<File> {
+    let mut parent = folder.to_owned();
+    for part in inside.parent().into_iter().flat_map(Path::components) {
+        parent.push(part);
+        match fs::create_dir(&parent) {
+            Err(error) if error.kind() != io::ErrorKind::AlreadyExists => return Err(error),
+            _ => {}
+        }
     }
-    OpenOptions::new().write(true).create_new(true).open(target)
+    OpenOptions::new().write(true).create_new(true).open(folder.join(inside))
 }
 
 /// A name in an archive as a path that stays within a folder.

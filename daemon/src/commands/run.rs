@@ -35,6 +35,9 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let rig = rig_of(args)?;
     let spec = rig.tracker.spec.clone().unwrap_or_else(|| SAMPLE_TRACKER.to_owned());
     let tracker: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
+    if let TrackerSpec::Path(path) | TrackerSpec::Replay { path, .. } = &tracker {
+        bug_report::refuse_archive(path)?;
+    }
     tracing::info!("{}: tracker {tracker}, panel {output} of {}", rig.name, rig.resolution());
     let weights = progress::during("loading the network", || setup::weights(&rig))?;
     let pictures = progress::during("loading the scene", || source::named(&args.scene, &rig.geometry))?;
