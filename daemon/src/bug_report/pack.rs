@@ -10,14 +10,16 @@ use flate2::write::GzEncoder;
 use holod_calibration::rig::Rig;
 use holod_pupil_input::{RecordFiles, with_header};
 use serde::de::DeserializeOwned;
+use serde_json::Value;
 use tar::{Builder, EntryType, Header};
+use toml_edit::DocumentMut;
 
+use super::play::parsed;
 use super::{FOLDER, MANIFEST, Manifest, Packed, SCENE_FOLDER, Scrubber, order_folder, unix_ms};
-use crate::control::Request;
 use crate::failure::{Exit, Failure};
 use crate::record::{
     self, BENCH, LOG, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SCENE, SceneSource, SourceFile,
-    content_xxh3,
+    content_xxh3, is_of_bench, is_weights,
 };
 use crate::snapshot::Snapshot;
 
@@ -92,7 +94,7 @@ impl Contents {
                 contents.started_unix_ms = Some(run.started_unix_ms);
                 contents.add_json::<RunFacts>(RUN, facts.as_deref().unwrap_or_default(), scrubber);
                 contents.add_bench(folder, scrubber)?;
-                contents.add_scene(SCENE_FOLDER, &run.scene, with_scene);
+                contents.add_scene(SCENE_FOLDER, &run.scene, with_scene, scrubber);
             }
             Some(Err(error)) => contents.left_out.push(format!("{RUN}, which is damaged: {error}; {NO_FRAMES}")),
             None => contents.left_out.push(format!("{RUN}: an earlier holod, which wrote none, made it; {NO_FRAMES}")),
@@ -105,13 +107,13 @@ impl Contents {
             contents.add_tracker_bytes(path, scrubber)?;
         }
         if let Some(text) = contents.text_of(folder, ORDERS)? {
-            contents.add_lines::<OrderLine>(ORDERS, &text, scrubber);
+            contents.add_checked(ORDERS, &text, scrubber, reads_as_orders);
         }
         if let Some(text) = contents.text_of(folder, ORDER_FILES)? {
             contents.add_lines::<OrderSource>(ORDER_FILES, &text, scrubber);
             for line in text.lines() {
                 if let Ok(source) = serde_json::from_str(line) {
-                    contents.add_order(&source, with_scene);
+                    contents.add_order(&source, with_scene, scrubber);
                 }
             }
         }
@@ -172,34 +174,50 @@ impl Contents {
         self.add_checked(name, text, scrubber, reads);
     }
 
-    /// The rig and its files.
+    /// The rig and its files, and nothing that somebody else has put beside them.
     fn add_bench(&mut self, folder: &Path, scrubber: &Scrubber) -> Result<(), Failure> {
         let bench = folder.join(BENCH);
         let cannot = |error: io::Error| Failure::new(Exit::NoInput, format!("{}: {error}", bench.display()));
-        let mut paths = Vec::new();
-        for entry in fs::read_dir(&bench).map_err(cannot)? {
-            paths.push(entry.map_err(cannot)?.path());
+        let entries = match fs::read_dir(&bench) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {
+                self.left_out.push(format!("{BENCH}/: it is not in the record; {NO_FRAMES}"));
+                return Ok(());
+            }
+            entries => entries.map_err(cannot)?,
+        };
+        let mut found = Vec::new();
+        for entry in entries {
+            let entry = entry.map_err(cannot)?;
+            let name = entry.file_name().to_string_lossy().into_owned();
+            // A link may lead anywhere.
+            if is_of_bench(&name) && entry.file_type().map_err(cannot)?.is_file() {
+                found.push((name, entry.path()));
+            } else {
+                self.left_out.push(format!("{BENCH}/{name}: no run has put it there"));
+            }
         }
-        paths.sort();
-        for path in paths.iter().filter(|path| path.is_file()) {
-            let Some(name) = path.file_name().and_then(|name| name.to_str()) else { continue };
+        found.sort();
+        for (name, path) in &found {
             let packed = format!("{BENCH}/{name}");
+            if is_weights(name) {
+                self.add_file(&packed, path);
+                continue;
+            }
             match fs::read_to_string(path) {
                 Ok(text) if name == RIG => {
                     // Its tables are found in its folder, whatever is in its text.
                     let reads = |text: &str| Rig::parse(text, path).is_ok();
                     self.add_checked(&packed, &text, scrubber, reads);
                 }
-                Ok(text) if name.ends_with(".toml") || name.ends_with(".csv") => {
-                    self.add_text(&packed, scrubber.text(&text));
-                }
-                _ => self.add_file(&packed, path),
+                Ok(text) => self.add_text(&packed, scrubber.text(&text)),
+                Err(error) if error.kind() == io::ErrorKind::InvalidData => self.add_file(&packed, path),
+                Err(error) => return Err(Failure::new(Exit::NoInput, format!("{}: {error}", path.display()))),
             }
         }
         Ok(())
     }
 
-    fn add_scene(&mut self, folder: &str, scene: &SceneSource, with_scene: bool) {
+    fn add_scene(&mut self, folder: &str, scene: &SceneSource, with_scene: bool, scrubber: &Scrubber) {
         let SceneSource::Files { description, files, .. } = scene else {
             if *scene == SceneSource::Feed {
                 self.left_out.push("pictures of the live feed, which are not recorded".into());
@@ -212,16 +230,19 @@ impl Contents {
             self.left_out.push(left);
             return;
         }
-        self.add_text(&format!("{folder}/{SCENE}"), description.clone());
+        // Its words are keys, numbers and the files' names in the report: names of others stand in comments alone.
+        let said = scene_values(description);
+        let reads = |text: &str| scene_values(text) == said;
+        self.add_checked(&format!("{folder}/{SCENE}"), description, scrubber, reads);
         for file in files {
             self.add_source(folder, file);
         }
     }
 
-    fn add_order(&mut self, source: &OrderSource, with_scene: bool) {
+    fn add_order(&mut self, source: &OrderSource, with_scene: bool, scrubber: &Scrubber) {
         let folder = order_folder(source.order);
         if let Some(scene) = &source.scene {
-            self.add_scene(&folder, scene, with_scene);
+            self.add_scene(&folder, scene, with_scene, scrubber);
         }
         if let Some(weights) = &source.weights {
             self.add_source(&folder, weights);
@@ -304,11 +325,18 @@ impl Contents {
 /// What is added where frames lack something.
 const NO_FRAMES: &str = "frames that need it cannot be shown again";
 
-/// A line of `orders.jsonl`.
-#[derive(serde::Deserialize)]
-struct OrderLine {
-    #[expect(dead_code, reason = "it is only looked whether it is there")]
-    request: Request,
+/// Whether each line is an order that can be carried out again.
+fn reads_as_orders(text: &str) -> bool {
+    text.lines().all(|line| serde_json::from_str::<Value>(line).is_ok_and(|line| parsed(&line["request"]).is_ok()))
+}
+
+/// The keys of a scene file and their values, without its comments.
+fn scene_values(text: &str) -> Option<Vec<(String, String)>> {
+    let document: DocumentMut = text.parse().ok()?;
+    let plain = |item: &toml_edit::Item| {
+        item.as_value().map_or_else(|| item.to_string(), |value| value.clone().decorated("", "").to_string())
+    };
+    Some(document.iter().map(|(key, item)| (key.to_owned(), plain(item))).collect())
 }
 
 /// Adds a file as long as it is now, whoever goes on writing it.
@@ -403,6 +431,83 @@ mod tests {
         assert_eq!(unpacked.manifest, manifest);
         assert_eq!(unpacked.text(LOG).unwrap().unwrap(), "in ~/lab\n");
         assert_eq!(unpacked.text("orders.jsonl").unwrap(), None);
+    }
+
+    fn anna() -> Scrubber {
+        Scrubber::new([("anna".to_owned(), "/home/anna".to_owned())], [])
+    }
+
+    fn packed_text(contents: &Contents, name: &str) -> String {
+        let entry = contents.entries.iter().find(|entry| entry.name == name).unwrap();
+        match &entry.content {
+            Content::Bytes(bytes) => String::from_utf8(bytes.clone()).unwrap(),
+            Content::File(path) => fs::read_to_string(path).unwrap(),
+        }
+    }
+
+    #[test]
+    fn names_leave_the_comments_of_a_scene_and_its_values_stay() {
+        let description = "# by Anna, in /home/anna/lab\ncolour = \"colour.png\" # anna's\n";
+        let scene = SceneSource::Files { fit: Default::default(), description: description.into(), files: Vec::new() };
+        let order = OrderSource { order: 2, scene: Some(scene.clone()), weights: None };
+        let mut contents = Contents::default();
+        contents.add_scene(SCENE_FOLDER, &scene, true, &anna());
+        contents.add_order(&order, true, &anna());
+        for name in ["scene/scene.toml", "order-2/scene.toml"] {
+            let text = packed_text(&contents, name);
+            assert_eq!(text, "# by USER, in ~/lab\ncolour = \"colour.png\" # USER's\n", "{name}");
+        }
+        assert!(contents.left_out.is_empty(), "{:?}", contents.left_out);
+
+        // Whoever is called like a key.
+        let mut contents = Contents::default();
+        let scrubber = Scrubber::new([("colour".to_owned(), "/home/anna".to_owned())], []);
+        contents.add_scene(SCENE_FOLDER, &scene, true, &scrubber);
+        let text = packed_text(&contents, "scene/scene.toml");
+        assert!(text.contains("colour = \"colour.png\"") && text.contains("in ~/lab"), "{text}");
+        assert_eq!(contents.left_out.len(), 1);
+    }
+
+    #[test]
+    fn of_the_bench_only_what_a_run_put_there_is_packed_and_its_text_without_names() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut contents = Contents::default();
+        contents.add_bench(folder.path(), &anna()).unwrap();
+        assert!(contents.left_out[0].contains("bench/: it is not in the record"), "{:?}", contents.left_out);
+
+        let bench = folder.path().join(BENCH);
+        fs::create_dir_all(bench.join("lut-folder")).unwrap();
+        for name in ["lut-green", "lut-red.txt", "lasers.toml", "notes.txt"] {
+            fs::write(bench.join(name), "# anna in /home/anna\n").unwrap();
+        }
+        fs::write(bench.join("flatness-blue.png"), b"\x89PNG\xff").unwrap();
+        fs::write(bench.join("weights.safetensors"), "anna").unwrap();
+        std::os::unix::fs::symlink(bench.join("notes.txt"), bench.join("lut-blue")).unwrap();
+        let mut contents = Contents::default();
+        contents.add_bench(folder.path(), &anna()).unwrap();
+        let names: Vec<_> = contents.entries.iter().map(|entry| entry.name.as_str()).collect();
+        let expected = ["flatness-blue.png", "lasers.toml", "lut-green", "lut-red.txt", "weights.safetensors"];
+        assert_eq!(names, expected.map(|name| format!("bench/{name}")));
+        for name in &expected[1..4] {
+            assert_eq!(packed_text(&contents, &format!("bench/{name}")), "# USER in ~\n");
+        }
+        assert_eq!(packed_text(&contents, "bench/weights.safetensors"), "anna", "as they are");
+        contents.left_out.sort();
+        let left = ["lut-blue", "lut-folder", "notes.txt"].map(|name| format!("bench/{name}: no run has put it there"));
+        assert_eq!(contents.left_out, left);
+    }
+
+    #[test]
+    fn orders_read_with_what_a_reload_changed_and_not_with_what_is_no_order() {
+        let reload = r#"{"request":{"do":"reload","changed":{"tracker.eye":"left"}},"t_ns":5}"#;
+        assert!(reads_as_orders(&format!("{reload}\n{reload}\n")));
+        for foreign in [r#"{"request":{"do":"USER"}}"#, r#"{"t_ns":5}"#, "half"] {
+            assert!(!reads_as_orders(&format!("{reload}\n{foreign}\n")), "{foreign}");
+        }
+        let mut contents = Contents::default();
+        let scrubber = Scrubber::new([("reload".to_owned(), "/home/anna".to_owned())], []);
+        contents.add_checked(ORDERS, reload, &scrubber, reads_as_orders);
+        assert_eq!(packed_text(&contents, ORDERS), reload);
     }
 
     #[test]

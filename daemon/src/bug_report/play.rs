@@ -233,7 +233,7 @@ impl Orders {
 }
 
 /// A request out of a record, which also tells what of the rig file it changed.
-fn parsed(request: &Value) -> Result<Request, String> {
+pub(super) fn parsed(request: &Value) -> Result<Request, String> {
     let mut request = request.clone();
     if let Some(request) = request.as_object_mut() {
         request.remove("changed");

@@ -174,6 +174,16 @@ fn name_pictures(
     paths.into_iter().enumerate().map(|(index, path)| (path, format!("{key}-{index:06}{ending}"))).collect()
 }
 
+/// Whether [`keep_bench`] gives this name to a file.
+pub fn is_of_bench(name: &str) -> bool {
+    is_weights(name) || [RIG, LASERS].contains(&name) || TABLES.iter().any(|table| name.starts_with(table))
+}
+
+/// Whether a file of the bench with this name holds its weights.
+pub fn is_weights(name: &str) -> bool {
+    name == WEIGHTS
+}
+
 /// Takes away what [`keep_bench`] has put into `folder`; what somebody else has put there stays.
 ///
 /// # Errors
@@ -187,7 +197,7 @@ pub(super) fn remove_bench(folder: &Path) -> io::Result<()> {
     for entry in entries {
         let entry = entry?;
         let name = entry.file_name().to_string_lossy().into_owned();
-        if [RIG, LASERS, WEIGHTS].contains(&name.as_str()) || TABLES.iter().any(|table| name.starts_with(table)) {
+        if is_of_bench(&name) {
             fs::remove_file(entry.path())?;
         }
     }
