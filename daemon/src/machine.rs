@@ -65,6 +65,18 @@ impl Machine {
         }
     }
 
+    /// The same with each of its texts as `scrub` leaves it.
+    pub fn scrubbed(self, scrub: impl Fn(&str) -> String) -> Self {
+        Self {
+            kernel: scrub(&self.kernel),
+            os: scrub(&self.os),
+            architecture: scrub(&self.architecture),
+            cpu: scrub(&self.cpu),
+            gpus: self.gpus.iter().map(|gpu| scrub(gpu)).collect(),
+            ..self
+        }
+    }
+
     /// A few lines for people.
     pub fn text(&self) -> String {
         let limit = |limit: Option<u64>| limit.map_or("none".to_owned(), |limit| limit.to_string());

@@ -19,7 +19,9 @@ use crate::failure::{Exit, Failure};
 use crate::source::PictureTag;
 
 pub use self::recorder::{LOG, ORDER_FILES, OrderSource, RUN, Recorder, RunFacts};
-pub use self::sources::{BENCH, RIG, SCENE, SceneSource, SourceFile, content_xxh3, hash_text, is_of_bench, is_weights};
+pub use self::sources::{
+    BENCH, Hashed, RIG, SCENE, SceneSource, SourceFile, content_xxh3, hash_text, is_of_bench, is_weights,
+};
 
 /// What the frame loop did for one frame.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -23,6 +23,22 @@ impl Staging {
     /// Prepares to fill `target`, which may exist, but holds none of `files` unless with `force`; its parent is created
     /// where it is missing.
     pub fn new(target: &Path, files: &[&str], force: bool) -> Result<Self, Failure> {
+        Self::in_folder(folder_of(target), target, files, force)
+    }
+
+    /// Prepares to write the file `path`, which may exist with `force` only; nothing but its folder is touched, which is
+    /// created where it is missing.
+    pub fn of_file(path: &Path, force: bool) -> Result<Self, Failure> {
+        let Some(name) = path.file_name().and_then(|name| name.to_str()) else {
+            let what = format!("--out {}: expected the name of a file to write", path.display());
+            return Err(Failure::new(Exit::CannotCreate, what));
+        };
+        let folder = folder_of(path);
+        Self::in_folder(folder, folder, &[name], force)
+    }
+
+    /// Prepares to fill `target` by way of a folder in `parent`, which is on the same disk.
+    fn in_folder(parent: &Path, target: &Path, files: &[&str], force: bool) -> Result<Self, Failure> {
         let cannot = |error: std::io::Error| {
             Failure::new(
                 Exit::CannotCreate,
@@ -39,10 +55,6 @@ impl Staging {
             ));
         }
         refuse_existing(files.iter().map(|file| target.join(file)), "--out", force)?;
-        let parent = match target.parent() {
-            Some(parent) if !parent.as_os_str().is_empty() => parent,
-            _ => Path::new("."),
-        };
         fs::create_dir_all(parent).map_err(cannot)?;
         take_away_on_signals();
         let beside = tempfile::Builder::new().prefix(".holod-partial-").tempdir_in(parent).map_err(cannot)?;
@@ -72,6 +84,11 @@ impl Staging {
         }
         Ok(())
     }
+}
+
+/// The folder in which a path's last part is.
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 impl Drop for Staging {
@@ -196,6 +213,22 @@ mod tests {
         fs::write(forced.path("x"), "new").unwrap();
         forced.commit().unwrap();
         assert_eq!(fs::read_to_string(target.join("x")).unwrap(), "new");
+    }
+
+    #[test]
+    fn a_single_file_needs_no_more_than_its_own_folder() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("there/report");
+        let staging = Staging::of_file(&path, false).unwrap();
+        fs::write(staging.path("report"), "whole").unwrap();
+        let beside = |folder: &Path| fs::read_dir(folder).unwrap().count();
+        assert_eq!((beside(root.path()), beside(&root.path().join("there"))), (1, 1), "half done within its folder");
+        staging.commit().unwrap();
+        assert_eq!(fs::read_to_string(&path).unwrap(), "whole");
+        assert_eq!(beside(&root.path().join("there")), 1);
+        assert_eq!(Staging::of_file(&path, false).err().unwrap().exit, Exit::CannotCreate);
+        assert!(Staging::of_file(&path, true).is_ok());
+        assert_eq!(Staging::of_file(Path::new("/"), true).err().unwrap().exit, Exit::CannotCreate);
     }
 
     #[test]

@@ -7,18 +7,17 @@ use std::time::{Duration, UNIX_EPOCH};
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
-use holod_calibration::rig::Rig;
+use holod_calibration::rig::{LaserDriver, Provenance, Rig};
 use holod_pupil_input::{RecordFiles, with_header};
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 use tar::{Builder, EntryType, Header};
 use toml_edit::DocumentMut;
 
-use super::play::parsed;
 use super::{FOLDER, MANIFEST, Manifest, Packed, SCENE_FOLDER, Scrubber, order_folder, unix_ms};
 use crate::failure::{Exit, Failure};
 use crate::record::{
-    self, BENCH, LOG, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SCENE, SceneSource, SourceFile,
+    self, BENCH, Hashed, LOG, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SCENE, SceneSource, SourceFile,
     content_xxh3, is_of_bench, is_weights,
 };
 use crate::snapshot::Snapshot;
@@ -55,15 +54,16 @@ pub fn default_name(contents: &Contents) -> PathBuf {
 }
 
 impl Contents {
-    /// Without a record: what the holods that run say of themselves.
-    pub fn of_running(running: &[Snapshot], scrubber: &Scrubber) -> Result<Self, Failure> {
+    /// Without a record: what the holods that run say of themselves, or why nothing can be had of them.
+    pub fn of_running(running: Result<Vec<Snapshot>, Failure>, scrubber: &Scrubber) -> Result<Self, Failure> {
         let mut contents = Self::default();
-        for status in running {
+        let running = running.unwrap_or_else(|failure| {
+            contents.left_out.push(format!("a status: {failure}"));
+            Vec::new()
+        });
+        for status in &running {
             let text = serde_json::to_string_pretty(status).map_err(Failure::because(Exit::Software))? + "\n";
             contents.add_json::<Snapshot>(&format!("status-{}.json", status.pid), &text, scrubber);
-        }
-        if running.is_empty() {
-            contents.left_out.push("a status: no holod is running".into());
         }
         contents.left_out.push(
             "frames: no record was named; `holod run --record DIR` writes one, `holod report DIR` packs it".into(),
@@ -92,25 +92,25 @@ impl Contents {
         match facts.as_deref().map(serde_json::from_str::<RunFacts>) {
             Some(Ok(run)) => {
                 contents.started_unix_ms = Some(run.started_unix_ms);
-                contents.add_json::<RunFacts>(RUN, facts.as_deref().unwrap_or_default(), scrubber);
+                contents.add_lines(RUN, facts.as_deref().unwrap_or_default(), scrubber);
                 contents.add_bench(folder, scrubber)?;
                 contents.add_scene(SCENE_FOLDER, &run.scene, with_scene, scrubber);
             }
             Some(Err(error)) => contents.left_out.push(format!("{RUN}, which is damaged: {error}; {NO_FRAMES}")),
             None => contents.left_out.push(format!("{RUN}: an earlier holod, which wrote none, made it; {NO_FRAMES}")),
         }
-        contents.add_file(record::FRAMES, &folder.join(record::FRAMES));
-        for path in samples.samples.iter().filter(|path| path.is_file()) {
-            contents.add_file("samples.csv", path);
+        contents.add_recorded(record::FRAMES, &folder.join(record::FRAMES));
+        if let Some(path) = &samples.samples {
+            contents.add_recorded("samples.csv", path);
         }
-        for path in samples.raw.iter().filter(|path| path.is_file()) {
+        if let Some(path) = &samples.raw {
             contents.add_tracker_bytes(path, scrubber)?;
         }
         if let Some(text) = contents.text_of(folder, ORDERS)? {
-            contents.add_checked(ORDERS, &text, scrubber, reads_as_orders);
+            contents.add_lines(ORDERS, &text, scrubber);
         }
         if let Some(text) = contents.text_of(folder, ORDER_FILES)? {
-            contents.add_lines::<OrderSource>(ORDER_FILES, &text, scrubber);
+            contents.add_lines(ORDER_FILES, &text, scrubber);
             for line in text.lines() {
                 if let Ok(source) = serde_json::from_str(line) {
                     contents.add_order(&source, with_scene, scrubber);
@@ -128,6 +128,9 @@ impl Contents {
 
     fn text_of(&mut self, folder: &Path, name: &str) -> Result<Option<String>, Failure> {
         let path = folder.join(name);
+        if !self.takes(name, &path) {
+            return Ok(None);
+        }
         let read = File::open(&path).and_then(|file| {
             let mut bytes = Vec::new();
             file.take(LARGEST_TEXT).read_to_end(&mut bytes)?;
@@ -145,6 +148,23 @@ impl Contents {
         }
     }
 
+    /// Whether something of a record is a plain file: a link may lead anywhere. What is something else is told.
+    fn takes(&mut self, name: &str, path: &Path) -> bool {
+        match path.symlink_metadata() {
+            Ok(found) if found.is_file() => return true,
+            Ok(_) => self.left_out.push(format!("{name}: no file, as a run writes one")),
+            Err(_) => {}
+        }
+        false
+    }
+
+    /// Adds a file of the record, where it is there.
+    fn add_recorded(&mut self, name: &str, path: &Path) {
+        if self.takes(name, path) {
+            self.add_file(name, path);
+        }
+    }
+
     fn add_file(&mut self, name: &str, path: &Path) {
         self.entries.push(Entry { name: name.to_owned(), content: Content::File(path.to_owned()) });
     }
@@ -153,10 +173,10 @@ impl Contents {
         self.entries.push(Entry { name: name.to_owned(), content: Content::Bytes(text.into_bytes()) });
     }
 
-    /// Adds text that a program reads: where a name in it is a word that the program needs, the name stays.
-    fn add_checked(&mut self, name: &str, text: &str, scrubber: &Scrubber, reads: impl Fn(&str) -> bool) {
+    /// Adds text that a program reads: where it would read something else without a name, the name stays.
+    fn add_checked<T: PartialEq>(&mut self, name: &str, text: &str, scrubber: &Scrubber, read: impl Fn(&str) -> T) {
         let scrubbed = scrubber.text(text);
-        let text = if !reads(text) || reads(&scrubbed) {
+        let text = if read(text) == read(&scrubbed) {
             scrubbed
         } else {
             self.left_out.push(format!("no name in {name}: one of them is a word of its format; look at it"));
@@ -169,9 +189,9 @@ impl Contents {
         self.add_checked(name, text, scrubber, |text| serde_json::from_str::<T>(text).is_ok());
     }
 
-    fn add_lines<T: DeserializeOwned>(&mut self, name: &str, text: &str, scrubber: &Scrubber) {
-        let reads = |text: &str| text.lines().all(|line| serde_json::from_str::<T>(line).is_ok());
-        self.add_checked(name, text, scrubber, reads);
+    /// Adds JSON that frames are made again by, a value or one in each line.
+    fn add_lines(&mut self, name: &str, text: &str, scrubber: &Scrubber) {
+        self.add_checked(name, text, scrubber, meaning);
     }
 
     /// The rig and its files, and nothing that somebody else has put beside them.
@@ -206,8 +226,8 @@ impl Contents {
             match fs::read_to_string(path) {
                 Ok(text) if name == RIG => {
                     // Its tables are found in its folder, whatever is in its text.
-                    let reads = |text: &str| Rig::parse(text, path).is_ok();
-                    self.add_checked(&packed, &text, scrubber, reads);
+                    let read = |text: &str| Rig::parse(text, path).ok().map(without_names);
+                    self.add_checked(&packed, &text, scrubber, read);
                 }
                 Ok(text) => self.add_text(&packed, scrubber.text(&text)),
                 Err(error) if error.kind() == io::ErrorKind::InvalidData => self.add_file(&packed, path),
@@ -231,9 +251,7 @@ impl Contents {
             return;
         }
         // Its words are keys, numbers and the files' names in the report: names of others stand in comments alone.
-        let said = scene_values(description);
-        let reads = |text: &str| scene_values(text) == said;
-        self.add_checked(&format!("{folder}/{SCENE}"), description, scrubber, reads);
+        self.add_checked(&format!("{folder}/{SCENE}"), description, scrubber, scene_values);
         for file in files {
             self.add_source(folder, file);
         }
@@ -263,6 +281,9 @@ impl Contents {
     /// The bytes that the tracker sent, with a header without names. Where a name is among the bytes, they stay out.
     fn add_tracker_bytes(&mut self, path: &Path, scrubber: &Scrubber) -> Result<(), Failure> {
         let name = "tracker.holodraw";
+        if !self.takes(name, path) {
+            return Ok(());
+        }
         let cannot = |error: io::Error| Failure::new(Exit::NoInput, format!("{}: {error}", path.display()));
         let bytes = path.metadata().map_err(cannot)?.len();
         if bytes > LARGEST_TEXT {
@@ -287,7 +308,7 @@ impl Contents {
         let names = record::shown_levels(folder)
             .map_err(|error| Failure::new(Exit::NoInput, format!("{}: {error}", folder.display())))?;
         match with_scene {
-            true => names.iter().for_each(|name| self.add_file(name, &folder.join(name))),
+            true => names.iter().for_each(|name| self.add_recorded(name, &folder.join(name))),
             false if names.is_empty() => {}
             false => self.left_out.push(format!("{} pictures of levels that were shown, as asked", names.len())),
         }
@@ -301,6 +322,7 @@ impl Contents {
     pub fn write(self, path: &Path, scrubber: &Scrubber) -> Result<Manifest, Failure> {
         let cannot = |error: io::Error| Failure::new(Exit::CannotCreate, format!("cannot write the report: {error}"));
         let mut manifest = Manifest::now(self.left_out.iter().map(|left| scrubber.text(left)).collect());
+        manifest.machine = manifest.machine.scrubbed(|text| scrubber.text(text));
         let encoder = GzEncoder::new(File::create(path).map_err(cannot)?, Compression::default());
         let mut archive = Builder::new(encoder);
         let t_s = manifest.packed_unix_ms / 1000;
@@ -325,9 +347,33 @@ impl Contents {
 /// What is added where frames lack something.
 const NO_FRAMES: &str = "frames that need it cannot be shown again";
 
-/// Whether each line is an order that can be carried out again.
-fn reads_as_orders(text: &str) -> bool {
-    text.lines().all(|line| serde_json::from_str::<Value>(line).is_ok_and(|line| parsed(&line["request"]).is_ok()))
+/// A rig without what may name somebody or something of a bench and makes no frame.
+fn without_names(mut rig: Rig) -> Rig {
+    rig.name.clear();
+    rig.tracker.spec = None;
+    rig.lasers.driver = LaserDriver::Simulated;
+    rig.provenance = Provenance::default();
+    rig
+}
+
+/// What frames are made again by, of a JSON value or of one in each line, without what is said to people alone and the
+/// places where files were. A run that broke off may have left half a line, which says nothing.
+fn meaning(text: &str) -> Vec<Value> {
+    serde_json::Deserializer::from_str(text).into_iter().map_while(Result::ok).map(without_words).collect()
+}
+
+/// A value without the words that nothing is made by.
+fn without_words(value: Value) -> Value {
+    const WORDS: [&str; 6] = ["tracker", "panel", "machine", "path", "description", "holod"];
+    match value {
+        Value::String(text) if text.contains('/') => Value::Null,
+        Value::Array(values) => values.into_iter().map(without_words).collect(),
+        Value::Object(values) => {
+            let kept = values.into_iter().filter(|(key, _)| !WORDS.contains(&key.as_str()));
+            Value::Object(kept.map(|(key, value)| (key, without_words(value))).collect())
+        }
+        value => value,
+    }
 }
 
 /// The keys of a scene file and their values, without its comments.
@@ -341,10 +387,15 @@ fn scene_values(text: &str) -> Option<Vec<(String, String)>> {
 
 /// Adds a file as long as it is now, whoever goes on writing it.
 fn add_file(archive: &mut Builder<GzEncoder<File>>, name: &str, t_s: u64, path: &Path) -> io::Result<Packed> {
-    let mut first = File::open(path)?;
-    let bytes = first.metadata()?.len();
-    let (bytes, xxh3) = content_xxh3(&mut Read::by_ref(&mut first).take(bytes))?;
-    append(archive, name, t_s, bytes, File::open(path)?.take(bytes))?;
+    let file = File::open(path)?;
+    let bytes = file.metadata()?.len();
+    let mut content = Hashed::new(file.take(bytes));
+    append(archive, name, t_s, bytes, &mut content)?;
+    let (found, xxh3) = content.finish();
+    if found < bytes {
+        let what = format!("it had {bytes} bytes and ended after {found}: something shortens it; pack again");
+        return Err(io::Error::other(what));
+    }
     Ok(Packed { name: name.to_owned(), bytes, xxh3 })
 }
 
@@ -498,24 +549,72 @@ mod tests {
     }
 
     #[test]
-    fn orders_read_with_what_a_reload_changed_and_not_with_what_is_no_order() {
+    fn what_frames_are_made_again_by_stays_where_it_is_called_like_a_name() {
+        let named = |name: &str| Scrubber::new([(name.to_owned(), format!("/home/{name}"))], []);
         let reload = r#"{"request":{"do":"reload","changed":{"tracker.eye":"left"}},"t_ns":5}"#;
-        assert!(reads_as_orders(&format!("{reload}\n{reload}\n")));
-        for foreign in [r#"{"request":{"do":"USER"}}"#, r#"{"t_ns":5}"#, "half"] {
-            assert!(!reads_as_orders(&format!("{reload}\n{foreign}\n")), "{foreign}");
+        let weights = r#"{"request":{"do":"weights","weights":"small"},"t_ns":6}"#;
+        let file = r#"{"request":{"do":"weights","weights":"/home/anna/small.safetensors"},"t_ns":7}"#;
+        let half = r#"{"request":{"do":"sc"#;
+        let text = [reload, weights, file, half].join("\n");
+        for (name, stays) in [("reload", true), ("small", true), ("anna", false), ("left", true), ("half", false)] {
+            let mut contents = Contents::default();
+            contents.add_lines(ORDERS, &text, &named(name));
+            let packed = packed_text(&contents, ORDERS);
+            assert_eq!(packed.contains(&format!("\"{name}\"")), stays, "{name}: {packed}");
+            assert_eq!(contents.left_out.is_empty(), !stays, "{name}");
         }
+        let run = r#"{"tracker":"mock","scene":{"kind":"files","files":[{"path":"/x/colour","name":"colour.png"}]}}"#;
         let mut contents = Contents::default();
-        let scrubber = Scrubber::new([("reload".to_owned(), "/home/anna".to_owned())], []);
-        contents.add_checked(ORDERS, reload, &scrubber, reads_as_orders);
-        assert_eq!(packed_text(&contents, ORDERS), reload);
+        contents.add_lines(RUN, run, &named("colour"));
+        assert_eq!(packed_text(&contents, RUN), run);
+        let mut contents = Contents::default();
+        contents.add_lines(RUN, run, &named("mock"));
+        assert!(packed_text(&contents, RUN).contains("\"USER\"") && contents.left_out.is_empty());
+    }
+
+    #[test]
+    fn links_in_a_record_are_not_followed() {
+        let folder = tempfile::tempdir().unwrap();
+        let secret = folder.path().join("secret");
+        fs::write(&secret, "private").unwrap();
+        let record = folder.path().join("record");
+        fs::create_dir(&record).unwrap();
+        fs::write(record.join(record::FRAMES), "frame,field\n").unwrap();
+        let links = ["log.txt", "samples.csv", "tracker.holodraw", "orders.jsonl", "shown_pupil_2.0mm.png"];
+        for name in links {
+            std::os::unix::fs::symlink(&secret, record.join(name)).unwrap();
+        }
+        fs::create_dir(record.join("shown_pupil_3.0mm.png")).unwrap();
+        let contents = Contents::of_record(&record, true, &Scrubber::default()).unwrap();
+        let names: Vec<_> = contents.entries.iter().map(|entry| entry.name.as_str()).collect();
+        assert_eq!(names, [record::FRAMES]);
+        for name in links.iter().chain(&["shown_pupil_3.0mm.png"]) {
+            assert!(contents.left_out.contains(&format!("{name}: no file, as a run writes one")), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_file_that_becomes_shorter_while_it_is_packed_is_told() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x");
+        fs::write(&path, "12345").unwrap();
+        let archive = |name: &str| {
+            let file = File::create(folder.path().join(name)).unwrap();
+            Builder::new(GzEncoder::new(file, Compression::fast()))
+        };
+        let packed = add_file(&mut archive("a"), "x", 0, &path).unwrap();
+        assert_eq!(packed, Packed::of("x", b"12345"));
+        // Such files say that they have a page and bring fewer bytes.
+        let error = add_file(&mut archive("b"), "x", 0, Path::new("/sys/kernel/mm/transparent_hugepage/enabled"));
+        assert!(error.unwrap_err().to_string().contains("something shortens it"));
     }
 
     #[test]
     fn a_name_that_is_a_word_of_the_format_stays_and_is_told() {
         let scrubber = Scrubber::new([("native".to_owned(), "/home/native".to_owned())], []);
         let mut contents = Contents::default();
-        let reads = |text: &str| text.contains("native");
-        contents.add_checked("a", "fit native in /home/native/x", &scrubber, reads);
+        let read = |text: &str| text.contains("native");
+        contents.add_checked("a", "fit native in /home/native/x", &scrubber, read);
         assert!(contents.left_out[0].contains("no name in a"), "{:?}", contents.left_out);
         let Content::Bytes(bytes) = &contents.entries[0].content else { panic!() };
         assert_eq!(bytes, b"fit native in ~/x");

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::ffi::OsStr;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::{Arc, Mutex};
 
 use holod_calibration::rig::{LaserDriver, Rig, WeightsChoice};
@@ -49,10 +49,6 @@ pub struct Played {
     pub(crate) playback: Playback,
     /// What they are compared with.
     pub comparison: Comparison,
-    /// The rig's file.
-    pub config: PathBuf,
-    /// The scene with which the run began.
-    pub scene: SceneArgs,
 }
 
 /// Reads everything that the frames of a report need. `backend` is the engine that is wanted; `Auto` is that of the run.
@@ -67,7 +63,9 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
                 .into(),
         )
     })?;
-    let facts: RunFacts = serde_json::from_str(&facts).map_err(|error| data(format!("{RUN}: {error}")))?;
+    let facts: RunFacts = serde_json::from_str(&facts).map_err(|error| {
+        data(format!("{RUN}: {error}; show it with the holod that made it, or ask for the report again"))
+    })?;
     let config = report.path(BENCH).join(RIG);
     refuse_foreign_files(report)?;
     let mut rig = Rig::load(&config).map_err(Failure::because(Exit::Data))?;
@@ -86,7 +84,6 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     }
     let backend = match backend {
         Backend::Auto if facts.engine.starts_with("cpu") => Backend::Cpu,
-        Backend::Auto => facts.backend,
         asked => asked,
     };
     if facts.holod != env!("HOLOD_VERSION") {
@@ -105,7 +102,9 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
         backend,
         orders: &orders,
         scenes: HashMap::new(),
+        opened_scenes: Vec::new(),
         engines: Vec::new(),
+        opened_engines: Vec::new(),
         engine_places: HashMap::new(),
         patterns: Vec::new(),
         drawn: Vec::new(),
@@ -116,6 +115,7 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     };
     let (mut cues, mut not_again) = (Vec::new(), BTreeMap::new());
     let first_scene = material.first_scene(&facts.scene);
+    material.opened_scenes.push((facts.scene.clone(), first_scene.clone()));
     material.scenes.insert(0, first_scene);
     for RecordedFrame { frame, made, .. } in &frames {
         let cue = made.as_ref().ok_or_else(|| "the record lacks what they were made for".to_owned());
@@ -137,16 +137,7 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     };
     let comparison = Comparison::new(frames, &cues, not_again, &facts);
     let playback = Playback { cues, pictures, engines, patterns, at: 0, engine: 0 };
-    let scene = SceneArgs {
-        scene: match &facts.scene {
-            SceneSource::BuiltIn => None,
-            SceneSource::Feed => Some("feed".into()),
-            SceneSource::Files { .. } => Some(report.path(SCENE_FOLDER).to_string_lossy().into_owned()),
-        },
-        resolution: Some(resolution),
-        ..SceneArgs::default()
-    };
-    Ok(Played { rig, pictures: Pictures::Scene(first), backend, playback, comparison, config, scene })
+    Ok(Played { rig, pictures: Pictures::Scene(first), backend, playback, comparison })
 }
 
 /// Refuses a rig that names files outside of the report, before any of them is opened.
@@ -200,7 +191,9 @@ impl Orders {
             let number = index + 1;
             let wrong = |what: String| Failure::new(Exit::Data, format!("{ORDERS} line {number}: {what}"));
             let mut order: Value = serde_json::from_str(line).map_err(|error| wrong(error.to_string()))?;
-            let t = order["t_ns"].as_i64().ok_or_else(|| wrong("found no t_ns".into()))?;
+            let t = order["t_ns"].as_i64().ok_or_else(|| {
+                wrong("found no t_ns, expected the time of the order in nanoseconds; ask for the report again".into())
+            })?;
             let request = order["request"].take();
             if parsed(&request).is_err() && orders.foreign.is_none() {
                 let what = request["do"].as_str().unwrap_or("something");
@@ -233,7 +226,7 @@ impl Orders {
 }
 
 /// A request out of a record, which also tells what of the rig file it changed.
-pub(super) fn parsed(request: &Value) -> Result<Request, String> {
+fn parsed(request: &Value) -> Result<Request, String> {
     let mut request = request.clone();
     if let Some(request) = request.as_object_mut() {
         request.remove("changed");
@@ -250,7 +243,11 @@ struct Material<'a> {
     orders: &'a Orders,
     /// By the order that brought them.
     scenes: HashMap<u32, Result<Arc<Frames>, String>>,
+    /// By what they are made of: several orders may have brought the same.
+    opened_scenes: Vec<(SceneSource, Result<Arc<Frames>, String>)>,
     engines: Vec<crate::control::NewEngine>,
+    /// Which weights each of them has: the name of built-in ones, or a file's hash.
+    opened_engines: Vec<String>,
     engine_places: HashMap<u32, Result<usize, String>>,
     patterns: Vec<LevelsFrame>,
     /// What each of them was asked for with.
@@ -352,13 +349,24 @@ impl Material<'_> {
         if !self.scenes.contains_key(&order) {
             let source = self.orders.sources.get(&order).and_then(|source| source.scene.as_ref());
             let scene = match source {
-                Some(_) if self.scenes.len() > MOST_SCENES => Err(format!("more than {MOST_SCENES} changes of scene")),
-                Some(source) => self.load(&order_folder(order), source),
+                Some(source) => self.open_scene(order, source),
                 None => Err(format!("the scene of order {order} is not in the report")),
             };
             self.scenes.insert(order, scene);
         }
         self.scenes[&order].as_deref().map_err(Clone::clone)
+    }
+
+    fn open_scene(&mut self, order: u32, source: &SceneSource) -> Result<Arc<Frames>, String> {
+        if let Some((_, scene)) = self.opened_scenes.iter().find(|(opened, _)| opened == source) {
+            return scene.clone();
+        }
+        if self.opened_scenes.len() > MOST_SCENES {
+            return Err(format!("more than {MOST_SCENES} scenes"));
+        }
+        let scene = self.load(&order_folder(order), source);
+        self.opened_scenes.push((source.clone(), scene.clone()));
+        scene
     }
 
     fn picture(&mut self, order: u32, number: u64) -> Result<usize, String> {
@@ -387,22 +395,30 @@ impl Material<'_> {
     }
 
     fn open_engine(&mut self, order: u32) -> Result<usize, String> {
-        let weights = match self.orders.sources.get(&order).and_then(|source| source.weights.as_ref()) {
+        let (weights, known_by) = match self.orders.sources.get(&order).and_then(|source| source.weights.as_ref()) {
             Some(file) => {
                 if !self.is_whole(&order_folder(order), file) {
                     return Err(format!("the weights of order {order} are not in the report"));
                 }
-                self.report.path(&order_folder(order)).join(&file.name).to_string_lossy().into_owned()
+                let path = self.report.path(&order_folder(order)).join(&file.name);
+                (path.to_string_lossy().into_owned(), file.xxh3.clone())
             }
-            None => self.orders.built_in_weights(order)?.to_owned(),
+            None => {
+                let name = self.orders.built_in_weights(order)?;
+                (name.to_owned(), name.to_owned())
+            }
         };
+        if let Some(place) = self.opened_engines.iter().position(|opened| *opened == known_by) {
+            return Ok(place + 1);
+        }
         if self.engines.len() == MOST_ENGINES {
-            return Err(format!("more than {MOST_ENGINES} changes of weights"));
+            return Err(format!("more than {MOST_ENGINES} weights beside the first"));
         }
         match self.carry_out(&Request::Weights { weights })? {
             Order::Engine(engine) => self.engines.push(engine),
             _ => return Err(format!("order {order} brought no weights")),
         }
+        self.opened_engines.push(known_by);
         Ok(self.engines.len())
     }
 
@@ -550,17 +566,17 @@ fn note(told: &mut Vec<u64>, frame: u64) {
 
 impl Observer for Comparison {
     fn frame(&mut self, record: &FrameRecord) -> Result<(), Failure> {
-        let (Some(expected), Some(found)) = (self.awaited.remove(&record.frame), record.levels_xxh3) else {
-            return Ok(());
-        };
-        if found == expected {
+        let Some(expected) = self.awaited.remove(&record.frame) else { return Ok(()) };
+        // A frame without a hash is not the same.
+        let found = record.levels_xxh3;
+        if found == Some(expected) {
             self.outcome.frames_same += 1;
             return Ok(());
         }
         self.outcome.frames_different += 1;
         if self.outcome.first_different.len() < TOLD {
             let (frame, pupil_mm) = (record.frame, record.pupil.mm());
-            let (expected, found) = (hash_text(expected), hash_text(found));
+            let (expected, found) = (hash_text(expected), found.map_or("none".into(), hash_text));
             tracing::warn!(
                 "frame {frame}, for a pupil of {pupil_mm} mm, has other levels: {found}, recorded {expected}"
             );
@@ -740,7 +756,7 @@ mod tests {
         let one = outcome(&[(2, Some(102)), (3, Some(104)), (9, Some(1))], &[]);
         assert_eq!((one.frames_same, one.frames_different, one.first_different), (1, 1, vec![3]));
         let unknown = outcome(&[(2, None)], &[]);
-        assert_eq!((unknown.frames_same, unknown.frames_different), (0, 0));
+        assert_eq!((unknown.frames_same, unknown.frames_different), (0, 1));
     }
 
     #[test]

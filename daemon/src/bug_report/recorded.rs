@@ -43,7 +43,9 @@ pub(super) struct Made {
 /// # Errors
 /// The table cannot be read, lacks a column or has a row that is none; a last row that is cut off is none.
 pub(super) fn read(path: &Path) -> Result<Vec<RecordedFrame>, Failure> {
-    let wrong = |line: usize, what: &str| Failure::new(Exit::Data, format!("frames.csv line {line}: {what}"));
+    let wrong = |line: usize, what: &str| {
+        Failure::new(Exit::Data, format!("frames.csv line {line}: {what}; ask for the report again"))
+    };
     let mut lines = BufReader::new(File::open(path).map_err(Failure::because(Exit::NoInput))?);
     let mut text = String::new();
     let mut next = |text: &mut String| {
@@ -58,7 +60,7 @@ pub(super) fn read(path: &Path) -> Result<Vec<RecordedFrame>, Failure> {
     while next(&mut text)? > 0 {
         number += 1;
         if text.len() as u64 == LONGEST_ROW {
-            return Err(wrong(number, "found a row without an end"));
+            return Err(wrong(number, "found a row of more than 4 KiB, expected one of holod's"));
         }
         // A run that broke off may have left half a row.
         let Some(row) = text.strip_suffix('\n') else { break };
@@ -97,7 +99,8 @@ impl Row<'_> {
         if hash.is_empty() {
             return Ok(None);
         }
-        let levels_xxh3 = u64::from_str_radix(hash, 16).map_err(|_| format!("levels_xxh3 is `{hash}`"))?;
+        let levels_xxh3 = u64::from_str_radix(hash, 16)
+            .map_err(|_| format!("levels_xxh3: found `{hash}`, expected hexadecimal digits"))?;
         Ok(Some(Made {
             pupil: PupilDiameter::from_mm(pupil_mm),
             pupil_state: pupil_state_named(self.text("pupil_state")?),
@@ -117,18 +120,20 @@ impl Row<'_> {
         let index = self.columns.get(name).ok_or_else(|| {
             format!("found no column {name}: an earlier holod recorded it, whose frames cannot be made again")
         })?;
-        self.cells.get(*index).copied().ok_or_else(|| format!("found {} cells", self.cells.len()))
+        self.cells.get(*index).copied().ok_or_else(|| {
+            format!("found {} cells, expected the {} that the first line names", self.cells.len(), self.columns.len())
+        })
     }
 
     fn cell<T: FromStr>(&self, name: &str) -> Result<Option<T>, String> {
         match self.text(name)? {
             "" => Ok(None),
-            text => text.parse().map(Some).map_err(|_| format!("{name} is `{text}`")),
+            text => text.parse().map(Some).map_err(|_| format!("{name}: found `{text}`, expected a number")),
         }
     }
 
     fn needed<T: FromStr>(&self, name: &str) -> Result<T, String> {
-        self.cell(name)?.ok_or_else(|| format!("{name} is empty"))
+        self.cell(name)?.ok_or_else(|| format!("{name}: found nothing, expected a number"))
     }
 }
 
@@ -167,9 +172,9 @@ mod tests {
     fn faults_name_their_line() {
         for (rows, says) in [
             (ROW.replace("green", "mauve"), "line 2: found the colour `mauve`"),
-            (ROW.replace("00000000000000ab", "xyz"), "levels_xxh3 is `xyz`"),
-            (ROW.replace("3.3000002", "wide"), "pupil_mm is `wide`"),
-            ("7,1,green\n".to_owned(), "found 3 cells"),
+            (ROW.replace("00000000000000ab", "xyz"), "levels_xxh3: found `xyz`, expected hexadecimal digits; ask"),
+            (ROW.replace("3.3000002", "wide"), "pupil_mm: found `wide`, expected a number"),
+            ("7,1,green\n".to_owned(), "found 3 cells, expected the 22 that"),
         ] {
             let said = table(&rows).unwrap_err();
             assert!(said.contains(says), "{said}");

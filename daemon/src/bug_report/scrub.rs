@@ -44,7 +44,7 @@ impl Scrubber {
         let variable = |name: &str| std::env::var(name).unwrap_or_default();
         let line = |path: &str| fs::read_to_string(path).unwrap_or_default().trim().to_owned();
         let accounts = fs::read_to_string("/etc/passwd").unwrap_or_default();
-        let people = accounts.lines().filter_map(person);
+        let people = accounts.lines().flat_map(person);
         let users = ["USER", "LOGNAME", "SUDO_USER"].map(variable).into_iter().map(|user| (user, String::new()));
         Self::new(
             people.chain(users).chain([(String::new(), variable("HOME"))]),
@@ -99,19 +99,25 @@ impl Scrubber {
     pub fn finds(&self, bytes: &[u8]) -> bool {
         let starts = (0..bytes.len()).step_by(WINDOW_BYTES);
         starts.into_iter().any(|start| {
+            // One byte before tells whether a word begins here.
             let end = bytes.len().min(start + WINDOW_BYTES + OVERLAP_BYTES);
-            let text = String::from_utf8_lossy(&bytes[start..end]);
+            let text = String::from_utf8_lossy(&bytes[start.saturating_sub(1)..end]);
             self.text(&text) != text
         })
     }
 }
 
-/// Name and home directory of a line of `/etc/passwd`, where it is a person's or root's.
-fn person(line: &str) -> Option<(String, String)> {
+/// Names, each with the home directory, of a line of `/etc/passwd`, where it is a person's or root's: that of the account,
+/// and the person's own.
+fn person(line: &str) -> Vec<(String, String)> {
     let fields: Vec<&str> = line.split(':').collect();
-    let [name, _, uid, _, _, home, ..] = fields[..] else { return None };
-    let uid: u32 = uid.parse().ok()?;
-    (uid == 0 || PEOPLE.contains(&uid)).then(|| (name.to_owned(), home.to_owned()))
+    let [name, _, uid, _, about, home, ..] = fields[..] else { return Vec::new() };
+    if !uid.parse::<u32>().is_ok_and(|uid| uid == 0 || PEOPLE.contains(&uid)) {
+        return Vec::new();
+    }
+    // What follows a comma is a room or a telephone.
+    let own = about.split(',').next().unwrap_or_default();
+    [name, own].map(|name| (name.to_owned(), home.to_owned())).into()
 }
 
 const fn is_word_byte(byte: u8) -> bool {
@@ -140,7 +146,7 @@ fn replaced(text: &str, lower: &str, place: &str, goes_on: fn(u8) -> bool) -> St
     out + &text[done..]
 }
 
-/// `~` for each directory in `homes`, whoever's it is.
+/// `~` for each directory in `homes`, whoever's it is, and `USER` for one in a folder of that name somewhere else.
 fn without_names_in(text: &str, homes: &str) -> String {
     let mut out = String::with_capacity(text.len());
     let mut rest = text;
@@ -151,11 +157,13 @@ fn without_names_in(text: &str, homes: &str) -> String {
         out.push_str(before);
         if name == 0 || goes_on {
             out.push_str(homes);
-            rest = after;
+            if name > 0 {
+                out.push_str("USER");
+            }
         } else {
             out.push('~');
-            rest = &after[name..];
         }
+        rest = &after[name..];
     }
     out + rest
 }
@@ -167,7 +175,13 @@ mod tests {
     fn scrubber() -> Scrubber {
         let user = |name: &str, home: &str| (name.to_owned(), home.to_owned());
         Scrubber::new(
-            [user("anna", "/home/anna"), user("root", "/root"), user("", "/srv/people/anna"), user("al", "/")],
+            [
+                user("anna", "/home/anna"),
+                user("root", "/root"),
+                user("", "/srv/people/anna"),
+                user("al", "/"),
+                user("Anna Huber", ""),
+            ],
             ["Optics7.lab.example".to_owned(), String::new()],
         )
     }
@@ -185,12 +199,28 @@ mod tests {
             ("OPTICS7.lab.example and optics7.other", "HOST and HOST.other"),
             ("al is short, root is nobody's", "al is short, root is nobody's"),
             ("/media/anna/disk", "/media/USER/disk"),
+            ("/mnt/home/berta/x of Anna Huber", "/mnt/home/USER/x of USER"),
+            ("/home/ alone", "/home/ alone"),
             ("nothing to hide: 0.125,üß", "nothing to hide: 0.125,üß"),
         ] {
             assert_eq!(scrubber().text(text), expected, "{text}");
             assert_eq!(scrubber().finds(text.as_bytes()), text != expected, "{text}");
         }
         assert_eq!(scrubber().paths("anna: /home/anna/x"), "anna: ~/x");
+    }
+
+    #[test]
+    fn a_name_across_the_border_of_two_windows_is_found() {
+        for at in [WINDOW_BYTES - 9, WINDOW_BYTES - 2, WINDOW_BYTES, WINDOW_BYTES + OVERLAP_BYTES - 2] {
+            let mut bytes = vec![b' '; 2 * WINDOW_BYTES];
+            assert!(!scrubber().finds(&bytes));
+            bytes[at..at + 4].copy_from_slice(b"anna");
+            assert!(scrubber().finds(&bytes), "{at}");
+        }
+        // A window begins within a longer word.
+        let mut bytes = vec![b' '; 2 * WINDOW_BYTES];
+        bytes[WINDOW_BYTES - 3..][..7].copy_from_slice(b"susanna");
+        assert!(!scrubber().finds(&bytes));
     }
 
     #[test]
@@ -202,9 +232,11 @@ mod tests {
 
     #[test]
     fn people_are_told_from_daemons() {
-        assert_eq!(person("anna:x:1000:1000:Anna,,,:/home/anna:/bin/sh"), Some(("anna".into(), "/home/anna".into())));
-        assert_eq!(person("daemon:x:1:1:daemon:/usr/sbin:/usr/sbin/nologin"), None);
-        assert_eq!(person("nonsense"), None);
+        let names = |line: &str| person(line).into_iter().map(|(name, _)| name).collect::<Vec<_>>();
+        assert_eq!(names("anna:x:1000:1000:Anna Huber,7,,:/home/anna:/bin/sh"), ["anna", "Anna Huber"]);
+        assert_eq!(person("anna:x:1000:1000::/home/anna:/bin/sh")[0].1, "/home/anna");
+        assert!(person("daemon:x:1:1:daemon:/usr/sbin:/usr/sbin/nologin").is_empty());
+        assert!(person("nonsense").is_empty());
         Scrubber::of_this_machine();
     }
 }

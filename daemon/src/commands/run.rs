@@ -9,7 +9,7 @@ use holod_slm_output::OutputSpec;
 use serde::Serialize;
 
 use crate::bug_report::{self, Outcome, Played};
-use crate::cli::{FitArg, RigArgs, RunArgs};
+use crate::cli::{FitArg, RunArgs};
 use crate::control::RigReader;
 use crate::failure::{Exit, Failure};
 use crate::page::Page;
@@ -104,15 +104,10 @@ fn replay(args: &RunArgs, output: OutputSpec, tracker: &TrackerSpec) -> Result<(
     refuse_options(args, tracker)?;
     let (TrackerSpec::Path(path) | TrackerSpec::Replay { path, .. }) = tracker else { return Ok(()) };
     let unpacked = progress::during("unpacking the report", || bug_report::unpack(path))?;
-    let Played { rig, pictures, backend, playback, comparison, config, scene } =
+    let Played { rig, pictures, backend, playback, comparison } =
         progress::during("reading what its frames are made of", || bug_report::prepare(&unpacked, args.backend))?;
     let weights = progress::during("loading the network", || setup::weights(&rig))?;
-    remove_earlier_record(args)?;
     let page = Page::open(&args.page)?;
-    let of_report = RunArgs { rig: RigArgs { config: Some(config) }, scene, ..args.clone() };
-    let recorder = |folder| Recorder::create(folder, &of_report, &rig, pictures.resolution());
-    let recorder = args.record.as_deref().map(recorder).transpose()?;
-    let recorder = recorder.map(|recorder| recorder.with_tracker(tracker.to_string()));
     let frames = playback.frames();
     tracing::info!("{frames} frames of {} are made again, with simulated lasers", path.display());
     let plan = SessionPlan {
@@ -128,26 +123,12 @@ fn replay(args: &RunArgs, output: OutputSpec, tracker: &TrackerSpec) -> Result<(
         record_tracker: None,
         frame_limit: Some(args.frames.map_or(frames, |asked| asked.min(frames))),
         duration: args.duration,
-        keep_levels: args.record.is_some(),
+        keep_levels: false,
         hash_levels: true,
     };
-    let mut observers = ((recorder, page), comparison);
-    let played = session::play(plan, playback, &mut observers);
-    let ((mut recorder, _), comparison) = observers;
-    let session = match played {
-        Ok(session) => session,
-        Err(failure) => {
-            if let Some(recorder) = recorder {
-                recorder.fail(&failure);
-            }
-            return Err(failure);
-        }
-    };
-    if let (Some(recorder), Some(folder)) = (&mut recorder, &args.record) {
-        recorder.finish()?;
-        save(&session, folder)?;
-    }
-    let outcome = comparison.finish(&session.summary.figures.engine);
+    let mut observers = (page, comparison);
+    let session = session::play(plan, playback, &mut observers)?;
+    let outcome = observers.1.finish(&session.summary.figures.engine);
     tell(args, &session.summary, Some(&outcome))?;
     if outcome.differs() {
         let (frames, fields) = (outcome.frames_different, outcome.fields_different);
@@ -159,6 +140,10 @@ fn replay(args: &RunArgs, output: OutputSpec, tracker: &TrackerSpec) -> Result<(
 
 /// Refuses what a report brings itself.
 fn refuse_options(args: &RunArgs, tracker: &TrackerSpec) -> Result<(), Failure> {
+    if args.record.is_some() {
+        let what = "--record: a report holds its record already; `tar xzf FILE` takes it out";
+        return Err(Failure::new(Exit::Usage, what));
+    }
     let own_pace =
         matches!(tracker, TrackerSpec::Replay { speed, repeat, .. } if *repeat || *speed != ReplaySpeed::Times(1.0));
     let given = [

@@ -58,19 +58,43 @@ impl SourceFile {
 /// # Errors
 /// The reader's.
 pub fn content_xxh3(reader: &mut impl Read) -> io::Result<(u64, String)> {
-    let mut hasher = XxHash3_64::new();
+    let mut hashed = Hashed::new(reader);
     let mut buffer = vec![0; 1 << 18];
-    let mut bytes = 0;
     loop {
-        match reader.read(&mut buffer) {
-            Ok(0) => return Ok((bytes, hash_text(hasher.finish()))),
-            Ok(count) => {
-                hasher.write(&buffer[..count]);
-                bytes += count as u64;
-            }
+        match hashed.read(&mut buffer) {
+            Ok(0) => return Ok(hashed.finish()),
+            Ok(_) => {}
             Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
             Err(error) => return Err(error),
         }
+    }
+}
+
+/// A reader that counts and hashes what is read of it.
+pub struct Hashed<R> {
+    reader: R,
+    hasher: XxHash3_64,
+    bytes: u64,
+}
+
+impl<R: Read> Hashed<R> {
+    /// Of what `reader` brings from here on.
+    pub fn new(reader: R) -> Self {
+        Self { reader, hasher: XxHash3_64::new(), bytes: 0 }
+    }
+
+    /// How many bytes there were, and their hash.
+    pub fn finish(self) -> (u64, String) {
+        (self.bytes, hash_text(self.hasher.finish()))
+    }
+}
+
+impl<R: Read> Read for Hashed<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let count = self.reader.read(buffer)?;
+        self.hasher.write(&buffer[..count]);
+        self.bytes += count as u64;
+        Ok(count)
     }
 }
 
