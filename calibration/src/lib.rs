@@ -4,11 +4,13 @@
 //! seconds (`f64`) or nanoseconds (`i64`); a pupil is the one quantity kept in millimetres, as trackers and the
 //! literature give it.
 
+mod clock;
 mod geometry;
 mod level_tables;
 pub mod rig;
 mod units;
 
+pub use clock::host_now;
 pub use geometry::DisplayGeometry;
 pub use level_tables::LevelTables;
 pub use units::{Colour, Dioptres, Metres, PerColour, PupilDiameter, Resolution, TimeNs};

@@ -264,7 +264,8 @@ mod tests {
 
     fn farthest_apart(a: &LinearImage, b: &LinearImage) -> f32 {
         let planes = Colour::ALL.into_iter().flat_map(|colour| a.plane(colour).iter().zip(b.plane(colour)));
-        planes.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
+        // By the total order a value that is no number is the largest.
+        planes.map(|(a, b)| (a - b).abs()).max_by(f32::total_cmp).unwrap_or(f32::NAN)
     }
 
     #[test]

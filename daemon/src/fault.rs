@@ -11,7 +11,6 @@ use std::time::Duration;
 
 use holod_calibration::TimeNs;
 use holod_slm_output::LevelsFrame;
-use holod_slm_output::output::monotonic_now;
 use holod_slm_output::present::{FrameSource, PanelFault, PresentedRefresh, Presenter};
 use signal_hook::consts::SIGUSR1;
 
@@ -99,7 +98,7 @@ pub(crate) fn gpu_is_lost() -> bool {
 
 /// The clock of the run's threads, which is where the fault finds them.
 pub(crate) fn host_now() -> TimeNs {
-    let now = monotonic_now();
+    let now = holod_calibration::host_now();
     let Some(fault) = now_happening() else { return now };
     let this = |name: &str| std::thread::current().name() == Some(name);
     match fault {

@@ -155,6 +155,7 @@ mod tests {
     use holod_calibration::{Metres, PerColour};
 
     use super::*;
+    use crate::worst::worst;
 
     const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
     const TRAINED: TrainedRange = TrainedRange { volume_blur_px: [10.0, 80.0], volume_fresnel_px2: [30.0, 50.0] };
@@ -170,7 +171,7 @@ mod tests {
         let told = |pupil_mm| Conditions::of(&TRAINED, &BENCH, PupilDiameter::from_mm(pupil_mm));
         // 14.2857 px to a millimetre, and (45.5714 + 37.1429 + 32.1429) / 3 px².
         let at_3_mm = Conditions { blur: (42.857_143f64 / 40.0).log2(), fresnel: (38.285_714f64 / 40.0).log2() };
-        let apart = |a: Conditions, b: Conditions| (a.blur - b.blur).abs().max((a.fresnel - b.fresnel).abs());
+        let apart = |a: Conditions, b: Conditions| worst([a.blur - b.blur, a.fresnel - b.fresnel].map(f64::abs));
         assert!(apart(told(3.0), at_3_mm) < 1e-6, "{:?}", told(3.0));
         assert!(apart(told(3.01), at_3_mm) > 1e-3, "the comparison is blind");
         assert_eq!((told(0.6).blur, told(0.1).blur), (-2.0, -2.0));

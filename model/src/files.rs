@@ -13,7 +13,7 @@ use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use serde::{Deserialize, Serialize};
 
-use crate::picture::linear_to_srgb;
+use crate::picture::srgb8;
 use crate::{ComplexHologram, LinearImage, PhasePattern};
 
 /// The value of the metadata key `format` of a hologram file.
@@ -187,14 +187,11 @@ impl StoredHologram {
     }
 }
 
-/// Writes a picture as an 8-bit sRGB PNG, the one place where linear light is encoded. What is brighter than white is
-/// white.
+/// Writes a picture as an 8-bit sRGB PNG. What is brighter than white is white.
 pub fn save_picture(image: &LinearImage, path: &Path) -> Result<(), FileError> {
     let planes = Colour::ALL.map(|colour| image.plane(colour));
     let width = image.resolution.width;
-    save_png(path, image.resolution, |x, y| {
-        Rgb(planes.map(|plane| (255.0 * linear_to_srgb(plane[y * width + x].clamp(0.0, 1.0))).round() as u8))
-    })
+    save_png(path, image.resolution, |x, y| Rgb(planes.map(|plane| srgb8(plane[y * width + x]))))
 }
 
 /// Writes one colour's phase as a 16-bit grey PNG: level·2π/65536, rounded.

@@ -20,10 +20,12 @@ pub mod scene_shard;
 mod simd;
 pub mod weights;
 mod worker_pool;
+#[cfg(test)]
+mod worst;
 
 pub use engine::CpuEngine;
 pub use optics::{ComplexHologram, PhasePattern};
-pub use picture::LinearImage;
+pub use picture::{LinearImage, srgb8};
 pub use scene::RgbdFrame;
 pub use weights::Weights;
 pub use worker_pool::{WorkerPool, WorkerPoolError};

@@ -57,12 +57,13 @@ mod tests {
     use std::f64::consts::TAU;
 
     use super::*;
+    use crate::worst::worst;
 
     /// The largest difference of `found` from `expected` over `count` places in 0..=1.
     fn largest_difference(count: u32, found: impl Fn(f64) -> f64, expected: impl Fn(f64) -> f64) -> f64 {
         let places = (0..=count).map(|index| f64::from(index) / f64::from(count));
         let differences = places.map(|at| (found(at) - expected(at)).abs());
-        differences.fold(0.0, |worst, value| if value.is_nan() { f64::INFINITY } else { worst.max(value) })
+        worst(differences)
     }
 
     #[test]

@@ -26,8 +26,7 @@ impl LinearImage {
     /// The picture as 8-bit sRGB, [height, width, 3]; intensities outside 0..=1 are clipped.
     pub fn to_srgb8(&self) -> Vec<u8> {
         let pixels = self.resolution.pixels();
-        let encoded = |value: f32| (linear_to_srgb(value.clamp(0.0, 1.0)) * 255.0).round() as u8;
-        (0..pixels).flat_map(|pixel| [0, 1, 2].map(|c| encoded(self.pixels[c * pixels + pixel]))).collect()
+        (0..pixels).flat_map(|pixel| [0, 1, 2].map(|c| srgb8(self.pixels[c * pixels + pixel]))).collect()
     }
 
     /// One colour, row-major [height, width], to write to.
@@ -42,8 +41,13 @@ pub(crate) fn srgb_to_linear(encoded: f32) -> f32 {
     if encoded <= 0.04045 { encoded / 12.92 } else { ((encoded + 0.055) / 1.055).powf(2.4) }
 }
 
+/// Linear light, of which what lies outside 0..=1 is clipped, as 8-bit sRGB: the one place where light is encoded.
+pub fn srgb8(linear: f32) -> u8 {
+    (linear_to_srgb(linear.clamp(0.0, 1.0)) * 255.0).round() as u8
+}
+
 /// sRGB value of linear light, both 0..=1 (IEC 61966-2-1).
-pub(crate) fn linear_to_srgb(linear: f32) -> f32 {
+fn linear_to_srgb(linear: f32) -> f32 {
     if linear <= 0.003_130_8 { linear * 12.92 } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 

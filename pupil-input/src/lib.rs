@@ -68,6 +68,7 @@ pub use refusals::{Refusal, RefusalChange, RefusalWatch};
 pub use sample::{PupilSample, SampleEye};
 pub use simulate::{MOCK_SEED, MockSample, MockSource, Scenario, Script, ScriptError};
 
+pub use holod_calibration::host_now;
 pub use source::SourceError;
 pub use source::commands::CommandError;
 pub use source::hid::{HidError, RULE_FILE, udev_rule};
@@ -78,5 +79,5 @@ pub use source::tcp::NetworkError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
 pub use tracker::{
     ChangeError, DecisionTap, EstimateReader, Link, Tracker, TrackerControl, TrackerError, TrackerHandle,
-    TrackerOptions, host_now, scaled_millimetres,
+    TrackerOptions, scaled_millimetres,
 };

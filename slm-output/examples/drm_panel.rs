@@ -26,9 +26,8 @@ use std::time::Duration;
 use crc::{Algorithm, Crc};
 use drm::Device;
 use holod_calibration::rig::{Panel, PanelMode, Rig};
-use holod_calibration::{Colour, Resolution, TimeNs};
+use holod_calibration::{Colour, Resolution, TimeNs, host_now};
 use holod_slm_output::fields::FrameTag;
-use holod_slm_output::output::monotonic_now;
 use holod_slm_output::present::drm::{DrmPanel, DrmTarget, Verdict};
 use holod_slm_output::present::{FrameSink, PanelSetup, PresentedRefresh, Presenter, Provenance, frame_channel};
 use holod_slm_output::{FrameLayout, LevelsFrame};
@@ -216,7 +215,7 @@ fn show(connector: &str, mode: &str, panel_mode: &str, options: &[&str]) -> Resu
     let flat = LevelsFrame::new(layout);
     let (mut sink, mut source) = frame_channel(&flat);
     let target = DrmTarget { connector: connector.to_owned(), card: None };
-    let t_begin = monotonic_now();
+    let t_begin = host_now();
     let mut presenter = DrmPanel::open(&target, &PanelSetup { panel, flat })?;
     let checks: Vec<_> = presenter
         .checks()
@@ -224,7 +223,7 @@ fn show(connector: &str, mode: &str, panel_mode: &str, options: &[&str]) -> Resu
         .map(|check| json!([check.name, check.found, check.wanted, format!("{:?}", check.verdict).to_lowercase()]))
         .collect();
     let wrong = presenter.checks().iter().filter(|check| check.verdict == Verdict::Wrong).count();
-    tell(&json!({ "opened_ms": (monotonic_now() - t_begin).0 / 1_000_000, "wrong": wrong, "checks": checks }));
+    tell(&json!({ "opened_ms": (host_now() - t_begin).0 / 1_000_000, "wrong": wrong, "checks": checks }));
 
     raise_priority();
     let mut crcs = options.crc.as_deref().map(Crcs::open).transpose()?;
@@ -238,24 +237,24 @@ fn show(connector: &str, mode: &str, panel_mode: &str, options: &[&str]) -> Resu
     let mut frame_id = 0;
     submit(&mut sink, &patterns, &mut frame_id, &options);
     while losses < options.losses || notes.refreshes.len() < options.refreshes {
-        if (monotonic_now() - t_begin) > LIMIT {
+        if (host_now() - t_begin) > LIMIT {
             return Err(
                 format!("after {} refreshes and {losses} losses the time was over", notes.refreshes.len()).into()
             );
         }
-        let now = monotonic_now();
+        let now = host_now();
         let before = (TAKEN.get(), notes.refreshes.len());
         let ticked = presenter.tick(now, &mut source, &mut |refresh| {
             notes.before_their_time += u64::from(refresh.t_present > now);
             notes.refreshes.push(refresh);
         });
         notes.allocations += TAKEN.get() - before.0;
-        notes.tick_ns.push((monotonic_now() - now).0);
+        notes.tick_ns.push((host_now() - now).0);
         if let Err(fault) = ticked {
             losses += 1;
-            tell(&json!({ "lost": fault.to_string(), "t_ms": (monotonic_now() - t_begin).0 / 1_000_000 }));
+            tell(&json!({ "lost": fault.to_string(), "t_ms": (host_now() - t_begin).0 / 1_000_000 }));
             wait_for_it(&mut presenter, t_begin)?;
-            tell(&json!({ "back_t_ms": (monotonic_now() - t_begin).0 / 1_000_000 }));
+            tell(&json!({ "back_t_ms": (host_now() - t_begin).0 / 1_000_000 }));
             notes.refreshes.clear();
             notes.tick_ns.clear();
             // The frame that was on its way is lost.
@@ -311,14 +310,14 @@ fn submit(sink: &mut FrameSink, patterns: &[LevelsFrame], frame_id: &mut u64, op
     for colour in Colour::ALL {
         frame.field_mut(colour).write(&levels.unpack_colour(colour).levels);
     }
-    let now = monotonic_now();
+    let now = host_now();
     sink.submit(FrameTag { frame_id: *frame_id, t_submit: now, t_desired_present: now, keep: None });
 }
 
 fn wait_for_it(presenter: &mut DrmPanel, t_begin: TimeNs) -> Result<(), Box<dyn Error>> {
     let mut said = None;
     loop {
-        match presenter.recover(monotonic_now()) {
+        match presenter.recover(host_now()) {
             Ok(()) => return Ok(()),
             Err(fault) if said != Some(fault) => {
                 said = Some(fault);
@@ -326,7 +325,7 @@ fn wait_for_it(presenter: &mut DrmPanel, t_begin: TimeNs) -> Result<(), Box<dyn 
             }
             Err(_) => {}
         }
-        if monotonic_now() - t_begin > LIMIT {
+        if host_now() - t_begin > LIMIT {
             return Err("the panel did not come back".into());
         }
         std::thread::sleep(RECOVER_EVERY);
@@ -334,7 +333,7 @@ fn wait_for_it(presenter: &mut DrmPanel, t_begin: TimeNs) -> Result<(), Box<dyn 
 }
 
 fn sleep_until(presenter: &DrmPanel) -> io::Result<()> {
-    let rest_ns = (presenter.t_next() - monotonic_now()).0.max(0);
+    let rest_ns = (presenter.t_next() - host_now()).0.max(0);
     let timeout = Timespec { tv_sec: rest_ns / 1_000_000_000, tv_nsec: rest_ns % 1_000_000_000 };
     let wake = presenter.wake_fd().map(|fd| PollFd::from_borrowed_fd(fd, PollFlags::IN));
     match poll(wake.into_iter().collect::<Vec<_>>().as_mut_slice(), Some(&timeout)) {

@@ -9,10 +9,10 @@ use std::sync::mpsc::{Sender, channel};
 use std::time::{Duration, Instant};
 
 use holod_calibration::rig::{PanelMode, Rig};
-use holod_calibration::{Resolution, TimeNs};
+use holod_calibration::{Resolution, TimeNs, host_now};
 use holod_slm_output::fields::FrameTag;
 use holod_slm_output::laser::{BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow};
-use holod_slm_output::output::{Output, OutputOptions, monotonic_now, pacing_config};
+use holod_slm_output::output::{Output, OutputOptions, pacing_config};
 use holod_slm_output::present::{PanelSetup, PresentedRefresh, open_panel};
 use holod_slm_output::schedule::{Evidence, FieldScheduler};
 use holod_slm_output::{FrameLayout, Pacer, PanelEncoder, Provenance};
@@ -92,7 +92,7 @@ impl LaserBox for Listener {
         Ok(None)
     }
     fn heartbeat(&mut self, _: TimeNs) -> Result<(), LaserError> {
-        let _nobody_listens = self.0.send(monotonic_now());
+        let _nobody_listens = self.0.send(host_now());
         Ok(())
     }
     fn dark(&mut self, _: DarkReason, _: TimeNs) -> Result<(), LaserError> {
@@ -110,18 +110,18 @@ fn heartbeat_jitter() -> Vec<f64> {
     rig.panel.refresh_hz = 180.0;
     let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).expect("the rig is sound");
     let setup = PanelSetup::new(&rig.panel, &encoder);
-    let panel = open_panel(&"headless".parse().expect("a spec"), &setup, monotonic_now()).expect("a virtual panel");
+    let panel = open_panel(&"headless".parse().expect("a spec"), &setup, host_now()).expect("a virtual panel");
     let (heard, heartbeats) = channel();
     let options = OutputOptions::default();
-    let output = Output::start(&rig, &encoder, panel, Box::new(Listener(heard)), options, monotonic_now);
+    let output = Output::start(&rig, &encoder, panel, Box::new(Listener(heard)), options, host_now);
     let mut output = output.expect("threads start");
-    let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(1_000_000)).expect("a rig"), monotonic_now());
+    let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(1_000_000)).expect("a rig"), host_now());
     let began = Instant::now();
     while began.elapsed() < Duration::from_secs(10) {
         output.frames.feed(&mut pacer, |_| ());
-        let plan = pacer.predict(monotonic_now());
-        std::thread::sleep(Duration::from_nanos((plan.t_wake - monotonic_now()).0.max(0) as u64));
-        output.frames.submit(&plan, None, monotonic_now());
+        let plan = pacer.predict(host_now());
+        std::thread::sleep(Duration::from_nanos((plan.t_wake - host_now()).0.max(0) as u64));
+        output.frames.submit(&plan, None, host_now());
         while output.events.pop().is_ok() {}
     }
     output.control.shutdown();

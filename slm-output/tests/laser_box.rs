@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::Duration;
 
 use holod_calibration::rig::{LaserDriver, Lasers, PanelMode, Rig};
-use holod_calibration::{Colour, PerColour, Resolution, TimeNs};
+use holod_calibration::{Colour, PerColour, Resolution, TimeNs, host_now};
 use holod_laser_firmware::Line;
 use holod_slm_output::PanelEncoder;
 use holod_slm_output::laser::edge_log::{LOG_HEADER, read_log};
@@ -20,7 +20,7 @@ use holod_slm_output::laser::{
     BoxEvent, DarkReason, LaserBox, LaserEdge, LaserError, LaserProgram, LitWindow, Refusal, SerialBox, SerialOptions,
     make_dark, open_laser,
 };
-use holod_slm_output::output::{FieldEvent, Output, OutputOptions, monotonic_now, pacing_config};
+use holod_slm_output::output::{FieldEvent, Output, OutputOptions, pacing_config};
 use holod_slm_output::pacing::{Pacer, Point};
 use holod_slm_output::present::{PanelSetup, open_panel};
 use holod_slm_output::schedule::Gate;
@@ -85,14 +85,14 @@ impl BoxProcess {
     }
 
     fn open(&self, options: SerialOptions) -> SerialBox {
-        SerialBox::open(&self.port, options, monotonic_now).unwrap()
+        SerialBox::open(&self.port, options, host_now).unwrap()
     }
 
     /// A host that has armed it.
     fn armed(&self, program: &LaserProgram) -> SerialBox {
         let mut host = self.open(SerialOptions::default());
-        host.program(program, monotonic_now()).unwrap();
-        host.arm(monotonic_now()).unwrap();
+        host.program(program, host_now()).unwrap();
+        host.arm(host_now()).unwrap();
         host
     }
 
@@ -121,9 +121,9 @@ impl Drop for BoxProcess {
 
 /// Waits until `holds`, for as long as a slow machine may need.
 fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
-    let t_end = monotonic_now() + TimeNs(30_000 * MS);
+    let t_end = host_now() + TimeNs(30_000 * MS);
     while !holds() {
-        assert!(monotonic_now() < t_end, "never came: {what}");
+        assert!(host_now() < t_end, "never came: {what}");
         std::thread::sleep(Duration::from_millis(5));
     }
 }
@@ -152,11 +152,11 @@ fn rig(mode: PanelMode, port: &Path) -> Rig {
 fn run(rig: &Rig) -> (Output, Vec<FieldEvent>) {
     let size = Resolution { width: 4, height: 2 };
     let encoder = PanelEncoder::new(&rig.panel, size, size).unwrap();
-    let panel = open_panel(&"headless".parse().unwrap(), &PanelSetup::new(&rig.panel, &encoder), monotonic_now());
-    let laser = open_laser(&rig.lasers, monotonic_now).unwrap();
+    let panel = open_panel(&"headless".parse().unwrap(), &PanelSetup::new(&rig.panel, &encoder), host_now());
+    let laser = open_laser(&rig.lasers, host_now).unwrap();
     let options = OutputOptions::default();
-    let mut output = Output::start(rig, &encoder, panel.unwrap(), laser, options, monotonic_now).unwrap();
-    let mut pacer = Pacer::new(pacing_config(rig, TimeNs(2 * MS)).unwrap(), monotonic_now());
+    let mut output = Output::start(rig, &encoder, panel.unwrap(), laser, options, host_now).unwrap();
+    let mut pacer = Pacer::new(pacing_config(rig, TimeNs(2 * MS)).unwrap(), host_now());
     let mut fields: Vec<FieldEvent> = Vec::new();
     for _ in 0..1000 {
         while let Ok(event) = output.events.pop() {
@@ -166,10 +166,10 @@ fn run(rig: &Rig) -> (Output, Vec<FieldEvent>) {
             break;
         }
         output.frames.feed(&mut pacer, |_| ());
-        let plan = pacer.predict(monotonic_now());
-        std::thread::sleep(Duration::from_nanos((plan.t_wake - monotonic_now()).0.max(0) as u64));
+        let plan = pacer.predict(host_now());
+        std::thread::sleep(Duration::from_nanos((plan.t_wake - host_now()).0.max(0) as u64));
         encoder.encode(PerColour([&[1.0; 8]; 3]), output.frames.acquire());
-        let now = monotonic_now();
+        let now = host_now();
         output.frames.submit(&plan, None, now);
         pacer.mark(Point::Submit, plan.frame_id, now);
     }
@@ -180,7 +180,7 @@ fn run(rig: &Rig) -> (Output, Vec<FieldEvent>) {
 fn dark_reason(host: &mut dyn LaserBox) -> DarkReason {
     let mut dark = None;
     eventually("darkness at the host", || {
-        let _on_the_way = host.poll(monotonic_now(), &mut |event| {
+        let _on_the_way = host.poll(host_now(), &mut |event| {
             if let BoxEvent::Dark { reason, .. } = event {
                 dark.get_or_insert(reason);
             }
@@ -223,10 +223,10 @@ fn a_host_that_falls_silent_leaves_a_box_that_goes_dark_by_its_heartbeat_timeout
     let laser = BoxProcess::start(&OTHER_CLOCK);
     let program = LaserProgram { heartbeat_timeout: TimeNs(60 * MS), ..host_program() };
     let mut host = laser.armed(&program);
-    host.heartbeat(monotonic_now()).unwrap();
+    host.heartbeat(host_now()).unwrap();
     // Lines are answered in order: with this answer the heartbeat has been heard.
     host.report().unwrap();
-    let t_silent = monotonic_now();
+    let t_silent = host_now();
     // Neither a word nor a closed line: like a process that hangs.
     std::mem::forget(host);
     let log = laser.dark_log();
@@ -260,7 +260,7 @@ fn faults_of_the_box_are_heard_of_by_their_own_names() {
         laser.tell(fault);
         let mut dark = None;
         eventually(fault, || {
-            let now = monotonic_now();
+            let now = host_now();
             let _refused_once_dark = host.heartbeat(now);
             let _on_the_way = host.poll(now, &mut |event| {
                 if let BoxEvent::Dark { reason, .. } = event {
@@ -283,12 +283,12 @@ fn a_box_whose_interlock_is_open_is_not_armed() {
     let mut laser = BoxProcess::start(&[]);
     laser.tell("interlock open");
     let mut host = laser.open(SerialOptions::default());
-    host.program(&host_program(), monotonic_now()).unwrap();
+    host.program(&host_program(), host_now()).unwrap();
     eventually("the interlock", || !host.report().unwrap().state.interlock_closed);
-    let refused = host.arm(monotonic_now()).unwrap_err();
+    let refused = host.arm(host_now()).unwrap_err();
     assert!(matches!(refused, LaserError::Refused { command: "ARM", refusal: Refusal::Interlock }), "{refused}");
     laser.tell("interlock closed");
-    eventually("arming", || host.arm(monotonic_now()).is_ok());
+    eventually("arming", || host.arm(host_now()).is_ok());
 }
 
 #[test]
@@ -297,7 +297,7 @@ fn a_second_host_finds_a_box_that_answers() {
     fs::OpenOptions::new().write(true).open(&laser.port).unwrap().write_all(b"17 POW 1 2").unwrap();
     for _ in 0..2 {
         let mut host = laser.armed(&host_program());
-        host.dark(DarkReason::Asked, monotonic_now()).unwrap();
+        host.dark(DarkReason::Asked, host_now()).unwrap();
     }
 }
 
@@ -305,21 +305,21 @@ fn a_second_host_finds_a_box_that_answers() {
 fn two_programs_do_not_drive_one_box_but_anybody_may_make_it_dark() {
     let laser = BoxProcess::start(&[]);
     let mut host = laser.armed(&LaserProgram { heartbeat_timeout: TimeNs(900 * MS), ..host_program() });
-    let in_use = SerialBox::open(&laser.port, SerialOptions::default(), monotonic_now).unwrap_err();
+    let in_use = SerialBox::open(&laser.port, SerialOptions::default(), host_now).unwrap_err();
     assert!(matches!(&in_use, LaserError::InUse { path } if laser.port == Path::new(path)), "{in_use}");
-    let in_use = SerialBox::inspect(&laser.port, monotonic_now).unwrap_err();
+    let in_use = SerialBox::inspect(&laser.port, host_now).unwrap_err();
     assert!(matches!(in_use, LaserError::InUse { .. }), "{in_use}");
 
     // The host's listener goes on reading beside it, as that of a program does whose other threads hang.
     let driver = LaserDriver::Serial { path: laser.port.clone(), sync_wire: false };
-    make_dark(&driver, monotonic_now).unwrap();
+    make_dark(&driver, host_now).unwrap();
     let log = laser.dark_log();
     assert!(matches!(log.last(), Some(BoxEvent::Dark { reason: DarkReason::Asked, .. })), "{log:?}");
     let mut dark = None;
     eventually("the host to notice", || {
-        let _refused_once_dark = host.heartbeat(monotonic_now());
+        let _refused_once_dark = host.heartbeat(host_now());
         // It may have missed an answer that the other program took.
-        let _missed = host.poll(monotonic_now(), &mut |event| {
+        let _missed = host.poll(host_now(), &mut |event| {
             if let BoxEvent::Dark { reason, .. } = event {
                 dark = Some(reason);
             }
@@ -328,10 +328,10 @@ fn two_programs_do_not_drive_one_box_but_anybody_may_make_it_dark() {
         dark.is_some()
     });
     assert_eq!(dark, Some(DarkReason::Asked));
-    assert!(matches!(host.arm(monotonic_now()), Err(LaserError::MadeDark)), "nobody arms it against that");
+    assert!(matches!(host.arm(host_now()), Err(LaserError::MadeDark)), "nobody arms it against that");
     drop(host);
 
-    let report = SerialBox::inspect(&laser.port, monotonic_now).unwrap();
+    let report = SerialBox::inspect(&laser.port, host_now).unwrap();
     assert!(!report.state.armed && report.name == "simulated" && report.state.interlock_closed, "{report:?}");
     assert!(report.clock_error_ns < 100 * MS);
 }
@@ -342,7 +342,7 @@ fn windows_are_inside_what_was_asked_for_whatever_the_clocks_and_dark_where_noth
     let mut host = laser.armed(&host_program());
     let mut asked = Vec::new();
     for colour in Colour::ALL {
-        let now = monotonic_now();
+        let now = host_now();
         host.heartbeat(now).unwrap();
         let window = LitWindow { colour, t_on: now + TimeNs(30 * MS), t_off: now + TimeNs(70 * MS) };
         host.light(window, now).unwrap();
@@ -351,9 +351,9 @@ fn windows_are_inside_what_was_asked_for_whatever_the_clocks_and_dark_where_noth
         host.light(LitWindow { t_on: now + TimeNs(80 * MS), t_off: now + TimeNs(80 * MS + 2000), ..window }, now)
             .unwrap();
         std::thread::sleep(Duration::from_millis(100));
-        host.poll(monotonic_now(), &mut |_| ()).unwrap();
+        host.poll(host_now(), &mut |_| ()).unwrap();
     }
-    host.dark(DarkReason::Asked, monotonic_now()).unwrap();
+    host.dark(DarkReason::Asked, host_now()).unwrap();
     let found = edges(&laser.dark_log());
     assert_eq!(found.len(), 6, "{found:?}");
     for (pair, window) in found.chunks(2).zip(asked) {
@@ -369,20 +369,20 @@ fn a_box_on_the_panels_wire_lights_after_its_edges_and_a_wire_that_disagrees_mak
     let program = LaserProgram { heartbeat_timeout: TimeNs(950 * MS), ..program(&rig) };
     let without = SerialOptions::default();
     let mut host = laser.open(SerialOptions { sync_wire: true, ..without });
-    host.program(&program, monotonic_now()).unwrap();
+    host.program(&program, host_now()).unwrap();
     laser.tell("sync 60");
     eventually("an edge", || host.report().unwrap().state.sync.count > 2);
     // What this host believes of the panel: frames at the same rate, in a phase of their own.
-    let t_first = monotonic_now();
+    let t_first = host_now();
     let frame = |index: i64| TimeNs(t_first.0 + index * program.frame_period.0);
-    host.arm(monotonic_now()).unwrap();
+    host.arm(host_now()).unwrap();
     let mut dark = None;
     let run = |host: &mut SerialBox, until: &dyn Fn(i64) -> bool, dark: &mut Option<DarkReason>| {
         for index in 0.. {
             if dark.is_some() || until(index) {
                 return;
             }
-            let now = monotonic_now();
+            let now = host_now();
             let known = (now.0 - t_first.0) / program.frame_period.0;
             let _once_dark = host.heartbeat(now);
             let _once_dark = host.sync(frame(known), now);
@@ -413,9 +413,9 @@ fn a_box_on_the_panels_wire_lights_after_its_edges_and_a_wire_that_disagrees_mak
     drop(host);
 
     let mut host = laser.open(SerialOptions { sync_wire: true, ..without });
-    host.program(&program, monotonic_now()).unwrap();
+    host.program(&program, host_now()).unwrap();
     laser.tell("sync 0");
-    host.arm(monotonic_now()).unwrap();
+    host.arm(host_now()).unwrap();
     assert_eq!(dark_reason(&mut host), DarkReason::SyncLost);
     assert!(laser.dark_log().len() > log.len());
 }
@@ -436,7 +436,7 @@ fn lying_box(stream: UnixStream, lie: fn(&str) -> String) {
     }
     stream.set_nonblocking(true).unwrap();
     let liar = Liar(stream.try_clone().unwrap(), lie);
-    SimulatedBox::new(monotonic_now()).serve(stream, liar, std::io::sink(), &Faults::default(), monotonic_now).unwrap();
+    SimulatedBox::new(host_now()).serve(stream, liar, std::io::sink(), &Faults::default(), host_now).unwrap();
 }
 
 /// The host's end of a line to it.
@@ -447,7 +447,7 @@ fn line_to(far: impl FnOnce(UnixStream) + Send + 'static) -> (UnixStream, UnixSt
 }
 
 fn identify(reader: UnixStream, writer: UnixStream, name: &str) -> Result<SerialBox, LaserError> {
-    SerialBox::identify(reader, writer, name, SerialOptions::default(), monotonic_now)
+    SerialBox::identify(reader, writer, name, SerialOptions::default(), host_now)
 }
 
 #[test]
@@ -459,11 +459,11 @@ fn real_lasers_stay_dark_over_a_virtual_panel() {
     let size = Resolution { width: 4, height: 2 };
     let encoder = PanelEncoder::new(&rig.panel, size, size).unwrap();
     let setup = PanelSetup::new(&rig.panel, &encoder);
-    let panel = open_panel(&"headless".parse().unwrap(), &setup, monotonic_now()).unwrap();
+    let panel = open_panel(&"headless".parse().unwrap(), &setup, host_now()).unwrap();
     let options = OutputOptions::default();
-    let mut output = Output::start(&rig, &encoder, panel, Box::new(laser), options, monotonic_now).unwrap();
-    let plan = Pacer::new(pacing_config(&rig, TimeNs(MS)).unwrap(), monotonic_now()).predict(monotonic_now());
-    output.frames.submit(&plan, None, monotonic_now());
+    let mut output = Output::start(&rig, &encoder, panel, Box::new(laser), options, host_now).unwrap();
+    let plan = Pacer::new(pacing_config(&rig, TimeNs(MS)).unwrap(), host_now()).predict(host_now());
+    output.frames.submit(&plan, None, host_now());
     let mut dark = 0;
     eventually("twenty dark fields", || {
         while let Ok(field) = output.events.pop() {
@@ -490,7 +490,7 @@ fn a_box_of_another_version_is_refused_and_both_versions_named() {
 
 #[test]
 fn a_port_that_is_no_laser_box_is_refused_by_name() {
-    let nothing = SerialBox::open(Path::new("/dev/no-such-port"), SerialOptions::default(), monotonic_now).unwrap_err();
+    let nothing = SerialBox::open(Path::new("/dev/no-such-port"), SerialOptions::default(), host_now).unwrap_err();
     assert!(matches!(&nothing, LaserError::Open { path, .. } if path == "/dev/no-such-port"), "{nothing}");
     let (reader, writer, tracker) = line_to(|mut far| {
         far.write_all(b"P1,1,1000,L,3.1,0.9*00\n").unwrap();
@@ -513,13 +513,13 @@ fn powers_beyond_the_rigs_limit_or_the_boxs_own_never_reach_it() {
     let power_limit_uw = PerColour([1000, 500, 1000]);
     let mut host = laser.open(SerialOptions { power_limit_uw, ..SerialOptions::default() });
     let strong = LaserProgram { power_uw: PerColour([1000, 501, 1]), ..host_program() };
-    let refused = host.program(&strong, monotonic_now()).unwrap_err();
+    let refused = host.program(&strong, host_now()).unwrap_err();
     assert!(matches!(refused, LaserError::Figure { what: "power_mw", .. }), "{refused}");
-    host.program(&LaserProgram { power_uw: power_limit_uw, ..strong }, monotonic_now()).unwrap();
+    host.program(&LaserProgram { power_uw: power_limit_uw, ..strong }, host_now()).unwrap();
     drop(host);
     let mut host = laser.open(SerialOptions::default());
     let stronger = LaserProgram { power_uw: PerColour([1, 1, 600_000]), ..host_program() };
-    let refused = host.program(&stronger, monotonic_now()).unwrap_err();
+    let refused = host.program(&stronger, host_now()).unwrap_err();
     assert!(matches!(refused, LaserError::BeyondBox { what: "power", limit: 500_000, .. }), "{refused}");
 }
 
@@ -534,45 +534,42 @@ fn a_box_that_was_unplugged_is_found_again_under_the_same_name() {
     let first = BoxProcess::start(&OTHER_CLOCK);
     plug_in(&first);
     let rig = rig(PanelMode::FieldSequential, &link);
-    let mut laser = open_laser(&rig.lasers, monotonic_now).unwrap();
+    let mut laser = open_laser(&rig.lasers, host_now).unwrap();
     let watch = laser.watch().unwrap();
-    laser.program(&host_program(), monotonic_now()).unwrap();
-    laser.arm(monotonic_now()).unwrap();
+    laser.program(&host_program(), host_now()).unwrap();
+    laser.arm(host_now()).unwrap();
     assert_eq!(watch.trouble(), None);
 
     drop(first);
     fs::remove_file(&link).unwrap();
-    let t_pulled = monotonic_now();
+    let t_pulled = host_now();
     assert_eq!(dark_reason(laser.as_mut()), DarkReason::BoxFault);
-    assert!(monotonic_now() - t_pulled < TimeNs(10_000 * MS));
+    assert!(host_now() - t_pulled < TimeNs(10_000 * MS));
     eventually("its name", || watch.trouble().is_some_and(|trouble| trouble.contains("lasers.device")));
     // Nobody waits for it meanwhile.
-    let t_asked = monotonic_now();
+    let t_asked = host_now();
     for _ in 0..100 {
-        assert!(matches!(laser.arm(monotonic_now()), Err(LaserError::Lost)));
-        assert!(
-            matches!(laser.dark(DarkReason::Shutdown, monotonic_now()), Err(LaserError::Lost)),
-            "no acknowledgement"
-        );
-        laser.poll(monotonic_now(), &mut |event| panic!("{event:?}")).unwrap();
+        assert!(matches!(laser.arm(host_now()), Err(LaserError::Lost)));
+        assert!(matches!(laser.dark(DarkReason::Shutdown, host_now()), Err(LaserError::Lost)), "no acknowledgement");
+        laser.poll(host_now(), &mut |event| panic!("{event:?}")).unwrap();
     }
     // Waiting for an answer would take ten seconds and more.
-    assert!(monotonic_now() - t_asked < TimeNs(5000 * MS));
+    assert!(host_now() - t_asked < TimeNs(5000 * MS));
 
     let second = BoxProcess::start(&["--clock-offset-us", "5"]);
     plug_in(&second);
     eventually("the box", || {
-        laser.poll(monotonic_now(), &mut |event| panic!("{event:?}")).unwrap();
-        laser.arm(monotonic_now()).is_ok()
+        laser.poll(host_now(), &mut |event| panic!("{event:?}")).unwrap();
+        laser.arm(host_now()).is_ok()
     });
     assert_eq!(watch.trouble(), None);
     eventually("its own log", || matches!(second.events().last(), Some(BoxEvent::Armed { .. })));
-    let now = monotonic_now();
+    let now = host_now();
     laser
         .light(LitWindow { colour: Colour::Red, t_on: now + TimeNs(20 * MS), t_off: now + TimeNs(60 * MS) }, now)
         .unwrap();
     eventually("light", || edges(&second.events()).len() == 2);
-    laser.dark(DarkReason::Shutdown, monotonic_now()).unwrap();
+    laser.dark(DarkReason::Shutdown, host_now()).unwrap();
 }
 
 #[test]
@@ -582,18 +579,18 @@ fn real_lasers_do_not_take_the_place_of_a_simulated_box() {
     let first = BoxProcess::start(&[]);
     std::os::unix::fs::symlink(&first.port, &link).unwrap();
     let rig = rig(PanelMode::FieldSequential, &link);
-    let mut laser = open_laser(&rig.lasers, monotonic_now).unwrap();
-    laser.program(&host_program(), monotonic_now()).unwrap();
+    let mut laser = open_laser(&rig.lasers, host_now).unwrap();
+    laser.program(&host_program(), host_now()).unwrap();
     drop(first);
     let real = BoxProcess::start(&["--name", "bench-4"]);
     fs::remove_file(&link).unwrap();
     std::os::unix::fs::symlink(&real.port, &link).unwrap();
     let watch = laser.watch().unwrap();
     eventually("refusal", || {
-        let _lost = laser.poll(monotonic_now(), &mut |_| ());
+        let _lost = laser.poll(host_now(), &mut |_| ());
         watch.trouble().is_some_and(|trouble| trouble.contains("another kind"))
     });
-    assert!(laser.arm(monotonic_now()).is_err());
+    assert!(laser.arm(host_now()).is_err());
 }
 
 proptest! {
@@ -617,8 +614,8 @@ proptest! {
         let mut host = laser.open(SerialOptions::default());
         prop_assert!(!host.report().unwrap().state.armed);
         prop_assert_eq!(edges(&laser.events()), vec![]);
-        host.program(&host_program(), monotonic_now()).unwrap();
-        host.arm(monotonic_now()).unwrap();
+        host.program(&host_program(), host_now()).unwrap();
+        host.arm(host_now()).unwrap();
     }
 }
 
@@ -653,24 +650,24 @@ fn host_on_a_bad_wire() -> (SerialBox, Arc<AtomicU8>, std::thread::JoinHandle<Ve
     far.set_nonblocking(true).unwrap();
     let serve = move || {
         let mut log = Vec::new();
-        let simulated = SimulatedBox::new(monotonic_now());
-        simulated.serve(&far, &far, &mut log, &Faults::default(), monotonic_now).unwrap();
+        let simulated = SimulatedBox::new(host_now());
+        simulated.serve(&far, &far, &mut log, &Faults::default(), host_now).unwrap();
         log
     };
     let served = std::thread::spawn(serve);
     let state = Arc::new(AtomicU8::new(SOUND));
     let wire = BadWire(host.try_clone().unwrap(), Arc::clone(&state));
-    let host = SerialBox::identify(host, wire, "wire", SerialOptions::default(), monotonic_now).unwrap();
+    let host = SerialBox::identify(host, wire, "wire", SerialOptions::default(), host_now).unwrap();
     (host, state, served)
 }
 
 #[test]
 fn a_damaged_line_makes_the_box_dark_and_the_host_hears_of_it() {
     let (mut host, wire, served) = host_on_a_bad_wire();
-    host.program(&host_program(), monotonic_now()).unwrap();
-    host.arm(monotonic_now()).unwrap();
+    host.program(&host_program(), host_now()).unwrap();
+    host.arm(host_now()).unwrap();
     wire.store(DAMAGES, Ordering::Relaxed);
-    host.heartbeat(monotonic_now()).unwrap();
+    host.heartbeat(host_now()).unwrap();
     wire.store(SOUND, Ordering::Relaxed);
     // The unanswered heartbeat may become an error first; the box's own word comes all the same.
     assert_eq!(dark_reason(&mut host), DarkReason::Line);
@@ -682,11 +679,11 @@ fn a_damaged_line_makes_the_box_dark_and_the_host_hears_of_it() {
 #[test]
 fn a_box_that_does_not_answer_is_an_error_and_never_an_acknowledgement() {
     let (mut host, wire, served) = host_on_a_bad_wire();
-    host.program(&host_program(), monotonic_now()).unwrap();
+    host.program(&host_program(), host_now()).unwrap();
     wire.store(SWALLOWS, Ordering::Relaxed);
-    let unheard = host.dark(DarkReason::Shutdown, monotonic_now()).unwrap_err();
+    let unheard = host.dark(DarkReason::Shutdown, host_now()).unwrap_err();
     assert!(matches!(unheard, LaserError::NoAnswer { command: "DISARM", .. }), "{unheard}");
-    let unheard = host.arm(monotonic_now()).unwrap_err();
+    let unheard = host.arm(host_now()).unwrap_err();
     assert!(matches!(unheard, LaserError::NoAnswer { command: "ARM", .. }), "{unheard}");
     drop(host);
     served.join().unwrap();

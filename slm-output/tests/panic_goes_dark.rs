@@ -4,10 +4,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use holod_calibration::rig::Rig;
-use holod_calibration::{PerColour, Resolution, TimeNs};
+use holod_calibration::{PerColour, Resolution, TimeNs, host_now};
 use holod_slm_output::PanelEncoder;
 use holod_slm_output::laser::{BoxEvent, DarkReason, open_laser};
-use holod_slm_output::output::{Output, OutputOptions, monotonic_now, pacing_config};
+use holod_slm_output::output::{Output, OutputOptions, pacing_config};
 use holod_slm_output::pacing::Pacer;
 use holod_slm_output::present::{PanelSetup, open_panel};
 
@@ -19,21 +19,20 @@ fn a_panic_in_any_thread_goes_dark_for_good() {
     let rig = Rig::default();
     let size = Resolution { width: 4, height: 2 };
     let encoder = PanelEncoder::new(&rig.panel, size, size).unwrap();
-    let panel = open_panel(&"headless".parse().unwrap(), &PanelSetup::new(&rig.panel, &encoder), monotonic_now());
-    let laser = open_laser(&rig.lasers, monotonic_now).unwrap();
-    let mut output =
-        Output::start(&rig, &encoder, panel.unwrap(), laser, OutputOptions::default(), monotonic_now).unwrap();
+    let panel = open_panel(&"headless".parse().unwrap(), &PanelSetup::new(&rig.panel, &encoder), host_now());
+    let laser = open_laser(&rig.lasers, host_now).unwrap();
+    let mut output = Output::start(&rig, &encoder, panel.unwrap(), laser, OutputOptions::default(), host_now).unwrap();
     let switch = output.control.dark_switch();
-    switch.install_panic_hook(monotonic_now, || IS_CAUGHT.load(Ordering::Acquire));
-    let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(1_000_000)).unwrap(), monotonic_now());
+    switch.install_panic_hook(host_now, || IS_CAUGHT.load(Ordering::Acquire));
+    let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(1_000_000)).unwrap(), host_now());
     let mut show = |frames: &mut holod_slm_output::FramePort| {
         encoder.encode(PerColour([&[1.0; 8]; 3]), frames.acquire());
-        frames.submit(&pacer.predict(monotonic_now()), None, monotonic_now());
+        frames.submit(&pacer.predict(host_now()), None, host_now());
         std::thread::sleep(Duration::from_millis(20));
     };
-    let t_end = monotonic_now() + TimeNs(30_000_000_000);
+    let t_end = host_now() + TimeNs(30_000_000_000);
     while !output.control.counts().armed {
-        assert!(monotonic_now() < t_end, "never armed");
+        assert!(host_now() < t_end, "never armed");
         show(&mut output.frames);
     }
     assert!(!switch.is_dark());
@@ -44,7 +43,7 @@ fn a_panic_in_any_thread_goes_dark_for_good() {
     assert!(!switch.is_dark() && switch.reason().is_none(), "a panic that is caught changes nothing");
     assert!(std::thread::spawn(|| panic!("meant")).join().is_err());
     while !switch.is_dark() {
-        assert!(monotonic_now() < t_end, "never dark");
+        assert!(host_now() < t_end, "never dark");
         std::thread::sleep(Duration::from_millis(1));
     }
     for _ in 0..5 {

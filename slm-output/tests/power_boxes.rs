@@ -10,11 +10,10 @@ use std::time::Duration;
 
 use crc::{CRC_16_XMODEM, Crc};
 use holod_calibration::rig::{LaserDriver, Lasers, PanelMode, Rig, TextLaserProfile};
-use holod_calibration::{Colour, PerColour, TimeNs};
+use holod_calibration::{Colour, PerColour, TimeNs, host_now};
 use holod_slm_output::laser::{
     BoxEvent, DarkReason, LaserBox, LaserError, LaserProgram, Refusal, make_dark, open_laser,
 };
-use holod_slm_output::output::monotonic_now;
 use holod_slm_output::schedule::Gate;
 use serialport::{SerialPort, TTYPort};
 
@@ -98,9 +97,9 @@ impl Drop for Bench {
 }
 
 fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
-    let t_end = monotonic_now() + TimeNs(30_000 * MS);
+    let t_end = host_now() + TimeNs(30_000 * MS);
     while !holds() {
-        assert!(monotonic_now() < t_end, "never came: {what}");
+        assert!(host_now() < t_end, "never came: {what}");
         std::thread::sleep(Duration::from_millis(2));
     }
 }
@@ -216,8 +215,8 @@ const GREEN: PanelMode = PanelMode::Monochrome(Colour::Green);
 fn alive_until(laser: &mut dyn LaserBox, mut holds: impl FnMut() -> bool) -> Vec<BoxEvent> {
     let mut events = Vec::new();
     eventually("what was waited for", || {
-        laser.heartbeat(monotonic_now()).unwrap();
-        laser.poll(monotonic_now(), &mut |event| events.push(event)).unwrap();
+        laser.heartbeat(host_now()).unwrap();
+        laser.poll(host_now(), &mut |event| events.push(event)).unwrap();
         holds()
     });
     events
@@ -228,37 +227,37 @@ fn a_ready_beam_is_recognised_set_lit_in_one_colour_and_put_out() {
     let bench = ready_beam(1171);
     let full_power_uw = PerColour([40_000, 20_000, 50_000]);
     let driver = LaserDriver::ReadyBeam { path: bench.path.clone(), full_power_uw };
-    let mut laser = open_laser(&lasers(driver.clone()), monotonic_now).unwrap();
+    let mut laser = open_laser(&lasers(driver.clone()), host_now).unwrap();
     let capability = laser.capability();
     assert!(!capability.simulated && !capability.gates_fields && !capability.has_heartbeat);
     let heard = bench.heard();
     assert!(heard[0].contains("?VR006401"), "the device type before anything else: {heard:?}");
 
-    let refused = laser.arm(monotonic_now()).unwrap_err();
+    let refused = laser.arm(host_now()).unwrap_err();
     assert!(matches!(refused, LaserError::Refused { refusal: Refusal::NotProgrammed, .. }), "{refused}");
-    laser.program(&program(GREEN), monotonic_now()).unwrap();
+    laser.program(&program(GREEN), host_now()).unwrap();
     let on = |bench: &Bench| bench.with(|device| [1, 2, 3].map(|instance| device.values[&(7006, instance)]));
     assert_eq!(on(&bench), [0, 0, 0]);
     // 1 mW of 20 mW.
     assert_eq!(bench.with(|device| f32::from_bits(device.values[&(7013, 2)])), 5.0);
-    laser.arm(monotonic_now()).unwrap();
+    laser.arm(host_now()).unwrap();
     let events = alive_until(laser.as_mut(), || on(&bench) == [0, 1, 0]);
     assert!(
         events.iter().all(|event| matches!(event, BoxEvent::Armed { .. })),
         "no edges of single fields: {events:?}"
     );
-    laser.dark(DarkReason::Shutdown, monotonic_now()).unwrap();
+    laser.dark(DarkReason::Shutdown, host_now()).unwrap();
     assert_eq!(on(&bench), [0, 0, 0]);
 
     // It is somebody else's in the eyes of a second program, but anybody may put it out.
-    let in_use = open_laser(&lasers(driver.clone()), monotonic_now).err().unwrap();
+    let in_use = open_laser(&lasers(driver.clone()), host_now).err().unwrap();
     assert!(matches!(in_use, LaserError::InUse { .. }), "{in_use}");
-    laser.arm(monotonic_now()).unwrap();
+    laser.arm(host_now()).unwrap();
     alive_until(laser.as_mut(), || on(&bench) == [0, 1, 0]);
     drop(laser);
     assert_eq!(on(&bench), [0, 0, 0], "put out before its port is closed");
     bench.with(|device| device.values.insert((7006, 3), 1));
-    make_dark(&driver, monotonic_now).unwrap();
+    make_dark(&driver, host_now).unwrap();
     assert_eq!(on(&bench), [0, 0, 0]);
 }
 
@@ -268,16 +267,16 @@ fn another_device_on_the_port_is_refused_before_anything_is_set() {
         [(ready_beam(1089), "1089"), (Bench::plug_in(b'\r', |_, _| b"P1,1,1000,L,3.1,0.9*00\r\n".to_vec()), "P1,1")]
     {
         let driver = LaserDriver::ReadyBeam { path: bench.path.clone(), full_power_uw: PerColour([1000; 3]) };
-        let error = open_laser(&lasers(driver), monotonic_now).err().unwrap();
+        let error = open_laser(&lasers(driver), host_now).err().unwrap();
         assert!(matches!(&error, LaserError::NotABox { found: text, .. } if text.contains(found)), "{error}");
         assert!(bench.heard().iter().all(|frame| frame.contains("?VR")), "reads only: {:?}", bench.heard());
     }
     let bench = ready_beam(1171);
-    let error = open_laser(&lasers(text_lasers("cobolt", [None, Some(&bench), None])), monotonic_now).err().unwrap();
+    let error = open_laser(&lasers(text_lasers("cobolt", [None, Some(&bench), None])), host_now).err().unwrap();
     assert!(matches!(error, LaserError::NoAnswer { .. }), "{error}");
     assert_eq!(bench.heard(), ["sn?"]);
     let bench = cobolt();
-    let error = open_laser(&lasers(text_lasers("coherent-obis", [Some(&bench), None, None])), monotonic_now).err();
+    let error = open_laser(&lasers(text_lasers("coherent-obis", [Some(&bench), None, None])), host_now).err();
     let error = error.unwrap();
     assert!(matches!(&error, LaserError::NoAnswer { .. } | LaserError::NotABox { .. }), "{error}");
     assert!(bench.heard().iter().all(|line| line == "*IDN?"), "{:?}", bench.heard());
@@ -287,19 +286,19 @@ fn another_device_on_the_port_is_refused_before_anything_is_set() {
 fn text_lasers_are_recognised_put_out_set_lit_and_put_out() {
     for (name, bench) in [("cobolt", cobolt()), ("coherent-obis", obis())] {
         let driver = text_lasers(name, [None, Some(&bench), None]);
-        let mut laser = open_laser(&lasers(driver.clone()), monotonic_now).unwrap();
+        let mut laser = open_laser(&lasers(driver.clone()), host_now).unwrap();
         assert!(!bench.with(|device| device.lit), "{name}: out from the first moment on");
-        laser.program(&program(GREEN), monotonic_now()).unwrap();
+        laser.program(&program(GREEN), host_now()).unwrap();
         assert_eq!(bench.with(|device| device.power_w.clone()), "0.001000", "{name}");
-        laser.arm(monotonic_now()).unwrap();
+        laser.arm(host_now()).unwrap();
         alive_until(laser.as_mut(), || bench.with(|device| device.lit));
-        laser.dark(DarkReason::Asked, monotonic_now()).unwrap();
+        laser.dark(DarkReason::Asked, host_now()).unwrap();
         assert!(!bench.with(|device| device.lit), "{name}");
 
-        let missing = laser.program(&program(PanelMode::Monochrome(Colour::Red)), monotonic_now()).unwrap_err();
+        let missing = laser.program(&program(PanelMode::Monochrome(Colour::Red)), host_now()).unwrap_err();
         assert!(matches!(missing, LaserError::NoLaser { colour: Colour::Red }), "{missing}");
         bench.with(|device| device.lit = true);
-        make_dark(&driver, monotonic_now).unwrap();
+        make_dark(&driver, host_now).unwrap();
         assert!(!bench.with(|device| device.lit), "{name}");
     }
 }
@@ -308,37 +307,37 @@ fn text_lasers_are_recognised_put_out_set_lit_and_put_out() {
 fn lasers_that_cannot_gate_fields_light_several_colours_only_where_the_panel_gates_them() {
     let benches = [cobolt(), cobolt(), cobolt()];
     let driver = text_lasers("cobolt", [Some(&benches[0]), Some(&benches[1]), Some(&benches[2])]);
-    let mut laser = open_laser(&lasers(driver.clone()), monotonic_now).unwrap();
+    let mut laser = open_laser(&lasers(driver.clone()), host_now).unwrap();
     for mode in [PanelMode::ChannelPacked, PanelMode::FieldSequential] {
-        let refused = laser.program(&program(mode), monotonic_now()).unwrap_err();
+        let refused = laser.program(&program(mode), host_now()).unwrap_err();
         assert!(matches!(refused, LaserError::CannotGate), "{refused}");
-        assert!(laser.arm(monotonic_now()).is_err());
+        assert!(laser.arm(host_now()).is_err());
     }
     drop(laser);
     let gated = Lasers { gated_by_panel: true, ..lasers(driver.clone()) };
-    let mut laser = open_laser(&gated, monotonic_now).unwrap();
-    laser.program(&program(PanelMode::ChannelPacked), monotonic_now()).unwrap();
-    laser.arm(monotonic_now()).unwrap();
+    let mut laser = open_laser(&gated, host_now).unwrap();
+    laser.program(&program(PanelMode::ChannelPacked), host_now()).unwrap();
+    laser.arm(host_now()).unwrap();
     alive_until(laser.as_mut(), || benches.iter().all(|bench| bench.with(|device| device.lit)));
     drop(laser);
     let unaccepted = Lasers { accept_no_heartbeat: false, ..gated };
     let heard = benches[0].heard().len();
-    assert!(matches!(open_laser(&unaccepted, monotonic_now).err(), Some(LaserError::NotAccepted)));
+    assert!(matches!(open_laser(&unaccepted, host_now).err(), Some(LaserError::NotAccepted)));
     assert_eq!(benches[0].heard().len(), heard, "not even opened");
 }
 
 #[test]
 fn a_host_that_falls_silent_and_a_laser_that_complains_end_in_darkness() {
     let bench = cobolt();
-    let mut laser = open_laser(&lasers(text_lasers("cobolt", [None, Some(&bench), None])), monotonic_now).unwrap();
-    laser.program(&program(GREEN), monotonic_now()).unwrap();
-    laser.arm(monotonic_now()).unwrap();
+    let mut laser = open_laser(&lasers(text_lasers("cobolt", [None, Some(&bench), None])), host_now).unwrap();
+    laser.program(&program(GREEN), host_now()).unwrap();
+    laser.arm(host_now()).unwrap();
     alive_until(laser.as_mut(), || bench.with(|device| device.lit));
     // No heartbeat any more.
     let mut dark = None;
     eventually("darkness", || {
         laser
-            .poll(monotonic_now(), &mut |event| {
+            .poll(host_now(), &mut |event| {
                 if let BoxEvent::Dark { reason, .. } = event {
                     dark = Some(reason);
                 }
@@ -349,33 +348,33 @@ fn a_host_that_falls_silent_and_a_laser_that_complains_end_in_darkness() {
     assert_eq!(dark, Some(DarkReason::Heartbeat));
     assert!(!bench.with(|device| device.lit));
 
-    laser.arm(monotonic_now()).unwrap();
+    laser.arm(host_now()).unwrap();
     alive_until(laser.as_mut(), || bench.with(|device| device.lit));
     let watch = laser.watch().unwrap();
     bench.with(|device| device.interlock = "1");
     eventually("the interlock", || {
-        let _lost = laser.heartbeat(monotonic_now());
-        let _lost = laser.poll(monotonic_now(), &mut |_| ());
+        let _lost = laser.heartbeat(host_now());
+        let _lost = laser.poll(host_now(), &mut |_| ());
         watch.trouble().is_some_and(|trouble| trouble.contains("ilk?") && trouble.contains("interlock"))
     });
     eventually("darkness", || !bench.with(|device| device.lit));
     bench.with(|device| device.interlock = "0");
     eventually("the laser", || {
-        laser.poll(monotonic_now(), &mut |_| ()).unwrap();
-        laser.arm(monotonic_now()).is_ok()
+        laser.poll(host_now(), &mut |_| ()).unwrap();
+        laser.arm(host_now()).is_ok()
     });
     alive_until(laser.as_mut(), || bench.with(|device| device.lit));
     bench.with(|device| device.mute = true);
-    let unheard = laser.dark(DarkReason::Shutdown, monotonic_now()).unwrap_err();
+    let unheard = laser.dark(DarkReason::Shutdown, host_now()).unwrap_err();
     assert!(matches!(unheard, LaserError::Lost), "no acknowledgement: {unheard}");
 }
 
 #[test]
 fn a_laser_that_does_not_hear_that_it_must_go_out_is_told_again_beside_a_host_that_hangs() {
     let bench = cobolt();
-    let mut laser = open_laser(&lasers(text_lasers("cobolt", [None, Some(&bench), None])), monotonic_now).unwrap();
-    laser.program(&program(GREEN), monotonic_now()).unwrap();
-    laser.arm(monotonic_now()).unwrap();
+    let mut laser = open_laser(&lasers(text_lasers("cobolt", [None, Some(&bench), None])), host_now).unwrap();
+    laser.program(&program(GREEN), host_now()).unwrap();
+    laser.arm(host_now()).unwrap();
     alive_until(laser.as_mut(), || bench.with(|device| device.lit));
     bench.with(|device| device.deaf_to_off = 3);
     // The host neither polls nor sends heartbeats from here on.
@@ -388,7 +387,7 @@ fn a_ready_beam_of_which_one_colour_does_not_obey_is_dark_in_the_others() {
     let bench = ready_beam(1171);
     let driver = LaserDriver::ReadyBeam { path: bench.path.clone(), full_power_uw: PerColour([40_000; 3]) };
     bench.with(|device| device.refused = Some((7006, 1)));
-    let error = make_dark(&driver, monotonic_now).unwrap_err();
+    let error = make_dark(&driver, host_now).unwrap_err();
     assert!(matches!(error, LaserError::Complaint { .. }), "{error}");
     assert_eq!(bench.with(|device| [1, 2, 3].map(|instance| device.values[&(7006, instance)])), [1, 0, 0]);
 }

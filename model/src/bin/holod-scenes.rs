@@ -12,6 +12,7 @@ use holod_calibration::{DisplayGeometry, Resolution};
 use holod_model::gpu::GpuError;
 use holod_model::scene_renderer::shard::{Outcome, PlanePlan, PlannedScene, Preview, PupilPlan, ShardError, ShardPlan};
 use holod_model::scene_renderer::{SceneKind, Tracer};
+use holod_model::srgb8;
 use indicatif::{ProgressBar, ProgressStyle};
 
 /// Random scenes and their thin-lens focal stacks.
@@ -423,19 +424,13 @@ fn contact_sheet(previews: &[Preview]) -> image::RgbImage {
                 sheet.put_pixel(x, y, image::Rgb(colour(pixel)));
             }
         };
-        let coloured = |image: &[f32], pixel: usize| [0, 1, 2].map(|c| srgb_level(image[c * pixels + pixel]));
+        let coloured = |image: &[f32], pixel: usize| [0, 1, 2].map(|c| srgb8(image[c * pixels + pixel]));
         put(0, &|pixel| coloured(&preview.image, pixel));
         put(1, &|pixel| [(preview.depth[pixel] * 255.0) as u8; 3]);
         put(2, &|pixel| coloured(&preview.focused_far, pixel));
         put(3, &|pixel| coloured(&preview.focused_near, pixel));
     }
     sheet
-}
-
-fn srgb_level(linear: f32) -> u8 {
-    let linear = linear.clamp(0.0, 1.0);
-    let encoded = if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 };
-    (encoded * 255.0).round() as u8
 }
 
 /// Writes beside and renames.

@@ -77,6 +77,7 @@ impl Dense {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::worst::worst;
 
     const SLOPE: f32 = 0.1;
 
@@ -98,14 +99,14 @@ mod tests {
     }
 
     /// The largest difference between `found` and what the definition gives for a hidden value.
-    fn largest_difference(found: &OffsetParameters<'_>, hidden: f32) -> f32 {
+    fn largest_difference(found: &OffsetParameters<'_>, hidden: f32) -> f64 {
         let of_place = |place: usize| place as f32 * hidden + 0.25;
         let weight = found.weight.iter().enumerate();
         let weight = weight.map(|(index, weight)| weight - index as f32 * (1.0 + of_place(index / 9)));
         let bias = found.bias.iter().enumerate();
         let bias = bias.map(|(output, bias)| bias - (of_place(OFFSET_CHANNELS * 2 + output) - output as f32));
         assert_eq!((weight.len(), bias.len()), (OFFSET_CHANNELS * 2 * 9, OFFSET_CHANNELS));
-        weight.chain(bias).fold(0.0, |largest, difference| largest.max(difference.abs()))
+        worst(weight.chain(bias).map(f32::abs))
     }
 
     #[test]

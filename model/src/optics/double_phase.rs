@@ -418,6 +418,7 @@ mod tests {
 
     use super::*;
     use crate::optics::{Eye, SimulatedEye};
+    use crate::worst::worst;
 
     const SMALL: Resolution = Resolution { width: 4, height: 3 };
 
@@ -526,9 +527,7 @@ mod tests {
     fn worst_phasor(found_rad: &[f32], expected: &[Complex64]) -> f64 {
         assert_eq!(found_rad.len(), expected.len());
         let judged = found_rad.iter().zip(expected).filter(|(_, expected)| expected.norm() > 0.05);
-        let distances =
-            judged.map(|(&phase, expected)| (Complex64::cis(phase.into()) - expected / expected.norm()).norm());
-        distances.fold(0.0, |worst, value| if value.is_nan() { f64::INFINITY } else { worst.max(value) })
+        worst(judged.map(|(&phase, expected)| (Complex64::cis(phase.into()) - expected / expected.norm()).norm()))
     }
 
     #[test]

@@ -211,6 +211,7 @@ pub(crate) fn signed_bin(bin: usize, bins: usize) -> isize {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::worst::worst;
     use proptest::prelude::*;
 
     /// The definition of the transform, term by term.
@@ -226,7 +227,7 @@ mod tests {
     }
 
     fn largest_difference(a: &[Complex<f64>], b: &[Complex<f64>]) -> f64 {
-        a.iter().zip(b).map(|(a, b)| (a - b).norm()).fold(0.0, f64::max)
+        worst(a.iter().zip(b).map(|(a, b)| (a - b).norm()))
     }
 
     proptest! {
@@ -289,7 +290,7 @@ mod tests {
             fft.give(index, &mut found);
             let difference = |found: &[Complex<f32>]| {
                 let differences = found.iter().zip(&expected).map(|(a, b)| (a - b).norm());
-                differences.fold(0.0, |worst: f32, value| if value.is_nan() { f32::INFINITY } else { worst.max(value) })
+                worst(differences)
             };
             assert!(difference(&found) < 1e-3, "plane {index}: {}", difference(&found));
             found[17].im += 2e-3;

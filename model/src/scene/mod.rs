@@ -18,6 +18,7 @@
 //! pixels outside the data window have no depth and are filled from their surroundings.
 
 mod array;
+mod decoded;
 mod depth;
 mod description;
 mod error;
@@ -35,9 +36,9 @@ use self::description::Description;
 use self::fit::Placement;
 
 pub use self::array::{ArrayColours, ArrayDepths, ArrayError, ArrayPicture};
+pub use self::decoded::MOST_PIXELS;
 pub use self::error::SceneError;
 pub use self::live::{LiveColour, LiveDepth, LiveError, LiveFormat, LivePart, LiveReader};
-pub use self::raster::MOST_PIXELS;
 
 /// Normalised depths this little outside 0..=1 are rounding, not clamping.
 const ROUNDING: f32 = 1e-5;

@@ -12,8 +12,8 @@ use exr::prelude::{ReadChannels, ReadLayers};
 use holod_calibration::Resolution;
 
 use super::SceneError;
+use super::decoded::{ColourRaster, DepthRaster, FORMATS, MOST_PIXELS, check_size};
 use super::depth::DepthNumbers;
-use super::raster::{ColourRaster, DepthRaster, FORMATS, MOST_PIXELS, check_size};
 
 /// A decoded file.
 struct Picture {

@@ -7,29 +7,10 @@ use std::path::Path;
 use holod_calibration::Resolution;
 use image::{DynamicImage, ImageFormat, ImageReader};
 
+use super::decoded::{ColourRaster, DepthRaster, FORMATS, check_size};
 use super::depth::DepthNumbers;
 use super::{SceneError, openexr};
 use crate::picture::srgb_to_linear;
-
-/// More pixels than an 8K frame are refused before anything is allocated for them.
-pub const MOST_PIXELS: usize = 7680 * 4320;
-/// What is read, for errors.
-pub(super) const FORMATS: &str = "an 8- or 16-bit PNG, a JPEG or an OpenEXR picture";
-
-/// A colour picture in linear light.
-pub(super) struct ColourRaster {
-    pub(super) size: Resolution,
-    /// [3, height, width], 0..=1
-    pub(super) linear: Vec<f32>,
-    /// Pixels of which some colour was above 1, below 0 or not finite.
-    pub(super) clipped_px: usize,
-}
-
-/// A depth picture.
-pub(super) struct DepthRaster {
-    pub(super) size: Resolution,
-    pub(super) numbers: DepthNumbers,
-}
 
 /// What kind of file a path holds, by its first bytes.
 enum Format {
@@ -59,19 +40,6 @@ pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
             Ok(DepthRaster { size, numbers: depth_numbers(path, picture)? })
         }
     }
-}
-
-/// Checks a picture's claimed size before memory is spent on it.
-pub(super) fn check_size(path: &Path, width: usize, height: usize) -> Result<Resolution, SceneError> {
-    let size = Resolution { width, height };
-    if width == 0 || height == 0 || width.checked_mul(height).is_none_or(|pixels| pixels > MOST_PIXELS) {
-        return Err(SceneError::Picture {
-            path: path.to_owned(),
-            found: format!("a picture of {size}"),
-            expected: format!("at least one pixel and at most {MOST_PIXELS}, as many as 7680x4320"),
-        });
-    }
-    Ok(size)
 }
 
 fn format_of(path: &Path) -> Result<Format, SceneError> {

@@ -5,44 +5,11 @@ use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
 use super::SceneKind;
 use super::families::{bright_and_dark, colour, marks, pattern};
 use super::random::{Random, hash_unit, mix};
+use super::stage::{Reach, Stage};
 use super::surface::{Bounds, Paint, Shape, Surface};
 use super::texture::{Pattern, blend};
 use super::thin_lens::{Lens, mean_light};
 use super::{meshes, rooms, shadow};
-
-/// Room for the outermost rays of the widest pupil for which a scene is laid out.
-#[derive(Clone, Copy)]
-pub(super) struct Reach {
-    /// Surfaces reach this far beyond the picture, so that rays never miss the background.
-    pub(super) overscan_px: f32,
-    /// Steepest plane, in dioptres per pixel: beyond it an aperture ray could meet the plane from behind.
-    steepest: f32,
-    /// The same for walls and grounds.
-    pub(super) steepest_wall: f32,
-}
-
-impl Reach {
-    /// For pupils of up to 8 mm on the default bench, whose outermost ray goes 20 px a dioptre.
-    pub(super) const USUAL: Self = Self { overscan_px: 60.0, steepest: 0.03, steepest_wall: 0.045 };
-
-    /// For a pupil of so many pixels of radius a dioptre: the usual where that is enough.
-    fn of_radius(radius_px_per_dpt: f32) -> Self {
-        let wider = (radius_px_per_dpt / 20.0).max(1.0);
-        let Self { overscan_px, steepest, steepest_wall } = Self::USUAL;
-        Self { overscan_px: overscan_px * wider, steepest: steepest / wider, steepest_wall: steepest_wall / wider }
-    }
-}
-
-/// The picture's extent and the size that random lengths scale with.
-pub(super) struct Stage {
-    pub(super) half_width: f32,
-    pub(super) half_height: f32,
-    /// 1 for a picture of 256 by 256 pixels. Half of what a larger picture gains is larger objects, half is more of them.
-    scale: f32,
-    pub(super) near: f32,
-    pub(super) kind: SceneKind,
-    pub(super) reach: Reach,
-}
 
 /// A random scene: a background or a room, cards with print, and 15 to 40 primitives, more in a picture larger than 256
 /// by 256 pixels.

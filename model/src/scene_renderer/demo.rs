@@ -2,7 +2,8 @@
 
 use holod_calibration::Resolution;
 
-use super::compose::{Reach, Slope};
+use super::compose::Slope;
+use super::stage::Reach;
 use super::surface::{Bounds, Paint, Shape, Surface};
 use super::texture::{Pattern, Rgb, fractal_noise};
 

@@ -10,6 +10,7 @@ mod families;
 mod glyphs;
 #[cfg(feature = "gpu")]
 mod gpu;
+mod grid;
 mod meshes;
 mod noise;
 mod points;
@@ -17,6 +18,7 @@ mod random;
 mod rooms;
 mod shadow;
 pub mod shard;
+mod stage;
 mod surface;
 #[cfg(test)]
 mod tests;

@@ -1,8 +1,8 @@
 //! A room in true perspective: a back wall, and side walls, floor and ceiling that run from it to the viewer.
 
-use super::compose::Stage;
 use super::families::pattern;
 use super::random::Random;
+use super::stage::Stage;
 use super::surface::{Bounds, Shape, Surface};
 use super::texture::{Pattern, Rgb, blend};
 

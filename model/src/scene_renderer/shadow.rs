@@ -1,8 +1,9 @@
 //! Soft shadows, baked: each surface darkens what lies behind it, the more blurred the farther that is.
 
+use super::grid::Grid;
 use super::random::Random;
 use super::surface::{Shape, Surface};
-use super::view::{Aim, Grid, View};
+use super::view::{Aim, View};
 
 /// A blurred silhouette, displaced by where the light comes from.
 struct Shadow {

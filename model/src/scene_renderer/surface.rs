@@ -4,8 +4,8 @@
 //! the aperture point a (in pixels per dioptre: metres over the angle of a pixel) that meets the focus plane F at
 //! (x_F, y_F) passes depth D at x_F + a_x·(D − F), y_F + a_y·(D − F). Planes of the world stay planes.
 
+use super::grid::Grid;
 use super::texture::{Pattern, Rgb};
-use super::view::Grid;
 
 /// Texels in a pixel's width.
 pub(super) const TEXELS_PER_PIXEL: f32 = 2.0;

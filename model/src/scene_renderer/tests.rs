@@ -4,9 +4,10 @@ use holod_calibration::{Metres, PerColour};
 use proptest::prelude::*;
 
 use super::families::Family;
+use super::grid::Grid;
 use super::shard::{Outcome, PlanePlan, PlannedScene, Preview, PupilPlan, ShardError, ShardPlan, file_name};
 use super::surface::{Bounds, Mesh, Ray, Shape, Vertex};
-use super::view::{Aim, Grid, View, nearest_first};
+use super::view::{Aim, View, nearest_first};
 use super::*;
 
 const SIZE: Resolution = Resolution { width: 96, height: 96 };

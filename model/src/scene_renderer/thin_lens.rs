@@ -17,10 +17,11 @@ use std::convert::Infallible;
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 use rayon::prelude::*;
 
+use super::grid::Grid;
 use super::points::{ViewPoint, view_points};
 use super::random::mix;
 use super::surface::Surface;
-use super::view::{Aim, Grid, View, nearest_first};
+use super::view::{Aim, View, nearest_first};
 
 /// Views that exist at once on the processor, unless there are more threads.
 const VIEWS_AT_ONCE: usize = 8;

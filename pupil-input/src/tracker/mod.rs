@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use holod_calibration::{TimeNs, rig};
+use holod_calibration::{TimeNs, host_now, rig};
 
 use self::job::Job;
 use self::worker::Worker;
@@ -22,12 +22,6 @@ use crate::record::{self, Header, RecordError, RecordFiles, RecordStatus, Record
 use crate::simulate::ScriptError;
 use crate::source::SourceError;
 use crate::spec::TrackerSpec;
-
-/// The host's monotonic clock: the one place where it is read.
-pub fn host_now() -> TimeNs {
-    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
-    TimeNs(now.tv_sec * 1_000_000_000 + now.tv_nsec)
-}
 
 /// Why a tracker could not be started.
 #[derive(Debug, thiserror::Error)]

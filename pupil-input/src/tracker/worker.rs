@@ -5,10 +5,10 @@ use std::sync::atomic::Ordering;
 use std::thread;
 use std::time::Duration;
 
-use holod_calibration::TimeNs;
+use holod_calibration::{TimeNs, host_now};
 
 use super::job::{Job, Play};
-use super::{Link, Shared, host_now};
+use super::{Link, Shared};
 use crate::PupilSample;
 use crate::counters::Counter;
 use crate::estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, StreamClock};

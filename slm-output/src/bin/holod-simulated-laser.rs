@@ -11,9 +11,8 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use holod_calibration::TimeNs;
+use holod_calibration::{TimeNs, host_now};
 use holod_slm_output::laser::simulator::{Faults, SimulatedBox, SimulatedTerminal};
-use holod_slm_output::output::monotonic_now;
 
 const USAGE: &str = "usage: holod-simulated-laser LOG [OPTION...]
 
@@ -56,7 +55,7 @@ struct Options {
 
 fn options(mut arguments: impl Iterator<Item = String>) -> io::Result<Options> {
     let mut log = None;
-    let mut simulated = SimulatedBox::new(monotonic_now());
+    let mut simulated = SimulatedBox::new(host_now());
     let mut sync_hz = 0.0;
     while let Some(argument) = arguments.next() {
         let mut value = || arguments.next().ok_or_else(|| wrong(format_args!("{argument}: a value is missing")));
@@ -83,7 +82,7 @@ fn hertz(text: &str) -> io::Result<f64> {
 
 fn set_sync(faults: &Faults, hz: f64) {
     let period_ns = if hz > 0.0 { (1e9 / hz) as i64 } else { 0 };
-    faults.set_sync(monotonic_now(), TimeNs(period_ns));
+    faults.set_sync(host_now(), TimeNs(period_ns));
 }
 
 fn run() -> io::Result<()> {
@@ -97,7 +96,7 @@ fn run() -> io::Result<()> {
     set_sync(&faults, sync_hz);
     let its_faults = Arc::clone(&faults);
     std::thread::spawn(move || {
-        let ended = terminal.serve(simulated, log, &its_faults, monotonic_now);
+        let ended = terminal.serve(simulated, log, &its_faults, host_now);
         let _nobody_reads = writeln!(io::stderr(), "holod-simulated-laser: {ended:?}");
     });
     for line in io::stdin().lock().lines() {

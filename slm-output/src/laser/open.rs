@@ -1,8 +1,9 @@
 //! The laser box that a rig names.
 
+use holod_calibration::TimeNs;
 use holod_calibration::rig::{LaserDriver, Lasers};
-use holod_calibration::{PerColour, TimeNs};
 
+use super::program::power_limit_uw;
 use super::reconnect::Reconnecting;
 use super::{DarkReason, LaserBox, LaserError, SerialBox, SerialOptions, SimulatedLaser, ready_beam, text_laser};
 
@@ -33,11 +34,6 @@ fn open_once(lasers: &Lasers, clock: fn() -> TimeNs) -> Result<Box<dyn LaserBox>
 
 fn serial_options(lasers: &Lasers, sync_wire: bool) -> SerialOptions {
     SerialOptions { sync_wire, power_limit_uw: power_limit_uw(lasers) }
-}
-
-/// The rig's power limits in microwatts, rounded down.
-pub(super) fn power_limit_uw(lasers: &Lasers) -> PerColour<u32> {
-    lasers.power_limit_mw.map(|mw| (mw * 1e3 + 1e-6) as u32)
 }
 
 /// Makes the lasers of a bench dark, whoever else has their ports open, and waits for their acknowledgement. All are

@@ -17,7 +17,7 @@ use rtrb::{Consumer, Producer, RingBuffer};
 use serialport::TTYPort;
 
 use super::line_link::{Sharing, open_port};
-use super::open::power_limit_uw;
+use super::program::power_limit_uw;
 use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow};
 
 /// How often a device is asked whether it is still there and healthy.

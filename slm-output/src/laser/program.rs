@@ -1,9 +1,15 @@
 //! A program as the commands that set it.
 
+use holod_calibration::rig::Lasers;
 use holod_calibration::{Colour, PerColour, TimeNs};
 use holod_laser_firmware::{Command, Laser, Sequence, TimeUs, Trigger, Window};
 
 use super::{LaserError, LaserProgram};
+
+/// The rig's power limits in microwatts, rounded down.
+pub(super) fn power_limit_uw(lasers: &Lasers) -> PerColour<u32> {
+    lasers.power_limit_mw.map(|mw| (mw * 1e3 + 1e-6) as u32)
+}
 
 /// The laser of a colour.
 pub(super) const fn laser_of(colour: Colour) -> Laser {

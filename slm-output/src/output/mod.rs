@@ -46,12 +46,6 @@ use crate::schedule::{Evidence, FieldScheduler, Gate};
 /// A monotonic clock. The threads read it; nothing below them does.
 pub type Clock = fn() -> TimeNs;
 
-/// The system's monotonic clock, which a simulated laser box in another process shares.
-pub fn monotonic_now() -> TimeNs {
-    let now = rustix::time::clock_gettime(rustix::time::ClockId::Monotonic);
-    TimeNs(now.tv_sec * 1_000_000_000 + now.tv_nsec)
-}
-
 /// Refreshes on their way to the laser thread, and reports on their way to the frame thread.
 const SHORT_RING: usize = 256;
 /// Events on their way to whoever records them: some 20 s of fields at 180 Hz.

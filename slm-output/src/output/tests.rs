@@ -4,7 +4,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use holod_calibration::rig::{Panel, PanelMode};
-use holod_calibration::{Colour, PerColour, Resolution};
+use holod_calibration::{Colour, PerColour, Resolution, host_now};
 use proptest::prelude::*;
 use rtrb::Producer;
 
@@ -36,9 +36,9 @@ fn rig(mode: PanelMode) -> Rig {
 }
 
 fn headless(rig: &Rig, encoder: &PanelEncoder, options: OutputOptions) -> Output {
-    let panel = HeadlessPanel::new(&PanelSetup::new(&rig.panel, encoder), monotonic_now(), ReportFaults::NONE);
-    let laser = Box::new(SimulatedLaser::new(monotonic_now()));
-    Output::start(rig, encoder, Box::new(panel), laser, options, monotonic_now).unwrap()
+    let panel = HeadlessPanel::new(&PanelSetup::new(&rig.panel, encoder), host_now(), ReportFaults::NONE);
+    let laser = Box::new(SimulatedLaser::new(host_now()));
+    Output::start(rig, encoder, Box::new(panel), laser, options, host_now).unwrap()
 }
 
 /// The panel and the laser thread's work, in a time of its own.
@@ -454,17 +454,17 @@ fn the_real_threads_show_light_and_end_in_order() {
         let options = OutputOptions { keep_slots: 1, ..OutputOptions::default() };
         let mut output = headless(&rig, &encoder, options);
         let config = pacing_config(&rig, TimeNs(2 * MS)).unwrap();
-        let mut pacer = Pacer::new(config, monotonic_now());
+        let mut pacer = Pacer::new(config, host_now());
         let pattern = vec![1.0f32; SIZE.pixels()];
         let mut last_plan = None;
         let mut reports = 0;
         for frame in 0..30 {
             output.frames.feed(&mut pacer, |_| reports += 1);
-            let plan = pacer.predict(monotonic_now());
-            let rest = plan.t_wake - monotonic_now();
+            let plan = pacer.predict(host_now());
+            let rest = plan.t_wake - host_now();
             std::thread::sleep(Duration::from_nanos(rest.0.max(0) as u64));
             encoder.encode(PerColour([&pattern; 3]), output.frames.acquire());
-            let now = monotonic_now();
+            let now = host_now();
             output.frames.submit(&plan, Some(0), now);
             pacer.mark(crate::pacing::Point::Submit, plan.frame_id, now);
             last_plan = Some(plan);
@@ -506,11 +506,11 @@ fn darkness_that_is_asked_for_is_acknowledged_each_time_or_said_not_to_be() {
     let output = headless(&rig, &encoder, OutputOptions::default());
     assert!(output.control.keep_dark(true) && output.control.keep_dark(true) && output.control.keep_dark(false));
     // A box that fails is not dark because nothing new is heard of it.
-    let panel = HeadlessPanel::new(&PanelSetup::new(&rig.panel, &encoder), monotonic_now(), ReportFaults::NONE);
+    let panel = HeadlessPanel::new(&PanelSetup::new(&rig.panel, &encoder), host_now(), ReportFaults::NONE);
     let fails = Arc::new(AtomicBool::new(false));
-    let laser = Faulty { inner: SimulatedLaser::new(monotonic_now()), fails: Arc::clone(&fails) };
+    let laser = Faulty { inner: SimulatedLaser::new(host_now()), fails: Arc::clone(&fails) };
     let options = OutputOptions::default();
-    let failing = Output::start(&rig, &encoder, Box::new(panel), Box::new(laser), options, monotonic_now).unwrap();
+    let failing = Output::start(&rig, &encoder, Box::new(panel), Box::new(laser), options, host_now).unwrap();
     fails.store(true, Ordering::Relaxed);
     assert!(!failing.control.keep_dark(true) && !failing.control.keep_dark(true));
     fails.store(false, Ordering::Relaxed);

@@ -6,6 +6,7 @@
 pub mod drm;
 mod headless;
 mod look;
+mod open;
 mod recorder;
 mod spec;
 #[cfg(feature = "window")]
@@ -14,6 +15,7 @@ pub mod window;
 pub use headless::{HeadlessPanel, ReportFaults};
 pub use look::PanelLook;
 pub(crate) use look::look;
+pub use open::{OpenError, open_panel};
 pub use recorder::Recorder;
 pub use spec::{OutputSpec, SpecError, WindowSpec};
 
@@ -189,45 +191,6 @@ impl PanelSetup {
         encoder.encode_flat(&mut flat);
         Self { panel: panel.clone(), flat }
     }
-}
-
-/// Why a panel could not be opened.
-#[derive(Debug, thiserror::Error)]
-pub enum OpenError {
-    /// The figures of a virtual panel.
-    #[error(transparent)]
-    Spec(#[from] SpecError),
-    /// A connector of a graphics card.
-    #[error(transparent)]
-    Drm(#[from] drm::DrmError),
-    /// The panel's window.
-    #[cfg(feature = "window")]
-    #[error("--output window: {0}")]
-    Window(#[from] window::WindowError),
-    /// The program holds no code for it.
-    #[error("this program was built without --output {kind}; build it with `--features {kind}`")]
-    NotBuilt {
-        /// The presenter, which is also the feature's name.
-        kind: &'static str,
-    },
-}
-
-/// Opens the panel that `spec` names.
-///
-/// # Errors
-/// [`OpenError`]: there is no such panel, it is not the one that the rig describes, or it may not be opened.
-pub fn open_panel(spec: &OutputSpec, setup: &PanelSetup, now: TimeNs) -> Result<Box<dyn Presenter>, OpenError> {
-    Ok(match spec {
-        OutputSpec::Headless(faults) => Box::new(HeadlessPanel::new(setup, now, *faults)),
-        OutputSpec::Drm(target) => Box::new(drm::DrmPanel::open(target, setup)?),
-        #[cfg(feature = "window")]
-        OutputSpec::Window(spec) => {
-            let server = window::DisplayServer::from_environment()?;
-            Box::new(window::WindowPanel::open(server, window::Road::best(), spec, setup)?)
-        }
-        #[cfg(not(feature = "window"))]
-        OutputSpec::Window(_) => return Err(OpenError::NotBuilt { kind: "window" }),
-    })
 }
 
 /// The way of frames to the panel: three buffers, of which the newest complete one is shown; wait-free at both ends.

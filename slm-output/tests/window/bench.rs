@@ -4,9 +4,8 @@ use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
 use holod_calibration::rig::{Panel, PanelMode, Rig};
-use holod_calibration::{Colour, Resolution, TimeNs};
+use holod_calibration::{Colour, Resolution, TimeNs, host_now};
 use holod_slm_output::fields::FrameTag;
-use holod_slm_output::output::monotonic_now;
 use holod_slm_output::present::window::{DisplayServer, Road, WindowError, WindowPanel};
 use holod_slm_output::present::{
     FrameSink, FrameSource, PanelFault, PanelSetup, PresentedRefresh, Presenter, WindowSpec, frame_channel,
@@ -62,7 +61,7 @@ impl Bench {
         for colour in Colour::ALL {
             self.sink.acquire().field_mut(colour).write(&levels(self.submitted, colour));
         }
-        let now = monotonic_now();
+        let now = host_now();
         let tag = FrameTag { frame_id: self.submitted, t_submit: now, t_desired_present: now, keep: None };
         self.sink.submit(tag);
         self.submitted
@@ -73,16 +72,16 @@ impl Bench {
         &mut self,
         mut done: impl FnMut(&PresentedRefresh) -> bool,
     ) -> Result<Vec<PresentedRefresh>, PanelFault> {
-        let t_end = monotonic_now() + TimeNs(10_000_000_000);
+        let t_end = host_now() + TimeNs(10_000_000_000);
         let (mut refreshes, mut is_done) = (Vec::new(), false);
         while !is_done {
-            let now = monotonic_now();
+            let now = host_now();
             assert!(now < t_end, "still not done after {} refreshes: {:?}", refreshes.len(), refreshes.last());
             self.panel.tick(now, &mut self.source, &mut |refresh| {
                 is_done |= done(&refresh);
                 refreshes.push(refresh);
             })?;
-            let rest_ns = (self.panel.t_next() - monotonic_now()).0.clamp(0, 20_000_000);
+            let rest_ns = (self.panel.t_next() - host_now()).0.clamp(0, 20_000_000);
             wait(self.panel.wake_fd(), rest_ns);
         }
         Ok(refreshes)
@@ -108,8 +107,8 @@ impl Bench {
     }
 
     pub(crate) fn recover(&mut self) {
-        let recovered = wait_until(|| self.panel.recover(monotonic_now()).is_ok());
-        assert!(recovered, "{:?}", self.panel.recover(monotonic_now()));
+        let recovered = wait_until(|| self.panel.recover(host_now()).is_ok());
+        assert!(recovered, "{:?}", self.panel.recover(host_now()));
     }
 }
 

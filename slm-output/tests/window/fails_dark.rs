@@ -9,11 +9,11 @@ use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
 use holod_calibration::rig::{LaserDriver, PanelMode, Rig};
-use holod_calibration::{PerColour, TimeNs};
+use holod_calibration::{PerColour, TimeNs, host_now};
 use holod_slm_output::laser::edge_log::read_log;
 use holod_slm_output::laser::simulator::{SimulatedBox, SimulatedTerminal};
 use holod_slm_output::laser::{BoxEvent, open_laser};
-use holod_slm_output::output::{Output, OutputOptions, monotonic_now, pacing_config};
+use holod_slm_output::output::{Output, OutputOptions, pacing_config};
 use holod_slm_output::pacing::Pacer;
 use holod_slm_output::present::window::{DisplayServer, Road, WindowPanel};
 use holod_slm_output::present::{FrameSource, PanelFault, PanelSetup, PresentedRefresh, Presenter, Provenance};
@@ -78,34 +78,34 @@ fn dark_after(server: DisplayServer, lasts: bool, strike: impl FnOnce()) -> Time
     rig.lasers.driver = LaserDriver::Serial { path: terminal.path().to_owned(), sync_wire: false };
     let log = File::create(folder.path().join("box.csv")).unwrap();
     std::thread::spawn(move || {
-        terminal.serve(SimulatedBox::new(monotonic_now()), log, &std::sync::Arc::default(), monotonic_now)
+        terminal.serve(SimulatedBox::new(host_now()), log, &std::sync::Arc::default(), host_now)
     });
     let events = || read_log(&fs::read_to_string(folder.path().join("box.csv")).unwrap()).unwrap();
 
     let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
     let setup = PanelSetup::new(&rig.panel, &encoder);
     let window = WindowPanel::open(server, Road::Copies, &named(PANEL), &setup).unwrap();
-    let laser = open_laser(&rig.lasers, monotonic_now).unwrap();
+    let laser = open_laser(&rig.lasers, host_now).unwrap();
     let options = OutputOptions::default();
-    let mut output = Output::start(&rig, &encoder, Box::new(Stamped(window)), laser, options, monotonic_now).unwrap();
-    let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(1_000_000)).unwrap(), monotonic_now());
+    let mut output = Output::start(&rig, &encoder, Box::new(Stamped(window)), laser, options, host_now).unwrap();
+    let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(1_000_000)).unwrap(), host_now());
     let pattern = vec![1.0; SIZE.pixels()];
     let mut frame = || {
         output.frames.feed(&mut pacer, |_| ());
-        let plan = pacer.predict(monotonic_now());
+        let plan = pacer.predict(host_now());
         encoder.encode(PerColour([&pattern; 3]), output.frames.acquire());
-        output.frames.submit(&plan, None, monotonic_now());
+        output.frames.submit(&plan, None, host_now());
         std::thread::sleep(Duration::from_millis(10));
     };
     let is_lit = |event: &&BoxEvent| matches!(event, BoxEvent::Edge(edge) if edge.on);
-    let t_end = monotonic_now() + TimeNs(30_000_000_000);
+    let t_end = host_now() + TimeNs(30_000_000_000);
     while events().iter().filter(is_lit).count() < 60 {
-        assert!(monotonic_now() < t_end, "never lit: {:?} {:?}", output.control.counts(), events().last());
+        assert!(host_now() < t_end, "never lit: {:?} {:?}", output.control.counts(), events().last());
         frame();
     }
-    let t_strike = monotonic_now();
+    let t_strike = host_now();
     strike();
-    while monotonic_now() < t_strike + WATCHED {
+    while host_now() < t_strike + WATCHED {
         frame();
     }
     let events = events();

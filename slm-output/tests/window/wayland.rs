@@ -1,8 +1,7 @@
 //! Under a real Wayland compositor.
 
-use holod_calibration::Colour;
 use holod_calibration::rig::PanelMode;
-use holod_slm_output::output::monotonic_now;
+use holod_calibration::{Colour, host_now};
 use holod_slm_output::present::window::{DisplayServer, Road, WindowError};
 use holod_slm_output::present::{PanelFault, Presenter, WindowSpec};
 
@@ -97,7 +96,7 @@ fn whatever_takes_the_window_off_its_monitor_is_a_fault_that_recovers() {
         let first = bench.fault();
         assert!(first == fault || first == PanelFault::WindowLost, "{attack}: {first}");
         if let Some(mend) = mend {
-            assert_eq!(bench.panel.recover(monotonic_now()), Err(fault), "{attack}: it is not mended yet");
+            assert_eq!(bench.panel.recover(host_now()), Err(fault), "{attack}: it is not mended yet");
             compositor.ask(mend);
         }
         bench.recover();
@@ -115,7 +114,7 @@ fn a_compositor_that_dies_is_a_fault_and_its_successor_gets_the_window() {
     bench.show(frame);
     compositor.kill();
     assert_eq!(bench.fault(), PanelFault::WindowLost);
-    assert!(bench.panel.recover(monotonic_now()).is_err());
+    assert!(bench.panel.recover(host_now()).is_err());
     compositor.restart();
     bench.recover();
     let frame = bench.submit();

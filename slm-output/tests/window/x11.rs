@@ -1,9 +1,8 @@
 //! Under a real X server: what the monitors show, pixel for pixel, and what happens when somebody moves the window, the
 //! monitors or the server.
 
-use holod_calibration::Colour;
 use holod_calibration::rig::PanelMode;
-use holod_slm_output::output::monotonic_now;
+use holod_calibration::{Colour, host_now};
 use holod_slm_output::present::window::{DisplayServer, Road, WindowError};
 use holod_slm_output::present::{PanelFault, Presenter, Provenance, WindowSpec};
 
@@ -297,11 +296,11 @@ fn whatever_takes_the_window_off_its_monitor(road: Road) {
         // While monitors change, windows come and go: that may be what is seen first.
         let first = bench.fault();
         assert!(first == fault || first == PanelFault::WindowLost, "{name}: {first}");
-        let now = monotonic_now();
+        let now = host_now();
         let again = bench.panel.tick(now, &mut bench.source, &mut |refresh| panic!("{name}: {refresh:?}"));
         assert_eq!(again, Err(first), "{name}");
         if let Some(mend) = mend {
-            assert_eq!(bench.panel.recover(monotonic_now()), Err(fault), "{name}: it is not mended yet");
+            assert_eq!(bench.panel.recover(host_now()), Err(fault), "{name}: it is not mended yet");
             assert_eq!(desktop.panel_window(), None, "{name}: a panel that is lost has no window");
             mend(&desktop);
         }
@@ -355,7 +354,7 @@ fn a_server_that_dies_is_a_fault(road: Road) {
     bench.show(frame);
     desktop.kill();
     assert_eq!(bench.fault(), PanelFault::WindowLost);
-    assert!(bench.panel.recover(monotonic_now()).is_err());
+    assert!(bench.panel.recover(host_now()).is_err());
     desktop.restart();
     bench.recover();
     let frame = bench.submit();

@@ -354,6 +354,7 @@ mod tests {
     use rayon::iter::ParallelIterator;
 
     use super::*;
+    use crate::worst::worst;
 
     /// Largest error allowed, over the output's root mean square: a quarter of what stages of whole networks may have, which
     /// are judged by their largest value.
@@ -434,15 +435,14 @@ mod tests {
                 }
                 let wanted: Vec<f64> = found.iter().map(|(_, at)| expected(size, epilogue, *at)).collect();
                 let rms = (wanted.iter().map(|value| value * value).sum::<f64>() / wanted.len() as f64).sqrt();
-                let worst = |spoiled: f64| {
+                let largest_error = |spoiled: f64| {
                     let first = std::iter::once(found[0].0 + spoiled);
                     let values = first.chain(found[1..].iter().map(|(value, _)| *value));
-                    let errors = values.zip(&wanted).map(|(value, wanted)| (value - wanted).abs() / rms);
-                    errors.fold(0.0, |worst, error| if error.is_nan() { f64::INFINITY } else { f64::max(worst, error) })
+                    worst(values.zip(&wanted).map(|(value, wanted)| (value - wanted).abs() / rms))
                 };
                 let context = format!("{size:?} {epilogue:?} on {}", set.name());
-                assert!(worst(0.0) < TOLERANCE, "{context}: {}", worst(0.0));
-                assert!(worst(2.0 * TOLERANCE * rms) > TOLERANCE, "{context}: the comparison is blind");
+                assert!(largest_error(0.0) < TOLERANCE, "{context}: {}", largest_error(0.0));
+                assert!(largest_error(2.0 * TOLERANCE * rms) > TOLERANCE, "{context}: the comparison is blind");
             }
         }
     }

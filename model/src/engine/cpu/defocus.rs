@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::blocks::Blocks;
 use super::depth_layers::DepthLayers;
-use super::maps::{BLOCK, SCALE, sample_pitch};
+use super::input_features::{BLOCK, SCALE, sample_pitch};
 use crate::RgbdFrame;
 use crate::engine::disc::DiscTable;
 use crate::optics::{PlanesFft, signed_bin};

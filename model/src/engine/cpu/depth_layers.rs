@@ -5,7 +5,7 @@ use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::blocks::Blocks;
-use super::maps::{BLOCK, SCALE, sample_pitch};
+use super::input_features::{BLOCK, SCALE, sample_pitch};
 use crate::RgbdFrame;
 use crate::optics::{TransposedFft2d, transfer_table};
 use crate::weights::NetworkConfig;

@@ -5,7 +5,7 @@ use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::depth_layers::DepthLayers;
-use super::maps::sample_pitch;
+use super::input_features::sample_pitch;
 use crate::optics::{signed_bin, transfer_table};
 use crate::weights::{Feedback, NetworkConfig};
 

@@ -10,11 +10,12 @@ mod expected_stack;
 mod feature_map;
 mod feedback;
 mod field;
-mod maps;
+mod input_features;
 mod network;
 mod peak;
 mod product;
 mod stage;
+mod stage_list;
 #[cfg(test)]
 pub(super) mod tests;
 mod trunk;

@@ -13,6 +13,7 @@ use crate::engine::reference::{self, Value};
 use crate::simd::InstructionSet;
 use crate::weights::tests::{self as weights_tests, random_weights};
 use crate::weights::{Grid, NetworkConfig};
+use crate::worst::worst;
 
 /// Largest difference allowed between a map and its reference, relative to the reference's largest value.
 const TOLERANCE: f64 = 2e-5;
@@ -40,7 +41,7 @@ pub(in crate::engine) fn frame(resolution: Resolution, seed: u32) -> RgbdFrame {
 }
 
 fn largest(values: impl Iterator<Item = f64>) -> f64 {
-    values.map(f64::abs).fold(0.0, |largest, value| if value.is_nan() { f64::INFINITY } else { largest.max(value) })
+    worst(values.map(f64::abs))
 }
 
 /// Difference of two maps relative to the reference's largest value.

@@ -2,12 +2,12 @@
 
 use holod_calibration::DisplayGeometry;
 
-use super::expected_stack::Grid;
 use super::fft::Lines;
+use super::grid_transforms::GridTransforms;
+use super::input_features::{InputChannels, grid_constants, plane_bytes, sample_pitch};
 use super::map::{GROUP, Map};
-use super::maps::{InputChannels, grid_constants, plane_bytes, sample_pitch};
-use super::network::Shared;
 use super::plan::{BufferId, Constant, Plan};
+use super::shared::Shared;
 use crate::engine::disc::DiscTable;
 use crate::weights::NetworkConfig;
 
@@ -34,7 +34,7 @@ pub(super) fn expect(
     config: &NetworkConfig,
     bench: &DisplayGeometry,
     shared: &Shared,
-    grid: &Grid,
+    grid: &GridTransforms,
     layer_of: BufferId,
     stack: BufferId,
     inputs: &Map,
@@ -57,7 +57,7 @@ pub(super) fn expect(
             ("ENTRIES_PER_MM", (disc.entries_per_mm as f32).into()),
         ])
         .collect();
-    let files = [include_str!("blocks.wgsl"), include_str!("maps.wgsl"), include_str!("defocus.wgsl")];
+    let files = [include_str!("blocks.wgsl"), include_str!("input_features.wgsl"), include_str!("defocus.wgsl")];
     let shader = |lines: &Lines, entry| lines.shader(&format!("defocus: {entry}"), &constants, &files, entry);
     let (rows, columns) = (grid.rows.rows(ROW_ITEMS), grid.columns.columns(BLUR_ITEMS));
     let (row_groups, column_groups) = (rows.workgroups(size.height), columns.workgroups(size.width));

@@ -1,7 +1,7 @@
 // What an eye should see at each depth layer, as defocus.rs computes it: every layer's light is blurred by its disc of
 // confusion at the focus on each other one, and the sum is divided by that of a white scene.
 //
-// Before this file: fft.wgsl, blocks.wgsl, maps.wgsl and the constants of defocus.rs.
+// Before this file: fft.wgsl, blocks.wgsl, input_features.wgsl and the constants of defocus.rs.
 
 const PIXELS = WIDTH * HEIGHT;
 // White with red, and green with blue: real pictures, two to a complex transform.

@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use holod_calibration::{Colour, DisplayGeometry, Metres};
 
-use super::expected_stack::Grid;
 use super::fft::Lines;
+use super::grid_transforms::GridTransforms;
+use super::input_features::{plane_bytes, sample_pitch};
 use super::map::Map;
-use super::maps::{plane_bytes, sample_pitch};
-use super::network::Shared;
 use super::plan::{BufferId, Constant, Plan, Shader, Stage};
+use super::shared::Shared;
 use crate::optics::transfer_table;
 use crate::weights::NetworkConfig;
 
@@ -74,7 +74,7 @@ impl DepthLayers {
         plan: &mut Plan,
         config: &NetworkConfig,
         shared: &Shared,
-        grid: &Grid,
+        grid: &GridTransforms,
         stack: BufferId,
         outputs: &Map,
     ) {
@@ -108,7 +108,7 @@ impl DepthLayers {
 
     /// Adds what carries the light of the layers in `grid.spectra`, along x, to the SLM plane, and through the pupil where
     /// it `stops`.
-    pub(super) fn bring_back(&self, stage: &mut Stage, shared: &Shared, grid: &Grid, stops: bool) {
+    pub(super) fn bring_back(&self, stage: &mut Stage, shared: &Shared, grid: &GridTransforms, stops: bool) {
         let columns = grid.columns.columns(COLUMN_ITEMS);
         // The shader has no part in what the first net gives.
         let constants: [(&str, Constant); 5] = [

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use super::map::Map;
-use super::network::Shared;
 use super::plan::{BufferId, Constant, Plan, Shader};
+use super::shared::Shared;
 use crate::weights::{Grid, NetworkConfig};
 
 /// Pixels of a row that a workgroup does.

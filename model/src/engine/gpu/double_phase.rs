@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use super::network::Shared;
 use super::plan::{BufferId, Plan, Shader};
+use super::shared::Shared;
 
 const SOURCE: &str = concat!(include_str!("phase_math.wgsl"), include_str!("double_phase.wgsl"));
 /// Edges of what a workgroup of each entry point does, as the shader has them.

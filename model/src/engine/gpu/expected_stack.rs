@@ -6,27 +6,20 @@ use holod_calibration::DisplayGeometry;
 use super::defocus;
 use super::depth_layers::DepthLayers;
 use super::feedback;
-use super::fft::{LineFft, WorkgroupLimits};
+use super::fft::WorkgroupLimits;
+use super::grid_transforms::GridTransforms;
 use super::map::Map;
-use super::network::Shared;
 use super::plan::{BufferId, Plan};
+use super::shared::Shared;
 use crate::gpu::GpuError;
 use crate::weights::{Feedback, NetworkConfig};
-
-/// Transforms on the network's grid.
-pub(super) struct Grid {
-    pub(super) rows: LineFft,
-    pub(super) columns: LineFft,
-    /// Scratch: planes of complex numbers.
-    pub(super) spectra: BufferId,
-}
 
 /// What these stages have in common.
 pub(crate) struct ExpectedStack<'a> {
     config: &'a NetworkConfig,
     bench: &'a DisplayGeometry,
     shared: Shared,
-    grid: Grid,
+    grid: GridTransforms,
     layers: DepthLayers,
     /// The depth layers of each block's corners, a byte each, [height, width].
     layer_of: BufferId,
@@ -51,11 +44,7 @@ impl<'a> ExpectedStack<'a> {
     ) -> Result<Self, GpuError> {
         let (size, count) = (shared.size, config.depth_layers);
         let planes = defocus::scratch_planes(count).max(3 * count);
-        let grid = Grid {
-            rows: LineFft::new(plan, size.width, limits)?,
-            columns: LineFft::new(plan, size.height, limits)?,
-            spectra: plan.buffer::<[f32; 2]>("spectra of the layers", planes * size.pixels()),
-        };
+        let grid = GridTransforms::new(plan, size, planes, limits)?;
         let layers = DepthLayers::new(plan, config, bench, shared);
         let layer_of = plan.buffer::<u32>("depth layers of the pixels", size.pixels());
         let stack = plan.buffer::<f32>("expected amplitudes", 3 * count * size.pixels());
@@ -86,9 +75,9 @@ mod tests {
     use num_complex::Complex64;
     use proptest::prelude::*;
 
+    use super::super::input_features::InputChannels;
     use super::super::map::GROUP;
-    use super::super::maps::InputChannels;
-    use super::super::network::pupil_values;
+    use super::super::shared::pupil_values;
     use super::super::trial::{Trial, complex, largest_difference};
     use super::super::upsample::{self, Low};
     use super::*;

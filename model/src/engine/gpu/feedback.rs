@@ -3,12 +3,12 @@
 use holod_calibration::{DisplayGeometry, Metres};
 
 use super::depth_layers::{DepthLayers, transfer_tables};
-use super::expected_stack::Grid;
 use super::fft::Lines;
+use super::grid_transforms::GridTransforms;
+use super::input_features::{InputChannels, plane_bytes};
 use super::map::{GROUP, Map};
-use super::maps::{InputChannels, plane_bytes};
-use super::network::Shared;
 use super::plan::{BufferId, Constant, Plan};
+use super::shared::Shared;
 use crate::weights::{Feedback, NetworkConfig};
 
 /// Samples that a thread holds of a row, and of a column.
@@ -24,7 +24,7 @@ pub(super) fn feed_back(
     bench: &DisplayGeometry,
     Feedback { share, sharpness }: Feedback,
     shared: &Shared,
-    grid: &Grid,
+    grid: &GridTransforms,
     layers: &DepthLayers,
     [layer_of, stack]: [BufferId; 2],
     inputs: &Map,

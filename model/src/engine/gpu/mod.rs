@@ -12,12 +12,14 @@ mod engine;
 mod expected_stack;
 mod feedback;
 mod fft;
+mod grid_transforms;
+mod input_features;
 mod levels;
 mod loaded_plan;
 mod map;
-mod maps;
 mod network;
 mod plan;
+mod shared;
 #[cfg(test)]
 pub(in crate::engine) mod tests;
 #[cfg(test)]

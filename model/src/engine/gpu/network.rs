@@ -1,51 +1,19 @@
-//! A network's plan: what its stages share, and their order.
+//! A network's plan: its stages in their order.
 
 use holod_calibration::{DisplayGeometry, LevelTables, PupilDiameter, Resolution};
 
 use super::expected_stack::ExpectedStack;
 use super::fft::WorkgroupLimits;
+use super::input_features::InputChannels;
 use super::map::Precision;
-use super::maps::InputChannels;
 use super::plan::{BufferId, Plan};
+use super::shared::Shared;
 use super::trunk::{self, Modulated};
 use super::upsample::Low;
 use super::{direct, double_phase, levels, upsample};
 use crate::conditions::{Conditions, TrainedRange};
 use crate::engine::EngineError;
 use crate::weights::{Family, Grid, Weights};
-
-/// What every stage may read or write.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Shared {
-    /// The frame's size, which may be odd.
-    pub(crate) resolution: Resolution,
-    /// The network's grid: half of that each way, rounded up, or the same.
-    pub(crate) size: Resolution,
-    /// [4, height, width] at the frame's resolution: amplitudes of red, green and blue, then normalised depth.
-    pub(crate) frame: BufferId,
-    /// The pupil's diameter in millimetres; then what is told of it and the bench: blur and diffraction.
-    pub(crate) pupil: BufferId,
-    /// [3, height, width] of complex numbers at the frame's resolution: the hologram.
-    pub(crate) field: BufferId,
-}
-
-/// What [`Shared::pupil`] holds for a pupil.
-pub(super) fn pupil_values(pupil: PupilDiameter, conditions: Conditions) -> [f32; 3] {
-    let [blur, fresnel] = conditions.told();
-    [pupil.mm(), blur as f32, fresnel as f32]
-}
-
-impl Shared {
-    pub(crate) fn new(plan: &mut Plan, resolution: Resolution, size: Resolution) -> Self {
-        Self {
-            resolution,
-            size,
-            frame: plan.buffer::<f32>("the frame", 4 * resolution.pixels()),
-            pupil: plan.buffer::<[f32; 4]>("the pupil", 1),
-            field: plan.buffer::<[f32; 2]>("the hologram", 3 * resolution.pixels()),
-        }
-    }
-}
 
 /// A network with double phase and one panel's levels.
 pub(crate) struct NetworkPlan {

@@ -10,8 +10,8 @@ use proptest::prelude::*;
 use super::engine::GpuEngine;
 use super::fft::WorkgroupLimits;
 use super::map::Precision;
-use super::network::Shared;
 use super::plan::Plan;
+use super::shared::Shared;
 use super::trial::Trial;
 use super::{double_phase, levels};
 use crate::engine::cpu::tests::{OTHER_BENCH, frame};
@@ -20,6 +20,7 @@ use crate::gpu::{Adapters, GpuError};
 use crate::optics::DoublePhase;
 use crate::weights::tests::{self as weights_tests, random_weights};
 use crate::weights::{Grid, NetworkConfig};
+use crate::worst::worst;
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
 
 /// Numbers that look random, in 0..1.
@@ -218,7 +219,7 @@ fn field_error(actual: &[Complex32], expected: &[Complex64]) -> f64 {
     assert_eq!(actual.len(), expected.len());
     let largest = expected.iter().map(|value| value.norm()).fold(0.0, f64::max);
     let differences = actual.iter().zip(expected).map(|(a, e)| (Complex64::new(a.re.into(), a.im.into()) - e).norm());
-    differences.fold(0.0, |worst, value| if value.is_nan() { f64::INFINITY } else { f64::max(worst, value) }) / largest
+    worst(differences) / largest
 }
 
 /// How many levels of a circle of 256 are farther apart than one.

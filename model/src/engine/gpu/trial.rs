@@ -6,6 +6,7 @@ use num_complex::Complex64;
 use super::map::{GROUP, Map, Precision};
 use super::plan::{BufferId, Dispatch, Plan};
 use crate::gpu::{Adapters, Gpu};
+use crate::worst::worst;
 
 /// Numbers behind each buffer, not finite, which no shader may read or write.
 const GUARD: usize = 1 << 12;
@@ -161,9 +162,6 @@ pub(super) fn complex(values: &[f32]) -> Vec<Complex64> {
 /// The largest difference relative to the largest value expected; infinite where anything is no number.
 pub(super) fn largest_difference(found: &[Complex64], expected: &[Complex64]) -> f64 {
     assert_eq!(found.len(), expected.len());
-    let largest = |values: &mut dyn Iterator<Item = f64>| {
-        values.fold(0.0, |worst: f64, value| if value.is_nan() { f64::INFINITY } else { worst.max(value) })
-    };
-    let difference = largest(&mut found.iter().zip(expected).map(|(found, expected)| (found - expected).norm()));
-    difference / largest(&mut expected.iter().map(|value| value.norm())).max(1e-6)
+    let difference = worst(found.iter().zip(expected).map(|(found, expected)| (found - expected).norm()));
+    difference / worst(expected.iter().map(|value| value.norm())).max(1e-6)
 }

@@ -5,10 +5,10 @@ use std::f64::consts::PI;
 use num_complex::Complex64;
 
 use super::fft::{LineFft, Lines, WorkgroupLimits};
+use super::input_features::grid_constants;
 use super::map::Map;
-use super::maps::grid_constants;
-use super::network::Shared;
 use super::plan::{BufferId, Constant, Plan};
+use super::shared::Shared;
 use crate::gpu::GpuError;
 use crate::optics::signed_bin;
 use crate::weights::Grid;

@@ -20,8 +20,8 @@ use rustix::fs::OFlags;
 
 use super::error::DrmError;
 use super::find::SeenConnector;
+use super::properties::{PipeProperties, Properties};
 use super::seat::{Seat, SeatLease};
-use super::settings::{PipeProperties, Properties};
 
 /// An open card.
 #[derive(Debug)]
@@ -199,6 +199,11 @@ pub(crate) struct Pipe {
 }
 
 impl Pipe {
+    /// The properties of its three objects as they are now.
+    pub(crate) fn properties(&self, card: &Card) -> io::Result<PipeProperties> {
+        PipeProperties::of(card, self.connector, self.crtc, self.plane)
+    }
+
     /// The way to the connector `seen`, with what it says of its modes now.
     pub(crate) fn find(
         card: &Card,

@@ -5,8 +5,8 @@ use std::path::PathBuf;
 
 use holod_calibration::Resolution;
 
+use super::check::DisplayCheck;
 use super::find::ConnectorList;
-use super::settings::DisplayCheck;
 
 /// Why a panel on a connector was not opened.
 #[derive(Debug, thiserror::Error)]

@@ -10,13 +10,14 @@ use rustix::event::epoll;
 use rustix::io::Errno;
 
 use super::card::{Card, Pipe, ScanBuffer, flip};
+use super::check::{DisplayCheck, Verdict};
 use super::error::DrmError;
 use super::event::{Uevent, for_each_flip};
 use super::find::{NotFound, SYS_CLASS_DRM, SeenConnector, choose, seen_connectors};
 use super::hotplug::Hotplug;
 use super::mode;
 use super::seat::Seat;
-use super::settings::{self, Change, DisplayCheck, PipeProperties, Verdict};
+use super::settings::{self, Change};
 use super::timing::FlipStamp;
 
 /// On the screen, on its way there, being written, and one more: a driver may still read the last picture a while after it
@@ -244,7 +245,7 @@ impl Ready {
             wanted_hz: wanted.refresh_hz,
             offered: mode::list(info.modes()),
         })?;
-        let before = PipeProperties::of(card, &pipe).map_err(card.refused("reading properties"))?;
+        let before = pipe.properties(card).map_err(card.refused("reading properties"))?;
         let buffer_property =
             before.plane.handle("FB_ID").ok_or_else(|| card.unsupported("its planes have no buffer"))?;
         let blob = card.create_property_blob(&drm_ffi::drm_mode_modeinfo::from(mode));
@@ -269,7 +270,7 @@ impl Ready {
     }
 
     fn read_back(&self, card: &Card, seen: &SeenConnector, wanted: &Wanted) -> Result<Vec<DisplayCheck>, DrmError> {
-        let properties = PipeProperties::of(card, &self.pipe).map_err(card.refused("reading properties back"))?;
+        let properties = self.pipe.properties(card).map_err(card.refused("reading properties back"))?;
         let crtc = card.get_crtc(self.pipe.crtc).map_err(card.refused("reading the mode back"))?;
         let size = |size: Resolution| format!("{} by {}", size.width, size.height);
         let mode_words = |mode: &Mode| {

@@ -9,6 +9,7 @@
 //! `slm-output/doc/drm.md` says how to give holod a connector and which drivers are known to tell wrong times.
 
 mod card;
+mod check;
 mod edid;
 mod error;
 mod event;
@@ -17,6 +18,7 @@ mod hotplug;
 mod link;
 mod margin;
 mod mode;
+mod properties;
 #[cfg(feature = "seat")]
 mod seat;
 #[cfg(not(feature = "seat"))]
@@ -25,22 +27,21 @@ mod seat;
 mod settings;
 mod timing;
 
+pub use check::{DisplayCheck, Verdict};
 pub use edid::Edid;
 pub use error::DrmError;
 pub use find::{ConnectorList, SeenConnector};
 pub use margin::CommitMargin;
-pub use settings::{DisplayCheck, Verdict};
 pub use timing::{FlipClock, FlipFaults, FlipStamp, Refresh};
 
 use std::os::fd::BorrowedFd;
 use std::path::PathBuf;
 
-use holod_calibration::TimeNs;
+use holod_calibration::{TimeNs, host_now};
 use rustix::io::Errno;
 
 use super::{FrameSource, PanelFault, PanelSetup, PresentedRefresh, Presenter, Provenance};
 use crate::fields::{FrameTag, LevelsFrame};
-use crate::output::monotonic_now;
 use crate::packing::{PixelFormat, write_frame};
 use card::ScanBuffer;
 use event::Uevent;
@@ -142,7 +143,7 @@ impl DrmPanel {
             under_way: None,
             refused: None,
             written: 0,
-            t_choose: monotonic_now(),
+            t_choose: host_now(),
             held: None,
             lost: None,
         })
@@ -231,7 +232,7 @@ impl DrmPanel {
         };
         match self.link()?.flip(picture.buffer) {
             Ok(()) => {
-                self.margin.learn(self.t_choose, now, monotonic_now());
+                self.margin.learn(self.t_choose, now, host_now());
                 self.under_way = Some((picture, now));
                 Ok(())
             }

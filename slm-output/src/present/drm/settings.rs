@@ -1,68 +1,13 @@
 //! What must be true of a connector for levels to reach the panel as they are: set where the driver lets it be set, and
 //! read back.
 
-use std::fmt;
-use std::io;
-
 use drm::control::atomic::AtomicModeReq;
 use drm::control::property::{self, ValueType};
-use drm::control::{AtomicCommitFlags, Device as _, RawResourceHandle, ResourceHandle};
+use drm::control::{AtomicCommitFlags, Device as _, RawResourceHandle};
 
 use super::card::{Card, Pipe};
-
-/// One thing that was looked at on the way to the panel.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct DisplayCheck {
-    /// What was looked at.
-    pub name: String,
-    /// What it is.
-    pub found: String,
-    /// What it must be.
-    pub wanted: String,
-    /// What follows.
-    pub verdict: Verdict,
-}
-
-/// Whether a thing is as it must be.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verdict {
-    /// It was read back, and it is.
-    Right,
-    /// It was read back, and it is not.
-    Wrong,
-    /// The driver does not tell.
-    Unverified,
-}
-
-impl fmt::Display for DisplayCheck {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let verdict = match self.verdict {
-            Verdict::Right => "right",
-            Verdict::Wrong => "WRONG",
-            Verdict::Unverified => "not verified",
-        };
-        write!(f, "{}: {}, wanted {} ({verdict})", self.name, self.found, self.wanted)
-    }
-}
-
-impl DisplayCheck {
-    /// A check whose found and wanted are texts that must be equal.
-    pub(crate) fn equal(name: &str, found: impl ToString, wanted: impl ToString) -> Self {
-        let (found, wanted) = (found.to_string(), wanted.to_string());
-        let verdict = if found == wanted { Verdict::Right } else { Verdict::Wrong };
-        Self { name: name.to_owned(), found, wanted, verdict }
-    }
-
-    /// A check that could not be made.
-    pub(crate) fn unverified(name: &str, found: &str, wanted: impl ToString) -> Self {
-        Self {
-            name: name.to_owned(),
-            found: found.to_owned(),
-            wanted: wanted.to_string(),
-            verdict: Verdict::Unverified,
-        }
-    }
-}
+use super::check::DisplayCheck;
+use super::properties::{PipeProperties, Properties};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum On {
@@ -123,51 +68,11 @@ const SETTINGS: &[Setting] = &[
     setting("blending", On::Plane, "pixel blend mode", Want::Named("None"), false),
 ];
 
-/// The properties of one object, by name.
-pub(crate) struct Properties(Vec<(property::Info, u64)>);
-
-impl Properties {
-    pub(crate) fn of<H: ResourceHandle>(card: &Card, object: H) -> io::Result<Self> {
-        let values = card.get_properties(object)?;
-        let read = |(&handle, &value)| card.get_property(handle).map(|info| (info, value));
-        values.iter().map(read).collect::<io::Result<_>>().map(Self)
-    }
-
-    pub(crate) fn find(&self, name: &str) -> Option<&(property::Info, u64)> {
-        self.0.iter().find(|(info, _)| info.name().to_bytes() == name.as_bytes())
-    }
-
-    pub(crate) fn handle(&self, name: &str) -> Option<property::Handle> {
-        self.find(name).map(|(info, _)| info.handle())
-    }
-
-    pub(crate) fn value(&self, name: &str) -> Option<u64> {
-        self.find(name).map(|&(_, value)| value)
-    }
-}
-
-/// The properties of the three objects on the way to the panel.
-pub(crate) struct PipeProperties {
-    pub(crate) connector: Properties,
-    pub(crate) crtc: Properties,
-    pub(crate) plane: Properties,
-}
-
-impl PipeProperties {
-    pub(crate) fn of(card: &Card, pipe: &Pipe) -> io::Result<Self> {
-        Ok(Self {
-            connector: Properties::of(card, pipe.connector)?,
-            crtc: Properties::of(card, pipe.crtc)?,
-            plane: Properties::of(card, pipe.plane)?,
-        })
-    }
-
-    fn on(&self, on: On) -> &Properties {
-        match on {
-            On::Connector => &self.connector,
-            On::Crtc => &self.crtc,
-            On::Plane => &self.plane,
-        }
+fn of_part(properties: &PipeProperties, on: On) -> &Properties {
+    match on {
+        On::Connector => &properties.connector,
+        On::Crtc => &properties.crtc,
+        On::Plane => &properties.plane,
     }
 }
 
@@ -228,7 +133,7 @@ fn wanted_words(want: Want, channel_bits: u8) -> String {
 /// Which properties are to be changed to what.
 pub(crate) fn plan(pipe: &Pipe, properties: &PipeProperties, channel_bits: u8) -> Vec<Change> {
     let change = |setting: &Setting| {
-        let (info, old) = properties.on(setting.on).find(setting.property)?;
+        let (info, old) = of_part(properties, setting.on).find(setting.property)?;
         let new = wanted(info, setting.want, channel_bits)?;
         let change = Change { object: object(pipe, setting.on), property: info.handle(), new, old: *old };
         info.mutable().then_some(change)
@@ -277,7 +182,7 @@ pub(crate) fn read_back(properties: &PipeProperties, channel_bits: u8) -> Vec<Di
     let check = |setting: &Setting| {
         let must = wanted_words(setting.want, channel_bits);
         let name = format!("{} ({})", setting.name, setting.property);
-        let Some((info, value)) = properties.on(setting.on).find(setting.property) else {
+        let Some((info, value)) = of_part(properties, setting.on).find(setting.property) else {
             let silent = || DisplayCheck::unverified(&name, "the driver does not say", must);
             return setting.essential.then(silent);
         };

@@ -25,15 +25,14 @@ use std::io;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
 
-use holod_calibration::TimeNs;
 use holod_calibration::rig::{Packing, PanelMode};
+use holod_calibration::{TimeNs, host_now};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use self::monitors::{Monitor, MonitorError, PanelMonitor};
 use self::timeline::{Lead, Outcome, Presented, Timeline};
 use self::watch::Watched;
 use crate::fields::{FIELDS, FrameTag, LevelsFrame};
-use crate::output::monotonic_now;
 use crate::packing::{PIXEL_BYTES, PixelFormat, write_frame};
 use crate::present::{
     FrameSource, PanelFault, PanelSetup, PanelTiming, PresentedRefresh, Presenter, Provenance, WindowSpec,
@@ -304,11 +303,11 @@ impl WindowPanel {
             DisplayServer::Wayland(socket) => wayland::open(socket, &self.wanted, 2 * planes)?,
         };
         let monitor = Box::new(watched.monitor().clone());
-        let (lead, t_refresh) = (Lead::new(self.timing.refresh_period), monotonic_now());
+        let (lead, t_refresh) = (Lead::new(self.timing.refresh_period), host_now());
         let mut open = Open { draw, watched, timeline: None, lead, t_refresh };
         let first = self.show_first(&mut open).map_err(|fault| WindowError::NothingShown { monitor, fault })?;
         open.timeline = first.map(Timeline::starting_with);
-        self.t_next = monotonic_now();
+        self.t_next = host_now();
         self.open = Some(open);
         Ok(())
     }
@@ -321,13 +320,13 @@ impl WindowPanel {
             open.draw.write(self.planes + plane, &self.pixels)?;
         }
         open.draw.present(self.planes)?;
-        let t_end = monotonic_now() + FIRST_PICTURE;
+        let t_end = host_now() + FIRST_PICTURE;
         let mut first = None;
         loop {
             open.watched.check()?;
             first = first.or_else(|| open.watched.completion());
             let is_there = open.watched.is_placed() && (first.is_some() || !open.watched.reports_completions());
-            let rest = t_end - monotonic_now();
+            let rest = t_end - host_now();
             if is_there {
                 return Ok(first);
             }
@@ -421,9 +420,9 @@ impl WindowPanel {
             let Some(timeline) = &mut open.timeline else { return Ok(()) };
             let Some(completion) = open.watched.completion() else { return Ok(()) };
             let Some(picture) = self.on_its_way else { continue };
-            match timeline.complete(completion, monotonic_now()) {
+            match timeline.complete(completion, host_now()) {
                 Outcome::NotThis => continue,
-                Outcome::Skipped => self.t_next = monotonic_now(),
+                Outcome::Skipped => self.t_next = host_now(),
                 Outcome::Shown(came) => {
                     open.lead.learn(open.t_refresh, came.t_present);
                     open.t_refresh = came.t_present;
@@ -472,7 +471,7 @@ impl Presenter for WindowPanel {
             if self.open.as_ref().is_some_and(|open| open.timeline.is_none())
                 && let Some(picture) = self.on_its_way.take()
             {
-                let t_present = monotonic_now();
+                let t_present = host_now();
                 self.t_next = (now + self.timing.refresh_period).max(t_present);
                 let came = Presented { t_present, provenance: Provenance::Software, refresh_count: None };
                 self.report(picture, came, presented);

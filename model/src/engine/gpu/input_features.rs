@@ -1,4 +1,4 @@
-//! How a frame and fields become the map that both nets of `expected-stack` read, for `maps.wgsl` and its users.
+//! How a frame and fields become the map that both nets of `expected-stack` read, for `input_features.wgsl` and its users.
 
 use holod_calibration::{DisplayGeometry, Metres, Resolution};
 
