@@ -198,7 +198,7 @@ fn name_pictures(
     paths.into_iter().enumerate().map(|(index, path)| (path, format!("{key}-{index:06}{ending}"))).collect()
 }
 
-/// Whether [`keep_bench`] gives this name to a file.
+/// Whether a record keeps a file of the bench, its rig or what the rig names, under this name.
 pub fn is_of_bench(name: &str) -> bool {
     is_weights(name) || [RIG, LASERS].contains(&name) || TABLES.iter().any(|table| name.starts_with(table))
 }
