@@ -14,6 +14,8 @@ use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 
 use super::live::Live;
+use crate::logging;
+use crate::record::RecordStand;
 use crate::session::FirstLight;
 use crate::snapshot::Snapshot;
 
@@ -99,6 +101,7 @@ impl Collector for OfSnapshot {
         told.gauge("page_viewers", "Browsers that watch the status page", None, viewers)?;
         let refused = live.refused.load(Ordering::Relaxed);
         told.counter("page_refused", "Requests that the status page refused", refused)?;
+        told.counter("log_lines_lost", "Lines that standard error did not take", logging::lines_lost())?;
         own_process(&mut told)?;
         match &*live.snapshot.load() {
             Some(snapshot) => of_run(&mut told, snapshot),
@@ -153,6 +156,11 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
     told.counter("deadline_misses", "Frames that came later than planned", figures.deadline_misses)?;
     let counts = figures.tracker_counts.iter().map(|(name, count)| (name.as_str(), *count));
     told.counters("tracker_events", "Samples, connections and rejections by their reason", "event", counts)?;
+    if let Some(record) = &figures.record {
+        let lost = f64::from(u8::from(record.state == RecordStand::Lost));
+        told.gauge("record_lost", "Whether the record was given up", None, lost)?;
+        told.counter("record_rows_lost", "Rows of the record that a slow disk left out", record.rows_lost)?;
+    }
     let Some(feed) = &figures.feed else { return Ok(()) };
     told.gauge("feed_clients", "Clients of the live feed", None, feed.clients.len() as f64)?;
     let pictures = [

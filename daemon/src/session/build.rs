@@ -209,6 +209,7 @@ pub(super) fn build(
         tracker,
         tracker_watch: TrackerWatch::new(&rig.tracker, t_origin),
         feed,
+        record: plan.record,
         desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }),
         signals,
         hangups: plan.hangups,
