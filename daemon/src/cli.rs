@@ -213,6 +213,8 @@ pub enum Backend {
     Cpu,
     /// A GPU by Vulkan; where there is none, a processor that plays one, which is slow.
     Gpu,
+    /// The same with a network's features in half precision, where the device has that: faster, a little less exact.
+    GpuHalf,
 }
 
 /// Options of `run`.
