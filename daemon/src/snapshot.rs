@@ -62,6 +62,9 @@ pub struct Snapshot {
     pub uptime_s: f64,
     /// Where `holod ctl` may ask it.
     pub control: Option<PathBuf>,
+    /// Orders that were refused, by reason.
+    #[serde(default)]
+    pub orders_refused: BTreeMap<String, u64>,
     /// The eye that is followed: left, right, both or better.
     #[serde(default)]
     pub eye: String,

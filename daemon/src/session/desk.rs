@@ -68,6 +68,11 @@ impl Desk {
         self.server.as_ref().map(|(server, _)| server.socket().to_owned())
     }
 
+    /// How many requests were refused, by reason.
+    pub(super) fn refused(&self) -> BTreeMap<String, u64> {
+        self.server.as_ref().map(|(server, _)| server.refused()).unwrap_or_default()
+    }
+
     pub(super) fn is_paused(&self) -> bool {
         self.changes.steering.is_paused()
     }

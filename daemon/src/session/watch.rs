@@ -307,6 +307,7 @@ impl Watch<'_> {
             state: self.told.state.name().to_owned(),
             uptime_s: (now - self.t_origin).seconds(),
             control: self.desk.socket(),
+            orders_refused: self.desk.refused(),
             eye: self.rig.tracker.eye.name().to_owned(),
             paused: self.desk.is_paused(),
             lasers_kept_dark: self.desk.keeps_dark(),

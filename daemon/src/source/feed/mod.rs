@@ -10,10 +10,11 @@ pub mod fuzzing;
 mod message;
 mod slots;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io;
 use std::os::fd::OwnedFd;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -27,11 +28,12 @@ use rustix::io::Errno;
 use rustix::net::{SocketFlags, SocketType, accept_with};
 use serde::{Deserialize, Serialize};
 
-use self::client::{Client, Gone, Target};
+use self::client::{Client, Gone, Refusal, Target};
 use self::message::Outcome;
 use self::slots::Picture;
 use super::{PictureSink, PictureTag, scene};
 use crate::local_socket::{self, SocketError};
+use crate::tally_by::TallyBy;
 
 /// Clients that may be connected at once.
 const CLIENTS: usize = 8;
@@ -89,6 +91,9 @@ pub struct FeedStatus {
     pub left_out: u64,
     /// Connections that were refused or broken off for what they sent.
     pub connections_refused: u64,
+    /// The same by reason.
+    #[serde(default)]
+    pub connections_refused_by: BTreeMap<String, u64>,
     /// Why a picture or a connection was refused last.
     pub last_refusal: Option<String>,
     /// Seconds since the newest picture was taken over.
@@ -100,6 +105,12 @@ pub struct FeedStatus {
 }
 
 impl FeedStatus {
+    /// That of a feed at `socket` to which nobody has come.
+    fn at(socket: &Path) -> Self {
+        let connections_refused_by = TallyBy::<Refusal>::default().map();
+        Self { socket: socket.to_owned(), connections_refused_by, ..Self::default() }
+    }
+
     fn tell_refusal(&mut self, what: &str, why: &str, now: TimeNs) {
         if self.t_told.is_none_or(|t| now - t >= REFUSAL_EVERY) {
             tracing::warn!("{what} is refused: {why}");
@@ -154,7 +165,7 @@ impl Feed {
         let listener = local_socket::listen(&socket, SocketType::SEQPACKET)?;
         let stop = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)
             .map_err(|error| FeedError::Thread(error.into()))?;
-        let status = Arc::new(Mutex::new(FeedStatus { socket: socket.clone(), ..FeedStatus::default() }));
+        let status = Arc::new(Mutex::new(FeedStatus::at(&socket)));
         let shown = Arc::clone(&sink);
         let mut server = Server {
             listener,
@@ -165,8 +176,9 @@ impl Feed {
             frames: (0..FRAMES).map(|_| Arc::new(RgbdFrame::black(resolution))).collect(),
             sink,
             shared: Arc::clone(&status),
-            status: FeedStatus { socket: socket.clone(), ..FeedStatus::default() },
+            status: FeedStatus::at(&socket),
             left_out_of_gone: 0,
+            refused: TallyBy::default(),
         };
         let thread = std::thread::Builder::new()
             .name("holod-feed".into())
@@ -210,6 +222,7 @@ struct Server {
     shared: Arc<Mutex<FeedStatus>>,
     status: FeedStatus,
     left_out_of_gone: u64,
+    refused: TallyBy<Refusal>,
 }
 
 impl Server {
@@ -277,7 +290,7 @@ impl Server {
         let client = Client::new(socket, self.connections);
         if self.clients.len() == CLIENTS {
             let full = format!("{CLIENTS} clients are connected already; end one of them");
-            self.refuse(&client.name, &client.show_out(&full));
+            self.refuse(&client.name, &client.show_out(Refusal::Full, &full));
             return;
         }
         self.clients.push((self.connections, client));
@@ -297,7 +310,7 @@ impl Server {
         self.left_out_of_gone = self.left_out_of_gone.saturating_add(client.left_out());
         match gone {
             Gone::Closed => tracing::info!("the feed's client `{}` is gone", client.name),
-            Gone::Refused(_) => self.refuse(&client.name, &gone),
+            Gone::Refused(..) => self.refuse(&client.name, &gone),
         }
         if *shown == Some(number) {
             tracing::info!("the last picture of `{}` stays", client.name);
@@ -306,8 +319,10 @@ impl Server {
     }
 
     fn refuse(&mut self, name: &str, gone: &Gone) {
-        if let Gone::Refused(why) = gone {
+        if let Gone::Refused(reason, why) = gone {
             self.status.connections_refused += 1;
+            self.refused.count(*reason);
+            self.status.connections_refused_by = self.refused.map();
             self.status.tell_refusal(&format!("the feed's client `{name}`"), why, host_now());
         }
     }
