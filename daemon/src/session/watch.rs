@@ -283,7 +283,7 @@ impl Watch<'_> {
 
     pub(super) fn write_status(&mut self, output: &OutputCounts, now: TimeNs) {
         let snapshot = self.snapshot(output, now);
-        self.status.write(&snapshot);
+        self.status.write(&snapshot, now);
         self.observer.snapshot(&snapshot);
         let figures = &snapshot.figures;
         tracing::debug!(

@@ -97,7 +97,11 @@ impl LaserThread {
                 self.scheduler.box_went_dark();
                 dark = Some(DarkReason::BoxFault);
             } else {
-                dark = self.obey(orders, now).or(dark);
+                let unlit = self.obey(orders, now);
+                if unlit.is_some() && orders.light.is_some() {
+                    self.scheduler.stayed_dark();
+                }
+                dark = unlit.or(dark);
             }
             self.ledger.field(&shown, dark, &self.shared);
         }
