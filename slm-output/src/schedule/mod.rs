@@ -178,8 +178,8 @@ impl FieldScheduler {
         self.interlock.box_went_dark();
     }
 
-    /// A person asks for darkness, or takes that back.
-    pub fn hold(&mut self, held: bool) -> Orders {
+    /// Darkness is asked for and why, or that is taken back.
+    pub fn hold(&mut self, held: Option<DarkReason>) -> Orders {
         self.interlock.hold(held)
     }
 
