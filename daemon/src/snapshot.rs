@@ -92,4 +92,7 @@ pub struct Snapshot {
     pub lasers: String,
     /// What is wrong with the laser box, where something is.
     pub lasers_trouble: Option<String>,
+    /// Why the live feed keeps lasers dark, where it does.
+    #[serde(default)]
+    pub feed_trouble: Option<String>,
 }

@@ -138,6 +138,11 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
     for (name, help, is_so) in [
         ("lasers_armed", "Whether lasers may be lit", snapshot.lasers == "armed"),
         ("lasers_kept_dark", "Whether a person keeps the lasers dark", snapshot.lasers_kept_dark),
+        (
+            "feed_keeps_dark",
+            "Whether lasers are dark as the live feed gives no pictures",
+            snapshot.feed_trouble.is_some(),
+        ),
         ("laser_box_lost", "Whether something is wrong with the laser box", snapshot.lasers_trouble.is_some()),
         ("panel_lost", "Whether the panel is lost", snapshot.panel_trouble.is_some()),
         ("paused", "Whether the picture stands still", snapshot.paused),

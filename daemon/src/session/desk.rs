@@ -273,7 +273,10 @@ impl Watch<'_> {
 
     fn keep_dark(&mut self, dark: bool, output: &OutputControl) -> Result<Value, String> {
         self.desk.keeps_dark = dark;
-        match (output.keep_dark(dark), dark) {
+        match (output.keep_dark(self.dark_wish()), dark) {
+            (_, false) if self.feed_watch.keeps_dark() => {
+                Ok("lasers are lit again by the rules, once the live feed gives a picture".into())
+            }
             (_, false) => Ok(format!("lasers are lit again by the rules{}", self.pattern_warning()).into()),
             (true, true) => Ok("the lasers are dark, and stay so until `holod ctl lasers arm`".into()),
             (false, true) => {

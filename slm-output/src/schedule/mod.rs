@@ -186,8 +186,8 @@ impl FieldScheduler {
         self.balance.give_back();
     }
 
-    /// A person asks for darkness, or takes that back.
-    pub fn hold(&mut self, held: bool) -> Orders {
+    /// Darkness is asked for and why, or that is taken back.
+    pub fn hold(&mut self, held: Option<DarkReason>) -> Orders {
         self.interlock.hold(held)
     }
 

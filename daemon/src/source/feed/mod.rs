@@ -61,12 +61,14 @@ pub struct FeedPlan {
     pub fit: Fit,
     /// What is shown until there is a picture. It lives as long as the plan: an engine keeps the last frame that it has seen.
     pub black: Arc<RgbdFrame>,
+    /// Lasers are dark once no new picture has come for this long; without it the last one stays lit.
+    pub dark_after: Option<TimeNs>,
 }
 
 impl FeedPlan {
     /// Listens at `socket` for pictures to be brought to `resolution`.
     pub fn new(socket: PathBuf, resolution: Resolution, fit: Fit) -> Self {
-        Self { socket, resolution, fit, black: Arc::new(RgbdFrame::black(resolution)) }
+        Self { socket, resolution, fit, black: Arc::new(RgbdFrame::black(resolution)), dark_after: None }
     }
 }
 
@@ -118,6 +120,15 @@ impl FeedStatus {
         }
         self.last_refusal = Some(why.to_owned());
     }
+}
+
+/// Whether pictures come.
+#[derive(Clone, Copy, Debug)]
+pub struct FeedPulse {
+    /// When the newest picture was taken over.
+    pub t_newest: Option<TimeNs>,
+    /// Whether live pictures are shown, and no scene.
+    pub is_live: bool,
 }
 
 /// Why there is no feed.
@@ -186,6 +197,19 @@ impl Feed {
             .map_err(FeedError::Thread)?;
         tracing::info!("waiting for pictures on {}", socket.display());
         Ok(Self { plan: Arc::clone(plan), sink: shown, stop, thread: Some(thread), status })
+    }
+
+    /// Whether pictures come.
+    pub fn pulse(&self) -> FeedPulse {
+        FeedPulse {
+            t_newest: self.status.lock().unwrap_or_else(PoisonError::into_inner).t_newest,
+            is_live: self.sink.lock().unwrap_or_else(PoisonError::into_inner).is_live(),
+        }
+    }
+
+    /// Whose pictures are shown.
+    pub fn shown(&self) -> Option<String> {
+        self.status.lock().unwrap_or_else(PoisonError::into_inner).shown.clone()
     }
 
     /// How it is at host time `now`.
@@ -404,7 +428,7 @@ fn take_over(
         let name = format!("the feed's client `{}`", client.name);
         scene::warn_of_oddities(&name, frame, &report, &target.geometry, client.sends_planes());
     }
-    Ok(PictureTag { number: picture.sequence, t_taken: Some(picture.t_taken), order: 0 })
+    Ok(PictureTag { number: picture.sequence, t_taken: Some(picture.t_taken), t_came: Some(now), order: 0 })
 }
 
 /// Counts what became of a picture.
