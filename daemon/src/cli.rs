@@ -213,6 +213,8 @@ pub enum Backend {
     Cpu,
     /// A GPU by Vulkan; where there is none, a processor that plays one, which is slow.
     Gpu,
+    /// The same with a network's features in half precision, where the device has that: faster, a little less exact.
+    GpuHalf,
 }
 
 /// Options of `run`.
@@ -236,6 +238,10 @@ pub struct RunArgs {
     /// The scene.
     #[command(flatten)]
     pub scene: SceneArgs,
+    /// With --scene feed: put the lasers out when no new picture has come for so many seconds, until one comes; the last
+    /// picture stays lit when left out.
+    #[arg(long, value_name = "SECONDS", value_parser = parse_silence)]
+    pub feed_dark_after: Option<Duration>,
     /// Where patterns go.
     #[arg(
         long,
@@ -706,6 +712,13 @@ fn parse_scale(text: &str) -> Result<f64, String> {
         .ok_or_else(|| format!("found '{text}', expected millimetres for one unit, a number above 0 such as 0.0125"))
 }
 
+fn parse_silence(text: &str) -> Result<Duration, String> {
+    let seconds = text.parse().ok().filter(|seconds| (0.1..=3600.0).contains(seconds));
+    seconds
+        .map(Duration::from_secs_f64)
+        .ok_or_else(|| format!("found '{text}', expected seconds without a picture, 0.1 to 3600"))
+}
+
 fn parse_count(text: &str) -> Result<usize, String> {
     text.parse().ok().filter(|&count| count > 0).ok_or_else(|| format!("found '{text}', expected a number above 0"))
 }
@@ -807,6 +820,10 @@ mod tests {
         for bad in ["0", "-1", "all", ""] {
             assert!(parse_count(bad).is_err(), "{bad}");
         }
+        for bad in ["0", "0.09", "3601", "nan", "2s", ""] {
+            assert!(parse_silence(bad).is_err(), "{bad}");
+        }
+        assert_eq!(parse_silence("0.5"), Ok(Duration::from_millis(500)));
         for bad in ["inf", "nan", "near", "40"] {
             assert!(parse_focus(bad).is_err(), "{bad}");
         }

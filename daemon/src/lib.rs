@@ -29,4 +29,5 @@ pub mod source;
 pub mod speed;
 pub mod staging;
 pub mod status;
+mod tally_by;
 pub mod terminal;

@@ -308,7 +308,7 @@ mod tests {
             t_render_end: TimeNs(20),
             t_submit: TimeNs(21),
             t_desired_present: TimeNs(30),
-            picture: PictureTag { number: 4, t_taken: Some(TimeNs(3)), order: 2 },
+            picture: PictureTag { number: 4, t_taken: Some(TimeNs(3)), t_came: Some(TimeNs(4)), order: 2 },
             keep: None,
             amplitude_constant: 1.0,
             orders: FrameOrders { scene: 2, weights: 0, pattern: 1 },

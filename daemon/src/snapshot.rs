@@ -65,6 +65,9 @@ pub struct Snapshot {
     pub uptime_s: f64,
     /// Where `holod ctl` may ask it.
     pub control: Option<PathBuf>,
+    /// Orders that were refused, by reason.
+    #[serde(default)]
+    pub orders_refused: BTreeMap<String, u64>,
     /// The eye that is followed: left, right, both or better.
     #[serde(default)]
     pub eye: String,
@@ -92,4 +95,7 @@ pub struct Snapshot {
     pub lasers: String,
     /// What is wrong with the laser box, where something is.
     pub lasers_trouble: Option<String>,
+    /// Why the live feed keeps lasers dark, where it does.
+    #[serde(default)]
+    pub feed_trouble: Option<String>,
 }

@@ -7,16 +7,19 @@ use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
+use holod_calibration::{TimeNs, host_now};
+use holod_model::files;
+use serde::{Deserialize, Serialize};
+
 use crate::aside::{Queue, Taking, join_within};
 use crate::failure::{Exit, Failure};
 use crate::runtime_folder;
 use crate::snapshot::Snapshot;
-use holod_model::files;
 
 /// The folder that the service's unit asks systemd for.
 const SERVICE_FOLDER: &str = "/run/holod";
 /// A file older than this was not written by a loop that still turns.
-const STALE: Duration = Duration::from_secs(5);
+const STALE: TimeNs = TimeNs(5_000_000_000);
 /// Moments that may wait for the disk; of those that do only the newest is written.
 const WAITING: usize = 4;
 /// How long the end of a run waits for its file to be taken away.
@@ -25,6 +28,17 @@ const PATIENCE: Duration = Duration::from_secs(1);
 /// The file of one process: each has its own, so that two holods know nothing of each other's.
 fn file_name(pid: u32) -> String {
     format!("status-{pid}.json")
+}
+
+/// What the file holds.
+#[derive(Serialize, Deserialize)]
+struct Written<S> {
+    /// When it was written, on the host's monotonic clock: the wall clock, and with it a file's own times, may be set while
+    /// holod runs. Older versions do not say it.
+    #[serde(default)]
+    written_ns: Option<i64>,
+    #[serde(flatten)]
+    status: S,
 }
 
 /// The file of a running process, which a thread of its own writes. Dropping it takes the file away.
@@ -53,12 +67,13 @@ impl StatusFile {
         Self { newest, writer: writer.ok() }
     }
 
-    /// Has the file written anew. Where the disk is still at what was written before, this one is left out.
-    pub fn write(&mut self, status: &Snapshot) {
+    /// Has the file written anew, with what holds at host time `now`. Where the disk is still at what was written before, this
+    /// one is left out.
+    pub fn write(&mut self, status: &Snapshot, now: TimeNs) {
         if self.writer.is_none() {
             return;
         }
-        match serde_json::to_vec(status) {
+        match serde_json::to_vec(&Written { written_ns: Some(now.0), status }) {
             Ok(bytes) => drop(self.newest.put(bytes, WAITING)),
             Err(error) => tracing::warn!("`holod status` will not know of this: {error}"),
         }
@@ -108,7 +123,7 @@ pub fn of_running() -> Result<Vec<Found>, Failure> {
     let mut folders = vec![PathBuf::from(SERVICE_FOLDER)];
     folders.extend(runtime_folder::candidates());
     folders.dedup();
-    of_running_in(&folders)
+    of_running_in(&folders, host_now())
 }
 
 /// Those that run and are meant: all, or the one of process `pid`.
@@ -141,7 +156,7 @@ pub fn only(running: &[Found]) -> Result<&Snapshot, Failure> {
     Err(Failure::new(Exit::Usage, several))
 }
 
-fn of_running_in(folders: &[PathBuf]) -> Result<Vec<Found>, Failure> {
+fn of_running_in(folders: &[PathBuf], now: TimeNs) -> Result<Vec<Found>, Failure> {
     let mut running: Vec<Found> = Vec::new();
     let mut closed = None;
     for folder in folders {
@@ -154,7 +169,7 @@ fn of_running_in(folders: &[PathBuf]) -> Result<Vec<Found>, Failure> {
         };
         let mut found = Vec::new();
         for path in entries.flatten().map(|entry| entry.path()) {
-            match read(&path) {
+            match read(&path, now) {
                 Ok(one) => found.extend(one),
                 Err(error) => note_closed(&mut closed, &path, error),
             }
@@ -187,17 +202,19 @@ fn note_closed(closed: &mut Option<Failure>, place: &Path, error: std::io::Error
     }
 }
 
-/// The status of a process that lives, out of its own file.
-fn read(path: &Path) -> std::io::Result<Option<Found>> {
+/// The status of a process that lives, out of its own file, at host time `now`.
+fn read(path: &Path, now: TimeNs) -> std::io::Result<Option<Found>> {
     let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
     if !(name.starts_with("status-") && name.ends_with(".json")) {
         return Ok(None);
     }
-    let written = std::fs::metadata(path)?.modified()?;
-    let Ok(status) = serde_json::from_slice::<Snapshot>(&std::fs::read(path)?) else { return Ok(None) };
+    let Ok(Written { written_ns, status }) = serde_json::from_slice::<Written<Snapshot>>(&std::fs::read(path)?) else {
+        return Ok(None);
+    };
     let lives = name == file_name(status.pid) && Path::new("/proc").join(status.pid.to_string()).exists();
-    let age = written.elapsed().unwrap_or_default();
-    Ok(lives.then_some(Found { status, stale: (age > STALE).then_some(age) }))
+    let age_ns = written_ns.map_or(0, |written_ns| now.0.saturating_sub(written_ns).max(0));
+    let stale = (age_ns > STALE.0).then(|| Duration::from_nanos(age_ns.unsigned_abs()));
+    Ok(lives.then_some(Found { status, stale }))
 }
 
 #[cfg(test)]
@@ -207,6 +224,17 @@ mod tests {
     use super::*;
 
     const LONG: Duration = Duration::from_secs(20);
+    const NOW: TimeNs = TimeNs(1_000_000_000_000);
+
+    fn found_in(folders: &[PathBuf]) -> Result<Vec<Found>, Failure> {
+        of_running_in(folders, NOW)
+    }
+
+    /// Waits until it is on the disk.
+    fn write_out(file: &mut StatusFile, status: &Snapshot, now: TimeNs) {
+        file.write(status, now);
+        assert!(file.newest.wait_until_done(LONG));
+    }
 
     fn status() -> Snapshot {
         Snapshot { pid: std::process::id(), state: "running".into(), ..Snapshot::default() }
@@ -216,13 +244,12 @@ mod tests {
     fn what_is_written_is_read_and_taken_away_at_the_end() {
         let folder = tempfile::tempdir().unwrap();
         let folders = [folder.path().join("absent"), folder.path().to_owned()];
-        assert_eq!(of_running_in(&folders).unwrap_err().exit, Exit::Unavailable);
+        assert_eq!(found_in(&folders).unwrap_err().exit, Exit::Unavailable);
         let mut file = StatusFile::at(folder.path().join(file_name(std::process::id())));
-        file.write(&status());
-        assert!(file.newest.wait_until_done(LONG));
-        assert_eq!(of_running_in(&folders).unwrap(), [Found { status: status(), stale: None }]);
+        write_out(&mut file, &status(), NOW);
+        assert_eq!(found_in(&folders).unwrap(), [Found { status: status(), stale: None }]);
         drop(file);
-        assert!(of_running_in(&folders).is_err());
+        assert!(found_in(&folders).is_err());
     }
 
     #[test]
@@ -233,16 +260,26 @@ mod tests {
         // No process has this number: the kernel's greatest is 2^22.
         let dead = serde_json::to_vec(&Snapshot { pid: u32::MAX, ..status() }).unwrap();
         std::fs::write(folder.path().join(file_name(u32::MAX)), &dead).unwrap();
-        assert!(of_running_in(&folders).is_err());
+        assert!(found_in(&folders).is_err());
         std::fs::write(&own, dead).unwrap();
-        assert!(of_running_in(&folders).is_err(), "another's status in this one's file");
+        assert!(found_in(&folders).is_err(), "another's status in this one's file");
         std::fs::write(&own, serde_json::to_vec(&status()).unwrap()).unwrap();
+        assert_eq!(found_in(&folders).unwrap()[0].stale, None, "an older holod does not say when");
+        let mut file = StatusFile::at(own.clone());
+        write_out(&mut file, &status(), NOW - TimeNs(60_000_000_000));
+        // The wall clock was set back, so that the file's own time lies ahead, or forward.
+        for later_s in [-3600, 0, 3600i64] {
+            let wall =
+                SystemTime::now() - Duration::from_secs(3600) + Duration::from_secs((3600 + later_s).unsigned_abs());
+            std::fs::File::options().write(true).open(&own).unwrap().set_modified(wall).unwrap();
+            assert_eq!(found_in(&folders).unwrap()[0].stale, Some(Duration::from_secs(60)));
+        }
+        write_out(&mut file, &status(), NOW - TimeNs(1_000_000_000));
         let long_ago = SystemTime::now() - Duration::from_secs(60);
         std::fs::File::options().write(true).open(&own).unwrap().set_modified(long_ago).unwrap();
-        let found = of_running_in(&folders).unwrap();
-        assert!(found[0].stale.unwrap() > Duration::from_secs(50));
+        assert_eq!(found_in(&folders).unwrap()[0].stale, None);
         std::fs::write(&own, "{").unwrap();
-        assert!(of_running_in(&folders).is_err());
+        assert!(found_in(&folders).is_err());
     }
 
     #[test]
@@ -252,15 +289,14 @@ mod tests {
         // The first process of all lives, whoever runs this.
         let [one, other] = [1, std::process::id()].map(|pid| {
             let mut file = StatusFile::at(folder.path().join(file_name(pid)));
-            file.write(&Snapshot { pid, ..status() });
-            assert!(file.newest.wait_until_done(LONG));
+            write_out(&mut file, &Snapshot { pid, ..status() }, NOW);
             file
         });
-        let pids = || of_running_in(&folders).unwrap().iter().map(|found| found.status.pid).collect::<Vec<_>>();
+        let pids = || found_in(&folders).unwrap().iter().map(|found| found.status.pid).collect::<Vec<_>>();
         assert_eq!(pids(), [1, std::process::id()]);
         drop(other);
         assert_eq!(pids(), [1]);
         drop(one);
-        assert!(of_running_in(&folders).is_err());
+        assert!(found_in(&folders).is_err());
     }
 }

@@ -219,12 +219,13 @@ impl EstimateSnapshot {
         let Some(motion) = self.motion else {
             return Shown { diameter_mm: fallback_mm, velocity_mm_per_s: 0.0, state: PupilState::Fallback };
         };
-        let slide_begins = motion.t + settings.hold;
+        // Samples that were older than `hold` when they became known begin a slide then, not before.
+        let slide_begins = (motion.t + settings.hold).max(self.blend.t);
         let followed = self.followed_at(&motion, t.min(slide_begins));
         let age = t - motion.t;
         let (diameter_mm, velocity_mm_per_s, state) = if age > settings.hold {
             let left_mm = fallback_mm - followed.0;
-            let slid_mm = settings.fallback_mm_per_s * (t - slide_begins).seconds() as f32;
+            let slid_mm = settings.fallback_mm_per_s * (t - slide_begins).seconds().max(0.0) as f32;
             let velocity = if slid_mm < left_mm.abs() { settings.fallback_mm_per_s.copysign(left_mm) } else { 0.0 };
             (followed.0 + slid_mm.min(left_mm.abs()).copysign(left_mm), velocity, PupilState::Fallback)
         } else if self.lost || age > self.silence {
@@ -328,7 +329,13 @@ impl Estimator {
 
     /// Takes the next sample and calls `on_decision` once for each sample on which the gate has now made up its mind:
     /// an accepted one comes [`GateSettings::lead`] late.
-    pub fn push(&mut self, sample: PupilSample, mut on_decision: impl FnMut(Decision)) {
+    pub fn push(&mut self, sample: PupilSample, on_decision: impl FnMut(Decision)) {
+        self.push_at(sample.t_sample, sample, on_decision);
+    }
+
+    /// The same for a sample that is known from `t_known` on, on the stream's clock. What is shown goes on from what was
+    /// shown then, however long ago the sample was taken.
+    pub fn push_at(&mut self, t_known: TimeNs, sample: PupilSample, mut on_decision: impl FnMut(Decision)) {
         let settings = self.snapshot.settings;
         let sample = PupilSample { diameter_mm: (f64::from(sample.diameter_mm) * settings.scale) as f32, ..sample };
         if !drives(settings.eye, sample.eye) {
@@ -374,7 +381,7 @@ impl Estimator {
         }
         if believed || set_changed {
             self.learn_eye_offsets();
-            self.combine(t, set_changed);
+            self.combine(t_known.max(t), set_changed);
         }
     }
 
@@ -477,9 +484,9 @@ impl Estimator {
             velocity_mm_per_s: sum.1 / sum.2,
             velocity_lasts: self.snapshot.settings.filter.velocity_lasts,
         };
-        if set_changed || self.snapshot.lost {
-            let shown_mm = self.snapshot.shown_at(t).diameter_mm;
-            self.snapshot.blend = Blend { t, excess_mm: shown_mm - motion.at(t).diameter_mm };
+        let shown = self.snapshot.shown_at(t);
+        if set_changed || shown.state != PupilState::Tracking {
+            self.snapshot.blend = Blend { t, excess_mm: shown.diameter_mm - motion.at(t).diameter_mm };
         }
         self.snapshot.motion = Some(motion);
         self.snapshot.lost = false;

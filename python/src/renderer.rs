@@ -304,7 +304,10 @@ pub(crate) fn backend_named(name: &str) -> PyResult<Backend> {
         "auto" => Ok(Backend::Auto),
         "cpu" => Ok(Backend::Cpu),
         "gpu" => Ok(Backend::Gpu),
-        _ => Err(InputError::new_err(format!("backend: found {name:?}, expected \"auto\", \"cpu\" or \"gpu\""))),
+        "gpu-half" => Ok(Backend::GpuHalf),
+        _ => Err(InputError::new_err(format!(
+            "backend: found {name:?}, expected \"auto\", \"cpu\", \"gpu\" or \"gpu-half\""
+        ))),
     }
 }
 

@@ -12,7 +12,7 @@ use crate::present::Provenance;
 
 /// Frames that are remembered until the panel reports them.
 const SLOTS: usize = 16;
-/// Frame times that are remembered, none of them, at the newest frame, older than [`FORGOTTEN_AFTER`].
+/// Frame times that are remembered, none of them, when the newest frame began, older than [`FORGOTTEN_AFTER`].
 const WINDOW: usize = 192;
 /// The budget is the longest of fewer than this many, the second longest of fewer than twice as many, else the third
 /// longest: one or two hiccups among many frames do not move it. At 60 frames a second that is the 98.4th percentile.
@@ -21,6 +21,9 @@ const RANK: usize = 3;
 /// Of frames that take several refreshes there are few in this time, and a rare long one must not slow all of them for
 /// longer: to be late by a refresh costs such a frame less than to wait for it costs all others.
 const FORGOTTEN_AFTER: TimeNs = TimeNs(3_200_000_000);
+/// Where fewer than [`FRAMES_A_RANK`] frames are remembered, one that took longer than the newest by this factor was a
+/// standstill, which says nothing of the next ones.
+const STANDSTILL_FACTOR: i64 = 4;
 /// Share of a refresh's error that moves the phase, and that moves the period, of the panel's clock.
 const PHASE_GAIN: f64 = 0.1;
 const PERIOD_GAIN: f64 = 0.005;
@@ -152,14 +155,21 @@ impl Pacer {
     }
 
     /// Plans the next frame: the first refresh that it can reach and no other frame is for. Where a frame takes longer
-    /// than a refresh, it keeps to every n-th.
+    /// than a refresh, it keeps to every n-th. A frame that was submitted long before the refresh that it was made for has
+    /// been shown at an earlier one, and its own is free.
     pub fn predict(&mut self, now: TimeNs) -> FramePlan {
         let budget = self.budget();
         let reachable = now + budget;
         let mut t_desired_present = self.clock.refresh_at_or_after(reachable);
         if let Some(t_last) = self.t_last_desired {
             let every = (budget.0 as f64 / self.clock.period_ns).ceil().max(1.0);
-            let spaced = TimeNs(t_last.0 + (every * self.clock.period_ns).round() as i64);
+            let space = TimeNs((every * self.clock.period_ns).round() as i64);
+            let last = self.slots[slot_index(self.last_frame_id)].filter(|slot| slot.frame_id == self.last_frame_id);
+            let t_last = match last.and_then(|slot| slot.t_submit) {
+                Some(t_submit) if t_last - now > space => self.clock.refresh_at_or_after(t_submit.min(now)),
+                _ => t_last,
+            };
+            let spaced = t_last + space;
             // The clock may have moved a little since: the refresh that is meant is the nearest one.
             if spaced > t_desired_present {
                 t_desired_present = self.clock.nearest_refresh(spaced);
@@ -348,19 +358,26 @@ impl FrameTimes {
     fn push(&mut self, time: TimeNs, t_submit: TimeNs) {
         self.window[self.count % WINDOW] = FrameTime { time, t_submit };
         self.count += 1;
+        let t_begin = t_submit.0.saturating_sub(time.0);
+        let standstill_ns = time.0.saturating_mul(STANDSTILL_FACTOR);
         let mut longest = [TimeNs(0); RANK];
+        let mut longest_of_few = time;
         let mut known = 0;
         for frame in &self.window[..self.count.min(WINDOW)] {
-            if t_submit.0.saturating_sub(frame.t_submit.0) > FORGOTTEN_AFTER.0 {
+            if t_begin.saturating_sub(frame.t_submit.0) > FORGOTTEN_AFTER.0 {
                 continue;
             }
             known += 1;
+            if frame.time.0 <= standstill_ns {
+                longest_of_few = longest_of_few.max(frame.time);
+            }
             if frame.time > longest[RANK - 1] {
                 longest[RANK - 1] = frame.time;
                 longest.sort_unstable_by(|a, b| b.cmp(a));
             }
         }
-        self.estimate = longest[(known / FRAMES_A_RANK).min(RANK - 1)];
+        let rank = (known / FRAMES_A_RANK).min(RANK - 1);
+        self.estimate = if rank == 0 { longest_of_few } else { longest[rank] };
     }
 }
 
@@ -518,6 +535,48 @@ mod tests {
         assert!((0.01..HICCUPS).contains(&late), "{ran:?}");
     }
 
+    /// The refreshes from the submission of each frame to that of the next, where frame `long` takes `long_ms` and all
+    /// others 8 ms.
+    fn spacings(long: u64, long_ms: i64) -> Vec<i64> {
+        let mut pacer = Pacer::new(config(), TimeNs(0));
+        let (mut now, mut submitted) = (TimeNs(1000), Vec::new());
+        for _ in 0..400 {
+            let plan = pacer.predict(now);
+            let takes_ms = if plan.frame_id == long { long_ms } else { 8 };
+            now = plan.t_wake + TimeNs(takes_ms * MS);
+            pacer.mark(Point::Submit, plan.frame_id, now);
+            let refresh = (now.0 as f64 / REFRESH.0 as f64).ceil() as i64;
+            submitted.push(refresh);
+            // Shown at the next refresh, whatever refresh it was made for.
+            pacer.report(plan.frame_id, TimeNs(refresh * REFRESH.0), Provenance::Hardware);
+        }
+        submitted.windows(2).map(|pair| pair[1] - pair[0]).collect()
+    }
+
+    /// A machine that stood still, or the first frame of a device that had to get ready.
+    #[test]
+    fn a_frame_that_takes_seconds_costs_its_own_time_and_no_more() {
+        for long in [1, 2, 5, 15, 100] {
+            for long_ms in [100, 1000, 2900, 3050, 3150, 3250, 4000, 30_000] {
+                let spacings = spacings(long, long_ms);
+                // The last part of a refresh, and the one that is lost to a plan made for the next such frame.
+                let stood = 2 + long_ms * MS / REFRESH.0;
+                let lost: i64 = spacings.iter().map(|spacing| spacing - 1).sum();
+                assert!(lost <= stood, "frame {long} of {long_ms} ms costs {lost} refreshes: {spacings:?}");
+            }
+        }
+        assert!(spacings(0, 0).iter().all(|spacing| *spacing == 1));
+    }
+
+    #[test]
+    fn frames_that_take_seconds_each_are_planned_for_as_long() {
+        for render_ms in [3000.0, 5000.0] {
+            let ran = Bench::new(REFRESH.0 as f64, render_ms, 30.0).run(3.0);
+            assert!((ran.missed as f64) < 0.5 * ran.frames as f64, "{render_ms} ms: {ran:?}");
+            assert!((3.0 * 3600e3 / ran.frames as f64) < render_ms + 60.0, "{render_ms} ms: {ran:?}");
+        }
+    }
+
     /// Canary for the benches above: a pacer whose budget is too small is seen to miss.
     #[test]
     fn frames_that_take_longer_than_planned_are_missed_and_counted() {
@@ -599,13 +658,14 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever it is told, a pacer plans forward: frames are numbered without a gap, never for a refresh of another
-        /// frame, never in the past.
+        /// Whatever it is told, a pacer plans forward: frames are numbered without a gap, never for a refresh that another
+        /// frame still waits for, never in the past.
         #[test]
         fn plans_go_forward_whatever_is_reported(steps in prop::collection::vec(steps(), 1..200)) {
             let mut pacer = Pacer::new(config(), TimeNs(0));
             let mut now = TimeNs(0);
             let mut last: Option<FramePlan> = None;
+            let mut last_submitted = false;
             for step in steps {
                 match step {
                     Step::Predict { later_ns } => {
@@ -615,13 +675,17 @@ mod tests {
                         prop_assert!(plan.t_desired_present >= plan.t_wake);
                         prop_assert_eq!(plan.frame_id, last.map_or(1, |last| last.frame_id + 1));
                         if let Some(last) = last {
-                            prop_assert!(plan.t_desired_present > last.t_desired_present);
+                            let forward = plan.t_desired_present > last.t_desired_present;
+                            // One that was submitted early enough has been shown before its refresh.
+                            let freed = last_submitted && last.t_desired_present > now;
+                            prop_assert!(forward || freed);
                         }
-                        last = Some(plan);
+                        (last, last_submitted) = (Some(plan), false);
                     }
                     Step::Mark { back, later_ns } => {
                         let id = last.map_or(0, |last| last.frame_id).wrapping_sub(back);
                         pacer.mark(Point::Submit, id, now + TimeNs(later_ns));
+                        last_submitted |= last.is_some() && back == 0;
                     }
                     Step::Report { back, t_ns, provenance } => {
                         let id = last.map_or(0, |last| last.frame_id).wrapping_sub(back);
@@ -646,11 +710,12 @@ mod tests {
                 pushed.push((now, TimeNs(time)));
                 kept.push(TimeNs(time), now);
                 let recent = &pushed[pushed.len().saturating_sub(WINDOW)..];
+                let began = now.0 - time;
                 let mut times: Vec<_> =
-                    recent.iter().filter(|(when, _)| now.0 - when.0 <= 3_200 * MS).map(|&(_, time)| time).collect();
+                    recent.iter().filter(|(when, _)| began - when.0 <= 3_200 * MS).map(|&(_, time)| time).collect();
                 times.sort_unstable_by(|a, b| b.cmp(a));
                 let rank = match times.len() {
-                    0..10 => 0,
+                    0..10 => times.iter().filter(|longer| longer.0 > 4 * time).count(),
                     10..20 => 1,
                     _ => 2,
                 };

@@ -6,6 +6,8 @@ import base64
 import http.client
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -117,6 +119,45 @@ def test_lasers_that_are_kept_dark_are_seen_dark(page: Holod, browser: webdriver
     page.ctl("lasers", "arm")
     wait_for("fields are lit again", lambda: pixels(browser, "fields", "green") > 50)
     assert text(browser, "lasers") == "lasers: armed"
+
+
+# A client of the feed: a grey picture thirty times a second.
+CLIENT = """
+import sys, time
+import numpy as np
+import holod_client
+with holod_client.Feed(64, 64, depth="none", plane_dpt=1.0, name="grey", path=sys.argv[1]) as feed:
+    while True:
+        feed.send(np.full((64, 64, 4), 128, np.uint8))
+        time.sleep(1 / 30)
+"""
+
+
+def test_a_feed_that_stands_still_is_seen_dark_until_it_goes_on(start: Start, browser: webdriver.Chrome) -> None:
+    holod = start("--scene", "feed", "--feed-dark-after", "1")
+    client = subprocess.Popen([sys.executable, "-c", CLIENT, str(holod.folder / "holod/feed")])
+    try:
+        browser.get(holod.place)
+        wait_for("the page says that it is lit", lambda: text(browser, "lasers") == "lasers: armed")
+        wait_for("fields are lit", lambda: pixels(browser, "fields", "green") > 50)
+        client.send_signal(signal.SIGSTOP)
+        wait_for("the badge says dark, and why", lambda: text(browser, "lasers") == "lasers: dark, no pictures")
+        dark = lambda: all(pixels(browser, "fields", laser) == 0 for laser in ["red", "green", "blue"])  # noqa: E731
+        wait_for("no window is drawn", dark)
+        wait_for("the reason stands at the fields", lambda: "dark: no-picture" in text(browser, "fields-text"))
+        trouble = "lasers dark: the feed's client `grey` has given no new picture for 1 s (--feed-dark-after)"
+        assert trouble in text(browser, "facts") and trouble in text(browser, "log")
+        assert b"\nholod_feed_keeps_dark 1" in holod.get("/metrics")[1]
+        client.send_signal(signal.SIGCONT)
+        wait_for("the badge says armed", lambda: text(browser, "lasers") == "lasers: armed")
+        wait_for("fields are lit again", lambda: pixels(browser, "fields", "green") > 50)
+        assert trouble not in text(browser, "facts")
+        client.kill()
+        wait_for("a dead client is dark, too", lambda: text(browser, "lasers") == "lasers: dark, no pictures")
+        assert faults(browser) == []
+    finally:
+        client.kill()
+        client.wait()
 
 
 def test_orders_and_troubles_are_in_the_log(page: Holod, browser: webdriver.Chrome) -> None:

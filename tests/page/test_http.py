@@ -44,7 +44,7 @@ def test_figures_are_openmetrics_and_agree_with_the_status(start: Start) -> None
     )
     for name in ["frames_made", "frames_shown", "deadline_misses"]:
         assert before[name] <= value(seen[f"holod_{name}"], "_total") <= after[name], name
-    samples = value(seen["holod_tracker_events"], "_total", event="samples")
+    samples = value(seen["holod_tracker_samples"], "_total")
     assert before["tracker_counts"]["samples"] <= samples <= after["tracker_counts"]["samples"]
     assert value(seen["holod_lasers_armed"]) == 1
     assert value(seen["holod_state"], **{"is": "running"}) == 1
@@ -58,10 +58,55 @@ def test_figures_are_openmetrics_and_agree_with_the_status(start: Start) -> None
     assert value(light, "_sum") / value(light, "_count") > 0.001
     buckets = [s.value for s in light if s.name.endswith("_bucket")]
     assert buckets == sorted(buckets) and buckets[-1] == value(light, "_count")
-    assert value(seen["holod_process_resident_memory_bytes"]) > 1e6
+    rejected = {s.labels["reason"]: s.value for s in seen["holod_tracker_rejected_samples"]}
+    assert rejected.keys() == {
+        name.removeprefix("rejected_") for name in after["tracker_counts"] if name.startswith("rejected_")
+    }
+    accepted = value(seen["holod_tracker_accepted_samples"], "_total")
+    assert 0 < accepted + sum(rejected.values()) <= samples, rejected
+    assert not any("rejected" in s.labels["event"] for s in seen["holod_tracker_events"])
     # The reading objects to what is no OpenMetrics.
     with pytest.raises(ValueError, match=r".+"):
         list(text_string_to_metric_families("# TYPE holod_x counter\nholod_x 1\n# EOF\n"))
+
+
+def test_the_process_is_told_under_the_names_that_every_process_has(start: Start) -> None:
+    holod = start()
+    holod.status()
+    seen = figures(holod)
+    proc = Path(f"/proc/{holod.process.pid}")
+    assert value(seen["process_resident_memory_bytes"]) > 1e6
+    assert value(seen["process_virtual_memory_bytes"]) > value(seen["process_resident_memory_bytes"])
+    assert abs(value(seen["process_threads"]) - len(list((proc / "task").iterdir()))) <= 2
+    # Those of the question itself come and go.
+    assert abs(value(seen["process_open_fds"]) - len(list((proc / "fd").iterdir()))) <= 4
+    [limit] = [line.split() for line in (proc / "limits").read_text().splitlines() if line.startswith("Max open files")]
+    assert value(seen["process_max_fds"]) == float(limit[3])
+    assert abs(value(seen["process_start_time_seconds"]) - time.time()) < 600
+    cpu_s = value(seen["process_cpu_seconds"], "_total")
+    assert cpu_s > 0
+    wait_for("it works on", lambda: value(figures(holod)["process_cpu_seconds"], "_total") > cpu_s)
+    assert not any(name.startswith("holod_process") for name in seen)
+
+
+def test_orders_that_are_refused_are_counted_by_reason(start: Start) -> None:
+    holod = start()
+    control = holod.status()["control"]
+
+    def refused() -> dict[str, float]:
+        return {s.labels["reason"]: s.value for s in figures(holod)["holod_control_refused"]}
+
+    assert sum(refused().values()) == 0 and {"malformed", "impossible", "busy"} <= refused().keys()
+    for line in [b'{"do":"dance"}\n', b"hello\n", b'{"do":"pupil","mm":99}\n']:
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(control)
+            client.sendall(line)
+            assert b'"error"' in client.recv(65536)
+    wait_for("three are counted", lambda: sum(refused().values()) == 3)
+    assert refused()["malformed"] == 2 and refused()["impossible"] == 1
+    holod.ctl("pupil", "3")
+    wait_for("it is taken", lambda: holod.status()["pupil_mm"] == 3)
+    assert sum(refused().values()) == 3
 
 
 def test_pictures_are_of_the_frame_and_the_eye_that_is_asked_for(start: Start) -> None:
@@ -145,7 +190,7 @@ def test_a_token_opens_the_page_to_others(start: Start, tmp_path: Path) -> None:
     cookie = answer.getheader("set-cookie", "")
     assert "HttpOnly" in cookie and "SameSite=Lax" in cookie
     answer, body = holod.get("/metrics", Cookie=cookie.split(";")[0])
-    assert answer.status == 200 and b"holod_page_refused_total 4" in body
+    assert answer.status == 200 and b'holod_page_refused_total{reason="token"} 4\n' in body
 
 
 @pytest.mark.parametrize(
@@ -227,7 +272,7 @@ def test_viewers_and_strangers_come_and_the_run_goes_on(start: Start) -> None:
     while time.monotonic() < t_end:
         holod.get("/metrics")
     assert holod.status()["frames_shown"] > frames_before + 20
-    assert value(figures(holod)["holod_page_refused"], "_total") >= 20
+    assert value(figures(holod)["holod_page_refused"], "_total", reason="viewers") >= 20
     assert holod.end() == 0
     for viewer in viewers:
         viewer.join(timeout=60)

@@ -1,13 +1,15 @@
 //! The live feed as other programs meet it: what they hand over is what the panel shows.
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
+use holod_pupil_input::host_now;
 use holod_tests::daemon::{Daemon, run, wait_until};
 use holod_tests::feed::{Answer, FeedClient, hello};
 use holod_tests::{frames, small_rig};
-use rustix::process::Signal;
+use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 
 use crate::HOLOD;
@@ -139,6 +141,90 @@ fn a_client_that_dies_leaves_its_picture_and_the_loop_goes_on() {
     assert_eq!(summary["lasers"]["unsafe_findings"], 0);
 }
 
+/// The client in C with its moving cards, as a process of its own; killed when it is dropped.
+struct TwoCards(Child);
+
+impl TwoCards {
+    fn start(folder: &Path) -> Self {
+        let sources = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/clients/c"));
+        let program = folder.join("two-cards");
+        let mut compiler = Command::new("cc");
+        compiler.arg("-o").arg(&program).args(["example.c", "holod_feed.c"].map(|name| sources.join(name)));
+        assert!(compiler.status().unwrap().success(), "the C compiler that Rust links with");
+        let mut client = Command::new(program);
+        client.arg(folder.join("pictures")).args(["64x64", "600", "30"]).stdout(Stdio::null());
+        Self(client.spawn().unwrap())
+    }
+
+    fn signal(&self, signal: Signal) {
+        kill_process(Pid::from_child(&self.0), signal).unwrap();
+    }
+}
+
+impl Drop for TwoCards {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+fn a_client_that_stands_still_makes_the_lasers_dark_until_it_goes_on() {
+    const DARK_AFTER_NS: i64 = 500_000_000;
+    /// A busy machine is later than that by this.
+    const LATE_NS: i64 = 500_000_000;
+
+    let folder = bench();
+    let daemon = holod_with_feed(folder.path(), &["--feed-dark-after", "0.5", "--record", "record", "--json"]);
+    let seen = |what: &str, is_so: &dyn Fn(&Value) -> bool| {
+        let mut last = Value::Null;
+        let came = wait_until(PATIENCE, || {
+            last = status(&daemon, folder.path());
+            is_so(&last)
+        });
+        assert!(came, "{what}: {last:#}");
+    };
+    let is_dark = |status: &Value| status["lasers"] == "dark" && status["feed_trouble"].is_string();
+    let is_lit = |status: &Value| status["lasers"] == "armed" && status["feed_trouble"].is_null();
+    seen("no picture has ever come", &is_dark);
+    let client = TwoCards::start(folder.path());
+    seen("pictures come", &is_lit);
+    std::thread::sleep(Duration::from_millis(500));
+    let t_stop_ns = host_now().0;
+    client.signal(Signal::STOP);
+    seen("the client stands still", &is_dark);
+    let text = said_of(&daemon, folder.path(), &[]);
+    assert!(text.contains("lasers   dark, kept dark as the live feed gives no pictures"), "{text}");
+    let frames_shown = status(&daemon, folder.path())["frames_shown"].as_u64();
+    seen("patterns go on in the dark", &|status| status["frames_shown"].as_u64() > frames_shown);
+    std::thread::sleep(Duration::from_secs(1));
+    let t_cont_ns = host_now().0;
+    client.signal(Signal::CONT);
+    seen("the client goes on", &is_lit);
+    std::thread::sleep(Duration::from_millis(500));
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(PATIENCE);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    for said in [
+        "lasers dark: the feed's client `two cards (C example)` has given no new picture for 0.5 s",
+        "the live feed gives pictures again: lasers are lit by the rules",
+    ] {
+        assert!(ended.stderr.contains(said), "{}", ended.stderr);
+    }
+    let summary: Value = serde_json::from_str(&ended.stdout).unwrap();
+    assert_eq!(summary["lasers"]["unsafe_findings"], 0);
+    assert!(summary["lasers"]["went_dark"].to_string().contains("no-picture at "), "{summary:#}");
+
+    let rows = frames::read(&folder.path().join("record/frames.csv")).unwrap();
+    let t_dark_ns = t_stop_ns + DARK_AFTER_NS + LATE_NS;
+    assert!(frames::lit_windows(&rows, t_stop_ns - DARK_AFTER_NS, t_stop_ns) > 10, "lit before");
+    assert_eq!(frames::lit_windows(&rows, t_dark_ns, t_cont_ns), 0, "dark while it stands still");
+    assert!(rows.iter().filter(|row| (t_dark_ns..t_cont_ns).contains(&row.t_present_ns)).count() > 10);
+    let stale = rows.iter().filter(|row| row.t_present_ns < t_cont_ns).map(|row| row.picture).max().unwrap();
+    let again = rows.iter().find(|row| row.laser_on_ns.is_some_and(|on_ns| on_ns > t_cont_ns)).expect("light again");
+    assert!(again.picture > stale, "a new picture is lit first: {} after {stale}", again.picture);
+}
+
 #[test]
 fn what_cannot_be_a_feed_is_said() {
     let folder = bench();
@@ -150,6 +236,8 @@ fn what_cannot_be_a_feed_is_said() {
     let feed = ["--config", "rig.toml", "--scene", "feed:pictures", "--duration", "1s"];
     refused(&[&feed[..], &["--depth-encoding", "metres"]].concat(), 64, "a feed's clients say what their depths are");
     refused(&[&feed[..], &["--resolution", "128x64"]].concat(), 64, "larger than the panel of 64x64");
+    refused(&["--feed-dark-after", "2"], 64, "name it with --scene feed");
+    refused(&[&feed[..], &["--feed-dark-after", "2s"]].concat(), 64, "expected seconds without a picture, 0.1 to 3600");
     refused(&["render", "--scene", "feed", "--pupil", "3", "--out", "x"], 64, "for `holod run` alone");
     let daemon = holod_with_feed(folder.path(), &[]);
     refused(&feed, 69, "another holod listens there; name another socket with --scene feed:PATH");

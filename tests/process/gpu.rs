@@ -39,13 +39,18 @@ fn share_apart(folder: &Path, one: &str, other: &str) -> f64 {
 #[test]
 fn a_gpu_gives_the_processors_hologram_and_is_named() {
     let folder = tempfile::tempdir().unwrap();
-    for backend in ["gpu", "cpu"] {
+    let named = [("gpu", "gpu, ", "single precision"), ("gpu-half", "gpu, ", "half precision"), ("cpu", "cpu, ", "")];
+    for (backend, begins, precision) in named {
         let ended = rendered(folder.path(), backend, backend);
         assert!(ended.status.success(), "{ended:?}");
         let engine = engine(folder.path(), backend);
-        assert!(engine.starts_with(&format!("{backend}, ")) && ended.stderr.contains(&engine), "{engine}: {ended:?}");
+        assert!(engine.starts_with(begins) && engine.contains(precision), "{engine}");
+        assert!(ended.stderr.contains(&engine), "{engine}: {ended:?}");
     }
     assert!(share_apart(folder.path(), "gpu", "cpu") < 1e-2);
+    // Half precision moves a pattern by a few levels in many pixels, most of all where there is little light.
+    let half = share_apart(folder.path(), "gpu-half", "gpu");
+    assert!(half > 0.0, "computed in single precision");
     let wider = [&RENDER[..5], &["5", "--force", "--backend", "cpu", "--out", "wider"]].concat();
     let wider: Vec<&str> = wider.iter().map(|&arg| if arg == "5" { "--pupil=5" } else { arg }).collect();
     assert!(run(HOLOD, &wider, folder.path()).status.success());

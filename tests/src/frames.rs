@@ -123,6 +123,12 @@ pub fn faults(rows: &[FieldRow], field_order: [&str; 3]) -> Vec<String> {
     found
 }
 
+/// Windows in which a laser was lit at some time from `from_ns` until `until_ns`, of the host's clock.
+pub fn lit_windows(rows: &[FieldRow], from_ns: i64, until_ns: i64) -> usize {
+    let windows = rows.iter().filter_map(|row| row.laser_on_ns.zip(row.laser_off_ns));
+    windows.filter(|(on_ns, off_ns)| *on_ns < until_ns && *off_ns > from_ns).count()
+}
+
 /// Fields that were not lit, between the first and the last one that was: lasers arm at the beginning and are out
 /// before the end.
 pub fn unlit(rows: &[FieldRow]) -> usize {
@@ -182,6 +188,10 @@ mod tests {
             |row| row.t_submit_ns = 2_000,
             |row| row.t_wake_ns = 25,
         ];
+        // The second window is 1120 to 1190.
+        assert_eq!(lit_windows(&good(), 1_090, 1_220), 1);
+        assert_eq!([(1_090, 1_120), (1_190, 1_220)].map(|(from, until)| lit_windows(&good(), from, until)), [0, 0]);
+        assert_eq!([(1_090, 1_121), (1_189, 1_220)].map(|(from, until)| lit_windows(&good(), from, until)), [1, 1]);
         let mut gap = good();
         gap.remove(2);
         assert!(!faults(&gap, RGB).is_empty(), "a field that is not there");

@@ -84,6 +84,7 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     }
     let backend = match backend {
         Backend::Auto if facts.engine.starts_with("cpu") => Backend::Cpu,
+        Backend::Auto if facts.engine.contains("half precision") => Backend::GpuHalf,
         asked => asked,
     };
     if facts.holod != env!("HOLOD_VERSION") {

@@ -1,7 +1,9 @@
 //! `holod check`: what the rig file means, and whether this bench is ready.
 
 pub(super) mod access;
+mod machine;
 mod output;
+mod service;
 
 use std::path::Path;
 
@@ -44,7 +46,12 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
     let runs = checks.iter().all(|check| check.passed);
     checks.push(frames_hz(&rig, network.as_ref().ok().filter(|_| runs), args.resolution));
     checks.push(tracker(&rig));
-    checks.extend(access::access(&rig, args.service, Path::new("/")));
+    let root = Path::new("/");
+    checks.extend(access::access(&rig, args.service, root));
+    if args.service {
+        checks.extend(service::service(&rig, args, root));
+    }
+    checks.extend(machine::machine(&rig, args.service, root));
     checks.extend(output::lasers(&rig));
     checks.extend(output::panel(&rig, output.as_ref()));
     let findings = Findings { ready: checks.iter().all(|check| check.passed), checks, meaning: rig.meaning() };

@@ -44,7 +44,8 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     }
     tracing::info!("{}: tracker {tracker}, panel {output} of {}", rig.name, rig.resolution());
     let weights = progress::during("loading the network", || setup::weights(&rig))?;
-    let pictures = progress::during("loading the scene", || source::named(&args.scene, &rig.geometry))?;
+    let pictures =
+        progress::during("loading the scene", || source::named(&args.scene, args.feed_dark_after, &rig.geometry))?;
     remove_earlier_record(args)?;
     let page = Page::open(&args.page)?;
     let recorder = |folder| Recorder::create(folder, args, &rig, pictures.resolution());
@@ -165,6 +166,7 @@ fn refuse_options(args: &RunArgs, tracker: &TrackerSpec) -> Result<(), Failure> 
         ("--depth-encoding", args.scene.depth_encoding.is_some()),
         ("--fit", args.scene.fit != FitArg::Native),
         ("--resolution", args.scene.resolution.is_some()),
+        ("--feed-dark-after", args.feed_dark_after.is_some()),
         ("--pupil", args.pupil.is_some()),
         ("--eye", args.eye.is_some()),
         ("--scale", args.scale.is_some()),

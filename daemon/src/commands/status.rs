@@ -74,7 +74,11 @@ fn text_of(status: &Snapshot) -> String {
         figures.panel_refresh_hz,
         status.panel_trouble.as_ref().map_or(String::new(), |trouble| format!("; lost: {trouble}")),
         status.lasers,
-        if status.lasers_kept_dark { ", kept dark by `holod ctl lasers dark`" } else { "" },
+        match &status.feed_trouble {
+            _ if status.lasers_kept_dark => ", kept dark by `holod ctl lasers dark`",
+            Some(_) => ", kept dark as the live feed gives no pictures",
+            None => "",
+        },
         status.lasers_trouble.as_ref().map_or(String::new(), |trouble| format!("; {trouble}")),
         figures.engine,
         figures.weights,

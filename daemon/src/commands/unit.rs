@@ -16,11 +16,11 @@ use crate::cli::{Backend, PageAddress, RunArgs, UnitArgs};
 use crate::failure::{Exit, Failure};
 use crate::{report, setup};
 
-const BINARY: &str = "/usr/bin/holod";
+pub(super) const BINARY: &str = "/usr/bin/holod";
 /// The rig that the unit itself names.
-const USUAL_RIG: &str = "/etc/holod/rig.toml";
+pub(super) const USUAL_RIG: &str = "/etc/holod/rig.toml";
 /// Where the unit lets holod write.
-const STATE_FOLDER: &str = "/var/lib/holod";
+pub(super) const STATE_FOLDER: &str = "/var/lib/holod";
 /// Where a tracker may be that has a name and no address.
 const LOCAL_NETWORKS: &str = "link-local 192.168.0.0/16 10.0.0.0/8 172.16.0.0/12";
 
@@ -38,7 +38,7 @@ pub(super) fn unit(args: &UnitArgs) -> Result<(), Failure> {
 }
 
 /// The drop-in for a run with these options, which `words` are; `/dev`, `/proc` and `/sys` are looked at below `root`.
-fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -> Result<String, Failure> {
+pub(super) fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -> Result<String, Failure> {
     let usage = |says: String| Failure::new(Exit::Usage, says);
     let config = run.rig.config.as_deref().ok_or_else(|| usage(format!("name the rig: --config {USUAL_RIG}")))?;
     visible_paths(rig, run).into_iter().try_for_each(|(what, path)| visible(what, &path))?;
@@ -179,7 +179,7 @@ fn stable_name(node: &Path, root: &Path) -> String {
 }
 
 /// Names in a folder that begin so, in order; none where there is no such folder.
-fn names(folder: &Path, prefix: &str) -> Vec<String> {
+pub(super) fn names(folder: &Path, prefix: &str) -> Vec<String> {
     let Ok(entries) = fs::read_dir(folder) else { return Vec::new() };
     let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
     let mut names: Vec<String> = names.filter(|name| name.starts_with(prefix)).collect();
@@ -187,12 +187,12 @@ fn names(folder: &Path, prefix: &str) -> Vec<String> {
     names
 }
 
-fn below(root: &Path, path: &Path) -> PathBuf {
+pub(super) fn below(root: &Path, path: &Path) -> PathBuf {
     root.join(path.strip_prefix("/").unwrap_or(path))
 }
 
 /// The files that the run reads, and what named them.
-fn visible_paths(rig: &Rig, run: &RunArgs) -> Vec<(&'static str, PathBuf)> {
+pub(super) fn visible_paths(rig: &Rig, run: &RunArgs) -> Vec<(&'static str, PathBuf)> {
     let mut paths: Vec<(&str, PathBuf)> = Vec::new();
     paths.extend(run.rig.config.clone().map(|path| ("--config", path)));
     paths.extend(run.record.clone().map(|path| ("--record", path)));
@@ -227,6 +227,30 @@ fn quoted(word: &str) -> String {
     let escaped = word.replace('\\', "\\\\").replace('"', "\\\"").replace('$', "$$").replace('%', "%%");
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_./:,=@+%$".contains(c);
     if !escaped.is_empty() && escaped.chars().all(plain) { escaped } else { format!("\"{escaped}\"") }
+}
+
+/// The words of an `ExecStart=` that [`quoted`] wrote, or a person did as it does.
+pub(super) fn unquoted(line: &str) -> Vec<String> {
+    let mut words = Vec::new();
+    let mut word: Option<String> = None;
+    let mut is_quoted = false;
+    let mut letters = line.chars().peekable();
+    while let Some(letter) = letters.next() {
+        match letter {
+            '"' => {
+                is_quoted = !is_quoted;
+                word.get_or_insert_default();
+            }
+            ' ' | '\t' if !is_quoted => words.extend(word.take()),
+            _ => {
+                let escapes = (letter == '\\') || ("$%".contains(letter) && letters.peek() == Some(&letter));
+                let letter = if escapes { letters.next().unwrap_or(letter) } else { letter };
+                word.get_or_insert_default().push(letter);
+            }
+        }
+    }
+    words.extend(word);
+    words
 }
 
 #[cfg(test)]
@@ -347,6 +371,8 @@ mod tests {
             (";", "\";\""),
         ] {
             assert_eq!(quoted(word), written);
+            let line = format!("{written} --after  {written}");
+            assert_eq!(unquoted(&line), [word, "--after", word], "{line}");
         }
     }
 }

@@ -19,6 +19,7 @@ use tokio::task::AbortHandle;
 
 use super::{Answer, Order, Ordered, Preparer, Request};
 use crate::local_socket;
+use crate::tally_by::{Reason, TallyBy};
 
 /// Connections at once. A further one takes the place of the oldest, so that nobody who only holds on keeps others out.
 const CONNECTIONS: usize = 32;
@@ -67,6 +68,7 @@ impl ControlServer {
             long_work: Semaphore::new(1),
             signal_waits: AtomicBool::new(false),
             under_way: AtomicUsize::new(0),
+            refused: TallyBy::default(),
         };
         let waiting = Arc::new(waiting);
         runtime.spawn(serve(listener, Arc::clone(&waiting)));
@@ -89,6 +91,11 @@ impl ControlServer {
                 Answer::Error(why) => tracing::error!("SIGHUP: {why}"),
             }
         });
+    }
+
+    /// How many requests were refused, by reason.
+    pub(crate) fn refused(&self) -> BTreeMap<String, u64> {
+        self.waiting.refused.map()
     }
 
     /// Where it listens.
@@ -149,7 +156,8 @@ async fn converse(stream: UnixStream, desk: &Arc<Waiting>) -> io::Result<()> {
         let answer = if is_whole {
             answer(&line, desk).await
         } else {
-            Answer::Error(format!("a request without an end was found, expected a line of at most {LONGEST} bytes"))
+            let why = format!("a request without an end was found, expected a line of at most {LONGEST} bytes");
+            desk.refuse(Refused::Malformed, why)
         };
         let mut bytes = serde_json::to_vec(&answer).map_err(io::Error::other)?;
         bytes.push(b'\n');
@@ -163,7 +171,7 @@ async fn converse(stream: UnixStream, desk: &Arc<Waiting>) -> io::Result<()> {
 async fn answer(line: &[u8], desk: &Arc<Waiting>) -> Answer {
     match serde_json::from_slice(line) {
         Ok(request) => answer_to(request, desk).await,
-        Err(error) => Answer::Error(format!("the request is not understood: {error}")),
+        Err(error) => desk.refuse(Refused::Malformed, format!("the request is not understood: {error}")),
     }
 }
 
@@ -175,7 +183,9 @@ async fn answer_to(request: Request, desk: &Arc<Waiting>) -> Answer {
     }
     match desk.long_work.try_acquire() {
         Ok(alone) => take_time(request, desk, alone).await,
-        Err(_) => Answer::Error("holod is busy with another scene, other weights or the rig file: ask again".into()),
+        Err(_) => {
+            desk.refuse(Refused::Busy, "holod is busy with another scene, other weights or the rig file: ask again")
+        }
     }
 }
 
@@ -186,7 +196,7 @@ async fn take_time(request: Request, desk: &Arc<Waiting>, alone: SemaphorePermit
     drop(alone);
     match prepared {
         Ok(prepared) => hand_over(prepared, request, desk).await,
-        Err(_panic) => Answer::Error("holod failed over this request, and goes on: see its log".into()),
+        Err(_panic) => desk.refuse(Refused::Failed, "holod failed over this request, and goes on: see its log"),
     }
 }
 
@@ -194,17 +204,18 @@ async fn take_time(request: Request, desk: &Arc<Waiting>, alone: SemaphorePermit
 async fn hand_over(prepared: Result<Order, String>, request: Request, desk: &Waiting) -> Answer {
     let order = match prepared {
         Ok(order) => order,
-        Err(why) => return Answer::Error(why),
+        Err(why) => return desk.refuse(Refused::Impossible, why),
     };
     let (answer, answered) = oneshot::channel();
-    let ending = || Answer::Error("holod is ending".into());
+    let ending = || desk.refuse(Refused::Unanswered, "holod is ending");
     if desk.orders.send(Ordered { order, request, answer }).is_err() {
         return ending();
     }
     match tokio::time::timeout(PATIENCE, answered).await {
-        Ok(Ok(answer)) => answer,
+        Ok(Ok(Answer::Error(why))) => desk.refuse(Refused::Declined, why),
+        Ok(Ok(done)) => done,
         Ok(Err(_dropped)) => ending(),
-        Err(_elapsed) => Answer::Error("holod's control thread does not answer: see its log".into()),
+        Err(_elapsed) => desk.refuse(Refused::Unanswered, "holod's control thread does not answer: see its log"),
     }
 }
 
@@ -234,6 +245,40 @@ struct Waiting {
     signal_waits: AtomicBool,
     /// Requests that have no answer yet.
     under_way: AtomicUsize,
+    refused: TallyBy<Refused>,
+}
+
+/// Why a request was not carried out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Refused {
+    /// It is none that holod knows.
+    Malformed,
+    /// Another one took its time.
+    Busy,
+    /// What it asks for is not there, or does not fit this run.
+    Impossible,
+    /// The run did not take it, or the laser box did not acknowledge darkness.
+    Declined,
+    /// holod failed over it.
+    Failed,
+    /// The run did not say anything, or was ending.
+    Unanswered,
+}
+
+impl Reason for Refused {
+    const ALL: &'static [Self] =
+        &[Self::Malformed, Self::Busy, Self::Impossible, Self::Declined, Self::Failed, Self::Unanswered];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Malformed => "malformed",
+            Self::Busy => "busy",
+            Self::Impossible => "impossible",
+            Self::Declined => "declined",
+            Self::Failed => "failed",
+            Self::Unanswered => "unanswered",
+        }
+    }
 }
 
 thread_local! {
@@ -246,6 +291,12 @@ pub(crate) fn panic_is_caught() -> bool {
 }
 
 impl Waiting {
+    /// The answer to a request that is not carried out, which is counted.
+    fn refuse(&self, reason: Refused, why: impl Into<String>) -> Answer {
+        self.refused.count(reason);
+        Answer::Error(why.into())
+    }
+
     fn prepare_long(&self, request: &Request) -> Result<Order, String> {
         CATCHES_PANICS.set(true);
         let order = catch_unwind(AssertUnwindSafe(|| self.preparer.prepare(request)));

@@ -4,7 +4,6 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
 
 use axum::extract::{Request, State};
 use axum::http::header::{AUTHORIZATION, COOKIE, HOST, LOCATION, SET_COOKIE, WWW_AUTHENTICATE};
@@ -13,7 +12,7 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use subtle::ConstantTimeEq;
 
-use super::live::Live;
+use super::live::{Live, Refused};
 
 const SHORTEST: usize = 16;
 const COOKIE_NAME: &str = "holod_token";
@@ -92,6 +91,14 @@ pub(super) enum Admission {
 }
 
 impl Door {
+    /// Why it stops whom it stops.
+    fn reason(&self) -> Refused {
+        match self {
+            Self::Token(_) => Refused::Token,
+            Self::OwnName | Self::Open => Refused::Name,
+        }
+    }
+
     /// Decides by a request's query and headers.
     pub(super) fn decide(&self, query: Option<&str>, headers: &HeaderMap) -> Admission {
         match self {
@@ -129,7 +136,7 @@ pub(super) async fn admit(State(keeper): State<Arc<Doorkeeper>>, request: Reques
         Admission::In => next.run(request).await,
         Admission::ByCookie(answer) => answer,
         Admission::Refused(answer) => {
-            keeper.live.refused.fetch_add(1, Ordering::Relaxed);
+            keeper.live.refused.count(keeper.door.reason());
             answer
         }
     }

@@ -1,7 +1,7 @@
 //! What viewers are told: the newest snapshot, and batches of what happened, each put into words once for all of them.
 
 use std::collections::VecDeque;
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use arc_swap::ArcSwapOption;
@@ -12,6 +12,7 @@ use tokio::sync::broadcast;
 use super::metrics::Latencies;
 use crate::logging::Line;
 use crate::snapshot::Snapshot;
+use crate::tally_by::{Reason, TallyBy};
 
 /// What a viewer who comes is told of what was before: ten seconds.
 const REMEMBERED: usize = 100;
@@ -28,8 +29,40 @@ pub(super) struct Live {
     /// Who watches.
     pub(super) viewers: AtomicUsize,
     /// Requests that were refused.
-    pub(super) refused: AtomicU64,
+    pub(super) refused: TallyBy<Refused>,
     channel: Mutex<Channel>,
+}
+
+/// Why a request was refused.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Refused {
+    /// It came without the token.
+    Token,
+    /// It asked for this machine by a name that is none of its own.
+    Name,
+    /// Too many connections were open.
+    Connections,
+    /// Too many browsers watched.
+    Viewers,
+    /// It asked for an eye that nobody has.
+    Query,
+    /// Too many asked for a picture.
+    Busy,
+}
+
+impl Reason for Refused {
+    const ALL: &'static [Self] = &[Self::Token, Self::Name, Self::Connections, Self::Viewers, Self::Query, Self::Busy];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Token => "token",
+            Self::Name => "name",
+            Self::Connections => "connections",
+            Self::Viewers => "viewers",
+            Self::Query => "query",
+            Self::Busy => "busy",
+        }
+    }
 }
 
 /// What is sent to everybody, and what newcomers are told first.

@@ -1,5 +1,8 @@
 //! The run's figures for Prometheus, as OpenMetrics text: base units, counters that only grow, histograms of latency.
 
+mod process;
+
+use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -13,6 +16,7 @@ use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 
+use self::process::OfProcess;
 use super::live::Live;
 use crate::logging;
 use crate::record::RecordStand;
@@ -57,7 +61,9 @@ impl Latencies {
 
 /// What is told of the run that `live` follows.
 pub(super) fn registry(live: &Arc<Live>) -> Registry {
-    let mut registry = Registry::with_prefix("holod");
+    let mut all = Registry::default();
+    all.register_collector(Box::new(OfProcess));
+    let registry = all.sub_registry_with_prefix("holod");
     let seconds = || Unit::Seconds;
     let Latencies { frame, sample_to_photon, picture_to_photon } = &live.latencies;
     registry.register_with_unit("frame", "From waking to the submitted levels", seconds(), frame.clone());
@@ -74,7 +80,7 @@ pub(super) fn registry(live: &Arc<Live>) -> Registry {
         picture_to_photon.clone(),
     );
     registry.register_collector(Box::new(OfSnapshot(Arc::clone(live))));
-    registry
+    all
 }
 
 /// All of them as text.
@@ -99,10 +105,8 @@ impl Collector for OfSnapshot {
         let live = &self.0;
         let viewers = live.viewers.load(Ordering::Relaxed) as f64;
         told.gauge("page_viewers", "Browsers that watch the status page", None, viewers)?;
-        let refused = live.refused.load(Ordering::Relaxed);
-        told.counter("page_refused", "Requests that the status page refused", refused)?;
+        told.counters("page_refused", "Requests that the status page refused", "reason", live.refused.each())?;
         told.counter("log_lines_lost", "Lines that standard error did not take", logging::lines_lost())?;
-        own_process(&mut told)?;
         match &*live.snapshot.load() {
             Some(snapshot) => of_run(&mut told, snapshot),
             None => Ok(()),
@@ -137,6 +141,11 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
     for (name, help, is_so) in [
         ("lasers_armed", "Whether lasers may be lit", snapshot.lasers == "armed"),
         ("lasers_kept_dark", "Whether a person keeps the lasers dark", snapshot.lasers_kept_dark),
+        (
+            "feed_keeps_dark",
+            "Whether lasers are dark as the live feed gives no pictures",
+            snapshot.feed_trouble.is_some(),
+        ),
         ("laser_box_lost", "Whether something is wrong with the laser box", snapshot.lasers_trouble.is_some()),
         ("panel_lost", "Whether the panel is lost", snapshot.panel_trouble.is_some()),
         ("paused", "Whether the picture stands still", snapshot.paused),
@@ -154,13 +163,18 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
     told.counter("frames_made", "Frames that were made", figures.frames_made)?;
     told.counter("frames_shown", "Frames that came on the panel", figures.frames_shown)?;
     told.counter("deadline_misses", "Frames that came later than planned", figures.deadline_misses)?;
-    let counts = figures.tracker_counts.iter().map(|(name, count)| (name.as_str(), *count));
-    told.counters("tracker_events", "Samples, connections and rejections by their reason", "event", counts)?;
+    of_tracker(told, &figures.tracker_counts)?;
     if let Some(record) = &figures.record {
         let lost = f64::from(u8::from(record.state == RecordStand::Lost));
         told.gauge("record_lost", "Whether the record was given up", None, lost)?;
         told.counter("record_rows_lost", "Rows of the record that a slow disk left out", record.rows_lost)?;
     }
+    told.counters(
+        "control_refused",
+        "Orders on the control socket that were not carried out",
+        "reason",
+        named(&snapshot.orders_refused),
+    )?;
     let Some(feed) = &figures.feed else { return Ok(()) };
     told.gauge("feed_clients", "Clients of the live feed", None, feed.clients.len() as f64)?;
     let pictures = [
@@ -171,28 +185,41 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
         ("left_out", feed.left_out),
     ];
     told.counters("feed_pictures", "Pictures of the live feed, by what became of them", "fate", pictures)?;
-    told.counter("feed_connections_refused", "Connections that were refused or broken off", feed.connections_refused)
+    told.counters(
+        "feed_connections_refused",
+        "Connections that were refused or broken off",
+        "reason",
+        named(&feed.connections_refused_by),
+    )
+}
+
+/// What came of the tracker, what was not believed of it and why, and what else happened. What can be added up is one
+/// figure with a label, all else has a name of its own.
+fn of_tracker(told: &mut Teller<'_>, counts: &BTreeMap<String, u64>) -> fmt::Result {
+    let (mut rejected, mut faulty, mut events) = (Vec::new(), Vec::new(), Vec::new());
+    for (name, count) in named(counts) {
+        match (name, name.strip_prefix("rejected_")) {
+            ("bytes", _) => {
+                let received = ConstCounter::new(count);
+                told.tell("tracker_received", "What the tracker sent", Some(Unit::Bytes), &received)?;
+            }
+            ("samples", _) => told.counter("tracker_samples", "Samples of the tracker", count)?,
+            ("accepted", _) => told.counter("tracker_accepted_samples", "Samples that were believed", count)?,
+            (_, Some(reason)) => rejected.push((reason, count)),
+            (fault, None) if fault.starts_with("wire_") || fault.starts_with("log_") => faulty.push((fault, count)),
+            (event, None) => events.push((event, count)),
+        }
+    }
+    told.counters("tracker_rejected_samples", "Samples that were not believed", "reason", rejected)?;
+    told.counters("tracker_faulty_messages", "Messages that held no sample", "reason", faulty)?;
+    told.counters("tracker_events", "What else happened at the tracker's link", "event", events)
+}
+
+fn named(counts: &BTreeMap<String, u64>) -> impl Iterator<Item = (&str, u64)> {
+    counts.iter().map(|(name, count)| (name.as_str(), *count))
 }
 
 const PUPIL_STATES: [&str; 4] = ["tracking", "holding", "fallback", "fixed"];
-
-/// Memory, descriptors and threads of this process, where the kernel tells them.
-fn own_process(told: &mut Teller<'_>) -> fmt::Result {
-    let entries = |path| std::fs::read_dir(path).map(|entries| entries.count() as f64);
-    let pages = std::fs::read_to_string("/proc/self/statm").ok();
-    let resident = pages.and_then(|text| text.split_whitespace().nth(1)?.parse::<f64>().ok());
-    if let Some(pages) = resident {
-        let bytes = pages * rustix::param::page_size() as f64;
-        told.gauge("process_resident_memory", "Memory in use", Some(Unit::Bytes), bytes)?;
-    }
-    if let Ok(descriptors) = entries("/proc/self/fd") {
-        told.gauge("process_open_fds", "Open file descriptors", None, descriptors)?;
-    }
-    if let Ok(threads) = entries("/proc/self/task") {
-        told.gauge("process_threads", "Threads", None, threads)?;
-    }
-    Ok(())
-}
 
 struct Teller<'a>(DescriptorEncoder<'a>);
 
@@ -244,5 +271,53 @@ impl Teller<'_> {
             metric.encode(family.encode_family(&labels)?)?;
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use holod_pupil_input::Rejection;
+
+    use super::super::live::Refused;
+    use super::*;
+    use crate::source::feed::FeedStatus;
+
+    #[test]
+    fn rejections_and_refusals_are_told_by_their_reasons() {
+        let live = Arc::new(Live::default());
+        live.refused.count(Refused::Token);
+        let counts = [("bytes", 900), ("samples", 30), ("accepted", 21), ("silences", 2), ("wire_bad_checksum", 4)];
+        let mut tracker_counts: BTreeMap<String, u64> = counts.map(|(name, count)| (name.to_owned(), count)).into();
+        for (count, reason) in Rejection::ALL.into_iter().enumerate() {
+            tracker_counts.insert(format!("rejected_{}", reason.name()), count as u64);
+        }
+        let mut feed = FeedStatus::default();
+        feed.connections_refused_by.insert("full".to_owned(), 3);
+        let mut snapshot = Snapshot { orders_refused: [("busy".to_owned(), 5)].into(), ..Snapshot::default() };
+        snapshot.figures.tracker_counts = tracker_counts;
+        snapshot.figures.feed = Some(feed);
+        live.publish(&snapshot);
+        let told = text(&registry(&live));
+        let has = |line: &str| told.lines().any(|told| told == line);
+        for (count, reason) in Rejection::ALL.into_iter().enumerate() {
+            let line = format!("holod_tracker_rejected_samples_total{{reason=\"{}\"}} {count}", reason.name());
+            assert!(has(&line), "{line} is not in:\n{told}");
+        }
+        for line in [
+            "holod_tracker_received_bytes_total 900",
+            "holod_tracker_samples_total 30",
+            "holod_tracker_accepted_samples_total 21",
+            "holod_tracker_events_total{event=\"silences\"} 2",
+            "holod_tracker_faulty_messages_total{reason=\"wire_bad_checksum\"} 4",
+            "holod_page_refused_total{reason=\"token\"} 1",
+            "holod_page_refused_total{reason=\"viewers\"} 0",
+            "holod_control_refused_total{reason=\"busy\"} 5",
+            "holod_feed_connections_refused_total{reason=\"full\"} 3",
+        ] {
+            assert!(has(line), "{line} is not in:\n{told}");
+        }
+        assert!(!has("holod_tracker_events_total{event=\"samples\"} 30"), "it cannot be added to other events");
+        // The names that Prometheus's own libraries give a process are without a prefix.
+        assert!(told.contains("\nprocess_open_fds ") && !told.contains("holod_process"), "{told}");
     }
 }

@@ -39,7 +39,7 @@ use super::address::PageAddress;
 use super::door::{Door, Doorkeeper, Token, admit};
 use super::eye::{Blind, EyeDesk, Gaze};
 use super::give_up::GivesUp;
-use super::live::{Live, Viewer};
+use super::live::{Live, Refused, Viewer};
 use super::metrics;
 use crate::cli::{focus_of_an_eye, human_pupil};
 use crate::local_socket;
@@ -186,7 +186,7 @@ async fn serve(listener: Listener, router: Router, live: Arc<Live>, patience: Du
             continue;
         };
         let Ok(place) = Arc::clone(&connections).try_acquire_owned() else {
-            live.refused.fetch_add(1, Ordering::Relaxed);
+            live.refused.count(Refused::Connections);
             continue;
         };
         let service = TowerToHyperService::new(router.clone());
@@ -249,7 +249,7 @@ async fn guarded(mut response: Response) -> Response {
 
 async fn events(State(shown): State<Shown>) -> Response {
     let Some(viewer) = Viewer::come(&shown.live, VIEWERS) else {
-        shown.live.refused.fetch_add(1, Ordering::Relaxed);
+        shown.live.refused.count(Refused::Viewers);
         let said = format!("{VIEWERS} browsers watch already: close one of them\n");
         return (StatusCode::SERVICE_UNAVAILABLE, said).into_response();
     };
@@ -285,7 +285,7 @@ async fn eye_picture(State(shown): State<Shown>, query: Result<Query<EyeQuery>, 
     let gaze = match gaze_of(query) {
         Ok(gaze) => gaze,
         Err(why) => {
-            shown.live.refused.fetch_add(1, Ordering::Relaxed);
+            shown.live.refused.count(Refused::Query);
             return (StatusCode::BAD_REQUEST, format!("{why}\n")).into_response();
         }
     };
@@ -302,11 +302,11 @@ async fn eye_picture(State(shown): State<Shown>, query: Result<Query<EyeQuery>, 
             ];
             (headers, seen.png).into_response()
         }
-        Err(why) => {
-            let status =
-                if why == Blind::Busy { StatusCode::TOO_MANY_REQUESTS } else { StatusCode::SERVICE_UNAVAILABLE };
-            (status, format!("{why}\n")).into_response()
+        Err(why @ Blind::Busy) => {
+            shown.live.refused.count(Refused::Busy);
+            (StatusCode::TOO_MANY_REQUESTS, format!("{why}\n")).into_response()
         }
+        Err(why) => (StatusCode::SERVICE_UNAVAILABLE, format!("{why}\n")).into_response(),
     }
 }
 

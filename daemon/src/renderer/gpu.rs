@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter};
 use holod_model::engine::{EngineError, GpuEngine, StageTiming};
-use holod_model::gpu::{Adapters, GpuError};
+use holod_model::gpu::{Adapters, GpuError, Precision};
 use holod_model::optics::PhasePattern;
 use holod_model::{ComplexHologram, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
@@ -21,6 +21,7 @@ pub(super) struct GpuRenderer {
     bench: DisplayGeometry,
     encoder: Arc<PanelEncoder>,
     adapters: Adapters,
+    precision: Precision,
     engine: Engine,
     reopenings_left: u32,
     description: String,
@@ -60,7 +61,7 @@ impl<T> ReadBack<T> {
 }
 
 impl GpuRenderer {
-    /// On the best device of the kind `adapters`.
+    /// On the best device of the kind `adapters`, with features in `precision` where it has that.
     ///
     /// # Errors
     /// There is none, or it lacks what the network needs at the pattern's size.
@@ -69,14 +70,16 @@ impl GpuRenderer {
         bench: &DisplayGeometry,
         encoder: &Arc<PanelEncoder>,
         adapters: Adapters,
+        precision: Precision,
     ) -> Result<Self, EngineError> {
-        let engine = Box::new(GpuEngine::open(weights, bench, &encoder.tables(), adapters)?);
+        let engine = Box::new(GpuEngine::open(weights, bench, &encoder.tables(), adapters, precision)?);
         Ok(Self {
             description: described(&engine, adapters),
             weights: weights.clone(),
             bench: *bench,
             encoder: Arc::clone(encoder),
             adapters,
+            precision,
             engine: Engine::Gpu(engine),
             reopenings_left: REOPENINGS,
             hologram: ReadBack::NONE,
@@ -91,7 +94,8 @@ impl GpuRenderer {
         self.engine = Engine::None(EngineError::Gpu(error.clone()));
         if self.reopenings_left > 0 {
             self.reopenings_left -= 1;
-            match GpuEngine::open(&self.weights, &self.bench, &self.encoder.tables(), self.adapters) {
+            let tables = self.encoder.tables();
+            match GpuEngine::open(&self.weights, &self.bench, &tables, self.adapters, self.precision) {
                 Ok(engine) => {
                     self.description = described(&engine, self.adapters);
                     tracing::warn!("the GPU was opened again: holograms are computed by {}", self.description);
@@ -122,7 +126,11 @@ impl GpuRenderer {
 
 fn described(engine: &GpuEngine, adapters: Adapters) -> String {
     let slow = if adapters == Adapters::Software { ", a processor that plays a GPU" } else { "" };
-    format!("gpu, {}{slow}", engine.device())
+    let precision = match engine.precision() {
+        Precision::Single => "single",
+        Precision::Half => "half",
+    };
+    format!("gpu, {}, {precision} precision{slow}", engine.device())
 }
 
 impl Renderer for GpuRenderer {
@@ -222,7 +230,8 @@ mod tests {
     const PANEL: Resolution = Resolution { width: 41, height: 25 };
 
     fn renderer(encoder: &Arc<PanelEncoder>) -> GpuRenderer {
-        GpuRenderer::new(&Weights::builtin_small(), &DisplayGeometry::DEFAULT, encoder, Adapters::Software)
+        let (weights, bench) = (Weights::builtin_small(), DisplayGeometry::DEFAULT);
+        GpuRenderer::new(&weights, &bench, encoder, Adapters::Software, Precision::Single)
             .expect("Mesa's software device; install mesa-vulkan-drivers")
     }
 

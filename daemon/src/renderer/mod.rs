@@ -9,7 +9,7 @@ use std::sync::Arc;
 use holod_calibration::rig::Rig;
 use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter, Resolution};
 use holod_model::engine::{EngineError, StageTiming};
-use holod_model::gpu::{Adapters, GpuError};
+use holod_model::gpu::{Adapters, GpuError, Precision};
 use holod_model::optics::PhasePattern;
 use holod_model::{ComplexHologram, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
@@ -77,7 +77,7 @@ pub struct Rendered {
 /// A renderer of frames of the pattern's size of `encoder`, on the optics of `bench`.
 ///
 /// `Auto` takes a GPU where there is one that will do, else the processor; `Gpu` a GPU, or where there is none a processor
-/// that plays one.
+/// that plays one. `GpuHalf` is as `Gpu`, in half precision where the device has it.
 ///
 /// # Errors
 /// The backend is not to be had.
@@ -87,16 +87,18 @@ pub fn open(
     bench: &DisplayGeometry,
     encoder: &Arc<PanelEncoder>,
 ) -> Result<Box<dyn Renderer>, Failure> {
+    let precision = if backend == Backend::GpuHalf { Precision::Half } else { Precision::Single };
+    let on_gpu = |adapters| on_gpu(weights, bench, encoder, adapters, precision);
     match backend {
         Backend::Cpu => Ok(Box::new(CpuRenderer::new(weights, bench, encoder, None)?)),
-        Backend::Auto => match on_gpu(weights, bench, encoder, Adapters::Hardware) {
+        Backend::Auto => match on_gpu(Adapters::Hardware) {
             Ok(renderer) => Ok(renderer),
             Err(EngineError::Gpu(error)) => Ok(Box::new(CpuRenderer::new(weights, bench, encoder, Some(&error))?)),
             Err(other) => Err(Failure::because(Exit::Unavailable)(other)),
         },
-        Backend::Gpu => on_gpu(weights, bench, encoder, Adapters::Hardware)
+        Backend::Gpu | Backend::GpuHalf => on_gpu(Adapters::Hardware)
             .or_else(|error| match error {
-                EngineError::Gpu(GpuError::None { .. }) => on_gpu(weights, bench, encoder, Adapters::Software),
+                EngineError::Gpu(GpuError::None { .. }) => on_gpu(Adapters::Software),
                 other => Err(other),
             })
             .map_err(|error| Failure::new(Exit::Unavailable, format!("--backend gpu: {error}"))),
@@ -109,8 +111,9 @@ fn on_gpu(
     bench: &DisplayGeometry,
     encoder: &Arc<PanelEncoder>,
     adapters: Adapters,
+    precision: Precision,
 ) -> Result<Box<dyn Renderer>, EngineError> {
-    Ok(Box::new(gpu::GpuRenderer::new(weights, bench, encoder, adapters)?))
+    Ok(Box::new(gpu::GpuRenderer::new(weights, bench, encoder, adapters, precision)?))
 }
 
 #[cfg(not(feature = "gpu"))]
@@ -119,6 +122,7 @@ fn on_gpu(
     _: &DisplayGeometry,
     _: &Arc<PanelEncoder>,
     _: Adapters,
+    _: Precision,
 ) -> Result<Box<dyn Renderer>, EngineError> {
     Err(GpuError::NotBuilt.into())
 }

@@ -13,6 +13,7 @@ use holod_slm_output::present::{PanelSetup, open_panel};
 use holod_slm_output::{LevelsFrame, Output, OutputControl, OutputOptions, Pacer, PanelEncoder};
 
 use super::desk::{Changes, Desk};
+use super::feed_watch::FeedWatch;
 use super::frame_loop::{FrameLoop, TrainedPupils};
 use super::inputs::{Followed, Inputs, Playback};
 use super::keep::KEEP_SLOTS;
@@ -28,7 +29,7 @@ use crate::control::{self, Preparer, Steering};
 use crate::failure::{Exit, Failure};
 use crate::record::FrameOrders;
 use crate::renderer::{self, Renderer};
-use crate::source::OpenPictures;
+use crate::source::{OpenPictures, Pictures};
 use crate::status::StatusFile;
 use crate::{progress, setup, source, speed};
 
@@ -106,6 +107,10 @@ pub(super) fn build(
     tracing::debug!("tracker `{}` is open, link {}", plan.tracker, tracker.link().name());
 
     let scene = plan.pictures.name().to_owned();
+    let dark_after = match &plan.pictures {
+        Pictures::Feed(feed) => feed.dark_after,
+        Pictures::Scene(_) => None,
+    };
     let OpenPictures { sink, source: pictures, feed } =
         source::open(&plan.pictures, &rig.geometry, t_origin).map_err(Failure::because(Exit::Unavailable))?;
     let options = OutputOptions {
@@ -209,6 +214,7 @@ pub(super) fn build(
         tracker,
         tracker_watch: TrackerWatch::new(&rig.tracker, t_origin),
         feed,
+        feed_watch: FeedWatch::new(dark_after, t_origin),
         record: plan.record,
         desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }),
         signals,

@@ -68,6 +68,11 @@ impl Desk {
         self.server.as_ref().map(|(server, _)| server.socket().to_owned())
     }
 
+    /// How many requests were refused, by reason.
+    pub(super) fn refused(&self) -> BTreeMap<String, u64> {
+        self.server.as_ref().map(|(server, _)| server.refused()).unwrap_or_default()
+    }
+
     pub(super) fn is_paused(&self) -> bool {
         self.changes.steering.is_paused()
     }
@@ -268,7 +273,10 @@ impl Watch<'_> {
 
     fn keep_dark(&mut self, dark: bool, output: &OutputControl) -> Result<Value, String> {
         self.desk.keeps_dark = dark;
-        match (output.keep_dark(dark), dark) {
+        match (output.keep_dark(self.dark_wish()), dark) {
+            (_, false) if self.feed_watch.keeps_dark() => {
+                Ok("lasers are lit again by the rules, once the live feed gives a picture".into())
+            }
             (_, false) => Ok(format!("lasers are lit again by the rules{}", self.pattern_warning()).into()),
             (true, true) => Ok("the lasers are dark, and stay so until `holod ctl lasers arm`".into()),
             (false, true) => {

@@ -183,7 +183,7 @@ impl Playback {
         let cue = self.cue();
         FrameContent {
             picture: &self.pictures[cue.picture],
-            tag: PictureTag { number: cue.number, t_taken: None, order: cue.orders.scene },
+            tag: PictureTag { number: cue.number, order: cue.orders.scene, ..PictureTag::default() },
             pattern: cue.pattern.map(|pattern| &self.patterns[pattern]),
         }
     }

@@ -2,6 +2,7 @@
 
 mod build;
 mod desk;
+mod feed_watch;
 mod frame_loop;
 mod inputs;
 mod keep;

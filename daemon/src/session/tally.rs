@@ -33,6 +33,8 @@ pub(super) struct Tally {
     pub(super) sample_to_photon: Recent,
     pub(super) picture_to_photon: Recent,
     newest_picture: Option<TimeNs>,
+    /// When the feed's picture that the panel shows was taken over.
+    shown_picture_came: Option<TimeNs>,
     pub(super) by_state: BTreeMap<&'static str, u64>,
     pub(super) pupil_range_mm: Option<[f32; 2]>,
     pub(super) beyond_trained: u64,
@@ -73,6 +75,7 @@ impl Tally {
         self.frames_shown += 1;
         self.deadline_misses += u64::from(event.deadline_missed);
         let frame = self.recent.iter().find(|frame| frame.frame == event.frame_id)?;
+        self.shown_picture_came = frame.picture.t_came;
         if let Some(slot) = frame.keep {
             self.kept[slot] = Some((frame.frame, frame.pupil));
         }
@@ -91,6 +94,11 @@ impl Tally {
         self.sample_to_photon.extend(light.sample_to_photon.map(milliseconds));
         self.picture_to_photon.extend(light.picture_to_photon.map(milliseconds));
         Some(light)
+    }
+
+    /// When the feed's picture was taken over that the panel shows, where it shows one.
+    pub(super) const fn shown_picture_came(&self) -> Option<TimeNs> {
+        self.shown_picture_came
     }
 
     /// The pupil that the newest frame was made for.

@@ -13,6 +13,7 @@ use holod_slm_output::output::OutputCounts;
 use holod_slm_output::{FieldEvent, OutputControl};
 
 use super::desk::Desk;
+use super::feed_watch::{FeedPart, FeedSeen, FeedWatch};
 use super::frame_loop::LoopRecord;
 use super::inputs::FIXED_PUPIL;
 use super::laser_watch::LaserBoxWatch;
@@ -48,6 +49,7 @@ pub(super) struct Watch<'a> {
     pub(super) tracker: TrackerControl,
     pub(super) tracker_watch: TrackerWatch,
     pub(super) feed: Option<Feed>,
+    pub(super) feed_watch: FeedWatch,
     pub(super) record: Option<Arc<RecordHealth>>,
     pub(super) desk: Desk,
     pub(super) signals: Signals,
@@ -145,6 +147,7 @@ impl Watch<'_> {
             if self.obey(output)? {
                 return Ok("holod ctl stop".to_owned());
             }
+            self.judge_feed(output, now);
             if self.hangups.as_ref().is_some_and(Hangups::asked) {
                 self.desk.reload();
             }
@@ -180,6 +183,54 @@ impl Watch<'_> {
                 }
             }
         }
+    }
+
+    /// Puts the lasers out where the feed gives no pictures any more, and lets them be lit where it does again.
+    fn judge_feed(&mut self, output: &OutputControl, now: TimeNs) {
+        let Some(feed) = &self.feed else { return };
+        let pulse = feed.pulse();
+        let part = match (pulse.is_live && self.desk.pattern().is_none(), self.desk.is_paused()) {
+            (false, _) => FeedPart::Nothing,
+            (true, true) => FeedPart::Still,
+            (true, false) => FeedPart::Pictures,
+        };
+        let seen = FeedSeen { part, t_newest: pulse.t_newest, t_shown: self.tally.shown_picture_came() };
+        if !self.feed_watch.judge(seen, now) {
+            return;
+        }
+        let acknowledged = output.keep_dark(self.dark_wish());
+        if !self.feed_watch.keeps_dark() {
+            tracing::info!("{}: lasers are lit by the rules", self.why_feed_is_over(part));
+        } else if acknowledged {
+            tracing::warn!("{}", self.feed_trouble().unwrap_or_default());
+        } else {
+            tracing::error!(
+                "{}, but the laser box did not acknowledge darkness: look at the lasers, and switch them off by hand",
+                self.feed_trouble().unwrap_or_default()
+            );
+        }
+        self.write_status(&output.counts(), now);
+    }
+
+    fn why_feed_is_over(&self, part: FeedPart) -> &'static str {
+        match part {
+            FeedPart::Nothing => "the live feed is not shown any more",
+            FeedPart::Pictures | FeedPart::Still => "the live feed gives pictures again",
+        }
+    }
+
+    /// Why lasers are to be kept dark, where they are: what a person asks for comes first.
+    pub(super) fn dark_wish(&self) -> Option<DarkReason> {
+        let feed = self.feed_watch.keeps_dark().then_some(DarkReason::NoPicture);
+        self.desk.keeps_dark().then_some(DarkReason::Asked).or(feed)
+    }
+
+    /// Why the feed keeps lasers dark, where it does.
+    fn feed_trouble(&self) -> Option<String> {
+        let dark_after_s = self.feed_watch.dark_after().filter(|_| self.feed_watch.keeps_dark())?.seconds();
+        let shown = self.feed.as_ref().and_then(Feed::shown);
+        let whose = shown.map_or("the live feed".to_owned(), |name| format!("the feed's client `{name}`"));
+        Some(format!("lasers dark: {whose} has given no new picture for {dark_after_s} s (--feed-dark-after)"))
     }
 
     /// Which limit has been reached.
@@ -296,7 +347,7 @@ impl Watch<'_> {
 
     pub(super) fn write_status(&mut self, output: &OutputCounts, now: TimeNs) {
         let snapshot = self.snapshot(output, now);
-        self.status.write(&snapshot);
+        self.status.write(&snapshot, now);
         self.observer.snapshot(&snapshot);
         let figures = &snapshot.figures;
         tracing::debug!(
@@ -320,6 +371,7 @@ impl Watch<'_> {
             state: self.told.state.name().to_owned(),
             uptime_s: (now - self.t_origin).seconds(),
             control: self.desk.socket(),
+            orders_refused: self.desk.refused(),
             eye: self.rig.tracker.eye.name().to_owned(),
             paused: self.desk.is_paused(),
             lasers_kept_dark: self.desk.keeps_dark(),
@@ -331,6 +383,7 @@ impl Watch<'_> {
             panel_trouble: self.panel.lost().map(|fault| fault.to_string()),
             lasers: if output.armed { "armed" } else { "dark" }.to_owned(),
             lasers_trouble: self.laser_box.trouble().map(str::to_owned),
+            feed_trouble: self.feed_trouble(),
             figures: self.figures(output, now),
         }
     }

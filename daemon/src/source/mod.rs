@@ -7,6 +7,7 @@ pub mod feed;
 pub mod scene;
 
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
 use holod_model::RgbdFrame;
@@ -62,12 +63,16 @@ pub(crate) fn is_feed(spec: &str) -> bool {
     feed_socket(spec).is_some()
 }
 
-/// The scene or the feed that was named.
+/// The scene or the feed that was named; of the latter, lasers are dark when it gives no picture for `dark_after`.
 ///
 /// # Errors
 /// The scene cannot be read, or what was named does not fit on the panel.
-pub fn named(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Pictures, Failure> {
+pub fn named(args: &SceneArgs, dark_after: Option<Duration>, geometry: &DisplayGeometry) -> Result<Pictures, Failure> {
     let Some(socket) = args.scene.as_deref().and_then(feed_socket) else {
+        if dark_after.is_some() {
+            let only = "--feed-dark-after is for a live feed: name it with --scene feed";
+            return Err(Failure::new(Exit::Usage, only));
+        }
         return scene::frames(args, geometry).map(|frames| Pictures::Scene(Arc::new(frames)));
     };
     if args.depth_encoding.is_some() {
@@ -80,7 +85,9 @@ pub fn named(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Pictures, F
         Some(path) => path.into(),
         None => feed::default_socket().map_err(Failure::because(Exit::Unavailable))?,
     };
-    Ok(Pictures::Feed(Arc::new(FeedPlan::new(socket, resolution, args.fit.into()))))
+    let dark_after = dark_after.map(|time| TimeNs(i64::try_from(time.as_nanos()).unwrap_or(i64::MAX)));
+    let plan = FeedPlan { dark_after, ..FeedPlan::new(socket, resolution, args.fit.into()) };
+    Ok(Pictures::Feed(Arc::new(plan)))
 }
 
 /// Pictures on their way, by the threads that hold their parts.
@@ -123,6 +130,8 @@ pub struct PictureTag {
     pub number: u64,
     /// When a feed's client took it, or else when it came.
     pub t_taken: Option<TimeNs>,
+    /// When it was taken over from a feed's client.
+    pub t_came: Option<TimeNs>,
     /// The order that brought its scene, as [`FrameOrders`](crate::record::FrameOrders) counts.
     pub order: u32,
 }
@@ -231,7 +240,7 @@ impl PictureSource {
         match self.output.output_buffer() {
             Shown::Scene { frames, t_start, order } => {
                 let index = frames.index_at((self.t - *t_start).seconds());
-                (&frames.frames[index], PictureTag { number: index as u64, t_taken: None, order: *order })
+                (&frames.frames[index], PictureTag { number: index as u64, order: *order, ..PictureTag::default() })
             }
             Shown::Live { frame, tag } => (frame, *tag),
         }
@@ -251,7 +260,7 @@ mod tests {
     }
 
     fn show(sink: &mut PictureSink, number: u64) {
-        let tag = PictureTag { number, t_taken: Some(TimeNs(number as i64)), order: 0 };
+        let tag = PictureTag { number, t_taken: Some(TimeNs(number as i64)), ..PictureTag::default() };
         sink.show_live(Arc::new(RgbdFrame::black(SIZE)), tag);
     }
 
@@ -285,7 +294,7 @@ mod tests {
         show(&mut sink, 7);
         sink.show_scene(sequence(2), TimeNs(0), 5);
         show(&mut sink, 8);
-        assert_eq!(source.at(TimeNs(0)).1, PictureTag { number: 0, t_taken: None, order: 5 });
+        assert_eq!(source.at(TimeNs(0)).1, PictureTag { order: 5, ..PictureTag::default() });
         sink.go_live();
         assert_eq!(source.at(TimeNs(0)).1.t_taken, None, "until there is a picture");
         show(&mut sink, 9);

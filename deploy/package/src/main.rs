@@ -1,5 +1,7 @@
-//! Writes man pages and shell completions from holod's own command line: `holod-package DIR`.
+//! Writes what the Debian package holds beside binaries: man pages and shell completions from holod's own command line,
+//! and the documentation of the sources, with links that lead to installed files: `holod-package SOURCES DIR`.
 
+mod documentation;
 mod pages;
 
 use std::path::{Path, PathBuf};
@@ -12,11 +14,11 @@ use holod_daemon::cli::Cli;
 
 fn main() -> ExitCode {
     let folders: Vec<PathBuf> = env::args_os().skip(1).map(PathBuf::from).collect();
-    let [folder] = &folders[..] else {
-        eprintln!("holod-package: expected one folder: holod-package DIR");
+    let [sources, folder] = &folders[..] else {
+        eprintln!("holod-package: expected two folders: holod-package SOURCES DIR");
         return ExitCode::from(64);
     };
-    match write(folder) {
+    match write(folder).and_then(|()| documentation::write(sources, &folder.join("doc"))) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("holod-package: cannot write into {}: {error}", folder.display());

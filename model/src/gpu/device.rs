@@ -18,6 +18,8 @@ pub(crate) struct Gpu {
     pub(crate) workgroup_bytes: u32,
     /// The most threads of a workgroup, all along x.
     pub(crate) workgroup_threads: u32,
+    /// Whether its shaders compute in half precision.
+    pub(crate) half_precision: bool,
     /// Nanoseconds to a tick of the timestamps, where the device has them.
     pub(crate) timestamp_ns: Option<f32>,
 }
@@ -80,8 +82,19 @@ impl Gpu {
         let largest_buffer = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
         let workgroup_bytes = limits.max_compute_workgroup_storage_size;
         let workgroup_threads = limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x);
+        let half_precision = !half_precision.is_empty();
         let timestamp_ns = (!timestamps.is_empty()).then(|| queue.get_timestamp_period());
-        Ok(Self { device, queue, name, fault, largest_buffer, workgroup_bytes, workgroup_threads, timestamp_ns })
+        Ok(Self {
+            device,
+            queue,
+            name,
+            fault,
+            largest_buffer,
+            workgroup_bytes,
+            workgroup_threads,
+            half_precision,
+            timestamp_ns,
+        })
     }
 
     /// The device's name, as its driver has it.

@@ -17,6 +17,15 @@ pub enum Adapters {
     Software,
 }
 
+/// What the features of a network are on a GPU, and with them most of what is computed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Precision {
+    /// 32 bits.
+    Single,
+    /// 16 bits, with sums in 32: two products at once. Where the device has none, single precision takes its place.
+    Half,
+}
+
 thread_local! {
     static CATCHES: Cell<bool> = const { Cell::new(false) };
 }

@@ -222,7 +222,7 @@ impl Worker {
                     }
                 }
                 sample.t_arrival = host_now();
-                self.take(sample);
+                self.take(sample, sample.t_sample);
                 self.publish();
             }
             if !repeat {
@@ -241,14 +241,15 @@ impl Worker {
                 return;
             }
             sample.t_arrival = host_now();
-            self.take(sample);
+            self.take(sample, sample.t_sample);
             self.publish();
         }
     }
 
-    fn take(&mut self, sample: PupilSample) {
+    /// Takes a sample that is known from `t_known` on, on the stream's clock.
+    fn take(&mut self, sample: PupilSample, t_known: TimeNs) {
         self.count(Counter::Samples, 1);
-        self.note_decisions(|estimator, tap| estimator.push(sample, |decision| tap.note(decision)));
+        self.note_decisions(|estimator, tap| estimator.push_at(t_known, sample, |decision| tap.note(decision)));
     }
 
     fn finish(&mut self) {
@@ -389,7 +390,7 @@ impl LiveStream {
                     worker.count_sequence(sequence.next(number, sample.eye));
                 }
                 if let Some(sample) = stamper.take(sample, arrival) {
-                    worker.take(sample);
+                    worker.take(sample, arrival);
                 }
             }
             WireEvent::Note => worker.count(Counter::Notes, 1),
@@ -404,7 +405,7 @@ impl LiveStream {
         if *datagrams {
             decoder.finish(&mut take);
         }
-        stamper.rest(arrival, |sample| worker.take(sample));
+        stamper.rest(arrival, |sample| worker.take(sample, arrival));
         worker.count(Counter::ClockResets, stamper.resets() - resets);
         worker.shared.clock.set(stamper.report());
     }

@@ -428,3 +428,32 @@ proptest::proptest! {
         proptest::prop_assert_eq!(decided, rows.len());
     }
 }
+
+/// As after the tracker's clock stood or was set back by less than makes a new one of it: for a while samples are taken
+/// to be older than they are.
+#[test]
+fn a_return_with_samples_that_are_old_by_then_slides_from_what_is_shown() {
+    for (late_ms, hold_ms) in [(0, 1000), (300, 1000), (400, 1000), (300, 100), (300, 300)] {
+        let settings = EstimatorSettings { hold: TimeNs(hold_ms * 1_000_000), ..settings(rig::Eye::Left) };
+        // What is older than `hold` slides away while the difference is worked off.
+        let fastest_mm_per_s = settings.return_mm_per_s + settings.fallback_mm_per_s + 0.01;
+        let mut estimator = Estimator::new(settings);
+        let mut push = |from_ms: i64, to_ms: i64, mm: f32, late_ms: i64, shown: &mut Vec<f32>| {
+            for t_ms in (from_ms..to_ms).step_by(5) {
+                let known = TimeNs((t_ms + late_ms) * 1_000_000);
+                let before = estimator.pupil_at(known).pupil.mm();
+                estimator.push_at(known, sample(t_ms, SampleEye::Left, mm), |_| {});
+                shown.extend([before, estimator.pupil_at(known).pupil.mm()]);
+            }
+        };
+        push(0, 1000, 5.0, 0, &mut Vec::new());
+        // A loss in which the pupil has become another one, and is believed again some time after.
+        push(1000, 1100, 0.0, 0, &mut Vec::new());
+        let mut shown = Vec::new();
+        push(1100, 3500, 2.0, late_ms, &mut shown);
+        let jumps = shown.windows(2).map(|pair| (pair[1] - pair[0]).abs());
+        let greatest_mm = jumps.fold(0.0, f32::max);
+        let most_mm = fastest_mm_per_s * 5e-3;
+        assert!(greatest_mm <= most_mm, "{late_ms} ms late, held for {hold_ms} ms: {greatest_mm} mm in 5 ms");
+    }
+}

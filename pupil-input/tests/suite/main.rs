@@ -2,6 +2,7 @@
 
 mod clock;
 mod core_network;
+mod day;
 mod export;
 mod eye;
 mod filters;

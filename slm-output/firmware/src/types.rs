@@ -213,6 +213,7 @@ dark_reasons! {
     SyncDisagrees, "sync-disagrees", "the edges on the box's sync wire are not those of the frames that holod knows of";
     PanelLost, "panel-lost", "the panel is gone";
     Balance, "balance", "another colour has been lit for less time";
+    NoPicture, "no-picture", "the live feed has given no new picture for the time of --feed-dark-after";
     Shutdown, "shutdown", "an orderly end";
     Panic, "panic", "a thread of holod failed";
     Asked, "asked", "as asked";

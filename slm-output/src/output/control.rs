@@ -9,7 +9,7 @@ use std::time::Duration;
 use holod_calibration::TimeNs;
 
 use super::panel_thread::ring;
-use super::shared::{DARK, NOT_YET, OutputCounts, Shared};
+use super::shared::{DARK, NOT_YET, OutputCounts, Shared, code_of, dark_request, dark_request_parts};
 use super::{Clock, SLEEP_MAX};
 use crate::fields::LevelsFrame;
 use crate::laser::DarkReason;
@@ -57,12 +57,12 @@ impl OutputControl {
         self.switch.clone()
     }
 
-    /// Keeps the lasers dark until this is taken back; then they are lit again by the rules. Waits for the box, some two
-    /// seconds at most; whether it has acknowledged. They are kept dark also where it has not.
-    pub fn keep_dark(&self, dark: bool) -> bool {
+    /// Keeps the lasers dark for the reason `why` until this is taken back with none; then they are lit again by the rules.
+    /// Waits for the box, some two seconds at most; whether it has acknowledged. They are kept dark also where it has not.
+    pub fn keep_dark(&self, why: Option<DarkReason>) -> bool {
         let shared = &self.switch.shared;
-        let before = shared.dark_request.load(Ordering::Acquire);
-        let request = ((before >> 1) + 1) << 1 | u64::from(dark);
+        let (before, _) = dark_request_parts(shared.dark_request.load(Ordering::Acquire));
+        let request = dark_request(before + 1, why);
         shared.dark_request.store(request, Ordering::Release);
         self.switch.laser.unpark();
         let t_end = (self.clock)() + KEEP_DARK_WAIT;
@@ -141,8 +141,7 @@ pub struct DarkSwitch {
 impl DarkSwitch {
     /// Asks the laser thread for darkness; the first reason stays. Does not wait.
     pub fn dark(&self, reason: DarkReason) {
-        let code = 1 + DarkReason::ALL.iter().position(|&known| known == reason).unwrap_or_default() as u8;
-        let _first = self.shared.latch.compare_exchange(0, code, Ordering::AcqRel, Ordering::Acquire);
+        let _first = self.shared.latch.compare_exchange(0, code_of(Some(reason)), Ordering::AcqRel, Ordering::Acquire);
         self.laser.unpark();
     }
 

@@ -9,7 +9,7 @@ use rtrb::{Consumer, Producer};
 
 use super::ledger::Ledger;
 use super::panel_thread::PanelNews;
-use super::shared::{DARK, FAILED, NOT_YET, Shared, count};
+use super::shared::{DARK, FAILED, NOT_YET, Shared, count, dark_request_parts};
 use super::{Clock, SLEEP_MAX};
 use crate::laser::{BoxEvent, DarkReason, LaserBox, LaserError, LaserProgram};
 use crate::schedule::{FieldDecision, FieldScheduler, Orders};
@@ -25,7 +25,7 @@ pub(super) struct LaserThread {
     pub(super) ledger: Ledger,
     /// What went wrong with the box, for whoever tells people.
     pub(super) faults: Producer<LaserError>,
-    /// The last of a person's requests for darkness, or to take it back.
+    /// The last of the requests for darkness, or to take it back.
     pub(super) dark_request: u64,
     /// A box that failed is left alone until then.
     pub(super) t_retry: TimeNs,
@@ -61,7 +61,7 @@ impl LaserThread {
         }
         let request = self.shared.dark_request.load(Ordering::Acquire);
         if request != std::mem::replace(&mut self.dark_request, request) {
-            let orders = self.scheduler.hold(request & 1 == 1);
+            let orders = self.scheduler.hold(dark_request_parts(request).1);
             let answer = self.darkness(orders, now);
             self.shared.dark_answer.store(request << 2 | u64::from(answer), Ordering::Release);
         }
@@ -97,7 +97,11 @@ impl LaserThread {
                 self.scheduler.box_went_dark();
                 dark = Some(DarkReason::BoxFault);
             } else {
-                dark = self.obey(orders, now).or(dark);
+                let unlit = self.obey(orders, now);
+                if unlit.is_some() && orders.light.is_some() {
+                    self.scheduler.stayed_dark();
+                }
+                dark = unlit.or(dark);
             }
             self.ledger.field(&shown, dark, &self.shared);
         }

@@ -38,7 +38,7 @@ pub(super) struct Shared {
     pub(super) latch: AtomicU8,
     /// What the box said to that.
     pub(super) acknowledged: AtomicU8,
-    /// Whether a person asks for darkness, in the lowest bit; above it the number of the request.
+    /// A [`dark_request`].
     pub(super) dark_request: AtomicU64,
     /// The request that has been obeyed, and the box's answer in the two lowest bits.
     pub(super) dark_answer: AtomicU64,
@@ -75,9 +75,28 @@ impl Shared {
     }
 
     pub(super) fn latched(&self) -> Option<DarkReason> {
-        let code = self.latch.load(Ordering::Acquire);
-        DarkReason::ALL.get(usize::from(code).wrapping_sub(1)).copied()
+        reason_of(self.latch.load(Ordering::Acquire))
     }
+}
+
+/// 1 + the reason's index, or 0.
+pub(super) fn code_of(reason: Option<DarkReason>) -> u8 {
+    let index = |reason| DarkReason::ALL.iter().position(|&known| known == reason);
+    reason.and_then(index).map_or(0, |index| 1 + index as u8)
+}
+
+fn reason_of(code: u8) -> Option<DarkReason> {
+    DarkReason::ALL.get(usize::from(code).wrapping_sub(1)).copied()
+}
+
+/// Asks for darkness with the number of the request: why, as [`code_of`], in the lowest eight bits.
+pub(super) fn dark_request(number: u64, why: Option<DarkReason>) -> u64 {
+    number << 8 | u64::from(code_of(why))
+}
+
+/// The number of a request, and why it asks for darkness, where it does.
+pub(super) fn dark_request_parts(request: u64) -> (u64, Option<DarkReason>) {
+    (request >> 8, reason_of(request as u8))
 }
 
 /// One more.

@@ -9,7 +9,7 @@ use proptest::prelude::*;
 use rtrb::Producer;
 
 use super::panel_thread::PanelNews;
-use super::shared::DARK;
+use super::shared::{DARK, dark_request};
 use super::*;
 use crate::fields::{FrameLayout, FrameTag};
 use crate::laser::verify::{EdgeReport, Finding, verify_edges};
@@ -233,20 +233,22 @@ fn times_that_nobody_saw_light_nothing() {
 
 #[test]
 fn lasers_that_are_kept_dark_stay_so_until_that_is_taken_back() {
-    for mode in MODES {
+    for (mode, reason) in MODES.into_iter().zip([DarkReason::Asked, DarkReason::NoPicture].into_iter().cycle()) {
         let mut bench = Bench::new(mode);
         bench.run(TimeNs(300 * MS), TimeNs(0));
-        bench.laser.shared.dark_request.store(3, Ordering::Release);
+        let request = dark_request(1, Some(reason));
+        bench.laser.shared.dark_request.store(request, Ordering::Release);
         let t_asked = bench.now + TimeNs(MS);
         bench.wake(t_asked);
-        let &[(t_dark, DarkReason::Asked)] = bench.darks.as_slice() else { panic!("{:?}", bench.darks) };
+        let &[(t_dark, told)] = bench.darks.as_slice() else { panic!("{:?}", bench.darks) };
+        assert_eq!(told, reason);
         assert!((0..1000).contains(&(t_asked.0 - t_dark.0)), "{t_dark:?} {t_asked:?}");
         let edges = bench.edges.len();
         bench.run(TimeNs(600 * MS), TimeNs(0));
         assert_eq!(bench.edges.len(), edges);
-        assert_eq!(bench.all_events.last().unwrap().dark, Some(DarkReason::Asked));
-        assert_eq!(bench.laser.shared.dark_answer.load(Ordering::Acquire), 3 << 2 | u64::from(DARK));
-        bench.laser.shared.dark_request.store(4, Ordering::Release);
+        assert_eq!(bench.all_events.last().unwrap().dark, Some(reason));
+        assert_eq!(bench.laser.shared.dark_answer.load(Ordering::Acquire), request << 2 | u64::from(DARK));
+        bench.laser.shared.dark_request.store(dark_request(2, None), Ordering::Release);
         bench.run(TimeNs(900 * MS), TimeNs(0));
         assert!(bench.edges.len() > edges + 10, "lit again by the rules");
         assert_eq!(bench.verdict().unsafe_findings().collect::<Vec<_>>(), Vec::<&Finding>::new());
@@ -501,10 +503,11 @@ fn the_real_threads_show_light_and_end_in_order() {
 
 #[test]
 fn darkness_that_is_asked_for_is_acknowledged_each_time_or_said_not_to_be() {
+    const ASKED: Option<DarkReason> = Some(DarkReason::Asked);
     let rig = rig(PanelMode::ChannelPacked);
     let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
     let output = headless(&rig, &encoder, OutputOptions::default());
-    assert!(output.control.keep_dark(true) && output.control.keep_dark(true) && output.control.keep_dark(false));
+    assert!(output.control.keep_dark(ASKED) && output.control.keep_dark(ASKED) && output.control.keep_dark(None));
     // A box that fails is not dark because nothing new is heard of it.
     let panel = HeadlessPanel::new(&PanelSetup::new(&rig.panel, &encoder), host_now(), ReportFaults::NONE);
     let fails = Arc::new(AtomicBool::new(false));
@@ -512,9 +515,9 @@ fn darkness_that_is_asked_for_is_acknowledged_each_time_or_said_not_to_be() {
     let options = OutputOptions::default();
     let failing = Output::start(&rig, &encoder, Box::new(panel), Box::new(laser), options, host_now).unwrap();
     fails.store(true, Ordering::Relaxed);
-    assert!(!failing.control.keep_dark(true) && !failing.control.keep_dark(true));
+    assert!(!failing.control.keep_dark(ASKED) && !failing.control.keep_dark(ASKED));
     fails.store(false, Ordering::Relaxed);
-    assert!(failing.control.keep_dark(true));
+    assert!(failing.control.keep_dark(ASKED));
 }
 
 #[test]

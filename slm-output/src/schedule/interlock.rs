@@ -58,8 +58,8 @@ pub(super) struct Interlock {
     armed: bool,
     /// Set for good by shutdown and panic.
     latched: Option<DarkReason>,
-    /// A person has asked for darkness, and not taken that back.
-    held: bool,
+    /// Why darkness is asked for, until that is taken back.
+    held: Option<DarkReason>,
     /// The last refresh known to be shown.
     t_known: Option<TimeNs>,
     /// When the frame that is shown was new.
@@ -76,7 +76,7 @@ impl Interlock {
             stall_timeout,
             armed: false,
             latched: None,
-            held: false,
+            held: None,
             t_known: None,
             t_new_frame: TimeNs(i64::MIN),
         }
@@ -148,15 +148,14 @@ impl Interlock {
         Orders { dark: Some(reason), ..Orders::default() }
     }
 
-    /// A person asks for darkness, or takes that back: lasers are lit again by the rules then.
+    /// Darkness is asked for and why, or that is taken back: lasers are lit again by the rules then.
     /// The box is told even where it should be dark already, so that its answer says that it is.
-    pub(super) fn hold(&mut self, held: bool) -> Orders {
+    pub(super) fn hold(&mut self, held: Option<DarkReason>) -> Orders {
         self.held = held;
-        if !held {
-            return Orders::default();
+        if held.is_some() {
+            self.armed = false;
         }
-        self.armed = false;
-        Orders { dark: Some(DarkReason::Asked), ..Orders::default() }
+        Orders { dark: held, ..Orders::default() }
     }
 
     /// Puts the lasers out for `reason` if they are armed.
@@ -181,8 +180,8 @@ impl Interlock {
         if !field.repeated && field.reported {
             self.t_new_frame = field.t_present.min(now);
         }
-        if self.held {
-            return Err(DarkReason::Asked);
+        if let Some(reason) = self.held {
+            return Err(reason);
         }
         if !self.evidence.accepts(field.provenance) {
             return Err(DarkReason::Untrusted);

@@ -146,11 +146,14 @@ impl FieldScheduler {
         if orders.arm {
             self.balance = Balance::new(&self.layout, self.gate.width());
         }
-        if let Some(window) = orders.light
-            && !self.balance.take(window.colour, window.t_off - window.t_on.max(now))
-        {
-            orders.light = None;
-            dark = Some(DarkReason::Balance);
+        if let Some(window) = &mut orders.light {
+            let t_begin = window.t_on.max(now);
+            let taken = self.balance.take(shown.field, window.t_off - t_begin);
+            window.t_off = t_begin + taken;
+            if taken == TimeNs(0) {
+                orders.light = None;
+                dark = Some(DarkReason::Balance);
+            }
         }
         Some(FieldDecision { shown, orders, dark })
     }
@@ -178,8 +181,13 @@ impl FieldScheduler {
         self.interlock.box_went_dark();
     }
 
-    /// A person asks for darkness, or takes that back.
-    pub fn hold(&mut self, held: bool) -> Orders {
+    /// The window that was ordered last stayed dark at the box.
+    pub fn stayed_dark(&mut self) {
+        self.balance.give_back();
+    }
+
+    /// Darkness is asked for and why, or that is taken back.
+    pub fn hold(&mut self, held: Option<DarkReason>) -> Orders {
         self.interlock.hold(held)
     }
 

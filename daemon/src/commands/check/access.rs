@@ -17,11 +17,11 @@ const SERVICE_GROUPS: [&str; 3] = ["dialout", "video", "render"];
 /// What the unit hides (`ProtectHome=`, `PrivateTmp=`).
 pub(in crate::commands) const HIDDEN_FROM_SERVICE: [&str; 5] = ["/home", "/root", "/run/user", "/tmp", "/var/tmp"];
 /// What the panel's, lasers' and tracker's threads ask for.
-const REALTIME_PRIORITY: u64 = 10;
+pub(super) const REALTIME_PRIORITY: u64 = 10;
 
 /// Who is to run holod.
 #[derive(Debug)]
-enum Runner {
+pub(super) enum Runner {
     Caller,
     Service { uid: u32, gids: Vec<u32> },
 }
@@ -39,7 +39,7 @@ pub(super) fn access(rig: &Rig, service: bool, root: &Path) -> Vec<Check> {
 }
 
 /// One line: what is wrong, or what is right.
-fn named(name: &'static str, found: Result<String, Vec<String>>) -> Check {
+pub(super) fn named(name: &'static str, found: Result<String, Vec<String>>) -> Check {
     match found {
         Ok(says) => Check { name, passed: true, says },
         Err(faults) => Check { name, passed: false, says: faults.join("; ") },
@@ -47,12 +47,7 @@ fn named(name: &'static str, found: Result<String, Vec<String>>) -> Check {
 }
 
 fn devices(rig: &Rig, runner: &Runner) -> Result<String, Vec<String>> {
-    let mut paths: Vec<PathBuf> = rig.lasers.driver.paths().into_iter().map(Path::to_path_buf).collect();
-    paths.extend(rig.tracker.spec.as_ref().and_then(|spec| match spec.parse() {
-        Ok(TrackerSpec::Serial { path, .. }) => Some(path),
-        Ok(TrackerSpec::Path(path)) if path.starts_with("/dev") => Some(path),
-        _ => None,
-    }));
+    let mut paths = serial_ports_of(rig);
     // One that is not there is named elsewhere.
     paths.retain(|path| path.exists());
     let faults: Vec<String> = paths
@@ -70,7 +65,18 @@ fn devices(rig: &Rig, runner: &Runner) -> Result<String, Vec<String>> {
     }
 }
 
-fn cure(path: &Path, runner: &Runner) -> String {
+/// The serial ports that the rig names: those of the laser box, then the tracker's.
+pub(super) fn serial_ports_of(rig: &Rig) -> Vec<PathBuf> {
+    let lasers = rig.lasers.driver.paths().into_iter().map(Path::to_path_buf);
+    let tracker = rig.tracker.spec.as_ref().and_then(|spec| match spec.parse() {
+        Ok(TrackerSpec::Serial { path, .. }) => Some(path),
+        Ok(TrackerSpec::Path(path)) if path.starts_with("/dev") => Some(path),
+        _ => None,
+    });
+    lasers.chain(tracker).collect()
+}
+
+pub(super) fn cure(path: &Path, runner: &Runner) -> String {
     let gid = fs::metadata(path).map(|found| found.gid());
     let group = gid.ok().and_then(|gid| group_name(gid, Path::new("/")));
     match (group.filter(|group| group != "root"), runner) {
@@ -136,25 +142,37 @@ fn realtime(limit: Option<u64>) -> Check {
 }
 
 impl Runner {
-    fn service(root: &Path) -> Result<Self, String> {
+    /// The service's user.
+    ///
+    /// # Errors
+    /// Why there is none, and what makes it.
+    pub(super) fn service(root: &Path) -> Result<Self, String> {
         let field = |line: &str, n: usize| line.split(':').nth(n)?.parse::<u32>().ok();
         let line = line_of("passwd", SERVICE_USER, root)
             .ok_or_else(|| format!("there is no user {SERVICE_USER}: install the package, or run systemd-sysusers"))?;
         let (Some(uid), Some(gid)) = (field(&line, 2), field(&line, 3)) else {
             return Err(format!("/etc/passwd: found `{line}`, expected seven fields"));
         };
-        let added = SERVICE_GROUPS.iter().filter_map(|group| field(&line_of("group", group, root)?, 2));
-        Ok(Self::Service { uid, gids: [gid].into_iter().chain(added).collect() })
+        let mut gids = vec![gid];
+        for group in SERVICE_GROUPS {
+            let line = line_of("group", group, root).and_then(|line| field(&line, 2));
+            gids.push(line.ok_or_else(|| {
+                format!(
+                    "there is no group {group}, and no service without it: systemd-sysusers makes those of the package"
+                )
+            })?);
+        }
+        Ok(Self::Service { uid, gids })
     }
 
-    fn name(&self) -> &'static str {
+    pub(super) fn name(&self) -> &'static str {
         match self {
             Self::Caller => "this user",
             Self::Service { .. } => "the service",
         }
     }
 
-    fn may(&self, path: &Path, wanted: Access) -> bool {
+    pub(super) fn may(&self, path: &Path, wanted: Access) -> bool {
         match self {
             Self::Caller => rustix::fs::access(path, wanted).is_ok(),
             Self::Service { uid, gids } => {
@@ -207,7 +225,11 @@ mod tests {
         let gid = if member { fs::metadata(root.path()).unwrap().gid() } else { 54_321 };
         fs::write(root.path().join("etc/passwd"), "root:x:0:0::/:/bin/sh\nholod:x:64123:64123::/:/bin/false\n")
             .unwrap();
-        fs::write(root.path().join("etc/group"), format!("holod:x:64123:\ndialout:x:{gid}:\n")).unwrap();
+        fs::write(
+            root.path().join("etc/group"),
+            format!("holod:x:64123:\ndialout:x:{gid}:\nvideo:x:54322:\nrender:x:54323:\n"),
+        )
+        .unwrap();
         root
     }
 
@@ -244,6 +266,12 @@ mod tests {
         let checks = access(&Rig::default(), true, root.path());
         assert!(!checks[0].passed && checks[0].says.contains("install the package"), "{}", checks[0].says);
         assert!(access(&Rig::default(), false, root.path()).iter().all(|check| check.passed));
+        let root = machine(true);
+        assert!(access(&Rig::default(), true, root.path())[0].passed);
+        let groups = fs::read_to_string(root.path().join("etc/group")).unwrap();
+        fs::write(root.path().join("etc/group"), groups.replace("render:", "renderer:")).unwrap();
+        let checks = access(&Rig::default(), true, root.path());
+        assert!(!checks[0].passed && checks[0].says.contains("no group render"), "{}", checks[0].says);
     }
 
     #[test]

@@ -114,8 +114,13 @@ function tellState(snapshot) {
   put(at("rig"), snapshot.rig);
   put(at("state"), snapshot.paused ? `${state}, paused` : state);
   at("state").dataset.state = state;
-  put(at("lasers"), `lasers: ${lasers}${snapshot.lasers_kept_dark ? ", by order" : ""}`);
+  put(at("lasers"), `lasers: ${lasers}${whyDark(snapshot)}`);
   at("lasers").dataset.lasers = lasers;
+}
+
+function whyDark(snapshot) {
+  if (snapshot.lasers_kept_dark) return ", by order";
+  return snapshot.feed_trouble ? ", no pictures" : "";
 }
 
 function tellFacts(snapshot) {
@@ -141,6 +146,7 @@ function tellFacts(snapshot) {
     ["Picture to photons", spread(snapshot.picture_to_photon)],
     ["Feed", feed && `${feed.shown ?? "nobody’s pictures are shown"}; ${feed.clients.length} clients, ${feed.taken} pictures, ` +
       `${feed.refused} refused${feed.newest_age_s == null ? "" : `, newest ${number(feed.newest_age_s)} s ago`}`],
+    ["Feed’s trouble", snapshot.feed_trouble],
     ["Feed refused", feed?.last_refusal],
     ["Record", record && `${record.state === "lost" ? `lost: ${record.reason}` : record.folder}` +
       `${record.rows_lost ? `; ${record.rows_lost} rows left out: the disk is too slow` : ""}`],

@@ -12,6 +12,7 @@ use rustix::net::{RecvFlags, SendAncillaryBuffer, SendAncillaryMessage, SendFlag
 
 use super::message::{self, LONGEST, Layout, Message, Outcome, Wrong};
 use super::slots::{Picture, Slots};
+use crate::tally_by::Reason;
 
 /// Messages of one client that are read at once, so that a hasty one leaves time to the others.
 const MESSAGES_AT_ONCE: usize = 64;
@@ -30,15 +31,44 @@ pub(super) enum Gone {
     /// It closed its end, or died.
     Closed,
     /// It was shown out, and told why.
-    Refused(String),
+    Refused(Refusal, String),
+}
+
+/// Why a client is shown out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Refusal {
+    /// There are as many clients as there may be.
+    Full,
+    /// It broke the protocol's rules.
+    Protocol,
+    /// Its pictures do not fit the hologram, or the memory.
+    Pictures,
+    /// It does not read what holod sends.
+    Deaf,
+    /// Its socket failed.
+    Socket,
+}
+
+impl Reason for Refusal {
+    const ALL: &'static [Self] = &[Self::Full, Self::Protocol, Self::Pictures, Self::Deaf, Self::Socket];
+
+    fn name(self) -> &'static str {
+        match self {
+            Self::Full => "full",
+            Self::Protocol => "protocol",
+            Self::Pictures => "pictures",
+            Self::Deaf => "deaf",
+            Self::Socket => "socket",
+        }
+    }
 }
 
 impl From<Errno> for Gone {
     fn from(error: Errno) -> Self {
         match error {
-            Errno::AGAIN => Self::Refused("it does not read what holod sends".into()),
+            Errno::AGAIN => Self::Refused(Refusal::Deaf, "it does not read what holod sends".into()),
             Errno::PIPE | Errno::CONNRESET => Self::Closed,
-            other => Self::Refused(format!("its socket: {other}")),
+            other => Self::Refused(Refusal::Socket, format!("its socket: {other}")),
         }
     }
 }
@@ -96,7 +126,7 @@ impl Client {
             };
             let heard =
                 Message::parse(&bytes[..length]).and_then(|message| self.hear(message, target, clock(), &mut note));
-            heard.map_err(|Wrong(why)| self.show_out(&why))??;
+            heard.map_err(|Wrong(why)| self.show_out(Refusal::Protocol, &why))??;
         }
         Ok(())
     }
@@ -112,11 +142,18 @@ impl Client {
             (Message::Hello { .. }, Some(_)) => Err(Wrong("HELO: a second one was found, expected FRAM".into())),
             (Message::Frame { .. }, None) => Err(Wrong("FRAM: was found first, expected HELO".into())),
             (Message::Hello { format, name }, stream) => {
-                let reader = LiveReader::new(format, &target.geometry, target.resolution, target.fit)
-                    .map_err(|error| Wrong(format!("HELO: {error}")))?;
                 let layout = Layout::of(&format);
-                let memory = shared_memory(layout.bytes())
-                    .map_err(|error| Wrong(format!("holod has no memory for these pictures: {error}")))?;
+                let fits = LiveReader::new(format, &target.geometry, target.resolution, target.fit)
+                    .map_err(|error| format!("HELO: {error}"));
+                let opened = fits.and_then(|reader| {
+                    let memory = shared_memory(layout.bytes());
+                    let memory = memory.map_err(|error| format!("holod has no memory for these pictures: {error}"))?;
+                    Ok((reader, memory))
+                });
+                let (reader, memory) = match opened {
+                    Ok(opened) => opened,
+                    Err(why) => return Ok(Err(self.show_out(Refusal::Pictures, &why))),
+                };
                 self.name = name;
                 let stream = stream.insert(Stream { memory, layout, slots: Slots::default(), reader });
                 Ok(send_ring(&self.socket, stream))
@@ -180,10 +217,10 @@ impl Client {
     }
 
     /// Tells it why it has to go.
-    pub(super) fn show_out(&self, why: &str) -> Gone {
+    pub(super) fn show_out(&self, refusal: Refusal, why: &str) -> Gone {
         // It may be gone already, or deaf.
         let _told = send(&self.socket, &message::nope(why), SendFlags::DONTWAIT | SendFlags::NOSIGNAL);
-        Gone::Refused(why.to_owned())
+        Gone::Refused(refusal, why.to_owned())
     }
 }
 

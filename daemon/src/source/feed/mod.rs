@@ -10,10 +10,11 @@ pub mod fuzzing;
 mod message;
 mod slots;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io;
 use std::os::fd::OwnedFd;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -27,11 +28,12 @@ use rustix::io::Errno;
 use rustix::net::{SocketFlags, SocketType, accept_with};
 use serde::{Deserialize, Serialize};
 
-use self::client::{Client, Gone, Target};
+use self::client::{Client, Gone, Refusal, Target};
 use self::message::Outcome;
 use self::slots::Picture;
 use super::{PictureSink, PictureTag, scene};
 use crate::local_socket::{self, SocketError};
+use crate::tally_by::TallyBy;
 
 /// Clients that may be connected at once.
 const CLIENTS: usize = 8;
@@ -59,12 +61,14 @@ pub struct FeedPlan {
     pub fit: Fit,
     /// What is shown until there is a picture. It lives as long as the plan: an engine keeps the last frame that it has seen.
     pub black: Arc<RgbdFrame>,
+    /// Lasers are dark once no new picture has come for this long; without it the last one stays lit.
+    pub dark_after: Option<TimeNs>,
 }
 
 impl FeedPlan {
     /// Listens at `socket` for pictures to be brought to `resolution`.
     pub fn new(socket: PathBuf, resolution: Resolution, fit: Fit) -> Self {
-        Self { socket, resolution, fit, black: Arc::new(RgbdFrame::black(resolution)) }
+        Self { socket, resolution, fit, black: Arc::new(RgbdFrame::black(resolution)), dark_after: None }
     }
 }
 
@@ -89,6 +93,9 @@ pub struct FeedStatus {
     pub left_out: u64,
     /// Connections that were refused or broken off for what they sent.
     pub connections_refused: u64,
+    /// The same by reason.
+    #[serde(default)]
+    pub connections_refused_by: BTreeMap<String, u64>,
     /// Why a picture or a connection was refused last.
     pub last_refusal: Option<String>,
     /// Seconds since the newest picture was taken over.
@@ -100,6 +107,12 @@ pub struct FeedStatus {
 }
 
 impl FeedStatus {
+    /// That of a feed at `socket` to which nobody has come.
+    fn at(socket: &Path) -> Self {
+        let connections_refused_by = TallyBy::<Refusal>::default().map();
+        Self { socket: socket.to_owned(), connections_refused_by, ..Self::default() }
+    }
+
     fn tell_refusal(&mut self, what: &str, why: &str, now: TimeNs) {
         if self.t_told.is_none_or(|t| now - t >= REFUSAL_EVERY) {
             tracing::warn!("{what} is refused: {why}");
@@ -107,6 +120,15 @@ impl FeedStatus {
         }
         self.last_refusal = Some(why.to_owned());
     }
+}
+
+/// Whether pictures come.
+#[derive(Clone, Copy, Debug)]
+pub struct FeedPulse {
+    /// When the newest picture was taken over.
+    pub t_newest: Option<TimeNs>,
+    /// Whether live pictures are shown, and no scene.
+    pub is_live: bool,
 }
 
 /// Why there is no feed.
@@ -154,7 +176,7 @@ impl Feed {
         let listener = local_socket::listen(&socket, SocketType::SEQPACKET)?;
         let stop = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)
             .map_err(|error| FeedError::Thread(error.into()))?;
-        let status = Arc::new(Mutex::new(FeedStatus { socket: socket.clone(), ..FeedStatus::default() }));
+        let status = Arc::new(Mutex::new(FeedStatus::at(&socket)));
         let shown = Arc::clone(&sink);
         let mut server = Server {
             listener,
@@ -165,8 +187,9 @@ impl Feed {
             frames: (0..FRAMES).map(|_| Arc::new(RgbdFrame::black(resolution))).collect(),
             sink,
             shared: Arc::clone(&status),
-            status: FeedStatus { socket: socket.clone(), ..FeedStatus::default() },
+            status: FeedStatus::at(&socket),
             left_out_of_gone: 0,
+            refused: TallyBy::default(),
         };
         let thread = std::thread::Builder::new()
             .name("holod-feed".into())
@@ -174,6 +197,19 @@ impl Feed {
             .map_err(FeedError::Thread)?;
         tracing::info!("waiting for pictures on {}", socket.display());
         Ok(Self { plan: Arc::clone(plan), sink: shown, stop, thread: Some(thread), status })
+    }
+
+    /// Whether pictures come.
+    pub fn pulse(&self) -> FeedPulse {
+        FeedPulse {
+            t_newest: self.status.lock().unwrap_or_else(PoisonError::into_inner).t_newest,
+            is_live: self.sink.lock().unwrap_or_else(PoisonError::into_inner).is_live(),
+        }
+    }
+
+    /// Whose pictures are shown.
+    pub fn shown(&self) -> Option<String> {
+        self.status.lock().unwrap_or_else(PoisonError::into_inner).shown.clone()
     }
 
     /// How it is at host time `now`.
@@ -210,6 +246,7 @@ struct Server {
     shared: Arc<Mutex<FeedStatus>>,
     status: FeedStatus,
     left_out_of_gone: u64,
+    refused: TallyBy<Refusal>,
 }
 
 impl Server {
@@ -277,7 +314,7 @@ impl Server {
         let client = Client::new(socket, self.connections);
         if self.clients.len() == CLIENTS {
             let full = format!("{CLIENTS} clients are connected already; end one of them");
-            self.refuse(&client.name, &client.show_out(&full));
+            self.refuse(&client.name, &client.show_out(Refusal::Full, &full));
             return;
         }
         self.clients.push((self.connections, client));
@@ -297,7 +334,7 @@ impl Server {
         self.left_out_of_gone = self.left_out_of_gone.saturating_add(client.left_out());
         match gone {
             Gone::Closed => tracing::info!("the feed's client `{}` is gone", client.name),
-            Gone::Refused(_) => self.refuse(&client.name, &gone),
+            Gone::Refused(..) => self.refuse(&client.name, &gone),
         }
         if *shown == Some(number) {
             tracing::info!("the last picture of `{}` stays", client.name);
@@ -306,8 +343,10 @@ impl Server {
     }
 
     fn refuse(&mut self, name: &str, gone: &Gone) {
-        if let Gone::Refused(why) = gone {
+        if let Gone::Refused(reason, why) = gone {
             self.status.connections_refused += 1;
+            self.refused.count(*reason);
+            self.status.connections_refused_by = self.refused.map();
             self.status.tell_refusal(&format!("the feed's client `{name}`"), why, host_now());
         }
     }
@@ -389,7 +428,7 @@ fn take_over(
         let name = format!("the feed's client `{}`", client.name);
         scene::warn_of_oddities(&name, frame, &report, &target.geometry, client.sends_planes());
     }
-    Ok(PictureTag { number: picture.sequence, t_taken: Some(picture.t_taken), order: 0 })
+    Ok(PictureTag { number: picture.sequence, t_taken: Some(picture.t_taken), t_came: Some(now), order: 0 })
 }
 
 /// Counts what became of a picture.

@@ -226,6 +226,8 @@ fn a_client_that_breaks_the_rules_is_told_and_shown_out() {
     };
     told(&foreign, "slot 3 was found, expected 0 to 2");
     bench.until("all are counted", |status| status.connections_refused == 6 && status.clients.is_empty());
+    let by = |reason: &str| bench.status().connections_refused_by[reason];
+    assert_eq!(["protocol", "pictures", "full", "deaf", "socket"].map(by), [5, 1, 0, 0, 0]);
     assert!(bench.status().last_refusal.is_some());
 }
 
@@ -235,6 +237,7 @@ fn the_ninth_client_is_refused_and_takes_a_place_that_is_given_up() {
     let clients: Vec<_> = (0..CLIENTS).map(|number| bench.client(&number.to_string())).collect();
     let mut late = FeedClient::connect(&bench.socket).unwrap();
     assert_eq!(late.answer(), Answer::Nope("8 clients are connected already; end one of them".into()));
+    bench.until("it is counted", |status| status.connections_refused_by["full"] == 1);
     drop(clients);
     bench.until("they are gone", |status| status.clients.is_empty());
     bench.client("late");
@@ -333,6 +336,7 @@ fn a_client_that_never_reads_is_shown_out_and_nobody_waits_for_it() {
     }
     bench.until("it is gone", |status| status.connections_refused > 0 && status.clients.is_empty());
     assert_eq!(bench.status().last_refusal.as_deref(), Some("it does not read what holod sends"));
+    assert_eq!(bench.status().connections_refused_by["deaf"], 1);
     let mut other = bench.client("other");
     assert_eq!(send(&mut other, 0, 1, 255).0, TAKEN);
     assert_eq!(bench.shown().0.amplitude[0], 1.0);

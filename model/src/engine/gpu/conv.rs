@@ -5,8 +5,9 @@
 
 use half::f16;
 
-use super::map::{GROUP, Map, Precision, ROWS};
+use super::map::{GROUP, Map, ROWS};
 use super::plan::{BufferId, Constant, ENABLE_F16, Plan, Shader};
+use crate::gpu::Precision;
 
 pub(super) const TAPS: usize = 9;
 /// Threads of a workgroup, along x.
@@ -19,8 +20,8 @@ impl Precision {
     /// so many a shader has registers left for what it multiplies.
     fn most_part_groups(self) -> usize {
         match self {
-            Self::F32 => 5,
-            Self::F16 => 4,
+            Self::Single => 5,
+            Self::Half => 4,
         }
     }
 
@@ -32,8 +33,8 @@ impl Precision {
     /// A buffer of parameters.
     pub(super) fn table(self, plan: &mut Plan, what: &'static str, parameters: &[f32]) -> BufferId {
         match self {
-            Self::F32 => plan.table(what, parameters),
-            Self::F16 => {
+            Self::Single => plan.table(what, parameters),
+            Self::Half => {
                 let half: Vec<_> = parameters.iter().map(|&value| f16::from_f32(value).to_bits()).collect();
                 plan.table(what, &half)
             }
@@ -86,7 +87,7 @@ impl ConvLayer<'_> {
 
     /// `epilogue.wgsl` and `text` for the vectors of two maps.
     pub(super) fn source(&self, input: &Map, output: &Map, text: &str) -> String {
-        let half = [input, output].iter().any(|map| map.precision == Precision::F16);
+        let half = [input, output].iter().any(|map| map.precision == Precision::Half);
         let (directive, epilogue) = (if half { ENABLE_F16 } else { "" }, include_str!("epilogue.wgsl"));
         let [input, output] = [input, output].map(|map| map.precision.vector());
         format!("{directive}alias InVector = {input};\nalias OutVector = {output};\n\n{epilogue}\n{text}")
@@ -200,8 +201,8 @@ pub(crate) fn convolve(
     constants.extend(layer.epilogue_constants(output));
     constants.extend(input.constants(["IN_GROUPS", "IN_PITCH"]));
     let text = match precision {
-        Precision::F32 => include_str!("conv.wgsl"),
-        Precision::F16 => include_str!("conv_f16.wgsl"),
+        Precision::Single => include_str!("conv.wgsl"),
+        Precision::Half => include_str!("conv_f16.wgsl"),
     };
     let shader = Shader::new(label, &constants, &layer.source(input, output, text), "convolve");
     let workgroups = [output.width.div_ceil(WORKGROUP) * packing.parts, output.height.div_ceil(ROWS), 1];
@@ -241,8 +242,8 @@ pub(super) mod tests {
     /// Whether both are alike.
     pub(in super::super) fn judge(precision: Precision, found: &[f32], expected: &[f64]) -> Result<(), String> {
         let tolerance = match precision {
-            Precision::F32 => TOLERANCE,
-            Precision::F16 => HALF_TOLERANCE,
+            Precision::Single => TOLERANCE,
+            Precision::Half => HALF_TOLERANCE,
         };
         assert_eq!(found.len(), expected.len());
         let rms = (expected.iter().map(|value| value * value).sum::<f64>() / expected.len() as f64).sqrt();
@@ -279,7 +280,7 @@ pub(super) mod tests {
 
     impl Case {
         fn new(size: (usize, usize), inputs: usize, outputs: usize, epilogue: Epilogue) -> Self {
-            let precisions = [Precision::F32; 2];
+            let precisions = [Precision::Single; 2];
             Self {
                 precisions,
                 size,
@@ -330,7 +331,7 @@ pub(super) mod tests {
 
         fn check(&self) {
             let Self { precisions, size, ref inputs, outputs, epilogue, .. } = *self;
-            let worse = if precisions.contains(&Precision::F16) { Precision::F16 } else { Precision::F32 };
+            let worse = if precisions.contains(&Precision::Half) { Precision::Half } else { Precision::Single };
             judge(worse, &self.found(), &self.expected()).unwrap_or_else(|error| {
                 panic!("{precisions:?}, {size:?}, {} to {outputs}, {epilogue:?}: {error}", inputs.len())
             });
@@ -363,7 +364,7 @@ pub(super) mod tests {
     /// Between maps of both precisions; an odd number of groups does not fill its elements.
     #[test]
     fn sums_are_right_in_half_precision() {
-        let (single, half) = (Precision::F32, Precision::F16);
+        let (single, half) = (Precision::Single, Precision::Half);
         for precisions in [[half, half], [single, half], [half, single]] {
             for (size, inputs, outputs) in [((65, 5), 5, 7), ((9, 7), 9, 24)] {
                 Case { precisions, ..Case::new(size, inputs, outputs, Epilogue::ResidualLeaky) }.check();
@@ -389,7 +390,7 @@ pub(super) mod tests {
 
     #[test]
     fn parameters_are_replaced_in_place() {
-        let packing = Packing::new(Precision::F32, 2, 5);
+        let packing = Packing::new(Precision::Single, 2, 5);
         let bias = |factor: f32| (0..18).map(move |output| factor * noise(output));
         let mut parameters = vec![0.0; packing.len()];
         packing.fill(&mut parameters, &[0, 5], bias(1.0), |output, input, tap| noise(100 + output + input + tap));
@@ -407,7 +408,7 @@ pub(super) mod tests {
     fn a_wrong_value_is_seen() {
         let case = Case::new((9, 7), 5, 7, Epilogue::ResidualLeaky);
         let expected = case.expected();
-        for (precision, little) in [(Precision::F32, 1e-3), (Precision::F16, 0.1)] {
+        for (precision, little) in [(Precision::Single, 1e-3), (Precision::Half, 0.1)] {
             let case = Case { precisions: [precision; 2], ..case.clone() };
             for wrong in [little, f32::NAN] {
                 let mut found = case.found();

@@ -4,8 +4,9 @@
 //! each tap gives in single precision.
 
 use super::conv::{ConvLayer, TAPS};
-use super::map::{GROUP, Map, Precision};
+use super::map::{GROUP, Map};
 use super::plan::{Plan, Shader};
+use crate::gpu::Precision;
 use crate::weights::OFFSET_CHANNELS;
 
 /// Threads of a workgroup, along x.
@@ -22,7 +23,7 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
     layer.check((input, input.groups), output);
     assert_eq!((offsets.width, offsets.height), (output.width, output.height));
     assert!(offsets.groups >= OFFSET_CHANNELS.div_ceil(GROUP) && offsets.buffer != output.buffer);
-    assert_eq!(offsets.precision, Precision::F32);
+    assert_eq!(offsets.precision, Precision::Single);
 
     let parts = output.groups.div_ceil(MOST_PART_GROUPS);
     let part_groups = output.groups.div_ceil(parts);
@@ -40,8 +41,8 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
     constants.extend(input.constants(["IN_GROUPS", "IN_PITCH"]));
     constants.extend(offsets.constants(["OFFSET_GROUPS", "OFFSET_PITCH"]));
     let text = match precision {
-        Precision::F32 => concat!(include_str!("deformable_places.wgsl"), include_str!("deformable.wgsl")),
-        Precision::F16 => concat!(include_str!("deformable_places.wgsl"), include_str!("deformable_f16.wgsl")),
+        Precision::Single => concat!(include_str!("deformable_places.wgsl"), include_str!("deformable.wgsl")),
+        Precision::Half => concat!(include_str!("deformable_places.wgsl"), include_str!("deformable_f16.wgsl")),
     };
     let shader = Shader::new(label, &constants, &layer.source(input, output, text), "convolve");
     let workgroups = [output.width.div_ceil(WORKGROUP) * parts, output.height.div_ceil(PIXELS), 1];
@@ -142,12 +143,12 @@ mod tests {
         }
 
         fn new(size: (usize, usize), inputs: usize, outputs: usize, epilogue: Epilogue, offset: Offset) -> Self {
-            Self { precisions: [Precision::F32; 2], size, inputs, outputs, epilogue, offset }
+            Self { precisions: [Precision::Single; 2], size, inputs, outputs, epilogue, offset }
         }
 
         fn check(&self) {
             let Self { precisions, size, inputs, outputs, epilogue, .. } = *self;
-            let worse = if precisions.contains(&Precision::F16) { Precision::F16 } else { Precision::F32 };
+            let worse = if precisions.contains(&Precision::Half) { Precision::Half } else { Precision::Single };
             judge(worse, &self.found(), &self.expected()).unwrap_or_else(|error| {
                 panic!("{precisions:?}, {size:?}, {inputs} to {outputs}, {epilogue:?}: {error}")
             });
@@ -195,7 +196,7 @@ mod tests {
     /// Between maps of both precisions; an odd number of groups does not fill its elements.
     #[test]
     fn sums_are_right_in_half_precision() {
-        let (single, half) = (Precision::F32, Precision::F16);
+        let (single, half) = (Precision::Single, Precision::Half);
         for (precisions, offset) in [([half, half], wild as Offset), ([single, half], moderate), ([half, single], wild)]
         {
             Case { precisions, ..Case::new((65, 3), 5, 12, Epilogue::ResidualLeaky, offset) }.check();
@@ -207,8 +208,8 @@ mod tests {
     fn a_wrong_offset_is_seen() {
         let case = Case::new((9, 7), 5, 7, Epilogue::None, moderate);
         let expected = case.expected();
-        judge(Precision::F32, &case.found(), &expected).expect("the same offsets");
+        judge(Precision::Single, &case.found(), &expected).expect("the same offsets");
         let offset = |channel, y, x| moderate(channel, y, x) + if (channel, y, x) == (4, 3, 2) { 1e-3 } else { 0.0 };
-        judge(Precision::F32, &Case { offset, ..case }.found(), &expected).expect_err("one other offset");
+        judge(Precision::Single, &Case { offset, ..case }.found(), &expected).expect_err("one other offset");
     }
 }

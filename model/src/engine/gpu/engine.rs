@@ -8,12 +8,11 @@ use wgpu::{BufferUsages, QuerySet};
 
 use super::fft::WorkgroupLimits;
 use super::loaded_plan::LoadedPlan;
-use super::map::Precision;
 use super::network::NetworkPlan;
 use super::plan::{BufferId, Plan, Stage};
 use super::shared::pupil_values;
 use crate::engine::{EngineError, StageTiming, StageTimings, check_pupil};
-use crate::gpu::{Adapters, Gpu, GpuError};
+use crate::gpu::{Adapters, Gpu, GpuError, Precision};
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
 
 /// Network, double phase and levels on the GPU, for frames of one size and one panel.
@@ -21,6 +20,7 @@ pub struct GpuEngine {
     gpu: Gpu,
     network: NetworkPlan,
     loaded: LoadedPlan,
+    precision: Precision,
     timestamps: Option<Timestamps>,
     timings: StageTimings,
     readback: Readback,
@@ -59,7 +59,7 @@ const TIMESTAMP_BYTES: u64 = 8;
 
 impl GpuEngine {
     /// An engine for frames of the pattern's size of `tables`, which may be odd, on the optics of `bench`, whose own
-    /// resolution does not matter.
+    /// resolution does not matter. Features are in `precision` where the device has it.
     ///
     /// # Errors
     /// There is no device, it lacks what the network needs at this size, or the size is nothing.
@@ -68,9 +68,10 @@ impl GpuEngine {
         bench: &DisplayGeometry,
         tables: &LevelTables,
         adapters: Adapters,
+        precision: Precision,
     ) -> Result<Self, EngineError> {
         let gpu = Gpu::open(adapters)?;
-        Self::on(gpu, weights, bench, tables)
+        Self::on(gpu, weights, bench, tables, precision)
     }
 
     pub(super) fn on(
@@ -78,9 +79,11 @@ impl GpuEngine {
         weights: &Weights,
         bench: &DisplayGeometry,
         tables: &LevelTables,
+        precision: Precision,
     ) -> Result<Self, EngineError> {
+        let precision = if gpu.half_precision { precision } else { Precision::Single };
         let limits = WorkgroupLimits { bytes: gpu.workgroup_bytes, threads: gpu.workgroup_threads };
-        let mut network = NetworkPlan::new(weights, bench, tables, Precision::F32, limits)?;
+        let mut network = NetworkPlan::new(weights, bench, tables, precision, limits)?;
         let plan = &network.plan;
         let loaded = LoadedPlan::new(&gpu, plan)?;
         let timestamps = match gpu.timestamp_ns {
@@ -109,6 +112,7 @@ impl GpuEngine {
             gpu,
             network,
             loaded,
+            precision,
             timestamps,
             uploaded: None,
             pupil: None,
@@ -118,6 +122,11 @@ impl GpuEngine {
     /// The device's name, as its driver has it.
     pub fn device(&self) -> &str {
         self.gpu.name()
+    }
+
+    /// What its features are.
+    pub fn precision(&self) -> Precision {
+        self.precision
     }
 
     /// Writes the samples of the hologram of `frame` for an eye with `pupil` to `samples`, as the panel takes them.

@@ -1,19 +1,12 @@
 //! Feature maps on the GPU.
 
 use super::plan::{BufferId, Constant, Plan};
+use crate::gpu::Precision;
 
 /// Channels of a group: what one vector of a shader holds.
 pub(crate) const GROUP: usize = 4;
 /// Rows that one thread of a convolution makes.
 pub(crate) const ROWS: usize = 4;
-
-/// What a map's numbers are.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Precision {
-    F32,
-    /// Half precision, which the device has to offer.
-    F16,
-}
 
 /// A feature map [row, group of channels, column, 4] with a border of zeros, one pixel wide, and below it as many rows as
 /// fill the last [`ROWS`]. Nothing but zeros is ever written there.
@@ -32,7 +25,7 @@ pub(crate) struct Map {
 impl Map {
     /// A map of single precision.
     pub(crate) fn new(plan: &mut Plan, what: &'static str, size: (usize, usize), channels: usize) -> Self {
-        Self::with(Precision::F32, plan, what, size, channels)
+        Self::with(Precision::Single, plan, what, size, channels)
     }
 
     pub(crate) fn with(
@@ -45,8 +38,8 @@ impl Map {
         let groups = channels.div_ceil(GROUP);
         let vectors = (height.next_multiple_of(ROWS) + 2) * groups * (width + 2);
         let buffer = match precision {
-            Precision::F32 => plan.buffer::<[f32; GROUP]>(what, vectors),
-            Precision::F16 => plan.buffer::<[u16; GROUP]>(what, vectors),
+            Precision::Single => plan.buffer::<[f32; GROUP]>(what, vectors),
+            Precision::Half => plan.buffer::<[u16; GROUP]>(what, vectors),
         };
         Self { buffer, width, height, groups, precision }
     }
@@ -71,16 +64,16 @@ impl Map {
 impl Precision {
     pub(crate) fn bytes(self) -> usize {
         match self {
-            Self::F32 => 4,
-            Self::F16 => 2,
+            Self::Single => 4,
+            Self::Half => 2,
         }
     }
 
     /// A group of channels in a shader.
     pub(crate) fn vector(self) -> &'static str {
         match self {
-            Self::F32 => "vec4<f32>",
-            Self::F16 => "vec4<f16>",
+            Self::Single => "vec4<f32>",
+            Self::Half => "vec4<f16>",
         }
     }
 }

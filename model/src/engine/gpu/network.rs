@@ -5,7 +5,6 @@ use holod_calibration::{DisplayGeometry, LevelTables, PupilDiameter, Resolution}
 use super::expected_stack::ExpectedStack;
 use super::fft::WorkgroupLimits;
 use super::input_features::InputChannels;
-use super::map::Precision;
 use super::plan::{BufferId, Plan};
 use super::shared::Shared;
 use super::trunk::{self, Modulated};
@@ -13,6 +12,7 @@ use super::upsample::Low;
 use super::{direct, double_phase, levels, upsample};
 use crate::conditions::{Conditions, TrainedRange};
 use crate::engine::EngineError;
+use crate::gpu::Precision;
 use crate::weights::{Family, Grid, Weights};
 
 /// A network with double phase and one panel's levels.

@@ -9,14 +9,13 @@ use proptest::prelude::*;
 
 use super::engine::GpuEngine;
 use super::fft::WorkgroupLimits;
-use super::map::Precision;
 use super::plan::Plan;
 use super::shared::Shared;
 use super::trial::Trial;
 use super::{double_phase, levels};
 use crate::engine::cpu::tests::{OTHER_BENCH, frame};
 use crate::engine::{CpuEngine, EngineError, reference};
-use crate::gpu::{Adapters, GpuError};
+use crate::gpu::{Adapters, GpuError, Precision};
 use crate::optics::DoublePhase;
 use crate::weights::tests::{self as weights_tests, random_weights};
 use crate::weights::{Grid, NetworkConfig};
@@ -192,7 +191,12 @@ fn linear_tables(resolution: Resolution) -> LevelTables {
 }
 
 fn engine(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) -> GpuEngine {
-    GpuEngine::open(weights, bench, &linear_tables(resolution), Adapters::Software).expect("an engine")
+    engine_in(Precision::Single, weights, bench, resolution)
+}
+
+fn engine_in(precision: Precision, weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) -> GpuEngine {
+    let tables = linear_tables(resolution);
+    GpuEngine::open(weights, bench, &tables, Adapters::Software, precision).expect("an engine")
 }
 
 /// Samples and hologram of a frame.
@@ -303,6 +307,31 @@ fn a_frame_of_256_pixels_each_way_is_the_processors() {
     assert!(field_error(&found.field, &expected) > FIELD_TOLERANCE, "the comparison is blind");
 }
 
+/// The largest error of a hologram whose features are in half precision, over its largest value; most of it is rounding of
+/// features that later layers carry on, and an eye sees a hundredth of it.
+const HALF_FIELD_TOLERANCE: f64 = 0.05;
+
+#[test]
+fn whole_networks_in_half_precision_are_near_the_same_in_single() {
+    let frame = Arc::new(frame(Resolution { width: 48, height: 32 }, 4));
+    for weights in [Weights::builtin(), Weights::builtin_small(), Weights::builtin_fast()] {
+        let bench = DisplayGeometry::DEFAULT;
+        let mut half = engine_in(Precision::Half, &weights, &bench, frame.resolution);
+        let mut single = engine(&weights, &bench, frame.resolution);
+        assert_eq!(half.precision(), Precision::Half, "the software device has it");
+        for pupil_mm in [1.0, 6.0] {
+            let (_, single) = rendered(&mut single, &frame, pupil_mm);
+            let (_, mut found) = rendered(&mut half, &frame, pupil_mm);
+            let expected: Vec<_> = single.field.iter().map(|v| Complex64::new(v.re.into(), v.im.into())).collect();
+            let error = field_error(&found.field, &expected);
+            assert!(error > 1e-5, "{error}: it was computed in single precision");
+            assert!(error < HALF_FIELD_TOLERANCE, "{error} at {pupil_mm} mm");
+            found.field[99].re += 2.0 * HALF_FIELD_TOLERANCE as f32;
+            assert!(field_error(&found.field, &expected) > HALF_FIELD_TOLERANCE, "the comparison is blind");
+        }
+    }
+}
+
 #[test]
 fn sizes_that_are_tiny_narrow_or_prime_match_the_reference() {
     let expected_stack = random_weights(weights_tests::expected_stack_config(), 5);
@@ -396,7 +425,7 @@ fn wrong_sizes_and_pupils_are_refused_and_a_lost_device_is_told() {
     assert!(matches!(lost, Err(EngineError::Gpu(GpuError::Failed { .. }))), "{lost:?}");
 
     let nothing = linear_tables(Resolution { width: 0, height: 4 });
-    let refused = GpuEngine::open(&weights, &DisplayGeometry::DEFAULT, &nothing, Adapters::Software);
+    let refused = GpuEngine::open(&weights, &DisplayGeometry::DEFAULT, &nothing, Adapters::Software, Precision::Single);
     assert!(matches!(refused.err(), Some(EngineError::Empty { .. })));
 }
 
@@ -406,7 +435,7 @@ fn a_size_whose_lines_do_not_fit_on_the_device_is_told_before_anything_is_made()
     let limits = WorkgroupLimits { bytes: 16 << 10, threads: 256 };
     let (weights, bench) = (Weights::builtin_small(), DisplayGeometry::DEFAULT);
     let refused =
-        super::network::NetworkPlan::new(&weights, &bench, &linear_tables(resolution), Precision::F32, limits);
+        super::network::NetworkPlan::new(&weights, &bench, &linear_tables(resolution), Precision::Single, limits);
     let text = refused.err().expect("no workgroup holds such a line").to_string();
     assert!(text.contains("20000") && text.contains("16384") && text.contains("--backend cpu"), "{text}");
 }

@@ -3,9 +3,9 @@
 use half::f16;
 use num_complex::Complex64;
 
-use super::map::{GROUP, Map, Precision};
+use super::map::{GROUP, Map};
 use super::plan::{BufferId, Dispatch, Plan};
-use crate::gpu::{Adapters, Gpu};
+use crate::gpu::{Adapters, Gpu, Precision};
 use crate::worst::worst;
 
 /// Numbers behind each buffer, not finite, which no shader may read or write.
@@ -119,8 +119,8 @@ impl Map {
         let mut values = vec![0.0; rows * self.groups * self.pitch() * GROUP];
         self.for_each(|channel, y, x| values[self.place(channel, y, x)] = value(channel, y, x));
         match self.precision {
-            Precision::F32 => values,
-            Precision::F16 => {
+            Precision::Single => values,
+            Precision::Half => {
                 let half: Vec<_> = values.iter().map(|&value| f16::from_f32(value).to_bits()).collect();
                 bytemuck::cast_slice(&half).to_vec()
             }
@@ -136,8 +136,8 @@ impl Map {
     /// [channels, height, width] of the first `channels` of `values`; the border and the rows below are zero.
     pub(super) fn planes(&self, values: &[f32], channels: usize) -> Vec<f32> {
         let mut rest = match self.precision {
-            Precision::F32 => values.to_vec(),
-            Precision::F16 => {
+            Precision::Single => values.to_vec(),
+            Precision::Half => {
                 let half: &[u16] = bytemuck::cast_slice(values);
                 half.iter().map(|&bits| f16::from_bits(bits).to_f32()).collect()
             }

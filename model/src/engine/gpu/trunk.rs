@@ -2,10 +2,11 @@
 
 use super::conv::{self, ConvLayer, Epilogue, Packing};
 use super::deformable;
-use super::map::{GROUP, Map, Precision};
+use super::map::{GROUP, Map};
 use super::plan::{BufferId, Plan};
 use crate::conditions::Conditions;
 use crate::engine::modulation::{Modulation, OffsetParameters};
+use crate::gpu::Precision;
 use crate::weights::{Layer, OFFSET_CHANNELS};
 
 /// The offset prediction of an adjustable layer, whose parameters depend on bench and pupil.

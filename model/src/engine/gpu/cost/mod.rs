@@ -24,11 +24,11 @@ use serde::Serialize;
 use self::assembly::{Assembly, Work};
 use self::null_device::{Binary, NullDevice, Request};
 use super::fft::WorkgroupLimits;
-use super::map::Precision;
 use super::network::NetworkPlan;
 use super::plan::{Dispatch, Plan, Shader};
 use crate::Weights;
 use crate::engine::EngineError;
+use crate::gpu::Precision;
 
 pub use self::null_device::serve;
 
@@ -229,7 +229,7 @@ impl FramePlan {
     /// # Errors
     /// The size is nothing, or too large.
     pub fn new(weights: &Weights, resolution: Resolution, half_precision: bool) -> Result<Self, EngineError> {
-        let precision = if half_precision { Precision::F16 } else { Precision::F32 };
+        let precision = if half_precision { Precision::Half } else { Precision::Single };
         // A panel of 8 bits.
         let levels = [0; 3].map(|_| (0..256).collect());
         let tables = LevelTables {
