@@ -24,7 +24,7 @@ pub struct FilterSettings {
 impl Default for FilterSettings {
     fn default() -> Self {
         Self {
-            velocity_lasts: TimeNs(200_000_000),
+            velocity_lasts: TimeNs(100_000_000),
             agility: 3.0,
             constriction_mm_per_s: 7.0,
             dilation_mm_per_s: 4.0,

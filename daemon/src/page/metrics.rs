@@ -166,7 +166,7 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
     told.counter("feed_connections_refused", "Connections that were refused or broken off", feed.connections_refused)
 }
 
-const PUPIL_STATES: [&str; 4] = ["tracking", "holding", "fallback", "fixed"];
+const PUPIL_STATES: [&str; 5] = ["acquiring", "tracking", "holding", "fallback", "fixed"];
 
 /// Memory, descriptors and threads of this process, where the kernel tells them.
 fn own_process(told: &mut Teller<'_>) -> fmt::Result {

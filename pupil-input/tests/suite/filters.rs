@@ -255,19 +255,48 @@ fn shared_data() -> PathBuf {
     std::env::var_os("HOLOD_SHARED_DATA").map_or_else(default, PathBuf::from)
 }
 
-/// The left eye of the Neon recording; the median of a tenth of a second stands for the truth, away from blinks.
-fn neon() -> Trace {
-    let recording = Recording::read(&shared_data().join("pupil/neon_demo/3d_eye_states.csv")).expect("reads");
-    let samples: Vec<_> = recording.samples().filter(|sample| sample.eye == SampleEye::Left).collect();
+/// One eye of a real recording, in millimetres; the median of a tenth of a second around each sample stands for the truth,
+/// away from blinks. Areas in arbitrary units are made diameters of 4 mm in the median.
+fn recorded(file: &str, eye: SampleEye, area: bool) -> Trace {
+    let recording = Recording::read(&shared_data().join("pupil").join(file)).expect("reads");
+    let mut samples: Vec<_> = recording.samples().filter(|sample| sample.eye == eye).collect();
+    if area {
+        let mut areas: Vec<_> = samples.iter().map(|sample| sample.diameter_mm).filter(|area| *area > 0.0).collect();
+        areas.sort_by(f32::total_cmp);
+        let middle = areas[areas.len() / 2];
+        samples.iter_mut().for_each(|sample| sample.diameter_mm = 4.0 * (sample.diameter_mm / middle).sqrt());
+    }
     let guard = TimeNs(250_000_000);
-    let open = |t: TimeNs| recording.blinks().iter().all(|blink| t < blink.begins - guard || t > blink.ends + guard);
-    let truth = samples.iter().filter(|sample| open(sample.t_sample)).map(|sample| {
-        let near = samples.iter().filter(|other| (other.t_sample - sample.t_sample).0.abs() < 50_000_000);
-        let mut near: Vec<_> = near.map(|other| f64::from(other.diameter_mm)).collect();
+    let seen = |sample: &PupilSample| sample.valid && sample.diameter_mm > 1.0 && sample.confidence > 0.6;
+    let lost: Vec<_> = samples.iter().filter(|sample| !seen(sample)).map(|sample| sample.t_sample).collect();
+    let open = |t: TimeNs| {
+        let first_lost = lost.partition_point(|lost| *lost < t - guard);
+        lost.get(first_lost).is_none_or(|lost| *lost > t + guard)
+            && recording.blinks().iter().all(|blink| t < blink.begins - guard || t > blink.ends + guard)
+    };
+    let half = TimeNs(50_000_000);
+    let truth = samples.iter().enumerate().filter(|(_, sample)| open(sample.t_sample)).map(|(index, sample)| {
+        let t = sample.t_sample;
+        let before = samples[..index].iter().rev().take_while(|other| t - other.t_sample < half);
+        let after = samples[index..].iter().take_while(|other| other.t_sample - t < half);
+        let mut near: Vec<_> = before.chain(after).map(|other| f64::from(other.diameter_mm)).collect();
         near.sort_by(f64::total_cmp);
-        ((sample.t_sample).seconds(), near[near.len() / 2])
+        (t.seconds(), near[near.len() / 2])
     });
     Trace { truth: truth.collect(), samples: samples.clone() }
+}
+
+const EYELINK: &str = "eyelink_500hz/002_rlmw_samples_short.asc";
+
+fn recorded_eyes() -> Vec<(&'static str, Trace)> {
+    let files = [
+        ("Neon", "neon_demo/3d_eye_states.csv", false),
+        ("Core", "core_music/pupil_positions.csv", false),
+        ("EyeLink", EYELINK, true),
+    ];
+    let eyes = [SampleEye::Left, SampleEye::Right];
+    let of_file = |(name, file, area)| eyes.map(|eye| (name, recorded(file, eye, area)));
+    files.into_iter().flat_map(of_file).collect()
 }
 
 fn row(name: &str, trace: &Trace, still: Option<&Trace>, kind: &Kind) {
@@ -292,10 +321,68 @@ fn shared_data_print_the_comparison() {
             row(&format!("{rate_hz} Hz, {name}"), &trace, Some(&still), kind);
         }
     }
-    let neon = neon();
-    for (name, kind) in &KINDS {
-        row(&format!("Neon, {name}"), &neon, None, kind);
+    for (eye, trace) in recorded_eyes() {
+        for (name, kind) in &KINDS {
+            row(&format!("{eye}, {name}"), &trace, None, kind);
+        }
     }
+}
+
+#[test]
+#[ignore = "needs shared data"]
+fn shared_data_print_the_tuning_on_recorded_eyes() {
+    let eyes = recorded_eyes();
+    for (name, trace) in &eyes {
+        let held = trace.samples.windows(2).map(|w| (w[1].t_sample - w[0].t_sample).seconds()).sum::<f64>();
+        eprintln!("{name}: {} samples, {:.1} s, {} truths", trace.samples.len(), held, trace.truth.len());
+    }
+    let lively = [60, 200, 1000].map(|rate_hz| Trace::simulated(&lively(), rate_hz));
+    let still = [60, 200, 1000].map(|rate_hz| Trace::simulated(STILL, rate_hz));
+    for ahead_ms in [20, 40] {
+        let held: Vec<_> =
+            eyes.iter().map(|(_, trace)| format!("{:.4}", error_mm(trace, &held(trace, ahead_ms)))).collect();
+        eprintln!("+{ahead_ms} ms held {}", held.join(" "));
+        for agility in [0.5, 1.0, 1.5, 2.0, 3.0] {
+            for lasts_ms in [20, 50, 100, 200] {
+                let mut settings = settings(rig::Eye::Both);
+                settings.filter.agility = agility;
+                settings.filter.velocity_lasts = TimeNs(lasts_ms * 1_000_000);
+                let of = |trace: &Trace| error_mm(trace, &shown(trace, settings, None, ahead_ms));
+                let real: Vec<_> = eyes.iter().map(|(_, trace)| format!("{:.4}", of(trace))).collect();
+                let sim: Vec<_> = lively.iter().map(|trace| format!("{:.4}", of(trace))).collect();
+                let calm: Vec<_> = still
+                    .iter()
+                    .map(|t| format!("{:.2}", COC_PX_PER_MM * flicker_mm(&shown(t, settings, None, ahead_ms)).0))
+                    .collect();
+                let lag: Vec<_> =
+                    lively.iter().map(|t| format!("{}", lag_ms(t, &shown(t, settings, None, 0)))).collect();
+                eprintln!(
+                    "+{ahead_ms} ms {agility} {lasts_ms:3}: {} | {} | {} | {}",
+                    real.join(" "),
+                    sim.join(" "),
+                    calm.join(" "),
+                    lag.join(" ")
+                );
+            }
+        }
+    }
+}
+
+/// The newest sample as it is, held, where `shown` has an estimate that tracks.
+fn held(trace: &Trace, ahead_ms: i64) -> Vec<(f64, f64)> {
+    let mut newest = f64::NAN;
+    let mut estimator = Estimator::new(settings(rig::Eye::Both));
+    let first_s = trace.samples[0].t_sample.seconds();
+    let mut out = Vec::new();
+    for sample in &trace.samples {
+        estimator.push(*sample, |_| {});
+        newest = f64::from(sample.diameter_mm);
+        let t_s = sample.t_sample.seconds();
+        if estimator.pupil_at(sample.t_sample).state == PupilState::Tracking && t_s > first_s + 1.0 {
+            out.push((t_s + ahead_ms as f64 * 1e-3, newest));
+        }
+    }
+    out
 }
 
 #[test]
