@@ -211,7 +211,7 @@ fn named(counts: &BTreeMap<String, u64>) -> impl Iterator<Item = (&str, u64)> {
     counts.iter().map(|(name, count)| (name.as_str(), *count))
 }
 
-const PUPIL_STATES: [&str; 4] = ["tracking", "holding", "fallback", "fixed"];
+const PUPIL_STATES: [&str; 5] = ["acquiring", "tracking", "holding", "fallback", "fixed"];
 
 struct Teller<'a>(DescriptorEncoder<'a>);
 

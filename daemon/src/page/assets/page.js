@@ -226,7 +226,7 @@ function drawPupil() {
   const plot = plots.pupil;
   overTime(plot, 9, "mm", 1);
   seen.frames.forEach(([, t, , state], index) => {
-    if (state === "holding" || state === "fallback") plot.box(t, seen.frames[index + 1]?.[1] ?? newest.t, 1, 9, "held");
+    if (["holding", "fallback", "acquiring"].includes(state)) plot.box(t, seen.frames[index + 1]?.[1] ?? newest.t, 1, 9, "held");
   });
   plot.dots(seen.samples.filter(([, , mm, refused]) => mm !== null && refused === null).map(([t, , mm]) => [t, mm]), "sample");
   // A refused sample may have any number or none: it is drawn at the edge.
