@@ -77,6 +77,7 @@ fn run(out: &Path) -> Result<(), Failure> {
         tracker: TrackerSpec::Mock(Scenario::Steady),
         pupil: None,
         record_tracker: None,
+        record: None,
         frame_limit: None,
         duration: Some(DURATION),
         keep_levels: true,

@@ -19,6 +19,8 @@ pub enum Exit {
     Software = 70,
     /// An output cannot be created.
     CannotCreate = 73,
+    /// Standard output takes no more.
+    Output = 74,
     /// The rig file is wrong.
     Config = 78,
 }

@@ -1,5 +1,6 @@
 //! The parts of the `holod` binary: command line, the frame loop, records and pictures.
 
+mod aside;
 pub mod bug_report;
 pub mod cli;
 pub mod commands;

@@ -1,18 +1,105 @@
 //! What the log on standard error says, by `HOLOD_LOG`; its newest lines for the status page, and a file of it.
+//!
+//! Whoever logs never waits: lines go to a thread for each place, which leaves out and counts what it does not get rid of.
 
+mod outlet;
+
+use std::backtrace::{Backtrace, BacktraceStatus};
 use std::collections::VecDeque;
 use std::fmt::{self, Write};
 use std::fs::File;
-use std::io::{self, Write as _};
-use std::path::Path;
-use std::sync::{Mutex, Once, PoisonError};
+use std::io::{self, IsTerminal, Write as _};
+use std::os::fd::AsFd;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, Once, OnceLock, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::Serialize;
 use tracing::field::{Field, Visit};
 use tracing::{Event, Level, Subscriber};
 use tracing_subscriber::EnvFilter;
-use tracing_subscriber::layer::{Context, Layer};
+use tracing_subscriber::layer::{Context, Layer, SubscriberExt};
+use tracing_subscriber::util::SubscriberInitExt;
+
+use self::outlet::Outlet;
+
+/// How long the end of a process, a panic or a report waits for the lines before it.
+const PATIENCE: Duration = Duration::from_secs(1);
+
+/// The way to standard error, once [`start`] has been called.
+static STDERR: OnceLock<Outlet> = OnceLock::new();
+
+/// Starts the log on standard error, which says as much as `HOLOD_LOG` asks for. A standard error that nobody reads, that is
+/// closed or full, stops nobody.
+///
+/// # Errors
+/// The system gives no thread for it.
+pub fn start() -> io::Result<()> {
+    let asked = std::env::var_os("HOLOD_LOG").map(|asked| asked.to_string_lossy().into_owned());
+    let (filter, complaint) = filter(asked.as_deref());
+    // A descriptor of its own: whoever else writes to standard error takes a lock.
+    match io::stderr().as_fd().try_clone_to_owned() {
+        Ok(stderr) => drop(STDERR.set(Outlet::start("holod-log", File::from(stderr))?)),
+        Err(_closed) => drop(STDERR.set(Outlet::start("holod-log", io::sink())?)),
+    }
+    std::panic::set_hook(Box::new(|panic| {
+        let backtrace = Backtrace::capture();
+        let backtrace = match backtrace.status() {
+            BacktraceStatus::Captured => format!("\n{backtrace}"),
+            _ => String::new(),
+        };
+        let thread = std::thread::current();
+        say(&format!("thread `{}` {panic}{backtrace}", thread.name().unwrap_or("without a name")));
+        flush();
+    }));
+    let lines = tracing_subscriber::fmt::layer()
+        .with_writer(|| ToStderr)
+        .with_ansi(io::stderr().is_terminal())
+        .with_target(false);
+    tracing_subscriber::registry().with(filter).with(lines).with(KeepRecent).init();
+    if let Some(complaint) = complaint {
+        tracing::warn!("{complaint}");
+    }
+    Ok(())
+}
+
+/// A line on standard error, in order with those of the log.
+pub fn say(text: &str) {
+    let line = format!("{text}\n").into_bytes();
+    match STDERR.get() {
+        Some(stderr) => stderr.put(line),
+        // Nobody is there to be told that it cannot be said.
+        None => drop(io::stderr().write_all(&line)),
+    }
+}
+
+/// Waits until all that was said on standard error is out, a second at most.
+pub fn flush() {
+    if let Some(stderr) = STDERR.get() {
+        stderr.flush(PATIENCE);
+    }
+}
+
+/// Lines that standard error has not taken since the process began.
+pub fn lines_lost() -> u64 {
+    STDERR.get().map_or(0, Outlet::lost)
+}
+
+/// Takes an event's line whole.
+struct ToStderr;
+
+impl io::Write for ToStderr {
+    fn write(&mut self, line: &[u8]) -> io::Result<usize> {
+        if let Some(stderr) = STDERR.get() {
+            stderr.put(line.to_vec());
+        }
+        Ok(line.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
 
 const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
 const DEFAULT: &str = "info";
@@ -57,6 +144,11 @@ impl Line {
         let unix_ms = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64);
         Self { unix_ms, level: level.as_str(), text }
     }
+
+    fn to_bytes(&self) -> Vec<u8> {
+        let at = UNIX_EPOCH + Duration::from_millis(self.unix_ms);
+        format!("{} {:5} {}\n", humantime::format_rfc3339_millis(at), self.level, self.text).into_bytes()
+    }
 }
 
 /// Keeps the newest lines in memory, from `info` up. Real-time threads do not log, so none of them waits here.
@@ -76,14 +168,13 @@ static RECENT: Mutex<Kept> = Mutex::new(Kept { lines: VecDeque::new(), ever: 0 }
 impl<S: Subscriber> Layer<S> for KeepRecent {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
         let level = *event.metadata().level();
-        let mut file = FILE.lock().unwrap_or_else(PoisonError::into_inner);
+        let file = FILE.lock().unwrap_or_else(PoisonError::into_inner);
         if level > Level::INFO && file.is_none() {
             return;
         }
         let line = Line::now(level, text_of(event));
-        if let Some(file) = &mut *file {
-            // A disk that refuses is told of by whoever records.
-            let _ = write_line(file, &line);
+        if let Some(file) = &*file {
+            file.put(line.to_bytes());
         }
         drop(file);
         if level > Level::INFO {
@@ -106,38 +197,50 @@ pub fn text_of(event: &Event<'_>) -> String {
 }
 
 /// The file that takes every line that the filter lets through.
-static FILE: Mutex<Option<File>> = Mutex::new(None);
+static FILE: Mutex<Option<Outlet>> = Mutex::new(None);
 
 /// The log goes into a file for as long as this lives.
 #[derive(Debug)]
-pub struct LogFile(());
+pub struct LogFile {
+    path: PathBuf,
+}
 
 impl LogFile {
     /// Begins a file with the lines that are kept already.
     ///
     /// # Errors
-    /// The file cannot be created.
+    /// The file cannot be created, or the system gives no thread for it.
     pub fn begin(path: &Path) -> io::Result<Self> {
         let mut place = FILE.lock().unwrap_or_else(PoisonError::into_inner);
         let mut file = File::create(path)?;
         for line in recent_since(&mut 0) {
-            write_line(&mut file, &line)?;
+            file.write_all(&line.to_bytes())?;
         }
-        *place = Some(file);
+        *place = Some(Outlet::start("holod-record-log", file)?);
         keep_panics();
-        Ok(Self(()))
+        Ok(Self { path: path.to_owned() })
     }
 
     /// Writes down what ended the run, which is said elsewhere.
     pub fn ended_by(&self, failure: &impl fmt::Display) {
-        if let Some(file) = &mut *FILE.lock().unwrap_or_else(PoisonError::into_inner) {
-            let _ = write_line(file, &Line::now(Level::ERROR, failure.to_string()));
+        if let Some(file) = &*FILE.lock().unwrap_or_else(PoisonError::into_inner) {
+            file.put(Line::now(Level::ERROR, failure.to_string()).to_bytes());
         }
     }
 
-    /// Nothing goes into it any more.
+    /// Why a line could not be written, where one could not.
+    pub fn trouble(&self) -> Option<String> {
+        let file = FILE.lock().unwrap_or_else(PoisonError::into_inner);
+        let error = file.as_ref()?.first_error()?;
+        Some(format!("cannot go on recording into {}: {error}", self.path.display()))
+    }
+
+    /// Nothing goes into it any more. Waits for what is on its way, a second at most.
     pub fn end(&mut self) {
-        *FILE.lock().unwrap_or_else(PoisonError::into_inner) = None;
+        let file = FILE.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some(file) = file {
+            file.flush(PATIENCE);
+        }
     }
 }
 
@@ -154,19 +257,15 @@ fn keep_panics() {
         let before = std::panic::take_hook();
         std::panic::set_hook(Box::new(move |panic| {
             // Whoever panics may hold it.
-            if let Ok(mut file) = FILE.try_lock()
-                && let Some(file) = &mut *file
+            if let Ok(file) = FILE.try_lock()
+                && let Some(file) = &*file
             {
-                let _ = write_line(file, &Line::now(Level::ERROR, panic.to_string()));
+                file.put(Line::now(Level::ERROR, panic.to_string()).to_bytes());
+                file.flush(PATIENCE);
             }
             before(panic);
         }));
     });
-}
-
-fn write_line(file: &mut File, line: &Line) -> io::Result<()> {
-    let at = UNIX_EPOCH + Duration::from_millis(line.unix_ms);
-    writeln!(file, "{} {:5} {}", humantime::format_rfc3339_millis(at), line.level, line.text)
 }
 
 struct Text(String);
@@ -200,7 +299,6 @@ mod tests {
 
     #[test]
     fn the_newest_lines_are_kept() {
-        use tracing_subscriber::layer::SubscriberExt;
         let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
         tracing::subscriber::with_default(tracing_subscriber::registry().with(KeepRecent), || {
             let mut seen = 0;
@@ -221,7 +319,6 @@ mod tests {
 
     #[test]
     fn a_file_has_what_was_said_before_it_and_how_the_run_ended() {
-        use tracing_subscriber::layer::SubscriberExt;
         let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("log.txt");

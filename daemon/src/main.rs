@@ -1,12 +1,12 @@
 //! holod: drives a holographic near-eye display in real time.
 
-use std::io::IsTerminal;
+use std::io;
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use clap::Parser;
+use holod_daemon::failure::{Exit, Failure};
 use holod_daemon::{cli::Cli, commands, logging};
-use tracing_subscriber::layer::SubscriberExt;
-use tracing_subscriber::util::SubscriberInitExt;
 
 fn main() -> ExitCode {
     let cli = Cli::try_parse().unwrap_or_else(|error| {
@@ -14,21 +14,20 @@ fn main() -> ExitCode {
         let _ = error.print();
         std::process::exit(code)
     });
-    let asked = std::env::var_os("HOLOD_LOG").map(|asked| asked.to_string_lossy().into_owned());
-    let (filter, complaint) = logging::filter(asked.as_deref());
-    let lines = tracing_subscriber::fmt::layer()
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal())
-        .with_target(false);
-    tracing_subscriber::registry().with(filter).with(lines).with(logging::KeepRecent).init();
-    if let Some(complaint) = complaint {
-        tracing::warn!("{complaint}");
-    }
-    match commands::dispatch(cli) {
+    let started = logging::start().and_then(|()| outlive_file_limits()).map_err(Failure::because(Exit::Unavailable));
+    let ended = started.and_then(|()| commands::dispatch(cli));
+    let code = match ended {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("holod: error: {failure}");
+            logging::say(&format!("holod: error: {failure}"));
             ExitCode::from(failure.exit as u8)
         }
-    }
+    };
+    logging::flush();
+    code
+}
+
+/// Makes a file that grows beyond the user's limit (`ulimit -f`) an error of whoever writes it, and not the process's end.
+fn outlive_file_limits() -> io::Result<()> {
+    signal_hook::flag::register(libc::SIGXFSZ, Arc::default()).map(drop)
 }

@@ -1,6 +1,7 @@
 //! A run written down: `frames.csv`, one row per colour field that the panel showed; with what it was made of, so that its
 //! frames can be made again.
 
+mod health;
 mod recorder;
 mod sources;
 
@@ -18,6 +19,8 @@ use crate::control::Request;
 use crate::failure::{Exit, Failure};
 use crate::source::PictureTag;
 
+use self::health::lost;
+pub use self::health::{RecordHealth, RecordStand, RecordState};
 pub use self::recorder::{LOG, ORDER_FILES, OrderSource, RUN, Recorder, RunFacts};
 pub use self::sources::{
     BENCH, Hashed, RIG, SCENE, SceneSource, SourceFile, content_xxh3, hash_text, is_of_bench, is_weights,
@@ -287,10 +290,6 @@ impl FrameLog {
     fn lost(&self, error: &std::io::Error) -> Failure {
         lost(&self.path, error)
     }
-}
-
-fn lost(path: &Path, error: &std::io::Error) -> Failure {
-    Failure::new(Exit::CannotCreate, format!("cannot go on recording into {}: {error}", path.display()))
 }
 
 #[cfg(test)]

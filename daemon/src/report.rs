@@ -1,6 +1,6 @@
 //! What a command says: text or JSON on standard output, and files that are written beside and renamed.
 
-use std::io::Write;
+use std::io::{self, Write};
 use std::path::Path;
 
 use image::RgbImage;
@@ -9,17 +9,38 @@ use serde::Serialize;
 use holod_model::files;
 
 use crate::failure::{Exit, Failure};
+use crate::logging;
 use crate::session::{Spread, Summary};
 use crate::source::feed::FeedStatus;
 
-/// Prints lines on standard output. A reader that has gone away is no failure.
+/// Prints lines on standard output, after what was said on standard error before. A reader that has gone away is no failure.
+///
+/// # Errors
+/// Standard output cannot be written.
 pub fn print(text: &str) -> Result<(), Failure> {
-    match writeln!(std::io::stdout().lock(), "{text}") {
-        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
-            Err(Failure::new(Exit::CannotCreate, format!("cannot write to standard output: {error}")))
-        }
+    match write_stdout(text) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(stdout_failure(&error)),
         _ => Ok(()),
     }
+}
+
+/// The same, of what nobody can ask for a second time: a reader that has gone away is a failure, too.
+///
+/// # Errors
+/// Standard output cannot be written.
+pub fn print_for_good(text: &str) -> Result<(), Failure> {
+    write_stdout(text).map_err(|error| stdout_failure(&error))
+}
+
+fn write_stdout(text: &str) -> io::Result<()> {
+    logging::flush();
+    let mut stdout = io::stdout().lock();
+    writeln!(stdout, "{text}").and_then(|()| stdout.flush())
+}
+
+/// Standard output takes no more.
+pub fn stdout_failure(error: &io::Error) -> Failure {
+    Failure::new(Exit::Output, format!("cannot write to standard output: {error}"))
 }
 
 /// Prints a value as JSON.
@@ -35,14 +56,18 @@ pub fn save_json(value: &impl Serialize, path: &Path) -> Result<(), Failure> {
 
 /// Saves a picture as PNG.
 pub fn save_png(picture: &RgbImage, path: &Path) -> Result<(), Failure> {
-    let mut bytes = std::io::Cursor::new(Vec::new());
+    let mut bytes = io::Cursor::new(Vec::new());
     picture
         .write_to(&mut bytes, image::ImageFormat::Png)
         .map_err(|error| Failure::new(Exit::Software, format!("{}: {error}", path.display())))?;
     files::write_atomically(path, bytes.get_ref()).map_err(Failure::because(Exit::CannotCreate))
 }
 
-fn to_json(value: &impl Serialize) -> Result<String, Failure> {
+/// A value as JSON.
+///
+/// # Errors
+/// It has no such form.
+pub fn to_json(value: &impl Serialize) -> Result<String, Failure> {
     serde_json::to_string_pretty(value).map_err(Failure::because(Exit::Software))
 }
 
@@ -77,6 +102,7 @@ pub fn summary_text(summary: &Summary) -> String {
     let feed = figures.feed.as_ref().map_or(String::new(), |feed| {
         format!("\nfeed      {}; picture to photons {}", feed_text(feed), spread_text(figures.picture_to_photon))
     });
+    let record = figures.record.as_ref().map_or(String::new(), |record| format!("\nrecord    {}", record.text()));
     format!(
         "ended by {} after {:.1} s\n\
          frames    {} made, {} shown ({} late), {:.1} a second of the panel's {:.1}; {} colour fields shown, {} of them \
@@ -85,7 +111,7 @@ pub fn summary_text(summary: &Summary) -> String {
          tracker   {}: link {}, {} samples, {} rejected{trouble}{feed}\n\
          time      per frame {}; tracker sample to photons {}\n\
          lasers    {} fields judged: {} lit by their own colour, {} kept dark, {} faults of which {} unsafe\n\
-         shutdown  lasers dark: {}; flat pattern on the panel: {}",
+         shutdown  lasers dark: {}; flat pattern on the panel: {}{record}",
         summary.ended_by,
         summary.duration_s,
         figures.frames_made,

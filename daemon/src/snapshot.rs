@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use crate::record::RecordState;
 use crate::session::Spread;
 use crate::source::feed::FeedStatus;
 
@@ -49,6 +50,8 @@ pub struct Figures {
     pub tracker_counts: BTreeMap<String, u64>,
     /// The live feed, where there is one.
     pub feed: Option<FeedStatus>,
+    /// The record, where there is one.
+    pub record: Option<RecordState>,
 }
 
 /// A run at one moment.

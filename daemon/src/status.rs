@@ -1,13 +1,17 @@
 //! What a running holod says of itself: a small JSON file of its own that it writes anew each second and takes away at its
 //! end.
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use holod_calibration::{TimeNs, host_now};
 use holod_model::files;
 use serde::{Deserialize, Serialize};
 
+use crate::aside::{Queue, Taking, join_within};
 use crate::failure::{Exit, Failure};
 use crate::runtime_folder;
 use crate::snapshot::Snapshot;
@@ -16,6 +20,10 @@ use crate::snapshot::Snapshot;
 const SERVICE_FOLDER: &str = "/run/holod";
 /// A file older than this was not written by a loop that still turns.
 const STALE: TimeNs = TimeNs(5_000_000_000);
+/// Moments that may wait for the disk; of those that do only the newest is written.
+const WAITING: usize = 4;
+/// How long the end of a run waits for its file to be taken away.
+const PATIENCE: Duration = Duration::from_secs(1);
 
 /// The file of one process: each has its own, so that two holods know nothing of each other's.
 fn file_name(pid: u32) -> String {
@@ -33,35 +41,67 @@ struct Written<S> {
     status: S,
 }
 
-/// The file of a running process. Dropping it takes the file away.
+/// The file of a running process, which a thread of its own writes. Dropping it takes the file away.
 #[derive(Debug)]
 pub struct StatusFile {
-    path: Option<PathBuf>,
+    newest: Arc<Queue<Vec<u8>>>,
+    writer: Option<JoinHandle<()>>,
 }
 
 impl StatusFile {
     /// The file, in the first folder that takes it; a process without any has none, which is no fault.
     pub fn create() -> Self {
-        Self { path: runtime_folder::own().map(|folder| folder.join(file_name(std::process::id()))) }
+        match runtime_folder::own() {
+            Some(folder) => Self::at(folder.join(file_name(std::process::id()))),
+            None => Self { newest: Arc::default(), writer: None },
+        }
     }
 
-    /// Writes the file anew at host time `now`. A disk that refuses is told once.
-    pub fn write(&mut self, status: &Snapshot, now: TimeNs) {
-        let Some(path) = &self.path else { return };
-        let written = serde_json::to_vec(&Written { written_ns: Some(now.0), status })
-            .map_err(|error| error.to_string())
-            .and_then(|bytes| files::write_atomically(path, &bytes).map_err(|error| error.to_string()));
-        if let Err(error) = written {
+    fn at(path: PathBuf) -> Self {
+        let newest = Arc::new(Queue::default());
+        let written = Arc::clone(&newest);
+        let writer = thread::Builder::new().name("holod-status".into()).spawn(move || write(&written, &path));
+        if let Err(error) = &writer {
             tracing::warn!("`holod status` will know nothing of this run: {error}");
-            self.path = None;
+        }
+        Self { newest, writer: writer.ok() }
+    }
+
+    /// Has the file written anew at host time `now`. Where the disk is still at what was written before, this one is left
+    /// out.
+    pub fn write(&mut self, status: &Snapshot, now: TimeNs) {
+        if self.writer.is_none() {
+            return;
+        }
+        match serde_json::to_vec(&Written { written_ns: Some(now.0), status }) {
+            Ok(bytes) => drop(self.newest.put(bytes, WAITING)),
+            Err(error) => tracing::warn!("`holod status` will not know of this: {error}"),
         }
     }
 }
 
+/// Writes what comes, and takes the file away at the end. A disk that refuses is told, and that it takes it again.
+fn write(newest: &Queue<Vec<u8>>, path: &Path) {
+    let mut taken = VecDeque::new();
+    let mut refuses = false;
+    while newest.take(&mut taken, Taking::AtOnce) {
+        let Some(bytes) = taken.back() else { continue };
+        let written = files::write_atomically(path, bytes);
+        match (&written, refuses) {
+            (Err(error), false) => tracing::warn!("`holod status` knows nothing new of this run: {error}"),
+            (Ok(()), true) => tracing::info!("`holod status` knows of this run again"),
+            _ => {}
+        }
+        refuses = written.is_err();
+    }
+    let _ = std::fs::remove_file(path);
+}
+
 impl Drop for StatusFile {
     fn drop(&mut self) {
-        if let Some(path) = self.path.take() {
-            let _ = std::fs::remove_file(path);
+        self.newest.close();
+        if let Some(writer) = self.writer.take() {
+            let _left = join_within(writer, PATIENCE);
         }
     }
 }
@@ -184,6 +224,7 @@ mod tests {
     use super::*;
 
     const NOW: TimeNs = TimeNs(1_000_000_000_000);
+    const LONG: Duration = Duration::from_secs(20);
 
     fn found_in(folders: &[PathBuf]) -> Result<Vec<Found>, Failure> {
         of_running_in(folders, NOW)
@@ -198,8 +239,9 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let folders = [folder.path().join("absent"), folder.path().to_owned()];
         assert_eq!(found_in(&folders).unwrap_err().exit, Exit::Unavailable);
-        let mut file = StatusFile { path: Some(folder.path().join(file_name(std::process::id()))) };
+        let mut file = StatusFile::at(folder.path().join(file_name(std::process::id())));
         file.write(&status(), NOW);
+        assert!(file.newest.wait_until_done(LONG));
         assert_eq!(found_in(&folders).unwrap(), [Found { status: status(), stale: None }]);
         drop(file);
         assert!(found_in(&folders).is_err());
@@ -218,8 +260,9 @@ mod tests {
         assert!(found_in(&folders).is_err(), "another's status in this one's file");
         std::fs::write(&own, serde_json::to_vec(&status()).unwrap()).unwrap();
         assert_eq!(found_in(&folders).unwrap()[0].stale, None, "an older holod does not say when");
-        let mut file = StatusFile { path: Some(own.clone()) };
+        let mut file = StatusFile::at(own.clone());
         file.write(&status(), NOW - TimeNs(60_000_000_000));
+        assert!(file.newest.wait_until_done(LONG));
         // The wall clock was set back, so that the file's own time lies ahead, or forward.
         for later_s in [-3600, 0, 3600i64] {
             let wall =
@@ -228,6 +271,7 @@ mod tests {
             assert_eq!(found_in(&folders).unwrap()[0].stale, Some(Duration::from_secs(60)));
         }
         file.write(&status(), NOW - TimeNs(1_000_000_000));
+        assert!(file.newest.wait_until_done(LONG));
         let long_ago = SystemTime::now() - Duration::from_secs(60);
         std::fs::File::options().write(true).open(&own).unwrap().set_modified(long_ago).unwrap();
         assert_eq!(found_in(&folders).unwrap()[0].stale, None);
@@ -241,8 +285,9 @@ mod tests {
         let folders = [folder.path().to_owned(), folder.path().to_owned()];
         // The first process of all lives, whoever runs this.
         let [one, other] = [1, std::process::id()].map(|pid| {
-            let mut file = StatusFile { path: Some(folder.path().join(file_name(pid))) };
+            let mut file = StatusFile::at(folder.path().join(file_name(pid)));
             file.write(&Snapshot { pid, ..status() }, NOW);
+            assert!(file.newest.wait_until_done(LONG));
             file
         });
         let pids = || found_in(&folders).unwrap().iter().map(|found| found.status.pid).collect::<Vec<_>>();

@@ -4,6 +4,7 @@ mod bad_input;
 mod bench;
 mod control;
 mod evaluate;
+mod faults;
 mod feed;
 mod gpu;
 mod inspect;

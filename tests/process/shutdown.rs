@@ -202,6 +202,22 @@ fn a_laser_box_is_looked_at_tried_out_and_put_out_by_its_port_alone() {
 }
 
 #[test]
+fn a_second_holod_on_a_laser_box_is_refused_and_the_first_goes_on() {
+    let laser_box = LaserBench::plug_in();
+    let mut first = laser_box.lit_daemon();
+    let args = ["--config", "rig.toml", "--tracker", "mock:steady", "--resolution", "64x64"];
+    let second = run(HOLOD, &args, laser_box.folder.path());
+    assert_eq!(second.status.code(), Some(69), "{}", second.stderr);
+    assert!(second.stderr.contains("lasers is in use by another program"), "{}", second.stderr);
+    let lit = laser_box.edges().len();
+    assert!(wait_until(Duration::from_secs(20), || laser_box.edges().len() > lit + 60), "the first one's are lit");
+    assert!(first.runs());
+    first.signal(Signal::TERM);
+    assert!(first.wait(Duration::from_secs(20)).status.success());
+    laser_box.assert_dark();
+}
+
+#[test]
 fn lasers_are_put_out_beside_a_daemon_that_hangs() {
     let laser_box = LaserBench::plug_in();
     let daemon = laser_box.lit_daemon();

@@ -223,6 +223,7 @@ fn closed_loop(args: &BenchArgs, rig: Rig, weights: Weights, frames: scene::Fram
         tracker: TrackerSpec::Mock(Scenario::Sweep),
         pupil: None,
         record_tracker: None,
+        record: None,
         frame_limit: None,
         duration: Some(args.duration),
         keep_levels: false,

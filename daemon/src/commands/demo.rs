@@ -15,12 +15,11 @@ use crate::failure::{Exit, Failure};
 use crate::pictures::{
     Area, LatencyPlot, PupilPlot, PupilSampleMark, Sheet, Tile, phase_picture, screen_picture, shown_pattern,
 };
-use crate::progress;
 use crate::record::{FieldRecord, FrameLog, FrameRecord};
 use crate::session::{self, Observer, SessionPlan, SessionReport};
 use crate::source::{Pictures, scene};
 use crate::staging::Staging;
-use crate::{report, setup};
+use crate::{logging, progress, report, setup};
 
 /// Where the sample scene's two text cards stand.
 const NEAR: Dioptres = Dioptres(2.5);
@@ -51,7 +50,8 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
     let frames = scene::frames(&named, &rig.geometry)?;
     let scene = frames.frames[0].clone();
     let geometry = rig.geometry;
-    eprintln!("running the loop for {:?}: {} px, tracker {}", args.duration, frames.resolution(), SCENARIO.name());
+    let (resolution, tracker) = (frames.resolution(), SCENARIO.name());
+    logging::say(&format!("running the loop for {:?}: {resolution} px, tracker {tracker}", args.duration));
     let mut log = Log {
         frames_csv: FrameLog::create(&staging.path("."))?,
         frames: Vec::new(),
@@ -70,6 +70,7 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
             tracker: TrackerSpec::Mock(SCENARIO),
             pupil: None,
             record_tracker: None,
+            record: None,
             frame_limit: None,
             duration: Some(args.duration),
             keep_levels: true,
@@ -85,7 +86,7 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
             format!("no frame was shown within {:?}; give the machine longer with --duration 30s", args.duration),
         ));
     };
-    eprintln!("computing what an eye sees of the recorded panel levels");
+    logging::say("computing what an eye sees of the recorded panel levels");
     let views: Vec<EyeView> = progress::during("computing what the eye sees", || {
         let mut eye = SimulatedEye::new(&geometry, scene.resolution);
         let of_frame = |(pupil, levels): &(PupilDiameter, LevelsFrame)| {

@@ -6,7 +6,7 @@ use crate::destination::Destination;
 use crate::failure::Failure;
 use crate::machine::Machine;
 use crate::staging::Staging;
-use crate::{progress, report, status};
+use crate::{logging, progress, report, status};
 
 pub(super) fn report(args: &ReportArgs) -> Result<(), Failure> {
     let scrubber = Scrubber::of_this_machine();
@@ -32,7 +32,7 @@ pub(super) fn report(args: &ReportArgs) -> Result<(), Failure> {
     })?;
     let Some(manifest) = manifest else { return Ok(()) };
     if destination.is_stdout() {
-        eprintln!("{}", manifest.text());
+        logging::say(&manifest.text());
         return Ok(());
     }
     if args.json {

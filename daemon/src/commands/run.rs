@@ -2,12 +2,14 @@
 
 use std::path::Path;
 use std::sync::Arc;
+use std::time::Duration;
 
 use holod_calibration::rig::Rig;
 use holod_pupil_input::{RecordFiles, ReplaySpeed, TrackerSpec};
 use holod_slm_output::OutputSpec;
 use serde::Serialize;
 
+use crate::aside;
 use crate::bug_report::{self, Outcome, Played};
 use crate::cli::{FitArg, RunArgs};
 use crate::control::RigReader;
@@ -15,13 +17,15 @@ use crate::failure::{Exit, Failure};
 use crate::page::Page;
 use crate::pictures::levels_picture;
 use crate::progress;
-use crate::record::{self, Recorder};
+use crate::record::{self, RecordHealth, Recorder};
 use crate::report;
 use crate::session::{self, Hangups, SessionPlan, SessionReport, Summary, not_dark};
 use crate::{setup, source};
 
 /// Scenario of the built-in tracker.
 const SAMPLE_TRACKER: &str = "mock";
+/// How long the end of a run waits for its summary and its levels to be written.
+const SAVING: Duration = Duration::from_secs(30);
 
 pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let output: OutputSpec = args.output.parse().map_err(Failure::because(Exit::Usage))?;
@@ -67,12 +71,13 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         tracker,
         pupil: args.pupil,
         record_tracker: args.record.as_deref().map(RecordFiles::in_folder),
+        record: observers.0.as_ref().map(Recorder::health),
         frame_limit: args.frames,
         duration: args.duration,
         keep_levels: args.record.is_some(),
         hash_levels: args.record.is_some(),
     };
-    let session = match session::run(plan, &mut observers) {
+    let mut session = match session::run(plan, &mut observers) {
         Ok(session) => session,
         Err(failure) => {
             if let (Some(recorder), _) = observers {
@@ -81,11 +86,16 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
             return Err(failure);
         }
     };
-    if let ((Some(recorder), _), Some(folder)) = (&mut observers, &args.record) {
-        recorder.finish()?;
-        save(&session, folder)?;
+    let (Some(mut recorder), _) = observers else { return tell(args, &session.summary, None) };
+    recorder.finish();
+    let health = recorder.health();
+    session.summary.figures.record = Some(health.state());
+    let session = Arc::new(session);
+    if !health.is_lost() {
+        finish_record(&session, recorder.folder(), &health)?;
     }
-    tell(args, &session.summary, None)
+    let told = tell(args, &session.summary, None);
+    told.and_then(|()| health.judge())
 }
 
 /// Overwrites the record that is there, where that is asked for.
@@ -122,6 +132,7 @@ fn replay(args: &RunArgs, output: OutputSpec, tracker: &TrackerSpec) -> Result<(
         tracker: tracker.clone(),
         pupil: None,
         record_tracker: None,
+        record: None,
         frame_limit: Some(args.frames.map_or(frames, |asked| asked.min(frames))),
         duration: args.duration,
         keep_levels: false,
@@ -182,15 +193,19 @@ struct Told<'a> {
 }
 
 /// Says what the run came to.
+///
+/// # Errors
+/// The lasers did not go dark, which matters most, or standard output takes no more.
 fn tell(args: &RunArgs, summary: &Summary, outcome: Option<&Outcome>) -> Result<(), Failure> {
-    if args.json {
-        report::print_json(&Told { summary, report: outcome })?;
+    let text = if args.json {
+        report::to_json(&Told { summary, report: outcome })?
     } else {
-        report::print(&report::summary_text(summary))?;
-        outcome.map_or(Ok(()), |outcome| report::print(&outcome.text()))?;
-    }
+        let outcome = outcome.map_or(String::new(), |outcome| format!("\n{}", outcome.text()));
+        format!("{}{outcome}", report::summary_text(summary))
+    };
+    let printed = report::print_for_good(&text);
     match &summary.lasers_not_dark {
-        None => Ok(()),
+        None => printed,
         Some(why) => Err(Failure::new(Exit::Unavailable, not_dark(why))),
     }
 }
@@ -205,7 +220,22 @@ fn rig_of(args: &RunArgs) -> Result<Rig, Failure> {
     Ok(rig)
 }
 
-/// Writes `summary.json` and the levels that the panel showed.
+/// Writes `summary.json` and the levels that the panel showed into the record, which is lost where they cannot be written.
+///
+/// # Errors
+/// The system gives no thread for it.
+fn finish_record(session: &Arc<SessionReport>, folder: &Path, health: &RecordHealth) -> Result<(), Failure> {
+    let (of_session, into) = (Arc::clone(session), folder.to_owned());
+    let save = move || save(&of_session, &into);
+    let saved = progress::during("finishing the record", || aside::within(SAVING, save));
+    match saved.map_err(Failure::because(Exit::Unavailable))? {
+        Some(Ok(())) => {}
+        Some(Err(failure)) => health.give_up(&format!("cannot finish it: {failure}")),
+        None => health.give_up(&format!("the disk of {} does not take its end within {SAVING:?}", folder.display())),
+    }
+    Ok(())
+}
+
 fn save(session: &SessionReport, folder: &Path) -> Result<(), Failure> {
     report::save_json(&session.summary, &folder.join("summary.json"))?;
     for (pupil, levels) in &session.shown {

@@ -43,6 +43,7 @@ fn text_of(status: &Snapshot) -> String {
             report::spread_text(figures.picture_to_photon)
         )
     });
+    let record = figures.record.as_ref().map_or(String::new(), |record| format!("\nrecord   {}", record.text()));
     format!(
         "{} for {:.0} s, process {}, {}{}\n\
          pupil    {}, {}; eye: {}\n\
@@ -52,7 +53,7 @@ fn text_of(status: &Snapshot) -> String {
          lasers   {}{}{}\n\
          engine   {}; weights {}\n\
          frames   {:.1} a second of the panel's {:.1}{}; {} made, {} shown, {} late\n\
-         time     per frame {}; tracker sample to photons {}{feed}",
+         time     per frame {}; tracker sample to photons {}{feed}{record}",
         status.state,
         status.uptime_s,
         status.pid,

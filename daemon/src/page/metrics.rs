@@ -18,6 +18,8 @@ use prometheus_client::registry::{Registry, Unit};
 
 use self::process::OfProcess;
 use super::live::Live;
+use crate::logging;
+use crate::record::RecordStand;
 use crate::session::FirstLight;
 use crate::snapshot::Snapshot;
 
@@ -104,6 +106,7 @@ impl Collector for OfSnapshot {
         let viewers = live.viewers.load(Ordering::Relaxed) as f64;
         told.gauge("page_viewers", "Browsers that watch the status page", None, viewers)?;
         told.counters("page_refused", "Requests that the status page refused", "reason", live.refused.each())?;
+        told.counter("log_lines_lost", "Lines that standard error did not take", logging::lines_lost())?;
         match &*live.snapshot.load() {
             Some(snapshot) => of_run(&mut told, snapshot),
             None => Ok(()),
@@ -167,6 +170,11 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
         "reason",
         named(&snapshot.orders_refused),
     )?;
+    if let Some(record) = &figures.record {
+        let lost = f64::from(u8::from(record.state == RecordStand::Lost));
+        told.gauge("record_lost", "Whether the record was given up", None, lost)?;
+        told.counter("record_rows_lost", "Rows of the record that a slow disk left out", record.rows_lost)?;
+    }
     let Some(feed) = &figures.feed else { return Ok(()) };
     told.gauge("feed_clients", "Clients of the live feed", None, feed.clients.len() as f64)?;
     let pictures = [

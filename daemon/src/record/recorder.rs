@@ -1,10 +1,12 @@
-//! Writes down a run as it goes, with what it was made of.
+//! Writes down a run as it goes, with what it was made of. A thread of its own writes: whoever records waits for no disk.
 
+use std::collections::VecDeque;
 use std::fs::{self, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::thread::JoinHandle;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
@@ -12,7 +14,8 @@ use holod_slm_output::FieldEvent;
 use serde::{Deserialize, Serialize};
 
 use super::sources::{self, SceneSource, SourceFile};
-use super::{FieldRecord, FrameLog, FrameRecord};
+use super::{FieldRecord, FrameLog, FrameRecord, RecordHealth};
+use crate::aside::{Queue, Taking, join_within};
 use crate::cli::{self, Backend, NetworkArgs, RigArgs, RunArgs, SceneArgs};
 use crate::control::Request;
 use crate::destination::refuse_existing;
@@ -79,17 +82,47 @@ struct Named {
     resolution: Resolution,
 }
 
+/// Rows that may wait for the disk: a minute of 60 frames a second in three colours.
+const ROWS: usize = 1 << 14;
+/// Orders that may wait for it beside them. None may be missing: each is known by its number.
+const ORDERS_ROOM: usize = 1 << 12;
+/// How often what has come is handed to the operating system.
+const WRITE_INTERVAL: Duration = Duration::from_millis(100);
+/// How long the end of a run waits for the disk to take what is left.
+const FINISH: Duration = Duration::from_secs(5);
+
+/// What the thread that writes is handed.
+enum Entry {
+    Began(Box<RunFacts>),
+    Frame(FrameRecord),
+    Field(FieldRecord),
+    Order(TimeNs, Box<Request>),
+}
+
 /// Writes down a run as it goes.
 pub struct Recorder {
     folder: PathBuf,
-    frames: FrameLog,
     log: LogFile,
     facts: RunFacts,
     named: Named,
     orders: u32,
     /// Reads the files of what an order brought.
     reading: Option<JoinHandle<()>>,
-    failed: Option<Failure>,
+    entries: Arc<Queue<Entry>>,
+    /// Writes them.
+    writer: Option<JoinHandle<FrameLog>>,
+    health: Arc<RecordHealth>,
+    made_frames: bool,
+    slowness: Slowness,
+}
+
+/// What was said of rows that the disk was too slow for.
+#[derive(Default)]
+struct Slowness {
+    /// Rows that were lost at the last look.
+    seen: u64,
+    /// Of those, rows of which it was said.
+    told: u64,
 }
 
 impl Recorder {
@@ -101,29 +134,44 @@ impl Recorder {
         let own = [LOG, RUN, ORDER_FILES, sources::BENCH].map(|name| folder.join(name));
         refuse_existing(own, "--record", false)?;
         let frames = FrameLog::create(folder)?;
-        let started = Self::start(folder, args, rig, resolution);
-        match started {
-            Ok((log, facts)) => Ok(Self {
-                folder: folder.to_owned(),
-                frames,
-                log,
-                facts,
-                named: Named {
-                    rig: args.rig.clone(),
-                    network: args.network.clone(),
-                    geometry: rig.geometry,
-                    resolution,
-                },
-                orders: 0,
-                reading: None,
-                failed: None,
-            }),
+        let (log, facts) = match Self::start(folder, args, rig, resolution) {
+            Ok(started) => started,
             Err(failure) => {
                 discard(folder);
                 frames.discard_if_empty();
-                Err(failure)
+                return Err(failure);
             }
-        }
+        };
+        let entries = Arc::new(Queue::default());
+        let health = Arc::new(RecordHealth::new(folder));
+        let write = {
+            let (entries, health, run) = (Arc::clone(&entries), Arc::clone(&health), folder.join(RUN));
+            move || write_entries(&entries, frames, &run, &health)
+        };
+        let writer = thread::Builder::new().name("holod-record".into()).spawn(write);
+        Ok(Self {
+            folder: folder.to_owned(),
+            log,
+            facts,
+            named: Named { rig: args.rig.clone(), network: args.network.clone(), geometry: rig.geometry, resolution },
+            orders: 0,
+            reading: None,
+            entries,
+            writer: Some(writer.map_err(Failure::because(Exit::Unavailable))?),
+            health,
+            made_frames: false,
+            slowness: Slowness::default(),
+        })
+    }
+
+    /// Where the record is.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Whether the record goes on, for others who write into its folder, and who ask.
+    pub fn health(&self) -> Arc<RecordHealth> {
+        Arc::clone(&self.health)
     }
 
     fn start(folder: &Path, args: &RunArgs, rig: &Rig, resolution: Resolution) -> Result<(LogFile, RunFacts), Failure> {
@@ -154,33 +202,68 @@ impl Recorder {
         self
     }
 
-    /// Hands everything to the operating system and ends the log.
-    ///
-    /// # Errors
-    /// The disk's, with the file's name.
-    pub fn finish(&mut self) -> Result<(), Failure> {
-        self.wait_for_reading();
+    /// Hands everything to the operating system and ends the log. A disk that does not take it within seconds has lost the
+    /// record.
+    pub fn finish(&mut self) {
+        self.end_writing();
+        self.note_log();
         self.log.end();
-        self.frames.flush()
     }
 
     /// Ends the record of a run that failed. Where no frame was ever made it is taken away again, so that the same directory
     /// may be named again.
     pub fn fail(mut self, failure: &Failure) {
-        self.wait_for_reading();
+        let frames = self.end_writing();
         self.log.ended_by(failure);
         self.log.end();
-        if self.frames.is_empty() {
+        if !self.made_frames
+            && let Some(frames) = frames
+        {
             discard(&self.folder);
+            frames.discard_if_empty();
         }
-        self.frames.discard_if_empty();
     }
 
-    fn wait_for_reading(&mut self) {
-        if let Some(reading) = self.reading.take() {
-            // A panic over there was told; the line is missing then.
-            let _ = reading.join();
+    fn end_writing(&mut self) -> Option<FrameLog> {
+        self.entries.close();
+        let reading = self.reading.take().map(|reading| join_within(reading, FINISH));
+        if reading == Some(None) {
+            tracing::warn!("the record lacks the files of the last order: they are not read yet");
         }
+        let frames = join_within(self.writer.take()?, FINISH);
+        if frames.is_none() {
+            let folder = self.folder.display();
+            self.health.give_up(&format!("the disk of {folder} does not take what was left within {FINISH:?}"));
+        }
+        frames
+    }
+
+    /// Hands an entry over; one that finds no room is a row less.
+    fn put(&mut self, entry: Entry) {
+        if !self.health.is_lost() && !self.entries.put(entry, ROWS) {
+            self.health.lose_row();
+        }
+    }
+
+    /// What was written into the log's file is lost, too, where nobody can write there.
+    fn note_log(&self) {
+        if let Some(trouble) = self.log.trouble() {
+            self.health.give_up(&trouble);
+        }
+    }
+
+    /// Says that rows were left out: when it begins, and how many they were once there is room again.
+    fn tell_slowness(&mut self) {
+        let lost = self.health.rows_lost();
+        let Slowness { seen, told } = &mut self.slowness;
+        let folder = self.folder.display();
+        if lost > *seen && *seen == *told {
+            tracing::warn!("the disk of {folder} is too slow for the record: rows are left out until it has caught up");
+        } else if lost == *seen && *seen > *told {
+            tracing::warn!("the record in {folder} goes on; {} rows were left out", lost - *told);
+            *told = lost;
+        }
+        *seen = lost;
     }
 
     /// Reads the files of what an order brought, beside the run: the control thread waits for no disk.
@@ -209,7 +292,7 @@ impl Recorder {
                 tracing::warn!("the record lacks the files of order {order}: {failure}");
             }
         };
-        match std::thread::Builder::new().name("holod-record".into()).spawn(read) {
+        match thread::Builder::new().name("holod-order".into()).spawn(read) {
             Ok(reading) => self.reading = Some(reading),
             Err(error) => tracing::warn!("the record lacks the files of order {order}: {error}"),
         }
@@ -259,32 +342,166 @@ fn discard(folder: &Path) {
     let _ = sources::remove_bench(folder);
 }
 
+/// Writes what comes until nothing more does. Where the disk refuses, the record is given up, and the rest dropped.
+fn write_entries(entries: &Queue<Entry>, mut frames: FrameLog, run: &Path, health: &RecordHealth) -> FrameLog {
+    let mut taken = VecDeque::new();
+    while entries.take(&mut taken, Taking::Every(WRITE_INTERVAL)) {
+        if health.is_lost() {
+            continue;
+        }
+        let mut write = |entry| match entry {
+            Entry::Began(facts) => report::save_json(&facts, run),
+            Entry::Frame(record) => {
+                frames.frame(record);
+                Ok(())
+            }
+            Entry::Field(field) => frames.field(&field),
+            Entry::Order(t, request) => frames.order(t, &request),
+        };
+        let written = taken.drain(..).try_for_each(&mut write).and_then(|()| frames.flush());
+        if let Err(failure) = written {
+            health.give_up(&failure.to_string());
+        }
+    }
+    frames
+}
+
 impl Observer for Recorder {
     fn began(&mut self, bench: &mut Began) {
         self.facts.t_origin_ns = bench.t_origin.0;
         self.facts.engine.clone_from(&bench.engine);
-        self.failed = report::save_json(&self.facts, &self.folder.join(RUN)).err();
+        self.put(Entry::Began(Box::new(self.facts.clone())));
     }
 
     fn frame(&mut self, record: &FrameRecord) -> Result<(), Failure> {
-        self.frames.frame(*record);
+        self.made_frames = true;
+        self.put(Entry::Frame(*record));
         Ok(())
     }
 
     fn field(&mut self, event: &FieldEvent) -> Result<(), Failure> {
-        self.frames.field(&FieldRecord::of(event))
+        self.put(Entry::Field(FieldRecord::of(event)));
+        Ok(())
     }
 
     fn order(&mut self, t: TimeNs, request: &Request) -> Result<(), Failure> {
         self.orders += 1;
+        if self.health.is_lost() {
+            return Ok(());
+        }
         self.note_files(request);
-        self.frames.order(t, request)
+        if !self.entries.put(Entry::Order(t, Box::new(request.clone())), ROWS + ORDERS_ROOM) {
+            self.health.give_up(&format!("the disk of {} is too slow for its orders", self.folder.display()));
+        }
+        Ok(())
     }
 
     fn tick(&mut self) -> Result<(), Failure> {
-        match self.failed.take() {
-            Some(failure) => Err(failure),
-            None => self.frames.flush(),
+        self.note_log();
+        self.tell_slowness();
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Read;
+
+    use clap::Parser;
+
+    use super::*;
+    use crate::cli::Cli;
+    use crate::record::{FRAMES, FrameOrders, ORDERS, RecordStand};
+    use crate::source::PictureTag;
+    use holod_calibration::PupilDiameter;
+
+    fn recorder(folder: &Path) -> Recorder {
+        let args = Cli::try_parse_from(["holod", "--record", "elsewhere"]).unwrap().run;
+        Recorder::create(folder, &args, &Rig::default(), Resolution { width: 64, height: 64 }).unwrap()
+    }
+
+    fn frame(number: u64) -> FrameRecord {
+        FrameRecord {
+            frame: number,
+            t_sample: None,
+            pupil_raw_mm: None,
+            pupil: PupilDiameter::from_mm(3.0),
+            pupil_state: "tracking",
+            t_wake: TimeNs(1),
+            t_render_begin: TimeNs(2),
+            t_render_end: TimeNs(3),
+            t_submit: TimeNs(4),
+            t_desired_present: TimeNs(5),
+            picture: PictureTag::default(),
+            keep: None,
+            amplitude_constant: 1.0,
+            orders: FrameOrders::default(),
+            levels_xxh3: None,
         }
+    }
+
+    #[test]
+    fn whoever_records_waits_for_no_disk_and_rows_beyond_a_minute_are_counted() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut recorder = recorder(&folder.path().join("record"));
+        // A disk that stands still: the writer ends, and nobody takes what comes.
+        recorder.entries.close();
+        let frames = join_within(recorder.writer.take().unwrap(), FINISH).unwrap();
+        recorder.entries = Arc::new(Queue::default());
+        for number in 0..ROWS as u64 + 100 {
+            recorder.frame(&frame(number)).unwrap();
+        }
+        recorder.order(TimeNs(6), &Request::LasersDark).unwrap();
+        let rows_lost = || recorder.health.state().rows_lost;
+        assert_eq!((rows_lost(), recorder.health.is_lost()), (100, false), "an order finds room yet");
+        recorder.tell_slowness();
+        assert_eq!((recorder.slowness.seen, recorder.slowness.told), (100, 0));
+
+        // It goes on.
+        let (entries, health, run) = (Arc::clone(&recorder.entries), recorder.health(), folder.path().join("run.json"));
+        recorder.writer = Some(thread::spawn(move || write_entries(&entries, frames, &run, &health)));
+        recorder.tell_slowness();
+        assert_eq!(recorder.slowness.told, 100);
+        recorder.finish();
+        assert!(!recorder.health.is_lost());
+        assert_eq!(fs::read_to_string(folder.path().join("record").join(ORDERS)).unwrap().lines().count(), 1);
+    }
+
+    #[test]
+    fn a_disk_that_never_takes_the_rest_loses_the_record_and_holds_nobody_up() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut recorder = recorder(folder.path());
+        recorder.entries.close();
+        let _written = join_within(recorder.writer.take().unwrap(), FINISH);
+        let (mut pipe, _nobody_writes) = std::io::pipe().unwrap();
+        recorder.writer = Some(thread::spawn(move || {
+            let _stuck = pipe.read(&mut [0; 1]);
+            unreachable!("nobody writes")
+        }));
+        recorder.finish();
+        let state = recorder.health.state();
+        assert_eq!(state.state, RecordStand::Lost);
+        assert!(state.reason.unwrap().contains("within 5s"));
+    }
+
+    #[test]
+    fn a_record_that_is_deleted_is_given_up_and_what_comes_is_dropped() {
+        let folder = tempfile::tempdir().unwrap();
+        let record = folder.path().join("record");
+        let mut recorder = recorder(&record);
+        recorder.frame(&frame(1)).unwrap();
+        assert!(record.join(FRAMES).exists());
+        fs::remove_dir_all(&record).unwrap();
+        let t_end = std::time::Instant::now() + Duration::from_secs(20);
+        while !recorder.health.is_lost() && std::time::Instant::now() < t_end {
+            thread::sleep(WRITE_INTERVAL);
+        }
+        let reason = recorder.health.state().reason.expect("it is noticed");
+        assert!(reason.contains("frames.csv: the file was deleted; leave a record where it is"), "{reason}");
+        for number in 0..3 * ROWS as u64 {
+            recorder.frame(&frame(number)).unwrap();
+        }
+        assert_eq!(recorder.health.rows_lost(), 0, "they are not wanted any more");
+        recorder.finish();
     }
 }

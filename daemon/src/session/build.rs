@@ -215,6 +215,7 @@ pub(super) fn build(
         tracker_watch: TrackerWatch::new(&rig.tracker, t_origin),
         feed,
         feed_watch: FeedWatch::new(dark_after, t_origin),
+        record: plan.record,
         desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }),
         signals,
         hangups: plan.hangups,

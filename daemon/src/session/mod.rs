@@ -20,6 +20,7 @@ mod tally;
 mod tracker_watch;
 mod watch;
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use holod_calibration::PupilDiameter;
@@ -31,6 +32,7 @@ use holod_slm_output::OutputSpec;
 use crate::cli::Backend;
 use crate::control::RigReader;
 use crate::failure::{Exit, Failure};
+use crate::record::RecordHealth;
 use crate::source::Pictures;
 
 #[cfg(feature = "fault-injection")]
@@ -69,6 +71,8 @@ pub struct SessionPlan {
     pub tracker: TrackerSpec,
     /// Where the tracker's bytes and samples are written down.
     pub record_tracker: Option<RecordFiles>,
+    /// Whether the run's record goes on.
+    pub record: Option<Arc<RecordHealth>>,
     /// Stop after so many frames.
     pub frame_limit: Option<u64>,
     /// Stop after so long.

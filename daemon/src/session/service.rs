@@ -1,7 +1,13 @@
 //! What the operating system and its service manager are told, and tell.
 
-use std::sync::Arc;
+use std::ffi::OsStr;
+use std::io;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::ffi::OsStrExt;
+use std::os::unix::net::{SocketAddr, UnixDatagram};
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Once};
 use std::time::Duration;
 
 use holod_calibration::TimeNs;
@@ -159,10 +165,25 @@ impl Service {
     }
 }
 
+/// Tells the service manager, and says once where it does not listen.
 fn tell(states: &[NotifyState<'_>]) {
-    if let Err(error) = sd_notify::notify(states) {
-        tracing::warn!("the service manager does not listen: {error}");
+    static WARNED: Once = Once::new();
+    let Some(socket) = std::env::var_os("NOTIFY_SOCKET") else { return };
+    if let Err(error) = send(&socket, states) {
+        WARNED.call_once(|| tracing::warn!("the service manager does not listen: {error}"));
     }
+}
+
+/// Sends a datagram that is left out where nobody takes those before: the loop waits for no service manager.
+fn send(socket: &OsStr, states: &[NotifyState<'_>]) -> io::Result<()> {
+    let address = match socket.as_bytes() {
+        [b'@', name @ ..] => SocketAddr::from_abstract_name(name)?,
+        path => SocketAddr::from_pathname(Path::new(OsStr::from_bytes(path)))?,
+    };
+    let text: String = states.iter().map(|state| format!("{state}\n")).collect();
+    let sender = UnixDatagram::unbound()?;
+    sender.set_nonblocking(true)?;
+    sender.send_to_addr(text.as_bytes(), &address).map(drop)
 }
 
 #[cfg(test)]
@@ -179,5 +200,19 @@ mod tests {
         for t in 0..100 {
             assert!(!watchdog.wants_food(5, TimeNs(2_000 + t * 100)), "a stalled panel does not feed it");
         }
+    }
+
+    #[test]
+    fn a_service_manager_who_takes_nothing_is_not_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("notify");
+        let manager = UnixDatagram::bind(&path).unwrap();
+        send(path.as_os_str(), &[NotifyState::Ready, NotifyState::Status("dark")]).unwrap();
+        let mut buffer = [0; 256];
+        let length = manager.recv(&mut buffer).unwrap();
+        assert_eq!(&buffer[..length], b"READY=1\nSTATUS=dark\n");
+        // More than any queue of datagrams holds.
+        let refused = (0..100_000).find_map(|_| send(path.as_os_str(), &[NotifyState::Watchdog]).err());
+        assert_eq!(refused.map(|error| error.kind()), Some(io::ErrorKind::WouldBlock));
     }
 }

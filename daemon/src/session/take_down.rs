@@ -31,12 +31,10 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
         watch.laser_box.trouble().unwrap_or(silent).to_owned()
     });
     watch.tracker_watch.judge(&watch.tracker, host_now());
+    watch.judge_recording();
     let figures = Figures { tracker_link, ..watch.figures(&down.counts, host_now()) };
     watch.feed = None;
     let recorded = watch.tracker.recording();
-    if let Some(failure) = recorded.as_ref().and_then(|status| status.failure.as_deref()) {
-        tracing::error!("the tracker's recording is not whole: {failure}");
-    }
     if let Some(why) = &lasers_not_dark
         && (ended.is_err() || observed.is_err() || !matches!(frame_loop, Ok(Ok(()))))
     {

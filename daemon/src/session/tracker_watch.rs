@@ -3,8 +3,6 @@
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::{Decision, RefusalChange, RefusalWatch, TrackerControl};
 
-use crate::failure::{Exit, Failure};
-
 /// Follows the tracker, and says in the log what changes.
 pub(super) struct TrackerWatch {
     refusals: RefusalWatch,
@@ -28,13 +26,7 @@ impl TrackerWatch {
     }
 
     /// Looks at the tracker, ten times a second.
-    ///
-    /// # Errors
-    /// Its recording is not written any more.
-    pub(super) fn look(&mut self, tracker: &mut TrackerControl, now: TimeNs) -> Result<(), Failure> {
-        if let Some(failure) = tracker.recording().and_then(|recording| recording.failure) {
-            return Err(Failure::new(Exit::CannotCreate, format!("cannot go on {failure}")));
-        }
+    pub(super) fn look(&mut self, tracker: &mut TrackerControl, now: TimeNs) {
         let lost = tracker.trouble();
         if lost != self.lost.as_deref() {
             self.lost = lost.map(str::to_owned);
@@ -44,7 +36,6 @@ impl TrackerWatch {
             }
         }
         self.judge(tracker, now);
-        Ok(())
     }
 
     /// Finds out whether everything that has come is refused.

@@ -25,6 +25,7 @@ use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
 use super::{Hangups, Observer, Signals, host_now};
 use crate::failure::{Exit, Failure};
+use crate::record::RecordHealth;
 use crate::snapshot::{Figures, Snapshot};
 use crate::source::feed::Feed;
 use crate::status::StatusFile;
@@ -49,6 +50,7 @@ pub(super) struct Watch<'a> {
     pub(super) tracker_watch: TrackerWatch,
     pub(super) feed: Option<Feed>,
     pub(super) feed_watch: FeedWatch,
+    pub(super) record: Option<Arc<RecordHealth>>,
     pub(super) desk: Desk,
     pub(super) signals: Signals,
     pub(super) hangups: Option<Hangups>,
@@ -284,11 +286,20 @@ impl Watch<'_> {
             self.write_status(output, now);
         }
         self.tell_rate(now);
-        self.tracker_watch.look(&mut self.tracker, now)?;
+        self.tracker_watch.look(&mut self.tracker, now);
+        self.judge_recording();
         self.panel.judge_rate(output, now);
         self.laser_box.drain(output.armed);
         self.desk.tidy();
         self.observer.tick()
+    }
+
+    /// Gives the record up where the tracker's part of it cannot be written any more.
+    pub(super) fn judge_recording(&self) {
+        let failure = self.tracker.recording().and_then(|recording| recording.failure);
+        if let (Some(record), Some(failure)) = (&self.record, failure) {
+            record.give_up(&format!("cannot go on {failure}"));
+        }
     }
 
     /// Says how the run is, where that has changed; whether it has.
@@ -298,7 +309,8 @@ impl Watch<'_> {
         let is_fixed = self.tally.newest_state == FIXED_PUPIL;
         let follows =
             self.plays || is_fixed || link == Link::Up && self.tally.newest_state != PupilState::Fallback.name();
-        let state = match (lit, follows) {
+        let record_lost = self.record.as_ref().is_some_and(|record| record.is_lost());
+        let state = match (lit, follows && !record_lost) {
             (false, _) => State::Dark,
             (true, false) => State::Degraded,
             (true, true) => State::Running,
@@ -311,7 +323,8 @@ impl Watch<'_> {
             fallback if fallback == PupilState::Fallback.name() => fallback,
             _ => "followed",
         };
-        let text = format!("{}: tracker {}, pupil {pupil}", state.name(), link.name());
+        let record = if record_lost { ", record lost" } else { "" };
+        let text = format!("{}: tracker {}, pupil {pupil}{record}", state.name(), link.name());
         if text == self.told.text {
             return false;
         }
@@ -400,6 +413,7 @@ impl Watch<'_> {
             tracker_trouble: self.tracker_watch.trouble(),
             tracker_counts: self.tracker.counters().entries().collect(),
             feed: self.feed.as_ref().map(|feed| feed.status(now)),
+            record: self.record.as_ref().map(|record| record.state()),
         }
     }
 }

@@ -26,6 +26,9 @@ pub(crate) const ROOM: usize = 1 << 13;
 const WRITE_INTERVAL: Duration = Duration::from_millis(100);
 /// How often it is forced to the disk; with the time that takes, a second at most.
 const SYNC_INTERVAL: Duration = Duration::from_millis(500);
+/// How long the end waits for the disk, and how often it looks whether that has come.
+const FINISH: Duration = Duration::from_secs(5);
+const FINISH_POLL: Duration = Duration::from_millis(5);
 
 /// The reader thread's part: wait-free, without allocation.
 pub(crate) struct Taps {
@@ -155,13 +158,25 @@ impl Recorder {
         }
     }
 
-    /// Waits until all is on the disk; the taps must have been dropped.
+    /// Waits until all is on the disk, some seconds at most: a disk that takes longer has lost the recording. The taps must
+    /// have been dropped.
     pub(crate) fn finish(&mut self) {
-        if let Some(thread) = self.thread.take() {
-            thread.thread().unpark();
-            // A panic over there has been reported by the panic hook; here it only means that it has ended.
-            let _ = thread.join();
+        self.finish_within(FINISH);
+    }
+
+    fn finish_within(&mut self, patience: Duration) {
+        let Some(thread) = self.thread.take() else { return };
+        thread.thread().unpark();
+        let t_end = Instant::now() + patience;
+        while !thread.is_finished() {
+            if Instant::now() >= t_end {
+                self.shared.fail(format!("recording: the disk does not take the end of it within {patience:?}"));
+                return;
+            }
+            thread::sleep(FINISH_POLL);
         }
+        // A panic over there has been reported by the panic hook; here it only means that it has ended.
+        let _ = thread.join();
     }
 }
 
@@ -426,5 +441,14 @@ mod tests {
             taps.bytes(TimeNs(t), b"abc");
         }
         assert!(taps.shared.chunks_lost.load(Ordering::Relaxed) > 500);
+    }
+
+    #[test]
+    fn a_disk_that_stands_still_at_the_end_is_not_waited_for() {
+        let shared = Arc::new(Shared::default());
+        let thread = thread::spawn(|| thread::sleep(Duration::from_secs(3600)));
+        let mut recorder = Recorder { shared, thread: Some(thread) };
+        recorder.finish_within(Duration::from_millis(20));
+        assert!(recorder.status().failure.expect("a failure").contains("within 20ms"));
     }
 }

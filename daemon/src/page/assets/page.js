@@ -125,7 +125,7 @@ function whyDark(snapshot) {
 
 function tellFacts(snapshot) {
   const spread = (time) => time && `${number(time.median_ms)} ms median, ${number(time.p99_ms)} ms 99th, ${number(time.max_ms)} ms most`;
-  const { feed } = snapshot;
+  const { feed, record } = snapshot;
   const facts = [
     ["Scene", snapshot.scene],
     ["Pattern", snapshot.pattern && `${snapshot.pattern}, in place of holograms, until holod ctl hologram`],
@@ -148,6 +148,8 @@ function tellFacts(snapshot) {
       `${feed.refused} refused${feed.newest_age_s == null ? "" : `, newest ${number(feed.newest_age_s)} s ago`}`],
     ["Feed’s trouble", snapshot.feed_trouble],
     ["Feed refused", feed?.last_refusal],
+    ["Record", record && `${record.state === "lost" ? `lost: ${record.reason}` : record.folder}` +
+      `${record.rows_lost ? `; ${record.rows_lost} rows left out: the disk is too slow` : ""}`],
     ["Running for", `${Math.round(snapshot.uptime_s)} s, process ${snapshot.pid}`],
   ].filter(([, value]) => value);
   rows(at("facts"), facts, (list, name, value) => {

@@ -1,0 +1,143 @@
+//! Whether a run's record goes on, for all who write it and all who ask.
+
+use std::io::{self, ErrorKind};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use serde::{Deserialize, Serialize};
+
+use crate::failure::{Exit, Failure};
+
+/// How the record of a run is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RecordStand {
+    /// It is written.
+    #[default]
+    Written,
+    /// It was given up.
+    Lost,
+}
+
+/// How the record of a run is, as its status says it.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct RecordState {
+    /// Where it is.
+    pub folder: PathBuf,
+    /// Whether it goes on.
+    pub state: RecordStand,
+    /// Why it was given up.
+    pub reason: Option<String>,
+    /// Rows that were left out because the disk was too slow.
+    pub rows_lost: u64,
+}
+
+impl RecordState {
+    /// The same in words.
+    pub fn text(&self) -> String {
+        let rows = match self.rows_lost {
+            0 => String::new(),
+            rows => format!("; {rows} rows are left out: the disk is too slow"),
+        };
+        match &self.reason {
+            Some(reason) => format!("lost: {reason}{rows}"),
+            None => format!("{}{rows}", self.folder.display()),
+        }
+    }
+}
+
+/// Whether a record goes on. The first who cannot write gives it up for all.
+#[derive(Debug)]
+pub struct RecordHealth {
+    folder: PathBuf,
+    reason: Mutex<Option<String>>,
+    rows_lost: AtomicU64,
+}
+
+impl RecordHealth {
+    /// That of a record in `folder`, which goes on.
+    pub fn new(folder: &Path) -> Self {
+        Self { folder: folder.to_owned(), reason: Mutex::new(None), rows_lost: AtomicU64::new(0) }
+    }
+
+    /// Gives the record up because of `why`, and says so in the log, unless somebody has done that already.
+    pub fn give_up(&self, why: &str) {
+        let mut reason = self.reason();
+        if reason.is_none() {
+            tracing::error!(
+                "the record is lost from here on: {why}. Frames and lasers go on without it, and what was written before \
+                 can be read; start holod again for a new record"
+            );
+            *reason = Some(why.to_owned());
+        }
+    }
+
+    /// Whether it was given up.
+    pub fn is_lost(&self) -> bool {
+        self.reason().is_some()
+    }
+
+    /// How it is.
+    pub fn state(&self) -> RecordState {
+        let reason = self.reason().clone();
+        let state = if reason.is_some() { RecordStand::Lost } else { RecordStand::Written };
+        RecordState { folder: self.folder.clone(), state, reason, rows_lost: self.rows_lost() }
+    }
+
+    /// What a run whose record was given up ends with.
+    ///
+    /// # Errors
+    /// It was.
+    pub fn judge(&self) -> Result<(), Failure> {
+        let Some(why) = self.reason().clone() else { return Ok(()) };
+        let said = format!("the record in {} was lost while the run went on: {why}", self.folder.display());
+        Err(Failure::new(Exit::CannotCreate, said))
+    }
+
+    pub(super) fn lose_row(&self) {
+        self.rows_lost.fetch_add(1, Ordering::Relaxed);
+    }
+
+    pub(super) fn rows_lost(&self) -> u64 {
+        self.rows_lost.load(Ordering::Relaxed)
+    }
+
+    fn reason(&self) -> MutexGuard<'_, Option<String>> {
+        self.reason.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A file of a record that cannot be written any more, and what to do about it.
+pub(super) fn lost(path: &Path, error: &io::Error) -> Failure {
+    let cure = match error.kind() {
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => "make room there, or name another place with --record",
+        ErrorKind::FileTooLarge => "raise the limit on a file's size (ulimit -f)",
+        ErrorKind::NotFound => "leave a record where it is until its run is over",
+        _ => "look after its disk, or name another place with --record",
+    };
+    Failure::new(Exit::CannotCreate, format!("cannot go on recording into {}: {error}; {cure}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_record_is_given_up_once_with_the_first_reason_and_what_to_do() {
+        let health = RecordHealth::new(Path::new("/a/record"));
+        assert_eq!(health.state().text(), "/a/record");
+        assert!(health.judge().is_ok());
+        let full = lost(Path::new("/a/record/frames.csv"), &ErrorKind::StorageFull.into());
+        health.give_up(&full.to_string());
+        health.give_up("another");
+        health.lose_row();
+        let state = health.state();
+        assert_eq!((state.state, state.rows_lost, health.is_lost()), (RecordStand::Lost, 1, true));
+        for part in ["lost: ", "/a/record/frames.csv", "no storage space", "make room", "1 rows are left out"] {
+            assert!(state.text().contains(part), "{part}: {}", state.text());
+        }
+        let failure = health.judge().unwrap_err();
+        assert!(failure.exit == Exit::CannotCreate && failure.to_string().contains("no storage space"), "{failure}");
+    }
+}

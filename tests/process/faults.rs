@@ -1,0 +1,300 @@
+//! Disks, pipes and folders that fail under a run cost the record or the log, and neither frames nor lasers.
+
+use std::fs;
+use std::io::{PipeReader, PipeWriter, Read};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::thread;
+use std::time::Duration;
+
+use holod_tests::daemon::{Daemon, Ended, run, wait_until};
+use holod_tests::tracker::PtyTracker;
+use holod_tests::{frames, small_rig};
+use rustix::fs::OFlags;
+use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
+
+use crate::HOLOD;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+/// What every run here is started with: frames so small that a machine that is busy with other work makes many.
+const ARGS: [&str; 10] = [
+    "--config",
+    "rig.toml",
+    "--tracker",
+    "mock:steady",
+    "--resolution",
+    "16x16",
+    "--weights",
+    "fast",
+    "--backend",
+    "cpu",
+];
+
+fn bench() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    folder
+}
+
+/// `holod` with `more` by a shell that does `before` first, such as setting limits, and `redirects` its output.
+fn by_shell(folder: &Path, before: &str, more: &[&str], redirects: &str) -> Command {
+    let words: Vec<_> = [&[HOLOD][..], &ARGS, more].concat().iter().map(|word| format!("'{word}'")).collect();
+    let mut command = Command::new("sh");
+    command.args(["-c", &format!("{before} exec {} {redirects}", words.join(" "))]);
+    command.current_dir(folder).env("XDG_RUNTIME_DIR", folder).stdin(Stdio::null());
+    command
+}
+
+/// A holod whose output is not read by the bench's own threads.
+struct Process(Child);
+
+impl Process {
+    fn start(mut command: Command) -> Self {
+        Self(command.spawn().expect("it starts"))
+    }
+
+    fn terminate(&self) {
+        kill_process(Pid::from_raw(self.0.id() as i32).unwrap(), Signal::TERM).unwrap();
+    }
+
+    /// Its exit code, where it ends in time.
+    fn code(&mut self) -> Option<i32> {
+        let mut status = None;
+        wait_until(PATIENCE, || {
+            status = self.0.try_wait().unwrap();
+            status.is_some()
+        });
+        status.expect("it ends").code()
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ended = self.0.kill();
+        let _ended = self.0.wait();
+    }
+}
+
+fn start(folder: &Path, more: &[&str]) -> Daemon {
+    let daemon = Daemon::start_with(HOLOD, &[&ARGS, more].concat(), folder, &[("XDG_RUNTIME_DIR", folder)]);
+    frames_go_on(folder);
+    daemon
+}
+
+fn ask(folder: &Path, args: &[&str]) -> Ended {
+    Daemon::start_with(HOLOD, args, folder, &[("XDG_RUNTIME_DIR", folder)]).wait(PATIENCE)
+}
+
+fn status(folder: &Path) -> Value {
+    serde_json::from_str(&ask(folder, &["status", "--json"]).stdout).unwrap_or_default()
+}
+
+/// Sees the counter of `holod status` rise, and that lasers are armed.
+fn frames_go_on(folder: &Path) {
+    let shown = || status(folder)["frames_shown"].as_u64();
+    let then = shown().unwrap_or(0) + 20;
+    assert!(wait_until(PATIENCE, || shown() > Some(then)), "{}", status(folder));
+    assert!(wait_until(PATIENCE, || status(folder)["lasers"] == "armed"), "{}", status(folder));
+}
+
+fn until_record_is_lost(folder: &Path) -> String {
+    let lost = wait_until(PATIENCE, || status(folder)["record"]["state"] == "lost");
+    assert!(lost, "{}", status(folder));
+    let text = ask(folder, &["status"]).stdout;
+    assert!(text.contains("degraded") && text.contains("\nrecord   lost: "), "{text}");
+    status(folder)["record"]["reason"].as_str().expect("a reason").to_owned()
+}
+
+/// Judges the end of a run whose record was lost because of `cause`.
+fn judge_lost(ended: &Ended, cause: &str) {
+    assert_eq!(ended.status.code(), Some(73), "{ended:?}");
+    let told: Vec<_> = ended.stderr.lines().filter(|line| line.contains("the record is lost from here on")).collect();
+    assert!(matches!(told[..], [line] if line.contains(cause) && line.contains("ERROR")), "{}", ended.stderr);
+    let last = ended.stderr.lines().last().unwrap();
+    assert!(last.starts_with("holod: error: the record in ") && last.contains(cause), "{last}");
+    assert!(ended.stdout.contains("\nrecord    lost: ") && ended.stdout.contains("lasers dark: true"), "{ended:?}");
+}
+
+#[test]
+fn a_record_that_is_deleted_is_given_up_and_frames_go_on() {
+    let folder = bench();
+    let daemon = start(folder.path(), &["--record", "record", "--page", "127.0.0.1:0"]);
+    assert_eq!(status(folder.path())["record"]["state"], "written");
+    let samples = folder.path().join("record/samples.csv");
+    assert!(wait_until(PATIENCE, || fs::metadata(&samples).is_ok_and(|samples| samples.len() > 1000)));
+    fs::remove_dir_all(folder.path().join("record")).unwrap();
+    let reason = until_record_is_lost(folder.path());
+    assert!(reason.contains("deleted"), "{reason}");
+    frames_go_on(folder.path());
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(PATIENCE);
+    judge_lost(&ended, "deleted");
+}
+
+#[test]
+fn a_record_that_grows_beyond_the_users_limit_is_given_up_and_can_be_read() {
+    let folder = bench();
+    // In blocks of 512 or 1024 bytes, by the shell: some seconds of rows.
+    let mut command = by_shell(folder.path(), "ulimit -f 128;", &["--record", "record"], "2>log");
+    command.stdout(Stdio::null());
+    let mut holod = Process::start(command);
+    frames_go_on(folder.path());
+    let reason = until_record_is_lost(folder.path());
+    assert!(reason.contains("ulimit -f") || reason.contains("File too large"), "{reason}");
+    frames_go_on(folder.path());
+    holod.terminate();
+    assert_eq!(holod.code(), Some(73));
+    let log = fs::read_to_string(folder.path().join("log")).unwrap();
+    assert!(log.contains("the record is lost from here on"), "{log}");
+    judge_what_is_left(folder.path());
+}
+
+/// What was written before the record was given up can be read.
+fn judge_what_is_left(folder: &Path) {
+    let rows = fs::read_to_string(folder.join("record/frames.csv")).unwrap();
+    // The last row may be cut off.
+    let whole = &rows[..=rows.rfind('\n').unwrap()];
+    fs::write(folder.join("whole.csv"), whole).unwrap();
+    let rows = frames::read(&folder.join("whole.csv")).unwrap();
+    assert!(rows.len() > 60 && frames::faults(&rows, holod_tests::FIELD_ORDER).is_empty(), "{} rows", rows.len());
+    let samples = fs::read_to_string(folder.join("record/samples.csv")).unwrap();
+    let mut cells = samples[..samples.rfind('\n').unwrap()].lines().map(|row| row.split(',').count());
+    let columns = cells.next().unwrap();
+    assert!(samples.lines().count() > 100 && cells.all(|count| count == columns));
+    let packed = run(HOLOD, &["report", "record", "--out", "report.tar.gz"], folder);
+    assert!(packed.status.success(), "{packed:?}");
+    let again = run(HOLOD, &["--tracker", "replay:report.tar.gz", "--frames", "20", "--json"], folder);
+    let again_json: Value = serde_json::from_str(&again.stdout).unwrap_or_else(|_| panic!("{again:?}"));
+    assert_eq!(again_json["report"]["frames_different"], 0, "{again_json}");
+}
+
+#[test]
+fn a_disk_that_is_full_costs_the_record_and_no_frame() {
+    let folder = bench();
+    fs::create_dir(folder.path().join("disk")).unwrap();
+    // A disk of its own, in a mount namespace that only this holod sees.
+    let words: Vec<_> = [&[HOLOD][..], &ARGS, &["--record", "disk/record"]].concat();
+    let mount = format!("mount -t tmpfs -o size=256k none disk && exec {}", words.join(" "));
+    let args = ["--mount", "--map-root-user", "sh", "-c", &mount];
+    let can_mount = Command::new("unshare").args(["--mount", "--map-root-user", "true"]).status();
+    assert!(can_mount.is_ok_and(|status| status.success()), "this test needs user namespaces, or root");
+    let daemon = Daemon::start_with("unshare", &args, folder.path(), &[("XDG_RUNTIME_DIR", folder.path())]);
+    frames_go_on(folder.path());
+    let reason = until_record_is_lost(folder.path());
+    assert!(reason.contains("No space left") && reason.contains("disk/record"), "{reason}");
+    frames_go_on(folder.path());
+    daemon.signal(Signal::TERM);
+    judge_lost(&daemon.wait(PATIENCE), "No space left");
+}
+
+/// A pipe that is full, and that nobody reads.
+fn full_pipe() -> (PipeReader, PipeWriter) {
+    let (reader, writer) = std::io::pipe().unwrap();
+    let flags = rustix::fs::fcntl_getfl(&writer).unwrap();
+    rustix::fs::fcntl_setfl(&writer, flags | OFlags::NONBLOCK).unwrap();
+    while rustix::io::write(&writer, &[b'x'; 4096]).is_ok() {}
+    rustix::fs::fcntl_setfl(&writer, flags).unwrap();
+    (reader, writer)
+}
+
+#[test]
+fn a_log_that_nobody_reads_holds_nothing_up_and_says_so_once_somebody_does() {
+    let folder = bench();
+    let (mut reader, writer) = full_pipe();
+    let mut command = by_shell(folder.path(), "", &["--record", "record"], "");
+    command.env("HOLOD_LOG", "trace").stdout(Stdio::null()).stderr(writer);
+    let mut holod = Process::start(command);
+    // The pipe's other writing end went with the command.
+    frames_go_on(folder.path());
+    let answered = (0..10).filter(|_| ask(folder.path(), &["ctl", "status"]).status.success()).count();
+    assert_eq!(answered, 10, "control requests are answered");
+    // Until more has been said than may wait.
+    let log = folder.path().join("record/log.txt");
+    let said = || fs::read_to_string(&log).map_or(0, |log| log.lines().count());
+    assert!(wait_until(PATIENCE, || said() > 20_000), "{}", said());
+    frames_go_on(folder.path());
+    let text = thread::spawn(move || {
+        let mut text = Vec::new();
+        reader.read_to_end(&mut text).unwrap();
+        String::from_utf8_lossy(&text).into_owned()
+    });
+    frames_go_on(folder.path());
+    holod.terminate();
+    assert_eq!(holod.code(), Some(0));
+    let text = text.join().unwrap();
+    assert!(text.contains("lines of the log were left out"), "{}", text.len());
+    assert!(text.contains("stopping: SIGTERM"), "the end is told");
+    let rows = frames::read(&folder.path().join("record/frames.csv")).unwrap();
+    assert_eq!(frames::faults(&rows, holod_tests::FIELD_ORDER), Vec::<String>::new());
+}
+
+#[test]
+fn a_run_whose_log_is_never_read_ends_when_it_is_asked_to() {
+    let folder = bench();
+    let (_reader, writer) = full_pipe();
+    let mut command = by_shell(folder.path(), "", &[], "");
+    command.stdout(Stdio::null()).stderr(writer);
+    let mut holod = Process::start(command);
+    frames_go_on(folder.path());
+    holod.terminate();
+    assert_eq!(holod.code(), Some(0));
+}
+
+#[test]
+fn a_log_that_is_closed_and_an_output_that_is_closed_end_no_run() {
+    // From the beginning; a reader that goes away; a disk that is full.
+    for (redirects, code) in [("2>&- >&-", 0), ("2>/dev/full >/dev/full", 74), ("2>/dev/full >/dev/null", 0)] {
+        let folder = bench();
+        let mut holod = Process::start(by_shell(folder.path(), "", &["--record", "record"], redirects));
+        frames_go_on(folder.path());
+        holod.terminate();
+        assert_eq!(holod.code(), Some(code), "{redirects}");
+        assert!(folder.path().join("record/summary.json").exists());
+    }
+}
+
+#[test]
+fn a_summary_that_nobody_reads_is_told_and_fails_the_run() {
+    for (stdout_gone, stderr_gone) in [(true, false), (true, true), (false, true)] {
+        let folder = bench();
+        let mut command = by_shell(folder.path(), "", &[], "");
+        command.stdout(Stdio::piped()).stderr(Stdio::piped());
+        let mut holod = Process::start(command);
+        let (mut stdout, mut stderr) = (holod.0.stdout.take(), holod.0.stderr.take());
+        if stdout_gone {
+            stdout = None;
+        }
+        if stderr_gone {
+            stderr = None;
+        }
+        frames_go_on(folder.path());
+        holod.terminate();
+        assert_eq!(holod.code(), Some(if stdout_gone { 74 } else { 0 }), "stderr gone: {stderr_gone}");
+        let mut text = String::new();
+        stderr.map(|mut stderr| stderr.read_to_string(&mut text)).transpose().unwrap();
+        if stdout_gone && !stderr_gone {
+            assert!(text.contains("holod: error: cannot write to standard output: Broken pipe"), "{text}");
+        }
+        assert!(!text.contains("panicked"), "{text}");
+        drop(stdout);
+    }
+}
+
+#[test]
+fn a_second_holod_on_a_tracker_is_refused_and_the_first_goes_on() {
+    let folder = bench();
+    let link = folder.path().join("ttyTracker");
+    let _tracker = PtyTracker::plug_in(&link).unwrap();
+    let args = ARGS.map(|arg| if arg == "mock:steady" { "ttyTracker" } else { arg });
+    let environment = [("XDG_RUNTIME_DIR", folder.path())];
+    let mut first = Daemon::start_with(HOLOD, &args, folder.path(), &environment);
+    frames_go_on(folder.path());
+    let second = Daemon::start_with(HOLOD, &args, folder.path(), &environment).wait(PATIENCE);
+    assert_eq!(second.status.code(), Some(66), "{second:?}");
+    assert!(second.stderr.contains("ttyTracker") && second.stderr.contains("another program"), "{}", second.stderr);
+    assert!(first.runs());
+    frames_go_on(folder.path());
+    first.signal(Signal::TERM);
+    assert!(first.wait(PATIENCE).status.success());
+}
