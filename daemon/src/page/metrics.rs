@@ -185,6 +185,9 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
         ("left_out", feed.left_out),
     ];
     told.counters("feed_pictures", "Pictures of the live feed, by what became of them", "fate", pictures)?;
+    let bad = feed.bad_depths_in_all.entries();
+    told.counters("feed_bad_depth_pixels", "Depths that cannot be shown as they are, by what they are", "kind", bad)?;
+    told.counter("feed_bad_depth_pictures", "Pictures that have some", feed.pictures_with_bad_depths)?;
     told.counters(
         "feed_connections_refused",
         "Connections that were refused or broken off",
