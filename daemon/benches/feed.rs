@@ -1,5 +1,5 @@
-//! What it costs to hand a 1920x1080 picture over through the live feed, beside a copy of its bytes in the same run:
-//! `cargo bench -p holod --bench feed`.
+//! What it costs a client to hand a 1920x1080 picture over through the live feed, beside a copy of its bytes in the same
+//! run: `cargo bench -p holod --bench feed`. What holod itself does with it is measured by `holod bench --feed`.
 
 #![allow(clippy::print_stdout, reason = "it prints what it measured")]
 
@@ -10,8 +10,7 @@ use std::time::{Duration, Instant};
 use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
 use holod_daemon::source::feed::FeedPlan;
 use holod_daemon::source::{self, OpenPictures, Pictures};
-use holod_model::RgbdFrame;
-use holod_model::scene::{Fit, LiveColour, LiveDepth, LiveFormat, LivePart, LiveReader};
+use holod_model::scene::{Fit, LiveColour, LiveDepth, LiveFormat};
 use holod_tests::feed::{Answer, FeedClient, hello};
 
 const SIZE: Resolution = Resolution { width: 1920, height: 1080 };
@@ -32,11 +31,8 @@ fn main() {
     let mut client = FeedClient::connect(&socket).expect("a connection");
     client.say(&hello(SIZE.width as u32, SIZE.height as u32, None, "bench")).expect("the feed listens");
     assert_eq!(client.answer(), Answer::Ring);
-    let mut reader =
-        LiveReader::new(format, &DisplayGeometry::DEFAULT, SIZE, Fit::Native).expect("the picture is the frame");
-    let mut frame = RgbdFrame::black(SIZE);
 
-    let mut times = [const { Vec::new() }; 4];
+    let mut times = [const { Vec::new() }; 3];
     for round in 0..ROUNDS {
         times[0].push(timed(|| {
             colour_copy.copy_from_slice(black_box(&colour));
@@ -47,30 +43,16 @@ fn main() {
             client.hand_over(0, 1 + round as u64, 0).expect("the feed listens");
             assert!(matches!(client.answer(), Answer::Free { outcome: 0, .. }));
         }));
-        let read_at = |part, bytes: &mut [u8], at: usize| {
-            let all = if part == LivePart::Colour { &colour } else { &depth };
-            bytes.copy_from_slice(&all[at..at + bytes.len()]);
-            Ok(())
-        };
-        times[3].push(timed(|| {
-            reader.read(read_at, &mut frame).expect("a picture");
-        }));
         black_box((&colour_copy, &depth_copy, source.at(TimeNs(0)).1));
     }
     let [copied, others @ ..] = times.map(median_ms);
     let bytes = format.colour_bytes() + format.depth_bytes();
-    let out = size_of_val(&*frame.amplitude) + size_of_val(&*frame.depth_normalised);
-    println!("{SIZE}, RGBA8 and 16-bit millimetres: {:.1} MB in, {:.1} MB of frame out", mb(bytes), mb(out));
+    println!("{SIZE}, RGBA8 and 16-bit millimetres: {:.1} MB", bytes as f64 / 1e6);
     println!("a copy of the bytes in memory          {copied:6.2} ms");
-    let names =
-        ["written into the shared memory", "handed over, until the slot is free", "made a frame, without the feed"];
+    let names = ["written into the shared memory", "handed over, until the slot is free"];
     for (name, ms) in names.into_iter().zip(others) {
         println!("{name:36}   {ms:6.2} ms, {:5.2} of a copy", ms / copied);
     }
-}
-
-fn mb(bytes: usize) -> f64 {
-    bytes as f64 / 1e6
 }
 
 fn timed(work: impl FnOnce()) -> Duration {

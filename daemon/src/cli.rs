@@ -429,6 +429,10 @@ pub struct BenchArgs {
     /// Engine for the network.
     #[arg(long, value_enum, default_value_t = Backend::Auto)]
     pub backend: Backend,
+    /// Time instead what a picture of the live feed costs, of this size or 1920x1080: while its client waits (take), and
+    /// then (make), beside a copy of its bytes in memory.
+    #[arg(long, value_name = "WxH", value_parser = parse_resolution, num_args = 0..=1, default_missing_value = "1920x1080")]
+    pub feed: Option<Resolution>,
     /// Size of the hologram.
     #[arg(long, value_name = "WxH", value_parser = parse_resolution, default_value = "512x512")]
     pub resolution: Resolution,

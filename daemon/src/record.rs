@@ -114,7 +114,7 @@ impl FieldRecord {
 /// The columns of `frames.csv`.
 pub const HEADER: &str = "frame,field,colour,t_sample_ns,pupil_raw_mm,pupil_mm,pupil_state,t_wake_ns,t_render_begin_ns,\
 t_render_end_ns,t_submit_ns,t_present_ns,present_provenance,laser_on_ns,laser_off_ns,deadline_missed,picture,t_picture_ns,\
-levels_xxh3,scene_order,weights_order,pattern_order";
+levels_xxh3,scene_order,weights_order,pattern_order,picture_focus_dpt,picture_fov_x_deg,picture_fov_y_deg";
 
 /// Name of the table of fields in a record.
 pub const FRAMES: &str = "frames.csv";
@@ -214,10 +214,12 @@ impl FrameLog {
         let frame = self.frames.get(&field.frame);
         let time = |t: Option<TimeNs>| t.map(|t| t.0.to_string()).unwrap_or_default();
         let order = |order: Option<u32>| order.map(|order| order.to_string()).unwrap_or_default();
+        let figure = |figure: Option<f32>| figure.map(|figure| figure.to_string()).unwrap_or_default();
+        let view = frame.map(|f| f.picture.view).unwrap_or_default();
         let (on, off) = (field.laser_window.map(|w| w.0), field.laser_window.map(|w| w.1));
         writeln!(
             self.file,
-            "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
             field.frame,
             field.field,
             field.colour,
@@ -241,6 +243,9 @@ impl FrameLog {
             order(frame.map(|f| f.orders.scene)),
             order(frame.map(|f| f.orders.weights)),
             order(frame.map(|f| f.orders.pattern)),
+            figure(view.focus_dpt),
+            figure(view.field_of_view_deg.map(|[across, _]| across)),
+            figure(view.field_of_view_deg.map(|[_, up]| up)),
         )
         .map_err(|error| self.lost(&error))
     }
@@ -295,6 +300,7 @@ impl FrameLog {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::source::PictureView;
 
     fn frame(number: u64) -> FrameRecord {
         FrameRecord {
@@ -308,7 +314,13 @@ mod tests {
             t_render_end: TimeNs(20),
             t_submit: TimeNs(21),
             t_desired_present: TimeNs(30),
-            picture: PictureTag { number: 4, t_taken: Some(TimeNs(3)), t_came: Some(TimeNs(4)), order: 2 },
+            picture: PictureTag {
+                number: 4,
+                t_taken: Some(TimeNs(3)),
+                t_came: Some(TimeNs(4)),
+                view: PictureView { focus_dpt: Some(1.25), field_of_view_deg: Some([60.0, 45.5]) },
+                order: 2,
+            },
             keep: None,
             amplitude_constant: 1.0,
             orders: FrameOrders { scene: 2, weights: 0, pattern: 1 },
@@ -340,9 +352,9 @@ mod tests {
         let rows: Vec<&str> = text.lines().collect();
         assert_eq!(
             rows[1],
-            "7,1,green,5,3.2500,3.3,tracking,10,11,20,21,30,software,33,36,0,4,3,00000000000000ab,2,0,1"
+            "7,1,green,5,3.2500,3.3,tracking,10,11,20,21,30,software,33,36,0,4,3,00000000000000ab,2,0,1,1.25,60,45.5"
         );
-        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0,,,,,,");
+        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,");
         assert!(rows.iter().all(|row| row.split(',').count() == HEADER.split(',').count()));
     }
 

@@ -78,10 +78,14 @@ pub fn spread_text(spread: Option<Spread>) -> String {
 
 /// What became of a feed's pictures.
 pub fn feed_text(feed: &FeedStatus) -> String {
+    let bad_depths = match feed.pictures_with_bad_depths {
+        0 => String::new(),
+        pictures => format!("; bad depths in {pictures} of them: {} pixels", feed.bad_depths_in_all.text()),
+    };
     let refusal = feed.last_refusal.as_ref().map_or(String::new(), |why| format!("; refused last: {why}"));
     format!(
         "{} pictures taken, {} overtaken, {} refused, {} of clients not shown, {} left out by clients; {} \
-         connections refused{refusal}",
+         connections refused{bad_depths}{refusal}",
         feed.taken, feed.overtaken, feed.refused, feed.not_shown, feed.left_out, feed.connections_refused,
     )
 }

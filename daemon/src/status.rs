@@ -67,8 +67,8 @@ impl StatusFile {
         Self { newest, writer: writer.ok() }
     }
 
-    /// Has the file written anew, with what holds at host time `now`. Where the disk is still at what was written before, this
-    /// one is left out.
+    /// Has the file written anew at host time `now`. Where the disk is still at what was written before, this one is left
+    /// out.
     pub fn write(&mut self, status: &Snapshot, now: TimeNs) {
         if self.writer.is_none() {
             return;
@@ -223,17 +223,11 @@ mod tests {
 
     use super::*;
 
-    const LONG: Duration = Duration::from_secs(20);
     const NOW: TimeNs = TimeNs(1_000_000_000_000);
+    const LONG: Duration = Duration::from_secs(20);
 
     fn found_in(folders: &[PathBuf]) -> Result<Vec<Found>, Failure> {
         of_running_in(folders, NOW)
-    }
-
-    /// Waits until it is on the disk.
-    fn write_out(file: &mut StatusFile, status: &Snapshot, now: TimeNs) {
-        file.write(status, now);
-        assert!(file.newest.wait_until_done(LONG));
     }
 
     fn status() -> Snapshot {
@@ -246,7 +240,8 @@ mod tests {
         let folders = [folder.path().join("absent"), folder.path().to_owned()];
         assert_eq!(found_in(&folders).unwrap_err().exit, Exit::Unavailable);
         let mut file = StatusFile::at(folder.path().join(file_name(std::process::id())));
-        write_out(&mut file, &status(), NOW);
+        file.write(&status(), NOW);
+        assert!(file.newest.wait_until_done(LONG));
         assert_eq!(found_in(&folders).unwrap(), [Found { status: status(), stale: None }]);
         drop(file);
         assert!(found_in(&folders).is_err());
@@ -266,7 +261,8 @@ mod tests {
         std::fs::write(&own, serde_json::to_vec(&status()).unwrap()).unwrap();
         assert_eq!(found_in(&folders).unwrap()[0].stale, None, "an older holod does not say when");
         let mut file = StatusFile::at(own.clone());
-        write_out(&mut file, &status(), NOW - TimeNs(60_000_000_000));
+        file.write(&status(), NOW - TimeNs(60_000_000_000));
+        assert!(file.newest.wait_until_done(LONG));
         // The wall clock was set back, so that the file's own time lies ahead, or forward.
         for later_s in [-3600, 0, 3600i64] {
             let wall =
@@ -274,7 +270,8 @@ mod tests {
             std::fs::File::options().write(true).open(&own).unwrap().set_modified(wall).unwrap();
             assert_eq!(found_in(&folders).unwrap()[0].stale, Some(Duration::from_secs(60)));
         }
-        write_out(&mut file, &status(), NOW - TimeNs(1_000_000_000));
+        file.write(&status(), NOW - TimeNs(1_000_000_000));
+        assert!(file.newest.wait_until_done(LONG));
         let long_ago = SystemTime::now() - Duration::from_secs(60);
         std::fs::File::options().write(true).open(&own).unwrap().set_modified(long_ago).unwrap();
         assert_eq!(found_in(&folders).unwrap()[0].stale, None);
@@ -289,7 +286,8 @@ mod tests {
         // The first process of all lives, whoever runs this.
         let [one, other] = [1, std::process::id()].map(|pid| {
             let mut file = StatusFile::at(folder.path().join(file_name(pid)));
-            write_out(&mut file, &Snapshot { pid, ..status() }, NOW);
+            file.write(&Snapshot { pid, ..status() }, NOW);
+            assert!(file.newest.wait_until_done(LONG));
             file
         });
         let pids = || found_in(&folders).unwrap().iter().map(|found| found.status.pid).collect::<Vec<_>>();

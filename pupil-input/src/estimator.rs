@@ -10,6 +10,11 @@ use crate::{PupilSample, SampleEye};
 /// lead, and the filter's rise at the onset of a reflex.
 pub const STATED_LAG: TimeNs = TimeNs(50_000_000);
 
+/// A first believed sample this soon after the begin is shown at once: hardly anything was shown before.
+const SHOWN_AT_ONCE: TimeNs = TimeNs(500_000_000);
+/// What was slid to is reached when no more than this is left.
+const REACHED_MM: f32 = 0.1;
+
 /// How samples become an estimate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EstimatorSettings {
@@ -71,6 +76,8 @@ impl From<&rig::Tracker> for EstimatorSettings {
 /// What the estimate rests on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum PupilState {
+    /// The slide from the fallback to fresh samples, farther than a tenth of a millimetre from them.
+    Acquiring,
     /// Fresh samples.
     Tracking,
     /// The last good value, through a blink or a short loss.
@@ -80,9 +87,13 @@ pub enum PupilState {
 }
 
 impl PupilState {
+    /// Every state.
+    pub const ALL: [Self; 4] = [Self::Acquiring, Self::Tracking, Self::Holding, Self::Fallback];
+
     /// The name used in records.
     pub const fn name(self) -> &'static str {
         match self {
+            Self::Acquiring => "acquiring",
             Self::Tracking => "tracking",
             Self::Holding => "holding",
             Self::Fallback => "fallback",
@@ -134,6 +145,18 @@ pub struct EstimateSnapshot {
 struct Blend {
     t: TimeNs,
     excess_mm: f32,
+    /// It began at the fallback, or on the way to it.
+    acquires: bool,
+}
+
+impl Blend {
+    const NONE: Self = Self { t: TimeNs(0), excess_mm: 0.0, acquires: false };
+
+    /// What is left of the difference at `t`, with its sign.
+    fn left_mm(&self, t: TimeNs, return_mm_per_s: f32) -> f32 {
+        let worked_off_mm = return_mm_per_s * (t - self.t).seconds().max(0.0) as f32;
+        (self.excess_mm.abs() - worked_off_mm).max(0.0).copysign(self.excess_mm)
+    }
 }
 
 /// Host time to the stream's time, for logs that are replayed at another speed.
@@ -168,7 +191,7 @@ impl EstimateSnapshot {
         Self {
             motion: None,
             lost: false,
-            blend: Blend { t: TimeNs(0), excess_mm: 0.0 },
+            blend: Blend::NONE,
             raw: None,
             silence: settings.silence,
             clock: StreamClock::LIVE,
@@ -193,7 +216,7 @@ impl EstimateSnapshot {
         let shown = self.shown_at(t);
         let before = std::mem::replace(&mut self.settings, settings);
         let t_believed = match (shown.state, self.motion) {
-            (PupilState::Tracking, _) => return before,
+            (PupilState::Acquiring | PupilState::Tracking, _) => return before,
             (PupilState::Holding, Some(motion)) => motion.t.max(t - settings.hold),
             // What is not held any more is not held again.
             _ => t - settings.hold - TimeNs(1),
@@ -204,7 +227,7 @@ impl EstimateSnapshot {
             velocity_mm_per_s: 0.0,
             velocity_lasts: settings.filter.velocity_lasts,
         });
-        self.blend = Blend { t, excess_mm: 0.0 };
+        self.blend = Blend::NONE;
         self.lost = true;
         before
     }
@@ -230,6 +253,8 @@ impl EstimateSnapshot {
             (followed.0 + slid_mm.min(left_mm.abs()).copysign(left_mm), velocity, PupilState::Fallback)
         } else if self.lost || age > self.silence {
             (followed.0, followed.1, PupilState::Holding)
+        } else if self.acquires(t, REACHED_MM) {
+            (followed.0, followed.1, PupilState::Acquiring)
         } else {
             (followed.0, followed.1, PupilState::Tracking)
         };
@@ -240,10 +265,14 @@ impl EstimateSnapshot {
     /// The motion and what is left of the blend: diameter and velocity.
     fn followed_at(&self, motion: &Motion, t: TimeNs) -> (f32, f32) {
         let motion = motion.at(t);
-        let worked_off_mm = self.settings.return_mm_per_s * (t - self.blend.t).seconds().max(0.0) as f32;
-        let left_mm = (self.blend.excess_mm.abs() - worked_off_mm).max(0.0);
-        let speed = if left_mm > 0.0 { -self.settings.return_mm_per_s.copysign(self.blend.excess_mm) } else { 0.0 };
-        (motion.diameter_mm + left_mm.copysign(self.blend.excess_mm), motion.velocity_mm_per_s + speed)
+        let left_mm = self.blend.left_mm(t, self.settings.return_mm_per_s);
+        let speed = if left_mm == 0.0 { 0.0 } else { -self.settings.return_mm_per_s.copysign(left_mm) };
+        (motion.diameter_mm + left_mm, motion.velocity_mm_per_s + speed)
+    }
+
+    /// Whether more than `least_mm` is left at `t` of a slide that began at the fallback.
+    fn acquires(&self, t: TimeNs, least_mm: f32) -> bool {
+        self.blend.acquires && self.blend.left_mm(t, self.settings.return_mm_per_s).abs() > least_mm
     }
 }
 
@@ -298,6 +327,8 @@ pub struct Estimator {
     chosen: Option<usize>,
     learnt: TimeNs,
     t_learnt: Option<TimeNs>,
+    /// Since when the fallback is shown before any sample is believed.
+    t_begins: Option<TimeNs>,
     snapshot: EstimateSnapshot,
 }
 
@@ -309,8 +340,15 @@ impl Estimator {
             chosen: None,
             learnt: TimeNs(0),
             t_learnt: None,
+            t_begins: None,
             snapshot: EstimateSnapshot::new(settings),
         }
+    }
+
+    /// Says that the estimate is shown from `t` on, in place of the first sample's time: the first diameter that is believed
+    /// is shown at once if that is soon after, else slid to.
+    pub fn begin(&mut self, t: TimeNs) {
+        self.t_begins = Some(t);
     }
 
     /// Goes on with other settings from `t` on; what is shown does not jump. Where they make something else of the samples,
@@ -342,6 +380,7 @@ impl Estimator {
             return on_decision(Decision { sample, verdict: Verdict::Rejected(Rejection::OtherEye) });
         }
         let t = sample.t_sample;
+        self.t_begins.get_or_insert(t);
         let channel = &mut self.channels[sample.eye.index()];
         let lives_before = channel.live;
         let mut believed = false;
@@ -465,14 +504,14 @@ impl Estimator {
     fn combine(&mut self, t: TimeNs, set_changed: bool) {
         let shown = |index| self.snapshot.settings.eye != rig::Eye::Better || Some(index) == self.chosen;
         let live = || (0..).zip(&self.channels).filter(|(i, eye)| eye.live && shown(*i)).map(|(_, eye)| eye);
-        let Some(newest) = live().filter_map(|channel| channel.filter.motion()).map(|motion| motion.t).max() else {
+        let Some(newest) = live().filter_map(|channel| channel.filter.outlook()).map(|motion| motion.t).max() else {
             self.snapshot.lost = true;
             return;
         };
         let alone = live().count() == 1 && self.snapshot.settings.eye == rig::Eye::Both;
         let mut sum = (0.0, 0.0, 0.0_f32);
         for channel in live() {
-            if let Some(motion) = channel.filter.motion() {
+            if let Some(motion) = channel.filter.outlook() {
                 let motion = motion.at(newest);
                 let to_mean_mm = if alone { channel.to_mean_mm } else { 0.0 };
                 sum = (sum.0 + motion.diameter_mm + to_mean_mm, sum.1 + motion.velocity_mm_per_s, sum.2 + 1.0);
@@ -485,8 +524,15 @@ impl Estimator {
             velocity_lasts: self.snapshot.settings.filter.velocity_lasts,
         };
         let shown = self.snapshot.shown_at(t);
-        if set_changed || shown.state != PupilState::Tracking {
-            self.snapshot.blend = Blend { t, excess_mm: shown.diameter_mm - motion.at(t).diameter_mm };
+        if set_changed || !matches!(shown.state, PupilState::Acquiring | PupilState::Tracking) {
+            let at_once =
+                self.snapshot.motion.is_none() && self.t_begins.is_none_or(|begins| t - begins <= SHOWN_AT_ONCE);
+            self.snapshot.blend = if at_once {
+                Blend::NONE
+            } else {
+                let acquires = shown.state == PupilState::Fallback || self.snapshot.acquires(t, 0.0);
+                Blend { t, excess_mm: shown.diameter_mm - motion.at(t).diameter_mm, acquires }
+            };
         }
         self.snapshot.motion = Some(motion);
         self.snapshot.lost = false;

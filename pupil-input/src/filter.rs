@@ -2,7 +2,7 @@
 //!
 //! dx = v dt, dv = −v/τ dt + white acceleration. Between samples and beyond the newest one the position runs on by
 //! v·τ·(1 − exp(−Δt/τ)): it extrapolates over the gate's latency and comes to rest where nothing more is heard, so a hold
-//! needs no case of its own. (The integrated Ornstein-Uhlenbeck model; Singer 1970 has it one derivative higher.)
+//! needs no case of its own. What is run on is less than the velocity v where that is small. (The integrated Ornstein-Uhlenbeck model; Singer 1970 has it one derivative higher.)
 
 use holod_calibration::TimeNs;
 
@@ -17,6 +17,9 @@ pub struct FilterSettings {
     pub constriction_mm_per_s: f32,
     /// Fastest dilation believed, mm/s.
     pub dilation_mm_per_s: f32,
+    /// A velocity of this, mm/s, is run on beyond the newest sample by half, a slower one by less: small movements of a
+    /// resting pupil have turned by then.
+    pub steady_mm_per_s: f32,
     /// A filter that has heard nothing for this long starts anew.
     pub forgets: TimeNs,
 }
@@ -25,9 +28,10 @@ impl Default for FilterSettings {
     fn default() -> Self {
         Self {
             velocity_lasts: TimeNs(200_000_000),
-            agility: 3.0,
+            agility: 5.0,
             constriction_mm_per_s: 7.0,
             dilation_mm_per_s: 4.0,
+            steady_mm_per_s: 1.5,
             forgets: TimeNs(150_000_000),
         }
     }
@@ -73,6 +77,15 @@ impl Filter {
 
     pub(crate) const fn motion(&self) -> Option<Motion> {
         self.motion
+    }
+
+    /// The motion as it is run on beyond the newest sample: by v²/(v² + `steady_mm_per_s`²) of its velocity v.
+    pub(crate) fn outlook(&self) -> Option<Motion> {
+        self.motion.map(|motion| {
+            let (squared, steady) = (motion.velocity_mm_per_s.powi(2), self.settings.steady_mm_per_s.powi(2));
+            let share = if squared > 0.0 { squared / (squared + steady) } else { 0.0 };
+            Motion { velocity_mm_per_s: share * motion.velocity_mm_per_s, ..motion }
+        })
     }
 
     /// Takes a believed sample of standard deviation `noise_mm`; times must not decrease.

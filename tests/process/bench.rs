@@ -55,6 +55,22 @@ fn bench_measures_stages_the_frame_both_ceilings_and_the_loop() {
 }
 
 #[test]
+fn bench_measures_what_a_picture_of_the_feed_costs_beside_a_copy() {
+    let folder = tempfile::tempdir().unwrap();
+    let args = ["bench", "--feed", "64x48", "--repeat", "3", "--json"];
+    let ended = run(HOLOD, &args, folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    let report: Value = serde_json::from_str(&ended.stdout).unwrap_or_else(|error| panic!("{error}: {ended:?}"));
+    let median = |part: &str| report[part]["median_ms"].as_f64().unwrap();
+    for part in ["take", "make"] {
+        let ratio = report[format!("{part}_of_memcpy")].as_f64().unwrap();
+        assert!((ratio / (median(part) / median("memcpy")) - 1.0).abs() < 1e-9, "{part}: {report}");
+    }
+    assert_eq!((&report["resolution"], &report["pictures"]), (&"64x48".into(), &3.into()));
+    assert!(run(HOLOD, &["bench", "--feed", "--repeat", "1"], folder.path()).stdout.starts_with("1920x1080, "));
+}
+
+#[test]
 fn bench_leaves_the_loop_out_and_refuses_what_is_larger_than_the_panel() {
     let folder = tempfile::tempdir().unwrap();
     let args = ["bench", "--backend", "cpu", "--weights", "small", "--repeat", "1", "--duration", "0s", "--resolution"];

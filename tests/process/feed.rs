@@ -45,7 +45,9 @@ fn picture(shift: u32) -> (Vec<u8>, Vec<u8>) {
 
 fn connect(folder: &Path) -> FeedClient {
     let mut client = FeedClient::connect(&folder.join("pictures")).unwrap();
-    client.say(&hello(SIDE, SIDE, None, "test camera")).unwrap();
+    let mut hello = hello(SIDE, SIDE, None, "test camera");
+    hello[4..8].copy_from_slice(&2_u32.to_ne_bytes());
+    client.say(&hello).unwrap();
     assert_eq!(client.answer(), Answer::Ring);
     client
 }
@@ -95,7 +97,9 @@ fn a_picture_that_is_handed_over_becomes_the_levels_of_the_same_picture_in_files
     let mut client = connect(folder.path());
     // What is not shown any more must leave no trace in what is.
     send(&mut client, 1, &picture(30));
-    send(&mut client, 2, &(colour, depth));
+    client.write(0, &colour, &depth);
+    client.hand_over_with(0, 2, 0, 3, [1.25, 60.0, 45.5]).unwrap();
+    assert!(matches!(client.answer(), Answer::Free { outcome: 0, .. }));
     let shown = || fs::read_to_string(folder.path().join("of-feed/frames.csv")).unwrap_or_default();
     assert!(wait_until(PATIENCE, || shown().lines().filter(|row| row.contains(",tracking,")).count() > 60));
     daemon.signal(Signal::TERM);
@@ -108,6 +112,14 @@ fn a_picture_that_is_handed_over_becomes_the_levels_of_the_same_picture_in_files
     let rows = frames::read(&folder.path().join("of-feed/frames.csv")).unwrap();
     let pictures: Vec<_> = rows.iter().map(|row| row.picture).collect();
     assert!(pictures.is_sorted() && pictures.last() == Some(&2), "{pictures:?}");
+    let view = |row: &frames::FieldRow| (row.picture_focus_dpt, row.picture_fov_x_deg, row.picture_fov_y_deg);
+    let taken = (Some(1.25), Some(60.0), Some(45.5));
+    assert!(rows.iter().all(|row| view(row) == if row.picture == 2 { taken } else { (None, None, None) }));
+    assert!(
+        ended.stderr.contains("pictures taken with 60.0 x 45.5 degrees are shown in 0.7 x 0.7"),
+        "{}",
+        ended.stderr
+    );
     assert!(!folder.path().join("pictures").exists(), "the socket goes with holod");
 }
 

@@ -139,11 +139,29 @@ impl FeedClient {
     /// # Errors
     /// The connection is closed.
     pub fn hand_over(&self, slot: u32, sequence: u64, t_taken_ns: i64) -> io::Result<()> {
+        self.hand_over_with(slot, sequence, t_taken_ns, 0, [0.0; 3])
+    }
+
+    /// The same with the optional figures of version 2: which are given, the focus in dioptres, the field of view in degrees.
+    ///
+    /// # Errors
+    /// The connection is closed.
+    pub fn hand_over_with(
+        &self,
+        slot: u32,
+        sequence: u64,
+        t_taken_ns: i64,
+        given: u32,
+        figures: [f32; 3],
+    ) -> io::Result<()> {
         let mut bytes = [0; 40];
         bytes[..4].copy_from_slice(b"FRAM");
         bytes[4..8].copy_from_slice(&slot.to_ne_bytes());
         bytes[8..16].copy_from_slice(&sequence.to_ne_bytes());
         bytes[16..24].copy_from_slice(&t_taken_ns.to_ne_bytes());
+        for (cell, bits) in bytes[24..].chunks_exact_mut(4).zip([given].into_iter().chain(figures.map(f32::to_bits))) {
+            cell.copy_from_slice(&bits.to_ne_bytes());
+        }
         self.say(&bytes)
     }
 

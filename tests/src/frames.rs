@@ -26,6 +26,9 @@ pub struct FieldRow {
     pub deadline_missed: bool,
     pub picture: u64,
     pub t_picture_ns: Option<i64>,
+    pub picture_focus_dpt: Option<f64>,
+    pub picture_fov_x_deg: Option<f64>,
+    pub picture_fov_y_deg: Option<f64>,
 }
 
 /// Reads every row of a record.
@@ -75,6 +78,9 @@ fn row(cells: &HashMap<&str, &str>) -> Result<FieldRow, String> {
         deadline_missed: needed::<u8>(cells, "deadline_missed")? == 1,
         picture: needed(cells, "picture")?,
         t_picture_ns: cell(cells, "t_picture_ns")?,
+        picture_focus_dpt: cell(cells, "picture_focus_dpt")?,
+        picture_fov_x_deg: cell(cells, "picture_fov_x_deg")?,
+        picture_fov_y_deg: cell(cells, "picture_fov_y_deg")?,
     })
 }
 
@@ -166,6 +172,9 @@ mod tests {
                     deadline_missed: false,
                     picture: 0,
                     t_picture_ns: None,
+                    picture_focus_dpt: None,
+                    picture_fov_x_deg: None,
+                    picture_fov_y_deg: None,
                 }
             })
             .collect()

@@ -5,8 +5,8 @@ use std::fmt::Write;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use holod_calibration::PupilDiameter;
 use holod_calibration::rig::{LaserDriver, Lasers, Rig};
+use holod_calibration::{PupilDiameter, Resolution};
 use holod_model::engine::{StageTiming, fma_peak, stream_bandwidth};
 use holod_model::{RgbdFrame, Weights};
 use holod_pupil_input::{Scenario, TrackerSpec};
@@ -18,6 +18,7 @@ use crate::cli::{BenchArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
 use crate::session::{self, Observer, SessionPlan, Spread, Summary};
 use crate::snapshot::Figures;
+use crate::source::feed::cost::{self, FeedCost};
 use crate::source::{Pictures, scene};
 use crate::{progress, renderer, report, setup};
 
@@ -96,7 +97,30 @@ struct Lap {
     stages: Vec<StageTiming>,
 }
 
+/// What a picture of the live feed costs.
+#[derive(Serialize)]
+struct FeedReport {
+    resolution: String,
+    picture_mb: f64,
+    pictures: usize,
+    /// Programs that ran or waited to run in the minute before, on so many cores.
+    load: Option<f64>,
+    cores: usize,
+    memcpy: Quartiles,
+    take: Quartiles,
+    make: Quartiles,
+    /// Of medians.
+    take_of_memcpy: f64,
+    make_of_memcpy: f64,
+}
+
 pub(super) fn bench(args: &BenchArgs) -> Result<(), Failure> {
+    if let Some(resolution) = args.feed {
+        let load = load();
+        let measure = || cost::measure(resolution, args.repeat).map_err(Failure::because(Exit::Unavailable));
+        let report = FeedReport::new(resolution, &progress::during("timing pictures", measure)?, load);
+        return if args.json { report::print_json(&report) } else { report::print(&report.text()) };
+    }
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let weights = setup::weights(&rig)?;
     let named = SceneArgs { resolution: Some(args.resolution), ..SceneArgs::default() };
@@ -107,6 +131,59 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), Failure> {
         report.closed_loop = Some(closed_loop(args, rig, weights, frames)?);
     }
     if args.json { report::print_json(&report) } else { report::print(&table(&report)) }
+}
+
+/// The load of the last minute, where the kernel tells it.
+fn load() -> Option<f64> {
+    std::fs::read_to_string("/proc/loadavg").ok()?.split_whitespace().next()?.parse().ok()
+}
+
+impl FeedReport {
+    fn new(resolution: Resolution, cost: &FeedCost, load: Option<f64>) -> Self {
+        let quartiles = |times: &[Duration]| Quartiles::of(times.iter().map(|time| time.as_secs_f64() * 1e3));
+        let [memcpy, take, make] = [&cost.memcpy, &cost.take, &cost.make].map(|times| quartiles(times));
+        Self {
+            resolution: resolution.to_string(),
+            picture_mb: cost.picture_bytes as f64 / 1e6,
+            pictures: cost.take.len(),
+            load,
+            cores: std::thread::available_parallelism().map_or(1, usize::from),
+            memcpy,
+            take,
+            make,
+            take_of_memcpy: take.median_ms / memcpy.median_ms,
+            make_of_memcpy: make.median_ms / memcpy.median_ms,
+        }
+    }
+
+    fn text(&self) -> String {
+        let Self { resolution, picture_mb, pictures, cores, .. } = self;
+        let mut text = format!(
+            "{resolution}, RGBA8 and 16-bit millimetres, {picture_mb:.1} MB; {pictures} pictures, on one of {cores} cores\n\n\
+             {:<44}{:>10}{:>22}{:>11}\n",
+            "", "median ms", "quartiles", "of memcpy"
+        );
+        for (name, time, ratio) in [
+            ("memcpy: its bytes from memory to memory", self.memcpy, 1.0),
+            ("take: copied, while its client waits", self.take, self.take_of_memcpy),
+            ("make: a frame of it, after that", self.make, self.make_of_memcpy),
+        ] {
+            let Quartiles { lower_quartile_ms, median_ms, upper_quartile_ms } = time;
+            let quartiles = format!("{lower_quartile_ms:.2} to {upper_quartile_ms:.2}");
+            writeln!(text, "{name:<44}{median_ms:>10.2}{quartiles:>22}{ratio:>11.2}").expect(GROWS);
+        }
+        match self.load {
+            Some(load) if load >= 1.0 => write!(
+                text,
+                "\nother programs were running (load {load:.1} in the minute before): the figures may be too high, and their \
+                 ratios wrong"
+            ),
+            Some(load) => write!(text, "\nload in the minute before: {load:.1}"),
+            None => write!(text, "\nthe load in the minute before is not known"),
+        }
+        .expect(GROWS);
+        text
+    }
 }
 
 impl Laps {
@@ -339,6 +416,31 @@ mod tests {
         assert_eq!(of(&[7.0]), [7.0; 3]);
         assert_eq!(of(&[5.0, 1.0, 4.0, 2.0, 3.0]), [2.0, 3.0, 4.0]);
         assert_eq!(of(&[4.0, 1.0, 3.0, 2.0]), [1.75, 2.5, 3.25]);
+    }
+
+    #[test]
+    fn ratios_of_the_feed_are_of_medians_and_a_busy_machine_is_told() {
+        let times = |ms: [u64; 3]| ms.map(Duration::from_millis).to_vec();
+        let cost = FeedCost {
+            picture_bytes: 12_441_600,
+            memcpy: times([2, 4, 90]),
+            take: times([5, 1, 6]),
+            make: times([30, 20, 10]),
+        };
+        let resolution = Resolution { width: 1920, height: 1080 };
+        let [calm, busy, unknown] =
+            [Some(0.3), Some(1.0), None].map(|load| FeedReport::new(resolution, &cost, load).text());
+        assert!(calm.starts_with("1920x1080, RGBA8 and 16-bit millimetres, 12.4 MB; 3 pictures"), "{calm}");
+        for (row, figures) in [
+            ("memcpy:", ["4.00", "3.00 to 47.00", "1.00"]),
+            ("take:", ["5.00", "3.00 to 5.50", "1.25"]),
+            ("make:", ["20.00", "15.00 to 25.00", "5.00"]),
+        ] {
+            let line = calm.lines().find(|line| line.starts_with(row)).unwrap();
+            assert!(figures.iter().all(|figure| line.contains(figure)), "{line}");
+        }
+        assert!(calm.ends_with("load in the minute before: 0.3"), "{calm}");
+        assert!(busy.contains("other programs were running (load 1.0") && unknown.contains("not known"));
     }
 
     #[test]

@@ -34,9 +34,10 @@ fn text_of(status: &Snapshot) -> String {
             Some(name) => format!("`{name}` is shown, of {}", feed.clients.len()),
             None => format!("nobody is shown, {} connected", feed.clients.len()),
         };
+        let view = feed.view.text().map_or(String::new(), |view| format!("; {view}"));
         let age = feed.newest_age_s.map_or(String::new(), |age_s| format!("; newest {age_s:.1} s ago"));
         format!(
-            "\nfeed     {}: {shown}{age}\n\
+            "\nfeed     {}: {shown}{age}{view}\n\
              \x20        {}; picture to photons {}",
             feed.socket.display(),
             report::feed_text(feed),

@@ -164,17 +164,17 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
     told.counter("frames_shown", "Frames that came on the panel", figures.frames_shown)?;
     told.counter("deadline_misses", "Frames that came later than planned", figures.deadline_misses)?;
     of_tracker(told, &figures.tracker_counts)?;
-    if let Some(record) = &figures.record {
-        let lost = f64::from(u8::from(record.state == RecordStand::Lost));
-        told.gauge("record_lost", "Whether the record was given up", None, lost)?;
-        told.counter("record_rows_lost", "Rows of the record that a slow disk left out", record.rows_lost)?;
-    }
     told.counters(
         "control_refused",
         "Orders on the control socket that were not carried out",
         "reason",
         named(&snapshot.orders_refused),
     )?;
+    if let Some(record) = &figures.record {
+        let lost = f64::from(u8::from(record.state == RecordStand::Lost));
+        told.gauge("record_lost", "Whether the record was given up", None, lost)?;
+        told.counter("record_rows_lost", "Rows of the record that a slow disk left out", record.rows_lost)?;
+    }
     let Some(feed) = &figures.feed else { return Ok(()) };
     told.gauge("feed_clients", "Clients of the live feed", None, feed.clients.len() as f64)?;
     let pictures = [
@@ -185,6 +185,9 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
         ("left_out", feed.left_out),
     ];
     told.counters("feed_pictures", "Pictures of the live feed, by what became of them", "fate", pictures)?;
+    let bad = feed.bad_depths_in_all.entries();
+    told.counters("feed_bad_depth_pixels", "Depths that cannot be shown as they are, by what they are", "kind", bad)?;
+    told.counter("feed_bad_depth_pictures", "Pictures that have some", feed.pictures_with_bad_depths)?;
     told.counters(
         "feed_connections_refused",
         "Connections that were refused or broken off",
@@ -219,7 +222,7 @@ fn named(counts: &BTreeMap<String, u64>) -> impl Iterator<Item = (&str, u64)> {
     counts.iter().map(|(name, count)| (name.as_str(), *count))
 }
 
-const PUPIL_STATES: [&str; 4] = ["tracking", "holding", "fallback", "fixed"];
+const PUPIL_STATES: [&str; 5] = ["acquiring", "tracking", "holding", "fallback", "fixed"];
 
 struct Teller<'a>(DescriptorEncoder<'a>);
 

@@ -21,7 +21,7 @@ pub(super) const FIXED_PUPIL: &str = "fixed";
 
 /// What a record calls an estimator's state; one that nobody knows is just a recorded one.
 pub(crate) fn pupil_state_named(name: &str) -> &'static str {
-    let states = [PupilState::Tracking, PupilState::Holding, PupilState::Fallback].map(PupilState::name);
+    let states = PupilState::ALL.map(PupilState::name);
     states.into_iter().chain([FIXED_PUPIL]).find(|state| *state == name).unwrap_or("recorded")
 }
 

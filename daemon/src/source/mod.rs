@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
 use holod_model::RgbdFrame;
+use serde::{Deserialize, Serialize};
 
 use crate::cli::SceneArgs;
 use crate::failure::{Exit, Failure};
@@ -123,8 +124,27 @@ enum Shown {
     Live { frame: Arc<RgbdFrame>, tag: PictureTag },
 }
 
+/// How a camera took a picture, where a feed's client says so. It is recorded and told, and changes nothing that is shown.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct PictureView {
+    /// The distance at which it was focused, in dioptres.
+    pub focus_dpt: Option<f32>,
+    /// Its field of view across and up, in degrees.
+    pub field_of_view_deg: Option<[f32; 2]>,
+}
+
+impl PictureView {
+    /// In words, where something is known.
+    pub fn text(&self) -> Option<String> {
+        let focus = self.focus_dpt.map(|dpt| format!("focused at {dpt:.2} dpt"));
+        let field = self.field_of_view_deg.map(|[across, up]| format!("{across:.1} x {up:.1} degrees"));
+        let parts: Vec<_> = focus.into_iter().chain(field).collect();
+        (!parts.is_empty()).then(|| parts.join(", "))
+    }
+}
+
 /// Which picture a hologram was made of.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PictureTag {
     /// Its number in a scene, from 0, or the sequence that a feed's client gave it.
     pub number: u64,
@@ -132,6 +152,8 @@ pub struct PictureTag {
     pub t_taken: Option<TimeNs>,
     /// When it was taken over from a feed's client.
     pub t_came: Option<TimeNs>,
+    /// How it was taken.
+    pub view: PictureView,
     /// The order that brought its scene, as [`FrameOrders`](crate::record::FrameOrders) counts.
     pub order: u32,
 }

@@ -120,7 +120,7 @@ fn warn_of_odd_depth(name: &str, frame: &RgbdFrame, report: &FrameReport, geomet
 }
 
 /// Colours that are nearly all brighter than white are most often scene-linear light that was never exposed.
-fn warn_of_clipped_colours(name: &str, frame: &RgbdFrame, report: &FrameReport) {
+pub(super) fn warn_of_clipped_colours(name: &str, frame: &RgbdFrame, report: &FrameReport) {
     let pixels = frame.resolution.pixels();
     if 2 * report.colour_clipped_px > pixels {
         tracing::warn!(

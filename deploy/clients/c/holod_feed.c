@@ -19,7 +19,8 @@
 #include <time.h>
 #include <unistd.h>
 
-#define PROTOCOL_VERSION 1
+#define PROTOCOL_VERSION 2
+#define NEAREST_DPT 20
 #define ANSWER_TIMEOUT_S 5
 #define MOST_SLOTS 64
 #define ALIGNMENT 64
@@ -57,8 +58,13 @@ struct fram {
     uint32_t slot;
     uint64_t sequence;
     int64_t t_capture_ns;
-    uint64_t reserved[2];
+    uint32_t given; /* of HAS_ */
+    float focus_dpt;
+    float across_deg;
+    float up_deg;
 };
+#define HAS_FOCUS 1
+#define HAS_FIELD_OF_VIEW 2
 _Static_assert(sizeof(struct fram) == 40, "FRAM has 40 bytes");
 
 struct freed {
@@ -86,6 +92,8 @@ struct holod_feed {
     uint64_t free_slots; /* bit k: slot k belongs to this program */
     int begun;           /* the slot being written, or -1 */
     uint64_t sequence;   /* of the newest picture, sent or left out */
+    bool tells_view;
+    struct holod_feed_view view; /* how the pictures were taken */
     struct holod_feed_outcomes outcomes;
     char refusal[TEXT_BYTES];
     char error[TEXT_BYTES];
@@ -213,7 +221,7 @@ static enum holod_feed_result unexpected(struct holod_feed *feed, const struct m
         kind[k] = message->bytes[k] >= ' ' && message->bytes[k] <= '~' ? message->bytes[k] : '?';
     return fail(feed,
                 "%s sent a message '%s' of %zu bytes, expected %s: is it holod, of a version that "
-                "speaks version %d of the feed?",
+                "speaks version 1 or %d of the feed?",
                 feed->path, kind, message->length, expected, PROTOCOL_VERSION);
 }
 
@@ -381,7 +389,7 @@ static enum holod_feed_result say_hello(struct holod_feed *feed,
 {
     struct helo helo = {
         .kind = {'H', 'E', 'L', 'O'},
-        .version = PROTOCOL_VERSION,
+        .version = format->tells_view ? PROTOCOL_VERSION : 1,
         .width_px = format->width_px,
         .height_px = format->height_px,
         .colour = format->colour,
@@ -511,6 +519,8 @@ enum holod_feed_result holod_feed_open(const char *path, const struct holod_feed
     opened->socket = -1;
     opened->begun = -1;
     opened->outcomes.refusal = opened->refusal;
+    opened->tells_view = format->tells_view != 0;
+    opened->view.focus_dpt = -1;
 
     enum holod_feed_result result = connect_to(opened, path);
     if (result == HOLOD_FEED_OK)
@@ -550,6 +560,33 @@ enum holod_feed_result holod_feed_begin(struct holod_feed *feed, int timeout_ms,
     return HOLOD_FEED_OK;
 }
 
+enum holod_feed_result holod_feed_set_view(struct holod_feed *feed,
+                                           const struct holod_feed_view *view)
+{
+    static const struct holod_feed_view unknown = {.focus_dpt = -1};
+    if (!view) {
+        feed->view = unknown;
+        return HOLOD_FEED_OK;
+    }
+    if (!feed->tells_view)
+        return report(feed, HOLOD_FEED_FAILED, "the feed was opened without tells_view");
+    if (!(view->focus_dpt <= NEAREST_DPT))
+        return report(feed, HOLOD_FEED_FAILED,
+                      "a focus of %g dioptres was given, expected 0 (infinity) to %d, or less than 0 "
+                      "where it is not known",
+                      (double)view->focus_dpt, NEAREST_DPT);
+    bool has_field = view->across_deg != 0 || view->up_deg != 0;
+    bool is_field = view->across_deg > 0 && view->across_deg < 180 && view->up_deg > 0 &&
+                    view->up_deg < 180;
+    if (has_field && !is_field)
+        return report(feed, HOLOD_FEED_FAILED,
+                      "a field of view of %g x %g degrees was given, expected two angles between 0 "
+                      "and 180, or 0 x 0 where it is not known",
+                      (double)view->across_deg, (double)view->up_deg);
+    feed->view = *view;
+    return HOLOD_FEED_OK;
+}
+
 enum holod_feed_result holod_feed_send(struct holod_feed *feed, int64_t t_capture_ns)
 {
     if (feed->socket < 0)
@@ -562,6 +599,15 @@ enum holod_feed_result holod_feed_send(struct holod_feed *feed, int64_t t_captur
         .sequence = feed->sequence + 1,
         .t_capture_ns = t_capture_ns,
     };
+    if (feed->view.focus_dpt >= 0) {
+        fram.given |= HAS_FOCUS;
+        fram.focus_dpt = feed->view.focus_dpt;
+    }
+    if (feed->view.across_deg > 0) {
+        fram.given |= HAS_FIELD_OF_VIEW;
+        fram.across_deg = feed->view.across_deg;
+        fram.up_deg = feed->view.up_deg;
+    }
     enum holod_feed_result result = send_message(feed, &fram, sizeof fram);
     if (result != HOLOD_FEED_OK)
         return result;

@@ -65,6 +65,16 @@ struct holod_feed_format {
     enum holod_depth depth;
     float plane_dpt;  /* with HOLOD_DEPTH_NONE: the distance, in dioptres; else 0 */
     const char *name; /* UTF-8, for holod's log and status; what exceeds 32 bytes is cut off */
+    /* 1: pictures may say how they were taken, with holod_feed_set_view; a holod that knows version
+     * 1 of the feed alone refuses that. 0: they say nothing, and any holod will do. */
+    int tells_view;
+};
+
+/* How a picture was taken. holod records it and shows it to people. */
+struct holod_feed_view {
+    float focus_dpt;    /* where the camera was focused, 0 to 20 dioptres; below 0: not known */
+    float across_deg;   /* the camera's field of view, 2 * atan(width_px / (2 * fx)); 0: not known */
+    float up_deg;       /* the same with height_px and fy */
 };
 
 /* Where to write one picture. Both begin at a multiple of 64 bytes. */
@@ -112,6 +122,13 @@ enum holod_feed_result holod_feed_open(const char *path, const struct holod_feed
  */
 enum holod_feed_result holod_feed_begin(struct holod_feed *feed, int timeout_ms,
                                         struct holod_feed_slot *slot);
+
+/*
+ * Says how the pictures that are sent from now on were taken. NULL: that is not known. Fails where
+ * a figure cannot be, or the feed was opened without tells_view; what was said before stays then.
+ */
+enum holod_feed_result holod_feed_set_view(struct holod_feed *feed,
+                                           const struct holod_feed_view *view);
 
 /*
  * Hands over the picture that was begun; its slot must not be touched any more. `t_capture_ns` is

@@ -34,6 +34,11 @@ impl Placement {
         Some(Self { scale, corner, source, target })
     }
 
+    /// Frame pixels to a picture pixel.
+    pub(super) const fn scale(&self) -> f64 {
+        self.scale
+    }
+
     /// The picture position that is shown at the centre of frame pixel `position` along `axis`, if any is.
     fn source_position(&self, axis: usize, position: usize) -> Option<f64> {
         let size = [self.source.width, self.source.height][axis] as f64;

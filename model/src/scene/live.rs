@@ -1,7 +1,5 @@
 //! Pictures that another program hands over, in the formats of the live feed.
 
-use std::io;
-
 use half::f16;
 use holod_calibration::{Dioptres, DisplayGeometry, Resolution};
 
@@ -67,10 +65,68 @@ pub enum LiveError {
     NoDepth {
         /// What a depth is in this format.
         expected: &'static str,
+        /// What was found in its place.
+        missing: MissingDepths,
     },
-    /// Its bytes cannot be read.
-    #[error("the picture cannot be read: {0}")]
-    Read(#[from] io::Error),
+}
+
+/// What was done to a picture when a frame was made of it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LiveReport {
+    /// As of a picture from files.
+    pub frame: FrameReport,
+    /// What stood in place of the depths that were missing.
+    pub missing: MissingDepths,
+}
+
+/// Numbers that are no depths, by what they are.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct MissingDepths {
+    /// Pixels with NaN.
+    pub nan: usize,
+    /// Pixels with 0, where that is no depth.
+    pub zero: usize,
+    /// Pixels with a number below 0.
+    pub negative: usize,
+    /// Pixels with an infinite number, where that is no depth.
+    pub infinite: usize,
+}
+
+impl MissingDepths {
+    /// Of a picture's depths as they are stored.
+    fn of(depth: LiveDepth, bytes: &[u8]) -> Self {
+        let halves = bytes.as_chunks::<2>().0.iter().map(|&bits| f16::from_ne_bytes(bits).to_f32());
+        let floats = bytes.as_chunks::<4>().0.iter().map(|&bits| f32::from_ne_bytes(bits));
+        match depth {
+            LiveDepth::Plane(_) => Self::default(),
+            LiveDepth::MillimetresU16 => Self {
+                zero: bytes.as_chunks::<2>().0.iter().filter(|bits| **bits == [0; 2]).count(),
+                ..Self::default()
+            },
+            LiveDepth::MetresF16 => Self::of_lengths(halves),
+            LiveDepth::DioptresF16 => Self::of_dioptres(halves),
+            LiveDepth::MetresF32 => Self::of_lengths(floats),
+            LiveDepth::DioptresF32 => Self::of_dioptres(floats),
+        }
+    }
+
+    fn of_lengths(lengths: impl Iterator<Item = f32>) -> Self {
+        lengths.fold(Self::default(), |mut counts, length| {
+            counts.nan += usize::from(length.is_nan());
+            counts.zero += usize::from(length == 0.0);
+            counts.negative += usize::from(length < 0.0);
+            counts
+        })
+    }
+
+    fn of_dioptres(dioptres: impl Iterator<Item = f32>) -> Self {
+        dioptres.fold(Self::default(), |mut counts, dioptres| {
+            counts.nan += usize::from(dioptres.is_nan());
+            counts.negative += usize::from(dioptres < 0.0);
+            counts.infinite += usize::from(dioptres == f32::INFINITY);
+            counts
+        })
+    }
 }
 
 impl LiveColour {
@@ -142,8 +198,6 @@ pub struct LiveReader {
     colours: ColourTable,
     /// Normalised depth of each 16-bit number; empty for other formats.
     depths: Vec<f32>,
-    /// Bytes on their way.
-    rows: Vec<u8>,
     /// Amplitude, or linear light where the picture is scaled, and normalised depth, at the picture's size; empty where
     /// that is the frame's.
     picture: RgbdFrame,
@@ -203,7 +257,6 @@ impl LiveReader {
             placement,
             colours,
             depths,
-            rows: Vec::new(),
             picture: RgbdFrame {
                 resolution: format.resolution,
                 amplitude: vec![0.0; 3 * pixels],
@@ -212,19 +265,54 @@ impl LiveReader {
         })
     }
 
-    /// Reads one picture. `read_at` fills a buffer from an offset in the picture's bytes: of its colours, or of its depths.
-    /// `frame` has the reader's size. Where this fails it holds nothing of worth.
+    /// Frame pixels to a picture's pixel.
+    pub const fn scale(&self) -> f64 {
+        self.placement.scale()
+    }
+
+    /// Whether a picture with these depths can be shown. Of most pictures it looks at a few pixels only.
     ///
     /// # Errors
-    /// No pixel has a depth, or the bytes cannot be read.
-    pub fn read(
-        &mut self,
-        mut read_at: impl FnMut(LivePart, &mut [u8], usize) -> io::Result<()>,
-        frame: &mut RgbdFrame,
-    ) -> Result<FrameReport, LiveError> {
+    /// [`LiveError::NoDepth`] where no pixel has one.
+    pub fn check(&self, depth: &[u8]) -> Result<(), LiveError> {
+        let is_depth = |bits: u16| !self.depths[usize::from(bits)].is_nan();
+        let is_there = match self.format.depth {
+            LiveDepth::Plane(_) => true,
+            LiveDepth::MillimetresU16 | LiveDepth::MetresF16 | LiveDepth::DioptresF16 => {
+                depth.as_chunks::<2>().0.iter().any(|&bytes| is_depth(u16::from_ne_bytes(bytes)))
+            }
+            LiveDepth::MetresF32 | LiveDepth::DioptresF32 => {
+                let dioptres = |&bytes: &[u8; 4]| self.format.depth.dioptres(f32::from_ne_bytes(bytes));
+                depth.as_chunks::<4>().0.iter().any(|bytes| !dioptres(bytes).is_nan())
+            }
+        };
+        if is_there { Ok(()) } else { Err(self.no_depth(depth)) }
+    }
+
+    fn no_depth(&self, depth: &[u8]) -> LiveError {
+        LiveError::NoDepth {
+            expected: self.format.depth.expected(),
+            missing: MissingDepths::of(self.format.depth, depth),
+        }
+    }
+
+    /// Makes `frame`, which has the reader's size, of one picture's colours and depths as they are stored. Where this fails
+    /// it holds nothing of worth.
+    ///
+    /// # Errors
+    /// No pixel has a depth.
+    ///
+    /// # Panics
+    /// Where there are fewer or more bytes than the format says.
+    pub fn make(&mut self, colour: &[u8], depth: &[u8], frame: &mut RgbdFrame) -> Result<LiveReport, LiveError> {
+        assert_eq!(
+            (colour.len(), depth.len()),
+            (self.format.colour_bytes(), self.format.depth_bytes()),
+            "bytes of colour and depth"
+        );
         let mut picture = std::mem::replace(&mut self.picture, RgbdFrame::empty());
         let is_identity = self.placement.is_identity();
-        let report = self.read_picture(&mut read_at, if is_identity { frame } else { &mut picture });
+        let report = self.read_picture(colour, depth, if is_identity { frame } else { &mut picture });
         if report.is_ok() && !is_identity {
             self.place(&picture, frame);
         }
@@ -233,26 +321,24 @@ impl LiveReader {
     }
 
     /// Reads a picture at its own size.
-    fn read_picture(
-        &mut self,
-        read_at: &mut impl FnMut(LivePart, &mut [u8], usize) -> io::Result<()>,
-        picture: &mut RgbdFrame,
-    ) -> Result<FrameReport, LiveError> {
+    fn read_picture(&self, colour: &[u8], depth: &[u8], picture: &mut RgbdFrame) -> Result<LiveReport, LiveError> {
         let mut report = FrameReport {
             source: Some(self.format.resolution),
             padded_px: self.padded_px,
-            colour_clipped_px: self.read_colours(read_at, &mut picture.amplitude)?,
+            colour_clipped_px: self.read_colours(colour, &mut picture.amplitude),
             ..FrameReport::default()
         };
-        self.read_depths(read_at, &mut picture.depth_normalised)?;
+        self.read_depths(depth, &mut picture.depth_normalised);
         report.depth_missing_px = depth::fill_missing(&mut picture.depth_normalised, self.format.resolution)
-            .ok_or(LiveError::NoDepth { expected: self.format.depth.expected() })?;
+            .ok_or_else(|| self.no_depth(depth))?;
         for depth in &mut picture.depth_normalised {
             report.depth_clamped_far_px += usize::from(*depth < -ROUNDING);
             report.depth_clamped_near_px += usize::from(*depth > 1.0 + ROUNDING);
             *depth = depth.clamp(0.0, 1.0);
         }
-        Ok(report)
+        let any_missing = report.depth_missing_px > 0;
+        let missing = any_missing.then(|| MissingDepths::of(self.format.depth, depth)).unwrap_or_default();
+        Ok(LiveReport { frame: report, missing })
     }
 
     /// Brings a picture to the frame's size.
@@ -270,84 +356,65 @@ impl LiveReader {
     }
 
     /// Writes the colours to `planes`, [3, height, width], and counts the pixels that were clipped.
-    fn read_colours(
-        &mut self,
-        read_at: &mut impl FnMut(LivePart, &mut [u8], usize) -> io::Result<()>,
-        planes: &mut [f32],
-    ) -> io::Result<usize> {
+    fn read_colours(&self, colour: &[u8], planes: &mut [f32]) -> usize {
         let pixels = self.format.resolution.pixels();
-        let mut read_at = |bytes: &mut [u8], at| read_at(LivePart::Colour, bytes, at);
         match &self.colours {
             ColourTable::Eight(table) => {
                 let [red, green, blue] = split(planes);
-                in_pieces(&mut self.rows, 4, 4 * pixels, &mut read_at, |bytes, first| {
-                    for (pixel, rgba) in (first..).zip(bytes.as_chunks::<4>().0) {
-                        red[pixel] = table[usize::from(rgba[0])];
-                        green[pixel] = table[usize::from(rgba[1])];
-                        blue[pixel] = table[usize::from(rgba[2])];
-                    }
-                })?;
-                Ok(0)
+                for (pixel, rgba) in colour.as_chunks::<4>().0.iter().enumerate() {
+                    red[pixel] = table[usize::from(rgba[0])];
+                    green[pixel] = table[usize::from(rgba[1])];
+                    blue[pixel] = table[usize::from(rgba[2])];
+                }
+                0
             }
             ColourTable::Sixteen(table) => {
                 let [red, green, blue] = split(planes);
                 let mut clipped_px = 0;
                 let white = f16::ONE.to_bits();
-                in_pieces(&mut self.rows, 8, 8 * pixels, &mut read_at, |bytes, first| {
-                    for (pixel, rgba) in (first..).zip(bytes.as_chunks::<8>().0) {
-                        let [r, g, b] = [0, 2, 4].map(|at| u16::from_ne_bytes([rgba[at], rgba[at + 1]]));
-                        red[pixel] = table[usize::from(r)];
-                        green[pixel] = table[usize::from(g)];
-                        blue[pixel] = table[usize::from(b)];
-                        // Above white, not finite, or below 0, which -0 is not.
-                        let is_clipped = |bits: u16| bits > white && bits != 0x8000;
-                        clipped_px += usize::from(is_clipped(r) || is_clipped(g) || is_clipped(b));
-                    }
-                })?;
-                Ok(clipped_px)
+                for (pixel, rgba) in colour.as_chunks::<8>().0.iter().enumerate() {
+                    let [r, g, b] = [0, 2, 4].map(|at| u16::from_ne_bytes([rgba[at], rgba[at + 1]]));
+                    red[pixel] = table[usize::from(r)];
+                    green[pixel] = table[usize::from(g)];
+                    blue[pixel] = table[usize::from(b)];
+                    // Above white, not finite, or below 0, which -0 is not.
+                    let is_clipped = |bits: u16| bits > white && bits != 0x8000;
+                    clipped_px += usize::from(is_clipped(r) || is_clipped(g) || is_clipped(b));
+                }
+                clipped_px
             }
             ColourTable::Float => {
-                // Of each plane: which of them are the same pixels is not worth a mask.
-                let mut clipped_px = [0; 3];
                 let unscaled = self.placement.is_unscaled();
-                in_pieces(&mut self.rows, 4, 12 * pixels, &mut read_at, |bytes, first| {
-                    for (value, &bytes) in (first..).zip(bytes.as_chunks::<4>().0) {
+                let planes = planes.chunks_exact_mut(pixels).zip(colour.chunks_exact(4 * pixels));
+                let clipped_px = planes.map(|(plane, bytes)| {
+                    let mut clipped_px = 0;
+                    for (value, &bytes) in plane.iter_mut().zip(bytes.as_chunks::<4>().0) {
                         let (light, is_clipped) = clip(f32::from_ne_bytes(bytes));
-                        planes[value] = if unscaled { light.sqrt() } else { light };
-                        clipped_px[value / pixels] += usize::from(is_clipped);
+                        *value = if unscaled { light.sqrt() } else { light };
+                        clipped_px += usize::from(is_clipped);
                     }
-                })?;
-                Ok(clipped_px.into_iter().max().unwrap_or(0))
+                    clipped_px
+                });
+                // Of each plane: which of them are the same pixels is not worth a mask.
+                clipped_px.max().unwrap_or(0)
             }
         }
     }
 
     /// Writes normalised depths, not clamped, NaN where there is none.
-    fn read_depths(
-        &mut self,
-        read_at: &mut impl FnMut(LivePart, &mut [u8], usize) -> io::Result<()>,
-        depths: &mut [f32],
-    ) -> io::Result<()> {
-        let Self { format, geometry, depths: table, rows, .. } = self;
-        let mut read_at = |bytes: &mut [u8], at| read_at(LivePart::Depth, bytes, at);
+    fn read_depths(&self, bytes: &[u8], depths: &mut [f32]) {
+        let Self { format, geometry, depths: table, .. } = self;
         match format.depth {
-            LiveDepth::Plane(plane) => {
-                depths.fill(normalised(format.depth, geometry, plane.0 as f32));
-                Ok(())
-            }
+            LiveDepth::Plane(plane) => depths.fill(normalised(format.depth, geometry, plane.0 as f32)),
             LiveDepth::MillimetresU16 | LiveDepth::MetresF16 | LiveDepth::DioptresF16 => {
-                in_pieces(rows, 2, 2 * depths.len(), &mut read_at, |bytes, first| {
-                    for (depth, &bits) in depths[first..].iter_mut().zip(bytes.as_chunks::<2>().0) {
-                        *depth = table[usize::from(u16::from_ne_bytes(bits))];
-                    }
-                })
+                for (depth, &bits) in depths.iter_mut().zip(bytes.as_chunks::<2>().0) {
+                    *depth = table[usize::from(u16::from_ne_bytes(bits))];
+                }
             }
             LiveDepth::MetresF32 | LiveDepth::DioptresF32 => {
-                in_pieces(rows, 4, 4 * depths.len(), &mut read_at, |bytes, first| {
-                    for (depth, &bytes) in depths[first..].iter_mut().zip(bytes.as_chunks::<4>().0) {
-                        *depth = normalised(format.depth, geometry, f32::from_ne_bytes(bytes));
-                    }
-                })
+                for (depth, &bytes) in depths.iter_mut().zip(bytes.as_chunks::<4>().0) {
+                    *depth = normalised(format.depth, geometry, f32::from_ne_bytes(bytes));
+                }
             }
         }
     }
@@ -360,41 +427,11 @@ fn split(planes: &mut [f32]) -> [&mut [f32]; 3] {
     [red, green, blue]
 }
 
-/// Which of a picture's bytes are meant.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum LivePart {
-    /// The colours.
-    Colour,
-    /// The depths.
-    Depth,
-}
-
 /// Normalised depth of a stored number, not clamped; NaN where it is none.
 fn normalised(depth: LiveDepth, geometry: &DisplayGeometry, number: f32) -> f32 {
     // A denormal length has an infinite vergence, which is as near as can be.
     let dioptres = depth.dioptres(number).clamp(f32::MIN, f32::MAX);
     geometry.normalised_depth(Dioptres(dioptres.into())) as f32
-}
-
-/// Bytes that are read at once: they stay in the processor's cache until they are converted.
-const PIECE_BYTES: usize = 1 << 16;
-
-/// Reads `total` bytes of elements of `element` bytes piece by piece, and hands each to `convert` with the number of its
-/// first element.
-fn in_pieces(
-    rows: &mut Vec<u8>,
-    element: usize,
-    total: usize,
-    mut read_at: impl FnMut(&mut [u8], usize) -> io::Result<()>,
-    mut convert: impl FnMut(&[u8], usize),
-) -> io::Result<()> {
-    rows.resize(PIECE_BYTES, 0);
-    for at in (0..total).step_by(PIECE_BYTES) {
-        let piece = &mut rows[..PIECE_BYTES.min(total - at)];
-        read_at(piece, at)?;
-        convert(piece, at / element);
-    }
-    Ok(())
 }
 
 #[cfg(test)]
@@ -414,12 +451,7 @@ mod tests {
 
     impl Picture {
         fn read_with(&self, reader: &mut LiveReader, frame: &mut RgbdFrame) -> Result<FrameReport, LiveError> {
-            let read_at = |part, bytes: &mut [u8], at: usize| {
-                let all = if part == LivePart::Colour { &self.colour } else { &self.depth };
-                bytes.copy_from_slice(&all[at..at + bytes.len()]);
-                Ok(())
-            };
-            reader.read(read_at, frame)
+            reader.make(&self.colour, &self.depth, frame).map(|report| report.frame)
         }
 
         fn read(&self, resolution: Resolution, fit: Fit) -> Result<(RgbdFrame, FrameReport), LiveError> {
@@ -581,6 +613,40 @@ mod tests {
     }
 
     #[test]
+    fn what_is_no_depth_is_counted_by_what_it_is() {
+        let numbers = [f32::NAN, f32::NAN, 0.0, -0.0, 0.0, -1.0, f32::INFINITY, f32::NEG_INFINITY, 1.0, 65504.0];
+        let lengths = MissingDepths { nan: 2, zero: 3, negative: 2, infinite: 0 };
+        let dioptres = MissingDepths { nan: 2, zero: 0, negative: 2, infinite: 1 };
+        for (depth, expected) in [
+            (LiveDepth::MetresF16, lengths),
+            (LiveDepth::MetresF32, lengths),
+            (LiveDepth::DioptresF16, dioptres),
+            (LiveDepth::DioptresF32, dioptres),
+            (LiveDepth::MillimetresU16, MissingDepths { zero: 4, ..MissingDepths::default() }),
+        ] {
+            let bytes = |pixel: usize| match depth {
+                LiveDepth::MetresF16 | LiveDepth::DioptresF16 => {
+                    f16::from_f32(numbers.get(pixel).copied().unwrap_or(1.0)).to_ne_bytes().to_vec()
+                }
+                LiveDepth::MillimetresU16 => u16::from(pixel > 3).to_ne_bytes().to_vec(),
+                _ => numbers.get(pixel).copied().unwrap_or(1.0).to_ne_bytes().to_vec(),
+            };
+            let mut picture = picture(LiveColour::Rgba8, depth);
+            picture.depth = (0..SIZE.pixels()).flat_map(bytes).collect();
+            let mut reader = LiveReader::new(picture.format, &BENCH, SIZE, Fit::Native).unwrap();
+            let report = reader.make(&picture.colour, &picture.depth, &mut RgbdFrame::black(SIZE)).unwrap();
+            assert_eq!(report.missing, expected, "{depth:?}");
+            let MissingDepths { nan, zero, negative, infinite } = report.missing;
+            assert_eq!(
+                report.frame.depth_missing_px,
+                nan + zero + negative + infinite,
+                "all that are filled are counted"
+            );
+            reader.check(&picture.depth).unwrap();
+        }
+    }
+
+    #[test]
     fn a_picture_that_is_refused_leaves_the_reader_usable() {
         let small = Resolution { width: 3, height: 3 };
         let right = picture(LiveColour::Rgba8, LiveDepth::MillimetresU16);
@@ -589,6 +655,8 @@ mod tests {
         let mut reader = LiveReader::new(right.format, &BENCH, small, Fit::Contain).unwrap();
         let mut frame = RgbdFrame::black(small);
         let refused = wrong.read_with(&mut reader, &mut frame).unwrap_err();
+        assert_eq!(reader.check(&wrong.depth).unwrap_err().to_string(), refused.to_string());
+        reader.check(&right.depth).unwrap();
         assert_eq!(refused.to_string(), "found no pixel with a valid depth, expected millimetres above 0");
         right.read_with(&mut reader, &mut frame).unwrap();
         assert_eq!(frame, right.read(small, Fit::Contain).unwrap().0);

@@ -38,7 +38,7 @@ use self::fit::Placement;
 pub use self::array::{ArrayColours, ArrayDepths, ArrayError, ArrayPicture};
 pub use self::decoded::MOST_PIXELS;
 pub use self::error::SceneError;
-pub use self::live::{LiveColour, LiveDepth, LiveError, LiveFormat, LivePart, LiveReader};
+pub use self::live::{LiveColour, LiveDepth, LiveError, LiveFormat, LiveReader, LiveReport, MissingDepths};
 
 /// Normalised depths this little outside 0..=1 are rounding, not clamping.
 const ROUNDING: f32 = 1e-5;

@@ -75,6 +75,7 @@ impl Worker {
         let mut back_off = FIRST_BACK_OFF;
         let mut silent_from = host_now() + FIRST_SILENCE;
         self.connected(host_now());
+        self.estimator.begin(host_now());
         while self.goes_on() {
             let Some(open) = &mut link else {
                 if !self.wait_until(host_now() + TimeNs(back_off.as_nanos() as i64)) {

@@ -98,7 +98,8 @@ impl Judge {
         if let Some((before, last)) = self.last.replace((now, estimate)) {
             let step_mm = (mm - last.pupil.mm()).abs();
             self.fastest_mm = self.fastest_mm.max(step_mm);
-            if step_mm > Self::MOST_A_FRAME_MM {
+            // The first diameter is shown at once.
+            if step_mm > Self::MOST_A_FRAME_MM && now > BEGINS + S / 2 {
                 self.object(format!("{step_mm} mm from {before} to {now}: {last:?}, {estimate:?}"));
             }
             if estimate.t_sample < last.t_sample {

@@ -152,16 +152,35 @@ fn a_loss_is_held_then_slides_to_the_fallback_and_back() {
     assert_eq!(state, PupilState::Fallback);
     assert!((sliding - (5.0 - 0.65)).abs() < 0.02, "{sliding}");
     assert_eq!(at(&estimator, 10_000), (3.0, PupilState::Fallback));
-    // Back at 10 s: after the guards it slides, no faster than a pupil, to what is measured.
+    // Back at 10 s: after the guards it slides, no faster than a pupil, to what is measured, and says so.
     let mut shown = vec![at(&estimator, 10_000).0];
     for k in 0..300 {
         let t_ms = 10_000 + 5 * k;
         estimator.push(sample(t_ms, SampleEye::Left, 5.0), |_| {});
-        shown.push(at(&estimator, t_ms).0);
+        let (mm, state) = at(&estimator, t_ms);
+        assert_eq!(state == PupilState::Tracking, mm > 4.91, "{state:?} at {mm} mm, {t_ms} ms");
+        shown.push(mm);
     }
     let fastest = shown.windows(2).map(|pair| (pair[1] - pair[0]).abs() / 5e-3).fold(0.0, f32::max);
     assert!(fastest < 5.5, "{fastest} mm/s");
     assert_eq!(at(&estimator, 11_495), (5.0, PupilState::Tracking));
+}
+
+/// At the begin nothing was shown that could jump; a tracker that comes later finds a picture for the fallback.
+#[test]
+fn the_first_diameter_is_shown_at_once_where_nothing_was_shown_before() {
+    let mut estimator = Estimator::new(settings(rig::Eye::Left));
+    push_all(&mut estimator, SampleEye::Left, 0, &[6.0; 10]);
+    let (mm, state) = at(&estimator, 50);
+    assert!((mm - 6.0).abs() < 1e-3 && state == PupilState::Tracking, "{mm} {state:?}");
+
+    let mut estimator = Estimator::new(settings(rig::Eye::Left));
+    estimator.begin(TimeNs(0));
+    push_all(&mut estimator, SampleEye::Left, 5000, &[6.0; 10]);
+    let (mm, state) = at(&estimator, 5050);
+    assert!(mm < 3.2 && state == PupilState::Acquiring, "{mm} {state:?}");
+    push_all(&mut estimator, SampleEye::Left, 5050, &[6.0; 200]);
+    assert_eq!(at(&estimator, 6045), (6.0, PupilState::Tracking));
 }
 
 #[test]

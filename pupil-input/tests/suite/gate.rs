@@ -175,13 +175,13 @@ fn a_loss_is_held_slides_to_the_fallback_and_slides_back() {
             states.push(estimate.state);
         }
     }
-    use PupilState::{Fallback, Holding, Tracking};
-    assert_eq!(states, [Fallback, Tracking, Holding, Fallback, Tracking]);
+    use PupilState::{Acquiring, Fallback, Holding, Tracking};
+    assert_eq!(states, [Fallback, Tracking, Holding, Fallback, Acquiring, Tracking]);
     let at = |t_ms: usize| shown[t_ms].1;
     assert!((at(4900) - 5.0).abs() < 0.1 && (at(5900) - 5.0).abs() < 0.1 && (at(9900) - 3.0).abs() < 1e-3);
     assert!((at(14_000) - 5.0).abs() < 0.1);
-    // The way back is 4 mm/s, and what the noise of the first samples adds.
-    let fastest = shown.windows(51).map(|window| (window[50].1 - window[0].1).abs() / 0.05).fold(0.0, f32::max);
+    // The way back is 4 mm/s, and what the noise of the first samples adds; the first one of all was shown at once.
+    let fastest = shown[500..].windows(51).map(|window| (window[50].1 - window[0].1).abs() / 0.05).fold(0.0, f32::max);
     assert!((3.9..6.5).contains(&fastest), "{fastest} mm/s");
 }
 

@@ -123,6 +123,12 @@ impl Ledger {
         }
     }
 
+    /// Fields and edges that wait.
+    #[cfg(test)]
+    pub(super) fn waiting(&self) -> usize {
+        self.open.len() + self.edges.len()
+    }
+
     fn event(&self, field: &ShownField, dark: Option<DarkReason>) -> FieldEvent {
         let tag = field.frame.unwrap_or_default();
         let t_end = self.gate.t_end(field);

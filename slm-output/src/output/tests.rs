@@ -1,5 +1,7 @@
 //! The panel, the laser thread's work and the real threads together.
 
+mod day;
+
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
@@ -66,11 +68,14 @@ impl Bench {
         Self::with_box(mode, Box::new(SimulatedLaser::new(TimeNs(0))))
     }
 
-    fn with_box(mode: PanelMode, mut laser: Box<dyn LaserBox>) -> Self {
-        let rig = rig(mode);
+    fn with_box(mode: PanelMode, laser: Box<dyn LaserBox>) -> Self {
+        Self::with_rig(&rig(mode), laser)
+    }
+
+    fn with_rig(rig: &Rig, mut laser: Box<dyn LaserBox>) -> Self {
         let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
         let setup = PanelSetup::new(&rig.panel, &encoder);
-        let scheduler = scheduler(&rig, Evidence::Seen);
+        let scheduler = scheduler(rig, Evidence::Seen);
         let gate = scheduler.gate();
         let program = scheduler.program(&rig.panel, &rig.lasers).unwrap();
         laser.program(&program, TimeNs(0)).unwrap();

@@ -123,6 +123,14 @@ function whyDark(snapshot) {
   return snapshot.feed_trouble ? ", no pictures" : "";
 }
 
+const camera = ({ focus_dpt: focus, field_of_view_deg: field }) => [
+  focus == null ? "" : `focused at ${number(focus, 2)} dpt`,
+  field && `${number(field[0])} x ${number(field[1])} degrees`,
+].filter(Boolean).join(", ");
+
+const kinds = (counts) => Object.entries(counts).filter(([, count]) => count > 0)
+  .map(([kind, count]) => `${count} ${kind.replaceAll("_", " ")}`).join(", ");
+
 function tellFacts(snapshot) {
   const spread = (time) => time && `${number(time.median_ms)} ms median, ${number(time.p99_ms)} ms 99th, ${number(time.max_ms)} ms most`;
   const { feed, record } = snapshot;
@@ -146,7 +154,10 @@ function tellFacts(snapshot) {
     ["Picture to photons", spread(snapshot.picture_to_photon)],
     ["Feed", feed && `${feed.shown ?? "nobody’s pictures are shown"}; ${feed.clients.length} clients, ${feed.taken} pictures, ` +
       `${feed.refused} refused${feed.newest_age_s == null ? "" : `, newest ${number(feed.newest_age_s)} s ago`}`],
+    ["Feed’s camera", feed && camera(feed.view)],
     ["Feed’s trouble", snapshot.feed_trouble],
+    ["Feed’s bad depths", feed?.pictures_with_bad_depths > 0 && `${kinds(feed.bad_depths) || "none"} in the newest picture; ` +
+      `${kinds(feed.bad_depths_in_all)} in ${feed.pictures_with_bad_depths} pictures`],
     ["Feed refused", feed?.last_refusal],
     ["Record", record && `${record.state === "lost" ? `lost: ${record.reason}` : record.folder}` +
       `${record.rows_lost ? `; ${record.rows_lost} rows left out: the disk is too slow` : ""}`],
@@ -228,7 +239,7 @@ function drawPupil() {
   const plot = plots.pupil;
   overTime(plot, 9, "mm", 1);
   seen.frames.forEach(([, t, , state], index) => {
-    if (state === "holding" || state === "fallback") plot.box(t, seen.frames[index + 1]?.[1] ?? newest.t, 1, 9, "held");
+    if (["holding", "fallback", "acquiring"].includes(state)) plot.box(t, seen.frames[index + 1]?.[1] ?? newest.t, 1, 9, "held");
   });
   plot.dots(seen.samples.filter(([, , mm, refused]) => mm !== null && refused === null).map(([t, , mm]) => [t, mm]), "sample");
   // A refused sample may have any number or none: it is drawn at the edge.

@@ -5,13 +5,15 @@ use std::os::fd::OwnedFd;
 
 use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
 use holod_model::RgbdFrame;
-use holod_model::scene::{Fit, FrameReport, LiveError, LivePart, LiveReader};
-use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, ftruncate, memfd_create};
-use rustix::io::{Errno, pread};
+use holod_model::scene::{Fit, LiveError, LiveFormat, LiveReader, LiveReport};
+use memmap2::{MmapOptions, MmapRaw};
+use rustix::fs::{FallocateFlags, MemfdFlags, SealFlags, fallocate, fcntl_add_seals, ftruncate, memfd_create};
+use rustix::io::Errno;
 use rustix::net::{RecvFlags, SendAncillaryBuffer, SendAncillaryMessage, SendFlags, recv, send, sendmsg};
 
-use super::message::{self, LONGEST, Layout, Message, Outcome, Wrong};
+use super::message::{self, LONGEST, Layout, Message, Outcome, SLOTS, Wrong};
 use super::slots::{Picture, Slots};
+use crate::source::PictureView;
 use crate::tally_by::Reason;
 
 /// Messages of one client that are read at once, so that a hasty one leaves time to the others.
@@ -81,15 +83,140 @@ pub(super) struct Client {
     pub(super) t_last: TimeNs,
     /// Whether a picture of it has been taken.
     pub(super) is_known: bool,
+    /// Whether it was said that its depths are bad.
+    pub(super) told_depths: bool,
+    /// Whether its pictures' field of view was looked at.
+    pub(super) told_field_of_view: bool,
     stream: Option<Stream>,
 }
 
 /// What there is once a client has said what its pictures are like.
-struct Stream {
+pub(super) struct Stream {
+    version: u32,
+    format: LiveFormat,
     memory: OwnedFd,
+    /// The same, to be read. Nobody looks into it but [`Stream::copy_out`].
+    mapped: MmapRaw,
+    /// Slots whose memory is there.
+    is_allocated: [bool; SLOTS],
     layout: Layout,
     slots: Slots,
+    /// How the picture in each slot was taken.
+    views: [PictureView; SLOTS],
     reader: LiveReader,
+}
+
+/// Why there is no stream.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum StreamError {
+    /// The pictures do not fit.
+    #[error("HELO: {0}")]
+    Format(#[from] LiveError),
+    /// There is no memory to share.
+    #[error("holod has no memory for these pictures: {0}")]
+    Memory(#[from] io::Error),
+}
+
+/// Why a picture cannot be taken over.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum TakeError {
+    /// There is no memory for all of it.
+    #[error("there is no memory for the picture: {0}")]
+    Memory(#[from] io::Error),
+    /// It cannot be shown.
+    #[error(transparent)]
+    Picture(#[from] LiveError),
+}
+
+/// A picture's bytes, copied out of the shared memory. The memory is used again for the next one.
+#[derive(Debug, Default)]
+pub(super) struct Copied {
+    bytes: Vec<u8>,
+    colour_bytes: usize,
+}
+
+impl Copied {
+    /// Colours and depths.
+    fn parts(&self) -> (&[u8], &[u8]) {
+        self.bytes.split_at(self.colour_bytes)
+    }
+}
+
+impl Stream {
+    /// Memory for pictures of `format`, and what makes frames of them, for a client that speaks `version`.
+    pub(super) fn open(version: u32, format: LiveFormat, target: &Target) -> Result<Self, StreamError> {
+        let reader = LiveReader::new(format, &target.geometry, target.resolution, target.fit)?;
+        let layout = Layout::of(&format);
+        let memory = shared_memory(layout.bytes()).map_err(io::Error::from)?;
+        let mapped = MmapOptions::new().len(layout.bytes()).map_raw_read_only(&memory)?;
+        let views = [PictureView::default(); SLOTS];
+        let is_allocated = [false; SLOTS];
+        Ok(Self { version, format, memory, mapped, is_allocated, layout, slots: Slots::default(), views, reader })
+    }
+
+    /// What its pictures are like.
+    pub(super) const fn format(&self) -> LiveFormat {
+        self.format
+    }
+
+    /// How a picture was taken.
+    pub(super) const fn view(&self, picture: &Picture) -> PictureView {
+        self.views[picture.slot]
+    }
+
+    /// The field of view in which an eye sees a whole picture: across and up, degrees.
+    pub(super) fn shown_field_of_view_deg(&self, geometry: &DisplayGeometry) -> [f32; 2] {
+        let Resolution { width, height } = self.format.resolution;
+        [width, height].map(|px| {
+            let half = 0.5 * px as f64 * self.reader.scale() * geometry.pixel_angle_rad();
+            (2.0 * half.atan()).to_degrees() as f32
+        })
+    }
+
+    /// What is shared with the client.
+    pub(super) const fn memory(&self) -> &OwnedFd {
+        &self.memory
+    }
+
+    /// Where a picture's colours and its depths begin.
+    pub(super) const fn offsets(&self, picture: &Picture) -> [usize; 2] {
+        let slot = picture.slot * self.layout.slot_bytes;
+        [slot, slot + self.layout.depth_offset]
+    }
+
+    /// Copies a picture and says whether it can be shown: all that is done while the client has to wait for its slot.
+    pub(super) fn copy_out(&mut self, picture: &Picture, copied: &mut Copied) -> Result<(), TakeError> {
+        let Layout { slot_bytes, colour_bytes, depth_bytes, .. } = self.layout;
+        if !std::mem::replace(&mut self.is_allocated[picture.slot], true) {
+            // What its client has not written is not there yet, and there may be no memory for it.
+            let begin = picture.slot * slot_bytes;
+            fallocate(&self.memory, FallocateFlags::empty(), begin as u64, slot_bytes as u64)
+                .map_err(io::Error::from)?;
+        }
+        copied.bytes.resize(colour_bytes + depth_bytes, 0);
+        copied.colour_bytes = colour_bytes;
+        let (colour, depth) = copied.bytes.split_at_mut(colour_bytes);
+        let [colour_at, depth_at] = self.offsets(picture);
+        self.copy_part(colour, colour_at);
+        self.copy_part(depth, depth_at);
+        Ok(self.reader.check(depth)?)
+    }
+
+    /// Copies what begins at `at` in the shared memory. The kernel would do the same by `pread`, page by page, in three
+    /// times the time.
+    fn copy_part(&self, part: &mut [u8], at: usize) {
+        assert!(at + part.len() <= self.mapped.len(), "within the shared memory");
+        // SAFETY: what is read lies within the mapping, which lives as long as `self` and cannot be made shorter (it is
+        // sealed). No reference into it is made. A client that breaks the rules may write meanwhile, and then the copy holds
+        // some of its old and some of its new bytes: of bytes, and of all that is made of them, every value is allowed.
+        unsafe { std::ptr::copy_nonoverlapping(self.mapped.as_ptr().add(at), part.as_mut_ptr(), part.len()) }
+    }
+
+    /// Makes `frame`, which has the target's size, of a picture that was copied.
+    pub(super) fn make(&mut self, copied: &Copied, frame: &mut RgbdFrame) -> Result<LiveReport, LiveError> {
+        let (colour, depth) = copied.parts();
+        self.reader.make(colour, depth, frame)
+    }
 }
 
 impl Client {
@@ -99,6 +226,8 @@ impl Client {
             name: format!("connection {number}"),
             t_last: TimeNs(i64::MIN / 2),
             is_known: false,
+            told_depths: false,
+            told_field_of_view: false,
             stream: None,
         }
     }
@@ -141,26 +270,25 @@ impl Client {
         match (message, &mut self.stream) {
             (Message::Hello { .. }, Some(_)) => Err(Wrong("HELO: a second one was found, expected FRAM".into())),
             (Message::Frame { .. }, None) => Err(Wrong("FRAM: was found first, expected HELO".into())),
-            (Message::Hello { format, name }, stream) => {
-                let layout = Layout::of(&format);
-                let fits = LiveReader::new(format, &target.geometry, target.resolution, target.fit)
-                    .map_err(|error| format!("HELO: {error}"));
-                let opened = fits.and_then(|reader| {
-                    let memory = shared_memory(layout.bytes());
-                    let memory = memory.map_err(|error| format!("holod has no memory for these pictures: {error}"))?;
-                    Ok((reader, memory))
-                });
-                let (reader, memory) = match opened {
+            (Message::Hello { version, format, name }, stream) => {
+                let opened = match Stream::open(version, format, target) {
                     Ok(opened) => opened,
-                    Err(why) => return Ok(Err(self.show_out(Refusal::Pictures, &why))),
+                    Err(why) => return Ok(Err(self.show_out(Refusal::Pictures, &why.to_string()))),
                 };
                 self.name = name;
-                let stream = stream.insert(Stream { memory, layout, slots: Slots::default(), reader });
+                let stream = stream.insert(opened);
                 Ok(send_ring(&self.socket, stream))
             }
-            (Message::Frame { slot, sequence, t_taken }, Some(stream)) => {
+            (Message::Frame { slot, sequence, t_taken, view }, Some(stream)) => {
+                if stream.version == 1 && view != PictureView::default() {
+                    return Err(Wrong(
+                        "FRAM: reserved bytes that are not 0 were found, expected 0 in version 1".into(),
+                    ));
+                }
                 self.t_last = now;
-                match stream.slots.hand_over(slot, sequence, t_taken.unwrap_or(now))? {
+                let freed = stream.slots.hand_over(slot, sequence, t_taken.unwrap_or(now))?;
+                stream.views[slot as usize] = view;
+                match freed {
                     None => Ok(Ok(())),
                     Some((picture, outcome)) => {
                         note(&outcome);
@@ -195,15 +323,9 @@ impl Client {
         self.stream.as_ref().map_or(0, |stream| stream.slots.left_out)
     }
 
-    /// Reads a picture into `frame`, which has the target's size.
-    pub(super) fn read(&mut self, picture: &Picture, frame: &mut RgbdFrame) -> Result<FrameReport, LiveError> {
-        let Stream { memory, layout, reader, .. } = self.stream.as_mut().expect("only a stream has pictures");
-        let slot = picture.slot * layout.slot_bytes;
-        let read_at = |part, bytes: &mut [u8], at: usize| {
-            let part = if part == LivePart::Colour { 0 } else { layout.depth_offset };
-            read_whole(memory, bytes, slot + part + at)
-        };
-        reader.read(read_at, frame)
+    /// What its pictures go through.
+    pub(super) fn stream(&mut self) -> &mut Stream {
+        self.stream.as_mut().expect("only a stream has pictures")
     }
 
     /// Gives a slot back, and says what became of its picture.
@@ -239,20 +361,5 @@ fn send_ring(socket: &OwnedFd, stream: &Stream) -> Result<(), Gone> {
     control.push(SendAncillaryMessage::ScmRights(&memory));
     let ring = stream.layout.ring();
     sendmsg(socket, &[io::IoSlice::new(&ring)], &mut control, SendFlags::DONTWAIT | SendFlags::NOSIGNAL)?;
-    Ok(())
-}
-
-fn read_whole(memory: &OwnedFd, mut bytes: &mut [u8], mut at: usize) -> io::Result<()> {
-    while !bytes.is_empty() {
-        match pread(memory, &mut *bytes, at as u64) {
-            Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
-            Ok(length) => {
-                bytes = &mut bytes[length..];
-                at += length;
-            }
-            Err(Errno::INTR) => {}
-            Err(error) => return Err(error.into()),
-        }
-    }
     Ok(())
 }

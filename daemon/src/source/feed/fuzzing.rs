@@ -2,7 +2,7 @@
 
 use holod_calibration::{DisplayGeometry, Resolution};
 use holod_model::RgbdFrame;
-use holod_model::scene::{Fit, LivePart, LiveReader};
+use holod_model::scene::{Fit, LiveReader};
 
 use super::message::{LONGEST, Layout, Message, Wrong, nope};
 
@@ -17,7 +17,7 @@ const PIXELS_MAX: usize = 4096;
 pub fn client(bytes: &[u8]) {
     let (first, rest) = bytes.split_at(bytes.len().min(LONGEST));
     let format = match Message::parse(first) {
-        Ok(Message::Hello { format, name }) => {
+        Ok(Message::Hello { format, name, .. }) => {
             assert!(!name.is_empty() && !name.contains(char::is_control), "{name:?}");
             assert!(Layout::of(&format).bytes() < 1 << 32, "{format:?}");
             format
@@ -31,21 +31,21 @@ pub fn client(bytes: &[u8]) {
     if format.resolution.pixels() > PIXELS_MAX || rest.is_empty() {
         return;
     }
-    let read_at = |part: LivePart, buffer: &mut [u8], offset: usize| {
-        let offset = if part == LivePart::Depth { Layout::of(&format).depth_offset + offset } else { offset };
-        for (at, byte) in buffer.iter_mut().enumerate() {
-            *byte = rest[(offset + at) % rest.len()];
-        }
-        Ok(())
+    let part = |length: usize, offset: usize| -> Vec<u8> {
+        rest.iter().copied().cycle().skip(offset % rest.len()).take(length).collect()
     };
+    let layout = Layout::of(&format);
+    let (colour, depth) = (part(layout.colour_bytes, 0), part(layout.depth_bytes, layout.depth_offset));
     let fit = [Fit::Native, Fit::Contain, Fit::Cover, Fit::Crop][usize::from(rest[0] % 4)];
     let Ok(mut reader) = LiveReader::new(format, &DisplayGeometry::DEFAULT, TARGET, fit) else { return };
     let mut frame = RgbdFrame::black(TARGET);
-    match reader.read(read_at, &mut frame) {
+    let is_shown = reader.check(&depth).is_ok();
+    match reader.make(&colour, &depth, &mut frame) {
         Ok(_) => {
+            assert!(is_shown, "{format:?} was refused");
             let figures = frame.amplitude.iter().chain(&frame.depth_normalised);
             assert!(figures.into_iter().all(|figure| (0.0..=1.0).contains(figure)), "{fit:?} of {format:?}");
         }
-        Err(error) => assert!(!error.to_string().is_empty()),
+        Err(error) => assert!(!is_shown && !error.to_string().is_empty()),
     }
 }

@@ -3,8 +3,10 @@
 use holod_calibration::{Dioptres, Resolution, TimeNs};
 use holod_model::scene::{LiveColour, LiveDepth, LiveFormat};
 
-/// The protocol's version.
-pub(super) const VERSION: u32 = 1;
+use crate::source::PictureView;
+
+/// The newest version of the protocol, and the first one in which a picture may say how it was taken.
+pub(super) const VERSION: u32 = 2;
 /// Slots of a client's shared memory: one that it writes, one that is read, one that waits.
 pub(super) const SLOTS: usize = 3;
 /// The longest message that a client sends; one more byte shows that one is longer.
@@ -17,7 +19,10 @@ const NAME: std::ops::Range<usize> = 32..HELLO_BYTES;
 const SIDE_MAX: u32 = 1 << 16;
 const PIXELS_MAX: usize = 7680 * 4320;
 /// Nobody sees nearer than this.
-const PLANE_MAX_DPT: f32 = 20.0;
+const NEAREST_DPT: f32 = 20.0;
+/// Which of a picture's optional figures are given.
+const HAS_FOCUS: u32 = 1;
+const HAS_FIELD_OF_VIEW: u32 = 2;
 /// Colour and depth begin at multiples of this.
 const ALIGNMENT: usize = 64;
 
@@ -26,6 +31,8 @@ const ALIGNMENT: usize = 64;
 pub(super) enum Message {
     /// `HELO`: what its pictures will be like.
     Hello {
+        /// The protocol's version.
+        version: u32,
         /// How they are stored.
         format: LiveFormat,
         /// What it is called.
@@ -39,6 +46,8 @@ pub(super) enum Message {
         sequence: u64,
         /// When it was taken, where the client says so.
         t_taken: Option<TimeNs>,
+        /// How it was taken.
+        view: PictureView,
     },
 }
 
@@ -81,8 +90,8 @@ fn hello(bytes: &[u8; HELLO_BYTES]) -> Result<Message, Wrong> {
         Err(Wrong(format!("HELO: {what} {found} was found, expected {expected}")))
     };
     let version = u32_at(bytes, 4);
-    if version != VERSION {
-        return wrong("version", version.to_string(), &VERSION.to_string());
+    if !(1..=VERSION).contains(&version) {
+        return wrong("version", version.to_string(), "1 or 2");
     }
     let (width, height) = (u32_at(bytes, 8), u32_at(bytes, 12));
     let resolution = Resolution { width: width as usize, height: height as usize };
@@ -98,7 +107,7 @@ fn hello(bytes: &[u8; HELLO_BYTES]) -> Result<Message, Wrong> {
     };
     let plane_dpt = f32::from_bits(u32_at(bytes, 24));
     let depth = match u32_at(bytes, 20) {
-        0 if (0.0..=PLANE_MAX_DPT).contains(&plane_dpt) => LiveDepth::Plane(Dioptres(plane_dpt.into())),
+        0 if (0.0..=NEAREST_DPT).contains(&plane_dpt) => LiveDepth::Plane(Dioptres(plane_dpt.into())),
         0 => return wrong("plane_dpt", plane_dpt.to_string(), "0 to 20 dioptres (0 is infinity)"),
         _ if plane_dpt != 0.0 => return wrong("plane_dpt", plane_dpt.to_string(), "0, as the pictures have depth"),
         1 => LiveDepth::MillimetresU16,
@@ -115,13 +124,10 @@ fn hello(bytes: &[u8; HELLO_BYTES]) -> Result<Message, Wrong> {
     // What a terminal or a log would take for an order has no place in a name.
     let name: String = String::from_utf8_lossy(name).chars().filter(|c| !c.is_control()).collect();
     let name = if name.trim().is_empty() { "unnamed".to_owned() } else { name.trim().to_owned() };
-    Ok(Message::Hello { format: LiveFormat { resolution, colour, depth }, name })
+    Ok(Message::Hello { version, format: LiveFormat { resolution, colour, depth }, name })
 }
 
 fn frame(bytes: &[u8; FRAME_BYTES]) -> Result<Message, Wrong> {
-    if bytes[24..] != [0; FRAME_BYTES - 24] {
-        return Err(Wrong("FRAM: reserved bytes that are not 0 were found, expected 0".into()));
-    }
     let t_taken = match u64_at(bytes, 16) as i64 {
         0 => None,
         t if t > 0 => Some(TimeNs(t)),
@@ -129,7 +135,33 @@ fn frame(bytes: &[u8; FRAME_BYTES]) -> Result<Message, Wrong> {
             return Err(Wrong(format!("FRAM: a time of {t} was found, expected nanoseconds of CLOCK_MONOTONIC, or 0")));
         }
     };
-    Ok(Message::Frame { slot: u32_at(bytes, 4), sequence: u64_at(bytes, 8), t_taken })
+    Ok(Message::Frame { slot: u32_at(bytes, 4), sequence: u64_at(bytes, 8), t_taken, view: view(bytes)? })
+}
+
+/// How a picture was taken, of which nothing need be said.
+fn view(bytes: &[u8; FRAME_BYTES]) -> Result<PictureView, Wrong> {
+    let wrong = |found: String, expected: &str| Err(Wrong(format!("FRAM: {found} was found, expected {expected}")));
+    let given = u32_at(bytes, 24);
+    if given & !(HAS_FOCUS | HAS_FIELD_OF_VIEW) != 0 {
+        return wrong(format!("given figures {given:#x}"), "a sum of 1 (focus) and 2 (field of view), or 0");
+    }
+    let figures = [28, 32, 36].map(|at| f32::from_bits(u32_at(bytes, at)));
+    let [focus_dpt, across_deg, up_deg] = figures;
+    let (has_focus, has_field) = (given & HAS_FOCUS != 0, given & HAS_FIELD_OF_VIEW != 0);
+    if !has_focus && focus_dpt.to_bits() != 0 || !has_field && (across_deg.to_bits() | up_deg.to_bits()) != 0 {
+        return wrong(format!("figures {figures:?} of which {given} are given"), "0 for those that are not");
+    }
+    if has_focus && !(0.0..=NEAREST_DPT).contains(&focus_dpt) {
+        return wrong(format!("a focus of {focus_dpt} dioptres"), "0 to 20 (0 is infinity)");
+    }
+    let is_angle = |deg: f32| deg > 0.0 && deg < 180.0;
+    if has_field && !(is_angle(across_deg) && is_angle(up_deg)) {
+        return wrong(format!("a field of view of {across_deg} x {up_deg} degrees"), "more than 0 and less than 180");
+    }
+    Ok(PictureView {
+        focus_dpt: has_focus.then_some(focus_dpt),
+        field_of_view_deg: has_field.then_some([across_deg, up_deg]),
+    })
 }
 
 /// Where the parts of a picture lie in the shared memory.
@@ -238,22 +270,41 @@ pub(super) mod tests {
         bytes
     }
 
+    fn frame_with(given: u32, figures: [f32; 3]) -> [u8; FRAME_BYTES] {
+        let mut bytes = frame_of(0, 1, 0);
+        for (cell, bits) in bytes[24..].chunks_exact_mut(4).zip([given].into_iter().chain(figures.map(f32::to_bits))) {
+            cell.copy_from_slice(&bits.to_ne_bytes());
+        }
+        bytes
+    }
+
     #[test]
     fn what_the_page_describes_is_read() {
         let hello = Message::parse(&hello_with(&[])).unwrap();
-        assert_eq!(hello, Message::Hello { format: FORMAT, name: "test".into() });
+        assert_eq!(hello, Message::Hello { version: 1, format: FORMAT, name: "test".into() });
         let plane = Message::parse(&hello_with(&[(20, 0), (24, 1.5_f32.to_bits())])).unwrap();
         let Message::Hello { format, .. } = plane else { panic!() };
         assert_eq!(format.depth, LiveDepth::Plane(Dioptres(1.5)));
-        let frame = |slot, sequence, t_taken| Message::Frame { slot, sequence, t_taken };
+        let frame = |slot, sequence, t_taken| Message::Frame { slot, sequence, t_taken, view: PictureView::default() };
         assert_eq!(Message::parse(&frame_of(2, 1 << 40, 77)).unwrap(), frame(2, 1 << 40, Some(TimeNs(77))));
         assert_eq!(Message::parse(&frame_of(0, 0, 0)).unwrap(), frame(0, 0, None));
+        for (given, figures, focus_dpt, field_of_view_deg) in [
+            (1, [1.25, 0.0, 0.0], Some(1.25), None),
+            (2, [0.0, 60.0, 45.0], None, Some([60.0, 45.0])),
+            (3, [0.0, 179.9, 0.1], Some(0.0), Some([179.9, 0.1])),
+        ] {
+            let Message::Frame { view, .. } = Message::parse(&frame_with(given, figures)).unwrap() else { panic!() };
+            assert_eq!(view, PictureView { focus_dpt, field_of_view_deg });
+        }
+        let newer = Message::parse(&hello_with(&[(4, 2)])).unwrap();
+        assert_eq!(newer, Message::Hello { version: 2, format: FORMAT, name: "test".into() });
     }
 
     #[test]
     fn what_the_page_does_not_describe_is_refused_in_words() {
         for (changes, said) in [
-            (&[(4, 2)][..], "HELO: version 2 was found, expected 1"),
+            (&[(4, 3)][..], "HELO: version 3 was found, expected 1 or 2"),
+            (&[(4, 0)], "HELO: version 0 was found"),
             (&[(8, 0)], "HELO: a size of 0x3 was found"),
             (&[(8, 7680), (12, 4321)], "a size of 7680x4321"),
             (&[(8, u32::MAX), (12, u32::MAX)], "expected 1x1 to 7680x4320 pixels"),
@@ -271,9 +322,19 @@ pub(super) mod tests {
         assert!(Message::parse(b"GET / HTTP").unwrap_err().0.contains("47 45 54 20 2f 20 48 54 was found"));
         assert!(Message::parse(b"").is_err());
         assert!(Message::parse(&frame_of(0, 0, -1)).unwrap_err().0.contains("CLOCK_MONOTONIC"));
-        let mut frame = frame_of(0, 0, 0);
-        frame[39] = 1;
-        assert!(Message::parse(&frame).is_err());
+        for (given, figures, said) in [
+            (4, [0.0; 3], "given figures 0x4 was found, expected a sum of 1 (focus) and 2"),
+            (0, [0.0, 0.0, 1.0], "expected 0 for those that are not"),
+            (2, [1.0, 60.0, 45.0], "expected 0 for those that are not"),
+            (1, [20.1, 0.0, 0.0], "a focus of 20.1 dioptres was found, expected 0 to 20"),
+            (1, [f32::NAN, 0.0, 0.0], "a focus of NaN"),
+            (2, [0.0, 60.0, 0.0], "a field of view of 60 x 0 degrees was found, expected more than 0"),
+            (2, [0.0, 180.0, 45.0], "less than 180"),
+            (3, [1.0, f32::NAN, 45.0], "NaN x 45"),
+        ] {
+            let wrong = Message::parse(&frame_with(given, figures)).unwrap_err();
+            assert!(wrong.0.contains(said), "{wrong}");
+        }
     }
 
     proptest! {
@@ -291,7 +352,7 @@ pub(super) mod tests {
                 *cell = byte;
             }
             match Message::parse(&bytes) {
-                Ok(Message::Hello { format, name }) => {
+                Ok(Message::Hello { format, name, .. }) => {
                     prop_assert!(format.resolution.pixels() > 0 && Layout::of(&format).bytes() < 1 << 32);
                     prop_assert!(!name.is_empty() && !name.contains(char::is_control));
                 }

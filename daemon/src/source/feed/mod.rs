@@ -1,10 +1,13 @@
 //! The live feed: programs that hand pictures over while holod runs. The protocol's page is `daemon/doc/feed.md`.
 //!
 //! One ordinary thread listens, reads what clients send, and turns the newest picture of the one that is shown into a
-//! frame. Pictures are copied out of the shared memory by the kernel and never looked at in place, so a client that breaks
-//! the rules harms its own picture only.
+//! frame. Pictures are copied out of the shared memory and never looked at in place, so a client that breaks
+//! the rules harms its own picture only. Once its picture is copied a client has its slot back; the frame is made of the
+//! copy after that.
 
 mod client;
+pub mod cost;
+mod depths;
 #[cfg(fuzzing)]
 pub mod fuzzing;
 mod message;
@@ -21,17 +24,18 @@ use std::time::Duration;
 
 use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
 use holod_model::RgbdFrame;
-use holod_model::scene::Fit;
+use holod_model::scene::{Fit, LiveError, LiveReport};
 use holod_pupil_input::host_now;
 use rustix::event::{EventfdFlags, PollFd, PollFlags, eventfd, poll};
 use rustix::io::Errno;
 use rustix::net::{SocketFlags, SocketType, accept_with};
 use serde::{Deserialize, Serialize};
 
-use self::client::{Client, Gone, Refusal, Target};
+use self::client::{Client, Copied, Gone, Refusal, TakeError, Target};
+pub use self::depths::BadDepths;
 use self::message::Outcome;
 use self::slots::Picture;
-use super::{PictureSink, PictureTag, scene};
+use super::{PictureSink, PictureTag, PictureView, scene};
 use crate::local_socket::{self, SocketError};
 use crate::tally_by::TallyBy;
 
@@ -47,6 +51,8 @@ const LONGEST_FUTURE: TimeNs = TimeNs(1_000_000_000);
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
 /// Clients that go on doing wrong make one line in the log in this time.
 const REFUSAL_EVERY: TimeNs = TimeNs(1_000_000_000);
+/// A field of view that is off by more than this share is told.
+const FIELD_TOLERANCE: f32 = 0.1;
 /// The name of the socket in the runtime folder.
 const SOCKET: &str = "feed";
 
@@ -98,6 +104,18 @@ pub struct FeedStatus {
     pub connections_refused_by: BTreeMap<String, u64>,
     /// Why a picture or a connection was refused last.
     pub last_refusal: Option<String>,
+    /// How the newest picture was taken, where its client says so.
+    #[serde(default)]
+    pub view: PictureView,
+    /// Depths of the newest picture, taken or refused, that cannot be shown as they are.
+    #[serde(default)]
+    pub bad_depths: BadDepths,
+    /// The same of all pictures.
+    #[serde(default)]
+    pub bad_depths_in_all: BadDepths,
+    /// Pictures that have some.
+    #[serde(default)]
+    pub pictures_with_bad_depths: u64,
     /// Seconds since the newest picture was taken over.
     pub newest_age_s: Option<f64>,
     #[serde(skip)]
@@ -111,6 +129,12 @@ impl FeedStatus {
     fn at(socket: &Path) -> Self {
         let connections_refused_by = TallyBy::<Refusal>::default().map();
         Self { socket: socket.to_owned(), connections_refused_by, ..Self::default() }
+    }
+
+    fn count_depths(&mut self, bad: BadDepths) {
+        self.bad_depths = bad;
+        self.bad_depths_in_all.add(&bad);
+        self.pictures_with_bad_depths += u64::from(bad.in_all() > 0);
     }
 
     fn tell_refusal(&mut self, what: &str, why: &str, now: TimeNs) {
@@ -184,6 +208,7 @@ impl Feed {
             target: Target { geometry: *geometry, resolution, fit },
             clients: Vec::new(),
             connections: 0,
+            copied: Copied::default(),
             frames: (0..FRAMES).map(|_| Arc::new(RgbdFrame::black(resolution))).collect(),
             sink,
             shared: Arc::clone(&status),
@@ -241,6 +266,8 @@ struct Server {
     /// In the order in which they came.
     clients: Vec<(u64, Client)>,
     connections: u64,
+    /// The picture of which a frame is made.
+    copied: Copied,
     frames: Vec<Arc<RgbdFrame>>,
     sink: Arc<Mutex<PictureSink>>,
     shared: Arc<Mutex<FeedStatus>>,
@@ -372,21 +399,37 @@ impl Server {
         let mut frame = free
             .map_or_else(|| Arc::new(RgbdFrame::black(self.target.resolution)), |free| self.frames.swap_remove(free));
         let sink = Arc::clone(&self.sink);
+        let mut copied = std::mem::take(&mut self.copied);
         self.with(number, shown, |client, target, status| {
             let Some(picture) = client.take() else { return Ok(()) };
-            let outcome = match take_over(client, &picture, target, &mut frame, now) {
-                Ok(tag) => {
-                    // Whoever hears that it was taken may count on it.
-                    status.t_newest = Some(now);
-                    let is_shown =
-                        sink.lock().unwrap_or_else(PoisonError::into_inner).show_live(Arc::clone(&frame), tag);
-                    if is_shown { Outcome::Taken } else { Outcome::NotShown }
-                }
-                Err(why) => Outcome::Refused(why),
-            };
+            let taken = take_over(client, &picture, &mut copied, now);
+            let outcome = taken.as_ref().map_or_else(|why| Outcome::Refused(why.to_string()), |_| Outcome::Taken);
             note(status, &outcome);
-            client.free(&picture, &outcome)
+            let freed = client.free(&picture, &outcome);
+            match taken {
+                Ok(tag) => {
+                    status.t_newest = Some(now);
+                    status.view = tag.view;
+                    let report = make(client, &copied, &mut frame);
+                    sink.lock().unwrap_or_else(PoisonError::into_inner).show_live(Arc::clone(&frame), tag);
+                    tell_field_of_view(client, tag.view, target);
+                    let bad = BadDepths::from(&report);
+                    status.count_depths(bad);
+                    tell_oddities(client, &bad, Some((&frame, &report)), target);
+                }
+                Err(PictureRefusal::Picture(TakeError::Picture(LiveError::NoDepth { missing, .. }))) => {
+                    let bad = BadDepths::from(missing);
+                    status.count_depths(bad);
+                    tell_oddities(client, &bad, None, target);
+                }
+                Err(_) => {}
+            }
+            freed
         });
+        // Its memory may be large.
+        if !self.clients.is_empty() {
+            self.copied = copied;
+        }
         self.frames.push(frame);
     }
 
@@ -406,29 +449,81 @@ struct Ready {
     clients: Vec<u64>,
 }
 
-/// Reads a picture into `frame`, or says why it cannot be shown.
+/// Why a picture is refused.
+#[derive(Debug, thiserror::Error)]
+enum PictureRefusal {
+    #[error(
+        "a picture taken {ahead_s:.0} s from now was found, expected nanoseconds of CLOCK_MONOTONIC (not of the calendar's \
+         clock), or 0"
+    )]
+    Future { ahead_s: f64 },
+    #[error(transparent)]
+    Picture(#[from] TakeError),
+}
+
+/// Copies a picture out of its slot, or says why it cannot be shown.
 fn take_over(
     client: &mut Client,
     picture: &Picture,
-    target: &Target,
-    frame: &mut Arc<RgbdFrame>,
+    copied: &mut Copied,
     now: TimeNs,
-) -> Result<PictureTag, String> {
+) -> Result<PictureTag, PictureRefusal> {
     if picture.t_taken > now + LONGEST_FUTURE {
-        let ahead_s = (picture.t_taken - now).seconds();
-        return Err(format!(
-            "a picture taken {ahead_s:.0} s from now was found, expected nanoseconds of CLOCK_MONOTONIC (not of the \
-             calendar's clock), or 0"
-        ));
+        return Err(PictureRefusal::Future { ahead_s: (picture.t_taken - now).seconds() });
     }
+    client.stream().copy_out(picture, copied)?;
+    Ok(PictureTag {
+        number: picture.sequence,
+        t_taken: Some(picture.t_taken),
+        t_came: Some(now),
+        view: client.stream().view(picture),
+        order: 0,
+    })
+}
+
+/// Makes `frame` of a picture that was taken over.
+fn make(client: &mut Client, copied: &Copied, frame: &mut Arc<RgbdFrame>) -> LiveReport {
     let frame = Arc::get_mut(frame).expect("the frame is nobody else's");
-    let report = client.read(picture, frame).map_err(|error| error.to_string())?;
-    if !client.is_known {
-        client.is_known = true;
-        let name = format!("the feed's client `{}`", client.name);
-        scene::warn_of_oddities(&name, frame, &report, &target.geometry, client.sends_planes());
+    client.stream().make(copied, frame).expect("a picture that was taken over has a depth")
+}
+
+/// Says once of each client what is most often a mistake: depths of which most are bad, and oddities of its first picture,
+/// where a frame could be made of that.
+fn tell_oddities(client: &mut Client, bad: &BadDepths, made: Option<(&RgbdFrame, &LiveReport)>, target: &Target) {
+    let name = format!("the feed's client `{}`", client.name);
+    let format = client.stream().format();
+    let pixels = format.resolution.pixels() as u64;
+    let is_first = made.is_some() && !client.is_known;
+    client.is_known |= made.is_some();
+    let are_bad = 2 * bad.in_all() > pixels;
+    if are_bad && !std::mem::replace(&mut client.told_depths, true) {
+        let (text, cure) = (bad.text(), bad.likely_cure(format.depth));
+        tracing::warn!("{name}: of {pixels} depths, these cannot be shown as they are: {text}; {cure}");
     }
-    Ok(PictureTag { number: picture.sequence, t_taken: Some(picture.t_taken), t_came: Some(now), order: 0 })
+    if let Some((frame, report)) = made.filter(|_| is_first) {
+        if are_bad {
+            scene::warn_of_clipped_colours(&name, frame, &report.frame);
+        } else {
+            scene::warn_of_oddities(&name, frame, &report.frame, &target.geometry, client.sends_planes());
+        }
+    }
+}
+
+/// Says once of each client that its pictures were taken with another field of view than they are seen with.
+fn tell_field_of_view(client: &mut Client, view: PictureView, target: &Target) {
+    let Some(taken_deg) = view.field_of_view_deg.filter(|_| !client.told_field_of_view) else { return };
+    client.told_field_of_view = true;
+    let shown_deg = client.stream().shown_field_of_view_deg(&target.geometry);
+    let half_tangent = |deg: f32| (deg.to_radians() / 2.0).tan();
+    let factor = half_tangent(shown_deg[0]) / half_tangent(taken_deg[0]);
+    if (factor - 1.0).abs() > FIELD_TOLERANCE {
+        let [[taken_x, taken_y], [shown_x, shown_y]] = [taken_deg, shown_deg];
+        tracing::warn!(
+            "the feed's client `{}`: pictures taken with {taken_x:.1} x {taken_y:.1} degrees are shown in {shown_x:.1} x \
+             {shown_y:.1}: things look {factor:.2} times as large as they are; set the camera's field of view to the latter",
+            client.name
+        );
+    }
 }
 
 /// Counts what became of a picture.

@@ -47,6 +47,16 @@ impl Bench {
         (RgbdFrame::clone(frame), tag)
     }
 
+    /// What is shown once that is picture `number`: it is made after its client has heard that it was taken.
+    fn shown_next(&mut self, number: u64) -> (RgbdFrame, PictureTag) {
+        let began = Instant::now();
+        while self.shown().1.number != number {
+            assert!(began.elapsed() < Duration::from_secs(10), "{number}: {:?}", self.shown().1);
+            thread::sleep(Duration::from_millis(1));
+        }
+        self.shown()
+    }
+
     fn status(&self) -> FeedStatus {
         self.feed.status(host_now())
     }
@@ -91,7 +101,7 @@ fn what_is_handed_over_is_shown_until_something_newer_is() {
     let mut client = bench.client("camera");
     let t_before = host_now();
     assert_eq!(send(&mut client, 1, 7, 255), (TAKEN, String::new()));
-    let (frame, tag) = bench.shown();
+    let (frame, tag) = bench.shown_next(7);
     assert_eq!(frame.amplitude, [1.0; 3 * PIXELS]);
     assert!((frame.depth_normalised[0] - BENCH.normalised_depth(holod_calibration::Dioptres(1.0)) as f32).abs() < 1e-6);
     assert_eq!(tag.number, 7);
@@ -120,7 +130,7 @@ fn pictures_that_wait_are_overtaken_and_slots_come_back() {
         client.hand_over(slot, 2 * sequence, 0).unwrap();
     }
     bench.until("all are done with", |status| status.taken + status.overtaken == 300);
-    assert_eq!((bench.shown().1.number, bench.status().left_out), (598, 299), "the newest is shown");
+    assert_eq!((bench.shown_next(598).1.number, bench.status().left_out), (598, 299), "the newest is shown");
 }
 
 #[test]
@@ -249,7 +259,7 @@ fn another_client_is_shown_once_the_first_is_gone_or_silent() {
     let (mut first, mut second) = (bench.client("first"), bench.client("second"));
     assert_eq!(send(&mut first, 0, 1, 255).0, TAKEN);
     assert_eq!(send(&mut second, 0, 10, 0).0, NOT_SHOWN);
-    assert_eq!(bench.shown().1.number, 1);
+    bench.shown_next(1);
     let began = Instant::now();
     let mut sequence = 10;
     while bench.shown().1.number < 10 {
@@ -270,6 +280,7 @@ fn while_a_scene_is_shown_no_client_is() {
     let mut bench = Bench::new();
     let mut client = bench.client("camera");
     assert_eq!(send(&mut client, 0, 1, 255).0, TAKEN);
+    bench.shown_next(1);
     let frames = vec![Arc::new(RgbdFrame::black(SIZE))];
     let scene = scene::Frames { frames, fps: None, reports: Vec::new(), name: "scene".into() };
     bench.sink.lock().unwrap().show_scene(Arc::new(scene), TimeNs(0), 1);
@@ -278,7 +289,7 @@ fn while_a_scene_is_shown_no_client_is() {
     bench.until("it is counted", |status| status.not_shown == 1);
     bench.sink.lock().unwrap().go_live();
     assert_eq!(send(&mut client, 0, 3, 255).0, TAKEN);
-    assert_eq!(bench.shown().1.number, 3);
+    bench.shown_next(3);
 }
 
 #[test]
@@ -308,10 +319,87 @@ fn frames_that_others_keep_are_replaced_by_new_ones() {
     let kept: Vec<_> = (0..20)
         .map(|sequence| {
             assert_eq!(send(&mut client, 0, sequence, sequence as u8).0, TAKEN);
+            bench.shown_next(sequence);
             Arc::clone(bench.pictures.at(TimeNs(0)).0)
         })
         .collect();
     assert!(kept.is_sorted_by(|a, b| a.amplitude[0] < b.amplitude[0]), "none was written to again");
+}
+
+#[test]
+fn a_slot_that_was_given_back_may_be_written_while_the_frame_is_made() {
+    let mut bench = Bench::new();
+    let mut client = bench.client("quick");
+    let right = {
+        assert_eq!(send(&mut client, 0, 1, 200).0, TAKEN);
+        bench.shown_next(1).0
+    };
+    for sequence in 2..200 {
+        assert_eq!(send(&mut client, 0, sequence, 200).0, TAKEN);
+        let (colour, depth) = picture(10, 3000);
+        client.write(0, &colour, &depth);
+        assert!(bench.shown_next(sequence).0 == right, "picture {sequence}");
+    }
+    assert_eq!(send(&mut client, 0, 200, 10).0, TAKEN);
+    assert!(bench.shown_next(200).0 != right, "another picture is told from it");
+}
+
+#[test]
+fn bad_depths_are_counted_in_each_picture_and_in_all() {
+    let mut bench = Bench::new();
+    let mut client = bench.client("holes");
+    let (colour, mut depth) = picture(9, 1000);
+    depth[..6].fill(0);
+    depth[6..8].copy_from_slice(&1_u16.to_ne_bytes());
+    client.write(0, &colour, &depth);
+    client.hand_over(0, 1, 0).unwrap();
+    bench.shown_next(1);
+    let bad = BadDepths { zero: 3, beyond_near: 1, ..BadDepths::default() };
+    bench.until("one picture is counted", |status| (status.bad_depths, status.pictures_with_bad_depths) == (bad, 1));
+    client.answer();
+    assert_eq!(send(&mut client, 0, 2, 9).0, TAKEN);
+    bench.until("a good one has none", |status| status.taken == 2 && status.bad_depths == BadDepths::default());
+    client.write(0, &colour, &[0; 2 * PIXELS]);
+    client.hand_over(0, 3, 0).unwrap();
+    bench.until("those of a refused one count, too", |status| status.refused == 1);
+    let status = bench.status();
+    assert_eq!(status.bad_depths_in_all, BadDepths { zero: 3 + PIXELS as u64, beyond_near: 1, ..BadDepths::default() });
+    assert_eq!(status.pictures_with_bad_depths, 2);
+}
+
+#[test]
+fn how_a_picture_was_taken_goes_with_it_in_version_2_alone() {
+    let mut bench = Bench::new();
+    let mut newer = FeedClient::connect(&bench.socket).unwrap();
+    let mut hello = hello(SIZE.width as u32, SIZE.height as u32, None, "camera");
+    hello[4..8].copy_from_slice(&2_u32.to_ne_bytes());
+    newer.say(&hello).unwrap();
+    assert_eq!(newer.answer(), Answer::Ring);
+    let (colour, depth) = picture(9, 1000);
+    newer.write(0, &colour, &depth);
+    newer.write(1, &colour, &depth);
+    newer.hand_over_with(0, 1, 0, 3, [1.25, 60.0, 45.0]).unwrap();
+    let view = PictureView { focus_dpt: Some(1.25), field_of_view_deg: Some([60.0, 45.0]) };
+    assert_eq!(bench.shown_next(1).1.view, view);
+    bench.until("the status has it", |status| status.view == view);
+    assert_eq!(bench.status().view.text().as_deref(), Some("focused at 1.25 dpt, 60.0 x 45.0 degrees"));
+    newer.hand_over(1, 2, 0).unwrap();
+    assert_eq!(bench.shown_next(2).1.view, PictureView::default(), "each picture says it of itself");
+    let mut older = bench.client("older");
+    older.hand_over_with(0, 1, 0, 1, [1.25, 0.0, 0.0]).unwrap();
+    assert_eq!(
+        older.answer(),
+        Answer::Nope("FRAM: reserved bytes that are not 0 were found, expected 0 in version 1".into())
+    );
+}
+
+#[test]
+fn what_is_measured_is_measured_in_each_round() {
+    let cost = cost::measure(SIZE, 5).unwrap();
+    assert_eq!(cost.picture_bytes, 6 * PIXELS);
+    for times in [cost.memcpy, cost.take, cost.make] {
+        assert!(times.len() == 5 && times.iter().any(|time| !time.is_zero()), "{times:?}");
+    }
 }
 
 #[test]
@@ -339,7 +427,7 @@ fn a_client_that_never_reads_is_shown_out_and_nobody_waits_for_it() {
     assert_eq!(bench.status().connections_refused_by["deaf"], 1);
     let mut other = bench.client("other");
     assert_eq!(send(&mut other, 0, 1, 255).0, TAKEN);
-    assert_eq!(bench.shown().0.amplitude[0], 1.0);
+    assert_eq!(bench.shown_next(1).0.amplitude[0], 1.0);
 }
 
 #[test]

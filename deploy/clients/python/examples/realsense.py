@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 from typing import Any
@@ -24,6 +25,12 @@ def millimetres(raw: NDArray[np.uint16], unit_m: float) -> NDArray[np.uint16]:
         return raw
     mm = np.clip(np.rint(raw * (unit_m * 1000)), 1, 65535).astype(np.uint16)
     return np.where(raw > 0, mm, np.uint16(0))
+
+
+def field_of_view_deg(width_px: int, height_px: int, intrinsics: Any) -> tuple[float, float]:
+    """Across and up, of a camera whose axis is in the picture's middle, as it nearly is."""
+    across, up = (2 * math.atan(side / (2 * f)) for side, f in ((width_px, intrinsics.fx), (height_px, intrinsics.fy)))
+    return math.degrees(across), math.degrees(up)
 
 
 def capture_time_ns(frame: Any, domains: set[Any]) -> int:
@@ -54,7 +61,11 @@ def main() -> None:
         computers_clock = {rs.timestamp_domain.system_time, rs.timestamp_domain.global_time}
         # Depth as the colour camera would see it: both planes of a picture show the same in the same pixel.
         align = rs.align(rs.stream.color)
-        with holod_client.Feed(width_px, height_px, depth="u16_mm", name="RealSense", path=options.socket) as feed:
+        intrinsics = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
+        field_deg = field_of_view_deg(width_px, height_px, intrinsics)
+        with holod_client.Feed(
+            width_px, height_px, depth="u16_mm", name="RealSense", path=options.socket, tells_view=True
+        ) as feed:
             while True:
                 frames = align.process(pipeline.wait_for_frames(WAIT_MS))
                 colour, depth = frames.get_color_frame(), frames.get_depth_frame()
@@ -63,6 +74,7 @@ def main() -> None:
                         np.asanyarray(colour.get_data()),
                         millimetres(np.asanyarray(depth.get_data()), unit_m),
                         capture_time_ns(colour, computers_clock),
+                        field_of_view_deg=field_deg,
                     )
     finally:
         pipeline.stop()

@@ -24,6 +24,7 @@ from holod_client.formats import Colour, Depth
 
 ANSWER_TIMEOUT_S = 5.0
 MOST_MESSAGE_BYTES = 16384
+NEAREST_DPT = 20.0
 SERVICE_PATH = Path("/run/holod/feed")
 
 _log = logging.getLogger("holod_client")
@@ -74,6 +75,10 @@ class Slot:
     """(height, width) of the type of the feed's `Depth`; (0, 0) where that is NONE"""
     t_capture_ns: int = 0
     """when the picture was taken, as time.monotonic_ns() tells it; 0 where that is not known"""
+    focus_dpt: float | None = None
+    """the distance at which the camera was focused, in dioptres, 0 to 20, where that is known"""
+    field_of_view_deg: tuple[float, float] | None = None
+    """the camera's field of view across and up, where that is known: twice atan(width_px / (2 * fx)) in degrees"""
 
 
 class Feed:
@@ -82,6 +87,9 @@ class Feed:
     `colour` and `depth` are formats or their names. Without depth ("none") a picture is a plane at `plane_dpt`
     dioptres. `name` is for holod's log and status, which keep 32 bytes of it. `path` is the socket; without one it is
     `default_path()`.
+
+    With `tells_view` pictures may say where the camera was focused and what its field of view was, which holod records
+    and shows; a holod that knows version 1 of the feed alone refuses such a feed.
 
     All calls wait for holod up to `timeout_s` seconds, which may be changed at any time: 0 does not wait, and None
     waits for ever. They raise FeedTimeoutError.
@@ -106,6 +114,7 @@ class Feed:
         name: str = "Python",
         path: str | os.PathLike[str] | None = None,
         timeout_s: float | None = 5.0,
+        tells_view: bool = False,
     ) -> None:
         self.width_px = width_px
         self.height_px = height_px
@@ -113,6 +122,7 @@ class Feed:
         self.depth = Depth(depth)
         self.path = default_path() if path is None else Path(path)
         self.timeout_s = timeout_s
+        self.tells_view = tells_view
         self.outcomes = Outcomes()
         self.refusal: str | None = None
         """why holod refused a picture last"""
@@ -127,7 +137,8 @@ class Feed:
         self._closed_because = "the feed is closed"
         self._socket: socket.socket | None = self._connect()
         try:
-            self._say(messages.helo(width_px, height_px, self.colour.number, self.depth.number, plane_dpt or 0.0, name))
+            numbers = (self.colour.number, self.depth.number)
+            self._say(messages.helo(width_px, height_px, *numbers, plane_dpt or 0.0, name, tells_view=tells_view))
             self._ring, self._memory = self._receive_ring()
         except BaseException:
             self.close()
@@ -135,19 +146,30 @@ class Feed:
         self._free = set(range(self._ring.slots))
         self._sent: set[int] = set()
 
-    def send(self, colour: NDArray[Any], depth: NDArray[Any] | None = None, t_capture_ns: int = 0) -> None:
+    def send(
+        self,
+        colour: NDArray[Any],
+        depth: NDArray[Any] | None = None,
+        t_capture_ns: int = 0,
+        *,
+        focus_dpt: float | None = None,
+        field_of_view_deg: tuple[float, float] | None = None,
+    ) -> None:
         """Copies one picture into shared memory and hands it over.
 
         `colour` and `depth` have the shape and type of the feed's formats; (height, width, 3) does for the formats
         with A. Nothing is converted. `t_capture_ns` is when the picture was taken, as time.monotonic_ns() tells it; 0
-        where that is not known.
+        where that is not known. `focus_dpt` and `field_of_view_deg` are those of a `Slot`: for a feed that
+        `tells_view`.
 
-        Raises ValueError for a wrong shape, TypeError for a wrong type, FeedTimeoutError, FeedError.
+        Raises ValueError for a wrong shape or view, TypeError for a wrong type, FeedTimeoutError, FeedError.
         """
         self._check_colour(colour)
         self._check_depth(depth)
         with self.slot() as slot:
             slot.t_capture_ns = t_capture_ns
+            slot.focus_dpt = focus_dpt
+            slot.field_of_view_deg = field_of_view_deg
             slot.colour[..., : colour.shape[-1]] = colour
             if depth is not None:
                 slot.depth[...] = depth
@@ -157,19 +179,21 @@ class Feed:
         """Gives the memory for a picture to write into, and hands it over at the end of the block; not where that
         raises. The slot's arrays are read-only afterwards; their slices must not be written to either.
 
-        Raises FeedTimeoutError, FeedError.
+        Raises FeedTimeoutError, FeedError; ValueError for a view that cannot be, or that the feed does not tell.
         """
         index = self._begin()
         slot = self._slot(index)
         try:
             yield slot
+            self._check_view(slot)
         except BaseException:
             self._free.add(index)
             raise
         finally:
             slot.colour.flags.writeable = False
             slot.depth.flags.writeable = False
-        self._say(messages.fram(index, self._sequence + 1, slot.t_capture_ns))
+        view = (slot.focus_dpt, slot.field_of_view_deg)
+        self._say(messages.fram(index, self._sequence + 1, slot.t_capture_ns, *view))
         self._sent.add(index)
         self._sequence += 1
         self.outcomes.sent += 1
@@ -223,6 +247,17 @@ class Feed:
             raise ValueError(f"depth: found none, expected {self.depth.dtype}: the feed was opened with depth")
         else:
             _check("depth", depth, [self.depth.shape(self.width_px, self.height_px)], self.depth.dtype)
+
+    def _check_view(self, slot: Slot) -> None:
+        focus_dpt, field_deg = slot.focus_dpt, slot.field_of_view_deg
+        if not self.tells_view and (focus_dpt is not None or field_deg is not None):
+            raise ValueError(
+                "focus_dpt or field_of_view_deg: found one, expected a feed that was opened with tells_view"
+            )
+        if focus_dpt is not None and not 0 <= focus_dpt <= NEAREST_DPT:
+            raise ValueError(f"focus_dpt: found {focus_dpt}, expected 0 (infinity) to {NEAREST_DPT:g} dioptres")
+        if field_deg is not None and not (len(field_deg) == 2 and all(0 < angle < 180 for angle in field_deg)):
+            raise ValueError(f"field_of_view_deg: found {field_deg}, expected two angles between 0 and 180 degrees")
 
     def _begin(self) -> int:
         deadline = self._deadline()
@@ -380,7 +415,8 @@ class Feed:
 
     def _unexpected(self, error: messages.MessageError) -> FeedError:
         return self._lost(
-            f"{self.path} sent {error}: is it holod, of a version that speaks version {messages.VERSION} of the feed?"
+            f"{self.path} sent {error}: is it holod, of a version that speaks version 1 or {messages.VERSION} of the "
+            "feed?"
         )
 
     def _lost(self, reason: str) -> FeedError:

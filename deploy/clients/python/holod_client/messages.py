@@ -5,13 +5,15 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
-VERSION = 1
+VERSION = 2
+"""The newest; pictures say how they were taken from this one on. What they do not need is said in version 1."""
 NAME_BYTES = 32
 ALIGNMENT = 64
 
 _HELO = struct.Struct(f"=4s5If4x{NAME_BYTES}s")
 _RING = struct.Struct("=4sI5Q")
-_FRAM = struct.Struct("=4sIQq16x")
+_FRAM = struct.Struct("=4sIQqI3f")
+_HAS_FOCUS, _HAS_FIELD_OF_VIEW = 1, 2
 _FREE = struct.Struct("=4sIQI4x")
 
 
@@ -39,8 +41,11 @@ class Free(NamedTuple):
     text: str
 
 
-def helo(width_px: int, height_px: int, colour: int, depth: int, plane_dpt: float, name: str) -> bytes:
-    return _HELO.pack(b"HELO", VERSION, width_px, height_px, colour, depth, plane_dpt, cut(name))
+def helo(
+    width_px: int, height_px: int, colour: int, depth: int, plane_dpt: float, name: str, *, tells_view: bool
+) -> bytes:
+    version = VERSION if tells_view else 1
+    return _HELO.pack(b"HELO", version, width_px, height_px, colour, depth, plane_dpt, cut(name))
 
 
 def cut(name: str) -> bytes:
@@ -48,8 +53,16 @@ def cut(name: str) -> bytes:
     return name.encode()[:NAME_BYTES].decode(errors="ignore").encode()
 
 
-def fram(slot: int, sequence: int, t_capture_ns: int) -> bytes:
-    return _FRAM.pack(b"FRAM", slot, sequence, t_capture_ns)
+def fram(
+    slot: int,
+    sequence: int,
+    t_capture_ns: int,
+    focus_dpt: float | None = None,
+    field_of_view_deg: tuple[float, float] | None = None,
+) -> bytes:
+    given = (focus_dpt is not None) * _HAS_FOCUS | (field_of_view_deg is not None) * _HAS_FIELD_OF_VIEW
+    across_deg, up_deg = field_of_view_deg or (0.0, 0.0)
+    return _FRAM.pack(b"FRAM", slot, sequence, t_capture_ns, given, focus_dpt or 0.0, across_deg, up_deg)
 
 
 def ring(message: bytes) -> Ring:

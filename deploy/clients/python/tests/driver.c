@@ -1,7 +1,7 @@
 /*
  * Does with a feed what the lines on standard input say, and prints how each went.
  *
- *     driver SOCKET WIDTHxHEIGHT COLOUR DEPTH PLANE_DPT NAME
+ *     driver SOCKET WIDTHxHEIGHT COLOUR DEPTH PLANE_DPT NAME [tells_view]
  */
 #define _POSIX_C_SOURCE 200809L
 
@@ -9,6 +9,7 @@
 
 #include <inttypes.h>
 #include <signal.h>
+#include <stdbool.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -33,13 +34,14 @@ static void print_result(const struct holod_feed *feed, enum holod_feed_result r
 int main(int argc, char **argv)
 {
     struct holod_feed_format format = {0};
-    if (argc != 7 ||
+    if (argc < 7 || argc > 8 ||
         sscanf(argv[2], "%" SCNu32 "x%" SCNu32, &format.width_px, &format.height_px) != 2)
         return 64;
     format.colour = (enum holod_colour)atoi(argv[3]);
     format.depth = (enum holod_depth)atoi(argv[4]);
     format.plane_dpt = (float)atof(argv[5]);
     format.name = argv[6];
+    format.tells_view = argc == 8;
 
     /* Without SA_RESTART: every call that waits is interrupted. */
     struct sigaction action = {.sa_handler = ignore};
@@ -63,6 +65,10 @@ int main(int argc, char **argv)
             puts("ok");
         } else if (strcmp(word, "send") == 0) {
             print_result(feed, holod_feed_send(feed, number));
+        } else if (strcmp(word, "view") == 0) {
+            struct holod_feed_view view = {0};
+            bool is_known = sscanf(line, "view %f %f %f", &view.focus_dpt, &view.across_deg, &view.up_deg) == 3;
+            print_result(feed, holod_feed_set_view(feed, is_known ? &view : NULL));
         } else if (strcmp(word, "leave_out") == 0) {
             holod_feed_leave_out(feed, (uint64_t)number);
             puts("ok");

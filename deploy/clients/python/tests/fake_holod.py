@@ -32,6 +32,7 @@ class Hello:
     depth: int
     plane_dpt: float
     name: str
+    version: int = 1
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class Frame:
     t_capture_ns: int
     colour: bytes
     depth: bytes
+    focus_dpt: float | None = None
+    field_of_view_deg: tuple[float, float] | None = None
 
     def check(self, colour: bytes, depth: bytes) -> None:
         """Raises ObjectionError at the first byte that is not as it should be."""
@@ -79,11 +82,11 @@ def parse_hello(message: bytes) -> Hello:
     version, width_px, height_px, colour, depth = struct.unpack_from("=5I", message, 4)
     plane_dpt, reserved = struct.unpack_from("=fI", message, 24)
     name, _, padding = message[32:].partition(b"\0")
-    if version != 1 or reserved or padding.strip(b"\0"):
+    if version not in (1, 2) or reserved or padding.strip(b"\0"):
         raise ObjectionError(f"HELO: found version {version}, reserved {reserved}, behind the name {padding!r}")
     if depth and plane_dpt:
         raise ObjectionError(f"HELO: found plane_dpt {plane_dpt} with depth")
-    return Hello(width_px, height_px, colour, depth, plane_dpt, name.decode())
+    return Hello(width_px, height_px, colour, depth, plane_dpt, name.decode(), version)
 
 
 class FakeHolod:
@@ -200,9 +203,13 @@ class FakeHolod:
             os.close(memory)
 
     def _frame(self, message: bytes) -> Frame:
-        if len(message) != 40 or message[:4] != b"FRAM" or message[24:] != bytes(16):
-            raise ObjectionError(f"found {message!r}, expected FRAM of 40 bytes, the last 16 of them 0")
-        slot, sequence, t_capture_ns = struct.unpack_from("=IQq", message, 4)
+        if len(message) != 40 or message[:4] != b"FRAM":
+            raise ObjectionError(f"found {message!r}, expected FRAM of 40 bytes")
+        if self._hello.version == 1 and message[24:] != bytes(16):
+            raise ObjectionError(f"found {message!r}, expected 0 in the last 16 bytes in version 1")
+        slot, sequence, t_capture_ns, given, focus_dpt, across_deg, up_deg = struct.unpack_from("=IQqI3f", message, 4)
+        if given > 3 or (not given & 1 and focus_dpt) or (not given & 2 and (across_deg or up_deg)):
+            raise ObjectionError(f"FRAM: found {message[24:]!r}, expected 0 for figures that are not given")
         if slot >= self._slots or slot in self._held:
             raise ObjectionError(f"FRAM: found slot {slot}, which does not belong to the client")
         if sequence <= self._sequence:
@@ -217,6 +224,8 @@ class FakeHolod:
             t_capture_ns,
             self._memory[colour : colour + self._layout.colour_bytes],
             self._memory[depth : depth + self._layout.depth_bytes],
+            focus_dpt if given & 1 else None,
+            (across_deg, up_deg) if given & 2 else None,
         )
 
     def _serve(self, greeting: _Work, outcome: Callable[[Frame], tuple[int, str]]) -> None:

@@ -62,10 +62,18 @@ class Driver:
 
 @contextmanager
 def drive(
-    driver: Path, path: Path | str, colour: int = 1, depth: int = 1, plane_dpt: float = 0, name: str = "C"
+    driver: Path,
+    path: Path | str,
+    colour: int = 1,
+    depth: int = 1,
+    plane_dpt: float = 0,
+    name: str = "C",
+    *,
+    tells_view: bool = False,
 ) -> Iterator[Driver]:
     """Ends the driver as well, which must leave nothing behind and object to nothing."""
     arguments = [str(driver), str(path), f"{WIDTH}x{HEIGHT}", str(colour), str(depth), str(plane_dpt), name]
+    arguments += ["tells_view"] if tells_view else []
     process = subprocess.Popen(
         arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -98,7 +106,7 @@ def test_every_format_arrives_byte_for_byte(driver: Path, path: Path, colour: in
     with FakeHolod(path) as holod, drive(driver, path, colour, depth, plane_dpt, "Gerät") as feed:
         assert feed.opened == "ok"
         hello = holod.hello()
-        assert dataclasses.astuple(hello) == (WIDTH, HEIGHT, colour, depth, plane_dpt, "Gerät")
+        assert dataclasses.astuple(hello) == (WIDTH, HEIGHT, colour, depth, plane_dpt, "Gerät", 1)
         for seed in range(5):
             feed.picture(seed, seed - 2)
             frame = holod.frame()
@@ -107,6 +115,36 @@ def test_every_format_arrives_byte_for_byte(driver: Path, path: Path, colour: in
             assert len(frame.depth) == WIDTH * HEIGHT * (0, 2, 2, 2, 4, 4)[depth]
             holod.free(frame)
         assert feed.ask("wait 5000") == "ok"
+
+
+def test_pictures_say_how_they_were_taken(driver: Path, path: Path) -> None:
+    with FakeHolod(path) as holod, drive(driver, path, tells_view=True) as feed:
+        assert holod.hello().version == 2
+        for line, view in [
+            (None, (None, None)),
+            ("view 1.25 60 45.5", (1.25, (60.0, 45.5))),
+            ("view 0 0 0", (0.0, None)),
+            ("view -1 90 60", (None, (90.0, 60.0))),
+            ("view", (None, None)),
+        ]:
+            assert line is None or feed.ask(line) == "ok"
+            feed.picture(1)
+            frame = holod.frame()
+            assert (frame.focus_dpt, frame.field_of_view_deg) == view
+            holod.free(frame)
+        for line, said in [
+            ("view 20.5 0 0", "a focus of 20.5 dioptres was given, expected 0"),
+            ("view nan 0 0", "a focus of nan dioptres"),
+            ("view 1 60 0", "a field of view of 60 x 0 degrees was given"),
+            ("view 1 180 45", "expected two angles"),
+            ("view 1 nan 45", "expected two angles"),
+        ]:
+            assert said in feed.ask(line)
+    with FakeHolod(path) as holod, drive(driver, path) as feed:
+        assert feed.ask("view 1 60 45") == "failed: the feed was opened without tells_view"
+        feed.picture(1)
+        holod.free(holod.frame())
+        assert holod.hello().version == 1
 
 
 def test_the_check_of_a_picture_objects_to_another(driver: Path, path: Path) -> None:

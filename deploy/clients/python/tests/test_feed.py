@@ -462,3 +462,38 @@ def test_where_holod_listens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_formats_have_the_names_that_they_are_given_by() -> None:
     assert list(Colour) == list(NUMBERS)
     assert list(Depth) == list(DEPTH_NUMBERS)
+
+
+def test_a_picture_says_how_it_was_taken(path: Path) -> None:
+    colour = np.zeros((2, 4, 4), np.uint8)
+    with FakeHolod(path) as holod:
+        holod.serve()
+        with Feed(4, 2, depth="none", plane_dpt=1.0, path=path, tells_view=True) as feed:
+            feed.send(colour, focus_dpt=1.25, field_of_view_deg=(60.0, 45.5))
+            feed.send(colour, focus_dpt=0.0)
+            feed.send(colour)
+            for view, said in [
+                ({"focus_dpt": 20.5}, "found 20.5, expected 0"),
+                ({"focus_dpt": float("nan")}, "found nan"),
+                ({"field_of_view_deg": (60.0, 180.0)}, "expected two angles"),
+                ({"field_of_view_deg": (60.0,)}, "expected two angles"),
+            ]:
+                with pytest.raises(ValueError, match=said):
+                    feed.send(colour, **view)
+            feed.wait()
+            assert feed.outcomes.sent == 3, "what is wrong is not sent, and the slot stays"
+        frames = holod.served()
+    assert holod.hello().version == 2
+    views = [(frame.focus_dpt, frame.field_of_view_deg) for frame in frames]
+    assert views == [(1.25, (60.0, 45.5)), (0.0, None), (None, None)]
+
+
+def test_a_feed_that_tells_no_view_is_of_version_1(path: Path) -> None:
+    with FakeHolod(path) as holod:
+        holod.serve()
+        with Feed(4, 2, depth="none", plane_dpt=1.0, path=path) as feed:
+            with pytest.raises(ValueError, match="expected a feed that was opened with tells_view"):
+                feed.send(np.zeros((2, 4, 4), np.uint8), focus_dpt=1.0)
+            feed.send(np.zeros((2, 4, 4), np.uint8))
+        assert len(holod.served()) == 1
+    assert holod.hello().version == 1

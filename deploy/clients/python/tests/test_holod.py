@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -16,6 +17,7 @@ import pytest
 from holod_client import Control, ControlError, Feed, FeedError
 
 HERE = Path(__file__).parent
+STAND_INS = HERE / "stand_ins"
 SIZE = 64
 
 
@@ -38,6 +40,17 @@ class Holod:
             assert self.process.poll() is None, self.process.communicate()[1]
             assert time.monotonic() < patience_s, "holod does not listen"
             time.sleep(0.02)
+
+    def example(self, name: str, *options: str, stand_ins: Path | None = None) -> subprocess.CompletedProcess[str]:
+        """Runs an example until it ends; what is in `stand_ins` takes the place of what it imports."""
+        folders = [HERE.parent, *([stand_ins] if stand_ins else [])]
+        return subprocess.run(
+            [sys.executable, HERE.parent / f"examples/{name}.py", *options, "--socket", self.socket],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, folders))},
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
 
     def end(self) -> dict:
         self.process.terminate()
@@ -101,6 +114,63 @@ def test_the_c_example_and_a_pipe_are_shown(holod: Holod, tmp_path: Path) -> Non
     assert done.returncode == 0, done.stderr
     told = holod.end()["feed"]
     assert told["taken"] >= 4 and told["refused"] == told["connections_refused"] == 0, told
+
+
+def needed(program: str) -> None:
+    if shutil.which(program) is None:
+        assert "CI" not in os.environ, f"{program} must be there: tests/all installs it"
+        pytest.skip(f"{program} is not installed")
+
+
+def test_a_picture_of_gstreamer_is_shown(holod: Holod) -> None:
+    """The pipeline of the README, with an end."""
+    needed("gst-launch-1.0")
+    source = "gst-launch-1.0 -q videotestsrc is-live=true num-buffers=20 pattern=ball"
+    caps = "video/x-raw,format=RGBA,width=320,height=240,framerate=30/1"
+    client = f"{sys.executable} -m holod_client stdin --size 320x240 --plane 1.0 --name GStreamer"
+    pipe = f"set -o pipefail; {source} ! {caps} ! fdsink | {client} --socket {holod.socket}"
+    done = subprocess.run(["bash", "-c", pipe], capture_output=True, text=True, timeout=120, cwd=HERE.parent)
+    assert done.returncode == 0, done.stderr
+    assert "20 sent: " in done.stderr and " 0 refused" in done.stderr
+    told = holod.end()["feed"]
+    assert told["taken"] >= 1 and told["taken"] + told["overtaken"] == 20, told
+
+
+def test_the_realsense_example_shows_what_a_camera_gives(holod: Holod) -> None:
+    """Without a camera: a module that gives what one would takes the place of Intel's."""
+    done = holod.example("realsense", "--size", "64x48", stand_ins=STAND_INS)
+    assert (done.returncode, done.stderr) == (1, "error: Frame didn't arrive within 5000\n")
+    told = holod.end()["feed"]
+    assert told["taken"] >= 1 and told["taken"] + told["overtaken"] == 10 and told["refused"] == 0, told
+    assert told["pictures_with_bad_depths"] == told["taken"], "its camera sees no depth in some pixels"
+    assert told["bad_depths"]["zero"] > 100 and told["bad_depths"]["beyond_near"] == 0
+    np.testing.assert_allclose(told["view"]["field_of_view_deg"], [60, 45], rtol=1e-5)
+
+
+@pytest.mark.parametrize("has_network", [True, False])
+def test_the_monocular_example_shows_a_folder_of_pictures(holod: Holod, tmp_path: Path, has_network: bool) -> None:
+    """With OpenCV as it is. The network is too large to be had for this: a stand-in estimates, or there is none."""
+    try:
+        import cv2
+        from PIL import Image  # noqa: F401
+    except ImportError:
+        assert "CI" not in os.environ, "opencv-python-headless and pillow must be there: tests/all installs them"
+        pytest.skip("opencv-python-headless or pillow is not installed")
+    pictures = tmp_path / "folder"
+    pictures.mkdir()
+    for name in ["one.png", "other.png"]:
+        assert cv2.imwrite(str(pictures / name), np.full((90, 120, 3), 120, np.uint8))
+    absent = tmp_path / "absent"
+    absent.mkdir()
+    for name in ["torch", "transformers"]:
+        (absent / f"{name}.py").write_text(f"raise ImportError(name={name!r})\n")
+    stand_ins = STAND_INS / "network" if has_network else absent
+    options = ["--size", "64x48", "--seconds", "0.2"]
+    done = holod.example("monocular_depth", str(pictures), *options, stand_ins=stand_ins)
+    said = "" if has_network else "torch is missing: each picture is a plane\n"
+    assert (done.returncode, done.stderr) == (0, said)
+    told = holod.end()["feed"]
+    assert (told["taken"], told["refused"], told["pictures_with_bad_depths"]) == (2, 0, 0), told
 
 
 def test_a_running_holod_is_changed(holod: Holod, monkeypatch: pytest.MonkeyPatch) -> None:
