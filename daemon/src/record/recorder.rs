@@ -148,7 +148,11 @@ impl Recorder {
             let (entries, health, run) = (Arc::clone(&entries), Arc::clone(&health), folder.join(RUN));
             move || write_entries(&entries, frames, &run, &health)
         };
-        let writer = thread::Builder::new().name("holod-record".into()).spawn(write);
+        let writer = thread::Builder::new().name("holod-record".into()).spawn(write).map_err(|error| {
+            discard(folder);
+            let _gone = fs::remove_file(folder.join(super::FRAMES));
+            Failure::because(Exit::Unavailable)(error)
+        })?;
         Ok(Self {
             folder: folder.to_owned(),
             log,
@@ -157,7 +161,7 @@ impl Recorder {
             orders: 0,
             reading: None,
             entries,
-            writer: Some(writer.map_err(Failure::because(Exit::Unavailable))?),
+            writer: Some(writer),
             health,
             made_frames: false,
             slowness: Slowness::default(),

@@ -211,10 +211,15 @@ impl Output {
     }
 
     fn failed(&self, error: &io::Error) -> String {
-        match error.kind() {
-            ErrorKind::NotFound => format!("recording {}: {error}", self.path.display()),
-            _ => format!("recording {}: {error}; what was written before is kept", self.path.display()),
-        }
+        let cure = match error.kind() {
+            ErrorKind::NotFound => "leave it where it is until the run is over",
+            ErrorKind::StorageFull | ErrorKind::QuotaExceeded => {
+                "make room on its disk; what was written before is kept"
+            }
+            ErrorKind::FileTooLarge => "raise the limit on a file's size (ulimit -f); what was written before is kept",
+            _ => "look after its disk; what was written before is kept",
+        };
+        format!("recording {}: {error}; {cure}", self.path.display())
     }
 }
 
@@ -436,7 +441,7 @@ mod tests {
         writer.write(false, true);
         assert!(writer.raw.is_none());
         let failure = writer.shared.failure.lock().expect("no panic").clone().expect("a failure");
-        assert!(failure.contains("No space left"), "{failure}");
+        assert!(failure.contains("No space left") && failure.contains("make room on its disk"), "{failure}");
         for t in 0..1000 {
             taps.bytes(TimeNs(t), b"abc");
         }
