@@ -13,7 +13,7 @@ use crate::failure::{Exit, Failure};
 pub const SAMPLE_RESOLUTION: Resolution = Resolution { width: 512, height: 512 };
 
 /// Frames of a sequence that are kept in memory, in bytes.
-const SEQUENCE_BYTES_MAX: usize = 4 << 30;
+const SEQUENCE_BYTES_MAX: u64 = 4 << 30;
 
 /// The frames to show, all of one size.
 pub struct Frames {
@@ -71,24 +71,39 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
                 ),
             ));
         }
-        let bytes = scene.frames() * frame.resolution.pixels() * 4 * size_of::<f32>();
-        if bytes > SEQUENCE_BYTES_MAX {
-            return Err(Failure::new(
-                Exit::Data,
-                format!(
-                    "{spec}: {} frames of {} need {} GiB of memory, more than 4; name fewer frames or a smaller \
-                     --resolution",
-                    scene.frames(),
-                    frame.resolution,
-                    bytes >> 30
-                ),
-            ));
+        if index == 0 && scene.frames() > 1 {
+            sequence_fits(scene.frames() as u64, frame.resolution, available_bytes())
+                .map_err(|why| Failure::new(Exit::Data, format!("{spec}: {why}")))?;
         }
         warn_of_oddities(spec, &frame, &report, geometry, false);
         loaded.frames.push(Arc::new(frame));
         loaded.reports.push(report);
     }
     Ok(loaded)
+}
+
+/// Memory that could be had, where the kernel tells it.
+fn available_bytes() -> Option<u64> {
+    let facts = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let line = facts.lines().find_map(|line| line.strip_prefix("MemAvailable:"))?;
+    line.split_whitespace().next()?.parse::<u64>().ok()?.checked_mul(1024)
+}
+
+/// Says why a sequence of so many frames cannot be kept in memory, where it cannot.
+fn sequence_fits(frames: u64, resolution: Resolution, available_bytes: Option<u64>) -> Result<(), String> {
+    let frame_bytes = (resolution.pixels() * 4 * size_of::<f32>()) as u64;
+    let needed = frames.saturating_mul(frame_bytes);
+    let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
+    let most = match available_bytes {
+        _ if needed > SEQUENCE_BYTES_MAX => format!("the {:.0} GiB that a sequence may have", gib(SEQUENCE_BYTES_MAX)),
+        Some(available) if needed > available => format!("the {:.1} GiB that are free", gib(available)),
+        _ => return Ok(()),
+    };
+    Err(format!(
+        "{frames} frames of {resolution} need {:.1} GiB of memory, more than {most}; name fewer frames or a smaller \
+         --resolution, or hand them over one by one (--scene feed)",
+        gib(needed)
+    ))
 }
 
 /// What is most often a mistake in a picture called `name`.
@@ -174,4 +189,22 @@ fn scene_failure(error: SceneError) -> Failure {
         _ => Exit::Data,
     };
     Failure::because(exit)(error)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sequence_that_memory_has_no_room_for_is_refused_in_figures() {
+        // 4 MiB each.
+        let fits = |frames, available| sequence_fits(frames, SAMPLE_RESOLUTION, available);
+        assert_eq!([fits(1024, None), fits(1024, Some(4 << 30)), fits(2, Some(8 << 20))], [const { Ok(()) }; 3]);
+        let why = fits(1025, Some(64 << 30)).unwrap_err();
+        assert!(why.starts_with("1025 frames of 512x512 need 4.0 GiB of memory, more than the 4 GiB that a"), "{why}");
+        let why = fits(512, Some(1 << 30)).unwrap_err();
+        assert!(why.contains("need 2.0 GiB of memory, more than the 1.0 GiB that are free; name fewer"), "{why}");
+        assert!(fits(u64::MAX, None).is_err());
+        assert!(available_bytes().is_some_and(|bytes| bytes > 1 << 20), "the kernel tells it");
+    }
 }

@@ -336,8 +336,10 @@ impl LiveReader {
             report.depth_clamped_near_px += usize::from(*depth > 1.0 + ROUNDING);
             *depth = depth.clamp(0.0, 1.0);
         }
-        let any_missing = report.depth_missing_px > 0;
-        let missing = any_missing.then(|| MissingDepths::of(self.format.depth, depth)).unwrap_or_default();
+        let missing = match report.depth_missing_px {
+            0 => MissingDepths::default(),
+            _ => MissingDepths::of(self.format.depth, depth),
+        };
         Ok(LiveReport { frame: report, missing })
     }
 
