@@ -54,8 +54,10 @@ on_delay_ms = 0.1
 lit_ms = 3.0
 heartbeat_timeout_ms = 100.0
 """
-RECORD_LOST = (0, 73)
-"""how a run may end whose record could not be written"""
+RECORD_LOST = (73,)
+"""how a run ends whose record could not be written"""
+OUTPUT_GONE = (74,)
+"""how a run ends whose summary could not be written"""
 NAMESPACE = "HOLOD_SOAK_NAMESPACE"
 
 
@@ -249,11 +251,11 @@ def closed_outputs(holod: Path, folder: Path, seed: int) -> list[Row]:
 
     stage.make("stdout and stderr closed", [], close)
     stage.make("tracker unplugged after that", ["tracker down"], stage.unplug_tracker, stage.plug_tracker_in)
-    return stage.end()
+    return stage.end(OUTPUT_GONE)
 
 
 def unread_log(holod: Path, folder: Path, seed: int) -> list[Row]:
-    """Nobody reads a log that is long. Light is judged by the laser box: holod's answers may wait for the reader."""
+    """Nobody reads a log that is long. Light is judged by the laser box."""
     stage = Stage(holod, folder, seed, How(log_to_pipe=True, log_level="trace"))
 
     said: list[bytes] = []
@@ -292,7 +294,7 @@ def full_disk(holod: Path, folder: Path, seed: int) -> list[Row]:
             while file.write(bytes(1 << 12)):
                 pass
 
-    stage.make("disk full under the record", ["record"], fill, filler.unlink)
+    stage.make("disk full under the record", ["the record is lost from here on"], fill, filler.unlink)
     rows = stage.end(RECORD_LOST)
     subprocess.run(["umount", "--lazy", disk], check=True)
     return rows
@@ -301,7 +303,7 @@ def full_disk(holod: Path, folder: Path, seed: int) -> list[Row]:
 def removed_record(holod: Path, folder: Path, seed: int) -> list[Row]:
     """Somebody tidies up."""
     stage = Stage(holod, folder, seed, How(record=folder / "run"))
-    stage.make("record removed", ["record"], lambda: shutil.rmtree(stage.bench.record))
+    stage.make("record removed", ["the record is lost from here on"], lambda: shutil.rmtree(stage.bench.record))
     return stage.end(RECORD_LOST)
 
 

@@ -118,7 +118,7 @@ def judge_soak(
     ]
     for what, key in (("frame time", "frame_ms"), ("time to light", "light_ms")):
         early, late = (statistics.median(getattr(s, key) for s in part) for part in (samples[:third], samples[-third:]))
-        # A run without light has no time to it, which the rows above say.
+        # A run without light has no time to it.
         right = late <= MOST_SLOWER * early if early > 0 else late == 0
         rows.append(Row(what, f"{early:.1f} ms at first, {late:.1f} ms at last", right))
     for what in ("descriptors", "threads"):

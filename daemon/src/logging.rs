@@ -11,7 +11,7 @@ use std::fs::File;
 use std::io::{self, IsTerminal, Write as _};
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, Once, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, Once, OnceLock, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::Serialize;
@@ -50,7 +50,9 @@ pub fn start() -> io::Result<()> {
         };
         let thread = std::thread::current();
         say(&format!("thread `{}` {panic}{backtrace}", thread.name().unwrap_or("without a name")));
-        flush();
+        if may_wait() {
+            flush();
+        }
     }));
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(|| ToStderr)
@@ -197,7 +199,7 @@ pub fn text_of(event: &Event<'_>) -> String {
 }
 
 /// The file that takes every line that the filter lets through.
-static FILE: Mutex<Option<Outlet>> = Mutex::new(None);
+static FILE: Mutex<Option<Arc<Outlet>>> = Mutex::new(None);
 
 /// The log goes into a file for as long as this lives.
 #[derive(Debug)]
@@ -216,7 +218,7 @@ impl LogFile {
         for line in recent_since(&mut 0) {
             file.write_all(&line.to_bytes())?;
         }
-        *place = Some(Outlet::start("holod-record-log", file)?);
+        *place = Some(Arc::new(Outlet::start("holod-record-log", file)?));
         keep_panics();
         Ok(Self { path: path.to_owned() })
     }
@@ -233,6 +235,14 @@ impl LogFile {
         let file = FILE.lock().unwrap_or_else(PoisonError::into_inner);
         let error = file.as_ref()?.first_error()?;
         Some(format!("cannot go on recording into {}: {error}", self.path.display()))
+    }
+
+    /// Waits until all lines are in it, a second at most.
+    pub fn flush(&self) {
+        let file = FILE.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        if let Some(file) = file {
+            file.flush(PATIENCE);
+        }
     }
 
     /// Nothing goes into it any more. Waits for what is on its way, a second at most.
@@ -257,15 +267,21 @@ fn keep_panics() {
         let before = std::panic::take_hook();
         std::panic::set_hook(Box::new(move |panic| {
             // Whoever panics may hold it.
-            if let Ok(file) = FILE.try_lock()
-                && let Some(file) = &*file
-            {
+            let file = FILE.try_lock().ok().and_then(|file| file.clone());
+            if let Some(file) = file {
                 file.put(Line::now(Level::ERROR, panic.to_string()).to_bytes());
-                file.flush(PATIENCE);
+                if may_wait() {
+                    file.flush(PATIENCE);
+                }
             }
             before(panic);
         }));
     });
+}
+
+/// Whether a thread that panics may wait for its last words: not those that make the lasers dark as they unwind.
+fn may_wait() -> bool {
+    !matches!(std::thread::current().name(), Some("holod-laser" | "holod-panel"))
 }
 
 struct Text(String);

@@ -20,7 +20,7 @@ use crate::snapshot::Snapshot;
 const SERVICE_FOLDER: &str = "/run/holod";
 /// A file older than this was not written by a loop that still turns.
 const STALE: TimeNs = TimeNs(5_000_000_000);
-/// Moments that may wait for the disk; of those that do only the newest is written.
+/// Moments that may wait for the disk, of which the newest is written; what comes after them is left out.
 const WAITING: usize = 4;
 /// How long the end of a run waits for its file to be taken away.
 const PATIENCE: Duration = Duration::from_secs(1);

@@ -42,7 +42,7 @@ pub(crate) fn exception(failure: &Failure) -> PyErr {
     match failure.exit {
         Exit::Config => RigError::new_err(text),
         Exit::Unavailable => UnavailableError::new_err(text),
-        Exit::Software | Exit::Different => HolodError::new_err(text),
+        Exit::Software | Exit::Different | Exit::Output => HolodError::new_err(text),
         Exit::Usage | Exit::Data | Exit::NoInput | Exit::CannotCreate => InputError::new_err(text),
     }
 }

@@ -212,7 +212,7 @@ fn a_log_that_nobody_reads_holds_nothing_up_and_says_so_once_somebody_does() {
     // Until more has been said than may wait.
     let log = folder.path().join("record/log.txt");
     let said = || fs::read_to_string(&log).map_or(0, |log| log.lines().count());
-    assert!(wait_until(PATIENCE, || said() > 20_000), "{}", said());
+    assert!(wait_until(PATIENCE, || said() > 10_000), "{}", said());
     frames_go_on(folder.path());
     let text = thread::spawn(move || {
         let mut text = Vec::new();

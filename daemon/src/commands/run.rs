@@ -95,6 +95,9 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         finish_record(&session, recorder.folder(), &health)?;
     }
     let told = tell(args, &session.summary, None);
+    if let (Err(_), Err(lost)) = (&told, health.judge()) {
+        tracing::error!("{lost}");
+    }
     told.and_then(|()| health.judge())
 }
 

@@ -20,7 +20,7 @@ use self::process::OfProcess;
 use super::live::Live;
 use crate::logging;
 use crate::record::RecordStand;
-use crate::session::FirstLight;
+use crate::session::{FirstLight, pupil_states};
 use crate::snapshot::Snapshot;
 
 /// What scrapers of OpenMetrics expect.
@@ -137,7 +137,7 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
         &["up", "silent", "down", "finished"],
         &figures.tracker_link,
     )?;
-    told.states("pupil_state", "What the pupil rests on", &PUPIL_STATES, &snapshot.pupil_state)?;
+    told.states("pupil_state", "What the pupil rests on", &pupil_states(), &snapshot.pupil_state)?;
     for (name, help, is_so) in [
         ("lasers_armed", "Whether lasers may be lit", snapshot.lasers == "armed"),
         ("lasers_kept_dark", "Whether a person keeps the lasers dark", snapshot.lasers_kept_dark),
@@ -221,8 +221,6 @@ fn of_tracker(told: &mut Teller<'_>, counts: &BTreeMap<String, u64>) -> fmt::Res
 fn named(counts: &BTreeMap<String, u64>) -> impl Iterator<Item = (&str, u64)> {
     counts.iter().map(|(name, count)| (name.as_str(), *count))
 }
-
-const PUPIL_STATES: [&str; 5] = ["acquiring", "tracking", "holding", "fallback", "fixed"];
 
 struct Teller<'a>(DescriptorEncoder<'a>);
 

@@ -210,6 +210,7 @@ impl Recorder {
     /// record.
     pub fn finish(&mut self) {
         self.end_writing();
+        self.log.flush();
         self.note_log();
         self.log.end();
     }

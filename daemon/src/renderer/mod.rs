@@ -101,7 +101,10 @@ pub fn open(
                 EngineError::Gpu(GpuError::None { .. }) => on_gpu(Adapters::Software),
                 other => Err(other),
             })
-            .map_err(|error| Failure::new(Exit::Unavailable, format!("--backend gpu: {error}"))),
+            .map_err(|error| {
+                let named = if backend == Backend::GpuHalf { "gpu-half" } else { "gpu" };
+                Failure::new(Exit::Unavailable, format!("--backend {named}: {error}"))
+            }),
     }
 }
 

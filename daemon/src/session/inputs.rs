@@ -19,10 +19,15 @@ const FARTHEST_PREDICTION: TimeNs = TimeNs(200_000_000);
 /// What stands in place of the estimator's state where a person has fixed the pupil.
 pub(super) const FIXED_PUPIL: &str = "fixed";
 
+/// Every state of a frame's pupil.
+pub(crate) fn pupil_states() -> [&'static str; 5] {
+    let [acquiring, tracking, holding, fallback] = PupilState::ALL.map(PupilState::name);
+    [acquiring, tracking, holding, fallback, FIXED_PUPIL]
+}
+
 /// What a record calls an estimator's state; one that nobody knows is just a recorded one.
 pub(crate) fn pupil_state_named(name: &str) -> &'static str {
-    let states = PupilState::ALL.map(PupilState::name);
-    states.into_iter().chain([FIXED_PUPIL]).find(|state| *state == name).unwrap_or("recorded")
+    pupil_states().into_iter().find(|state| *state == name).unwrap_or("recorded")
 }
 
 /// Where pupils and pictures come from.

@@ -40,7 +40,7 @@ use crate::fault::host_now;
 #[cfg(not(feature = "fault-injection"))]
 use holod_pupil_input::host_now;
 
-pub(crate) use self::inputs::{Cue, Playback, pupil_state_named};
+pub(crate) use self::inputs::{Cue, Playback, pupil_state_named, pupil_states};
 pub use self::ledger::LaserSummary;
 pub use self::observer::{Began, FirstLight, Observer};
 pub use self::service::Hangups;

@@ -146,8 +146,7 @@ impl Service {
     /// Frames were shown: tells readiness after the first, feeds the watchdog.
     pub(super) fn progress(&mut self, frames_shown: u64, now: TimeNs) {
         if frames_shown > 0 && !self.ready {
-            self.ready = true;
-            tell(&[NotifyState::Ready]);
+            self.ready = tell(&[NotifyState::Ready]);
         }
         if self.watchdog.as_mut().is_some_and(|watchdog| watchdog.wants_food(frames_shown, now)) {
             tell(&[NotifyState::Watchdog]);
@@ -165,13 +164,15 @@ impl Service {
     }
 }
 
-/// Tells the service manager, and says once where it does not listen.
-fn tell(states: &[NotifyState<'_>]) {
+/// Tells the service manager, and says once where it does not listen. Whether it need not be told again.
+fn tell(states: &[NotifyState<'_>]) -> bool {
     static WARNED: Once = Once::new();
-    let Some(socket) = std::env::var_os("NOTIFY_SOCKET") else { return };
-    if let Err(error) = send(&socket, states) {
+    let Some(socket) = std::env::var_os("NOTIFY_SOCKET") else { return true };
+    let sent = send(&socket, states);
+    if let Err(error) = &sent {
         WARNED.call_once(|| tracing::warn!("the service manager does not listen: {error}"));
     }
+    sent.is_ok()
 }
 
 /// Sends a datagram that is left out where nobody takes those before: the loop waits for no service manager.

@@ -6,7 +6,7 @@ use clap::Command;
 use clap_mangen::Man;
 use clap_mangen::roff::{Inline, Roff, bold, roman};
 
-const EXIT_STATUS: [(&str, &str); 8] = [
+const EXIT_STATUS: [(&str, &str); 9] = [
     ("0", "It did what was asked."),
     ("64", "The command line asks for something that cannot be had."),
     ("65", "An input file's content is wrong."),
@@ -14,6 +14,7 @@ const EXIT_STATUS: [(&str, &str); 8] = [
     ("69", "A device or service is not there, or the bench is not ready."),
     ("70", "A fault of holod itself."),
     ("73", "An output cannot be written."),
+    ("74", "Standard output takes no more."),
     ("78", "The rig file is faulty."),
 ];
 const FILES: [(&str, &str); 4] = [

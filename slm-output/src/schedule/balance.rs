@@ -6,7 +6,7 @@ use holod_calibration::{Colour, PerColour, TimeNs};
 use crate::fields::FrameLayout;
 
 /// A window shorter than this is not worth its rounding to the box's microseconds: its field stays dark.
-const LIGHT_MIN: TimeNs = TimeNs(20_000);
+pub(super) const LIGHT_MIN: TimeNs = TimeNs(20_000);
 
 /// Keeps any colour from being lit longer than the others, so that a picture of which some fields stay dark gets darker
 /// and not coloured.

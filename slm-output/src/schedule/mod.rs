@@ -18,7 +18,7 @@ pub use interlock::{Evidence, Orders};
 use holod_calibration::rig::{Lasers, Panel};
 use holod_calibration::{Colour, TimeNs};
 
-use self::balance::Balance;
+use self::balance::{Balance, LIGHT_MIN};
 use self::interlock::Interlock;
 use self::refreshes::RefreshJudge;
 use crate::fields::{FrameLayout, FrameTag};
@@ -148,11 +148,12 @@ impl FieldScheduler {
         }
         if let Some(window) = &mut orders.light {
             let t_begin = window.t_on.max(now);
-            let taken = self.balance.take(shown.field, window.t_off - t_begin);
+            let left = window.t_off - t_begin;
+            let taken = self.balance.take(shown.field, left);
             window.t_off = t_begin + taken;
             if taken == TimeNs(0) {
                 orders.light = None;
-                dark = Some(DarkReason::Balance);
+                dark = Some(if left < LIGHT_MIN { DarkReason::Late } else { DarkReason::Balance });
             }
         }
         Some(FieldDecision { shown, orders, dark })

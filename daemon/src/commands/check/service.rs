@@ -121,11 +121,11 @@ fn unit_fits(
 ) -> Result<String, Vec<String>> {
     let one = |fault: String| Err(vec![fault]);
     let Some(unit) = unit else { return one(format!("there is no {UNIT}: install the package")) };
-    let output = args.output.as_deref().unwrap_or("headless");
+    let output = args.output.as_deref().unwrap_or("OUTPUT");
     let config = args.rig.config.as_deref().unwrap_or(Path::new(USUAL_RIG));
     let anew = format!(
-        "write it anew: holod unit --config {} --output {output} >/etc/systemd/system/{UNIT}.d/bench.conf && systemctl \
-         daemon-reload",
+        "write it anew: holod unit --config {} --output {output}, with the run's other options after these, \
+         >/etc/systemd/system/{UNIT}.d/bench.conf && systemctl daemon-reload",
         config.display()
     );
     let (run, words) = match run {
@@ -226,7 +226,7 @@ fn records(runner: &Runner, root: &Path) -> Result<String, Vec<String>> {
     }
     if !runner.may(&folder, Access::WRITE_OK | Access::EXEC_OK) {
         return Err(vec![format!(
-            "{} may not write to {STATE_FOLDER}: chown holod:holod {STATE_FOLDER}, and a+x its folders",
+            "{} may not write to {STATE_FOLDER}: chown holod:holod {STATE_FOLDER}",
             runner.name()
         )]);
     }
@@ -315,12 +315,14 @@ fn options(rig: &Rig, run: &RunArgs, runner: &Runner, root: &Path) -> Result<Str
                 let wanted = if found.is_dir() { Access::READ_OK | Access::EXEC_OK } else { Access::READ_OK };
                 if !runner.may(&below(root, path), wanted) {
                     faults.push(format!(
-                        "{what}: {} may not read {shown}: chmod a+r it, and a+x its folders",
+                        "{what}: {} may not read {shown}: chmod a+r {shown}, and chmod a+x the folders above it",
                         runner.name()
                     ));
                 }
                 if *what == "--page-token" && found.mode() & 0o077 != 0 {
-                    faults.push(format!("--page-token: others may read {shown}: install -o holod -m 600 it"));
+                    faults.push(format!(
+                        "--page-token: others may read {shown}: chown holod {shown} && chmod 600 {shown}"
+                    ));
                 }
             }
         }

@@ -187,11 +187,14 @@ impl Stream {
     /// Copies a picture and says whether it can be shown: all that is done while the client has to wait for its slot.
     pub(super) fn copy_out(&mut self, picture: &Picture, copied: &mut Copied) -> Result<(), TakeError> {
         let Layout { slot_bytes, colour_bytes, depth_bytes, .. } = self.layout;
-        if !std::mem::replace(&mut self.is_allocated[picture.slot], true) {
+        if !self.is_allocated[picture.slot] {
             // What its client has not written is not there yet, and there may be no memory for it.
             let begin = picture.slot * slot_bytes;
-            fallocate(&self.memory, FallocateFlags::empty(), begin as u64, slot_bytes as u64)
-                .map_err(io::Error::from)?;
+            rustix::io::retry_on_intr(|| {
+                fallocate(&self.memory, FallocateFlags::empty(), begin as u64, slot_bytes as u64)
+            })
+            .map_err(io::Error::from)?;
+            self.is_allocated[picture.slot] = true;
         }
         copied.bytes.resize(colour_bytes + depth_bytes, 0);
         copied.colour_bytes = colour_bytes;

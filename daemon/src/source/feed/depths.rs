@@ -63,6 +63,16 @@ impl BadDepths {
         self.entries().into_iter().map(|(_, pixels)| pixels).sum()
     }
 
+    /// Those of pixels that have none.
+    pub(super) const fn missing(&self) -> u64 {
+        self.nan + self.zero + self.negative + self.infinite
+    }
+
+    /// Those beyond the display's range.
+    pub(super) const fn beyond(&self) -> u64 {
+        self.beyond_far + self.beyond_near
+    }
+
     /// Counts those of one more picture.
     pub(super) fn add(&mut self, other: &Self) {
         self.nan += other.nan;

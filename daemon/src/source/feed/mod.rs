@@ -495,7 +495,7 @@ fn tell_oddities(client: &mut Client, bad: &BadDepths, made: Option<(&RgbdFrame,
     let pixels = format.resolution.pixels() as u64;
     let is_first = made.is_some() && !client.is_known;
     client.is_known |= made.is_some();
-    let are_bad = 2 * bad.in_all() > pixels;
+    let are_bad = 2 * bad.missing().max(bad.beyond()) > pixels;
     if are_bad && !std::mem::replace(&mut client.told_depths, true) {
         let (text, cure) = (bad.text(), bad.likely_cure(format.depth));
         tracing::warn!("{name}: of {pixels} depths, these cannot be shown as they are: {text}; {cure}");

@@ -1,9 +1,9 @@
 //! A day of fields in simulated time: pacer, scheduler and the lasers' thread's work, judged by what was truly on the
 //! panel and by the box's own edges.
 //!
-//! In the night the panel is off. Most other minutes are quiet. In each eighth one of them panel, host, box and people do what they should not: flips are missed,
-//! reports are lost or lie, threads wake up late or stand still, frames take seconds, panel and box are lost, darkness
-//! is asked for, nobody reads the events.
+//! In the night the panel is off. Most other minutes are quiet. In each eighth one of them panel, host, box and people do
+//! what they should not: flips are missed, reports are lost or lie, threads wake up late or stand still, frames take
+//! seconds, panel and box are lost, darkness is asked for, nobody reads the events.
 
 use std::collections::VecDeque;
 
@@ -11,6 +11,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use super::*;
+use crate::output::shared::dark_request;
 use crate::pacing::{FramePlan, Outcome, PacingCounts, Point};
 
 const S: i64 = 1_000 * MS;
@@ -167,6 +168,8 @@ struct Day {
     armed: i64,
     frames_shown: u64,
     lost_before: u64,
+    /// How often darkness was asked for or that was taken back.
+    asked: u64,
     /// Edges as they came, where somebody wants them.
     kept: Option<(Vec<Shown>, Vec<LaserEdge>)>,
 }
@@ -200,6 +203,7 @@ impl Day {
             armed: 0,
             frames_shown: 0,
             lost_before: 0,
+            asked: 0,
             kept: None,
         }
     }
@@ -324,9 +328,15 @@ impl Day {
             self.fails.store(false, Ordering::Relaxed);
         }
         if over(&mut self.trouble.t_lit_again) {
-            self.laser.shared.dark_request.fetch_add(1, Ordering::AcqRel);
+            self.ask(None);
         }
         over(&mut self.trouble.t_read_again);
+    }
+
+    /// A person asks for darkness, or takes that back.
+    fn ask(&mut self, why: Option<DarkReason>) {
+        self.asked += 1;
+        self.laser.shared.dark_request.store(dark_request(self.asked, why), Ordering::Release);
     }
 
     /// One more thing goes wrong.
@@ -359,7 +369,7 @@ impl Day {
             }
             10 if self.trouble.t_lit_again.is_none() => {
                 self.trouble.t_lit_again = until(lasts(3_000));
-                self.laser.shared.dark_request.fetch_add(1, Ordering::AcqRel);
+                self.ask(Some(DarkReason::Asked));
             }
             11 if self.trouble.t_read_again.is_none() => self.trouble.t_read_again = until(lasts(30_000)),
             _ => {}
@@ -480,7 +490,8 @@ fn canary_the_judge_objects_to_a_single_wrong_window() {
     let moved = |edges: &mut [LaserEdge], by_ns: i64| {
         edges[on..on + 2].iter_mut().for_each(|edge| edge.t = edge.t + TimeNs(by_ns));
     };
-    let spoilt: [(&str, &dyn Fn(&mut Vec<Shown>, &mut Vec<LaserEdge>)); 8] = [
+    type Spoil<'a> = &'a dyn Fn(&mut Vec<Shown>, &mut Vec<LaserEdge>);
+    let spoilt: [(&str, Spoil<'_>); 8] = [
         ("unsettled", &|_, edges| moved(edges, -400_000)),
         ("into the next field", &|_, edges| moved(edges, 800_000)),
         ("another laser", &|_, edges| {
