@@ -9,6 +9,8 @@
 //! | `recorded` | reads which frames were made, and of what |
 //! | `play` | lets the loop make them again, and compares |
 
+#[cfg(fuzzing)]
+pub mod fuzzing;
 mod pack;
 mod play;
 mod recorded;

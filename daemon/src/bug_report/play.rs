@@ -172,6 +172,17 @@ fn black(resolution: Resolution) -> Arc<Frames> {
     })
 }
 
+/// Reads the orders of a report whose rig names no file elsewhere.
+#[cfg(fuzzing)]
+pub(super) fn read_orders(report: &Unpacked) -> Result<(), Failure> {
+    refuse_foreign_files(report)?;
+    let orders = Orders::read(report)?;
+    for order in 0..=orders.requests.len() as u32 + 1 {
+        let _ = std::hint::black_box((orders.request(order), orders.built_in_weights(order)));
+    }
+    Ok(())
+}
+
 /// The orders of a record.
 struct Orders {
     /// By their lines, as they were written down.

@@ -88,6 +88,21 @@ pub fn refuse_archive(path: &Path) -> Result<(), Failure> {
 /// # Errors
 /// It cannot be read, is damaged or cut off, is no report, or holds what none does.
 pub fn unpack(path: &Path) -> Result<Unpacked, Failure> {
+    let unpacked = open(path)?;
+    let refused = |what: String| Failure::new(Exit::Data, format!("{}: {what}", path.display()));
+    for Packed { name, bytes, xxh3, .. } in &unpacked.manifest.files {
+        let found = within(name).map_err(|found| refused(format!("found {found} (`{name}`) in {MANIFEST}")))?;
+        let found = File::open(unpacked.path(&found.to_string_lossy()));
+        let found = found.and_then(|mut file| content_xxh3(&mut file));
+        if found.map_err(|error| refused(format!("{name}: {error}")))? != (*bytes, xxh3.clone()) {
+            return Err(refused(format!("{name} is another one than was packed: ask for the report again")));
+        }
+    }
+    Ok(unpacked)
+}
+
+/// The same of a report whose files are not compared with its listing yet.
+pub(super) fn open(path: &Path) -> Result<Unpacked, Failure> {
     let refused = |what: String| Failure::new(Exit::Data, format!("{}: {what}", path.display()));
     let folder = Temporary::new("holod-report-").map_err(Failure::because(Exit::CannotCreate))?;
     take_apart(path, folder.path()).map_err(|fault| match fault {
@@ -105,16 +120,7 @@ pub fn unpack(path: &Path) -> Result<Unpacked, Failure> {
     let manifest: Manifest = serde_json::from_str(&text).map_err(|error| {
         refused(format!("found {MANIFEST} that this holod does not know: {error}; show it with the holod that made it"))
     })?;
-    let unpacked = Unpacked { folder, manifest };
-    for Packed { name, bytes, xxh3, .. } in &unpacked.manifest.files {
-        let found = within(name).map_err(|found| refused(format!("found {found} (`{name}`) in {MANIFEST}")))?;
-        let found = File::open(unpacked.path(&found.to_string_lossy()));
-        let found = found.and_then(|mut file| content_xxh3(&mut file));
-        if found.map_err(|error| refused(format!("{name}: {error}")))? != (*bytes, xxh3.clone()) {
-            return Err(refused(format!("{name} is another one than was packed: ask for the report again")));
-        }
-    }
-    Ok(unpacked)
+    Ok(Unpacked { folder, manifest })
 }
 
 /// The text of a file, where there is one.
