@@ -103,7 +103,10 @@ fn files(rig: &Rig, runner: &Runner) -> Result<String, Vec<String>> {
                 faults.push(format!("{shown}: the service does not see {folder}: move it to /etc/holod or /srv"));
             }
             _ if !runner.may(file, Access::READ_OK) => {
-                faults.push(format!("{} may not read {shown}: chmod a+r it, and a+x its folders", runner.name()));
+                faults.push(format!(
+                    "{} may not read {shown}: chmod a+r {shown}, and chmod a+x the folders above it",
+                    runner.name()
+                ));
             }
             _ => {}
         }

@@ -478,7 +478,7 @@ mod tests {
         machine.put("etc/holod/token", "0123456789abcdef\n");
         machine.mode("etc/holod/token", 0o644);
         machine.write_drop_in(&["--output", "drm:DP-1", "--page", "8420", "--page-token", "/etc/holod/token"]);
-        machine.fault("options", &["others may read /etc/holod/token", "install -o holod -m 600"]);
+        machine.fault("options", &["others may read /etc/holod/token", "chown holod /etc/holod/token && chmod 600"]);
         machine.mode("etc/holod/token", 0o600);
         assert!(machine.checks(&bench())["options"].0);
         machine.write_drop_in(&["--output", "drm:DP-1", "--scene", "/srv/cards"]);
