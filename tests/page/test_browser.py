@@ -135,6 +135,7 @@ with holod_client.Feed(64, 64, depth="none", plane_dpt=1.0, name="grey", path=sy
 
 def test_a_feed_that_stands_still_is_seen_dark_until_it_goes_on(start: Start, browser: webdriver.Chrome) -> None:
     holod = start("--scene", "feed", "--feed-dark-after", "1")
+    browser.get_log("browser")
     client = subprocess.Popen([sys.executable, "-c", CLIENT, str(holod.folder / "holod/feed")])
     try:
         browser.get(holod.place)
