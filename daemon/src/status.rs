@@ -37,6 +37,9 @@ struct Written<S> {
     /// holod runs. Older versions do not say it.
     #[serde(default)]
     written_ns: Option<i64>,
+    /// When the process began, as [`runtime_folder::began_ticks`] has it. Older versions do not say it.
+    #[serde(default)]
+    began_ticks: Option<u64>,
     #[serde(flatten)]
     status: S,
 }
@@ -45,6 +48,7 @@ struct Written<S> {
 #[derive(Debug)]
 pub struct StatusFile {
     newest: Arc<Queue<Vec<u8>>>,
+    began_ticks: Option<u64>,
     writer: Option<JoinHandle<()>>,
 }
 
@@ -52,19 +56,23 @@ impl StatusFile {
     /// The file, in the first folder that takes it; a process without any has none, which is no fault.
     pub fn create() -> Self {
         match runtime_folder::own() {
-            Some(folder) => Self::at(folder.join(file_name(std::process::id()))),
-            None => Self { newest: Arc::default(), writer: None },
+            Some(folder) => {
+                remove_leftovers(&folder);
+                Self::of(std::process::id(), &folder)
+            }
+            None => Self { newest: Arc::default(), began_ticks: None, writer: None },
         }
     }
 
-    fn at(path: PathBuf) -> Self {
+    fn of(pid: u32, folder: &Path) -> Self {
+        let path = folder.join(file_name(pid));
         let newest = Arc::new(Queue::default());
         let written = Arc::clone(&newest);
         let writer = thread::Builder::new().name("holod-status".into()).spawn(move || write(&written, &path));
         if let Err(error) = &writer {
             tracing::warn!("`holod status` will know nothing of this run: {error}");
         }
-        Self { newest, writer: writer.ok() }
+        Self { newest, began_ticks: runtime_folder::began_ticks(pid), writer: writer.ok() }
     }
 
     /// Has the file written anew at host time `now`. Where the disk is still at what was written before, this one is left
@@ -73,7 +81,7 @@ impl StatusFile {
         if self.writer.is_none() {
             return;
         }
-        match serde_json::to_vec(&Written { written_ns: Some(now.0), status }) {
+        match serde_json::to_vec(&Written { written_ns: Some(now.0), began_ticks: self.began_ticks, status }) {
             Ok(bytes) => drop(self.newest.put(bytes, WAITING)),
             Err(error) => tracing::warn!("`holod status` will not know of this: {error}"),
         }
@@ -95,6 +103,29 @@ fn write(newest: &Queue<Vec<u8>>, path: &Path) {
         refuses = written.is_err();
     }
     let _ = std::fs::remove_file(path);
+}
+
+/// Takes away what holods that were killed have left: nobody else does, and their numbers are given out again.
+fn remove_leftovers(folder: &Path) {
+    for path in std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()) {
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        // Also a status that was being written.
+        let of_status = name.trim_start_matches('.').strip_prefix("status-").and_then(|rest| rest.split('.').next());
+        let Some(pid) = of_status.or_else(|| name.strip_prefix("control-")).and_then(|pid| pid.parse().ok()) else {
+            continue;
+        };
+        let status = std::fs::read(folder.join(file_name(pid))).unwrap_or_default();
+        let began_ticks = serde_json::from_slice::<Written<()>>(&status).ok().and_then(|written| written.began_ticks);
+        if !lives(pid, began_ticks) {
+            let _another_did = std::fs::remove_file(&path);
+        }
+    }
+}
+
+/// Whether the process of this number lives and, where that is known, began then.
+fn lives(pid: u32, began_ticks: Option<u64>) -> bool {
+    let now = runtime_folder::began_ticks(pid);
+    now.is_some() && (began_ticks.is_none() || began_ticks == now)
 }
 
 impl Drop for StatusFile {
@@ -208,10 +239,9 @@ fn read(path: &Path, now: TimeNs) -> std::io::Result<Option<Found>> {
     if !(name.starts_with("status-") && name.ends_with(".json")) {
         return Ok(None);
     }
-    let Ok(Written { written_ns, status }) = serde_json::from_slice::<Written<Snapshot>>(&std::fs::read(path)?) else {
-        return Ok(None);
-    };
-    let lives = name == file_name(status.pid) && Path::new("/proc").join(status.pid.to_string()).exists();
+    let written = serde_json::from_slice::<Written<Snapshot>>(&std::fs::read(path)?);
+    let Ok(Written { written_ns, began_ticks, status }) = written else { return Ok(None) };
+    let lives = name == file_name(status.pid) && lives(status.pid, began_ticks);
     let age_ns = written_ns.map_or(0, |written_ns| now.0.saturating_sub(written_ns).max(0));
     let stale = (age_ns > STALE.0).then(|| Duration::from_nanos(age_ns.unsigned_abs()));
     Ok(lives.then_some(Found { status, stale }))
@@ -239,7 +269,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let folders = [folder.path().join("absent"), folder.path().to_owned()];
         assert_eq!(found_in(&folders).unwrap_err().exit, Exit::Unavailable);
-        let mut file = StatusFile::at(folder.path().join(file_name(std::process::id())));
+        let mut file = StatusFile::of(std::process::id(), folder.path());
         file.write(&status(), NOW);
         assert!(file.newest.wait_until_done(LONG));
         assert_eq!(found_in(&folders).unwrap(), [Found { status: status(), stale: None }]);
@@ -260,7 +290,7 @@ mod tests {
         assert!(found_in(&folders).is_err(), "another's status in this one's file");
         std::fs::write(&own, serde_json::to_vec(&status()).unwrap()).unwrap();
         assert_eq!(found_in(&folders).unwrap()[0].stale, None, "an older holod does not say when");
-        let mut file = StatusFile::at(own.clone());
+        let mut file = StatusFile::of(std::process::id(), folder.path());
         file.write(&status(), NOW - TimeNs(60_000_000_000));
         assert!(file.newest.wait_until_done(LONG));
         // The wall clock was set back, so that the file's own time lies ahead, or forward.
@@ -280,12 +310,46 @@ mod tests {
     }
 
     #[test]
+    fn what_a_killed_holod_left_is_not_taken_for_a_later_process_of_its_number_and_is_taken_away() {
+        let folder = tempfile::tempdir().unwrap();
+        let folders = [folder.path().to_owned()];
+        let pid = std::process::id();
+        let own = folder.path().join(file_name(pid));
+        let began_ticks = runtime_folder::began_ticks(pid).unwrap();
+        let write = |began_ticks, status| {
+            let written = Written { written_ns: Some(NOW.0), began_ticks: Some(began_ticks), status };
+            std::fs::write(&own, serde_json::to_vec(&written).unwrap()).unwrap();
+        };
+        let left = || {
+            let mut names: Vec<_> =
+                std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+            names.sort();
+            names
+        };
+        // Of no process, or of a later one of the same number.
+        let control = format!("control-{pid}");
+        let names = ["control-4294967295", "status-4294967295.json", ".status-4294967295.json.4294967295.part"];
+        for name in names.iter().chain(&["feed", "control-x", &control[..]]) {
+            std::fs::write(folder.path().join(name), "{}").unwrap();
+        }
+        write(began_ticks, status());
+        assert_eq!(found_in(&folders).unwrap().len(), 1);
+        remove_leftovers(folder.path());
+        let ours = [&control[..], "control-x", "feed", &file_name(pid)];
+        assert_eq!(left(), ours);
+        write(began_ticks - 1, status());
+        assert!(found_in(&folders).is_err());
+        remove_leftovers(folder.path());
+        assert!(!own.exists());
+    }
+
+    #[test]
     fn two_that_run_are_both_found_and_the_end_of_one_leaves_the_other() {
         let folder = tempfile::tempdir().unwrap();
         let folders = [folder.path().to_owned(), folder.path().to_owned()];
         // The first process of all lives, whoever runs this.
         let [one, other] = [1, std::process::id()].map(|pid| {
-            let mut file = StatusFile::at(folder.path().join(file_name(pid)));
+            let mut file = StatusFile::of(pid, folder.path());
             file.write(&Snapshot { pid, ..status() }, NOW);
             assert!(file.newest.wait_until_done(LONG));
             file

@@ -29,7 +29,7 @@ fn depth(path: &Path, width: u32, height: u32) {
 
 #[test]
 fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let at = |name: &str| folder.path().join(name);
     colour(&at("colour.png"), 64, 48);
     depth(&at("depth.png"), 64, 48);
@@ -160,7 +160,7 @@ fn listing(folder: &Path) -> Vec<(String, u64)> {
 
 #[test]
 fn results_are_overwritten_by_force_only_and_by_the_same_rule_everywhere() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let at = |name: &str| folder.path().join(name);
     let rig = small_rig(64, 64, "driver = \"simulated\"");
     fs::write(at("rig.toml"), rig).unwrap();
@@ -202,7 +202,7 @@ fn results_are_overwritten_by_force_only_and_by_the_same_rule_everywhere() {
 
 #[test]
 fn a_dash_writes_to_standard_output() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     let to_stdout = |args: &[&str]| {
         let output = std::process::Command::new(HOLOD).args(args).current_dir(folder.path()).output().unwrap();
@@ -227,7 +227,7 @@ fn a_dash_writes_to_standard_output() {
 
 #[test]
 fn a_signal_takes_what_is_half_done_away() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let args = ["render", "--pupil", "3", "--resolution", "1920x1080", "--out", "out"];
     let daemon = Daemon::start(HOLOD, &args, folder.path());
     assert!(wait_until(Duration::from_secs(60), || !listing(folder.path()).is_empty()));
@@ -239,7 +239,7 @@ fn a_signal_takes_what_is_half_done_away() {
 
 #[test]
 fn a_record_is_never_overwritten() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::create_dir(folder.path().join("record")).unwrap();
     fs::write(folder.path().join("record/frames.csv"), "precious").unwrap();
     let ended = run(HOLOD, &["--record", "record", "--frames", "1"], folder.path());

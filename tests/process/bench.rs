@@ -7,7 +7,7 @@ use crate::HOLOD;
 
 #[test]
 fn bench_measures_stages_the_frame_both_ceilings_and_the_loop() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let args = [
         "bench",
         "--backend",
@@ -56,7 +56,7 @@ fn bench_measures_stages_the_frame_both_ceilings_and_the_loop() {
 
 #[test]
 fn bench_measures_what_a_picture_of_the_feed_costs_beside_a_copy() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let args = ["bench", "--feed", "64x48", "--repeat", "3", "--json"];
     let ended = run(HOLOD, &args, folder.path());
     assert!(ended.status.success(), "{ended:?}");
@@ -72,7 +72,7 @@ fn bench_measures_what_a_picture_of_the_feed_costs_beside_a_copy() {
 
 #[test]
 fn bench_leaves_the_loop_out_and_refuses_what_is_larger_than_the_panel() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let args = ["bench", "--backend", "cpu", "--weights", "small", "--repeat", "1", "--duration", "0s", "--resolution"];
     let ended = run(HOLOD, &[&args[..], &["64x48"]].concat(), folder.path());
     assert!(ended.status.success(), "{ended:?}");

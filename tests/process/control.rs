@@ -30,7 +30,7 @@ const ARGS: [&str; 11] = [
 ];
 
 fn folder_with_rig() -> tempfile::TempDir {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     folder
 }
@@ -299,7 +299,7 @@ fn a_terminal_that_goes_away_ends_the_run_in_order() {
 
 #[test]
 fn a_run_that_is_to_outlive_its_terminal_does() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     // Without a rig file the signal has nothing else to say than that the terminal is gone.
     let options = ["--resolution", "64x64", "--backend", "cpu", "--weights", "fast", "--record", "record", "--json"];
     let environment = [("XDG_RUNTIME_DIR", folder.path())];

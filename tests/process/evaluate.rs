@@ -44,7 +44,7 @@ fn entry(bytes: &[u8], key: &str) -> Value {
 
 /// Evaluates the golden scene whose file is `bytes`, as scene and as cards, with the weights and border that it names.
 fn evaluated(bytes: &[u8]) -> Value {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::write(folder.path().join(file_name(0)), bytes).unwrap();
     let weights = model().join("weights").join(entry(bytes, "weights").as_str().unwrap());
     let border_px = entry(bytes, "border_px").to_string();
@@ -143,7 +143,7 @@ fn names(folder: &Path) -> Vec<String> {
 
 #[test]
 fn scenes_of_the_renderer_are_judged_told_and_written() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     render(&folder.path().join("scenes"), SceneKind::Test, 2);
     let common = ["evaluate", "--scenes", "scenes", "--border-px", "8"];
     let with = |more: &[&str]| {
@@ -189,7 +189,7 @@ fn scenes_of_the_renderer_are_judged_told_and_written() {
 
 #[test]
 fn each_bad_folder_gets_a_clear_error_and_leaves_nothing_behind() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let at = |name: &str| folder.path().join(name);
     render(&at("scenes"), SceneKind::Test, 1);
     fs::create_dir(at("empty")).unwrap();

@@ -71,7 +71,7 @@ const CAUSES: [(&str, Cause); 22] = [
 
 /// One run: when the box was dark after the fault, in milliseconds, and why, by its own word.
 fn dark_after(name: &str, sequential: bool, cause: Cause) -> (f64, String) {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let terminal = SimulatedTerminal::open().unwrap();
     let device = terminal.path().to_str().unwrap().to_owned();
     let log_path = folder.path().join("box.csv");

@@ -32,7 +32,7 @@ const ARGS: [&str; 10] = [
 ];
 
 fn bench() -> tempfile::TempDir {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     folder
 }
@@ -94,7 +94,7 @@ fn status(folder: &Path) -> Value {
 fn frames_go_on(folder: &Path) {
     let shown = || status(folder)["frames_shown"].as_u64();
     let then = shown().unwrap_or(0) + 20;
-    assert!(wait_until(PATIENCE, || shown() > Some(then)), "{}", status(folder));
+    assert!(wait_until(PATIENCE, || shown() > Some(then)), "no frame more than {then}: {}", status(folder));
     assert!(wait_until(PATIENCE, || status(folder)["lasers"] == "armed"), "{}", status(folder));
 }
 

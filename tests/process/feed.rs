@@ -19,7 +19,7 @@ const SIDE: u32 = 64;
 
 /// A folder with a rig and a log of an eye whose pupil never changes.
 fn bench() -> tempfile::TempDir {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     let rows = (0..24_000_u64).map(|row| format!("{},left,3.0,1.0,,1\n", row * 5_000_000));
     let log = "t_ns,eye,diameter_mm,confidence,aperture_mm,valid\n".to_owned() + &rows.collect::<String>();

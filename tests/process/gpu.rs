@@ -38,7 +38,7 @@ fn share_apart(folder: &Path, one: &str, other: &str) -> f64 {
 
 #[test]
 fn a_gpu_gives_the_processors_hologram_and_is_named() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let named = [("gpu", "gpu, ", "single precision"), ("gpu-half", "gpu, ", "half precision"), ("cpu", "cpu, ", "")];
     for (backend, begins, precision) in named {
         let ended = rendered(folder.path(), backend, backend);
@@ -59,7 +59,7 @@ fn a_gpu_gives_the_processors_hologram_and_is_named() {
 
 #[test]
 fn without_a_gpu_the_processor_computes_and_one_that_is_asked_for_is_refused() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let ended = rendered_without_vulkan(folder.path(), "auto");
     assert!(ended.status.success(), "{ended:?}");
     let engine = engine(folder.path(), "without");

@@ -47,7 +47,7 @@ fn samples(folder: &Path) -> String {
 
 #[test]
 fn a_tracker_that_is_tried_is_counted_recorded_and_played_again() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let link = folder.path().join("ttyTracker");
     let mut tracker = PtyTracker::plug_in(&link).unwrap();
     let args = ["tracker", "try", "ttyTracker", "--duration", "6s", "--record", "live", "--json"];
@@ -83,7 +83,7 @@ fn a_tracker_that_is_tried_is_counted_recorded_and_played_again() {
 
 #[test]
 fn a_tracker_that_says_nothing_or_nonsense_is_told_from_one_that_works() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let link = folder.path().join("ttyTracker");
     let mut tracker = PtyTracker::plug_in(&link).unwrap();
     let args = ["tracker", "try", "ttyTracker", "--duration", "1s"];
@@ -104,7 +104,7 @@ fn a_tracker_that_says_nothing_or_nonsense_is_told_from_one_that_works() {
 
 #[test]
 fn a_tracker_is_never_looked_for_at_the_laser_boxs_port() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let box_link = folder.path().join("ttyLasers");
     let _laser_box = PtyTracker::plug_in(&box_link).unwrap();
     let lasers = format!("driver = \"serial\"\ndevice = \"{}\"", box_link.display());
@@ -117,7 +117,7 @@ fn a_tracker_is_never_looked_for_at_the_laser_boxs_port() {
 
 #[test]
 fn check_estimates_the_frames_a_second_and_takes_a_tracker() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     let ended = run(HOLOD, &["check", "--config", "rig.toml", "--tracker", "mock", "--json"], folder.path());
     let check = |ended: &Ended, name: &str| {
@@ -139,7 +139,7 @@ fn check_estimates_the_frames_a_second_and_takes_a_tracker() {
 
 #[test]
 fn check_says_where_a_bench_lies_in_what_the_network_was_trained_for() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let rig = small_rig(64, 64, "driver = \"simulated\"");
     let fine = rig.replace("pixel_pitch_um = 8.0", "pixel_pitch_um = 1.0");
     fs::write(folder.path().join("default.toml"), rig).unwrap();
@@ -165,7 +165,7 @@ fn check_says_where_a_bench_lies_in_what_the_network_was_trained_for() {
 
 #[test]
 fn check_names_a_profile_that_is_not_there() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let rig = |profile: &str| {
         let rig = small_rig(64, 64, "driver = \"simulated\"");
         rig.replace("[tracker]\n", &format!("[tracker]\nspec = \"tcp:127.0.0.1:4242,profile={profile}\"\n"))
@@ -180,7 +180,7 @@ fn check_names_a_profile_that_is_not_there() {
 
 #[test]
 fn logs_are_looked_into_and_converted_without_loss() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let text: Vec<u8> = lines(4000).into_iter().flat_map(|line| line.bytes).collect();
     fs::write(folder.path().join("log"), text).unwrap();
     let info = |name: &str| json(&run(HOLOD, &["log", "info", name, "--json"], folder.path()));
@@ -209,7 +209,7 @@ fn logs_are_looked_into_and_converted_without_loss() {
 
 #[test]
 fn a_log_in_arbitrary_units_needs_a_scale_and_says_so() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let mut text = String::from("SAMPLES\tGAZE\tLEFT\tRATE\t1000.00\nPUPIL\tAREA\nSTART\t1000 \tLEFT\tSAMPLES\n");
     for t_ms in 1000..3000 {
         text.push_str(&format!("{t_ms}\t  964.3\t  541.5\t  1256.0\t...\n"));
@@ -232,7 +232,7 @@ fn a_log_in_arbitrary_units_needs_a_scale_and_says_so() {
 
 #[test]
 fn a_running_holod_says_how_it_is_and_a_stopped_one_is_not_found() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     let runtime = folder.path().join("runtime");
     // None of the other places in which a holod of another test may write its status.
@@ -256,7 +256,7 @@ fn a_running_holod_says_how_it_is_and_a_stopped_one_is_not_found() {
 
 #[test]
 fn two_holods_are_told_apart_and_found_without_a_runtime_folder() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     let environment = [("XDG_RUNTIME_DIR", Path::new("")), ("TMPDIR", folder.path())];
     let start = |tracker| {
@@ -290,7 +290,7 @@ fn two_holods_are_told_apart_and_found_without_a_runtime_folder() {
 
 #[test]
 fn a_replay_that_ends_ends_the_run() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     let text: Vec<u8> = lines(800).into_iter().flat_map(|line| line.bytes).collect();
     fs::write(folder.path().join("log"), text).unwrap();
@@ -303,7 +303,7 @@ fn a_replay_that_ends_ends_the_run() {
 
 #[test]
 fn a_log_that_is_not_in_millimetres_is_plotted_in_its_own_unit_and_replayed_with_a_scale() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let mut text = String::from("SAMPLES\tGAZE\tLEFT\tRATE\t1000.00\nPUPIL\tDIAMETER\nSTART\t1000 \tLEFT\tSAMPLES\n");
     for t_ms in 1000..3000 {
         text.push_str(&format!("{t_ms}\t  964.3\t  541.5\t  320.0\t...\n"));
@@ -331,7 +331,7 @@ fn a_log_that_is_not_in_millimetres_is_plotted_in_its_own_unit_and_replayed_with
 
 #[test]
 fn the_log_says_more_when_asked_and_a_typo_silences_nothing() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     let logged = |level: &str| {
         let args = ["--config", "rig.toml", "--tracker", "mock", "--resolution", "64x64", "--duration", "3s"];
@@ -350,7 +350,7 @@ fn the_log_says_more_when_asked_and_a_typo_silences_nothing() {
 
 #[test]
 fn profiles_are_listed_with_what_they_are() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let ended = run(HOLOD, &["tracker", "list", "--json"], folder.path());
     let profiles = json(&ended);
     let of = |name: &str| profiles.as_array().unwrap().iter().find(|profile| profile["name"] == name).cloned();

@@ -70,10 +70,22 @@ fn get(socket: &Path, path: &str) -> Option<String> {
 
 #[test]
 fn pictures_for_the_page_are_computed_behind_everything_else() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let socket = folder.path().join("page");
     let page = format!("unix:{}", socket.display());
-    let args = ["--resolution", "64x64", "--weights", "fast", "--backend", "cpu", "--tracker", "mock:sweep", "--page"];
+    let args = [
+        "--resolution",
+        "64x64",
+        "--weights",
+        "fast",
+        "--backend",
+        "cpu",
+        "--tracker",
+        "mock:sweep",
+        "--record",
+        "record",
+        "--page",
+    ];
     let environment = [("XDG_RUNTIME_DIR", folder.path()), ("RAYON_NUM_THREADS", Path::new("3"))];
     let daemon = Daemon::start_with(HOLOD, &[&args[..], &[&page]].concat(), folder.path(), &environment);
     let seen = || get(&socket, "/eye.png").is_some_and(|status| status == "HTTP/1.1 200 OK");
@@ -98,6 +110,13 @@ fn pictures_for_the_page_are_computed_behind_everything_else() {
     let ended = daemon.wait(PATIENCE);
     assert!(ended.status.success(), "{}", ended.stderr);
     let may_be_prompt = !ended.stderr.contains("threads run at ordinary priority");
-    let panel: Vec<_> = of_name("holod-panel").map(|thread| thread.policy).collect();
-    assert_eq!(panel, [if may_be_prompt { SCHED_FIFO } else { SCHED_OTHER }], "{}", ended.stderr);
+    for name in ["holod-panel", "holod-laser", "pupil-reader"] {
+        let policies: Vec<_> = of_name(name).map(|thread| thread.policy).collect();
+        assert_eq!(policies, [if may_be_prompt { SCHED_FIFO } else { SCHED_OTHER }], "{name}: {}", ended.stderr);
+    }
+    // Who waits for a disk must not go before anybody.
+    for name in ["pupil-recorder", "holod-record", "holod-status", "holod-log", "holod-frame"] {
+        let of_name: Vec<_> = of_name(name).collect();
+        assert!(!of_name.is_empty() && of_name.iter().all(|thread| is_ordinary(thread, 0)), "{name}: {threads:#?}");
+    }
 }

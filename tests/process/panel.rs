@@ -9,7 +9,7 @@ use crate::HOLOD;
 
 /// Runs for `duration` over `output`, with one field for each refresh where `sequential`; the end, and its summary.
 fn run_over(output: &str, sequential: bool, duration: &str) -> (Ended, serde_json::Value) {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let packed = small_rig(64, 64, "driver = \"simulated\"");
     let rig = match sequential {
         true => packed.replace("channel-packed", "field-sequential").replace("refresh_hz = 60.0", "refresh_hz = 180.0"),

@@ -26,7 +26,7 @@ fn picture(path: &Path) -> RgbImage {
 
 #[test]
 fn a_picture_holds_the_bytes_that_travel_to_the_panel() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let ended = pattern(folder.path(), &rig(), "level 37 --colour green --out level.png");
     assert!(ended.status.success(), "{}", ended.stderr);
     let level = picture(&folder.path().join("level.png"));
@@ -59,7 +59,7 @@ fn a_picture_holds_the_bytes_that_travel_to_the_panel() {
 
 #[test]
 fn a_pattern_on_a_panel_is_lit_by_each_fields_own_laser_or_stays_dark() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let lit = pattern(folder.path(), &rig(), "field-identity --output headless --duration 1500ms");
     assert!(lit.status.success(), "{}", lit.stderr);
     for colour in ["red", "green", "blue"] {
@@ -78,7 +78,7 @@ fn a_pattern_on_a_panel_is_lit_by_each_fields_own_laser_or_stays_dark() {
 
 #[test]
 fn what_cannot_be_drawn_or_written_is_said_and_nothing_is_left_behind() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     fs::create_dir(folder.path().join("folder.png")).unwrap();
     for (args, exit, says) in [
         ("level 256 --out x.png", 64, "0 to 255"),

@@ -77,7 +77,7 @@ fn edge_blur_px(picture: &LinearImage, edge: usize) -> f64 {
 
 #[test]
 fn the_recorded_panel_levels_blur_with_the_pupil_and_keep_what_is_in_focus() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let at = |name: &str| folder.path().join(name);
     let rig_text = small_rig(SIZE.width, SIZE.height, "driver = \"simulated\"");
     let rig = Rig::parse(&rig_text, Path::new("rig.toml")).unwrap();

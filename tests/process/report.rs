@@ -22,7 +22,7 @@ struct Bench(tempfile::TempDir);
 
 impl Bench {
     fn new() -> Self {
-        let bench = Self(tempfile::tempdir().unwrap());
+        let bench = Self(holod_tests::new_folder());
         let lut: String = (0..256).map(|level| format!("{level},{}\n", f64::from(level) * 0.0246)).collect();
         fs::write(bench.path("lut.csv"), lut).unwrap();
         let rig = small_rig(64, 64, "driver = \"simulated\"");
@@ -71,7 +71,7 @@ impl Bench {
 
     /// Only the report stays, under another name and in another folder.
     fn send(self) -> Sent {
-        let sent = Sent(tempfile::tempdir().unwrap());
+        let sent = Sent(holod_tests::new_folder());
         fs::copy(self.path("report.tar.gz"), sent.path()).unwrap();
         sent
     }

@@ -26,7 +26,7 @@ struct LaserBench {
 
 impl LaserBench {
     fn plug_in() -> Self {
-        let folder = tempfile::tempdir().unwrap();
+        let folder = holod_tests::new_folder();
         let device = folder.path().join("lasers");
         let rig = small_rig(64, 64, &format!("driver = \"serial\"\ndevice = {device:?}"));
         fs::write(folder.path().join("rig.toml"), rig).unwrap();
@@ -129,7 +129,7 @@ fn signals_end_in_order_with_lasers_dark_and_a_flat_panel() {
 #[test]
 fn an_unplugged_laser_box_is_named_at_once_and_lit_again_when_it_is_back() {
     let mut laser_box = LaserBench::plug_in();
-    let runtime = tempfile::tempdir().unwrap();
+    let runtime = holod_tests::new_folder();
     let args = ["--config", "rig.toml", "--tracker", "mock:steady", "--resolution", "64x64", "--duration", "60s"];
     let environment = [("XDG_RUNTIME_DIR", runtime.path())];
     let daemon = Daemon::start_with(HOLOD, &args, laser_box.folder.path(), &environment);
@@ -240,7 +240,7 @@ fn judge_record(record: &Path) {
 
 #[test]
 fn the_watchdog_is_fed_and_readiness_told_only_once_frames_are_shown() {
-    let folder = tempfile::tempdir().unwrap();
+    let folder = holod_tests::new_folder();
     let socket = folder.path().join("notify");
     let listener = std::os::unix::net::UnixDatagram::bind(&socket).unwrap();
     listener.set_read_timeout(Some(Duration::from_secs(20))).unwrap();

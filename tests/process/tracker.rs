@@ -47,7 +47,7 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
+        let folder = holod_tests::new_folder();
         let path = |name: &str| folder.path().join(name);
         let (rig, link, record) = (path("rig.toml"), path("ttyTracker"), path("record"));
         fs::write(&rig, small_rig(64, 64, "driver = \"simulated\"")).unwrap();

@@ -35,13 +35,16 @@ impl Daemon {
         Self::start_with(binary, args, folder, &[])
     }
 
-    /// The same with additional variables in its environment.
+    /// The same with additional variables in its environment. Where they do not name one, `folder` is also that for status
+    /// and sockets, so that tests know nothing of each other's daemons and leave nothing behind.
     ///
     /// # Panics
     /// Where it cannot be started.
     pub fn start_with(binary: &str, args: &[&str], folder: &Path, environment: &[(&str, &Path)]) -> Self {
         let mut child = Command::new(binary)
             .args(args)
+            .env("XDG_RUNTIME_DIR", folder)
+            .env("TMPDIR", folder)
             .envs(environment.iter().copied())
             .current_dir(folder)
             .stdin(Stdio::null())

@@ -5,6 +5,24 @@ pub mod feed;
 pub mod frames;
 pub mod tracker;
 
+use rustix::fs::statvfs;
+use tempfile::TempDir;
+
+/// A new folder in memory, or where there is little of that, on the disk: a disk that is busy with other work, such as what
+/// a build has written, holds status files and records up for minutes.
+///
+/// # Panics
+/// Where no folder can be made.
+pub fn new_folder() -> TempDir {
+    let free_bytes = statvfs(MEMORY).map_or(0, |disk| disk.f_bavail * disk.f_frsize);
+    let in_memory = (free_bytes > MEMORY_BYTES).then(|| tempfile::tempdir_in(MEMORY).ok()).flatten();
+    in_memory.unwrap_or_else(|| tempfile::tempdir().expect("a temporary folder"))
+}
+
+const MEMORY: &str = "/dev/shm";
+/// More than what the tests that run at one time leave in their folders.
+const MEMORY_BYTES: u64 = 1 << 28;
+
 /// A rig file for tests: the default optics on a panel of `width` x `height` pixels, which a processor keeps up with.
 /// `lasers` is the text of the `[lasers]` table's driver.
 pub fn small_rig(width: usize, height: usize, lasers: &str) -> String {

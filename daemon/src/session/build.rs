@@ -94,11 +94,12 @@ pub(super) fn build(
         origin: t_origin,
         record: plan.record_tracker.clone(),
         forbidden: setup::ports_of_others(rig),
+        reader_begins: Some(scheduling::raise),
     };
     let tracker = if plays {
         TrackerHandle::ended(&rig.tracker)
     } else {
-        scheduling::prompt(|| Tracker::start(&plan.tracker, &rig.tracker, tracker_options)).map_err(tracker_failure)?
+        Tracker::start(&plan.tracker, &rig.tracker, tracker_options).map_err(tracker_failure)?
     };
     let (estimates, tap, tracker) = tracker.split();
     for warning in tracker.warnings() {

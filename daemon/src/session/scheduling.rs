@@ -29,7 +29,8 @@ pub(crate) fn patient<T: Send>(make: impl FnOnce() -> T + Send) -> T {
     on_thread_with(give_way, make)
 }
 
-fn raise() {
+/// Makes the calling thread wake at once when it is its time, as in [`prompt`].
+pub(super) fn raise() {
     let priority = ThreadPriority::Crossplatform(REALTIME_PRIORITY.try_into().expect("a priority below 100"));
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
     if let Err(error) = set_thread_priority_and_policy(thread_native_id(), priority, policy) {

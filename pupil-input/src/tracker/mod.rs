@@ -125,6 +125,9 @@ pub struct TrackerOptions {
     pub record: Option<RecordFiles>,
     /// Serial ports that belong to something else, the laser box for one: a tracker is never looked for there.
     pub forbidden: Vec<PathBuf>,
+    /// What the thread that reads the tracker does first, such as raising its own priority. The thread that writes the
+    /// record does not.
+    pub reader_begins: Option<fn()>,
 }
 
 impl From<TimeNs> for TrackerOptions {
@@ -164,7 +167,7 @@ impl Tracker {
         settings: &rig::Tracker,
         options: impl Into<TrackerOptions>,
     ) -> Result<TrackerHandle, TrackerError> {
-        let TrackerOptions { origin, record, forbidden } = options.into();
+        let TrackerOptions { origin, record, forbidden, reader_begins } = options.into();
         let job = Job::open(spec, origin, &forbidden)?;
         if job.unit() != SizeUnit::Millimetres && settings.scale.is_none() {
             return Err(TrackerError::NoScale { spec: spec.to_string(), unit: job.unit().name() });
@@ -211,7 +214,12 @@ impl Tracker {
         };
         let thread = thread::Builder::new()
             .name("pupil-reader".into())
-            .spawn(move || worker.run(job))
+            .spawn(move || {
+                if let Some(begin) = reader_begins {
+                    begin();
+                }
+                worker.run(job);
+            })
             .map_err(TrackerError::Thread)?;
         Ok(TrackerHandle {
             reader: EstimateReader { output },

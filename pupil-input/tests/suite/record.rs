@@ -16,7 +16,7 @@ use tempfile::TempDir;
 
 fn start(spec: &str, record: Option<RecordFiles>) -> TrackerHandle {
     let settings = rig::Tracker { eye: rig::Eye::Both, ..rig::Rig::default().tracker };
-    let options = TrackerOptions { origin: host_now(), record, forbidden: Vec::new() };
+    let options = TrackerOptions { record, ..TrackerOptions::from(host_now()) };
     Tracker::start(&spec.parse().expect("a spec"), &settings, options).expect("starts")
 }
 

@@ -66,6 +66,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         origin: began,
         record: args.record.as_deref().map(created).transpose()?,
         forbidden: setup::ports_of_others(&rig),
+        ..TrackerOptions::default()
     };
     let mut tracker = Tracker::start(&spec, &rig.tracker, options).map_err(tracker_failure)?;
     if !args.json {
