@@ -8,6 +8,7 @@ mod clock;
 mod geometry;
 mod level_tables;
 pub mod rig;
+pub mod toml_source;
 mod units;
 
 pub use clock::host_now;

@@ -5,9 +5,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::rig::{
-    Eye, Fault, LaserDriver, LevelPhase, OutOfStroke, Packing, PanelMode, PanelProfile, PhaseSign, Provenance, Rig,
-    RigError, TextLaserProfile, WeightsChoice,
+    Eye, LaserDriver, LevelPhase, OutOfStroke, Packing, PanelMode, PanelProfile, PhaseSign, Provenance, Rig, RigError,
+    TextLaserProfile, WeightsChoice,
 };
+use holod_calibration::toml_source::Fault;
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, Resolution, TimeNs};
 use image::{GrayImage, ImageBuffer, ImageFormat, Luma, Rgb, RgbImage, RgbaImage};
 use proptest::prelude::*;

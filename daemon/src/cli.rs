@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::rig::{Eye, WeightsChoice};
+use holod_calibration::toml_source::did_you_mean;
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_model::scene::Fit;
 use holod_pupil_input::UsbIds;
@@ -141,9 +142,7 @@ pub(crate) fn parse_weights(text: &str) -> Result<WeightsChoice, String> {
         return Ok(WeightsChoice::File(text.into()));
     }
     let names = WeightsChoice::BUILT_IN.map(|(name, _)| name);
-    let near = names.into_iter().max_by(|a, b| strsim::jaro_winkler(a, text).total_cmp(&strsim::jaro_winkler(b, text)));
-    let meant = near.filter(|near| strsim::jaro_winkler(near, text) > 0.7);
-    let meant = meant.map_or(String::new(), |name| format!("; did you mean `{name}`?"));
+    let meant = did_you_mean(text, &names).map_or(String::new(), |meant| format!("; {meant}"));
     Err(format!("found `{text}`, neither {} nor a file{meant}", names.join(" nor ")))
 }
 

@@ -15,7 +15,7 @@ mod text_laser;
 use std::path::{Path, PathBuf};
 
 pub use drive::{LevelPhase, OutOfStroke, Packing};
-pub use error::{Fault, RigError};
+pub use error::RigError;
 pub use meaning::{ActiveFile, BlurMeaning, FieldMeaning, Meaning, PerColourFigures};
 pub use profile::PanelProfile;
 pub use text_laser::{Expected, Question, TextLaserProfile};

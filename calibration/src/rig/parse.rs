@@ -1,5 +1,6 @@
 //! From a rig file's text to a [`Rig`].
 
+use std::collections::BTreeSet;
 use std::f64::consts::PI;
 use std::path::Path;
 
@@ -113,22 +114,11 @@ const STROKE_TOLERANCE: f64 = 0.02;
 
 /// Parses `text`; relative paths in it start at the folder of `origin`.
 pub(super) fn parse(text: &str, origin: &Path) -> Result<Rig, RigError> {
-    let mut reader = Reader::new(text);
-    let document = reader.document();
-    let rig = document.as_ref().and_then(|document| {
-        let root = reader.root(document);
-        read_rig(&mut reader, root, text, origin)
-    });
-    match rig {
-        Some(rig) if reader.faults.is_empty() => Ok(rig),
-        _ => {
-            reader.faults.sort_by_key(|fault| fault.line.unwrap_or(usize::MAX));
-            Err(RigError { origin: origin.display().to_string(), faults: reader.faults })
-        }
-    }
+    let rig = Reader::read(text, |reader, root| read_rig(reader, root, text, origin));
+    rig.map_err(|faults| RigError { origin: origin.display().to_string(), faults })
 }
 
-fn read_rig<'a>(reader: &mut Reader<'a>, root: Section<'a>, text: &str, origin: &Path) -> Option<Rig> {
+fn read_rig<'a>(reader: &Reader<'a>, root: Section<'a>, text: &str, origin: &Path) -> Option<Rig> {
     reader.reject_unknown(root, &LAYOUT, &RETIRED);
     let name = match reader.text(root, "name", "a name for logs and reports") {
         Some(name) => name.value.to_owned(),
@@ -185,12 +175,12 @@ fn read_rig<'a>(reader: &mut Reader<'a>, root: Section<'a>, text: &str, origin: 
     Some(Rig { name, panel, geometry: geometry?, lasers: lasers?, tracker: tracker?, model: model?, provenance })
 }
 
-fn read_profile<'a>(reader: &mut Reader<'a>, panel: Section<'a>) -> Option<&'static PanelProfile> {
+fn read_profile<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<&'static PanelProfile> {
     let choices: Vec<_> = PanelProfile::all().iter().map(|profile| (profile.name, profile)).collect();
     Some(reader.choice(panel, "profile", &choices, false)?.value)
 }
 
-fn read_pixels<'a>(reader: &mut Reader<'a>, panel: Section<'a>) -> Option<(Resolution, Metres)> {
+fn read_pixels<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<(Resolution, Metres)> {
     let [width, height] = ["width_px", "height_px"].map(|key| {
         let pixels = reader.required_integer(panel, key, PIXELS)?;
         if pixels.value % 2 == 0 {
@@ -231,7 +221,7 @@ impl FieldTiming {
     }
 }
 
-fn read_field_timing<'a>(reader: &mut Reader<'a>, panel: Section<'a>) -> Option<FieldTiming> {
+fn read_field_timing<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<FieldTiming> {
     let refresh_hz = reader.required_number(panel, "refresh_hz", REFRESH);
     let mode = read_mode(reader, panel);
     let field_order = match mode {
@@ -254,7 +244,7 @@ fn read_field_timing<'a>(reader: &mut Reader<'a>, panel: Section<'a>) -> Option<
 }
 
 /// `mode`, with the colour that monochrome mode shows.
-fn read_mode<'a>(reader: &mut Reader<'a>, panel: Section<'a>) -> Option<PanelMode> {
+fn read_mode<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<PanelMode> {
     let modes = ["channel-packed", "field-sequential", "monochrome"].map(|name| (name, name));
     let mode = reader.choice(panel, "mode", &modes, true);
     let monochrome = mode.is_some_and(|mode| mode.value == "monochrome");
@@ -273,7 +263,7 @@ fn read_mode<'a>(reader: &mut Reader<'a>, panel: Section<'a>) -> Option<PanelMod
     }
 }
 
-fn read_frames_per_colour<'a>(reader: &mut Reader<'a>, panel: Section<'a>, mode: Option<PanelMode>) -> Option<u8> {
+fn read_frames_per_colour<'a>(reader: &Reader<'a>, panel: Section<'a>, mode: Option<PanelMode>) -> Option<u8> {
     if !panel.has("frames_per_colour") {
         return Some(1);
     }
@@ -290,7 +280,7 @@ fn read_frames_per_colour<'a>(reader: &mut Reader<'a>, panel: Section<'a>, mode:
 }
 
 /// The bits of a level and where they travel on the video link.
-fn read_levels<'a>(reader: &mut Reader<'a>, panel: Section<'a>, mode: Option<PanelMode>) -> Option<(u8, Packing)> {
+fn read_levels<'a>(reader: &Reader<'a>, panel: Section<'a>, mode: Option<PanelMode>) -> Option<(u8, Packing)> {
     let bits = reader.required_integer(panel, "bit_depth", BIT_DEPTH);
     let packings = Packing::ALL.map(|packing| (packing.name(), packing));
     let packing = reader.choice(panel, "packing", &packings, false);
@@ -344,7 +334,7 @@ struct Phase {
 }
 
 fn read_phase<'a>(
-    reader: &mut Reader<'a>,
+    reader: &Reader<'a>,
     panel: Section<'a>,
     levels: Option<(u8, Packing)>,
     resolution: Option<Resolution>,
@@ -396,7 +386,7 @@ fn read_phase<'a>(
 }
 
 /// Whether the flatness pictures show what is to be taken off.
-fn read_flatness_sign<'a>(reader: &mut Reader<'a>, panel: Section<'a>) -> bool {
+fn read_flatness_sign<'a>(reader: &Reader<'a>, panel: Section<'a>) -> bool {
     let signs = [("add", false), ("subtract", true)];
     let sign = reader.choice(panel, "flatness_sign", &signs, false);
     if let Some(sign) = sign.filter(|_| !panel.has("flatness_file")) {
@@ -433,7 +423,7 @@ fn table_range(table: &[LevelPhase]) -> TableRange {
 
 /// Judges a measured table against what the rig file says in words.
 fn check_lut<'a>(
-    reader: &mut Reader<'a>,
+    reader: &Reader<'a>,
     panel: Section<'a>,
     key: &str,
     line: Option<usize>,
@@ -471,7 +461,7 @@ fn check_lut<'a>(
 }
 
 fn read_optics<'a>(
-    reader: &mut Reader<'a>,
+    reader: &Reader<'a>,
     optics: Section<'a>,
     pixels: Option<(Resolution, Metres)>,
 ) -> Option<DisplayGeometry> {
@@ -515,7 +505,7 @@ fn read_optics<'a>(
 
 /// One end of the depth range, in metres or in dioptres; `default` where the rig file gives neither.
 fn read_depth<'a>(
-    reader: &mut Reader<'a>,
+    reader: &Reader<'a>,
     optics: Section<'a>,
     [key_m, key_dpt]: [&'static str; 2],
     default: Dioptres,
@@ -535,7 +525,7 @@ fn read_depth<'a>(
 }
 
 fn read_lasers<'a>(
-    reader: &mut Reader<'a>,
+    reader: &Reader<'a>,
     lasers: Section<'a>,
     timing: Option<FieldTiming>,
     folder: &Path,
@@ -612,7 +602,7 @@ const DRIVERS: [(&str, &[&str]); 4] = [
     ("text", &["devices", "profile", "profile_file", "gated_by_panel", "accept_no_heartbeat"]),
 ];
 
-fn read_driver<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, folder: &Path) -> Option<LaserDriver> {
+fn read_driver<'a>(reader: &Reader<'a>, lasers: Section<'a>, folder: &Path) -> Option<LaserDriver> {
     const PORT: &str = "a serial port's path";
     let drivers: Vec<_> = DRIVERS.iter().map(|driver| (driver.0, driver)).collect();
     let driver = reader.choice(lasers, "driver", &drivers, true);
@@ -624,19 +614,17 @@ fn read_driver<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, folder: &Path) 
     let profile = read_text_laser(reader, lasers, folder);
     let driver = driver?;
     let (name, own) = *driver.value;
-    for key in DRIVERS.iter().flat_map(|(_, keys)| *keys) {
+    let keys: BTreeSet<_> = DRIVERS.iter().flat_map(|(_, keys)| *keys).collect();
+    for key in keys {
         if lasers.has(key) && !own.contains(key) {
             let of: Vec<_> = DRIVERS.iter().filter(|(_, keys)| keys.contains(key)).map(|(name, _)| *name).collect();
             let found = format!("a key that the driver \"{name}\" does not have");
             let advice = format!("take {key} out, or write driver = \"{}\"", of.join("\" or \""));
             let line = reader.line_of_key(lasers, key);
-            // A key of several drivers is one fault.
-            if !reader.faults.iter().any(|fault| fault.line == line && fault.found == found) {
-                reader.fault_in(lasers, key, line, &found, "only keys of the chosen driver", advice);
-            }
+            reader.fault_in(lasers, key, line, &found, "only keys of the chosen driver", advice);
         }
     }
-    let mut missing = |key: &str, expected: &str, example: &str| {
+    let missing = |key: &str, expected: &str, example: &str| {
         if !lasers.has(key) {
             let advice = format!("write for example {example}");
             reader.fault_in(lasers, key, driver.line, "nothing", expected, advice);
@@ -680,7 +668,7 @@ fn read_driver<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, folder: &Path) 
 }
 
 /// Whether the rig file accepts, in words, lasers that stay lit when holod dies.
-fn read_acceptance<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, driver: Option<&LaserDriver>) -> bool {
+fn read_acceptance<'a>(reader: &Reader<'a>, lasers: Section<'a>, driver: Option<&LaserDriver>) -> bool {
     let expected = format!("the words {ACCEPTANCE:?}");
     let words = reader.text(lasers, "accept_no_heartbeat", &expected);
     let accepted = words.is_some_and(|words| words.value == ACCEPTANCE);
@@ -698,7 +686,7 @@ fn read_acceptance<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, driver: Opt
 }
 
 /// The profile that `profile` or `profile_file` names.
-fn read_text_laser<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, folder: &Path) -> Option<TextLaserProfile> {
+fn read_text_laser<'a>(reader: &Reader<'a>, lasers: Section<'a>, folder: &Path) -> Option<TextLaserProfile> {
     let choices: Vec<_> = TextLaserProfile::names().map(|name| (name, name)).collect();
     let named = reader.choice(lasers, "profile", &choices, false);
     let file = reader.text(lasers, "profile_file", "a TOML file's path");
@@ -722,7 +710,7 @@ fn read_text_laser<'a>(reader: &mut Reader<'a>, lasers: Section<'a>, folder: &Pa
     }
 }
 
-fn read_tracker<'a>(reader: &mut Reader<'a>, tracker: Section<'a>) -> Option<Tracker> {
+fn read_tracker<'a>(reader: &Reader<'a>, tracker: Section<'a>) -> Option<Tracker> {
     let default = Rig::default().tracker;
     let spec = reader.text(tracker, "spec", "a tracker spec, as on the command line");
     let eye = reader.choice(tracker, "eye", &Eye::NAMES, false);
@@ -738,7 +726,7 @@ fn read_tracker<'a>(reader: &mut Reader<'a>, tracker: Section<'a>) -> Option<Tra
     })
 }
 
-fn read_model<'a>(reader: &mut Reader<'a>, model: Section<'a>, folder: &Path) -> Option<Model> {
+fn read_model<'a>(reader: &Reader<'a>, model: Section<'a>, folder: &Path) -> Option<Model> {
     let network = reader.choice(model, "network", &WeightsChoice::BUILT_IN, false);
     let file = reader.text(model, "weights_file", "a safetensors file's path").map(|path| {
         let file = folder.join(path.value);

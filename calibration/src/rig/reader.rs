@@ -1,15 +1,10 @@
 //! Reads keys out of a TOML document and keeps count of everything that is wrong with them.
 
-use std::ops::Range;
-
 use toml_edit::{Document, Item, Table, TableLike};
 
-use super::Fault;
 use super::files::FileFault;
+use crate::toml_source::{Fault, TomlSource, describe, describe_unknown, did_you_mean, nearest};
 use crate::{Colour, PerColour};
-
-/// How many syntax faults are looked for before a file is given up.
-const SYNTAX_FAULTS_MAX: usize = 16;
 
 /// The numbers that a key takes.
 #[derive(Clone, Copy)]
@@ -99,65 +94,34 @@ impl<'a> Section<'a> {
     }
 }
 
-/// A parsed rig file and the faults found in it so far.
+/// Reads the values of a file's keys.
 pub(super) struct Reader<'a> {
-    text: &'a str,
-    /// What was found wrong; the caller adds what only it can judge.
-    pub(super) faults: Vec<Fault>,
+    source: TomlSource<'a>,
 }
 
 impl<'a> Reader<'a> {
-    /// A reader of the file whose text is `text`.
-    pub(super) fn new(text: &'a str) -> Self {
-        Self { text, faults: Vec::new() }
-    }
-
-    /// The document, or nothing where it is not TOML; then every syntax fault is noted that shows up when the faulty
-    /// lines before it are left out.
-    pub(super) fn document(&mut self) -> Option<Document<String>> {
-        let mut remaining = self.text.to_owned();
-        while self.faults.len() < SYNTAX_FAULTS_MAX {
-            let error = match Document::parse(remaining.clone()) {
-                Ok(document) if self.faults.is_empty() => return Some(document),
-                Ok(_) => return None,
-                Err(error) => error,
-            };
-            let start = error.span().map_or(0, |span| span.start).min(remaining.len());
-            let line_start = remaining.as_bytes()[..start].iter().rposition(|&b| b == b'\n').map_or(0, |at| at + 1);
-            let line_end = remaining.as_bytes()[start..].iter().position(|&b| b == b'\n');
-            let line_end = line_end.map_or(remaining.len(), |at| start + at);
-            let content = remaining[line_start..line_end].trim().to_owned();
-            self.faults.push(Fault {
-                key: String::new(),
-                line: Some(self.line_at(start)),
-                found: format!("`{content}`"),
-                expected: "TOML".into(),
-                advice: error.message().replace('\n', ", "),
-            });
-            if content.is_empty() || content.starts_with('[') {
-                return None;
-            }
-            remaining.replace_range(line_start..line_end, &" ".repeat(line_end - line_start));
-        }
-        None
-    }
-
-    /// The line, from 1, in which the byte at `offset` stands.
-    pub(super) fn line_at(&self, offset: usize) -> usize {
-        1 + self.text.as_bytes()[..offset.min(self.text.len())].iter().filter(|&&b| b == b'\n').count()
-    }
-
-    fn line_of(&self, span: Option<Range<usize>>) -> Option<usize> {
-        span.map(|span| self.line_at(span.start))
+    /// What `read` makes of the file whose text is `text`, starting with its top level.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the file, in the order of its lines.
+    pub(super) fn read<T>(
+        text: &str,
+        read: impl for<'s> FnOnce(&Reader<'s>, Section<'s>) -> Option<T>,
+    ) -> Result<T, Vec<Fault>> {
+        let source = TomlSource::new(text);
+        let document = source.document();
+        let reader = Reader { source };
+        let made = document.as_ref().and_then(|document| read(&reader, Reader::root(document)));
+        reader.source.finish(made)
     }
 
     /// The keys of the file's top level, outside any table.
-    pub(super) fn root(&self, document: &'a Document<String>) -> Section<'a> {
+    fn root(document: &Document<String>) -> Section<'_> {
         Section { name: "", table: Some(document.as_table()), line: None, profile: None, excused: &[] }
     }
 
     /// The table `name`; a fault where something else has its name, or where it is required and missing.
-    pub(super) fn section(&mut self, root: Section<'a>, name: &'static str, required: bool) -> Section<'a> {
+    pub(super) fn section(&self, root: Section<'a>, name: &'static str, required: bool) -> Section<'a> {
         let entry = root.table.and_then(|table| table.get_key_value(name));
         let Some((key, item)) = entry else {
             if required {
@@ -171,7 +135,7 @@ impl<'a> Reader<'a> {
             }
             return Section { name, table: None, line: None, profile: None, excused: &[] };
         };
-        let line = self.line_of(item.span().or_else(|| key.span()));
+        let line = self.source.line_of(item.span().or_else(|| key.span()));
         let table = item.as_table_like();
         if table.is_none() {
             let found = describe(item);
@@ -181,13 +145,13 @@ impl<'a> Reader<'a> {
     }
 
     /// Notes a fault.
-    pub(super) fn fault(&mut self, key: String, line: Option<usize>, found: &str, expected: &str, advice: String) {
-        self.faults.push(Fault { key, line, found: found.into(), expected: expected.into(), advice });
+    pub(super) fn fault(&self, key: String, line: Option<usize>, found: &str, expected: &str, advice: String) {
+        self.source.fault(key, line, found, expected, advice);
     }
 
     /// Notes a fault of a key in `section`.
     pub(super) fn fault_in(
-        &mut self,
+        &self,
         section: Section<'_>,
         key: &str,
         line: Option<usize>,
@@ -202,7 +166,7 @@ impl<'a> Reader<'a> {
     /// section, to tell where a misplaced one belongs; `retired` are sections' keys that there were once, each with what
     /// to do about it.
     pub(super) fn reject_unknown(
-        &mut self,
+        &self,
         section: Section<'a>,
         layout: &[(&'static str, &[&'static str])],
         retired: &[(&str, &str, &str)],
@@ -213,24 +177,22 @@ impl<'a> Reader<'a> {
             if known.contains(&key) {
                 continue;
             }
-            let line = self.line_of(table.key(key).and_then(|key| key.span()).or_else(|| item.span()));
+            let line = self.source.line_of_key(table, key, item);
             let home = layout.iter().find(|(name, keys)| *name != section.name && keys.contains(&key));
             let once = retired.iter().find(|(name, once, _)| (*name, *once) == (section.name, key));
-            let advice = match (once, home, nearest(key, known)) {
-                (Some((.., advice)), ..) => (*advice).into(),
-                (_, Some(("", _)), _) => format!("move `{key}` above the first table"),
-                (_, Some((home, _)), _) => format!("move `{key}` to [{home}]"),
-                (_, None, Some(name)) => format!("did you mean `{name}`?"),
-                (_, None, None) => "take it out".into(),
+            let advice = match (once, home) {
+                (Some((.., advice)), _) => (*advice).into(),
+                (_, Some(("", _))) => format!("move `{key}` above the first table"),
+                (_, Some((home, _))) => format!("move `{key}` to [{home}]"),
+                (_, None) => did_you_mean(key, known).unwrap_or("take it out".into()),
             };
-            let found = if item.is_table() { "an unknown table" } else { "an unknown key" };
-            self.fault_in(section, key, line, found, &format!("one of {}", known.join(", ")), advice);
+            self.fault_in(section, key, line, describe_unknown(item), &format!("one of {}", known.join(", ")), advice);
         }
     }
 
     fn lookup(&self, section: Section<'a>, key: &str) -> Option<Found<&'a Item>> {
         if let Some((key, item)) = section.table.and_then(|table| table.get_key_value(key)) {
-            return Some(Found { value: item, line: self.line_of(key.span().or_else(|| item.span())) });
+            return Some(Found { value: item, line: self.source.line_of(key.span().or_else(|| item.span())) });
         }
         let item = section.profile?.get(key)?;
         Some(Found { value: item, line: None })
@@ -241,7 +203,7 @@ impl<'a> Reader<'a> {
         self.lookup(section, key)?.line
     }
 
-    fn missing(&mut self, section: Section<'a>, key: &str, expected: &str) {
+    fn missing(&self, section: Section<'a>, key: &str, expected: &str) {
         // A missing table is one fault, not one for each of its keys.
         if section.table.is_some() && !section.excused.contains(&key) {
             let advice = format!("add {key} to [{}]", section.name);
@@ -249,19 +211,19 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn wrong_type(&mut self, section: Section<'a>, key: &str, found: Found<&Item>, expected: &str, advice: String) {
+    fn wrong_type(&self, section: Section<'a>, key: &str, found: Found<&Item>, expected: &str, advice: String) {
         let described = describe(found.value);
         self.fault_in(section, key, found.line, &described, expected, advice);
     }
 
     /// A number within `span`, where the key is there.
-    pub(super) fn number(&mut self, section: Section<'a>, key: &str, span: Span) -> Option<Found<f64>> {
+    pub(super) fn number(&self, section: Section<'a>, key: &str, span: Span) -> Option<Found<f64>> {
         let found = self.lookup(section, key)?;
         let value = self.number_of(section, key, found, span)?;
         Some(Found { value, line: found.line })
     }
 
-    fn number_of(&mut self, section: Section<'a>, key: &str, found: Found<&Item>, span: Span) -> Option<f64> {
+    fn number_of(&self, section: Section<'a>, key: &str, found: Found<&Item>, span: Span) -> Option<f64> {
         let Some(value) = number_in(found.value) else {
             let advice = match found.value.as_str() {
                 Some(text) if text.trim().parse::<f64>().is_ok() => "take the quotes away".into(),
@@ -279,7 +241,7 @@ impl<'a> Reader<'a> {
     }
 
     /// A number within `span`; a fault where the key is missing.
-    pub(super) fn required_number(&mut self, section: Section<'a>, key: &str, span: Span) -> Option<Found<f64>> {
+    pub(super) fn required_number(&self, section: Section<'a>, key: &str, span: Span) -> Option<Found<f64>> {
         if self.lookup(section, key).is_none() {
             self.missing(section, key, &span.expected());
         }
@@ -287,7 +249,7 @@ impl<'a> Reader<'a> {
     }
 
     /// A whole number within `span`; a fault where the key is missing.
-    pub(super) fn required_integer(&mut self, section: Section<'a>, key: &str, span: Span) -> Option<Found<usize>> {
+    pub(super) fn required_integer(&self, section: Section<'a>, key: &str, span: Span) -> Option<Found<usize>> {
         let found = self.required_number(section, key, span)?;
         if found.value.fract() != 0.0 {
             let advice = "write it without a fraction".into();
@@ -299,7 +261,7 @@ impl<'a> Reader<'a> {
 
     /// A number for each colour within `span`; `required` says which colours may not be left out.
     pub(super) fn numbers(
-        &mut self,
+        &self,
         section: Section<'a>,
         key: &str,
         span: Span,
@@ -316,12 +278,7 @@ impl<'a> Reader<'a> {
     }
 
     /// A text for each colour, none required.
-    pub(super) fn texts(
-        &mut self,
-        section: Section<'a>,
-        key: &str,
-        expected: &str,
-    ) -> PerColour<Option<Found<&'a str>>> {
+    pub(super) fn texts(&self, section: Section<'a>, key: &str, expected: &str) -> PerColour<Option<Found<&'a str>>> {
         let example = "{ red = \"red.file\", green = \"green.file\", blue = \"blue.file\" }";
         let items = self.colours(section, key, expected, PerColour([false; 3]), example);
         PerColour(Colour::ALL.map(|colour| {
@@ -331,7 +288,7 @@ impl<'a> Reader<'a> {
     }
 
     fn colours(
-        &mut self,
+        &self,
         section: Section<'a>,
         key: &str,
         expected: &str,
@@ -352,8 +309,8 @@ impl<'a> Reader<'a> {
         };
         let names = Colour::ALL.map(Colour::name);
         for (name, item) in table.iter().filter(|(name, _)| !names.contains(name)) {
-            let line = found.line.map(|line| self.line_of(item.span()).unwrap_or(line));
-            let advice = nearest(name, &names).map_or("take it out".into(), |name| format!("did you mean `{name}`?"));
+            let line = found.line.map(|line| self.source.line_of(item.span()).unwrap_or(line));
+            let advice = did_you_mean(name, &names).unwrap_or("take it out".into());
             self.fault_in(section, &format!("{key}.{name}"), line, "an unknown key", "one of red, green, blue", advice);
         }
         PerColour(Colour::ALL.map(|colour| {
@@ -364,19 +321,19 @@ impl<'a> Reader<'a> {
             }
             item.map(|item| Found {
                 value: item,
-                line: found.line.map(|line| self.line_of(item.span()).unwrap_or(line)),
+                line: found.line.map(|line| self.source.line_of(item.span()).unwrap_or(line)),
             })
         }))
     }
 
     /// A text that is not empty, where the key is there.
-    pub(super) fn text(&mut self, section: Section<'a>, key: &str, expected: &str) -> Option<Found<&'a str>> {
+    pub(super) fn text(&self, section: Section<'a>, key: &str, expected: &str) -> Option<Found<&'a str>> {
         let found = self.lookup(section, key)?;
         self.text_of(section, key, found, expected)
     }
 
     /// A text that is not empty; a fault where the key is missing.
-    pub(super) fn required_text(&mut self, section: Section<'a>, key: &str, expected: &str) -> Option<Found<&'a str>> {
+    pub(super) fn required_text(&self, section: Section<'a>, key: &str, expected: &str) -> Option<Found<&'a str>> {
         if self.lookup(section, key).is_none() {
             self.missing(section, key, expected);
         }
@@ -384,12 +341,7 @@ impl<'a> Reader<'a> {
     }
 
     /// A text of any characters; a fault where the key is missing.
-    pub(super) fn required_raw_text(
-        &mut self,
-        section: Section<'a>,
-        key: &str,
-        expected: &str,
-    ) -> Option<Found<&'a str>> {
+    pub(super) fn required_raw_text(&self, section: Section<'a>, key: &str, expected: &str) -> Option<Found<&'a str>> {
         let Some(found) = self.lookup(section, key) else {
             self.missing(section, key, expected);
             return None;
@@ -403,7 +355,7 @@ impl<'a> Reader<'a> {
 
     /// A list of texts that are not empty; an empty list where the key is missing and not required.
     pub(super) fn text_list(
-        &mut self,
+        &self,
         section: Section<'a>,
         key: &str,
         required: bool,
@@ -439,12 +391,7 @@ impl<'a> Reader<'a> {
     }
 
     /// The tables `[[name]]`, at most `count_max` of them.
-    pub(super) fn sections(
-        &mut self,
-        root: Section<'a>,
-        name: &'static str,
-        count_max: usize,
-    ) -> Option<Vec<Section<'a>>> {
+    pub(super) fn sections(&self, root: Section<'a>, name: &'static str, count_max: usize) -> Option<Vec<Section<'a>>> {
         let Some(found) = self.lookup(root, name) else { return Some(Vec::new()) };
         let Some(tables) = found.value.as_array_of_tables().filter(|tables| tables.len() <= count_max) else {
             let expected = format!("1 to {count_max} tables");
@@ -454,7 +401,7 @@ impl<'a> Reader<'a> {
         let section = |table: &'a Table| Section {
             name,
             table: Some(table as &dyn TableLike),
-            line: self.line_of(table.span()),
+            line: self.source.line_of(table.span()),
             profile: None,
             excused: &[],
         };
@@ -462,7 +409,7 @@ impl<'a> Reader<'a> {
     }
 
     fn text_of(
-        &mut self,
+        &self,
         section: Section<'a>,
         key: &str,
         found: Found<&'a Item>,
@@ -485,7 +432,7 @@ impl<'a> Reader<'a> {
 
     /// What was read from the file that `key` names; its fault becomes the key's.
     pub(super) fn of_file<T>(
-        &mut self,
+        &self,
         section: Section<'a>,
         key: &str,
         line: Option<usize>,
@@ -495,7 +442,7 @@ impl<'a> Reader<'a> {
     }
 
     /// true or false; `default` where the key is missing.
-    pub(super) fn flag(&mut self, section: Section<'a>, key: &str, default: bool) -> bool {
+    pub(super) fn flag(&self, section: Section<'a>, key: &str, default: bool) -> bool {
         let Some(found) = self.lookup(section, key) else { return default };
         found.value.as_bool().unwrap_or_else(|| {
             self.wrong_type(section, key, found, "true or false", "write true or false, without quotes".into());
@@ -505,7 +452,7 @@ impl<'a> Reader<'a> {
 
     /// One of the named choices; a fault where the key is missing and `required`.
     pub(super) fn choice<T: Clone>(
-        &mut self,
+        &self,
         section: Section<'a>,
         key: &str,
         choices: &[(&'static str, T)],
@@ -528,7 +475,7 @@ impl<'a> Reader<'a> {
     }
 
     /// The order of the colours: each of the three once.
-    pub(super) fn colour_order(&mut self, section: Section<'a>, key: &str) -> Option<[Colour; 3]> {
+    pub(super) fn colour_order(&self, section: Section<'a>, key: &str) -> Option<[Colour; 3]> {
         const EXPECTED: &str = "red, green and blue, each once";
         let Some(found) = self.lookup(section, key) else {
             self.missing(section, key, EXPECTED);
@@ -556,25 +503,4 @@ fn number_in(item: &Item) -> Option<f64> {
         Some("inf" | "infinity") => Some(f64::INFINITY),
         _ => None,
     })
-}
-
-/// What stands in the file, short enough for one line.
-fn describe(item: &Item) -> String {
-    const SHOWN_MAX: usize = 60;
-    let text = item.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
-    let shown: String = text.chars().take(SHOWN_MAX).collect();
-    let more = if shown.len() < text.len() { "..." } else { "" };
-    match item.type_name() {
-        kind @ ("array" | "integer") => format!("an {kind} {shown}{more}"),
-        "table" | "array of tables" => "a table".into(),
-        kind => format!("a {kind} {shown}{more}"),
-    }
-}
-
-/// The name among `names` that `given` was most likely meant to be.
-fn nearest<'n>(given: &str, names: &[&'n str]) -> Option<&'n str> {
-    const ALIKE_MIN: f64 = 0.8;
-    let alike = |name: &&&str| strsim::jaro_winkler(given, name);
-    let best = names.iter().max_by(|a, b| alike(a).total_cmp(&alike(b)))?;
-    (alike(&best) >= ALIKE_MIN).then_some(*best)
 }

@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::sync::LazyLock;
 
+use super::RigError;
 use super::reader::{Reader, Section, Span};
-use super::{Fault, RigError};
 
 const FILES: [(&str, &str); 2] = [
     ("cobolt", include_str!("../../profiles/lasers/cobolt.toml")),
@@ -109,23 +109,11 @@ impl TextLaserProfile {
     /// # Errors
     /// [`RigError`] with every fault.
     pub fn parse(text: &str, origin: &Path) -> Result<Self, RigError> {
-        let mut reader = Reader::new(text);
-        let document = reader.document();
-        let profile = document.as_ref().and_then(|document| {
-            let root = reader.root(document);
-            read(&mut reader, root)
-        });
-        match profile {
-            Some(profile) if reader.faults.is_empty() => Ok(profile),
-            _ => {
-                reader.faults.sort_by_key(|fault: &Fault| fault.line.unwrap_or(usize::MAX));
-                Err(RigError { origin: origin.display().to_string(), faults: reader.faults })
-            }
-        }
+        Reader::read(text, read).map_err(|faults| RigError { origin: origin.display().to_string(), faults })
     }
 }
 
-fn read<'a>(reader: &mut Reader<'a>, root: Section<'a>) -> Option<TextLaserProfile> {
+fn read<'a>(reader: &Reader<'a>, root: Section<'a>) -> Option<TextLaserProfile> {
     reader.reject_unknown(root, &LAYOUT, &[]);
     let description = reader.required_text(root, "description", "maker and model");
     let _for_people = reader.text(root, "source", "where the commands come from");
@@ -180,7 +168,7 @@ fn read<'a>(reader: &mut Reader<'a>, root: Section<'a>) -> Option<TextLaserProfi
     })
 }
 
-fn read_end_of_command<'a>(reader: &mut Reader<'a>, line: Section<'a>) -> Option<&'a str> {
+fn read_end_of_command<'a>(reader: &Reader<'a>, line: Section<'a>) -> Option<&'a str> {
     const EXPECTED: &str = r#"one of "\r", "\n" and "\r\n""#;
     let found = reader.required_raw_text(line, "end_of_command", EXPECTED)?;
     if ["\r", "\n", "\r\n"].contains(&found.value) {
@@ -191,7 +179,7 @@ fn read_end_of_command<'a>(reader: &mut Reader<'a>, line: Section<'a>) -> Option
 }
 
 /// Notes a fault where `text` cannot be sent as one line.
-fn sendable(reader: &mut Reader<'_>, section: Section<'_>, key: &str, line: Option<usize>, text: &str) {
+fn sendable(reader: &Reader<'_>, section: Section<'_>, key: &str, line: Option<usize>, text: &str) {
     if text.len() > TEXT_BYTES_MAX || !text.bytes().all(|byte| (b' '..=b'~').contains(&byte)) {
         let expected = format!("printable ASCII, {TEXT_BYTES_MAX} characters at most");
         let advice = "write one command without its line end".into();
@@ -200,7 +188,7 @@ fn sendable(reader: &mut Reader<'_>, section: Section<'_>, key: &str, line: Opti
 }
 
 fn command_list<'a>(
-    reader: &mut Reader<'a>,
+    reader: &Reader<'a>,
     section: Section<'a>,
     key: &'static str,
     required: bool,
@@ -212,7 +200,7 @@ fn command_list<'a>(
     Some(texts.value.iter().map(|text| (*text).to_owned()).collect())
 }
 
-fn questions<'a>(reader: &mut Reader<'a>, root: Section<'a>, name: &'static str) -> Option<Vec<Question>> {
+fn questions<'a>(reader: &Reader<'a>, root: Section<'a>, name: &'static str) -> Option<Vec<Question>> {
     let mut questions = Vec::new();
     for section in reader.sections(root, name, LIST_MAX)? {
         reader.reject_unknown(section, &LAYOUT, &[]);

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 use std::time::Duration;
 
-use holod_calibration::rig::Fault;
+use holod_calibration::toml_source::{Fault, did_you_mean};
 
 use crate::import::SizeUnit;
 use crate::spec::UsbIds;
@@ -154,7 +154,7 @@ impl Profile {
         }
         Self::shipped().find(|profile| profile.name == name_or_path).ok_or_else(|| {
             let names = FILES.map(|(name, _)| name);
-            let advice = reader::did_you_mean(name_or_path, &names)
+            let advice = did_you_mean(name_or_path, &names)
                 .unwrap_or_else(|| "name one of these, or the path of a profile of your own".into());
             ProfileError::Unknown { name: name_or_path.into(), known: names.join(", "), advice }
         })

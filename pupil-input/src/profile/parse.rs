@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use holod_calibration::rig::Fault;
+use holod_calibration::toml_source::Fault;
 
 use super::reader::{Found, Reader, Section};
 use super::wire::{Context, read_wire};
@@ -19,17 +19,7 @@ const ANSWER_WITHIN_MS: i64 = 1000;
 
 /// Parses a profile, or tells all that is wrong with it, in the order of its lines.
 pub(super) fn parse(text: &str) -> Result<Profile, Vec<Fault>> {
-    let reader = Reader::new(text);
-    let document = reader.document();
-    let profile = document.as_ref().and_then(|document| read(&reader.root(document)));
-    let mut faults = reader.faults.take();
-    match profile {
-        Some(profile) if faults.is_empty() => Ok(profile),
-        _ => {
-            faults.sort_by_key(|fault| fault.line.unwrap_or(usize::MAX));
-            Err(faults)
-        }
-    }
+    Reader::read(text, read)
 }
 
 fn read(root: &Section<'_>) -> Option<Profile> {

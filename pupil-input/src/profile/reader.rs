@@ -1,15 +1,14 @@
 //! Reads keys out of a profile's TOML and keeps count of everything that is wrong with them.
 
 use std::cell::RefCell;
-use std::ops::{Range, RangeInclusive};
+use std::ops::RangeInclusive;
 
-use holod_calibration::rig::Fault;
+use holod_calibration::toml_source::{Fault, TomlSource, describe, describe_unknown, did_you_mean};
 use toml_edit::{Array, Document, Item, TableLike, Value};
 
-/// The faults found so far, in the order in which they were found.
+/// Reads the values of a file's keys.
 pub(super) struct Reader<'a> {
-    text: &'a str,
-    pub(super) faults: RefCell<Vec<Fault>>,
+    source: TomlSource<'a>,
 }
 
 /// One table, with the keys that were asked of it: any other is unknown.
@@ -36,23 +35,19 @@ impl<T> Found<T> {
 }
 
 impl<'a> Reader<'a> {
-    pub(super) const fn new(text: &'a str) -> Self {
-        Self { text, faults: RefCell::new(Vec::new()) }
+    /// What `read` makes of the file whose text is `text`, starting with its top level.
+    ///
+    /// # Errors
+    /// Everything that is wrong with the file, in the order of its lines.
+    pub(super) fn read<T>(text: &str, read: impl FnOnce(&Section<'_>) -> Option<T>) -> Result<T, Vec<Fault>> {
+        let source = TomlSource::new(text);
+        let document = source.document();
+        let reader = Reader { source };
+        let made = document.as_ref().and_then(|document| read(&reader.root(document)));
+        reader.source.finish(made)
     }
 
-    /// The document, or nothing, with a fault, where the text is no TOML.
-    pub(super) fn document(&self) -> Option<Document<String>> {
-        Document::parse(self.text.to_owned())
-            .map_err(|error| {
-                let start = error.span().map_or(0, |span| span.start);
-                let line = self.line_at(start);
-                let found = self.text.lines().nth(line - 1).unwrap_or_default().trim();
-                self.push("", Some(line), &format!("`{found}`"), "TOML", error.message().replace('\n', ", "));
-            })
-            .ok()
-    }
-
-    pub(super) fn root(&'a self, document: &'a Document<String>) -> Section<'a> {
+    fn root(&'a self, document: &'a Document<String>) -> Section<'a> {
         Section {
             reader: self,
             path: String::new(),
@@ -62,22 +57,9 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn line_at(&self, offset: usize) -> usize {
-        1 + self.text.as_bytes()[..offset.min(self.text.len())].iter().filter(|byte| **byte == b'\n').count()
-    }
-
-    fn line_of(&self, span: Option<Range<usize>>) -> Option<usize> {
-        span.map(|span| self.line_at(span.start))
-    }
-
-    fn push(&self, key: &str, line: Option<usize>, found: &str, expected: &str, advice: String) {
-        let (key, found, expected) = (key.to_owned(), found.to_owned(), expected.to_owned());
-        self.faults.borrow_mut().push(Fault { key, line, found, expected, advice });
-    }
-
     /// Notes what is wrong with a value that was found.
     pub(super) fn fault<T>(&self, at: &Found<T>, found: impl ToString, expected: &str, advice: impl Into<String>) {
-        self.push(&at.key, at.line, &found.to_string(), expected, advice.into());
+        self.source.fault(&at.key, at.line, found, expected, advice);
     }
 
     /// Notes a value of the wrong type.
@@ -161,7 +143,7 @@ impl<'a> Reader<'a> {
         let item = |(index, value): (usize, &Value)| Found {
             value: Item::Value(value.clone()),
             key: format!("{}[{index}]", at.key),
-            line: self.line_of(value.span()).or(at.line),
+            line: self.source.line_of(value.span()).or(at.line),
         };
         array.iter().enumerate().map(item).collect()
     }
@@ -185,7 +167,7 @@ impl<'a> Section<'a> {
     pub(super) fn get(&self, key: &'static str) -> Option<Found<&'a Item>> {
         self.asked.borrow_mut().push(key);
         let (name, item) = self.table?.get_key_value(key)?;
-        let line = self.reader.line_of(name.span().or_else(|| item.span())).or(self.line);
+        let line = self.reader.source.line_of(name.span().or_else(|| item.span())).or(self.line);
         Some(Found { value: item, key: self.path(key), line })
     }
 
@@ -200,13 +182,14 @@ impl<'a> Section<'a> {
 
     /// Notes what is wrong with the table as a whole.
     pub(super) fn fault(&self, found: &str, expected: &str, advice: &str) {
-        self.reader.push(&self.path, self.line, found, expected, advice.into());
+        self.reader.source.fault(&self.path, self.line, found, expected, advice);
     }
 
     /// Notes that `key` is missing.
     pub(super) fn missing(&self, key: &str, expected: &str) {
         let place = if self.path.is_empty() { "the top of the file".into() } else { format!("[{}]", self.path) };
-        self.reader.push(&self.path(key), self.line, "nothing", expected, format!("add {key} to {place}"));
+        let advice = format!("add {key} to {place}");
+        self.reader.source.fault(self.path(key), self.line, "nothing", expected, advice);
     }
 
     /// The table called `key`; an empty one where there is none.
@@ -286,11 +269,10 @@ impl<'a> Section<'a> {
             }
         });
         for (name, item) in table.iter().filter(|(name, _)| !asked.contains(name)) {
-            let span = table.key(name).and_then(|key| key.span()).or_else(|| item.span());
-            let line = self.reader.line_of(span).or(self.line);
-            let found = if item.is_table() { "an unknown table" } else { "an unknown key" };
+            let line = self.reader.source.line_of_key(table, name, item).or(self.line);
+            let expected = format!("one of {}", asked.join(", "));
             let advice = did_you_mean(name, &asked).unwrap_or("take it out".into());
-            self.reader.push(&self.path(name), line, found, &format!("one of {}", asked.join(", ")), advice);
+            self.reader.source.fault(self.path(name), line, describe_unknown(item), expected, advice);
         }
     }
 }
@@ -337,25 +319,4 @@ fn unescape(text: &str) -> Result<Vec<u8>, String> {
         });
     }
     Ok(bytes)
-}
-
-/// What stands in the file, short enough for one line.
-fn describe(item: &Item) -> String {
-    const SHOWN_MAX: usize = 60;
-    let text = item.to_string().split_whitespace().collect::<Vec<_>>().join(" ");
-    let shown: String = text.chars().take(SHOWN_MAX).collect();
-    let more = if shown.len() < text.len() { "..." } else { "" };
-    match item.type_name() {
-        kind @ ("array" | "integer") => format!("an {kind} {shown}{more}"),
-        "table" | "array of tables" => "a table".into(),
-        kind => format!("a {kind} {shown}{more}"),
-    }
-}
-
-/// Asks for the name that `given` was most likely meant to be.
-pub(super) fn did_you_mean(given: &str, names: &[&str]) -> Option<String> {
-    const ALIKE_MIN: f64 = 0.8;
-    let alike = |name: &&&str| strsim::jaro_winkler(given, name);
-    let best = names.iter().max_by(|a, b| alike(a).total_cmp(&alike(b)))?;
-    (alike(&best) >= ALIKE_MIN).then(|| format!("did you mean `{best}`?"))
 }

@@ -2,10 +2,11 @@
 
 use std::cell::RefCell;
 
+use holod_calibration::toml_source::did_you_mean;
 use toml_edit::Item;
 
 use super::parse::EYES;
-use super::reader::{Found, Reader, Section, did_you_mean};
+use super::reader::{Found, Reader, Section};
 use super::vendor::{read_iscan, read_livetrack, read_open_gaze, read_pupilext};
 use crate::SampleEye;
 use crate::import::SizeUnit;
