@@ -4,6 +4,7 @@
 //! seconds (`f64`) or nanoseconds (`i64`); a pupil is the one quantity kept in millimetres, as trackers and the
 //! literature give it.
 
+mod atomic_write;
 mod clock;
 mod geometry;
 mod level_tables;
@@ -11,6 +12,7 @@ pub mod rig;
 pub mod toml_source;
 mod units;
 
+pub use atomic_write::write_atomically;
 pub use clock::host_now;
 pub use geometry::DisplayGeometry;
 pub use level_tables::LevelTables;

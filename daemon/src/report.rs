@@ -6,7 +6,7 @@ use std::path::Path;
 use image::RgbImage;
 use serde::Serialize;
 
-use holod_model::files;
+use holod_calibration::write_atomically;
 
 use crate::failure::{Exit, Failure};
 use crate::logging;
@@ -51,7 +51,7 @@ pub fn print_json(value: &impl Serialize) -> Result<(), Failure> {
 /// Saves a value as JSON.
 pub fn save_json(value: &impl Serialize, path: &Path) -> Result<(), Failure> {
     let text = to_json(value)? + "\n";
-    files::write_atomically(path, text.as_bytes()).map_err(Failure::because(Exit::CannotCreate))
+    save(text.as_bytes(), path)
 }
 
 /// Saves a picture as PNG.
@@ -60,7 +60,12 @@ pub fn save_png(picture: &RgbImage, path: &Path) -> Result<(), Failure> {
     picture
         .write_to(&mut bytes, image::ImageFormat::Png)
         .map_err(|error| Failure::new(Exit::Software, format!("{}: {error}", path.display())))?;
-    files::write_atomically(path, bytes.get_ref()).map_err(Failure::because(Exit::CannotCreate))
+    save(bytes.get_ref(), path)
+}
+
+fn save(bytes: &[u8], path: &Path) -> Result<(), Failure> {
+    let cannot = |error| Failure::new(Exit::CannotCreate, format!("{}: {error}", path.display()));
+    write_atomically(path, |out| out.write_all(bytes)).map_err(cannot)
 }
 
 /// A value as JSON.

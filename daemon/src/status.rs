@@ -2,13 +2,13 @@
 //! end.
 
 use std::collections::VecDeque;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use holod_calibration::{TimeNs, host_now};
-use holod_model::files;
+use holod_calibration::{TimeNs, host_now, write_atomically};
 use serde::{Deserialize, Serialize};
 
 use crate::aside::{Queue, Taking, join_within};
@@ -94,9 +94,11 @@ fn write(newest: &Queue<Vec<u8>>, path: &Path) {
     let mut refuses = false;
     while newest.take(&mut taken, Taking::AtOnce) {
         let Some(bytes) = taken.back() else { continue };
-        let written = files::write_atomically(path, bytes);
+        let written = write_atomically(path, |out| out.write_all(bytes));
         match (&written, refuses) {
-            (Err(error), false) => tracing::warn!("`holod status` knows nothing new of this run: {error}"),
+            (Err(error), false) => {
+                tracing::warn!("`holod status` knows nothing new of this run: {}: {error}", path.display());
+            }
             (Ok(()), true) => tracing::info!("`holod status` knows of this run again"),
             _ => {}
         }

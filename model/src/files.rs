@@ -2,11 +2,12 @@
 
 use std::collections::HashMap;
 use std::f32::consts::TAU;
-use std::fs::File;
 use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 
-use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution};
+use holod_calibration::{
+    Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, write_atomically,
+};
 use image::{ImageBuffer, ImageFormat, Luma, PixelWithColorType, Rgb};
 use num_complex::Complex32;
 use safetensors::tensor::TensorView;
@@ -120,7 +121,7 @@ impl StoredHologram {
         let file = TensorView::new(Dtype::F32, vec![3, height, width, 2], &bytes)
             .and_then(|view| safetensors::serialize([("field", view)], Some(metadata)))
             .map_err(|error| content(error.to_string()))?;
-        write_atomically(path, &file)
+        write_bytes(path, &file)
     }
 
     /// Reads what [`Self::save`] wrote.
@@ -202,28 +203,9 @@ pub fn save_phase(pattern: &PhasePattern, colour: Colour, path: &Path) -> Result
     })
 }
 
-/// Writes `bytes` beside `path` and renames them into place.
-pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
+fn write_bytes(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
     let io = |source| FileError::Io { path: path.to_owned(), source };
-    let Some(name) = path.file_name() else {
-        return Err(FileError::Content {
-            path: path.to_owned(),
-            found: "no file name".into(),
-            expected: "a path that ends in one".into(),
-        });
-    };
-    let mut beside_name = std::ffi::OsString::from(".");
-    beside_name.push(name);
-    beside_name.push(format!(".{}.part", std::process::id()));
-    let beside = path.with_file_name(beside_name);
-    let written = File::create(&beside)
-        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
-        .and_then(|()| std::fs::rename(&beside, path));
-    if written.is_err() {
-        // Whatever there is of it is of no use; that it may not be there is no second error.
-        let _ = std::fs::remove_file(&beside);
-    }
-    written.map_err(io)
+    write_atomically(path, |out| out.write_all(bytes)).map_err(io)
 }
 
 fn save_png<P>(path: &Path, size: Resolution, pixel: impl Fn(usize, usize) -> P) -> Result<(), FileError>
@@ -242,7 +224,7 @@ where
     let picture = ImageBuffer::from_fn(width, height, |x, y| pixel(x as usize, y as usize));
     let mut bytes = Cursor::new(Vec::new());
     picture.write_to(&mut bytes, ImageFormat::Png).map_err(|error| content(error.to_string()))?;
-    write_atomically(path, bytes.get_ref())
+    write_bytes(path, bytes.get_ref())
 }
 
 #[cfg(test)]
@@ -313,15 +295,5 @@ mod tests {
         save_phase(&pattern, Colour::Blue, &path).unwrap();
         let read = image::open(&path).unwrap().into_luma16();
         assert_eq!([0, 1, 2, 3].map(|x| read.get_pixel(x, 0).0[0]), [16384, 32768, 0, 0]);
-    }
-
-    #[test]
-    fn a_failed_write_leaves_what_was_there() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("taken");
-        std::fs::create_dir(&path).unwrap();
-        assert!(matches!(write_atomically(&path, b"x"), Err(FileError::Io { .. })));
-        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
-        assert!(write_atomically(Path::new("/"), b"x").is_err());
     }
 }

@@ -34,10 +34,9 @@
 
 use std::io::{self, Read};
 
+use crc::{CRC_32_ISO_HDLC, Crc};
 use holod_calibration::TimeNs;
 use toml_edit::value;
-
-use super::crc32::crc32;
 
 /// What a recording begins with.
 pub(crate) const MAGIC: [u8; 8] = *b"HOLOD\x1a\r\n";
@@ -51,6 +50,12 @@ const LATEST: TimeNs = TimeNs(1 << 60);
 const MAX_HEADER_BYTES: usize = 1 << 20;
 /// A record's bytes before its payload.
 pub(crate) const RECORD_HEAD_BYTES: usize = 17;
+
+/// CRC-32 of Ethernet and zip.
+pub(crate) fn crc32(bytes: &[u8]) -> u32 {
+    static CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISO_HDLC);
+    CRC.checksum(bytes)
+}
 
 /// What a record tells.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -6,18 +6,15 @@
 //! since then and never the file.
 
 mod container;
-mod crc32;
 mod samples;
 mod writer;
 
 use std::path::{Path, PathBuf};
 
-#[cfg(fuzzing)]
-pub(crate) use container::RECORD_HEAD_BYTES;
 pub use container::with_header;
 pub(crate) use container::{Ending, Header, HeaderFault, Kind, MAGIC, RawReader};
 #[cfg(fuzzing)]
-pub(crate) use crc32::crc32;
+pub(crate) use container::{RECORD_HEAD_BYTES, crc32};
 pub(crate) use writer::{ROOM, Recorder, Taps, start};
 
 /// Where a run is written down.

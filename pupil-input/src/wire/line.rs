@@ -12,6 +12,7 @@
 
 use std::fmt::Write;
 
+use crc::{CRC_8_SMBUS, Crc};
 use holod_calibration::TimeNs;
 
 use super::{Decoder, WireEvent, WireFault, WireSample};
@@ -192,11 +193,10 @@ pub fn encode_line(sample: &LineSample, out: &mut String) {
     writeln!(out, "*{check:02X}").expect("a String takes all");
 }
 
-/// CRC-8, polynomial x^8 + x^2 + x + 1, initial value 0, nothing reflected (Koopman's 0x83).
+/// CRC-8/SMBUS: polynomial x^8 + x^2 + x + 1, initial value 0, nothing reflected (Koopman's 0x83).
 pub fn crc8(bytes: &[u8]) -> u8 {
-    bytes.iter().fold(0, |crc, &byte| {
-        (0..8).fold(crc ^ byte, |crc: u8, _| if crc & 0x80 == 0 { crc << 1 } else { (crc << 1) ^ 0x07 })
-    })
+    static CRC: Crc<u8> = Crc::<u8>::new(&CRC_8_SMBUS);
+    CRC.checksum(bytes)
 }
 
 #[cfg(test)]

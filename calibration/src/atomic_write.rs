@@ -1,0 +1,67 @@
+//! Files that are written whole or not at all.
+
+use std::ffi::OsString;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+/// Bytes written at a time.
+const BUFFER_BYTES: usize = 1 << 16;
+
+/// Writes a file beside its place, and moves it there when it is whole and on the disk: whoever looks sees all of it or what
+/// was there before.
+///
+/// # Errors
+/// The path names no file, `write` fails, or the system does; nothing is left of the file then.
+pub fn write_atomically(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
+    let name = path.file_name().ok_or_else(|| io::Error::other("it names no file"))?;
+    if path.is_dir() {
+        return Err(io::ErrorKind::IsADirectory.into());
+    }
+    let mut beside = OsString::from(".");
+    beside.push(name);
+    beside.push(format!(".{}.part", std::process::id()));
+    let beside = path.with_file_name(beside);
+    let written = write_synced(&beside, write).and_then(|()| fs::rename(&beside, path));
+    if written.is_err() {
+        // Whatever is left of it; that it was never there is no second error.
+        let _ = fs::remove_file(&beside);
+    }
+    written?;
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    // The file is in its place and whole; that a folder cannot be synced, as on some network disks, does not undo that.
+    let _ = File::open(folder).and_then(|folder| folder.sync_all());
+    Ok(())
+}
+
+fn write_synced(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
+    let file = OpenOptions::new().write(true).create(true).truncate(true).open(path)?;
+    let mut writer = BufWriter::with_capacity(BUFFER_BYTES, file);
+    write(&mut writer)?;
+    writer.into_inner().map_err(io::IntoInnerError::into_error)?.sync_all()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_failed_write_leaves_what_was_there_and_nothing_else() {
+        let dir = tempfile::TempDir::new().expect("a folder");
+        let path = dir.path().join("out.csv");
+        write_atomically(&path, |out| out.write_all(b"before")).expect("writes");
+        let failed = write_atomically(&path, |out| {
+            out.write_all(&[b'x'; 2 * BUFFER_BYTES])?;
+            Err(io::Error::other("no room"))
+        });
+        assert!(failed.expect_err("failed").to_string().contains("no room"));
+        assert_eq!(fs::read(&path).expect("reads"), b"before");
+        assert_eq!(fs::read_dir(dir.path()).expect("reads").count(), 1);
+        write_atomically(&path, |out| out.write_all(b"after")).expect("writes");
+        assert_eq!(fs::read(&path).expect("reads"), b"after");
+        for nowhere in [dir.path(), &dir.path().join("no/such/folder"), Path::new("/")] {
+            assert!(write_atomically(nowhere, |_| Ok(())).is_err(), "{}", nowhere.display());
+        }
+        assert_eq!(fs::read_dir(dir.path()).expect("reads").count(), 1);
+    }
+}
