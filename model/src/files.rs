@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::f32::consts::TAU;
-use std::io::{Cursor, Write};
+use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::{
