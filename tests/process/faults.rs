@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::io::{PipeReader, PipeWriter, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::Duration;
@@ -303,4 +303,49 @@ fn a_second_holod_on_a_tracker_is_refused_and_the_first_goes_on() {
     frames_go_on(folder.path());
     first.signal(Signal::TERM);
     assert!(first.wait(PATIENCE).status.success());
+}
+
+/// Gives a program a wall clock of its own, which a file sets.
+fn faked_wall_clock() -> PathBuf {
+    let folders = fs::read_dir("/usr/lib").unwrap();
+    let libraries = folders.map(|folder| folder.unwrap().path().join("faketime/libfaketimeMT.so.1"));
+    libraries.into_iter().find(|library| library.exists()).expect("this test needs Debian's package `libfaketime`")
+}
+
+#[test]
+fn a_wall_clock_that_is_set_is_seen_in_the_log_and_nowhere_else() {
+    let folder = bench();
+    let by = folder.path().join("by");
+    let set = |offset: &str| {
+        fs::write(folder.path().join("by.new"), offset).unwrap();
+        fs::rename(folder.path().join("by.new"), &by).unwrap();
+    };
+    set("+0d");
+    let library = faked_wall_clock();
+    let environment = [
+        ("XDG_RUNTIME_DIR", folder.path()),
+        ("LD_PRELOAD", &library),
+        ("FAKETIME_TIMESTAMP_FILE", &by),
+        ("FAKETIME_NO_CACHE", Path::new("1")),
+        ("FAKETIME_DONT_FAKE_MONOTONIC", Path::new("1")),
+    ];
+    let args = [&ARGS[..], &["--record", "record"]].concat();
+    let daemon = Daemon::start_with(HOLOD, &args, folder.path(), &environment);
+    frames_go_on(folder.path());
+    for offset in ["-30d", "+30d", "+0d"] {
+        set(offset);
+        let told = ask(folder.path(), &["ctl", "pupil", "4"]);
+        assert!(told.status.success(), "{told:?}");
+        frames_go_on(folder.path());
+        let text = ask(folder.path(), &["status"]);
+        assert!(text.stdout.starts_with("running") && !text.stderr.contains("its loop does not turn"), "{text:?}");
+    }
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(PATIENCE);
+    assert!(ended.status.success(), "{ended:?}");
+    let log = fs::read_to_string(folder.path().join("record/log.txt")).unwrap();
+    let days: Vec<_> = log.lines().filter(|line| line.contains("asked for")).map(|line| &line[..10]).collect();
+    assert!(matches!(days[..], [early, late, now] if early < now && now < late), "the clock is set: {log}");
+    let rows = frames::read(&folder.path().join("record/frames.csv")).unwrap();
+    assert_eq!(frames::faults(&rows, holod_tests::FIELD_ORDER), Vec::<String>::new());
 }
