@@ -5,8 +5,8 @@ use std::path::Path;
 use crate::import::raw::RawLog;
 use crate::record::{MAGIC, RECORD_HEAD_BYTES, crc32};
 use crate::wire::Decoder;
-use crate::wire::core::CoreDecoder;
 use crate::wire::neon::NeonDecoder;
+use crate::wire::pupil_labs_core::CoreDecoder;
 use crate::{Profile, ProfileError};
 
 /// The decoder of Pupil Labs Core's messages; each push is one.

@@ -45,10 +45,12 @@ mod refusals;
 mod sample;
 mod sequence;
 mod simulate;
+mod size_unit;
 pub mod source;
 mod spec;
 mod stamp;
 mod tracker;
+mod usb_ids;
 pub mod wire;
 
 pub use clock::{ClockModel, ClockReport};
@@ -60,13 +62,13 @@ pub use filter::FilterSettings;
 pub use gate::{GateSettings, Rejection, Verdict};
 pub use import::{
     Blink, BlinkCounts, EyeInfo, FaultCount, LogFault, LogFaults, LogFormat, LogInfo, Range, Recording, ReplayError,
-    SizeUnit,
 };
 pub use profile::{Command, DEFAULT_PROFILE, HidSettings, NetworkSettings, Profile, ProfileError, SerialSettings};
 pub use record::{RecordError, RecordFiles, RecordStatus, with_header};
 pub use refusals::{Refusal, RefusalChange, RefusalWatch};
 pub use sample::{PupilSample, SampleEye};
 pub use simulate::{MOCK_SEED, MockSample, MockSource, Scenario, Script, ScriptError};
+pub use size_unit::SizeUnit;
 
 pub use holod_calibration::host_now;
 pub use source::SourceError;
@@ -76,8 +78,9 @@ pub use source::serial::identity::{SerialPortInfo, UsbPort, serial_ports};
 pub use source::serial::{SerialError, serial_port_warnings};
 pub use source::server::ServerError;
 pub use source::tcp::NetworkError;
-pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec, UsbIds};
+pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec};
 pub use tracker::{
     ChangeError, DecisionTap, EstimateReader, Link, Tracker, TrackerControl, TrackerError, TrackerHandle,
     TrackerOptions, scaled_millimetres,
 };
+pub use usb_ids::UsbIds;

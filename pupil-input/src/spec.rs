@@ -4,8 +4,9 @@ use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use crate::profile::Profile;
+use crate::profile::{DEFAULT_BAUD, Profile};
 use crate::simulate::Scenario;
+use crate::usb_ids::UsbIds;
 
 /// A parsed tracker spec.
 #[derive(Clone, Debug, PartialEq)]
@@ -63,33 +64,6 @@ pub enum TrackerSpec {
     MockFile(PathBuf),
 }
 
-/// USB vendor and product.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct UsbIds {
-    /// Vendor.
-    pub vendor: u16,
-    /// Product.
-    pub product: u16,
-}
-
-impl fmt::Display for UsbIds {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:04x}:{:04x}", self.vendor, self.product)
-    }
-}
-
-impl FromStr for UsbIds {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let number = |part: &str| (part.len() <= 4).then(|| u16::from_str_radix(part, 16).ok()).flatten();
-        let ids = text.split_once(':').and_then(|(vendor, product)| number(vendor).zip(number(product)));
-        let (vendor, product) =
-            ids.ok_or_else(|| format!("`{text}` is no USB VID:PID, two hexadecimal numbers such as 1209:0001"))?;
-        Ok(Self { vendor, product })
-    }
-}
-
 /// A name or address of a host, and a port.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct HostPort {
@@ -123,8 +97,6 @@ pub struct SpecError {
     problem: String,
 }
 
-/// Bits a second where neither spec nor profile names any.
-pub(crate) const DEFAULT_BAUD: u32 = 115_200;
 /// Port of Pupil Remote.
 const CORE_PORT: u16 = 50020;
 /// Port of the Companion's REST interface.

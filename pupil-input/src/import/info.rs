@@ -17,7 +17,7 @@
 use holod_calibration::TimeNs;
 use serde::Serialize;
 
-use super::{Blink, Recording, Row};
+use super::recording::{Blink, Recording, Row};
 use crate::{GateSettings, SampleEye};
 
 const LEAST_CONFIDENCE: f32 = 0.6;
@@ -429,7 +429,8 @@ impl BlinkFinder {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::import::{GREATEST_NS, LogBuilder, LogFormat, LogSample};
+    use crate::import::format::LogFormat;
+    use crate::import::recording::{GREATEST_NS, LogBuilder, LogSample};
 
     /// 20 s at 200 Hz of 4 units; `at` makes of the time in milliseconds diameter, confidence, aperture and validity.
     fn info(at: impl Fn(i64) -> (f32, f32, Option<f32>, bool)) -> LogInfo {

@@ -3,7 +3,11 @@
 use crate::wire::line::LineDecoder;
 use crate::wire::{Decoder, WireEvent};
 
-use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError};
+use super::fault::{LogFault, ReplayError};
+use super::format::LogFormat;
+use super::importer::Importer;
+use super::input::LogInput;
+use super::recording::{LogBuilder, LogSample};
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Lines, recognises, read };
 

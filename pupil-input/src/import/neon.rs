@@ -12,8 +12,12 @@ use holod_calibration::TimeNs;
 
 use crate::SampleEye;
 
-use super::text::{Header, Picker, number, time};
-use super::{Blink, Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError};
+use super::fault::{LogFault, ReplayError};
+use super::format::LogFormat;
+use super::importer::Importer;
+use super::input::LogInput;
+use super::recording::{Blink, LogBuilder, LogSample};
+use super::text::{self, Header, Picker, number, time};
 
 pub(super) const CLOUD: Importer =
     Importer { format: LogFormat::NeonEyeStates, recognises: recognises_cloud, read: read_cloud };
@@ -67,7 +71,7 @@ fn read_cloud(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayEr
             let diameter = match diameters[index] {
                 None => Err(LogFault::Malformed),
                 Some(b"") => Ok(0.0),
-                Some(cell) => LogBuilder::diameter(cell),
+                Some(cell) => text::diameter(cell),
             };
             match diameter {
                 Err(fault) => log.count(fault),
@@ -221,9 +225,7 @@ fn read_native(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayE
             }
         }
     }
-    if let Some(source) = times_input.failure.take() {
-        return Err(times_input.io(source));
-    }
+    times_input.failed()?;
     let mut cut_off = [0; 1];
     if states.read(&mut cut_off).is_ok_and(|count| count > 0) {
         log.note("the file ends within a record: it is cut off; copy it again");

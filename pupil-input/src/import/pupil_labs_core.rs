@@ -6,8 +6,13 @@
 
 use crate::SampleEye;
 
+use super::fault::{LogFault, ReplayError};
+use super::format::LogFormat;
+use super::importer::Importer;
+use super::input::LogInput;
+use super::recording::{LogBuilder, LogSample};
 use super::text::{Header, Picker, number, time};
-use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError, SizeUnit};
+use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Core, recognises, read };
 

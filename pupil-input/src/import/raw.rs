@@ -6,7 +6,11 @@ use std::path::{Path, PathBuf};
 
 use holod_calibration::TimeNs;
 
-use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError};
+use super::fault::{LogFault, ReplayError};
+use super::format::LogFormat;
+use super::importer::Importer;
+use super::input::LogInput;
+use super::recording::{LogBuilder, LogSample};
 use crate::PupilSample;
 use crate::profile::Profile;
 use crate::record::{Ending, Header, HeaderFault, Kind, MAGIC, RawReader};

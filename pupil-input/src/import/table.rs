@@ -2,8 +2,10 @@
 
 use holod_calibration::TimeNs;
 
+use super::fault::{LogFault, ReplayError};
+use super::input::LogInput;
+use super::recording::{GREATEST_NS, LogBuilder};
 use super::text::{self, Lines};
-use super::{GREATEST_NS, LogBuilder, LogFault, LogInput, ReplayError};
 
 /// Columns of a table that are told apart; later ones are not looked at.
 const MAX_COLUMNS: usize = 1 << 14;
@@ -173,13 +175,6 @@ pub(super) fn ns_per_unit(unit: &str) -> Option<f64> {
         "ns" | "nsec" | "nanosecond" | "nanoseconds" => 1.0,
         _ => return None,
     })
-}
-
-/// The usual step of `times`: the median of those that are positive.
-pub(super) fn usual_step(times: &[f64]) -> Option<f64> {
-    let mut steps: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).filter(|step| *step > 0.0).collect();
-    steps.sort_by(f64::total_cmp);
-    steps.get(steps.len() / 2).copied()
 }
 
 #[cfg(test)]

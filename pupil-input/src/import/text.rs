@@ -4,7 +4,8 @@ use std::io::Read;
 
 use holod_calibration::TimeNs;
 
-use super::{LogBuilder, LogFault};
+use super::fault::LogFault;
+use super::recording::LogBuilder;
 
 /// A longer line is no line of any log: it is counted as [`LogFault::TooLong`] and never held.
 pub(crate) const MAX_LINE_BYTES: usize = 1 << 16;
@@ -235,6 +236,22 @@ pub(crate) fn time(text: &[u8], places: i32) -> Option<TimeNs> {
         (i128::from(digits) + unit / 2) / unit
     };
     i64::try_from(if negative { -ns } else { ns }).ok().map(TimeNs)
+}
+
+/// Reads a diameter's cell: a finite number that is not negative.
+pub(crate) fn diameter(cell: impl AsRef<[u8]>) -> Result<f32, LogFault> {
+    let cell = cell.as_ref();
+    if cell.is_empty() {
+        return Err(LogFault::Missing);
+    }
+    let diameter = number(cell).ok_or(LogFault::BadNumber)? as f32;
+    if !diameter.is_finite() {
+        Err(LogFault::NotFinite)
+    } else if diameter < 0.0 {
+        Err(LogFault::Negative)
+    } else {
+        Ok(diameter)
+    }
 }
 
 #[cfg(test)]

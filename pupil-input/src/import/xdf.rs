@@ -13,8 +13,13 @@ use roxmltree::{Document, Node, ParsingOptions};
 use crate::SampleEye;
 use crate::wire::WireFault;
 
+use super::fault::{LogFault, ReplayError};
+use super::format::LogFormat;
+use super::importer::Importer;
+use super::input::LogInput;
+use super::recording::{LogBuilder, LogSample};
 use super::table::ns_of;
-use super::{Importer, LogBuilder, LogFault, LogFormat, LogInput, LogSample, ReplayError, SizeUnit};
+use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Xdf, recognises, read };
 

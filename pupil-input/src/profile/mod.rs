@@ -2,10 +2,9 @@
 //!
 //! A profile is a TOML file. `profiles/README.md` in this crate describes every key; the files beside it are shipped.
 
+mod kinds;
 mod parse;
 mod reader;
-mod vendor;
-mod wire;
 
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
@@ -13,8 +12,8 @@ use std::time::Duration;
 
 use holod_calibration::toml_source::{Fault, did_you_mean};
 
-use crate::import::SizeUnit;
-use crate::spec::UsbIds;
+use crate::size_unit::SizeUnit;
+use crate::usb_ids::UsbIds;
 use crate::wire::hid_descriptor::DescriptorError;
 use crate::wire::{Decoder, Format};
 
@@ -121,6 +120,9 @@ fn in_words(faults: &[Fault]) -> String {
 
 /// The profile that a tracker spec means when it names none.
 pub const DEFAULT_PROFILE: &str = "holod";
+
+/// Bits a second where neither spec nor profile names any.
+pub(crate) const DEFAULT_BAUD: u32 = 115_200;
 
 /// By name.
 const FILES: [(&str, &str); 13] = [

@@ -4,12 +4,12 @@ use std::time::Duration;
 
 use holod_calibration::toml_source::Fault;
 
+use super::kinds::{Context, EYES, read_wire};
 use super::reader::{Found, Reader, Section};
-use super::wire::{Context, read_wire};
 use super::{Command, HidSettings, NetworkSettings, Profile, SerialSettings};
-use crate::SampleEye;
-use crate::import::SizeUnit;
-use crate::spec::{DEFAULT_BAUD, UsbIds};
+use crate::profile::DEFAULT_BAUD;
+use crate::size_unit::SizeUnit;
+use crate::usb_ids::UsbIds;
 use crate::wire::field::{SizeKind, SizeRule};
 
 /// What a profile's first key must say.
@@ -43,9 +43,6 @@ fn read(root: &Section<'_>) -> Option<Profile> {
     let (format, unit) = wire?;
     Some(Profile { name, about, unit, serial, hid, network, format })
 }
-
-pub(super) const EYES: [(&str, SampleEye); 3] =
-    [("left", SampleEye::Left), ("right", SampleEye::Right), ("both", SampleEye::Both)];
 
 fn read_serial(serial: &Section<'_>) -> SerialSettings {
     let baud = serial.integer("baud", 1..=i64::from(u32::MAX)).map_or(DEFAULT_BAUD, |baud| baud as u32);

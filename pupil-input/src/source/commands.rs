@@ -111,7 +111,7 @@ pub(crate) fn overhear(link: &mut dyn Dialogue, during: Duration) -> io::Result<
 }
 
 /// A link that was told to start. Dropping it tells it to stop.
-pub(crate) struct Told<L: Dialogue> {
+pub(crate) struct StartedLink<L: Dialogue> {
     link: L,
     /// What came behind the answer to the last command.
     pending: Vec<u8>,
@@ -119,7 +119,7 @@ pub(crate) struct Told<L: Dialogue> {
     gone: bool,
 }
 
-impl<L: Dialogue> Told<L> {
+impl<L: Dialogue> StartedLink<L> {
     /// Tells it to start.
     pub(crate) fn start(link: L, start: &[Command], stop: &[Command]) -> Result<Self, CommandError> {
         // From here on it is told to stop whatever happens.
@@ -129,7 +129,7 @@ impl<L: Dialogue> Told<L> {
     }
 }
 
-impl<L: Dialogue + Send> ByteSource for Told<L> {
+impl<L: Dialogue + Send> ByteSource for StartedLink<L> {
     fn read(&mut self, buffer: &mut [u8]) -> ReadEvent {
         if !self.pending.is_empty() {
             let count = self.pending.len().min(buffer.len());
@@ -148,7 +148,7 @@ impl<L: Dialogue + Send> ByteSource for Told<L> {
     }
 }
 
-impl<L: Dialogue> Drop for Told<L> {
+impl<L: Dialogue> Drop for StartedLink<L> {
     fn drop(&mut self) {
         if !self.gone {
             // Nobody is left to be told that it did not stop; the next start begins with the start commands again.

@@ -1,9 +1,9 @@
 //! Where bytes come from: one file for each kind of link, behind one trait.
 
 pub(crate) mod commands;
-pub(crate) mod core;
 pub(crate) mod hid;
 pub(crate) mod neon;
+pub(crate) mod pupil_labs_core;
 pub(crate) mod serial;
 pub(crate) mod server;
 pub(crate) mod tcp;

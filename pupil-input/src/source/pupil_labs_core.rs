@@ -15,7 +15,7 @@ use super::server::{OPEN_WITHIN, Server, ServerError, wait};
 use super::zmtp::Zmtp;
 use super::{ByteSource, Feed, READ_TIMEOUT, ReadEvent, SourceError};
 use crate::spec::HostPort;
-use crate::wire::core::{MAX_MESSAGE_BYTES, time_message};
+use crate::wire::pupil_labs_core::{MAX_MESSAGE_BYTES, time_message};
 
 /// All messages about pupils, of both eyes and both detectors.
 const SUBSCRIPTION: &[u8] = b"\x01pupil.";

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use rustix::net::sockopt;
 
-use super::commands::{CommandError, Dialogue, Told, hung_up};
+use super::commands::{CommandError, Dialogue, StartedLink, hung_up};
 use super::{ByteSource, Feed, READ_TIMEOUT, SourceError};
 use crate::profile::{NetworkSettings, Profile};
 use crate::spec::HostPort;
@@ -127,7 +127,7 @@ impl Feed for TcpFeed {
     fn open(&mut self) -> Result<Box<dyn ByteSource>, SourceError> {
         let stream = self.connect()?;
         let NetworkSettings { start, stop, .. } = &self.settings;
-        let told = Told::start(Connection(stream), start, stop).map_err(|problem| NetworkError::Command {
+        let told = StartedLink::start(Connection(stream), start, stop).map_err(|problem| NetworkError::Command {
             address: self.address.clone(),
             profile: self.profile.clone(),
             problem: Box::new(problem),

@@ -5,18 +5,20 @@ use std::path::{Path, PathBuf};
 use holod_calibration::TimeNs;
 
 use super::TrackerError;
+use crate::import::Recording;
 use crate::import::raw::RawLog;
-use crate::import::{Recording, SizeUnit};
 use crate::profile::{DEFAULT_PROFILE, Profile};
 use crate::simulate::Script;
-use crate::source::core::CoreFeed;
+use crate::size_unit::SizeUnit;
 use crate::source::hid::{self, HidFeed, Wanted};
 use crate::source::neon::NeonFeed;
+use crate::source::pupil_labs_core::CoreFeed;
 use crate::source::serial::SerialFeed;
 use crate::source::tcp::TcpFeed;
 use crate::source::udp::UdpFeed;
 use crate::source::{ByteSource, Feed, SourceError};
-use crate::spec::{ReplaySpeed, TrackerSpec, UsbIds};
+use crate::spec::{ReplaySpeed, TrackerSpec};
+use crate::usb_ids::UsbIds;
 use crate::wire::Format;
 
 /// What the thread is to do.

@@ -16,10 +16,11 @@ use self::worker::Worker;
 use crate::clock::{ClockGauge, ClockReport};
 use crate::counters::{CounterSnapshot, Counters};
 use crate::estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, StreamClock};
-use crate::import::{ReplayError, SizeUnit};
+use crate::import::ReplayError;
 use crate::profile::ProfileError;
 use crate::record::{self, Header, RecordError, RecordFiles, RecordStatus, Recorder};
 use crate::simulate::ScriptError;
+use crate::size_unit::SizeUnit;
 use crate::source::SourceError;
 use crate::spec::TrackerSpec;
 

@@ -4,7 +4,6 @@
 //! are the same; formats that come in messages (a HID report, a datagram) are pushed one message at a time instead.
 
 mod checksum;
-pub(crate) mod core;
 pub mod delimited;
 pub mod field;
 pub mod hid_descriptor;
@@ -14,6 +13,7 @@ pub mod livetrack;
 pub(crate) mod neon;
 pub mod open_gaze;
 pub mod packet;
+pub(crate) mod pupil_labs_core;
 pub mod pupilext;
 pub mod report;
 #[cfg(test)]
@@ -207,7 +207,7 @@ impl Format {
             Self::OpenGaze(settings) => Box::new(OpenGazeDecoder::new(*settings)),
             Self::PupilExt(settings) => Box::new(PupilExtDecoder::new(*settings)),
             Self::Usages(_) => Box::new(Undescribed),
-            Self::CoreMsgpack => Box::new(core::CoreDecoder),
+            Self::CoreMsgpack => Box::new(pupil_labs_core::CoreDecoder),
             Self::NeonRtp => Box::new(neon::NeonDecoder::new()),
         }
     }

@@ -1,10 +1,9 @@
 //! The `[wire]` of trackers whose formats are their makers'.
 
-use super::parse::EYES;
-use super::reader::Section;
-use super::wire::Context;
+use super::context::{Context, EYES};
 use crate::SampleEye;
-use crate::import::SizeUnit;
+use crate::profile::reader::{Found, Section};
+use crate::size_unit::SizeUnit;
 use crate::wire::Format;
 use crate::wire::field::SizeKind;
 use crate::wire::iscan::{IscanPupil, IscanSettings};
@@ -75,7 +74,7 @@ pub(super) fn read_livetrack(wire: &Section<'_>, context: &Context) -> Option<(F
     sizes.extend(table.integer("diameter", columns.clone()).map(|column| LiveTrackSize::Diameter(place(column))));
     if let Some(axes) = table.get("axes") {
         let items = reader.items(&axes, EXPECTED);
-        let axis = |item: &super::reader::Found<_>| reader.integer(&item.with(&item.value), columns.clone());
+        let axis = |item: &Found<_>| reader.integer(&item.with(&item.value), columns.clone());
         match items.iter().map(axis).collect::<Option<Vec<_>>>().as_deref() {
             Some([width, height]) => sizes.push(LiveTrackSize::Axes(place(*width), place(*height))),
             Some(other) => reader.fault(&axes, format!("{} columns", other.len()), EXPECTED, "name width and height"),
@@ -146,9 +145,9 @@ fn refuse_eye(wire: &Section<'_>, context: &Context) {
 #[cfg(test)]
 mod tests {
     use crate::SampleEye;
-    use crate::import::SizeUnit;
     use crate::profile::Profile;
     use crate::profile::parse::parse;
+    use crate::size_unit::SizeUnit;
     use crate::wire::testing::events_of;
     use crate::wire::{WireEvent, WireSample};
 

@@ -18,7 +18,7 @@ use select::{Candidate, Choice, Identity, either, in_words};
 
 use super::{ByteSource, Feed, READ_TIMEOUT, ReadEvent, SourceError};
 use crate::profile::{HidSettings, Profile};
-use crate::spec::UsbIds;
+use crate::usb_ids::UsbIds;
 use crate::wire::hid_descriptor::DescriptorError;
 
 /// Why a HID tracker could not be opened.

@@ -1,6 +1,6 @@
 //! The udev rule that lets a user read a tracker's hidraw node, which only root may by default.
 
-use crate::spec::UsbIds;
+use crate::usb_ids::UsbIds;
 
 /// Where the rule belongs. Its number lies before 73-seat-late.rules, which is what acts on `uaccess`.
 pub const RULE_FILE: &str = "/etc/udev/rules.d/61-holod-tracker-hid.rules";

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::path::PathBuf;
 
-use crate::spec::UsbIds;
+use crate::usb_ids::UsbIds;
 
 /// What tells a device from others, however often it is replugged.
 #[derive(Clone, Debug, PartialEq, Eq)]

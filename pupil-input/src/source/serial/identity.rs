@@ -5,7 +5,7 @@ use std::fmt;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::spec::UsbIds;
+use crate::usb_ids::UsbIds;
 
 /// A serial port.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use serialport::{ClearBuffer, SerialPort, TTYPort};
 
 use self::identity::{SerialPortInfo, UsbPort, ports_below, serial_ports};
-use super::commands::{CommandError, Dialogue, Told, hung_up, overhear};
+use super::commands::{CommandError, Dialogue, StartedLink, hung_up, overhear};
 use super::{ByteSource, Feed, READ_TIMEOUT, SourceError};
 use crate::profile::Profile;
 use crate::wire::line::crc8;
@@ -233,7 +233,7 @@ impl Feed for SerialFeed {
         if has_commands && !known {
             self.check_protocol(&path, &mut port)?;
         }
-        let port = Told::start(port, &serial.start, &serial.stop).map_err(|problem| SerialError::Command {
+        let port = StartedLink::start(port, &serial.start, &serial.stop).map_err(|problem| SerialError::Command {
             path: path.clone(),
             profile: name.clone(),
             problem: Box::new(problem),

@@ -1,0 +1,185 @@
+//! What is wrong with a log: as a whole, or with one line of it.
+
+use std::ops::AddAssign;
+use std::path::PathBuf;
+
+use crate::wire::WireFault;
+
+/// What went wrong with a log as a whole.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// It cannot be read.
+    #[error("pupil log {path}: {source}; expected a readable file")]
+    Io {
+        /// The log.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// It is a directory or a device.
+    #[error("pupil log {path} is {found}; expected a log file{hint}")]
+    NotAFile {
+        /// The path.
+        path: PathBuf,
+        /// What it is.
+        found: &'static str,
+        /// What to do.
+        hint: &'static str,
+    },
+    /// Its beginning is of no known format.
+    #[error("pupil log {path}, line 1: found {found}; expected one of: {formats}; convert the log to one of these")]
+    UnknownFormat {
+        /// The log.
+        path: PathBuf,
+        /// How it begins.
+        found: String,
+        /// The known formats.
+        formats: String,
+    },
+    /// It is of a known format and wrong as a whole.
+    #[error("pupil log {path}{at}: found {found}; expected {expected}")]
+    Content {
+        /// The log.
+        path: PathBuf,
+        /// `, line 7`, or nothing.
+        at: String,
+        /// What is there.
+        found: String,
+        /// What should be there, and what to do.
+        expected: String,
+    },
+    /// Not one sample could be read.
+    #[error(
+        "pupil log {path} holds no sample: {rejected} of its lines were rejected ({reasons}); expected at least one"
+    )]
+    Empty {
+        /// The log.
+        path: PathBuf,
+        /// Rejected lines.
+        rejected: u64,
+        /// How many for which reason.
+        reasons: String,
+    },
+    /// Its times are in no order.
+    #[error(
+        "pupil log {path} is not in order of time: {backwards} of {rows} times go backwards, the first in line {line}; \
+         sort it by time"
+    )]
+    Unsorted {
+        /// The log.
+        path: PathBuf,
+        /// Times that go backwards.
+        backwards: u64,
+        /// Times in all.
+        rows: u64,
+        /// Line of the first.
+        line: u64,
+    },
+}
+
+/// Why a line or a cell of a log was rejected.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum LogFault {
+    /// A message of a wire format with this fault.
+    Wire(WireFault),
+    /// A row that is too short or not text.
+    Malformed,
+    /// A line longer than any of a log.
+    TooLong,
+    /// The eye is none that the format knows.
+    BadEye,
+    /// Time or diameter is not a number.
+    BadNumber,
+    /// The diameter is missing.
+    Missing,
+    /// The diameter is NaN or infinite.
+    NotFinite,
+    /// The diameter is negative.
+    Negative,
+    /// The time lies before its predecessor's.
+    Backwards,
+}
+
+/// The names under which faults are counted, in the order of [`LogFault::index`].
+pub(crate) const LOG_FAULT_NAMES: [&str; 8 + WireFault::ALL.len()] = {
+    let mut names = [""; 8 + WireFault::ALL.len()];
+    let mut k = 0;
+    while k < WireFault::ALL.len() {
+        names[k] = WireFault::ALL[k].name();
+        k += 1;
+    }
+    names[k] = "log_malformed";
+    names[k + 1] = "log_bad_number";
+    names[k + 2] = "log_missing";
+    names[k + 3] = "log_not_finite";
+    names[k + 4] = "log_negative";
+    names[k + 5] = "log_backwards";
+    names[k + 6] = "log_too_long";
+    names[k + 7] = "log_bad_eye";
+    names
+};
+
+impl LogFault {
+    pub(crate) const fn index(self) -> usize {
+        let lines = WireFault::ALL.len();
+        match self {
+            Self::Wire(fault) => fault.index(),
+            Self::Malformed => lines,
+            Self::BadNumber => lines + 1,
+            Self::Missing => lines + 2,
+            Self::NotFinite => lines + 3,
+            Self::Negative => lines + 4,
+            Self::Backwards => lines + 5,
+            Self::TooLong => lines + 6,
+            Self::BadEye => lines + 7,
+        }
+    }
+}
+
+/// How many lines or cells of a log were rejected, by reason.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct LogFaults([u64; LOG_FAULT_NAMES.len()]);
+
+impl LogFaults {
+    /// How many were rejected for `fault`.
+    pub const fn of(&self, fault: LogFault) -> u64 {
+        self.0[fault.index()]
+    }
+
+    /// How many were rejected in all.
+    pub fn total(&self) -> u64 {
+        self.0.iter().sum()
+    }
+
+    /// Each reason's name and count.
+    pub fn entries(&self) -> impl Iterator<Item = (&'static str, u64)> {
+        LOG_FAULT_NAMES.into_iter().zip(self.0)
+    }
+
+    pub(crate) const fn count(&mut self, fault: LogFault) {
+        self.0[fault.index()] += 1;
+    }
+}
+
+impl AddAssign for LogFaults {
+    fn add_assign(&mut self, other: Self) {
+        for (count, more) in self.0.iter_mut().zip(other.0) {
+            *count += more;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+
+    #[test]
+    fn every_fault_has_a_name_of_its_own() {
+        assert_eq!(LOG_FAULT_NAMES.iter().collect::<HashSet<_>>().len(), LOG_FAULT_NAMES.len());
+        assert_eq!(LOG_FAULT_NAMES[LogFault::TooLong.index()], "log_too_long");
+        assert_eq!(LOG_FAULT_NAMES[LogFault::BadEye.index()], "log_bad_eye");
+        assert_eq!(LOG_FAULT_NAMES[LogFault::Malformed.index()], "log_malformed");
+    }
+}

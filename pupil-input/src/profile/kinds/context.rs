@@ -1,0 +1,20 @@
+//! What every kind of message is read with.
+
+use crate::SampleEye;
+use crate::profile::reader::Found;
+use crate::size_unit::SizeUnit;
+use crate::wire::field::SizeRule;
+
+/// The eyes, as profiles name them.
+pub(in crate::profile) const EYES: [(&str, SampleEye); 3] =
+    [("left", SampleEye::Left), ("right", SampleEye::Right), ("both", SampleEye::Both)];
+
+/// What the rest of the profile says about the figures on the wire.
+pub(in crate::profile) struct Context {
+    pub(in crate::profile) eye: Option<Found<SampleEye>>,
+    pub(in crate::profile) rate_hz: Option<f64>,
+    pub(in crate::profile) size: SizeRule,
+    pub(in crate::profile) unit: SizeUnit,
+    /// Where `[size]` is.
+    pub(in crate::profile) size_at: Option<Found<()>>,
+}

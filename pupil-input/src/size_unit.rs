@@ -1,0 +1,24 @@
+//! What the figures of trackers and logs are.
+
+/// What a tracker's figures are, before the rig's scale.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum SizeUnit {
+    /// Diameters in millimetres.
+    #[default]
+    Millimetres,
+    /// Diameters in pixels of the eye camera.
+    Pixels,
+    /// Diameters in units of the tracker's own; an area A is given as the diameter 2·√(A/π) of its disc.
+    Arbitrary,
+}
+
+impl SizeUnit {
+    /// Its name for people.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Millimetres => "mm",
+            Self::Pixels => "camera pixels",
+            Self::Arbitrary => "arbitrary units",
+        }
+    }
+}
