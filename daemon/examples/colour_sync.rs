@@ -15,7 +15,7 @@ use holod_daemon::cli::Backend;
 use holod_daemon::exposure::{Exposure, PatternOnPanel};
 use holod_daemon::failure::{Exit, Failure};
 use holod_daemon::pictures::{Sheet, Tile, screen_picture};
-use holod_daemon::report;
+use holod_daemon::results;
 use holod_daemon::session::{self, Observer, SessionPlan};
 use holod_daemon::source::Pictures;
 use holod_daemon::source::scene::{self, Frames};
@@ -121,5 +121,5 @@ fn run(out: &Path) -> Result<(), Failure> {
     };
     let tiles = vec![tile("in step", TimeNs(0)), tile("lasers one field late", field)];
     let sheet = Sheet { title: "One colour frame".into(), rows: vec![tiles], footer: Vec::new() };
-    report::save_png(&sheet.draw(), out)
+    results::save_png(&sheet.draw(), out)
 }

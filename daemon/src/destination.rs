@@ -5,7 +5,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use crate::failure::{Exit, Failure};
-use crate::report;
+use crate::results;
 
 /// A file, or standard output where `-` is named.
 #[derive(Debug)]
@@ -53,7 +53,7 @@ impl Destination {
                 write(&path)?;
                 let copied = File::open(&path).and_then(|mut file| io::copy(&mut file, &mut io::stdout().lock()));
                 match copied {
-                    Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(report::stdout_failure(&error)),
+                    Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(results::stdout_failure(&error)),
                     _ => Ok(()),
                 }
             }

@@ -20,7 +20,7 @@ use crate::failure::{Exit, Failure};
 use crate::source::PictureTag;
 
 use self::health::lost;
-pub use self::health::{RecordHealth, RecordStand, RecordState};
+pub use self::health::{RecordCondition, RecordHealth, RecordState};
 pub use self::recorder::{LOG, ORDER_FILES, OrderSource, RUN, Recorder, RunFacts};
 pub use self::sources::{
     BENCH, Hashed, RIG, SCENE, SceneSource, SourceFile, content_xxh3, hash_text, is_of_bench, is_weights,

@@ -6,6 +6,7 @@ use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_calibration::{DisplayGeometry, PupilDiameter};
 use holod_model::Weights;
 use holod_model::conditions::BenchFit;
+use holod_pupil_input::{ReplayError, SourceError, TrackerError};
 
 use crate::cli::{NetworkArgs, RigArgs};
 use crate::failure::{Exit, Failure};
@@ -83,4 +84,20 @@ pub fn weights_name(weights: &WeightsChoice) -> String {
 /// Ports that belong to something else than the tracker: the laser box's.
 pub fn ports_of_others(rig: &Rig) -> Vec<PathBuf> {
     rig.lasers.driver.paths().into_iter().map(Path::to_path_buf).collect()
+}
+
+/// The exit code of a tracker that cannot be started.
+pub(crate) fn tracker_failure(error: TrackerError) -> Failure {
+    let exit = match &error {
+        TrackerError::Source(SourceError::Serial(_)) => Exit::NoInput,
+        TrackerError::Source(_) => Exit::Unavailable,
+        TrackerError::Profile(_) | TrackerError::WrongLink { .. } => Exit::Usage,
+        TrackerError::Replay(ReplayError::Io { .. }) => Exit::NoInput,
+        TrackerError::Replay(_) => Exit::Data,
+        TrackerError::Script(_) => Exit::Data,
+        TrackerError::Record(_) => Exit::CannotCreate,
+        TrackerError::NoScale { .. } => Exit::Config,
+        TrackerError::Thread(_) => Exit::Unavailable,
+    };
+    Failure::because(exit)(error)
 }

@@ -6,8 +6,8 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::record::RecordState;
-use crate::session::Spread;
 use crate::source::feed::FeedStatus;
+use crate::spread::Spread;
 
 /// What holds of a run that goes on and of one that is over alike.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]

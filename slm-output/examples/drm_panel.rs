@@ -29,7 +29,7 @@ use holod_calibration::rig::{Panel, PanelMode, Rig};
 use holod_calibration::{Colour, Resolution, TimeNs, host_now};
 use holod_slm_output::fields::FrameTag;
 use holod_slm_output::present::drm::{DrmPanel, DrmTarget, Verdict};
-use holod_slm_output::present::{FrameSink, PanelSetup, PresentedRefresh, Presenter, Provenance, frame_channel};
+use holod_slm_output::present::{FrameSink, PanelSetup, PresentedRefresh, Presenter, TimestampSource, frame_channel};
 use holod_slm_output::{FrameLayout, LevelsFrame};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use serde_json::json;
@@ -344,7 +344,7 @@ fn sleep_until(presenter: &DrmPanel) -> io::Result<()> {
 
 fn report(notes: &mut Notes, presenter: &DrmPanel, layout: FrameLayout) {
     // The first refreshes are those that make the clock believed.
-    let begin = notes.refreshes.iter().position(|refresh| refresh.provenance == Provenance::Hardware).unwrap_or(0);
+    let begin = notes.refreshes.iter().position(|refresh| refresh.provenance == TimestampSource::Hardware).unwrap_or(0);
     let believed = &notes.refreshes[begin..];
     let pairs = || believed.windows(2).map(|pair| (&pair[0], &pair[1]));
     let intervals_us = || pairs().map(|(a, b)| (b.t_present - a.t_present).0 / 1000);
@@ -363,7 +363,7 @@ fn report(notes: &mut Notes, presenter: &DrmPanel, layout: FrameLayout) {
     tell(&json!({
         "refreshes": notes.refreshes.len(),
         "before_believed": begin,
-        "hardware": believed.iter().filter(|refresh| refresh.provenance == Provenance::Hardware).count(),
+        "hardware": believed.iter().filter(|refresh| refresh.provenance == TimestampSource::Hardware).count(),
         "repeated": believed.iter().filter(|refresh| refresh.repeated).count(),
         "not_counted_on_by_one": pairs().filter(|(a, b)| !counted(a, b)).count(),
         "not_the_next_field_of_the_next_frame": pairs().filter(|(a, b)| !follows(a, b)).count(),

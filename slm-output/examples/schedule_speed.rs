@@ -15,7 +15,7 @@ use holod_slm_output::laser::{BoxEvent, Capability, DarkReason, LaserBox, LaserE
 use holod_slm_output::output::{Output, OutputOptions, pacing_config};
 use holod_slm_output::present::{PanelSetup, PresentedRefresh, open_panel};
 use holod_slm_output::schedule::{Evidence, FieldScheduler};
-use holod_slm_output::{FrameLayout, Pacer, PanelEncoder, Provenance};
+use holod_slm_output::{FrameLayout, Pacer, PanelEncoder, TimestampSource};
 
 const SIZE: Resolution = Resolution { width: 8, height: 8 };
 const REFRESHES: i64 = 1_000_000;
@@ -59,7 +59,7 @@ fn decisions(rig: &Rig) -> (i64, f64) {
             field: index as usize % layout.refreshes() * layout.fields_per_refresh(),
             repeated: false,
             t_present,
-            provenance: Provenance::Hardware,
+            provenance: TimestampSource::Hardware,
             refresh_count: Some(index as u64),
         };
         scheduler.on_refresh(&refresh);

@@ -21,4 +21,4 @@ pub use fields::{ColourField, FrameLayout, LevelsFrame};
 pub use levels::{EncodeReport, PanelEncoder};
 pub use output::{FieldEvent, FramePort, Output, OutputControl, OutputOptions, PanelEvent};
 pub use pacing::{FramePlan, Pacer};
-pub use present::{OutputSpec, Presenter, Provenance};
+pub use present::{OutputSpec, Presenter, TimestampSource};

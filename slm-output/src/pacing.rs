@@ -8,7 +8,7 @@
 
 use holod_calibration::TimeNs;
 
-use crate::present::Provenance;
+use crate::present::TimestampSource;
 
 /// Frames that are remembered until the panel reports them.
 const SLOTS: usize = 16;
@@ -198,7 +198,7 @@ impl Pacer {
 
     /// The panel says that `frame_id` was first shown at `t_present`. Reports may come late, early, twice, in any order,
     /// or with a time of zero.
-    pub fn report(&mut self, frame_id: u64, t_present: TimeNs, provenance: Provenance) -> Outcome {
+    pub fn report(&mut self, frame_id: u64, t_present: TimeNs, provenance: TimestampSource) -> Outcome {
         let Some(slot) = self.slots[slot_index(frame_id)]
             .as_mut()
             .filter(|slot| slot.frame_id == frame_id && slot.t_submit.is_some() && !slot.reported)
@@ -216,7 +216,7 @@ impl Pacer {
         slot.reported = true;
         let late_ns = t_present.0 - slot.t_desired_present.0;
         self.counts.presented += 1;
-        if provenance != Provenance::Estimated && self.clock.observe(t_present) {
+        if provenance != TimestampSource::Estimated && self.clock.observe(t_present) {
             self.counts.resyncs += 1;
         }
         let refreshes = (late_ns as f64 / self.clock.period_ns).round();
@@ -228,9 +228,9 @@ impl Pacer {
     }
 
     /// The panel refreshed at `t_refresh` with whatever it had: keeps its clock true while frames are rare.
-    pub fn observe_refresh(&mut self, t_refresh: TimeNs, provenance: Provenance) {
+    pub fn observe_refresh(&mut self, t_refresh: TimeNs, provenance: TimestampSource) {
         let possible = t_refresh > TimeNs(0) && t_refresh.0 < i64::MAX / 4;
-        if provenance != Provenance::Estimated && possible && self.clock.observe(t_refresh) {
+        if provenance != TimestampSource::Estimated && possible && self.clock.observe(t_refresh) {
             self.counts.resyncs += 1;
         }
     }
@@ -454,8 +454,10 @@ mod tests {
                     && t_present.0 + self.report_delay_ns <= now.0
                 {
                     reports.pop_front();
-                    ran.missed +=
-                        u64::from(matches!(pacer.report(id, t_present, Provenance::Hardware), Outcome::Missed { .. }));
+                    ran.missed += u64::from(matches!(
+                        pacer.report(id, t_present, TimestampSource::Hardware),
+                        Outcome::Missed { .. }
+                    ));
                 }
                 let plan = pacer.predict(now);
                 assert!(plan.t_wake >= now && plan.t_desired_present > plan.t_wake);
@@ -548,7 +550,7 @@ mod tests {
             let refresh = (now.0 as f64 / REFRESH.0 as f64).ceil() as i64;
             submitted.push(refresh);
             // Shown at the next refresh, whatever refresh it was made for.
-            pacer.report(plan.frame_id, TimeNs(refresh * REFRESH.0), Provenance::Hardware);
+            pacer.report(plan.frame_id, TimeNs(refresh * REFRESH.0), TimestampSource::Hardware);
         }
         submitted.windows(2).map(|pair| pair[1] - pair[0]).collect()
     }
@@ -581,11 +583,11 @@ mod tests {
     #[test]
     fn frames_that_take_longer_than_planned_are_missed_and_counted() {
         let mut pacer = Pacer::new(config(), TimeNs(0));
-        pacer.observe_refresh(TimeNs(MS), Provenance::Hardware);
+        pacer.observe_refresh(TimeNs(MS), TimestampSource::Hardware);
         let plan = pacer.predict(TimeNs(2 * MS));
         pacer.mark(Point::Submit, plan.frame_id, plan.t_desired_present + TimeNs(MS));
         let shown = plan.t_desired_present + REFRESH;
-        assert_eq!(pacer.report(plan.frame_id, shown, Provenance::Hardware), Outcome::Missed { refreshes: 1 });
+        assert_eq!(pacer.report(plan.frame_id, shown, TimestampSource::Hardware), Outcome::Missed { refreshes: 1 });
         assert_eq!(pacer.counts().missed, 1);
     }
 
@@ -594,14 +596,18 @@ mod tests {
         let mut pacer = Pacer::new(config(), TimeNs(0));
         let plan = pacer.predict(TimeNs(MS));
         let id = plan.frame_id;
-        assert_eq!(pacer.report(id, plan.t_desired_present, Provenance::Hardware), Outcome::Unknown, "not submitted");
+        assert_eq!(
+            pacer.report(id, plan.t_desired_present, TimestampSource::Hardware),
+            Outcome::Unknown,
+            "not submitted"
+        );
         pacer.mark(Point::Submit, id, plan.t_wake + TimeNs(5 * MS));
-        assert_eq!(pacer.report(id + 1, plan.t_desired_present, Provenance::Hardware), Outcome::Unknown);
-        assert_eq!(pacer.report(id, TimeNs(0), Provenance::Hardware), Outcome::Implausible);
-        assert_eq!(pacer.report(id, TimeNs(i64::MAX), Provenance::Hardware), Outcome::Implausible);
-        assert_eq!(pacer.report(id, plan.t_wake - REFRESH, Provenance::Hardware), Outcome::Implausible);
-        assert_eq!(pacer.report(id, plan.t_desired_present, Provenance::Hardware), Outcome::OnTime);
-        assert_eq!(pacer.report(id, plan.t_desired_present + REFRESH, Provenance::Hardware), Outcome::Unknown);
+        assert_eq!(pacer.report(id + 1, plan.t_desired_present, TimestampSource::Hardware), Outcome::Unknown);
+        assert_eq!(pacer.report(id, TimeNs(0), TimestampSource::Hardware), Outcome::Implausible);
+        assert_eq!(pacer.report(id, TimeNs(i64::MAX), TimestampSource::Hardware), Outcome::Implausible);
+        assert_eq!(pacer.report(id, plan.t_wake - REFRESH, TimestampSource::Hardware), Outcome::Implausible);
+        assert_eq!(pacer.report(id, plan.t_desired_present, TimestampSource::Hardware), Outcome::OnTime);
+        assert_eq!(pacer.report(id, plan.t_desired_present + REFRESH, TimestampSource::Hardware), Outcome::Unknown);
         let counts = pacer.counts();
         assert_eq!((counts.unknown_reports, counts.implausible_reports, counts.missed), (3, 3, 0));
     }
@@ -610,18 +616,18 @@ mod tests {
     fn a_guess_does_not_move_the_clock() {
         let mut pacer = Pacer::new(config(), TimeNs(0));
         let before = pacer.clone().predict(TimeNs(MS));
-        pacer.observe_refresh(TimeNs(7 * MS), Provenance::Estimated);
+        pacer.observe_refresh(TimeNs(7 * MS), TimestampSource::Estimated);
         assert_eq!(pacer.clone().predict(TimeNs(MS)), before);
-        pacer.observe_refresh(TimeNs(7 * MS), Provenance::External);
+        pacer.observe_refresh(TimeNs(7 * MS), TimestampSource::External);
         assert_ne!(pacer.predict(TimeNs(MS)), before);
     }
 
     #[test]
     fn a_panel_that_jumps_is_found_again() {
         let mut pacer = Pacer::new(config(), TimeNs(0));
-        pacer.observe_refresh(TimeNs(MS), Provenance::Hardware);
+        pacer.observe_refresh(TimeNs(MS), TimestampSource::Hardware);
         for refresh in 1..=8 {
-            pacer.observe_refresh(TimeNs(9 * MS + refresh * REFRESH.0), Provenance::Hardware);
+            pacer.observe_refresh(TimeNs(9 * MS + refresh * REFRESH.0), TimestampSource::Hardware);
         }
         assert_eq!(pacer.counts().resyncs, 1);
         let plan = pacer.predict(TimeNs(200 * MS));
@@ -639,15 +645,18 @@ mod tests {
     enum Step {
         Predict { later_ns: i64 },
         Mark { back: u64, later_ns: i64 },
-        Report { back: u64, t_ns: i64, provenance: Provenance },
+        Report { back: u64, t_ns: i64, provenance: TimestampSource },
         Refresh { t_ns: i64 },
     }
 
     fn steps() -> impl Strategy<Value = Step> {
         let odd_times =
             prop_oneof![Just(0), Just(-1), Just(i64::MAX), Just(i64::MIN), 0i64..2_000_000_000, any::<i64>()];
-        let provenance =
-            prop_oneof![Just(Provenance::Hardware), Just(Provenance::Software), Just(Provenance::Estimated)];
+        let provenance = prop_oneof![
+            Just(TimestampSource::Hardware),
+            Just(TimestampSource::Software),
+            Just(TimestampSource::Estimated)
+        ];
         prop_oneof![
             4 => (0i64..40 * MS).prop_map(|later_ns| Step::Predict { later_ns }),
             4 => (0u64..20, 0i64..60 * MS).prop_map(|(back, later_ns)| Step::Mark { back, later_ns }),
@@ -691,7 +700,7 @@ mod tests {
                         let id = last.map_or(0, |last| last.frame_id).wrapping_sub(back);
                         pacer.report(id, TimeNs(t_ns), provenance);
                     }
-                    Step::Refresh { t_ns } => pacer.observe_refresh(TimeNs(t_ns), Provenance::Hardware),
+                    Step::Refresh { t_ns } => pacer.observe_refresh(TimeNs(t_ns), TimestampSource::Hardware),
                 }
             }
         }

@@ -23,7 +23,7 @@ use holod_slm_output::laser::{
 use holod_slm_output::output::{FieldEvent, Output, OutputOptions, pacing_config};
 use holod_slm_output::pacing::{Pacer, Point};
 use holod_slm_output::present::{PanelSetup, open_panel};
-use holod_slm_output::schedule::Gate;
+use holod_slm_output::schedule::FieldGate;
 use proptest::prelude::*;
 
 const MS: i64 = 1_000_000;
@@ -137,7 +137,7 @@ fn edges(events: &[BoxEvent]) -> Vec<LaserEdge> {
 }
 
 fn program(rig: &Rig) -> LaserProgram {
-    Gate::new(&rig.panel, &rig.lasers).unwrap().program(&rig.panel, &rig.lasers).unwrap()
+    FieldGate::new(&rig.panel, &rig.lasers).unwrap().program(&rig.panel, &rig.lasers).unwrap()
 }
 
 fn rig(mode: PanelMode, port: &Path) -> Rig {

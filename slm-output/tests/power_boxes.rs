@@ -14,7 +14,7 @@ use holod_calibration::{Colour, PerColour, TimeNs, host_now};
 use holod_slm_output::laser::{
     BoxEvent, DarkReason, LaserBox, LaserError, LaserProgram, Refusal, make_dark, open_laser,
 };
-use holod_slm_output::schedule::Gate;
+use holod_slm_output::schedule::FieldGate;
 use serialport::{SerialPort, TTYPort};
 
 const MS: i64 = 1_000_000;
@@ -206,7 +206,7 @@ fn program(mode: PanelMode) -> LaserProgram {
     let mut rig = Rig::default();
     rig.panel.mode = mode;
     rig.lasers.heartbeat_timeout = TimeNs(150 * MS);
-    Gate::new(&rig.panel, &rig.lasers).unwrap().program(&rig.panel, &rig.lasers).unwrap()
+    FieldGate::new(&rig.panel, &rig.lasers).unwrap().program(&rig.panel, &rig.lasers).unwrap()
 }
 
 const GREEN: PanelMode = PanelMode::Monochrome(Colour::Green);

@@ -655,7 +655,7 @@ impl Outcome {
 #[cfg(test)]
 mod tests {
     use holod_calibration::PupilDiameter;
-    use holod_slm_output::Provenance;
+    use holod_slm_output::TimestampSource;
 
     use super::*;
     use crate::record::FrameOrders;
@@ -736,7 +736,7 @@ mod tests {
             t_present: TimeNs(1),
             t_settled: TimeNs(2),
             t_end: TimeNs(3),
-            provenance: Provenance::Software,
+            provenance: TimestampSource::Software,
             laser_on: None,
             laser_off: None,
             dark: None,

@@ -16,11 +16,12 @@ use serde::Serialize;
 
 use crate::cli::{BenchArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
-use crate::session::{self, Observer, SessionPlan, Spread, Summary};
+use crate::session::{self, Observer, SessionPlan, Summary};
 use crate::snapshot::Figures;
 use crate::source::feed::cost::{self, FeedCost};
 use crate::source::{Pictures, scene};
-use crate::{progress, renderer, report, setup};
+use crate::spread::Spread;
+use crate::{progress, renderer, results, run_text, setup};
 
 /// How often the memory's bandwidth is measured before the frames, and again after them: between them, it would empty
 /// the caches.
@@ -119,7 +120,7 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), Failure> {
         let load = load();
         let measure = || cost::measure(resolution, args.repeat).map_err(Failure::because(Exit::Unavailable));
         let report = FeedReport::new(resolution, &progress::during("timing pictures", measure)?, load);
-        return if args.json { report::print_json(&report) } else { report::print(&report.text()) };
+        return if args.json { results::print_json(&report) } else { results::print(&report.text()) };
     }
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let weights = setup::weights(&rig)?;
@@ -130,7 +131,7 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), Failure> {
     if !args.duration.is_zero() {
         report.closed_loop = Some(closed_loop(args, rig, weights, frames)?);
     }
-    if args.json { report::print_json(&report) } else { report::print(&table(&report)) }
+    if args.json { results::print_json(&report) } else { results::print(&table(&report)) }
 }
 
 /// The load of the last minute, where the kernel tells it.
@@ -369,8 +370,8 @@ fn table(report: &Report) -> String {
             "\nclosed loop, a simulated eye and a virtual panel, {duration_s:.1} s: {frames_shown} frames shown, \
              {frames_shown_hz:.1} a second of the panel's {panel_frames_hz:.1}\n\
              time per frame {}; tracker sample to photons {}\n",
-            report::spread_text(*frame_time),
-            report::spread_text(*sample_to_photon)
+            run_text::spread_text(*frame_time),
+            run_text::spread_text(*sample_to_photon)
         )
         .expect(GROWS);
     }

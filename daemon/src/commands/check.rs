@@ -19,7 +19,7 @@ use crate::cli::CheckArgs;
 use crate::failure::{Exit, Failure};
 use crate::source::scene;
 use crate::speed::{self, Estimate};
-use crate::{progress, report, setup};
+use crate::{progress, results, setup};
 
 #[derive(Serialize)]
 struct Findings {
@@ -56,7 +56,7 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
     checks.extend(output::panel(&rig, output.as_ref()));
     let findings = Findings { ready: checks.iter().all(|check| check.passed), checks, meaning: rig.meaning() };
     if args.json {
-        report::print_json(&findings)?;
+        results::print_json(&findings)?;
     } else {
         let mut text = findings.meaning.to_string();
         text.push_str("\n\nChecks\n");
@@ -68,7 +68,7 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
                 check.says
             ));
         }
-        report::print(text.trim_end())?;
+        results::print(text.trim_end())?;
     }
     let failed: Vec<&str> = findings.checks.iter().filter(|c| !c.passed).map(|c| c.says.as_str()).collect();
     if failed.is_empty() {

@@ -8,7 +8,7 @@ use holod_calibration::rig::WeightsChoice;
 use crate::cli::{CtlArgs, CtlOrder, LasersArg, PupilOrder};
 use crate::control::{Request, ask};
 use crate::failure::{Exit, Failure};
-use crate::report;
+use crate::results;
 use crate::setup;
 use crate::status;
 
@@ -19,8 +19,8 @@ pub(super) fn ctl(args: &CtlArgs) -> Result<(), Failure> {
     };
     let answer = ask(&socket, &request(&args.order)?)?;
     match answer {
-        serde_json::Value::String(said) => report::print(&said),
-        other => report::print_json(&other),
+        serde_json::Value::String(said) => results::print(&said),
+        other => results::print_json(&other),
     }
 }
 

@@ -19,7 +19,7 @@ use crate::record::{FieldRecord, FrameLog, FrameRecord};
 use crate::session::{self, Observer, SessionPlan, SessionReport};
 use crate::source::{Pictures, scene};
 use crate::staging::Staging;
-use crate::{logging, progress, report, setup};
+use crate::{logging, progress, results, run_text, setup};
 
 /// Where the sample scene's two text cards stand.
 const NEAR: Dioptres = Dioptres(2.5);
@@ -95,19 +95,19 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
         };
         [narrow, wide].into_iter().flat_map(of_frame).collect()
     });
-    report::save_png(&eye_sheet(&views).draw(), &staging.path("eye.png"))?;
+    results::save_png(&eye_sheet(&views).draw(), &staging.path("eye.png"))?;
     let pattern = shown_pattern(&session.encoder, &wide.1);
     for colour in Colour::ALL {
-        report::save_png(&phase_picture(&pattern, colour), &staging.path(&format!("phase_{colour}.png")))?;
+        results::save_png(&phase_picture(&pattern, colour), &staging.path(&format!("phase_{colour}.png")))?;
     }
     log.pupil_plot(&session, &staging)?;
     log.latency_plot(&session, &staging)?;
-    report::save_json(&session.summary, &staging.path("summary.json"))?;
+    results::save_json(&session.summary, &staging.path("summary.json"))?;
     let text = summary_text(&session, &views);
     std::fs::write(staging.path("summary.txt"), format!("{text}\n")).map_err(Failure::because(Exit::CannotCreate))?;
     staging.commit()?;
-    report::print(&text)?;
-    report::print(&format!("\nThe pictures are in {}; begin with eye.png.", out.display()))
+    results::print(&text)?;
+    results::print(&format!("\nThe pictures are in {}; begin with eye.png.", out.display()))
 }
 
 /// `holod-demo`, or the first of `holod-demo-2` and so on that is not there yet.
@@ -191,7 +191,7 @@ fn summary_text(session: &SessionReport, views: &[EyeView]) -> String {
          latency.svg                 what each frame cost\n\
          frames.csv, summary.json    the record of every colour field, and the numbers of the run\n\n\
          Sharpness of the two text cards (gradient energy; larger is sharper):\n{table}\n{}",
-        report::summary_text(&session.summary)
+        run_text::summary_text(&session.summary)
     )
 }
 

@@ -11,7 +11,7 @@ use crate::evaluation::{
 use crate::failure::Failure;
 use crate::pictures::{Sheet, Tile, screen_picture};
 use crate::staging::Staging;
-use crate::{report, setup};
+use crate::{results, setup};
 
 /// Scenes on the sheet.
 const SHEET_SCENES: usize = 2;
@@ -39,12 +39,12 @@ pub(super) fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
     })?;
     progress.finish_and_clear();
     if let Some(staging) = staging {
-        report::save_json(&evaluation, &staging.path("evaluation.json"))?;
+        results::save_json(&evaluation, &staging.path("evaluation.json"))?;
         let sheet = sheet(&evaluation, &pupils, &scene_views, &card_views);
-        report::save_png(&sheet.draw(), &staging.path("sheet.png"))?;
+        results::save_png(&sheet.draw(), &staging.path("sheet.png"))?;
         staging.commit()?;
     }
-    if args.json { report::print_json(&evaluation) } else { report::print(&table(&evaluation)) }
+    if args.json { results::print_json(&evaluation) } else { results::print(&table(&evaluation)) }
 }
 
 fn progress_bar(scenes: usize) -> ProgressBar {

@@ -9,11 +9,11 @@ use holod_slm_output::laser::{
     BoxEvent, BoxReport, DarkReason, LaserBox, LaserError, LaserProgram, SerialBox, SerialOptions, Trigger, make_dark,
     open_laser,
 };
-use holod_slm_output::schedule::Gate;
+use holod_slm_output::schedule::FieldGate;
 
 use crate::cli::{LaserArgs, LaserCommand};
 use crate::failure::{Exit, Failure};
-use crate::{report, setup};
+use crate::{results, setup};
 
 /// How long beyond its own timeout a box is waited for that should go dark by itself.
 const PATIENCE: TimeNs = TimeNs(2_000_000_000);
@@ -31,10 +31,10 @@ pub(super) fn dark(args: &LaserArgs) -> Result<(), Failure> {
     let rig = bench(args)?;
     let driver = &rig.lasers.driver;
     if *driver == LaserDriver::Simulated {
-        return report::print("no laser box on this bench: its simulated lasers ended with the daemon");
+        return results::print("no laser box on this bench: its simulated lasers ended with the daemon");
     }
     make_dark(driver, host_now).map_err(Failure::because(Exit::Unavailable))?;
-    report::print(&format!("{}: the lasers acknowledged that they are dark", ports(driver)))
+    results::print(&format!("{}: the lasers acknowledged that they are dark", ports(driver)))
 }
 
 /// The rig that was named, or the built-in one with a laser box at the port that was named.
@@ -67,7 +67,7 @@ fn status(rig: &Rig) -> Result<(), Failure> {
             )
         }
     };
-    report::print(&text)
+    results::print(&text)
 }
 
 fn text_of(found: &BoxReport) -> String {
@@ -106,7 +106,7 @@ fn arm(rig: &Rig) -> Result<(), Failure> {
         ));
     };
     let unavailable = Failure::because(Exit::Unavailable);
-    let program = Gate::new(&rig.panel, &rig.lasers).and_then(|gate| gate.program(&rig.panel, &rig.lasers));
+    let program = FieldGate::new(&rig.panel, &rig.lasers).and_then(|gate| gate.program(&rig.panel, &rig.lasers));
     // Windows that the host asks for, of which it asks for none: whatever is on the sync wire, nothing is lit.
     let program = LaserProgram { trigger: Trigger::Host, ..program.map_err(Failure::because(Exit::Config))? };
     let options = SerialOptions { sync_wire: false, ..SerialOptions::default() };
@@ -127,7 +127,7 @@ fn arm(rig: &Rig) -> Result<(), Failure> {
             ),
         ));
     };
-    report::print(&format!(
+    results::print(&format!(
         "{}: armed with no laser lit, and dark by itself after {:.0} ms of silence ({}; its timeout is {timeout_ms:.0} ms)",
         path.display(),
         t_dark.seconds() * 1e3,

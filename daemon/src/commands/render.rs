@@ -16,7 +16,7 @@ use crate::progress;
 use crate::renderer::{self, Renderer};
 use crate::source::scene;
 use crate::staging::Staging;
-use crate::{report, setup};
+use crate::{results, setup};
 
 /// What was done, and what the reader should know of it; `report.json`.
 #[derive(Serialize)]
@@ -66,12 +66,12 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
         Ok::<_, Failure>(())
     })?;
     report.total_ms = began.elapsed().as_secs_f64() * 1e3;
-    report::save_json(&report, &staging.path(FILES[4]))?;
+    results::save_json(&report, &staging.path(FILES[4]))?;
     staging.commit()?;
     if args.json {
-        return report::print_json(&report);
+        return results::print_json(&report);
     }
-    report::print(&format!(
+    results::print(&format!(
         "{}: hologram of {}x{} for a pupil of {} mm in {:.0} ms, {:.1} s with all else; {:.3} % of amplitudes clipped\n\
          depth {:.2} to {:.2} dpt; pixels filled {}, clamped to the far end {}, to the near end {}, padded {}\n\
          in {}: {}",

@@ -6,7 +6,7 @@ use crate::destination::Destination;
 use crate::failure::Failure;
 use crate::machine::Machine;
 use crate::staging::Staging;
-use crate::{logging, progress, report, status};
+use crate::{logging, progress, results, status};
 
 pub(super) fn report(args: &ReportArgs) -> Result<(), Failure> {
     let scrubber = Scrubber::of_this_machine();
@@ -36,10 +36,10 @@ pub(super) fn report(args: &ReportArgs) -> Result<(), Failure> {
         return Ok(());
     }
     if args.json {
-        return report::print_json(&manifest);
+        return results::print_json(&manifest);
     }
     let bytes = path.metadata().map_or(0, |metadata| metadata.len());
-    report::print(&format!(
+    results::print(&format!(
         "{}\nholod     {}\n{}\n\n{} is written ({bytes} bytes); `tar tzf` lists it. Look into it before you send it.",
         manifest.text(),
         manifest.holod,

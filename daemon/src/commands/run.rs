@@ -18,8 +18,8 @@ use crate::page::Page;
 use crate::pictures::levels_picture;
 use crate::progress;
 use crate::record::{self, RecordHealth, Recorder};
-use crate::report;
 use crate::session::{self, Hangups, SessionPlan, SessionReport, Summary, not_dark};
+use crate::{results, run_text};
 use crate::{setup, source};
 
 /// Scenario of the built-in tracker.
@@ -188,7 +188,7 @@ fn refuse_options(args: &RunArgs, tracker: &TrackerSpec) -> Result<(), Failure> 
 
 /// A run that is over, and how a report came out.
 #[derive(Serialize)]
-struct Told<'a> {
+struct RunResult<'a> {
     #[serde(flatten)]
     summary: &'a Summary,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -201,12 +201,12 @@ struct Told<'a> {
 /// The lasers did not go dark, which matters most, or standard output takes no more.
 fn tell(args: &RunArgs, summary: &Summary, outcome: Option<&Outcome>) -> Result<(), Failure> {
     let text = if args.json {
-        report::to_json(&Told { summary, report: outcome })?
+        results::to_json(&RunResult { summary, report: outcome })?
     } else {
         let outcome = outcome.map_or(String::new(), |outcome| format!("\n{}", outcome.text()));
-        format!("{}{outcome}", report::summary_text(summary))
+        format!("{}{outcome}", run_text::summary_text(summary))
     };
-    let printed = report::print_for_good(&text);
+    let printed = results::print_once(&text);
     match &summary.lasers_not_dark {
         None => printed,
         Some(why) => Err(Failure::new(Exit::Unavailable, not_dark(why))),
@@ -240,10 +240,10 @@ fn finish_record(session: &Arc<SessionReport>, folder: &Path, health: &RecordHea
 }
 
 fn save(session: &SessionReport, folder: &Path) -> Result<(), Failure> {
-    report::save_json(&session.summary, &folder.join("summary.json"))?;
+    results::save_json(&session.summary, &folder.join("summary.json"))?;
     for (pupil, levels) in &session.shown {
         let name = format!("shown_pupil_{:.2}mm_frame_{:06}.png", pupil.mm(), levels.tag().frame_id);
-        report::save_png(&levels_picture(levels), &folder.join(name))?;
+        results::save_png(&levels_picture(levels), &folder.join(name))?;
     }
     Ok(())
 }

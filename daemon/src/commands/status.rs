@@ -2,9 +2,9 @@
 
 use crate::cli::StatusArgs;
 use crate::failure::Failure;
-use crate::report;
 use crate::snapshot::Snapshot;
 use crate::status::{self, Found};
+use crate::{results, run_text};
 
 pub(super) fn status(args: &StatusArgs) -> Result<(), Failure> {
     let running = status::of_running_as(args.pid)?;
@@ -15,10 +15,10 @@ pub(super) fn status(args: &StatusArgs) -> Result<(), Failure> {
         }
     }
     if args.json {
-        return report::print_json(status::only(&running)?);
+        return results::print_json(status::only(&running)?);
     }
     let texts: Vec<_> = running.iter().map(|found| text_of(&found.status)).collect();
-    report::print(&texts.join("\n\n"))
+    results::print(&texts.join("\n\n"))
 }
 
 fn text_of(status: &Snapshot) -> String {
@@ -40,8 +40,8 @@ fn text_of(status: &Snapshot) -> String {
             "\nfeed     {}: {shown}{age}{view}\n\
              \x20        {}; picture to photons {}",
             feed.socket.display(),
-            report::feed_text(feed),
-            report::spread_text(figures.picture_to_photon)
+            run_text::feed_text(feed),
+            run_text::spread_text(figures.picture_to_photon)
         )
     });
     let record = figures.record.as_ref().map_or(String::new(), |record| format!("\nrecord   {}", record.text()));
@@ -89,7 +89,7 @@ fn text_of(status: &Snapshot) -> String {
         figures.frames_made,
         figures.frames_shown,
         figures.deadline_misses,
-        report::spread_text(figures.frame_time),
-        report::spread_text(figures.sample_to_photon),
+        run_text::spread_text(figures.frame_time),
+        run_text::spread_text(figures.sample_to_photon),
     )
 }

@@ -14,7 +14,7 @@ use holod_slm_output::present::drm::DrmTarget;
 use super::check::access::{HIDDEN_FROM_SERVICE, files_of};
 use crate::cli::{Backend, PageAddress, RunArgs, UnitArgs};
 use crate::failure::{Exit, Failure};
-use crate::{report, setup};
+use crate::{results, setup};
 
 pub(super) const BINARY: &str = "/usr/bin/holod";
 /// The rig that the unit itself names.
@@ -34,7 +34,7 @@ pub(super) fn unit(args: &UnitArgs) -> Result<(), Failure> {
         )
     })?;
     let rig = setup::rig_with_network(&args.run.rig, &args.run.network)?;
-    report::print(drop_in(&rig, &args.run, &words, Path::new("/"))?.trim_end())
+    results::print(drop_in(&rig, &args.run, &words, Path::new("/"))?.trim_end())
 }
 
 /// The drop-in for a run with these options, which `words` are; `/dev`, `/proc` and `/sys` are looked at below `root`.

@@ -17,7 +17,7 @@ use crate::cli::{Backend, SceneArgs, ViewArgs};
 use crate::destination::Destination;
 use crate::failure::{Exit, Failure};
 use crate::pictures::shown_pattern;
-use crate::{progress, renderer, report, setup};
+use crate::{progress, renderer, results, setup};
 
 #[derive(Serialize)]
 struct Report<'a> {
@@ -79,9 +79,9 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
         focus_u_mm: geometry.image_distance(eye.focus).0 * 1e3,
     };
     if args.json {
-        return report::print_json(&said);
+        return results::print_json(&said);
     }
-    report::print(&format!(
+    results::print(&format!(
         "{}: hologram for {} mm, seen by a pupil of {} mm focused at {} dpt (u = {:.3} mm)",
         args.out.display(),
         said.hologram_pupil_mm,

@@ -9,7 +9,7 @@ use axum::body::Bytes;
 use serde::Serialize;
 use tokio::sync::broadcast;
 
-use super::metrics::Latencies;
+use super::latencies::Latencies;
 use crate::logging::Line;
 use crate::snapshot::Snapshot;
 use crate::tally_by::{Reason, TallyBy};

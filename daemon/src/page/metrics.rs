@@ -7,57 +7,23 @@ use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use holod_calibration::TimeNs;
 use prometheus_client::collector::Collector;
 use prometheus_client::encoding::{DescriptorEncoder, EncodeLabelSet, EncodeMetric, text};
 use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
-use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::{Registry, Unit};
 
 use self::process::OfProcess;
+use super::latencies::Latencies;
 use super::live::Live;
 use crate::logging;
-use crate::record::RecordStand;
-use crate::session::{FirstLight, pupil_states};
+use crate::record::RecordCondition;
+use crate::session::pupil_states;
 use crate::snapshot::Snapshot;
 
 /// What scrapers of OpenMetrics expect.
 pub(super) const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
-
-/// Bounds of the histograms: from a frame of a fast panel to a slide show.
-const BOUNDS_S: [f64; 14] = [0.002, 0.004, 0.006, 0.008, 0.012, 0.016, 0.024, 0.032, 0.048, 0.064, 0.1, 0.2, 0.5, 2.0];
-
-/// How long things take.
-pub(super) struct Latencies {
-    frame: Histogram,
-    sample_to_photon: Histogram,
-    picture_to_photon: Histogram,
-}
-
-impl Default for Latencies {
-    fn default() -> Self {
-        let histogram = || Histogram::new(BOUNDS_S);
-        Self { frame: histogram(), sample_to_photon: histogram(), picture_to_photon: histogram() }
-    }
-}
-
-impl Latencies {
-    pub(super) fn frame(&self, time: TimeNs) {
-        self.frame.observe(time.seconds());
-    }
-
-    pub(super) fn light(&self, light: &FirstLight) {
-        for (histogram, time) in
-            [(&self.sample_to_photon, light.sample_to_photon), (&self.picture_to_photon, light.picture_to_photon)]
-        {
-            if let Some(time) = time {
-                histogram.observe(time.seconds());
-            }
-        }
-    }
-}
 
 /// What is told of the run that `live` follows.
 pub(super) fn registry(live: &Arc<Live>) -> Registry {
@@ -171,7 +137,7 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
         named(&snapshot.orders_refused),
     )?;
     if let Some(record) = &figures.record {
-        let lost = f64::from(u8::from(record.state == RecordStand::Lost));
+        let lost = f64::from(u8::from(record.state == RecordCondition::Lost));
         told.gauge("record_lost", "Whether the record was given up", None, lost)?;
         told.counter("record_rows_lost", "Rows of the record that a slow disk left out", record.rows_lost)?;
     }

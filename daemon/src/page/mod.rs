@@ -16,6 +16,7 @@ mod eye;
 #[cfg(fuzzing)]
 pub mod fuzzing;
 mod give_up;
+mod latencies;
 mod live;
 mod metrics;
 mod server;

@@ -12,7 +12,7 @@ use crate::failure::{Exit, Failure};
 /// How the record of a run is.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum RecordStand {
+pub enum RecordCondition {
     /// It is written.
     #[default]
     Written,
@@ -26,7 +26,7 @@ pub struct RecordState {
     /// Where it is.
     pub folder: PathBuf,
     /// Whether it goes on.
-    pub state: RecordStand,
+    pub state: RecordCondition,
     /// Why it was given up.
     pub reason: Option<String>,
     /// Rows that were left out because the disk was too slow.
@@ -81,7 +81,7 @@ impl RecordHealth {
     /// How it is.
     pub fn state(&self) -> RecordState {
         let reason = self.reason().clone();
-        let state = if reason.is_some() { RecordStand::Lost } else { RecordStand::Written };
+        let state = if reason.is_some() { RecordCondition::Lost } else { RecordCondition::Written };
         RecordState { folder: self.folder.clone(), state, reason, rows_lost: self.rows_lost() }
     }
 
@@ -133,7 +133,7 @@ mod tests {
         health.give_up("another");
         health.lose_row();
         let state = health.state();
-        assert_eq!((state.state, state.rows_lost, health.is_lost()), (RecordStand::Lost, 1, true));
+        assert_eq!((state.state, state.rows_lost, health.is_lost()), (RecordCondition::Lost, 1, true));
         for part in ["lost: ", "/a/record/frames.csv", "no storage space", "make room", "1 rows are left out"] {
             assert!(state.text().contains(part), "{part}: {}", state.text());
         }

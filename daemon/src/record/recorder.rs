@@ -22,7 +22,7 @@ use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
 use crate::logging::LogFile;
 use crate::machine::Machine;
-use crate::report;
+use crate::results;
 use crate::session::{Began, Observer};
 use crate::{setup, source};
 
@@ -355,7 +355,7 @@ fn write_entries(entries: &Queue<Entry>, mut frames: FrameLog, run: &Path, healt
             continue;
         }
         let mut write = |entry| match entry {
-            Entry::Began(facts) => report::save_json(&facts, run),
+            Entry::Began(facts) => results::save_json(&facts, run),
             Entry::Frame(record) => {
                 frames.frame(record);
                 Ok(())
@@ -416,7 +416,7 @@ mod tests {
 
     use super::*;
     use crate::cli::Cli;
-    use crate::record::{FRAMES, FrameOrders, ORDERS, RecordStand};
+    use crate::record::{FRAMES, FrameOrders, ORDERS, RecordCondition};
     use crate::source::PictureTag;
     use holod_calibration::PupilDiameter;
 
@@ -485,7 +485,7 @@ mod tests {
         }));
         recorder.finish();
         let state = recorder.health.state();
-        assert_eq!(state.state, RecordStand::Lost);
+        assert_eq!(state.state, RecordCondition::Lost);
         assert!(state.reason.unwrap().contains("within 5s"));
     }
 

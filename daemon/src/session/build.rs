@@ -12,19 +12,22 @@ use holod_slm_output::output::{OutputError, pacing_config};
 use holod_slm_output::present::{PanelSetup, open_panel};
 use holod_slm_output::{LevelsFrame, Output, OutputControl, OutputOptions, Pacer, PanelEncoder};
 
+use super::clock::host_now;
 use super::desk::{Changes, Desk};
 use super::feed_watch::FeedWatch;
-use super::frame_loop::{FrameLoop, TrainedPupils};
-use super::inputs::{Followed, Inputs, Playback};
-use super::keep::KEEP_SLOTS;
+use super::frame_loop::{FrameLoop, RECORDS};
+use super::inputs::{Followed, Inputs, Playback, TrainedPupils};
 use super::laser_watch::LaserBoxWatch;
+use super::observer::{Began, Observer};
 use super::output_watch::OutputWatch;
-use super::service::Service;
+use super::plan::SessionPlan;
+use super::recorded_levels::KEEP_SLOTS;
+use super::scheduling;
+use super::service::{Service, Signals};
 use super::stats::FrameRate;
 use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
-use super::watch::{Limits, Names, Rings, Told, Watch};
-use super::{Began, Observer, RECORDS, SessionPlan, Signals, host_now, scheduling, tracker_failure};
+use super::watch::{Announced, Limits, Names, Rings, Watch};
 use crate::control::{self, Preparer, Steering};
 use crate::failure::{Exit, Failure};
 use crate::record::FrameOrders;
@@ -99,7 +102,7 @@ pub(super) fn build(
     let tracker = if plays {
         TrackerHandle::ended(&rig.tracker)
     } else {
-        Tracker::start(&plan.tracker, &rig.tracker, tracker_options).map_err(tracker_failure)?
+        Tracker::start(&plan.tracker, &rig.tracker, tracker_options).map_err(setup::tracker_failure)?
     };
     let (estimates, tap, tracker) = tracker.split();
     for warning in tracker.warnings() {
@@ -223,7 +226,7 @@ pub(super) fn build(
         service: Service::connect(),
         status: StatusFile::create(),
         t_origin,
-        told: Told::new(advised),
+        announced: Announced::new(advised),
         tally: Tally::default(),
         frame_rate: FrameRate::default(),
         frames_shown_hz: 0.0,

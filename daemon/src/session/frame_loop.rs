@@ -4,14 +4,14 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use holod_calibration::{PupilDiameter, TimeNs};
+use holod_calibration::TimeNs;
 use holod_model::engine::EngineError;
 use holod_slm_output::pacing::Point;
 use holod_slm_output::{FramePlan, FramePort, LevelsFrame, Pacer};
 
-use super::host_now;
-use super::inputs::{FrameContent, Inputs};
-use super::keep::keep_slot;
+use super::clock::host_now;
+use super::inputs::{FrameContent, Inputs, TrainedPupils};
+use super::recorded_levels::keep_slot;
 use crate::record::{FrameOrders, FrameRecord, levels_xxh3};
 use crate::renderer::{Rendered, Renderer};
 use crate::source::PictureTag;
@@ -70,27 +70,8 @@ pub(super) enum Change {
     Pattern(Option<Box<LevelsFrame>>),
 }
 
-/// The pupils that a network was trained for, on one bench.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct TrainedPupils {
-    narrowest: PupilDiameter,
-    widest: PupilDiameter,
-}
-
-impl TrainedPupils {
-    pub(super) fn of([narrowest, widest]: [PupilDiameter; 2]) -> Self {
-        Self { narrowest, widest }
-    }
-
-    /// Their two ends.
-    pub(super) fn ends(self) -> [PupilDiameter; 2] {
-        [self.narrowest, self.widest]
-    }
-
-    fn contain(self, pupil: PupilDiameter) -> bool {
-        (self.narrowest..=self.widest).contains(&pupil)
-    }
-}
+/// Frame records on their way to the control thread.
+pub(super) const RECORDS: usize = 1024;
 
 /// What the loop tells of one frame.
 #[derive(Clone, Copy, Debug)]

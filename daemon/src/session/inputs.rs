@@ -7,7 +7,6 @@ use holod_model::RgbdFrame;
 use holod_pupil_input::{EstimateReader, PupilState};
 use holod_slm_output::LevelsFrame;
 
-use super::frame_loop::TrainedPupils;
 use crate::control::{NewEngine, Steering};
 use crate::record::FrameOrders;
 use crate::renderer::Renderer;
@@ -196,5 +195,27 @@ impl Playback {
     /// Goes on to the next one, where there is one.
     pub(super) fn advance(&mut self) {
         self.at = (self.at + 1).min(self.cues.len() - 1);
+    }
+}
+
+/// The pupils that a network was trained for, on one bench.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct TrainedPupils {
+    narrowest: PupilDiameter,
+    widest: PupilDiameter,
+}
+
+impl TrainedPupils {
+    pub(super) fn of([narrowest, widest]: [PupilDiameter; 2]) -> Self {
+        Self { narrowest, widest }
+    }
+
+    /// Their two ends.
+    pub(super) fn ends(self) -> [PupilDiameter; 2] {
+        [self.narrowest, self.widest]
+    }
+
+    pub(super) fn contain(self, pupil: PupilDiameter) -> bool {
+        (self.narrowest..=self.widest).contains(&pupil)
     }
 }

@@ -94,7 +94,7 @@ fn take_while<T>(queue: &mut VecDeque<T>, mut wanted: impl FnMut(&T) -> bool) ->
 mod tests {
     use super::*;
     use holod_calibration::Colour;
-    use holod_slm_output::Provenance;
+    use holod_slm_output::TimestampSource;
 
     fn event(index: i64) -> FieldEvent {
         let t = TimeNs(index * 1000);
@@ -107,7 +107,7 @@ mod tests {
             t_present: t,
             t_settled: t + TimeNs(100),
             t_end: t + TimeNs(1000),
-            provenance: Provenance::Software,
+            provenance: TimestampSource::Software,
             laser_on: Some(t + TimeNs(200)),
             laser_off: Some(t + TimeNs(900)),
             dark: None,

@@ -1,7 +1,8 @@
 //! Medians of what came lately.
 
 use holod_calibration::TimeNs;
-use serde::{Deserialize, Serialize};
+
+use crate::spread::Spread;
 
 const WINDOW: usize = 1 << 14;
 
@@ -10,17 +11,6 @@ const WINDOW: usize = 1 << 14;
 pub(super) struct Recent {
     values: Vec<f32>,
     next: usize,
-}
-
-/// Median and tail of a quantity, milliseconds.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Spread {
-    /// Half of the values are smaller.
-    pub median_ms: f32,
-    /// 99 of 100 values are smaller.
-    pub p99_ms: f32,
-    /// The largest.
-    pub max_ms: f32,
 }
 
 impl Recent {

@@ -6,7 +6,7 @@ use holod_calibration::PupilDiameter;
 use holod_slm_output::LevelsFrame;
 
 use super::build::Session;
-use super::host_now;
+use super::clock::host_now;
 use super::summary::{SessionReport, Summary};
 use crate::failure::{Exit, Failure};
 use crate::snapshot::Figures;

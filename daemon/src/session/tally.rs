@@ -6,10 +6,11 @@ use holod_calibration::{PupilDiameter, TimeNs};
 use holod_slm_output::FieldEvent;
 
 use super::frame_loop::LoopRecord;
-use super::keep::KEEP_SLOTS;
+use super::frame_loop::RECORDS;
 use super::ledger::LaserLedger;
+use super::observer::FirstLight;
+use super::recorded_levels::KEEP_SLOTS;
 use super::stats::Recent;
-use super::{FirstLight, RECORDS};
 use crate::record::FrameRecord;
 
 /// Frames whose fields may still come: all that the ring of records can hold at once, and some more.

@@ -12,18 +12,19 @@ use holod_slm_output::laser::{BoxEvent, DarkReason};
 use holod_slm_output::output::OutputCounts;
 use holod_slm_output::{FieldEvent, OutputControl};
 
+use super::clock::host_now;
 use super::desk::Desk;
 use super::feed_watch::{FeedPart, FeedSeen, FeedWatch};
 use super::frame_loop::LoopRecord;
 use super::inputs::FIXED_PUPIL;
 use super::laser_watch::LaserBoxWatch;
+use super::observer::Observer;
 use super::output_watch::OutputWatch;
 use super::rate_watch::RateWatch;
-use super::service::Service;
+use super::service::{Hangups, Service, Signals};
 use super::stats::FrameRate;
 use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
-use super::{Hangups, Observer, Signals, host_now};
 use crate::failure::{Exit, Failure};
 use crate::record::RecordHealth;
 use crate::snapshot::{Figures, Snapshot};
@@ -57,7 +58,7 @@ pub(super) struct Watch<'a> {
     pub(super) service: Service,
     pub(super) status: StatusFile,
     pub(super) t_origin: TimeNs,
-    pub(super) told: Told,
+    pub(super) announced: Announced,
     pub(super) tally: Tally,
     pub(super) frame_rate: FrameRate,
     /// In the last second.
@@ -86,7 +87,7 @@ pub(super) struct Rings {
 
 /// What has been said to people.
 #[derive(Default)]
-pub(super) struct Told {
+pub(super) struct Announced {
     /// What would bring more frames a second has been said.
     advised: bool,
     rate: RateWatch,
@@ -95,7 +96,7 @@ pub(super) struct Told {
     armed: bool,
 }
 
-impl Told {
+impl Announced {
     pub(super) fn new(advised: bool) -> Self {
         Self { advised, ..Self::default() }
     }
@@ -282,7 +283,7 @@ impl Watch<'_> {
     /// What is looked at ten times a second.
     fn report(&mut self, output: &OutputCounts, now: TimeNs) -> Result<(), Failure> {
         let is_new = self.tell_state(output);
-        if is_new | (std::mem::replace(&mut self.told.armed, output.armed) != output.armed) {
+        if is_new | (std::mem::replace(&mut self.announced.armed, output.armed) != output.armed) {
             self.write_status(output, now);
         }
         self.tell_rate(now);
@@ -315,7 +316,7 @@ impl Watch<'_> {
             (true, false) => State::Degraded,
             (true, true) => State::Running,
         };
-        self.told.state = state;
+        self.announced.state = state;
         // A blink is no news; what the pupil falls back to is.
         let pupil = match self.tally.newest_state {
             "" => "not known yet",
@@ -325,21 +326,21 @@ impl Watch<'_> {
         };
         let record = if record_lost { ", record lost" } else { "" };
         let text = format!("{}: tracker {}, pupil {pupil}{record}", state.name(), link.name());
-        if text == self.told.text {
+        if text == self.announced.text {
             return false;
         }
         tracing::info!("{text}");
         self.service.status(&text);
-        self.told.text = text;
+        self.announced.text = text;
         true
     }
 
     /// Says once how many frames a second are really reached.
     fn tell_rate(&mut self, now: TimeNs) {
-        let Some(reached_hz) = self.told.rate.reached_hz(self.tally.frames_shown, now) else { return };
+        let Some(reached_hz) = self.announced.rate.reached_hz(self.tally.frames_shown, now) else { return };
         let panel_hz = speed::panel_frames_hz(&self.rig.panel);
         let reached = format!("{reached_hz:.2} frames a second are shown, of the panel's {panel_hz:.1}");
-        match speed::advice(reached_hz, &self.rig, self.names.hologram).filter(|_| !self.told.advised) {
+        match speed::advice(reached_hz, &self.rig, self.names.hologram).filter(|_| !self.announced.advised) {
             None => tracing::info!("{reached}"),
             Some(advice) => tracing::warn!("{reached}: {advice}"),
         }
@@ -368,7 +369,7 @@ impl Watch<'_> {
     pub(super) fn snapshot(&self, output: &OutputCounts, now: TimeNs) -> Snapshot {
         Snapshot {
             pid: std::process::id(),
-            state: self.told.state.name().to_owned(),
+            state: self.announced.state.name().to_owned(),
             uptime_s: (now - self.t_origin).seconds(),
             control: self.desk.socket(),
             orders_refused: self.desk.refused(),

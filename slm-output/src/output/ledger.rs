@@ -8,8 +8,8 @@ use rtrb::Producer;
 use super::shared::{Shared, count};
 use crate::laser::verify::FieldSpan;
 use crate::laser::{BoxEvent, DarkReason, LaserEdge};
-use crate::present::Provenance;
-use crate::schedule::{Gate, ShownField};
+use crate::present::TimestampSource;
+use crate::schedule::{FieldGate, ShownField};
 
 /// Fields that wait for their edges, and edges that wait for their fields.
 const OPEN_MAX: usize = 256;
@@ -34,7 +34,7 @@ pub struct FieldEvent {
     /// When it made way for the next one.
     pub t_end: TimeNs,
     /// Where `t_present` comes from.
-    pub provenance: Provenance,
+    pub provenance: TimestampSource,
     /// The on edge of its laser, if it was lit.
     pub laser_on: Option<TimeNs>,
     /// The off edge of its laser, if it was lit.
@@ -64,7 +64,7 @@ impl FieldEvent {
 
 /// Puts fields and laser edges together.
 pub(super) struct Ledger {
-    gate: Gate,
+    gate: FieldGate,
     open: VecDeque<(ShownField, Option<DarkReason>)>,
     edges: VecDeque<LaserEdge>,
     last_dark: Option<DarkReason>,
@@ -73,7 +73,7 @@ pub(super) struct Ledger {
 }
 
 impl Ledger {
-    pub(super) fn new(gate: Gate, events: Producer<FieldEvent>, box_events: Producer<BoxEvent>) -> Self {
+    pub(super) fn new(gate: FieldGate, events: Producer<FieldEvent>, box_events: Producer<BoxEvent>) -> Self {
         let open = VecDeque::with_capacity(OPEN_MAX);
         Self { gate, open, edges: VecDeque::with_capacity(OPEN_MAX), last_dark: None, events, box_events }
     }

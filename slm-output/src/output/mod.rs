@@ -41,7 +41,7 @@ use crate::laser::{BoxEvent, DarkReason, LaserBox, LaserError, LaserWatch, Trigg
 use crate::levels::PanelEncoder;
 use crate::pacing::PacingConfig;
 use crate::present::{OpenError, PanelLook, PanelSetup, Presenter, Recorder, frame_channel, look};
-use crate::schedule::{Evidence, FieldScheduler, Gate};
+use crate::schedule::{Evidence, FieldGate, FieldScheduler};
 
 /// A monotonic clock. The threads read it; nothing below them does.
 pub type Clock = fn() -> TimeNs;
@@ -124,7 +124,7 @@ impl Output {
         // A box with a wire to the panel's sync times its own windows, and in channel-packed mode the panel's own sequence
         // says which colour each of them is for: that frames go by is all that must be known here.
         let wired =
-            !panel.is_virtual() && laser.capability().sync_wire && Gate::trigger(&rig.panel) == Trigger::PanelSync;
+            !panel.is_virtual() && laser.capability().sync_wire && FieldGate::trigger(&rig.panel) == Trigger::PanelSync;
         let evidence = if virtual_bench || wired { Evidence::Seen } else { Evidence::Stamped };
         let scheduler = FieldScheduler::new(&rig.panel, flat.layout(), &rig.lasers, evidence, options.stall_timeout)?;
         let program = scheduler.program(&rig.panel, &rig.lasers)?;
@@ -203,9 +203,9 @@ impl Output {
 /// What a pacer must know to make frames for the output of `rig`.
 ///
 /// # Errors
-/// As [`Gate::new`].
+/// As [`FieldGate::new`].
 pub fn pacing_config(rig: &Rig, first_frame_time: TimeNs) -> Result<PacingConfig, LaserError> {
-    let gate = Gate::new(&rig.panel, &rig.lasers)?;
+    let gate = FieldGate::new(&rig.panel, &rig.lasers)?;
     let timing = gate.timing();
     // The middle of the fields stands for all of them.
     let middle_field_ns = timing.field_period.0 * (timing.fields as i64 - 1) / 2;

@@ -5,7 +5,7 @@ use rtrb::Consumer;
 
 use crate::fields::{FrameTag, LevelsFrame};
 use crate::pacing::{FramePlan, Pacer};
-use crate::present::{FrameSink, Provenance};
+use crate::present::{FrameSink, TimestampSource};
 
 /// What the panel did at the start of a colour frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -15,7 +15,7 @@ pub struct PresentReport {
     /// Since when.
     pub t_present: TimeNs,
     /// Where `t_present` comes from.
-    pub provenance: Provenance,
+    pub provenance: TimestampSource,
     /// The frame had been shown before.
     pub repeated: bool,
 }

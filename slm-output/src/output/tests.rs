@@ -17,7 +17,7 @@ use crate::fields::{FrameLayout, FrameTag};
 use crate::laser::verify::{EdgeReport, Finding, verify_edges};
 use crate::laser::{Capability, LaserEdge, LaserProgram, LitWindow, Refusal, SimulatedLaser};
 use crate::pacing::Pacer;
-use crate::present::{FrameSink, FrameSource, HeadlessPanel, PresentedRefresh, Provenance, ReportFaults};
+use crate::present::{FrameSink, FrameSource, HeadlessPanel, PresentedRefresh, ReportFaults, TimestampSource};
 
 const SIZE: Resolution = Resolution { width: 8, height: 4 };
 const MS: i64 = 1_000_000;
@@ -221,7 +221,7 @@ fn nothing_is_lit_over_the_flat_pattern_or_before_the_first_frame() {
 fn times_that_nobody_saw_light_nothing() {
     for mode in MODES {
         let mut bench = Bench::new(mode);
-        bench.falsify = |refresh| Some(PresentedRefresh { provenance: Provenance::Estimated, ..refresh });
+        bench.falsify = |refresh| Some(PresentedRefresh { provenance: TimestampSource::Estimated, ..refresh });
         bench.run(TimeNs(500 * MS), TimeNs(0));
         assert_eq!(bench.edges, []);
         // Of a real panel, software's word is not enough either.
@@ -230,7 +230,7 @@ fn times_that_nobody_saw_light_nothing() {
         bench.run(TimeNs(500 * MS), TimeNs(0));
         assert_eq!(bench.edges, []);
         assert!(bench.all_events.iter().all(|event| event.dark == Some(DarkReason::Untrusted)));
-        bench.falsify = |refresh| Some(PresentedRefresh { provenance: Provenance::Hardware, ..refresh });
+        bench.falsify = |refresh| Some(PresentedRefresh { provenance: TimestampSource::Hardware, ..refresh });
         bench.run(TimeNs(1000 * MS), TimeNs(0));
         assert_ne!(bench.edges, []);
     }

@@ -4,7 +4,7 @@ use holod_calibration::TimeNs;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
-use super::{FrameSource, PanelFault, PanelSetup, PanelTiming, PresentedRefresh, Presenter, Provenance};
+use super::{FrameSource, PanelFault, PanelSetup, PanelTiming, PresentedRefresh, Presenter, TimestampSource};
 use crate::fields::{FrameTag, LevelsFrame};
 
 /// Colour frames that a late tick reports after the fact, of the first and of the last ones that went by.
@@ -202,7 +202,7 @@ impl Presenter for HeadlessPanel {
                     field: self.next_refresh * self.fields_per_refresh,
                     repeated: self.repeated && self.frame.is_some(),
                     t_present: self.t_next,
-                    provenance: Provenance::Software,
+                    provenance: TimestampSource::Software,
                     refresh_count: Some(self.refresh_count),
                 };
                 self.report(refresh, presented);

@@ -31,7 +31,7 @@ use crate::levels::PanelEncoder;
 
 /// Where the time of a presentation comes from, and so how far it can be trusted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Provenance {
+pub enum TimestampSource {
     /// The display controller stamped it.
     Hardware,
     /// The display server or driver reported it, from the controller's stamp as far as it says so.
@@ -44,7 +44,7 @@ pub enum Provenance {
     Estimated,
 }
 
-impl Provenance {
+impl TimestampSource {
     /// The lower-case name, as in files and logs.
     pub const fn name(self) -> &'static str {
         match self {
@@ -92,7 +92,7 @@ pub struct PresentedRefresh {
     /// When the pattern came on the panel.
     pub t_present: TimeNs,
     /// Where `t_present` comes from.
-    pub provenance: Provenance,
+    pub provenance: TimestampSource,
     /// The display controller's own count of refreshes, where it has one.
     pub refresh_count: Option<u64>,
 }

@@ -14,7 +14,7 @@ const TOLERANCE_MIN: TimeNs = TimeNs(20_000);
 /// Cuts a window out of each colour field: after the panel's settle time and the laser's on delay, and never past the
 /// field's end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Gate {
+pub struct FieldGate {
     timing: PanelTiming,
     /// From a field's start to its on edge.
     delay: TimeNs,
@@ -23,7 +23,7 @@ pub struct Gate {
     settle: TimeNs,
 }
 
-impl Gate {
+impl FieldGate {
     /// The gate for one bench; a window that is longer than its field is cut at the field's end.
     ///
     /// # Errors
@@ -142,7 +142,7 @@ impl Gate {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::present::Provenance;
+    use crate::present::TimestampSource;
     use holod_calibration::Colour;
     use holod_calibration::rig::Rig;
 
@@ -153,13 +153,13 @@ mod tests {
         let rig = Rig::default();
         let long = Lasers { width: TimeNs(50 * MS), ..rig.lasers.clone() };
         for (lasers, t_off) in [(&rig.lasers, TimeNs(105_100_000)), (&long, TimeNs(105_555_556))] {
-            let gate = Gate::new(&rig.panel, lasers).unwrap();
+            let gate = FieldGate::new(&rig.panel, lasers).unwrap();
             let field = ShownField {
                 frame: None,
                 field: 1,
                 colour: Colour::Blue,
                 t_present: TimeNs(100 * MS),
-                provenance: Provenance::Hardware,
+                provenance: TimestampSource::Hardware,
                 repeated: false,
                 reported: true,
             };
@@ -179,12 +179,18 @@ mod tests {
     fn figures_that_leave_no_light_are_refused() {
         let rig = Rig::default();
         let slow = Panel { settle: TimeNs(6 * MS), ..rig.panel.clone() };
-        assert!(matches!(Gate::new(&slow, &rig.lasers), Err(LaserError::NoRoom { field_us: 5555, delay_us: 6100 })));
+        assert!(matches!(
+            FieldGate::new(&slow, &rig.lasers),
+            Err(LaserError::NoRoom { field_us: 5555, delay_us: 6100 })
+        ));
         let backwards = Panel { settle: TimeNs(-1), ..rig.panel.clone() };
-        assert!(matches!(Gate::new(&backwards, &rig.lasers), Err(LaserError::Figure { what: "panel.settle", .. })));
+        assert!(matches!(
+            FieldGate::new(&backwards, &rig.lasers),
+            Err(LaserError::Figure { what: "panel.settle", .. })
+        ));
         let never = Lasers { width: TimeNs(0), ..rig.lasers.clone() };
-        assert!(matches!(Gate::new(&rig.panel, &never), Err(LaserError::Figure { what: "width", .. })));
-        let gate = Gate::new(&rig.panel, &rig.lasers).unwrap();
+        assert!(matches!(FieldGate::new(&rig.panel, &never), Err(LaserError::Figure { what: "width", .. })));
+        let gate = FieldGate::new(&rig.panel, &rig.lasers).unwrap();
         for power_mw in [-1.0, f64::NAN, 5000.0] {
             let lasers = Lasers { power_mw: PerColour([1.0, power_mw, 1.0]), ..rig.lasers.clone() };
             assert!(matches!(gate.program(&rig.panel, &lasers), Err(LaserError::Figure { what: "power_mw", .. })));

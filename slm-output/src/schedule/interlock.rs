@@ -6,9 +6,9 @@
 
 use holod_calibration::TimeNs;
 
-use super::{Gate, ShownField};
+use super::{FieldGate, ShownField};
 use crate::laser::{DarkReason, LitWindow, Trigger};
-use crate::present::Provenance;
+use crate::present::TimestampSource;
 
 /// Panel refreshes without a present report after which lasers go dark.
 const MISSING_REFRESHES: i64 = 2;
@@ -24,11 +24,11 @@ pub enum Evidence {
 }
 
 impl Evidence {
-    fn accepts(self, provenance: Provenance) -> bool {
+    fn accepts(self, provenance: TimestampSource) -> bool {
         match provenance {
-            Provenance::Hardware | Provenance::Driver | Provenance::External => true,
-            Provenance::Software => self == Self::Seen,
-            Provenance::Estimated => false,
+            TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External => true,
+            TimestampSource::Software => self == Self::Seen,
+            TimestampSource::Estimated => false,
         }
     }
 }
@@ -51,7 +51,7 @@ pub struct Orders {
 /// Decides from the panel's reports whether lasers may be lit.
 #[derive(Clone, Debug)]
 pub(super) struct Interlock {
-    gate: Gate,
+    gate: FieldGate,
     trigger: Trigger,
     evidence: Evidence,
     stall_timeout: TimeNs,
@@ -68,7 +68,7 @@ pub(super) struct Interlock {
 
 impl Interlock {
     /// An interlock that begins dark.
-    pub(super) fn new(gate: Gate, trigger: Trigger, evidence: Evidence, stall_timeout: TimeNs) -> Self {
+    pub(super) fn new(gate: FieldGate, trigger: Trigger, evidence: Evidence, stall_timeout: TimeNs) -> Self {
         Self {
             gate,
             trigger,

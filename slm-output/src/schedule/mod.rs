@@ -12,7 +12,7 @@ mod gate;
 mod interlock;
 mod refreshes;
 
-pub use gate::Gate;
+pub use gate::FieldGate;
 pub use interlock::{Evidence, Orders};
 
 use holod_calibration::rig::{Lasers, Panel};
@@ -23,7 +23,7 @@ use self::interlock::Interlock;
 use self::refreshes::RefreshJudge;
 use crate::fields::{FrameLayout, FrameTag};
 use crate::laser::{DarkReason, LaserError, LaserProgram};
-use crate::present::{PresentedRefresh, Provenance};
+use crate::present::{PresentedRefresh, TimestampSource};
 
 /// One colour field that is on the panel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,7 +37,7 @@ pub struct ShownField {
     /// When the pattern came on the panel.
     pub t_present: TimeNs,
     /// Where `t_present` comes from.
-    pub provenance: Provenance,
+    pub provenance: TimestampSource,
     /// Whether the frame had been shown before, because no newer one was there in time.
     pub repeated: bool,
     /// Whether the panel reported this field itself; the panel's sequencer shows the others after it.
@@ -59,7 +59,7 @@ pub struct FieldDecision {
 #[derive(Clone, Debug)]
 pub struct FieldScheduler {
     layout: FrameLayout,
-    gate: Gate,
+    gate: FieldGate,
     judge: RefreshJudge,
     interlock: Interlock,
     balance: Balance,
@@ -82,7 +82,7 @@ impl FieldScheduler {
     /// one frame may stay lit without a newer one.
     ///
     /// # Errors
-    /// As [`Gate::new`].
+    /// As [`FieldGate::new`].
     pub fn new(
         panel: &Panel,
         layout: FrameLayout,
@@ -90,8 +90,8 @@ impl FieldScheduler {
         evidence: Evidence,
         stall_timeout: TimeNs,
     ) -> Result<Self, LaserError> {
-        let gate = Gate::new(panel, lasers)?;
-        let trigger = Gate::trigger(panel);
+        let gate = FieldGate::new(panel, lasers)?;
+        let trigger = FieldGate::trigger(panel);
         Ok(Self {
             layout,
             gate,
@@ -105,13 +105,13 @@ impl FieldScheduler {
     /// What the laser box must be told before it is armed.
     ///
     /// # Errors
-    /// As [`Gate::program`].
+    /// As [`FieldGate::program`].
     pub fn program(&self, panel: &Panel, lasers: &Lasers) -> Result<LaserProgram, LaserError> {
         self.gate.program(panel, lasers)
     }
 
     /// The windows and the panel's periods.
-    pub fn gate(&self) -> Gate {
+    pub fn gate(&self) -> FieldGate {
         self.gate
     }
 

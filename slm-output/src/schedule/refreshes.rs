@@ -161,7 +161,7 @@ fn counts_agree(anchor: &Anchor, refresh: &PresentedRefresh, periods: f64) -> bo
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::present::Provenance;
+    use crate::present::TimestampSource;
 
     const PERIOD: i64 = 16_666_667;
 
@@ -171,7 +171,7 @@ mod tests {
             field: 0,
             repeated: false,
             t_present: TimeNs(t),
-            provenance: Provenance::Hardware,
+            provenance: TimestampSource::Hardware,
             refresh_count,
         }
     }

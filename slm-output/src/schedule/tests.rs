@@ -89,7 +89,7 @@ fn run(rig: &Rig, steps: &[Step]) -> Ran {
             field,
             repeated: field > 0,
             t_present: t_true + TimeNs(step.jitter_ns - step.early_ns),
-            provenance: Provenance::Hardware,
+            provenance: TimestampSource::Hardware,
             refresh_count: None,
         };
         let t_told = t_true + TimeNs(step.delay_ns);

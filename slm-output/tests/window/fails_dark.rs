@@ -16,7 +16,7 @@ use holod_slm_output::laser::{BoxEvent, open_laser};
 use holod_slm_output::output::{Output, OutputOptions, pacing_config};
 use holod_slm_output::pacing::Pacer;
 use holod_slm_output::present::window::{DisplayServer, Road, WindowPanel};
-use holod_slm_output::present::{FrameSource, PanelFault, PanelSetup, PresentedRefresh, Presenter, Provenance};
+use holod_slm_output::present::{FrameSource, PanelFault, PanelSetup, PresentedRefresh, Presenter, TimestampSource};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 use super::bench::{SIZE, named, panel};
@@ -52,7 +52,7 @@ impl Presenter for Stamped {
         presented: &mut dyn FnMut(PresentedRefresh),
     ) -> Result<(), PanelFault> {
         self.0.tick(now, frames, &mut |refresh| {
-            presented(PresentedRefresh { provenance: Provenance::Driver, ..refresh });
+            presented(PresentedRefresh { provenance: TimestampSource::Driver, ..refresh });
         })
     }
 

@@ -4,7 +4,7 @@
 use holod_calibration::rig::PanelMode;
 use holod_calibration::{Colour, host_now};
 use holod_slm_output::present::window::{DisplayServer, Road, WindowError};
-use holod_slm_output::present::{PanelFault, Presenter, Provenance, WindowSpec};
+use holod_slm_output::present::{PanelFault, Presenter, TimestampSource, WindowSpec};
 
 use super::bench::{Bench, FLAT, SIZE, differences, expected, levels, named, packed, wait_until};
 use super::x11_server::{Desktop, MAIN, MAIN_PLACE, PANEL, PANEL_PLACE, PANEL_SIZE};
@@ -58,7 +58,7 @@ fn refreshes_have_the_servers_times_which_a_copy_does_not_make_the_drivers() {
     let mut bench = open(&desktop, &named(PANEL), PanelMode::ChannelPacked).unwrap();
     bench.submit();
     let refreshes = bench.run_for(61).unwrap();
-    assert!(refreshes.iter().all(|refresh| refresh.provenance == Provenance::Software));
+    assert!(refreshes.iter().all(|refresh| refresh.provenance == TimestampSource::Software));
     let counts: Vec<_> = refreshes.iter().filter_map(|refresh| refresh.refresh_count).collect();
     assert_eq!(counts.len(), refreshes.len());
     assert!(counts.is_sorted_by(|a, b| a < b), "{counts:?}");

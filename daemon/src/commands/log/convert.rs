@@ -6,7 +6,7 @@ use super::{odd_scale, read};
 use crate::cli::{LogConvertArgs, LogFormatArg};
 use crate::destination::Destination;
 use crate::failure::{Exit, Failure};
-use crate::report;
+use crate::results;
 
 pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
     let out = Destination::new(&args.out, "--out", args.force)?;
@@ -42,7 +42,7 @@ pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
     if out.is_stdout() {
         return Ok(());
     }
-    report::print(&format!(
+    results::print(&format!(
         "{}: {} samples of {} written to {}; {rejected} lines or cells held none",
         args.log.display(),
         recording.len(),

@@ -14,7 +14,7 @@ use crate::cli::LogInfoArgs;
 use crate::destination::Destination;
 use crate::failure::{Exit, Failure};
 use crate::pictures::{PupilPlot, PupilSampleMark};
-use crate::report;
+use crate::results;
 use crate::terminal::{Axes, LiveText, Series, TextSize, plot};
 
 /// What was found, with the gate's word.
@@ -69,7 +69,7 @@ pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
     }
     if args.json {
         let gate = judged.as_ref().map(|judged| &judged.counts);
-        return report::print_json(&Report { info: &info, gate });
+        return results::print_json(&Report { info: &info, gate });
     }
     let mut text = format!("{}\n{}", args.log.display(), text_of(&info));
     match &judged {
@@ -79,7 +79,7 @@ pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
         ),
     }
     text.push_str(&drawn(&recording, args.scale, info.duration_s));
-    report::print(text.trim_end())
+    results::print(text.trim_end())
 }
 
 /// Lets the gate and the filter see the whole log.

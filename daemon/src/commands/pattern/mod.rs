@@ -15,7 +15,7 @@ use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
 use crate::pictures::video_pictures;
 use crate::session::not_dark;
-use crate::{report, setup};
+use crate::{results, setup};
 
 pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> {
     let to = kind.target();
@@ -34,13 +34,13 @@ pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> 
         sight.files = save(&levels, out, to.force)?;
     }
     if to.json {
-        report::print_json(&sight)?;
+        results::print_json(&sight)?;
     } else {
-        report::print(sight.to_string().trim_end())?;
+        results::print(sight.to_string().trim_end())?;
     }
     let Some(output) = output else { return Ok(()) };
     let shown = show::show(&output, &rig, &encoder, &levels, to)?;
-    report::print(&shown.to_string())?;
+    results::print(&shown.to_string())?;
     match shown.lasers_dark {
         true => Ok(()),
         false => Err(Failure::new(Exit::Unavailable, not_dark("the laser box did not acknowledge in time"))),
@@ -68,7 +68,7 @@ fn save(levels: &LevelsFrame, out: &Path, force: bool) -> Result<Vec<PathBuf>, F
         pictures.iter().enumerate().map(|(position, (colour, _))| name(position, *colour)).collect();
     refuse_existing(files.iter().cloned(), "--out", force)?;
     for ((_, picture), file) in pictures.iter().zip(&files) {
-        report::save_png(picture, file)?;
+        results::save_png(picture, file)?;
     }
     Ok(files)
 }

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use crate::cli::ListArgs;
 use crate::failure::Failure;
-use crate::report;
+use crate::results;
 
 #[derive(Serialize)]
 struct Entry {
@@ -27,7 +27,7 @@ pub(super) fn list(args: &ListArgs) -> Result<(), Failure> {
         })
         .collect();
     if args.json {
-        return report::print_json(&entries);
+        return results::print_json(&entries);
     }
     let mut text = String::from("Profiles, for `profile=NAME` in a tracker spec:\n");
     for Entry { name, wire, unit, about } in &entries {
@@ -47,5 +47,5 @@ pub(super) fn list(args: &ListArgs) -> Result<(), Failure> {
     if serial_ports().is_empty() {
         text.push_str("  none\n");
     }
-    report::print(&text)
+    results::print(&text)
 }

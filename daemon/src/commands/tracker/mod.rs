@@ -8,12 +8,12 @@ use holod_pupil_input::udev_rule;
 
 use crate::cli::TrackerCommand;
 use crate::failure::Failure;
-use crate::report;
+use crate::results;
 
 pub(super) fn tracker(command: &TrackerCommand) -> Result<(), Failure> {
     match command {
         TrackerCommand::List(args) => list::list(args),
-        TrackerCommand::Rule(args) => report::print(udev_rule(args.ids).trim_end()),
+        TrackerCommand::Rule(args) => results::print(udev_rule(args.ids).trim_end()),
         TrackerCommand::Try(args) => try_out::try_out(args),
     }
 }

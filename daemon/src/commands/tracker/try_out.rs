@@ -18,9 +18,9 @@ use crate::bug_report;
 use crate::cli::TryArgs;
 use crate::failure::{Exit, Failure};
 use crate::record;
-use crate::session::{Signals, tracker_failure};
+use crate::session::Signals;
 use crate::terminal::{Axes, LiveText, Series, TextSize, plot};
-use crate::{report, setup};
+use crate::{results, setup};
 
 /// What came of it.
 #[derive(Serialize)]
@@ -68,7 +68,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         forbidden: setup::ports_of_others(&rig),
         ..TrackerOptions::default()
     };
-    let mut tracker = Tracker::start(&spec, &rig.tracker, options).map_err(tracker_failure)?;
+    let mut tracker = Tracker::start(&spec, &rig.tracker, options).map_err(setup::tracker_failure)?;
     if !args.json {
         for warning in tracker.warnings() {
             tracing::warn!("{warning}");
@@ -118,11 +118,11 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         ..report_of(&spec, &ended_by, began, now, &observed, &mut tracker)
     };
     if args.json {
-        report::print_json(&report)?;
+        results::print_json(&report)?;
     } else {
         live.show("");
         let text = text_of(&report);
-        report::print(&format!("{}\n{text}", traces(&observed, now, LiveText::visible(), text.lines().count())))?;
+        results::print(&format!("{}\n{text}", traces(&observed, now, LiveText::visible(), text.lines().count())))?;
     }
     if let Some(failure) = tracker.recording().and_then(|recording| recording.failure) {
         return Err(Failure::new(Exit::CannotCreate, format!("the recording is not whole: {failure}")));

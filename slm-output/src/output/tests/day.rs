@@ -217,7 +217,7 @@ impl Day {
             self.panel.waiting = Some(FrameTag { frame_id, t_submit: now, t_desired_present, keep: None });
             while let Some(&(_, id, t_present)) = self.reports.front().filter(|(t_told, ..)| *t_told <= now) {
                 self.reports.pop_front();
-                let outcome = self.pacer.report(id, t_present, Provenance::Hardware);
+                let outcome = self.pacer.report(id, t_present, TimestampSource::Hardware);
                 assert!(!matches!(outcome, Outcome::Unknown), "frame {id} of {}", self.plan.frame_id);
             }
             self.plan = self.pacer.predict(now);
@@ -266,7 +266,7 @@ impl Day {
             field,
             repeated: !new,
             t_present,
-            provenance: Provenance::Hardware,
+            provenance: TimestampSource::Hardware,
             refresh_count: None,
         };
         self.tell(PanelNews::Refresh(refresh));

@@ -40,7 +40,7 @@ use std::path::PathBuf;
 use holod_calibration::{TimeNs, host_now};
 use rustix::io::Errno;
 
-use super::{FrameSource, PanelFault, PanelSetup, PresentedRefresh, Presenter, Provenance};
+use super::{FrameSource, PanelFault, PanelSetup, PresentedRefresh, Presenter, TimestampSource};
 use crate::fields::{FrameTag, LevelsFrame};
 use crate::packing::{PixelFormat, write_frame};
 use card::ScanBuffer;
@@ -200,7 +200,7 @@ impl DrmPanel {
             self.margin.missed();
         }
         self.t_choose = self.margin.t_choose(refresh.t_present + self.period).max(t_sent);
-        if refresh.provenance != Provenance::Hardware {
+        if refresh.provenance != TimestampSource::Hardware {
             // Of two flips within half a refresh the clock takes the second for the first one's event, once more.
             self.t_choose = self.t_choose.max(TimeNs(refresh.t_present.0 + 5 * self.period.0 / 8));
         }

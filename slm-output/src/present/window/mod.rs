@@ -35,7 +35,7 @@ use self::watch::Watched;
 use crate::fields::{FIELDS, FrameTag, LevelsFrame};
 use crate::packing::{PIXEL_BYTES, PixelFormat, write_frame};
 use crate::present::{
-    FrameSource, PanelFault, PanelSetup, PanelTiming, PresentedRefresh, Presenter, Provenance, WindowSpec,
+    FrameSource, PanelFault, PanelSetup, PanelTiming, PresentedRefresh, Presenter, TimestampSource, WindowSpec,
 };
 
 /// The display server that windows are opened on.
@@ -473,7 +473,7 @@ impl Presenter for WindowPanel {
             {
                 let t_present = host_now();
                 self.t_next = (now + self.timing.refresh_period).max(t_present);
-                let came = Presented { t_present, provenance: Provenance::Software, refresh_count: None };
+                let came = Presented { t_present, provenance: TimestampSource::Software, refresh_count: None };
                 self.report(picture, came, presented);
             }
             Ok(())

@@ -3,7 +3,7 @@
 use holod_calibration::TimeNs;
 
 use super::watch::{Completion, Shown};
-use crate::present::Provenance;
+use crate::present::TimestampSource;
 
 /// How far after its arrival a completion's time may lie, and how long before: clocks are read at different places.
 const AHEAD_MAX: TimeNs = TimeNs(2_000_000);
@@ -13,7 +13,7 @@ const BEHIND_MAX: TimeNs = TimeNs(1_000_000_000);
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Presented {
     pub(super) t_present: TimeNs,
-    pub(super) provenance: Provenance,
+    pub(super) provenance: TimestampSource,
     pub(super) refresh_count: Option<u64>,
 }
 
@@ -63,12 +63,16 @@ impl Timeline {
         let counts_on = completion.refresh_count > self.refresh_count;
         self.refresh_count = completion.refresh_count;
         if age < TimeNs(-AHEAD_MAX.0) || age > BEHIND_MAX {
-            return Outcome::Shown(Presented { t_present: now, provenance: Provenance::Software, refresh_count: None });
+            return Outcome::Shown(Presented {
+                t_present: now,
+                provenance: TimestampSource::Software,
+                refresh_count: None,
+            });
         }
         let is_stamped = completion.shown == Shown::Flipped && counts_on;
         Outcome::Shown(Presented {
             t_present: completion.t_present,
-            provenance: if is_stamped { Provenance::Driver } else { Provenance::Software },
+            provenance: if is_stamped { TimestampSource::Driver } else { TimestampSource::Software },
             refresh_count: counts_on.then_some(completion.refresh_count),
         })
     }
@@ -175,7 +179,9 @@ mod tests {
 
     #[test]
     fn a_flip_has_the_drivers_time_and_a_copy_has_not() {
-        for (shown, provenance) in [(Shown::Flipped, Provenance::Driver), (Shown::Copied, Provenance::Software)] {
+        for (shown, provenance) in
+            [(Shown::Flipped, TimestampSource::Driver), (Shown::Copied, TimestampSource::Software)]
+        {
             let outcome = timeline().complete(completion(10, 1016, 101, shown), TimeNs(1017 * MS));
             let presented = Presented { t_present: TimeNs(1016 * MS), provenance, refresh_count: Some(101) };
             assert_eq!(outcome, Outcome::Shown(presented));
@@ -199,13 +205,13 @@ mod tests {
         for t_ms in [0, 10, 1020, 1_700_000_000_000] {
             let outcome = timeline().complete(completion(10, t_ms, 101, Shown::Flipped), TimeNs(1017 * MS));
             let arrival =
-                Presented { t_present: TimeNs(1017 * MS), provenance: Provenance::Software, refresh_count: None };
+                Presented { t_present: TimeNs(1017 * MS), provenance: TimestampSource::Software, refresh_count: None };
             assert_eq!(outcome, Outcome::Shown(arrival), "{t_ms}");
         }
         for count in [100, 0] {
             let outcome = timeline().complete(completion(10, 1016, count, Shown::Flipped), TimeNs(1017 * MS));
             let Outcome::Shown(Presented { provenance, refresh_count, .. }) = outcome else { panic!("{outcome:?}") };
-            assert_eq!((provenance, refresh_count), (Provenance::Software, None));
+            assert_eq!((provenance, refresh_count), (TimestampSource::Software, None));
         }
     }
 }
