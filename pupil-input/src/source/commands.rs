@@ -1,6 +1,6 @@
 //! What a tracker has to be told before it sends, and before the link is closed; and that it has understood.
 
-use std::io::{self, ErrorKind};
+use std::io::{self, ErrorKind, Read};
 use std::time::{Duration, Instant};
 
 use super::{ByteSource, ReadEvent};
@@ -162,8 +162,21 @@ pub(crate) fn in_words(bytes: &[u8]) -> String {
     bytes.escape_ascii().to_string()
 }
 
+/// What a link that waits for a while at most has brought: 0 bytes where that was nothing.
+pub(crate) fn receive_from(link: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
+    match link.read(buffer) {
+        // End of file: a peer that has hung up; some serial drivers tell an unplugged device in this way, at once and for ever.
+        Ok(0) => Err(hung_up()),
+        Ok(count) => Ok(count),
+        Err(error) => match error.kind() {
+            ErrorKind::TimedOut | ErrorKind::WouldBlock | ErrorKind::Interrupted => Ok(0),
+            _ => Err(error),
+        },
+    }
+}
+
 /// The error of a peer that has hung up.
-pub(crate) fn hung_up() -> io::Error {
+fn hung_up() -> io::Error {
     io::Error::new(ErrorKind::UnexpectedEof, "the other end has hung up")
 }
 

@@ -1,12 +1,12 @@
 //! A tracker that a TCP connection leads to, such as a Gazepoint's Open Gaze server.
 
-use std::io::{self, ErrorKind, Read, Write};
+use std::io::{self, ErrorKind, Write};
 use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
 use std::time::Duration;
 
 use rustix::net::sockopt;
 
-use super::commands::{CommandError, Dialogue, StartedLink, hung_up};
+use super::commands::{CommandError, Dialogue, StartedLink, receive_from};
 use super::{ByteSource, Feed, READ_TIMEOUT, SourceError};
 use crate::profile::{NetworkSettings, Profile};
 use crate::spec::HostPort;
@@ -144,13 +144,6 @@ impl Dialogue for Connection {
     }
 
     fn receive(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        match self.0.read(buffer) {
-            Ok(0) => Err(hung_up()),
-            Ok(count) => Ok(count),
-            Err(error) => match error.kind() {
-                ErrorKind::TimedOut | ErrorKind::WouldBlock | ErrorKind::Interrupted => Ok(0),
-                _ => Err(error),
-            },
-        }
+        receive_from(&mut self.0, buffer)
     }
 }

@@ -5,7 +5,7 @@
 
 pub(crate) mod identity;
 
-use std::io::{self, ErrorKind, Read, Write};
+use std::io::{self, ErrorKind, Write};
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use serialport::{ClearBuffer, SerialPort, TTYPort};
 
 use self::identity::{SerialPortInfo, UsbPort, ports_below, serial_ports};
-use super::commands::{CommandError, Dialogue, StartedLink, hung_up, overhear};
+use super::commands::{CommandError, Dialogue, StartedLink, overhear, receive_from};
 use super::{ByteSource, Feed, READ_TIMEOUT, SourceError};
 use crate::profile::Profile;
 use crate::wire::line::crc8;
@@ -353,15 +353,7 @@ impl Dialogue for OpenPort {
     }
 
     fn receive(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        match self.0.read(buffer) {
-            // End of file: some drivers tell an unplugged device in this way, at once and for ever.
-            Ok(0) => Err(hung_up()),
-            Ok(count) => Ok(count),
-            Err(error) => match error.kind() {
-                ErrorKind::TimedOut | ErrorKind::WouldBlock | ErrorKind::Interrupted => Ok(0),
-                _ => Err(error),
-            },
-        }
+        receive_from(&mut self.0, buffer)
     }
 }
 
@@ -417,6 +409,8 @@ fn ports_in_words(root: &Path) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::io::Read;
+
     use super::identity::fake::FakeSystem;
     use super::*;
     use crate::SampleEye;
