@@ -8,11 +8,11 @@ use std::path::Path;
 /// Bytes written at a time.
 const BUFFER_BYTES: usize = 1 << 16;
 
-/// Writes a file beside its place, and moves it there when it is whole and on the disk: whoever looks sees all of it or what
-/// was there before.
+/// Writes a file beside its place, and moves it there when it is whole and on the disk: whoever looks sees all of it or
+/// what was there before.
 ///
 /// # Errors
-/// The path names no file, `write` fails, or the system does; nothing is left of the file then.
+/// The path names no file, `write` fails, or the system does; what was there before stays then, and nothing beside it.
 pub fn write_atomically(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
     let name = path.file_name().ok_or_else(|| io::Error::other("it names no file"))?;
     if path.is_dir() {

@@ -1,5 +1,5 @@
-//! The text of a TOML file that describes a thing, such as a bench or a tracker, and all that is found wrong with it, so
-//! that one look at the messages is enough to mend the file.
+//! The text of a TOML file that describes a thing, such as a bench or a tracker, and all that is found wrong with it,
+//! so that one look at the messages is enough to mend the file.
 
 use std::cell::RefCell;
 use std::fmt;

@@ -3,10 +3,9 @@
 use std::io::{self, Write};
 use std::path::Path;
 
+use holod_calibration::write_atomically;
 use image::RgbImage;
 use serde::Serialize;
-
-use holod_calibration::write_atomically;
 
 use crate::failure::{Exit, Failure};
 use crate::logging;

@@ -20,14 +20,6 @@ pub fn candidates() -> Vec<PathBuf> {
     named("RUNTIME_DIRECTORY").into_iter().chain(runtime).chain([temporary]).collect()
 }
 
-/// When a process that lives began, in the kernel's clock ticks since the machine's start: with its number, it is this
-/// process and no later one that was given the same number.
-pub fn began_ticks(pid: u32) -> Option<u64> {
-    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
-    // Field 22, see proc(5), the third being the first after the name, which may hold blanks and brackets.
-    stat.rsplit_once(')')?.1.split_whitespace().nth(22 - 3)?.parse().ok()
-}
-
 /// Makes a folder that only this user can write to; false where it cannot be, or is somebody else's.
 fn prepare(folder: &Path) -> bool {
     let made = std::fs::DirBuilder::new().recursive(true).mode(0o700).create(folder).is_ok();
@@ -39,20 +31,6 @@ fn prepare(folder: &Path) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn processes_are_told_apart_by_their_beginning() {
-        let own = began_ticks(std::process::id()).unwrap();
-        let mut later = std::process::Command::new("sleep").arg("100").spawn().unwrap();
-        let of_later = began_ticks(later.id()).unwrap();
-        let again = began_ticks(later.id());
-        later.kill().unwrap();
-        later.wait().unwrap();
-        assert!(own <= of_later && again == Some(of_later), "{own} {of_later} {again:?}");
-        assert_eq!(began_ticks(later.id()), None);
-        // No process has this number: the kernel's greatest is 2^22.
-        assert_eq!(began_ticks(u32::MAX), None);
-    }
 
     #[test]
     fn a_folder_of_ones_own_is_made_and_a_link_is_none() {

@@ -1,7 +1,8 @@
 //! What a running holod says of itself: a small JSON file of its own that it writes anew each second and takes away at its
 //! end.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
@@ -36,7 +37,7 @@ struct Written<S> {
     /// holod runs. Older versions do not say it.
     #[serde(default)]
     written_ns: Option<i64>,
-    /// When the process began, as [`runtime_folder::began_ticks`] has it. Older versions do not say it.
+    /// When the process began, as [`began_ticks`] has it. Older versions do not say it.
     #[serde(default)]
     began_ticks: Option<u64>,
     #[serde(flatten)]
@@ -55,10 +56,7 @@ impl StatusFile {
     /// The file, in the first folder that takes it; a process without any has none, which is no fault.
     pub fn create() -> Self {
         match runtime_folder::own() {
-            Some(folder) => {
-                remove_leftovers(&folder);
-                Self::of(std::process::id(), &folder)
-            }
+            Some(folder) => Self::of(std::process::id(), &folder),
             None => Self { newest: Arc::default(), began_ticks: None, writer: None },
         }
     }
@@ -71,7 +69,7 @@ impl StatusFile {
         if let Err(error) = &writer {
             tracing::warn!("`holod status` will know nothing of this run: {error}");
         }
-        Self { newest, began_ticks: runtime_folder::began_ticks(pid), writer: writer.ok() }
+        Self { newest, began_ticks: began_ticks(pid), writer: writer.ok() }
     }
 
     /// Has the file written anew at host time `now`. Where the disk is still at what was written before, this one is left
@@ -106,27 +104,47 @@ fn write(newest: &Queue<Vec<u8>>, path: &Path) {
     let _ = std::fs::remove_file(path);
 }
 
-/// Takes away what holods that were killed have left: nobody else does, and their numbers are given out again.
-fn remove_leftovers(folder: &Path) {
+/// Takes away what holods that were killed have left in this process's folder: nobody else does, and their numbers are given
+/// out again. Call it before this process puts anything there.
+pub fn remove_leftovers() {
+    if let Some(folder) = runtime_folder::own() {
+        remove_leftovers_in(&folder);
+    }
+}
+
+fn remove_leftovers_in(folder: &Path) {
+    let mut of_processes: BTreeMap<u32, Vec<PathBuf>> = BTreeMap::new();
     for path in std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path()) {
         let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
         // Also a status that was being written.
         let of_status = name.trim_start_matches('.').strip_prefix("status-").and_then(|rest| rest.split('.').next());
-        let Some(pid) = of_status.or_else(|| name.strip_prefix("control-")).and_then(|pid| pid.parse().ok()) else {
-            continue;
-        };
+        if let Some(pid) = of_status.or_else(|| name.strip_prefix("control-")).and_then(|pid| pid.parse().ok()) {
+            of_processes.entry(pid).or_default().push(path);
+        }
+    }
+    for (pid, paths) in of_processes {
         let status = std::fs::read(folder.join(file_name(pid))).unwrap_or_default();
         let began_ticks = serde_json::from_slice::<Written<()>>(&status).ok().and_then(|written| written.began_ticks);
-        if !lives(pid, began_ticks) {
-            let _another_did = std::fs::remove_file(&path);
+        // The process of another container is not seen from here, but it answers.
+        let answers = || UnixStream::connect(folder.join(format!("control-{pid}"))).is_ok();
+        if !lives(pid, began_ticks) && !answers() {
+            paths.iter().for_each(|path| drop(std::fs::remove_file(path)));
         }
     }
 }
 
 /// Whether the process of this number lives and, where that is known, began then.
 fn lives(pid: u32, began_ticks: Option<u64>) -> bool {
-    let now = runtime_folder::began_ticks(pid);
-    now.is_some() && (began_ticks.is_none() || began_ticks == now)
+    let found = self::began_ticks(pid);
+    found.is_some() && (began_ticks.is_none() || began_ticks == found)
+}
+
+/// When a process that lives began, in the kernel's clock ticks since the machine's start: with its number, it is this
+/// process and no later one that was given the same number.
+fn began_ticks(pid: u32) -> Option<u64> {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).ok()?;
+    // Field 22, see proc(5), the third being the first after the name, which may hold blanks and brackets.
+    stat.rsplit_once(')')?.1.split_whitespace().nth(22 - 3)?.parse().ok()
 }
 
 impl Drop for StatusFile {
@@ -250,6 +268,8 @@ fn read(path: &Path, now: TimeNs) -> std::io::Result<Option<Found>> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+    use std::os::unix::net::UnixListener;
     use std::time::SystemTime;
 
     use super::*;
@@ -311,21 +331,33 @@ mod tests {
     }
 
     #[test]
+    fn processes_are_told_apart_by_their_beginning() {
+        let own = began_ticks(std::process::id()).unwrap();
+        let mut later = std::process::Command::new("sleep").arg("100").spawn().unwrap();
+        let of_later = began_ticks(later.id()).unwrap();
+        let again = began_ticks(later.id());
+        later.kill().unwrap();
+        later.wait().unwrap();
+        assert!(own <= of_later && again == Some(of_later), "{own} {of_later} {again:?}");
+        assert_eq!(began_ticks(later.id()), None);
+        // No process has this number: the kernel's greatest is 2^22.
+        assert_eq!(began_ticks(u32::MAX), None);
+    }
+
+    #[test]
     fn what_a_killed_holod_left_is_not_taken_for_a_later_process_of_its_number_and_is_taken_away() {
         let folder = tempfile::tempdir().unwrap();
         let folders = [folder.path().to_owned()];
         let pid = std::process::id();
         let own = folder.path().join(file_name(pid));
-        let began_ticks = runtime_folder::began_ticks(pid).unwrap();
+        let began_ticks = began_ticks(pid).unwrap();
         let write = |began_ticks, status| {
             let written = Written { written_ns: Some(NOW.0), began_ticks: Some(began_ticks), status };
             std::fs::write(&own, serde_json::to_vec(&written).unwrap()).unwrap();
         };
         let left = || {
-            let mut names: Vec<_> =
-                std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
-            names.sort();
-            names
+            let names = std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name());
+            names.map(|name| name.into_string().unwrap()).collect::<BTreeSet<_>>()
         };
         // Of no process, or of a later one of the same number.
         let control = format!("control-{pid}");
@@ -335,13 +367,15 @@ mod tests {
         }
         write(began_ticks, status());
         assert_eq!(found_in(&folders).unwrap().len(), 1);
-        remove_leftovers(folder.path());
-        let ours = [&control[..], "control-x", "feed", &file_name(pid)];
-        assert_eq!(left(), ours);
+        let elsewhere = UnixListener::bind(folder.path().join("control-4294967294")).unwrap();
+        remove_leftovers_in(folder.path());
+        let ours = ["control-4294967294", &control[..], "control-x", "feed", &file_name(pid)];
+        assert_eq!(left(), ours.map(str::to_owned).into());
+        drop(elsewhere);
         write(began_ticks - 1, status());
         assert!(found_in(&folders).is_err());
-        remove_leftovers(folder.path());
-        assert!(!own.exists());
+        remove_leftovers_in(folder.path());
+        assert_eq!(left(), ["control-x", "feed"].map(str::to_owned).into());
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use holod_calibration::{TimeNs, rig};
+use holod_calibration::{Sorted, TimeNs, rig};
 
 use crate::counters::{Counter, CounterSnapshot};
 use crate::estimator::Decision;
@@ -180,7 +180,7 @@ impl RefusalWatch {
     }
 
     fn gate_advice(&self, reason: Rejection) -> String {
-        let newest = |figure: fn(&PupilSample) -> f64| median(self.samples.iter().map(figure).collect());
+        let newest = |figure: fn(&PupilSample) -> f64| median(self.samples.iter().map(figure));
         match reason {
             Rejection::OutOfRange => self.range_advice(),
             Rejection::Lost => {
@@ -221,7 +221,7 @@ impl RefusalWatch {
     /// Diameters that are none: most often another unit.
     fn range_advice(&self) -> String {
         let figures = self.samples.iter().filter(|sample| sample.valid && sample.diameter_mm.is_finite());
-        let Some(mm) = median(figures.map(|sample| f64::from(sample.diameter_mm)).collect()) else {
+        let Some(mm) = median(figures.map(|sample| f64::from(sample.diameter_mm))) else {
             return "the figures are no diameters of a pupil".into();
         };
         let figure = mm / self.scale;
@@ -260,7 +260,7 @@ impl RefusalWatch {
                 let of_eye: Vec<_> = self.samples.iter().filter(|sample| sample.eye == eye).collect();
                 of_eye.windows(2).map(|pair| step(pair[0], pair[1])).collect::<Vec<_>>()
             });
-            median(pairs.collect())
+            median(pairs)
         };
         let interval = steps(|before, after| (after.t_device.0.saturating_sub(before.t_device.0)).abs() as f64);
         match interval.map(|ns| TimeNs(ns as i64)) {
@@ -332,10 +332,8 @@ fn wire_advice(fault: WireFault) -> String {
     }
 }
 
-fn median(mut values: Vec<f64>) -> Option<f64> {
-    values.retain(|value| value.is_finite());
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
+fn median(values: impl IntoIterator<Item = f64>) -> Option<f64> {
+    Sorted::new(values.into_iter().filter(|value| value.is_finite())).map(|sorted| sorted.median())
 }
 
 /// Four significant digits, without zeros behind them.

@@ -35,8 +35,8 @@ impl Daemon {
         Self::start_with(binary, args, folder, &[])
     }
 
-    /// The same with additional variables in its environment. Where they do not name one, `folder` is also that for status
-    /// and sockets, so that tests know nothing of each other's daemons and leave nothing behind.
+    /// The same with additional variables in its environment. Where they do not name one, `folder` is also that for
+    /// status and sockets, so that tests know nothing of each other's daemons and leave nothing behind.
     ///
     /// # Panics
     /// Where it cannot be started.

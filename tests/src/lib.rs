@@ -8,8 +8,8 @@ pub mod tracker;
 use rustix::fs::statvfs;
 use tempfile::TempDir;
 
-/// A new folder in memory, or where there is little of that, on the disk: a disk that is busy with other work, such as what
-/// a build has written, holds status files and records up for minutes.
+/// A new folder in memory, or where there is little of that, on the disk: a disk that is busy with other work, such as
+/// what a build has written, holds status files and records up for minutes.
 ///
 /// # Panics
 /// Where no folder can be made.

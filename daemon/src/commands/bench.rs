@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use holod_calibration::rig::{LaserDriver, Lasers, Rig};
-use holod_calibration::{PupilDiameter, Resolution};
+use holod_calibration::{PupilDiameter, Resolution, Sorted};
 use holod_model::engine::{StageTiming, fma_peak, stream_bandwidth};
 use holod_model::{RgbdFrame, Weights};
 use holod_pupil_input::{Scenario, TrackerSpec};
@@ -267,16 +267,11 @@ impl Measured {
 }
 
 impl Quartiles {
-    /// Of at least one value; between two of them by linear interpolation.
+    /// Of at least one value.
     fn of(values_ms: impl Iterator<Item = f64>) -> Self {
-        let mut sorted: Vec<f64> = values_ms.collect();
-        sorted.sort_by(f64::total_cmp);
-        let at = |share: f64| {
-            let place = share * (sorted.len() - 1) as f64;
-            let (below, above) = (sorted[place.floor() as usize], sorted[place.ceil() as usize]);
-            below + (above - below) * place.fract()
-        };
-        Self { lower_quartile_ms: at(0.25), median_ms: at(0.5), upper_quartile_ms: at(0.75) }
+        let sorted = Sorted::new(values_ms).expect("at least one value");
+        let [lower_quartile_ms, median_ms, upper_quartile_ms] = [0.25, 0.5, 0.75].map(|share| sorted.quantile(share));
+        Self { lower_quartile_ms, median_ms, upper_quartile_ms }
     }
 }
 
@@ -407,17 +402,6 @@ mod tests {
     }
 
     const CEILINGS: Ceilings = Ceilings { threads: 2, gflop_per_s: 2.0, gb_per_s: 0.5 };
-
-    #[test]
-    fn quartiles_of_a_known_series() {
-        let of = |values: &[f64]| {
-            let Quartiles { lower_quartile_ms, median_ms, upper_quartile_ms } = Quartiles::of(values.iter().copied());
-            [lower_quartile_ms, median_ms, upper_quartile_ms]
-        };
-        assert_eq!(of(&[7.0]), [7.0; 3]);
-        assert_eq!(of(&[5.0, 1.0, 4.0, 2.0, 3.0]), [2.0, 3.0, 4.0]);
-        assert_eq!(of(&[4.0, 1.0, 3.0, 2.0]), [1.75, 2.5, 3.25]);
-    }
 
     #[test]
     fn ratios_of_the_feed_are_of_medians_and_a_busy_machine_is_told() {

@@ -19,8 +19,7 @@ use crate::pictures::levels_picture;
 use crate::progress;
 use crate::record::{self, RecordHealth, Recorder};
 use crate::session::{self, Hangups, SessionPlan, SessionReport, Summary, not_dark};
-use crate::{results, run_text};
-use crate::{setup, source};
+use crate::{results, run_text, setup, source};
 
 /// Scenario of the built-in tracker.
 const SAMPLE_TRACKER: &str = "mock";

@@ -33,7 +33,7 @@ use crate::failure::{Exit, Failure};
 use crate::record::FrameOrders;
 use crate::renderer::{self, Renderer};
 use crate::source::{OpenPictures, Pictures};
-use crate::status::StatusFile;
+use crate::status::{self, StatusFile};
 use crate::{progress, setup, source, speed};
 
 /// Lasers go dark when one frame has stayed on the panel for so many frame times, within these limits.
@@ -71,6 +71,7 @@ pub(super) fn build(
     signals: Signals,
     observer: &mut dyn Observer,
 ) -> Result<Session<'_>, Failure> {
+    status::remove_leftovers();
     // Its threads keep the priority of whoever calls it first, which must not be the panel's.
     scheduling::patient(rayon::current_num_threads);
     let plays = playback.is_some();

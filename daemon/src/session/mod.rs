@@ -6,7 +6,6 @@ mod desk;
 mod feed_watch;
 mod frame_loop;
 mod inputs;
-
 mod laser_watch;
 mod ledger;
 mod obey;

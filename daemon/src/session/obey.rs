@@ -218,9 +218,9 @@ const fn eye_in_words(eye: Eye) -> &'static str {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use holod_calibration::rig::WeightsChoice;
 
+    use super::*;
     use crate::control::CHANGEABLE;
 
     #[test]

@@ -1,7 +1,7 @@
 //! Which threads go first: the panel, lasers and tracker before the network's workers.
 //!
 //! A thread starts with the scheduling of the one that creates it, so parts are created on a short-lived thread that
-//! has the wanted one.
+//! has the wanted one. The tracker's reader raises itself, since the thread that writes its record must not be raised.
 
 use rustix::process::setpriority_process;
 use thread_priority::{

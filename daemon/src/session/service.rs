@@ -123,7 +123,7 @@ struct Watchdog {
 }
 
 impl Watchdog {
-    fn is_due(&mut self, frames_shown: u64, now: TimeNs) -> bool {
+    fn feed_if_due(&mut self, frames_shown: u64, now: TimeNs) -> bool {
         let due = now - self.t_fed >= self.every && frames_shown > self.frames_fed;
         if due {
             (self.t_fed, self.frames_fed) = (now, frames_shown);
@@ -148,7 +148,7 @@ impl Service {
         if frames_shown > 0 && !self.ready {
             self.ready = tell(&[NotifyState::Ready]);
         }
-        if self.watchdog.as_mut().is_some_and(|watchdog| watchdog.is_due(frames_shown, now)) {
+        if self.watchdog.as_mut().is_some_and(|watchdog| watchdog.feed_if_due(frames_shown, now)) {
             tell(&[NotifyState::Watchdog]);
         }
     }
@@ -194,12 +194,12 @@ mod tests {
     #[test]
     fn the_watchdog_starves_when_no_new_frame_is_shown() {
         let mut watchdog = Watchdog { every: TimeNs(100), t_fed: TimeNs(0), frames_fed: 0 };
-        assert!(!watchdog.is_due(0, TimeNs(1_000)));
-        assert!(watchdog.is_due(1, TimeNs(1_000)));
-        assert!(!watchdog.is_due(5, TimeNs(1_050)), "not due yet");
-        assert!(watchdog.is_due(5, TimeNs(1_100)));
+        assert!(!watchdog.feed_if_due(0, TimeNs(1_000)));
+        assert!(watchdog.feed_if_due(1, TimeNs(1_000)));
+        assert!(!watchdog.feed_if_due(5, TimeNs(1_050)), "not due yet");
+        assert!(watchdog.feed_if_due(5, TimeNs(1_100)));
         for t in 0..100 {
-            assert!(!watchdog.is_due(5, TimeNs(2_000 + t * 100)), "a stalled panel does not feed it");
+            assert!(!watchdog.feed_if_due(5, TimeNs(2_000 + t * 100)), "a stalled panel does not feed it");
         }
     }
 

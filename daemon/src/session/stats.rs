@@ -1,6 +1,6 @@
 //! Medians of what came lately.
 
-use holod_calibration::TimeNs;
+use holod_calibration::{Sorted, TimeNs};
 
 use crate::spread::Spread;
 
@@ -33,11 +33,9 @@ impl Recent {
 
     /// Nothing where there are no values.
     pub(super) fn spread(&self) -> Option<Spread> {
-        let mut sorted = self.values.clone();
-        sorted.sort_by(f32::total_cmp);
-        let last = sorted.len().checked_sub(1)?;
-        let at = |share: f64| sorted[(last as f64 * share).round() as usize];
-        Some(Spread { median_ms: at(0.5), p99_ms: at(0.99), max_ms: sorted[last] })
+        let sorted = Sorted::new(self.values.iter().copied().map(f64::from))?;
+        let [median_ms, p99_ms, max_ms] = [0.5, 0.99, 1.0].map(|share| sorted.quantile(share) as f32);
+        Some(Spread { median_ms, p99_ms, max_ms })
     }
 }
 

@@ -5,8 +5,7 @@ use std::collections::{BTreeMap, VecDeque};
 use holod_calibration::{PupilDiameter, TimeNs};
 use holod_slm_output::FieldEvent;
 
-use super::frame_loop::LoopRecord;
-use super::frame_loop::RECORDS;
+use super::frame_loop::{LoopRecord, RECORDS};
 use super::ledger::LaserLedger;
 use super::observer::FirstLight;
 use super::recorded_levels::KEEP_SLOTS;

@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::rig::{Rig, RigError};
-use holod_calibration::{DisplayGeometry, Resolution};
+use holod_calibration::{DisplayGeometry, Resolution, Sorted};
 use holod_model::gpu::GpuError;
 use holod_model::scene_renderer::shard::{Outcome, PlanePlan, PlannedScene, Preview, PupilPlan, ShardError, ShardPlan};
 use holod_model::scene_renderer::{SceneKind, Tracer};
@@ -316,9 +316,9 @@ fn bench(options: &Bench) -> Result<String, Failure> {
         "{scenes} scenes of {}, {} planes; medians\n{:>8.2} s to compose a scene",
         plan.resolution,
         plan.planes.count(),
-        median(&mut composing_s)
+        median(&composing_s)
     );
-    let of_cpu = median(&mut rates[0].clone());
+    let of_cpu = median(&rates[0]);
     for (place, (tracing_s, rates)) in tracing_s.iter_mut().zip(&mut rates).enumerate() {
         let tracer = &tracers[place];
         let rate = median(rates);
@@ -336,9 +336,8 @@ fn bench(options: &Bench) -> Result<String, Failure> {
     Ok(report)
 }
 
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    0.5 * (values[values.len() / 2] + values[(values.len() - 1) / 2])
+fn median(values: &[f64]) -> f64 {
+    Sorted::new(values.iter().copied()).expect("at least one round").median()
 }
 
 /// Noise is averaged as power over the scenes.

@@ -10,14 +10,13 @@ use std::path::{Path, PathBuf};
 use holod_calibration::TimeNs;
 use serde_json::{Map, Value};
 
-use crate::SampleEye;
-
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{Blink, LogBuilder, LogSample, usual_step};
 use super::table::{Row, cells, is_missing, ns_of, ns_per_unit, number, time_ns};
+use crate::SampleEye;
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Bids, recognises, read };

@@ -2,14 +2,13 @@
 
 use holod_calibration::TimeNs;
 
-use crate::SampleEye;
-
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
 use super::table::{Row, Table, number, time_ns};
+use crate::SampleEye;
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Csv, recognises, read };

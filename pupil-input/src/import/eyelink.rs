@@ -9,14 +9,13 @@ use std::f64::consts::PI;
 
 use holod_calibration::TimeNs;
 
-use crate::SampleEye;
-
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{Blink, LogBuilder, LogSample};
 use super::text::{number, time};
+use crate::SampleEye;
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::EyeLink, recognises, read };

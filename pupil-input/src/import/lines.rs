@@ -1,13 +1,12 @@
 //! holod's own recordings: files of [protocol lines](crate::wire::line).
 
-use crate::wire::line::LineDecoder;
-use crate::wire::{Decoder, WireEvent};
-
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
+use crate::wire::line::LineDecoder;
+use crate::wire::{Decoder, WireEvent};
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Lines, recognises, read };
 

@@ -1,5 +1,5 @@
-//! Logs of pupil diameters, told apart by their content and read into one shape: one file for each format, and a line for it
-//! in [`IMPORTERS`].
+//! Logs of pupil diameters, told apart by their content and read into one shape: one file for each format, and a line
+//! for it in [`IMPORTERS`].
 //!
 //! A log is read in one pass, as a stream: what stays in memory is 24 bytes a sample.
 

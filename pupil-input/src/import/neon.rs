@@ -10,14 +10,13 @@ use std::path::{Path, PathBuf};
 
 use holod_calibration::TimeNs;
 
-use crate::SampleEye;
-
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{Blink, LogBuilder, LogSample};
 use super::text::{self, Header, Picker, number, time};
+use crate::SampleEye;
 
 pub(super) const CLOUD: Importer =
     Importer { format: LogFormat::NeonEyeStates, recognises: recognises_cloud, read: read_cloud };

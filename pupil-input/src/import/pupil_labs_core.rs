@@ -4,14 +4,13 @@
 //! `diameter_3d` in millimetres besides. Where there are 3-D rows the 2-D ones tell nothing more and are left out. Eye 0
 //! is the right one.
 
-use crate::SampleEye;
-
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
 use super::text::{Header, Picker, number, time};
+use crate::SampleEye;
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Core, recognises, read };

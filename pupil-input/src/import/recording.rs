@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use holod_calibration::TimeNs;
+use holod_calibration::{Sorted, TimeNs};
 
 use super::fault::{LogFault, LogFaults, ReplayError};
 use super::format::LogFormat;
@@ -278,9 +278,8 @@ fn slow_rate_hz(rows: &[Row]) -> Option<f64> {
 
 /// The usual step of `times`: the median of those that are positive.
 pub(super) fn usual_step(times: &[f64]) -> Option<f64> {
-    let mut steps: Vec<f64> = times.windows(2).map(|pair| pair[1] - pair[0]).filter(|step| *step > 0.0).collect();
-    steps.sort_by(f64::total_cmp);
-    steps.get(steps.len() / 2).copied()
+    let steps = times.windows(2).map(|pair| pair[1] - pair[0]).filter(|step| *step > 0.0);
+    Sorted::new(steps).map(|steps| steps.median())
 }
 
 #[cfg(test)]

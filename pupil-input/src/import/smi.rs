@@ -5,14 +5,13 @@
 
 use holod_calibration::TimeNs;
 
-use crate::SampleEye;
-
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{Blink, LogBuilder, LogSample};
 use super::text::{Header, Picker, number, time};
+use crate::SampleEye;
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Smi, recognises, read };

@@ -7,14 +7,13 @@
 
 use holod_calibration::TimeNs;
 
-use crate::SampleEye;
-
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample, usual_step};
 use super::table::{Row, Table, cells, is_missing, ns_per_unit, number, separator, time_ns};
+use crate::SampleEye;
 use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Tobii, recognises, read };

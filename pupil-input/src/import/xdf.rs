@@ -7,11 +7,8 @@
 use std::collections::BTreeMap;
 use std::io::{self, BufRead, Read};
 
-use holod_calibration::TimeNs;
+use holod_calibration::{Sorted, TimeNs};
 use roxmltree::{Document, Node, ParsingOptions};
-
-use crate::SampleEye;
-use crate::wire::WireFault;
 
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
@@ -19,7 +16,9 @@ use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
 use super::table::ns_of;
+use crate::SampleEye;
 use crate::size_unit::SizeUnit;
+use crate::wire::WireFault;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Xdf, recognises, read };
 
@@ -465,11 +464,9 @@ impl Clock {
         let mut kept = offsets.to_vec();
         let mut clock = Self::line(&kept);
         for _ in 0..2 {
-            let mut errors: Vec<f64> = kept.iter().map(|at| (at.1 - clock.at(at.0)).abs()).collect();
-            errors.sort_by(f64::total_cmp);
+            let Some(errors_s) = Sorted::new(kept.iter().map(|at| (at.1 - clock.at(at.0)).abs())) else { break };
             // 1.4826 times the median is the deviation of a normal distribution.
-            let Some(median_s) = errors.get(errors.len() / 2).copied() else { break };
-            let limit_s = (3.0 * 1.4826 * median_s).max(1e-6);
+            let limit_s = (3.0 * 1.4826 * errors_s.median()).max(1e-6);
             kept.retain(|at| (at.1 - clock.at(at.0)).abs() <= limit_s);
             clock = Self::line(&kept);
         }

@@ -6,8 +6,7 @@ use holod_calibration::toml_source::Fault;
 
 use super::kinds::{Context, EYES, read_wire};
 use super::reader::{Found, Reader, Section};
-use super::{Command, HidSettings, NetworkSettings, Profile, SerialSettings};
-use crate::profile::DEFAULT_BAUD;
+use super::{Command, DEFAULT_BAUD, HidSettings, NetworkSettings, Profile, SerialSettings};
 use crate::size_unit::SizeUnit;
 use crate::usb_ids::UsbIds;
 use crate::wire::field::{SizeKind, SizeRule};

@@ -165,7 +165,8 @@ pub(crate) fn in_words(bytes: &[u8]) -> String {
 /// What a link that waits for a while at most has brought: 0 bytes where that was nothing.
 pub(crate) fn receive_from(link: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
     match link.read(buffer) {
-        // End of file: a peer that has hung up; some serial drivers tell an unplugged device in this way, at once and for ever.
+        // End of file: a peer that has hung up. Some serial drivers tell an unplugged device in this way, at once and for
+        // ever.
         Ok(0) => Err(hung_up()),
         Ok(count) => Ok(count),
         Err(error) => match error.kind() {

@@ -127,12 +127,12 @@ impl Feed for TcpFeed {
     fn open(&mut self) -> Result<Box<dyn ByteSource>, SourceError> {
         let stream = self.connect()?;
         let NetworkSettings { start, stop, .. } = &self.settings;
-        let told = StartedLink::start(Connection(stream), start, stop).map_err(|problem| NetworkError::Command {
+        let link = StartedLink::start(Connection(stream), start, stop).map_err(|problem| NetworkError::Command {
             address: self.address.clone(),
             profile: self.profile.clone(),
             problem: Box::new(problem),
         })?;
-        Ok(Box::new(told))
+        Ok(Box::new(link))
     }
 }
 

@@ -1,7 +1,7 @@
 //! Checksums of messages: sums, exclusive ors and cyclic redundancy checks of up to 16 bits.
 //!
-//! A profile says the parameters of its check, and the crate `crc` borrows them for as long as it is used; a table that owns
-//! them is made here.
+//! A profile gives the parameters when it is read, and the crate `crc` takes only those that are there for good, so the
+//! table is made here.
 
 /// How bytes are summed up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -21,7 +21,7 @@ const TIMEOUT_US: u32 = 30_000;
 /// What the pins of a board did, in order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Pin {
-    FieldGate(Option<Laser>),
+    Gate(Option<Laser>),
     Power([u32; 3]),
 }
 
@@ -71,7 +71,7 @@ impl Hardware for Board {
     }
 
     fn set_gate(&mut self, lit: Option<Laser>) {
-        self.0.borrow_mut().pins.push(Pin::FieldGate(lit));
+        self.0.borrow_mut().pins.push(Pin::Gate(lit));
     }
 
     fn set_power(&mut self, power_uw: [u32; 3]) {
@@ -218,7 +218,7 @@ const FRAME: [(u64, Laser, bool); 6] = [
 #[test]
 fn it_boots_dark_and_says_so_and_lights_nothing_until_it_is_programmed_and_armed() {
     let mut bench = Bench::boot();
-    assert_eq!(bench.wires.borrow().pins, [Pin::FieldGate(None), Pin::Power([0; 3])]);
+    assert_eq!(bench.wires.borrow().pins, [Pin::Gate(None), Pin::Power([0; 3])]);
     assert_eq!(bench.said(), ["!BOOT"]);
     assert_eq!(bench.state().reason, DarkReason::Boot);
     for command in [Command::Heartbeat, frame(0, 0), light(Laser::Red, 0, 100)] {
@@ -260,10 +260,9 @@ fn each_sync_edge_lights_each_field_once_in_its_order_and_nothing_follows_withou
     bench.run_until(6000);
     assert_eq!(bench.state().reason, DarkReason::SyncLost);
     let gates: Vec<_> = bench.wires.borrow().pins.clone();
-    let expected =
-        [Laser::Green, Laser::Red, Laser::Blue].map(|laser| [Pin::FieldGate(Some(laser)), Pin::FieldGate(None)]);
+    let expected = [Laser::Green, Laser::Red, Laser::Blue].map(|laser| [Pin::Gate(Some(laser)), Pin::Gate(None)]);
     assert_eq!(gates[..6], expected.as_flattened()[..]);
-    assert_eq!(gates[6..], [Pin::FieldGate(None), Pin::Power([0; 3])]);
+    assert_eq!(gates[6..], [Pin::Gate(None), Pin::Power([0; 3])]);
 }
 
 #[test]
@@ -432,7 +431,7 @@ fn every_fault_makes_dark_from_every_armed_state_until_it_is_armed_again() {
             let said = bench.said();
             assert_eq!(said.iter().any(|text| text.starts_with("!DARK")), reason.is_of_box(), "{case}: {said:?}");
             let pins = bench.wires.borrow().pins.clone();
-            assert_eq!(pins[pins.len() - 2..], [Pin::FieldGate(None), Pin::Power([0; 3])], "{case}");
+            assert_eq!(pins[pins.len() - 2..], [Pin::Gate(None), Pin::Power([0; 3])], "{case}");
             assert!(
                 matches!(bench.events.last(), Some(Event::Dark { reason: found, .. }) if *found == reason),
                 "{case}"
@@ -485,7 +484,7 @@ fn heartbeats_hold_it_and_their_end_cuts_a_window_even_if_the_box_looks_late() {
         Event::Dark { t: TimeUs(65_000), reason: DarkReason::Heartbeat },
     ];
     assert_eq!(bench.events, expected);
-    assert!(!bench.wires.borrow().pins.contains(&Pin::FieldGate(Some(Laser::Blue))), "no gate opens after its time");
+    assert!(!bench.wires.borrow().pins.contains(&Pin::Gate(Some(Laser::Blue))), "no gate opens after its time");
     assert_eq!(bench.said(), ["!DARK 65000 heartbeat"]);
 }
 
@@ -662,7 +661,7 @@ proptest! {
         judge.events = std::mem::take(&mut bench.events);
         prop_assert_eq!(judge.fault(), None);
         let pins = bench.wires.borrow().pins.clone();
-        let last_gate = pins.iter().rev().find_map(|pin| if let Pin::FieldGate(gate) = pin { Some(*gate) } else { None });
+        let last_gate = pins.iter().rev().find_map(|pin| if let Pin::Gate(gate) = pin { Some(*gate) } else { None });
         prop_assert_eq!(last_gate, Some(None));
         for power in pins.iter().filter_map(|pin| if let Pin::Power(power) = pin { Some(power) } else { None }) {
             prop_assert!([[0; 3], [10, 20, 30]].contains(power));

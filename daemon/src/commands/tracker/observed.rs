@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use holod_calibration::TimeNs;
+use holod_calibration::{Sorted, TimeNs};
 use holod_pupil_input::{Decision, SampleEye, Verdict};
 use serde::Serialize;
 
@@ -41,11 +41,10 @@ pub(super) struct Quantiles {
 
 impl Quantiles {
     /// None of nothing.
-    fn of(mut values: Vec<f64>) -> Option<Self> {
-        values.sort_by(f64::total_cmp);
-        let last = values.len().checked_sub(1)?;
-        let at = |share: f64| values[(last as f64 * share).round() as usize];
-        Some(Self { p1: at(0.01), median: at(0.5), p99: at(0.99), max: values[last] })
+    fn of(values: Vec<f64>) -> Option<Self> {
+        let sorted = Sorted::new(values)?;
+        let [p1, median, p99, max] = [0.01, 0.5, 0.99, 1.0].map(|share| sorted.quantile(share));
+        Some(Self { p1, median, p99, max })
     }
 }
 

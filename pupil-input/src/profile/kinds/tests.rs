@@ -321,7 +321,7 @@ fn every_kind_has_a_shipped_profile_and_a_fuzz_target() {
     for kind in &KINDS {
         let key = format!("\nkind = \"{}\"\n", kind.name);
         assert!(FILES.iter().any(|(_, text)| text.contains(&key)), "no profile of {}", kind.name);
-        // The line protocol is called after its daemon in profiles.
+        // In profiles the line protocol is called `holod`.
         let target = if kind.name == "holod" { "line".into() } else { kind.name.replace('-', "_") };
         assert!(targets.iter().any(|name| name.starts_with(&target)), "no fuzz target of {}", kind.name);
     }

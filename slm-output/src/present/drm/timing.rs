@@ -30,8 +30,8 @@ pub struct FlipStamp {
 pub struct Refresh {
     /// Start of scan-out.
     pub t_present: TimeNs,
-    /// [`TimestampSource::Hardware`] where the event is believed; [`TimestampSource::Estimated`] where it is not but earlier ones
-    /// tell the time; [`TimestampSource::Software`] where only the event's arrival is known.
+    /// [`TimestampSource::Hardware`] where the event is believed; [`TimestampSource::Estimated`] where it is not but
+    /// earlier ones tell the time; [`TimestampSource::Software`] where only the event's arrival is known.
     pub provenance: TimestampSource,
     /// The display controller's counter, widened to 64 bits; `None` where the event is not believed.
     pub refresh_count: Option<u64>,

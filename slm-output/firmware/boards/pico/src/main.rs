@@ -51,13 +51,13 @@ const FULL_POWER_UW: [u32; 3] = [1000; 3];
 /// A loop that stands still for this long resets the board, which makes it dark.
 const WATCHDOG_MS: u32 = 20;
 
-type FieldGate = Pin<DynPinId, FunctionSioOutput, PullDown>;
+type Gate = Pin<DynPinId, FunctionSioOutput, PullDown>;
 type Input<P> = Pin<DynPinId, FunctionSioInput, P>;
 
 struct Board<'a, R, G, B> {
     timer: Timer,
     watchdog: Watchdog,
-    gates: [FieldGate; 3],
+    gates: [Gate; 3],
     powers: (R, G, B),
     interlock: Input<PullUp>,
     sync: Input<PullDown>,
