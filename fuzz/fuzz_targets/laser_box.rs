@@ -5,7 +5,7 @@
 //! else is sent as a line with its checksum.
 #![no_main]
 
-use holod_fuzz::allocations;
+use holod_fuzz::counting;
 use holod_laser_firmware::{Controller, Event, Hardware, Laser, Limits, Line, TimeUs};
 use libfuzzer_sys::fuzz_target;
 
@@ -120,14 +120,14 @@ fuzz_target!(|bytes: &[u8]| {
         let (now_us, heard) = (board.now_us, !board.to_box.is_empty());
         let mut events = [None; 64];
         let mut count = 0;
-        let before = allocations();
+        let before = counting::here();
         for _ in 0..steps {
             controller.step(&mut |event| {
                 events[count] = Some(event);
                 count += 1;
             });
         }
-        assert_eq!(allocations(), before, "the firmware takes memory");
+        assert_eq!(counting::here(), before, "the firmware takes memory");
         for event in events.iter().flatten() {
             judge.see(*event);
         }

@@ -1,41 +1,15 @@
 //! What every decoder and every importer must hold on any bytes.
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::wire::{Decoder, WireEvent};
 use holod_pupil_input::{Estimator, EstimatorSettings, LogInfo, Recording};
-
-/// The system's allocator, counting for each thread.
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: every call is passed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.set(ALLOCATIONS.get() + 1);
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
+pub use holod_tests::counting;
+use holod_tests::counting::Counting;
 
 #[global_allocator]
 static COUNTING: Counting = Counting;
-
-/// Allocations of this thread so far.
-pub fn allocations() -> u64 {
-    ALLOCATIONS.get()
-}
 
 /// More than any decoder makes of `bytes`, so that what it does can be written down without an allocation.
 const fn most_events(bytes: usize) -> usize {
@@ -81,12 +55,12 @@ fn events_of<'a>(
     pieces: impl IntoIterator<Item = &'a [u8]>,
 ) -> Vec<WireEvent> {
     let mut events = Vec::with_capacity(most_events(bytes));
-    let allocations = ALLOCATIONS.get();
+    let allocations = counting::here();
     for piece in pieces {
         decoder.push(piece, &mut |event| events.push(event));
     }
     decoder.finish(&mut |event| events.push(event));
-    assert_eq!(ALLOCATIONS.get(), allocations, "the decoder, or too many events, allocated");
+    assert_eq!(counting::here(), allocations, "the decoder, or too many events, allocated");
     assert!(events.len() <= most_events(bytes), "{} events of {bytes} bytes", events.len());
     for event in &mut events {
         if let WireEvent::Sample(sample) = event {

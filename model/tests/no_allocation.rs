@@ -1,33 +1,14 @@
 //! A running frame loop must not allocate: counts every allocation of the process while frames are rendered.
 
-use std::alloc::{GlobalAlloc, Layout, System};
 use std::path::Path;
-use std::sync::atomic::{AtomicUsize, Ordering};
 
 use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
 use holod_model::optics::DoublePhase;
 use holod_model::{ComplexHologram, CpuEngine, PhasePattern, RgbdFrame, Weights, WorkerPool};
-
-struct Counting;
-
-static ALLOCATIONS: AtomicUsize = AtomicUsize::new(0);
-
-// SAFETY: every call is passed on to the system's allocator as it is.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.fetch_add(1, Ordering::Relaxed);
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
+use holod_tests::counting::{self, Counting};
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static COUNTING: Counting = Counting;
 
 #[test]
 fn frames_do_not_allocate() {
@@ -65,10 +46,10 @@ fn check(weights: &Weights) {
     };
     // As many as are judged: each worker has waited for work by then, which takes memory the first time.
     frames(130);
-    let before = ALLOCATIONS.load(Ordering::Relaxed);
+    let before = counting::everywhere();
     frames(130);
-    assert_eq!(ALLOCATIONS.load(Ordering::Relaxed) - before, 0);
+    assert_eq!(counting::everywhere() - before, 0);
 
     drop(std::hint::black_box(Box::new(1)));
-    assert!(ALLOCATIONS.load(Ordering::Relaxed) > before, "the counter counts");
+    assert!(counting::everywhere() > before, "the counter counts");
 }

@@ -1,13 +1,15 @@
 //! After its start the way from bytes to an estimate allocates nothing.
 
-mod counting;
-
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::wire::line::{LineDecoder, LineSample, encode_line};
 use holod_pupil_input::wire::{Decoder, WireEvent};
 use holod_pupil_input::{
     ClockModel, Estimator, EstimatorSettings, MockSource, Profile, PupilSample, SampleEye, Scenario,
 };
+use holod_tests::counting::{self, Counting};
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
 
 fn allocations_of(work: impl FnOnce()) -> u64 {
     let before = counting::here();

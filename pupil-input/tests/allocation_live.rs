@@ -1,16 +1,18 @@
 //! A tracker that runs, recorded, allocates nothing for the samples that come. The only test in its crate: it counts the
 //! allocations of all threads.
 
-mod counting;
-
 use std::io::Write as _;
 use std::time::{Duration, Instant};
 
 use holod_calibration::rig;
 use holod_pupil_input::wire::line::{LineSample, encode_line};
 use holod_pupil_input::{Counter, RecordFiles, SampleEye, Tracker, TrackerHandle, TrackerOptions, host_now};
+use holod_tests::counting::{self, Counting};
 use serialport::{SerialPort, TTYPort};
 use tempfile::TempDir;
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
 
 fn send(tracker: &mut TTYPort, lines: &[String], handle: &mut TrackerHandle) {
     for line in lines {

@@ -12,8 +12,6 @@
 //!
 //! It prints lines of JSON. MODE is channel-packed, field-sequential or monochrome.
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::error::Error;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
@@ -31,6 +29,7 @@ use holod_slm_output::fields::FrameTag;
 use holod_slm_output::present::drm::{DrmPanel, DrmTarget, Verdict};
 use holod_slm_output::present::{FrameSink, PanelSetup, PresentedRefresh, Presenter, TimestampSource, frame_channel};
 use holod_slm_output::{FrameLayout, LevelsFrame};
+use holod_tests::counting::{self, Counting};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use serde_json::json;
 use thread_priority::{
@@ -43,28 +42,8 @@ const PATTERNS: u64 = 7;
 const LIMIT: TimeNs = TimeNs(240_000_000_000);
 const RECOVER_EVERY: Duration = Duration::from_millis(100);
 
-struct Counting;
-
-thread_local! {
-    static TAKEN: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: every call is handed to the system's allocator as it is.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        TAKEN.set(TAKEN.get() + 1);
-        // SAFETY: the caller's promises are the ones asked for here.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, memory: *mut u8, layout: Layout) {
-        // SAFETY: as above.
-        unsafe { System.dealloc(memory, layout) }
-    }
-}
-
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static COUNTING: Counting = Counting;
 
 fn main() -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
@@ -243,12 +222,12 @@ fn show(connector: &str, mode: &str, panel_mode: &str, options: &[&str]) -> Resu
             );
         }
         let now = host_now();
-        let before = (TAKEN.get(), notes.refreshes.len());
+        let before = (counting::here(), notes.refreshes.len());
         let ticked = presenter.tick(now, &mut source, &mut |refresh| {
             notes.before_their_time += u64::from(refresh.t_present > now);
             notes.refreshes.push(refresh);
         });
-        notes.allocations += TAKEN.get() - before.0;
+        notes.allocations += counting::here() - before.0;
         notes.tick_ns.push((host_now() - now).0);
         if let Err(fault) = ticked {
             losses += 1;

@@ -1,7 +1,7 @@
 //! For which refresh a frame is made, and when to begin it.
 //!
 //! A pure object in the manner of Monado's compositor pacing: [`Pacer::predict`] says when to wake and what to aim for,
-//! [`Pacer::mark`] is told what happened to the frame on the host, [`Pacer::report`] what the panel did with it. It is
+//! [`Pacer::submitted`] is told that the frame went to the panel, [`Pacer::report`] what the panel did with it. It is
 //! given every time and never reads a clock, so that a test runs through a day in a second.
 //!
 //! "Refresh" here is a whole colour frame of the panel, three fields: frames change there and nowhere else.
@@ -58,19 +58,6 @@ pub struct FramePlan {
     pub t_desired_present: TimeNs,
     /// When its light reaches the eye.
     pub t_predicted_photon: TimeNs,
-}
-
-/// What happens to a frame on the host.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Point {
-    /// The frame thread woke for it.
-    WakeUp,
-    /// Its hologram is begun.
-    RenderBegin,
-    /// Its hologram is done.
-    RenderEnd,
-    /// It was handed to the panel.
-    Submit,
 }
 
 /// What a present report was worth.
@@ -185,14 +172,14 @@ impl Pacer {
         FramePlan { frame_id, t_wake, t_desired_present, t_predicted_photon }
     }
 
-    /// Tells what happened to a frame and when. Unknown frames are ignored.
-    pub fn mark(&mut self, point: Point, frame_id: u64, when: TimeNs) {
+    /// A frame was handed to the panel. Unknown frames are ignored.
+    pub fn submitted(&mut self, frame_id: u64, t_submit: TimeNs) {
         let Some(slot) = self.slots[slot_index(frame_id)].as_mut().filter(|slot| slot.frame_id == frame_id) else {
             return;
         };
-        if point == Point::Submit && slot.t_submit.is_none() {
-            slot.t_submit = Some(when);
-            self.frame_times.push(TimeNs((when.0 - slot.t_wake.0).max(0)), when);
+        if slot.t_submit.is_none() {
+            slot.t_submit = Some(t_submit);
+            self.frame_times.push(TimeNs((t_submit.0 - slot.t_wake.0).max(0)), t_submit);
         }
     }
 
@@ -462,13 +449,12 @@ mod tests {
                 let plan = pacer.predict(now);
                 assert!(plan.t_wake >= now && plan.t_desired_present > plan.t_wake);
                 let t_wake = plan.t_wake + TimeNs(self.random.random_range(0..200_000));
-                pacer.mark(Point::WakeUp, plan.frame_id, t_wake);
                 let mut render_ns = self.render_ns + self.random.random_range(0..=self.jitter_ns);
                 if self.hiccup_ns > 0 && self.random.random_bool(HICCUPS) {
                     render_ns += self.hiccup_ns;
                 }
                 now = t_wake + TimeNs(render_ns);
-                pacer.mark(Point::Submit, plan.frame_id, now);
+                pacer.submitted(plan.frame_id, now);
                 let refresh = ((now.0 as f64 - t_first_ns) / self.period_ns).ceil();
                 let t_present = TimeNs((t_first_ns + refresh * self.period_ns) as i64);
                 reports.push_back((plan.frame_id, t_present));
@@ -546,7 +532,7 @@ mod tests {
             let plan = pacer.predict(now);
             let takes_ms = if plan.frame_id == long { long_ms } else { 8 };
             now = plan.t_wake + TimeNs(takes_ms * MS);
-            pacer.mark(Point::Submit, plan.frame_id, now);
+            pacer.submitted(plan.frame_id, now);
             let refresh = (now.0 as f64 / REFRESH.0 as f64).ceil() as i64;
             submitted.push(refresh);
             // Shown at the next refresh, whatever refresh it was made for.
@@ -585,7 +571,7 @@ mod tests {
         let mut pacer = Pacer::new(config(), TimeNs(0));
         pacer.observe_refresh(TimeNs(MS), TimestampSource::Hardware);
         let plan = pacer.predict(TimeNs(2 * MS));
-        pacer.mark(Point::Submit, plan.frame_id, plan.t_desired_present + TimeNs(MS));
+        pacer.submitted(plan.frame_id, plan.t_desired_present + TimeNs(MS));
         let shown = plan.t_desired_present + REFRESH;
         assert_eq!(pacer.report(plan.frame_id, shown, TimestampSource::Hardware), Outcome::Missed { refreshes: 1 });
         assert_eq!(pacer.counts().missed, 1);
@@ -601,7 +587,7 @@ mod tests {
             Outcome::Unknown,
             "not submitted"
         );
-        pacer.mark(Point::Submit, id, plan.t_wake + TimeNs(5 * MS));
+        pacer.submitted(id, plan.t_wake + TimeNs(5 * MS));
         assert_eq!(pacer.report(id + 1, plan.t_desired_present, TimestampSource::Hardware), Outcome::Unknown);
         assert_eq!(pacer.report(id, TimeNs(0), TimestampSource::Hardware), Outcome::Implausible);
         assert_eq!(pacer.report(id, TimeNs(i64::MAX), TimestampSource::Hardware), Outcome::Implausible);
@@ -693,7 +679,7 @@ mod tests {
                     }
                     Step::Mark { back, later_ns } => {
                         let id = last.map_or(0, |last| last.frame_id).wrapping_sub(back);
-                        pacer.mark(Point::Submit, id, now + TimeNs(later_ns));
+                        pacer.submitted(id, now + TimeNs(later_ns));
                         last_submitted |= last.is_some() && back == 0;
                     }
                     Step::Report { back, t_ns, provenance } => {

@@ -21,7 +21,7 @@ use holod_slm_output::laser::{
     make_dark, open_laser,
 };
 use holod_slm_output::output::{FieldEvent, Output, OutputOptions, pacing_config};
-use holod_slm_output::pacing::{Pacer, Point};
+use holod_slm_output::pacing::Pacer;
 use holod_slm_output::present::{PanelSetup, open_panel};
 use holod_slm_output::schedule::FieldGate;
 use proptest::prelude::*;
@@ -171,7 +171,7 @@ fn run(rig: &Rig) -> (Output, Vec<FieldEvent>) {
         encoder.encode(PerColour([&[1.0; 8]; 3]), output.frames.acquire());
         let now = host_now();
         output.frames.submit(&plan, None, now);
-        pacer.mark(Point::Submit, plan.frame_id, now);
+        pacer.submitted(plan.frame_id, now);
     }
     (output, fields)
 }

@@ -1,8 +1,4 @@
-//! What runs for every frame takes no memory. Only a global allocator sees that, and one cannot be written without
-//! `unsafe`.
-
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
+//! What runs for every frame takes no memory.
 
 use holod_calibration::rig::{PanelMode, Rig};
 use holod_calibration::{PerColour, Resolution, TimeNs};
@@ -10,38 +6,19 @@ use holod_laser_firmware::{Controller, Hardware, Laser, Limits, Line, TimeUs};
 use holod_slm_output::fields::FrameTag;
 use holod_slm_output::laser::{DarkReason, LaserBox, SimulatedLaser};
 use holod_slm_output::output::pacing_config;
-use holod_slm_output::pacing::{Pacer, Point};
+use holod_slm_output::pacing::Pacer;
 use holod_slm_output::present::{HeadlessPanel, PanelSetup, Presenter, Recorder, ReportFaults, frame_channel};
 use holod_slm_output::schedule::{Evidence, FieldDecision, FieldScheduler};
 use holod_slm_output::{FrameLayout, LevelsFrame, PanelEncoder};
-
-struct Counting;
-
-thread_local! {
-    static TAKEN: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: every call is handed to the system's allocator as it is.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        TAKEN.set(TAKEN.get() + 1);
-        // SAFETY: the caller's promises are the ones asked for here.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, memory: *mut u8, layout: Layout) {
-        // SAFETY: as above.
-        unsafe { System.dealloc(memory, layout) }
-    }
-}
+use holod_tests::counting::{self, Counting};
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static COUNTING: Counting = Counting;
 
 fn taken(work: impl FnOnce()) -> u64 {
-    let before = TAKEN.get();
+    let before = counting::here();
     work();
-    TAKEN.get() - before
+    counting::here() - before
 }
 
 #[test]
@@ -154,7 +131,7 @@ fn a_frame_from_phase_to_light_takes_no_memory() {
                     t_desired_present: plan.t_desired_present,
                     keep,
                 });
-                pacer.mark(Point::Submit, plan.frame_id, now);
+                pacer.submitted(plan.frame_id, now);
                 for _ in 0..3 {
                     now = panel.t_next().min(scheduler.t_next().unwrap_or(TimeNs(i64::MAX)));
                     panel

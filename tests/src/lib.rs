@@ -1,5 +1,6 @@
 //! A simulated bench: the daemon as a process, a tracker on a pseudo-terminal, a judge of `frames.csv`.
 
+pub mod counting;
 pub mod daemon;
 pub mod feed;
 pub mod frames;

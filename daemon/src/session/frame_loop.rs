@@ -6,7 +6,6 @@ use std::time::Duration;
 
 use holod_calibration::TimeNs;
 use holod_model::engine::EngineError;
-use holod_slm_output::pacing::Point;
 use holod_slm_output::{FramePlan, FramePort, LevelsFrame, Pacer};
 
 use super::clock::host_now;
@@ -113,10 +112,10 @@ impl FrameLoop {
     /// One frame, top to bottom.
     fn frame(&mut self, plan: FramePlan) -> Result<(), EngineError> {
         self.make_changes();
-        let t_wake = self.mark(Point::WakeUp, plan);
+        let t_wake = host_now();
         let mut pupil = self.inputs.pupil(t_wake, plan.t_predicted_photon);
 
-        let t_render_begin = self.mark(Point::RenderBegin, plan);
+        let t_render_begin = host_now();
         let FrameContent { picture, mut tag, pattern } = self.inputs.content(plan.t_predicted_photon);
         let pattern = pattern.or(self.pattern.as_deref());
         let rendered = match pattern {
@@ -135,7 +134,7 @@ impl FrameLoop {
             // It happens when a device is lost, which took longer than any lock.
             self.renderer.description().clone_into(&mut self.engine.lock().unwrap_or_else(PoisonError::into_inner));
         }
-        let t_render_end = self.mark(Point::RenderEnd, plan);
+        let t_render_end = host_now();
 
         let levels_xxh3 = self.hash_levels.then(|| levels_xxh3(self.port.acquire()));
         let keep = if self.keep_levels && is_hologram && pupil.is_meant() { keep_slot(pupil.pupil) } else { None };
@@ -170,7 +169,7 @@ impl FrameLoop {
             self.records_lost.fetch_add(1, Ordering::Relaxed);
         }
         self.port.submit(&plan, keep, t_submit);
-        self.pacer.mark(Point::Submit, plan.frame_id, t_submit);
+        self.pacer.submitted(plan.frame_id, t_submit);
         self.submitted = plan.frame_id;
         self.hear_the_panel();
         Ok(())
@@ -211,12 +210,6 @@ impl FrameLoop {
             };
             assert!(self.retired.push(retired).is_ok(), "there is room for as many as are sent");
         }
-    }
-
-    fn mark(&mut self, point: Point, plan: FramePlan) -> TimeNs {
-        let now = host_now();
-        self.pacer.mark(point, plan.frame_id, now);
-        now
     }
 
     /// Sleeps in short steps, so that an order to stop is seen; false where it came.

@@ -1,9 +1,6 @@
 //! What holds for the decoders of all named vendors: the split of the bytes does not matter, two messages after rubbish
 //! are enough to be in step, no bytes make them panic or grow, and no sample costs an allocation.
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
 use holod_pupil_input::SampleEye;
 use holod_pupil_input::wire::iscan::{IscanDecoder, IscanPupil, IscanSettings};
 use holod_pupil_input::wire::livetrack::{LiveTrackDecoder, LiveTrackSettings};
@@ -12,28 +9,8 @@ use holod_pupil_input::wire::pupilext::{
     PupilExtContainer, PupilExtDecoder, PupilExtEyes, PupilExtSettings, PupilExtSize,
 };
 use holod_pupil_input::wire::{Decoder, WireEvent, WireSample};
+use holod_tests::counting::{self, Counting};
 use proptest::prelude::*;
-
-/// The system's allocator, counting for each thread.
-struct Counting;
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-// SAFETY: every call is passed on to the system's allocator unchanged.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.set(ALLOCATIONS.get() + 1);
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller's promises are passed on.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
 
 #[global_allocator]
 static COUNTING: Counting = Counting;
@@ -156,16 +133,16 @@ fn samples_cost_no_allocation() {
             .collect();
         let mut decoder = vendor.decoder();
         let mut samples = 0;
-        let before = ALLOCATIONS.get();
+        let before = counting::here();
         for chunk in bytes.chunks(61) {
             decoder.push(chunk, &mut |event| samples += u32::from(matches!(event, WireEvent::Sample(_))));
         }
-        assert_eq!(ALLOCATIONS.get() - before, 0, "{vendor:?}");
+        assert_eq!(counting::here() - before, 0, "{vendor:?}");
         assert!(samples > 350, "{vendor:?} {samples}");
     }
-    let before = ALLOCATIONS.get();
+    let before = counting::here();
     drop(std::hint::black_box(Box::new(1)));
-    assert_eq!(ALLOCATIONS.get() - before, 1, "the count sees an allocation");
+    assert_eq!(counting::here() - before, 1, "the count sees an allocation");
 }
 
 fn any_vendor() -> impl Strategy<Value = Vendor> {

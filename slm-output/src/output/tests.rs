@@ -473,7 +473,7 @@ fn the_real_threads_show_light_and_end_in_order() {
             encoder.encode(PerColour([&pattern; 3]), output.frames.acquire());
             let now = host_now();
             output.frames.submit(&plan, Some(0), now);
-            pacer.mark(crate::pacing::Point::Submit, plan.frame_id, now);
+            pacer.submitted(plan.frame_id, now);
             last_plan = Some(plan);
             assert_eq!(plan.frame_id, frame + 1);
         }

@@ -8,7 +8,6 @@ use holod_calibration::{Colour, PerColour, TimeNs};
 use holod_pupil_input::host_now;
 use holod_slm_output::laser::{DarkReason, open_laser};
 use holod_slm_output::output::{OutputError, pacing_config};
-use holod_slm_output::pacing::Point;
 use holod_slm_output::present::{PanelSetup, open_panel};
 use holod_slm_output::{LevelsFrame, Output, OutputOptions, OutputSpec, Pacer, PanelEncoder, PanelEvent};
 
@@ -82,14 +81,13 @@ pub(super) fn show(
             let sleep = (plan.t_wake - now).min(LONGEST_SLEEP);
             std::thread::sleep(Duration::from_nanos(sleep.0 as u64));
         }
-        pacer.mark(Point::WakeUp, plan.frame_id, host_now());
         let frame = output.frames.acquire();
         for colour in Colour::ALL {
             frame.field_mut(colour).write(&planes[colour.index()]);
         }
         let now = host_now();
         output.frames.submit(&plan, None, now);
-        pacer.mark(Point::Submit, plan.frame_id, now);
+        pacer.submitted(plan.frame_id, now);
         output.frames.feed(&mut pacer, |_| ());
         while let Ok(field) = output.events.pop() {
             shown.fields[field.colour] += 1;

@@ -12,7 +12,7 @@ use rand_pcg::Pcg64Mcg;
 
 use super::*;
 use crate::output::shared::dark_request;
-use crate::pacing::{FramePlan, Outcome, PacingCounts, Point};
+use crate::pacing::{FramePlan, Outcome, PacingCounts};
 
 const S: i64 = 1_000 * MS;
 const MINUTE: i64 = 60 * S;
@@ -213,7 +213,7 @@ impl Day {
         while self.t_submit <= t {
             let now = self.t_submit;
             let FramePlan { frame_id, t_desired_present, .. } = self.plan;
-            self.pacer.mark(Point::Submit, frame_id, now);
+            self.pacer.submitted(frame_id, now);
             self.panel.waiting = Some(FrameTag { frame_id, t_submit: now, t_desired_present, keep: None });
             while let Some(&(_, id, t_present)) = self.reports.front().filter(|(t_told, ..)| *t_told <= now) {
                 self.reports.pop_front();

@@ -1,12 +1,26 @@
 //! The system's allocator, counting.
-
-#![allow(dead_code, reason = "each test crate uses a part")]
+//!
+//! Only a global allocator sees every allocation, and one cannot be written without `unsafe`. A program that counts makes
+//! it its own:
+//!
+//! ```
+//! use holod_tests::counting::{self, Counting};
+//!
+//! #[global_allocator]
+//! static COUNTING: Counting = Counting;
+//!
+//! let before = counting::here();
+//! drop(std::hint::black_box(Box::new(1)));
+//! assert_eq!(counting::here() - before, 1);
+//! ```
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-struct Counting;
+/// The system's allocator; reallocations count as allocations.
+#[derive(Debug)]
+pub struct Counting;
 
 thread_local! {
     static HERE: Cell<u64> = const { Cell::new(0) };
@@ -28,15 +42,17 @@ unsafe impl GlobalAlloc for Counting {
     }
 }
 
-#[global_allocator]
-static COUNTING: Counting = Counting;
-
 /// Allocations of the calling thread.
-pub(crate) fn here() -> u64 {
+pub fn here() -> u64 {
     HERE.get()
 }
 
+/// Allocations of all threads.
+pub fn everywhere() -> u64 {
+    EVERYWHERE.load(Ordering::Relaxed)
+}
+
 /// Allocations of all other threads.
-pub(crate) fn elsewhere() -> u64 {
-    EVERYWHERE.load(Ordering::Relaxed) - HERE.get()
+pub fn elsewhere() -> u64 {
+    everywhere() - here()
 }
