@@ -22,10 +22,13 @@ pub fn candidates() -> Vec<PathBuf> {
 
 /// Makes a folder that only this user can write to; false where it cannot be, or is somebody else's.
 fn prepare(folder: &Path) -> bool {
-    let made = std::fs::DirBuilder::new().recursive(true).mode(0o700).create(folder).is_ok();
-    let own = std::fs::symlink_metadata(folder)
-        .is_ok_and(|metadata| metadata.is_dir() && metadata.uid() == rustix::process::geteuid().as_raw());
-    made && own
+    std::fs::DirBuilder::new().recursive(true).mode(0o700).create(folder).is_ok() && is_own(folder)
+}
+
+/// Whether the folder is there and this user's.
+pub fn is_own(folder: &Path) -> bool {
+    std::fs::symlink_metadata(folder)
+        .is_ok_and(|metadata| metadata.is_dir() && metadata.uid() == rustix::process::geteuid().as_raw())
 }
 
 #[cfg(test)]

@@ -104,10 +104,10 @@ fn write(newest: &Queue<Vec<u8>>, path: &Path) {
     let _ = std::fs::remove_file(path);
 }
 
-/// Takes away what holods that were killed have left in this process's folder: nobody else does, and their numbers are given
-/// out again. Call it before this process puts anything there.
+/// Takes away what holods that were killed have left in this user's folders: nobody else does, and their numbers are
+/// given out again. Call it before this process puts anything there.
 pub fn remove_leftovers() {
-    if let Some(folder) = runtime_folder::own() {
+    for folder in runtime_folder::candidates().into_iter().filter(|folder| runtime_folder::is_own(folder)) {
         remove_leftovers_in(&folder);
     }
 }
