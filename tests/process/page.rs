@@ -114,7 +114,7 @@ fn pictures_for_the_page_are_computed_behind_everything_else() {
         let policies: Vec<_> = of_name(name).map(|thread| thread.policy).collect();
         assert_eq!(policies, [if may_be_prompt { SCHED_FIFO } else { SCHED_OTHER }], "{name}: {}", ended.stderr);
     }
-    // Those that wait for a disk or a pipe, and the one that waits for the network.
+    // Those that wait for a disk or a pipe, and the one that makes frames.
     for name in ["pupil-recorder", "holod-record", "holod-status", "holod-log", "holod-frame"] {
         let of_name: Vec<_> = of_name(name).collect();
         assert!(!of_name.is_empty() && of_name.iter().all(|thread| is_ordinary(thread, 0)), "{name}: {threads:#?}");
