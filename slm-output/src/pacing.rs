@@ -60,43 +60,6 @@ pub struct FramePlan {
     pub t_predicted_photon: TimeNs,
 }
 
-/// What a present report was worth.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Outcome {
-    /// The frame was shown at the refresh that it was made for, or earlier.
-    OnTime,
-    /// It was shown this many refreshes late.
-    Missed {
-        /// At least 1.
-        refreshes: u32,
-    },
-    /// It has no time, or no time that can be, and told nothing.
-    Implausible,
-    /// The frame is unknown, or was reported before.
-    Unknown,
-}
-
-/// Counters since the start.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct PacingCounts {
-    /// Frames planned.
-    pub planned: u64,
-    /// Frames reported as shown.
-    pub presented: u64,
-    /// Frames shown later than planned.
-    pub missed: u64,
-    /// Frames that were submitted and never reported.
-    pub unreported: u64,
-    /// Frames that were planned and never submitted.
-    pub abandoned: u64,
-    /// Reports of frames that are unknown or were reported before.
-    pub unknown_reports: u64,
-    /// Reports without a possible time.
-    pub implausible_reports: u64,
-    /// Times that the panel's clock was taken anew.
-    pub resyncs: u64,
-}
-
 /// Plans frames and learns from what became of them.
 #[derive(Clone, Debug)]
 pub struct Pacer {
@@ -106,14 +69,12 @@ pub struct Pacer {
     slots: [Option<Slot>; SLOTS],
     last_frame_id: u64,
     t_last_desired: Option<TimeNs>,
-    counts: PacingCounts,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Slot {
     frame_id: u64,
     t_wake: TimeNs,
-    t_desired_present: TimeNs,
     t_submit: Option<TimeNs>,
     reported: bool,
 }
@@ -132,7 +93,6 @@ impl Pacer {
             slots: [None; SLOTS],
             last_frame_id: 0,
             t_last_desired: None,
-            counts: PacingCounts::default(),
         }
     }
 
@@ -166,8 +126,7 @@ impl Pacer {
         let t_wake = (t_desired_present - budget).max(now);
         self.last_frame_id = frame_id;
         self.t_last_desired = Some(t_desired_present);
-        self.counts.planned += 1;
-        self.remember(Slot { frame_id, t_wake, t_desired_present, t_submit: None, reported: false });
+        self.slots[slot_index(frame_id)] = Some(Slot { frame_id, t_wake, t_submit: None, reported: false });
         let t_predicted_photon = t_desired_present + self.config.photon_delay;
         FramePlan { frame_id, t_wake, t_desired_present, t_predicted_photon }
     }
@@ -184,41 +143,28 @@ impl Pacer {
     }
 
     /// The panel says that `frame_id` was first shown at `t_present`. Reports may come late, early, twice, in any order,
-    /// or with a time of zero.
-    pub fn report(&mut self, frame_id: u64, t_present: TimeNs, provenance: TimestampSource) -> Outcome {
-        let Some(slot) = self.slots[slot_index(frame_id)]
-            .as_mut()
-            .filter(|slot| slot.frame_id == frame_id && slot.t_submit.is_some() && !slot.reported)
-        else {
-            self.counts.unknown_reports += 1;
-            return Outcome::Unknown;
+    /// with a time of zero or of frames that are unknown; what cannot be is ignored.
+    pub fn report(&mut self, frame_id: u64, t_present: TimeNs, provenance: TimestampSource) {
+        let Some(slot) = self.slots[slot_index(frame_id)].as_mut().filter(|slot| slot.awaits_report(frame_id)) else {
+            return;
         };
         // Half a refresh of grace for times taken by software.
         let after_submit_ns = t_present.0.saturating_sub(slot.t_submit.unwrap_or_default().0);
         let possible = -self.config.refresh_period.0 / 2..LATENESS_MAX.0;
         if t_present <= TimeNs(0) || !possible.contains(&after_submit_ns) {
-            self.counts.implausible_reports += 1;
-            return Outcome::Implausible;
+            return;
         }
         slot.reported = true;
-        let late_ns = t_present.0 - slot.t_desired_present.0;
-        self.counts.presented += 1;
-        if provenance != TimestampSource::Estimated && self.clock.observe(t_present) {
-            self.counts.resyncs += 1;
+        if provenance != TimestampSource::Estimated {
+            self.clock.observe(t_present);
         }
-        let refreshes = (late_ns as f64 / self.clock.period_ns).round();
-        if refreshes >= 1.0 {
-            self.counts.missed += 1;
-            return Outcome::Missed { refreshes: refreshes as u32 };
-        }
-        Outcome::OnTime
     }
 
     /// The panel refreshed at `t_refresh` with whatever it had: keeps its clock true while frames are rare.
     pub fn observe_refresh(&mut self, t_refresh: TimeNs, provenance: TimestampSource) {
         let possible = t_refresh > TimeNs(0) && t_refresh.0 < i64::MAX / 4;
-        if provenance != TimestampSource::Estimated && possible && self.clock.observe(t_refresh) {
-            self.counts.resyncs += 1;
+        if provenance != TimestampSource::Estimated && possible {
+            self.clock.observe(t_refresh);
         }
     }
 
@@ -226,24 +172,11 @@ impl Pacer {
     pub fn budget(&self) -> TimeNs {
         self.frame_times.estimate + self.config.submit_margin
     }
+}
 
-    /// Time from one refresh to the next, as observed.
-    pub fn refresh_period(&self) -> TimeNs {
-        TimeNs(self.clock.period_ns.round() as i64)
-    }
-
-    /// Counters since the start.
-    pub fn counts(&self) -> PacingCounts {
-        self.counts
-    }
-
-    fn remember(&mut self, slot: Slot) {
-        let evicted = self.slots[slot_index(slot.frame_id)].replace(slot);
-        match evicted {
-            Some(old) if old.t_submit.is_none() => self.counts.abandoned += 1,
-            Some(old) if !old.reported => self.counts.unreported += 1,
-            _ => {}
-        }
+impl Slot {
+    fn awaits_report(&self, frame_id: u64) -> bool {
+        self.frame_id == frame_id && self.t_submit.is_some() && !self.reported
     }
 }
 
@@ -269,13 +202,13 @@ impl RefreshClock {
         Self { nominal_ns, period_ns: nominal_ns, t_anchor: now, rest_ns: 0.0, strays: 0, observed: false }
     }
 
-    /// Takes in one refresh; whether the clock had to be set anew.
-    fn observe(&mut self, t: TimeNs) -> bool {
+    /// Takes in one refresh.
+    fn observe(&mut self, t: TimeNs) {
         if !self.observed {
             self.observed = true;
             self.t_anchor = t;
             self.rest_ns = 0.0;
-            return false;
+            return;
         }
         let since_ns = (t.0 - self.t_anchor.0) as f64 - self.rest_ns;
         let count = (since_ns / self.period_ns).round();
@@ -283,12 +216,12 @@ impl RefreshClock {
         if error_ns.abs() > 0.25 * self.period_ns {
             self.strays += 1;
             if self.strays < STRAYS_MAX {
-                return false;
+                return;
             }
             self.strays = 0;
             self.t_anchor = t;
             self.rest_ns = 0.0;
-            return true;
+            return;
         }
         self.strays = 0;
         if count > 0.0 {
@@ -301,7 +234,6 @@ impl RefreshClock {
         let whole_ns = advance_ns.floor();
         self.t_anchor = TimeNs(self.t_anchor.0 + whole_ns as i64);
         self.rest_ns = advance_ns - whole_ns;
-        false
     }
 
     fn refresh(&self, count: f64) -> TimeNs {
@@ -403,6 +335,11 @@ mod tests {
         random: Pcg64Mcg,
     }
 
+    /// Whether a frame was shown at least half a refresh after the one that it was made for.
+    fn is_late(plan: &FramePlan, t_present: TimeNs) -> bool {
+        2 * (t_present - plan.t_desired_present).0 > REFRESH.0
+    }
+
     #[derive(Debug, Default, PartialEq)]
     struct Ran {
         frames: u64,
@@ -411,7 +348,8 @@ mod tests {
         spacing: [u64; 5],
         /// Mean time from waking to presentation.
         latency_ms: f64,
-        counts: PacingCounts,
+        /// Reports of frames that were forgotten before.
+        forgotten: u64,
     }
 
     impl Bench {
@@ -430,21 +368,21 @@ mod tests {
             // The panel's refreshes have nothing to do with the time at which the host begins.
             let t_first_ns = 5.3e6;
             let mut pacer = Pacer::new(config(), TimeNs(0));
-            let mut reports: VecDeque<(u64, TimeNs)> = VecDeque::new();
+            let mut reports: VecDeque<(FramePlan, TimeNs)> = VecDeque::new();
             let mut ran = Ran::default();
             let mut now = TimeNs(1000);
             let mut last_refresh = 0i64;
             let t_end = TimeNs((hours * 3600e9) as i64);
             let mut latency_ns = 0.0;
             while now < t_end {
-                while let Some(&(id, t_present)) = reports.front()
+                while let Some(&(plan, t_present)) = reports.front()
                     && t_present.0 + self.report_delay_ns <= now.0
                 {
                     reports.pop_front();
-                    ran.missed += u64::from(matches!(
-                        pacer.report(id, t_present, TimestampSource::Hardware),
-                        Outcome::Missed { .. }
-                    ));
+                    ran.missed += u64::from(is_late(&plan, t_present));
+                    let slot = pacer.slots[slot_index(plan.frame_id)];
+                    ran.forgotten += u64::from(!slot.is_some_and(|slot| slot.awaits_report(plan.frame_id)));
+                    pacer.report(plan.frame_id, t_present, TimestampSource::Hardware);
                 }
                 let plan = pacer.predict(now);
                 assert!(plan.t_wake >= now && plan.t_desired_present > plan.t_wake);
@@ -457,7 +395,7 @@ mod tests {
                 pacer.submitted(plan.frame_id, now);
                 let refresh = ((now.0 as f64 - t_first_ns) / self.period_ns).ceil();
                 let t_present = TimeNs((t_first_ns + refresh * self.period_ns) as i64);
-                reports.push_back((plan.frame_id, t_present));
+                reports.push_back((plan, t_present));
                 let since = (refresh as i64 - last_refresh).clamp(0, 4) as usize;
                 if ran.frames > 0 {
                     ran.spacing[since] += 1;
@@ -467,7 +405,6 @@ mod tests {
                 ran.frames += 1;
             }
             ran.latency_ms = latency_ns / 1e6 / ran.frames as f64;
-            ran.counts = pacer.counts();
             ran
         }
     }
@@ -489,7 +426,6 @@ mod tests {
             let ran = Bench::new(REFRESH.0 as f64 * share, 6.0, 2.0).run(1.0);
             assert!((ran.spacing[1] as f64) > 0.99 * ran.frames as f64, "{share}: {ran:?}");
             assert!((ran.missed as f64) < 0.01 * ran.frames as f64, "{share}: {ran:?}");
-            assert_eq!(ran.counts.resyncs, 0, "{share}: {ran:?}");
         }
     }
 
@@ -499,7 +435,7 @@ mod tests {
         bench.report_delay_ns = 100 * MS;
         let ran = bench.run(1.0);
         assert!((ran.spacing[1] as f64) > 0.99 * ran.frames as f64, "{ran:?}");
-        assert_eq!(ran.counts.unknown_reports, 0, "{ran:?}");
+        assert_eq!(ran.forgotten, 0, "{ran:?}");
     }
 
     #[test]
@@ -565,37 +501,38 @@ mod tests {
         }
     }
 
-    /// Canary for the benches above: a pacer whose budget is too small is seen to miss.
+    /// Canary for the benches above: a pacer whose frames take longer than planned is seen to miss.
     #[test]
-    fn frames_that_take_longer_than_planned_are_missed_and_counted() {
-        let mut pacer = Pacer::new(config(), TimeNs(0));
-        pacer.observe_refresh(TimeNs(MS), TimestampSource::Hardware);
-        let plan = pacer.predict(TimeNs(2 * MS));
-        pacer.submitted(plan.frame_id, plan.t_desired_present + TimeNs(MS));
-        let shown = plan.t_desired_present + REFRESH;
-        assert_eq!(pacer.report(plan.frame_id, shown, TimestampSource::Hardware), Outcome::Missed { refreshes: 1 });
-        assert_eq!(pacer.counts().missed, 1);
+    fn canary_frames_that_take_longer_than_planned_are_missed() {
+        let mut bench = Bench::new(REFRESH.0 as f64, 6.0, 0.0);
+        bench.hiccup_ns = 17 * MS;
+        let ran = bench.run(0.1);
+        let late = ran.missed as f64 / ran.frames as f64;
+        assert!((0.3 * HICCUPS..3.0 * HICCUPS).contains(&late), "{ran:?}");
     }
 
     #[test]
-    fn useless_reports_are_counted_and_change_no_plan() {
+    fn useless_reports_change_no_plan() {
         let mut pacer = Pacer::new(config(), TimeNs(0));
         let plan = pacer.predict(TimeNs(MS));
-        let id = plan.frame_id;
-        assert_eq!(
-            pacer.report(id, plan.t_desired_present, TimestampSource::Hardware),
-            Outcome::Unknown,
-            "not submitted"
-        );
+        let (id, good) = (plan.frame_id, plan.t_desired_present + TimeNs(MS));
+        let next = |pacer: &Pacer| pacer.clone().predict(TimeNs(300 * MS));
+        let before = next(&pacer);
+        pacer.report(id, good, TimestampSource::Hardware);
+        assert_eq!(next(&pacer), before, "not submitted");
         pacer.submitted(id, plan.t_wake + TimeNs(5 * MS));
-        assert_eq!(pacer.report(id + 1, plan.t_desired_present, TimestampSource::Hardware), Outcome::Unknown);
-        assert_eq!(pacer.report(id, TimeNs(0), TimestampSource::Hardware), Outcome::Implausible);
-        assert_eq!(pacer.report(id, TimeNs(i64::MAX), TimestampSource::Hardware), Outcome::Implausible);
-        assert_eq!(pacer.report(id, plan.t_wake - REFRESH, TimestampSource::Hardware), Outcome::Implausible);
-        assert_eq!(pacer.report(id, plan.t_desired_present, TimestampSource::Hardware), Outcome::OnTime);
-        assert_eq!(pacer.report(id, plan.t_desired_present + REFRESH, TimestampSource::Hardware), Outcome::Unknown);
-        let counts = pacer.counts();
-        assert_eq!((counts.unknown_reports, counts.implausible_reports, counts.missed), (3, 3, 0));
+        let before = next(&pacer);
+        for (frame_id, t_present) in
+            [(id + 1, good), (id, TimeNs(0)), (id, TimeNs(i64::MAX)), (id, plan.t_wake - REFRESH)]
+        {
+            pacer.report(frame_id, t_present, TimestampSource::Hardware);
+            assert_eq!(next(&pacer), before, "frame {frame_id} at {t_present:?}");
+        }
+        pacer.report(id, good, TimestampSource::Hardware);
+        let after = next(&pacer);
+        assert_ne!(after, before, "a report that can be is taken in");
+        pacer.report(id, good + TimeNs(2 * MS), TimestampSource::Hardware);
+        assert_eq!(next(&pacer), after, "reported before");
     }
 
     #[test]
@@ -615,7 +552,6 @@ mod tests {
         for refresh in 1..=8 {
             pacer.observe_refresh(TimeNs(9 * MS + refresh * REFRESH.0), TimestampSource::Hardware);
         }
-        assert_eq!(pacer.counts().resyncs, 1);
         let plan = pacer.predict(TimeNs(200 * MS));
         let phase = (plan.t_desired_present.0 - 9 * MS).rem_euclid(REFRESH.0);
         assert!(!(1000..REFRESH.0 - 1000).contains(&phase), "{phase}");

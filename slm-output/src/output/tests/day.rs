@@ -12,7 +12,7 @@ use rand_pcg::Pcg64Mcg;
 
 use super::*;
 use crate::output::shared::dark_request;
-use crate::pacing::{FramePlan, Outcome, PacingCounts};
+use crate::pacing::FramePlan;
 
 const S: i64 = 1_000 * MS;
 const MINUTE: i64 = 60 * S;
@@ -167,6 +167,8 @@ struct Day {
     /// In this minute.
     armed: i64,
     frames_shown: u64,
+    /// In all that time: shown later than planned.
+    frames_missed: u64,
     lost_before: u64,
     /// How often darkness was asked for or that was taken back.
     asked: u64,
@@ -202,6 +204,7 @@ impl Day {
             now: TimeNs(0),
             armed: 0,
             frames_shown: 0,
+            frames_missed: 0,
             lost_before: 0,
             asked: 0,
             kept: None,
@@ -217,8 +220,7 @@ impl Day {
             self.panel.waiting = Some(FrameTag { frame_id, t_submit: now, t_desired_present, keep: None });
             while let Some(&(_, id, t_present)) = self.reports.front().filter(|(t_told, ..)| *t_told <= now) {
                 self.reports.pop_front();
-                let outcome = self.pacer.report(id, t_present, TimestampSource::Hardware);
-                assert!(!matches!(outcome, Outcome::Unknown), "frame {id} of {}", self.plan.frame_id);
+                self.pacer.report(id, t_present, TimestampSource::Hardware);
             }
             self.plan = self.pacer.predict(now);
             assert_eq!(self.plan.frame_id, frame_id + 1);
@@ -274,6 +276,8 @@ impl Day {
             self.tell(PanelNews::Refresh(PresentedRefresh { t_present: t_present + TimeNs(100_000), ..refresh }));
         }
         if new && let Some(tag) = self.panel.frame {
+            let late_ns = (t_present - tag.t_desired_present).0;
+            self.frames_missed += u64::from(late_ns > 3 * self.panel.period.0 / 2);
             self.reports.push_back((now, tag.frame_id, t_present));
         }
     }
@@ -423,8 +427,8 @@ impl Day {
     }
 }
 
-/// A day's minutes; what the pacer counted, and the windows that were judged.
-fn run_minutes(seed: u64, minutes: i64) -> (PacingCounts, u64) {
+/// A day's minutes.
+fn run_minutes(seed: u64, minutes: i64) -> Day {
     let mut day = Day::new(seed);
     // The first second arms.
     day.run(TimeNs(S), false);
@@ -444,7 +448,7 @@ fn run_minutes(seed: u64, minutes: i64) -> (PacingCounts, u64) {
         assert!(!night || lit == 0 || minute == NIGHT.end - 1, "{lit} windows in the night");
         assert!(day.judge.faults.is_empty(), "seed {seed}, minute {minute}: {:#?}", day.judge.faults);
     }
-    (day.pacer.counts(), day.judge.windows)
+    day
 }
 
 proptest! {
@@ -452,13 +456,12 @@ proptest! {
 
     #[test]
     fn a_day_of_fields_is_lit_safely_and_equally(seed in any::<u64>()) {
-        let (pacing, windows) = run_minutes(seed, 24 * 60);
+        let day = run_minutes(seed, 24 * 60);
         let frames = 24 * 3600 * 60;
-        prop_assert!(pacing.planned > frames * 9 / 10, "{:?}", pacing);
-        prop_assert!(pacing.missed < frames / 50, "{:?}", pacing);
-        prop_assert!(pacing.unknown_reports == 0 && pacing.implausible_reports == 0, "{:?}", pacing);
+        prop_assert!(day.plan.frame_id > frames * 9 / 10, "{} frames were planned", day.plan.frame_id);
+        prop_assert!(day.frames_missed < frames / 50, "{} frames were missed", day.frames_missed);
         let by_day = frames * (24 * 60 - (NIGHT.end - NIGHT.start) as u64) / (24 * 60);
-        prop_assert!(windows > 3 * by_day * 9 / 10, "{}", windows);
+        prop_assert!(day.judge.windows > 3 * by_day * 9 / 10, "{}", day.judge.windows);
     }
 }
 
