@@ -18,8 +18,8 @@ fn send(tracker: &mut TTYPort, lines: &[String], handle: &mut TrackerHandle) {
     for line in lines {
         tracker.write_all(line.as_bytes()).expect("writes");
         std::thread::sleep(Duration::from_micros(500));
-        handle.pupil_at(host_now());
-        while handle.decisions().pop().is_some() {}
+        handle.estimate.pupil_at(host_now());
+        while handle.decisions.pop().is_some() {}
     }
 }
 
@@ -44,7 +44,7 @@ fn bytes_of_a_link_become_estimates_and_records_without_allocation() {
     let before = counting::elsewhere();
     send(&mut tracker, rest, &mut handle);
     let begun = Instant::now();
-    while handle.counters().of(Counter::Samples) < 4000 {
+    while handle.control.counters().of(Counter::Samples) < 4000 {
         assert!(begun.elapsed() < Duration::from_secs(20), "never came");
         std::thread::sleep(Duration::from_millis(5));
     }

@@ -105,7 +105,7 @@ pub(super) fn build(
     } else {
         Tracker::start(&plan.tracker, &rig.tracker, tracker_options).map_err(setup::tracker_failure)?
     };
-    let (estimates, tap, tracker) = tracker.split();
+    let TrackerHandle { estimate: estimates, decisions: tap, control: tracker } = tracker;
     for warning in tracker.warnings() {
         tracing::warn!("{warning}");
     }

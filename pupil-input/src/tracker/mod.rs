@@ -223,8 +223,8 @@ impl Tracker {
             })
             .map_err(TrackerError::Thread)?;
         Ok(TrackerHandle {
-            reader: EstimateReader { output },
-            tap: DecisionTap { consumer },
+            estimate: EstimateReader { output },
+            decisions: DecisionTap { consumer },
             control: TrackerControl {
                 shared,
                 thread: Some(thread),
@@ -253,8 +253,8 @@ impl TrackerHandle {
             link: AtomicU8::new(Link::Finished as u8),
         });
         Self {
-            reader: EstimateReader { output },
-            tap: DecisionTap { consumer },
+            estimate: EstimateReader { output },
+            decisions: DecisionTap { consumer },
             control: TrackerControl {
                 shared,
                 thread: None,
@@ -269,69 +269,15 @@ impl TrackerHandle {
     }
 }
 
-/// A running tracker.
+/// A running tracker, in three parts: each for the thread that needs it.
 #[derive(Debug)]
 pub struct TrackerHandle {
-    reader: EstimateReader,
-    tap: DecisionTap,
-    control: TrackerControl,
-}
-
-impl TrackerHandle {
-    /// The pupil at host time `t`: wait-free, no allocation.
-    pub fn pupil_at(&mut self, t: TimeNs) -> PupilEstimate {
-        self.reader.pupil_at(t)
-    }
-
-    /// The gate's decisions since the last call.
-    pub const fn decisions(&mut self) -> &mut DecisionTap {
-        &mut self.tap
-    }
-
-    /// All counts at this moment.
-    pub fn counters(&self) -> CounterSnapshot {
-        self.control.counters()
-    }
-
-    /// What has been found of the tracker's clock; nothing where its samples carry no time.
-    pub fn clock(&self) -> Option<ClockReport> {
-        self.control.clock()
-    }
-
-    /// How the link is.
-    pub fn link(&self) -> Link {
-        self.control.link()
-    }
-
-    /// Whether a log has been played to its end.
-    pub fn finished(&self) -> bool {
-        self.control.finished()
-    }
-
-    /// What a user should know of the tracker although it runs.
-    pub fn warnings(&self) -> &[String] {
-        self.control.warnings()
-    }
-
-    /// Why a link that was lost does not come back, while it does not.
-    pub fn trouble(&mut self) -> Option<&str> {
-        self.control.trouble()
-    }
-
-    /// How the recording goes, where there is one.
-    pub fn recording(&self) -> Option<RecordStatus> {
-        self.control.recording()
-    }
-
-    /// Stops the thread and waits for its end.
-    pub fn stop(&mut self) {
-        self.control.stop();
-    }
-
-    /// Its three parts, each for the thread that needs it.
-    pub fn split(self) -> (EstimateReader, DecisionTap, TrackerControl) {
-        (self.reader, self.tap, self.control)
-    }
+    /// For the frame thread.
+    pub estimate: EstimateReader,
+    /// For whoever records or shows what was believed.
+    pub decisions: DecisionTap,
+    /// For the control thread. Dropping it stops the tracker.
+    pub control: TrackerControl,
 }
 
 /// The frame thread's part: the newest estimate.

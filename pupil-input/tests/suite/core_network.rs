@@ -218,7 +218,7 @@ fn published_pupils_are_followed_and_rubbish_is_counted() {
     let capture = Capture::start(0);
     let mut handle = start(&capture.spec());
     publish_until(&capture, "tracking", || tracks(&mut handle));
-    let counters = handle.counters();
+    let counters = handle.control.counters();
     assert!(counters.of(Counter::Notes) > 5, "2-D maps are notes");
     assert!(counters.rejected(Rejection::OtherEye) > 5);
     assert_eq!(counters.faults_in_all(), 0);
@@ -237,10 +237,10 @@ fn published_pupils_are_followed_and_rubbish_is_counted() {
     // Commands in between are of no concern.
     capture.publish_raw(&frame(4, b"\x04PING\0\0"));
     publish_until(&capture, "tracking through rubbish", || {
-        let counters = handle.counters();
+        let counters = handle.control.counters();
         counters.faults_in_all() >= 8 && tracks(&mut handle)
     });
-    let counters = handle.counters();
+    let counters = handle.control.counters();
     let fault = |fault| counters.fault(LogFault::Wire(fault));
     assert_eq!(fault(WireFault::TooShort), 2);
     assert_eq!(fault(WireFault::Malformed), 3);
@@ -251,12 +251,12 @@ fn published_pupils_are_followed_and_rubbish_is_counted() {
 
     // Half a message, and its rest later.
     let whole = [frame(1, b"pupil.1.3d"), frame(0, &datum(1, 1.0, Some(4.0), 0.0))].concat();
-    let lost = handle.counters().rejected(Rejection::Lost);
+    let lost = handle.control.counters().rejected(Rejection::Lost);
     capture.publish_raw(&whole[..40]);
     thread::sleep(Duration::from_millis(120));
     capture.publish_raw(&whole[40..]);
-    eventually("a lost pupil", || handle.counters().rejected(Rejection::Lost) > lost);
-    assert_eq!(handle.counters().faults_in_all(), 8);
+    eventually("a lost pupil", || handle.control.counters().rejected(Rejection::Lost) > lost);
+    assert_eq!(handle.control.counters().faults_in_all(), 8);
 }
 
 #[test]
@@ -265,14 +265,14 @@ fn samples_are_put_to_the_time_of_their_images() {
     let mut handle = start(&capture.spec());
     let mut delays_s = Vec::new();
     publish_until(&capture, "delays of the pipeline", || {
-        while let Some(decision) = handle.decisions().pop() {
+        while let Some(decision) = handle.decisions.pop() {
             delays_s.push((decision.sample.t_arrival - decision.sample.t_sample).seconds());
         }
         // Arrival times alone would tell of no delay that all samples have.
         let newest = &delays_s[delays_s.len().saturating_sub(50)..];
         newest.iter().filter(|delay_s| **delay_s > PIPELINE_S / 2.0).count() >= 40
     });
-    assert_eq!(handle.counters().of(Counter::ClockResets), 0);
+    assert_eq!(handle.control.counters().of(Counter::ClockResets), 0);
 }
 
 #[test]
@@ -282,15 +282,15 @@ fn a_capture_that_restarts_is_found_at_its_new_port() {
     let mut handle = start(&capture.spec());
     publish_until(&capture, "tracking", || tracks(&mut handle));
     drop(capture);
-    eventually("the loss", || handle.link() == Link::Down);
-    eventually("tries", || handle.counters().of(Counter::ReconnectAttempts) >= 2);
-    eventually("holding", || handle.pupil_at(host_now()).state != PupilState::Tracking);
+    eventually("the loss", || handle.control.link() == Link::Down);
+    eventually("tries", || handle.control.counters().of(Counter::ReconnectAttempts) >= 2);
+    eventually("holding", || handle.estimate.pupil_at(host_now()).state != PupilState::Tracking);
 
     let capture = Capture::start(remote_port);
     assert_ne!(capture.shared.publish_port, publish_port);
     publish_until(&capture, "tracking again", || tracks(&mut handle));
-    assert_eq!(handle.counters().of(Counter::Disconnects), 1);
-    assert_eq!(handle.counters().of(Counter::Connects), 2);
+    assert_eq!(handle.control.counters().of(Counter::Disconnects), 1);
+    assert_eq!(handle.control.counters().of(Counter::Connects), 2);
 }
 
 #[test]
@@ -298,15 +298,15 @@ fn a_capture_without_pupils_is_silent_and_not_gone() {
     let capture = Capture::start(0);
     let mut handle = start(&capture.spec());
     publish_until(&capture, "tracking", || tracks(&mut handle));
-    eventually("silence", || handle.link() == Link::Silent);
+    eventually("silence", || handle.control.link() == Link::Silent);
     let asked = capture.shared.asked.load(Ordering::Relaxed);
     eventually("signs of life", || capture.shared.asked.load(Ordering::Relaxed) >= asked + 3);
-    assert_eq!(handle.link(), Link::Silent);
+    assert_eq!(handle.control.link(), Link::Silent);
     publish_until(&capture, "tracking again", || tracks(&mut handle));
-    assert_eq!(handle.link(), Link::Up);
-    assert_eq!(handle.counters().of(Counter::Disconnects), 0);
-    handle.stop();
-    assert!(handle.finished());
+    assert_eq!(handle.control.link(), Link::Up);
+    assert_eq!(handle.control.counters().of(Counter::Disconnects), 0);
+    handle.control.stop();
+    assert!(handle.control.finished());
 }
 
 #[test]
@@ -315,10 +315,10 @@ fn a_capture_that_hangs_is_given_up() {
     let mut handle = start(&capture.spec());
     publish_until(&capture, "tracking", || tracks(&mut handle));
     capture.shared.answers.store(false, Ordering::Release);
-    eventually("the loss", || handle.counters().of(Counter::Disconnects) == 1);
+    eventually("the loss", || handle.control.counters().of(Counter::Disconnects) == 1);
     capture.shared.answers.store(true, Ordering::Release);
-    let samples = handle.counters().of(Counter::Samples);
-    publish_until(&capture, "samples again", || handle.counters().of(Counter::Samples) > samples);
+    let samples = handle.control.counters().of(Counter::Samples);
+    publish_until(&capture, "samples again", || handle.control.counters().of(Counter::Samples) > samples);
 }
 
 #[test]
@@ -328,9 +328,9 @@ fn a_frame_without_end_costs_the_connection_and_not_the_memory() {
     publish_until(&capture, "tracking", || tracks(&mut handle));
     for (disconnects, length) in [(1, 1_u64 << 46), (2, u64::MAX)] {
         capture.publish_raw(&[&[2][..], &length.to_be_bytes()].concat());
-        eventually("the loss", || handle.counters().of(Counter::Disconnects) == disconnects);
-        let samples = handle.counters().of(Counter::Samples);
-        publish_until(&capture, "samples again", || handle.counters().of(Counter::Samples) > samples);
+        eventually("the loss", || handle.control.counters().of(Counter::Disconnects) == disconnects);
+        let samples = handle.control.counters().of(Counter::Samples);
+        publish_until(&capture, "samples again", || handle.control.counters().of(Counter::Samples) > samples);
     }
 }
 

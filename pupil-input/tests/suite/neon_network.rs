@@ -310,7 +310,7 @@ fn payload(length: usize, worn: u8) -> Vec<u8> {
 /// Times of the samples, seconds after the first packet in Unix time, where the wire told any.
 fn unix_times_s(handle: &mut TrackerHandle) -> Vec<f64> {
     let mut times = Vec::new();
-    while let Some(decision) = handle.decisions().pop() {
+    while let Some(decision) = handle.decisions.pop() {
         times.push((decision.sample.t_device.0 - UNIX_S as i64 * 1_000_000_000) as f64 * 1e-9);
     }
     times
@@ -323,8 +323,8 @@ fn datagrams_are_followed_and_what_is_wrong_with_them_is_counted() {
     // Over the wrap of numbers and RTP times.
     companion.stream_until("tracking", || tracks(&mut handle));
     let begun = companion.next;
-    companion.stream_until("500 samples", || handle.counters().of(Counter::Samples) > 500);
-    let counters = handle.counters();
+    companion.stream_until("500 samples", || handle.control.counters().of(Counter::Samples) > 500);
+    let counters = handle.control.counters();
     assert_eq!(counters.faults_in_all(), 0);
     assert_eq!(counters.of(Counter::SequenceGaps), 0);
     assert_eq!(counters.of(Counter::SequenceRestarts), 0);
@@ -340,17 +340,17 @@ fn datagrams_are_followed_and_what_is_wrong_with_them_is_counted() {
     for packet in [&first, &third, &second, &third] {
         companion.send(0, packet);
     }
-    let notes = handle.counters().of(Counter::Notes);
+    let notes = handle.control.counters().of(Counter::Notes);
     for (length, worn) in [(9, 255), (17, 255), (40, 255), (70, 255), (65, 255), (89, 0)] {
         companion.send_datum(&payload(length, worn));
     }
     companion.send(0, b"no packet at all");
     companion.send(0, b"");
-    let before = handle.counters().of(Counter::Samples);
+    let before = handle.control.counters().of(Counter::Samples);
     companion.stream_until("tracking through rubbish", || {
-        handle.counters().of(Counter::Samples) > before + 40 && tracks(&mut handle)
+        handle.control.counters().of(Counter::Samples) > before + 40 && tracks(&mut handle)
     });
-    let counters = handle.counters();
+    let counters = handle.control.counters();
     let fault = |fault| counters.fault(LogFault::Wire(fault));
     assert_eq!(counters.of(Counter::SequenceGaps), 3, "3 lost, 1 late, 4 without a readable pupil");
     assert_eq!(counters.of(Counter::SequenceMissing), 8);
@@ -363,13 +363,13 @@ fn datagrams_are_followed_and_what_is_wrong_with_them_is_counted() {
     assert_eq!(counters.of(Counter::Disconnects), 0);
 
     // Glasses that are put down are silent, and the session is kept.
-    eventually("silence", || handle.link() == Link::Silent);
+    eventually("silence", || handle.control.link() == Link::Silent);
     let options = companion.shared.options.load(Ordering::Relaxed);
     eventually("signs of life", || companion.shared.options.load(Ordering::Relaxed) >= options + 2);
     companion.stream_until("tracking again", || tracks(&mut handle));
-    assert_eq!(handle.link(), Link::Up);
-    assert_eq!(handle.counters().of(Counter::Disconnects), 0);
-    handle.stop();
+    assert_eq!(handle.control.link(), Link::Up);
+    assert_eq!(handle.control.counters().of(Counter::Disconnects), 0);
+    handle.control.stop();
     eventually("the end of the session", || companion.shared.teardowns.load(Ordering::Relaxed) == 1);
 }
 
@@ -379,7 +379,7 @@ fn packets_come_over_tcp_where_datagrams_do_not() {
     companion.shared.datagrams.store(false, Ordering::Release);
     let mut handle = start(&companion.spec());
     companion.stream_until("tracking", || tracks(&mut handle));
-    let counters = handle.counters();
+    let counters = handle.control.counters();
     assert_eq!((counters.of(Counter::Connects), counters.of(Counter::Disconnects)), (2, 1));
     assert_eq!(counters.faults_in_all(), 0);
 
@@ -388,11 +388,11 @@ fn packets_come_over_tcp_where_datagrams_do_not() {
     let [head, body] = [&framed(0, &packet)[..4], &packet[..]].map(<[u8]>::to_vec);
     companion.throw_in(&[&head[..], b"RTSP/1.0 400 Bad Request\r\nCSeq: 9\r\n\r\n", &body].concat());
     companion.throw_in(&[0; 1000]);
-    let before = handle.counters().of(Counter::Samples);
+    let before = handle.control.counters().of(Counter::Samples);
     companion.stream_until("tracking through rubbish", || {
-        handle.counters().of(Counter::Samples) > before + 40 && tracks(&mut handle)
+        handle.control.counters().of(Counter::Samples) > before + 40 && tracks(&mut handle)
     });
-    let counters = handle.counters();
+    let counters = handle.control.counters();
     assert!((2..=3).contains(&counters.fault(LogFault::Wire(WireFault::OutOfStep))), "{}", counters.faults_in_all());
     assert_eq!(counters.of(Counter::Disconnects), 1);
     let options = companion.shared.options.load(Ordering::Relaxed);
@@ -407,14 +407,15 @@ fn a_companion_that_restarts_is_found_at_its_new_port() {
     let mut handle = start(&companion.spec());
     companion.stream_until("tracking", || tracks(&mut handle));
     drop(companion);
-    eventually("the loss", || handle.link() == Link::Down);
-    eventually("tries", || handle.counters().of(Counter::ReconnectAttempts) >= 2);
+    eventually("the loss", || handle.control.link() == Link::Down);
+    eventually("tries", || handle.control.counters().of(Counter::ReconnectAttempts) >= 2);
     let mut companion = Companion::start(status_port);
     assert_ne!(companion.shared.rtsp_port, rtsp_port);
-    let samples = handle.counters().of(Counter::Samples);
-    companion
-        .stream_until("samples again", || handle.counters().of(Counter::Samples) > samples + 50 && tracks(&mut handle));
-    assert_eq!(handle.counters().of(Counter::Disconnects), 1);
+    let samples = handle.control.counters().of(Counter::Samples);
+    companion.stream_until("samples again", || {
+        handle.control.counters().of(Counter::Samples) > samples + 50 && tracks(&mut handle)
+    });
+    assert_eq!(handle.control.counters().of(Counter::Disconnects), 1);
 }
 
 /// What is said where a status page answers so.

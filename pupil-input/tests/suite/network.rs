@@ -28,6 +28,6 @@ pub(crate) fn eventually(what: &str, mut holds: impl FnMut() -> bool) {
 
 /// Whether a steady pupil of 4 mm is followed.
 pub(crate) fn tracks(handle: &mut TrackerHandle) -> bool {
-    let estimate = handle.pupil_at(host_now());
+    let estimate = handle.estimate.pupil_at(host_now());
     estimate.state == PupilState::Tracking && (estimate.pupil.mm() - 4.0).abs() < 0.01
 }

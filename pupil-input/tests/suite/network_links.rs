@@ -67,7 +67,7 @@ fn follow(handle: &mut TrackerHandle, mut send: impl FnMut(&str)) {
     eventually("tracking", || {
         send(&line(sequence));
         sequence += 1;
-        handle.pupil_at(host_now()).state == PupilState::Tracking
+        handle.estimate.pupil_at(host_now()).state == PupilState::Tracking
     });
 }
 
@@ -90,11 +90,11 @@ fn a_server_is_followed_over_a_loss() {
     let (mut stream, _) = server.accept().expect("accepts");
     follow(&mut handle, |text| stream.write_all(text.as_bytes()).expect("sends"));
     drop(stream);
-    eventually("the loss", || handle.link() == Link::Down);
+    eventually("the loss", || handle.control.link() == Link::Down);
     let (mut stream, _) = server.accept().expect("accepts again");
-    eventually("the return", || handle.link() == Link::Up);
+    eventually("the return", || handle.control.link() == Link::Up);
     follow(&mut handle, |text| stream.write_all(text.as_bytes()).expect("sends"));
-    let counters = handle.counters();
+    let counters = handle.control.counters();
     assert_eq!((counters.of(Counter::Connects), counters.of(Counter::Disconnects)), (2, 1));
 }
 
@@ -116,8 +116,8 @@ fn a_server_is_told_to_start_and_to_stop() {
         stopped
     });
     let mut handle = start(&spec);
-    eventually("the first sample", || handle.counters().of(Counter::Samples) == 1);
-    handle.stop();
+    eventually("the first sample", || handle.control.counters().of(Counter::Samples) == 1);
+    handle.control.stop();
     let error = refused(&spec);
     assert!(error.contains("`ON\\n` was sent 3 times and answered by `what?\\n`; expected `ON OK\\n`"), "{error}");
     assert_eq!(peer.join().expect("no panic"), "OFF\n");
@@ -161,10 +161,10 @@ fn datagrams_stand_for_themselves_live_and_played_again() {
     send(&line(1)[..9]);
     send(&line(2));
     send(&format!("{}{}", line(3), line(4)));
-    eventually("four samples", || handle.counters().of(Counter::Samples) == 4);
-    handle.stop();
-    assert_eq!(handle.counters().fault(LogFault::Wire(WireFault::BadChecksum)), 1);
-    assert_eq!(handle.counters().of(Counter::Disconnects), 0);
+    eventually("four samples", || handle.control.counters().of(Counter::Samples) == 4);
+    handle.control.stop();
+    assert_eq!(handle.control.counters().fault(LogFault::Wire(WireFault::BadChecksum)), 1);
+    assert_eq!(handle.control.counters().of(Counter::Disconnects), 0);
     let log = Recording::read(&folder.path().join("tracker.holodraw")).expect("reads");
     assert_eq!((log.len(), log.faults().of(LogFault::Wire(WireFault::BadChecksum))), (4, 1));
 }

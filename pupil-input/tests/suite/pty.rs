@@ -80,7 +80,7 @@ fn feed_until(tracker: &mut Plug, first: u64, what: &str, mut holds: impl FnMut(
 }
 
 fn tracks(handle: &mut TrackerHandle) -> bool {
-    let estimate = handle.pupil_at(host_now());
+    let estimate = handle.estimate.pupil_at(host_now());
     estimate.state == PupilState::Tracking && (estimate.pupil.mm() - 4.0).abs() < 0.01
 }
 
@@ -89,10 +89,10 @@ fn samples_are_followed_and_rubbish_is_counted() {
     let mut tracker = Plug::new();
     let mut handle = start(&tracker.path());
     let next = feed_until(&mut tracker, 0, "tracking", || tracks(&mut handle));
-    let before = handle.counters();
+    let before = handle.control.counters();
     assert_eq!(before.of(Counter::Connects), 1);
     assert_eq!(before.faults_in_all(), 0);
-    let clock = handle.clock().expect("lines carry times");
+    let clock = handle.control.clock().expect("lines carry times");
     assert!((TimeNs(0)..host_now()).contains(&clock.offset), "{clock:?}");
 
     let half = &line(next, 4.0)[..10];
@@ -108,9 +108,9 @@ fn samples_are_followed_and_rubbish_is_counted() {
         tracker.send(&[*byte]);
     }
     feed_until(&mut tracker, next + 6, "tracking through rubbish", || {
-        handle.counters().of(Counter::Samples) > before.of(Counter::Samples) + 10 && tracks(&mut handle)
+        handle.control.counters().of(Counter::Samples) > before.of(Counter::Samples) + 10 && tracks(&mut handle)
     });
-    let counters = handle.counters();
+    let counters = handle.control.counters();
     assert_eq!(counters.of(Counter::Notes), 1);
     assert_eq!(counters.fault(LogFault::Wire(WireFault::TooLong)), 1);
     assert_eq!(counters.fault(LogFault::Wire(WireFault::Malformed)), 1);
@@ -118,14 +118,14 @@ fn samples_are_followed_and_rubbish_is_counted() {
     assert_eq!(counters.of(Counter::SequenceGaps), 2);
     assert_eq!(counters.of(Counter::SequenceMissing), 4);
     assert_eq!(counters.of(Counter::Disconnects), 0);
-    handle.stop();
-    assert_eq!(handle.link(), Link::Finished);
+    handle.control.stop();
+    assert_eq!(handle.control.link(), Link::Finished);
 
     let mut accepted = 0;
-    while let Some(decision) = handle.decisions().pop() {
+    while let Some(decision) = handle.decisions.pop() {
         accepted += u64::from(decision.verdict == Verdict::Accepted);
     }
-    let counters = handle.counters();
+    let counters = handle.control.counters();
     assert_eq!(accepted, counters.of(Counter::Accepted));
     assert_eq!(counters.of(Counter::Accepted) + counters.rejected_in_all(), counters.of(Counter::Samples));
 }
@@ -141,22 +141,22 @@ fn a_port_that_is_unplugged_is_opened_again_where_it_comes_back() {
 
     drop(tracker);
     std::fs::remove_file(&by_id).expect("unlinks");
-    eventually("the loss", || handle.link() == Link::Down);
-    eventually("holding", || handle.pupil_at(host_now()).state == PupilState::Holding);
-    eventually("tries", || handle.counters().of(Counter::ReconnectAttempts) >= 2);
-    eventually("fallback", || handle.pupil_at(host_now() + TimeNs::from_seconds(5.0)).pupil.mm() == 3.0);
+    eventually("the loss", || handle.control.link() == Link::Down);
+    eventually("holding", || handle.estimate.pupil_at(host_now()).state == PupilState::Holding);
+    eventually("tries", || handle.control.counters().of(Counter::ReconnectAttempts) >= 2);
+    eventually("fallback", || handle.estimate.pupil_at(host_now() + TimeNs::from_seconds(5.0)).pupil.mm() == 3.0);
 
     // A file or folder in its place is no port.
     std::fs::create_dir(&by_id).expect("a folder");
-    let tries = handle.counters().of(Counter::ReconnectAttempts);
-    eventually("another try", || handle.counters().of(Counter::ReconnectAttempts) > tries);
+    let tries = handle.control.counters().of(Counter::ReconnectAttempts);
+    eventually("another try", || handle.control.counters().of(Counter::ReconnectAttempts) > tries);
     std::fs::remove_dir(&by_id).expect("removes");
 
     let mut tracker = Plug::new();
     symlink(tracker.path(), &by_id).expect("links");
     // The tracker restarted: numbers and clock begin anew.
     feed_until(&mut tracker, 0, "tracking again", || tracks(&mut handle));
-    let counters = handle.counters();
+    let counters = handle.control.counters();
     assert_eq!(counters.of(Counter::Disconnects), 1);
     assert_eq!(counters.of(Counter::Connects), 2);
     assert_eq!(counters.of(Counter::SequenceRestarts), 0);
@@ -167,13 +167,13 @@ fn silence_is_noticed_once_and_ends() {
     let mut tracker = Plug::new();
     let mut handle = start(&tracker.path());
     let next = feed_until(&mut tracker, 0, "tracking", || tracks(&mut handle));
-    eventually("silence", || handle.link() == Link::Silent);
-    let silences = handle.counters().of(Counter::Silences);
+    eventually("silence", || handle.control.link() == Link::Silent);
+    let silences = handle.control.counters().of(Counter::Silences);
     assert!(silences >= 1);
     std::thread::sleep(Duration::from_millis(700));
-    assert_eq!(handle.counters().of(Counter::Silences), silences);
+    assert_eq!(handle.control.counters().of(Counter::Silences), silences);
     feed_until(&mut tracker, next, "tracking again", || tracks(&mut handle));
-    assert_eq!(handle.link(), Link::Up);
+    assert_eq!(handle.control.link(), Link::Up);
 }
 
 /// A tracker that must be told to start, and its profile.
@@ -223,7 +223,7 @@ fn a_tracker_is_told_to_start_and_by_a_drop_to_stop() {
     let mut handle = start(&spec);
     boot.join().expect("no panic");
     feed_until(&mut tracker, 1, "tracking", || tracks(&mut handle));
-    assert_eq!(handle.counters().of(Counter::SequenceMissing), 0, "the first sample came with the answer");
+    assert_eq!(handle.control.counters().of(Counter::SequenceMissing), 0, "the first sample came with the answer");
     drop(handle);
     assert_eq!(heard(&mut tracker), "HALT\r".repeat(3), "it never said BYE");
 }
@@ -250,33 +250,33 @@ fn a_board_that_restarts_when_its_port_is_opened_is_not_called_silent() {
     let mut tracker = Plug::new();
     let mut handle = start(&tracker.path());
     std::thread::sleep(Duration::from_millis(1500));
-    assert_eq!((handle.link(), handle.counters().of(Counter::Silences)), (Link::Up, 0));
+    assert_eq!((handle.control.link(), handle.control.counters().of(Counter::Silences)), (Link::Up, 0));
     // What it sent before the reset is cut off.
     tracker.send(&line(7, 4.0).as_bytes()[5..]);
     feed_until(&mut tracker, 0, "tracking", || tracks(&mut handle));
-    assert_eq!((handle.counters().of(Counter::Partials), handle.counters().faults_in_all()), (1, 0));
+    assert_eq!((handle.control.counters().of(Counter::Partials), handle.control.counters().faults_in_all()), (1, 0));
 }
 
 #[test]
 fn a_port_that_never_speaks_is_called_silent() {
     let tracker = Plug::new();
     let handle = start(&tracker.path());
-    eventually("silence", || handle.link() == Link::Silent);
+    eventually("silence", || handle.control.link() == Link::Silent);
 }
 
 #[test]
 fn stopping_does_not_wait_for_the_tracker() {
     let tracker = Plug::new();
     let mut handle = start(&tracker.path());
-    handle.stop();
-    assert!(handle.finished());
+    handle.control.stop();
+    assert!(handle.control.finished());
     // The port is free again.
-    start(&tracker.path()).stop();
+    start(&tracker.path()).control.stop();
     // So it is in the middle of a log that has hours to go.
     let dir = TempDir::new().expect("a folder");
     let log = dir.path().join("log");
     std::fs::write(&log, line(0, 4.0) + &line(3_600_000, 4.0)).expect("writes");
-    start(&log.display().to_string()).stop();
+    start(&log.display().to_string()).control.stop();
 }
 
 #[test]
@@ -307,7 +307,7 @@ fn what_is_no_port_is_refused_with_what_to_do() {
 #[test]
 fn a_running_tracker_goes_on_with_other_settings() {
     let mut tracker = Plug::new();
-    let (mut pupil, _tap, mut control) = start(&tracker.path()).split();
+    let TrackerHandle { estimate: mut pupil, mut control, .. } = start(&tracker.path());
     let settings = rig::Tracker { eye: rig::Eye::Left, ..rig::Rig::default().tracker };
     let fallback_5 = rig::Tracker { fallback: PupilDiameter::from_mm(5.0), ..settings.clone() };
     control.change(&fallback_5).expect("is taken");
@@ -355,7 +355,7 @@ fn blinks_are_held_on_a_pty_that_tells_only_diameters() {
         tracker.send(text.as_bytes());
         if since > TimeNs::from_seconds(0.6) {
             for ahead_ms in [0, 20, 40] {
-                let estimate = handle.pupil_at(host_now() + TimeNs(ahead_ms * 1_000_000));
+                let estimate = handle.estimate.pupil_at(host_now() + TimeNs(ahead_ms * 1_000_000));
                 assert!((3.0..4.3).contains(&estimate.pupil.mm()), "{estimate:?} at {} s", since.seconds());
                 for (held, begin_s) in held_in.iter_mut().zip(NEON_BLINKS_S) {
                     let within = (begin_s + 0.1..begin_s + 0.2).contains(&since.seconds());
@@ -378,20 +378,20 @@ fn a_log_ends_in_the_fallback() {
     std::fs::write(&log, neon_like_csv(13)).expect("writes");
     for options in [",speed=20", ",speed=max"] {
         let mut handle = play(&log, options);
-        eventually("the end", || handle.finished());
-        let counters = handle.counters();
+        eventually("the end", || handle.control.finished());
+        let counters = handle.control.counters();
         assert_eq!(counters.of(Counter::Samples), 2000);
         assert_eq!(counters.of(Counter::Accepted) + counters.rejected_in_all(), 2000);
         assert_eq!(counters.rejected(holod_pupil_input::Rejection::OtherEye), 1000);
         assert!(counters.of(Counter::Accepted) > 800, "{options}: {}", counters.of(Counter::Accepted));
-        let later = handle.pupil_at(host_now() + TimeNs::from_seconds(30.0));
+        let later = handle.estimate.pupil_at(host_now() + TimeNs::from_seconds(30.0));
         assert_eq!((later.state, later.pupil.mm()), (PupilState::Fallback, 3.0));
         if options == ",speed=max" {
-            let now = handle.pupil_at(host_now());
+            let now = handle.estimate.pupil_at(host_now());
             assert!(now.raw_mm.is_some_and(|raw_mm| (3.3..4.2).contains(&raw_mm)));
         }
         let mut last = TimeNs(i64::MIN);
-        while let Some(decision) = handle.decisions().pop() {
+        while let Some(decision) = handle.decisions.pop() {
             last = last.max(decision.sample.t_sample);
         }
         assert!(last <= host_now(), "decisions are on the host's clock");
@@ -404,21 +404,21 @@ fn a_looped_log_goes_on() {
     let log = dir.path().join("log");
     std::fs::write(&log, (0..200).map(|k| line(k, 4.0)).collect::<String>()).expect("writes");
     let mut handle = play(&log, ",speed=50,loop");
-    eventually("three loops", || handle.counters().of(Counter::Loops) >= 3);
+    eventually("three loops", || handle.control.counters().of(Counter::Loops) >= 3);
     eventually("tracking", || tracks(&mut handle));
-    let counters = handle.counters();
+    let counters = handle.control.counters();
     assert_eq!(counters.rejected_in_all(), 0, "the seam is no step");
-    assert!(!handle.finished());
+    assert!(!handle.control.finished());
 }
 
 #[test]
 fn the_mock_runs_and_is_followed() {
     let mut handle = start("mock:steady");
     eventually("tracking", || {
-        let estimate = handle.pupil_at(host_now());
+        let estimate = handle.estimate.pupil_at(host_now());
         estimate.state == PupilState::Tracking && (3.7..4.4).contains(&estimate.pupil.mm())
     });
-    let (mut reader, mut tap, mut control) = handle.split();
+    let TrackerHandle { estimate: mut reader, decisions: mut tap, mut control } = handle;
     eventually("tracking in parts", || reader.pupil_at(host_now()).state == PupilState::Tracking);
     assert!(tap.pop().is_some());
     assert_eq!(control.link(), Link::Up);

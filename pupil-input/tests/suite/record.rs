@@ -45,16 +45,16 @@ fn lines() -> String {
 
 /// Sends `text` through a PTY in pieces that respect no line, some 3 s of samples in a good second.
 fn send(tracker: &mut TTYPort, text: &str, handle: &TrackerHandle) {
-    let before = handle.counters().of(Counter::Bytes);
+    let before = handle.control.counters().of(Counter::Bytes);
     for piece in text.as_bytes().chunks(211) {
         tracker.write_all(piece).expect("writes");
         std::thread::sleep(Duration::from_millis(3));
     }
-    eventually("all bytes", || handle.counters().of(Counter::Bytes) == before + text.len() as u64);
+    eventually("all bytes", || handle.control.counters().of(Counter::Bytes) == before + text.len() as u64);
 }
 
 fn decisions(handle: &mut TrackerHandle) -> Vec<Decision> {
-    std::iter::from_fn(|| handle.decisions().pop()).collect()
+    std::iter::from_fn(|| handle.decisions.pop()).collect()
 }
 
 /// A run with a reconnect, recorded into `folder`; its decisions.
@@ -73,13 +73,13 @@ fn recorded_run(folder: &Path) -> Vec<Decision> {
     send(&mut tracker, first, &handle);
     fs::remove_file(&link).expect("unlinks");
     drop(tracker);
-    eventually("the loss", || handle.counters().of(Counter::Disconnects) == 1);
+    eventually("the loss", || handle.control.counters().of(Counter::Disconnects) == 1);
     let (mut tracker, port) = plug();
-    eventually("the return", || handle.counters().of(Counter::Connects) == 2);
+    eventually("the return", || handle.control.counters().of(Counter::Connects) == 2);
     drop(port);
     send(&mut tracker, second, &handle);
-    handle.stop();
-    let status = handle.recording().expect("it is recorded");
+    handle.control.stop();
+    let status = handle.control.recording().expect("it is recorded");
     assert_eq!((status.chunks_lost, status.decisions_lost, status.failure), (0, 0, None));
     decisions(&mut handle)
 }
@@ -96,10 +96,10 @@ fn a_recorded_run_plays_again_bit_for_bit() {
     let again = folder.path().join("again.csv");
     let files = RecordFiles { raw: None, samples: Some(again.clone()) };
     let mut handle = start(&format!("replay:{},speed=max", raw.display()), Some(files));
-    eventually("the end", || handle.finished());
-    handle.stop();
-    assert_eq!(handle.warnings(), [""; 0]);
-    let counters = handle.counters();
+    eventually("the end", || handle.control.finished());
+    handle.control.stop();
+    assert_eq!(handle.control.warnings(), [""; 0]);
+    let counters = handle.control.counters();
     assert_eq!((counters.of(Counter::Connects), counters.of(Counter::Disconnects)), (2, 1));
     assert!(counters.faults_in_all() > 0 && counters.of(Counter::Notes) > 0);
     assert_eq!(fs::read_to_string(&again).expect("reads"), samples);
@@ -129,9 +129,9 @@ fn one_wrong_byte_in_a_recording_is_not_played() {
     let again = folder.path().join("again.csv");
     let files = RecordFiles { raw: None, samples: Some(again.clone()) };
     let mut handle = start(&format!("replay:{},speed=max", raw.display()), Some(files));
-    eventually("the end", || handle.finished());
-    handle.stop();
-    let [warning] = handle.warnings() else { panic!("{:?}", handle.warnings()) };
+    eventually("the end", || handle.control.finished());
+    handle.control.stop();
+    let [warning] = handle.control.warnings() else { panic!("{:?}", handle.control.warnings()) };
     assert!(warning.contains("is torn: its last"), "{warning}");
     let played = fs::read_to_string(&again).expect("reads");
     assert_ne!(played, samples);
@@ -147,7 +147,7 @@ fn a_run_that_was_killed_keeps_what_had_come() {
     let (mut tracker, port) = TTYPort::pair().expect("a PTY");
     let handle = start(&port.name().expect("a path"), Some(RecordFiles::in_folder(folder.path())));
     send(&mut tracker, &lines(), &handle);
-    let in_all = handle.counters().of(Counter::Samples) as usize;
+    let in_all = handle.control.counters().of(Counter::Samples) as usize;
     // The files as a killed process would leave them: copied while it runs.
     let raw = folder.path().join("tracker.holodraw");
     let copy = folder.path().join("copy.holodraw");
@@ -192,11 +192,11 @@ fn nothing_is_overwritten_and_what_cannot_be_made_is_told() {
 fn the_mock_has_samples_and_no_bytes() {
     let folder = TempDir::new().expect("a folder");
     let mut handle = start("mock:steady", Some(RecordFiles::in_folder(folder.path())));
-    assert!(handle.warnings()[0].contains("no bytes to record"), "{:?}", handle.warnings());
-    eventually("samples", || handle.counters().of(Counter::Accepted) > 50);
-    handle.stop();
+    assert!(handle.control.warnings()[0].contains("no bytes to record"), "{:?}", handle.control.warnings());
+    eventually("samples", || handle.control.counters().of(Counter::Accepted) > 50);
+    handle.control.stop();
     let samples = fs::read_to_string(folder.path().join("samples.csv")).expect("reads");
-    assert_eq!(samples.lines().count() as u64, 1 + handle.counters().of(Counter::Samples));
+    assert_eq!(samples.lines().count() as u64, 1 + handle.control.counters().of(Counter::Samples));
     assert!(!folder.path().join("tracker.holodraw").exists());
 }
 
@@ -212,7 +212,7 @@ fn a_full_disk_is_told_and_the_run_goes_on() {
 fn a_recording_without_bytes_says_so() {
     let folder = TempDir::new().expect("a folder");
     let (_tracker, port) = TTYPort::pair().expect("a PTY");
-    start(&port.name().expect("a path"), Some(RecordFiles::in_folder(folder.path()))).stop();
+    start(&port.name().expect("a path"), Some(RecordFiles::in_folder(folder.path()))).control.stop();
     let raw = folder.path().join("tracker.holodraw");
     let spec = format!("replay:{}", raw.display()).parse().expect("a spec");
     let error = Tracker::start(&spec, &rig::Rig::default().tracker, TimeNs(0)).expect_err("empty").to_string();
@@ -247,11 +247,11 @@ fn a_log_that_is_played_as_fast_as_it_can_be_is_recorded_whole() {
     let mut taken = 0;
     eventually("the end", || {
         taken += decisions(&mut handle).len();
-        handle.finished()
+        handle.control.finished()
     });
-    handle.stop();
+    handle.control.stop();
     taken += decisions(&mut handle).len();
-    let status = handle.recording().expect("records");
+    let status = handle.control.recording().expect("records");
     assert_eq!((status.decisions_lost, status.failure), (0, None));
     assert_eq!(fs::read_to_string(folder.path().join("samples.csv")).expect("reads").lines().count(), count + 1);
     assert_eq!(taken, count, "the tap has them all, too");
@@ -275,9 +275,9 @@ fn a_tap_that_nobody_reads_stops_no_log() {
     let again: String = again.collect();
     fs::write(&path, text.clone() + &again).expect("writes");
     let handle = start(&format!("replay:{},speed=max", path.display()), None);
-    eventually("the end", || handle.finished());
-    assert_eq!(handle.counters().of(Counter::Samples), 120_000);
-    assert!(handle.counters().of(Counter::DecisionsDropped) > 0);
+    eventually("the end", || handle.control.finished());
+    assert_eq!(handle.control.counters().of(Counter::Samples), 120_000);
+    assert!(handle.control.counters().of(Counter::DecisionsDropped) > 0);
 }
 
 #[test]
@@ -286,11 +286,11 @@ fn files_that_are_deleted_under_a_recording_are_noticed_while_it_runs() {
     let record = folder.path().join("record");
     fs::create_dir(&record).expect("makes");
     let handle = start("mock", Some(RecordFiles::in_folder(&record)));
-    eventually("samples", || handle.counters().of(Counter::Samples) > 10);
-    assert_eq!(handle.recording().expect("records").failure, None);
+    eventually("samples", || handle.control.counters().of(Counter::Samples) > 10);
+    assert_eq!(handle.control.recording().expect("records").failure, None);
     fs::remove_dir_all(&record).expect("deletes");
-    eventually("the failure", || handle.recording().expect("records").failure.is_some());
-    let failure = handle.recording().expect("records").failure.expect("a failure");
+    eventually("the failure", || handle.control.recording().expect("records").failure.is_some());
+    let failure = handle.control.recording().expect("records").failure.expect("a failure");
     assert!(failure.contains("samples.csv") && failure.contains("deleted"), "{failure}");
 }
 
@@ -299,7 +299,7 @@ fn a_scale_on_millimetres_is_warned_of() {
     let warnings = |scale: Option<f64>| {
         let settings = rig::Tracker { scale, ..rig::Rig::default().tracker };
         let handle = Tracker::start(&"mock".parse().expect("a spec"), &settings, host_now()).expect("starts");
-        handle.warnings().join("; ")
+        handle.control.warnings().join("; ")
     };
     assert!(warnings(Some(0.0125)).contains("millimetres already") && warnings(Some(0.0125)).contains("0.0125"));
     assert_eq!([warnings(None), warnings(Some(1.0))], ["", ""]);

@@ -177,12 +177,12 @@ fn a_file_is_a_scenario_for_a_tracker() {
     };
     let mut handle = start("rate 1000\nends 50ms\n").expect("starts");
     let begun = std::time::Instant::now();
-    while !handle.finished() {
+    while !handle.control.finished() {
         assert!(begun.elapsed().as_secs() < 20, "ends");
         std::thread::sleep(std::time::Duration::from_millis(5));
     }
-    assert_eq!(handle.counters().of(holod_pupil_input::Counter::Samples), 100);
-    handle.stop();
+    assert_eq!(handle.control.counters().of(holod_pupil_input::Counter::Samples), 100);
+    handle.control.stop();
     let error = start("rate many\n").expect_err("is refused").to_string();
     assert!(error.contains("eye.txt, line 1: found `many`"), "{error}");
 }

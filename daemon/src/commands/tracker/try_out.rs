@@ -70,7 +70,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     };
     let mut tracker = Tracker::start(&spec, &rig.tracker, options).map_err(setup::tracker_failure)?;
     if !args.json {
-        for warning in tracker.warnings() {
+        for warning in tracker.control.warnings() {
             tracing::warn!("{warning}");
         }
     }
@@ -81,7 +81,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     let ended_by = loop {
         std::thread::sleep(TICK);
         let now = host_now();
-        while let Some(decision) = tracker.decisions().pop() {
+        while let Some(decision) = tracker.decisions.pop() {
             observed.take(&decision);
             refusals.note(&decision);
         }
@@ -91,7 +91,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         if (now - began).seconds() >= args.duration.as_secs_f64() {
             break "the asked duration".to_owned();
         }
-        if tracker.finished() {
+        if tracker.control.finished() {
             break "the end of the pupil log".to_owned();
         }
         if !args.json && now - redrawn >= REDRAW {
@@ -103,8 +103,8 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     };
     let now = host_now();
     let last = report_of(&spec, &ended_by, began, now, &observed, &mut tracker);
-    tracker.stop();
-    while let Some(decision) = tracker.decisions().pop() {
+    tracker.control.stop();
+    while let Some(decision) = tracker.decisions.pop() {
         observed.take(&decision);
         refusals.note(&decision);
     }
@@ -124,14 +124,14 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         let text = text_of(&report);
         results::print(&format!("{}\n{text}", traces(&observed, now, LiveText::visible(), text.lines().count())))?;
     }
-    if let Some(failure) = tracker.recording().and_then(|recording| recording.failure) {
+    if let Some(failure) = tracker.control.recording().and_then(|recording| recording.failure) {
         return Err(Failure::new(Exit::CannotCreate, format!("the recording is not whole: {failure}")));
     }
     if observed.accepted() > 0 {
         return Ok(());
     }
     let bytes = report.counts.get("bytes").copied().unwrap_or(0);
-    refusals.judge(now, &tracker.counters(), true);
+    refusals.judge(now, &tracker.control.counters(), true);
     let heard = match refusals.current().filter(|refusal| refusal.refused > 0) {
         Some(refusal) => refusal.to_string(),
         None if bytes == 0 => "nothing was heard; is it switched on, and does it send without being asked?".to_owned(),
@@ -166,21 +166,21 @@ fn report_of(
     observed: &Observed,
     tracker: &mut TrackerHandle,
 ) -> Report {
-    let estimate = tracker.pupil_at(now);
+    let estimate = tracker.estimate.pupil_at(now);
     Report {
         tracker: spec.to_string(),
         ended_by: ended_by.to_owned(),
         duration_s: (now - began).seconds(),
-        link: tracker.link().name(),
+        link: tracker.control.link().name(),
         eyes: observed.figures(),
         pupil_mm: estimate.pupil.mm(),
         pupil_state: estimate.state.name(),
-        clock_drift_ppm: tracker.clock().map(|clock| clock.drift_ppm),
-        delay_spread_ms: tracker.clock().map(|clock| clock.delay_spread.seconds() * 1e3),
-        counts: tracker.counters().entries().collect(),
-        records_lost: tracker.recording().map_or(0, |status| status.chunks_lost + status.decisions_lost),
-        trouble: tracker.trouble().map(str::to_owned),
-        warnings: tracker.warnings().to_vec(),
+        clock_drift_ppm: tracker.control.clock().map(|clock| clock.drift_ppm),
+        delay_spread_ms: tracker.control.clock().map(|clock| clock.delay_spread.seconds() * 1e3),
+        counts: tracker.control.counters().entries().collect(),
+        records_lost: tracker.control.recording().map_or(0, |status| status.chunks_lost + status.decisions_lost),
+        trouble: tracker.control.trouble().map(str::to_owned),
+        warnings: tracker.control.warnings().to_vec(),
     }
 }
 
