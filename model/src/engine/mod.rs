@@ -1,5 +1,6 @@
 //! Engines run the network on frames.
 
+mod constants;
 mod cpu;
 mod disc;
 #[cfg(test)]

@@ -11,17 +11,17 @@ use crate::phase_math::argument;
 use crate::simd::{InstructionSet, Simd, Task};
 
 /// Edge of the tiles of which the rms amplitude is taken, in pixels.
-const TILE: usize = 32;
+pub(crate) const TILE: usize = 32;
 /// A pixel is dark below this share of its tile's rms amplitude,
-const DARK_SHARE: f32 = 0.5;
+pub(crate) const DARK_SHARE: f32 = 0.5;
 /// at least below this amplitude and at most below that one, in units of the amplitude constant.
-const LEAST_DARK: f32 = 0.01;
-const MOST_DARK: f32 = 0.08;
+pub(crate) const LEAST_DARK: f32 = 0.01;
+pub(crate) const MOST_DARK: f32 = 0.08;
 /// Pixels of a row that are corrected together.
 const RUN: usize = 64;
 /// Of the binomial filter 1 4 6 4 1, how far it reaches.
-const REACH: usize = 2;
-const CORRECTION_GAIN: f32 = 2.0;
+pub(crate) const REACH: usize = 2;
+pub(crate) const CORRECTION_GAIN: f32 = 2.0;
 
 /// Encodes complex holograms as phase patterns (Hsueh and Sawchuk 1978; Maimone et al. 2017).
 ///

@@ -1,6 +1,6 @@
 //! Wave optics: holograms, how light propagates, how a field becomes a phase pattern, and what an eye sees.
 
-mod double_phase;
+pub(crate) mod double_phase;
 mod eye;
 mod fft;
 mod propagation;

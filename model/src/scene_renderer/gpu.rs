@@ -330,3 +330,84 @@ impl Adder for GpuAdder<'_> {
         Ok(&self.total)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::mem::offset_of;
+
+    use naga::{Module, TypeInner, front::wgsl};
+
+    use super::*;
+
+    const VIEW: &str = include_str!("view.wgsl");
+    const THIN_LENS: &str = include_str!("thin_lens.wgsl");
+
+    /// Bytes of a structure of `wgsl` as it lies in an array, and where each 4-byte member of it, or of one in it, is.
+    fn layout_in_shader(wgsl: &str, name: &str) -> (usize, Vec<(String, usize)>) {
+        let module = wgsl::parse_str(wgsl).unwrap();
+        let (_, found) = module.types.iter().find(|(_, found)| found.name.as_deref() == Some(name)).unwrap();
+        let TypeInner::Struct { span, .. } = found.inner else { panic!("{name} is no structure") };
+        let mut places = Vec::new();
+        add_places(&module, &found.inner, 0, &mut places);
+        (span as usize, places)
+    }
+
+    fn add_places(module: &Module, inner: &TypeInner, at: u32, places: &mut Vec<(String, usize)>) {
+        let TypeInner::Struct { members, .. } = inner else { panic!("only structures have members") };
+        for member in members {
+            let (inner, at) = (&module.types[member.ty].inner, at + member.offset);
+            match inner {
+                TypeInner::Scalar(scalar) if scalar.width == 4 => {
+                    places.push((member.name.clone().unwrap(), at as usize));
+                }
+                _ => add_places(module, inner, at, places),
+            }
+        }
+    }
+
+    macro_rules! layout {
+        ($of:ident: $($member:ident),*) => {
+            (size_of::<$of>(), vec![$((stringify!($member).to_owned(), offset_of!($of, $member))),*])
+        };
+    }
+
+    #[test]
+    fn structures_lie_in_the_shaders_as_they_do_here() {
+        let frame = layout!(Frame: left, top, grid_depth, columns, rows, first_point, surfaces, nodes);
+        let batch = layout!(Batch: width, height, columns, rows, views, first_point, weight, planes);
+        let surface = layout!(PackedSurface:
+            kind, columns, rows, first_texel, left, top, cx, cy, depth, gx_rx, gy_ry, rd);
+        assert_eq!(layout_in_shader(VIEW, "Frame"), frame);
+        assert_eq!(layout_in_shader(THIN_LENS, "Batch"), batch);
+        assert_eq!(layout_in_shader(VIEW, "Surface"), surface);
+        assert_ne!(layout_in_shader(THIN_LENS, "Batch"), frame, "another order of the same size is another layout");
+    }
+
+    #[test]
+    fn structures_of_arrays_lie_in_the_shader_as_they_do_here() {
+        let row = |count: usize| (0..count).map(|index| 4 * index);
+        let (bytes, places) = layout_in_shader(VIEW, "Triangle");
+        assert_eq!((bytes, offset_of!(Triangle, surface)), (size_of::<Triangle>(), 60));
+        let names = ["x", "y", "depth", "u", "v"].into_iter().cycle().take(15).chain(["surface"]).map(str::to_owned);
+        assert_eq!(places, names.zip(row(16)).collect::<Vec<_>>());
+
+        let (bytes, places) = layout_in_shader(VIEW, "Node");
+        assert_eq!(bytes, size_of::<Node>());
+        assert_eq!((offset_of!(Node, first), offset_of!(Node, triangles)), (24, 28));
+        let names = ["left", "right", "top", "bottom", "far", "near", "first", "triangles"].map(str::to_owned);
+        assert_eq!(places, names.into_iter().zip(row(8)).collect::<Vec<_>>());
+
+        let points = ["ax", "ay", "dx", "dy"].map(str::to_owned);
+        assert_eq!(layout_in_shader(VIEW, "ViewPoint"), (16, points.into_iter().zip(row(4)).collect()));
+    }
+
+    #[test]
+    fn workgroups_have_the_size_that_the_grids_are_made_for() {
+        for wgsl in [VIEW, THIN_LENS] {
+            let module = wgsl::parse_str(wgsl).unwrap();
+            let [x, y] = WORKGROUP;
+            assert!(module.entry_points.iter().all(|entry| entry.workgroup_size == [x, y, 1]));
+            assert_eq!(module.entry_points.len(), 1);
+        }
+    }
+}

@@ -8,17 +8,14 @@ use super::blocks::Blocks;
 use super::depth_layers::DepthLayers;
 use super::input_features::{BLOCK, SCALE, sample_pitch};
 use crate::RgbdFrame;
+use crate::engine::constants::{LEAST_COVER, PAIRS};
 use crate::engine::disc::DiscTable;
 use crate::optics::{PlanesFft, signed_bin};
 use crate::simd::{InstructionSet, Simd, Task};
 use crate::weights::{MOST_DEPTH_LAYERS, NetworkConfig};
 
-/// The least share of a white scene's light by which what is seen is divided.
-const LEAST_COVER: f32 = 0.02;
 /// Bins of a spectrum that are blurred together.
 const BINS: usize = 16;
-/// White with red, and green with blue: real pictures, two to a complex transform.
-const PAIRS: usize = 2;
 
 /// Blurs each depth layer by its disc of confusion at the focus on each other one, and divides the sum by that of a white
 /// scene. Blur is circular, and no layer hides another. Nothing is allocated after `new`.

@@ -15,14 +15,13 @@ use super::input_features::{BLOCK, FIRST_MAP, MAPS, RUN_PX, write_maps};
 use super::stage::{Buffers, Job, MapId, Maps, Stage, frame_bytes, plane_bytes};
 use super::stage_list::StageList;
 use super::trunk::Trunk;
+use crate::engine::constants::REFINED_SHARE;
 use crate::phase_math::cos_sin_pi;
 use crate::simd::{InstructionSet, Simd, Task};
 use crate::weights::{Feedback, LIT, Layer, NetworkConfig, OUTPUT_CHANNELS, REFINED};
 
 /// The mask's place among the first net's outputs for a layer.
 const MASK: usize = 3;
-/// Of the first net's changes, in the amplitudes.
-const REFINED_SHARE: f32 = 0.3;
 
 /// For frames of `resolution`; the layers are those of the first and of the second net.
 pub(super) fn stages(

@@ -6,11 +6,9 @@ use rayon::prelude::*;
 
 use super::depth_layers::DepthLayers;
 use super::input_features::sample_pitch;
+use crate::engine::constants::FEEDBACK_DARK_POWER;
 use crate::optics::{signed_bin, transfer_table};
 use crate::weights::{Feedback, NetworkConfig};
-
-/// Keeps the phase of what is dark defined: |a| = sqrt(re² + im² + this).
-const DARK: f32 = 1e-6;
 
 /// One step of Gerchberg and Saxton (1972) at all depth layers at once: the field goes through the pupil to every layer,
 /// takes the wanted amplitude there with the phase that it has, and the mean of these changes comes back, in which what is
@@ -62,7 +60,7 @@ impl LayerFeedback {
                 layers.arrive(colour, reaching, change);
                 change.par_iter_mut().zip(&mut stack[plane.clone()]).zip(layers.cover(layer)).for_each(
                     |((arriving, lack), cover)| {
-                        let amplitude = (arriving.norm_sqr() + DARK).sqrt();
+                        let amplitude = (arriving.norm_sqr() + FEEDBACK_DARK_POWER).sqrt();
                         *lack -= amplitude;
                         *arriving *= (1.0 + *sharpness * cover) * *lack / amplitude;
                     },

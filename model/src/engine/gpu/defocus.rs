@@ -8,11 +8,10 @@ use super::input_features::{InputChannels, grid_constants, plane_bytes, sample_p
 use super::map::{GROUP, Map};
 use super::plan::{BufferId, Constant, Plan};
 use super::shared::Shared;
+use crate::engine::constants::{LEAST_COVER, PAIRS};
 use crate::engine::disc::DiscTable;
 use crate::weights::NetworkConfig;
 
-/// White with red, and green with blue: real pictures, two to a complex transform.
-const PAIRS: usize = 2;
 /// Foci whose spectra a thread holds at once; where there are more layers, these are transformed anew for each so many.
 const MOST_FOCI: usize = 8;
 /// Samples of each of these that a thread holds.
@@ -50,6 +49,8 @@ pub(super) fn expect(
         .chain(inputs.constants(["INPUT_GROUPS", "INPUT_PITCH"]))
         .chain([
             ("LAYERS", count.into()),
+            ("PAIRS", PAIRS.into()),
+            ("LEAST_COVER", LEAST_COVER.into()),
             ("FOCI", foci.into()),
             ("FIRST_SEEN", (scratch_planes(count) - PAIRS * count).into()),
             ("FIRST_PART_GROUPS", (first_part / GROUP).into()),

@@ -4,10 +4,6 @@
 // Before this file: fft.wgsl, blocks.wgsl, input_features.wgsl and the constants of defocus.rs.
 
 const PIXELS = WIDTH * HEIGHT;
-// White with red, and green with blue: real pictures, two to a complex transform.
-const PAIRS = 2u;
-// The least share of a white scene's light by which what is seen is divided.
-const LEAST_COVER = 0.02f;
 
 @group(0) @binding(1) var<storage, read> frame: array<f32>; // [4, frame height, frame width]
 @group(0) @binding(2) var<storage, read> pupil: Pupil;

@@ -10,6 +10,7 @@ use super::input_features::{plane_bytes, sample_pitch};
 use super::map::Map;
 use super::plan::{BufferId, Constant, Plan, Shader, Stage};
 use super::shared::Shared;
+use crate::engine::constants::REFINED_SHARE;
 use crate::optics::transfer_table;
 use crate::weights::NetworkConfig;
 
@@ -55,6 +56,7 @@ impl DepthLayers {
                 ("WIDTH", size.width.into()),
                 ("HEIGHT", size.height.into()),
                 ("LAYERS", count.into()),
+                ("REFINED_SHARE", REFINED_SHARE.into()),
                 ("RADIUS_PER_MM_RED", radius_per_mm(Colour::Red).into()),
                 ("RADIUS_PER_MM_GREEN", radius_per_mm(Colour::Green).into()),
                 ("RADIUS_PER_MM_BLUE", radius_per_mm(Colour::Blue).into()),

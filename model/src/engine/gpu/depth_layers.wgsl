@@ -3,8 +3,6 @@
 // Before this file: fft.wgsl, phase_math.wgsl, pupil.wgsl and the constants of depth_layers.rs.
 
 const PIXELS = WIDTH * HEIGHT;
-// Of the first net's changes, in the amplitudes.
-const REFINED_SHARE = 0.3f;
 
 // The first net's: for each layer a group of three phases over π and a mask, then the changes of the amplitudes.
 @group(0) @binding(1) var<storage, read> outputs: array<vec4f>;

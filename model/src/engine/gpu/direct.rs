@@ -45,7 +45,8 @@ fn shader(grid: Grid, shared: &Shared, map: &Map, entry: &'static str) -> Arc<Sh
         Grid::HalfBand => 2,
         Grid::Full => 1,
     };
-    let constants: [(&str, Constant); 7] = [
+    let constants: [(&str, Constant); 8] = [
+        ("WORKGROUP", WORKGROUP.into()),
         ("FRAME_WIDTH", shared.resolution.width.into()),
         ("FRAME_HEIGHT", shared.resolution.height.into()),
         ("WIDTH", shared.size.width.into()),

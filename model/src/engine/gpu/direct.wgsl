@@ -1,5 +1,6 @@
 // What the `direct` family's net reads, and the field that it gives. After these constants:
-// FRAME_WIDTH, FRAME_HEIGHT, WIDTH, HEIGHT (of the network's grid), SCALE (panel pixels to a sample, each way), MAP_GROUPS, MAP_PITCH.
+// WORKGROUP (pixels of a row), FRAME_WIDTH, FRAME_HEIGHT, WIDTH, HEIGHT (of the network's grid), SCALE (panel pixels to a
+// sample, each way), MAP_GROUPS, MAP_PITCH.
 
 // The eye's pupil in millimetres, and what networks are told of it and the bench (conditions.rs).
 struct Pupil {
@@ -40,7 +41,7 @@ fn channel(index: u32, x: u32, y: u32) -> f32 {
     return select(0.0, pupil.fresnel, index == 5u * BLOCK + 1u);
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(WORKGROUP)
 fn encode(@builtin(global_invocation_id) place: vec3u) {
     let x = place.x;
     let y = place.y;
@@ -56,7 +57,7 @@ fn encode(@builtin(global_invocation_id) place: vec3u) {
 }
 
 // The mean amplitude of each block, and what the net adds to it: three real parts and three imaginary ones.
-@compute @workgroup_size(64)
+@compute @workgroup_size(WORKGROUP)
 fn add_residual(@builtin(global_invocation_id) place: vec3u) {
     let x = place.x;
     let y = place.y;

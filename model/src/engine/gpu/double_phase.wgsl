@@ -1,18 +1,14 @@
 // Double phase; optics/double_phase.rs says what it does and why. After these constants and phase_math.wgsl:
-// WIDTH, HEIGHT, AMPLITUDE_SCALE.
+// WIDTH, HEIGHT, AMPLITUDE_SCALE, those of double_phase.rs, and SIDE: the edge of what a workgroup of `phases` does.
 
 @group(0) @binding(0) var<storage, read> field: array<vec2f>; // [3, height, width]
 @group(0) @binding(1) var<storage, read_write> errors: array<vec2f>; // [3, height, width]
 @group(0) @binding(2) var<storage, read_write> clipped_samples: atomic<u32>;
 @group(0) @binding(3) var<storage, read_write> phases_rad: array<f32>; // [3, height, width]
 
-// Edge of the tiles of which the rms amplitude is taken, in pixels; edge of the blocks of a thread.
-const TILE: u32 = 32;
+// Edge of the blocks of a thread, in pixels.
 const BLOCK: u32 = 4;
 const THREADS: u32 = (TILE / BLOCK) * (TILE / BLOCK);
-const DARK_SHARE: f32 = 0.5;
-const LEAST_DARK: f32 = 0.01;
-const MOST_DARK: f32 = 0.08;
 
 struct Clipped {
     value: vec2f,
@@ -109,11 +105,8 @@ fn pair_errors(@builtin(workgroup_id) tile: vec3u, @builtin(local_invocation_ind
     }
 }
 
-// Of the binomial filter 1 4 6 4 1, how far it reaches; pixels of a workgroup each way, and those with what it reaches.
-const REACH: u32 = 2;
-const SIDE: u32 = 16;
+// With what the binomial filter 1 4 6 4 1 reaches.
 const AROUND: u32 = SIDE + 2 * REACH;
-const CORRECTION_GAIN: f32 = 2.0;
 
 var<workgroup> around: array<vec2f, AROUND * AROUND>;
 var<workgroup> columns: array<vec2f, AROUND * SIDE>;

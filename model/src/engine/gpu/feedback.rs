@@ -9,6 +9,7 @@ use super::input_features::{InputChannels, plane_bytes};
 use super::map::{GROUP, Map};
 use super::plan::{BufferId, Constant, Plan};
 use super::shared::Shared;
+use crate::engine::constants::FEEDBACK_DARK_POWER;
 use crate::weights::{Feedback, NetworkConfig};
 
 /// Samples that a thread holds of a row, and of a column.
@@ -40,7 +41,8 @@ pub(super) fn feed_back(
     let to_farthest = plan.table("the way to the farthest layer", &to_farthest);
 
     let channels = InputChannels::new(count);
-    let own: [(&str, Constant); 4] = [
+    let own: [(&str, Constant); 5] = [
+        ("DARK_POWER", FEEDBACK_DARK_POWER.into()),
         ("SHARE", share.into()),
         ("SHARPNESS", sharpness.into()),
         ("FIELD_GROUP", (channels.field / GROUP).into()),

@@ -3,9 +3,6 @@
 //
 // Before this file: fft.wgsl, pupil.wgsl and the constants of feedback.rs.
 
-// Keeps the phase of what is dark defined.
-const DARK = 1e-6f;
-
 @group(0) @binding(1) var<storage, read> pupil_mm: f32;
 @group(0) @binding(2) var<storage, read> carried_spectrum: array<vec2f>; // [3, height, width], over the number of samples
 // [3, height, width]: transfer functions from the SLM plane to the farthest layer, and from one to the next nearer one.
@@ -89,7 +86,7 @@ fn compare(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
             let y = group.x * LINES + place % LINES;
             if (place < PLACES && y < HEIGHT) {
                 let arriving = line[place];
-                let amplitude = sqrt(dot(arriving, arriving) + DARK);
+                let amplitude = sqrt(dot(arriving, arriving) + DARK_POWER);
                 let lack = stack[(channel * HEIGHT + y) * WIDTH + place / LINES] - amplitude;
                 line[place] = (1f + SHARPNESS * cover(layers[item], channel / 3u)) * lack / amplitude * arriving;
                 // A register is chosen by comparing: memory is what has addresses.

@@ -4,8 +4,9 @@ use holod_calibration::{Colour, LevelTables};
 
 use super::plan::{BufferId, Plan, Shader};
 
-/// Samples of a workgroup.
-const SAMPLES: usize = 2 * 256;
+/// Threads of a workgroup, and its samples.
+const THREADS: usize = 256;
+const SAMPLES: usize = 2 * THREADS;
 /// Workgroups of a row of the grid.
 const ROW: usize = 1 << 15;
 
@@ -30,6 +31,7 @@ pub(crate) fn encode(plan: &mut Plan, tables: &LevelTables, phases: BufferId, un
     };
     let [first, second, third] = field_order.map(Colour::index);
     let constants = [
+        ("THREADS", THREADS.into()),
         ("PANEL_WIDTH", panel.width.into()),
         ("PANEL_HEIGHT", panel.height.into()),
         ("WIDTH", pattern.width.into()),

@@ -1,6 +1,6 @@
 // Phases to the panel's samples, as the panel takes them. After these constants:
-// PANEL_WIDTH, PANEL_HEIGHT, WIDTH, HEIGHT, LEFT, TOP, INTERLEAVED, FIRST, SECOND, THIRD (colours in the order shown),
-// ENTRIES (of a colour's table), FLATNESS (whether there is any).
+// THREADS (of a workgroup), PANEL_WIDTH, PANEL_HEIGHT, WIDTH, HEIGHT, LEFT, TOP, INTERLEAVED, FIRST, SECOND, THIRD
+// (colours in the order shown), ENTRIES (of a colour's table), FLATNESS (whether there is any).
 
 @group(0) @binding(0) var<storage, read> phases_rad: array<f32>; // [3, height, width]
 @group(0) @binding(1) var<storage, read> level_of_phase: array<u32>; // [3, entries]
@@ -8,7 +8,6 @@
 @group(0) @binding(3) var<storage, read_write> samples: array<u32>; // two to each
 @group(0) @binding(4) var<storage, read_write> unreachable_samples: array<atomic<u32>, 3>;
 
-const THREADS: u32 = 256;
 const PIXELS: u32 = PANEL_WIDTH * PANEL_HEIGHT;
 const ENTRIES_PER_RAD: f32 = f32(ENTRIES) / 6.28318530717959;
 const UNREACHABLE: u32 = 1 << 16;
