@@ -9,7 +9,7 @@ use crate::results;
 
 /// A file, or standard output where `-` is named.
 #[derive(Debug)]
-pub enum Destination {
+pub(crate) enum Destination {
     /// A file that is written beside its place and renamed.
     File(PathBuf),
     /// The standard output.
@@ -21,7 +21,7 @@ impl Destination {
     ///
     /// # Errors
     /// A file is there already, or a directory.
-    pub fn new(path: &Path, option: &str, force: bool) -> Result<Self, Failure> {
+    pub(crate) fn new(path: &Path, option: &str, force: bool) -> Result<Self, Failure> {
         if path == Path::new("-") {
             return Ok(Self::Stdout);
         }
@@ -36,7 +36,7 @@ impl Destination {
     }
 
     /// Whether results go where reports usually do, so that these must not.
-    pub const fn is_stdout(&self) -> bool {
+    pub(crate) const fn is_stdout(&self) -> bool {
         matches!(self, Self::Stdout)
     }
 
@@ -44,7 +44,7 @@ impl Destination {
     ///
     /// # Errors
     /// That of `write`, or standard output takes no more.
-    pub fn write(&self, write: impl FnOnce(&Path) -> Result<(), Failure>) -> Result<(), Failure> {
+    pub(crate) fn write(&self, write: impl FnOnce(&Path) -> Result<(), Failure>) -> Result<(), Failure> {
         match self {
             Self::File(path) => write(path),
             Self::Stdout => {
@@ -65,7 +65,11 @@ impl Destination {
 ///
 /// # Errors
 /// One of them is there already.
-pub fn refuse_existing(paths: impl IntoIterator<Item = PathBuf>, option: &str, force: bool) -> Result<(), Failure> {
+pub(crate) fn refuse_existing(
+    paths: impl IntoIterator<Item = PathBuf>,
+    option: &str,
+    force: bool,
+) -> Result<(), Failure> {
     match paths.into_iter().find(|path| !force && path.symlink_metadata().is_ok()) {
         None => Ok(()),
         Some(path) => Err(Failure::new(

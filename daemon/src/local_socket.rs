@@ -40,7 +40,7 @@ pub enum SocketError {
 ///
 /// # Errors
 /// Something else is there, or the socket cannot be made.
-pub fn listen(path: &Path, kind: SocketType) -> Result<OwnedFd, SocketError> {
+pub(crate) fn listen(path: &Path, kind: SocketType) -> Result<OwnedFd, SocketError> {
     let cannot = |error: io::Error| SocketError::Listen { socket: path.to_owned(), error };
     let new_socket = || {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;

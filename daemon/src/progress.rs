@@ -10,7 +10,7 @@ const FIRST_WORD: Duration = Duration::from_secs(1);
 const NEXT_WORD: Duration = Duration::from_secs(5);
 
 /// Does `work`, and says on the log what it is, once it takes a second, and that it goes on, every five.
-pub fn during<T>(what: &str, work: impl FnOnce() -> T) -> T {
+pub(crate) fn during<T>(what: &str, work: impl FnOnce() -> T) -> T {
     during_with(what, [FIRST_WORD, NEXT_WORD], |text| tracing::info!("{text}"), work)
 }
 

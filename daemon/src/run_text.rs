@@ -5,12 +5,12 @@ use crate::source::feed::FeedStatus;
 use crate::spread::Spread;
 
 /// Median and tail in words.
-pub fn spread_text(spread: Option<Spread>) -> String {
+pub(crate) fn spread_text(spread: Option<Spread>) -> String {
     spread.map_or("not measured".to_owned(), |s| format!("median {:.1} ms, p99 {:.1} ms", s.median_ms, s.p99_ms))
 }
 
 /// What became of a feed's pictures.
-pub fn feed_text(feed: &FeedStatus) -> String {
+pub(crate) fn feed_text(feed: &FeedStatus) -> String {
     let bad_depths = match feed.pictures_with_bad_depths {
         0 => String::new(),
         pictures => format!("; bad depths in {pictures} of them: {} pixels", feed.bad_depths_in_all.text()),
@@ -24,7 +24,7 @@ pub fn feed_text(feed: &FeedStatus) -> String {
 }
 
 /// A run in a few lines.
-pub fn summary_text(summary: &Summary) -> String {
+pub(crate) fn summary_text(summary: &Summary) -> String {
     let states: Vec<String> =
         summary.frames_by_pupil_state.iter().map(|(state, count)| format!("{count} {state}")).collect();
     let pupils = summary.pupil_range_mm.map_or("none".to_owned(), |[a, b]| format!("{a:.2} to {b:.2} mm"));

@@ -4,13 +4,13 @@ use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
 /// The best folder that this process may write to, made where it is missing; nothing where there is none.
-pub fn own() -> Option<PathBuf> {
+pub(crate) fn own() -> Option<PathBuf> {
     candidates().into_iter().find(|folder| prepare(folder))
 }
 
 /// Where such a folder may be, the best place first: the folder that systemd made for it, one in the user's own
 /// runtime folder, one of this user's in the folder for temporary files.
-pub fn candidates() -> Vec<PathBuf> {
+pub(crate) fn candidates() -> Vec<PathBuf> {
     let named = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
     let uid = rustix::process::getuid().as_raw();
     let login = PathBuf::from(format!("/run/user/{uid}"));
@@ -26,7 +26,7 @@ fn prepare(folder: &Path) -> bool {
 }
 
 /// Whether the folder is there and this user's.
-pub fn is_own(folder: &Path) -> bool {
+pub(crate) fn is_own(folder: &Path) -> bool {
     std::fs::symlink_metadata(folder)
         .is_ok_and(|metadata| metadata.is_dir() && metadata.uid() == rustix::process::geteuid().as_raw())
 }

@@ -22,12 +22,12 @@ const SIDE_STEP_PX: usize = 16;
 const LEAST_SIDE_PX: usize = 64;
 
 /// Frames of all colours that the panel can show in a second.
-pub fn panel_frames_hz(panel: &Panel) -> f64 {
+pub(crate) fn panel_frames_hz(panel: &Panel) -> f64 {
     panel.refresh_hz * panel.mode.fields_per_refresh() / panel.fields() as f64
 }
 
 /// What would bring `frames_hz` frames of `size` nearer to the panel's; nothing where there are enough.
-pub fn advice(frames_hz: f64, rig: &Rig, size: Resolution) -> Option<String> {
+pub(crate) fn advice(frames_hz: f64, rig: &Rig, size: Resolution) -> Option<String> {
     let panel_hz = panel_frames_hz(&rig.panel);
     if frames_hz >= ENOUGH * panel_hz {
         return None;
@@ -55,7 +55,7 @@ pub fn advice(frames_hz: f64, rig: &Rig, size: Resolution) -> Option<String> {
 
 /// The times of two small frames, from which those of others are estimated.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Estimate {
+pub(crate) struct Estimate {
     /// How the frames were computed.
     pub engine: String,
     /// Their sizes, the smaller first.
@@ -68,7 +68,7 @@ impl Estimate {
     ///
     /// # Errors
     /// The backend is not to be had, or the rig contradicts itself.
-    pub fn of(rig: &Rig, weights: &Weights) -> Result<Self, Failure> {
+    pub(crate) fn of(rig: &Rig, weights: &Weights) -> Result<Self, Failure> {
         let panel = rig.resolution();
         let timed = TIMED_PX.map(|side| Resolution { width: side.min(panel.width), height: side.min(panel.height) });
         let [(_, smaller_s), (engine, larger_s)] = [time(rig, weights, timed[0])?, time(rig, weights, timed[1])?];
@@ -76,7 +76,7 @@ impl Estimate {
     }
 
     /// Frames of `size` a second: a GPU takes some of the time for each frame, the rest goes with the pixels.
-    pub fn frames_hz(&self, size: Resolution) -> f64 {
+    pub(crate) fn frames_hz(&self, size: Resolution) -> f64 {
         let ([smaller, larger], [smaller_s, larger_s]) = (self.timed.map(|size| size.pixels() as f64), self.seconds);
         // Not less for a frame that took longer, nor more for each pixel than all of them took.
         let by_pixel = if larger > smaller { (larger_s - smaller_s) / (larger - smaller) } else { f64::INFINITY };

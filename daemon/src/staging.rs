@@ -13,7 +13,7 @@ use crate::failure::{Exit, Failure};
 
 /// Files on their way into a directory: written beside it, moved in by rename when all are whole. What is half done when a
 /// signal ends the process is taken away first.
-pub struct Staging {
+pub(crate) struct Staging {
     target: PathBuf,
     beside: TempDir,
     force: bool,
@@ -22,13 +22,13 @@ pub struct Staging {
 impl Staging {
     /// Prepares to fill `target`, which may exist, but holds none of `files` unless with `force`; its parent is created
     /// where it is missing.
-    pub fn new(target: &Path, files: &[&str], force: bool) -> Result<Self, Failure> {
+    pub(crate) fn new(target: &Path, files: &[&str], force: bool) -> Result<Self, Failure> {
         Self::in_folder(folder_of(target), target, files, force)
     }
 
     /// Prepares to write the file `path`, which may exist with `force` only; nothing but its folder is touched, which is
     /// created where it is missing.
-    pub fn of_file(path: &Path, force: bool) -> Result<Self, Failure> {
+    pub(crate) fn of_file(path: &Path, force: bool) -> Result<Self, Failure> {
         let Some(name) = path.file_name().and_then(|name| name.to_str()) else {
             let what = format!("--out {}: expected the name of a file to write", path.display());
             return Err(Failure::new(Exit::CannotCreate, what));
@@ -63,12 +63,12 @@ impl Staging {
     }
 
     /// Where to write the file that will be called `name`.
-    pub fn path(&self, name: &str) -> PathBuf {
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
         self.beside.path().join(name)
     }
 
     /// Moves every file into the target.
-    pub fn commit(self) -> Result<(), Failure> {
+    pub(crate) fn commit(self) -> Result<(), Failure> {
         let cannot = |error: std::io::Error| {
             Failure::new(Exit::CannotCreate, format!("cannot move results into {}: {error}", self.target.display()))
         };
@@ -98,14 +98,14 @@ impl Drop for Staging {
 }
 
 /// A folder for files that are needed for a while; it goes with this, and when a signal ends the process.
-pub struct Temporary(TempDir);
+pub(crate) struct Temporary(TempDir);
 
 impl Temporary {
     /// A new one in the folder for temporary files.
     ///
     /// # Errors
     /// It cannot be made.
-    pub fn new(prefix: &str) -> std::io::Result<Self> {
+    pub(crate) fn new(prefix: &str) -> std::io::Result<Self> {
         take_away_on_signals();
         let folder = tempfile::Builder::new().prefix(prefix).tempdir()?;
         half_done(|folders| folders.push(folder.path().to_owned()));
@@ -113,7 +113,7 @@ impl Temporary {
     }
 
     /// Where it is.
-    pub fn path(&self) -> &Path {
+    pub(crate) fn path(&self) -> &Path {
         self.0.path()
     }
 }

@@ -46,7 +46,7 @@ struct Written<S> {
 
 /// The file of a running process, which a thread of its own writes. Dropping it takes the file away.
 #[derive(Debug)]
-pub struct StatusFile {
+pub(crate) struct StatusFile {
     newest: Arc<Queue<Vec<u8>>>,
     began_ticks: Option<u64>,
     writer: Option<JoinHandle<()>>,
@@ -54,7 +54,7 @@ pub struct StatusFile {
 
 impl StatusFile {
     /// The file, in the first folder that takes it; a process without any has none, which is no fault.
-    pub fn create() -> Self {
+    pub(crate) fn create() -> Self {
         match runtime_folder::own() {
             Some(folder) => Self::of(std::process::id(), &folder),
             None => Self { newest: Arc::default(), began_ticks: None, writer: None },
@@ -74,7 +74,7 @@ impl StatusFile {
 
     /// Has the file written anew at host time `now`. Where the disk is still at what was written before, this one is left
     /// out.
-    pub fn write(&mut self, status: &Snapshot, now: TimeNs) {
+    pub(crate) fn write(&mut self, status: &Snapshot, now: TimeNs) {
         if self.writer.is_none() {
             return;
         }
@@ -106,7 +106,7 @@ fn write(newest: &Queue<Vec<u8>>, path: &Path) {
 
 /// Takes away what holods that were killed have left in this user's folders: nobody else does, and their numbers are
 /// given out again. Call it before this process puts anything there.
-pub fn remove_leftovers() {
+pub(crate) fn remove_leftovers() {
     for folder in runtime_folder::candidates().into_iter().filter(|folder| runtime_folder::is_own(folder)) {
         remove_leftovers_in(&folder);
     }
@@ -158,7 +158,7 @@ impl Drop for StatusFile {
 
 /// What a running holod wrote last.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Found {
+pub(crate) struct Found {
     /// It.
     pub status: Snapshot,
     /// How long ago that was, where it is too long.
@@ -169,7 +169,7 @@ pub struct Found {
 ///
 /// # Errors
 /// None runs, or what it says may not be read.
-pub fn of_running() -> Result<Vec<Found>, Failure> {
+pub(crate) fn of_running() -> Result<Vec<Found>, Failure> {
     let mut folders = vec![PathBuf::from(SERVICE_FOLDER)];
     folders.extend(runtime_folder::candidates());
     folders.dedup();
@@ -180,7 +180,7 @@ pub fn of_running() -> Result<Vec<Found>, Failure> {
 ///
 /// # Errors
 /// As [`of_running`], or that process is no holod.
-pub fn of_running_as(pid: Option<u32>) -> Result<Vec<Found>, Failure> {
+pub(crate) fn of_running_as(pid: Option<u32>) -> Result<Vec<Found>, Failure> {
     let look = || {
         let mut running = of_running()?;
         running.retain(|found| pid.is_none_or(|pid| found.status.pid == pid));
@@ -197,7 +197,7 @@ pub fn of_running_as(pid: Option<u32>) -> Result<Vec<Found>, Failure> {
 ///
 /// # Errors
 /// There are several.
-pub fn only(running: &[Found]) -> Result<&Snapshot, Failure> {
+pub(crate) fn only(running: &[Found]) -> Result<&Snapshot, Failure> {
     if let [one] = running {
         return Ok(&one.status);
     }

@@ -11,7 +11,7 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Axis, Chart, Dataset, GraphType, Widget};
 
 /// One set of points in a [`plot`].
-pub struct Series<'a> {
+pub(crate) struct Series<'a> {
     /// What it is.
     pub name: &'a str,
     /// Its colour; where there are no colours, a plot with one series still says all.
@@ -21,7 +21,7 @@ pub struct Series<'a> {
 }
 
 /// The axes of a [`plot`].
-pub struct Axes<'a> {
+pub(crate) struct Axes<'a> {
     /// What x is, with its unit.
     pub x_name: &'a str,
     /// First and last x.
@@ -34,7 +34,7 @@ pub struct Axes<'a> {
 
 /// Columns and rows of a plot.
 #[derive(Clone, Copy, Debug)]
-pub struct TextSize {
+pub(crate) struct TextSize {
     /// Columns.
     pub width: u16,
     /// Rows.
@@ -46,12 +46,12 @@ const PLOT_SIZE: TextSize = TextSize { width: 100, height: 18 };
 
 impl TextSize {
     /// A plot's size on this terminal.
-    pub fn of_plot() -> Self {
+    pub(crate) fn of_plot() -> Self {
         Self { width: PLOT_SIZE.width.min(window().width).max(40), ..PLOT_SIZE }
     }
 
     /// The same where `rows` rows of text stand below it, none of which should be lost.
-    pub fn of_plot_above(rows: usize) -> Self {
+    pub(crate) fn of_plot_above(rows: usize) -> Self {
         let left = usize::from(window().height).saturating_sub(rows + 2).max(6);
         Self { height: PLOT_SIZE.height.min(left as u16), ..Self::of_plot() }
     }
@@ -67,7 +67,7 @@ fn window() -> TextSize {
 }
 
 /// Points as braille dots, with axes and a legend; `colours` adds ANSI colours.
-pub fn plot(series: &[Series<'_>], axes: &Axes<'_>, size: TextSize, colours: bool) -> String {
+pub(crate) fn plot(series: &[Series<'_>], axes: &Axes<'_>, size: TextSize, colours: bool) -> String {
     let area = Rect::new(0, 0, size.width, size.height);
     let mut buffer = Buffer::empty(area);
     let datasets = series.iter().map(|series| {
@@ -128,19 +128,19 @@ const fn ansi(colour: Color) -> u8 {
 
 /// Text that is shown again and again in the same place of a terminal; nothing where standard output is none.
 #[derive(Debug, Default)]
-pub struct LiveText {
+pub(crate) struct LiveText {
     /// Rows of the terminal that the text took.
     rows: usize,
 }
 
 impl LiveText {
     /// Whether anybody would see it.
-    pub fn visible() -> bool {
+    pub(crate) fn visible() -> bool {
         io::stdout().is_terminal()
     }
 
     /// Puts `text` in the place of what was shown before.
-    pub fn show(&mut self, text: &str) {
+    pub(crate) fn show(&mut self, text: &str) {
         if !Self::visible() {
             return;
         }

@@ -28,7 +28,7 @@ use crate::{setup, source};
 
 /// What a run was started with; `run.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct RunFacts {
+pub(crate) struct RunFacts {
     /// What `holod --version` says.
     pub holod: String,
     /// When it began, by the wall clock: milliseconds since 1970.
@@ -55,7 +55,7 @@ pub struct RunFacts {
 
 /// The files of what an order brought; a line of `order-files.jsonl`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct OrderSource {
+pub(crate) struct OrderSource {
     /// Its line in `orders.jsonl`.
     pub order: u32,
     /// The scene that it brought.
@@ -67,11 +67,11 @@ pub struct OrderSource {
 }
 
 /// Name of [`RunFacts`] in a record.
-pub const RUN: &str = "run.json";
+pub(crate) const RUN: &str = "run.json";
 /// Name of the log in a record.
-pub const LOG: &str = "log.txt";
+pub(crate) const LOG: &str = "log.txt";
 /// Name of the lines of [`OrderSource`] in a record.
-pub const ORDER_FILES: &str = "order-files.jsonl";
+pub(crate) const ORDER_FILES: &str = "order-files.jsonl";
 
 /// What tells which files an order brings.
 #[derive(Clone)]
@@ -100,7 +100,7 @@ enum Entry {
 }
 
 /// Writes down a run as it goes.
-pub struct Recorder {
+pub(crate) struct Recorder {
     folder: PathBuf,
     log: LogFile,
     facts: RunFacts,
@@ -130,7 +130,7 @@ impl Recorder {
     ///
     /// # Errors
     /// An earlier record is there, a file cannot be read or written.
-    pub fn create(folder: &Path, args: &RunArgs, rig: &Rig, resolution: Resolution) -> Result<Self, Failure> {
+    pub(crate) fn create(folder: &Path, args: &RunArgs, rig: &Rig, resolution: Resolution) -> Result<Self, Failure> {
         let own = [LOG, RUN, ORDER_FILES, sources::BENCH].map(|name| folder.join(name));
         refuse_existing(own, "--record", false)?;
         let frames = FrameLog::create(folder)?;
@@ -169,12 +169,12 @@ impl Recorder {
     }
 
     /// Where the record is.
-    pub fn folder(&self) -> &Path {
+    pub(crate) fn folder(&self) -> &Path {
         &self.folder
     }
 
     /// Whether the record goes on, for others who write into its folder, and who ask.
-    pub fn health(&self) -> Arc<RecordHealth> {
+    pub(crate) fn health(&self) -> Arc<RecordHealth> {
         Arc::clone(&self.health)
     }
 
@@ -201,14 +201,14 @@ impl Recorder {
 
     /// Says what the tracker's spec is.
     #[must_use]
-    pub fn with_tracker(mut self, spec: String) -> Self {
+    pub(crate) fn with_tracker(mut self, spec: String) -> Self {
         self.facts.tracker = spec;
         self
     }
 
     /// Hands everything to the operating system and ends the log. A disk that does not take it within seconds has lost the
     /// record.
-    pub fn finish(&mut self) {
+    pub(crate) fn finish(&mut self) {
         self.end_writing();
         self.log.flush();
         self.note_log();
@@ -217,7 +217,7 @@ impl Recorder {
 
     /// Ends the record of a run that failed. Where no frame was ever made it is taken away again, so that the same directory
     /// may be named again.
-    pub fn fail(mut self, failure: &Failure) {
+    pub(crate) fn fail(mut self, failure: &Failure) {
         let frames = self.end_writing();
         self.log.ended_by(failure);
         self.log.end();

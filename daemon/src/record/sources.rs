@@ -16,21 +16,21 @@ use crate::cli::SceneArgs;
 use crate::failure::{Exit, Failure};
 
 /// The folder in a record with the rig and the files that it names.
-pub const BENCH: &str = "bench";
+pub(crate) const BENCH: &str = "bench";
 /// The rig in it.
-pub const RIG: &str = "rig.toml";
+pub(crate) const RIG: &str = "rig.toml";
 /// The profile of its lasers, and its weights.
 const LASERS: &str = "lasers.toml";
 pub(super) const WEIGHTS: &str = "weights.safetensors";
 /// How the names of its tables begin: look-up tables and pictures of flatness, each with its colour behind it.
 const TABLES: [&str; 2] = ["lut-", "flatness-"];
 /// The file that says what a scene is made of, in its folder.
-pub const SCENE: &str = "scene.toml";
+pub(crate) const SCENE: &str = "scene.toml";
 
 /// A file as it was when a run read it.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct SourceFile {
+pub(crate) struct SourceFile {
     /// Where it was.
     pub path: PathBuf,
     /// What it is called in a report.
@@ -46,7 +46,7 @@ impl SourceFile {
     ///
     /// # Errors
     /// It cannot be read.
-    pub fn of(path: &Path, name: String) -> io::Result<Self> {
+    pub(crate) fn of(path: &Path, name: String) -> io::Result<Self> {
         let path = std::path::absolute(path)?;
         let (bytes, xxh3) = content_xxh3(&mut File::open(&path)?)?;
         Ok(Self { path, name, bytes, xxh3 })
@@ -57,7 +57,7 @@ impl SourceFile {
 ///
 /// # Errors
 /// The reader's.
-pub fn content_xxh3(reader: &mut impl Read) -> io::Result<(u64, String)> {
+pub(crate) fn content_xxh3(reader: &mut impl Read) -> io::Result<(u64, String)> {
     let mut hashed = Hashed::new(reader);
     let mut buffer = vec![0; 1 << 18];
     loop {
@@ -71,7 +71,7 @@ pub fn content_xxh3(reader: &mut impl Read) -> io::Result<(u64, String)> {
 }
 
 /// A reader that counts and hashes what is read of it.
-pub struct Hashed<R> {
+pub(crate) struct Hashed<R> {
     reader: R,
     hasher: XxHash3_64,
     bytes: u64,
@@ -79,12 +79,12 @@ pub struct Hashed<R> {
 
 impl<R: Read> Hashed<R> {
     /// Of what `reader` brings from here on.
-    pub fn new(reader: R) -> Self {
+    pub(crate) fn new(reader: R) -> Self {
         Self { reader, hasher: XxHash3_64::new(), bytes: 0 }
     }
 
     /// How many bytes there were, and their hash.
-    pub fn finish(self) -> (u64, String) {
+    pub(crate) fn finish(self) -> (u64, String) {
         (self.bytes, hash_text(self.hasher.finish()))
     }
 }
@@ -99,14 +99,14 @@ impl<R: Read> Read for Hashed<R> {
 }
 
 /// A hash as records write it.
-pub fn hash_text(hash: u64) -> String {
+pub(crate) fn hash_text(hash: u64) -> String {
     format!("{hash:016x}")
 }
 
 /// What a run shows.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
-pub enum SceneSource {
+pub(crate) enum SceneSource {
     /// The built-in scene.
     BuiltIn,
     /// Pictures of a live feed, which are not kept.
@@ -127,7 +127,7 @@ impl SceneSource {
     ///
     /// # Errors
     /// Its files cannot be read.
-    pub fn of(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Self, Failure> {
+    pub(crate) fn of(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Self, Failure> {
         let Some(spec) = &args.scene else { return Ok(Self::BuiltIn) };
         if crate::source::is_feed(spec) {
             return Ok(Self::Feed);
@@ -199,12 +199,12 @@ fn name_pictures(
 }
 
 /// Whether a record keeps a file of the bench, its rig or what the rig names, under this name.
-pub fn is_of_bench(name: &str) -> bool {
+pub(crate) fn is_of_bench(name: &str) -> bool {
     is_weights(name) || [RIG, LASERS].contains(&name) || TABLES.iter().any(|table| name.starts_with(table))
 }
 
 /// Whether a file of the bench with this name holds its weights.
-pub fn is_weights(name: &str) -> bool {
+pub(crate) fn is_weights(name: &str) -> bool {
     name == WEIGHTS
 }
 

@@ -1,0 +1,267 @@
+//! `frames.csv`: a row for each colour field that the panel showed, with what is known of its frame.
+
+use std::collections::HashMap;
+use std::fs::{self, File, OpenOptions};
+use std::io::Write;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use holod_calibration::TimeNs;
+
+use super::health::lost;
+use super::sources::hash_text;
+use super::{FRAMES, FieldRecord, FrameRecord, ORDERS};
+use crate::control::Request;
+use crate::failure::{Exit, Failure};
+
+use self::Cell::{Field, Frame};
+
+/// What is in a cell. That of a frame is empty where the frame is not known.
+#[derive(Clone, Copy)]
+enum Cell {
+    Field(fn(&FieldRecord) -> String),
+    Frame(fn(&FrameRecord) -> Option<String>),
+}
+
+const COLUMNS: [(&str, Cell); 25] = [
+    ("frame", Field(|field| field.frame.to_string())),
+    ("field", Field(|field| field.field.to_string())),
+    ("colour", Field(|field| field.colour.to_string())),
+    ("t_sample_ns", Frame(|frame| frame.t_sample.map(nanoseconds))),
+    ("pupil_raw_mm", Frame(|frame| frame.pupil_raw_mm.map(|mm| format!("{mm:.4}")))),
+    // The shortest text that reads back as the same bits.
+    ("pupil_mm", Frame(|frame| Some(frame.pupil.mm().to_string()))),
+    ("pupil_state", Frame(|frame| Some(frame.pupil_state.into()))),
+    ("t_wake_ns", Frame(|frame| Some(nanoseconds(frame.t_wake)))),
+    ("t_render_begin_ns", Frame(|frame| Some(nanoseconds(frame.t_render_begin)))),
+    ("t_render_end_ns", Frame(|frame| Some(nanoseconds(frame.t_render_end)))),
+    ("t_submit_ns", Frame(|frame| Some(nanoseconds(frame.t_submit)))),
+    ("t_present_ns", Field(|field| nanoseconds(field.t_present))),
+    ("present_provenance", Field(|field| field.provenance.into())),
+    ("laser_on_ns", Field(|field| field.laser_window.map_or_else(String::new, |(on, _)| nanoseconds(on)))),
+    ("laser_off_ns", Field(|field| field.laser_window.map_or_else(String::new, |(_, off)| nanoseconds(off)))),
+    ("deadline_missed", Field(|field| u8::from(field.deadline_missed).to_string())),
+    ("picture", Frame(|frame| Some(frame.picture.number.to_string()))),
+    ("t_picture_ns", Frame(|frame| frame.picture.t_taken.map(nanoseconds))),
+    ("levels_xxh3", Frame(|frame| frame.levels_xxh3.map(hash_text))),
+    ("scene_order", Frame(|frame| Some(frame.orders.scene.to_string()))),
+    ("weights_order", Frame(|frame| Some(frame.orders.weights.to_string()))),
+    ("pattern_order", Frame(|frame| Some(frame.orders.pattern.to_string()))),
+    ("picture_focus_dpt", Frame(|frame| frame.picture.view.focus_dpt.map(|dpt| dpt.to_string()))),
+    ("picture_fov_x_deg", Frame(|frame| frame.picture.view.field_of_view_deg.map(|[across, _]| across.to_string()))),
+    ("picture_fov_y_deg", Frame(|frame| frame.picture.view.field_of_view_deg.map(|[_, up]| up.to_string()))),
+];
+
+fn nanoseconds(t: TimeNs) -> String {
+    t.0.to_string()
+}
+
+/// Writes `frames.csv` as the run goes; what a crash can cost is what came since the last [`FrameLog::flush`].
+pub(crate) struct FrameLog {
+    file: csv::Writer<File>,
+    path: PathBuf,
+    frames: HashMap<u64, FrameRecord>,
+}
+
+/// Frames remembered for fields that are still to be shown: more than can wait for a control thread that is late.
+const KEPT_FRAMES: u64 = 2048;
+
+impl FrameLog {
+    /// Starts `frames.csv` in `folder`, which is created; a record that is already there is never overwritten.
+    pub(crate) fn create(folder: &Path) -> Result<Self, Failure> {
+        let cannot = |error: std::io::Error| {
+            Failure::new(
+                Exit::CannotCreate,
+                format!("cannot record into {}: {error}; name another directory with --record", folder.display()),
+            )
+        };
+        fs::create_dir_all(folder).map_err(cannot)?;
+        let path = folder.join(FRAMES);
+        let file = OpenOptions::new().write(true).create_new(true).open(&path).map_err(|error| match error.kind() {
+            std::io::ErrorKind::AlreadyExists => Failure::new(
+                Exit::CannotCreate,
+                format!(
+                    "{} holds an earlier record; name another directory with --record, or overwrite it with --force",
+                    path.display()
+                ),
+            ),
+            _ => cannot(error),
+        })?;
+        let mut file = csv::Writer::from_writer(file);
+        file.write_record(COLUMNS.map(|(name, _)| name)).map_err(|error| cannot(error.into()))?;
+        Ok(Self { file, path, frames: HashMap::new() })
+    }
+
+    /// Takes note of a rendered frame; its rows are written when its fields are shown.
+    pub(crate) fn frame(&mut self, record: FrameRecord) {
+        self.frames.insert(record.frame, record);
+        if self.frames.len() as u64 > 2 * KEPT_FRAMES {
+            self.frames.retain(|&frame, _| frame + KEPT_FRAMES >= record.frame);
+        }
+    }
+
+    /// Writes the row of a field that was shown.
+    ///
+    /// # Errors
+    /// The disk's, with the file's name.
+    pub(crate) fn field(&mut self, field: &FieldRecord) -> Result<(), Failure> {
+        let frame = self.frames.get(&field.frame);
+        let row = COLUMNS.map(|(_, cell)| match cell {
+            Field(cell) => cell(field),
+            Frame(cell) => frame.and_then(cell).unwrap_or_default(),
+        });
+        self.file.write_record(row).map_err(|error| self.lost(&error.into()))
+    }
+
+    /// Writes down beside it, in `orders.jsonl`, that a person changed something at host time `t`. The file is there once
+    /// there is something in it.
+    ///
+    /// # Errors
+    /// The disk's, with the file's name.
+    pub(crate) fn order(&self, t: TimeNs, request: &Request) -> Result<(), Failure> {
+        let path = self.path.with_file_name(ORDERS);
+        let line = serde_json::json!({ "t_ns": t.0, "request": request });
+        let file = OpenOptions::new().create(true).append(true).open(&path);
+        file.and_then(|mut file| writeln!(file, "{line}")).map_err(|error| lost(&path, &error))
+    }
+
+    /// Hands everything to the operating system.
+    ///
+    /// # Errors
+    /// The disk's, with the file's name.
+    pub(crate) fn flush(&mut self) -> Result<(), Failure> {
+        let links = self.file.flush().and_then(|()| self.file.get_ref().metadata()).map(|metadata| metadata.nlink());
+        match links {
+            // What is written into a file without a name is lost when it is closed.
+            Ok(0) => Err(self.lost(&std::io::Error::new(std::io::ErrorKind::NotFound, "the file was deleted"))),
+            Ok(_) => Ok(()),
+            Err(error) => Err(self.lost(&error)),
+        }
+    }
+
+    /// Whether no frame was ever made.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.frames.is_empty()
+    }
+
+    /// Takes the file away again where no frame was ever made, so that the same directory may be named again.
+    pub(crate) fn discard_if_empty(self) {
+        if self.is_empty() {
+            let _gone = fs::remove_file(&self.path);
+            if let Some(folder) = self.path.parent() {
+                // Fails where something else is in it, which then stays.
+                let _gone = fs::remove_dir(folder);
+            }
+        }
+    }
+
+    fn lost(&self, error: &std::io::Error) -> Failure {
+        lost(&self.path, error)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use holod_calibration::{Colour, PupilDiameter};
+
+    use super::*;
+    use crate::record::FrameOrders;
+    use crate::source::{PictureTag, PictureView};
+
+    fn frame(number: u64) -> FrameRecord {
+        FrameRecord {
+            frame: number,
+            t_sample: Some(TimeNs(5)),
+            pupil_raw_mm: Some(3.25),
+            pupil: PupilDiameter::from_mm(3.3),
+            pupil_state: "tracking",
+            t_wake: TimeNs(10),
+            t_render_begin: TimeNs(11),
+            t_render_end: TimeNs(20),
+            t_submit: TimeNs(21),
+            t_desired_present: TimeNs(30),
+            picture: PictureTag {
+                number: 4,
+                t_taken: Some(TimeNs(3)),
+                t_came: Some(TimeNs(4)),
+                view: PictureView { focus_dpt: Some(1.25), field_of_view_deg: Some([60.0, 45.5]) },
+                order: 2,
+            },
+            keep: None,
+            amplitude_constant: 1.0,
+            orders: FrameOrders { scene: 2, weights: 0, pattern: 1 },
+            levels_xxh3: Some(0xab),
+        }
+    }
+
+    fn field(number: u64) -> FieldRecord {
+        FieldRecord {
+            frame: number,
+            field: 1,
+            colour: Colour::Green,
+            t_present: TimeNs(30),
+            provenance: "software",
+            laser_window: Some((TimeNs(33), TimeNs(36))),
+            deadline_missed: false,
+        }
+    }
+
+    #[test]
+    fn a_row_has_one_cell_per_column_and_holds_both_halves() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = FrameLog::create(folder.path()).unwrap();
+        log.frame(frame(7));
+        log.field(&field(7)).unwrap();
+        log.field(&field(999)).unwrap();
+        log.flush().unwrap();
+        let text = fs::read_to_string(folder.path().join("frames.csv")).unwrap();
+        let rows: Vec<&str> = text.lines().collect();
+        assert_eq!(
+            rows[1],
+            "7,1,green,5,3.2500,3.3,tracking,10,11,20,21,30,software,33,36,0,4,3,00000000000000ab,2,0,1,1.25,60,45.5"
+        );
+        assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,");
+        assert!(rows.iter().all(|row| row.split(',').count() == COLUMNS.len()));
+    }
+
+    #[test]
+    fn an_earlier_record_is_never_overwritten() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join("frames.csv"), "precious").unwrap();
+        assert_eq!(FrameLog::create(folder.path()).err().unwrap().exit, Exit::CannotCreate);
+        assert_eq!(fs::read_to_string(folder.path().join("frames.csv")).unwrap(), "precious");
+    }
+
+    #[test]
+    fn orders_stand_beside_the_frames_one_to_a_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let log = FrameLog::create(folder.path()).unwrap();
+        log.order(TimeNs(5), &Request::Pupil { mm: Some(3.5) }).unwrap();
+        log.order(TimeNs(6), &Request::LasersDark).unwrap();
+        let text = fs::read_to_string(folder.path().join("orders.jsonl")).unwrap();
+        let expected =
+            [r#"{"request":{"do":"pupil","mm":3.5},"t_ns":5}"#, r#"{"request":{"do":"lasers-dark"},"t_ns":6}"#];
+        assert_eq!(text.lines().collect::<Vec<_>>(), expected);
+    }
+
+    #[test]
+    fn a_record_that_is_deleted_is_noticed_when_it_is_flushed() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = FrameLog::create(&folder.path().join("record")).unwrap();
+        log.flush().unwrap();
+        fs::remove_dir_all(folder.path().join("record")).unwrap();
+        let failure = log.flush().unwrap_err();
+        assert_eq!(failure.exit, Exit::CannotCreate);
+        assert!(failure.to_string().contains("frames.csv: the file was deleted"), "{failure}");
+    }
+
+    #[test]
+    fn a_day_of_frames_does_not_grow_the_log() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = FrameLog::create(folder.path()).unwrap();
+        for number in 0..10_000 {
+            log.frame(frame(number));
+        }
+        assert!(log.frames.len() as u64 <= 2 * KEPT_FRAMES + 1);
+    }
+}
