@@ -47,7 +47,8 @@ pub enum Command {
     Check(CheckArgs),
     /// Print the drop-in for the service's unit: these options of `run`, and the devices that they and the rig name.
     Unit(UnitArgs),
-    /// Time each stage and the frame, beside what the cores compute and their memory moves, and tracker sample to photons.
+    /// Time each stage and the frame, beside what the cores compute and their memory moves, and tracker sample to
+    /// photons.
     Bench(BenchArgs),
     /// Judge weights by what an eye sees of the panel's levels, on held-out scenes with known thin-lens pictures.
     Evaluate(EvaluateArgs),
@@ -58,8 +59,8 @@ pub enum Command {
     Status(StatusArgs),
     /// Change what the running daemon does: scene, weights, pupil, eye, patterns, lasers, or read the rig file again.
     Ctl(CtlArgs),
-    /// Pack a record of a run with bench, scene, log and facts of this machine into one file, without names of people or
-    /// machines; `holod --tracker replay:FILE` shows its frames again.
+    /// Pack a record of a run with bench, scene, log and facts of this machine into one file, without names of people
+    /// or machines; `holod --tracker replay:FILE` shows its frames again.
     Report(ReportArgs),
     /// List trackers, or try one out.
     #[command(subcommand)]
@@ -127,8 +128,8 @@ pub struct RigArgs {
 /// Which network computes the holograms.
 #[derive(Args, Debug, Clone, Default)]
 pub struct NetworkArgs {
-    /// The network's weights: standard, small or fast (built in), or a file that the trainer exported (./small is a file); what the rig names
-    /// when left out.
+    /// The network's weights: standard, small or fast (built in), or a file that the trainer exported (./small is a
+    /// file); what the rig names when left out.
     #[arg(long, value_name = "NAME|FILE", value_parser = parse_weights)]
     pub weights: Option<WeightsChoice>,
 }
@@ -237,8 +238,8 @@ pub struct RunArgs {
     /// The scene.
     #[command(flatten)]
     pub scene: SceneArgs,
-    /// With --scene feed: put the lasers out when no new picture has come for so many seconds, until one comes; the last
-    /// picture stays lit when left out.
+    /// With --scene feed: put the lasers out when no new picture has come for so many seconds, until one comes; the
+    /// last picture stays lit when left out.
     #[arg(long, value_name = "SECONDS", value_parser = parse_silence)]
     pub feed_dark_after: Option<Duration>,
     /// Where patterns go.
@@ -394,7 +395,8 @@ pub struct CheckArgs {
     /// Eye tracker's spec, as `run` takes it; the rig's own when left out.
     #[arg(long, value_name = "SPEC")]
     pub tracker: Option<String>,
-    /// Size of the hologram whose frames a second are estimated; that of the built-in scene and the panel's when left out.
+    /// Size of the hologram whose frames a second are estimated; that of the built-in scene and the panel's when left
+    /// out.
     #[arg(long, value_name = "WxH", value_parser = parse_resolution)]
     pub resolution: Option<Resolution>,
     /// The panel, as `run` takes it: opened, looked at with the flat pattern on it, and closed.
@@ -428,8 +430,8 @@ pub struct BenchArgs {
     /// Engine for the network.
     #[arg(long, value_enum, default_value_t = Backend::Auto)]
     pub backend: Backend,
-    /// Time instead what a picture of the live feed costs, of this size or 1920x1080: while its client waits (take), and
-    /// then (make), beside a copy of its bytes in memory.
+    /// Time instead what a picture of the live feed costs, of this size or 1920x1080: while its client waits (take),
+    /// and then (make), beside a copy of its bytes in memory.
     #[arg(long, value_name = "WxH", value_parser = parse_resolution, num_args = 0..=1, default_missing_value = "1920x1080")]
     pub feed: Option<Resolution>,
     /// Size of the hologram.
@@ -438,7 +440,8 @@ pub struct BenchArgs {
     /// Frames of which medians and quartiles are taken.
     #[arg(long, value_name = "N", default_value_t = 15, value_parser = clap::value_parser!(u32).range(1..))]
     pub repeat: u32,
-    /// How long the loop then runs with a simulated eye and a virtual panel, for the time from tracker sample to photons;
+    /// How long the loop then runs with a simulated eye and a virtual panel, for the time from tracker sample to
+    /// photons;
     /// 0s leaves it out.
     #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration, default_value = "5s")]
     pub duration: Duration,
@@ -459,6 +462,9 @@ pub struct EvaluateArgs {
     /// Folder of refocus cards, as `holod-scenes generate --kind cards` writes them.
     #[arg(long, value_name = "DIR")]
     pub cards: Option<PathBuf>,
+    /// Folder of bright marks on exact black, as `holod-scenes generate --kind marks` writes them.
+    #[arg(long, value_name = "DIR")]
+    pub marks: Option<PathBuf>,
     /// The network to judge.
     #[command(flatten)]
     pub network: NetworkArgs,
@@ -662,8 +668,8 @@ pub struct LogInfoArgs {
     /// Millimetres for one unit of the log's figure, where it is not in millimetres.
     #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
     pub scale: Option<f64>,
-    /// Write a plot of raw, rejected and believed samples as SVG; - is standard output. Without millimetres it shows the
-    /// raw samples in the log's own unit.
+    /// Write a plot of raw, rejected and believed samples as SVG; - is standard output. Without millimetres it shows
+    /// the raw samples in the log's own unit.
     #[arg(long, value_name = "FILE.svg")]
     pub plot: Option<PathBuf>,
     /// Overwrite the plot where it is there already.

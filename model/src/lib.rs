@@ -2,14 +2,16 @@
 //!
 //! The data's way: [`scene`] loads a frame, [`engine`] runs the pupil-adaptive network of [`weights`] on it and gives a
 //! [`ComplexHologram`], [`optics::DoublePhase`] turns that into a [`PhasePattern`], and [`optics::SimulatedEye`] shows
-//! what an eye sees of it. [`metrics`] and [`refocus`] judge pictures against those of [`scene_shard`], and [`files`] keeps
-//! holograms and pictures on disk. [`scene_renderer`] makes scenes, on the processor or by [`gpu`].
+//! what an eye sees of it. [`metrics`], [`refocus`] and [`marks`] judge pictures against those of [`scene_shard`], and
+//! [`files`] keeps holograms and pictures on disk. [`scene_renderer`] makes scenes, on the processor or by [`gpu`].
 
 pub mod conditions;
 pub mod engine;
 pub mod files;
 pub mod gpu;
+pub mod marks;
 pub mod metrics;
+mod neighbourhood;
 pub mod optics;
 mod phase_math;
 mod picture;

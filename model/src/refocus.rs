@@ -5,6 +5,7 @@
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, Resolution};
 
 use crate::LinearImage;
+use crate::neighbourhood::any_within;
 
 /// Where the near card stands.
 pub const NEAR_CARD: Dioptres = Dioptres(2.5);
@@ -41,17 +42,12 @@ impl CardArea {
             .iter()
             .map(|&depth| (geometry.depth_at(depth.into()).0 - card.0).abs() > TOLERANCE_DPT)
             .collect();
-        let around = |at: usize, end: usize| at.saturating_sub(SEAM_PX)..(at + SEAM_PX + 1).min(end);
-        let beside_outside: Vec<bool> = (0..resolution.pixels())
-            .map(|index| around(index % width, width).any(|x| outside[index / width * width + x]))
-            .collect();
+        let near_outside = any_within(&outside, resolution, SEAM_PX);
         let in_picture = |at: usize, end: usize| at >= border_px && at + border_px < end;
         let inside: Vec<bool> = (0..resolution.pixels())
             .map(|index| {
                 let (x, y) = (index % width, index / width);
-                in_picture(x, width)
-                    && in_picture(y, height)
-                    && !around(y, height).any(|row| beside_outside[row * width + x])
+                in_picture(x, width) && in_picture(y, height) && !near_outside[index]
             })
             .collect();
         (inside.iter().filter(|&&inside| inside).count() >= FEWEST_PX).then_some(Self { inside })

@@ -25,6 +25,7 @@ const PUPILS_MM: std::ops::RangeInclusive<f64> = 0.1..=100.0;
 
 /// A shard that cannot be used.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum SceneShardError {
     /// A folder or file cannot be read.
     #[error("{path}: {source}; expected scenes that `holod-scenes generate` wrote", path = path.display())]
@@ -39,17 +40,13 @@ pub enum SceneShardError {
         "{folder}: found no scene_*.safetensors; write some with `holod-scenes generate --out {folder}`",
         folder = folder.display()
     )]
-    Empty {
-        /// The folder.
-        folder: PathBuf,
-    },
+    Empty { folder: PathBuf },
     /// The file is cut short or no safetensors file at all.
     #[error(
         "{path}: found {found}; expected a whole safetensors file: delete it and run `holod-scenes generate` again",
         path = path.display()
     )]
     Damaged {
-        /// The file.
         path: PathBuf,
         /// What is wrong with it.
         found: String,
@@ -57,11 +54,9 @@ pub enum SceneShardError {
     /// A tensor or a metadata entry is missing or is not what it should be.
     #[error("{path}: {what} is {found}; expected {expected}", path = path.display())]
     Content {
-        /// The file.
         path: PathBuf,
         /// The tensor or metadata key.
         what: String,
-        /// What was found.
         found: String,
         /// What was expected, and what to do.
         expected: String,
@@ -170,7 +165,7 @@ impl SceneShard {
         self.resolution
     }
 
-    /// What the scene is for: `train`, `test` or `cards`.
+    /// What the scene is for: `train`, `test`, `cards` or `marks`.
     pub fn kind(&self) -> &str {
         &self.kind
     }

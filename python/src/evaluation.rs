@@ -14,18 +14,19 @@ use crate::view::pupil;
 
 /// Judges weights by what an eye sees of the panel's levels on held-out scenes, as `holod evaluate` does.
 ///
-/// `scenes` is a folder that `holod-scenes generate --kind test` wrote, `cards` one of `--kind cards`. `rig` and `weights`
-/// are as those of `Renderer`. `pupils_mm` are among the scenes' own, all of these where it is left out; `limit` is the
-/// number of scenes to judge, `border_px` the pixels at each edge that are not judged.
+/// `scenes` is a folder that `holod-scenes generate --kind test` wrote, `cards` one of `--kind cards`, `marks` one of
+/// `--kind marks`. `rig` and `weights` are as those of `Renderer`. `pupils_mm` are among the scenes' own, all of these
+/// where it is left out; `limit` is the number of scenes to judge, `border_px` the pixels at each edge that are not
+/// judged.
 ///
-/// Returns the dict that `holod evaluate --json` prints: "rows" (PSNR, slope, correlation, SSIM for each pupil, each with its
-/// "mean" and "ci95_half_width"), "matrix", "refocus". Takes minutes; other threads of Python run meanwhile, and Ctrl-C ends
-/// it after a scene.
+/// Returns the dict that `holod evaluate --json` prints: "rows" (PSNR, slope, correlation, SSIM for each pupil, each
+/// with its "mean" and "ci95_half_width"), "matrix", "refocus", "marks". Takes minutes; other threads of Python run
+/// meanwhile, and Ctrl-C ends it after a scene.
 ///
 /// Raises InputError, RigError, UnavailableError; warns (HolodWarning) of what the weights were not trained for.
 #[pyfunction]
 #[pyo3(signature = (
-    scenes, weights=None, *, rig=None, cards=None, pupils_mm=None, limit=None, border_px=24, backend="auto"
+    scenes, weights=None, *, rig=None, cards=None, marks=None, pupils_mm=None, limit=None, border_px=24, backend="auto"
 ))]
 #[allow(clippy::too_many_arguments, reason = "keywords in Python")]
 pub(crate) fn evaluate<'py>(
@@ -34,6 +35,7 @@ pub(crate) fn evaluate<'py>(
     weights: Option<PathBuf>,
     rig: Option<&Bound<'py, Rig>>,
     cards: Option<PathBuf>,
+    marks: Option<PathBuf>,
     pupils_mm: Option<Vec<f32>>,
     limit: Option<usize>,
     border_px: usize,
@@ -47,6 +49,7 @@ pub(crate) fn evaluate<'py>(
         backend,
         scenes: &scenes,
         cards: cards.as_deref(),
+        marks: marks.as_deref(),
         pupils: &pupils,
         limit,
         border_px,

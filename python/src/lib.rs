@@ -1,8 +1,8 @@
 //! holod as a Python module: the same way from picture, depth and pupil to panel levels as in the daemon, its simulated
 //! eye, its judge and its log reader, on numpy arrays.
 //!
-//! What Python's users read are the docstrings, which are the comments of functions and classes here; the package around
-//! this module is in `python/`.
+//! What Python's users read are the docstrings, which are the comments of functions and classes here; the package
+//! around this module is in `python/`.
 
 mod arrays;
 mod evaluation;

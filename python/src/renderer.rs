@@ -25,15 +25,15 @@ use crate::view::{eye, pupil, see};
 /// Makes holograms of pictures with depth, as the daemon does: the same levels.
 ///
 /// `rig` is the bench, the built-in one without. `weights` are "standard", "small", "fast" or a file that the trainer
-/// exported; without, those that the rig names. `width_px` and `height_px` are the size of the pictures, which are centred
-/// on the panel; without, the panel's. `backend` is "auto" (a GPU where there is one that will do, else the processor),
-/// "cpu" or "gpu".
+/// exported; without, those that the rig names. `width_px` and `height_px` are the size of the pictures, which are
+/// centred on the panel; without, the panel's. `backend` is "auto" (a GPU where there is one that will do, else the
+/// processor), "cpu" or "gpu".
 ///
-/// Making one takes seconds and much memory: keep it and render with it again and again. Several threads may use one; they
-/// take turns.
+/// Making one takes seconds and much memory: keep it and render with it again and again. Several threads may use one;
+/// they take turns.
 ///
-/// Raises InputError, RigError, and UnavailableError where the backend is not to be had. Warns (HolodWarning) of what the
-/// weights were not trained for.
+/// Raises InputError, RigError, and UnavailableError where the backend is not to be had. Warns (HolodWarning) of what
+/// the weights were not trained for.
 #[pyclass(frozen, module = "holod")]
 pub(crate) struct Renderer {
     rig: Arc<calibration::Rig>,
@@ -93,22 +93,24 @@ impl Renderer {
 
     /// Computes the hologram of a picture for an eye whose pupil is `pupil_mm` millimetres wide.
     ///
-    /// `rgb` is (height_px, width_px, 3), red first, the top row first: uint8 is sRGB; float32 from 0 to 1 needs `colour`,
-    /// "srgb" or "linear" (light).
+    /// `rgb` is (height_px, width_px, 3), red first, the top row first: uint8 is sRGB; float32 from 0 to 1 needs
+    /// `colour`, "srgb" or "linear" (light).
     ///
-    /// `depth` is (height_px, width_px) of float32, or of uint16 with "millimetres". `depth_unit` must be said: "metres" or
-    /// "millimetres" (along the axis of view, as cameras and renderers give it; infinity is one), "dioptres" (1/metres),
-    /// or "normalised_dioptres" (0 the far end of the rig's depth range, 1 the near end, uniform in dioptres). NaN, lengths
-    /// that are not above 0, and negative dioptres are no depths: they are an error, or with `fill_missing` are filled from
-    /// their surroundings as the daemon does. Depths outside the rig's range are clamped to it and counted.
+    /// `depth` is (height_px, width_px) of float32, or of uint16 with "millimetres". `depth_unit` must be said:
+    /// "metres" or "millimetres" (along the axis of view, as cameras and renderers give it; infinity is one),
+    /// "dioptres" (1/metres), or "normalised_dioptres" (0 the far end of the rig's depth range, 1 the near end, uniform
+    /// in dioptres). NaN, lengths that are not above 0, and negative dioptres are no depths: they are an error, or with
+    /// `fill_missing` are filled from their surroundings as the daemon does. Depths outside the rig's range are clamped
+    /// to it and counted.
     ///
     /// Of a pupil outside `trained_pupils_mm` the network is told the nearest, as in a run; blur and stop are its own.
     ///
     /// Arrays that are C-contiguous are read where they lie, others are copied; none is changed. `out_levels` and
-    /// `out_phase_rad` are arrays to write to in place of new ones; they are in the hologram that is returned, and the next
-    /// call overwrites them. With `field`, the hologram has the complex field too.
+    /// `out_phase_rad` are arrays to write to in place of new ones; they are in the hologram that is returned, and the
+    /// next call overwrites them. With `field`, the hologram has the complex field too.
     ///
-    /// Other threads of Python run meanwhile. Raises InputError; warns (HolodWarning) of depth that looks like a wrong unit.
+    /// Other threads of Python run meanwhile. Raises InputError; warns (HolodWarning) of depth that looks like a wrong
+    /// unit.
     #[pyo3(signature = (
         rgb, depth, pupil_mm, *, depth_unit, colour=None, fill_missing=false, field=false, out_levels=None,
         out_phase_rad=None
@@ -331,8 +333,8 @@ pub(crate) struct Hologram {
 
 #[pymethods]
 impl Hologram {
-    /// What the panel is sent: each colour's levels, (3, rows, columns) of the rig's panel, uint8 for a panel of 8 bits, else
-    /// uint16.
+    /// What the panel is sent: each colour's levels, (3, rows, columns) of the rig's panel, uint8 for a panel of 8
+    /// bits, else uint16.
     #[getter]
     fn levels(&self, py: Python<'_>) -> Py<PyAny> {
         self.levels.clone_ref(py)
@@ -352,7 +354,8 @@ impl Hologram {
         self.field.as_ref().map(|field| field.clone_ref(py))
     }
 
-    /// The phases that the panel shows for the levels: float32 (3, rows, columns) of the picture's size, radians from 0 to
+    /// The phases that the panel shows for the levels: float32 (3, rows, columns) of the picture's size, radians from 0
+    /// to
     /// 2π. Computed when it is called.
     fn shown_phase_rad<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let Resolution { width, height } = self.encoder.pattern_resolution();
@@ -362,8 +365,8 @@ impl Hologram {
 
     /// What an eye sees of the levels, as `holod view` shows it: float32 (rows, columns, 3), linear light, 1 is white.
     ///
-    /// `focus_dpt` is where the eye is focused: 0 is infinity, 2 is 50 cm. `pupil_mm` is the pupil that looks, the one that
-    /// the hologram was made for where it is left out. Other threads of Python run meanwhile.
+    /// `focus_dpt` is where the eye is focused: 0 is infinity, 2 is 50 cm. `pupil_mm` is the pupil that looks, the one
+    /// that the hologram was made for where it is left out. Other threads of Python run meanwhile.
     #[pyo3(signature = (focus_dpt, pupil_mm=None))]
     fn view<'py>(&self, py: Python<'py>, focus_dpt: f64, pupil_mm: Option<f32>) -> PyResult<Bound<'py, PyAny>> {
         let eye = eye(pupil_mm.unwrap_or(self.pupil_mm), focus_dpt)?;

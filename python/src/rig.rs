@@ -134,12 +134,12 @@ impl Rig {
 
     /// The levels that the panel is sent for phases of any origin.
     ///
-    /// `phase_rad` is float32 (3, rows, columns) in radians: red, green, blue. Smaller patterns than the panel are centred
-    /// on it, and phase 0 is around them. Each phase becomes the level whose phase is nearest on the circle, by the rig's
-    /// look-up tables, stroke, sign and flatness.
+    /// `phase_rad` is float32 (3, rows, columns) in radians: red, green, blue. Smaller patterns than the panel are
+    /// centred on it, and phase 0 is around them. Each phase becomes the level whose phase is nearest on the circle, by
+    /// the rig's look-up tables, stroke, sign and flatness.
     ///
-    /// Returns (3, height_px, width_px) of uint8 for a panel of 8 bits, else uint16. Raises InputError for phases that are
-    /// not finite or beyond 50 turns, and for patterns larger than the panel.
+    /// Returns (3, height_px, width_px) of uint8 for a panel of 8 bits, else uint16. Raises InputError for phases that
+    /// are not finite or beyond 50 turns, and for patterns larger than the panel.
     fn levels_of<'py>(&self, py: Python<'py>, phase_rad: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         let (phases, resolution) = phases_of("phase_rad", phase_rad)?;
         let encoder = self.encoder(resolution)?;
@@ -154,9 +154,9 @@ impl Rig {
 
     /// The phases that the panel shows for levels: (3, height_px, width_px), as `levels_of` returns them.
     ///
-    /// `width_px` and `height_px` are the size of the pattern in the middle of the panel, the whole panel where they are
-    /// left out. Returns float32 (3, rows, columns), radians from 0 to 2π. Raises InputError for another shape or type, and
-    /// for levels that the panel does not have.
+    /// `width_px` and `height_px` are the size of the pattern in the middle of the panel, the whole panel where they
+    /// are left out. Returns float32 (3, rows, columns), radians from 0 to 2π. Raises InputError for another shape or
+    /// type, and for levels that the panel does not have.
     #[pyo3(signature = (levels, *, width_px=None, height_px=None))]
     fn phase_of<'py>(
         &self,

@@ -15,7 +15,8 @@ use crate::rig::Rig;
 /// rgb, depth, frames, frames a second, pixels without a depth, pixels that were clipped.
 type Read<'py> = (Bound<'py, PyAny>, Bound<'py, PyAny>, usize, Option<f64>, usize, usize);
 
-/// `holod.load_scene` without its class: linear float32 (rows, columns, 3), float32 (rows, columns) of dioptres, and counts.
+/// `holod.load_scene` without its class: linear float32 (rows, columns, 3), float32 (rows, columns) of dioptres, and
+/// counts.
 #[pyfunction]
 #[allow(clippy::too_many_arguments, reason = "keywords in Python")]
 pub(crate) fn read_scene<'py>(
@@ -58,7 +59,8 @@ pub(crate) fn read_scene<'py>(
     ))
 }
 
-/// `holod.builtin_scene` without its class: linear float32 (rows, columns, 3), float32 (rows, columns) of normalised dioptres.
+/// `holod.builtin_scene` without its class: linear float32 (rows, columns, 3), float32 (rows, columns) of normalised
+/// dioptres.
 #[pyfunction]
 pub(crate) fn render_builtin_scene(
     py: Python<'_>,

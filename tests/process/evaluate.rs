@@ -118,12 +118,12 @@ fn the_trainers_evaluation_finds_the_same() {
     assert!(wrong.iter().any(|what| what.starts_with("psnr_db at 2")), "{wrong:?}");
 }
 
-/// Renders `count` small scenes of `kind` into `folder`.
-fn render(folder: &Path, kind: SceneKind, count: u64) {
+/// Renders `count` scenes of `kind` into `folder`.
+fn render(folder: &Path, kind: SceneKind, resolution: Resolution, count: u64) {
     let plan = ShardPlan {
         kind,
         seed: 11,
-        resolution: SIZE,
+        resolution,
         bench: holod_calibration::DisplayGeometry::DEFAULT,
         pupils: PupilPlan::Fixed([2.0, 4.0].map(PupilDiameter::from_mm).to_vec()),
         planes: PlanePlan::Uniform(2),
@@ -144,7 +144,7 @@ fn names(folder: &Path) -> Vec<String> {
 #[test]
 fn scenes_of_the_renderer_are_judged_told_and_written() {
     let folder = holod_tests::new_folder();
-    render(&folder.path().join("scenes"), SceneKind::Test, 2);
+    render(&folder.path().join("scenes"), SceneKind::Test, SIZE, 2);
     let common = ["evaluate", "--scenes", "scenes", "--border-px", "8"];
     let with = |more: &[&str]| {
         let ended = run(HOLOD, &[&common[..], more].concat(), folder.path());
@@ -187,17 +187,80 @@ fn scenes_of_the_renderer_are_judged_told_and_written() {
     }
 }
 
+/// What the trainer finds with the weights `fast` on the scenes of [`render`], 256x256 pixels: all light over what was
+/// put in, and mean light of what is black. To have it again: `holod-scenes generate --kind marks --seed 11 --count 3
+/// --size 256
+/// --pupils 2,4 --planes 2 --rays 8`, then `python -m holod_training evaluate --marks` on these.
+const LIGHT_OF_MARKS: [(&str, f64, f64, f64); 6] = [
+    ("dots", 2.0, 1.5551, 0.000_275_6),
+    ("dots", 4.0, 1.1411, 0.000_224_3),
+    ("lines", 2.0, 1.1070, 0.000_337_4),
+    ("lines", 4.0, 0.9472, 0.000_281_3),
+    ("stars", 2.0, 1.3883, 0.000_249_1),
+    ("stars", 4.0, 0.7874, 0.000_169_9),
+];
+
+/// Every figure of `rows` that is more than 1 % off what was `found`, or of something else.
+fn wrong_light(rows: &Value, found: &[(&str, f64, f64, f64)]) -> Vec<String> {
+    let rows = rows.as_array().unwrap();
+    assert_eq!(rows.len(), found.len());
+    let mut wrong = Vec::new();
+    for (row, (marks, pupil_mm, light_ratio, dark_mean)) in rows.iter().zip(found) {
+        if row["marks"] != *marks || row["pupil_mm"] != *pupil_mm || row["scenes"] != 1 {
+            wrong.push(format!("{row} for {marks} at {pupil_mm} mm"));
+        }
+        for (figure, found) in [("light_ratio", light_ratio), ("dark_mean", dark_mean)] {
+            let ours = row[figure].as_f64().unwrap();
+            let is_near = (ours / found - 1.0).abs() < 0.01;
+            if !is_near {
+                wrong.push(format!("{figure} of {marks} at {pupil_mm} mm: {ours} for {found}"));
+            }
+        }
+    }
+    wrong
+}
+
+#[test]
+fn the_trainer_finds_as_much_light_of_bright_marks_on_black() {
+    let folder = holod_tests::new_folder();
+    render(&folder.path().join("scenes"), SceneKind::Test, SIZE, 1);
+    render(&folder.path().join("marks"), SceneKind::Marks, Resolution { width: 256, height: 256 }, 3);
+    let evaluate = |more: &[&str]| {
+        let args = ["evaluate", "--scenes", "scenes", "--marks", "marks", "--border-px", "8", "--weights", "fast"];
+        let ended = run(HOLOD, &[&args[..], more].concat(), folder.path());
+        assert!(ended.status.success(), "{ended:?}");
+        ended.stdout
+    };
+    let printed: Value = serde_json::from_str(&evaluate(&["--json", "--out", "judged"])).unwrap();
+    let rows = &printed["marks"];
+    assert_eq!(wrong_light(rows, &LIGHT_OF_MARKS), Vec::<String>::new());
+    for row in 0..LIGHT_OF_MARKS.len() {
+        let mut spoilt = LIGHT_OF_MARKS;
+        spoilt[row].2 *= 1.02;
+        assert_eq!(wrong_light(rows, &spoilt).len(), 1);
+        (spoilt[row].2, spoilt[row].3) = (LIGHT_OF_MARKS[row].2, 0.98 * LIGHT_OF_MARKS[row].3);
+        assert_eq!(wrong_light(rows, &spoilt).len(), 1);
+    }
+    let sheet = image::open(folder.path().join("judged/sheet.png")).unwrap();
+    assert!(sheet.height() > 3 * 2 * 256, "each kind of marks is on the sheet, for both pupils");
+    let told = evaluate(&["--pupil", "4"]);
+    for words in ["bright marks on exact black", "dots", "lines", "stars"] {
+        assert!(told.contains(words), "no '{words}' in {told}");
+    }
+}
+
 #[test]
 fn each_bad_folder_gets_a_clear_error_and_leaves_nothing_behind() {
     let folder = holod_tests::new_folder();
     let at = |name: &str| folder.path().join(name);
-    render(&at("scenes"), SceneKind::Test, 1);
+    render(&at("scenes"), SceneKind::Test, SIZE, 1);
+    render(&at("small"), SceneKind::Marks, SIZE, 1);
     fs::create_dir(at("empty")).unwrap();
     fs::create_dir(at("cut")).unwrap();
     let whole = fs::read(at("scenes").join(file_name(0))).unwrap();
     fs::write(at("cut").join(file_name(3)), &whole[..whole.len() / 2]).unwrap();
     fs::write(at("file"), "").unwrap();
-    let cases: [(&[&str], i32, &[&str]); 9] = [
+    let cases: [(&[&str], i32, &[&str]); 11] = [
         (&["--scenes", "nowhere"], 66, &["nowhere", "holod-scenes"]),
         (&["--scenes", "empty"], 66, &["empty", "scene_*.safetensors", "holod-scenes generate"]),
         (&["--scenes", "cut"], 65, &["cut/scene_000003.safetensors", "bytes", "holod-scenes generate"]),
@@ -207,6 +270,16 @@ fn each_bad_folder_gets_a_clear_error_and_leaves_nothing_behind() {
             &["--scenes", "scenes", "--border-px", "8", "--cards", "scenes"],
             65,
             &["scene_000000", "card", "--kind cards"],
+        ),
+        (
+            &["--scenes", "scenes", "--border-px", "8", "--marks", "scenes"],
+            65,
+            &["scene_000000", "kind `test`", "--kind marks"],
+        ),
+        (
+            &["--scenes", "scenes", "--border-px", "8", "--marks", "small"],
+            65,
+            &["scene_000000", "no mark in 64x48", "96x120", "--kind marks"],
         ),
         (&["--scenes", "scenes", "--limit", "0"], 64, &["--limit", "0"]),
         (&["--scenes", "scenes", "--weights", "file"], 65, &["file"]),

@@ -6,7 +6,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::cli::EvaluateArgs;
 use crate::evaluation::{
-    Estimate, Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, Matrix, Refocus, SceneViews,
+    Estimate, Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, MarksRow, MarksViews, Matrix, Refocus,
+    SceneViews,
 };
 use crate::failure::Failure;
 use crate::pictures::{Sheet, Tile, screen_picture};
@@ -25,6 +26,7 @@ pub(super) fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
         backend: args.backend,
         scenes: &args.scenes,
         cards: args.cards.as_deref(),
+        marks: args.marks.as_deref(),
         pupils: &args.pupil,
         limit: args.limit,
         border_px: args.border_px,
@@ -33,18 +35,18 @@ pub(super) fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
         args.out.as_deref().map(|out| Staging::new(out, &["evaluation.json", "sheet.png"], args.force)).transpose()?;
 
     let progress = progress_bar(plan.steps());
-    let Evaluated { evaluation, pupils, scene_views, card_views } = plan.judge(SHEET_SCENES, || {
+    let evaluated = plan.judge(SHEET_SCENES, || {
         progress.inc(1);
         Ok(())
     })?;
+    let evaluation = &evaluated.evaluation;
     progress.finish_and_clear();
     if let Some(staging) = staging {
-        results::save_json(&evaluation, &staging.path("evaluation.json"))?;
-        let sheet = sheet(&evaluation, &pupils, &scene_views, &card_views);
-        results::save_png(&sheet.draw(), &staging.path("sheet.png"))?;
+        results::save_json(evaluation, &staging.path("evaluation.json"))?;
+        results::save_png(&sheet(&evaluated).draw(), &staging.path("sheet.png"))?;
         staging.commit()?;
     }
-    if args.json { results::print_json(&evaluation) } else { results::print(&table(&evaluation)) }
+    if args.json { results::print_json(evaluation) } else { results::print(&table(evaluation)) }
 }
 
 fn progress_bar(scenes: usize) -> ProgressBar {
@@ -68,20 +70,18 @@ fn sheet_pupils(pupils: &[PupilDiameter]) -> Vec<usize> {
     }
 }
 
-fn sheet(
-    evaluation: &Evaluation,
-    pupils: &[PupilDiameter],
-    scenes: &[SceneViews],
-    cards: &[(Refocus, [LinearImage; 2])],
-) -> Sheet {
+fn sheet(evaluated: &Evaluated) -> Sheet {
+    let Evaluated { evaluation, pupils, scene_views, card_views, marks_views } = evaluated;
     let chosen = sheet_pupils(pupils);
     let tile = |caption: String, picture: &LinearImage| Tile { caption, picture: screen_picture(picture) };
     let mut rows = Vec::new();
-    for SceneViews { index, views } in scenes {
+    let of_scenes = scene_views.iter().map(|SceneViews { index, views }| (format!("scene {index}"), views));
+    let of_marks = marks_views.iter().map(|MarksViews { marks, views }| (marks.name().to_owned(), views));
+    for (what, views) in of_scenes.chain(of_marks) {
         for &number in &chosen {
             let (view, pupil_mm) = (&views[number], pupils[number].mm());
             rows.push(vec![
-                tile(format!("scene {index}, {pupil_mm} mm: target far"), &view.target_far),
+                tile(format!("{what}, {pupil_mm} mm: target far"), &view.target_far),
                 tile("holod far".into(), &view.seen_far),
                 tile("target near".into(), &view.target_near),
                 tile("holod near".into(), &view.seen_near),
@@ -89,7 +89,7 @@ fn sheet(
         }
     }
     let shown: Vec<f32> = chosen.iter().map(|&number| pupils[number].mm()).collect();
-    for (refocus, [near, far]) in cards.iter().filter(|(refocus, _)| shown.contains(&refocus.pupil_mm)) {
+    for (refocus, [near, far]) in card_views.iter().filter(|(refocus, _)| shown.contains(&refocus.pupil_mm)) {
         rows.push(vec![
             tile(format!("cards, {}, {} mm: holod near", refocus.contrast, refocus.pupil_mm), near),
             tile("holod far".into(), far),
@@ -167,6 +167,16 @@ fn table(evaluation: &Evaluation) -> String {
         text.push_str(&format!("{:>8}{:>18}{:>12}{:>12}", "pupil mm", "marks", "near card", "far card"));
         for Refocus { contrast, pupil_mm, near_card, far_card } in &evaluation.refocus {
             text.push_str(&format!("\n{pupil_mm:>8}{contrast:>18}{near_card:>12.2}{far_card:>12.2}"));
+        }
+    }
+    if !evaluation.marks.is_empty() {
+        text.push_str(
+            "\n\nbright marks on exact black: all light seen over what was put in, and mean light of what is ",
+        );
+        text.push_str("black, in thousandths of white\n");
+        text.push_str(&format!("{:>8}{:>18}{:>12}{:>12}", "pupil mm", "marks", "light", "black"));
+        for MarksRow { marks, pupil_mm, light_ratio, dark_mean, .. } in &evaluation.marks {
+            text.push_str(&format!("\n{pupil_mm:>8}{marks:>18}{light_ratio:>12.3}{:>12.4}", 1e3 * dark_mean));
         }
     }
     text

@@ -1,9 +1,9 @@
-//! Judges weights by what an eye sees of the levels that the panel would be sent, on scenes whose thin-lens pictures are
-//! known.
+//! Judges weights by what an eye sees of the levels that the panel would be sent, on scenes whose thin-lens pictures
+//! are known.
 //!
 //! Each hologram goes network → double phase → levels of the rig's panel → the phases that these show → 4f stop, pupil
-//! and focus of a simulated eye. The scenes are pieces cut out of a wider view, so the eye takes the pattern as going on
-//! beyond its edges ([`SimulatedEye::repeating`]), as the trainer's own evaluation does.
+//! and focus of a simulated eye. The scenes are pieces cut out of a wider view, so the eye takes the pattern as going
+//! on beyond its edges ([`SimulatedEye::repeating`]), as the trainer's own evaluation does.
 
 mod plan;
 mod statistics;
@@ -12,15 +12,19 @@ use std::sync::Arc;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
+use holod_model::marks::{self, DarkArea};
 use holod_model::metrics::{self, StackScore};
 use holod_model::optics::{Eye, PhasePattern, SimulatedEye};
 use holod_model::refocus::{CardArea, FAR_CARD, NEAR_CARD};
+use holod_model::scene_renderer::{Marks, SceneKind};
 use holod_model::scene_shard::SceneShard;
 use holod_model::{LinearImage, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 use serde::Serialize;
 
-pub use plan::{Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, Matrix, Row, SceneViews};
+pub use plan::{
+    Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, MarksRow, MarksViews, Matrix, Row, SceneViews,
+};
 pub use statistics::Estimate;
 
 use crate::cli::Backend;
@@ -79,6 +83,27 @@ pub struct Refocus {
     pub far_card: f64,
 }
 
+/// The light of one scene of bright marks on exact black for one pupil, which the hologram is made for and which looks.
+pub struct MarksLight {
+    /// What is bright.
+    pub marks: Marks,
+    /// All light that is seen over what was put in.
+    pub light_ratio: f64,
+    /// Mean light where all is black, more than 16 px from any mark at every focus; white is 1.
+    pub dark_mean: f64,
+    /// The pictures at the farthest and at the nearest focus.
+    pub views: EndViews,
+}
+
+impl EndViews {
+    /// The ends of two stacks.
+    fn of(target: &[LinearImage], seen: &[LinearImage]) -> Self {
+        let ends = |stack: &[LinearImage]| (stack[0].clone(), stack[stack.len() - 1].clone());
+        let ((target_far, target_near), (seen_far, seen_near)) = (ends(target), ends(seen));
+        Self { target_far, seen_far, target_near, seen_near }
+    }
+}
+
 impl Judge {
     /// A judge of `weights` on `rig` for scenes of `resolution`, of which `border_px` at each edge are not judged.
     ///
@@ -131,9 +156,7 @@ impl Judge {
                 judged.matrix_psnr_db[row].push(psnr_db);
                 if row == column {
                     judged.scores.push(self.score(&seen, &target, shard, &frame, pupil));
-                    let ends = |stack: &[LinearImage]| (stack[0].clone(), stack[stack.len() - 1].clone());
-                    let ((target_far, target_near), (seen_far, seen_near)) = (ends(&target), ends(&seen));
-                    judged.views.push(EndViews { target_far, seen_far, target_near, seen_near });
+                    judged.views.push(EndViews::of(&target, &seen));
                 }
             }
         }
@@ -177,6 +200,46 @@ impl Judge {
                 far_card: ratio(&far, far_focus, near_focus),
             };
             found.push((refocus, views));
+        }
+        Ok(found)
+    }
+
+    /// Judges how much light a scene of [`SceneKind::Marks`] shows, and where, with the stacks `pupil_indices` of the
+    /// shard, each made for its pupil and seen by it. No border is left out.
+    ///
+    /// # Errors
+    /// Where the shard cannot be read, is of another kind or too small for marks and black.
+    pub fn marks(&mut self, shard: &SceneShard, pupil_indices: &[usize]) -> Result<Vec<MarksLight>, Failure> {
+        let unreadable = Failure::because(Exit::Data);
+        let wrong = |found: &str, expected: &str| {
+            let said = format!(
+                "{}: found {found}; expected {expected} of `holod-scenes generate --kind marks`",
+                shard.path().display()
+            );
+            Failure::new(Exit::Data, said)
+        };
+        if shard.kind() != SceneKind::Marks.name() {
+            return Err(wrong(&format!("a scene of the kind `{}`", shard.kind()), "one"));
+        }
+        let frame = Arc::new(shard.frame().map_err(&unreadable)?);
+        let mut found = Vec::new();
+        for &index in pupil_indices {
+            let target = shard.stack(index).map_err(&unreadable)?;
+            if !marks::is_lit(&target) {
+                return Err(wrong(&format!("no mark in {}", shard.resolution()), "a scene of 96x120 pixels or more"));
+            }
+            let dark = DarkArea::find(&target).ok_or_else(|| {
+                wrong(&format!("nothing that stays black in {}", shard.resolution()), "a larger scene")
+            })?;
+            let pupil = shard.pupils()[index];
+            let (pattern, _) = self.shown(&frame, pupil)?;
+            let seen = self.look(&pattern, pupil, shard.focuses());
+            found.push(MarksLight {
+                marks: Marks::of_index(shard.index()),
+                light_ratio: marks::light_ratio(&seen, &target),
+                dark_mean: dark.mean_light(&seen),
+                views: EndViews::of(&target, &seen),
+            });
         }
         Ok(found)
     }

@@ -5,11 +5,12 @@ use std::path::Path;
 use holod_calibration::rig::Rig;
 use holod_calibration::{DisplayGeometry, PupilDiameter};
 use holod_model::metrics::StackScore;
+use holod_model::scene_renderer::Marks;
 use holod_model::scene_shard::{SceneShard, SceneShardError};
 use holod_model::{LinearImage, Weights};
 use serde::Serialize;
 
-use super::{EndViews, Estimate, Judge, JudgedScene, Refocus};
+use super::{EndViews, Estimate, Judge, JudgedScene, MarksLight, Refocus};
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
 use crate::setup;
@@ -28,6 +29,8 @@ pub struct EvaluationSettings<'a> {
     pub scenes: &'a Path,
     /// Folder of refocus cards.
     pub cards: Option<&'a Path>,
+    /// Folder of bright marks on exact black.
+    pub marks: Option<&'a Path>,
     /// Pupils to judge, among those of the scenes; all of these where there are none.
     pub pupils: &'a [PupilDiameter],
     /// Judge only so many scenes.
@@ -42,6 +45,7 @@ pub struct EvaluationPlan<'a> {
     weights: Weights,
     shards: Vec<SceneShard>,
     cards: Vec<SceneShard>,
+    marks: Vec<SceneShard>,
     pupils: Vec<PupilDiameter>,
 }
 
@@ -55,6 +59,16 @@ pub struct Evaluated {
     pub scene_views: Vec<SceneViews>,
     /// What each pupil sees of each card, focused near and far.
     pub card_views: Vec<(Refocus, [LinearImage; 2])>,
+    /// What is seen of the first scene of each kind of marks.
+    pub marks_views: Vec<MarksViews>,
+}
+
+/// What is seen of one scene of marks.
+pub struct MarksViews {
+    /// What is bright.
+    pub marks: Marks,
+    /// One for each pupil.
+    pub views: Vec<EndViews>,
 }
 
 /// What is seen of one scene.
@@ -92,6 +106,23 @@ pub struct Evaluation {
     pub matrix: Matrix,
     /// Refocus ratios of the cards.
     pub refocus: Vec<Refocus>,
+    /// Light of bright marks on exact black.
+    pub marks: Vec<MarksRow>,
+}
+
+/// One kind of marks and one pupil, which the hologram is made for and which looks: means over scenes.
+#[derive(Serialize)]
+pub struct MarksRow {
+    /// `dots`, `lines` or `stars`.
+    pub marks: &'static str,
+    /// The pupil.
+    pub pupil_mm: f32,
+    /// How many scenes there are of this kind.
+    pub scenes: usize,
+    /// [`MarksLight::light_ratio`].
+    pub light_ratio: f64,
+    /// [`MarksLight::dark_mean`].
+    pub dark_mean: f64,
 }
 
 /// One pupil: the hologram is made for it, and it looks. A figure that no scene has is `null`. [`StackScore`] says what
@@ -135,25 +166,27 @@ impl<'a> EvaluationPlan<'a> {
     /// # Errors
     /// They cannot be read, do not fit each other or the panel, or lack a pupil that is asked for.
     pub fn new(settings: EvaluationSettings<'a>) -> Result<Self, Failure> {
-        let EvaluationSettings { rig, scenes, cards, limit, .. } = settings;
+        let EvaluationSettings { rig, scenes, cards, marks, limit, .. } = settings;
         let weights = setup::weights(rig)?;
         let shards = open(scenes, limit, rig)?;
         let cards = cards.map(|folder| open(folder, None, rig)).transpose()?.unwrap_or_default();
+        let marks = marks.map(|folder| open(folder, None, rig)).transpose()?.unwrap_or_default();
         let pupils = judged_pupils(&shards, settings.pupils)?;
+        marks.iter().try_for_each(|shard| pupil_indices(shard, &pupils).map(drop))?;
         warn_of_untrained_pupils(&weights, &rig.geometry, &pupils);
         for shard in [shards.first(), cards.first()].into_iter().flatten() {
             check_border(settings.border_px, shard)?;
         }
-        Ok(Self { settings, weights, shards, cards, pupils })
+        Ok(Self { settings, weights, shards, cards, marks, pupils })
     }
 
     /// How often [`Self::judge`] tells of a step.
     pub fn steps(&self) -> usize {
-        self.shards.len() + self.cards.len()
+        self.shards.len() + self.cards.len() + self.marks.len()
     }
 
-    /// Judges, with the views of the first `views_kept` scenes. `after_step` is called after each scene, and ends it all
-    /// where it fails.
+    /// Judges, with the views of the first `views_kept` scenes. `after_step` is called after each scene, and ends it
+    /// all where it fails.
     ///
     /// # Errors
     /// The engine is not to be had, a scene cannot be read, or `after_step` failed.
@@ -162,15 +195,23 @@ impl<'a> EvaluationPlan<'a> {
         views_kept: usize,
         mut after_step: impl FnMut() -> Result<(), Failure>,
     ) -> Result<Evaluated, Failure> {
-        let Self { settings, weights, shards, cards, pupils } = self;
+        let Self { settings, weights, shards, cards, marks, pupils } = self;
         let EvaluationSettings { rig, backend, border_px, .. } = settings;
         let judge_of = |shard: &SceneShard| Judge::new(rig, &weights, backend, shard.resolution(), border_px);
-        // Cards first: they are few, and what is wrong with them is told before the long work.
+        // Cards and marks first: they are few, and what is wrong with them is told before the long work.
         let mut card_views = Vec::new();
         if let Some(first) = cards.first() {
             let mut judge = judge_of(first)?;
             for shard in &cards {
                 card_views.extend(judge.cards(shard, &pupils)?);
+                after_step()?;
+            }
+        }
+        let mut of_marks = Vec::new();
+        if let Some(first) = marks.first() {
+            let mut judge = judge_of(first)?;
+            for shard in &marks {
+                of_marks.push(judge.marks(shard, &pupil_indices(shard, &pupils)?)?);
                 after_step()?;
             }
         }
@@ -199,8 +240,10 @@ impl<'a> EvaluationPlan<'a> {
             rows: pupils.iter().enumerate().map(|(number, &pupil)| row(pupil, number, &judged)).collect(),
             matrix: matrix(&pupils, &judged),
             refocus: card_views.iter().map(|(refocus, _)| refocus.clone()).collect(),
+            marks: marks_rows(&pupils, &of_marks),
         };
-        Ok(Evaluated { evaluation, pupils, scene_views, card_views })
+        let marks_views = marks_views(of_marks);
+        Ok(Evaluated { evaluation, pupils, scene_views, card_views, marks_views })
     }
 }
 
@@ -316,4 +359,44 @@ fn matrix(pupils: &[PupilDiameter], judged: &[JudgedScene]) -> Matrix {
         judged_pupil_mm: pupils_mm,
         psnr_db: all.clone().map(|row| all.clone().map(|column| mean(row, column)).collect()).collect(),
     }
+}
+
+/// Means over the scenes of each kind of marks, kinds in the order in which they come; of each scene there is one for
+/// each pupil.
+fn marks_rows(pupils: &[PupilDiameter], scenes: &[Vec<MarksLight>]) -> Vec<MarksRow> {
+    let mut kinds: Vec<Marks> = Vec::new();
+    for scene in scenes {
+        if !kinds.contains(&scene[0].marks) {
+            kinds.push(scene[0].marks);
+        }
+    }
+    let mut rows = Vec::new();
+    for kind in kinds {
+        for (number, pupil) in pupils.iter().enumerate() {
+            let of_kind: Vec<&MarksLight> =
+                scenes.iter().map(|scene| &scene[number]).filter(|light| light.marks == kind).collect();
+            let mean = |figure: &dyn Fn(&MarksLight) -> f64| {
+                of_kind.iter().map(|light| figure(light)).sum::<f64>() / of_kind.len() as f64
+            };
+            rows.push(MarksRow {
+                marks: kind.name(),
+                pupil_mm: pupil.mm(),
+                scenes: of_kind.len(),
+                light_ratio: mean(&|light| light.light_ratio),
+                dark_mean: mean(&|light| light.dark_mean),
+            });
+        }
+    }
+    rows
+}
+
+fn marks_views(scenes: Vec<Vec<MarksLight>>) -> Vec<MarksViews> {
+    let mut found: Vec<MarksViews> = Vec::new();
+    for scene in scenes {
+        let marks = scene[0].marks;
+        if found.iter().all(|views| views.marks != marks) {
+            found.push(MarksViews { marks, views: scene.into_iter().map(|light| light.views).collect() });
+        }
+    }
+    found
 }

@@ -493,16 +493,29 @@ pub(super) fn refocus_cards(
 }
 
 /// What [`SceneKind::Marks`] are.
-#[derive(Clone, Copy)]
-pub(super) enum Marks {
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Marks {
+    /// Discs, from a pixel to nine.
     Dots,
+    /// Strokes of 1 to 2 px, 14 px long.
     Lines,
+    /// Soft points of 2 to 100 % of the light.
     Stars,
 }
 
 impl Marks {
-    pub(super) fn of_index(index: u64) -> Self {
+    /// Those of the scene with this number.
+    pub fn of_index(index: u64) -> Self {
         [Self::Dots, Self::Lines, Self::Stars][(index % 3) as usize]
+    }
+
+    /// Its name in tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Dots => "dots",
+            Self::Lines => "lines",
+            Self::Stars => "stars",
+        }
     }
 }
 

@@ -29,6 +29,7 @@ mod view;
 
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 
+pub use compose::Marks;
 pub use noise::Noise;
 use surface::Surface;
 use thin_lens::PixelSamples;

@@ -140,6 +140,7 @@ def evaluate(
     *,
     rig: Rig | None = None,
     cards: _Path | None = None,
+    marks: _Path | None = None,
     pupils_mm: list[float] | None = None,
     limit: int | None = None,
     border_px: int = 24,
