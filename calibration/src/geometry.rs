@@ -88,8 +88,8 @@ impl DisplayGeometry {
         self.wavelengths.map(|wavelength| Metres(wavelength.0 * self.eyepiece_focal_length.0 / self.pixel_pitch.0))
     }
 
-    /// Width λf/2p of the part of the eyebox that the 4f stop's half band fills. Light with a smooth phase goes no farther than
-    /// that, so it is blurred over the depth range as by a pupil of this width at most:
+    /// Width λf/2p of the part of the eyebox that the 4f stop's half band fills. Light with a smooth phase goes no
+    /// farther than that, so it is blurred over the depth range as by a pupil of this width at most:
     /// λ·(f/p)²·V/2, half of [`Self::volume_fresnel_px2`], whatever the width of the eye's own.
     pub fn half_band_eyebox(&self) -> PerColour<Metres> {
         self.eyebox().map(|width| Metres(width.0 / 2.0))

@@ -12,8 +12,8 @@ impl Sorted {
         (!values.is_empty()).then_some(Self(values))
     }
 
-    /// What this share of the values lies below, 0 being the smallest value and 1 the largest; between two values by linear
-    /// interpolation (Hyndman and Fan 1996, type 7).
+    /// What this share of the values lies below, 0 being the smallest value and 1 the largest; between two values by
+    /// linear interpolation (Hyndman and Fan 1996, type 7).
     pub fn quantile(&self, share: f64) -> f64 {
         let Self(values) = self;
         let place = share.clamp(0.0, 1.0) * (values.len() - 1) as f64;

@@ -906,8 +906,8 @@ fn a_faulty_flatness_picture_is_named() {
     }
 }
 
-/// A BMP of 64x66 pixels as vendors write them: 8 bits with a palette, rows from the bottom up. Byte `x + 64 y` from the
-/// top is `index`; `palette` gives red, green and blue of an index.
+/// A BMP of 64x66 pixels as vendors write them: 8 bits with a palette, rows from the bottom up. Byte `x + 64 y` from
+/// the top is `index`; `palette` gives red, green and blue of an index.
 fn paletted_bmp(index: impl Fn(usize) -> u8, palette: impl Fn(u8) -> [u8; 3]) -> Vec<u8> {
     const HEADERS: u32 = 14 + 40;
     const PALETTE: u32 = 4 * 256;

@@ -1,5 +1,5 @@
-//! What it costs a client to hand a 1920x1080 picture over through the live feed, beside a copy of its bytes in the same
-//! run: `cargo bench -p holod --bench feed`. What holod itself does with it is measured by `holod bench --feed`.
+//! What it costs a client to hand a 1920x1080 picture over through the live feed, beside a copy of its bytes in the
+//! same run: `cargo bench -p holod --bench feed`. What holod itself does with it is measured by `holod bench --feed`.
 
 #![allow(clippy::print_stdout, reason = "it prints what it measured")]
 

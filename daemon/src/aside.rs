@@ -51,8 +51,8 @@ impl<T> Queue<T> {
         has_room
     }
 
-    /// Takes all that is there in place of what is in `taken`, which counts as done with. False once the queue is closed and
-    /// nothing is left.
+    /// Takes all that is there in place of what is in `taken`, which counts as done with. False once the queue is
+    /// closed and nothing is left.
     pub(crate) fn take(&self, taken: &mut VecDeque<T>, taking: Taking) -> bool {
         taken.clear();
         let mut state = self.state();
@@ -91,8 +91,8 @@ impl<T> Queue<T> {
     }
 }
 
-/// What a thread came to, where it ends within `patience`; else it is left to itself. A panic over there has been told, and
-/// brings nothing.
+/// What a thread came to, where it ends within `patience`; else it is left to itself. A panic over there has been told,
+/// and brings nothing.
 pub(crate) fn join_within<T>(thread: JoinHandle<T>, patience: Duration) -> Option<T> {
     let t_end = Instant::now() + patience;
     while !thread.is_finished() {

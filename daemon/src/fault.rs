@@ -1,7 +1,7 @@
 //! Faults on command, for the bench that shows that any of them makes the lasers dark.
 //!
-//! Only in builds with the feature `fault-injection`. `HOLOD_FAULT` names the fault, SIGUSR1 lets it happen. Threads meet
-//! it where they read the clock, and the panel's reports where they pass through [`FaultyPanel`].
+//! Only in builds with the feature `fault-injection`. `HOLOD_FAULT` names the fault, SIGUSR1 lets it happen. Threads
+//! meet it where they read the clock, and the panel's reports where they pass through [`FaultyPanel`].
 
 use std::hint::black_box;
 use std::os::fd::BorrowedFd;

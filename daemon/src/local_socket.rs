@@ -17,23 +17,14 @@ const MODE: u32 = 0o660;
 
 /// Why nobody can listen at a socket.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum SocketError {
     /// The name is taken.
     #[error("{}: {found}", .socket.display())]
-    Taken {
-        /// The socket.
-        socket: PathBuf,
-        /// By what.
-        found: &'static str,
-    },
+    Taken { socket: PathBuf, found: &'static str },
     /// The socket cannot be made.
     #[error("{}: cannot listen there: {error}", .socket.display())]
-    Listen {
-        /// The socket.
-        socket: PathBuf,
-        /// Why.
-        error: io::Error,
-    },
+    Listen { socket: PathBuf, error: io::Error },
 }
 
 /// Listens at `path`, without blocking; a socket that a dead process left there is replaced.

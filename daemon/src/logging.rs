@@ -1,6 +1,7 @@
 //! What the log on standard error says, by `HOLOD_LOG`; its newest lines for the status page, and a file of it.
 //!
-//! Whoever logs never waits: lines go to a thread for each place, which leaves out and counts what it does not get rid of.
+//! Whoever logs never waits: lines go to a thread for each place, which leaves out and counts what it does not get rid
+//! of.
 
 mod outlet;
 
@@ -29,8 +30,8 @@ const PATIENCE: Duration = Duration::from_secs(1);
 /// The way to standard error, once [`start`] has been called.
 static STDERR: OnceLock<Outlet> = OnceLock::new();
 
-/// Starts the log on standard error, which says as much as `HOLOD_LOG` asks for. A standard error that nobody reads, that is
-/// closed or full, stops nobody.
+/// Starts the log on standard error, which says as much as `HOLOD_LOG` asks for. A standard error that nobody reads,
+/// that is closed or full, stops nobody.
 ///
 /// # Errors
 /// The system gives no thread for it.
@@ -106,8 +107,8 @@ impl io::Write for ToStderr {
 const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
 const DEFAULT: &str = "info";
 
-/// The filter that `HOLOD_LOG` asks for: a level, or directives such as `holod_daemon=debug`, separated by commas, over the
-/// usual `info`. With what is wrong with it, which is then left out.
+/// The filter that `HOLOD_LOG` asks for: a level, or directives such as `holod_daemon=debug`, separated by commas, over
+/// the usual `info`. With what is wrong with it, which is then left out.
 pub fn filter(asked: Option<&str>) -> (EnvFilter, Option<String>) {
     let (mut directives, mut wrong) = (Vec::new(), Vec::new());
     for directive in asked.unwrap_or_default().split(',').map(str::trim).filter(|directive| !directive.is_empty()) {

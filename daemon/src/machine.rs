@@ -27,7 +27,6 @@ pub struct Machine {
     pub memory_mib: u64,
     /// Graphics cards: vendor and device on PCI, driver, and a name where the driver tells one.
     pub gpus: Vec<String>,
-    /// Started by systemd.
     pub under_systemd: bool,
     /// Greatest real-time priority that may be asked for; no limit where absent.
     pub realtime_priority_max: Option<u64>,

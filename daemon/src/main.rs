@@ -27,7 +27,8 @@ fn main() -> ExitCode {
     code
 }
 
-/// Makes a file that grows beyond the user's limit (`ulimit -f`) an error of whoever writes it, and not the process's end.
+/// Makes a file that grows beyond the user's limit (`ulimit -f`) an error of whoever writes it, and not the process's
+/// end.
 fn outlive_file_limits() -> io::Result<()> {
     signal_hook::flag::register(libc::SIGXFSZ, Arc::default()).map(drop)
 }

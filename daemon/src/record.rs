@@ -1,5 +1,5 @@
-//! A run written down: `frames.csv`, one row per colour field that the panel showed; with what it was made of, so that its
-//! frames can be made again.
+//! A run written down: `frames.csv`, one row per colour field that the panel showed; with what it was made of, so that
+//! its frames can be made again.
 
 mod frame_log;
 mod health;
@@ -38,7 +38,6 @@ pub struct FrameRecord {
     pub pupil_state: &'static str,
     /// The loop woke for this frame.
     pub t_wake: TimeNs,
-    /// The network began.
     pub t_render_begin: TimeNs,
     /// The levels were ready.
     pub t_render_end: TimeNs,
@@ -61,9 +60,7 @@ pub struct FrameRecord {
 /// The orders that brought what a frame shows: their lines in `orders.jsonl`, from 1; 0 for what the run began with.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct FrameOrders {
-    /// The scene.
     pub scene: u32,
-    /// The weights.
     pub weights: u32,
     /// The pattern, or holograms again.
     pub pattern: u32,
@@ -81,11 +78,9 @@ pub(crate) struct FieldRecord {
     pub frame: u64,
     /// Place of the field in the panel's order.
     pub field: u8,
-    /// Its colour.
     pub colour: Colour,
     /// When the field appeared on the panel.
     pub t_present: TimeNs,
-    /// Who says so.
     pub provenance: &'static str,
     /// The laser's lit window, where it was lit.
     pub laser_window: Option<(TimeNs, TimeNs)>,

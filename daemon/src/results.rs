@@ -10,7 +10,8 @@ use serde::Serialize;
 use crate::failure::{Exit, Failure};
 use crate::logging;
 
-/// Prints lines on standard output, after what was said on standard error before. A reader that has gone away is no failure.
+/// Prints lines on standard output, after what was said on standard error before. A reader that has gone away is no
+/// failure.
 ///
 /// # Errors
 /// Standard output cannot be written.

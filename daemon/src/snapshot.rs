@@ -12,11 +12,8 @@ use crate::spread::Spread;
 /// What holds of a run that goes on and of one that is over alike.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Figures {
-    /// The rig's name.
     pub rig: String,
-    /// The scene's name.
     pub scene: String,
-    /// The tracker spec.
     pub tracker: String,
     /// How holograms are computed.
     pub engine: String,
@@ -57,7 +54,6 @@ pub struct Figures {
 /// A run at one moment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Snapshot {
-    /// The process.
     pub pid: u32,
     /// Dark, running or degraded.
     pub state: String,
@@ -87,7 +83,6 @@ pub struct Snapshot {
     pub pupil_state: String,
     /// The pupil that the newest frame was made for.
     pub pupil_mm: Option<f32>,
-    /// The panel's spec.
     pub panel: String,
     /// Why the panel is lost, where it is.
     pub panel_trouble: Option<String>,

@@ -11,8 +11,8 @@ use tempfile::TempDir;
 use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
 
-/// Files on their way into a directory: written beside it, moved in by rename when all are whole. What is half done when a
-/// signal ends the process is taken away first.
+/// Files on their way into a directory: written beside it, moved in by rename when all are whole. What is half done
+/// when a signal ends the process is taken away first.
 pub(crate) struct Staging {
     target: PathBuf,
     beside: TempDir,
@@ -26,8 +26,8 @@ impl Staging {
         Self::in_folder(folder_of(target), target, files, force)
     }
 
-    /// Prepares to write the file `path`, which may exist with `force` only; nothing but its folder is touched, which is
-    /// created where it is missing.
+    /// Prepares to write the file `path`, which may exist with `force` only; nothing but its folder is touched, which
+    /// is created where it is missing.
     pub(crate) fn of_file(path: &Path, force: bool) -> Result<Self, Failure> {
         let Some(name) = path.file_name().and_then(|name| name.to_str()) else {
             let what = format!("--out {}: expected the name of a file to write", path.display());

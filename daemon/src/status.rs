@@ -1,5 +1,5 @@
-//! What a running holod says of itself: a small JSON file of its own that it writes anew each second and takes away at its
-//! end.
+//! What a running holod says of itself: a small JSON file of its own that it writes anew each second and takes away at
+//! its end.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::os::unix::net::UnixStream;
@@ -33,8 +33,8 @@ fn file_name(pid: u32) -> String {
 /// What the file holds.
 #[derive(Serialize, Deserialize)]
 struct Written<S> {
-    /// When it was written, on the host's monotonic clock: the wall clock, and with it a file's own times, may be set while
-    /// holod runs. Older versions do not say it.
+    /// When it was written, on the host's monotonic clock: the wall clock, and with it a file's own times, may be set
+    /// while holod runs. Older versions do not say it.
     #[serde(default)]
     written_ns: Option<i64>,
     /// When the process began, as [`began_ticks`] has it. Older versions do not say it.
@@ -72,8 +72,8 @@ impl StatusFile {
         Self { newest, began_ticks: began_ticks(pid), writer: writer.ok() }
     }
 
-    /// Has the file written anew at host time `now`. Where the disk is still at what was written before, this one is left
-    /// out.
+    /// Has the file written anew at host time `now`. Where the disk is still at what was written before, this one is
+    /// left out.
     pub(crate) fn write(&mut self, status: &Snapshot, now: TimeNs) {
         if self.writer.is_none() {
             return;
@@ -159,7 +159,6 @@ impl Drop for StatusFile {
 /// What a running holod wrote last.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Found {
-    /// It.
     pub status: Snapshot,
     /// How long ago that was, where it is too long.
     pub stale: Option<Duration>,

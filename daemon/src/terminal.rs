@@ -12,7 +12,6 @@ use ratatui::widgets::{Axis, Chart, Dataset, GraphType, Widget};
 
 /// One set of points in a [`plot`].
 pub(crate) struct Series<'a> {
-    /// What it is.
     pub name: &'a str,
     /// Its colour; where there are no colours, a plot with one series still says all.
     pub colour: Color,

@@ -1,8 +1,9 @@
-//! The laser box's firmware, fed a bench's history: lines, noise, edges, an interlock, a host that comes and goes, time.
+//! The laser box's firmware, fed a bench's history: lines, noise, edges, an interlock, a host that comes and goes,
+//! time.
 //!
-//! Each line of the input is one deed: `+N` lets N microseconds go by, `e` is an edge on the sync wire, `o` and `c` open and
-//! close the interlock, `g` and `h` take the host away and bring it back, `=BYTES` sends them as they are, and anything
-//! else is sent as a line with its checksum.
+//! Each line of the input is one deed: `+N` lets N microseconds go by, `e` is an edge on the sync wire, `o` and `c`
+//! open and close the interlock, `g` and `h` take the host away and bring it back, `=BYTES` sends them as they are, and
+//! anything else is sent as a line with its checksum.
 #![no_main]
 
 use holod_fuzz::counting;

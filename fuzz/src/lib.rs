@@ -83,8 +83,8 @@ pub fn folder() -> PathBuf {
     folder
 }
 
-/// Reads a log and holds what it gives to: times in order, diameters that can be used, a summary, and estimates of a pupil
-/// that an eye can have.
+/// Reads a log and holds what it gives to: times in order, diameters that can be used, a summary, and estimates of a
+/// pupil that an eye can have.
 pub fn check_log(path: &Path) {
     let recording = match Recording::read(path) {
         Ok(recording) => recording,

@@ -121,8 +121,8 @@ impl fmt::Display for OutsideTraining {
 
 impl std::error::Error for OutsideTraining {}
 
-/// What networks are told of a bench and a pupil: log2(b / 40 px), and log2(F / 40 px²) of the mean of three colours, both
-/// within what was trained. What networks compute with is the bench and the pupil themselves.
+/// What networks are told of a bench and a pupil: log2(b / 40 px), and log2(F / 40 px²) of the mean of three colours,
+/// both within what was trained. What networks compute with is the bench and the pupil themselves.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Conditions {
     pub(crate) blur: f64,

@@ -78,25 +78,18 @@ impl BenchOptics {
 
 /// A file that cannot be written or read.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum FileError {
     /// Reading or writing failed.
     #[error("{path}: {source}", path = path.display())]
     Io {
-        /// The file.
         path: PathBuf,
         /// What the system said.
         source: std::io::Error,
     },
     /// The content is not what it should be.
     #[error("{path}: {found}; expected {expected}", path = path.display())]
-    Content {
-        /// The file.
-        path: PathBuf,
-        /// What was found.
-        found: String,
-        /// What was expected.
-        expected: String,
-    },
+    Content { path: PathBuf, found: String, expected: String },
 }
 
 impl StoredHologram {

@@ -68,8 +68,8 @@ pub fn ssim(actual: &LinearImage, expected: &LinearImage, border_px: usize) -> O
     Some(mean_of_planes.sum::<f64>() / 3.0)
 }
 
-/// Sum of squared differences of neighbouring pixels, along x and y, over all colours and the rectangle of `columns` and
-/// `rows`: how sharp that part is.
+/// Sum of squared differences of neighbouring pixels, along x and y, over all colours and the rectangle of `columns`
+/// and `rows`: how sharp that part is.
 pub fn gradient_energy(image: &LinearImage, columns: std::ops::Range<usize>, rows: std::ops::Range<usize>) -> f64 {
     let width = image.resolution.width;
     let mut energy = 0.0;

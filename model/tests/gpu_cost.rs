@@ -12,8 +12,8 @@ fn said(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// The costs of all networks on both cards, with the least share of multiply-adds that a hot loop of products may have. The
-/// program's exit code is not 0 where a register spills or a shader does not compile.
+/// The costs of all networks on both cards, with the least share of multiply-adds that a hot loop of products may have.
+/// The program's exit code is not 0 where a register spills or a shader does not compile.
 fn judge_frames(more: &[&str], least_share: f64) -> Vec<f64> {
     let output = gpu_cost().arg("--json").args(more).output().expect("it starts");
     assert!(output.status.success(), "{}", said(&output));

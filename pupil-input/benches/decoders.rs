@@ -1,7 +1,7 @@
 //! How fast each decoder is, beside the plainest program that reads the same bytes in the same run.
 //!
-//! `cargo bench -p holod-pupil-input --bench decoders [-- NAME...]`. Every figure is the median of the runs and counts the
-//! thread's own time on a core; bytes are pushed 4096 at a time, as the tracker's thread does.
+//! `cargo bench -p holod-pupil-input --bench decoders [-- NAME...]`. Every figure is the median of the runs and counts
+//! the thread's own time on a core; bytes are pushed 4096 at a time, as the tracker's thread does.
 #![allow(clippy::print_stdout)]
 
 use std::hint::black_box;

@@ -1,5 +1,5 @@
-//! How long a sample takes from the tracker's end of a PTY to an estimate that knows it, at 1 kHz, beside the least that a
-//! program can do: a thread that reads the PTY and stores what came.
+//! How long a sample takes from the tracker's end of a PTY to an estimate that knows it, at 1 kHz, beside the least
+//! that a program can do: a thread that reads the PTY and stores what came.
 //!
 //! `cargo bench -p holod-pupil-input --bench latency`
 

@@ -1,9 +1,9 @@
 //! How fast one-hour logs at 1 kHz open, and in how much memory.
 //!
-//! `cargo bench -p holod-pupil-input --bench logs`; set `TMPDIR` to a folder in memory to measure without a disk. Each log
-//! is opened by a process of its own, so that its peak memory is known; the peer, a pass of the csv crate over the records
-//! of the same file that keeps nothing, runs beside it. Seconds are those of the processor, one core, so that other work on
-//! the machine spoils them less.
+//! `cargo bench -p holod-pupil-input --bench logs`; set `TMPDIR` to a folder in memory to measure without a disk. Each
+//! log is opened by a process of its own, so that its peak memory is known; the peer, a pass of the csv crate over the
+//! records of the same file that keeps nothing, runs beside it. Seconds are those of the processor, one core, so that
+//! other work on the machine spoils them less.
 
 #![allow(clippy::print_stdout, reason = "a bench reports on stdout")]
 

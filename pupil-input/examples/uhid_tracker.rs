@@ -1,8 +1,9 @@
-//! A virtual HID tracker, made with the kernel's UHID: plugged in, read, unplugged, and plugged in again at another node.
+//! A virtual HID tracker, made with the kernel's UHID: plugged in, read, unplugged, and plugged in again at another
+//! node.
 //!
 //! `uhid_tracker [plugs=N] [reports=N] [wrong=KIND]`: for each plug it waits until someone opens the tracker, sends the
-//! reports at 1 kHz, and tells on the standard output what it did. KIND makes it lie, so that a test of it can be shown to fail:
-//! `missing` leaves a report out, `diameter` adds a millimetre to it.
+//! reports at 1 kHz, and tells on the standard output what it did. KIND makes it lie, so that a test of it can be shown
+//! to fail: `missing` leaves a report out, `diameter` adds a millimetre to it.
 //!
 //! Layouts are those of the kernel's linux/uhid.h: an event is its type, 32 bits, and what belongs to that type.
 

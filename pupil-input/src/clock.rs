@@ -1,16 +1,17 @@
 //! The tracker's clock mapped onto the host's.
 //!
-//! A sample cannot arrive before it was taken, and what delays it (USB frames, FTDI's latency timer, bursts, a network, the
-//! scheduler) only ever adds. So over the device's time the offset host − device is a line (a crystal is some parts per
-//! million off, a log that a script feeds with sleeps some per cent), and all of `arrival − device` lies on it or above.
-//! Of the last 16 s the least of each quarter second is kept. The line's slope is that of the line below all of these
-//! points that is closest to them in sum, which is the edge of their lower convex hull below their mean time (Moon, Skelly
-//! and Towsley 1999: late points do not move it at all). Its height is the least of the last second along that slope,
-//! so that a link whose delay changes is followed soon.
+//! A sample cannot arrive before it was taken, and what delays it (USB frames, FTDI's latency timer, bursts, a network,
+//! the scheduler) only ever adds. So over the device's time the offset host − device is a line (a crystal is some parts
+//! per million off, a log that a script feeds with sleeps some per cent), and all of `arrival − device` lies on it or
+//! above. Of the last 16 s the least of each quarter second is kept. The line's slope is that of the line below all of
+//! these points that is closest to them in sum, which is the edge of their lower convex hull below their mean time
+//! (Moon, Skelly and Towsley 1999: late points do not move it at all). Its height is the least of the last second along
+//! that slope, so that a link whose delay changes is followed soon.
 //!
-//! What does not fit is not taken into the line at once: a sample that lies far below it (a clock set forward, or one wrong
-//! time) or far above (set back, stopped for a while, or one late sample) is a stray. Strays that agree with each other, or
-//! that go on for too long without a fitting sample between them, are a reset, and the line begins anew with them.
+//! What does not fit is not taken into the line at once: a sample that lies far below it (a clock set forward, or one
+//! wrong time) or far above (set back, stopped for a while, or one late sample) is a stray. Strays that agree with each
+//! other, or that go on for too long without a fitting sample between them, are a reset, and the line begins anew with
+//! them.
 
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 
@@ -136,8 +137,8 @@ impl ClockModel {
     }
 
     /// Host time at which a sample of device time `device` was taken, given that it arrived at `arrival`; never later
-    /// than `arrival`. Samples that come in the order of their device times are mapped in that order, and one that comes
-    /// late is not put behind those that it is before.
+    /// than `arrival`. Samples that come in the order of their device times are mapped in that order, and one that
+    /// comes late is not put behind those that it is before.
     pub fn map(&mut self, device: TimeNs, arrival: TimeNs) -> TimeNs {
         // Device times are untrusted and may lie anywhere in i64.
         let offset_ns = arrival.0.saturating_sub(device.0);
@@ -168,9 +169,9 @@ impl ClockModel {
         host
     }
 
-    /// Takes a reading of the device's clock that came by itself, as the answer to a question. It delays no sample and is
-    /// mapped to nothing, but the line cannot lie above it: where samples take long to be made, as those of a camera do, it
-    /// lies below theirs by as much, so that they are mapped to when they were taken.
+    /// Takes a reading of the device's clock that came by itself, as the answer to a question. It delays no sample and
+    /// is mapped to nothing, but the line cannot lie above it: where samples take long to be made, as those of a camera
+    /// do, it lies below theirs by as much, so that they are mapped to when they were taken.
     pub fn observe(&mut self, device: TimeNs, arrival: TimeNs) {
         let offset_ns = arrival.0.saturating_sub(device.0);
         // One far above is late, or the clock was set back, which the samples will tell.
@@ -226,8 +227,8 @@ impl ClockModel {
             || lasted(strays.since) >= STRAYS_LAST
     }
 
-    /// The best that can be said of one that may be wrong: what lies far below the line took as long as its predecessor,
-    /// what lies above it is late.
+    /// The best that can be said of one that may be wrong: what lies far below the line took as long as its
+    /// predecessor, what lies above it is late.
     fn map_stray(&self, device: TimeNs, offset_ns: i64, arrival: TimeNs) -> TimeNs {
         match self.newest {
             Some(newest) if offset_ns < self.line.offset_at(device) => {

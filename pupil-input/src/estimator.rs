@@ -1,4 +1,5 @@
-//! From samples to `pupil_at(t)`: gate and filter per eye, eyes combined or chosen, hold, fallback and the slides between.
+//! From samples to `pupil_at(t)`: gate and filter per eye, eyes combined or chosen, hold, fallback and the slides
+//! between.
 
 use holod_calibration::{PupilDiameter, TimeNs, rig};
 
@@ -6,8 +7,8 @@ use crate::filter::{Filter, FilterSettings, Motion};
 use crate::gate::{Expected, Gate, GateSettings, Rejection, Verdict};
 use crate::{PupilSample, SampleEye};
 
-/// With the default settings the estimate of the present moment is never farther behind a moving pupil than this: the gate's
-/// lead, and the filter's rise at the onset of a reflex.
+/// With the default settings the estimate of the present moment is never farther behind a moving pupil than this: the
+/// gate's lead, and the filter's rise at the onset of a reflex.
 pub const STATED_LAG: TimeNs = TimeNs(50_000_000);
 
 /// A first believed sample this soon after the begin is shown at once: hardly anything was shown before.
@@ -31,8 +32,8 @@ pub struct EstimatorSettings {
     /// Speed at which a difference between what is shown and what is measured is worked off when samples come back,
     /// mm/s.
     pub return_mm_per_s: f32,
-    /// A stream whose last believed sample is older than this, and than the gate's lead and three of the tracker's usual
-    /// intervals, is held.
+    /// A stream whose last believed sample is older than this, and than the gate's lead and three of the tracker's
+    /// usual intervals, is held.
     pub silence: TimeNs,
     /// Over how long the difference between the two eyes is learnt.
     pub eye_offset: TimeNs,
@@ -345,15 +346,15 @@ impl Estimator {
         }
     }
 
-    /// Says that the estimate is shown from `t` on, in place of the first sample's time: the first diameter that is believed
-    /// is shown at once if that is soon after, else slid to.
+    /// Says that the estimate is shown from `t` on, in place of the first sample's time: the first diameter that is
+    /// believed is shown at once if that is soon after, else slid to.
     pub fn begin(&mut self, t: TimeNs) {
         self.t_begins = Some(t);
     }
 
-    /// Goes on with other settings from `t` on; what is shown does not jump. Where they make something else of the samples,
-    /// the eyes are learnt anew: what is shown is held until one is believed again, and slides there. The slide to another
-    /// fallback begins from what is shown.
+    /// Goes on with other settings from `t` on; what is shown does not jump. Where they make something else of the
+    /// samples, the eyes are learnt anew: what is shown is held until one is believed again, and slides there. The
+    /// slide to another fallback begins from what is shown.
     pub fn change(&mut self, settings: EstimatorSettings, t: TimeNs, on_decision: impl FnMut(Decision)) {
         let before = self.snapshot.change(settings, t);
         let EstimatorSettings { fallback, hold, fallback_mm_per_s, return_mm_per_s, silence, .. } = settings;
@@ -371,8 +372,8 @@ impl Estimator {
         self.push_at(sample.t_sample, sample, on_decision);
     }
 
-    /// The same for a sample that is known from `t_known` on, on the stream's clock. What is shown goes on from what was
-    /// shown then, however long ago the sample was taken.
+    /// The same for a sample that is known from `t_known` on, on the stream's clock. What is shown goes on from what
+    /// was shown then, however long ago the sample was taken.
     pub fn push_at(&mut self, t_known: TimeNs, sample: PupilSample, mut on_decision: impl FnMut(Decision)) {
         let settings = self.snapshot.settings;
         let sample = PupilSample { diameter_mm: (f64::from(sample.diameter_mm) * settings.scale) as f32, ..sample };

@@ -1,8 +1,8 @@
 //! The smoothed diameter of one eye: a Kalman filter of position and velocity whose velocity dies away.
 //!
 //! dx = v dt, dv = −v/τ dt + white acceleration. Between samples and beyond the newest one the position runs on by
-//! v·τ·(1 − exp(−Δt/τ)): it extrapolates over the gate's latency and comes to rest where nothing more is heard, so a hold
-//! needs no case of its own. What is run on is less than the velocity v where that is small. (The integrated
+//! v·τ·(1 − exp(−Δt/τ)): it extrapolates over the gate's latency and comes to rest where nothing more is heard, so a
+//! hold needs no case of its own. What is run on is less than the velocity v where that is small. (The integrated
 //! Ornstein-Uhlenbeck model; Singer 1970 has it one derivative higher.)
 
 use holod_calibration::TimeNs;

@@ -9,8 +9,8 @@
 //! 3. it lies within reach of the estimate: a band that widens with the time since the last believed sample, so that
 //!    a dip of a lid is outside for longer than a blink lasts, and a real change of the pupil is inside soon after;
 //! 4. none of this happened within the guard times around it. The leading guard needs the sample's successors, so every
-//!    sample waits for [`GateSettings::lead`] before it is believed: that is the gate's whole latency, and because of it
-//!    the estimate never starts to follow the onset of a blink.
+//!    sample waits for [`GateSettings::lead`] before it is believed: that is the gate's whole latency, and because of
+//!    it the estimate never starts to follow the onset of a blink.
 
 use holod_calibration::TimeNs;
 
@@ -43,7 +43,8 @@ pub struct GateSettings {
     pub lead: TimeNs,
     /// Trailing guard: a sample this close after a bad one is not believed.
     pub trail: TimeNs,
-    /// A silence longer than this, and than three of the tracker's usual intervals, is a loss with guards on both sides.
+    /// A silence longer than this, and than three of the tracker's usual intervals, is a loss with guards on both
+    /// sides.
     pub gap: TimeNs,
 }
 
@@ -371,7 +372,8 @@ impl StepScale {
     }
 }
 
-/// A running median of the time between samples, from 1 kHz to 6 Hz, so that a slow tracker is not taken for a lost one.
+/// A running median of the time between samples, from 1 kHz to 6 Hz, so that a slow tracker is not taken for a lost
+/// one.
 #[derive(Clone, Copy, Debug)]
 struct Interval {
     median_ns: i64,

@@ -10,8 +10,8 @@
 //! # What the estimate costs and gives
 //!
 //! A sample is believed 30 ms after it was taken, when its successors have shown that no blink was beginning
-//! ([`GateSettings::lead`]). The filter bridges that time by extrapolation, so the estimate of the present moment lags much
-//! less than the gate. With the default settings, as `tests/eye.rs` measures and bounds them:
+//! ([`GateSettings::lead`]). The filter bridges that time by extrapolation, so the estimate of the present moment lags
+//! much less than the gate. With the default settings, as `tests/eye.rs` measures and bounds them:
 //!
 //! | | |
 //! |---|---|
@@ -26,8 +26,8 @@
 //! Flicker in pixels of blur, the error of predictions, and how other filters do: `doc/estimate.md`. Scenarios of the
 //! simulated eye: [`Script`].
 //!
-//! A pupil is held for as long as the rig says ([`rig::Tracker::hold`](holod_calibration::rig::Tracker::hold)), then slides to
-//! the fallback at 1.3 mm/s; when samples come back, what is shown meets them at 4 mm/s. Neither is
+//! A pupil is held for as long as the rig says ([`rig::Tracker::hold`](holod_calibration::rig::Tracker::hold)), then
+//! slides to the fallback at 1.3 mm/s; when samples come back, what is shown meets them at 4 mm/s. Neither is
 //! faster than the peak of the light reflex, 5.5 mm/s.
 
 mod clock;

@@ -19,8 +19,8 @@ const LEAST_MESSAGES: u64 = 5;
 const UNHEARD_FOR: TimeNs = TimeNs(1_800_000_000);
 /// Samples of which the figures are looked at.
 const KEPT: usize = 64;
-/// Diameters at which an eye is likely to be, in millimetres: narrower than what the gate allows, so that a guess at the
-/// unit is seldom wrong.
+/// Diameters at which an eye is likely to be, in millimetres: narrower than what the gate allows, so that a guess at
+/// the unit is seldom wrong.
 const LIKELY_MM: std::ops::RangeInclusive<f64> = 1.5..=9.0;
 /// No tracker's samples of one eye are nearer to each other, or, while they come, farther apart.
 const LIKELY_INTERVAL: std::ops::RangeInclusive<TimeNs> = TimeNs(100_000)..=TimeNs(1_000_000_000);
@@ -376,8 +376,8 @@ mod tests {
         }
     }
 
-    /// Sends `count` samples at 200 Hz through gate and watch and looks ten times a second, as the daemon does; what was
-    /// told, and when.
+    /// Sends `count` samples at 200 Hz through gate and watch and looks ten times a second, as the daemon does; what
+    /// was told, and when.
     fn told(settings: &rig::Tracker, count: i64, of: impl Fn(i64) -> PupilSample) -> Vec<(TimeNs, RefusalChange)> {
         let counters = Counters::new();
         let mut estimator = Estimator::new(EstimatorSettings::from(settings));

@@ -10,12 +10,12 @@ use crate::usb_ids::UsbIds;
 
 /// A parsed tracker spec.
 #[derive(Clone, Debug, PartialEq)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum TrackerSpec {
     /// A path by itself: a log if it is a regular file, else a serial port.
     Path(PathBuf),
     /// `serial:PATH[,profile=NAME][,baud=N]`, or without `serial:` where there is an option
     Serial {
-        /// The port.
         path: PathBuf,
         /// The tracker's profile; [`DEFAULT_PROFILE`](crate::DEFAULT_PROFILE) where the spec names none.
         profile: Option<String>,
@@ -35,14 +35,12 @@ pub enum TrackerSpec {
     Tcp {
         /// Host and port.
         address: HostPort,
-        /// The tracker's profile.
         profile: String,
     },
     /// `udp:HOST[:PORT],profile=NAME`: listens there
     Udp {
         /// Address of this machine and port.
         address: HostPort,
-        /// The tracker's profile.
         profile: String,
     },
     /// `core[:HOST[:PORT]]`: Pupil Labs Core, its Pupil Remote
@@ -51,7 +49,6 @@ pub enum TrackerSpec {
     Neon(HostPort),
     /// `replay:FILE[,speed=X][,loop]`, or without `replay:` where there is an option
     Replay {
-        /// The log.
         path: PathBuf,
         /// How fast it is played.
         speed: ReplaySpeed,
@@ -163,7 +160,8 @@ fn parse_mock(name: &str) -> Result<TrackerSpec, String> {
     }
 }
 
-/// The path and the `key=value` or bare options behind it. Options are taken from the end, so that a path may hold a comma.
+/// The path and the `key=value` or bare options behind it. Options are taken from the end, so that a path may hold a
+/// comma.
 fn split_options(rest: &str) -> Result<(&str, Vec<&str>), String> {
     let mut path = rest;
     let mut options = Vec::new();

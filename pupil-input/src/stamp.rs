@@ -1,5 +1,5 @@
-//! The time at which a sample was taken, on the host's clock: by the tracker's own time where the wire has one, else by the
-//! samples' places among those that arrived together.
+//! The time at which a sample was taken, on the host's clock: by the tracker's own time where the wire has one, else by
+//! the samples' places among those that arrived together.
 
 use holod_calibration::TimeNs;
 
@@ -49,8 +49,8 @@ impl Stamper {
         self.clock.report()
     }
 
-    /// Takes a sample of the bytes that were read at `arrival`. One that has a time comes back at once; one that has none is
-    /// kept for [`Self::rest`], which tells how many came together.
+    /// Takes a sample of the bytes that were read at `arrival`. One that has a time comes back at once; one that has
+    /// none is kept for [`Self::rest`], which tells how many came together.
     pub(crate) fn take(&mut self, wire: WireSample, arrival: TimeNs) -> Option<PupilSample> {
         match wire.t_device {
             Some(t_device) => Some(stamped(&wire, t_device, self.clock.map(t_device, arrival), arrival)),
@@ -62,8 +62,8 @@ impl Stamper {
         }
     }
 
-    /// Ends the bytes that were read at `arrival`: each eye's samples that have no time lie one usual interval apart, the
-    /// newest at the arrival.
+    /// Ends the bytes that were read at `arrival`: each eye's samples that have no time lie one usual interval apart,
+    /// the newest at the arrival.
     pub(crate) fn rest(&mut self, arrival: TimeNs, mut on_sample: impl FnMut(PupilSample)) {
         if self.batch.is_empty() {
             return;

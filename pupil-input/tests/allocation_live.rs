@@ -1,5 +1,5 @@
-//! A tracker that runs, recorded, allocates nothing for the samples that come. The only test in its crate: it counts the
-//! allocations of all threads.
+//! A tracker that runs, recorded, allocates nothing for the samples that come. The only test in its crate: it counts
+//! the allocations of all threads.
 
 use std::io::Write as _;
 use std::time::{Duration, Instant};

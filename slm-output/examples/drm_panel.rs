@@ -3,9 +3,10 @@
 //!
 //! - `drm_panel show CONNECTOR WIDTHxHEIGHT@HZ MODE [refreshes=N] [losses=N] [crc=FOLDER] [wrong=level|submission]`
 //!   shows a new frame as often as the panel takes one, until `losses` losses are over and N refreshes have come since.
-//!   `crc` is the controller's folder in debugfs (such as `/sys/kernel/debug/dri/0/crtc-0/crc`), whose check sums of what was
-//!   scanned out are compared with those of the patterns; only vkms's are known. `wrong` is there so that a test of this can be
-//!   shown to fail: `level` expects another level in one pattern, `submission` leaves out a frame now and then.
+//!   `crc` is the controller's folder in debugfs (such as `/sys/kernel/debug/dri/0/crtc-0/crc`), whose check sums of
+//!   what was scanned out are compared with those of the patterns; only vkms's are known. `wrong` is there so that a
+//!   test of this can be shown to fail: `level` expects another level in one pattern, `submission` leaves out a frame
+//!   now and then.
 //! - `drm_panel steal PROCESS CARD MILLISECONDS` takes the card away from a process, as a session manager does, is its
 //!   master for a while, and lets it go.
 //! - `drm_panel hold CARD MILLISECONDS` is the card's master for a while.

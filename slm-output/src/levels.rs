@@ -41,15 +41,14 @@ const TO_INTEGER: f32 = 12_582_912.0;
 
 /// Why a panel's description cannot be used for encoding.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum LevelsError {
     /// A bit depth that the panel's packing does not carry.
     #[error(
         "panel.bit_depth is {found}, but panel.packing = \"{packing}\" carries {carried} bits: correct one of the two in the rig file"
     )]
     BitDepth {
-        /// What was found.
         found: u8,
-        /// The packing's name.
         packing: &'static str,
         /// The bits that it carries.
         carried: u8,
@@ -58,28 +57,18 @@ pub enum LevelsError {
     #[error(
         "panel.packing is \"{packing}\" in mode channel-packed; expected gray or gray10, as red, green and blue each carry a field of their own: use mode field-sequential, or 8 bits"
     )]
-    PackedDepth {
-        /// What was found.
-        packing: &'static str,
-    },
+    PackedDepth { packing: &'static str },
     /// A stroke that is no positive number.
     #[error("the {colour} stroke is {found} rad; expected a positive number: correct panel.stroke of the rig file")]
-    Stroke {
-        /// Whose stroke.
-        colour: Colour,
-        /// What was found.
-        found: f64,
-    },
+    Stroke { colour: Colour, found: f64 },
     /// A look-up table with too few entries, or with a level that is out of order or that the panel does not have.
     #[error(
         "the {colour} look-up table has level {found} as its entry {entry}; expected levels that rise, two at least, all below {levels}: write the table again"
     )]
     LutLevel {
-        /// Whose table.
         colour: Colour,
         /// Position of the first entry that is wrong, from 0; the number of entries where they are too few.
         entry: usize,
-        /// Its level.
         found: u16,
         /// Levels of the panel.
         levels: usize,
@@ -89,7 +78,6 @@ pub enum LevelsError {
         "the {colour} look-up table is flat, not monotonic or not finite at level {level}: smooth or measure it again"
     )]
     LutShape {
-        /// Whose table.
         colour: Colour,
         /// The first level at which it goes wrong.
         level: u16,
@@ -98,32 +86,22 @@ pub enum LevelsError {
     #[error(
         "the {colour} look-up table falls with the level but panel.phase_sign is positive: set it to negative, or correct the table"
     )]
-    LutSign {
-        /// Whose table.
-        colour: Colour,
-    },
+    LutSign { colour: Colour },
     /// A flatness picture of another size than the panel, or with a value that is not finite.
     #[error(
         "the {colour} flatness has {found} usable values; expected {expected} ({panel}): make it at the panel's own size"
     )]
     Flatness {
-        /// Whose flatness.
         colour: Colour,
         /// Finite values found.
         found: usize,
         /// Pixels of the panel.
         expected: usize,
-        /// The panel.
         panel: Resolution,
     },
     /// A pattern that does not fit on the panel.
     #[error("the pattern is {pattern} pixels, the panel {panel}: render a pattern that is no larger than the panel")]
-    PatternSize {
-        /// The pattern.
-        pattern: Resolution,
-        /// The panel.
-        panel: Resolution,
-    },
+    PatternSize { pattern: Resolution, panel: Resolution },
 }
 
 /// What encoding one pattern met.
@@ -145,8 +123,8 @@ pub struct PanelEncoder {
 struct ColourEncoder {
     /// The level of each phase bin, with [`UNREACHABLE`] set where it is not near.
     table: Vec<u32>,
-    /// Phase that each level shows on a flat panel, with its whole turns; not a number where the panel's table leaves it
-    /// out.
+    /// Phase that each level shows on a flat panel, with its whole turns; not a number where the panel's table leaves
+    /// it out.
     phase_of_level_rad: Vec<f32>,
     /// Phase to add at each panel pixel, in table entries, [0, table length).
     flatness_entries: Option<Vec<f32>>,
@@ -286,8 +264,8 @@ impl PanelEncoder {
         self.of_pattern(&self.decode(colour, levels))
     }
 
-    /// As [`Self::decode_pattern`], with the whole turns of each level's phase: what the liquid crystal does, which light
-    /// of another wavelength meets too. The panel's own unflatness is known to a turn only.
+    /// As [`Self::decode_pattern`], with the whole turns of each level's phase: what the liquid crystal does, which
+    /// light of another wavelength meets too. The panel's own unflatness is known to a turn only.
     ///
     /// # Panics
     /// As [`Self::decode`].
@@ -657,7 +635,8 @@ mod tests {
             (OutOfStroke::Clip, false, [asked, near_end, 255, 255, 0]),
             (OutOfStroke::Zero, false, [asked, near_end, 0, 0, 0]),
             (OutOfStroke::Scale, false, [level(0.2325), level(0.555), level(0.6375), level(0.675), 255]),
-            // The levels run the other way: 0.69, 0.26, 0.15, 0.1 and 0.0001 turns round are 0.31, 0.74, 0.85, 0.9 and 0.9999.
+            // The levels run the other way: 0.69, 0.26, 0.15, 0.1 and 0.0001 turns round are 0.31, 0.74, 0.85, 0.9 and
+            // 0.9999.
             (OutOfStroke::Clip, true, [level(0.69), level(0.26), level(0.15), level(0.1), 0]),
         ] {
             let panel = Panel {

@@ -102,8 +102,8 @@ impl Pacer {
     }
 
     /// Plans the next frame: the first refresh that it can reach and no other frame is for. Where a frame takes longer
-    /// than a refresh, it keeps to every n-th. A frame that was submitted long before the refresh that it was made for has
-    /// been shown at an earlier one, and its own is free.
+    /// than a refresh, it keeps to every n-th. A frame that was submitted long before the refresh that it was made for
+    /// has been shown at an earlier one, and its own is free.
     pub fn predict(&mut self, now: TimeNs) -> FramePlan {
         let budget = self.budget();
         let reachable = now + budget;
@@ -142,8 +142,8 @@ impl Pacer {
         }
     }
 
-    /// The panel says that `frame_id` was first shown at `t_present`. Reports may come late, early, twice, in any order,
-    /// with a time of zero or of frames that are unknown; what cannot be is ignored.
+    /// The panel says that `frame_id` was first shown at `t_present`. Reports may come late, early, twice, in any
+    /// order, with a time of zero or of frames that are unknown; what cannot be is ignored.
     pub fn report(&mut self, frame_id: u64, t_present: TimeNs, provenance: TimestampSource) {
         let Some(slot) = self.slots[slot_index(frame_id)].as_mut().filter(|slot| slot.awaits_report(frame_id)) else {
             return;
@@ -589,8 +589,8 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever it is told, a pacer plans forward: frames are numbered without a gap, never for a refresh that another
-        /// frame still waits for, never in the past.
+        /// Whatever it is told, a pacer plans forward: frames are numbered without a gap, never for a refresh that
+        /// another frame still waits for, never in the past.
         #[test]
         fn plans_go_forward_whatever_is_reported(steps in prop::collection::vec(steps(), 1..200)) {
             let mut pacer = Pacer::new(config(), TimeNs(0));

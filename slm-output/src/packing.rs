@@ -62,7 +62,8 @@ pub fn write_frame(levels: &LevelsFrame, first_field: usize, format: PixelFormat
     }
 }
 
-/// Writes one row of a video frame: `samples` as [`LevelsFrame::video_row`] gives them, `pixels` of [`PIXEL_BYTES`] each.
+/// Writes one row of a video frame: `samples` as [`LevelsFrame::video_row`] gives them, `pixels` of [`PIXEL_BYTES`]
+/// each.
 ///
 /// # Panics
 /// Where `pixels` has room for another number of pixels than `samples` are; as [`write_frame`].

@@ -36,12 +36,10 @@ const ORDER_SAMPLES: usize = 4096;
 /// figure that has a usual value may be left out.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "kebab-case", deny_unknown_fields)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Pattern {
     /// One level everywhere, as it is: neither table nor flatness is applied.
-    Level {
-        /// The level.
-        level: u16,
-    },
+    Level { level: u16 },
     /// Squares of two phases.
     Checkerboard {
         /// Pixels across two squares, even.
@@ -56,7 +54,6 @@ pub enum Pattern {
         /// Where the first order goes, degrees from x to y.
         #[serde(default)]
         angle_deg: f64,
-        /// The lines' shape.
         profile: Profile,
         /// Largest less smallest phase, radians; the profile's own ([`Profile::depth_rad`]) when left out.
         #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -77,7 +74,6 @@ pub enum Pattern {
     Dots {
         /// Pixels from dot to dot.
         spacing_px: usize,
-        /// A dot's diameter.
         diameter_px: usize,
     },
     /// Bright lines on black that cross at the optical axis, with a square in the upper right quarter.

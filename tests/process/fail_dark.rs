@@ -1,9 +1,9 @@
 //! How long after a fault all lasers are dark, whatever the fault:
 //! `cargo test -p holod --features fault-injection --test fail_dark -- --nocapture`
 //!
-//! The real daemon drives the reference firmware over a pseudo-terminal. The fault is let happen, and the firmware's own
-//! log, written by a process that the fault does not touch, says when it went dark, and that nothing was lit that was not
-//! armed anew.
+//! The real daemon drives the reference firmware over a pseudo-terminal. The fault is let happen, and the firmware's
+//! own log, written by a process that the fault does not touch, says when it went dark, and that nothing was lit that
+//! was not armed anew.
 
 use std::fmt::Write as _;
 use std::fs::{self, File};
@@ -29,8 +29,8 @@ const GOAL_MS: f64 = 100.0;
 const BUSY_MS: f64 = 400.0;
 /// now and then by more, but not as often as this.
 const TRIES: usize = 3;
-/// The last hologram stays lit for so long when no new one comes. A busy machine is slower than its panel, and dark now and
-/// then for that.
+/// The last hologram stays lit for so long when no new one comes. A busy machine is slower than its panel, and dark now
+/// and then for that.
 const STALL_TIMEOUT_MS: i64 = 80;
 
 /// Who does what.
@@ -131,7 +131,8 @@ fn armed_at_the_end(events: &[BoxEvent]) -> bool {
     matches!(last, Some(BoxEvent::Armed { .. }))
 }
 
-/// The first thing in a box's log that must not be: light that was not armed, two lasers at once, darkness with one lit.
+/// The first thing in a box's log that must not be: light that was not armed, two lasers at once, darkness with one
+/// lit.
 fn light_in_the_dark(events: &[BoxEvent]) -> Option<BoxEvent> {
     let mut armed = false;
     let mut lit = None;

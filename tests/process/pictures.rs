@@ -62,8 +62,8 @@ fn write_cards(folder: &Path, rig: &Rig) {
     depth.save(folder.join("depth.png")).unwrap();
 }
 
-/// How blurred the upright edge at column `edge` is, in pixels: the area between the mean row profile and an ideal step,
-/// over the step's height. A uniform blur of diameter c gives about c/4.
+/// How blurred the upright edge at column `edge` is, in pixels: the area between the mean row profile and an ideal
+/// step, over the step's height. A uniform blur of diameter c gives about c/4.
 fn edge_blur_px(picture: &LinearImage, edge: usize) -> f64 {
     let linear = |encoded: u8| ((f64::from(encoded) / 255.0 + 0.055) / 1.055).powf(2.4);
     let (dark, light) = (linear(DARK), linear(LIGHT));

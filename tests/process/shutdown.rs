@@ -17,7 +17,8 @@ use rustix::process::Signal;
 
 use crate::HOLOD;
 
-/// A laser box on a pseudo-terminal, outside the daemon's process, with a clock of its own, that logs what its lasers do.
+/// A laser box on a pseudo-terminal, outside the daemon's process, with a clock of its own, that logs what its lasers
+/// do.
 struct LaserBench {
     folder: tempfile::TempDir,
     device: PathBuf,
@@ -82,8 +83,8 @@ impl LaserBench {
 
 #[test]
 fn a_killed_daemon_leaves_the_laser_box_dark_within_its_heartbeat_timeout() {
-    // On a machine that is busy with other work a daemon may have lost its panel's rhythm just before it is killed, and the
-    // lasers are dark by that. Only a box that was lit shows that a closed port puts it out, so it is tried again.
+    // On a machine that is busy with other work a daemon may have lost its panel's rhythm just before it is killed, and
+    // the lasers are dark by that. Only a box that was lit shows that a closed port puts it out, so it is tried again.
     let hung_up = (0..5).any(|_| kill_a_daemon_and_judge_its_lasers() == DarkReason::HangUp);
     assert!(hung_up, "the kernel closes the port of a killed process");
 }

@@ -95,8 +95,9 @@ fn judge(rows: &[FieldRow], summary: &serde_json::Value) {
 }
 
 /// The largest and the median error of what frames were made for, over those that were shown when they were meant to be
-/// (a frame that stays on the panel because the machine is slow says nothing about the estimate): the distance to the nearest of the eye's diameters
-/// between the filter's stated lag before the frame's light and that light. `delay` shifts the eye, for a canary.
+/// (a frame that stays on the panel because the machine is slow says nothing about the estimate): the distance to the
+/// nearest of the eye's diameters between the filter's stated lag before the frame's light and that light. `delay`
+/// shifts the eye, for a canary.
 fn errors(rows: &[FieldRow], t_first: TimeNs, delay: TimeNs, truth_mm: impl Fn(TimeNs) -> Option<f64>) -> (f64, f64) {
     let first_shown = |index: usize| index == 0 || rows[index - 1].frame != rows[index].frame;
     let mut errors: Vec<f64> = rows

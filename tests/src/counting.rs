@@ -1,7 +1,7 @@
 //! The system's allocator, counting.
 //!
-//! Only a global allocator sees every allocation, and one cannot be written without `unsafe`. A program that counts makes
-//! it its own:
+//! Only a global allocator sees every allocation, and one cannot be written without `unsafe`. A program that counts
+//! makes it its own:
 //!
 //! ```
 //! use holod_tests::counting::{self, Counting};

@@ -142,7 +142,8 @@ impl FeedClient {
         self.hand_over_with(slot, sequence, t_taken_ns, 0, [0.0; 3])
     }
 
-    /// The same with the optional figures of version 2: which are given, the focus in dioptres, the field of view in degrees.
+    /// The same with the optional figures of version 2: which are given, the focus in dioptres, the field of view in
+    /// degrees.
     ///
     /// # Errors
     /// The connection is closed.

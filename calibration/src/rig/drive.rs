@@ -80,8 +80,8 @@ pub enum OutOfStroke {
     Clip,
     /// It goes to the beginning of the stroke: a blaze loses its tips.
     Zero,
-    /// All phases are multiplied by stroke/2π: a blaze keeps its shape and gets too shallow, and light stays in the zero
-    /// order.
+    /// All phases are multiplied by stroke/2π: a blaze keeps its shape and gets too shallow, and light stays in the
+    /// zero order.
     Scale,
 }
 

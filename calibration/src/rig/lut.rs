@@ -18,8 +18,8 @@ const LEVELS_MIN: usize = 2;
 /// The file is CSV, with an optional header line and `#` comments, in one of two forms:
 /// - every level: a row for each from 0 up, `level,phase_rad` or `phase_rad` alone. The phase may rise or fall with the
 ///   level but not both.
-/// - some levels, for a panel with few and irregular ones: a row `level,phase_rad` for each that may be used, the levels
-///   rising, the phases in any order.
+/// - some levels, for a panel with few and irregular ones: a row `level,phase_rad` for each that may be used, the
+///   levels rising, the phases in any order.
 ///
 /// # Errors
 /// [`FileFault`] where the file cannot be read, has a row that is no number or out of order, has too few or too many

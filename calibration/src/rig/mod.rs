@@ -135,6 +135,7 @@ pub struct Lasers {
 
 /// Which laser box is on the bench.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum LaserDriver {
     /// No box: a simulated laser that logs its edges.
     Simulated,
@@ -147,7 +148,6 @@ pub enum LaserDriver {
     },
     /// FISBA READYBeam: power and on or off only, and it stays lit when holod dies.
     ReadyBeam {
-        /// The port.
         path: PathBuf,
         /// Optical power of each colour at the panel when the box is set to 100 %, milliwatts, rounded to microwatts.
         full_power_uw: PerColour<u32>,

@@ -163,8 +163,8 @@ impl<'a> Reader<'a> {
     }
 
     /// Notes every key of `section` that is not in the section's part of `layout`, which holds the keys of every
-    /// section, to tell where a misplaced one belongs; `retired` are sections' keys that there were once, each with what
-    /// to do about it.
+    /// section, to tell where a misplaced one belongs; `retired` are sections' keys that there were once, each with
+    /// what to do about it.
     pub(super) fn reject_unknown(
         &self,
         section: Section<'a>,

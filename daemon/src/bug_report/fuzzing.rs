@@ -29,11 +29,12 @@ pub fn seal(archive: &mut [u8]) {
     }
 }
 
-/// An archive at `path`, plain or with gzip. It is refused in words, or taken apart and read as far as no engine is needed,
-/// also where its files are not those of its listing, for no mutation would guess their hashes.
+/// An archive at `path`, plain or with gzip. It is refused in words, or taken apart and read as far as no engine is
+/// needed, also where its files are not those of its listing, for no mutation would guess their hashes.
 ///
 /// # Panics
-/// Where something of it leads out of its folder, a refusal has no words, or a frame is read that no eye could have seen.
+/// Where something of it leads out of its folder, a refusal has no words, or a frame is read that no eye could have
+/// seen.
 pub fn report(path: &Path) {
     if let Err(failure) = unpack(path) {
         assert!(!failure.to_string().is_empty());

@@ -1,5 +1,5 @@
-//! A report of what went wrong, in one file: a record of a run, its bench, log and scenes, and facts of the machine, without
-//! names of people or machines. The page is `daemon/doc/report.md`.
+//! A report of what went wrong, in one file: a record of a run, its bench, log and scenes, and facts of the machine,
+//! without names of people or machines. The page is `daemon/doc/report.md`.
 //!
 //! | Part | Does |
 //! |---|---|

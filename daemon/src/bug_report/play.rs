@@ -51,7 +51,8 @@ pub struct Played {
     pub comparison: Comparison,
 }
 
-/// Reads everything that the frames of a report need. `backend` is the engine that is wanted; `Auto` is that of the run.
+/// Reads everything that the frames of a report need. `backend` is the engine that is wanted; `Auto` is that of the
+/// run.
 ///
 /// # Errors
 /// The report lacks what every frame needs, or none of its frames can be made again.
@@ -497,7 +498,6 @@ struct FrameMaterial {
 pub struct Comparison {
     /// By their numbers: those that are made again and have not come yet.
     awaited: HashMap<u64, u64>,
-    /// Their fields.
     fields: HashMap<u64, Vec<(u8, Colour)>>,
     shown: HashMap<u64, Vec<(u8, Colour)>>,
     outcome: Outcome,

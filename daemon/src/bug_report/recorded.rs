@@ -1,6 +1,7 @@
 //! Reads `frames.csv`: which frames a run made, of what, and how its fields were shown.
 //!
-//! By hand, since a report comes from others and may hold rows of any length, which the `csv` crate would take in whole.
+//! By hand, since a report comes from others and may hold rows of any length, which the `csv` crate would take in
+//! whole.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;

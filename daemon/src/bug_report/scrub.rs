@@ -107,8 +107,8 @@ impl Scrubber {
     }
 }
 
-/// Names, each with the home directory, of a line of `/etc/passwd`, where it is a person's or root's: that of the account,
-/// and the person's own.
+/// Names, each with the home directory, of a line of `/etc/passwd`, where it is a person's or root's: that of the
+/// account, and the person's own.
 fn person(line: &str) -> Vec<(String, String)> {
     let fields: Vec<&str> = line.split(':').collect();
     let [name, _, uid, _, about, home, ..] = fields[..] else { return Vec::new() };

@@ -1,5 +1,5 @@
-//! Takes a report apart into a folder of its own. What is in an archive is anybody's: nothing of it leads out of the folder,
-//! and there is an end to its size.
+//! Takes a report apart into a folder of its own. What is in an archive is anybody's: nothing of it leads out of the
+//! folder, and there is an end to its size.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufReader, Read, Write};

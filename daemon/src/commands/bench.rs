@@ -1,5 +1,5 @@
-//! `holod bench`: how long each stage and the frame take, beside the machine's ceilings measured in the same run, and how
-//! long the loop takes from tracker sample to photons.
+//! `holod bench`: how long each stage and the frame take, beside the machine's ceilings measured in the same run, and
+//! how long the loop takes from tracker sample to photons.
 
 use std::fmt::Write;
 use std::sync::Arc;

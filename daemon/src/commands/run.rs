@@ -222,7 +222,8 @@ fn rig_of(args: &RunArgs) -> Result<Rig, Failure> {
     Ok(rig)
 }
 
-/// Writes `summary.json` and the levels that the panel showed into the record, which is lost where they cannot be written.
+/// Writes `summary.json` and the levels that the panel showed into the record, which is lost where they cannot be
+/// written.
 ///
 /// # Errors
 /// The system gives no thread for it.

@@ -42,7 +42,8 @@ pub fn request(line: &[u8]) {
             return;
         }
     };
-    // The text of a figure may be a neighbour's, that of an infinite one is `null`: texts are compared after one more round.
+    // The text of a figure may be a neighbour's, that of an infinite one is `null`: texts are compared after one more
+    // round.
     let again = |request: &Request| {
         let written = serde_json::to_vec(request).expect("a request can be written");
         let read: Request = serde_json::from_slice(&written).expect("what was written can be read");

@@ -1,5 +1,5 @@
-//! What a person or a program may ask of a running holod: one line of JSON for each request, one for each answer, over a
-//! Unix socket. The page is `daemon/doc/control.md`.
+//! What a person or a program may ask of a running holod: one line of JSON for each request, one for each answer, over
+//! a Unix socket. The page is `daemon/doc/control.md`.
 //!
 //! Everything here is on the control side. A request is made ready by ordinary threads, which may take their time; what
 //! then changes in the loop is handed over by the control thread, wait-free.
@@ -34,6 +34,7 @@ use crate::source::scene::Frames;
 /// A request.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Request {
     /// Say how the run is: the same as `holod status --json`, at this moment.
     Status,
@@ -64,10 +65,7 @@ pub enum Request {
         mm: Option<f32>,
     },
     /// Follow another eye.
-    Eye {
-        /// Which.
-        eye: Eye,
-    },
+    Eye { eye: Eye },
     /// Read the rig file again, and go on with what it says now.
     Reload {
         /// In a record: the keys of the rig file that say something else now, and what.
@@ -76,7 +74,6 @@ pub enum Request {
     },
     /// Show a test pattern in place of holograms.
     Pattern {
-        /// Which.
         pattern: Pattern,
         /// The optical axis in pixels from the panel's centre, right and up.
         #[serde(default)]
@@ -123,8 +120,8 @@ impl Request {
 pub enum Answer {
     /// It is done; with what was asked for.
     Ok(Value),
-    /// It is not, and nothing has changed, but that lasers which do not acknowledge darkness are kept dark all the same:
-    /// what was found, what was expected, what to do.
+    /// It is not, and nothing has changed, but that lasers which do not acknowledge darkness are kept dark all the
+    /// same: what was found, what was expected, what to do.
     Error(String),
 }
 

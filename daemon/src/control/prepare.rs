@@ -54,7 +54,6 @@ pub(crate) struct NewEngine {
     pub(crate) renderer: Box<dyn Renderer>,
     /// The pupils that its network was trained for, on this bench.
     pub(crate) trained: [PupilDiameter; 2],
-    /// Its weights.
     pub(crate) weights: WeightsChoice,
 }
 

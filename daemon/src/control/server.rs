@@ -75,8 +75,8 @@ impl ControlServer {
         Ok((Self { socket, waiting, runtime: Some(runtime) }, receiver))
     }
 
-    /// Has the rig file read again for a signal, which cannot ask twice: after whatever takes long now. What came of it is
-    /// said in the log.
+    /// Has the rig file read again for a signal, which cannot ask twice: after whatever takes long now. What came of it
+    /// is said in the log.
     pub(crate) fn reload_by_signal(&self) {
         let (Some(runtime), waiting) = (&self.runtime, Arc::clone(&self.waiting)) else { return };
         // One that waits will read the file as it is then.

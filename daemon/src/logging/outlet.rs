@@ -17,8 +17,8 @@ const ROOM: usize = 4096;
 /// How long a pipe that takes nothing at once is left alone.
 const PIPE_POLL: Duration = Duration::from_millis(10);
 
-/// Takes lines without ever waiting, which a thread of its own writes. Lines that find no room, or that cannot be written,
-/// are left out and counted, and that is written once lines go out again.
+/// Takes lines without ever waiting, which a thread of its own writes. Lines that find no room, or that cannot be
+/// written, are left out and counted, and that is written once lines go out again.
 #[derive(Debug)]
 pub(super) struct Outlet {
     shared: Arc<Shared>,

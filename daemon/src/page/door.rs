@@ -67,8 +67,8 @@ impl Token {
 pub(super) enum Door {
     /// The token.
     Token(Token),
-    /// That the browser asked for this machine by one of its own names: a page from elsewhere whose name was made to lead
-    /// here has another.
+    /// That the browser asked for this machine by one of its own names: a page from elsewhere whose name was made to
+    /// lead here has another.
     OwnName,
     /// Nothing: the file system has asked.
     Open,

@@ -24,9 +24,7 @@ const IN_FLIGHT: usize = 32;
 pub(super) struct Live {
     /// The newest; nothing before the first.
     pub(super) snapshot: ArcSwapOption<Snapshot>,
-    /// For Prometheus.
     pub(super) latencies: Latencies,
-    /// Who watches.
     pub(super) viewers: AtomicUsize,
     /// Requests that were refused.
     pub(super) refused: TallyBy<Refused>,
@@ -160,8 +158,8 @@ pub(super) struct Batch {
 #[derive(Serialize)]
 pub(super) struct TakenSample(pub(super) f64, pub(super) char, pub(super) f32, pub(super) Option<&'static str>);
 
-/// Number, when the loop woke, the pupil in millimetres, what that rests on, and milliseconds to the engine's start, to its
-/// end, to the submission.
+/// Number, when the loop woke, the pupil in millimetres, what that rests on, and milliseconds to the engine's start, to
+/// its end, to the submission.
 #[derive(Serialize)]
 pub(super) struct MadeFrame(
     pub(super) u64,

@@ -17,9 +17,10 @@ pub struct Area {
 const TOLERANCE: f32 = 0.01;
 
 impl Area {
-    /// The card at `depth`, less `inset_px` on each side: the columns with at least half as many pixels of that depth as
-    /// the fullest one has, and the rows with at least half of these columns, the longest run of each. Slanted surfaces that only pass through
-    /// the depth do not count. Nothing where too little is left. `depth_normalised` is [height, width].
+    /// The card at `depth`, less `inset_px` on each side: the columns with at least half as many pixels of that depth
+    /// as the fullest one has, and the rows with at least half of these columns, the longest run of each. Slanted
+    /// surfaces that only pass through the depth do not count. Nothing where too little is left. `depth_normalised` is
+    /// [height, width].
     pub fn at_depth(
         depth_normalised: &[f32],
         resolution: Resolution,

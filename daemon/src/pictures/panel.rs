@@ -24,8 +24,8 @@ pub fn levels_picture(levels: &LevelsFrame) -> RgbImage {
     from_planes(levels.layout().resolution, |colour, pixel| fields[colour][pixel] as u8)
 }
 
-/// What travels to the panel for `levels`, bit for bit on a link of eight bits a channel: each different video frame of the colour frame, with the colour
-/// whose field it carries where it carries one.
+/// What travels to the panel for `levels`, bit for bit on a link of eight bits a channel: each different video frame of
+/// the colour frame, with the colour whose field it carries where it carries one.
 pub fn video_pictures(levels: &LevelsFrame) -> Vec<(Option<Colour>, RgbImage)> {
     let layout = levels.layout();
     let Resolution { width, height } = layout.resolution;

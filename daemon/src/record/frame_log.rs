@@ -113,8 +113,8 @@ impl FrameLog {
         self.file.write_record(row).map_err(|error| self.lost(&error.into()))
     }
 
-    /// Writes down beside it, in `orders.jsonl`, that a person changed something at host time `t`. The file is there once
-    /// there is something in it.
+    /// Writes down beside it, in `orders.jsonl`, that a person changed something at host time `t`. The file is there
+    /// once there is something in it.
     ///
     /// # Errors
     /// The disk's, with the file's name.

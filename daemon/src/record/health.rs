@@ -23,7 +23,6 @@ pub enum RecordCondition {
 /// How the record of a run is, as its status says it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RecordState {
-    /// Where it is.
     pub folder: PathBuf,
     /// Whether it goes on.
     pub state: RecordCondition,

@@ -1,4 +1,5 @@
-//! Writes down a run as it goes, with what it was made of. A thread of its own writes: whoever records waits for no disk.
+//! Writes down a run as it goes, with what it was made of. A thread of its own writes: whoever records waits for no
+//! disk.
 
 use std::collections::VecDeque;
 use std::fs::{self, OpenOptions};
@@ -35,21 +36,17 @@ pub(crate) struct RunFacts {
     pub started_unix_ms: u64,
     /// The same by the host's monotonic clock.
     pub t_origin_ns: i64,
-    /// The scene.
     pub scene: SceneSource,
     /// Size of the hologram, pixels.
     pub hologram: [usize; 2],
-    /// The tracker's spec.
     pub tracker: String,
     /// Millimetres for one unit of the tracker's figure.
     pub scale_mm_per_unit: Option<f64>,
-    /// The panel's spec.
     pub panel: String,
     /// The engine that was asked for.
     pub backend: Backend,
     /// How holograms are computed.
     pub engine: String,
-    /// The machine.
     pub machine: Machine,
 }
 
@@ -109,7 +106,6 @@ pub(crate) struct Recorder {
     /// Reads the files of what an order brought.
     reading: Option<JoinHandle<()>>,
     entries: Arc<Queue<Entry>>,
-    /// Writes them.
     writer: Option<JoinHandle<FrameLog>>,
     health: Arc<RecordHealth>,
     made_frames: bool,
@@ -206,8 +202,8 @@ impl Recorder {
         self
     }
 
-    /// Hands everything to the operating system and ends the log. A disk that does not take it within seconds has lost the
-    /// record.
+    /// Hands everything to the operating system and ends the log. A disk that does not take it within seconds has lost
+    /// the record.
     pub(crate) fn finish(&mut self) {
         self.end_writing();
         self.log.flush();
@@ -215,8 +211,8 @@ impl Recorder {
         self.log.end();
     }
 
-    /// Ends the record of a run that failed. Where no frame was ever made it is taken away again, so that the same directory
-    /// may be named again.
+    /// Ends the record of a run that failed. Where no frame was ever made it is taken away again, so that the same
+    /// directory may be named again.
     pub(crate) fn fail(mut self, failure: &Failure) {
         let frames = self.end_writing();
         self.log.ended_by(failure);

@@ -31,11 +31,9 @@ pub(crate) const SCENE: &str = "scene.toml";
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct SourceFile {
-    /// Where it was.
     pub path: PathBuf,
     /// What it is called in a report.
     pub name: String,
-    /// Its length.
     pub bytes: u64,
     /// XXH3 of 64 bits of its content, hexadecimal.
     pub xxh3: String,
@@ -117,7 +115,6 @@ pub(crate) enum SceneSource {
         fit: Fit,
         /// A `scene.toml` for them, with the names that they have in a report.
         description: String,
-        /// The pictures.
         files: Vec<SourceFile>,
     },
 }

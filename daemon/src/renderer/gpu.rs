@@ -1,5 +1,5 @@
-//! The renderer on the GPU. Where its device fails, that is opened anew; where it fails again and again, or is gone, the
-//! processor takes over, so that the display goes on.
+//! The renderer on the GPU. Where its device fails, that is opened anew; where it fails again and again, or is gone,
+//! the processor takes over, so that the display goes on.
 
 use std::sync::Arc;
 

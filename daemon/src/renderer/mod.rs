@@ -23,7 +23,8 @@ pub trait Renderer: Send {
     /// Writes the levels of the hologram of `frame` for an eye with `pupil` to `levels`, which has the panel's layout.
     /// On the processor it does not allocate, once some frames have been rendered; what a GPU's driver does is its own.
     ///
-    /// Of a pupil beyond those that the weights were trained for, the network is told the nearest; blur and stop are its own.
+    /// Of a pupil beyond those that the weights were trained for, the network is told the nearest; blur and stop are
+    /// its own.
     ///
     /// # Errors
     /// [`EngineError`] for a frame of another size than the renderer was made for, a pupil that is none, and
@@ -76,8 +77,8 @@ pub struct Rendered {
 
 /// A renderer of frames of the pattern's size of `encoder`, on the optics of `bench`.
 ///
-/// `Auto` takes a GPU where there is one that will do, else the processor; `Gpu` a GPU, or where there is none a processor
-/// that plays one. `GpuHalf` is as `Gpu`, in half precision where the device has it.
+/// `Auto` takes a GPU where there is one that will do, else the processor; `Gpu` a GPU, or where there is none a
+/// processor that plays one. `GpuHalf` is as `Gpu`, in half precision where the device has it.
 ///
 /// # Errors
 /// The backend is not to be had.

@@ -51,7 +51,6 @@ pub(super) struct Session<'a> {
     pub(super) watch: Watch<'a>,
     /// Ends panel and lasers.
     pub(super) output: OutputControl,
-    /// Makes frames.
     pub(super) frame_thread: JoinHandle<Result<(), EngineError>>,
     /// Ends the frame thread.
     pub(super) stop: Arc<AtomicBool>,

@@ -42,7 +42,6 @@ pub(super) struct FrameLoop {
     pub changes: rtrb::Consumer<(u32, Change)>,
     /// Whose place was taken: giving back what it has is nothing for this thread.
     pub retired: rtrb::Producer<Change>,
-    /// To whoever records.
     pub records: rtrb::Producer<LoopRecord>,
     /// Records that found no room.
     pub records_lost: Arc<AtomicU64>,
@@ -75,7 +74,6 @@ pub(super) const RECORDS: usize = 1024;
 /// What the loop tells of one frame.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct LoopRecord {
-    /// Times and pupil.
     pub frame: FrameRecord,
     /// Whether the pupil is one that the network was not trained for.
     pub beyond_trained: bool,

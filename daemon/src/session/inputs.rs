@@ -41,7 +41,6 @@ pub(super) enum Inputs {
 pub(super) struct Followed {
     /// The tracker's newest estimate.
     pub(super) pupil: EstimateReader,
-    /// What to show.
     pub(super) pictures: PictureSource,
     /// What a person changes.
     pub(super) steering: Arc<Steering>,
@@ -117,7 +116,6 @@ pub(crate) struct Cue {
     pub(crate) frame: u64,
     /// The pupil that it was made for.
     pub(crate) pupil: PupilDiameter,
-    /// The estimator's state.
     pub(crate) pupil_state: &'static str,
     /// The place of its picture in [`Playback::pictures`].
     pub(crate) picture: usize,

@@ -17,7 +17,8 @@ impl LaserBoxWatch {
         Self { faults, link, lost: None, fault: None }
     }
 
-    /// Takes note of everything that the laser thread has said. `armed`: lasers may be lit, so whatever was wrong is over.
+    /// Takes note of everything that the laser thread has said. `armed`: lasers may be lit, so whatever was wrong is
+    /// over.
     pub(super) fn drain(&mut self, armed: bool) {
         while let Ok(fault) = self.faults.pop() {
             // Why it is lost is said below, once.

@@ -190,7 +190,8 @@ impl Watch<'_> {
     }
 }
 
-/// What `new` says of the keys that it changes, in the rig file's own units. A weights file that is read anew is a change.
+/// What `new` says of the keys that it changes, in the rig file's own units. A weights file that is read anew is a
+/// change.
 fn changed_keys(new: &NewRig, old: &Rig) -> BTreeMap<&'static str, Value> {
     let NewRig { rig: new, engine } = new;
     let value = |key| match key {

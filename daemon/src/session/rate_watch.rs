@@ -14,7 +14,8 @@ pub(super) struct RateWatch {
 }
 
 impl RateWatch {
-    /// Frames a second since the first one came on the panel; once, when that is known. `frames_shown` have come by `now`.
+    /// Frames a second since the first one came on the panel; once, when that is known. `frames_shown` have come by
+    /// `now`.
     pub(super) fn reached_hz(&mut self, frames_shown: u64, now: TimeNs) -> Option<f64> {
         if frames_shown == 0 || self.told {
             return None;

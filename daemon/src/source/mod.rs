@@ -124,7 +124,8 @@ enum Shown {
     Live { frame: Arc<RgbdFrame>, tag: PictureTag },
 }
 
-/// How a camera took a picture, where a feed's client says so. It is recorded and told, and changes nothing that is shown.
+/// How a camera took a picture, where a feed's client says so. It is recorded and told, and changes nothing that is
+/// shown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct PictureView {
     /// The distance at which it was focused, in dioptres.
@@ -199,8 +200,8 @@ impl PictureSink {
         self.scenes.push(frames);
     }
 
-    /// Shows a live picture from the next frame on, where those are shown, and says whether they are. Whoever has it keeps
-    /// its frame alive.
+    /// Shows a live picture from the next frame on, where those are shown, and says whether they are. Whoever has it
+    /// keeps its frame alive.
     ///
     /// # Panics
     /// As [`Self::show_scene`].

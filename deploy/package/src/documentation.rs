@@ -1,5 +1,5 @@
-//! The pages and examples of `/usr/share/doc/holod`: those of the sources, with links that lead to where things are once
-//! they are installed. A link to what the package does not hold becomes its text.
+//! The pages and examples of `/usr/share/doc/holod`: those of the sources, with links that lead to where things are
+//! once they are installed. A link to what the package does not hold becomes its text.
 
 use std::fs;
 use std::io;
@@ -189,7 +189,8 @@ mod tests {
             .collect()
     }
 
-    /// Links of the pages in `folder` that lead to nothing there, or out of it and not to what the package has elsewhere.
+    /// Links of the pages in `folder` that lead to nothing there, or out of it and not to what the package has
+    /// elsewhere.
     fn dead(folder: &Path) -> Vec<String> {
         let mut dead = Vec::new();
         for page in pages(folder) {

@@ -12,15 +12,15 @@ use serde::Serialize;
 
 /// What one frame of the built-in networks costs on graphics cards that are not there, by a model.
 ///
-/// Each shader is compiled by Mesa's RADV for a card that it only pretends to have, and its time is worked out: by arithmetic,
-/// the instructions of its loops times their trips at the card's clock, and by bytes, each buffer once at the card's
-/// bandwidth. A dispatch takes the longer of the two, and a frame the sum of its dispatches.
+/// Each shader is compiled by Mesa's RADV for a card that it only pretends to have, and its time is worked out: by
+/// arithmetic, the instructions of its loops times their trips at the card's clock, and by bytes, each buffer once at
+/// the card's bandwidth. A dispatch takes the longer of the two, and a frame the sum of its dispatches.
 ///
 /// Nothing is run or measured: the model knows neither latency nor caches nor the time between dispatches. It compares
 /// kernels and finds registers that spill; it does not replace a measurement.
 ///
-/// Needs Mesa 22.3 to 25 with RADV (Debian: mesa-vulkan-drivers), or that which VK_DRIVER_FILES names. Exit code 70: a register
-/// spills or a shader does not compile; 69: there is no such driver.
+/// Needs Mesa 22.3 to 25 with RADV (Debian: mesa-vulkan-drivers), or that which VK_DRIVER_FILES names. Exit code 70: a
+/// register spills or a shader does not compile; 69: there is no such driver.
 #[derive(Parser)]
 #[command(version)]
 struct Cli {

@@ -23,8 +23,8 @@ impl DiscTable {
     /// For `layers` of the depth range of `bench`, on a grid of `sample_rad` from one sample to the next.
     ///
     /// The largest argument is that of the whole range at the widest pupil, of the highest frequency, half a cycle a
-    /// sample each way: 1.11 to a panel pixel of blur on the half-band grid, so a bench of 250 px at 8 mm has 180 thousand
-    /// entries. A frame reads only those up to its own pupil's.
+    /// sample each way: 1.11 to a panel pixel of blur on the half-band grid, so a bench of 250 px at 8 mm has 180
+    /// thousand entries. A frame reads only those up to its own pupil's.
     pub(super) fn new(bench: &DisplayGeometry, layers: usize, sample_rad: f64) -> Self {
         let argument_per_mm = PI * (bench.volume().0 / layers as f64) * 1e-3 / sample_rad;
         let largest = argument_per_mm * f64::from(WIDEST_PUPIL.mm()) * layers as f64 / SQRT_2;

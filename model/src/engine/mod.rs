@@ -23,23 +23,17 @@ pub use gpu::cost as gpu_cost;
 #[cfg(feature = "gpu")]
 pub use gpu::{EncodedCounts, GpuEngine};
 
-/// The widest pupil that engines take. No eye's is half as wide; but scenes of wider ones on one bench stand for those of
-/// eyes on another, whose pixels are finer.
+/// The widest pupil that engines take. No eye's is half as wide; but scenes of wider ones on one bench stand for those
+/// of eyes on another, whose pixels are finer.
 pub const WIDEST_PUPIL: PupilDiameter = PupilDiameter::from_mm(20.0);
 
 /// A frame that an engine refuses.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum EngineError {
     /// A buffer has another size than the engine was made for.
     #[error("{what} is {found}; this engine was made for {expected}: make one for the other size or fit the frame")]
-    Resolution {
-        /// Which buffer.
-        what: &'static str,
-        /// Its size.
-        found: Resolution,
-        /// The engine's size.
-        expected: Resolution,
-    },
+    Resolution { what: &'static str, found: Resolution, expected: Resolution },
     /// There is nothing to render.
     #[error("frame size {resolution}; expected at least one pixel each way")]
     Empty {
@@ -48,10 +42,7 @@ pub enum EngineError {
     },
     /// The pupil is not a positive length, or wider than [`WIDEST_PUPIL`].
     #[error("pupil diameter {pupil_mm} mm; expected a positive number up to {widest_mm}", widest_mm = WIDEST_PUPIL.mm())]
-    Pupil {
-        /// What was given.
-        pupil_mm: f32,
-    },
+    Pupil { pupil_mm: f32 },
     /// The device cannot do it, or failed at it.
     #[error(transparent)]
     Gpu(#[from] GpuError),
@@ -80,8 +71,8 @@ pub struct StageTiming {
     /// Floating-point operations of matrix-like work as its definition has them, two to a multiply-add; 0 for other
     /// stages. Winograd's filtering does with a quarter of those of a plain layer.
     pub flop: u64,
-    /// The least that its definition moves: each map, plane or field that it is given, read once, and each that it hands
-    /// on, written once, without padding. What it makes on the way, parameters and tables do not count. 0 where it is not
-    /// known.
+    /// The least that its definition moves: each map, plane or field that it is given, read once, and each that it
+    /// hands on, written once, without padding. What it makes on the way, parameters and tables do not count. 0 where
+    /// it is not known.
     pub bytes: u64,
 }

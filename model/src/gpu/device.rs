@@ -1,5 +1,5 @@
-//! One device with its queue. Faults that the driver tells late, between calls, are kept and given by the next call that
-//! can fail, so that none is missed.
+//! One device with its queue. Faults that the driver tells late, between calls, are kept and given by the next call
+//! that can fail, so that none is missed.
 
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;

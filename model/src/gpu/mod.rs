@@ -30,8 +30,8 @@ thread_local! {
     static CATCHES: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Whether a panic of this thread would be caught and become a [`GpuError`]: wgpu panics where it finds a device lost. A
-/// panic hook leaves such a one alone.
+/// Whether a panic of this thread would be caught and become a [`GpuError`]: wgpu panics where it finds a device lost.
+/// A panic hook leaves such a one alone.
 pub fn panic_is_caught() -> bool {
     CATCHES.get()
 }
@@ -47,6 +47,7 @@ fn caught<T>(work: impl FnOnce() -> T) -> std::thread::Result<T> {
 
 /// Why the graphics processor cannot be used.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum GpuError {
     /// The program holds no code for it.
     #[error("this program was built without the GPU; build it with `--features gpu`, or choose --backend cpu")]
@@ -62,7 +63,6 @@ pub enum GpuError {
     /// The device could not be opened.
     #[error("the GPU {name} could not be opened: {reason}; choose --backend cpu")]
     Refused {
-        /// The device.
         name: String,
         /// What its driver said.
         reason: String,
@@ -74,11 +74,8 @@ pub enum GpuError {
     TooLarge {
         /// What does not fit.
         what: &'static str,
-        /// Its size.
         bytes: u64,
-        /// The device.
         name: String,
-        /// What fits.
         limit: u64,
     },
     /// A row or a column of the network's grid does not fit in the memory that a workgroup's threads share.
@@ -88,9 +85,7 @@ pub enum GpuError {
     LineTooLong {
         /// Samples of the line.
         samples: usize,
-        /// What it needs.
         bytes: usize,
-        /// What there is.
         limit: usize,
     },
     /// The device failed at work.
@@ -98,7 +93,6 @@ pub enum GpuError {
         "the GPU {name} failed: {reason}; start again, choose a smaller size if its memory was full, or --backend cpu"
     )]
     Failed {
-        /// The device.
         name: String,
         /// What its driver said.
         reason: String,

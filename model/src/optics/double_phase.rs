@@ -30,14 +30,14 @@ pub(crate) const CORRECTION_GAIN: f32 = 2.0;
 /// and the mean of the two phasors is a. Their difference, a checkerboard of u, is stopped in the Fourier plane only as
 /// far as u changes slowly from pixel to pixel, but where there is no light, the phase of c is noise. Therefore:
 ///
-/// - The carrier is smooth where it is dark: a block of 4x4 pixels has the phase of its mean, each quarter of it that of
-///   its own mean and a little of the block's, each pixel its own and a little of its quarter's. Means are weighted by
-///   intensity. A little is as much as a pixel has that is dark beside its surroundings.
-/// - What is still wrong in the band is taken from the phasors: the error, a less the phasor, through a binomial filter,
-///   is added to the phasor, twice, before its phase is taken. One step of Gerchberg and Saxton's (1972).
+/// - The carrier is smooth where it is dark: a block of 4x4 pixels has the phase of its mean, each quarter of it that
+///   of its own mean and a little of the block's, each pixel its own and a little of its quarter's. Means are weighted
+///   by intensity. A little is as much as a pixel has that is dark beside its surroundings.
+/// - What is still wrong in the band is taken from the phasors: the error, a less the phasor, through a binomial
+///   filter, is added to the phasor, twice, before its phase is taken. One step of Gerchberg and Saxton's (1972).
 ///
-/// K is fixed, so brightness does not flicker from frame to frame; what exceeds it is clipped and counted. An eye behind
-/// the 4f stop sees c/K, so intensities are multiplied by K² to compare.
+/// K is fixed, so brightness does not flicker from frame to frame; what exceeds it is clipped and counted. An eye
+/// behind the 4f stop sees c/K, so intensities are multiplied by K² to compare.
 ///
 /// The threads that it works on are those of the [`WorkerPool`](crate::WorkerPool) that it is called in, elsewhere
 /// rayon's own.
@@ -149,9 +149,7 @@ fn mirrored(padded: usize, count: usize) -> usize {
 
 /// A row of samples: a of c.
 struct ClippedRow<'a> {
-    /// c.
     field: &'a [Complex32],
-    /// Becomes a.
     clipped: &'a mut [Complex32],
     /// Of each tile that the row crosses; its intensities are added.
     power: &'a mut [f32],
@@ -185,8 +183,8 @@ impl Task for ClippedRow<'_> {
 
 /// Makes c a, adds its intensities to `power`, and to `inside` how many samples were not clipped.
 ///
-/// Every `if` of this and what follows chooses between values that are both computed, so that the compiler makes vectors
-/// of the loops.
+/// Every `if` of this and what follows chooses between values that are both computed, so that the compiler makes
+/// vectors of the loops.
 #[inline(always)]
 fn clip(samples: &mut [Complex32; TILE], power: &mut f32, inside: &mut u32, amplitude_scale: f32) {
     let (mut intensity, mut unclipped) = ([0.0; TILE], [0; TILE]);
@@ -272,8 +270,8 @@ fn write<const N: usize>(values: &[f32; N], to: &mut [f32]) {
     }
 }
 
-/// The carriers of the quarters of blocks of 4x4 pixels in four rows, of the upper and of the lower quarters, at each of
-/// their columns.
+/// The carriers of the quarters of blocks of 4x4 pixels in four rows, of the upper and of the lower quarters, at each
+/// of their columns.
 #[inline(always)]
 fn quarter_carriers(lines: &[Line; 4], floor: f32) -> [Line; 2] {
     let mut means = [[[0.0; TILE / 2]; 2]; 2];

@@ -19,8 +19,8 @@ pub struct Eye {
 /// The bench's optics from the panel to a retina.
 ///
 /// Light leaves the panel, passes the 4f stop (|fx|, |fy| < 1/4p) and the pupil (a disc of radius (s/2)/(λf) in the
-/// panel's spectrum), and is focused at u = f²·D. Both stops are hard. The panel is surrounded by darkness, unless it is
-/// [`repeating`](Self::repeating).
+/// panel's spectrum), and is focused at u = f²·D. Both stops are hard. The panel is surrounded by darkness, unless it
+/// is [`repeating`](Self::repeating).
 pub struct SimulatedEye {
     geometry: DisplayGeometry,
     propagator: Propagator,

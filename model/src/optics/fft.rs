@@ -118,8 +118,8 @@ impl<T: FftNum> TransposedFft2d<T> {
     }
 }
 
-/// Two-dimensional circular transforms of several planes at once, between which something is done with the spectra of all
-/// of them, column by column, while these are in the cache.
+/// Two-dimensional circular transforms of several planes at once, between which something is done with the spectra of
+/// all of them, column by column, while these are in the cache.
 pub(crate) struct PlanesFft {
     width: usize,
     height: usize,

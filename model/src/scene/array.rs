@@ -47,28 +47,20 @@ pub struct ArrayPicture<'a> {
 
 /// Why a picture cannot be shown.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum ArrayError {
     /// An array has another number of values than the picture has.
     #[error("{what}: found {found} values, expected {expected}")]
-    Length {
-        /// Colours or depths.
-        what: &'static str,
-        /// Values found.
-        found: usize,
-        /// Values expected.
-        expected: usize,
-    },
+    Length { what: &'static str, found: usize, expected: usize },
     /// Colour values are none.
     #[error(
         "colours: {count} values are outside 0..=1 or not finite, the first {found} ({colour} in row {row}, column {column}); \
          expected 0 to 1: scale the picture so that white is 1, or clip what is brighter"
     )]
     Colours {
-        /// How many.
         count: usize,
         /// The first of them.
         found: f32,
-        /// Its colour.
         colour: Colour,
         /// Its row, from 0.
         row: usize,
@@ -81,7 +73,6 @@ pub enum ArrayError {
          correct them or the unit, or have them filled from their surroundings"
     )]
     Missing {
-        /// How many.
         count: usize,
         /// Of how many.
         pixels: usize,

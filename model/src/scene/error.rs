@@ -7,11 +7,11 @@ use holod_calibration::Resolution;
 /// A scene that cannot be loaded. Each message says which file, line or key it is about, what was found, what was
 /// expected and what to do.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum SceneError {
     /// A file or directory cannot be read.
     #[error("scene {path}: {source}; expected {expected}", path = path.display())]
     Read {
-        /// The path.
         path: PathBuf,
         /// What the system said.
         source: std::io::Error,
@@ -21,9 +21,7 @@ pub enum SceneError {
     /// The path is of another kind than it should be.
     #[error("scene {path}: found {found}; expected {expected}", path = path.display())]
     Kind {
-        /// The path.
         path: PathBuf,
-        /// What is there.
         found: String,
         /// What should be there.
         expected: &'static str,
@@ -31,61 +29,35 @@ pub enum SceneError {
     /// A line of a scene file cannot be used.
     #[error("{path}, line {line}: `{key}`: found {found}; expected {expected}", path = path.display())]
     Description {
-        /// The scene file.
         path: PathBuf,
         /// Line, from 1.
         line: usize,
-        /// The key.
         key: String,
-        /// What was found.
         found: String,
-        /// What was expected.
         expected: String,
     },
     /// The depth encoding is not named, or not one of those known.
     #[error(
         "depth encoding: found {found}; expected metres, millimetres, dioptres or normalised_dioptres[:FAR,NEAR] (ends in dioptres): give it with --depth-encoding"
     )]
-    DepthEncoding {
-        /// What was found.
-        found: String,
-    },
+    DepthEncoding { found: String },
     /// A picture file is damaged, truncated or of a kind that is not read.
     #[error("{path}: {found}; expected {expected}", path = path.display())]
     Picture {
-        /// The file.
         path: PathBuf,
-        /// What was found.
         found: String,
         /// What was expected and what to do.
         expected: String,
     },
     /// Colour and depth differ in size.
     #[error("{depth} is {depth_size} and {colour} is {colour_size}; expected one size: export both alike, or ask for a fit (contain, cover or crop), which resamples depth of the same aspect ratio", depth = depth.display(), colour = colour.display())]
-    SizesDiffer {
-        /// The colour file.
-        colour: PathBuf,
-        /// Its size.
-        colour_size: Resolution,
-        /// The depth file.
-        depth: PathBuf,
-        /// Its size.
-        depth_size: Resolution,
-    },
+    SizesDiffer { colour: PathBuf, colour_size: Resolution, depth: PathBuf, depth_size: Resolution },
     /// The picture is larger than the frame and no fit was asked for.
     #[error("{path} is {found}; expected at most {wanted}: ask for a fit (contain, cover or crop)", path = path.display())]
-    TooLarge {
-        /// The colour file.
-        path: PathBuf,
-        /// Its size.
-        found: Resolution,
-        /// The frame's size.
-        wanted: Resolution,
-    },
+    TooLarge { path: PathBuf, found: Resolution, wanted: Resolution },
     /// The sequence has no such frame.
     #[error("scene {path}: found {frames} frames; expected more than {index}", path = path.display())]
     NoSuchFrame {
-        /// The scene.
         path: PathBuf,
         /// The frame asked for.
         index: usize,

@@ -296,8 +296,8 @@ impl LiveReader {
         }
     }
 
-    /// Makes `frame`, which has the reader's size, of one picture's colours and depths as they are stored. Where this fails
-    /// it holds nothing of worth.
+    /// Makes `frame`, which has the reader's size, of one picture's colours and depths as they are stored. Where this
+    /// fails it holds nothing of worth.
     ///
     /// # Errors
     /// No pixel has a depth.

@@ -182,7 +182,8 @@ impl Scene {
         Ok((frame, report))
     }
 
-    /// Loads frame `index` as [`Self::load`] does, for any bench. What the picture does not reach is black, at infinity.
+    /// Loads frame `index` as [`Self::load`] does, for any bench. What the picture does not reach is black, at
+    /// infinity.
     pub fn picture(&self, index: usize, resolution: Option<Resolution>, fit: Fit) -> Result<ScenePicture, SceneError> {
         let ScenePicture { resolution: size, linear, depth_dpt, mut report } = self.read(index, fit)?;
         let (placement, resolution) = self.placement(index, size, resolution, fit)?;

@@ -17,7 +17,6 @@ use super::depth::DepthNumbers;
 
 /// A decoded file.
 struct Picture {
-    /// The display window.
     size: Resolution,
     /// Position of the display window's first pixel.
     origin: [i64; 2],

@@ -12,8 +12,8 @@ const INK: Rgb = [0.03, 0.03, 0.05];
 const SLATE: Rgb = [0.03, 0.05, 0.09];
 const CHALK: Rgb = [0.78, 0.82, 0.80];
 
-/// Angles of the composition in units of the picture: x from -1 at the left to 1 at the right, y likewise downwards, and
-/// lengths in `unit`, the same along both.
+/// Angles of the composition in units of the picture: x from -1 at the left to 1 at the right, y likewise downwards,
+/// and lengths in `unit`, the same along both.
 struct Stage {
     half_width: f32,
     half_height: f32,

@@ -1,6 +1,7 @@
 //! A stroke font of capitals and digits, drawn on a 4 x 6 grid (y down), for text on scene surfaces.
 
-/// Distance from (x, y) to the strokes of `letter`, all in grid units (a letter is 4 wide and 6 high); infinite for a blank.
+/// Distance from (x, y) to the strokes of `letter`, all in grid units (a letter is 4 wide and 6 high); infinite for a
+/// blank.
 pub(super) fn stroke_distance(letter: u8, x: f32, y: f32) -> f32 {
     let mut nearest = f32::INFINITY;
     for polyline in strokes(letter).split(' ').filter(|line| !line.is_empty()) {

@@ -1,8 +1,8 @@
 //! Thin-lens images on a graphics processor: `view.wgsl` draws the views, `thin_lens.wgsl` adds them.
 //!
-//! The scene is composed and baked on the processor; its surfaces, texels and triangles are sent over once. The rays are
-//! those of the CPU, so the images agree to rounding, not only on average; texels are sent as half floats, which is what
-//! shards keep of the images.
+//! The scene is composed and baked on the processor; its surfaces, texels and triangles are sent over once. The rays
+//! are those of the CPU, so the images agree to rounding, not only on average; texels are sent as half floats, which is
+//! what shards keep of the images.
 
 use bytemuck::{Pod, Zeroable};
 use half::f16;

@@ -20,9 +20,9 @@ pub(super) struct ViewPoint {
 /// `count` points spread evenly over the ring between two radii, in pixels per dioptre. `lifts` are the distances in
 /// dioptres from the grids' depth to the focus planes.
 ///
-/// The aperture points are a Kronecker sequence of the plastic number. The offsets are chosen one after another: of a few
-/// candidates the one that makes the rays' places within the pixels of all focus planes together most even, which is to
-/// say that makes the power of their low frequencies least.
+/// The aperture points are a Kronecker sequence of the plastic number. The offsets are chosen one after another: of a
+/// few candidates the one that makes the rays' places within the pixels of all focus planes together most even, which
+/// is to say that makes the power of their low frequencies least.
 pub(super) fn view_points(inner: f32, outer: f32, count: usize, lifts: &[f32], key: u64) -> Vec<ViewPoint> {
     // The root of g³ = g + 1.
     const G: f64 = 1.324_717_957_244_746;

@@ -38,8 +38,8 @@ pub(super) fn room(random: &mut Random, stage: &Stage) -> Vec<Surface> {
     surfaces
 }
 
-/// `side`: 0 floor, 1 ceiling, 2 right, 3 left. The depth is `nearest` at the picture's edge. `lamp`: how bright the near
-/// end is, and the far end's share of it.
+/// `side`: 0 floor, 1 ceiling, 2 right, 3 left. The depth is `nearest` at the picture's edge. `lamp`: how bright the
+/// near end is, and the far end's share of it.
 fn side_wall(
     stage: &Stage,
     side: usize,

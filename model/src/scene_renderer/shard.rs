@@ -1,11 +1,12 @@
 //! Shards: one safetensors file for each scene, with its picture, depth and focal stacks.
 //!
-//! `scene_000123.safetensors` holds `image` F16 [3, H, W] (linear light, pinhole), `depth` F32 [H, W] (normalised, 0 far,
-//! 1 near) and `stack_0` … `stack_n` F16 [planes, 3, H, W] (linear light, one for each pupil). Its metadata are strings:
-//! `format` = "holod-scene-1", `generator` (see [`GENERATOR`]), `kind`, `seed`, `index`, `pupils_mm` and `focus_dpt` (JSON
-//! lists, which other scenes of the folder need not share), those of the bench on which the scene is seen: `far_dpt`,
-//! `near_dpt`, `pixel_angle_rad`, `wavelengths_nm` (JSON list), `pixel_pitch_um`; `rays`, and `traced_by`: `cpu` or a
-//! device's name.
+//! `scene_000123.safetensors` holds `image` F16 [3, H, W] (linear light, pinhole), `depth` F32 [H, W] (normalised, 0
+//! far,
+//! 1 near) and `stack_0` … `stack_n` F16 [planes, 3, H, W] (linear light, one for each pupil). Its metadata are
+//! strings: `format` = "holod-scene-1", `generator` (see [`GENERATOR`]), `kind`, `seed`, `index`, `pupils_mm` and
+//! `focus_dpt` (JSON lists, which other scenes of the folder need not share), those of the bench on which the scene is
+//! seen: `far_dpt`, `near_dpt`, `pixel_angle_rad`, `wavelengths_nm` (JSON list), `pixel_pitch_um`; `rays`, and
+//! `traced_by`: `cpu` or a device's name.
 //!
 //! While a shard is made, memory holds its stacks as F16 and, once, the F32 sums of one: at 1920x1080 12 MB and 25 MB a
 //! plane. It is written from there, and read for a sheet, without a copy of the whole.
@@ -29,8 +30,8 @@ pub const FORMAT: &str = "holod-scene-1";
 /// The generation of the random scenes: the same kind, seed and index give the same scene within one generation only.
 /// Shards that name none are of the first.
 pub const GENERATOR: u32 = 2;
-/// Blur over the depth volume, in panel pixels, that scenes are made for: less is hardly any, and more would be as large
-/// as the objects.
+/// Blur over the depth volume, in panel pixels, that scenes are made for: less is hardly any, and more would be as
+/// large as the objects.
 pub const BLUR_RANGE_PX: (f64, f64) = (5.0, 250.0);
 /// No eye's is wider; of small displays whose pixels subtend much, a wider one may be asked for all the same.
 const WIDEST_MM: f32 = 20.0;
@@ -221,11 +222,11 @@ pub struct PlannedScene {
 
 /// Why a shard could not be written.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum ShardError {
     /// The output folder cannot be made or written to.
     #[error("cannot write to the folder {}: {source}; choose another with --out", path.display())]
     Folder {
-        /// The folder.
         path: PathBuf,
         /// What the system said.
         source: io::Error,
@@ -233,23 +234,16 @@ pub enum ShardError {
     /// A file could not be read.
     #[error("cannot read {}: {source}; choose another folder with --out", path.display())]
     Read {
-        /// The file.
         path: PathBuf,
         /// What the system said.
         source: io::Error,
     },
     /// A file could not be written.
     #[error("cannot write {}: {reason}", path.display())]
-    Write {
-        /// The file.
-        path: PathBuf,
-        /// What went wrong.
-        reason: String,
-    },
+    Write { path: PathBuf, reason: String },
     /// A file of that name is there and holds something else.
     #[error("{} is there already, but {found}, where {expected} was expected; remove it or choose another --out", path.display())]
     Occupied {
-        /// The file.
         path: PathBuf,
         /// What the file holds.
         found: String,
@@ -259,7 +253,6 @@ pub enum ShardError {
     /// A file is not a shard.
     #[error("{} is not a scene shard: {reason}", path.display())]
     Malformed {
-        /// The file.
         path: PathBuf,
         /// What is wrong with it.
         reason: String,

@@ -29,7 +29,8 @@ impl Reach {
 pub(super) struct Stage {
     pub(super) half_width: f32,
     pub(super) half_height: f32,
-    /// 1 for a picture of 256 by 256 pixels. Half of what a larger picture gains is larger objects, half is more of them.
+    /// 1 for a picture of 256 by 256 pixels. Half of what a larger picture gains is larger objects, half is more of
+    /// them.
     pub(super) scale: f32,
     pub(super) near: f32,
     pub(super) kind: SceneKind,

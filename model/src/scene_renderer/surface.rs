@@ -191,7 +191,8 @@ impl Surface {
     }
 }
 
-/// Columns, rows and texels: each the mean of four samples that are painted, and the share of those as the fourth number.
+/// Columns, rows and texels: each the mean of four samples that are painted, and the share of those as the fourth
+/// number.
 fn bake_texels(bounds: Bounds, mut paint: impl FnMut(f32, f32) -> Option<Rgb>) -> (i32, i32, Vec<[f32; 4]>) {
     let columns = ((bounds.right - bounds.left) * TEXELS_PER_PIXEL).ceil().max(1.0) as i32;
     let rows = ((bounds.bottom - bounds.top) * TEXELS_PER_PIXEL).ceil().max(1.0) as i32;

@@ -716,7 +716,8 @@ mod on_a_gpu {
         let scene = Scene { resolution: size, ..scene(vec![card(0.4)]) };
         let focus = [0.0, 0.4, 0.9, 1.4, 2.0].map(Dioptres);
         let mut gpu = device();
-        // Sums of three planes and the other two; three views for the narrow pupil and two for the wide one, and a rest.
+        // Sums of three planes and the other two; three views for the narrow pupil and two for the wide one, and a
+        // rest.
         gpu.largest_buffer = 153_000;
         let tracer_of_parts = tracer(gpu);
         assert_agree("in parts", &both(&tracer_of_parts, &scene, &[mm(1.0), mm(2.0)], &focus, 17));

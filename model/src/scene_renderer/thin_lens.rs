@@ -1,9 +1,9 @@
 //! Pinhole pictures and thin-lens focal stacks.
 //!
 //! A ray is a straight line in (x, y, dioptre), so one traced ray belongs to every focus plane: it lands in the pixel
-//! where it crosses that plane. All rays through one aperture point form a [`View`] on a grid of one ray a pixel; at each
-//! focus plane the view is displaced as a whole, so that each pixel gets exactly one ray of it, and adding views is adding
-//! rows of numbers. Nothing is divided by a random weight: energy is kept exactly.
+//! where it crosses that plane. All rays through one aperture point form a [`View`] on a grid of one ray a pixel; at
+//! each focus plane the view is displaced as a whole, so that each pixel gets exactly one ray of it, and adding views
+//! is adding rows of numbers. Nothing is divided by a random weight: energy is kept exactly.
 //!
 //! `points` says which aperture points these are, and where in its pixel each view's ray is.
 //!

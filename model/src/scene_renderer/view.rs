@@ -1,13 +1,14 @@
 //! One view of a scene: a ray through one point of the aperture for each sample of a regular grid.
 //!
 //! Rays through one aperture point are parallel in (x, y, dioptre), so a view is an oblique parallel projection of that
-//! space, and surfaces are drawn into it row by row with a depth buffer: planes and ellipsoids by their equations, meshes
-//! triangle by triangle. Every sample gets exactly what its ray meets first.
+//! space, and surfaces are drawn into it row by row with a depth buffer: planes and ellipsoids by their equations,
+//! meshes triangle by triangle. Every sample gets exactly what its ray meets first.
 
 use super::grid::Grid;
 use super::surface::{Mesh, Ray, Shape, Surface};
 
-/// The aperture point that a view's rays pass through, in pixels per dioptre, and the depth at which they pass the grid.
+/// The aperture point that a view's rays pass through, in pixels per dioptre, and the depth at which they pass the
+/// grid.
 #[derive(Clone, Copy)]
 pub(super) struct Aim {
     pub(super) ax: f32,

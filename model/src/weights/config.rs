@@ -12,8 +12,8 @@ pub(crate) const CONDITIONS: usize = 2;
 /// Real and imaginary residual of three colours.
 pub(crate) const OUTPUT_CHANNELS: usize = 6;
 
-/// Outputs of the first net of `expected-stack` for each depth layer: the phases of three colours and a mask; then, after
-/// those of all layers, changes of three colours' amplitudes if it refines the stack.
+/// Outputs of the first net of `expected-stack` for each depth layer: the phases of three colours and a mask; then,
+/// after those of all layers, changes of three colours' amplitudes if it refines the stack.
 pub(crate) const LIT: usize = 4;
 pub(crate) const REFINED: usize = 3;
 

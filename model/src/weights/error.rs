@@ -9,29 +9,23 @@ pub(super) const OLD_FORMAT: &str = "holod-weights-1";
 
 /// Weights that cannot be used.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum WeightsError {
     /// The file cannot be read.
     #[error("weights {path}: {source}; expected a safetensors file that holod's trainer exported", path = path.display())]
     Read {
-        /// The file.
         path: PathBuf,
         /// What the system said.
         source: std::io::Error,
     },
     /// The path is a directory or the file is far too large.
     #[error("weights {path}: found {found}; expected a safetensors file of at most 256 MiB", path = path.display())]
-    NotAFile {
-        /// The path.
-        path: PathBuf,
-        /// What is there.
-        found: String,
-    },
+    NotAFile { path: PathBuf, found: String },
     /// The bytes are no safetensors file.
     #[error(
         "weights {name}: not a valid safetensors file ({detail}); the file is damaged or of another kind: export or copy it again"
     )]
     Damaged {
-        /// Which weights.
         name: String,
         /// What the parser said.
         detail: String,
@@ -41,13 +35,10 @@ pub enum WeightsError {
         "weights {name}: metadata `{key}` is {found}; expected {expected}; export the weights with this version's trainer"
     )]
     Metadata {
-        /// Which weights.
         name: String,
         /// The metadata key, with a path inside it where it is structured.
         key: String,
-        /// What was found.
         found: String,
-        /// What was expected.
         expected: String,
     },
     /// The file is of a format that this version no longer runs.
@@ -56,20 +47,8 @@ pub enum WeightsError {
          expected \"{FORMAT}\"; convert it with `python -m holod_training export --source FILE --out NEW`; it then needs a \
          short training: model/training/README.md"
     )]
-    OldFormat {
-        /// Which weights.
-        name: String,
-    },
+    OldFormat { name: String },
     /// One tensor is missing or cannot be used.
     #[error("weights {name}: tensor `{tensor}` is {found}; expected {expected}")]
-    Tensor {
-        /// Which weights.
-        name: String,
-        /// The tensor's name.
-        tensor: String,
-        /// What was found.
-        found: String,
-        /// What was expected.
-        expected: String,
-    },
+    Tensor { name: String, tensor: String, found: String, expected: String },
 }

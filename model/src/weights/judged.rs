@@ -28,8 +28,8 @@ pub struct Judged {
 }
 
 impl JudgedBench {
-    /// Of the benches in a file's metrics the one that is most like `bench` in its diffraction, at the blur that is most
-    /// like that of `pupil` on `bench`.
+    /// Of the benches in a file's metrics the one that is most like `bench` in its diffraction, at the blur that is
+    /// most like that of `pupil` on `bench`.
     pub(super) fn nearest(metrics: &serde_json::Value, bench: &DisplayGeometry, pupil: PupilDiameter) -> Option<Self> {
         let apart = |found: f64, wanted: f64| (found / wanted).ln().abs();
         let mean = |fresnel_px2: &[f64; 3]| fresnel_px2.iter().sum::<f64>() / 3.0;

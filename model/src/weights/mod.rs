@@ -27,7 +27,8 @@ pub(crate) use self::layers::{Adjustable, Dense, Family, Feedback, Layer, OFFSET
 /// Larger files are refused before they are read.
 const LARGEST_FILE_BYTES: u64 = 256 << 20;
 
-/// Weights that were checked as a whole: every tensor is there, finite, and of the shape that the configuration asks for.
+/// Weights that were checked as a whole: every tensor is there, finite, and of the shape that the configuration asks
+/// for.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Weights {
     pub(crate) config: NetworkConfig,
@@ -89,7 +90,8 @@ impl Weights {
     }
 
     /// What the weights reached, when they were judged on several benches, on the one that is most like `bench` in its
-    /// diffraction, at the blur there that is most like that of `pupil` on `bench`. Nothing where the file does not say.
+    /// diffraction, at the blur there that is most like that of `pupil` on `bench`. Nothing where the file does not
+    /// say.
     pub fn judged_on_the_like_of(&self, bench: &DisplayGeometry, pupil: PupilDiameter) -> Option<JudgedBench> {
         JudgedBench::nearest(&self.metrics, bench, pupil)
     }

@@ -7,8 +7,8 @@ use crate::Recording;
 use crate::import::csv::header;
 
 /// Writes `recording` as CSV with the columns `t_ns`, `eye` (left, right, both), `diameter_mm` (or `diameter_px`,
-/// `diameter_arbitrary`), `confidence`, `aperture_mm` (empty where there is none) and `valid` (1, 0). Figures are written
-/// with as many digits as it takes to read the same ones.
+/// `diameter_arbitrary`), `confidence`, `aperture_mm` (empty where there is none) and `valid` (1, 0). Figures are
+/// written with as many digits as it takes to read the same ones.
 ///
 /// # Errors
 /// The file cannot be written.

@@ -21,15 +21,11 @@ pub use lines::write_lines;
 
 /// Why a recording could not be written. Nothing has been changed then.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum ExportError {
     /// The file cannot be written.
     #[error("cannot write {path}: {source}; expected a path in a folder that can be written to, with room on its disk")]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: io::Error,
-    },
+    Io { path: PathBuf, source: io::Error },
     /// The line protocol is in millimetres and the recording is not.
     #[error(
         "cannot write {path} in holod's line protocol: its diameters are millimetres, and those of the recording are \
@@ -37,19 +33,13 @@ pub enum ExportError {
          {unit}), or write CSV, which keeps the unit"
     )]
     NoScale {
-        /// The file.
         path: PathBuf,
         /// The recording's unit.
         unit: &'static str,
     },
     /// The scale is no factor.
     #[error("cannot write {path}: found a scale of {scale}; expected millimetres per unit, a number above 0")]
-    BadScale {
-        /// The file.
-        path: PathBuf,
-        /// The scale.
-        scale: f64,
-    },
+    BadScale { path: PathBuf, scale: f64 },
 }
 
 /// Writes a file whole or not at all.

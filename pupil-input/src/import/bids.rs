@@ -1,9 +1,9 @@
-//! BIDS eye tracking: `<matches>_recording-<label>_physio.tsv[.gz]`, a table without names whose columns are told by the
-//! JSON sidecar of the same stem, with blinks in `<matches>_recording-<label>_physioevents.tsv[.gz]`
+//! BIDS eye tracking: `<matches>_recording-<label>_physio.tsv[.gz]`, a table without names whose columns are told by
+//! the JSON sidecar of the same stem, with blinks in `<matches>_recording-<label>_physioevents.tsv[.gz]`
 //! (<https://bids-specification.readthedocs.io>, physiological recordings).
 //!
-//! Each eye has a file of its own. Whichever is named, the files of the other eyes beside it are read too; a file of both
-//! eyes together (`cyclopean`) only where it is the one that is named.
+//! Each eye has a file of its own. Whichever is named, the files of the other eyes beside it are read too; a file of
+//! both eyes together (`cyclopean`) only where it is the one that is named.
 
 use std::path::{Path, PathBuf};
 
@@ -310,8 +310,8 @@ impl Part {
         LogInput::at(&self.path)
     }
 
-    /// Nanoseconds of one unit of the time column. Where the sidecar gives no unit, or one that is none of time, the usual
-    /// step from row to row is one over the sampling frequency.
+    /// Nanoseconds of one unit of the time column. Where the sidecar gives no unit, or one that is none of time, the
+    /// usual step from row to row is one over the sampling frequency.
     fn ns_per_tick(&self, time: usize, log: &mut LogBuilder) -> Result<f64, ReplayError> {
         let name = self.sidecar.columns()[time].to_owned();
         let stated = self.sidecar.of_column(&name, "Units");
@@ -424,8 +424,8 @@ impl Part {
         }
     }
 
-    /// Events that are called blinks; if there are none, those during which the eye was closed (`blink` = 1), such as the
-    /// saccades that EyeLink puts around each blink.
+    /// Events that are called blinks; if there are none, those during which the eye was closed (`blink` = 1), such as
+    /// the saccades that EyeLink puts around each blink.
     fn blinks(&self, path: &Path, sidecar: &Sidecar, ns_per_tick: Option<f64>) -> Result<Vec<Blink>, ReplayError> {
         let columns = sidecar.columns();
         let column = |wanted: &str| columns.iter().position(|name| name.eq_ignore_ascii_case(wanted));

@@ -1,9 +1,9 @@
 //! SR Research EyeLink: `.asc` as `edf2asc` writes it.
 //!
-//! A line that begins with a number is a sample: time in milliseconds, then x, y and pupil of the left eye, of the right
-//! eye or of both in this order, then whatever else was asked for. All other lines begin with a word; of these
-//! `START`, `END`, `PUPIL`, `SAMPLES`, `SBLINK` and `EBLINK` matter here. A lost eye has `.` for its gaze and 0.0 for its
-//! pupil.
+//! A line that begins with a number is a sample: time in milliseconds, then x, y and pupil of the left eye, of the
+//! right eye or of both in this order, then whatever else was asked for. All other lines begin with a word; of these
+//! `START`, `END`, `PUPIL`, `SAMPLES`, `SBLINK` and `EBLINK` matter here. A lost eye has `.` for its gaze and 0.0 for
+//! its pupil.
 
 use std::f64::consts::PI;
 
@@ -49,7 +49,8 @@ fn is_bare_sample(line: &[u8]) -> bool {
         && (padded || cells.last().is_some_and(|flags| flag_count(flags).is_some()))
 }
 
-/// How many flags the last column of a sample has, if it is flags: 3 of one eye, 5 of two, 13 and 17 with a head target.
+/// How many flags the last column of a sample has, if it is flags: 3 of one eye, 5 of two, 13 and 17 with a head
+/// target.
 fn flag_count(word: &[u8]) -> Option<usize> {
     let flags = matches!(word.len(), 3 | 5 | 13 | 17)
         && word.iter().all(|byte| *byte == b'.' || byte.is_ascii_uppercase())

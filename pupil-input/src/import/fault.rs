@@ -7,43 +7,23 @@ use crate::wire::WireFault;
 
 /// What went wrong with a log as a whole.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum ReplayError {
     /// It cannot be read.
     #[error("pupil log {path}: {source}; expected a readable file")]
-    Io {
-        /// The log.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
+    Io { path: PathBuf, source: std::io::Error },
     /// It is a directory or a device.
     #[error("pupil log {path} is {found}; expected a log file{hint}")]
-    NotAFile {
-        /// The path.
-        path: PathBuf,
-        /// What it is.
-        found: &'static str,
-        /// What to do.
-        hint: &'static str,
-    },
+    NotAFile { path: PathBuf, found: &'static str, hint: &'static str },
     /// Its beginning is of no known format.
     #[error("pupil log {path}, line 1: found {found}; expected one of: {formats}; convert the log to one of these")]
-    UnknownFormat {
-        /// The log.
-        path: PathBuf,
-        /// How it begins.
-        found: String,
-        /// The known formats.
-        formats: String,
-    },
+    UnknownFormat { path: PathBuf, found: String, formats: String },
     /// It is of a known format and wrong as a whole.
     #[error("pupil log {path}{at}: found {found}; expected {expected}")]
     Content {
-        /// The log.
         path: PathBuf,
         /// `, line 7`, or nothing.
         at: String,
-        /// What is there.
         found: String,
         /// What should be there, and what to do.
         expected: String,
@@ -53,9 +33,7 @@ pub enum ReplayError {
         "pupil log {path} holds no sample: {rejected} of its lines were rejected ({reasons}); expected at least one"
     )]
     Empty {
-        /// The log.
         path: PathBuf,
-        /// Rejected lines.
         rejected: u64,
         /// How many for which reason.
         reasons: String,
@@ -66,7 +44,6 @@ pub enum ReplayError {
          sort it by time"
     )]
     Unsorted {
-        /// The log.
         path: PathBuf,
         /// Times that go backwards.
         backwards: u64,

@@ -2,14 +2,14 @@
 //!
 //! # Blinks
 //!
-//! Two counts: those that the log itself tells, and those found here by one rule for every tracker. For each eye a sample
-//! is *shut* where the tracker calls it lost, is less than 0.6 confident of it, or sees the lids less than 0.3 of their
-//! usual distance apart; and it is *low* where the diameter is below 0.8 of what it was, averaged over the 100 ms before:
-//! no pupil narrows so fast, but what a lid leaves of it does. A run of shut and low samples lasts from the last good
-//! sample before it to the first one after it; two runs are one where the gate's guards, 80 ms, leave nothing between
-//! them. A run of 40 to 500 ms is a blink, a longer one a loss, a shorter one a dropout. Where the log has a sign of shut
-//! eyes, a run needs a shut sample; one of low samples alone counts only where it has none. An eye that is shut in more
-//! than half of its samples is not judged.
+//! Two counts: those that the log itself tells, and those found here by one rule for every tracker. For each eye a
+//! sample is *shut* where the tracker calls it lost, is less than 0.6 confident of it, or sees the lids less than 0.3
+//! of their usual distance apart; and it is *low* where the diameter is below 0.8 of what it was, averaged over the 100
+//! ms before: no pupil narrows so fast, but what a lid leaves of it does. A run of shut and low samples lasts from the
+//! last good sample before it to the first one after it; two runs are one where the gate's guards, 80 ms, leave nothing
+//! between them. A run of 40 to 500 ms is a blink, a longer one a loss, a shorter one a dropout. Where the log has a
+//! sign of shut eyes, a run needs a shut sample; one of low samples alone counts only where it has none. An eye that is
+//! shut in more than half of its samples is not judged.
 //!
 //! Two eyes blink together: blinks of the two that overlap or are less than 80 ms apart are one, and where both are
 //! judged, a blink of one eye while the other has neither blink nor loss is a wink or a fault, counted apart.
@@ -75,8 +75,8 @@ pub struct FaultCount {
 pub struct BlinkCounts {
     /// Those that the log or the file beside it tells; those of two eyes that overlap are one.
     pub told: u64,
-    /// Those found: runs of 40 to 500 ms in which the eye is shut by the tracker's own signs, or by a fall of the diameter
-    /// that no pupil makes where the tracker has no sign; of both eyes, where both are measured.
+    /// Those found: runs of 40 to 500 ms in which the eye is shut by the tracker's own signs, or by a fall of the
+    /// diameter that no pupil makes where the tracker has no sign; of both eyes, where both are measured.
     pub found: u64,
     /// Found in one of two eyes only, and not among those above.
     pub found_in_one_eye: u64,
@@ -138,7 +138,8 @@ pub struct Range {
 }
 
 impl LogInfo {
-    /// Looks through a log; diameters are multiplied by `scale_mm_per_unit` where there is one, and are millimetres then.
+    /// Looks through a log; diameters are multiplied by `scale_mm_per_unit` where there is one, and are millimetres
+    /// then.
     pub fn of(recording: &Recording, scale_mm_per_unit: Option<f64>) -> Self {
         let mut notes = recording.notes().to_vec();
         let mut eyes = Vec::new();

@@ -57,8 +57,8 @@ impl Recording {
     /// Reads a log.
     ///
     /// # Errors
-    /// It is no readable file, of no known format, without a single sample, or in no order of time. Single bad lines are
-    /// counted instead: [`Self::faults`].
+    /// It is no readable file, of no known format, without a single sample, or in no order of time. Single bad lines
+    /// are counted instead: [`Self::faults`].
     pub fn read(path: &Path) -> Result<Self, ReplayError> {
         let kind = std::fs::metadata(path).map_err(|source| ReplayError::Io { path: path.into(), source })?.file_type();
         if kind.is_dir() {

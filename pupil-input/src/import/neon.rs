@@ -1,5 +1,5 @@
-//! Pupil Labs Neon: `3d_eye_states.csv` of its cloud, and `eye_state ps1.raw` as the phone writes it, with the blinks of
-//! the file beside either.
+//! Pupil Labs Neon: `3d_eye_states.csv` of its cloud, and `eye_state ps1.raw` as the phone writes it, with the blinks
+//! of the file beside either.
 //!
 //! The layout of the phone's files: one record of 20 little-endian f32 an eye camera frame (14 before eyelids were
 //! measured), their times as i64 nanoseconds in the `.time` file, the fields' names in `eye_state.dtype`; each blink an

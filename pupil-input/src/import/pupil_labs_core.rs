@@ -1,8 +1,8 @@
 //! Pupil Labs Core: `pupil_positions.csv` of its player.
 //!
 //! Both eyes and two kinds of rows interleave: 2-D detection with a diameter in camera pixels, and the 3-D model with
-//! `diameter_3d` in millimetres besides. Where there are 3-D rows the 2-D ones tell nothing more and are left out. Eye 0
-//! is the right one.
+//! `diameter_3d` in millimetres besides. Where there are 3-D rows the 2-D ones tell nothing more and are left out. Eye
+//! 0 is the right one.
 
 use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
@@ -118,8 +118,8 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     Ok(())
 }
 
-/// A model that was not fitted says 0, a negative diameter or nothing, and confidence 0 says that there is no pupil: such
-/// samples are lost. A model fitted badly says 16 mm; that is handed on for the gate to judge.
+/// A model that was not fitted says 0, a negative diameter or nothing, and confidence 0 says that there is no pupil:
+/// such samples are lost. A model fitted badly says 16 mm; that is handed on for the gate to judge.
 fn sample(t: &[u8], eye: &[u8], confidence: &[u8], diameter: Option<&[u8]>) -> Result<LogSample, LogFault> {
     let t = time(t, 0).ok_or(LogFault::BadNumber)?;
     let eye = match eye {

@@ -1,11 +1,11 @@
 //! PupilEXT: the CSV of its data recording, parted by comma, semicolon or tab.
 //!
-//! Names are `diameter_px`, `physicalDiameter_mm`, `confidence` and so on up to version 0.1.2, with `A` or `B` behind the
-//! first word where there are two pupils and `Main` or `Sec` where there are two views (`diameterAMain_px`), and later
-//! `pupilDiameter_px_R_M` (eye, camera). `A` is the right eye: later versions put R in its place. Of two views the main one
-//! counts; a lone pupil without an eye's letter is [`SampleEye::Both`]. The first versions had their units in brackets
-//! (`timestamp[ms]`, `diameter[px]`, `physicaldiameter[mm]`, `outline_confidence`), and one pupil only, with `Sec` behind
-//! the second view's. (Open-PupilEXT, `eyeDataSerializer`, `pDataTypes` and `dataWriter`.)
+//! Names are `diameter_px`, `physicalDiameter_mm`, `confidence` and so on up to version 0.1.2, with `A` or `B` behind
+//! the first word where there are two pupils and `Main` or `Sec` where there are two views (`diameterAMain_px`), and
+//! later `pupilDiameter_px_R_M` (eye, camera). `A` is the right eye: later versions put R in its place. Of two views
+//! the main one counts; a lone pupil without an eye's letter is [`SampleEye::Both`]. The first versions had their units
+//! in brackets (`timestamp[ms]`, `diameter[px]`, `physicaldiameter[mm]`, `outline_confidence`), and one pupil only,
+//! with `Sec` behind the second view's. (Open-PupilEXT, `eyeDataSerializer`, `pDataTypes` and `dataWriter`.)
 
 use holod_calibration::TimeNs;
 
@@ -21,7 +21,8 @@ use crate::size_unit::SizeUnit;
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::PupilExt, recognises, read };
 
 const TIMES: [&str; 2] = ["timestamp_ms", "timestamp[ms]"];
-/// Eyes, and what stands for each in the names of earlier and of later versions; other letters of later ones are no eye's.
+/// Eyes, and what stands for each in the names of earlier and of later versions; other letters of later ones are no
+/// eye's.
 const PUPILS: [(SampleEye, &str, Option<&str>); 3] =
     [(SampleEye::Both, "", None), (SampleEye::Right, "A", Some("R")), (SampleEye::Left, "B", Some("L"))];
 

@@ -31,8 +31,8 @@ pub(crate) struct LogSample {
     /// 1 where the log has none.
     pub(crate) confidence: f32,
     pub(crate) aperture_mm: Option<f32>,
-    /// False where the log says that the tracker saw no pupil: such a sample tells the gate of a blink, a missing one does
-    /// not.
+    /// False where the log says that the tracker saw no pupil: such a sample tells the gate of a blink, a missing one
+    /// does not.
     pub(crate) valid: bool,
 }
 
@@ -80,7 +80,8 @@ impl LogBuilder {
         self.faults.count(fault);
     }
 
-    /// Takes a sample of line (or record) `line`; one that goes back in time against its own eye is counted and dropped.
+    /// Takes a sample of line (or record) `line`; one that goes back in time against its own eye is counted and
+    /// dropped.
     pub(crate) fn push(&mut self, sample: LogSample, line: u64) {
         let LogSample { t, eye, diameter, confidence, aperture_mm, valid } = sample;
         if t.0.unsigned_abs() > GREATEST_NS {
@@ -213,8 +214,8 @@ impl Recording {
         self.rows.is_empty()
     }
 
-    /// Blinks that the log or a companion file tells, in order of time. They do not reach the gate, since no live tracker
-    /// knows them.
+    /// Blinks that the log or a companion file tells, in order of time. They do not reach the gate, since no live
+    /// tracker knows them.
     pub fn blinks(&self) -> &[Blink] {
         &self.blinks
     }

@@ -16,8 +16,8 @@ pub(super) fn separator(header: &[u8]) -> u8 {
     b"\t;,".iter().copied().max_by_key(|separator| (count(*separator), *separator == b'\t')).unwrap_or(b',')
 }
 
-/// `line` cut at `separator`, the cells trimmed and without quotes around them. In a line with quotes, separators between
-/// two of them do not count, except in a line of tabs, where quotes are text.
+/// `line` cut at `separator`, the cells trimmed and without quotes around them. In a line with quotes, separators
+/// between two of them do not count, except in a line of tabs, where quotes are text.
 pub(super) fn cells(line: &[u8], separator: u8) -> impl Iterator<Item = &[u8]> {
     let mut rest = Some(line);
     let quoted = separator != b'\t' && memchr::memchr(b'"', line).is_some();

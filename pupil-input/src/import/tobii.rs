@@ -212,8 +212,8 @@ fn open(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<Option<(Table, Col
     Ok(Some((table, columns)))
 }
 
-/// The column of a clock that counts microseconds, beside one of `ns_per_unit` nanoseconds: it advances with that one, and
-/// each of the first rows with a pupil has it.
+/// The column of a clock that counts microseconds, beside one of `ns_per_unit` nanoseconds: it advances with that one,
+/// and each of the first rows with a pupil has it.
 fn finer_clock(mut table: Table, columns: &Columns, ns_per_unit: f64) -> Option<usize> {
     let candidates = FINER_TIMES.map(|wanted| table.column(|name| plain_name(name).0 == wanted));
     let mut times = Vec::with_capacity(UNIT_ROWS);

@@ -108,8 +108,8 @@ struct Damage {
     too_short: u64,
 }
 
-/// Goes through the chunks. From where no chunk begins, reading goes on behind the next boundary; a file that is cut off
-/// ends where it is cut off.
+/// Goes through the chunks. From where no chunk begins, reading goes on behind the next boundary; a file that is cut
+/// off ends where it is cut off.
 fn for_chunks(
     input: &LogInput<'_>,
     mut take: impl FnMut(&mut Chunk<'_>) -> io::Result<()>,
@@ -382,8 +382,8 @@ fn channel(node: Node<'_, '_>) -> Channel {
     Channel::Size { eye, measure, unit, factor }
 }
 
-/// Says of which channels the samples are taken: the best unit that there is, and of each eye the first of it. On error,
-/// what streams there are.
+/// Says of which channels the samples are taken: the best unit that there is, and of each eye the first of it. On
+/// error, what streams there are.
 fn choose(streams: &mut BTreeMap<u32, Stream>, log: &mut LogBuilder) -> Result<(), String> {
     let units = [SizeUnit::Millimetres, SizeUnit::Pixels, SizeUnit::Arbitrary];
     let has = |stream: &Stream, wanted: SizeUnit| {

@@ -84,25 +84,19 @@ pub struct Command {
 
 /// Why there is no such profile.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum ProfileError {
     /// No profile of that name is shipped.
     #[error("no tracker profile `{name}`; there are {known}; {advice}")]
     Unknown {
-        /// The name.
         name: String,
         /// The names that there are.
         known: String,
-        /// What to do.
         advice: String,
     },
     /// Its file cannot be read.
     #[error("tracker profile {path}: {reason}; expected a readable TOML file")]
-    Unreadable {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        reason: String,
-    },
+    Unreadable { path: PathBuf, reason: String },
     /// It is wrong.
     #[error("tracker profile {origin}: {}", in_words(.faults))]
     Wrong {

@@ -112,7 +112,6 @@ fn u32_at(bytes: &[u8], at: usize) -> u32 {
 /// What a recording says of itself.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Header {
-    /// The tracker's spec.
     pub(crate) spec: String,
     /// The name of the profile by which it was read.
     pub(crate) profile: String,
@@ -265,7 +264,8 @@ impl<R: Read> RawReader<R> {
         &self.header
     }
 
-    /// The next record; none at the end, of which [`Self::ending`] then tells. After the first call it allocates nothing.
+    /// The next record; none at the end, of which [`Self::ending`] then tells. After the first call it allocates
+    /// nothing.
     pub(crate) fn next(&mut self) -> io::Result<Option<(RecordHead, &[u8])>> {
         if self.ending.is_some() {
             return Ok(None);

@@ -1,9 +1,9 @@
 //! A run written down: the bytes of the link with their times of arrival, and the samples with their verdicts.
 //!
-//! The reader thread puts what it has into rings that were allocated at the start, and never waits: what finds no room is
-//! counted and left out, and the file says so. A thread of its own writes. What it has written is handed to the system ten
-//! times a second and is on the disk after at most a second, so a crash, of the program or of the machine, costs what came
-//! since then and never the file.
+//! The reader thread puts what it has into rings that were allocated at the start, and never waits: what finds no room
+//! is counted and left out, and the file says so. A thread of its own writes. What it has written is handed to the
+//! system ten times a second and is on the disk after at most a second, so a crash, of the program or of the machine,
+//! costs what came since then and never the file.
 
 mod container;
 mod samples;
@@ -35,17 +35,11 @@ impl RecordFiles {
 
 /// Why a run cannot be written down.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum RecordError {
     /// The file cannot be made.
     #[error("recording {path}: {source}; {hint}")]
-    Create {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-        /// What to do.
-        hint: &'static str,
-    },
+    Create { path: PathBuf, source: std::io::Error, hint: &'static str },
     /// The system gave no thread.
     #[error("no thread for the recording: {0}; free memory or raise the limit on threads")]
     Thread(std::io::Error),

@@ -56,8 +56,8 @@ struct Shared {
     failure: Mutex<Option<String>>,
 }
 
-/// Makes the files and starts the thread that writes them; it ends when the taps are dropped. `header` is none where there
-/// is no link whose bytes could be written.
+/// Makes the files and starts the thread that writes them; it ends when the taps are dropped. `header` is none where
+/// there is no link whose bytes could be written.
 pub(crate) fn start(files: &RecordFiles, header: Option<&Header>) -> Result<(Taps, Recorder), RecordError> {
     let shared = Arc::new(Shared::default());
     let mut taps = Taps {
@@ -158,8 +158,8 @@ impl Recorder {
         }
     }
 
-    /// Waits until all is on the disk, some seconds at most: a disk that takes longer has lost the recording. The taps must
-    /// have been dropped.
+    /// Waits until all is on the disk, some seconds at most: a disk that takes longer has lost the recording. The taps
+    /// must have been dropped.
     pub(crate) fn finish(&mut self) {
         self.finish_within(FINISH);
     }
@@ -308,8 +308,8 @@ impl RawWriter {
         Self { ring, head: None, payload, bytes, last, told: 0, out }
     }
 
-    /// Writes every whole record that is in the ring; at the end of a run also that it ended, and of how many pieces the
-    /// file does not tell yet that they were lost.
+    /// Writes every whole record that is in the ring; at the end of a run also that it ended, and of how many pieces
+    /// the file does not tell yet that they were lost.
     fn write(&mut self, end_with_lost: Option<u64>) -> io::Result<()> {
         while let Some((head, length)) = self.head.take().or_else(|| self.next_head()) {
             self.payload.resize(length, 0);

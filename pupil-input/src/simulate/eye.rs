@@ -1,9 +1,9 @@
 //! The simulated eye: iris, hippus and lids.
 //!
 //! After a change of light the iris waits, constricts at up to 5.5 mm/s and dilates again at up to 1.3 mm/s. Where it
-//! settles is Watson and Yellott's (2012) unified formula, for both eyes, their reference age and the field of the default
-//! bench's display; for how long it waits is Link and Stark's (1988) latency for a single step, as Pamplona, Oliveira and
-//! Baranoski (2009) use it.
+//! settles is Watson and Yellott's (2012) unified formula, for both eyes, their reference age and the field of the
+//! default bench's display; for how long it waits is Link and Stark's (1988) latency for a single step, as Pamplona,
+//! Oliveira and Baranoski (2009) use it.
 
 use std::f64::consts::TAU;
 

@@ -1,9 +1,9 @@
 //! A simulated eye before a simulated tracker: the pupil's light reflex, hippus, blinks, dropouts, sensor noise and the
 //! tracker's clock and link, the same for the same seed, with the true diameter beside each sample.
 //!
-//! What happens is told by a [`Script`]: the built-in ones are `scenarios/*.txt`, and `mock:FILE` reads one from a file.
-//! In a blink the diameter collapses with the lids while the tracker goes on giving millimetres, as real ones do, with low
-//! confidence; or, if the script says so, it ramps down and is then 0 and lost.
+//! What happens is told by a [`Script`]: the built-in ones are `scenarios/*.txt`, and `mock:FILE` reads one from a
+//! file. In a blink the diameter collapses with the lids while the tracker goes on giving millimetres, as real ones do,
+//! with low confidence; or, if the script says so, it ramps down and is then 0 and lost.
 
 mod eye;
 mod script;

@@ -92,15 +92,11 @@ impl Event {
 
 /// What is wrong with a scenario's text.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum ScriptError {
     /// The file cannot be read.
     #[error("scenario {path}: {source}; expected a readable text file")]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
+    Io { path: PathBuf, source: std::io::Error },
     /// A line cannot be understood.
     #[error("scenario {name}, line {line}: found {found}, expected {expected}")]
     Line {

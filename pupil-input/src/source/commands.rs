@@ -23,23 +23,20 @@ pub(crate) trait Dialogue {
 
 /// Why a tracker did not do as it was told.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum CommandError {
     /// The link failed.
     #[error("the link failed at `{command}`: {source}")]
     Link {
         /// What was to be sent, or had been.
         command: String,
-        /// Why.
         source: io::Error,
     },
     /// It did not answer, or something else.
     #[error("`{command}` was sent {TRIES} times and answered by {found}; expected `{expected}` within {within:?}")]
     NoAnswer {
-        /// What was sent.
         command: String,
-        /// What came back.
         found: String,
-        /// What should have.
         expected: String,
         /// For how long each answer was waited for.
         within: Duration,
@@ -165,8 +162,8 @@ pub(crate) fn in_words(bytes: &[u8]) -> String {
 /// What a link that waits for a while at most has brought: 0 bytes where that was nothing.
 pub(crate) fn receive_from(link: &mut impl Read, buffer: &mut [u8]) -> io::Result<usize> {
     match link.read(buffer) {
-        // End of file: a peer that has hung up. Some serial drivers tell an unplugged device in this way, at once and for
-        // ever.
+        // End of file: a peer that has hung up. Some serial drivers tell an unplugged device in this way, at once and
+        // for ever.
         Ok(0) => Err(hung_up()),
         Ok(count) => Ok(count),
         Err(error) => match error.kind() {

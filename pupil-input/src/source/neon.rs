@@ -1,10 +1,10 @@
-//! Pupil Labs Neon: the Companion app on its phone says over HTTP where its gaze stream is (`/api/status`), and sends it
-//! by RTSP (RFC 2326).
+//! Pupil Labs Neon: the Companion app on its phone says over HTTP where its gaze stream is (`/api/status`), and sends
+//! it by RTSP (RFC 2326).
 //!
 //! Datagrams come first, as in the maker's own client. Where none arrives, as behind a firewall, the next try
-//! has the packets interleaved with RTSP's TCP connection; where that stays empty too, datagrams are tried again. Nothing is
-//! sent back over TCP but a sign of life: Companions were seen to answer receiver reports there with errors in the middle
-//! of a packet.
+//! has the packets interleaved with RTSP's TCP connection; where that stays empty too, datagrams are tried again.
+//! Nothing is sent back over TCP but a sign of life: Companions were seen to answer receiver reports there with errors
+//! in the middle of a packet.
 //!
 //! Bytes are given as RTSP interleaves them, with the answer to `DESCRIBE` first, so that one decoder reads both.
 

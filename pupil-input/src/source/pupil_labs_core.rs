@@ -3,8 +3,8 @@
 //! Each read is one published message, without its topic: its map says all. Pupil Remote is asked for Pupil's time four
 //! times a second, and its answer given as a message too ([`time_message`]): an answer comes within about a
 //! millisecond of the time that it tells, a sample tens of them after the time of its image. The answers also show that
-//! Capture is alive where no pupil is published: a tracker that is only silent stays connected, one that answers no more
-//! is given up and found again, at whatever port it then publishes.
+//! Capture is alive where no pupil is published: a tracker that is only silent stays connected, one that answers no
+//! more is given up and found again, at whatever port it then publishes.
 
 use std::io;
 use std::net::SocketAddr;

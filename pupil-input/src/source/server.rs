@@ -12,6 +12,7 @@ use crate::spec::HostPort;
 
 /// Why a tracker's server cannot be used.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum ServerError {
     /// The host's name is not known.
     #[error(
@@ -22,9 +23,7 @@ pub enum ServerError {
     Host {
         /// What was looked for.
         server: &'static str,
-        /// Where.
         address: HostPort,
-        /// Why.
         reason: io::Error,
     },
     /// It does not accept a connection, or breaks it while it is being talked to.
@@ -32,11 +31,8 @@ pub enum ServerError {
     Link {
         /// What was looked for.
         server: &'static str,
-        /// Where.
         address: HostPort,
-        /// Why.
         reason: io::Error,
-        /// What to do.
         hint: &'static str,
     },
     /// It answers, and not as expected.
@@ -44,13 +40,10 @@ pub enum ServerError {
     Answer {
         /// What was looked for.
         server: &'static str,
-        /// Where.
         address: HostPort,
-        /// What it said.
         found: String,
         /// What it should have said.
         expected: &'static str,
-        /// What to do.
         hint: &'static str,
     },
 }

@@ -13,13 +13,13 @@ use crate::spec::HostPort;
 
 /// Why a tracker on a network cannot be reached.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum NetworkError {
     /// The host's name is not known.
     #[error("tracker {address}: the host `{}` is not found: {reason}; check its name, or give its address in numbers", address.host)]
     Host {
         /// Host and port.
         address: HostPort,
-        /// Why.
         reason: String,
     },
     /// No connection came about.
@@ -27,9 +27,7 @@ pub enum NetworkError {
     Connect {
         /// Host and port.
         address: HostPort,
-        /// Why.
         reason: io::Error,
-        /// What to do.
         hint: &'static str,
     },
     /// Datagrams cannot be received there.
@@ -37,9 +35,7 @@ pub enum NetworkError {
     Listen {
         /// Address of this machine and port.
         address: HostPort,
-        /// Why.
         reason: io::Error,
-        /// What to do.
         hint: &'static str,
     },
     /// The tracker does not do as it is told.
@@ -47,9 +43,7 @@ pub enum NetworkError {
     Command {
         /// Host and port.
         address: HostPort,
-        /// The profile.
         profile: String,
-        /// What went wrong.
         problem: Box<CommandError>,
     },
     /// Datagrams come from anywhere, so there is nobody to be told anything.
@@ -60,7 +54,6 @@ pub enum NetworkError {
     NobodyToTell {
         /// Address of this machine and port.
         address: HostPort,
-        /// The profile.
         profile: String,
     },
 }

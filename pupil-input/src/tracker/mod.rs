@@ -26,6 +26,7 @@ use crate::spec::TrackerSpec;
 
 /// Why a tracker could not be started.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum TrackerError {
     /// The tracker cannot be reached.
     #[error(transparent)]
@@ -47,16 +48,10 @@ pub enum TrackerError {
         "tracker `{spec}` gives pupil sizes in {unit}; holod needs millimetres: measure an artificial pupil of known \
          diameter and write tracker.scale_mm_per_unit = (its millimetres / its units) into the rig file"
     )]
-    NoScale {
-        /// The tracker's spec.
-        spec: String,
-        /// What it gives.
-        unit: &'static str,
-    },
+    NoScale { spec: String, unit: &'static str },
     /// The profile is for another kind of link.
     #[error("profile `{profile}` is for {link}; a serial port does not bring such messages: write `{instead}`")]
     WrongLink {
-        /// The profile's name.
         profile: String,
         /// What it is for.
         link: &'static str,
@@ -114,7 +109,8 @@ const TAP_DECISIONS: usize = 1 << 16;
 /// Reasons why a link does not come back, on their way to the control thread.
 const TROUBLES: usize = 16;
 
-/// Changes of settings on their way to the thread, which looks for them several times a second while it waits for bytes.
+/// Changes of settings on their way to the thread, which looks for them several times a second while it waits for
+/// bytes.
 const CHANGES: usize = 16;
 
 /// What a tracker is started with beside its spec and the rig's settings.
@@ -161,8 +157,8 @@ impl Tracker {
     /// Opens what `spec` names and starts the thread that reads it. In the place of options an origin will do.
     ///
     /// # Errors
-    /// The path does not exist, is of the wrong kind or does not open; what is there is another device; the log is of no
-    /// known format, empty or unsorted; the recording cannot be made. What fails later is counted and tried again.
+    /// The path does not exist, is of the wrong kind or does not open; what is there is another device; the log is of
+    /// no known format, empty or unsorted; the recording cannot be made. What fails later is counted and tried again.
     pub fn start(
         spec: &TrackerSpec,
         settings: &rig::Tracker,
@@ -340,8 +336,8 @@ impl TrackerControl {
         self.link() == Link::Finished
     }
 
-    /// What a user should know of the tracker although it runs, found at its start: a port that will change its name, an
-    /// adapter that holds bytes back, a recording that is torn. A sentence each.
+    /// What a user should know of the tracker although it runs, found at its start: a port that will change its name,
+    /// an adapter that holds bytes back, a recording that is torn. A sentence each.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
@@ -354,8 +350,8 @@ impl TrackerControl {
         self.trouble.as_deref()
     }
 
-    /// Goes on with another eye, scale, fallback or hold time, from the next sample on ([`Estimator::change`]); what the
-    /// settings say of the spec is not looked at. What a user should know of it comes back.
+    /// Goes on with another eye, scale, fallback or hold time, from the next sample on ([`Estimator::change`]); what
+    /// the settings say of the spec is not looked at. What a user should know of it comes back.
     ///
     /// # Errors
     /// [`ChangeError`]; nothing has changed then.

@@ -285,8 +285,8 @@ impl Worker {
         }
     }
 
-    /// Waits until recording and tap have room for what one piece of a log brings, since a log can be read faster than a
-    /// disk is written; false if the tracker is to stop. A tap that nobody reads is not waited for.
+    /// Waits until recording and tap have room for what one piece of a log brings, since a log can be read faster than
+    /// a disk is written; false if the tracker is to stop. A tap that nobody reads is not waited for.
     fn wait_for_room(&mut self) -> bool {
         let mut waiting_since = None;
         loop {

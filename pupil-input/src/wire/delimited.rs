@@ -1,6 +1,7 @@
 //! Lines of text with a fixed set of columns, as most home-made trackers write them.
 //!
-//! A line ends in LF, CR or both. Columns are counted from 1, or named by a header line: on the wire, or in the profile.
+//! A line ends in LF, CR or both. Columns are counted from 1, or named by a header line: on the wire, or in the
+//! profile.
 
 use super::checksum::{Checksum, ChecksumKind};
 use super::field::{Fields, Layout, Message, Raw};
@@ -24,8 +25,8 @@ pub struct DelimitedSettings {
     pub comment: Vec<u8>,
     /// The names of the columns, where the wire need not tell them.
     pub columns: Vec<String>,
-    /// The checksum in two or four hexadecimal digits behind the last `*`, and how many of the line's first bytes it leaves
-    /// out.
+    /// The checksum in two or four hexadecimal digits behind the last `*`, and how many of the line's first bytes it
+    /// leaves out.
     pub checksum: Option<(ChecksumKind, usize)>,
     /// Where everything stands.
     pub layout: Layout<Column>,
@@ -135,8 +136,8 @@ impl DelimitedDecoder {
         Self { line: Box::new([0; MAX_LINE_BYTES]), used: 0, overlong: false, rows }
     }
 
-    /// A decoder for a stream that may be joined in the middle of a line: the first line, unless a checksum holds it to be
-    /// whole or it is a header, is [`WireEvent::Partial`].
+    /// A decoder for a stream that may be joined in the middle of a line: the first line, unless a checksum holds it to
+    /// be whole or it is a header, is [`WireEvent::Partial`].
     pub fn joining(settings: &DelimitedSettings) -> Self {
         let mut decoder = Self::new(settings);
         decoder.rows.first = true;

@@ -1,11 +1,11 @@
 //! HID report descriptors: which bits of which report mean what.
 //!
-//! A tracker may move its fields from one firmware to the next, but its descriptor says where they are: each field of an
-//! input report has a usage (a page and a number; vendors' own pages begin at 0xFF00), and this finds it by that. The
-//! grammar is that of the *Device Class Definition for Human Interface Devices* 1.11, section 6.2.2.
+//! A tracker may move its fields from one firmware to the next, but its descriptor says where they are: each field of
+//! an input report has a usage (a page and a number; vendors' own pages begin at 0xFF00), and this finds it by that.
+//! The grammar is that of the *Device Class Definition for Human Interface Devices* 1.11, section 6.2.2.
 //!
-//! A descriptor comes from a device, so nothing in it is believed: any bytes give fields or an error, and its counts make
-//! no more than [`MAX_FIELDS`] of them.
+//! A descriptor comes from a device, so nothing in it is believed: any bytes give fields or an error, and its counts
+//! make no more than [`MAX_FIELDS`] of them.
 
 use std::fmt;
 use std::str::FromStr;
@@ -19,9 +19,9 @@ const MAX_REPORT_BITS: u32 = 16_384 * 8;
 /// Bits of the widest field that can be read.
 const MAX_FIELD_BITS: u32 = 64;
 
-/// The report descriptor of holod's own HID format, for microcontrollers (profile `holod-hid`): report 1 holds the device's
-/// clock in microseconds, a running number, and for the left and then the right eye the diameter in micrometres, the
-/// confidence in 255ths and flags.
+/// The report descriptor of holod's own HID format, for microcontrollers (profile `holod-hid`): report 1 holds the
+/// device's clock in microseconds, a running number, and for the left and then the right eye the diameter in
+/// micrometres, the confidence in 255ths and flags.
 pub const HOLOD_HID_DESCRIPTOR: &[u8] = &[
     0x06, 0x00, 0xFF, // usage page: vendor
     0x09, 0x01, // usage: eye tracker
@@ -99,7 +99,8 @@ pub struct ReportField {
     pub collection: Option<Usage>,
     /// The report that it is in; None for a device whose reports have no ids.
     pub report_id: Option<u8>,
-    /// Its lowest bit, counted from the lowest bit of the report's first byte, which is the report id where there are ids.
+    /// Its lowest bit, counted from the lowest bit of the report's first byte, which is the report id where there are
+    /// ids.
     pub bit_offset: u32,
     /// Its width, 1 to 64 bits, little-endian.
     pub bits: u32,
@@ -154,7 +155,8 @@ impl ReportField {
         }
     }
 
-    /// Raw figures to physical ones, in the unit that [`Self::kind`] names; None where the descriptor's ranges say nothing.
+    /// Raw figures to physical ones, in the unit that [`Self::kind`] names; None where the descriptor's ranges say
+    /// nothing.
     ///
     /// Section 6.2.2.7: physical = (raw - logical minimum) * (physical range / logical range) + physical minimum, times
     /// ten to the unit exponent; a physical range that is not given, or 0 to 0, is the logical one.
@@ -176,6 +178,7 @@ impl ReportField {
 
 /// Why there are no fields to be had from a descriptor.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum DescriptorError {
     /// There are no bytes.
     #[error("the report descriptor is empty; the device is no HID tracker")]
@@ -188,7 +191,6 @@ pub enum DescriptorError {
     Malformed {
         /// Offset of the item.
         at: usize,
-        /// What is wrong.
         problem: &'static str,
     },
     /// It describes more fields than any tracker has.
@@ -205,7 +207,6 @@ pub enum DescriptorError {
     /// Several have it, and the profile does not say which.
     #[error("the device has {count} input fields of usage {wanted}, in {found}; name the collection in the profile")]
     Ambiguous {
-        /// How many.
         count: usize,
         /// What the profile names.
         wanted: String,
@@ -227,21 +228,16 @@ pub enum DescriptorError {
         "the field of usage {usage}, {bits} bits from bit {bit_offset}, spans more than 8 bytes, or is signed and ends within a byte"
     )]
     Unreadable {
-        /// What it is.
         usage: Usage,
         /// Its width.
         bits: u32,
-        /// Its lowest bit.
         bit_offset: u32,
     },
     /// It has a unit, and no range to convert by.
     #[error(
         "the field of usage {usage} has a unit and no range; name its offset, type and scale in a profile of kind `report`"
     )]
-    NoRange {
-        /// What it is.
-        usage: Usage,
-    },
+    NoRange { usage: Usage },
 }
 
 /// Global items: they hold until they are set again.
@@ -332,7 +328,8 @@ impl Locals {
 }
 
 /// Every input field of a descriptor that is a figure of its own (a *variable*), in the descriptor's order. Constants,
-/// which are padding, arrays, such as a keyboard's keys, and fields without a usage or wider than 64 bits are passed over.
+/// which are padding, arrays, such as a keyboard's keys, and fields without a usage or wider than 64 bits are passed
+/// over.
 ///
 /// # Errors
 /// The bytes are no descriptor, or describe more than [`MAX_FIELDS`] fields.
@@ -740,8 +737,8 @@ mod tests {
         judged
     }
 
-    /// One main item with what it needs, or a change of the globals around it. Unsigned maxima keep their top bit clear:
-    /// the other parser takes it for a sign.
+    /// One main item with what it needs, or a change of the globals around it. Unsigned maxima keep their top bit
+    /// clear: the other parser takes it for a sign.
     fn any_part() -> impl Strategy<Value = Vec<u8>> {
         let usages = prop_oneof![
             prop::collection::vec((any::<u8>(), any::<bool>()), 1..4).prop_map(|usages| {

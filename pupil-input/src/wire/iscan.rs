@@ -3,7 +3,8 @@
 //! The host sends 0x80 to start and 0x81 to stop. A packet is the two bytes 0x44 0x44 and then as many little-endian
 //! 16-bit words as the operator has ticked outputs, in the order of the tracker's list; one of them may be a pupil
 //! diameter. Words are tenths of the tracker's unit. There is no time, no checksum and no length, and the two bytes may
-//! stand in the data as well. All words are 0 while no pupil is seen. (Layout: the ISCAN drivers of MWorks and of pype.)
+//! stand in the data as well. All words are 0 while no pupil is seen. (Layout: the ISCAN drivers of MWorks and of
+//! pype.)
 
 use super::{Decoder, WireEvent, WireFault, WireSample};
 use crate::SampleEye;

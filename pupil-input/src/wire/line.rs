@@ -6,9 +6,9 @@
 //! P1,<seq>,<device_us>,<L|R|B>,<diameter_mm>,<confidence 0..1>*<CRC-8, two hex digits>
 //! ```
 //!
-//! ending in LF (CR LF accepted). The CRC has polynomial 0x07 and initial value 0 and covers the bytes before `*`. A line
-//! that starts with `#` is a comment; fields after the confidence are ignored. `seq` counts up by one a line (two eyes of
-//! one instant may share a number).
+//! ending in LF (CR LF accepted). The CRC has polynomial 0x07 and initial value 0 and covers the bytes before `*`. A
+//! line that starts with `#` is a comment; fields after the confidence are ignored. `seq` counts up by one a line (two
+//! eyes of one instant may share a number).
 
 use std::fmt::Write;
 

@@ -5,11 +5,11 @@
 //! rightEye; <frame>; <trigger 0|1>; <x>; <y>; <z>; <pupil>;
 //! ```
 //!
-//! Each eye's row ends in LF, with a CR on either side of it. The monocular AV may write `Eye` for the label. What stands
-//! for the pupil is an area by the one public description and its width and height by the public reader's own table of
-//! names, so [`LiveTrackSize`] says it; all are in the camera's units, and mm need a scale from a printed pupil. The
-//! tracker answers `$Command` with a line that begins in `$`. (Layout: the LiveTrack reader of the GagLab toolbox,
-//! `gaglab_livetrack` and `gaglab_eye_start`.)
+//! Each eye's row ends in LF, with a CR on either side of it. The monocular AV may write `Eye` for the label. What
+//! stands for the pupil is an area by the one public description and its width and height by the public reader's own
+//! table of names, so [`LiveTrackSize`] says it; all are in the camera's units, and mm need a scale from a printed
+//! pupil. The tracker answers `$Command` with a line that begins in `$`. (Layout: the LiveTrack reader of the GagLab
+//! toolbox, `gaglab_livetrack` and `gaglab_eye_start`.)
 
 use holod_calibration::TimeNs;
 
@@ -36,7 +36,8 @@ pub enum LiveTrackSize {
 pub struct LiveTrackSettings {
     /// Where the pupil is.
     pub size: LiveTrackSize,
-    /// Frames of the camera a second, greater than 0; the frame counter becomes the time by it. None: rows have no time.
+    /// Frames of the camera a second, greater than 0; the frame counter becomes the time by it. None: rows have no
+    /// time.
     pub frames_per_second: Option<f64>,
     /// Bits of the frame counter, 1..=63: how far it counts before it wraps.
     pub counter_bits: u32,

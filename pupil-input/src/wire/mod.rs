@@ -38,8 +38,8 @@ use usages::{Undescribed, UsageSettings};
 /// A sample as the wire gives it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WireSample {
-    /// The tracker's own clock; its origin means nothing. None where the wire carries no time: the time of arrival stands
-    /// in for it.
+    /// The tracker's own clock; its origin means nothing. None where the wire carries no time: the time of arrival
+    /// stands in for it.
     pub t_device: Option<TimeNs>,
     /// The eye.
     pub eye: SampleEye,

@@ -1,8 +1,8 @@
 //! Pupil Labs Neon: the gaze stream of the Companion app, RTP as RTSP interleaves it.
 //!
 //! The stream holds two kinds of messages: RTSP's own (the answer to `DESCRIBE` with its SDP comes first and names the
-//! clock rate; answers to keep-alives come in between), and `$`, channel, length (16 bits), then one RTP or RTCP packet.
-//! Datagrams are given the same four bytes, so that the transport makes no difference here.
+//! clock rate; answers to keep-alives come in between), and `$`, channel, length (16 bits), then one RTP or RTCP
+//! packet. Datagrams are given the same four bytes, so that the transport makes no difference here.
 //!
 //! One RTP packet is one instant of both eyes. All numbers are big-endian; its payload is told by its length:
 //!
@@ -16,8 +16,9 @@
 //! Only the last two tell of pupils; the others are [`WireEvent::Note`]s.
 //!
 //! RTCP's sender reports tie RTP time to Unix time (RFC 3550, 6.4.1): `t_device` is Unix time, as in Neon's own
-//! recordings, and `None` until the first report. Reports that disagree by less than [`CLOCK_STEP`] are taken in gently.
-//! `sequence` is RTP's number carried on over its 16 bits; a packet that was overtaken has none, as it leaves no gap.
+//! recordings, and `None` until the first report. Reports that disagree by less than [`CLOCK_STEP`] are taken in
+//! gently. `sequence` is RTP's number carried on over its 16 bits; a packet that was overtaken has none, as it leaves
+//! no gap.
 
 use holod_calibration::TimeNs;
 

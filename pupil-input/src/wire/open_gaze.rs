@@ -4,12 +4,12 @@
 //! <REC CNT="1484" TIME="5.01366" TIME_TICK="2096547271623" LPMM="4.80" LPMMV="1" RPMM="5.00" RPMMV="1" />
 //! ```
 //!
-//! Lines end in CR LF. A record holds what the client has asked for (`ENABLE_SEND_PUPILMM` for the pupils in mm), in any
-//! order; a flag `…V` of 0 says that the figure before it means nothing, though it may look good. `LPMM` and `RPMM` are
-//! millimetres, `LPUPILD` and `RPUPILD` the same in metres, `LPD` and `RPD` pixels of the camera. `TIME` is seconds since
-//! the start *or the last calibration*, so it falls back; `TIME_TICK` does not, and needs the rate that the server tells
-//! for `TIME_TICK_FREQUENCY`. Lines of other kinds (`ACK`, `NACK`, `CAL`, `UPDATE`) are notes. Values may hold entities;
-//! figures do not. (Layout: Gazepoint's Open Gaze API document, version 2.)
+//! Lines end in CR LF. A record holds what the client has asked for (`ENABLE_SEND_PUPILMM` for the pupils in mm), in
+//! any order; a flag `…V` of 0 says that the figure before it means nothing, though it may look good. `LPMM` and `RPMM`
+//! are millimetres, `LPUPILD` and `RPUPILD` the same in metres, `LPD` and `RPD` pixels of the camera. `TIME` is seconds
+//! since the start *or the last calibration*, so it falls back; `TIME_TICK` does not, and needs the rate that the
+//! server tells for `TIME_TICK_FREQUENCY`. Lines of other kinds (`ACK`, `NACK`, `CAL`, `UPDATE`) are notes. Values may
+//! hold entities; figures do not. (Layout: Gazepoint's Open Gaze API document, version 2.)
 
 use holod_calibration::TimeNs;
 

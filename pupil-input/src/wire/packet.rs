@@ -1,8 +1,8 @@
 //! Binary packets with a sync word, as a stream.
 //!
-//! The sync word may stand in the data, too. So after bytes that belong to no packet, a packet is believed by its checksum
-//! or, where it has none, by the sync word of the next one just behind it. As long as packet follows upon packet, each is
-//! read as soon as it is whole.
+//! The sync word may stand in the data, too. So after bytes that belong to no packet, a packet is believed by its
+//! checksum or, where it has none, by the sync word of the next one just behind it. As long as packet follows upon
+//! packet, each is read as soon as it is whole.
 
 use super::checksum::{Checksum, ChecksumKind};
 use super::field::{Bytes, Field, Fields, Layout, Message, place};
@@ -26,12 +26,12 @@ pub struct PacketSettings {
 
 /// How long a packet is, with sync word and checksum.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum PacketLength {
     /// This many bytes.
     Fixed(usize),
     /// It tells it itself.
     Told {
-        /// Where.
         field: Field,
         /// What the figure there lacks to the whole length.
         adds: i64,

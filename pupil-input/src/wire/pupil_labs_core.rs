@@ -9,9 +9,9 @@
 //!
 //! Confidence 0 is Pupil's word for "no pupil found".
 //!
-//! A map with `pupil_time` (seconds) is none of Pupil's: the link puts it between them where Pupil Remote has told the time,
-//! [`time_message`], so that a recording holds it too. The times of samples are those of their images, some tens of
-//! milliseconds before they are published; that alone tells how many.
+//! A map with `pupil_time` (seconds) is none of Pupil's: the link puts it between them where Pupil Remote has told the
+//! time, [`time_message`], so that a recording holds it too. The times of samples are those of their images, some tens
+//! of milliseconds before they are published; that alone tells how many.
 
 use holod_calibration::TimeNs;
 use rmp::Marker;

@@ -10,9 +10,9 @@
 //!   (confidence,outlineConfidence)…[,trial,message,temperature_c…]
 //! ```
 //!
-//! where `…` is once for each view, A before B and Main before Sec (`physicalDiameter_mm` once for each eye). `filename`
-//! is only in rows as 0.1.1 records them, without `trial` and what follows. Later versions have no algorithm, and the
-//! figures stand view by view, right before left:
+//! where `…` is once for each view, A before B and Main before Sec (`physicalDiameter_mm` once for each eye).
+//! `filename` is only in rows as 0.1.1 records them, without `trial` and what follows. Later versions have no
+//! algorithm, and the figures stand view by view, right before left:
 //!
 //! ```text
 //! timestamp_ms,(diameter_px,undistortedDiameter_px,physicalDiameter_mm,width_px,height_px,axisRatio,
@@ -27,9 +27,9 @@
 //! { "EyeData": { "A": { "Main": { "diameter_px": "41.2", "physicalDiameter_mm": "3.25", "timestamp_ms": "1700000000123", … } } } }
 //! ```
 //!
-//! with `A` and `B` up to 0.1.2, and later `R` and `L` and names such as `pupilDiameter_px`. Each message's brace stands at
-//! the beginning of a line and no other does, so that is where reading begins anew after anything bad. The scanner is
-//! written by hand: it keeps the few figures that matter and no text, so a message may be of any length.
+//! with `A` and `B` up to 0.1.2, and later `R` and `L` and names such as `pupilDiameter_px`. Each message's brace
+//! stands at the beginning of a line and no other does, so that is where reading begins anew after anything bad. The
+//! scanner is written by hand: it keeps the few figures that matter and no text, so a message may be of any length.
 //!
 //! A figure of −1 means *not found* (also: no calibration, for millimetres; an algorithm without confidence). (Layouts:
 //! Open-PupilEXT, `eyeDataSerializer`, `dataStreamer` and `pDataTypes`.)
@@ -51,12 +51,10 @@ const MAX_TOKEN_BYTES: usize = 40;
 
 /// How messages are written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum PupilExtContainer {
     /// Rows with this ASCII character between columns.
-    Csv {
-        /// The delimiter.
-        delimiter: u8,
-    },
+    Csv { delimiter: u8 },
     /// Objects.
     Json,
 }

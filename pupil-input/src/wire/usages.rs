@@ -1,4 +1,5 @@
-//! HID reports whose fields are named by usage: the device's own descriptor says where they stand and what they measure.
+//! HID reports whose fields are named by usage: the device's own descriptor says where they stand and what they
+//! measure.
 
 use super::field::{Field, Figure, Layout, NumberType, PupilAt, TimeAt, Validity};
 use super::hid_descriptor::{DescriptorError, FieldUnit, ReportField, Usage, find_field, input_fields};
@@ -17,8 +18,8 @@ pub struct UsageAt {
 /// The fields of a tracker, by what they are.
 ///
 /// Where the descriptor gives a unit, figures are in it: a length in millimetres, a time in nanoseconds, whatever the
-/// profile says of the time's unit. The profile's scales and offsets are applied to what the descriptor makes of a figure,
-/// its rules for validity to the raw one.
+/// profile says of the time's unit. The profile's scales and offsets are applied to what the descriptor makes of a
+/// figure, its rules for validity to the raw one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct UsageSettings {
     /// Where everything stands.
@@ -29,8 +30,8 @@ impl UsageSettings {
     /// How reports of the device with this descriptor are read.
     ///
     /// # Errors
-    /// The descriptor is faulty, or a field of the layout is not in it, is there twice, stands in another report than the
-    /// rest, or has bits that cannot be read as one number.
+    /// The descriptor is faulty, or a field of the layout is not in it, is there twice, stands in another report than
+    /// the rest, or has bits that cannot be read as one number.
     pub fn resolve(&self, descriptor: &[u8]) -> Result<ReportSettings, DescriptorError> {
         let fields = input_fields(descriptor)?;
         let mut resolver = Resolver { fields: &fields, report: None, least: 0 };
@@ -141,9 +142,9 @@ fn null_state(field: &ReportField) -> Option<Validity> {
 
 /// The number of 1, 2, 4 or 8 bytes that holds a field's bits; None where no such number does.
 ///
-/// It ends with the field's last byte if the report has as many bytes before that, so that nothing behind a report's last
-/// field is asked for; a field of 3, 5, 6 or 7 bytes at the very beginning needs bytes behind it. A signed field must end
-/// with a byte: its sign is then the number's.
+/// It ends with the field's last byte if the report has as many bytes before that, so that nothing behind a report's
+/// last field is asked for; a field of 3, 5, 6 or 7 bytes at the very beginning needs bytes behind it. A signed field
+/// must end with a byte: its sign is then the number's.
 fn place(field: &ReportField) -> Option<Field> {
     let end = field.bit_offset + field.bits;
     let (first, last) = (field.bit_offset / 8, end.div_ceil(8));

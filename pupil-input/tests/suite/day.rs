@@ -40,11 +40,11 @@ struct Judge {
 
 impl Judge {
     /// The greatest change from one frame to the next: the fastest that the filter follows an eye (7 mm/s) while a
-    /// difference is worked off (4 mm/s), 0.19 mm in a frame; and what working it off comes too late by where a frame has
-    /// looked ahead, 0.08 mm, where a velocity was run on for as long, 0.14 mm; and the noise of one sample.
+    /// difference is worked off (4 mm/s), 0.19 mm in a frame; and what working it off comes too late by where a frame
+    /// has looked ahead, 0.08 mm, where a velocity was run on for as long, 0.14 mm; and the noise of one sample.
     const MOST_A_FRAME_MM: f32 = 0.45;
-    /// The greatest distance from the true pupil while samples are followed and nothing has gone wrong of late: the stated
-    /// lag, and noise, and how far a lid takes the first samples of a blink before it is known for one.
+    /// The greatest distance from the true pupil while samples are followed and nothing has gone wrong of late: the
+    /// stated lag, and noise, and how far a lid takes the first samples of a blink before it is known for one.
     const MOST_TRACKING_MM: f32 = 0.6;
     /// The greatest error of a time when nothing has gone wrong of late: the link's least delay, 2 ms, which cannot be
     /// known, half of its jitter, and what a drift that changes makes of it.

@@ -276,8 +276,9 @@ fn another_eye_by_order_is_slid_to_and_every_sample_is_decided_upon() {
     assert!(fastest < 5.5, "{fastest} mm/s");
 }
 
-/// What is shown from a change of hold time and fallback on, in steps of 5 ms: of an eye of 3.5 mm that was there from 0
-/// to 2 s where `believed` says so, with the fallback at 3 mm and held for 1 s before, at 5 mm and for `hold_ms` after.
+/// What is shown from a change of hold time and fallback on, in steps of 5 ms: of an eye of 3.5 mm that was there from
+/// 0 to 2 s where `believed` says so, with the fallback at 3 mm and held for 1 s before, at 5 mm and for `hold_ms`
+/// after.
 fn shown_after_a_change(believed: bool, t_change_ms: i64, hold_ms: i64) -> Vec<(f32, PupilState)> {
     let before = settings(rig::Eye::Both);
     let (hold, fallback) = (TimeNs(hold_ms * 1_000_000), PupilDiameter::from_mm(5.0));

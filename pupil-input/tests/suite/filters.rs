@@ -1,7 +1,7 @@
 //! The shipped filter against two others, on simulated eyes whose truth is known and on a real recording.
 //!
-//! `cargo test -p holod-pupil-input --test suite -- --ignored --nocapture shared_data_print_the_comparison` prints the table of
-//! `doc/estimate.md`. The others live here only.
+//! `cargo test -p holod-pupil-input --test suite -- --ignored --nocapture shared_data_print_the_comparison` prints the
+//! table of `doc/estimate.md`. The others live here only.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -27,7 +27,8 @@ trait Follower {
     fn at(&self, t_s: f64) -> f64;
 }
 
-/// One Euro (Casiez, Roussel and Vogel 2012), held or extrapolated by its own derivative as the shipped filter is by its.
+/// One Euro (Casiez, Roussel and Vogel 2012), held or extrapolated by its own derivative as the shipped filter is by
+/// its.
 #[derive(Clone, Copy)]
 struct OneEuro {
     settings: OneEuroSettings,
@@ -274,8 +275,8 @@ fn shared_data() -> PathBuf {
     std::env::var_os("HOLOD_SHARED_DATA").map_or_else(default, PathBuf::from)
 }
 
-/// One eye of a real recording, in millimetres; the median of a tenth of a second around each sample stands for the truth,
-/// away from blinks. Areas in arbitrary units are made diameters of 4 mm in the median.
+/// One eye of a real recording, in millimetres; the median of a tenth of a second around each sample stands for the
+/// truth, away from blinks. Areas in arbitrary units are made diameters of 4 mm in the median.
 fn recorded(file: &str, eye: SampleEye, area: bool) -> Trace {
     let recording = Recording::read(&shared_data().join("pupil").join(file)).expect("reads");
     let mut samples: Vec<_> = recording.samples().filter(|sample| sample.eye == eye).collect();

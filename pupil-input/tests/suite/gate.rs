@@ -1,4 +1,5 @@
-//! The gate on simulated trackers that blink, lose and misread as real ones do: what is shown stays with the true pupil.
+//! The gate on simulated trackers that blink, lose and misread as real ones do: what is shown stays with the true
+//! pupil.
 
 use crate::support::settings;
 use holod_calibration::{TimeNs, rig};

@@ -16,9 +16,9 @@ pub(crate) const NEON_BLINK_S: f64 = 0.24;
 
 /// A Neon `3d_eye_states.csv` of 5 s at 200 Hz.
 ///
-/// As in real ones: the first samples are frozen repeats; some intervals are two or three times as long; from about 25 ms
-/// after a blink's begin the left diameter scatters between 1.1 and 2.8 mm from sample to sample and the right one lies
-/// quietly at 1.5 to 2.1 mm, until both come back over some 40 ms; only the lid aperture says so.
+/// As in real ones: the first samples are frozen repeats; some intervals are two or three times as long; from about 25
+/// ms after a blink's begin the left diameter scatters between 1.1 and 2.8 mm from sample to sample and the right one
+/// lies quietly at 1.5 to 2.1 mm, until both come back over some 40 ms; only the lid aperture says so.
 pub(crate) fn neon_like_csv(seed: u64) -> String {
     let mut random = Pcg64Mcg::seed_from_u64(seed);
     let mut csv = String::from(
@@ -52,8 +52,8 @@ pub(crate) fn settings(eye: rig::Eye) -> EstimatorSettings {
     EstimatorSettings::from(&rig::Tracker { eye, ..rig::Rig::default().tracker })
 }
 
-/// Feeds `samples` and asks for the pupil at each sample's time and up to 40 ms ahead, as a frame loop does, from when the
-/// slide from the fallback is over. The time beside an estimate is when it was asked for.
+/// Feeds `samples` and asks for the pupil at each sample's time and up to 40 ms ahead, as a frame loop does, from when
+/// the slide from the fallback is over. The time beside an estimate is when it was asked for.
 pub(crate) fn estimates(
     samples: impl IntoIterator<Item = PupilSample>,
     settings: EstimatorSettings,

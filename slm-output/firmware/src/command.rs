@@ -16,6 +16,7 @@ const ARM_TOKEN: &str = "LIGHT";
 
 /// A host's command.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Command {
     /// `ID?`: who are you.
     Identify,
@@ -31,14 +32,12 @@ pub enum Command {
         sequence: Sequence,
         /// From one colour frame's start to the next, microseconds.
         period_us: u32,
-        /// Who starts windows.
         trigger: Trigger,
     },
     /// `FLD`: one field's window.
     Field {
         /// Position in the sequence.
         field: usize,
-        /// Its window.
         window: Window,
     },
     /// `MAX`: the greatest power that this bench allows each laser, microwatts.
@@ -55,20 +54,12 @@ pub enum Command {
     Heartbeat,
     /// `FRM`: a colour frame began.
     Frame {
-        /// When.
         t: TimeUs,
         /// By how much `t` may be wrong either way, microseconds.
         error_us: u32,
     },
     /// `LIT`: light one window.
-    Light {
-        /// Which laser.
-        laser: Laser,
-        /// Its on edge.
-        t_on: TimeUs,
-        /// Its off edge.
-        t_off: TimeUs,
-    },
+    Light { laser: Laser, t_on: TimeUs, t_off: TimeUs },
 }
 
 impl Command {
@@ -213,40 +204,22 @@ impl fmt::Display for Refusal {
 
 /// What a box says to a command that it carried out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Answer<'a> {
     /// Who it is.
     Identity {
         /// Its version of the protocol.
         version: u32,
-        /// Its name.
         name: &'a str,
     },
     /// It has done it, at `t` of its clock.
-    Done {
-        /// When.
-        t: TimeUs,
-    },
+    Done { t: TimeUs },
     /// It has heard the heartbeat, and has seen sync edges.
-    Sync {
-        /// When.
-        t: TimeUs,
-        /// The edges.
-        sync: SyncSeen,
-    },
+    Sync { t: TimeUs, sync: SyncSeen },
     /// What it is built for.
-    Limits {
-        /// When.
-        t: TimeUs,
-        /// The limits.
-        limits: Limits,
-    },
+    Limits { t: TimeUs, limits: Limits },
     /// How it is.
-    State {
-        /// When.
-        t: TimeUs,
-        /// Its state.
-        state: State,
-    },
+    State { t: TimeUs, state: State },
 }
 
 impl Answer<'_> {
@@ -261,30 +234,20 @@ impl Answer<'_> {
 
 /// Any line from a box.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Message<'a> {
     /// The answer to a command that was carried out.
-    Done {
-        /// The command's number.
-        number: u32,
-        /// The answer.
-        answer: Answer<'a>,
-    },
+    Done { number: u32, answer: Answer<'a> },
     /// The answer to one that was not.
     Refused {
         /// The command's number; 0 where the line was damaged.
         number: u32,
-        /// Why.
         refusal: Refusal,
     },
     /// It has booted.
     Booted,
     /// It went dark by itself.
-    Dark {
-        /// When.
-        t: TimeUs,
-        /// Why.
-        reason: DarkReason,
-    },
+    Dark { t: TimeUs, reason: DarkReason },
 }
 
 impl<'a> Message<'a> {

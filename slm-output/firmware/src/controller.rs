@@ -12,7 +12,8 @@ const CHUNK_BYTES: usize = 64;
 ///
 /// A board must be dark without its program: gates pulled to off by a resistor, and off while it is in reset.
 pub trait Hardware {
-    /// Its clock: microseconds since it booted. Never runs backwards, wraps only after thousands of years, and is within
+    /// Its clock: microseconds since it booted. Never runs backwards, wraps only after thousands of years, and is
+    /// within
     /// 100 parts per million of true time.
     fn now(&mut self) -> TimeUs;
 
@@ -54,8 +55,8 @@ pub struct Controller<H> {
 }
 
 impl<H: Hardware> Controller<H> {
-    /// A box that has just booted: closes all gates before anything else, and says on the line that it booted. `name` is
-    /// one word of at most 40 letters.
+    /// A box that has just booted: closes all gates before anything else, and says on the line that it booted. `name`
+    /// is one word of at most 40 letters.
     pub fn new(mut hardware: H, name: &'static str, limits: Limits) -> Self {
         hardware.set_gate(None);
         hardware.set_power([0; 3]);

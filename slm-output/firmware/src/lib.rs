@@ -1,9 +1,9 @@
 //! Reference firmware of a laser box that speaks holod's laser protocol.
 //!
-//! The protocol is specified in `slm-output/doc/laser-protocol.md`. This crate is all of a box but its pins: [`mod@line`]
-//! cuts and checks lines, [`command`] gives them their meaning, [`machine`] is the state machine that decides which laser
-//! is lit, and [`controller`] joins them over the [`Hardware`] of a board. holod itself uses the same types to talk to a
-//! box and as its model of one.
+//! The protocol is specified in `slm-output/doc/laser-protocol.md`. This crate is all of a box but its pins:
+//! [`mod@line`] cuts and checks lines, [`command`] gives them their meaning, [`machine`] is the state machine that
+//! decides which laser is lit, and [`controller`] joins them over the [`Hardware`] of a board. holod itself uses the
+//! same types to talk to a box and as its model of one.
 //!
 //! It needs no operating system, no heap and no `unsafe`. It is no safety device: lasers that can reach an eye need an
 //! interlock that works without any software.

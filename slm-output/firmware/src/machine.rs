@@ -18,33 +18,16 @@ pub const PERIOD_US: core::ops::RangeInclusive<u32> = 500..=1_000_000;
 
 /// Something that happened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Event {
     /// Lasers may be lit from now on.
-    Armed {
-        /// When.
-        t: TimeUs,
-    },
+    Armed { t: TimeUs },
     /// A laser went on.
-    On {
-        /// When.
-        t: TimeUs,
-        /// Which.
-        laser: Laser,
-    },
+    On { t: TimeUs, laser: Laser },
     /// A laser went off.
-    Off {
-        /// When.
-        t: TimeUs,
-        /// Which.
-        laser: Laser,
-    },
+    Off { t: TimeUs, laser: Laser },
     /// All lasers are out until the box is armed again.
-    Dark {
-        /// When.
-        t: TimeUs,
-        /// Why.
-        reason: DarkReason,
-    },
+    Dark { t: TimeUs, reason: DarkReason },
 }
 
 /// A laser, lit from `t_on` to `t_off`.

@@ -388,8 +388,8 @@ fn programs_that_no_box_can_run_are_refused() {
     assert_eq!(machine.obey(&sync, TimeUs(0), &mut |_| ()), Err(Refusal::Trigger));
 }
 
-/// Every way into darkness, out of every state that may be lit: the laser goes out at once, the power is taken away, the
-/// box says why where its host does not know, and nothing lights it again but a new `ARM`.
+/// Every way into darkness, out of every state that may be lit: the laser goes out at once, the power is taken away,
+/// the box says why where its host does not know, and nothing lights it again but a new `ARM`.
 #[test]
 fn every_fault_makes_dark_from_every_armed_state_until_it_is_armed_again() {
     type Fault = (DarkReason, fn(&mut Bench));

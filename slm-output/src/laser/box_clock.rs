@@ -8,9 +8,9 @@ const DRIFT_PPM: i64 = 200;
 
 /// What is known of box time minus host time: never a guess, always an interval.
 ///
-/// A box answers with the time at which it carried a command out. That lies between sending and hearing, so one exchange
-/// bounds the offset from both sides, within the exchange's round trip. Intervals of many exchanges are cut with each
-/// other, each widened by the drift since, so that what stays is the best bound and still always true.
+/// A box answers with the time at which it carried a command out. That lies between sending and hearing, so one
+/// exchange bounds the offset from both sides, within the exchange's round trip. Intervals of many exchanges are cut
+/// with each other, each widened by the drift since, so that what stays is the best bound and still always true.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct BoxClock {
     known: Option<Known>,
@@ -51,8 +51,8 @@ fn drift_ns(time: TimeNs) -> i64 {
 }
 
 impl BoxClock {
-    /// Learns from one exchange: the box did something at `t_box` of its clock, after the host had begun to ask for it at
-    /// `t_asked` and before the host heard of it at `t_heard`.
+    /// Learns from one exchange: the box did something at `t_box` of its clock, after the host had begun to ask for it
+    /// at `t_asked` and before the host heard of it at `t_heard`.
     ///
     /// # Errors
     /// By how many nanoseconds the clocks have run apart beyond what their drift allows. What was known before is
@@ -131,8 +131,8 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever the round trips, the ticks and the drift within its bound: the truth always lies in the interval, the
-        /// clocks are never taken to have jumped, and the best exchange bounds the error.
+        /// Whatever the round trips, the ticks and the drift within its bound: the truth always lies in the interval,
+        /// the clocks are never taken to have jumped, and the best exchange bounds the error.
         #[test]
         fn the_truth_is_always_inside(
             offset_ms in -1_000i64..1_000_000,

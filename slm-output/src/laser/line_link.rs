@@ -1,5 +1,5 @@
-//! The line to a device, as the laser thread needs it: what arrives is stamped at once by a thread of its own and waits in
-//! a ring, so that nobody who drives lasers ever waits for it.
+//! The line to a device, as the laser thread needs it: what arrives is stamped at once by a thread of its own and waits
+//! in a ring, so that nobody who drives lasers ever waits for it.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::os::fd::{AsRawFd, BorrowedFd};
@@ -31,7 +31,6 @@ pub(super) enum Arrival {
         t: TimeNs,
         /// How many of `bytes` count.
         count: usize,
-        /// The bytes.
         bytes: [u8; CHUNK_BYTES],
     },
     /// The line failed; nothing comes any more.

@@ -18,14 +18,12 @@ const ANY_ADDRESS: u8 = 0;
 pub(super) enum Request {
     /// The value of a parameter.
     Read {
-        /// Which.
         parameter: u16,
         /// Of which part of the device, from 1.
         instance: u8,
     },
     /// That a parameter be set.
     Write {
-        /// Which.
         parameter: u16,
         /// Of which part of the device, from 1.
         instance: u8,

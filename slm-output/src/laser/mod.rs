@@ -10,8 +10,9 @@
 //! | FISBA READYBeam | `ready_beam.rs`, on `power_box.rs`; its frames: `mecom.rs` |
 //! | lasers that take commands in text | `text_laser.rs`, on `power_box.rs`; their profiles: `calibration/profiles/lasers/` |
 //!
-//! [`open_laser`] opens the one that the rig names; `reconnect.rs` finds it again when it is lost. Another box is a file
-//! here, a variant of [`LaserDriver`](holod_calibration::rig::LaserDriver) and a line in `open.rs`. [`simulator`] is the other end of the protocol's line: the firmware itself, on a pseudo-terminal.
+//! [`open_laser`] opens the one that the rig names; `reconnect.rs` finds it again when it is lost. Another box is a
+//! file here, a variant of [`LaserDriver`](holod_calibration::rig::LaserDriver) and a line in `open.rs`. [`simulator`]
+//! is the other end of the protocol's line: the firmware itself, on a pseudo-terminal.
 
 pub mod box_clock;
 pub mod edge_log;
@@ -62,21 +63,14 @@ pub struct LitWindow {
 
 /// What happened at a laser box.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum BoxEvent {
     /// It may light lasers from now on.
-    Armed {
-        /// When.
-        t: TimeNs,
-    },
+    Armed { t: TimeNs },
     /// A laser went on or off.
     Edge(LaserEdge),
     /// All lasers are out until it is armed again.
-    Dark {
-        /// When.
-        t: TimeNs,
-        /// Why.
-        reason: DarkReason,
-    },
+    Dark { t: TimeNs, reason: DarkReason },
 }
 
 /// Who starts a lit window.
@@ -116,6 +110,7 @@ pub struct LaserProgram {
 
 /// Why lasers could not be driven.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum LaserError {
     /// The field ends before its window begins.
     #[error(
@@ -130,9 +125,7 @@ pub enum LaserError {
     /// A laser figure of the rig that no box can take.
     #[error("lasers: {what} is {found}; expected {expected}: correct the rig file")]
     Figure {
-        /// Which figure.
         what: &'static str,
-        /// What it is.
         found: String,
         /// What it may be.
         expected: &'static str,
@@ -142,7 +135,6 @@ pub enum LaserError {
         "{path}: {why}; expected the serial port of a laser box: check lasers.device, the cable and the port's permissions"
     )]
     Open {
-        /// The port.
         path: String,
         /// What the system said.
         why: String,
@@ -152,7 +144,6 @@ pub enum LaserError {
         "{path}: answered `{found}`; expected `{expected}`: check that lasers.device names the laser box and not another device"
     )]
     NotABox {
-        /// The port.
         path: String,
         /// What it answered.
         found: String,
@@ -164,28 +155,21 @@ pub enum LaserError {
         "{path}: a laser box that speaks version {found} of the laser protocol; this holod speaks version {expected}: flash the firmware that came with this holod"
     )]
     Version {
-        /// The port.
         path: String,
-        /// The box's version.
         found: u32,
         /// The version spoken here.
         expected: u32,
     },
     /// Another holod has the port.
     #[error("{path} is in use by another program: end that one first (`holod dark` works beside it)")]
-    InUse {
-        /// The port.
-        path: String,
-    },
+    InUse { path: String },
     /// The rig wants the panel's sync wire, which the box cannot take.
     #[error("the laser box has no input for the panel's sync output: take lasers.sync_wire out of the rig file")]
     NoSyncInput,
     /// The box is not built for what the rig asks of it.
     #[error("the laser box takes {limit} {unit} of {what} at most; the rig asks for {asked}: correct the rig file")]
     BeyondBox {
-        /// Which figure.
         what: &'static str,
-        /// The box's limit.
         limit: u32,
         /// What the rig asks for.
         asked: u32,
@@ -210,7 +194,6 @@ pub enum LaserError {
     /// The device answered something else than it should.
     #[error("{path}: answered `{found}` to `{sent}`; expected {expected}")]
     Complaint {
-        /// The port.
         path: String,
         /// What it was told or asked.
         sent: String,
@@ -231,10 +214,7 @@ pub enum LaserError {
     CannotGate,
     /// The bench has no laser of a colour that is to be shown.
     #[error("there is no {colour} laser on this bench: name its port in lasers.devices, or show other colours")]
-    NoLaser {
-        /// The colour.
-        colour: Colour,
-    },
+    NoLaser { colour: Colour },
     /// Somebody else made the box dark.
     #[error("somebody made the laser box dark with `holod dark`: restart holod to light lasers again")]
     MadeDark,
@@ -244,19 +224,13 @@ pub enum LaserError {
     /// The box did not acknowledge in time.
     #[error("the laser box did not answer `{command}` within {waited_ms} ms: check its cable and power")]
     NoAnswer {
-        /// The command's word.
         command: &'static str,
         /// How long it was waited for.
         waited_ms: i64,
     },
     /// The box refused a command.
     #[error("the laser box refused `{command}`: {refusal}")]
-    Refused {
-        /// The command's word.
-        command: &'static str,
-        /// Its reason.
-        refusal: Refusal,
-    },
+    Refused { command: &'static str, refusal: Refusal },
 }
 
 impl LaserError {
@@ -279,8 +253,8 @@ impl LaserError {
 pub struct Capability {
     /// It has no lasers. Only such a box is lit over a panel that is not there.
     pub simulated: bool,
-    /// It lights each field by itself, at times that it keeps. Otherwise its lasers are simply on while it is armed, and
-    /// it reports no edges.
+    /// It lights each field by itself, at times that it keeps. Otherwise its lasers are simply on while it is armed,
+    /// and it reports no edges.
     pub gates_fields: bool,
     /// It goes dark by itself when its host dies.
     pub has_heartbeat: bool,
@@ -291,8 +265,8 @@ pub struct Capability {
 /// A box that lights lasers.
 ///
 /// It boots dark, lights nothing until it is armed, is armed only when it is programmed, and goes dark by itself:
-/// without heartbeats for its timeout, and, where the panel's sync starts its windows, without sync for two colour frames.
-/// Once dark it stays dark until it is armed again. No method waits but [`Self::program`], [`Self::arm`] and
+/// without heartbeats for its timeout, and, where the panel's sync starts its windows, without sync for two colour
+/// frames. Once dark it stays dark until it is armed again. No method waits but [`Self::program`], [`Self::arm`] and
 /// [`Self::dark`], which wait for the box's answer for a bounded time.
 pub trait LaserBox: Send {
     /// What it can do.

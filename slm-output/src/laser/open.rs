@@ -7,11 +7,12 @@ use super::program::power_limit_uw;
 use super::reconnect::Reconnecting;
 use super::{DarkReason, LaserBox, LaserError, SerialBox, SerialOptions, SimulatedLaser, ready_beam, text_laser};
 
-/// Opens the laser box of a bench, which is recognised before it is told anything. A box that is lost later is looked for
-/// again by a thread of its own.
+/// Opens the laser box of a bench, which is recognised before it is told anything. A box that is lost later is looked
+/// for again by a thread of its own.
 ///
 /// # Errors
-/// [`LaserError`] where there is none, it is another device, another program uses it, or the rig does not accept its kind.
+/// [`LaserError`] where there is none, it is another device, another program uses it, or the rig does not accept its
+/// kind.
 pub fn open_laser(lasers: &Lasers, clock: fn() -> TimeNs) -> Result<Box<dyn LaserBox>, LaserError> {
     let opened = open_once(lasers, clock)?;
     if lasers.driver == LaserDriver::Simulated {

@@ -1,8 +1,8 @@
-//! Boxes that can set a power and switch it, and nothing more: neither do they gate single fields, nor do they go dark by
-//! themselves when their host dies.
+//! Boxes that can set a power and switch it, and nothing more: neither do they gate single fields, nor do they go dark
+//! by themselves when their host dies.
 //!
-//! Such devices take milliseconds to answer, so a thread of their own speaks to them. It also puts them out when the laser
-//! thread has not been heard of for the heartbeat timeout; a process that is killed leaves them lit.
+//! Such devices take milliseconds to answer, so a thread of their own speaks to them. It also puts them out when the
+//! laser thread has not been heard of for the heartbeat timeout; a process that is killed leaves them lit.
 
 use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
@@ -90,8 +90,8 @@ impl PowerBox {
     /// Drives `device`, which has been recognised, as `lasers` says.
     ///
     /// # Errors
-    /// [`LaserError::NotAccepted`] where the rig does not accept lasers without a heartbeat; [`LaserError::Line`] where no
-    /// thread can be started.
+    /// [`LaserError::NotAccepted`] where the rig does not accept lasers without a heartbeat; [`LaserError::Line`] where
+    /// no thread can be started.
     pub(super) fn new(device: impl PowerDevice, lasers: &Lasers, clock: fn() -> TimeNs) -> Result<Self, LaserError> {
         require_acceptance(lasers)?;
         let (orders, order_consumer) = RingBuffer::new(RING);

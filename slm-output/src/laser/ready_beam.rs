@@ -1,8 +1,8 @@
 //! FISBA READYBeam: three lasers behind one serial port, spoken to in MeCom frames.
 //!
-//! It sets powers and switches lasers in tens of milliseconds, so it never gates single fields, and it stays as it is when
-//! its host dies. Its usual port is the one that an eye tracker may get as well: nothing but a harmless read is sent
-//! before it has said what it is.
+//! It sets powers and switches lasers in tens of milliseconds, so it never gates single fields, and it stays as it is
+//! when its host dies. Its usual port is the one that an eye tracker may get as well: nothing but a harmless read is
+//! sent before it has said what it is.
 
 use std::path::Path;
 

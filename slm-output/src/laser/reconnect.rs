@@ -251,7 +251,8 @@ impl<F: Fn() -> Result<Box<dyn LaserBox>, LaserError>> Seeker<F> {
 
     fn find(&self, program: Option<&LaserProgram>) -> Result<Box<dyn LaserBox>, LaserError> {
         let mut laser = (self.open)()?;
-        // What the rules made of the first one holds for its successors: real lasers never take a simulated box's place.
+        // What the rules made of the first one holds for its successors: real lasers never take a simulated box's
+        // place.
         if laser.capability() != self.capability {
             return Err(LaserError::AnotherKind);
         }

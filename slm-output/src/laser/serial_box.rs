@@ -28,7 +28,8 @@ const IDENTIFY_WAIT: TimeNs = TimeNs(2_000_000_000);
 /// How long an identity is still waited for after a line that is no box's: it may be the end of an answer to somebody
 /// else, whose beginning they have read.
 const STRANGER_WAIT: TimeNs = TimeNs(500_000_000);
-/// A box that is not spoken to otherwise is asked for its time this often, so that a pulled cable is noticed in the dark.
+/// A box that is not spoken to otherwise is asked for its time this often, so that a pulled cable is noticed in the
+/// dark.
 const ASK_TIME_EVERY: TimeNs = TimeNs(250_000_000);
 /// Commands that may wait for an answer: a quarter of a second of fields at 1000 Hz.
 const UNANSWERED_MAX: usize = 512;
@@ -75,9 +76,9 @@ pub struct BoxReport {
 /// answer ([`BoxClock`]), windows are cut by what is not known of it, and where nothing is left of one the field stays
 /// dark.
 ///
-/// The box does not tell its edges, so the ones reported here are those of a model that is told the same as the box: what
-/// it does if it keeps its rules. Once it contradicts the model (it went dark, it refuses, it does not answer) that is
-/// an event or an error.
+/// The box does not tell its edges, so the ones reported here are those of a model that is told the same as the box:
+/// what it does if it keeps its rules. Once it contradicts the model (it went dark, it refuses, it does not answer)
+/// that is an event or an error.
 #[derive(Debug)]
 pub struct SerialBox {
     link: Link,
@@ -128,8 +129,8 @@ impl SerialBox {
         // Numbers that the other program does not wait for.
         let first = std::process::id().wrapping_mul(0x1_0000) | 0x8000_0000;
         let mut this = Self::on(link, &path.display().to_string(), SerialOptions::default(), first, clock);
-        // No LF comes first: it would make an armed box dark as a line that is no command, and its host would arm it again.
-        // Where somebody has left half a line, the first try completes and the second one follows it.
+        // No LF comes first: it would make an armed box dark as a line that is no command, and its host would arm it
+        // again. Where somebody has left half a line, the first try completes and the second one follows it.
         for _ in 0..DARK_TRIES {
             let number = this.send(&Command::Disarm(reason))?;
             this.awaited = Some((number, None));
@@ -169,8 +170,9 @@ impl SerialBox {
         Ok(BoxReport { name: self.name.clone(), limits: self.limits, state, clock_error_ns })
     }
 
-    /// Talks to the box on `reader` and `writer`; `name` is for messages. Reads return within some tens of milliseconds,
-    /// with [`std::io::ErrorKind::WouldBlock`] or [`std::io::ErrorKind::TimedOut`] where nothing is there.
+    /// Talks to the box on `reader` and `writer`; `name` is for messages. Reads return within some tens of
+    /// milliseconds, with [`std::io::ErrorKind::WouldBlock`] or [`std::io::ErrorKind::TimedOut`] where nothing is
+    /// there.
     ///
     /// # Errors
     /// As [`Self::open`].

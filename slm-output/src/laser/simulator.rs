@@ -1,7 +1,7 @@
 //! A laser box without lasers as a process or thread of its own: the reference firmware on a pseudo-terminal.
 //!
-//! It outlives the program that it serves, so its log tells what the lasers did when that program was killed. Its clock is
-//! its own, with an offset and a drift, and faults can be put into it.
+//! It outlives the program that it serves, so its log tells what the lasers did when that program was killed. Its clock
+//! is its own, with an offset and a drift, and faults can be put into it.
 
 use std::ffi::OsString;
 use std::fs::File;
@@ -159,11 +159,11 @@ impl SimulatedBox {
         }
     }
 
-    /// Serves one host until its line has hung up and the box is dark, and logs what the lasers do as lines of CSV under
-    /// [`LOG_HEADER`], in the host's time.
+    /// Serves one host until its line has hung up and the box is dark, and logs what the lasers do as lines of CSV
+    /// under [`LOG_HEADER`], in the host's time.
     ///
-    /// `reader` returns within some milliseconds, with [`ErrorKind::WouldBlock`] or [`ErrorKind::TimedOut`] where nothing
-    /// is there. Answers that cannot be sent are dropped.
+    /// `reader` returns within some milliseconds, with [`ErrorKind::WouldBlock`] or [`ErrorKind::TimedOut`] where
+    /// nothing is there. Answers that cannot be sent are dropped.
     ///
     /// # Errors
     /// [`io::Error`] where the log cannot be written.

@@ -1,7 +1,7 @@
 //! Lasers that take commands in text (SCPI and its like), one to a port, as a [`TextLaserProfile`] describes them.
 //!
-//! They are switched in tens of milliseconds, so they never gate single fields, and they stay as they are when their host
-//! dies.
+//! They are switched in tens of milliseconds, so they never gate single fields, and they stay as they are when their
+//! host dies.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +12,8 @@ use super::line_link::Sharing;
 use super::power_box::{Conversation, PowerBox, PowerDevice, require_acceptance};
 use super::{LaserBox, LaserError};
 
-/// How long an acknowledgement after the answer to a question is waited for, so that it is not taken for the next one's.
+/// How long an acknowledgement after the answer to a question is waited for, so that it is not taken for the next
+/// one's.
 const TRAIL_WAIT: TimeNs = TimeNs(30_000_000);
 
 /// One laser on its port.

@@ -27,84 +27,31 @@ pub struct FieldSpan {
 
 /// What is wrong.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Finding {
     /// A laser was lit while no field was on the panel.
-    WindowWithoutField {
-        /// Which laser.
-        colour: Colour,
-        /// Since when.
-        t_on: TimeNs,
-    },
+    WindowWithoutField { colour: Colour, t_on: TimeNs },
     /// A laser was lit over a field of another colour.
-    WrongColour {
-        /// Which laser.
-        colour: Colour,
-        /// Since when.
-        t_on: TimeNs,
-        /// The field's colour.
-        field_colour: Colour,
-        /// The field's frame.
-        frame_id: u64,
-    },
+    WrongColour { colour: Colour, t_on: TimeNs, field_colour: Colour, frame_id: u64 },
     /// A laser was lit over its own field but also before it had settled or after its end.
-    OutsideField {
-        /// Which laser.
-        colour: Colour,
-        /// Since when.
-        t_on: TimeNs,
-        /// Until when.
-        t_off: TimeNs,
-        /// The field's frame.
-        frame_id: u64,
-    },
+    OutsideField { colour: Colour, t_on: TimeNs, t_off: TimeNs, frame_id: u64 },
     /// Two lasers were lit at once.
-    TwoLit {
-        /// The two lasers.
-        colours: [Colour; 2],
-        /// Since when.
-        t: TimeNs,
-    },
+    TwoLit { colours: [Colour; 2], t: TimeNs },
     /// A laser was lit twice in one field.
-    SecondWindow {
-        /// Which laser.
-        colour: Colour,
-        /// Since when.
-        t_on: TimeNs,
-        /// The field's frame.
-        frame_id: u64,
-    },
+    SecondWindow { colour: Colour, t_on: TimeNs, frame_id: u64 },
     /// A laser was lit over a field that must stay dark.
-    ForbiddenField {
-        /// Which laser.
-        colour: Colour,
-        /// The field's frame.
-        frame_id: u64,
-        /// Why it must.
-        reason: DarkReason,
-    },
+    ForbiddenField { colour: Colour, frame_id: u64, reason: DarkReason },
     /// A field that should have been lit was not.
     FieldWithoutWindow {
-        /// The field's colour.
         colour: Colour,
-        /// The field's frame.
         frame_id: u64,
         /// When it came on the panel.
         t_present: TimeNs,
     },
     /// A laser went on that was on, or off that was off.
-    BrokenLog {
-        /// Which laser.
-        colour: Colour,
-        /// When.
-        t: TimeNs,
-    },
+    BrokenLog { colour: Colour, t: TimeNs },
     /// A laser was never switched off.
-    StillLit {
-        /// Which laser.
-        colour: Colour,
-        /// Since when.
-        t_on: TimeNs,
-    },
+    StillLit { colour: Colour, t_on: TimeNs },
 }
 
 impl Finding {

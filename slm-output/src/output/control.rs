@@ -57,8 +57,9 @@ impl OutputControl {
         self.switch.clone()
     }
 
-    /// Keeps the lasers dark for the reason `why` until this is taken back with none; then they are lit again by the rules.
-    /// Waits for the box, some two seconds at most; whether it has acknowledged. They are kept dark also where it has not.
+    /// Keeps the lasers dark for the reason `why` until this is taken back with none; then they are lit again by the
+    /// rules. Waits for the box, some two seconds at most; whether it has acknowledged. They are kept dark also where
+    /// it has not.
     pub fn keep_dark(&self, why: Option<DarkReason>) -> bool {
         let shared = &self.switch.shared;
         let (before, _) = dark_request_parts(shared.dark_request.load(Ordering::Acquire));
@@ -155,8 +156,9 @@ impl DarkSwitch {
         self.shared.acknowledged.load(Ordering::Acquire) == DARK
     }
 
-    /// From now on any panic of the program first makes the lasers dark, and waits a moment for the acknowledgement. One of
-    /// which `is_caught` says, on the thread that panics, that it is caught and is an error like any other, does nothing.
+    /// From now on any panic of the program first makes the lasers dark, and waits a moment for the acknowledgement.
+    /// One of which `is_caught` says, on the thread that panics, that it is caught and is an error like any other, does
+    /// nothing.
     pub fn install_panic_hook(&self, clock: Clock, is_caught: fn() -> bool) {
         let switch = self.clone();
         let before = std::panic::take_hook();

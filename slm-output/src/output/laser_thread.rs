@@ -51,8 +51,8 @@ impl LaserThread {
         }
     }
 
-    /// Does all that is to be done at the time that `clock` says, which is handed back. The clock is read again for each
-    /// field: a field that came since the last reading is not one that was reported before it was shown.
+    /// Does all that is to be done at the time that `clock` says, which is handed back. The clock is read again for
+    /// each field: a field that came since the last reading is not one that was reported before it was shown.
     pub(super) fn step(&mut self, clock: impl Fn() -> TimeNs) -> TimeNs {
         let now = clock();
         self.poll(now);
@@ -149,7 +149,8 @@ impl LaserThread {
         }
     }
 
-    /// Counts a fault of the box and hands it over to whoever tells people; where nobody has listened it is only counted.
+    /// Counts a fault of the box and hands it over to whoever tells people; where nobody has listened it is only
+    /// counted.
     fn note(&mut self, error: LaserError) {
         count(&self.shared.box_faults);
         let _counted = self.faults.push(error);

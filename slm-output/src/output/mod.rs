@@ -58,7 +58,8 @@ const SLEEP_MAX: TimeNs = TimeNs(20_000_000);
 pub struct OutputOptions {
     /// Frames whose presented levels can be kept in memory (see [`FramePort::submit`]).
     pub keep_slots: usize,
-    /// Lasers go dark when one frame has stayed on the panel for this long. Not less than a few times the slowest frame.
+    /// Lasers go dark when one frame has stayed on the panel for this long. Not less than a few times the slowest
+    /// frame.
     pub stall_timeout: TimeNs,
     /// Whether somebody may look at what is shown ([`Output::look`]).
     pub look: bool,
@@ -121,8 +122,8 @@ impl Output {
     ) -> Result<Self, OutputError> {
         let flat = PanelSetup::new(&rig.panel, encoder).flat;
         let virtual_bench = panel.is_virtual() && laser.is_simulated();
-        // A box with a wire to the panel's sync times its own windows, and in channel-packed mode the panel's own sequence
-        // says which colour each of them is for: that frames go by is all that must be known here.
+        // A box with a wire to the panel's sync times its own windows, and in channel-packed mode the panel's own
+        // sequence says which colour each of them is for: that frames go by is all that must be known here.
         let wired =
             !panel.is_virtual() && laser.capability().sync_wire && FieldGate::trigger(&rig.panel) == Trigger::PanelSync;
         let evidence = if virtual_bench || wired { Evidence::Seen } else { Evidence::Stamped };

@@ -28,19 +28,12 @@ pub(super) enum PanelNews {
 
 /// What happened to the panel, for whoever tells people.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum PanelEvent {
     /// It was lost, and is tried again where the fault is recoverable.
-    Lost {
-        /// When.
-        t: TimeNs,
-        /// Why.
-        fault: PanelFault,
-    },
+    Lost { t: TimeNs, fault: PanelFault },
     /// It is back.
-    Back {
-        /// When.
-        t: TimeNs,
-    },
+    Back { t: TimeNs },
 }
 
 pub(super) struct PanelThread {

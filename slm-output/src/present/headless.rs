@@ -10,7 +10,8 @@ use crate::fields::{FrameTag, LevelsFrame};
 /// Colour frames that a late tick reports after the fact, of the first and of the last ones that went by.
 const CATCH_UP_FRAMES: i64 = 8;
 
-/// What a virtual panel does wrong on purpose, so that a bench can be tried out without one. Shares are of all refreshes.
+/// What a virtual panel does wrong on purpose, so that a bench can be tried out without one. Shares are of all
+/// refreshes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ReportFaults {
     /// Its true refresh rate, where that is not the rig's.

@@ -15,7 +15,8 @@ use super::drm::DrmTarget;
 pub enum OutputSpec {
     /// `headless[:KEY=VALUE,...]`: a virtual panel, with what it does wrong on purpose.
     Headless(ReportFaults),
-    /// `drm:CONNECTOR[,card=/dev/dri/cardN]`: a connector of a graphics card, or the monitor at it, without a display server.
+    /// `drm:CONNECTOR[,card=/dev/dri/cardN]`: a connector of a graphics card, or the monitor at it, without a display
+    /// server.
     Drm(DrmTarget),
     /// `window[:MONITOR][,allow_primary]`: a window that covers a monitor of the desktop.
     Window(WindowSpec),

@@ -31,8 +31,8 @@ impl Balance {
         Self { lit: PerColour([TimeNs(0); 3]), last: None, layout: *layout, width }
     }
 
-    /// For how much of `time` the colour of `field`, a position in the colour frame, may be lit now; it is then taken as
-    /// lit. 0 where it must wait.
+    /// For how much of `time` the colour of `field`, a position in the colour frame, may be lit now; it is then taken
+    /// as lit. 0 where it must wait.
     pub(super) fn take(&mut self, field: usize, time: TimeNs) -> TimeNs {
         let colour = self.layout.colour_of_field(field);
         // There is only one colour.

@@ -61,7 +61,8 @@ impl FieldGate {
     /// How far the reported time of a refresh may be wrong without light where it must not be.
     ///
     /// Where the host starts the windows that is half of the time that the rig leaves free at both ends of a window, on
-    /// delay and the rest of the field; the other half is for what the rhythm itself is off by. Where the panel's sync starts them the reports only say that the panel runs.
+    /// delay and the rest of the field; the other half is for what the rhythm itself is off by. Where the panel's sync
+    /// starts them the reports only say that the panel runs.
     pub fn time_tolerance(&self, trigger: Trigger) -> TimeNs {
         match trigger {
             Trigger::PanelSync => TimeNs(self.timing.refresh_period.0 / 16),

@@ -1,8 +1,9 @@
 //! From refreshes of the panel to what the lasers may do.
 //!
-//! A [`FieldScheduler`] is told of every refresh that a panel reports and says, field by field, what the laser box shall
-//! do: `refreshes` decides whether the reports can be believed, `gate` cuts the window out of each field, `interlock`
-//! decides whether it may be lit, `balance` keeps the colours equal. All of it is pure: times come in as arguments.
+//! A [`FieldScheduler`] is told of every refresh that a panel reports and says, field by field, what the laser box
+//! shall do: `refreshes` decides whether the reports can be believed, `gate` cuts the window out of each field,
+//! `interlock` decides whether it may be lit, `balance` keeps the colours equal. All of it is pure: times come in as
+//! arguments.
 //!
 //! What it knows of the panel is a report for each refresh. What it does not know, it leaves dark: a refresh without a
 //! report, one that contradicts the others, one whose time is a guess.

@@ -9,8 +9,8 @@ use crate::present::PresentedRefresh;
 const AGREEING_MIN: u32 = 2;
 /// Reports in a row that contradict the panel's clock, after which the clock is taken from the newest.
 const STRAYS_MAX: u32 = 2;
-/// Share of a believed report's error that moves the phase of the rhythm: one that is a little off must not make the next
-/// one, which is a little more off, look right.
+/// Share of a believed report's error that moves the phase of the rhythm: one that is a little off must not make the
+/// next one, which is a little more off, look right.
 const PHASE_GAIN: f64 = 0.2;
 /// Share of an interval's error that moves the period.
 const PERIOD_GAIN: f64 = 0.02;
@@ -24,10 +24,11 @@ const RATE_GAIN: f64 = 0.05;
 
 /// Compares each report with the ones before it.
 ///
-/// A panel refreshes in a steady rhythm. A report is believed when it lies on that rhythm, as the ones that were believed
-/// before made it, to within a tolerance, when the display controller's own count, where there is one, has gone on
-/// by that number, when the field that it carries can follow, and when [`AGREEING_MIN`] reports in a row have done so. A report that is early, doubled, of no
-/// time, or of a time that runs back, is not; nor are those right after it.
+/// A panel refreshes in a steady rhythm. A report is believed when it lies on that rhythm, as the ones that were
+/// believed before made it, to within a tolerance, when the display controller's own count, where there is one, has
+/// gone on by that number, when the field that it carries can follow, and when [`AGREEING_MIN`] reports in a row have
+/// done so. A report that is early, doubled, of no time, or of a time that runs back, is not; nor are those right after
+/// it.
 #[derive(Clone, Debug)]
 pub(super) struct RefreshJudge {
     nominal_ns: f64,
@@ -127,8 +128,8 @@ impl RefreshJudge {
         if self.agreeing < AGREEING_MIN || !steady { Err(DarkReason::Untrusted) } else { Ok(()) }
     }
 
-    /// The panel goes on by at least one refresh of a colour frame, and by no more than the time allows; a doubled report
-    /// a whole period late is told by that.
+    /// The panel goes on by at least one refresh of a colour frame, and by no more than the time allows; a doubled
+    /// report a whole period late is told by that.
     fn fields_agree(&self, anchor: &Anchor, refresh: &PresentedRefresh, periods: f64) -> bool {
         let count = self.refreshes_per_frame;
         if count == 1 || periods >= count as f64 {

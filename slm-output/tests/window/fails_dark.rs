@@ -1,5 +1,5 @@
-//! Whatever happens to the window, the lasers go dark: the real threads, and a laser box on a terminal with a log of its
-//! own.
+//! Whatever happens to the window, the lasers go dark: the real threads, and a laser box on a terminal with a log of
+//! its own.
 //!
 //! No display server here scans a window out directly, so none stamps a time that a laser may be lit by. A decorator
 //! passes the times of copies off as stamped ones; all else is what a bench runs.

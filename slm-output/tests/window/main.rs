@@ -1,5 +1,5 @@
-//! The panel's window under real display servers, which each test starts for itself: Xorg with dummy monitors, Xvfb, and
-//! a headless compositor. `tests/all` installs them.
+//! The panel's window under real display servers, which each test starts for itself: Xorg with dummy monitors, Xvfb,
+//! and a headless compositor. `tests/all` installs them.
 
 #![cfg(feature = "window")]
 

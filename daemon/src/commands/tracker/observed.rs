@@ -63,8 +63,8 @@ pub(super) struct EyeFigures {
     pub(super) interval_ms: Option<Quantiles>,
     /// Time between neighbouring samples as they arrived.
     pub(super) arrival_interval_ms: Option<Quantiles>,
-    /// From the time at which a sample was taken, as the clock model maps it, to its arrival; the least delay is not known
-    /// and counts as none.
+    /// From the time at which a sample was taken, as the clock model maps it, to its arrival; the least delay is not
+    /// known and counts as none.
     pub(super) delay_ms: Option<Quantiles>,
     /// Diameters as the tracker gave them, scaled to millimetres, where it said that it saw a pupil.
     pub(super) raw_mm: Option<Quantiles>,

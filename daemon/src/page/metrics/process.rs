@@ -1,4 +1,5 @@
-//! This process under the names that Prometheus's own libraries give every process, so that their rules and dashboards fit.
+//! This process under the names that Prometheus's own libraries give every process, so that their rules and dashboards
+//! fit.
 
 use std::fmt;
 use std::fs;

@@ -210,8 +210,9 @@ impl Stream {
     fn copy_part(&self, part: &mut [u8], at: usize) {
         assert!(at + part.len() <= self.mapped.len(), "within the shared memory");
         // SAFETY: what is read lies within the mapping, which lives as long as `self` and cannot be made shorter (it is
-        // sealed). No reference into it is made. A client that breaks the rules may write meanwhile, and then the copy holds
-        // some of its old and some of its new bytes: of bytes, and of all that is made of them, every value is allowed.
+        // sealed). No reference into it is made. A client that breaks the rules may write meanwhile, and then the copy
+        // holds some of its old and some of its new bytes: of bytes, and of all that is made of them, every value is
+        // allowed.
         unsafe { std::ptr::copy_nonoverlapping(self.mapped.as_ptr().add(at), part.as_mut_ptr(), part.len()) }
     }
 
@@ -235,7 +236,8 @@ impl Client {
         }
     }
 
-    /// Reads what it has sent. Pictures that are overtaken or refused by their numbers are freed, with `note` told of each.
+    /// Reads what it has sent. Pictures that are overtaken or refused by their numbers are freed, with `note` told of
+    /// each.
     pub(super) fn receive(
         &mut self,
         target: &Target,

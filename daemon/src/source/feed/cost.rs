@@ -18,8 +18,8 @@ pub struct FeedCost {
     pub picture_bytes: usize,
     /// A copy of these bytes from memory to memory.
     pub memcpy: Vec<Duration>,
-    /// What is done while the client waits for its slot: the picture's bytes are copied out of the shared memory, and it is
-    /// found out whether it can be shown.
+    /// What is done while the client waits for its slot: the picture's bytes are copied out of the shared memory, and
+    /// it is found out whether it can be shown.
     pub take: Vec<Duration>,
     /// What is done once the slot has been given back: a frame is made of the copy.
     pub make: Vec<Duration>,

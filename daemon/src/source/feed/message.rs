@@ -31,7 +31,6 @@ const ALIGNMENT: usize = 64;
 pub(super) enum Message {
     /// `HELO`: what its pictures will be like.
     Hello {
-        /// The protocol's version.
         version: u32,
         /// How they are stored.
         format: LiveFormat,
@@ -40,9 +39,7 @@ pub(super) enum Message {
     },
     /// `FRAM`: a picture is in a slot.
     Frame {
-        /// The slot.
         slot: u32,
-        /// The picture's number.
         sequence: u64,
         /// When it was taken, where the client says so.
         t_taken: Option<TimeNs>,
@@ -173,7 +170,6 @@ pub(super) struct Layout {
     pub(super) colour_bytes: usize,
     /// From a slot's beginning to its depths.
     pub(super) depth_offset: usize,
-    /// Depths.
     pub(super) depth_bytes: usize,
 }
 
@@ -338,7 +334,8 @@ pub(super) mod tests {
     }
 
     proptest! {
-        /// Whatever bytes come, they are a message that holod can obey, or are refused in words that fit into an answer.
+        /// Whatever bytes come, they are a message that holod can obey, or are refused in words that fit into an
+        /// answer.
         #[test]
         fn no_bytes_are_too_odd(
             kind in 0..3, noise in prop::collection::vec(any::<u8>(), 0..80), at in 0_usize..64, byte: u8,

@@ -2,8 +2,8 @@
 //!
 //! One ordinary thread listens, reads what clients send, and turns the newest picture of the one that is shown into a
 //! frame. Pictures are copied out of the shared memory and never looked at in place, so a client that breaks
-//! the rules harms its own picture only. Once its picture is copied a client has its slot back; the frame is made of the
-//! copy after that.
+//! the rules harms its own picture only. Once its picture is copied a client has its slot back; the frame is made of
+//! the copy after that.
 
 mod client;
 pub mod cost;
@@ -65,7 +65,8 @@ pub struct FeedPlan {
     pub resolution: Resolution,
     /// How pictures of another size are brought to it.
     pub fit: Fit,
-    /// What is shown until there is a picture. It lives as long as the plan: an engine keeps the last frame that it has seen.
+    /// What is shown until there is a picture. It lives as long as the plan: an engine keeps the last frame that it has
+    /// seen.
     pub black: Arc<RgbdFrame>,
     /// Lasers are dark once no new picture has come for this long; without it the last one stays lit.
     pub dark_after: Option<TimeNs>,
@@ -487,8 +488,8 @@ fn make(client: &mut Client, copied: &Copied, frame: &mut Arc<RgbdFrame>) -> Liv
     client.stream().make(copied, frame).expect("a picture that was taken over has a depth")
 }
 
-/// Says once of each client what is most often a mistake: depths of which most are bad, and oddities of its first picture,
-/// where a frame could be made of that.
+/// Says once of each client what is most often a mistake: depths of which most are bad, and oddities of its first
+/// picture, where a frame could be made of that.
 fn tell_oddities(client: &mut Client, bad: &BadDepths, made: Option<(&RgbdFrame, &LiveReport)>, target: &Target) {
     let name = format!("the feed's client `{}`", client.name);
     let format = client.stream().format();

@@ -10,9 +10,7 @@ use super::message::{Outcome, SLOTS, Wrong};
 /// A picture that waits to be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Picture {
-    /// Where it is.
     pub(super) slot: usize,
-    /// Its number.
     pub(super) sequence: u64,
     /// When it was taken, or else when it came.
     pub(super) t_taken: TimeNs,
@@ -163,8 +161,9 @@ mod tests {
         }
     }
 
-    /// A client and holod with two words of a picture in each slot. loom runs every order of their steps, and objects where
-    /// one writes what the other may be reading. holod hears all that has come before it reads the newest, as it does.
+    /// A client and holod with two words of a picture in each slot. loom runs every order of their steps, and objects
+    /// where one writes what the other may be reading. holod hears all that has come before it reads the newest, as it
+    /// does.
     fn conversation(waits_for_free: bool) {
         const PICTURES: u64 = 5;
         let memory = Arc::new([(); SLOTS].map(|()| [UnsafeCell::new(0_u64), UnsafeCell::new(0)]));

@@ -1,9 +1,10 @@
-//! Plain 3x3 convolutions, by Winograd's minimal filtering: F(4x4, 3x3) takes 36 multiplications where the sum over taps
-//! takes 144.
+//! Plain 3x3 convolutions, by Winograd's minimal filtering: F(4x4, 3x3) takes 36 multiplications where the sum over
+//! taps takes 144.
 //!
-//! Six input values of a row or column become six points, the input polynomial's remainders at 0, ±⅝, ±1½ and ∞; products
-//! with the weights' points are summed over channels; and four outputs come back of six sums. With these points, of which
-//! all factors are exact, the error is 1.7 times that of the sum over taps; with the usual 0, ±1, ±2 and ∞ it is 4 times.
+//! Six input values of a row or column become six points, the input polynomial's remainders at 0, ±⅝, ±1½ and ∞;
+//! products with the weights' points are summed over channels; and four outputs come back of six sums. With these
+//! points, of which all factors are exact, the error is 1.7 times that of the sum over taps; with the usual 0, ±1, ±2
+//! and ∞ it is 4 times.
 
 use super::feature_map::{FeatureMap, TILE, WORKERS};
 use super::product::{ROWS, Shape, panel_place, panels_len};
@@ -335,8 +336,8 @@ impl TileRow<'_> {
         for pixel in 0..pixels {
             for channel in (0..out_stride).step_by(S::LANES) {
                 let place = pixel * out_stride + channel;
-                // SAFETY: `place` and the LANES values after it lie in each of six rows of `from` and of `rows` of `to`;
-                // `channel` likewise in the bias.
+                // SAFETY: `place` and the LANES values after it lie in each of six rows of `from` and of `rows` of
+                // `to`; `channel` likewise in the bias.
                 unsafe {
                     let values = std::array::from_fn(|row| simd.load(from.as_ptr().add(row * from_row_len + place)));
                     let bias = simd.load(activation.bias.as_ptr().add(channel));
@@ -356,8 +357,8 @@ mod tests {
     use super::*;
     use crate::worst::worst;
 
-    /// Largest error allowed, over the output's root mean square: a quarter of what stages of whole networks may have, which
-    /// are judged by their largest value.
+    /// Largest error allowed, over the output's root mean square: a quarter of what stages of whole networks may have,
+    /// which are judged by their largest value.
     const TOLERANCE: f64 = 2e-5;
     const SLOPE: f32 = 0.1;
 

@@ -17,14 +17,15 @@ use crate::weights::{MOST_DEPTH_LAYERS, NetworkConfig};
 /// Bins of a spectrum that are blurred together.
 const BINS: usize = 16;
 
-/// Blurs each depth layer by its disc of confusion at the focus on each other one, and divides the sum by that of a white
-/// scene. Blur is circular, and no layer hides another. Nothing is allocated after `new`.
+/// Blurs each depth layer by its disc of confusion at the focus on each other one, and divides the sum by that of a
+/// white scene. Blur is circular, and no layer hides another. Nothing is allocated after `new`.
 pub(super) struct Defocus {
     size: Resolution,
     disc: DiscTable,
     /// The pupil that `discs` is for.
     pupil_mm: f32,
-    /// [width, layers, height], over the number of samples: spectra of the discs between layers that are 0, 1, 2, .. apart.
+    /// [width, layers, height], over the number of samples: spectra of the discs between layers that are 0, 1, 2, ..
+    /// apart.
     discs: Vec<f32>,
     /// Whether a layer has a pixel.
     present: Vec<bool>,

@@ -77,8 +77,8 @@ impl DepthLayers {
         });
     }
 
-    /// Adds the light [height, width] that one layer sends out, which is used up, to the transposed spectrum `sum` of the
-    /// light of farther ones: Horner's rule, far to near, from zeros on.
+    /// Adds the light [height, width] that one layer sends out, which is used up, to the transposed spectrum `sum` of
+    /// the light of farther ones: Horner's rule, far to near, from zeros on.
     pub(super) fn add_light(&mut self, colour: Colour, light: &mut [Complex32], sum: &mut [Complex32]) {
         self.fft.forward(light);
         let samples = self.size.pixels() as f32;

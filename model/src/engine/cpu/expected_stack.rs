@@ -65,7 +65,8 @@ pub(super) fn stages(
             light: vec![Complex32::ZERO; size.pixels()],
         })
         .then(FeedBack {
-            // The field before and after, for the net the field and its change, and the stack and what is lacking of it.
+            // The field before and after, for the net the field and its change, and the stack and what is lacking of
+            // it.
             bytes: layer_numbers + plane_bytes(4 * OUTPUT_CHANNELS + 2 * stack_planes, size),
             feedback: LayerFeedback::new(config, bench, feedback, size),
             correction_input: correction.input,

@@ -36,8 +36,8 @@ impl FeatureMap {
         self.data[self.row_len..].par_chunks_exact_mut(self.row_len).take(self.height)
     }
 
-    /// Runs `work(scratch, y, rows)` for each row of tiles, the last one perhaps with fewer than [`TILE`] rows, from `y`
-    /// on and as [`Self::rows_mut`] has them. Each worker takes one after another, with its own of the scratches.
+    /// Runs `work(scratch, y, rows)` for each row of tiles, the last one perhaps with fewer than [`TILE`] rows, from
+    /// `y` on and as [`Self::rows_mut`] has them. Each worker takes one after another, with its own of the scratches.
     pub(super) fn for_each_tile_row<T: Send>(
         &mut self,
         scratches: &mut [T],

@@ -10,9 +10,10 @@ use crate::engine::constants::FEEDBACK_DARK_POWER;
 use crate::optics::{signed_bin, transfer_table};
 use crate::weights::{Feedback, NetworkConfig};
 
-/// One step of Gerchberg and Saxton (1972) at all depth layers at once: the field goes through the pupil to every layer,
-/// takes the wanted amplitude there with the phase that it has, and the mean of these changes comes back, in which what is
-/// in focus weighs more. The layers change one another too; the second net mends that. Nothing is allocated after `new`.
+/// One step of Gerchberg and Saxton (1972) at all depth layers at once: the field goes through the pupil to every
+/// layer, takes the wanted amplitude there with the phase that it has, and the mean of these changes comes back, in
+/// which what is in focus weighs more. The layers change one another too; the second net mends that. Nothing is
+/// allocated after `new`.
 pub(super) struct LayerFeedback {
     parameters: Feedback,
     bench: DisplayGeometry,

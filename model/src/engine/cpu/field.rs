@@ -21,7 +21,6 @@ pub(super) trait UncorrectedField {
 /// Corrects the field, and upsamples it on the half-band grid.
 pub(super) struct Field {
     residual: MapId,
-    /// The network's grid.
     size: Resolution,
     /// The panel's size, and that rounded up to what the grid needs.
     resolution: Resolution,

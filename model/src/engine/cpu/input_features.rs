@@ -85,8 +85,8 @@ impl FeatureMap {
         });
     }
 
-    /// Writes `base` and a share of this correction of one colour to `field`, both [height, width]; the map's channels are
-    /// three real parts and three imaginary ones.
+    /// Writes `base` and a share of this correction of one colour to `field`, both [height, width]; the map's channels
+    /// are three real parts and three imaginary ones.
     pub(super) fn correct(&self, base: &[Complex32], colour: Colour, field: &mut [Complex32]) {
         let rows = field.par_chunks_exact_mut(self.width).zip(base.par_chunks_exact(self.width));
         rows.enumerate().for_each(|(y, (row, base))| {

@@ -29,8 +29,8 @@ use crate::{ComplexHologram, RgbdFrame, Weights};
 
 pub use peak::{fma_peak, stream_bandwidth};
 
-/// The network on the CPU, for frames of one size. It works on the threads of the [`WorkerPool`](crate::WorkerPool) that
-/// it is called in, elsewhere on rayon's own.
+/// The network on the CPU, for frames of one size. It works on the threads of the [`WorkerPool`](crate::WorkerPool)
+/// that it is called in, elsewhere on rayon's own.
 pub struct CpuEngine {
     network: Network,
     resolution: Resolution,
@@ -54,7 +54,8 @@ impl CpuEngine {
     /// Writes the hologram of `frame` for an eye with `pupil` to `hologram`. Does not allocate in a
     /// [`WorkerPool`](crate::WorkerPool).
     ///
-    /// Of a pupil beyond those that the weights were trained for, the network is told the nearest; blur and stop are its own.
+    /// Of a pupil beyond those that the weights were trained for, the network is told the nearest; blur and stop are
+    /// its own.
     ///
     /// # Errors
     /// [`EngineError`] for buffers of another size than the engine's, and a pupil that is none.

@@ -92,8 +92,8 @@ pub(super) const fn panel_place(row: usize, channel: usize) -> usize {
 /// Output channels that are computed together: four vectors of them, or two of 16 lanes, or the rest.
 ///
 /// An odd number of half vectors, which a rest has at 16 lanes only, would leave lanes idle. There each output channel
-/// takes two neighbouring lanes, one for the sum over even inputs and one for that over odd ones: 24 channels fill three
-/// vectors of 16 lanes, each step takes two inputs, and `add_pairs` joins the two sums at the end.
+/// takes two neighbouring lanes, one for the sum over even inputs and one for that over odd ones: 24 channels fill
+/// three vectors of 16 lanes, each step takes two inputs, and `add_pairs` joins the two sums at the end.
 struct Block {
     first: usize,
     channels: usize,
@@ -133,9 +133,9 @@ fn kernel<S: Simd, const V: usize, const I: usize, const P: usize>(
     assert!(outputs.len() >= (rows - P.min(rows)) * PANEL + (P - 1) * PANEL + V.div_ceil(I) * S::LANES);
     for row in (0..rows).step_by(P) {
         // Bounds checks in this loop would cost more than its arithmetic.
-        // SAFETY: the panels hold ROWS rows, of which `row + P - 1` is one, and a panel is read below its width, of which
-        // I is a divisor; the weights' rows are walked once, in order, and are as many as inputs. What is written lies
-        // below `outputs.len()`. All was asserted above.
+        // SAFETY: the panels hold ROWS rows, of which `row + P - 1` is one, and a panel is read below its width, of
+        // which I is a divisor; the weights' rows are walked once, in order, and are as many as inputs. What is written
+        // lies below `outputs.len()`. All was asserted above.
         unsafe {
             let mut sums = [[simd.splat(0.0); V]; P];
             let mut weight_row = weights.as_ptr();

@@ -17,8 +17,8 @@ use crate::worst::worst;
 
 /// Largest difference allowed between a map and its reference, relative to the reference's largest value.
 const TOLERANCE: f64 = 2e-5;
-/// The same between holograms of benches that are one in pixels: 4.3e-4 was found of random weights, 3.3e-5 of the small
-/// built-in ones; of a pitch of 7 µm 0.2.
+/// The same between holograms of benches that are one in pixels: 4.3e-4 was found of random weights, 3.3e-5 of the
+/// small built-in ones; of a pitch of 7 µm 0.2.
 const SAME_IN_PIXELS: f64 = 2e-3;
 
 pub(in crate::engine) fn frame(resolution: Resolution, seed: u32) -> RgbdFrame {

@@ -1,7 +1,7 @@
 //! 3x3 convolutions on the GPU, as sums over taps.
 //!
-//! Layers that write a map of half precision multiply in half precision, two products at once, and sum up what each group of
-//! input channels gives in single precision. All others multiply in single precision, whatever they read.
+//! Layers that write a map of half precision multiply in half precision, two products at once, and sum up what each
+//! group of input channels gives in single precision. All others multiply in single precision, whatever they read.
 
 use half::f16;
 
@@ -16,8 +16,8 @@ const WORKGROUP: usize = 64;
 const ELEMENT_BYTES: usize = 64;
 
 impl Precision {
-    /// Groups of output channels that a thread of a layer that multiplies so holds sums of, at most: with [`ROWS`] rows of
-    /// so many a shader has registers left for what it multiplies.
+    /// Groups of output channels that a thread of a layer that multiplies so holds sums of, at most: with [`ROWS`] rows
+    /// of so many a shader has registers left for what it multiplies.
     fn most_part_groups(self) -> usize {
         match self {
             Self::Single => 5,
@@ -110,7 +110,8 @@ impl ConvLayer<'_> {
 
 /// How a layer's parameters lie in their buffer.
 ///
-/// Threads make the output channels in parts of a few whole groups; those beyond the map's groups are zero and not stored.
+/// Threads make the output channels in parts of a few whole groups; those beyond the map's groups are zero and not
+/// stored.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Packing {
     precision: Precision,
@@ -120,7 +121,8 @@ pub(crate) struct Packing {
 }
 
 impl Packing {
-    /// For a layer that multiplies in `precision`, reads the first `input_groups` of a map and writes a map of `output_groups`.
+    /// For a layer that multiplies in `precision`, reads the first `input_groups` of a map and writes a map of
+    /// `output_groups`.
     pub(crate) fn new(precision: Precision, input_groups: usize, output_groups: usize) -> Self {
         let parts = output_groups.div_ceil(precision.most_part_groups());
         Self { precision, input_groups, parts, part_groups: output_groups.div_ceil(parts) }
@@ -149,9 +151,9 @@ impl Packing {
         first + (channel * self.part_groups + group) * GROUP + lane
     }
 
-    /// Writes the parameters of a layer to `parameters`, of [`Self::len`] zeros or of the same layer at other values: the bias
-    /// of each output, and `weight(output, input, tap)`, taps row-major over the kernel, for those of the map's channels
-    /// that `inputs` lists.
+    /// Writes the parameters of a layer to `parameters`, of [`Self::len`] zeros or of the same layer at other values:
+    /// the bias of each output, and `weight(output, input, tap)`, taps row-major over the kernel, for those of the
+    /// map's channels that `inputs` lists.
     pub(crate) fn fill(
         &self,
         parameters: &mut [f32],
@@ -178,8 +180,8 @@ impl Packing {
     }
 }
 
-/// Adds to the plan's last stage the convolution of the first `input_groups` of `input` into `output`, a map of the same size in
-/// another buffer. Gives the buffer of the parameters, and how they lie there.
+/// Adds to the plan's last stage the convolution of the first `input_groups` of `input` into `output`, a map of the
+/// same size in another buffer. Gives the buffer of the parameters, and how they lie there.
 pub(crate) fn convolve(
     plan: &mut Plan,
     label: &str,
@@ -219,8 +221,8 @@ pub(super) mod tests {
     use super::*;
     use crate::engine::reference;
 
-    /// Largest error allowed, over the output's root mean square: of sums in single precision, and of products and sums in
-    /// half precision.
+    /// Largest error allowed, over the output's root mean square: of sums in single precision, and of products and sums
+    /// in half precision.
     const TOLERANCE: f64 = 1e-5;
     const HALF_TOLERANCE: f64 = 1e-2;
     pub(in super::super) const SLOPE: f32 = 0.1;

@@ -1,11 +1,11 @@
 // A 3x3 convolution of maps [row, group, column, 4], with bias, skip and leaky rectifier; twin of ../cpu/conv.rs.
 //
-// A thread makes ROWS rows of one column by PART_GROUPS groups of output channels, which it holds in registers. Threads of a
-// workgroup lie along x and multiply by the same weights at the same time.
+// A thread makes ROWS rows of one column by PART_GROUPS groups of output channels, which it holds in registers. Threads
+// of a workgroup lie along x and multiply by the same weights at the same time.
 
 @group(0) @binding(0) var<storage, read> input: array<InVector>;
-// The bias of each group of outputs, filled up to whole elements, then the weights: [part, input group, column, row, input
-// channel, output group]. Four vectors are an element because they are then loaded at once.
+// The bias of each group of outputs, filled up to whole elements, then the weights: [part, input group, column, row,
+// input channel, output group]. Four vectors are an element because they are then loaded at once.
 @group(0) @binding(1) var<storage, read> parameters: array<array<vec4f, 4>>;
 @group(0) @binding(2) var<storage, read_write> output: array<OutVector>;
 

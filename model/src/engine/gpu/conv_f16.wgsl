@@ -1,8 +1,8 @@
-// As conv.wgsl, in packed half precision: two products at once. What one group of input channels gives is summed in half
-// precision, and those sums in single precision.
+// As conv.wgsl, in packed half precision: two products at once. What one group of input channels gives is summed in
+// half precision, and those sums in single precision.
 //
-// A thread makes ROWS rows of one column by PART_GROUPS groups of output channels, which it holds in registers. Threads of a
-// workgroup lie along x and multiply by the same weights at the same time.
+// A thread makes ROWS rows of one column by PART_GROUPS groups of output channels, which it holds in registers. Threads
+// of a workgroup lie along x and multiply by the same weights at the same time.
 
 @group(0) @binding(0) var<storage, read> input: array<InVector>;
 // As in conv.wgsl, with eight vectors to an element, and the weights of each input group filled up to whole elements.

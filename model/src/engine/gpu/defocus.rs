@@ -25,8 +25,8 @@ pub(super) fn scratch_planes(depth_layers: usize) -> usize {
     buffers * PAIRS * depth_layers
 }
 
-/// Adds the stage `expected stack`, which writes the layers of each block's corners, the stack, and to `inputs` the frame's
-/// maps and the stack.
+/// Adds the stage `expected stack`, which writes the layers of each block's corners, the stack, and to `inputs` the
+/// frame's maps and the stack.
 #[expect(clippy::too_many_arguments)]
 pub(super) fn expect(
     plan: &mut Plan,

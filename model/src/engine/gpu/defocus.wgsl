@@ -20,8 +20,8 @@ fn depth_layer(depth: f32) -> u32 {
     return u32(min(select(0f, layer, layer > 0f), f32(LAYERS - 1u)));
 }
 
-// Rows of each layer's light, to spectra along x. A workgroup reads its rows of the frame once, and also writes what the map
-// has of them.
+// Rows of each layer's light, to spectra along x. A workgroup reads its rows of the frame once, and also writes what
+// the map has of them.
 @compute @workgroup_size(THREADS)
 fn take_layers(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;
@@ -83,8 +83,8 @@ fn disc(entry: f32) -> f32 {
     return mix(disc_table[below], disc_table[below + 1u], fract(entry));
 }
 
-// Columns of one pair: from spectra along x of all layers to those, along x too, of what is seen at the focus on FOCI of
-// them.
+// Columns of one pair: from spectra along x of all layers to those, along x too, of what is seen at the focus on FOCI
+// of them.
 @compute @workgroup_size(THREADS)
 fn blur(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;
@@ -138,7 +138,8 @@ fn blur(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) in
     }
 }
 
-// Rows of what is seen at the foci 4·b - 2 to 4·b + 1 of workgroup b along y: to the stack, and to the twelve channels from
+// Rows of what is seen at the foci 4·b - 2 to 4·b + 1 of workgroup b along y: to the stack, and to the twelve channels
+// from
 // 12·b + 16 on of the map. The first workgroup has only the last two foci, whose channels share a group with blur and
 // diffraction.
 @compute @workgroup_size(THREADS)

@@ -1,7 +1,7 @@
 //! Deformable 3x3 convolutions on the GPU: every tap of every pixel is read at a place of its own.
 //!
-//! Layers that write a map of half precision interpolate and multiply in half precision, two products at once, and sum up what
-//! each tap gives in single precision.
+//! Layers that write a map of half precision interpolate and multiply in half precision, two products at once, and sum
+//! up what each tap gives in single precision.
 
 use super::conv::{ConvLayer, TAPS};
 use super::map::{GROUP, Map};
@@ -13,11 +13,12 @@ use crate::weights::OFFSET_CHANNELS;
 const WORKGROUP: usize = 64;
 /// Rows that one thread makes.
 const PIXELS: usize = 2;
-/// Groups of output channels that a thread holds sums of, at most. With all of them in one thread no place is read twice.
+/// Groups of output channels that a thread holds sums of, at most. With all of them in one thread no place is read
+/// twice.
 const MOST_PART_GROUPS: usize = 8;
 
-/// Adds to the plan's last stage the deformable convolution of `input` into `output`, a map of the same size in another buffer:
-/// each tap k of each pixel is read at its place plus (`offsets[2k]`, `offsets[2k + 1]`) = (dy, dx) by bilinear
+/// Adds to the plan's last stage the deformable convolution of `input` into `output`, a map of the same size in another
+/// buffer: each tap k of each pixel is read at its place plus (`offsets[2k]`, `offsets[2k + 1]`) = (dy, dx) by bilinear
 /// interpolation, zero outside.
 pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &Map, offsets: &Map, output: &Map) {
     layer.check((input, input.groups), output);

@@ -1,11 +1,11 @@
-// A deformable 3x3 convolution of maps [row, group, column, 4]: every tap of every pixel is read at a place of its own; twin
-// of ../cpu/deformable.rs.
+// A deformable 3x3 convolution of maps [row, group, column, 4]: every tap of every pixel is read at a place of its own;
+// twin of ../cpu/deformable.rs.
 //
 // A thread makes PIXELS rows of one column by PART_GROUPS groups of output channels, which it holds in registers.
 
 @group(0) @binding(0) var<storage, read> input: array<InVector>;
-// The bias of each group of outputs, filled up to whole elements, then the weights: [part, tap, input group, input channel,
-// output group]. Four vectors are an element because they are then loaded at once.
+// The bias of each group of outputs, filled up to whole elements, then the weights: [part, tap, input group, input
+// channel, output group]. Four vectors are an element because they are then loaded at once.
 @group(0) @binding(2) var<storage, read> parameters: array<array<vec4f, 4>>;
 @group(0) @binding(3) var<storage, read_write> output: array<OutVector>;
 

@@ -1,5 +1,5 @@
-// As deformable.wgsl, in packed half precision: two products at once. What one tap gives is summed in half precision, and
-// those sums in single precision.
+// As deformable.wgsl, in packed half precision: two products at once. What one tap gives is summed in half precision,
+// and those sums in single precision.
 //
 // A thread makes PIXELS rows of one column by PART_GROUPS groups of output channels, which it holds in registers.
 

@@ -21,8 +21,8 @@ const COLUMN_ITEMS: usize = 9;
 /// What carries light between the layers and the SLM plane.
 pub(super) struct DepthLayers {
     count: usize,
-    /// [3, height, width]: transfer functions from one layer to the next nearer one, and over the number of samples from
-    /// the nearest to the SLM plane.
+    /// [3, height, width]: transfer functions from one layer to the next nearer one, and over the number of samples
+    /// from the nearest to the SLM plane.
     pub(super) step: BufferId,
     back: BufferId,
     /// [3, height, width]: the spectrum of what the layers' light gives at the SLM plane, over the number of samples.
@@ -108,8 +108,8 @@ impl DepthLayers {
         arrive.bytes = Some(6 * complex);
     }
 
-    /// Adds what carries the light of the layers in `grid.spectra`, along x, to the SLM plane, and through the pupil where
-    /// it `stops`.
+    /// Adds what carries the light of the layers in `grid.spectra`, along x, to the SLM plane, and through the pupil
+    /// where it `stops`.
     pub(super) fn bring_back(&self, stage: &mut Stage, shared: &Shared, grid: &GridTransforms, stops: bool) {
         let columns = grid.columns.columns(COLUMN_ITEMS);
         // The shader has no part in what the first net gives.

@@ -65,8 +65,8 @@ fn light(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) i
     }
 }
 
-// Columns of one colour: from spectra along x of all layers' light to that, along x too, of what arrives of it at the SLM
-// plane, in the place of the farthest layer's. Where STOPS, it has gone through the pupil.
+// Columns of one colour: from spectra along x of all layers' light to that, along x too, of what arrives of it at the
+// SLM plane, in the place of the farthest layer's. Where STOPS, it has gone through the pupil.
 @compute @workgroup_size(THREADS)
 fn bring_back(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;

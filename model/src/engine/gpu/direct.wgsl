@@ -1,6 +1,6 @@
 // What the `direct` family's net reads, and the field that it gives. After these constants:
-// WORKGROUP (pixels of a row), FRAME_WIDTH, FRAME_HEIGHT, WIDTH, HEIGHT (of the network's grid), SCALE (panel pixels to a
-// sample, each way), MAP_GROUPS, MAP_PITCH.
+// WORKGROUP (pixels of a row), FRAME_WIDTH, FRAME_HEIGHT, WIDTH, HEIGHT (of the network's grid), SCALE (panel pixels to
+// a sample, each way), MAP_GROUPS, MAP_PITCH.
 
 // The eye's pupil in millimetres, and what networks are told of it and the bench (conditions.rs).
 struct Pupil {

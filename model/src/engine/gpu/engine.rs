@@ -131,8 +131,8 @@ impl GpuEngine {
 
     /// Writes the samples of the hologram of `frame` for an eye with `pupil` to `samples`, as the panel takes them.
     ///
-    /// Of a pupil beyond those that the weights were trained for, the network is told the nearest; blur and stop are its
-    /// own. The frame is sent to the device once, however often it is rendered.
+    /// Of a pupil beyond those that the weights were trained for, the network is told the nearest; blur and stop are
+    /// its own. The frame is sent to the device once, however often it is rendered.
     ///
     /// # Errors
     /// [`EngineError`] for a frame of another size than the engine's, a pupil that is none, and a device

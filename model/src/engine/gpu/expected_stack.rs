@@ -1,5 +1,5 @@
-//! The stages of the `expected-stack` family that are no nets: what an eye should see, its light carried to the SLM plane,
-//! and what that lacks fed back.
+//! The stages of the `expected-stack` family that are no nets: what an eye should see, its light carried to the SLM
+//! plane, and what that lacks fed back.
 
 use holod_calibration::DisplayGeometry;
 
@@ -23,14 +23,14 @@ pub(crate) struct ExpectedStack<'a> {
     layers: DepthLayers,
     /// The depth layers of each block's corners, a byte each, [height, width].
     layer_of: BufferId,
-    /// [layers, 3, height, width]: the amplitudes that an eye should see, once the layers are lit as the first net corrects
-    /// them.
+    /// [layers, 3, height, width]: the amplitudes that an eye should see, once the layers are lit as the first net
+    /// corrects them.
     stack: BufferId,
 }
 
 impl<'a> ExpectedStack<'a> {
-    /// Adds the stage `expected stack`, which writes the maps of the frame and what an eye should see to the channels of
-    /// `inputs` that the first net reads.
+    /// Adds the stage `expected stack`, which writes the maps of the frame and what an eye should see to the channels
+    /// of `inputs` that the first net reads.
     ///
     /// # Errors
     /// A row or a column does not fit in a workgroup's memory.

@@ -16,8 +16,8 @@ use crate::weights::{Feedback, NetworkConfig};
 const ROW_ITEMS: usize = 4;
 const COLUMN_ITEMS: usize = 9;
 
-/// Adds the stage `feedback`: changes the carried field by what it lacks of the amplitudes `stack`, and writes the field,
-/// its change and the lack to `inputs`.
+/// Adds the stage `feedback`: changes the carried field by what it lacks of the amplitudes `stack`, and writes the
+/// field, its change and the lack to `inputs`.
 #[expect(clippy::too_many_arguments)]
 pub(super) fn feed_back(
     plan: &mut Plan,

@@ -1,5 +1,5 @@
-// What an eye lacks when it focuses on each depth layer, as feedback.rs has it; how the changes of the layers come back to
-// the SLM plane is `bring_back` of depth_layers.wgsl.
+// What an eye lacks when it focuses on each depth layer, as feedback.rs has it; how the changes of the layers come back
+// to the SLM plane is `bring_back` of depth_layers.wgsl.
 //
 // Before this file: fft.wgsl, pupil.wgsl and the constants of feedback.rs.
 
@@ -56,8 +56,8 @@ fn send(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) in
     }
 }
 
-// Rows of the light at the layers 4·b to 4·(b + 1) of workgroup b along y: from spectra along x to those of the change that
-// would give what it lacks, which goes to the map.
+// Rows of the light at the layers 4·b to 4·(b + 1) of workgroup b along y: from spectra along x to those of the change
+// that would give what it lacks, which goes to the map.
 @compute @workgroup_size(THREADS)
 fn compare(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;

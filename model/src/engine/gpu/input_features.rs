@@ -1,4 +1,5 @@
-//! How a frame and fields become the map that both nets of `expected-stack` read, for `input_features.wgsl` and its users.
+//! How a frame and fields become the map that both nets of `expected-stack` read, for `input_features.wgsl` and its
+//! users.
 
 use holod_calibration::{DisplayGeometry, Metres, Resolution};
 
@@ -14,8 +15,8 @@ const MAPS: usize = 4 * 5 + CONDITIONS;
 pub(crate) struct InputChannels {
     /// From here on the expected amplitudes less 0.4, [layers, 3]; before them the frame's maps.
     pub(crate) stack: usize,
-    /// From here on what the second net alone reads, in whole groups: three real parts of the field, then three imaginary
-    /// ones. Channels between the stack and this are zero.
+    /// From here on what the second net alone reads, in whole groups: three real parts of the field, then three
+    /// imaginary ones. Channels between the stack and this are zero.
     pub(crate) field: usize,
     /// The same of the field's change.
     pub(crate) change: usize,

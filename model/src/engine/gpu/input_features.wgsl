@@ -1,5 +1,5 @@
-// What the nets of `expected-stack` are told of a frame, as input_features.rs writes it. Before this file: WIDTH, HEIGHT, blocks.wgsl,
-// INPUT_GROUPS and INPUT_PITCH of the nets' map.
+// What the nets of `expected-stack` are told of a frame, as input_features.rs writes it. Before this file: WIDTH,
+// HEIGHT, blocks.wgsl, INPUT_GROUPS and INPUT_PITCH of the nets' map.
 
 // The eye's pupil in millimetres, and what networks are told of it and the bench (conditions.rs).
 struct Pupil {

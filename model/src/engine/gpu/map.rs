@@ -8,8 +8,8 @@ pub(crate) const GROUP: usize = 4;
 /// Rows that one thread of a convolution makes.
 pub(crate) const ROWS: usize = 4;
 
-/// A feature map [row, group of channels, column, 4] with a border of zeros, one pixel wide, and below it as many rows as
-/// fill the last [`ROWS`]. Nothing but zeros is ever written there.
+/// A feature map [row, group of channels, column, 4] with a border of zeros, one pixel wide, and below it as many rows
+/// as fill the last [`ROWS`]. Nothing but zeros is ever written there.
 ///
 /// Channels are padded to whole groups; what is read of the padding is multiplied by zero, so it has to be finite.
 #[derive(Clone, Copy, Debug)]

@@ -32,7 +32,8 @@ pub(crate) struct NetworkPlan {
 }
 
 impl NetworkPlan {
-    /// On `bench`, for frames of the pattern's size of `tables`, with features in `precision`, on a device of these limits.
+    /// On `bench`, for frames of the pattern's size of `tables`, with features in `precision`, on a device of these
+    /// limits.
     ///
     /// # Errors
     /// The size is nothing, or too large for that memory.

@@ -57,8 +57,8 @@ pub(crate) struct Shader {
 }
 
 impl Shader {
-    /// The entry point `entry` of `source` after the constants that `source` uses without declaring them. Where `source`
-    /// begins with [`ENABLE_F16`], so does the shader.
+    /// The entry point `entry` of `source` after the constants that `source` uses without declaring them. Where
+    /// `source` begins with [`ENABLE_F16`], so does the shader.
     pub(crate) fn new(
         label: impl Into<String>,
         constants: &[(&str, Constant)],

@@ -307,8 +307,8 @@ fn a_frame_of_256_pixels_each_way_is_the_processors() {
     assert!(field_error(&found.field, &expected) > FIELD_TOLERANCE, "the comparison is blind");
 }
 
-/// The largest error of a hologram whose features are in half precision, over its largest value; most of it is rounding of
-/// features that later layers carry on, and an eye sees a hundredth of it.
+/// The largest error of a hologram whose features are in half precision, over its largest value; most of it is rounding
+/// of features that later layers carry on, and an eye sees a hundredth of it.
 const HALF_FIELD_TOLERANCE: f64 = 0.05;
 
 #[test]

@@ -28,8 +28,8 @@ pub(crate) enum Low<'a> {
     Corrected(BufferId, &'a Map),
 }
 
-/// Adds to the stage `field` what brings `low` to the panel's grid. [`Low::Field`] has been written in that stage, which is
-/// the plan's last one, and on the full grid is already the hologram.
+/// Adds to the stage `field` what brings `low` to the panel's grid. [`Low::Field`] has been written in that stage,
+/// which is the plan's last one, and on the full grid is already the hologram.
 ///
 /// # Errors
 /// A row or a column of the network's grid does not fit in a workgroup's memory.

@@ -29,8 +29,8 @@ pub(super) struct Taken {
 }
 
 impl FieldPlaces<'_, '_> {
-    /// Takes the bytes from `at` for `what`; a fault where they lie outside the message or are taken already. Two fields may
-    /// be the same number, of which each has its bits.
+    /// Takes the bytes from `at` for `what`; a fault where they lie outside the message or are taken already. Two
+    /// fields may be the same number, of which each has its bits.
     pub(super) fn take(&self, found: &Found<impl Sized>, at: i32, bytes: usize, field: Option<&Field>) {
         let reader = self.reader;
         let from = if at < 0 { self.least as i64 + i64::from(at) } else { i64::from(at) };

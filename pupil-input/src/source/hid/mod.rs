@@ -23,6 +23,7 @@ use crate::wire::hid_descriptor::DescriptorError;
 
 /// Why a HID tracker could not be opened.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum HidError {
     /// No device fits.
     #[error(
@@ -37,7 +38,6 @@ pub enum HidError {
     /// More than one device fits, and none of them is the one that was open before.
     #[error("{count} HID devices are {wanted}: {found}; say which one: add `,serial=TEXT` to the tracker's spec")]
     Several {
-        /// How many fit.
         count: usize,
         /// What was looked for, in words.
         wanted: String,
@@ -54,7 +54,6 @@ pub enum HidError {
     Permission {
         /// Its vendor and product.
         ids: UsbIds,
-        /// Its node.
         path: PathBuf,
         /// The udev rule that grants it.
         rule: String,
@@ -66,9 +65,7 @@ pub enum HidError {
     Open {
         /// Its vendor and product.
         ids: UsbIds,
-        /// Its node.
         path: PathBuf,
-        /// Why.
         reason: String,
     },
     /// No shipped profile is for these ids.
@@ -76,31 +73,22 @@ pub enum HidError {
         "no shipped profile is for the HID device {ids}; name one: add `,profile=NAME` to the tracker's spec ({known})"
     )]
     NoProfile {
-        /// The ids.
         ids: UsbIds,
         /// The shipped profiles of HID trackers, in words.
         known: String,
     },
     /// Neither the spec nor the profile says which device it is.
     #[error("profile `{profile}` names no HID device; expected `hid:VID:PID,profile={profile}`")]
-    Unnamed {
-        /// The profile's name.
-        profile: String,
-    },
+    Unnamed { profile: String },
     /// The system does not tell which devices there are.
     #[error("HID devices cannot be listed: {reason}; check that /sys is mounted and the kernel has hidraw")]
-    List {
-        /// Why.
-        reason: String,
-    },
+    List { reason: String },
     /// It does not have the fields that the profile names.
     #[error("HID tracker {ids}, profile `{profile}`: {fault}")]
     Descriptor {
         /// Its vendor and product.
         ids: UsbIds,
-        /// The profile's name.
         profile: String,
-        /// What is wrong.
         #[source]
         fault: DescriptorError,
     },
@@ -111,7 +99,6 @@ pub enum HidError {
     Changed {
         /// Its vendor and product.
         ids: UsbIds,
-        /// Its node.
         path: PathBuf,
     },
 }

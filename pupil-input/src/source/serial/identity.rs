@@ -40,8 +40,8 @@ pub struct UsbPort {
 }
 
 impl UsbPort {
-    /// Whether both are one device's same port, by vendor, product and serial number; by the socket too where the serial
-    /// number is missing or, since cheap adapters all have the same, `shared`.
+    /// Whether both are one device's same port, by vendor, product and serial number; by the socket too where the
+    /// serial number is missing or, since cheap adapters all have the same, `shared`.
     pub(crate) fn is_same(&self, other: &Self, shared: bool) -> bool {
         self.looks_like(other) && (self.serial.is_some() && !shared || self.socket == other.socket)
     }

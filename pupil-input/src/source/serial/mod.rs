@@ -21,44 +21,29 @@ use crate::wire::{Format, WireEvent};
 
 /// Why a serial tracker could not be opened.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum SerialError {
     /// There is nothing at the path.
     #[error(
         "tracker port {path} does not exist; {ports}; plug the tracker in, name its port (best by /dev/serial/by-id), or correct the name of the log"
     )]
     Missing {
-        /// The path.
         path: PathBuf,
         /// The ports there are, in words.
         ports: String,
     },
     /// What is there is no serial port.
     #[error("tracker port {path} is {found}; expected a serial port; {hint}")]
-    NotAPort {
-        /// The path.
-        path: PathBuf,
-        /// What it is.
-        found: &'static str,
-        /// What to do.
-        hint: String,
-    },
+    NotAPort { path: PathBuf, found: &'static str, hint: String },
     /// It is there and does not open.
     #[error("tracker port {path} does not open: {reason}; {hint}")]
-    Open {
-        /// The path.
-        path: PathBuf,
-        /// Why.
-        reason: String,
-        /// What to do.
-        hint: &'static str,
-    },
+    Open { path: PathBuf, reason: String, hint: &'static str },
     /// The port is somebody else's.
     #[error(
         "tracker port {path} is the port {owner} that the rig names for another device, such as its laser box; nothing was \
          opened; name the tracker's own port: {ports}"
     )]
     Forbidden {
-        /// The path.
         path: PathBuf,
         /// The path by which the rig knows it.
         owner: PathBuf,
@@ -68,27 +53,17 @@ pub enum SerialError {
     /// Another device is plugged in there.
     #[error("tracker port {path} is {found}; expected {expected}; nothing was written to it; {hint}")]
     WrongDevice {
-        /// The path.
         path: PathBuf,
-        /// What is there.
         found: String,
         /// What should be there.
         expected: String,
-        /// What to do.
         hint: String,
     },
     /// The tracker does not do as it is told.
     #[error(
         "tracker port {path}, profile `{profile}`: {problem}; check the profile, the baud rate and the tracker's power"
     )]
-    Command {
-        /// The path.
-        path: PathBuf,
-        /// The profile.
-        profile: String,
-        /// What went wrong.
-        problem: Box<CommandError>,
-    },
+    Command { path: PathBuf, profile: String, problem: Box<CommandError> },
 }
 
 /// How long a port is listened to before anything is written to a device that nothing else tells of.
@@ -250,8 +225,8 @@ impl Feed for SerialFeed {
     }
 }
 
-/// What a user should know of reading a tracker at the serial port `path`: a name that will change, an adapter that holds
-/// bytes back. A sentence each; none where there is no port.
+/// What a user should know of reading a tracker at the serial port `path`: a name that will change, an adapter that
+/// holds bytes back. A sentence each; none where there is no port.
 pub fn serial_port_warnings(path: &Path) -> Vec<String> {
     let ports = serial_ports();
     port_at(path, &ports).map_or_else(Vec::new, |port| port_warnings(port, path))

@@ -1,8 +1,8 @@
 //! A day of fields in simulated time: pacer, scheduler and the lasers' thread's work, judged by what was truly on the
 //! panel and by the box's own edges.
 //!
-//! In the night the panel is off. Most other minutes are quiet. In each eighth one of them panel, host, box and people do
-//! what they should not: flips are missed, reports are lost or lie, threads wake up late or stand still, frames take
+//! In the night the panel is off. Most other minutes are quiet. In each eighth one of them panel, host, box and people
+//! do what they should not: flips are missed, reports are lost or lie, threads wake up late or stand still, frames take
 //! seconds, panel and box are lost, darkness is asked for, nobody reads the events.
 
 use std::collections::VecDeque;

@@ -85,9 +85,9 @@ impl Card {
         self.lease.as_ref().map_or("holod itself".to_owned(), |lease| format!("seat `{}`", lease.seat()))
     }
 
-    /// Who opens a card that has no master is its master; after mastership was lost it must be asked for. Of a card that a
-    /// seat has opened its manager makes the file master when it opens it and when the session comes to the front; then it
-    /// can only be seen whether it did.
+    /// Who opens a card that has no master is its master; after mastership was lost it must be asked for. Of a card
+    /// that a seat has opened its manager makes the file master when it opens it and when the session comes to the
+    /// front; then it can only be seen whether it did.
     pub(crate) fn become_master(&self) -> io::Result<()> {
         if self.lease.is_none() {
             return self.acquire_master_lock();
@@ -326,8 +326,8 @@ impl ScanBuffer {
         let framebuffer = card.add_framebuffer(&dumb, depth, 32).map_err(&refused)?;
         let place = drm_ffi::mode::dumbbuffer::map(card.as_fd(), u32::from(dumb.handle()), 0, 0).map_err(&refused)?;
         let length = dumb.pitch() as usize * size.height;
-        // SAFETY: the memory belongs to the buffer, which nobody else has a handle of, and stays mapped until it is dropped;
-        // the display controller only reads it.
+        // SAFETY: the memory belongs to the buffer, which nobody else has a handle of, and stays mapped until it is
+        // dropped; the display controller only reads it.
         let pixels = unsafe { MmapOptions::new().offset(place.offset).len(length).map_mut(&card.file) };
         let mut pixels = pixels.map_err(&refused)?;
         pixels.fill(0);

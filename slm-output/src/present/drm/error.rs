@@ -10,6 +10,7 @@ use super::find::ConnectorList;
 
 /// Why a panel on a connector was not opened.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum DrmError {
     /// No card with connectors.
     #[error(
@@ -28,7 +29,6 @@ pub enum DrmError {
     NoSuchConnector {
         /// What was asked for.
         asked: String,
-        /// What there is.
         there: ConnectorList,
     },
     /// More than one.
@@ -41,14 +41,7 @@ pub enum DrmError {
     },
     /// Nothing is plugged in.
     #[error("{connector} on {card} is disconnected; there is: {there}. Plug the panel in and switch it on")]
-    Disconnected {
-        /// The connector.
-        connector: String,
-        /// Its card.
-        card: PathBuf,
-        /// What there is.
-        there: ConnectorList,
-    },
+    Disconnected { connector: String, card: PathBuf, there: ConnectorList },
     /// The card's node may not be opened.
     #[error(
         "{card} does not open: permission denied. It belongs to group `{group}` (mode {mode:04o}): add the user that runs \
@@ -58,30 +51,21 @@ pub enum DrmError {
          then `udevadm control --reload && udevadm trigger --subsystem-match=drm --action=change`"
     )]
     Permission {
-        /// The card's node.
         card: PathBuf,
-        /// Its group.
         group: String,
-        /// Its permission bits.
         mode: u32,
         /// Its name in the kernel.
         kernel: String,
     },
     /// The seat's manager does not open the card: its node is gone, or it belongs to another seat.
     #[error("the seat's manager does not open {card}: {source}")]
-    NotOfSeat {
-        /// The card's node.
-        card: PathBuf,
-        /// Why.
-        source: io::Error,
-    },
+    NotOfSeat { card: PathBuf, source: io::Error },
     /// Another program rules the card.
     #[error(
         "another program is master of {card}: {}. One program at a time may set a card's modes: end it, or give the \
          panel a card of its own", if who.is_empty() { "it cannot be told which (as root it can)".to_owned() } else { who.join(", ") }
     )]
     OtherMaster {
-        /// The card's node.
         card: PathBuf,
         /// The programs that have it open, the master first where it is known.
         who: Vec<String>,
@@ -92,11 +76,9 @@ pub enum DrmError {
          scale the pattern: correct the rig file or the connector", found.width, found.height, wanted.width, wanted.height
     )]
     OtherSize {
-        /// The connector.
         connector: String,
         /// The panel's own size.
         found: Resolution,
-        /// The rig's.
         wanted: Resolution,
     },
     /// The size and rate are not offered.
@@ -105,9 +87,7 @@ pub enum DrmError {
          the rig's `refresh_hz` or the panel's own settings", wanted.width, wanted.height
     )]
     NoSuchMode {
-        /// The connector.
         connector: String,
-        /// The rig's size.
         wanted: Resolution,
         /// The rig's refresh rate.
         wanted_hz: f64,
@@ -116,36 +96,17 @@ pub enum DrmError {
     },
     /// The driver lacks something that is needed.
     #[error("{card} (driver `{driver}`) cannot be used: {lacks}")]
-    Unsupported {
-        /// The card's node.
-        card: PathBuf,
-        /// Its driver.
-        driver: String,
-        /// What it lacks.
-        lacks: String,
-    },
+    Unsupported { card: PathBuf, driver: String, lacks: String },
     /// The driver takes the mode, but the picture would not be the one that is sent.
     #[error(
         "{connector} would not show the levels as they are sent: {}. Put it right with the driver's or the panel's own \
          settings",
         list(wrong)
     )]
-    NotAsSent {
-        /// The connector.
-        connector: String,
-        /// What is wrong.
-        wrong: Vec<DisplayCheck>,
-    },
+    NotAsSent { connector: String, wrong: Vec<DisplayCheck> },
     /// The kernel refused something.
     #[error("{what} on {card}: {source}")]
-    Refused {
-        /// What was tried.
-        what: &'static str,
-        /// The card's node.
-        card: PathBuf,
-        /// Why.
-        source: io::Error,
-    },
+    Refused { what: &'static str, card: PathBuf, source: io::Error },
 }
 
 /// Where a rule for the panel's card goes.

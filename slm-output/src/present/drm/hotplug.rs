@@ -25,7 +25,8 @@ impl Hotplug {
         Ok(Self(socket))
     }
 
-    /// What has been said of `connector` on `card`, a node's name such as `card0`, since the last call. Takes no memory.
+    /// What has been said of `connector` on `card`, a node's name such as `card0`, since the last call. Takes no
+    /// memory.
     pub(crate) fn news(&self, card: &[u8], connector: u32) -> Uevent {
         let mut news = Uevent::Other;
         let mut message = [0u8; MESSAGE_BYTES];

@@ -20,8 +20,8 @@ use super::seat::Seat;
 use super::settings::{self, Change};
 use super::timing::FlipStamp;
 
-/// On the screen, on its way there, being written, and one more: a driver may still read the last picture a while after it
-/// has said that the next one is shown (vkms does), but the kernel takes no third commit before it has done so.
+/// On the screen, on its way there, being written, and one more: a driver may still read the last picture a while after
+/// it has said that the next one is shown (vkms does), but the kernel takes no third commit before it has done so.
 pub(crate) const BUFFERS: usize = 4;
 /// Events that are read at once; one flip is under way at a time.
 const EVENTS_MAX: usize = 32;
@@ -56,8 +56,8 @@ pub(crate) struct Link {
 }
 
 impl Link {
-    /// Finds the connector, becomes master of its card and makes it ready: the first buffer, written by `write_flat`, is on
-    /// the screen.
+    /// Finds the connector, becomes master of its card and makes it ready: the first buffer, written by `write_flat`,
+    /// is on the screen.
     pub(crate) fn open(
         wanted: &Wanted,
         seat: Option<&Seat>,

@@ -27,8 +27,8 @@ impl CommitMargin {
         Self { period, blank, work: TimeNs(0), lateness: TimeNs(0), penalty: TimeNs(0) }
     }
 
-    /// When to choose the frame for the scan-out that begins at `t_present`. The controller takes the new picture at the
-    /// begin of the blank before it. At most three quarters of a refresh before that.
+    /// When to choose the frame for the scan-out that begins at `t_present`. The controller takes the new picture at
+    /// the begin of the blank before it. At most three quarters of a refresh before that.
     pub fn t_choose(&self, t_present: TimeNs) -> TimeNs {
         let margin = FLOOR.0 + self.work.0 + self.lateness.0 + self.penalty.0;
         TimeNs(t_present.0 - self.blank.0 - margin.min(self.period.0 * 3 / 4))

@@ -1,10 +1,10 @@
 //! A panel on a connector of a graphics card, without a display server: atomic kernel mode setting.
 //!
-//! [`DrmPanel`] rules the card while it runs; where there is a seat manager, that opens it ([`seat`](self)). It finds the
-//! connector by its name or its monitor ([`find`](self)), sets the panel's own mode and everything that keeps levels
-//! from being changed on the way ([`DisplayCheck`]), and then flips once every refresh between four buffers, also where
-//! no newer frame has come, so that each refresh is proven by an event of its own. What an event says is judged by
-//! [`FlipClock`]; the frame for the next refresh is chosen as late as [`CommitMargin`] thinks safe.
+//! [`DrmPanel`] rules the card while it runs; where there is a seat manager, that opens it ([`seat`](self)). It finds
+//! the connector by its name or its monitor ([`find`](self)), sets the panel's own mode and everything that keeps
+//! levels from being changed on the way ([`DisplayCheck`]), and then flips once every refresh between four buffers,
+//! also where no newer frame has come, so that each refresh is proven by an event of its own. What an event says is
+//! judged by [`FlipClock`]; the frame for the next refresh is chosen as late as [`CommitMargin`] thinks safe.
 //!
 //! `slm-output/doc/drm.md` says how to give holod a connector and which drivers are known to tell wrong times.
 
@@ -278,8 +278,8 @@ impl DrmPanel {
         Ok(next)
     }
 
-    /// Whether the panel may be taken back as far as the seat goes. Lasers have been told of the loss by now, so the seat
-    /// may be left to another session.
+    /// Whether the panel may be taken back as far as the seat goes. Lasers have been told of the loss by now, so the
+    /// seat may be left to another session.
     fn follow_seat(&mut self) -> Result<(), PanelFault> {
         match self.seat.as_ref().map(Seat::standing) {
             None | Some(Standing::InFront) => Ok(()),
@@ -353,8 +353,8 @@ impl Presenter for DrmPanel {
         self.follow_seat()?;
         if let Err(why) = self.take_back() {
             let fault = why.fault();
-            // What is gone is opened anew from now on; and so is what another program is master of where only the seat's
-            // manager can ask for it, which it does when it opens it.
+            // What is gone is opened anew from now on; and so is what another program is master of where only the
+            // seat's manager can ask for it, which it does when it opens it.
             if fault == PanelFault::DeviceLost || (fault == PanelFault::MastershipLost && self.seat.is_some()) {
                 self.lost = Some(PanelFault::DeviceLost);
             }

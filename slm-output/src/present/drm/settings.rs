@@ -40,8 +40,8 @@ const fn setting(name: &'static str, on: On, property: &'static str, want: Want,
     Setting { name, on, property, want, essential }
 }
 
-/// Every property that can change levels between the buffer and the panel, by the names of the kernel's documentation and
-/// of the drivers i915, xe, amdgpu, radeon, nouveau, nvidia-drm and vc4.
+/// Every property that can change levels between the buffer and the panel, by the names of the kernel's documentation
+/// and of the drivers i915, xe, amdgpu, radeon, nouveau, nvidia-drm and vc4.
 const SETTINGS: &[Setting] = &[
     setting("range of RGB", On::Connector, "Broadcast RGB", Want::Named("Full"), true),
     setting("bits of a channel on the link", On::Connector, "max bpc", Want::ChannelBits, true),
@@ -191,7 +191,8 @@ pub(crate) fn read_back(properties: &PipeProperties, channel_bits: u8) -> Vec<Di
             Some(wanted) => DisplayCheck::equal(&name, found, words(info, setting.want, wanted)),
             // A link of fewer bits would cut the levels.
             None if matches!(setting.want, Want::ChannelBits) => DisplayCheck::equal(&name, found, must),
-            // Such as a laptop's panel whose scaler cannot be switched off, and has nothing to do in the panel's own mode.
+            // Such as a laptop's panel whose scaler cannot be switched off, and has nothing to do in the panel's own
+            // mode.
             None => DisplayCheck::unverified(&name, &format!("{found}, and the driver offers nothing else"), must),
         })
     };

@@ -1,10 +1,10 @@
 //! When a refresh began, from page-flip events that may be wrong.
 //!
 //! The kernel stamps a page flip with the time at which the first pixel of the new picture is scanned out and with a
-//! counter of refreshes. Most drivers tell the truth. Known to be wrong are: a counter that stays at zero and a time that
-//! software took, where a driver has no vertical-blank interrupt; a time of zero; an event that comes before the flip,
-//! with a time that is not a refresh's; one event twice; a counter that starts anew; a clock that is not the monotonic
-//! one. [`FlipClock`] believes an event only where counter and time agree with the events before it, and says
+//! counter of refreshes. Most drivers tell the truth. Known to be wrong are: a counter that stays at zero and a time
+//! that software took, where a driver has no vertical-blank interrupt; a time of zero; an event that comes before the
+//! flip, with a time that is not a refresh's; one event twice; a counter that starts anew; a clock that is not the
+//! monotonic one. [`FlipClock`] believes an event only where counter and time agree with the events before it, and says
 //! [`TimestampSource::Hardware`] only then.
 
 use holod_calibration::TimeNs;
@@ -13,7 +13,8 @@ use crate::present::TimestampSource;
 
 /// Events in a row that must agree with one another before they are believed.
 const AGREEING_EVENTS: u32 = 3;
-/// Events in a row that may be delivered more than two refreshes after their time, before the clock is held to be another one.
+/// Events in a row that may be delivered more than two refreshes after their time, before the clock is held to be
+/// another one.
 const LATE_EVENTS: u32 = 3;
 
 /// What a page-flip event says.
@@ -192,7 +193,8 @@ impl FlipClock {
         }
         self.candidate = Some((anchor, agreeing));
         let Some(trusted) = self.trusted else { return self.by_arrival(now) };
-        // The refresh nearest to the arrival, counted on from those that were believed, and never one that was reported.
+        // The refresh nearest to the arrival, counted on from those that were believed, and never one that was
+        // reported.
         let refreshes = ((now.0 - trusted.t.0 + self.period.0 / 2) / self.period.0).max(1);
         let mut t_present = TimeNs(trusted.t.0 + refreshes * self.period.0);
         if self.t_last.is_some_and(|t_last| t_present <= t_last) {

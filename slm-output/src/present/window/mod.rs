@@ -6,9 +6,9 @@
 //! opens everything anew, from the connection to the display server on, by the same rules. That is also how a new
 //! monitor mode, a replugged monitor, a lost device and a restarted display server are survived.
 //!
-//! Threads: `holod-window` watches and answers the display server; the panel thread, which calls the [`Presenter`], hands
-//! pictures over. This file's own code does not allocate after its start. The libraries of X11, Wayland and wgpu do
-//! within their calls, and lock: that is the price of a window, and one reason why `drm` is the road for a bench.
+//! Threads: `holod-window` watches and answers the display server; the panel thread, which calls the [`Presenter`],
+//! hands pictures over. This file's own code does not allocate after its start. The libraries of X11, Wayland and wgpu
+//! do within their calls, and lock: that is the price of a window, and one reason why `drm` is the road for a bench.
 //!
 //! holod speaks X11 and Wayland itself rather than through a windowing library: those allow one connection for a
 //! process, end it when the X server does, and do not hand on when a picture came on the monitor.
@@ -64,6 +64,7 @@ impl DisplayServer {
 
 /// Why the panel's window could not be opened.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum WindowError {
     /// There is no display server to ask.
     #[error(
@@ -72,20 +73,12 @@ pub enum WindowError {
     NoServer,
     /// It failed.
     #[error("{server}: {reason}")]
-    Server {
-        /// Which one.
-        server: String,
-        /// What it said.
-        reason: String,
-    },
+    Server { server: String, reason: String },
     /// It is one that draws to another.
     #[error(
         "X server {display} is Xwayland, which hides how its pixels are scaled; set WAYLAND_DISPLAY, so that holod speaks to the compositor itself"
     )]
-    Xwayland {
-        /// Its name.
-        display: String,
-    },
+    Xwayland { display: String },
     /// No monitor can be the panel.
     #[error(transparent)]
     Monitor(#[from] MonitorError),
@@ -96,32 +89,22 @@ pub enum WindowError {
     NotShown {
         /// Where it should be.
         monitor: Box<Monitor>,
-        /// What is wrong.
         fault: PanelFault,
     },
     /// Nothing can draw to it.
     #[error(
         "Vulkan cannot draw to the window: {reason}; install the graphics driver's Vulkan part (mesa-vulkan-drivers)"
     )]
-    Vulkan {
-        /// What it said.
-        reason: String,
-    },
+    Vulkan { reason: String },
     /// The device cannot show levels as they are.
     #[cfg(feature = "vulkan")]
     #[error("{device} does not give the window {what}")]
-    Surface {
-        /// The Vulkan device.
-        device: String,
-        /// What it lacks.
-        what: &'static str,
-    },
+    Surface { device: String, what: &'static str },
     /// Nothing came on the monitor.
     #[error("the flat pattern did not come on {monitor}: {fault}")]
     NothingShown {
         /// Where it should be.
         monitor: Box<Monitor>,
-        /// What is wrong.
         fault: PanelFault,
     },
     /// The levels need more bits than a window's channels have.
@@ -153,8 +136,8 @@ impl WindowError {
 /// How pictures get to a window of an X server. On a Wayland compositor they go through memory that both share.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Road {
-    /// By Vulkan. A window that fills all of an X screen, which then has but one monitor, is scanned out directly, and the
-    /// driver stamps the refreshes.
+    /// By Vulkan. A window that fills all of an X screen, which then has but one monitor, is scanned out directly, and
+    /// the driver stamps the refreshes.
     #[cfg(feature = "vulkan")]
     Vulkan,
     /// The server copies them at a refresh. Nothing says when the copy is done, so no laser is lit by it.

@@ -116,22 +116,17 @@ impl fmt::Display for PanelMonitor {
 
 /// Why no monitor can be the panel.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum MonitorError {
     /// Nothing is connected.
     #[error("the display server has no lit monitor; connect the panel and switch it on in the monitor settings")]
     NoneThere,
     /// No monitor has that name.
     #[error("no monitor is called \"{wanted}\"; there is {}", list(there))]
-    NotThere {
-        /// The name.
-        wanted: String,
-        /// All monitors.
-        there: Vec<Monitor>,
-    },
+    NotThere { wanted: String, there: Vec<Monitor> },
     /// Several have it.
     #[error("\"{wanted}\" is more than one monitor: {}; name it by its connector or serial number", list(called))]
     Ambiguous {
-        /// The name.
         wanted: String,
         /// Those that are called so.
         called: Vec<Monitor>,
@@ -142,11 +137,9 @@ pub enum MonitorError {
         if *fitting == 0 { "no monitor but the primary one".to_owned() } else { format!("{fitting} monitors") }, list(there)
     )]
     NotNamed {
-        /// How many fit.
         fitting: usize,
         /// What was looked for.
         panel: PanelMonitor,
-        /// All monitors.
         there: Vec<Monitor>,
     },
     /// It is where the desktop is.
@@ -157,7 +150,6 @@ pub enum MonitorError {
     Primary {
         /// The one that was meant.
         monitor: Box<Monitor>,
-        /// All monitors.
         there: Vec<Monitor>,
     },
     /// It shows another size or rate.

@@ -138,8 +138,8 @@ mod tests {
         timeline
     }
 
-    /// A display server that takes pictures until `deadline` before a refresh; the refreshes that are missed of the last
-    /// `count` of 200.
+    /// A display server that takes pictures until `deadline` before a refresh; the refreshes that are missed of the
+    /// last `count` of 200.
     fn missed(deadline: TimeNs, hiccups: usize, count: usize) -> usize {
         let period = TimeNs(16 * MS);
         let mut lead = Lead::new(period);

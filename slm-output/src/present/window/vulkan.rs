@@ -129,7 +129,8 @@ impl Scanout {
         Ok(Self { surface, configuration, pictures, queue, device, lost, size })
     }
 
-    /// Writes a picture: `pixels` has [`PIXEL_BYTES`] for each pixel, row-major: blue, green, red and one that is unused.
+    /// Writes a picture: `pixels` has [`PIXEL_BYTES`] for each pixel, row-major: blue, green, red and one that is
+    /// unused.
     pub(super) fn write(&self, picture: usize, pixels: &[u8]) {
         let layout = wgpu::TexelCopyBufferLayout {
             offset: 0,

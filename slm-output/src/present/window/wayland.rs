@@ -38,8 +38,8 @@ const PATIENCE: Duration = Duration::from_secs(2);
 /// A picture is written to one while the compositor may still read the other.
 const COPIES: usize = 2;
 
-/// Opens the panel's window on the compositor at `socket`, with room for `pictures`. It is on its monitor once the first
-/// picture is: see [`Watched::is_placed`].
+/// Opens the panel's window on the compositor at `socket`, with room for `pictures`. It is on its monitor once the
+/// first picture is: see [`Watched::is_placed`].
 pub(super) fn open(socket: &Path, wanted: &Wanted, pictures: usize) -> Result<Opened, WindowError> {
     let failed = |reason: String| WindowError::Server { server: format!("compositor {}", socket.display()), reason };
     let stream = UnixStream::connect(socket).map_err(|why| failed(why.to_string()))?;
@@ -559,8 +559,8 @@ impl Dispatch<wp_presentation::WpPresentation, ()> for View {
     }
 }
 
-/// What the compositor says of a picture that came on the monitor at `time`, in seconds and nanoseconds of the monotonic
-/// clock.
+/// What the compositor says of a picture that came on the monitor at `time`, in seconds and nanoseconds of the
+/// monotonic clock.
 fn presented(serial: u32, time: Option<(u64, u32)>, refresh_count: u64, flags: WEnum<Kind>) -> Completion {
     let t_present = time.map_or(0, |(seconds, nanoseconds)| {
         i64::try_from(seconds).unwrap_or(0).saturating_mul(1_000_000_000).saturating_add(nanoseconds.into())

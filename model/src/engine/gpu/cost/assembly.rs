@@ -12,8 +12,8 @@ struct Instruction {
     vector: u32,
     /// How many of those are multiply-adds.
     multiply_adds: u32,
-    /// Cycles for which a wave of 32 threads keeps its SIMD's vector port; those of a wave of 64 are twice as many, but for
-    /// products of matrices.
+    /// Cycles for which a wave of 32 threads keeps its SIMD's vector port; those of a wave of 64 are twice as many, but
+    /// for products of matrices.
     passes: u32,
     matrix: bool,
     /// Bytes that each thread reads or writes in the workgroup's memory.

@@ -1,14 +1,15 @@
 //! A model of what a plan costs on cards that are not there.
 //!
-//! Every shader of a plan is compiled by the real driver's own compiler, Mesa's RADV with its null device, and what it costs is
-//! counted from its instructions, the trips of its loops, and the bytes of its buffers. **Nothing is run or measured.** The
-//! model knows neither latency nor caches, nor the time between two dispatches; it takes every branch that goes forward as not
-//! taken, the bytes of a dispatch as moved once, and the vector port as the only one besides the workgroup's memory that can
-//! be busy. Real cards are slower than this where too few waves hide their loads, and faster where a map stays in a cache.
+//! Every shader of a plan is compiled by the real driver's own compiler, Mesa's RADV with its null device, and what it
+//! costs is counted from its instructions, the trips of its loops, and the bytes of its buffers. **Nothing is run or
+//! measured.** The model knows neither latency nor caches, nor the time between two dispatches; it takes every branch
+//! that goes forward as not taken, the bytes of a dispatch as moved once, and the vector port as the only one besides
+//! the workgroup's memory that can be busy. Real cards are slower than this where too few waves hide their loads, and
+//! faster where a map stays in a cache.
 //!
-//! Cards of RDNA 3 can issue two operations of some kinds together: in waves of 32 threads as instructions of their own,
-//! `v_dual_*`, which count as two in one cycle here; in waves of 64 the hardware does it unasked where registers allow, which
-//! is not counted here.
+//! Cards of RDNA 3 can issue two operations of some kinds together: in waves of 32 threads as instructions of their
+//! own, `v_dual_*`, which count as two in one cycle here; in waves of 64 the hardware does it unasked where registers
+//! allow, which is not counted here.
 
 mod assembly;
 mod null_device;
@@ -68,6 +69,7 @@ const LIMITS: WorkgroupLimits = WorkgroupLimits { bytes: 65536, threads: 1024 };
 
 /// Why there is no cost, or none that may be.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "the messages say what the fields are")]
 pub enum CostError {
     /// Mesa's driver is not there.
     #[error("Mesa's driver RADV is not installed: no radeon_icd*.json; install mesa-vulkan-drivers")]
@@ -77,18 +79,10 @@ pub enum CostError {
         "{driver} has no null device for the {card} ({said}); Mesa 26 has dropped it: install mesa-vulkan-drivers of Debian 12 or 13, and libvulkan1",
         driver = driver.display()
     )]
-    NoNullDevice {
-        /// The card.
-        card: &'static str,
-        /// The driver's file.
-        driver: PathBuf,
-        /// What it said.
-        said: String,
-    },
+    NoNullDevice { card: &'static str, driver: PathBuf, said: String },
     /// The program that runs the compiler does not start.
     #[error("{program} cannot be started: {source}", program = program.display())]
     Process {
-        /// The program.
         program: PathBuf,
         /// What the system said.
         source: std::io::Error,
@@ -96,19 +90,13 @@ pub enum CostError {
     /// A shader is none.
     #[error("shader `{label}` does not compile: {reason}")]
     Shader {
-        /// The shader.
         label: String,
         /// What the compiler said.
         reason: String,
     },
     /// The driver leaves out what is looked for.
     #[error("shader `{label}`: the driver does not tell its {what}; the versions that are known to are 22.3 to 25.0")]
-    Untold {
-        /// The shader.
-        label: String,
-        /// What is missing.
-        what: &'static str,
-    },
+    Untold { label: String, what: &'static str },
 }
 
 /// What one frame costs on one card.
@@ -224,7 +212,8 @@ struct Compiled {
 pub struct FramePlan(Plan);
 
 impl FramePlan {
-    /// The plan of `weights` on the default bench at `resolution`; `half_precision` is that of features, and so of most products.
+    /// The plan of `weights` on the default bench at `resolution`; `half_precision` is that of features, and so of most
+    /// products.
     ///
     /// # Errors
     /// The size is nothing, or too large.

@@ -1,7 +1,7 @@
 //! Mesa's RADV with its null device: the real driver's compiler for a card that is not there. Nothing can be run on it.
 //!
-//! The driver takes the card from the environment and ends the process where it does not know the card, so it runs in a process
-//! of its own, which is told by lines of JSON what to compile.
+//! The driver takes the card from the environment and ends the process where it does not know the card, so it runs in a
+//! process of its own, which is told by lines of JSON what to compile.
 
 use std::ffi::{CStr, CString};
 use std::io::{self, BufRead, Write};
@@ -148,15 +148,14 @@ struct Compiler {
     device: ash::Device,
     executables: ash::khr::pipeline_executable_properties::Device,
     instance: ash::Instance,
-    /// Unloaded last.
     _entry: ash::Entry,
 }
 
 impl Compiler {
     fn open() -> Result<Self, String> {
         let says = |result: vk::Result| format!("Vulkan says {result}");
-        // SAFETY: the loader is a system library; the handles are used by this object alone, which destroys each of them
-        // after all that was made from it.
+        // SAFETY: the loader is a system library; the handles are used by this object alone, which destroys each of
+        // them after all that was made from it.
         unsafe {
             let entry = ash::Entry::load().map_err(|error| format!("no Vulkan loader: {error}"))?;
             let application = vk::ApplicationInfo::default().api_version(vk::API_VERSION_1_3);
@@ -198,8 +197,8 @@ impl Compiler {
             })
             .collect();
         let entry = CString::new(request.entry.as_str()).map_err(|_| vk::Result::ERROR_UNKNOWN)?;
-        // SAFETY: naga made the module for this entry point and these bindings; what is made here is destroyed in turn where
-        // all went well, and where it did not, the process ends soon.
+        // SAFETY: naga made the module for this entry point and these bindings; what is made here is destroyed in turn
+        // where all went well, and where it did not, the process ends soon.
         unsafe {
             let info = vk::DescriptorSetLayoutCreateInfo::default().bindings(&bindings);
             let sets = [device.create_descriptor_set_layout(&info, None)?];

@@ -8,8 +8,9 @@
 //! | GP15 | the panel's sync output, 3.3 V, rising edge |
 //! | USB | the host |
 //!
-//! `LIMITS` are this box's own: set them to what your lasers and optics make safe, and `FULL_POWER_UW` to what each laser
-//! emits at full PWM. Neither wiring nor timing has been tried on a board of ours: measure both before an eye is near.
+//! `LIMITS` are this box's own: set them to what your lasers and optics make safe, and `FULL_POWER_UW` to what each
+//! laser emits at full PWM. Neither wiring nor timing has been tried on a board of ours: measure both before an eye is
+//! near.
 
 #![no_std]
 #![no_main]

@@ -1,7 +1,7 @@
 //! The panel's window on an X server.
 //!
-//! Two connections: on one the window lives and is drawn to ([`copies`], `vulkan_window`); the other, which only this file
-//! reads, watches both the window and the monitors. The window is one that window managers leave alone
+//! Two connections: on one the window lives and is drawn to ([`copies`], `vulkan_window`); the other, which only this
+//! file reads, watches both the window and the monitors. The window is one that window managers leave alone
 //! (override-redirect): none moves, decorates or focuses it, and none is needed.
 
 mod copies;
@@ -421,8 +421,8 @@ fn refresh_hz(mode: &randr::ModeInfo) -> Option<f64> {
     (hz.is_finite() && hz > 0.0).then_some(hz)
 }
 
-/// Whether a gamma ramp leaves 8-bit levels as they are. Servers begin with ramps that end at 65535 or a level short of it;
-/// those that have no ramps give zeros.
+/// Whether a gamma ramp leaves 8-bit levels as they are. Servers begin with ramps that end at 65535 or a level short of
+/// it; those that have no ramps give zeros.
 fn is_straight(ramp: &[u16]) -> bool {
     if ramp.iter().all(|&value| value == 0) {
         return true;

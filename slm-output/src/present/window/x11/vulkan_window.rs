@@ -1,4 +1,5 @@
-//! The window as Vulkan's surface needs it: on a connection of the C library, which Vulkan uses with threads of its own.
+//! The window as Vulkan's surface needs it: on a connection of the C library, which Vulkan uses with threads of its
+//! own.
 
 use std::ffi::CString;
 use std::num::NonZeroU32;
