@@ -155,7 +155,7 @@ pub struct PictureTag {
     pub t_came: Option<TimeNs>,
     /// How it was taken.
     pub view: PictureView,
-    /// The order that brought its scene, as [`FrameOrders`](crate::record::FrameOrders) counts.
+    /// The line in `orders.jsonl` of the order that brought its scene, from 1; 0 for what the run began with.
     pub order: u32,
 }
 
