@@ -436,6 +436,9 @@ mod tests {
         let ran = bench.run(1.0);
         assert!((ran.spacing[1] as f64) > 0.99 * ran.frames as f64, "{ran:?}");
         assert_eq!(ran.forgotten, 0, "{ran:?}");
+        // Canary: more frames than are remembered.
+        bench.report_delay_ns = 20 * REFRESH.0;
+        assert!(bench.run(0.01).forgotten > 0);
     }
 
     #[test]

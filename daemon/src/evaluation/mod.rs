@@ -91,8 +91,6 @@ pub struct MarksLight {
     pub light_ratio: f64,
     /// Mean light where all is black, more than 16 px from any mark at every focus; white is 1.
     pub dark_mean: f64,
-    /// The pictures at the farthest and at the nearest focus.
-    pub views: EndViews,
 }
 
 impl EndViews {
@@ -205,11 +203,15 @@ impl Judge {
     }
 
     /// Judges how much light a scene of [`SceneKind::Marks`] shows, and where, with the stacks `pupil_indices` of the
-    /// shard, each made for its pupil and seen by it. No border is left out.
+    /// shard, each made for its pupil and seen by it, and returns what each pupil sees. No border is left out.
     ///
     /// # Errors
     /// Where the shard cannot be read, is of another kind or too small for marks and black.
-    pub fn marks(&mut self, shard: &SceneShard, pupil_indices: &[usize]) -> Result<Vec<MarksLight>, Failure> {
+    pub fn marks(
+        &mut self,
+        shard: &SceneShard,
+        pupil_indices: &[usize],
+    ) -> Result<Vec<(MarksLight, EndViews)>, Failure> {
         let unreadable = Failure::because(Exit::Data);
         let wrong = |found: &str, expected: &str| {
             let said = format!(
@@ -234,12 +236,12 @@ impl Judge {
             let pupil = shard.pupils()[index];
             let (pattern, _) = self.shown(&frame, pupil)?;
             let seen = self.look(&pattern, pupil, shard.focuses());
-            found.push(MarksLight {
+            let light = MarksLight {
                 marks: Marks::of_index(shard.index()),
                 light_ratio: marks::light_ratio(&seen, &target),
                 dark_mean: dark.mean_light(&seen),
-                views: EndViews::of(&target, &seen),
-            });
+            };
+            found.push((light, EndViews::of(&target, &seen)));
         }
         Ok(found)
     }

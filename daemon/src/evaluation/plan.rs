@@ -185,8 +185,8 @@ impl<'a> EvaluationPlan<'a> {
         self.shards.len() + self.cards.len() + self.marks.len()
     }
 
-    /// Judges, with the views of the first `views_kept` scenes. `after_step` is called after each scene, and ends it
-    /// all where it fails.
+    /// Judges, with the views of the first `views_kept` scenes and, unless that is 0, of one scene of each kind of
+    /// marks. `after_step` is called after each scene, and ends it all where it fails.
     ///
     /// # Errors
     /// The engine is not to be had, a scene cannot be read, or `after_step` failed.
@@ -207,11 +207,17 @@ impl<'a> EvaluationPlan<'a> {
                 after_step()?;
             }
         }
-        let mut of_marks = Vec::new();
+        let (mut of_marks, mut marks_views) = (Vec::new(), Vec::<MarksViews>::new());
         if let Some(first) = marks.first() {
             let mut judge = judge_of(first)?;
             for shard in &marks {
-                of_marks.push(judge.marks(shard, &pupil_indices(shard, &pupils)?)?);
+                let found = judge.marks(shard, &pupil_indices(shard, &pupils)?)?;
+                let (light, views): (Vec<MarksLight>, Vec<EndViews>) = found.into_iter().unzip();
+                let kind = light[0].marks;
+                if views_kept > 0 && marks_views.iter().all(|views| views.marks != kind) {
+                    marks_views.push(MarksViews { marks: kind, views });
+                }
+                of_marks.push(light);
                 after_step()?;
             }
         }
@@ -242,7 +248,6 @@ impl<'a> EvaluationPlan<'a> {
             refocus: card_views.iter().map(|(refocus, _)| refocus.clone()).collect(),
             marks: marks_rows(&pupils, &of_marks),
         };
-        let marks_views = marks_views(of_marks);
         Ok(Evaluated { evaluation, pupils, scene_views, card_views, marks_views })
     }
 }
@@ -361,22 +366,17 @@ fn matrix(pupils: &[PupilDiameter], judged: &[JudgedScene]) -> Matrix {
     }
 }
 
-/// Means over the scenes of each kind of marks, kinds in the order in which they come; of each scene there is one for
-/// each pupil.
+/// Means over the scenes of each kind of marks; of each scene there is one for each pupil.
 fn marks_rows(pupils: &[PupilDiameter], scenes: &[Vec<MarksLight>]) -> Vec<MarksRow> {
-    let mut kinds: Vec<Marks> = Vec::new();
-    for scene in scenes {
-        if !kinds.contains(&scene[0].marks) {
-            kinds.push(scene[0].marks);
-        }
-    }
     let mut rows = Vec::new();
-    for kind in kinds {
+    for kind in Marks::ALL {
+        let of_kind: Vec<_> = scenes.iter().filter(|scene| scene[0].marks == kind).collect();
+        if of_kind.is_empty() {
+            continue;
+        }
         for (number, pupil) in pupils.iter().enumerate() {
-            let of_kind: Vec<&MarksLight> =
-                scenes.iter().map(|scene| &scene[number]).filter(|light| light.marks == kind).collect();
             let mean = |figure: &dyn Fn(&MarksLight) -> f64| {
-                of_kind.iter().map(|light| figure(light)).sum::<f64>() / of_kind.len() as f64
+                of_kind.iter().map(|scene| figure(&scene[number])).sum::<f64>() / of_kind.len() as f64
             };
             rows.push(MarksRow {
                 marks: kind.name(),
@@ -388,15 +388,4 @@ fn marks_rows(pupils: &[PupilDiameter], scenes: &[Vec<MarksLight>]) -> Vec<Marks
         }
     }
     rows
-}
-
-fn marks_views(scenes: Vec<Vec<MarksLight>>) -> Vec<MarksViews> {
-    let mut found: Vec<MarksViews> = Vec::new();
-    for scene in scenes {
-        let marks = scene[0].marks;
-        if found.iter().all(|views| views.marks != marks) {
-            found.push(MarksViews { marks, views: scene.into_iter().map(|light| light.views).collect() });
-        }
-    }
-    found
 }

@@ -504,9 +504,12 @@ pub enum Marks {
 }
 
 impl Marks {
+    /// Every kind.
+    pub const ALL: [Self; 3] = [Self::Dots, Self::Lines, Self::Stars];
+
     /// Those of the scene with this number.
     pub fn of_index(index: u64) -> Self {
-        [Self::Dots, Self::Lines, Self::Stars][(index % 3) as usize]
+        Self::ALL[(index % 3) as usize]
     }
 
     /// Its name in tables.
