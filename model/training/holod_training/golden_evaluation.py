@@ -105,11 +105,14 @@ def found(shard: Shard, weights: Path) -> dict[str, Any]:
         shown = panel_field(through_levels(phase)) * config.amplitude_constant
         blur = coc_px(network.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
         near_focus, far_focus = card_eye.look(shown, stack.pupil_mm)
+        judged = judge(eye.look(shown, stack.pupil_mm), stack.target, blur, BORDER_PX).known()
+        # `holod evaluate` does not know it.
+        judged.pop("foam", None)
         near, far = ([gradient_energy(p, areas[name]) for p in (near_focus, far_focus)] for name in ("near", "far"))
         rows.append(
             {
                 "pupil_mm": stack.pupil_mm,
-                **judge(eye.look(shown, stack.pupil_mm), stack.target, blur, BORDER_PX).known(),
+                **judged,
                 "flat_oracle_psnr_db": judge(flat_oracle(stack.target), stack.target, blur, BORDER_PX).psnr_db,
                 "clipped_share": clipped,
                 "near_card": near[0] / near[1],

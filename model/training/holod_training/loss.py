@@ -10,6 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from holod_training.foam import foam_energy
+
 IN_FOCUS_PX = 2.0
 # Blur over the depth volume for which the weight of what is in focus is meant, and above which it grows no more: a
 # pupil of 2 mm and one of 5 mm on the default bench.
@@ -45,6 +47,7 @@ class LossWeights:
     focus_absolute: float = 0.0
     outlines: float = 0.0
     black: float = 0.0
+    foam: float = 0.0
     structure: float = 0.0
     lpips: float = 1.0
     teacher: float = 8.0
@@ -145,6 +148,9 @@ def focus_loss(
         terms["outlines"] = (blurred[..., 1:] * dx.square()).mean() + (blurred[..., 1:, :] * dy.square()).mean()
     if weights.black:
         terms["black"] = (picture * (target < BLACK)).mean()
+    if weights.foam:
+        energy, pixels = foam_energy(picture, target, coc_px)
+        terms["foam"] = energy / pixels.clamp_min(1)
     if weights.focus_absolute:
         terms["focus_absolute"] = centred_error.abs().mean()
     chosen = slice(None) if perceptual_planes is None else perceptual_planes

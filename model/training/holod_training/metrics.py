@@ -9,9 +9,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from holod_training.foam import OUT_OF_FOCUS_PX, REGION_PX, foam_energy
 from holod_training.loss import IN_FOCUS_PX, inner
-
-OUT_OF_FOCUS_PX = 8.0
 
 
 @dataclass(frozen=True)
@@ -24,6 +23,7 @@ class Judgement:
     slope: float
     correlation: float
     ssim: float
+    foam: float = math.nan
     lpips: float = math.nan
 
     def known(self) -> dict[str, float]:
@@ -101,11 +101,15 @@ def judge(
     fifty focuses in full HD leaves no room for copies. `lpips`: distances [N] of pictures [N, 3, H, W]."""
     picture, target, coc_px = (inner(t, border_px) for t in (picture, target, coc_px))
     whole, sharp, blurred = _Mean(), _Mean(), _Mean()
+    foam, foam_pixels = 0.0, 0.0
     for shown, wanted, blur in zip(picture, target, coc_px, strict=True):
         error = (shown - wanted).square()
         whole.add(error)
         sharp.add(error[:, blur < IN_FOCUS_PX])
         blurred.add(error[:, blur > OUT_OF_FOCUS_PX])
+        if min(blur.shape) >= REGION_PX:
+            energy, pixels = foam_energy(shown[None], wanted[None], blur[None])
+            foam, foam_pixels = foam + energy.item(), foam_pixels + pixels.item()
     slope, correlation = focus_response(picture, target)
     return Judgement(
         psnr_db=whole.psnr_db(),
@@ -114,6 +118,7 @@ def judge(
         slope=slope,
         correlation=correlation,
         ssim=ssim(picture, target) if with_ssim else math.nan,
+        foam=foam / foam_pixels if foam_pixels else math.nan,
         lpips=math.nan if lpips is None else _mean_distance(lpips, picture, target),
     )
 

@@ -15,6 +15,7 @@ NUMBERS = (
     ("slope", "slope", 3),
     ("correlation", "correlation", 3),
     ("ssim", "SSIM", 3),
+    ("foam", "foam", 5),
 )
 LPIPS = ("lpips", "LPIPS", 4)
 PAIRED = NUMBERS[:4]
@@ -56,7 +57,8 @@ def _opening(result: dict[str, Any]) -> list[str]:
         f"{planes}, a border of {result['border_px']} px left out; linear light, peak 1. Means over scenes, in "
         f"brackets their 95 % interval (Student's t). Amplitude constant {result['amplitude_constant']}. Slope and "
         "correlation: P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, 0 = one picture at all "
-        f"depths). In focus: CoC < 2 px; out of focus: CoC > 8 px. Everything is after double phase.{optimised} Two "
+        "depths). In focus: CoC < 2 px; out of focus: CoC > 8 px. Foam: mean energy of structure of 4 to 16 px out of "
+        f"focus that the target does not have there; less is better. Everything is after double phase.{optimised} Two "
         "rows are no holograms: the flat oracle is the target's mean at every focus, RGB-D blur is what a simple "
         "incoherent display would show that knows the picture and its depth alone, and guesses nothing that is hidden.",
     ]

@@ -198,7 +198,7 @@ def test_lpips_has_a_column_where_its_files_are_given(evaluation: Path, tmp_path
     assert all(row["lpips"] > 2 * found for row in result["rows"] if row["method"] not in ("flat oracle", "RGB-D blur"))
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("| 2 | flat oracle "))
     assert line.endswith(f" | {found:.4f} |")
-    heading = "| s mm | method | scenes | PSNR dB | in focus | out of focus | slope | correlation | SSIM |"
+    heading = "| s mm | method | scenes | PSNR dB | in focus | out of focus | slope | correlation | SSIM | foam |"
     assert f"{heading} LPIPS |" in (tmp_path / "out" / "evaluation.md").read_text()
     without = (evaluation / "out" / "evaluation.md").read_text()
     assert heading in without and "LPIPS" not in without
