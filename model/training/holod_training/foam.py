@@ -3,6 +3,9 @@
 Coherent light that is out of focus interferes: text and dots turn into cell walls and rings. Three octaves of structure
 count, which blocks of 4, 8 and 16 px hold; what a block of 2 px holds is beyond what an eye makes out (on the default
 bench above 22 cycles a degree).
+
+Blocks stand still: a regular pattern that is shifted against its target's may have all of its energy
+counted. In pictures that averages out: the blur that an incoherent display would show has a tenth of `standard`'s foam.
 """
 
 from __future__ import annotations
@@ -31,8 +34,13 @@ def foam_energy(picture: Tensor, target: Tensor, coc_px: Tensor) -> tuple[Tensor
     regions' pixels and colours, white = 1; and over how many pixels and colours.
 
     In regions of 32x32 px each octave's energy over that of the target counts, of blocks all of which is out of focus.
-    What is left of a region at the right and the bottom is left out.
+    What is left of a region at the right and the bottom is left out. Raises ValueError where no region fits.
     """
+    if min(picture.shape[-2:]) < REGION_PX:
+        raise ValueError(
+            f"foam: pictures of {tuple(picture.shape[-2:])} pixels have no region of {REGION_PX}x{REGION_PX}; "
+            "take a larger crop or a narrower border"
+        )
     height, width = (size // REGION_PX * REGION_PX for size in picture.shape[-2:])
     picture, target, coc_px = (t[..., :height, :width] for t in (picture, target, coc_px))
     energy, pixels = picture.new_zeros(()), picture.new_zeros(())
