@@ -3,9 +3,12 @@
 //! PSNR alone rewards one blurred picture that is shown at every focus, so a stack is judged by a row of figures: see
 //! [`StackScore`].
 
+mod foam;
+
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 use rayon::prelude::*;
 
+use self::foam::Foam;
 use crate::LinearImage;
 
 /// Side and standard deviation of SSIM's window (Wang et al. 2004).
@@ -104,6 +107,9 @@ pub struct StackScore {
     pub focus_correlation: Option<f64>,
     /// [`ssim`], mean over planes; `None` where its window does not fit.
     pub ssim: Option<f64>,
+    /// Mean energy, white = 1, of structure of 4 to 16 px that the pictures have with more than 8 px of blur and the
+    /// target has not; `None` where no region of 32x32 px has some.
+    pub foam: Option<f64>,
     /// PSNR of showing the target's mean at every plane: what no focus at all would score.
     pub flat_oracle_psnr_db: f64,
 }
@@ -156,6 +162,12 @@ pub fn score_stack(
     let correlation = if actual_energy > NO_CHANGE { cross / (actual_energy * expected_energy).sqrt() } else { 0.0 };
     let ssims: Option<Vec<f64>> =
         actual.par_iter().zip(expected).map(|(actual, expected)| ssim(actual, expected, border_px)).collect();
+    let foam = (0..planes).into_par_iter().map(|plane| {
+        Foam::of(&actual[plane], &expected[plane], border_px, |index| {
+            let depth = geometry.depth_at(depth_normalised[index].into());
+            geometry.coc_px(pupil, depth, focuses[plane]) > OUT_OF_FOCUS_COC_PX
+        })
+    });
     let some = |error: SquaredError| (error.count > 0).then(|| error.psnr_db());
     StackScore {
         psnr_db: all.psnr_db(),
@@ -164,6 +176,7 @@ pub fn score_stack(
         focus_slope: refocuses.then(|| cross / expected_energy),
         focus_correlation: refocuses.then_some(correlation),
         ssim: ssims.map(|ssims| ssims.iter().sum::<f64>() / planes as f64),
+        foam: foam.reduce(Foam::default, |one, other| one + other).mean(),
         flat_oracle_psnr_db: flat.psnr_db(),
     }
 }

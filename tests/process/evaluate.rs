@@ -14,7 +14,7 @@ use crate::HOLOD;
 const SIZE: Resolution = Resolution { width: 64, height: 48 };
 
 /// How far the two evaluations may be apart.
-const TOLERANCES: [(&str, f64); 8] = [
+const TOLERANCES: [(&str, f64); 9] = [
     ("psnr_db", 0.05),
     ("psnr_in_focus_db", 0.05),
     ("psnr_out_of_focus_db", 0.05),
@@ -22,6 +22,7 @@ const TOLERANCES: [(&str, f64); 8] = [
     ("slope", 0.005),
     ("correlation", 0.005),
     ("ssim", 0.005),
+    ("foam", 0.000_02),
     ("clipped_share", 0.0002),
 ];
 /// Largest relative difference of a refocus ratio.
@@ -182,7 +183,7 @@ fn scenes_of_the_renderer_are_judged_told_and_written() {
     assert_eq!((&one["scenes"], &one["rows"][0]["psnr_db"]["ci95_half_width"]), (&1.into(), &Value::Null));
 
     let told = with(&["--limit", "1"]);
-    for words in ["1 scenes of 64x48", "8-bit levels", "in focus", "flat oracle", "seen by another"] {
+    for words in ["1 scenes of 64x48", "8-bit levels", "in focus", "foam", "flat oracle", "seen by another"] {
         assert!(told.contains(words), "no '{words}' in {told}");
     }
 }

@@ -110,8 +110,8 @@ fn table(evaluation: &Evaluation) -> String {
         "weights {weights} on {scenes} scenes of {size}, {} planes from {:.2} to {:.2} dpt, {panel_bit_depth}-bit levels; \
          a border of {border_px} px is left out\n\
          mean over scenes ± half of its confidence interval ({})\n\n\
-         {:>8}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>11}\n\
-         {:>8}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>11}\n",
+         {:>8}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>11}\n\
+         {:>8}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>11}\n",
         focus.len(),
         focus.iter().copied().fold(f64::INFINITY, f64::min),
         focus.iter().copied().fold(f64::NEG_INFINITY, f64::max),
@@ -123,6 +123,7 @@ fn table(evaluation: &Evaluation) -> String {
         "slope",
         "correlation",
         "SSIM",
+        "foam",
         "flat oracle",
         "clipped",
         "mm",
@@ -132,19 +133,24 @@ fn table(evaluation: &Evaluation) -> String {
         "",
         "",
         "",
+        "0.001",
         "dB",
         "%",
     );
     for row in &evaluation.rows {
-        let figure = |estimate: Option<Estimate>, decimals: usize| {
-            estimate.map_or("none".to_owned(), |Estimate { mean, ci95_half_width, .. }| match ci95_half_width {
-                Some(half_width) => format!("{mean:.decimals$} ± {half_width:.decimals$}"),
-                None => format!("{mean:.decimals$}"),
+        let scaled = |estimate: Option<Estimate>, scale: f64, decimals: usize| {
+            estimate.map_or("none".to_owned(), |Estimate { mean, ci95_half_width, .. }| {
+                let mean = scale * mean;
+                match ci95_half_width {
+                    Some(half_width) => format!("{mean:.decimals$} ± {:.decimals$}", scale * half_width),
+                    None => format!("{mean:.decimals$}"),
+                }
             })
         };
+        let figure = |estimate, decimals| scaled(estimate, 1.0, decimals);
         let clipped = row.clipped_share.map_or("none".to_owned(), |share| format!("{:.3}", 100.0 * share.mean));
         text.push_str(&format!(
-            "{:>8}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{clipped:>11}\n",
+            "{:>8}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{clipped:>11}\n",
             row.pupil_mm,
             figure(row.psnr_db, 2),
             figure(row.psnr_in_focus_db, 2),
@@ -152,6 +158,7 @@ fn table(evaluation: &Evaluation) -> String {
             figure(row.slope, 3),
             figure(row.correlation, 3),
             figure(row.ssim, 3),
+            scaled(row.foam, 1e3, 2),
             figure(row.flat_oracle_psnr_db, 2),
         ));
     }

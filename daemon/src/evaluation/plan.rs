@@ -143,6 +143,8 @@ pub struct Row {
     pub correlation: Option<Estimate>,
     /// [`StackScore::ssim`].
     pub ssim: Option<Estimate>,
+    /// [`StackScore::foam`].
+    pub foam: Option<Estimate>,
     /// [`StackScore::flat_oracle_psnr_db`].
     pub flat_oracle_psnr_db: Option<Estimate>,
     /// Share of amplitudes above the double phase's constant, 0..=1.
@@ -348,6 +350,7 @@ fn row(pupil: PupilDiameter, number: usize, judged: &[JudgedScene]) -> Row {
         slope: over_scenes(&|score| score.focus_slope),
         correlation: over_scenes(&|score| score.focus_correlation),
         ssim: over_scenes(&|score| score.ssim),
+        foam: over_scenes(&|score| score.foam),
         flat_oracle_psnr_db: over_scenes(&|score| Some(score.flat_oracle_psnr_db)),
         clipped_share: Estimate::of(&clipped),
     }

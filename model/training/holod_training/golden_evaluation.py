@@ -106,8 +106,6 @@ def found(shard: Shard, weights: Path) -> dict[str, Any]:
         blur = coc_px(network.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
         near_focus, far_focus = card_eye.look(shown, stack.pupil_mm)
         judged = judge(eye.look(shown, stack.pupil_mm), stack.target, blur, BORDER_PX).known()
-        # `holod evaluate` does not know it.
-        judged.pop("foam", None)
         near, far = ([gradient_energy(p, areas[name]) for p in (near_focus, far_focus)] for name in ("near", "far"))
         rows.append(
             {
