@@ -139,6 +139,7 @@ def test_a_feed_that_stands_still_is_seen_dark_until_it_goes_on(start: Start, br
     client = subprocess.Popen([sys.executable, "-c", CLIENT, str(holod.folder / "holod/feed")])
     try:
         browser.get(holod.place)
+        wait_for("the page names the client", lambda: "grey; 1 clients" in text(browser, "facts"))
         wait_for("the page says that it is lit", lambda: text(browser, "lasers") == "lasers: armed")
         wait_for("fields are lit", lambda: pixels(browser, "fields", "green") > 50)
         client.send_signal(signal.SIGSTOP)
@@ -147,7 +148,7 @@ def test_a_feed_that_stands_still_is_seen_dark_until_it_goes_on(start: Start, br
         wait_for("no window is drawn", dark)
         wait_for("the reason stands at the fields", lambda: "dark: no-picture" in text(browser, "fields-text"))
         trouble = "lasers dark: the feed's client `grey` has given no new picture for 1 s (--feed-dark-after)"
-        assert trouble in text(browser, "facts") and trouble in text(browser, "log")
+        wait_for("it names the client", lambda: trouble in text(browser, "facts") and trouble in text(browser, "log"))
         assert b"\nholod_feed_keeps_dark 1" in holod.get("/metrics")[1]
         client.send_signal(signal.SIGCONT)
         wait_for("the badge says armed", lambda: text(browser, "lasers") == "lasers: armed")
