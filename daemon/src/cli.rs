@@ -328,9 +328,13 @@ pub struct RenderArgs {
     /// The scene.
     #[command(flatten)]
     pub scene: SceneArgs,
-    /// Pupil diameter for which the hologram is made, in millimetres.
-    #[arg(long, value_name = "MM", value_parser = parse_pupil)]
-    pub pupil: PupilDiameter,
+    /// A directory with a stack.toml, in place of a scene: images of one scene that are focused at several depths, seen
+    /// by an eye with one pupil, for the weights of a focal-stack network.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "depth_encoding", "pupil"])]
+    pub focal_stack: Option<PathBuf>,
+    /// Pupil diameter for which the hologram is made, in millimetres; a focal stack says its own.
+    #[arg(long, value_name = "MM", value_parser = parse_pupil, required_unless_present = "focal_stack")]
+    pub pupil: Option<PupilDiameter>,
     /// Engine for the network.
     #[arg(long, value_enum, default_value_t = Backend::Auto)]
     pub backend: Backend,

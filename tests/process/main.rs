@@ -6,6 +6,7 @@ mod control;
 mod evaluate;
 mod faults;
 mod feed;
+mod focal_stack;
 mod gpu;
 mod inspect;
 mod page;

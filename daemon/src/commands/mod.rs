@@ -5,6 +5,7 @@ mod check;
 mod ctl;
 mod demo;
 mod evaluate;
+mod focal_stack;
 mod laser;
 mod log;
 mod pattern;

@@ -7,9 +7,11 @@ use holod_calibration::rig::Rig;
 use holod_calibration::{Colour, DisplayGeometry, PupilDiameter};
 use holod_model::Weights;
 use holod_model::files::{self, BenchOptics, StoredHologram};
+use holod_model::optics::PhasePattern;
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 use serde::Serialize;
 
+use super::focal_stack;
 use crate::cli::{Backend, RenderArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
 use crate::progress;
@@ -43,28 +45,26 @@ pub(super) struct Report {
     files: [&'static str; 5],
 }
 
-const FILES: [&str; 5] = ["field.safetensors", "phase_red.png", "phase_green.png", "phase_blue.png", "report.json"];
+pub(super) const FILES: [&str; 5] =
+    ["field.safetensors", "phase_red.png", "phase_green.png", "phase_blue.png", "report.json"];
 
 pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
     let began = Instant::now();
+    let pupil = match (&args.focal_stack, args.pupil) {
+        (Some(directory), _) => return focal_stack::render(args, &rig, directory, began),
+        (None, Some(pupil)) => pupil,
+        (None, None) => return Err(Failure::new(Exit::Usage, "--pupil MM is missing")),
+    };
     let staging = Staging::new(&args.out, &FILES, args.force)?;
-    let Computed { mut renderer, mut report, optics, .. } = compute(&rig, &args.scene, args.pupil, args.backend)?;
+    let Computed { mut renderer, mut report, optics, .. } = compute(&rig, &args.scene, pupil, args.backend)?;
     let hologram = StoredHologram {
         hologram: renderer.hologram().map_err(Failure::because(Exit::Unavailable))?.clone(),
-        pupil: args.pupil,
+        pupil,
         optics,
         amplitude_constant: report.amplitude_constant,
     };
-    let pattern = renderer.pattern().map_err(Failure::because(Exit::Unavailable))?;
-    progress::during("writing the hologram", || {
-        let cannot = Failure::because(Exit::CannotCreate);
-        hologram.save(&staging.path(FILES[0])).map_err(&cannot)?;
-        for (colour, name) in Colour::ALL.into_iter().zip(&FILES[1..4]) {
-            files::save_phase(pattern, colour, &staging.path(name)).map_err(&cannot)?;
-        }
-        Ok::<_, Failure>(())
-    })?;
+    save(&hologram, renderer.pattern().map_err(Failure::because(Exit::Unavailable))?, &staging)?;
     report.total_ms = began.elapsed().as_secs_f64() * 1e3;
     results::save_json(&report, &staging.path(FILES[4]))?;
     staging.commit()?;
@@ -93,6 +93,18 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
     ))
 }
 
+/// Writes all files but the report.
+pub(super) fn save(hologram: &StoredHologram, pattern: &PhasePattern, staging: &Staging) -> Result<(), Failure> {
+    progress::during("writing the hologram", || {
+        let cannot = Failure::because(Exit::CannotCreate);
+        hologram.save(&staging.path(FILES[0])).map_err(&cannot)?;
+        for (colour, name) in Colour::ALL.into_iter().zip(&FILES[1..4]) {
+            files::save_phase(pattern, colour, &staging.path(name)).map_err(&cannot)?;
+        }
+        Ok(())
+    })
+}
+
 /// A scene's first frame on its way to the panel.
 pub(super) struct Computed {
     /// Holds the hologram and its phases.
@@ -111,7 +123,7 @@ pub(super) fn compute(
     backend: Backend,
 ) -> Result<Computed, Failure> {
     let weights = progress::during("loading the network", || setup::weights(rig))?;
-    check_pupil(&weights, &rig.geometry, pupil)?;
+    check_pupil(&weights, &rig.geometry, "--pupil", pupil)?;
     let frames = progress::during("loading the scene", || scene::frames(named, &rig.geometry))?;
     let resolution = frames.resolution();
     let encoder = renderer::panel_encoder(rig, resolution)?;
@@ -153,7 +165,13 @@ pub(super) fn compute(
     Ok(Computed { renderer, encoder, levels, optics, report })
 }
 
-fn check_pupil(weights: &Weights, bench: &DisplayGeometry, pupil: PupilDiameter) -> Result<(), Failure> {
+/// Refuses a pupil, which `name` says, that the weights were not trained for.
+pub(super) fn check_pupil(
+    weights: &Weights,
+    bench: &DisplayGeometry,
+    name: &str,
+    pupil: PupilDiameter,
+) -> Result<(), Failure> {
     let [narrowest, widest] = weights.trained_pupils(bench);
     if (narrowest..=widest).contains(&pupil) {
         return Ok(());
@@ -161,7 +179,7 @@ fn check_pupil(weights: &Weights, bench: &DisplayGeometry, pupil: PupilDiameter)
     Err(Failure::new(
         Exit::Usage,
         format!(
-            "--pupil: found {} mm, expected {:.2} to {:.2} mm, the pupils that these weights were trained for on this \
+            "{name}: found {} mm, expected {:.2} to {:.2} mm, the pupils that these weights were trained for on this \
              bench",
             pupil.mm(),
             narrowest.mm(),

@@ -49,7 +49,7 @@ impl CpuRenderer {
         no_gpu: Option<&GpuError>,
     ) -> Result<Self, Failure> {
         let resolution = encoder.pattern_resolution();
-        let engine = CpuEngine::new(weights, bench, resolution).map_err(Failure::because(Exit::Unavailable))?;
+        let engine = CpuEngine::new(weights, bench, resolution).map_err(super::failure)?;
         let levels = LevelsFrame::new(encoder.layout());
         let (hologram, pattern) = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
         let pattern_bytes: usize = Colour::ALL.map(|colour| size_of_val(pattern.plane(colour))).iter().sum();

@@ -95,7 +95,7 @@ pub fn open(
         Backend::Auto => match on_gpu(Adapters::Hardware) {
             Ok(renderer) => Ok(renderer),
             Err(EngineError::Gpu(error)) => Ok(Box::new(CpuRenderer::new(weights, bench, encoder, Some(&error))?)),
-            Err(other) => Err(Failure::because(Exit::Unavailable)(other)),
+            Err(other) => Err(failure(other)),
         },
         Backend::Gpu | Backend::GpuHalf => on_gpu(Adapters::Hardware)
             .or_else(|error| match error {
@@ -107,6 +107,12 @@ pub fn open(
                 Failure::new(Exit::Unavailable, format!("--backend {named}: {error}"))
             }),
     }
+}
+
+/// An engine's error with its exit code.
+pub fn failure(error: EngineError) -> Failure {
+    let exit = if matches!(error, EngineError::Family { .. }) { Exit::Config } else { Exit::Unavailable };
+    Failure::because(exit)(error)
 }
 
 #[cfg(feature = "gpu")]

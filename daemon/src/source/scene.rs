@@ -55,10 +55,10 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
         .map(|text| DepthEncoding::parse(text, geometry))
         .transpose()
         .map_err(Failure::because(Exit::Usage))?;
-    let scene = Scene::open(spec, encoding).map_err(scene_failure)?;
+    let scene = Scene::open(spec, encoding).map_err(failure)?;
     let mut loaded = Frames { frames: Vec::new(), fps: scene.fps(), reports: Vec::new(), name: spec.clone() };
     for index in 0..scene.frames() {
-        let (frame, report) = scene.load(index, geometry, args.resolution, args.fit.into()).map_err(scene_failure)?;
+        let (frame, report) = scene.load(index, geometry, args.resolution, args.fit.into()).map_err(failure)?;
         check_fits(frame.resolution, geometry, spec)?;
         if let Some(first) = loaded.frames.first()
             && first.resolution != frame.resolution
@@ -168,7 +168,8 @@ pub fn sample_frame(resolution: Resolution) -> RgbdFrame {
     RgbdFrame { resolution, amplitude, depth_normalised: picture.depth }
 }
 
-pub(super) fn check_fits(resolution: Resolution, geometry: &DisplayGeometry, name: &str) -> Result<(), Failure> {
+/// Refuses what is larger than the panel.
+pub fn check_fits(resolution: Resolution, geometry: &DisplayGeometry, name: &str) -> Result<(), Failure> {
     let panel = geometry.resolution;
     if resolution.width <= panel.width && resolution.height <= panel.height {
         return Ok(());
@@ -182,7 +183,8 @@ pub(super) fn check_fits(resolution: Resolution, geometry: &DisplayGeometry, nam
     ))
 }
 
-fn scene_failure(error: SceneError) -> Failure {
+/// A scene or a focal stack that cannot be loaded, with its exit code.
+pub fn failure(error: SceneError) -> Failure {
     let exit = match &error {
         SceneError::Read { .. } | SceneError::Kind { .. } => Exit::NoInput,
         SceneError::DepthEncoding { .. } => Exit::Usage,

@@ -8,10 +8,12 @@ use std::time::Instant;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::rig::{Rig, RigError};
-use holod_calibration::{DisplayGeometry, Resolution, Sorted};
+use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution, Sorted};
 use holod_model::gpu::GpuError;
+use holod_model::scene::FocalStack;
 use holod_model::scene_renderer::shard::{Outcome, PlanePlan, PlannedScene, Preview, PupilPlan, ShardError, ShardPlan};
 use holod_model::scene_renderer::{SceneKind, Tracer};
+use holod_model::scene_shard::{SceneShard, SceneShardError};
 use holod_model::srgb8;
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -29,6 +31,8 @@ enum Command {
     Generate(Generate),
     /// Put scenes of a folder on one picture: all in focus, depth, and the widest pupil focused far and near.
     Sheet(Sheet),
+    /// Write what one pupil sees of a scene as pictures, for `holod render --focal-stack`.
+    FocalStack(FocalStackOf),
     /// Measure how many aperture rays are traced in a second.
     Bench(Bench),
     /// Measure the noise of the thin-lens images, in and out of focus, for each pupil.
@@ -104,10 +108,7 @@ struct Look {
 
 impl Look {
     fn plan(&self, seed: u64) -> Result<ShardPlan, Failure> {
-        let bench = match &self.rig {
-            Some(path) => Rig::load(path)?.geometry,
-            None => DisplayGeometry::DEFAULT,
-        };
+        let bench = bench_of(self.rig.as_deref())?;
         self.pupils
             .check(&bench)
             .map_err(|fault| Failure { code: exit::USAGE, message: format!("--pupils: {fault}") })?;
@@ -129,6 +130,11 @@ impl Look {
             rays: self.rays as usize,
         })
     }
+}
+
+/// The bench of a rig file, or the default one.
+fn bench_of(rig: Option<&Path>) -> Result<DisplayGeometry, RigError> {
+    rig.map_or(Ok(DisplayGeometry::DEFAULT), |path| Ok(Rig::load(path)?.geometry))
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -153,6 +159,21 @@ struct Sheet {
     /// Scenes to show, the first of the folder.
     #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u16).range(1..=400))]
     scenes: u16,
+}
+
+#[derive(Args)]
+struct FocalStackOf {
+    /// File of the scene.
+    scene: PathBuf,
+    /// Pupil diameter in millimetres, one of those that the scene was rendered for.
+    #[arg(long)]
+    pupil: f32,
+    /// Bench that the scene was rendered for, from a rig file; the built-in one when left out.
+    #[arg(long, value_name = "FILE")]
+    rig: Option<PathBuf>,
+    /// Folder to make, for the pictures and their stack.toml.
+    #[arg(long)]
+    out: PathBuf,
 }
 
 #[derive(Args)]
@@ -248,6 +269,7 @@ fn main() -> ExitCode {
     let done = match cli.command {
         Command::Generate(options) => generate(&options),
         Command::Sheet(options) => sheet(&options),
+        Command::FocalStack(options) => focal_stack(&options),
         Command::Bench(options) => bench(&options),
         Command::Noise(options) => noise(&options),
     };
@@ -288,6 +310,29 @@ fn generate(options: &Generate) -> Result<String, Failure> {
     }
     bar.finish_and_clear();
     Ok(format!("{written} scenes written to {}, {present} were there already", options.out.display()))
+}
+
+fn focal_stack(options: &FocalStackOf) -> Result<String, Failure> {
+    let bench = bench_of(options.rig.as_deref())?;
+    let unreadable = |error: SceneShardError| Failure { code: exit::DATA, message: error.to_string() };
+    let shard = SceneShard::open(&options.scene, &bench).map_err(unreadable)?;
+    let wanted = |pupil: &PupilDiameter| (pupil.mm() - options.pupil).abs() < 1e-4;
+    let index = shard.pupils().iter().position(wanted).ok_or_else(|| {
+        let there: Vec<String> = shard.pupils().iter().map(|pupil| pupil.mm().to_string()).collect();
+        let message = format!(
+            "--pupil: found {}, expected one of {} mm, which {} was rendered for",
+            options.pupil,
+            there.join(", "),
+            options.scene.display()
+        );
+        Failure { code: exit::USAGE, message }
+    })?;
+    let images = shard.stack(index).map_err(unreadable)?;
+    FocalStack::save(&options.out, &images, shard.focuses(), shard.pupils()[index]).map_err(|error| Failure {
+        code: exit::CANNOT_CREATE,
+        message: format!("{}: {error}; name a new folder with --out", options.out.display()),
+    })?;
+    Ok(format!("{} pictures and stack.toml written to {}", images.len(), options.out.display()))
 }
 
 fn bench(options: &Bench) -> Result<String, Failure> {

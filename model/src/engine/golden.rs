@@ -7,9 +7,10 @@ use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PupilDiameter
 use num_complex::{Complex32, Complex64};
 use safetensors::SafeTensors;
 
-use super::{CpuEngine, reference};
+use super::{CpuEngine, FocalStackEngine, reference};
 use crate::files::BenchOptics;
 use crate::optics::{DoublePhase, Eye, Propagator, SimulatedEye};
+use crate::scene::FocalStack;
 use crate::worst::worst;
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
 
@@ -83,6 +84,22 @@ impl Golden {
             depth_normalised: single("depth"),
         }
     }
+
+    fn focal_stack(&self) -> FocalStack {
+        let RgbdFrame { resolution, amplitude, .. } = self.frame();
+        let planes = self.weights().config().planes;
+        let bench = self.bench(resolution);
+        FocalStack {
+            resolution,
+            amplitude,
+            focuses: (0..planes).map(|plane| bench.depth_at(plane as f64 / (planes - 1) as f64)).collect(),
+            pupil: self.pupil(),
+        }
+    }
+
+    fn pupil(&self) -> PupilDiameter {
+        PupilDiameter::from_mm(self.values("pupil_mm").unwrap()[0] as f32)
+    }
 }
 
 fn widen(values: &[Complex32]) -> Vec<Complex64> {
@@ -112,11 +129,38 @@ fn real(values: &[f64]) -> Vec<Complex64> {
 
 fn check(name: &str) {
     let golden = Golden::open(name);
-    let (weights, frame) = (golden.weights(), golden.frame());
+    let (weights, frame, pupil) = (golden.weights(), golden.frame(), golden.pupil());
     let bench = golden.bench(frame.resolution);
-    let pupil = PupilDiameter::from_mm(golden.values("pupil_mm").unwrap()[0] as f32);
+    let field = golden.complex("field").unwrap();
+    check_stages(name, &golden, &reference::run(&weights, &bench, &frame, pupil));
 
-    let trace = reference::run(&weights, &bench, &frame, pupil);
+    let mut engine = CpuEngine::new(&weights, &bench, frame.resolution).unwrap();
+    let mut hologram = ComplexHologram::dark(frame.resolution);
+    engine.render(&frame, pupil, &mut hologram).unwrap();
+    assert_matches(&format!("{name} engine"), &widen(&hologram.field), &field, ENGINE_TOLERANCE);
+    #[cfg(feature = "gpu")]
+    {
+        let on_gpu = super::gpu::tests::hologram_of(&weights, &bench, &frame, pupil);
+        assert_matches(&format!("{name} engine on the GPU"), &widen(&on_gpu.field), &field, ENGINE_TOLERANCE);
+    }
+    check_optics(name, &golden);
+}
+
+fn check_focal_stack(name: &str) {
+    let golden = Golden::open(name);
+    let (weights, stack) = (golden.weights(), golden.focal_stack());
+    let bench = golden.bench(stack.resolution);
+    check_stages(name, &golden, &reference::run_focal_stack(&weights, &bench, &stack));
+    let mut engine = FocalStackEngine::new(&weights, &bench, stack.resolution).unwrap();
+    let mut hologram = ComplexHologram::dark(stack.resolution);
+    engine.render(&stack, &mut hologram).unwrap();
+    let field = golden.complex("field").unwrap();
+    assert_matches(&format!("{name} engine"), &widen(&hologram.field), &field, ENGINE_TOLERANCE);
+    check_optics(name, &golden);
+}
+
+/// Compares each stage of the reference, and its field.
+fn check_stages(name: &str, golden: &Golden, trace: &reference::Trace) {
     let mut unused = golden.stages();
     let mut stage = |what: &str, actual: &[Complex64], expected: Option<Vec<Complex64>>| {
         if let Some(expected) = expected {
@@ -141,27 +185,23 @@ fn check(name: &str) {
     assert_eq!(unused, BTreeSet::new(), "{name}: golden stages that nothing was compared with");
     let field = golden.complex("field").unwrap();
     assert_matches(&format!("{name} field"), &trace.field, &field, REFERENCE_TOLERANCE);
+}
 
-    let mut engine = CpuEngine::new(&weights, &bench, frame.resolution).unwrap();
-    let mut hologram = ComplexHologram::dark(frame.resolution);
-    engine.render(&frame, pupil, &mut hologram).unwrap();
-    assert_matches(&format!("{name} engine"), &widen(&hologram.field), &field, ENGINE_TOLERANCE);
-    #[cfg(feature = "gpu")]
-    {
-        let on_gpu = super::gpu::tests::hologram_of(&weights, &bench, &frame, pupil);
-        assert_matches(&format!("{name} engine on the GPU"), &widen(&on_gpu.field), &field, ENGINE_TOLERANCE);
-    }
-
+/// Compares what double phase, propagation and the simulated eye make of the golden field.
+fn check_optics(name: &str, golden: &Golden) {
+    let (weights, pupil, field) = (golden.weights(), golden.pupil(), golden.complex("field").unwrap());
+    let resolution = golden.frame().resolution;
+    let bench = golden.bench(resolution);
     let golden_hologram = ComplexHologram {
-        resolution: frame.resolution,
+        resolution,
         field: field.iter().map(|value| Complex32::new(value.re as f32, value.im as f32)).collect(),
     };
-    check_phase(name, &golden, &golden_hologram, weights.config().amplitude_constant);
+    check_phase(name, golden, &golden_hologram, weights.config().amplitude_constant);
 
     let distance_m: f64 = golden.metadata("asm_distance_m").parse().unwrap();
     for (what, mut propagator) in [
-        ("asm_padded", Propagator::new(&bench, frame.resolution)),
-        ("asm_circular", Propagator::repeating(&bench, frame.resolution)),
+        ("asm_padded", Propagator::new(&bench, resolution)),
+        ("asm_circular", Propagator::repeating(&bench, resolution)),
     ] {
         let mut propagated = golden_hologram.clone();
         for colour in Colour::ALL {
@@ -174,9 +214,9 @@ fn check(name: &str) {
     let focus_dpt: Vec<f64> = serde_json::from_str(&golden.metadata("focus_dpt")).unwrap();
     let eyes = focus_dpt.into_iter().map(|focus_dpt| Eye { pupil, focus: Dioptres(focus_dpt) });
     let phases = golden.values("phase").unwrap().into_iter().map(|phase| phase as f32).collect();
-    let pattern = PhasePattern { resolution: frame.resolution, phase_rad: phases };
+    let pattern = PhasePattern { resolution, phase_rad: phases };
     let constant = weights.config().amplitude_constant;
-    let mut simulated = SimulatedEye::repeating(&bench, frame.resolution);
+    let mut simulated = SimulatedEye::repeating(&bench, resolution);
     for (planes_before, eye) in eyes.enumerate() {
         let (field, panel) = (simulated.view_field(&golden_hologram, eye), simulated.view(&pattern, constant, eye));
         for (what, seen) in [("eye_field", field), ("eye_panel", panel)] {
@@ -222,6 +262,11 @@ fn a_narrow_expected_stack_network_matches_its_golden_vectors() {
 #[test]
 fn a_narrow_network_that_refines_its_stack_matches_its_golden_vectors() {
     check("expected-stack-narrow-refined.safetensors");
+}
+
+#[test]
+fn a_narrow_focal_stack_network_matches_its_golden_vectors() {
+    check_focal_stack("focal-stack-narrow.safetensors");
 }
 
 #[test]

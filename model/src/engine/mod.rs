@@ -16,8 +16,9 @@ use std::time::Duration;
 use holod_calibration::{PupilDiameter, Resolution};
 
 use crate::gpu::GpuError;
+use crate::weights::Architecture;
 
-pub use cpu::{CpuEngine, fma_peak, stream_bandwidth};
+pub use cpu::{CpuEngine, FocalStackEngine, fma_peak, stream_bandwidth};
 #[cfg(feature = "gpu-cost")]
 pub use gpu::cost as gpu_cost;
 #[cfg(feature = "gpu")]
@@ -26,6 +27,9 @@ pub use gpu::{EncodedCounts, GpuEngine};
 /// The widest pupil that engines take. No eye's is half as wide; but scenes of wider ones on one bench stand for those
 /// of eyes on another, whose pixels are finer.
 pub const WIDEST_PUPIL: PupilDiameter = PupilDiameter::from_mm(20.0);
+
+/// Focuses no farther apart are one.
+pub(crate) const SAME_FOCUS_DPT: f64 = 1e-3;
 
 /// A frame that an engine refuses.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -43,9 +47,42 @@ pub enum EngineError {
     /// The pupil is not a positive length, or wider than [`WIDEST_PUPIL`].
     #[error("pupil diameter {pupil_mm} mm; expected a positive number up to {widest_mm}", widest_mm = WIDEST_PUPIL.mm())]
     Pupil { pupil_mm: f32 },
+    /// The weights are for an engine of other input.
+    #[error("weights of a `{found}` network: it takes {takes}; {remedy}")]
+    Family { found: Architecture, takes: &'static str, remedy: &'static str },
+    /// A focal stack has other images than the network takes.
+    #[error(
+        "found {}; the network takes {}: render the scene so, or train for these (`planes`)",
+        at_focuses(found),
+        at_focuses(expected)
+    )]
+    Focuses { found: Vec<f64>, expected: Vec<f64> },
     /// The device cannot do it, or failed at it.
     #[error(transparent)]
     Gpu(#[from] GpuError),
+}
+
+impl EngineError {
+    fn takes_focal_stacks() -> Self {
+        Self::Family {
+            found: Architecture::FocalStack,
+            takes: "images that are focused at several depths, not a picture and its depth",
+            remedy: "hand them over with `holod render --focal-stack`, or take other weights",
+        }
+    }
+
+    fn takes_frames(found: Architecture) -> Self {
+        Self::Family {
+            found,
+            takes: "a picture and its depth, not a focal stack",
+            remedy: "name the weights of a `focal-stack` network, or the scene",
+        }
+    }
+}
+
+fn at_focuses(focus_dpt: &[f64]) -> String {
+    let focuses: Vec<String> = focus_dpt.iter().map(|focus_dpt| format!("{focus_dpt:.3}")).collect();
+    format!("{} images focused at {} dpt", focuses.len(), focuses.join(", "))
 }
 
 /// Refuses what is no pupil.

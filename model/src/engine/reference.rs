@@ -9,6 +9,7 @@ use num_complex::Complex64;
 
 use crate::RgbdFrame;
 use crate::conditions::Conditions;
+use crate::scene::FocalStack;
 use crate::weights::{Adjustable, Dense, Family, Grid, Layer, NetworkConfig, Weights};
 
 #[derive(Clone, Debug)]
@@ -97,24 +98,89 @@ pub(crate) fn run(weights: &Weights, bench: &DisplayGeometry, frame: &RgbdFrame,
         Family::ExpectedStack { lighting, correction, feedback } => {
             let maps = encode_for_light(frame, conditions);
             let wanted = expected_stack(weights, bench, frame, [maps.height, maps.width], pupil_mm).map(f64::sqrt);
-            let maps = concatenate(&[&maps, &wanted.clone().map(|amplitude| amplitude - 0.4)]);
-            let out = trunk(&mut stages, "lighting.", lighting, weights, maps.clone(), conditions);
-            let wanted = if weights.config.refined_stack { refined(weights, &out, wanted) } else { wanted };
-            let carried = light_layers(weights, bench, &out, &wanted);
-            stages.push(Stage { name: "carried".into(), value: Value::Light(carried.clone()) });
-            let sharpness = f64::from(feedback.sharpness);
-            let (change, lack) = feed_back(weights, bench, frame, &carried, &wanted, sharpness, pupil_mm);
-            let field: Vec<_> = carried.iter().zip(&change).map(|(f, c)| f + c * f64::from(feedback.share)).collect();
-            let [real, imaginary] = parts(&field, &maps);
-            let [change_real, change_imaginary] = parts(&change, &maps);
-            let encoded = concatenate(&[&real, &imaginary, &maps, &change_real, &change_imaginary, &lack]);
-            let residual = trunk(&mut stages, "correction.", correction, weights, encoded, conditions);
-            add(&field, &residual, 0.3)
+            let told = concatenate(&[&maps, &wanted.clone().map(|amplitude| amplitude - 0.4)]);
+            let positions_m: Vec<f64> =
+                (0..weights.config.depth_layers).map(|layer| centre_m(weights, bench, layer)).collect();
+            let nets = Nets { lighting, correction, share: feedback.share };
+            let weight = |plane: usize, index: usize| {
+                1.0 + f64::from(feedback.sharpness) * cover(weights, frame, maps.width, index, plane)
+            };
+            lit_planes(&mut stages, &nets, weights, bench, &positions_m, [&told, &wanted], pupil, weight)
         }
+        Family::FocalStack { .. } => panic!("it is told images: see `run_focal_stack`"),
     };
     let scale = scale_of(weights.config.grid);
     let (rows, columns) = (frame.resolution.height.div_ceil(scale), frame.resolution.width.div_ceil(scale));
     Trace { stages, field: onto_panel(weights.config.grid, frame.resolution, &low, [rows, columns]) }
+}
+
+/// The same of a `focal-stack` network.
+pub(crate) fn run_focal_stack(weights: &Weights, bench: &DisplayGeometry, focal: &FocalStack) -> Trace {
+    let Family::FocalStack { lighting, correction, feedback_share } = &weights.family else {
+        panic!("it is told a frame: see `run`")
+    };
+    let Resolution { width, height } = focal.resolution;
+    let (rows, columns, planes) = (height.div_ceil(2), width.div_ceil(2), focal.focuses.len());
+    let at =
+        |image: usize, y: usize, x: usize| sample(&focal.amplitude[image * width * height..], focal.resolution, y, x);
+    let wanted = Map::from_fn([3 * planes, rows, columns], |image, y, x| {
+        let corners = [(0, 0), (0, 1), (1, 0), (1, 1)];
+        (corners.iter().map(|(dy, dx)| at(image, 2 * y + dy, 2 * x + dx).powi(2)).sum::<f64>() / 4.0).sqrt()
+    });
+    let conditions = Conditions::of(&weights.config.trained, bench, focal.pupil);
+    let told = Map::from_fn([12 * planes + 2, rows, columns], |channel, y, x| {
+        let (image, corner) = (channel / 4, channel % 4);
+        match channel.checked_sub(12 * planes) {
+            None => at(image, 2 * y + corner / 2, 2 * x + corner % 2) - 0.4,
+            Some(condition) => conditions.told()[condition],
+        }
+    });
+    let positions_m: Vec<f64> = (0..planes)
+        .map(|plane| {
+            let share = plane as f64 / (planes - 1) as f64;
+            let dioptres = bench.depth_far.0 + share * (bench.depth_near.0 - bench.depth_far.0);
+            bench.eyepiece_focal_length.0.powi(2) * dioptres
+        })
+        .collect();
+    let mut stages = Vec::new();
+    let nets = Nets { lighting, correction, share: *feedback_share };
+    let weight = |_, _| 1.0;
+    let low = lit_planes(&mut stages, &nets, weights, bench, &positions_m, [&told, &wanted], focal.pupil, weight);
+    Trace { stages, field: onto_panel(Grid::HalfBand, focal.resolution, &low, [rows, columns]) }
+}
+
+/// The layers of a network that lights planes, and the share of the change that the field takes.
+struct Nets<'a> {
+    lighting: &'a [Layer],
+    correction: &'a [Layer],
+    share: f32,
+}
+
+/// The field of a network that lights planes at `positions_m`: both nets are `told` the one map and the other amplitudes
+/// are `wanted` there; each change has the `weight` of a plane and a sample.
+#[allow(clippy::too_many_arguments, reason = "written out as plainly as it can be")]
+fn lit_planes(
+    stages: &mut Vec<Stage>,
+    nets: &Nets<'_>,
+    weights: &Weights,
+    bench: &DisplayGeometry,
+    positions_m: &[f64],
+    [told, wanted]: [&Map; 2],
+    pupil: PupilDiameter,
+    weight: impl Fn(usize, usize) -> f64,
+) -> Vec<Complex64> {
+    let conditions = Conditions::of(&weights.config.trained, bench, pupil);
+    let out = trunk(stages, "lighting.", nets.lighting, weights, told.clone(), conditions);
+    let wanted = if weights.config.refined_stack { refined(weights, &out, wanted.clone()) } else { wanted.clone() };
+    let carried = light_planes(bench, positions_m, &out, &wanted);
+    stages.push(Stage { name: "carried".into(), value: Value::Light(carried.clone()) });
+    let (change, lack) = feed_back(bench, positions_m, &carried, &wanted, weight, pupil.mm().into());
+    let field: Vec<_> = carried.iter().zip(&change).map(|(f, c)| f + c * f64::from(nets.share)).collect();
+    let [real, imaginary] = parts(&field, told);
+    let [change_real, change_imaginary] = parts(&change, told);
+    let encoded = concatenate(&[&real, &imaginary, told, &change_real, &change_imaginary, &lack]);
+    let residual = trunk(stages, "correction.", nets.correction, weights, encoded, conditions);
+    add(&field, &residual, 0.3)
 }
 
 /// Runs a stack of layers; its stages are added to `stages`, the last layer's map is returned.
@@ -369,42 +435,41 @@ fn refined(weights: &Weights, out: &Map, wanted: Map) -> Map {
     Map { values, ..wanted }
 }
 
-/// The field at the SLM plane when the wanted amplitudes light the depth layers through the first net's masks, with its
+/// The field at the SLM plane when the wanted amplitudes light planes at `positions_m` through the first net's masks, with its
 /// phases.
-fn light_layers(weights: &Weights, bench: &DisplayGeometry, out: &Map, wanted: &Map) -> Vec<Complex64> {
-    let (count, size, pixels) = (weights.config.depth_layers, [out.height, out.width], out.height * out.width);
+fn light_planes(bench: &DisplayGeometry, positions_m: &[f64], out: &Map, wanted: &Map) -> Vec<Complex64> {
+    let (count, size, pixels) = (positions_m.len(), [out.height, out.width], out.height * out.width);
     let offset = ((count - 1) as f64).ln();
     let mut field = vec![Complex64::ZERO; 3 * pixels];
-    for (layer, colour) in (0..count).flat_map(|layer| (0..3).map(move |colour| (layer, colour))) {
+    for (number, colour) in (0..count).flat_map(|plane| (0..3).map(move |colour| (plane, colour))) {
         let plane = |map: &Map, channel: usize| map.values[channel * pixels..][..pixels].to_vec();
-        let (phase, mask) = (plane(out, 4 * layer + colour), plane(out, 4 * layer + 3));
+        let (phase, mask) = (plane(out, 4 * number + colour), plane(out, 4 * number + 3));
         let light =
-            plane(wanted, 3 * layer + colour).into_iter().zip(phase).zip(mask).map(|((wanted, phase), mask)| {
+            plane(wanted, 3 * number + colour).into_iter().zip(phase).zip(mask).map(|((wanted, phase), mask)| {
                 Complex64::from_polar(wanted, PI * phase) / (1.0 + (offset - mask).exp())
             });
-        let u_m = centre_m(weights, bench, layer);
+        let u_m = positions_m[number];
         let carried = filtered(&light.collect::<Vec<_>>(), size, |fx, fy| transfer(bench, colour, -u_m, [fx, fy]));
         field[colour * pixels..].iter_mut().zip(carried).for_each(|(sum, value)| *sum += value);
     }
     field
 }
 
-/// The mean over the depth layers of the changes of the field at the SLM plane that would give an eye what it lacks of
+/// The mean over the planes of the changes of the field at the SLM plane that would give an eye what it lacks of
 /// the wanted amplitudes there, and these lacks.
 fn feed_back(
-    weights: &Weights,
     bench: &DisplayGeometry,
-    frame: &RgbdFrame,
+    positions_m: &[f64],
     carried: &[Complex64],
     wanted: &Map,
-    sharpness: f64,
+    weight: impl Fn(usize, usize) -> f64,
     pupil_mm: f64,
 ) -> (Vec<Complex64>, Map) {
-    let (NetworkConfig { depth_layers: count, .. }, size) = (&weights.config, [wanted.height, wanted.width]);
+    let (count, size) = (positions_m.len(), [wanted.height, wanted.width]);
     let pixels = wanted.height * wanted.width;
     let mut change = vec![Complex64::ZERO; carried.len()];
     let mut lack = wanted.clone();
-    for (layer, colour) in (0..*count).flat_map(|layer| (0..3).map(move |colour| (layer, colour))) {
+    for (number, colour) in (0..count).flat_map(|number| (0..3).map(move |colour| (number, colour))) {
         let plane = colour * pixels..(colour + 1) * pixels;
         let per_mm = 1e-3 / (bench.wavelengths.0[colour].0 * bench.eyepiece_focal_length.0);
         let through = |field: &[Complex64], u_m: f64| {
@@ -413,17 +478,16 @@ fn feed_back(
                 if per_m < 0.5 * pupil_mm * per_mm { transfer(bench, colour, u_m, [fx, fy]) } else { Complex64::ZERO }
             })
         };
-        let u_m = centre_m(weights, bench, layer);
+        let u_m = positions_m[number];
         let mut arriving = through(&carried[plane.clone()], u_m);
-        let lack = &mut lack.values[(3 * layer + colour) * pixels..][..pixels];
+        let lack = &mut lack.values[(3 * number + colour) * pixels..][..pixels];
         for (index, (arriving, lack)) in arriving.iter_mut().zip(lack).enumerate() {
             let amplitude = (arriving.norm_sqr() + 1e-6).sqrt();
             *lack -= amplitude;
-            let weight = 1.0 + sharpness * cover(weights, frame, wanted.width, index, layer);
-            *arriving *= weight * *lack / amplitude;
+            *arriving *= weight(number, index) * *lack / amplitude;
         }
         for (change, back) in change[plane].iter_mut().zip(through(&arriving, -u_m)) {
-            *change += back / *count as f64;
+            *change += back / count as f64;
         }
     }
     (change, lack)

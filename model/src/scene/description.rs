@@ -145,24 +145,41 @@ fn single_file(path: &Path) -> Result<(), SceneError> {
 }
 
 fn read_scene_file(path: &Path) -> Result<Description, SceneError> {
-    let read_error = |source| SceneError::Read { path: path.to_owned(), source, expected: "a scene.toml" };
+    parse(path, &read_text(path, "a scene.toml of at most 1 MiB")?)
+}
+
+/// The text of a file that describes pictures.
+pub(super) fn read_text(path: &Path, expected: &'static str) -> Result<String, SceneError> {
+    let read_error = |source| SceneError::Read { path: path.to_owned(), source, expected };
     let metadata = std::fs::metadata(path).map_err(read_error)?;
     if !metadata.is_file() || metadata.len() > LARGEST_FILE_BYTES {
         let found = if metadata.is_file() { format!("{} bytes", metadata.len()) } else { "no regular file".into() };
-        return Err(SceneError::Kind { path: path.to_owned(), found, expected: "a scene.toml of at most 1 MiB" });
+        return Err(SceneError::Kind { path: path.to_owned(), found, expected });
     }
-    let text = std::fs::read_to_string(path).map_err(read_error)?;
-    parse(path, &text)
+    std::fs::read_to_string(path).map_err(read_error)
 }
 
-fn parse(path: &Path, text: &str) -> Result<Description, SceneError> {
-    let error_at = |offset: usize, key: &str, found: String, expected: &str| SceneError::Description {
+/// What is wrong at `offset` of the text of such a file.
+pub(super) fn line_error(
+    path: &Path,
+    text: &str,
+    offset: usize,
+    key: &str,
+    found: String,
+    expected: &str,
+) -> SceneError {
+    SceneError::Description {
         path: path.to_owned(),
         line: text[..offset.min(text.len())].matches('\n').count() + 1,
         key: key.into(),
         found,
         expected: expected.into(),
-    };
+    }
+}
+
+fn parse(path: &Path, text: &str) -> Result<Description, SceneError> {
+    let error_at =
+        |offset: usize, key: &str, found: String, expected: &str| line_error(path, text, offset, key, found, expected);
     let file: SceneFile = toml::from_str(text).map_err(|error| {
         let span = error.span().unwrap_or_default();
         let key = text.get(span.clone()).filter(|key| !key.is_empty() && key.len() < 60 && !key.contains('\n'));

@@ -30,7 +30,7 @@ pub struct NetworkConfig {
     pub version: u32,
     /// The grid on which the network predicts.
     pub grid: Grid,
-    /// 3x3 layers of `direct`'s net or of `expected-stack`'s first: the first, pairs of body layers, the last.
+    /// 3x3 layers of `direct`'s net or of the other families' first: the first, pairs of body layers, the last.
     pub layers: usize,
     /// Feature channels of the body.
     pub channels: usize,
@@ -47,13 +47,19 @@ pub struct NetworkConfig {
     /// `expected-stack`: into how many layers, equal in dioptres, the depth volume is divided.
     #[serde(default = "default_depth_layers", skip_serializing_if = "is_default_depth_layers")]
     pub depth_layers: usize,
-    /// `expected-stack`: 3x3 layers of the net that corrects what arrives at the SLM plane.
+    /// 3x3 layers of the net that corrects what arrives at the SLM plane, where there is one.
     #[serde(default = "default_correction_layers", skip_serializing_if = "is_default_correction_layers")]
     pub correction_layers: usize,
     /// `expected-stack`: whether the first net also corrects the expected images before they light the layers and are
     /// asked for by the feedback. Both nets are told them uncorrected.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub refined_stack: bool,
+    /// `focal-stack`: how many images, equally far apart in dioptres from one end of the depth range to the other.
+    #[serde(default = "default_planes", skip_serializing_if = "is_default_planes")]
+    pub planes: usize,
+    /// `focal-stack`: whether what the field lacks of the images is fed back and corrected; only such networks are run.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub feedback: bool,
 }
 
 // The trainer leaves out what has its default, so that files of older networks stay as they are.
@@ -73,6 +79,14 @@ fn is_default_correction_layers(count: &usize) -> bool {
     *count == default_correction_layers()
 }
 
+pub(super) const fn default_planes() -> usize {
+    6
+}
+
+fn is_default_planes(count: &usize) -> bool {
+    *count == default_planes()
+}
+
 /// How a network comes to the field at the SLM plane.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -82,6 +96,8 @@ pub enum Architecture {
     /// Light on every depth layer for what an eye should see there, carried by physics, what that lacks fed back, and a
     /// residual.
     ExpectedStack,
+    /// The same with true images, each focused at its plane, in place of what is expected, and without depth.
+    FocalStack,
 }
 
 impl fmt::Display for Architecture {
@@ -89,6 +105,7 @@ impl fmt::Display for Architecture {
         f.write_str(match self {
             Self::Direct => "direct",
             Self::ExpectedStack => "expected-stack",
+            Self::FocalStack => "focal-stack",
         })
     }
 }
@@ -108,7 +125,7 @@ impl NetworkConfig {
     pub fn layer_count(&self) -> usize {
         match self.architecture {
             Architecture::Direct => self.layers,
-            Architecture::ExpectedStack => self.layers + self.correction_layers,
+            Architecture::ExpectedStack | Architecture::FocalStack => self.layers + self.correction_layers,
         }
     }
 

@@ -1,11 +1,11 @@
 //! The layers that weights hold, and how a family stacks them.
 
-use super::config::{Architecture, NetworkConfig, OUTPUT_CHANNELS};
+use super::config::{Architecture, CONDITIONS, LIT, NetworkConfig, OUTPUT_CHANNELS};
 
 /// Offsets that an adjustable layer predicts for each pixel: (dy, dx) of nine taps.
 pub(crate) const OFFSET_CHANNELS: usize = 18;
 
-/// The names of the tensors of [`Feedback`].
+/// The names of the tensors of [`Feedback`]; a `focal-stack` has the first alone.
 pub(super) const FEEDBACK_SHARE: &str = "feedback_share";
 pub(super) const SHARPNESS: &str = "sharpness";
 
@@ -14,9 +14,10 @@ pub(super) const SHARPNESS: &str = "sharpness";
 pub(crate) enum Family {
     Direct { layers: Vec<Layer> },
     ExpectedStack { lighting: Vec<Layer>, correction: Vec<Layer>, feedback: Feedback },
+    FocalStack { lighting: Vec<Layer>, correction: Vec<Layer>, feedback_share: f32 },
 }
 
-/// How what is lacking is fed back to the field of `expected-stack`.
+/// How what is lacking is fed back to the field.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Feedback {
     /// The share of the change that would give what is lacking which the field takes.
@@ -69,6 +70,17 @@ impl Family {
                         &[],
                     )?,
                     feedback: Feedback { share: number(FEEDBACK_SHARE)?, sharpness: number(SHARPNESS)? },
+                }
+            }
+            Architecture::FocalStack => {
+                let images = 3 * config.planes;
+                // Each image four times after the unshuffle.
+                let told = 4 * images + CONDITIONS;
+                let (lights, corrects) = (LIT * config.planes, 2 * OUTPUT_CHANNELS + told + images);
+                Self::FocalStack {
+                    lighting: stack_of("lighting", told, lights, config.layers, adjustable)?,
+                    correction: stack_of("correction", corrects, OUTPUT_CHANNELS, config.correction_layers, &[])?,
+                    feedback_share: number(FEEDBACK_SHARE)?,
                 }
             }
         })

@@ -50,7 +50,7 @@ impl Metadata<'_> {
         let require = |holds: bool, key: &str, found: String, expected: &str| {
             if holds { Ok(()) } else { Err(self.error(&format!("config.{key}"), found, expected)) }
         };
-        let NetworkConfig { version, layers, channels, correction_layers, depth_layers, .. } = config;
+        let NetworkConfig { version, layers, channels, correction_layers, depth_layers, planes, .. } = config;
         require(*version == VERSION, "version", version.to_string(), &VERSION.to_string())?;
         for (key, layers) in [("layers", layers), ("correction_layers", correction_layers)] {
             require(
@@ -77,6 +77,23 @@ impl Metadata<'_> {
             "refined_stack",
             "true".into(),
             "false; only `expected-stack` can have it",
+        )?;
+        require(
+            (2..=MOST_DEPTH_LAYERS).contains(planes),
+            "planes",
+            planes.to_string(),
+            &format!("2 to {MOST_DEPTH_LAYERS}"),
+        )?;
+        let is_focal_stack = config.architecture == Architecture::FocalStack;
+        require(
+            config.feedback == is_focal_stack,
+            "feedback",
+            config.feedback.to_string(),
+            if is_focal_stack {
+                "true: a `focal-stack` without it is not run; train `--variant focal-stack-feedback`"
+            } else {
+                "false; only `focal-stack` can have it"
+            },
         )?;
         require((1..=256).contains(channels), "channels", channels.to_string(), "1 to 256")?;
         let adjustable = &config.adjustable_layers;

@@ -7,7 +7,7 @@ use rand::RngExt;
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
 
-use super::config::{default_correction_layers, default_depth_layers};
+use super::config::{default_correction_layers, default_depth_layers, default_planes};
 use super::error::{FORMAT, OLD_FORMAT};
 use super::layers::{FEEDBACK_SHARE, LayerShape, SHARPNESS};
 use super::metadata::VERSION;
@@ -51,7 +51,7 @@ pub(crate) fn random_weights(config: NetworkConfig, seed: u64) -> Weights {
 fn tensors(weights: &Weights) -> Vec<(String, Vec<usize>, Vec<f32>)> {
     let stacks = match &weights.family {
         Family::Direct { layers } => vec![("layers", layers)],
-        Family::ExpectedStack { lighting, correction, .. } => {
+        Family::ExpectedStack { lighting, correction, .. } | Family::FocalStack { lighting, correction, .. } => {
             vec![("lighting", lighting), ("correction", correction)]
         }
     };
@@ -79,6 +79,9 @@ fn tensors(weights: &Weights) -> Vec<(String, Vec<usize>, Vec<f32>)> {
         tensors.push((FEEDBACK_SHARE.into(), vec![1], vec![share]));
         tensors.push((SHARPNESS.into(), vec![1], vec![sharpness]));
     }
+    if let Family::FocalStack { feedback_share, .. } = weights.family {
+        tensors.push((FEEDBACK_SHARE.into(), vec![1], vec![feedback_share]));
+    }
     tensors
 }
 
@@ -101,11 +104,23 @@ pub(crate) fn config() -> NetworkConfig {
         depth_layers: default_depth_layers(),
         correction_layers: default_correction_layers(),
         refined_stack: false,
+        planes: default_planes(),
+        feedback: false,
     }
 }
 
 pub(crate) fn expected_stack_config() -> NetworkConfig {
     NetworkConfig { architecture: Architecture::ExpectedStack, depth_layers: 5, correction_layers: 4, ..config() }
+}
+
+pub(crate) fn focal_stack_config() -> NetworkConfig {
+    NetworkConfig {
+        architecture: Architecture::FocalStack,
+        correction_layers: 4,
+        planes: 3,
+        feedback: true,
+        ..config()
+    }
 }
 
 /// A file with small random weights, after `change` has changed it.
@@ -147,7 +162,7 @@ fn a_file_round_trips() {
     let expected = random_weights(config(), 1);
     assert_eq!((&weights.config, &weights.family), (&expected.config, &expected.family));
     let refined = NetworkConfig { refined_stack: true, ..expected_stack_config() };
-    for other in [expected_stack_config(), refined] {
+    for other in [expected_stack_config(), refined, focal_stack_config()] {
         let read = Weights::from_bytes(&file_of(other.clone(), |_, _| {}), "test").unwrap();
         assert_eq!((&read.config, &read.family), (&other, &random_weights(other.clone(), 1).family));
     }
@@ -264,6 +279,11 @@ fn faulty_metadata_is_named() {
     assert_mentions(&configured(&|c| c.depth_layers = 1), &["config.depth_layers", "1"]);
     assert_mentions(&configured(&|c| c.depth_layers = 65), &["config.depth_layers", "65", "2 to 64"]);
     assert_mentions(&configured(&|c| c.refined_stack = true), &["config.refined_stack", "true", "`expected-stack`"]);
+    assert_mentions(&configured(&|c| c.planes = 1), &["config.planes", "1", "2 to 64"]);
+    assert_mentions(&configured(&|c| c.feedback = true), &["config.feedback", "true", "only `focal-stack`"]);
+    let without = file_of(NetworkConfig { feedback: false, ..focal_stack_config() }, |_, _| {});
+    let without = Weights::from_bytes(&without, "test").unwrap_err().to_string();
+    assert_mentions(&without, &["config.feedback", "false", "`--variant focal-stack-feedback`"]);
     assert_mentions(&configured(&|c| c.version = 7), &["config.version", "7"]);
     assert_mentions(&configured(&|c| c.layers = 5), &["config.layers", "5", "even"]);
     assert_mentions(&configured(&|c| c.channels = 100_000), &["config.channels", "100000"]);

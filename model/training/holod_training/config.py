@@ -11,8 +11,8 @@ from typing import Any
 
 WEIGHTS_FORMAT = "holod-weights-2"
 ARCHITECTURES = ("direct", "layered", "expected-stack", "focal-stack")
-# Those of them that the engines run.
-ENGINE_ARCHITECTURES = ("direct", "expected-stack")
+# Those of them that the engines run; a `focal-stack` with feedback.
+ENGINE_ARCHITECTURES = ("direct", "expected-stack", "focal-stack")
 CONDITIONINGS = ("adjustable", "deformable", "modulated")
 
 

@@ -85,8 +85,14 @@ def load_weights(path: Path) -> FieldNetwork:
 def check_engines_run(config: NetworkConfig, source: Path) -> None:
     """Raises WeightsError for a network of a family that no engine runs."""
     if config.architecture not in ENGINE_ARCHITECTURES:
-        known = " and ".join(f"`{name}`" for name in ENGINE_ARCHITECTURES)
+        *first, last = (f"`{name}`" for name in ENGINE_ARCHITECTURES)
+        known = f"{', '.join(first)} and {last}"
         raise WeightsError(f"{source}: found a `{config.architecture}` network; the engines run {known} networks only")
+    if config.architecture == "focal-stack" and not config.feedback:
+        raise WeightsError(
+            f"{source}: found a `focal-stack` network without feedback; the engines run those with it: train "
+            "`--variant focal-stack-feedback`"
+        )
 
 
 def export(

@@ -18,6 +18,7 @@ from holod_training.network import (
     constant_maps,
     corrected,
     first_net,
+    run_traced,
     second_net,
 )
 from holod_training.optics import frequencies, transfer
@@ -120,17 +121,22 @@ class FedBackFocalStackNetwork(FieldNetwork):
         self.correction = second_net(config, 2 * OUTPUT_CHANNELS + maps + images)
         self.feedback_share = nn.Parameter(torch.tensor([FEEDBACK_SHARE]))
 
-    def forward(self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor) -> Tensor:
-        """amplitude [N, planes, 3, H, W] from `focal_amplitudes`; depth is not looked at."""
+    def forward(
+        self, amplitude: Tensor, depth: Tensor, pupil_mm: Tensor, trace: dict[str, Tensor] | None = None
+    ) -> Tensor:
+        """amplitude [N, planes, 3, H, W] from `focal_amplitudes`; depth is not looked at. `trace`, where given,
+        receives what each stage puts out, as that of `expected-stack` does."""
         optics, told = self.optics, self.told(pupil_mm)
         images = checked(amplitude, self.config).flatten(1, 2)
         maps = with_conditions(F.pixel_unshuffle(images, self.scale) - 0.4, told, self.config)
         wanted = F.avg_pool2d(images.square(), self.scale).sqrt().unflatten(1, (-1, 3))
         distances_m = tuple(optics.distance_m(d) for d in planes_dpt(self.config, optics))
-        out = self.lighting(maps, told).to(amplitude.dtype)
+        out = run_traced("lighting", self.lighting, maps, told, trace)
         field = light_planes(out, wanted, optics, distances_m, self.scale)
+        if trace is not None:
+            trace["carried"] = field
         lack, change = feed_back(field, wanted, 1.0, pupil_mm, optics, distances_m, self.scale)
         field = field + self.feedback_share * change
         seen = torch.cat((field.real, field.imag, maps, change.real, change.imag, lack.flatten(1, 2)), dim=1)
-        residual = self.correction(seen, told).to(amplitude.dtype)
+        residual = run_traced("correction", self.correction, seen, told, trace)
         return corrected(field, residual)

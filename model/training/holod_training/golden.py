@@ -77,6 +77,23 @@ NARROW: dict[str, Narrow] = {
         16,
         24,
     ),
+    # Another bench here, too.
+    "focal-stack-narrow": Narrow(
+        NetworkConfig(
+            architecture="focal-stack",
+            layers=4,
+            channels=4,
+            adjustable_layers=(2,),
+            modulation_hidden=8,
+            correction_layers=4,
+            planes=3,
+            feedback=True,
+        ),
+        16,
+        24,
+        pupil_mm=1.6,
+        optics=OpticsConfig((633.0, 532.0, 473.0), 4.5, 32.0, 0.5, 3.25),
+    ),
 }
 
 
@@ -111,6 +128,11 @@ def scene(height: int, width: int, seed: int) -> tuple[Tensor, Tensor]:
     return light.sqrt(), depth
 
 
+def focal_images(planes: int, height: int, width: int, seed: int) -> Tensor:
+    """Amplitudes [planes, 3, H, W]: another scene's at each focus, so that none can stand for another."""
+    return torch.stack([scene(height, width, seed + 1 + plane)[0].roll(5 * plane, dims=-1) for plane in range(planes)])
+
+
 def complex_parts(field: Tensor) -> Tensor:
     """Complex [...] -> [2, ...]: real, imaginary."""
     return torch.stack((field.real, field.imag))
@@ -130,7 +152,8 @@ def told_layers(config: NetworkConfig) -> set[str]:
 def vectors(
     network: FieldNetwork, amplitude: Tensor, depth: Tensor, pupil_mm: float, every_layer: bool = True
 ) -> dict[str, Tensor]:
-    """Every stage's answer, float64; without `every_layer` only the maps of `told_layers`."""
+    """Every stage's answer, float64; without `every_layer` only the maps of `told_layers`. `amplitude` [3, H, W], or
+    [planes, 3, H, W] for a `focal-stack`, which does not look at `depth` [H, W]."""
     config = network.config
     height, width = depth.shape
     trace: dict[str, Tensor] = {}
@@ -179,6 +202,8 @@ def write_golden(
         provenance = {"script": "python -m holod_training golden", "seed": seed}
         save_weights(weights, narrow_network(config, seed), {}, provenance)
         amplitude, depth = scene(height, width, seed)
+        if config.architecture == "focal-stack":
+            amplitude = focal_images(config.planes, height, width, seed)
         result = vectors(load_weights(weights).double().on(optics), amplitude, depth, pupil_mm)
         about = {"seed": seed, "weights": weights.name, "optics": dataclasses.asdict(optics)}
         write_vectors(out / f"{name}.safetensors", result, about)

@@ -350,16 +350,29 @@ def test_export_stamps_the_constant_and_the_evaluation(evaluation: Path) -> None
     assert main(["export", *arguments, *judged, "nobody"]) == 65
 
 
-@pytest.mark.parametrize("name", ["focal-stack", "half-band-layered-small"])
-def test_networks_that_no_engine_runs_are_not_exported(name: str, tmp_path: Path, capsys) -> None:
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("focal-stack", "`focal-stack` network without feedback; the engines run those with it"),
+        (
+            "half-band-layered-small",
+            "found a `layered` network; the engines run `direct`, `expected-stack` and `focal-stack` networks only",
+        ),
+    ],
+)
+def test_networks_that_no_engine_runs_are_not_exported(name: str, told: str, tmp_path: Path, capsys) -> None:
     source, out = tmp_path / "w.safetensors", tmp_path / "out.safetensors"
     save_weights(source, build_network(variant(name)), {}, {})
     assert main(["export", "--source", str(source), "--out", str(out)]) == 65
-    found = (
-        f"found a `{variant(name).architecture}` network; the engines run `direct` and `expected-stack` networks only"
-    )
-    assert found in capsys.readouterr().err
+    assert told in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_focal_stack_with_feedback_is_exported(tmp_path: Path) -> None:
+    source, out = tmp_path / "w.safetensors", tmp_path / "out.safetensors"
+    save_weights(source, build_network(variant("focal-stack-feedback")), {}, {})
+    assert main(["export", "--source", str(source), "--out", str(out)]) == 0
+    assert read_metadata(out)["config"].planes == 6
 
 
 def test_card_areas_leave_out_border_and_seam() -> None:

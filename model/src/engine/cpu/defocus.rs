@@ -95,7 +95,7 @@ impl Defocus {
         let Self { size, present, seen, fft, .. } = self;
         let (width, pixels) = (size.width, frame.resolution.pixels());
         let present = &mut present[usize::from(layer)];
-        *present = layers.cover(layer).any(|cover| cover > 0.0);
+        *present = layers.has_any_in(layer);
         if !*present {
             return;
         }

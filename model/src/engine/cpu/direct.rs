@@ -7,9 +7,10 @@ use rayon::prelude::*;
 use super::blocks::{Blocks, grid_size, scale_of};
 use super::feature_map::FeatureMap;
 use super::field::{Field, UncorrectedField};
-use super::stage::{Buffers, Job, MapId, Maps, Stage, frame_bytes, plane_bytes};
+use super::stage::{Buffers, Job, MapId, Maps, Shared, Stage, frame_bytes, plane_bytes};
 use super::stage_list::StageList;
 use super::trunk::Trunk;
+use crate::RgbdFrame;
 use crate::simd::InstructionSet;
 use crate::weights::{CONDITIONS, Layer, NetworkConfig};
 
@@ -40,6 +41,10 @@ pub(super) struct BlockMeans {
     amplitude: Vec<f32>,
 }
 
+impl Shared for BlockMeans {
+    type Input = RgbdFrame;
+}
+
 /// Writes the first layer's input, and the amplitude to which the last layer's output is a residual.
 struct Encode {
     bytes: u64,
@@ -57,8 +62,8 @@ impl Stage<BlockMeans> for Encode {
         self.bytes
     }
 
-    fn run(&mut self, buffers: &mut Buffers<BlockMeans>, job: &mut Job<'_>) {
-        let (input, Job { frame, conditions, .. }) = (&mut buffers.maps[self.input], job);
+    fn run(&mut self, buffers: &mut Buffers<BlockMeans>, job: &mut Job<'_, RgbdFrame>) {
+        let (input, Job { input: frame, conditions, .. }) = (&mut buffers.maps[self.input], job);
         let (told, blur_scale) = (conditions.told().map(|value| value as f32), conditions.blur_scale() as f32);
         let (pixels, block) = (frame.resolution.pixels(), self.scale * self.scale);
         let blocks = Blocks { frame: frame.resolution, scale: self.scale };
@@ -88,7 +93,7 @@ impl Stage<BlockMeans> for Encode {
     }
 
     #[cfg(test)]
-    fn seen<'a>(&'a self, buffers: &'a Buffers<BlockMeans>, _: &'a Job<'_>) -> super::stage::Seen<'a> {
+    fn seen<'a>(&'a self, buffers: &'a Buffers<BlockMeans>, _: &'a Job<'_, RgbdFrame>) -> super::stage::Seen<'a> {
         super::stage::Seen::Map(&buffers.maps[self.input], None)
     }
 }

@@ -1,39 +1,35 @@
-//! What an eye lacks when it focuses on each depth layer, fed back to the field at the SLM plane.
+//! What an eye lacks when it focuses on each plane, fed back to the field at the SLM plane.
 
-use holod_calibration::{Colour, DisplayGeometry, Metres, Resolution};
+use holod_calibration::{Colour, DisplayGeometry, Resolution};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
-use super::depth_layers::DepthLayers;
 use super::input_features::sample_pitch;
+use super::plane_light::{PlaneLight, PlanePositions};
 use crate::engine::constants::FEEDBACK_DARK_POWER;
 use crate::optics::{signed_bin, transfer_table};
-use crate::weights::{Feedback, NetworkConfig};
 
-/// One step of Gerchberg and Saxton (1972) at all depth layers at once: the field goes through the pupil to every
-/// layer, takes the wanted amplitude there with the phase that it has, and the mean of these changes comes back, in
-/// which what is in focus weighs more. The layers change one another too; the second net mends that. Nothing is
-/// allocated after `new`.
-pub(super) struct LayerFeedback {
-    parameters: Feedback,
+/// One step of Gerchberg and Saxton (1972) at all planes at once: the field goes through the pupil to every plane, takes
+/// the wanted amplitude there with the phase that it has, and the mean of these changes comes back, each with its
+/// weight. The planes change one another too; the second net mends that. Nothing is allocated after `new`.
+pub(super) struct PlaneFeedback {
+    /// The share of the change that the field takes.
+    share: f32,
     bench: DisplayGeometry,
     size: Resolution,
-    /// From the SLM plane to the farthest layer: transposed spectra of each colour, over the number of samples.
+    /// From the SLM plane to the farthest plane: transposed spectra of each colour, over the number of samples.
     to_farthest: [Vec<Complex32>; 3],
-    /// Transposed spectrum of what reaches the layer at hand.
+    /// Transposed spectrum of what reaches the plane at hand.
     reaching: Vec<Complex32>,
     /// The change of the field that would give what is lacking, [3, height, width].
     pub(super) change: Vec<Complex32>,
 }
 
-impl LayerFeedback {
-    pub(super) fn new(config: &NetworkConfig, bench: &DisplayGeometry, parameters: Feedback, size: Resolution) -> Self {
-        let far_m = bench.image_distance(bench.depth_far).0;
-        let volume_m = bench.image_distance(bench.depth_near).0 - far_m;
-        let farthest = Metres(far_m + volume_m / (2 * config.depth_layers) as f64);
-        let table = |colour| transfer_table(bench.wavelengths[colour], sample_pitch(bench), size, farthest);
+impl PlaneFeedback {
+    pub(super) fn new(share: f32, positions: PlanePositions, bench: &DisplayGeometry, size: Resolution) -> Self {
+        let table = |colour| transfer_table(bench.wavelengths[colour], sample_pitch(bench), size, positions.farthest);
         Self {
-            parameters,
+            share,
             bench: *bench,
             size,
             to_farthest: Colour::ALL.map(table),
@@ -42,35 +38,42 @@ impl LayerFeedback {
         }
     }
 
-    /// Changes the field that `layers` carried by what it lacks of the amplitudes `stack` [layers, 3, height, width],
-    /// which become that lack. `sum` is scratch for a spectrum.
-    pub(super) fn run(&mut self, layers: &mut DepthLayers, stack: &mut [f32], sum: &mut [Complex32], pupil_mm: f32) {
-        let Self { parameters: Feedback { share, sharpness }, bench, size, to_farthest, reaching, change } = self;
+    /// Changes the field that `light` carried by what it lacks of the amplitudes `stack` [planes, 3, height, width],
+    /// which become that lack. `weight` is that of a change at a plane and a sample; `sum` is scratch for a spectrum.
+    pub(super) fn run(
+        &mut self,
+        light: &mut PlaneLight,
+        stack: &mut [f32],
+        sum: &mut [Complex32],
+        pupil_mm: f32,
+        weight: impl Fn(usize, usize) -> f32 + Sync,
+    ) {
+        let Self { share, bench, size, to_farthest, reaching, change } = self;
         let pixels = size.pixels();
-        let mean = 1.0 / layers.numbers().len() as f32;
+        let mean = 1.0 / light.count as f32;
         for colour in Colour::ALL {
             let plane = colour.index() * pixels..(colour.index() + 1) * pixels;
             let pupil = Pupil::new(bench, colour, pupil_mm, *size);
-            // Until the last step it holds the light at one layer after another.
+            // Until the last step it holds the light at one plane after another.
             let change = &mut change[plane.clone()];
 
-            layers.send(colour, &to_farthest[colour.index()], reaching, change);
+            light.send(colour, &to_farthest[colour.index()], reaching, change);
             pupil.stop(reaching);
             sum.fill(Complex32::ZERO);
-            for (layer, stack) in layers.numbers().zip(stack.chunks_exact_mut(3 * pixels)) {
-                layers.arrive(colour, reaching, change);
-                change.par_iter_mut().zip(&mut stack[plane.clone()]).zip(layers.cover(layer)).for_each(
-                    |((arriving, lack), cover)| {
+            for (number, stack) in stack.chunks_exact_mut(3 * pixels).enumerate() {
+                light.arrive(colour, reaching, change);
+                change.par_iter_mut().zip(&mut stack[plane.clone()]).enumerate().for_each(
+                    |(sample, (arriving, lack))| {
                         let amplitude = (arriving.norm_sqr() + FEEDBACK_DARK_POWER).sqrt();
                         *lack -= amplitude;
-                        *arriving *= (1.0 + *sharpness * cover) * *lack / amplitude;
+                        *arriving *= weight(number, sample) * *lack / amplitude;
                     },
                 );
-                layers.add_light(colour, change, sum);
+                light.add_light(colour, change, sum);
             }
             pupil.stop(sum);
-            layers.bring_back(colour, sum, change);
-            layers.carried[plane].par_iter_mut().zip(change).for_each(|(field, change)| {
+            light.bring_back(colour, sum, change);
+            light.carried[plane].par_iter_mut().zip(change).for_each(|(field, change)| {
                 *change *= mean;
                 *field += *change * *share;
             });

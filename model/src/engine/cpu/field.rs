@@ -5,12 +5,12 @@ use num_complex::Complex32;
 
 use super::blocks::{grid_size, scale_of};
 use super::feature_map::FeatureMap;
-use super::stage::{Buffers, Job, MapId, Stage, plane_bytes};
+use super::stage::{Buffers, Job, MapId, Shared, Stage, plane_bytes};
 use crate::optics::FourierUpsampler;
 use crate::weights::{Grid, OUTPUT_CHANNELS};
 
 /// The field on the network's grid that the last net corrects.
-pub(super) trait UncorrectedField {
+pub(super) trait UncorrectedField: Shared {
     /// Planes of real numbers that it is kept in.
     const PLANES: usize;
 
@@ -55,7 +55,7 @@ impl<F: UncorrectedField> Stage<F> for Field {
         plane_bytes(F::PLANES + OUTPUT_CHANNELS, *size) + plane_bytes(OUTPUT_CHANNELS, *resolution)
     }
 
-    fn run(&mut self, Buffers { maps, family }: &mut Buffers<F>, job: &mut Job<'_>) {
+    fn run(&mut self, Buffers { maps, family }: &mut Buffers<F>, job: &mut Job<'_, F::Input>) {
         let Self { residual, resolution, padded, upsampler, uncropped, .. } = self;
         let residual = &maps[*residual];
         for colour in Colour::ALL {
@@ -78,7 +78,7 @@ impl<F: UncorrectedField> Stage<F> for Field {
     }
 
     #[cfg(test)]
-    fn seen<'a>(&'a self, _: &'a Buffers<F>, job: &'a Job<'_>) -> super::stage::Seen<'a> {
+    fn seen<'a>(&'a self, _: &'a Buffers<F>, job: &'a Job<'_, F::Input>) -> super::stage::Seen<'a> {
         super::stage::Seen::Light(&job.hologram.field)
     }
 }

@@ -10,9 +10,12 @@ mod expected_stack;
 mod feature_map;
 mod feedback;
 mod field;
+mod focal_stack;
 mod input_features;
 mod network;
 mod peak;
+mod plane_light;
+mod plane_stack;
 mod product;
 mod stage;
 mod stage_list;
@@ -20,10 +23,11 @@ mod stage_list;
 pub(super) mod tests;
 mod trunk;
 
-use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
+use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 
 use self::network::Network;
-use crate::engine::{EngineError, StageTimings, check_pupil};
+use crate::engine::{EngineError, SAME_FOCUS_DPT, StageTimings, check_pupil};
+use crate::scene::FocalStack;
 use crate::simd::InstructionSet;
 use crate::{ComplexHologram, RgbdFrame, Weights};
 
@@ -32,7 +36,7 @@ pub use peak::{fma_peak, stream_bandwidth};
 /// The network on the CPU, for frames of one size. It works on the threads of the [`WorkerPool`](crate::WorkerPool)
 /// that it is called in, elsewhere on rayon's own.
 pub struct CpuEngine {
-    network: Network,
+    network: Network<RgbdFrame>,
     resolution: Resolution,
     set: InstructionSet,
 }
@@ -42,13 +46,11 @@ impl CpuEngine {
     /// matter.
     ///
     /// # Errors
-    /// [`EngineError::Empty`].
+    /// [`EngineError::Empty`], and [`EngineError::Family`] for weights that take focal stacks.
     pub fn new(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) -> Result<Self, EngineError> {
-        if resolution.pixels() == 0 {
-            return Err(EngineError::Empty { resolution });
-        }
+        check_not_empty(resolution)?;
         let set = InstructionSet::best();
-        Ok(Self { network: Network::new(weights, bench, resolution, set), resolution, set })
+        Ok(Self { network: Network::of_frames(weights, bench, resolution, set)?, resolution, set })
     }
 
     /// Writes the hologram of `frame` for an eye with `pupil` to `hologram`. Does not allocate in a
@@ -65,11 +67,7 @@ impl CpuEngine {
         pupil: PupilDiameter,
         hologram: &mut ComplexHologram,
     ) -> Result<(), EngineError> {
-        for (what, found) in [("the frame", frame.resolution), ("the hologram", hologram.resolution)] {
-            if found != self.resolution {
-                return Err(EngineError::Resolution { what, found, expected: self.resolution });
-            }
-        }
+        check_sizes(self.resolution, [("the frame", frame.resolution), ("the hologram", hologram.resolution)])?;
         check_pupil(pupil)?;
         self.network.render(frame, pupil, hologram);
         Ok(())
@@ -83,5 +81,68 @@ impl CpuEngine {
     /// Which instruction set the kernels use: `avx512`, `avx2` or `portable`.
     pub fn instruction_set(&self) -> &'static str {
         self.set.name()
+    }
+}
+
+/// A `focal-stack` network on the CPU, for images of one size.
+pub struct FocalStackEngine {
+    network: Network<FocalStack>,
+    focuses: Vec<Dioptres>,
+    resolution: Resolution,
+    set: InstructionSet,
+}
+
+impl FocalStackEngine {
+    /// An engine for images of `resolution`, which may be odd, on the optics of `bench`, whose own resolution does not
+    /// matter.
+    ///
+    /// # Errors
+    /// [`EngineError::Empty`], and [`EngineError::Family`] for weights that take a picture with depth.
+    pub fn new(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) -> Result<Self, EngineError> {
+        check_not_empty(resolution)?;
+        let set = InstructionSet::best();
+        let network = Network::of_focal_stacks(weights, bench, resolution, set)?;
+        let planes = weights.config.planes;
+        let focuses = (0..planes).map(|plane| bench.depth_at(plane as f64 / (planes - 1) as f64)).collect();
+        Ok(Self { network, focuses, resolution, set })
+    }
+
+    /// Where its images are focused, far to near.
+    pub fn focuses(&self) -> &[Dioptres] {
+        &self.focuses
+    }
+
+    /// Writes the hologram of `stack`, for an eye with the pupil that it was made for, to `hologram`.
+    ///
+    /// # Errors
+    /// [`EngineError::Focuses`] for another number of images or other focuses than [`Self::focuses`], and as
+    /// [`CpuEngine::render`] has them.
+    pub fn render(&mut self, stack: &FocalStack, hologram: &mut ComplexHologram) -> Result<(), EngineError> {
+        check_sizes(self.resolution, [("the stack", stack.resolution), ("the hologram", hologram.resolution)])?;
+        check_pupil(stack.pupil)?;
+        let is_near = |(found, expected): (&Dioptres, &Dioptres)| (found.0 - expected.0).abs() <= SAME_FOCUS_DPT;
+        if stack.focuses.len() != self.focuses.len() || !stack.focuses.iter().zip(&self.focuses).all(is_near) {
+            let told = |focuses: &[Dioptres]| focuses.iter().map(|focus| focus.0).collect();
+            return Err(EngineError::Focuses { found: told(&stack.focuses), expected: told(&self.focuses) });
+        }
+        assert_eq!(stack.amplitude.len(), 3 * stack.focuses.len() * stack.resolution.pixels(), "one image a focus");
+        self.network.render(stack, stack.pupil, hologram);
+        Ok(())
+    }
+
+    /// As [`CpuEngine::instruction_set`].
+    pub fn instruction_set(&self) -> &'static str {
+        self.set.name()
+    }
+}
+
+fn check_not_empty(resolution: Resolution) -> Result<(), EngineError> {
+    if resolution.pixels() == 0 { Err(EngineError::Empty { resolution }) } else { Ok(()) }
+}
+
+fn check_sizes(expected: Resolution, sizes: [(&'static str, Resolution); 2]) -> Result<(), EngineError> {
+    match sizes.into_iter().find(|(_, found)| *found != expected) {
+        Some((what, found)) => Err(EngineError::Resolution { what, found, expected }),
+        None => Ok(()),
     }
 }

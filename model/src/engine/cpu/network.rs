@@ -4,37 +4,74 @@ use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
 
 use super::stage::Job;
 use super::stage_list::Stages;
-use super::{direct, expected_stack};
+use super::{direct, expected_stack, focal_stack};
 use crate::conditions::{Conditions, TrainedRange};
-use crate::engine::StageTimings;
+use crate::engine::{EngineError, StageTimings};
+use crate::scene::FocalStack;
 use crate::simd::InstructionSet;
 use crate::weights::{Family, Weights};
 use crate::{ComplexHologram, RgbdFrame};
 
-/// Everything that one frame needs; nothing is allocated after `new`.
-pub(super) struct Network {
+/// Everything that one hologram of `I` needs; nothing is allocated after `new`.
+pub(super) struct Network<I> {
     trained: TrainedRange,
     bench: DisplayGeometry,
-    pub(super) stages: Box<dyn Stages>,
+    pub(super) stages: Box<dyn Stages<I>>,
     pub(super) timings: StageTimings,
 }
 
-impl Network {
-    pub(super) fn new(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution, set: InstructionSet) -> Self {
+impl Network<RgbdFrame> {
+    /// For frames of `resolution`.
+    ///
+    /// # Errors
+    /// [`EngineError::Family`].
+    pub(super) fn of_frames(
+        weights: &Weights,
+        bench: &DisplayGeometry,
+        resolution: Resolution,
+        set: InstructionSet,
+    ) -> Result<Self, EngineError> {
         let config = &weights.config;
-        let stages: Box<dyn Stages> = match &weights.family {
+        let stages: Box<dyn Stages<RgbdFrame>> = match &weights.family {
             Family::Direct { layers } => Box::new(direct::stages(config, layers, resolution, set)),
             Family::ExpectedStack { lighting, correction, feedback } => {
                 Box::new(expected_stack::stages(config, bench, [lighting, correction], *feedback, resolution, set))
             }
+            Family::FocalStack { .. } => return Err(EngineError::takes_focal_stacks()),
         };
-        Self { trained: config.trained, bench: *bench, timings: stages.untimed(), stages }
+        Ok(Self::new(weights, bench, stages))
+    }
+}
+
+impl Network<FocalStack> {
+    /// For images of `resolution`.
+    ///
+    /// # Errors
+    /// [`EngineError::Family`].
+    pub(super) fn of_focal_stacks(
+        weights: &Weights,
+        bench: &DisplayGeometry,
+        resolution: Resolution,
+        set: InstructionSet,
+    ) -> Result<Self, EngineError> {
+        let Family::FocalStack { lighting, correction, feedback_share } = &weights.family else {
+            return Err(EngineError::takes_frames(weights.config.architecture));
+        };
+        let nets = [&lighting[..], correction];
+        let stages = focal_stack::stages(&weights.config, bench, nets, *feedback_share, resolution, set);
+        Ok(Self::new(weights, bench, Box::new(stages)))
+    }
+}
+
+impl<I> Network<I> {
+    fn new(weights: &Weights, bench: &DisplayGeometry, stages: Box<dyn Stages<I>>) -> Self {
+        Self { trained: weights.config.trained, bench: *bench, timings: stages.untimed(), stages }
     }
 
-    /// One frame; `frame` and `hologram` have the network's resolution.
-    pub(super) fn render(&mut self, frame: &RgbdFrame, pupil: PupilDiameter, hologram: &mut ComplexHologram) {
+    /// One frame; `input` and `hologram` have the network's resolution.
+    pub(super) fn render(&mut self, input: &I, pupil: PupilDiameter, hologram: &mut ComplexHologram) {
         let conditions = self.conditions(pupil);
-        self.stages.run(&mut Job { frame, pupil_mm: pupil.mm(), conditions, hologram }, &mut self.timings);
+        self.stages.run(&mut Job { input, pupil_mm: pupil.mm(), conditions, hologram }, &mut self.timings);
     }
 
     /// What the network is told of the bench and a pupil.

@@ -6,21 +6,26 @@ use holod_calibration::Resolution;
 
 use super::conv::Scratch;
 use super::feature_map::FeatureMap;
+use crate::ComplexHologram;
 use crate::conditions::Conditions;
 use crate::simd::InstructionSet;
-use crate::{ComplexHologram, RgbdFrame};
 
-/// A frame to render; picture and hologram have the network's resolution.
-pub(super) struct Job<'a> {
-    pub(super) frame: &'a RgbdFrame,
+/// What to render; it and the hologram have the network's resolution.
+pub(super) struct Job<'a, I> {
+    pub(super) input: &'a I,
     pub(super) pupil_mm: f32,
     pub(super) conditions: Conditions,
     pub(super) hologram: &'a mut ComplexHologram,
 }
 
-/// One step of a frame, with its parameters and what it alone needs to run. `F` is what the stages of its family share
-/// besides maps.
-pub(super) trait Stage<F>: Send + Sync {
+/// What the stages of a family share besides maps.
+pub(super) trait Shared: Send + Sync {
+    /// What the family makes holograms of.
+    type Input;
+}
+
+/// One step of a frame, with its parameters and what it alone needs to run.
+pub(super) trait Stage<F: Shared>: Send + Sync {
     /// As in [`StageTiming`](crate::engine::StageTiming).
     fn name(&self) -> &str;
 
@@ -33,11 +38,11 @@ pub(super) trait Stage<F>: Send + Sync {
     fn bytes(&self) -> u64;
 
     /// Does the step; allocates nothing.
-    fn run(&mut self, buffers: &mut Buffers<F>, job: &mut Job<'_>);
+    fn run(&mut self, buffers: &mut Buffers<F>, job: &mut Job<'_, F::Input>);
 
     /// What the step has just written, for tests that look inside.
     #[cfg(test)]
-    fn seen<'a>(&'a self, buffers: &'a Buffers<F>, job: &'a Job<'_>) -> Seen<'a>;
+    fn seen<'a>(&'a self, buffers: &'a Buffers<F>, job: &'a Job<'_, F::Input>) -> Seen<'a>;
 }
 
 /// Bytes of `count` planes of real numbers of `size`; a field has [`OUTPUT_CHANNELS`](crate::weights::OUTPUT_CHANNELS).

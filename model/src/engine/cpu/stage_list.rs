@@ -2,16 +2,16 @@
 
 use std::time::{Duration, Instant};
 
-use super::stage::{Buffers, Job, Maps, Stage};
+use super::stage::{Buffers, Job, Maps, Shared, Stage};
 use crate::engine::{StageTiming, StageTimings};
 
 /// The stages of a network in the order in which they run, and what they share.
-pub(super) struct StageList<F> {
+pub(super) struct StageList<F: Shared> {
     stages: Vec<Box<dyn Stage<F>>>,
     buffers: Buffers<F>,
 }
 
-impl<F> StageList<F> {
+impl<F: Shared> StageList<F> {
     pub(super) fn new(maps: Maps, family: F) -> Self {
         Self { stages: Vec::new(), buffers: Buffers { maps, family } }
     }
@@ -26,20 +26,20 @@ impl<F> StageList<F> {
     }
 }
 
-/// A [`StageList`] of some family.
-pub(super) trait Stages: Send + Sync {
+/// A [`StageList`] of some family that makes holograms of `I`.
+pub(super) trait Stages<I>: Send + Sync {
     /// What the stages are called and cost.
     fn untimed(&self) -> StageTimings;
 
     /// Renders a frame and writes how long each stage took.
-    fn run(&mut self, job: &mut Job<'_>, timings: &mut StageTimings);
+    fn run(&mut self, job: &mut Job<'_, I>, timings: &mut StageTimings);
 
     /// Renders a frame and shows what each stage has written, by its name.
     #[cfg(test)]
-    fn run_seen(&mut self, job: &mut Job<'_>, look: &mut dyn FnMut(&str, super::stage::Seen<'_>));
+    fn run_seen(&mut self, job: &mut Job<'_, I>, look: &mut dyn FnMut(&str, super::stage::Seen<'_>));
 }
 
-impl<F: Send + Sync> Stages for StageList<F> {
+impl<F: Shared> Stages<F::Input> for StageList<F> {
     fn untimed(&self) -> StageTimings {
         let stages = self.stages.iter().map(|stage| StageTiming {
             name: stage.name().into(),
@@ -50,7 +50,7 @@ impl<F: Send + Sync> Stages for StageList<F> {
         StageTimings { stages: stages.collect() }
     }
 
-    fn run(&mut self, job: &mut Job<'_>, timings: &mut StageTimings) {
+    fn run(&mut self, job: &mut Job<'_, F::Input>, timings: &mut StageTimings) {
         let mut stage_begin = Instant::now();
         for (stage, timing) in self.stages.iter_mut().zip(&mut timings.stages) {
             stage.run(&mut self.buffers, job);
@@ -61,7 +61,7 @@ impl<F: Send + Sync> Stages for StageList<F> {
     }
 
     #[cfg(test)]
-    fn run_seen(&mut self, job: &mut Job<'_>, look: &mut dyn FnMut(&str, super::stage::Seen<'_>)) {
+    fn run_seen(&mut self, job: &mut Job<'_, F::Input>, look: &mut dyn FnMut(&str, super::stage::Seen<'_>)) {
         for stage in &mut self.stages {
             stage.run(&mut self.buffers, job);
             look(stage.name(), stage.seen(&self.buffers, job));

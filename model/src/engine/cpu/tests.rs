@@ -10,6 +10,7 @@ use super::stage::{Job, Seen};
 use super::*;
 use crate::engine::WIDEST_PUPIL;
 use crate::engine::reference::{self, Value};
+use crate::scene::FocalStack;
 use crate::simd::InstructionSet;
 use crate::weights::tests::{self as weights_tests, random_weights};
 use crate::weights::{Grid, NetworkConfig};
@@ -66,12 +67,12 @@ fn error_once_spoiled(map: &FeatureMap, expected: &mut reference::Map) -> f64 {
     map_error(map, expected)
 }
 
-/// What the engine calls a stage of the reference.
-fn name_of(stage: &reference::Stage) -> String {
+/// What the engine calls a stage of the reference; `first` is the first one's name of a network that lights planes.
+fn name_of(stage: &reference::Stage, first: &str) -> String {
     let adjustable = if matches!(stage.value, Value::Layer(_, Some(_))) { " (adjustable)" } else { "" };
     match stage.name.as_str() {
         "encoded" => "encode".into(),
-        "lighting.encoded" => "expected stack".into(),
+        "lighting.encoded" => first.into(),
         "carried" => "light of the layers".into(),
         "correction.encoded" => "feedback".into(),
         layer_or_field => layer_or_field.replace(['.', '_'], " ") + adjustable,
@@ -102,27 +103,48 @@ fn check_on(
     seed: u32,
     set: InstructionSet,
 ) {
-    let (frame, pupil) = (frame(resolution, seed), PupilDiameter::from_mm(pupil_mm));
-    let reference::Trace { mut stages, field } = reference::run(weights, bench, &frame, pupil);
-    stages.push(reference::Stage { name: "field".into(), value: Value::Light(field.clone()) });
-    let mut network = Network::new(weights, bench, resolution, set);
+    let [frame, other] = [seed, seed + 1].map(|seed| frame(resolution, seed));
+    let pupil = PupilDiameter::from_mm(pupil_mm);
+    let network = Network::of_frames(weights, bench, resolution, set).unwrap();
     let context = format!("{resolution}, {} on {}", weights.config().channels, set.name());
+    let reference = reference::run(weights, bench, &frame, pupil);
+    check_network(
+        &context,
+        network,
+        reference,
+        "expected stack",
+        [&frame, &other],
+        [pupil, PupilDiameter::from_mm(2.0)],
+        resolution,
+    );
+}
 
+/// Runs a network on the first of two inputs, stage by stage, after the second one.
+fn check_network<I>(
+    context: &str,
+    mut network: Network<I>,
+    reference::Trace { mut stages, field }: reference::Trace,
+    first: &str,
+    [input, other]: [&I; 2],
+    [pupil, other_pupil]: [PupilDiameter; 2],
+    resolution: Resolution,
+) {
+    stages.push(reference::Stage { name: "field".into(), value: Value::Light(field.clone()) });
     // The second time round, what the first left in the maps must not show.
     let mut hologram = ComplexHologram::dark(resolution);
-    network.render(&self::frame(resolution, seed + 1), PupilDiameter::from_mm(2.0), &mut hologram);
+    network.render(other, other_pupil, &mut hologram);
     let mut remaining = stages.iter_mut();
     let conditions = network.conditions(pupil);
-    let mut job = Job { frame: &frame, pupil_mm, conditions, hologram: &mut hologram };
+    let mut job = Job { input, pupil_mm: pupil.mm(), conditions, hologram: &mut hologram };
     network.stages.run_seen(&mut job, &mut |name, seen| {
         let stage = remaining.next().unwrap_or_else(|| panic!("{context}: {name} is not in the reference"));
-        assert_eq!(name, name_of(stage), "{context}");
+        assert_eq!(name, name_of(stage, first), "{context}");
         check_stage(&format!("{context}: {name}"), &seen, &mut stage.value);
     });
     assert!(remaining.next().is_none(), "{context}: a stage of the reference is missing");
 
     hologram.field.fill(Complex32::ZERO);
-    network.render(&frame, pupil, &mut hologram);
+    network.render(input, pupil, &mut hologram);
     check_stage(&format!("{context}: rendered"), &Seen::Light(&hologram.field), &mut Value::Light(field));
 }
 
@@ -197,6 +219,67 @@ proptest! {
             check_all_stages(&weights, Resolution { width, height }, pupil_mm, seed, set);
         }
     }
+}
+
+/// Images for a network with `planes`.
+fn focal_stack(resolution: Resolution, planes: usize, pupil_mm: f32, seed: u32) -> FocalStack {
+    let bench = DisplayGeometry::DEFAULT;
+    FocalStack {
+        resolution,
+        amplitude: (0..planes).flat_map(|plane| frame(resolution, seed + 31 * plane as u32).amplitude).collect(),
+        focuses: (0..planes).map(|plane| bench.depth_at(plane as f64 / (planes - 1) as f64)).collect(),
+        pupil: PupilDiameter::from_mm(pupil_mm),
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(12))]
+    #[test]
+    fn every_stage_of_a_focal_stack_network_matches_the_reference(
+        width in 1usize..40,
+        height in 1usize..14,
+        channels in 1usize..20,
+        planes in 2usize..7,
+        pupil_mm in 1.0f32..5.0,
+        seed in 0u32..1000,
+    ) {
+        let config = NetworkConfig { channels, planes, ..weights_tests::focal_stack_config() };
+        let (weights, bench) = (random_weights(config, u64::from(seed)), DisplayGeometry::DEFAULT);
+        let resolution = Resolution { width, height };
+        let inputs = [seed, seed + 1].map(|seed| focal_stack(resolution, planes, pupil_mm, seed));
+        for set in InstructionSet::available() {
+            let reference = reference::run_focal_stack(&weights, &bench, &inputs[0]);
+            let network = Network::of_focal_stacks(&weights, &bench, resolution, set).unwrap();
+            let context = format!("{resolution}, {channels}, {planes} planes on {}", set.name());
+            let pupils = [inputs[0].pupil, PupilDiameter::from_mm(2.0)];
+            check_network(&context, network, reference, "focal stack", [&inputs[0], &inputs[1]], pupils, resolution);
+        }
+    }
+}
+
+#[test]
+fn a_focal_stack_that_the_network_does_not_take_is_refused_in_words() {
+    let bench = DisplayGeometry::DEFAULT;
+    let size = Resolution { width: 6, height: 4 };
+    let weights = random_weights(weights_tests::focal_stack_config(), 3);
+    let mut engine = FocalStackEngine::new(&weights, &bench, size).unwrap();
+    let mut hologram = ComplexHologram::dark(size);
+    let mut error_of = |stack: &FocalStack| engine.render(stack, &mut hologram).unwrap_err().to_string();
+    let right = focal_stack(size, 3, 3.0, 1);
+    let error = error_of(&focal_stack(size, 2, 3.0, 1));
+    assert!(error.contains("found 2 images focused at 0.000, 2.857 dpt; the network takes 3 images"), "{error}");
+    let error = error_of(&FocalStack { focuses: [0.0, 1.0, 2.857].map(Dioptres).to_vec(), ..right.clone() });
+    assert!(error.contains("at 0.000, 1.000, 2.857 dpt") && error.contains("0.000, 1.429, 2.857 dpt"), "{error}");
+    let error = error_of(&FocalStack { pupil: PupilDiameter::from_mm(0.0), ..right.clone() });
+    assert!(error.contains("pupil diameter 0 mm"), "{error}");
+    let error = error_of(&focal_stack(Resolution { width: 5, height: 4 }, 3, 3.0, 1));
+    assert!(error.contains("the stack is 5x4; this engine was made for 6x4"), "{error}");
+    engine.render(&right, &mut hologram).unwrap();
+
+    let takes_images = CpuEngine::new(&weights, &bench, size).err().unwrap().to_string();
+    assert!(takes_images.contains("`focal-stack` network") && takes_images.contains("--focal-stack"), "{takes_images}");
+    let takes_frames = FocalStackEngine::new(&Weights::builtin_fast(), &bench, size).err().unwrap().to_string();
+    assert!(takes_frames.contains("`expected-stack` network") && takes_frames.contains("its depth"), "{takes_frames}");
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use super::conv::{Epilogue, PlainConv};
 use super::deformable::DeformableConv;
 use super::feature_map::FeatureMap;
-use super::stage::{Buffers, Job, MapId, Maps, Stage, plane_bytes};
+use super::stage::{Buffers, Job, MapId, Maps, Shared, Stage, plane_bytes};
 use crate::conditions::Conditions;
 use crate::engine::modulation::Modulation;
 use crate::weights::{Layer, OFFSET_CHANNELS};
@@ -60,7 +60,7 @@ pub(super) struct LayerStage {
     conv: Conv,
 }
 
-impl<F> Stage<F> for LayerStage {
+impl<F: Shared> Stage<F> for LayerStage {
     fn name(&self) -> &str {
         &self.name
     }
@@ -73,7 +73,7 @@ impl<F> Stage<F> for LayerStage {
         self.bytes
     }
 
-    fn run(&mut self, buffers: &mut Buffers<F>, job: &mut Job<'_>) {
+    fn run(&mut self, buffers: &mut Buffers<F>, job: &mut Job<'_, F::Input>) {
         let (input, output, scratch) = buffers.maps.for_layer(self.from, self.to);
         match &mut self.conv {
             Conv::Plain(conv) => conv.run(input, scratch, output),
@@ -86,7 +86,7 @@ impl<F> Stage<F> for LayerStage {
     }
 
     #[cfg(test)]
-    fn seen<'a>(&'a self, buffers: &'a Buffers<F>, _: &'a Job<'_>) -> super::stage::Seen<'a> {
+    fn seen<'a>(&'a self, buffers: &'a Buffers<F>, _: &'a Job<'_, F::Input>) -> super::stage::Seen<'a> {
         let offsets = match &self.conv {
             Conv::Plain(_) => None,
             Conv::Adjustable(adjustable) => Some(&adjustable.offsets),

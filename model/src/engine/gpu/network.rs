@@ -36,7 +36,7 @@ impl NetworkPlan {
     /// limits.
     ///
     /// # Errors
-    /// The size is nothing, or too large for that memory.
+    /// The size is nothing, or too large for that memory; or the weights take focal stacks.
     pub(crate) fn new(
         weights: &Weights,
         bench: &DisplayGeometry,
@@ -79,6 +79,7 @@ impl NetworkPlan {
                 let low = Low::Corrected(stack.carried(), &residual);
                 upsample::field(&mut plan, &shared, config.grid, low, limits)?;
             }
+            Family::FocalStack { .. } => return Err(EngineError::takes_focal_stacks()),
         }
         let clipped = plan.buffer::<u32>("clipped samples", 1);
         let unreachable = plan.buffer::<u32>("samples out of reach", 3);

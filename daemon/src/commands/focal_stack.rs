@@ -1,0 +1,111 @@
+//! `holod render --focal-stack`: the hologram of images that are focused at several depths.
+
+use std::path::Path;
+use std::time::Instant;
+
+use holod_calibration::rig::Rig;
+use holod_calibration::{Dioptres, DisplayGeometry};
+use holod_model::ComplexHologram;
+use holod_model::engine::FocalStackEngine;
+use holod_model::files::{BenchOptics, StoredHologram};
+use holod_model::optics::{DoublePhase, PhasePattern};
+use holod_model::scene::FocalStack;
+use serde::Serialize;
+
+use super::render::{self, FILES};
+use crate::cli::{Backend, RenderArgs};
+use crate::failure::{Exit, Failure};
+use crate::source::scene;
+use crate::staging::Staging;
+use crate::{progress, renderer, results, setup};
+
+/// What was done, and what the reader should know of it; `report.json`.
+#[derive(Serialize)]
+struct Report {
+    focal_stack: String,
+    pupil_mm: f32,
+    focus_dpt: Vec<f64>,
+    width_px: usize,
+    height_px: usize,
+    amplitude_constant: f32,
+    clipped_share: f32,
+    /// Of all images.
+    colour_clipped_px: usize,
+    /// Of each image.
+    padded_px: usize,
+    /// How the hologram was computed.
+    engine: String,
+    /// From images to phases.
+    frame_ms: f64,
+    /// From the command's beginning until everything but this report was written.
+    total_ms: f64,
+    files: [&'static str; 5],
+}
+
+/// Renders the focal stack in `directory`; the command `began`.
+pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Instant) -> Result<(), Failure> {
+    if !matches!(args.backend, Backend::Auto | Backend::Cpu) {
+        let only = "--backend: focal stacks are computed by the processor alone; leave it out, or name `cpu`";
+        return Err(Failure::new(Exit::Usage, only));
+    }
+    let staging = Staging::new(&args.out, &FILES, args.force)?;
+    let weights = progress::during("loading the network", || setup::weights(rig))?;
+    let name = directory.display().to_string();
+    let (stack, done) = progress::during("loading the focal stack", || {
+        FocalStack::load(directory, args.scene.resolution, args.scene.fit.into()).map_err(scene::failure)
+    })?;
+    let resolution = stack.resolution;
+    scene::check_fits(resolution, &rig.geometry, &name)?;
+    render::check_pupil(&weights, &rig.geometry, &format!("{name}/stack.toml: pupil_mm"), stack.pupil)?;
+    let mut engine = progress::during(&format!("preparing the network for {resolution}"), || {
+        FocalStackEngine::new(&weights, &rig.geometry, resolution).map_err(renderer::failure)
+    })?;
+    let amplitude_constant = weights.config().amplitude_constant;
+    let mut double_phase = DoublePhase::new(resolution, amplitude_constant);
+    let (mut hologram, mut pattern) = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
+    let computing = Instant::now();
+    let clipped_share = progress::during(&format!("computing the hologram of {resolution}"), || {
+        engine
+            .render(&stack, &mut hologram)
+            .map_err(|error| Failure::new(Exit::Data, format!("{name}/stack.toml: {error}")))?;
+        Ok::<_, Failure>(double_phase.encode(&hologram, &mut pattern).clipped_share)
+    })?;
+    let frame_ms = computing.elapsed().as_secs_f64() * 1e3;
+    let optics = BenchOptics::of(&DisplayGeometry { resolution, ..rig.geometry });
+    render::save(&StoredHologram { hologram, pupil: stack.pupil, optics, amplitude_constant }, &pattern, &staging)?;
+    let report = Report {
+        pupil_mm: stack.pupil.mm(),
+        focus_dpt: stack.focuses.iter().map(|&Dioptres(focus_dpt)| focus_dpt).collect(),
+        width_px: resolution.width,
+        height_px: resolution.height,
+        amplitude_constant,
+        clipped_share,
+        colour_clipped_px: done.colour_clipped_px,
+        padded_px: done.padded_px,
+        engine: format!("cpu, {}", engine.instruction_set()),
+        frame_ms,
+        total_ms: began.elapsed().as_secs_f64() * 1e3,
+        files: FILES,
+        focal_stack: name,
+    };
+    results::save_json(&report, &staging.path(FILES[4]))?;
+    staging.commit()?;
+    if args.json {
+        return results::print_json(&report);
+    }
+    results::print(&format!(
+        "{}: hologram of {resolution} from {} images for a pupil of {} mm in {:.0} ms, {:.1} s with all else; {:.3} % of \
+         amplitudes clipped\nfocused from {:.2} to {:.2} dpt; pixels padded {}\nin {}: {}",
+        report.focal_stack,
+        report.focus_dpt.len(),
+        report.pupil_mm,
+        report.frame_ms,
+        report.total_ms / 1e3,
+        report.clipped_share * 100.0,
+        report.focus_dpt[0],
+        report.focus_dpt[report.focus_dpt.len() - 1],
+        report.padded_px,
+        args.out.display(),
+        FILES.join(", ")
+    ))
+}

@@ -1,0 +1,100 @@
+//! The `focal-stack` family: planes are lit for images of a scene that are focused there.
+
+use holod_calibration::{DisplayGeometry, Resolution};
+use rayon::prelude::*;
+
+use super::blocks::{Blocks, grid_size};
+use super::input_features::{BLOCK, FIRST_MAP, SCALE};
+use super::plane_light::PlanePositions;
+use super::plane_stack::{PlaneNetwork, PlaneStack, View};
+use super::stage::{Buffers, Job, MapId, Stage, plane_bytes};
+use super::stage_list::StageList;
+use crate::scene::FocalStack;
+use crate::simd::InstructionSet;
+use crate::weights::{CONDITIONS, Feedback, Layer, NetworkConfig};
+
+/// For images of `resolution`; `nets` are the layers of the first and of the second net.
+pub(super) fn stages(
+    config: &NetworkConfig,
+    bench: &DisplayGeometry,
+    nets: [&[Layer]; 2],
+    share: f32,
+    resolution: Resolution,
+    set: InstructionSet,
+) -> StageList<PlaneStack<FocalImages>> {
+    let size = grid_size(config.grid, resolution);
+    let images = 3 * config.planes;
+    let positions = PlanePositions::from_end_to_end(config.planes, bench);
+    let feedback = Feedback { share, sharpness: 0.0 };
+    PlaneNetwork { config, bench, nets, feedback, positions, resolution, set }.stages(FocalImages, 0, |inputs| Tell {
+        bytes: plane_bytes(images, resolution) + plane_bytes(images + 2 * (BLOCK * images + CONDITIONS), size),
+        inputs,
+    })
+}
+
+/// Without depth it is not known what is in focus.
+pub(super) struct FocalImages;
+
+impl View for FocalImages {
+    type Input = FocalStack;
+
+    fn share_in_focus(&self, _: usize, _: usize) -> f32 {
+        0.0
+    }
+}
+
+/// Writes what is to be seen, and shows the images to both nets.
+struct Tell {
+    bytes: u64,
+    inputs: [MapId; 2],
+}
+
+impl Stage<PlaneStack<FocalImages>> for Tell {
+    fn name(&self) -> &str {
+        "focal stack"
+    }
+
+    fn bytes(&self) -> u64 {
+        self.bytes
+    }
+
+    fn run(&mut self, buffers: &mut Buffers<PlaneStack<FocalImages>>, job: &mut Job<'_, FocalStack>) {
+        let Buffers { maps, family: PlaneStack { stack, .. } } = buffers;
+        let FocalStack { resolution, amplitude, .. } = job.input;
+        let blocks = Blocks { frame: *resolution, scale: SCALE };
+        let Resolution { width, height } = maps.size;
+        stack.par_chunks_exact_mut(width).enumerate().for_each(|(row, means)| {
+            let image = &amplitude[row / height * resolution.pixels()..][..resolution.pixels()];
+            for (x, mean) in means.iter_mut().enumerate() {
+                let light = (0..BLOCK).map(|corner| image[blocks.index(x, row % height, corner)].powi(2));
+                *mean = (light.sum::<f32>() / BLOCK as f32).sqrt();
+            }
+        });
+        let told = job.conditions.told().map(|value| value as f32);
+        for (input, first) in self.inputs.into_iter().zip([0, FIRST_MAP]) {
+            let map = &mut maps[input];
+            let stride = map.stride;
+            map.rows_mut().enumerate().for_each(|(y, row)| {
+                for (x, channels) in row[stride..][..width * stride].chunks_exact_mut(stride).enumerate() {
+                    let (images, rest) = channels[first..].split_at_mut(BLOCK * amplitude.len() / resolution.pixels());
+                    let planes = amplitude.chunks_exact(resolution.pixels());
+                    for (block, plane) in images.chunks_exact_mut(BLOCK).zip(planes) {
+                        for (corner, value) in block.iter_mut().enumerate() {
+                            *value = plane[blocks.index(x, y, corner)] - 0.4;
+                        }
+                    }
+                    rest[..CONDITIONS].copy_from_slice(&told);
+                }
+            });
+        }
+    }
+
+    #[cfg(test)]
+    fn seen<'a>(
+        &'a self,
+        buffers: &'a Buffers<PlaneStack<FocalImages>>,
+        _: &'a Job<'_, FocalStack>,
+    ) -> super::stage::Seen<'a> {
+        super::stage::Seen::Map(&buffers.maps[self.inputs[0]], None)
+    }
+}

@@ -1,0 +1,269 @@
+//! Focal stacks: what an eye with one pupil sees of a scene, focused at several depths.
+//!
+//! A focal stack is a directory with a `stack.toml`:
+//!
+//! ```toml
+//! pupil_mm = 3.0             # diameter of that eye's pupil
+//!
+//! [[image]]                  # for each depth, in any order
+//! file = "focus-0.png"       # a picture as in a scene: 8- or 16-bit PNG, JPEG or OpenEXR
+//! focus_dpt = 0.0            # where the eye is focused
+//! ```
+
+use std::path::Path;
+
+use holod_calibration::{Colour, Dioptres, PupilDiameter, Resolution};
+use serde::Deserialize;
+use toml::Spanned;
+
+use super::description::{line_error, read_text};
+use super::fit::Placement;
+use super::{Fit, SceneError, raster};
+use crate::LinearImage;
+use crate::engine::{SAME_FOCUS_DPT, WIDEST_PUPIL};
+use crate::weights::MOST_DEPTH_LAYERS;
+
+const FILE: &str = "stack.toml";
+/// Vergence of a hundredth of a metre: what is nearer is not meant.
+const NEAREST_DPT: f64 = 100.0;
+
+/// What an eye with one pupil sees of a scene, focused at several depths.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FocalStack {
+    /// Width and height of each image.
+    pub resolution: Resolution,
+    /// Square root of linear light, 0..=1, [images, 3, height, width].
+    pub amplitude: Vec<f32>,
+    /// Where each image is focused, far to near.
+    pub focuses: Vec<Dioptres>,
+    /// The eye's pupil.
+    pub pupil: PupilDiameter,
+}
+
+/// What happened to the images between their files and the network.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct FocalStackReport {
+    /// Colour values of all images above white or not finite, which were clipped.
+    pub colour_clipped_px: usize,
+    /// Pixels of each image that the picture does not reach: black.
+    pub padded_px: usize,
+}
+
+/// `stack.toml`.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct StackFile {
+    pupil_mm: Spanned<f64>,
+    image: Spanned<Vec<ImageEntry>>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ImageEntry {
+    file: String,
+    focus_dpt: Spanned<f64>,
+}
+
+impl FocalStack {
+    /// Writes `images`, of one size, as OpenEXR files of single precision, with a `stack.toml` that says where each is
+    /// focused, to the new folder `directory`.
+    ///
+    /// # Errors
+    /// The folder is there already, or it or a file cannot be written.
+    ///
+    /// # Panics
+    /// Where there are not as many images as focuses.
+    pub fn save(
+        directory: &Path,
+        images: &[LinearImage],
+        focuses: &[Dioptres],
+        pupil: PupilDiameter,
+    ) -> std::io::Result<()> {
+        assert_eq!(images.len(), focuses.len(), "one image a focus");
+        std::fs::create_dir(directory)?;
+        let mut text = format!("pupil_mm = {}\n", pupil.mm());
+        for (number, (image, Dioptres(focus_dpt))) in images.iter().zip(focuses).enumerate() {
+            let file = format!("focus-{number:02}.exr");
+            let [red, green, blue] = Colour::ALL.map(|colour| image.plane(colour));
+            let Resolution { width, height } = image.resolution;
+            exr::prelude::write_rgb_file(directory.join(&file), width, height, |x, y| {
+                let index = y * width + x;
+                (red[index], green[index], blue[index])
+            })
+            .map_err(std::io::Error::other)?;
+            text.push_str(&format!("\n[[image]]\nfile = \"{file}\"\nfocus_dpt = {focus_dpt}\n"));
+        }
+        std::fs::write(directory.join(FILE), text)
+    }
+
+    /// Loads the focal stack in `directory`, at `resolution` or, without one, at its images' own.
+    ///
+    /// # Errors
+    /// There is no `stack.toml`, or a line of it cannot be used, or an image cannot be read or has another size than
+    /// the first.
+    pub fn load(
+        directory: &Path,
+        resolution: Option<Resolution>,
+        fit: Fit,
+    ) -> Result<(Self, FocalStackReport), SceneError> {
+        let path = directory.join(FILE);
+        let text = read_text(&path, "a directory with a stack.toml, which names images and their focuses")?;
+        let (pupil, images) = parse(&path, &text)?;
+        let mut report = FocalStackReport::default();
+        let mut sizes: Option<(Resolution, Resolution)> = None;
+        let (mut amplitude, mut focuses) = (Vec::new(), Vec::new());
+        for image in images {
+            let file = directory.join(&image.file);
+            let colour = raster::read_colour(&file)?;
+            let (first, wanted) = *sizes.get_or_insert((colour.size, resolution.unwrap_or(colour.size)));
+            if colour.size != first {
+                let (found, expected) = (format!("an image of {}", colour.size), format!("{first}, as the others"));
+                return Err(SceneError::Picture { path: file, found, expected });
+            }
+            let placement =
+                Placement::new(first, wanted, fit).ok_or(SceneError::TooLarge { path: file, found: first, wanted })?;
+            report.colour_clipped_px += colour.clipped_px;
+            report.padded_px = placement.padded_px();
+            for plane in colour.linear.chunks_exact(first.pixels()) {
+                amplitude.extend(placement.light(plane).into_iter().map(f32::sqrt));
+            }
+            focuses.push(Dioptres(image.focus_dpt.into_inner()));
+        }
+        let (_, resolution) = sizes.expect("a stack has images");
+        Ok((Self { resolution, amplitude, focuses, pupil }, report))
+    }
+}
+
+/// The pupil, and at least two images from far to near.
+fn parse(path: &Path, text: &str) -> Result<(PupilDiameter, Vec<ImageEntry>), SceneError> {
+    let error_at = |span: std::ops::Range<usize>, key: &str, found: String, expected: &str| {
+        line_error(path, text, span.start, key, found, expected)
+    };
+    let StackFile { pupil_mm, image } = toml::from_str(text).map_err(|error| {
+        let expected = "TOML with pupil_mm, and for each image [[image]] with file and focus_dpt";
+        error_at(error.span().unwrap_or_default(), "stack", error.message().to_owned(), expected)
+    })?;
+    let pupil = PupilDiameter::from_mm(*pupil_mm.get_ref() as f32);
+    if !(pupil.mm() > 0.0 && pupil <= WIDEST_PUPIL) {
+        let expected = format!("millimetres, above 0 and up to {}", WIDEST_PUPIL.mm());
+        return Err(error_at(pupil_mm.span(), "pupil_mm", pupil_mm.get_ref().to_string(), &expected));
+    }
+    let (span, mut images) = (image.span(), image.into_inner());
+    if !(2..=MOST_DEPTH_LAYERS).contains(&images.len()) {
+        let expected = format!("2 to {MOST_DEPTH_LAYERS}, each focused at another depth");
+        return Err(error_at(span, "image", format!("{} images", images.len()), &expected));
+    }
+    for image in &images {
+        let focus_dpt = *image.focus_dpt.get_ref();
+        if !(0.0..=NEAREST_DPT).contains(&focus_dpt) {
+            let expected = format!("dioptres, from 0, which is infinity, to {NEAREST_DPT}");
+            return Err(error_at(image.focus_dpt.span(), "focus_dpt", focus_dpt.to_string(), &expected));
+        }
+    }
+    images.sort_by(|a, b| a.focus_dpt.get_ref().total_cmp(b.focus_dpt.get_ref()));
+    for pair in images.windows(2) {
+        let [far, near] = [&pair[0], &pair[1]].map(|image| *image.focus_dpt.get_ref());
+        if near - far <= SAME_FOCUS_DPT {
+            let found = format!("{near} of \"{}\" beside {far} of \"{}\"", pair[1].file, pair[0].file);
+            return Err(error_at(pair[1].focus_dpt.span(), "focus_dpt", found, "each image at a depth of its own"));
+        }
+    }
+    Ok((pupil, images))
+}
+
+#[cfg(test)]
+mod tests {
+    use image::{ImageBuffer, Rgb};
+
+    use super::*;
+
+    const SIZE: Resolution = Resolution { width: 5, height: 3 };
+
+    /// A folder with images whose red is their number times 50, and what `text` says of them.
+    fn folder(text: &str) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        for number in 0..3u8 {
+            let (width, height) = if number < 2 { (SIZE.width, SIZE.height) } else { (4, 4) };
+            let image = ImageBuffer::from_pixel(width as u32, height as u32, Rgb([50 * number, 128, 255]));
+            image.save(folder.path().join(format!("{number}.png"))).unwrap();
+        }
+        std::fs::write(folder.path().join(FILE), text).unwrap();
+        folder
+    }
+
+    fn entry(file: &str, focus_dpt: &str) -> String {
+        format!("[[image]]\nfile = \"{file}\"\nfocus_dpt = {focus_dpt}\n")
+    }
+
+    fn two() -> String {
+        format!("pupil_mm = 2.5\n{}{}", entry("1.png", "2.5"), entry("0.png", "0"))
+    }
+
+    #[test]
+    fn images_are_sorted_from_far_to_near_and_become_amplitudes() {
+        let folder = folder(&two());
+        let (stack, report) = FocalStack::load(folder.path(), None, Fit::Native).unwrap();
+        assert_eq!((stack.resolution, &stack.focuses), (SIZE, &[0.0, 2.5].map(Dioptres).to_vec()));
+        assert_eq!((stack.pupil.mm(), report), (2.5, FocalStackReport::default()));
+        assert_eq!(stack.amplitude.len(), 2 * 3 * SIZE.pixels());
+        let red_of = |image: usize| stack.amplitude[image * 3 * SIZE.pixels()];
+        // sRGB 50 is 0.0319 of white.
+        assert!(red_of(0) == 0.0 && (red_of(1) - 0.0319f32.sqrt()).abs() < 1e-3, "{}", red_of(1));
+        assert_eq!(stack.amplitude[2 * SIZE.pixels()], 1.0);
+
+        let larger = Some(Resolution { width: 9, height: 4 });
+        let (padded, report) = FocalStack::load(folder.path(), larger, Fit::Native).unwrap();
+        assert_eq!((padded.resolution.pixels(), report.padded_px), (36, 36 - 15));
+        assert_eq!(padded.amplitude.len(), 2 * 3 * 36);
+    }
+
+    #[test]
+    fn what_is_saved_is_loaded() {
+        let folder = tempfile::tempdir().unwrap();
+        let directory = folder.path().join("stack");
+        let image = |number: usize| LinearImage {
+            resolution: SIZE,
+            pixels: (0..3 * SIZE.pixels()).map(|index| (index + number) as f32 / 64.0).collect(),
+        };
+        let focuses = [0.0, 1.25, 2.857].map(Dioptres);
+        FocalStack::save(&directory, &[0, 1, 2].map(image), &focuses, PupilDiameter::from_mm(3.25)).unwrap();
+        let (stack, report) = FocalStack::load(&directory, None, Fit::Native).unwrap();
+        assert_eq!((stack.focuses, stack.pupil.mm(), report), (focuses.to_vec(), 3.25, FocalStackReport::default()));
+        let written = [0, 1, 2].map(image).into_iter().flat_map(|image| image.pixels);
+        assert_eq!(stack.amplitude, written.map(f32::sqrt).collect::<Vec<_>>());
+        let again = FocalStack::save(&directory, &[image(0)], &focuses[..1], PupilDiameter::from_mm(3.0));
+        assert_eq!(again.unwrap_err().kind(), std::io::ErrorKind::AlreadyExists);
+    }
+
+    #[test]
+    fn what_cannot_be_used_is_told_with_its_line() {
+        let cases: [(&str, &[&str]); 11] = [
+            (&two().replace("2.5\n[", "0\n["), &["line 1: `pupil_mm`", "found 0", "millimetres", "up to 20"]),
+            (&two().replace("2.5\n[", "300\n["), &["line 1: `pupil_mm`", "found 300"]),
+            (&two().replace("pupil_mm", "pupil"), &["line 1", "unknown field `pupil`", "pupil_mm", "focus_dpt"]),
+            (&entry("0.png", "0"), &["missing field `pupil_mm`"]),
+            (&format!("pupil_mm = 3\n{}", entry("0.png", "0")), &["line 2: `image`", "1 images", "2 to 64"]),
+            (&two().replace("focus_dpt = 0\n", "focus_dpt = -0.5\n"), &["line 7: `focus_dpt`", "-0.5", "infinity"]),
+            (&two().replace("focus_dpt = 0\n", "focus_dpt = nan\n"), &["line 7: `focus_dpt`", "NaN"]),
+            (
+                &two().replace("focus_dpt = 0\n", "focus_dpt = 2.5003\n"),
+                &["line 7: `focus_dpt`", "2.5003 of \"0.png\" beside 2.5 of \"1.png\"", "of its own"],
+            ),
+            (&two().replace("\"0.png\"", "\"none.png\""), &["none.png", "PNG"]),
+            (&two().replace("\"1.png\"", "\"2.png\""), &["2.png: an image of 4x4", "5x3, as the others"]),
+            (&two().replace("file = \"0.png\"\n", ""), &["line 5", "missing field `file`"]),
+        ];
+        for (text, says) in cases {
+            let folder = folder(text);
+            let error = FocalStack::load(folder.path(), None, Fit::Native).unwrap_err().to_string();
+            for words in says {
+                assert!(error.contains(words), "no '{words}' in: {error}\nof {text}");
+            }
+        }
+        let small = Some(Resolution { width: 4, height: 3 });
+        let error = FocalStack::load(folder(&two()).path(), small, Fit::Native).unwrap_err().to_string();
+        assert!(error.contains("0.png is 5x3; expected at most 4x3"), "{error}");
+        let absent = FocalStack::load(Path::new("nowhere"), None, Fit::Native).unwrap_err().to_string();
+        assert!(absent.contains("nowhere/stack.toml") && absent.contains("a directory with a stack.toml"), "{absent}");
+    }
+}
