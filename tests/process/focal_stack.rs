@@ -115,4 +115,6 @@ fn other_stacks_weights_and_options_are_refused_in_words_and_nothing_is_left() {
         assert!(!ended.stderr.contains("panicked") && ended.stdout.is_empty(), "{what}");
         assert_eq!(names(), before, "something was left behind by {what}");
     }
+    let checked = run(HOLOD, &["check", "--weights", weights.to_str().unwrap()], folder.path());
+    assert!(!checked.status.success() && checked.stdout.contains("it takes focal stacks"), "{checked:?}");
 }

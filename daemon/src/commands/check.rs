@@ -11,7 +11,7 @@ use holod_calibration::rig::{Meaning, Rig};
 use holod_calibration::{PupilDiameter, Resolution};
 use holod_model::Weights;
 use holod_model::conditions::BenchFit;
-use holod_model::weights::JudgedBench;
+use holod_model::weights::{Architecture, JudgedBench};
 use holod_pupil_input::{Profile, TrackerSpec, serial_port_warnings};
 use serde::Serialize;
 
@@ -86,7 +86,12 @@ fn weights_checks(rig: &Rig, weights: &Result<Weights, Failure>) -> Vec<Check> {
         Err(failure) => return vec![check("weights", false, failure.to_string())],
     };
     let (config, bench) = (weights.config(), &rig.geometry);
-    let network = format!("{} {} with {} layers", config.architecture, config.version, config.layer_count());
+    let mut network = format!("{} {} with {} layers", config.architecture, config.version, config.layer_count());
+    let shows_pictures = config.architecture != Architecture::FocalStack;
+    if !shows_pictures {
+        network
+            .push_str(": it takes focal stacks, which are for `holod render --focal-stack` alone; name other weights");
+    }
     let [least_px, most_px] = config.trained.volume_blur_px;
     let [narrowest, widest] = weights.trained_pupils(bench).map(PupilDiameter::mm);
     let mut blur = format!(
@@ -109,7 +114,7 @@ fn weights_checks(rig: &Rig, weights: &Result<Weights, Failure>) -> Vec<Check> {
         BenchFit::Far(outside) => (false, outside.to_string()),
     };
     let mut checks =
-        vec![check("weights", true, network), check("blur", true, blur), check("spread", fits, diffraction)];
+        vec![check("weights", shows_pictures, network), check("blur", true, blur), check("spread", fits, diffraction)];
     if let Some(JudgedBench { name, judged }) = weights.judged_on_the_like_of(bench, PupilDiameter::from_mm(3.0)) {
         let quality = format!(
             "{:.1} dB over all ({:+.1} to smooth phase), {:.1} dB in focus and a focus slope of {:.2} on the bench most \

@@ -55,6 +55,14 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
         FocalStack::load(directory, args.scene.resolution, args.scene.fit.into()).map_err(scene::failure)
     })?;
     let resolution = stack.resolution;
+    let pixels = stack.amplitude.len() / 3;
+    if 2 * done.colour_clipped_px > pixels {
+        tracing::warn!(
+            "{name}: {} of {pixels} pixels are brighter than white and were clipped: scale the pictures' light so that \
+             white is 1",
+            done.colour_clipped_px
+        );
+    }
     scene::check_fits(resolution, &rig.geometry, &name)?;
     render::check_pupil(&weights, &rig.geometry, &format!("{name}/stack.toml: pupil_mm"), stack.pupil)?;
     let mut engine = progress::during(&format!("preparing the network for {resolution}"), || {
@@ -95,7 +103,7 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
     }
     results::print(&format!(
         "{}: hologram of {resolution} from {} images for a pupil of {} mm in {:.0} ms, {:.1} s with all else; {:.3} % of \
-         amplitudes clipped\nfocused from {:.2} to {:.2} dpt; pixels padded {}\nin {}: {}",
+         amplitudes clipped\nfocused from {:.2} to {:.2} dpt; pixels clipped {}, padded {}\nin {}: {}",
         report.focal_stack,
         report.focus_dpt.len(),
         report.pupil_mm,
@@ -104,6 +112,7 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
         report.clipped_share * 100.0,
         report.focus_dpt[0],
         report.focus_dpt[report.focus_dpt.len() - 1],
+        report.colour_clipped_px,
         report.padded_px,
         args.out.display(),
         FILES.join(", ")

@@ -43,7 +43,7 @@ pub struct FocalStack {
 /// What happened to the images between their files and the network.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct FocalStackReport {
-    /// Colour values of all images above white or not finite, which were clipped.
+    /// Pixels of all images of which some colour was above white or not finite, and was clipped.
     pub colour_clipped_px: usize,
     /// Pixels of each image that the picture does not reach: black.
     pub padded_px: usize,
