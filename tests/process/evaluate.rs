@@ -193,12 +193,12 @@ fn scenes_of_the_renderer_are_judged_told_and_written() {
 /// --size 256
 /// --pupils 2,4 --planes 2 --rays 8`, then `python -m holod_training evaluate --marks` on these.
 const LIGHT_OF_MARKS: [(&str, f64, f64, f64); 6] = [
-    ("dots", 2.0, 1.5551, 0.000_275_6),
-    ("dots", 4.0, 1.1411, 0.000_224_3),
-    ("lines", 2.0, 1.1070, 0.000_337_4),
-    ("lines", 4.0, 0.9472, 0.000_281_3),
-    ("stars", 2.0, 1.3883, 0.000_249_1),
-    ("stars", 4.0, 0.7874, 0.000_169_9),
+    ("dots", 2.0, 1.1884, 0.000_188_7),
+    ("dots", 4.0, 1.0340, 0.000_105_3),
+    ("lines", 2.0, 0.9561, 0.000_243_0),
+    ("lines", 4.0, 0.9953, 0.000_174_5),
+    ("stars", 2.0, 1.1016, 0.000_178_9),
+    ("stars", 4.0, 0.9661, 0.000_085_3),
 ];
 
 /// Every figure of `rows` that is more than 1 % off what was `found`, or of something else.
