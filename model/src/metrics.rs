@@ -108,7 +108,7 @@ pub struct StackScore {
     /// [`ssim`], mean over planes; `None` where its window does not fit.
     pub ssim: Option<f64>,
     /// Mean energy, white = 1, of structure of 4 to 16 px that the pictures have with more than 8 px of blur and the
-    /// target has not; `None` where no region of 32x32 px has some.
+    /// target has not; `None` where no whole region of 32x32 px has a block with so much blur.
     pub foam: Option<f64>,
     /// PSNR of showing the target's mean at every plane: what no focus at all would score.
     pub flat_oracle_psnr_db: f64,

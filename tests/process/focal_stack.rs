@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
 use holod_model::engine::FocalStackEngine;
 use holod_model::files::StoredHologram;
-use holod_model::scene::{Fit, FocalStack};
+use holod_model::scene::{Fit, FocalStack, FocalStackFiles};
 use holod_model::scene_renderer::sample_scene;
 use holod_model::{ComplexHologram, LinearImage, Weights};
 use holod_tests::daemon::run;
@@ -47,7 +47,7 @@ fn a_folder_of_images_becomes_the_hologram_that_the_engine_makes_of_it() {
     let written = fs::read(folder.path().join("hologram/report.json")).unwrap();
     assert_eq!(serde_json::from_slice::<Value>(&written).unwrap()["focal_stack"], "stack");
 
-    let (stack, _) = FocalStack::load(&folder.path().join("stack"), None, Fit::Native).unwrap();
+    let (stack, _) = FocalStackFiles::open(&folder.path().join("stack")).unwrap().load(None, Fit::Native).unwrap();
     let mut expected = ComplexHologram::dark(SIZE);
     FocalStackEngine::new(&Weights::load(&weights).unwrap(), &BENCH, SIZE)
         .unwrap()
@@ -85,17 +85,18 @@ fn other_stacks_weights_and_options_are_refused_in_words_and_nothing_is_left() {
     let image = fs::read(at("cut/focus-01.exr")).unwrap();
     fs::write(at("cut/focus-01.exr"), &image[..image.len() / 2]).unwrap();
     let weights = weights();
-    let cases: [(&[&str], i32, &[&str]); 11] = [
+    let cases: [(&[&str], i32, &[&str]); 12] = [
         (&["--focal-stack", "two"], 65, &["two/stack.toml", "found 2 images", "takes 3 images", "1.429"]),
-        (&["--focal-stack", "empty"], 66, &["empty/stack.toml", "names images and their focuses"]),
+        (&["--focal-stack", "empty"], 66, &["empty/stack.toml", "names images and focuses"]),
         (&["--focal-stack", "cut"], 65, &["cut/focus-01.exr"]),
-        (&["--focal-stack", "wide"], 64, &["wide/stack.toml: pupil_mm: found 12 mm", "trained"]),
+        (&["--focal-stack", "wide"], 65, &["wide/stack.toml: `pupil_mm`: found 12 mm", "trained"]),
         (&["--focal-stack", "stack", "--weights", "fast"], 78, &["`expected-stack` network", "not a focal stack"]),
         (&["--focal-stack", "stack", "--backend", "gpu"], 64, &["--backend", "processor alone", "`cpu`"]),
         (&["--focal-stack", "stack", "--pupil", "3"], 64, &["--focal-stack", "--pupil"]),
         (&["--focal-stack", "stack", "--scene", "stack"], 64, &["--focal-stack", "--scene"]),
         (&["--focal-stack", "stack", "--resolution", "40x32"], 65, &["48x32", "at most 40x32", "fit"]),
         (&["--focal-stack", "stack", "--resolution", "4000x32"], 64, &["4000x32", "larger than the panel"]),
+        (&["--pupil", "3"], 78, &["`focal-stack` network", "--focal-stack"]),
         (&["--pupil", "3", "--backend", "cpu"], 78, &["`focal-stack` network", "--focal-stack"]),
     ];
     let names = || {

@@ -6,10 +6,10 @@ use std::time::Instant;
 use holod_calibration::rig::Rig;
 use holod_calibration::{Dioptres, DisplayGeometry};
 use holod_model::ComplexHologram;
-use holod_model::engine::FocalStackEngine;
+use holod_model::engine::{EngineError, FocalStackEngine};
 use holod_model::files::{BenchOptics, StoredHologram};
 use holod_model::optics::{DoublePhase, PhasePattern};
-use holod_model::scene::FocalStack;
+use holod_model::scene::FocalStackFiles;
 use serde::Serialize;
 
 use super::render::{self, FILES};
@@ -51,31 +51,36 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
     let staging = Staging::new(&args.out, &FILES, args.force)?;
     let weights = progress::during("loading the network", || setup::weights(rig))?;
     let name = directory.display().to_string();
+    let at_fault = |error: EngineError| match error {
+        EngineError::Focuses { .. } => Failure::new(Exit::Data, format!("{name}/stack.toml: {error}")),
+        other => renderer::failure(other),
+    };
+    let files = FocalStackFiles::open(directory).map_err(scene::failure)?;
+    FocalStackEngine::check(&weights, &rig.geometry, files.focuses()).map_err(at_fault)?;
+    render::check_pupil(&weights, &rig.geometry, files.pupil())
+        .map_err(|why| Failure::new(Exit::Data, format!("{name}/stack.toml: `pupil_mm`: {why}")))?;
     let (stack, done) = progress::during("loading the focal stack", || {
-        FocalStack::load(directory, args.scene.resolution, args.scene.fit.into()).map_err(scene::failure)
+        files.load(args.scene.resolution, args.scene.fit.into()).map_err(scene::failure)
     })?;
     let resolution = stack.resolution;
-    let pixels = stack.amplitude.len() / 3;
-    if 2 * done.colour_clipped_px > pixels {
+    if 2 * done.colour_clipped_px > done.source_px {
         tracing::warn!(
-            "{name}: {} of {pixels} pixels are brighter than white and were clipped: scale the pictures' light so that \
-             white is 1",
-            done.colour_clipped_px
+            "{name}: {} of {} pixels are brighter than white and were clipped: scale the pictures' light so that white \
+             is 1",
+            done.colour_clipped_px,
+            done.source_px
         );
     }
     scene::check_fits(resolution, &rig.geometry, &name)?;
-    render::check_pupil(&weights, &rig.geometry, &format!("{name}/stack.toml: pupil_mm"), stack.pupil)?;
     let mut engine = progress::during(&format!("preparing the network for {resolution}"), || {
-        FocalStackEngine::new(&weights, &rig.geometry, resolution).map_err(renderer::failure)
+        FocalStackEngine::new(&weights, &rig.geometry, resolution).map_err(at_fault)
     })?;
     let amplitude_constant = weights.config().amplitude_constant;
     let mut double_phase = DoublePhase::new(resolution, amplitude_constant);
     let (mut hologram, mut pattern) = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
     let computing = Instant::now();
     let clipped_share = progress::during(&format!("computing the hologram of {resolution}"), || {
-        engine
-            .render(&stack, &mut hologram)
-            .map_err(|error| Failure::new(Exit::Data, format!("{name}/stack.toml: {error}")))?;
+        engine.render(&stack, &mut hologram).map_err(at_fault)?;
         Ok::<_, Failure>(double_phase.encode(&hologram, &mut pattern).clipped_share)
     })?;
     let frame_ms = computing.elapsed().as_secs_f64() * 1e3;
@@ -102,8 +107,8 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
         return results::print_json(&report);
     }
     results::print(&format!(
-        "{}: hologram of {resolution} from {} images for a pupil of {} mm in {:.0} ms, {:.1} s with all else; {:.3} % of \
-         amplitudes clipped\nfocused from {:.2} to {:.2} dpt; pixels clipped {}, padded {}\nin {}: {}",
+        "{}: hologram of {resolution} from {} images for a pupil of {} mm in {:.0} ms, {:.1} s with all else; {:.3} % \
+         of amplitudes clipped\nfocused from {:.2} to {:.2} dpt; pixels clipped {}, padded {}\nin {}: {}",
         report.focal_stack,
         report.focus_dpt.len(),
         report.pupil_mm,

@@ -123,7 +123,7 @@ pub(super) fn compute(
     backend: Backend,
 ) -> Result<Computed, Failure> {
     let weights = progress::during("loading the network", || setup::weights(rig))?;
-    check_pupil(&weights, &rig.geometry, "--pupil", pupil)?;
+    check_pupil(&weights, &rig.geometry, pupil).map_err(|why| Failure::new(Exit::Usage, format!("--pupil: {why}")))?;
     let frames = progress::during("loading the scene", || scene::frames(named, &rig.geometry))?;
     let resolution = frames.resolution();
     let encoder = renderer::panel_encoder(rig, resolution)?;
@@ -165,25 +165,16 @@ pub(super) fn compute(
     Ok(Computed { renderer, encoder, levels, optics, report })
 }
 
-/// Refuses a pupil, which `name` says, that the weights were not trained for.
-pub(super) fn check_pupil(
-    weights: &Weights,
-    bench: &DisplayGeometry,
-    name: &str,
-    pupil: PupilDiameter,
-) -> Result<(), Failure> {
+/// Says why a pupil cannot be had, where the weights were not trained for it.
+pub(super) fn check_pupil(weights: &Weights, bench: &DisplayGeometry, pupil: PupilDiameter) -> Result<(), String> {
     let [narrowest, widest] = weights.trained_pupils(bench);
     if (narrowest..=widest).contains(&pupil) {
         return Ok(());
     }
-    Err(Failure::new(
-        Exit::Usage,
-        format!(
-            "{name}: found {} mm, expected {:.2} to {:.2} mm, the pupils that these weights were trained for on this \
-             bench",
-            pupil.mm(),
-            narrowest.mm(),
-            widest.mm()
-        ),
+    Err(format!(
+        "found {} mm, expected {:.2} to {:.2} mm, the pupils that these weights were trained for on this bench",
+        pupil.mm(),
+        narrowest.mm(),
+        widest.mm()
     ))
 }

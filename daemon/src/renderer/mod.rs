@@ -103,6 +103,9 @@ pub fn open(
                 other => Err(other),
             })
             .map_err(|error| {
+                if matches!(error, EngineError::Family { .. }) {
+                    return failure(error);
+                }
                 let named = if backend == Backend::GpuHalf { "gpu-half" } else { "gpu" };
                 Failure::new(Exit::Unavailable, format!("--backend {named}: {error}"))
             }),

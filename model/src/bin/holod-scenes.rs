@@ -314,7 +314,10 @@ fn generate(options: &Generate) -> Result<String, Failure> {
 
 fn focal_stack(options: &FocalStackOf) -> Result<String, Failure> {
     let bench = bench_of(options.rig.as_deref())?;
-    let unreadable = |error: SceneShardError| Failure { code: exit::DATA, message: error.to_string() };
+    let unreadable = |error: SceneShardError| {
+        let is_absent = matches!(error, SceneShardError::Read { .. });
+        Failure { code: if is_absent { exit::NO_INPUT } else { exit::DATA }, message: error.to_string() }
+    };
     let shard = SceneShard::open(&options.scene, &bench).map_err(unreadable)?;
     let wanted = |pupil: &PupilDiameter| (pupil.mm() - options.pupil).abs() < 1e-4;
     let index = shard.pupils().iter().position(wanted).ok_or_else(|| {
@@ -330,7 +333,12 @@ fn focal_stack(options: &FocalStackOf) -> Result<String, Failure> {
     let images = shard.stack(index).map_err(unreadable)?;
     FocalStack::save(&options.out, &images, shard.focuses(), shard.pupils()[index]).map_err(|error| Failure {
         code: exit::CANNOT_CREATE,
-        message: format!("{}: {error}; name a new folder with --out", options.out.display()),
+        message: match error.kind() {
+            std::io::ErrorKind::AlreadyExists => {
+                format!("{}: found a file or folder; name a new one with --out", options.out.display())
+            }
+            _ => format!("{}: {error}", options.out.display()),
+        },
     })?;
     Ok(format!("{} pictures and stack.toml written to {}", images.len(), options.out.display()))
 }

@@ -87,12 +87,11 @@ impl Golden {
 
     fn focal_stack(&self) -> FocalStack {
         let RgbdFrame { resolution, amplitude, .. } = self.frame();
-        let planes = self.weights().config().planes;
         let bench = self.bench(resolution);
         FocalStack {
             resolution,
             amplitude,
-            focuses: (0..planes).map(|plane| bench.depth_at(plane as f64 / (planes - 1) as f64)).collect(),
+            focuses: FocalStackEngine::focuses(&self.weights(), &bench).unwrap(),
             pupil: self.pupil(),
         }
     }

@@ -52,7 +52,7 @@ pub enum EngineError {
     Family { found: Architecture, takes: &'static str, remedy: &'static str },
     /// A focal stack has other images than the network takes.
     #[error(
-        "found {}; the network takes {}: render the scene so, or train for these (`planes`)",
+        "found {}; the network takes {}, uniform over the depth range of the rig: render the scene so; other numbers want a network of theirs (`--planes`)",
         at_focuses(found),
         at_focuses(expected)
     )]

@@ -156,8 +156,8 @@ struct Nets<'a> {
     share: f32,
 }
 
-/// The field of a network that lights planes at `positions_m`: both nets are `told` the one map and the other amplitudes
-/// are `wanted` there; each change has the `weight` of a plane and a sample.
+/// The field of a network that lights planes at `positions_m`: both nets are `told` the one map and the other's
+/// amplitudes are `wanted` there; each change has the `weight` of a plane and a sample.
 #[allow(clippy::too_many_arguments, reason = "written out as plainly as it can be")]
 fn lit_planes(
     stages: &mut Vec<Stage>,
@@ -435,8 +435,8 @@ fn refined(weights: &Weights, out: &Map, wanted: Map) -> Map {
     Map { values, ..wanted }
 }
 
-/// The field at the SLM plane when the wanted amplitudes light planes at `positions_m` through the first net's masks, with its
-/// phases.
+/// The field at the SLM plane when the wanted amplitudes light planes at `positions_m` through the first net's masks,
+/// with its phases.
 fn light_planes(bench: &DisplayGeometry, positions_m: &[f64], out: &Map, wanted: &Map) -> Vec<Complex64> {
     let (count, size, pixels) = (positions_m.len(), [out.height, out.width], out.height * out.width);
     let offset = ((count - 1) as f64).ln();

@@ -10,7 +10,7 @@
 //! focus_dpt = 0.0            # where the eye is focused
 //! ```
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use holod_calibration::{Colour, Dioptres, PupilDiameter, Resolution};
 use serde::Deserialize;
@@ -43,7 +43,9 @@ pub struct FocalStack {
 /// What happened to the images between their files and the network.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct FocalStackReport {
-    /// Pixels of all images of which some colour was above white or not finite, and was clipped.
+    /// Pixels of all images in their files.
+    pub source_px: usize,
+    /// Those of which some colour was above white, below 0 or not finite, and was clipped.
     pub colour_clipped_px: usize,
     /// Pixels of each image that the picture does not reach: black.
     pub padded_px: usize,
@@ -64,9 +66,74 @@ struct ImageEntry {
     focus_dpt: Spanned<f64>,
 }
 
+/// A focal stack whose `stack.toml` was read, and whose images are as yet in their files.
+#[derive(Debug)]
+pub struct FocalStackFiles {
+    files: Vec<PathBuf>,
+    focuses: Vec<Dioptres>,
+    pupil: PupilDiameter,
+}
+
+impl FocalStackFiles {
+    /// Reads the `stack.toml` in `directory`.
+    ///
+    /// # Errors
+    /// There is none, or a line of it cannot be used.
+    pub fn open(directory: &Path) -> Result<Self, SceneError> {
+        let path = directory.join(FILE);
+        let text = read_text(&path, "a directory with a stack.toml, of at most 1 MiB, which names images and focuses")?;
+        let (pupil, images) = parse(&path, &text)?;
+        let focuses = images.iter().map(|image| Dioptres(*image.focus_dpt.get_ref())).collect();
+        let files = images.into_iter().map(|image| directory.join(image.file)).collect();
+        Ok(Self { files, focuses, pupil })
+    }
+
+    /// Where the images are focused, far to near.
+    pub fn focuses(&self) -> &[Dioptres] {
+        &self.focuses
+    }
+
+    /// The pupil that they were made for.
+    pub fn pupil(&self) -> PupilDiameter {
+        self.pupil
+    }
+
+    /// Loads the images, at `resolution` or, without one, at their own.
+    ///
+    /// # Errors
+    /// One cannot be read, or has another size than the first.
+    pub fn load(self, resolution: Option<Resolution>, fit: Fit) -> Result<(FocalStack, FocalStackReport), SceneError> {
+        let Self { files, focuses, pupil } = self;
+        let mut report = FocalStackReport::default();
+        let mut sizes: Option<(Resolution, Resolution)> = None;
+        let mut amplitude = Vec::new();
+        for file in files {
+            let colour = raster::read_colour(&file)?;
+            let (first, wanted) = *sizes.get_or_insert((colour.size, resolution.unwrap_or(colour.size)));
+            if colour.size != first {
+                let (found, expected) = (format!("an image of {}", colour.size), format!("{first}, as the others"));
+                return Err(SceneError::Picture { path: file, found, expected });
+            }
+            let placement =
+                Placement::new(first, wanted, fit).ok_or(SceneError::TooLarge { path: file, found: first, wanted })?;
+            report.source_px += first.pixels();
+            report.colour_clipped_px += colour.clipped_px;
+            report.padded_px = placement.padded_px();
+            if amplitude.is_empty() {
+                amplitude.reserve_exact(3 * focuses.len() * wanted.pixels());
+            }
+            for plane in colour.linear.chunks_exact(first.pixels()) {
+                amplitude.extend(placement.light(plane).into_iter().map(f32::sqrt));
+            }
+        }
+        let (_, resolution) = sizes.expect("a stack has images");
+        Ok((FocalStack { resolution, amplitude, focuses, pupil }, report))
+    }
+}
+
 impl FocalStack {
     /// Writes `images`, of one size, as OpenEXR files of single precision, with a `stack.toml` that says where each is
-    /// focused, to the new folder `directory`.
+    /// focused, to the new folder `directory`, which appears once all is written.
     ///
     /// # Errors
     /// The folder is there already, or it or a file cannot be written.
@@ -80,7 +147,27 @@ impl FocalStack {
         pupil: PupilDiameter,
     ) -> std::io::Result<()> {
         assert_eq!(images.len(), focuses.len(), "one image a focus");
-        std::fs::create_dir(directory)?;
+        if directory.exists() {
+            return Err(std::io::ErrorKind::AlreadyExists.into());
+        }
+        let mut part = directory.as_os_str().to_owned();
+        part.push(".part");
+        let part = PathBuf::from(part);
+        std::fs::create_dir_all(&part)?;
+        let written = Self::write(&part, images, focuses, pupil).and_then(|()| std::fs::rename(&part, directory));
+        if written.is_err() {
+            // Why it failed is what is told.
+            let _ = std::fs::remove_dir_all(&part);
+        }
+        written
+    }
+
+    fn write(
+        directory: &Path,
+        images: &[LinearImage],
+        focuses: &[Dioptres],
+        pupil: PupilDiameter,
+    ) -> std::io::Result<()> {
         let mut text = format!("pupil_mm = {}\n", pupil.mm());
         for (number, (image, Dioptres(focus_dpt))) in images.iter().zip(focuses).enumerate() {
             let file = format!("focus-{number:02}.exr");
@@ -95,43 +182,6 @@ impl FocalStack {
         }
         std::fs::write(directory.join(FILE), text)
     }
-
-    /// Loads the focal stack in `directory`, at `resolution` or, without one, at its images' own.
-    ///
-    /// # Errors
-    /// There is no `stack.toml`, or a line of it cannot be used, or an image cannot be read or has another size than
-    /// the first.
-    pub fn load(
-        directory: &Path,
-        resolution: Option<Resolution>,
-        fit: Fit,
-    ) -> Result<(Self, FocalStackReport), SceneError> {
-        let path = directory.join(FILE);
-        let text = read_text(&path, "a directory with a stack.toml, which names images and their focuses")?;
-        let (pupil, images) = parse(&path, &text)?;
-        let mut report = FocalStackReport::default();
-        let mut sizes: Option<(Resolution, Resolution)> = None;
-        let (mut amplitude, mut focuses) = (Vec::new(), Vec::new());
-        for image in images {
-            let file = directory.join(&image.file);
-            let colour = raster::read_colour(&file)?;
-            let (first, wanted) = *sizes.get_or_insert((colour.size, resolution.unwrap_or(colour.size)));
-            if colour.size != first {
-                let (found, expected) = (format!("an image of {}", colour.size), format!("{first}, as the others"));
-                return Err(SceneError::Picture { path: file, found, expected });
-            }
-            let placement =
-                Placement::new(first, wanted, fit).ok_or(SceneError::TooLarge { path: file, found: first, wanted })?;
-            report.colour_clipped_px += colour.clipped_px;
-            report.padded_px = placement.padded_px();
-            for plane in colour.linear.chunks_exact(first.pixels()) {
-                amplitude.extend(placement.light(plane).into_iter().map(f32::sqrt));
-            }
-            focuses.push(Dioptres(image.focus_dpt.into_inner()));
-        }
-        let (_, resolution) = sizes.expect("a stack has images");
-        Ok((Self { resolution, amplitude, focuses, pupil }, report))
-    }
 }
 
 /// The pupil, and at least two images from far to near.
@@ -141,7 +191,9 @@ fn parse(path: &Path, text: &str) -> Result<(PupilDiameter, Vec<ImageEntry>), Sc
     };
     let StackFile { pupil_mm, image } = toml::from_str(text).map_err(|error| {
         let expected = "TOML with pupil_mm, and for each image [[image]] with file and focus_dpt";
-        error_at(error.span().unwrap_or_default(), "stack", error.message().to_owned(), expected)
+        let span = error.span().unwrap_or_default();
+        let key = text.get(span.clone()).filter(|key| !key.is_empty() && key.len() < 60 && !key.contains('\n'));
+        error_at(span, key.unwrap_or("stack"), error.message().to_owned(), expected)
     })?;
     let pupil = PupilDiameter::from_mm(*pupil_mm.get_ref() as f32);
     if !(pupil.mm() > 0.0 && pupil <= WIDEST_PUPIL) {
@@ -191,6 +243,10 @@ mod tests {
         folder
     }
 
+    fn load(directory: &Path, resolution: Option<Resolution>) -> Result<(FocalStack, FocalStackReport), SceneError> {
+        FocalStackFiles::open(directory)?.load(resolution, Fit::Native)
+    }
+
     fn entry(file: &str, focus_dpt: &str) -> String {
         format!("[[image]]\nfile = \"{file}\"\nfocus_dpt = {focus_dpt}\n")
     }
@@ -202,9 +258,9 @@ mod tests {
     #[test]
     fn images_are_sorted_from_far_to_near_and_become_amplitudes() {
         let folder = folder(&two());
-        let (stack, report) = FocalStack::load(folder.path(), None, Fit::Native).unwrap();
+        let (stack, report) = load(folder.path(), None).unwrap();
         assert_eq!((stack.resolution, &stack.focuses), (SIZE, &[0.0, 2.5].map(Dioptres).to_vec()));
-        assert_eq!((stack.pupil.mm(), report), (2.5, FocalStackReport::default()));
+        assert_eq!((stack.pupil.mm(), report), (2.5, FocalStackReport { source_px: 30, ..Default::default() }));
         assert_eq!(stack.amplitude.len(), 2 * 3 * SIZE.pixels());
         let red_of = |image: usize| stack.amplitude[image * 3 * SIZE.pixels()];
         // sRGB 50 is 0.0319 of white.
@@ -212,7 +268,7 @@ mod tests {
         assert_eq!(stack.amplitude[2 * SIZE.pixels()], 1.0);
 
         let larger = Some(Resolution { width: 9, height: 4 });
-        let (padded, report) = FocalStack::load(folder.path(), larger, Fit::Native).unwrap();
+        let (padded, report) = load(folder.path(), larger).unwrap();
         assert_eq!((padded.resolution.pixels(), report.padded_px), (36, 36 - 15));
         assert_eq!(padded.amplitude.len(), 2 * 3 * 36);
     }
@@ -227,8 +283,9 @@ mod tests {
         };
         let focuses = [0.0, 1.25, 2.857].map(Dioptres);
         FocalStack::save(&directory, &[0, 1, 2].map(image), &focuses, PupilDiameter::from_mm(3.25)).unwrap();
-        let (stack, report) = FocalStack::load(&directory, None, Fit::Native).unwrap();
-        assert_eq!((stack.focuses, stack.pupil.mm(), report), (focuses.to_vec(), 3.25, FocalStackReport::default()));
+        let (stack, report) = load(&directory, None).unwrap();
+        assert_eq!((stack.focuses, stack.pupil.mm(), report.source_px), (focuses.to_vec(), 3.25, 45));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left beside it");
         let written = [0, 1, 2].map(image).into_iter().flat_map(|image| image.pixels);
         assert_eq!(stack.amplitude, written.map(f32::sqrt).collect::<Vec<_>>());
         let again = FocalStack::save(&directory, &[image(0)], &focuses[..1], PupilDiameter::from_mm(3.0));
@@ -255,15 +312,15 @@ mod tests {
         ];
         for (text, says) in cases {
             let folder = folder(text);
-            let error = FocalStack::load(folder.path(), None, Fit::Native).unwrap_err().to_string();
+            let error = load(folder.path(), None).unwrap_err().to_string();
             for words in says {
                 assert!(error.contains(words), "no '{words}' in: {error}\nof {text}");
             }
         }
         let small = Some(Resolution { width: 4, height: 3 });
-        let error = FocalStack::load(folder(&two()).path(), small, Fit::Native).unwrap_err().to_string();
+        let error = load(folder(&two()).path(), small).unwrap_err().to_string();
         assert!(error.contains("0.png is 5x3; expected at most 4x3"), "{error}");
-        let absent = FocalStack::load(Path::new("nowhere"), None, Fit::Native).unwrap_err().to_string();
+        let absent = load(Path::new("nowhere"), None).unwrap_err().to_string();
         assert!(absent.contains("nowhere/stack.toml") && absent.contains("a directory with a stack.toml"), "{absent}");
     }
 }

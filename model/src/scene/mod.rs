@@ -39,7 +39,7 @@ use self::fit::Placement;
 pub use self::array::{ArrayColours, ArrayDepths, ArrayError, ArrayPicture};
 pub use self::decoded::MOST_PIXELS;
 pub use self::error::SceneError;
-pub use self::focal_stack::{FocalStack, FocalStackReport};
+pub use self::focal_stack::{FocalStack, FocalStackFiles, FocalStackReport};
 pub use self::live::{LiveColour, LiveDepth, LiveError, LiveFormat, LiveReader, LiveReport, MissingDepths};
 
 /// Normalised depths this little outside 0..=1 are rounding, not clamping.

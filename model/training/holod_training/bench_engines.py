@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from holod_training.expected_stack import ExpectedStackNetwork
-from holod_training.export import check_engines_run, load_weights
+from holod_training.export import check_takes_pictures, load_weights
 from holod_training.network import DirectNetwork, FieldNetwork
 from holod_training.optics import double_phase_phasors, levels, upsample_half_band
 
@@ -218,7 +218,7 @@ def parse_holod(text: str) -> HolodTimes:
 def _torch_engines(plan: Plan) -> dict[tuple[str, str], Work | str]:
     """Each part and engine, with its work or why it cannot do it."""
     network = load_weights(plan.weights).to(plan.device)
-    check_engines_run(network.config, plan.weights)
+    check_takes_pictures(network.config, plan.weights)
     whole = PanelLevels(network).eval()
     generator = torch.Generator().manual_seed(1)
     amplitude = torch.rand(1, 3, plan.height, plan.width, generator=generator).to(plan.device)
@@ -283,7 +283,7 @@ def _nets_of(network: FieldNetwork) -> dict[str, nn.Module]:
         return {"lighting.encoded": network.lighting, "correction.encoded": network.correction}
     if isinstance(network, DirectNetwork):
         return {"encoded": network.layers}
-    raise BenchError(f"found a {type(network).__name__}, expected a network that the engines run")
+    raise BenchError(f"found a {type(network).__name__}, expected a network that the engines run on pictures")
 
 
 def _channels_last(x: Tensor) -> Tensor:

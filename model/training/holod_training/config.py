@@ -181,7 +181,7 @@ class NetworkConfig:
             and all(d >= 1 for d in self.correction_dilations),
             f"none, or {self.correction_layers} numbers of at least 1, one for each layer",
         )
-        self._require("planes", self.planes >= 2, "at least 2")
+        self._require("planes", 2 <= self.planes <= 64, "2 to 64")
         self._require("specialists_mm", _rises(self.specialists_mm), "pupils in rising order")
 
     def _require(self, key: str, met: bool, expected: str) -> None:

@@ -95,6 +95,13 @@ def check_engines_run(config: NetworkConfig, source: Path) -> None:
         )
 
 
+def check_takes_pictures(config: NetworkConfig, source: Path) -> None:
+    """Raises WeightsError for a network that no engine runs on a picture and its depth."""
+    check_engines_run(config, source)
+    if config.architecture == "focal-stack":
+        raise WeightsError(f"{source}: found a `focal-stack` network; expected one that takes a picture and its depth")
+
+
 def export(
     source: Path,
     out: Path,

@@ -15,7 +15,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from holod_training.config import ENGINE_ARCHITECTURES, NetworkConfig, OpticsConfig
-from holod_training.export import check_engines_run, load_weights, save_weights, write_beside
+from holod_training.export import check_takes_pictures, load_weights, save_weights, write_beside
 from holod_training.golden_evaluation import write_evaluation
 from holod_training.network import AdjustableLayer, FieldNetwork, Trunk
 from holod_training.optics import (
@@ -212,7 +212,7 @@ def write_golden(
         if not shipped:
             continue
         built_in = load_weights(shipped)
-        check_engines_run(built_in.config, shipped)
+        check_takes_pictures(built_in.config, shipped)
         family = built_in.config.architecture
         path = out / f"{family}-shipped{suffix}.safetensors"
         amplitude, depth = scene(32, 48, seed)

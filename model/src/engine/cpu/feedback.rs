@@ -9,8 +9,8 @@ use super::plane_light::{PlaneLight, PlanePositions};
 use crate::engine::constants::FEEDBACK_DARK_POWER;
 use crate::optics::{signed_bin, transfer_table};
 
-/// One step of Gerchberg and Saxton (1972) at all planes at once: the field goes through the pupil to every plane, takes
-/// the wanted amplitude there with the phase that it has, and the mean of these changes comes back, each with its
+/// One step of Gerchberg and Saxton (1972) at all planes at once: the field goes through the pupil to every plane,
+/// takes the wanted amplitude there with the phase that it has, and the mean of these changes comes back, each with its
 /// weight. The planes change one another too; the second net mends that. Nothing is allocated after `new`.
 pub(super) struct PlaneFeedback {
     /// The share of the change that the field takes.

@@ -29,6 +29,7 @@ use self::network::Network;
 use crate::engine::{EngineError, SAME_FOCUS_DPT, StageTimings, check_pupil};
 use crate::scene::FocalStack;
 use crate::simd::InstructionSet;
+use crate::weights::{Architecture, NetworkConfig};
 use crate::{ComplexHologram, RgbdFrame, Weights};
 
 pub use peak::{fma_peak, stream_bandwidth};
@@ -102,29 +103,38 @@ impl FocalStackEngine {
         check_not_empty(resolution)?;
         let set = InstructionSet::best();
         let network = Network::of_focal_stacks(weights, bench, resolution, set)?;
-        let planes = weights.config.planes;
-        let focuses = (0..planes).map(|plane| bench.depth_at(plane as f64 / (planes - 1) as f64)).collect();
+        let focuses = Self::focuses(weights, bench)?;
         Ok(Self { network, focuses, resolution, set })
     }
 
-    /// Where its images are focused, far to near.
-    pub fn focuses(&self) -> &[Dioptres] {
-        &self.focuses
+    /// Where the images that `weights` take on `bench` are focused, far to near.
+    ///
+    /// # Errors
+    /// [`EngineError::Family`] for weights that take a picture with depth.
+    pub fn focuses(weights: &Weights, bench: &DisplayGeometry) -> Result<Vec<Dioptres>, EngineError> {
+        let &NetworkConfig { architecture, planes, .. } = &weights.config;
+        if architecture != Architecture::FocalStack {
+            return Err(EngineError::takes_frames(architecture));
+        }
+        Ok((0..planes).map(|plane| bench.depth_at(plane as f64 / (planes - 1) as f64)).collect())
+    }
+
+    /// Whether `weights` take images at `found` on `bench`, before these are read.
+    ///
+    /// # Errors
+    /// [`EngineError::Family`], and [`EngineError::Focuses`] for another number of images or other focuses.
+    pub fn check(weights: &Weights, bench: &DisplayGeometry, found: &[Dioptres]) -> Result<(), EngineError> {
+        check_focuses(found, &Self::focuses(weights, bench)?)
     }
 
     /// Writes the hologram of `stack`, for an eye with the pupil that it was made for, to `hologram`.
     ///
     /// # Errors
-    /// [`EngineError::Focuses`] for another number of images or other focuses than [`Self::focuses`], and as
-    /// [`CpuEngine::render`] has them.
+    /// As [`Self::check`] and [`CpuEngine::render`] have them.
     pub fn render(&mut self, stack: &FocalStack, hologram: &mut ComplexHologram) -> Result<(), EngineError> {
         check_sizes(self.resolution, [("the stack", stack.resolution), ("the hologram", hologram.resolution)])?;
         check_pupil(stack.pupil)?;
-        let is_near = |(found, expected): (&Dioptres, &Dioptres)| (found.0 - expected.0).abs() <= SAME_FOCUS_DPT;
-        if stack.focuses.len() != self.focuses.len() || !stack.focuses.iter().zip(&self.focuses).all(is_near) {
-            let told = |focuses: &[Dioptres]| focuses.iter().map(|focus| focus.0).collect();
-            return Err(EngineError::Focuses { found: told(&stack.focuses), expected: told(&self.focuses) });
-        }
+        check_focuses(&stack.focuses, &self.focuses)?;
         assert_eq!(stack.amplitude.len(), 3 * stack.focuses.len() * stack.resolution.pixels(), "one image a focus");
         self.network.render(stack, stack.pupil, hologram);
         Ok(())
@@ -145,4 +155,13 @@ fn check_sizes(expected: Resolution, sizes: [(&'static str, Resolution); 2]) -> 
         Some((what, found)) => Err(EngineError::Resolution { what, found, expected }),
         None => Ok(()),
     }
+}
+
+fn check_focuses(found: &[Dioptres], expected: &[Dioptres]) -> Result<(), EngineError> {
+    let is_near = |(found, expected): (&Dioptres, &Dioptres)| (found.0 - expected.0).abs() <= SAME_FOCUS_DPT;
+    if found.len() == expected.len() && found.iter().zip(expected).all(is_near) {
+        return Ok(());
+    }
+    let told = |focuses: &[Dioptres]| focuses.iter().map(|focus| focus.0).collect();
+    Err(EngineError::Focuses { found: told(found), expected: told(expected) })
 }
