@@ -63,14 +63,7 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
         files.load(args.scene.resolution, args.scene.fit.into()).map_err(scene::failure)
     })?;
     let resolution = stack.resolution;
-    if 2 * done.colour_clipped_px > done.source_px {
-        tracing::warn!(
-            "{name}: {} of {} pixels are brighter than white and were clipped: scale the pictures' light so that white \
-             is 1",
-            done.colour_clipped_px,
-            done.source_px
-        );
-    }
+    scene::warn_of_clipped_colours(&name, done.colour_clipped_px, done.source_px);
     scene::check_fits(resolution, &rig.geometry, &name)?;
     let mut engine = progress::during(&format!("preparing the network for {resolution}"), || {
         FocalStackEngine::new(&weights, &rig.geometry, resolution).map_err(at_fault)

@@ -116,7 +116,7 @@ pub fn warn_of_oddities(
     is_plane: bool,
 ) {
     warn_of_odd_depth(name, frame, report, geometry, is_plane);
-    warn_of_clipped_colours(name, frame, report);
+    warn_of_clipped_colours(name, report.colour_clipped_px, frame.resolution.pixels());
 }
 
 /// Depth that is nearly all clamped, or all one, is most often a wrong encoding.
@@ -135,13 +135,11 @@ fn warn_of_odd_depth(name: &str, frame: &RgbdFrame, report: &FrameReport, geomet
 }
 
 /// Colours that are nearly all brighter than white are most often scene-linear light that was never exposed.
-pub(super) fn warn_of_clipped_colours(name: &str, frame: &RgbdFrame, report: &FrameReport) {
-    let pixels = frame.resolution.pixels();
-    if 2 * report.colour_clipped_px > pixels {
+pub fn warn_of_clipped_colours(name: &str, clipped_px: usize, pixels: usize) {
+    if 2 * clipped_px > pixels {
         tracing::warn!(
-            "{name}: {} of {pixels} pixels are brighter than white and were clipped: scale the picture's light so that \
-             white is 1",
-            report.colour_clipped_px
+            "{name}: {clipped_px} of {pixels} pixels are brighter than white and were clipped: scale the picture's light \
+             so that white is 1"
         );
     }
 }

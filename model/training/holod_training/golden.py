@@ -44,55 +44,28 @@ class Narrow(NamedTuple):
     optics: OpticsConfig = OpticsConfig()
 
 
+SMALL = NetworkConfig(
+    architecture="expected-stack",
+    layers=4,
+    channels=4,
+    adjustable_layers=(2,),
+    modulation_hidden=8,
+    correction_layers=4,
+)
+OTHER_BENCH = OpticsConfig((633.0, 532.0, 473.0), 4.5, 32.0, 0.5, 3.25)
 # Depth layers are left at their default, so that no engine has another.
 NARROW: dict[str, Narrow] = {
     "direct-narrow": Narrow(NetworkConfig(channels=8, modulation_hidden=8), 32, 48),
     "direct-narrow-full": Narrow(NetworkConfig(grid="full", channels=8, modulation_hidden=8), 12, 16),
-    # A pupil that cuts the half band.
-    "expected-stack-narrow": Narrow(
-        NetworkConfig(
-            architecture="expected-stack",
-            layers=4,
-            channels=4,
-            adjustable_layers=(2,),
-            modulation_hidden=8,
-            correction_layers=4,
-        ),
-        16,
-        24,
-        pupil_mm=1.6,
-        # Another bench: more diffraction than was trained, and a volume that does not begin at infinity.
-        optics=OpticsConfig((633.0, 532.0, 473.0), 4.5, 32.0, 0.5, 3.25),
-    ),
-    "expected-stack-narrow-refined": Narrow(
-        NetworkConfig(
-            architecture="expected-stack",
-            layers=4,
-            channels=4,
-            adjustable_layers=(2,),
-            modulation_hidden=8,
-            correction_layers=4,
-            refined_stack=True,
-        ),
-        16,
-        24,
-    ),
-    # Another bench here, too.
+    # A pupil that cuts the half band; more diffraction than was trained, and a volume that does not begin at infinity.
+    "expected-stack-narrow": Narrow(SMALL, 16, 24, pupil_mm=1.6, optics=OTHER_BENCH),
+    "expected-stack-narrow-refined": Narrow(dataclasses.replace(SMALL, refined_stack=True), 16, 24),
     "focal-stack-narrow": Narrow(
-        NetworkConfig(
-            architecture="focal-stack",
-            layers=4,
-            channels=4,
-            adjustable_layers=(2,),
-            modulation_hidden=8,
-            correction_layers=4,
-            planes=3,
-            feedback=True,
-        ),
+        dataclasses.replace(SMALL, architecture="focal-stack", planes=3, feedback=True),
         16,
         24,
         pupil_mm=1.6,
-        optics=OpticsConfig((633.0, 532.0, 473.0), 4.5, 32.0, 0.5, 3.25),
+        optics=OTHER_BENCH,
     ),
 }
 

@@ -503,7 +503,7 @@ fn tell_oddities(client: &mut Client, bad: &BadDepths, made: Option<(&RgbdFrame,
     }
     if let Some((frame, report)) = made.filter(|_| is_first) {
         if are_bad {
-            scene::warn_of_clipped_colours(&name, frame, &report.frame);
+            scene::warn_of_clipped_colours(&name, report.frame.colour_clipped_px, frame.resolution.pixels());
         } else {
             scene::warn_of_oddities(&name, frame, &report.frame, &target.geometry, client.sends_planes());
         }
