@@ -506,8 +506,8 @@ mod tests {
     use crate::fields::FrameLayout;
     use holod_calibration::Resolution;
     use holod_calibration::rig::Rig;
-    use rustfft::num_complex::Complex64;
-    use rustfft::{FftDirection, FftPlanner};
+    use holod_fft::num_complex::Complex64;
+    use holod_fft::{FftDirection, Real};
 
     const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
     const SIZE: Resolution = Resolution { width: 192, height: 160 };
@@ -534,9 +534,8 @@ mod tests {
     }
 
     fn transform(field: &mut [Complex64], size: Resolution, direction: FftDirection) {
-        let mut planner = FftPlanner::new();
-        planner.plan_fft(size.width, direction).process(field);
-        let columns = planner.plan_fft(size.height, direction);
+        f64::plan(size.width, direction).process(field);
+        let columns = f64::plan(size.height, direction);
         for column in 0..size.width {
             let mut values: Vec<_> = field.iter().skip(column).step_by(size.width).copied().collect();
             columns.process(&mut values);

@@ -3,9 +3,9 @@
 
 use std::sync::Arc;
 
+use holod_fft::{Fft, FftDirection, Real};
 use num_complex::Complex;
 use rayon::prelude::*;
-use rustfft::{Fft, FftDirection, FftNum, FftPlanner};
 
 /// Side of the square blocks in which a transpose walks its matrix.
 const BLOCK: usize = 32;
@@ -15,14 +15,14 @@ const LINE: usize = 8;
 const BANDS: usize = 16;
 
 /// A one-dimensional transform of every row of a matrix, not normalised.
-pub(crate) struct RowFft<T: FftNum> {
+pub(crate) struct RowFft<T: Real> {
     fft: Arc<dyn Fft<T>>,
     scratch: Vec<Complex<T>>,
 }
 
-impl<T: FftNum> RowFft<T> {
+impl<T: Real> RowFft<T> {
     pub(crate) fn new(length: usize, direction: FftDirection) -> Self {
-        let fft = FftPlanner::new().plan_fft(length, direction);
+        let fft = T::plan(length, direction);
         let scratch = vec![Complex::new(T::zero(), T::zero()); BANDS * fft.get_inplace_scratch_len().max(1)];
         Self { fft, scratch }
     }
@@ -79,7 +79,7 @@ fn transpose_apart<T: Copy + Send + Sync>(
 }
 
 /// A two-dimensional circular transform that leaves the spectrum transposed, which saves two of four transposes.
-pub(crate) struct TransposedFft2d<T: FftNum> {
+pub(crate) struct TransposedFft2d<T: Real> {
     width: usize,
     height: usize,
     rows_forward: RowFft<T>,
@@ -90,7 +90,7 @@ pub(crate) struct TransposedFft2d<T: FftNum> {
     pub(crate) spectrum: Vec<Complex<T>>,
 }
 
-impl<T: FftNum> TransposedFft2d<T> {
+impl<T: Real> TransposedFft2d<T> {
     pub(crate) fn new(width: usize, height: usize) -> Self {
         Self {
             width,
@@ -135,9 +135,8 @@ pub(crate) struct PlanesFft {
 
 impl PlanesFft {
     pub(crate) fn new(width: usize, height: usize, planes: usize) -> Self {
-        let mut planner = FftPlanner::new();
-        let columns_forward = planner.plan_fft_forward(height);
-        let columns_inverse = planner.plan_fft_inverse(height);
+        let columns_forward = f32::plan(height, FftDirection::Forward);
+        let columns_inverse = f32::plan(height, FftDirection::Inverse);
         let scratch_len = columns_forward.get_inplace_scratch_len().max(columns_inverse.get_inplace_scratch_len());
         Self {
             width,

@@ -1,9 +1,9 @@
 //! Fourier upsampling by 2: from the half-band grid to the panel's, in real time.
 
 use holod_calibration::Resolution;
+use holod_fft::FftDirection;
 use num_complex::Complex32;
 use rayon::prelude::*;
-use rustfft::FftDirection;
 
 use super::fft::{RowFft, signed_bin, transpose};
 

@@ -4,8 +4,8 @@ use std::f64::consts::{PI, TAU};
 use std::fmt::Write;
 use std::sync::Arc;
 
+use holod_fft::{FftDirection, Real};
 use num_complex::{Complex32, Complex64};
-use rustfft::FftPlanner;
 
 use super::plan::{BufferId, Constant, Plan, Shader};
 use crate::gpu::GpuError;
@@ -122,7 +122,7 @@ fn chirp_spectrum(length: usize, span: usize) -> Vec<Complex64> {
         spectrum[sample] = chirp.conj() / span as f64;
         spectrum[(span - sample) % span] = spectrum[sample];
     }
-    FftPlanner::new().plan_fft_forward(span).process(&mut spectrum);
+    f64::plan(span, FftDirection::Forward).process(&mut spectrum);
     spectrum
 }
 
@@ -234,8 +234,8 @@ mod tests {
         trial.write(from, &values.iter().flat_map(|value| [value.re as f32, value.im as f32]).collect::<Vec<_>>());
         trial.run();
         let found = complex(&trial.read(to));
-        let direction = if direction > 0.0 { rustfft::FftDirection::Forward } else { rustfft::FftDirection::Inverse };
-        FftPlanner::new().plan_fft(length, direction).process(&mut values);
+        let direction = if direction > 0.0 { FftDirection::Forward } else { FftDirection::Inverse };
+        f64::plan(length, direction).process(&mut values);
         [found, values]
     }
 
