@@ -18,6 +18,21 @@ pub(crate) trait Simd: Copy + Send + Sync {
     /// # Safety
     /// `from` points to `LANES` readable values.
     unsafe fn load(self, from: *const f32) -> Self::Vector;
+    /// N vectors whose first values lie `stride` values apart.
+    ///
+    /// No closure, as `array::from_fn` would want: the compiler would make a function without the set's features of it.
+    ///
+    /// # Safety
+    /// From each of these places `LANES` values are readable.
+    #[inline(always)]
+    unsafe fn load_strided<const N: usize>(self, from: *const f32, stride: usize) -> [Self::Vector; N] {
+        let mut vectors = [self.splat(0.0); N];
+        for (index, vector) in vectors.iter_mut().enumerate() {
+            // SAFETY: the caller's.
+            *vector = unsafe { self.load(from.add(index * stride)) };
+        }
+        vectors
+    }
     /// # Safety
     /// `to` points to `LANES` writable values.
     unsafe fn store(self, to: *mut f32, vector: Self::Vector);

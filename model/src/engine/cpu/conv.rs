@@ -264,7 +264,7 @@ impl TileRow<'_> {
             // SAFETY: `len` is a multiple of LANES; so much is readable in each of six rows of `from`, and writable in
             // each of `to`.
             unsafe {
-                let values = std::array::from_fn(|row| simd.load(from.as_ptr().add(row * *row_len + place)));
+                let values = simd.load_strided(from.as_ptr().add(place), *row_len);
                 for (point, value) in to_points(simd, values).into_iter().enumerate() {
                     simd.store(to.as_mut_ptr().add(point * to_row_len + place), value);
                 }
@@ -287,7 +287,7 @@ impl TileRow<'_> {
                 // SAFETY: a tile's six pixels lie in `from`, and its row of the channel's panel in each point's panels.
                 unsafe {
                     let pixel = from.as_ptr().add(tile * TILE * in_stride + channel);
-                    let values = std::array::from_fn(|column| simd.load(pixel.add(column * in_stride)));
+                    let values = simd.load_strided(pixel, in_stride);
                     let place = points.as_mut_ptr().add(panel_place(tile, channel));
                     for (point, value) in to_points(simd, values).into_iter().enumerate() {
                         simd.store(place.add(point * points_len), value);
@@ -312,7 +312,7 @@ impl TileRow<'_> {
                 // SAFETY: as above, from each point's panels to a tile's four pixels in `to`.
                 unsafe {
                     let place = products.as_ptr().add(panel_place(tile, channel));
-                    let values = std::array::from_fn(|point| simd.load(place.add(point * products_len)));
+                    let values = simd.load_strided(place, products_len);
                     let pixel = to.as_mut_ptr().add(tile * TILE * out_stride + channel);
                     for (column, value) in from_points(simd, values).into_iter().enumerate() {
                         simd.store(pixel.add(column * out_stride), value);
@@ -339,7 +339,7 @@ impl TileRow<'_> {
                 // SAFETY: `place` and the LANES values after it lie in each of six rows of `from` and of `rows` of
                 // `to`; `channel` likewise in the bias.
                 unsafe {
-                    let values = std::array::from_fn(|row| simd.load(from.as_ptr().add(row * from_row_len + place)));
+                    let values = simd.load_strided(from.as_ptr().add(place), from_row_len);
                     let bias = simd.load(activation.bias.as_ptr().add(channel));
                     for (row, value) in from_points(simd, values).into_iter().enumerate().take(rows) {
                         activation.store(simd, value, bias, to.as_mut_ptr().add(row * *out_row_len + place));

@@ -143,8 +143,7 @@ fn kernel<S: Simd, const V: usize, const I: usize, const P: usize>(
                 let from = inputs.as_ptr().add((panel * ROWS + row) * PANEL);
                 let used = (group_inputs - panel % panels * PANEL).min(PANEL);
                 for input in (0..used).step_by(I) {
-                    let weights: [S::Vector; V] =
-                        std::array::from_fn(|vector| simd.load(weight_row.add(vector * S::LANES)));
+                    let weights: [S::Vector; V] = simd.load_strided(weight_row, S::LANES);
                     weight_row = weight_row.add(V * S::LANES);
                     for (row, sums) in sums.iter_mut().enumerate() {
                         let input = from.add(row * PANEL + input);
