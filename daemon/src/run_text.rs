@@ -40,6 +40,10 @@ pub(crate) fn summary_text(summary: &Summary) -> String {
         format!("\nfeed      {}; picture to photons {}", feed_text(feed), spread_text(figures.picture_to_photon))
     });
     let record = figures.record.as_ref().map_or(String::new(), |record| format!("\nrecord    {}", record.text()));
+    let not_told = match lasers.not_told {
+        0 => String::new(),
+        fields => format!("; of {fields} more the lasers tell nothing, they are simply on"),
+    };
     format!(
         "ended by {} after {:.1} s\n\
          frames    {} made, {} shown ({} late), {:.1} a second of the panel's {:.1}; {} colour fields shown, {} of them \
@@ -47,7 +51,7 @@ pub(crate) fn summary_text(summary: &Summary) -> String {
          pupil     {pupils}; frames: {}\n\
          tracker   {}: link {}, {} samples, {} rejected{trouble}{feed}\n\
          time      per frame {}; tracker sample to photons {}\n\
-         lasers    {} fields judged: {} lit by their own colour, {} kept dark, {} faults of which {} unsafe\n\
+         lasers    {} fields judged: {} lit by their own colour, {} kept dark, {} faults of which {} unsafe{not_told}\n\
          shutdown  lasers dark: {}; flat pattern on the panel: {}{record}",
         summary.ended_by,
         summary.duration_s,

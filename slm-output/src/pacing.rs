@@ -29,6 +29,9 @@ const PHASE_GAIN: f64 = 0.1;
 const PERIOD_GAIN: f64 = 0.005;
 /// A panel's rate differs from its nominal one by less than this share.
 const PERIOD_TOLERANCE: f64 = 0.02;
+/// What was learned of how early the panel wants its frames falls by this part with each frame that came in time, so
+/// that it is tried again after some seconds whether less would do.
+const FORGET_LEAD: i64 = 512;
 /// A report of a frame that was submitted longer ago than this has a wrong time.
 const LATENESS_MAX: TimeNs = TimeNs(60_000_000_000);
 /// Reports in a row that fit no refresh, after which the panel's clock is taken from the last of them.
@@ -41,7 +44,8 @@ pub struct PacingConfig {
     pub refresh_period: TimeNs,
     /// From a colour frame's presentation to the middle of its light.
     pub photon_delay: TimeNs,
-    /// A frame must be submitted this long before the refresh that it is for.
+    /// A frame must be submitted this long before the refresh that it is for. Panels that choose their frame earlier
+    /// are learned from frames that were in time and came a refresh late: by so much more after each.
     pub submit_margin: TimeNs,
     /// How long a frame takes from waking to submission, until that has been measured.
     pub first_frame_time: TimeNs,
@@ -69,12 +73,17 @@ pub struct Pacer {
     slots: [Option<Slot>; SLOTS],
     last_frame_id: u64,
     t_last_desired: Option<TimeNs>,
+    /// From the submission of a frame to its refresh.
+    lead: TimeNs,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Slot {
     frame_id: u64,
     t_wake: TimeNs,
+    t_desired_present: TimeNs,
+    /// What was planned.
+    lead: TimeNs,
     t_submit: Option<TimeNs>,
     reported: bool,
 }
@@ -93,6 +102,7 @@ impl Pacer {
             slots: [None; SLOTS],
             last_frame_id: 0,
             t_last_desired: None,
+            lead: config.submit_margin,
         }
     }
 
@@ -109,7 +119,9 @@ impl Pacer {
         let reachable = now + budget;
         let mut t_desired_present = self.clock.refresh_at_or_after(reachable);
         if let Some(t_last) = self.t_last_desired {
-            let every = (budget.0 as f64 / self.clock.period_ns).ceil().max(1.0);
+            // While a frame waits for its refresh the next one is made.
+            let busy = self.frame_times.estimate + self.config.submit_margin;
+            let every = (busy.0 as f64 / self.clock.period_ns).ceil().max(1.0);
             let space = TimeNs((every * self.clock.period_ns).round() as i64);
             let last = self.slots[slot_index(self.last_frame_id)].filter(|slot| slot.frame_id == self.last_frame_id);
             let t_last = match last.and_then(|slot| slot.t_submit) {
@@ -126,7 +138,9 @@ impl Pacer {
         let t_wake = (t_desired_present - budget).max(now);
         self.last_frame_id = frame_id;
         self.t_last_desired = Some(t_desired_present);
-        self.slots[slot_index(frame_id)] = Some(Slot { frame_id, t_wake, t_submit: None, reported: false });
+        let lead = self.lead;
+        self.slots[slot_index(frame_id)] =
+            Some(Slot { frame_id, t_wake, t_desired_present, lead, t_submit: None, reported: false });
         let t_predicted_photon = t_desired_present + self.config.photon_delay;
         FramePlan { frame_id, t_wake, t_desired_present, t_predicted_photon }
     }
@@ -155,8 +169,22 @@ impl Pacer {
             return;
         }
         slot.reported = true;
+        let slot = *slot;
         if provenance != TimestampSource::Estimated {
             self.clock.observe(t_present);
+            self.learn_lead(&slot, t_present);
+        }
+    }
+
+    fn learn_lead(&mut self, slot: &Slot, t_present: TimeNs) {
+        let was_in_time = slot.t_submit.is_some_and(|t_submit| t_submit + slot.lead <= slot.t_desired_present);
+        let came_late = 2 * (t_present.0 - slot.t_desired_present.0) > self.config.refresh_period.0;
+        if !came_late {
+            self.lead.0 -= (self.lead - self.config.submit_margin).0 / FORGET_LEAD;
+        } else if was_in_time {
+            // Frames that were under way at the time had no more.
+            let more = slot.lead + self.config.submit_margin;
+            self.lead = self.lead.max(more).min(TimeNs(self.config.refresh_period.0 / 2));
         }
     }
 
@@ -170,7 +198,7 @@ impl Pacer {
 
     /// Time that is planned for a frame from waking to its refresh.
     pub fn budget(&self) -> TimeNs {
-        self.frame_times.estimate + self.config.submit_margin
+        self.frame_times.estimate + self.lead
     }
 }
 
@@ -332,6 +360,8 @@ mod tests {
         hiccup_ns: i64,
         /// From a presentation to its report.
         report_delay_ns: i64,
+        /// From the choice of a frame to its presentation.
+        lead_ns: i64,
         random: Pcg64Mcg,
     }
 
@@ -360,6 +390,7 @@ mod tests {
                 jitter_ns: (jitter_ms * 1e6) as i64,
                 hiccup_ns: 0,
                 report_delay_ns: 300_000,
+                lead_ns: 0,
                 random: Pcg64Mcg::seed_from_u64(7),
             }
         }
@@ -393,7 +424,7 @@ mod tests {
                 }
                 now = t_wake + TimeNs(render_ns);
                 pacer.submitted(plan.frame_id, now);
-                let refresh = ((now.0 as f64 - t_first_ns) / self.period_ns).ceil();
+                let refresh = (((now.0 + self.lead_ns) as f64 - t_first_ns) / self.period_ns).ceil();
                 let t_present = TimeNs((t_first_ns + refresh * self.period_ns) as i64);
                 reports.push_back((plan, t_present));
                 let since = (refresh as i64 - last_refresh).clamp(0, 4) as usize;
@@ -426,6 +457,23 @@ mod tests {
             let ran = Bench::new(REFRESH.0 as f64 * share, 6.0, 2.0).run(1.0);
             assert!((ran.spacing[1] as f64) > 0.99 * ran.frames as f64, "{share}: {ran:?}");
             assert!((ran.missed as f64) < 0.01 * ran.frames as f64, "{share}: {ran:?}");
+        }
+    }
+
+    /// A display server that draws some milliseconds before a refresh, or a card that is told before the blank.
+    #[test]
+    fn a_panel_that_chooses_its_frames_early_gets_them_earlier() {
+        for (lead_ms, report_delay_ms, render_ms) in
+            [(2, 0, 5.0), (4, 0, 5.0), (4, 100, 5.0), (7, 0, 5.0), (4, 0, 14.0)]
+        {
+            let mut bench = Bench::new(REFRESH.0 as f64, render_ms, 0.5);
+            (bench.lead_ns, bench.report_delay_ns) = (lead_ms * MS, 300_000 + report_delay_ms * MS);
+            let ran = bench.run(1.0);
+            assert!(ran.missed > 0, "it is learned from misses");
+            assert!((ran.missed as f64) < 0.02 * ran.frames as f64, "{lead_ms} ms: {ran:?}");
+            assert!((ran.spacing[1] as f64) > 0.97 * ran.frames as f64, "{lead_ms} ms: {ran:?}");
+            // Render time with its jitter, the lead and what is tried above it.
+            assert!(ran.latency_ms < render_ms + 0.7 + lead_ms as f64 + 1.5, "{lead_ms} ms: {ran:?}");
         }
     }
 

@@ -22,6 +22,9 @@ pub struct LaserSummary {
     pub lit: usize,
     /// Of those, meant to stay dark and dark.
     pub dark: usize,
+    /// Fields of lasers that are simply on while their box is armed: nobody tells which were lit, and they are not
+    /// judged.
+    pub not_told: u64,
     /// Light where there must be none.
     pub unsafe_findings: usize,
     /// Everything that was not as it should be.
@@ -43,6 +46,10 @@ pub(super) struct LaserLedger {
 impl LaserLedger {
     /// A field is over.
     pub(super) fn field(&mut self, event: &FieldEvent) {
+        if event.laser_on.is_none() && event.dark.is_none() {
+            self.summary.not_told += 1;
+            return;
+        }
         self.fields.push_back(event.span());
         if self.fields.len() >= 2 * WAITING_FIELDS {
             let until = self.fields[WAITING_FIELDS].t_present;
@@ -73,7 +80,12 @@ impl LaserLedger {
     fn judge(&mut self, until: Option<TimeNs>) {
         let before = |t: TimeNs| until.is_none_or(|until| t < until);
         let fields: Vec<FieldSpan> = take_while(&mut self.fields, |field| before(field.t_present));
-        let edges: Vec<LaserEdge> = take_while(&mut self.edges, |edge| before(edge.t));
+        let mut edges: Vec<LaserEdge> = take_while(&mut self.edges, |edge| before(edge.t));
+        // A window may end where the first field begins that is left for the next batch.
+        while edges.last().is_some_and(|edge| edge.on) {
+            let Some(next) = self.edges.pop_front() else { break };
+            edges.push(next);
+        }
         let report = verify_edges(&fields, &edges);
         self.summary.fields += report.fields;
         self.summary.lit += report.lit;
@@ -95,6 +107,7 @@ mod tests {
     use super::*;
     use holod_calibration::Colour;
     use holod_slm_output::TimestampSource;
+    use holod_slm_output::laser::DarkReason;
 
     fn event(index: i64) -> FieldEvent {
         let t = TimeNs(index * 1000);
@@ -127,6 +140,32 @@ mod tests {
             ledger.field(&event);
         }
         ledger.finish()
+    }
+
+    #[test]
+    fn a_window_that_ends_with_its_field_is_judged_with_it_at_a_seam_as_well() {
+        let mut ledger = LaserLedger::default();
+        for index in 0..5000 {
+            let event = FieldEvent { laser_off: Some(event(index).t_end), ..event(index) };
+            for (t, on) in [(event.laser_on, true), (event.laser_off, false)] {
+                ledger.box_event(&BoxEvent::Edge(LaserEdge { t: t.unwrap(), colour: event.colour, on }));
+            }
+            ledger.field(&event);
+        }
+        let summary = ledger.finish();
+        assert_eq!((summary.fields, summary.lit, summary.findings), (5000, 5000, vec![]));
+    }
+
+    #[test]
+    fn fields_of_a_laser_that_tells_no_edges_are_counted_and_not_judged() {
+        let mut ledger = LaserLedger::default();
+        for index in 0..30 {
+            let dark = (index < 3).then_some(DarkReason::SyncLost);
+            ledger.field(&FieldEvent { laser_on: None, laser_off: None, dark, ..event(index) });
+        }
+        let summary = ledger.finish();
+        assert_eq!((summary.fields, summary.lit, summary.dark, summary.not_told), (3, 0, 3, 27));
+        assert_eq!(summary.findings, Vec::<String>::new());
     }
 
     #[test]

@@ -114,7 +114,8 @@ pub(super) struct Service {
     ready: bool,
 }
 
-/// Decides when the service manager's watchdog is fed: only when frames have come on the panel since the last time.
+/// Decides when the service manager's watchdog is fed: only when frames have come on the panel since the last time, or
+/// none can because the panel is lost and waited for. A restart would not bring it back.
 #[derive(Debug)]
 struct Watchdog {
     every: TimeNs,
@@ -123,8 +124,8 @@ struct Watchdog {
 }
 
 impl Watchdog {
-    fn feed_if_due(&mut self, frames_shown: u64, now: TimeNs) -> bool {
-        let due = now - self.t_fed >= self.every && frames_shown > self.frames_fed;
+    fn feed_if_due(&mut self, frames_shown: u64, awaits_panel: bool, now: TimeNs) -> bool {
+        let due = now - self.t_fed >= self.every && (frames_shown > self.frames_fed || awaits_panel);
         if due {
             (self.t_fed, self.frames_fed) = (now, frames_shown);
         }
@@ -143,12 +144,12 @@ impl Service {
         Self { watchdog, ready: false }
     }
 
-    /// Frames were shown: tells readiness after the first, feeds the watchdog.
-    pub(super) fn progress(&mut self, frames_shown: u64, now: TimeNs) {
+    /// Frames were shown, or cannot be before a lost panel is back: tells readiness after the first, feeds the watchdog.
+    pub(super) fn progress(&mut self, frames_shown: u64, awaits_panel: bool, now: TimeNs) {
         if frames_shown > 0 && !self.ready {
             self.ready = tell(&[NotifyState::Ready]);
         }
-        if self.watchdog.as_mut().is_some_and(|watchdog| watchdog.feed_if_due(frames_shown, now)) {
+        if self.watchdog.as_mut().is_some_and(|watchdog| watchdog.feed_if_due(frames_shown, awaits_panel, now)) {
             tell(&[NotifyState::Watchdog]);
         }
     }
@@ -194,13 +195,22 @@ mod tests {
     #[test]
     fn the_watchdog_starves_when_no_new_frame_is_shown() {
         let mut watchdog = Watchdog { every: TimeNs(100), t_fed: TimeNs(0), frames_fed: 0 };
-        assert!(!watchdog.feed_if_due(0, TimeNs(1_000)));
-        assert!(watchdog.feed_if_due(1, TimeNs(1_000)));
-        assert!(!watchdog.feed_if_due(5, TimeNs(1_050)), "not due yet");
-        assert!(watchdog.feed_if_due(5, TimeNs(1_100)));
+        assert!(!watchdog.feed_if_due(0, false, TimeNs(1_000)));
+        assert!(watchdog.feed_if_due(1, false, TimeNs(1_000)));
+        assert!(!watchdog.feed_if_due(5, false, TimeNs(1_050)), "not due yet");
+        assert!(watchdog.feed_if_due(5, false, TimeNs(1_100)));
         for t in 0..100 {
-            assert!(!watchdog.feed_if_due(5, TimeNs(2_000 + t * 100)), "a stalled panel does not feed it");
+            assert!(!watchdog.feed_if_due(5, false, TimeNs(2_000 + t * 100)), "a stalled panel does not feed it");
         }
+    }
+
+    #[test]
+    fn a_lost_panel_that_is_waited_for_feeds_the_watchdog() {
+        let mut watchdog = Watchdog { every: TimeNs(100), t_fed: TimeNs(0), frames_fed: 5 };
+        assert!(watchdog.feed_if_due(5, true, TimeNs(1_000)));
+        assert!(!watchdog.feed_if_due(5, true, TimeNs(1_050)), "not due yet");
+        assert!(watchdog.feed_if_due(5, true, TimeNs(1_100)));
+        assert!(!watchdog.feed_if_due(5, false, TimeNs(2_000)), "it is back and shows nothing");
     }
 
     #[test]

@@ -28,6 +28,7 @@ pub(super) struct Tally {
     pub(super) deadline_misses: u64,
     newest_made: u64,
     newest_shown: u64,
+    newest_lit: u64,
     pub(super) newest_state: &'static str,
     pub(super) frame_time: Recent,
     pub(super) sample_to_photon: Recent,
@@ -68,18 +69,28 @@ impl Tally {
         self.lasers.field(event);
         self.fields_shown += 1;
         self.fields_repeated += u64::from(event.repeated);
-        if event.repeated || event.frame_id == self.newest_shown {
+        if event.repeated {
             return None;
         }
-        self.newest_shown = event.frame_id;
-        self.frames_shown += 1;
-        self.deadline_misses += u64::from(event.deadline_missed);
+        let is_new = event.frame_id != self.newest_shown;
+        if is_new {
+            self.newest_shown = event.frame_id;
+            self.frames_shown += 1;
+            self.deadline_misses += u64::from(event.deadline_missed);
+        }
         let frame = self.recent.iter().find(|frame| frame.frame == event.frame_id)?;
-        self.shown_picture_came = frame.picture.t_came;
-        if let Some(slot) = frame.keep {
-            self.kept[slot] = Some((frame.frame, frame.pupil));
+        if is_new {
+            self.shown_picture_came = frame.picture.t_came;
+            if let Some(slot) = frame.keep {
+                self.kept[slot] = Some((frame.frame, frame.pupil));
+            }
+        }
+        // Its first fields may have stayed dark.
+        if event.frame_id == self.newest_lit {
+            return None;
         }
         let (on, off) = event.laser_on.zip(event.laser_off)?;
+        self.newest_lit = event.frame_id;
         let t = TimeNs(on.0 / 2 + off.0 / 2);
         // A picture that is shown for another pupil is no newer for that.
         let new_picture = frame.picture.t_taken.filter(|_| self.newest_picture != frame.picture.t_taken);
@@ -114,5 +125,71 @@ impl Tally {
     /// The pupil that a frame was made for whose levels were kept.
     pub(super) fn pupil_of_kept(&self, frame: u64) -> Option<PupilDiameter> {
         self.kept.iter().flatten().find(|(kept, _)| *kept == frame).map(|(_, pupil)| *pupil)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use holod_calibration::Colour;
+    use holod_slm_output::TimestampSource;
+    use holod_slm_output::laser::DarkReason;
+
+    use crate::record::FrameOrders;
+    use crate::source::PictureTag;
+
+    fn record(frame: u64) -> LoopRecord {
+        let t = TimeNs(0);
+        let frame = FrameRecord {
+            frame,
+            t_sample: Some(TimeNs(1_000)),
+            pupil_raw_mm: None,
+            pupil: PupilDiameter::from_mm(3.0),
+            pupil_state: "tracking",
+            t_wake: t,
+            t_render_begin: t,
+            t_render_end: t,
+            t_submit: t,
+            t_desired_present: t,
+            picture: PictureTag::default(),
+            keep: None,
+            amplitude_constant: 1.0,
+            orders: FrameOrders::default(),
+            levels_xxh3: None,
+        };
+        LoopRecord { frame, beyond_trained: false, clipped_share: 0.0, unreachable_share: 0.0 }
+    }
+
+    fn field(frame_id: u64, field: usize, is_lit: bool) -> FieldEvent {
+        let t_present = TimeNs(frame_id as i64 * 30_000 + field as i64 * 10_000);
+        FieldEvent {
+            frame_id,
+            field,
+            colour: Colour::ALL[field],
+            t_submit: TimeNs(0),
+            t_desired_present: TimeNs(0),
+            t_present,
+            t_settled: t_present,
+            t_end: t_present + TimeNs(10_000),
+            provenance: TimestampSource::Software,
+            laser_on: is_lit.then_some(t_present + TimeNs(2_000)),
+            laser_off: is_lit.then_some(t_present + TimeNs(8_000)),
+            dark: (!is_lit).then_some(DarkReason::Late),
+            repeated: false,
+            deadline_missed: false,
+        }
+    }
+
+    #[test]
+    fn a_frames_first_light_is_its_first_lit_fields_and_is_told_once() {
+        let mut tally = Tally::default();
+        let mut first_light = |frame, lit: [bool; 3]| {
+            tally.frame(&record(frame));
+            [0, 1, 2].map(|index| tally.field(&field(frame, index, lit[index])).map(|light| light.t.0))
+        };
+        assert_eq!(first_light(1, [true; 3]), [Some(35_000), None, None]);
+        assert_eq!(first_light(2, [false, true, true]), [None, Some(75_000), None]);
+        assert_eq!(first_light(3, [false; 3]), [None; 3]);
+        assert_eq!((tally.frames_shown, tally.fields_shown), (3, 9));
     }
 }

@@ -152,7 +152,8 @@ impl Watch<'_> {
             if self.hangups.as_ref().is_some_and(Hangups::asked) {
                 self.desk.reload();
             }
-            self.service.progress(self.tally.frames_shown, now);
+            let awaits_panel = self.panel.lost().is_some_and(|fault| fault.is_recoverable());
+            self.service.progress(self.tally.frames_shown, awaits_panel, now);
             ticks = ticks.wrapping_add(1);
             if ticks.is_multiple_of(TICKS_PER_REPORT) {
                 self.report(&output.counts(), now)?;
@@ -174,6 +175,8 @@ impl Watch<'_> {
                 return Err(Failure::new(Exit::Unavailable, format!("the panel: {fault}")));
             }
             if frame_thread.is_finished() {
+                // What it said last, between the look at its ring above and its end.
+                self.drain()?;
                 let t_end = *t_give_up.get_or_insert(now + LAST_FRAME_WAIT);
                 let is_whole = limits.frames.is_some_and(|frames| self.tally.frames_made >= frames);
                 if !is_whole {

@@ -161,11 +161,14 @@ pub enum LaserError {
         expected: u32,
     },
     /// Another holod has the port.
-    #[error("{path} is in use by another program: end that one first (`holod dark` works beside it)")]
+    #[error("{path} is in use by another program: end that one first (`holod dark --config RIG` works beside it)")]
     InUse { path: String },
     /// The rig wants the panel's sync wire, which the box cannot take.
     #[error("the laser box has no input for the panel's sync output: take lasers.sync_wire out of the rig file")]
     NoSyncInput,
+    /// The edges on its sync wire are not those of the frames that the host knows of.
+    #[error("the edges on the laser box's sync wire are not this panel's frames: check where the wire comes from")]
+    SyncDisagrees,
     /// The box is not built for what the rig asks of it.
     #[error("the laser box takes {limit} {unit} of {what} at most; the rig asks for {asked}: correct the rig file")]
     BeyondBox {

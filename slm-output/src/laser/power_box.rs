@@ -28,6 +28,8 @@ const REST: Duration = Duration::from_millis(5);
 const PROGRAM_WAIT: TimeNs = TimeNs(5_000_000_000);
 /// How long darkness is waited for.
 const DARK_WAIT: TimeNs = TimeNs(450_000_000);
+/// How often the lasers are put out at the end where the device does not say that they are.
+const LAST_TRIES: usize = 3;
 /// Orders and reports on their way.
 const RING: usize = 64;
 
@@ -323,8 +325,8 @@ impl<D: PowerDevice> Worker<D> {
             }
             std::thread::park_timeout(REST);
         }
-        // Nobody listens any more.
-        let _put_out = self.device.set_lit(NONE_LIT);
+        // Nobody listens any more, and a line may swallow an order.
+        let _put_out = (0..LAST_TRIES).any(|_| self.device.set_lit(NONE_LIT).is_ok());
     }
 
     fn obey(&mut self, order: Order) -> Result<(), LaserError> {

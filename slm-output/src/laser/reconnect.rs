@@ -7,8 +7,8 @@
 use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::thread::Thread;
-use std::time::Duration;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 use holod_calibration::{Colour, TimeNs};
 use rtrb::{Consumer, Producer, RingBuffer};
@@ -19,6 +19,9 @@ use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserEdge, LaserError, L
 const RETRY_EVERY: Duration = Duration::from_millis(250);
 /// Events that wait between a loss and the next [`LaserBox::poll`].
 const EVENTS_MAX: usize = 64;
+/// How long the closing of a lost box is waited for that does not go dark by itself: longer than it takes to put three
+/// lasers out one after the other, some of which do not answer.
+const CLOSE_WAIT: Duration = Duration::from_secs(5);
 
 /// What is wrong with the link to a laser box, for a thread that may wait.
 #[derive(Clone, Debug, Default)]
@@ -56,7 +59,7 @@ pub(super) struct Reconnecting {
     found: Consumer<Box<dyn LaserBox>>,
     watch: LaserWatch,
     stop: Arc<AtomicBool>,
-    seeker: Thread,
+    seeker: JoinHandle<()>,
 }
 
 impl Reconnecting {
@@ -95,7 +98,7 @@ impl Reconnecting {
             found,
             watch,
             stop,
-            seeker: seeker.thread().clone(),
+            seeker,
         })
     }
 
@@ -132,7 +135,7 @@ impl Reconnecting {
         self.fresh = false;
         // Two boxes cannot be lost before the first has been found again.
         let _never_full = self.lost.push(Lost { laser, why, program: self.program });
-        self.seeker.unpark();
+        self.seeker.thread().unpark();
     }
 
     fn note(&mut self, event: BoxEvent) {
@@ -207,10 +210,15 @@ impl LaserBox for Reconnecting {
 }
 
 impl Drop for Reconnecting {
-    /// Does not wait for the seeker, which may be waiting for a device that does not answer.
+    /// A box that was lost may still have lasers lit: one that does not go dark by itself is put out while it is
+    /// closed, and a program that ended before would leave it lit. The search for another is not waited for.
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Release);
-        self.seeker.unpark();
+        self.seeker.thread().unpark();
+        let t_end = Instant::now() + CLOSE_WAIT;
+        while !self.capability.has_heartbeat && !self.seeker.is_finished() && Instant::now() < t_end {
+            std::thread::sleep(Duration::from_millis(5));
+        }
     }
 }
 
@@ -227,8 +235,11 @@ struct Seeker<F> {
 
 impl<F: Fn() -> Result<Box<dyn LaserBox>, LaserError>> Seeker<F> {
     fn run(mut self) {
-        while !self.stop.load(Ordering::Acquire) {
+        loop {
             let Ok(Lost { laser, why, program }) = self.lost.pop() else {
+                if self.stop.load(Ordering::Acquire) {
+                    return;
+                }
                 std::thread::park();
                 continue;
             };
@@ -261,5 +272,73 @@ impl<F: Fn() -> Result<Box<dyn LaserBox>, LaserError>> Seeker<F> {
             laser.program(program, (self.clock)())?;
         }
         Ok(laser)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A box that does not answer, and takes a while to be put out when it is closed.
+    struct Mute {
+        has_heartbeat: bool,
+        put_out: Arc<AtomicBool>,
+    }
+
+    impl LaserBox for Mute {
+        fn capability(&self) -> Capability {
+            Capability { simulated: false, gates_fields: false, has_heartbeat: self.has_heartbeat, sync_wire: false }
+        }
+
+        fn program(&mut self, _program: &LaserProgram, _now: TimeNs) -> Result<(), LaserError> {
+            Ok(())
+        }
+
+        fn arm(&mut self, _now: TimeNs) -> Result<(), LaserError> {
+            Ok(())
+        }
+
+        fn sync(&mut self, _t_sync: TimeNs, _now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+            Ok(None)
+        }
+
+        fn light(&mut self, _window: LitWindow, _now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+            Ok(None)
+        }
+
+        fn heartbeat(&mut self, _now: TimeNs) -> Result<(), LaserError> {
+            Ok(())
+        }
+
+        fn dark(&mut self, _reason: DarkReason, _now: TimeNs) -> Result<(), LaserError> {
+            Err(LaserError::NoAnswer { command: "off", waited_ms: 450 })
+        }
+
+        fn poll(&mut self, _now: TimeNs, _event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
+            Ok(())
+        }
+    }
+
+    impl Drop for Mute {
+        fn drop(&mut self) {
+            std::thread::sleep(Duration::from_millis(300));
+            self.put_out.store(true, Ordering::Release);
+        }
+    }
+
+    /// Whether a box that did not answer to the last order was put out before the run's end.
+    fn is_put_out_before_the_end(has_heartbeat: bool) -> bool {
+        let put_out = Arc::new(AtomicBool::new(false));
+        let mute = Mute { has_heartbeat, put_out: Arc::clone(&put_out) };
+        let mut laser = Reconnecting::new(Box::new(mute), || Err(LaserError::Lost), || TimeNs(0)).unwrap();
+        assert!(matches!(laser.dark(DarkReason::Shutdown, TimeNs(0)), Err(LaserError::Lost)));
+        drop(laser);
+        put_out.load(Ordering::Acquire)
+    }
+
+    #[test]
+    fn a_lost_box_that_does_not_go_dark_by_itself_is_waited_for_and_one_that_does_is_not() {
+        assert!(is_put_out_before_the_end(false));
+        assert!(!is_put_out_before_the_end(true));
     }
 }

@@ -384,10 +384,9 @@ impl SerialBox {
         if wire.agrees(sync, offset) {
             return Ok(());
         }
-        self.wire = None;
         self.send(&Command::Disarm(DarkReason::SyncDisagrees))?;
         self.model.set_dark(DarkReason::SyncDisagrees, now);
-        Ok(())
+        Err(LaserError::SyncDisagrees)
     }
 
     fn trigger(&self, program: &LaserProgram) -> BoxTrigger {
@@ -552,18 +551,23 @@ impl Drop for SerialBox {
 
 /// Compares the edges on the box's sync wire with the frames that the host knows of. The wire may come at any constant
 /// delay, which is learned from the first edge after arming; it must not wander, and no frame may be missing.
+///
+/// Frames are counted from one comparison to the next, since a panel's period is never quite the rig's: counted from the
+/// first one, 59.94 Hz for 60 would be half a frame apart within nine seconds.
 #[derive(Clone, Copy, Debug)]
 struct WireCheck {
     period: TimeNs,
     /// Start of the last colour frame that the host knows of.
     t_frame: Option<TimeNs>,
-    /// The first comparison: start of a frame, count of edges, and from that start to the edge.
-    first: Option<(TimeNs, u32, i64)>,
+    /// From the start of a frame to the edge, at the first comparison.
+    delay_ns: Option<i64>,
+    /// The last comparison: count of edges, and when the last of them was.
+    last: Option<(u32, i64)>,
 }
 
 impl WireCheck {
     const fn new(period: TimeNs) -> Self {
-        Self { period, t_frame: None, first: None }
+        Self { period, t_frame: None, delay_ns: None, last: None }
     }
 
     fn frame_began(&mut self, t: TimeNs) {
@@ -574,15 +578,14 @@ impl WireCheck {
         let (Some(t_frame), Some(t_edge)) = (self.t_frame, sync.t_last) else { return true };
         let t_edge_ns = nanoseconds(t_edge).0.saturating_sub(offset.middle_ns());
         let since_frame_ns = t_edge_ns.saturating_sub(t_frame.0);
-        let Some((t_first, first_count, first_ns)) = self.first else {
-            self.first = Some((t_frame, sync.count, since_frame_ns));
-            return true;
-        };
-        let wander_ns = (since_frame_ns - first_ns + self.period.0 / 2).rem_euclid(self.period.0) - self.period.0 / 2;
+        let delay_ns = *self.delay_ns.get_or_insert(since_frame_ns);
+        let (last_count, t_last_edge_ns) =
+            self.last.replace((sync.count, t_edge_ns)).unwrap_or((sync.count, t_edge_ns));
+        let half = self.period.0 / 2;
+        let wander_ns = since_frame_ns.saturating_sub(delay_ns).saturating_add(half).rem_euclid(self.period.0) - half;
         let tolerance_ns = self.period.0 / 16 + offset.error_ns();
-        let frames = (since_frame_ns.saturating_sub(first_ns) + t_frame.0 - t_first.0 + self.period.0 / 2)
-            .div_euclid(self.period.0);
-        let edges = i64::from(sync.count.wrapping_sub(first_count));
+        let frames = t_edge_ns.saturating_sub(t_last_edge_ns).saturating_add(half).div_euclid(self.period.0);
+        let edges = i64::from(sync.count.wrapping_sub(last_count));
         wander_ns.abs() <= tolerance_ns && edges == frames
     }
 }
@@ -601,6 +604,25 @@ mod tests {
             check.frame_began(TimeNs(frame * 1_000_000));
             check.agrees(SyncSeen { count, t_last: Some(TimeUs(edge as u64 * 1000)) }, EXACT)
         })
+    }
+
+    /// Whether a panel of `period_us` agrees for ten minutes, heard of once in `every` frames.
+    fn agrees_for_ten_minutes(period_us: i64, every: u32) -> bool {
+        let mut check = WireCheck::new(PERIOD);
+        (1..600_000_000 / period_us as u32).step_by(every as usize).all(|count| {
+            let t_us = i64::from(count) * period_us;
+            check.frame_began(TimeNs(t_us * 1000));
+            check.agrees(SyncSeen { count, t_last: Some(TimeUs(t_us as u64 + 3000)) }, EXACT)
+        })
+    }
+
+    #[test]
+    fn a_panel_whose_period_is_not_quite_the_rigs_agrees_for_as_long_as_it_runs() {
+        for off_us in [-16, -1, 0, 1, 16] {
+            assert!(agrees_for_ten_minutes(16_000 + off_us, 1), "{off_us} µs");
+            assert!(agrees_for_ten_minutes(16_000 + off_us, 60), "{off_us} µs, asked once in 60 frames");
+        }
+        assert!(!agrees_for_ten_minutes(17_000, 60), "a panel of another rate, asked once in 60 frames");
     }
 
     #[test]

@@ -35,11 +35,12 @@ pub struct FieldEvent {
     pub t_end: TimeNs,
     /// Where `t_present` comes from.
     pub provenance: TimestampSource,
-    /// The on edge of its laser, if it was lit.
+    /// The on edge of its laser, if it was lit and the box tells edges.
     pub laser_on: Option<TimeNs>,
-    /// The off edge of its laser, if it was lit.
+    /// The off edge of its laser, likewise.
     pub laser_off: Option<TimeNs>,
-    /// Why it was not lit, or must not have been.
+    /// Why it was not lit, or must not have been. Neither this nor an edge: a laser that is simply on while its box is
+    /// armed, of which single fields are not known.
     pub dark: Option<DarkReason>,
     /// The frame had been shown before: no newer one was there in time.
     pub repeated: bool,
@@ -65,6 +66,8 @@ impl FieldEvent {
 /// Puts fields and laser edges together.
 pub(super) struct Ledger {
     gate: FieldGate,
+    /// Whether the box lights single fields, and tells when.
+    gates_fields: bool,
     open: VecDeque<(ShownField, Option<DarkReason>)>,
     edges: VecDeque<LaserEdge>,
     last_dark: Option<DarkReason>,
@@ -73,9 +76,15 @@ pub(super) struct Ledger {
 }
 
 impl Ledger {
-    pub(super) fn new(gate: FieldGate, events: Producer<FieldEvent>, box_events: Producer<BoxEvent>) -> Self {
+    pub(super) fn new(
+        gate: FieldGate,
+        gates_fields: bool,
+        events: Producer<FieldEvent>,
+        box_events: Producer<BoxEvent>,
+    ) -> Self {
         let open = VecDeque::with_capacity(OPEN_MAX);
-        Self { gate, open, edges: VecDeque::with_capacity(OPEN_MAX), last_dark: None, events, box_events }
+        let edges = VecDeque::with_capacity(OPEN_MAX);
+        Self { gate, gates_fields, open, edges, last_dark: None, events, box_events }
     }
 
     pub(super) fn field(&mut self, field: &ShownField, dark: Option<DarkReason>, shared: &Shared) {
@@ -114,7 +123,7 @@ impl Ledger {
         while let Some((field, dark)) = self.open.front().copied().filter(|(field, _)| self.gate.t_end(field) <= now) {
             self.open.pop_front();
             let event = self.event(&field, dark);
-            if event.laser_on.is_none() {
+            if event.laser_on.is_none() && event.dark.is_some() {
                 count(&shared.dark_fields);
             }
             if self.events.push(event).is_err() {
@@ -153,6 +162,7 @@ impl Ledger {
             laser_off: off.map(|edge| edge.t),
             dark: match (on, dark) {
                 (Some(_), reason) => reason.filter(|reason| reason.forbids_light()),
+                (None, reason) if !self.gates_fields => reason,
                 (None, reason) => reason.or(self.last_dark).or(Some(DarkReason::Late)),
             },
             repeated: field.repeated,

@@ -140,6 +140,7 @@ impl Output {
         let (panel_producer, panel_consumer) = RingBuffer::new(SHORT_RING);
         let (fault_producer, fault_consumer) = RingBuffer::new(SHORT_RING);
         let laser_watch = laser.watch();
+        let gates_fields = laser.capability().gates_fields;
         let shared = Arc::new(Shared::default());
         let doorbell =
             Arc::new(eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(std::io::Error::from)?);
@@ -150,7 +151,7 @@ impl Output {
             program,
             scheduler,
             news: news_consumer,
-            ledger: Ledger::new(gate, event_producer, box_producer),
+            ledger: Ledger::new(gate, gates_fields, event_producer, box_producer),
             faults: fault_producer,
             t_retry: TimeNs(i64::MIN),
             program_lost: false,

@@ -79,6 +79,7 @@ impl Bench {
         let gate = scheduler.gate();
         let program = scheduler.program(&rig.panel, &rig.lasers).unwrap();
         laser.program(&program, TimeNs(0)).unwrap();
+        let gates_fields = laser.capability().gates_fields;
         let (sink, source) = frame_channel(&setup.flat);
         let (news, news_consumer) = RingBuffer::new(SHORT_RING);
         let (event_producer, events) = RingBuffer::new(LONG_RING);
@@ -88,7 +89,7 @@ impl Bench {
             program,
             scheduler,
             news: news_consumer,
-            ledger: Ledger::new(gate, event_producer, box_producer),
+            ledger: Ledger::new(gate, gates_fields, event_producer, box_producer),
             faults: RingBuffer::new(SHORT_RING).0,
             t_retry: TimeNs(i64::MIN),
             program_lost: false,

@@ -28,6 +28,8 @@ pub(super) struct Shown {
     refresh_hz: f64,
     fields: PerColour<u64>,
     lit: PerColour<u64>,
+    /// Fields of lasers that are simply on while their box is armed.
+    not_told: PerColour<u64>,
     /// Why the last field that was not lit was not.
     dark: Option<DarkReason>,
     pub(super) lasers_dark: bool,
@@ -92,6 +94,7 @@ pub(super) fn show(
         while let Ok(field) = output.events.pop() {
             shown.fields[field.colour] += 1;
             shown.lit[field.colour] += u64::from(field.laser_on.is_some());
+            shown.not_told[field.colour] += u64::from(field.laser_on.is_none() && field.dark.is_none());
             shown.dark = field.dark.or(shown.dark);
         }
         while output.box_events.pop().is_ok() {}
@@ -133,7 +136,10 @@ impl fmt::Display for Shown {
             self.duration_s, self.refresh_hz, self.ended_by
         )?;
         for (colour, fields) in self.fields.iter().filter(|(_, fields)| **fields > 0) {
-            writeln!(f, "{colour}: {fields} fields, {} of them lit", self.lit[colour])?;
+            match self.not_told[colour] {
+                0 => writeln!(f, "{colour}: {fields} fields, {} of them lit", self.lit[colour])?,
+                on => writeln!(f, "{colour}: {fields} fields, its laser on in {on} of them as far as it was told")?,
+            }
         }
         if let Some(reason) = self.dark {
             writeln!(f, "not lit, last: {reason}")?;
