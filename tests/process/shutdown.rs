@@ -200,6 +200,9 @@ fn a_laser_box_is_looked_at_tried_out_and_put_out_by_its_port_alone() {
     assert!(none.stderr.contains("/dev/no-such-port"), "{}", none.stderr);
     let both = run(HOLOD, &["dark", "--port", "x", "--config", "rig.toml"], folder);
     assert_eq!(both.status.code(), Some(64));
+    let neither = run(HOLOD, &["dark"], folder);
+    assert_eq!(neither.status.code(), Some(64), "nothing was put out: {}", neither.stdout);
+    assert!(neither.stderr.contains("--config RIG"), "{}", neither.stderr);
 }
 
 #[test]

@@ -26,8 +26,14 @@ pub(super) fn laser(command: &LaserCommand) -> Result<(), Failure> {
     }
 }
 
-/// Puts the lasers out, whoever else has their ports open.
+/// Puts the lasers out, whoever else has their ports open. The built-in rig has none: without a rig or a port nothing
+/// would be put out.
 pub(super) fn dark(args: &LaserArgs) -> Result<(), Failure> {
+    if args.rig.config.is_none() && args.port.is_none() {
+        let which = "holod dark: which lasers? say --config RIG, the rig file of the holod that drives them, or --port \
+                     PATH, the port of a laser box; nothing was put out";
+        return Err(Failure::new(Exit::Usage, which));
+    }
     let rig = bench(args)?;
     let driver = &rig.lasers.driver;
     if *driver == LaserDriver::Simulated {

@@ -22,7 +22,7 @@ pub fn ask(socket: &Path, request: &Request) -> Result<Value, Failure> {
         Failure::new(
             Exit::Unavailable,
             format!(
-                "{}: holod does not answer there: {error}; `holod dark` puts the lasers out beside it",
+                "{}: holod does not answer there: {error}; `holod dark --config RIG` puts the lasers out beside it",
                 socket.display()
             ),
         )

@@ -207,6 +207,16 @@ mod tests {
     }
 
     #[test]
+    fn each_column_is_explained_on_the_page_about_records() {
+        let page = include_str!("../../doc/record.md");
+        let missing = |columns: &[&str]| -> Vec<String> {
+            columns.iter().map(|name| format!("`{name}`")).filter(|name| !page.contains(name)).collect()
+        };
+        assert_eq!(missing(&COLUMNS.map(|(name, _)| name)), Vec::<String>::new());
+        assert_eq!(missing(&["no_such_column"]).len(), 1);
+    }
+
+    #[test]
     fn a_row_has_one_cell_per_column_and_holds_both_halves() {
         let folder = tempfile::tempdir().unwrap();
         let mut log = FrameLog::create(folder.path()).unwrap();
