@@ -186,6 +186,12 @@ def _training_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--warm-up-steps", type=int, default=defaults.warm_up_steps)
     sub.add_argument("--seed", type=int, default=defaults.seed)
     sub.add_argument("--precision", choices=PRECISIONS, default=defaults.precision, help="of convolutions in training")
+    sub.add_argument(
+        "--double-phase",
+        type=float,
+        metavar="K",
+        help="the loss is of what a panel shows after double phase with this amplitude constant, not of the field",
+    )
     sub.add_argument("--teacher", help="weights file whose pictures the loss compares too")
     _lpips_options(sub, "adds LPIPS to the loss")
     sub.add_argument("--validate-every", type=int, default=defaults.validate_every)

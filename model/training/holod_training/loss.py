@@ -18,10 +18,15 @@ IN_FOCUS_PX = 2.0
 IN_FOCUS_BLUR_PX = 200 / 7
 MOST_IN_FOCUS_BLUR_PX = 500 / 7
 PERCEPTUAL_PLANES = 5
-# Linear light below which a target is black.
-BLACK = 1e-3
+# Marks are faint at the edges of their discs; black is exactly 0.
+LEAST_LIGHT = 1e-6
+AWAY_PX = 16
 STRUCTURE_SCALES = 3
 WINDOW_PX = 8
+# Wider than a pupil of 1 mm spreads a pixel by diffraction, and about what one of 8 mm blurs it over; and the light, in
+# white pixels, from which on a window's error counts in proportion.
+LIGHT_WINDOWS_PX = (16, 64)
+LIGHT_FLOOR_PX = 1.25
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,9 @@ class LossWeights:
     `absolute` and `gradient` are the paper's: |P − R| and |∇P − ∇R| weighted by W; so is a perceptual error of some
     planes: `lpips` where a run has its weights, `structure` needs none. `outlines` is |∇P − ∇R|² where the scene is out
     of focus: what stands there of a mark is small in every other term. `black` is the light where there should be
-    none, which squares nearly to nothing and is seen all the same. `teacher` counts only where there is one.
+    none for 16 px around, which squares nearly to nothing and is seen all the same; `light` is how far the mean light
+    of windows is off, in proportion: a small mark that cannot be sharp is nearest to its target, by every other term,
+    when it is dim. `teacher` counts only where there is one.
     """
 
     absolute: float = 1.0
@@ -47,6 +54,7 @@ class LossWeights:
     focus_absolute: float = 0.0
     outlines: float = 0.0
     black: float = 0.0
+    light: float = 0.0
     foam: float = 0.0
     structure: float = 0.0
     lpips: float = 1.0
@@ -110,6 +118,24 @@ def structure_loss(picture: Tensor, target: Tensor) -> Tensor:
         scales.append(similarity.mean())
 
 
+def dark_area(target: Tensor) -> Tensor:
+    """Where a stack [K, 3, H, W] is black at every focus and so is all within 16 px each way, [H, W] bool."""
+    lit = (target.amax(dim=(0, 1)) > LEAST_LIGHT).float()
+    return F.max_pool2d(lit[None, None], 2 * AWAY_PX + 1, stride=1, padding=AWAY_PX)[0, 0] == 0
+
+
+def light_loss(picture: Tensor, target: Tensor) -> Tensor:
+    """Mean of |light − wanted light| / (wanted light + that of 1.25 white pixels) of windows of [K, 3, H, W], 16 and 64
+    px wide, half a window apart; the wider ones are left out where a picture is smaller."""
+    errors = []
+    for window in LIGHT_WINDOWS_PX:
+        if errors and min(picture.shape[-2:]) < window:
+            break
+        seen, wanted = (F.avg_pool2d(t, window, window // 2) for t in (picture, target))
+        errors.append(((seen - wanted).abs() / (wanted + LIGHT_FLOOR_PX / window**2)).mean())
+    return torch.stack(errors).mean()
+
+
 def focus_loss(
     picture: Tensor,
     target: Tensor,
@@ -118,8 +144,12 @@ def focus_loss(
     perceptual_planes: Tensor | None = None,
     lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
     teacher: Tensor | None = None,
+    border_px: int = 0,
 ) -> LossParts:
     """picture, target [K, 3, H, W] linear light at every focus of one pupil; coc_px [K, H, W] for these focuses.
+
+    border_px: left out on every side, where a crop lacks the light of what is beyond; but for `black` and `light`: a
+    network whose light by the edges nothing weighs leaves a rim there, bright on black or dark on all else.
 
     perceptual_planes: indices of the planes for `structure` and `lpips`; all of them where left out.
     lpips: distances [N] of pictures [N, 3, H, W] of linear light.
@@ -129,6 +159,12 @@ def focus_loss(
     differences to their median, zero, and the network would show one blurred picture at every depth.
     In-focus pixels are a few per cent of a stack: only a weight on *their* squared error makes them sharp.
     """
+    terms = {}
+    if weights.black:
+        terms["black"] = (picture * dark_area(target)).mean()
+    if weights.light:
+        terms["light"] = light_loss(picture, target)
+    picture, target, coc_px = (inner(t, border_px) for t in (picture, target, coc_px))
     w = sharpness_weight(coc_px, weights.coc_floor_px)[:, None]
     error = picture - target
     dx = error[..., :, 1:] - error[..., :, :-1]
@@ -136,7 +172,7 @@ def focus_loss(
     squared_error = error.square()
     squared = squared_error.mean()
     centred_error = error - error.mean(dim=0)
-    terms = {
+    terms |= {
         "absolute": (w * error.abs()).mean(),
         "gradient": (w[..., 1:] * dx.abs()).mean() + (w[..., 1:, :] * dy.abs()).mean(),
         "squared": squared,
@@ -146,8 +182,6 @@ def focus_loss(
     if weights.outlines:
         blurred = 1 - in_focus_weight(coc_px)[:, None]
         terms["outlines"] = (blurred[..., 1:] * dx.square()).mean() + (blurred[..., 1:, :] * dy.square()).mean()
-    if weights.black:
-        terms["black"] = (picture * (target < BLACK)).mean()
     if weights.foam:
         energy, pixels = foam_energy(picture, target, coc_px)
         terms["foam"] = energy / pixels.clamp_min(1)
@@ -159,7 +193,7 @@ def focus_loss(
     if lpips is not None:
         terms["lpips"] = lpips(picture[chosen], target[chosen]).mean()
     if teacher is not None:
-        terms["teacher"] = (picture - teacher).square().mean()
+        terms["teacher"] = (picture - inner(teacher, border_px)).square().mean()
     total = sum((getattr(weights, name) * value for name, value in terms.items()), picture.new_zeros(()))
     with torch.no_grad():
         r = target - target.mean(dim=0)

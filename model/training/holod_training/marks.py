@@ -5,24 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import torch.nn.functional as F
 from torch import Tensor
 
 from holod_training.judging import AFTER, BEFORE, OURS, Bench, Method
-from holod_training.shards import Shard, ShardError, Stack
+from holod_training.loss import LEAST_LIGHT, dark_area
+from holod_training.shards import Shard, ShardError
 from holod_training.sheets import save_sheet
 
 KINDS = ("dots", "lines", "stars")
-# Marks are faint at the edges of their discs; black is exactly 0.
-LEAST_LIGHT = 1e-6
-AWAY_PX = 16
 LEAST_AREA_PX = 256
-
-
-def dark_area(stack: Stack) -> Tensor:
-    """Where a stack is black at every focus and so is all within 16 px each way, [H, W] bool."""
-    lit = (stack.target.amax(dim=(0, 1)) > LEAST_LIGHT).float()
-    return F.max_pool2d(lit[None, None], 2 * AWAY_PX + 1, stride=1, padding=AWAY_PX)[0, 0] == 0
 
 
 def light_ratio(picture: Tensor, target: Tensor) -> float:
@@ -41,7 +32,7 @@ def judge_marks(shards: list[Shard], methods: list[Method], bench: Bench, sheet:
             )
         for index, pupil in enumerate(shard.pupils_mm):
             stack = bench.read(shard, index)
-            dark = dark_area(stack)
+            dark = dark_area(stack.target)
             if int(dark.sum()) < LEAST_AREA_PX:
                 raise ShardError(f"{shard.path}: nothing of it stays black; write larger ones with --kind marks")
             if not float(stack.target.amax()) > LEAST_LIGHT:

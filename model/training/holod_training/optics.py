@@ -112,6 +112,20 @@ def upsample_half_band(low: Tensor) -> Tensor:
     return torch.fft.ifft2(full * (4 * shift).to(low.dtype))
 
 
+def half_band_samples(field_: Tensor) -> Tensor:
+    """What `upsample_half_band` undoes: the half band of [..., H, W] on a grid of half the size, at block centres."""
+    height, width = field_.shape[-2:]
+    fy, fx = frequencies(height, 1.0, field_.device), frequencies(width, 1.0, field_.device)
+    angle = math.pi * (fy[:, None] + fx[None, :])
+    shift = torch.polar(torch.ones_like(angle), angle)
+    spectrum = torch.fft.fft2(field_) * (shift / 4).to(field_.dtype)
+    low_rows, rows = kept_bins(height // 2, field_.device)
+    low_columns, columns = kept_bins(width // 2, field_.device)
+    low = torch.zeros(*field_.shape[:-2], height // 2, width // 2, dtype=field_.dtype, device=field_.device)
+    low[..., low_rows[:, None], low_columns] = spectrum[..., rows[:, None], columns]
+    return torch.fft.ifft2(low)
+
+
 def kept_bins(size: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Bins below the low grid's Nyquist frequency: where they lie on the low grid, and on one of twice the size."""
     signed = torch.arange(-((size - 1) // 2), (size - 1) // 2 + 1, device=device)
@@ -281,6 +295,15 @@ def through_levels(phase: Tensor, bit_depth: int = 8) -> Tensor:
 def panel_field(phase: Tensor) -> Tensor:
     """What leaves a phase-only panel: exp(j·phase)."""
     return torch.polar(torch.ones_like(phase), phase)
+
+
+def shown_by_panel(field: Tensor, amplitude_constant: float, size: tuple[int, int]) -> Tensor:
+    """What a panel of `size` (height, width) shows of [..., h, w] after double phase, on the same grid: that of the
+    panel or, of which the half band counts, one of half its size. Has a gradient."""
+    half_band = field.shape[-2:] != size
+    phasors = double_phase_phasors(upsample_half_band(field) if half_band else field, amplitude_constant)
+    shown = amplitude_constant * phasors / phasors.abs().clamp_min(1e-6)
+    return half_band_samples(shown) if half_band else shown
 
 
 def coc_px(optics: OpticsConfig, depth: Tensor, focus_dpt: Tensor | list[float], pupil_mm: float) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from holod_training.config import OpticsConfig
 from holod_training.loss import LossWeights, focus_loss
-from holod_training.optics import HalfBandEye, coc_px, double_phase_phasors, frequencies, kept_bins, upsample_half_band
+from holod_training.optics import HalfBandEye, coc_px, half_band_samples, shown_by_panel, upsample_half_band
 from holod_training.shards import Stack
 
 NOISE_SIGMA = 0.03
@@ -41,20 +41,6 @@ class Solution:
     last_loss: float
 
 
-def half_band_samples(field_: Tensor) -> Tensor:
-    """What `upsample_half_band` undoes: the half band of [..., H, W] on a grid of half the size, at block centres."""
-    height, width = field_.shape[-2:]
-    fy, fx = frequencies(height, 1.0, field_.device), frequencies(width, 1.0, field_.device)
-    angle = math.pi * (fy[:, None] + fx[None, :])
-    shift = torch.polar(torch.ones_like(angle), angle)
-    spectrum = torch.fft.fft2(field_) * (shift / 4).to(field_.dtype)
-    low_rows, rows = kept_bins(height // 2, field_.device)
-    low_columns, columns = kept_bins(width // 2, field_.device)
-    low = torch.zeros(*field_.shape[:-2], height // 2, width // 2, dtype=field_.dtype, device=field_.device)
-    low[..., low_rows[:, None], low_columns] = spectrum[..., rows[:, None], columns]
-    return torch.fft.ifft2(low)
-
-
 def smooth_noise(shape: tuple[int, ...], seed: int) -> Tensor:
     """Complex noise of rms 1, [..., h, w], its spectrum a Gaussian of σ 0.03 cycles per sample: no speckle."""
     noise = torch.randn(shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(seed))
@@ -62,13 +48,6 @@ def smooth_noise(shape: tuple[int, ...], seed: int) -> Tensor:
     passed = torch.exp(-(fy[:, None] ** 2 + fx[None, :] ** 2) / (2 * NOISE_SIGMA**2))
     low = torch.fft.ifft2(torch.fft.fft2(noise) * passed)
     return low / low.abs().square().mean().sqrt()
-
-
-def shown_by_panel(low: Tensor, amplitude_constant: float) -> Tensor:
-    """The half band of what a panel shows of [..., h, w] after double phase, on the same grid, with a gradient."""
-    phasors = double_phase_phasors(upsample_half_band(low), amplitude_constant)
-    shown = phasors / phasors.abs().clamp_min(1e-6)
-    return amplitude_constant * half_band_samples(shown)
 
 
 @torch.enable_grad()
@@ -96,7 +75,7 @@ def optimise(
     first_loss = best_loss = math.inf
     best = low.detach().clone()
     for iteration in range(config.iterations + 1):
-        frames = shown_by_panel(torch.view_as_complex(low), amplitude_constant)
+        frames = shown_by_panel(torch.view_as_complex(low), amplitude_constant, (height, width))
         picture = torch.stack([eye.look(frame, stack.pupil_mm) for frame in frames]).mean(dim=0)
         loss = focus_loss(picture, target, blur, config.loss.for_blur(optics.volume_blur_px(stack.pupil_mm))).total
         if iteration == 0:

@@ -34,7 +34,7 @@ from holod_training.loss import PERCEPTUAL_PLANES, LossWeights, focus_loss, inne
 from holod_training.lpips import Lpips
 from holod_training.metrics import Judgement, judge, psnr_db
 from holod_training.network import FieldNetwork
-from holod_training.optics import Eye, HalfBandEye, coc_px
+from holod_training.optics import Eye, HalfBandEye, coc_px, shown_by_panel
 from holod_training.optimizer import OPTIMIZERS, make_optimizer
 from holod_training.rivals import flat_oracle
 from holod_training.sampling import AugmentConfig, Sampler
@@ -81,6 +81,8 @@ class TrainConfig:
     initial_weights: str | None = None
     # bf16: convolutions only; FFTs, taps of deformable layers and the loss stay f32.
     precision: str = "f32"
+    # The loss is of what a panel shows after double phase with this constant; without, of the field itself.
+    double_phase: float | None = None
     # A weights file whose pictures the loss compares too, at weight `loss.teacher`.
     teacher: str | None = None
     # Files of LPIPS's weights, see `lpips.py`; both or none.
@@ -190,6 +192,12 @@ class Run:
     def _precision(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16")
 
+    def _seen(self, field_: Tensor, stack: Stack) -> Tensor:
+        """What the loss is of: pictures of the field, or of what a panel shows of it."""
+        if self.config.double_phase:
+            field_ = shown_by_panel(field_, self.config.double_phase, stack.depth.shape)
+        return see(field_, stack)
+
     def _taught(self, stacks: list[Stack]) -> list[Tensor] | None:
         """The teacher's pictures; it is given the true depth."""
         if self.teacher is None:
@@ -198,7 +206,7 @@ class Run:
         with torch.no_grad(), self._precision():
             fields = self._fields(self.teacher, config, stacks, [s.depth for s in stacks])
         with torch.no_grad():
-            return [see(f, stack) for f, stack in zip(fields, stacks, strict=True)]
+            return [self._seen(f, stack) for f, stack in zip(fields, stacks, strict=True)]
 
     def _perceptual_planes(self, stacks: list[Stack]) -> list[Tensor]:
         """Five random planes of each stack."""
@@ -220,18 +228,18 @@ class Run:
         perceptual_planes = self._perceptual_planes(stacks)
         parts = []
         for index, (low, stack) in enumerate(zip(fields, stacks, strict=True)):
-            border = config.border_px
-            picture = see(low, stack)
+            picture = self._seen(low, stack)
             blur = coc_px(stack.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
             parts.append(
                 focus_loss(
-                    inner(picture, border),
-                    inner(stack.target, border),
-                    inner(blur, border),
+                    picture,
+                    stack.target,
+                    blur,
                     config.loss.for_blur(stack.optics.volume_blur_px(stack.pupil_mm)),
                     perceptual_planes[index],
                     self.lpips,
-                    inner(taught[index], border) if taught else None,
+                    taught[index] if taught else None,
+                    config.border_px,
                 )
             )
         loss = torch.stack([p.total for p in parts]).mean()

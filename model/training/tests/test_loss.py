@@ -4,7 +4,15 @@ import pytest
 import torch
 
 from holod_training.config import OpticsConfig
-from holod_training.loss import LossWeights, focus_loss, in_focus_weight, inner, sharpness_weight, structure_loss
+from holod_training.loss import (
+    LossWeights,
+    focus_loss,
+    in_focus_weight,
+    inner,
+    light_loss,
+    sharpness_weight,
+    structure_loss,
+)
 
 TERMS = ("absolute", "gradient", "squared", "focus", "in_focus", "outlines", "focus_absolute", "structure", "teacher")
 NONE = {name: 0.0 for name in TERMS}
@@ -158,16 +166,46 @@ def test_a_wider_pupil_weighs_the_in_focus_term_more_and_no_other() -> None:
 
 def test_light_where_there_should_be_none_is_weighed_and_no_other() -> None:
     """What is seen of it is its light, not its square: a thousandth of white everywhere counts as a thousandth."""
-    target = torch.zeros(2, 3, 16, 16)
-    target[..., 8:] = 0.5
-    picture, coc = target + 1e-3, torch.full((2, 16, 16), 9.0)
+    target = torch.zeros(2, 3, 64, 64)
+    target[..., 48:] = 0.5
+    picture, coc = target + 1e-3, torch.full((2, 64, 64), 9.0)
     loss = focus_loss(picture, target, coc, LossWeights(black=30.0))
-    assert loss.terms["black"] == pytest.approx(0.5e-3, rel=1e-4)
+    assert loss.terms["black"] == pytest.approx(0.5e-3, rel=1e-4), "half of it is 16 px and more from light"
     assert float(loss.total - focus_loss(picture, target, coc, LossWeights()).total) == pytest.approx(0.015, rel=1e-3)
     brighter = target.clone()
-    brighter[..., 8:] += 0.1
+    brighter[..., 32:] += 0.1
     assert focus_loss(brighter, target, coc, LossWeights(black=30.0)).terms["black"] == 0
     assert "black" not in loss_terms(LossWeights())
+
+
+def test_a_border_counts_for_black_and_light_alone() -> None:
+    """A rim there is light that a viewer sees, or misses; all else by the edges is not known of a crop."""
+    target = torch.zeros(1, 3, 48, 48)
+    coc = torch.full((1, 48, 48), 9.0)
+    weights = LossWeights(black=30.0, light=1.0)
+    lit, dimmed = target.clone(), target + 0.5
+    lit[..., :2] = 0.24
+    terms = focus_loss(lit, target, coc, weights, border_px=8).terms
+    assert terms.pop("black") == pytest.approx(0.01)
+    assert terms.pop("light") > 0 and all(value == 0 for value in terms.values()), terms
+    dimmed[..., :2] = 0.3
+    terms = focus_loss(dimmed, target + 0.5, coc, weights, border_px=8).terms
+    assert terms.pop("light") > 0.005 and all(value == 0 for value in terms.values()), terms
+    assert focus_loss(lit, target, coc, weights).terms["absolute"] > 0
+
+
+def test_a_mark_that_lacks_light_is_told_from_one_that_is_not_sharp() -> None:
+    """A dot of one pixel, spread over eight by eight of the same window, and at half its light."""
+    dot = torch.zeros(1, 3, 32, 32)
+    dot[..., 12, 12] = 1.0
+    spread = torch.zeros(1, 3, 32, 32)
+    spread[..., 8:16, 8:16] = 1 / 64
+    assert light_loss(spread, dot) < 1e-6
+    dimmed = float(light_loss(0.5 * dot, dot))
+    assert dimmed > 0.01 and float(light_loss(0.5 * spread, dot)) == pytest.approx(dimmed, rel=1e-4)
+    terms = focus_loss(0.5 * dot, dot, torch.ones(1, 32, 32), LossWeights(light=2.0)).terms
+    assert terms["light"] == pytest.approx(dimmed)
+    assert "light" not in loss_terms(LossWeights())
 
 
 def loss_terms(weights: LossWeights) -> set[str]:

@@ -9,7 +9,8 @@ from safetensors.torch import load_file, save_file
 
 from holod_training.config import OpticsConfig
 from holod_training.judging import AFTER, BEFORE, OURS, Bench, Method, rivals
-from holod_training.marks import AWAY_PX, dark_area, judge_marks, light_ratio
+from holod_training.loss import AWAY_PX, dark_area
+from holod_training.marks import judge_marks, light_ratio
 from holod_training.optics import stop_half_band
 from holod_training.shards import Shard, ShardError
 
@@ -53,7 +54,7 @@ def test_rows_tell_light_that_is_added_and_black_that_is_none(tmp_path: Path) ->
 
 def test_black_is_what_is_far_from_light_at_every_focus(tmp_path: Path) -> None:
     stack = write_marks(tmp_path / "scene_000000.safetensors").read(0)
-    dark = dark_area(stack)
+    dark = dark_area(stack.target)
     assert dark[:50].all() and not dark[80, 30] and not dark[76 - AWAY_PX, 30] and dark[75 - AWAY_PX, 30]
     assert light_ratio(0.5 * stack.target, stack.target) == pytest.approx(0.5)
 

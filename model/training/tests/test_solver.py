@@ -7,10 +7,17 @@ from holod_training.judging import Bench, network_field
 from holod_training.loss import LossWeights, focus_loss
 from holod_training.metrics import judge
 from holod_training.network import DirectNetwork
-from holod_training.optics import double_phase, panel_field, stop_half_band, upsample_half_band
+from holod_training.optics import (
+    double_phase,
+    half_band_samples,
+    panel_field,
+    shown_by_panel,
+    stop_half_band,
+    upsample_half_band,
+)
 from holod_training.rivals import layered_asm
 from holod_training.shards import Shard, Stack
-from holod_training.solver import Solution, SolverConfig, half_band_samples, optimise, shown_by_panel
+from holod_training.solver import Solution, SolverConfig, optimise
 
 OPTICS = OpticsConfig()
 CONSTANT = 1.4
@@ -49,8 +56,10 @@ def test_what_the_panel_shows_is_double_phase(stack: Stack) -> None:
         phase, clipped = double_phase(field, CONSTANT)
         assert (clipped > 0) == (gain > 1)
         expected = half_band_samples(panel_field(phase) * CONSTANT)
-        found = shown_by_panel(half_band_samples(field), CONSTANT)
+        found = shown_by_panel(half_band_samples(field), CONSTANT, stack.depth.shape)
         assert (found - expected).abs().max() < 5e-3
+        on_the_panels_grid = shown_by_panel(field, CONSTANT, stack.depth.shape)
+        assert (half_band_samples(on_the_panels_grid) - expected).abs().max() < 5e-3
 
 
 def test_it_beats_its_start_and_itself_with_more_iterations(stack: Stack) -> None:

@@ -192,6 +192,20 @@ def test_bf16_is_near_f32_and_leaves_the_weights_f32(shards: Path, tmp_path: Pat
         Run(tiny(shards, tmp_path, precision="f16"), CPU)
 
 
+@pytest.mark.parametrize("grid", ["half-band", "full"])
+def test_the_loss_may_be_of_what_a_panel_shows(shards: Path, tmp_path: Path, grid: str) -> None:
+    """Which is nearly the field where that is bright and within the constant, and far too dark where it is clipped."""
+    network = dataclasses.replace(TINY, grid=grid)
+    field, shown, clipped = (
+        Run(tiny(shards, tmp_path, network=network, double_phase=constant), CPU) for constant in (None, 1.4, 0.05)
+    )
+    before = [p.clone() for p in shown.network.parameters()]
+    of_field, of_panel, of_clipped = (run.train_step()["loss_squared"] for run in (field, shown, clipped))
+    assert of_panel != of_field and of_panel == pytest.approx(of_field, rel=0.1)
+    assert of_clipped > 2 * of_panel
+    assert any((p != q).any() for p, q in zip(shown.network.parameters(), before, strict=True))
+
+
 def test_a_teacher_is_compared_by_its_pictures(shards: Path, tmp_path: Path) -> None:
     """Against itself the term is nothing, against another grid something; its own weights never move."""
     itself = tmp_path / "itself.safetensors"
