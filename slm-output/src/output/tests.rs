@@ -402,6 +402,56 @@ fn a_box_that_fails_goes_dark_by_itself_and_is_tried_again_later() {
     }
 }
 
+/// A box that is simply on while it is armed, and tells no edges.
+struct Switch(SimulatedLaser);
+
+impl LaserBox for Switch {
+    fn capability(&self) -> Capability {
+        Capability { simulated: true, gates_fields: false, has_heartbeat: true, sync_wire: false }
+    }
+    fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
+        self.0.program(program, now)
+    }
+    fn arm(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        self.0.arm(now)
+    }
+    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        self.0.sync(t_sync, now)
+    }
+    fn light(&mut self, _window: LitWindow, _now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        Ok(None)
+    }
+    fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        self.0.heartbeat(now)
+    }
+    fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
+        self.0.dark(reason, now)
+    }
+    fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
+        self.0.poll(now, &mut |happened| {
+            if !matches!(happened, BoxEvent::Edge(_)) {
+                event(happened);
+            }
+        })
+    }
+}
+
+#[test]
+fn a_field_of_a_box_that_tells_no_edges_is_not_said_to_be_dark() {
+    for mode in MODES {
+        let mut bench = Bench::with_box(mode, Box::new(Switch(SimulatedLaser::new(TimeNs(0)))));
+        bench.run(TimeNs(1000 * MS), TimeNs(0));
+        bench.laser.latch(DarkReason::Shutdown, TimeNs(1000 * MS));
+        bench.run(TimeNs(1200 * MS), TimeNs(0));
+        bench.wake(TimeNs(1201 * MS));
+        let (lit, dark): (Vec<&FieldEvent>, Vec<_>) = bench.all_events.iter().partition(|event| event.dark.is_none());
+        assert!(lit.len() > 150 && lit.iter().all(|event| event.laser_on.is_none()), "{}", lit.len());
+        assert!(lit.iter().all(|event| event.t_present < TimeNs(1000 * MS)));
+        assert!(dark.iter().any(|event| event.dark == Some(DarkReason::Shutdown)));
+        assert_eq!(bench.laser.shared.counts().dark_fields, dark.len() as u64);
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(96))]
 
