@@ -41,8 +41,9 @@ LOSSES = {
     "unplug": "the panel was unplugged",
     "removal": "the graphics device was lost",
 }
-# The seat manager takes mastership away before it says so, and a flip may come between.
-LOST_AT_FIRST = {"seat": "another program took the display over"}
+# The seat manager takes mastership away before it says so, and with its own end before that is noticed: a flip may come
+# between.
+LOST_AT_FIRST = dict.fromkeys(["seat", "seat_manager"], "another program took the display over")
 # Runs whose card a seat manager opens, for a user who may not.
 SEATED = ["seat", "seat_thief", "seat_manager"]
 # Runs during which another terminal was in front: without a seat manager nothing is lost.
