@@ -57,6 +57,31 @@ pub struct FrameRecord {
     pub levels_xxh3: Option<u64>,
 }
 
+#[cfg(test)]
+impl FrameRecord {
+    /// A frame for `pupil` of which nothing else is known, made at time 0.
+    pub(crate) fn of_pupil(frame: u64, pupil: PupilDiameter) -> Self {
+        let t = TimeNs(0);
+        Self {
+            frame,
+            t_sample: None,
+            pupil_raw_mm: None,
+            pupil,
+            pupil_state: "tracking",
+            t_wake: t,
+            t_render_begin: t,
+            t_render_end: t,
+            t_submit: t,
+            t_desired_present: t,
+            picture: PictureTag::default(),
+            keep: None,
+            amplitude_constant: 1.0,
+            orders: FrameOrders::default(),
+            levels_xxh3: None,
+        }
+    }
+}
+
 /// The orders that brought what a frame shows: their lines in `orders.jsonl`, from 1; 0 for what the run began with.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct FrameOrders {

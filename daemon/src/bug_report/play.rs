@@ -659,7 +659,6 @@ mod tests {
 
     use super::*;
     use crate::record::FrameOrders;
-    use crate::source::PictureTag;
 
     const COLOURS: [(u8, Colour); 3] = [(0, Colour::Green), (1, Colour::Red), (2, Colour::Blue)];
 
@@ -706,24 +705,7 @@ mod tests {
     }
 
     fn record(frame: u64, levels_xxh3: Option<u64>) -> FrameRecord {
-        let t = TimeNs(0);
-        FrameRecord {
-            frame,
-            t_sample: None,
-            pupil_raw_mm: None,
-            pupil: PupilDiameter::from_mm(3.0),
-            pupil_state: "tracking",
-            t_wake: t,
-            t_render_begin: t,
-            t_render_end: t,
-            t_submit: t,
-            t_desired_present: t,
-            picture: PictureTag::default(),
-            keep: None,
-            amplitude_constant: 1.0,
-            orders: FrameOrders::default(),
-            levels_xxh3,
-        }
+        FrameRecord { levels_xxh3, ..FrameRecord::of_pupil(frame, PupilDiameter::from_mm(3.0)) }
     }
 
     fn field(frame_id: u64, (field, colour): (u8, Colour)) -> FieldEvent {

@@ -135,28 +135,9 @@ mod tests {
     use holod_slm_output::TimestampSource;
     use holod_slm_output::laser::DarkReason;
 
-    use crate::record::FrameOrders;
-    use crate::source::PictureTag;
-
     fn record(frame: u64) -> LoopRecord {
-        let t = TimeNs(0);
-        let frame = FrameRecord {
-            frame,
-            t_sample: Some(TimeNs(1_000)),
-            pupil_raw_mm: None,
-            pupil: PupilDiameter::from_mm(3.0),
-            pupil_state: "tracking",
-            t_wake: t,
-            t_render_begin: t,
-            t_render_end: t,
-            t_submit: t,
-            t_desired_present: t,
-            picture: PictureTag::default(),
-            keep: None,
-            amplitude_constant: 1.0,
-            orders: FrameOrders::default(),
-            levels_xxh3: None,
-        };
+        let pupil = PupilDiameter::from_mm(3.0);
+        let frame = FrameRecord { t_sample: Some(TimeNs(1_000)), ..FrameRecord::of_pupil(frame, pupil) };
         LoopRecord { frame, beyond_trained: false, clipped_share: 0.0, unreachable_share: 0.0 }
     }
 
