@@ -39,6 +39,9 @@ pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> 
         results::print(sight.to_string().trim_end())?;
     }
     let Some(output) = output else { return Ok(()) };
+    if to.rig.config.is_none() && !matches!(output, OutputSpec::Headless(_)) {
+        tracing::warn!("no --config: this is the built-in rig's panel and optics, and it lights no lasers");
+    }
     let shown = show::show(&output, &rig, &encoder, &levels, to)?;
     results::print(&shown.to_string())?;
     match shown.lasers_dark {
