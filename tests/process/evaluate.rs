@@ -193,12 +193,12 @@ fn scenes_of_the_renderer_are_judged_told_and_written() {
 /// --size 256
 /// --pupils 2,4 --planes 2 --rays 8`, then `python -m holod_training evaluate --marks` on these.
 const LIGHT_OF_MARKS: [(&str, f64, f64, f64); 6] = [
-    ("dots", 2.0, 0.9842, 0.000_004_757),
-    ("dots", 4.0, 0.9158, 0.000_004_550),
-    ("lines", 2.0, 1.0029, 0.000_009_138),
-    ("lines", 4.0, 0.9843, 0.000_007_968),
-    ("stars", 2.0, 1.0047, 0.000_003_447),
-    ("stars", 4.0, 0.9345, 0.000_003_459),
+    ("dots", 2.0, 0.9960, 0.000_002_376),
+    ("dots", 4.0, 0.9138, 0.000_003_012),
+    ("lines", 2.0, 1.0115, 0.000_006_894),
+    ("lines", 4.0, 0.9661, 0.000_004_693),
+    ("stars", 2.0, 1.0041, 0.000_001_302),
+    ("stars", 4.0, 0.9541, 0.000_002_448),
 ];
 
 /// How far the light on black may be off, of white's: phases of which some fall on the next level.

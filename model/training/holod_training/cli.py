@@ -145,6 +145,13 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--benches-method", default="", help="whose rows of it; the name of --out where left out")
     export.set_defaults(run=_export)
 
+    mean = command("average", "Writes the weighted mean of weights files that went on from the same weights")
+    mean.add_argument(
+        "--weights", nargs=2, action="append", required=True, metavar=("FILE", "SHARE"), help="more than once; sum 1"
+    )
+    mean.add_argument("--out", required=True)
+    mean.set_defaults(run=_average)
+
     golden = command("golden", "Writes the golden vectors that the engines are tested against")
     golden.add_argument("--out", required=True, help="folder, model/golden")
     golden.add_argument("--weights", help="the shipped standard weights, for vectors of them too")
@@ -320,6 +327,19 @@ def _export(options: argparse.Namespace) -> None:
             options.benches_method,
         )
     )
+
+
+def _average(options: argparse.Namespace) -> None:
+    from holod_training.average import average
+
+    print(average([(Path(path), _share(share)) for path, share in options.weights], Path(options.out)))
+
+
+def _share(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise WeightsError(f"found a share of {text!r}, expected a number") from None
 
 
 def _golden(options: argparse.Namespace) -> None:
