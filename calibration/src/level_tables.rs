@@ -5,7 +5,8 @@ use crate::{Colour, PerColour, Resolution};
 /// What turns phases into a panel's samples, for whoever does it elsewhere than the encoder that made it: on a GPU.
 ///
 /// The sample of a pixel is entry ⌊φ/2π·n + flatness⌋ mod n of its colour's table of n entries, without
-/// [`UNREACHABLE`](Self::UNREACHABLE). Pixels around the pattern have phase 0.
+/// [`UNREACHABLE`](Self::UNREACHABLE). Pixels around the pattern have π/2 where x + y, counted from its first pixel, is
+/// odd and −π/2 where it is even: double phase's darkness.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LevelTables {
     /// Pixels of the panel.

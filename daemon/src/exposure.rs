@@ -268,6 +268,48 @@ mod tests {
         planes.map(|(a, b)| (a - b).abs()).max_by(f32::total_cmp).unwrap_or(f32::NAN)
     }
 
+    /// The least and the greatest light at 8 px or more from a bright pattern that is smaller than its panel, white 1.
+    fn light_around(frame: impl FnOnce(&PanelEncoder, &mut LevelsFrame)) -> (f32, f32) {
+        const AWAY: usize = 8;
+        let panel = Resolution { width: 95, height: 70 };
+        let rig = Rig::default();
+        let encoder = PanelEncoder::new(&rig.panel, panel, SIZE).unwrap();
+        let mut levels = LevelsFrame::new(FrameLayout::new(&rig.panel, panel));
+        frame(&encoder, &mut levels);
+        let phases_rad = encoder.decode(Colour::Green, &levels.unpack_colour(Colour::Green).levels);
+        let mut light = vec![0.0; panel.pixels()];
+        SimulatedEye::new(&rig.geometry, panel).view_colour(
+            Colour::Green,
+            &phases_rad,
+            EYE,
+            CONSTANT * CONSTANT,
+            &mut light,
+        );
+        let (left, top) = ((panel.width - SIZE.width) / 2, (panel.height - SIZE.height) / 2);
+        let is_away = |pixel: usize| {
+            let (x, y) = (pixel % panel.width, pixel / panel.width);
+            let from_edges = [x, panel.width - 1 - x, y, panel.height - 1 - y];
+            let is_near =
+                x + AWAY >= left && x < left + SIZE.width + AWAY && y + AWAY >= top && y < top + SIZE.height + AWAY;
+            !is_near && from_edges.into_iter().all(|distance| distance >= AWAY)
+        };
+        let around = light.iter().enumerate().filter(|(pixel, _)| is_away(*pixel)).map(|(_, light)| *light);
+        around.fold((f32::INFINITY, f32::NEG_INFINITY), |(least, most), light| (least.min(light), most.max(light)))
+    }
+
+    #[test]
+    fn what_surrounds_a_small_pattern_is_dark_to_an_eye_that_sees_the_whole_panel() {
+        let bright = bench(&[&|_, _| 1.0]);
+        let phases_rad = bright.encoder.decode(Colour::Green, &bright.frames[0].unpack_colour(Colour::Green).levels);
+        let (_, most) = light_around(|encoder, frame| {
+            encoder.encode(PerColour([&phases_rad[..]; 3]), frame);
+        });
+        assert!(most < 5e-3, "{most}");
+        // Phase 0 in its place would be brighter than white.
+        let (least, _) = light_around(|encoder, frame| encoder.encode_flat(frame));
+        assert!(least > 1.2, "{least}");
+    }
+
     #[test]
     fn in_step_the_eye_sees_what_view_shows() {
         let ramps = |pixel: usize, colour: Colour| match colour {

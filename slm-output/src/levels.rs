@@ -20,6 +20,7 @@
 //! the width of an entry, 2π/(16·L), a sixteenth of a level's step; where levels are 2π/L apart the steps' borders fall
 //! on the entries' borders and it is the nearest one. With 16 bits there is one entry for each level.
 
+use std::f32::consts::FRAC_PI_2;
 use std::f64::consts::TAU;
 
 use holod_calibration::rig::{LevelPhase, OutOfStroke, Panel, PanelMode, PhaseSign};
@@ -132,7 +133,9 @@ struct ColourEncoder {
 
 impl PanelEncoder {
     /// An encoder for `panel` of `panel_resolution` pixels, for patterns of `pattern_resolution` pixels, which are
-    /// centred on the panel (half a pixel up and left where the difference is odd) within a flat surround of phase 0.
+    /// centred on the panel (half a pixel up and left where the difference is odd). What is around them is dark behind
+    /// the stop that passes half of the band, as a double-phase pattern of nothing: π/2 where x + y of the pattern, gone
+    /// on with, is odd and −π/2 where it is even. Phase 0 would pass the stop whole, and outshine white.
     ///
     /// A look-up table that rises is a magnitude and takes the panel's `phase_sign`; one that falls is signed already
     /// and the panel's `phase_sign` must be negative too.
@@ -217,16 +220,18 @@ impl PanelEncoder {
     fn encode_row(&self, colour: Colour, y: usize, phase_rad: &[f32], mut samples: Strided<'_>) -> usize {
         let encoder = &self.colours[colour.index()];
         let (left, top) = self.pattern_origin();
-        let first = y * self.layout.resolution.width;
+        let width = self.layout.resolution.width;
+        let first = y * width;
+        let is_odd = |x: usize| (x + left + y + top) % 2 == 1;
         if y < top || y >= top + self.pattern.height {
-            encoder.encode_flat(first, self.layout.resolution.width, &mut samples);
+            encoder.encode_dark(first, width, is_odd(0), &mut samples);
             return 0;
         }
         let phases_rad = &phase_rad[(y - top) * self.pattern.width..][..self.pattern.width];
         let right = left + self.pattern.width;
-        encoder.encode_flat(first, left, &mut samples);
+        encoder.encode_dark(first, left, is_odd(0), &mut samples);
         let unreachable = encoder.encode_run(first + left, phases_rad, &mut samples.from(left));
-        encoder.encode_flat(first + right, self.layout.resolution.width - right, &mut samples.from(right));
+        encoder.encode_dark(first + right, width - right, is_odd(right), &mut samples.from(right));
         unreachable
     }
 
@@ -331,9 +336,28 @@ impl ColourEncoder {
     }
 
     fn encode_flat(&self, first: usize, count: usize, samples: &mut Strided<'_>) {
-        const ZEROS: [f32; BLOCK] = [0.0; BLOCK];
-        for start in (0..count).step_by(BLOCK) {
-            self.encode_run(first + start, &ZEROS[..BLOCK.min(count - start)], &mut samples.from(start));
+        self.encode_repeated(&[0.0; BLOCK], first, count, samples);
+    }
+
+    /// Double phase of amplitude 0, from a pixel on whose x + y is odd or even.
+    fn encode_dark(&self, first: usize, count: usize, is_odd: bool, samples: &mut Strided<'_>) {
+        const FROM_EVEN: [f32; BLOCK + 1] = {
+            let mut phases_rad = [-FRAC_PI_2; BLOCK + 1];
+            let mut x = 1;
+            while x <= BLOCK {
+                phases_rad[x] = FRAC_PI_2;
+                x += 2;
+            }
+            phases_rad
+        };
+        let from = usize::from(is_odd);
+        self.encode_repeated(&FROM_EVEN[from..from + BLOCK], first, count, samples);
+    }
+
+    fn encode_repeated(&self, block_rad: &[f32], first: usize, count: usize, samples: &mut Strided<'_>) {
+        for start in (0..count).step_by(block_rad.len()) {
+            let run = &block_rad[..block_rad.len().min(count - start)];
+            self.encode_run(first + start, run, &mut samples.from(start));
         }
     }
 
@@ -765,7 +789,7 @@ mod tests {
     }
 
     #[test]
-    fn a_small_pattern_is_centred_in_a_flat_surround() {
+    fn a_small_pattern_is_centred_in_a_dark_surround() {
         let panel = Panel { mode: PanelMode::FieldSequential, ..panel() };
         let (big, small) = (Resolution { width: 6, height: 5 }, Resolution { width: 3, height: 2 });
         let encoder = PanelEncoder::new(&panel, big, small).unwrap();
@@ -775,9 +799,10 @@ mod tests {
         }
         let half_turn = [TAU as f32 / 2.0; 6];
         encoder.encode(PerColour([&half_turn; 3]), &mut frame);
-        let (z, x) = (0, 128);
+        // Pixel (0, 0) of the pattern is even, and so has -π/2 beside it where x + y is even.
+        let (o, e, x) = (64, 192, 128);
         let expected =
-            [[z, z, z, z, z, z], [z, x, x, x, z, z], [z, x, x, x, z, z], [z, z, z, z, z, z], [z, z, z, z, z, z]];
+            [[e, o, e, o, e, o], [o, x, x, x, o, e], [e, x, x, x, e, o], [o, e, o, e, o, e], [e, o, e, o, e, o]];
         let levels = frame.unpack_colour(Colour::Red).levels;
         assert_eq!(levels, expected.concat());
         assert_eq!(first_wrong(&half_turn, &encoder.decode_pattern(Colour::Red, &levels), 1e-6), None);

@@ -1,6 +1,6 @@
 //! The GPU's stages on Mesa's software device, against their twins on the processor.
 
-use std::f32::consts::TAU;
+use std::f32::consts::{FRAC_PI_2, TAU};
 use std::sync::Arc;
 
 use holod_calibration::{Colour, DisplayGeometry, LevelTables, PerColour, PupilDiameter, Resolution};
@@ -106,8 +106,11 @@ fn samples(tables: &LevelTables, phases_rad: &[f32]) -> (Vec<u16>, [u32; 3]) {
         let colour = tables.field_order[position];
         let (x, y) = ((pixel % panel.width).wrapping_sub(*left), (pixel / panel.width).wrapping_sub(*top));
         let inside = x < pattern.width && y < pattern.height;
-        let phase_rad =
-            if inside { phases_rad[colour.index() * pattern.pixels() + y * pattern.width + x] } else { 0.0 };
+        let phase_rad = match inside {
+            true => phases_rad[colour.index() * pattern.pixels() + y * pattern.width + x],
+            false if x.wrapping_add(y) % 2 == 1 => FRAC_PI_2,
+            false => 3.0 * FRAC_PI_2,
+        };
         let table = &tables.levels[colour];
         let flat = tables.flatness[colour].as_ref().map_or(0.0, |flatness| flatness[pixel]);
         let entry = phase_rad * (table.len() as f32 / TAU) + flat;
