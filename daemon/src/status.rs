@@ -2,6 +2,8 @@
 //! its end.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::fs::File;
+use std::io::Read;
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -9,6 +11,7 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use holod_calibration::{TimeNs, host_now, write_atomically};
+use rustix::fs::{Mode, OFlags};
 use serde::{Deserialize, Serialize};
 
 use crate::aside::{Queue, Taking, join_within};
@@ -20,6 +23,8 @@ use crate::snapshot::Snapshot;
 const SERVICE_FOLDER: &str = "/run/holod";
 /// A file older than this was not written by a loop that still turns.
 const STALE: TimeNs = TimeNs(5_000_000_000);
+/// Bytes of the longest file that is read.
+const LONGEST: u64 = 1 << 20;
 /// Moments that may wait for the disk, of which the newest is written; what comes after them is left out.
 const WAITING: usize = 4;
 /// How long the end of a run waits for its file to be taken away.
@@ -170,7 +175,9 @@ pub(crate) struct Found {
 /// None runs, or what it says may not be read.
 pub(crate) fn of_running() -> Result<Vec<Found>, Failure> {
     let mut folders = vec![PathBuf::from(SERVICE_FOLDER)];
-    folders.extend(runtime_folder::candidates());
+    // In the folder for temporary files anybody could have made one of this user's name first.
+    let is_trusted = |folder: &PathBuf| runtime_folder::is_own(folder) || !folder.exists();
+    folders.extend(runtime_folder::candidates().into_iter().filter(is_trusted));
     folders.dedup();
     of_running_in(&folders, host_now())
 }
@@ -257,12 +264,23 @@ fn read(path: &Path, now: TimeNs) -> std::io::Result<Option<Found>> {
     if !(name.starts_with("status-") && name.ends_with(".json")) {
         return Ok(None);
     }
-    let written = serde_json::from_slice::<Written<Snapshot>>(&std::fs::read(path)?);
+    let written = serde_json::from_slice::<Written<Snapshot>>(&read_file(path)?);
     let Ok(Written { written_ns, began_ticks, status }) = written else { return Ok(None) };
     let lives = name == file_name(status.pid) && lives(status.pid, began_ticks);
     let age_ns = written_ns.map_or(0, |written_ns| now.0.saturating_sub(written_ns).max(0));
     let stale = (age_ns > STALE.0).then(|| Duration::from_nanos(age_ns.unsigned_abs()));
     Ok(lives.then_some(Found { status, stale }))
+}
+
+/// What a file holds, as far as a status goes; nothing of a link, a FIFO, which would be waited for, or a device.
+fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
+    let flags = OFlags::RDONLY | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    let file = File::from(rustix::fs::open(path, flags, Mode::empty())?);
+    let mut bytes = Vec::new();
+    if file.metadata()?.is_file() {
+        file.take(LONGEST).read_to_end(&mut bytes)?;
+    }
+    Ok(bytes)
 }
 
 #[cfg(test)]
@@ -327,6 +345,27 @@ mod tests {
         assert_eq!(found_in(&folders).unwrap()[0].stale, None);
         std::fs::write(&own, "{").unwrap();
         assert!(found_in(&folders).is_err());
+    }
+
+    #[test]
+    fn a_link_and_a_fifo_in_the_place_of_a_status_are_passed_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let folders = [folder.path().to_owned()];
+        let elsewhere = folder.path().join("elsewhere.json");
+        std::fs::write(&elsewhere, serde_json::to_vec(&status()).unwrap()).unwrap();
+        let own = folder.path().join(file_name(std::process::id()));
+        std::os::unix::fs::symlink(&elsewhere, &own).unwrap();
+        rustix::fs::mknodat(
+            rustix::fs::CWD,
+            folder.path().join(file_name(1)),
+            rustix::fs::FileType::Fifo,
+            Mode::RWXU,
+            0,
+        )
+        .unwrap();
+        assert!(found_in(&folders).is_err());
+        std::fs::rename(&elsewhere, &own).unwrap();
+        assert_eq!(found_in(&folders).unwrap().len(), 1);
     }
 
     #[test]

@@ -452,7 +452,7 @@ impl Material<'_> {
 
     /// The place of what a request for a pattern shows; nothing where that is holograms.
     fn draw(&mut self, request: Request) -> Result<Option<usize>, String> {
-        if !matches!(request, Request::Flat | Request::Pattern { .. } | Request::Hologram) {
+        if !matches!(request, Request::Flat {} | Request::Pattern { .. } | Request::Hologram {}) {
             return Err("it brought no pattern".into());
         }
         if let Some(place) = self.drawn.iter().position(|drawn| *drawn == request) {

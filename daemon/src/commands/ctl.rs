@@ -35,7 +35,7 @@ fn socket_of_running(pid: Option<u32>) -> Result<PathBuf, Failure> {
 /// The request that is meant; names of files become absolute, as the daemon is elsewhere.
 fn request(order: &CtlOrder) -> Result<Request, Failure> {
     Ok(match order {
-        CtlOrder::Status => Request::Status,
+        CtlOrder::Status => Request::Status {},
         CtlOrder::Scene { scene, depth_encoding, fit } => Request::Scene {
             scene: if scene == "feed" { scene.clone() } else { absolute_scene(scene)? },
             depth_encoding: depth_encoding.clone(),
@@ -43,8 +43,8 @@ fn request(order: &CtlOrder) -> Result<Request, Failure> {
         },
         CtlOrder::Weights { weights: WeightsChoice::File(path) } => Request::Weights { weights: absolute(path)? },
         CtlOrder::Weights { weights } => Request::Weights { weights: setup::weights_name(weights) },
-        CtlOrder::Pause => Request::Pause,
-        CtlOrder::Resume => Request::Resume,
+        CtlOrder::Pause => Request::Pause {},
+        CtlOrder::Resume => Request::Resume {},
         CtlOrder::Pupil { pupil: PupilOrder::Follow } => Request::Pupil { mm: None },
         CtlOrder::Pupil { pupil: PupilOrder::Fixed(pupil) } => Request::Pupil { mm: Some(pupil.mm()) },
         CtlOrder::Pattern(kind) => {
@@ -52,11 +52,11 @@ fn request(order: &CtlOrder) -> Result<Request, Failure> {
         }
         CtlOrder::Eye { eye } => Request::Eye { eye: *eye },
         CtlOrder::Reload => Request::Reload { changed: BTreeMap::new() },
-        CtlOrder::Flat => Request::Flat,
-        CtlOrder::Hologram => Request::Hologram,
-        CtlOrder::Lasers { lasers: LasersArg::Dark } => Request::LasersDark,
-        CtlOrder::Lasers { lasers: LasersArg::Arm } => Request::LasersArm,
-        CtlOrder::Stop => Request::Stop,
+        CtlOrder::Flat => Request::Flat {},
+        CtlOrder::Hologram => Request::Hologram {},
+        CtlOrder::Lasers { lasers: LasersArg::Dark } => Request::LasersDark {},
+        CtlOrder::Lasers { lasers: LasersArg::Arm } => Request::LasersArm {},
+        CtlOrder::Stop => Request::Stop {},
     })
 }
 

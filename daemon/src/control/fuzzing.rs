@@ -35,10 +35,10 @@ static PREPARER: LazyLock<Preparer> = LazyLock::new(|| {
 /// # Panics
 /// Where a request that is written down and read is written down as another one, or a pupil is taken that no eye has.
 pub fn request(line: &[u8]) {
-    let request: Request = match serde_json::from_slice(line) {
+    let request: Request = match Request::from_line(line) {
         Ok(request) => request,
-        Err(error) => {
-            assert!(!error.to_string().is_empty());
+        Err(why) => {
+            assert!(!why.is_empty());
             return;
         }
     };
@@ -46,7 +46,7 @@ pub fn request(line: &[u8]) {
     // round.
     let again = |request: &Request| {
         let written = serde_json::to_vec(request).expect("a request can be written");
-        let read: Request = serde_json::from_slice(&written).expect("what was written can be read");
+        let read: Request = Request::from_line(&written).expect("what was written can be read");
         (written, read)
     };
     let (_, read) = again(&request);

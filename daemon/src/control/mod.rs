@@ -31,13 +31,14 @@ pub(crate) use self::steering::Steering;
 
 use crate::source::scene::Frames;
 
-/// A request.
+/// A request. Those without fields have braces all the same: serde lets a variant without pass with fields that are not
+/// known, and who wrote `"armed": false` beside `lasers-arm` meant something.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "do", rename_all = "kebab-case", deny_unknown_fields)]
 #[allow(missing_docs, reason = "the variants say what their fields are")]
 pub enum Request {
     /// Say how the run is: the same as `holod status --json`, at this moment.
-    Status,
+    Status {},
     /// Show a scene from files, or the live feed again.
     Scene {
         /// As after `--scene`, with absolute paths; `feed` for the live feed.
@@ -55,9 +56,9 @@ pub enum Request {
         weights: String,
     },
     /// Show the picture that is shown until further notice; the pupil is followed.
-    Pause,
+    Pause {},
     /// Take that back.
-    Resume,
+    Resume {},
     /// Compute for one pupil, whatever the tracker says.
     Pupil {
         /// Its diameter; nothing follows the tracker again.
@@ -83,33 +84,45 @@ pub enum Request {
         colours: Vec<Colour>,
     },
     /// Show one phase everywhere in place of holograms.
-    Flat,
+    Flat {},
     /// Show holograms again.
-    Hologram,
+    Hologram {},
     /// Keep the lasers dark.
-    LasersDark,
+    LasersDark {},
     /// Take that back: lasers are lit again by the rules.
-    LasersArm,
+    LasersArm {},
     /// End the run in order.
-    Stop,
+    Stop {},
 }
 
 impl Request {
+    /// The request that a line of JSON is.
+    ///
+    /// # Errors
+    /// It is none, in words.
+    pub(crate) fn from_line(line: &[u8]) -> Result<Self, String> {
+        // Of an array serde would make a request, too, with its fields in their order.
+        if !line.trim_ascii_start().starts_with(b"{") {
+            return Err("expected an object, such as {\"do\": \"status\"}".into());
+        }
+        serde_json::from_slice(line).map_err(|error| error.to_string())
+    }
+
     /// Whether the run is another one after it.
     pub(crate) fn changes_something(&self) -> bool {
-        *self != Self::Status
+        *self != Self::Status {}
     }
 
     /// Whether frames may have other levels after it.
     fn changes_levels(&self) -> bool {
-        !matches!(self, Self::Status | Self::LasersDark | Self::LasersArm | Self::Stop)
+        !matches!(self, Self::Status {} | Self::LasersDark {} | Self::LasersArm {} | Self::Stop {})
     }
 
     /// Whether files must be read or an engine opened for it, which takes a while.
     fn takes_long(&self) -> bool {
         matches!(
             self,
-            Self::Scene { .. } | Self::Weights { .. } | Self::Reload { .. } | Self::Pattern { .. } | Self::Flat
+            Self::Scene { .. } | Self::Weights { .. } | Self::Reload { .. } | Self::Pattern { .. } | Self::Flat {}
         )
     }
 }
@@ -168,10 +181,10 @@ mod tests {
     #[test]
     fn requests_are_lines_of_json() {
         for (line, request) in [
-            (r#"{"do":"status"}"#, Request::Status),
+            (r#"{"do":"status"}"#, Request::Status {}),
             (r#"{"do":"pupil","mm":3.5}"#, Request::Pupil { mm: Some(3.5) }),
             (r#"{"do":"pupil"}"#, Request::Pupil { mm: None }),
-            (r#"{"do":"lasers-dark"}"#, Request::LasersDark),
+            (r#"{"do":"lasers-dark"}"#, Request::LasersDark {}),
             (r#"{"do":"eye","eye":"better"}"#, Request::Eye { eye: Eye::Better }),
             (r#"{"do":"reload"}"#, Request::Reload { changed: BTreeMap::new() }),
             (
@@ -187,11 +200,22 @@ mod tests {
                 Request::Scene { scene: "/a,/b".into(), depth_encoding: Some("metres".into()), fit: Fit::Cover },
             ),
         ] {
-            assert_eq!(serde_json::from_str::<Request>(line).unwrap(), request);
+            assert_eq!(Request::from_line(line.as_bytes()).unwrap(), request);
         }
-        for wrong in [r#"{"do":"pupil","cm":1}"#, r#"{"do":"dance"}"#, r#"{}"#, "[]", "status"] {
-            assert!(serde_json::from_str::<Request>(wrong).is_err(), "{wrong}");
+        for wrong in [r#"{"do":"pupil","cm":1}"#, r#"{"do":"dance"}"#, r#"{}"#, "[]", "status", r#"["pupil",3.5]"#] {
+            assert!(Request::from_line(wrong.as_bytes()).is_err(), "{wrong}");
         }
         assert_eq!(serde_json::to_string(&Answer::Error("no".into())).unwrap(), r#"{"error":"no"}"#);
+    }
+
+    #[test]
+    fn a_request_with_a_field_that_it_does_not_have_is_none() {
+        for name in ["status", "pause", "resume", "reload", "flat", "hologram", "lasers-dark", "lasers-arm", "stop"] {
+            assert!(Request::from_line(format!(r#" {{"do":"{name}"}}"#).as_bytes()).is_ok(), "{name}");
+            let with_more = format!(r#"{{"do":"{name}","armed":false}}"#);
+            let refused = Request::from_line(with_more.as_bytes()).unwrap_err();
+            assert!(refused.contains("unknown field `armed`"), "{name}: {refused}");
+            assert!(Request::from_line(format!(r#"["{name}"]"#).as_bytes()).is_err(), "{name}");
+        }
     }
 }

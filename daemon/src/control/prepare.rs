@@ -71,15 +71,15 @@ impl Preparer {
             );
         }
         match request {
-            Request::Status => Ok(Order::Status),
-            Request::Pause => Ok(Order::Pause(true)),
-            Request::Resume => Ok(Order::Pause(false)),
-            Request::LasersDark => Ok(Order::KeepDark(true)),
-            Request::LasersArm => Ok(Order::KeepDark(false)),
-            Request::Stop => Ok(Order::Stop),
+            Request::Status {} => Ok(Order::Status),
+            Request::Pause {} => Ok(Order::Pause(true)),
+            Request::Resume {} => Ok(Order::Pause(false)),
+            Request::LasersDark {} => Ok(Order::KeepDark(true)),
+            Request::LasersArm {} => Ok(Order::KeepDark(false)),
+            Request::Stop {} => Ok(Order::Stop),
             Request::Pupil { mm: None } => Ok(Order::Pupil(None)),
             Request::Pupil { mm: Some(mm) } => cli::human_pupil(*mm).map(|pupil| Order::Pupil(Some(pupil))),
-            Request::Flat => self.pattern("flat".into(), |encoder, levels| {
+            Request::Flat {} => self.pattern("flat".into(), |encoder, levels| {
                 encoder.encode_flat(levels);
                 Ok(())
             }),
@@ -90,7 +90,7 @@ impl Preparer {
                 };
                 self.pattern(pattern.to_string(), draw)
             }
-            Request::Hologram => Ok(Order::Pattern(None)),
+            Request::Hologram {} => Ok(Order::Pattern(None)),
             Request::Scene { scene, depth_encoding, .. } if scene == "feed" => self.feed(depth_encoding.is_some()),
             Request::Scene { scene, depth_encoding, fit } => self.scene(scene, depth_encoding.as_ref(), *fit),
             Request::Weights { weights } => self.weights(weights).map(Order::Engine),

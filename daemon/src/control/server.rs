@@ -169,7 +169,7 @@ async fn converse(stream: UnixStream, desk: &Arc<Waiting>) -> io::Result<()> {
 }
 
 async fn answer(line: &[u8], desk: &Arc<Waiting>) -> Answer {
-    match serde_json::from_slice(line) {
+    match Request::from_line(line) {
         Ok(request) => answer_to(request, desk).await,
         Err(error) => desk.refuse(Refused::Malformed, format!("the request is not understood: {error}")),
     }

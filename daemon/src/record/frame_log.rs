@@ -247,7 +247,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let log = FrameLog::create(folder.path()).unwrap();
         log.order(TimeNs(5), &Request::Pupil { mm: Some(3.5) }).unwrap();
-        log.order(TimeNs(6), &Request::LasersDark).unwrap();
+        log.order(TimeNs(6), &Request::LasersDark {}).unwrap();
         let text = fs::read_to_string(folder.path().join("orders.jsonl")).unwrap();
         let expected =
             [r#"{"request":{"do":"pupil","mm":3.5},"t_ns":5}"#, r#"{"request":{"do":"lasers-dark"},"t_ns":6}"#];

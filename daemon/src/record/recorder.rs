@@ -452,7 +452,7 @@ mod tests {
         for number in 0..ROWS as u64 + 100 {
             recorder.frame(&frame(number)).unwrap();
         }
-        recorder.order(TimeNs(6), &Request::LasersDark).unwrap();
+        recorder.order(TimeNs(6), &Request::LasersDark {}).unwrap();
         let rows_lost = || recorder.health.state().rows_lost;
         assert_eq!((rows_lost(), recorder.health.is_lost()), (100, false), "an order finds room yet");
         recorder.tell_slowness();

@@ -145,8 +145,11 @@ def _listens(path: str) -> bool:
 
 
 def _only_socket() -> Path:
-    own = default_path().parent
-    for folder in (own, Path("/run/holod")):
+    own, service = default_path().parent, Path("/run/holod")
+    for folder in (own, service):
+        if folder != service and folder.exists() and folder.stat().st_uid != os.geteuid():
+            # In the folder for temporary files anybody could have made one of this user's name first.
+            continue
         found = [path for path in sorted(glob.glob(glob.escape(str(folder)) + "/control-*")) if _listens(path)]
         if len(found) > 1:
             raise ControlError(f"several holods run: {', '.join(found)}; give the path of one")

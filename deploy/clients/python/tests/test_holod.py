@@ -176,6 +176,9 @@ def test_the_monocular_example_shows_a_folder_of_pictures(holod: Holod, tmp_path
 def test_a_running_holod_is_changed(holod: Holod, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(holod.socket.parent))
+    with monkeypatch.context() as as_another, pytest.raises(ControlError, match="no holod runs"):
+        as_another.setattr(os, "geteuid", lambda: os.getuid() + 1)
+        Control()
     with Control() as control:
         assert control.pupil(3.5) == "the pupil is 3.5 mm until further notice"
         patience_s = time.monotonic() + 60
