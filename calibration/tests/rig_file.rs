@@ -154,6 +154,7 @@ fn figures_in_another_unit_are_recognised() {
             "seconds: write 100 ",
         ),
         ("fallback_mm = 3.0", "fallback_mm = 0.003", "tracker.fallback_mm", "looks like metres: write 3 "),
+        ("hold_ms = 1000.0", "hold_ms = 1", "tracker.hold_ms", "looks like seconds: write 1000 "),
     ] {
         check(from, to, key, "", "a number from", advice);
     }
@@ -183,7 +184,7 @@ fn figures_out_of_range_are_refused() {
         ("heartbeat_timeout_ms = 100.0", "heartbeat_timeout_ms = 5000", "lasers.heartbeat_timeout_ms"),
         ("eye = \"both\"", "scale_mm_per_unit = 0\neye = \"both\"", "tracker.scale_mm_per_unit"),
         ("fallback_mm = 3.0", "fallback_mm = 0.5", "tracker.fallback_mm"),
-        ("hold_ms = 1000.0", "hold_ms = -1", "tracker.hold_ms"),
+        ("hold_ms = 1000.0", "hold_ms = 0", "tracker.hold_ms"),
     ] {
         check(from, to, key, "", "a number from", "");
     }

@@ -6,7 +6,7 @@ use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_calibration::{DisplayGeometry, PupilDiameter};
 use holod_model::Weights;
 use holod_model::conditions::BenchFit;
-use holod_pupil_input::{ReplayError, SourceError, TrackerError};
+use holod_pupil_input::{ReplayError, SourceError, TrackerError, TrackerSpec};
 
 use crate::cli::{NetworkArgs, RigArgs};
 use crate::failure::{Exit, Failure};
@@ -20,7 +20,13 @@ pub fn rig(args: &RigArgs) -> Result<Rig, Failure> {
         None => Ok(Rig::default()),
         Some(path) => {
             let exit = if path.exists() { Exit::Config } else { Exit::NoInput };
-            Rig::load(path).map_err(Failure::because(exit))
+            let mut rig = Rig::load(path).map_err(Failure::because(exit))?;
+            // As all paths of the file; what is no spec is told where the tracker is needed.
+            if let Some(Ok(spec)) = rig.tracker.spec.as_deref().map(str::parse::<TrackerSpec>) {
+                let folder = path.parent().unwrap_or(Path::new(""));
+                rig.tracker.spec = Some(spec.in_folder(folder).to_string());
+            }
+            Ok(rig)
         }
     }
 }

@@ -25,7 +25,8 @@ pub struct EstimatorSettings {
     pub scale: f64,
     /// Diameter to slide to when nothing has been believed for longer than `hold`.
     pub fallback: PupilDiameter,
-    /// How long the last good value is held.
+    /// How long the last good value is held; not shorter than `silence` and what is said there, since samples are not
+    /// known sooner.
     pub hold: TimeNs,
     /// Speed of the slide to the fallback, mm/s.
     pub fallback_mm_per_s: f32,
@@ -218,9 +219,9 @@ impl EstimateSnapshot {
         let before = std::mem::replace(&mut self.settings, settings);
         let t_believed = match (shown.state, self.motion) {
             (PupilState::Acquiring | PupilState::Tracking, _) => return before,
-            (PupilState::Holding, Some(motion)) => motion.t.max(t - settings.hold),
+            (PupilState::Holding, Some(motion)) => motion.t.max(t - self.hold()),
             // What is not held any more is not held again.
-            _ => t - settings.hold - TimeNs(1),
+            _ => t - self.hold() - TimeNs(1),
         };
         self.motion = Some(Motion {
             t: t_believed,
@@ -237,17 +238,23 @@ impl EstimateSnapshot {
         self.clock = clock;
     }
 
+    /// How long a believed sample is followed or held.
+    fn hold(&self) -> TimeNs {
+        self.settings.hold.max(self.silence)
+    }
+
     fn shown_at(&self, t: TimeNs) -> Shown {
         let settings = &self.settings;
         let fallback_mm = settings.fallback.mm();
         let Some(motion) = self.motion else {
             return Shown { diameter_mm: fallback_mm, velocity_mm_per_s: 0.0, state: PupilState::Fallback };
         };
+        let hold = self.hold();
         // Samples that were older than `hold` when they became known begin a slide then, not before.
-        let slide_begins = (motion.t + settings.hold).max(self.blend.t);
+        let slide_begins = (motion.t + hold).max(self.blend.t);
         let followed = self.followed_at(&motion, t.min(slide_begins));
         let age = t - motion.t;
-        let (diameter_mm, velocity_mm_per_s, state) = if age > settings.hold {
+        let (diameter_mm, velocity_mm_per_s, state) = if age > hold {
             let left_mm = fallback_mm - followed.0;
             let slid_mm = settings.fallback_mm_per_s * (t - slide_begins).seconds().max(0.0) as f32;
             let velocity = if slid_mm < left_mm.abs() { settings.fallback_mm_per_s.copysign(left_mm) } else { 0.0 };

@@ -17,6 +17,11 @@ const REFUSED_FOR: TimeNs = TimeNs(1_000_000_000);
 const LEAST_MESSAGES: u64 = 5;
 /// For so long a tracker may say nothing at all before that is said.
 const UNHEARD_FOR: TimeNs = TimeNs(1_800_000_000);
+/// The reason where messages come that a tracker's profile passes over, and none with a pupil.
+const OTHER_MESSAGES: &str = "notes";
+const OTHER_MESSAGES_ADVICE: &str = "is the tracker's pupil measurement switched on (Neon: \"compute eye state\" in the \
+                                     Companion; Pupil Core: the 3D detector), and are a profile's `prefix` or report `id` \
+                                     those that it sends?";
 /// Samples of which the figures are looked at.
 const KEPT: usize = 64;
 /// Diameters at which an eye is likely to be, in millimetres: narrower than what the gate allows, so that a guess at
@@ -30,7 +35,8 @@ const MISTAKEN_UNITS: [(&str, f64); 3] = [("micrometres", 1e-3), ("centimetres",
 /// That nothing is believed, the most frequent reason, and what to do.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Refusal {
-    /// Messages and samples that were refused in a row, none that was believed between them.
+    /// Messages and samples that were refused in a row, none that was believed between them; 0 where nothing was heard,
+    /// or nothing that could be refused.
     pub refused: u64,
     /// The counter's name of the most frequent reason; nothing where nothing was heard.
     pub reason: String,
@@ -145,6 +151,18 @@ impl RefusalWatch {
         let causes: Vec<_> = faults.chain(rejections).filter(|(_, count)| *count > 0).collect();
         let refused: u64 = causes.iter().map(|(_, count)| count).sum();
         if refused == 0 {
+            let messages = counts.of(Counter::Notes) - before.of(Counter::Notes);
+            let samples = counts.of(Counter::Samples) - before.of(Counter::Samples);
+            if messages > 0 && samples == 0 {
+                let since = *self.refused_since.get_or_insert(now);
+                let is_long = messages >= LEAST_MESSAGES && now - since >= REFUSED_FOR;
+                let is_known = self.current.as_ref().is_some_and(|current| current.reason == OTHER_MESSAGES);
+                return ((over || is_long) && !is_known).then(|| Refusal {
+                    refused: 0,
+                    reason: OTHER_MESSAGES.into(),
+                    advice: format!("{messages} messages came, and none of them is of a pupil: {OTHER_MESSAGES_ADVICE}"),
+                });
+            }
             let unheard = counts.of(Counter::Connects) > 0 && counts.of(Counter::Bytes) == 0;
             return (unheard && self.current.is_none() && now - self.began >= UNHEARD_FOR).then(|| Refusal {
                 refused: 0,
@@ -529,6 +547,31 @@ mod tests {
         assert_eq!(watch.judge(TimeNs(4_000 * MS), &counters.snapshot(), false), None);
         let said = watch.judge(TimeNs(5_000 * MS), &counters.snapshot(), false);
         assert!(matches!(said, Some(RefusalChange::Refused(refusal)) if refusal.reason == "wire_bad_checksum"));
+    }
+
+    #[test]
+    fn messages_that_are_of_no_pupil_are_told_once() {
+        let counters = Counters::new();
+        let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+        counters.add(Counter::Connects, 1);
+        let mut told = Vec::new();
+        for tenth in 1..40 {
+            counters.add(Counter::Bytes, 90);
+            counters.add(Counter::Notes, 10);
+            told.extend(watch.judge(TimeNs(tenth * 100 * MS), &counters.snapshot(), false).map(|change| (tenth, change)));
+        }
+        let [(11, RefusalChange::Refused(refusal))] = &told[..] else { panic!("{told:?}") };
+        assert!(refusal.to_string().starts_with("110 messages came") && refusal.advice.contains("eye state"), "{refusal}");
+        // Among samples such messages are nothing to tell.
+        counters.add(Counter::Samples, 5);
+        counters.add(Counter::Accepted, 5);
+        assert_eq!(watch.judge(TimeNs(5_000 * MS), &counters.snapshot(), false), Some(RefusalChange::Believed));
+        for tenth in 51..90 {
+            counters.add(Counter::Notes, 10);
+            counters.add(Counter::Samples, 5);
+            counters.add(Counter::Accepted, 5);
+            assert_eq!(watch.judge(TimeNs(tenth * 100 * MS), &counters.snapshot(), false), None);
+        }
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! Where samples come from, as named on the command line or in the rig file.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use crate::profile::{DEFAULT_BAUD, Profile};
@@ -59,6 +59,29 @@ pub enum TrackerSpec {
     Mock(Scenario),
     /// `mock:FILE`: the text of a [`Script`](crate::Script)
     MockFile(PathBuf),
+}
+
+impl TrackerSpec {
+    /// The same as read in `folder`: where its relative paths start, those of a profile's file included.
+    pub fn in_folder(self, folder: &Path) -> Self {
+        let path = |path: PathBuf| folder.join(path);
+        let profile = |name: String| match Profile::is_path(&name) {
+            true => folder.join(name).display().to_string(),
+            false => name,
+        };
+        match self {
+            Self::Path(named) => Self::Path(path(named)),
+            Self::Serial { path: named, profile: of, baud } => {
+                Self::Serial { path: path(named), profile: of.map(profile), baud }
+            }
+            Self::Hid { ids, serial, profile: of } => Self::Hid { ids, serial, profile: of.map(profile) },
+            Self::Tcp { address, profile: of } => Self::Tcp { address, profile: profile(of) },
+            Self::Udp { address, profile: of } => Self::Udp { address, profile: profile(of) },
+            Self::Replay { path: named, speed, repeat } => Self::Replay { path: path(named), speed, repeat },
+            Self::MockFile(named) => Self::MockFile(path(named)),
+            Self::Core(_) | Self::Neon(_) | Self::Mock(_) => self,
+        }
+    }
 }
 
 /// A name or address of a host, and a port.
@@ -369,6 +392,24 @@ mod tests {
             "mock:./steady",
         ] {
             assert_eq!(parsed(&parsed(spec).to_string()), parsed(spec));
+        }
+    }
+
+    #[test]
+    fn relative_paths_start_at_the_folder_that_is_named() {
+        for (spec, expected) in [
+            ("log.csv", "/rigs/a/log.csv"),
+            ("/dev/ttyUSB0", "/dev/ttyUSB0"),
+            ("replay:../log.csv,loop", "replay:/rigs/a/../log.csv,loop"),
+            ("serial:/dev/x,profile=mine.toml", "serial:/dev/x,profile=/rigs/a/mine.toml"),
+            ("serial:/dev/x,profile=iscan-etl", "serial:/dev/x,profile=iscan-etl"),
+            ("udp:[::1]:6900,profile=./mine.toml", "udp:[::1]:6900,profile=/rigs/a/./mine.toml"),
+            ("mock:my.txt", "mock:/rigs/a/my.txt"),
+            ("mock:steady", "mock:steady"),
+            ("neon", "neon"),
+        ] {
+            assert_eq!(parsed(spec).in_folder(Path::new("/rigs/a")), parsed(expected), "{spec}");
+            assert_eq!(parsed(spec).in_folder(Path::new("")), parsed(spec), "{spec}");
         }
     }
 

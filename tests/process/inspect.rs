@@ -314,10 +314,12 @@ fn a_log_that_is_not_in_millimetres_is_plotted_in_its_own_unit_and_replayed_with
     let svg = fs::read_to_string(folder.path().join("raw.svg")).unwrap();
     assert!(svg.contains("pupil diameter / arbitrary units") && !svg.contains("rejected"));
 
-    // A rig file that has a tracker alone is of the built-in bench.
-    fs::write(folder.path().join("rig.toml"), "[tracker]\nspec = \"log.asc\"\nscale_mm_per_unit = 1.0\n").unwrap();
+    // A rig file that has a tracker alone is of the built-in bench; the log is beside it.
+    fs::create_dir(folder.path().join("bench")).unwrap();
+    fs::rename(folder.path().join("log.asc"), folder.path().join("bench/log.asc")).unwrap();
+    fs::write(folder.path().join("bench/rig.toml"), "[tracker]\nspec = \"log.asc\"\nscale_mm_per_unit = 1.0\n").unwrap();
     let run_with = |more: &[&str]| {
-        let args = [&["--config", "rig.toml", "--resolution", "64x64", "--json"], more].concat();
+        let args = [&["--config", "bench/rig.toml", "--resolution", "64x64", "--json"], more].concat();
         run(HOLOD, &args, folder.path())
     };
     let summary = json(&run_with(&["--scale", "0.0125"]));
@@ -327,6 +329,34 @@ fn a_log_that_is_not_in_millimetres_is_plotted_in_its_own_unit_and_replayed_with
     let wrong = run_with(&[]);
     assert!(wrong.stderr.contains("rejected_out_of_range"), "{wrong:?}");
     assert!(json(&wrong)["tracker_trouble"].as_str().unwrap().contains("320"), "{wrong:?}");
+}
+
+#[test]
+fn check_says_what_would_keep_a_tracker_from_being_started() {
+    let folder = holod_tests::new_folder();
+    let asc = "SAMPLES\tGAZE\tLEFT\tRATE\t1000.00\nPUPIL\tDIAMETER\nSTART\t1000 \tLEFT\tSAMPLES\n\
+               1000\t  964.3\t  541.5\t  320.0\t...\n1001\t  964.3\t  541.5\t  320.0\t...\n";
+    fs::write(folder.path().join("log.asc"), asc).unwrap();
+    fs::write(folder.path().join("notes.txt"), "eye three, day two\n").unwrap();
+    let tracker_check = |spec: &str, scale: &str| {
+        fs::write(folder.path().join("rig.toml"), format!("[tracker]\nspec = \"{spec}\"\n{scale}")).unwrap();
+        let found = json(&run(HOLOD, &["check", "--config", "rig.toml", "--resolution", "64x64", "--json"], folder.path()));
+        let checks = found["checks"].as_array().unwrap();
+        checks.iter().find(|check| check["name"] == "tracker").unwrap().clone()
+    };
+    for (spec, says) in [
+        ("log.asc", "millimetres"),
+        ("replay:notes.txt", "notes.txt"),
+        ("serial:notes.txt", "no serial port"),
+        ("serial:/dev/null,profile=livetrack", "millimetres"),
+        ("serial:/dev/null,profile=holod-hid", "hid:VID:PID"),
+        ("hid:046d:c31c", "no shipped profile"),
+    ] {
+        let check = tracker_check(spec, "");
+        assert!(check["passed"] == false && check["says"].as_str().unwrap().contains(says), "{spec}: {check}");
+    }
+    let check = tracker_check("log.asc", "scale_mm_per_unit = 0.0125");
+    assert!(check["passed"] == true, "{check}");
 }
 
 #[test]

@@ -108,7 +108,8 @@ const HEARTBEAT: Span = Span::new(5.0, 1000.0, "ms").slips(&[("seconds", 1e3)]);
 const STALL: Span = Span::new(10.0, 60_000.0, "ms").slips(&[("seconds", 1e3)]);
 const SCALE: Span = Span::new(1e-4, 100.0, "mm per unit");
 const FALLBACK: Span = Span::new(1.0, 9.0, "mm").slips(&[("metres", 1e3), ("micrometres", 1e-3)]);
-const HOLD: Span = Span::new(0.0, 60_000.0, "ms");
+/// A sample is judged with its successors, so that none is known sooner.
+const HOLD: Span = Span::new(150.0, 60_000.0, "ms").slips(&[("seconds", 1e3)]);
 /// By how much a stated stroke may differ from that of a measured table.
 const STROKE_TOLERANCE: f64 = 0.02;
 

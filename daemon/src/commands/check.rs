@@ -5,6 +5,7 @@ mod machine;
 mod output;
 mod service;
 
+use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 
 use holod_calibration::rig::{Meaning, Rig};
@@ -12,7 +13,7 @@ use holod_calibration::{PupilDiameter, Resolution};
 use holod_model::Weights;
 use holod_model::conditions::BenchFit;
 use holod_model::weights::{Architecture, JudgedBench};
-use holod_pupil_input::{Profile, TrackerSpec, serial_port_warnings};
+use holod_pupil_input::{Tracker, TrackerSpec, serial_port_warnings};
 use serde::Serialize;
 
 use crate::cli::CheckArgs;
@@ -168,20 +169,15 @@ fn tracker(rig: &Rig) -> Check {
     };
     let (passed, says) = match spec.parse::<TrackerSpec>() {
         Err(error) => (false, error.to_string()),
-        Ok(spec) => match profile_of(&spec).map(Profile::find) {
-            Some(Err(error)) => (false, error.to_string()),
-            _ => reachable(&spec),
+        Ok(spec) => match reachable(&spec) {
+            (true, says) => match Tracker::examine(&spec, &rig.tracker) {
+                Ok(()) => (true, says),
+                Err(error) => (false, error.to_string()),
+            },
+            not_there => not_there,
         },
     };
     Check { name, passed, says }
-}
-
-fn profile_of(spec: &TrackerSpec) -> Option<&str> {
-    match spec {
-        TrackerSpec::Serial { profile, .. } | TrackerSpec::Hid { profile, .. } => profile.as_deref(),
-        TrackerSpec::Tcp { profile, .. } | TrackerSpec::Udp { profile, .. } => Some(profile),
-        _ => None,
-    }
 }
 
 /// Whether the tracker is there, as far as that can be told without opening it.
@@ -193,6 +189,11 @@ fn reachable(spec: &TrackerSpec) -> (bool, String) {
         | TrackerSpec::Replay { path, .. }
         | TrackerSpec::MockFile(path) => {
             let (passed, says) = present(path, "plug the tracker in or correct tracker.spec");
+            let is_port = path.metadata().is_ok_and(|metadata| metadata.file_type().is_char_device());
+            let may_be_file = !matches!(spec, TrackerSpec::Serial { .. });
+            if passed && !is_port && !(may_be_file && path.is_file()) {
+                return (false, format!("{} is no serial port: correct tracker.spec", path.display()));
+            }
             let warnings = serial_port_warnings(path);
             (passed, std::iter::once(says).chain(warnings).collect::<Vec<_>>().join("; "))
         }

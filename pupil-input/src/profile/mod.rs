@@ -140,12 +140,17 @@ static SHIPPED: LazyLock<Vec<Profile>> =
     LazyLock::new(|| FILES.into_iter().filter_map(|(_, text)| parse::parse(text).ok()).collect());
 
 impl Profile {
-    /// The shipped profile of that name, or the one in a file: what has a `/` or ends in `.toml` is a path.
+    /// Whether what is named is a file: what has a `/` or ends in `.toml`.
+    pub(crate) fn is_path(name_or_path: &str) -> bool {
+        name_or_path.contains('/') || name_or_path.ends_with(".toml")
+    }
+
+    /// The shipped profile of that name, or the one in a file, whose path has a `/` or ends in `.toml`.
     ///
     /// # Errors
     /// There is none of that name, or the file is not readable or wrong.
     pub fn find(name_or_path: &str) -> Result<Self, ProfileError> {
-        if name_or_path.contains('/') || name_or_path.ends_with(".toml") {
+        if Self::is_path(name_or_path) {
             return Self::read(Path::new(name_or_path));
         }
         Self::shipped().find(|profile| profile.name == name_or_path).ok_or_else(|| {

@@ -81,6 +81,23 @@ impl Job {
         }
     }
 
+    /// What the sizes of a tracker are before the rig's scale, as far as can be told without opening a link: of a HID
+    /// device that its profile does not know to the end, as far as the profile does.
+    pub(super) fn unit_unopened(spec: &TrackerSpec) -> Result<SizeUnit, TrackerError> {
+        let profile = match spec {
+            TrackerSpec::Path(path) if !path.is_file() => serial_profile(None)?,
+            TrackerSpec::Serial { profile, .. } => serial_profile(profile.as_deref())?,
+            TrackerSpec::Hid { ids, profile, .. } => hid_profile(*ids, profile.as_deref())?,
+            TrackerSpec::Tcp { profile, .. } | TrackerSpec::Udp { profile, .. } => Profile::find(profile)?,
+            TrackerSpec::Core(_) => Profile::find("core")?,
+            TrackerSpec::Neon(_) => Profile::find("neon")?,
+            TrackerSpec::Path(_) | TrackerSpec::Replay { .. } | TrackerSpec::Mock(_) | TrackerSpec::MockFile(_) => {
+                return Ok(Self::open(spec, TimeNs(0), &[])?.unit());
+            }
+        };
+        Ok(profile.unit)
+    }
+
     /// What its sizes are before the rig's scale.
     pub(super) fn unit(&self) -> SizeUnit {
         match self {
@@ -123,24 +140,12 @@ impl Job {
         baud: Option<u32>,
         forbidden: &[PathBuf],
     ) -> Result<Self, TrackerError> {
-        let profile = Profile::find(profile.unwrap_or(DEFAULT_PROFILE))?;
-        let other = match profile.format {
-            Format::Report(_) | Format::Usages(_) => Some(("HID reports", "hid:VID:PID")),
-            Format::CoreMsgpack => Some(("Pupil Labs Core's server", "core:HOST")),
-            Format::NeonRtp => Some(("Pupil Labs Neon's Companion", "neon:HOST")),
-            _ => None,
-        };
-        if let Some((link, instead)) = other {
-            return Err(TrackerError::WrongLink { profile: profile.name, link, instead });
-        }
+        let profile = serial_profile(profile)?;
         Self::live(Box::new(SerialFeed::new(path, baud, profile.clone(), forbidden)), profile)
     }
 
     fn hid(ids: Option<UsbIds>, serial: Option<&str>, profile: Option<&str>) -> Result<Self, TrackerError> {
-        let profile = match profile {
-            Some(name) => Profile::find(name)?,
-            None => hid::profile_of(ids).map_err(SourceError::from)?,
-        };
+        let profile = hid_profile(ids, profile)?;
         let wanted = Wanted::new(ids, serial, &profile).map_err(SourceError::from)?;
         let mut feed = HidFeed::new(wanted);
         let open = feed.open()?;
@@ -160,6 +165,27 @@ impl Job {
     }
 }
 
+fn serial_profile(name: Option<&str>) -> Result<Profile, TrackerError> {
+    let profile = Profile::find(name.unwrap_or(DEFAULT_PROFILE))?;
+    let other = match profile.format {
+        Format::Report(_) | Format::Usages(_) => Some(("HID reports", "hid:VID:PID")),
+        Format::CoreMsgpack => Some(("Pupil Labs Core's server", "core:HOST")),
+        Format::NeonRtp => Some(("Pupil Labs Neon's Companion", "neon:HOST")),
+        _ => None,
+    };
+    match other {
+        Some((link, instead)) => Err(TrackerError::WrongLink { profile: profile.name, link, instead }),
+        None => Ok(profile),
+    }
+}
+
+fn hid_profile(ids: Option<UsbIds>, name: Option<&str>) -> Result<Profile, TrackerError> {
+    Ok(match name {
+        Some(name) => Profile::find(name)?,
+        None => hid::profile_of(ids).map_err(SourceError::from)?,
+    })
+}
+
 /// The text of the profile that a spec names, where it is a user's own and no name would find it again.
 pub(super) fn own_profile(spec: &TrackerSpec) -> Option<String> {
     let name = match spec {
@@ -167,6 +193,5 @@ pub(super) fn own_profile(spec: &TrackerSpec) -> Option<String> {
         TrackerSpec::Tcp { profile, .. } | TrackerSpec::Udp { profile, .. } => profile,
         _ => return None,
     };
-    let is_path = name.contains('/') || name.ends_with(".toml");
-    is_path.then(|| std::fs::read_to_string(name).ok()).flatten()
+    Profile::is_path(name).then(|| std::fs::read_to_string(name).ok()).flatten()
 }

@@ -71,6 +71,15 @@ pub fn scaled_millimetres(whose: &str, scale: f64) -> String {
     )
 }
 
+fn check_scale(spec: &TrackerSpec, unit: SizeUnit, settings: &rig::Tracker) -> Result<(), TrackerError> {
+    match settings.scale {
+        None if unit != SizeUnit::Millimetres => {
+            Err(TrackerError::NoScale { spec: spec.to_string(), unit: unit.name() })
+        }
+        _ => Ok(()),
+    }
+}
+
 fn needless_scale(whose: &str, unit: SizeUnit, settings: &rig::Tracker) -> Option<String> {
     let scale = settings.scale.filter(|scale| unit == SizeUnit::Millimetres && *scale != 1.0)?;
     Some(scaled_millimetres(whose, scale))
@@ -154,6 +163,15 @@ pub enum ChangeError {
 pub struct Tracker;
 
 impl Tracker {
+    /// Finds what would keep `spec` from being started, as far as can be told without opening a port, a device or a
+    /// connection; a log is read.
+    ///
+    /// # Errors
+    /// The profile, the log or the script is not there or wrong, or the unit wants a scale.
+    pub fn examine(spec: &TrackerSpec, settings: &rig::Tracker) -> Result<(), TrackerError> {
+        check_scale(spec, Job::unit_unopened(spec)?, settings)
+    }
+
     /// Opens what `spec` names and starts the thread that reads it. In the place of options an origin will do.
     ///
     /// # Errors
@@ -166,9 +184,7 @@ impl Tracker {
     ) -> Result<TrackerHandle, TrackerError> {
         let TrackerOptions { origin, record, forbidden, reader_begins } = options.into();
         let job = Job::open(spec, origin, &forbidden)?;
-        if job.unit() != SizeUnit::Millimetres && settings.scale.is_none() {
-            return Err(TrackerError::NoScale { spec: spec.to_string(), unit: job.unit().name() });
-        }
+        check_scale(spec, job.unit(), settings)?;
         let mut warnings = job.warnings();
         warnings.extend(needless_scale(&format!("tracker `{spec}`"), job.unit(), settings));
         let header = job.link().map(|(profile, datagrams)| Header {

@@ -132,7 +132,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     }
     let bytes = report.counts.get("bytes").copied().unwrap_or(0);
     refusals.judge(now, &tracker.control.counters(), true);
-    let heard = match refusals.current().filter(|refusal| refusal.refused > 0) {
+    let heard = match refusals.current().filter(|_| bytes > 0) {
         Some(refusal) => refusal.to_string(),
         None if bytes == 0 => "nothing was heard; is it switched on, and does it send without being asked?".to_owned(),
         None => format!("{bytes} bytes came, and no sample was in them: is it this profile and baud rate?"),
