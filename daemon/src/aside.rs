@@ -94,14 +94,19 @@ impl<T> Queue<T> {
 /// What a thread came to, where it ends within `patience`; else it is left to itself. A panic over there has been told,
 /// and brings nothing.
 pub(crate) fn join_within<T>(thread: JoinHandle<T>, patience: Duration) -> Option<T> {
+    ends_within(&thread, patience).then(|| thread.join().ok()).flatten()
+}
+
+/// Waits for a thread's end, for `patience` at most, and tells whether it came.
+pub(crate) fn ends_within<T>(thread: &JoinHandle<T>, patience: Duration) -> bool {
     let t_end = Instant::now() + patience;
     while !thread.is_finished() {
         if Instant::now() >= t_end {
-            return None;
+            return false;
         }
         thread::sleep(LOOK);
     }
-    thread.join().ok()
+    true
 }
 
 /// What `work` comes to on a thread of its own, where it is done within `patience`; else it is left to itself.

@@ -90,8 +90,15 @@ impl GpuRenderer {
     /// Puts another engine in the place of the one whose device failed.
     fn replace(&mut self, error: &GpuError) {
         tracing::error!("{error}");
-        // The failed one's memory is given back before the next one asks for as much.
-        self.engine = Engine::None(EngineError::Gpu(error.clone()));
+        let failed = std::mem::replace(&mut self.engine, Engine::None(EngineError::Gpu(error.clone())));
+        if matches!(error, GpuError::Hung { .. }) {
+            // To drop it would wait for work that does not end, and the same device would be no better.
+            std::mem::forget(failed);
+            self.reopenings_left = 0;
+        } else {
+            // Its memory is given back before the next one asks for as much.
+            drop(failed);
+        }
         if self.reopenings_left > 0 {
             self.reopenings_left -= 1;
             let tables = self.encoder.tables();
@@ -220,6 +227,8 @@ impl Renderer for GpuRenderer {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use holod_calibration::Resolution;
     use holod_calibration::rig::Rig;
 
@@ -279,6 +288,16 @@ mod tests {
         gpu.lose_device();
         assert!(render(&mut gpu) && gpu.description().starts_with("cpu, "), "{}", gpu.description());
         assert!(gpu.description().contains("failed") && !render(&mut gpu));
+    }
+
+    #[test]
+    fn a_device_that_hangs_is_left_to_itself_and_the_processor_takes_over() {
+        let encoder = Arc::new(PanelEncoder::new(&Rig::default().panel, PANEL, SIZE).unwrap());
+        let mut gpu = renderer(&encoder);
+        gpu.replace(&GpuError::Hung { name: "a card".into(), waited: Duration::from_secs(120) });
+        assert!(matches!(gpu.engine, Engine::Cpu(_)) && gpu.description().contains("120 s"), "{}", gpu.description());
+        let (frame, mut levels) = (Arc::new(scene::sample_frame(SIZE)), LevelsFrame::new(encoder.layout()));
+        gpu.render(&frame, PupilDiameter::from_mm(3.0), &mut levels).unwrap();
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! The end of a run: lasers dark, flat pattern, threads joined, and what it all came to.
 
 use std::sync::atomic::Ordering;
+use std::time::Duration;
 
 use holod_calibration::PupilDiameter;
 use holod_slm_output::LevelsFrame;
@@ -8,8 +9,12 @@ use holod_slm_output::LevelsFrame;
 use super::build::Session;
 use super::clock::host_now;
 use super::summary::{SessionReport, Summary};
+use crate::aside::ends_within;
 use crate::failure::{Exit, Failure};
 use crate::snapshot::Figures;
+
+/// Longer than any frame takes, of the largest size on a slow processor.
+const LONGEST_FRAME: Duration = Duration::from_secs(60);
 
 /// Ends every part in order, whatever `ended` says, and then says what the run came to.
 ///
@@ -21,7 +26,7 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
     tracing::info!("stopping: {}", ended.as_deref().unwrap_or("a failure"));
     stop.store(true, Ordering::Release);
     let down = output.shutdown();
-    let frame_loop = frame_thread.join();
+    let frame_loop = ends_within(&frame_thread, LONGEST_FRAME).then(|| frame_thread.join());
     let tracker_link = watch.tracker.link().name().to_owned();
     watch.tracker.stop();
     let observed = watch.drain();
@@ -36,15 +41,21 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
     watch.feed = None;
     let recorded = watch.tracker.recording();
     if let Some(why) = &lasers_not_dark
-        && (ended.is_err() || observed.is_err() || !matches!(frame_loop, Ok(Ok(()))))
+        && (ended.is_err() || observed.is_err() || !matches!(frame_loop, Some(Ok(Ok(())))))
     {
         tracing::error!("{}", not_dark(why));
     }
     let ended_by = ended?;
     observed?;
     match frame_loop {
-        Err(_panic) => return Err(Failure::new(Exit::Software, "the frame loop failed (its message stands above)")),
-        Ok(rendered) => rendered.map_err(Failure::because(Exit::Unavailable))?,
+        None => {
+            let hangs = "the frame loop has not ended: does the GPU hang? The kernel's log may tell; --backend cpu does without";
+            return Err(Failure::new(Exit::Unavailable, hangs));
+        }
+        Some(Err(_panic)) => {
+            return Err(Failure::new(Exit::Software, "the frame loop failed (its message stands above)"));
+        }
+        Some(Ok(rendered)) => rendered.map_err(Failure::because(Exit::Unavailable))?,
     }
 
     let tally = watch.tally;

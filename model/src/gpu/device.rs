@@ -211,13 +211,21 @@ impl Gpu {
 
     /// Waits until the work of `submission`, and all before it, is done.
     pub(crate) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), GpuError> {
-        let until = wgpu::PollType::Wait { submission_index: Some(submission), timeout: Some(PATIENCE) };
-        self.guarded(|| self.device.poll(until).map(drop))
+        self.wait_for(submission, PATIENCE)
+    }
+
+    fn wait_for(&self, submission: wgpu::SubmissionIndex, patience: Duration) -> Result<(), GpuError> {
+        let until = wgpu::PollType::Wait { submission_index: Some(submission), timeout: Some(patience) };
+        let ended = self.guarded(|| match self.device.poll(until) {
+            Err(wgpu::PollError::Timeout) => Ok(false),
+            polled => polled.map(|_| true),
+        })?;
+        if ended { Ok(()) } else { Err(GpuError::Hung { name: self.name.clone(), waited: patience }) }
     }
 
     /// What was told late comes first: it is the cause. wgpu panics where a device is lost in `poll`, after it has told
     /// the callback.
-    fn guarded<E: ToString>(&self, poll: impl FnOnce() -> Result<(), E>) -> Result<(), GpuError> {
+    fn guarded<T, E: ToString>(&self, poll: impl FnOnce() -> Result<T, E>) -> Result<T, GpuError> {
         let polled = caught(poll);
         self.check()?;
         polled.map_err(|_| self.failed("it was lost"))?.map_err(|error| self.failed(error))
@@ -291,7 +299,7 @@ mod tests {
         let gpu = gpu();
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
         let buffer = gpu.buffer("numbers", 12, usage).expect("a buffer");
-        let panicked = gpu.guarded::<String>(|| {
+        let panicked = gpu.guarded::<(), String>(|| {
             assert!(panic_is_caught());
             panic!("as wgpu does")
         });
@@ -300,6 +308,29 @@ mod tests {
         assert!(panicked.to_string().contains("it was lost"), "{panicked}");
         gpu.device.destroy();
         assert!(matches!(gpu.read(&buffer, &mut [0.0_f32; 3]), Err(GpuError::Failed { .. })));
+    }
+
+    #[test]
+    fn work_that_does_not_end_in_time_is_told_as_such() {
+        let gpu = gpu();
+        let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
+        let buffer = gpu.buffer("numbers", 4, usage).expect("a buffer");
+        let source = "@group(0) @binding(0) var<storage, read_write> sum: u32;
+            @compute @workgroup_size(1) fn f() {
+                for (var i = 0u; i < 50000000u; i++) { sum = sum * 1664525u + i; }
+            }";
+        let pipeline = gpu.pipeline("long", source).expect("a pipeline");
+        let group = gpu.bind(&pipeline, &[&buffer]);
+        let mut encoder = gpu.device.create_command_encoder(&wgpu::CommandEncoderDescriptor::default());
+        let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor::default());
+        pass.set_pipeline(&pipeline);
+        pass.set_bind_group(0, &group, &[]);
+        pass.dispatch_workgroups(1, 1, 1);
+        drop(pass);
+        let submission = gpu.queue.submit([encoder.finish()]);
+        let hung = gpu.wait_for(submission.clone(), Duration::from_millis(1)).expect_err("it takes longer");
+        assert!(matches!(&hung, GpuError::Hung { .. }), "{hung}");
+        assert_eq!(gpu.wait(submission), Ok(()));
     }
 
     #[test]

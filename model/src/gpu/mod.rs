@@ -4,6 +4,7 @@
 mod device;
 
 use std::cell::Cell;
+use std::time::Duration;
 
 #[cfg(feature = "gpu")]
 pub(crate) use device::Gpu;
@@ -97,6 +98,12 @@ pub enum GpuError {
         /// What its driver said.
         reason: String,
     },
+    /// The device does not end its work. Whoever drops what it holds waits for that work, for ever perhaps.
+    #[error(
+        "the GPU {name} has not ended its work within {} s: it hangs; choose --backend cpu, and look at the kernel's log",
+        waited.as_secs()
+    )]
+    Hung { name: String, waited: Duration },
 }
 
 impl GpuError {
@@ -113,6 +120,7 @@ impl GpuError {
                 "a line of {samples} samples needs {bytes} bytes of a workgroup's memory, and the GPU has {limit}"
             ),
             Self::Failed { name, reason } => format!("the GPU {name} failed: {reason}"),
+            Self::Hung { name, waited } => format!("the GPU {name} did not end its work within {} s", waited.as_secs()),
         }
     }
 }

