@@ -189,6 +189,22 @@ class Run:
         cast(FieldNetwork, bare).on(stacks[0].optics)
         return network(amplitudes, torch.stack(depths), pupils)
 
+    def _check_benches(self, benches: list[OpticsConfig]) -> None:
+        """A network computes with one bench at a time, and is told diffraction within its range alone."""
+        if any(bench != benches[0] for bench in benches):
+            raise TrainingError(
+                f"{self.config.shards}: found scenes of several benches in a batch of {self.config.batch}, expected "
+                "one bench: train with `--batch 1` (torchrun adds more), or with scenes of one bench"
+            )
+        least, most = self.config.network.trained.volume_fresnel_px2
+        found = benches[0].volume_fresnel_px2
+        if self.config.benches is None and not (min(found) > 0.99 * least and max(found) < 1.01 * most):
+            raise TrainingError(
+                f"{self.config.shards}: found scenes of a bench whose diffraction is {min(found):.1f} to "
+                f"{max(found):.1f} px2, expected {least:g} to {most:g}, which the network is told: give this bench's "
+                "`--volume-fresnel-px2` and `--volume-blur-px` (`holod check` says them), or `--benches any`"
+            )
+
     def _precision(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16")
 
@@ -222,6 +238,7 @@ class Run:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         stacks = [s.to(self.device) for s in self.sampler.draw(self.step, config.batch)]
+        self._check_benches([s.optics for s in stacks])
         with self._precision():
             fields = self._fields(self.trained, config.network, stacks, [s.given_depth for s in stacks])
         taught = self._taught(stacks)

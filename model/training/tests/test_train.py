@@ -338,6 +338,21 @@ def test_each_step_has_a_bench_of_its_own(shards: Path, tmp_path: Path) -> None:
         Run(tiny(shards, tmp_path / "two", network=network, benches=BenchDraw(), batch=2), CPU)
 
 
+def test_scenes_of_another_bench_are_refused(shards: Path, tmp_path: Path) -> None:
+    other = {"pixel_angle_rad": str(3.74e-6 / 40e-3)}
+    for index in range(2, 4):
+        write_shard(shards / f"scene_{index:06}.safetensors", seed=index, metadata=other)
+    run = Run(tiny(shards, tmp_path / "mixed", batch=8, validation=None), CPU)
+    with pytest.raises(TrainingError, match="found scenes of several benches in a batch of 8, expected one bench"):
+        run.train_step()
+    for index in range(2):
+        (shards / f"scene_{index:06}.safetensors").unlink()
+    with pytest.raises(TrainingError, match=r"diffraction is 147\.\d to 208\.\d px2, expected 32 to 46"):
+        Run(tiny(shards, tmp_path / "other", batch=4, validation=None), CPU).train_step()
+    network = dataclasses.replace(TINY, trained=ANY_BENCH)
+    assert Run(tiny(shards, tmp_path / "told", batch=4, network=network, validation=None), CPU).train_step()["loss"] > 0
+
+
 @pytest.mark.usefixtures("no_plots")
 def test_a_flat_run_is_stopped(shards: Path, tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="shows one blurred picture"):
