@@ -31,6 +31,7 @@
 //! faster than the peak of the light reflex, 5.5 mm/s.
 
 mod clock;
+mod clock_watch;
 mod counters;
 mod estimator;
 pub mod export;
@@ -54,6 +55,7 @@ mod usb_ids;
 pub mod wire;
 
 pub use clock::{ClockModel, ClockReport};
+pub use clock_watch::ClockWatch;
 pub use counters::{Counter, CounterSnapshot};
 pub use estimator::{
     BetterSettings, Decision, EstimateSnapshot, Estimator, EstimatorSettings, PupilEstimate, PupilState, STATED_LAG,

@@ -160,7 +160,9 @@ impl RefusalWatch {
                 return ((over || is_long) && !is_known).then(|| Refusal {
                     refused: 0,
                     reason: OTHER_MESSAGES.into(),
-                    advice: format!("{messages} messages came, and none of them is of a pupil: {OTHER_MESSAGES_ADVICE}"),
+                    advice: format!(
+                        "{messages} messages came, and none of them is of a pupil: {OTHER_MESSAGES_ADVICE}"
+                    ),
                 });
             }
             let unheard = counts.of(Counter::Connects) > 0 && counts.of(Counter::Bytes) == 0;
@@ -342,6 +344,11 @@ fn wire_advice(fault: WireFault) -> String {
         WireFault::Negative => "the tracker sends negative diameters: does it see the pupil, and is this its profile?".into(),
         WireFault::BadConfidence => {
             "the confidence is not between 0 and 1: let the sender divide it, or give a profile that does".into()
+        }
+        WireFault::MissingField => {
+            "messages lack a figure that the profile reads: is it this tracker's profile? Where it names columns, and the \
+             tracker sends their names once at its start, restart the tracker, or write `columns = [...]` in the profile"
+                .into()
         }
         WireFault::BadEye => "the eye is named otherwise than the profile expects: is this the tracker's profile?".into(),
         _ => "no message is of the form that the profile expects: is it this tracker's profile and baud rate? (`holod \
@@ -558,10 +565,15 @@ mod tests {
         for tenth in 1..40 {
             counters.add(Counter::Bytes, 90);
             counters.add(Counter::Notes, 10);
-            told.extend(watch.judge(TimeNs(tenth * 100 * MS), &counters.snapshot(), false).map(|change| (tenth, change)));
+            told.extend(
+                watch.judge(TimeNs(tenth * 100 * MS), &counters.snapshot(), false).map(|change| (tenth, change)),
+            );
         }
         let [(11, RefusalChange::Refused(refusal))] = &told[..] else { panic!("{told:?}") };
-        assert!(refusal.to_string().starts_with("110 messages came") && refusal.advice.contains("eye state"), "{refusal}");
+        assert!(
+            refusal.to_string().starts_with("110 messages came") && refusal.advice.contains("eye state"),
+            "{refusal}"
+        );
         // Among samples such messages are nothing to tell.
         counters.add(Counter::Samples, 5);
         counters.add(Counter::Accepted, 5);

@@ -317,7 +317,8 @@ fn a_log_that_is_not_in_millimetres_is_plotted_in_its_own_unit_and_replayed_with
     // A rig file that has a tracker alone is of the built-in bench; the log is beside it.
     fs::create_dir(folder.path().join("bench")).unwrap();
     fs::rename(folder.path().join("log.asc"), folder.path().join("bench/log.asc")).unwrap();
-    fs::write(folder.path().join("bench/rig.toml"), "[tracker]\nspec = \"log.asc\"\nscale_mm_per_unit = 1.0\n").unwrap();
+    fs::write(folder.path().join("bench/rig.toml"), "[tracker]\nspec = \"log.asc\"\nscale_mm_per_unit = 1.0\n")
+        .unwrap();
     let run_with = |more: &[&str]| {
         let args = [&["--config", "bench/rig.toml", "--resolution", "64x64", "--json"], more].concat();
         run(HOLOD, &args, folder.path())
@@ -340,7 +341,8 @@ fn check_says_what_would_keep_a_tracker_from_being_started() {
     fs::write(folder.path().join("notes.txt"), "eye three, day two\n").unwrap();
     let tracker_check = |spec: &str, scale: &str| {
         fs::write(folder.path().join("rig.toml"), format!("[tracker]\nspec = \"{spec}\"\n{scale}")).unwrap();
-        let found = json(&run(HOLOD, &["check", "--config", "rig.toml", "--resolution", "64x64", "--json"], folder.path()));
+        let found =
+            json(&run(HOLOD, &["check", "--config", "rig.toml", "--resolution", "64x64", "--json"], folder.path()));
         let checks = found["checks"].as_array().unwrap();
         checks.iter().find(|check| check["name"] == "tracker").unwrap().clone()
     };

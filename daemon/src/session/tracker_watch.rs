@@ -1,18 +1,19 @@
 //! What a person should hear of the tracker while the loop runs.
 
 use holod_calibration::{TimeNs, rig};
-use holod_pupil_input::{Decision, RefusalChange, RefusalWatch, TrackerControl};
+use holod_pupil_input::{ClockWatch, Counter, Decision, RefusalChange, RefusalWatch, TrackerControl};
 
 /// Follows the tracker, and says in the log what changes.
 pub(super) struct TrackerWatch {
     refusals: RefusalWatch,
+    clock: ClockWatch,
     /// Why a lost link does not come back.
     lost: Option<String>,
 }
 
 impl TrackerWatch {
     pub(super) fn new(settings: &rig::Tracker, began: TimeNs) -> Self {
-        Self { refusals: RefusalWatch::new(settings, began), lost: None }
+        Self { refusals: RefusalWatch::new(settings, began), clock: ClockWatch::default(), lost: None }
     }
 
     /// The tracker goes on with other settings.
@@ -34,6 +35,10 @@ impl TrackerWatch {
                 Some(lost) => tracing::warn!("the tracker is not found again: {lost}"),
                 None => tracing::info!("the tracker is found again"),
             }
+        }
+        let resets = tracker.counters().of(Counter::ClockResets);
+        if let Some(wrong) = self.clock.judge(now, tracker.clock(), resets) {
+            tracing::warn!("{wrong}");
         }
         self.judge(tracker, now);
     }

@@ -37,7 +37,12 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     while let Some((head, payload)) = raw.next().map_err(|source| input.io(source))? {
         number += 1;
         match head.kind {
-            Kind::Connected => (decoder, stamper) = (profile.decoder(), Stamper::new()),
+            Kind::Connected => {
+                if !decoder.rejoin() {
+                    decoder = profile.decoder();
+                }
+                stamper = Stamper::new();
+            }
             Kind::Bytes => {
                 let mut take = |event| match event {
                     WireEvent::Sample(sample) => {

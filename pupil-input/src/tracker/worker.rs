@@ -94,7 +94,7 @@ impl Worker {
                     }
                 };
                 if link.is_some() {
-                    stream = LiveStream::new(profile, datagrams);
+                    stream.rejoin(profile);
                     silent_from = host_now() + FIRST_SILENCE;
                     self.connected(host_now());
                 }
@@ -177,7 +177,7 @@ impl Worker {
                 }
                 match head.kind {
                     Kind::Connected => {
-                        stream = LiveStream::new(raw.profile(), raw.datagrams());
+                        stream.rejoin(raw.profile());
                         self.connected(arrival);
                     }
                     Kind::Bytes => {
@@ -379,6 +379,14 @@ struct LiveStream {
 impl LiveStream {
     fn new(profile: &Profile, datagrams: bool) -> Self {
         Self { decoder: profile.decoder(), sequence: SequenceTracker::new(), stamper: Stamper::new(), datagrams }
+    }
+
+    /// Goes on with a link that was opened anew.
+    fn rejoin(&mut self, profile: &Profile) {
+        if !self.decoder.rejoin() {
+            self.decoder = profile.decoder();
+        }
+        (self.sequence, self.stamper) = (SequenceTracker::new(), Stamper::new());
     }
 
     fn push(&mut self, bytes: &[u8], arrival: TimeNs, worker: &mut Worker) {

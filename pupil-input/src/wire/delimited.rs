@@ -184,6 +184,12 @@ impl Decoder for DelimitedDecoder {
             self.end_kept(on_event);
         }
     }
+
+    /// A header stays known.
+    fn rejoin(&mut self) -> bool {
+        (self.used, self.overlong, self.rows.first) = (0, false, true);
+        true
+    }
 }
 
 impl Rows {
@@ -514,6 +520,24 @@ mod tests {
     fn only_lines_with_the_prefix_are_samples() {
         let settings = DelimitedSettings { prefix: b"D:".to_vec(), ..settings() };
         assert_eq!(decode(&settings, "D:7,3,4\nready\n"), [left(7, 3.0), right(7, 4.0), WireEvent::Note]);
+    }
+
+    #[test]
+    fn a_header_outlives_its_link() {
+        let mut settings = one_eye();
+        settings.layout.pupils[0].size.at = Column::Name("left".into());
+        let mut decoder = DelimitedDecoder::joining(&settings);
+        let before = events_of(&mut decoder, b"time,gaze,left\n1000,7,3.5\n1001,7,3.");
+        assert_eq!(before[..2], [WireEvent::Note, left(1000, 3.5)]);
+        // What was cut off is not joined with what comes, whose beginning was missed.
+        assert!(decoder.rejoin());
+        assert_eq!(events_of(&mut decoder, b"7,4.5\n1003,7,4.5\n"), [WireEvent::Partial, left(1003, 4.5)]);
+        // Without a header nothing is known.
+        let unknown = events_of(&mut DelimitedDecoder::new(&settings), b"1003,7,4.5\n");
+        assert_eq!(unknown, [WireEvent::Rejected(WireFault::MissingField)]);
+        // A tracker that was started anew may have other columns.
+        assert!(decoder.rejoin());
+        assert_eq!(events_of(&mut decoder, b"time,left\n1004,5\n"), [WireEvent::Note, left(1004, 5.0)]);
     }
 
     #[test]

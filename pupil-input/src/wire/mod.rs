@@ -148,6 +148,12 @@ pub trait Decoder: Send {
 
     /// Ends the stream: a last line without its ending is read, anything else that is incomplete is dropped.
     fn finish(&mut self, on_event: &mut dyn FnMut(WireEvent));
+
+    /// Begins again on a link that was opened anew, with what the tracker says once of what it sends, as it may have
+    /// gone on meanwhile; false where there is no such thing, and a new decoder does as well.
+    fn rejoin(&mut self) -> bool {
+        false
+    }
 }
 
 /// How a tracker's bytes are read: every decoder, with its settings.

@@ -8,7 +8,8 @@ use std::time::Duration;
 use holod_calibration::TimeNs;
 use holod_calibration::rig::Rig;
 use holod_pupil_input::{
-    RecordFiles, RefusalWatch, Tracker, TrackerHandle, TrackerOptions, TrackerSpec, Verdict, host_now,
+    ClockWatch, Counter, RecordFiles, RefusalWatch, Tracker, TrackerHandle, TrackerOptions, TrackerSpec, Verdict,
+    host_now,
 };
 use ratatui::style::Color;
 use serde::Serialize;
@@ -76,6 +77,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     }
     let mut observed = Observed::default();
     let mut refusals = RefusalWatch::new(&rig.tracker, began);
+    let mut clock = ClockWatch::default();
     let mut live = LiveText::default();
     let mut redrawn = began;
     let ended_by = loop {
@@ -84,6 +86,10 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         while let Some(decision) = tracker.decisions.pop() {
             observed.take(&decision);
             refusals.note(&decision);
+        }
+        let resets = tracker.control.counters().of(Counter::ClockResets);
+        if let Some(wrong) = clock.judge(now, tracker.control.clock(), resets) {
+            tracing::warn!("{wrong}");
         }
         if let Some(signal) = signals.caught() {
             break signal.to_owned();
