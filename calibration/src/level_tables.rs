@@ -15,6 +15,8 @@ pub struct LevelTables {
     pub pattern: Resolution,
     /// Where the panel has a pattern's first pixel: column and row.
     pub origin: [usize; 2],
+    /// Whether a pattern's columns run the other way on the panel, and whether its rows do.
+    pub mirrors: [bool; 2],
     /// Whether samples are `[height, width, 3]`; else they are `[3, height, width]`. The 3 are `field_order`.
     pub interleaved: bool,
     /// The order in which colours are shown.

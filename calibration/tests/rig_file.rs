@@ -5,8 +5,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::rig::{
-    Eye, LaserDriver, LevelPhase, OutOfStroke, Packing, PanelMode, PanelProfile, PhaseSign, Provenance, Rig, RigError,
-    TextLaserProfile, WeightsChoice,
+    Eye, LaserDriver, LevelPhase, Orientation, OutOfStroke, Packing, PanelMode, PanelProfile, PhaseSign, Provenance,
+    Rig, RigError, TextLaserProfile, WeightsChoice,
 };
 use holod_calibration::toml_source::Fault;
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, Resolution, TimeNs};
@@ -813,6 +813,25 @@ fn what_becomes_of_phases_out_of_stroke_is_chosen() {
         line,
         "\"compress\"",
         "\"nearest\", \"clip\", \"zero\", \"scale\"",
+        "choose one",
+    );
+}
+
+#[test]
+fn how_patterns_lie_is_chosen() {
+    assert_eq!(Rig::parse(&changed(&[]), Path::new("")).unwrap().panel.orientation, Orientation::Normal);
+    for orientation in Orientation::ALL {
+        let text = changed(&[("settle_ms", &format!("orientation = \"{}\"\nsettle_ms", orientation.name()))]);
+        assert_eq!(Rig::parse(&text, Path::new("")).unwrap().panel.orientation, orientation);
+    }
+    let (instead, choices) =
+        ("orientation = \"flipped\"\nsettle_ms", "\"normal\", \"half-turn\", \"mirror-x\", \"mirror-y\"");
+    assert_fault(
+        &fault_of("settle_ms", instead),
+        "panel.orientation",
+        line_of("settle_ms"),
+        "\"flipped\"",
+        choices,
         "choose one",
     );
 }

@@ -117,6 +117,8 @@ pub struct EncodeReport {
 pub struct PanelEncoder {
     layout: FrameLayout,
     pattern: Resolution,
+    /// Whether a pattern's columns run the other way on the panel, and whether its rows do.
+    mirrors: [bool; 2],
     colours: [ColourEncoder; 3],
 }
 
@@ -159,7 +161,12 @@ impl PanelEncoder {
         }
         let of = |colour| ColourEncoder::new(panel, panel_resolution, colour);
         let colours = [of(Colour::Red)?, of(Colour::Green)?, of(Colour::Blue)?];
-        Ok(Self { layout: FrameLayout::new(panel, panel_resolution), pattern: pattern_resolution, colours })
+        Ok(Self {
+            layout: FrameLayout::new(panel, panel_resolution),
+            pattern: pattern_resolution,
+            mirrors: panel.orientation.mirrors(),
+            colours,
+        })
     }
 
     /// Pixels of the patterns that are encoded.
@@ -185,6 +192,7 @@ impl PanelEncoder {
             panel: self.layout.resolution,
             pattern: self.pattern,
             origin: [left, top],
+            mirrors: self.mirrors,
             interleaved: self.layout.mode == PanelMode::ChannelPacked,
             field_order: self.layout.field_order,
             levels: PerColour(Colour::ALL.map(|colour| of(colour).table.clone())),
@@ -222,15 +230,23 @@ impl PanelEncoder {
         let (left, top) = self.pattern_origin();
         let width = self.layout.resolution.width;
         let first = y * width;
-        let is_odd = |x: usize| (x + left + y + top) % 2 == 1;
+        let [mirrors_x, mirrors_y] = self.mirrors;
+        let Resolution { width: pattern_width, height: pattern_height } = self.pattern;
+        // Of the pattern's own column and row, gone on with beyond its edges.
+        let turned = usize::from(mirrors_x) * (pattern_width + 1) + usize::from(mirrors_y) * (pattern_height + 1);
+        let is_odd = |x: usize| (x + left + y + top + turned) % 2 == 1;
         if y < top || y >= top + self.pattern.height {
             encoder.encode_dark(first, width, is_odd(0), &mut samples);
             return 0;
         }
-        let phases_rad = &phase_rad[(y - top) * self.pattern.width..][..self.pattern.width];
-        let right = left + self.pattern.width;
+        let row = if mirrors_y { pattern_height - 1 - (y - top) } else { y - top };
+        let phases_rad = &phase_rad[row * pattern_width..][..pattern_width];
+        let right = left + pattern_width;
         encoder.encode_dark(first, left, is_odd(0), &mut samples);
-        let unreachable = encoder.encode_run(first + left, phases_rad, &mut samples.from(left));
+        let unreachable = match mirrors_x {
+            false => encoder.encode_run(first + left, phases_rad, &mut samples.from(left)),
+            true => encoder.encode_mirrored(first + left, phases_rad, &mut samples.from(left)),
+        };
         encoder.encode_dark(first + right, width - right, is_odd(right), &mut samples.from(right));
         unreachable
     }
@@ -284,9 +300,15 @@ impl PanelEncoder {
 
     /// The part of a panel's values that carries the pattern.
     fn of_pattern(&self, values: &[f32]) -> Vec<f32> {
-        let (left, top) = self.pattern_origin();
-        let rows = values.chunks_exact(self.layout.resolution.width).skip(top).take(self.pattern.height);
-        rows.flat_map(|row| &row[left..left + self.pattern.width]).copied().collect()
+        let ((left, top), [mirrors_x, mirrors_y]) = (self.pattern_origin(), self.mirrors);
+        let Resolution { width, height } = self.pattern;
+        let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+        let placed = pixels.map(|(x, y)| {
+            let column = if mirrors_x { width - 1 - x } else { x };
+            let row = if mirrors_y { height - 1 - y } else { y };
+            values[(top + row) * self.layout.resolution.width + left + column]
+        });
+        placed.collect()
     }
 
     fn pattern_origin(&self) -> (usize, usize) {
@@ -333,6 +355,18 @@ impl ColourEncoder {
             1 => self.encode_strided::<1>(phases_rad, flatness, samples.samples),
             _ => self.encode_strided::<{ crate::fields::FIELDS }>(phases_rad, flatness, samples.samples),
         }
+    }
+
+    /// As [`Self::encode_run`], the last phase first.
+    fn encode_mirrored(&self, first: usize, phases_rad: &[f32], samples: &mut Strided<'_>) -> usize {
+        let mut unreachable = 0;
+        let mut mirrored = [0.0; BLOCK];
+        for (block, phases_rad) in phases_rad.rchunks(BLOCK).enumerate() {
+            let (start, run) = (block * BLOCK, &mut mirrored[..phases_rad.len()]);
+            run.iter_mut().zip(phases_rad.iter().rev()).for_each(|(to, from)| *to = *from);
+            unreachable += self.encode_run(first + start, run, &mut samples.from(start));
+        }
+        unreachable
     }
 
     fn encode_flat(&self, first: usize, count: usize, samples: &mut Strided<'_>) {
@@ -566,7 +600,7 @@ fn circle_distance(a_rad: f64, b_rad: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::fields::FrameLayout;
-    use holod_calibration::rig::{Packing, Rig};
+    use holod_calibration::rig::{Orientation, Packing, Rig};
     use proptest::prelude::*;
 
     const FULL_STROKE_RAD: f64 = TAU * 255.0 / 256.0;
@@ -808,6 +842,70 @@ mod tests {
         assert_eq!(first_wrong(&half_turn, &encoder.decode_pattern(Colour::Red, &levels), 1e-6), None);
         encoder.encode_flat(&mut frame);
         assert_eq!(frame.samples(), [0; 90]);
+    }
+
+    fn on_panel(orientation: Orientation, size: Resolution, pattern: Resolution, phase_rad: &[f32]) -> Vec<u16> {
+        let flatness = (0..size.pixels()).map(|pixel| 0.01 * pixel as f32).collect();
+        let panel = Panel {
+            mode: PanelMode::FieldSequential,
+            orientation,
+            flatness_rad: PerColour([None, Some(flatness), None]),
+            ..panel()
+        };
+        let encoder = PanelEncoder::new(&panel, size, pattern).unwrap();
+        let mut frame = LevelsFrame::new(FrameLayout::new(&panel, size));
+        encoder.encode(PerColour([phase_rad; 3]), &mut frame);
+        let green = frame.unpack_colour(Colour::Green).levels;
+        assert!(
+            first_wrong(phase_rad, &encoder.decode_pattern(Colour::Green, &green), 0.013).is_none(),
+            "{orientation:?}"
+        );
+        frame.unpack_colour(Colour::Red).levels
+    }
+
+    #[test]
+    fn a_pattern_lies_as_the_rig_says_and_the_flatness_stays() {
+        // Wider than a block.
+        let (size, pattern) =
+            (Resolution { width: 2 * BLOCK + 9, height: 5 }, Resolution { width: BLOCK + 6, height: 2 });
+        let level = |x: usize, y: usize| (3 * x + 100 * y) % 256;
+        let (xs, ys) = (|x| pattern.width - 1 - x, |y| pattern.height - 1 - y);
+        let phase_rad: Vec<f32> = (0..pattern.pixels())
+            .map(|pixel| (level(pixel % pattern.width, pixel / pattern.width) as f64 / 256.0 * TAU) as f32)
+            .collect();
+        let (left, top) = ((size.width - pattern.width) / 2, (size.height - pattern.height) / 2);
+        for orientation in Orientation::ALL {
+            let levels = on_panel(orientation, size, pattern, &phase_rad);
+            for (x, y) in (0..pattern.height).flat_map(|y| (0..pattern.width).map(move |x| (x, y))) {
+                let expected = match orientation {
+                    Orientation::Normal => level(x, y),
+                    Orientation::HalfTurn => level(xs(x), ys(y)),
+                    Orientation::MirrorX => level(xs(x), y),
+                    Orientation::MirrorY => level(x, ys(y)),
+                };
+                let found = levels[(top + y) * size.width + left + x];
+                assert_eq!(usize::from(found), expected, "{orientation:?} {x} {y}");
+            }
+        }
+    }
+
+    #[test]
+    fn the_darkness_around_goes_on_with_that_of_a_pattern_however_it_lies() {
+        for (width, height) in [(6, 4), (7, 4), (6, 3), (7, 3)] {
+            let (size, pattern) = (Resolution { width: 12, height: 9 }, Resolution { width, height });
+            let is_odd = |pixel: usize| (pixel % width + pixel / width) % 2 == 1;
+            let phase_rad: Vec<f32> =
+                (0..pattern.pixels()).map(|pixel| if is_odd(pixel) { FRAC_PI_2 } else { 3.0 * FRAC_PI_2 }).collect();
+            for orientation in Orientation::ALL {
+                let levels = on_panel(orientation, size, pattern, &phase_rad);
+                let other = |one: u16| if one == 64 { 192 } else { 64 };
+                for (pixel, &found) in levels.iter().enumerate() {
+                    let (x, y) = (pixel % size.width, pixel / size.width);
+                    let expected = if (x + y) % 2 == 0 { levels[0] } else { other(levels[0]) };
+                    assert_eq!(found, expected, "{width}x{height} {orientation:?} {x} {y}");
+                }
+            }
+        }
     }
 
     #[test]

@@ -67,6 +67,40 @@ impl Packing {
     }
 }
 
+/// How patterns lie on the panel, so that the eye sees pictures upright behind the relays and mirrors of a bench.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Orientation {
+    /// Row 0 of the picture is row 0 of the panel, column 0 its column 0.
+    #[default]
+    Normal,
+    /// Turned by half a turn, as behind a relay of two lenses.
+    HalfTurn,
+    /// Mirrored left to right.
+    MirrorX,
+    /// Mirrored top to bottom.
+    MirrorY,
+}
+
+impl Orientation {
+    /// Every one.
+    pub const ALL: [Self; 4] = [Self::Normal, Self::HalfTurn, Self::MirrorX, Self::MirrorY];
+
+    /// The name in a rig file.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Normal => "normal",
+            Self::HalfTurn => "half-turn",
+            Self::MirrorX => "mirror-x",
+            Self::MirrorY => "mirror-y",
+        }
+    }
+
+    /// Whether columns run the other way, and whether rows do.
+    pub const fn mirrors(self) -> [bool; 2] {
+        [matches!(self, Self::HalfTurn | Self::MirrorX), matches!(self, Self::HalfTurn | Self::MirrorY)]
+    }
+}
+
 /// What becomes of a phase in the gap that a stroke under 2π leaves on the circle.
 ///
 /// The gap lies between the phase of the highest level and that of the lowest one, a whole turn further. A phase within

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{LaserDriver, PanelProfile, Rig};
+use super::{LaserDriver, Orientation, PanelProfile, Rig};
 use crate::{PerColour, PupilDiameter};
 
 /// The pupils for which blur is worked out.
@@ -231,6 +231,9 @@ fn notes(rig: &Rig) -> Vec<String> {
         if *power_mw == 0.0 {
             notes.push(format!("{colour}: the laser's power is 0, so this colour stays dark"));
         }
+    }
+    if rig.panel.orientation != Orientation::Normal {
+        notes.push(format!("pictures lie on the panel in the orientation {}", rig.panel.orientation.name()));
     }
     let wavelengths = &rig.geometry.wavelengths;
     if let Some((longest, wavelength)) = wavelengths.iter().max_by(|(_, one), (_, other)| one.0.total_cmp(&other.0)) {

@@ -14,7 +14,7 @@ mod text_laser;
 
 use std::path::{Path, PathBuf};
 
-pub use drive::{LevelPhase, OutOfStroke, Packing};
+pub use drive::{LevelPhase, Orientation, OutOfStroke, Packing};
 pub use error::RigError;
 pub use meaning::{ActiveFile, BlurMeaning, FieldMeaning, Meaning, PerColourFigures};
 pub use profile::PanelProfile;
@@ -73,6 +73,8 @@ pub struct Panel {
     pub bit_depth: u8,
     /// Where these bits travel on the video link.
     pub packing: Packing,
+    /// How patterns lie on it; look-up tables and flatness are the panel's own and stay.
+    pub orientation: Orientation,
     /// Whether a higher level retards or advances the phase.
     pub phase_sign: PhaseSign,
     /// Phase at the top level of each colour, radians; 2π where a pattern can be shown without loss.
@@ -257,6 +259,7 @@ impl Default for Rig {
                 frames_per_colour: 1,
                 bit_depth: 8,
                 packing: Packing::Gray,
+                orientation: Orientation::Normal,
                 phase_sign: PhaseSign::Positive,
                 stroke_rad: PerColour([std::f64::consts::TAU * 255.0 / 256.0; 3]),
                 out_of_stroke: OutOfStroke::Nearest,

@@ -9,8 +9,8 @@ use super::flatness::GrayScale;
 use super::profile::PanelProfile;
 use super::reader::{Found, Reader, Section, Span};
 use super::{
-    Eye, LaserDriver, Lasers, LevelPhase, Model, OutOfStroke, Packing, Panel, PanelMode, PhaseSign, Provenance, Rig,
-    RigError, TextLaserProfile, Tracker, WeightsChoice, flatness, lut,
+    Eye, LaserDriver, Lasers, LevelPhase, Model, Orientation, OutOfStroke, Packing, Panel, PanelMode, PhaseSign,
+    Provenance, Rig, RigError, TextLaserProfile, Tracker, WeightsChoice, flatness, lut,
 };
 use crate::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
 
@@ -31,6 +31,7 @@ const LAYOUT: [(&str, &[&str]); 6] = [
             "colour",
             "bit_depth",
             "packing",
+            "orientation",
             "phase_sign",
             "stroke_pi",
             "out_of_stroke",
@@ -167,6 +168,7 @@ fn read_rig<'a>(reader: &Reader<'a>, root: Section<'a>, text: &str, origin: &Pat
         settle: milliseconds(timing.settle_ms.value),
         bit_depth,
         packing,
+        orientation: phase.orientation,
         phase_sign: phase.sign,
         stroke_rad: phase.stroke_rad,
         out_of_stroke: phase.out_of_stroke,
@@ -327,6 +329,7 @@ fn read_levels<'a>(reader: &Reader<'a>, panel: Section<'a>, mode: Option<PanelMo
 
 /// The panel as a phase modulator.
 struct Phase {
+    orientation: Orientation,
     sign: PhaseSign,
     stroke_rad: PerColour<f64>,
     out_of_stroke: OutOfStroke,
@@ -347,6 +350,8 @@ fn read_phase<'a>(
     let lut_paths = reader.texts(panel, "lut_file", "a CSV file's path");
     let needs_stroke = PerColour(lut_paths.0.map(|path| path.is_none()));
     let stroke_pi = reader.numbers(panel, "stroke_pi", STROKE, needs_stroke);
+    let orientations = Orientation::ALL.map(|orientation| (orientation.name(), orientation));
+    let orientation = reader.choice(panel, "orientation", &orientations, false);
     let ways = OutOfStroke::ALL.map(|way| (way.name(), way));
     let out_of_stroke = reader.choice(panel, "out_of_stroke", &ways, false);
     let flatness_paths = reader.texts(panel, "flatness_file", "a PNG or BMP file's path");
@@ -383,7 +388,8 @@ fn read_phase<'a>(
     }
     let stroke_rad = PerColour([stroke_rad.0[0]?, stroke_rad.0[1]?, stroke_rad.0[2]?]);
     let out_of_stroke = out_of_stroke.map_or(OutOfStroke::default(), |way| way.value);
-    Some(Phase { sign: sign?.value, stroke_rad, out_of_stroke, lut, flatness_rad })
+    let orientation = orientation.map_or(Orientation::default(), |orientation| orientation.value);
+    Some(Phase { orientation, sign: sign?.value, stroke_rad, out_of_stroke, lut, flatness_rad })
 }
 
 /// Whether the flatness pictures show what is to be taken off.

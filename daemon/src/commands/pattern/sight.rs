@@ -60,7 +60,7 @@ impl Sight {
                  stroke's error"
                     .into(),
             ),
-            Pattern::Grating { .. } => notes.push("light on the opposite side means that phase_sign is wrong or the relay inverts".into()),
+            Pattern::Grating { .. } => notes.push("light on the opposite side means that panel.phase_sign or panel.orientation is wrong".into()),
             Pattern::Lens { focal_length: Metres(f_m), .. } => {
                 for &field in &fields {
                     let diameter_m = pattern.lens_diameter(optics, field)?.0;
@@ -81,6 +81,7 @@ impl Sight {
                 let spacing_mrad = spacing_px as f64 * optics.pixel_angle_rad() * 1e3;
                 notes.push(format!("focus the camera at infinity: dots {spacing_mrad:.2} mrad apart, bright on black"));
                 notes.push("the middle dot is twice as wide; the one right of it and the second above it are left out".into());
+                notes.push("where others are missing, correct panel.orientation of the rig file".into());
             }
             Pattern::CrossHair { line_px } => {
                 let width_mrad = line_px as f64 * optics.pixel_angle_rad() * 1e3;

@@ -13,7 +13,8 @@ const ROW: usize = 1 << 15;
 /// Adds the stage `panel levels`: the samples of `phases` [3, height, width], two to 32 bits; of each colour
 /// `unreachable` counts those that the panel cannot show. Returns the samples' buffer.
 pub(crate) fn encode(plan: &mut Plan, tables: &LevelTables, phases: BufferId, unreachable: BufferId) -> BufferId {
-    let LevelTables { panel, pattern, origin: [left, top], interleaved, field_order, levels, flatness } = tables;
+    let LevelTables { panel, pattern, origin: [left, top], mirrors: [mirror_x, mirror_y], .. } = tables;
+    let LevelTables { interleaved, field_order, levels, flatness, .. } = tables;
     let entries = levels.0[0].len();
     assert!(
         entries.is_power_of_two() && levels.0.iter().all(|table| table.len() == entries),
@@ -38,6 +39,8 @@ pub(crate) fn encode(plan: &mut Plan, tables: &LevelTables, phases: BufferId, un
         ("HEIGHT", pattern.height.into()),
         ("LEFT", (*left).into()),
         ("TOP", (*top).into()),
+        ("MIRROR_X", (*mirror_x).into()),
+        ("MIRROR_Y", (*mirror_y).into()),
         ("INTERLEAVED", (*interleaved).into()),
         ("FIRST", first.into()),
         ("SECOND", second.into()),

@@ -1,5 +1,5 @@
 // Phases to the panel's samples, as the panel takes them. After these constants:
-// THREADS (of a workgroup), PANEL_WIDTH, PANEL_HEIGHT, WIDTH, HEIGHT, LEFT, TOP, INTERLEAVED, FIRST, SECOND, THIRD
+// THREADS (of a workgroup), PANEL_WIDTH, PANEL_HEIGHT, WIDTH, HEIGHT, LEFT, TOP, MIRROR_X, MIRROR_Y, INTERLEAVED, FIRST, SECOND, THIRD
 // (colours in the order shown), ENTRIES (of a colour's table), FLATNESS (whether there is any).
 
 @group(0) @binding(0) var<storage, read> phases_rad: array<f32>; // [3, height, width]
@@ -23,8 +23,10 @@ fn sample(index: u32) -> u32 {
     }
     let colour = select(select(THIRD, SECOND, position == 1u), FIRST, position == 0u);
     // Above and left of the pattern these wrap round to what is too large.
-    let x = pixel % PANEL_WIDTH - LEFT;
-    let y = pixel / PANEL_WIDTH - TOP;
+    let column = pixel % PANEL_WIDTH - LEFT;
+    let row = pixel / PANEL_WIDTH - TOP;
+    let x = select(column, WIDTH - 1u - column, MIRROR_X);
+    let y = select(row, HEIGHT - 1u - row, MIRROR_Y);
     let inside = x < WIDTH && y < HEIGHT;
     // Around it what double phase makes of no light: π/2 where x + y is odd, -π/2 where it is even.
     var entries = f32(ENTRIES) * select(0.75, 0.25, (x + y) % 2u == 1u);

@@ -96,7 +96,7 @@ fn double_phase_is_the_processors() {
 
 /// The samples of `phases_rad` by the definition, and how many are out of reach in each colour.
 fn samples(tables: &LevelTables, phases_rad: &[f32]) -> (Vec<u16>, [u32; 3]) {
-    let LevelTables { panel, pattern, origin: [left, top], .. } = tables;
+    let LevelTables { panel, pattern, origin: [left, top], mirrors: [mirror_x, mirror_y], .. } = tables;
     let mut unreachable = [0; 3];
     let samples = (0..3 * panel.pixels()).map(|index| {
         let (position, pixel) = match tables.interleaved {
@@ -105,6 +105,8 @@ fn samples(tables: &LevelTables, phases_rad: &[f32]) -> (Vec<u16>, [u32; 3]) {
         };
         let colour = tables.field_order[position];
         let (x, y) = ((pixel % panel.width).wrapping_sub(*left), (pixel / panel.width).wrapping_sub(*top));
+        let x = if *mirror_x { (pattern.width - 1).wrapping_sub(x) } else { x };
+        let y = if *mirror_y { (pattern.height - 1).wrapping_sub(y) } else { y };
         let inside = x < pattern.width && y < pattern.height;
         let phase_rad = match inside {
             true => phases_rad[colour.index() * pattern.pixels() + y * pattern.width + x],
@@ -129,6 +131,7 @@ proptest! {
         height in 1usize..12,
         around in (0usize..9, 0usize..5),
         interleaved in any::<bool>(),
+        mirrors in any::<[bool; 2]>(),
         flat in any::<bool>(),
         seed in 0u32..1000,
     ) {
@@ -143,6 +146,7 @@ proptest! {
             panel,
             pattern,
             origin: [around.0 / 2, around.1 / 2],
+            mirrors,
             interleaved,
             field_order: [Colour::Blue, Colour::Red, Colour::Green],
             levels: PerColour([0, 5, 11].map(|first| (first..first + ENTRIES).map(level).collect())),
@@ -186,6 +190,7 @@ fn linear_tables(resolution: Resolution) -> LevelTables {
         panel: resolution,
         pattern: resolution,
         origin: [0, 0],
+        mirrors: [false; 2],
         interleaved: true,
         field_order: Colour::ALL,
         levels: PerColour([table(), table(), table()]),

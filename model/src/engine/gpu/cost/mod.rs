@@ -225,6 +225,7 @@ impl FramePlan {
             panel: resolution,
             pattern: resolution,
             origin: [0, 0],
+            mirrors: [false; 2],
             interleaved: false,
             field_order: Colour::ALL,
             levels: PerColour(levels),
