@@ -419,7 +419,7 @@ impl Part {
         let Some(path) = events.table() else { return };
         let blinks = events.sidecar().and_then(|sidecar| self.blinks(&path, &sidecar, ns_per_tick));
         match blinks {
-            Ok(blinks) => log.blinks.extend(blinks),
+            Ok(blinks) => blinks.into_iter().for_each(|blink| log.blink_beside(blink)),
             Err(error) => log.note(format!("its blinks could not be read: {error}")),
         }
     }

@@ -115,6 +115,25 @@ fn tobii_pro_lab_reads_in_each_of_its_dialects() {
 }
 
 #[test]
+fn tobii_recordings_without_names_are_put_behind_each_other() {
+    let mut text = String::from("Recording timestamp [ms]\tSensor\tPupil diameter left [mm]\tValidity left\n");
+    for (rows, mm) in [(600, "3.0"), (900, "5.0"), (100, "4.0")] {
+        for row in 0..rows {
+            writeln!(text, "{}\tEye Tracker\t{mm}\tValid", 100 + 16 * row).expect("a String takes all");
+        }
+    }
+    let left = of_eye(&read(&text), Left);
+    assert_eq!(left.len(), 1600);
+    assert!(left.windows(2).all(|pair| pair[0].0 < pair[1].0));
+    let changes: Vec<_> = (1..1600)
+        .filter(|row| left[*row].1 != left[row - 1].1)
+        .map(|row| (row, left[row].0 - left[row - 1].0))
+        .collect();
+    assert_eq!(changes, [(600, 1000 * MS), (1500, 1000 * MS)]);
+    assert!(noted(&read(&text), "begins anew in lines 602, 1502: "), "{:?}", read(&text).notes());
+}
+
+#[test]
 fn tobii_studio_reads_with_its_names_and_validity_codes() {
     let header = "ParticipantName\tMediaName\tRecordingTimestamp\tGazePointIndex\tPupilLeft\tPupilRight\tValidityLeft\tValidityRight\t\n";
     let rows = "P03\t\t3\t1\t2,80\t2,62\t0\t0\t\nP03\t\t19\t2\t2,81\t-1,00\t1\t4\t\nP03\t\t36\t3\t2,82\t2,6\t2\t3\t\n\
@@ -234,6 +253,32 @@ fn gazepoint_without_millimetres_or_ticks_reads_what_there_is() {
     let recording = read(standing);
     assert_eq!(of_eye(&recording, Right)[1].0, 16_670_000);
     assert_eq!(recording.faults().of(LogFault::Backwards), 58);
+}
+
+#[test]
+fn gazepoint_media_whose_time_starts_again_are_put_behind_with_their_blinks() {
+    let mut text = String::from("MEDIA_ID,CNT,TIME,BKID,BKDUR,LPMM,LPMMV\n");
+    for media in 0..7 {
+        for row in 0..300_i64 {
+            // Each medium ends in a blink that goes on in the next one, and has one soon after its beginning.
+            let id = match row {
+                0..3 if media > 0 => media,
+                5..8 => 100 + media,
+                290.. => media + 1,
+                _ => 0,
+            };
+            writeln!(text, "{media},{row},{:.2},{id},0,3.1,1", row as f64 * 0.01).expect("a String takes all");
+        }
+    }
+    let recording = read(text);
+    let left = of_eye(&recording, Left);
+    assert_eq!((left.len(), left[300].0, left[2099].0), (2100, 3990 * MS, (6 * 3990 + 2990) * MS));
+    assert_eq!(recording.faults().total(), 0);
+    assert!(noted(&recording, "in lines 302, 602, 902, 1202, 1502 and 1 more: "), "{:?}", recording.notes());
+    let within: Vec<_> = recording.blinks().iter().map(|blink| blink.ends.0 - blink.begins.0).collect();
+    assert_eq!(within.len(), 7 * 3 - 1);
+    assert!(within.iter().all(|lasts| [20 * MS, 90 * MS].contains(lasts)), "{:?}", recording.blinks());
+    assert_eq!(recording.blinks()[3].begins, TimeNs((3990 + 50) * MS));
 }
 
 #[test]
