@@ -461,6 +461,51 @@ fn bids_reads_what_its_sidecar_says() {
 }
 
 #[test]
+fn bids_areas_are_told_from_diameters_by_unit_then_name_then_description() {
+    let (area, noted_area, diameter, noted_diameter) = ((true, false), (true, true), (false, false), (false, true));
+    let cases = [
+        ("pupil_size", "mm", "Pupil diameter", diameter),
+        ("pupil_size", "mm", "Diameter of the ellipse fitted to the dark area", diameter),
+        ("pupil_size", "mm", "", diameter),
+        ("pupil_size", "mm", "Pupil area", noted_diameter),
+        ("pupil_size", "mm^2", "", area),
+        ("pupil_size", "mm2", "", area),
+        ("pupil_size", "mm \u{b2}", "Pupil size", area),
+        ("pupil_size", "mm**2", "Diameter", area),
+        ("pupil_area", "mm2", "", area),
+        ("pupil_area", "mm", "", noted_area),
+        ("pupil_area", "pixels", "", area),
+        ("pupil_size", "px2", "", area),
+        ("pupil_size", "pixels", "Pupil area", area),
+        ("pupil_size", "pixels", "Pupil diameter", diameter),
+        ("pupil_size", "pixels", "", noted_diameter),
+        ("pupil_area", "arbitrary", "The diameter's square", area),
+        ("pupil_diameter", "arbitrary", "of the dark area", diameter),
+        ("pupil_size", "arbitrary", "Pupil area as calculated by the eye-tracker", area),
+        ("pupil_size", "arbitrary", "Pupil diameter", diameter),
+        ("pupil_size", "arbitrary", "Area or diameter, depending on the setting", noted_diameter),
+        ("pupil_size", "arbitrary", "", noted_diameter),
+        ("pupil_size", "a.u.2", "", noted_diameter),
+    ];
+    for (column, unit, description, expected) in cases {
+        let sidecar = format!(
+            r#"{{"Columns": ["timestamp", "{column}"], "SamplingFrequency": 500, "RecordedEye": "left",
+                "timestamp": {{"Units": "ms"}}, "{column}": {{"Units": "{unit}", "Description": "{description}"}}}}"#
+        );
+        let recording = bids(&[("x_physio.tsv", b"0\t9.62\n2\t9.62\n"), ("x_physio.json", sidecar.as_bytes())]);
+        let recording = recording.expect("reads");
+        let read = recording.samples().next().expect("a sample").diameter_mm;
+        let is_area = (read - 3.5).abs() < 0.001;
+        assert!(is_area || read == 9.62, "{column}, {unit}, {description}: {read}");
+        let found = (is_area, noted(&recording, "x_physio.json: `pupil_"));
+        assert_eq!(found, expected, "{column}, {unit}, {description}: {:?}", recording.notes());
+        assert_eq!(noted(&recording, "areas were made diameters"), is_area);
+        let of_mm = unit.starts_with("mm");
+        assert_eq!(recording.unit() == SizeUnit::Millimetres, of_mm, "{unit}: {:?}", recording.unit());
+    }
+}
+
+#[test]
 fn bids_sidecars_are_inherited_and_the_nearer_wins() {
     let table = format!("{STEM}.tsv");
     let recording = bids(&[
