@@ -9,7 +9,7 @@ use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
 use crate::clock::RESTART;
 use crate::wire::line::LineDecoder;
-use crate::wire::{Decoder, WireEvent};
+use crate::wire::{Decoder, WireEvent, WireSample};
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Lines, recognises, read };
 
@@ -27,9 +27,9 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         let mut take = |event| match event {
             WireEvent::Sample(sample) => {
                 let Some(t) = sample.t_device else { return log.count(LogFault::BadNumber) };
-                let (eye, diameter, confidence) = (sample.eye, sample.diameter_mm, sample.confidence);
+                let WireSample { eye, diameter_mm: diameter, confidence, valid, .. } = sample;
                 let t = counter.next(t);
-                log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid: true }, line.number);
+                log.push(LogSample { t, eye, diameter, confidence, aperture_mm: None, valid }, line.number);
             }
             WireEvent::Rejected(fault) => log.count(LogFault::Wire(fault)),
             WireEvent::Note | WireEvent::Partial | WireEvent::Clock(_) => {}

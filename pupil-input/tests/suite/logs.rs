@@ -113,6 +113,28 @@ fn each_bad_cell_is_counted_by_its_reason() {
 }
 
 #[test]
+fn lost_pupils_of_a_recording_in_lines_are_lost() {
+    let mut text = String::new();
+    for sequence in 0..300 {
+        // Lost; a diameter without confidence is unsure, and so is none with some.
+        let (diameter_mm, confidence) = match sequence {
+            100..120 => (0.0, 0.0),
+            200..205 => (3.0, 0.0),
+            205..210 => (0.0, 0.1),
+            _ => (4.0, 1.0),
+        };
+        let (device_us, eye) = (5_000 * sequence as i64, SampleEye::Left);
+        encode_line(&LineSample { sequence, device_us, eye, diameter_mm, confidence }, &mut text);
+    }
+    let dir = TempDir::new().expect("a folder");
+    let (recording, info) = info(&written(&dir, "log", text));
+    let eye = &info.eyes[0];
+    assert_eq!((eye.valid, eye.lost, eye.lost_runs, eye.unsure), (280, 20, 1, 10));
+    assert_eq!((eye.blinks_found, eye.diameter.map(|range| range.least)), (Some(2), Some(4.0)));
+    assert!(recording.samples().all(|sample| sample.valid == (sample.diameter_mm > 0.0 || sample.confidence > 0.0)));
+}
+
+#[test]
 fn bad_lines_of_a_recording_are_counted_and_skipped() {
     let mut text = as_lines(&neon_like()[..50]);
     let nan = "P1,99,1,L,NaN,1";
