@@ -34,7 +34,7 @@ const STRAY_ABOVE: TimeNs = TimeNs(150_000_000);
 /// the line: then it may be that the clock was set back.
 const STRAY_BACKWARDS: TimeNs = TimeNs(30_000_000);
 /// A clock that falls by this much has restarted or wrapped: no link keeps a sample for so long.
-const RESTART: TimeNs = TimeNs(1_000_000_000);
+pub(crate) const RESTART: TimeNs = TimeNs(1_000_000_000);
 /// Strays agree when their offsets differ by less.
 const AGREEMENT: TimeNs = TimeNs(50_000_000);
 /// So many strays that agree are a step forward or a restart.

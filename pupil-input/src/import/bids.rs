@@ -218,25 +218,52 @@ struct Size {
     unit: SizeUnit,
     factor: f64,
     is_area: bool,
+    /// Why it may be the other, where the sidecar does not say clearly whether it is an area or a diameter.
+    doubt: Option<&'static str>,
+}
+
+/// A unit of size and its factor to millimetres or pixels, if it is one that is known.
+fn unit_of_size(unit: &str) -> Option<(SizeUnit, f64)> {
+    Some(match unit {
+        "mm" | "millimetre" | "millimetres" | "millimeter" | "millimeters" => (SizeUnit::Millimetres, 1.0),
+        "cm" => (SizeUnit::Millimetres, 10.0),
+        "m" | "metre" | "meter" => (SizeUnit::Millimetres, 1e3),
+        "um" | "\u{b5}m" | "\u{3bc}m" => (SizeUnit::Millimetres, 1e-3),
+        "px" | "pixel" | "pixels" => (SizeUnit::Pixels, 1.0),
+        _ => return None,
+    })
 }
 
 impl Size {
     fn of(sidecar: &Sidecar, column: &str) -> Self {
         let says = |key| sidecar.of_column(column, key).unwrap_or_default().to_lowercase();
-        let unit = says("Units").replace(' ', "");
-        let is_area = [column.to_lowercase(), unit.clone(), says("Description"), says("LongName")]
-            .iter()
-            .any(|text| text.contains("area") || text.contains("^2") || text.contains('\u{b2}'));
-        let unit = unit.trim_end_matches("^2").trim_end_matches('\u{b2}');
-        let (unit, factor) = match unit {
-            "mm" | "millimetre" | "millimetres" | "millimeter" | "millimeters" => (SizeUnit::Millimetres, 1.0),
-            "cm" => (SizeUnit::Millimetres, 10.0),
-            "m" | "metre" | "meter" => (SizeUnit::Millimetres, 1e3),
-            "um" | "\u{b5}m" | "\u{3bc}m" => (SizeUnit::Millimetres, 1e-3),
-            "px" | "pixel" | "pixels" => (SizeUnit::Pixels, 1.0),
-            _ => (SizeUnit::Arbitrary, 1.0),
+        let stated = says("Units").replace(' ', "");
+        let squared = ["^2", "**2", "\u{b2}", "2"].iter().find_map(|power| unit_of_size(stated.strip_suffix(power)?));
+        let (unit, factor) = squared.or_else(|| unit_of_size(&stated)).unwrap_or((SizeUnit::Arbitrary, 1.0));
+
+        let column = column.to_lowercase();
+        let about = [says("Description"), says("LongName")];
+        let tells = |word: &str| about.iter().any(|text| text.contains(word));
+        let (tells_area, tells_diameter) = (tells("area"), tells("diam"));
+        // Pixels count areas as well as lengths.
+        let is_length = squared.is_none() && unit == SizeUnit::Millimetres;
+        let (is_area, doubt) = if squared.is_some() {
+            (true, None)
+        } else if column.contains("area") {
+            (true, is_length.then_some("its name says area and its unit is one of length"))
+        } else if is_length {
+            (
+                false,
+                (tells_area && !tells_diameter).then_some("its description says area and its unit is one of length"),
+            )
+        } else if ["diam", "radius"].iter().any(|word| column.contains(word)) {
+            (false, None)
+        } else {
+            let doubt =
+                (tells_area == tells_diameter).then_some("neither its unit nor its description says which it is");
+            (tells_area && !tells_diameter, doubt)
         };
-        Self { unit, factor, is_area }
+        Self { unit, factor, is_area, doubt }
     }
 
     fn diameter(self, figure: f64) -> f64 {
@@ -354,9 +381,18 @@ impl Part {
         let ns_per_tick = self.time.map(|time| self.ns_per_tick(time, log)).transpose()?;
         let start_s = self.sidecar.number("StartTime").unwrap_or(0.0);
         let at_row = |row: f64| ns_of(start_s + row / rate_hz.unwrap_or(1.0), 1e9);
-        for (_, eye, size) in &self.pupils {
+        for (column, eye, size) in &self.pupils {
             if size.is_area {
                 log.note(format!("{}: the {eye} eye's pupil areas were made diameters", self.path.display()));
+            }
+            if let Some(doubt) = size.doubt {
+                log.note(format!(
+                    "{}: `{column}` is taken for {}, though {doubt}; give it \"Units\": \"mm\" for diameters or \"mm^2\" \
+                     for areas, or a \"Description\" that says diameter or area where its unit is arbitrary",
+                    self.sidecar.path.display(),
+                    if size.is_area { "areas" } else { "diameters" },
+                    column = self.sidecar.columns()[*column].escape_debug(),
+                ));
             }
         }
 
@@ -419,7 +455,7 @@ impl Part {
         let Some(path) = events.table() else { return };
         let blinks = events.sidecar().and_then(|sidecar| self.blinks(&path, &sidecar, ns_per_tick));
         match blinks {
-            Ok(blinks) => log.blinks.extend(blinks),
+            Ok(blinks) => blinks.into_iter().for_each(|blink| log.blink_beside(blink)),
             Err(error) => log.note(format!("its blinks could not be read: {error}")),
         }
     }

@@ -20,9 +20,6 @@ use crate::size_unit::SizeUnit;
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::EyeLink, recognises, read };
 
-/// A block whose clock has begun anew is put this far behind the one before it.
-const BETWEEN_CLOCKS: TimeNs = TimeNs(1_000_000_000);
-
 fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> {
     line.split(|byte| matches!(byte, b' ' | b'\t')).filter(|word| !word.is_empty())
 }
@@ -99,13 +96,10 @@ struct Reader<'b> {
     eyes: Option<Eyes>,
     measure: Option<Measure>,
     rate_hz: Option<f64>,
-    /// Added to the file's times.
-    shift: TimeNs,
-    /// As written, of the sample before.
+    /// Of the sample before, in the same block.
     previous: Option<TimeNs>,
     shut_since: [Option<TimeNs>; 3],
     blocks: u64,
-    restarts: u64,
     measures_differ: bool,
     rates_differ: bool,
     guessed: bool,
@@ -119,11 +113,9 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         eyes: None,
         measure: None,
         rate_hz: None,
-        shift: TimeNs(0),
         previous: None,
         shut_since: [None; 3],
         blocks: 0,
-        restarts: 0,
         measures_differ: false,
         rates_differ: false,
         guessed: false,
@@ -131,13 +123,12 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     while let Some(line) = lines.next(reader.log) {
         match line.bytes.first() {
             Some(b'0'..=b'9') => reader.sample(line.bytes, line.number),
-            Some(b'A'..=b'Z') => reader.word(line.bytes),
+            Some(b'A'..=b'Z') => reader.word(line.bytes, line.number),
             // Comments, the figures of a calibration, blank lines.
             _ => {}
         }
     }
-    let end = reader.log.latest();
-    reader.end_blinks(end);
+    reader.end_blinks(reader.previous);
     reader.notes();
     Ok(())
 }
@@ -159,7 +150,7 @@ impl Reader<'_> {
         // Before version 4 half milliseconds were written as whole ones, each twice.
         let half = self.previous == Some(written) && self.rate_hz.is_some_and(|rate_hz| rate_hz > 1500.0);
         self.previous = Some(written);
-        let t = TimeNs(written.0.saturating_add(self.shift.0).saturating_add(if half { 500_000 } else { 0 }));
+        let t = TimeNs(written.0.saturating_add(if half { 500_000 } else { 0 }));
         let eyes = match eyes {
             Eyes::One(eye) => [Some(eye), None],
             Eyes::Two => [Some(SampleEye::Left), Some(SampleEye::Right)],
@@ -194,23 +185,20 @@ impl Reader<'_> {
         })
     }
 
-    fn word(&mut self, line: &[u8]) {
+    fn word(&mut self, line: &[u8], line_number: u64) {
         let mut words = words(line);
         match words.next() {
             Some(b"START") => {
                 self.eyes = Eyes::named_by(line).or(self.eyes);
                 self.blocks += 1;
+                self.end_blinks(self.previous);
                 self.previous = None;
-                let (Some(t), Some(latest)) = (words.next().and_then(|word| time(word, 3)), self.log.latest()) else {
-                    return;
-                };
-                if t.0.saturating_add(self.shift.0) < latest.0 {
-                    self.shift = TimeNs((latest + BETWEEN_CLOCKS).0.saturating_sub(t.0));
-                    self.restarts += 1;
+                if let Some(t) = words.next().and_then(|word| time(word, 3)) {
+                    self.log.recording_begins(t, line_number);
                 }
             }
             Some(b"END") => {
-                let t = words.next().and_then(|word| self.time(word)).or(self.log.latest());
+                let t = words.next().and_then(|word| time(word, 3)).or(self.previous);
                 self.end_blinks(t);
             }
             Some(b"PUPIL") => {
@@ -228,19 +216,19 @@ impl Reader<'_> {
             }
             Some(b"MSG") => self.message(line),
             Some(b"SBLINK") => {
-                if let Some((eye, t)) = words.next().and_then(eye).zip(words.next().and_then(|word| self.time(word))) {
+                if let Some((eye, t)) = words.next().and_then(eye).zip(words.next().and_then(|word| time(word, 3))) {
                     self.shut_since[eye.index()] = Some(t);
                 }
             }
             Some(b"EBLINK") => {
                 let eye = words.next().and_then(eye);
-                let mut time = || words.next().and_then(|word| self.time(word));
-                let (begins, ends) = (time(), time());
+                let mut next = || words.next().and_then(|word| time(word, 3));
+                let (begins, ends) = (next(), next());
                 if let (Some(eye), Some(begins), Some(ends)) = (eye, begins, ends)
                     && begins <= ends
                 {
                     self.shut_since[eye.index()] = None;
-                    self.log.blinks.push(Blink { eye, begins, ends });
+                    self.log.blink(Blink { eye, begins, ends });
                 }
             }
             _ => {}
@@ -271,16 +259,12 @@ impl Reader<'_> {
         self.log.stated_rate_hz.get_or_insert(rate_hz);
     }
 
-    fn time(&self, word: &[u8]) -> Option<TimeNs> {
-        time(word, 3).map(|t| TimeNs(t.0.saturating_add(self.shift.0)))
-    }
-
     /// Ends blinks that began and are told no end of, because the recording stopped.
     fn end_blinks(&mut self, t: Option<TimeNs>) {
         for eye in SampleEye::ALL {
             let begins = self.shut_since[eye.index()].take();
             if let Some((begins, ends)) = begins.zip(t).filter(|(begins, ends)| begins <= ends) {
-                self.log.blinks.push(Blink { eye, begins, ends });
+                self.log.blink(Blink { eye, begins, ends });
             }
         }
     }
@@ -300,12 +284,6 @@ impl Reader<'_> {
         }
         if self.blocks > 1 {
             self.log.note(format!("{} blocks of recording, with gaps between them", self.blocks));
-        }
-        if self.restarts > 0 {
-            let restarts = self.restarts;
-            self.log.note(format!(
-                "the clock begins anew at {restarts} blocks: each is put one second after the block before it"
-            ));
         }
         if self.measures_differ {
             self.log.note("some blocks give areas and some diameters: their units are not the same");

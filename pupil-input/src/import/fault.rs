@@ -41,7 +41,8 @@ pub enum ReplayError {
     /// Its times are in no order.
     #[error(
         "pupil log {path} is not in order of time: {backwards} of {rows} times go backwards, the first in line {line}; \
-         sort it by time"
+         expected samples in the order in which they were taken; export it again, each recording into a file of its own \
+         (to sort it by time would mix recordings)"
     )]
     Unsorted {
         path: PathBuf,

@@ -6,6 +6,7 @@ use super::fault::{LogFault, ReplayError};
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
+use super::parts::is_restart;
 use super::recording::{Blink, LogBuilder, LogSample};
 use super::table::{Row, Table, cells, is_missing, number, separator, time_ns};
 use crate::SampleEye;
@@ -38,9 +39,6 @@ fn is_time(name: &str) -> bool {
     name == "TIME" || name.starts_with("TIME(") || name == "Time (in secs)"
 }
 
-/// A fall of the time by more than this is a new medium.
-const BETWEEN_MEDIA_NS: i64 = 1_000_000_000;
-
 /// Where time is read.
 #[derive(Clone, Copy)]
 struct Clock {
@@ -63,18 +61,9 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         log.note(format!("the header says that it began at {}", begin.escape_debug()));
     }
 
-    // `TIME` starts again with each medium; the next one is put a second behind the one before.
-    let (mut later_ns, mut latest_ns, mut media) = (0, None, 1);
     while let Some(row) = table.next_row(log) {
         let t = match row.cell(clock.column).and_then(|cell| time_ns(cell, clock.ns_per_unit)) {
-            Ok(t_ns) => {
-                if let Some(latest_ns) = latest_ns.filter(|latest| t_ns < latest - BETWEEN_MEDIA_NS) {
-                    later_ns += latest_ns - t_ns + BETWEEN_MEDIA_NS;
-                    media += 1;
-                }
-                latest_ns = Some(t_ns);
-                TimeNs(t_ns.saturating_add(later_ns))
-            }
+            Ok(t_ns) => TimeNs(t_ns),
             Err(fault) => {
                 log.count(fault);
                 continue;
@@ -92,9 +81,6 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         blinks.take(&row, t, log);
     }
     blinks.end(log);
-    if media > 1 {
-        log.note(format!("its clock starts anew {} times; each part was put 1 s behind the one before", media - 1));
-    }
     Ok(())
 }
 
@@ -153,6 +139,8 @@ struct Blinks {
     current: Option<Current>,
     /// Length in the row before.
     duration_ns: i64,
+    /// The end of the blink that was told last.
+    told_until: Option<TimeNs>,
 }
 
 #[derive(Clone, Copy)]
@@ -172,7 +160,7 @@ impl Blinks {
         let news_ns = if duration_ns == self.duration_ns { 0 } else { duration_ns };
         self.duration_ns = duration_ns;
         match &mut self.current {
-            Some(current) if id == current.id => {
+            Some(current) if id == current.id && !is_restart(current.ends.0, t.0) => {
                 current.ends = t;
                 current.duration_ns = current.duration_ns.max(news_ns);
             }
@@ -183,8 +171,8 @@ impl Blinks {
                 } else if news_ns > 0 {
                     let begins = TimeNs(t.0.saturating_sub(news_ns));
                     // Unless it is the length of the blink that was just told by its number.
-                    if log.blinks.last().is_none_or(|last| last.ends < begins) {
-                        log.blinks.push(Blink { eye: SampleEye::Both, begins, ends: t });
+                    if self.told_until.is_none_or(|ends| !(begins..=t).contains(&ends)) {
+                        self.tell(begins, t, log);
                     }
                 }
             }
@@ -197,6 +185,11 @@ impl Blinks {
         let by_rows = (1..=LONGEST_BLINK_NS).contains(&(ends.0.saturating_sub(begins.0)));
         let (begins, ends) =
             if by_rows { (begins, ends) } else { (TimeNs(begins.0.saturating_sub(duration_ns)), begins) };
-        log.blinks.push(Blink { eye: SampleEye::Both, begins, ends });
+        self.tell(begins, ends, log);
+    }
+
+    fn tell(&mut self, begins: TimeNs, ends: TimeNs, log: &mut LogBuilder) {
+        self.told_until = Some(ends);
+        log.blink(Blink { eye: SampleEye::Both, begins, ends });
     }
 }

@@ -106,7 +106,7 @@ fn read_cloud_blinks(path: &Path, log: &mut LogBuilder) {
     while let Some(line) = lines.next(&mut faults) {
         let [begins, ends] = picker.pick(line.bytes).map(|cell| cell.and_then(|cell| time(cell, 9)));
         match begins.zip(ends) {
-            Some((begins, ends)) if begins <= ends => log.blinks.push(Blink { eye: SampleEye::Both, begins, ends }),
+            Some((begins, ends)) if begins <= ends => log.blink_beside(Blink { eye: SampleEye::Both, begins, ends }),
             _ if line.bytes.is_empty() => {}
             _ => unread += 1,
         }
@@ -295,7 +295,7 @@ fn read_native_blinks(path: &Path, log: &mut LogBuilder) {
         let at = |from: usize| TimeNs(i64::from_le_bytes(std::array::from_fn(|index| record[from + index])));
         let (begins, ends) = (at(4), at(12));
         if begins <= ends {
-            log.blinks.push(Blink { eye: SampleEye::Both, begins, ends });
+            log.blink_beside(Blink { eye: SampleEye::Both, begins, ends });
         } else {
             unread += 1;
         }

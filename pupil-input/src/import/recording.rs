@@ -6,6 +6,7 @@ use holod_calibration::{Sorted, TimeNs};
 
 use super::fault::{LogFault, LogFaults, ReplayError};
 use super::format::LogFormat;
+use super::parts::{Parts, is_restart};
 use crate::size_unit::SizeUnit;
 use crate::{PupilSample, SampleEye};
 
@@ -55,7 +56,9 @@ pub(crate) struct LogBuilder {
     pub(crate) unit: SizeUnit,
     /// The rate that the log's header states.
     pub(crate) stated_rate_hz: Option<f64>,
-    pub(crate) blinks: Vec<Blink>,
+    blinks: Vec<Blink>,
+    /// Blinks of companion files.
+    blinks_beside: Vec<Blink>,
     /// What a user should know of how the log was read, a sentence each.
     pub(crate) notes: Vec<String>,
     /// Lines or rows whose time could be read.
@@ -63,10 +66,15 @@ pub(crate) struct LogBuilder {
     first_backwards: Option<u64>,
     /// The last line, where the file ends within it, and how many malformed ones there were before it.
     unended: Option<(u64, u64)>,
-    /// Of each eye: the cameras of two eyes may run free of each other.
-    latest_ns: [Option<i64>; 3],
+    parts: Parts,
+    /// Of each eye: samples behind a fall of the clock, with their lines, until they are enough to be a part.
+    fallen: [Vec<(LogSample, u64)>; 3],
+    /// Blinks told among those.
+    fallen_blinks: Vec<Blink>,
 }
 
+/// So many samples of an eye in a row are a part of their own; fewer that lie far back are wrong times.
+const PART_SAMPLES: usize = 8;
 /// By how many samples one eye may be behind the other before the whole log is sorted.
 const EYES_OUT_OF_STEP: usize = 64;
 
@@ -80,10 +88,10 @@ impl LogBuilder {
         self.faults.count(fault);
     }
 
-    /// Takes a sample of line (or record) `line`; one that goes back in time against its own eye is counted and
-    /// dropped.
+    /// Takes a sample of line (or record) `line`, at the time that is written there; one that goes back a little against
+    /// its own eye is counted and dropped, and where a clock begins anew its samples are put behind those before.
     pub(crate) fn push(&mut self, sample: LogSample, line: u64) {
-        let LogSample { t, eye, diameter, confidence, aperture_mm, valid } = sample;
+        let LogSample { t, eye, diameter, valid, .. } = sample;
         if t.0.unsigned_abs() > GREATEST_NS {
             return self.count(LogFault::BadNumber);
         }
@@ -92,17 +100,54 @@ impl LogBuilder {
             return self.count(LogFault::NotFinite);
         }
         self.times += 1;
+        if self.parts.follow(t.0, eye).is_some() {
+            self.reject_fallen(eye);
+            return self.place(sample, line);
+        }
+        let fallen = &self.fallen[eye.index()];
+        if fallen.iter().any(|(before, _)| is_restart(before.t.0, t.0)) {
+            self.reject_fallen(eye);
+        }
+        let fallen = &mut self.fallen[eye.index()];
+        fallen.push((sample, line));
+        if fallen.len() == PART_SAMPLES {
+            let fallen = std::mem::take(fallen);
+            let first_ns = fallen.iter().map(|(sample, _)| sample.t.0).min().unwrap_or(t.0);
+            self.parts.enter(first_ns, t.0, fallen[0].1, eye);
+            for blink in std::mem::take(&mut self.fallen_blinks) {
+                self.blink(blink);
+            }
+            fallen.into_iter().for_each(|(sample, line)| self.place(sample, line));
+        }
+    }
+
+    /// What went back and returned was no part.
+    fn reject_fallen(&mut self, eye: SampleEye) {
+        for (_, line) in std::mem::take(&mut self.fallen[eye.index()]) {
+            self.reject_backwards(line);
+        }
+        if self.fallen.iter().all(Vec::is_empty) {
+            self.fallen_blinks.clear();
+        }
+    }
+
+    fn reject_backwards(&mut self, line: u64) {
+        self.first_backwards.get_or_insert(line);
+        self.count(LogFault::Backwards);
+    }
+
+    fn place(&mut self, sample: LogSample, line: u64) {
+        let LogSample { t, eye, diameter, confidence, aperture_mm, valid } = sample;
         if self.rows.len() == MOST_SAMPLES {
             return self.count(LogFault::TooLong);
         }
-        let latest = &mut self.latest_ns[eye.index()];
-        if latest.is_some_and(|latest| t.0 < latest) {
-            self.first_backwards.get_or_insert(line);
-            return self.count(LogFault::Backwards);
-        }
-        *latest = Some(t.0);
+        let t_ns = match self.parts.follow(t.0, eye) {
+            Some(t_ns) if t_ns.unsigned_abs() > GREATEST_NS => return self.count(LogFault::BadNumber),
+            Some(t_ns) if self.parts.advance(t_ns, eye) => t_ns,
+            _ => return self.reject_backwards(line),
+        };
         let aperture_mm = aperture_mm.unwrap_or(f32::NAN);
-        let row = Row { t_ns: t.0, diameter_mm: diameter, confidence, aperture_mm, eye, valid };
+        let row = Row { t_ns, diameter_mm: diameter, confidence, aperture_mm, eye, valid };
         // The eyes come interleaved, a few samples out of step; what lies farther back is left to one sort at the end.
         let recent = self.rows.len().saturating_sub(EYES_OUT_OF_STEP);
         let behind = self.rows[recent..].iter().rev().take_while(|before| before.t_ns > row.t_ns).count();
@@ -118,9 +163,25 @@ impl LogBuilder {
         self.unended = Some((line, self.faults.of(LogFault::Malformed)));
     }
 
-    /// The latest time of any eye.
-    pub(crate) fn latest(&self) -> Option<TimeNs> {
-        self.latest_ns.into_iter().flatten().max().map(TimeNs)
+    /// The log says that a recording begins at `t`, in line `line`: where that lies before the latest time, its clock
+    /// has begun anew.
+    pub(crate) fn recording_begins(&mut self, t: TimeNs, line: u64) {
+        SampleEye::ALL.into_iter().for_each(|eye| self.reject_fallen(eye));
+        self.parts.begins_at(t.0, line);
+    }
+
+    /// Takes a blink that is told among the samples, at the times that are written there.
+    pub(crate) fn blink(&mut self, blink: Blink) {
+        if self.fallen.iter().any(|fallen| !fallen.is_empty()) && self.parts.may_be_later(blink.ends.0) {
+            return self.fallen_blinks.push(blink);
+        }
+        let [begins, ends] = [blink.begins, blink.ends].map(|t| TimeNs(self.parts.in_newest(t.0)));
+        self.blinks.push(Blink { begins, ends, ..blink });
+    }
+
+    /// Takes a blink of a companion file.
+    pub(crate) fn blink_beside(&mut self, blink: Blink) {
+        self.blinks_beside.push(blink);
     }
 
     /// Tells the user something of how the log was read.
@@ -129,6 +190,7 @@ impl LogBuilder {
     }
 
     pub(super) fn finish(mut self, format: LogFormat, path: &Path) -> Result<Recording, ReplayError> {
+        SampleEye::ALL.into_iter().for_each(|eye| self.reject_fallen(eye));
         let backwards = self.faults.of(LogFault::Backwards);
         if backwards * 2 > self.times {
             let line = self.first_backwards.unwrap_or(0);
@@ -165,11 +227,35 @@ impl LogBuilder {
                  export every sample instead (with Gazepoint: `..._all_gaze.csv`)"
             ));
         }
+        self.end_parts();
         self.blinks.sort_by_key(|blink| blink.begins);
         let Self { rows, faults, unit, stated_rate_hz, blinks, notes, .. } = self;
         Ok(Recording { format, unit, rows, blinks, faults, stated_rate_hz, notes })
     }
+
+    fn end_parts(&mut self) {
+        let restarts = self.parts.restarts();
+        let count = restarts.len();
+        if count == 0 {
+            return self.blinks.append(&mut self.blinks_beside);
+        }
+        let lines: Vec<_> = restarts.take(RESTARTS_TOLD).map(|line| line.to_string()).collect();
+        let more = count - lines.len();
+        let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+        self.note(format!(
+            "the clock begins anew in {} {}{more}: each part was put 1 s behind the one before it; to read one \
+             alone, put its lines, below the header if there is one, into a file of their own",
+            if count == 1 { "line" } else { "lines" },
+            lines.join(", ")
+        ));
+        if !self.blinks_beside.is_empty() {
+            self.note("the blinks of the file beside it are left out: it does not say of which part they are");
+        }
+    }
 }
+
+/// Lines in which a clock begins anew that are named.
+const RESTARTS_TOLD: usize = 5;
 
 /// A whole log in memory, in order of time.
 #[derive(Clone, Debug)]
@@ -292,10 +378,7 @@ mod tests {
     }
 
     fn finished(samples: impl IntoIterator<Item = LogSample>) -> Vec<(i64, SampleEye)> {
-        let mut log = LogBuilder::default();
-        samples.into_iter().zip(1..).for_each(|(sample, line)| log.push(sample, line));
-        let recording = log.finish(LogFormat::Lines, Path::new("x")).expect("a recording");
-        recording.samples().map(|sample| (sample.t_sample.0, sample.eye)).collect()
+        read(samples).samples().map(|sample| (sample.t_sample.0, sample.eye)).collect()
     }
 
     #[test]
@@ -313,6 +396,111 @@ mod tests {
         // Samples of one time stay in the order of the log.
         let finished = finished([at(1, SampleEye::Left), at(2, SampleEye::Left), at(1, SampleEye::Right)]);
         assert_eq!(finished, [(1, SampleEye::Left), (1, SampleEye::Right), (2, SampleEye::Left)]);
+    }
+
+    const MS: i64 = 1_000_000;
+
+    /// Samples every 10 ms.
+    fn part(from_ms: i64, count: i64, eye: SampleEye) -> impl Iterator<Item = LogSample> {
+        (0..count).map(move |k| sample((from_ms + 10 * k) * MS, eye))
+    }
+
+    fn read(samples: impl IntoIterator<Item = LogSample>) -> Recording {
+        let mut log = LogBuilder::default();
+        samples.into_iter().zip(1..).for_each(|(sample, line)| log.push(sample, line));
+        log.finish(LogFormat::Lines, Path::new("x")).expect("a recording")
+    }
+
+    fn times_ms(recording: &Recording, eye: SampleEye) -> Vec<i64> {
+        recording.samples().filter(|sample| sample.eye == eye).map(|sample| sample.t_sample.0 / MS).collect()
+    }
+
+    #[test]
+    fn a_clock_that_begins_anew_is_put_behind_with_both_eyes_in_step() {
+        let (left, right) = (SampleEye::Left, SampleEye::Right);
+        let together =
+            |from_ms, count| part(from_ms, count, left).zip(part(from_ms, count, right)).flat_map(|(l, r)| [l, r]);
+        // The second part is shorter, as long, longer than the first.
+        for count in [30, 300, 900] {
+            let recording = read(together(500, 300).chain(together(100, count)));
+            let expected: Vec<_> = (0..300).map(|k| 500 + 10 * k).chain((0..count).map(|k| 4490 + 10 * k)).collect();
+            assert_eq!([left, right].map(|eye| times_ms(&recording, eye)), [expected.clone(), expected]);
+            assert_eq!(recording.faults().total(), 0);
+            let notes = recording.notes();
+            assert!(notes.len() == 1 && notes[0].contains("anew in line 601: "), "{notes:?}");
+        }
+        // An eye that is in no part but the second, and one that is not in the second.
+        let right_alone = read(part(500, 300, left).chain(part(100, 300, left)).chain(part(3090, 9, right)));
+        assert_eq!(times_ms(&right_alone, right)[0], 4490 + 2990);
+        let three = read(
+            part(500, 300, left).chain(part(500, 300, right)).chain(part(100, 300, left)).chain(together(50, 300)),
+        );
+        assert_eq!(
+            [left, right].map(|eye| times_ms(&three, eye).last().copied()),
+            [Some(4490 + 2990 + 1000 + 2990); 2]
+        );
+        assert_eq!(three.faults().total(), 0);
+    }
+
+    #[test]
+    fn eyes_that_are_told_one_after_the_other_have_the_same_parts() {
+        let (left, right) = (SampleEye::Left, SampleEye::Right);
+        let eye = |eye| part(500, 300, eye).chain(part(100, 400, eye));
+        let recording = read(eye(left).chain(eye(right)));
+        assert_eq!(times_ms(&recording, left), times_ms(&recording, right));
+        assert!(recording.notes()[0].contains("in line 301: "), "{:?}", recording.notes());
+        let one = read(part(0, 400, left).chain(part(0, 400, right)));
+        assert_eq!((times_ms(&one, right)[0], one.notes()), (0, &[][..]));
+        // The other eye's first part lasts longer than the gap is: its second one is another.
+        let recording = read(eye(left).chain(part(500, 900, right)).chain(part(100, 400, right)));
+        assert_eq!((times_ms(&recording, right).len(), recording.faults().total()), (1300, 0));
+    }
+
+    #[test]
+    fn samples_that_go_back_and_return_are_no_part() {
+        let eye = SampleEye::Left;
+        let stray = |t_ms: i64| sample(t_ms * MS, eye);
+        for strays in [&[3990][..], &[0], &[2000, 2010], &[1100, 0, 1100, 0, 1100, 0, 1100, 0, 1100, 0]] {
+            let samples = part(0, 400, eye).chain(strays.iter().map(|t| stray(*t - 10))).chain(part(4000, 400, eye));
+            let recording = read(samples);
+            assert_eq!(times_ms(&recording, eye), (0..800).map(|k| 10 * k).collect::<Vec<_>>(), "{strays:?}");
+            assert_eq!((recording.faults().of(LogFault::Backwards), recording.notes().len()), (strays.len() as u64, 0));
+        }
+        // Too few for a part, at the end.
+        let recording = read(part(0, 400, eye).chain(part(0, 7, eye)));
+        assert_eq!((recording.len(), recording.faults().of(LogFault::Backwards)), (400, 7));
+    }
+
+    #[test]
+    fn blinks_go_with_their_part() {
+        let eye = SampleEye::Left;
+        let blink = |begins: i64, ends: i64| Blink { eye, begins: TimeNs(begins * MS), ends: TimeNs(ends * MS) };
+        let mut log = LogBuilder::default();
+        part(0, 400, eye).for_each(|sample| log.push(sample, 1));
+        part(0, 4, eye).for_each(|sample| log.push(sample, 2));
+        // One of the part before, and two of the part that is not sure yet and then is.
+        log.blink(blink(3900, 3990));
+        log.blink(blink(10, 20));
+        part(40, 100, eye).for_each(|sample| log.push(sample, 3));
+        log.blink(blink(500, 600));
+        log.blink_beside(blink(1, 2));
+        let recording = log.finish(LogFormat::Lines, Path::new("x")).expect("a recording");
+        assert_eq!(recording.blinks(), [blink(3900, 3990), blink(5000, 5010), blink(5490, 5590)]);
+        assert!(recording.notes()[0].contains("line 2: ") && recording.notes()[1].contains("left out"));
+    }
+
+    #[test]
+    fn times_as_far_apart_as_a_log_can_hold_do_not_overflow() {
+        let far = GREATEST_NS as i64;
+        let mut log = LogBuilder::default();
+        for part in [far, -far, far, -far] {
+            (0..20).for_each(|k| log.push(sample(part - part.signum() * k, SampleEye::Left), 1));
+            (0..20).for_each(|k| log.push(sample(part - part.signum() * (20 - k), SampleEye::Left), 1));
+            log.recording_begins(TimeNs(-part), 2);
+            log.blink(Blink { eye: SampleEye::Left, begins: TimeNs(i64::MIN), ends: TimeNs(i64::MAX) });
+        }
+        let recording = log.finish(LogFormat::Lines, Path::new("x")).expect("a recording");
+        assert!(recording.samples().all(|sample| sample.t_sample.0.unsigned_abs() <= GREATEST_NS));
     }
 
     #[test]

@@ -6,9 +6,11 @@
 use holod_calibration::TimeNs;
 
 use super::fault::{LogFault, ReplayError};
+use super::first_recording::FirstRecording;
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
+use super::parts::is_restart;
 use super::recording::{Blink, LogBuilder, LogSample};
 use super::text::{Header, Picker, number, time};
 use crate::SampleEye;
@@ -88,22 +90,36 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         }
     });
     let [left_event, right_event] = EYES.map(|eye| header.first_of(&eye.event));
-    let columns = [Some(time_column), header.column("Type"), left.0, left.1, right.0, right.1, left_event, right_event];
+    let columns = [
+        Some(time_column),
+        header.column("Type"),
+        header.column("Participant"),
+        left.0,
+        left.1,
+        right.0,
+        right.1,
+        left_event,
+        right_event,
+    ];
     let picker = Picker::new(header.separator, columns);
     let has_type = header.has("Type");
 
     let mut blinks = [Shut::default(), Shut::default()];
+    let mut first = FirstRecording::new(["participant"]);
     let mut rows = 0_u64;
     while let Some(line) = lines.next(log) {
         if line.bytes.is_empty() || line.bytes[0] == b'#' {
             continue;
         }
-        let [t, kind, left_size, left_height, right_size, right_height, left_event, right_event] =
+        let [t, kind, participant, left_size, left_height, right_size, right_height, left_event, right_event] =
             picker.pick(line.bytes);
         if has_type && kind.is_some_and(|kind| kind != b"SMP") {
             continue;
         }
         rows += 1;
+        if participant.is_some_and(|participant| !first.has([participant])) {
+            continue;
+        }
         let Some(t) = t else {
             log.count(LogFault::Malformed);
             continue;
@@ -138,6 +154,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     for (shut, names) in blinks.iter_mut().zip(&EYES) {
         shut.end(names.eye, log);
     }
+    first.note(log);
     if let Some(stated) = stated_samples.filter(|stated| (rows as f64) < *stated) {
         log.note(format!(
             "the header promises {stated} samples and there are {rows}: the file is cut off; copy it again"
@@ -179,8 +196,11 @@ struct Shut {
 
 impl Shut {
     fn note(&mut self, t: TimeNs, blinks: bool, eye: SampleEye, log: &mut LogBuilder) {
+        if !blinks || self.run.is_some_and(|(_, ends)| is_restart(ends.0, t.0)) {
+            self.end(eye, log);
+        }
         if !blinks {
-            return self.end(eye, log);
+            return;
         }
         let begins = self.run.map_or(t, |(begins, _)| begins);
         self.run = Some((begins, t.max(begins)));
@@ -188,7 +208,7 @@ impl Shut {
 
     fn end(&mut self, eye: SampleEye, log: &mut LogBuilder) {
         if let Some((begins, ends)) = self.run.take() {
-            log.blinks.push(Blink { eye, begins, ends });
+            log.blink(Blink { eye, begins, ends });
         }
     }
 }

@@ -8,6 +8,7 @@
 use holod_calibration::TimeNs;
 
 use super::fault::{LogFault, ReplayError};
+use super::first_recording::FirstRecording;
 use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
@@ -151,20 +152,15 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         }
     };
 
-    let mut first: Option<[Vec<u8>; 2]> = None;
-    let (mut of_others, mut unmeasured) = (0_u64, 0_u64);
+    let mut first = FirstRecording::new(["recording", "participant"]);
+    let mut unmeasured = 0_u64;
     while let Some(row) = table.next_row(log) {
         if !columns.is_of_eyes(&row) {
             continue;
         }
         let recording = columns.recording.map(|column| column.and_then(|column| row.cell(column).ok()).unwrap_or(b""));
-        match &first {
-            None => first = Some(recording.map(<[u8]>::to_vec)),
-            Some(first) if first.iter().zip(recording).any(|(first, this)| first != this) => {
-                of_others += 1;
-                continue;
-            }
-            Some(_) => {}
+        if !first.has(recording) {
+            continue;
         }
         let t = match row.cell(columns.time).and_then(|cell| time_ns(cell, ns_per_unit)) {
             Ok(t) => TimeNs(t),
@@ -192,13 +188,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
             "{unmeasured} times an eye is valid and has no diameter: some trackers measure pupils at a lower rate than gaze"
         ));
     }
-    if let Some(first) = first.filter(|_| of_others > 0) {
-        let [recording, participant] = first.map(|name| String::from_utf8_lossy(&name).escape_debug().to_string());
-        log.note(format!(
-            "the file holds several recordings; only the first was read (recording `{recording}`, participant \
-             `{participant}`), and {of_others} rows of others were left out"
-        ));
-    }
+    first.note(log);
     Ok(())
 }
 

@@ -113,6 +113,28 @@ fn each_bad_cell_is_counted_by_its_reason() {
 }
 
 #[test]
+fn lost_pupils_of_a_recording_in_lines_are_lost() {
+    let mut text = String::new();
+    for sequence in 0..300 {
+        // Lost; a diameter without confidence is unsure, and so is none with some.
+        let (diameter_mm, confidence) = match sequence {
+            100..120 => (0.0, 0.0),
+            200..205 => (3.0, 0.0),
+            205..210 => (0.0, 0.1),
+            _ => (4.0, 1.0),
+        };
+        let (device_us, eye) = (5_000 * sequence as i64, SampleEye::Left);
+        encode_line(&LineSample { sequence, device_us, eye, diameter_mm, confidence }, &mut text);
+    }
+    let dir = TempDir::new().expect("a folder");
+    let (recording, info) = info(&written(&dir, "log", text));
+    let eye = &info.eyes[0];
+    assert_eq!((eye.valid, eye.lost, eye.lost_runs, eye.unsure), (280, 20, 1, 10));
+    assert_eq!((eye.blinks_found, eye.diameter.map(|range| range.least)), (Some(2), Some(4.0)));
+    assert!(recording.samples().all(|sample| sample.valid == (sample.diameter_mm > 0.0 || sample.confidence > 0.0)));
+}
+
+#[test]
 fn bad_lines_of_a_recording_are_counted_and_skipped() {
     let mut text = as_lines(&neon_like()[..50]);
     let nan = "P1,99,1,L,NaN,1";
@@ -152,6 +174,14 @@ fn a_log_as_a_whole_is_refused_with_its_reason() {
     (0..100).rev().for_each(|k| writeln!(unsorted, "{k},3.5").expect("a String takes all"));
     let error = refused(&written(&dir, "unsorted", unsorted));
     assert!(matches!(error, ReplayError::Unsorted { backwards: 99, rows: 100, line: 3, .. }), "{error}");
+    // Shuffled over 100 s, so that most times fall far.
+    let mut shuffled = String::from("timestamp [ns],pupil diameter left [mm]\n");
+    for k in 0..10_000_i64 {
+        writeln!(shuffled, "{},3.5", k * 7919 % 10_000 * 10_000_000).expect("a String takes all");
+    }
+    let error = refused(&written(&dir, "shuffled", shuffled));
+    assert!(matches!(error, ReplayError::Unsorted { line: 4, .. }), "{error}");
+    assert!(error.to_string().contains("each recording into a file of its own"), "{error}");
 }
 
 #[test]
@@ -283,7 +313,7 @@ fn eyelink_blocks_keep_their_gap_and_a_clock_that_begins_anew_is_put_behind() {
     assert_eq!((info.eyes[0].gaps, info.blinks.told, recording.faults().total()), (2, 3, 0));
     assert_eq!(recording.blinks()[2].begins, TimeNs(10_198_000_000));
     let notes = info.notes.join("\n");
-    assert!(notes.contains("3 blocks") && notes.contains("anew at 1 blocks"), "{notes}");
+    assert!(notes.contains("3 blocks") && notes.contains("anew in line 213: "), "{notes}");
 }
 
 #[test]
@@ -347,6 +377,109 @@ fn smi_in_pixels_gives_the_disc_of_the_ellipse_and_counts_bad_rows() {
     let faults: Vec<_> = info.faults.iter().map(|fault| (fault.name, fault.count)).collect();
     let expected = [("log_malformed", 1), ("log_bad_number", 2), ("log_not_finite", 1), ("log_negative", 1)];
     assert_eq!(faults, expected);
+}
+
+/// BeGaze's raw data of two participants at 60 Hz: P01 for 20 s of 3 mm, P02 for 35 s of 5 mm.
+fn smi_of_two(participants: [&str; 2]) -> String {
+    let mut text =
+        String::from("RecordingTime [ms]\tTrial\tStimulus\tParticipant\tPupil Diameter Left [mm]\tCategory Left\n");
+    for (participant, (seconds, mm)) in participants.into_iter().zip([(20, "3.0"), (35, "5.0")]) {
+        for k in 0..60 * seconds {
+            let t_ms = 1000.0 + f64::from(k) * 1000.0 / 60.0;
+            let (stimulus, blinks) = (k / 300, k + 30 >= 60 * seconds || k < 30);
+            let category = if blinks { "Blink" } else { "Fixation" };
+            writeln!(text, "{t_ms:.3}\tTrial001\t{stimulus}.jpg\t{participant}\t{mm}\t{category}")
+                .expect("a String takes all");
+        }
+    }
+    text
+}
+
+#[test]
+fn smi_of_two_participants_is_read_as_the_first_alone() {
+    let dir = TempDir::new().expect("a folder");
+    let (recording, info) = info(&written(&dir, "log", smi_of_two(["P01", "P02"])));
+    assert_eq!((recording.len(), recording.faults().total()), (1200, 0));
+    assert!(recording.samples().all(|sample| sample.diameter_mm == 3.0));
+    let notes = info.notes.join("\n");
+    assert!(notes.contains("participant `P01`") && notes.contains("2100 rows of others"), "{notes}");
+    assert!(notes.contains("export each into a file of its own"), "{notes}");
+}
+
+#[test]
+fn smi_that_does_not_name_its_participants_has_a_gap_between_them() {
+    let dir = TempDir::new().expect("a folder");
+    let (recording, info) = info(&written(&dir, "log", smi_of_two([""; 2])));
+    assert_eq!((recording.len(), recording.faults().total(), info.eyes[0].gaps), (3300, 0, 1));
+    let samples: Vec<_> = recording.samples().collect();
+    assert!(samples[..1200].iter().all(|sample| sample.diameter_mm == 3.0));
+    assert!(samples[1200..].iter().all(|sample| sample.diameter_mm == 5.0));
+    assert_eq!(samples[1200].t_sample - samples[1199].t_sample, TimeNs(1_000_000_000));
+    assert!(info.notes[0].contains("anew in line 1202: "), "{:?}", info.notes);
+    // The blinks before and behind the gap are two.
+    let ends: Vec<_> = recording.blinks().iter().map(|blink| (blink.begins, blink.ends)).collect();
+    let at = |index: usize| samples[index].t_sample;
+    assert_eq!(ends, [(at(0), at(29)), (at(1170), at(1199)), (at(1200), at(1229)), (at(3270), at(3299))]);
+}
+
+/// Lines of 60 Hz: the times of a counter of `bits` bits of microseconds from `from_us` on.
+fn counted(from_us: u64, seconds: u64, diameter_mm: f32, bits: u32) -> String {
+    let mut text = String::new();
+    for sequence in 0..60 * seconds {
+        for (eye, later_us) in [(SampleEye::Left, 0), (SampleEye::Right, 5_000)] {
+            // The right eye is two samples behind.
+            let late_us = if eye == SampleEye::Right { 2 * 16_667 } else { 0 };
+            let t_us = from_us + sequence * 16_667 + later_us - late_us;
+            let device_us = (t_us % (1 << bits)) as i64;
+            encode_line(&LineSample { sequence, device_us, eye, diameter_mm, confidence: 1.0 }, &mut text);
+        }
+    }
+    text
+}
+
+#[test]
+fn lines_go_on_over_the_wrap_of_a_32_bit_counter() {
+    let dir = TempDir::new().expect("a folder");
+    let wrap_us = 1 << 32;
+    // The wrap behind the middle, before it, and twice.
+    for (before_s, seconds) in [(35, 40), (5, 40), (1, 3)] {
+        let from_us = wrap_us - before_s * 1_000_000;
+        let path = |bits| written(&dir, &format!("{bits}"), counted(from_us, seconds, 4.0, bits));
+        let [(wrapped, of_wrapped), (plain, _)] = [32, 40].map(|bits| info(&path(bits)));
+        assert_eq!((wrapped.faults().total(), of_wrapped.eyes[0].gaps), (0, 0));
+        let times = |log: &Recording| log.samples().map(|sample| (sample.eye, sample.t_sample)).collect::<Vec<_>>();
+        assert_eq!(times(&wrapped), times(&plain));
+        assert!(plain.notes().is_empty());
+        let notes = wrapped.notes();
+        assert!(notes.len() == 1 && notes[0].contains("32 bits") && notes[0].contains("over its wrap"), "{notes:?}");
+    }
+    // Not after a pause of more than 10 s, nor of a clock that has come further.
+    for (from_us, to_us) in
+        [(wrap_us - 26_000_000, 100_000), (wrap_us - 10_000_000, 11_000_000), (2 * wrap_us, 100_000)]
+    {
+        let text = counted(from_us, 15, 3.0, 40) + &counted(to_us, 15, 5.0, 40);
+        let (recording, info) = info(&written(&dir, "log", text));
+        assert_eq!((recording.faults().total(), info.eyes[0].gaps), (0, 1));
+        assert!(info.notes[0].contains("the clock begins anew in line 1801: "), "{:?}", info.notes);
+    }
+}
+
+#[test]
+fn lines_of_a_second_session_are_put_behind_the_first() {
+    let dir = TempDir::new().expect("a folder");
+    for (first_s, second_s) in [(20, 35), (35, 20), (5, 60)] {
+        let text = counted(2_000_000, first_s, 3.0, 40) + &counted(1_000_000, second_s, 5.0, 40);
+        let (recording, info) = info(&written(&dir, "log", text));
+        assert_eq!((recording.len() as u64, recording.faults().total()), (120 * (first_s + second_s), 0));
+        let samples: Vec<_> = recording.samples().collect();
+        let second = samples.iter().position(|sample| sample.diameter_mm == 5.0).expect("a second session");
+        assert_eq!(second as u64, 120 * first_s);
+        assert!(samples[second..].iter().all(|sample| sample.diameter_mm == 5.0));
+        assert!((samples[second].t_sample - samples[second - 1].t_sample).0 > 900_000_000);
+        assert!(info.eyes.iter().all(|eye| eye.gaps == 1), "{info:?}");
+        let line = format!("anew in line {}: ", 120 * first_s + 1);
+        assert!(info.notes[0].contains(&line) && info.notes[0].contains("a file of their own"), "{:?}", info.notes);
+    }
 }
 
 #[test]

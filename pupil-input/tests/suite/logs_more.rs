@@ -115,6 +115,25 @@ fn tobii_pro_lab_reads_in_each_of_its_dialects() {
 }
 
 #[test]
+fn tobii_recordings_without_names_are_put_behind_each_other() {
+    let mut text = String::from("Recording timestamp [ms]\tSensor\tPupil diameter left [mm]\tValidity left\n");
+    for (rows, mm) in [(600, "3.0"), (900, "5.0"), (100, "4.0")] {
+        for row in 0..rows {
+            writeln!(text, "{}\tEye Tracker\t{mm}\tValid", 100 + 16 * row).expect("a String takes all");
+        }
+    }
+    let left = of_eye(&read(&text), Left);
+    assert_eq!(left.len(), 1600);
+    assert!(left.windows(2).all(|pair| pair[0].0 < pair[1].0));
+    let changes: Vec<_> = (1..1600)
+        .filter(|row| left[*row].1 != left[row - 1].1)
+        .map(|row| (row, left[row].0 - left[row - 1].0))
+        .collect();
+    assert_eq!(changes, [(600, 1000 * MS), (1500, 1000 * MS)]);
+    assert!(noted(&read(&text), "begins anew in lines 602, 1502: "), "{:?}", read(&text).notes());
+}
+
+#[test]
 fn tobii_studio_reads_with_its_names_and_validity_codes() {
     let header = "ParticipantName\tMediaName\tRecordingTimestamp\tGazePointIndex\tPupilLeft\tPupilRight\tValidityLeft\tValidityRight\t\n";
     let rows = "P03\t\t3\t1\t2,80\t2,62\t0\t0\t\nP03\t\t19\t2\t2,81\t-1,00\t1\t4\t\nP03\t\t36\t3\t2,82\t2,6\t2\t3\t\n\
@@ -234,6 +253,32 @@ fn gazepoint_without_millimetres_or_ticks_reads_what_there_is() {
     let recording = read(standing);
     assert_eq!(of_eye(&recording, Right)[1].0, 16_670_000);
     assert_eq!(recording.faults().of(LogFault::Backwards), 58);
+}
+
+#[test]
+fn gazepoint_media_whose_time_starts_again_are_put_behind_with_their_blinks() {
+    let mut text = String::from("MEDIA_ID,CNT,TIME,BKID,BKDUR,LPMM,LPMMV\n");
+    for media in 0..7 {
+        for row in 0..300_i64 {
+            // Each medium ends in a blink that goes on in the next one, and has one soon after its beginning.
+            let id = match row {
+                0..3 if media > 0 => media,
+                5..8 => 100 + media,
+                290.. => media + 1,
+                _ => 0,
+            };
+            writeln!(text, "{media},{row},{:.2},{id},0,3.1,1", row as f64 * 0.01).expect("a String takes all");
+        }
+    }
+    let recording = read(text);
+    let left = of_eye(&recording, Left);
+    assert_eq!((left.len(), left[300].0, left[2099].0), (2100, 3990 * MS, (6 * 3990 + 2990) * MS));
+    assert_eq!(recording.faults().total(), 0);
+    assert!(noted(&recording, "in lines 302, 602, 902, 1202, 1502 and 1 more: "), "{:?}", recording.notes());
+    let within: Vec<_> = recording.blinks().iter().map(|blink| blink.ends.0 - blink.begins.0).collect();
+    assert_eq!(within.len(), 7 * 3 - 1);
+    assert!(within.iter().all(|lasts| [20 * MS, 90 * MS].contains(lasts)), "{:?}", recording.blinks());
+    assert_eq!(recording.blinks()[3].begins, TimeNs((3990 + 50) * MS));
 }
 
 #[test]
@@ -413,6 +458,51 @@ fn bids_reads_what_its_sidecar_says() {
         samples(&recording)[..2],
         [(1_700_000_000_000_000_001, Left, Some(3.5)), (1_700_000_000_000_000_001, Right, Some(3.6))]
     );
+}
+
+#[test]
+fn bids_areas_are_told_from_diameters_by_unit_then_name_then_description() {
+    let (area, noted_area, diameter, noted_diameter) = ((true, false), (true, true), (false, false), (false, true));
+    let cases = [
+        ("pupil_size", "mm", "Pupil diameter", diameter),
+        ("pupil_size", "mm", "Diameter of the ellipse fitted to the dark area", diameter),
+        ("pupil_size", "mm", "", diameter),
+        ("pupil_size", "mm", "Pupil area", noted_diameter),
+        ("pupil_size", "mm^2", "", area),
+        ("pupil_size", "mm2", "", area),
+        ("pupil_size", "mm \u{b2}", "Pupil size", area),
+        ("pupil_size", "mm**2", "Diameter", area),
+        ("pupil_area", "mm2", "", area),
+        ("pupil_area", "mm", "", noted_area),
+        ("pupil_area", "pixels", "", area),
+        ("pupil_size", "px2", "", area),
+        ("pupil_size", "pixels", "Pupil area", area),
+        ("pupil_size", "pixels", "Pupil diameter", diameter),
+        ("pupil_size", "pixels", "", noted_diameter),
+        ("pupil_area", "arbitrary", "The diameter's square", area),
+        ("pupil_diameter", "arbitrary", "of the dark area", diameter),
+        ("pupil_size", "arbitrary", "Pupil area as calculated by the eye-tracker", area),
+        ("pupil_size", "arbitrary", "Pupil diameter", diameter),
+        ("pupil_size", "arbitrary", "Area or diameter, depending on the setting", noted_diameter),
+        ("pupil_size", "arbitrary", "", noted_diameter),
+        ("pupil_size", "a.u.2", "", noted_diameter),
+    ];
+    for (column, unit, description, expected) in cases {
+        let sidecar = format!(
+            r#"{{"Columns": ["timestamp", "{column}"], "SamplingFrequency": 500, "RecordedEye": "left",
+                "timestamp": {{"Units": "ms"}}, "{column}": {{"Units": "{unit}", "Description": "{description}"}}}}"#
+        );
+        let recording = bids(&[("x_physio.tsv", b"0\t9.62\n2\t9.62\n"), ("x_physio.json", sidecar.as_bytes())]);
+        let recording = recording.expect("reads");
+        let read = recording.samples().next().expect("a sample").diameter_mm;
+        let is_area = (read - 3.5).abs() < 0.001;
+        assert!(is_area || read == 9.62, "{column}, {unit}, {description}: {read}");
+        let found = (is_area, noted(&recording, "x_physio.json: `pupil_"));
+        assert_eq!(found, expected, "{column}, {unit}, {description}: {:?}", recording.notes());
+        assert_eq!(noted(&recording, "areas were made diameters"), is_area);
+        let of_mm = unit.starts_with("mm");
+        assert_eq!(recording.unit() == SizeUnit::Millimetres, of_mm, "{unit}: {:?}", recording.unit());
+    }
 }
 
 #[test]
