@@ -75,7 +75,7 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
             sequence_fits(scene.frames() as u64, frame.resolution, available_bytes())
                 .map_err(|why| Failure::new(Exit::Data, format!("{spec}: {why}")))?;
         }
-        warn_of_oddities(spec, &frame, &report, geometry, false);
+        warn_of_oddities(spec, &report, geometry, false);
         loaded.frames.push(Arc::new(frame));
         loaded.reports.push(report);
     }
@@ -106,42 +106,40 @@ fn sequence_fits(frames: u64, resolution: Resolution, available_bytes: Option<u6
     ))
 }
 
-/// What is most often a mistake in a picture called `name`.
+/// Warns of what is most often a mistake in a picture called `name`.
 /// `is_plane`: one depth for all of it is meant.
-pub fn warn_of_oddities(
-    name: &str,
-    frame: &RgbdFrame,
-    report: &FrameReport,
-    geometry: &DisplayGeometry,
-    is_plane: bool,
-) {
-    warn_of_odd_depth(name, frame, report, geometry, is_plane);
-    warn_of_clipped_colours(name, report.colour_clipped_px, frame.resolution.pixels());
+pub fn warn_of_oddities(name: &str, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) {
+    let Some(source) = report.source else { return };
+    if let Some(oddity) = odd_depth(source, report, geometry, is_plane) {
+        tracing::warn!("{name}: {oddity}");
+    }
+    warn_of_clipped_colours(name, report.colour_clipped_px, source.pixels());
 }
 
-/// Depth that is nearly all clamped, or all one, is most often a wrong encoding.
-fn warn_of_odd_depth(name: &str, frame: &RgbdFrame, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) {
-    let pixels = frame.resolution.pixels();
+/// Warns of colours of which most are brighter than white: most often scene-linear light that was never exposed.
+/// Both counts are of the picture as it came, before it was fitted.
+pub fn warn_of_clipped_colours(name: &str, clipped_px: usize, source_px: usize) {
+    if 2 * clipped_px > source_px {
+        tracing::warn!(
+            "{name}: {clipped_px} of {source_px} pixels are brighter than white and were clipped: scale the picture's \
+             light so that white is 1"
+        );
+    }
+}
+
+/// Depth of which most is clamped, or that is all one, is most often a wrong encoding.
+fn odd_depth(source: Resolution, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) -> Option<String> {
+    let pixels = source.pixels();
     let clamped = report.depth_clamped_far_px + report.depth_clamped_near_px;
-    let ends = frame.depth_normalised.iter().fold((f32::MAX, f32::MIN), |(a, b), &d| (a.min(d), b.max(d)));
-    let spread_dpt = geometry.depth_at(f64::from(ends.1)).0 - geometry.depth_at(f64::from(ends.0)).0;
     if 2 * clamped > pixels {
-        tracing::warn!(
-            "{name}: {clamped} of {pixels} pixels lie outside the display's depth range: is the depth encoding right?"
-        );
-    } else if spread_dpt < 0.05 && pixels > 1 && !is_plane {
-        tracing::warn!("{name}: all depths lie within {spread_dpt:.3} dpt: is the depth encoding right?");
+        return Some(format!(
+            "{clamped} of {pixels} pixels lie outside the display's depth range: is the depth encoding right?"
+        ));
     }
-}
-
-/// Colours that are nearly all brighter than white are most often scene-linear light that was never exposed.
-pub fn warn_of_clipped_colours(name: &str, clipped_px: usize, pixels: usize) {
-    if 2 * clipped_px > pixels {
-        tracing::warn!(
-            "{name}: {clipped_px} of {pixels} pixels are brighter than white and were clipped: scale the picture's light \
-             so that white is 1"
-        );
-    }
+    let [far_dpt, near_dpt] = report.depth_range.map(|depth| geometry.depth_at(f64::from(depth)).0);
+    let spread_dpt = near_dpt - far_dpt;
+    (spread_dpt < 0.05 && pixels > 1 && !is_plane)
+        .then(|| format!("all depths lie within {spread_dpt:.3} dpt: is the depth encoding right?"))
 }
 
 fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
@@ -193,7 +191,51 @@ pub fn failure(error: SceneError) -> Failure {
 
 #[cfg(test)]
 mod tests {
+    use holod_model::scene::Fit;
+
     use super::*;
+
+    /// What is odd about the depth of a picture of 64x48 whose pixels number `index` have `depth_mm`, at each size.
+    fn odd_at_every_size(depth_mm: impl Fn(u32) -> u16) -> Vec<Option<String>> {
+        const SIZE: Resolution = Resolution { width: 64, height: 48 };
+        const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
+        let folder = tempfile::tempdir().unwrap();
+        let [colour, depth] = ["colour.png", "depth.png"].map(|name| folder.path().join(name));
+        image::RgbImage::new(64, 48).save(&colour).unwrap();
+        let at = |x, y| image::Luma([depth_mm(y * 64 + x)]);
+        image::ImageBuffer::from_fn(64, 48, at).save(&depth).unwrap();
+        let spec = format!("{},{}", colour.display(), depth.display());
+        let scene = Scene::open(&spec, Some(DepthEncoding::Millimetres)).unwrap();
+        let sizes = [(SIZE, Fit::Native), (SIZE, Fit::Contain)].into_iter().chain(
+            [(96, 72), (19, 14), (96, 48), (20, 60)]
+                .into_iter()
+                .flat_map(|(width, height)| [Fit::Contain, Fit::Cover, Fit::Crop].map(|fit| (width, height, fit)))
+                .map(|(width, height, fit)| (Resolution { width, height }, fit)),
+        );
+        sizes
+            .map(|(size, fit)| scene.load(0, &BENCH, Some(size), fit).unwrap().1)
+            .map(|report| odd_depth(report.source.unwrap(), &report, &BENCH, false))
+            .collect()
+    }
+
+    #[test]
+    fn a_wrong_encoding_is_told_whatever_the_picture_is_fitted_to() {
+        let too_near = odd_at_every_size(|_| 2);
+        let told = "3072 of 3072 pixels lie outside the display's depth range: is the depth encoding right?";
+        assert_eq!(too_near, vec![Some(told.to_owned()); 14]);
+        let told = "1920 of 3072 pixels lie outside the display's depth range: is the depth encoding right?";
+        let most_too_near = odd_at_every_size(|index| if index < 1920 { 2 } else { 1000 });
+        assert_eq!(most_too_near, vec![Some(told.to_owned()); 14]);
+        let one_depth = odd_at_every_size(|_| 1000);
+        let told = "all depths lie within 0.000 dpt: is the depth encoding right?";
+        assert_eq!(one_depth, vec![Some(told.to_owned()); 14]);
+    }
+
+    #[test]
+    fn a_picture_with_a_few_depths_that_are_too_near_is_not_doubted() {
+        let some_too_near = odd_at_every_size(|index| if index % 25 < 3 { 2 } else { 1000 + index as u16 });
+        assert_eq!(some_too_near, vec![None; 14]);
+    }
 
     #[test]
     fn a_sequence_that_memory_has_no_room_for_is_refused_in_figures() {

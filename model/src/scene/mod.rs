@@ -76,11 +76,13 @@ pub struct FrameReport {
     pub source: Option<Resolution>,
     /// Pixels without a valid depth, which were filled from their surroundings.
     pub depth_missing_px: usize,
-    /// Pixels farther than the display shows, set to its far end.
+    /// Pixels of the source farther than the display shows, set to its far end.
     pub depth_clamped_far_px: usize,
-    /// Pixels nearer than the display shows, set to its near end.
+    /// Pixels of the source nearer than the display shows, set to its near end.
     pub depth_clamped_near_px: usize,
-    /// Colour values above white or not finite, which were clipped.
+    /// The least and the greatest normalised depth of the source's pixels.
+    pub depth_range: [f32; 2],
+    /// Pixels of the source with colours above white or not finite, which were clipped.
     pub colour_clipped_px: usize,
     /// Pixels of the frame that the picture does not reach: black, at the far end.
     pub padded_px: usize,
@@ -276,15 +278,24 @@ fn normalised(depth_dpt: &[f32], geometry: &DisplayGeometry, report: &mut FrameR
     clamped(depth_dpt.iter().map(normalise), report)
 }
 
-/// Normalised depths clamped to the display's range; counts those that were outside.
+/// Normalised depths clamped to the display's range; counts those that were outside, and notes how far they reach.
 fn clamped(depths: impl Iterator<Item = f32>, report: &mut FrameReport) -> Vec<f32> {
+    let mut depths: Vec<f32> = depths.collect();
+    clamp(&mut depths, report);
     depths
-        .map(|depth| {
-            report.depth_clamped_far_px += usize::from(depth < -ROUNDING);
-            report.depth_clamped_near_px += usize::from(depth > 1.0 + ROUNDING);
-            depth.clamp(0.0, 1.0)
-        })
-        .collect()
+}
+
+/// [`clamped`] in place.
+fn clamp(depths: &mut [f32], report: &mut FrameReport) {
+    let [mut least, mut greatest] = [f32::MAX, f32::MIN];
+    for depth in depths {
+        report.depth_clamped_far_px += usize::from(*depth < -ROUNDING);
+        report.depth_clamped_near_px += usize::from(*depth > 1.0 + ROUNDING);
+        *depth = depth.clamp(0.0, 1.0);
+        least = least.min(*depth);
+        greatest = greatest.max(*depth);
+    }
+    report.depth_range = [least, greatest];
 }
 
 impl DepthEncoding {

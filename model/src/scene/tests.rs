@@ -101,7 +101,12 @@ fn a_pair_of_pngs_becomes_amplitude_and_normalised_depth() {
     for (actual, expected) in frame.depth_normalised.iter().zip([1.0, 0.5, 0.5]) {
         assert!((actual - expected).abs() < 1e-5, "{actual} for {expected}");
     }
-    let expected = FrameReport { source: Some(size(3, 1)), depth_missing_px: 1, ..FrameReport::default() };
+    let expected = FrameReport {
+        source: Some(size(3, 1)),
+        depth_missing_px: 1,
+        depth_range: [frame.depth_normalised[1], frame.depth_normalised[0]],
+        ..FrameReport::default()
+    };
     assert_eq!(report, expected);
 
     let pair = format!("{},{}", files.path("c.png").display(), files.path("d.png").display());
