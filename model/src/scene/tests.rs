@@ -83,6 +83,22 @@ impl Files {
     }
 }
 
+/// An OpenEXR file of two pixels, each part of which has its channels with one value each.
+fn write_parts(path: &Path, parts: &[(&str, &[(&str, f32)])]) {
+    let layers = parts.iter().map(|(part, channels)| {
+        let channel = |&(name, value): &(&str, f32)| AnyChannel::new(name, FlatSamples::F32(vec![value; 2]));
+        Layer::new(
+            Vec2(2, 1),
+            LayerAttributes::named(Text::from(*part)),
+            Encoding::UNCOMPRESSED,
+            AnyChannels::sort(channels.iter().map(channel).collect()),
+        )
+    });
+    let window = IntegerBounds { position: Vec2(0, 0), size: Vec2(2, 1) };
+    let image = Image::from_layers(ImageAttributes::new(window), layers.collect::<Vec<_>>());
+    image.write().to_file(path).unwrap();
+}
+
 const MILLIMETRES: &str = "colour = \"c.png\"\ndepth = \"d.png\"\ndepth_encoding = \"millimetres\"\n";
 
 #[test]
@@ -197,6 +213,89 @@ fn an_exr_with_a_small_data_window_fills_the_display_window() {
 
     files.describe("colour = \"both.exr\"\ndepth_encoding = \"metres\"");
     assert_eq!(files.open().load(0, &BENCH, None, Fit::Native).unwrap().0, frame);
+}
+
+#[test]
+fn an_exrs_colours_are_those_of_one_layer_and_its_depth_is_no_vector() {
+    let files = Files::new();
+    let path = files.path("layers.exr");
+    let colours = || raster::read_colour(&path).map(|colour| [0, 2, 4].map(|plane| colour.linear[plane]));
+    let depth = || raster::read_depth(&path).map(|depth| depth.numbers.values[0]);
+    let rgb = |layer: &str, red: f32| {
+        [("R", red), ("G", red + 0.01), ("B", red + 0.02)].map(|(name, value)| (format!("{layer}{name}"), value))
+    };
+    let xyz = |layer: &str| ["X", "Y", "Z"].map(|name| (format!("{layer}{name}"), 9.0));
+    let one = |name: &str, value: f32| [(name.to_owned(), value)];
+    let write = |parts: &[(&str, Vec<(String, f32)>)]| {
+        let borrowed: Vec<(&str, Vec<(&str, f32)>)> = parts
+            .iter()
+            .map(|(part, channels)| (*part, channels.iter().map(|(name, value)| (name.as_str(), *value)).collect()))
+            .collect();
+        write_parts(&path, &borrowed.iter().map(|(part, channels)| (*part, &channels[..])).collect::<Vec<_>>());
+    };
+    let shown = [0.5, 0.51, 0.52];
+    let blender = [
+        &rgb("ViewLayer.AO.", 0.1)[..],
+        &rgb("ViewLayer.Combined.", 0.5),
+        &xyz("ViewLayer.Denoising Normal."),
+        &one("ViewLayer.Depth.Z", 3.0),
+        &one("ViewLayer.Mist.Z", 0.7),
+    ]
+    .concat();
+    for (what, parts) in [
+        ("Blender's passes", vec![("", blender.clone())]),
+        (
+            "no layer before layers",
+            vec![("main", [&rgb("", 0.5)[..], &one("Z", 3.0), &rgb("Combined.", 0.1), &one("Depth.Z", 1.0)].concat())],
+        ),
+        ("small letters", vec![("", [&rgb("beauty.", 0.5)[..], &one("depth.z", 3.0), &xyz("n.")].concat())]),
+        ("a depth layer's only channel", vec![("", [&rgb("", 0.5)[..], &one("a.Depth.V", 3.0), &xyz("N.")].concat())]),
+        ("a channel called depth", vec![("", [&rgb("", 0.5)[..], &one("depth", 3.0), &xyz("P.")].concat())]),
+        ("parts", vec![("rgba", rgb("", 0.5).to_vec()), ("normals", xyz("").to_vec()), ("z", one("Z", 3.0).to_vec())]),
+        (
+            "parts with a layer each",
+            vec![
+                ("a", [&rgb("AO.", 0.1)[..], &rgb("Combined.", 0.5)].concat()),
+                ("b", [&one("Depth.Z", 3.0)[..], &one("Mist.Z", 1.0)].concat()),
+            ],
+        ),
+    ] {
+        write(&parts);
+        assert_eq!((colours().unwrap(), depth().unwrap()), (shown, 3.0), "{what}");
+    }
+    write(&[("", [&one("Y", 0.5)[..], &xyz("normal.")].concat())]);
+    assert_eq!((colours().unwrap(), depth().unwrap()), ([0.5; 3], 0.5), "luminance alone");
+
+    let two = [
+        &rgb("left.Combined.", 0.5)[..],
+        &rgb("right.Combined.", 0.5),
+        &one("left.Depth.Z", 3.0),
+        &one("right.Depth.Z", 3.0),
+    ]
+    .concat();
+    let others = [&rgb("AO.", 0.5)[..], &rgb("Emit.", 0.5), &xyz("Normal."), &one("Mist.Z", 0.5)].concat();
+    let parts = |part| (part, [&rgb("", 0.5)[..], &one("Z", 3.0)].concat());
+    let apart = vec![("", [&one("a.R", 0.5)[..], &one("b.G", 0.5), &one("c.B", 0.5)].concat())];
+    for (parts, of_colours, of_depth) in [
+        (
+            vec![("", two)],
+            &["colours more than once: left.Combined, right.Combined;", "export only one"][..],
+            &["depth more than once: left.Depth.Z, right.Depth.Z;", "export only one"][..],
+        ),
+        (
+            vec![("", others)],
+            &["more than once: AO, Emit;", "Combined"],
+            &["the channels AO.B, AO.G, AO.R, Emit.B,", "Mist.Z, Normal.X", "called Depth"],
+        ),
+        (vec![parts("l"), parts("r")], &["more than once: l, r;"], &["more than once: l.Z, r.Z;"]),
+        (apart, &["the channels a.R, b.G, c.B;", "R, G and B"], &["the channels a.R, b.G, c.B;", "Z"]),
+    ] {
+        write(&parts);
+        for (error, says) in [(colours().unwrap_err(), of_colours), (depth().unwrap_err(), of_depth)] {
+            let error = error.to_string();
+            assert!(says.iter().all(|part| error.contains(part)) && error.contains("layers.exr"), "{error}");
+        }
+    }
 }
 
 #[test]
