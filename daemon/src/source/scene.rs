@@ -183,7 +183,7 @@ pub fn check_fits(resolution: Resolution, geometry: &DisplayGeometry, name: &str
 pub fn failure(error: SceneError) -> Failure {
     let exit = match &error {
         SceneError::Read { .. } | SceneError::Kind { .. } => Exit::NoInput,
-        SceneError::DepthEncoding { .. } => Exit::Usage,
+        SceneError::DepthEncoding { .. } | SceneError::EncodingsDiffer { .. } => Exit::Usage,
         _ => Exit::Data,
     };
     Failure::because(exit)(error)

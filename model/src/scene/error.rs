@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use holod_calibration::Resolution;
 
+use super::DepthEncoding;
+
 /// A scene that cannot be loaded. Each message says which file, line or key it is about, what was found, what was
 /// expected and what to do.
 #[derive(Debug, thiserror::Error)]
@@ -41,6 +43,21 @@ pub enum SceneError {
         "depth encoding: found {found}; expected metres, millimetres, dioptres or normalised_dioptres[:FAR,NEAR] (ends in dioptres): give it with --depth-encoding"
     )]
     DepthEncoding { found: String },
+    /// A scene file says another encoding than was named beside it.
+    #[error(
+        "{path}, line {line}: `depth_encoding`: found {own} here and {named} named beside the scene \
+         (--depth-encoding); expected one of them: leave out what is named beside it, or change it in this file",
+        path = path.display()
+    )]
+    EncodingsDiffer {
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// What the file says.
+        own: DepthEncoding,
+        /// What was named beside it.
+        named: DepthEncoding,
+    },
     /// A picture file is damaged, truncated or of a kind that is not read.
     #[error("{path}: {found}; expected {expected}", path = path.display())]
     Picture {

@@ -28,6 +28,7 @@ mod live;
 mod openexr;
 mod raster;
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::{Dioptres, DisplayGeometry, Resolution};
@@ -142,7 +143,8 @@ pub struct Scene {
 
 impl Scene {
     /// Opens a scene as a command line names it: a directory with a `scene.toml`, that file itself, `COLOUR,DEPTH`, or
-    /// one OpenEXR file with colour and depth. The latter two need `depth_encoding`; a scene file names its own.
+    /// one OpenEXR file with colour and depth. The latter two need `depth_encoding`; a scene file names its own, and
+    /// another one beside it is an error.
     ///
     /// Pictures are read when they are loaded, so a missing or damaged one is reported then.
     pub fn open(spec: &str, depth_encoding: Option<DepthEncoding>) -> Result<Self, SceneError> {
@@ -321,6 +323,18 @@ impl DepthEncoding {
                     Err(unknown())
                 }
             }
+        }
+    }
+}
+
+/// As on a command line.
+impl fmt::Display for DepthEncoding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Metres => f.write_str("metres"),
+            Self::Millimetres => f.write_str("millimetres"),
+            Self::Dioptres => f.write_str("dioptres"),
+            Self::NormalisedDioptres { far_dpt, near_dpt } => write!(f, "normalised_dioptres:{far_dpt},{near_dpt}"),
         }
     }
 }
