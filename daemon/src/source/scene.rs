@@ -42,9 +42,22 @@ impl Frames {
     }
 }
 
-/// Loads every frame of the scene that was named, or renders the built-in one.
+/// Loads every frame of the scene that was named, to be played, or renders the built-in one.
 pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
-    let Some(spec) = &args.scene else { return sample_frames(args, geometry) };
+    let Some((spec, scene)) = open(args, geometry)? else { return sample_frames(args, geometry) };
+    let fps = scene.playback_fps().map_err(failure)?;
+    load(spec, &scene, scene.frames(), fps, args, geometry)
+}
+
+/// Loads the first frame of the scene that was named, or renders the built-in one.
+pub fn first_frame(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
+    let Some((spec, scene)) = open(args, geometry)? else { return sample_frames(args, geometry) };
+    load(spec, &scene, 1, None, args, geometry)
+}
+
+/// The scene that was named, with its name.
+fn open<'a>(args: &'a SceneArgs, geometry: &DisplayGeometry) -> Result<Option<(&'a str, Scene)>, Failure> {
+    let Some(spec) = args.scene.as_deref() else { return Ok(None) };
     if super::feed_socket(spec).is_some() {
         let only = "--scene feed is for `holod run` alone; for a folder of that name write ./feed";
         return Err(Failure::new(Exit::Usage, only));
@@ -55,9 +68,20 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
         .map(|text| DepthEncoding::parse(text, geometry))
         .transpose()
         .map_err(Failure::because(Exit::Usage))?;
-    let scene = Scene::open(spec, encoding).map_err(failure)?;
-    let mut loaded = Frames { frames: Vec::new(), fps: scene.fps(), reports: Vec::new(), name: spec.clone() };
-    for index in 0..scene.frames() {
+    Ok(Some((spec, Scene::open(spec, encoding).map_err(failure)?)))
+}
+
+/// Loads the first `count` frames of a scene.
+fn load(
+    spec: &str,
+    scene: &Scene,
+    count: usize,
+    fps: Option<f64>,
+    args: &SceneArgs,
+    geometry: &DisplayGeometry,
+) -> Result<Frames, Failure> {
+    let mut loaded = Frames { frames: Vec::new(), fps, reports: Vec::new(), name: spec.to_owned() };
+    for index in 0..count {
         let (frame, report) = scene.load(index, geometry, args.resolution, args.fit.into()).map_err(failure)?;
         check_fits(frame.resolution, geometry, spec)?;
         if let Some(first) = loaded.frames.first()
@@ -71,8 +95,8 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
                 ),
             ));
         }
-        if index == 0 && scene.frames() > 1 {
-            sequence_fits(scene.frames() as u64, frame.resolution, available_bytes())
+        if index == 0 && count > 1 {
+            sequence_fits(count as u64, frame.resolution, available_bytes())
                 .map_err(|why| Failure::new(Exit::Data, format!("{spec}: {why}")))?;
         }
         warn_of_oddities(spec, &report, geometry, false);
@@ -235,6 +259,44 @@ mod tests {
     fn a_picture_with_a_few_depths_that_are_too_near_is_not_doubted() {
         let some_too_near = odd_at_every_size(|index| if index % 25 < 3 { 2 } else { 1000 + index as u16 });
         assert_eq!(some_too_near, vec![None; 14]);
+    }
+
+    #[test]
+    fn a_sequence_is_played_by_its_fps_and_its_first_picture_is_had_without() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        for index in 0..3_u16 {
+            image::RgbImage::new(8, 8).save(at(&format!("c{index}.png"))).unwrap();
+            let depth = |x, _| image::Luma([500 + 100 * x as u16]);
+            image::ImageBuffer::from_fn(8, 8, depth).save(at(&format!("d{index}.png"))).unwrap();
+        }
+        let args = SceneArgs { scene: folder.path().to_str().map(str::to_owned), ..SceneArgs::default() };
+        let describe = |text: &str| {
+            std::fs::write(
+                at("scene.toml"),
+                format!("depth_encoding = \"millimetres\"\ndepth = \"d{{}}.png\"\n{text}"),
+            )
+            .unwrap();
+        };
+        let played = || frames(&args, &DisplayGeometry::DEFAULT);
+        let first = || first_frame(&args, &DisplayGeometry::DEFAULT).unwrap();
+
+        describe("colour = \"c{}.png\"\nfps = 20.0");
+        assert_eq!((played().unwrap().frames.len(), played().unwrap().index_at(0.12)), (3, 2));
+        assert_eq!((first().frames.len(), first().reports.len(), first().index_at(0.12)), (1, 1, 0));
+        for (text, line) in
+            [("colour = \"c{}.png\"", 3), ("colour = \"c0.png\"", 2), ("colour = \"c{}.png\"\ncount = 3", 3)]
+        {
+            describe(text);
+            let refused = played().err().unwrap();
+            assert_eq!(refused.exit, Exit::Data);
+            let why = refused.to_string();
+            let place = format!("scene.toml, line {line}: `fps`: found none for this sequence of 3 frames");
+            assert!(why.contains(&place) && why.contains("fps = 30.0"), "{why}");
+            assert_eq!(first().frames.len(), 1);
+        }
+        describe("colour = \"c{}.png\"\ncount = 1");
+        assert_eq!(played().unwrap().frames.len(), 1);
     }
 
     #[test]

@@ -25,6 +25,8 @@ pub(super) struct Description {
     pub(super) first: u64,
     pub(super) step: u64,
     pub(super) fps: Option<f64>,
+    /// The line of a scene file at which a sequence begins, from 1.
+    pub(super) sequence_line: usize,
 }
 
 /// A path in which `{}` or `{:05}` stands for the number of a frame.
@@ -128,6 +130,7 @@ pub(super) fn describe(spec: &str, encoding: Option<DepthEncoding>) -> Result<De
         first: 0,
         step: 1,
         fps: None,
+        sequence_line: 1,
     })
 }
 
@@ -261,6 +264,8 @@ fn parse(path: &Path, text: &str, named: Option<DepthEncoding>) -> Result<Descri
         Some(depth) => pattern("depth", depth)?,
         None => colour.clone(),
     };
+    let numbered_key = file.depth.as_ref().filter(|_| !colour.numbered()).unwrap_or(&file.colour);
+    let sequence_line = line_at(text, numbered_key.span().start);
     let (first, step) = (file.first.unwrap_or(0), file.step.map_or(1, Spanned::into_inner));
     let numbered = colour.numbered() || depth.numbered();
     let frames = match file.count {
@@ -299,6 +304,7 @@ fn parse(path: &Path, text: &str, named: Option<DepthEncoding>) -> Result<Descri
         first,
         step,
         fps: file.fps.map(Spanned::into_inner),
+        sequence_line,
     })
 }
 

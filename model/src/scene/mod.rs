@@ -11,7 +11,7 @@
 //! first = 0                        # for a sequence: its first number,
 //! step = 1                         # the distance of numbers,
 //! count = 240                      # how many (as many as are there, where absent)
-//! fps = 30.0                       # and how many a second
+//! fps = 30.0                       # and how many a second, without which it cannot be played
 //! ```
 //!
 //! PNG and JPEG are decoded from sRGB once; OpenEXR is linear already. NaN, lengths that are not positive and OpenEXR
@@ -159,6 +159,27 @@ impl Scene {
     /// Frames a second, where the scene says so.
     pub fn fps(&self) -> Option<f64> {
         self.description.fps
+    }
+
+    /// Frames a second at which the scene is played; none of a still.
+    ///
+    /// # Errors
+    /// It is a sequence that does not say so.
+    pub fn playback_fps(&self) -> Result<Option<f64>, SceneError> {
+        let Description { path, frames, fps, sequence_line, .. } = &self.description;
+        match fps {
+            _ if *frames == 1 => Ok(None),
+            Some(fps) => Ok(Some(*fps)),
+            None => Err(SceneError::Description {
+                path: path.clone(),
+                line: *sequence_line,
+                key: "fps".into(),
+                found: format!("none for this sequence of {frames} frames"),
+                expected:
+                    "how many are shown a second: write, for example, fps = 30.0, or count = 1 for the first alone"
+                        .into(),
+            }),
+        }
     }
 
     /// Loads frame `index` for the depth range of `geometry`, at `resolution` or, without one, at the picture's own.
