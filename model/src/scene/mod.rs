@@ -24,6 +24,7 @@ mod description;
 mod error;
 mod fit;
 mod focal_stack;
+mod jpeg;
 mod live;
 mod openexr;
 mod raster;

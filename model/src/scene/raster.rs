@@ -9,7 +9,7 @@ use image::{DynamicImage, ImageFormat, ImageReader};
 
 use super::decoded::{ColourRaster, DepthRaster, FORMATS, check_size};
 use super::depth::DepthNumbers;
-use super::{SceneError, openexr};
+use super::{SceneError, jpeg, openexr};
 use crate::picture::srgb_to_linear;
 
 /// What kind of file a path holds, by its first bytes.
@@ -68,19 +68,13 @@ fn decode(path: &Path) -> Result<DynamicImage, SceneError> {
     };
     if open()?.format() == Some(ImageFormat::Jpeg) {
         let bytes = std::fs::read(path).map_err(read_error)?;
-        if !jpeg_is_whole(&bytes) {
+        if !jpeg::is_whole(&bytes) {
             return Err(damaged("the JPEG data end before the end-of-image marker".into()));
         }
     }
     let (width, height) = open()?.into_dimensions().map_err(|error| damaged(error.to_string()))?;
     check_size(path, width as usize, height as usize)?;
     open()?.decode().map_err(|error| damaged(error.to_string()))
-}
-
-/// Whether an end-of-image marker stands behind the last start of a scan: the decoder fills what was cut off with grey.
-fn jpeg_is_whole(bytes: &[u8]) -> bool {
-    let last = |marker: [u8; 2]| bytes.windows(2).rposition(|pair| pair == marker);
-    last([0xff, 0xd9]) > last([0xff, 0xda])
 }
 
 /// Linear light of each colour; transparent pixels over black.

@@ -362,6 +362,18 @@ fn a_jpeg_that_was_cut_short_is_refused() {
 }
 
 #[test]
+fn a_jpeg_with_a_film_behind_it_is_read() {
+    let files = Files::new();
+    let path = files.path("motion.jpg");
+    let whole = include_bytes!("progressive.jpg");
+    std::fs::write(&path, whole).unwrap();
+    let picture = raster::read_colour(&path).unwrap();
+    assert_eq!(picture.size, size(24, 16));
+    std::fs::write(&path, [&whole[..], b"\0\0\0\x18ftypmp42\xff\xda\0\x08mdat"].concat()).unwrap();
+    assert!(raster::read_colour(&path).unwrap().linear == picture.linear);
+}
+
+#[test]
 fn a_file_that_claims_a_huge_picture_is_refused_before_it_is_decoded() {
     let files = Files::new();
     files.colour8("c.png", 2, 2, |_, _| [0; 3]);
