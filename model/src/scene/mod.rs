@@ -14,8 +14,9 @@
 //! fps = 30.0                       # and how many a second, without which it cannot be played
 //! ```
 //!
-//! PNG and JPEG are decoded from sRGB once; OpenEXR is linear already. NaN, lengths that are not positive and OpenEXR
-//! pixels outside the data window have no depth and are filled from their surroundings.
+//! PNG and JPEG are decoded from sRGB once, and each is turned by its own EXIF orientation; OpenEXR is linear already.
+//! NaN, lengths that are not positive and OpenEXR pixels outside the data window have no depth and are filled from
+//! their surroundings.
 
 mod array;
 mod decoded;
@@ -286,8 +287,10 @@ impl Scene {
                 return Err(SceneError::SizesDiffer {
                     colour: colour_path,
                     colour_size: colour.size,
+                    colour_orientation: colour.turned.to_exif(),
                     depth: depth_path,
                     depth_size: depth.size,
+                    depth_orientation: depth.turned.to_exif(),
                 });
             };
             depth_dpt = placement.nearest(&depth_dpt, 0.0);

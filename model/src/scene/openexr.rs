@@ -10,6 +10,7 @@ use exr::image::{AnyChannel, FlatSamples};
 use exr::meta::MetaData;
 use exr::prelude::{ReadChannels, ReadLayers};
 use holod_calibration::Resolution;
+use image::metadata::Orientation;
 
 use super::SceneError;
 use super::decoded::{ColourRaster, DepthRaster, FORMATS, MOST_PIXELS, check_size};
@@ -54,7 +55,7 @@ pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
         });
     }
     let clipped_px = clipped.into_iter().filter(|&clipped| clipped).count();
-    Ok(ColourRaster { size: picture.size, linear, clipped_px })
+    Ok(ColourRaster { size: picture.size, turned: Orientation::NoTransforms, linear, clipped_px })
 }
 
 pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
@@ -62,7 +63,8 @@ pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
     let channel = picture.depth(path)?;
     let mut values = vec![f32::NAN; picture.size.pixels()];
     picture.place(channel, |index, value| values[index] = value);
-    Ok(DepthRaster { size: picture.size, numbers: DepthNumbers { values, full_scale: None } })
+    let numbers = DepthNumbers { values, full_scale: None };
+    Ok(DepthRaster { size: picture.size, turned: Orientation::NoTransforms, numbers })
 }
 
 impl Picture {

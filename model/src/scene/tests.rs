@@ -361,6 +361,48 @@ fn a_jpeg_that_was_cut_short_is_refused() {
     }
 }
 
+/// A JPEG with an EXIF orientation, 16x8, bright in its upper left quarter.
+fn jpeg_turned(path: &Path, orientation: u8) {
+    let mut jpeg = Vec::new();
+    let bright = |x, y| Rgb([if x < 8 && y < 4 { 255_u8 } else { 0 }; 3]);
+    let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 100);
+    ImageBuffer::from_fn(16, 8, bright).write_with_encoder(encoder).unwrap();
+    // One entry of a directory of TIFF: a short that is the orientation.
+    let entry = [0x01, 0x12, 0, 3, 0, 0, 0, 1, 0, orientation, 0, 0];
+    let exif = [&b"Exif\0\0MM\0\x2a\0\0\0\x08\0\x01"[..], &entry, &[0; 4]].concat();
+    let segment = [&[0xff, 0xe1, 0, exif.len() as u8 + 2][..], &exif].concat();
+    std::fs::write(path, [&jpeg[..2], &segment, &jpeg[2..]].concat()).unwrap();
+}
+
+#[test]
+fn a_picture_is_turned_by_its_own_orientation() {
+    let files = Files::new();
+    files.describe("colour = \"c.jpg\"\ndepth = \"d.png\"\ndepth_encoding = \"millimetres\"\n");
+    for (orientation, shown, bright) in [(1, size(16, 8), [0, 0]), (3, size(16, 8), [1, 1]), (6, size(8, 16), [1, 0])] {
+        jpeg_turned(&files.path("c.jpg"), orientation);
+        files.depth16("d.png", shown.width as u32, shown.height as u32, |x, _| 500 + x as u16);
+        let (frame, report) = files.open().load(0, &BENCH, None, Fit::Native).unwrap();
+        assert_eq!((frame.resolution, report.source), (shown, Some(shown)));
+        for y in 0..shown.height {
+            for x in 0..shown.width {
+                let is_bright = [2 * x / shown.width, 2 * y / shown.height] == bright;
+                let light = frame.amplitude[y * shown.width + x];
+                assert_eq!(light > 0.5, is_bright, "orientation {orientation}: {light} at {x}, {y}");
+            }
+        }
+        assert!(frame.depth_normalised.chunks_exact(shown.width).all(|row| row.is_sorted_by(|a, b| a > b)));
+    }
+    files.depth16("d.png", 16, 8, |x, _| 500 + x as u16);
+    for fit in [Fit::Native, Fit::Cover] {
+        let error = files.open().load(0, &BENCH, None, fit).unwrap_err().to_string();
+        let said = ["d.png is 16x8 and ", "c.jpg is 8x16 (turned by its EXIF orientation 6);"];
+        assert!(said.iter().all(|part| error.contains(part)), "{error}");
+    }
+    jpeg_turned(&files.path("d.jpg"), 8);
+    let turned = raster::read_depth(&files.path("d.jpg")).unwrap();
+    assert_eq!((turned.size, turned.turned.to_exif()), (size(8, 16), 8), "depth is turned by its own");
+}
+
 #[test]
 fn a_jpeg_with_a_film_behind_it_is_read() {
     let files = Files::new();
