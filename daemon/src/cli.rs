@@ -154,8 +154,8 @@ pub struct SceneArgs {
     /// feed:SOCKET, the pictures that other programs hand over.
     #[arg(long, value_name = "PATH")]
     pub scene: Option<String>,
-    /// What the depth file's numbers are; required for COLOUR,DEPTH: metres, millimetres, dioptres, or
-    /// normalised_dioptres:FAR,NEAR (both in dioptres; 0 in the file is FAR).
+    /// What the depth file's numbers are; required for COLOUR,DEPTH, while a scene.toml names its own: metres,
+    /// millimetres, dioptres, or normalised_dioptres:FAR,NEAR (both in dioptres; 0 in the file is FAR).
     #[arg(long, value_name = "ENCODING")]
     pub depth_encoding: Option<String>,
     /// How a picture of another size is brought to --resolution.

@@ -141,7 +141,7 @@ impl Renderer {
         let (frame, report) = self.frame(rgb, colour, depth, depth_unit, fill_missing)?;
         let frame = Arc::new(frame);
         let made = without_lock(py, || {
-            warn_of_oddities("the picture", &frame, &report, &self.rig.geometry, false);
+            warn_of_oddities("the picture", &report, &self.rig.geometry, false);
             let mut state = self
                 .state
                 .lock()

@@ -37,6 +37,9 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
     fs::write(at("cut.exr"), [0x76, 0x2f, 0x31, 0x01, 2, 0, 0, 0, b'c', b'h']).unwrap();
     fs::write(at("text.png"), "this is no picture").unwrap();
     fs::create_dir(at("directory")).unwrap();
+    fs::create_dir(at("scene")).unwrap();
+    let scene = "colour = \"../colour.png\"\ndepth = \"../depth.png\"\ndepth_encoding = \"millimetres\"\n";
+    fs::write(at("scene/scene.toml"), scene).unwrap();
     fs::write(at("log.csv"), "when,how wide\n1,3.5\n2,3.6\n").unwrap();
     fs::write(at("empty.csv"), "").unwrap();
     let rig = small_rig(64, 64, "driver = \"simulated\"");
@@ -78,6 +81,11 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
             ],
             exit: 64,
             says: &["feet", "metres"],
+        },
+        Case {
+            args: &["--scene", "scene", "--depth-encoding", "dioptres"],
+            exit: 64,
+            says: &["scene/scene.toml, line 3: `depth_encoding`", "millimetres here and dioptres", "in this file"],
         },
         Case { args: &["render", "--pupil", "wide", "--out", "out"], exit: 64, says: &["wide", "--pupil"] },
         Case { args: &["render", "--pupil", "12", "--out", "out"], exit: 64, says: &["12"] },

@@ -378,8 +378,11 @@ fn levels_are_kept_of_holograms_and_of_no_pattern() {
 fn what_cannot_be_done_is_said_and_changes_nothing() {
     let bench = Bench::start(&[]);
     let before = bench.status();
+    let scene = "colour = \"colour.png\"\ndepth = \"depth.png\"\ndepth_encoding = \"metres\"\n";
+    fs::write(bench.path().join("scene.toml"), scene).unwrap();
     for (args, said) in [
         (&["scene", "absent"][..], "absent"),
+        (&["scene", ".", "--depth-encoding", "dioptres"], "scene.toml, line 3: `depth_encoding`: found metres here"),
         (&["scene", "feed"], "start it with --scene feed"),
         (&["weights", "./absent.safetensors"], "absent.safetensors"),
         (&["pupil", "12"], "expected a human pupil of 0.5 to 9 mm"),

@@ -236,6 +236,34 @@ fn a_client_that_stands_still_makes_the_lasers_dark_until_it_goes_on() {
 }
 
 #[test]
+fn a_picture_that_is_too_bright_and_too_near_is_told_though_it_is_enlarged() {
+    let folder = bench();
+    let daemon = holod_with_feed(folder.path(), &["--fit", "contain"]);
+    let one_half = 0x3c00_u16;
+    for (name, number, depth_mm) in [("near", 1, 2_u16), ("flat", 2, 1000)] {
+        let mut client = FeedClient::connect(&folder.path().join("pictures")).unwrap();
+        let mut hello = hello(32, 32, None, name);
+        hello[16..20].copy_from_slice(&2_u32.to_ne_bytes());
+        client.say(&hello).unwrap();
+        assert_eq!(client.answer(), Answer::Ring);
+        let pixel = [2 * one_half, 0, 0, one_half].map(u16::to_ne_bytes).concat();
+        send(&mut client, number, &(pixel.repeat(32 * 32), depth_mm.to_ne_bytes().repeat(32 * 32)));
+        assert!(wait_until(PATIENCE, || status(&daemon, folder.path())["feed"]["taken"] == number));
+    }
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(PATIENCE);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    for said in [
+        "`near`: of 1024 depths, these cannot be shown as they are: 1024 nearer than the display",
+        "`near`: 1024 of 1024 pixels are brighter than white and were clipped",
+        "`flat`: 1024 of 1024 pixels are brighter than white and were clipped",
+        "`flat`: all depths lie within 0.000 dpt: is the depth encoding right?",
+    ] {
+        assert!(ended.stderr.contains(said), "`{said}` is not in: {}", ended.stderr);
+    }
+}
+
+#[test]
 fn what_cannot_be_a_feed_is_said() {
     let folder = bench();
     let refused = |args: &[&str], exit: i32, expected: &str| {

@@ -124,7 +124,7 @@ pub(super) fn compute(
 ) -> Result<Computed, Failure> {
     let weights = progress::during("loading the network", || setup::weights(rig))?;
     check_pupil(&weights, &rig.geometry, pupil).map_err(|why| Failure::new(Exit::Usage, format!("--pupil: {why}")))?;
-    let frames = progress::during("loading the scene", || scene::frames(named, &rig.geometry))?;
+    let frames = progress::during("loading the scene", || scene::first_frame(named, &rig.geometry))?;
     let resolution = frames.resolution();
     let encoder = renderer::panel_encoder(rig, resolution)?;
     let mut renderer = progress::during(&format!("preparing the network for {resolution}"), || {

@@ -42,9 +42,22 @@ impl Frames {
     }
 }
 
-/// Loads every frame of the scene that was named, or renders the built-in one.
+/// Loads every frame of the scene that was named, to be played, or renders the built-in one.
 pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
-    let Some(spec) = &args.scene else { return sample_frames(args, geometry) };
+    let Some((spec, scene)) = open(args, geometry)? else { return sample_frames(args, geometry) };
+    let fps = scene.playback_fps().map_err(failure)?;
+    load(spec, &scene, scene.frames(), fps, args, geometry)
+}
+
+/// Loads the first frame of the scene that was named, or renders the built-in one.
+pub fn first_frame(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
+    let Some((spec, scene)) = open(args, geometry)? else { return sample_frames(args, geometry) };
+    load(spec, &scene, 1, None, args, geometry)
+}
+
+/// The scene that was named, with its name.
+fn open<'a>(args: &'a SceneArgs, geometry: &DisplayGeometry) -> Result<Option<(&'a str, Scene)>, Failure> {
+    let Some(spec) = args.scene.as_deref() else { return Ok(None) };
     if super::feed_socket(spec).is_some() {
         let only = "--scene feed is for `holod run` alone; for a folder of that name write ./feed";
         return Err(Failure::new(Exit::Usage, only));
@@ -55,9 +68,20 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
         .map(|text| DepthEncoding::parse(text, geometry))
         .transpose()
         .map_err(Failure::because(Exit::Usage))?;
-    let scene = Scene::open(spec, encoding).map_err(failure)?;
-    let mut loaded = Frames { frames: Vec::new(), fps: scene.fps(), reports: Vec::new(), name: spec.clone() };
-    for index in 0..scene.frames() {
+    Ok(Some((spec, Scene::open(spec, encoding).map_err(failure)?)))
+}
+
+/// Loads the first `count` frames of a scene.
+fn load(
+    spec: &str,
+    scene: &Scene,
+    count: usize,
+    fps: Option<f64>,
+    args: &SceneArgs,
+    geometry: &DisplayGeometry,
+) -> Result<Frames, Failure> {
+    let mut loaded = Frames { frames: Vec::new(), fps, reports: Vec::new(), name: spec.to_owned() };
+    for index in 0..count {
         let (frame, report) = scene.load(index, geometry, args.resolution, args.fit.into()).map_err(failure)?;
         check_fits(frame.resolution, geometry, spec)?;
         if let Some(first) = loaded.frames.first()
@@ -71,11 +95,11 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
                 ),
             ));
         }
-        if index == 0 && scene.frames() > 1 {
-            sequence_fits(scene.frames() as u64, frame.resolution, available_bytes())
+        if index == 0 && count > 1 {
+            sequence_fits(count as u64, frame.resolution, available_bytes())
                 .map_err(|why| Failure::new(Exit::Data, format!("{spec}: {why}")))?;
         }
-        warn_of_oddities(spec, &frame, &report, geometry, false);
+        warn_of_oddities(spec, &report, geometry, false);
         loaded.frames.push(Arc::new(frame));
         loaded.reports.push(report);
     }
@@ -106,42 +130,40 @@ fn sequence_fits(frames: u64, resolution: Resolution, available_bytes: Option<u6
     ))
 }
 
-/// What is most often a mistake in a picture called `name`.
+/// Warns of what is most often a mistake in a picture called `name`.
 /// `is_plane`: one depth for all of it is meant.
-pub fn warn_of_oddities(
-    name: &str,
-    frame: &RgbdFrame,
-    report: &FrameReport,
-    geometry: &DisplayGeometry,
-    is_plane: bool,
-) {
-    warn_of_odd_depth(name, frame, report, geometry, is_plane);
-    warn_of_clipped_colours(name, report.colour_clipped_px, frame.resolution.pixels());
+pub fn warn_of_oddities(name: &str, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) {
+    let Some(source) = report.source else { return };
+    if let Some(oddity) = odd_depth(source, report, geometry, is_plane) {
+        tracing::warn!("{name}: {oddity}");
+    }
+    warn_of_clipped_colours(name, report.colour_clipped_px, source.pixels());
 }
 
-/// Depth that is nearly all clamped, or all one, is most often a wrong encoding.
-fn warn_of_odd_depth(name: &str, frame: &RgbdFrame, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) {
-    let pixels = frame.resolution.pixels();
+/// Warns of colours of which most are brighter than white: most often scene-linear light that was never exposed.
+/// Both counts are of the picture as it came, before it was fitted.
+pub fn warn_of_clipped_colours(name: &str, clipped_px: usize, source_px: usize) {
+    if 2 * clipped_px > source_px {
+        tracing::warn!(
+            "{name}: {clipped_px} of {source_px} pixels are brighter than white and were clipped: scale the picture's \
+             light so that white is 1"
+        );
+    }
+}
+
+/// Depth of which most is clamped, or that is all one, is most often a wrong encoding.
+fn odd_depth(source: Resolution, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) -> Option<String> {
+    let pixels = source.pixels();
     let clamped = report.depth_clamped_far_px + report.depth_clamped_near_px;
-    let ends = frame.depth_normalised.iter().fold((f32::MAX, f32::MIN), |(a, b), &d| (a.min(d), b.max(d)));
-    let spread_dpt = geometry.depth_at(f64::from(ends.1)).0 - geometry.depth_at(f64::from(ends.0)).0;
     if 2 * clamped > pixels {
-        tracing::warn!(
-            "{name}: {clamped} of {pixels} pixels lie outside the display's depth range: is the depth encoding right?"
-        );
-    } else if spread_dpt < 0.05 && pixels > 1 && !is_plane {
-        tracing::warn!("{name}: all depths lie within {spread_dpt:.3} dpt: is the depth encoding right?");
+        return Some(format!(
+            "{clamped} of {pixels} pixels lie outside the display's depth range: is the depth encoding right?"
+        ));
     }
-}
-
-/// Colours that are nearly all brighter than white are most often scene-linear light that was never exposed.
-pub fn warn_of_clipped_colours(name: &str, clipped_px: usize, pixels: usize) {
-    if 2 * clipped_px > pixels {
-        tracing::warn!(
-            "{name}: {clipped_px} of {pixels} pixels are brighter than white and were clipped: scale the picture's light \
-             so that white is 1"
-        );
-    }
+    let [far_dpt, near_dpt] = report.depth_range.map(|depth| geometry.depth_at(f64::from(depth)).0);
+    let spread_dpt = near_dpt - far_dpt;
+    (spread_dpt < 0.05 && pixels > 1 && !is_plane)
+        .then(|| format!("all depths lie within {spread_dpt:.3} dpt: is the depth encoding right?"))
 }
 
 fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
@@ -185,7 +207,7 @@ pub fn check_fits(resolution: Resolution, geometry: &DisplayGeometry, name: &str
 pub fn failure(error: SceneError) -> Failure {
     let exit = match &error {
         SceneError::Read { .. } | SceneError::Kind { .. } => Exit::NoInput,
-        SceneError::DepthEncoding { .. } => Exit::Usage,
+        SceneError::DepthEncoding { .. } | SceneError::EncodingsDiffer { .. } => Exit::Usage,
         _ => Exit::Data,
     };
     Failure::because(exit)(error)
@@ -193,7 +215,89 @@ pub fn failure(error: SceneError) -> Failure {
 
 #[cfg(test)]
 mod tests {
+    use holod_model::scene::Fit;
+
     use super::*;
+
+    /// What is odd about the depth of a picture of 64x48 whose pixels number `index` have `depth_mm`, at each size.
+    fn odd_at_every_size(depth_mm: impl Fn(u32) -> u16) -> Vec<Option<String>> {
+        const SIZE: Resolution = Resolution { width: 64, height: 48 };
+        const BENCH: DisplayGeometry = DisplayGeometry::DEFAULT;
+        let folder = tempfile::tempdir().unwrap();
+        let [colour, depth] = ["colour.png", "depth.png"].map(|name| folder.path().join(name));
+        image::RgbImage::new(64, 48).save(&colour).unwrap();
+        let at = |x, y| image::Luma([depth_mm(y * 64 + x)]);
+        image::ImageBuffer::from_fn(64, 48, at).save(&depth).unwrap();
+        let spec = format!("{},{}", colour.display(), depth.display());
+        let scene = Scene::open(&spec, Some(DepthEncoding::Millimetres)).unwrap();
+        let sizes = [(SIZE, Fit::Native), (SIZE, Fit::Contain)].into_iter().chain(
+            [(96, 72), (19, 14), (96, 48), (20, 60)]
+                .into_iter()
+                .flat_map(|(width, height)| [Fit::Contain, Fit::Cover, Fit::Crop].map(|fit| (width, height, fit)))
+                .map(|(width, height, fit)| (Resolution { width, height }, fit)),
+        );
+        sizes
+            .map(|(size, fit)| scene.load(0, &BENCH, Some(size), fit).unwrap().1)
+            .map(|report| odd_depth(report.source.unwrap(), &report, &BENCH, false))
+            .collect()
+    }
+
+    #[test]
+    fn a_wrong_encoding_is_told_whatever_the_picture_is_fitted_to() {
+        let too_near = odd_at_every_size(|_| 2);
+        let told = "3072 of 3072 pixels lie outside the display's depth range: is the depth encoding right?";
+        assert_eq!(too_near, vec![Some(told.to_owned()); 14]);
+        let told = "1920 of 3072 pixels lie outside the display's depth range: is the depth encoding right?";
+        let most_too_near = odd_at_every_size(|index| if index < 1920 { 2 } else { 1000 });
+        assert_eq!(most_too_near, vec![Some(told.to_owned()); 14]);
+        let one_depth = odd_at_every_size(|_| 1000);
+        let told = "all depths lie within 0.000 dpt: is the depth encoding right?";
+        assert_eq!(one_depth, vec![Some(told.to_owned()); 14]);
+    }
+
+    #[test]
+    fn a_picture_with_a_few_depths_that_are_too_near_is_not_doubted() {
+        let some_too_near = odd_at_every_size(|index| if index % 25 < 3 { 2 } else { 1000 + index as u16 });
+        assert_eq!(some_too_near, vec![None; 14]);
+    }
+
+    #[test]
+    fn a_sequence_is_played_by_its_fps_and_its_first_picture_is_had_without() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        for index in 0..3_u16 {
+            image::RgbImage::new(8, 8).save(at(&format!("c{index}.png"))).unwrap();
+            let depth = |x, _| image::Luma([500 + 100 * x as u16]);
+            image::ImageBuffer::from_fn(8, 8, depth).save(at(&format!("d{index}.png"))).unwrap();
+        }
+        let args = SceneArgs { scene: folder.path().to_str().map(str::to_owned), ..SceneArgs::default() };
+        let describe = |text: &str| {
+            std::fs::write(
+                at("scene.toml"),
+                format!("depth_encoding = \"millimetres\"\ndepth = \"d{{}}.png\"\n{text}"),
+            )
+            .unwrap();
+        };
+        let played = || frames(&args, &DisplayGeometry::DEFAULT);
+        let first = || first_frame(&args, &DisplayGeometry::DEFAULT).unwrap();
+
+        describe("colour = \"c{}.png\"\nfps = 20.0");
+        assert_eq!((played().unwrap().frames.len(), played().unwrap().index_at(0.12)), (3, 2));
+        assert_eq!((first().frames.len(), first().reports.len(), first().index_at(0.12)), (1, 1, 0));
+        for (text, line) in
+            [("colour = \"c{}.png\"", 3), ("colour = \"c0.png\"", 2), ("colour = \"c{}.png\"\ncount = 3", 3)]
+        {
+            describe(text);
+            let refused = played().err().unwrap();
+            assert_eq!(refused.exit, Exit::Data);
+            let why = refused.to_string();
+            let place = format!("scene.toml, line {line}: `fps`: found none for this sequence of 3 frames");
+            assert!(why.contains(&place) && why.contains("fps = 30.0"), "{why}");
+            assert_eq!(first().frames.len(), 1);
+        }
+        describe("colour = \"c{}.png\"\ncount = 1");
+        assert_eq!(played().unwrap().frames.len(), 1);
+    }
 
     #[test]
     fn a_sequence_that_memory_has_no_room_for_is_refused_in_figures() {

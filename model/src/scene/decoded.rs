@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use holod_calibration::Resolution;
+use image::metadata::Orientation;
 
 use super::SceneError;
 use super::depth::DepthNumbers;
@@ -15,6 +16,8 @@ pub(super) const FORMATS: &str = "an 8- or 16-bit PNG, a JPEG or an OpenEXR pict
 /// A colour picture in linear light.
 pub(super) struct ColourRaster {
     pub(super) size: Resolution,
+    /// How it was turned after it was read.
+    pub(super) turned: Orientation,
     /// [3, height, width], 0..=1
     pub(super) linear: Vec<f32>,
     /// Pixels of which some colour was above 1, below 0 or not finite.
@@ -24,6 +27,8 @@ pub(super) struct ColourRaster {
 /// A depth picture.
 pub(super) struct DepthRaster {
     pub(super) size: Resolution,
+    /// How it was turned after it was read.
+    pub(super) turned: Orientation,
     pub(super) numbers: DepthNumbers,
 }
 

@@ -25,6 +25,8 @@ pub(super) struct Description {
     pub(super) first: u64,
     pub(super) step: u64,
     pub(super) fps: Option<f64>,
+    /// The line of a scene file at which a sequence begins, from 1.
+    pub(super) sequence_line: usize,
 }
 
 /// A path in which `{}` or `{:05}` stands for the number of a frame.
@@ -100,10 +102,10 @@ struct SceneFile {
 pub(super) fn describe(spec: &str, encoding: Option<DepthEncoding>) -> Result<Description, SceneError> {
     let path = Path::new(spec);
     if path.is_dir() {
-        return read_scene_file(&path.join("scene.toml"));
+        return read_scene_file(&path.join("scene.toml"), encoding);
     }
     if path.extension().is_some_and(|extension| extension == "toml") {
-        return read_scene_file(path);
+        return read_scene_file(path, encoding);
     }
     let pair = if path.exists() { None } else { spec.split_once(',') };
     let (colour, depth) = pair.map_or((path, path), |(colour, depth)| (Path::new(colour), Path::new(depth)));
@@ -128,6 +130,7 @@ pub(super) fn describe(spec: &str, encoding: Option<DepthEncoding>) -> Result<De
         first: 0,
         step: 1,
         fps: None,
+        sequence_line: 1,
     })
 }
 
@@ -144,8 +147,8 @@ fn single_file(path: &Path) -> Result<(), SceneError> {
     Err(SceneError::Kind { path: path.to_owned(), found: "one file that is not OpenEXR".into(), expected: KINDS })
 }
 
-fn read_scene_file(path: &Path) -> Result<Description, SceneError> {
-    parse(path, &read_text(path, "a scene.toml of at most 1 MiB")?)
+fn read_scene_file(path: &Path, named: Option<DepthEncoding>) -> Result<Description, SceneError> {
+    parse(path, &read_text(path, "a scene.toml of at most 1 MiB")?, named)
 }
 
 /// The text of a file that describes pictures.
@@ -170,14 +173,20 @@ pub(super) fn line_error(
 ) -> SceneError {
     SceneError::Description {
         path: path.to_owned(),
-        line: text[..offset.min(text.len())].matches('\n').count() + 1,
+        line: line_at(text, offset),
         key: key.into(),
         found,
         expected: expected.into(),
     }
 }
 
-fn parse(path: &Path, text: &str) -> Result<Description, SceneError> {
+/// The line at `offset` of `text`, from 1.
+fn line_at(text: &str, offset: usize) -> usize {
+    text[..offset.min(text.len())].matches('\n').count() + 1
+}
+
+/// Reads a scene file, beside which `named` was named.
+fn parse(path: &Path, text: &str, named: Option<DepthEncoding>) -> Result<Description, SceneError> {
     let error_at =
         |offset: usize, key: &str, found: String, expected: &str| line_error(path, text, offset, key, found, expected);
     let file: SceneFile = toml::from_str(text).map_err(|error| {
@@ -226,6 +235,10 @@ fn parse(path: &Path, text: &str) -> Result<Description, SceneError> {
         let found = format!("{} with depth_encoding \"{name}\"", bound.get_ref());
         return Err(error_at(bound.span().start, key, found, "it only with normalised_dioptres"));
     }
+    if let Some(named) = named.filter(|named| *named != encoding) {
+        let line = line_at(text, file.depth_encoding.span().start);
+        return Err(SceneError::EncodingsDiffer { path: path.to_owned(), line, own: encoding, named });
+    }
     for (key, value) in [("depth_scale", &file.depth_scale), ("fps", &file.fps)] {
         if let Some(value) = value
             && !(*value.get_ref() > 0.0 && value.get_ref().is_finite())
@@ -251,6 +264,8 @@ fn parse(path: &Path, text: &str) -> Result<Description, SceneError> {
         Some(depth) => pattern("depth", depth)?,
         None => colour.clone(),
     };
+    let numbered_key = file.depth.as_ref().filter(|_| !colour.numbered()).unwrap_or(&file.colour);
+    let sequence_line = line_at(text, numbered_key.span().start);
     let (first, step) = (file.first.unwrap_or(0), file.step.map_or(1, Spanned::into_inner));
     let numbered = colour.numbered() || depth.numbered();
     let frames = match file.count {
@@ -289,6 +304,7 @@ fn parse(path: &Path, text: &str) -> Result<Description, SceneError> {
         first,
         step,
         fps: file.fps.map(Spanned::into_inner),
+        sequence_line,
     })
 }
 
@@ -301,7 +317,7 @@ mod tests {
     use super::*;
 
     fn parse_text(text: &str) -> Result<Description, SceneError> {
-        parse(Path::new("somewhere/scene.toml"), text)
+        parse(Path::new("somewhere/scene.toml"), text, None)
     }
 
     fn assert_refused(text: &str, line: usize, parts: &[&str]) {
@@ -356,6 +372,34 @@ mod tests {
         assert_refused(&encoded("count = 0"), 4, &["`count`"]);
         assert_refused("colour = \"{x}.png\"\ndepth_encoding = \"metres\"", 1, &["`colour`", "{x}"]);
         assert_refused("colour = ", 1, &["scene"]);
+    }
+
+    #[test]
+    fn an_encoding_beside_a_scene_file_must_be_the_files_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("scene.toml");
+        let normalised = |far_dpt, near_dpt| DepthEncoding::NormalisedDioptres { far_dpt, near_dpt };
+        let bounds = "normalised_dioptres\"\nfar_dpt = 0.5\nnear_dpt = 2.5";
+        for (text, own, other, said) in [
+            ("metres\"", DepthEncoding::Metres, DepthEncoding::Dioptres, "found metres here and dioptres named"),
+            ("millimetres\"", DepthEncoding::Millimetres, DepthEncoding::Metres, "found millimetres here and metres"),
+            (
+                bounds,
+                normalised(0.5, 2.5),
+                normalised(0.5, 2.75),
+                "found normalised_dioptres:0.5,2.5 here and normalised_dioptres:0.5,2.75 named",
+            ),
+        ] {
+            std::fs::write(&file, format!("{PAIR}depth_encoding = \"{text}")).unwrap();
+            for spec in [folder.path(), file.as_path()].map(|path| path.to_str().unwrap()) {
+                assert_eq!(describe(spec, Some(own)).unwrap(), describe(spec, None).unwrap());
+                let error = describe(spec, Some(other)).unwrap_err().to_string();
+                for part in ["scene.toml, line 3: `depth_encoding`", said, "--depth-encoding", "change it in this file"]
+                {
+                    assert!(error.contains(part), "`{part}` is not in: {error}");
+                }
+            }
+        }
     }
 
     #[test]

@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use holod_calibration::Resolution;
 
+use super::DepthEncoding;
+
 /// A scene that cannot be loaded. Each message says which file, line or key it is about, what was found, what was
 /// expected and what to do.
 #[derive(Debug, thiserror::Error)]
@@ -41,6 +43,21 @@ pub enum SceneError {
         "depth encoding: found {found}; expected metres, millimetres, dioptres or normalised_dioptres[:FAR,NEAR] (ends in dioptres): give it with --depth-encoding"
     )]
     DepthEncoding { found: String },
+    /// A scene file says another encoding than was named beside it.
+    #[error(
+        "{path}, line {line}: `depth_encoding`: found {own} here and {named} named beside the scene \
+         (--depth-encoding); expected one of them: leave out what is named beside it, or change it in this file",
+        path = path.display()
+    )]
+    EncodingsDiffer {
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// What the file says.
+        own: DepthEncoding,
+        /// What was named beside it.
+        named: DepthEncoding,
+    },
     /// A picture file is damaged, truncated or of a kind that is not read.
     #[error("{path}: {found}; expected {expected}", path = path.display())]
     Picture {
@@ -50,8 +67,26 @@ pub enum SceneError {
         expected: String,
     },
     /// Colour and depth differ in size.
-    #[error("{depth} is {depth_size} and {colour} is {colour_size}; expected one size: export both alike, or ask for a fit (contain, cover or crop), which resamples depth of the same aspect ratio", depth = depth.display(), colour = colour.display())]
-    SizesDiffer { colour: PathBuf, colour_size: Resolution, depth: PathBuf, depth_size: Resolution },
+    #[error(
+        "{depth} is {depth_size}{} and {colour} is {colour_size}{}; expected one size: export both alike, or ask for a \
+         fit (contain, cover or crop), which resamples depth of the same aspect ratio",
+        as_turned(*depth_orientation),
+        as_turned(*colour_orientation),
+        depth = depth.display(),
+        colour = colour.display()
+    )]
+    SizesDiffer {
+        colour: PathBuf,
+        /// As it is turned.
+        colour_size: Resolution,
+        /// How it is turned, by EXIF's numbers.
+        colour_orientation: u8,
+        depth: PathBuf,
+        /// As it is turned.
+        depth_size: Resolution,
+        /// How it is turned, by EXIF's numbers.
+        depth_orientation: u8,
+    },
     /// The picture is larger than the frame and no fit was asked for.
     #[error("{path} is {found}; expected at most {wanted}: ask for a fit (contain, cover or crop)", path = path.display())]
     TooLarge { path: PathBuf, found: Resolution, wanted: Resolution },
@@ -64,4 +99,9 @@ pub enum SceneError {
         /// How many there are.
         frames: usize,
     },
+}
+
+/// What is said of a picture that is not shown as it is stored.
+fn as_turned(exif_orientation: u8) -> String {
+    if exif_orientation == 1 { String::new() } else { format!(" (turned by its EXIF orientation {exif_orientation})") }
 }

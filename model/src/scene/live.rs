@@ -4,7 +4,7 @@ use half::f16;
 use holod_calibration::{Dioptres, DisplayGeometry, Resolution};
 
 use super::fit::Placement;
-use super::{Fit, FrameReport, ROUNDING, RgbdFrame, depth};
+use super::{Fit, FrameReport, RgbdFrame, clamp, depth};
 use crate::picture::srgb_to_linear;
 
 /// How a picture's colours are stored.
@@ -331,11 +331,7 @@ impl LiveReader {
         self.read_depths(depth, &mut picture.depth_normalised);
         report.depth_missing_px = depth::fill_missing(&mut picture.depth_normalised, self.format.resolution)
             .ok_or_else(|| self.no_depth(depth))?;
-        for depth in &mut picture.depth_normalised {
-            report.depth_clamped_far_px += usize::from(*depth < -ROUNDING);
-            report.depth_clamped_near_px += usize::from(*depth > 1.0 + ROUNDING);
-            *depth = depth.clamp(0.0, 1.0);
-        }
+        clamp(&mut picture.depth_normalised, &mut report);
         let missing = match report.depth_missing_px {
             0 => MissingDepths::default(),
             _ => MissingDepths::of(self.format.depth, depth),

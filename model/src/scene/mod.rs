@@ -11,11 +11,12 @@
 //! first = 0                        # for a sequence: its first number,
 //! step = 1                         # the distance of numbers,
 //! count = 240                      # how many (as many as are there, where absent)
-//! fps = 30.0                       # and how many a second
+//! fps = 30.0                       # and how many a second, without which it cannot be played
 //! ```
 //!
-//! PNG and JPEG are decoded from sRGB once; OpenEXR is linear already. NaN, lengths that are not positive and OpenEXR
-//! pixels outside the data window have no depth and are filled from their surroundings.
+//! PNG and JPEG are decoded from sRGB once, and each is turned by its own EXIF orientation; OpenEXR is linear already.
+//! NaN, lengths that are not positive and OpenEXR pixels outside the data window have no depth and are filled from
+//! their surroundings.
 
 mod array;
 mod decoded;
@@ -24,10 +25,12 @@ mod description;
 mod error;
 mod fit;
 mod focal_stack;
+mod jpeg;
 mod live;
 mod openexr;
 mod raster;
 
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::{Dioptres, DisplayGeometry, Resolution};
@@ -76,11 +79,13 @@ pub struct FrameReport {
     pub source: Option<Resolution>,
     /// Pixels without a valid depth, which were filled from their surroundings.
     pub depth_missing_px: usize,
-    /// Pixels farther than the display shows, set to its far end.
+    /// Pixels of the source farther than the display shows, set to its far end.
     pub depth_clamped_far_px: usize,
-    /// Pixels nearer than the display shows, set to its near end.
+    /// Pixels of the source nearer than the display shows, set to its near end.
     pub depth_clamped_near_px: usize,
-    /// Colour values above white or not finite, which were clipped.
+    /// The least and the greatest normalised depth of the source's pixels.
+    pub depth_range: [f32; 2],
+    /// Pixels of the source with colours above white or not finite, which were clipped.
     pub colour_clipped_px: usize,
     /// Pixels of the frame that the picture does not reach: black, at the far end.
     pub padded_px: usize,
@@ -140,7 +145,8 @@ pub struct Scene {
 
 impl Scene {
     /// Opens a scene as a command line names it: a directory with a `scene.toml`, that file itself, `COLOUR,DEPTH`, or
-    /// one OpenEXR file with colour and depth. The latter two need `depth_encoding`; a scene file names its own.
+    /// one OpenEXR file with colour and depth. The latter two need `depth_encoding`; a scene file names its own, and
+    /// another one beside it is an error.
     ///
     /// Pictures are read when they are loaded, so a missing or damaged one is reported then.
     pub fn open(spec: &str, depth_encoding: Option<DepthEncoding>) -> Result<Self, SceneError> {
@@ -155,6 +161,27 @@ impl Scene {
     /// Frames a second, where the scene says so.
     pub fn fps(&self) -> Option<f64> {
         self.description.fps
+    }
+
+    /// Frames a second at which the scene is played; none of a still.
+    ///
+    /// # Errors
+    /// It is a sequence that does not say so.
+    pub fn playback_fps(&self) -> Result<Option<f64>, SceneError> {
+        let Description { path, frames, fps, sequence_line, .. } = &self.description;
+        match fps {
+            _ if *frames == 1 => Ok(None),
+            Some(fps) => Ok(Some(*fps)),
+            None => Err(SceneError::Description {
+                path: path.clone(),
+                line: *sequence_line,
+                key: "fps".into(),
+                found: format!("none for this sequence of {frames} frames"),
+                expected:
+                    "how many are shown a second: write, for example, fps = 30.0, or count = 1 for the first alone"
+                        .into(),
+            }),
+        }
     }
 
     /// Loads frame `index` for the depth range of `geometry`, at `resolution` or, without one, at the picture's own.
@@ -260,8 +287,10 @@ impl Scene {
                 return Err(SceneError::SizesDiffer {
                     colour: colour_path,
                     colour_size: colour.size,
+                    colour_orientation: colour.turned.to_exif(),
                     depth: depth_path,
                     depth_size: depth.size,
+                    depth_orientation: depth.turned.to_exif(),
                 });
             };
             depth_dpt = placement.nearest(&depth_dpt, 0.0);
@@ -276,15 +305,24 @@ fn normalised(depth_dpt: &[f32], geometry: &DisplayGeometry, report: &mut FrameR
     clamped(depth_dpt.iter().map(normalise), report)
 }
 
-/// Normalised depths clamped to the display's range; counts those that were outside.
+/// Normalised depths clamped to the display's range; counts those that were outside, and notes how far they reach.
 fn clamped(depths: impl Iterator<Item = f32>, report: &mut FrameReport) -> Vec<f32> {
+    let mut depths: Vec<f32> = depths.collect();
+    clamp(&mut depths, report);
     depths
-        .map(|depth| {
-            report.depth_clamped_far_px += usize::from(depth < -ROUNDING);
-            report.depth_clamped_near_px += usize::from(depth > 1.0 + ROUNDING);
-            depth.clamp(0.0, 1.0)
-        })
-        .collect()
+}
+
+/// [`clamped`] in place.
+fn clamp(depths: &mut [f32], report: &mut FrameReport) {
+    let [mut least, mut greatest] = [f32::MAX, f32::MIN];
+    for depth in depths {
+        report.depth_clamped_far_px += usize::from(*depth < -ROUNDING);
+        report.depth_clamped_near_px += usize::from(*depth > 1.0 + ROUNDING);
+        *depth = depth.clamp(0.0, 1.0);
+        least = least.min(*depth);
+        greatest = greatest.max(*depth);
+    }
+    report.depth_range = [least, greatest];
 }
 
 impl DepthEncoding {
@@ -310,6 +348,18 @@ impl DepthEncoding {
                     Err(unknown())
                 }
             }
+        }
+    }
+}
+
+/// As on a command line.
+impl fmt::Display for DepthEncoding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Metres => f.write_str("metres"),
+            Self::Millimetres => f.write_str("millimetres"),
+            Self::Dioptres => f.write_str("dioptres"),
+            Self::NormalisedDioptres { far_dpt, near_dpt } => write!(f, "normalised_dioptres:{far_dpt},{near_dpt}"),
         }
     }
 }

@@ -10,6 +10,7 @@ use exr::image::{AnyChannel, FlatSamples};
 use exr::meta::MetaData;
 use exr::prelude::{ReadChannels, ReadLayers};
 use holod_calibration::Resolution;
+use image::metadata::Orientation;
 
 use super::SceneError;
 use super::decoded::{ColourRaster, DepthRaster, FORMATS, MOST_PIXELS, check_size};
@@ -25,23 +26,25 @@ struct Picture {
 
 /// One channel with the part of the plane that it covers.
 struct Channel {
-    /// `R`, or with its layer `ViewLayer.Combined.R`.
+    /// `R`, or with its layer `ViewLayer.Combined.R`; of a file with several parts it begins with the part's name.
     name: String,
+    /// Whether it is in no layer of its part.
+    is_bare: bool,
     origin: [i64; 2],
     size: Resolution,
     samples: FlatSamples,
 }
 
+/// Channels whose names are alike but for the last part.
+struct Layer<'a> {
+    /// `ViewLayer.Combined`; empty for channels that are in none.
+    name: &'a str,
+    channels: Vec<&'a Channel>,
+}
+
 pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
     let picture = read(path)?;
-    let names = ["r", "g", "b"].map(|name| picture.find(|channel| channel.component() == name));
-    let channels = match names {
-        [Some(red), Some(green), Some(blue)] => [red, green, blue],
-        _ => match picture.find(|channel| channel.component() == "y") {
-            Some(luminance) => [luminance; 3],
-            None => return Err(picture.lacks(path, "channels R, G and B, or Y")),
-        },
-    };
+    let channels = picture.colours(path)?;
     let pixels = picture.size.pixels();
     let mut linear = vec![0.0; 3 * pixels];
     let mut clipped = vec![false; pixels];
@@ -52,25 +55,92 @@ pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
         });
     }
     let clipped_px = clipped.into_iter().filter(|&clipped| clipped).count();
-    Ok(ColourRaster { size: picture.size, linear, clipped_px })
+    Ok(ColourRaster { size: picture.size, turned: Orientation::NoTransforms, linear, clipped_px })
 }
 
 pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
     let picture = read(path)?;
-    let channel = picture
-        .find(|channel| channel.component() == "z")
-        .or_else(|| picture.find(|channel| channel.component() == "depth" || channel.layer() == "depth"))
-        // A file of depth alone often calls it luminance.
-        .or_else(|| picture.find(|channel| channel.component() == "y"));
-    let Some(channel) = channel else { return Err(picture.lacks(path, "a depth channel Z, `*.Z`, `Depth` or Y")) };
+    let channel = picture.depth(path)?;
     let mut values = vec![f32::NAN; picture.size.pixels()];
     picture.place(channel, |index, value| values[index] = value);
-    Ok(DepthRaster { size: picture.size, numbers: DepthNumbers { values, full_scale: None } })
+    let numbers = DepthNumbers { values, full_scale: None };
+    Ok(DepthRaster { size: picture.size, turned: Orientation::NoTransforms, numbers })
 }
 
 impl Picture {
-    fn find(&self, wanted: impl Fn(&Channel) -> bool) -> Option<&Channel> {
-        self.channels.iter().find(|channel| wanted(channel))
+    /// Red, green and blue of one layer: of none, of one called Combined, or else of the only one. A picture without
+    /// them may have luminance.
+    fn colours(&self, path: &Path) -> Result<[&Channel; 3], SceneError> {
+        let mut candidates = Vec::new();
+        for layer in self.layers() {
+            if let [Some(red), Some(green), Some(blue)] = ["R", "G", "B"].map(|name| layer.channel(name)) {
+                let rules = [layer.name.is_empty(), layer.is_called("Combined"), red.is_bare, true];
+                let rank = rules.iter().take_while(|keeps| !**keeps).count();
+                candidates.push((rank, layer.name, [red, green, blue]));
+            } else if let Some((rank, luminance)) = layer.luminance() {
+                candidates.push((4 + rank, luminance.name.as_str(), [luminance; 3]));
+            }
+        }
+        let expected = "channels R, G and B in no layer, in one called Combined or in only one, or else Y";
+        self.best(path, candidates, "colours", expected)
+    }
+
+    /// Z in no layer or in one called Depth. A file of depth alone often calls it luminance.
+    fn depth(&self, path: &Path) -> Result<&Channel, SceneError> {
+        let mut candidates = Vec::new();
+        for layer in self.layers() {
+            let z = layer.channel("Z").filter(|_| !layer.is_vector());
+            let named = match &layer.channels[..] {
+                _ if !layer.is_called("Depth") => layer.channel("Depth"),
+                [only] => Some(*only),
+                _ => z,
+            };
+            let found = match (named, z) {
+                (_, Some(z)) if layer.name.is_empty() => Some((0, z)),
+                (Some(named), _) => Some((1, named)),
+                (None, Some(z)) if z.is_bare => Some((2, z)),
+                _ => layer.luminance().map(|(rank, luminance)| (3 + rank, luminance)),
+            };
+            candidates.extend(found.map(|(rank, channel)| (rank, channel.name.as_str(), channel)));
+        }
+        let expected = "one depth channel: Z in no layer or in one called Depth, without X and Y, or else Y";
+        self.best(path, candidates, "depth", expected)
+    }
+
+    /// The one of the lowest rank; each has the name that says which it is.
+    fn best<T>(
+        &self,
+        path: &Path,
+        candidates: Vec<(usize, &str, T)>,
+        what: &str,
+        expected: &str,
+    ) -> Result<T, SceneError> {
+        let Some(rank) = candidates.iter().map(|(rank, ..)| *rank).min() else {
+            return Err(self.lacks(path, expected));
+        };
+        let mut best: Vec<_> = candidates.into_iter().filter(|(of, ..)| *of == rank).collect();
+        if best.len() > 1 {
+            let names: Vec<_> = best.iter().map(|(_, name, _)| *name).collect();
+            return Err(SceneError::Picture {
+                path: path.to_owned(),
+                found: format!("{what} more than once: {}", names.join(", ")),
+                expected: format!("{expected}: export only one of them"),
+            });
+        }
+        Ok(best.remove(0).2)
+    }
+
+    /// Layers in the order of the file.
+    fn layers(&self) -> Vec<Layer<'_>> {
+        let mut layers: Vec<Layer<'_>> = Vec::new();
+        for channel in &self.channels {
+            let name = channel.layer();
+            match layers.iter_mut().find(|layer| layer.name == name) {
+                Some(layer) => layer.channels.push(channel),
+                None => layers.push(Layer { name, channels: vec![channel] }),
+            }
+        }
+        layers
     }
 
     fn lacks(&self, path: &Path, expected: &str) -> SceneError {
@@ -98,14 +168,36 @@ impl Picture {
 }
 
 impl Channel {
-    /// The name's last part in lower case.
-    fn component(&self) -> String {
-        self.name.rsplit('.').next().unwrap_or_default().to_ascii_lowercase()
+    /// The name's last part.
+    fn component(&self) -> &str {
+        self.name.rsplit('.').next().unwrap_or_default()
     }
 
-    /// The part before the last in lower case.
-    fn layer(&self) -> String {
-        self.name.rsplit('.').nth(1).unwrap_or_default().to_ascii_lowercase()
+    /// The name without its last part.
+    fn layer(&self) -> &str {
+        self.name.rsplit_once('.').map_or("", |(layer, _)| layer)
+    }
+}
+
+impl<'a> Layer<'a> {
+    fn channel(&self, component: &str) -> Option<&'a Channel> {
+        self.channels.iter().copied().find(|channel| channel.component().eq_ignore_ascii_case(component))
+    }
+
+    /// Whether that is the last part of its name.
+    fn is_called(&self, name: &str) -> bool {
+        self.name.rsplit('.').next().is_some_and(|last| last.eq_ignore_ascii_case(name))
+    }
+
+    /// Whether Z is not alone: a normal or a motion.
+    fn is_vector(&self) -> bool {
+        self.channel("X").is_some() && self.channel("Y").is_some()
+    }
+
+    /// Luminance, with 0 where it is in no layer and 1 where it is in one.
+    fn luminance(&self) -> Option<(usize, &'a Channel)> {
+        let luminance = self.channel("Y").filter(|_| self.channel("X").is_none())?;
+        Some((usize::from(!self.name.is_empty()), luminance))
     }
 }
 
@@ -156,15 +248,18 @@ fn read(path: &Path) -> Result<Picture, SceneError> {
         .map_err(damaged)?;
     let window = image.attributes.display_window;
     let size = check_size(path, window.size.width(), window.size.height())?;
+    let has_parts = image.layer_data.len() > 1;
     let channels = image
         .layer_data
         .into_iter()
         .flat_map(|layer| {
             let position = layer.attributes.layer_position;
             let size = Resolution { width: layer.size.width(), height: layer.size.height() };
-            let prefix = layer.attributes.layer_name.map(|name| format!("{name}.")).unwrap_or_default();
+            let part = layer.attributes.layer_name.filter(|_| has_parts);
+            let prefix = part.map(|name| format!("{name}.")).unwrap_or_default();
             layer.channel_data.list.into_iter().map(move |AnyChannel { name, sample_data, .. }| Channel {
                 name: format!("{prefix}{name}"),
+                is_bare: !name.to_string().contains('.'),
                 origin: [i64::from(position.x()), i64::from(position.y())],
                 size,
                 samples: sample_data,

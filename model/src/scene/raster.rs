@@ -5,11 +5,12 @@ use std::io::BufReader;
 use std::path::Path;
 
 use holod_calibration::Resolution;
-use image::{DynamicImage, ImageFormat, ImageReader};
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader};
 
 use super::decoded::{ColourRaster, DepthRaster, FORMATS, check_size};
 use super::depth::DepthNumbers;
-use super::{SceneError, openexr};
+use super::{SceneError, jpeg, openexr};
 use crate::picture::srgb_to_linear;
 
 /// What kind of file a path holds, by its first bytes.
@@ -23,9 +24,9 @@ pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
     match format_of(path)? {
         Format::OpenExr => openexr::read_colour(path),
         Format::Other => {
-            let picture = decode(path)?;
+            let (picture, turned) = decode(path)?;
             let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
-            Ok(ColourRaster { size, linear: linear_planes(&picture), clipped_px: 0 })
+            Ok(ColourRaster { size, turned, linear: linear_planes(&picture), clipped_px: 0 })
         }
     }
 }
@@ -35,9 +36,9 @@ pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
     match format_of(path)? {
         Format::OpenExr => openexr::read_depth(path),
         Format::Other => {
-            let picture = decode(path)?;
+            let (picture, turned) = decode(path)?;
             let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
-            Ok(DepthRaster { size, numbers: depth_numbers(path, picture)? })
+            Ok(DepthRaster { size, turned, numbers: depth_numbers(path, picture)? })
         }
     }
 }
@@ -55,7 +56,8 @@ fn format_of(path: &Path) -> Result<Format, SceneError> {
     Ok(if magic == [0x76, 0x2f, 0x31, 0x01] { Format::OpenExr } else { Format::Other })
 }
 
-fn decode(path: &Path) -> Result<DynamicImage, SceneError> {
+/// The picture as viewers show it, and how its file says that it is turned for that.
+fn decode(path: &Path) -> Result<(DynamicImage, Orientation), SceneError> {
     let damaged = |found: String| SceneError::Picture {
         path: path.to_owned(),
         found,
@@ -68,19 +70,18 @@ fn decode(path: &Path) -> Result<DynamicImage, SceneError> {
     };
     if open()?.format() == Some(ImageFormat::Jpeg) {
         let bytes = std::fs::read(path).map_err(read_error)?;
-        if !jpeg_is_whole(&bytes) {
+        if !jpeg::is_whole(&bytes) {
             return Err(damaged("the JPEG data end before the end-of-image marker".into()));
         }
     }
-    let (width, height) = open()?.into_dimensions().map_err(|error| damaged(error.to_string()))?;
+    let damaged = |error: ImageError| damaged(error.to_string());
+    let mut decoder = open()?.into_decoder().map_err(damaged)?;
+    let (width, height) = decoder.dimensions();
     check_size(path, width as usize, height as usize)?;
-    open()?.decode().map_err(|error| damaged(error.to_string()))
-}
-
-/// Whether an end-of-image marker stands behind the last start of a scan: the decoder fills what was cut off with grey.
-fn jpeg_is_whole(bytes: &[u8]) -> bool {
-    let last = |marker: [u8; 2]| bytes.windows(2).rposition(|pair| pair == marker);
-    last([0xff, 0xd9]) > last([0xff, 0xda])
+    let turned = decoder.orientation().map_err(damaged)?;
+    let mut picture = DynamicImage::from_decoder(decoder).map_err(damaged)?;
+    picture.apply_orientation(turned);
+    Ok((picture, turned))
 }
 
 /// Linear light of each colour; transparent pixels over black.

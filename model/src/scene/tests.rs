@@ -83,6 +83,22 @@ impl Files {
     }
 }
 
+/// An OpenEXR file of two pixels, each part of which has its channels with one value each.
+fn write_parts(path: &Path, parts: &[(&str, &[(&str, f32)])]) {
+    let layers = parts.iter().map(|(part, channels)| {
+        let channel = |&(name, value): &(&str, f32)| AnyChannel::new(name, FlatSamples::F32(vec![value; 2]));
+        Layer::new(
+            Vec2(2, 1),
+            LayerAttributes::named(Text::from(*part)),
+            Encoding::UNCOMPRESSED,
+            AnyChannels::sort(channels.iter().map(channel).collect()),
+        )
+    });
+    let window = IntegerBounds { position: Vec2(0, 0), size: Vec2(2, 1) };
+    let image = Image::from_layers(ImageAttributes::new(window), layers.collect::<Vec<_>>());
+    image.write().to_file(path).unwrap();
+}
+
 const MILLIMETRES: &str = "colour = \"c.png\"\ndepth = \"d.png\"\ndepth_encoding = \"millimetres\"\n";
 
 #[test]
@@ -101,7 +117,12 @@ fn a_pair_of_pngs_becomes_amplitude_and_normalised_depth() {
     for (actual, expected) in frame.depth_normalised.iter().zip([1.0, 0.5, 0.5]) {
         assert!((actual - expected).abs() < 1e-5, "{actual} for {expected}");
     }
-    let expected = FrameReport { source: Some(size(3, 1)), depth_missing_px: 1, ..FrameReport::default() };
+    let expected = FrameReport {
+        source: Some(size(3, 1)),
+        depth_missing_px: 1,
+        depth_range: [frame.depth_normalised[1], frame.depth_normalised[0]],
+        ..FrameReport::default()
+    };
     assert_eq!(report, expected);
 
     let pair = format!("{},{}", files.path("c.png").display(), files.path("d.png").display());
@@ -195,6 +216,89 @@ fn an_exr_with_a_small_data_window_fills_the_display_window() {
 }
 
 #[test]
+fn an_exrs_colours_are_those_of_one_layer_and_its_depth_is_no_vector() {
+    let files = Files::new();
+    let path = files.path("layers.exr");
+    let colours = || raster::read_colour(&path).map(|colour| [0, 2, 4].map(|plane| colour.linear[plane]));
+    let depth = || raster::read_depth(&path).map(|depth| depth.numbers.values[0]);
+    let rgb = |layer: &str, red: f32| {
+        [("R", red), ("G", red + 0.01), ("B", red + 0.02)].map(|(name, value)| (format!("{layer}{name}"), value))
+    };
+    let xyz = |layer: &str| ["X", "Y", "Z"].map(|name| (format!("{layer}{name}"), 9.0));
+    let one = |name: &str, value: f32| [(name.to_owned(), value)];
+    let write = |parts: &[(&str, Vec<(String, f32)>)]| {
+        let borrowed: Vec<(&str, Vec<(&str, f32)>)> = parts
+            .iter()
+            .map(|(part, channels)| (*part, channels.iter().map(|(name, value)| (name.as_str(), *value)).collect()))
+            .collect();
+        write_parts(&path, &borrowed.iter().map(|(part, channels)| (*part, &channels[..])).collect::<Vec<_>>());
+    };
+    let shown = [0.5, 0.51, 0.52];
+    let blender = [
+        &rgb("ViewLayer.AO.", 0.1)[..],
+        &rgb("ViewLayer.Combined.", 0.5),
+        &xyz("ViewLayer.Denoising Normal."),
+        &one("ViewLayer.Depth.Z", 3.0),
+        &one("ViewLayer.Mist.Z", 0.7),
+    ]
+    .concat();
+    for (what, parts) in [
+        ("Blender's passes", vec![("", blender.clone())]),
+        (
+            "no layer before layers",
+            vec![("main", [&rgb("", 0.5)[..], &one("Z", 3.0), &rgb("Combined.", 0.1), &one("Depth.Z", 1.0)].concat())],
+        ),
+        ("small letters", vec![("", [&rgb("beauty.", 0.5)[..], &one("depth.z", 3.0), &xyz("n.")].concat())]),
+        ("a depth layer's only channel", vec![("", [&rgb("", 0.5)[..], &one("a.Depth.V", 3.0), &xyz("N.")].concat())]),
+        ("a channel called depth", vec![("", [&rgb("", 0.5)[..], &one("depth", 3.0), &xyz("P.")].concat())]),
+        ("parts", vec![("rgba", rgb("", 0.5).to_vec()), ("normals", xyz("").to_vec()), ("z", one("Z", 3.0).to_vec())]),
+        (
+            "parts with a layer each",
+            vec![
+                ("a", [&rgb("AO.", 0.1)[..], &rgb("Combined.", 0.5)].concat()),
+                ("b", [&one("Depth.Z", 3.0)[..], &one("Mist.Z", 1.0)].concat()),
+            ],
+        ),
+    ] {
+        write(&parts);
+        assert_eq!((colours().unwrap(), depth().unwrap()), (shown, 3.0), "{what}");
+    }
+    write(&[("", [&one("Y", 0.5)[..], &xyz("normal.")].concat())]);
+    assert_eq!((colours().unwrap(), depth().unwrap()), ([0.5; 3], 0.5), "luminance alone");
+
+    let two = [
+        &rgb("left.Combined.", 0.5)[..],
+        &rgb("right.Combined.", 0.5),
+        &one("left.Depth.Z", 3.0),
+        &one("right.Depth.Z", 3.0),
+    ]
+    .concat();
+    let others = [&rgb("AO.", 0.5)[..], &rgb("Emit.", 0.5), &xyz("Normal."), &one("Mist.Z", 0.5)].concat();
+    let parts = |part| (part, [&rgb("", 0.5)[..], &one("Z", 3.0)].concat());
+    let apart = vec![("", [&one("a.R", 0.5)[..], &one("b.G", 0.5), &one("c.B", 0.5)].concat())];
+    for (parts, of_colours, of_depth) in [
+        (
+            vec![("", two)],
+            &["colours more than once: left.Combined, right.Combined;", "export only one"][..],
+            &["depth more than once: left.Depth.Z, right.Depth.Z;", "export only one"][..],
+        ),
+        (
+            vec![("", others)],
+            &["more than once: AO, Emit;", "Combined"],
+            &["the channels AO.B, AO.G, AO.R, Emit.B,", "Mist.Z, Normal.X", "called Depth"],
+        ),
+        (vec![parts("l"), parts("r")], &["more than once: l, r;"], &["more than once: l.Z, r.Z;"]),
+        (apart, &["the channels a.R, b.G, c.B;", "R, G and B"], &["the channels a.R, b.G, c.B;", "Z"]),
+    ] {
+        write(&parts);
+        for (error, says) in [(colours().unwrap_err(), of_colours), (depth().unwrap_err(), of_depth)] {
+            let error = error.to_string();
+            assert!(says.iter().all(|part| error.contains(part)) && error.contains("layers.exr"), "{error}");
+        }
+    }
+}
+
+#[test]
 fn a_sequence_has_as_many_frames_as_files() {
     let files = Files::new();
     for index in 2..5 {
@@ -255,6 +359,60 @@ fn a_jpeg_that_was_cut_short_is_refused() {
         let error = raster::read_colour(&path).err().unwrap().to_string();
         assert!(error.contains("c.jpg") && error.contains("end-of-image"), "{length}: {error}");
     }
+}
+
+/// A JPEG with an EXIF orientation, 16x8, bright in its upper left quarter.
+fn jpeg_turned(path: &Path, orientation: u8) {
+    let mut jpeg = Vec::new();
+    let bright = |x, y| Rgb([if x < 8 && y < 4 { 255_u8 } else { 0 }; 3]);
+    let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 100);
+    ImageBuffer::from_fn(16, 8, bright).write_with_encoder(encoder).unwrap();
+    // One entry of a directory of TIFF: a short that is the orientation.
+    let entry = [0x01, 0x12, 0, 3, 0, 0, 0, 1, 0, orientation, 0, 0];
+    let exif = [&b"Exif\0\0MM\0\x2a\0\0\0\x08\0\x01"[..], &entry, &[0; 4]].concat();
+    let segment = [&[0xff, 0xe1, 0, exif.len() as u8 + 2][..], &exif].concat();
+    std::fs::write(path, [&jpeg[..2], &segment, &jpeg[2..]].concat()).unwrap();
+}
+
+#[test]
+fn a_picture_is_turned_by_its_own_orientation() {
+    let files = Files::new();
+    files.describe("colour = \"c.jpg\"\ndepth = \"d.png\"\ndepth_encoding = \"millimetres\"\n");
+    for (orientation, shown, bright) in [(1, size(16, 8), [0, 0]), (3, size(16, 8), [1, 1]), (6, size(8, 16), [1, 0])] {
+        jpeg_turned(&files.path("c.jpg"), orientation);
+        files.depth16("d.png", shown.width as u32, shown.height as u32, |x, _| 500 + x as u16);
+        let (frame, report) = files.open().load(0, &BENCH, None, Fit::Native).unwrap();
+        assert_eq!((frame.resolution, report.source), (shown, Some(shown)));
+        for y in 0..shown.height {
+            for x in 0..shown.width {
+                let is_bright = [2 * x / shown.width, 2 * y / shown.height] == bright;
+                let light = frame.amplitude[y * shown.width + x];
+                assert_eq!(light > 0.5, is_bright, "orientation {orientation}: {light} at {x}, {y}");
+            }
+        }
+        assert!(frame.depth_normalised.chunks_exact(shown.width).all(|row| row.is_sorted_by(|a, b| a > b)));
+    }
+    files.depth16("d.png", 16, 8, |x, _| 500 + x as u16);
+    for fit in [Fit::Native, Fit::Cover] {
+        let error = files.open().load(0, &BENCH, None, fit).unwrap_err().to_string();
+        let said = ["d.png is 16x8 and ", "c.jpg is 8x16 (turned by its EXIF orientation 6);"];
+        assert!(said.iter().all(|part| error.contains(part)), "{error}");
+    }
+    jpeg_turned(&files.path("d.jpg"), 8);
+    let turned = raster::read_depth(&files.path("d.jpg")).unwrap();
+    assert_eq!((turned.size, turned.turned.to_exif()), (size(8, 16), 8), "depth is turned by its own");
+}
+
+#[test]
+fn a_jpeg_with_a_film_behind_it_is_read() {
+    let files = Files::new();
+    let path = files.path("motion.jpg");
+    let whole = include_bytes!("progressive.jpg");
+    std::fs::write(&path, whole).unwrap();
+    let picture = raster::read_colour(&path).unwrap();
+    assert_eq!(picture.size, size(24, 16));
+    std::fs::write(&path, [&whole[..], b"\0\0\0\x18ftypmp42\xff\xda\0\x08mdat"].concat()).unwrap();
+    assert!(raster::read_colour(&path).unwrap().linear == picture.linear);
 }
 
 #[test]

@@ -46,9 +46,9 @@ def load_scene(
 
     `path` is a folder with a scene.toml, that file, "COLOUR,DEPTH", or an OpenEXR file with both. For the latter two
     `depth_encoding` says what the depth file's numbers are: "metres", "millimetres", "dioptres", or
-    "normalised_dioptres:FAR,NEAR" in dioptres, whose ends are those of `rig` where they are left out. `frame` is the
-    picture's place in a sequence. `width_px` and `height_px` bring it to another size in the way of `fit`; nothing is
-    stretched.
+    "normalised_dioptres:FAR,NEAR" in dioptres, whose ends are those of `rig` where they are left out; a scene.toml
+    names its own, and another one beside it is refused. `frame` is the picture's place in a sequence. `width_px` and
+    `height_px` bring it to another size in the way of `fit`; nothing is stretched.
 
     Raises InputError with the file, what was found in it and what was expected.
     """

@@ -416,7 +416,7 @@ impl Server {
                     tell_field_of_view(client, tag.view, target);
                     let bad = BadDepths::from(&report);
                     status.count_depths(bad);
-                    tell_oddities(client, &bad, Some((&frame, &report)), target);
+                    tell_oddities(client, &bad, Some(&report), target);
                 }
                 Err(PictureRefusal::Picture(TakeError::Picture(LiveError::NoDepth { missing, .. }))) => {
                     let bad = BadDepths::from(missing);
@@ -490,22 +490,22 @@ fn make(client: &mut Client, copied: &Copied, frame: &mut Arc<RgbdFrame>) -> Liv
 
 /// Says once of each client what is most often a mistake: depths of which most are bad, and oddities of its first
 /// picture, where a frame could be made of that.
-fn tell_oddities(client: &mut Client, bad: &BadDepths, made: Option<(&RgbdFrame, &LiveReport)>, target: &Target) {
+fn tell_oddities(client: &mut Client, bad: &BadDepths, made: Option<&LiveReport>, target: &Target) {
     let name = format!("the feed's client `{}`", client.name);
     let format = client.stream().format();
-    let pixels = format.resolution.pixels() as u64;
+    let pixels = format.resolution.pixels();
     let is_first = made.is_some() && !client.is_known;
     client.is_known |= made.is_some();
-    let are_bad = 2 * bad.missing().max(bad.beyond()) > pixels;
+    let are_bad = 2 * bad.missing().max(bad.beyond()) > pixels as u64;
     if are_bad && !std::mem::replace(&mut client.told_depths, true) {
         let (text, cure) = (bad.text(), bad.likely_cure(format.depth));
         tracing::warn!("{name}: of {pixels} depths, these cannot be shown as they are: {text}; {cure}");
     }
-    if let Some((frame, report)) = made.filter(|_| is_first) {
+    if let Some(report) = made.filter(|_| is_first) {
         if are_bad {
-            scene::warn_of_clipped_colours(&name, report.frame.colour_clipped_px, frame.resolution.pixels());
+            scene::warn_of_clipped_colours(&name, report.frame.colour_clipped_px, pixels);
         } else {
-            scene::warn_of_oddities(&name, frame, &report.frame, &target.geometry, client.sends_planes());
+            scene::warn_of_oddities(&name, &report.frame, &target.geometry, client.sends_planes());
         }
     }
 }

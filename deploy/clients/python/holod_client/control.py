@@ -60,7 +60,9 @@ class Control:
         return self.ask("status")
 
     def scene(self, scene: str | os.PathLike[str], depth_encoding: str | None = None, fit: str = "native") -> str:
-        """Shows another scene (a folder, or "COLOUR,DEPTH"), or the live feed again ("feed")."""
+        """Shows another scene (a folder, or "COLOUR,DEPTH"), or the live feed again ("feed").
+
+        `depth_encoding` is for "COLOUR,DEPTH": a folder's scene.toml names its own."""
         named = os.fspath(scene)
         if named != "feed":
             parts = [named] if os.path.exists(named) else named.split(",")
