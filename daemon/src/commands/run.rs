@@ -45,8 +45,8 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let weights = progress::during("loading the network", || setup::weights(&rig))?;
     let pictures =
         progress::during("loading the scene", || source::named(&args.scene, args.feed_dark_after, &rig.geometry))?;
-    let folder = args.record.as_deref().map(|path| RecordFolder::claim(path, args.force)).transpose()?;
     let page = Page::open(&args.page)?;
+    let folder = args.record.as_deref().map(|path| RecordFolder::claim(path, args.force)).transpose()?;
     let recorder = |folder| Recorder::create(folder, args, &rig, pictures.resolution());
     let recorder = folder.map(recorder).transpose()?;
     let mut observers = (recorder.map(|recorder| recorder.with_tracker(tracker.to_string())), page);
@@ -86,11 +86,11 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         }
     };
     let (Some(mut recorder), _) = observers else { return tell(args, &session.summary, None) };
-    recorder.finish();
+    let has_record = recorder.finish();
     let health = recorder.health();
-    session.summary.figures.record = Some(health.state());
+    session.summary.figures.record = (has_record || health.is_lost()).then(|| health.state());
     let session = Arc::new(session);
-    if !health.is_lost() {
+    if has_record && !health.is_lost() {
         finish_record(&session, recorder.folder(), &health)?;
     }
     let told = tell(args, &session.summary, None);

@@ -112,6 +112,8 @@ pub(crate) struct Recorder {
     reading: Option<JoinHandle<()>>,
     entries: Arc<Queue<Entry>>,
     writer: Option<JoinHandle<Writing>>,
+    /// What it had in hand at its end.
+    written: Option<Writing>,
     health: Arc<RecordHealth>,
     slowness: Slowness,
 }
@@ -158,6 +160,7 @@ impl Recorder {
             reading: None,
             entries,
             writer: Some(writer),
+            written: None,
             health,
             slowness: Slowness::default(),
         })
@@ -202,14 +205,21 @@ impl Recorder {
     }
 
     /// Hands everything to the operating system and ends the log. A disk that does not take it within seconds has lost
-    /// the record.
-    pub(crate) fn finish(&mut self) {
-        if let Some(mut writing) = self.end_writing() {
-            writing.folder.keep();
-        }
+    /// the record. Whether there is one: where no frame was written, an earlier record is put back when this is dropped.
+    pub(crate) fn finish(&mut self) -> bool {
+        self.written = self.end_writing();
         self.log.flush();
         self.note_log();
         self.log.end();
+        let Some(Writing { folder, .. }) = &mut self.written else { return false };
+        if folder.earlier_waits() {
+            tracing::warn!("no frame was recorded: the earlier record in {} stays", self.folder.display());
+            return false;
+        }
+        if let Err(failure) = folder.keep() {
+            self.health.give_up(&failure.to_string());
+        }
+        true
     }
 
     /// Ends the record of a run that failed. Where no frame was ever made it is taken away again, so that the same
@@ -350,10 +360,9 @@ fn write_entries(entries: &Queue<Entry>, mut writing: Writing, run: &Path, healt
             Entry::Order(t, request) => frames.order(t, &request),
         };
         let written = taken.drain(..).try_for_each(&mut write).and_then(|()| frames.flush());
-        match written {
-            Ok(()) if !frames.is_empty() => folder.keep(),
-            Ok(()) => {}
-            Err(failure) => health.give_up(&failure.to_string()),
+        let kept = written.and_then(|()| if frames.is_empty() { Ok(()) } else { folder.keep() });
+        if let Err(failure) = kept {
+            health.give_up(&failure.to_string());
         }
     }
     writing
@@ -409,8 +418,15 @@ mod tests {
     use holod_calibration::PupilDiameter;
 
     fn recorder(folder: &Path) -> Recorder {
+        recorder_in(RecordFolder::claim(folder, false).unwrap())
+    }
+
+    fn forced_recorder(folder: &Path) -> Recorder {
+        recorder_in(RecordFolder::claim(folder, true).unwrap())
+    }
+
+    fn recorder_in(folder: RecordFolder) -> Recorder {
         let args = Cli::try_parse_from(["holod", "--record", "elsewhere"]).unwrap().run;
-        let folder = RecordFolder::claim(folder, false).unwrap();
         Recorder::create(folder, &args, &Rig::default(), Resolution { width: 64, height: 64 }).unwrap()
     }
 
@@ -459,6 +475,26 @@ mod tests {
         recorder.finish();
         assert!(!recorder.health.is_lost());
         assert_eq!(fs::read_to_string(folder.path().join("record").join(ORDERS)).unwrap().lines().count(), 1);
+    }
+
+    #[test]
+    fn an_earlier_record_goes_with_the_first_frame() {
+        let folder = tempfile::tempdir().unwrap();
+        let frames_csv = || fs::read_to_string(folder.path().join(FRAMES)).unwrap();
+        fs::write(folder.path().join(FRAMES), "old").unwrap();
+        let mut without_frame = forced_recorder(folder.path());
+        assert!(!without_frame.finish());
+        drop(without_frame);
+        assert_eq!(frames_csv(), "old");
+
+        forced_recorder(folder.path()).fail(&Failure::new(Exit::Unavailable, "no panel"));
+        assert_eq!(frames_csv(), "old");
+
+        let mut recorder = forced_recorder(folder.path());
+        recorder.frame(&frame(1)).unwrap();
+        assert!(recorder.finish());
+        drop(recorder);
+        assert!(frames_csv().starts_with("frame,field,"));
     }
 
     #[test]

@@ -78,7 +78,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     let ended_by = loop {
         std::thread::sleep(TICK);
         let now = host_now();
-        keep_what_came(folder.as_mut(), &tracker);
+        keep_what_came(folder.as_mut(), &tracker)?;
         while let Some(decision) = tracker.decisions.pop() {
             observed.take(&decision);
             refusals.note(&decision);
@@ -99,7 +99,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
             live.show(&format!("{}\n{text}", traces(&observed, now, LiveText::visible(), text.lines().count())));
         }
     };
-    keep_what_came(folder.as_mut(), &tracker);
+    keep_what_came(folder.as_mut(), &tracker)?;
     let now = host_now();
     let last = report_of(&spec, &ended_by, began, now, &observed, &mut tracker);
     tracker.control.stop();
@@ -139,14 +139,11 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     Err(Failure::new(Exit::Unavailable, format!("tracker {spec}: {heard}")))
 }
 
-/// A recording of silence is not worth keeping.
-fn keep_what_came(folder: Option<&mut RecordFolder>, tracker: &TrackerHandle) {
+/// A recording of silence is not worth keeping, and takes no earlier one's place.
+fn keep_what_came(folder: Option<&mut RecordFolder>, tracker: &TrackerHandle) -> Result<(), Failure> {
     let counters = tracker.control.counters();
-    if let Some(folder) = folder
-        && (counters.of(Counter::Bytes) > 0 || counters.of(Counter::Samples) > 0)
-    {
-        folder.keep();
-    }
+    let came = counters.of(Counter::Bytes) > 0 || counters.of(Counter::Samples) > 0;
+    folder.filter(|_| came).map_or(Ok(()), RecordFolder::keep)
 }
 
 fn spec_of(args: &TryArgs, rig: &Rig) -> Result<TrackerSpec, Failure> {
