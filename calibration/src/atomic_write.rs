@@ -3,20 +3,37 @@
 use std::ffi::OsString;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
+use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 
 /// Bytes written at a time.
 const BUFFER_BYTES: usize = 1 << 16;
 
+/// What is at `path` where it is, or leads to, something that no file may take the place of: a device, a pipe or a
+/// socket.
+pub fn special_file(path: &Path) -> Option<&'static str> {
+    let kind = fs::metadata(path).ok()?.file_type();
+    let kinds = [
+        (kind.is_char_device() || kind.is_block_device(), "a device"),
+        (kind.is_fifo(), "a pipe"),
+        (kind.is_socket(), "a socket"),
+    ];
+    kinds.into_iter().find(|(is_it, _)| *is_it).map(|(_, name)| name)
+}
+
 /// Writes a file beside its place, and moves it there when it is whole and on the disk: whoever looks sees all of it or
 /// what was there before.
 ///
 /// # Errors
-/// The path names no file, `write` fails, or the system does; what was there before stays then, and nothing beside it.
+/// The path names no file, but a directory, device, pipe or socket, `write` fails, or the system does; what was there before stays then, and nothing beside it.
 pub fn write_atomically(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
     let name = path.file_name().ok_or_else(|| io::Error::other("it names no file"))?;
     if path.is_dir() {
         return Err(io::ErrorKind::IsADirectory.into());
+    }
+    if let Some(found) = special_file(path) {
+        let what = format!("found {found}, expected a file or nothing; name another file");
+        return Err(io::Error::new(io::ErrorKind::AlreadyExists, what));
     }
     let mut beside = OsString::from(".");
     beside.push(name);
@@ -63,5 +80,27 @@ mod tests {
             assert!(write_atomically(nowhere, |_| Ok(())).is_err(), "{}", nowhere.display());
         }
         assert_eq!(fs::read_dir(dir.path()).expect("reads").count(), 1);
+    }
+
+    #[test]
+    fn only_a_file_is_replaced() {
+        let dir = tempfile::TempDir::new().expect("a folder");
+        let at = |name: &str| dir.path().join(name);
+        rustix::fs::mkfifoat(rustix::fs::CWD, at("pipe"), rustix::fs::Mode::RUSR).expect("a pipe");
+        let _socket = std::os::unix::net::UnixListener::bind(at("socket")).expect("a socket");
+        std::os::unix::fs::symlink("/dev/null", at("device")).expect("a link");
+        for (name, found) in [("pipe", "a pipe"), ("socket", "a socket"), ("device", "a device")] {
+            let refused = write_atomically(&at(name), |_| unreachable!("nothing is written")).expect_err("refused");
+            assert!(refused.to_string().contains(&format!("found {found}, expected a file")), "{refused}");
+            assert_eq!(special_file(&at(name)), Some(found));
+        }
+        assert_eq!(fs::read_dir(dir.path()).expect("reads").count(), 3);
+
+        fs::write(at("file"), "before").expect("writes");
+        std::os::unix::fs::symlink("file", at("link")).expect("a link");
+        assert_eq!((special_file(&at("link")), special_file(&at("absent"))), (None, None));
+        write_atomically(&at("link"), |out| out.write_all(b"after")).expect("writes");
+        assert_eq!(fs::read(at("link")).expect("reads"), b"after");
+        assert_eq!(fs::read(at("file")).expect("reads"), b"before", "the link is replaced, not what it leads to");
     }
 }

@@ -13,7 +13,7 @@ pub mod rig;
 pub mod toml_source;
 mod units;
 
-pub use atomic_write::write_atomically;
+pub use atomic_write::{special_file, write_atomically};
 pub use clock::host_now;
 pub use geometry::DisplayGeometry;
 pub use level_tables::LevelTables;

@@ -273,7 +273,7 @@ pub struct RunArgs {
     /// (orders.jsonl), the log and the bench into this directory, for `holod report`.
     #[arg(long, value_name = "DIR")]
     pub record: Option<PathBuf>,
-    /// Overwrite an earlier record.
+    /// Overwrite an earlier record; it goes once the first frame is made.
     #[arg(long, requires = "record")]
     pub force: bool,
     /// The status page.
@@ -655,7 +655,7 @@ pub struct TryArgs {
     /// the first.
     #[arg(long, value_name = "DIR")]
     pub record: Option<PathBuf>,
-    /// Overwrite an earlier record.
+    /// Overwrite an earlier record; it goes once something is heard.
     #[arg(long, requires = "record")]
     pub force: bool,
     /// Print what was found as JSON, and show nothing meanwhile.

@@ -4,6 +4,8 @@ use std::fs::File;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use holod_calibration::special_file;
+
 use crate::failure::{Exit, Failure};
 use crate::results;
 
@@ -20,16 +22,18 @@ impl Destination {
     /// The place that `option` names. What is there already is overwritten with `force` only.
     ///
     /// # Errors
-    /// A file is there already, or a directory.
+    /// A file is there already, or a directory, device, pipe or socket.
     pub(crate) fn new(path: &Path, option: &str, force: bool) -> Result<Self, Failure> {
         if path == Path::new("-") {
             return Ok(Self::Stdout);
         }
-        if path.is_dir() {
-            return Err(Failure::new(
-                Exit::CannotCreate,
-                format!("{option} {}: found a directory, expected the name of a file to write", path.display()),
-            ));
+        let expected = "expected the name of a file to write";
+        let trouble = match special_file(path) {
+            Some(found) => Some(format!("found {found}, {expected}; {option} - is standard output")),
+            None => path.is_dir().then(|| format!("found a directory, {expected}")),
+        };
+        if let Some(trouble) = trouble {
+            return Err(Failure::new(Exit::CannotCreate, format!("{option} {}: {trouble}", path.display())));
         }
         refuse_existing([path.to_owned()], option, force)?;
         Ok(Self::File(path.to_owned()))
@@ -61,7 +65,7 @@ impl Destination {
     }
 }
 
-/// Refuses to overwrite any of `paths`, unless with `force`.
+/// Refuses to overwrite any of `paths`, unless with `force`; devices, pipes and sockets always.
 ///
 /// # Errors
 /// One of them is there already.
@@ -70,16 +74,17 @@ pub(crate) fn refuse_existing(
     option: &str,
     force: bool,
 ) -> Result<(), Failure> {
-    match paths.into_iter().find(|path| !force && path.symlink_metadata().is_ok()) {
-        None => Ok(()),
-        Some(path) => Err(Failure::new(
-            Exit::CannotCreate,
-            format!(
-                "{} exists already; name another place with {option}, or overwrite it with --force",
-                path.display()
-            ),
-        )),
+    for path in paths {
+        let found = match special_file(&path) {
+            Some(found) => format!("is {found}, which no file takes the place of; name another place with {option}"),
+            None if !force && path.symlink_metadata().is_ok() => {
+                format!("exists already; name another place with {option}, or overwrite it with --force")
+            }
+            None => continue,
+        };
+        return Err(Failure::new(Exit::CannotCreate, format!("{} {found}", path.display())));
     }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -103,5 +108,22 @@ mod tests {
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "third");
         assert!(Destination::new(folder.path(), "--out", true).is_err(), "a directory is no file");
         assert!(Destination::new(Path::new("-"), "--out", false).unwrap().is_stdout());
+    }
+
+    #[test]
+    fn a_device_is_not_replaced_by_a_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let link = folder.path().join("link");
+        std::os::unix::fs::symlink("/dev/null", &link).unwrap();
+        for force in [false, true] {
+            for path in [Path::new("/dev/null"), &link] {
+                let refused = Destination::new(path, "--plot", force).unwrap_err();
+                assert_eq!(refused.exit, Exit::CannotCreate);
+                let says = "found a device, expected the name of a file to write; --plot - is standard output";
+                assert!(refused.to_string().contains(says), "{refused}");
+                let refused = refuse_existing([path.to_owned()], "--out", force).unwrap_err();
+                assert!(refused.to_string().contains("is a device, which no file takes the place of"), "{refused}");
+            }
+        }
     }
 }

@@ -1,6 +1,7 @@
 //! A run written down: `frames.csv`, one row per colour field that the panel showed; with what it was made of, so that
 //! its frames can be made again.
 
+mod folder;
 mod frame_log;
 mod health;
 mod recorder;
@@ -13,9 +14,9 @@ use holod_calibration::{Colour, PupilDiameter, TimeNs};
 use holod_slm_output::{FieldEvent, LevelsFrame};
 use twox_hash::XxHash3_64;
 
-use crate::failure::{Exit, Failure};
 use crate::source::PictureTag;
 
+pub(crate) use self::folder::RecordFolder;
 pub(crate) use self::frame_log::FrameLog;
 pub(crate) use self::health::{RecordCondition, RecordHealth, RecordState};
 pub(crate) use self::recorder::{LOG, ORDER_FILES, OrderSource, RUN, Recorder, RunFacts};
@@ -137,26 +138,6 @@ const FILES: [&str; 8] = [FRAMES, ORDERS, "summary.json", "samples.csv", "tracke
 /// How the names of the levels that were shown begin and end.
 const SHOWN: (&str, &str) = ("shown_pupil_", ".png");
 
-/// Takes an earlier record out of `folder`, for a run that is to overwrite it; other files stay.
-///
-/// # Errors
-/// One of them cannot be removed.
-pub(crate) fn remove_earlier(folder: &Path) -> Result<(), Failure> {
-    let cannot = |error: std::io::Error| {
-        Failure::new(Exit::CannotCreate, format!("cannot overwrite the record in {}: {error}", folder.display()))
-    };
-    let Ok(entries) = fs::read_dir(folder) else { return Ok(()) };
-    sources::remove_bench(folder).map_err(cannot)?;
-    for entry in entries {
-        let entry = entry.map_err(cannot)?;
-        let name = entry.file_name().to_string_lossy().into_owned();
-        if FILES.contains(&name.as_str()) || is_shown_levels(&name) {
-            fs::remove_file(entry.path()).map_err(cannot)?;
-        }
-    }
-    Ok(())
-}
-
 fn is_shown_levels(name: &str) -> bool {
     name.starts_with(SHOWN.0) && name.ends_with(SHOWN.1)
 }
@@ -172,30 +153,4 @@ pub(crate) fn shown_levels(folder: &Path) -> std::io::Result<Vec<String>> {
     }
     names.sort();
     Ok(names)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn force_takes_an_earlier_record_away_and_nothing_else() {
-        let folder = tempfile::tempdir().unwrap();
-        let names = [
-            "frames.csv",
-            "orders.jsonl",
-            "summary.json",
-            "samples.csv",
-            "tracker.holodraw",
-            "shown_pupil_3.00mm_frame_000001.png",
-        ];
-        for name in names.into_iter().chain(["notes.txt", "shown.png"]) {
-            fs::write(folder.path().join(name), "old").unwrap();
-        }
-        remove_earlier(folder.path()).unwrap();
-        let mut left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
-        left.sort();
-        assert_eq!(left, ["notes.txt", "shown.png"]);
-        remove_earlier(&folder.path().join("absent")).unwrap();
-    }
 }

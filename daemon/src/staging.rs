@@ -11,11 +11,11 @@ use tempfile::TempDir;
 use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
 
-/// Files on their way into a directory: written beside it, moved in by rename when all are whole. What is half done
-/// when a signal ends the process is taken away first.
+/// Files on their way into a directory: written in a hidden folder on its disk, moved in by rename when all are whole.
+/// What is half done when a signal ends the process is taken away first.
 pub(crate) struct Staging {
     target: PathBuf,
-    beside: TempDir,
+    partial: TempDir,
     force: bool,
 }
 
@@ -23,7 +23,9 @@ impl Staging {
     /// Prepares to fill `target`, which may exist, but holds none of `files` unless with `force`; its parent is created
     /// where it is missing.
     pub(crate) fn new(target: &Path, files: &[&str], force: bool) -> Result<Self, Failure> {
-        Self::in_folder(folder_of(target), target, files, force)
+        // Beside a directory that is there one may not be allowed to write, or another disk begins.
+        let folder = if target.is_dir() { target } else { folder_of(target) };
+        Self::in_folder(folder, target, files, force)
     }
 
     /// Prepares to write the file `path`, which may exist with `force` only; nothing but its folder is touched, which
@@ -37,8 +39,8 @@ impl Staging {
         Self::in_folder(folder, folder, &[name], force)
     }
 
-    /// Prepares to fill `target` by way of a folder in `parent`, which is on the same disk.
-    fn in_folder(parent: &Path, target: &Path, files: &[&str], force: bool) -> Result<Self, Failure> {
+    /// Prepares to fill `target` by way of a folder in `folder`, which is on the same disk.
+    fn in_folder(folder: &Path, target: &Path, files: &[&str], force: bool) -> Result<Self, Failure> {
         let cannot = |error: std::io::Error| {
             Failure::new(
                 Exit::CannotCreate,
@@ -55,16 +57,16 @@ impl Staging {
             ));
         }
         refuse_existing(files.iter().map(|file| target.join(file)), "--out", force)?;
-        fs::create_dir_all(parent).map_err(cannot)?;
+        fs::create_dir_all(folder).map_err(cannot)?;
         take_away_on_signals();
-        let beside = tempfile::Builder::new().prefix(".holod-partial-").tempdir_in(parent).map_err(cannot)?;
-        half_done(|folders| folders.push(beside.path().to_owned()));
-        Ok(Self { target: target.to_owned(), beside, force })
+        let partial = tempfile::Builder::new().prefix(".holod-partial-").tempdir_in(folder).map_err(cannot)?;
+        half_done(|folders| folders.push(partial.path().to_owned()));
+        Ok(Self { target: target.to_owned(), partial, force })
     }
 
     /// Where to write the file that will be called `name`.
     pub(crate) fn path(&self, name: &str) -> PathBuf {
-        self.beside.path().join(name)
+        self.partial.path().join(name)
     }
 
     /// Moves every file into the target.
@@ -73,14 +75,14 @@ impl Staging {
             Failure::new(Exit::CannotCreate, format!("cannot move results into {}: {error}", self.target.display()))
         };
         let mut names = Vec::new();
-        for entry in fs::read_dir(self.beside.path()).map_err(cannot)? {
+        for entry in fs::read_dir(self.partial.path()).map_err(cannot)? {
             names.push(entry.map_err(cannot)?.file_name());
         }
         // Looked for again: it may have come meanwhile.
         refuse_existing(names.iter().map(|name| self.target.join(name)), "--out", self.force)?;
         fs::create_dir_all(&self.target).map_err(cannot)?;
         for name in names {
-            fs::rename(self.beside.path().join(&name), self.target.join(&name)).map_err(cannot)?;
+            fs::rename(self.partial.path().join(&name), self.target.join(&name)).map_err(cannot)?;
         }
         Ok(())
     }
@@ -93,7 +95,7 @@ fn folder_of(path: &Path) -> &Path {
 
 impl Drop for Staging {
     fn drop(&mut self) {
-        half_done(|folders| folders.retain(|folder| folder != self.beside.path()));
+        half_done(|folders| folders.retain(|folder| folder != self.partial.path()));
     }
 }
 
@@ -178,6 +180,8 @@ fn remove(folder: &Path) {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::MetadataExt;
+
     use super::*;
 
     #[test]
@@ -213,6 +217,41 @@ mod tests {
         fs::write(forced.path("x"), "new").unwrap();
         forced.commit().unwrap();
         assert_eq!(fs::read_to_string(target.join("x")).unwrap(), "new");
+    }
+
+    #[test]
+    fn a_directory_that_is_there_is_filled_by_way_of_itself_and_one_that_is_not_by_way_of_its_parent() {
+        let root = tempfile::tempdir().unwrap();
+        let target = root.path().join("out");
+        let partial_in = |staging: &Staging| staging.partial.path().parent().unwrap().to_owned();
+        assert_eq!(partial_in(&Staging::new(&target, &[], false).unwrap()), root.path());
+        fs::create_dir(&target).unwrap();
+        let staging = Staging::new(&target, &["x"], false).unwrap();
+        assert_eq!(partial_in(&staging), target);
+        fs::write(staging.path("x"), "whole").unwrap();
+        staging.commit().unwrap();
+        let left: Vec<_> = fs::read_dir(&target).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+        assert_eq!(left, ["x"]);
+    }
+
+    #[test]
+    fn a_directory_on_another_disk_than_its_parent_is_filled() {
+        let Ok(elsewhere) = tempfile::tempdir_in("/dev/shm") else {
+            eprintln!("skipped: nothing can be written into /dev/shm");
+            return;
+        };
+        let root = tempfile::tempdir().unwrap();
+        if fs::metadata(elsewhere.path()).unwrap().dev() == fs::metadata(root.path()).unwrap().dev() {
+            eprintln!("skipped: /dev/shm is no other file system than {}", root.path().display());
+            return;
+        }
+        let target = root.path().join("out");
+        std::os::unix::fs::symlink(elsewhere.path(), &target).unwrap();
+        let staging = Staging::new(&target, &["x"], false).unwrap();
+        fs::write(staging.path("x"), "whole").unwrap();
+        staging.commit().unwrap();
+        assert_eq!(fs::read_to_string(elsewhere.path().join("x")).unwrap(), "whole");
+        assert_eq!(fs::read_dir(elsewhere.path()).unwrap().count(), 1);
     }
 
     #[test]

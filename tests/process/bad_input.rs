@@ -3,12 +3,14 @@
 use std::ffi::OsStr;
 use std::fs;
 use std::os::unix::ffi::OsStrExt;
+use std::os::unix::fs::FileTypeExt;
 use std::path::Path;
 use std::time::Duration;
 
 use holod_tests::daemon::{Daemon, run, wait_until};
 use holod_tests::small_rig;
 use image::{ImageBuffer, Luma, Rgb, RgbImage};
+use rustix::fs::Mode;
 use rustix::process::Signal;
 
 use crate::HOLOD;
@@ -243,6 +245,25 @@ fn a_signal_takes_what_is_half_done_away() {
     let ended = daemon.wait(Duration::from_secs(60));
     assert_eq!(ended.status.code(), Some(130), "{ended:?}");
     assert_eq!(listing(folder.path()), []);
+}
+
+#[test]
+fn a_pipe_is_never_replaced_by_a_file() {
+    let folder = holod_tests::new_folder();
+    let pipe = folder.path().join("pipe");
+    rustix::fs::mkfifoat(rustix::fs::CWD, &pipe, Mode::RUSR | Mode::WUSR).unwrap();
+    fs::write(folder.path().join("log.csv"), "time_s,diameter_mm\n0,3\n0.01,3\n").unwrap();
+    let view = ["view", "--pupil", "3", "--focus", "1", "--resolution", "64x64", "--out", "pipe"];
+    let convert = ["log", "convert", "log.csv", "--to", "csv", "--out", "pipe"];
+    for args in [&view[..], &convert, &["report", "--out", "pipe"], &["pattern", "level", "7", "--out", "pipe"]] {
+        for force in [&[][..], &["--force"]] {
+            let ended = run(HOLOD, &[args, force].concat(), folder.path());
+            assert_eq!(ended.status.code(), Some(73), "{args:?}: {}", ended.stderr);
+            assert!(ended.stderr.contains("a pipe"), "{args:?}: {}", ended.stderr);
+            assert!(fs::metadata(&pipe).unwrap().file_type().is_fifo(), "{args:?}");
+        }
+    }
+    assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 2, "nothing stays beside it");
 }
 
 #[test]

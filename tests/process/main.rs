@@ -13,6 +13,7 @@ mod page;
 mod panel;
 mod pattern;
 mod pictures;
+mod record;
 mod report;
 mod shutdown;
 mod tracker;

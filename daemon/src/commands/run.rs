@@ -17,7 +17,7 @@ use crate::failure::{Exit, Failure};
 use crate::page::Page;
 use crate::pictures::levels_picture;
 use crate::progress;
-use crate::record::{self, RecordHealth, Recorder};
+use crate::record::{RecordFolder, RecordHealth, Recorder};
 use crate::session::{self, Hangups, SessionPlan, SessionReport, Summary, not_dark};
 use crate::{results, run_text, setup, source};
 
@@ -45,10 +45,10 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let weights = progress::during("loading the network", || setup::weights(&rig))?;
     let pictures =
         progress::during("loading the scene", || source::named(&args.scene, args.feed_dark_after, &rig.geometry))?;
-    remove_earlier_record(args)?;
     let page = Page::open(&args.page)?;
+    let folder = args.record.as_deref().map(|path| RecordFolder::claim(path, args.force)).transpose()?;
     let recorder = |folder| Recorder::create(folder, args, &rig, pictures.resolution());
-    let recorder = args.record.as_deref().map(recorder).transpose()?;
+    let recorder = folder.map(recorder).transpose()?;
     let mut observers = (recorder.map(|recorder| recorder.with_tracker(tracker.to_string())), page);
     let network = weights.config();
     tracing::info!(
@@ -86,11 +86,11 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         }
     };
     let (Some(mut recorder), _) = observers else { return tell(args, &session.summary, None) };
-    recorder.finish();
+    let has_record = recorder.finish();
     let health = recorder.health();
-    session.summary.figures.record = Some(health.state());
+    session.summary.figures.record = (has_record || health.is_lost()).then(|| health.state());
     let session = Arc::new(session);
-    if !health.is_lost() {
+    if has_record && !health.is_lost() {
         finish_record(&session, recorder.folder(), &health)?;
     }
     let told = tell(args, &session.summary, None);
@@ -98,11 +98,6 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         tracing::error!("{lost}");
     }
     told.and_then(|()| health.judge())
-}
-
-/// Overwrites the record that is there, where that is asked for.
-fn remove_earlier_record(args: &RunArgs) -> Result<(), Failure> {
-    args.record.as_deref().filter(|_| args.force).map_or(Ok(()), record::remove_earlier)
 }
 
 /// The report that a tracker's spec names.

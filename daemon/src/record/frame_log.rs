@@ -144,17 +144,6 @@ impl FrameLog {
         self.frames.is_empty()
     }
 
-    /// Takes the file away again where no frame was ever made, so that the same directory may be named again.
-    pub(crate) fn discard_if_empty(self) {
-        if self.is_empty() {
-            let _gone = fs::remove_file(&self.path);
-            if let Some(folder) = self.path.parent() {
-                // Fails where something else is in it, which then stays.
-                let _gone = fs::remove_dir(folder);
-            }
-        }
-    }
-
     fn lost(&self, error: &std::io::Error) -> Failure {
         lost(&self.path, error)
     }

@@ -2,7 +2,7 @@
 //! disk.
 
 use std::collections::VecDeque;
-use std::fs::{self, OpenOptions};
+use std::fs::OpenOptions;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -15,11 +15,10 @@ use holod_slm_output::FieldEvent;
 use serde::{Deserialize, Serialize};
 
 use super::sources::{self, SceneSource, SourceFile};
-use super::{FieldRecord, FrameLog, FrameRecord, RecordHealth};
+use super::{FieldRecord, FrameLog, FrameRecord, RecordFolder, RecordHealth};
 use crate::aside::{Queue, Taking, join_within};
 use crate::cli::{self, Backend, NetworkArgs, RigArgs, RunArgs, SceneArgs};
 use crate::control::Request;
-use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
 use crate::logging::LogFile;
 use crate::machine::Machine;
@@ -96,6 +95,12 @@ enum Entry {
     Order(TimeNs, Box<Request>),
 }
 
+/// What that thread has in hand.
+struct Writing {
+    frames: FrameLog,
+    folder: RecordFolder,
+}
+
 /// Writes down a run as it goes.
 pub(crate) struct Recorder {
     folder: PathBuf,
@@ -106,9 +111,10 @@ pub(crate) struct Recorder {
     /// Reads the files of what an order brought.
     reading: Option<JoinHandle<()>>,
     entries: Arc<Queue<Entry>>,
-    writer: Option<JoinHandle<FrameLog>>,
+    writer: Option<JoinHandle<Writing>>,
+    /// What it had in hand at its end.
+    written: Option<Writing>,
     health: Arc<RecordHealth>,
-    made_frames: bool,
     slowness: Slowness,
 }
 
@@ -122,35 +128,31 @@ struct Slowness {
 }
 
 impl Recorder {
-    /// Starts the record that `args` ask for in `folder`, of a run of `rig` with holograms of `resolution`.
+    /// Starts the record of a run of `rig` in `folder`, with holograms of `resolution`, as `args` ask for it.
     ///
     /// # Errors
-    /// An earlier record is there, a file cannot be read or written.
-    pub(crate) fn create(folder: &Path, args: &RunArgs, rig: &Rig, resolution: Resolution) -> Result<Self, Failure> {
-        let own = [LOG, RUN, ORDER_FILES, sources::BENCH].map(|name| folder.join(name));
-        refuse_existing(own, "--record", false)?;
-        let frames = FrameLog::create(folder)?;
-        let (log, facts) = match Self::start(folder, args, rig, resolution) {
-            Ok(started) => started,
-            Err(failure) => {
-                discard(folder);
-                frames.discard_if_empty();
-                return Err(failure);
-            }
-        };
+    /// A file cannot be read or written.
+    pub(crate) fn create(
+        folder: RecordFolder,
+        args: &RunArgs,
+        rig: &Rig,
+        resolution: Resolution,
+    ) -> Result<Self, Failure> {
+        let path = folder.path().to_owned();
+        let frames = FrameLog::create(&path)?;
+        let (log, facts) = Self::start(&path, args, rig, resolution)?;
         let entries = Arc::new(Queue::default());
-        let health = Arc::new(RecordHealth::new(folder));
+        let health = Arc::new(RecordHealth::new(&path));
         let write = {
-            let (entries, health, run) = (Arc::clone(&entries), Arc::clone(&health), folder.join(RUN));
-            move || write_entries(&entries, frames, &run, &health)
+            let (entries, health, run) = (Arc::clone(&entries), Arc::clone(&health), path.join(RUN));
+            move || write_entries(&entries, Writing { frames, folder }, &run, &health)
         };
-        let writer = thread::Builder::new().name("holod-record".into()).spawn(write).map_err(|error| {
-            discard(folder);
-            let _gone = fs::remove_file(folder.join(super::FRAMES));
-            Failure::because(Exit::Unavailable)(error)
-        })?;
+        let writer = thread::Builder::new()
+            .name("holod-record".into())
+            .spawn(write)
+            .map_err(Failure::because(Exit::Unavailable))?;
         Ok(Self {
-            folder: folder.to_owned(),
+            folder: path,
             log,
             facts,
             named: Named { rig: args.rig.clone(), network: args.network.clone(), geometry: rig.geometry, resolution },
@@ -158,8 +160,8 @@ impl Recorder {
             reading: None,
             entries,
             writer: Some(writer),
+            written: None,
             health,
-            made_frames: false,
             slowness: Slowness::default(),
         })
     }
@@ -203,40 +205,44 @@ impl Recorder {
     }
 
     /// Hands everything to the operating system and ends the log. A disk that does not take it within seconds has lost
-    /// the record.
-    pub(crate) fn finish(&mut self) {
-        self.end_writing();
+    /// the record. Whether there is one: where no frame was written, an earlier record is put back when this is dropped.
+    pub(crate) fn finish(&mut self) -> bool {
+        self.written = self.end_writing();
         self.log.flush();
         self.note_log();
         self.log.end();
+        let Some(Writing { folder, .. }) = &mut self.written else { return false };
+        if folder.earlier_waits() {
+            tracing::warn!("no frame was recorded: the earlier record in {} stays", self.folder.display());
+            return false;
+        }
+        if let Err(failure) = folder.keep() {
+            self.health.give_up(&failure.to_string());
+        }
+        true
     }
 
     /// Ends the record of a run that failed. Where no frame was ever made it is taken away again, so that the same
     /// directory may be named again.
     pub(crate) fn fail(mut self, failure: &Failure) {
-        let frames = self.end_writing();
+        let writing = self.end_writing();
         self.log.ended_by(failure);
         self.log.end();
-        if !self.made_frames
-            && let Some(frames) = frames
-        {
-            discard(&self.folder);
-            frames.discard_if_empty();
-        }
+        drop(writing);
     }
 
-    fn end_writing(&mut self) -> Option<FrameLog> {
+    fn end_writing(&mut self) -> Option<Writing> {
         self.entries.close();
         let reading = self.reading.take().map(|reading| join_within(reading, FINISH));
         if reading == Some(None) {
             tracing::warn!("the record lacks the files of the last order: they are not read yet");
         }
-        let frames = join_within(self.writer.take()?, FINISH);
-        if frames.is_none() {
+        let writing = join_within(self.writer.take()?, FINISH);
+        if writing.is_none() {
             let folder = self.folder.display();
             self.health.give_up(&format!("the disk of {folder} does not take what was left within {FINISH:?}"));
         }
-        frames
+        writing
     }
 
     /// Hands an entry over; one that finds no room is a row less.
@@ -335,21 +341,15 @@ fn append(path: &Path, source: &OrderSource) -> Result<(), Failure> {
     file.and_then(|mut file| writeln!(file, "{line}")).map_err(Failure::because(Exit::CannotCreate))
 }
 
-/// Takes away what was written before the first frame.
-fn discard(folder: &Path) {
-    for name in [LOG, RUN, ORDER_FILES] {
-        let _ = fs::remove_file(folder.join(name));
-    }
-    let _ = sources::remove_bench(folder);
-}
-
-/// Writes what comes until nothing more does. Where the disk refuses, the record is given up, and the rest dropped.
-fn write_entries(entries: &Queue<Entry>, mut frames: FrameLog, run: &Path, health: &RecordHealth) -> FrameLog {
+/// Writes what comes until nothing more does; a record with a frame is kept. Where the disk refuses, the record is given
+/// up, and the rest dropped.
+fn write_entries(entries: &Queue<Entry>, mut writing: Writing, run: &Path, health: &RecordHealth) -> Writing {
     let mut taken = VecDeque::new();
     while entries.take(&mut taken, Taking::Every(WRITE_INTERVAL)) {
         if health.is_lost() {
             continue;
         }
+        let Writing { frames, folder } = &mut writing;
         let mut write = |entry| match entry {
             Entry::Began(facts) => results::save_json(&facts, run),
             Entry::Frame(record) => {
@@ -360,11 +360,12 @@ fn write_entries(entries: &Queue<Entry>, mut frames: FrameLog, run: &Path, healt
             Entry::Order(t, request) => frames.order(t, &request),
         };
         let written = taken.drain(..).try_for_each(&mut write).and_then(|()| frames.flush());
-        if let Err(failure) = written {
+        let kept = written.and_then(|()| if frames.is_empty() { Ok(()) } else { folder.keep() });
+        if let Err(failure) = kept {
             health.give_up(&failure.to_string());
         }
     }
-    frames
+    writing
 }
 
 impl Observer for Recorder {
@@ -375,7 +376,6 @@ impl Observer for Recorder {
     }
 
     fn frame(&mut self, record: &FrameRecord) -> Result<(), Failure> {
-        self.made_frames = true;
         self.put(Entry::Frame(*record));
         Ok(())
     }
@@ -406,6 +406,7 @@ impl Observer for Recorder {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
     use std::io::Read;
 
     use clap::Parser;
@@ -417,6 +418,14 @@ mod tests {
     use holod_calibration::PupilDiameter;
 
     fn recorder(folder: &Path) -> Recorder {
+        recorder_in(RecordFolder::claim(folder, false).unwrap())
+    }
+
+    fn forced_recorder(folder: &Path) -> Recorder {
+        recorder_in(RecordFolder::claim(folder, true).unwrap())
+    }
+
+    fn recorder_in(folder: RecordFolder) -> Recorder {
         let args = Cli::try_parse_from(["holod", "--record", "elsewhere"]).unwrap().run;
         Recorder::create(folder, &args, &Rig::default(), Resolution { width: 64, height: 64 }).unwrap()
     }
@@ -447,7 +456,7 @@ mod tests {
         let mut recorder = recorder(&folder.path().join("record"));
         // A disk that stands still: the writer ends, and nobody takes what comes.
         recorder.entries.close();
-        let frames = join_within(recorder.writer.take().unwrap(), FINISH).unwrap();
+        let writing = join_within(recorder.writer.take().unwrap(), FINISH).unwrap();
         recorder.entries = Arc::new(Queue::default());
         for number in 0..ROWS as u64 + 100 {
             recorder.frame(&frame(number)).unwrap();
@@ -460,12 +469,32 @@ mod tests {
 
         // It goes on.
         let (entries, health, run) = (Arc::clone(&recorder.entries), recorder.health(), folder.path().join("run.json"));
-        recorder.writer = Some(thread::spawn(move || write_entries(&entries, frames, &run, &health)));
+        recorder.writer = Some(thread::spawn(move || write_entries(&entries, writing, &run, &health)));
         recorder.tell_slowness();
         assert_eq!(recorder.slowness.told, 100);
         recorder.finish();
         assert!(!recorder.health.is_lost());
         assert_eq!(fs::read_to_string(folder.path().join("record").join(ORDERS)).unwrap().lines().count(), 1);
+    }
+
+    #[test]
+    fn an_earlier_record_goes_with_the_first_frame() {
+        let folder = tempfile::tempdir().unwrap();
+        let frames_csv = || fs::read_to_string(folder.path().join(FRAMES)).unwrap();
+        fs::write(folder.path().join(FRAMES), "old").unwrap();
+        let mut without_frame = forced_recorder(folder.path());
+        assert!(!without_frame.finish());
+        drop(without_frame);
+        assert_eq!(frames_csv(), "old");
+
+        forced_recorder(folder.path()).fail(&Failure::new(Exit::Unavailable, "no panel"));
+        assert_eq!(frames_csv(), "old");
+
+        let mut recorder = forced_recorder(folder.path());
+        recorder.frame(&frame(1)).unwrap();
+        assert!(recorder.finish());
+        drop(recorder);
+        assert!(frames_csv().starts_with("frame,field,"));
     }
 
     #[test]

@@ -205,26 +205,21 @@ pub(crate) fn is_weights(name: &str) -> bool {
     name == WEIGHTS
 }
 
-/// Takes away what [`keep_bench`] has put into `folder`; what somebody else has put there stays.
+/// The files that [`keep_bench`] has put into [`BENCH`] of `folder`, by their names there.
 ///
 /// # Errors
-/// One of the files cannot be removed.
-pub(super) fn remove_bench(folder: &Path) -> io::Result<()> {
-    let bench = folder.join(BENCH);
-    let entries = match fs::read_dir(&bench) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+/// The folder cannot be read.
+pub(super) fn names_of_bench(folder: &Path) -> io::Result<Vec<String>> {
+    let entries = match fs::read_dir(folder.join(BENCH)) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
         entries => entries?,
     };
+    let mut names = Vec::new();
     for entry in entries {
-        let entry = entry?;
-        let name = entry.file_name().to_string_lossy().into_owned();
-        if is_of_bench(&name) {
-            fs::remove_file(entry.path())?;
-        }
+        names.extend(entry?.file_name().into_string().ok().filter(|name| is_of_bench(name)));
     }
-    // Fails where something else is in it, which then stays.
-    let _ = fs::remove_dir(&bench);
-    Ok(())
+    names.sort();
+    Ok(names)
 }
 
 /// The ending of a file's name with its dot, where it is a plain one.
@@ -244,7 +239,7 @@ pub(super) fn keep_bench(folder: &Path, config: Option<&Path>, rig: &Rig) -> Res
     let cannot = |path: &Path, error: io::Error| {
         Failure::new(Exit::CannotCreate, format!("cannot record {}: {error}", path.display()))
     };
-    fs::create_dir(&bench).map_err(|error| cannot(&bench, error))?;
+    fs::create_dir_all(&bench).map_err(|error| cannot(&bench, error))?;
     let keep = |path: &Path, name: String| {
         fs::copy(path, bench.join(&name)).map_err(|error| cannot(path, error))?;
         Ok::<_, Failure>(value(name))
@@ -396,11 +391,7 @@ mod tests {
         assert_eq!(failure.exit, Exit::CannotCreate, "{failure}");
 
         fs::write(record.join(BENCH).join("notes.txt"), "mine").unwrap();
-        remove_bench(&record).unwrap();
-        let left: Vec<_> = fs::read_dir(record.join(BENCH)).unwrap().map(|entry| entry.unwrap().file_name()).collect();
-        assert_eq!(left, ["notes.txt"]);
-        remove_bench(&folder.path().join("other")).unwrap();
-        assert!(!folder.path().join("other").join(BENCH).exists());
-        remove_bench(&folder.path().join("absent")).unwrap();
+        assert_eq!(names_of_bench(&record).unwrap(), ["lut-green", RIG, WEIGHTS]);
+        assert!(names_of_bench(&folder.path().join("absent")).unwrap().is_empty());
     }
 }

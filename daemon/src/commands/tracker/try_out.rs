@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::path::Path;
 use std::time::Duration;
 
 use holod_calibration::TimeNs;
@@ -18,7 +17,7 @@ use super::observed::{EyeFigures, Observed, Quantiles};
 use crate::bug_report;
 use crate::cli::TryArgs;
 use crate::failure::{Exit, Failure};
-use crate::record;
+use crate::record::RecordFolder;
 use crate::session::Signals;
 use crate::terminal::{Axes, LiveText, Series, TextSize, plot};
 use crate::{results, setup};
@@ -58,14 +57,12 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     if let Some(scale) = args.scale {
         rig.tracker.scale = Some(scale);
     }
-    if let Some(folder) = args.record.as_deref().filter(|_| args.force) {
-        record::remove_earlier(folder)?;
-    }
     let signals = Signals::install(None)?;
+    let mut folder = args.record.as_deref().map(|path| RecordFolder::claim(path, args.force)).transpose()?;
     let began = host_now();
     let options = TrackerOptions {
         origin: began,
-        record: args.record.as_deref().map(created).transpose()?,
+        record: folder.as_ref().map(|folder| RecordFiles::in_folder(folder.path())),
         forbidden: setup::ports_of_others(&rig),
         ..TrackerOptions::default()
     };
@@ -83,6 +80,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     let ended_by = loop {
         std::thread::sleep(TICK);
         let now = host_now();
+        keep_what_came(folder.as_mut(), &tracker)?;
         while let Some(decision) = tracker.decisions.pop() {
             observed.take(&decision);
             refusals.note(&decision);
@@ -107,6 +105,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
             live.show(&format!("{}\n{text}", traces(&observed, now, LiveText::visible(), text.lines().count())));
         }
     };
+    keep_what_came(folder.as_mut(), &tracker)?;
     let now = host_now();
     let last = report_of(&spec, &ended_by, began, now, &observed, &mut tracker);
     tracker.control.stop();
@@ -146,11 +145,11 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     Err(Failure::new(Exit::Unavailable, format!("tracker {spec}: {heard}")))
 }
 
-fn created(folder: &Path) -> Result<RecordFiles, Failure> {
-    std::fs::create_dir_all(folder).map_err(|error| {
-        Failure::new(Exit::CannotCreate, format!("cannot record into {}: {error}", folder.display()))
-    })?;
-    Ok(RecordFiles::in_folder(folder))
+/// A recording of silence is not worth keeping, and takes no earlier one's place.
+fn keep_what_came(folder: Option<&mut RecordFolder>, tracker: &TrackerHandle) -> Result<(), Failure> {
+    let counters = tracker.control.counters();
+    let came = counters.of(Counter::Bytes) > 0 || counters.of(Counter::Samples) > 0;
+    folder.filter(|_| came).map_or(Ok(()), RecordFolder::keep)
 }
 
 fn spec_of(args: &TryArgs, rig: &Rig) -> Result<TrackerSpec, Failure> {

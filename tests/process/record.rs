@@ -1,0 +1,151 @@
+//! What becomes of a record and its folder: where a run does not begin, and where there is an earlier record.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use holod_tests::daemon::{Daemon, Ended, run, wait_until};
+use holod_tests::small_rig;
+use holod_tests::tracker::PtyTracker;
+use rustix::process::Signal;
+
+use crate::HOLOD;
+
+const PATIENCE: Duration = Duration::from_secs(60);
+/// What every run here is started with.
+const ARGS: [&str; 12] = [
+    "--config",
+    "rig.toml",
+    "--tracker",
+    "mock:steady",
+    "--resolution",
+    "16x16",
+    "--weights",
+    "fast",
+    "--backend",
+    "cpu",
+    "--record",
+    "record",
+];
+/// A connector that no machine has.
+const NO_PANEL: [&str; 2] = ["--output", "drm:DP-99"];
+
+fn bench() -> tempfile::TempDir {
+    let folder = holod_tests::new_folder();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    folder
+}
+
+fn record(folder: &Path, more: &[&str]) -> Ended {
+    run(HOLOD, &[&ARGS, more].concat(), folder)
+}
+
+/// All files in `folder` and below, with what is in them.
+fn contents(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut found = BTreeMap::new();
+    for path in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
+        match path.is_dir() {
+            true => found.extend(contents(&path)),
+            false => drop(found.insert(path.clone(), fs::read(path).unwrap())),
+        }
+    }
+    found
+}
+
+#[test]
+fn a_run_that_does_not_begin_leaves_no_record_and_its_folder_may_be_named_again() {
+    let bench = bench();
+    let ended = record(bench.path(), &NO_PANEL);
+    assert_eq!(ended.status.code(), Some(69), "{}", ended.stderr);
+    assert!(!bench.path().join("record").exists());
+
+    fs::create_dir(bench.path().join("record")).unwrap();
+    fs::write(bench.path().join("record/notes.txt"), "mine").unwrap();
+    let ended = record(bench.path(), &NO_PANEL);
+    assert_eq!(ended.status.code(), Some(69), "{}", ended.stderr);
+    let left: Vec<_> = fs::read_dir(bench.path().join("record")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    assert_eq!(left, [bench.path().join("record/notes.txt")]);
+    let ended = record(bench.path(), &["--frames", "5"]);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    assert!(bench.path().join("record/samples.csv").exists());
+}
+
+#[test]
+fn samples_that_are_there_already_are_kept_and_what_overwrites_them_is_said() {
+    let bench = bench();
+    fs::create_dir(bench.path().join("record")).unwrap();
+    fs::write(bench.path().join("record/samples.csv"), "precious").unwrap();
+    let tried = ["tracker", "try", "mock:steady", "--duration", "1s", "--record", "record"];
+    for args in [&ARGS[..], &tried] {
+        let ended = run(HOLOD, args, bench.path());
+        assert_eq!(ended.status.code(), Some(73), "{}", ended.stderr);
+        let says = "samples.csv exists already; name another place with --record, or overwrite it with --force";
+        assert!(ended.stderr.contains(says), "{}", ended.stderr);
+        assert_eq!(fs::read_to_string(bench.path().join("record/samples.csv")).unwrap(), "precious");
+    }
+}
+
+#[test]
+fn a_tracker_that_says_nothing_leaves_no_recording() {
+    let bench = bench();
+    let _silent = PtyTracker::plug_in(&bench.path().join("ttyTracker")).unwrap();
+    let args = ["tracker", "try", "ttyTracker", "--duration", "1s", "--record", "record"];
+    let ended = run(HOLOD, &args, bench.path());
+    assert_eq!(ended.status.code(), Some(69), "{}", ended.stderr);
+    assert!(!bench.path().join("record").exists());
+}
+
+#[test]
+fn force_takes_no_record_away_for_a_run_that_does_not_begin() {
+    let bench = bench();
+    let ended = record(bench.path(), &["--frames", "5"]);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let path = bench.path().join("record");
+    let earlier = contents(&path);
+    assert!(earlier.contains_key(&path.join("frames.csv")) && earlier.contains_key(&path.join("samples.csv")));
+
+    let other = TcpListener::bind("127.0.0.1:0").unwrap();
+    let taken = other.local_addr().unwrap().to_string();
+    for trouble in [&["--page", &taken][..], &NO_PANEL, &["--tracker", "no-such-log.csv"]] {
+        let ended = run(HOLOD, &[&ARGS[..2], &ARGS[4..], trouble, &["--force"]].concat(), bench.path());
+        assert!(matches!(ended.status.code(), Some(66 | 69)), "{trouble:?}: {}", ended.stderr);
+        assert!(contents(&path) == earlier, "{trouble:?}");
+    }
+    let _silent = PtyTracker::plug_in(&bench.path().join("ttyTracker")).unwrap();
+    for tracker in ["ttyTracker", "no-such-log.csv"] {
+        let args = ["tracker", "try", tracker, "--duration", "1s", "--record", "record", "--force"];
+        let ended = run(HOLOD, &args, bench.path());
+        assert!(matches!(ended.status.code(), Some(66 | 69)), "{tracker}: {}", ended.stderr);
+        assert!(contents(&path) == earlier, "{tracker}");
+    }
+
+    let ended = record(bench.path(), &["--frames", "5", "--force"]);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let new = contents(&path);
+    assert!(new[&path.join("frames.csv")] != earlier[&path.join("frames.csv")]);
+    assert!(new.keys().all(|path| !path.to_string_lossy().contains(".holod-")), "{:?}", new.keys());
+}
+
+#[test]
+fn a_record_that_is_being_written_is_refused_and_goes_on() {
+    let bench = bench();
+    let mut daemon = Daemon::start(HOLOD, &ARGS, bench.path());
+    let path = bench.path().join("record/frames.csv");
+    let rows = || fs::read_to_string(&path).map_or(0, |text| text.lines().count());
+    assert!(wait_until(PATIENCE, || rows() > 10));
+    let tried = ["tracker", "try", "mock:steady", "--duration", "1s", "--record", "record", "--force"];
+    for args in [&[&ARGS[..], &["--force"]].concat()[..], &ARGS, &tried] {
+        let ended = run(HOLOD, args, bench.path());
+        assert_eq!(ended.status.code(), Some(73), "{}", ended.stderr);
+        assert!(ended.stderr.contains("record: another holod records there; end it"), "{}", ended.stderr);
+    }
+    let before = rows();
+    assert!(wait_until(PATIENCE, || rows() > before + 10) && daemon.runs());
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(PATIENCE);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    assert!(bench.path().join("record/summary.json").exists());
+    assert!(record(bench.path(), &["--frames", "5", "--force"]).status.success());
+}
