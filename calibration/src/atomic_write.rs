@@ -25,7 +25,8 @@ pub fn special_file(path: &Path) -> Option<&'static str> {
 /// what was there before.
 ///
 /// # Errors
-/// The path names no file, but a directory, device, pipe or socket, `write` fails, or the system does; what was there before stays then, and nothing beside it.
+/// The path names no file, but a directory, device, pipe or socket, `write` fails, or the system does; what was there
+/// before stays then, and nothing beside it.
 pub fn write_atomically(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
     let name = path.file_name().ok_or_else(|| io::Error::other("it names no file"))?;
     if path.is_dir() {

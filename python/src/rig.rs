@@ -135,8 +135,8 @@ impl Rig {
     /// The levels that the panel is sent for phases of any origin.
     ///
     /// `phase_rad` is float32 (3, rows, columns) in radians: red, green, blue. Smaller patterns than the panel are
-    /// centred on it, and dark around, which is ±π/2 in turn. Each phase becomes the level whose phase is nearest on the circle, by
-    /// the rig's look-up tables, stroke, sign and flatness.
+    /// centred on it, and dark around, which is ±π/2 in turn; they lie as the rig's `panel.orientation` says. Each phase
+    /// becomes the level whose phase is nearest on the circle, by the rig's look-up tables, stroke, sign and flatness.
     ///
     /// Returns (3, height_px, width_px) of uint8 for a panel of 8 bits, else uint16. Raises InputError for phases that
     /// are not finite or beyond 50 turns, and for patterns larger than the panel.

@@ -136,8 +136,8 @@ struct ColourEncoder {
 impl PanelEncoder {
     /// An encoder for `panel` of `panel_resolution` pixels, for patterns of `pattern_resolution` pixels, which are
     /// centred on the panel (half a pixel up and left where the difference is odd). What is around them is dark behind
-    /// the stop that passes half of the band, as a double-phase pattern of nothing: π/2 where x + y of the pattern, gone
-    /// on with, is odd and −π/2 where it is even. Phase 0 would pass the stop whole, and outshine white.
+    /// the stop that passes half of the band, as a double-phase pattern of nothing: π/2 where x + y of the pattern,
+    /// gone on with, is odd and −π/2 where it is even. Phase 0 would pass the stop whole, and outshine white.
     ///
     /// A look-up table that rises is a magnitude and takes the panel's `phase_sign`; one that falls is signed already
     /// and the panel's `phase_sign` must be negative too.

@@ -1,8 +1,8 @@
 //! Test patterns for a bench: what a panel can be sent to see that it, its lasers and its optics do what they should.
 //!
 //! **Frame of reference.** x runs to the right and y up, from the panel's centre, as an eye in the display sees the
-//! panel; angles run from x to y. What a bench's relays and mirrors turn is turned back by the rig's `panel.orientation`;
-//! where that is wrong, the first pattern shows it.
+//! panel; angles run from x to y. What a bench's relays and mirrors turn is turned back by the rig's
+//! `panel.orientation`; where that is wrong, the first pattern shows it.
 //!
 //! **Where light goes.** A pattern of period Λ sends the light of wavelength λ into orders m at the angles
 //! asin(m·λ/Λ). In the focal plane of the eyepiece, where the viewer's pupil is, order m is a spot f·tan(asin(m·λ/Λ))

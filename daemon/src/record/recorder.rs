@@ -205,7 +205,8 @@ impl Recorder {
     }
 
     /// Hands everything to the operating system and ends the log. A disk that does not take it within seconds has lost
-    /// the record. Whether there is one: where no frame was written, an earlier record is put back when this is dropped.
+    /// the record. Whether there is one: where no frame was written, an earlier record is put back when this is
+    /// dropped.
     pub(crate) fn finish(&mut self) -> bool {
         self.written = self.end_writing();
         self.log.flush();
@@ -341,8 +342,8 @@ fn append(path: &Path, source: &OrderSource) -> Result<(), Failure> {
     file.and_then(|mut file| writeln!(file, "{line}")).map_err(Failure::because(Exit::CannotCreate))
 }
 
-/// Writes what comes until nothing more does; a record with a frame is kept. Where the disk refuses, the record is given
-/// up, and the rest dropped.
+/// Writes what comes until nothing more does; a record with a frame is kept. Where the disk refuses, the record is
+/// given up, and the rest dropped.
 fn write_entries(entries: &Queue<Entry>, mut writing: Writing, run: &Path, health: &RecordHealth) -> Writing {
     let mut taken = VecDeque::new();
     while entries.take(&mut taken, Taking::Every(WRITE_INTERVAL)) {

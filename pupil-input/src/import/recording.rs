@@ -88,8 +88,8 @@ impl LogBuilder {
         self.faults.count(fault);
     }
 
-    /// Takes a sample of line (or record) `line`, at the time that is written there; one that goes back a little against
-    /// its own eye is counted and dropped, and where a clock begins anew its samples are put behind those before.
+    /// Takes a sample of line (or record) `line`, at the time that is written there; one that goes back a little
+    /// against its own eye is counted and dropped, and where a clock begins anew its samples are put behind those before.
     pub(crate) fn push(&mut self, sample: LogSample, line: u64) {
         let LogSample { t, eye, diameter, valid, .. } = sample;
         if t.0.unsigned_abs() > GREATEST_NS {

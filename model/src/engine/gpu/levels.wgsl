@@ -1,6 +1,7 @@
 // Phases to the panel's samples, as the panel takes them. After these constants:
-// THREADS (of a workgroup), PANEL_WIDTH, PANEL_HEIGHT, WIDTH, HEIGHT, LEFT, TOP, MIRROR_X, MIRROR_Y, INTERLEAVED, FIRST, SECOND, THIRD
-// (colours in the order shown), ENTRIES (of a colour's table), FLATNESS (whether there is any).
+// THREADS (of a workgroup), PANEL_WIDTH, PANEL_HEIGHT, WIDTH, HEIGHT, LEFT, TOP, MIRROR_X, MIRROR_Y (whether a pattern's
+// columns and rows run the other way), INTERLEAVED, FIRST, SECOND, THIRD (colours in the order shown), ENTRIES (of a
+// colour's table), FLATNESS (whether there is any).
 
 @group(0) @binding(0) var<storage, read> phases_rad: array<f32>; // [3, height, width]
 @group(0) @binding(1) var<storage, read> level_of_phase: array<u32>; // [3, entries]
