@@ -317,7 +317,7 @@ mod tests {
         let buffer = gpu.buffer("numbers", 4, usage).expect("a buffer");
         let source = "@group(0) @binding(0) var<storage, read_write> sum: u32;
             @compute @workgroup_size(1) fn f() {
-                for (var i = 0u; i < 50000000u; i++) { sum = sum * 1664525u + i; }
+                for (var i = 0u; i < 400000000u; i++) { sum = sum * 1664525u + i; }
             }";
         let pipeline = gpu.pipeline("long", source).expect("a pipeline");
         let group = gpu.bind(&pipeline, &[&buffer]);

@@ -12,7 +12,9 @@ use crate::gpu::GpuError;
 
 /// Radices of the passes, in the order in which they are taken: odd strides spread a pass's stores over the banks of a
 /// workgroup's memory.
-const RADICES: [usize; 4] = [5, 3, 2, 4];
+const RADICES: [usize; 7] = [13, 11, 7, 5, 3, 2, 4];
+/// The first of these, whose passes are written out by [`prime_pass`]; what chirps are transformed over does without.
+const PRIMES: usize = 3;
 /// Bytes of a sample.
 const SAMPLE_BYTES: usize = size_of::<Complex32>();
 /// Neighbouring columns of this many fill a line of a cache.
@@ -53,8 +55,13 @@ impl LineFft {
     /// # Errors
     /// Not even one such line fits in a workgroup.
     pub(crate) fn new(plan: &mut Plan, length: usize, limits: WorkgroupLimits) -> Result<Self, GpuError> {
-        let smooth = |span: &usize| radices(*span).is_some();
-        let span = if smooth(&length) { length } else { (2 * length - 1..).find(smooth).expect("powers of 2 are") };
+        let (span, radices) = match radices(length, &RADICES) {
+            Some(radices) => (length, radices),
+            None => {
+                let of_small = |span| Some((span, radices(span, &RADICES[PRIMES..])?));
+                (2 * length - 1..).find_map(of_small).expect("powers of 2 are")
+            }
+        };
         let bytes = span * SAMPLE_BYTES;
         if bytes > limits.bytes as usize {
             return Err(GpuError::LineTooLong { samples: length, bytes, limit: limits.bytes as usize });
@@ -66,7 +73,7 @@ impl LineFft {
         }
         let turns: Vec<_> = turns.iter().map(|turn| [turn.re as f32, turn.im as f32]).collect();
         let turns = plan.table("turns of a transform", &turns);
-        Ok(Self { length, span, radices: radices(span).expect("found so"), turns, limits })
+        Ok(Self { length, span, radices, turns, limits })
     }
 
     /// Workgroups for rows, whose threads hold `items` samples, or more where there are not threads enough.
@@ -94,10 +101,10 @@ impl LineFft {
     }
 }
 
-/// The radices of a transform of `length`, one for each pass, unless other factors are left.
-fn radices(length: usize) -> Option<Vec<usize>> {
+/// The radices of a transform of `length`, one for each pass, unless other factors than `all` are left.
+fn radices(length: usize, all: &[usize]) -> Option<Vec<usize>> {
     let (mut rest, mut radices) = (length, Vec::new());
-    for radix in RADICES {
+    for &radix in all {
         let once = radix == 2;
         while rest.is_multiple_of(radix) && (!once || !rest.trailing_zeros().is_multiple_of(2)) {
             radices.push(radix);
@@ -105,6 +112,58 @@ fn radices(length: usize) -> Option<Vec<usize>> {
         }
     }
     (rest == 1).then_some(radices)
+}
+
+/// A pass of an odd `radix` in WGSL, as those of 3 and 5 in `fft.wgsl`: of samples that lie alike around the first, sums
+/// take part by cosines and differences by sines. No thread takes more than `rounds` butterflies.
+fn prime_pass(radix: usize, rounds: usize) -> String {
+    let half = radix / 2;
+    let list = |items: &mut dyn Iterator<Item = String>, between: &str| items.collect::<Vec<_>>().join(between);
+    let mut body = String::from("let t1 = turn(place, RADIX, stride, direction);\nlet x0 = line[place];\n");
+    for part in 1..radix {
+        if part > 1 {
+            body += &format!("let t{part} = times(t{}, t{});\n", part / 2, part - part / 2);
+        }
+        body += &format!("let x{part} = times(line[place + {part}u * COUNT], t{part});\n");
+    }
+    for part in 1..=half {
+        body += &format!("let sum{part} = x{part} + x{0};\nlet less{part} = x{part} - x{0};\n", radix - part);
+    }
+    for bin in 1..=half {
+        let angle = |part: usize| TAU * (bin * part % radix) as f64 / radix as f64;
+        let even = list(&mut (1..=half).map(|part| format!("{:?} * sum{part}", angle(part).cos() as f32)), " + ");
+        let odd = list(&mut (1..=half).map(|part| format!("{:?} * less{part}", angle(part).sin() as f32)), " + ");
+        body += &format!("let even{bin} = x0 + {even};\nlet odd{bin} = quarter_turn({odd}, direction);\n");
+    }
+    let all = list(&mut (1..=half).map(|part| format!("sum{part}")), " + ");
+    let low = list(&mut (1..=half).map(|bin| format!("even{bin} + odd{bin}")), ", ");
+    let high = list(&mut (1..=half).rev().map(|bin| format!("even{bin} - odd{bin}")), ", ");
+    format!(
+        "
+fn pass{radix}(stride: u32, direction: f32) {{
+    const RADIX = {radix}u;
+    const COUNT = SPAN / RADIX * LINES;
+    var values: array<array<vec2f, {radix}>, {rounds}>;
+    for (var round = 0u; round < {rounds}u; round++) {{
+        let place = round * THREADS + thread;
+        if (place < COUNT) {{
+            {body}values[round] = array(x0 + {all}, {low}, {high});
+        }}
+    }}
+    workgroupBarrier();
+    for (var round = 0u; round < {rounds}u; round++) {{
+        let place = round * THREADS + thread;
+        if (place < COUNT) {{
+            let first = output(place, RADIX, stride);
+            for (var part = 0u; part < RADIX; part++) {{
+                line[first + part * stride * LINES] = values[round][part];
+            }}
+        }}
+    }}
+    workgroupBarrier();
+}}
+"
+    )
 }
 
 /// exp(-j·π·s²/length) of each sample s.
@@ -145,7 +204,8 @@ impl Lines {
     ) -> Arc<Shader> {
         let Self { fft: LineFft { length, span, radices, .. }, lines, threads } = self;
         // At least one: an array without elements is none.
-        let rounds = |radix: usize| (span / radix * lines).div_ceil(*threads).max(1).into();
+        let butterflies = |radix: usize| (span / radix * lines).div_ceil(*threads).max(1);
+        let rounds = |radix: usize| butterflies(radix).into();
         let own: [(&str, Constant); 9] = [
             ("LENGTH", (*length).into()),
             ("SPAN", (*span).into()),
@@ -158,6 +218,8 @@ impl Lines {
             ("ROUNDS_5", rounds(5)),
         ];
         let mut source = String::from(include_str!("fft.wgsl"));
+        let primes = RADICES[..PRIMES].iter().filter(|radix| radices.contains(radix));
+        primes.for_each(|&radix| source.push_str(&prime_pass(radix, butterflies(radix))));
         writeln!(source, "\nfn passes(direction: f32) {{").expect("text grows");
         let mut stride = 1;
         for radix in radices {
@@ -245,9 +307,12 @@ mod tests {
 
     #[test]
     fn lines_of_any_length_are_transformed_and_back() {
-        let lengths =
-            [1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 16, 25, 30, 31, 64, 97, 128, 135, 480, 541, 683, 1080, 1021, 3840];
-        for (index, length) in lengths.into_iter().enumerate() {
+        let lengths = [
+            1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 13, 16, 17, 25, 30, 31, 49, 64, 97, 128, 135, 143, 480, 541, 683, 1001, 1080,
+        ]
+        .into_iter()
+        .chain([1021, 1232, 2080, 3840]);
+        for (index, length) in lengths.enumerate() {
             for direction in [1.0, -1.0] {
                 let lines = |fft: &LineFft| match index % 3 {
                     0 => fft.rows(4),
@@ -276,6 +341,27 @@ mod tests {
             assert_eq!(error, GpuError::LineTooLong { samples, bytes, limit: 16384 });
             let text = error.to_string();
             assert!([&samples.to_string(), "16384", "--backend cpu"].iter().all(|part| text.contains(*part)), "{text}");
+        }
+    }
+
+    /// Half the pixels, across and down, of panels that are sold; with the spans that they take.
+    #[test]
+    fn lines_of_known_panels_fit_in_the_least_memory_that_devices_have() {
+        for (length, span) in [
+            (960, 960),
+            (540, 540),
+            (600, 600),
+            (576, 576),
+            (636, 1280),
+            (512, 512),
+            (1200, 1200),
+            (2047, 4096),
+            (2080, 2080),
+            (1232, 1232),
+            (1920, 1920),
+            (1080, 1080),
+        ] {
+            assert_eq!(LineFft::new(&mut Plan::default(), length, LIMITS).expect("it fits").span, span, "{length}");
         }
     }
 

@@ -1,11 +1,12 @@
 // Circular transforms of lines of LENGTH samples, not normalised. A workgroup transforms LINES lines in its own memory:
-// by Stockham's passes where LENGTH has no factor but 2, 3 and 5, and else by Bluestein's chirps, over SPAN samples.
+// by Stockham's passes where LENGTH has no prime factor above 13, and else by Bluestein's chirps, over SPAN samples.
 //
 // A thread stores to and loads from `line` only the places item·THREADS + thread, below PLACES, item in 0..ITEMS; place
 // p is sample p / LINES of line p % LINES. Nothing else has to be waited for around `transform`. Lines beyond the last
 // one may hold anything.
 //
-// Before this file: LENGTH, SPAN, LINES, THREADS, BLUESTEIN and, for each radix, its rounds. After it: `passes`.
+// Before this file: LENGTH, SPAN, LINES, THREADS, BLUESTEIN and, for each radix, its rounds. After it: the passes of 7,
+// 11 and 13 where they are needed, and `passes`.
 
 const PLACES = LENGTH * LINES;
 const ITEMS = (PLACES + THREADS - 1u) / THREADS;
