@@ -143,8 +143,11 @@ fn assert_dark_in_time(what: &str, dark_after: TimeNs) {
 #[test]
 #[should_panic(expected = "not dark at the end")]
 fn canary_a_window_that_nothing_happens_to_stays_lit() {
-    let desktop = Desktop::with_two_monitors();
-    dark_after(DisplayServer::X11(desktop.name.clone()), true, || ());
+    // On a busy machine it may be dark just when it is looked at; three times in a row is no accident.
+    for _ in 0..3 {
+        let desktop = Desktop::with_two_monitors();
+        dark_after(DisplayServer::X11(desktop.name.clone()), true, || ());
+    }
 }
 
 #[test]
