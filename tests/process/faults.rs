@@ -18,7 +18,7 @@ use crate::HOLOD;
 
 const PATIENCE: Duration = Duration::from_secs(60);
 /// What every run here is started with: frames so small that a machine that is busy with other work makes many.
-const ARGS: [&str; 10] = [
+pub(crate) const ARGS: [&str; 10] = [
     "--config",
     "rig.toml",
     "--tracker",
@@ -31,7 +31,7 @@ const ARGS: [&str; 10] = [
     "cpu",
 ];
 
-fn bench() -> tempfile::TempDir {
+pub(crate) fn bench() -> tempfile::TempDir {
     let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
     folder

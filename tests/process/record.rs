@@ -7,39 +7,23 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use holod_tests::daemon::{Daemon, Ended, run, wait_until};
-use holod_tests::small_rig;
 use holod_tests::tracker::PtyTracker;
 use rustix::process::Signal;
 
 use crate::HOLOD;
+use crate::faults::{ARGS, bench};
 
 const PATIENCE: Duration = Duration::from_secs(60);
-/// What every run here is started with.
-const ARGS: [&str; 12] = [
-    "--config",
-    "rig.toml",
-    "--tracker",
-    "mock:steady",
-    "--resolution",
-    "16x16",
-    "--weights",
-    "fast",
-    "--backend",
-    "cpu",
-    "--record",
-    "record",
-];
 /// A connector that no machine has.
 const NO_PANEL: [&str; 2] = ["--output", "drm:DP-99"];
 
-fn bench() -> tempfile::TempDir {
-    let folder = holod_tests::new_folder();
-    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
-    folder
+/// What every run here is started with.
+fn args() -> Vec<&'static str> {
+    [&ARGS[..], &["--record", "record"]].concat()
 }
 
 fn record(folder: &Path, more: &[&str]) -> Ended {
-    run(HOLOD, &[&ARGS, more].concat(), folder)
+    run(HOLOD, &[&args()[..], more].concat(), folder)
 }
 
 /// All files in `folder` and below, with what is in them.
@@ -78,7 +62,7 @@ fn samples_that_are_there_already_are_kept_and_what_overwrites_them_is_said() {
     fs::create_dir(bench.path().join("record")).unwrap();
     fs::write(bench.path().join("record/samples.csv"), "precious").unwrap();
     let tried = ["tracker", "try", "mock:steady", "--duration", "1s", "--record", "record"];
-    for args in [&ARGS[..], &tried] {
+    for args in [&args()[..], &tried] {
         let ended = run(HOLOD, args, bench.path());
         assert_eq!(ended.status.code(), Some(73), "{}", ended.stderr);
         let says = "samples.csv exists already; name another place with --record, or overwrite it with --force";
@@ -109,7 +93,7 @@ fn force_takes_no_record_away_for_a_run_that_does_not_begin() {
     let other = TcpListener::bind("127.0.0.1:0").unwrap();
     let taken = other.local_addr().unwrap().to_string();
     for trouble in [&["--page", &taken][..], &NO_PANEL, &["--tracker", "no-such-log.csv"]] {
-        let ended = run(HOLOD, &[&ARGS[..2], &ARGS[4..], trouble, &["--force"]].concat(), bench.path());
+        let ended = run(HOLOD, &[&args()[..2], &args()[4..], trouble, &["--force"]].concat(), bench.path());
         assert!(matches!(ended.status.code(), Some(66 | 69)), "{trouble:?}: {}", ended.stderr);
         assert!(contents(&path) == earlier, "{trouble:?}");
     }
@@ -131,12 +115,12 @@ fn force_takes_no_record_away_for_a_run_that_does_not_begin() {
 #[test]
 fn a_record_that_is_being_written_is_refused_and_goes_on() {
     let bench = bench();
-    let mut daemon = Daemon::start(HOLOD, &ARGS, bench.path());
+    let mut daemon = Daemon::start(HOLOD, &args(), bench.path());
     let path = bench.path().join("record/frames.csv");
     let rows = || fs::read_to_string(&path).map_or(0, |text| text.lines().count());
     assert!(wait_until(PATIENCE, || rows() > 10));
     let tried = ["tracker", "try", "mock:steady", "--duration", "1s", "--record", "record", "--force"];
-    for args in [&[&ARGS[..], &["--force"]].concat()[..], &ARGS, &tried] {
+    for args in [&[&args()[..], &["--force"]].concat()[..], &args(), &tried] {
         let ended = run(HOLOD, args, bench.path());
         assert_eq!(ended.status.code(), Some(73), "{}", ended.stderr);
         assert!(ended.stderr.contains("record: another holod records there; end it"), "{}", ended.stderr);
