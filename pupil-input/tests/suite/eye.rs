@@ -449,6 +449,28 @@ proptest::proptest! {
     }
 }
 
+#[test]
+fn a_sample_is_held_at_least_until_the_next_ones_can_be_known() {
+    for interval_ms in [5, 16, 33, 100] {
+        for hold_ms in [0, 1, 20] {
+            let settings = EstimatorSettings { hold: TimeNs(hold_ms * 1_000_000), ..settings(rig::Eye::Left) };
+            let mut estimator = Estimator::new(settings);
+            for t_ms in (0..4000).step_by(interval_ms) {
+                estimator.push(sample(t_ms, SampleEye::Left, 4.0), |_| {});
+                // As the frame loop asks, until just before the next sample; once the tracker's rate is known.
+                for ahead_ms in [0, 50, interval_ms as i64 + 49].into_iter().filter(|_| t_ms > 2500) {
+                    let (mm, state) = at(&estimator, t_ms + ahead_ms);
+                    assert!(
+                        state != PupilState::Fallback && (mm - 4.0).abs() < 0.01,
+                        "every {interval_ms} ms, held for {hold_ms} ms, {ahead_ms} ms after {t_ms}: {mm} mm, {state:?}"
+                    );
+                }
+            }
+            assert_eq!(at(&estimator, 10_000), (3.0, PupilState::Fallback));
+        }
+    }
+}
+
 /// As after the tracker's clock stood or was set back by less than makes a new one of it: for a while samples are taken
 /// to be older than they are.
 #[test]
