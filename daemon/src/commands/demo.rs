@@ -162,7 +162,7 @@ fn eye_sheet(views: &[EyeView]) -> Sheet {
         footer: vec![
             "Left: the eye focuses on the near card. Right: on the far card. Top: narrow pupil. Bottom: wide pupil."
                 .into(),
-            "What is in focus is sharper than what is not, and the wider pupil blurs more (it costs sharpness in focus, too)."
+            "What is in focus is sharper than what is not. The wider pupil blurs edges more, but outlines of print stay."
                 .into(),
         ],
     }
