@@ -258,17 +258,26 @@ fn has_ended(polled: Result<wgpu::PollStatus, wgpu::PollError>) -> Result<bool, 
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::gpu::panic_is_caught;
 
-    fn gpu() -> Gpu {
-        Gpu::open(Adapters::Software).expect("Mesa's software device; install mesa-vulkan-drivers")
+    /// What the tests of this crate run on: Mesa's software device, or with `HOLOD_TEST_GPU=hardware` a graphics card.
+    pub(crate) fn test_adapters() -> Adapters {
+        match std::env::var("HOLOD_TEST_GPU").as_deref() {
+            Err(_) | Ok("software") => Adapters::Software,
+            Ok("hardware") => Adapters::Hardware,
+            Ok(other) => panic!("HOLOD_TEST_GPU is `{other}`; expected software or hardware"),
+        }
+    }
+
+    pub(crate) fn test_gpu() -> Gpu {
+        Gpu::open(test_adapters()).expect("Mesa's software device; install mesa-vulkan-drivers")
     }
 
     #[test]
     fn what_is_uploaded_is_read_back() {
-        let gpu = gpu();
+        let gpu = test_gpu();
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
         let buffer = gpu.buffer("numbers", 12, usage).expect("a buffer");
         gpu.queue.write_buffer(&buffer, 0, bytemuck::cast_slice(&[1.5f32, -2.0, 1e-30]));
@@ -279,7 +288,7 @@ mod tests {
 
     #[test]
     fn what_does_not_fit_is_told_with_both_sizes() {
-        let gpu = gpu();
+        let gpu = test_gpu();
         let bytes = gpu.largest_buffer + 4;
         let error = gpu.buffer("the sky", bytes, wgpu::BufferUsages::STORAGE).expect_err("too large");
         let text = error.to_string();
@@ -291,7 +300,7 @@ mod tests {
 
     #[test]
     fn a_shader_that_is_none_is_an_error_now_and_ever_after() {
-        let gpu = gpu();
+        let gpu = test_gpu();
         let error = gpu.pipeline("broken", "@compute @workgroup_size(1) fn f() { nonsense(); }").expect_err("nonsense");
         assert!(matches!(&error, GpuError::Failed { reason, .. } if reason.contains("nonsense")), "{error}");
         assert_eq!(gpu.check(), Err(error));
@@ -299,7 +308,7 @@ mod tests {
 
     #[test]
     fn a_lost_device_is_an_error() {
-        let gpu = gpu();
+        let gpu = test_gpu();
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC;
         let buffer = gpu.buffer("numbers", 12, usage).expect("a buffer");
         let panicked = gpu.guarded::<(), String>(|| {
@@ -322,7 +331,7 @@ mod tests {
 
     #[test]
     fn much_is_read_back_in_parts() {
-        let gpu = gpu();
+        let gpu = test_gpu();
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
         let count = (READ_BYTES / 4) as usize + 3;
         let buffer = gpu.buffer("numbers", 4 * count as u64, usage).expect("a buffer");

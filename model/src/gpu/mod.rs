@@ -8,6 +8,8 @@ use std::time::Duration;
 
 #[cfg(feature = "gpu")]
 pub(crate) use device::Gpu;
+#[cfg(all(test, feature = "gpu"))]
+pub(crate) use device::tests::{test_adapters, test_gpu};
 
 /// Which devices will do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -650,7 +650,7 @@ fn a_folder_that_cannot_be_made_is_named() {
 #[cfg(feature = "gpu")]
 mod on_a_gpu {
     use super::*;
-    use crate::gpu::{Adapters, Gpu, GpuError};
+    use crate::gpu::{Gpu, GpuError, test_gpu};
 
     /// Mean squared difference in dB below the peak of 1, and the share of values more than 0.02 apart.
     fn apart(a: &[f32], b: &[f32]) -> (f64, f64) {
@@ -666,7 +666,7 @@ mod on_a_gpu {
     }
 
     fn device() -> Gpu {
-        Gpu::open(Adapters::Software).expect("Mesa's software device; install mesa-vulkan-drivers")
+        test_gpu()
     }
 
     fn tracer(gpu: Gpu) -> Tracer {

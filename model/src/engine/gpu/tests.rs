@@ -15,7 +15,7 @@ use super::trial::Trial;
 use super::{double_phase, levels};
 use crate::engine::cpu::tests::{OTHER_BENCH, frame};
 use crate::engine::{CpuEngine, EngineError, reference};
-use crate::gpu::{Adapters, GpuError, Precision};
+use crate::gpu::{GpuError, Precision, test_adapters};
 use crate::optics::DoublePhase;
 use crate::weights::tests::{self as weights_tests, random_weights};
 use crate::weights::{Grid, NetworkConfig};
@@ -204,7 +204,7 @@ fn engine(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) ->
 
 fn engine_in(precision: Precision, weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) -> GpuEngine {
     let tables = linear_tables(resolution);
-    GpuEngine::open(weights, bench, &tables, Adapters::Software, precision).expect("an engine")
+    GpuEngine::open(weights, bench, &tables, test_adapters(), precision).expect("an engine")
 }
 
 /// Samples and hologram of a frame.
@@ -433,7 +433,7 @@ fn wrong_sizes_and_pupils_are_refused_and_a_lost_device_is_told() {
     assert!(matches!(lost, Err(EngineError::Gpu(GpuError::Failed { .. }))), "{lost:?}");
 
     let nothing = linear_tables(Resolution { width: 0, height: 4 });
-    let refused = GpuEngine::open(&weights, &DisplayGeometry::DEFAULT, &nothing, Adapters::Software, Precision::Single);
+    let refused = GpuEngine::open(&weights, &DisplayGeometry::DEFAULT, &nothing, test_adapters(), Precision::Single);
     assert!(matches!(refused.err(), Some(EngineError::Empty { .. })));
 }
 

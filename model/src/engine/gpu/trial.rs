@@ -1,11 +1,11 @@
-//! Runs a plan on Mesa's software device, for tests.
+//! Runs a plan on the device that tests run on.
 
 use half::f16;
 use num_complex::Complex64;
 
 use super::map::{GROUP, Map};
 use super::plan::{BufferId, Dispatch, Plan};
-use crate::gpu::{Adapters, Gpu, Precision};
+use crate::gpu::{Gpu, Precision, test_gpu};
 use crate::worst::worst;
 
 /// Numbers behind each buffer, not finite, which no shader may read or write.
@@ -23,7 +23,7 @@ type Work = (wgpu::ComputePipeline, wgpu::BindGroup, [u32; 3]);
 
 impl Trial {
     pub(super) fn new(plan: &Plan) -> Self {
-        let gpu = Gpu::open(Adapters::Software).expect("Mesa's software device; install mesa-vulkan-drivers");
+        let gpu = test_gpu();
         let usage = wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::COPY_SRC;
         let guard = vec![f32::NAN; GUARD];
         let buffers: Vec<_> = plan
