@@ -206,12 +206,12 @@ impl From<Fit> for FitArg {
 #[derive(ValueEnum, Serialize, Deserialize, Debug, Clone, Copy, Default, PartialEq, Eq)]
 #[serde(rename_all = "kebab-case")]
 pub enum Backend {
-    /// A GPU where there is one that will do, else the processor's cores.
+    /// A GPU where there is one that will do, in half precision if it multiplies matrices so; else the processor's cores.
     #[default]
     Auto,
     /// Native code on the processor's cores.
     Cpu,
-    /// A GPU by Vulkan; where there is none, a processor that plays one, which is slow.
+    /// A GPU by Vulkan, in single precision; where there is none, a processor that plays one, which is slow.
     Gpu,
     /// The same with a network's features in half precision, where the device has that: faster, a little less exact.
     GpuHalf,

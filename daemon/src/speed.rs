@@ -1,5 +1,7 @@
-//! How many frames a second there are, how many the panel could show, and what would bring more.
+//! How many frames a second there are, how many the panel could show, and what would bring more; and whether a GPU
+//! computes what the processor does.
 
+use std::f32::consts::TAU;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -10,7 +12,7 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
-use crate::renderer;
+use crate::renderer::{self, Renderer};
 use crate::source::scene;
 
 /// A display that shows less than this share of the panel's frames is called slow.
@@ -20,6 +22,11 @@ const TIMED_PX: [usize; 2] = [256, 512];
 /// A side that is advised is a multiple of this, and not less than [`LEAST_SIDE_PX`].
 const SIDE_STEP_PX: usize = 16;
 const LEAST_SIDE_PX: usize = 64;
+
+/// Phases of two engines are the same up to this, in half precision, too: the step of a panel of 256 levels.
+const SAME_PHASE_RAD: f32 = TAU / 256.0;
+/// A GPU whose phases are farther from the processor's at more than this share of the pixels computes wrongly.
+pub(crate) const MOST_APART: f64 = 1e-3;
 
 /// Frames of all colours that the panel can show in a second.
 pub(crate) fn panel_frames_hz(panel: &Panel) -> f64 {
@@ -61,6 +68,9 @@ pub(crate) struct Estimate {
     /// Their sizes, the smaller first.
     pub timed: [Resolution; 2],
     seconds: [f64; 2],
+    /// Where they were computed by a GPU: the share of the smaller one's phases, of all colours, that are not the
+    /// processor's.
+    pub apart: Option<f64>,
 }
 
 impl Estimate {
@@ -68,11 +78,21 @@ impl Estimate {
     ///
     /// # Errors
     /// The backend is not to be had, or the rig contradicts itself.
-    pub(crate) fn of(rig: &Rig, weights: &Weights) -> Result<Self, Failure> {
+    pub(crate) fn of(rig: &Rig, weights: &Weights, backend: Backend) -> Result<Self, Failure> {
         let panel = rig.resolution();
         let timed = TIMED_PX.map(|side| Resolution { width: side.min(panel.width), height: side.min(panel.height) });
-        let [(_, smaller_s), (engine, larger_s)] = [time(rig, weights, timed[0])?, time(rig, weights, timed[1])?];
-        Ok(Self { engine, timed, seconds: [smaller_s, larger_s] })
+        let time = |backend, size| Timed::new(rig, weights, backend, size);
+        let [mut smaller, larger] = [time(backend, timed[0])?, time(backend, timed[1])?];
+        let apart = match smaller.renderer.cpu_threads() {
+            Some(_) => None,
+            None => {
+                let mut processor = time(Backend::Cpu, timed[0])?;
+                let [found, expected] = [smaller.phases_rad()?, processor.phases_rad()?];
+                Some(share_apart(found, expected))
+            }
+        };
+        let engine = larger.renderer.description().to_owned();
+        Ok(Self { engine, timed, seconds: [smaller.seconds, larger.seconds], apart })
     }
 
     /// Frames of `size` a second: a GPU takes some of the time for each frame, the rest goes with the pixels.
@@ -85,21 +105,44 @@ impl Estimate {
     }
 }
 
-/// How a frame of `size` is computed, and the seconds that it takes.
-fn time(rig: &Rig, weights: &Weights, size: Resolution) -> Result<(String, f64), Failure> {
-    // A panel of the frame's size: what surrounds the frame would be timed, too, and does not go with its pixels.
-    let panel = Panel { flatness_rad: PerColour([None, None, None]), ..rig.panel.clone() };
-    let encoder = PanelEncoder::new(&panel, size, size).map(Arc::new).map_err(Failure::because(Exit::Config))?;
-    let mut renderer = renderer::open(Backend::Auto, weights, &rig.geometry, &encoder)?;
-    let (frame, mut levels) = (Arc::new(scene::sample_frame(size)), LevelsFrame::new(encoder.layout()));
-    let pupil = weights.trained_pupils(&rig.geometry)[0];
-    let mut seconds = f64::MAX;
-    for _ in 0..2 {
-        let began = Instant::now();
-        renderer.render(&frame, pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))?;
-        seconds = seconds.min(began.elapsed().as_secs_f64());
+/// A renderer that has made the sample frame of a size, and the seconds that it takes.
+struct Timed {
+    renderer: Box<dyn Renderer>,
+    seconds: f64,
+}
+
+impl Timed {
+    fn new(rig: &Rig, weights: &Weights, backend: Backend, size: Resolution) -> Result<Self, Failure> {
+        // A panel of the frame's size: what surrounds the frame would be timed, too, and does not go with its pixels.
+        let panel = Panel { flatness_rad: PerColour([None, None, None]), ..rig.panel.clone() };
+        let encoder = PanelEncoder::new(&panel, size, size).map(Arc::new).map_err(Failure::because(Exit::Config))?;
+        let mut renderer = renderer::open(backend, weights, &rig.geometry, &encoder)?;
+        let (frame, mut levels) = (Arc::new(scene::sample_frame(size)), LevelsFrame::new(encoder.layout()));
+        let pupil = weights.trained_pupils(&rig.geometry)[0];
+        let mut seconds = f64::MAX;
+        for _ in 0..2 {
+            let began = Instant::now();
+            renderer.render(&frame, pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))?;
+            seconds = seconds.min(began.elapsed().as_secs_f64());
+        }
+        Ok(Self { renderer, seconds })
     }
-    Ok((renderer.description().to_owned(), seconds))
+
+    /// The frame's phases, [3, height, width].
+    fn phases_rad(&mut self) -> Result<&[f32], Failure> {
+        let pattern = self.renderer.pattern().map_err(Failure::because(Exit::Unavailable))?;
+        Ok(&pattern.phase_rad)
+    }
+}
+
+/// The share of phases that are not the same, round the circle; those that are no numbers are not.
+fn share_apart(found: &[f32], expected: &[f32]) -> f64 {
+    assert_eq!(found.len(), expected.len());
+    let same = |(found, expected): &(&f32, &f32)| {
+        let apart_rad = (*found - *expected).rem_euclid(TAU);
+        apart_rad.min(TAU - apart_rad) <= SAME_PHASE_RAD && apart_rad.is_finite()
+    };
+    1.0 - found.iter().zip(expected).filter(same).count() as f64 / found.len() as f64
 }
 
 #[cfg(test)]
@@ -141,7 +184,8 @@ mod tests {
     #[test]
     fn the_estimate_goes_with_the_pixels_and_leaves_out_what_each_frame_takes() {
         let square = |side| Resolution { width: side, height: side };
-        let estimate = |seconds| Estimate { engine: "cpu".into(), timed: [square(256), square(512)], seconds };
+        let estimate =
+            |seconds| Estimate { engine: "cpu".into(), timed: [square(256), square(512)], seconds, apart: None };
         let frames_hz = |seconds, side| estimate(seconds).frames_hz(square(side));
         let near = |found: f64, expected: f64| assert!((found / expected - 1.0).abs() < 1e-9, "{found} for {expected}");
         near(frames_hz([0.25, 1.0], 256), 4.0);
@@ -151,7 +195,25 @@ mod tests {
         // A lap that something disturbed.
         near(frames_hz([0.5, 0.4], 1024), 1.0 / 0.4);
         near(frames_hz([0.0, 0.4], 1024), 1.0 / 1.6);
-        let same = Estimate { engine: "cpu".into(), timed: [square(64); 2], seconds: [0.1, 0.1] };
+        let same = Estimate { engine: "cpu".into(), timed: [square(64); 2], seconds: [0.1, 0.1], apart: None };
         near(same.frames_hz(square(128)), 2.5);
+    }
+
+    #[test]
+    fn phases_are_compared_round_the_circle_and_what_is_no_number_is_wrong() {
+        let expected = [0.0, 0.01, 3.0, 6.279, 1.0, 2.0, 4.0, 5.0];
+        assert_eq!(share_apart(&[6.279, 0.02, 3.02, 0.0, 1.0, 2.0, 4.0, 5.0], &expected), 0.0);
+        assert_eq!(share_apart(&[0.0, 0.01, 3.03, 6.279, 1.0, 2.0, f32::NAN, 5.0], &expected), 0.25);
+    }
+
+    /// On Mesa's software device, which `Auto` does not take.
+    #[cfg(feature = "gpu")]
+    #[test]
+    fn a_gpu_is_compared_with_the_processor() {
+        let rig = Rig::default();
+        let estimate = |backend| Estimate::of(&rig, &Weights::builtin_fast(), backend).expect("an engine");
+        let on_gpu = estimate(Backend::Gpu);
+        assert!(on_gpu.engine.starts_with("gpu, ") && on_gpu.apart.expect("compared") < MOST_APART, "{on_gpu:?}");
+        assert_eq!(estimate(Backend::Cpu).apart, None);
     }
 }

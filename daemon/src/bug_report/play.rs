@@ -86,6 +86,7 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     let backend = match backend {
         Backend::Auto if facts.engine.starts_with("cpu") => Backend::Cpu,
         Backend::Auto if facts.engine.contains("half precision") => Backend::GpuHalf,
+        Backend::Auto if facts.engine.contains("single precision") => Backend::Gpu,
         asked => asked,
     };
     if facts.holod != env!("HOLOD_VERSION") {

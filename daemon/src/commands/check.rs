@@ -16,7 +16,7 @@ use holod_model::weights::{Architecture, JudgedBench};
 use holod_pupil_input::{Tracker, TrackerSpec, serial_port_warnings};
 use serde::Serialize;
 
-use crate::cli::CheckArgs;
+use crate::cli::{Backend, CheckArgs};
 use crate::failure::{Exit, Failure};
 use crate::source::scene;
 use crate::speed::{self, Estimate};
@@ -45,7 +45,7 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
     let network = setup::load_weights(&rig);
     let mut checks = weights_checks(&rig, &network);
     let runs = checks.iter().all(|check| check.passed);
-    checks.push(frames_hz(&rig, network.as_ref().ok().filter(|_| runs), args.resolution));
+    checks.extend(speed(&rig, network.as_ref().ok().filter(|_| runs), args.resolution));
     checks.push(tracker(&rig));
     let root = Path::new("/");
     checks.extend(access::access(&rig, args.service, root));
@@ -127,9 +127,8 @@ fn weights_checks(rig: &Rig, weights: &Result<Weights, Failure>) -> Vec<Check> {
     checks
 }
 
-/// Frames a second, estimated from a small frame: slow is no fault of the bench.
-fn frames_hz(rig: &Rig, weights: Option<&Weights>, resolution: Option<Resolution>) -> Check {
-    let name = "speed";
+/// Frames a second, estimated from a small frame: slow is no fault of the bench. A GPU that computes wrongly is one.
+fn speed(rig: &Rig, weights: Option<&Weights>, resolution: Option<Resolution>) -> Vec<Check> {
     let panel = rig.resolution();
     let sizes = match resolution {
         Some(size) => vec![size],
@@ -137,8 +136,13 @@ fn frames_hz(rig: &Rig, weights: Option<&Weights>, resolution: Option<Resolution
     };
     let fits = |size: &Resolution| size.width <= panel.width && size.height <= panel.height;
     let sizes: Vec<Resolution> = sizes.into_iter().filter(fits).collect();
-    let estimated =
-        weights.map(|weights| progress::during("estimating the frames a second", || Estimate::of(rig, weights)));
+    let estimate =
+        |weights| progress::during("estimating the frames a second", || Estimate::of(rig, weights, Backend::Auto));
+    let estimated = weights.map(estimate);
+    let gpu = match &estimated {
+        Some(Ok(Estimate { apart: Some(apart), .. })) => Some(gpu(*apart)),
+        _ => None,
+    };
     let (passed, says) = match (estimated, &sizes[..]) {
         // Why is said above, of the weights.
         (None, _) => (true, "not estimated without weights that fit".into()),
@@ -159,7 +163,22 @@ fn frames_hz(rig: &Rig, weights: Option<&Weights>, resolution: Option<Resolution
             (true, says)
         }
     };
-    Check { name, passed, says }
+    [Check { name: "speed", passed, says }].into_iter().chain(gpu).collect()
+}
+
+/// Whether a GPU computes what the processor does; of a share `apart` of the pixels it does not.
+fn gpu(apart: f64) -> Check {
+    let passed = apart <= speed::MOST_APART;
+    let found = format!("at {:.2} % of the pixels more than 1/256 of a turn from the processor's", 1e2 * apart);
+    let says = match passed {
+        true => format!("the phases of a frame are {found}"),
+        false => format!(
+            "it computes wrongly: the phases of a frame are {found}; expected {:.1} % at most; try another version of its \
+             driver, and use --backend cpu until then",
+            1e2 * speed::MOST_APART
+        ),
+    };
+    Check { name: "gpu", passed, says }
 }
 
 fn tracker(rig: &Rig) -> Check {

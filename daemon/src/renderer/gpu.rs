@@ -21,7 +21,7 @@ pub(super) struct GpuRenderer {
     bench: DisplayGeometry,
     encoder: Arc<PanelEncoder>,
     adapters: Adapters,
-    precision: Precision,
+    precision: Option<Precision>,
     engine: Engine,
     reopenings_left: u32,
     description: String,
@@ -61,7 +61,7 @@ impl<T> ReadBack<T> {
 }
 
 impl GpuRenderer {
-    /// On the best device of the kind `adapters`, with features in `precision` where it has that.
+    /// On the best device of the kind `adapters`, with features in `precision` where it has that, as [`GpuEngine::open`].
     ///
     /// # Errors
     /// There is none, or it lacks what the network needs at the pattern's size.
@@ -70,7 +70,7 @@ impl GpuRenderer {
         bench: &DisplayGeometry,
         encoder: &Arc<PanelEncoder>,
         adapters: Adapters,
-        precision: Precision,
+        precision: Option<Precision>,
     ) -> Result<Self, EngineError> {
         let engine = Box::new(GpuEngine::open(weights, bench, &encoder.tables(), adapters, precision)?);
         Ok(Self {
@@ -137,7 +137,8 @@ fn described(engine: &GpuEngine, adapters: Adapters) -> String {
         Precision::Single => "single",
         Precision::Half => "half",
     };
-    format!("gpu, {}, {precision} precision{slow}", engine.device())
+    let units = if engine.uses_matrix_units() { " by matrix units" } else { "" };
+    format!("gpu, {}, {precision} precision{units}{slow}", engine.device())
 }
 
 impl Renderer for GpuRenderer {
@@ -240,7 +241,7 @@ mod tests {
 
     fn renderer(encoder: &Arc<PanelEncoder>) -> GpuRenderer {
         let (weights, bench) = (Weights::builtin_small(), DisplayGeometry::DEFAULT);
-        GpuRenderer::new(&weights, &bench, encoder, Adapters::Software, Precision::Single)
+        GpuRenderer::new(&weights, &bench, encoder, Adapters::Software, None)
             .expect("Mesa's software device; install mesa-vulkan-drivers")
     }
 

@@ -78,7 +78,8 @@ pub struct Rendered {
 /// A renderer of frames of the pattern's size of `encoder`, on the optics of `bench`.
 ///
 /// `Auto` takes a GPU where there is one that will do, else the processor; `Gpu` a GPU, or where there is none a
-/// processor that plays one. `GpuHalf` is as `Gpu`, in half precision where the device has it.
+/// processor that plays one. `GpuHalf` is as `Gpu`, in half precision where the device has it; `Auto` computes so where
+/// the device multiplies matrices.
 ///
 /// # Errors
 /// The backend is not to be had.
@@ -88,7 +89,11 @@ pub fn open(
     bench: &DisplayGeometry,
     encoder: &Arc<PanelEncoder>,
 ) -> Result<Box<dyn Renderer>, Failure> {
-    let precision = if backend == Backend::GpuHalf { Precision::Half } else { Precision::Single };
+    let precision = match backend {
+        Backend::Auto | Backend::Cpu => None,
+        Backend::Gpu => Some(Precision::Single),
+        Backend::GpuHalf => Some(Precision::Half),
+    };
     let on_gpu = |adapters| on_gpu(weights, bench, encoder, adapters, precision);
     match backend {
         Backend::Cpu => Ok(Box::new(CpuRenderer::new(weights, bench, encoder, None)?)),
@@ -124,7 +129,7 @@ fn on_gpu(
     bench: &DisplayGeometry,
     encoder: &Arc<PanelEncoder>,
     adapters: Adapters,
-    precision: Precision,
+    precision: Option<Precision>,
 ) -> Result<Box<dyn Renderer>, EngineError> {
     Ok(Box::new(gpu::GpuRenderer::new(weights, bench, encoder, adapters, precision)?))
 }
@@ -135,7 +140,7 @@ fn on_gpu(
     _: &DisplayGeometry,
     _: &Arc<PanelEncoder>,
     _: Adapters,
-    _: Precision,
+    _: Option<Precision>,
 ) -> Result<Box<dyn Renderer>, EngineError> {
     Err(GpuError::NotBuilt.into())
 }

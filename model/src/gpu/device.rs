@@ -4,7 +4,7 @@
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use super::{Adapters, GpuError, caught};
+use super::{Adapters, GpuError, MatrixUnits, caught};
 
 /// A device and its queue.
 pub(crate) struct Gpu {
@@ -20,6 +20,7 @@ pub(crate) struct Gpu {
     pub(crate) workgroup_threads: u32,
     /// Whether its shaders compute in half precision.
     pub(crate) half_precision: bool,
+    pub(crate) matrix_units: Option<MatrixUnits>,
     /// Nanoseconds to a tick of the timestamps, where the device has them.
     pub(crate) timestamp_ns: Option<f32>,
 }
@@ -59,10 +60,17 @@ impl Gpu {
         let name = adapter.get_info().name;
         let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         let half_precision = adapter.features() & wgpu::Features::SHADER_F16;
+        let (matrix_units, experimental_features) = match has_matrix_units(adapter) {
+            // SAFETY: no other experimental feature is asked for, and this one is used by this crate's own shaders alone,
+            // whose results are compared with the reference's on cards that have it.
+            true => (wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX, unsafe { wgpu::ExperimentalFeatures::enabled() }),
+            false => (wgpu::Features::empty(), wgpu::ExperimentalFeatures::disabled()),
+        };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("holod"),
-            required_features: timestamps | half_precision,
+            required_features: timestamps | half_precision | matrix_units,
             required_limits: adapter.limits(),
+            experimental_features,
             memory_hints: wgpu::MemoryHints::Performance,
             ..wgpu::DeviceDescriptor::default()
         };
@@ -83,6 +91,7 @@ impl Gpu {
         let workgroup_bytes = limits.max_compute_workgroup_storage_size;
         let workgroup_threads = limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x);
         let half_precision = !half_precision.is_empty();
+        let matrix_units = (!matrix_units.is_empty()).then_some(MatrixUnits::Device);
         let timestamp_ns = (!timestamps.is_empty()).then(|| queue.get_timestamp_period());
         Ok(Self {
             device,
@@ -93,6 +102,7 @@ impl Gpu {
             workgroup_bytes,
             workgroup_threads,
             half_precision,
+            matrix_units,
             timestamp_ns,
         })
     }
@@ -247,6 +257,21 @@ impl Gpu {
         }
         Ok(())
     }
+}
+
+/// Whether the adapter multiplies matrices as [`MatrixUnits`] does, in subgroups of 32 threads always: where their size
+/// may vary, a workgroup of 32 could be half of one.
+fn has_matrix_units(adapter: &wgpu::Adapter) -> bool {
+    use wgpu::CooperativeScalarType::{F16, F32};
+    let info = adapter.get_info();
+    let features = wgpu::Features::SHADER_F16 | wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX;
+    let of_16 = |offered: &wgpu::CooperativeMatrixProperties| {
+        let &wgpu::CooperativeMatrixProperties { m_size, n_size, k_size, ab_type, cr_type, .. } = offered;
+        (m_size, n_size, k_size, ab_type, cr_type) == (16, 16, 16, F16, F32)
+    };
+    adapter.features().contains(features)
+        && (info.subgroup_min_size, info.subgroup_max_size) == (32, 32)
+        && adapter.cooperative_matrix_properties().iter().any(of_16)
 }
 
 /// Whether work has ended within the time that it was waited for.

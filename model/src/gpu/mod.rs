@@ -29,6 +29,16 @@ pub enum Precision {
     Half,
 }
 
+/// What multiplies matrices of 16 by 16 numbers of half precision, and sums up in single precision.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum MatrixUnits {
+    /// The device's own, which a subgroup of 32 threads drives (Vulkan's cooperative matrices).
+    Device,
+    /// A workgroup of 32 threads that multiplies as they do: for tests, since software devices have none.
+    #[cfg(test)]
+    Threads,
+}
+
 thread_local! {
     static CATCHES: Cell<bool> = const { Cell::new(false) };
 }

@@ -1,11 +1,13 @@
 //! 3x3 convolutions on the GPU, as sums over taps.
 //!
-//! Layers that write a map of half precision multiply in half precision, two products at once, and sum up what each
-//! group of input channels gives in single precision. All others multiply in single precision, whatever they read.
+//! Layers that read matrices multiply these, in half precision, and sum up in single precision. Of the others those that
+//! write a map of half precision multiply in half precision, two products at once, and sum up what each group of input
+//! channels gives in single precision; the rest multiply in single precision, whatever they read.
 
 use half::f16;
 
-use super::map::{GROUP, Map, ROWS};
+use super::map::{Format, GROUP, Map, ROWS, TILE};
+use super::matrix::{self, TilePacking};
 use super::plan::{BufferId, Constant, ENABLE_F16, Plan, Shader};
 use crate::gpu::Precision;
 
@@ -81,15 +83,17 @@ impl ConvLayer<'_> {
             ("LEAKY", (self.epilogue != Epilogue::None).into()),
             ("LEAKY_SLOPE", self.leaky_slope.into()),
         ];
+        constants.push(output.block("OUT_BLOCK"));
         constants.extend(output.constants(["OUT_GROUPS", "OUT_PITCH"]));
         constants
     }
 
     /// `epilogue.wgsl` and `text` for the vectors of two maps.
     pub(super) fn source(&self, input: &Map, output: &Map, text: &str) -> String {
-        let half = [input, output].iter().any(|map| map.precision == Precision::Half);
-        let (directive, epilogue) = (if half { ENABLE_F16 } else { "" }, include_str!("epilogue.wgsl"));
-        let [input, output] = [input, output].map(|map| map.precision.vector());
+        let half = [input, output].iter().any(|map| map.format.precision() == Precision::Half);
+        let epilogue = concat!(include_str!("epilogue.wgsl"), "\n", include_str!("store.wgsl"));
+        let directive = if half { ENABLE_F16 } else { "" };
+        let [input, output] = [input, output].map(|map| map.format.precision().vector());
         format!("{directive}alias InVector = {input};\nalias OutVector = {output};\n\n{epilogue}\n{text}")
     }
 
@@ -109,46 +113,83 @@ impl ConvLayer<'_> {
 }
 
 /// How a layer's parameters lie in their buffer.
-///
-/// Threads make the output channels in parts of a few whole groups; those beyond the map's groups are zero and not
-/// stored.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Packing {
-    precision: Precision,
-    input_groups: usize,
-    parts: usize,
-    part_groups: usize,
+    /// Of the parameters.
+    pub(super) precision: Precision,
+    layout: Layout,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Layout {
+    /// Threads make the output channels in parts of a few whole groups; those beyond the map's groups are zero and not
+    /// stored.
+    Groups { input_groups: usize, parts: usize, part_groups: usize },
+    /// Matrices, for each column of the kernel, block of inputs and row of the kernel.
+    Tiles { input_blocks: usize, packing: TilePacking },
 }
 
 impl Packing {
-    /// For a layer that multiplies in `precision`, reads the first `input_groups` of a map and writes a map of
+    /// For a layer that multiplies vectors in `precision`, reads the first `input_groups` of a map and writes a map of
     /// `output_groups`.
     pub(crate) fn new(precision: Precision, input_groups: usize, output_groups: usize) -> Self {
         let parts = output_groups.div_ceil(precision.most_part_groups());
-        Self { precision, input_groups, parts, part_groups: output_groups.div_ceil(parts) }
+        let part_groups = output_groups.div_ceil(parts);
+        Self { precision, layout: Layout::Groups { input_groups, parts, part_groups } }
+    }
+
+    /// For a layer that multiplies matrices, and reads the first `input_blocks` of a map.
+    fn of_tiles(input_blocks: usize, output_groups: usize) -> Self {
+        let packing = TilePacking::new(output_groups, TAPS * input_blocks);
+        Self { precision: Precision::Half, layout: Layout::Tiles { input_blocks, packing } }
     }
 
     /// Numbers in the buffer.
     pub(crate) fn len(&self) -> usize {
-        self.biases() + self.parts * self.input_groups * self.group_len()
+        match self.layout {
+            Layout::Groups { input_groups, parts, .. } => self.biases() + parts * input_groups * self.group_len(),
+            Layout::Tiles { packing, .. } => packing.len(),
+        }
+    }
+
+    fn parts(&self) -> usize {
+        match self.layout {
+            Layout::Groups { parts, .. } => parts,
+            Layout::Tiles { packing, .. } => packing.parts,
+        }
+    }
+
+    /// Groups of outputs of a part.
+    fn part_groups(&self) -> usize {
+        match self.layout {
+            Layout::Groups { part_groups, .. } => part_groups,
+            Layout::Tiles { packing, .. } => packing.biases() / packing.parts / GROUP,
+        }
     }
 
     fn biases(&self) -> usize {
-        (self.parts * self.part_groups).next_multiple_of(self.precision.element_vectors()) * GROUP
+        (self.parts() * self.part_groups()).next_multiple_of(self.precision.element_vectors()) * GROUP
     }
 
     /// Weights of one part for one group of inputs.
     fn group_len(&self) -> usize {
-        (TAPS * GROUP * self.part_groups).next_multiple_of(self.precision.element_vectors()) * GROUP
+        (TAPS * GROUP * self.part_groups()).next_multiple_of(self.precision.element_vectors()) * GROUP
     }
 
     /// The place of the weight by which `input`, a channel of the map, is multiplied at `tap` for `output`.
     fn place(&self, output: usize, input: usize, tap: usize) -> usize {
-        let (group, lane) = (output / GROUP, output % GROUP);
-        let (part, group) = (group / self.part_groups, group % self.part_groups);
-        let first = self.biases() + (part * self.input_groups + input / GROUP) * self.group_len();
-        let channel = (tap % 3 * 3 + tap / 3) * GROUP + input % GROUP;
-        first + (channel * self.part_groups + group) * GROUP + lane
+        match self.layout {
+            Layout::Groups { input_groups, part_groups, .. } => {
+                let (group, lane) = (output / GROUP, output % GROUP);
+                let (part, group) = (group / part_groups, group % part_groups);
+                let first = self.biases() + (part * input_groups + input / GROUP) * self.group_len();
+                let channel = (tap % 3 * 3 + tap / 3) * GROUP + input % GROUP;
+                first + (channel * part_groups + group) * GROUP + lane
+            }
+            Layout::Tiles { input_blocks, packing } => {
+                packing.place(output, (tap % 3 * input_blocks + input / TILE) * 3 + tap / 3, input)
+            }
+        }
     }
 
     /// Writes the parameters of a layer to `parameters`, of [`Self::len`] zeros or of the same layer at other values:
@@ -190,36 +231,53 @@ pub(crate) fn convolve(
     output: &Map,
 ) -> (BufferId, Packing) {
     layer.check((input, input_groups), output);
-    let precision = output.precision;
-    let packing = Packing::new(precision, input_groups, output.groups);
-    let parameters = precision.table(plan, "a convolution's parameters", &packing.pack(layer));
+    let precision = output.format.precision();
+    let input_blocks = input_groups.div_ceil(TILE / GROUP);
+    let packing = match input.format {
+        Format::HalfTiles(_) => Packing::of_tiles(input_blocks, output.groups),
+        Format::Single | Format::Half => Packing::new(precision, input_groups, output.groups),
+    };
+    let parameters = packing.precision.table(plan, "a convolution's parameters", &packing.pack(layer));
+    let (rows, columns) = match input.format {
+        Format::HalfTiles(units) => (matrix::rows(units), TILE),
+        Format::Single | Format::Half => (ROWS, WORKGROUP),
+    };
     let mut constants = vec![
         ("WORKGROUP", WORKGROUP.into()),
-        ("ROWS", ROWS.into()),
+        ("ROWS", rows.into()),
         ("INPUT_GROUPS", input_groups.into()),
-        ("PARTS", packing.parts.into()),
-        ("PART_GROUPS", packing.part_groups.into()),
+        ("INPUT_BLOCKS", input_blocks.into()),
+        ("PARTS", packing.parts().into()),
+        ("PART_GROUPS", packing.part_groups().into()),
     ];
     constants.extend(layer.epilogue_constants(output));
+    constants.push(input.block("IN_BLOCK"));
     constants.extend(input.constants(["IN_GROUPS", "IN_PITCH"]));
-    let text = match precision {
-        Precision::Single => include_str!("conv.wgsl"),
-        Precision::Half => include_str!("conv_f16.wgsl"),
+    let source = match (input.format, precision) {
+        (Format::HalfTiles(units), _) => {
+            matrix::source(output, units, "input", rows, &[include_str!("conv_matrix.wgsl")])
+        }
+        (_, Precision::Single) => layer.source(input, output, include_str!("conv.wgsl")),
+        (_, Precision::Half) => layer.source(input, output, include_str!("conv_f16.wgsl")),
     };
-    let shader = Shader::new(label, &constants, &layer.source(input, output, text), "convolve");
-    let workgroups = [output.width.div_ceil(WORKGROUP) * packing.parts, output.height.div_ceil(ROWS), 1];
+    let shader = Shader::new(label, &constants, &source, "convolve");
+    let workgroups = [output.width.div_ceil(columns) * packing.parts(), output.height.div_ceil(rows), 1];
     let stage = plan.stages.last_mut().expect("a stage was added for the layer");
     let dispatch = stage.dispatch(shader, &[input.buffer, parameters, output.buffer], workgroups);
     let input_bytes = input.inner_bytes() / input.groups as u64 * input_groups as u64;
-    dispatch.bytes = Some(input_bytes + (packing.len() * precision.bytes()) as u64 + layer.output_bytes(output));
+    let parameter_bytes = (packing.len() * packing.precision.bytes()) as u64;
+    dispatch.bytes = Some(input_bytes + parameter_bytes + layer.output_bytes(output));
     (parameters, packing)
 }
 
 #[cfg(test)]
 pub(super) mod tests {
+    use std::sync::OnceLock;
+
     use super::super::trial::Trial;
     use super::*;
     use crate::engine::reference;
+    use crate::gpu::{MatrixUnits, test_gpu};
 
     /// Largest error allowed, over the output's root mean square: of sums in single precision, and of products and sums
     /// in half precision.
@@ -259,6 +317,12 @@ pub(super) mod tests {
         Ok(())
     }
 
+    /// Of the maps' precisions the lower.
+    pub(in super::super) fn worse(formats: [Format; 2]) -> Precision {
+        let half = formats.iter().any(|format| format.precision() == Precision::Half);
+        if half { Precision::Half } else { Precision::Single }
+    }
+
     pub(in super::super) fn finish(epilogue: Epilogue, sum: f64, skip: f32) -> f64 {
         let leaky = |value: f64| value.max(value * f64::from(SLOPE));
         match epilogue {
@@ -268,11 +332,17 @@ pub(super) mod tests {
         }
     }
 
+    /// Matrices for the units of the device that tests run on, or for threads.
+    pub(in super::super) fn tiles() -> Format {
+        static UNITS: OnceLock<MatrixUnits> = OnceLock::new();
+        Format::HalfTiles(*UNITS.get_or_init(|| test_gpu().matrix_units.unwrap_or(MatrixUnits::Threads)))
+    }
+
     /// A layer of `outputs` that reads `inputs`, channels of the first groups of a wider map.
     #[derive(Clone)]
     struct Case {
         /// Of the input map and of the output map.
-        precisions: [Precision; 2],
+        formats: [Format; 2],
         size: (usize, usize),
         inputs: Vec<usize>,
         input_groups: usize,
@@ -282,9 +352,8 @@ pub(super) mod tests {
 
     impl Case {
         fn new(size: (usize, usize), inputs: usize, outputs: usize, epilogue: Epilogue) -> Self {
-            let precisions = [Precision::Single; 2];
             Self {
-                precisions,
+                formats: [Format::Single; 2],
                 size,
                 inputs: (0..inputs).collect(),
                 input_groups: inputs.div_ceil(GROUP),
@@ -294,10 +363,10 @@ pub(super) mod tests {
         }
 
         fn found(&self) -> Vec<f32> {
-            let Self { precisions, size, ref inputs, input_groups, outputs, epilogue } = *self;
+            let Self { formats, size, ref inputs, input_groups, outputs, epilogue } = *self;
             let mut plan = Plan::default();
-            let input = Map::with(precisions[0], &mut plan, "input", size, (input_groups + 1) * GROUP);
-            let output = Map::with(precisions[1], &mut plan, "output", size, outputs);
+            let input = Map::with(formats[0], &mut plan, "input", size, (input_groups + 1) * GROUP);
+            let output = Map::with(formats[1], &mut plan, "output", size, outputs);
             let weight: Vec<_> = (0..outputs * inputs.len() * TAPS).map(noise).collect();
             let bias: Vec<_> = (0..outputs).map(|output| noise(9_000_000 + output)).collect();
             let layer = ConvLayer { weight: &weight, bias: &bias, inputs, epilogue, leaky_slope: SLOPE };
@@ -305,7 +374,8 @@ pub(super) mod tests {
             convolve(&mut plan, "convolution", &layer, (&input, input_groups), &output);
             let trial = Trial::new(&plan);
             // What no layer reads is not finite.
-            let shown = |channel, y, x| if channel < input_groups * GROUP { value(channel, y, x) } else { f32::NAN };
+            let read = input_groups.next_multiple_of(formats[0].block_groups()) * GROUP;
+            let shown = |channel, y, x| if channel < read { value(channel, y, x) } else { f32::NAN };
             trial.write(input.buffer, &input.values(shown));
             trial.write(
                 output.buffer,
@@ -332,10 +402,9 @@ pub(super) mod tests {
         }
 
         fn check(&self) {
-            let Self { precisions, size, ref inputs, outputs, epilogue, .. } = *self;
-            let worse = if precisions.contains(&Precision::Half) { Precision::Half } else { Precision::Single };
-            judge(worse, &self.found(), &self.expected()).unwrap_or_else(|error| {
-                panic!("{precisions:?}, {size:?}, {} to {outputs}, {epilogue:?}: {error}", inputs.len())
+            let Self { formats, size, ref inputs, outputs, epilogue, .. } = *self;
+            judge(worse(formats), &self.found(), &self.expected()).unwrap_or_else(|error| {
+                panic!("{formats:?}, {size:?}, {} to {outputs}, {epilogue:?}: {error}", inputs.len())
             });
         }
     }
@@ -366,13 +435,28 @@ pub(super) mod tests {
     /// Between maps of both precisions; an odd number of groups does not fill its elements.
     #[test]
     fn sums_are_right_in_half_precision() {
-        let (single, half) = (Precision::Single, Precision::Half);
-        for precisions in [[half, half], [single, half], [half, single]] {
+        let (single, half) = (Format::Single, Format::Half);
+        for formats in [[half, half], [single, half], [half, single]] {
             for (size, inputs, outputs) in [((65, 5), 5, 7), ((9, 7), 9, 24)] {
-                Case { precisions, ..Case::new(size, inputs, outputs, Epilogue::ResidualLeaky) }.check();
+                Case { formats, ..Case::new(size, inputs, outputs, Epilogue::ResidualLeaky) }.check();
             }
         }
-        Case { precisions: [half, half], ..Case::new((1, 1), 4, 4, Epilogue::Leaky) }.check();
+        Case { formats: [half, half], ..Case::new((1, 1), 4, 4, Epilogue::Leaky) }.check();
+    }
+
+    /// With blocks that the layer does not fill, parts that it does not, and rows of workgroups that end below the map.
+    #[test]
+    fn sums_of_products_of_matrices_are_right() {
+        let tiles = tiles();
+        for (output, size, inputs, outputs, epilogue) in [
+            (tiles, (33, 5), 32, 32, Epilogue::Leaky),
+            (tiles, (33, 7), 32, 32, Epilogue::ResidualLeaky),
+            (Format::Single, (17, 1), 24, 18, Epilogue::None),
+            (tiles, (31, 3), 84, 34, Epilogue::Leaky),
+            (Format::Single, (1, 1), 5, 7, Epilogue::ResidualLeaky),
+        ] {
+            Case { formats: [tiles, output], ..Case::new(size, inputs, outputs, epilogue) }.check();
+        }
     }
 
     #[test]
@@ -410,8 +494,9 @@ pub(super) mod tests {
     fn a_wrong_value_is_seen() {
         let case = Case::new((9, 7), 5, 7, Epilogue::ResidualLeaky);
         let expected = case.expected();
-        for (precision, little) in [(Precision::Single, 1e-3), (Precision::Half, 0.1)] {
-            let case = Case { precisions: [precision; 2], ..case.clone() };
+        for (format, little) in [(Format::Single, 1e-3), (Format::Half, 0.1), (tiles(), 0.1)] {
+            let case = Case { formats: [format; 2], ..case.clone() };
+            let precision = format.precision();
             for wrong in [little, f32::NAN] {
                 let mut found = case.found();
                 judge(precision, &found, &expected).expect("what is right");

@@ -15,7 +15,7 @@ use crate::weights::NetworkConfig;
 /// Foci whose spectra a thread holds at once; where there are more layers, these are transformed anew for each so many.
 const MOST_FOCI: usize = 8;
 /// Samples of each of these that a thread holds.
-const BLUR_ITEMS: usize = 5;
+const BLUR_ITEMS: usize = 4;
 /// Samples that a thread holds of the rows of a frame, and of the colours at four foci.
 const ROW_ITEMS: usize = 4;
 
@@ -43,10 +43,9 @@ pub(super) fn expect(
     let disc_table = plan.table("the spectrum of a disc", &disc.values);
 
     let foci = count.min(MOST_FOCI);
-    let first_part = InputChannels::new(count).field;
+    let first_part = InputChannels::new(count, inputs.format).field;
     let constants: Vec<(&str, Constant)> = grid_constants(shared.resolution, size)
         .into_iter()
-        .chain(inputs.constants(["INPUT_GROUPS", "INPUT_PITCH"]))
         .chain([
             ("LAYERS", count.into()),
             ("PAIRS", PAIRS.into()),
@@ -58,7 +57,9 @@ pub(super) fn expect(
             ("ENTRIES_PER_MM", (disc.entries_per_mm as f32).into()),
         ])
         .collect();
-    let files = [include_str!("blocks.wgsl"), include_str!("input_features.wgsl"), include_str!("defocus.wgsl")];
+    let declared = inputs.declaration("input");
+    let features = include_str!("input_features.wgsl");
+    let files = [&declared, include_str!("blocks.wgsl"), features, include_str!("defocus.wgsl")];
     let shader = |lines: &Lines, entry| lines.shader(&format!("defocus: {entry}"), &constants, &files, entry);
     let (rows, columns) = (grid.rows.rows(ROW_ITEMS), grid.columns.columns(BLUR_ITEMS));
     let (row_groups, column_groups) = (rows.workgroups(size.height), columns.workgroups(size.width));

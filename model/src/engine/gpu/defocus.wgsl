@@ -13,7 +13,7 @@ const PIXELS = WIDTH * HEIGHT;
 @group(0) @binding(4) var<storage, read_write> spectra: array<vec2f>;
 @group(0) @binding(5) var<storage, read> disc_table: array<f32>;
 @group(0) @binding(6) var<storage, read_write> stack: array<f32>; // [layers, 3, height, width]
-@group(0) @binding(7) var<storage, read_write> inputs: array<vec4f>;
+@group(0) @binding(7) var<storage, read_write> inputs: array<input_vector>;
 
 fn depth_layer(depth: f32) -> u32 {
     let layer = depth * f32(LAYERS);
@@ -34,15 +34,15 @@ fn take_layers(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
         let y = group.x * LINES + place % LINES;
         if (place < PLACES && y < HEIGHT) {
             let depths = corners(3u, x, y);
-            inputs[input_place(3u, x, y)] = 2f * (depths - 0.5f);
-            inputs[input_place(4u, x, y)] = (depths - 0.5f) * (3f + 2f * pupil.blur);
+            inputs[input_place(3u, x, y)] = input_vector(2f * (depths - 0.5f));
+            inputs[input_place(4u, x, y)] = input_vector((depths - 0.5f) * (3f + 2f * pupil.blur));
             for (var corner = 0u; corner < BLOCK; corner++) {
                 layers[item] |= depth_layer(depths[corner]) << (8u * corner);
             }
             layer_of[y * WIDTH + x] = layers[item];
             for (var colour = 0u; colour < 3u; colour++) {
                 let amplitudes = corners(colour, x, y);
-                inputs[input_place(colour, x, y)] = amplitudes - 0.4f;
+                inputs[input_place(colour, x, y)] = input_vector(amplitudes - 0.4f);
                 light[item][colour] = amplitudes * amplitudes;
             }
         }
@@ -92,14 +92,23 @@ fn blur(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) in
     let first_focus = group.z * FOCI;
     let entries_apart = ENTRIES_PER_MM * pupil.mm;
     var seen: array<array<vec2f, FOCI>, ITEMS>;
-    for (var layer = 0u; layer < LAYERS; layer++) {
+    // Each layer's light is asked for while the one before is transformed.
+    var next: array<vec2f, ITEMS>;
+    for (var turn_of = 0u; turn_of <= LAYERS; turn_of++) {
         for (var item = 0u; item < ITEMS; item++) {
             let place = item * THREADS + thread;
             let x = group.x * LINES + place % LINES;
             if (place < PLACES && x < WIDTH) {
-                line[place] = spectra[((layer * PAIRS + pair) * HEIGHT + place / LINES) * WIDTH + x];
+                line[place] = next[item];
+                if (turn_of < LAYERS) {
+                    next[item] = spectra[((turn_of * PAIRS + pair) * HEIGHT + place / LINES) * WIDTH + x];
+                }
             }
         }
+        if (turn_of == 0u) {
+            continue;
+        }
+        let layer = turn_of - 1u;
         transform(FORWARD);
         for (var item = 0u; item < ITEMS; item++) {
             let place = item * THREADS + thread;
@@ -138,6 +147,17 @@ fn blur(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) in
     }
 }
 
+// Of one pair of what is seen at a focus, along x, what is at `item` of the rows of a workgroup; nothing of pairs that
+// follow the last one.
+fn seen_spectrum(focus_pair: u32, rows: u32, item: u32) -> vec2f {
+    let place = item * THREADS + thread;
+    let y = rows * LINES + place % LINES;
+    if (place < PLACES && y < HEIGHT && focus_pair < LAYERS * PAIRS) {
+        return spectra[((FIRST_SEEN + focus_pair) * HEIGHT + y) * WIDTH + place / LINES];
+    }
+    return vec2f();
+}
+
 // Rows of what is seen at the foci 4·b - 2 to 4·b + 1 of workgroup b along y: to the stack, and to the twelve channels
 // from
 // 12·b + 16 on of the map. The first workgroup has only the last two foci, whose channels share a group with blur and
@@ -146,6 +166,11 @@ fn blur(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) in
 fn see(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;
     var shown: array<array<vec3f, 4>, ITEMS>;
+    // Each pair's spectra are asked for while those before are transformed.
+    var next: array<vec2f, ITEMS>;
+    for (var item = 0u; item < ITEMS; item++) {
+        next[item] = seen_spectrum(select(4u * group.y - 2u, 0u, group.y == 0u) * PAIRS, group.x, item);
+    }
     for (var slot = 0u; slot < 4u; slot++) {
         let focus = 4u * group.y + slot - 2u;
         if (focus < LAYERS) {
@@ -153,12 +178,11 @@ fn see(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) ind
             for (var pair = 0u; pair < PAIRS; pair++) {
                 for (var item = 0u; item < ITEMS; item++) {
                     let place = item * THREADS + thread;
-                    let y = group.x * LINES + place % LINES;
-                    if (place < PLACES && y < HEIGHT) {
+                    if (place < PLACES) {
                         // What the pair before has left, the second time round.
                         white_red[item] = line[place];
-                        let plane = FIRST_SEEN + focus * PAIRS + pair;
-                        line[place] = spectra[(plane * HEIGHT + y) * WIDTH + place / LINES];
+                        line[place] = next[item];
+                        next[item] = seen_spectrum(focus * PAIRS + pair + 1u, group.x, item);
                     }
                 }
                 transform(INVERSE);
@@ -194,7 +218,7 @@ fn see(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) ind
             for (var part = 0u; part < 3u; part++) {
                 let map_group = 3u * group.y + 4u + part;
                 if (map_group < FIRST_PART_GROUPS && (part > 0u || group.y > 0u)) {
-                    inputs[input_place(map_group, x, y)] = channels[part];
+                    inputs[input_place(map_group, x, y)] = input_vector(channels[part]);
                 }
             }
         }

@@ -1,10 +1,12 @@
 //! Deformable 3x3 convolutions on the GPU: every tap of every pixel is read at a place of its own.
 //!
-//! Layers that write a map of half precision interpolate and multiply in half precision, two products at once, and sum
-//! up what each tap gives in single precision.
+//! Layers that read matrices interpolate in half precision and multiply matrices. Of the others those that write a map of
+//! half precision interpolate and multiply in half precision, two products at once, and sum up what each tap gives in
+//! single precision.
 
 use super::conv::{ConvLayer, TAPS};
-use super::map::{GROUP, Map};
+use super::map::{Format, GROUP, Map, TILE};
+use super::matrix::{self, TilePacking};
 use super::plan::{Plan, Shader};
 use crate::gpu::Precision;
 use crate::weights::OFFSET_CHANNELS;
@@ -24,33 +26,69 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
     layer.check((input, input.groups), output);
     assert_eq!((offsets.width, offsets.height), (output.width, output.height));
     assert!(offsets.groups >= OFFSET_CHANNELS.div_ceil(GROUP) && offsets.buffer != output.buffer);
-    assert_eq!(offsets.precision, Precision::Single);
+    assert_eq!(offsets.format, Format::Single);
 
-    let parts = output.groups.div_ceil(MOST_PART_GROUPS);
-    let part_groups = output.groups.div_ceil(parts);
-    let precision = output.precision;
-    let values = pack(layer, precision, input.groups, [parts, part_groups]);
-    let parameters = precision.table(plan, "a deformable convolution's parameters", &values);
+    let input_blocks = input.groups.div_ceil(TILE / GROUP);
+    let precision = output.format.precision();
+    let (parts, part_groups) = match input.format {
+        Format::HalfTiles(_) => (TilePacking::new(output.groups, TAPS * input_blocks).parts, 0),
+        Format::Single | Format::Half => {
+            let parts = output.groups.div_ceil(MOST_PART_GROUPS);
+            (parts, output.groups.div_ceil(parts))
+        }
+    };
     let mut constants = vec![
         ("WORKGROUP", WORKGROUP.into()),
         ("PIXELS", PIXELS.into()),
+        ("ROWS", PIXELS.into()),
         ("INPUT_GROUPS", input.groups.into()),
+        ("INPUT_BLOCKS", input_blocks.into()),
         ("PARTS", parts.into()),
         ("PART_GROUPS", part_groups.into()),
     ];
     constants.extend(layer.epilogue_constants(output));
+    constants.push(input.block("IN_BLOCK"));
     constants.extend(input.constants(["IN_GROUPS", "IN_PITCH"]));
     constants.extend(offsets.constants(["OFFSET_GROUPS", "OFFSET_PITCH"]));
-    let text = match precision {
-        Precision::Single => concat!(include_str!("deformable_places.wgsl"), include_str!("deformable.wgsl")),
-        Precision::Half => concat!(include_str!("deformable_places.wgsl"), include_str!("deformable_f16.wgsl")),
+    let places = include_str!("deformable_places.wgsl");
+    let of_vectors = |text| layer.source(input, output, &[places, text].concat());
+    let (source, values, precision, columns) = match (input.format, precision) {
+        (Format::HalfTiles(units), _) => {
+            let files = [places, include_str!("deformable_matrix.wgsl")];
+            let source = matrix::source(output, units, "gathered", PIXELS, &files);
+            (source, pack_tiles(layer, input_blocks, output.groups), Precision::Half, TILE)
+        }
+        (_, precision) => {
+            let text = match precision {
+                Precision::Single => include_str!("deformable.wgsl"),
+                Precision::Half => include_str!("deformable_f16.wgsl"),
+            };
+            (of_vectors(text), pack(layer, precision, input.groups, [parts, part_groups]), precision, WORKGROUP)
+        }
     };
-    let shader = Shader::new(label, &constants, &layer.source(input, output, text), "convolve");
-    let workgroups = [output.width.div_ceil(WORKGROUP) * parts, output.height.div_ceil(PIXELS), 1];
+    let parameters = precision.table(plan, "a deformable convolution's parameters", &values);
+    let shader = Shader::new(label, &constants, &source, "convolve");
+    let workgroups = [output.width.div_ceil(columns) * parts, output.height.div_ceil(PIXELS), 1];
     let stage = plan.stages.last_mut().expect("a stage was added for the layer");
     let dispatch = stage.dispatch(shader, &[input.buffer, offsets.buffer, parameters, output.buffer], workgroups);
     let parameter_bytes = (values.len() * precision.bytes()) as u64;
     dispatch.bytes = Some(input.inner_bytes() + offsets.inner_bytes() + parameter_bytes + layer.output_bytes(output));
+}
+
+/// The parameters of `layer` as the shader that multiplies matrices has them.
+fn pack_tiles(layer: &ConvLayer, input_blocks: usize, output_groups: usize) -> Vec<f32> {
+    let packing = TilePacking::new(output_groups, TAPS * input_blocks);
+    let mut parameters = vec![0.0; packing.len()];
+    for (output, bias) in layer.bias.iter().enumerate() {
+        parameters[output] = *bias;
+        for (input, channel) in layer.inputs.iter().enumerate() {
+            for tap in 0..TAPS {
+                let step = tap * input_blocks + channel / TILE;
+                parameters[packing.place(output, step, *channel)] = layer.weight(output, input, tap);
+            }
+        }
+    }
+    parameters
 }
 
 /// The parameters of `layer` as the shader has them.
@@ -75,7 +113,7 @@ fn pack(layer: &ConvLayer, precision: Precision, input_groups: usize, [parts, pa
 #[cfg(test)]
 mod tests {
     use super::super::conv::Epilogue;
-    use super::super::conv::tests::{SLOPE, finish, judge, noise, value};
+    use super::super::conv::tests::{SLOPE, finish, judge, noise, tiles, value, worse};
     use super::super::trial::Trial;
     use super::*;
     use crate::engine::reference;
@@ -90,7 +128,7 @@ mod tests {
     #[derive(Clone)]
     struct Case {
         /// Of the input map and of the output map.
-        precisions: [Precision; 2],
+        formats: [Format; 2],
         size: (usize, usize),
         inputs: usize,
         outputs: usize,
@@ -100,11 +138,11 @@ mod tests {
 
     impl Case {
         fn found(&self) -> Vec<f32> {
-            let Self { precisions, size, inputs, outputs, epilogue, offset } = *self;
+            let Self { formats, size, inputs, outputs, epilogue, offset } = *self;
             let mut plan = Plan::default();
-            let input = Map::with(precisions[0], &mut plan, "input", size, inputs);
+            let input = Map::with(formats[0], &mut plan, "input", size, inputs);
             let offsets = Map::new(&mut plan, "offsets", size, OFFSET_CHANNELS);
-            let output = Map::with(precisions[1], &mut plan, "output", size, outputs);
+            let output = Map::with(formats[1], &mut plan, "output", size, outputs);
             let weight: Vec<_> = (0..outputs * inputs * TAPS).map(noise).collect();
             let bias: Vec<_> = (0..outputs).map(|output| noise(9_000_000 + output)).collect();
             let channels: Vec<_> = (0..inputs).rev().collect();
@@ -144,15 +182,13 @@ mod tests {
         }
 
         fn new(size: (usize, usize), inputs: usize, outputs: usize, epilogue: Epilogue, offset: Offset) -> Self {
-            Self { precisions: [Precision::Single; 2], size, inputs, outputs, epilogue, offset }
+            Self { formats: [Format::Single; 2], size, inputs, outputs, epilogue, offset }
         }
 
         fn check(&self) {
-            let Self { precisions, size, inputs, outputs, epilogue, .. } = *self;
-            let worse = if precisions.contains(&Precision::Half) { Precision::Half } else { Precision::Single };
-            judge(worse, &self.found(), &self.expected()).unwrap_or_else(|error| {
-                panic!("{precisions:?}, {size:?}, {inputs} to {outputs}, {epilogue:?}: {error}")
-            });
+            let Self { formats, size, inputs, outputs, epilogue, .. } = *self;
+            judge(worse(formats), &self.found(), &self.expected())
+                .unwrap_or_else(|error| panic!("{formats:?}, {size:?}, {inputs} to {outputs}, {epilogue:?}: {error}"));
         }
     }
 
@@ -197,10 +233,23 @@ mod tests {
     /// Between maps of both precisions; an odd number of groups does not fill its elements.
     #[test]
     fn sums_are_right_in_half_precision() {
-        let (single, half) = (Precision::Single, Precision::Half);
-        for (precisions, offset) in [([half, half], wild as Offset), ([single, half], moderate), ([half, single], wild)]
-        {
-            Case { precisions, ..Case::new((65, 3), 5, 12, Epilogue::ResidualLeaky, offset) }.check();
+        let (single, half) = (Format::Single, Format::Half);
+        for (formats, offset) in [([half, half], wild as Offset), ([single, half], moderate), ([half, single], wild)] {
+            Case { formats, ..Case::new((65, 3), 5, 12, Epilogue::ResidualLeaky, offset) }.check();
+        }
+    }
+
+    /// With blocks that the layer does not fill, and rows of workgroups that end below the map.
+    #[test]
+    fn sums_of_products_of_matrices_are_right() {
+        let tiles = tiles();
+        for (output, size, inputs, outputs, offset) in [
+            (tiles, (33, 5), 32, 32, wild as Offset),
+            (tiles, (16, 2), 5, 7, moderate),
+            (Format::Single, (1, 1), 24, 40, moderate),
+        ] {
+            let formats = [tiles, output];
+            Case { formats, ..Case::new(size, inputs, outputs, Epilogue::ResidualLeaky, offset) }.check();
         }
     }
 

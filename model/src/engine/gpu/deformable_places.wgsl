@@ -21,6 +21,6 @@ fn place_of(tap: u32, x: u32, y: u32) -> Place {
     let shares = select(vec4f(), vec4f((1.0 - share.y) * horizontal, share.y * horizontal), inside);
     // The border makes all four neighbours readable.
     let first = min(vec2u(corner + 1.0), vec2u(WIDTH, HEIGHT));
-    return Place(first.y * (IN_GROUPS * IN_PITCH) + first.x, shares);
+    return Place(first.y * (IN_GROUPS * IN_PITCH) + first.x * IN_BLOCK, shares);
 }
 

@@ -16,7 +16,7 @@ use crate::weights::NetworkConfig;
 
 /// Samples that a thread holds of a row, and of a column.
 const ROW_ITEMS: usize = 4;
-const COLUMN_ITEMS: usize = 9;
+const COLUMN_ITEMS: usize = 6;
 
 /// What carries light between the layers and the SLM plane.
 pub(super) struct DepthLayers {
@@ -80,19 +80,18 @@ impl DepthLayers {
         stack: BufferId,
         outputs: &Map,
     ) {
-        let own: [(&str, Constant); 3] = [
-            ("REFINES", config.refined_stack.into()),
-            ("MASK_OFFSET", ((self.count - 1) as f32).ln().into()),
-            ("STOPS", false.into()),
-        ];
-        let constants = [&own[..], &outputs.constants(["OUTPUT_GROUPS", "OUTPUT_PITCH"])].concat();
+        let own: [(&str, Constant); 2] =
+            [("REFINES", config.refined_stack.into()), ("MASK_OFFSET", ((self.count - 1) as f32).ln().into())];
+        let constants = [&self.constants[..], &own].concat();
+        let declared = outputs.declaration("output");
+        let files = [&declared, include_str!("phase_math.wgsl"), include_str!("light_of_layers.wgsl")];
         let rows = grid.rows.rows(ROW_ITEMS);
         let row_groups = rows.workgroups(shared.size.height);
         let [complex, real, group] = plane_bytes(shared.size);
         let (count, planes) = (self.count as u64, 3 * self.count as u64);
         let stage = plan.stage("light of the layers", 0);
         let light = stage.dispatch_with(
-            self.shader(&rows, &constants, "light"),
+            rows.shader("light of the layers", &constants, &files, "light"),
             &[rows.turns(), (1, outputs.buffer), (2, stack), (3, grid.spectra)],
             [row_groups, self.count, 1],
         );
@@ -101,7 +100,7 @@ impl DepthLayers {
         light.bytes = Some(count * group + planes * (real + complex) + refined);
         self.bring_back(stage, shared, grid, false);
         let arrive = stage.dispatch_with(
-            self.shader(&rows, &constants, "arrive"),
+            self.shader(&rows, false, "arrive"),
             &[rows.turns(), (3, grid.spectra), (8, self.carried)],
             [row_groups, 3, 1],
         );
@@ -112,17 +111,9 @@ impl DepthLayers {
     /// where it `stops`.
     pub(super) fn bring_back(&self, stage: &mut Stage, shared: &Shared, grid: &GridTransforms, stops: bool) {
         let columns = grid.columns.columns(COLUMN_ITEMS);
-        // The shader has no part in what the first net gives.
-        let constants: [(&str, Constant); 5] = [
-            ("REFINES", false.into()),
-            ("MASK_OFFSET", 0.0.into()),
-            ("OUTPUT_GROUPS", 1.into()),
-            ("OUTPUT_PITCH", 1.into()),
-            ("STOPS", stops.into()),
-        ];
         let [complex, ..] = plane_bytes(shared.size);
         let bring_back = stage.dispatch_with(
-            self.shader(&columns, &constants, "bring_back"),
+            self.shader(&columns, stops, "bring_back"),
             &[
                 columns.turns(),
                 (3, grid.spectra),
@@ -138,9 +129,9 @@ impl DepthLayers {
         bring_back.bytes = Some((3 * self.count as u64 + 6 + made) * complex);
     }
 
-    fn shader(&self, lines: &Lines, constants: &[(&str, Constant)], entry: &'static str) -> Arc<Shader> {
-        let files = [include_str!("phase_math.wgsl"), include_str!("pupil.wgsl"), include_str!("depth_layers.wgsl")];
-        let constants = [&self.constants[..], constants].concat();
+    fn shader(&self, lines: &Lines, stops: bool, entry: &'static str) -> Arc<Shader> {
+        let files = [include_str!("pupil.wgsl"), include_str!("depth_layers.wgsl")];
+        let constants = [&self.constants[..], &[("STOPS", stops.into())]].concat();
         lines.shader(&format!("depth layers: {entry}"), &constants, &files, entry)
     }
 }

@@ -1,13 +1,10 @@
 // The light of the depth layers, and how it goes to the SLM plane, as depth_layers.rs and expected_stack.rs have it.
 //
-// Before this file: fft.wgsl, phase_math.wgsl, pupil.wgsl and the constants of depth_layers.rs.
+// Before this file: fft.wgsl, pupil.wgsl and the constants of depth_layers.rs. What lights the layers is in
+// light_of_layers.wgsl.
 
 const PIXELS = WIDTH * HEIGHT;
 
-// The first net's: for each layer a group of three phases over π and a mask, then the changes of the amplitudes.
-@group(0) @binding(1) var<storage, read> outputs: array<vec4f>;
-// [layers, 3, height, width]: the amplitudes that an eye should see, which are refined here.
-@group(0) @binding(2) var<storage, read_write> stack: array<f32>;
 @group(0) @binding(3) var<storage, read_write> spectra: array<vec2f>; // [layers, 3, height, width]
 // [3, height, width]: transfer functions from one layer to the next nearer one, and from the nearest to the SLM plane,
 // the latter over the number of samples.
@@ -17,53 +14,6 @@ const PIXELS = WIDTH * HEIGHT;
 // [3, height, width]: the spectrum of what arrives at the SLM plane, over the number of samples, and that itself.
 @group(0) @binding(7) var<storage, read_write> carried_spectrum: array<vec2f>;
 @group(0) @binding(8) var<storage, read_write> carried: array<vec2f>;
-
-fn output_place(group: u32, x: u32, y: u32) -> u32 {
-    return ((y + 1u) * OUTPUT_GROUPS + group) * OUTPUT_PITCH + x + 1u;
-}
-
-// Rows of the light that one layer sends out, to spectra along x.
-@compute @workgroup_size(THREADS)
-fn light(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
-    thread = index;
-    let layer = group.y;
-    var half_turns: array<vec3f, ITEMS>;
-    var masks: array<f32, ITEMS>;
-    for (var item = 0u; item < ITEMS; item++) {
-        let place = item * THREADS + thread;
-        let y = group.x * LINES + place % LINES;
-        if (place < PLACES && y < HEIGHT) {
-            let lit = outputs[output_place(layer, place / LINES, y)];
-            half_turns[item] = lit.xyz;
-            masks[item] = 1f / (1f + exp(MASK_OFFSET - lit.w));
-        }
-    }
-    for (var colour = 0u; colour < 3u; colour++) {
-        let channel = 3u * layer + colour;
-        for (var item = 0u; item < ITEMS; item++) {
-            let place = item * THREADS + thread;
-            let x = place / LINES;
-            let y = group.x * LINES + place % LINES;
-            if (place < PLACES && y < HEIGHT) {
-                var wanted = stack[(channel * HEIGHT + y) * WIDTH + x];
-                if (REFINES) {
-                    let change = outputs[output_place(LAYERS + channel / 4u, x, y)][channel % 4u];
-                    wanted = max(wanted + REFINED_SHARE * change, 0f);
-                    stack[(channel * HEIGHT + y) * WIDTH + x] = wanted;
-                }
-                line[place] = masks[item] * wanted * cos_sin_pi(half_turns[item][colour]);
-            }
-        }
-        transform(FORWARD);
-        for (var item = 0u; item < ITEMS; item++) {
-            let place = item * THREADS + thread;
-            let y = group.x * LINES + place % LINES;
-            if (place < PLACES && y < HEIGHT) {
-                spectra[(channel * HEIGHT + y) * WIDTH + place / LINES] = line[place];
-            }
-        }
-    }
-}
 
 // Columns of one colour: from spectra along x of all layers' light to that, along x too, of what arrives of it at the
 // SLM plane, in the place of the farthest layer's. Where STOPS, it has gone through the pupil.
@@ -79,15 +29,22 @@ fn bring_back(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_ind
             steps[item] = step_nearer[(colour * HEIGHT + place / LINES) * WIDTH + x];
         }
     }
-    // Horner's rule, far to near.
+    // Horner's rule, far to near. Each layer's light is asked for while the one before is transformed.
     var sums: array<vec2f, ITEMS>;
-    for (var layer = 0u; layer < LAYERS; layer++) {
+    var next: array<vec2f, ITEMS>;
+    for (var layer = 0u; layer <= LAYERS; layer++) {
         for (var item = 0u; item < ITEMS; item++) {
             let place = item * THREADS + thread;
             let x = group.x * LINES + place % LINES;
             if (place < PLACES && x < WIDTH) {
-                line[place] = spectra[((3u * layer + colour) * HEIGHT + place / LINES) * WIDTH + x];
+                line[place] = next[item];
+                if (layer < LAYERS) {
+                    next[item] = spectra[((3u * layer + colour) * HEIGHT + place / LINES) * WIDTH + x];
+                }
             }
+        }
+        if (layer == 0u) {
+            continue;
         }
         transform(FORWARD);
         for (var item = 0u; item < ITEMS; item++) {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::map::Map;
+use super::map::{Format, Map};
 use super::plan::{BufferId, Constant, Plan, Shader};
 use super::shared::Shared;
 use crate::weights::{Grid, NetworkConfig};
@@ -10,10 +10,10 @@ use crate::weights::{Grid, NetworkConfig};
 /// Pixels of a row that a workgroup does.
 const WORKGROUP: usize = 64;
 
-/// Adds the stage `encode`: what the net is told of the frame. Returns its map.
-pub(super) fn encode(plan: &mut Plan, config: &NetworkConfig, shared: &Shared) -> Map {
+/// Adds the stage `encode`: what the net is told of the frame. Returns its map, in `format`.
+pub(super) fn encode(plan: &mut Plan, config: &NetworkConfig, shared: &Shared, format: Format) -> Map {
     let size = shared.size;
-    let input = Map::new(plan, "what the net reads", (size.width, size.height), config.map_channels());
+    let input = Map::with(format, plan, "what the net reads", (size.width, size.height), config.map_channels());
     let shader = shader(config.grid, shared, &input, "encode");
     plan.stage("encode", 0).dispatch_with(
         shader,
@@ -45,15 +45,14 @@ fn shader(grid: Grid, shared: &Shared, map: &Map, entry: &'static str) -> Arc<Sh
         Grid::HalfBand => 2,
         Grid::Full => 1,
     };
-    let constants: [(&str, Constant); 8] = [
+    let constants: [(&str, Constant); 6] = [
         ("WORKGROUP", WORKGROUP.into()),
         ("FRAME_WIDTH", shared.resolution.width.into()),
         ("FRAME_HEIGHT", shared.resolution.height.into()),
         ("WIDTH", shared.size.width.into()),
         ("HEIGHT", shared.size.height.into()),
         ("SCALE", scale.into()),
-        ("MAP_GROUPS", map.groups.into()),
-        ("MAP_PITCH", map.pitch().into()),
     ];
-    Arc::new(Shader::new(format!("direct: {entry}"), &constants, include_str!("direct.wgsl"), entry))
+    let source = [map.declaration("map"), include_str!("direct.wgsl").to_owned()].concat();
+    Arc::new(Shader::new(format!("direct: {entry}"), &constants, &source, entry))
 }

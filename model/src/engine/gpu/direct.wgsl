@@ -1,6 +1,6 @@
 // What the `direct` family's net reads, and the field that it gives. After these constants:
 // WORKGROUP (pixels of a row), FRAME_WIDTH, FRAME_HEIGHT, WIDTH, HEIGHT (of the network's grid), SCALE (panel pixels to
-// a sample, each way), MAP_GROUPS, MAP_PITCH.
+// a sample, each way), and what the map declares of itself.
 
 // The eye's pupil in millimetres, and what networks are told of it and the bench (conditions.rs).
 struct Pupil {
@@ -11,7 +11,7 @@ struct Pupil {
 
 @group(0) @binding(0) var<storage, read> frame: array<f32>; // [4, frame height, frame width]
 @group(0) @binding(1) var<storage, read> pupil: Pupil;
-@group(0) @binding(2) var<storage, read_write> map: array<vec4f>;
+@group(0) @binding(2) var<storage, read_write> map: array<map_vector>;
 @group(0) @binding(3) var<storage, read_write> low: array<vec2f>; // [3, height, width]
 
 const BLOCK: u32 = SCALE * SCALE;
@@ -53,7 +53,7 @@ fn encode(@builtin(global_invocation_id) place: vec3u) {
     for (var part = 0u; part < 4u; part++) {
         values[part] = channel(4u * group + part, x, y);
     }
-    map[((y + 1u) * MAP_GROUPS + group) * MAP_PITCH + x + 1u] = values;
+    map[map_place(group, x, y)] = map_vector(values);
 }
 
 // The mean amplitude of each block, and what the net adds to it: three real parts and three imaginary ones.
@@ -64,9 +64,8 @@ fn add_residual(@builtin(global_invocation_id) place: vec3u) {
     if x >= WIDTH {
         return;
     }
-    let first = (y + 1u) * MAP_GROUPS * MAP_PITCH + x + 1u;
-    let reals = map[first];
-    let rest = map[first + MAP_PITCH];
+    let reals = vec4f(map[map_place(0u, x, y)]);
+    let rest = vec4f(map[map_place(1u, x, y)]);
     let residual = array<vec2f, 3>(vec2f(reals.x, reals.w), vec2f(reals.y, rest.x), vec2f(reals.z, rest.y));
     for (var colour = 0u; colour < 3u; colour++) {
         var sum = 0.0;

@@ -8,6 +8,7 @@ use wgpu::{BufferUsages, QuerySet};
 
 use super::fft::WorkgroupLimits;
 use super::loaded_plan::LoadedPlan;
+use super::map::Format;
 use super::network::NetworkPlan;
 use super::plan::{BufferId, Plan, Stage};
 use super::shared::pupil_values;
@@ -59,7 +60,8 @@ const TIMESTAMP_BYTES: u64 = 8;
 
 impl GpuEngine {
     /// An engine for frames of the pattern's size of `tables`, which may be odd, on the optics of `bench`, whose own
-    /// resolution does not matter. Features are in `precision` where the device has it.
+    /// resolution does not matter. Features are in `precision` where the device has it; where that is left to the device,
+    /// in half precision if it multiplies matrices so, since it sums up in single, and else in single precision.
     ///
     /// # Errors
     /// There is no device, it lacks what the network needs at this size, or the size is nothing.
@@ -68,7 +70,7 @@ impl GpuEngine {
         bench: &DisplayGeometry,
         tables: &LevelTables,
         adapters: Adapters,
-        precision: Precision,
+        precision: Option<Precision>,
     ) -> Result<Self, EngineError> {
         let gpu = Gpu::open(adapters)?;
         Self::on(gpu, weights, bench, tables, precision)
@@ -79,11 +81,16 @@ impl GpuEngine {
         weights: &Weights,
         bench: &DisplayGeometry,
         tables: &LevelTables,
-        precision: Precision,
+        precision: Option<Precision>,
     ) -> Result<Self, EngineError> {
-        let precision = if gpu.half_precision { precision } else { Precision::Single };
+        let precision = match precision {
+            Some(precision) if gpu.half_precision => precision,
+            None if gpu.matrix_units.is_some() => Precision::Half,
+            _ => Precision::Single,
+        };
         let limits = WorkgroupLimits { bytes: gpu.workgroup_bytes, threads: gpu.workgroup_threads };
-        let mut network = NetworkPlan::new(weights, bench, tables, precision, limits)?;
+        let format = Format::of(precision, gpu.matrix_units);
+        let mut network = NetworkPlan::new(weights, bench, tables, format, limits)?;
         let plan = &network.plan;
         let loaded = LoadedPlan::new(&gpu, plan)?;
         let timestamps = match gpu.timestamp_ns {
@@ -127,6 +134,11 @@ impl GpuEngine {
     /// What its features are.
     pub fn precision(&self) -> Precision {
         self.precision
+    }
+
+    /// Whether layers multiply on units of the device that multiply matrices.
+    pub fn uses_matrix_units(&self) -> bool {
+        self.precision == Precision::Half && self.gpu.matrix_units.is_some()
     }
 
     /// Writes the samples of the hologram of `frame` for an eye with `pupil` to `samples`, as the panel takes them.
@@ -173,7 +185,7 @@ impl GpuEngine {
             for modulated in &mut network.modulated {
                 let buffer = loaded.buffer(modulated.buffer);
                 if let Some(parameters) = modulated.change_to(conditions) {
-                    gpu.queue.write_buffer(buffer, 0, bytemuck::cast_slice(parameters));
+                    gpu.queue.write_buffer(buffer, 0, parameters);
                 }
             }
             self.pupil = Some(pupil);

@@ -76,7 +76,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::super::input_features::InputChannels;
-    use super::super::map::GROUP;
+    use super::super::map::{Format, GROUP};
     use super::super::shared::pupil_values;
     use super::super::trial::{Trial, complex, largest_difference};
     use super::super::upsample::{self, Low};
@@ -112,7 +112,7 @@ mod tests {
             let (config, plan) = (&weights.config, &mut Plan::default());
             let size = Resolution { width: resolution.width.div_ceil(2), height: resolution.height.div_ceil(2) };
             let shared = Shared::new(plan, resolution, size);
-            let channels = InputChannels::new(config.depth_layers);
+            let channels = InputChannels::new(config.depth_layers, Format::Single);
             let inputs = channels.map(plan, size);
             let net = |plan: &mut Plan, what, channels| Map::new(plan, what, (size.width, size.height), channels);
             let stages = ExpectedStack::expect(plan, config, bench, &shared, &inputs, limits).expect("it fits");

@@ -14,7 +14,7 @@ use crate::weights::{Feedback, NetworkConfig};
 
 /// Samples that a thread holds of a row, and of a column.
 const ROW_ITEMS: usize = 4;
-const COLUMN_ITEMS: usize = 9;
+const COLUMN_ITEMS: usize = 6;
 
 /// Adds the stage `feedback`: changes the carried field by what it lacks of the amplitudes `stack`, and writes the
 /// field, its change and the lack to `inputs`.
@@ -40,16 +40,18 @@ pub(super) fn feed_back(
         transfer_tables(bench, shared, farthest).map(|[re, im]| [re * samples, im * samples]).collect();
     let to_farthest = plan.table("the way to the farthest layer", &to_farthest);
 
-    let channels = InputChannels::new(count);
-    let own: [(&str, Constant); 5] = [
+    let channels = InputChannels::new(count, inputs.format);
+    let own: [(&str, Constant); 6] = [
         ("DARK_POWER", FEEDBACK_DARK_POWER.into()),
         ("SHARE", share.into()),
         ("SHARPNESS", sharpness.into()),
         ("FIELD_GROUP", (channels.field / GROUP).into()),
         ("LACK_GROUP", (channels.lack / GROUP).into()),
+        ("INPUT_GROUPS", inputs.groups.into()),
     ];
-    let constants = [layers.constants(), &own, &inputs.constants(["INPUT_GROUPS", "INPUT_PITCH"])].concat();
-    let files = [include_str!("pupil.wgsl"), include_str!("feedback.wgsl")];
+    let constants = [layers.constants(), &own].concat();
+    let declared = inputs.declaration("input");
+    let files = [&declared, include_str!("pupil.wgsl"), include_str!("feedback.wgsl")];
     let shader = |lines: &Lines, entry| lines.shader(&format!("feedback: {entry}"), &constants, &files, entry);
     let (rows, columns) = (grid.rows.rows(ROW_ITEMS), grid.columns.columns(COLUMN_ITEMS));
     let row_groups = rows.workgroups(size.height);

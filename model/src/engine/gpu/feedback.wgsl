@@ -1,7 +1,7 @@
 // What an eye lacks when it focuses on each depth layer, as feedback.rs has it; how the changes of the layers come back
 // to the SLM plane is `bring_back` of depth_layers.wgsl.
 //
-// Before this file: fft.wgsl, pupil.wgsl and the constants of feedback.rs.
+// Before this file: fft.wgsl, pupil.wgsl, the constants of feedback.rs and what the nets' map declares as `input`.
 
 @group(0) @binding(1) var<storage, read> pupil_mm: f32;
 @group(0) @binding(2) var<storage, read> carried_spectrum: array<vec2f>; // [3, height, width], over the number of samples
@@ -13,11 +13,7 @@
 // The depth layers of each block's corners, a byte each, [height, width].
 @group(0) @binding(7) var<storage, read> layer_of: array<u32>;
 @group(0) @binding(8) var<storage, read_write> carried: array<vec2f>; // [3, height, width]
-@group(0) @binding(9) var<storage, read_write> inputs: array<vec4f>;
-
-fn input_place(group: u32, x: u32, y: u32) -> u32 {
-    return ((y + 1u) * INPUT_GROUPS + group) * INPUT_PITCH + x + 1u;
-}
+@group(0) @binding(9) var<storage, read_write> inputs: array<input_vector>;
 
 // Columns of one colour: from the spectrum of the field at the SLM plane to spectra along x of what reaches each layer
 // through the pupil.
@@ -71,15 +67,30 @@ fn compare(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
     }
     // Three groups of the map.
     var lacks: array<array<f32, 12>, ITEMS>;
-    for (var slot = 0u; slot < 12u && 12u * group.y + slot < 3u * LAYERS; slot++) {
-        let channel = 12u * group.y + slot;
+    // What is compared in each turn is asked for while that of the one before is transformed: first there is nothing.
+    var next: array<vec2f, ITEMS>;
+    var next_wanted: array<f32, ITEMS>;
+    for (var turn_of = 0u; turn_of <= 12u && 12u * group.y + turn_of <= 3u * LAYERS; turn_of++) {
+        var wanted: array<f32, ITEMS>;
         for (var item = 0u; item < ITEMS; item++) {
             let place = item * THREADS + thread;
             let y = group.x * LINES + place % LINES;
             if (place < PLACES && y < HEIGHT) {
-                line[place] = spectra[(channel * HEIGHT + y) * WIDTH + place / LINES];
+                line[place] = next[item];
+                wanted[item] = next_wanted[item];
+                let next_channel = 12u * group.y + turn_of;
+                if (turn_of < 12u && next_channel < 3u * LAYERS) {
+                    let there = (next_channel * HEIGHT + y) * WIDTH + place / LINES;
+                    next[item] = spectra[there];
+                    next_wanted[item] = stack[there];
+                }
             }
         }
+        if (turn_of == 0u) {
+            continue;
+        }
+        let slot = turn_of - 1u;
+        let channel = 12u * group.y + slot;
         transform(INVERSE);
         for (var item = 0u; item < ITEMS; item++) {
             let place = item * THREADS + thread;
@@ -87,7 +98,7 @@ fn compare(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
             if (place < PLACES && y < HEIGHT) {
                 let arriving = line[place];
                 let amplitude = sqrt(dot(arriving, arriving) + DARK_POWER);
-                let lack = stack[(channel * HEIGHT + y) * WIDTH + place / LINES] - amplitude;
+                let lack = wanted[item] - amplitude;
                 line[place] = (1f + SHARPNESS * cover(layers[item], channel / 3u)) * lack / amplitude * arriving;
                 // A register is chosen by comparing: memory is what has addresses.
                 for (var candidate = 0u; candidate < 12u; candidate++) {
@@ -113,12 +124,13 @@ fn compare(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
                 let map_group = LACK_GROUP + 3u * group.y + part;
                 let first = 4u * part;
                 if (map_group < INPUT_GROUPS) {
-                    inputs[input_place(map_group, x, y)] = vec4f(
+                    let lack = vec4f(
                         lacks[item][first],
                         lacks[item][first + 1u],
                         lacks[item][first + 2u],
                         lacks[item][first + 3u],
                     );
+                    inputs[input_place(map_group, x, y)] = input_vector(lack);
                 }
             }
         }
@@ -171,9 +183,12 @@ fn change(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) 
         if (place < PLACES && y < HEIGHT) {
             let field = fields[item];
             let mean = changes[item];
-            inputs[input_place(FIELD_GROUP, x, y)] = vec4f(field[0].x, field[1].x, field[2].x, field[0].y);
-            inputs[input_place(FIELD_GROUP + 1u, x, y)] = vec4f(field[1].y, field[2].y, mean[0].x, mean[1].x);
-            inputs[input_place(FIELD_GROUP + 2u, x, y)] = vec4f(mean[2].x, mean[0].y, mean[1].y, mean[2].y);
+            let part0 = vec4f(field[0].x, field[1].x, field[2].x, field[0].y);
+            let part1 = vec4f(field[1].y, field[2].y, mean[0].x, mean[1].x);
+            let part2 = vec4f(mean[2].x, mean[0].y, mean[1].y, mean[2].y);
+            inputs[input_place(FIELD_GROUP + 0u, x, y)] = input_vector(part0);
+            inputs[input_place(FIELD_GROUP + 1u, x, y)] = input_vector(part1);
+            inputs[input_place(FIELD_GROUP + 2u, x, y)] = input_vector(part2);
         }
     }
 }

@@ -1,5 +1,6 @@
 //! Circular transforms of lines of samples in a workgroup's memory, for `fft.wgsl`.
 
+use std::collections::BTreeSet;
 use std::f64::consts::{PI, TAU};
 use std::fmt::Write;
 use std::sync::Arc;
@@ -7,14 +8,15 @@ use std::sync::Arc;
 use holod_fft::{FftDirection, Real};
 use num_complex::{Complex32, Complex64};
 
-use super::plan::{BufferId, Constant, Plan, Shader};
+use super::plan::{BufferId, Constant, ENABLE_F16, Plan, Shader};
 use crate::gpu::GpuError;
 
-/// Radices of the passes, in the order in which they are taken: odd strides spread a pass's stores over the banks of a
-/// workgroup's memory.
-const RADICES: [usize; 7] = [13, 11, 7, 5, 3, 2, 4];
-/// The first of these, whose passes are written out by [`prime_pass`]; what chirps are transformed over does without.
-const PRIMES: usize = 3;
+/// Prime factors that passes do without chirps.
+const PRIMES: [usize; 6] = [2, 3, 5, 7, 11, 13];
+/// Those of what chirps are transformed over.
+const SMALL_PRIMES: usize = 3;
+/// The largest radix: a thread holds a butterfly's samples in registers.
+const MOST_RADIX: usize = 16;
 /// Bytes of a sample.
 const SAMPLE_BYTES: usize = size_of::<Complex32>();
 /// Neighbouring columns of this many fill a line of a cache.
@@ -22,7 +24,7 @@ const MOST_LINES: usize = 8;
 /// More of the memory of workgroups than this for one leaves too few beside it.
 const MOST_BYTES: usize = 32 << 10;
 /// The same of threads.
-const MOST_THREADS: usize = 512;
+const MOST_THREADS: usize = 640;
 /// Threads come in whole multiples of this.
 const WAVE: usize = 64;
 /// Samples of short rows that one workgroup takes.
@@ -55,13 +57,13 @@ impl LineFft {
     /// # Errors
     /// Not even one such line fits in a workgroup.
     pub(crate) fn new(plan: &mut Plan, length: usize, limits: WorkgroupLimits) -> Result<Self, GpuError> {
-        let (span, radices) = match radices(length, &RADICES) {
-            Some(radices) => (length, radices),
-            None => {
-                let of_small = |span| Some((span, radices(span, &RADICES[PRIMES..])?));
-                (2 * length - 1..).find_map(of_small).expect("powers of 2 are")
+        let span = match consists_of(length, &PRIMES) {
+            true => length,
+            false => {
+                (2 * length - 1..).find(|&span| consists_of(span, &PRIMES[..SMALL_PRIMES])).expect("powers of 2 are")
             }
         };
+        let radices = radices(span);
         let bytes = span * SAMPLE_BYTES;
         if bytes > limits.bytes as usize {
             return Err(GpuError::LineTooLong { samples: length, bytes, limit: limits.bytes as usize });
@@ -101,43 +103,127 @@ impl LineFft {
     }
 }
 
-/// The radices of a transform of `length`, one for each pass, unless other factors than `all` are left.
-fn radices(length: usize, all: &[usize]) -> Option<Vec<usize>> {
-    let (mut rest, mut radices) = (length, Vec::new());
-    for &radix in all {
-        let once = radix == 2;
-        while rest.is_multiple_of(radix) && (!once || !rest.trailing_zeros().is_multiple_of(2)) {
-            radices.push(radix);
-            rest /= radix;
+/// Whether all prime factors of `length` are among `primes`.
+fn consists_of(length: usize, primes: &[usize]) -> bool {
+    let mut rest = length;
+    for prime in primes {
+        while rest.is_multiple_of(*prime) {
+            rest /= prime;
         }
     }
-    (rest == 1).then_some(radices)
+    rest == 1
 }
 
-/// A pass of an odd `radix` in WGSL, as those of 3 and 5 in `fft.wgsl`: of samples that lie alike around the first, sums
-/// take part by cosines and differences by sines. No thread takes more than `rounds` butterflies.
-fn prime_pass(radix: usize, rounds: usize) -> String {
-    let half = radix / 2;
+/// The radices of a transform of `length`, which has small prime factors only: as few passes as there can be, the first
+/// of an odd radix where it can be, which spreads its stores over the banks of a workgroup's memory, and radices as
+/// small as they can be.
+fn radices(length: usize) -> Vec<usize> {
+    let mut best: Option<Vec<usize>> = None;
+    let mut begun = vec![(length, Vec::new())];
+    while let Some((rest, radices)) = begun.pop() {
+        if rest == 1 {
+            let cost = |radices: &Vec<usize>| {
+                let even = radices.first().is_some_and(|first| first.is_multiple_of(2));
+                (radices.len(), even, radices.iter().sum::<usize>())
+            };
+            if best.as_ref().is_none_or(|best| cost(&radices) < cost(best)) {
+                best = Some(radices);
+            }
+            continue;
+        }
+        // What follows the first radix does so in one order.
+        let most = if radices.len() < 2 { MOST_RADIX } else { radices[radices.len() - 1] };
+        for radix in (2..=most).filter(|&radix| rest.is_multiple_of(radix)) {
+            begun.push((rest / radix, [&radices[..], &[radix]].concat()));
+        }
+    }
+    best.expect("a length of small factors")
+}
+
+/// Two factors of a radix whose butterfly is made of theirs; `None` where it is written out.
+fn split(radix: usize) -> Option<[usize; 2]> {
+    let written_out = radix <= 5 || PRIMES.contains(&radix);
+    (!written_out).then(|| {
+        let factor = [4, 5, 3, 2].into_iter().find(|&factor| radix.is_multiple_of(factor)).expect("a small factor");
+        [factor, radix / factor]
+    })
+}
+
+/// The radices whose butterflies that of `radix` is made of, each after those that it is made of.
+fn parts(radix: usize) -> Vec<usize> {
+    let below = split(radix).into_iter().flatten().flat_map(parts);
+    below.chain([radix]).collect()
+}
+
+/// The butterfly of a `radix` that fft.wgsl does not have, in WGSL.
+fn butterfly(radix: usize) -> String {
     let list = |items: &mut dyn Iterator<Item = String>, between: &str| items.collect::<Vec<_>>().join(between);
-    let mut body = String::from("let t1 = turn(place, RADIX, stride, direction);\nlet x0 = line[place];\n");
+    let (body, outputs) = match split(radix) {
+        // Of all samples n·second + m those of each m are transformed, turned, and transformed over m.
+        Some([first, second]) => {
+            let mut body = String::new();
+            for m in 0..second {
+                let samples = list(&mut (0..first).map(|n| format!("x[{}]", n * second + m)), ", ");
+                body += &format!("    let a{m} = butterfly{first}(array({samples}), direction);\n");
+            }
+            for k in 0..first {
+                let turned = |m: usize| {
+                    let turn = Complex64::cis(-TAU * (m * k) as f64 / radix as f64);
+                    match m * k {
+                        0 => format!("a{m}[{k}]"),
+                        _ => {
+                            format!("times(a{m}[{k}], vec2f({:?}f, direction * {:?}f))", turn.re as f32, turn.im as f32)
+                        }
+                    }
+                };
+                let samples = list(&mut (0..second).map(turned), ", ");
+                body += &format!("    let b{k} = butterfly{second}(array({samples}), direction);\n");
+            }
+            (body, list(&mut (0..radix).map(|bin| format!("b{}[{}]", bin % first, bin / first)), ", "))
+        }
+        // Of samples that lie alike around the first, sums take part by cosines and differences by sines.
+        None => {
+            let (half, mut body) = (radix / 2, String::new());
+            for part in 1..=half {
+                let other = radix - part;
+                body += &format!("    let sum{part} = x[{part}] + x[{other}];\n");
+                body += &format!("    let less{part} = x[{part}] - x[{other}];\n");
+            }
+            for bin in 1..=half {
+                let angle = |part: usize| TAU * (bin * part % radix) as f64 / radix as f64;
+                let even =
+                    list(&mut (1..=half).map(|part| format!("{:?} * sum{part}", angle(part).cos() as f32)), " + ");
+                let odd =
+                    list(&mut (1..=half).map(|part| format!("{:?} * less{part}", angle(part).sin() as f32)), " + ");
+                body += &format!(
+                    "    let even{bin} = x[0] + {even};\n    let odd{bin} = quarter_turn({odd}, direction);\n"
+                );
+            }
+            let all = list(&mut (1..=half).map(|part| format!("sum{part}")), " + ");
+            let low = list(&mut (1..=half).map(|bin| format!("even{bin} + odd{bin}")), ", ");
+            let high = list(&mut (1..=half).rev().map(|bin| format!("even{bin} - odd{bin}")), ", ");
+            (body, format!("x[0] + {all}, {low}, {high}"))
+        }
+    };
+    format!(
+        "
+fn butterfly{radix}(x: array<vec2f, {radix}>, direction: f32) -> array<vec2f, {radix}> {{
+{body}    return array({outputs});
+}}
+"
+    )
+}
+
+/// A pass of `radix` in WGSL, in which no thread takes more than `rounds` butterflies.
+fn pass(radix: usize, rounds: usize) -> String {
+    let mut load = String::from("let t1 = turn(place, RADIX, stride, direction);\nlet x0 = line[place];\n");
     for part in 1..radix {
         if part > 1 {
-            body += &format!("let t{part} = times(t{}, t{});\n", part / 2, part - part / 2);
+            load += &format!("let t{part} = times(t{}, t{});\n", part / 2, part - part / 2);
         }
-        body += &format!("let x{part} = times(line[place + {part}u * COUNT], t{part});\n");
+        load += &format!("let x{part} = times(line[place + {part}u * COUNT], t{part});\n");
     }
-    for part in 1..=half {
-        body += &format!("let sum{part} = x{part} + x{0};\nlet less{part} = x{part} - x{0};\n", radix - part);
-    }
-    for bin in 1..=half {
-        let angle = |part: usize| TAU * (bin * part % radix) as f64 / radix as f64;
-        let even = list(&mut (1..=half).map(|part| format!("{:?} * sum{part}", angle(part).cos() as f32)), " + ");
-        let odd = list(&mut (1..=half).map(|part| format!("{:?} * less{part}", angle(part).sin() as f32)), " + ");
-        body += &format!("let even{bin} = x0 + {even};\nlet odd{bin} = quarter_turn({odd}, direction);\n");
-    }
-    let all = list(&mut (1..=half).map(|part| format!("sum{part}")), " + ");
-    let low = list(&mut (1..=half).map(|bin| format!("even{bin} + odd{bin}")), ", ");
-    let high = list(&mut (1..=half).rev().map(|bin| format!("even{bin} - odd{bin}")), ", ");
+    let samples = (0..radix).map(|part| format!("x{part}")).collect::<Vec<_>>().join(", ");
     format!(
         "
 fn pass{radix}(stride: u32, direction: f32) {{
@@ -147,7 +233,7 @@ fn pass{radix}(stride: u32, direction: f32) {{
     for (var round = 0u; round < {rounds}u; round++) {{
         let place = round * THREADS + thread;
         if (place < COUNT) {{
-            {body}values[round] = array(x0 + {all}, {low}, {high});
+            {load}values[round] = butterfly{radix}(array({samples}), direction);
         }}
     }}
     workgroupBarrier();
@@ -203,23 +289,25 @@ impl Lines {
         entry: &'static str,
     ) -> Arc<Shader> {
         let Self { fft: LineFft { length, span, radices, .. }, lines, threads } = self;
-        // At least one: an array without elements is none.
-        let butterflies = |radix: usize| (span / radix * lines).div_ceil(*threads).max(1);
-        let rounds = |radix: usize| butterflies(radix).into();
-        let own: [(&str, Constant); 9] = [
+        let own: [(&str, Constant); 5] = [
             ("LENGTH", (*length).into()),
             ("SPAN", (*span).into()),
             ("LINES", (*lines).into()),
             ("THREADS", (*threads).into()),
             ("BLUESTEIN", (span != length).into()),
-            ("ROUNDS_2", rounds(2)),
-            ("ROUNDS_3", rounds(3)),
-            ("ROUNDS_4", rounds(4)),
-            ("ROUNDS_5", rounds(5)),
         ];
-        let mut source = String::from(include_str!("fft.wgsl"));
-        let primes = RADICES[..PRIMES].iter().filter(|radix| radices.contains(radix));
-        primes.for_each(|&radix| source.push_str(&prime_pass(radix, butterflies(radix))));
+        // A directive comes before all else.
+        let directive = if files.iter().any(|file| file.starts_with(ENABLE_F16)) { ENABLE_F16 } else { "" };
+        let mut source = String::from(directive);
+        source.push_str(include_str!("fft.wgsl"));
+        let different: BTreeSet<_> = radices.iter().copied().collect();
+        // Those of larger radices are made of those of smaller ones.
+        let butterflies: BTreeSet<_> =
+            different.iter().flat_map(|&radix| parts(radix)).filter(|&radix| radix > 5).collect();
+        butterflies.into_iter().for_each(|radix| source.push_str(&butterfly(radix)));
+        different
+            .into_iter()
+            .for_each(|radix| source.push_str(&pass(radix, (span / radix * lines).div_ceil(*threads))));
         writeln!(source, "\nfn passes(direction: f32) {{").expect("text grows");
         let mut stride = 1;
         for radix in radices {
@@ -227,7 +315,7 @@ impl Lines {
             stride *= radix;
         }
         writeln!(source, "}}").expect("text grows");
-        files.iter().for_each(|file| source.push_str(file));
+        files.iter().for_each(|file| source.push_str(file.strip_prefix(ENABLE_F16).unwrap_or(file)));
         Arc::new(Shader::new(label, &[&own, constants].concat(), &source, entry))
     }
 
@@ -362,6 +450,15 @@ mod tests {
             (1080, 1080),
         ] {
             assert_eq!(LineFft::new(&mut Plan::default(), length, LIMITS).expect("it fits").span, span, "{length}");
+        }
+    }
+
+    #[test]
+    fn passes_are_few_and_the_first_radix_is_odd_where_it_can_be() {
+        let known: [(usize, &[usize]); 5] =
+            [(1, &[]), (8, &[8]), (540, &[9, 10, 6]), (960, &[15, 8, 8]), (2080, &[13, 16, 10])];
+        for (length, expected) in known {
+            assert_eq!(radices(length), expected, "{length}");
         }
     }
 

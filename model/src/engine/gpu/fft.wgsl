@@ -5,8 +5,8 @@
 // p is sample p / LINES of line p % LINES. Nothing else has to be waited for around `transform`. Lines beyond the last
 // one may hold anything.
 //
-// Before this file: LENGTH, SPAN, LINES, THREADS, BLUESTEIN and, for each radix, its rounds. After it: the passes of 7,
-// 11 and 13 where they are needed, and `passes`.
+// Before this file: LENGTH, SPAN, LINES, THREADS and BLUESTEIN. After it: the other butterflies, a pass for each radix,
+// and `passes`, as fft.rs writes them.
 
 const PLACES = LENGTH * LINES;
 const ITEMS = (PLACES + THREADS - 1u) / THREADS;
@@ -53,123 +53,39 @@ fn output(place: u32, radix: u32, stride: u32) -> u32 {
     return ((butterfly - within) * radix + within) * LINES + place % LINES;
 }
 
-fn pass2(stride: u32, direction: f32) {
-    const COUNT = SPAN / 2u * LINES;
-    var values: array<array<vec2f, 2>, ROUNDS_2>;
-    for (var round = 0u; round < ROUNDS_2; round++) {
-        let place = round * THREADS + thread;
-        if (place < COUNT) {
-            let a = line[place];
-            let b = times(line[place + COUNT], turn(place, 2u, stride, direction));
-            values[round] = array(a + b, a - b);
-        }
-    }
-    workgroupBarrier();
-    for (var round = 0u; round < ROUNDS_2; round++) {
-        let place = round * THREADS + thread;
-        if (place < COUNT) {
-            let first = output(place, 2u, stride);
-            line[first] = values[round][0];
-            line[first + stride * LINES] = values[round][1];
-        }
-    }
-    workgroupBarrier();
+// Transforms of a few samples each.
+
+fn butterfly2(x: array<vec2f, 2>, direction: f32) -> array<vec2f, 2> {
+    return array(x[0] + x[1], x[0] - x[1]);
 }
 
-fn pass3(stride: u32, direction: f32) {
-    const COUNT = SPAN / 3u * LINES;
+fn butterfly3(x: array<vec2f, 3>, direction: f32) -> array<vec2f, 3> {
     const SINE = 0.8660254037844386f;
-    var values: array<array<vec2f, 3>, ROUNDS_3>;
-    for (var round = 0u; round < ROUNDS_3; round++) {
-        let place = round * THREADS + thread;
-        if (place < COUNT) {
-            let once = turn(place, 3u, stride, direction);
-            let a = line[place];
-            let b = times(line[place + COUNT], once);
-            let c = times(line[place + 2u * COUNT], times(once, once));
-            let even = a - 0.5f * (b + c);
-            let odd = quarter_turn(SINE * (b - c), direction);
-            values[round] = array(a + b + c, even + odd, even - odd);
-        }
-    }
-    workgroupBarrier();
-    for (var round = 0u; round < ROUNDS_3; round++) {
-        let place = round * THREADS + thread;
-        if (place < COUNT) {
-            let first = output(place, 3u, stride);
-            for (var part = 0u; part < 3u; part++) {
-                line[first + part * stride * LINES] = values[round][part];
-            }
-        }
-    }
-    workgroupBarrier();
+    let even = x[0] - 0.5f * (x[1] + x[2]);
+    let odd = quarter_turn(SINE * (x[1] - x[2]), direction);
+    return array(x[0] + x[1] + x[2], even + odd, even - odd);
 }
 
-fn pass4(stride: u32, direction: f32) {
-    const COUNT = SPAN / 4u * LINES;
-    var values: array<array<vec2f, 4>, ROUNDS_4>;
-    for (var round = 0u; round < ROUNDS_4; round++) {
-        let place = round * THREADS + thread;
-        if (place < COUNT) {
-            let once = turn(place, 4u, stride, direction);
-            let twice = times(once, once);
-            let a = line[place];
-            let b = times(line[place + COUNT], once);
-            let c = times(line[place + 2u * COUNT], twice);
-            let d = times(line[place + 3u * COUNT], times(once, twice));
-            let odd = quarter_turn(b - d, direction);
-            values[round] = array(a + c + (b + d), a - c + odd, a + c - (b + d), a - c - odd);
-        }
-    }
-    workgroupBarrier();
-    for (var round = 0u; round < ROUNDS_4; round++) {
-        let place = round * THREADS + thread;
-        if (place < COUNT) {
-            let first = output(place, 4u, stride);
-            for (var part = 0u; part < 4u; part++) {
-                line[first + part * stride * LINES] = values[round][part];
-            }
-        }
-    }
-    workgroupBarrier();
+fn butterfly4(x: array<vec2f, 4>, direction: f32) -> array<vec2f, 4> {
+    let low = x[0] + x[2];
+    let high = x[1] + x[3];
+    let difference = x[0] - x[2];
+    let odd = quarter_turn(x[1] - x[3], direction);
+    return array(low + high, difference + odd, low - high, difference - odd);
 }
 
-fn pass5(stride: u32, direction: f32) {
-    const COUNT = SPAN / 5u * LINES;
+fn butterfly5(x: array<vec2f, 5>, direction: f32) -> array<vec2f, 5> {
     const COSINE = 0.30901699437494745f;
     const COSINE_TWICE = -0.8090169943749475f;
     const SINE = 0.9510565162951535f;
     const SINE_TWICE = 0.5877852522924731f;
-    var values: array<array<vec2f, 5>, ROUNDS_5>;
-    for (var round = 0u; round < ROUNDS_5; round++) {
-        let place = round * THREADS + thread;
-        if (place < COUNT) {
-            let once = turn(place, 5u, stride, direction);
-            let twice = times(once, once);
-            let a = line[place];
-            let b = times(line[place + COUNT], once);
-            let c = times(line[place + 2u * COUNT], twice);
-            let d = times(line[place + 3u * COUNT], times(once, twice));
-            let e = times(line[place + 4u * COUNT], times(twice, twice));
-            let even = a + COSINE * (b + e) + COSINE_TWICE * (c + d);
-            let even_twice = a + COSINE_TWICE * (b + e) + COSINE * (c + d);
-            let odd = quarter_turn(SINE * (b - e) + SINE_TWICE * (c - d), direction);
-            let odd_twice = quarter_turn(SINE_TWICE * (b - e) - SINE * (c - d), direction);
-            values[round] =
-                array(a + (b + e) + (c + d), even + odd, even_twice + odd_twice, even_twice - odd_twice, even - odd);
-        }
-    }
-    workgroupBarrier();
-    for (var round = 0u; round < ROUNDS_5; round++) {
-        let place = round * THREADS + thread;
-        if (place < COUNT) {
-            let first = output(place, 5u, stride);
-            for (var part = 0u; part < 5u; part++) {
-                line[first + part * stride * LINES] = values[round][part];
-            }
-        }
-    }
-    workgroupBarrier();
+    let outer = x[1] + x[4];
+    let inner = x[2] + x[3];
+    let even = x[0] + COSINE * outer + COSINE_TWICE * inner;
+    let even_twice = x[0] + COSINE_TWICE * outer + COSINE * inner;
+    let odd = quarter_turn(SINE * (x[1] - x[4]) + SINE_TWICE * (x[2] - x[3]), direction);
+    let odd_twice = quarter_turn(SINE_TWICE * (x[1] - x[4]) - SINE * (x[2] - x[3]), direction);
+    return array(x[0] + outer + inner, even + odd, even_twice + odd_twice, even_twice - odd_twice, even - odd);
 }
 
 // Transforms every line in `line`; `direction` is FORWARD or INVERSE.

@@ -3,7 +3,7 @@
 
 use holod_calibration::{DisplayGeometry, Metres, Resolution};
 
-use super::map::{GROUP, Map};
+use super::map::{Format, GROUP, Map};
 use super::plan::{Constant, Plan};
 use crate::weights::{CONDITIONS, OUTPUT_CHANNELS};
 
@@ -15,7 +15,7 @@ const MAPS: usize = 4 * 5 + CONDITIONS;
 pub(crate) struct InputChannels {
     /// From here on the expected amplitudes less 0.4, [layers, 3]; before them the frame's maps.
     pub(crate) stack: usize,
-    /// From here on what the second net alone reads, in whole groups: three real parts of the field, then three
+    /// From here on what the second net alone reads, in whole blocks: three real parts of the field, then three
     /// imaginary ones. Channels between the stack and this are zero.
     pub(crate) field: usize,
     /// The same of the field's change.
@@ -23,13 +23,15 @@ pub(crate) struct InputChannels {
     /// From here on what is lacking of the expected amplitudes, [layers, 3].
     pub(crate) lack: usize,
     depth_layers: usize,
+    format: Format,
 }
 
 impl InputChannels {
-    pub(crate) fn new(depth_layers: usize) -> Self {
-        let field = (MAPS + 3 * depth_layers).next_multiple_of(GROUP);
+    /// Of a map in `format`.
+    pub(crate) fn new(depth_layers: usize, format: Format) -> Self {
+        let field = (MAPS + 3 * depth_layers).next_multiple_of(GROUP * format.block_groups());
         let change = field + OUTPUT_CHANNELS;
-        Self { stack: MAPS, field, change, lack: change + OUTPUT_CHANNELS, depth_layers }
+        Self { stack: MAPS, field, change, lack: change + OUTPUT_CHANNELS, depth_layers, format }
     }
 
     /// Channels of the map.
@@ -49,7 +51,7 @@ impl InputChannels {
 
     /// The map that both nets read, on the network's grid.
     pub(crate) fn map(self, plan: &mut Plan, size: Resolution) -> Map {
-        Map::new(plan, "what the nets read", (size.width, size.height), self.count())
+        Map::with(self.format, plan, "what the nets read", (size.width, size.height), self.count())
     }
 }
 

@@ -1,16 +1,11 @@
 // What the nets of `expected-stack` are told of a frame, as input_features.rs writes it. Before this file: WIDTH,
-// HEIGHT, blocks.wgsl, INPUT_GROUPS and INPUT_PITCH of the nets' map.
+// HEIGHT, blocks.wgsl and what the nets' map declares as `input`.
 
 // The eye's pupil in millimetres, and what networks are told of it and the bench (conditions.rs).
 struct Pupil {
     mm: f32,
     blur: f32,
     fresnel: f32,
-}
-
-// Where that map has group `group` of pixel (x, y).
-fn input_place(group: u32, x: u32, y: u32) -> u32 {
-    return ((y + 1u) * INPUT_GROUPS + group) * INPUT_PITCH + x + 1u;
 }
 
 // One of the frame's planes at the corners of block (x, y).

@@ -17,6 +17,7 @@ mod input_features;
 mod levels;
 mod loaded_plan;
 mod map;
+mod matrix;
 mod network;
 mod plan;
 mod shared;

@@ -57,19 +57,17 @@ pub(crate) struct Shader {
 }
 
 impl Shader {
-    /// The entry point `entry` of `source` after the constants that `source` uses without declaring them. Where
-    /// `source` begins with [`ENABLE_F16`], so does the shader.
+    /// The entry point `entry` of `source` after the constants that `source` uses without declaring them. The lines with
+    /// which `source` enables extensions come before these.
     pub(crate) fn new(
         label: impl Into<String>,
         constants: &[(&str, Constant)],
         source: &str,
         entry: &'static str,
     ) -> Self {
-        let (directive, source) = match source.strip_prefix(ENABLE_F16) {
-            Some(rest) => (ENABLE_F16, rest),
-            None => ("", source),
-        };
-        let mut text = String::from(directive);
+        let directives = source.split_inclusive('\n').take_while(|line| line.starts_with("enable "));
+        let (directives, source) = source.split_at(directives.map(str::len).sum());
+        let mut text = String::from(directives);
         for (name, value) in constants {
             let (kind, value) = match value {
                 Constant::U32(value) => ("u32", format!("{value}u")),

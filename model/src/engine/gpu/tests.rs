@@ -9,13 +9,14 @@ use proptest::prelude::*;
 
 use super::engine::GpuEngine;
 use super::fft::WorkgroupLimits;
+use super::map::Format;
 use super::plan::Plan;
 use super::shared::Shared;
 use super::trial::Trial;
 use super::{double_phase, levels};
 use crate::engine::cpu::tests::{OTHER_BENCH, frame};
 use crate::engine::{CpuEngine, EngineError, reference};
-use crate::gpu::{GpuError, Precision, test_adapters};
+use crate::gpu::{GpuError, MatrixUnits, Precision, test_adapters, test_gpu};
 use crate::optics::DoublePhase;
 use crate::weights::tests::{self as weights_tests, random_weights};
 use crate::weights::{Grid, NetworkConfig};
@@ -204,7 +205,7 @@ fn engine(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) ->
 
 fn engine_in(precision: Precision, weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) -> GpuEngine {
     let tables = linear_tables(resolution);
-    GpuEngine::open(weights, bench, &tables, test_adapters(), precision).expect("an engine")
+    GpuEngine::open(weights, bench, &tables, test_adapters(), Some(precision)).expect("an engine")
 }
 
 /// Samples and hologram of a frame.
@@ -325,19 +326,69 @@ fn whole_networks_in_half_precision_are_near_the_same_in_single() {
     for weights in [Weights::builtin(), Weights::builtin_small(), Weights::builtin_fast()] {
         let bench = DisplayGeometry::DEFAULT;
         let mut half = engine_in(Precision::Half, &weights, &bench, frame.resolution);
-        let mut single = engine(&weights, &bench, frame.resolution);
         assert_eq!(half.precision(), Precision::Half, "the software device has it");
-        for pupil_mm in [1.0, 6.0] {
-            let (_, single) = rendered(&mut single, &frame, pupil_mm);
-            let (_, mut found) = rendered(&mut half, &frame, pupil_mm);
-            let expected: Vec<_> = single.field.iter().map(|v| Complex64::new(v.re.into(), v.im.into())).collect();
-            let error = field_error(&found.field, &expected);
-            assert!(error > 1e-5, "{error}: it was computed in single precision");
-            assert!(error < HALF_FIELD_TOLERANCE, "{error} at {pupil_mm} mm");
-            found.field[99].re += 2.0 * HALF_FIELD_TOLERANCE as f32;
-            assert!(field_error(&found.field, &expected) > HALF_FIELD_TOLERANCE, "the comparison is blind");
+        assert_near_single(&mut half, &weights, &bench, &frame);
+    }
+}
+
+/// Asserts that what an engine in half precision gives is near the same in single precision, and is not that.
+fn assert_near_single(half: &mut GpuEngine, weights: &Weights, bench: &DisplayGeometry, frame: &Arc<RgbdFrame>) {
+    let mut single = engine(weights, bench, frame.resolution);
+    for pupil_mm in [1.0, 6.0] {
+        let (_, single) = rendered(&mut single, frame, pupil_mm);
+        let (_, mut found) = rendered(half, frame, pupil_mm);
+        let expected: Vec<_> = single.field.iter().map(|v| Complex64::new(v.re.into(), v.im.into())).collect();
+        let error = field_error(&found.field, &expected);
+        assert!(error > 1e-5, "{error}: it was computed in single precision");
+        assert!(error < HALF_FIELD_TOLERANCE, "{error} at {pupil_mm} mm");
+        found.field[99].re += 2.0 * HALF_FIELD_TOLERANCE as f32;
+        assert!(field_error(&found.field, &expected) > HALF_FIELD_TOLERANCE, "the comparison is blind");
+    }
+}
+
+/// With matrices in one network, whose inputs and layers do not fill them.
+#[test]
+fn a_whole_network_of_matrices_is_near_the_same_in_single_precision() {
+    let frame = Arc::new(frame(Resolution { width: 50, height: 34 }, 4));
+    let (weights, bench) = (Weights::builtin_fast(), DisplayGeometry::DEFAULT);
+    let mut gpu = test_gpu();
+    gpu.matrix_units.get_or_insert(MatrixUnits::Threads);
+    let tables = linear_tables(frame.resolution);
+    let mut matrices = GpuEngine::on(gpu, &weights, &bench, &tables, None).expect("an engine");
+    assert!(matrices.uses_matrix_units(), "it is left to the device");
+    assert_near_single(&mut matrices, &weights, &bench, &frame);
+}
+
+/// No software device has matrix units: what a card with them would compile is looked at here.
+#[test]
+fn shaders_for_matrix_units_are_valid() {
+    use wgpu::naga;
+    let limits = WorkgroupLimits { bytes: 32 << 10, threads: 512 };
+    let tables = linear_tables(Resolution { width: 50, height: 34 });
+    let format = Format::HalfTiles(MatrixUnits::Device);
+    let valid = |source: &str| -> Result<(), String> {
+        let capabilities = naga::valid::Capabilities::all();
+        let options = naga::front::wgsl::Options { capabilities, ..naga::front::wgsl::Options::new() };
+        let module = naga::front::wgsl::Frontend::new_with_options(options).parse(source);
+        let module = module.map_err(|error| error.emit_to_string(source))?;
+        let mut validator = naga::valid::Validator::new(naga::valid::ValidationFlags::all(), capabilities);
+        validator.validate(&module).map_err(|error| error.emit_to_string(source))?;
+        Ok(())
+    };
+    let mut with_matrices = 0;
+    for weights in [Weights::builtin(), Weights::builtin_small(), Weights::builtin_fast()] {
+        let bench = DisplayGeometry::DEFAULT;
+        let network = super::network::NetworkPlan::new(&weights, &bench, &tables, format, limits).expect("a plan");
+        for shader in network.plan.stages.iter().flat_map(|stage| &stage.dispatches).map(|dispatch| &dispatch.shader) {
+            valid(&shader.source).unwrap_or_else(|error| panic!("{}: {error}", shader.label));
+            if shader.source.contains("coopMultiplyAdd") {
+                with_matrices += 1;
+                let wrong = shader.source.replace("coop_mat16x16<f16, A>", "coop_mat16x16<f16, B>");
+                valid(&wrong).expect_err("the matrices' roles matter");
+            }
         }
     }
+    assert!(with_matrices > 30, "{with_matrices}");
 }
 
 #[test]
@@ -433,7 +484,7 @@ fn wrong_sizes_and_pupils_are_refused_and_a_lost_device_is_told() {
     assert!(matches!(lost, Err(EngineError::Gpu(GpuError::Failed { .. }))), "{lost:?}");
 
     let nothing = linear_tables(Resolution { width: 0, height: 4 });
-    let refused = GpuEngine::open(&weights, &DisplayGeometry::DEFAULT, &nothing, test_adapters(), Precision::Single);
+    let refused = GpuEngine::open(&weights, &DisplayGeometry::DEFAULT, &nothing, test_adapters(), None);
     assert!(matches!(refused.err(), Some(EngineError::Empty { .. })));
 }
 
@@ -443,7 +494,7 @@ fn a_size_whose_lines_do_not_fit_on_the_device_is_told_before_anything_is_made()
     let limits = WorkgroupLimits { bytes: 16 << 10, threads: 256 };
     let (weights, bench) = (Weights::builtin_small(), DisplayGeometry::DEFAULT);
     let refused =
-        super::network::NetworkPlan::new(&weights, &bench, &linear_tables(resolution), Precision::Single, limits);
+        super::network::NetworkPlan::new(&weights, &bench, &linear_tables(resolution), Format::Single, limits);
     let text = refused.err().expect("no workgroup holds such a line").to_string();
     assert!(text.contains("20000") && text.contains("16384") && text.contains("--backend cpu"), "{text}");
 }

@@ -110,15 +110,16 @@ impl Trial {
 
 impl Map {
     fn place(&self, channel: usize, y: usize, x: usize) -> usize {
-        (((y + 1) * self.groups + channel / GROUP) * self.pitch() + x + 1) * GROUP + channel % GROUP
+        let block = GROUP * self.format.block_groups();
+        let first = channel / block * block / GROUP;
+        ((y + 1) * self.groups + first) * self.pitch() * GROUP + (x + 1) * block + channel % block
     }
 
     /// What the map's buffer holds, as 32-bit words, where channel c of pixel (x, y) is `value(c, y, x)`.
     pub(super) fn values(&self, value: impl Fn(usize, usize, usize) -> f32) -> Vec<f32> {
-        let rows = self.height.next_multiple_of(super::map::ROWS) + 2;
-        let mut values = vec![0.0; rows * self.groups * self.pitch() * GROUP];
+        let mut values = vec![0.0; self.rows() * self.groups * self.pitch() * GROUP];
         self.for_each(|channel, y, x| values[self.place(channel, y, x)] = value(channel, y, x));
-        match self.precision {
+        match self.format.precision() {
             Precision::Single => values,
             Precision::Half => {
                 let half: Vec<_> = values.iter().map(|&value| f16::from_f32(value).to_bits()).collect();
@@ -135,7 +136,7 @@ impl Map {
 
     /// [channels, height, width] of the first `channels` of `values`; the border and the rows below are zero.
     pub(super) fn planes(&self, values: &[f32], channels: usize) -> Vec<f32> {
-        let mut rest = match self.precision {
+        let mut rest = match self.format.precision() {
             Precision::Single => values.to_vec(),
             Precision::Half => {
                 let half: &[u16] = bytemuck::cast_slice(values);

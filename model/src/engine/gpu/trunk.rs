@@ -1,8 +1,10 @@
 //! A stack of 3x3 layers on the GPU: convolutions in residual pairs, some of them adjustable.
 
+use half::f16;
+
 use super::conv::{self, ConvLayer, Epilogue, Packing};
 use super::deformable;
-use super::map::{GROUP, Map};
+use super::map::{Format, GROUP, Map};
 use super::plan::{BufferId, Plan};
 use crate::conditions::Conditions;
 use crate::engine::modulation::{Modulation, OffsetParameters};
@@ -18,36 +20,44 @@ pub(super) struct Modulated {
     /// Where the device has the parameters, and what it shall have there.
     pub(super) buffer: BufferId,
     parameters: Vec<f32>,
+    /// The same in half precision, where the device has them so.
+    half: Vec<u16>,
 }
 
 impl Modulated {
     /// The parameters for a bench and a pupil, as the device takes them; `None` if it has them.
-    pub(super) fn change_to(&mut self, conditions: Conditions) -> Option<&[f32]> {
-        let Self { modulation, inputs, packing, parameters, .. } = self;
+    pub(super) fn change_to(&mut self, conditions: Conditions) -> Option<&[u8]> {
+        let Self { modulation, inputs, packing, parameters, half, .. } = self;
         let OffsetParameters { weight, bias } = modulation.change_to(conditions)?;
         let count = inputs.len();
         packing.fill(parameters, inputs, bias.iter().copied(), |output, input, tap| {
             weight[(output * count + input) * 9 + tap]
         });
-        Some(parameters)
+        if packing.precision == Precision::Single {
+            return Some(bytemuck::cast_slice(parameters));
+        }
+        for (half, value) in half.iter_mut().zip(parameters.iter()) {
+            *half = f16::from_f32(*value).to_bits();
+        }
+        Some(bytemuck::cast_slice(half))
     }
 }
 
 /// Adds a stage for each of `layers`, called `{prefix}layer 0` and so on. The first one reads the channels `inputs` of
-/// `input`, and features are in `precision`. Returns the last one's map, and what depends on the pupil.
+/// `input`, and features are in `format`. Returns the last one's map, and what depends on the pupil.
 pub(super) fn run(
     plan: &mut Plan,
     prefix: &str,
     layers: &[Layer],
     leaky_slope: f32,
-    precision: Precision,
+    format: Format,
     input: &Map,
     inputs: &[usize],
 ) -> (Map, Vec<Modulated>) {
     let size = (input.width, input.height);
     let last = layers.len() - 1;
-    let features = Map::with(precision, plan, "features", size, layers[0].out_channels);
-    let between = Map::with(precision, plan, "features between two layers", size, layers[0].out_channels);
+    let features = Map::with(format, plan, "features", size, layers[0].out_channels);
+    let between = Map::with(format, plan, "features between two layers", size, layers[0].out_channels);
     let output = Map::new(plan, "what a net gives", size, layers[last].out_channels);
     let in_order: Vec<usize> = (0..layers[0].out_channels).collect();
     let mut modulated = Vec::new();
@@ -85,6 +95,7 @@ pub(super) fn run(
             modulation: Modulation::new(adjustable, leaky_slope),
             inputs: channels.to_vec(),
             parameters: vec![0.0; packing.len()],
+            half: vec![0; packing.len()],
             packing,
             buffer,
         });

@@ -17,7 +17,7 @@ use crate::weights::Grid;
 const CORRECTION_SHARE: f32 = 0.3;
 /// Samples that a thread holds of a row, and of a column.
 const ROW_ITEMS: usize = 4;
-const COLUMN_ITEMS: usize = 9;
+const COLUMN_ITEMS: usize = 6;
 
 /// A field on the network's grid.
 #[derive(Clone, Copy)]

@@ -25,11 +25,11 @@ use serde::Serialize;
 use self::assembly::{Assembly, Work};
 use self::null_device::{Binary, NullDevice, Request};
 use super::fft::WorkgroupLimits;
+use super::map::Format;
 use super::network::NetworkPlan;
 use super::plan::{Dispatch, Plan, Shader};
 use crate::Weights;
 use crate::engine::EngineError;
-use crate::gpu::Precision;
 
 pub use self::null_device::serve;
 
@@ -218,7 +218,7 @@ impl FramePlan {
     /// # Errors
     /// The size is nothing, or too large.
     pub fn new(weights: &Weights, resolution: Resolution, half_precision: bool) -> Result<Self, EngineError> {
-        let precision = if half_precision { Precision::Half } else { Precision::Single };
+        let format = if half_precision { Format::Half } else { Format::Single };
         // A panel of 8 bits.
         let levels = [0; 3].map(|_| (0..256).collect());
         let tables = LevelTables {
@@ -231,7 +231,7 @@ impl FramePlan {
             levels: PerColour(levels),
             flatness: PerColour([None, None, None]),
         };
-        Ok(Self(NetworkPlan::new(weights, &DisplayGeometry::DEFAULT, &tables, precision, LIMITS)?.plan))
+        Ok(Self(NetworkPlan::new(weights, &DisplayGeometry::DEFAULT, &tables, format, LIMITS)?.plan))
     }
 
     /// Labels of the shaders, each once.

@@ -1,0 +1,31 @@
+// As matrix_units.wgsl, without such units: matrices are the places where they lie, and thread `lane` holds of sums row
+// lane / 2, and of that the eight columns from 8·(lane % 2) on.
+
+alias Pixels = u32;
+alias Weights = u32;
+alias Sums = array<vec4f, 2>;
+
+fn load_pixels(place: u32) -> Pixels {
+    return place + lane / 2u * 4u;
+}
+
+fn load_weights(place: u32) -> Weights {
+    return place + lane % 2u * 2u;
+}
+
+fn multiply_add(pixels: Pixels, weights: Weights, sums: Sums) -> Sums {
+    var low = sums[0];
+    var high = sums[1];
+    for (var channel = 0u; channel < 16u; channel++) {
+        let value = vec4f(vec4<f16>(MEMORY[pixels + channel / 4u][channel % 4u]));
+        low = fma(value, vec4f(parameters[weights + 4u * channel]), low);
+        high = fma(value, vec4f(parameters[weights + 4u * channel + 1u]), high);
+    }
+    return array(low, high);
+}
+
+fn store_sums(sums: Sums, place: u32) {
+    let first = place + lane / 2u * 4u + lane % 2u * 2u;
+    finished[first] = sums[0];
+    finished[first + 1u] = sums[1];
+}

@@ -1,0 +1,23 @@
+// Products of matrices of 16 by 16 numbers, on the units of the device: the 32 threads of a workgroup, which are a
+// subgroup, hold each matrix together. What `MEMORY` stands for is the shader's memory of pixels.
+
+// [pixel, input channel], [input channel, output channel], and sums [pixel, output channel].
+alias Pixels = coop_mat16x16<f16, A>;
+alias Weights = coop_mat16x16<f16, B>;
+alias Sums = coop_mat16x16<f32, C>;
+
+fn load_pixels(place: u32) -> Pixels {
+    return coopLoadT<Pixels>(&MEMORY[place], 4u);
+}
+
+fn load_weights(place: u32) -> Weights {
+    return coopLoadT<Weights>(&parameters[place], 4u);
+}
+
+fn multiply_add(pixels: Pixels, weights: Weights, sums: Sums) -> Sums {
+    return coopMultiplyAdd(pixels, weights, sums);
+}
+
+fn store_sums(sums: Sums, place: u32) {
+    coopStoreT(sums, &finished[place], 4u);
+}
