@@ -33,13 +33,16 @@ from holod_training.optics import double_phase_phasors, levels, upsample_half_ba
 
 WHOLE, NETS = "whole frame", "networks only"
 HOLOD, EAGER = "holod", "PyTorch, eager"
+HALF = "PyTorch, channels-last, the networks in half precision"
 # Of which `holod bench` times frames, too.
 PUPIL_MM = 3.0
 LEVELS = 256
 # Levels of two engines that do the same are one apart where rounding decides, and farther where a phase is undefined.
 LEVELS_APART, SHARE_FARTHER_APART = 1, 1e-3
-# Outputs of the nets, over the largest one.
-NETS_TOLERANCE = 1e-3
+# Outputs of the nets, over the largest one: in single precision, and in half.
+NETS_TOLERANCE, HALF_NETS_TOLERANCE = 1e-3, 0.05
+# The same of levels of a network in half precision: those whose phase is nearly undefined are anywhere.
+HALF_LEVELS_APART, HALF_SHARE_FARTHER_APART = 4, 0.1
 REASON_CHARACTERS = 160
 # With more of the CPUs' time taken by other programs, threads that wait for each other wait for those.
 QUIET_SHARE = 0.05
@@ -60,6 +63,8 @@ class Plan:
     rounds: int
     calls: int
     device: torch.device
+    # That of holod on a GPU.
+    backend: str = "auto"
 
     def __post_init__(self) -> None:
         if self.width < 2 or self.height < 2 or self.width % 2 or self.height % 2:
@@ -114,6 +119,18 @@ class PanelLevels(nn.Module):
         if config.grid == "half-band":
             field = upsample_half_band(field)
         return levels(double_phase_phasors(field, config.amplitude_constant).angle()).to(torch.uint8)
+
+
+class HalfNet(nn.Module):
+    """A net in half precision and channels-last, between inputs and outputs in single."""
+
+    def __init__(self, net: nn.Module) -> None:
+        super().__init__()
+        self.net = copy.deepcopy(net).half().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, x: Tensor, told: Tensor, trace: dict[str, Tensor] | None = None) -> Tensor:
+        output: Tensor = self.net(_channels_last(x.half()), told.half(), trace)
+        return output.float()
 
 
 class Nets(nn.Module):
@@ -184,7 +201,7 @@ def _rows(plan: Plan, works: dict[tuple[str, str], Work | str]) -> tuple[list[Ro
 
 def run_holod(plan: Plan, threads: int) -> HolodTimes:
     """One `holod bench` of the plan's calls. Raises BenchError where it fails, or computes on other threads."""
-    backend = "cpu" if plan.device.type == "cpu" else "gpu"
+    backend = "cpu" if plan.device.type == "cpu" else plan.backend
     options = ["--weights", str(plan.weights), "--resolution", plan.resolution, "--repeat", str(plan.calls)]
     command = [str(plan.holod), "bench", "--json", "--backend", backend, "--duration", "0s", *options]
     try:
@@ -237,9 +254,6 @@ def _torch_engines(plan: Plan) -> dict[tuple[str, str], Work | str]:
             net.compile()
         return _work(partly, frame)
 
-    def same_levels(found: tuple[Tensor, ...], expected: tuple[Tensor, ...]) -> bool:
-        return levels_agree(found[0], expected[0])
-
     def engines(part: str, module: nn.Module, like: tuple[Tensor, ...], last: tuple[Tensor, ...]) -> list[Attempt]:
         moved = copy.deepcopy(module).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return [
@@ -252,6 +266,9 @@ def _torch_engines(plan: Plan) -> dict[tuple[str, str], Work | str]:
     attempts = engines(WHOLE, whole, frame, frame_channels_last)
     attempts.append((WHOLE, "PyTorch, torch.compile of the networks, the rest eager", compiled_nets))
     attempts += engines(NETS, nets, inputs, inputs_channels_last)
+    if plan.device.type == "cuda":
+        attempts.append((WHOLE, HALF, lambda: _work(_in_half_precision(whole), frame)))
+        attempts.append((NETS, HALF, lambda: _work(_in_half_precision(nets), inputs)))
 
     works: dict[tuple[str, str], Work | str] = {}
     expected: dict[str, tuple[Tensor, ...]] = {}
@@ -263,9 +280,9 @@ def _torch_engines(plan: Plan) -> dict[tuple[str, str], Work | str]:
         except Exception as error:
             works[part, engine] = reason(error)
             continue
-        same = same_levels if part == WHOLE else nets_agree
-        differs = not same(found, expected.setdefault(part, found))
-        works[part, engine] = f"its results are not those of {EAGER}" if differs else work
+        like, half = expected.setdefault(part, found), engine == HALF
+        same = levels_agree(found[0], like[0], half) if part == WHOLE else nets_agree(found, like, half)
+        works[part, engine] = work if same else f"its results are not those of {EAGER}"
     return works
 
 
@@ -275,6 +292,18 @@ def _nets(network: FieldNetwork, frame: tuple[Tensor, ...]) -> tuple[Nets, list[
     network(*frame, trace)
     nets = _nets_of(network)
     return Nets(list(nets.values())).eval(), [trace[name] for name in nets]
+
+
+def _in_half_precision(module: nn.Module) -> nn.Module:
+    """A copy of `PanelLevels` or `Nets` whose nets are in half precision."""
+    copied = copy.deepcopy(module)
+    if isinstance(copied, Nets):
+        copied.nets = nn.ModuleList(HalfNet(net) for net in copied.nets)
+    elif isinstance(copied, PanelLevels):
+        for name in ("lighting", "correction", "layers"):
+            if hasattr(copied.network, name):
+                setattr(copied.network, name, HalfNet(getattr(copied.network, name)))
+    return copied
 
 
 def _nets_of(network: FieldNetwork) -> dict[str, nn.Module]:
@@ -333,21 +362,24 @@ def _calls_ms(work: Work, plan: Plan) -> list[float]:
     return taken[1:]
 
 
-def levels_agree(found: Tensor, expected: Tensor) -> bool:
-    """Whether two frames of levels are one apart at most, round the circle, at all but a few pixels."""
+def levels_agree(found: Tensor, expected: Tensor, half: bool = False) -> bool:
+    """Whether two frames of levels are one apart at most, round the circle, at all but a few pixels; or where the
+    networks of one are in half precision, a few apart."""
     if found.shape != expected.shape:
         return False
     apart = torch.remainder(found.cpu().int() - expected.cpu().int(), LEVELS)
     apart = torch.minimum(apart, LEVELS - apart)
-    return (apart > LEVELS_APART).float().mean().item() <= SHARE_FARTHER_APART
+    most_apart, most = (HALF_LEVELS_APART, HALF_SHARE_FARTHER_APART) if half else (LEVELS_APART, SHARE_FARTHER_APART)
+    return (apart > most_apart).float().mean().item() <= most
 
 
-def nets_agree(found: tuple[Tensor, ...], expected: tuple[Tensor, ...]) -> bool:
-    """Whether all outputs of nets are the same but for rounding."""
+def nets_agree(found: tuple[Tensor, ...], expected: tuple[Tensor, ...], half: bool = False) -> bool:
+    """Whether all outputs of nets are the same but for rounding, of those of one in half precision or not."""
+    tolerance = HALF_NETS_TOLERANCE if half else NETS_TOLERANCE
 
     def agree(one: Tensor, other: Tensor) -> bool:
         one, other = one.cpu(), other.cpu()
-        return one.shape == other.shape and bool((one - other).abs().max() <= NETS_TOLERANCE * other.abs().max())
+        return one.shape == other.shape and bool((one - other).abs().max() <= tolerance * other.abs().max())
 
     return len(found) == len(expected) and all(map(agree, found, expected))
 

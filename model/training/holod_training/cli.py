@@ -165,6 +165,7 @@ def _parser() -> argparse.ArgumentParser:
     engines.add_argument("--holod", required=True, help="the program, built with --release")
     engines.add_argument("--resolution", type=_resolution, default=(512, 512), metavar="WxH")
     engines.add_argument("--rounds", type=int, default=7, help="how often the engines take turns")
+    engines.add_argument("--backend", default="auto", choices=("auto", "gpu", "gpu-half"), help="of holod, on a GPU")
     engines.add_argument("--calls", type=int, default=5, help="frames of each engine in each round")
     engines.add_argument("--json", action="store_true", help="print the figures as JSON")
     engines.set_defaults(run=_bench_engines)
@@ -376,6 +377,7 @@ def _bench_engines(options: argparse.Namespace) -> None:
         rounds=options.rounds,
         calls=options.calls,
         device=choose_device(options.device),
+        backend=options.backend,
     )
     result = bench_engines(plan, ["python", "-m", "holod_training", *options.arguments])
     print(json.dumps(result, indent=1) if options.json else markdown(result), end="\n" if options.json else "")

@@ -22,6 +22,8 @@ from holod_training.bench_engines import (
     Plan,
     Row,
     _CpuTime,
+    _in_half_precision,
+    _nets,
     busy_s,
     levels_agree,
     markdown,
@@ -131,6 +133,24 @@ def test_results_are_compared_round_the_circle_and_but_for_rounding() -> None:
     for value in (0.1, math.nan):
         spoiled[7] = value
         assert not nets_agree((spoiled, outputs[1]), outputs)
+
+
+def test_what_is_in_half_precision_is_compared_by_what_that_loses() -> None:
+    torch.manual_seed(1)
+    network = build_network(TINY)
+    frame = (torch.rand(1, 3, 12, 16), torch.rand(1, 12, 16), torch.tensor([3.0]))
+    single = PanelLevels(network).eval()
+    half = _in_half_precision(single)
+    with torch.no_grad():
+        levels, half_levels = single(*frame), half(*frame)
+        nets, seen = _nets(network, frame)
+        inputs = (network.told(frame[2]), *seen)
+        outputs, half_outputs = nets(*inputs), _in_half_precision(nets)(*inputs)
+    assert levels_agree(half_levels, levels, half=True) and not levels_agree(levels.flip(-1), levels, half=True)
+    assert nets_agree(half_outputs, outputs, half=True)
+    assert any(not torch.equal(one, other) for one, other in zip(half_outputs, outputs, strict=True))
+    spoiled = (outputs[0] + 0.1 * outputs[0].abs().max(), *outputs[1:])
+    assert not nets_agree(spoiled, outputs, half=True)
 
 
 def test_levels_are_those_of_the_trainers_double_phase() -> None:
