@@ -206,7 +206,8 @@ impl From<Fit> for FitArg {
 #[derive(ValueEnum, Serialize, Deserialize, Debug, Clone, Copy, Default, PartialEq, Eq)]
 #[serde(rename_all = "kebab-case")]
 pub enum Backend {
-    /// A GPU where there is one that will do, in half precision if it multiplies matrices so; else the processor's cores.
+    /// A GPU where there is one that will do, in half precision if it multiplies matrices so; else the processor's
+    /// cores.
     #[default]
     Auto,
     /// Native code on the processor's cores.
@@ -403,6 +404,10 @@ pub struct CheckArgs {
     /// out.
     #[arg(long, value_name = "WxH", value_parser = parse_resolution)]
     pub resolution: Option<Resolution>,
+    /// Engine for the network, as `run` takes it: its frames a second are estimated, and a GPU's phases compared with
+    /// the processor's.
+    #[arg(long, value_enum, default_value_t)]
+    pub backend: Backend,
     /// The panel, as `run` takes it: opened, looked at with the flat pattern on it, and closed.
     #[arg(long, value_name = "SPEC")]
     pub output: Option<String>,

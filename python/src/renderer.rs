@@ -26,8 +26,8 @@ use crate::view::{eye, pupil, see};
 ///
 /// `rig` is the bench, the built-in one without. `weights` are "standard", "small", "fast" or a file that the trainer
 /// exported; without, those that the rig names. `width_px` and `height_px` are the size of the pictures, which are
-/// centred on the panel; without, the panel's. `backend` is "auto" (a GPU where there is one that will do, else the
-/// processor), "cpu" or "gpu".
+/// centred on the panel; without, the panel's. `backend` is "auto" (a GPU where there is one that will do, in half
+/// precision if it multiplies matrices so, else the processor), "cpu", "gpu" (in single precision) or "gpu-half".
 ///
 /// Making one takes seconds and much memory: keep it and render with it again and again. Several threads may use one;
 /// they take turns.

@@ -51,6 +51,19 @@ pub struct Played {
     pub comparison: Comparison,
 }
 
+/// The backend that computes as the engine of that description did, or `Auto` where it was a GPU and there is none.
+fn like(engine: &str, there_is_a_gpu: impl FnOnce() -> bool) -> Backend {
+    if engine.starts_with("cpu") {
+        Backend::Cpu
+    } else if !there_is_a_gpu() {
+        Backend::Auto
+    } else if engine.contains("half precision") {
+        Backend::GpuHalf
+    } else {
+        Backend::Gpu
+    }
+}
+
 /// Reads everything that the frames of a report need. `backend` is the engine that is wanted; `Auto` is that of the
 /// run.
 ///
@@ -84,9 +97,7 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
         )));
     }
     let backend = match backend {
-        Backend::Auto if facts.engine.starts_with("cpu") => Backend::Cpu,
-        Backend::Auto if facts.engine.contains("half precision") => Backend::GpuHalf,
-        Backend::Auto if facts.engine.contains("single precision") => Backend::Gpu,
+        Backend::Auto => like(&facts.engine, || holod_model::gpu::find().is_ok()),
         asked => asked,
     };
     if facts.holod != env!("HOLOD_VERSION") {
@@ -737,6 +748,15 @@ mod tests {
             comparison.field(&field(*frame, *shown)).unwrap();
         }
         comparison.finish("cpu, 2 threads")
+    }
+
+    #[test]
+    fn frames_are_made_again_as_they_were_made_where_that_can_be() {
+        let [with, without] = [true, false].map(|there| move |engine| like(engine, || there));
+        assert_eq!([with("cpu, avx2, 2 threads"), without("cpu, avx2, 2 threads")], [Backend::Cpu; 2]);
+        assert_eq!(with("gpu, X, single precision"), Backend::Gpu);
+        assert_eq!(with("gpu, X, matrix units, half precision"), Backend::GpuHalf);
+        assert_eq!(without("gpu, X, single precision"), Backend::Auto);
     }
 
     #[test]

@@ -45,7 +45,7 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
     let network = setup::load_weights(&rig);
     let mut checks = weights_checks(&rig, &network);
     let runs = checks.iter().all(|check| check.passed);
-    checks.extend(speed(&rig, network.as_ref().ok().filter(|_| runs), args.resolution));
+    checks.extend(speed(&rig, network.as_ref().ok().filter(|_| runs), (args.backend, args.resolution)));
     checks.push(tracker(&rig));
     let root = Path::new("/");
     checks.extend(access::access(&rig, args.service, root));
@@ -128,7 +128,7 @@ fn weights_checks(rig: &Rig, weights: &Result<Weights, Failure>) -> Vec<Check> {
 }
 
 /// Frames a second, estimated from a small frame: slow is no fault of the bench. A GPU that computes wrongly is one.
-fn speed(rig: &Rig, weights: Option<&Weights>, resolution: Option<Resolution>) -> Vec<Check> {
+fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, Option<Resolution>)) -> Vec<Check> {
     let panel = rig.resolution();
     let sizes = match resolution {
         Some(size) => vec![size],
@@ -136,11 +136,10 @@ fn speed(rig: &Rig, weights: Option<&Weights>, resolution: Option<Resolution>) -
     };
     let fits = |size: &Resolution| size.width <= panel.width && size.height <= panel.height;
     let sizes: Vec<Resolution> = sizes.into_iter().filter(fits).collect();
-    let estimate =
-        |weights| progress::during("estimating the frames a second", || Estimate::of(rig, weights, Backend::Auto));
+    let estimate = |weights| progress::during("estimating the frames a second", || Estimate::of(rig, weights, backend));
     let estimated = weights.map(estimate);
     let gpu = match &estimated {
-        Some(Ok(Estimate { apart: Some(apart), .. })) => Some(gpu(*apart)),
+        Some(Ok(Estimate { engine, apart: Some(apart), .. })) => Some(gpu(engine, *apart)),
         _ => None,
     };
     let (passed, says) = match (estimated, &sizes[..]) {
@@ -167,18 +166,20 @@ fn speed(rig: &Rig, weights: Option<&Weights>, resolution: Option<Resolution>) -
 }
 
 /// Whether a GPU computes what the processor does; of a share `apart` of the pixels it does not.
-fn gpu(apart: f64) -> Check {
-    let passed = apart <= speed::MOST_APART;
+fn gpu(engine: &str, apart: f64) -> Check {
+    let most = speed::most_apart(engine);
     let found = format!("at {:.2} % of the pixels more than 1/256 of a turn from the processor's", 1e2 * apart);
-    let says = match passed {
-        true => format!("the phases of a frame are {found}"),
-        false => format!(
-            "it computes wrongly: the phases of a frame are {found}; expected {:.1} % at most; try another version of its \
-             driver, and use --backend cpu until then",
-            1e2 * speed::MOST_APART
-        ),
+    let says = if apart <= most {
+        format!("the phases of a frame are {found}")
+    } else {
+        let other = if engine.contains("half precision") { "--backend gpu, or cpu" } else { "--backend cpu" };
+        let most_percent = 1e2 * most;
+        format!(
+            "it computes wrongly: the phases of a frame are {found}; expected {most_percent:.1} % at most; take {other}, or \
+             another version of its driver"
+        )
     };
-    Check { name: "gpu", passed, says }
+    Check { name: "gpu", passed: apart <= most, says }
 }
 
 fn tracker(rig: &Rig) -> Check {
@@ -229,5 +230,20 @@ fn present(path: &Path, otherwise: &str) -> (bool, String) {
         Ok(true) => (true, format!("{} is there", path.display())),
         Ok(false) => (false, format!("{} does not exist: {otherwise}", path.display())),
         Err(error) => (false, format!("{}: {error}: {otherwise}", path.display())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_gpu_that_computes_wrongly_is_told_with_what_to_take() {
+        let [single, half] = ["gpu, X, single precision", "gpu, X, matrix units, half precision"];
+        assert!(gpu(single, 0.0005).passed && gpu(half, 0.005).passed);
+        for (engine, cure) in [(single, "--backend cpu"), (half, "--backend gpu, or cpu")] {
+            let Check { passed, says, .. } = gpu(engine, 0.02);
+            assert!(!passed && says.contains("at 2.00 % of the pixels") && says.contains(cure), "{says}");
+        }
     }
 }

@@ -61,7 +61,8 @@ impl<T> ReadBack<T> {
 }
 
 impl GpuRenderer {
-    /// On the best device of the kind `adapters`, with features in `precision` where it has that, as [`GpuEngine::open`].
+    /// On the best device of the kind `adapters`, with features in `precision` where it has that, as
+    /// [`GpuEngine::open`].
     ///
     /// # Errors
     /// There is none, or it lacks what the network needs at the pattern's size.
@@ -137,8 +138,8 @@ fn described(engine: &GpuEngine, adapters: Adapters) -> String {
         Precision::Single => "single",
         Precision::Half => "half",
     };
-    let units = if engine.uses_matrix_units() { " by matrix units" } else { "" };
-    format!("gpu, {}, {precision} precision{units}{slow}", engine.device())
+    let units = if engine.uses_matrix_units() { ", matrix units" } else { "" };
+    format!("gpu, {}{units}, {precision} precision{slow}", engine.device())
 }
 
 impl Renderer for GpuRenderer {

@@ -31,11 +31,12 @@ const READ_BYTES: u64 = 64 << 20;
 const PATIENCE: Duration = Duration::from_secs(if cfg!(test) { 900 } else { 120 });
 
 impl Gpu {
-    /// Opens the best device: a card of its own before one that is a part of the processor.
+    /// Opens the best device: a card of its own before one that is a part of the processor. Its matrix units can be
+    /// used where that is asked for.
     ///
     /// # Errors
     /// There is none, or its driver refuses.
-    pub(crate) fn open(adapters: Adapters) -> Result<Self, GpuError> {
+    pub(crate) fn open(adapters: Adapters, with_matrices: bool) -> Result<Self, GpuError> {
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
             backends: wgpu::Backends::VULKAN,
             ..wgpu::InstanceDescriptor::new_without_display_handle()
@@ -60,9 +61,9 @@ impl Gpu {
         let name = adapter.get_info().name;
         let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         let half_precision = adapter.features() & wgpu::Features::SHADER_F16;
-        let (matrix_units, experimental_features) = match has_matrix_units(adapter) {
-            // SAFETY: no other experimental feature is asked for, and this one is used by this crate's own shaders alone,
-            // whose results are compared with the reference's on cards that have it.
+        let (matrix_units, experimental_features) = match with_matrices && has_matrix_units(adapter) {
+            // SAFETY: no other experimental feature is asked for, and this one is used by this crate's own shaders
+            // alone, whose results are compared with the reference's on cards that have it.
             true => (wgpu::Features::EXPERIMENTAL_COOPERATIVE_MATRIX, unsafe { wgpu::ExperimentalFeatures::enabled() }),
             false => (wgpu::Features::empty(), wgpu::ExperimentalFeatures::disabled()),
         };
@@ -297,7 +298,8 @@ pub(crate) mod tests {
     }
 
     pub(crate) fn test_gpu() -> Gpu {
-        Gpu::open(test_adapters()).expect("Mesa's software device; install mesa-vulkan-drivers")
+        let adapters = test_adapters();
+        Gpu::open(adapters, true).unwrap_or_else(|error| panic!("{adapters:?} for tests: {error}"))
     }
 
     #[test]

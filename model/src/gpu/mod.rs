@@ -30,6 +30,7 @@ pub enum Precision {
 }
 
 /// What multiplies matrices of 16 by 16 numbers of half precision, and sums up in single precision.
+#[cfg(feature = "gpu")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum MatrixUnits {
     /// The device's own, which a subgroup of 32 threads drives (Vulkan's cooperative matrices).
@@ -37,6 +38,17 @@ pub(crate) enum MatrixUnits {
     /// A workgroup of 32 threads that multiplies as they do: for tests, since software devices have none.
     #[cfg(test)]
     Threads,
+}
+
+/// The name of the graphics processor that an engine would take.
+///
+/// # Errors
+/// There is none that can be opened.
+pub fn find() -> Result<String, GpuError> {
+    #[cfg(feature = "gpu")]
+    return Gpu::open(Adapters::Hardware, false).map(|gpu| gpu.name().to_owned());
+    #[cfg(not(feature = "gpu"))]
+    Err(GpuError::NotBuilt)
 }
 
 thread_local! {

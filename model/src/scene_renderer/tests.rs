@@ -646,7 +646,7 @@ fn a_folder_that_cannot_be_made_is_named() {
     assert!(error.to_string().contains("--out"), "{error}");
 }
 
-/// On Mesa's software device.
+/// On the device that tests run on.
 #[cfg(feature = "gpu")]
 mod on_a_gpu {
     use super::*;
@@ -663,10 +663,6 @@ mod on_a_gpu {
     fn agree(cpu: &[f32], gpu: &[f32]) -> bool {
         let (db, far) = apart(cpu, gpu);
         cpu.len() == gpu.len() && db < -70.0 && far < 1e-3
-    }
-
-    fn device() -> Gpu {
-        test_gpu()
     }
 
     fn tracer(gpu: Gpu) -> Tracer {
@@ -694,7 +690,7 @@ mod on_a_gpu {
 
     #[test]
     fn scenes_of_every_kind_are_those_of_the_cpu() {
-        let gpu = tracer(device());
+        let gpu = tracer(test_gpu());
         let focus = [0.0, 0.7, 1.9, 2.857].map(Dioptres);
         let pupils = [mm(4.7), mm(1.2), mm(2.5)];
         for (kind, index) in [(SceneKind::Train, 0), (SceneKind::Train, 5), (SceneKind::Test, 3), (SceneKind::Cards, 1)]
@@ -715,14 +711,14 @@ mod on_a_gpu {
         let card = |depth| Surface::bake(facing(depth), bounds, |x, y| Some([0.5 + 0.02 * x, 0.5 + 0.02 * y, 0.7]));
         let scene = Scene { resolution: size, ..scene(vec![card(0.4)]) };
         let focus = [0.0, 0.4, 0.9, 1.4, 2.0].map(Dioptres);
-        let mut gpu = device();
+        let mut gpu = test_gpu();
         // Sums of three planes and the other two; three views for the narrow pupil and two for the wide one, and a
         // rest.
         gpu.largest_buffer = 153_000;
         let tracer_of_parts = tracer(gpu);
         assert_agree("in parts", &both(&tracer_of_parts, &scene, &[mm(1.0), mm(2.0)], &focus, 17));
 
-        let mut gpu = device();
+        let mut gpu = test_gpu();
         gpu.largest_buffer = 8 * 6399;
         let refused = scene.traced_focal_stacks(&tracer(gpu), &[mm(1.0)], &focus, 4).err();
         let textures = "the scene's textures";
@@ -734,7 +730,7 @@ mod on_a_gpu {
 
     #[test]
     fn solids_of_triangles_are_those_of_the_cpu() {
-        let gpu = tracer(device());
+        let gpu = tracer(test_gpu());
         let mut random = random::Random::new(17, 0);
         for round in 0..6 {
             let solids = (0..3).map(|n| {

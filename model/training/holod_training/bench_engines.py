@@ -211,6 +211,8 @@ def run_holod(plan: Plan, threads: int) -> HolodTimes:
     if done.returncode != 0:
         raise BenchError(f"{shlex.join(command)}: exit code {done.returncode}: {done.stderr.strip()[-500:]}")
     times = parse_holod(done.stdout)
+    if plan.device.type != "cpu" and not times.renderer.startswith("gpu"):
+        raise BenchError(f"{plan.holod}: found {times.renderer}, expected a GPU; install its driver, or --device cpu")
     if times.threads not in (None, threads):
         raise BenchError(f"{plan.holod}: computes on {times.threads} threads, expected {threads}: name --threads")
     return times

@@ -1,8 +1,8 @@
 //! 3x3 convolutions on the GPU, as sums over taps.
 //!
-//! Layers that read matrices multiply these, in half precision, and sum up in single precision. Of the others those that
-//! write a map of half precision multiply in half precision, two products at once, and sum up what each group of input
-//! channels gives in single precision; the rest multiply in single precision, whatever they read.
+//! Layers that read matrices multiply these, in half precision, and sum up in single precision. Of the others those
+//! that write a map of half precision multiply in half precision, two products at once, and sum up what each group of
+//! input channels gives in single precision; the rest multiply in single precision, whatever they read.
 
 use half::f16;
 
@@ -147,7 +147,9 @@ impl Packing {
     /// Numbers in the buffer.
     pub(crate) fn len(&self) -> usize {
         match self.layout {
-            Layout::Groups { input_groups, parts, .. } => self.biases() + parts * input_groups * self.group_len(),
+            Layout::Groups { input_groups, parts, part_groups } => {
+                self.biases(parts * part_groups) + parts * input_groups * self.group_len(part_groups)
+            }
             Layout::Tiles { packing, .. } => packing.len(),
         }
     }
@@ -159,30 +161,24 @@ impl Packing {
         }
     }
 
-    /// Groups of outputs of a part.
-    fn part_groups(&self) -> usize {
-        match self.layout {
-            Layout::Groups { part_groups, .. } => part_groups,
-            Layout::Tiles { packing, .. } => packing.biases() / packing.parts / GROUP,
-        }
+    /// Biases of so many groups of outputs, filled up to whole elements.
+    fn biases(&self, groups: usize) -> usize {
+        groups.next_multiple_of(self.precision.element_vectors()) * GROUP
     }
 
-    fn biases(&self) -> usize {
-        (self.parts() * self.part_groups()).next_multiple_of(self.precision.element_vectors()) * GROUP
-    }
-
-    /// Weights of one part for one group of inputs.
-    fn group_len(&self) -> usize {
-        (TAPS * GROUP * self.part_groups()).next_multiple_of(self.precision.element_vectors()) * GROUP
+    /// Weights of one part of `part_groups` for one group of inputs.
+    fn group_len(&self, part_groups: usize) -> usize {
+        (TAPS * GROUP * part_groups).next_multiple_of(self.precision.element_vectors()) * GROUP
     }
 
     /// The place of the weight by which `input`, a channel of the map, is multiplied at `tap` for `output`.
     fn place(&self, output: usize, input: usize, tap: usize) -> usize {
         match self.layout {
-            Layout::Groups { input_groups, part_groups, .. } => {
+            Layout::Groups { input_groups, parts, part_groups } => {
                 let (group, lane) = (output / GROUP, output % GROUP);
                 let (part, group) = (group / part_groups, group % part_groups);
-                let first = self.biases() + (part * input_groups + input / GROUP) * self.group_len();
+                let before = (part * input_groups + input / GROUP) * self.group_len(part_groups);
+                let first = self.biases(parts * part_groups) + before;
                 let channel = (tap % 3 * 3 + tap / 3) * GROUP + input % GROUP;
                 first + (channel * part_groups + group) * GROUP + lane
             }
@@ -238,28 +234,30 @@ pub(crate) fn convolve(
         Format::Single | Format::Half => Packing::new(precision, input_groups, output.groups),
     };
     let parameters = packing.precision.table(plan, "a convolution's parameters", &packing.pack(layer));
-    let (rows, columns) = match input.format {
-        Format::HalfTiles(units) => (matrix::rows(units), TILE),
-        Format::Single | Format::Half => (ROWS, WORKGROUP),
-    };
-    let mut constants = vec![
-        ("WORKGROUP", WORKGROUP.into()),
-        ("ROWS", rows.into()),
-        ("INPUT_GROUPS", input_groups.into()),
-        ("INPUT_BLOCKS", input_blocks.into()),
-        ("PARTS", packing.parts().into()),
-        ("PART_GROUPS", packing.part_groups().into()),
-    ];
-    constants.extend(layer.epilogue_constants(output));
-    constants.push(input.block("IN_BLOCK"));
+    let mut constants = layer.epilogue_constants(output);
+    constants.push(("PARTS", packing.parts().into()));
     constants.extend(input.constants(["IN_GROUPS", "IN_PITCH"]));
-    let source = match (input.format, precision) {
+    let (source, rows, columns) = match (input.format, packing.layout) {
         (Format::HalfTiles(units), _) => {
-            matrix::source(output, units, "input", rows, &[include_str!("conv_matrix.wgsl")])
+            let rows = matrix::rows(units);
+            constants.extend([("INPUT_BLOCKS", input_blocks.into()), input.block("IN_BLOCK")]);
+            (matrix::source(output, units, "input", rows, &[include_str!("conv_matrix.wgsl")]), rows, TILE)
         }
-        (_, Precision::Single) => layer.source(input, output, include_str!("conv.wgsl")),
-        (_, Precision::Half) => layer.source(input, output, include_str!("conv_f16.wgsl")),
+        (_, Layout::Groups { part_groups, .. }) => {
+            constants.extend([
+                ("WORKGROUP", WORKGROUP.into()),
+                ("INPUT_GROUPS", input_groups.into()),
+                ("PART_GROUPS", part_groups.into()),
+            ]);
+            let text = match precision {
+                Precision::Single => include_str!("conv.wgsl"),
+                Precision::Half => include_str!("conv_f16.wgsl"),
+            };
+            (layer.source(input, output, text), ROWS, WORKGROUP)
+        }
+        (_, Layout::Tiles { .. }) => unreachable!("only maps of tiles have such parameters"),
     };
+    constants.push(("ROWS", rows.into()));
     let shader = Shader::new(label, &constants, &source, "convolve");
     let workgroups = [output.width.div_ceil(columns) * packing.parts(), output.height.div_ceil(rows), 1];
     let stage = plan.stages.last_mut().expect("a stage was added for the layer");

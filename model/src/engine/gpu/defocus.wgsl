@@ -159,9 +159,8 @@ fn seen_spectrum(focus_pair: u32, rows: u32, item: u32) -> vec2f {
 }
 
 // Rows of what is seen at the foci 4·b - 2 to 4·b + 1 of workgroup b along y: to the stack, and to the twelve channels
-// from
-// 12·b + 16 on of the map. The first workgroup has only the last two foci, whose channels share a group with blur and
-// diffraction.
+// from 12·b + 16 on of the map. The first workgroup has only the last two foci, whose channels share a group with blur
+// and diffraction.
 @compute @workgroup_size(THREADS)
 fn see(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) index: u32) {
     thread = index;

@@ -1,8 +1,8 @@
 //! Deformable 3x3 convolutions on the GPU: every tap of every pixel is read at a place of its own.
 //!
-//! Layers that read matrices interpolate in half precision and multiply matrices. Of the others those that write a map of
-//! half precision interpolate and multiply in half precision, two products at once, and sum up what each tap gives in
-//! single precision.
+//! Layers that read matrices interpolate in half precision and multiply matrices. Of the others those that write a map
+//! of half precision interpolate and multiply in half precision, two products at once, and sum up what each tap gives
+//! in single precision.
 
 use super::conv::{ConvLayer, TAPS};
 use super::map::{Format, GROUP, Map, TILE};
@@ -14,7 +14,7 @@ use crate::weights::OFFSET_CHANNELS;
 /// Threads of a workgroup, along x.
 const WORKGROUP: usize = 64;
 /// Rows that one thread makes.
-const PIXELS: usize = 2;
+const ROWS: usize = 2;
 /// Groups of output channels that a thread holds sums of, at most. With all of them in one thread no place is read
 /// twice.
 const MOST_PART_GROUPS: usize = 8;
@@ -28,47 +28,41 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
     assert!(offsets.groups >= OFFSET_CHANNELS.div_ceil(GROUP) && offsets.buffer != output.buffer);
     assert_eq!(offsets.format, Format::Single);
 
-    let input_blocks = input.groups.div_ceil(TILE / GROUP);
-    let precision = output.format.precision();
-    let (parts, part_groups) = match input.format {
-        Format::HalfTiles(_) => (TilePacking::new(output.groups, TAPS * input_blocks).parts, 0),
-        Format::Single | Format::Half => {
-            let parts = output.groups.div_ceil(MOST_PART_GROUPS);
-            (parts, output.groups.div_ceil(parts))
-        }
-    };
-    let mut constants = vec![
-        ("WORKGROUP", WORKGROUP.into()),
-        ("PIXELS", PIXELS.into()),
-        ("ROWS", PIXELS.into()),
-        ("INPUT_GROUPS", input.groups.into()),
-        ("INPUT_BLOCKS", input_blocks.into()),
-        ("PARTS", parts.into()),
-        ("PART_GROUPS", part_groups.into()),
-    ];
-    constants.extend(layer.epilogue_constants(output));
-    constants.push(input.block("IN_BLOCK"));
+    let mut constants = layer.epilogue_constants(output);
+    constants.extend([("ROWS", ROWS.into()), input.block("IN_BLOCK")]);
     constants.extend(input.constants(["IN_GROUPS", "IN_PITCH"]));
     constants.extend(offsets.constants(["OFFSET_GROUPS", "OFFSET_PITCH"]));
     let places = include_str!("deformable_places.wgsl");
-    let of_vectors = |text| layer.source(input, output, &[places, text].concat());
-    let (source, values, precision, columns) = match (input.format, precision) {
-        (Format::HalfTiles(units), _) => {
+    let (source, values, precision, parts, columns) = match input.format {
+        Format::HalfTiles(units) => {
+            let input_blocks = input.groups * GROUP / TILE;
+            let packing = TilePacking::new(output.groups, TAPS * input_blocks);
+            constants.push(("INPUT_BLOCKS", input_blocks.into()));
             let files = [places, include_str!("deformable_matrix.wgsl")];
-            let source = matrix::source(output, units, "gathered", PIXELS, &files);
-            (source, pack_tiles(layer, input_blocks, output.groups), Precision::Half, TILE)
+            let source = matrix::source(output, units, "gathered", ROWS, &files);
+            (source, pack_tiles(layer, input_blocks, packing), Precision::Half, packing.parts, TILE)
         }
-        (_, precision) => {
+        Format::Single | Format::Half => {
+            let precision = output.format.precision();
+            let parts = output.groups.div_ceil(MOST_PART_GROUPS);
+            let part_groups = output.groups.div_ceil(parts);
+            constants.extend([
+                ("WORKGROUP", WORKGROUP.into()),
+                ("INPUT_GROUPS", input.groups.into()),
+                ("PART_GROUPS", part_groups.into()),
+            ]);
             let text = match precision {
                 Precision::Single => include_str!("deformable.wgsl"),
                 Precision::Half => include_str!("deformable_f16.wgsl"),
             };
-            (of_vectors(text), pack(layer, precision, input.groups, [parts, part_groups]), precision, WORKGROUP)
+            let source = layer.source(input, output, &[places, text].concat());
+            (source, pack(layer, precision, input.groups, [parts, part_groups]), precision, parts, WORKGROUP)
         }
     };
+    constants.push(("PARTS", parts.into()));
     let parameters = precision.table(plan, "a deformable convolution's parameters", &values);
     let shader = Shader::new(label, &constants, &source, "convolve");
-    let workgroups = [output.width.div_ceil(columns) * parts, output.height.div_ceil(PIXELS), 1];
+    let workgroups = [output.width.div_ceil(columns) * parts, output.height.div_ceil(ROWS), 1];
     let stage = plan.stages.last_mut().expect("a stage was added for the layer");
     let dispatch = stage.dispatch(shader, &[input.buffer, offsets.buffer, parameters, output.buffer], workgroups);
     let parameter_bytes = (values.len() * precision.bytes()) as u64;
@@ -76,8 +70,7 @@ pub(crate) fn convolve(plan: &mut Plan, label: &str, layer: &ConvLayer, input: &
 }
 
 /// The parameters of `layer` as the shader that multiplies matrices has them.
-fn pack_tiles(layer: &ConvLayer, input_blocks: usize, output_groups: usize) -> Vec<f32> {
-    let packing = TilePacking::new(output_groups, TAPS * input_blocks);
+fn pack_tiles(layer: &ConvLayer, input_blocks: usize, packing: TilePacking) -> Vec<f32> {
     let mut parameters = vec![0.0; packing.len()];
     for (output, bias) in layer.bias.iter().enumerate() {
         parameters[output] = *bias;

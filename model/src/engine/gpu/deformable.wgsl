@@ -1,7 +1,7 @@
 // A deformable 3x3 convolution of maps [row, group, column, 4]: every tap of every pixel is read at a place of its own;
 // twin of ../cpu/deformable.rs.
 //
-// A thread makes PIXELS rows of one column by PART_GROUPS groups of output channels, which it holds in registers.
+// A thread makes ROWS rows of one column by PART_GROUPS groups of output channels, which it holds in registers.
 
 @group(0) @binding(0) var<storage, read> input: array<InVector>;
 // The bias of each group of outputs, filled up to whole elements, then the weights: [part, tap, input group, input
@@ -13,27 +13,27 @@
 fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) lane: u32) {
     let part = workgroup.x % PARTS;
     let x = workgroup.x / PARTS * WORKGROUP + lane;
-    let y = workgroup.y * PIXELS;
+    let y = workgroup.y * ROWS;
 
-    var sums: array<array<vec4f, PART_GROUPS>, PIXELS>;
+    var sums: array<array<vec4f, PART_GROUPS>, ROWS>;
     for (var group = 0u; group < PART_GROUPS; group++) {
         let place = part * PART_GROUPS + group;
         let bias = parameters[place / 4u][place % 4u];
-        for (var pixel = 0u; pixel < PIXELS; pixel++) {
+        for (var pixel = 0u; pixel < ROWS; pixel++) {
             sums[pixel][group] = bias;
         }
     }
 
     var weight = (PARTS * PART_GROUPS + 3u) / 4u + part * 9u * INPUT_GROUPS * PART_GROUPS;
     for (var tap = 0u; tap < 9u; tap++) {
-        var places: array<Place, PIXELS>;
-        for (var pixel = 0u; pixel < PIXELS; pixel++) {
+        var places: array<Place, ROWS>;
+        for (var pixel = 0u; pixel < ROWS; pixel++) {
             // Threads beyond the last column read what that one reads.
             places[pixel] = place_of(tap, min(x, WIDTH - 1u), y + pixel);
         }
         for (var input_group = 0u; input_group < INPUT_GROUPS; input_group++) {
-            var values: array<vec4f, PIXELS>;
-            for (var pixel = 0u; pixel < PIXELS; pixel++) {
+            var values: array<vec4f, ROWS>;
+            for (var pixel = 0u; pixel < ROWS; pixel++) {
                 let corner = places[pixel].corner + input_group * IN_PITCH;
                 let below = corner + IN_GROUPS * IN_PITCH;
                 let shares = places[pixel].shares;
@@ -46,7 +46,7 @@ fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_i
                 for (var group = 0u; group < PART_GROUPS; group++) {
                     let place = channel * PART_GROUPS + group;
                     let factors = parameters[weight + place / 4u][place % 4u];
-                    for (var pixel = 0u; pixel < PIXELS; pixel++) {
+                    for (var pixel = 0u; pixel < ROWS; pixel++) {
                         sums[pixel][group] = fma(vec4f(values[pixel][channel]), factors, sums[pixel][group]);
                     }
                 }
@@ -56,7 +56,7 @@ fn convolve(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_i
     }
 
     if x < WIDTH {
-        for (var pixel = 0u; pixel < PIXELS; pixel++) {
+        for (var pixel = 0u; pixel < ROWS; pixel++) {
             for (var group = 0u; group < PART_GROUPS; group++) {
                 store(sums[pixel][group], part * PART_GROUPS + group, x, y + pixel);
             }

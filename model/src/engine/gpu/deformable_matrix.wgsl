@@ -1,5 +1,5 @@
-// As deformable.wgsl, by products of matrices: what 16 pixels of a row read at one tap, by 16 input channels, with these
-// by 16 output channels.
+// As deformable.wgsl, by products of matrices: what 16 pixels of a row read at one tap, by 16 input channels, with
+// these by 16 output channels.
 //
 // A workgroup makes ROWS rows of 16 columns by two blocks of output channels, whose sums it holds in registers. Lines
 // that begin with `each` stand for themselves with all values of the names that follow.

@@ -1,4 +1,5 @@
-//! The light of the depth layers, and how it goes to the SLM plane, for `depth_layers.wgsl`.
+//! The light of the depth layers, and how it goes to the SLM plane, for `light_of_layers.wgsl` and
+//! `depth_layers.wgsl`.
 
 use std::sync::Arc;
 
@@ -29,7 +30,7 @@ pub(super) struct DepthLayers {
     pub(super) carried_spectrum: BufferId,
     /// [3, height, width]: what is at the SLM plane.
     pub(super) carried: BufferId,
-    /// Of the grid, the optics and the first net's output.
+    /// Of the grid and the optics.
     constants: Vec<(&'static str, Constant)>,
 }
 

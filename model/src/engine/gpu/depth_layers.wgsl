@@ -3,8 +3,6 @@
 // Before this file: fft.wgsl, pupil.wgsl and the constants of depth_layers.rs. What lights the layers is in
 // light_of_layers.wgsl.
 
-const PIXELS = WIDTH * HEIGHT;
-
 @group(0) @binding(3) var<storage, read_write> spectra: array<vec2f>; // [layers, 3, height, width]
 // [3, height, width]: transfer functions from one layer to the next nearer one, and from the nearest to the SLM plane,
 // the latter over the number of samples.

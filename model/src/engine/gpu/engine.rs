@@ -60,8 +60,9 @@ const TIMESTAMP_BYTES: u64 = 8;
 
 impl GpuEngine {
     /// An engine for frames of the pattern's size of `tables`, which may be odd, on the optics of `bench`, whose own
-    /// resolution does not matter. Features are in `precision` where the device has it; where that is left to the device,
-    /// in half precision if it multiplies matrices so, since it sums up in single, and else in single precision.
+    /// resolution does not matter. Features are in `precision` where the device has it; where that is left to the
+    /// device, in half precision if it multiplies matrices so, since it sums up in single, and else in single
+    /// precision.
     ///
     /// # Errors
     /// There is no device, it lacks what the network needs at this size, or the size is nothing.
@@ -72,8 +73,17 @@ impl GpuEngine {
         adapters: Adapters,
         precision: Option<Precision>,
     ) -> Result<Self, EngineError> {
-        let gpu = Gpu::open(adapters)?;
-        Self::on(gpu, weights, bench, tables, precision)
+        let with_matrices = precision != Some(Precision::Single);
+        let opened = Gpu::open(adapters, with_matrices)
+            .map_err(EngineError::from)
+            .and_then(|gpu| Self::on(gpu, weights, bench, tables, precision));
+        match opened {
+            // A driver may offer matrices and refuse their shaders.
+            Err(EngineError::Gpu(GpuError::Refused { .. } | GpuError::Failed { .. })) if precision.is_none() => {
+                Self::on(Gpu::open(adapters, false)?, weights, bench, tables, Some(Precision::Single))
+            }
+            opened => opened,
+        }
     }
 
     pub(super) fn on(

@@ -1,4 +1,5 @@
-// What one thread does with matrices of sums in `finished`, of which it has one pixel and eight channels, from `group` on.
+// What one thread does with matrices of sums in `finished`, of which it has one pixel and eight channels, from `group`
+// on.
 
 // Of matrix `matrix`.
 fn finish(matrix: u32, skip: Skipped, group: u32, x: u32, y: u32) {

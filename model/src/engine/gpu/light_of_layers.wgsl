@@ -1,8 +1,8 @@
-// The light that the depth layers send out. Before this file: fft.wgsl, phase_math.wgsl, the constants of depth_layers.rs
-// and what the map of the first net's outputs declares as `output`.
+// The light that the depth layers send out. Before this file: fft.wgsl, phase_math.wgsl, the constants of
+// depth_layers.rs and what the map of the first net's outputs declares as `output`, in single precision.
 
 // The first net's: for each layer a group of three phases over π and a mask, then the changes of the amplitudes.
-@group(0) @binding(1) var<storage, read> outputs: array<vec4f>;
+@group(0) @binding(1) var<storage, read> outputs: array<output_vector>;
 // [layers, 3, height, width]: the amplitudes that an eye should see, which are refined here.
 @group(0) @binding(2) var<storage, read_write> stack: array<f32>;
 @group(0) @binding(3) var<storage, read_write> spectra: array<vec2f>; // [layers, 3, height, width]

@@ -17,8 +17,8 @@ pub(crate) enum Format {
     Single,
     /// The same in half precision.
     Half,
-    /// [row, block of 16 channels, column, 16] in half precision, so that 16 neighbouring pixels of a block are a matrix.
-    /// The layers that read such a map multiply on these units.
+    /// [row, block of 16 channels, column, 16] in half precision, so that 16 neighbouring pixels of a block are a
+    /// matrix. The layers that read such a map multiply on these units.
     HalfTiles(MatrixUnits),
 }
 
@@ -50,8 +50,8 @@ impl Format {
     }
 }
 
-/// A feature map with a border of zeros, one pixel wide, and below and beside it as much as fills the last matrix or the
-/// last [`ROWS`]. Nothing but zeros is ever written there.
+/// A feature map with a border of zeros, one pixel wide, and below and beside it as much as fills the last matrix or
+/// the last [`ROWS`]. Nothing but zeros is ever written there.
 ///
 /// Channels are padded to whole blocks; what is read of the padding is multiplied by zero, so it has to be finite.
 #[derive(Clone, Copy, Debug)]
@@ -105,8 +105,8 @@ impl Map {
         }
     }
 
-    /// WGSL for a shader that writes or reads groups of this map: the type `{name}_vector` of its buffer's elements, and
-    /// `{name}_place`, where the buffer has a group of a pixel.
+    /// WGSL for a shader that writes or reads groups of this map: the type `{name}_vector` of its buffer's elements,
+    /// and `{name}_place`, where the buffer has a group of a pixel.
     pub(crate) fn declaration(&self, name: &str) -> String {
         let directive = if self.format.precision() == Precision::Half { ENABLE_F16 } else { "" };
         let (vector, groups) = (self.format.precision().vector(), self.groups);

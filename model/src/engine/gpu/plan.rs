@@ -57,8 +57,8 @@ pub(crate) struct Shader {
 }
 
 impl Shader {
-    /// The entry point `entry` of `source` after the constants that `source` uses without declaring them. The lines with
-    /// which `source` enables extensions come before these.
+    /// The entry point `entry` of `source` after the constants that `source` uses without declaring them. The lines
+    /// with which `source` enables extensions come before these.
     pub(crate) fn new(
         label: impl Into<String>,
         constants: &[(&str, Constant)],

@@ -350,13 +350,18 @@ fn assert_near_single(half: &mut GpuEngine, weights: &Weights, bench: &DisplayGe
 #[test]
 fn a_whole_network_of_matrices_is_near_the_same_in_single_precision() {
     let frame = Arc::new(frame(Resolution { width: 50, height: 34 }, 4));
-    let (weights, bench) = (Weights::builtin_fast(), DisplayGeometry::DEFAULT);
+    let weights = Weights::builtin_fast();
+    let mut matrices = of_matrices(&weights, frame.resolution);
+    assert!(matrices.uses_matrix_units(), "it is left to the device");
+    assert_near_single(&mut matrices, &weights, &DisplayGeometry::DEFAULT, &frame);
+}
+
+/// An engine on the default bench that multiplies matrices.
+fn of_matrices(weights: &Weights, resolution: Resolution) -> GpuEngine {
     let mut gpu = test_gpu();
     gpu.matrix_units.get_or_insert(MatrixUnits::Threads);
-    let tables = linear_tables(frame.resolution);
-    let mut matrices = GpuEngine::on(gpu, &weights, &bench, &tables, None).expect("an engine");
-    assert!(matrices.uses_matrix_units(), "it is left to the device");
-    assert_near_single(&mut matrices, &weights, &bench, &frame);
+    let tables = linear_tables(resolution);
+    GpuEngine::on(gpu, weights, &DisplayGeometry::DEFAULT, &tables, None).expect("an engine")
 }
 
 /// No software device has matrix units: what a card with them would compile is looked at here.
@@ -446,8 +451,13 @@ fn of_pupils_beyond_the_trained_ones_the_nearest_is_told_and_a_frame_is_the_same
 fn what_is_no_number_leaves_no_trace_in_the_next_frame() {
     let resolution = Resolution { width: 31, height: 18 };
     let direct = random_weights(NetworkConfig { channels: 8, ..weights_tests::config() }, 2);
-    for weights in [direct, Weights::builtin_small()] {
-        let mut engine = engine(&weights, &DisplayGeometry::DEFAULT, resolution);
+    let on_default = |weights: &Weights| engine(weights, &DisplayGeometry::DEFAULT, resolution);
+    for mut engine in [
+        on_default(&direct),
+        on_default(&Weights::builtin_small()),
+        of_matrices(&direct, resolution),
+        of_matrices(&Weights::builtin_fast(), resolution),
+    ] {
         let given = |spoil: &dyn Fn(&mut RgbdFrame)| {
             let mut frame = frame(resolution, 4);
             spoil(&mut frame);

@@ -95,7 +95,7 @@ pub(super) fn run(
             modulation: Modulation::new(adjustable, leaky_slope),
             inputs: channels.to_vec(),
             parameters: vec![0.0; packing.len()],
-            half: vec![0; packing.len()],
+            half: vec![0; if packing.precision == Precision::Half { packing.len() } else { 0 }],
             packing,
             buffer,
         });
