@@ -24,8 +24,8 @@ def average(parts: list[tuple[Path, float]], out: Path) -> Path:
         raise WeightsError(f"found {len(parts)} file(s) to take the mean of, expected at least two")
     total = sum(share for _, share in parts)
     if not all(share > 0 for _, share in parts) or abs(total - 1) > SUM_TOLERANCE:
-        shares = ", ".join(f"{share:g}" for _, share in parts)
-        raise WeightsError(f"found shares of {shares}, expected numbers above 0 that sum to 1")
+        found_shares = ", ".join(f"{share:g}" for _, share in parts)
+        raise WeightsError(f"found shares of {found_shares}, expected numbers above 0 that sum to 1")
     first = parts[0][0]
     mean = load_weights(first)
     networks = [load_weights(path) for path, _ in parts]

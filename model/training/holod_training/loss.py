@@ -127,7 +127,7 @@ def dark_area(target: Tensor) -> Tensor:
 def light_loss(picture: Tensor, target: Tensor) -> Tensor:
     """Mean of |light − wanted light| / (wanted light + that of 1.25 white pixels) of windows of [K, 3, H, W], 16 and 64
     px wide, half a window apart; the wider ones are left out where a picture is smaller."""
-    errors = []
+    errors: list[Tensor] = []
     for window in LIGHT_WINDOWS_PX:
         if errors and min(picture.shape[-2:]) < window:
             break

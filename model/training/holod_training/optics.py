@@ -5,6 +5,7 @@ FFTs here are circular; a border is left out of losses and metrics instead of pa
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
@@ -278,7 +279,8 @@ def _binomial(value: Tensor) -> Tensor:
         at = torch.arange(-2, size + 2, device=value.device).abs()
         at = torch.where(at < size, at, 2 * (size - 1) - at).clamp(0, size - 1)
         mirrored = value.index_select(dim, at)
-        value = sum(tap * mirrored.narrow(dim, k, size) for k, tap in enumerate((0.0625, 0.25, 0.375, 0.25, 0.0625)))
+        taps = enumerate((0.0625, 0.25, 0.375, 0.25, 0.0625))
+        value = functools.reduce(torch.add, (tap * mirrored.narrow(dim, k, size) for k, tap in taps))
     return value
 
 

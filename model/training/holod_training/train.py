@@ -211,7 +211,8 @@ class Run:
     def _seen(self, field_: Tensor, stack: Stack) -> Tensor:
         """What the loss is of: pictures of the field, or of what a panel shows of it."""
         if self.config.double_phase:
-            field_ = shown_by_panel(field_, self.config.double_phase, stack.depth.shape)
+            height, width = stack.depth.shape
+            field_ = shown_by_panel(field_, self.config.double_phase, (height, width))
         return see(field_, stack)
 
     def _taught(self, stacks: list[Stack]) -> list[Tensor] | None:
