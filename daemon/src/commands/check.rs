@@ -168,14 +168,14 @@ fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, 
 /// Whether a GPU computes what the processor does; of a share `apart` of the pixels it does not.
 fn gpu(engine: &str, apart: f64) -> Check {
     let most = speed::most_apart(engine);
-    let found = format!("at {:.2} % of the pixels more than 1/256 of a turn from the processor's", 1e2 * apart);
+    let found = format!("{:.2} % of a frame's phases are more than 1/256 of a turn from the processor's", 1e2 * apart);
     let says = if apart <= most {
-        format!("the phases of a frame are {found}")
+        found
     } else {
         let other = if engine.contains("half precision") { "--backend gpu, or cpu" } else { "--backend cpu" };
         let most_percent = 1e2 * most;
         format!(
-            "it computes wrongly: the phases of a frame are {found}; expected {most_percent:.1} % at most; take {other}, or \
+            "it computes wrongly: {found}; expected {most_percent:.1} % at most; take {other}, or \
              another version of its driver"
         )
     };
@@ -243,7 +243,7 @@ mod tests {
         assert!(gpu(single, 0.0005).passed && gpu(half, 0.005).passed);
         for (engine, cure) in [(single, "--backend cpu"), (half, "--backend gpu, or cpu")] {
             let Check { passed, says, .. } = gpu(engine, 0.02);
-            assert!(!passed && says.contains("at 2.00 % of the pixels") && says.contains(cure), "{says}");
+            assert!(!passed && says.contains("2.00 % of a frame's phases") && says.contains(cure), "{says}");
         }
     }
 }
