@@ -139,7 +139,8 @@ fn described(engine: &GpuEngine, adapters: Adapters) -> String {
         Precision::Half => "half",
     };
     let units = if engine.uses_matrix_units() { ", matrix units" } else { "" };
-    format!("gpu, {}{units}, {precision} precision{slow}", engine.device())
+    let why = engine.refused_matrices().map_or(String::new(), |why| format!(", as with matrix units {}", why.reason()));
+    format!("gpu, {}{units}, {precision} precision{slow}{why}", engine.device())
 }
 
 impl Renderer for GpuRenderer {

@@ -22,6 +22,8 @@ pub struct GpuEngine {
     network: NetworkPlan,
     loaded: LoadedPlan,
     precision: Precision,
+    /// Why it multiplies no matrices though that was tried.
+    refused_matrices: Option<GpuError>,
     timestamps: Option<Timestamps>,
     timings: StageTimings,
     readback: Readback,
@@ -73,17 +75,12 @@ impl GpuEngine {
         adapters: Adapters,
         precision: Option<Precision>,
     ) -> Result<Self, EngineError> {
-        let with_matrices = precision != Some(Precision::Single);
-        let opened = Gpu::open(adapters, with_matrices)
-            .map_err(EngineError::from)
-            .and_then(|gpu| Self::on(gpu, weights, bench, tables, precision));
-        match opened {
-            // A driver may offer matrices and refuse their shaders.
-            Err(EngineError::Gpu(GpuError::Refused { .. } | GpuError::Failed { .. })) if precision.is_none() => {
-                Self::on(Gpu::open(adapters, false)?, weights, bench, tables, Some(Precision::Single))
-            }
-            opened => opened,
+        let open = |with_matrices| Self::on(Gpu::open(adapters, with_matrices)?, weights, bench, tables, precision);
+        if precision.is_some() {
+            return open(precision == Some(Precision::Half));
         }
+        let (engine, refused_matrices) = without_matrices_if_need_be(open)?;
+        Ok(Self { refused_matrices, ..engine })
     }
 
     pub(super) fn on(
@@ -130,6 +127,7 @@ impl GpuEngine {
             network,
             loaded,
             precision,
+            refused_matrices: None,
             timestamps,
             uploaded: None,
             pupil: None,
@@ -149,6 +147,11 @@ impl GpuEngine {
     /// Whether layers multiply on units of the device that multiply matrices.
     pub fn uses_matrix_units(&self) -> bool {
         self.precision == Precision::Half && self.gpu.matrix_units.is_some()
+    }
+
+    /// Why it does without such units, where the device failed with them.
+    pub fn refused_matrices(&self) -> Option<&GpuError> {
+        self.refused_matrices.as_ref()
     }
 
     /// Writes the samples of the hologram of `frame` for an eye with `pupil` to `samples`, as the panel takes them.
@@ -299,6 +302,19 @@ impl GpuEngine {
     }
 }
 
+/// What `open` gives where it may use matrix units, or where the driver refuses that, without; and why. A driver may
+/// offer such units and refuse their shaders.
+fn without_matrices_if_need_be<T>(
+    open: impl Fn(bool) -> Result<T, EngineError>,
+) -> Result<(T, Option<GpuError>), EngineError> {
+    match open(true) {
+        Err(EngineError::Gpu(cause @ (GpuError::Refused { .. } | GpuError::Failed { .. }))) => {
+            open(false).map(|opened| (opened, Some(cause)))
+        }
+        opened => opened.map(|opened| (opened, None)),
+    }
+}
+
 impl Timestamps {
     fn new(gpu: &Gpu, stages: usize, tick_ns: f32) -> Result<Self, GpuError> {
         let count = 2 * stages as u32;
@@ -319,5 +335,26 @@ impl Timestamps {
             beginning_of_pass_write_index: Some(first),
             end_of_pass_write_index: Some(first + 1),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_device_that_fails_with_matrices_is_tried_without() {
+        let fault = |reason: &str| GpuError::Failed { name: "X".into(), reason: reason.into() };
+        let tried = |with: Result<&'static str, GpuError>, without: Result<&'static str, GpuError>| {
+            without_matrices_if_need_be(|matrices| {
+                if matrices { with.clone() } else { without.clone() }.map_err(Into::into)
+            })
+        };
+        assert_eq!(tried(Ok("with"), Ok("without")).ok(), Some(("with", None)));
+        assert_eq!(tried(Err(fault("a shader")), Ok("without")).ok(), Some(("without", Some(fault("a shader")))));
+        let both = tried(Err(fault("a shader")), Err(fault("all"))).err();
+        assert!(matches!(both, Some(EngineError::Gpu(error)) if error == fault("all")));
+        let too_large = GpuError::TooLarge { what: "a map", bytes: 2, name: "X".into(), limit: 1 };
+        assert!(tried(Err(too_large), Ok("without")).is_err());
     }
 }
