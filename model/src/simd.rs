@@ -36,14 +36,47 @@ pub(crate) trait Simd: Copy + Send + Sync {
     /// # Safety
     /// `to` points to `LANES` writable values.
     unsafe fn store(self, to: *mut f32, vector: Self::Vector);
+    /// The first `LANES` values.
+    #[inline(always)]
+    fn read(self, from: &[f32]) -> Self::Vector {
+        assert!(from.len() >= Self::LANES);
+        // SAFETY: so many are readable.
+        unsafe { self.load(from.as_ptr()) }
+    }
+    /// Writes the first `LANES` values.
+    #[inline(always)]
+    fn write(self, to: &mut [f32], vector: Self::Vector) {
+        assert!(to.len() >= Self::LANES);
+        // SAFETY: so many are writable.
+        unsafe { self.store(to.as_mut_ptr(), vector) }
+    }
     /// a·b + c
     fn mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
+    /// c − a·b
+    fn neg_mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector;
     fn add(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
     fn sub(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
     fn mul(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
+    fn div(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
+    fn sqrt(self, a: Self::Vector) -> Self::Vector;
+    /// The larger one, and `b` where either is no number.
     fn max(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
+    /// `value` where `a` and `b` are equal, else 0.
+    fn where_equal(self, a: Self::Vector, b: Self::Vector, value: Self::Vector) -> Self::Vector;
+    /// Lanes 0, 2, 4 and so on of `a`, then those of `b`; and the lanes between them.
+    fn unzip(self, a: Self::Vector, b: Self::Vector) -> [Self::Vector; 2];
     /// The sums of lanes 0 and 1, 2 and 3 and so on of `a`, then those of `b`.
-    fn add_pairs(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
+    #[inline(always)]
+    fn add_pairs(self, a: Self::Vector, b: Self::Vector) -> Self::Vector {
+        let [even, odd] = self.unzip(a, b);
+        self.add(even, odd)
+    }
+    /// Writes the transpose of a square of `LANES` by `LANES` values, whose rows begin `pitches[0]` values apart, to one
+    /// whose rows begin `pitches[1]` apart.
+    ///
+    /// # Safety
+    /// All of the first square is readable, and all of the second, which lies elsewhere, writable.
+    unsafe fn transpose(self, from: *const f32, to: *mut f32, pitches: [usize; 2]);
 
     /// Runs `task` with this set's instructions enabled.
     fn vectorise<T: Task>(self, task: T);
@@ -168,6 +201,11 @@ impl<const N: usize> Simd for Portable<N> {
     }
 
     #[inline(always)]
+    fn neg_mul_add(self, a: [f32; N], b: [f32; N], c: [f32; N]) -> [f32; N] {
+        self.mul_add(a.map(|value| -value), b, c)
+    }
+
+    #[inline(always)]
     fn add(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
         std::array::from_fn(|lane| a[lane] + b[lane])
     }
@@ -183,19 +221,41 @@ impl<const N: usize> Simd for Portable<N> {
     }
 
     #[inline(always)]
+    fn div(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
+        std::array::from_fn(|lane| a[lane] / b[lane])
+    }
+
+    #[inline(always)]
+    fn sqrt(self, a: [f32; N]) -> [f32; N] {
+        a.map(f32::sqrt)
+    }
+
+    #[inline(always)]
+    fn where_equal(self, a: [f32; N], b: [f32; N], value: [f32; N]) -> [f32; N] {
+        std::array::from_fn(|lane| if a[lane] == b[lane] { value[lane] } else { 0.0 })
+    }
+
+    #[inline(always)]
     fn max(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
         std::array::from_fn(|lane| if a[lane] > b[lane] { a[lane] } else { b[lane] })
     }
 
     #[inline(always)]
-    fn add_pairs(self, a: [f32; N], b: [f32; N]) -> [f32; N] {
-        std::array::from_fn(|lane| {
-            let (pairs, first) = if lane < N / 2 { (a, 2 * lane) } else { (b, 2 * lane - N) };
-            pairs[first] + pairs[first + 1]
-        })
+    fn unzip(self, a: [f32; N], b: [f32; N]) -> [[f32; N]; 2] {
+        let of = |odd: usize| {
+            std::array::from_fn(|lane| if lane < N / 2 { a[2 * lane + odd] } else { b[2 * lane - N + odd] })
+        };
+        [of(0), of(1)]
     }
 
     #[inline(always)]
+    unsafe fn transpose(self, from: *const f32, to: *mut f32, [from_pitch, to_pitch]: [usize; 2]) {
+        for (row, column) in (0..N).flat_map(|row| (0..N).map(move |column| (row, column))) {
+            // SAFETY: the caller promises N readable rows and N writable ones.
+            unsafe { *to.add(column * to_pitch + row) = *from.add(row * from_pitch + column) };
+        }
+    }
+
     fn vectorise<T: Task>(self, task: T) {
         task.run(self);
     }
@@ -205,9 +265,11 @@ impl<const N: usize> Simd for Portable<N> {
 macro_rules! x86_instruction_set {
     (
         $(#[$doc:meta])* $name:ident, $lanes:literal, $vector:ident, $features:literal, detect $($feature:tt),+;
-        $set1:ident, $loadu:ident, $storeu:ident, $fmadd:ident, $add:ident, $sub:ident, $mul:ident,
-        $max:ident;
-        $set1_pair:ident, $cast_pair:ident; add_pairs($a:ident, $b:ident) $add_pairs:expr
+        $set1:ident, $loadu:ident, $storeu:ident, $fmadd:ident, $fnmadd:ident, $add:ident, $sub:ident, $mul:ident,
+        $div:ident, $sqrt:ident, $max:ident;
+        where_equal($x:ident, $y:ident, $value:ident) $where_equal:expr;
+        $set1_pair:ident, $cast_pair:ident; unzip($a:ident, $b:ident) $unzip:expr;
+        transpose($rows:ident) $transpose:expr
     ) => {
         $(#[$doc])*
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -255,6 +317,11 @@ macro_rules! x86_instruction_set {
             }
 
             #[inline(always)]
+            fn neg_mul_add(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector {
+                unsafe { std::arch::x86_64::$fnmadd(a, b, c) }
+            }
+
+            #[inline(always)]
             fn add(self, a: Self::Vector, b: Self::Vector) -> Self::Vector {
                 unsafe { std::arch::x86_64::$add(a, b) }
             }
@@ -270,14 +337,41 @@ macro_rules! x86_instruction_set {
             }
 
             #[inline(always)]
+            fn div(self, a: Self::Vector, b: Self::Vector) -> Self::Vector {
+                unsafe { std::arch::x86_64::$div(a, b) }
+            }
+
+            #[inline(always)]
+            fn sqrt(self, a: Self::Vector) -> Self::Vector {
+                unsafe { std::arch::x86_64::$sqrt(a) }
+            }
+
+            #[inline(always)]
+            fn where_equal(self, $x: Self::Vector, $y: Self::Vector, $value: Self::Vector) -> Self::Vector {
+                use std::arch::x86_64::*;
+                unsafe { $where_equal }
+            }
+
+            #[inline(always)]
             fn max(self, a: Self::Vector, b: Self::Vector) -> Self::Vector {
                 unsafe { std::arch::x86_64::$max(a, b) }
             }
 
             #[inline(always)]
-            fn add_pairs(self, $a: Self::Vector, $b: Self::Vector) -> Self::Vector {
+            fn unzip(self, $a: Self::Vector, $b: Self::Vector) -> [Self::Vector; 2] {
                 use std::arch::x86_64::*;
-                unsafe { $add_pairs }
+                unsafe { $unzip }
+            }
+
+            #[inline(always)]
+            unsafe fn transpose(self, from: *const f32, to: *mut f32, [from_pitch, to_pitch]: [usize; 2]) {
+                use std::arch::x86_64::*;
+                unsafe {
+                    let $rows: [Self::Vector; $lanes] = self.load_strided(from, from_pitch);
+                    for (row, vector) in $transpose.into_iter().enumerate() {
+                        self.store(to.add(row * to_pitch), vector);
+                    }
+                }
             }
 
             fn vectorise<T: Task>(self, task: T) {
@@ -295,24 +389,70 @@ macro_rules! x86_instruction_set {
 x86_instruction_set! {
     /// AVX2 with fused multiply-add: 16 registers of 8 lanes.
     Avx2, 8, __m256, "avx2,fma", detect "avx2", "fma";
-    _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_add_ps, _mm256_sub_ps,
-    _mm256_mul_ps, _mm256_max_ps;
+    _mm256_set1_ps, _mm256_loadu_ps, _mm256_storeu_ps, _mm256_fmadd_ps, _mm256_fnmadd_ps, _mm256_add_ps,
+    _mm256_sub_ps, _mm256_mul_ps, _mm256_div_ps, _mm256_sqrt_ps, _mm256_max_ps;
+    where_equal(a, b, value) _mm256_and_ps(_mm256_cmp_ps::<_CMP_EQ_OQ>(a, b), value);
     _mm256_set1_pd, _mm256_castpd_ps;
-    add_pairs(a, b) _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(_mm256_castps_pd(_mm256_hadd_ps(a, b))))
+    unzip(a, b) {
+        // Lanes of both, by turns of two: the middle two are exchanged.
+        let in_order = |pairs| _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(_mm256_castps_pd(pairs)));
+        [in_order(_mm256_shuffle_ps::<0b10_00_10_00>(a, b)), in_order(_mm256_shuffle_ps::<0b11_01_11_01>(a, b))]
+    };
+    transpose(rows) {
+        let mut to = rows;
+        let mut fours = rows;
+        for four in [0, 4] {
+            let pair = |low: __m256, high: __m256| (_mm256_castps_pd(low), _mm256_castps_pd(high));
+            let (a, b) = pair(_mm256_unpacklo_ps(rows[four], rows[four + 1]), _mm256_unpackhi_ps(rows[four], rows[four + 1]));
+            let (c, d) = pair(_mm256_unpacklo_ps(rows[four + 2], rows[four + 3]), _mm256_unpackhi_ps(rows[four + 2], rows[four + 3]));
+            fours[four] = _mm256_castpd_ps(_mm256_unpacklo_pd(a, c));
+            fours[four + 1] = _mm256_castpd_ps(_mm256_unpackhi_pd(a, c));
+            fours[four + 2] = _mm256_castpd_ps(_mm256_unpacklo_pd(b, d));
+            fours[four + 3] = _mm256_castpd_ps(_mm256_unpackhi_pd(b, d));
+        }
+        for column in 0..4 {
+            to[column] = _mm256_permute2f128_ps::<0x20>(fours[column], fours[column + 4]);
+            to[column + 4] = _mm256_permute2f128_ps::<0x31>(fours[column], fours[column + 4]);
+        }
+        to
+    }
 }
 
 #[cfg(target_arch = "x86_64")]
 x86_instruction_set! {
     /// AVX-512: 32 registers of 16 lanes.
     Avx512, 16, __m512, "avx512f", detect "avx512f";
-    _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_add_ps, _mm512_sub_ps,
-    _mm512_mul_ps, _mm512_max_ps;
+    _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_fnmadd_ps, _mm512_add_ps,
+    _mm512_sub_ps, _mm512_mul_ps, _mm512_div_ps, _mm512_sqrt_ps, _mm512_max_ps;
+    where_equal(a, b, value) _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_EQ_OQ>(a, b), value);
     _mm512_set1_pd, _mm512_castpd_ps;
-    add_pairs(a, b) {
+    unzip(a, b) {
         // Lanes from 16 on are those of `b`.
         let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
         let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
-        _mm512_add_ps(_mm512_permutex2var_ps(a, even, b), _mm512_permutex2var_ps(a, odd, b))
+        [_mm512_permutex2var_ps(a, even, b), _mm512_permutex2var_ps(a, odd, b)]
+    };
+    transpose(rows) {
+        let mut to = rows;
+        let mut fours = rows;
+        for four in [0, 4, 8, 12] {
+            let (a, b) = (_mm512_castps_pd(_mm512_unpacklo_ps(rows[four], rows[four + 1])), _mm512_castps_pd(_mm512_unpackhi_ps(rows[four], rows[four + 1])));
+            let (c, d) = (_mm512_castps_pd(_mm512_unpacklo_ps(rows[four + 2], rows[four + 3])), _mm512_castps_pd(_mm512_unpackhi_ps(rows[four + 2], rows[four + 3])));
+            fours[four] = _mm512_castpd_ps(_mm512_unpacklo_pd(a, c));
+            fours[four + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(a, c));
+            fours[four + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(b, d));
+            fours[four + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(b, d));
+        }
+        for column in 0..4 {
+            let [a, b, c, d] = [fours[column], fours[column + 4], fours[column + 8], fours[column + 12]];
+            let (ab_low, ab_high) = (_mm512_shuffle_f32x4::<0x44>(a, b), _mm512_shuffle_f32x4::<0xee>(a, b));
+            let (cd_low, cd_high) = (_mm512_shuffle_f32x4::<0x44>(c, d), _mm512_shuffle_f32x4::<0xee>(c, d));
+            to[column] = _mm512_shuffle_f32x4::<0x88>(ab_low, cd_low);
+            to[column + 4] = _mm512_shuffle_f32x4::<0xdd>(ab_low, cd_low);
+            to[column + 8] = _mm512_shuffle_f32x4::<0x88>(ab_high, cd_high);
+            to[column + 12] = _mm512_shuffle_f32x4::<0xdd>(ab_high, cd_high);
+        }
+        to
     }
 }
 
@@ -349,6 +489,61 @@ mod tests {
             assert_eq!(found, expected, "{}", set.name());
             expected.swap(set.lanes(), set.lanes() + 1);
             assert_ne!(found, expected, "two lanes that changed places are seen");
+        }
+    }
+
+    /// Writes what each operation on squares and on lanes makes of values that are all different, one after another.
+    struct Moves<'a>(&'a mut Vec<f32>);
+
+    impl Task for Moves<'_> {
+        #[inline(always)]
+        fn run<S: Simd>(self, simd: S) {
+            let lanes = S::LANES;
+            let square: Vec<f32> = (0..lanes * (lanes + 3)).map(|value| value as f32).collect();
+            let mut transposed = vec![0.0; lanes * (lanes + 1)];
+            // SAFETY: rows of LANES values lie so far apart in both.
+            unsafe { simd.transpose(square.as_ptr(), transposed.as_mut_ptr(), [lanes + 3, lanes + 1]) };
+            let [a, b] = [simd.read(&square[1..]), simd.read(&square[20..])];
+            let four = simd.splat(4.0);
+            let vectors = [
+                simd.unzip(a, b)[0],
+                simd.unzip(a, b)[1],
+                simd.where_equal(a, four, b),
+                simd.neg_mul_add(a, b, four),
+                simd.div(b, four),
+                simd.sqrt(simd.mul(b, b)),
+                simd.max(simd.splat(f32::NAN), b),
+                simd.max(a, four),
+            ];
+            self.0.extend(&transposed);
+            for vector in vectors {
+                let mut to = vec![0.0; lanes];
+                simd.write(&mut to, vector);
+                self.0.extend(to);
+            }
+        }
+    }
+
+    #[test]
+    fn squares_are_transposed_and_lanes_chosen_alike_on_every_set() {
+        for set in InstructionSet::available() {
+            let (lanes, mut found) = (set.lanes(), Vec::new());
+            set.run(Moves(&mut found));
+            let mut expected = vec![0.0; lanes * (lanes + 1)];
+            for (row, column) in (0..lanes).flat_map(|row| (0..lanes).map(move |column| (row, column))) {
+                expected[column * (lanes + 1) + row] = (row * (lanes + 3) + column) as f32;
+            }
+            let (a, b) = (|lane: usize| (1 + lane) as f32, |lane: usize| (20 + lane) as f32);
+            let both = |lane: usize| if lane < lanes { a(lane) } else { b(lane - lanes) };
+            expected.extend((0..2).flat_map(|odd| (0..lanes).map(move |lane| both(2 * lane + odd))));
+            expected.extend((0..lanes).map(|lane| if a(lane) == 4.0 { b(lane) } else { 0.0 }));
+            expected.extend((0..lanes).map(|lane| 4.0 - a(lane) * b(lane)));
+            expected.extend((0..lanes).map(|lane| b(lane) / 4.0));
+            expected.extend((0..2).flat_map(|_| (0..lanes).map(b)));
+            expected.extend((0..lanes).map(|lane| a(lane).max(4.0)));
+            assert_eq!(found, expected, "{}", set.name());
+            expected.swap(1, lanes + 2);
+            assert_ne!(found, expected, "two values that changed places are seen");
         }
     }
 }

@@ -42,24 +42,12 @@ impl<T: Real> RowFft<T> {
 /// Writes the transpose of `from` [rows, columns] to `to` [columns, rows].
 pub(crate) fn transpose<T: Copy + Send + Sync>(from: &[T], to: &mut [T], rows: usize, columns: usize) {
     debug_assert!(from.len() == rows * columns && to.len() == from.len());
-    transpose_apart(from, columns, to, rows, rows, columns);
-}
-
-/// The same between matrices whose rows begin `from_pitch` and `to_pitch` apart.
-fn transpose_apart<T: Copy + Send + Sync>(
-    from: &[T],
-    from_pitch: usize,
-    to: &mut [T],
-    to_pitch: usize,
-    rows: usize,
-    columns: usize,
-) {
-    to.par_chunks_mut(BLOCK * to_pitch).enumerate().for_each(|(band, to)| {
+    to.par_chunks_mut(BLOCK * rows).enumerate().for_each(|(band, to)| {
         let first_column = band * BLOCK;
         let block_columns = BLOCK.min(columns - first_column);
-        let from_row = |row: usize| &from[row * from_pitch + first_column..][..block_columns];
+        let from_row = |row: usize| &from[row * columns + first_column..][..block_columns];
         for first_row in (0..rows).step_by(LINE) {
-            let to_rows = to.chunks_mut(to_pitch).enumerate();
+            let to_rows = to.chunks_mut(rows).enumerate();
             if rows - first_row < LINE {
                 for (offset, to_row) in to_rows {
                     for (row, to) in (first_row..rows).zip(&mut to_row[first_row..rows]) {
@@ -115,90 +103,6 @@ impl<T: Real> TransposedFft2d<T> {
         self.columns_inverse.process(&mut self.spectrum);
         transpose(&self.spectrum, data, self.width, self.height);
         self.rows_inverse.process(data);
-    }
-}
-
-/// Two-dimensional circular transforms of several planes at once, between which something is done with the spectra of
-/// all of them, column by column, while these are in the cache.
-pub(crate) struct PlanesFft {
-    width: usize,
-    height: usize,
-    planes: usize,
-    rows_forward: RowFft<f32>,
-    rows_inverse: RowFft<f32>,
-    columns_forward: Arc<dyn Fft<f32>>,
-    columns_inverse: Arc<dyn Fft<f32>>,
-    scratch: Vec<Complex<f32>>,
-    /// [width, planes, height]
-    columns: Vec<Complex<f32>>,
-}
-
-impl PlanesFft {
-    pub(crate) fn new(width: usize, height: usize, planes: usize) -> Self {
-        let columns_forward = f32::plan(height, FftDirection::Forward);
-        let columns_inverse = f32::plan(height, FftDirection::Inverse);
-        let scratch_len = columns_forward.get_inplace_scratch_len().max(columns_inverse.get_inplace_scratch_len());
-        Self {
-            width,
-            height,
-            planes,
-            rows_forward: RowFft::new(width, FftDirection::Forward),
-            rows_inverse: RowFft::new(width, FftDirection::Inverse),
-            columns_forward,
-            columns_inverse,
-            scratch: vec![Complex::ZERO; BANDS * scratch_len.max(1)],
-            columns: vec![Complex::ZERO; width * planes * height],
-        }
-    }
-
-    /// Takes plane `index` from `data` [height, width], which is used as scratch.
-    pub(crate) fn take(&mut self, index: usize, data: &mut [Complex<f32>]) {
-        let Self { width, height, planes, rows_forward, columns, .. } = self;
-        rows_forward.process(data);
-        transpose_apart(data, *width, &mut columns[index * *height..], *planes * *height, *height, *width);
-    }
-
-    /// Writes plane `index` to `data` [height, width].
-    pub(crate) fn give(&mut self, index: usize, data: &mut [Complex<f32>]) {
-        let Self { width, height, planes, rows_inverse, columns, .. } = self;
-        transpose_apart(&columns[index * *height..], *planes * *height, data, *width, *width, *height);
-        rows_inverse.process(data);
-    }
-
-    /// Runs `work` on each column and its number.
-    pub(crate) fn for_each_column(&mut self, work: impl Fn(usize, Column<'_>) + Sync) {
-        let Self { width, height, planes, columns_forward, columns_inverse, scratch, columns, .. } = self;
-        let (columns_per_band, scratch_len) = (width.div_ceil(BANDS), scratch.len() / BANDS);
-        let bands = columns.par_chunks_mut(columns_per_band * *planes * *height);
-        bands.zip(scratch.par_chunks_exact_mut(scratch_len)).enumerate().for_each(|(band, (columns, scratch))| {
-            let first = band * columns_per_band;
-            for (kx, values) in (first..).zip(columns.chunks_exact_mut(*planes * *height)) {
-                let [forward, inverse] = [&**columns_forward, &**columns_inverse];
-                work(kx, Column { values, forward, inverse, scratch });
-            }
-        });
-    }
-}
-
-/// One column of all planes.
-pub(crate) struct Column<'a> {
-    /// [planes, height]
-    pub(crate) values: &'a mut [Complex<f32>],
-    forward: &'a dyn Fft<f32>,
-    inverse: &'a dyn Fft<f32>,
-    scratch: &'a mut [Complex<f32>],
-}
-
-impl Column<'_> {
-    /// Transforms the column of one plane to its spectrum.
-    pub(crate) fn transform(&mut self, plane: usize) {
-        let height = self.forward.len();
-        self.forward.process_with_scratch(&mut self.values[plane * height..][..height], self.scratch);
-    }
-
-    /// Transforms the spectra of all planes back, times height.
-    pub(crate) fn transform_back(&mut self) {
-        self.inverse.process_with_scratch(self.values, self.scratch);
     }
 }
 
@@ -258,42 +162,6 @@ mod tests {
                     prop_assert_eq!(to[column * rows + row], from[row * columns + column]);
                 }
             }
-        }
-    }
-
-    #[test]
-    fn planes_change_places_between_the_transforms_and_only_there() {
-        let size @ (width, height) = (11, 6);
-        let planes: [Vec<_>; 3] = std::array::from_fn(|plane| {
-            let value = |i| Complex::cis((i as f32 + 7.0 * plane as f32).powf(1.7));
-            (0..width * height).map(value).collect()
-        });
-        let mut fft = PlanesFft::new(width, height, 3);
-        for (index, plane) in planes.iter().enumerate() {
-            fft.take(index, &mut plane.clone());
-        }
-        let twice_at = 4;
-        fft.for_each_column(|kx, mut column| {
-            (0..3).for_each(|plane| column.transform(plane));
-            column.values.rotate_left(height);
-            column.values.iter_mut().for_each(|value| *value *= if kx == twice_at { 2.0 } else { 1.0 });
-            column.transform_back();
-        });
-        let mut spectrum = TransposedFft2d::new(size.0, size.1);
-        for (index, plane) in planes.iter().cycle().skip(1).take(3).enumerate() {
-            let mut expected = plane.clone();
-            spectrum.forward(&mut expected);
-            spectrum.spectrum[twice_at * height..][..height].iter_mut().for_each(|value| *value *= 2.0);
-            spectrum.inverse(&mut expected);
-            let mut found = vec![Complex::ZERO; width * height];
-            fft.give(index, &mut found);
-            let difference = |found: &[Complex<f32>]| {
-                let differences = found.iter().zip(&expected).map(|(a, b)| (a - b).norm());
-                worst(differences)
-            };
-            assert!(difference(&found) < 1e-3, "plane {index}: {}", difference(&found));
-            found[17].im += 2e-3;
-            assert!(difference(&found) > 1e-3, "the comparison is blind");
         }
     }
 

@@ -11,7 +11,9 @@ use num_complex::Complex32;
 
 pub use double_phase::{DoublePhase, DoublePhaseReport};
 pub use eye::{Eye, SimulatedEye};
-pub(crate) use fft::{PlanesFft, TransposedFft2d, signed_bin};
+#[cfg(test)]
+pub(crate) use fft::TransposedFft2d;
+pub(crate) use fft::signed_bin;
 pub use propagation::Propagator;
 pub(crate) use propagation::transfer_table;
 pub(crate) use upsample::FourierUpsampler;

@@ -6,8 +6,9 @@
 //! points, of which all factors are exact, the error is 1.7 times that of the sum over taps; with the usual 0, ±1, ±2
 //! and ∞ it is 4 times.
 
-use super::feature_map::{FeatureMap, TILE, WORKERS};
+use super::feature_map::{FeatureMap, TILE};
 use super::product::{ROWS, Shape, panel_place, panels_len};
+use super::workers::WORKERS;
 use crate::simd::{InstructionSet, Simd, Task};
 
 pub(super) const TAPS: usize = 9;

@@ -1,37 +1,34 @@
 //! What an eye should see at each depth layer, as far as a picture and its depth tell.
 
 use holod_calibration::{DisplayGeometry, Resolution};
-use num_complex::Complex32;
 use rayon::prelude::*;
 
-use super::blocks::Blocks;
+use super::blocks::BLOCK;
+use super::column_blocks::ColumnBlocks;
 use super::depth_layers::DepthLayers;
-use super::input_features::{BLOCK, SCALE, sample_pitch};
-use crate::RgbdFrame;
+use super::frame_blocks::FrameBlocks;
+use super::input_features::sample_pitch;
+use super::plane_fft::{Columns, PlaneFft, Rows};
+use super::plane_light::{load, store};
 use crate::engine::constants::{LEAST_COVER, PAIRS};
 use crate::engine::disc::DiscTable;
-use crate::optics::{PlanesFft, signed_bin};
+use crate::optics::signed_bin;
 use crate::simd::{InstructionSet, Simd, Task};
 use crate::weights::{MOST_DEPTH_LAYERS, NetworkConfig};
-
-/// Bins of a spectrum that are blurred together.
-const BINS: usize = 16;
 
 /// Blurs each depth layer by its disc of confusion at the focus on each other one, and divides the sum by that of a
 /// white scene. Blur is circular, and no layer hides another. Nothing is allocated after `new`.
 pub(super) struct Defocus {
     size: Resolution,
+    count: usize,
     disc: DiscTable,
     /// The pupil that `discs` is for.
     pupil_mm: f32,
-    /// [width, layers, height], over the number of samples: spectra of the discs between layers that are 0, 1, 2, ..
-    /// apart.
+    /// [block of rows, layers, column up to half of them, row of the block], over the number of samples: spectra of the
+    /// discs between layers that are 0, 1, 2, .. apart. Columns beyond half are those before it in turn.
     discs: Vec<f32>,
-    /// Whether a layer has a pixel.
-    present: Vec<bool>,
-    seen: [Vec<Complex32>; PAIRS],
     /// For each layer its light's pairs, and then those seen at the focus on it.
-    fft: PlanesFft,
+    fft: PlaneFft,
     set: InstructionSet,
 }
 
@@ -39,29 +36,34 @@ impl Defocus {
     pub(super) fn new(config: &NetworkConfig, bench: &DisplayGeometry, size: Resolution, set: InstructionSet) -> Self {
         let count = config.depth_layers;
         let sample_rad = sample_pitch(bench).0 / bench.eyepiece_focal_length.0;
-        let plane = || vec![Complex32::ZERO; size.pixels()];
         Self {
             size,
+            count,
             disc: DiscTable::new(bench, count, sample_rad),
             pupil_mm: f32::NAN,
-            discs: vec![0.0; count * size.pixels()],
-            present: vec![false; count],
-            seen: [plane(), plane()],
-            fft: PlanesFft::new(size.width, size.height, PAIRS * count),
+            discs: vec![0.0; count * (size.width / 2 + 1) * size.height.next_multiple_of(set.lanes())],
+            fft: PlaneFft::new(PAIRS * count, size, set),
             set,
         }
     }
 
-    /// Writes the expected amplitudes [layers, 3, height, width] of `frame`, whose depths `layers` has.
-    pub(super) fn expect(&mut self, frame: &RgbdFrame, layers: &DepthLayers, pupil_mm: f32, amplitudes: &mut [f32]) {
+    /// Writes the expected amplitudes, three colours of each layer, of `frame`, whose depths `layers` has.
+    pub(super) fn expect(
+        &mut self,
+        frame: &FrameBlocks,
+        layers: &DepthLayers,
+        pupil_mm: f32,
+        amplitudes: &mut ColumnBlocks,
+    ) {
         self.shape_discs(pupil_mm);
-        for layer in layers.numbers() {
-            self.take_layer(frame, layers, layer);
-        }
-        self.blur();
-        for (focus, amplitudes) in amplitudes.chunks_exact_mut(3 * self.size.pixels()).enumerate() {
-            self.see(focus, amplitudes);
-        }
+        let Self { size: Resolution { width, .. }, count, discs, fft, set, .. } = self;
+        let (width, count, set) = (*width, *count, *set);
+        fft.for_columns(frame.planes.blocks().zip(layers.layer_of.blocks()), |columns, (frame, layer_of)| {
+            set.run(TakeLayers { columns, frame, layers, layer_of, count });
+        });
+        let discs = discs.chunks_exact(discs.len() / self.size.height.div_ceil(set.lanes()));
+        fft.for_rows(discs, |rows, discs| set.run(Blur { rows, discs, layers, width, count }));
+        fft.for_columns(amplitudes.blocks_mut(), |columns, amplitudes| set.run(See { columns, amplitudes }));
     }
 
     /// Sets the discs to those of a pupil, unless they are already.
@@ -69,18 +71,20 @@ impl Defocus {
         if self.pupil_mm == pupil_mm {
             return;
         }
-        let Self { size: Resolution { width, height }, disc, discs, .. } = self;
-        let (width, height, norm) = (*width, *height, 1.0 / (*width * *height) as f32);
+        let Self { size: Resolution { width, height }, count, disc, discs, set, .. } = self;
+        let (width, height, lanes, norm) = (*width, *height, set.lanes(), 1.0 / (*width * *height) as f32);
         let scale = disc.entries_per_mm * f64::from(pupil_mm);
-        let count = discs.len() / (width * height);
-        discs.par_chunks_exact_mut(count * height).enumerate().for_each(|(kx, discs)| {
-            let fx = signed_bin(kx, width) as f64 / width as f64;
-            for (apart, values) in discs.chunks_exact_mut(height).enumerate() {
-                for (ky, value) in values.iter_mut().enumerate() {
-                    let fy = signed_bin(ky, height) as f64 / height as f64;
-                    let entry = scale * apart as f64 * (fx * fx + fy * fy).sqrt();
+        let rows_len = discs.len() / height.div_ceil(lanes);
+        discs.par_chunks_exact_mut(rows_len).enumerate().for_each(|(block, discs)| {
+            let columns = width / 2 + 1;
+            for (kx, lane) in (0..columns).flat_map(|kx| (0..lanes).map(move |lane| (kx, lane))) {
+                let fx = signed_bin(kx, width) as f64 / width as f64;
+                let fy = signed_bin(block * lanes + lane, height) as f64 / height as f64;
+                let entry_of_neighbour = scale * (fx * fx + fy * fy).sqrt();
+                for apart in 0..*count {
+                    let entry = apart as f64 * entry_of_neighbour;
                     let (below, share) = (entry as usize, entry.fract() as f32);
-                    *value = match disc.values.get(below..below + 2) {
+                    discs[(apart * columns + kx) * lanes + lane] = match disc.values.get(below..below + 2) {
                         Some(&[low, high]) => norm * (low + share * (high - low)),
                         _ => 0.0,
                     };
@@ -89,140 +93,143 @@ impl Defocus {
         });
         self.pupil_mm = pupil_mm;
     }
+}
 
-    /// Takes what lies in one layer.
-    fn take_layer(&mut self, frame: &RgbdFrame, layers: &DepthLayers, layer: u8) {
-        let Self { size, present, seen, fft, .. } = self;
-        let (width, pixels) = (size.width, frame.resolution.pixels());
-        let present = &mut present[usize::from(layer)];
-        *present = layers.has_any_in(layer);
-        if !*present {
-            return;
-        }
-        let blocks = Blocks { frame: frame.resolution, scale: SCALE };
-        let [white_red, green_blue] = seen;
-        let rows = white_red.par_chunks_exact_mut(width).zip(green_blue.par_chunks_exact_mut(width));
-        rows.enumerate().for_each(|(y, (white_red, green_blue))| {
-            let row = white_red.iter_mut().zip(green_blue).zip(layers.row(y)).enumerate();
-            for (x, ((white_red, green_blue), layer_of)) in row {
-                let mut parts = [0.0f32; 4];
-                for corner in (0..BLOCK).filter(|&corner| layer_of[corner] == layer) {
-                    let index = blocks.index(x, y, corner);
-                    parts[0] += 1.0;
-                    for colour in 0..3 {
-                        parts[1 + colour] += frame.amplitude[colour * pixels + index].powi(2);
+/// The light of each layer in a block of columns leaves as pairs: white with red, and green with blue.
+struct TakeLayers<'a> {
+    columns: Columns<'a>,
+    /// Three amplitudes of the frame, [colour, pixel, row, column of the block].
+    frame: &'a [f32],
+    layers: &'a DepthLayers,
+    /// [pixel, row, column of the block]
+    layer_of: &'a [f32],
+    count: usize,
+}
+
+impl Task for TakeLayers<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut columns, frame, layers, layer_of, count } = self;
+        let plane_len = layer_of.len() / BLOCK;
+        for (y, row) in (0..plane_len).step_by(S::LANES).enumerate() {
+            let zero = simd.splat(0.0);
+            // Of each pixel behind the samples its layer, 1 and its powers, which are shares of the sample's.
+            let mut pixels = [(zero, [zero; 1 + 3]); BLOCK];
+            for (pixel, (layer, parts)) in pixels.iter_mut().enumerate() {
+                *layer = simd.read(&layer_of[pixel * plane_len + row..]);
+                let share = simd.splat(1.0 / BLOCK as f32);
+                parts[0] = share;
+                for (colour, power) in parts[1..].iter_mut().enumerate() {
+                    let amplitude = simd.read(&frame[(colour * BLOCK + pixel) * plane_len + row..]);
+                    *power = simd.mul(simd.mul(amplitude, amplitude), share);
+                }
+            }
+            for layer in (0..count).filter(|&layer| layers.has_any_in(layer)) {
+                let mut sums = [zero; 1 + 3];
+                for (layer_of, parts) in pixels {
+                    for (sum, part) in sums.iter_mut().zip(parts) {
+                        *sum = simd.add(*sum, simd.where_equal(layer_of, simd.splat(layer as f32), part));
                     }
                 }
-                let [white, red, green, blue] = parts.map(|part| part / BLOCK as f32);
-                *white_red = Complex32::new(white, red);
-                *green_blue = Complex32::new(green, blue);
-            }
-        });
-        for (pair, seen) in seen.iter_mut().enumerate() {
-            fft.take(PAIRS * usize::from(layer) + pair, seen);
-        }
-    }
-
-    /// Turns the layers' light into what is seen at the focus on each.
-    fn blur(&mut self) {
-        let Self { size, discs, present, fft, set, .. } = self;
-        let discs_len = discs.len() / size.width;
-        fft.for_each_column(|kx, mut column| {
-            let planes = (0..PAIRS * present.len()).filter(|plane| present[plane / PAIRS]);
-            planes.for_each(|plane| column.transform(plane));
-            let discs = &discs[kx * discs_len..][..discs_len];
-            set.run(BlurColumn { values: column.values, discs, present, height: size.height });
-            column.transform_back();
-        });
-    }
-
-    /// Amplitudes [3, height, width] at the focus on one layer.
-    fn see(&mut self, focus: usize, amplitudes: &mut [f32]) {
-        let Self { size, seen, fft, set, .. } = self;
-        for (pair, seen) in seen.iter_mut().enumerate() {
-            fft.give(PAIRS * focus + pair, seen);
-        }
-        let ([white_red, green_blue], width) = (&self.seen, size.width);
-        let [red, green, blue] = split_planes(amplitudes, size.pixels()).map(|plane| plane.par_chunks_exact_mut(width));
-        let seen = white_red.par_chunks_exact(width).zip(green_blue.par_chunks_exact(width));
-        red.zip(green).zip(blue).zip(seen).for_each(|(((red, green), blue), (white_red, green_blue))| {
-            set.run(SeenRow { white_red, green_blue, amplitudes: [red, green, blue] });
-        });
-    }
-}
-
-/// One column of all layers' spectra, which become those of what is seen.
-struct BlurColumn<'a> {
-    /// [layers, pairs, height]
-    values: &'a mut [Complex32],
-    /// [layers, height]
-    discs: &'a [f32],
-    present: &'a [bool],
-    height: usize,
-}
-
-impl Task for BlurColumn<'_> {
-    #[inline(always)]
-    fn run<S: Simd>(mut self, _: S) {
-        let mut seen = [[Complex32::ZERO; BINS]; MOST_DEPTH_LAYERS];
-        let in_whole_blocks = self.height - self.height % BINS;
-        for pair in 0..PAIRS {
-            for bin in (0..in_whole_blocks).step_by(BINS) {
-                self.blur::<BINS>(pair, bin, &mut seen);
-            }
-            for bin in in_whole_blocks..self.height {
-                self.blur::<1>(pair, bin, &mut seen);
-            }
-        }
-    }
-}
-
-impl BlurColumn<'_> {
-    /// N bins from `bin` on; `seen` is scratch.
-    #[inline(always)]
-    fn blur<const N: usize>(&mut self, pair: usize, bin: usize, seen: &mut [[Complex32; BINS]]) {
-        let Self { values, discs, present, height } = self;
-        let place = |layer: usize| (layer * PAIRS + pair) * *height + bin;
-        for (focus, seen) in seen.iter_mut().enumerate().take(present.len()) {
-            let mut sum = [Complex32::ZERO; N];
-            for layer in (0..present.len()).filter(|&layer| present[layer]) {
-                let disc = &discs[layer.abs_diff(focus) * *height + bin..][..N];
-                for ((sum, value), disc) in sum.iter_mut().zip(&values[place(layer)..][..N]).zip(disc) {
-                    *sum += value * disc;
+                let [white, red, green, blue] = sums;
+                for (pair, cell) in [[white, red], [green, blue]].into_iter().enumerate() {
+                    store(simd, &mut columns.cells(PAIRS * layer + pair)[y * 2 * S::LANES..], cell);
                 }
             }
-            seen[..N].copy_from_slice(&sum);
         }
-        for (focus, seen) in seen.iter().enumerate().take(present.len()) {
-            values[place(focus)..][..N].copy_from_slice(&seen[..N]);
+        for layer in (0..count).filter(|&layer| layers.has_any_in(layer)) {
+            for pair in 0..PAIRS {
+                columns.send(simd, PAIRS * layer + pair);
+            }
         }
     }
 }
 
-/// One row of the amplitudes seen, of all colours.
-struct SeenRow<'a> {
-    white_red: &'a [Complex32],
-    green_blue: &'a [Complex32],
-    amplitudes: [&'a mut [f32]; 3],
+/// The spectra of all layers in a block of rows become those of what is seen at the focus on each.
+struct Blur<'a> {
+    rows: Rows<'a>,
+    /// [layers, column up to half of them, row of the block]
+    discs: &'a [f32],
+    layers: &'a DepthLayers,
+    width: usize,
+    count: usize,
 }
 
-impl Task for SeenRow<'_> {
+impl Task for Blur<'_> {
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
-        let Self { white_red, green_blue, amplitudes: [red, green, blue] } = self;
-        let colours = red.iter_mut().zip(green).zip(blue);
-        for (((red, green), blue), (white_red, green_blue)) in colours.zip(white_red.iter().zip(green_blue)) {
-            let amplitude = |light: f32| (light / white_red.re.max(LEAST_COVER)).max(0.0).sqrt();
-            *red = amplitude(white_red.im);
-            *green = amplitude(green_blue.re);
-            *blue = amplitude(green_blue.im);
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut rows, discs, layers, width, count } = self;
+        for layer in (0..count).filter(|&layer| layers.has_any_in(layer)) {
+            for pair in 0..PAIRS {
+                rows.arrive(simd, PAIRS * layer + pair);
+            }
+        }
+        let cells = rows.all_cells();
+        let (plane_len, columns) = (width * 2 * S::LANES, width / 2 + 1);
+        assert!(cells.len() >= PAIRS * count * plane_len && discs.len() == count * columns * S::LANES);
+        let mut seen = [[simd.splat(0.0); 2]; MOST_DEPTH_LAYERS];
+        for (pair, kx) in (0..PAIRS).flat_map(|pair| (0..width).map(move |kx| (pair, kx))) {
+            let place = |layer: usize| (PAIRS * layer + pair) * plane_len + kx * 2 * S::LANES;
+            let disc = |apart: usize| (apart * columns + kx.min(width - kx)) * S::LANES;
+            for (focus, seen) in seen.iter_mut().enumerate().take(count) {
+                let mut sum = [simd.splat(0.0); 2];
+                for layer in (0..count).filter(|&layer| layers.has_any_in(layer)) {
+                    // SAFETY: a cell lies at each `place` of `count` layers and `width` columns, and a vector at each
+                    // `disc`, as asserted above.
+                    unsafe {
+                        let disc = simd.load(discs.as_ptr().add(disc(layer.abs_diff(focus))));
+                        let cell = cells.as_ptr().add(place(layer));
+                        sum[0] = simd.mul_add(simd.load(cell), disc, sum[0]);
+                        sum[1] = simd.mul_add(simd.load(cell.add(S::LANES)), disc, sum[1]);
+                    }
+                }
+                *seen = sum;
+            }
+            for (focus, [re, im]) in seen.into_iter().enumerate().take(count) {
+                // SAFETY: as above.
+                unsafe {
+                    let cell = cells.as_mut_ptr().add(place(focus));
+                    simd.store(cell, re);
+                    simd.store(cell.add(S::LANES), im);
+                }
+            }
+        }
+        for plane in 0..PAIRS * count {
+            rows.send(simd, plane);
         }
     }
 }
 
-/// The three planes of [3, height, width].
-fn split_planes(values: &mut [f32], pixels: usize) -> [&mut [f32]; 3] {
-    let (first, rest) = values.split_at_mut(pixels);
-    let (second, third) = rest.split_at_mut(pixels);
-    [first, second, third]
+/// What is seen at each focus arrives in a block of columns.
+struct See<'a> {
+    columns: Columns<'a>,
+    /// Three colours of each layer.
+    amplitudes: &'a mut [f32],
+}
+
+impl Task for See<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut columns, amplitudes } = self;
+        let plane_len = columns.cells(0).len() / 2;
+        for (focus, amplitudes) in amplitudes.chunks_exact_mut(3 * plane_len).enumerate() {
+            for pair in 0..PAIRS {
+                columns.arrive(simd, PAIRS * focus + pair);
+            }
+            let (red, others) = amplitudes.split_at_mut(plane_len);
+            let (green, blue) = others.split_at_mut(plane_len);
+            let colours = red.chunks_exact_mut(S::LANES).zip(green.chunks_exact_mut(S::LANES));
+            let colours = colours.zip(blue.chunks_exact_mut(S::LANES));
+            let pairs = &columns.all_cells()[PAIRS * focus * 2 * plane_len..][..PAIRS * 2 * plane_len];
+            let (white_red, green_blue) = pairs.split_at(2 * plane_len);
+            let cells = white_red.chunks_exact(2 * S::LANES).zip(green_blue.chunks_exact(2 * S::LANES));
+            for (((red, green), blue), (white_red, green_blue)) in colours.zip(cells) {
+                let ([white, seen_red], [seen_green, seen_blue]) = (load(simd, white_red), load(simd, green_blue));
+                let white = simd.max(white, simd.splat(LEAST_COVER));
+                for (amplitude, light) in [(red, seen_red), (green, seen_green), (blue, seen_blue)] {
+                    simd.write(amplitude, simd.sqrt(simd.max(simd.div(light, white), simd.splat(0.0))));
+                }
+            }
+        }
+    }
 }

@@ -1,8 +1,9 @@
 //! Deformable 3x3 convolutions: every tap of every pixel is read at a place of its own.
 
 use super::conv::{Activation, Epilogue, TAPS};
-use super::feature_map::{FeatureMap, WORKERS};
+use super::feature_map::FeatureMap;
 use super::product::{ROWS, Shape, panel_place, panels_len};
+use super::workers::WORKERS;
 use crate::simd::{InstructionSet, Simd, Task};
 
 /// A deformable convolution of maps.

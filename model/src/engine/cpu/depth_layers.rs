@@ -3,55 +3,86 @@
 use holod_calibration::Resolution;
 use rayon::prelude::*;
 
-use super::blocks::Blocks;
-use super::input_features::{BLOCK, SCALE};
+use super::blocks::BLOCK;
+use super::column_blocks::ColumnBlocks;
+use super::frame_blocks::{DEPTH, FrameBlocks};
+use super::view::View;
 use crate::RgbdFrame;
+use crate::simd::{InstructionSet, Simd, Task};
+
+/// What lies beyond the grid is in no layer.
+const NO_LAYER: f32 = -1.0;
 
 /// Layers equal in dioptres, far to near. Nothing is allocated after `new`.
 pub(super) struct DepthLayers {
-    count: u8,
+    count: usize,
     size: Resolution,
-    /// The depth layer of each pixel of each block, [height, width, 4].
-    layer_of: Vec<[u8; BLOCK]>,
+    set: InstructionSet,
+    /// The number of the layer of each of the pixels behind a sample.
+    pub(super) layer_of: ColumnBlocks,
+    /// A bit for each layer that anything lies in.
+    present: u64,
 }
 
 impl DepthLayers {
-    pub(super) fn new(count: usize, size: Resolution) -> Self {
-        Self { count: count as u8, size, layer_of: vec![[0; BLOCK]; size.pixels()] }
-    }
-
-    /// The layers' numbers, far to near.
-    pub(super) fn numbers(&self) -> std::ops::Range<u8> {
-        0..self.count
-    }
-
-    /// The share of a block that lies in one layer.
-    pub(super) fn cover(&self, layer: usize, block: usize) -> f32 {
-        self.layer_of[block].iter().filter(|&&of| usize::from(of) == layer).count() as f32 / BLOCK as f32
+    pub(super) fn new(count: usize, size: Resolution, set: InstructionSet) -> Self {
+        Self { count, size, set, layer_of: ColumnBlocks::of_reals(BLOCK, size, set), present: 0 }
     }
 
     /// Whether anything lies in one layer.
-    pub(super) fn has_any_in(&self, layer: u8) -> bool {
-        self.layer_of.par_iter().any(|block| block.contains(&layer))
+    pub(super) fn has_any_in(&self, layer: usize) -> bool {
+        self.present >> layer & 1 == 1
     }
 
-    /// The layers of the corners of each block of row `y`.
-    pub(super) fn row(&self, y: usize) -> &[[u8; BLOCK]] {
-        &self.layer_of[y * self.size.width..][..self.size.width]
-    }
-
-    /// Takes the depths of `frame`.
-    pub(super) fn place(&mut self, frame: &RgbdFrame) {
-        let blocks = Blocks { frame: frame.resolution, scale: SCALE };
-        let (columns, count) = (self.size.width, self.count);
-        self.layer_of.par_chunks_exact_mut(columns).enumerate().for_each(|(y, row)| {
-            for (x, block) in row.iter_mut().enumerate() {
-                for (corner, layer) in block.iter_mut().enumerate() {
-                    let depth = frame.depth_normalised[blocks.index(x, y, corner)];
-                    // A cast of what lies outside saturates.
-                    *layer = ((depth * f32::from(count)) as u8).min(count - 1);
-                }
+    /// Takes the depths of a frame.
+    pub(super) fn place(&mut self, frame: &FrameBlocks) {
+        let Self { count, size, set, layer_of, present } = self;
+        let (count, width, lanes) = (*count, size.width, set.lanes());
+        let blocks = layer_of.par_blocks_mut().zip(frame.planes.par_blocks()).enumerate();
+        let placed = blocks.map(|(block, (layers, planes))| {
+            let mut present = 0;
+            set.run(Place { depths: &planes[DEPTH * layers.len()..], count, layers, present: &mut present });
+            for layers in layers.chunks_exact_mut(lanes) {
+                layers[lanes.min(width - block * lanes)..].fill(NO_LAYER);
             }
+            present
         });
+        *present = placed.reduce(|| 0, |a, b| a | b);
+    }
+}
+
+/// The layers of the pixels behind a block of columns.
+struct Place<'a> {
+    depths: &'a [f32],
+    count: usize,
+    layers: &'a mut [f32],
+    present: &'a mut u64,
+}
+
+impl Task for Place<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let Self { depths, count, layers, present } = self;
+        for (layer, depth) in layers.iter_mut().zip(depths) {
+            // What lies outside, or is no number, goes to an end.
+            let number = (depth * count as f32).max(0.0).min((count - 1) as f32) as i32;
+            *layer = number as f32;
+            *present |= 1 << number;
+        }
+    }
+}
+
+impl View for DepthLayers {
+    type Input = RgbdFrame;
+
+    #[inline(always)]
+    fn share_in_focus<S: Simd>(&self, simd: S, plane: usize, block: usize, y: usize) -> S::Vector {
+        let mut share = simd.splat(0.0);
+        for pixel in 0..BLOCK {
+            let layer = simd.read(self.layer_of.row_of_block(block, pixel, y));
+            let part = simd.where_equal(layer, simd.splat(plane as f32), simd.splat(1.0 / BLOCK as f32));
+            share = simd.add(share, part);
+        }
+        share
     }
 }

@@ -2,12 +2,13 @@
 
 use holod_calibration::{DisplayGeometry, Resolution};
 
-use super::blocks::grid_size;
+use super::blocks::{BLOCK, grid_size};
 use super::defocus::Defocus;
 use super::depth_layers::DepthLayers;
-use super::input_features::{BLOCK, FIRST_MAP, MAPS, write_maps};
+use super::frame_blocks::FrameBlocks;
+use super::input_features::{MAPS, write_inputs};
 use super::plane_light::PlanePositions;
-use super::plane_stack::{PlaneNetwork, PlaneStack, View};
+use super::plane_stack::{PlaneNetwork, PlaneStack};
 use super::stage::{Buffers, Job, MapId, Stage, frame_bytes, plane_bytes};
 use super::stage_list::StageList;
 use crate::RgbdFrame;
@@ -28,27 +29,21 @@ pub(super) fn stages(
     let layer_numbers = (BLOCK * size.pixels()) as u64;
     let positions = PlanePositions::of_layers(count, bench);
     PlaneNetwork { config, bench, nets, feedback, positions, resolution, set }.stages(
-        DepthLayers::new(count, size),
+        DepthLayers::new(count, size, set),
         layer_numbers,
         |inputs| Expect {
             bytes: frame_bytes(resolution) + layer_numbers + plane_bytes(3 * count + 2 * (MAPS + 3 * count), size),
+            frame: FrameBlocks::new(size, set),
             defocus: Defocus::new(config, bench, size, set),
             inputs,
         },
     )
 }
 
-impl View for DepthLayers {
-    type Input = RgbdFrame;
-
-    fn share_in_focus(&self, plane: usize, sample: usize) -> f32 {
-        self.cover(plane, sample)
-    }
-}
-
 /// Writes what an eye should see, and with the maps of the frame shows it to both nets.
 struct Expect {
     bytes: u64,
+    frame: FrameBlocks,
     defocus: Defocus,
     inputs: [MapId; 2],
 }
@@ -64,14 +59,12 @@ impl Stage<PlaneStack<DepthLayers>> for Expect {
 
     fn run(&mut self, buffers: &mut Buffers<PlaneStack<DepthLayers>>, job: &mut Job<'_, RgbdFrame>) {
         let Buffers { maps, family: PlaneStack { view: layers, stack, .. } } = buffers;
-        layers.place(job.input);
-        self.defocus.expect(job.input, layers, job.pupil_mm, stack);
-        let pixels = maps.size.pixels();
-        for (input, first) in self.inputs.into_iter().zip([0, FIRST_MAP]) {
-            let map = &mut maps[input];
-            write_maps(map, first, job.input, job.conditions);
-            map.write_planes(first + MAPS, stack.chunks_exact(pixels), |amplitude| amplitude - 0.4);
-        }
+        let Self { frame, defocus, inputs, .. } = self;
+        frame.take(job.input);
+        layers.place(frame);
+        defocus.expect(frame, layers, job.pupil_mm, stack);
+        let set = maps.set;
+        write_inputs(maps.get_two(*inputs), frame, job.conditions, stack, set);
     }
 
     #[cfg(test)]

@@ -1,15 +1,14 @@
 //! Maps between layers: channels last, with a border.
 
-use std::sync::{Mutex, PoisonError};
-
 use rayon::prelude::*;
 
+use super::workers::share_out;
 use crate::simd::InstructionSet;
 
 /// Side of the squares of pixels that a layer computes together.
 pub(super) const TILE: usize = 4;
-/// More threads than this share no layer.
-pub(super) const WORKERS: usize = 32;
+/// Rows of a band.
+pub(super) const BAND: usize = 16;
 
 /// A feature map [height, width, channels] with a border of zeros: one pixel before, and after as many as fill the last
 /// tile and one more. Nothing but zeros is ever written there.
@@ -36,6 +35,12 @@ impl FeatureMap {
         self.data[self.row_len..].par_chunks_exact_mut(self.row_len).take(self.height)
     }
 
+    /// The same, [`BAND`] rows together, the last time perhaps fewer: what is read in blocks of columns is read row after
+    /// row of a block so.
+    pub(super) fn bands_mut(&mut self) -> impl IndexedParallelIterator<Item = &mut [f32]> {
+        self.data[self.row_len..][..self.height * self.row_len].par_chunks_mut(BAND * self.row_len)
+    }
+
     /// Runs `work(scratch, y, rows)` for each row of tiles, the last one perhaps with fewer than [`TILE`] rows, from
     /// `y` on and as [`Self::rows_mut`] has them. Each worker takes one after another, with its own of the scratches.
     pub(super) fn for_each_tile_row<T: Send>(
@@ -44,13 +49,8 @@ impl FeatureMap {
         work: impl Fn(&mut T, usize, &mut [f32]) + Sync,
     ) {
         let rows = self.data[self.row_len..][..self.height * self.row_len].chunks_mut(TILE * self.row_len);
-        let remaining = Mutex::new((0..self.height).step_by(TILE).zip(rows));
-        let next = || remaining.lock().unwrap_or_else(PoisonError::into_inner).next();
-        scratches.par_iter_mut().for_each(|scratch| {
-            while let Some((y, rows)) = next() {
-                work(scratch, y, rows);
-            }
-        });
+        let rows_from = (0..self.height).step_by(TILE);
+        share_out(scratches, rows_from.zip(rows), |scratch, (y, rows)| work(scratch, y, rows));
     }
 
     /// The rows from the one above row `y` on; row `y` is one row further, with its border pixels.
@@ -58,10 +58,9 @@ impl FeatureMap {
         &self.data[y * self.row_len..]
     }
 
-    /// One channel of row `y`.
-    pub(super) fn channel(&self, channel: usize, y: usize) -> impl Iterator<Item = &f32> {
-        let begin = (y + 1) * self.row_len + self.stride;
-        self.data[begin..][..self.width * self.stride][channel..].iter().step_by(self.stride)
+    /// The channels of pixel (x, y) and of what lies after it, with the border and further rows.
+    pub(super) fn pixels_from(&self, x: usize, y: usize) -> &[f32] {
+        &self.data[(y + 1) * self.row_len + (x + 1) * self.stride..]
     }
 
     /// The channels of one pixel.

@@ -1,114 +1,155 @@
 //! What an eye lacks when it focuses on each plane, fed back to the field at the SLM plane.
 
 use holod_calibration::{Colour, DisplayGeometry, Resolution};
-use num_complex::Complex32;
-use rayon::prelude::*;
 
-use super::input_features::sample_pitch;
-use super::plane_light::{PlaneLight, PlanePositions};
+use super::column_blocks::ColumnBlocks;
+use super::plane_fft::Columns;
+use super::plane_light::{PlaneLight, PlanePositions, load, store, transfer};
+use super::pupil_stop::PupilStop;
+use super::view::View;
 use crate::engine::constants::FEEDBACK_DARK_POWER;
-use crate::optics::{signed_bin, transfer_table};
+use crate::simd::{InstructionSet, Simd, Task};
+use crate::weights::Feedback;
 
 /// One step of Gerchberg and Saxton (1972) at all planes at once: the field goes through the pupil to every plane,
 /// takes the wanted amplitude there with the phase that it has, and the mean of these changes comes back, each with its
 /// weight. The planes change one another too; the second net mends that. Nothing is allocated after `new`.
 pub(super) struct PlaneFeedback {
-    /// The share of the change that the field takes.
-    share: f32,
-    bench: DisplayGeometry,
-    size: Resolution,
-    /// From the SLM plane to the farthest plane: transposed spectra of each colour, over the number of samples.
-    to_farthest: [Vec<Complex32>; 3],
-    /// Transposed spectrum of what reaches the plane at hand.
-    reaching: Vec<Complex32>,
-    /// The change of the field that would give what is lacking, [3, height, width].
-    pub(super) change: Vec<Complex32>,
+    feedback: Feedback,
+    pupil: PupilStop,
+    /// From the SLM plane to the farthest plane, as spectra of [`PlaneLight`] lie.
+    to_farthest: Vec<f32>,
+    /// The spectrum of what reaches the next plane.
+    reaching: Vec<f32>,
+    /// Three colours: the change of the field that would give what is lacking.
+    pub(super) change: ColumnBlocks,
 }
 
 impl PlaneFeedback {
-    pub(super) fn new(share: f32, positions: PlanePositions, bench: &DisplayGeometry, size: Resolution) -> Self {
-        let table = |colour| transfer_table(bench.wavelengths[colour], sample_pitch(bench), size, positions.farthest);
+    pub(super) fn new(
+        feedback: Feedback,
+        positions: PlanePositions,
+        bench: &DisplayGeometry,
+        size: Resolution,
+        set: InstructionSet,
+    ) -> Self {
+        let to_farthest = transfer(bench, size, positions.farthest, set);
         Self {
-            share,
-            bench: *bench,
-            size,
-            to_farthest: Colour::ALL.map(table),
-            reaching: vec![Complex32::ZERO; size.pixels()],
-            change: vec![Complex32::ZERO; 3 * size.pixels()],
+            feedback,
+            pupil: PupilStop::new(bench, size, set),
+            reaching: vec![0.0; to_farthest.len()],
+            to_farthest,
+            change: ColumnBlocks::of_cells(Colour::ALL.len(), size, set),
         }
     }
 
-    /// Changes the field that `light` carried by what it lacks of the amplitudes `stack` [planes, 3, height, width],
-    /// which become that lack. `weight` is that of a change at a plane and a sample; `sum` is scratch for a spectrum.
-    pub(super) fn run(
-        &mut self,
-        light: &mut PlaneLight,
-        stack: &mut [f32],
-        sum: &mut [Complex32],
-        pupil_mm: f32,
-        weight: impl Fn(usize, usize) -> f32 + Sync,
-    ) {
-        let Self { share, bench, size, to_farthest, reaching, change } = self;
-        let pixels = size.pixels();
-        let mean = 1.0 / light.count as f32;
-        for colour in Colour::ALL {
-            let plane = colour.index() * pixels..(colour.index() + 1) * pixels;
-            let pupil = Pupil::new(bench, colour, pupil_mm, *size);
-            // Until the last step it holds the light at one plane after another.
-            let change = &mut change[plane.clone()];
-
-            light.send(colour, &to_farthest[colour.index()], reaching, change);
-            pupil.stop(reaching);
-            sum.fill(Complex32::ZERO);
-            for (number, stack) in stack.chunks_exact_mut(3 * pixels).enumerate() {
-                light.arrive(colour, reaching, change);
-                change.par_iter_mut().zip(&mut stack[plane.clone()]).enumerate().for_each(
-                    |(sample, (arriving, lack))| {
-                        let amplitude = (arriving.norm_sqr() + FEEDBACK_DARK_POWER).sqrt();
-                        *lack -= amplitude;
-                        *arriving *= weight(number, sample) * *lack / amplitude;
-                    },
-                );
-                light.add_light(colour, change, sum);
+    /// Changes the field that `light` carried by what it lacks of the amplitudes `stack`, three colours of each plane,
+    /// which become that lack.
+    pub(super) fn run(&mut self, light: &mut PlaneLight, stack: &mut ColumnBlocks, view: &impl View, pupil_mm: f32) {
+        let Self { feedback: Feedback { share, sharpness }, pupil, to_farthest, reaching, change } = self;
+        let (set, share, sharpness) = (light.set, *share, *sharpness);
+        pupil.set_mm(pupil_mm);
+        let fields = light.carried.blocks();
+        light.fft.for_columns(fields, |columns, field| set.run(Leave { columns, field }));
+        for plane in 0..light.count {
+            if plane == 0 {
+                light.send_to_farthest(to_farthest, pupil, reaching);
+            } else {
+                light.send_to_next(reaching);
             }
-            pupil.stop(sum);
-            light.bring_back(colour, sum, change);
-            light.carried[plane].par_iter_mut().zip(change).for_each(|(field, change)| {
-                *change *= mean;
-                *field += *change * *share;
+            light.fft.for_columns(stack.blocks_mut().enumerate(), |columns, (block, stack)| {
+                set.run(Compare { columns, stack, plane, block, view, sharpness });
             });
+            light.add(plane);
         }
-    }
-}
-
-/// The eye's pupil in the Fourier plane of the network's grid: a disc of radius (s/2)/(λ·f).
-struct Pupil {
-    radius_per_m: f64,
-    /// Cycles per metre from one bin to the next.
-    bin_per_m: [f64; 2],
-    size: Resolution,
-}
-
-impl Pupil {
-    fn new(bench: &DisplayGeometry, colour: Colour, pupil_mm: f32, size: Resolution) -> Self {
-        Self {
-            radius_per_m: 0.5e-3 * f64::from(pupil_mm) / (bench.wavelengths[colour].0 * bench.eyepiece_focal_length.0),
-            bin_per_m: [size.width, size.height].map(|bins| 1.0 / (bins as f64 * sample_pitch(bench).0)),
-            size,
-        }
-    }
-
-    /// Sets the transposed `spectrum` to 0 outside the pupil.
-    fn stop(&self, spectrum: &mut [Complex32]) {
-        let Self { radius_per_m, bin_per_m, size: Resolution { width, height } } = *self;
-        let squared = |bin, bins, bin_per_m: f64| (signed_bin(bin, bins) as f64 * bin_per_m).powi(2);
-        spectrum.par_chunks_exact_mut(height).enumerate().for_each(|(kx, spectrum)| {
-            let fx_squared = squared(kx, width, bin_per_m[0]);
-            for (ky, value) in spectrum.iter_mut().enumerate() {
-                if fx_squared + squared(ky, height, bin_per_m[1]) >= radius_per_m * radius_per_m {
-                    *value = Complex32::ZERO;
-                }
-            }
+        light.bring_back(Some(pupil));
+        let mean = 1.0 / light.count as f32;
+        let blocks = light.carried.blocks_mut().zip(change.blocks_mut());
+        light.fft.for_columns(blocks, |columns, (field, change)| {
+            set.run(Change { columns, field, change, mean, share });
         });
+    }
+}
+
+/// Light leaves the SLM plane.
+struct Leave<'a> {
+    columns: Columns<'a>,
+    field: &'a [f32],
+}
+
+impl Task for Leave<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut columns, field } = self;
+        for (colour, field) in field.chunks_exact(field.len() / Colour::ALL.len()).enumerate() {
+            columns.cells(colour).copy_from_slice(field);
+            columns.send(simd, colour);
+        }
+    }
+}
+
+/// What arrives at a plane becomes the change that it should have there, which is sent back.
+struct Compare<'a, V> {
+    columns: Columns<'a>,
+    /// Three colours of each plane.
+    stack: &'a mut [f32],
+    plane: usize,
+    block: usize,
+    view: &'a V,
+    sharpness: f32,
+}
+
+impl<V: View> Task for Compare<'_, V> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut columns, stack, plane, block, view, sharpness } = self;
+        for colour in Colour::ALL {
+            columns.arrive(simd, colour.index());
+        }
+        let cells = columns.all_cells();
+        let len = cells.len() / Colour::ALL.len();
+        let lacks = &mut stack[plane * cells.len() / 2..][..cells.len() / 2];
+        for y in 0..len / (2 * S::LANES) {
+            let share = view.share_in_focus(simd, plane, block, y);
+            let weight = simd.mul_add(simd.splat(sharpness), share, simd.splat(1.0));
+            for colour in 0..Colour::ALL.len() {
+                let cell = &mut cells[colour * len + y * 2 * S::LANES..];
+                let wanted = &mut lacks[(colour * len / 2) + y * S::LANES..];
+                let [re, im] = load(simd, cell);
+                let power = simd.mul_add(re, re, simd.mul_add(im, im, simd.splat(FEEDBACK_DARK_POWER)));
+                let amplitude = simd.sqrt(power);
+                let lack = simd.sub(simd.read(wanted), amplitude);
+                simd.write(wanted, lack);
+                let change = simd.div(simd.mul(weight, lack), amplitude);
+                store(simd, cell, [simd.mul(re, change), simd.mul(im, change)]);
+            }
+        }
+        for colour in Colour::ALL {
+            columns.send(simd, colour.index());
+        }
+    }
+}
+
+/// The field takes its share of the mean change.
+struct Change<'a> {
+    columns: Columns<'a>,
+    field: &'a mut [f32],
+    change: &'a mut [f32],
+    mean: f32,
+    share: f32,
+}
+
+impl Task for Change<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut columns, field, change, mean, share } = self;
+        let len = field.len() / Colour::ALL.len();
+        for (colour, (field, change)) in field.chunks_exact_mut(len).zip(change.chunks_exact_mut(len)).enumerate() {
+            let sums = columns.arrive(simd, colour);
+            for ((field, change), sum) in field.iter_mut().zip(change).zip(sums) {
+                *change = *sum * mean;
+                *field += *change * share;
+            }
+        }
     }
 }

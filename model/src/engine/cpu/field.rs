@@ -79,6 +79,6 @@ impl<F: UncorrectedField> Stage<F> for Field {
 
     #[cfg(test)]
     fn seen<'a>(&'a self, _: &'a Buffers<F>, job: &'a Job<'_, F::Input>) -> super::stage::Seen<'a> {
-        super::stage::Seen::Light(&job.hologram.field)
+        super::stage::Seen::Light(job.hologram.field[..].into())
     }
 }

@@ -3,14 +3,15 @@
 use holod_calibration::{DisplayGeometry, Resolution};
 use rayon::prelude::*;
 
-use super::blocks::{Blocks, grid_size};
-use super::input_features::{BLOCK, FIRST_MAP, SCALE};
+use super::blocks::{BLOCK, Blocks, SCALE, grid_size};
+use super::input_features::FIRST_MAP;
 use super::plane_light::PlanePositions;
-use super::plane_stack::{PlaneNetwork, PlaneStack, View};
+use super::plane_stack::{PlaneNetwork, PlaneStack};
 use super::stage::{Buffers, Job, MapId, Stage, plane_bytes};
 use super::stage_list::StageList;
+use super::view::View;
 use crate::scene::FocalStack;
-use crate::simd::InstructionSet;
+use crate::simd::{InstructionSet, Simd};
 use crate::weights::{CONDITIONS, Feedback, Layer, NetworkConfig};
 
 /// For images of `resolution`; `nets` are the layers of the first and of the second net.
@@ -38,8 +39,9 @@ pub(super) struct FocalImages;
 impl View for FocalImages {
     type Input = FocalStack;
 
-    fn share_in_focus(&self, _: usize, _: usize) -> f32 {
-        0.0
+    #[inline(always)]
+    fn share_in_focus<S: Simd>(&self, simd: S, _: usize, _: usize, _: usize) -> S::Vector {
+        simd.splat(0.0)
     }
 }
 
@@ -62,14 +64,12 @@ impl Stage<PlaneStack<FocalImages>> for Tell {
         let Buffers { maps, family: PlaneStack { stack, .. } } = buffers;
         let FocalStack { resolution, amplitude, .. } = job.input;
         let blocks = Blocks { frame: *resolution, scale: SCALE };
-        let Resolution { width, height } = maps.size;
-        stack.par_chunks_exact_mut(width).enumerate().for_each(|(row, means)| {
-            let image = &amplitude[row / height * resolution.pixels()..][..resolution.pixels()];
-            for (x, mean) in means.iter_mut().enumerate() {
-                let light = (0..BLOCK).map(|corner| image[blocks.index(x, row % height, corner)].powi(2));
-                *mean = (light.sum::<f32>() / BLOCK as f32).sqrt();
-            }
+        stack.fill(|plane, x, y| {
+            let image = &amplitude[plane * resolution.pixels()..][..resolution.pixels()];
+            let light = (0..BLOCK).map(|corner| image[blocks.index(x, y, corner)].powi(2));
+            (light.sum::<f32>() / BLOCK as f32).sqrt()
         });
+        let width = maps.size.width;
         let told = job.conditions.told().map(|value| value as f32);
         for (input, first) in self.inputs.into_iter().zip([0, FIRST_MAP]) {
             let map = &mut maps[input];

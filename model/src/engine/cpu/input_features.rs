@@ -4,21 +4,18 @@ use holod_calibration::{Colour, DisplayGeometry, Metres};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
-use super::blocks::{Blocks, scale_of};
-use super::feature_map::FeatureMap;
-use crate::RgbdFrame;
+use super::blocks::{BLOCK, SCALE};
+use super::column_blocks::ColumnBlocks;
+use super::feature_map::{BAND, FeatureMap};
+use super::frame_blocks::{DEPTH, FrameBlocks};
 use crate::conditions::Conditions;
-use crate::weights::{CONDITIONS, Grid, OUTPUT_CHANNELS};
+use crate::simd::{InstructionSet, Simd, Task};
+use crate::weights::{CONDITIONS, OUTPUT_CHANNELS};
 
-pub(super) const SCALE: usize = scale_of(Grid::HalfBand);
-/// Panel pixels to a sample of the grid.
-pub(super) const BLOCK: usize = SCALE * SCALE;
 /// Amplitude and two depth maps, each four times, and what is told of bench and pupil.
 pub(super) const MAPS: usize = 5 * BLOCK + CONDITIONS;
 /// Where the second net's input has the maps: after the field.
 pub(super) const FIRST_MAP: usize = OUTPUT_CHANNELS;
-/// Pixels whose channels stay in the first-level cache while one plane after another is read or written.
-pub(super) const RUN_PX: usize = 16;
 /// The share of the second net's output that is added to the field.
 const CORRECTION_SHARE: f32 = 0.3;
 
@@ -27,70 +24,148 @@ pub(super) fn sample_pitch(bench: &DisplayGeometry) -> Metres {
     Metres(SCALE as f64 * bench.pixel_pitch.0)
 }
 
-/// Writes what a net is told of a frame, bench and pupil to the channels of `map` from `first` on.
-pub(super) fn write_maps(map: &mut FeatureMap, first: usize, frame: &RgbdFrame, conditions: Conditions) {
-    let blocks = Blocks { frame: frame.resolution, scale: SCALE };
-    let (columns, stride, pixels) = (map.width, map.stride, frame.resolution.pixels());
+/// Writes what both nets are told of a frame, bench and pupil, and the amplitudes `stack` that an eye should see: to the
+/// channels of the first one's map from 0 on, of the second one's from [`FIRST_MAP`] on.
+pub(super) fn write_inputs(
+    [first, second]: [&mut FeatureMap; 2],
+    frame: &FrameBlocks,
+    conditions: Conditions,
+    stack: &ColumnBlocks,
+    set: InstructionSet,
+) {
+    let strides = [first.stride, second.stride];
+    let row_lens = [first.row_len, second.row_len];
+    let (width, lanes) = (first.width, stack.lanes());
     let (told, blur_scale) = (conditions.told().map(|value| value as f32), conditions.blur_scale() as f32);
-    map.rows_mut().enumerate().for_each(|(y, row)| {
-        for (x, channels) in row[stride..][..columns * stride].chunks_exact_mut(stride).enumerate() {
-            let maps = &mut channels[first..][..MAPS];
-            for corner in 0..BLOCK {
-                let source = blocks.index(x, y, corner);
-                for colour in 0..3 {
-                    maps[colour * BLOCK + corner] = frame.amplitude[colour * pixels + source] - 0.4;
-                }
-                let centred = frame.depth_normalised[source] - 0.5;
-                maps[3 * BLOCK + corner] = 2.0 * centred;
-                maps[4 * BLOCK + corner] = centred * blur_scale;
+    first.bands_mut().zip(second.bands_mut()).enumerate().for_each(|(band, (first, second))| {
+        for (block, x) in (0..width).step_by(lanes).enumerate() {
+            let pixels = lanes.min(width - x);
+            let rows = first.chunks_exact_mut(row_lens[0]).zip(second.chunks_exact_mut(row_lens[1]));
+            for (y, (first, second)) in (band * BAND..).zip(rows) {
+                let channels = Samples { frame, stack, told, blur_scale, block, y };
+                let to = [
+                    (&mut first[(x + 1) * strides[0]..][..pixels * strides[0]], strides[0]),
+                    (&mut second[(x + 1) * strides[1] + FIRST_MAP..][..pixels * strides[1] - FIRST_MAP], strides[1]),
+                ];
+                set.run(WriteChannels { count: MAPS + stack.planes(), channels, to });
             }
-            maps[5 * BLOCK..].copy_from_slice(&told);
         }
     });
 }
 
-impl FeatureMap {
-    /// Writes planes [height, width] to the channels from `first` on, each value through `change`.
-    pub(super) fn write_planes<'a>(
-        &mut self,
-        first: usize,
-        planes: impl Iterator<Item = &'a [f32]> + Clone + Sync,
-        change: impl Fn(f32) -> f32 + Sync,
-    ) {
-        let (width, stride) = (self.width, self.stride);
-        self.rows_mut().enumerate().for_each(|(y, row)| {
-            let runs = row[stride..][..width * stride].chunks_mut(RUN_PX * stride);
-            for (x, pixels) in (0..width).step_by(RUN_PX).zip(runs) {
-                for (channel, plane) in planes.clone().enumerate() {
-                    let pixels = pixels[first + channel..].iter_mut().step_by(stride);
-                    for (to, from) in pixels.zip(&plane[y * width + x..]) {
-                        *to = change(*from);
+/// What is written to the channels of the pixels in one row of a block of columns.
+trait Channels {
+    /// One channel of each pixel.
+    fn channel<S: Simd>(&self, simd: S, channel: usize) -> S::Vector;
+}
+
+/// What nets are told of the samples of a block.
+struct Samples<'a> {
+    frame: &'a FrameBlocks,
+    stack: &'a ColumnBlocks,
+    told: [f32; CONDITIONS],
+    blur_scale: f32,
+    block: usize,
+    y: usize,
+}
+
+impl Channels for Samples<'_> {
+    #[inline(always)]
+    fn channel<S: Simd>(&self, simd: S, channel: usize) -> S::Vector {
+        let Self { frame, stack, told, blur_scale, block, y } = self;
+        let (planes, plane, less, factor) = match channel / BLOCK {
+            0..DEPTH => (&frame.planes, channel, 0.4, 1.0),
+            DEPTH => (&frame.planes, channel, 0.5, 2.0),
+            4 => (&frame.planes, channel - BLOCK, 0.5, *blur_scale),
+            _ if channel < MAPS => return simd.splat(told[channel - 5 * BLOCK]),
+            _ => (*stack, channel - MAPS, 0.4, 1.0),
+        };
+        let values = simd.read(planes.row_of_block(*block, plane, *y));
+        simd.mul(simd.sub(values, simd.splat(less)), simd.splat(factor))
+    }
+}
+
+/// Planes beside one another, of complex ones first all real parts.
+struct Planes<'a> {
+    blocks: &'a [&'a ColumnBlocks],
+    block: usize,
+    y: usize,
+}
+
+impl Channels for Planes<'_> {
+    #[inline(always)]
+    fn channel<S: Simd>(&self, simd: S, channel: usize) -> S::Vector {
+        let mut plane = channel;
+        for blocks in self.blocks {
+            let count = blocks.planes() * blocks.parts();
+            if plane < count {
+                let (part, plane) = (plane / blocks.planes(), plane % blocks.planes());
+                return simd.read(&blocks.row_of_block(self.block, plane, self.y)[part * S::LANES..]);
+            }
+            plane -= count;
+        }
+        unreachable!("there are so many channels")
+    }
+}
+
+/// Writes channels to pixels of N maps, each with its stride.
+struct WriteChannels<'a, C, const N: usize> {
+    count: usize,
+    channels: C,
+    to: [(&'a mut [f32], usize); N],
+}
+
+impl<C: Channels, const N: usize> Task for WriteChannels<'_, C, N> {
+    #[inline(always)]
+    fn run<S: Simd>(mut self, simd: S) {
+        // No set has more lanes.
+        let (mut rows, mut columns) = ([[0.0f32; 16]; 16], [[0.0f32; 16]; 16]);
+        let count = S::LANES.min(self.count);
+        for first in (0..self.count).step_by(S::LANES) {
+            // The last ones begin early enough to be whole vectors, too.
+            let first = first.min(self.count - count);
+            for (channel, row) in rows.iter_mut().enumerate().take(count) {
+                simd.write(row, self.channels.channel(simd, first + channel));
+            }
+            // SAFETY: both have 16 rows of 16, of which LANES are read and written.
+            unsafe { simd.transpose(rows[0].as_ptr(), columns[0].as_mut_ptr(), [16; 2]) };
+            for (pixels, stride) in &mut self.to {
+                for (pixel, channels) in pixels.chunks_mut(*stride).zip(&columns) {
+                    let pixel = &mut pixel[first..][..count];
+                    if count == S::LANES {
+                        simd.write(pixel, simd.read(channels));
+                    } else {
+                        pixel.iter_mut().zip(channels).for_each(|(to, from)| *to = *from);
                     }
                 }
             }
-        });
+        }
     }
+}
 
-    /// Writes fields [3, height, width] to six channels from `first` on, the real parts first.
-    pub(super) fn write_fields(&mut self, first: usize, fields: &[Complex32]) {
-        let (width, height, stride) = (self.width, self.height, self.stride);
-        self.rows_mut().enumerate().for_each(|(y, row)| {
-            for (colour, field) in fields.chunks_exact(width * height).enumerate() {
-                let pixels = row[stride + first..].chunks_mut(stride);
-                for (to, from) in pixels.zip(&field[y * width..][..width]) {
-                    to[colour] = from.re;
-                    to[3 + colour] = from.im;
+impl FeatureMap {
+    /// Writes planes to the channels from `first` on, those of one [`ColumnBlocks`] after another; of complex ones first
+    /// all real parts.
+    pub(super) fn write_planes(&mut self, first: usize, blocks: &[&ColumnBlocks], set: InstructionSet) {
+        let (width, stride, lanes) = (self.width, self.stride, set.lanes());
+        let count = blocks.iter().map(|blocks| blocks.planes() * blocks.parts()).sum();
+        let row_len = self.row_len;
+        self.bands_mut().enumerate().for_each(|(band, rows)| {
+            for (block, x) in (0..width).step_by(lanes).enumerate() {
+                let pixels = lanes.min(width - x);
+                for (y, row) in (band * BAND..).zip(rows.chunks_exact_mut(row_len)) {
+                    let to = [(&mut row[(x + 1) * stride + first..][..pixels * stride - first], stride)];
+                    set.run(WriteChannels { count, channels: Planes { blocks, block, y }, to });
                 }
             }
         });
     }
 
-    /// Writes `base` and a share of this correction of one colour to `field`, both [height, width]; the map's channels
-    /// are three real parts and three imaginary ones.
-    pub(super) fn correct(&self, base: &[Complex32], colour: Colour, field: &mut [Complex32]) {
-        let rows = field.par_chunks_exact_mut(self.width).zip(base.par_chunks_exact(self.width));
-        rows.enumerate().for_each(|(y, (row, base))| {
-            for (x, (value, base)) in row.iter_mut().zip(base).enumerate() {
+    /// Writes `base` and a share of this correction of one colour to `field` [height, width]; the map's channels are
+    /// three real parts and three imaginary ones.
+    pub(super) fn correct(&self, base: &ColumnBlocks, colour: Colour, field: &mut [Complex32]) {
+        field.par_chunks_exact_mut(self.width).enumerate().for_each(|(y, row)| {
+            for (x, (value, base)) in row.iter_mut().zip(base.row_of_cells(colour.index(), y)).enumerate() {
                 let residual = self.pixel(x, y);
                 let residual = Complex32::new(residual[colour.index()], residual[3 + colour.index()]);
                 *value = base + residual * CORRECTION_SHARE;

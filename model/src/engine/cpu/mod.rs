@@ -1,6 +1,7 @@
 //! The network on the CPU: channels-last maps, rayon over rows, SIMD chosen at run time.
 
 mod blocks;
+mod column_blocks;
 mod conv;
 mod defocus;
 mod deformable;
@@ -11,17 +12,23 @@ mod feature_map;
 mod feedback;
 mod field;
 mod focal_stack;
+mod frame_blocks;
 mod input_features;
+mod line_fft;
 mod network;
 mod peak;
+mod plane_fft;
 mod plane_light;
 mod plane_stack;
 mod product;
+mod pupil_stop;
 mod stage;
 mod stage_list;
 #[cfg(test)]
 pub(super) mod tests;
 mod trunk;
+mod view;
+mod workers;
 
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 

@@ -1,11 +1,13 @@
 //! Light on planes of the depth volume, and how it goes between them and the SLM plane.
 
 use holod_calibration::{Colour, DisplayGeometry, Metres, Resolution};
-use num_complex::Complex32;
-use rayon::prelude::*;
 
+use super::column_blocks::ColumnBlocks;
 use super::input_features::sample_pitch;
-use crate::optics::{TransposedFft2d, transfer_table};
+use super::plane_fft::{Columns, PlaneFft, Rows};
+use super::pupil_stop::PupilStop;
+use crate::optics::transfer_table;
+use crate::simd::{InstructionSet, Simd, Task};
 
 /// Planes equally far apart, which is equal in dioptres, too.
 #[derive(Clone, Copy)]
@@ -35,73 +37,239 @@ impl PlanePositions {
 
 /// Light of planes far to near, carried by ASM on the half-band grid. Nothing is allocated after `new`.
 ///
-/// Transfer functions are transposed spectra of each colour, over the number of samples.
+/// Spectra and transfer functions lie as [`PlaneFft::room_for_spectra`] has them, a plane for each colour.
 pub(super) struct PlaneLight {
     pub(super) count: usize,
-    size: Resolution,
-    /// From one plane to the next nearer one, and from the nearest to the SLM plane.
-    step: [Vec<Complex32>; 3],
-    back: [Vec<Complex32>; 3],
-    fft: TransposedFft2d<f32>,
-    /// [3, height, width]: what arrives at the SLM plane.
-    pub(super) carried: Vec<Complex32>,
+    pub(super) set: InstructionSet,
+    pub(super) fft: PlaneFft,
+    /// From one plane to the next nearer one.
+    step: Vec<f32>,
+    /// From the nearest plane to the SLM plane, over the number of samples.
+    back: Vec<f32>,
+    /// The light of the planes so far.
+    sum: Vec<f32>,
+    /// Three colours: what arrives at the SLM plane.
+    pub(super) carried: ColumnBlocks,
 }
 
 impl PlaneLight {
-    pub(super) fn new(positions: PlanePositions, bench: &DisplayGeometry, size: Resolution) -> Self {
+    pub(super) fn new(
+        positions: PlanePositions,
+        bench: &DisplayGeometry,
+        size: Resolution,
+        set: InstructionSet,
+    ) -> Self {
         let PlanePositions { count, farthest, step } = positions;
-        let tables = |u_m: f64| {
-            let table = |colour| transfer_table(bench.wavelengths[colour], sample_pitch(bench), size, Metres(u_m));
-            Colour::ALL.map(table)
-        };
+        let nearest_m = farthest.0 + (count - 1) as f64 * step.0;
+        let mut step = transfer(bench, size, step, set);
+        step.iter_mut().for_each(|value| *value *= size.pixels() as f32);
+        let fft = PlaneFft::new(Colour::ALL.len(), size, set);
         Self {
             count,
-            size,
-            step: tables(step.0),
-            back: tables(-(farthest.0 + (count - 1) as f64 * step.0)),
-            fft: TransposedFft2d::new(size.width, size.height),
-            carried: vec![Complex32::ZERO; 3 * size.pixels()],
+            set,
+            step,
+            back: transfer(bench, size, Metres(-nearest_m), set),
+            sum: fft.room_for_spectra(),
+            fft,
+            carried: ColumnBlocks::of_cells(Colour::ALL.len(), size, set),
         }
     }
 
-    /// Adds the light [height, width] that one plane sends out, which is used up, to the transposed spectrum `sum` of
-    /// the light of farther ones: Horner's rule, far to near, from zeros on.
-    pub(super) fn add_light(&mut self, colour: Colour, light: &mut [Complex32], sum: &mut [Complex32]) {
-        self.fft.forward(light);
-        let samples = self.size.pixels() as f32;
-        let transformed = self.fft.spectrum.par_iter().zip(&self.step[colour.index()]);
-        sum.par_iter_mut().zip(transformed).for_each(|(sum, (spectrum, step))| {
-            *sum = *sum * (step * samples) + spectrum;
+    /// Adds the light that plane `number` has sent to that of farther ones: Horner's rule, far to near.
+    pub(super) fn add(&mut self, number: usize) {
+        let Self { set, fft, step, sum, .. } = self;
+        let blocks = sum.chunks_exact_mut(fft.spectra_len()).zip(step.chunks_exact(fft.spectra_len()));
+        fft.for_rows(blocks, |rows, (sum, step)| set.run(Add { rows, sum, step, is_first: number == 0 }));
+    }
+
+    /// Sends what arrives at the SLM plane of the light of all planes, through a pupil or past it.
+    pub(super) fn bring_back(&mut self, pupil: Option<&PupilStop>) {
+        let Self { set, fft, sum, back, .. } = self;
+        let blocks = sum.chunks_exact(fft.spectra_len()).zip(back.chunks_exact(fft.spectra_len())).enumerate();
+        fft.for_rows(blocks, |rows, (block, (sum, back))| set.run(BringBack { rows, sum, back, pupil, block }));
+    }
+
+    /// Sends light that has left the SLM plane to the farthest plane through a pupil: `transfer` is the transfer
+    /// function to there, and `reaching` becomes what reaches the next nearer plane.
+    pub(super) fn send_to_farthest(&mut self, transfer: &[f32], pupil: &PupilStop, reaching: &mut [f32]) {
+        let Self { set, fft, step, .. } = self;
+        let len = fft.spectra_len();
+        let tables = transfer.chunks_exact(len).zip(step.chunks_exact(len));
+        let blocks = reaching.chunks_exact_mut(len).zip(tables).enumerate();
+        fft.for_rows(blocks, |rows, (block, (reaching, (transfer, step)))| {
+            set.run(SendToFarthest { rows, transfer, pupil, block, reaching, step });
         });
     }
 
-    /// Writes to `field` [height, width] what arrives at the SLM plane of the light of all planes.
-    pub(super) fn bring_back(&mut self, colour: Colour, sum: &[Complex32], field: &mut [Complex32]) {
-        let summed = sum.par_iter().zip(&self.back[colour.index()]);
-        self.fft.spectrum.par_iter_mut().zip(summed).for_each(|(value, (sum, back))| *value = sum * back);
-        self.fft.inverse(field);
+    /// Sends `reaching` to a plane, and makes of it what reaches the next nearer one.
+    pub(super) fn send_to_next(&mut self, reaching: &mut [f32]) {
+        let Self { set, fft, step, .. } = self;
+        let blocks = reaching.chunks_exact_mut(fft.spectra_len()).zip(step.chunks_exact(fft.spectra_len()));
+        fft.for_rows(blocks, |rows, (reaching, step)| set.run(SendToNext { rows, reaching, step }));
     }
 
-    /// Writes the transposed spectrum of one colour of the carried field, times `transfer`, to `spectrum`; `scratch` is
-    /// [height, width].
-    pub(super) fn send(
-        &mut self,
-        colour: Colour,
-        transfer: &[Complex32],
-        spectrum: &mut [Complex32],
-        scratch: &mut [Complex32],
-    ) {
-        scratch.copy_from_slice(&self.carried[colour.index() * self.size.pixels()..][..self.size.pixels()]);
-        self.fft.forward(scratch);
-        let sent = self.fft.spectrum.par_iter().zip(transfer);
-        spectrum.par_iter_mut().zip(sent).for_each(|(value, (sent, transfer))| *value = sent * transfer);
+    /// Takes what has arrived at the SLM plane as the field.
+    pub(super) fn keep(&mut self) {
+        let Self { set, fft, carried, .. } = self;
+        fft.for_columns(carried.blocks_mut(), |columns, carried| set.run(Keep { columns, carried }));
     }
+}
 
-    /// Writes the light [height, width] of a transposed `spectrum`, and carries that to the next nearer plane.
-    pub(super) fn arrive(&mut self, colour: Colour, spectrum: &mut [Complex32], light: &mut [Complex32]) {
-        self.fft.spectrum.copy_from_slice(spectrum);
-        self.fft.inverse(light);
-        let samples = self.size.pixels() as f32;
-        spectrum.par_iter_mut().zip(&self.step[colour.index()]).for_each(|(value, step)| *value *= step * samples);
+/// The transfer functions of all colours over the distance `u`, over the number of samples.
+pub(super) fn transfer(bench: &DisplayGeometry, size: Resolution, u: Metres, set: InstructionSet) -> Vec<f32> {
+    let Resolution { width, height } = size;
+    let lanes = set.lanes();
+    let tables = Colour::ALL.map(|colour| transfer_table(bench.wavelengths[colour], sample_pitch(bench), size, u));
+    let mut spectra = vec![0.0; height.div_ceil(lanes) * tables.len() * width * 2 * lanes];
+    for (number, cell) in spectra.chunks_exact_mut(2 * lanes).enumerate() {
+        let (first, table, column) = (number / (3 * width) * lanes, &tables[number / width % 3], number % width);
+        for (lane, value) in table[column * height..][..height].iter().skip(first).take(lanes).enumerate() {
+            (cell[lane], cell[lanes + lane]) = (value.re, value.im);
+        }
+    }
+    spectra
+}
+
+/// The two vectors of a cell.
+#[inline(always)]
+pub(super) fn load<S: Simd>(simd: S, cell: &[f32]) -> [S::Vector; 2] {
+    [simd.read(cell), simd.read(&cell[S::LANES..])]
+}
+
+#[inline(always)]
+pub(super) fn store<S: Simd>(simd: S, cell: &mut [f32], [re, im]: [S::Vector; 2]) {
+    simd.write(cell, re);
+    simd.write(&mut cell[S::LANES..], im);
+}
+
+#[inline(always)]
+fn product<S: Simd>(simd: S, [a_re, a_im]: [S::Vector; 2], [b_re, b_im]: [S::Vector; 2]) -> [S::Vector; 2] {
+    [simd.neg_mul_add(a_im, b_im, simd.mul(a_re, b_re)), simd.mul_add(a_im, b_re, simd.mul(a_re, b_im))]
+}
+
+struct Add<'a> {
+    rows: Rows<'a>,
+    sum: &'a mut [f32],
+    step: &'a [f32],
+    is_first: bool,
+}
+
+impl Task for Add<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut rows, sum, step, is_first } = self;
+        for colour in Colour::ALL {
+            let arriving = rows.arrive(simd, colour.index());
+            let plane = colour.index() * arriving.len()..(colour.index() + 1) * arriving.len();
+            let (sum, step) = (&mut sum[plane.clone()], &step[plane]);
+            if is_first {
+                sum.copy_from_slice(arriving);
+                continue;
+            }
+            let cells = sum.chunks_exact_mut(2 * S::LANES).zip(step.chunks_exact(2 * S::LANES));
+            for ((sum, step), arriving) in cells.zip(arriving.chunks_exact(2 * S::LANES)) {
+                let ([sum_re, sum_im], [step_re, step_im]) = (load(simd, sum), load(simd, step));
+                let [re, im] = load(simd, arriving);
+                let re = simd.neg_mul_add(sum_im, step_im, simd.mul_add(sum_re, step_re, re));
+                let im = simd.mul_add(sum_im, step_re, simd.mul_add(sum_re, step_im, im));
+                store(simd, sum, [re, im]);
+            }
+        }
+    }
+}
+
+struct BringBack<'a> {
+    rows: Rows<'a>,
+    sum: &'a [f32],
+    back: &'a [f32],
+    pupil: Option<&'a PupilStop>,
+    block: usize,
+}
+
+impl Task for BringBack<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut rows, sum, back, pupil, block } = self;
+        for colour in Colour::ALL {
+            let cells = rows.cells(colour.index());
+            let plane = colour.index() * cells.len()..(colour.index() + 1) * cells.len();
+            multiply(simd, &sum[plane.clone()], &back[plane], cells);
+            if let Some(pupil) = pupil {
+                pupil.stop::<S>(colour, block, cells);
+            }
+            rows.send(simd, colour.index());
+        }
+    }
+}
+
+struct SendToFarthest<'a> {
+    rows: Rows<'a>,
+    transfer: &'a [f32],
+    pupil: &'a PupilStop,
+    block: usize,
+    reaching: &'a mut [f32],
+    step: &'a [f32],
+}
+
+impl Task for SendToFarthest<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut rows, transfer, pupil, block, reaching, step } = self;
+        for colour in Colour::ALL {
+            let cells = rows.arrive(simd, colour.index());
+            let plane = colour.index() * cells.len()..(colour.index() + 1) * cells.len();
+            let reaching = &mut reaching[plane.clone()];
+            multiply(simd, cells, &transfer[plane.clone()], reaching);
+            pupil.stop::<S>(colour, block, reaching);
+            cells.copy_from_slice(reaching);
+            multiply(simd, cells, &step[plane], reaching);
+            rows.send(simd, colour.index());
+        }
+    }
+}
+
+struct SendToNext<'a> {
+    rows: Rows<'a>,
+    reaching: &'a mut [f32],
+    step: &'a [f32],
+}
+
+impl Task for SendToNext<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut rows, reaching, step } = self;
+        for colour in Colour::ALL {
+            let cells = rows.cells(colour.index());
+            let plane = colour.index() * cells.len()..(colour.index() + 1) * cells.len();
+            let reaching = &mut reaching[plane.clone()];
+            cells.copy_from_slice(reaching);
+            multiply(simd, cells, &step[plane], reaching);
+            rows.send(simd, colour.index());
+        }
+    }
+}
+
+/// Writes the products of the cells of `a` and `b` to `to`.
+#[inline(always)]
+fn multiply<S: Simd>(simd: S, a: &[f32], b: &[f32], to: &mut [f32]) {
+    let factors = a.chunks_exact(2 * S::LANES).zip(b.chunks_exact(2 * S::LANES));
+    for ((a, b), to) in factors.zip(to.chunks_exact_mut(2 * S::LANES)) {
+        store(simd, to, product(simd, load(simd, a), load(simd, b)));
+    }
+}
+
+struct Keep<'a> {
+    columns: Columns<'a>,
+    carried: &'a mut [f32],
+}
+
+impl Task for Keep<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut columns, carried } = self;
+        let plane_len = carried.len() / Colour::ALL.len();
+        for (colour, carried) in carried.chunks_exact_mut(plane_len).enumerate() {
+            carried.copy_from_slice(columns.arrive(simd, colour));
+        }
     }
 }

@@ -6,38 +6,31 @@ use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::blocks::grid_size;
+use super::column_blocks::ColumnBlocks;
 use super::feature_map::FeatureMap;
 use super::feedback::PlaneFeedback;
 use super::field::{Field, UncorrectedField};
-use super::input_features::{FIRST_MAP, RUN_PX};
-use super::plane_light::{PlaneLight, PlanePositions};
+use super::input_features::FIRST_MAP;
+use super::plane_fft::Columns;
+use super::plane_light::{PlaneLight, PlanePositions, store};
 use super::stage::{Buffers, Job, MapId, Maps, Shared, Stage, plane_bytes};
 use super::stage_list::StageList;
 use super::trunk::Trunk;
+use super::view::View;
 use crate::engine::constants::REFINED_SHARE;
-use crate::phase_math::cos_sin_pi;
+use crate::phase_math::{cos_sin_pi, exp};
 use crate::simd::{InstructionSet, Simd, Task};
 use crate::weights::{Feedback, LIT, Layer, NetworkConfig, OUTPUT_CHANNELS, REFINED};
 
 /// The mask's place among the first net's outputs for a plane.
 const MASK: usize = 3;
 
-/// Where it is known what is to be seen at the planes.
-pub(super) trait View: Send + Sync {
-    type Input;
-
-    /// The share of a sample that is known to be in focus at a plane.
-    fn share_in_focus(&self, plane: usize, sample: usize) -> f32;
-}
-
 /// What the stages share besides maps.
 pub(super) struct PlaneStack<V> {
     light: PlaneLight,
-    /// [planes, 3, height, width]: the amplitudes that an eye should see, once the planes are lit as the first net
+    /// Three colours of each plane: the amplitudes that an eye should see, once the planes are lit as the first net
     /// corrects them; after the feedback, what is lacking of them.
-    pub(super) stack: Vec<f32>,
-    /// Scratch: the transposed spectrum of the light of the planes so far.
-    sum: Vec<Complex32>,
+    pub(super) stack: ColumnBlocks,
     pub(super) view: V,
 }
 
@@ -49,7 +42,7 @@ impl<V: View> UncorrectedField for PlaneStack<V> {
     const PLANES: usize = OUTPUT_CHANNELS;
 
     fn write_corrected(&self, residual: &FeatureMap, colour: Colour, field: &mut [Complex32]) {
-        residual.correct(&self.light.carried[colour.index() * field.len()..], colour, field);
+        residual.correct(&self.light.carried, colour, field);
     }
 }
 
@@ -84,9 +77,8 @@ impl PlaneNetwork<'_> {
         let correction = Trunk::new(&mut maps, "correction ", correction, config.leaky_slope);
         let stack_planes = 3 * positions.count;
         let shared = PlaneStack {
-            light: PlaneLight::new(positions, bench, size),
-            stack: vec![0.0; stack_planes * size.pixels()],
-            sum: vec![Complex32::ZERO; size.pixels()],
+            light: PlaneLight::new(positions, bench, size, set),
+            stack: ColumnBlocks::of_reals(stack_planes, size, set),
             view,
         };
         StageList::new(maps, shared)
@@ -100,15 +92,13 @@ impl PlaneNetwork<'_> {
                 ),
                 output: lighting.output,
                 refines: config.refined_stack,
-                rows: vec![0.0; lights * size.pixels()],
-                light: vec![Complex32::ZERO; size.pixels()],
+                outputs: ColumnBlocks::of_reals(lights.next_multiple_of(set.lanes()), size, set),
             })
             .then(FeedBack {
                 // The field before and after, for the net the field and its change, and the stack and what is lacking
                 // of it.
                 bytes: view_bytes + plane_bytes(4 * OUTPUT_CHANNELS + 2 * stack_planes, size),
-                feedback: PlaneFeedback::new(feedback.share, positions, bench, size),
-                sharpness: feedback.sharpness,
+                feedback: PlaneFeedback::new(feedback, positions, bench, size, set),
                 told,
                 correction_input: correction.input,
             })
@@ -124,11 +114,8 @@ struct LightPlanes {
     /// The first net's.
     output: MapId,
     refines: bool,
-    /// [height, channels, width]: what the first net gives, masks as shares of the light; a copy of its map in which a
-    /// channel's row lies together, so that it is read as vectors.
-    rows: Vec<f32>,
-    /// What one plane sends out in one colour.
-    light: Vec<Complex32>,
+    /// What the first net gives, masks as shares of the light.
+    outputs: ColumnBlocks,
 }
 
 impl<V: View> Stage<PlaneStack<V>> for LightPlanes {
@@ -141,77 +128,105 @@ impl<V: View> Stage<PlaneStack<V>> for LightPlanes {
     }
 
     fn run(&mut self, buffers: &mut Buffers<PlaneStack<V>>, _: &mut Job<'_, V::Input>) {
-        let Self { output, refines, rows: output_rows, light, .. } = self;
-        let Buffers { maps, family: PlaneStack { light: planes, stack, sum, .. } } = buffers;
-        let (output, set, width, pixels) = (&maps[*output], maps.set, maps.size.width, maps.size.pixels());
-        let (count, channels) = (planes.count, output_rows.len() / pixels);
-        let offset = ((count - 1) as f32).ln();
-        output_rows.par_chunks_exact_mut(channels * width).enumerate().for_each(|(y, rows)| {
-            for x in (0..width).step_by(RUN_PX) {
-                for (channel, row) in rows.chunks_exact_mut(width).enumerate() {
-                    let run = row[x..].iter_mut().take(RUN_PX);
-                    run.zip(output.channel(channel, y).skip(x)).for_each(|(to, from)| *to = *from);
-                }
-            }
-            for (channel, row) in rows.chunks_exact_mut(width).enumerate() {
-                if channel < LIT * count && channel % LIT == MASK {
-                    row.iter_mut().for_each(|mask| *mask = 1.0 / (1.0 + (offset - *mask).exp()));
-                }
-            }
+        let Self { output, refines, outputs, .. } = self;
+        let Buffers { maps, family: PlaneStack { light, stack, .. } } = buffers;
+        let (map, set, count, refines) = (&maps[*output], maps.set, light.count, *refines);
+        outputs.par_blocks_mut().enumerate().for_each(|(block, outputs)| {
+            set.run(TakeOutputs { map, first: block * set.lanes(), outputs, planes: count });
         });
-        for colour in Colour::ALL {
-            sum.fill(Complex32::ZERO);
-            for (plane, wanted) in stack.chunks_exact_mut(3 * pixels).enumerate() {
-                let wanted = wanted[colour.index() * pixels..][..pixels].par_chunks_exact_mut(width);
-                let rows = light.par_chunks_exact_mut(width).zip(wanted);
-                rows.zip(output_rows.par_chunks_exact(channels * width)).for_each(|((light, wanted), outputs)| {
-                    let output = |channel: usize| &outputs[channel * width..][..width];
-                    set.run(LightRow {
-                        changes: refines.then(|| output(LIT * count + REFINED * plane + colour.index())),
-                        masks: output(LIT * plane + MASK),
-                        half_turns: output(LIT * plane + colour.index()),
-                        wanted,
-                        light,
-                    });
-                });
-                planes.add_light(colour, light, sum);
-            }
-            planes.bring_back(colour, sum, light);
-            planes.carried[colour.index() * pixels..][..pixels].copy_from_slice(light);
+        for plane in 0..count {
+            light.fft.for_columns(outputs.blocks().zip(stack.blocks_mut()), |columns, (outputs, wanted)| {
+                set.run(LightColumns { columns, plane, count, refines, outputs, wanted });
+            });
+            light.add(plane);
         }
+        light.bring_back(None);
+        light.keep();
     }
 
     #[cfg(test)]
     fn seen<'a>(&'a self, buffers: &'a Buffers<PlaneStack<V>>, _: &'a Job<'_, V::Input>) -> super::stage::Seen<'a> {
-        super::stage::Seen::Light(&buffers.family.light.carried)
+        super::stage::Seen::Light(buffers.family.light.carried.to_fields().into())
     }
 }
 
-/// What a row of one plane sends out in one colour.
-struct LightRow<'a> {
-    /// Where the stack is refined: what the first net adds to the amplitudes, before [`REFINED_SHARE`].
-    changes: Option<&'a [f32]>,
-    masks: &'a [f32],
-    /// Phases over π.
-    half_turns: &'a [f32],
-    /// The amplitudes that an eye should see, which are refined here.
-    wanted: &'a mut [f32],
-    light: &'a mut [Complex32],
+/// Takes the first net's outputs in a block of columns.
+struct TakeOutputs<'a> {
+    map: &'a FeatureMap,
+    /// The first column.
+    first: usize,
+    /// [channel, row, column of the block]
+    outputs: &'a mut [f32],
+    planes: usize,
 }
 
-impl Task for LightRow<'_> {
+impl Task for TakeOutputs<'_> {
     #[inline(always)]
-    fn run<S: Simd>(self, _: S) {
-        let Self { changes, masks, half_turns, wanted, light } = self;
-        if let Some(changes) = changes {
-            for (wanted, change) in wanted.iter_mut().zip(changes) {
-                *wanted = (*wanted + REFINED_SHARE * change).max(0.0);
+    fn run<S: Simd>(self, simd: S) {
+        let Self { map, first, outputs, planes } = self;
+        let plane_len = map.height * S::LANES;
+        for y in 0..map.height {
+            let pixels = map.pixels_from(first, y);
+            for channel in (0..map.stride).step_by(S::LANES) {
+                let to = &mut outputs[channel * plane_len + y * S::LANES..];
+                if pixels.len() >= S::LANES * map.stride {
+                    assert!(to.len() >= (S::LANES - 1) * plane_len + S::LANES);
+                    // SAFETY: a square of channels and pixels lies in both slices: in `pixels` with its last pixel, in
+                    // `to` as asserted.
+                    unsafe {
+                        simd.transpose(pixels.as_ptr().add(channel), to.as_mut_ptr(), [map.stride, plane_len]);
+                    }
+                    continue;
+                }
+                for (column, pixel) in pixels.chunks_exact(map.stride).enumerate() {
+                    for (lane, value) in pixel[channel..][..S::LANES].iter().enumerate() {
+                        to[lane * plane_len + column] = *value;
+                    }
+                }
             }
         }
-        for (((light, wanted), mask), half_turns) in light.iter_mut().zip(wanted).zip(masks).zip(half_turns) {
-            let (cosine, sine) = cos_sin_pi(*half_turns);
-            let amplitude = mask * *wanted;
-            *light = Complex32::new(amplitude * cosine, amplitude * sine);
+        let offset = ((planes - 1) as f32).ln();
+        for masks in outputs.chunks_exact_mut(plane_len).take(LIT * planes).skip(MASK).step_by(LIT) {
+            masks.iter_mut().for_each(|mask| *mask = 1.0 / (1.0 + exp(offset - *mask)));
+        }
+    }
+}
+
+/// What one plane sends out in a block of columns.
+struct LightColumns<'a> {
+    columns: Columns<'a>,
+    plane: usize,
+    count: usize,
+    /// Whether the first net adds to the amplitudes, before [`REFINED_SHARE`].
+    refines: bool,
+    /// [channel, row, column of the block]: masks, and phases over π.
+    outputs: &'a [f32],
+    /// Three colours of each plane: the amplitudes that an eye should see, which are refined here.
+    wanted: &'a mut [f32],
+}
+
+impl Task for LightColumns<'_> {
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let Self { mut columns, plane, count, refines, outputs, wanted } = self;
+        for colour in Colour::ALL.map(Colour::index) {
+            let cells = columns.cells(colour);
+            let len = cells.len() / 2;
+            let output = |channel: usize| &outputs[channel * len..][..len];
+            let wanted = &mut wanted[(3 * plane + colour) * len..][..len];
+            if refines {
+                for (wanted, change) in wanted.iter_mut().zip(output(LIT * count + REFINED * plane + colour)) {
+                    *wanted = (*wanted + REFINED_SHARE * change).max(0.0);
+                }
+            }
+            let lit = wanted.chunks_exact(S::LANES).zip(output(LIT * plane + MASK).chunks_exact(S::LANES));
+            let lit = lit.zip(output(LIT * plane + colour).chunks_exact(S::LANES));
+            for (cell, ((wanted, masks), half_turns)) in cells.chunks_exact_mut(2 * S::LANES).zip(lit) {
+                let amplitude = simd.mul(simd.read(masks), simd.read(wanted));
+                let [cosine, sine] = cos_sin_pi(simd, simd.read(half_turns));
+                store(simd, cell, [simd.mul(amplitude, cosine), simd.mul(amplitude, sine)]);
+            }
+            columns.send(simd, colour);
         }
     }
 }
@@ -220,7 +235,6 @@ impl Task for LightRow<'_> {
 struct FeedBack {
     bytes: u64,
     feedback: PlaneFeedback,
-    sharpness: f32,
     /// Channels of what both nets are told besides.
     told: usize,
     correction_input: MapId,
@@ -236,15 +250,11 @@ impl<V: View> Stage<PlaneStack<V>> for FeedBack {
     }
 
     fn run(&mut self, buffers: &mut Buffers<PlaneStack<V>>, job: &mut Job<'_, V::Input>) {
-        let Buffers { maps, family: PlaneStack { light, stack, sum, view } } = buffers;
-        let weight = |plane, sample| 1.0 + self.sharpness * view.share_in_focus(plane, sample);
-        self.feedback.run(light, stack, sum, job.pupil_mm, weight);
-        let pixels = maps.size.pixels();
+        let Buffers { maps, family: PlaneStack { light, stack, view } } = buffers;
+        self.feedback.run(light, stack, view, job.pupil_mm);
         let map = &mut maps[self.correction_input];
-        map.write_fields(0, &light.carried);
-        map.write_fields(FIRST_MAP + self.told, &self.feedback.change);
-        let first_lack = FIRST_MAP + self.told + OUTPUT_CHANNELS;
-        map.write_planes(first_lack, stack.chunks_exact(pixels), |lack| lack);
+        map.write_planes(0, &[&light.carried], light.set);
+        map.write_planes(FIRST_MAP + self.told, &[&self.feedback.change, stack], light.set);
     }
 
     #[cfg(test)]

@@ -60,7 +60,7 @@ pub(super) enum Seen<'a> {
     /// A layer's map, and the offsets of an adjustable one; or what the first layer reads.
     Map(&'a FeatureMap, Option<&'a FeatureMap>),
     /// A field, [3, height, width].
-    Light(&'a [num_complex::Complex32]),
+    Light(std::borrow::Cow<'a, [num_complex::Complex32]>),
 }
 
 /// What stages write for later ones.
@@ -76,6 +76,8 @@ pub(super) struct Maps {
     pub(super) set: InstructionSet,
     pub(super) scratch: Scratch,
     maps: Vec<FeatureMap>,
+    /// What the layers of nets hand on, with its channels.
+    handed_on: Vec<(usize, [MapId; 2])>,
 }
 
 /// One of [`Maps`].
@@ -84,13 +86,29 @@ pub(super) struct MapId(usize);
 
 impl Maps {
     pub(super) fn new(size: Resolution, set: InstructionSet) -> Self {
-        Self { size, set, scratch: Scratch::new(), maps: Vec::new() }
+        Self { size, set, scratch: Scratch::new(), maps: Vec::new(), handed_on: Vec::new() }
     }
 
     /// A further map.
     pub(super) fn add(&mut self, channels: usize) -> MapId {
         self.maps.push(FeatureMap::new(self.size.width, self.size.height, channels, self.set));
         MapId(self.maps.len() - 1)
+    }
+
+    /// Two maps that the layers of a net hand on by turns. All nets of so many channels share them: each has made its
+    /// output when the next one begins.
+    pub(super) fn handed_on(&mut self, channels: usize) -> [MapId; 2] {
+        if let Some((_, maps)) = self.handed_on.iter().find(|(of, _)| *of == channels) {
+            return *maps;
+        }
+        let maps = [self.add(channels), self.add(channels)];
+        self.handed_on.push((channels, maps));
+        maps
+    }
+
+    /// Two maps, which are not the same.
+    pub(super) fn get_two(&mut self, maps: [MapId; 2]) -> [&mut FeatureMap; 2] {
+        self.maps.get_disjoint_mut(maps.map(|map| map.0)).expect("they are two")
     }
 
     /// What a layer needs that reads one map and writes another.

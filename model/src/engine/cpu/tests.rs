@@ -145,7 +145,7 @@ fn check_network<I>(
 
     hologram.field.fill(Complex32::ZERO);
     network.render(input, pupil, &mut hologram);
-    check_stage(&format!("{context}: rendered"), &Seen::Light(&hologram.field), &mut Value::Light(field));
+    check_stage(&format!("{context}: rendered"), &Seen::Light(hologram.field[..].into()), &mut Value::Light(field));
 }
 
 /// Compares what a stage wrote with what it should have written, and again after `expected` was spoiled.

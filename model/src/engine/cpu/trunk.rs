@@ -21,9 +21,8 @@ impl Trunk {
     pub(super) fn new(maps: &mut Maps, prefix: &str, layers: &[Layer], leaky_slope: f32) -> Self {
         let last = layers.len() - 1;
         let input = maps.add(layers[0].in_channels);
-        let features = maps.add(layers[0].out_channels);
-        // Between the two convolutions of a residual pair.
-        let between = maps.add(layers[0].out_channels);
+        // The latter between the two convolutions of a residual pair.
+        let [features, between] = maps.handed_on(layers[0].out_channels);
         let output = maps.add(layers[last].out_channels);
         let stage = |(index, layer): (usize, &Layer)| {
             let ([from, to], epilogue) = match index {

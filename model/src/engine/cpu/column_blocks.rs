@@ -1,0 +1,113 @@
+//! Planes of samples in blocks of as many columns as a vector has lanes.
+//!
+//! So what is done at a place of several planes reads and writes whole vectors, and every block can go to another
+//! thread.
+
+use holod_calibration::Resolution;
+use num_complex::Complex32;
+use rayon::prelude::*;
+
+use crate::simd::InstructionSet;
+
+/// Planes [block, plane, row, part, column of the block]: a real number has one part; a complex one has two, and both of
+/// a row are a *cell*. What the last block has beyond the width has no meaning.
+pub(super) struct ColumnBlocks {
+    size: Resolution,
+    lanes: usize,
+    planes: usize,
+    parts: usize,
+    values: Vec<f32>,
+}
+
+impl ColumnBlocks {
+    pub(super) fn of_reals(planes: usize, size: Resolution, set: InstructionSet) -> Self {
+        Self::new(planes, 1, size, set)
+    }
+
+    pub(super) fn of_cells(planes: usize, size: Resolution, set: InstructionSet) -> Self {
+        Self::new(planes, 2, size, set)
+    }
+
+    fn new(planes: usize, parts: usize, size: Resolution, set: InstructionSet) -> Self {
+        let lanes = set.lanes();
+        let values = vec![0.0; size.width.div_ceil(lanes) * planes * size.height * parts * lanes];
+        Self { size, lanes, planes, parts, values }
+    }
+
+    pub(super) fn planes(&self) -> usize {
+        self.planes
+    }
+
+    pub(super) fn parts(&self) -> usize {
+        self.parts
+    }
+
+    pub(super) fn lanes(&self) -> usize {
+        self.lanes
+    }
+
+    /// Values of a plane in one block.
+    fn plane_len(&self) -> usize {
+        self.size.height * self.parts * self.lanes
+    }
+
+    fn block_len(&self) -> usize {
+        self.planes * self.plane_len()
+    }
+
+    /// The blocks from left to right.
+    pub(super) fn blocks(&self) -> impl Iterator<Item = &[f32]> + Send {
+        self.values.chunks_exact(self.block_len())
+    }
+
+    pub(super) fn blocks_mut(&mut self) -> impl Iterator<Item = &mut [f32]> + Send {
+        let len = self.block_len();
+        self.values.chunks_exact_mut(len)
+    }
+
+    /// The blocks for several threads.
+    pub(super) fn par_blocks(&self) -> impl IndexedParallelIterator<Item = &[f32]> {
+        self.values.par_chunks_exact(self.block_len())
+    }
+
+    pub(super) fn par_blocks_mut(&mut self) -> impl IndexedParallelIterator<Item = &mut [f32]> {
+        let len = self.block_len();
+        self.values.par_chunks_exact_mut(len)
+    }
+
+    /// Row `y` of one plane in one block, [part, column of the block].
+    #[inline(always)]
+    pub(super) fn row_of_block(&self, block: usize, plane: usize, y: usize) -> &[f32] {
+        let row_len = self.parts * self.lanes;
+        &self.values[block * self.block_len() + plane * self.plane_len() + y * row_len..][..row_len]
+    }
+
+    /// Row `y` of one complex plane.
+    pub(super) fn row_of_cells(&self, plane: usize, y: usize) -> impl Iterator<Item = Complex32> {
+        assert_eq!(self.parts, 2);
+        let cells = (0..self.size.width.div_ceil(self.lanes)).flat_map(move |block| {
+            let (re, im) = self.row_of_block(block, plane, y).split_at(self.lanes);
+            re.iter().zip(im).map(|(re, im)| Complex32::new(*re, *im))
+        });
+        cells.take(self.size.width)
+    }
+
+    /// All complex planes, [plane, height, width].
+    #[cfg(test)]
+    pub(super) fn to_fields(&self) -> Vec<Complex32> {
+        let rows = (0..self.planes).flat_map(|plane| (0..self.size.height).map(move |y| (plane, y)));
+        rows.flat_map(|(plane, y)| self.row_of_cells(plane, y)).collect()
+    }
+
+    /// Writes `value(plane, x, y)` to real planes.
+    pub(super) fn fill(&mut self, value: impl Fn(usize, usize, usize) -> f32 + Sync) {
+        assert_eq!(self.parts, 1);
+        let (Resolution { width, height }, lanes, planes) = (self.size, self.lanes, self.planes);
+        self.values.par_chunks_exact_mut(lanes).enumerate().for_each(|(row, values)| {
+            let (y, plane, first) = (row % height, row / height % planes, row / height / planes * lanes);
+            for (x, to) in (first..width).zip(values) {
+                *to = value(plane, x, y);
+            }
+        });
+    }
+}
