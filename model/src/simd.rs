@@ -3,6 +3,9 @@
 //! A value of an instruction set's type exists only where the processor has that set, which is what makes calling its
 //! instructions sound.
 
+/// The lanes of the widest vector.
+pub(crate) const MOST_LANES: usize = 16;
+
 /// One instruction set. Everything here is inlined into [`Simd::vectorise`], where the set's features are enabled.
 pub(crate) trait Simd: Copy + Send + Sync {
     /// A vector of `LANES` values.
@@ -71,8 +74,8 @@ pub(crate) trait Simd: Copy + Send + Sync {
         let [even, odd] = self.unzip(a, b);
         self.add(even, odd)
     }
-    /// Writes the transpose of a square of `LANES` by `LANES` values, whose rows begin `pitches[0]` values apart, to one
-    /// whose rows begin `pitches[1]` apart.
+    /// Writes the transpose of a square of `LANES` by `LANES` values, whose rows begin `pitches[0]` values apart, to a
+    /// square whose rows begin `pitches[1]` apart.
     ///
     /// # Safety
     /// All of the first square is readable, and all of the second, which lies elsewhere, writable.
@@ -395,20 +398,25 @@ x86_instruction_set! {
     _mm256_set1_pd, _mm256_castpd_ps;
     unzip(a, b) {
         // Lanes of both, by turns of two: the middle two are exchanged.
-        let in_order = |pairs| _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(_mm256_castps_pd(pairs)));
-        [in_order(_mm256_shuffle_ps::<0b10_00_10_00>(a, b)), in_order(_mm256_shuffle_ps::<0b11_01_11_01>(a, b))]
+        let mut both = [_mm256_shuffle_ps::<0b10_00_10_00>(a, b), _mm256_shuffle_ps::<0b11_01_11_01>(a, b)];
+        for lanes in &mut both {
+            *lanes = _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(_mm256_castps_pd(*lanes)));
+        }
+        both
     };
     transpose(rows) {
         let mut to = rows;
         let mut fours = rows;
         for four in [0, 4] {
-            let pair = |low: __m256, high: __m256| (_mm256_castps_pd(low), _mm256_castps_pd(high));
-            let (a, b) = pair(_mm256_unpacklo_ps(rows[four], rows[four + 1]), _mm256_unpackhi_ps(rows[four], rows[four + 1]));
-            let (c, d) = pair(_mm256_unpacklo_ps(rows[four + 2], rows[four + 3]), _mm256_unpackhi_ps(rows[four + 2], rows[four + 3]));
-            fours[four] = _mm256_castpd_ps(_mm256_unpacklo_pd(a, c));
-            fours[four + 1] = _mm256_castpd_ps(_mm256_unpackhi_pd(a, c));
-            fours[four + 2] = _mm256_castpd_ps(_mm256_unpacklo_pd(b, d));
-            fours[four + 3] = _mm256_castpd_ps(_mm256_unpackhi_pd(b, d));
+            let [a, b, c, d] = [rows[four], rows[four + 1], rows[four + 2], rows[four + 3]];
+            let (ab, cd) = (_mm256_unpacklo_ps(a, b), _mm256_unpacklo_ps(c, d));
+            let (ab, cd) = (_mm256_castps_pd(ab), _mm256_castps_pd(cd));
+            fours[four] = _mm256_castpd_ps(_mm256_unpacklo_pd(ab, cd));
+            fours[four + 1] = _mm256_castpd_ps(_mm256_unpackhi_pd(ab, cd));
+            let (ab, cd) = (_mm256_unpackhi_ps(a, b), _mm256_unpackhi_ps(c, d));
+            let (ab, cd) = (_mm256_castps_pd(ab), _mm256_castps_pd(cd));
+            fours[four + 2] = _mm256_castpd_ps(_mm256_unpacklo_pd(ab, cd));
+            fours[four + 3] = _mm256_castpd_ps(_mm256_unpackhi_pd(ab, cd));
         }
         for column in 0..4 {
             to[column] = _mm256_permute2f128_ps::<0x20>(fours[column], fours[column + 4]);
@@ -436,12 +444,15 @@ x86_instruction_set! {
         let mut to = rows;
         let mut fours = rows;
         for four in [0, 4, 8, 12] {
-            let (a, b) = (_mm512_castps_pd(_mm512_unpacklo_ps(rows[four], rows[four + 1])), _mm512_castps_pd(_mm512_unpackhi_ps(rows[four], rows[four + 1])));
-            let (c, d) = (_mm512_castps_pd(_mm512_unpacklo_ps(rows[four + 2], rows[four + 3])), _mm512_castps_pd(_mm512_unpackhi_ps(rows[four + 2], rows[four + 3])));
-            fours[four] = _mm512_castpd_ps(_mm512_unpacklo_pd(a, c));
-            fours[four + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(a, c));
-            fours[four + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(b, d));
-            fours[four + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(b, d));
+            let [a, b, c, d] = [rows[four], rows[four + 1], rows[four + 2], rows[four + 3]];
+            let (ab, cd) = (_mm512_unpacklo_ps(a, b), _mm512_unpacklo_ps(c, d));
+            let (ab, cd) = (_mm512_castps_pd(ab), _mm512_castps_pd(cd));
+            fours[four] = _mm512_castpd_ps(_mm512_unpacklo_pd(ab, cd));
+            fours[four + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(ab, cd));
+            let (ab, cd) = (_mm512_unpackhi_ps(a, b), _mm512_unpackhi_ps(c, d));
+            let (ab, cd) = (_mm512_castps_pd(ab), _mm512_castps_pd(cd));
+            fours[four + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(ab, cd));
+            fours[four + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(ab, cd));
         }
         for column in 0..4 {
             let [a, b, c, d] = [fours[column], fours[column + 4], fours[column + 8], fours[column + 12]];

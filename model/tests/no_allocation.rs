@@ -21,7 +21,12 @@ fn frames_do_not_allocate() {
 }
 
 fn check(weights: &Weights) {
-    let resolution = Resolution { width: 10, height: 7 };
+    check_at(weights, Resolution { width: 10, height: 7 });
+    // Lines of 17 samples, which no radix divides, and of 30, which take two passes.
+    check_at(weights, Resolution { width: 34, height: 60 });
+}
+
+fn check_at(weights: &Weights, resolution: Resolution) {
     let engine = CpuEngine::new(weights, &DisplayGeometry::DEFAULT, resolution).unwrap();
     let double_phase = DoublePhase::new(resolution, weights.config().amplitude_constant);
     let frame = RgbdFrame {

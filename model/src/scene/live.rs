@@ -159,13 +159,13 @@ impl LiveDepth {
         }
     }
 
-    /// Vergence in dioptres of a number as it is stored; NaN where it is none.
+    /// Vergence in dioptres of a number as it is stored, rounded as that of a file's number is; NaN where it is none.
     fn dioptres(self, number: f32) -> f32 {
-        let reciprocal = |length: f32| if length > 0.0 { 1.0 / length } else { f32::NAN };
+        let reciprocal = |length: f32| if length > 0.0 { 1.0 / f64::from(length) } else { f64::NAN };
         match self {
             Self::Plane(plane) => plane.0 as f32,
-            Self::MillimetresU16 => 1e3 * reciprocal(number),
-            Self::MetresF16 | Self::MetresF32 => reciprocal(number),
+            Self::MillimetresU16 => (1e3 * reciprocal(number)) as f32,
+            Self::MetresF16 | Self::MetresF32 => reciprocal(number) as f32,
             Self::DioptresF16 | Self::DioptresF32 => {
                 if number >= 0.0 && number.is_finite() {
                     number
@@ -434,7 +434,8 @@ fn normalised(depth: LiveDepth, geometry: &DisplayGeometry, number: f32) -> f32 
 
 #[cfg(test)]
 mod tests {
-    use super::super::Scene;
+    use super::super::depth::DepthReading;
+    use super::super::{DepthEncoding, Scene};
     use super::*;
 
     const SIZE: Resolution = Resolution { width: 6, height: 4 };
@@ -511,7 +512,7 @@ mod tests {
             .save(&depth)
             .unwrap();
         let spec = format!("{},{}", colour.display(), depth.display());
-        let scene = Scene::open(&spec, Some(super::super::DepthEncoding::Millimetres)).unwrap();
+        let scene = Scene::open(&spec, Some(DepthEncoding::Millimetres)).unwrap();
         scene.load(0, &BENCH, Some(resolution), fit).unwrap()
     }
 
@@ -540,6 +541,18 @@ mod tests {
             assert!(difference(&frame, &of_files) < 1e-6, "{resolution} {fit:?}: {}", difference(&frame, &of_files));
             assert_eq!(report, report_of_files);
         }
+    }
+
+    /// Else the same picture would give other levels at pixels where rounding decides.
+    #[test]
+    fn a_length_is_the_vergence_of_a_file_s_to_the_bit() {
+        let reading = |encoding| DepthReading { encoding, scale: None, missing: None }.converter(None);
+        let (millimetres, metres) = (reading(DepthEncoding::Millimetres), reading(DepthEncoding::Metres));
+        for number in (1..=u16::MAX).map(f32::from) {
+            assert_eq!(LiveDepth::MillimetresU16.dioptres(number), millimetres(number), "{number} mm");
+            assert_eq!(LiveDepth::MetresF32.dioptres(number / 997.0), metres(number / 997.0), "{} m", number / 997.0);
+        }
+        assert_ne!(LiveDepth::MillimetresU16.dioptres(450.0), millimetres(450.01), "the comparison sees a little");
     }
 
     #[test]

@@ -6,8 +6,8 @@ use crate::weights::Grid;
 
 /// Panel pixels to a sample of the half-band grid, each way.
 pub(super) const SCALE: usize = scale_of(Grid::HalfBand);
-/// The same in all.
-pub(super) const BLOCK: usize = SCALE * SCALE;
+/// All of them.
+pub(super) const PIXELS_PER_SAMPLE: usize = SCALE * SCALE;
 
 /// Panel pixels to a sample of `grid`, each way.
 pub(super) const fn scale_of(grid: Grid) -> usize {

@@ -7,10 +7,10 @@ use holod_calibration::Resolution;
 use num_complex::Complex32;
 use rayon::prelude::*;
 
-use crate::simd::InstructionSet;
+use crate::simd::{InstructionSet, Simd};
 
-/// Planes [block, plane, row, part, column of the block]: a real number has one part; a complex one has two, and both of
-/// a row are a *cell*. What the last block has beyond the width has no meaning.
+/// Planes [block, plane, row, part, column of the block]: a real number has one part; a complex one has two, and both
+/// of a row are a *cell*. What the last block has beyond the width has no meaning.
 pub(super) struct ColumnBlocks {
     size: Resolution,
     lanes: usize,
@@ -110,4 +110,17 @@ impl ColumnBlocks {
             }
         });
     }
+}
+
+/// The real parts and the imaginary ones of the first cell.
+#[inline(always)]
+pub(super) fn load<S: Simd>(simd: S, cells: &[f32]) -> [S::Vector; 2] {
+    [simd.read(cells), simd.read(&cells[S::LANES..])]
+}
+
+/// Writes the first cell.
+#[inline(always)]
+pub(super) fn store<S: Simd>(simd: S, cells: &mut [f32], [re, im]: [S::Vector; 2]) {
+    simd.write(cells, re);
+    simd.write(&mut cells[S::LANES..], im);
 }

@@ -3,13 +3,12 @@
 use holod_calibration::{DisplayGeometry, Resolution};
 use rayon::prelude::*;
 
-use super::blocks::BLOCK;
-use super::column_blocks::ColumnBlocks;
+use super::blocks::PIXELS_PER_SAMPLE;
+use super::column_blocks::{ColumnBlocks, load, store};
 use super::depth_layers::DepthLayers;
 use super::frame_blocks::FrameBlocks;
 use super::input_features::sample_pitch;
 use super::plane_fft::{Columns, PlaneFft, Rows};
-use super::plane_light::{load, store};
 use crate::engine::constants::{LEAST_COVER, PAIRS};
 use crate::engine::disc::DiscTable;
 use crate::optics::signed_bin;
@@ -25,7 +24,7 @@ pub(super) struct Defocus {
     /// The pupil that `discs` is for.
     pupil_mm: f32,
     /// [block of rows, layers, column up to half of them, row of the block], over the number of samples: spectra of the
-    /// discs between layers that are 0, 1, 2, .. apart. Columns beyond half are those before it in turn.
+    /// discs between layers that are 0, 1, 2, .. apart. Column k beyond half is that of width − k.
     discs: Vec<f32>,
     /// For each layer its light's pairs, and then those seen at the focus on it.
     fft: PlaneFft,
@@ -110,17 +109,17 @@ impl Task for TakeLayers<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Self { mut columns, frame, layers, layer_of, count } = self;
-        let plane_len = layer_of.len() / BLOCK;
+        let plane_len = layer_of.len() / PIXELS_PER_SAMPLE;
         for (y, row) in (0..plane_len).step_by(S::LANES).enumerate() {
             let zero = simd.splat(0.0);
             // Of each pixel behind the samples its layer, 1 and its powers, which are shares of the sample's.
-            let mut pixels = [(zero, [zero; 1 + 3]); BLOCK];
+            let mut pixels = [(zero, [zero; 1 + 3]); PIXELS_PER_SAMPLE];
             for (pixel, (layer, parts)) in pixels.iter_mut().enumerate() {
                 *layer = simd.read(&layer_of[pixel * plane_len + row..]);
-                let share = simd.splat(1.0 / BLOCK as f32);
+                let share = simd.splat(1.0 / PIXELS_PER_SAMPLE as f32);
                 parts[0] = share;
                 for (colour, power) in parts[1..].iter_mut().enumerate() {
-                    let amplitude = simd.read(&frame[(colour * BLOCK + pixel) * plane_len + row..]);
+                    let amplitude = simd.read(&frame[(colour * PIXELS_PER_SAMPLE + pixel) * plane_len + row..]);
                     *power = simd.mul(simd.mul(amplitude, amplitude), share);
                 }
             }

@@ -3,20 +3,20 @@
 use holod_calibration::Resolution;
 use rayon::prelude::*;
 
-use super::blocks::BLOCK;
+use super::blocks::PIXELS_PER_SAMPLE;
 use super::column_blocks::ColumnBlocks;
 use super::frame_blocks::{DEPTH, FrameBlocks};
 use super::view::View;
 use crate::RgbdFrame;
 use crate::simd::{InstructionSet, Simd, Task};
+use crate::weights::MOST_DEPTH_LAYERS;
 
-/// What lies beyond the grid is in no layer.
-const NO_LAYER: f32 = -1.0;
+// A bit of `present` for each.
+const _: () = assert!(MOST_DEPTH_LAYERS <= u64::BITS as usize);
 
 /// Layers equal in dioptres, far to near. Nothing is allocated after `new`.
 pub(super) struct DepthLayers {
     count: usize,
-    size: Resolution,
     set: InstructionSet,
     /// The number of the layer of each of the pixels behind a sample.
     pub(super) layer_of: ColumnBlocks,
@@ -26,7 +26,7 @@ pub(super) struct DepthLayers {
 
 impl DepthLayers {
     pub(super) fn new(count: usize, size: Resolution, set: InstructionSet) -> Self {
-        Self { count, size, set, layer_of: ColumnBlocks::of_reals(BLOCK, size, set), present: 0 }
+        Self { count, set, layer_of: ColumnBlocks::of_reals(PIXELS_PER_SAMPLE, size, set), present: 0 }
     }
 
     /// Whether anything lies in one layer.
@@ -36,15 +36,11 @@ impl DepthLayers {
 
     /// Takes the depths of a frame.
     pub(super) fn place(&mut self, frame: &FrameBlocks) {
-        let Self { count, size, set, layer_of, present } = self;
-        let (count, width, lanes) = (*count, size.width, set.lanes());
-        let blocks = layer_of.par_blocks_mut().zip(frame.planes.par_blocks()).enumerate();
-        let placed = blocks.map(|(block, (layers, planes))| {
+        let Self { count, set, layer_of, present } = self;
+        let count = *count;
+        let placed = layer_of.par_blocks_mut().zip(frame.planes.par_blocks()).map(|(layers, planes)| {
             let mut present = 0;
             set.run(Place { depths: &planes[DEPTH * layers.len()..], count, layers, present: &mut present });
-            for layers in layers.chunks_exact_mut(lanes) {
-                layers[lanes.min(width - block * lanes)..].fill(NO_LAYER);
-            }
             present
         });
         *present = placed.reduce(|| 0, |a, b| a | b);
@@ -78,9 +74,9 @@ impl View for DepthLayers {
     #[inline(always)]
     fn share_in_focus<S: Simd>(&self, simd: S, plane: usize, block: usize, y: usize) -> S::Vector {
         let mut share = simd.splat(0.0);
-        for pixel in 0..BLOCK {
+        for pixel in 0..PIXELS_PER_SAMPLE {
             let layer = simd.read(self.layer_of.row_of_block(block, pixel, y));
-            let part = simd.where_equal(layer, simd.splat(plane as f32), simd.splat(1.0 / BLOCK as f32));
+            let part = simd.where_equal(layer, simd.splat(plane as f32), simd.splat(1.0 / PIXELS_PER_SAMPLE as f32));
             share = simd.add(share, part);
         }
         share

@@ -2,7 +2,7 @@
 
 use holod_calibration::{DisplayGeometry, Resolution};
 
-use super::blocks::{BLOCK, grid_size};
+use super::blocks::{PIXELS_PER_SAMPLE, grid_size};
 use super::defocus::Defocus;
 use super::depth_layers::DepthLayers;
 use super::frame_blocks::FrameBlocks;
@@ -26,7 +26,7 @@ pub(super) fn stages(
 ) -> StageList<PlaneStack<DepthLayers>> {
     let size = grid_size(config.grid, resolution);
     let count = config.depth_layers;
-    let layer_numbers = (BLOCK * size.pixels()) as u64;
+    let layer_numbers = plane_bytes(PIXELS_PER_SAMPLE, size);
     let positions = PlanePositions::of_layers(count, bench);
     PlaneNetwork { config, bench, nets, feedback, positions, resolution, set }.stages(
         DepthLayers::new(count, size, set),

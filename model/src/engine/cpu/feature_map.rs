@@ -7,7 +7,7 @@ use crate::simd::InstructionSet;
 
 /// Side of the squares of pixels that a layer computes together.
 pub(super) const TILE: usize = 4;
-/// Rows of a band.
+/// Rows of a band: so many of one block of columns lie together in the cache.
 pub(super) const BAND: usize = 16;
 
 /// A feature map [height, width, channels] with a border of zeros: one pixel before, and after as many as fill the last
@@ -35,8 +35,8 @@ impl FeatureMap {
         self.data[self.row_len..].par_chunks_exact_mut(self.row_len).take(self.height)
     }
 
-    /// The same, [`BAND`] rows together, the last time perhaps fewer: what is read in blocks of columns is read row after
-    /// row of a block so.
+    /// The same, [`BAND`] rows together, the last time perhaps fewer: so what lies in blocks of columns is read row after
+    /// row of a block.
     pub(super) fn bands_mut(&mut self) -> impl IndexedParallelIterator<Item = &mut [f32]> {
         self.data[self.row_len..][..self.height * self.row_len].par_chunks_mut(BAND * self.row_len)
     }

@@ -2,9 +2,9 @@
 
 use holod_calibration::{Colour, DisplayGeometry, Resolution};
 
-use super::column_blocks::ColumnBlocks;
+use super::column_blocks::{ColumnBlocks, load, store};
 use super::plane_fft::Columns;
-use super::plane_light::{PlaneLight, PlanePositions, load, store, transfer};
+use super::plane_light::{PlaneLight, PlanePositions, transfer};
 use super::pupil_stop::PupilStop;
 use super::view::View;
 use crate::engine::constants::FEEDBACK_DARK_POWER;
@@ -63,10 +63,10 @@ impl PlaneFeedback {
             light.add(plane);
         }
         light.bring_back(Some(pupil));
-        let mean = 1.0 / light.count as f32;
+        let per_plane = 1.0 / light.count as f32;
         let blocks = light.carried.blocks_mut().zip(change.blocks_mut());
         light.fft.for_columns(blocks, |columns, (field, change)| {
-            set.run(Change { columns, field, change, mean, share });
+            set.run(Change { columns, field, change, per_plane, share });
         });
     }
 }
@@ -135,19 +135,20 @@ struct Change<'a> {
     columns: Columns<'a>,
     field: &'a mut [f32],
     change: &'a mut [f32],
-    mean: f32,
+    /// One over the number of planes.
+    per_plane: f32,
     share: f32,
 }
 
 impl Task for Change<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let Self { mut columns, field, change, mean, share } = self;
+        let Self { mut columns, field, change, per_plane, share } = self;
         let len = field.len() / Colour::ALL.len();
         for (colour, (field, change)) in field.chunks_exact_mut(len).zip(change.chunks_exact_mut(len)).enumerate() {
             let sums = columns.arrive(simd, colour);
             for ((field, change), sum) in field.iter_mut().zip(change).zip(sums) {
-                *change = *sum * mean;
+                *change = *sum * per_plane;
                 *field += *change * share;
             }
         }

@@ -3,7 +3,7 @@
 use holod_calibration::{DisplayGeometry, Resolution};
 use rayon::prelude::*;
 
-use super::blocks::{BLOCK, Blocks, SCALE, grid_size};
+use super::blocks::{Blocks, PIXELS_PER_SAMPLE, SCALE, grid_size};
 use super::input_features::FIRST_MAP;
 use super::plane_light::PlanePositions;
 use super::plane_stack::{PlaneNetwork, PlaneStack};
@@ -28,7 +28,8 @@ pub(super) fn stages(
     let positions = PlanePositions::from_end_to_end(config.planes, bench);
     let feedback = Feedback { share, sharpness: 0.0 };
     PlaneNetwork { config, bench, nets, feedback, positions, resolution, set }.stages(FocalImages, 0, |inputs| Tell {
-        bytes: plane_bytes(images, resolution) + plane_bytes(images + 2 * (BLOCK * images + CONDITIONS), size),
+        bytes: plane_bytes(images, resolution)
+            + plane_bytes(images + 2 * (PIXELS_PER_SAMPLE * images + CONDITIONS), size),
         inputs,
     })
 }
@@ -66,8 +67,8 @@ impl Stage<PlaneStack<FocalImages>> for Tell {
         let blocks = Blocks { frame: *resolution, scale: SCALE };
         stack.fill(|plane, x, y| {
             let image = &amplitude[plane * resolution.pixels()..][..resolution.pixels()];
-            let light = (0..BLOCK).map(|corner| image[blocks.index(x, y, corner)].powi(2));
-            (light.sum::<f32>() / BLOCK as f32).sqrt()
+            let light = (0..PIXELS_PER_SAMPLE).map(|corner| image[blocks.index(x, y, corner)].powi(2));
+            (light.sum::<f32>() / PIXELS_PER_SAMPLE as f32).sqrt()
         });
         let width = maps.size.width;
         let told = job.conditions.told().map(|value| value as f32);
@@ -76,9 +77,10 @@ impl Stage<PlaneStack<FocalImages>> for Tell {
             let stride = map.stride;
             map.rows_mut().enumerate().for_each(|(y, row)| {
                 for (x, channels) in row[stride..][..width * stride].chunks_exact_mut(stride).enumerate() {
-                    let (images, rest) = channels[first..].split_at_mut(BLOCK * amplitude.len() / resolution.pixels());
+                    let (images, rest) =
+                        channels[first..].split_at_mut(PIXELS_PER_SAMPLE * amplitude.len() / resolution.pixels());
                     let planes = amplitude.chunks_exact(resolution.pixels());
-                    for (block, plane) in images.chunks_exact_mut(BLOCK).zip(planes) {
+                    for (block, plane) in images.chunks_exact_mut(PIXELS_PER_SAMPLE).zip(planes) {
                         for (corner, value) in block.iter_mut().enumerate() {
                             *value = plane[blocks.index(x, y, corner)] - 0.4;
                         }

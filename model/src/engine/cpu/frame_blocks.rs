@@ -3,7 +3,7 @@
 use holod_calibration::Resolution;
 use rayon::prelude::*;
 
-use super::blocks::{BLOCK, Blocks, SCALE};
+use super::blocks::{Blocks, PIXELS_PER_SAMPLE, SCALE};
 use super::column_blocks::ColumnBlocks;
 use crate::RgbdFrame;
 use crate::simd::{InstructionSet, Simd, Task};
@@ -22,7 +22,7 @@ pub(super) struct FrameBlocks {
 
 impl FrameBlocks {
     pub(super) fn new(size: Resolution, set: InstructionSet) -> Self {
-        Self { planes: ColumnBlocks::of_reals(PLANES * BLOCK, size, set), set }
+        Self { planes: ColumnBlocks::of_reals(PLANES * PIXELS_PER_SAMPLE, size, set), set }
     }
 
     /// Takes the pixels of `frame`.
@@ -48,9 +48,9 @@ impl Task for Take<'_> {
     fn run<S: Simd>(self, simd: S) {
         let Self { frame, first, planes } = self;
         let blocks = Blocks { frame: frame.resolution, scale: SCALE };
-        let plane_len = planes.len() / (PLANES * BLOCK);
+        let plane_len = planes.len() / (PLANES * PIXELS_PER_SAMPLE);
         let sources = frame.amplitude.chunks_exact(frame.resolution.pixels()).chain([&frame.depth_normalised[..]]);
-        for (source, to) in sources.zip(planes.chunks_exact_mut(BLOCK * plane_len)) {
+        for (source, to) in sources.zip(planes.chunks_exact_mut(PIXELS_PER_SAMPLE * plane_len)) {
             for (pair, to) in to.chunks_exact_mut(SCALE * plane_len).enumerate() {
                 let (left, right) = to.split_at_mut(plane_len);
                 let rows = left.chunks_exact_mut(S::LANES).zip(right.chunks_exact_mut(S::LANES)).enumerate();

@@ -4,16 +4,16 @@ use holod_calibration::{Colour, DisplayGeometry, Metres};
 use num_complex::Complex32;
 use rayon::prelude::*;
 
-use super::blocks::{BLOCK, SCALE};
+use super::blocks::{PIXELS_PER_SAMPLE, SCALE};
 use super::column_blocks::ColumnBlocks;
 use super::feature_map::{BAND, FeatureMap};
 use super::frame_blocks::{DEPTH, FrameBlocks};
 use crate::conditions::Conditions;
-use crate::simd::{InstructionSet, Simd, Task};
+use crate::simd::{InstructionSet, MOST_LANES, Simd, Task};
 use crate::weights::{CONDITIONS, OUTPUT_CHANNELS};
 
 /// Amplitude and two depth maps, each four times, and what is told of bench and pupil.
-pub(super) const MAPS: usize = 5 * BLOCK + CONDITIONS;
+pub(super) const MAPS: usize = 5 * PIXELS_PER_SAMPLE + CONDITIONS;
 /// Where the second net's input has the maps: after the field.
 pub(super) const FIRST_MAP: usize = OUTPUT_CHANNELS;
 /// The share of the second net's output that is added to the field.
@@ -24,8 +24,8 @@ pub(super) fn sample_pitch(bench: &DisplayGeometry) -> Metres {
     Metres(SCALE as f64 * bench.pixel_pitch.0)
 }
 
-/// Writes what both nets are told of a frame, bench and pupil, and the amplitudes `stack` that an eye should see: to the
-/// channels of the first one's map from 0 on, of the second one's from [`FIRST_MAP`] on.
+/// Writes what both nets are told of a frame, bench and pupil, and the amplitudes `stack` that an eye should see: to
+/// the channels of the first one's map from 0 on, of the second one's from [`FIRST_MAP`] on.
 pub(super) fn write_inputs(
     [first, second]: [&mut FeatureMap; 2],
     frame: &FrameBlocks,
@@ -72,12 +72,14 @@ struct Samples<'a> {
 impl Channels for Samples<'_> {
     #[inline(always)]
     fn channel<S: Simd>(&self, simd: S, channel: usize) -> S::Vector {
+        const AGAIN: usize = DEPTH + 1;
         let Self { frame, stack, told, blur_scale, block, y } = self;
-        let (planes, plane, less, factor) = match channel / BLOCK {
+        // The frame's planes, the depth once more, what is told, and the stack.
+        let (planes, plane, less, factor) = match channel / PIXELS_PER_SAMPLE {
             0..DEPTH => (&frame.planes, channel, 0.4, 1.0),
             DEPTH => (&frame.planes, channel, 0.5, 2.0),
-            4 => (&frame.planes, channel - BLOCK, 0.5, *blur_scale),
-            _ if channel < MAPS => return simd.splat(told[channel - 5 * BLOCK]),
+            AGAIN => (&frame.planes, channel - PIXELS_PER_SAMPLE, 0.5, *blur_scale),
+            _ if channel < MAPS => return simd.splat(told[channel - 5 * PIXELS_PER_SAMPLE]),
             _ => (*stack, channel - MAPS, 0.4, 1.0),
         };
         let values = simd.read(planes.row_of_block(*block, plane, *y));
@@ -118,8 +120,8 @@ struct WriteChannels<'a, C, const N: usize> {
 impl<C: Channels, const N: usize> Task for WriteChannels<'_, C, N> {
     #[inline(always)]
     fn run<S: Simd>(mut self, simd: S) {
-        // No set has more lanes.
-        let (mut rows, mut columns) = ([[0.0f32; 16]; 16], [[0.0f32; 16]; 16]);
+        const { assert!(S::LANES <= MOST_LANES) };
+        let (mut rows, mut columns) = ([[0.0; MOST_LANES]; MOST_LANES], [[0.0; MOST_LANES]; MOST_LANES]);
         let count = S::LANES.min(self.count);
         for first in (0..self.count).step_by(S::LANES) {
             // The last ones begin early enough to be whole vectors, too.
@@ -127,8 +129,11 @@ impl<C: Channels, const N: usize> Task for WriteChannels<'_, C, N> {
             for (channel, row) in rows.iter_mut().enumerate().take(count) {
                 simd.write(row, self.channels.channel(simd, first + channel));
             }
-            // SAFETY: both have 16 rows of 16, of which LANES are read and written.
-            unsafe { simd.transpose(rows[0].as_ptr(), columns[0].as_mut_ptr(), [16; 2]) };
+            // SAFETY: both have MOST_LANES rows of so many values, of which LANES, no more, are read and written.
+            unsafe {
+                let (rows, columns) = (rows.as_flattened().as_ptr(), columns.as_flattened_mut().as_mut_ptr());
+                simd.transpose(rows, columns, [MOST_LANES; 2]);
+            }
             for (pixels, stride) in &mut self.to {
                 for (pixel, channels) in pixels.chunks_mut(*stride).zip(&columns) {
                     let pixel = &mut pixel[first..][..count];
@@ -144,8 +149,8 @@ impl<C: Channels, const N: usize> Task for WriteChannels<'_, C, N> {
 }
 
 impl FeatureMap {
-    /// Writes planes to the channels from `first` on, those of one [`ColumnBlocks`] after another; of complex ones first
-    /// all real parts.
+    /// Writes planes to the channels from `first` on, those of one [`ColumnBlocks`] after another; of complex ones
+    /// first all real parts.
     pub(super) fn write_planes(&mut self, first: usize, blocks: &[&ColumnBlocks], set: InstructionSet) {
         let (width, stride, lanes) = (self.width, self.stride, set.lanes());
         let count = blocks.iter().map(|blocks| blocks.planes() * blocks.parts()).sum();

@@ -61,6 +61,7 @@ fn turn(parts: usize, of: usize) -> Turn {
 impl LineFft {
     /// For lines of `length`, which is not 0.
     pub(super) fn new(length: usize) -> Self {
+        assert!(length > 0, "a line has samples");
         let Some(radices) = radices(length) else {
             return Self { length, passes: Vec::new(), single: Some(f32::plan(length, FftDirection::Forward)) };
         };
@@ -79,7 +80,7 @@ impl LineFft {
 
     /// Room for transforms of this length on vectors of `lanes`.
     pub(super) fn scratch(&self, lanes: usize) -> FftScratch {
-        let buffers = if self.passes.len() > 2 { 2 } else { 1 };
+        let buffers = self.passes.len().saturating_sub(1);
         let cells = std::array::from_fn(|buffer| vec![0.0; if buffer < buffers { self.length * 2 * lanes } else { 0 }]);
         let (line, single) = match &self.single {
             Some(fft) => (self.length, fft.get_inplace_scratch_len()),
@@ -301,7 +302,8 @@ fn odd<S: Simd, const N: usize>(simd: S, x: [Cell<S>; N], circle: &[Turn; MOST_R
     for j in 1..=half {
         let (mut even, mut odd) = (x[0], [simd.splat(0.0); 2]);
         for k in 1..=half {
-            let [cosine, sine] = circle[j * k % N * step].map(|value| simd.splat(value));
+            let [cosine, sine] = circle[j * k % N * step];
+            let (cosine, sine) = (simd.splat(cosine), simd.splat(sine));
             even = [simd.mul_add(sums[k][0], cosine, even[0]), simd.mul_add(sums[k][1], cosine, even[1])];
             odd = [simd.mul_add(differences[k][0], sine, odd[0]), simd.mul_add(differences[k][1], sine, odd[1])];
         }
@@ -323,7 +325,7 @@ fn difference<S: Simd>(simd: S, a: Cell<S>, b: Cell<S>) -> Cell<S> {
 
 #[inline(always)]
 fn turned<S: Simd>(simd: S, [re, im]: Cell<S>, turn: Turn) -> Cell<S> {
-    let [cosine, sine] = turn.map(|value| simd.splat(value));
+    let (cosine, sine) = (simd.splat(turn[0]), simd.splat(turn[1]));
     [simd.neg_mul_add(im, sine, simd.mul(re, cosine)), simd.mul_add(im, cosine, simd.mul(re, sine))]
 }
 

@@ -1,4 +1,5 @@
-//! The network on the CPU: channels-last maps, rayon over rows, SIMD chosen at run time.
+//! The network on the CPU: channels-last maps, planes in blocks of columns, rayon over rows or blocks, SIMD chosen at
+//! run time.
 
 mod blocks;
 mod column_blocks;

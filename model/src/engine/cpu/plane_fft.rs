@@ -21,8 +21,8 @@ pub(super) struct PlaneFft {
     /// What columns were transformed to: [block of columns, plane, row, part, column of the block], with rows up to
     /// whole blocks of rows.
     by_columns: Vec<f32>,
-    /// What rows were transformed back to: [block of rows, plane, block of columns, row of the block, part, column of the
-    /// block].
+    /// What rows were transformed back to: [block of rows, plane, block of columns, row of the block, part, column of
+    /// the block].
     by_rows: Vec<f32>,
     workers: Vec<Worker>,
 }
@@ -132,8 +132,10 @@ pub(super) struct Columns<'a> {
     fft: &'a LineFft,
     from: Tiles<'a>,
     to: &'a mut [f32],
+    /// Values of one plane in `to`.
     plane_len: usize,
     lines: &'a mut [f32],
+    /// Values of one plane in `lines`.
     len: usize,
     between: &'a mut [f32],
     scratch: &'a mut FftScratch,
@@ -179,8 +181,10 @@ pub(super) struct Rows<'a> {
     fft: &'a LineFft,
     from: Tiles<'a>,
     to: &'a mut [f32],
+    /// Values of one plane in `to`.
     plane_len: usize,
     lines: &'a mut [f32],
+    /// Values of one plane in `lines`.
     len: usize,
     between: &'a mut [f32],
     scratch: &'a mut FftScratch,
@@ -247,7 +251,7 @@ mod tests {
 
     const PLANES: usize = 3;
 
-    /// Sends planes; takes the spectrum of each from the next one, and doubles one column of it; and takes what arrives.
+    /// Sends planes; takes the spectrum of each from the next one, of which it doubles one column; takes what arrives.
     enum Step<'a> {
         Send(Columns<'a>, &'a [f32]),
         Exchange(Rows<'a>, usize),
@@ -280,9 +284,9 @@ mod tests {
         }
     }
 
-    /// Planes of noise, as blocks and as they are.
-    fn planes(size: Resolution, set: InstructionSet) -> (ColumnBlocks, Vec<Vec<Complex32>>) {
-        let value = |plane: usize, index: usize| Complex32::cis((index as f32 + 7.0 * plane as f32 + 0.3).powf(1.3));
+    /// Planes of noise, as blocks, which have no numbers beyond the width, and as they are.
+    fn planes(size: Resolution, set: InstructionSet, seed: f32) -> (ColumnBlocks, Vec<Vec<Complex32>>) {
+        let value = |plane: usize, index: usize| Complex32::cis((index as f32 + 7.0 * plane as f32 + seed).powf(1.3));
         let fields: Vec<Vec<_>> =
             (0..PLANES).map(|plane| (0..size.pixels()).map(|index| value(plane, index)).collect()).collect();
         let mut blocks = ColumnBlocks::of_cells(PLANES, size, set);
@@ -290,6 +294,7 @@ mod tests {
         for (block, values) in blocks.blocks_mut().enumerate() {
             for (row, cell) in values.chunks_exact_mut(2 * lanes).enumerate() {
                 let (plane, y) = (row / size.height, row % size.height);
+                cell.fill(f32::NAN);
                 for lane in 0..lanes.min(size.width - block * lanes) {
                     let value = fields[plane][y * size.width + block * lanes + lane];
                     (cell[lane], cell[lanes + lane]) = (value.re, value.im);
@@ -304,12 +309,15 @@ mod tests {
         for (width, height) in [(1, 1), (11, 6), (16, 32), (37, 17), (5, 53)] {
             for set in InstructionSet::available() {
                 let (size, doubled) = (Resolution { width, height }, width / 3);
-                let (from, fields) = planes(size, set);
+                let (from, fields) = planes(size, set, 0.3);
                 let mut to = ColumnBlocks::of_cells(PLANES, size, set);
                 let mut fft = PlaneFft::new(PLANES, size, set);
-                fft.for_columns(from.blocks(), |columns, from| set.run(Step::Send(columns, from)));
-                fft.for_rows(std::iter::repeat(doubled), |rows, doubled| set.run(Step::Exchange(rows, doubled)));
-                fft.for_columns(to.blocks_mut(), |columns, to| set.run(Step::Take(columns, to)));
+                // What the first planes leave behind must not show in the second.
+                for from in [&planes(size, set, 5.3).0, &from] {
+                    fft.for_columns(from.blocks(), |columns, from| set.run(Step::Send(columns, from)));
+                    fft.for_rows(std::iter::repeat(doubled), |rows, doubled| set.run(Step::Exchange(rows, doubled)));
+                    fft.for_columns(to.blocks_mut(), |columns, to| set.run(Step::Take(columns, to)));
+                }
 
                 let mut slow = TransposedFft2d::new(width, height);
                 let expected = fields.iter().cycle().skip(1).take(PLANES).flat_map(|field| {

@@ -2,7 +2,7 @@
 
 use holod_calibration::{Colour, DisplayGeometry, Metres, Resolution};
 
-use super::column_blocks::ColumnBlocks;
+use super::column_blocks::{ColumnBlocks, load, store};
 use super::input_features::sample_pitch;
 use super::plane_fft::{Columns, PlaneFft, Rows};
 use super::pupil_stop::PupilStop;
@@ -122,24 +122,13 @@ pub(super) fn transfer(bench: &DisplayGeometry, size: Resolution, u: Metres, set
     let tables = Colour::ALL.map(|colour| transfer_table(bench.wavelengths[colour], sample_pitch(bench), size, u));
     let mut spectra = vec![0.0; height.div_ceil(lanes) * tables.len() * width * 2 * lanes];
     for (number, cell) in spectra.chunks_exact_mut(2 * lanes).enumerate() {
-        let (first, table, column) = (number / (3 * width) * lanes, &tables[number / width % 3], number % width);
+        let (first, table, column) =
+            (number / (tables.len() * width) * lanes, &tables[number / width % tables.len()], number % width);
         for (lane, value) in table[column * height..][..height].iter().skip(first).take(lanes).enumerate() {
             (cell[lane], cell[lanes + lane]) = (value.re, value.im);
         }
     }
     spectra
-}
-
-/// The two vectors of a cell.
-#[inline(always)]
-pub(super) fn load<S: Simd>(simd: S, cell: &[f32]) -> [S::Vector; 2] {
-    [simd.read(cell), simd.read(&cell[S::LANES..])]
-}
-
-#[inline(always)]
-pub(super) fn store<S: Simd>(simd: S, cell: &mut [f32], [re, im]: [S::Vector; 2]) {
-    simd.write(cell, re);
-    simd.write(&mut cell[S::LANES..], im);
 }
 
 #[inline(always)]

@@ -6,13 +6,13 @@ use num_complex::Complex32;
 use rayon::prelude::*;
 
 use super::blocks::grid_size;
-use super::column_blocks::ColumnBlocks;
+use super::column_blocks::{ColumnBlocks, store};
 use super::feature_map::FeatureMap;
 use super::feedback::PlaneFeedback;
 use super::field::{Field, UncorrectedField};
 use super::input_features::FIRST_MAP;
 use super::plane_fft::Columns;
-use super::plane_light::{PlaneLight, PlanePositions, store};
+use super::plane_light::{PlaneLight, PlanePositions};
 use super::stage::{Buffers, Job, MapId, Maps, Shared, Stage, plane_bytes};
 use super::stage_list::StageList;
 use super::trunk::Trunk;

@@ -8,9 +8,9 @@ use crate::simd::{InstructionSet, Simd};
 
 /// The pupil in the Fourier plane of the network's grid: a disc of radius (s/2)/(λ·f).
 pub(super) struct PupilStop {
-    /// Of each colour, in cycles per metre.
+    /// Squares of each colour's radius and of each bin's frequency along rows and along columns, in cycles per metre
+    /// squared; the latter up to whole blocks of rows.
     radius_squared: [f64; 3],
-    /// The same of each bin's frequency, along rows and along columns, these up to whole blocks of rows.
     along_rows: Vec<f64>,
     along_columns: Vec<f64>,
     bench: DisplayGeometry,
@@ -18,14 +18,14 @@ pub(super) struct PupilStop {
 
 impl PupilStop {
     pub(super) fn new(bench: &DisplayGeometry, size: Resolution, set: InstructionSet) -> Self {
-        let squared = |bins: usize| {
+        let squared = |bins: usize, padded: usize| {
             let bin_per_m = 1.0 / (bins as f64 * sample_pitch(bench).0);
-            (0..bins.next_multiple_of(set.lanes())).map(move |bin| (signed_bin(bin, bins) as f64 * bin_per_m).powi(2))
+            (0..padded).map(move |bin| (signed_bin(bin, bins) as f64 * bin_per_m).powi(2))
         };
         Self {
             radius_squared: [0.0; 3],
-            along_rows: squared(size.width).collect(),
-            along_columns: squared(size.height).collect(),
+            along_rows: squared(size.width, size.width).collect(),
+            along_columns: squared(size.height, size.height.next_multiple_of(set.lanes())).collect(),
             bench: *bench,
         }
     }

@@ -406,7 +406,7 @@ fn stages_tell_the_least_that_they_move() {
     let frame = 4 * 4 * 31 * 18;
     let planes = |count: u64| count * 4 * 16 * 9;
     let hologram = 3 * 8 * 31 * 18;
-    let numbers = 4 * 16 * 9;
+    let numbers = planes(4);
     let named =
         |stages: &[(&str, u64)]| stages.iter().map(|&(name, bytes)| (name.to_owned(), bytes)).collect::<Vec<_>>();
     assert_eq!(
@@ -445,25 +445,30 @@ fn stages_tell_the_least_that_they_move() {
 
 #[test]
 fn what_is_no_number_at_the_border_leaves_no_trace_in_the_next_frame() {
-    let resolution = Resolution { width: 31, height: 18 };
-    for weights in [random_weights(config(Grid::HalfBand, 4, 8, vec![1]), 2), Weights::builtin_small()] {
-        let pupil = PupilDiameter::from_mm(3.0);
-        let render = |engine: &mut CpuEngine, frame: &RgbdFrame| {
+    // Neither is a multiple of any set's lanes.
+    let resolution = Resolution { width: 37, height: 18 };
+    for (weights, set) in [random_weights(config(Grid::HalfBand, 4, 8, vec![1]), 2), Weights::builtin_small()]
+        .iter()
+        .flat_map(|weights| InstructionSet::available().map(move |set| (weights, set)))
+    {
+        let render = |network: &mut Network<RgbdFrame>, frame: &RgbdFrame| {
             let mut hologram = ComplexHologram::dark(resolution);
-            engine.render(frame, pupil, &mut hologram).unwrap();
+            network.render(frame, PupilDiameter::from_mm(3.0), &mut hologram);
             hologram.field
         };
-        let mut engine = CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, resolution).unwrap();
-        let clean = render(&mut engine, &frame(resolution, 4));
-        for (pixel, spoiler) in [(0, f32::NAN), (30, f32::INFINITY), (31 * 18 - 1, f32::NEG_INFINITY)] {
+        let mut network = Network::of_frames(weights, &DisplayGeometry::DEFAULT, resolution, set).unwrap();
+        let clean = render(&mut network, &frame(resolution, 4));
+        let spoilers = [(0, f32::NAN), (36, f32::INFINITY), (37 * 18 - 1, f32::NEG_INFINITY)];
+        for (pixel, spoiler) in spoilers {
+            let context = format!("pixel {pixel} on {}", set.name());
             let mut spoiled = frame(resolution, 4);
             spoiled.amplitude[pixel] = spoiler;
-            assert!(render(&mut engine, &spoiled).iter().any(|value| !value.is_finite()), "pixel {pixel} is not seen");
-            assert_eq!(render(&mut engine, &frame(resolution, 4)), clean, "pixel {pixel} left a trace");
+            assert!(render(&mut network, &spoiled).iter().any(|value| !value.is_finite()), "{context} is not seen");
+            assert_eq!(render(&mut network, &frame(resolution, 4)), clean, "{context} left a trace");
             let mut spoiled = frame(resolution, 4);
             spoiled.depth_normalised[pixel] = spoiler;
-            render(&mut engine, &spoiled);
-            assert_eq!(render(&mut engine, &frame(resolution, 4)), clean, "the depth of pixel {pixel} left a trace");
+            render(&mut network, &spoiled);
+            assert_eq!(render(&mut network, &frame(resolution, 4)), clean, "the depth of {context} left a trace");
         }
     }
 }
@@ -485,4 +490,28 @@ fn wrong_sizes_and_pupils_are_refused() {
     }
     let empty = Resolution { width: 0, height: 4 };
     assert!(matches!(CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, empty), Err(EngineError::Empty { .. })));
+}
+
+#[test]
+fn a_frame_is_the_same_to_the_bit_whatever_was_rendered_before() {
+    let resolution = Resolution { width: 37, height: 26 };
+    let other = frame(resolution, 4);
+    // Some layers have nothing now.
+    let mut shown = frame(resolution, 5);
+    for (index, depth) in shown.depth_normalised.iter_mut().enumerate() {
+        *depth = if index % resolution.width < 20 { 0.7 } else { 0.1 };
+    }
+    for set in InstructionSet::available() {
+        let weights = Weights::builtin_fast();
+        let mut network = Network::of_frames(&weights, &DisplayGeometry::DEFAULT, resolution, set).unwrap();
+        let mut render = |frame, pupil_mm| {
+            let mut hologram = ComplexHologram::dark(resolution);
+            network.render(frame, PupilDiameter::from_mm(pupil_mm), &mut hologram);
+            hologram
+        };
+        let alone = render(&shown, 3.0);
+        let before = render(&other, 5.0);
+        assert!(before != alone, "another frame is another hologram");
+        assert!(render(&shown, 3.0) == alone, "{}", set.name());
+    }
 }
