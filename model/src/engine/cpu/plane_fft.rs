@@ -5,6 +5,8 @@
 //! columns ends a transform back, does something with samples and begins the next one forward; one over blocks of rows
 //! does the same with spectra.
 
+use std::ops::Range;
+
 use holod_calibration::Resolution;
 
 use super::line_fft::{Direction, FftScratch, LineFft};
@@ -84,8 +86,8 @@ impl PlaneFft {
         share_out(workers, chunks.zip(items).enumerate(), |worker, (block, (to, item))| {
             let Worker { lines, between, column_scratch: scratch, .. } = worker;
             let from = Tiles { values: by_rows, tile, first: block, step: blocks, planes: *planes };
-            let len = *height * 2 * *lanes;
-            work(Columns { fft: columns, from, to, plane_len, lines, len, between, scratch }, item);
+            let lines = &mut lines[..*planes * *height * 2 * *lanes];
+            work(Columns(Block { fft: columns, from, to, plane_len, lines, between, scratch }), item);
         });
     }
 
@@ -102,8 +104,8 @@ impl PlaneFft {
         share_out(workers, chunks.zip(items).enumerate(), |worker, (block, (to, item))| {
             let Worker { lines, between, row_scratch: scratch, .. } = worker;
             let from = Tiles { values: by_columns, tile, first: block, step: blocks, planes: *planes };
-            let len = *width * 2 * *lanes;
-            work(Rows { fft: rows, from, to, plane_len, lines, len, between, scratch }, item);
+            let lines = &mut lines[..*planes * *width * 2 * *lanes];
+            work(Rows(Block { fft: rows, from, to, plane_len, lines, between, scratch }), item);
         });
     }
 }
@@ -127,39 +129,51 @@ impl<'a> Tiles<'a> {
     }
 }
 
-/// A block of columns of all planes.
-pub(super) struct Columns<'a> {
+/// Lines of all planes, as many of each as a vector has lanes: a block of columns or of rows.
+struct Block<'a> {
     fft: &'a LineFft,
     from: Tiles<'a>,
     to: &'a mut [f32],
     /// Values of one plane in `to`.
     plane_len: usize,
+    /// [plane, cell]
     lines: &'a mut [f32],
-    /// Values of one plane in `lines`.
-    len: usize,
     between: &'a mut [f32],
     scratch: &'a mut FftScratch,
 }
 
-impl Columns<'_> {
-    /// The cells [row] of one plane, to be read and written.
+impl Block<'_> {
+    /// The values of one plane in `lines`.
     #[inline(always)]
-    pub(super) fn cells(&mut self, plane: usize) -> &mut [f32] {
-        &mut self.lines[plane * self.len..][..self.len]
+    fn range(&self, plane: usize) -> Range<usize> {
+        let len = self.lines.len() / self.from.planes;
+        plane * len..(plane + 1) * len
     }
+}
 
-    /// The cells of all planes, [plane, row].
+/// A block of columns of all planes.
+pub(super) struct Columns<'a>(Block<'a>);
+
+impl Columns<'_> {
+    /// The cells of all planes, [plane, row], to be read and written.
     #[inline(always)]
     pub(super) fn all_cells(&mut self) -> &mut [f32] {
-        let Self { lines, len, from, .. } = self;
-        &mut lines[..from.planes * *len]
+        self.0.lines
+    }
+
+    /// The cells [row] of one plane.
+    #[inline(always)]
+    pub(super) fn cells(&mut self, plane: usize) -> &mut [f32] {
+        let range = self.0.range(plane);
+        &mut self.0.lines[range]
     }
 
     /// Ends the transform of one plane from its spectrum, and gives the cells [row].
     #[inline(always)]
     pub(super) fn arrive<S: Simd>(&mut self, simd: S, plane: usize) -> &mut [f32] {
-        let Self { fft, from, lines, len, between, scratch, .. } = self;
-        let (lines, between) = (&mut lines[plane * *len..][..*len], &mut between[..*len]);
+        let range = self.0.range(plane);
+        let Block { fft, from, lines, between, scratch, .. } = &mut self.0;
+        let (lines, between) = (&mut lines[range.clone()], &mut between[..range.len()]);
         for (to, tile) in between.chunks_mut(from.tile).zip(from.of_plane(plane)) {
             to.copy_from_slice(&tile[..to.len()]);
         }
@@ -170,58 +184,50 @@ impl Columns<'_> {
     /// Begins the transform of the cells of one plane to its spectrum.
     #[inline(always)]
     pub(super) fn send<S: Simd>(&mut self, simd: S, plane: usize) {
-        let Self { fft, to, plane_len, lines, len, scratch, .. } = self;
-        let to = &mut to[plane * *plane_len..][..*len];
-        fft.transform(simd, Direction::Forward, &lines[plane * *len..][..*len], to, scratch);
+        let range = self.0.range(plane);
+        let Block { fft, to, plane_len, lines, scratch, .. } = &mut self.0;
+        let to = &mut to[plane * *plane_len..][..range.len()];
+        fft.transform(simd, Direction::Forward, &lines[range], to, scratch);
     }
 }
 
 /// A block of rows of all planes' spectra.
-pub(super) struct Rows<'a> {
-    fft: &'a LineFft,
-    from: Tiles<'a>,
-    to: &'a mut [f32],
-    /// Values of one plane in `to`.
-    plane_len: usize,
-    lines: &'a mut [f32],
-    /// Values of one plane in `lines`.
-    len: usize,
-    between: &'a mut [f32],
-    scratch: &'a mut FftScratch,
-}
+pub(super) struct Rows<'a>(Block<'a>);
 
 impl Rows<'_> {
-    /// The cells of all planes' spectra, [plane, column].
+    /// The cells of all planes' spectra, [plane, column], to be read and written.
     #[inline(always)]
     pub(super) fn all_cells(&mut self) -> &mut [f32] {
-        let Self { lines, len, from, .. } = self;
-        &mut lines[..from.planes * *len]
+        self.0.lines
     }
 
-    /// The cells [column] of one plane's spectrum, to be read and written.
+    /// The cells [column] of one plane's spectrum.
     #[inline(always)]
     pub(super) fn cells(&mut self, plane: usize) -> &mut [f32] {
-        &mut self.lines[plane * self.len..][..self.len]
+        let range = self.0.range(plane);
+        &mut self.0.lines[range]
     }
 
     /// Ends the transform of one plane to its spectrum, and gives the cells [column].
     #[inline(always)]
     pub(super) fn arrive<S: Simd>(&mut self, simd: S, plane: usize) -> &mut [f32] {
-        let Self { fft, from, lines, len, between, scratch, .. } = self;
-        let lines = &mut lines[plane * *len..][..*len];
+        let range = self.0.range(plane);
+        let Block { fft, from, lines, between, scratch, .. } = &mut self.0;
         for (to, tile) in between.chunks_exact_mut(from.tile).zip(from.of_plane(plane)) {
             transpose(simd, tile, to);
         }
-        fft.transform(simd, Direction::Forward, &between[..*len], lines, scratch);
+        let (lines, between) = (&mut lines[range.clone()], &between[..range.len()]);
+        fft.transform(simd, Direction::Forward, between, lines, scratch);
         lines
     }
 
     /// Begins the transform back of one plane's spectrum.
     #[inline(always)]
     pub(super) fn send<S: Simd>(&mut self, simd: S, plane: usize) {
-        let Self { fft, from, to, plane_len, lines, len, between, scratch } = self;
-        let (lines, to) = (&lines[plane * *len..][..*len], &mut to[plane * *plane_len..][..*plane_len]);
-        fft.transform(simd, Direction::Inverse, lines, &mut between[..*len], scratch);
+        let range = self.0.range(plane);
+        let Block { fft, from, to, plane_len, lines, between, scratch } = &mut self.0;
+        fft.transform(simd, Direction::Inverse, &lines[range.clone()], &mut between[..range.len()], scratch);
+        let to = &mut to[plane * *plane_len..][..*plane_len];
         for (to, tile) in to.chunks_exact_mut(from.tile).zip(between.chunks_exact(from.tile)) {
             transpose(simd, tile, to);
         }
