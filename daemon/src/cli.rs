@@ -207,15 +207,25 @@ impl From<Fit> for FitArg {
 #[serde(rename_all = "kebab-case")]
 pub enum Backend {
     /// A GPU where there is one that will do, in half precision if it multiplies matrices so; else the processor's
-    /// cores.
+    /// cores, in half precision where that is faster.
     #[default]
     Auto,
-    /// Native code on the processor's cores.
+    /// Native code on the processor's cores, in single precision.
     Cpu,
+    /// The same with what a network's layers multiply in half precision (bfloat16), where the processor gains by that:
+    /// faster, a little less exact.
+    CpuHalf,
     /// A GPU by Vulkan, in single precision; where there is none, a processor that plays one, which is slow.
     Gpu,
     /// The same with a network's features in half precision, where the device has that: faster, a little less exact.
     GpuHalf,
+}
+
+impl Backend {
+    /// Whether it takes a GPU, at least where there is one.
+    pub fn takes_a_gpu(self) -> bool {
+        !matches!(self, Self::Cpu | Self::CpuHalf)
+    }
 }
 
 /// Options of `run`.

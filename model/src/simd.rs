@@ -3,6 +3,9 @@
 //! A value of an instruction set's type exists only where the processor has that set, which is what makes calling its
 //! instructions sound.
 
+#[cfg(target_arch = "x86_64")]
+use std::mem;
+
 /// The lanes of the widest vector.
 pub(crate) const MOST_LANES: usize = 16;
 
@@ -73,6 +76,23 @@ pub(crate) trait Simd: Copy + Send + Sync {
     fn add_pairs(self, a: Self::Vector, b: Self::Vector) -> Self::Vector {
         let [even, odd] = self.unzip(a, b);
         self.add(even, odd)
+    }
+    /// Factors in a word, the 32 bits of a lane: one `f32`, or the bfloat16s of two neighbouring channels, first channel
+    /// in the lower half.
+    const FACTORS: usize = 1;
+    /// Writes `LANES` values as factors, in `LANES / FACTORS` words.
+    ///
+    /// # Safety
+    /// `to` points to as many writable words.
+    #[inline(always)]
+    unsafe fn store_factors(self, to: *mut f32, vector: Self::Vector) {
+        // SAFETY: the caller's.
+        unsafe { self.store(to, vector) }
+    }
+    /// The sum of a word's products and c: a·b + c, or a₀·b₀ + a₁·b₁ + c.
+    #[inline(always)]
+    fn mul_add_factors(self, a: Self::Vector, b: Self::Vector, c: Self::Vector) -> Self::Vector {
+        self.mul_add(a, b, c)
     }
     /// Writes the transpose of a square of `LANES` by `LANES` values, whose rows begin `pitches[0]` values apart, to a
     /// square whose rows begin `pitches[1]` apart.
@@ -159,13 +179,111 @@ impl InstructionSet {
     }
 }
 
-/// Lanes in plain Rust; four are what every compiler target has base vectors for.
+/// What layers multiply with: the vectors of an instruction set, and factors in single precision or as bfloat16s. Sums
+/// are in single precision.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Portable<const N: usize>;
+pub(crate) enum Products {
+    Single(InstructionSet),
+    #[cfg(target_arch = "x86_64")]
+    Avx512Bf16(Avx512Bf16),
+    #[cfg(test)]
+    PortableHalf(Portable<4, 2>),
+    #[cfg(test)]
+    WideHalf(Portable<16, 2>),
+}
 
-impl<const N: usize> Simd for Portable<N> {
+impl Products {
+    /// All that this processor can do.
+    #[cfg(test)]
+    pub(crate) fn available() -> impl Iterator<Item = Self> {
+        let half = [Self::half(), Some(Self::PortableHalf(Portable)), Some(Self::WideHalf(Portable))];
+        InstructionSet::available().map(Self::Single).chain(half.into_iter().flatten())
+    }
+
+    /// Products of bfloat16s, where the processor has an instruction for them.
+    pub(crate) fn half() -> Option<Self> {
+        #[cfg(target_arch = "x86_64")]
+        return Avx512Bf16::detect().map(Self::Avx512Bf16);
+        #[cfg(not(target_arch = "x86_64"))]
+        None
+    }
+
+    /// The vectors.
+    pub(crate) fn set(self) -> InstructionSet {
+        match self {
+            Self::Single(set) => set,
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512Bf16(simd) => InstructionSet::Avx512(simd.into()),
+            #[cfg(test)]
+            Self::PortableHalf(_) => InstructionSet::Portable(Portable),
+            #[cfg(test)]
+            Self::WideHalf(_) => InstructionSet::Wide(Portable),
+        }
+    }
+
+    /// [`Simd::FACTORS`].
+    pub(crate) fn factors(self) -> usize {
+        if matches!(self, Self::Single(_)) { 1 } else { 2 }
+    }
+
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Single(set) => set.name(),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512Bf16(_) => "avx512 in half precision",
+            #[cfg(test)]
+            Self::PortableHalf(_) => "portable in half precision",
+            #[cfg(test)]
+            Self::WideHalf(_) => "wide in half precision",
+        }
+    }
+
+    pub(crate) fn run(self, task: impl Task) {
+        match self {
+            Self::Single(set) => set.run(task),
+            #[cfg(target_arch = "x86_64")]
+            Self::Avx512Bf16(simd) => simd.vectorise(task),
+            #[cfg(test)]
+            Self::PortableHalf(simd) => simd.vectorise(task),
+            #[cfg(test)]
+            Self::WideHalf(simd) => simd.vectorise(task),
+        }
+    }
+}
+
+/// Lanes in plain Rust, with so many factors in a word; four are what every compiler target has base vectors for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Portable<const N: usize, const FACTORS: usize = 1>;
+
+impl<const N: usize, const FACTORS: usize> Simd for Portable<N, FACTORS> {
     type Vector = [f32; N];
     const LANES: usize = N;
+    const FACTORS: usize = FACTORS;
+
+    #[inline(always)]
+    unsafe fn store_factors(self, to: *mut f32, vector: [f32; N]) {
+        for (word, values) in vector.chunks(FACTORS).enumerate() {
+            // SAFETY: the caller promises as many writable words as there are chunks.
+            unsafe {
+                *to.add(word) = match *values {
+                    [first, second] => word_of([first, second]),
+                    [value, ..] => value,
+                    [] => unreachable!("chunks are not empty"),
+                };
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn mul_add_factors(self, a: [f32; N], b: [f32; N], c: [f32; N]) -> [f32; N] {
+        if FACTORS == 1 {
+            return self.mul_add(a, b, c);
+        }
+        std::array::from_fn(|lane| {
+            let ([a0, a1], [b0, b1]) = (factors_of(a[lane]), factors_of(b[lane]));
+            a0 * b0 + a1 * b1 + c[lane]
+        })
+    }
 
     #[inline(always)]
     fn splat(self, value: f32) -> [f32; N] {
@@ -264,6 +382,17 @@ impl<const N: usize> Simd for Portable<N> {
     }
 }
 
+/// Two values as bfloat16s in a word.
+pub(crate) fn word_of(values: [f32; 2]) -> f32 {
+    let [low, high] = values.map(|value| u32::from(half::bf16::from_f32(value).to_bits()));
+    f32::from_bits(high << 16 | low)
+}
+
+/// The values of the bfloat16s in a word.
+pub(crate) fn factors_of(word: f32) -> [f32; 2] {
+    [word.to_bits() << 16, word.to_bits() & 0xffff_0000].map(f32::from_bits)
+}
+
 #[cfg(target_arch = "x86_64")]
 macro_rules! x86_instruction_set {
     (
@@ -273,6 +402,9 @@ macro_rules! x86_instruction_set {
         where_equal($x:ident, $y:ident, $value:ident) $where_equal:expr;
         $set1_pair:ident, $cast_pair:ident; unzip($a:ident, $b:ident) $unzip:expr;
         transpose($rows:ident) $transpose:expr
+        $(; factors $factors:literal
+        store_factors($to:ident, $from:ident) $store_factors:expr;
+        mul_add_factors($p:ident, $q:ident, $sum:ident) $mul_add_factors:expr)?
     ) => {
         $(#[$doc])*
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -285,7 +417,7 @@ macro_rules! x86_instruction_set {
         }
 
         // SAFETY, for every block below: a value of this type exists only where `detect` found the features, so the
-        // instructions are there; `splat_pair`, `load` and `store` pass their callers' promises on.
+        // instructions are there; `splat_pair`, `load`, `store` and `store_factors` pass their callers' promises on.
         #[allow(clippy::undocumented_unsafe_blocks, reason = "one reason for all, above")]
         impl Simd for $name {
             type Vector = std::arch::x86_64::$vector;
@@ -377,6 +509,20 @@ macro_rules! x86_instruction_set {
                 }
             }
 
+            $(const FACTORS: usize = $factors;
+
+            #[inline(always)]
+            unsafe fn store_factors(self, $to: *mut f32, $from: Self::Vector) {
+                use std::arch::x86_64::*;
+                unsafe { $store_factors }
+            }
+
+            #[inline(always)]
+            fn mul_add_factors(self, $p: Self::Vector, $q: Self::Vector, $sum: Self::Vector) -> Self::Vector {
+                use std::arch::x86_64::*;
+                unsafe { $mul_add_factors }
+            })?
+
             fn vectorise<T: Task>(self, task: T) {
                 #[target_feature(enable = $features)]
                 fn with_features<T: Task>(simd: $name, task: T) {
@@ -426,44 +572,77 @@ x86_instruction_set! {
     }
 }
 
+/// Two instruction sets of the same vectors.
 #[cfg(target_arch = "x86_64")]
-x86_instruction_set! {
-    /// AVX-512: 32 registers of 16 lanes.
-    Avx512, 16, __m512, "avx512f", detect "avx512f";
-    _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_fnmadd_ps, _mm512_add_ps,
-    _mm512_sub_ps, _mm512_mul_ps, _mm512_div_ps, _mm512_sqrt_ps, _mm512_max_ps;
-    where_equal(a, b, value) _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_EQ_OQ>(a, b), value);
-    _mm512_set1_pd, _mm512_castpd_ps;
-    unzip(a, b) {
-        // Lanes from 16 on are those of `b`.
-        let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
-        let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
-        [_mm512_permutex2var_ps(a, even, b), _mm512_permutex2var_ps(a, odd, b)]
+macro_rules! avx512 {
+    (
+        $(#[$doc:meta])* $name:ident, $features:literal, detect $($feature:tt),+;
+        $($factors:tt)*
+    ) => {
+        x86_instruction_set! {
+            $(#[$doc])*
+            $name, 16, __m512, $features, detect $($feature),+;
+            _mm512_set1_ps, _mm512_loadu_ps, _mm512_storeu_ps, _mm512_fmadd_ps, _mm512_fnmadd_ps, _mm512_add_ps,
+            _mm512_sub_ps, _mm512_mul_ps, _mm512_div_ps, _mm512_sqrt_ps, _mm512_max_ps;
+            where_equal(a, b, value) _mm512_maskz_mov_ps(_mm512_cmp_ps_mask::<_CMP_EQ_OQ>(a, b), value);
+            _mm512_set1_pd, _mm512_castpd_ps;
+            unzip(a, b) {
+                // Lanes from 16 on are those of `b`.
+                let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+                let odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
+                [_mm512_permutex2var_ps(a, even, b), _mm512_permutex2var_ps(a, odd, b)]
+            };
+            transpose(rows) {
+                let mut to = rows;
+                let mut fours = rows;
+                for four in [0, 4, 8, 12] {
+                    let [a, b, c, d] = [rows[four], rows[four + 1], rows[four + 2], rows[four + 3]];
+                    let (ab, cd) = (_mm512_unpacklo_ps(a, b), _mm512_unpacklo_ps(c, d));
+                    let (ab, cd) = (_mm512_castps_pd(ab), _mm512_castps_pd(cd));
+                    fours[four] = _mm512_castpd_ps(_mm512_unpacklo_pd(ab, cd));
+                    fours[four + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(ab, cd));
+                    let (ab, cd) = (_mm512_unpackhi_ps(a, b), _mm512_unpackhi_ps(c, d));
+                    let (ab, cd) = (_mm512_castps_pd(ab), _mm512_castps_pd(cd));
+                    fours[four + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(ab, cd));
+                    fours[four + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(ab, cd));
+                }
+                for column in 0..4 {
+                    let [a, b, c, d] = [fours[column], fours[column + 4], fours[column + 8], fours[column + 12]];
+                    let (ab_low, ab_high) = (_mm512_shuffle_f32x4::<0x44>(a, b), _mm512_shuffle_f32x4::<0xee>(a, b));
+                    let (cd_low, cd_high) = (_mm512_shuffle_f32x4::<0x44>(c, d), _mm512_shuffle_f32x4::<0xee>(c, d));
+                    to[column] = _mm512_shuffle_f32x4::<0x88>(ab_low, cd_low);
+                    to[column + 4] = _mm512_shuffle_f32x4::<0xdd>(ab_low, cd_low);
+                    to[column + 8] = _mm512_shuffle_f32x4::<0x88>(ab_high, cd_high);
+                    to[column + 12] = _mm512_shuffle_f32x4::<0xdd>(ab_high, cd_high);
+                }
+                to
+            }
+            $($factors)*
+        }
     };
-    transpose(rows) {
-        let mut to = rows;
-        let mut fours = rows;
-        for four in [0, 4, 8, 12] {
-            let [a, b, c, d] = [rows[four], rows[four + 1], rows[four + 2], rows[four + 3]];
-            let (ab, cd) = (_mm512_unpacklo_ps(a, b), _mm512_unpacklo_ps(c, d));
-            let (ab, cd) = (_mm512_castps_pd(ab), _mm512_castps_pd(cd));
-            fours[four] = _mm512_castpd_ps(_mm512_unpacklo_pd(ab, cd));
-            fours[four + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(ab, cd));
-            let (ab, cd) = (_mm512_unpackhi_ps(a, b), _mm512_unpackhi_ps(c, d));
-            let (ab, cd) = (_mm512_castps_pd(ab), _mm512_castps_pd(cd));
-            fours[four + 2] = _mm512_castpd_ps(_mm512_unpacklo_pd(ab, cd));
-            fours[four + 3] = _mm512_castpd_ps(_mm512_unpackhi_pd(ab, cd));
-        }
-        for column in 0..4 {
-            let [a, b, c, d] = [fours[column], fours[column + 4], fours[column + 8], fours[column + 12]];
-            let (ab_low, ab_high) = (_mm512_shuffle_f32x4::<0x44>(a, b), _mm512_shuffle_f32x4::<0xee>(a, b));
-            let (cd_low, cd_high) = (_mm512_shuffle_f32x4::<0x44>(c, d), _mm512_shuffle_f32x4::<0xee>(c, d));
-            to[column] = _mm512_shuffle_f32x4::<0x88>(ab_low, cd_low);
-            to[column + 4] = _mm512_shuffle_f32x4::<0xdd>(ab_low, cd_low);
-            to[column + 8] = _mm512_shuffle_f32x4::<0x88>(ab_high, cd_high);
-            to[column + 12] = _mm512_shuffle_f32x4::<0xdd>(ab_high, cd_high);
-        }
-        to
+}
+
+#[cfg(target_arch = "x86_64")]
+avx512! {
+    /// AVX-512: 32 registers of 16 lanes.
+    Avx512, "avx512f", detect "avx512f";
+}
+
+#[cfg(target_arch = "x86_64")]
+avx512! {
+    /// The same with sums of two products of bfloat16s in each lane.
+    Avx512Bf16, "avx512f,avx512bf16", detect "avx512f", "avx512bf16";
+    ; factors 2
+    store_factors(to, from) _mm256_storeu_si256(to.cast(), mem::transmute::<__m256bh, __m256i>(_mm512_cvtneps_pbh(from)));
+    mul_add_factors(a, b, c) {
+        _mm512_dpbf16_ps(c, mem::transmute::<__m512, __m512bh>(a), mem::transmute::<__m512, __m512bh>(b))
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl From<Avx512Bf16> for Avx512 {
+    fn from(_: Avx512Bf16) -> Self {
+        Self(())
     }
 }
 
@@ -500,6 +679,62 @@ mod tests {
             assert_eq!(found, expected, "{}", set.name());
             expected.swap(set.lanes(), set.lanes() + 1);
             assert_ne!(found, expected, "two lanes that changed places are seen");
+        }
+    }
+
+    /// Writes the factors of a vector of fractions and those of their halves, and one sum of the products of both.
+    struct Factors<'a>(&'a mut Vec<f32>);
+
+    fn fraction(index: usize) -> f32 {
+        (index as f32 - 5.0) / 7.0
+    }
+
+    impl Task for Factors<'_> {
+        #[inline(always)]
+        fn run<S: Simd>(self, simd: S) {
+            let words = 2 * S::LANES / S::FACTORS;
+            let values: Vec<f32> = (0..2 * S::LANES).map(fraction).collect();
+            let [mut a, mut b] = [vec![0.0; 2 * S::LANES], vec![0.0; 2 * S::LANES]];
+            let half = simd.splat(0.5);
+            let mut sums = vec![0.0; S::LANES];
+            // SAFETY: `values` holds two vectors, `a` and `b` as many words, and `sums` a vector.
+            unsafe {
+                for vector in 0..2 {
+                    let (from, to) = (vector * S::LANES, vector * S::LANES / S::FACTORS);
+                    let value = simd.load(values.as_ptr().add(from));
+                    simd.store_factors(a.as_mut_ptr().add(to), value);
+                    simd.store_factors(b.as_mut_ptr().add(to), simd.mul(half, value));
+                }
+                let sum = simd.mul_add_factors(simd.load(a.as_ptr()), simd.load(b.as_ptr()), simd.splat(1.0));
+                simd.store(sums.as_mut_ptr(), sum);
+            }
+            self.0.extend(a[..words].iter().chain(&b[..words]).chain(&sums));
+        }
+    }
+
+    #[test]
+    fn factors_are_rounded_in_pairs_and_their_products_added_in_single_precision() {
+        for products in Products::available() {
+            let (lanes, factors) = (products.set().lanes(), products.factors());
+            let mut found = Vec::new();
+            products.run(Factors(&mut found));
+            let kept = |index: usize, share: f32| {
+                let value = share * fraction(index);
+                if factors == 1 { value } else { half::bf16::from_f32(value).to_f32() }
+            };
+            let words = 2 * lanes / factors;
+            for (word, share) in (0..2 * words).map(|word| (word, if word < words { 1.0 } else { 0.5 })) {
+                let values = if factors == 1 { vec![found[word]] } else { factors_of(found[word]).to_vec() };
+                let expected = (0..factors).map(|factor| kept(word % words * factors + factor, share));
+                assert_eq!(values, expected.collect::<Vec<_>>(), "word {word} on {}", products.name());
+            }
+            for (lane, found) in found[2 * words..].iter().enumerate() {
+                let products_of = |index: usize| f64::from(kept(index, 1.0)) * f64::from(kept(index, 0.5));
+                let expected = 1.0 + (0..factors).map(|factor| products_of(lane * factors + factor)).sum::<f64>();
+                let error = |expected: f64| (f64::from(*found) - expected).abs();
+                assert!(error(expected) < 1e-6 * expected, "lane {lane} on {}: {found}", products.name());
+                assert!(error(expected + 1e-4) > 1e-6 * expected, "the comparison is blind");
+            }
         }
     }
 

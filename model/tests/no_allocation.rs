@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
+use holod_model::engine::Precision;
 use holod_model::optics::DoublePhase;
 use holod_model::{ComplexHologram, CpuEngine, PhasePattern, RgbdFrame, Weights, WorkerPool};
 use holod_tests::counting::{self, Counting};
@@ -27,7 +28,13 @@ fn check(weights: &Weights) {
 }
 
 fn check_at(weights: &Weights, resolution: Resolution) {
-    let engine = CpuEngine::new(weights, &DisplayGeometry::DEFAULT, resolution).unwrap();
+    for precision in [Precision::Single, Precision::Half] {
+        check_in(precision, weights, resolution);
+    }
+}
+
+fn check_in(precision: Precision, weights: &Weights, resolution: Resolution) {
+    let engine = CpuEngine::new(weights, &DisplayGeometry::DEFAULT, resolution, precision).unwrap();
     let double_phase = DoublePhase::new(resolution, weights.config().amplitude_constant);
     let frame = RgbdFrame {
         resolution,

@@ -27,7 +27,8 @@ use crate::view::{eye, pupil, see};
 /// `rig` is the bench, the built-in one without. `weights` are "standard", "small", "fast" or a file that the trainer
 /// exported; without, those that the rig names. `width_px` and `height_px` are the size of the pictures, which are
 /// centred on the panel; without, the panel's. `backend` is "auto" (a GPU where there is one that will do, in half
-/// precision if it multiplies matrices so, else the processor), "cpu", "gpu" (in single precision) or "gpu-half".
+/// precision if it multiplies matrices so, else the processor, in half precision where that is faster), "cpu" or "gpu"
+/// (in single precision), "cpu-half" or "gpu-half".
 ///
 /// Making one takes seconds and much memory: keep it and render with it again and again. Several threads may use one;
 /// they take turns.
@@ -305,10 +306,11 @@ pub(crate) fn backend_named(name: &str) -> PyResult<Backend> {
     match name {
         "auto" => Ok(Backend::Auto),
         "cpu" => Ok(Backend::Cpu),
+        "cpu-half" => Ok(Backend::CpuHalf),
         "gpu" => Ok(Backend::Gpu),
         "gpu-half" => Ok(Backend::GpuHalf),
         _ => Err(InputError::new_err(format!(
-            "backend: found {name:?}, expected \"auto\", \"cpu\", \"gpu\" or \"gpu-half\""
+            "backend: found {name:?}, expected \"auto\", \"cpu\", \"cpu-half\", \"gpu\" or \"gpu-half\""
         ))),
     }
 }

@@ -134,7 +134,7 @@ def test_a_renderer_that_cannot_be_had_says_why(tmp_path: Path) -> None:
         ('weights: found "standart", expected one of standard, small, fast, or a file', {"weights": "standart"}),
         ("found a pattern of 0x5, expected 1x1 to the panel's 1920x1080", {"width_px": 0, "height_px": 5}),
         ("found a pattern of 1921x1080", {"width_px": 1921}),
-        ('backend: found "cuda", expected "auto", "cpu", "gpu" or "gpu-half"', {"backend": "cuda"}),
+        ('backend: found "cuda", expected "auto", "cpu", "cpu-half", "gpu" or "gpu-half"', {"backend": "cuda"}),
     ]:
         with pytest.raises(holod.InputError) as raised:
             holod.Renderer(**options)  # type: ignore[arg-type]

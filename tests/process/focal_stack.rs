@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution};
-use holod_model::engine::FocalStackEngine;
+use holod_model::engine::{FocalStackEngine, Precision};
 use holod_model::files::StoredHologram;
 use holod_model::scene::{Fit, FocalStack, FocalStackFiles};
 use holod_model::scene_renderer::sample_scene;
@@ -38,7 +38,8 @@ fn a_folder_of_images_becomes_the_hologram_that_the_engine_makes_of_it() {
     let folder = holod_tests::new_folder();
     write_stack(folder.path(), "stack", PLANES);
     let weights = weights();
-    let args = ["render", "--focal-stack", "stack", "--weights", weights.to_str().unwrap(), "--out", "hologram"];
+    let weights_path = weights.to_str().unwrap();
+    let args = ["render", "--focal-stack", "stack", "--weights", weights_path, "--backend", "cpu", "--out", "hologram"];
     let ended = run(HOLOD, &[&args[..], &["--json"]].concat(), folder.path());
     assert!(ended.status.success(), "{ended:?}");
     let report: Value = serde_json::from_str(&ended.stdout).unwrap();
@@ -49,7 +50,7 @@ fn a_folder_of_images_becomes_the_hologram_that_the_engine_makes_of_it() {
 
     let (stack, _) = FocalStackFiles::open(&folder.path().join("stack")).unwrap().load(None, Fit::Native).unwrap();
     let mut expected = ComplexHologram::dark(SIZE);
-    FocalStackEngine::new(&Weights::load(&weights).unwrap(), &BENCH, SIZE)
+    FocalStackEngine::new(&Weights::load(&weights).unwrap(), &BENCH, SIZE, Precision::Single)
         .unwrap()
         .render(&stack, &mut expected)
         .unwrap();

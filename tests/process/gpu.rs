@@ -39,7 +39,13 @@ fn share_apart(folder: &Path, one: &str, other: &str) -> f64 {
 #[test]
 fn a_gpu_gives_the_processors_hologram_and_is_named() {
     let folder = holod_tests::new_folder();
-    let named = [("gpu", "gpu, ", "single precision"), ("gpu-half", "gpu, ", "half precision"), ("cpu", "cpu, ", "")];
+    let named = [
+        ("gpu", "gpu, ", "single precision"),
+        ("gpu-half", "gpu, ", "half precision"),
+        ("cpu", "cpu, ", "threads"),
+        // Half precision where the processor has it.
+        ("cpu-half", "cpu, ", "threads"),
+    ];
     for (backend, begins, precision) in named {
         let ended = rendered(folder.path(), backend, backend);
         assert!(ended.status.success(), "{ended:?}");
@@ -49,6 +55,8 @@ fn a_gpu_gives_the_processors_hologram_and_is_named() {
     }
     assert!(share_apart(folder.path(), "gpu", "cpu") < 1e-2);
     assert!(share_apart(folder.path(), "gpu-half", "gpu") < 1e-2);
+    assert!(share_apart(folder.path(), "cpu-half", "cpu") < 2e-2);
+    assert!(!engine(folder.path(), "cpu").contains("half precision"));
     let [half, single] = ["gpu-half", "gpu"].map(|out| std::fs::read(folder.path().join(out).join("phase_green.png")));
     assert!(half.unwrap() != single.unwrap(), "computed in single precision");
     let wider = [&RENDER[..5], &["5", "--force", "--backend", "cpu", "--out", "wider"]].concat();

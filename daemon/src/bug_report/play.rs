@@ -53,11 +53,12 @@ pub struct Played {
 
 /// The backend that computes as the engine of that description did, or `Auto` where it was a GPU and there is none.
 fn like(engine: &str, there_is_a_gpu: impl FnOnce() -> bool) -> Backend {
+    let half = engine.contains("half precision");
     if engine.starts_with("cpu") {
-        Backend::Cpu
+        if half { Backend::CpuHalf } else { Backend::Cpu }
     } else if !there_is_a_gpu() {
         Backend::Auto
-    } else if engine.contains("half precision") {
+    } else if half {
         Backend::GpuHalf
     } else {
         Backend::Gpu
@@ -754,6 +755,7 @@ mod tests {
     fn frames_are_made_again_as_they_were_made_where_that_can_be() {
         let [with, without] = [true, false].map(|there| move |engine| like(engine, || there));
         assert_eq!([with("cpu, avx2, 2 threads"), without("cpu, avx2, 2 threads")], [Backend::Cpu; 2]);
+        assert_eq!(with("cpu, avx512 in half precision, 2 threads"), Backend::CpuHalf);
         assert_eq!(with("gpu, X, single precision"), Backend::Gpu);
         assert_eq!(with("gpu, X, matrix units, half precision"), Backend::GpuHalf);
         assert_eq!(without("gpu, X, single precision"), Backend::Auto);

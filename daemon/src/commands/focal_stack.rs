@@ -6,7 +6,7 @@ use std::time::Instant;
 use holod_calibration::rig::Rig;
 use holod_calibration::{Dioptres, DisplayGeometry};
 use holod_model::ComplexHologram;
-use holod_model::engine::{EngineError, FocalStackEngine};
+use holod_model::engine::{EngineError, FocalStackEngine, Precision};
 use holod_model::files::{BenchOptics, StoredHologram};
 use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::scene::FocalStackFiles;
@@ -44,7 +44,7 @@ struct Report {
 
 /// Renders the focal stack in `directory`; the command `began`.
 pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Instant) -> Result<(), Failure> {
-    if !matches!(args.backend, Backend::Auto | Backend::Cpu) {
+    if args.backend.takes_a_gpu() && args.backend != Backend::Auto {
         let only = "--backend: focal stacks are computed by the processor alone; leave it out, or name `cpu`";
         return Err(Failure::new(Exit::Usage, only));
     }
@@ -66,7 +66,8 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
     scene::warn_of_clipped_colours(&name, done.colour_clipped_px, done.source_px);
     scene::check_fits(resolution, &rig.geometry, &name)?;
     let mut engine = progress::during(&format!("preparing the network for {resolution}"), || {
-        FocalStackEngine::new(&weights, &rig.geometry, resolution).map_err(at_fault)
+        let precision = if args.backend == Backend::Cpu { Precision::Single } else { Precision::Half };
+        FocalStackEngine::new(&weights, &rig.geometry, resolution, precision).map_err(at_fault)
     })?;
     let amplitude_constant = weights.config().amplitude_constant;
     let mut double_phase = DoublePhase::new(resolution, amplitude_constant);

@@ -12,7 +12,7 @@ use holod_slm_output::OutputSpec;
 use holod_slm_output::present::drm::DrmTarget;
 
 use super::check::access::{HIDDEN_FROM_SERVICE, files_of};
-use crate::cli::{Backend, PageAddress, RunArgs, UnitArgs};
+use crate::cli::{PageAddress, RunArgs, UnitArgs};
 use crate::failure::{Exit, Failure};
 use crate::{results, setup};
 
@@ -120,7 +120,7 @@ fn needs(rig: &Rig, run: &RunArgs, root: &Path) -> Result<Needs, Failure> {
             return Err(Failure::new(Exit::Usage, format!("{says}CONNECTOR")));
         }
     }
-    if run.backend != Backend::Cpu {
+    if run.backend.takes_a_gpu() {
         needs.devices.extend(gpus(root));
     }
     Ok(needs)

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use holod_calibration::{Colour, DisplayGeometry, PerColour, PupilDiameter, Resolution};
-use holod_model::engine::{EngineError, StageTiming};
+use holod_model::engine::{EngineError, Precision, StageTiming};
 use holod_model::gpu::GpuError;
 use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::{ComplexHologram, CpuEngine, RgbdFrame, Weights, WorkerPool};
@@ -46,10 +46,11 @@ impl CpuRenderer {
         weights: &Weights,
         bench: &DisplayGeometry,
         encoder: &Arc<PanelEncoder>,
+        precision: Precision,
         no_gpu: Option<&GpuError>,
     ) -> Result<Self, Failure> {
         let resolution = encoder.pattern_resolution();
-        let engine = CpuEngine::new(weights, bench, resolution).map_err(super::failure)?;
+        let engine = CpuEngine::new(weights, bench, resolution, precision).map_err(super::failure)?;
         let levels = LevelsFrame::new(encoder.layout());
         let (hologram, pattern) = (ComplexHologram::dark(resolution), PhasePattern::flat(resolution));
         let pattern_bytes: usize = Colour::ALL.map(|colour| size_of_val(pattern.plane(colour))).iter().sum();
@@ -179,7 +180,8 @@ mod tests {
     /// The levels of one stage after the other.
     fn stage_by_stage(weights: &Weights, frame: &RgbdFrame, pupil: PupilDiameter) -> LevelsFrame {
         let (mut hologram, mut pattern) = (ComplexHologram::dark(SIZE), PhasePattern::flat(SIZE));
-        CpuEngine::new(weights, &DisplayGeometry::DEFAULT, SIZE).unwrap().render(frame, pupil, &mut hologram).unwrap();
+        let mut engine = CpuEngine::new(weights, &DisplayGeometry::DEFAULT, SIZE, Precision::Single).unwrap();
+        engine.render(frame, pupil, &mut hologram).unwrap();
         DoublePhase::new(SIZE, weights.config().amplitude_constant).encode(&hologram, &mut pattern);
         let encoder = encoder();
         let mut levels = LevelsFrame::new(encoder.layout());
@@ -190,7 +192,8 @@ mod tests {
     #[test]
     fn levels_are_those_of_the_stages_for_each_pupil_in_whatever_buffer() {
         let weights = Weights::builtin_small();
-        let mut renderer = CpuRenderer::new(&weights, &DisplayGeometry::DEFAULT, &encoder(), None).unwrap();
+        let mut renderer =
+            CpuRenderer::new(&weights, &DisplayGeometry::DEFAULT, &encoder(), Precision::Single, None).unwrap();
         let frame = Arc::new(scene::sample_frame(SIZE));
         let mut buffers = [(); 2].map(|()| LevelsFrame::new(encoder().layout()));
         let mut shown = Vec::new();
@@ -210,7 +213,8 @@ mod tests {
     #[test]
     fn a_frame_of_another_size_is_refused_and_the_next_one_rendered() {
         let weights = Weights::builtin_small();
-        let mut renderer = CpuRenderer::new(&weights, &DisplayGeometry::DEFAULT, &encoder(), None).unwrap();
+        let mut renderer =
+            CpuRenderer::new(&weights, &DisplayGeometry::DEFAULT, &encoder(), Precision::Single, None).unwrap();
         let mut levels = LevelsFrame::new(encoder().layout());
         let pupil = PupilDiameter::from_mm(3.0);
         let wrong = Arc::new(scene::sample_frame(PANEL));

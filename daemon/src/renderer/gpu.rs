@@ -4,8 +4,8 @@
 use std::sync::Arc;
 
 use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter};
-use holod_model::engine::{EngineError, GpuEngine, StageTiming};
-use holod_model::gpu::{Adapters, GpuError, Precision};
+use holod_model::engine::{EngineError, GpuEngine, Precision, StageTiming};
+use holod_model::gpu::{Adapters, GpuError};
 use holod_model::optics::PhasePattern;
 use holod_model::{ComplexHologram, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
@@ -113,7 +113,8 @@ impl GpuRenderer {
                 Err(again) => tracing::error!("the GPU cannot be opened again: {again}"),
             }
         }
-        match CpuRenderer::new(&self.weights, &self.bench, &self.encoder, Some(error)) {
+        let precision = self.precision.unwrap_or(Precision::Half);
+        match CpuRenderer::new(&self.weights, &self.bench, &self.encoder, precision, Some(error)) {
             Ok(cpu) => {
                 self.description = cpu.description().to_owned();
                 tracing::warn!("holograms are computed by {}", self.description);
@@ -243,7 +244,7 @@ mod tests {
 
     fn renderer(encoder: &Arc<PanelEncoder>) -> GpuRenderer {
         let (weights, bench) = (Weights::builtin_small(), DisplayGeometry::DEFAULT);
-        GpuRenderer::new(&weights, &bench, encoder, Adapters::Software, None)
+        GpuRenderer::new(&weights, &bench, encoder, Adapters::Software, Some(Precision::Single))
             .expect("Mesa's software device; install mesa-vulkan-drivers")
     }
 
@@ -260,7 +261,9 @@ mod tests {
         let frame = Arc::new(scene::sample_frame(SIZE));
         let levels = || LevelsFrame::new(encoder.layout());
         let (mut expected, mut flat) = (levels(), levels());
-        let mut cpu = CpuRenderer::new(&Weights::builtin_small(), &DisplayGeometry::DEFAULT, &encoder, None).unwrap();
+        let mut cpu =
+            CpuRenderer::new(&Weights::builtin_small(), &DisplayGeometry::DEFAULT, &encoder, Precision::Single, None)
+                .unwrap();
         let on_cpu = cpu.render(&frame, pupil, &mut expected).unwrap();
         encoder.encode_flat(&mut flat);
         assert!(apart(&expected, &flat) > 100, "the comparison is blind");

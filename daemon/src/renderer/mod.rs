@@ -8,8 +8,8 @@ use std::sync::Arc;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter, Resolution};
-use holod_model::engine::{EngineError, StageTiming};
-use holod_model::gpu::{Adapters, GpuError, Precision};
+use holod_model::engine::{EngineError, Precision, StageTiming};
+use holod_model::gpu::{Adapters, GpuError};
 use holod_model::optics::PhasePattern;
 use holod_model::{ComplexHologram, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
@@ -78,8 +78,8 @@ pub struct Rendered {
 /// A renderer of frames of the pattern's size of `encoder`, on the optics of `bench`.
 ///
 /// `Auto` takes a GPU where there is one that will do, else the processor; `Gpu` a GPU, or where there is none a
-/// processor that plays one. `GpuHalf` is as `Gpu`, in half precision where the device has it; `Auto` computes so where
-/// the device multiplies matrices.
+/// processor that plays one. `GpuHalf` and `CpuHalf` compute in half precision where the device has it; `Auto` does so
+/// on a GPU that multiplies matrices, and on a processor that gains by it.
 ///
 /// # Errors
 /// The backend is not to be had.
@@ -90,16 +90,17 @@ pub fn open(
     encoder: &Arc<PanelEncoder>,
 ) -> Result<Box<dyn Renderer>, Failure> {
     let precision = match backend {
-        Backend::Auto | Backend::Cpu => None,
-        Backend::Gpu => Some(Precision::Single),
-        Backend::GpuHalf => Some(Precision::Half),
+        Backend::Auto => None,
+        Backend::Cpu | Backend::Gpu => Some(Precision::Single),
+        Backend::CpuHalf | Backend::GpuHalf => Some(Precision::Half),
     };
+    let on_cpu = |no_gpu| CpuRenderer::new(weights, bench, encoder, precision.unwrap_or(Precision::Half), no_gpu);
     let on_gpu = |adapters| on_gpu(weights, bench, encoder, adapters, precision);
     match backend {
-        Backend::Cpu => Ok(Box::new(CpuRenderer::new(weights, bench, encoder, None)?)),
+        Backend::Cpu | Backend::CpuHalf => Ok(Box::new(on_cpu(None)?)),
         Backend::Auto => match on_gpu(Adapters::Hardware) {
             Ok(renderer) => Ok(renderer),
-            Err(EngineError::Gpu(error)) => Ok(Box::new(CpuRenderer::new(weights, bench, encoder, Some(&error))?)),
+            Err(EngineError::Gpu(error)) => Ok(Box::new(on_cpu(Some(&error))?)),
             Err(other) => Err(failure(other)),
         },
         Backend::Gpu | Backend::GpuHalf => on_gpu(Adapters::Hardware)

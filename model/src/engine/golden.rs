@@ -7,7 +7,7 @@ use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PupilDiameter
 use num_complex::{Complex32, Complex64};
 use safetensors::SafeTensors;
 
-use super::{CpuEngine, FocalStackEngine, reference};
+use super::{CpuEngine, FocalStackEngine, Precision, reference};
 use crate::files::BenchOptics;
 use crate::optics::{DoublePhase, Eye, Propagator, SimulatedEye};
 use crate::scene::FocalStack;
@@ -133,7 +133,7 @@ fn check(name: &str) {
     let field = golden.complex("field").unwrap();
     check_stages(name, &golden, &reference::run(&weights, &bench, &frame, pupil));
 
-    let mut engine = CpuEngine::new(&weights, &bench, frame.resolution).unwrap();
+    let mut engine = CpuEngine::new(&weights, &bench, frame.resolution, Precision::Single).unwrap();
     let mut hologram = ComplexHologram::dark(frame.resolution);
     engine.render(&frame, pupil, &mut hologram).unwrap();
     assert_matches(&format!("{name} engine"), &widen(&hologram.field), &field, ENGINE_TOLERANCE);
@@ -150,7 +150,7 @@ fn check_focal_stack(name: &str) {
     let (weights, stack) = (golden.weights(), golden.focal_stack());
     let bench = golden.bench(stack.resolution);
     check_stages(name, &golden, &reference::run_focal_stack(&weights, &bench, &stack));
-    let mut engine = FocalStackEngine::new(&weights, &bench, stack.resolution).unwrap();
+    let mut engine = FocalStackEngine::new(&weights, &bench, stack.resolution, Precision::Single).unwrap();
     let mut hologram = ComplexHologram::dark(stack.resolution);
     engine.render(&stack, &mut hologram).unwrap();
     let field = golden.complex("field").unwrap();

@@ -28,6 +28,16 @@ pub use gpu::{EncodedCounts, GpuEngine};
 /// of eyes on another, whose pixels are finer.
 pub const WIDEST_PUPIL: PupilDiameter = PupilDiameter::from_mm(20.0);
 
+/// What the layers of a network multiply, which is most of what is computed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Precision {
+    /// 32 bits.
+    Single,
+    /// 16 bits, with sums in 32: two products at once. On a GPU these are half-precision numbers, as which features are
+    /// stored as well; on a processor bfloat16s. Where the device has none, single precision takes its place.
+    Half,
+}
+
 /// Focuses no farther apart are one.
 pub(crate) const SAME_FOCUS_DPT: f64 = 1e-3;
 

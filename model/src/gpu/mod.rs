@@ -20,15 +20,6 @@ pub enum Adapters {
     Software,
 }
 
-/// What the features of a network are on a GPU, and with them most of what is computed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Precision {
-    /// 32 bits.
-    Single,
-    /// 16 bits, with sums in 32: two products at once. Where the device has none, single precision takes its place.
-    Half,
-}
-
 /// What multiplies matrices of 16 by 16 numbers of half precision, and sums up in single precision.
 #[cfg(feature = "gpu")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

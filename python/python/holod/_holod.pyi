@@ -16,7 +16,7 @@ __all__ = [
     "view",
 ]
 
-_Backend = Literal["auto", "cpu", "gpu", "gpu-half"]
+_Backend = Literal["auto", "cpu", "cpu-half", "gpu", "gpu-half"]
 _DepthUnit = Literal["metres", "millimetres", "dioptres", "normalised_dioptres"]
 _Levels = NDArray[np.uint8] | NDArray[np.uint16]
 _Path = str | os.PathLike[str]

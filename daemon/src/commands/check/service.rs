@@ -13,7 +13,7 @@ use rustix::fs::Access;
 
 use super::Check;
 use super::access::{REALTIME_PRIORITY, Runner, cure, named, serial_ports_of};
-use crate::cli::{Backend, CheckArgs, Cli, Command, RunArgs};
+use crate::cli::{CheckArgs, Cli, Command, RunArgs};
 use crate::commands::unit::{BINARY, STATE_FOLDER, USUAL_RIG, below, drop_in, names, unquoted, visible_paths};
 
 /// Where units are, the first that has one counts; drop-ins of all of them do.
@@ -189,7 +189,7 @@ fn realtime(unit: Option<&Unit>) -> Result<String, Vec<String>> {
 
 /// Whether the service's user may open cards and render nodes that its options name or let it use.
 fn graphics(run: Option<&RunArgs>, runner: &Runner, root: &Path) -> Result<String, Vec<String>> {
-    let computes_on_gpu = run.is_none_or(|run| run.backend != Backend::Cpu);
+    let computes_on_gpu = run.is_none_or(|run| run.backend.takes_a_gpu());
     let shows = run.is_some_and(|run| run.output.starts_with("drm:"));
     let dri = Path::new("/dev/dri");
     let of = |prefix: &str| names(&below(root, dri), prefix).into_iter().map(|name| dri.join(name)).collect::<Vec<_>>();

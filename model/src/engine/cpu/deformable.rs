@@ -4,7 +4,7 @@ use super::conv::{Activation, Epilogue, TAPS};
 use super::feature_map::FeatureMap;
 use super::product::{ROWS, Shape, panel_place, panels_len};
 use super::workers::WORKERS;
-use crate::simd::{InstructionSet, Simd, Task};
+use crate::simd::{Products, Simd, Task};
 
 /// A deformable convolution of maps.
 pub(super) struct DeformableConv {
@@ -14,7 +14,7 @@ pub(super) struct DeformableConv {
     shape: Shape,
     weights: Vec<f32>,
     activation: Activation,
-    set: InstructionSet,
+    products: Products,
     workers: Vec<Scratch>,
 }
 
@@ -32,25 +32,26 @@ impl DeformableConv {
         weight: impl Fn(usize, usize, usize) -> f32,
         epilogue: Epilogue,
         leaky_slope: f32,
-        set: InstructionSet,
+        products: Products,
     ) -> Self {
-        let shape = Shape::new(TAPS, in_channels, bias.len());
+        let shape = Shape::new(TAPS, in_channels, bias.len(), products);
         let mut weights = vec![0.0; shape.weights_len()];
         for (output, tap) in (0..bias.len()).flat_map(|output| (0..TAPS).map(move |tap| (output, tap))) {
             for input in 0..in_channels {
-                weights[shape.place(tap, input, output, set)] = weight(output, input, tap);
+                shape.set_weight(&mut weights, [tap, input, output], weight(output, input, tap));
             }
         }
-        let out_stride = bias.len().next_multiple_of(set.lanes());
+        let lanes = products.set().lanes();
+        let out_stride = bias.len().next_multiple_of(lanes);
         let mut padded_bias = bias.to_vec();
         padded_bias.resize(out_stride, 0.0);
         Self {
-            in_stride: in_channels.next_multiple_of(set.lanes()),
+            in_stride: in_channels.next_multiple_of(lanes),
             out_stride,
             shape,
             weights,
             activation: Activation { bias: padded_bias, epilogue, leaky_slope },
-            set,
+            products,
             workers: (0..WORKERS)
                 .map(|_| Scratch { taps: vec![0.0; shape.inputs_len()], sums: vec![0.0; shape.outputs_len()] })
                 .collect(),
@@ -60,12 +61,12 @@ impl DeformableConv {
     /// Runs the convolution over `input` into `output`, each tap k of each pixel being read at its place plus
     /// (`offsets[2k]`, `offsets[2k + 1]`) = (dy, dx) by bilinear interpolation, zero outside.
     pub(super) fn run(&mut self, input: &FeatureMap, offsets: &FeatureMap, output: &mut FeatureMap) {
-        let Self { in_stride, out_stride, shape, weights, activation, set, workers } = self;
+        let Self { in_stride, out_stride, shape, weights, activation, products, workers } = self;
         debug_assert_eq!((input.stride, output.stride), (*in_stride, *out_stride));
         let row_len = output.row_len;
         output.for_each_tile_row(workers, |scratch, first, rows| {
             for (y, output_row) in (first..).zip(rows.chunks_exact_mut(row_len)) {
-                set.run(Row { shape: *shape, weights, activation, input, offsets, y, scratch, output_row });
+                products.run(Row { shape: *shape, weights, activation, input, offsets, y, scratch, output_row });
             }
         });
     }
@@ -90,7 +91,7 @@ impl Task for Row<'_> {
         let Self { shape, weights, activation, input, offsets, y, scratch: Scratch { taps, sums }, output_row } = self;
         let out_stride = activation.bias.len();
         let group_len = shape.inputs_len() / TAPS;
-        assert!(group_len >= panels_len(input.stride) && out_stride.is_multiple_of(S::LANES));
+        assert!(group_len * S::FACTORS >= panels_len(input.stride) && out_stride.is_multiple_of(S::LANES));
         for x in (0..input.width).step_by(ROWS) {
             let pixels = (input.width - x).min(ROWS);
             for (index, x) in (x..x + pixels).enumerate() {
@@ -124,11 +125,11 @@ impl Task for Row<'_> {
 #[inline(always)]
 fn sample<S: Simd>(simd: S, map: &FeatureMap, x: f32, y: f32, row: usize, panels: &mut [f32]) {
     let (width, height) = (map.width as f32, map.height as f32);
-    assert!(panels.len() >= panels_len(map.stride) && row < ROWS && map.stride.is_multiple_of(S::LANES));
+    assert!(panels.len() * S::FACTORS >= panels_len(map.stride) && row < ROWS && map.stride.is_multiple_of(S::LANES));
     // NaN is outside too.
     if !(x > -1.0 && x < width && y > -1.0 && y < height) {
         for channel in (0..map.stride).step_by(S::LANES) {
-            panels[panel_place(row, channel)..][..S::LANES].fill(0.0);
+            panels[panel_place(row, channel) / S::FACTORS..][..S::LANES / S::FACTORS].fill(0.0);
         }
         return;
     }
@@ -153,7 +154,7 @@ fn sample<S: Simd>(simd: S, map: &FeatureMap, x: f32, y: f32, row: usize, panels
             sum = simd.mul_add(shares[1], simd.load(upper.add(map.stride)), sum);
             sum = simd.mul_add(shares[2], simd.load(lower), sum);
             sum = simd.mul_add(shares[3], simd.load(lower.add(map.stride)), sum);
-            simd.store(panels.as_mut_ptr().add(panel_place(row, channel)), sum);
+            simd.store_factors(panels.as_mut_ptr().add(panel_place(row, channel) / S::FACTORS), sum);
         }
     }
 }

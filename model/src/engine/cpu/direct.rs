@@ -11,7 +11,7 @@ use super::stage::{Buffers, Job, MapId, Maps, Shared, Stage, frame_bytes, plane_
 use super::stage_list::StageList;
 use super::trunk::Trunk;
 use crate::RgbdFrame;
-use crate::simd::InstructionSet;
+use crate::simd::Products;
 use crate::weights::{CONDITIONS, Layer, NetworkConfig};
 
 /// For frames of `resolution`.
@@ -19,10 +19,10 @@ pub(super) fn stages(
     config: &NetworkConfig,
     layers: &[Layer],
     resolution: Resolution,
-    set: InstructionSet,
+    products: Products,
 ) -> StageList<BlockMeans> {
     let size = grid_size(config.grid, resolution);
-    let mut maps = Maps::new(size, set);
+    let mut maps = Maps::new(size, products);
     let trunk = Trunk::new(&mut maps, "", layers, config.leaky_slope);
     StageList::new(maps, BlockMeans { size, amplitude: vec![0.0; 3 * size.pixels()] })
         .then(Encode {

@@ -12,7 +12,7 @@ use super::plane_stack::{PlaneNetwork, PlaneStack};
 use super::stage::{Buffers, Job, MapId, Stage, frame_bytes, plane_bytes};
 use super::stage_list::StageList;
 use crate::RgbdFrame;
-use crate::simd::InstructionSet;
+use crate::simd::Products;
 use crate::weights::{Feedback, Layer, NetworkConfig};
 
 /// For frames of `resolution`; `nets` are the layers of the first and of the second net.
@@ -22,13 +22,13 @@ pub(super) fn stages(
     nets: [&[Layer]; 2],
     feedback: Feedback,
     resolution: Resolution,
-    set: InstructionSet,
+    products: Products,
 ) -> StageList<PlaneStack<DepthLayers>> {
-    let size = grid_size(config.grid, resolution);
+    let (size, set) = (grid_size(config.grid, resolution), products.set());
     let count = config.depth_layers;
     let layer_numbers = plane_bytes(PIXELS_PER_SAMPLE, size);
     let positions = PlanePositions::of_layers(count, bench);
-    PlaneNetwork { config, bench, nets, feedback, positions, resolution, set }.stages(
+    PlaneNetwork { config, bench, nets, feedback, positions, resolution, products }.stages(
         DepthLayers::new(count, size, set),
         layer_numbers,
         |inputs| Expect {
@@ -63,7 +63,7 @@ impl Stage<PlaneStack<DepthLayers>> for Expect {
         frame.take(job.input);
         layers.place(frame);
         defocus.expect(frame, layers, job.pupil_mm, stack);
-        let set = maps.set;
+        let set = maps.set();
         write_inputs(maps.get_two(*inputs), frame, job.conditions, stack, set);
     }
 

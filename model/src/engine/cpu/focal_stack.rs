@@ -11,7 +11,7 @@ use super::stage::{Buffers, Job, MapId, Stage, plane_bytes};
 use super::stage_list::StageList;
 use super::view::View;
 use crate::scene::FocalStack;
-use crate::simd::{InstructionSet, Simd};
+use crate::simd::{Products, Simd};
 use crate::weights::{CONDITIONS, Feedback, Layer, NetworkConfig};
 
 /// For images of `resolution`; `nets` are the layers of the first and of the second net.
@@ -21,16 +21,18 @@ pub(super) fn stages(
     nets: [&[Layer]; 2],
     share: f32,
     resolution: Resolution,
-    set: InstructionSet,
+    products: Products,
 ) -> StageList<PlaneStack<FocalImages>> {
     let size = grid_size(config.grid, resolution);
     let images = 3 * config.planes;
     let positions = PlanePositions::from_end_to_end(config.planes, bench);
     let feedback = Feedback { share, sharpness: 0.0 };
-    PlaneNetwork { config, bench, nets, feedback, positions, resolution, set }.stages(FocalImages, 0, |inputs| Tell {
-        bytes: plane_bytes(images, resolution)
-            + plane_bytes(images + 2 * (PIXELS_PER_SAMPLE * images + CONDITIONS), size),
-        inputs,
+    PlaneNetwork { config, bench, nets, feedback, positions, resolution, products }.stages(FocalImages, 0, |inputs| {
+        Tell {
+            bytes: plane_bytes(images, resolution)
+                + plane_bytes(images + 2 * (PIXELS_PER_SAMPLE * images + CONDITIONS), size),
+            inputs,
+        }
     })
 }
 

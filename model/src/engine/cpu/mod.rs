@@ -34,11 +34,13 @@ mod workers;
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 
 use self::network::Network;
-use crate::engine::{EngineError, SAME_FOCUS_DPT, StageTimings, check_pupil};
+use crate::engine::{EngineError, Precision, SAME_FOCUS_DPT, StageTimings, check_pupil};
 use crate::scene::FocalStack;
-use crate::simd::InstructionSet;
+use crate::simd::{InstructionSet, Products};
 use crate::weights::{Architecture, NetworkConfig};
 use crate::{ComplexHologram, RgbdFrame, Weights};
+
+use self::peak::half_pays;
 
 pub use peak::{fma_peak, stream_bandwidth};
 
@@ -47,19 +49,24 @@ pub use peak::{fma_peak, stream_bandwidth};
 pub struct CpuEngine {
     network: Network<RgbdFrame>,
     resolution: Resolution,
-    set: InstructionSet,
+    products: Products,
 }
 
 impl CpuEngine {
     /// An engine for frames of `resolution`, which may be odd, on the optics of `bench`, whose own resolution does not
-    /// matter.
+    /// matter, in `precision` where the processor gains by that.
     ///
     /// # Errors
     /// [`EngineError::Empty`], and [`EngineError::Family`] for weights that take focal stacks.
-    pub fn new(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) -> Result<Self, EngineError> {
+    pub fn new(
+        weights: &Weights,
+        bench: &DisplayGeometry,
+        resolution: Resolution,
+        precision: Precision,
+    ) -> Result<Self, EngineError> {
         check_not_empty(resolution)?;
-        let set = InstructionSet::best();
-        Ok(Self { network: Network::of_frames(weights, bench, resolution, set)?, resolution, set })
+        let products = products_in(precision);
+        Ok(Self { network: Network::of_frames(weights, bench, resolution, products)?, resolution, products })
     }
 
     /// Writes the hologram of `frame` for an eye with `pupil` to `hologram`. Does not allocate in a
@@ -87,9 +94,10 @@ impl CpuEngine {
         &self.network.timings
     }
 
-    /// Which instruction set the kernels use: `avx512`, `avx2` or `portable`.
+    /// Which instruction set the kernels use, and its precision where it is half: `avx512 in half precision`, `avx512`,
+    /// `avx2` or `portable`.
     pub fn instruction_set(&self) -> &'static str {
-        self.set.name()
+        self.products.name()
     }
 }
 
@@ -98,21 +106,26 @@ pub struct FocalStackEngine {
     network: Network<FocalStack>,
     focuses: Vec<Dioptres>,
     resolution: Resolution,
-    set: InstructionSet,
+    products: Products,
 }
 
 impl FocalStackEngine {
     /// An engine for images of `resolution`, which may be odd, on the optics of `bench`, whose own resolution does not
-    /// matter.
+    /// matter, in `precision` where the processor gains by that.
     ///
     /// # Errors
     /// [`EngineError::Empty`], and [`EngineError::Family`] for weights that take a picture with depth.
-    pub fn new(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) -> Result<Self, EngineError> {
+    pub fn new(
+        weights: &Weights,
+        bench: &DisplayGeometry,
+        resolution: Resolution,
+        precision: Precision,
+    ) -> Result<Self, EngineError> {
         check_not_empty(resolution)?;
-        let set = InstructionSet::best();
-        let network = Network::of_focal_stacks(weights, bench, resolution, set)?;
+        let products = products_in(precision);
+        let network = Network::of_focal_stacks(weights, bench, resolution, products)?;
         let focuses = Self::focuses(weights, bench)?;
-        Ok(Self { network, focuses, resolution, set })
+        Ok(Self { network, focuses, resolution, products })
     }
 
     /// Where the images that `weights` take on `bench` are focused, far to near.
@@ -150,8 +163,14 @@ impl FocalStackEngine {
 
     /// As [`CpuEngine::instruction_set`].
     pub fn instruction_set(&self) -> &'static str {
-        self.set.name()
+        self.products.name()
     }
+}
+
+/// The best that the processor has: in half precision only where that is asked for and is faster.
+fn products_in(precision: Precision) -> Products {
+    let half = if precision == Precision::Half { Products::half().filter(|_| half_pays()) } else { None };
+    half.unwrap_or(Products::Single(InstructionSet::best()))
 }
 
 fn check_not_empty(resolution: Resolution) -> Result<(), EngineError> {

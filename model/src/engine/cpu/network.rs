@@ -8,7 +8,7 @@ use super::{direct, expected_stack, focal_stack};
 use crate::conditions::{Conditions, TrainedRange};
 use crate::engine::{EngineError, StageTimings};
 use crate::scene::FocalStack;
-use crate::simd::InstructionSet;
+use crate::simd::Products;
 use crate::weights::{Family, Weights};
 use crate::{ComplexHologram, RgbdFrame};
 
@@ -29,13 +29,13 @@ impl Network<RgbdFrame> {
         weights: &Weights,
         bench: &DisplayGeometry,
         resolution: Resolution,
-        set: InstructionSet,
+        products: Products,
     ) -> Result<Self, EngineError> {
         let config = &weights.config;
         let stages: Box<dyn Stages<RgbdFrame>> = match &weights.family {
-            Family::Direct { layers } => Box::new(direct::stages(config, layers, resolution, set)),
+            Family::Direct { layers } => Box::new(direct::stages(config, layers, resolution, products)),
             Family::ExpectedStack { lighting, correction, feedback } => {
-                Box::new(expected_stack::stages(config, bench, [lighting, correction], *feedback, resolution, set))
+                Box::new(expected_stack::stages(config, bench, [lighting, correction], *feedback, resolution, products))
             }
             Family::FocalStack { .. } => return Err(EngineError::takes_focal_stacks()),
         };
@@ -52,13 +52,13 @@ impl Network<FocalStack> {
         weights: &Weights,
         bench: &DisplayGeometry,
         resolution: Resolution,
-        set: InstructionSet,
+        products: Products,
     ) -> Result<Self, EngineError> {
         let Family::FocalStack { lighting, correction, feedback_share } = &weights.family else {
             return Err(EngineError::takes_frames(weights.config.architecture));
         };
         let nets = [&lighting[..], correction];
-        let stages = focal_stack::stages(&weights.config, bench, nets, *feedback_share, resolution, set);
+        let stages = focal_stack::stages(&weights.config, bench, nets, *feedback_share, resolution, products);
         Ok(Self::new(weights, bench, Box::new(stages)))
     }
 }

@@ -3,16 +3,19 @@
 use std::fs;
 use std::hint::black_box;
 use std::path::Path;
-use std::sync::Barrier;
+use std::sync::{Barrier, OnceLock};
 use std::time::{Duration, Instant};
 
-use crate::simd::{InstructionSet, Simd, Task};
+use crate::simd::{InstructionSet, Products, Simd, Task};
 
 /// How long each ceiling is measured, at least.
 const MEASURED: Duration = Duration::from_millis(200);
 /// Independent chains of multiply-adds: enough to hide the latency of two units on every processor in sight.
 const CHAINS: usize = 12;
 const STEPS_PER_ROUND: usize = 20_000;
+/// So often both are timed to decide on half precision, and so many times faster it must be at least.
+const HALF_ROUNDS: usize = 20;
+const HALF_GAIN: f64 = 1.4;
 /// A stream's buffers are so many times the last-level caches, within these limits.
 const TIMES_CACHES: u64 = 4;
 const STREAM_BYTES_MIN: u64 = 256 << 20;
@@ -69,6 +72,26 @@ fn flop_per_s() -> f64 {
     rounds_per_s(|| set.run(MultiplyAdds)) * flop_per_round as f64
 }
 
+/// Whether products of half precision are well faster here than those of single precision; measured once, in some
+/// milliseconds. Processors do either twice as many of them in the same time or no more.
+pub(super) fn half_pays() -> bool {
+    static PAYS: OnceLock<bool> = OnceLock::new();
+    *PAYS.get_or_init(|| {
+        let Some(half) = Products::half() else { return false };
+        // Whatever else the machine does can only make a round longer.
+        let shortest = |products: Products| {
+            let round = || {
+                let began = Instant::now();
+                products.run(MultiplyAdds);
+                began.elapsed()
+            };
+            (0..HALF_ROUNDS).map(|_| round()).min().unwrap_or_default() / products.factors() as u32
+        };
+        let [half, single] = [half, Products::Single(InstructionSet::best())].map(shortest);
+        half.mul_f64(HALF_GAIN) < single
+    })
+}
+
 /// Bytes/s of this thread.
 fn bytes_per_s(a: &mut [f32], b: &[f32]) -> f64 {
     let set = InstructionSet::best();
@@ -85,7 +108,7 @@ impl Task for MultiplyAdds {
         let mut chains = [simd.splat(black_box(1.0)); CHAINS];
         for _ in 0..STEPS_PER_ROUND {
             for chain in &mut chains {
-                *chain = simd.mul_add(*chain, factor, addend);
+                *chain = simd.mul_add_factors(*chain, factor, addend);
             }
         }
         black_box(chains);

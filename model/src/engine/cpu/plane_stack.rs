@@ -19,7 +19,7 @@ use super::trunk::Trunk;
 use super::view::View;
 use crate::engine::constants::REFINED_SHARE;
 use crate::phase_math::{cos_sin_pi, exp};
-use crate::simd::{InstructionSet, Simd, Task};
+use crate::simd::{Products, Simd, Task};
 use crate::weights::{Feedback, LIT, Layer, NetworkConfig, OUTPUT_CHANNELS, REFINED};
 
 /// The mask's place among the first net's outputs for a plane.
@@ -55,7 +55,7 @@ pub(super) struct PlaneNetwork<'a> {
     pub(super) feedback: Feedback,
     pub(super) positions: PlanePositions,
     pub(super) resolution: Resolution,
-    pub(super) set: InstructionSet,
+    pub(super) products: Products,
 }
 
 impl PlaneNetwork<'_> {
@@ -68,9 +68,9 @@ impl PlaneNetwork<'_> {
         view_bytes: u64,
         tell: impl FnOnce([MapId; 2]) -> S,
     ) -> StageList<PlaneStack<V>> {
-        let Self { config, bench, nets: [lighting, correction], feedback, positions, resolution, set } = self;
-        let size = grid_size(config.grid, resolution);
-        let mut maps = Maps::new(size, set);
+        let Self { config, bench, nets: [lighting, correction], feedback, positions, resolution, products } = self;
+        let (size, set) = (grid_size(config.grid, resolution), products.set());
+        let mut maps = Maps::new(size, products);
         let told = lighting[0].in_channels;
         let lights = lighting[lighting.len() - 1].out_channels;
         let lighting = Trunk::new(&mut maps, "lighting ", lighting, config.leaky_slope);
@@ -130,7 +130,7 @@ impl<V: View> Stage<PlaneStack<V>> for LightPlanes {
     fn run(&mut self, buffers: &mut Buffers<PlaneStack<V>>, _: &mut Job<'_, V::Input>) {
         let Self { output, refines, outputs, .. } = self;
         let Buffers { maps, family: PlaneStack { light, stack, .. } } = buffers;
-        let (map, set, count, refines) = (&maps[*output], maps.set, light.count, *refines);
+        let (map, set, count, refines) = (&maps[*output], maps.set(), light.count, *refines);
         outputs.par_blocks_mut().enumerate().for_each(|(block, outputs)| {
             set.run(TakeOutputs { map, first: block * set.lanes(), outputs, planes: count });
         });

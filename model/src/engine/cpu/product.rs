@@ -1,13 +1,13 @@
 //! Products of rows of channels with packed weights, with as many sums as fit the registers.
 
-use crate::simd::{InstructionSet, Simd};
+use crate::simd::{Products, Simd, factors_of, word_of};
 
 /// Rows that are multiplied together at most; each kernel's number of rows divides it.
 pub(super) const ROWS: usize = 24;
 /// Channels are kept in panels [panel, row, channel of the panel] of this many: the distance between rows is then a
-/// constant of the kernel.
+/// constant of the kernel. Inputs lie there as words of factors ([`Simd::FACTORS`]).
 const PANEL: usize = 32;
-/// Input channels of a pair.
+/// Words of inputs that are taken together.
 const PAIR: usize = 2;
 /// Output channels are rounded up to a multiple of this.
 const OUTPUTS_STEP: usize = 8;
@@ -16,36 +16,48 @@ const OUTPUTS_STEP: usize = 8;
 #[derive(Clone, Copy)]
 pub(super) struct Shape {
     groups: usize,
-    /// Inputs of a group, rounded up to whole pairs; rows have zeros there.
-    inputs: usize,
+    /// Words of a group's inputs, rounded up to whole pairs; rows have zeros there.
+    words: usize,
     /// Rounded up to [`OUTPUTS_STEP`].
     outputs: usize,
+    products: Products,
 }
 
 impl Shape {
-    pub(super) fn new(groups: usize, inputs: usize, outputs: usize) -> Self {
-        Self { groups, inputs: inputs.next_multiple_of(PAIR), outputs: outputs.next_multiple_of(OUTPUTS_STEP) }
+    pub(super) fn new(groups: usize, inputs: usize, outputs: usize, products: Products) -> Self {
+        let words = inputs.div_ceil(products.factors()).next_multiple_of(PAIR);
+        Self { groups, words, outputs: outputs.next_multiple_of(OUTPUTS_STEP), products }
     }
 
-    /// Values of the packed weights: for each [`Block`] [group, input, channel of the block], or, where it is paired,
-    /// [group, pair of inputs, channel of the block, input of the pair].
+    /// Words of the packed weights: for each [`Block`] [group, word of inputs, channel of the block], or, where it is
+    /// paired, [group, pair of words, channel of the block, word of the pair].
     pub(super) fn weights_len(self) -> usize {
-        self.groups * self.inputs * self.outputs
+        self.groups * self.words * self.outputs
     }
 
-    /// Where the packed weights have that of one input and output.
-    pub(super) fn place(self, group: usize, input: usize, output: usize, set: InstructionSet) -> usize {
-        let block = Block::of(output, self.outputs, set.lanes());
-        let (row, together) = (group * self.inputs + input, block.inputs_together);
-        block.first * self.groups * self.inputs
+    /// Writes one input's and output's weight to the packed ones.
+    pub(super) fn set_weight(self, weights: &mut [f32], [group, input, output]: [usize; 3], weight: f32) {
+        let factors = self.products.factors();
+        let block = Block::of(output, self.outputs, self.products.set().lanes());
+        let (row, together) = (group * self.words + input / factors, block.words_together);
+        let place = block.first * self.groups * self.words
             + (row - row % together) * block.channels
             + (output - block.first) * together
-            + row % together
+            + row % together;
+        let word = &mut weights[place];
+        *word = if factors == 1 {
+            weight
+        } else {
+            let mut values = factors_of(*word);
+            values[input % factors] = weight;
+            word_of(values)
+        };
     }
 
-    /// Values of the panels that a product of up to [`ROWS`] rows reads.
+    /// Words of the panels that a product of up to [`ROWS`] rows reads.
     pub(super) fn inputs_len(self) -> usize {
-        self.groups * panels_len(self.inputs)
+        let factors = self.products.factors();
+        self.groups * panels_len(self.words * factors) / factors
     }
 
     /// Values of the panels that it writes.
@@ -61,11 +73,11 @@ impl Shape {
         assert!(weights.len() == self.weights_len() && outputs.len() == self.outputs_len());
         for first in (0..self.outputs).step_by(Block::most_channels(S::LANES)) {
             let block = Block::of(first, self.outputs, S::LANES);
-            let depth = self.groups * self.inputs;
+            let depth = self.groups * self.words;
             let weights = &weights[first * depth..][..block.channels * depth];
             let outputs = &mut outputs[first / PANEL * ROWS * PANEL + first % PANEL..];
             // Sums, weights and one input fit the registers: 16, or 32 with 16 lanes.
-            match (block.channels * block.inputs_together / S::LANES, block.inputs_together, S::LANES) {
+            match (block.channels * block.words_together / S::LANES, block.words_together, S::LANES) {
                 (4, 1, _) => kernel::<S, 4, 1, 2>(simd, self, rows, inputs, weights, outputs),
                 (3, 1, _) => kernel::<S, 3, 1, 3>(simd, self, rows, inputs, weights, outputs),
                 (2, 1, 16) => kernel::<S, 2, 1, 8>(simd, self, rows, inputs, weights, outputs),
@@ -92,13 +104,13 @@ pub(super) const fn panel_place(row: usize, channel: usize) -> usize {
 /// Output channels that are computed together: four vectors of them, or two of 16 lanes, or the rest.
 ///
 /// An odd number of half vectors, which a rest has at 16 lanes only, would leave lanes idle. There each output channel
-/// takes two neighbouring lanes, one for the sum over even inputs and one for that over odd ones: 24 channels fill
-/// three vectors of 16 lanes, each step takes two inputs, and `add_pairs` joins the two sums at the end.
+/// takes two neighbouring lanes, one for the sum over even words and one for that over odd ones: 24 channels fill three
+/// vectors of 16 lanes, each step takes two words, and `add_pairs` joins the two sums at the end.
 struct Block {
     first: usize,
     channels: usize,
     /// [`PAIR`] or 1.
-    inputs_together: usize,
+    words_together: usize,
 }
 
 impl Block {
@@ -111,11 +123,11 @@ impl Block {
         let most = Self::most_channels(lanes);
         let first = output - output % most;
         let channels = most.min(outputs - first);
-        Self { first, channels, inputs_together: if channels.is_multiple_of(lanes) { 1 } else { PAIR } }
+        Self { first, channels, words_together: if channels.is_multiple_of(lanes) { 1 } else { PAIR } }
     }
 }
 
-/// One block of V vectors of sums, of I inputs together, P rows at a time.
+/// One block of V vectors of sums, of I words together, P rows at a time.
 #[inline(always)]
 fn kernel<S: Simd, const V: usize, const I: usize, const P: usize>(
     simd: S,
@@ -125,31 +137,32 @@ fn kernel<S: Simd, const V: usize, const I: usize, const P: usize>(
     weights: &[f32],
     outputs: &mut [f32],
 ) {
-    let Shape { groups, inputs: group_inputs, .. } = shape;
-    let panels = group_inputs.div_ceil(PANEL);
+    let Shape { groups, words: group_words, .. } = shape;
+    let panel_words = PANEL / S::FACTORS;
+    let panels = group_words.div_ceil(panel_words);
     let rows = rows.next_multiple_of(P);
-    assert!(rows <= ROWS && group_inputs.is_multiple_of(I) && inputs.len() == groups * panels * ROWS * PANEL);
-    assert!(weights.len() * I == groups * group_inputs * V * S::LANES);
+    assert!(rows <= ROWS && group_words.is_multiple_of(I) && inputs.len() == groups * panels * ROWS * panel_words);
+    assert!(weights.len() * I == groups * group_words * V * S::LANES);
     assert!(outputs.len() >= (rows - P.min(rows)) * PANEL + (P - 1) * PANEL + V.div_ceil(I) * S::LANES);
     for row in (0..rows).step_by(P) {
         // Bounds checks in this loop would cost more than its arithmetic.
         // SAFETY: the panels hold ROWS rows, of which `row + P - 1` is one, and a panel is read below its width, of
-        // which I is a divisor; the weights' rows are walked once, in order, and are as many as inputs. What is written
+        // which I is a divisor; the weights' rows are walked once, in order, and are as many as words. What is written
         // lies below `outputs.len()`. All was asserted above.
         unsafe {
             let mut sums = [[simd.splat(0.0); V]; P];
             let mut weight_row = weights.as_ptr();
             for panel in 0..groups * panels {
-                let from = inputs.as_ptr().add((panel * ROWS + row) * PANEL);
-                let used = (group_inputs - panel % panels * PANEL).min(PANEL);
-                for input in (0..used).step_by(I) {
+                let from = inputs.as_ptr().add((panel * ROWS + row) * panel_words);
+                let used = (group_words - panel % panels * panel_words).min(panel_words);
+                for word in (0..used).step_by(I) {
                     let weights: [S::Vector; V] = simd.load_strided(weight_row, S::LANES);
                     weight_row = weight_row.add(V * S::LANES);
                     for (row, sums) in sums.iter_mut().enumerate() {
-                        let input = from.add(row * PANEL + input);
-                        let value = if I == PAIR { simd.splat_pair(input) } else { simd.splat(*input) };
+                        let word = from.add(row * panel_words + word);
+                        let value = if I == PAIR { simd.splat_pair(word) } else { simd.splat(*word) };
                         for (sum, weight) in sums.iter_mut().zip(weights) {
-                            *sum = simd.mul_add(value, weight, *sum);
+                            *sum = simd.mul_add_factors(value, weight, *sum);
                         }
                     }
                 }

@@ -8,7 +8,7 @@ use super::conv::Scratch;
 use super::feature_map::FeatureMap;
 use crate::ComplexHologram;
 use crate::conditions::Conditions;
-use crate::simd::InstructionSet;
+use crate::simd::{InstructionSet, Products};
 
 /// What to render; it and the hologram have the network's resolution.
 pub(super) struct Job<'a, I> {
@@ -73,7 +73,7 @@ pub(super) struct Buffers<F> {
 pub(super) struct Maps {
     /// Width and height of each map.
     pub(super) size: Resolution,
-    pub(super) set: InstructionSet,
+    pub(super) products: Products,
     pub(super) scratch: Scratch,
     maps: Vec<FeatureMap>,
     /// What the layers of nets hand on, with its channels.
@@ -85,13 +85,18 @@ pub(super) struct Maps {
 pub(super) struct MapId(usize);
 
 impl Maps {
-    pub(super) fn new(size: Resolution, set: InstructionSet) -> Self {
-        Self { size, set, scratch: Scratch::new(), maps: Vec::new(), handed_on: Vec::new() }
+    pub(super) fn new(size: Resolution, products: Products) -> Self {
+        Self { size, products, scratch: Scratch::new(), maps: Vec::new(), handed_on: Vec::new() }
+    }
+
+    /// The vectors of everything that is no product.
+    pub(super) fn set(&self) -> InstructionSet {
+        self.products.set()
     }
 
     /// A further map.
     pub(super) fn add(&mut self, channels: usize) -> MapId {
-        self.maps.push(FeatureMap::new(self.size.width, self.size.height, channels, self.set));
+        self.maps.push(FeatureMap::new(self.size.width, self.size.height, channels, self.set()));
         MapId(self.maps.len() - 1)
     }
 

@@ -11,7 +11,7 @@ use super::*;
 use crate::engine::WIDEST_PUPIL;
 use crate::engine::reference::{self, Value};
 use crate::scene::FocalStack;
-use crate::simd::InstructionSet;
+use crate::simd::{InstructionSet, Products};
 use crate::weights::tests::{self as weights_tests, random_weights};
 use crate::weights::{Grid, NetworkConfig};
 use crate::worst::worst;
@@ -105,7 +105,7 @@ fn check_on(
 ) {
     let [frame, other] = [seed, seed + 1].map(|seed| frame(resolution, seed));
     let pupil = PupilDiameter::from_mm(pupil_mm);
-    let network = Network::of_frames(weights, bench, resolution, set).unwrap();
+    let network = Network::of_frames(weights, bench, resolution, Products::Single(set)).unwrap();
     let context = format!("{resolution}, {} on {}", weights.config().channels, set.name());
     let reference = reference::run(weights, bench, &frame, pupil);
     check_network(
@@ -249,7 +249,7 @@ proptest! {
         let inputs = [seed, seed + 1].map(|seed| focal_stack(resolution, planes, pupil_mm, seed));
         for set in InstructionSet::available() {
             let reference = reference::run_focal_stack(&weights, &bench, &inputs[0]);
-            let network = Network::of_focal_stacks(&weights, &bench, resolution, set).unwrap();
+            let network = Network::of_focal_stacks(&weights, &bench, resolution, Products::Single(set)).unwrap();
             let context = format!("{resolution}, {channels}, {planes} planes on {}", set.name());
             let pupils = [inputs[0].pupil, PupilDiameter::from_mm(2.0)];
             check_network(&context, network, reference, "focal stack", [&inputs[0], &inputs[1]], pupils, resolution);
@@ -262,7 +262,7 @@ fn a_focal_stack_that_the_network_does_not_take_is_refused_in_words() {
     let bench = DisplayGeometry::DEFAULT;
     let size = Resolution { width: 6, height: 4 };
     let weights = random_weights(weights_tests::focal_stack_config(), 3);
-    let mut engine = FocalStackEngine::new(&weights, &bench, size).unwrap();
+    let mut engine = FocalStackEngine::new(&weights, &bench, size, Precision::Single).unwrap();
     let mut hologram = ComplexHologram::dark(size);
     let mut error_of = |stack: &FocalStack| engine.render(stack, &mut hologram).unwrap_err().to_string();
     let right = focal_stack(size, 3, 3.0, 1);
@@ -276,9 +276,10 @@ fn a_focal_stack_that_the_network_does_not_take_is_refused_in_words() {
     assert!(error.contains("the stack is 5x4; this engine was made for 6x4"), "{error}");
     engine.render(&right, &mut hologram).unwrap();
 
-    let takes_images = CpuEngine::new(&weights, &bench, size).err().unwrap().to_string();
+    let takes_images = CpuEngine::new(&weights, &bench, size, Precision::Single).err().unwrap().to_string();
     assert!(takes_images.contains("`focal-stack` network") && takes_images.contains("--focal-stack"), "{takes_images}");
-    let takes_frames = FocalStackEngine::new(&Weights::builtin_fast(), &bench, size).err().unwrap().to_string();
+    let takes_frames =
+        FocalStackEngine::new(&Weights::builtin_fast(), &bench, size, Precision::Single).err().unwrap().to_string();
     assert!(takes_frames.contains("`expected-stack` network") && takes_frames.contains("its depth"), "{takes_frames}");
 }
 
@@ -334,7 +335,7 @@ fn the_same_bench_in_pixels_has_the_same_hologram() {
                 ..BENCH
             };
             let mut hologram = ComplexHologram::dark(resolution);
-            let mut engine = CpuEngine::new(&weights, &bench, resolution).unwrap();
+            let mut engine = CpuEngine::new(&weights, &bench, resolution, Precision::Single).unwrap();
             engine.render(&frame, PupilDiameter::from_mm(3.0), &mut hologram).unwrap();
             hologram.field
         };
@@ -378,7 +379,7 @@ fn the_built_in_network_matches_the_reference_at_both_ends_of_the_pupil_range() 
 fn an_engine_renders_as_its_network_does_and_tells_it_the_nearest_pupil() {
     let weights = random_weights(config(Grid::HalfBand, 4, 8, vec![1]), 2);
     let resolution = Resolution { width: 31, height: 18 };
-    let mut engine = CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, resolution).unwrap();
+    let mut engine = CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, resolution, Precision::Single).unwrap();
     let frame = frame(resolution, 4);
     let mut hologram = ComplexHologram::dark(resolution);
     for (given_mm, meant_mm) in [(5.0, 5.0), (1.5, 1.5), (9.0, 5.0), (0.2, 1.0)] {
@@ -399,7 +400,9 @@ fn an_engine_renders_as_its_network_does_and_tells_it_the_nearest_pupil() {
 fn stages_tell_the_least_that_they_move() {
     let resolution = Resolution { width: 31, height: 18 };
     let stages = |config| {
-        let engine = CpuEngine::new(&random_weights(config, 2), &DisplayGeometry::DEFAULT, resolution).unwrap();
+        let engine =
+            CpuEngine::new(&random_weights(config, 2), &DisplayGeometry::DEFAULT, resolution, Precision::Single)
+                .unwrap();
         engine.last_timings().stages.iter().map(|stage| (stage.name.clone(), stage.bytes)).collect::<Vec<_>>()
     };
     // Picture and depth; planes on the network's grid; what comes out.
@@ -447,20 +450,20 @@ fn stages_tell_the_least_that_they_move() {
 fn what_is_no_number_at_the_border_leaves_no_trace_in_the_next_frame() {
     // Neither is a multiple of any set's lanes.
     let resolution = Resolution { width: 37, height: 18 };
-    for (weights, set) in [random_weights(config(Grid::HalfBand, 4, 8, vec![1]), 2), Weights::builtin_small()]
+    for (weights, products) in [random_weights(config(Grid::HalfBand, 4, 8, vec![1]), 2), Weights::builtin_small()]
         .iter()
-        .flat_map(|weights| InstructionSet::available().map(move |set| (weights, set)))
+        .flat_map(|weights| Products::available().map(move |products| (weights, products)))
     {
         let render = |network: &mut Network<RgbdFrame>, frame: &RgbdFrame| {
             let mut hologram = ComplexHologram::dark(resolution);
             network.render(frame, PupilDiameter::from_mm(3.0), &mut hologram);
             hologram.field
         };
-        let mut network = Network::of_frames(weights, &DisplayGeometry::DEFAULT, resolution, set).unwrap();
+        let mut network = Network::of_frames(weights, &DisplayGeometry::DEFAULT, resolution, products).unwrap();
         let clean = render(&mut network, &frame(resolution, 4));
         let spoilers = [(0, f32::NAN), (36, f32::INFINITY), (37 * 18 - 1, f32::NEG_INFINITY)];
         for (pixel, spoiler) in spoilers {
-            let context = format!("pixel {pixel} on {}", set.name());
+            let context = format!("pixel {pixel} on {}", products.name());
             let mut spoiled = frame(resolution, 4);
             spoiled.amplitude[pixel] = spoiler;
             assert!(render(&mut network, &spoiled).iter().any(|value| !value.is_finite()), "{context} is not seen");
@@ -477,7 +480,7 @@ fn what_is_no_number_at_the_border_leaves_no_trace_in_the_next_frame() {
 fn wrong_sizes_and_pupils_are_refused() {
     let weights = random_weights(config(Grid::HalfBand, 4, 8, vec![]), 2);
     let (right, wrong) = (Resolution { width: 8, height: 6 }, Resolution { width: 6, height: 8 });
-    let mut engine = CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, right).unwrap();
+    let mut engine = CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, right, Precision::Single).unwrap();
     let pupil = PupilDiameter::from_mm(3.0);
     let mut render = |frame_size, pupil, hologram_size| {
         engine.render(&frame(frame_size, 0), pupil, &mut ComplexHologram::dark(hologram_size))
@@ -489,7 +492,8 @@ fn wrong_sizes_and_pupils_are_refused() {
         assert!(matches!(render(right, PupilDiameter::from_mm(pupil_mm), right), Err(EngineError::Pupil { .. })));
     }
     let empty = Resolution { width: 0, height: 4 };
-    assert!(matches!(CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, empty), Err(EngineError::Empty { .. })));
+    let none = CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, empty, Precision::Single);
+    assert!(matches!(none, Err(EngineError::Empty { .. })));
 }
 
 #[test]
@@ -501,9 +505,9 @@ fn a_frame_is_the_same_to_the_bit_whatever_was_rendered_before() {
     for (index, depth) in shown.depth_normalised.iter_mut().enumerate() {
         *depth = if index % resolution.width < 20 { 0.7 } else { 0.1 };
     }
-    for set in InstructionSet::available() {
+    for products in Products::available() {
         let weights = Weights::builtin_fast();
-        let mut network = Network::of_frames(&weights, &DisplayGeometry::DEFAULT, resolution, set).unwrap();
+        let mut network = Network::of_frames(&weights, &DisplayGeometry::DEFAULT, resolution, products).unwrap();
         let mut render = |frame, pupil_mm| {
             let mut hologram = ComplexHologram::dark(resolution);
             network.render(frame, PupilDiameter::from_mm(pupil_mm), &mut hologram);
@@ -512,6 +516,46 @@ fn a_frame_is_the_same_to_the_bit_whatever_was_rendered_before() {
         let alone = render(&shown, 3.0);
         let before = render(&other, 5.0);
         assert!(before != alone, "another frame is another hologram");
-        assert!(render(&shown, 3.0) == alone, "{}", set.name());
+        assert!(render(&shown, 3.0) == alone, "{}", products.name());
     }
+}
+
+/// Largest difference allowed between a hologram in half precision and the same in single precision, over the largest
+/// value; an eye sees a hundredth of it.
+const HALF_TOLERANCE: f64 = 0.05;
+
+#[test]
+fn whole_networks_in_half_precision_are_near_the_same_in_single() {
+    let (resolution, bench) = (Resolution { width: 48, height: 32 }, DisplayGeometry::DEFAULT);
+    let frame = frame(resolution, 4);
+    for weights in [Weights::builtin(), Weights::builtin_small(), Weights::builtin_fast()] {
+        let render = |products, pupil_mm| {
+            let mut hologram = ComplexHologram::dark(resolution);
+            let mut network = Network::of_frames(&weights, &bench, resolution, products).unwrap();
+            network.render(&frame, PupilDiameter::from_mm(pupil_mm), &mut hologram);
+            hologram.field
+        };
+        let half = Products::available().filter(|products| products.factors() == 2);
+        for (products, pupil_mm) in half.flat_map(|products| [(products, 1.0), (products, 6.0)]) {
+            let single = render(Products::Single(InstructionSet::best()), pupil_mm);
+            let mut found = render(products, pupil_mm);
+            let (error, context) = (apart(&found, &single), format!("{} at {pupil_mm} mm", products.name()));
+            assert!(error > 1e-4, "{context}: {error}, so it was computed in single precision");
+            assert!(error < HALF_TOLERANCE, "{context}: {error}");
+            found[99].re +=
+                2.0 * HALF_TOLERANCE as f32 * largest(single.iter().map(|value| value.norm().into())) as f32;
+            assert!(apart(&found, &single) > HALF_TOLERANCE, "{context}: the comparison is blind");
+        }
+    }
+}
+
+#[test]
+fn half_precision_is_taken_where_it_is_asked_for_and_pays() {
+    let (weights, resolution) = (Weights::builtin_fast(), Resolution { width: 8, height: 6 });
+    let set = |precision| {
+        CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, resolution, precision).unwrap().instruction_set()
+    };
+    assert_eq!(set(Precision::Single), InstructionSet::best().name());
+    let half = Products::half().filter(|_| super::peak::half_pays());
+    assert_eq!(set(Precision::Half), half.map_or(InstructionSet::best().name(), Products::name));
 }

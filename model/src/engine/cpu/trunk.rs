@@ -111,24 +111,24 @@ struct AdjustableConv {
 impl Conv {
     fn new(maps: &mut Maps, layer: &Layer, epilogue: Epilogue, leaky_slope: f32) -> Self {
         let Layer { in_channels: channels, out_channels, weight, bias, adjustable } = layer;
-        let (channels, set) = (*channels, maps.set);
+        let (channels, products) = (*channels, maps.products);
         let weight = |output, input, tap| weight[(output * channels + input) * 9 + tap];
         match adjustable {
             None => {
-                let mut conv = PlainConv::new(channels, *out_channels, epilogue, leaky_slope, set);
+                let mut conv = PlainConv::new(channels, *out_channels, epilogue, leaky_slope, products);
                 conv.fill(channels, bias.iter().copied(), weight);
                 maps.scratch.fit(&conv);
                 Self::Plain(conv)
             }
             Some(parameters) => {
-                let offset_conv = PlainConv::new(channels, OFFSET_CHANNELS, Epilogue::None, leaky_slope, set);
+                let offset_conv = PlainConv::new(channels, OFFSET_CHANNELS, Epilogue::None, leaky_slope, products);
                 maps.scratch.fit(&offset_conv);
                 Self::Adjustable(Box::new(AdjustableConv {
-                    conv: DeformableConv::new(channels, bias, weight, epilogue, leaky_slope, set),
+                    conv: DeformableConv::new(channels, bias, weight, epilogue, leaky_slope, products),
                     channels,
                     modulation: Modulation::new(parameters, leaky_slope),
                     offset_conv,
-                    offsets: FeatureMap::new(maps.size.width, maps.size.height, OFFSET_CHANNELS, set),
+                    offsets: FeatureMap::new(maps.size.width, maps.size.height, OFFSET_CHANNELS, products.set()),
                 }))
             }
         }

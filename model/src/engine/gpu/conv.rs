@@ -9,7 +9,7 @@ use half::f16;
 use super::map::{Format, GROUP, Map, ROWS, TILE};
 use super::matrix::{self, TilePacking};
 use super::plan::{BufferId, Constant, ENABLE_F16, Plan, Shader};
-use crate::gpu::Precision;
+use crate::engine::Precision;
 
 pub(super) const TAPS: usize = 9;
 /// Threads of a workgroup, along x.

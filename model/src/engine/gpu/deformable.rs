@@ -8,7 +8,7 @@ use super::conv::{ConvLayer, TAPS};
 use super::map::{Format, GROUP, Map, TILE};
 use super::matrix::{self, TilePacking};
 use super::plan::{Plan, Shader};
-use crate::gpu::Precision;
+use crate::engine::Precision;
 use crate::weights::OFFSET_CHANNELS;
 
 /// Threads of a workgroup, along x.

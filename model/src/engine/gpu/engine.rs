@@ -12,8 +12,8 @@ use super::map::Format;
 use super::network::NetworkPlan;
 use super::plan::{BufferId, Plan, Stage};
 use super::shared::pupil_values;
-use crate::engine::{EngineError, StageTiming, StageTimings, check_pupil};
-use crate::gpu::{Adapters, Gpu, GpuError, Precision};
+use crate::engine::{EngineError, Precision, StageTiming, StageTimings, check_pupil};
+use crate::gpu::{Adapters, Gpu, GpuError};
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
 
 /// Network, double phase and levels on the GPU, for frames of one size and one panel.

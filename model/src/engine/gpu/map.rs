@@ -1,7 +1,8 @@
 //! Feature maps on the GPU.
 
 use super::plan::{BufferId, Constant, ENABLE_F16, Plan};
-use crate::gpu::{MatrixUnits, Precision};
+use crate::engine::Precision;
+use crate::gpu::MatrixUnits;
 
 /// Channels of a group: what one vector of a shader holds.
 pub(crate) const GROUP: usize = 4;

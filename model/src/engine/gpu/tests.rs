@@ -15,8 +15,8 @@ use super::shared::Shared;
 use super::trial::Trial;
 use super::{double_phase, levels};
 use crate::engine::cpu::tests::{OTHER_BENCH, frame};
-use crate::engine::{CpuEngine, EngineError, reference};
-use crate::gpu::{GpuError, MatrixUnits, Precision, test_adapters, test_gpu};
+use crate::engine::{CpuEngine, EngineError, Precision, reference};
+use crate::gpu::{GpuError, MatrixUnits, test_adapters, test_gpu};
 use crate::optics::DoublePhase;
 use crate::weights::tests::{self as weights_tests, random_weights};
 use crate::weights::{Grid, NetworkConfig};
@@ -267,7 +267,7 @@ fn check_on(bench: &DisplayGeometry, weights: &Weights, resolution: Resolution, 
     assert!(field_error(&hologram.field, &expected) > FIELD_TOLERANCE, "{context}: the comparison is blind");
 
     let mut on_cpu = ComplexHologram::dark(resolution);
-    CpuEngine::new(weights, bench, resolution)
+    CpuEngine::new(weights, bench, resolution, Precision::Single)
         .unwrap()
         .render(&frame, PupilDiameter::from_mm(pupil_mm), &mut on_cpu)
         .unwrap();
@@ -304,7 +304,7 @@ fn a_frame_of_256_pixels_each_way_is_the_processors() {
     let (weights, resolution) = (Weights::builtin(), Resolution { width: 256, height: 256 });
     let frame = frame(resolution, 5);
     let mut on_cpu = ComplexHologram::dark(resolution);
-    CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, resolution)
+    CpuEngine::new(&weights, &DisplayGeometry::DEFAULT, resolution, Precision::Single)
         .unwrap()
         .render(&frame, PupilDiameter::from_mm(3.3), &mut on_cpu)
         .unwrap();

@@ -5,7 +5,8 @@ use num_complex::Complex64;
 
 use super::map::{GROUP, Map};
 use super::plan::{BufferId, Dispatch, Plan};
-use crate::gpu::{Gpu, Precision, test_gpu};
+use crate::engine::Precision;
+use crate::gpu::{Gpu, test_gpu};
 use crate::worst::worst;
 
 /// Numbers behind each buffer, not finite, which no shader may read or write.

@@ -7,8 +7,8 @@ use super::deformable;
 use super::map::{Format, GROUP, Map};
 use super::plan::{BufferId, Plan};
 use crate::conditions::Conditions;
+use crate::engine::Precision;
 use crate::engine::modulation::{Modulation, OffsetParameters};
-use crate::gpu::Precision;
 use crate::weights::{Layer, OFFSET_CHANNELS};
 
 /// The offset prediction of an adjustable layer, whose parameters depend on bench and pupil.
