@@ -3,7 +3,7 @@
 mod pattern;
 
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::rig::{Eye, WeightsChoice};
@@ -284,6 +284,10 @@ pub struct RunArgs {
     /// (orders.jsonl), the log and the bench into this directory, for `holod report`.
     #[arg(long, value_name = "DIR")]
     pub record: Option<PathBuf>,
+    /// Record as --record does, into a new directory in this one that is named after the time in UTC: one for each
+    /// start, as a service wants it.
+    #[arg(long, value_name = "DIR", conflicts_with = "record")]
+    pub record_in: Option<PathBuf>,
     /// Overwrite an earlier record; it goes once the first frame is made.
     #[arg(long, requires = "record")]
     pub force: bool,
@@ -293,6 +297,17 @@ pub struct RunArgs {
     /// Print the summary as JSON.
     #[arg(long)]
     pub json: bool,
+}
+
+impl RunArgs {
+    /// The same for a run that starts `now`: `record` is the folder that it records into, if any.
+    pub fn starting(&self, now: SystemTime) -> Self {
+        let Some(parent) = &self.record_in else { return self.clone() };
+        let time = humantime::format_rfc3339_seconds(now).to_string().replace(':', "-");
+        let names = std::iter::once(time.clone()).chain((2..).map(|start| format!("{time}-{start}")));
+        let unused = names.map(|name| parent.join(name)).find(|folder| !folder.exists());
+        Self { record: unused, record_in: None, ..self.clone() }
+    }
 }
 
 /// Where the status page is served.
@@ -816,6 +831,23 @@ mod tests {
         assert!(cli.command.is_none());
         assert_eq!(cli.run.tracker.as_deref(), Some("/dev/ttyUSB0"));
         assert_eq!(cli.run.duration, Some(Duration::from_secs(2)));
+    }
+
+    #[test]
+    fn each_start_has_a_record_of_its_own() {
+        let parent = tempfile::tempdir().unwrap();
+        let asked = parent.path().to_str().unwrap();
+        let cli = Cli::try_parse_from(["holod", "--record-in", asked]).unwrap();
+        let now = SystemTime::UNIX_EPOCH + Duration::from_millis(1_000_000_000_700);
+        let folders = ["2001-09-09T01-46-40Z", "2001-09-09T01-46-40Z-2", "2001-09-09T01-46-40Z-3"];
+        for folder in folders.map(|name| parent.path().join(name)) {
+            let run = cli.run.starting(now);
+            assert_eq!((run.record.as_ref(), run.record_in), (Some(&folder), None));
+            std::fs::create_dir(folder).unwrap();
+        }
+        let named = Cli::try_parse_from(["holod", "--record", "here"]).unwrap().run;
+        assert_eq!(named.starting(now).record, named.record);
+        assert!(Cli::try_parse_from(["holod", "--record", "here", "--record-in", asked]).is_err());
     }
 
     #[test]

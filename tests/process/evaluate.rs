@@ -49,7 +49,7 @@ fn evaluated(bytes: &[u8]) -> Value {
     fs::write(folder.path().join(file_name(0)), bytes).unwrap();
     let weights = model().join("weights").join(entry(bytes, "weights").as_str().unwrap());
     let border_px = entry(bytes, "border_px").to_string();
-    let args = ["evaluate", "--scenes", ".", "--cards", ".", "--border-px", &border_px, "--json"];
+    let args = ["evaluate", "--scenes", ".", "--cards", ".", "--border-px", &border_px, "--json", "--backend", "cpu"];
     let args = [&args[..], &["--weights", weights.to_str().unwrap()]].concat();
     let ended = run(HOLOD, &args, folder.path());
     assert!(ended.status.success(), "{ended:?}");
@@ -231,7 +231,19 @@ fn the_trainer_finds_as_much_light_of_bright_marks_on_black() {
     render(&folder.path().join("scenes"), SceneKind::Test, SIZE, 1);
     render(&folder.path().join("marks"), SceneKind::Marks, Resolution { width: 256, height: 256 }, 3);
     let evaluate = |more: &[&str]| {
-        let args = ["evaluate", "--scenes", "scenes", "--marks", "marks", "--border-px", "8", "--weights", "fast"];
+        let args = [
+            "evaluate",
+            "--scenes",
+            "scenes",
+            "--marks",
+            "marks",
+            "--border-px",
+            "8",
+            "--weights",
+            "fast",
+            "--backend",
+            "cpu",
+        ];
         let ended = run(HOLOD, &[&args[..], more].concat(), folder.path());
         assert!(ended.status.success(), "{ended:?}");
         ended.stdout

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use holod_calibration::rig::Rig;
 use holod_pupil_input::{RecordFiles, ReplaySpeed, TrackerSpec};
@@ -33,6 +33,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     {
         return replay(args, output, &report);
     }
+    let args = &args.starting(SystemTime::now());
     // From the first reading on, another may be asked for.
     let hangups = if args.rig.config.is_some() { Hangups::take_over()? } else { None };
     let rig = rig_of(args)?;
@@ -149,7 +150,7 @@ fn replay(args: &RunArgs, output: OutputSpec, tracker: &TrackerSpec) -> Result<(
 
 /// Refuses what a report brings itself.
 fn refuse_options(args: &RunArgs, tracker: &TrackerSpec) -> Result<(), Failure> {
-    if args.record.is_some() {
+    if args.record.is_some() || args.record_in.is_some() {
         let what = "--record: a report holds its record already; `tar xzf FILE` takes it out";
         return Err(Failure::new(Exit::Usage, what));
     }

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fs;
-use std::net::IpAddr;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
 use std::path::{Path, PathBuf};
 
 use holod_calibration::rig::Rig;
@@ -21,8 +21,8 @@ pub(super) const BINARY: &str = "/usr/bin/holod";
 pub(super) const USUAL_RIG: &str = "/etc/holod/rig.toml";
 /// Where the unit lets holod write.
 pub(super) const STATE_FOLDER: &str = "/var/lib/holod";
-/// Where a tracker may be that has a name and no address.
-const LOCAL_NETWORKS: &str = "link-local 192.168.0.0/16 10.0.0.0/8 172.16.0.0/12";
+/// Networks that no address of the wider Internet is in.
+const PRIVATE_NETWORKS: &str = "link-local 192.168.0.0/16 10.0.0.0/8 172.16.0.0/12 fc00::/7";
 
 pub(super) fn unit(args: &UnitArgs) -> Result<(), Failure> {
     let words = std::env::args_os().skip_while(|word| word != "unit").skip(1).map(OsString::into_string);
@@ -42,9 +42,16 @@ pub(super) fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -
     let usage = |says: String| Failure::new(Exit::Usage, says);
     let config = run.rig.config.as_deref().ok_or_else(|| usage(format!("name the rig: --config {USUAL_RIG}")))?;
     visible_paths(rig, run).into_iter().try_for_each(|(what, path)| visible(what, &path))?;
-    if let Some(record) = run.record.as_deref().filter(|record| !record.starts_with(STATE_FOLDER)) {
+    if let Some(record) = &run.record {
         let found = record.display();
-        return Err(usage(format!("--record {found}: the service may write below {STATE_FOLDER} only")));
+        return Err(usage(format!(
+            "--record {found}: a service that starts again would find the record of its last start there; name \
+             --record-in {STATE_FOLDER}/NAME, in which each start has a folder of its own"
+        )));
+    }
+    if let Some(folder) = run.record_in.as_deref().filter(|folder| !folder.starts_with(STATE_FOLDER)) {
+        let found = folder.display();
+        return Err(usage(format!("--record-in {found}: the service may write below {STATE_FOLDER} only")));
     }
     let command: Vec<String> = words.iter().map(|word| quoted(word)).collect();
     let mut text = format!(
@@ -98,16 +105,16 @@ fn needs(rig: &Rig, run: &RunArgs, root: &Path) -> Result<Needs, Failure> {
             TrackerSpec::Hid { .. } => needs.devices.extend(["char-hidraw".to_owned()]),
             TrackerSpec::Tcp { address, .. } | TrackerSpec::Core(address) | TrackerSpec::Neon(address) => {
                 let address = address.host.parse::<IpAddr>();
-                needs.allow(&address.map_or(LOCAL_NETWORKS.to_owned(), |address| address.to_string()));
+                needs.allow(&address.map_or_else(|_| bench_networks(root), |address| address.to_string()));
             }
             // The address is this machine's own; the tracker's is known when it sends.
-            TrackerSpec::Udp { .. } => needs.allow(LOCAL_NETWORKS),
+            TrackerSpec::Udp { .. } => needs.allow(&bench_networks(root)),
             TrackerSpec::Path(_) | TrackerSpec::Replay { .. } | TrackerSpec::Mock(_) | TrackerSpec::MockFile(_) => {}
         }
     }
     match &run.page.page {
         Some(PageAddress::Tcp(address)) if address.ip().is_loopback() => needs.network = true,
-        Some(PageAddress::Tcp(_)) => needs.allow(LOCAL_NETWORKS),
+        Some(PageAddress::Tcp(_)) => needs.allow(&bench_networks(root)),
         Some(PageAddress::Unix(_)) | None => {}
     }
     match run.output.parse().map_err(Failure::because(Exit::Usage))? {
@@ -124,6 +131,38 @@ fn needs(rig: &Rig, run: &RunArgs, root: &Path) -> Result<Needs, Failure> {
         needs.devices.extend(gpus(root));
     }
     Ok(needs)
+}
+
+/// Where a page is looked at from, and a tracker may be that has a name and no address: private networks, and those
+/// that this machine is in.
+fn bench_networks(root: &Path) -> String {
+    let read = |file: &str| fs::read_to_string(below(root, Path::new(file))).unwrap_or_default();
+    let (v4, v6) = (read("/proc/net/route"), read("/proc/net/if_inet6"));
+    let own = v4.lines().filter_map(own_network_v4).chain(v6.lines().filter_map(own_network_v6));
+    let own: BTreeSet<String> = own.collect();
+    own.iter().fold(PRIVATE_NETWORKS.to_owned(), |all, network| format!("{all} {network}"))
+}
+
+/// The network of a line of `/proc/net/route` that is reached without a gateway, unless it is a private one.
+fn own_network_v4(line: &str) -> Option<String> {
+    let columns: Vec<&str> = line.split_whitespace().collect();
+    let hex = |column: usize| u32::from_str_radix(columns.get(column)?, 16).ok();
+    // The bytes of an address, in the machine's own order.
+    let [network, gateway, mask] = [hex(1)?, hex(2)?, hex(7)?].map(|word| u32::from_be_bytes(word.to_ne_bytes()));
+    let address = Ipv4Addr::from(network);
+    let is_own =
+        gateway == 0 && mask != 0 && !(address.is_private() || address.is_link_local() || address.is_loopback());
+    is_own.then(|| format!("{address}/{}", mask.leading_ones()))
+}
+
+/// The network of a line of `/proc/net/if_inet6`, where its address is a global one.
+fn own_network_v6(line: &str) -> Option<String> {
+    const GLOBAL: &str = "00";
+    let columns: Vec<&str> = line.split_whitespace().collect();
+    let [address, _, prefix, scope, ..] = columns[..] else { return None };
+    let (address, prefix) = (u128::from_str_radix(address, 16).ok()?, u32::from_str_radix(prefix, 16).ok()?);
+    let network = Ipv6Addr::from(address & u128::MAX.checked_shl(128_u32.checked_sub(prefix)?).unwrap_or(0));
+    (scope == GLOBAL && !network.is_unique_local()).then(|| format!("{network}/{prefix}"))
 }
 
 /// The class of a serial port: its number may be another after a replug, so that its own node would be too little.
@@ -195,7 +234,7 @@ pub(super) fn below(root: &Path, path: &Path) -> PathBuf {
 pub(super) fn visible_paths(rig: &Rig, run: &RunArgs) -> Vec<(&'static str, PathBuf)> {
     let mut paths: Vec<(&str, PathBuf)> = Vec::new();
     paths.extend(run.rig.config.clone().map(|path| ("--config", path)));
-    paths.extend(run.record.clone().map(|path| ("--record", path)));
+    paths.extend(run.record_in.clone().map(|path| ("--record-in", path)));
     paths.extend(run.page.page_token.clone().map(|path| ("--page-token", path)));
     if let Some(PageAddress::Unix(path)) = &run.page.page {
         paths.push(("--page", path.clone()));
@@ -343,6 +382,32 @@ mod tests {
         assert!(!with(&["--page", "unix:/run/holod/page"]).contains("AF_INET"));
     }
 
+    /// As a machine has it whose bench is 131.114.5.0/24 and 2001:db8:0:5::/64, beside 192.168.1.0/24 and fd00::/64.
+    #[test]
+    fn networks_that_the_machine_is_in_may_see_the_page_and_have_trackers_with_names() {
+        let root = machine();
+        fs::create_dir_all(root.path().join("proc/net")).unwrap();
+        let routes = "Iface\tDestination\tGateway \tFlags\tRefCnt\tUse\tMetric\tMask\t\tMTU\tWindow\tIRTT\n\
+            eth0\t00000000\t01057283\t0003\t0\t0\t100\t00000000\t0\t0\t0\n\
+            eth0\t00057283\t00000000\t0001\t0\t0\t100\t00FFFFFF\t0\t0\t0\n\
+            eth1\t0001A8C0\t00000000\t0001\t0\t0\t101\t00FFFFFF\t0\t0\t0\n";
+        fs::write(root.path().join("proc/net/route"), routes).unwrap();
+        let addresses = "00000000000000000000000000000001 01 80 10 80       lo\n\
+            20010db8000000050000000000000007 02 40 00 80     eth0\n\
+            fd000000000000000000000000000007 02 40 00 80     eth0\n\
+            fe800000000000000000000000000007 02 40 20 80     eth0\n";
+        fs::write(root.path().join("proc/net/if_inet6"), addresses).unwrap();
+        let allowed = |options: &[&str]| {
+            let text = drop_in_of(&[&RIG[..], options].concat(), &Rig::default(), root.path()).unwrap();
+            text.lines().find_map(|line| line.strip_prefix("IPAddressAllow=").map(str::to_owned)).unwrap()
+        };
+        let expected = format!("localhost {PRIVATE_NETWORKS} 131.114.5.0/24 2001:db8:0:5::/64");
+        let page = ["--page", "131.114.5.7:8420", "--page-token", "/etc/holod/token"];
+        assert_eq!(allowed(&page), expected);
+        assert_eq!(allowed(&["--tracker", "tcp:gazepc.uni.example:4242,profile=gazepoint"]), expected);
+        assert_eq!(allowed(&["--tracker", "core:131.114.5.20"]), "localhost 131.114.5.20");
+    }
+
     #[test]
     fn what_the_service_could_not_do_is_refused() {
         let root = machine();
@@ -351,7 +416,10 @@ mod tests {
         assert!(refused(&["--config", "rig.toml"]).contains("whole path"));
         assert!(refused(&["--config", "/home/me/rig.toml"]).contains("does not see /home"));
         assert!(refused(&[&RIG[..], &["--output", "window"]].concat()).contains("no desktop"));
-        assert!(refused(&[&RIG[..], &["--record", "/srv/run1"]].concat()).contains("/var/lib/holod only"));
+        let record = refused(&[&RIG[..], &["--record", "/var/lib/holod/run1"]].concat());
+        assert!(record.contains("find the record of its last start") && record.contains("--record-in"), "{record}");
+        assert!(refused(&[&RIG[..], &["--record-in", "/srv/runs"]].concat()).contains("/var/lib/holod only"));
+        drop_in_of(&[&RIG[..], &["--record-in", "/var/lib/holod/runs"]].concat(), &rig(), root.path()).unwrap();
         assert!(refused(&[&RIG[..], &["--scene", "/srv/a.png,b.png"]].concat()).contains("found b.png"));
         assert!(refused(&[&RIG[..], &["--tracker", "/dev/ttyUSB9"]].concat()).contains("plug the tracker in"));
         let mut rig = rig();
