@@ -385,7 +385,7 @@ pub struct ViewArgs {
     #[command(flatten)]
     pub network: NetworkArgs,
     /// A directory that `holod render` wrote.
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "pupil", "weights"])]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "pupil", "weights", "resolution", "fit", "depth_encoding", "backend"])]
     pub hologram: Option<PathBuf>,
     /// The scene.
     #[command(flatten)]
@@ -397,7 +397,7 @@ pub struct ViewArgs {
     #[arg(long, value_enum, default_value_t = Backend::Auto)]
     pub backend: Backend,
     /// Where the eye focuses, in dioptres: 0 is infinity, 2.857 is 35 cm.
-    #[arg(long, value_name = "DPT", value_parser = parse_focus)]
+    #[arg(long, value_name = "DPT", value_parser = parse_focus, allow_negative_numbers = true)]
     pub focus: Dioptres,
     /// Diameter of the pupil that looks, in millimetres; the one that the hologram was made for when left out.
     #[arg(long, value_name = "MM", value_parser = parse_pupil)]

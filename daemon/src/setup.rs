@@ -1,11 +1,13 @@
 //! From names on the command line to the parts of a run: rig and weights.
 
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_calibration::{DisplayGeometry, PupilDiameter};
 use holod_model::Weights;
 use holod_model::conditions::BenchFit;
+use holod_model::weights::WeightsError;
 use holod_pupil_input::{ReplayError, SourceError, TrackerError, TrackerSpec};
 
 use crate::cli::{NetworkArgs, RigArgs};
@@ -46,7 +48,11 @@ pub fn load_weights(rig: &Rig) -> Result<Weights, Failure> {
         WeightsChoice::Standard => Ok(Weights::builtin()),
         WeightsChoice::Small => Ok(Weights::builtin_small()),
         WeightsChoice::Fast => Ok(Weights::builtin_fast()),
-        WeightsChoice::File(path) => Weights::load(path).map_err(Failure::because(Exit::Data)),
+        WeightsChoice::File(path) => Weights::load(path).map_err(|error| {
+            let is_missing =
+                matches!(&error, WeightsError::Read { source, .. } if source.kind() == ErrorKind::NotFound);
+            Failure::because(if is_missing { Exit::NoInput } else { Exit::Data })(error)
+        }),
     }
 }
 

@@ -46,7 +46,7 @@ pub(crate) fn advice(frames_hz: f64, rig: &Rig, size: Resolution) -> Option<Stri
     let mut cures = Vec::new();
     match rig.model.weights {
         WeightsChoice::Standard => {
-            cures.push("--weights small takes about 0.6 of the time, --weights fast 0.4".to_owned());
+            cures.push("--weights small takes about 0.7 of the time, --weights fast 0.5".to_owned());
         }
         WeightsChoice::Small => cures.push("--weights fast takes about 0.7 of the time".to_owned()),
         WeightsChoice::Fast | WeightsChoice::File(_) => {}

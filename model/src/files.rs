@@ -1,6 +1,6 @@
 //! Holograms and pictures on disk. Everything is written beside its place and renamed, so nothing is ever half written.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::f32::consts::TAU;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
@@ -92,6 +92,20 @@ pub enum FileError {
     Content { path: PathBuf, found: String, expected: String },
 }
 
+/// Brings the names in a safetensors file's header to order: the same content is then the same bytes, where a map of
+/// metadata would come in another order each time.
+fn sort_header(file: &mut Vec<u8>) -> serde_json::Result<()> {
+    const LENGTH: usize = size_of::<u64>();
+    let data = LENGTH + u64::from_le_bytes(std::array::from_fn(|byte| file[byte])) as usize;
+    let sorted: BTreeMap<String, BTreeMap<String, serde_json::Value>> = serde_json::from_slice(&file[LENGTH..data])?;
+    let mut header = serde_json::to_vec(&sorted)?;
+    // Spaces, so that the data begin as aligned as they did.
+    header.resize(header.len().next_multiple_of(LENGTH), b' ');
+    let length = (header.len() as u64).to_le_bytes();
+    file.splice(..data, length.into_iter().chain(header));
+    Ok(())
+}
+
 impl StoredHologram {
     /// Writes a safetensors file: `field` [3, height, width, 2] (real, imaginary) in F32, and in the metadata format,
     /// pupil_mm, amplitude_constant and optics (JSON).
@@ -111,9 +125,10 @@ impl StoredHologram {
             ("amplitude_constant".to_owned(), self.amplitude_constant.to_string()),
             ("optics".to_owned(), optics),
         ]);
-        let file = TensorView::new(Dtype::F32, vec![3, height, width, 2], &bytes)
+        let mut file = TensorView::new(Dtype::F32, vec![3, height, width, 2], &bytes)
             .and_then(|view| safetensors::serialize([("field", view)], Some(metadata)))
             .map_err(|error| content(error.to_string()))?;
+        sort_header(&mut file).map_err(|error| content(error.to_string()))?;
         write_bytes(path, &file)
     }
 
@@ -243,6 +258,21 @@ mod tests {
         hologram().save(&path).unwrap();
         assert_eq!(StoredHologram::load(&path).unwrap(), hologram());
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn the_same_hologram_is_the_same_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("field.safetensors");
+        let saved = |stored: &StoredHologram| {
+            stored.save(&path).unwrap();
+            std::fs::read(&path).unwrap()
+        };
+        let first = saved(&hologram());
+        for _ in 0..8 {
+            assert!(saved(&hologram()) == first);
+        }
+        assert!(saved(&StoredHologram { amplitude_constant: 1.5, ..hologram() }) != first, "the comparison is blind");
     }
 
     #[test]

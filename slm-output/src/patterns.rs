@@ -173,16 +173,15 @@ impl Profile {
         }
     }
 
-    /// Share of the light in order `order` of lines that are finely sampled.
-    fn share(self, depth_rad: f64, order: i32) -> f64 {
+    /// Share of the light in order `order` of what has this profile at `places`, counted in lines.
+    fn share(self, places: &[f64], depth_rad: f64, order: i32) -> f64 {
         let (mut re, mut im) = (0.0, 0.0);
-        for sample in 0..ORDER_SAMPLES {
-            let lines = (sample as f64 + 0.5) / ORDER_SAMPLES as f64;
+        for &lines in places {
             let phase_rad = self.phase_rad(lines, depth_rad) - TAU * f64::from(order) * lines;
             re += phase_rad.cos();
             im += phase_rad.sin();
         }
-        (re * re + im * im) / (ORDER_SAMPLES * ORDER_SAMPLES) as f64
+        (re * re + im * im) / (places.len() * places.len()) as f64
     }
 }
 
@@ -232,6 +231,12 @@ impl Pattern {
         frame: &mut LevelsFrame,
     ) -> Result<(), PatternError> {
         let optics = DisplayGeometry { resolution: encoder.pattern_resolution(), ..*optics };
+        let [x_px, y_px] = placement.axis_px;
+        let [most_x_px, most_y_px] = [optics.resolution.width, optics.resolution.height].map(|px| px as f64 / 2.0);
+        if !(x_px.abs() <= most_x_px && y_px.abs() <= most_y_px) {
+            let expected = format!("a place on the panel: at most {most_x_px} px across and {most_y_px} px up or down");
+            return Err(wrong("axis", format!("{x_px},{y_px}"), expected));
+        }
         if let Self::Level { level } = *self {
             let top = ((1u32 << frame.layout().packing.bit_depth()) - 1) as u16;
             if level > top {
@@ -277,7 +282,7 @@ impl Pattern {
             Self::Grating { period_px, angle_deg, profile, depth_rad } => {
                 checked_period(period_px, optics)?;
                 let depth_rad = checked_depth(depth_rad.unwrap_or(profile.depth_rad()))?;
-                let (sine, cosine) = checked_angle(angle_deg)?.to_radians().sin_cos();
+                let [cosine, sine] = direction(checked_angle(angle_deg)?);
                 let lines = |x_px: f64, y_px: f64| (x_px * cosine + y_px * sine) / period_px;
                 Ok(by_place(optics, [0.0; 2], |x_px, y_px| profile.phase_rad(lines(x_px, y_px), depth_rad)))
             }
@@ -290,6 +295,7 @@ impl Pattern {
                 }))
             }
             Self::Dots { spacing_px, diameter_px } => {
+                checked_size("dots' spacing", spacing_px, 8, optics.resolution.width.max(optics.resolution.height))?;
                 checked_size("dots' diameter", diameter_px, 4, spacing_px / 2)?;
                 let spacing_px = spacing_px as f64;
                 Ok(light_and_dark(optics, axis_px, |x_px, y_px| {
@@ -341,10 +347,25 @@ impl Pattern {
             Self::Grating { period_px, angle_deg, profile, depth_rad } => {
                 checked_period(period_px, optics)?;
                 let depth_rad = checked_depth(depth_rad.unwrap_or(profile.depth_rad()))? * field_m / laser_m;
-                let (sine, cosine) = checked_angle(angle_deg)?.to_radians().sin_cos();
+                let [cosine, sine] = direction(checked_angle(angle_deg)?);
+                // Along one side of the panel each line falls on the same few places of pixels; otherwise on all.
+                let along = match [cosine, sine] {
+                    [side, 0.0] => Some((side, optics.resolution.width)),
+                    [0.0, side] => Some((side, optics.resolution.height)),
+                    _ => None,
+                };
+                let places: Vec<f64> = match along {
+                    Some((side, side_px)) => {
+                        // As many as are nearly whole lines.
+                        let lines = (ORDER_SAMPLES as f64 / period_px).floor();
+                        let places_px = 0..(lines * period_px).round() as usize;
+                        places_px.map(|px| side * (px as f64 - middle(side_px)) / period_px).collect()
+                    }
+                    None => (0..ORDER_SAMPLES).map(|part| (part as f64 + 0.5) / ORDER_SAMPLES as f64).collect(),
+                };
                 let orders = [1, 0, -1, 2, -2].map(|number| {
-                    let per_px = f64::from(number) / period_px;
-                    order([number, 0], [per_px * cosine, per_px * sine], profile.share(depth_rad, number))
+                    let per_px = [cosine, sine].map(|along| f64::from(number) / period_px * along);
+                    order([number, 0], per_px, profile.share(&places, depth_rad, number))
                 });
                 Ok(orders.to_vec())
             }
@@ -482,9 +503,20 @@ fn by_pixel(optics: &DisplayGeometry, phase_rad: impl Fn(usize, usize) -> f64) -
     (0..optics.resolution.pixels()).map(phase).collect()
 }
 
+/// x and y of the direction, of which one is exactly 0 along a side of the panel: rounding would decide otherwise where
+/// a line's edge falls on the middle of a pixel.
+fn direction(angle_deg: f64) -> [f64; 2] {
+    let (sine, cosine) = angle_deg.to_radians().sin_cos();
+    [cosine, sine].map(|along| if along.abs() < 1e-12 { 0.0 } else { along })
+}
+
+/// The place of the middle of so many pixels in a row.
+fn middle(pixels: usize) -> f64 {
+    0.5 * (pixels as f64 - 1.0)
+}
+
 /// Phases by the pixels' places, x and y from `axis_px`.
 fn by_place(optics: &DisplayGeometry, axis_px: [f64; 2], phase_rad: impl Fn(f64, f64) -> f64) -> Vec<f32> {
-    let middle = |pixels: usize| 0.5 * (pixels as f64 - 1.0);
     let (middle_x, middle_y) = (middle(optics.resolution.width), middle(optics.resolution.height));
     by_pixel(optics, |row, column| phase_rad(column as f64 - middle_x - axis_px[0], middle_y - row as f64 - axis_px[1]))
 }
@@ -591,7 +623,11 @@ mod tests {
         let sinusoidal = grating(32.0, 0.0, Profile::Sinusoidal);
         let shallow =
             Pattern::Grating { period_px: 32.0, angle_deg: 90.0, profile: Profile::Blazed, depth_rad: Some(PI) };
-        for pattern in [grating(32.0, 0.0, Profile::Binary), sinusoidal, shallow] {
+        // Lines of an odd number of pixels are not half and half.
+        let odd = [(3.0, 0.0), (3.0, 180.0), (5.0, 90.0), (9.6, 0.0)];
+        let odd = odd.map(|(period_px, angle_deg)| grating(period_px, angle_deg, Profile::Binary));
+        let even = grating(32.0, 0.0, Profile::Binary);
+        for pattern in [even, sinusoidal, shallow].into_iter().chain(odd) {
             let seen = shown(&pattern, &Placement::default(), SIZE, Colour::Red);
             for order in pattern.orders(&BENCH, Colour::Red, Colour::Red).unwrap() {
                 let per_px = order.position.map(|place| {
@@ -605,9 +641,12 @@ mod tests {
         }
         // The textbook's figures: (2/π)², J₁² at its largest, and half of the first order for half a blaze.
         let first = |pattern: &Pattern| pattern.orders(&BENCH, Colour::Red, Colour::Red).unwrap()[0].share;
-        assert!((first(&grating(32.0, 0.0, Profile::Binary)) - 0.4053).abs() < 1e-3);
+        assert!((first(&grating(64.0, 0.0, Profile::Binary)) - 0.4053).abs() < 1e-3);
         assert!((first(&sinusoidal) - 0.3386).abs() < 1e-3);
         assert!((first(&shallow) - 0.4053).abs() < 1e-3);
+        // One pixel of three, or two of five, less the others.
+        let middle = |pattern: &Pattern| pattern.orders(&BENCH, Colour::Red, Colour::Red).unwrap()[1].share;
+        assert!((middle(&odd[0]) - 1.0 / 9.0).abs() < 1e-3 && (middle(&odd[2]) - 0.04).abs() < 1e-3);
     }
 
     #[test]
@@ -642,8 +681,10 @@ mod tests {
         // The same field lit by red light goes farther out, and no longer all into the first order.
         let red = grating(8.0, 0.0, Profile::Blazed).orders(&BENCH, Colour::Green, Colour::Red).unwrap();
         assert!((red[0].position[0].0 / green[0].position[0].0 - 638.0 / 520.0).abs() < 1e-3);
+        // Eight pixels a line.
         let sinc = |x: f64| (PI * x).sin() / (PI * x);
-        assert!((red[0].share - sinc(1.0 - 520.0 / 638.0).powi(2)).abs() < 1e-3, "{}", red[0].share);
+        let expected = |miss: f64| (sinc(miss) / sinc(miss / 8.0)).powi(2);
+        assert!((red[0].share - expected(1.0 - 520.0 / 638.0)).abs() < 1e-3, "{}", red[0].share);
     }
 
     /// Share of the light within `radius_px` of the middle after propagation over `u_m`, of that within the lens.
@@ -810,6 +851,18 @@ mod tests {
         let error = Pattern::Level { level: 256 }.draw(&placement, &encoder, &BENCH, &mut frame).unwrap_err();
         assert_eq!(error.to_string(), "the pattern's level is 256; expected 0 to 255, the panel's levels");
         assert_eq!(frame, before);
+    }
+
+    #[test]
+    fn an_axis_off_the_panel_is_refused() {
+        let lens = Pattern::Lens { focal_length: Metres(0.3), diameter: None };
+        let encoder = PanelEncoder::new(&Rig::default().panel, BENCH.resolution, BENCH.resolution).unwrap();
+        let mut frame = LevelsFrame::new(encoder.layout());
+        let mut drawn = |axis_px| lens.draw(&Placement::new(axis_px, &[]), &encoder, &BENCH, &mut frame);
+        let error = drawn([5000.0, 0.0]).unwrap_err().to_string();
+        assert!(error.contains("axis is 5000,0") && error.contains("at most 960 px across and 540 px"), "{error}");
+        assert!(drawn([0.0, -541.0]).is_err() && drawn([f64::NAN, 0.0]).is_err());
+        drawn([960.0, -540.0]).unwrap();
     }
 
     #[test]

@@ -98,6 +98,17 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
             exit: 66,
             says: &["directory", "field.safetensors", "holod render"],
         },
+        Case {
+            args: &["view", "--hologram", "directory", "--resolution", "64x48", "--focus", "-1", "--out", "v.png"],
+            exit: 64,
+            says: &["--hologram", "--resolution"],
+        },
+        Case {
+            args: &["view", "--hologram", "directory", "--backend", "cpu", "--focus", "1", "--out", "v.png"],
+            exit: 64,
+            says: &["--hologram", "--backend"],
+        },
+        Case { args: &["--weights", "nowhere.safetensors"], exit: 66, says: &["nowhere.safetensors"] },
         Case { args: &["view", "--focus", "1", "--out", "v.png"], exit: 64, says: &["--hologram", "--pupil"] },
         Case { args: &["check", "--config", "nowhere.toml"], exit: 66, says: &["nowhere.toml"] },
         Case { args: &["check", "--config", "junk.toml"], exit: 78, says: &["junk.toml"] },

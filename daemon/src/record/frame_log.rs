@@ -61,6 +61,8 @@ pub(crate) struct FrameLog {
     file: csv::Writer<File>,
     path: PathBuf,
     frames: HashMap<u64, FrameRecord>,
+    /// The frame of the last row.
+    newest: Option<u64>,
 }
 
 /// Frames remembered for fields that are still to be shown: more than can wait for a control thread that is late.
@@ -89,7 +91,7 @@ impl FrameLog {
         })?;
         let mut file = csv::Writer::from_writer(file);
         file.write_record(COLUMNS.map(|(name, _)| name)).map_err(|error| cannot(error.into()))?;
-        Ok(Self { file, path, frames: HashMap::new() })
+        Ok(Self { file, path, frames: HashMap::new(), newest: None })
     }
 
     /// Takes note of a rendered frame; its rows are written when its fields are shown.
@@ -105,6 +107,8 @@ impl FrameLog {
     /// # Errors
     /// The disk's, with the file's name.
     pub(crate) fn field(&mut self, field: &FieldRecord) -> Result<(), Failure> {
+        let is_first = self.newest.replace(field.frame) != Some(field.frame);
+        let field = &FieldRecord { deadline_missed: field.deadline_missed && is_first, ..*field };
         let frame = self.frames.get(&field.frame);
         let row = COLUMNS.map(|(_, cell)| match cell {
             Field(cell) => cell(field),
@@ -221,6 +225,21 @@ mod tests {
         );
         assert_eq!(rows[2], "999,1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,");
         assert!(rows.iter().all(|row| row.split(',').count() == COLUMNS.len()));
+    }
+
+    #[test]
+    fn a_late_frame_is_counted_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut log = FrameLog::create(folder.path()).unwrap();
+        for (number, deadline_missed) in [(7, true), (7, true), (7, true), (8, false), (8, false), (9, true), (9, true)]
+        {
+            log.field(&FieldRecord { deadline_missed, ..field(number) }).unwrap();
+        }
+        log.flush().unwrap();
+        let text = fs::read_to_string(folder.path().join("frames.csv")).unwrap();
+        let column = COLUMNS.iter().position(|(name, _)| *name == "deadline_missed").unwrap();
+        let cells: Vec<&str> = text.lines().skip(1).map(|row| row.split(',').nth(column).unwrap()).collect();
+        assert_eq!(cells, ["1", "0", "0", "0", "0", "1", "0"]);
     }
 
     #[test]

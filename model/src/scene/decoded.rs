@@ -22,6 +22,8 @@ pub(super) struct ColourRaster {
     pub(super) linear: Vec<f32>,
     /// Pixels of which some colour was above 1, below 0 or not finite.
     pub(super) clipped_px: usize,
+    /// Whether one channel of luminance stands for all colours.
+    pub(super) is_luminance: bool,
 }
 
 /// A depth picture.
@@ -30,6 +32,8 @@ pub(super) struct DepthRaster {
     /// How it was turned after it was read.
     pub(super) turned: Orientation,
     pub(super) numbers: DepthNumbers,
+    /// Whether they were found in a channel of luminance.
+    pub(super) is_luminance: bool,
 }
 
 /// Checks a picture's claimed size before memory is spent on it.

@@ -270,6 +270,13 @@ impl Scene {
             FrameReport { source: Some(colour.size), colour_clipped_px: colour.clipped_px, ..FrameReport::default() };
 
         let depth = raster::read_depth(&depth_path)?;
+        if colour_path == depth_path && colour.is_luminance && depth.is_luminance {
+            return Err(SceneError::Picture {
+                path: colour_path,
+                found: "a channel Y, and nothing else to see or to know depth by".into(),
+                expected: "colours and depth: it cannot be both, name the other's file, too (COLOUR,DEPTH)".into(),
+            });
+        }
         let mut depth_dpt = self.description.depth_reading.dioptres(&depth.numbers);
         report.depth_missing_px =
             depth::fill_missing(&mut depth_dpt, depth.size).ok_or_else(|| SceneError::Picture {

@@ -45,6 +45,7 @@ struct Layer<'a> {
 pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
     let picture = read(path)?;
     let channels = picture.colours(path)?;
+    let is_luminance = std::ptr::eq(channels[0], channels[1]);
     let pixels = picture.size.pixels();
     let mut linear = vec![0.0; 3 * pixels];
     let mut clipped = vec![false; pixels];
@@ -55,7 +56,7 @@ pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
         });
     }
     let clipped_px = clipped.into_iter().filter(|&clipped| clipped).count();
-    Ok(ColourRaster { size: picture.size, turned: Orientation::NoTransforms, linear, clipped_px })
+    Ok(ColourRaster { size: picture.size, turned: Orientation::NoTransforms, linear, clipped_px, is_luminance })
 }
 
 pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
@@ -64,7 +65,8 @@ pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
     let mut values = vec![f32::NAN; picture.size.pixels()];
     picture.place(channel, |index, value| values[index] = value);
     let numbers = DepthNumbers { values, full_scale: None };
-    Ok(DepthRaster { size: picture.size, turned: Orientation::NoTransforms, numbers })
+    let is_luminance = channel.component().eq_ignore_ascii_case("Y");
+    Ok(DepthRaster { size: picture.size, turned: Orientation::NoTransforms, numbers, is_luminance })
 }
 
 impl Picture {

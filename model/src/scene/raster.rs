@@ -26,7 +26,7 @@ pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
         Format::Other => {
             let (picture, turned) = decode(path)?;
             let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
-            Ok(ColourRaster { size, turned, linear: linear_planes(&picture), clipped_px: 0 })
+            Ok(ColourRaster { size, turned, linear: linear_planes(&picture), clipped_px: 0, is_luminance: false })
         }
     }
 }
@@ -38,7 +38,7 @@ pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
         Format::Other => {
             let (picture, turned) = decode(path)?;
             let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
-            Ok(DepthRaster { size, turned, numbers: depth_numbers(path, picture)? })
+            Ok(DepthRaster { size, turned, numbers: depth_numbers(path, picture)?, is_luminance: false })
         }
     }
 }

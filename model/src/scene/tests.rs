@@ -265,6 +265,15 @@ fn an_exrs_colours_are_those_of_one_layer_and_its_depth_is_no_vector() {
     }
     write(&[("", [&one("Y", 0.5)[..], &xyz("normal.")].concat())]);
     assert_eq!((colours().unwrap(), depth().unwrap()), ([0.5; 3], 0.5), "luminance alone");
+    let loaded = |names: String| {
+        let scene = Scene::open(&names, Some(DepthEncoding::Metres)).unwrap();
+        scene.load(0, &BENCH, None, Fit::Native).map_err(|error| error.to_string())
+    };
+    let both = loaded(path.display().to_string()).unwrap_err();
+    assert!(both.contains("layers.exr") && both.contains("COLOUR,DEPTH"), "{both}");
+    let other = files.path("other.exr");
+    std::fs::copy(&path, &other).unwrap();
+    loaded(format!("{},{}", path.display(), other.display())).unwrap();
 
     let two = [
         &rgb("left.Combined.", 0.5)[..],

@@ -1,6 +1,7 @@
 //! Whether the user who is to run holod may open what the rig names: this one, or the service's.
 
 use std::fs;
+use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
@@ -101,6 +102,9 @@ fn files(rig: &Rig, runner: &Runner) -> Result<String, Vec<String>> {
         match (runner, hidden) {
             (Runner::Service { .. }, Some(folder)) => {
                 faults.push(format!("{shown}: the service does not see {folder}: move it to /etc/holod or /srv"));
+            }
+            _ if matches!(file.metadata(), Err(error) if error.kind() == ErrorKind::NotFound) => {
+                faults.push(format!("there is no {shown}: correct its path"));
             }
             _ if !runner.may(file, Access::READ_OK) => {
                 faults.push(format!(

@@ -135,10 +135,15 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     if observed.accepted() > 0 {
         return Ok(());
     }
-    let bytes = report.counts.get("bytes").copied().unwrap_or(0);
-    refusals.judge(now, &tracker.control.counters(), true);
-    let heard = match refusals.current().filter(|_| bytes > 0) {
+    let counters = tracker.control.counters();
+    // Logs and simulated eyes have no bytes.
+    let [bytes, samples] = [Counter::Bytes, Counter::Samples].map(|counter| counters.of(counter));
+    refusals.judge(now, &counters, true);
+    let heard = match refusals.current().filter(|_| bytes > 0 || samples > 0) {
         Some(refusal) => refusal.to_string(),
+        None if samples > 0 => {
+            format!("{samples} samples came, and none was believed yet: give it a longer --duration")
+        }
         None if bytes == 0 => "nothing was heard; is it switched on, and does it send without being asked?".to_owned(),
         None => format!("{bytes} bytes came, and no sample was in them: is it this profile and baud rate?"),
     };
