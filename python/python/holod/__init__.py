@@ -18,7 +18,7 @@ blue; pictures are (rows, columns, 3), phases and levels (3, rows, columns). Not
 another shape or type, or a value that is none, raises InputError, which says what was found and expected.
 """
 
-from holod_client import Control, ControlError, Feed, FeedError, FeedTimeoutError
+from holod_client import Control, ControlError, Feed, FeedError, FeedTimeoutError, UnansweredError
 
 from holod._holod import Hologram, Renderer, Rig, evaluate, to_srgb8, view
 from holod.errors import HolodError, HolodWarning, InputError, RigError, UnavailableError
@@ -41,6 +41,7 @@ __all__ = [
     "Rig",
     "RigError",
     "Scene",
+    "UnansweredError",
     "UnavailableError",
     "builtin_scene",
     "evaluate",

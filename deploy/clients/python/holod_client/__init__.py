@@ -13,7 +13,7 @@ holod must listen (`holod run --scene feed`). Then:
         print(holod.status()["frames_shown_hz"])
 """
 
-from holod_client.control import Control, ControlError
+from holod_client.control import Control, ControlError, UnansweredError
 from holod_client.feed import Feed, FeedError, FeedTimeoutError, Outcomes, Slot, default_path
 from holod_client.formats import Colour, Depth
 
@@ -27,5 +27,6 @@ __all__ = [
     "FeedTimeoutError",
     "Outcomes",
     "Slot",
+    "UnansweredError",
     "default_path",
 ]

@@ -9,7 +9,7 @@ import socket
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, BinaryIO, Self
 
 from holod_client.feed import default_path
 
@@ -17,40 +17,61 @@ LONGEST_ANSWER_BYTES = 1 << 20
 
 
 class ControlError(Exception):
-    """holod is not there, or refuses the order; nothing has changed then, but for `lasers_dark()`: it is in force."""
+    """holod is not there, or refuses the order; nothing has changed then, but for `lasers_dark()`: it is in force.
+
+    An `UnansweredError`, which is one of these, is the exception: what holod has done is not known.
+    """
+
+
+class UnansweredError(ControlError):
+    """holod has the order, but its answer did not come. Whether the order took effect, or still will, is not known."""
 
 
 class Control:
     """A connection to the control socket of a running holod, for orders one after the other.
 
     `path` is the socket; without one it is that of the only holod in this user's runtime folder, or else of the
-    service. Each order waits for holod up to `timeout_s` seconds: weights and long sequences take a while to read.
+    service. Each order waits for holod up to `timeout_s` seconds, which may be changed at any time: weights and long
+    sequences take a while to read.
+
+    An order whose answer does not come raises UnansweredError. It may have taken effect, and where holod hangs it may
+    take effect later, even after orders that are given meanwhile: ask for the `status()` before relying on either. The
+    connection is closed then, and so it is where a call is interrupted; the next order opens another one to the same
+    socket, so that no answer is taken for that of another order. Nothing is sent twice by itself.
+
+    One of these must not be used by two threads at the same time.
 
     Raises ControlError where no holod is found, or several are.
     """
 
-    def __init__(self, path: str | os.PathLike[str] | None = None, timeout_s: float = 60.0) -> None:
+    def __init__(self, path: str | os.PathLike[str] | None = None, timeout_s: float = 120.0) -> None:
         self.path = _only_socket() if path is None else Path(path)
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._socket.settimeout(timeout_s)
-        try:
-            self._socket.connect(str(self.path))
-        except OSError as error:
-            self._socket.close()
-            raise ControlError(f"no holod answers on {self.path}: {error.strerror or error}; is it running?") from error
-        self._answers = self._socket.makefile("rb")
+        self.timeout_s = timeout_s
+        self._is_closed = False
+        self._socket: socket.socket | None = None
+        self._answers: BinaryIO | None = None
+        self._connected()
 
     def ask(self, do: str, **details: Any) -> Any:
-        """Gives the order `do` of daemon/doc/control.md, and returns the answer. Raises ControlError."""
+        """Gives the order `do` of daemon/doc/control.md, and returns the answer.
+
+        Raises UnansweredError where it is not known whether it took effect, else ControlError.
+        """
         request = json.dumps({"do": do, **details}).encode() + b"\n"
+        connection, answers = self._connected()
+        connection.settimeout(self.timeout_s)
         try:
-            self._socket.sendall(request)
-            line = self._answers.readline(LONGEST_ANSWER_BYTES)
-        except OSError as error:
-            raise ControlError(f"holod does not answer on {self.path}: {error.strerror or error}") from error
-        if not line.endswith(b"\n"):
-            raise ControlError(f"holod closed the connection on {self.path}: see its log")
-        answer = json.loads(line)
+            try:
+                # What raises here has left out the end of the line at least, without which holod does nothing.
+                connection.sendall(request)
+            except OSError as error:
+                raise ControlError(
+                    f"{self.path} takes no order ({_why(error)}), and nothing has changed: does that holod still run?"
+                ) from error
+            answer = self._answer(do, answers)
+        except BaseException:
+            self._disconnect()
+            raise
         if "error" in answer:
             raise ControlError(answer["error"])
         return answer["ok"]
@@ -128,8 +149,8 @@ class Control:
 
     def close(self) -> None:
         """May be called again."""
-        self._answers.close()
-        self._socket.close()
+        self._is_closed = True
+        self._disconnect()
 
     def __enter__(self) -> Self:
         return self
@@ -138,6 +159,53 @@ class Control:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+    def _connected(self) -> tuple[socket.socket, BinaryIO]:
+        """The connection, which is opened where there is none."""
+        if self._is_closed:
+            raise ControlError(f"this connection to {self.path} was closed; nothing has changed")
+        if self._socket is None or self._answers is None:
+            connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            connection.settimeout(self.timeout_s)
+            try:
+                connection.connect(str(self.path))
+            except OSError as error:
+                connection.close()
+                raise ControlError(f"no holod answers on {self.path}: {_why(error)}; is it running?") from error
+            self._socket, self._answers = connection, connection.makefile("rb")
+        return self._socket, self._answers
+
+    def _disconnect(self) -> None:
+        for one in (self._answers, self._socket):
+            if one is not None:
+                one.close()
+        self._socket = self._answers = None
+
+    def _answer(self, do: str, answers: BinaryIO) -> dict[str, Any]:
+        def unanswered(what: str) -> UnansweredError:
+            return UnansweredError(f"{what}; whether `{do}` took effect is not known: see its status and its log")
+
+        try:
+            line = answers.readline(LONGEST_ANSWER_BYTES)
+        except TimeoutError as error:
+            raise unanswered(f"holod has not answered on {self.path} for {self.timeout_s:g} s") from error
+        except OSError as error:
+            raise unanswered(f"holod does not answer on {self.path}: {_why(error)}") from error
+        if len(line) == LONGEST_ANSWER_BYTES:
+            raise unanswered(f"the answer on {self.path} is longer than {LONGEST_ANSWER_BYTES} bytes")
+        if not line.endswith(b"\n"):
+            raise unanswered(f"holod closed the connection on {self.path}")
+        try:
+            answer = json.loads(line)
+        except ValueError as error:
+            raise unanswered(f"{self.path} answered {line[:40]!r}, which is no JSON: is it holod?") from error
+        if not isinstance(answer, dict) or not ("ok" in answer or "error" in answer):
+            raise unanswered(f"{self.path} answered {line[:40]!r}, expected `ok` or `error`: is it holod?")
+        return answer
+
+
+def _why(error: OSError) -> str:
+    return error.strerror or str(error)
 
 
 def _listens(path: str) -> bool:

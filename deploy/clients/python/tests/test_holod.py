@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from holod_client import Control, ControlError, Feed, FeedError
+from holod_client import Control, ControlError, Feed, FeedError, UnansweredError
 
 HERE = Path(__file__).parent
 STAND_INS = HERE / "stand_ins"
@@ -171,6 +172,20 @@ def test_the_monocular_example_shows_a_folder_of_pictures(holod: Holod, tmp_path
     assert (done.returncode, done.stderr) == (0, said)
     told = holod.end()["feed"]
     assert (told["taken"], told["refused"], told["pictures_with_bad_depths"]) == (2, 0, 0), told
+
+
+def test_orders_that_a_hanging_holod_does_not_answer_are_told_apart_from_refused_ones(holod: Holod) -> None:
+    with Control(next(holod.socket.parent.glob("holod/control-*"))) as control:
+        control.lasers_dark()
+        holod.process.send_signal(signal.SIGSTOP)
+        control.timeout_s = 0.5
+        with pytest.raises(UnansweredError, match="whether `pupil` took effect is not known"):
+            control.pupil(3.5)
+        holod.process.send_signal(signal.SIGCONT)
+        control.timeout_s = 60
+        assert control.status()["lasers_kept_dark"]
+        assert control.lasers_arm() == "lasers are lit again by the rules"
+        assert not control.status()["lasers_kept_dark"]
 
 
 def test_a_running_holod_is_changed(holod: Holod, monkeypatch: pytest.MonkeyPatch) -> None:
