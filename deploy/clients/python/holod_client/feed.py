@@ -6,6 +6,7 @@ import errno
 import logging
 import math
 import mmap
+import operator
 import os
 import socket
 import time
@@ -100,7 +101,8 @@ class Feed:
 
     As a context manager it waits for all answers and closes. One feed must not be used by two threads at the same time.
 
-    Raises ValueError for an unknown format, FeedError where no holod listens or where it refuses the connection.
+    Raises ValueError for an unknown format, TypeError for a size that is no whole number, FeedError where no holod
+    listens or where it refuses the connection.
     """
 
     def __init__(
@@ -129,7 +131,7 @@ class Feed:
         if (self.depth is Depth.NONE) != (plane_dpt is not None):
             raise ValueError(f"plane_dpt: found {plane_dpt} with depth {str(self.depth)!r}, expected one of the two")
         for label, size in (("width_px", width_px), ("height_px", height_px)):
-            if not 0 < size < 2**32:
+            if not 0 < _whole(label, size, "a whole number of pixels") < 2**32:
                 raise ValueError(f"{label}: found {size}, expected more than 0")
 
         self._sequence = 0
@@ -162,10 +164,11 @@ class Feed:
         where that is not known. `focus_dpt` and `field_of_view_deg` are those of a `Slot`: for a feed that
         `tells_view`.
 
-        Raises ValueError for a wrong shape or view, TypeError for a wrong type, FeedTimeoutError, FeedError.
+        Raises ValueError for a wrong shape, time or view, TypeError for a wrong type, FeedTimeoutError, FeedError.
         """
         self._check_colour(colour)
         self._check_depth(depth)
+        t_capture_ns = _time(t_capture_ns)
         with self.slot() as slot:
             slot.t_capture_ns = t_capture_ns
             slot.focus_dpt = focus_dpt
@@ -179,27 +182,37 @@ class Feed:
         """Gives the memory for a picture to write into, and hands it over at the end of the block; not where that
         raises. The slot's arrays are read-only afterwards; their slices must not be written to either.
 
-        Raises FeedTimeoutError, FeedError; ValueError for a view that cannot be, or that the feed does not tell.
+        Raises FeedTimeoutError, FeedError; ValueError for a time or a view that cannot be, or a view that the feed does
+        not tell; TypeError for a time that is no whole number.
         """
         index = self._begin()
         slot = self._slot(index)
         try:
             yield slot
             self._check_view(slot)
+            # In here as well, so that nothing that cannot be said costs a slot.
+            view = (slot.focus_dpt, slot.field_of_view_deg)
+            message = messages.fram(index, self._sequence + 1, _time(slot.t_capture_ns), *view)
         except BaseException:
             self._free.add(index)
             raise
         finally:
             slot.colour.flags.writeable = False
             slot.depth.flags.writeable = False
-        view = (slot.focus_dpt, slot.field_of_view_deg)
-        self._say(messages.fram(index, self._sequence + 1, slot.t_capture_ns, *view))
+        self._say(message)
         self._sent.add(index)
         self._sequence += 1
         self.outcomes.sent += 1
 
     def leave_out(self, pictures: int = 1) -> None:
-        """Tells holod, with the next picture, that some were left out before it: for a program that does not wait."""
+        """Tells holod, with the next picture, that some were left out before it: for a program that does not wait.
+
+        Raises ValueError for fewer than none, TypeError for what is no whole number.
+        """
+        pictures = _whole("pictures", pictures, "a whole number")
+        most = messages.MOST_SEQUENCE - 1 - self._sequence
+        if not 0 <= pictures <= most:
+            raise ValueError(f"pictures: found {pictures}, expected 0 or more, and fewer than {most + 1}")
         self._sequence += pictures
 
     def wait(self) -> None:
@@ -440,6 +453,22 @@ def default_path() -> Path:
         folder = Path(f"/tmp/holod-{os.getuid()}")
     path = folder / "feed"
     return SERVICE_PATH if SERVICE_PATH.exists() and not path.exists() else path
+
+
+def _whole(label: str, number: object, expected: str) -> int:
+    try:
+        return operator.index(number)  # type: ignore[arg-type]
+    except TypeError:
+        raise TypeError(f"{label}: found {number!r} ({type(number).__name__}), expected {expected}") from None
+
+
+def _time(t_capture_ns: object) -> int:
+    time_ns = _whole("t_capture_ns", t_capture_ns, "whole nanoseconds, as time.monotonic_ns() tells them")
+    if not -messages.MOST_TIME_NS - 1 <= time_ns <= messages.MOST_TIME_NS:
+        raise ValueError(
+            f"t_capture_ns: found {time_ns}, expected {-messages.MOST_TIME_NS - 1} to {messages.MOST_TIME_NS}"
+        )
+    return time_ns
 
 
 def _check(label: str, array: NDArray[Any], shapes: list[tuple[int, ...]], dtype: np.dtype) -> None:

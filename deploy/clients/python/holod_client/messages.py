@@ -9,6 +9,8 @@ VERSION = 2
 """The newest; pictures say how they were taken from this one on. What they do not need is said in version 1."""
 NAME_BYTES = 32
 ALIGNMENT = 64
+MOST_SEQUENCE = 2**64 - 1
+MOST_TIME_NS = 2**63 - 1
 
 _HELO = struct.Struct(f"=4s5If4x{NAME_BYTES}s")
 _RING = struct.Struct("=4sI5Q")

@@ -6,6 +6,7 @@ import dataclasses
 import gc
 import logging
 import os
+import re
 import socket
 import threading
 import time
@@ -383,6 +384,8 @@ def test_formats_that_are_none(path: Path, changes: dict, expected: str) -> None
 def test_sizes_that_are_none(path: Path) -> None:
     with pytest.raises(ValueError, match="height_px: found 0"):
         Feed(640, 0, depth="u16_mm", path=path)
+    with pytest.raises(TypeError, match=r"width_px: found 640.0 \(float\), expected a whole number"):
+        Feed(640.0, 480, depth="u16_mm", path=path)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -457,6 +460,52 @@ def test_where_holod_listens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     uid = os.getuid()
     folder = f"/run/user/{uid}/holod" if os.path.exists(f"/run/user/{uid}") else f"/tmp/holod-{uid}"
     assert holod_client.default_path() == Path(folder) / "feed"
+
+
+@pytest.mark.parametrize(
+    ("t_capture_ns", "error", "expected"),
+    [
+        (1.5e9, TypeError, "t_capture_ns: found 1500000000.0 (float), expected whole nanoseconds"),
+        ("now", TypeError, "t_capture_ns: found 'now' (str), expected whole nanoseconds"),
+        (2**63, ValueError, f"t_capture_ns: found {2**63}, expected {-(2**63)} to {2**63 - 1}"),
+        (np.uint64(2**64 - 1), ValueError, f"t_capture_ns: found {2**64 - 1}, expected"),
+        (-(2**63) - 1, ValueError, f"t_capture_ns: found {-(2**63) - 1}, expected"),
+    ],
+)
+def test_times_that_are_none_cost_no_slot(
+    path: Path, t_capture_ns: object, error: type[Exception], expected: str
+) -> None:
+    with FakeHolod(path, slots=1) as holod, open_feed(path, timeout_s=0.5) as feed:
+        for _ in range(2):
+            with pytest.raises(error, match=re.escape(expected)):
+                feed.send(*picture(0), t_capture_ns=t_capture_ns)
+            with pytest.raises(error, match=re.escape(expected)), feed.slot() as slot:
+                slot.t_capture_ns = t_capture_ns
+        assert feed.outcomes.sent == 0
+        feed.send(*picture(1), t_capture_ns=np.int64(77))
+        frame = holod.frame()
+        assert frame.t_capture_ns == 77
+        holod.free(frame)
+
+
+@pytest.mark.parametrize(
+    ("pictures", "error", "expected"),
+    [
+        (1.0, TypeError, "pictures: found 1.0 (float), expected a whole number"),
+        (-1, ValueError, "pictures: found -1, expected 0 or more"),
+        (2**64, ValueError, f"pictures: found {2**64}, expected 0 or more, and fewer than"),
+    ],
+)
+def test_pictures_left_out_that_are_no_number_cost_no_slot(
+    path: Path, pictures: object, error: type[Exception], expected: str
+) -> None:
+    with FakeHolod(path, slots=1) as holod, open_feed(path, timeout_s=0.5) as feed:
+        with pytest.raises(error, match=re.escape(expected)):
+            feed.leave_out(pictures)
+        feed.send(*picture(1))
+        frame = holod.frame()
+        assert frame.sequence == 1
+        holod.free(frame)
 
 
 def test_formats_have_the_names_that_they_are_given_by() -> None:
