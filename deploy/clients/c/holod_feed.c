@@ -25,7 +25,9 @@
 #define MOST_SLOTS 64
 #define ALIGNMENT 64
 #define TEXT_BYTES 1024
+#ifndef SERVICE_PATH
 #define SERVICE_PATH "/run/holod/feed"
+#endif
 
 /* The messages of daemon/doc/feed.md. */
 
@@ -83,9 +85,11 @@ struct message {
     char bytes[sizeof(struct freed) + TEXT_BYTES];
 };
 
+typedef char socket_path[sizeof(((struct sockaddr_un *)0)->sun_path)];
+
 struct holod_feed {
     int socket; /* -1 before it is open and once it has failed */
-    char path[sizeof(((struct sockaddr_un *)0)->sun_path)];
+    socket_path path;
     struct ring ring;
     unsigned char *memory;
     size_t memory_bytes;
@@ -311,8 +315,25 @@ static bool is_set(const char *value)
     return value && *value;
 }
 
-/* Returns the length as snprintf does: the path may be longer than a socket's may be. */
-static int default_path(char *path, size_t bytes)
+#define MOST_PATHS 2
+#define NOBODY_LISTENS                                                                            \
+    "no holod listens on %s: start it with `holod run --scene feed`, or give the path that its "  \
+    "log names"
+
+/* Leaves out what is too long for a socket: nobody listens there. */
+__attribute__((format(printf, 3, 4))) static void add_path(socket_path paths[MOST_PATHS],
+                                                           size_t *count, const char *format, ...)
+{
+    va_list arguments;
+    va_start(arguments, format);
+    int length = vsnprintf(paths[*count], sizeof paths[*count], format, arguments);
+    va_end(arguments);
+    if (length >= 0 && (size_t)length < sizeof paths[*count])
+        ++*count;
+}
+
+/* Where a holod may listen by itself: this user's, then the service. Returns how many they are. */
+static size_t default_paths(socket_path paths[MOST_PATHS])
 {
     const char *runtime = getenv("RUNTIME_DIRECTORY");
     const char *xdg_runtime = getenv("XDG_RUNTIME_DIR");
@@ -320,25 +341,26 @@ static int default_path(char *path, size_t bytes)
     char user_runtime[64];
     snprintf(user_runtime, sizeof user_runtime, "/run/user/%lu", uid);
 
-    int length;
+    size_t count = 0;
     if (is_set(runtime))
-        length = snprintf(path, bytes, "%s/feed", runtime);
+        add_path(paths, &count, "%s/feed", runtime);
     else if (is_set(xdg_runtime))
-        length = snprintf(path, bytes, "%s/holod/feed", xdg_runtime);
+        add_path(paths, &count, "%s/holod/feed", xdg_runtime);
     else if (access(user_runtime, F_OK) == 0)
-        length = snprintf(path, bytes, "%s/holod/feed", user_runtime);
+        add_path(paths, &count, "%s/holod/feed", user_runtime);
     else
-        length = snprintf(path, bytes, "/tmp/holod-%lu/feed", uid);
-    if (access(path, F_OK) != 0 && access(SERVICE_PATH, F_OK) == 0)
-        length = snprintf(path, bytes, "%s", SERVICE_PATH);
-    return length;
+        add_path(paths, &count, "/tmp/holod-%lu/feed", uid);
+    add_path(paths, &count, "%s", SERVICE_PATH);
+    return count;
 }
 
-static enum holod_feed_result connect_to(struct holod_feed *feed, const char *path)
+/* Where nobody listens there, also where a holod that was killed has left its socket, says so in
+ * *is_nobody. */
+static enum holod_feed_result connect_to(struct holod_feed *feed, const char *path,
+                                         bool *is_nobody)
 {
     struct sockaddr_un address = {.sun_family = AF_UNIX};
-    int length = path ? snprintf(feed->path, sizeof feed->path, "%s", path)
-                      : default_path(feed->path, sizeof feed->path);
+    int length = snprintf(feed->path, sizeof feed->path, "%s", path);
     if (length < 0 || (size_t)length >= sizeof feed->path)
         return fail(feed,
                     "the path %s... has %d bytes, and a socket's at most %zu: use a shorter one",
@@ -362,10 +384,8 @@ static enum holod_feed_result connect_to(struct holod_feed *feed, const char *pa
     case ENOENT:
     case ENOTDIR:
     case ECONNREFUSED:
-        return fail(feed,
-                    "no holod listens on %s: start it with `holod run --scene feed`, or give the "
-                    "path that its log names",
-                    feed->path);
+        *is_nobody = true;
+        return fail(feed, NOBODY_LISTENS, feed->path);
     case EACCES:
         return fail(feed,
                     "this user may not open %s: run as the user that holod runs as, or as one who "
@@ -382,6 +402,25 @@ static enum holod_feed_result connect_to(struct holod_feed *feed, const char *pa
     default:
         return fail(feed, "cannot connect to %s: %s", feed->path, strerror(errno));
     }
+}
+
+/* The first of the paths of its own on which a holod listens. */
+static enum holod_feed_result connect_to_any(struct holod_feed *feed)
+{
+    socket_path paths[MOST_PATHS];
+    char tried[MOST_PATHS * (sizeof paths[0] + sizeof " or ")] = "";
+    size_t count = default_paths(paths);
+    for (size_t k = 0; k < count; k++) {
+        bool is_nobody = false;
+        enum holod_feed_result result = connect_to(feed, paths[k], &is_nobody);
+        if (result == HOLOD_FEED_OK)
+            feed->error[0] = '\0';
+        if (!is_nobody)
+            return result;
+        size_t length = strlen(tried);
+        snprintf(tried + length, sizeof tried - length, "%s%s", k ? " or " : "", paths[k]);
+    }
+    return fail(feed, NOBODY_LISTENS, tried);
 }
 
 static enum holod_feed_result say_hello(struct holod_feed *feed,
@@ -522,7 +561,9 @@ enum holod_feed_result holod_feed_open(const char *path, const struct holod_feed
     opened->tells_view = format->tells_view != 0;
     opened->view.focus_dpt = -1;
 
-    enum holod_feed_result result = connect_to(opened, path);
+    bool is_nobody;
+    enum holod_feed_result result =
+        path ? connect_to(opened, path, &is_nobody) : connect_to_any(opened);
     if (result == HOLOD_FEED_OK)
         result = say_hello(opened, format);
     if (result == HOLOD_FEED_OK)

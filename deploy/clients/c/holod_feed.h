@@ -108,7 +108,7 @@ struct holod_feed;
 /*
  * Connects to holod. `path` is the socket. NULL is `feed` in holod's runtime folder
  * ($RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/holod, else /run/user/UID/holod, else /tmp/holod-UID),
- * or the service's /run/holod/feed where nothing is there. Waits for holod up to 5 s.
+ * or the service's /run/holod/feed where no holod listens there. Waits for holod up to 5 s.
  *
  * Also after a failure *feed can tell its error and must be closed.
  */

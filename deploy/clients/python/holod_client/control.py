@@ -11,7 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
 
-from holod_client.feed import default_path
+from holod_client import feed
+from holod_client.folders import own_folders
 
 LONGEST_ANSWER_BYTES = 1 << 20
 
@@ -215,8 +216,8 @@ def _listens(path: str) -> bool:
 
 
 def _only_socket() -> Path:
-    own, service = default_path().parent, Path("/run/holod")
-    for folder in (own, service):
+    folders, service = own_folders(), feed.SERVICE_PATH.parent
+    for folder in (*folders, service):
         if folder != service and folder.exists() and folder.stat().st_uid != os.geteuid():
             # In the folder for temporary files anybody could have made one of this user's name first.
             continue
@@ -225,4 +226,5 @@ def _only_socket() -> Path:
             raise ControlError(f"several holods run: {', '.join(found)}; give the path of one")
         if found:
             return Path(found[0])
-    raise ControlError(f"no holod runs that has a control socket in {own} or /run/holod: start it, or give the path")
+    places = " or ".join(map(str, (*folders, service)))
+    raise ControlError(f"no holod runs that has a control socket in {places}: start it, or give the path")

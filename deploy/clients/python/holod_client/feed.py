@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from holod_client import messages
+from holod_client.folders import own_folders
 from holod_client.formats import Colour, Depth
 
 ANSWER_TIMEOUT_S = 5.0
@@ -63,6 +64,8 @@ class Outcomes:
         )
 
 
+_NOBODY = (errno.ENOENT, errno.ENOTDIR, errno.ECONNREFUSED)
+"""Also where a holod that was killed has left its socket."""
 _OUTCOMES = ("taken", "overtaken", "refused", "not_shown")
 
 
@@ -87,7 +90,7 @@ class Feed:
 
     `colour` and `depth` are formats or their names. Without depth ("none") a picture is a plane at `plane_dpt`
     dioptres. `name` is for holod's log and status, which keep 32 bytes of it. `path` is the socket; without one it is
-    `default_path()`.
+    that of this user's holod, or of the service where no holod of this user listens.
 
     With `tells_view` pictures may say where the camera was focused and what its field of view was, which holod records
     and shows; a holod that knows version 1 of the feed alone refuses such a feed.
@@ -122,7 +125,6 @@ class Feed:
         self.height_px = height_px
         self.colour = Colour(colour)
         self.depth = Depth(depth)
-        self.path = default_path() if path is None else Path(path)
         self.timeout_s = timeout_s
         self.tells_view = tells_view
         self.outcomes = Outcomes()
@@ -137,7 +139,8 @@ class Feed:
         self._sequence = 0
         self._memory: mmap.mmap | None = None
         self._closed_because = "the feed is closed"
-        self._socket: socket.socket | None = self._connect()
+        self.path, connection = _connect(_default_paths() if path is None else [Path(path)])
+        self._socket: socket.socket | None = connection
         try:
             numbers = (self.colour.number, self.depth.number)
             self._say(messages.helo(width_px, height_px, *numbers, plane_dpt or 0.0, name, tells_view=tells_view))
@@ -290,16 +293,6 @@ class Feed:
 
         return Slot(plane(self.colour, self._ring.colour_offset), plane(self.depth, self._ring.depth_offset))
 
-    def _connect(self) -> socket.socket:
-        connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        connection.settimeout(ANSWER_TIMEOUT_S)
-        try:
-            connection.connect(str(self.path))
-        except OSError as error:
-            connection.close()
-            raise FeedError(_why_not_connected(self.path, error)) from error
-        return connection
-
     def _receive_ring(self) -> tuple[messages.Ring, mmap.mmap]:
         descriptors: list[int] = []
         try:
@@ -440,19 +433,32 @@ class Feed:
 
 
 def default_path() -> Path:
-    """Where holod listens by itself: `feed` in its runtime folder, or that of the service where nothing is there."""
-    runtime, xdg_runtime = os.environ.get("RUNTIME_DIRECTORY"), os.environ.get("XDG_RUNTIME_DIR")
-    user_runtime = Path(f"/run/user/{os.getuid()}")
-    if runtime:
-        folder = Path(runtime)
-    elif xdg_runtime:
-        folder = Path(xdg_runtime) / "holod"
-    elif user_runtime.exists():
-        folder = user_runtime / "holod"
-    else:
-        folder = Path(f"/tmp/holod-{os.getuid()}")
-    path = folder / "feed"
-    return SERVICE_PATH if SERVICE_PATH.exists() and not path.exists() else path
+    """Where a holod has its socket by itself, of this user's or else of the service, as far as files tell: nobody may
+    listen there. A `Feed` without a path tries all of them."""
+    paths = _default_paths()
+    return next((path for path in paths if os.path.exists(path)), paths[0])
+
+
+def _default_paths() -> list[Path]:
+    return [*(folder / "feed" for folder in own_folders()), SERVICE_PATH]
+
+
+def _connect(paths: list[Path]) -> tuple[Path, socket.socket]:
+    """The first of `paths` on which a holod listens. Raises FeedError."""
+    reason: OSError | None = None
+    for path in paths:
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        connection.settimeout(ANSWER_TIMEOUT_S)
+        try:
+            connection.connect(str(path))
+            return path, connection
+        except OSError as error:
+            connection.close()
+            # Without a number where a path is too long for a socket: nobody listens there either.
+            if len(paths) == 1 or error.errno not in (*_NOBODY, None):
+                raise FeedError(_why_not_connected(path, error)) from error
+            reason = error
+    raise FeedError(_nobody(" or ".join(map(str, paths)))) from reason
 
 
 def _whole(label: str, number: object, expected: str) -> int:
@@ -480,11 +486,13 @@ def _check(label: str, array: NDArray[Any], shapes: list[tuple[int, ...]], dtype
         raise ValueError(f"{label}: found shape {array.shape}, expected {' or '.join(map(str, shapes))}")
 
 
+def _nobody(paths: str) -> str:
+    return f"no holod listens on {paths}: start it with `holod run --scene feed`, or give the path that its log names"
+
+
 def _why_not_connected(path: Path, error: OSError) -> str:
-    if error.errno in (errno.ENOENT, errno.ENOTDIR, errno.ECONNREFUSED):
-        return (
-            f"no holod listens on {path}: start it with `holod run --scene feed`, or give the path that its log names"
-        )
+    if error.errno in _NOBODY:
+        return _nobody(str(path))
     if error.errno == errno.EACCES:
         return (
             f"this user may not open {path}: run as the user that holod runs as, or as one who may write to that socket"

@@ -74,6 +74,8 @@ int main(int argc, char **argv)
             puts("ok");
         } else if (strcmp(word, "wait") == 0) {
             print_result(feed, holod_feed_wait(feed, (int)number));
+        } else if (strcmp(word, "error") == 0) {
+            puts(holod_feed_error(feed));
         } else if (strcmp(word, "outcomes") == 0) {
             const struct holod_feed_outcomes *seen = holod_feed_outcomes(feed);
             printf("%" PRIu64 " %" PRIu64 " %" PRIu64 " %" PRIu64 " %" PRIu64 " %" PRIu64

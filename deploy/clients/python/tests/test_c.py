@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -29,7 +30,10 @@ def build(out: Path, source: Path, *options: str) -> Path:
 
 @pytest.fixture(scope="session")
 def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build(tmp_path_factory.mktemp("c") / "driver", HERE / "driver.c", *SANITIZERS)
+    """Beside it is the folder of its service."""
+    out = tmp_path_factory.mktemp("c") / "driver"
+    (out.parent / "service").mkdir()
+    return build(out, HERE / "driver.c", f'-DSERVICE_PATH="{out.parent}/service/feed"', *SANITIZERS)
 
 
 @pytest.fixture(scope="session", params=["plain", "sanitized"])
@@ -70,12 +74,18 @@ def drive(
     name: str = "C",
     *,
     tells_view: bool = False,
+    **environment: str,
 ) -> Iterator[Driver]:
     """Ends the driver as well, which must leave nothing behind and object to nothing."""
     arguments = [str(driver), str(path), f"{WIDTH}x{HEIGHT}", str(colour), str(depth), str(plane_dpt), name]
     arguments += ["tells_view"] if tells_view else []
     process = subprocess.Popen(
-        arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        arguments,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "RUNTIME_DIRECTORY": "", **environment},
     )
     try:
         yield Driver(process)
@@ -299,6 +309,41 @@ def test_nobody_listens(driver: Path, path: Path) -> None:
         assert feed.opened.startswith(f"failed: no holod listens on {path}: start it with `holod run --scene feed`")
     with drive(driver, path / ("x" * 100)) as feed:
         assert "a socket's at most 107" in feed.opened
+
+
+def leave_behind(path: Path) -> Path:
+    """What a holod that was killed leaves: a socket on which nobody listens."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left_behind:
+        left_behind.bind(str(path))
+    return path
+
+
+@pytest.mark.parametrize("is_left_behind", [True, False])
+def test_the_service_is_found_behind_a_socket_that_was_left(driver: Path, tmp_path: Path, is_left_behind: bool) -> None:
+    service, own = driver.parent / "service" / "feed", tmp_path / "holod" / "feed"
+    if is_left_behind:
+        leave_behind(own)
+    with FakeHolod(service) as holod, drive(driver, "", XDG_RUNTIME_DIR=str(tmp_path)) as feed:
+        assert (feed.opened, feed.ask("error")) == ("ok", "")
+        feed.picture(3)
+        filled(holod.frame())(3)
+    with drive(driver, "", XDG_RUNTIME_DIR=str(tmp_path)) as feed:
+        assert feed.opened.startswith(f"failed: no holod listens on {own} or ")
+        assert f"{service}: start it with" in feed.opened
+    # A path that was named is the one that is meant.
+    named = leave_behind(tmp_path / "named")
+    with FakeHolod(service), drive(driver, service), drive(driver, named) as feed:
+        assert feed.opened.startswith(f"failed: no holod listens on {named}: start it with")
+
+
+def test_a_holod_of_ones_own_goes_before_the_service(driver: Path, tmp_path: Path) -> None:
+    service, own = driver.parent / "service" / "feed", tmp_path / "holod" / "feed"
+    own.parent.mkdir()
+    with FakeHolod(service), drive(driver, service), FakeHolod(own) as holod:
+        with drive(driver, "", name="mine", XDG_RUNTIME_DIR=str(tmp_path)) as feed:
+            assert feed.opened == "ok"
+        assert holod.hello().name == "mine"
 
 
 def test_holod_says_nothing(driver: Path, path: Path) -> None:

@@ -171,6 +171,23 @@ def test_orders_wait_as_long_as_those_of_the_command() -> None:
     assert Control.__init__.__defaults__ == (None, 120.0)
 
 
+def test_a_holod_without_a_feed_is_found_beside_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("holod_client.feed.SERVICE_PATH", tmp_path / "service" / "feed")
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    for folder in ("service", "holod"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "service" / "feed").touch()
+    service = FakeControl(tmp_path / "service" / "control-2")
+    with Control() as control:
+        assert control.path == service.path
+    own = FakeControl(tmp_path / "holod" / "control-1")
+    with Control() as control:
+        assert control.path == own.path
+    own.close()
+    service.close()
+
+
 def test_nobody_listens(tmp_path: Path) -> None:
     with pytest.raises(ControlError, match="is it running"):
         Control(tmp_path / "control-1")

@@ -276,10 +276,56 @@ def test_nobody_listens(path: Path) -> None:
     advice = "start it with `holod run --scene feed`"
     with pytest.raises(FeedError, match=f"no holod listens on {path}: {advice}"):
         open_feed(path)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left_behind:
-        left_behind.bind(str(path))
+    leave_behind(path)
     with pytest.raises(FeedError, match=advice):
         open_feed(path)
+
+
+def leave_behind(path: Path) -> Path:
+    """What a holod that was killed leaves: a socket on which nobody listens."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left_behind:
+        left_behind.bind(str(path))
+    return path
+
+
+@pytest.mark.parametrize("is_left_behind", [True, False])
+def test_the_service_is_found_behind_a_socket_that_was_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_left_behind: bool
+) -> None:
+    service = tmp_path / "service" / "feed"
+    service.parent.mkdir()
+    monkeypatch.setattr("holod_client.feed.SERVICE_PATH", service)
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    own = tmp_path / "holod" / "feed"
+    if is_left_behind:
+        leave_behind(own)
+    with FakeHolod(service) as holod, Feed(WIDTH, HEIGHT, depth="u16_mm") as feed:
+        assert feed.path == service
+        feed.send(*picture(0))
+        holod.free(holod.frame())
+    with pytest.raises(FeedError, match=f"no holod listens on {own} or .*{service}: start it with"):
+        Feed(WIDTH, HEIGHT, depth="u16_mm")
+    # A path that was named is the one that is meant.
+    named = leave_behind(tmp_path / "named")
+    with FakeHolod(service) as holod:
+        with pytest.raises(FeedError, match=f"no holod listens on {named}: start it with"):
+            open_feed(named)
+        Feed(WIDTH, HEIGHT, depth="u16_mm").close()
+
+
+def test_a_holod_of_ones_own_goes_before_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("holod_client.feed.SERVICE_PATH", tmp_path / "service")
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "holod").mkdir()
+    own = tmp_path / "holod" / "feed"
+    with FakeHolod(tmp_path / "service"), FakeHolod(own):
+        feed = Feed(WIDTH, HEIGHT, depth="u16_mm")
+        assert feed.path == own
+        feed.close()
+        open_feed(tmp_path / "service").close()
 
 
 def test_another_program_listens(path: Path) -> None:

@@ -1,0 +1,1 @@
+../../../deploy/clients/python/holod_client/folders.py
