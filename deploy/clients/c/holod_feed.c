@@ -310,12 +310,7 @@ static enum holod_feed_result receive_what_is_there(struct holod_feed *feed)
 
 /* Opening */
 
-static bool is_set(const char *value)
-{
-    return value && *value;
-}
-
-#define MOST_PATHS 2
+#define MOST_PATHS 4
 #define NOBODY_LISTENS                                                                            \
     "no holod listens on %s: start it with `holod run --scene feed`, or give the path that its "  \
     "log names"
@@ -332,24 +327,57 @@ __attribute__((format(printf, 3, 4))) static void add_path(socket_path paths[MOS
         ++*count;
 }
 
-/* Where a holod may listen by itself: this user's, then the service. Returns how many they are. */
+static const char *absolute(const char *variable)
+{
+    const char *value = getenv(variable);
+    return value && *value == '/' ? value : NULL;
+}
+
+static bool is_folder(const char *path)
+{
+    struct stat found;
+    return stat(path, &found) == 0 && S_ISDIR(found.st_mode);
+}
+
+/* The folder in which this user's holod has its sockets where it has no other; false where its name
+ * is too long. Anybody could have made it first: it must be used only where it is_own. */
+static bool temporary_folder(socket_path folder)
+{
+    const char *temporary = getenv("TMPDIR");
+    if (!temporary)
+        temporary = "/tmp";
+    int length = snprintf(folder, sizeof(socket_path), "%s%sholod-%lu", temporary,
+                          *temporary ? "/" : "", (unsigned long)getuid());
+    return length >= 0 && (size_t)length < sizeof(socket_path);
+}
+
+/* Whether the folder is there, no link, and this user's. */
+static bool is_own(const char *folder, bool *is_there)
+{
+    struct stat found;
+    *is_there = lstat(folder, &found) == 0;
+    return *is_there && S_ISDIR(found.st_mode) && found.st_uid == geteuid();
+}
+
+/* Where a holod may listen by itself, as daemon/src/runtime_folder.rs says, and then the service.
+ * Returns how many they are. */
 static size_t default_paths(socket_path paths[MOST_PATHS])
 {
-    const char *runtime = getenv("RUNTIME_DIRECTORY");
-    const char *xdg_runtime = getenv("XDG_RUNTIME_DIR");
-    unsigned long uid = getuid();
-    char user_runtime[64];
-    snprintf(user_runtime, sizeof user_runtime, "/run/user/%lu", uid);
+    const char *runtime = absolute("RUNTIME_DIRECTORY");
+    const char *xdg_runtime = absolute("XDG_RUNTIME_DIR");
+    char login[64];
+    snprintf(login, sizeof login, "/run/user/%lu", (unsigned long)getuid());
+    if (!xdg_runtime && is_folder(login))
+        xdg_runtime = login;
 
     size_t count = 0;
-    if (is_set(runtime))
+    socket_path folder;
+    if (runtime)
         add_path(paths, &count, "%s/feed", runtime);
-    else if (is_set(xdg_runtime))
+    if (xdg_runtime)
         add_path(paths, &count, "%s/holod/feed", xdg_runtime);
-    else if (access(user_runtime, F_OK) == 0)
-        add_path(paths, &count, "%s/holod/feed", user_runtime);
-    else
-        add_path(paths, &count, "/tmp/holod-%lu/feed", uid);
+    if (temporary_folder(folder))
+        add_path(paths, &count, "%s/feed", folder);
     add_path(paths, &count, "%s", SERVICE_PATH);
     return count;
 }
@@ -407,19 +435,30 @@ static enum holod_feed_result connect_to(struct holod_feed *feed, const char *pa
 /* The first of the paths of its own on which a holod listens. */
 static enum holod_feed_result connect_to_any(struct holod_feed *feed)
 {
-    socket_path paths[MOST_PATHS];
+    socket_path paths[MOST_PATHS], folder;
     char tried[MOST_PATHS * (sizeof paths[0] + sizeof " or ")] = "";
+    bool has_folder = temporary_folder(folder), is_there = false, is_anothers = false;
     size_t count = default_paths(paths);
     for (size_t k = 0; k < count; k++) {
-        bool is_nobody = false;
-        enum holod_feed_result result = connect_to(feed, paths[k], &is_nobody);
-        if (result == HOLOD_FEED_OK)
-            feed->error[0] = '\0';
-        if (!is_nobody)
-            return result;
+        bool is_in_it = has_folder && strncmp(paths[k], folder, strlen(folder)) == 0 &&
+                        strcmp(paths[k] + strlen(folder), "/feed") == 0;
+        if (is_in_it && !is_own(folder, &is_there)) {
+            is_anothers = is_there;
+        } else {
+            bool is_nobody = false;
+            enum holod_feed_result result = connect_to(feed, paths[k], &is_nobody);
+            if (result == HOLOD_FEED_OK)
+                feed->error[0] = '\0';
+            if (!is_nobody)
+                return result;
+        }
         size_t length = strlen(tried);
         snprintf(tried + length, sizeof tried - length, "%s%s", k ? " or " : "", paths[k]);
     }
+    if (is_anothers)
+        return fail(feed,
+                    NOBODY_LISTENS "; nothing in %s is used, which is no folder of this user's",
+                    tried, folder);
     return fail(feed, NOBODY_LISTENS, tried);
 }
 

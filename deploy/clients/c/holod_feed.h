@@ -106,9 +106,10 @@ struct holod_feed_outcomes {
 struct holod_feed;
 
 /*
- * Connects to holod. `path` is the socket. NULL is `feed` in holod's runtime folder
- * ($RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/holod, else /run/user/UID/holod, else /tmp/holod-UID),
- * or the service's /run/holod/feed where no holod listens there. Waits for holod up to 5 s.
+ * Connects to holod. `path` is the socket. NULL is the first `feed` on which a holod listens, in
+ * $RUNTIME_DIRECTORY, $XDG_RUNTIME_DIR/holod (/run/user/UID/holod without that variable),
+ * $TMPDIR/holod-UID (/tmp/holod-UID), where this user owns that folder, and the service's
+ * /run/holod. Waits for holod up to 5 s.
  *
  * Also after a failure *feed can tell its error and must be closed.
  */

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any, BinaryIO, Self
 
 from holod_client import feed
-from holod_client.folders import own_folders
+from holod_client.folders import is_own, own_folders, warning_of
 
 LONGEST_ANSWER_BYTES = 1 << 20
 
@@ -218,7 +218,7 @@ def _listens(path: str) -> bool:
 def _only_socket() -> Path:
     folders, service = own_folders(), feed.SERVICE_PATH.parent
     for folder in (*folders, service):
-        if folder != service and folder.exists() and folder.stat().st_uid != os.geteuid():
+        if folder != service and not is_own(folder):
             # In the folder for temporary files anybody could have made one of this user's name first.
             continue
         found = [path for path in sorted(glob.glob(glob.escape(str(folder)) + "/control-*")) if _listens(path)]
@@ -227,4 +227,5 @@ def _only_socket() -> Path:
         if found:
             return Path(found[0])
     places = " or ".join(map(str, (*folders, service)))
-    raise ControlError(f"no holod runs that has a control socket in {places}: start it, or give the path")
+    warnings = "".join(warning_of(folder) for folder in folders if folder != service)
+    raise ControlError(f"no holod runs that has a control socket in {places}: start it, or give the path{warnings}")

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from holod_client import messages
-from holod_client.folders import own_folders
+from holod_client.folders import is_own, own_folders, temporary_folder, warning_of
 from holod_client.formats import Colour, Depth
 
 ANSWER_TIMEOUT_S = 5.0
@@ -139,7 +139,7 @@ class Feed:
         self._sequence = 0
         self._memory: mmap.mmap | None = None
         self._closed_because = "the feed is closed"
-        self.path, connection = _connect(_default_paths() if path is None else [Path(path)])
+        self.path, connection = _connect(None if path is None else Path(path))
         self._socket: socket.socket | None = connection
         try:
             numbers = (self.colour.number, self.depth.number)
@@ -436,17 +436,24 @@ def default_path() -> Path:
     """Where a holod has its socket by itself, of this user's or else of the service, as far as files tell: nobody may
     listen there. A `Feed` without a path tries all of them."""
     paths = _default_paths()
-    return next((path for path in paths if os.path.exists(path)), paths[0])
+    return next((path for path in paths if _may_be_used(path) and os.path.exists(path)), paths[0])
 
 
 def _default_paths() -> list[Path]:
-    return [*(folder / "feed" for folder in own_folders()), SERVICE_PATH]
+    return list(dict.fromkeys([*(folder / "feed" for folder in own_folders()), SERVICE_PATH]))
 
 
-def _connect(paths: list[Path]) -> tuple[Path, socket.socket]:
-    """The first of `paths` on which a holod listens. Raises FeedError."""
+def _may_be_used(path: Path) -> bool:
+    return path.parent != temporary_folder() or is_own(path.parent)
+
+
+def _connect(named: Path | None) -> tuple[Path, socket.socket]:
+    """To the path that is named, or else to the first one of its own on which a holod listens. Raises FeedError."""
+    paths = _default_paths() if named is None else [named]
     reason: OSError | None = None
     for path in paths:
+        if named is None and not _may_be_used(path):
+            continue
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         connection.settimeout(ANSWER_TIMEOUT_S)
         try:
@@ -455,10 +462,10 @@ def _connect(paths: list[Path]) -> tuple[Path, socket.socket]:
         except OSError as error:
             connection.close()
             # Without a number where a path is too long for a socket: nobody listens there either.
-            if len(paths) == 1 or error.errno not in (*_NOBODY, None):
+            if named is not None or error.errno not in (*_NOBODY, None):
                 raise FeedError(_why_not_connected(path, error)) from error
             reason = error
-    raise FeedError(_nobody(" or ".join(map(str, paths)))) from reason
+    raise FeedError(_nobody(" or ".join(map(str, paths))) + warning_of(temporary_folder())) from reason
 
 
 def _whole(label: str, number: object, expected: str) -> int:

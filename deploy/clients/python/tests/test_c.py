@@ -346,6 +346,44 @@ def test_a_holod_of_ones_own_goes_before_the_service(driver: Path, tmp_path: Pat
         assert holod.hello().name == "mine"
 
 
+@pytest.mark.parametrize("named", ["/dev/null", "relative", ""])
+def test_holod_is_found_in_the_folder_for_temporary_files(driver: Path, tmp_path: Path, named: str) -> None:
+    """Where it has no folder of its own elsewhere, or may not write there."""
+    environment = {"RUNTIME_DIRECTORY": named, "XDG_RUNTIME_DIR": named, "TMPDIR": str(tmp_path)}
+    folder = tmp_path / f"holod-{os.getuid()}"
+    folder.mkdir()
+    with FakeHolod(folder / "feed"), drive(driver, "", **environment) as feed:
+        assert feed.opened == "ok"
+    with drive(driver, "", **environment) as feed:
+        assert f"{folder}/feed or {driver.parent}/service/feed: start it with" in feed.opened
+        assert "is used" not in feed.opened
+
+
+@pytest.mark.parametrize("is_link", [True, False])
+def test_a_folder_of_somebody_elses_is_not_used(driver: Path, tmp_path: Path, is_link: bool) -> None:
+    environment = {"XDG_RUNTIME_DIR": "/dev/null", "TMPDIR": str(tmp_path)}
+    folder = tmp_path / f"holod-{os.getuid()}"
+    if is_link:
+        (tmp_path / "elsewhere").mkdir()
+        folder.symlink_to(tmp_path / "elsewhere")
+    else:
+        if os.geteuid() != 0:
+            pytest.skip("only root can give a folder away")
+        folder.mkdir()
+        os.chown(folder, 65534, 65534)
+    trap = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    trap.bind(str(folder / "feed"))
+    trap.listen()
+    with trap, FakeHolod(driver.parent / "service" / "feed"), drive(driver, "", **environment) as feed:
+        assert feed.opened == "ok"
+        trap.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            trap.accept()
+    with drive(driver, "", **environment) as feed:
+        assert feed.opened.startswith("failed: no holod listens on /dev/null/holod/feed or ")
+        assert feed.opened.endswith(f"; nothing in {folder} is used, which is no folder of this user's")
+
+
 def test_holod_says_nothing(driver: Path, path: Path) -> None:
     with FakeHolod(path, silent=True), drive(driver, path) as feed:
         assert feed.opened == f"failed: holod said nothing on {path} for 5 s: see its log, start it again"

@@ -188,6 +188,22 @@ def test_a_holod_without_a_feed_is_found_beside_the_service(tmp_path: Path, monk
     service.close()
 
 
+def test_a_folder_of_somebody_elses_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("holod_client.feed.SERVICE_PATH", tmp_path / "service" / "feed")
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/dev/null")
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    folder = tmp_path / f"holod-{os.getuid()}"
+    folder.mkdir()
+    own = FakeControl(folder / "control-1")
+    Control().close()
+    folder.rename(tmp_path / "elsewhere")
+    folder.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ControlError, match=f"no holod runs .*; nothing in {folder} is used, which is no folder of"):
+        Control()
+    own.close()
+
+
 def test_nobody_listens(tmp_path: Path) -> None:
     with pytest.raises(ControlError, match="is it running"):
         Control(tmp_path / "control-1")

@@ -19,6 +19,7 @@ from fake_holod import NOT_SHOWN, OVERTAKEN, REFUSED, TAKEN, FakeHolod, Hello, L
 
 import holod_client
 from holod_client import Colour, Depth, Feed, FeedError, FeedTimeoutError, Outcomes
+from holod_client.folders import own_folders
 
 WIDTH, HEIGHT = 21, 10
 NUMBERS = {"rgba8": 1, "rgba16f": 2, "rgb32f": 3}
@@ -502,10 +503,60 @@ def test_where_holod_listens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     (tmp_path / "xdg" / "holod" / "feed").touch()
     assert holod_client.default_path() == tmp_path / "xdg" / "holod" / "feed"
     (tmp_path / "service" / "feed").unlink()
-    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
     uid = os.getuid()
-    folder = f"/run/user/{uid}/holod" if os.path.exists(f"/run/user/{uid}") else f"/tmp/holod-{uid}"
-    assert holod_client.default_path() == Path(folder) / "feed"
+    for none in ["", "relative"]:
+        monkeypatch.setenv("RUNTIME_DIRECTORY", none)
+        monkeypatch.setenv("XDG_RUNTIME_DIR", none)
+        for temporary in ["/tmp", str(tmp_path)]:
+            monkeypatch.setenv("TMPDIR", temporary)
+            folder = f"/run/user/{uid}/holod" if os.path.isdir(f"/run/user/{uid}") else f"{temporary}/holod-{uid}"
+            assert holod_client.default_path() == Path(folder) / "feed"
+    monkeypatch.delenv("TMPDIR")
+    assert own_folders()[-1] == Path(f"/tmp/holod-{uid}")
+
+
+def test_holod_is_found_in_the_folder_for_temporary_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it has no folder of its own elsewhere, or may not write there."""
+    monkeypatch.setattr("holod_client.feed.SERVICE_PATH", tmp_path / "service" / "feed")
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/dev/null")
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    folder = tmp_path / f"holod-{os.getuid()}"
+    folder.mkdir()
+    with FakeHolod(folder / "feed"):
+        assert holod_client.default_path() == folder / "feed"
+        Feed(WIDTH, HEIGHT, depth="u16_mm").close()
+
+
+@pytest.mark.parametrize("is_link", [True, False])
+def test_a_folder_of_somebody_elses_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_link: bool) -> None:
+    service = tmp_path / "service" / "feed"
+    service.parent.mkdir()
+    monkeypatch.setattr("holod_client.feed.SERVICE_PATH", service)
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/dev/null")
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    folder = tmp_path / f"holod-{os.getuid()}"
+    if is_link:
+        (tmp_path / "elsewhere").mkdir()
+        folder.symlink_to(tmp_path / "elsewhere")
+    else:
+        folder.mkdir()
+        monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    trap = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    trap.bind(str(folder / "feed"))
+    trap.listen()
+    with trap, FakeHolod(service) as holod:
+        assert holod_client.default_path() == service
+        feed = Feed(WIDTH, HEIGHT, depth="u16_mm")
+        assert feed.path == service
+        holod.hello()
+        feed.close()
+        trap.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            trap.accept()
+    with pytest.raises(FeedError, match=f"no holod listens on .*; nothing in {folder} is used, which is no folder of"):
+        Feed(WIDTH, HEIGHT, depth="u16_mm")
 
 
 @pytest.mark.parametrize(

@@ -23,21 +23,23 @@ SIZE = 64
 
 
 class Holod:
-    """A holod that listens on `socket` until `end()`, which returns its summary."""
+    """A holod that listens on `socket` until `end()`, which returns its summary.
 
-    def __init__(self, binary: str, folder: Path) -> None:
-        self.socket = folder / "pictures"
+    Its runtime folder is in `folder`, or without that where the environment says, and then so is the socket."""
+
+    def __init__(self, binary: str, folder: Path | None, sockets: Path) -> None:
+        self.socket = sockets / "feed" if folder is None else folder / "pictures"
         options = ["--resolution", f"{SIZE}x{SIZE}", "--fit", "contain", "--weights", "fast", "--backend", "cpu"]
         self.process = subprocess.Popen(
-            [binary, "run", "--scene", f"feed:{self.socket}", *options, "--json"],
-            env={**os.environ, "XDG_RUNTIME_DIR": str(folder)},
+            [binary, "run", "--scene", "feed" if folder is None else f"feed:{self.socket}", *options, "--json"],
+            env={**os.environ, **({} if folder is None else {"XDG_RUNTIME_DIR": str(folder)})},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
         patience_s = time.monotonic() + 60
         # The control socket comes last.
-        while not self.socket.exists() or not list(folder.glob("holod/control-*")):
+        while not self.socket.exists() or not list(sockets.glob("control-*")):
             assert self.process.poll() is None, self.process.communicate()[1]
             assert time.monotonic() < patience_s, "holod does not listen"
             time.sleep(0.02)
@@ -61,12 +63,17 @@ class Holod:
 
 
 @pytest.fixture
-def holod(tmp_path: Path) -> Iterator[Holod]:
-    binary = os.environ.get("HOLOD")
-    if binary is None:
+def binary() -> str:
+    named = os.environ.get("HOLOD")
+    if named is None:
         assert "CI" not in os.environ, "HOLOD must name the daemon: its clients are tested against it"
         pytest.skip("HOLOD does not name the daemon, such as target/release/holod")
-    running = Holod(binary, tmp_path)
+    return named
+
+
+@pytest.fixture
+def holod(binary: str, tmp_path: Path) -> Iterator[Holod]:
+    running = Holod(binary, tmp_path, tmp_path / "holod")
     yield running
     running.process.kill()
     running.process.wait()
@@ -101,6 +108,30 @@ def test_every_format_is_taken(holod: Holod, colour: str, depth: str) -> None:
             slot.depth[...] = 1000 if depth == "u16_mm" else 1
         feed.wait()
         assert feed.outcomes.taken == 1, feed.refusal
+
+
+def test_a_holod_without_a_runtime_folder_is_found(
+    binary: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its sockets are where $TMPDIR says then, and all clients look there."""
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/dev/null")
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    c = HERE.parents[1] / "c"
+    example = tmp_path / "example"
+    subprocess.run(["cc", "-O2", "-o", example, c / "example.c", c / "holod_feed.c"], check=True, timeout=120)
+    folder = tmp_path / f"holod-{os.getuid()}"
+    running = Holod(binary, None, folder)
+    try:
+        with Feed(SIZE, SIZE, depth="u16_mm") as feed:
+            assert feed.path == folder / "feed"
+        with Control() as control:
+            assert control.path.parent == folder
+        done = subprocess.run([example, "-", "320x240", "0.2"], capture_output=True, text=True, timeout=60)
+        assert done.returncode == 0, done.stderr
+    finally:
+        running.process.kill()
+        running.process.wait()
 
 
 def test_the_c_example_and_a_pipe_are_shown(holod: Holod, tmp_path: Path) -> None:
