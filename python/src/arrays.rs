@@ -20,7 +20,25 @@ impl<'a, 'py> Given<'a, 'py> {
             let found = given.get_type().name().map_or_else(|_| "something else".to_owned(), |name| name.to_string());
             InputError::new_err(format!("{name}: found {found}, expected a numpy array"))
         })?;
-        Ok(Self { name, array })
+        let given = Self { name, array };
+        given.without_a_mask()?;
+        Ok(given)
+    }
+
+    /// Refuses numpy's masked arrays, of which the values alone would be read, those under the mask, too, or written.
+    fn without_a_mask(&self) -> PyResult<()> {
+        if !self.array.is_instance(&self.array.py().import("numpy.ma")?.getattr("MaskedArray")?)? {
+            return Ok(());
+        }
+        let advice = match self.name {
+            "depth" if self.array.dtype().kind() == b'f' => {
+                ", such as its filled(numpy.nan), for which there is fill_missing=True"
+            }
+            "depth" => ", such as its filled(0), for which there is fill_missing=True",
+            name if name.starts_with("out_") => "",
+            _ => ", such as its filled(0)",
+        };
+        Err(self.refusal("a masked array".into(), &format!("one without a mask{advice}")))
     }
 
     /// Refuses another shape; `names` are those of its axes, `advice` is what is most likely to help.

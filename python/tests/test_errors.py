@@ -32,6 +32,10 @@ def wrong(said: str, rgb: Any = RGB8, depth: Any = METRES, pupil_mm: Any = 3.0, 
     return pytest.param(rgb, depth, pupil_mm, {"depth_unit": "metres"} | options, said, id=said[:60])
 
 
+def masked(array: np.ndarray) -> np.ndarray:
+    return np.ma.masked_array(array, np.zeros(array.shape, bool))
+
+
 @pytest.mark.parametrize(
     ("rgb", "depth", "pupil_mm", "options", "said"),
     [
@@ -52,6 +56,22 @@ def wrong(said: str, rgb: Any = RGB8, depth: Any = METRES, pupil_mm: Any = 3.0, 
             colour="linear",
         ),
         wrong("the first 255 (red in row 0, column 0)", rgb=LINEAR * 510, colour="srgb"),
+        wrong("rgb: found a masked array, expected one without a mask, such as its filled(0)", rgb=masked(RGB8)),
+        wrong(
+            "depth: found a masked array, expected one without a mask, such as its filled(numpy.nan), for which there "
+            "is fill_missing=True",
+            depth=masked(METRES),
+        ),
+        wrong(
+            "depth: found a masked array, expected one without a mask, such as its filled(0), for which there is "
+            "fill_missing=True",
+            depth=masked((METRES * 1000).astype(np.uint16)),
+            depth_unit="millimetres",
+        ),
+        wrong(
+            "out_levels: found a masked array, expected one without a mask",
+            out_levels=masked(np.zeros((3, 1080, 1920), np.uint8)),
+        ),
         wrong("depth: found an array of shape (96, 64), expected (64, 96)", depth=METRES.T),
         wrong("depth: found an array of float64, expected float32", depth=METRES.astype(np.float64)),
         wrong("depth: found an array of uint16, expected float32, or uint16 with", depth=METRES.astype(np.uint16)),
@@ -182,6 +202,7 @@ def test_views_of_what_is_no_phase_are_refused() -> None:
     for said, phase_rad, options in [
         ("phase_rad: found an array of shape [8, 8]", flat[0], {}),
         ("phase_rad: found an array of float64, expected float32", flat.astype(float), {}),
+        ("phase_rad: found a masked array, expected one without a mask", masked(flat), {}),
         ("phase_rad: found NaN (blue, row 1, column 2)", changed(flat, (2, 1, 2), np.nan), {}),
         ("phase_rad: found 1000", changed(flat, (0, 0, 0), 1000), {}),
         ("pupil_mm: found 40", flat, {"pupil_mm": 40.0}),

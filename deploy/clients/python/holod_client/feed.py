@@ -71,7 +71,9 @@ _OUTCOMES = ("taken", "overtaken", "refused", "not_shown")
 
 @dataclass
 class Slot:
-    """Shared memory for one picture. What it holds at first is an old one, or 0."""
+    """Shared memory for one picture. What it holds at first is an old one, or 0.
+
+    A masked array that is assigned to it loses its mask, without a word of numpy: assign what its filled() gives."""
 
     colour: NDArray[Any]
     """of the shape and type of the feed's `Colour`"""
@@ -163,9 +165,9 @@ class Feed:
         """Copies one picture into shared memory and hands it over.
 
         `colour` and `depth` have the shape and type of the feed's formats; (height, width, 3) does for the formats
-        with A. Nothing is converted. `t_capture_ns` is when the picture was taken, as time.monotonic_ns() tells it; 0
-        where that is not known. `focus_dpt` and `field_of_view_deg` are those of a `Slot`: for a feed that
-        `tells_view`.
+        with A. Nothing is converted, and arrays with a mask are refused. `t_capture_ns` is when the picture was taken,
+        as time.monotonic_ns() tells it; 0 where that is not known. `focus_dpt` and `field_of_view_deg` are those of a
+        `Slot`: for a feed that `tells_view`.
 
         Raises ValueError for a wrong shape, time or view, TypeError for a wrong type, FeedTimeoutError, FeedError.
         """
@@ -253,7 +255,7 @@ class Feed:
         shapes = [self.colour.shape(self.width_px, self.height_px)]
         if self.colour is not Colour.RGB32F:
             shapes.append((self.height_px, self.width_px, 3))
-        _check("colour", colour, shapes, self.colour.dtype)
+        _check("colour", colour, shapes, self.colour.dtype, "filled(0), which is black")
 
     def _check_depth(self, depth: NDArray[Any] | None) -> None:
         if self.depth is Depth.NONE:
@@ -262,7 +264,9 @@ class Feed:
         elif depth is None:
             raise ValueError(f"depth: found none, expected {self.depth.dtype}: the feed was opened with depth")
         else:
-            _check("depth", depth, [self.depth.shape(self.width_px, self.height_px)], self.depth.dtype)
+            filled = "filled(0)" if self.depth is Depth.U16_MM else "filled(np.nan)"
+            shape = self.depth.shape(self.width_px, self.height_px)
+            _check("depth", depth, [shape], self.depth.dtype, f"{filled}, which is no depth")
 
     def _check_view(self, slot: Slot) -> None:
         focus_dpt, field_deg = slot.focus_dpt, slot.field_of_view_deg
@@ -484,9 +488,12 @@ def _time(t_capture_ns: object) -> int:
     return time_ns
 
 
-def _check(label: str, array: NDArray[Any], shapes: list[tuple[int, ...]], dtype: np.dtype) -> None:
+def _check(label: str, array: NDArray[Any], shapes: list[tuple[int, ...]], dtype: np.dtype, filled: str) -> None:
+    """`filled` is what a masked array may be made of: numpy copies what lies under the mask without a word."""
     if not isinstance(array, np.ndarray):
         raise TypeError(f"{label}: found {type(array).__name__}, expected a numpy array")
+    if isinstance(array, np.ma.MaskedArray):
+        raise TypeError(f"{label}: found a masked array, expected one without a mask, such as its {filled}")
     if array.dtype != dtype:
         raise TypeError(f"{label}: found {array.dtype}, expected {dtype}; nothing is converted silently")
     if array.shape not in shapes:

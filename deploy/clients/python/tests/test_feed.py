@@ -400,6 +400,34 @@ def test_nothing_is_converted(
         assert feed.outcomes.sent == 0
 
 
+@pytest.mark.parametrize(
+    ("depth", "advice"),
+    [
+        ("u16_mm", "filled(0)"),
+        ("f16_m", "filled(np.nan)"),
+        ("f32_m", "filled(np.nan)"),
+        ("f16_dpt", "filled(np.nan)"),
+        ("f32_dpt", "filled(np.nan)"),
+    ],
+)
+def test_a_mask_is_not_lost(path: Path, depth: str, advice: str) -> None:
+    light, far = picture(0, depth=depth)
+    mask = np.zeros((HEIGHT, WIDTH), bool)
+    mask[2, 3] = True
+    masked = np.ma.masked_array(far, mask)
+    with FakeHolod(path, slots=1) as holod, open_feed(path, depth=depth, timeout_s=0.5) as feed:
+        said = f"depth: found a masked array, expected one without a mask, such as its {advice}, which is no depth"
+        with pytest.raises(TypeError, match=re.escape(said)):
+            feed.send(light, masked)
+        said = "colour: found a masked array, expected one without a mask, such as its filled(0), which is black"
+        with pytest.raises(TypeError, match=re.escape(said)):
+            feed.send(np.ma.masked_array(light), far)
+        feed.send(light, masked.filled(0 if depth == "u16_mm" else np.nan))
+        frame = holod.frame()
+        assert not np.frombuffer(frame.depth, far.dtype).reshape(far.shape)[2, 3] > 0
+        holod.free(frame)
+
+
 def test_planes_of_floats_have_their_channels_first(path: Path) -> None:
     with FakeHolod(path), open_feed(path, colour="rgb32f") as feed, pytest.raises(ValueError, match=r"expected \(3,"):
         feed.send(np.zeros((HEIGHT, WIDTH, 3), np.float32), np.zeros((HEIGHT, WIDTH), np.uint16))
