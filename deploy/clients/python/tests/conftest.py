@@ -9,3 +9,9 @@ import pytest
 def path(tmp_path: Path) -> Path:
     """A socket for the test to listen on."""
     return tmp_path / "feed"
+
+
+@pytest.fixture(autouse=True)
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test finds a holod that runs on this machine, in the folder for temporary files."""
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
