@@ -40,7 +40,10 @@ struct LookedAt {
 pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
     if let Some(found) = args.out.extension().filter(|extension| !extension.eq_ignore_ascii_case("png")) {
         let found = found.display();
-        return Err(Failure::new(Exit::Usage, format!("--out: found a file of kind .{found}; expected FILE.png, or -")));
+        return Err(Failure::new(
+            Exit::Usage,
+            format!("--out: found a file of kind .{found}; expected FILE.png, or -"),
+        ));
     }
     let out = Destination::new(&args.out, "--out", args.force)?;
     if out.is_stdout() && args.json {

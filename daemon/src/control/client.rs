@@ -27,16 +27,50 @@ pub fn ask(socket: &Path, request: &Request) -> Result<Value, Failure> {
             ),
         )
     };
+    let unanswered = |error: std::io::Error| {
+        Failure::new(
+            Exit::Unavailable,
+            format!(
+                "{}: holod has the order and does not answer: {error}; whether it took effect, or still will, is not \
+                 known: ask `holod status`; `holod dark --config RIG` puts the lasers out beside it",
+                socket.display()
+            ),
+        )
+    };
     let mut stream = UnixStream::connect(socket).map_err(gone)?;
     stream.set_read_timeout(Some(PATIENCE)).map_err(gone)?;
     let mut line = serde_json::to_vec(request).map_err(Failure::because(Exit::Software))?;
     line.push(b'\n');
     stream.write_all(&line).map_err(gone)?;
     let mut answer = String::new();
-    BufReader::new(stream).read_line(&mut answer).map_err(gone)?;
+    BufReader::new(stream).read_line(&mut answer).map_err(unanswered)?;
     match serde_json::from_str(&answer) {
         Ok(Answer::Ok(value)) => Ok(value),
         Ok(Answer::Error(why)) => Err(Failure::new(Exit::Unavailable, why)),
-        Err(_) => Err(gone(std::io::ErrorKind::UnexpectedEof.into())),
+        Err(_) => Err(unanswered(std::io::ErrorKind::UnexpectedEof.into())),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::net::UnixListener;
+
+    use super::*;
+
+    #[test]
+    fn an_order_that_nobody_has_heard_is_told_from_one_without_an_answer() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("control");
+        let listener = UnixListener::bind(&path).unwrap();
+        let holod = std::thread::spawn(move || {
+            let (stream, _) = listener.accept().unwrap();
+            let mut order = String::new();
+            BufReader::new(stream).read_line(&mut order).unwrap();
+            order
+        });
+        let unanswered = ask(&path, &Request::Pause {}).unwrap_err().to_string();
+        assert!(holod.join().unwrap().contains("pause") && unanswered.contains("is not known"), "{unanswered}");
+        let unheard = ask(&path, &Request::Pause {}).unwrap_err().to_string();
+        assert!(unheard.contains("does not answer there") && !unheard.contains("is not known"), "{unheard}");
     }
 }
