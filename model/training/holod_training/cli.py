@@ -15,12 +15,12 @@ import torch
 
 from holod_training.bench_engines import BenchError, Plan, bench_engines, markdown
 from holod_training.benches import ANY_BENCH, BenchDraw
-from holod_training.config import CONDITIONINGS, ConfigError, NetworkConfig, TrainedRange
+from holod_training.config import CONDITIONINGS, ConfigError, NetworkConfig, TrainedRange, require
 from holod_training.evaluate_config import EvaluateConfig
 from holod_training.export import WeightsError
 from holod_training.goals import ReportError
 from holod_training.judging import LAYERED_ASM, OURS
-from holod_training.loss import LossWeights
+from holod_training.loss import LossWeights, option_of
 from holod_training.optimizer import OPTIMIZERS
 from holod_training.rgbd import RgbdError
 from holod_training.sampling import AugmentConfig
@@ -45,9 +45,10 @@ def choose_device(name: str) -> torch.device:
 def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     options.arguments = sys.argv[1:] if arguments is None else arguments
-    if options.threads:
-        torch.set_num_threads(options.threads)
     try:
+        require("--threads", options.threads, options.threads >= 0, "at least 0")
+        if options.threads:
+            torch.set_num_threads(options.threads)
         options.run(options)
     except (BenchError, ConfigError, ReportError, RgbdError, ShardError, TrainingError, WeightsError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -70,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     training.add_argument("--steps", type=int, required=True)
     training.add_argument("--resume", action="store_true", help="go on from the run folder's checkpoint")
     training.add_argument("--initial-weights", help="start from a weights file of the same variant")
-    training.add_argument("--stop-below-slope", type=float, default=TrainConfig("", "", 0).stop_below_slope)
+    training.add_argument("--stop-below-slope", type=float, default=TrainConfig("", "", 1).stop_below_slope)
     _network_options(training)
     training.set_defaults(run=_train)
 
@@ -173,7 +174,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _training_options(sub: argparse.ArgumentParser) -> None:
-    defaults, loss = TrainConfig("", "", 0), LossWeights()
+    defaults, loss = TrainConfig("", "", 1), LossWeights()
     sub.add_argument("--shards", required=True, help="folder of training scenes; may grow while training")
     sub.add_argument("--validation", help="folder of held-out scenes")
     sub.add_argument("--out", required=True, help="run folder")
@@ -208,16 +209,12 @@ def _training_options(sub: argparse.ArgumentParser) -> None:
         "--faulty-depth", type=float, default=defaults.augment.faulty_depth, help="chance of a poor camera's depth"
     )
     for term in dataclasses.fields(LossWeights):
-        sub.add_argument(_option_of(term.name), dest=f"loss_{term.name}", type=float, default=getattr(loss, term.name))
+        sub.add_argument(option_of(term.name), dest=f"loss_{term.name}", type=float, default=getattr(loss, term.name))
 
 
 def _lpips_options(sub: argparse.ArgumentParser, effect: str) -> None:
     sub.add_argument("--lpips-backbone", help=f"torchvision's AlexNet state dict; with the linear layers {effect}")
     sub.add_argument("--lpips-linear", help="LPIPS's authors' linear layers, lin0.model.1.weight and so on")
-
-
-def _option_of(loss_key: str) -> str:
-    return f"--{loss_key.replace('_', '-')}" + ("" if loss_key.endswith(("_px", "_growth")) else "-weight")
 
 
 def _network_options(sub: argparse.ArgumentParser) -> None:
@@ -268,7 +265,8 @@ def _compare(options: argparse.Namespace) -> None:
     from holod_training.compare import compare
 
     names = [name for name in options.variants.split(",") if name]
-    print(compare(_train_config(options, steps=0), names, 60 * options.minutes, choose_device(options.device)), end="")
+    # Steps come of the minutes.
+    print(compare(_train_config(options, steps=1), names, 60 * options.minutes, choose_device(options.device)), end="")
 
 
 def _list_of(kind: type[int] | type[float]) -> Callable[[str], tuple[float, ...]]:

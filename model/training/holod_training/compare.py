@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import statistics
 import time
@@ -12,7 +13,7 @@ from typing import Any
 
 import torch
 
-from holod_training.config import ConfigError, NetworkConfig
+from holod_training.config import ConfigError, NetworkConfig, require
 from holod_training.costs import operations_per_pixel
 from holod_training.curves import read_rows
 from holod_training.export import load_weights, write_beside
@@ -23,7 +24,7 @@ from holod_training.report import NUMBERS
 from holod_training.rivals import flat_oracle
 from holod_training.shards import Shard, open_held_out
 from holod_training.train import VALIDATION_PUPILS_MM, Run, TrainConfig, train
-from holod_training.variants import network_amplitude, variant
+from holod_training.variants import VARIANTS, network_amplitude, variant
 
 WARM_STEPS, TIMED_STEPS = 2, 7
 NO_STOP = -10.0
@@ -98,8 +99,8 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
         raise ConfigError("validation: found no folder of held-out scenes; variants are compared on them")
     if os.environ.get("WORLD_SIZE", "1") != "1":
         raise ConfigError("WORLD_SIZE: found several processes; variants are compared by one, run it without torchrun")
-    if not seconds > 0:
-        raise ConfigError(f"minutes: found {seconds / 60}, expected more than 0")
+    require("--minutes", seconds / 60, 0 < seconds < math.inf, "a number above 0")
+    require("--variants", ",".join(names), bool(names), f"some of {', '.join(VARIANTS)}")
     networks = {name: variant(name) for name in names}
     key_defaults = json.loads(json.dumps(dataclasses.asdict(NetworkConfig())))
     out = Path(base.out)
@@ -109,6 +110,7 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
         network = dataclasses.replace(network, trained=base.network.trained)
         config = dataclasses.replace(base, network=network, out=str(out / name), stop_below_slope=NO_STOP)
         terms = {"minutes": seconds / 60, **json.loads(json.dumps(dataclasses.asdict(config)))}
+        del terms["steps"]
         if known.is_file():
             kept = json.loads(known.read_text())["terms"]
             # A row may be from before a key of networks was there.

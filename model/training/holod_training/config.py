@@ -20,6 +20,12 @@ class ConfigError(ValueError):
     """A configuration that cannot be used; the message says which key, what was found and what is expected."""
 
 
+def require(name: str, found: object, met: bool, expected: str) -> None:
+    """Raises ConfigError for an option or key whose value is not `met`."""
+    if not met:
+        raise ConfigError(f"{name}: found {found!r}, expected {expected}")
+
+
 @dataclass(frozen=True)
 class OpticsConfig:
     """The bench: units are in the names; `depth_*_dpt` bound the volume, dioptres."""
@@ -185,8 +191,7 @@ class NetworkConfig:
         self._require("specialists_mm", _rises(self.specialists_mm), "pupils in rising order")
 
     def _require(self, key: str, met: bool, expected: str) -> None:
-        if not met:
-            raise ConfigError(f"{key}: found {getattr(self, key)!r}, expected {expected}")
+        require(key, getattr(self, key), met, expected)
 
     def to_json(self) -> str:
         values = dataclasses.asdict(self)

@@ -65,6 +65,11 @@ class LossWeights:
         return replace(self, in_focus=self.in_focus * growth**self.in_focus_growth)
 
 
+def option_of(loss_key: str) -> str:
+    """The command line's name of a value of `LossWeights`."""
+    return f"--{loss_key.replace('_', '-')}" + ("" if loss_key.endswith(("_px", "_growth")) else "-weight")
+
+
 @dataclass(frozen=True)
 class LossParts:
     """`total` carries the gradient; the rest are plain numbers to log. `terms` are as yet without their weights."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 import datetime
 import io
 import json
@@ -12,7 +11,7 @@ import os
 import platform
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, cast
@@ -25,13 +24,22 @@ from torch.nn.parallel import DistributedDataParallel
 from tqdm import tqdm
 
 from holod_training.benches import BenchDraw
-from holod_training.config import NetworkConfig, OpticsConfig
+from holod_training.config import NetworkConfig, OpticsConfig, require
 from holod_training.curves import plot_curves
 from holod_training.expected_stack import with_refined_stack
 from holod_training.export import load_weights, save_weights, write_beside
+from holod_training.foam import REGION_PX
 from holod_training.focal_stack import planes_dpt
-from holod_training.loss import PERCEPTUAL_PLANES, LossWeights, focus_loss, inner
-from holod_training.lpips import Lpips
+from holod_training.loss import (
+    LIGHT_WINDOWS_PX,
+    PERCEPTUAL_PLANES,
+    WINDOW_PX,
+    LossWeights,
+    focus_loss,
+    inner,
+    option_of,
+)
+from holod_training.lpips import SMALLEST_PX, Lpips
 from holod_training.metrics import Judgement, judge, psnr_db
 from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, HalfBandEye, coc_px, shown_by_panel
@@ -44,6 +52,8 @@ from holod_training.variants import build_network, network_amplitude
 VALIDATION_PUPILS_MM = (2.0, 3.0, 4.0)
 PRECISIONS = ("f32", "bf16")
 PERCEPTUAL_STREAM = 2
+# What of TrainConfig only programs can set: errors name it by its key.
+WITHOUT_OPTION = ("final_rate_share", "gradient_clip", "ema_decay", "log_every", "checkpoint_every", "rescan_every")
 
 
 class TrainingError(RuntimeError):
@@ -89,6 +99,51 @@ class TrainConfig:
     lpips_backbone: str | None = None
     lpips_linear: str | None = None
 
+    def __post_init__(self) -> None:
+        """Raises ConfigError for what no run can do."""
+        periods = ("log_every", "validate_every", "checkpoint_every", "rescan_every")
+        for key in ("steps", "batch", "validation_scenes", *periods):
+            self._require(key, getattr(self, key) >= 1, "at least 1")
+        for key in ("border_px", "validation_border_px", "warm_up_steps"):
+            self._require(key, getattr(self, key) >= 0, "at least 0")
+        # A half-band grid has a value for each 2x2 pixels.
+        self._require("crop", self.crop >= 2 and self.crop % 2 == 0, "an even number of at least 2")
+        self._require("border_px", 2 * self.border_px < self.crop, f"less than half the crop of {self.crop} px")
+        for least_px, wanted, what in (
+            (WINDOW_PX, self.loss.structure, "structure"),
+            (REGION_PX, self.loss.foam, "foam"),
+            (SMALLEST_PX, self.lpips_backbone or self.lpips_linear, "LPIPS"),
+        ):
+            least_px += 2 * self.border_px
+            about = f"at least {least_px} for {what} within a border of {self.border_px} px"
+            self._require("crop", not wanted or self.crop >= least_px, about)
+        light_px = min(LIGHT_WINDOWS_PX)
+        self._require("crop", not self.loss.light or self.crop >= light_px, f"at least {light_px} for the light")
+        one_bench = self.benches is None or self.batch == 1
+        self._require("batch", one_bench, "1 where each crop has a bench of its own; torchrun adds more")
+        self._require("precision", self.precision in PRECISIONS, f"one of {', '.join(PRECISIONS)}")
+        self._require("optimizer", self.optimizer in OPTIMIZERS, f"one of {', '.join(OPTIMIZERS)}")
+        self._require("learning_rate", 0 < self.learning_rate < math.inf, "a number above 0")
+        self._require("gradient_clip", self.gradient_clip > 0, "a number above 0")
+        for key in ("final_rate_share", "ema_decay"):
+            self._require(key, 0 <= getattr(self, key) <= 1, "0 to 1")
+        self._require("seed", 0 <= self.seed < 2**63, "a whole number from 0 to 2^63 - 1")
+        self._require("stop_below_slope", not math.isnan(self.stop_below_slope), "a number")
+        constant = self.double_phase
+        self._require("double_phase", constant is None or 0 < constant < math.inf, "a number above 0")
+        for chance, value in asdict(self.augment).items():
+            name = "--faulty-depth" if chance == "faulty_depth" else f"augment.{chance}"
+            require(name, value, 0 <= value <= 1, "0 to 1")
+        for term, value in asdict(self.loss).items():
+            # Sharpness has a logarithm of the floor below it.
+            above = term == "coc_floor_px"
+            met = 0 < value < math.inf if above else 0 <= value < math.inf
+            require(option_of(term), value, met, "a number above 0" if above else "a number of at least 0")
+
+    def _require(self, key: str, met: bool, expected: str) -> None:
+        name = key if key in WITHOUT_OPTION else f"--{key.replace('_', '-')}"
+        require(name, getattr(self, key), met, expected)
+
     def learning_rate_at(self, step: int) -> float:
         """Linear warm-up, then cosine to `final_rate_share` of the peak."""
         warm = min(1.0, (step + 1) / max(1, self.warm_up_steps))
@@ -127,14 +182,6 @@ class Run:
         self.step = 0
         self.seconds = 0.0
         torch.manual_seed(config.seed)
-        if config.precision not in PRECISIONS:
-            raise TrainingError(f"precision: found {config.precision!r}, expected one of {', '.join(PRECISIONS)}")
-        if config.benches and config.batch != 1:
-            raise TrainingError(
-                f"batch: found {config.batch}, expected 1 where each crop has a bench of its own; torchrun adds more"
-            )
-        if config.optimizer not in OPTIMIZERS:
-            raise TrainingError(f"optimizer: found {config.optimizer!r}, expected one of {', '.join(OPTIMIZERS)}")
         self.network = build_network(config.network).to(device)
         if config.initial_weights:
             self.network.load_state_dict(self._initial_weights(Path(config.initial_weights)))
@@ -324,7 +371,7 @@ class Run:
             "optimizer": self.optimizer.state_dict(),
             "shards": self.sampler.names,
             "provenance": self.provenance(),
-            "config": json.dumps(dataclasses.asdict(self.config)),
+            "config": json.dumps(asdict(self.config)),
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -457,7 +504,7 @@ class RunLog:
 
     def __init__(self, out: Path, config: TrainConfig, step: int) -> None:
         out.mkdir(parents=True, exist_ok=True)
-        write_beside(out / "config.json", json.dumps(dataclasses.asdict(config), indent=1).encode())
+        write_beside(out / "config.json", json.dumps(asdict(config), indent=1).encode())
         self.path = out / "metrics.jsonl"
         rows = self.path.read_text().splitlines(keepends=True) if step and self.path.exists() else []
         # A run that was killed may have left half a row.

@@ -51,6 +51,7 @@ def test_variants_compete_for_the_same_time(shards: Path, tmp_path: Path, capsys
     older = json.loads(known.read_text())
     for key in ("refined_stack", "feedback"):
         del older["terms"]["network"][key]
+    older["terms"]["steps"] = 0
     known.write_text(json.dumps(older))
     assert main([*command[:-5], "half-band-8", *command[-4:]]) == 0
     # Rows of other terms never share a table.
@@ -59,18 +60,27 @@ def test_variants_compete_for_the_same_time(shards: Path, tmp_path: Path, capsys
 
 
 def test_comparison_says_what_is_missing(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = TrainConfig(str(shards), str(tmp_path / "out"), 0)
+    config = TrainConfig(str(shards), str(tmp_path / "out"), 1)
     with pytest.raises(ConfigError, match="validation: found no folder"):
         compare(config, ["half-band-8"], 1, CPU)
     with pytest.raises(ConfigError, match="variant: found 'half'"):
-        compare(TrainConfig(str(shards), str(tmp_path), 0, validation=str(shards)), ["half"], 1, CPU)
+        compare(TrainConfig(str(shards), str(tmp_path), 1, validation=str(shards)), ["half"], 1, CPU)
     write_shard(tmp_path / "own" / "scene_000000.safetensors", metadata={"kind": "train"})
-    own = TrainConfig(str(shards), str(tmp_path / "out"), 0, validation=str(tmp_path / "own"), crop=48)
+    own = TrainConfig(str(shards), str(tmp_path / "out"), 1, validation=str(tmp_path / "own"), crop=48, border_px=8)
     with pytest.raises(ShardError, match=r"own/scene_000000\.safetensors: metadata kind is 'train'"):
         compare(own, ["half-band-8"], 1, CPU)
+    sound = TrainConfig(str(shards), str(tmp_path / "out"), 1, validation=str(shards))
+    for names, seconds, message in (
+        (["half-band-8"], float("inf"), "--minutes: found inf, expected a number above 0"),
+        (["half-band-8"], 0, "--minutes: found 0.0, expected a number above 0"),
+        ([], 1, "--variants: found '', expected some of direct-26"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            compare(sound, names, seconds, CPU)
+    assert not (tmp_path / "out").exists()
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(ConfigError, match="WORLD_SIZE: found several processes"):
-        compare(TrainConfig(str(shards), str(tmp_path), 0, validation=str(shards)), ["half-band-8"], 1, CPU)
+        compare(TrainConfig(str(shards), str(tmp_path), 1, validation=str(shards)), ["half-band-8"], 1, CPU)
 
 
 def test_operations_are_counted() -> None:

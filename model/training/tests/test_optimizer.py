@@ -7,8 +7,9 @@ from test_train import CPU, tiny
 from torch import nn
 
 from holod_training import cli
+from holod_training.config import ConfigError
 from holod_training.optimizer import Muon, make_optimizer, orthogonalised
-from holod_training.train import Run, TrainConfig, TrainingError
+from holod_training.train import Run, TrainConfig
 
 KERNELS = ((16, 8, 3, 3), (64, 2, 3, 3), (24, 24, 3, 3))
 OTHERS = ((6, 8, 3, 3), (24,), (18, 24))
@@ -109,8 +110,8 @@ def test_a_run_takes_the_optimizer_that_it_names(shards: Path, tmp_path: Path) -
         run.train_step()
         weights[name] = run.network.get_parameter("layers.0.weight").detach()
     assert not torch.equal(weights["muon"], weights["adam"])
-    with pytest.raises(TrainingError, match="optimizer: found 'sgd', expected one of muon, adam"):
-        Run(tiny(shards, tmp_path, optimizer="sgd"), CPU)
+    with pytest.raises(ConfigError, match="--optimizer: found 'sgd', expected one of muon, adam"):
+        tiny(shards, tmp_path, optimizer="sgd")
 
 
 def test_the_option_names_the_optimizer() -> None:
@@ -118,7 +119,7 @@ def test_the_option_names_the_optimizer() -> None:
         common = ["train", "--shards", "s", "--out", "o", "--steps", "1"]
         return cli._train_config(cli._parser().parse_args([*common, *options]))
 
-    assert config().optimizer == TrainConfig("", "", 0).optimizer == "muon"
+    assert config().optimizer == TrainConfig("", "", 1).optimizer == "muon"
     assert config("--optimizer", "adam").optimizer == "adam"
     with pytest.raises(SystemExit):
         config("--optimizer", "sgd")

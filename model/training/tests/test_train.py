@@ -188,8 +188,8 @@ def test_bf16_is_near_f32_and_leaves_the_weights_f32(shards: Path, tmp_path: Pat
     assert rows["bf16"][0]["loss"] == pytest.approx(rows["f32"][0]["loss"], rel=0.02)
     assert rows["bf16"][0]["loss"] != rows["f32"][0]["loss"]
     assert all(p.dtype == torch.float32 for p in runs["bf16"].network.parameters())
-    with pytest.raises(TrainingError, match="precision: found 'f16'"):
-        Run(tiny(shards, tmp_path, precision="f16"), CPU)
+    with pytest.raises(ConfigError, match="--precision: found 'f16'"):
+        tiny(shards, tmp_path, precision="f16")
 
 
 @pytest.mark.parametrize("grid", ["half-band", "full"])
@@ -334,8 +334,8 @@ def test_each_step_has_a_bench_of_its_own(shards: Path, tmp_path: Path) -> None:
         assert run.network.optics == drawn
         seen.append(drawn)
     assert len(set(seen)) > 1
-    with pytest.raises(TrainingError, match="batch: found 2, expected 1 where each crop has a bench of its own"):
-        Run(tiny(shards, tmp_path / "two", network=network, benches=BenchDraw(), batch=2), CPU)
+    with pytest.raises(ConfigError, match="--batch: found 2, expected 1 where each crop has a bench of its own"):
+        tiny(shards, tmp_path / "two", network=network, benches=BenchDraw(), batch=2)
 
 
 def test_scenes_of_another_bench_are_refused(shards: Path, tmp_path: Path) -> None:
@@ -438,6 +438,61 @@ def test_weights_round_trip_and_errors(tmp_path: Path) -> None:
     path.write_bytes(b"garbage")
     with pytest.raises(WeightsError, match="not a readable weights file"):
         load_weights(path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--crop 64 --border-px 32", "--border-px: found 32, expected less than half the crop of 64 px"),
+        ("--crop 64 --border-px 40", "--border-px: found 40, expected less than half the crop of 64 px"),
+        ("--border-px -1", "--border-px: found -1, expected at least 0"),
+        ("--validation-border-px -1", "--validation-border-px: found -1, expected at least 0"),
+        ("--steps 0", "--steps: found 0, expected at least 1"),
+        ("--steps -1", "--steps: found -1, expected at least 1"),
+        ("--learning-rate -1", "--learning-rate: found -1.0, expected a number above 0"),
+        ("--learning-rate 0", "--learning-rate: found 0.0, expected a number above 0"),
+        ("--learning-rate nan", "--learning-rate: found nan, expected a number above 0"),
+        ("--learning-rate inf", "--learning-rate: found inf, expected a number above 0"),
+        ("--batch 0", "--batch: found 0, expected at least 1"),
+        ("--batch -1", "--batch: found -1, expected at least 1"),
+        ("--crop 63 --border-px 8", "--crop: found 63, expected an even number of at least 2"),
+        ("--crop -64", "--crop: found -64, expected an even number of at least 2"),
+        ("--crop 0", "--crop: found 0, expected an even number of at least 2"),
+        ("--crop 36 --border-px 8 --foam-weight 1", "--crop: found 36, expected at least 48 for foam within a border"),
+        ("--crop 20 --border-px 8 --structure-weight 1", "--crop: found 20, expected at least 24 for structure"),
+        ("--crop 64 --border-px 8 --lpips-backbone a --lpips-linear b", "--crop: found 64, expected at least 79 for L"),
+        ("--crop 14 --border-px 2 --light-weight 1", "--crop: found 14, expected at least 16 for the light"),
+        ("--warm-up-steps -1", "--warm-up-steps: found -1, expected at least 0"),
+        ("--seed -1", "--seed: found -1, expected a whole number from 0 to"),
+        ("--double-phase 0", "--double-phase: found 0.0, expected a number above 0"),
+        ("--validate-every 0", "--validate-every: found 0, expected at least 1"),
+        ("--validation-scenes 0", "--validation-scenes: found 0, expected at least 1"),
+        ("--stop-below-slope nan", "--stop-below-slope: found nan, expected a number"),
+        ("--faulty-depth 1.5", "--faulty-depth: found 1.5, expected 0 to 1"),
+        ("--focus-weight -1", "--focus-weight: found -1.0, expected a number of at least 0"),
+        ("--in-focus-growth nan", "--in-focus-growth: found nan, expected a number of at least 0"),
+        ("--coc-floor-px 0", "--coc-floor-px: found 0.0, expected a number above 0"),
+        ("--threads -1", "--threads: found -1, expected at least 0"),
+    ],
+)
+def test_what_no_run_can_do_is_refused_before_anything_is_written(
+    options: str, message: str, shards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["train", "--shards", str(shards), "--out", str(tmp_path / "run"), "--steps", "1", "--device", "cpu"]
+    assert main([*command, "--crop", "48", "--border-px", "8", *options.split()]) == 65
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_programs_are_told_of_what_has_no_option(shards: Path, tmp_path: Path) -> None:
+    for changes, message in (
+        ({"log_every": 0}, "log_every: found 0, expected at least 1"),
+        ({"ema_decay": 1.5}, r"ema_decay: found 1\.5, expected 0 to 1"),
+        ({"gradient_clip": 0}, "gradient_clip: found 0, expected a number above 0"),
+        ({"augment": AugmentConfig(dim=-1)}, r"augment\.dim: found -1, expected 0 to 1"),
+    ):
+        with pytest.raises(ConfigError, match=f"^{message}"):
+            tiny(shards, tmp_path / "run", **changes)
 
 
 def test_cli_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
