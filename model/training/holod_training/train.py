@@ -443,10 +443,16 @@ def _train(config: TrainConfig, device: torch.device, resume: bool, rank: int, w
         if not checkpoint.is_file():
             raise TrainingError(f"{checkpoint}: no checkpoint to resume; start without --resume")
         run.load_state(torch.load(checkpoint, map_location=device, weights_only=True))
+        if run.step > config.steps:
+            raise TrainingError(f"--steps: found {config.steps}, expected at least {run.step}, where {checkpoint} is")
     elif checkpoint.exists():
         raise TrainingError(f"{out}: holds a run already; go on with --resume or choose another --out")
-    log = RunLog(out, config, run.step) if rank == 0 else None
+    first = run.step
+    log: RunLog | None = None
     weights = out / "weights.safetensors"
+    if rank == 0 and first == config.steps and not weights.is_file():
+        # It was killed between its last checkpoint and its weights.
+        _validate(run, RunLog(out, config, first), weights)
     progress = tqdm(
         total=config.steps,
         initial=run.step,
@@ -458,6 +464,9 @@ def _train(config: TrainConfig, device: torch.device, resume: bool, rank: int, w
     began = time.monotonic() - run.seconds
     while run.step < config.steps:
         window.append(run.train_step())
+        if rank == 0 and log is None:
+            # A run that fails before its first step is done leaves nothing behind.
+            log = RunLog(out, config, first)
         run.seconds = time.monotonic() - began
         progress.update()
         done = run.step == config.steps
@@ -473,14 +482,19 @@ def _train(config: TrainConfig, device: torch.device, resume: bool, rank: int, w
             if world > 1:
                 dist.barrier()
         if log and (run.step % config.validate_every == 0 or done):
-            measured = run.validate()
-            log.write("validation", run, {"pupils": measured})
-            metrics = {"validation_before_double_phase": measured} if measured else {}
-            save_weights(weights, run.average, metrics, run.provenance())
-            plot_curves(out)
-            _stop_if_flat(run, measured)
+            _validate(run, log, weights)
     progress.close()
     return weights
+
+
+def _validate(run: Run, log: RunLog, weights: Path) -> None:
+    """Judges the averaged weights and writes them. Raises TrainingError for a run that is flat."""
+    measured = run.validate()
+    log.write("validation", run, {"pupils": measured})
+    metrics = {"validation_before_double_phase": measured} if measured else {}
+    save_weights(weights, run.average, metrics, run.provenance())
+    plot_curves(Path(run.config.out))
+    _stop_if_flat(run, measured)
 
 
 def _stop_if_flat(run: Run, measured: dict[str, dict[str, float]]) -> None:

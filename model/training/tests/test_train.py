@@ -1,9 +1,11 @@
 import dataclasses
 import json
+import math
 import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -493,6 +495,34 @@ def test_programs_are_told_of_what_has_no_option(shards: Path, tmp_path: Path) -
     ):
         with pytest.raises(ConfigError, match=f"^{message}"):
             tiny(shards, tmp_path / "run", **changes)
+
+
+def test_a_run_that_fails_before_its_first_step_leaves_nothing(tmp_path: Path) -> None:
+    """Scenes are looked at in the first step, where they are too small for the crop or of other benches."""
+    write_shard(tmp_path / "small" / "scene_000000.safetensors", size=40)
+    with pytest.raises(ShardError, match="40x40 pixels, smaller than the crop 48"):
+        train(tiny(tmp_path / "small", tmp_path / "run", validation=None), CPU)
+    write_shard(tmp_path / "nan" / "scene_000000.safetensors")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("holod_training.train.focus_loss", lambda *_: SimpleNamespace(total=torch.tensor(math.nan)))
+        with pytest.raises(TrainingError, match="step 0: the loss is nan"):
+            train(tiny(tmp_path / "nan", tmp_path / "run", validation=None), CPU)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_a_run_that_is_done_says_so_and_has_its_weights(shards: Path, tmp_path: Path) -> None:
+    weights = train(tiny(shards, tmp_path / "run"), CPU)
+    with pytest.raises(TrainingError, match=r"--steps: found 5, expected at least 6, where .*checkpoint\.pt is"):
+        train(tiny(shards, tmp_path / "run", steps=5), CPU, resume=True)
+    done = weights.read_bytes(), rows_of(tmp_path / "run")
+    assert train(tiny(shards, tmp_path / "run"), CPU, resume=True) == weights
+    assert (weights.read_bytes(), rows_of(tmp_path / "run")) == done
+    before = load_file(weights)
+    weights.unlink()
+    assert train(tiny(shards, tmp_path / "run"), CPU, resume=True) == weights
+    after = load_file(weights)
+    assert all(torch.equal(value, after[name]) for name, value in before.items())
 
 
 def test_cli_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
