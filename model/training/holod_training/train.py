@@ -309,7 +309,7 @@ class Run:
             )
         loss = torch.stack([p.total for p in parts]).mean()
         if not torch.isfinite(loss):
-            raise TrainingError(f"step {self.step}: the loss is {loss.item()}; lower the learning rate")
+            raise TrainingError(f"step {self.step}: the loss is {loss.item()}: {self._likely_cause(stacks)}")
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_clip)
@@ -325,6 +325,22 @@ class Run:
             "gradient_norm": float(norm),
             **{f"loss_{name}": sum(p.terms[name] for p in parts) / n for name in parts[0].terms},
         }
+
+    def _likely_cause(self, stacks: list[Stack]) -> str:
+        """Of a loss that is no number, and what to do."""
+        config = self.config
+        if not all(t.isfinite().all() for s in stacks for t in (s.image, s.depth, s.target)):
+            return f"a scene of {config.shards} has values that are no numbers; write its scenes again"
+        for path, network in ((config.initial_weights, self.network), (config.teacher, self.teacher)):
+            if self.step == 0 and path and network and not all(p.isfinite().all() for p in network.parameters()):
+                return f"{path} has values that are no numbers; name other weights"
+        narrow = ", or train with --precision f32" if config.precision == "bf16" else ""
+        if self.step == 0:
+            return f"no step has changed a weight, so it is not the learning rate; lower the loss's weights{narrow}"
+        return (
+            "the run diverged; lower --learning-rate, lengthen --warm-up-steps, lower the weight of the term that "
+            f"grew, loss_* in {Path(config.out) / 'metrics.jsonl'}{narrow}"
+        )
 
     @torch.no_grad()
     def _average(self) -> None:

@@ -10,7 +10,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 from conftest import write_shard
-from safetensors.torch import load_file
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from test_lpips import random_lpips_files
 
 from holod_training import cli
@@ -508,6 +509,34 @@ def test_a_run_that_fails_before_its_first_step_leaves_nothing(tmp_path: Path) -
         with pytest.raises(TrainingError, match="step 0: the loss is nan"):
             train(tiny(tmp_path / "nan", tmp_path / "run", validation=None), CPU)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_loss_that_is_no_number_is_told_with_its_likely_cause(shards: Path, tmp_path: Path) -> None:
+    broken = DirectNetwork(TINY)
+    with torch.no_grad():
+        next(broken.parameters()).fill_(math.nan)
+    save_weights(tmp_path / "broken.safetensors", broken, {}, {})
+
+    def cause(step: int = 0, **changes: object) -> str:
+        run = Run(tiny(shards, tmp_path / "run", **changes), CPU)
+        run.network.load_state_dict(broken.state_dict())
+        run.step = step
+        run.sampler.rescan()
+        with pytest.raises(TrainingError, match=f"^step {step}: the loss is nan: ") as error:
+            run.train_step()
+        return str(error.value)
+
+    given = str(tmp_path / "broken.safetensors")
+    assert "it is not the learning rate; lower the loss's weights" in cause()
+    assert "lower --learning-rate, lengthen --warm-up-steps, lower the weight of the term that grew" in cause(3)
+    assert "--precision" not in cause(3) and "or train with --precision f32" in cause(3, precision="bf16")
+    for option in ("initial_weights", "teacher"):
+        assert f"{given} has values that are no numbers" in cause(**{option: given})
+    for path in shards.iterdir():
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata()
+        save_file({**load_file(path), "image": torch.full((3, 64, 64), math.nan).half()}, path, metadata)
+    assert f"a scene of {shards} has values that are no numbers; write its scenes again" in cause()
 
 
 @pytest.mark.usefixtures("no_plots")
