@@ -11,8 +11,9 @@ import torch
 
 from holod_training.export import load_weights, write_beside
 from holod_training.judging import AFTER, OURS, Bench, Judged, judge_scenes, network_method, open_alike, rivals
+from holod_training.metrics import SSIM_WINDOW_PX
 from holod_training.network import FieldNetwork
-from holod_training.shards import Shard, ShardError
+from holod_training.shards import Shard, ShardError, check_border
 
 RIVAL = "smooth phase"
 LINE = 100
@@ -21,12 +22,14 @@ LINE = 100
 @torch.no_grad()
 def across_benches(weights: list[Path], folders: list[Path], out: Path, border_px: int, limit: int | None) -> str:
     """Judges every weights file on every folder's bench; writes benches.md and benches.json into `out`, and returns the
-    Markdown. Raises ShardError, WeightsError."""
+    Markdown. Raises ConfigError, ShardError, WeightsError."""
     networks = {path.stem: load_weights(path) for path in weights}
     if len(networks) < len(weights):
         raise ShardError("weights: found two files of one name; give each a name of its own")
     # All folders are looked at before the long work.
     benches = [(folder.name, open_alike(folder, limit)) for folder in folders]
+    for _, shards in benches:
+        check_border(shards, border_px, "--border-px", SSIM_WINDOW_PX)
     judged = {
         name: {key: _judge(key, network, shards, border_px) for key, network in networks.items()}
         for name, shards in benches

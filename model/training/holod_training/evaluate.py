@@ -25,15 +25,16 @@ from holod_training.judging import (
     rivals,
     table_pupils,
 )
-from holod_training.lpips import Lpips
+from holod_training.lpips import SMALLEST_PX, Lpips
 from holod_training.marks import judge_marks
+from holod_training.metrics import SSIM_WINDOW_PX
 from holod_training.network import FieldNetwork
 from holod_training.offsets import offset_statistics
 from holod_training.plots import write_plots
 from holod_training.refocus import refocus_cards
 from holod_training.report import markdown
 from holod_training.rgbd import read_pictures, write_rgbd_sheet
-from holod_training.shards import open_shards
+from holod_training.shards import check_border, open_shards
 from holod_training.sheets import write_sheet
 from holod_training.solver import optimise
 from holod_training.tradeoff import focus_curve, on_the_same_scenes
@@ -60,6 +61,9 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     marks = open_shards(config.marks, optics) if config.marks else []
     pictures = read_pictures(config.rgbd, optics) if config.rgbd else []
     lpips = Lpips.open(config.lpips_backbone, config.lpips_linear, device)
+    least_px = SMALLEST_PX if lpips else SSIM_WINDOW_PX
+    check_border(shards, config.border_px, "--border-px", least_px)
+    check_border(cards, config.border_px, "--border-px")
     bench = Bench(optics, network.config.amplitude_constant, config.border_px, device, lpips, config.judge_between)
     trained = [network_method(name, one) for name, one in networks.items()]
     learned_and_rivals = [*trained, *rivals(optics)]

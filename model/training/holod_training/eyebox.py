@@ -28,7 +28,7 @@ from holod_training.loss import inner
 from holod_training.metrics import psnr_db
 from holod_training.optics import frequencies, half_band_mask, intensity, pupil_mask, transfer
 from holod_training.rivals import all_in_focus, layered_asm
-from holod_training.shards import Stack, open_held_out
+from holod_training.shards import Stack, check_border, open_held_out
 
 PUPILS_MM = (1.0, 2.0, 3.0, 4.0, 5.0)
 SHARES = (0.5, 0.9, 0.99)
@@ -129,10 +129,11 @@ def study(stacks: list[Stack], methods: dict[str, Callable[[Stack], Tensor]], op
 def write_eyebox(weights: Path, test: Path, out: Path, limit: int | None) -> str:
     """Writes eyebox.md, eyebox.json and eyebox.png into `out`; returns the Markdown.
 
-    Raises WeightsError, ShardError.
+    Raises ConfigError, WeightsError, ShardError.
     """
     network = load_weights(weights)
     shards = open_held_out(test, limit=limit)
+    check_border(shards, BORDER_PX)
     optics = network.on(shards[0].optics).optics
     stacks = [shard.read(0) for shard in shards]
     methods: dict[str, Callable[[Stack], Tensor]] = {

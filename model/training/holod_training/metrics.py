@@ -12,6 +12,8 @@ from torch import Tensor
 from holod_training.foam import OUT_OF_FOCUS_PX, REGION_PX, foam_energy
 from holod_training.loss import IN_FOCUS_PX, inner
 
+SSIM_WINDOW_PX = 11
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -79,9 +81,9 @@ def _ssim_map(picture: Tensor, target: Tensor) -> Tensor:
 def _windowed(light: Tensor) -> Tensor:
     """The Gaussian mean [..., H - 10, W - 10] where the window fits. Eleven shifted sums a way: on a CPU eight times
     faster than a convolution of one channel, and without a matrix that grows with the picture."""
-    taps = [math.exp(-((k - 5) ** 2) / (2 * 1.5**2)) for k in range(11)]
+    taps = [math.exp(-((k - 5) ** 2) / (2 * 1.5**2)) for k in range(SSIM_WINDOW_PX)]
     for dim in (-1, -2):
-        size = light.shape[dim] - 10
+        size = light.shape[dim] - (SSIM_WINDOW_PX - 1)
         total = torch.zeros_like(light.narrow(dim, 0, size))
         for k, tap in enumerate(taps):
             total.add_(light.narrow(dim, k, size), alpha=tap / sum(taps))

@@ -13,7 +13,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from holod_training.config import OpticsConfig
+from holod_training.config import ConfigError, OpticsConfig, require
 
 SHARD_FORMAT = "holod-scene-1"
 TRAINING_KIND = "train"
@@ -219,7 +219,9 @@ def shard_names(folder: Path) -> list[str]:
 
 def open_shards(folder: Path, optics: OpticsConfig | None = None, limit: int | None = None) -> list[Shard]:
     """Every shard of a folder, headers checked, as they look on a bench; without one on that which they were
-    rendered for. Raises ShardError for none at all, for the first bad one and for shards of several benches."""
+    rendered for. Raises ShardError for none at all, for the first bad one and for shards of several benches, and
+    ConfigError for a limit that leaves none."""
+    require("--limit", limit, limit is None or limit >= 1, "at least 1 scene")
     names = shard_names(folder)[:limit]
     if not names:
         raise ShardError(f"{folder}: no scene_*.safetensors in it; write some with `holod-scenes generate`")
@@ -245,3 +247,18 @@ def open_held_out(folder: Path, optics: OpticsConfig | None = None, limit: int |
                 "what they learn from; write others with `holod-scenes generate --kind test`"
             )
     return shards
+
+
+def check_border(shards: Sequence[Shard], border_px: int, option: str = "", least_px: int = 1) -> None:
+    """Raises for scenes of which a border leaves fewer than `least_px` pixels either way: ConfigError for an option
+    that asks for too much, ShardError for scenes that are too small for any."""
+    if option:
+        require(option, border_px, border_px >= 0, "at least 0")
+    for shard in shards:
+        most = (min(shard.height, shard.width) - least_px) // 2
+        if border_px > most:
+            size = f"{shard.width}x{shard.height} pixels"
+            if option and most >= 0:
+                raise ConfigError(f"{option}: found {border_px}, expected at most {most}: {shard.path} has {size}")
+            least = least_px + 2 * border_px
+            raise ShardError(f"{shard.path}: {size}, expected at least {least}x{least} within a border of {border_px}")

@@ -46,7 +46,7 @@ from holod_training.optics import Eye, HalfBandEye, coc_px, shown_by_panel
 from holod_training.optimizer import OPTIMIZERS, make_optimizer
 from holod_training.rivals import flat_oracle
 from holod_training.sampling import AugmentConfig, Sampler
-from holod_training.shards import Shard, Stack, open_held_out
+from holod_training.shards import Shard, Stack, check_border, open_held_out
 from holod_training.variants import build_network, network_amplitude
 
 VALIDATION_PUPILS_MM = (2.0, 3.0, 4.0)
@@ -207,6 +207,7 @@ class Run:
         self.validation: list[Shard] = []
         if config.validation:
             self.validation = open_held_out(Path(config.validation), limit=config.validation_scenes)
+            check_border(self.validation, config.validation_border_px, "--validation-border-px")
 
     def _focal_stack_planes(self) -> tuple[float, ...]:
         """The focuses that a network or teacher takes as its input."""

@@ -59,6 +59,21 @@ def test_a_folder_without_scenes_is_said_before_the_long_work(tmp_path: Path) ->
     assert not (tmp_path / "out").exists()
 
 
+def test_borders_and_limits_that_leave_nothing_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_weights(tmp_path / "one.safetensors", build_network(TINY), {}, {})
+    write_shard(tmp_path / "test" / "scene_000000.safetensors")
+    command = ["across-benches", "--weights", str(tmp_path / "one.safetensors"), "--out", str(tmp_path / "out")]
+    command += ["--test", str(tmp_path / "test")]
+    for options, message in (
+        (("--border-px", "27"), "--border-px: found 27, expected at most 26: "),
+        (("--border-px", "-1"), "--border-px: found -1, expected at least 0"),
+        (("--limit", "0"), "--limit: found 0, expected at least 1 scene"),
+    ):
+        assert main([*command, *options]) == 65
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_export_carries_what_a_network_reached_on_each_bench(tmp_path: Path) -> None:
     torch.manual_seed(1)
     source, out = tmp_path / "one.safetensors", tmp_path / "exported.safetensors"

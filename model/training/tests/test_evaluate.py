@@ -205,6 +205,42 @@ def test_lpips_has_a_column_where_its_files_are_given(evaluation: Path, tmp_path
     assert not any("lpips" in row for row in read(evaluation)["rows"])
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--border-px 27", "--border-px: found 27, expected at most 26: "),
+        ("--border-px 60", "--border-px: found 60, expected at most 26: "),
+        ("--border-px -1", "--border-px: found -1, expected at least 0"),
+        ("--limit 0", "--limit: found 0, expected at least 1 scene"),
+        ("--limit -1", "--limit: found -1, expected at least 1 scene"),
+        ("--solver-scenes -1", "--solver-scenes: found -1, expected at least 0"),
+        ("--solver-iterations -1", "--solver-iterations: found -1, expected at least 0"),
+        ("--solver-frames 0,1", "--solver-frames: found (0, 1), expected numbers of at least 1, each once"),
+        ("--solver-frames 2,2", "--solver-frames: found (2, 2), expected numbers of at least 1, each once"),
+        ("--solver-focus-weight -1", "--solver-focus-weight: found -1.0, expected a number of at least 0"),
+        ("--solver-in-focus-weight nan", "--solver-in-focus-weight: found nan, expected a number of at least 0"),
+        ("--focus-curve-weights 1,-1", "--focus-curve-weights: found (1.0, -1.0), expected numbers of at least 0"),
+        ("--timing-calls 0", "--timing-calls: found 0, expected at least 1"),
+    ],
+)
+def test_what_cannot_be_judged_is_refused_before_the_work(
+    options: str, message: str, evaluation: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The scenes are 80x64: within a border of 26 px there is just one window of SSIM."""
+    arguments = ["--weights", str(evaluation / "w.safetensors"), "--test", str(evaluation / "test")]
+    arguments = ["evaluate", *arguments, "--out", str(tmp_path / "out"), "--device", "cpu"]
+    assert main([*arguments, *options.split()]) == 65
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_widest_border_is_judged(evaluation: Path, tmp_path: Path) -> None:
+    arguments = ["--weights", str(evaluation / "w.safetensors"), "--test", str(evaluation / "test"), "--limit", "1"]
+    arguments += ["--out", str(tmp_path), "--solver-scenes", "0", "--timing-calls", "1", "--border-px", "26"]
+    assert main(["evaluate", *arguments]) == 0
+    assert row_of(json.loads((tmp_path / "evaluation.json").read_text()), "holod", "after", 2.0)["ssim"] < 1
+
+
 def test_two_methods_of_one_name_are_refused(evaluation: Path, tmp_path: Path, capsys) -> None:
     weights = str(evaluation / "deeper.safetensors")
     arguments = ["--weights", weights, "--also", weights, "--also", weights, "--test", str(evaluation / "test")]

@@ -80,3 +80,10 @@ def test_the_command_writes_page_record_and_plot(tmp_path: Path, capsys: pytest.
     assert "| layered, random phase |" in capsys.readouterr().out
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"eyebox.md", "eyebox.json", "eyebox.png"}
     assert main(["eyebox", *arguments[:2], "--test", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 65
+    capsys.readouterr()
+    assert main(["eyebox", *arguments, "--limit", "0", "--out", str(tmp_path / "other")]) == 65
+    assert "--limit: found 0, expected at least 1 scene" in capsys.readouterr().err
+    write_shard(tmp_path / "small" / "scene_000000.safetensors", size=48)
+    assert main(["eyebox", *arguments[:2], "--test", str(tmp_path / "small"), "--out", str(tmp_path / "other")]) == 65
+    assert "48x48 pixels, expected at least 49x49 within a border of 24" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()

@@ -487,6 +487,14 @@ def test_what_no_run_can_do_is_refused_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
+def test_a_border_that_leaves_nothing_to_validate_is_refused_before_the_first_step(
+    shards: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=r"--validation-border-px: found 32, expected at most 31: .* has 64x64 pix"):
+        train(tiny(shards, tmp_path / "run", validation_border_px=32), CPU)
+    assert not (tmp_path / "run").exists()
+
+
 def test_programs_are_told_of_what_has_no_option(shards: Path, tmp_path: Path) -> None:
     for changes, message in (
         ({"log_every": 0}, "log_every: found 0, expected at least 1"),
