@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from holod_training.export import load_weights, write_beside
+from holod_training.export import check_folder, load_weights, write_beside
 from holod_training.judging import AFTER, OURS, Bench, Judged, judge_scenes, network_method, open_alike, rivals
 from holod_training.metrics import SSIM_WINDOW_PX
 from holod_training.network import FieldNetwork
@@ -23,6 +23,7 @@ LINE = 100
 def across_benches(weights: list[Path], folders: list[Path], out: Path, border_px: int, limit: int | None) -> str:
     """Judges every weights file on every folder's bench; writes benches.md and benches.json into `out`, and returns the
     Markdown. Raises ConfigError, ShardError, WeightsError."""
+    check_folder(out)
     networks = {path.stem: load_weights(path) for path in weights}
     if len(networks) < len(weights):
         raise ShardError("weights: found two files of one name; give each a name of its own")

@@ -53,6 +53,10 @@ def main(arguments: list[str] | None = None) -> int:
     except (BenchError, ConfigError, ReportError, RgbdError, ShardError, TrainingError, WeightsError) as error:
         print(f"error: {error}", file=sys.stderr)
         return EX_DATAERR
+    except OSError as error:
+        named = f"{error.filename2 or error.filename}: " if error.filename else ""
+        print(f"error: {named}{error.strerror or error}", file=sys.stderr)
+        return EX_DATAERR
     return 0
 
 

@@ -16,7 +16,7 @@ import torch
 from holod_training.config import ConfigError, NetworkConfig, require
 from holod_training.costs import operations_per_pixel
 from holod_training.curves import read_rows
-from holod_training.export import load_weights, write_beside
+from holod_training.export import check_folder, load_weights, write_beside
 from holod_training.metrics import Judgement, judge
 from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, coc_px, double_phase, panel_field, through_levels, upsample_half_band
@@ -102,6 +102,7 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
     require("--minutes", seconds / 60, 0 < seconds < math.inf, "a number above 0")
     require("--variants", ",".join(names), bool(names), f"some of {', '.join(VARIANTS)}")
     networks = {name: variant(name) for name in names}
+    check_folder(Path(base.out))
     key_defaults = json.loads(json.dumps(dataclasses.asdict(NetworkConfig())))
     out = Path(base.out)
     rows = []

@@ -11,7 +11,7 @@ import torch
 
 from holod_training.costs import network_cost, time_methods
 from holod_training.evaluate_config import EvaluateConfig
-from holod_training.export import WeightsError, load_weights, read_metadata, write_beside
+from holod_training.export import WeightsError, check_folder, load_weights, read_metadata, write_beside
 from holod_training.judging import (
     ASKED,
     BETWEEN,
@@ -50,6 +50,7 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
 
     Raises ConfigError, WeightsError, ShardError, RgbdError.
     """
+    check_folder(config.out)
     metadata = read_metadata(config.weights)
     networks = _load(config, device)
     network = networks[OURS]

@@ -27,8 +27,21 @@ def write_beside(path: Path, content: bytes) -> None:
     """Writes beside and renames, so that no reader ever meets half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.write_bytes(content)
-    part.replace(path)
+    try:
+        part.write_bytes(content)
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def check_folder(out: Path) -> None:
+    """Raises ConfigError, before the long work, for an `--out` that is no folder and cannot become one."""
+    there = next(path for path in (out, *out.parents) if os.path.lexists(path))
+    if not there.is_dir():
+        raise ConfigError(f"--out: found {there}, which is no folder, expected one to write into")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ConfigError(f"--out: found {there}, which may not be written, expected a folder to write into")
 
 
 def save_weights(path: Path, network: FieldNetwork, metrics: dict[str, Any], provenance: dict[str, Any]) -> None:

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from holod_training.config import OpticsConfig
 from holod_training.evaluate import network_field
-from holod_training.export import load_weights, write_beside
+from holod_training.export import check_folder, load_weights, write_beside
 from holod_training.loss import inner
 from holod_training.metrics import psnr_db
 from holod_training.optics import frequencies, half_band_mask, intensity, pupil_mask, transfer
@@ -131,6 +131,7 @@ def write_eyebox(weights: Path, test: Path, out: Path, limit: int | None) -> str
 
     Raises ConfigError, WeightsError, ShardError.
     """
+    check_folder(out)
     network = load_weights(weights)
     shards = open_held_out(test, limit=limit)
     check_border(shards, BORDER_PX)

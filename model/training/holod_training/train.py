@@ -27,7 +27,7 @@ from holod_training.benches import BenchDraw
 from holod_training.config import NetworkConfig, OpticsConfig, require
 from holod_training.curves import plot_curves
 from holod_training.expected_stack import with_refined_stack
-from holod_training.export import load_weights, save_weights, write_beside
+from holod_training.export import check_folder, load_weights, save_weights, write_beside
 from holod_training.foam import REGION_PX
 from holod_training.focal_stack import planes_dpt
 from holod_training.loss import (
@@ -454,6 +454,7 @@ def train(config: TrainConfig, device: torch.device, resume: bool = False) -> Pa
 
 def _train(config: TrainConfig, device: torch.device, resume: bool, rank: int, world: int) -> Path:
     out = Path(config.out)
+    check_folder(out)
     run = Run(config, device, rank, world)
     checkpoint = out / "checkpoint.pt"
     if resume:

@@ -562,6 +562,39 @@ def test_a_run_that_is_done_says_so_and_has_its_weights(shards: Path, tmp_path: 
     assert all(torch.equal(value, after[name]) for name, value in before.items())
 
 
+def test_an_out_that_is_no_folder_is_refused_before_the_work(
+    shards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "w.safetensors").touch()
+    data = ["--shards", str(shards), "--validation", str(shards)]
+    judged = ["--weights", str(tmp_path / "w.safetensors"), "--test", str(shards)]
+    for command in (
+        ["train", *data, "--steps", "1"],
+        ["compare", *data, "--variants", "half-band-8", "--minutes", "1"],
+        ["evaluate", *judged],
+        ["across-benches", *judged],
+        ["eyebox", *judged],
+    ):
+        for out in ("file", "file/below/it"):
+            assert main([*command, "--out", str(tmp_path / out)]) == 65
+            expected = f"error: --out: found {tmp_path / 'file'}, which is no folder, expected one to write into\n"
+            assert capsys.readouterr().err == expected
+
+
+def test_what_cannot_be_written_or_read_is_an_error_not_a_traceback(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = tmp_path / "source.safetensors"
+    save_weights(source, DirectNetwork(TINY), {}, {})
+    (tmp_path / "folder").mkdir()
+    assert main(["export", "--source", str(source), "--out", str(tmp_path / "folder")]) == 65
+    assert capsys.readouterr().err == f"error: {tmp_path / 'folder'}: Is a directory\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "source.safetensors"]
+    assert main(["export", "--source", str(source), "--out", str(source / "below")]) == 65
+    assert f"error: {source}: " in capsys.readouterr().err
+
+
 def test_cli_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code = main(["train", "--shards", str(tmp_path / "none"), "--out", str(tmp_path / "run"), "--steps", "1"])
     assert code == 65
