@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,23 +14,33 @@ import matplotlib
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
 from holod_training.export import write_beside
-from holod_training.judging import PICTURES
+from holod_training.judging import FLAT_ORACLE, PICTURES, RGBD_BLUR
 
 MARKERS = "osD^vPX*<>"
+# Colour, marker and line.
 FIXED_STYLES = {
-    "holod": ("#0b5fa5", "o"),
-    "all-in-focus": ("tab:brown", "v"),
-    "layered ASM": ("tab:orange", "s"),
-    "smooth phase": ("tab:green", "P"),
-    "transport of intensity": ("tab:purple", "D"),
-    "optimised, 1 frame": ("tab:pink", "^"),
-    "optimised, 2 frames": ("0.1", "^"),
-    "RGB-D blur": ("0.6", ""),
-    "flat oracle": ("0.45", ""),
+    "holod": ("#0b5fa5", "o", "-"),
+    "small": ("#3d9be9", ">", "--"),
+    "fast": ("#64b5d9", "<", "-."),
+    "all-in-focus": ("tab:brown", "v", "-"),
+    "layered ASM": ("tab:orange", "s", "-"),
+    "smooth phase": ("tab:green", "P", "-"),
+    "transport of intensity": ("tab:purple", "D", "-"),
+    "optimised, 1 frame": ("tab:pink", "^", "-"),
+    "optimised, 2 frames": ("0.1", "^", "-"),
+    RGBD_BLUR: ("0.6", "", ":"),
+    FLAT_ORACLE: ("0.45", "", "--"),
 }
+FAMILY_COLOURS = ("#b3202c", "tab:olive", "k", "#c2479b", "#12806a", "#7a5c00")
+DEPTH_MARKERS = "*Xdph8"
+# How much white the last depth of a family has.
+MOST_LIGHTER = 0.5
+# Line and marker's filling.
+LOSS_LINES = (("-", "full"), ("--", "none"), (":", "left"), ("-.", "bottom"))
 DPI = 110
 
 
@@ -53,18 +64,19 @@ def write_plots(out: Path, result: dict[str, Any]) -> list[str]:
 
 def pupil_plot(result: dict[str, Any]) -> Figure:
     """PSNR and slope after double phase against s (the paper's figure 16), ours with its 95 % interval."""
-    figure, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    figure, axes = plt.subplots(1, 2, figsize=(10, 5), layout="constrained")
     styles = _styles(_on_every_scene(result))
     for ax, key, label in zip(axes, ("psnr_db", "slope"), ("PSNR, dB", "focus slope"), strict=True):
         for method, style in styles.items():
             rows = _shown_rows(result, method)
-            ax.plot([r["pupil_mm"] for r in rows], [r[key] for r in rows], ms=4, **style, label=method)
+            ax.plot([r["pupil_mm"] for r in rows], [r[key] for r in rows], ms=5.5, **style, label=method)
             if method == "holod" and all(key in r["interval_95"] for r in rows):
                 ends = list(zip(*(r["interval_95"][key] for r in rows), strict=True))
                 ax.fill_between([r["pupil_mm"] for r in rows], *ends, color=style["color"], alpha=0.15, lw=0)
         _label(ax, "pupil s, mm", label)
         ax.set_xticks(sorted({round(p) for p in result["all_pupils_mm"]}))
-    _legend(figure, axes[0])
+    # Room for a whole period of each broken line.
+    _legend(figure, axes[0], handlelength=4.0)
     return figure
 
 
@@ -203,18 +215,51 @@ def _with_scenes(result: dict[str, Any], method: str) -> str:
 
 
 def _styles(methods: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Ours bold and blue, what has no hologram grey and broken, each rival the same in every plot, the rest in turn."""
-    rest = itertools.cycle(zip(("tab:red", "tab:olive", "tab:cyan", "k"), "*<>X", strict=True))
+    """Ours bold and blue, what has no hologram grey and broken, each rival the same in every plot. Of the rest a family
+    has a colour, each depth of it a shade and a marker, each loss a line and a filling: no two methods look alike, with
+    lines or without."""
+    names = sorted(methods, key=lambda method: method in PICTURES)
+    kinds = {name: _kind(name) for name in names if name not in FIXED_STYLES}
+    families = list(dict.fromkeys(family for family, _, _ in kinds.values()))
+    depths = list(dict.fromkeys((family, depth) for family, depth, _ in kinds.values()))
     styles: dict[str, dict[str, Any]] = {}
-    for method in sorted(methods, key=lambda method: method in PICTURES):
-        colour, marker = FIXED_STYLES.get(method) or next(rest)
-        styles[method] = {"color": colour, "marker": marker, "lw": 1.2}
-    if "holod" in styles:
-        styles["holod"].update(lw=2.2, zorder=3)
-    for method, line in zip(PICTURES, (":", "--"), strict=True):
-        if method in styles:
-            styles[method].update(ls=line)
+    taken = set()
+    for name in names:
+        if name in FIXED_STYLES:
+            colour, marker, line = FIXED_STYLES[name]
+            styles[name] = {"color": colour, "marker": marker, "ls": line, "fillstyle": "full", "lw": 1.2}
+            continue
+        family, depth, loss = kinds[name]
+        losses = list(dict.fromkeys(of for other, _, of in kinds.values() if other == family))
+        wanted = (
+            FAMILY_COLOURS[families.index(family) % len(FAMILY_COLOURS)],
+            DEPTH_MARKERS[depths.index((family, depth)) % len(DEPTH_MARKERS)],
+            LOSS_LINES[losses.index(loss) % len(LOSS_LINES)],
+        )
+        others = ((c, m, of) for of, m, c in itertools.product(LOSS_LINES, DEPTH_MARKERS, FAMILY_COLOURS))
+        chosen = next((style for style in (wanted, *others) if style not in taken), wanted)
+        taken.add(chosen)
+        colour, marker, (line, filling) = chosen
+        of_family = [of for other, of in depths if other == family]
+        shade = _lighter(colour, MOST_LIGHTER * of_family.index(depth) / max(1, len(of_family) - 1))
+        styles[name] = {"color": shade, "marker": marker, "ls": line, "fillstyle": filling, "lw": 1.2}
+    for name, of in (("holod", {"lw": 2.2, "zorder": 3}), ("small", {"zorder": 3.1}), ("fast", {"zorder": 3.1})):
+        if name in styles:
+            styles[name].update(of)
     return styles
+
+
+def _lighter(colour: str, share: float) -> str:
+    """A colour of which so much is white."""
+    red, green, blue = (value + share * (1 - value) for value in to_rgb(colour))
+    return to_hex((red, green, blue))
+
+
+def _kind(name: str) -> tuple[str, str, str]:
+    """Family, depth and loss of a network by its name, such as `direct-26-paper`; a name of another form is a family
+    of its own."""
+    found = re.fullmatch(r"(.+?)-(\d+)(?:-(.+))?", name)
+    return (found[1], found[2], found[3] or "") if found else (name, "", "")
 
 
 def _sequence(count: int) -> list[tuple[float, ...]]:
@@ -229,6 +274,6 @@ def _label(ax: Axes, x: str, y: str) -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def _legend(figure: Figure, ax: Axes) -> None:
+def _legend(figure: Figure, ax: Axes, handlelength: float = 2.0) -> None:
     handles, labels = ax.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right center", fontsize=8, frameon=False)
+    figure.legend(handles, labels, loc="outside right center", fontsize=8, frameon=False, handlelength=handlelength)
