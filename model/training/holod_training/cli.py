@@ -34,8 +34,11 @@ SOLVER_STARTS = {"network": OURS, "layered-asm": LAYERED_ASM}
 
 
 def choose_device(name: str) -> torch.device:
+    """Raises ConfigError for a GPU that is not there."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
+    met = name != "cuda" or torch.cuda.is_available()
+    require("--device", name, met, "cpu or auto: PyTorch finds no GPU that it can use")
     if name == "cuda" and "LOCAL_RANK" in os.environ:
         name = f"cuda:{os.environ['LOCAL_RANK']}"
         torch.cuda.set_device(name)

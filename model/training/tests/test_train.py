@@ -495,6 +495,16 @@ def test_a_border_that_leaves_nothing_to_validate_is_refused_before_the_first_st
     assert not (tmp_path / "run").exists()
 
 
+def test_a_gpu_that_is_not_there_is_refused(
+    shards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    command = ["train", "--shards", str(shards), "--out", str(tmp_path / "run"), "--steps", "1", "--device", "cuda"]
+    assert main(command) == 65
+    assert "error: --device: found 'cuda', expected cpu or auto: PyTorch finds no GPU" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_programs_are_told_of_what_has_no_option(shards: Path, tmp_path: Path) -> None:
     for changes, message in (
         ({"log_every": 0}, "log_every: found 0, expected at least 1"),
