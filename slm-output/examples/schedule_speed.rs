@@ -14,7 +14,7 @@ use holod_slm_output::fields::FrameTag;
 use holod_slm_output::laser::{BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow};
 use holod_slm_output::output::{Output, OutputOptions, pacing_config};
 use holod_slm_output::present::{PanelSetup, PresentedRefresh, open_panel};
-use holod_slm_output::schedule::{Evidence, FieldScheduler};
+use holod_slm_output::schedule::{Evidence, FieldScheduler, WindowClock};
 use holod_slm_output::{FrameLayout, Pacer, PanelEncoder, TimestampSource};
 
 const SIZE: Resolution = Resolution { width: 8, height: 8 };
@@ -46,8 +46,9 @@ fn main() -> std::io::Result<()> {
 fn decisions(rig: &Rig) -> (i64, f64) {
     let layout = FrameLayout::new(&rig.panel, SIZE);
     let stall_timeout = TimeNs(2_000_000_000);
-    let mut scheduler = FieldScheduler::new(&rig.panel, layout, &rig.lasers, Evidence::Stamped, stall_timeout)
-        .expect("the rig is sound");
+    let (evidence, clock) = (Evidence::Stamped, WindowClock::Reports);
+    let mut scheduler =
+        FieldScheduler::new(&rig.panel, layout, &rig.lasers, evidence, clock, stall_timeout).expect("the rig is sound");
     let period_ns = scheduler.gate().timing().refresh_period.0;
     let mut armed = 0;
     let mut fields = 0;

@@ -8,7 +8,7 @@ use holod_slm_output::laser::{DarkReason, LaserBox, SimulatedLaser};
 use holod_slm_output::output::pacing_config;
 use holod_slm_output::pacing::Pacer;
 use holod_slm_output::present::{HeadlessPanel, PanelSetup, Presenter, Recorder, ReportFaults, frame_channel};
-use holod_slm_output::schedule::{Evidence, FieldDecision, FieldScheduler};
+use holod_slm_output::schedule::{Evidence, FieldDecision, FieldScheduler, WindowClock};
 use holod_slm_output::{FrameLayout, LevelsFrame, PanelEncoder};
 use holod_tests::counting::{self, Counting};
 
@@ -113,7 +113,8 @@ fn a_frame_from_phase_to_light_takes_no_memory() {
         let mut panel = Recorder::new(Box::new(panel), &flat, 2);
         let stall_timeout = TimeNs(1_000_000_000);
         let mut scheduler =
-            FieldScheduler::new(&rig.panel, layout, &rig.lasers, Evidence::Seen, stall_timeout).unwrap();
+            FieldScheduler::new(&rig.panel, layout, &rig.lasers, Evidence::Seen, WindowClock::Reports, stall_timeout)
+                .unwrap();
         let program = scheduler.program(&rig.panel, &rig.lasers).unwrap();
         let mut laser = SimulatedLaser::new(TimeNs(0));
         laser.program(&program, TimeNs(0)).unwrap();

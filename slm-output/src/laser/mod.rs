@@ -76,7 +76,8 @@ pub enum BoxEvent {
 /// Who starts a lit window.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Trigger {
-    /// The panel's sync: the box lights its programmed windows after each colour frame's start.
+    /// The start of a colour frame, of which the panel's sync wire tells the box, or else the host: the box lights its
+    /// programmed windows after it.
     PanelSync,
     /// The host, which asks for each window.
     Host,

@@ -1,4 +1,7 @@
 //! Was the rule kept? Judged from what was on the panel and from the box's own log of edges, and from nothing else.
+//!
+//! When a field was on the panel is what the panel reported: a report that is wrong, by no more than
+//! [`FieldGate::time_tolerance`](crate::schedule::FieldGate::time_tolerance), is not found here.
 
 use std::fmt;
 

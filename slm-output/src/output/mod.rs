@@ -37,11 +37,11 @@ use self::laser_thread::LaserThread;
 use self::ledger::Ledger;
 use self::panel_thread::PanelThread;
 use self::shared::Shared;
-use crate::laser::{BoxEvent, DarkReason, LaserBox, LaserError, LaserWatch, Trigger};
+use crate::laser::{BoxEvent, DarkReason, LaserBox, LaserError, LaserWatch};
 use crate::levels::PanelEncoder;
 use crate::pacing::PacingConfig;
 use crate::present::{OpenError, PanelLook, PanelSetup, Presenter, Recorder, frame_channel, look};
-use crate::schedule::{Evidence, FieldGate, FieldScheduler};
+use crate::schedule::{Evidence, FieldGate, FieldScheduler, WindowClock};
 
 /// A monotonic clock. The threads read it; nothing below them does.
 pub type Clock = fn() -> TimeNs;
@@ -124,10 +124,11 @@ impl Output {
         let virtual_bench = panel.is_virtual() && laser.is_simulated();
         // A box with a wire to the panel's sync times its own windows, and in channel-packed mode the panel's own
         // sequence says which colour each of them is for: that frames go by is all that must be known here.
-        let wired =
-            !panel.is_virtual() && laser.capability().sync_wire && FieldGate::trigger(&rig.panel) == Trigger::PanelSync;
+        let window_clock = WindowClock::of(&rig.panel, laser.capability());
+        let wired = !panel.is_virtual() && laser.capability().sync_wire && window_clock == WindowClock::Panel;
         let evidence = if virtual_bench || wired { Evidence::Seen } else { Evidence::Stamped };
-        let scheduler = FieldScheduler::new(&rig.panel, flat.layout(), &rig.lasers, evidence, options.stall_timeout)?;
+        let (layout, stall_timeout) = (flat.layout(), options.stall_timeout);
+        let scheduler = FieldScheduler::new(&rig.panel, layout, &rig.lasers, evidence, window_clock, stall_timeout)?;
         let program = scheduler.program(&rig.panel, &rig.lasers)?;
         laser.dark(DarkReason::Asked, clock())?;
         laser.program(&program, clock())?;

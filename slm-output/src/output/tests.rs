@@ -26,7 +26,7 @@ const T_FIRST: TimeNs = TimeNs(10 * MS);
 
 fn scheduler(rig: &Rig, evidence: Evidence) -> FieldScheduler {
     let layout = FrameLayout::new(&rig.panel, SIZE);
-    FieldScheduler::new(&rig.panel, layout, &rig.lasers, evidence, TimeNs(500 * MS)).unwrap()
+    FieldScheduler::new(&rig.panel, layout, &rig.lasers, evidence, WindowClock::Reports, TimeNs(500 * MS)).unwrap()
 }
 
 fn rig(mode: PanelMode) -> Rig {

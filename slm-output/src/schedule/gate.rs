@@ -4,12 +4,36 @@ use holod_calibration::rig::{Lasers, Panel, PanelMode};
 use holod_calibration::{PerColour, TimeNs};
 
 use super::ShownField;
-use crate::laser::{FieldWindow, LaserError, LaserProgram, LitWindow, Trigger};
+use super::refreshes::PERIOD_TOLERANCE;
+use crate::fields::FIELDS;
+use crate::laser::{Capability, FieldWindow, LaserError, LaserProgram, LitWindow, Trigger};
 use crate::present::PanelTiming;
 
 /// A report may lie off the panel's rhythm by this much whatever the rig says: display controllers stamp to the
 /// microsecond, and rounding to whole scan lines is below it.
 const TOLERANCE_MIN: TimeNs = TimeNs(20_000);
+
+/// What a window's place on the panel depends on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum WindowClock {
+    /// The reports: the box is told of each window, or of each colour frame's start, by them.
+    Reports,
+    /// The panel itself, by a wire from its sync output to the box or by hardware of its own that gates the lasers: the
+    /// reports only say that the panel runs.
+    Panel,
+}
+
+impl WindowClock {
+    /// That of a box which can do `capability` over `panel`.
+    pub fn of(panel: &Panel, capability: Capability) -> Self {
+        // A box that cannot gate single fields is lit over a panel of several colours only where that gates them.
+        let by_panel = capability.sync_wire || !capability.gates_fields;
+        match FieldGate::trigger(panel) {
+            Trigger::PanelSync if by_panel => Self::Panel,
+            Trigger::PanelSync | Trigger::Host => Self::Reports,
+        }
+    }
+}
 
 /// Cuts a window out of each colour field: after the panel's settle time and the laser's on delay, and never past the
 /// field's end.
@@ -50,7 +74,8 @@ impl FieldGate {
         Ok(Self { timing, delay, width: lasers.width.min(room), settle: panel.settle })
     }
 
-    /// Who starts the windows: the panel's own sync where its sequencer shows the colours of a refresh, else the host.
+    /// What starts the windows: a colour frame's start where the panel's own sequencer shows the colours of a refresh,
+    /// else the host, one by one. Who tells the box of that start, a wire or the host, is [`WindowClock`]'s matter.
     pub fn trigger(panel: &Panel) -> Trigger {
         match panel.mode {
             PanelMode::ChannelPacked => Trigger::PanelSync,
@@ -60,18 +85,20 @@ impl FieldGate {
 
     /// How far the reported time of a refresh may be wrong without light where it must not be.
     ///
-    /// Where the host starts the windows that is half of the time that the rig leaves free at both ends of a window, on
-    /// delay and the rest of the field; the other half is for what the rhythm itself is off by. Where the panel's sync
-    /// starts them the reports only say that the panel runs.
-    pub fn time_tolerance(&self, trigger: Trigger) -> TimeNs {
-        match trigger {
-            Trigger::PanelSync => TimeNs(self.timing.refresh_period.0 / 16),
-            Trigger::Host => {
-                let before = self.delay - self.settle;
-                let after = self.timing.field_period - self.delay - self.width;
-                TimeNs(before.min(after).0 / 2).max(TOLERANCE_MIN)
-            }
-        }
+    /// Where windows follow the reports that is half of the time that the rig leaves free at both ends of a window, on
+    /// delay and the rest of the field; the other half is for what the rhythm itself is off by. The windows of a whole
+    /// colour frame that follow one report leave less: the last field's start is off by what the panel's period may be
+    /// off the rig's, twice.
+    pub fn time_tolerance(&self, trigger: Trigger, clock: WindowClock) -> TimeNs {
+        let fields_later = match (clock, trigger) {
+            (WindowClock::Panel, _) => return TimeNs(self.timing.refresh_period.0 / 16),
+            (WindowClock::Reports, Trigger::PanelSync) => FIELDS - 1,
+            (WindowClock::Reports, Trigger::Host) => 0,
+        };
+        let before = self.delay - self.settle;
+        let after = self.timing.field_period - self.delay - self.width;
+        let drift_ns = (self.timing.field_period.0 as f64 * PERIOD_TOLERANCE) as i64 * fields_later as i64;
+        TimeNs((before.min(after).0 - drift_ns) / 2).max(TOLERANCE_MIN)
     }
 
     /// Length of a window.
@@ -174,6 +201,38 @@ mod tests {
                 assert!(programmed.delay + programmed.width <= t_field + gate.timing().field_period);
             }
         }
+    }
+
+    #[test]
+    fn reports_may_be_as_wrong_as_the_rig_leaves_room_for_unless_the_panel_starts_the_windows() {
+        let rig = Rig::default();
+        let roomy = Lasers { on_delay: TimeNs(400_000), width: TimeNs(2_700_000), ..rig.lasers.clone() };
+        let tolerance = |lasers: &Lasers, trigger, clock| {
+            FieldGate::new(&rig.panel, lasers).unwrap().time_tolerance(trigger, clock)
+        };
+        assert_eq!(tolerance(&roomy, Trigger::Host, WindowClock::Reports), TimeNs(200_000));
+        // 0.5 % of two fields of 5.56 ms less.
+        assert_eq!(tolerance(&roomy, Trigger::PanelSync, WindowClock::Reports), TimeNs(172_223));
+        let tight = Lasers { on_delay: TimeNs(0), ..rig.lasers.clone() };
+        assert_eq!(tolerance(&tight, Trigger::PanelSync, WindowClock::Reports), TOLERANCE_MIN);
+        assert_eq!(
+            tolerance(&tight, Trigger::PanelSync, WindowClock::Panel),
+            TimeNs(rig.panel.field_period().0 * 3 / 16)
+        );
+    }
+
+    #[test]
+    fn only_a_wire_or_hardware_of_its_own_lets_the_panel_start_the_windows() {
+        let packed = Rig::default().panel;
+        let sequential = Panel { mode: PanelMode::FieldSequential, ..packed.clone() };
+        let gates = Capability { simulated: false, gates_fields: true, has_heartbeat: true, sync_wire: false };
+        let wired = Capability { sync_wire: true, ..gates };
+        let always_on = Capability { gates_fields: false, ..gates };
+        assert_eq!(WindowClock::of(&packed, gates), WindowClock::Reports);
+        assert_eq!(WindowClock::of(&packed, wired), WindowClock::Panel);
+        assert_eq!(WindowClock::of(&packed, always_on), WindowClock::Panel);
+        assert_eq!(WindowClock::of(&sequential, wired), WindowClock::Reports);
+        assert_eq!(WindowClock::of(&sequential, always_on), WindowClock::Reports);
     }
 
     #[test]

@@ -13,7 +13,7 @@ mod gate;
 mod interlock;
 mod refreshes;
 
-pub use gate::FieldGate;
+pub use gate::{FieldGate, WindowClock};
 pub use interlock::{Evidence, Orders};
 
 use holod_calibration::rig::{Lasers, Panel};
@@ -79,8 +79,8 @@ struct Current {
 impl FieldScheduler {
     /// A scheduler that begins dark.
     ///
-    /// `evidence` is the weakest that is accepted for the time of a refresh, `stall_timeout` the longest time for which
-    /// one frame may stay lit without a newer one.
+    /// `evidence` is the weakest that is accepted for the time of a refresh, `clock` what the windows' places depend
+    /// on, `stall_timeout` the longest time for which one frame may stay lit without a newer one.
     ///
     /// # Errors
     /// As [`FieldGate::new`].
@@ -89,14 +89,16 @@ impl FieldScheduler {
         layout: FrameLayout,
         lasers: &Lasers,
         evidence: Evidence,
+        clock: WindowClock,
         stall_timeout: TimeNs,
     ) -> Result<Self, LaserError> {
         let gate = FieldGate::new(panel, lasers)?;
         let trigger = FieldGate::trigger(panel);
+        let tolerance = gate.time_tolerance(trigger, clock);
         Ok(Self {
             layout,
             gate,
-            judge: RefreshJudge::new(gate.timing().refresh_period, gate.time_tolerance(trigger), layout.refreshes()),
+            judge: RefreshJudge::new(gate.timing().refresh_period, tolerance, layout.refreshes()),
             interlock: Interlock::new(gate, trigger, evidence, stall_timeout),
             balance: Balance::new(&layout, gate.width()),
             current: None,

@@ -16,7 +16,7 @@ const PHASE_GAIN: f64 = 0.2;
 const PERIOD_GAIN: f64 = 0.02;
 /// A panel's period may be learned to differ from the nominal one by this share, and the intervals may on average lie
 /// off the learned one by as much: beyond, the fields are not as long as the rig says, and nothing is believed.
-const PERIOD_TOLERANCE: f64 = 0.005;
+pub(super) const PERIOD_TOLERANCE: f64 = 0.005;
 /// Share of a new interval's error in their average.
 const BIAS_GAIN: f64 = 0.05;
 /// Share of a new interval in the rate that is shown to people.

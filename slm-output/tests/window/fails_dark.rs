@@ -75,6 +75,8 @@ fn dark_after(server: DisplayServer, lasts: bool, strike: impl FnOnce()) -> Time
     let folder = tempfile::tempdir().unwrap();
     let terminal = SimulatedTerminal::open().unwrap();
     let mut rig = Rig { panel: panel(PanelMode::ChannelPacked), ..Rig::default() };
+    // Copies come up to a millisecond off the rhythm; the windows leave room for that.
+    (rig.panel.settle, rig.lasers.on_delay, rig.lasers.width) = (TimeNs(500_000), TimeNs(2_000_000), TimeNs(1_000_000));
     rig.lasers.driver = LaserDriver::Serial { path: terminal.path().to_owned(), sync_wire: false };
     let log = File::create(folder.path().join("box.csv")).unwrap();
     std::thread::spawn(move || {
