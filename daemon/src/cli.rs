@@ -71,7 +71,11 @@ pub enum Command {
     /// Look at the laser box, try out that it goes dark by itself, or put the lasers out.
     #[command(subcommand)]
     Laser(LaserCommand),
-    /// Put the lasers out, also while a holod that hangs has their port open.
+    /// Put the lasers out, also while another holod has their port open.
+    ///
+    /// A laser box of holod's protocol tells the holod that drives it, which leaves it dark. Lasers without a heartbeat
+    /// (READYBeam, lasers that take commands in text) tell nobody: a holod that goes on may light them again. End it
+    /// first.
     Dark(LaserArgs),
 }
 

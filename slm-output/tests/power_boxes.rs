@@ -30,6 +30,8 @@ struct Device {
     power_w: String,
     interlock: &'static str,
     mute: bool,
+    /// How long it takes to answer.
+    slow: Duration,
     /// So many commands to go out are not heard.
     deaf_to_off: usize,
     /// A write that a MeCom device refuses.
@@ -64,7 +66,10 @@ impl Bench {
                         let mut device = its_device.lock().unwrap();
                         device.heard.push(text.clone());
                         let answer = answer(&mut device, &text);
-                        if !device.mute {
+                        let (mute, slow) = (device.mute, device.slow);
+                        drop(device);
+                        std::thread::sleep(slow);
+                        if !mute {
                             terminal.write_all(&answer).unwrap();
                         }
                     }
@@ -390,4 +395,71 @@ fn a_ready_beam_of_which_one_colour_does_not_obey_is_dark_in_the_others() {
     let error = make_dark(&driver, host_now).unwrap_err();
     assert!(matches!(error, LaserError::Complaint { .. }), "{error}");
     assert_eq!(bench.with(|device| [1, 2, 3].map(|instance| device.values[&(7006, instance)])), [1, 0, 0]);
+}
+
+/// Set when it goes, also by a failed assertion.
+struct SetAtTheEnd<'a>(&'a AtomicBool);
+
+impl Drop for SetAtTheEnd<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+/// Runs `beside` again and again after `light`, next to a host that asks its device how it is all the while.
+fn beside_a_live_host(driver: &LaserDriver, light: impl Fn() + Send, mut beside: impl FnMut()) {
+    let stop = AtomicBool::new(false);
+    let mut laser = open_laser(&lasers(driver.clone()), host_now).unwrap();
+    laser.program(&program(GREEN), host_now()).unwrap();
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            while !stop.load(Ordering::Relaxed) {
+                // It is found again where its answers were taken away.
+                let _lost = laser.poll(host_now(), &mut |_| ());
+                let _lost = laser.heartbeat(host_now());
+                std::thread::sleep(Duration::from_millis(2));
+            }
+        });
+        let _stop = SetAtTheEnd(&stop);
+        for _ in 0..12 {
+            light();
+            beside();
+        }
+    });
+}
+
+#[test]
+fn lasers_are_put_out_beside_a_host_that_talks_to_them() {
+    let text = cobolt();
+    text.with(|device| device.slow = Duration::from_millis(40));
+    let driver = text_lasers("cobolt", [None, Some(&text), None]);
+    let light = || text.with(|device| device.lit = true);
+    beside_a_live_host(&driver, light, || {
+        make_dark(&driver, host_now).unwrap();
+        assert!(!text.with(|device| device.lit));
+    });
+
+    let beam = ready_beam(1171);
+    beam.with(|device| device.slow = Duration::from_millis(20));
+    let driver = LaserDriver::ReadyBeam { path: beam.path.clone(), full_power_uw: PerColour([40_000; 3]) };
+    let light = || beam.with(|device| device.values.extend([((7006, 3), 1)]));
+    beside_a_live_host(&driver, light, || {
+        make_dark(&driver, host_now).unwrap();
+        assert_eq!(beam.with(|device| device.values[&(7006, 3)]), 0);
+    });
+}
+
+#[test]
+fn a_laser_that_was_recognised_is_told_to_go_out_whether_or_not_it_answers() {
+    let bench = cobolt();
+    bench.with(|device| device.deaf_to_off = 2);
+    let driver = text_lasers("cobolt", [None, Some(&bench), None]);
+    make_dark(&driver, host_now).unwrap();
+    assert!(!bench.with(|device| device.lit), "told again");
+    // Whatever else is at the port is asked what it is, and told nothing.
+    let stranger = Bench::plug_in(b'\r', |_, _| b"P1,1,1000,L,3.1,0.9*00\r\n".to_vec());
+    let driver = text_lasers("cobolt", [None, Some(&stranger), None]);
+    let error = make_dark(&driver, host_now).unwrap_err();
+    assert!(matches!(error, LaserError::NotABox { .. }), "{error}");
+    assert!(stranger.heard().iter().all(|line| line == "sn?"), "{:?}", stranger.heard());
 }

@@ -40,7 +40,13 @@ pub(super) fn dark(args: &LaserArgs) -> Result<(), Failure> {
         return results::print("no laser box on this bench: its simulated lasers ended with the daemon");
     }
     make_dark(driver, host_now).map_err(Failure::because(Exit::Unavailable))?;
-    results::print(&format!("{}: the lasers acknowledged that they are dark", ports(driver)))
+    let who_knows = match driver {
+        LaserDriver::Simulated | LaserDriver::Serial { .. } => "",
+        LaserDriver::ReadyBeam { .. } | LaserDriver::Text { .. } => {
+            "; a holod that still drives them does not know of it and may light them again: end it"
+        }
+    };
+    results::print(&format!("{}: the lasers acknowledged that they are dark{who_knows}", ports(driver)))
 }
 
 /// The rig that was named, or the built-in one with a laser box at the port that was named.

@@ -30,6 +30,10 @@ const PROGRAM_WAIT: TimeNs = TimeNs(5_000_000_000);
 const DARK_WAIT: TimeNs = TimeNs(450_000_000);
 /// How often the lasers are put out at the end where the device does not say that they are.
 const LAST_TRIES: usize = 3;
+/// How long a device is told to go out beside a program that takes its answers away.
+const BESIDE_PATIENCE: TimeNs = TimeNs(8_000_000_000);
+/// Between two tries of that; no share of [`PROBE_EVERY`], so that not every try meets the other program's question.
+const BESIDE_REST: Duration = Duration::from_millis(37);
 /// Orders and reports on their way.
 const RING: usize = 64;
 
@@ -185,6 +189,41 @@ impl PowerBox {
 /// Fails unless the rig accepts, in words, lasers without a heartbeat.
 pub(super) fn require_acceptance(lasers: &Lasers) -> Result<(), LaserError> {
     if lasers.accept_no_heartbeat { Ok(()) } else { Err(LaserError::NotAccepted) }
+}
+
+/// Puts out the lasers of a device that another program may be speaking to, which takes some of its answers away and
+/// puts its own beside them: the device is asked who it is until it says so, and from then on told to go out until it
+/// acknowledges that, whatever else it says.
+///
+/// # Errors
+/// The last try's, after some seconds; [`LaserError::Line`] and [`LaserError::Open`] at once.
+pub(super) fn put_out_beside<D>(
+    clock: fn() -> TimeNs,
+    open: impl Fn() -> Result<D, LaserError>,
+    recognise: impl Fn(&mut D) -> Result<(), LaserError>,
+    mut put_out: impl FnMut(&mut D) -> Result<(), LaserError>,
+) -> Result<(), LaserError> {
+    let t_end = clock() + BESIDE_PATIENCE;
+    let (mut device, mut recognised) = (None, false);
+    let mut attempt = || {
+        let device = match &mut device {
+            Some(device) => device,
+            none => none.insert(open()?),
+        };
+        if !recognised {
+            recognise(device)?;
+            recognised = true;
+        }
+        put_out(device)
+    };
+    loop {
+        match attempt() {
+            Ok(()) => return Ok(()),
+            Err(final_one @ (LaserError::Line(_) | LaserError::Open { .. })) => return Err(final_one),
+            Err(last) if clock() >= t_end => return Err(last),
+            Err(_) => std::thread::sleep(BESIDE_REST),
+        }
+    }
 }
 
 impl LaserBox for PowerBox {

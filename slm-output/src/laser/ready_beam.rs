@@ -11,12 +11,14 @@ use holod_calibration::{Colour, PerColour, TimeNs};
 
 use super::line_link::Sharing;
 use super::mecom::{Reply, Request, frame, reply};
-use super::power_box::{Conversation, PowerBox, PowerDevice, require_acceptance};
+use super::power_box::{Conversation, PowerBox, PowerDevice, put_out_beside, require_acceptance};
 use super::{LaserBox, LaserError};
 
 const BAUD: u32 = 57_600;
 /// A sound device answers within some tens of milliseconds.
 const ANSWER_WAIT: TimeNs = TimeNs(300_000_000);
+/// The same beside another program, so that the two do not ask again at the same moments for ever.
+const BESIDE_ANSWER_WAIT: TimeNs = TimeNs(130_000_000);
 /// How often a frame is sent before the device is taken for mute.
 const TRIES: usize = 2;
 
@@ -33,6 +35,9 @@ const POWER_PERCENT: u16 = 7013;
 struct ReadyBeam {
     port: Conversation,
     sequence: u16,
+    /// It has said what it is.
+    recognised: bool,
+    answer_wait: TimeNs,
     /// Power at the panel at 100 %.
     full_power_uw: PerColour<u32>,
 }
@@ -49,28 +54,44 @@ pub(super) fn open(
     clock: fn() -> TimeNs,
 ) -> Result<Box<dyn LaserBox>, LaserError> {
     require_acceptance(lasers)?;
-    let mut device =
-        ReadyBeam { port: Conversation::open(path, BAUD, Sharing::Alone, clock)?, sequence: 0, full_power_uw };
+    let port = Conversation::open(path, BAUD, Sharing::Alone, clock)?;
+    let mut device = ReadyBeam { port, sequence: 0, recognised: false, answer_wait: ANSWER_WAIT, full_power_uw };
     device.recognise()?;
     Ok(Box::new(PowerBox::new(device, lasers, clock)?))
 }
 
-/// Puts out the lasers of the device at `path`, whoever else has its port open.
+/// Puts out the lasers of the device at `path`, whoever else has its port open and speaks to it. A holod that drives it
+/// does not know of that and lights them again the next time that it arms it.
 ///
 /// # Errors
-/// As [`open`].
+/// As [`open`], after some seconds.
 pub(super) fn make_dark(path: &Path, clock: fn() -> TimeNs) -> Result<(), LaserError> {
-    let port = Conversation::open(path, BAUD, Sharing::Beside, clock)?;
-    let mut device = ReadyBeam { port, sequence: 0x8000, full_power_uw: PerColour([1; 3]) };
-    device.recognise()?;
-    device.set_lit(PerColour([false; 3]))
+    let open = || {
+        let port = Conversation::open(path, BAUD, Sharing::Beside, clock)?;
+        Ok(ReadyBeam {
+            port,
+            sequence: 0x8000,
+            recognised: false,
+            answer_wait: BESIDE_ANSWER_WAIT,
+            full_power_uw: PerColour([1; 3]),
+        })
+    };
+    let mut left = Colour::ALL.to_vec();
+    put_out_beside(clock, open, ReadyBeam::recognise, |device| {
+        let mut failed = None;
+        left.retain(|&colour| device.switch(colour, false).map_err(|why| failed.get_or_insert(why)).is_err());
+        failed.map_or(Ok(()), Err)
+    })
 }
 
 impl ReadyBeam {
     fn recognise(&mut self) -> Result<(), LaserError> {
         let expected = "a MeCom device of type 1171 (READYBeam)";
         let found = match self.ask(Request::Read { parameter: DEVICE_TYPE, instance: 1 })? {
-            Reply::Value(READY_BEAM) => return Ok(()),
+            Reply::Value(READY_BEAM) => {
+                self.recognised = true;
+                return Ok(());
+            }
             Reply::Value(other) => format!("device type {other}"),
             other => format!("{other:?}"),
         };
@@ -83,12 +104,13 @@ impl ReadyBeam {
             self.sequence = self.sequence.wrapping_add(1);
             let sent = frame(self.sequence, request);
             self.port.send(sent.as_bytes())?;
-            let t_end = self.port.t_end(ANSWER_WAIT);
+            let t_end = self.port.t_end(self.answer_wait);
             while let Some(line) = self.port.line_until(t_end)? {
                 match reply(&sent, &line) {
                     Some(reply) => return Ok(reply),
-                    // A frame that was damaged, or the answer to somebody else's; whatever is no frame is a stranger's.
-                    None if line.starts_with(b"!") => {}
+                    // A frame that was damaged, the answer to somebody else's, or what another program left of one;
+                    // from a device that has not said what it is, whatever is no frame is a stranger's.
+                    None if line.starts_with(b"!") || self.recognised => {}
                     None => {
                         stranger = Some(String::from_utf8_lossy(&line).chars().take(40).collect::<String>());
                         break;
@@ -96,7 +118,7 @@ impl ReadyBeam {
                 }
             }
         }
-        let waited_ms = ANSWER_WAIT.0 / 1_000_000 * TRIES as i64;
+        let waited_ms = self.answer_wait.0 / 1_000_000 * TRIES as i64;
         Err(match stranger {
             Some(found) => LaserError::NotABox { path: self.port.path(), found, expected: "a MeCom frame" },
             None => LaserError::NoAnswer { command: "MeCom frame", waited_ms },

@@ -9,7 +9,7 @@ use holod_calibration::rig::{Lasers, Question, TextLaserProfile};
 use holod_calibration::{Colour, PerColour, TimeNs};
 
 use super::line_link::Sharing;
-use super::power_box::{Conversation, PowerBox, PowerDevice, require_acceptance};
+use super::power_box::{Conversation, PowerBox, PowerDevice, put_out_beside, require_acceptance};
 use super::{LaserBox, LaserError};
 
 /// How long an acknowledgement after the answer to a question is waited for, so that it is not taken for the next
@@ -56,14 +56,14 @@ pub(super) fn open(
     Ok(Box::new(PowerBox::new(open, lasers, clock)?))
 }
 
-/// Puts out the laser at `path`, whoever else has its port open.
+/// Puts out the laser at `path`, whoever else has its port open and speaks to it. A holod that drives it does not know
+/// of that and lights it again the next time that it arms it.
 ///
 /// # Errors
-/// As [`open`].
+/// As [`open`], after some seconds.
 pub(super) fn make_dark(profile: &TextLaserProfile, path: &Path, clock: fn() -> TimeNs) -> Result<(), LaserError> {
-    let mut laser = TextLaser::open(profile, path, Sharing::Beside, clock)?;
-    laser.recognise()?;
-    laser.put_out()
+    let open = || TextLaser::open(profile, path, Sharing::Beside, clock);
+    put_out_beside(clock, open, TextLaser::recognise, TextLaser::put_out)
 }
 
 impl TextLaser {
