@@ -40,6 +40,9 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
     let figures = Figures { tracker_link, ..watch.figures(&down.counts, host_now()) };
     watch.feed = None;
     let recorded = watch.tracker.recording();
+    if !down.panel_ended {
+        tracing::error!("the panel's thread has not ended: does the display server or the graphics driver hang?");
+    }
     if let Some(why) = &lasers_not_dark
         && (ended.is_err() || observed.is_err() || !matches!(frame_loop, Some(Ok(Ok(())))))
     {

@@ -13,12 +13,13 @@ use super::shared::{DARK, NOT_YET, OutputCounts, Shared, code_of, dark_request, 
 use super::{Clock, SLEEP_MAX};
 use crate::fields::LevelsFrame;
 use crate::laser::DarkReason;
-use crate::present::Recorder;
 
 /// How long shutdown waits for the lasers' acknowledgement.
 const DARK_WAIT: TimeNs = TimeNs(500_000_000);
 /// Boxes that are asked twice take a second.
 const KEEP_DARK_WAIT: TimeNs = TimeNs(2_000_000_000);
+/// How long the panel's thread is waited for at the end: a mode may be set once more, a display server may hang.
+const PANEL_WAIT: TimeNs = TimeNs(3_000_000_000);
 /// How long a panic waits for it.
 const PANIC_WAIT: TimeNs = TimeNs(20_000_000);
 
@@ -29,7 +30,10 @@ pub struct ShutdownReport {
     pub lasers_dark: bool,
     /// The flat pattern was on the panel before the threads ended.
     pub flat_presented: bool,
-    /// Levels of the frames that were shown and kept, by slot.
+    /// The panel's thread has ended and closed the panel. One that hangs, as where its display server does, is left to
+    /// the end of the process.
+    pub panel_ended: bool,
+    /// Levels of the frames that were shown and kept, by slot; none where the panel's thread has not ended.
     pub kept: Vec<Option<LevelsFrame>>,
     /// Counters at the end.
     pub counts: OutputCounts,
@@ -37,7 +41,7 @@ pub struct ShutdownReport {
 
 #[derive(Debug)]
 pub(super) struct Threads {
-    pub(super) panel: JoinHandle<Recorder>,
+    pub(super) panel: JoinHandle<Vec<Option<LevelsFrame>>>,
     pub(super) laser: JoinHandle<()>,
 }
 
@@ -85,7 +89,8 @@ impl OutputControl {
     }
 
     /// Ends the output in order: lasers dark and acknowledged, flat pattern on the panel, threads joined. The waits for
-    /// darkness and for the flat pattern are bounded; a box that does not answer is left to its heartbeat timeout.
+    /// darkness, the flat pattern and the panel's end are bounded; a box that does not answer is left to its heartbeat
+    /// timeout.
     pub fn shutdown(mut self) -> ShutdownReport {
         self.end()
     }
@@ -110,11 +115,13 @@ impl OutputControl {
         let flat_presented = wait_for(&|| flat() || shared.panel_lost.load(Ordering::Acquire), flat_patience) && flat();
         shared.stop.store(true, Ordering::Release);
         ring(&self.doorbell);
-        let mut report =
-            ShutdownReport { lasers_dark, flat_presented, kept: Vec::new(), counts: OutputCounts::default() };
+        let (kept, counts) = (Vec::new(), OutputCounts::default());
+        let mut report = ShutdownReport { lasers_dark, flat_presented, panel_ended: true, kept, counts };
         if let Some(Threads { panel, laser }) = self.threads.take() {
-            if let Ok(recorder) = panel.join() {
-                report.kept = recorder.into_kept();
+            report.panel_ended = wait_for(&|| panel.is_finished(), PANEL_WAIT);
+            if report.panel_ended {
+                // A panic over there has been reported by the panic hook.
+                report.kept = panel.join().unwrap_or_default();
             }
             laser.thread().unpark();
             report.lasers_dark &= laser.join().is_ok();

@@ -12,6 +12,7 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use super::port::PresentReport;
 use super::shared::{Shared, count};
 use super::{Clock, SLEEP_MAX};
+use crate::fields::LevelsFrame;
 use crate::present::{FrameSource, PanelFault, PresentedRefresh, Presenter, Recorder};
 
 /// How often a lost panel is tried again.
@@ -50,7 +51,8 @@ pub(super) struct PanelThread {
 }
 
 impl PanelThread {
-    pub(super) fn run(mut self) -> Recorder {
+    /// Runs until it is told to stop and closes the panel; the levels that were kept.
+    pub(super) fn run(mut self) -> Vec<Option<LevelsFrame>> {
         let mut lost = None;
         while !self.shared.stop.load(Ordering::Acquire) {
             if self.shared.flat_wanted.load(Ordering::Acquire) {
@@ -63,7 +65,8 @@ impl PanelThread {
             let t_next = lost.map_or_else(|| self.panel.t_next(), |lost: Lost| lost.t_retry);
             self.sleep_until(t_next, lost.is_none());
         }
-        self.panel
+        // The panel is closed in this thread: a display server that hangs may keep it from that.
+        self.panel.into_kept()
     }
 
     fn tick(&mut self) -> Result<(), PanelFault> {

@@ -6,6 +6,7 @@
 
 use std::fs::{self, File};
 use std::os::fd::BorrowedFd;
+use std::sync::mpsc;
 use std::time::Duration;
 
 use holod_calibration::rig::{LaserDriver, PanelMode, Rig};
@@ -168,4 +169,46 @@ fn a_monitor_that_goes_and_a_window_that_is_covered_are_darkness() {
     assert_dark_in_time("monitor switched off", after(true, |desktop| desktop.switch_off(PANEL)));
     // The window is opened anew, above what covers it.
     assert_dark_in_time("window covered", after(false, |desktop| cover(desktop, false)));
+}
+
+/// What `work` comes to on a thread of its own, which is left to itself after `patience`.
+fn within<T: Send + 'static>(patience: Duration, work: impl FnOnce() -> T + Send + 'static) -> Option<T> {
+    let (done, result) = mpsc::channel();
+    std::thread::spawn(move || done.send(work()));
+    result.recv_timeout(patience).ok()
+}
+
+#[test]
+fn an_x_server_that_hangs_keeps_no_output_from_its_end_and_opens_no_window() {
+    let desktop = Desktop::with_two_monitors();
+    let server = DisplayServer::X11(desktop.name.clone());
+    let rig = Rig { panel: panel(PanelMode::ChannelPacked), ..Rig::default() };
+    let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
+    let setup = PanelSetup::new(&rig.panel, &encoder);
+    let start = || {
+        let window = WindowPanel::open(server.clone(), Road::Copies, &named(PANEL), &setup).unwrap();
+        let laser = open_laser(&rig.lasers, host_now).unwrap();
+        Output::start(&rig, &encoder, Box::new(window), laser, OutputOptions::default(), host_now).unwrap()
+    };
+    let well = within(Duration::from_secs(30), {
+        let output = start();
+        move || output.control.shutdown()
+    });
+    let well = well.expect("it ends");
+    assert!(well.panel_ended && well.flat_presented && well.lasers_dark);
+
+    let output = start();
+    desktop.suspend();
+    // Its watcher has asked the server something by then, and the panel's thread has missed its refreshes.
+    std::thread::sleep(Duration::from_secs(2));
+    let down = within(Duration::from_secs(8), move || output.control.shutdown());
+    let down = down.expect("the output ends beside a server that hangs");
+    assert!(down.lasers_dark && !down.flat_presented);
+
+    let opened = within(Duration::from_secs(20), {
+        let setup = setup.clone();
+        move || WindowPanel::open(server, Road::Copies, &named(PANEL), &setup).map(|_| ())
+    });
+    let refused = opened.expect("nobody waits for the server for ever").expect_err("no window").to_string();
+    assert!(refused.contains("has not answered"), "{refused}");
 }

@@ -153,6 +153,12 @@ impl Desktop {
         self.server.wait().expect("it ends");
     }
 
+    /// Lets the server hang: it keeps its connections and answers nobody.
+    pub(crate) fn suspend(&self) {
+        let server = rustix::process::Pid::from_child(&self.server);
+        rustix::process::kill_process(server, rustix::process::Signal::STOP).expect("the server is there");
+    }
+
     /// Runs a program that finds this desktop in its environment.
     pub(crate) fn run(&self, program: &str, arguments: &[&str]) -> Child {
         Command::new(program)

@@ -21,9 +21,11 @@ mod watch;
 mod wayland;
 mod x11;
 
-use std::io;
 use std::os::fd::BorrowedFd;
 use std::path::{Path, PathBuf};
+use std::sync::mpsc;
+use std::time::Duration;
+use std::{fmt, io};
 
 use holod_calibration::rig::{Packing, PanelMode};
 use holod_calibration::{TimeNs, host_now};
@@ -62,6 +64,15 @@ impl DisplayServer {
     }
 }
 
+impl fmt::Display for DisplayServer {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Wayland(socket) => write!(f, "compositor {}", socket.display()),
+            Self::X11(display) => write!(f, "X server {display}"),
+        }
+    }
+}
+
 /// Why the panel's window could not be opened.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "the messages say what the fields are")]
@@ -74,6 +85,13 @@ pub enum WindowError {
     /// It failed.
     #[error("{server}: {reason}")]
     Server { server: String, reason: String },
+    /// It says nothing.
+    #[error("{server} has not answered for {waited_s} s: does it hang?")]
+    Silent {
+        server: String,
+        /// How long it was waited for, seconds.
+        waited_s: u64,
+    },
     /// It is one that draws to another.
     #[error(
         "X server {display} is Xwayland, which hides how its pixels are scaled; set WAYLAND_DISPLAY, so that holod speaks to the compositor itself"
@@ -180,6 +198,8 @@ struct Wanted {
     panel: PanelMonitor,
 }
 
+/// How long a display server may take to bring a window up, its graphics driver included.
+const OPEN_WAIT: Duration = Duration::from_secs(10);
 /// How long the first picture may take to come on the monitor.
 const FIRST_PICTURE: TimeNs = TimeNs(1_000_000_000);
 /// A picture that has been on its way for this long is stuck.
@@ -241,11 +261,32 @@ struct OnItsWay {
 }
 
 impl WindowPanel {
-    /// Opens the window on `server` and shows the flat pattern.
+    /// Opens the window on `server` and shows the flat pattern. A server that hangs is waited for some seconds; the
+    /// thread that opens the window is then left to itself.
     ///
     /// # Errors
     /// [`WindowError`].
     pub fn open(server: DisplayServer, road: Road, spec: &WindowSpec, setup: &PanelSetup) -> Result<Self, WindowError> {
+        let (done, opened) = mpsc::channel();
+        let silent = WindowError::Silent { server: server.to_string(), waited_s: OPEN_WAIT.as_secs() };
+        let (spec, setup) = (spec.clone(), setup.clone());
+        let open = move || {
+            // Whoever asked may have gone.
+            let _late = done.send(Self::open_waiting(server, road, &spec, &setup));
+        };
+        std::thread::Builder::new().name("holod-window-up".into()).spawn(open).map_err(WindowError::System)?;
+        match opened.recv_timeout(OPEN_WAIT) {
+            Ok(opened) => opened,
+            Err(_) => Err(silent),
+        }
+    }
+
+    fn open_waiting(
+        server: DisplayServer,
+        road: Road,
+        spec: &WindowSpec,
+        setup: &PanelSetup,
+    ) -> Result<Self, WindowError> {
         let PanelSetup { panel, flat } = setup;
         let layout = flat.layout();
         if layout.packing.channel_bits() != FORMAT.channel_bits() {

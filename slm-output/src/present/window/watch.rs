@@ -75,14 +75,18 @@ pub(super) struct Watched {
     completions: Consumer<Completion>,
     reports_completions: bool,
     shared: Arc<Shared>,
+    /// The watcher's connection, where it waits for answers on it.
+    socket: Option<OwnedFd>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Watched {
     /// Starts the watcher: `watch` runs on a thread of its own and returns what is wrong, or when it is ordered to end.
+    /// Where it waits for a display server's answers, its end shuts their `socket`: one that hangs answers never.
     pub(super) fn start(
         monitor: Monitor,
         reports_completions: bool,
+        socket: Option<OwnedFd>,
         watch: impl FnOnce(&mut Watcher) -> PanelFault + Send + 'static,
     ) -> Result<Self, WindowError> {
         let descriptor = || eventfd(0, EventfdFlags::NONBLOCK | EventfdFlags::CLOEXEC);
@@ -101,7 +105,7 @@ impl Watched {
                 watcher.shared.tell(fault);
             })
             .map_err(WindowError::System)?;
-        Ok(Self { monitor, completions, reports_completions, shared, thread: Some(thread) })
+        Ok(Self { monitor, completions, reports_completions, shared, socket, thread: Some(thread) })
     }
 
     /// Where the window is.
@@ -142,6 +146,10 @@ impl Watched {
 impl Drop for Watched {
     fn drop(&mut self) {
         ring(&self.shared.order);
+        if let Some(socket) = &self.socket {
+            // Where it is shut already, nobody waits on it.
+            let _shut = rustix::net::shutdown(socket, rustix::net::Shutdown::Both);
+        }
         if let Some(thread) = self.thread.take() {
             // A panic over there has been reported by the panic hook.
             let _ended = thread.join();

@@ -90,7 +90,7 @@ pub(super) fn open(socket: &Path, wanted: &Wanted, pictures: usize) -> Result<Op
         serial: 0,
     };
     let (shown, wanted) = (monitor.clone(), wanted.clone());
-    let watched = Watched::start(monitor, true, move |watcher| {
+    let watched = Watched::start(monitor, true, None, move |watcher| {
         let fault = watch(queue, view, &shown, &wanted, watcher).unwrap_or(PanelFault::WindowLost);
         // No monitor may show the pattern until the panel is back.
         surface.attach(None, 0, 0);

@@ -63,7 +63,9 @@ pub(super) fn open(display: &str, wanted: &Wanted, road: Road, pictures: usize) 
     };
     let (shown, wanted) = (monitor.clone(), wanted.clone());
     let completions = view.completions;
-    let watched = Watched::start(monitor, completions, move |watcher| watch(view, &shown, &wanted, watcher))?;
+    let socket = view.connection.stream().as_fd().try_clone_to_owned().map_err(WindowError::System)?;
+    let watch = move |watcher: &mut Watcher| watch(view, &shown, &wanted, watcher);
+    let watched = Watched::start(monitor, completions, Some(socket), watch)?;
     Ok(Opened { draw, watched })
 }
 
