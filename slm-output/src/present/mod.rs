@@ -109,6 +109,9 @@ pub enum PanelFault {
     /// The seat that the display belongs to shows another session.
     #[error("the display was switched to another session: switch back to holod's terminal")]
     SwitchedAway,
+    /// The link to the panel fell below what its mode needs, and the mode must be set once more.
+    #[error("the link to the panel failed: check the cable; holod sets the panel's mode once more")]
+    LinkBad,
     /// The graphics device is gone or was reset.
     #[error("the graphics device was lost")]
     DeviceLost,

@@ -17,7 +17,7 @@ use super::find::{NotFound, SYS_CLASS_DRM, SeenConnector, choose, seen_connector
 use super::hotplug::Hotplug;
 use super::mode;
 use super::seat::Seat;
-use super::settings::{self, Change};
+use super::settings::{self, Change, LinkStatus};
 use super::timing::FlipStamp;
 
 /// On the screen, on its way there, being written, and one more: a driver may still read the last picture a while after
@@ -48,6 +48,7 @@ pub(crate) struct Link {
     pipe: Pipe,
     mode: Mode,
     buffer_property: property::Handle,
+    link_status: Option<LinkStatus>,
     pub(crate) buffers: [ScanBuffer; BUFFERS],
     changes: Vec<Change>,
     checks: Vec<DisplayCheck>,
@@ -73,12 +74,12 @@ impl Link {
         let wake = wake_fd(&card, hotplug.as_ref(), seat).map_err(|why| card.refused("waiting for it")(why.into()))?;
         let node = seen.card.file_name().map(|name| name.as_encoded_bytes().to_vec()).unwrap_or_default();
         let ready = Ready::make(&card, &seen, wanted, &buffers[0])?;
-        let Ready { pipe, mode, buffer_property, changes, mut checks } = ready;
+        let Ready { pipe, mode, buffer_property, link_status, changes, mut checks } = ready;
         checks.push(match hotplug {
             Some(_) => DisplayCheck::equal("hotplug messages", "heard", "heard"),
             None => DisplayCheck::unverified("hotplug messages", "the kernel's socket does not open", "heard"),
         });
-        Ok(Self { card, node, seen, pipe, mode, buffer_property, buffers, changes, checks, hotplug, wake })
+        Ok(Self { card, node, seen, pipe, mode, buffer_property, link_status, buffers, changes, checks, hotplug, wake })
     }
 
     /// Makes the connector ready again after mastership or the monitor had been lost; like [`Link::open`], but the card
@@ -100,6 +101,7 @@ impl Link {
         let ready = Ready::make(&self.card, &seen, wanted, &self.buffers[0])?;
         let hotplug = self.checks.pop();
         (self.seen, self.pipe, self.mode, self.buffer_property) = (seen, ready.pipe, ready.mode, ready.buffer_property);
+        self.link_status = ready.link_status;
         self.checks = ready.checks;
         self.checks.extend(hotplug);
         Ok(())
@@ -148,6 +150,15 @@ impl Link {
     pub(crate) fn is_connected(&self) -> Result<bool, Errno> {
         let connector: connector::Handle = self.pipe.connector;
         self.card.is_connected(connector).map_err(|why| Errno::from_io_error(&why).unwrap_or(Errno::IO))
+    }
+
+    /// Whether the driver still calls the link to the monitor good, as far as it says. Takes memory: it is asked after
+    /// hotplug messages only.
+    pub(crate) fn is_good(&self) -> Result<bool, Errno> {
+        let Some(status) = self.link_status else { return Ok(true) };
+        let values = self.card.get_properties(self.pipe.connector);
+        let values = values.map_err(|why| Errno::from_io_error(&why).unwrap_or(Errno::IO))?;
+        Ok(status.is_good(values.iter().map(|(&property, &value)| (property, value))))
     }
 
     /// The stamps of the connector's flips since the last call, in order. Takes no memory.
@@ -220,6 +231,7 @@ struct Ready {
     pipe: Pipe,
     mode: Mode,
     buffer_property: property::Handle,
+    link_status: Option<LinkStatus>,
     changes: Vec<Change>,
     checks: Vec<DisplayCheck>,
 }
@@ -257,7 +269,8 @@ impl Ready {
         // The mode's own reference to it stays.
         let _ = card.destroy_property_blob(blob);
         set.map_err(card.refused("setting the mode"))?;
-        let mut ready = Self { pipe, mode, buffer_property, changes, checks: Vec::new() };
+        let link_status = LinkStatus::of(&before.connector);
+        let mut ready = Self { pipe, mode, buffer_property, link_status, changes, checks: Vec::new() };
         ready.checks = ready.read_back(card, seen, wanted)?;
         let wrong: Vec<_> = ready.checks.iter().filter(|check| check.verdict == Verdict::Wrong).cloned().collect();
         if !wrong.is_empty() {

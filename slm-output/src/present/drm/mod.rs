@@ -173,6 +173,7 @@ impl DrmPanel {
         match self.link()?.hotplug() {
             Uevent::Removed => return Err(PanelFault::DeviceLost),
             Uevent::Changed if !self.link()?.is_connected().map_err(fault_of)? => return Err(PanelFault::Unplugged),
+            Uevent::Changed if !self.link()?.is_good().map_err(fault_of)? => return Err(PanelFault::LinkBad),
             Uevent::Changed | Uevent::Other => {}
         }
         for &stamp in self.link()?.flips().map_err(fault_of)?.stamps() {

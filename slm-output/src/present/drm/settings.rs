@@ -68,6 +68,27 @@ const SETTINGS: &[Setting] = &[
     setting("blending", On::Plane, "pixel blend mode", Want::Named("None"), false),
 ];
 
+/// Where a connector's driver says whether the link still carries the mode: it may have trained it anew, to less than
+/// that, and shows nothing then until the mode is set once more.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct LinkStatus {
+    property: property::Handle,
+    good: u64,
+}
+
+impl LinkStatus {
+    /// That of the connector with `properties`, where its driver has one.
+    pub(crate) fn of(properties: &Properties) -> Option<Self> {
+        let (info, _) = properties.find("link-status")?;
+        Some(Self { property: info.handle(), good: wanted(info, Want::Named("Good"), 0)? })
+    }
+
+    /// Whether the connector's `values` say that the link is good, or nothing of it.
+    pub(crate) fn is_good(self, values: impl IntoIterator<Item = (property::Handle, u64)>) -> bool {
+        values.into_iter().all(|(property, value)| property != self.property || value == self.good)
+    }
+}
+
 fn of_part(properties: &PipeProperties, on: On) -> &Properties {
     match on {
         On::Connector => &properties.connector,
@@ -201,4 +222,18 @@ pub(crate) fn read_back(properties: &PipeProperties, channel_bits: u8) -> Vec<Di
         checks.push(DisplayCheck::unverified("dithering", "the driver does not say", "off"));
     }
     checks
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_links_own_property_says_that_it_is_bad() {
+        let handle = |raw| drm::control::from_u32::<property::Handle>(raw).unwrap();
+        let status = LinkStatus { property: handle(7), good: 0 };
+        assert!(status.is_good([(handle(3), 1), (handle(7), 0)]));
+        assert!(status.is_good([(handle(3), 1)]), "a driver that does not say");
+        assert!(!status.is_good([(handle(3), 0), (handle(7), 1)]));
+    }
 }
