@@ -17,6 +17,7 @@ use drm::{ClientCapability, Device, DriverCapability, VblankWaitFlags, VblankWai
 use holod_calibration::Resolution;
 use memmap2::{MmapMut, MmapOptions};
 use rustix::fs::OFlags;
+use rustix::io::Errno;
 
 use super::error::DrmError;
 use super::find::SeenConnector;
@@ -114,7 +115,8 @@ impl Card {
 
     /// Asks the monitor at `connector` anew; takes no memory.
     pub(crate) fn is_connected(&self, connector: connector::Handle) -> io::Result<bool> {
-        let found = drm_ffi::mode::get_connector(self.as_fd(), connector.into(), None, None, None, None, true)?;
+        let ask = || drm_ffi::mode::get_connector(self.as_fd(), connector.into(), None, None, None, None, true);
+        let found = uninterrupted(ask)?;
         Ok(connector::State::from(found.connection) != connector::State::Disconnected)
     }
 
@@ -346,16 +348,43 @@ pub(crate) fn flip(
     plane: plane::Handle,
     buffer_property: property::Handle,
     buffer: framebuffer::Handle,
-) -> Result<(), rustix::io::Errno> {
+) -> Result<(), Errno> {
     let flags = AtomicCommitFlags::PAGE_FLIP_EVENT | AtomicCommitFlags::NONBLOCK;
-    let mut value = [u64::from(u32::from(buffer))];
-    drm_ffi::mode::atomic_commit(
-        card.as_fd(),
-        flags.bits(),
-        &mut [plane.into()],
-        &mut [1],
-        &mut [buffer_property.into()],
-        &mut value,
-    )
-    .map_err(|why| rustix::io::Errno::from_io_error(&why).unwrap_or(rustix::io::Errno::IO))
+    let commit = || {
+        drm_ffi::mode::atomic_commit(
+            card.as_fd(),
+            flags.bits(),
+            &mut [plane.into()],
+            &mut [1],
+            &mut [buffer_property.into()],
+            &mut [u64::from(u32::from(buffer))],
+        )
+    };
+    uninterrupted(commit).map_err(|why| Errno::from_io_error(&why).unwrap_or(Errno::IO))
+}
+
+/// Calls the kernel until a signal or a lock that another task holds no longer keeps it from an answer, as the contract
+/// of these calls asks for.
+fn uninterrupted<T>(mut call: impl FnMut() -> io::Result<T>) -> io::Result<T> {
+    loop {
+        match call() {
+            Err(why) if matches!(Errno::from_io_error(&why), Some(Errno::INTR | Errno::AGAIN)) => {}
+            answer => return answer,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_call_that_is_interrupted_is_made_again_and_a_refusal_is_handed_on() {
+        for last in [Ok(7), Err(Errno::BUSY), Err(Errno::INVAL)] {
+            let mut answers = [Err(Errno::INTR), Err(Errno::AGAIN), Err(Errno::INTR), last].into_iter();
+            let answer = uninterrupted(|| answers.next().expect("no call more").map_err(io::Error::from));
+            assert_eq!(answer.map_err(|why| Errno::from_io_error(&why).unwrap()), last);
+            assert_eq!(answers.next(), None);
+        }
+    }
 }
