@@ -32,7 +32,7 @@ pub use self::plan::SessionPlan;
 pub use self::service::Hangups;
 pub(crate) use self::service::Signals;
 pub use self::summary::{SessionReport, Summary};
-pub use self::take_down::not_dark;
+pub use self::take_down::{NO_ACKNOWLEDGEMENT, PANEL_HANGS, not_dark};
 
 /// Runs until a limit, a signal or a failure ends it; lasers are dark when it returns.
 ///

@@ -16,6 +16,11 @@ use crate::snapshot::Figures;
 /// Longer than any frame takes, of the largest size on a slow processor.
 const LONGEST_FRAME: Duration = Duration::from_secs(60);
 
+/// Why lasers are not known to be dark where nobody says more.
+pub const NO_ACKNOWLEDGEMENT: &str = "the laser box did not acknowledge in time";
+/// What is said where the panel's thread was left to itself.
+pub const PANEL_HANGS: &str = "the panel's thread has not ended: does the display server or the graphics driver hang?";
+
 /// Ends every part in order, whatever `ended` says, and then says what the run came to.
 ///
 /// # Errors
@@ -31,17 +36,15 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
     watch.tracker.stop();
     let observed = watch.drain();
     watch.laser_box.drain(false);
-    let lasers_not_dark = (!down.lasers_dark).then(|| {
-        let silent = "the laser box did not acknowledge in time";
-        watch.laser_box.trouble().unwrap_or(silent).to_owned()
-    });
+    let lasers_not_dark =
+        (!down.lasers_dark).then(|| watch.laser_box.trouble().unwrap_or(NO_ACKNOWLEDGEMENT).to_owned());
     watch.tracker_watch.judge(&watch.tracker, host_now());
     watch.judge_recording();
     let figures = Figures { tracker_link, ..watch.figures(&down.counts, host_now()) };
     watch.feed = None;
     let recorded = watch.tracker.recording();
     if !down.panel_ended {
-        tracing::error!("the panel's thread has not ended: does the display server or the graphics driver hang?");
+        tracing::error!("{PANEL_HANGS}");
     }
     if let Some(why) = &lasers_not_dark
         && (ended.is_err() || observed.is_err() || !matches!(frame_loop, Some(Ok(Ok(())))))

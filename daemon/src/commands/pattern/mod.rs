@@ -14,7 +14,7 @@ use crate::cli::{PatternKind, PatternTarget};
 use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
 use crate::pictures::video_pictures;
-use crate::session::not_dark;
+use crate::session::{NO_ACKNOWLEDGEMENT, not_dark};
 use crate::{results, setup};
 
 pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> {
@@ -46,7 +46,7 @@ pub(super) fn pattern(kind: &PatternKind<PatternTarget>) -> Result<(), Failure> 
     results::print(&shown.to_string())?;
     match shown.lasers_dark {
         true => Ok(()),
-        false => Err(Failure::new(Exit::Unavailable, not_dark("the laser box did not acknowledge in time"))),
+        false => Err(Failure::new(Exit::Unavailable, not_dark(NO_ACKNOWLEDGEMENT))),
     }
 }
 

@@ -13,7 +13,7 @@ use holod_slm_output::{LevelsFrame, Output, OutputOptions, OutputSpec, Pacer, Pa
 
 use crate::cli::PatternTarget;
 use crate::failure::{Exit, Failure};
-use crate::session::Signals;
+use crate::session::{NO_ACKNOWLEDGEMENT, PANEL_HANGS, Signals, not_dark};
 
 /// Time that a frame may take before it has been measured.
 const FIRST_COPY: TimeNs = TimeNs(5_000_000);
@@ -62,20 +62,18 @@ pub(super) fn show(
     let duration = to.duration.map(|duration| TimeNs(i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX)));
     let mut pacer = Pacer::new(pacing, t_begin);
     let mut shown = Shown::default();
-    'frames: loop {
+    let ended = 'frames: loop {
         let plan = pacer.predict(host_now());
         loop {
             let now = host_now();
             if let Some(signal) = signals.caught() {
-                shown.ended_by = signal.into();
-                break 'frames;
+                break 'frames Ok(signal.to_owned());
             }
             if switch.reason() == Some(DarkReason::Panic) {
-                return Err(Failure::new(Exit::Software, "a thread failed (its message stands above)"));
+                break 'frames Err(Failure::new(Exit::Software, "a thread failed (its message stands above)"));
             }
             if duration.is_some_and(|duration| now - t_begin >= duration) {
-                shown.ended_by = "the asked duration".into();
-                break 'frames;
+                break 'frames Ok("the asked duration".to_owned());
             }
             if now >= plan.t_wake {
                 break;
@@ -107,15 +105,22 @@ pub(super) fn show(
                     tracing::error!("the panel is lost, lasers dark: {fault}");
                 }
                 PanelEvent::Lost { fault, .. } => {
-                    return Err(Failure::new(Exit::Unavailable, format!("the panel: {fault}")));
+                    break 'frames Err(Failure::new(Exit::Unavailable, format!("the panel: {fault}")));
                 }
                 PanelEvent::Back { .. } => tracing::info!("the panel is back"),
             }
         }
-    }
+    };
     shown.duration_s = (host_now() - t_begin).seconds();
     shown.refresh_hz = output.control.counts().refresh_hz;
     let down = output.control.shutdown();
+    if !down.panel_ended {
+        tracing::error!("{PANEL_HANGS}");
+    }
+    if ended.is_err() && !down.lasers_dark {
+        tracing::error!("{}", not_dark(NO_ACKNOWLEDGEMENT));
+    }
+    shown.ended_by = ended?;
     (shown.lasers_dark, shown.flat_presented) = (down.lasers_dark, down.flat_presented);
     Ok(shown)
 }
