@@ -263,7 +263,7 @@ impl Ready {
         let blob = card.create_property_blob(&drm_ffi::drm_mode_modeinfo::from(mode));
         let blob = u64::from(blob.map_err(card.refused("describing the mode"))?);
         let mut request = pipe.mode_request(&before, &mode, blob, buffer.framebuffer, card)?;
-        let changes = settings::plan(&pipe, &before, wanted.channel_bits);
+        let changes = settings::plan(card, &pipe, &before, wanted.channel_bits);
         settings::add_accepted(card, &mut request, &changes);
         let set = card.atomic_commit(AtomicCommitFlags::ALLOW_MODESET, request);
         // The mode's own reference to it stays.

@@ -98,12 +98,14 @@ fn of_part(properties: &PipeProperties, on: On) -> &Properties {
 }
 
 /// A property's value before and after.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(crate) struct Change {
     object: RawResourceHandle,
     property: property::Handle,
     new: u64,
     old: u64,
+    /// What the old value stood for where it was the number of a table: the kernel frees one that nobody uses.
+    old_table: Option<Vec<u8>>,
 }
 
 fn object(pipe: &Pipe, on: On) -> RawResourceHandle {
@@ -152,12 +154,14 @@ fn wanted_words(want: Want, channel_bits: u8) -> String {
 }
 
 /// Which properties are to be changed to what.
-pub(crate) fn plan(pipe: &Pipe, properties: &PipeProperties, channel_bits: u8) -> Vec<Change> {
+pub(crate) fn plan(card: &Card, pipe: &Pipe, properties: &PipeProperties, channel_bits: u8) -> Vec<Change> {
     let change = |setting: &Setting| {
         let (info, old) = of_part(properties, setting.on).find(setting.property)?;
         let new = wanted(info, setting.want, channel_bits)?;
-        let change = Change { object: object(pipe, setting.on), property: info.handle(), new, old: *old };
-        info.mutable().then_some(change)
+        let is_table = matches!(setting.want, Want::NoBlob) && *old != 0;
+        let old_table = is_table.then(|| card.get_property_blob(*old).ok()).flatten();
+        let (object, property) = (object(pipe, setting.on), info.handle());
+        info.mutable().then_some(Change { object, property, new, old: *old, old_table })
     };
     SETTINGS.iter().filter_map(change).collect()
 }
@@ -183,18 +187,29 @@ pub(crate) fn add_accepted(card: &Card, request: &mut AtomicModeReq, changes: &[
 }
 
 /// Puts back what [`plan`] changed, as far as the driver lets it: the next user of the connector may not know these
-/// properties.
+/// properties. Tables are made anew, for as long as the driver uses them.
 pub(crate) fn restore(card: &Card, changes: &[Change]) {
     let mut request = AtomicModeReq::new();
-    let back: Vec<_> = changes
-        .iter()
-        .filter(|change| change.old != change.new)
-        .map(|change| Change { new: change.old, old: change.new, ..*change })
-        .collect();
+    let mut tables = Vec::new();
+    let mut back = Vec::new();
+    for change in changes.iter().filter(|change| change.old != change.new) {
+        let mut old = change.old;
+        if let Some(table) = &change.old_table {
+            let made = card.create_property_blob(table.as_slice());
+            let Ok(made) = made.map(u64::from) else { continue };
+            tables.push(made);
+            old = made;
+        }
+        back.push(Change { new: old, old: change.new, old_table: None, ..*change });
+    }
     if !back.is_empty() {
         add_accepted(card, &mut request, &back);
         // At the end there is nobody who could do anything about it.
         let _ = card.atomic_commit(AtomicCommitFlags::ALLOW_MODESET, request);
+    }
+    for table in tables {
+        // The driver's own reference to it stays.
+        let _ = card.destroy_property_blob(table);
     }
 }
 
