@@ -149,7 +149,7 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
         Case { args: &["--tracker", "serial:/dev/null,profile=neon"], exit: 64, says: &["neon:HOST"] },
         Case { args: &["--tracker", "serial:/dev/null,profile=nosuch"], exit: 64, says: &["nosuch", "holod-hid"] },
         Case { args: &["--weights", "smal"], exit: 64, says: &["smal", "did you mean `small`?"] },
-        Case { args: &["--weights", "./smal"], exit: 65, says: &["smal"] },
+        Case { args: &["--weights", "./smal"], exit: 66, says: &["smal"] },
         Case { args: &["check", "--tracker", "/dev/nothing-here"], exit: 69, says: &["/dev/nothing-here"] },
         Case { args: &["--tracker", "/dev/null,profile=nosuch"], exit: 64, says: &["nosuch", "holod-hid"] },
         Case { args: &["--force"], exit: 64, says: &["--record"] },
