@@ -49,6 +49,8 @@ pub(crate) struct Link {
     mode: Mode,
     buffer_property: property::Handle,
     link_status: Option<LinkStatus>,
+    /// The connector's properties and their values when it was last asked; their memory is taken when it is opened.
+    connector_says: (Vec<u32>, Vec<u64>),
     pub(crate) buffers: [ScanBuffer; BUFFERS],
     changes: Vec<Change>,
     checks: Vec<DisplayCheck>,
@@ -79,7 +81,25 @@ impl Link {
             Some(_) => DisplayCheck::equal("hotplug messages", "heard", "heard"),
             None => DisplayCheck::unverified("hotplug messages", "the kernel's socket does not open", "heard"),
         });
-        Ok(Self { card, node, seen, pipe, mode, buffer_property, link_status, buffers, changes, checks, hotplug, wake })
+        let connector_says = (Vec::new(), Vec::new());
+        let mut link = Self {
+            card,
+            node,
+            seen,
+            pipe,
+            mode,
+            buffer_property,
+            link_status,
+            connector_says,
+            buffers,
+            changes,
+            checks,
+            hotplug,
+            wake,
+        };
+        // What it says by now, `checks` have; this takes the memory that later answers go to.
+        link.is_good().map_err(|why| link.card.refused("reading its connector")(why.into()))?;
+        Ok(link)
     }
 
     /// Makes the connector ready again after mastership or the monitor had been lost; like [`Link::open`], but the card
@@ -152,13 +172,19 @@ impl Link {
         self.card.is_connected(connector).map_err(|why| Errno::from_io_error(&why).unwrap_or(Errno::IO))
     }
 
-    /// Whether the driver still calls the link to the monitor good, as far as it says. Takes memory: it is asked after
-    /// hotplug messages only.
-    pub(crate) fn is_good(&self) -> Result<bool, Errno> {
+    /// Whether the driver still calls the link to the monitor good, as far as it says.
+    pub(crate) fn is_good(&mut self) -> Result<bool, Errno> {
         let Some(status) = self.link_status else { return Ok(true) };
-        let values = self.card.get_properties(self.pipe.connector);
-        let values = values.map_err(|why| Errno::from_io_error(&why).unwrap_or(Errno::IO))?;
-        Ok(status.is_good(values.iter().map(|(&property, &value)| (property, value))))
+        let (properties, values) = &mut self.connector_says;
+        drm_ffi::mode::get_properties(
+            self.card.as_fd(),
+            self.pipe.connector.into(),
+            drm_ffi::DRM_MODE_OBJECT_CONNECTOR,
+            Some(properties),
+            Some(values),
+        )
+        .map_err(|why| Errno::from_io_error(&why).unwrap_or(Errno::IO))?;
+        Ok(status.is_good(properties.iter().copied().zip(values.iter().copied())))
     }
 
     /// The stamps of the connector's flips since the last call, in order. Takes no memory.

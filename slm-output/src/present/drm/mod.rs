@@ -173,8 +173,13 @@ impl DrmPanel {
         match self.link()?.hotplug() {
             Uevent::Removed => return Err(PanelFault::DeviceLost),
             Uevent::Changed if !self.link()?.is_connected().map_err(fault_of)? => return Err(PanelFault::Unplugged),
-            Uevent::Changed if !self.link()?.is_good().map_err(fault_of)? => return Err(PanelFault::LinkBad),
-            Uevent::Changed | Uevent::Other => {}
+            Uevent::Changed => {
+                let link = self.link.as_mut().ok_or(PanelFault::DeviceLost)?;
+                if !link.is_good().map_err(fault_of)? {
+                    return Err(PanelFault::LinkBad);
+                }
+            }
+            Uevent::Other => {}
         }
         for &stamp in self.link()?.flips().map_err(fault_of)?.stamps() {
             self.on_flip(stamp, now, presented);
