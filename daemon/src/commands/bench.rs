@@ -346,7 +346,7 @@ fn table(report: &Report) -> String {
     if ceilings.is_some() {
         text.push_str(
             "\nof peak: operations as the definition has them over time, beside the peak; a plain layer does a quarter of \
-             them (Winograd), so it may exceed 100 %\n\
+             them (Winograd) and half precision two at once, so it may exceed 100 %\n\
              of GB/s: the bytes that come in and go out, once each, over time, beside the bandwidth; what stays in caches \
              may exceed 100 %\n",
         );

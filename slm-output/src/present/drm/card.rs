@@ -363,15 +363,19 @@ pub(crate) fn flip(
     uninterrupted(commit).map_err(|why| Errno::from_io_error(&why).unwrap_or(Errno::IO))
 }
 
+/// How often a call is made that is interrupted each time: no storm of signals lasts so long.
+const CALLS: usize = 1000;
+
 /// Calls the kernel until a signal or a lock that another task holds no longer keeps it from an answer, as the contract
 /// of these calls asks for.
 fn uninterrupted<T>(mut call: impl FnMut() -> io::Result<T>) -> io::Result<T> {
-    loop {
+    for _ in 1..CALLS {
         match call() {
             Err(why) if matches!(Errno::from_io_error(&why), Some(Errno::INTR | Errno::AGAIN)) => {}
             answer => return answer,
         }
     }
+    call()
 }
 
 #[cfg(test)]
@@ -386,5 +390,11 @@ mod tests {
             assert_eq!(answer.map_err(|why| Errno::from_io_error(&why).unwrap()), last);
             assert_eq!(answers.next(), None);
         }
+        let mut calls = 0;
+        let answer: io::Result<()> = uninterrupted(|| {
+            calls += 1;
+            Err(Errno::INTR.into())
+        });
+        assert_eq!((Errno::from_io_error(&answer.unwrap_err()), calls), (Some(Errno::INTR), CALLS));
     }
 }
