@@ -44,7 +44,7 @@ pub(crate) const CORRECTION_GAIN: f32 = 2.0;
 pub struct DoublePhase {
     resolution: Resolution,
     amplitude_constant: f32,
-    /// a, `[3, height, width]`.
+    /// a of one colour after another, `[height, width]`.
     clipped: Vec<Complex32>,
     error: PairErrors,
     /// Sum of intensities of each tile; of each row of tiles, how many samples were clipped.
@@ -77,7 +77,7 @@ impl DoublePhase {
 
     fn with_instructions(resolution: Resolution, amplitude_constant: f32, set: InstructionSet) -> Self {
         assert!(amplitude_constant > 0.0, "the amplitude constant is positive");
-        let (samples, tile_rows) = (3 * resolution.pixels(), 3 * resolution.height.div_ceil(TILE));
+        let (samples, tile_rows) = (resolution.pixels(), resolution.height.div_ceil(TILE));
         Self {
             resolution,
             amplitude_constant,
@@ -101,42 +101,40 @@ impl DoublePhase {
             pattern.resolution,
             self.resolution
         );
+        let planes =
+            hologram.field.chunks_exact(self.clipped.len()).zip(pattern.phase_rad.chunks_exact_mut(self.clipped.len()));
+        let clipped = planes.map(|(field, phase_rad)| self.encode_plane(field, phase_rad)).sum::<u64>();
+        DoublePhaseReport { clipped_share: (clipped as f64 / pattern.phase_rad.len().max(1) as f64) as f32 }
+    }
+
+    /// Encodes one colour, and says how many of its samples were clipped.
+    fn encode_plane(&mut self, field: &[Complex32], phase_rad: &mut [f32]) -> u64 {
         let Self { clipped, error, tile_power, clipped_in_tile_row, set, .. } = self;
         let Resolution { width, height } = self.resolution;
-        let (plane, tiles_across) = (width * height, width.div_ceil(TILE));
         let amplitude_scale = 1.0 / self.amplitude_constant;
-        let planes = hologram.field.par_chunks_exact(plane).zip(clipped.par_chunks_exact_mut(plane));
-        let errors = error.re.par_chunks_exact_mut(plane).zip(error.im.par_chunks_exact_mut(plane));
-        let tiles = tile_power
-            .par_chunks_exact_mut(height.div_ceil(TILE) * tiles_across)
-            .zip(clipped_in_tile_row.par_chunks_exact_mut(height.div_ceil(TILE)));
-        planes.zip(errors).zip(tiles).for_each(|(((field, clipped), (error_re, error_im)), (power, counts))| {
-            let fields = field.par_chunks(TILE * width).zip(clipped.par_chunks_mut(TILE * width));
-            let errors = error_re.par_chunks_mut(TILE * width).zip(error_im.par_chunks_mut(TILE * width));
-            let tiles = power.par_chunks_exact_mut(tiles_across).zip(counts);
-            fields.zip(errors).zip(tiles).for_each(|(((field, clipped), (error_re, error_im)), (power, count))| {
-                power.fill(0.0);
-                *count = 0;
-                for (field, clipped) in field.chunks_exact(width).zip(clipped.chunks_exact_mut(width)) {
-                    set.run(ClippedRow { field, clipped, power, count, amplitude_scale });
-                }
-                let errors = error_re.chunks_mut(4 * width).zip(error_im.chunks_mut(4 * width));
-                for (field, (error_re, error_im)) in clipped.chunks(4 * width).zip(errors) {
-                    set.run(BlockRow { field, error_re, error_im, power, width });
-                }
-            });
+        let fields = field.par_chunks(TILE * width).zip(clipped.par_chunks_mut(TILE * width));
+        let errors = error.re.par_chunks_mut(TILE * width).zip(error.im.par_chunks_mut(TILE * width));
+        let tiles = tile_power.par_chunks_exact_mut(width.div_ceil(TILE)).zip(&mut *clipped_in_tile_row);
+        fields.zip(errors).zip(tiles).for_each(|(((field, clipped), (error_re, error_im)), (power, count))| {
+            power.fill(0.0);
+            *count = 0;
+            for (field, clipped) in field.chunks_exact(width).zip(clipped.chunks_exact_mut(width)) {
+                set.run(ClippedRow { field, clipped, power, count, amplitude_scale });
+            }
+            let errors = error_re.chunks_mut(4 * width).zip(error_im.chunks_mut(4 * width));
+            for (field, (error_re, error_im)) in clipped.chunks(4 * width).zip(errors) {
+                set.run(BlockRow { field, error_re, error_im, power, width });
+            }
         });
-        let field = &*clipped;
-        pattern.phase_rad.par_chunks_exact_mut(width).enumerate().for_each(|(row, phases)| {
-            let (plane, y) = (row / height * width * height, row % height);
-            let field = &field[row * width..][..width];
-            let lines = [0, 1, 2, 3, 4].map(|line| plane + mirrored(y + line, height) * width);
-            let lines_re = lines.map(|line| &error.re[line..][..width]);
-            let lines_im = lines.map(|line| &error.im[line..][..width]);
-            set.run(CorrectedRow { field, lines_re, lines_im, phases });
-        });
-        let clipped = clipped_in_tile_row.iter().map(|&count| u64::from(count)).sum::<u64>();
-        DoublePhaseReport { clipped_share: (clipped as f64 / pattern.phase_rad.len().max(1) as f64) as f32 }
+        phase_rad.par_chunks_exact_mut(width).zip(clipped.par_chunks_exact(width)).enumerate().for_each(
+            |(y, (phases, field))| {
+                let lines = [0, 1, 2, 3, 4].map(|line| mirrored(y + line, height) * width);
+                let lines_re = lines.map(|line| &error.re[line..][..width]);
+                let lines_im = lines.map(|line| &error.im[line..][..width]);
+                set.run(CorrectedRow { field, lines_re, lines_im, phases });
+            },
+        );
+        clipped_in_tile_row.iter().map(|&count| u64::from(count)).sum()
     }
 }
 
@@ -548,12 +546,13 @@ mod tests {
                 encoder.clipped_in_tile_row.fill(u32::MAX);
                 encoder.tile_power.fill(f32::NAN);
                 let mut pattern = PhasePattern::flat(resolution);
-                encoder.encode(&hologram, &mut pattern);
+                let clipped_share = encoder.encode(&hologram, &mut pattern).clipped_share;
                 let found = &mut pattern.phase_rad;
                 let worst = worst_phasor(found, &expected);
                 // At an amplitude of 1 a rounding of 1e-7 turns a phasor by 5e-4.
                 assert!(worst < 1e-3, "{worst} of {resolution} on {}", set.name());
-                assert_eq!(encoder.clipped_in_tile_row.iter().sum::<u32>() as usize, above, "on {}", set.name());
+                let samples = hologram.field.len() as f64;
+                assert_eq!((f64::from(clipped_share) * samples).round() as usize, above, "on {}", set.name());
                 let judged = || (0..expected.len()).filter(|&place| expected[place].norm() > 0.05);
                 for place in [judged().next().unwrap(), judged().next_back().unwrap()] {
                     let right = found[place];

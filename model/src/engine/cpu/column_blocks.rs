@@ -3,6 +3,8 @@
 //! So what is done at a place of several planes reads and writes whole vectors, and every block can go to another
 //! thread.
 
+use std::ops::DerefMut;
+
 use holod_calibration::Resolution;
 use num_complex::Complex32;
 use rayon::prelude::*;
@@ -11,12 +13,12 @@ use crate::simd::{InstructionSet, Simd};
 
 /// Planes [block, plane, row, part, column of the block]: a real number has one part; a complex one has two, and both
 /// of a row are a *cell*. What the last block has beyond the width has no meaning.
-pub(super) struct ColumnBlocks {
+pub(super) struct ColumnBlocks<V = Vec<f32>> {
     size: Resolution,
     lanes: usize,
     planes: usize,
     parts: usize,
-    values: Vec<f32>,
+    values: V,
 }
 
 impl ColumnBlocks {
@@ -28,22 +30,36 @@ impl ColumnBlocks {
         Self::new(planes, 2, size, set)
     }
 
-    fn new(planes: usize, parts: usize, size: Resolution, set: InstructionSet) -> Self {
-        let lanes = set.lanes();
-        let values = vec![0.0; size.width.div_ceil(lanes) * planes * size.height * parts * lanes];
-        Self { size, lanes, planes, parts, values }
+    /// Values of so many real planes.
+    pub(super) fn room_for_reals(planes: usize, size: Resolution, set: InstructionSet) -> usize {
+        values_of(planes, 1, size, set)
     }
 
+    fn new(planes: usize, parts: usize, size: Resolution, set: InstructionSet) -> Self {
+        let values = vec![0.0; values_of(planes, parts, size, set)];
+        Self { size, lanes: set.lanes(), planes, parts, values }
+    }
+}
+
+impl<'a> ColumnBlocks<&'a mut [f32]> {
+    /// Such planes in the first [`ColumnBlocks::room_for_reals`] values of `room`, as these are.
+    pub(super) fn of_reals_in(room: &'a mut [f32], planes: usize, size: Resolution, set: InstructionSet) -> Self {
+        let values = &mut room[..ColumnBlocks::room_for_reals(planes, size, set)];
+        Self { size, lanes: set.lanes(), planes, parts: 1, values }
+    }
+}
+
+fn values_of(planes: usize, parts: usize, size: Resolution, set: InstructionSet) -> usize {
+    size.width.next_multiple_of(set.lanes()) * planes * size.height * parts
+}
+
+impl<V: DerefMut<Target = [f32]>> ColumnBlocks<V> {
     pub(super) fn planes(&self) -> usize {
         self.planes
     }
 
     pub(super) fn parts(&self) -> usize {
         self.parts
-    }
-
-    pub(super) fn lanes(&self) -> usize {
-        self.lanes
     }
 
     /// Values of a plane in one block.

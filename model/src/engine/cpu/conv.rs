@@ -61,7 +61,8 @@ impl Activation {
 
 /// A plain convolution of maps.
 pub(super) struct PlainConv {
-    in_stride: usize,
+    /// Channels of each pixel that are read, in whole vectors.
+    in_channels: usize,
     out_stride: usize,
     shape: Shape,
     /// For each point, rows first, a packed product of `shape`.
@@ -71,7 +72,8 @@ pub(super) struct PlainConv {
 }
 
 impl PlainConv {
-    /// Room for a convolution of `in_channels` to `out_channels`; all parameters are zero.
+    /// Room for a convolution of the first `in_channels` of a map to `out_channels`; all parameters are zero. What fills
+    /// the last vector of those channels has to be numbers.
     pub(super) fn new(
         in_channels: usize,
         out_channels: usize,
@@ -83,7 +85,7 @@ impl PlainConv {
         let lanes = products.set().lanes();
         let out_stride = out_channels.next_multiple_of(lanes);
         Self {
-            in_stride: in_channels.next_multiple_of(lanes),
+            in_channels: in_channels.next_multiple_of(lanes),
             out_stride,
             shape,
             weights: vec![0.0; POINTS * POINTS * shape.weights_len()],
@@ -93,22 +95,23 @@ impl PlainConv {
     }
 
     /// Sets the parameters: `weight(output, input, tap)`, taps row-major over the kernel, and the bias of each output.
+    /// `inputs` are the channels of the map that the inputs are.
     pub(super) fn fill(
         &mut self,
-        in_channels: usize,
+        inputs: &[usize],
         bias: impl ExactSizeIterator<Item = f32>,
         weight: impl Fn(usize, usize, usize) -> f32,
     ) {
         for (output, value) in bias.enumerate() {
             self.activation.bias[output] = value;
-            for input in 0..in_channels {
+            for (input, channel) in inputs.iter().enumerate() {
                 let rows: [[f64; POINTS]; 3] = std::array::from_fn(|row| {
                     weight_points(std::array::from_fn(|column| weight(output, input, 3 * row + column).into()))
                 });
                 for column in 0..POINTS {
                     for (row, value) in weight_points(rows.map(|row| row[column])).into_iter().enumerate() {
                         let weights = &mut self.weights[(row * POINTS + column) * self.shape.weights_len()..];
-                        self.shape.set_weight(weights, [0, input, output], value as f32);
+                        self.shape.set_weight(weights, [0, *channel, output], value as f32);
                     }
                 }
             }
@@ -117,12 +120,40 @@ impl PlainConv {
 
     /// Runs the convolution over `input` into `output`.
     pub(super) fn run(&self, input: &FeatureMap, scratch: &mut Scratch, output: &mut FeatureMap) {
-        debug_assert_eq!((input.stride, output.stride), (self.in_stride, self.out_stride));
-        let (width, out_row_len) = (output.width, output.row_len);
+        debug_assert!(input.stride >= self.in_channels && output.stride == self.out_stride);
+        let out_row_len = output.row_len;
         output.for_each_tile_row(&mut scratch.workers, |scratch, y, output_rows| {
-            let (rows, row_len) = (&input.rows_from_above(y)[..POINTS * input.row_len], input.row_len);
-            self.products.run(TileRow { conv: self, rows, row_len, width, scratch, output_rows, out_row_len });
+            self.run_tile_row(input, y, scratch, output_rows, out_row_len);
         });
+    }
+
+    /// Runs it for one row of tiles, the one from row `y` on, into `output_rows` with their borders.
+    pub(super) fn run_tile_row(
+        &self,
+        input: &FeatureMap,
+        y: usize,
+        scratch: &mut WorkerScratch,
+        output_rows: &mut [f32],
+        out_row_len: usize,
+    ) {
+        let FeatureMap { stride, row_len, width, .. } = *input;
+        let rows = &input.rows_from_above(y)[..POINTS * row_len];
+        self.products.run(TileRow { conv: self, rows, row_len, stride, width, scratch, output_rows, out_row_len });
+    }
+
+    /// What it makes of `input`, of `out_channels`.
+    #[cfg(test)]
+    pub(super) fn run_anew(&self, input: &FeatureMap, out_channels: usize) -> FeatureMap {
+        let mut output = FeatureMap::new(input.width, input.height, out_channels, self.products.set());
+        let mut scratch = Scratch::new();
+        scratch.fit(self);
+        self.run(input, &mut scratch, &mut output);
+        output
+    }
+
+    /// Channels of a pixel of the output.
+    pub(super) fn out_stride(&self) -> usize {
+        self.out_stride
     }
 }
 
@@ -185,7 +216,7 @@ pub(super) struct Scratch {
 
 /// What one worker makes of a strip of up to [`ROWS`] tiles side by side.
 #[derive(Default)]
-struct WorkerScratch {
+pub(super) struct WorkerScratch {
     /// Six rows of the input at its vertical points [point, pixel, channel].
     inputs: Vec<f32>,
     /// Of one vertical point, the panels at each horizontal point, before the products and after.
@@ -203,14 +234,23 @@ impl Scratch {
 
     /// Makes room for `layer` too.
     pub(super) fn fit(&mut self, layer: &PlainConv) {
-        for WorkerScratch { inputs, points, products, sums } in &mut self.workers {
-            for (buffer, row_len) in [
-                (inputs, layer.inputs_row_len()),
-                (points, layer.shape.inputs_len()),
-                (products, layer.shape.outputs_len()),
-                (sums, layer.sums_row_len()),
-            ] {
-                buffer.resize(buffer.len().max(POINTS * row_len), 0.0);
+        self.workers.iter_mut().for_each(|worker| worker.fit(layer));
+    }
+}
+
+impl WorkerScratch {
+    /// Makes room for `layer` too.
+    pub(super) fn fit(&mut self, layer: &PlainConv) {
+        let Self { inputs, points, products, sums } = self;
+        for (buffer, row_len) in [
+            (inputs, layer.inputs_row_len()),
+            (points, layer.shape.inputs_len()),
+            (products, layer.shape.outputs_len()),
+            (sums, layer.sums_row_len()),
+        ] {
+            if buffer.len() < POINTS * row_len {
+                // Of zeros that nobody has written the system makes memory only when a worker uses it.
+                *buffer = vec![0.0; POINTS * row_len];
             }
         }
     }
@@ -218,7 +258,7 @@ impl Scratch {
 
 impl PlainConv {
     fn inputs_row_len(&self) -> usize {
-        (ROWS * TILE + 2) * self.in_stride + ROW_PAD
+        (ROWS * TILE + 2) * self.in_channels + ROW_PAD
     }
 
     fn sums_row_len(&self) -> usize {
@@ -232,6 +272,8 @@ struct TileRow<'a> {
     /// [`POINTS`] rows of the input with their borders.
     rows: &'a [f32],
     row_len: usize,
+    /// Channels of a pixel there.
+    stride: usize,
     width: usize,
     scratch: &'a mut WorkerScratch,
     /// Up to [`TILE`] rows of the output with their borders.
@@ -257,18 +299,21 @@ impl TileRow<'_> {
     /// Brings the columns of the strip that begins at pixel `x` to their points.
     #[inline(always)]
     fn transform_columns<S: Simd>(&mut self, simd: S, x: usize, tiles: usize) {
-        let Self { conv, rows, row_len, scratch, .. } = self;
-        let len = (tiles * TILE + 2) * conv.in_stride;
-        let to_row_len = conv.inputs_row_len();
-        let (from, to) = (&rows[x * conv.in_stride..], &mut scratch.inputs[..POINTS * to_row_len]);
-        assert!(from.len() >= (POINTS - 1) * *row_len + len && to_row_len >= len && len.is_multiple_of(S::LANES));
-        for place in (0..len).step_by(S::LANES) {
-            // SAFETY: `len` is a multiple of LANES; so much is readable in each of six rows of `from`, and writable in
-            // each of `to`.
+        let Self { conv: &PlainConv { in_channels, .. }, rows, row_len, stride, ref mut scratch, .. } = *self;
+        let pixels = tiles * TILE + 2;
+        let to_row_len = self.conv.inputs_row_len();
+        let (from, to) = (&rows[x * stride..], &mut scratch.inputs[..POINTS * to_row_len]);
+        // Pixels of which all channels are read are one run.
+        let (runs, len) = if stride == in_channels { (1, pixels * in_channels) } else { (pixels, in_channels) };
+        assert!(in_channels.is_multiple_of(S::LANES) && to_row_len >= runs * len);
+        assert!(from.len() >= (POINTS - 1) * row_len + (runs - 1) * stride + len);
+        for (run, place) in (0..runs).flat_map(|run| (0..len).step_by(S::LANES).map(move |place| (run, place))) {
+            // SAFETY: `len` is a multiple of LANES; so much is readable in each run of each of six rows of `from`, and
+            // writable in each of `to`.
             unsafe {
-                let values = simd.load_strided(from.as_ptr().add(place), *row_len);
+                let values = simd.load_strided(from.as_ptr().add(run * stride + place), row_len);
                 for (point, value) in to_points(simd, values).into_iter().enumerate() {
-                    simd.store(to.as_mut_ptr().add(point * to_row_len + place), value);
+                    simd.store(to.as_mut_ptr().add(point * to_row_len + run * len + place), value);
                 }
             }
         }
@@ -278,18 +323,20 @@ impl TileRow<'_> {
     #[inline(always)]
     fn multiply<S: Simd>(&mut self, simd: S, point: usize, tiles: usize) {
         let Self { conv, scratch: WorkerScratch { inputs, points, products, sums }, .. } = self;
-        let PlainConv { in_stride, out_stride, shape, .. } = **conv;
+        let PlainConv { in_channels, out_stride, shape, .. } = **conv;
         let (points_len, products_len, weights_len) = (shape.inputs_len(), shape.outputs_len(), shape.weights_len());
         let from = &inputs[point * conv.inputs_row_len()..][..conv.inputs_row_len()];
         let points = &mut points[..POINTS * points_len];
-        assert!(from.len() >= (tiles * TILE + 2) * in_stride && tiles <= ROWS && in_stride.is_multiple_of(S::LANES));
-        assert!(points_len * S::FACTORS >= panels_len(in_stride));
-        for channel in (0..in_stride).step_by(S::LANES) {
+        assert!(
+            from.len() >= (tiles * TILE + 2) * in_channels && tiles <= ROWS && in_channels.is_multiple_of(S::LANES)
+        );
+        assert!(points_len * S::FACTORS >= panels_len(in_channels));
+        for channel in (0..in_channels).step_by(S::LANES) {
             for tile in 0..tiles {
                 // SAFETY: a tile's six pixels lie in `from`, and its row of the channel's panel in each point's panels.
                 unsafe {
-                    let pixel = from.as_ptr().add(tile * TILE * in_stride + channel);
-                    let values = simd.load_strided(pixel, in_stride);
+                    let pixel = from.as_ptr().add(tile * TILE * in_channels + channel);
+                    let values = simd.load_strided(pixel, in_channels);
                     let place = points.as_mut_ptr().add(panel_place(tile, channel) / S::FACTORS);
                     for (point, value) in to_points(simd, values).into_iter().enumerate() {
                         simd.store_factors(place.add(point * points_len), value);
@@ -388,7 +435,8 @@ mod tests {
         products: Products,
     ) -> (PlainConv, FeatureMap, FeatureMap) {
         let mut conv = PlainConv::new(inputs, outputs, epilogue, SLOPE, products);
-        conv.fill(inputs, (0..outputs).map(|output| noise(output + 9_000_000)), weight);
+        let channels: Vec<_> = (0..inputs).collect();
+        conv.fill(&channels, (0..outputs).map(|output| noise(output + 9_000_000)), weight);
         let map = |channels: usize| {
             let mut map = FeatureMap::new(width, height, channels, products.set());
             for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {

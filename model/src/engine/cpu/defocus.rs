@@ -46,6 +46,11 @@ impl Defocus {
         }
     }
 
+    /// Values that [`Self::expect`] needs room for.
+    pub(super) fn room(&self) -> usize {
+        self.fft.room_between()
+    }
+
     /// Writes the expected amplitudes, three colours of each layer, of `frame`, whose depths `layers` has.
     pub(super) fn expect(
         &mut self,
@@ -53,16 +58,17 @@ impl Defocus {
         layers: &DepthLayers,
         pupil_mm: f32,
         amplitudes: &mut ColumnBlocks,
+        room: &mut [f32],
     ) {
         self.shape_discs(pupil_mm);
         let Self { size: Resolution { width, .. }, count, discs, fft, set, .. } = self;
         let (width, count, set) = (*width, *count, *set);
-        fft.for_columns(frame.planes.blocks().zip(layers.layer_of.blocks()), |columns, (frame, layer_of)| {
+        fft.for_columns(room, frame.planes.blocks().zip(layers.layer_of.blocks()), |columns, (frame, layer_of)| {
             set.run(TakeLayers { columns, frame, layers, layer_of, count });
         });
         let discs = discs.chunks_exact(discs.len() / self.size.height.div_ceil(set.lanes()));
-        fft.for_rows(discs, |rows, discs| set.run(Blur { rows, discs, layers, width, count }));
-        fft.for_columns(amplitudes.blocks_mut(), |columns, amplitudes| set.run(See { columns, amplitudes }));
+        fft.for_rows(room, discs, |rows, discs| set.run(Blur { rows, discs, layers, width, count }));
+        fft.for_columns(room, amplitudes.blocks_mut(), |columns, amplitudes| set.run(See { columns, amplitudes }));
     }
 
     /// Sets the discs to those of a pupil, unless they are already.

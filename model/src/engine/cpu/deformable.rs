@@ -1,13 +1,16 @@
 //! Deformable 3x3 convolutions: every tap of every pixel is read at a place of its own.
 
-use super::conv::{Activation, Epilogue, TAPS};
-use super::feature_map::FeatureMap;
+use super::conv::{Activation, Epilogue, PlainConv, TAPS, WorkerScratch};
+use super::feature_map::{FeatureMap, TILE};
 use super::product::{ROWS, Shape, panel_place, panels_len};
 use super::workers::WORKERS;
 use crate::simd::{Products, Simd, Task};
+use crate::weights::OFFSET_CHANNELS;
 
-/// A deformable convolution of maps.
+/// A deformable convolution of maps, and the plain one that predicts where it reads.
 pub(super) struct DeformableConv {
+    /// To [`OFFSET_CHANNELS`]: of each tap dy and dx.
+    pub(super) offset_conv: PlainConv,
     in_stride: usize,
     out_stride: usize,
     /// A group for each tap.
@@ -18,16 +21,22 @@ pub(super) struct DeformableConv {
     workers: Vec<Scratch>,
 }
 
-/// The panels of what [`ROWS`] pixels read at each tap, and those of their sums.
+/// What one worker makes of a row of tiles, [`ROWS`] pixels at a time.
 struct Scratch {
+    offset_conv: WorkerScratch,
+    /// Rows of offsets with their borders.
+    offsets: Vec<f32>,
+    /// The panels of what the pixels read at each tap, and those of their sums.
     taps: Vec<f32>,
     sums: Vec<f32>,
 }
 
 impl DeformableConv {
-    /// `weight(output, input, tap)`, taps row-major over the kernel, and the bias of each output.
+    /// For maps of `width`: `weight(output, input, tap)`, taps row-major over the kernel, and the bias of each output.
+    /// All parameters of the prediction are zero.
     pub(super) fn new(
         in_channels: usize,
+        width: usize,
         bias: &[f32],
         weight: impl Fn(usize, usize, usize) -> f32,
         epilogue: Epilogue,
@@ -41,6 +50,7 @@ impl DeformableConv {
                 shape.set_weight(&mut weights, [tap, input, output], weight(output, input, tap));
             }
         }
+        let offset_conv = PlainConv::new(in_channels, OFFSET_CHANNELS, Epilogue::None, leaky_slope, products);
         let lanes = products.set().lanes();
         let out_stride = bias.len().next_multiple_of(lanes);
         let mut padded_bias = bias.to_vec();
@@ -52,23 +62,53 @@ impl DeformableConv {
             weights,
             activation: Activation { bias: padded_bias, epilogue, leaky_slope },
             products,
-            workers: (0..WORKERS)
-                .map(|_| Scratch { taps: vec![0.0; shape.inputs_len()], sums: vec![0.0; shape.outputs_len()] })
-                .collect(),
+            workers: (0..WORKERS).map(|_| Scratch::new(shape, &offset_conv, width)).collect(),
+            offset_conv,
         }
     }
 
-    /// Runs the convolution over `input` into `output`, each tap k of each pixel being read at its place plus
-    /// (`offsets[2k]`, `offsets[2k + 1]`) = (dy, dx) by bilinear interpolation, zero outside.
-    pub(super) fn run(&mut self, input: &FeatureMap, offsets: &FeatureMap, output: &mut FeatureMap) {
-        let Self { in_stride, out_stride, shape, weights, activation, products, workers } = self;
+    /// Runs the convolution over `input` into `output`, each tap k of each pixel being read at its place plus its
+    /// offset by bilinear interpolation, zero outside.
+    pub(super) fn run(&mut self, input: &FeatureMap, output: &mut FeatureMap) {
+        let Self { offset_conv, in_stride, out_stride, shape, weights, activation, products, workers } = self;
         debug_assert_eq!((input.stride, output.stride), (*in_stride, *out_stride));
         let row_len = output.row_len;
         output.for_each_tile_row(workers, |scratch, first, rows| {
-            for (y, output_row) in (first..).zip(rows.chunks_exact_mut(row_len)) {
-                products.run(Row { shape: *shape, weights, activation, input, offsets, y, scratch, output_row });
+            let Scratch { offset_conv: offset_scratch, offsets, taps, sums } = scratch;
+            let (offsets_stride, offsets_row_len) = (offset_conv.out_stride(), offsets.len() / TILE);
+            let offsets = &mut offsets[..rows.len() / row_len * offsets_row_len];
+            offset_conv.run_tile_row(input, first, offset_scratch, offsets, offsets_row_len);
+            let rows = rows.chunks_exact_mut(row_len).zip(offsets.chunks_exact(offsets_row_len));
+            for (y, (output_row, offsets)) in (first..).zip(rows) {
+                let offsets = &offsets[offsets_stride..];
+                let shape = *shape;
+                products.run(Row {
+                    shape,
+                    weights,
+                    activation,
+                    input,
+                    offsets,
+                    offsets_stride,
+                    y,
+                    taps,
+                    sums,
+                    output_row,
+                });
             }
         });
+    }
+}
+
+impl Scratch {
+    fn new(shape: Shape, offset_conv: &PlainConv, width: usize) -> Self {
+        let mut scratch = WorkerScratch::default();
+        scratch.fit(offset_conv);
+        Self {
+            offset_conv: scratch,
+            offsets: vec![0.0; TILE * (width + 2) * offset_conv.out_stride()],
+            taps: vec![0.0; shape.inputs_len()],
+            sums: vec![0.0; shape.outputs_len()],
+        }
     }
 }
 
@@ -78,9 +118,12 @@ struct Row<'a> {
     weights: &'a [f32],
     activation: &'a Activation,
     input: &'a FeatureMap,
-    offsets: &'a FeatureMap,
+    /// Of each pixel, with what else its vectors hold.
+    offsets: &'a [f32],
+    offsets_stride: usize,
     y: usize,
-    scratch: &'a mut Scratch,
+    taps: &'a mut [f32],
+    sums: &'a mut [f32],
     /// With its border.
     output_row: &'a mut [f32],
 }
@@ -88,14 +131,14 @@ struct Row<'a> {
 impl Task for Row<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let Self { shape, weights, activation, input, offsets, y, scratch: Scratch { taps, sums }, output_row } = self;
+        let Self { shape, weights, activation, input, offsets, offsets_stride, y, taps, sums, output_row } = self;
         let out_stride = activation.bias.len();
         let group_len = shape.inputs_len() / TAPS;
         assert!(group_len * S::FACTORS >= panels_len(input.stride) && out_stride.is_multiple_of(S::LANES));
         for x in (0..input.width).step_by(ROWS) {
             let pixels = (input.width - x).min(ROWS);
             for (index, x) in (x..x + pixels).enumerate() {
-                let offsets = offsets.pixel(x, y);
+                let offsets = &offsets[x * offsets_stride..][..OFFSET_CHANNELS];
                 for (k, tap) in taps.chunks_exact_mut(group_len).enumerate() {
                     let tap_y = (y + k / 3) as f32 - 1.0 + offsets[2 * k];
                     let tap_x = (x + k % 3) as f32 - 1.0 + offsets[2 * k + 1];

@@ -23,12 +23,14 @@ pub(super) fn stages(
 ) -> StageList<BlockMeans> {
     let size = grid_size(config.grid, resolution);
     let mut maps = Maps::new(size, products);
-    let trunk = Trunk::new(&mut maps, "", layers, config.leaky_slope);
+    let input = maps.add(layers[0].in_channels);
+    let inputs: Vec<_> = (0..layers[0].in_channels).collect();
+    let trunk = Trunk::new(&mut maps, "", layers, config.leaky_slope, input, &inputs);
     StageList::new(maps, BlockMeans { size, amplitude: vec![0.0; 3 * size.pixels()] })
         .then(Encode {
             bytes: frame_bytes(resolution) + plane_bytes(layers[0].in_channels + BlockMeans::PLANES, size),
             scale: scale_of(config.grid),
-            input: trunk.input,
+            input,
         })
         .then_each(trunk.layers)
         .then(Field::new(config.grid, resolution, trunk.output))
@@ -94,7 +96,8 @@ impl Stage<BlockMeans> for Encode {
 
     #[cfg(test)]
     fn seen<'a>(&'a self, buffers: &'a Buffers<BlockMeans>, _: &'a Job<'_, RgbdFrame>) -> super::stage::Seen<'a> {
-        super::stage::Seen::Map(&buffers.maps[self.input], None)
+        let channels = 0..5 * self.scale * self.scale + CONDITIONS;
+        super::stage::Seen::Inputs(&buffers.maps[self.input], channels.collect())
     }
 }
 

@@ -28,14 +28,16 @@ pub(super) fn stages(
     let count = config.depth_layers;
     let layer_numbers = plane_bytes(PIXELS_PER_SAMPLE, size);
     let positions = PlanePositions::of_layers(count, bench);
+    let defocus = Defocus::new(config, bench, size, set);
     PlaneNetwork { config, bench, nets, feedback, positions, resolution, products }.stages(
         DepthLayers::new(count, size, set),
         layer_numbers,
-        |inputs| Expect {
-            bytes: frame_bytes(resolution) + layer_numbers + plane_bytes(3 * count + 2 * (MAPS + 3 * count), size),
+        defocus.room(),
+        |input| Expect {
+            bytes: frame_bytes(resolution) + layer_numbers + plane_bytes(3 * count + MAPS + 3 * count, size),
             frame: FrameBlocks::new(size, set),
-            defocus: Defocus::new(config, bench, size, set),
-            inputs,
+            defocus,
+            input,
         },
     )
 }
@@ -45,7 +47,7 @@ struct Expect {
     bytes: u64,
     frame: FrameBlocks,
     defocus: Defocus,
-    inputs: [MapId; 2],
+    input: MapId,
 }
 
 impl Stage<PlaneStack<DepthLayers>> for Expect {
@@ -58,13 +60,13 @@ impl Stage<PlaneStack<DepthLayers>> for Expect {
     }
 
     fn run(&mut self, buffers: &mut Buffers<PlaneStack<DepthLayers>>, job: &mut Job<'_, RgbdFrame>) {
-        let Buffers { maps, family: PlaneStack { view: layers, stack, .. } } = buffers;
-        let Self { frame, defocus, inputs, .. } = self;
+        let Buffers { maps, family: PlaneStack { view: layers, stack, room, .. } } = buffers;
+        let Self { frame, defocus, input, .. } = self;
         frame.take(job.input);
         layers.place(frame);
-        defocus.expect(frame, layers, job.pupil_mm, stack);
+        defocus.expect(frame, layers, job.pupil_mm, stack, room);
         let set = maps.set();
-        write_inputs(maps.get_two(*inputs), frame, job.conditions, stack, set);
+        write_inputs(&mut maps[*input], frame, job.conditions, stack, set);
     }
 
     #[cfg(test)]
@@ -73,6 +75,7 @@ impl Stage<PlaneStack<DepthLayers>> for Expect {
         buffers: &'a Buffers<PlaneStack<DepthLayers>>,
         _: &'a Job<'_, RgbdFrame>,
     ) -> super::stage::Seen<'a> {
-        super::stage::Seen::Map(&buffers.maps[self.inputs[0]], None)
+        let told = MAPS + buffers.family.stack.planes();
+        super::stage::Seen::Inputs(&buffers.maps[self.input], (0..told).collect())
     }
 }

@@ -50,14 +50,14 @@ impl PlaneFeedback {
         let (set, share, sharpness) = (light.set, *share, *sharpness);
         pupil.set_mm(pupil_mm);
         let fields = light.carried.blocks();
-        light.fft.for_columns(fields, |columns, field| set.run(Leave { columns, field }));
+        light.fft.for_columns(&mut light.between, fields, |columns, field| set.run(Leave { columns, field }));
         for plane in 0..light.count {
             if plane == 0 {
                 light.send_to_farthest(to_farthest, pupil, reaching);
             } else {
                 light.send_to_next(reaching);
             }
-            light.fft.for_columns(stack.blocks_mut().enumerate(), |columns, (block, stack)| {
+            light.fft.for_columns(&mut light.between, stack.blocks_mut().enumerate(), |columns, (block, stack)| {
                 set.run(Compare { columns, stack, plane, block, view, sharpness });
             });
             light.add(plane);
@@ -65,7 +65,7 @@ impl PlaneFeedback {
         light.bring_back(Some(pupil));
         let per_plane = 1.0 / light.count as f32;
         let blocks = light.carried.blocks_mut().zip(change.blocks_mut());
-        light.fft.for_columns(blocks, |columns, (field, change)| {
+        light.fft.for_columns(&mut light.between, blocks, |columns, (field, change)| {
             set.run(Change { columns, field, change, per_plane, share });
         });
     }

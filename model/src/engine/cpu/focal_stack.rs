@@ -4,7 +4,6 @@ use holod_calibration::{DisplayGeometry, Resolution};
 use rayon::prelude::*;
 
 use super::blocks::{Blocks, PIXELS_PER_SAMPLE, SCALE, grid_size};
-use super::input_features::FIRST_MAP;
 use super::plane_light::PlanePositions;
 use super::plane_stack::{PlaneNetwork, PlaneStack};
 use super::stage::{Buffers, Job, MapId, Stage, plane_bytes};
@@ -27,12 +26,10 @@ pub(super) fn stages(
     let images = 3 * config.planes;
     let positions = PlanePositions::from_end_to_end(config.planes, bench);
     let feedback = Feedback { share, sharpness: 0.0 };
-    PlaneNetwork { config, bench, nets, feedback, positions, resolution, products }.stages(FocalImages, 0, |inputs| {
-        Tell {
-            bytes: plane_bytes(images, resolution)
-                + plane_bytes(images + 2 * (PIXELS_PER_SAMPLE * images + CONDITIONS), size),
-            inputs,
-        }
+    let network = PlaneNetwork { config, bench, nets, feedback, positions, resolution, products };
+    network.stages(FocalImages, 0, 0, |input| Tell {
+        bytes: plane_bytes(images, resolution) + plane_bytes(images + PIXELS_PER_SAMPLE * images + CONDITIONS, size),
+        input,
     })
 }
 
@@ -51,7 +48,7 @@ impl View for FocalImages {
 /// Writes what is to be seen, and shows the images to both nets.
 struct Tell {
     bytes: u64,
-    inputs: [MapId; 2],
+    input: MapId,
 }
 
 impl Stage<PlaneStack<FocalImages>> for Tell {
@@ -74,23 +71,20 @@ impl Stage<PlaneStack<FocalImages>> for Tell {
         });
         let width = maps.size.width;
         let told = job.conditions.told().map(|value| value as f32);
-        for (input, first) in self.inputs.into_iter().zip([0, FIRST_MAP]) {
-            let map = &mut maps[input];
-            let stride = map.stride;
-            map.rows_mut().enumerate().for_each(|(y, row)| {
-                for (x, channels) in row[stride..][..width * stride].chunks_exact_mut(stride).enumerate() {
-                    let (images, rest) =
-                        channels[first..].split_at_mut(PIXELS_PER_SAMPLE * amplitude.len() / resolution.pixels());
-                    let planes = amplitude.chunks_exact(resolution.pixels());
-                    for (block, plane) in images.chunks_exact_mut(PIXELS_PER_SAMPLE).zip(planes) {
-                        for (corner, value) in block.iter_mut().enumerate() {
-                            *value = plane[blocks.index(x, y, corner)] - 0.4;
-                        }
+        let map = &mut maps[self.input];
+        let stride = map.stride;
+        map.rows_mut().enumerate().for_each(|(y, row)| {
+            for (x, channels) in row[stride..][..width * stride].chunks_exact_mut(stride).enumerate() {
+                let (images, rest) = channels.split_at_mut(PIXELS_PER_SAMPLE * amplitude.len() / resolution.pixels());
+                let planes = amplitude.chunks_exact(resolution.pixels());
+                for (block, plane) in images.chunks_exact_mut(PIXELS_PER_SAMPLE).zip(planes) {
+                    for (corner, value) in block.iter_mut().enumerate() {
+                        *value = plane[blocks.index(x, y, corner)] - 0.4;
                     }
-                    rest[..CONDITIONS].copy_from_slice(&told);
                 }
-            });
-        }
+                rest[..CONDITIONS].copy_from_slice(&told);
+            }
+        });
     }
 
     #[cfg(test)]
@@ -99,6 +93,7 @@ impl Stage<PlaneStack<FocalImages>> for Tell {
         buffers: &'a Buffers<PlaneStack<FocalImages>>,
         _: &'a Job<'_, FocalStack>,
     ) -> super::stage::Seen<'a> {
-        super::stage::Seen::Map(&buffers.maps[self.inputs[0]], None)
+        let told = PIXELS_PER_SAMPLE * buffers.family.stack.planes() + CONDITIONS;
+        super::stage::Seen::Inputs(&buffers.maps[self.input], (0..told).collect())
     }
 }

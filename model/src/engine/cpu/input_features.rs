@@ -1,4 +1,6 @@
-//! How a frame and fields become maps for the nets of `expected-stack`, and maps a field again.
+//! How a frame and fields become the map that both nets of a network read, and maps a field again.
+
+use std::ops::Range;
 
 use holod_calibration::{Colour, DisplayGeometry, Metres};
 use num_complex::Complex32;
@@ -14,8 +16,6 @@ use crate::weights::{CONDITIONS, OUTPUT_CHANNELS};
 
 /// Amplitude and two depth maps, each four times, and what is told of bench and pupil.
 pub(super) const MAPS: usize = 5 * PIXELS_PER_SAMPLE + CONDITIONS;
-/// Where the second net's input has the maps: after the field.
-pub(super) const FIRST_MAP: usize = OUTPUT_CHANNELS;
 /// The share of the second net's output that is added to the field.
 const CORRECTION_SHARE: f32 = 0.3;
 
@@ -24,33 +24,48 @@ pub(super) fn sample_pitch(bench: &DisplayGeometry) -> Metres {
     Metres(SCALE as f64 * bench.pixel_pitch.0)
 }
 
-/// Writes what both nets are told of a frame, bench and pupil, and the amplitudes `stack` that an eye should see: to
-/// the channels of the first one's map from 0 on, of the second one's from [`FIRST_MAP`] on.
+/// Which channels of the map that both nets read are what.
+#[derive(Clone, Copy)]
+pub(super) struct InputChannels {
+    /// So many, the first ones, are told to both nets.
+    pub(super) told: usize,
+    /// From here on what the second net alone reads: the field, three real parts and three imaginary ones, its change
+    /// likewise, and three colours of each plane of what is lacking. Nothing but zeros lies between what is told and
+    /// this.
+    pub(super) field: usize,
+    /// All of them.
+    pub(super) count: usize,
+}
+
+impl InputChannels {
+    /// Of `planes` that are lit, in whole vectors of `set`.
+    pub(super) fn new(told: usize, planes: usize, set: InstructionSet) -> Self {
+        let field = told.next_multiple_of(set.lanes());
+        Self { told, field, count: field + 2 * OUTPUT_CHANNELS + 3 * planes }
+    }
+
+    /// The channel of each input of the first net, in its weights' order.
+    pub(super) fn lighting(self) -> Vec<usize> {
+        (0..self.told).collect()
+    }
+
+    /// The same of the second net.
+    pub(super) fn correction(self) -> Vec<usize> {
+        let change = self.field + OUTPUT_CHANNELS;
+        (self.field..change).chain(0..self.told).chain(change..self.count).collect()
+    }
+}
+
+/// Writes what both nets are told of a frame, bench and pupil, and the amplitudes `stack` that an eye should see.
 pub(super) fn write_inputs(
-    [first, second]: [&mut FeatureMap; 2],
+    map: &mut FeatureMap,
     frame: &FrameBlocks,
     conditions: Conditions,
     stack: &ColumnBlocks,
     set: InstructionSet,
 ) {
-    let strides = [first.stride, second.stride];
-    let row_lens = [first.row_len, second.row_len];
-    let (width, lanes) = (first.width, stack.lanes());
     let (told, blur_scale) = (conditions.told().map(|value| value as f32), conditions.blur_scale() as f32);
-    first.bands_mut().zip(second.bands_mut()).enumerate().for_each(|(band, (first, second))| {
-        for (block, x) in (0..width).step_by(lanes).enumerate() {
-            let pixels = lanes.min(width - x);
-            let rows = first.chunks_exact_mut(row_lens[0]).zip(second.chunks_exact_mut(row_lens[1]));
-            for (y, (first, second)) in (band * BAND..).zip(rows) {
-                let channels = Samples { frame, stack, told, blur_scale, block, y };
-                let to = [
-                    (&mut first[(x + 1) * strides[0]..][..pixels * strides[0]], strides[0]),
-                    (&mut second[(x + 1) * strides[1] + FIRST_MAP..][..pixels * strides[1] - FIRST_MAP], strides[1]),
-                ];
-                set.run(WriteChannels { count: MAPS + stack.planes(), channels, to });
-            }
-        }
-    });
+    map.write_channels(0..MAPS + stack.planes(), set, |block, y| Samples { frame, stack, told, blur_scale, block, y });
 }
 
 /// What is written to the channels of the pixels in one row of a block of columns.
@@ -110,16 +125,19 @@ impl Channels for Planes<'_> {
     }
 }
 
-/// Writes channels to pixels of N maps, each with its stride.
-struct WriteChannels<'a, C, const N: usize> {
+/// Writes channels to pixels.
+struct WriteChannels<'a, C> {
     count: usize,
     channels: C,
-    to: [(&'a mut [f32], usize); N],
+    /// From the first channel that is written on.
+    to: &'a mut [f32],
+    /// From one pixel to the next.
+    stride: usize,
 }
 
-impl<C: Channels, const N: usize> Task for WriteChannels<'_, C, N> {
+impl<C: Channels> Task for WriteChannels<'_, C> {
     #[inline(always)]
-    fn run<S: Simd>(mut self, simd: S) {
+    fn run<S: Simd>(self, simd: S) {
         const { assert!(S::LANES <= MOST_LANES) };
         let (mut rows, mut columns) = ([[0.0; MOST_LANES]; MOST_LANES], [[0.0; MOST_LANES]; MOST_LANES]);
         let count = S::LANES.min(self.count);
@@ -134,14 +152,12 @@ impl<C: Channels, const N: usize> Task for WriteChannels<'_, C, N> {
                 let (rows, columns) = (rows.as_flattened().as_ptr(), columns.as_flattened_mut().as_mut_ptr());
                 simd.transpose(rows, columns, [MOST_LANES; 2]);
             }
-            for (pixels, stride) in &mut self.to {
-                for (pixel, channels) in pixels.chunks_mut(*stride).zip(&columns) {
-                    let pixel = &mut pixel[first..][..count];
-                    if count == S::LANES {
-                        simd.write(pixel, simd.read(channels));
-                    } else {
-                        pixel.iter_mut().zip(channels).for_each(|(to, from)| *to = *from);
-                    }
+            for (pixel, channels) in self.to.chunks_mut(self.stride).zip(&columns) {
+                let pixel = &mut pixel[first..][..count];
+                if count == S::LANES {
+                    simd.write(pixel, simd.read(channels));
+                } else {
+                    pixel.iter_mut().zip(channels).for_each(|(to, from)| *to = *from);
                 }
             }
         }
@@ -152,15 +168,25 @@ impl FeatureMap {
     /// Writes planes to the channels from `first` on, those of one [`ColumnBlocks`] after another; of complex ones
     /// first all real parts.
     pub(super) fn write_planes(&mut self, first: usize, blocks: &[&ColumnBlocks], set: InstructionSet) {
-        let (width, stride, lanes) = (self.width, self.stride, set.lanes());
-        let count = blocks.iter().map(|blocks| blocks.planes() * blocks.parts()).sum();
-        let row_len = self.row_len;
+        let count = blocks.iter().map(|blocks| blocks.planes() * blocks.parts()).sum::<usize>();
+        self.write_channels(first..first + count, set, |block, y| Planes { blocks, block, y });
+    }
+
+    /// Writes what `channels(block, y)` has to the channels in `range`.
+    fn write_channels<C: Channels>(
+        &mut self,
+        range: Range<usize>,
+        set: InstructionSet,
+        channels: impl Fn(usize, usize) -> C + Sync,
+    ) {
+        let (width, stride, row_len, lanes) = (self.width, self.stride, self.row_len, set.lanes());
+        let Range { start: first, end } = range;
         self.bands_mut().enumerate().for_each(|(band, rows)| {
             for (block, x) in (0..width).step_by(lanes).enumerate() {
                 let pixels = lanes.min(width - x);
                 for (y, row) in (band * BAND..).zip(rows.chunks_exact_mut(row_len)) {
-                    let to = [(&mut row[(x + 1) * stride + first..][..pixels * stride - first], stride)];
-                    set.run(WriteChannels { count, channels: Planes { blocks, block, y }, to });
+                    let to = &mut row[(x + 1) * stride + first..][..pixels * stride - first];
+                    set.run(WriteChannels { count: end - first, channels: channels(block, y), to, stride });
                 }
             }
         });

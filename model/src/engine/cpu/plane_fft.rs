@@ -13,19 +13,17 @@ use super::line_fft::{Direction, FftScratch, LineFft};
 use super::workers::{WORKERS, share_out};
 use crate::simd::{InstructionSet, Simd};
 
-/// The transforms, and what is between their halves. Nothing is allocated after `new`.
+/// The transforms. Nothing is allocated after `new`.
+///
+/// What columns were transformed to, [block of columns, plane, row, part, column of the block], with rows up to whole
+/// blocks of rows, and what rows were transformed back to, [block of rows, plane, block of columns, row of the block,
+/// part, column of the block], lies in room that the user lends ([`Self::room_between`]).
 pub(super) struct PlaneFft {
     size: Resolution,
     planes: usize,
     lanes: usize,
     rows: LineFft,
     columns: LineFft,
-    /// What columns were transformed to: [block of columns, plane, row, part, column of the block], with rows up to
-    /// whole blocks of rows.
-    by_columns: Vec<f32>,
-    /// What rows were transformed back to: [block of rows, plane, block of columns, row of the block, part, column of
-    /// the block].
-    by_rows: Vec<f32>,
     workers: Vec<Worker>,
 }
 
@@ -43,23 +41,19 @@ impl PlaneFft {
     pub(super) fn new(planes: usize, size: Resolution, set: InstructionSet) -> Self {
         let (Resolution { width, height }, lanes) = (size, set.lanes());
         let (rows, columns) = (LineFft::new(width), LineFft::new(height));
-        let padded = width.next_multiple_of(lanes) * height.next_multiple_of(lanes);
         let worker = |_| Worker {
             lines: vec![0.0; planes * 2 * lanes * width.max(height)],
             between: vec![0.0; 2 * lanes * width.next_multiple_of(lanes).max(height)],
             row_scratch: rows.scratch(lanes),
             column_scratch: columns.scratch(lanes),
         };
-        Self {
-            size,
-            planes,
-            lanes,
-            workers: (0..WORKERS).map(worker).collect(),
-            by_columns: vec![0.0; planes * 2 * padded],
-            by_rows: vec![0.0; planes * 2 * padded],
-            rows,
-            columns,
-        }
+        Self { size, planes, lanes, workers: (0..WORKERS).map(worker).collect(), rows, columns }
+    }
+
+    /// Values between the halves of transforms.
+    pub(super) fn room_between(&self) -> usize {
+        let Self { size: Resolution { width, height }, planes, lanes, .. } = *self;
+        2 * planes * 2 * width.next_multiple_of(lanes) * height.next_multiple_of(lanes)
     }
 
     /// Values of the spectra in one block of rows.
@@ -75,11 +69,12 @@ impl PlaneFft {
     /// Runs `work` on each block of columns, from left to right, with one of `items`.
     pub(super) fn for_columns<T: Send>(
         &mut self,
+        between: &mut [f32],
         items: impl Iterator<Item = T> + Send,
         work: impl Fn(Columns<'_>, T) + Sync,
     ) {
-        let Self { size: Resolution { width, height }, planes, lanes, columns, by_columns, by_rows, workers, .. } =
-            self;
+        let (by_columns, by_rows) = between[..self.room_between()].split_at_mut(self.room_between() / 2);
+        let Self { size: Resolution { width, height }, planes, lanes, columns, workers, .. } = self;
         let (tile, blocks) = (*lanes * 2 * *lanes, width.div_ceil(*lanes));
         let plane_len = height.next_multiple_of(*lanes) * 2 * *lanes;
         let chunks = by_columns.chunks_exact_mut(*planes * plane_len);
@@ -94,10 +89,12 @@ impl PlaneFft {
     /// Runs `work` on each block of rows, from top to bottom, with one of `items`.
     pub(super) fn for_rows<T: Send>(
         &mut self,
+        between: &mut [f32],
         items: impl Iterator<Item = T> + Send,
         work: impl Fn(Rows<'_>, T) + Sync,
     ) {
-        let Self { size: Resolution { width, height }, planes, lanes, rows, by_columns, by_rows, workers, .. } = self;
+        let (by_columns, by_rows) = between[..self.room_between()].split_at_mut(self.room_between() / 2);
+        let Self { size: Resolution { width, height }, planes, lanes, rows, workers, .. } = self;
         let (tile, blocks) = (*lanes * 2 * *lanes, height.div_ceil(*lanes));
         let plane_len = width.next_multiple_of(*lanes) * 2 * *lanes;
         let chunks = by_rows.chunks_exact_mut(*planes * plane_len);
@@ -318,11 +315,13 @@ mod tests {
                 let (from, fields) = planes(size, set, 0.3);
                 let mut to = ColumnBlocks::of_cells(PLANES, size, set);
                 let mut fft = PlaneFft::new(PLANES, size, set);
+                let between = &mut vec![f32::NAN; fft.room_between() + 3];
                 // What the first planes leave behind must not show in the second.
                 for from in [&planes(size, set, 5.3).0, &from] {
-                    fft.for_columns(from.blocks(), |columns, from| set.run(Step::Send(columns, from)));
-                    fft.for_rows(std::iter::repeat(doubled), |rows, doubled| set.run(Step::Exchange(rows, doubled)));
-                    fft.for_columns(to.blocks_mut(), |columns, to| set.run(Step::Take(columns, to)));
+                    fft.for_columns(between, from.blocks(), |columns, from| set.run(Step::Send(columns, from)));
+                    let doubled = std::iter::repeat(doubled);
+                    fft.for_rows(between, doubled, |rows, doubled| set.run(Step::Exchange(rows, doubled)));
+                    fft.for_columns(between, to.blocks_mut(), |columns, to| set.run(Step::Take(columns, to)));
                 }
 
                 let mut slow = TransposedFft2d::new(width, height);

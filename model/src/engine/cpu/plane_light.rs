@@ -42,6 +42,8 @@ pub(super) struct PlaneLight {
     pub(super) count: usize,
     pub(super) set: InstructionSet,
     pub(super) fft: PlaneFft,
+    /// What is between the halves of its transforms.
+    pub(super) between: Vec<f32>,
     /// From one plane to the next nearer one.
     step: Vec<f32>,
     /// From the nearest plane to the SLM plane, over the number of samples.
@@ -70,6 +72,7 @@ impl PlaneLight {
             step,
             back: transfer(bench, size, Metres(-nearest_m), set),
             sum: fft.room_for_spectra(),
+            between: vec![0.0; fft.room_between()],
             fft,
             carried: ColumnBlocks::of_cells(Colour::ALL.len(), size, set),
         }
@@ -77,41 +80,43 @@ impl PlaneLight {
 
     /// Adds the light that plane `number` has sent to that of farther ones: Horner's rule, far to near.
     pub(super) fn add(&mut self, number: usize) {
-        let Self { set, fft, step, sum, .. } = self;
+        let Self { set, fft, between, step, sum, .. } = self;
         let blocks = sum.chunks_exact_mut(fft.spectra_len()).zip(step.chunks_exact(fft.spectra_len()));
-        fft.for_rows(blocks, |rows, (sum, step)| set.run(Add { rows, sum, step, is_first: number == 0 }));
+        fft.for_rows(between, blocks, |rows, (sum, step)| set.run(Add { rows, sum, step, is_first: number == 0 }));
     }
 
     /// Sends what arrives at the SLM plane of the light of all planes, through a pupil or past it.
     pub(super) fn bring_back(&mut self, pupil: Option<&PupilStop>) {
-        let Self { set, fft, sum, back, .. } = self;
+        let Self { set, fft, between, sum, back, .. } = self;
         let blocks = sum.chunks_exact(fft.spectra_len()).zip(back.chunks_exact(fft.spectra_len())).enumerate();
-        fft.for_rows(blocks, |rows, (block, (sum, back))| set.run(BringBack { rows, sum, back, pupil, block }));
+        fft.for_rows(between, blocks, |rows, (block, (sum, back))| {
+            set.run(BringBack { rows, sum, back, pupil, block })
+        });
     }
 
     /// Sends light that has left the SLM plane to the farthest plane through a pupil: `transfer` is the transfer
     /// function to there, and `reaching` becomes what reaches the next nearer plane.
     pub(super) fn send_to_farthest(&mut self, transfer: &[f32], pupil: &PupilStop, reaching: &mut [f32]) {
-        let Self { set, fft, step, .. } = self;
+        let Self { set, fft, between, step, .. } = self;
         let len = fft.spectra_len();
         let tables = transfer.chunks_exact(len).zip(step.chunks_exact(len));
         let blocks = reaching.chunks_exact_mut(len).zip(tables).enumerate();
-        fft.for_rows(blocks, |rows, (block, (reaching, (transfer, step)))| {
+        fft.for_rows(between, blocks, |rows, (block, (reaching, (transfer, step)))| {
             set.run(SendToFarthest { rows, transfer, pupil, block, reaching, step });
         });
     }
 
     /// Sends `reaching` to a plane, and makes of it what reaches the next nearer one.
     pub(super) fn send_to_next(&mut self, reaching: &mut [f32]) {
-        let Self { set, fft, step, .. } = self;
+        let Self { set, fft, between, step, .. } = self;
         let blocks = reaching.chunks_exact_mut(fft.spectra_len()).zip(step.chunks_exact(fft.spectra_len()));
-        fft.for_rows(blocks, |rows, (reaching, step)| set.run(SendToNext { rows, reaching, step }));
+        fft.for_rows(between, blocks, |rows, (reaching, step)| set.run(SendToNext { rows, reaching, step }));
     }
 
     /// Takes what has arrived at the SLM plane as the field.
     pub(super) fn keep(&mut self) {
-        let Self { set, fft, carried, .. } = self;
-        fft.for_columns(carried.blocks_mut(), |columns, carried| set.run(Keep { columns, carried }));
+        let Self { set, fft, between, carried, .. } = self;
+        fft.for_columns(between, carried.blocks_mut(), |columns, carried| set.run(Keep { columns, carried }));
     }
 }
 

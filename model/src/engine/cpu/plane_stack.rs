@@ -10,7 +10,7 @@ use super::column_blocks::{ColumnBlocks, store};
 use super::feature_map::FeatureMap;
 use super::feedback::PlaneFeedback;
 use super::field::{Field, UncorrectedField};
-use super::input_features::FIRST_MAP;
+use super::input_features::InputChannels;
 use super::plane_fft::Columns;
 use super::plane_light::{PlaneLight, PlanePositions};
 use super::stage::{Buffers, Job, MapId, Maps, Shared, Stage, plane_bytes};
@@ -31,6 +31,8 @@ pub(super) struct PlaneStack<V> {
     /// Three colours of each plane: the amplitudes that an eye should see, once the planes are lit as the first net
     /// corrects them; after the feedback, what is lacking of them.
     pub(super) stack: ColumnBlocks,
+    /// What one stage needs, and the next one no more.
+    pub(super) room: Vec<f32>,
     pub(super) view: V,
 }
 
@@ -59,30 +61,37 @@ pub(super) struct PlaneNetwork<'a> {
 }
 
 impl PlaneNetwork<'_> {
-    /// Its stages. The first one, which `tell` makes for the inputs of both nets, writes [`PlaneStack::stack`] and what
-    /// they are told: the first net from channel 0, the second from [`FIRST_MAP`] on. `view_bytes` are read of `view`
-    /// for the feedback.
+    /// Its stages. The first one, which `tell` makes for the map that both nets read, writes
+    /// [`PlaneStack::stack`] and what they are told, with `room` values of [`PlaneStack::room`]. `view_bytes` are read
+    /// of `view` for the feedback.
     pub(super) fn stages<V: View, S: Stage<PlaneStack<V>> + 'static>(
         self,
         view: V,
         view_bytes: u64,
-        tell: impl FnOnce([MapId; 2]) -> S,
+        room: usize,
+        tell: impl FnOnce(MapId) -> S,
     ) -> StageList<PlaneStack<V>> {
         let Self { config, bench, nets: [lighting, correction], feedback, positions, resolution, products } = self;
         let (size, set) = (grid_size(config.grid, resolution), products.set());
         let mut maps = Maps::new(size, products);
-        let told = lighting[0].in_channels;
+        let channels = InputChannels::new(lighting[0].in_channels, positions.count, set);
+        let input = maps.add(channels.count);
         let lights = lighting[lighting.len() - 1].out_channels;
-        let lighting = Trunk::new(&mut maps, "lighting ", lighting, config.leaky_slope);
-        let correction = Trunk::new(&mut maps, "correction ", correction, config.leaky_slope);
+        let mut net = |prefix, layers, inputs: Vec<usize>| {
+            Trunk::new(&mut maps, prefix, layers, config.leaky_slope, input, &inputs)
+        };
+        let lighting = net("lighting ", lighting, channels.lighting());
+        let correction = net("correction ", correction, channels.correction());
         let stack_planes = 3 * positions.count;
+        let room = room.max(ColumnBlocks::room_for_reals(maps[lighting.output].stride, size, set));
         let shared = PlaneStack {
             light: PlaneLight::new(positions, bench, size, set),
             stack: ColumnBlocks::of_reals(stack_planes, size, set),
+            room: vec![0.0; room],
             view,
         };
         StageList::new(maps, shared)
-            .then(tell([lighting.input, correction.input]))
+            .then(tell(input))
             .then_each(lighting.layers)
             .then(LightPlanes {
                 // The stack is written where it is refined.
@@ -92,15 +101,14 @@ impl PlaneNetwork<'_> {
                 ),
                 output: lighting.output,
                 refines: config.refined_stack,
-                outputs: ColumnBlocks::of_reals(lights.next_multiple_of(set.lanes()), size, set),
             })
             .then(FeedBack {
                 // The field before and after, for the net the field and its change, and the stack and what is lacking
                 // of it.
                 bytes: view_bytes + plane_bytes(4 * OUTPUT_CHANNELS + 2 * stack_planes, size),
                 feedback: PlaneFeedback::new(feedback, positions, bench, size, set),
-                told,
-                correction_input: correction.input,
+                input,
+                channels,
             })
             .then_each(correction.layers)
             .then(Field::new(config.grid, resolution, correction.output))
@@ -114,8 +122,6 @@ struct LightPlanes {
     /// The first net's.
     output: MapId,
     refines: bool,
-    /// What the first net gives, masks as shares of the light.
-    outputs: ColumnBlocks,
 }
 
 impl<V: View> Stage<PlaneStack<V>> for LightPlanes {
@@ -128,14 +134,17 @@ impl<V: View> Stage<PlaneStack<V>> for LightPlanes {
     }
 
     fn run(&mut self, buffers: &mut Buffers<PlaneStack<V>>, _: &mut Job<'_, V::Input>) {
-        let Self { output, refines, outputs, .. } = self;
-        let Buffers { maps, family: PlaneStack { light, stack, .. } } = buffers;
+        let Self { output, refines, .. } = self;
+        let Buffers { maps, family: PlaneStack { light, stack, room, .. } } = buffers;
         let (map, set, count, refines) = (&maps[*output], maps.set(), light.count, *refines);
+        // What the first net gives, masks as shares of the light.
+        let mut outputs = ColumnBlocks::of_reals_in(room, map.stride, maps.size, set);
         outputs.par_blocks_mut().enumerate().for_each(|(block, outputs)| {
             set.run(TakeOutputs { map, first: block * set.lanes(), outputs, planes: count });
         });
         for plane in 0..count {
-            light.fft.for_columns(outputs.blocks().zip(stack.blocks_mut()), |columns, (outputs, wanted)| {
+            let blocks = outputs.blocks().zip(stack.blocks_mut());
+            light.fft.for_columns(&mut light.between, blocks, |columns, (outputs, wanted)| {
                 set.run(LightColumns { columns, plane, count, refines, outputs, wanted });
             });
             light.add(plane);
@@ -235,9 +244,8 @@ impl Task for LightColumns<'_> {
 struct FeedBack {
     bytes: u64,
     feedback: PlaneFeedback,
-    /// Channels of what both nets are told besides.
-    told: usize,
-    correction_input: MapId,
+    input: MapId,
+    channels: InputChannels,
 }
 
 impl<V: View> Stage<PlaneStack<V>> for FeedBack {
@@ -250,15 +258,14 @@ impl<V: View> Stage<PlaneStack<V>> for FeedBack {
     }
 
     fn run(&mut self, buffers: &mut Buffers<PlaneStack<V>>, job: &mut Job<'_, V::Input>) {
-        let Buffers { maps, family: PlaneStack { light, stack, view } } = buffers;
+        let Buffers { maps, family: PlaneStack { light, stack, view, .. } } = buffers;
         self.feedback.run(light, stack, view, job.pupil_mm);
-        let map = &mut maps[self.correction_input];
-        map.write_planes(0, &[&light.carried], light.set);
-        map.write_planes(FIRST_MAP + self.told, &[&self.feedback.change, stack], light.set);
+        let change = &self.feedback.change;
+        maps[self.input].write_planes(self.channels.field, &[&light.carried, change, stack], light.set);
     }
 
     #[cfg(test)]
     fn seen<'a>(&'a self, buffers: &'a Buffers<PlaneStack<V>>, _: &'a Job<'_, V::Input>) -> super::stage::Seen<'a> {
-        super::stage::Seen::Map(&buffers.maps[self.correction_input], None)
+        super::stage::Seen::Inputs(&buffers.maps[self.input], self.channels.correction())
     }
 }

@@ -57,8 +57,10 @@ pub(super) const fn frame_bytes(resolution: Resolution) -> u64 {
 
 #[cfg(test)]
 pub(super) enum Seen<'a> {
-    /// A layer's map, and the offsets of an adjustable one; or what the first layer reads.
-    Map(&'a FeatureMap, Option<&'a FeatureMap>),
+    /// A layer's map, and the offsets of an adjustable one.
+    Map(&'a FeatureMap, Option<FeatureMap>),
+    /// What a net reads, and the channel of each of its inputs.
+    Inputs(&'a FeatureMap, Vec<usize>),
     /// A field, [3, height, width].
     Light(std::borrow::Cow<'a, [num_complex::Complex32]>),
 }
@@ -109,11 +111,6 @@ impl Maps {
         let maps = [self.add(channels), self.add(channels)];
         self.handed_on.push((channels, maps));
         maps
-    }
-
-    /// Two maps, which are not the same.
-    pub(super) fn get_two(&mut self, maps: [MapId; 2]) -> [&mut FeatureMap; 2] {
-        self.maps.get_disjoint_mut(maps.map(|map| map.0)).expect("they are two")
     }
 
     /// What a layer needs that reads one map and writes another.

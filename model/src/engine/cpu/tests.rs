@@ -47,9 +47,16 @@ fn largest(values: impl Iterator<Item = f64>) -> f64 {
 
 /// Difference of two maps relative to the reference's largest value.
 fn map_error(actual: &FeatureMap, expected: &reference::Map) -> f64 {
-    let [channels, height, width] = [expected.channels, expected.height, expected.width];
-    let differences = reference::Map::from_fn([channels, height, width], |channel, y, x| {
-        f64::from(actual.pixel(x, y)[channel]) - expected.at(channel, y as isize, x as isize)
+    let channels: Vec<_> = (0..expected.channels).collect();
+    error_of_channels(actual, &channels, expected)
+}
+
+/// The error of the channels of a map that are listed, in the order of the expected ones.
+fn error_of_channels(actual: &FeatureMap, channels: &[usize], expected: &reference::Map) -> f64 {
+    assert_eq!(channels.len(), expected.channels);
+    let shape = [expected.channels, expected.height, expected.width];
+    let differences = reference::Map::from_fn(shape, |channel, y, x| {
+        f64::from(actual.pixel(x, y)[channels[channel]]) - expected.at(channel, y as isize, x as isize)
     });
     largest(differences.values.into_iter()) / largest(expected.values.iter().copied()).max(1e-6)
 }
@@ -62,9 +69,13 @@ fn light_error(actual: &[Complex32], expected: &[Complex64]) -> f64 {
 
 /// The error of a map after one value of the expected one was changed.
 fn error_once_spoiled(map: &FeatureMap, expected: &mut reference::Map) -> f64 {
+    spoil(expected);
+    map_error(map, expected)
+}
+
+fn spoil(expected: &mut reference::Map) {
     let middle = expected.values.len() / 2;
     expected.values[middle] += 1e-3 * largest(expected.values.iter().copied()).max(1e-6);
-    map_error(map, expected)
 }
 
 /// What the engine calls a stage of the reference; `first` is the first one's name of a network that lights planes.
@@ -151,7 +162,7 @@ fn check_network<I>(
 /// Compares what a stage wrote with what it should have written, and again after `expected` was spoiled.
 fn check_stage(what: &str, seen: &Seen<'_>, expected: &mut Value) {
     let error = match (seen, &*expected) {
-        (Seen::Map(map, None), Value::Encoded(expected)) => map_error(map, expected),
+        (Seen::Inputs(map, channels), Value::Encoded(expected)) => error_of_channels(map, channels, expected),
         (Seen::Map(map, offsets), Value::Layer(expected, expected_offsets)) => {
             assert_eq!(offsets.is_some(), expected_offsets.is_some(), "{what}");
             let errors = offsets.iter().zip(expected_offsets).map(|(map, expected)| map_error(map, expected));
@@ -162,7 +173,10 @@ fn check_stage(what: &str, seen: &Seen<'_>, expected: &mut Value) {
     };
     assert!(error < TOLERANCE, "{what}: {error}");
     let spoiled = match (seen, expected) {
-        (Seen::Map(map, _), Value::Encoded(expected)) => error_once_spoiled(map, expected),
+        (Seen::Inputs(map, channels), Value::Encoded(expected)) => {
+            spoil(expected);
+            error_of_channels(map, channels, expected)
+        }
         (Seen::Map(map, offsets), Value::Layer(expected, expected_offsets)) => {
             let offsets = offsets.iter().zip(expected_offsets).map(|(map, expected)| error_once_spoiled(map, expected));
             offsets.fold(error_once_spoiled(map, expected), f64::min)
@@ -429,7 +443,7 @@ fn stages_tell_the_least_that_they_move() {
         assert_eq!(
             stages(config),
             named(&[
-                ("expected stack", frame + numbers + planes(15 + 2 * (22 + 15))),
+                ("expected stack", frame + numbers + planes(15 + 22 + 15)),
                 ("lighting layer 0", planes(22 + 15 + 8)),
                 ("lighting layer 1", planes(8 + 8)),
                 ("lighting layer 2 (adjustable)", planes(8 + 8 + 8)),

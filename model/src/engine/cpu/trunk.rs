@@ -2,25 +2,30 @@
 
 use super::conv::{Epilogue, PlainConv};
 use super::deformable::DeformableConv;
-use super::feature_map::FeatureMap;
 use super::stage::{Buffers, Job, MapId, Maps, Shared, Stage, plane_bytes};
 use crate::conditions::Conditions;
 use crate::engine::modulation::Modulation;
 use crate::weights::{Layer, OFFSET_CHANNELS};
 
-/// The layers as stages, and the maps at both ends.
+/// The layers as stages, and the map that the last one writes.
 pub(super) struct Trunk {
-    pub(super) input: MapId,
     pub(super) layers: Vec<LayerStage>,
     pub(super) output: MapId,
 }
 
 impl Trunk {
-    /// At least two layers, which weights are checked for when they are read. `prefix` is what the stages' names begin
-    /// with.
-    pub(super) fn new(maps: &mut Maps, prefix: &str, layers: &[Layer], leaky_slope: f32) -> Self {
+    /// At least two layers, which weights are checked for when they are read. The first one reads the channels `inputs`
+    /// of the map `input`, in its weights' order; `prefix` is what the stages' names begin with.
+    pub(super) fn new(
+        maps: &mut Maps,
+        prefix: &str,
+        layers: &[Layer],
+        leaky_slope: f32,
+        input: MapId,
+        inputs: &[usize],
+    ) -> Self {
         let last = layers.len() - 1;
-        let input = maps.add(layers[0].in_channels);
+        let features_of: Vec<_> = (0..layers[0].out_channels).collect();
         // The latter between the two convolutions of a residual pair.
         let [features, between] = maps.handed_on(layers[0].out_channels);
         let output = maps.add(layers[last].out_channels);
@@ -31,7 +36,8 @@ impl Trunk {
                 _ if index % 2 == 1 => ([features, between], Epilogue::Leaky),
                 _ => ([between, features], Epilogue::ResidualLeaky),
             };
-            let conv = Conv::new(maps, layer, epilogue, leaky_slope);
+            let inputs = if index == 0 { inputs } else { &features_of };
+            let conv = Conv::new(maps, layer, inputs, epilogue, leaky_slope);
             let adjustable = if layer.adjustable.is_some() { " (adjustable)" } else { "" };
             // What is there already is read, too.
             let skipped = if epilogue == Epilogue::ResidualLeaky { layer.out_channels } else { 0 };
@@ -45,7 +51,7 @@ impl Trunk {
                 conv,
             }
         };
-        Self { input, layers: layers.iter().enumerate().map(stage).collect(), output }
+        Self { layers: layers.iter().enumerate().map(stage).collect(), output }
     }
 }
 
@@ -78,8 +84,7 @@ impl<F: Shared> Stage<F> for LayerStage {
             Conv::Plain(conv) => conv.run(input, scratch, output),
             Conv::Adjustable(adjustable) => {
                 adjustable.modulate(job.conditions);
-                adjustable.offset_conv.run(input, scratch, &mut adjustable.offsets);
-                adjustable.conv.run(input, &adjustable.offsets, output);
+                adjustable.conv.run(input, output);
             }
         }
     }
@@ -88,7 +93,10 @@ impl<F: Shared> Stage<F> for LayerStage {
     fn seen<'a>(&'a self, buffers: &'a Buffers<F>, _: &'a Job<'_, F::Input>) -> super::stage::Seen<'a> {
         let offsets = match &self.conv {
             Conv::Plain(_) => None,
-            Conv::Adjustable(adjustable) => Some(&adjustable.offsets),
+            // Once more: they are nowhere kept whole.
+            Conv::Adjustable(adjustable) => {
+                Some(adjustable.conv.offset_conv.run_anew(&buffers.maps[self.from], OFFSET_CHANNELS))
+            }
         };
         super::stage::Seen::Map(&buffers.maps[self.to], offsets)
     }
@@ -99,36 +107,32 @@ enum Conv {
     Adjustable(Box<AdjustableConv>),
 }
 
-/// A deformable convolution whose offsets are predicted by a plain one, which is modulated for bench and pupil.
+/// A deformable convolution, the prediction of whose offsets is modulated for bench and pupil.
 struct AdjustableConv {
     conv: DeformableConv,
-    channels: usize,
+    inputs: Vec<usize>,
     modulation: Modulation,
-    offset_conv: PlainConv,
-    offsets: FeatureMap,
 }
 
 impl Conv {
-    fn new(maps: &mut Maps, layer: &Layer, epilogue: Epilogue, leaky_slope: f32) -> Self {
+    fn new(maps: &mut Maps, layer: &Layer, inputs: &[usize], epilogue: Epilogue, leaky_slope: f32) -> Self {
         let Layer { in_channels: channels, out_channels, weight, bias, adjustable } = layer;
         let (channels, products) = (*channels, maps.products);
         let weight = |output, input, tap| weight[(output * channels + input) * 9 + tap];
         match adjustable {
             None => {
-                let mut conv = PlainConv::new(channels, *out_channels, epilogue, leaky_slope, products);
-                conv.fill(channels, bias.iter().copied(), weight);
+                let read = inputs.iter().max().map_or(0, |channel| channel + 1);
+                let mut conv = PlainConv::new(read, *out_channels, epilogue, leaky_slope, products);
+                conv.fill(inputs, bias.iter().copied(), weight);
                 maps.scratch.fit(&conv);
                 Self::Plain(conv)
             }
             Some(parameters) => {
-                let offset_conv = PlainConv::new(channels, OFFSET_CHANNELS, Epilogue::None, leaky_slope, products);
-                maps.scratch.fit(&offset_conv);
+                let width = maps.size.width;
                 Self::Adjustable(Box::new(AdjustableConv {
-                    conv: DeformableConv::new(channels, bias, weight, epilogue, leaky_slope, products),
-                    channels,
+                    conv: DeformableConv::new(channels, width, bias, weight, epilogue, leaky_slope, products),
+                    inputs: inputs.to_vec(),
                     modulation: Modulation::new(parameters, leaky_slope),
-                    offset_conv,
-                    offsets: FeatureMap::new(maps.size.width, maps.size.height, OFFSET_CHANNELS, products.set()),
                 }))
             }
         }
@@ -138,10 +142,10 @@ impl Conv {
 impl AdjustableConv {
     /// Sets the offset prediction to that for a bench and a pupil, unless it is already.
     fn modulate(&mut self, conditions: Conditions) {
-        let Self { channels, modulation, offset_conv, .. } = self;
+        let Self { inputs, modulation, conv } = self;
         if let Some(parameters) = modulation.change_to(conditions) {
-            offset_conv.fill(*channels, parameters.bias.iter().copied(), |output, input, tap| {
-                parameters.weight[(output * *channels + input) * 9 + tap]
+            conv.offset_conv.fill(inputs, parameters.bias.iter().copied(), |output, input, tap| {
+                parameters.weight[(output * inputs.len() + input) * 9 + tap]
             });
         }
     }
