@@ -27,7 +27,14 @@ from holod_training.benches import BenchDraw
 from holod_training.config import NetworkConfig, OpticsConfig, require
 from holod_training.curves import plot_curves
 from holod_training.expected_stack import with_refined_stack
-from holod_training.export import check_folder, load_weights, save_weights, write_beside
+from holod_training.export import (
+    WeightsError,
+    check_folder,
+    load_weights,
+    read_metadata,
+    save_weights,
+    write_beside,
+)
 from holod_training.foam import REGION_PX
 from holod_training.focal_stack import planes_dpt
 from holod_training.loss import (
@@ -468,9 +475,9 @@ def _train(config: TrainConfig, device: torch.device, resume: bool, rank: int, w
     first = run.step
     log: RunLog | None = None
     weights = out / "weights.safetensors"
-    if rank == 0 and first == config.steps and not weights.is_file():
-        # It was killed between its last checkpoint and its weights.
-        _validate(run, RunLog(out, config, first), weights)
+    if rank == 0 and first == config.steps and _steps_of(weights) != first:
+        # It ended between its last checkpoint and its weights; those that are there, if any, are of an earlier step.
+        _validate(run, RunLog(out, config, first, is_to_validate=True), weights)
     progress = tqdm(
         total=config.steps,
         initial=run.step,
@@ -505,6 +512,15 @@ def _train(config: TrainConfig, device: torch.device, resume: bool, rank: int, w
     return weights
 
 
+def _steps_of(weights: Path) -> int | None:
+    """After how many steps a weights file was written; None where there is none that can be read."""
+    try:
+        steps: int | None = read_metadata(weights)["provenance"].get("steps")
+    except WeightsError:
+        return None
+    return steps
+
+
 def _validate(run: Run, log: RunLog, weights: Path) -> None:
     """Judges the averaged weights and writes them. Raises TrainingError for a run that is flat."""
     measured = run.validate()
@@ -532,16 +548,22 @@ def _stop_if_flat(run: Run, measured: dict[str, dict[str, float]]) -> None:
 
 
 class RunLog:
-    """config.json and metrics.jsonl of a run folder. A run that goes on from a step writes anew what came after it."""
+    """config.json and metrics.jsonl of a run folder. A run that goes on from a step writes anew what came after it, and
+    what validation found at the step itself where that is done again."""
 
-    def __init__(self, out: Path, config: TrainConfig, step: int) -> None:
+    def __init__(self, out: Path, config: TrainConfig, step: int, is_to_validate: bool = False) -> None:
         out.mkdir(parents=True, exist_ok=True)
         write_beside(out / "config.json", json.dumps(asdict(config), indent=1).encode())
         self.path = out / "metrics.jsonl"
         rows = self.path.read_text().splitlines(keepends=True) if step and self.path.exists() else []
         # A run that was killed may have left half a row.
-        kept = [row for row in rows if row.endswith("\n") and json.loads(row)["step"] <= step]
-        write_beside(self.path, "".join(kept).encode())
+        kept = [json.loads(row) for row in rows if row.endswith("\n")]
+        kept = [
+            row
+            for row in kept
+            if row["step"] < step or (row["step"] == step and not (is_to_validate and row["kind"] == "validation"))
+        ]
+        write_beside(self.path, "".join(json.dumps(row) + "\n" for row in kept).encode())
 
     def write(self, kind: str, run: Run, values: dict[str, Any]) -> None:
         row = {"kind": kind, "step": run.step, "seconds": round(run.seconds, 1), **values}

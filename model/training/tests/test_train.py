@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from safetensors.torch import load_file, save_file
 from test_lpips import random_lpips_files
 
 from holod_training import cli
+from holod_training import train as train_module
 from holod_training.benches import ANY_BENCH, BenchDraw
 from holod_training.cli import main
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig, TrainedRange
@@ -570,6 +572,31 @@ def test_a_run_that_is_done_says_so_and_has_its_weights(shards: Path, tmp_path: 
     assert train(tiny(shards, tmp_path / "run"), CPU, resume=True) == weights
     after = load_file(weights)
     assert all(torch.equal(value, after[name]) for name, value in before.items())
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_weights_of_an_earlier_step_are_not_taken_for_those_of_the_last(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run that is interrupted while it validates its last step has that step's checkpoint, but older weights."""
+    config = tiny(shards, tmp_path / "run", validate_every=4)
+    original = train_module.save_weights
+
+    def interrupted(*arguments: Any) -> None:
+        if arguments[3]["steps"] == 6:
+            raise KeyboardInterrupt
+        original(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train_module, "save_weights", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            train(config, CPU)
+    old = tmp_path / "run" / "weights.safetensors"
+    assert read_metadata(old)["provenance"]["steps"] == 4
+    assert read_metadata(train(config, CPU, resume=True))["provenance"]["steps"] == 6
+    whole = load_file(train(dataclasses.replace(config, out=str(tmp_path / "whole")), CPU))
+    assert all(torch.equal(value, load_file(old)[name]) for name, value in whole.items())
+    assert rows_of(tmp_path / "run") == rows_of(tmp_path / "whole"), "validation of the last step has one row"
 
 
 def test_an_out_that_is_no_folder_is_refused_before_the_work(
