@@ -7,17 +7,22 @@ use holod_calibration::{Colour, Dioptres, DisplayGeometry, Resolution};
 use crate::LinearImage;
 use crate::neighbourhood::any_within;
 
-/// Where the near card stands.
+/// Where the near card stands on the default bench, for which scenes are laid out; on another: [`depth_on`].
 pub const NEAR_CARD: Dioptres = Dioptres(2.5);
-/// Where the far card stands.
+/// Where the far card stands, likewise.
 pub const FAR_CARD: Dioptres = Dioptres(0.25);
 
-/// How far a pixel of a card may lie from it.
+/// How far a pixel of a card may lie from it on the default bench.
 const TOLERANCE_DPT: f64 = 0.05;
 /// Pixels this near to anything else, each way, are left out: in front of and behind a card's rim other things blur.
 const SEAM_PX: usize = 16;
 /// Fewer pixels tell nothing.
 const FEWEST_PX: usize = 256;
+
+/// Where a card stands on `bench`, whose depth range takes the place of the default bench's, end by end.
+pub fn depth_on(bench: &DisplayGeometry, card: Dioptres) -> Dioptres {
+    bench.depth_at(DisplayGeometry::DEFAULT.normalised_depth(card))
+}
 
 /// The inner part of one card.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -27,20 +32,15 @@ pub struct CardArea {
 }
 
 impl CardArea {
-    /// The card at `card` in a scene of `depth_normalised` [height, width], without 16 px along its edges and without
-    /// `border_px` at each edge of the picture; nothing where fewer than 256 pixels are left.
-    pub fn find(
-        depth_normalised: &[f32],
-        resolution: Resolution,
-        geometry: &DisplayGeometry,
-        card: Dioptres,
-        border_px: usize,
-    ) -> Option<Self> {
+    /// The card that stands at `card` on the default bench, in a scene of any bench with `depth_normalised` [height,
+    /// width]: without 16 px along its edges and without `border_px` at each edge of the picture; nothing where fewer
+    /// than 256 pixels are left.
+    pub fn find(depth_normalised: &[f32], resolution: Resolution, card: Dioptres, border_px: usize) -> Option<Self> {
         let Resolution { width, height } = resolution;
         assert_eq!(depth_normalised.len(), resolution.pixels(), "depth has the resolution's size");
         let outside: Vec<bool> = depth_normalised
             .iter()
-            .map(|&depth| (geometry.depth_at(depth.into()).0 - card.0).abs() > TOLERANCE_DPT)
+            .map(|&depth| (DisplayGeometry::DEFAULT.depth_at(depth.into()).0 - card.0).abs() > TOLERANCE_DPT)
             .collect();
         let near_outside = any_within(&outside, resolution, SEAM_PX);
         let in_picture = |at: usize, end: usize| at >= border_px && at + border_px < end;
@@ -87,19 +87,19 @@ mod tests {
         let resolution = Resolution { width: 100, height: 70 };
         let near = BENCH.normalised_depth(NEAR_CARD) as f32;
         let depth: Vec<f32> = (0..7000).map(|index| if index % 100 < 60 { near } else { 0.0 }).collect();
-        let area = CardArea::find(&depth, resolution, &BENCH, NEAR_CARD, 10).unwrap();
+        let area = CardArea::find(&depth, resolution, NEAR_CARD, 10).unwrap();
         for index in 0..7000 {
             let (x, y) = (index % 100, index / 100);
             assert_eq!(area.inside[index], (10..44).contains(&x) && (10..60).contains(&y), "{x}, {y}");
         }
-        assert_eq!(CardArea::find(&depth, resolution, &BENCH, FAR_CARD, 10), None);
-        assert_eq!(CardArea::find(&depth, resolution, &BENCH, NEAR_CARD, 34), None, "too little is left");
+        assert_eq!(CardArea::find(&depth, resolution, FAR_CARD, 10), None);
+        assert_eq!(CardArea::find(&depth, resolution, NEAR_CARD, 34), None, "too little is left");
     }
 
     #[test]
     fn gradient_energy_counts_pairs_inside_only() {
         let resolution = Resolution { width: 20, height: 20 };
-        let area = CardArea::find(&[0.0; 400], resolution, &BENCH, Dioptres(0.0), 2).unwrap();
+        let area = CardArea::find(&[0.0; 400], resolution, Dioptres(0.0), 2).unwrap();
         let image = |value: fn(usize, usize) -> f32| LinearImage {
             resolution,
             pixels: (0..1200).map(|index| value(index % 20, index / 20 % 20)).collect(),
@@ -121,9 +121,18 @@ mod tests {
             resolution,
             pixels: pixels[plane * 3 * resolution.pixels()..][..3 * resolution.pixels()].to_vec(),
         });
-        let area = |card| CardArea::find(&depth, resolution, &BENCH, card, 8).unwrap();
+        let area = |card| CardArea::find(&depth, resolution, card, 8).unwrap();
         let (near_card, far_card) = (area(NEAR_CARD), area(FAR_CARD));
         assert!(near_card.gradient_energy(&near) > 4.0 * near_card.gradient_energy(&far));
         assert!(far_card.gradient_energy(&far) > 4.0 * far_card.gradient_energy(&near));
+    }
+
+    #[test]
+    fn cards_of_another_bench_stand_at_the_same_place_of_its_depth_range() {
+        let bench = DisplayGeometry { depth_far: Dioptres(0.5), depth_near: Dioptres(1.5), ..BENCH };
+        for (card, expected_dpt) in [(NEAR_CARD, 0.5 + 2.5 * 0.35), (FAR_CARD, 0.5 + 0.25 * 0.35)] {
+            assert!((depth_on(&bench, card).0 - expected_dpt).abs() < 1e-9);
+            assert!((depth_on(&BENCH, card).0 - card.0).abs() < 1e-9);
+        }
     }
 }

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use holod_calibration::{PupilDiameter, Resolution};
+use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 use holod_model::scene_renderer::SceneKind;
 use holod_model::scene_renderer::shard::{PlanePlan, PupilPlan, ShardPlan, file_name};
 use holod_tests::daemon::run;
@@ -121,11 +121,16 @@ fn the_trainers_evaluation_finds_the_same() {
 
 /// Renders `count` scenes of `kind` into `folder`.
 fn render(folder: &Path, kind: SceneKind, resolution: Resolution, count: u64) {
+    render_for(DisplayGeometry::DEFAULT, folder, kind, resolution, count);
+}
+
+/// The same for a bench.
+fn render_for(bench: DisplayGeometry, folder: &Path, kind: SceneKind, resolution: Resolution, count: u64) {
     let plan = ShardPlan {
         kind,
         seed: 11,
         resolution,
-        bench: holod_calibration::DisplayGeometry::DEFAULT,
+        bench,
         pupils: PupilPlan::Fixed([2.0, 4.0].map(PupilDiameter::from_mm).to_vec()),
         planes: PlanePlan::Uniform(2),
         rays: 8,
@@ -263,6 +268,29 @@ fn the_trainer_finds_as_much_light_of_bright_marks_on_black() {
     let told = evaluate(&["--pupil", "4"]);
     for words in ["bright marks on exact black", "dots", "lines", "stars"] {
         assert!(told.contains(words), "no '{words}' in {told}");
+    }
+}
+
+/// Cards stand at the same place of every bench's depth range: here at 1.81 and 0.63 dpt.
+#[test]
+fn cards_are_judged_on_a_bench_with_another_depth_range() {
+    const CARDS: Resolution = Resolution { width: 128, height: 128 };
+    let folder = holod_tests::new_folder();
+    let bench = DisplayGeometry { depth_far: Dioptres(0.5), depth_near: Dioptres(2.0), ..DisplayGeometry::DEFAULT };
+    render_for(bench, &folder.path().join("scenes"), SceneKind::Test, CARDS, 1);
+    render_for(bench, &folder.path().join("cards"), SceneKind::Cards, CARDS, 2);
+    let rig = holod_tests::small_rig(CARDS.width, CARDS.height, "driver = \"simulated\"")
+        .replace("depth_far_m = inf", "depth_far_m = 2.0")
+        .replace("depth_near_m = 0.35", "depth_near_m = 0.5");
+    fs::write(folder.path().join("rig.toml"), rig).unwrap();
+    let args = ["evaluate", "--config", "rig.toml", "--scenes", "scenes", "--cards", "cards", "--weights", "fast"];
+    let ended = run(HOLOD, &[&args[..], &["--border-px", "8", "--backend", "cpu", "--json"]].concat(), folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    let judged: Value = serde_json::from_str(&ended.stdout).unwrap();
+    let rows = judged["refocus"].as_array().unwrap();
+    assert_eq!(rows.len(), 4, "two cards and two pupils");
+    for card in ["near_card", "far_card"] {
+        assert!(rows.iter().all(|row| row[card].as_f64().unwrap() > 1.1), "{rows:?}");
     }
 }
 

@@ -15,7 +15,7 @@ use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 use holod_model::marks::{self, DarkArea};
 use holod_model::metrics::{self, StackScore};
 use holod_model::optics::{Eye, PhasePattern, SimulatedEye};
-use holod_model::refocus::{CardArea, FAR_CARD, NEAR_CARD};
+use holod_model::refocus::{self, CardArea, FAR_CARD, NEAR_CARD};
 use holod_model::scene_renderer::{Marks, SceneKind};
 use holod_model::scene_shard::SceneShard;
 use holod_model::{LinearImage, RgbdFrame, Weights};
@@ -172,32 +172,33 @@ impl Judge {
         pupils: &[PupilDiameter],
     ) -> Result<Vec<(Refocus, [LinearImage; 2])>, Failure> {
         let frame = Arc::new(shard.frame().map_err(Failure::because(Exit::Data))?);
+        let depth_on_bench = |card: Dioptres| refocus::depth_on(&self.geometry, card);
         let area = |name: &str, card: Dioptres| {
-            CardArea::find(&frame.depth_normalised, shard.resolution(), &self.geometry, card, self.border_px)
-                .ok_or_else(|| {
-                    let said = format!(
-                        "{}: found no {name} card at {} dpt; expected a scene of `holod-scenes generate --kind cards`",
-                        shard.path().display(),
-                        card.0
-                    );
-                    Failure::new(Exit::Data, said)
-                })
+            CardArea::find(&frame.depth_normalised, shard.resolution(), card, self.border_px).ok_or_else(|| {
+                let said = format!(
+                    "{}: found no {name} card at {:.2} dpt; expected a scene of `holod-scenes generate --kind cards`",
+                    shard.path().display(),
+                    depth_on_bench(card).0
+                );
+                Failure::new(Exit::Data, said)
+            })
         };
         let (near, far) = (area("near", NEAR_CARD)?, area("far", FAR_CARD)?);
+        let focuses = [NEAR_CARD, FAR_CARD].map(depth_on_bench);
         let contrast = if shard.index().is_multiple_of(2) { "dark on bright" } else { "bright on dark" };
         let mut found = Vec::new();
         for &pupil in pupils {
             let (pattern, _) = self.shown(&frame, pupil)?;
-            let views = [NEAR_CARD, FAR_CARD].map(|focus| self.view(&pattern, Eye { pupil, focus }));
+            let views = focuses.map(|focus| self.view(&pattern, Eye { pupil, focus }));
             let [near_focus, far_focus] = &views;
             let ratio = |area: &CardArea, sharp, soft| area.gradient_energy(sharp) / area.gradient_energy(soft);
-            let refocus = Refocus {
+            let ratios = Refocus {
                 contrast,
                 pupil_mm: pupil.mm(),
                 near_card: ratio(&near, near_focus, far_focus),
                 far_card: ratio(&far, far_focus, near_focus),
             };
-            found.push((refocus, views));
+            found.push((ratios, views));
         }
         Ok(found)
     }

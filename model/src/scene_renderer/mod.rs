@@ -44,11 +44,11 @@ pub enum SceneKind {
     Train,
     /// For testing: families of textures, and ranges, that no training scene has.
     Test,
-    /// The refocus test: fine marks on a near card at 2.5 dioptres and a far card at 0.25 dioptres; dark on bright
-    /// where the index is even, bright on dark where it is odd.
+    /// The refocus test: fine marks on a near and a far card, at 7/8 and 7/80 of the depth range in dioptres, which are
+    /// 2.5 and 0.25 on the default bench; dark on bright where the index is even, bright on dark where it is odd.
     Cards,
-    /// What black stays: bright marks at 2.5 and at 0.25 dioptres in the lower half of a picture that is exactly black
-    /// else. By the index in turn dots of 1 to 3 px, thin lines, many of them diagonal, and stars.
+    /// What black stays: bright marks in the lower half of a picture that is exactly black else, as near and as far as
+    /// the cards. By the index in turn dots of 1 to 3 px, thin lines, many of them diagonal, and stars.
     Marks,
 }
 

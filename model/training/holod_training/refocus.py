@@ -16,18 +16,26 @@ from holod_training.metrics import gradient_energy
 from holod_training.shards import Shard, ShardError
 from holod_training.sheets import SHEET_PUPILS_MM, save_sheet
 
-CARD_NEAR_DPT = 2.5
-CARD_FAR_DPT = 0.25
+# On the default bench, for which scenes are laid out; on another, at the same place of its depth range.
+CARDS_DPT = {"near": 2.5, "far": 0.25}
+LAID_OUT = OpticsConfig()
 SEAM_PX = 16
 LEAST_AREA_PX = 256
 PUPILS_MM = (1.0, 2.0, 3.0, 4.0, 5.0)
 
 
-def card_areas(depth: Tensor, optics: OpticsConfig, border_px: int) -> dict[str, Tensor]:
+def cards_dpt(optics: OpticsConfig) -> tuple[float, ...]:
+    """Where the near and the far card stand on a bench."""
+    return tuple(
+        optics.dioptres((card_dpt - LAID_OUT.depth_far_dpt) / LAID_OUT.volume_dpt) for card_dpt in CARDS_DPT.values()
+    )
+
+
+def card_areas(depth: Tensor, border_px: int) -> dict[str, Tensor]:
     """Where each card is, [H, W] bool, without the picture's border and a strip along the card's edges."""
     areas = {}
-    for name, card_dpt in (("near", CARD_NEAR_DPT), ("far", CARD_FAR_DPT)):
-        dioptres = optics.depth_far_dpt + depth * (optics.depth_near_dpt - optics.depth_far_dpt)
+    for name, card_dpt in CARDS_DPT.items():
+        dioptres = LAID_OUT.depth_far_dpt + depth * LAID_OUT.volume_dpt
         outside = ((dioptres - card_dpt).abs() > 0.05).float()
         near_edge = F.max_pool2d(outside[None, None], 2 * SEAM_PX + 1, stride=1, padding=SEAM_PX)[0, 0] > 0
         area = ~near_edge
@@ -41,10 +49,10 @@ def refocus_cards(shards: list[Shard], methods: list[Method], bench: Bench, shee
     """The ratio of every method that does not need a target, after double phase, at s = 1 to 5; and a sheet of ours."""
     rows = []
     pictures = []
-    focus = (CARD_NEAR_DPT, CARD_FAR_DPT)
+    focus = cards_dpt(bench.optics)
     for shard in shards:
         stack = bench.read(shard, 0)
-        areas = card_areas(stack.depth, bench.optics, bench.border_px)
+        areas = card_areas(stack.depth, bench.border_px)
         for name, area in areas.items():
             if int(area.sum()) < LEAST_AREA_PX:
                 raise ShardError(f"{shard.path}: no {name} card found at its depth; write it with --kind cards")

@@ -117,7 +117,8 @@ def _refocus(result: dict[str, Any]) -> list[str]:
     lines = [
         "## Refocus ratio",
         "",
-        "Gradient energy of a card in focus over out of focus; near card at 2.5 dpt, far card at 0.25 dpt.",
+        "Gradient energy of a card in focus over out of focus; near card at 7/8 of the depth range in dioptres, far "
+        "card at 7/80 (default bench: 2.5 and 0.25 dpt).",
         "",
     ]
     lines += _header(["method", "marks", "card", *(f"s = {p:g}" for p in pupils)])

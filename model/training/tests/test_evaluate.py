@@ -1,6 +1,7 @@
 import copy
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,12 @@ from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.export import load_weights, read_metadata, save_weights
 from holod_training.goals import ReportError, checks, row_of
 from holod_training.intervals import interval_95
+from holod_training.judging import Bench, rivals
 from holod_training.lpips import Lpips
 from holod_training.network import DirectNetwork
 from holod_training.optics import coc_px, intensity, propagate
 from holod_training.plots import on_all_scenes
-from holod_training.refocus import card_areas
+from holod_training.refocus import card_areas, refocus_cards
 from holod_training.report import markdown
 from holod_training.rivals import (
     all_in_focus,
@@ -44,8 +46,8 @@ RIVALS = ("all-in-focus", "layered ASM", "smooth phase", "transport of intensity
 OPTICS = OpticsConfig()
 
 
-def write_card(path: Path, seed: int) -> None:
-    write_shard(path, seed=seed, size=128, pupils_mm=(1.0, 2.0))
+def write_card(path: Path, seed: int, metadata: dict[str, str] | None = None) -> None:
+    write_shard(path, seed=seed, size=128, pupils_mm=(1.0, 2.0), metadata=metadata)
     with safe_open(path, framework="pt") as file:
         metadata = file.metadata()
     tensors = load_file(path)
@@ -413,10 +415,29 @@ def test_a_focal_stack_with_feedback_is_exported(tmp_path: Path) -> None:
 
 def test_card_areas_leave_out_border_and_seam() -> None:
     depth = torch.where(torch.arange(128) < 64, 2.5 / OPTICS.depth_near_dpt, 0.25 / OPTICS.depth_near_dpt)
-    areas = card_areas(depth.expand(128, 128), OPTICS, border_px=10)
+    areas = card_areas(depth.expand(128, 128), border_px=10)
     assert areas["near"].nonzero().amin(0).tolist() == [10, 10]
     assert areas["near"].nonzero().amax(0).tolist() == [117, 47]
     assert areas["far"].nonzero().amin(0).tolist() == [10, 80]
+
+
+def test_cards_are_judged_on_a_bench_with_another_depth_range(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They stand at the same place of every bench's depth range, and the eye is focused there."""
+    bench = {"far_dpt": "0.5", "near_dpt": "2.0"}
+    path = tmp_path / "scene_000000.safetensors"
+    write_card(path, seed=0, metadata=bench)
+    shard = Shard(path)
+    looked: list[tuple[float, ...]] = []
+
+    def look(self: Bench, field: torch.Tensor, pupil_mm: float, focus_dpt: Sequence[float]) -> torch.Tensor:
+        looked.append(tuple(focus_dpt))
+        return torch.rand(2, 3, 128, 128)
+
+    monkeypatch.setattr(Bench, "look", look)
+    rows = refocus_cards([shard], rivals(shard.optics)[:1], Bench(shard.optics, 1.25, 8), tmp_path / "sheet.png")
+    assert len(rows) == 5
+    for focuses in looked:
+        assert focuses == pytest.approx((0.5 + 1.5 * 2.5 * 0.35, 0.5 + 1.5 * 0.25 * 0.35))
 
 
 def smooth_scene() -> tuple[torch.Tensor, torch.Tensor]:
