@@ -7,6 +7,7 @@
 mod atomic_write;
 mod clock;
 mod geometry;
+mod hangup;
 mod level_tables;
 mod quantile;
 pub mod rig;
@@ -16,6 +17,7 @@ mod units;
 pub use atomic_write::{special_file, write_atomically};
 pub use clock::host_now;
 pub use geometry::DisplayGeometry;
+pub use hangup::hangup_is_ignored;
 pub use level_tables::LevelTables;
 pub use quantile::Sorted;
 pub use units::{Colour, Dioptres, Metres, PerColour, PupilDiameter, Resolution, TimeNs};

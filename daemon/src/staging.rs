@@ -3,8 +3,9 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Mutex, Once, OnceLock, PoisonError};
+use std::sync::{Mutex, Once, PoisonError};
 
+use holod_calibration::hangup_is_ignored;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use tempfile::TempDir;
 
@@ -137,17 +138,6 @@ fn half_done<T>(with: impl FnOnce(&mut Vec<PathBuf>) -> T) -> T {
 /// Leaves signals to a run, or takes them back from it.
 pub(crate) fn leave_signals_to_a_run(left: bool) {
     OBEYED_ELSEWHERE.store(left, Ordering::Release);
-}
-
-/// Whether holod was started so that its terminal's end is nothing to it, as `nohup` does.
-pub(crate) fn hangup_is_ignored() -> bool {
-    static IGNORED: OnceLock<bool> = OnceLock::new();
-    *IGNORED.get_or_init(|| {
-        let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
-        let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
-        let mask = mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
-        mask.is_some_and(|mask| mask >> (SIGHUP - 1) & 1 == 1)
-    })
 }
 
 /// Starts the thread that waits for signals, once. Where there can be none, signals end the process as ever.

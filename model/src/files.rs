@@ -1,6 +1,6 @@
 //! Holograms and pictures on disk. Everything is written beside its place and renamed, so nothing is ever half written.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::f32::consts::TAU;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
@@ -10,11 +10,11 @@ use holod_calibration::{
 };
 use image::{ImageBuffer, ImageFormat, Luma, PixelWithColorType, Rgb};
 use num_complex::Complex32;
-use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 use serde::{Deserialize, Serialize};
 
 use crate::picture::srgb8;
+use crate::safetensors_file::{self, Tensor};
 use crate::{ComplexHologram, LinearImage, PhasePattern};
 
 /// The value of the metadata key `format` of a hologram file.
@@ -92,20 +92,6 @@ pub enum FileError {
     Content { path: PathBuf, found: String, expected: String },
 }
 
-/// Brings the names in a safetensors file's header to order: the same content is then the same bytes, where a map of
-/// metadata would come in another order each time.
-fn sort_header(file: &mut Vec<u8>) -> serde_json::Result<()> {
-    const LENGTH: usize = size_of::<u64>();
-    let data = LENGTH + u64::from_le_bytes(std::array::from_fn(|byte| file[byte])) as usize;
-    let sorted: BTreeMap<String, BTreeMap<String, serde_json::Value>> = serde_json::from_slice(&file[LENGTH..data])?;
-    let mut header = serde_json::to_vec(&sorted)?;
-    // Spaces, so that the data begin as aligned as they did.
-    header.resize(header.len().next_multiple_of(LENGTH), b' ');
-    let length = (header.len() as u64).to_le_bytes();
-    file.splice(..data, length.into_iter().chain(header));
-    Ok(())
-}
-
 impl StoredHologram {
     /// Writes a safetensors file: `field` [3, height, width, 2] (real, imaginary) in F32, and in the metadata format,
     /// pupil_mm, amplitude_constant and optics (JSON).
@@ -113,23 +99,21 @@ impl StoredHologram {
         let Resolution { width, height } = self.hologram.resolution;
         let bytes: Vec<u8> =
             self.hologram.field.iter().flat_map(|value| [value.re, value.im]).flat_map(f32::to_le_bytes).collect();
-        let content = |error: String| FileError::Content {
+        let optics = serde_json::to_string(&self.optics).map_err(|error| FileError::Content {
             path: path.to_owned(),
-            found: error,
-            expected: "a hologram that safetensors can hold".into(),
-        };
-        let optics = serde_json::to_string(&self.optics).map_err(|error| content(error.to_string()))?;
-        let metadata = HashMap::from([
+            found: error.to_string(),
+            expected: "optics that JSON can hold".into(),
+        })?;
+        let metadata = BTreeMap::from([
             ("format".to_owned(), FORMAT.to_owned()),
             ("pupil_mm".to_owned(), self.pupil.mm().to_string()),
             ("amplitude_constant".to_owned(), self.amplitude_constant.to_string()),
             ("optics".to_owned(), optics),
         ]);
-        let mut file = TensorView::new(Dtype::F32, vec![3, height, width, 2], &bytes)
-            .and_then(|view| safetensors::serialize([("field", view)], Some(metadata)))
-            .map_err(|error| content(error.to_string()))?;
-        sort_header(&mut file).map_err(|error| content(error.to_string()))?;
-        write_bytes(path, &file)
+        let field =
+            Tensor { name: "field".to_owned(), dtype: Dtype::F32, shape: vec![3, height, width, 2], bytes: &bytes };
+        write_atomically(path, |out| safetensors_file::write(out, vec![field], &metadata))
+            .map_err(|source| FileError::Io { path: path.to_owned(), source })
     }
 
     /// Reads what [`Self::save`] wrote.

@@ -16,6 +16,7 @@ pub mod optics;
 mod phase_math;
 mod picture;
 pub mod refocus;
+mod safetensors_file;
 pub mod scene;
 pub mod scene_renderer;
 pub mod scene_shard;

@@ -10,13 +10,13 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Once};
 use std::time::Duration;
 
-use holod_calibration::TimeNs;
+use holod_calibration::{TimeNs, hangup_is_ignored};
 use sd_notify::NotifyState;
 use signal_hook::SigId;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use crate::failure::{Exit, Failure};
-use crate::staging::{hangup_is_ignored, leave_signals_to_a_run};
+use crate::staging::leave_signals_to_a_run;
 
 /// SIGHUPs that ask for the rig file to be read again, for as long as this lives.
 pub struct Hangups {

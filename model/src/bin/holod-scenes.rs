@@ -4,18 +4,22 @@ use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::thread;
 use std::time::Instant;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::rig::{Rig, RigError};
-use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution, Sorted};
+use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution, Sorted, hangup_is_ignored};
 use holod_model::gpu::GpuError;
 use holod_model::scene::FocalStack;
-use holod_model::scene_renderer::shard::{Outcome, PlanePlan, PlannedScene, Preview, PupilPlan, ShardError, ShardPlan};
+use holod_model::scene_renderer::shard::{
+    Outcome, PlanePlan, PlannedScene, Preview, PupilPlan, ShardError, ShardPlan, stop_writing,
+};
 use holod_model::scene_renderer::{SceneKind, Tracer};
 use holod_model::scene_shard::{SceneShard, SceneShardError};
 use holod_model::srgb8;
 use indicatif::{ProgressBar, ProgressStyle};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 /// Random scenes and their thin-lens focal stacks.
 #[derive(Parser)]
@@ -240,6 +244,10 @@ impl From<ShardError> for Failure {
             ShardError::Write { .. } => exit::IO,
             ShardError::Malformed { .. } => exit::DATA,
             ShardError::Gpu(_) => exit::UNAVAILABLE,
+            // The thread that stopped it ends the program.
+            ShardError::Stopped => loop {
+                thread::park();
+            },
         };
         Self { code, message: error.to_string() }
     }
@@ -299,6 +307,7 @@ fn generate(options: &Generate) -> Result<String, Failure> {
     let style = ProgressStyle::with_template("{bar:40} {pos}/{len} scenes by {msg}, {eta} left")
         .expect("the template is constant");
     let tracer = options.backend.open()?;
+    take_away_on_signals();
     let bar = ProgressBar::new(options.count).with_style(style).with_message(tracer.name().to_owned());
     let (mut written, mut present) = (0, 0);
     for index in options.first..options.first + options.count {
@@ -310,6 +319,22 @@ fn generate(options: &Generate) -> Result<String, Failure> {
     }
     bar.finish_and_clear();
     Ok(format!("{written} scenes written to {}, {present} were there already", options.out.display()))
+}
+
+/// From now on a signal ends the program without a file that is half written. Where no thread can wait for signals, they
+/// end it as ever.
+fn take_away_on_signals() {
+    let hangup = (!hangup_is_ignored()).then_some(SIGHUP);
+    let Ok(mut signals) = signal_hook::iterator::Signals::new([SIGINT, SIGTERM].into_iter().chain(hangup)) else {
+        return;
+    };
+    let wait = move || {
+        if let Some(signal) = signals.forever().next() {
+            stop_writing();
+            std::process::exit(128 + signal);
+        }
+    };
+    let _ = thread::Builder::new().name("signals".into()).spawn(wait);
 }
 
 fn focal_stack(options: &FocalStackOf) -> Result<String, Failure> {

@@ -11,19 +11,22 @@
 //! While a shard is made, memory holds its stacks as F16 and, once, the F32 sums of one: at 1920x1080 12 MB and 25 MB a
 //! plane. It is written from there, and read for a sheet, without a copy of the whole.
 
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::{self, Read, Seek, SeekFrom};
+use std::io::{self, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 use half::f16;
-use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
-use safetensors::tensor::{Dtype, Metadata, SafeTensorError, TensorView};
+use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution, write_atomically};
+use safetensors::tensor::{Dtype, Metadata};
 
 use super::random::{Random, mix};
 use super::{Scene, SceneKind, Tracer};
 use crate::gpu::GpuError;
+use crate::safetensors_file::{self, Tensor};
 
 /// The `format` that a shard's metadata names.
 pub const FORMAT: &str = "holod-scene-1";
@@ -260,6 +263,9 @@ pub enum ShardError {
     /// The graphics processor could not render the scene.
     #[error(transparent)]
     Gpu(#[from] GpuError),
+    /// [`stop_writing`] was called.
+    #[error("no scene is written any more: the program ends")]
+    Stopped,
 }
 
 /// What became of one scene.
@@ -305,7 +311,7 @@ impl ShardPlan {
         }
     }
 
-    fn metadata(&self, index: u64) -> HashMap<String, String> {
+    fn metadata(&self, index: u64) -> BTreeMap<String, String> {
         let bench = &self.bench;
         let pupils_mm: Vec<f32> = self.pupils(index).iter().map(|p| p.mm()).collect();
         let wavelengths_nm = bench.wavelengths.0.map(|wavelength| wavelength.0 * 1e9);
@@ -347,30 +353,32 @@ impl ShardPlan {
 
         let Resolution { width, height } = self.resolution;
         let depth: Vec<u8> = picture.depth.iter().flat_map(|value| value.to_le_bytes()).collect();
+        let image = half_bytes(picture.image.iter().copied());
+        let tensor = |name: &str, dtype, shape: &[usize], bytes| Tensor {
+            name: name.to_owned(),
+            dtype,
+            shape: shape.to_vec(),
+            bytes,
+        };
         let mut tensors = vec![
-            ("image".to_owned(), Dtype::F16, vec![3, height, width], half_bytes(picture.image.iter().copied())),
-            ("depth".to_owned(), Dtype::F32, vec![height, width], depth),
+            tensor("image", Dtype::F16, &[3, height, width], &image[..]),
+            tensor("depth", Dtype::F32, &[height, width], &depth),
         ];
-        for (number, stack) in stacks.into_iter().enumerate() {
-            tensors.push((format!("stack_{number}"), Dtype::F16, vec![self.planes.count(), 3, height, width], stack));
+        for (number, stack) in stacks.iter().enumerate() {
+            let shape = [self.planes.count(), 3, height, width];
+            tensors.push(tensor(&format!("stack_{number}"), Dtype::F16, &shape, stack));
         }
-        let unwritable = |reason: String| ShardError::Write { path: path.clone(), reason };
-        let views = tensors
-            .iter()
-            .map(|(name, dtype, shape, bytes)| Ok((name, TensorView::new(*dtype, shape.clone(), bytes)?)))
-            .collect::<Result<Vec<_>, SafeTensorError>>()
-            .map_err(|error| unwritable(error.to_string()))?;
-        let beside = folder.join(format!(".{}.{}.partial", file_name(index), std::process::id()));
         let mut metadata = self.metadata(index);
         metadata.insert("traced_by".to_owned(), tracer.name().to_owned());
-        let written = safetensors::serialize_to_file(views, Some(metadata), &beside);
-        let renamed = written
-            .map_err(|error| error.to_string())
-            .and_then(|()| fs::rename(&beside, &path).map_err(|error| error.to_string()));
-        renamed.map_err(|reason| {
-            // The partial file is only litter; the first error is the one to report.
-            let _ = fs::remove_file(&beside);
-            unwritable(reason)
+        let on_disk = ON_DISK.lock().unwrap_or_else(PoisonError::into_inner);
+        let written = write_unless(&STOPPED, &path, tensors, &metadata);
+        drop(on_disk);
+        written.map_err(|error| {
+            if STOPPED.load(Ordering::Acquire) {
+                ShardError::Stopped
+            } else {
+                ShardError::Write { path, reason: error.to_string() }
+            }
         })?;
         Ok(Outcome::Written { rays_traced })
     }
@@ -402,6 +410,49 @@ impl ShardPlan {
             }
         }
         Ok(true)
+    }
+}
+
+/// Held while a shard is on its way to the disk.
+static ON_DISK: Mutex<()> = Mutex::new(());
+/// Nothing is written any more.
+static STOPPED: AtomicBool = AtomicBool::new(false);
+
+/// Takes away a shard that is half written, and lets none be written any more: for a program that a signal ends.
+pub fn stop_writing() {
+    STOPPED.store(true, Ordering::Release);
+    // Held for good: who writes has given up by then, and nobody begins again.
+    std::mem::forget(ON_DISK.lock().unwrap_or_else(PoisonError::into_inner));
+}
+
+/// Writes a whole file or, once `stopped` is true, none.
+fn write_unless(
+    stopped: &AtomicBool,
+    path: &Path,
+    tensors: Vec<Tensor<'_>>,
+    metadata: &BTreeMap<String, String>,
+) -> io::Result<()> {
+    write_atomically(path, |out| safetensors_file::write(&mut Stoppable { out, stopped }, tensors, metadata))
+}
+
+/// A file that takes no more once it is stopped.
+struct Stoppable<'a> {
+    out: &'a mut dyn Write,
+    stopped: &'a AtomicBool,
+}
+
+impl Write for Stoppable<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        /// So much is written in some milliseconds.
+        const MOST_BYTES: usize = 1 << 20;
+        if self.stopped.load(Ordering::Acquire) {
+            return Err(io::Error::other("stopped"));
+        }
+        self.out.write(&bytes[..bytes.len().min(MOST_BYTES)])
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.out.flush()
     }
 }
 
@@ -508,4 +559,43 @@ impl Preview {
 
 fn half_values(bytes: &[u8]) -> Vec<f32> {
     bytes.chunks_exact(2).map(|pair| f16::from_le_bytes([pair[0], pair[1]]).to_f32()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    fn tensor(bytes: &[u8]) -> Tensor<'_> {
+        Tensor { name: "image".to_owned(), dtype: Dtype::F16, shape: vec![bytes.len() / 2], bytes }
+    }
+
+    #[test]
+    fn a_file_that_is_stopped_halfway_leaves_nothing() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join(file_name(0));
+        let bytes = vec![7; 1 << 22];
+        let stopped = AtomicBool::new(false);
+        let begun = write_atomically(&path, |out| {
+            let mut out = Stoppable { out, stopped: &stopped };
+            out.write_all(&bytes)?;
+            assert_eq!(fs::read_dir(folder.path())?.count(), 1, "half of it is there");
+            stopped.store(true, Ordering::Release);
+            out.write_all(&bytes)
+        });
+        assert!(begun.is_err());
+        assert!(write_unless(&stopped, &path, vec![tensor(&bytes)], &BTreeMap::new()).is_err());
+        assert_eq!(fs::read_dir(folder.path()).expect("the folder").count(), 0);
+    }
+
+    #[test]
+    fn a_file_has_the_mode_that_others_of_the_folder_get() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let [shard, other] = [file_name(0), "other".to_owned()].map(|name| folder.path().join(name));
+        fs::write(&other, "").expect("a file");
+        write_unless(&AtomicBool::new(false), &shard, vec![tensor(&[1, 2])], &BTreeMap::new()).expect("a shard");
+        let mode = |path: &Path| fs::metadata(path).expect("a file").permissions().mode();
+        assert_eq!(mode(&shard), mode(&other));
+    }
 }
