@@ -23,12 +23,22 @@ from holod_training.network import (
 )
 from holod_training.optics import frequencies, transfer
 from holod_training.plane_light import FEEDBACK_SHARE, LIT, feed_back, light_planes
-from holod_training.shards import Stack, same_focuses
+from holod_training.shards import Shard, ShardError, Stack, same_focuses
 
 
 def planes_dpt(config: NetworkConfig, optics: OpticsConfig) -> list[float]:
     """Where the images are focused on a bench, far to near."""
     return [optics.dioptres(k / (config.planes - 1)) for k in range(config.planes)]
+
+
+def check_focuses(shard: Shard, config: NetworkConfig) -> None:
+    """Raises ShardError for a scene with other focuses than a focal-stack network takes on the scene's bench."""
+    expected = tuple(planes_dpt(config, shard.optics))
+    if not same_focuses(shard.focus_dpt, expected):
+        raise ShardError(
+            f"{shard.path}: focus_dpt is {shard.focus_dpt}, expected those that a focal-stack network takes, "
+            f"{expected}; render such scenes with `holod-scenes generate --planes {config.planes}`"
+        )
 
 
 def focal_amplitudes(config: NetworkConfig, stack: Stack) -> Tensor:

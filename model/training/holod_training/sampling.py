@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,8 +11,10 @@ import torch
 from torch import Tensor
 
 from holod_training.benches import BenchDraw
+from holod_training.config import NetworkConfig
 from holod_training.depth_faults import faulty_depth
-from holod_training.shards import Shard, ShardError, Stack, same_focuses, shard_names
+from holod_training.focal_stack import check_focuses
+from holod_training.shards import Shard, ShardError, Stack, shard_names
 
 FAULTS_STREAM = 1
 
@@ -79,18 +82,18 @@ class Sampler:
         rank: int,
         augment_config: AugmentConfig,
         specialists_mm: tuple[float, ...] = (),
-        focus_dpt: tuple[float, ...] = (),
+        focal_stacks: Sequence[NetworkConfig] = (),
         benches: BenchDraw | None = None,
     ) -> None:
-        """Where `focus_dpt` is given, shards with other focuses are refused. With `benches` each crop is shown on a
-        bench of its own, drawn for its blur, in place of that which its scene was rendered for."""
+        """Shards with other focuses than the networks `focal_stacks` take are refused. With `benches` each crop is
+        shown on a bench of its own, drawn for its blur, in place of that which its scene was rendered for."""
         self.folder = folder
         self.crop = crop
         self.seed = seed
         self.rank = rank
         self.augment_config = augment_config
         self.specialists_mm = specialists_mm
-        self.focus_dpt = focus_dpt
+        self.focal_stacks = focal_stacks
         self.benches = benches
         self.shards: list[Shard] = []
 
@@ -109,11 +112,8 @@ class Sampler:
         shard = Shard(self.folder / name)
         if min(shard.height, shard.width) < self.crop:
             raise ShardError(f"{shard.path}: {shard.width}x{shard.height} pixels, smaller than the crop {self.crop}")
-        if self.focus_dpt and not same_focuses(shard.focus_dpt, self.focus_dpt):
-            raise ShardError(
-                f"{shard.path}: focus_dpt is {shard.focus_dpt}, expected those that a focal-stack network takes, "
-                f"{self.focus_dpt}; render such scenes with `holod-scenes generate --planes {len(self.focus_dpt)}`"
-            )
+        for config in self.focal_stacks:
+            check_focuses(shard, config)
         return shard
 
     def rescan(self) -> None:

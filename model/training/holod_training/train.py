@@ -36,7 +36,6 @@ from holod_training.export import (
     write_beside,
 )
 from holod_training.foam import REGION_PX
-from holod_training.focal_stack import planes_dpt
 from holod_training.loss import (
     LIGHT_WINDOWS_PX,
     PERCEPTUAL_PLANES,
@@ -208,7 +207,7 @@ class Run:
             rank,
             config.augment,
             config.network.specialists_mm,
-            self._focal_stack_planes(),
+            self._focal_stacks(),
             config.benches,
         )
         self.validation: list[Shard] = []
@@ -216,10 +215,10 @@ class Run:
             self.validation = open_held_out(Path(config.validation), limit=config.validation_scenes)
             check_border(self.validation, config.validation_border_px, "--validation-border-px")
 
-    def _focal_stack_planes(self) -> tuple[float, ...]:
-        """The focuses that a network or teacher takes as its input."""
+    def _focal_stacks(self) -> list[NetworkConfig]:
+        """The networks, of the student and its teacher, that take a focal stack as their input."""
         networks = [self.config.network, *([self.teacher.config] if self.teacher else [])]
-        return next((tuple(planes_dpt(n, OpticsConfig())) for n in networks if n.architecture == "focal-stack"), ())
+        return [network for network in networks if network.architecture == "focal-stack"]
 
     def _initial_weights(self, path: Path) -> dict[str, Tensor]:
         source = load_weights(path)

@@ -22,10 +22,11 @@ def write_shard(
     planes: int = 3,
     metadata: dict[str, str] | None = None,
     places: tuple[float, ...] | None = None,
+    depth_dpt: tuple[float, float] = (OpticsConfig.depth_far_dpt, OpticsConfig.depth_near_dpt),
 ) -> Path:
     """A flat picture with a brighter square that fades with |focus - depth|: enough for a loss to fall. `places`, where
-    given, are the focuses in place of uniform `planes`, 0 far .. 1 near."""
-    optics = OpticsConfig()
+    given, are the focuses in place of uniform `planes`, 0 far .. 1 near; `depth_dpt` is the bench's depth range."""
+    optics = OpticsConfig(depth_far_dpt=depth_dpt[0], depth_near_dpt=depth_dpt[1])
     height, width = size if isinstance(size, tuple) else (size, size)
     generator = torch.Generator().manual_seed(seed)
     image = torch.rand(3, height, width, generator=generator) * 0.2 + 0.3

@@ -187,6 +187,17 @@ def test_a_focal_stack_network_refuses_scenes_with_other_planes(shards: Path, tm
         train(tiny(shards, tmp_path / "run", network=variant("focal-stack")), CPU)
 
 
+@pytest.mark.usefixtures("no_plots")
+def test_a_focal_stack_network_trains_on_a_bench_with_another_depth_range(tmp_path: Path) -> None:
+    """Its images are focused uniformly over the depth range of the bench that its scenes are seen on."""
+    write_shard(tmp_path / "s" / "scene_000000.safetensors", depth_dpt=(0.5, 3.0))
+    network = dataclasses.replace(variant("focal-stack"), channels=4, planes=3, trained=ANY_BENCH)
+    train(tiny(tmp_path / "s", tmp_path / "run", steps=2, network=network), CPU)
+    write_shard(tmp_path / "s" / "scene_000000.safetensors", depth_dpt=(0.5, 3.0), places=(0.0, 0.4, 1.0))
+    with pytest.raises(ShardError, match=r"focus_dpt is \(0\.5, 1\.5, 3\.0\), expected .* \(0\.5, 1\.75, 3\.0\)"):
+        train(tiny(tmp_path / "s", tmp_path / "other", network=network, validation=None), CPU)
+
+
 def test_bf16_is_near_f32_and_leaves_the_weights_f32(shards: Path, tmp_path: Path) -> None:
     runs = {p: Run(tiny(shards, tmp_path, precision=p), CPU) for p in ("f32", "bf16")}
     rows = {p: [run.train_step() for _ in range(3)] for p, run in runs.items()}
