@@ -36,6 +36,7 @@ from holod_training.export import (
     write_beside,
 )
 from holod_training.foam import REGION_PX
+from holod_training.focal_stack import check_focuses
 from holod_training.loss import (
     LIGHT_WINDOWS_PX,
     PERCEPTUAL_PLANES,
@@ -214,6 +215,8 @@ class Run:
         if config.validation:
             self.validation = open_held_out(Path(config.validation), limit=config.validation_scenes)
             check_border(self.validation, config.validation_border_px, "--validation-border-px")
+            for shard in self.validation if config.network.architecture == "focal-stack" else []:
+                check_focuses(shard, config.network)
 
     def _focal_stacks(self) -> list[NetworkConfig]:
         """The networks, of the student and its teacher, that take a focal stack as their input."""

@@ -198,6 +198,16 @@ def test_a_focal_stack_network_trains_on_a_bench_with_another_depth_range(tmp_pa
         train(tiny(tmp_path / "s", tmp_path / "other", network=network, validation=None), CPU)
 
 
+def test_validation_scenes_at_other_focuses_are_refused_before_the_first_step(shards: Path, tmp_path: Path) -> None:
+    write_shard(tmp_path / "v" / "scene_000000.safetensors", planes=4)
+    network = dataclasses.replace(variant("focal-stack"), channels=4, planes=3)
+    config = tiny(shards, tmp_path / "run", network=network, validation=str(tmp_path / "v"))
+    with pytest.raises(ShardError, match=r"v/scene_000000\.safetensors: focus_dpt is .* expected those .*--planes 3"):
+        train(config, CPU)
+    assert not (tmp_path / "run").exists()
+    Run(dataclasses.replace(config, network=TINY), CPU)
+
+
 def test_bf16_is_near_f32_and_leaves_the_weights_f32(shards: Path, tmp_path: Path) -> None:
     runs = {p: Run(tiny(shards, tmp_path, precision=p), CPU) for p in ("f32", "bf16")}
     rows = {p: [run.train_step() for _ in range(3)] for p, run in runs.items()}
