@@ -300,12 +300,13 @@ fn each_bad_folder_gets_a_clear_error_and_leaves_nothing_behind() {
     let at = |name: &str| folder.path().join(name);
     render(&at("scenes"), SceneKind::Test, SIZE, 1);
     render(&at("small"), SceneKind::Marks, SIZE, 1);
+    render(&at("learned"), SceneKind::Train, SIZE, 1);
     fs::create_dir(at("empty")).unwrap();
     fs::create_dir(at("cut")).unwrap();
     let whole = fs::read(at("scenes").join(file_name(0))).unwrap();
     fs::write(at("cut").join(file_name(3)), &whole[..whole.len() / 2]).unwrap();
     fs::write(at("file"), "").unwrap();
-    let cases: [(&[&str], i32, &[&str]); 11] = [
+    let cases: [(&[&str], i32, &[&str]); 14] = [
         (&["--scenes", "nowhere"], 66, &["nowhere", "holod-scenes"]),
         (&["--scenes", "empty"], 66, &["empty", "scene_*.safetensors", "holod-scenes generate"]),
         (&["--scenes", "cut"], 65, &["cut/scene_000003.safetensors", "bytes", "holod-scenes generate"]),
@@ -326,6 +327,9 @@ fn each_bad_folder_gets_a_clear_error_and_leaves_nothing_behind() {
             65,
             &["scene_000000", "no mark in 64x48", "96x120", "--kind marks"],
         ),
+        (&["--scenes", "learned"], 65, &["scene_000000", "`kind` is `train`", "held-out", "--kind test"]),
+        (&["--scenes", "scenes", "--cards", "learned"], 65, &["scene_000000", "`kind` is `train`", "held-out"]),
+        (&["--scenes", "small"], 65, &["scene_000000", "`kind` is `marks`", "--kind test", "with --marks"]),
         (&["--scenes", "scenes", "--limit", "0"], 64, &["--limit", "0"]),
         (&["--scenes", "scenes", "--weights", "file"], 65, &["file"]),
         (&["--border-px", "8"], 64, &["--scenes"]),

@@ -5,7 +5,7 @@ use std::path::Path;
 use holod_calibration::rig::Rig;
 use holod_calibration::{DisplayGeometry, PupilDiameter};
 use holod_model::metrics::StackScore;
-use holod_model::scene_renderer::Marks;
+use holod_model::scene_renderer::{Marks, SceneKind};
 use holod_model::scene_shard::{SceneShard, SceneShardError};
 use holod_model::{LinearImage, Weights};
 use serde::Serialize;
@@ -171,6 +171,7 @@ impl<'a> EvaluationPlan<'a> {
         let EvaluationSettings { rig, scenes, cards, marks, limit, .. } = settings;
         let weights = setup::weights(rig)?;
         let shards = open(scenes, limit, rig)?;
+        shards.iter().try_for_each(refuse_special)?;
         let cards = cards.map(|folder| open(folder, None, rig)).transpose()?.unwrap_or_default();
         let marks = marks.map(|folder| open(folder, None, rig)).transpose()?.unwrap_or_default();
         let pupils = judged_pupils(&shards, settings.pupils)?;
@@ -254,7 +255,7 @@ impl<'a> EvaluationPlan<'a> {
     }
 }
 
-/// The shards of a folder, which must have one size and the same planes.
+/// The shards of a folder, which must be held out and have one size and the same planes.
 fn open(folder: &Path, limit: Option<usize>, rig: &Rig) -> Result<Vec<SceneShard>, Failure> {
     let shards = SceneShard::open_folder(folder, limit, &rig.geometry).map_err(|error| {
         let exit = match error {
@@ -270,6 +271,11 @@ fn open(folder: &Path, limit: Option<usize>, rig: &Rig) -> Result<Vec<SceneShard
             let path = shard.path().display();
             Failure::new(Exit::Data, format!("{path}: {what} is {found}; expected {expected}"))
         };
+        if shard.kind() == SceneKind::Train.name() {
+            let expected = "held-out scenes: networks are not judged on what they learn from; write others with \
+                            `holod-scenes generate --kind test`";
+            return Err(wrong("metadata `kind`", format!("`{}`", shard.kind()), expected.into()));
+        }
         let size = shard.resolution();
         if size != first.resolution() || shard.focuses() != first.focuses() {
             let of = |shard: &SceneShard| {
@@ -288,6 +294,21 @@ fn open(folder: &Path, limit: Option<usize>, rig: &Rig) -> Result<Vec<SceneShard
         }
     }
     Ok(shards)
+}
+
+/// An error for cards and marks, of which PSNR and slope tell nothing.
+fn refuse_special(shard: &SceneShard) -> Result<(), Failure> {
+    match [SceneKind::Cards, SceneKind::Marks].into_iter().find(|kind| kind.name() == shard.kind()) {
+        None => Ok(()),
+        Some(kind) => {
+            let (path, kind) = (shard.path().display(), kind.name());
+            let said = format!(
+                "{path}: metadata `kind` is `{kind}`; expected scenes of `holod-scenes generate --kind test`: name a \
+                 folder of {kind} with --{kind}"
+            );
+            Err(Failure::new(Exit::Data, said))
+        }
+    }
 }
 
 /// The pupils that were asked for, or those of the first scene.

@@ -34,7 +34,7 @@ from holod_training.plots import write_plots
 from holod_training.refocus import refocus_cards
 from holod_training.report import markdown
 from holod_training.rgbd import read_pictures, write_rgbd_sheet
-from holod_training.shards import check_border, open_shards
+from holod_training.shards import check_border, open_held_out
 from holod_training.sheets import write_sheet
 from holod_training.solver import optimise
 from holod_training.tradeoff import focus_curve, on_the_same_scenes
@@ -58,8 +58,8 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     optics = shards[0].optics
     for one in networks.values():
         one.on(optics)
-    cards = open_shards(config.cards, optics) if config.cards else []
-    marks = open_shards(config.marks, optics) if config.marks else []
+    cards = open_held_out(config.cards, optics) if config.cards else []
+    marks = open_held_out(config.marks, optics) if config.marks else []
     pictures = read_pictures(config.rgbd, optics) if config.rgbd else []
     lpips = Lpips.open(config.lpips_backbone, config.lpips_linear, device)
     least_px = SMALLEST_PX if lpips else SSIM_WINDOW_PX

@@ -28,7 +28,7 @@ from holod_training.loss import inner
 from holod_training.metrics import psnr_db
 from holod_training.optics import frequencies, half_band_mask, intensity, pupil_mask, transfer
 from holod_training.rivals import all_in_focus, layered_asm
-from holod_training.shards import Stack, check_border, open_held_out
+from holod_training.shards import Stack, check_border, open_test
 
 PUPILS_MM = (1.0, 2.0, 3.0, 4.0, 5.0)
 SHARES = (0.5, 0.9, 0.99)
@@ -133,7 +133,7 @@ def write_eyebox(weights: Path, test: Path, out: Path, limit: int | None) -> str
     """
     check_folder(out)
     network = load_weights(weights)
-    shards = open_held_out(test, limit=limit)
+    shards = open_test(test, limit)
     check_border(shards, BORDER_PX)
     optics = network.on(shards[0].optics).optics
     stacks = [shard.read(0) for shard in shards]

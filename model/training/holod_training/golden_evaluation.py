@@ -123,7 +123,8 @@ def found(shard: Shard, weights: Path) -> dict[str, Any]:
 
 
 def write_evaluation(path: Path, weights: Path, seed: int) -> None:
-    """A shard of kind cards, whose metadata has `weights`, `border_px` and what is to be `found` besides."""
+    """A shard that serves as a test scene and as cards, whose metadata has `weights`, `border_px` and what is to be
+    `found` besides."""
     optics = OpticsConfig()
     image, depth, stacks = scene(optics, seed)
     tensors = {"image": image.half(), "depth": depth.float()}
@@ -131,7 +132,7 @@ def write_evaluation(path: Path, weights: Path, seed: int) -> None:
     metadata = {
         "format": SHARD_FORMAT,
         "script": "python -m holod_training golden",
-        "kind": "cards",
+        "kind": "test",
         "seed": json.dumps(seed),
         "index": "0",
         "pupils_mm": json.dumps(PUPILS_MM),

@@ -27,7 +27,7 @@ from holod_training.rivals import (
     smooth_phase,
     transport_of_intensity,
 )
-from holod_training.shards import Shard, ShardError, Stack, open_held_out
+from holod_training.shards import Shard, ShardError, Stack, open_test
 from holod_training.solver import SolverConfig
 from holod_training.variants import network_amplitude
 
@@ -153,7 +153,7 @@ class Bench:
 def open_alike(folder: Path, limit: int | None = None, between: bool = False) -> list[Shard]:
     """The shards of one evaluation: held out, of one bench, same size, pupils and focuses; to judge `between`, an odd
     number of focuses. Raises ShardError that names the odd one."""
-    shards = open_held_out(folder, limit=limit)
+    shards = open_test(folder, limit)
     first = shards[0]
     for shard in shards[1:]:
         for what, found, expected in (

@@ -17,6 +17,7 @@ from holod_training.config import ConfigError, OpticsConfig, require
 
 SHARD_FORMAT = "holod-scene-1"
 TRAINING_KIND = "train"
+SPECIAL_KINDS = ("cards", "marks")
 DEFAULT_BENCH = OpticsConfig()
 
 
@@ -245,6 +246,19 @@ def open_held_out(folder: Path, optics: OpticsConfig | None = None, limit: int |
             raise ShardError(
                 f"{shard.path}: metadata kind is {shard.kind!r}, expected held-out scenes: networks are not judged on "
                 "what they learn from; write others with `holod-scenes generate --kind test`"
+            )
+    return shards
+
+
+def open_test(folder: Path, limit: int | None = None) -> list[Shard]:
+    """`open_held_out` for the scenes of `--test`. Raises ShardError for cards and marks, too, of which PSNR and slope
+    tell nothing."""
+    shards = open_held_out(folder, limit=limit)
+    for shard in shards:
+        if shard.kind in SPECIAL_KINDS:
+            raise ShardError(
+                f"{shard.path}: metadata kind is {shard.kind!r}, expected scenes of `holod-scenes generate --kind "
+                f"test`: name a folder of {shard.kind} with `evaluate --{shard.kind}`"
             )
     return shards
 

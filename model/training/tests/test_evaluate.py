@@ -371,6 +371,16 @@ def test_scenes_of_training_are_refused(tmp_path: Path, evaluation: Path, capsys
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("kind", ["cards", "marks"])
+def test_cards_and_marks_are_no_test_scenes(kind: str, tmp_path: Path, evaluation: Path, capsys) -> None:
+    write_shard(tmp_path / "scene_000000.safetensors", metadata={"kind": kind})
+    for command in ("evaluate", "eyebox", "across-benches"):
+        arguments = [command, "--weights", str(evaluation / "w.safetensors"), "--test", str(tmp_path)]
+        assert main([*arguments, "--out", str(tmp_path / "out")]) == 65
+        assert f"metadata kind is {kind!r}, expected scenes of" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_export_stamps_the_constant_and_the_evaluation(evaluation: Path) -> None:
     out = evaluation / "shipped.safetensors"
     arguments = ["--source", str(evaluation / "w.safetensors"), "--out", str(out), "--amplitude-constant", "1.25"]
