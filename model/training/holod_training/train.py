@@ -63,6 +63,15 @@ PERCEPTUAL_STREAM = 2
 WITHOUT_OPTION = ("final_rate_share", "gradient_clip", "ema_decay", "log_every", "checkpoint_every", "rescan_every")
 
 
+# What may be another when a run is resumed: where it lies, how long and how carefully it goes on, when it is looked at.
+CHANGED_ON_RESUMING = (
+    *("shards", "validation", "out", "initial_weights"),
+    *("steps", "learning_rate", "final_rate_share", "warm_up_steps", "gradient_clip", "precision"),
+    *("log_every", "validate_every", "checkpoint_every", "rescan_every"),
+    *("validation_scenes", "validation_border_px", "stop_below_slope", "network.amplitude_constant"),
+)
+
+
 class TrainingError(RuntimeError):
     """A run that must not go on; the message says why and what to do."""
 
@@ -156,6 +165,17 @@ class TrainConfig:
         warm = min(1.0, (step + 1) / max(1, self.warm_up_steps))
         cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, step / max(1, self.steps))))
         return self.learning_rate * warm * (self.final_rate_share + (1 - self.final_rate_share) * cosine)
+
+
+def _by_option(config: dict[str, Any]) -> dict[str, Any]:
+    """A run's config as config.json has it, by dotted keys; of files that the loss takes, whether there are any."""
+    values = json.loads(json.dumps(config))
+    found = {key: value for key, value in values.items() if key not in ("network", "loss", "augment")}
+    for part in ("network", "loss", "augment"):
+        found |= {f"{part}.{key}": value for key, value in values.get(part, {}).items()}
+    for path in ("teacher", "lpips_backbone", "lpips_linear"):
+        found[path] = "a file" if found.get(path) else "none"
+    return found
 
 
 # Scenes may each have their own focuses: only the eyes of scenes that have the same are worth keeping.
@@ -409,12 +429,10 @@ class Run:
                 "the pupil, so that its loss would change; go on with the version that began it, or start again from "
                 "its weights with --initial-weights"
             )
-        # Runs from before there was a choice had Adam.
-        found = stored.get("optimizer", "adam")
-        if found != self.config.optimizer:
+        if other := self._other_options(stored):
             raise TrainingError(
-                f"{self.config.out}: optimizer: found a checkpoint of {found!r}, expected {self.config.optimizer!r}; "
-                f"resume with --optimizer {found}"
+                f"{self.config.out}: {'; '.join(other)}; resume with the options that config.json there has, or go on "
+                "with others in a folder of its own by --initial-weights"
             )
         try:
             self.network.load_state_dict(state["network"])
@@ -428,6 +446,17 @@ class Run:
         self.seconds = state["seconds"]
         self.optimizer.load_state_dict(state["optimizer"])
         self.sampler.use(state["shards"])
+
+    def _other_options(self, stored: dict[str, Any]) -> list[str]:
+        """In what the config of a checkpoint is another than this run's, of all that makes network, loss and crops."""
+        # Runs from before there was a choice had Adam; what else a checkpoint does not have was as it is by default.
+        usual = {**asdict(TrainConfig("", "", 1)), "optimizer": "adam"}
+        default, found, given = (_by_option(config) for config in (usual, stored, asdict(self.config)))
+        return [
+            f"{key}: found a checkpoint of {found.get(key, default[key])!r}, expected {value!r}"
+            for key, value in given.items()
+            if key not in CHANGED_ON_RESUMING and found.get(key, default[key]) != value
+        ]
 
     def save_checkpoint(self) -> None:
         buffer = io.BytesIO()

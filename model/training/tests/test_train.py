@@ -138,6 +138,7 @@ def test_a_checkpoint_of_another_network_or_of_another_loss_is_refused(shards: P
             del stored["loss"]["in_focus"]
         if older:
             del stored["optimizer"]
+        changes = {"loss": LossWeights() if in_focus is None else LossWeights(in_focus=in_focus), **changes}
         again = Run(tiny(shards, tmp_path / "run", optimizer="adam", **changes), CPU)
         try:
             again.load_state({**state, "config": json.dumps(stored)})
@@ -147,13 +148,47 @@ def test_a_checkpoint_of_another_network_or_of_another_loss_is_refused(shards: P
         return again
 
     for in_focus, older in ((20.0, False), (0.0, True), (None, True)):
-        assert resumed(in_focus, older, loss=LossWeights(in_focus=30.0)).step == 1
+        assert resumed(in_focus, older).step == 1
     for loss in (LossWeights(), LossWeights(in_focus=20.0)):
         with pytest.raises(TrainingError, match=r"loss\.in_focus: found 20\.0 in a checkpoint .* --initial-weights"):
             resumed(20.0, True, loss=loss)
-    for changes in ({"layers": 6}, {"channels": 6}):
-        with pytest.raises(TrainingError, match="of a network with other layers than this run's"):
-            resumed(0.0, False, network=dataclasses.replace(TINY, **changes))
+    # Of a checkpoint whose config does not say so.
+    state["network"]["layers.0.weight"] = state["network"]["layers.0.weight"][:, :3]
+    with pytest.raises(TrainingError, match="of a network with other layers than this run's"):
+        resumed(0.0, False)
+
+
+def test_other_options_than_the_checkpoints_are_refused_by_name(shards: Path, tmp_path: Path) -> None:
+    """What makes network, loss and crops stays; where files lie, how long a run is and when it is looked at may not."""
+    run = Run(tiny(shards, tmp_path / "run"), CPU)
+    run.train_step()
+    state = run.state()
+
+    def resume(**changes: object) -> int:
+        again = Run(dataclasses.replace(run.config, **changes), CPU)
+        again.load_state(state)
+        return again.step
+
+    for changes, message in (
+        ({"network": dataclasses.replace(TINY, layers=6)}, r"network\.layers: found a checkpoint of 4, expected 6;"),
+        (
+            {"network": dataclasses.replace(TINY, trained=ANY_BENCH)},
+            r"network\.trained: found a checkpoint of .*\[14\.0, 72\.0\].*, expected .*\[5\.0, 115\.0\].*;",
+        ),
+        ({"loss": LossWeights(foam=3.0)}, r"loss\.foam: found a checkpoint of 0.*, expected 3\.0;"),
+        ({"augment": AugmentConfig(dim=0.9)}, r"augment\.dim: found a checkpoint of 0\.3, expected 0\.9;"),
+        ({"double_phase": 1.25}, r"double_phase: found a checkpoint of None, expected 1\.25;"),
+        ({"crop": 32, "seed": 3}, r"crop: found .* 48, expected 32; seed: found .* 1, expected 3; resume with"),
+    ):
+        with pytest.raises(TrainingError, match=message):
+            resume(**changes)
+    elsewhere = {"out": str(tmp_path / "moved"), "initial_weights": None, "validation": None}
+    assert resume(steps=9, validate_every=1, learning_rate=1e-3, precision="bf16", **elsewhere) == 1
+    # An older checkpoint lacks what is as it was.
+    stored = json.loads(state["config"])
+    del stored["double_phase"], stored["loss"]["foam"], stored["network"]["feedback"]
+    state["config"] = json.dumps(stored)
+    assert resume() == 1
 
 
 @pytest.mark.parametrize(
