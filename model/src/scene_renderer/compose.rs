@@ -442,10 +442,10 @@ impl Outline {
     }
 }
 
-/// The refocus test: two cards of fine marks, one near on the left and one far on the right.
+/// The refocus test: two cards of fine marks, which `random` draws, one near on the left and one far on the right.
 pub(super) fn refocus_cards(
     dark_on_bright: bool,
-    seed: u64,
+    mut random: Random,
     resolution: Resolution,
     widest: PupilDiameter,
 ) -> Vec<Surface> {
@@ -463,7 +463,6 @@ pub(super) fn refocus_cards(
     let mut surfaces = vec![Surface::bake(flat(0.0), wall, |_, _| Some(backdrop))];
     let (light, dark) = ([0.8, 0.8, 0.8], [0.03, 0.03, 0.03]);
     let (ground, mark) = if dark_on_bright { (light, dark) } else { (dark, light) };
-    let mut random = Random::new(mix(seed) ^ SceneKind::Cards.stream(), u64::from(dark_on_bright));
     for (side, depth) in [(-1.0, 2.5), (1.0, 0.25)] {
         let margin = 10.0 * scale;
         let (inner, outer) = (side * margin, side * (half_width - margin));
@@ -522,8 +521,14 @@ impl Marks {
     }
 }
 
-/// Bright marks in the lower half of a black picture: on the left they stand at 2.5 dioptres, on the right at 0.25.
-pub(super) fn bright_marks(marks: Marks, seed: u64, resolution: Resolution, widest: PupilDiameter) -> Vec<Surface> {
+/// Bright marks, which `random` draws, in the lower half of a black picture: on the left they stand at 2.5 dioptres, on
+/// the right at 0.25.
+pub(super) fn bright_marks(
+    marks: Marks,
+    mut random: Random,
+    resolution: Resolution,
+    widest: PupilDiameter,
+) -> Vec<Surface> {
     let Reach { overscan_px, .. } = Reach::of_radius(Lens::radius(widest));
     const CELL_PX: f32 = 24.0;
     let (half_width, half_height) = (0.5 * resolution.width as f32, 0.5 * resolution.height as f32);
@@ -533,7 +538,6 @@ pub(super) fn bright_marks(marks: Marks, seed: u64, resolution: Resolution, wide
     };
     let (across, down) = (half_width + overscan_px, half_height + overscan_px);
     let mut surfaces = vec![black(-across, -down, across, down, 0.0, &|_, _| 0.0)];
-    let mut random = Random::new(mix(seed) ^ SceneKind::Marks.stream(), marks as u64);
     // Nothing is cut off, and what is out of focus stays in the picture.
     let margin = 0.5 * CELL_PX;
     let (columns, rows) =

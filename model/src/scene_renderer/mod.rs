@@ -7,6 +7,7 @@
 mod compose;
 mod demo;
 mod families;
+mod generation;
 mod glyphs;
 #[cfg(feature = "gpu")]
 mod gpu;
@@ -30,6 +31,7 @@ mod view;
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 
 pub use compose::Marks;
+pub use generation::generator;
 pub use noise::Noise;
 use surface::Surface;
 use thin_lens::PixelSamples;
@@ -111,12 +113,14 @@ impl Scene {
     pub fn random_for(kind: SceneKind, seed: u64, index: u64, resolution: Resolution, widest: PupilDiameter) -> Self {
         let (surfaces, pixel_samples) = match kind {
             SceneKind::Cards => {
-                let cards = compose::refocus_cards(index.is_multiple_of(2), seed ^ (index / 2), resolution, widest);
+                let drawn = generation::drawn(kind, seed, index);
+                let cards = compose::refocus_cards(index.is_multiple_of(2), drawn, resolution, widest);
                 (cards, PixelSamples::Grid)
             }
             SceneKind::Marks => {
-                let marks = compose::Marks::of_index(index);
-                (compose::bright_marks(marks, seed ^ (index / 3), resolution, widest), PixelSamples::Grid)
+                let drawn = generation::drawn(kind, seed, index);
+                let marks = compose::bright_marks(compose::Marks::of_index(index), drawn, resolution, widest);
+                (marks, PixelSamples::Grid)
             }
             SceneKind::Train | SceneKind::Test => {
                 (compose::random_surfaces(kind, seed, index, resolution, widest), PixelSamples::Lattice)

@@ -3,7 +3,7 @@
 //! `scene_000123.safetensors` holds `image` F16 [3, H, W] (linear light, pinhole), `depth` F32 [H, W] (normalised, 0
 //! far,
 //! 1 near) and `stack_0` … `stack_n` F16 [planes, 3, H, W] (linear light, one for each pupil). Its metadata are
-//! strings: `format` = "holod-scene-1", `generator` (see [`GENERATOR`]), `kind`, `seed`, `index`, `pupils_mm` and
+//! strings: `format` = "holod-scene-1", `generator` (see [`generator`]), `kind`, `seed`, `index`, `pupils_mm` and
 //! `focus_dpt` (JSON lists, which other scenes of the folder need not share), those of the bench on which the scene is
 //! seen: `far_dpt`, `near_dpt`, `pixel_angle_rad`, `wavelengths_nm` (JSON list), `pixel_pitch_um`; `rays`, and
 //! `traced_by`: `cpu` or a device's name.
@@ -24,15 +24,12 @@ use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution, wr
 use safetensors::tensor::{Dtype, Metadata};
 
 use super::random::{Random, mix};
-use super::{Scene, SceneKind, Tracer};
+use super::{Scene, SceneKind, Tracer, generator};
 use crate::gpu::GpuError;
 use crate::safetensors_file::{self, Tensor};
 
 /// The `format` that a shard's metadata names.
 pub const FORMAT: &str = "holod-scene-1";
-/// The generation of the random scenes: the same kind, seed and index give the same scene within one generation only.
-/// Shards that name none are of the first.
-pub const GENERATOR: u32 = 2;
 /// Blur over the depth volume, in panel pixels, that scenes are made for: less is hardly any, and more would be as
 /// large as the objects.
 pub const BLUR_RANGE_PX: (f64, f64) = (5.0, 250.0);
@@ -318,7 +315,7 @@ impl ShardPlan {
         let focus_dpt: Vec<f64> = self.focus(index).iter().map(|f| f.0).collect();
         [
             ("format", FORMAT.to_owned()),
-            ("generator", GENERATOR.to_string()),
+            ("generator", generator(self.kind, self.seed, index).to_string()),
             ("kind", self.kind.name().to_owned()),
             ("seed", self.seed.to_string()),
             ("index", index.to_string()),
