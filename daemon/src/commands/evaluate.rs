@@ -6,7 +6,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::cli::EvaluateArgs;
 use crate::evaluation::{
-    Estimate, Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, MarksRow, MarksViews, Matrix, Refocus,
+    Estimate, Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, MarksRow, MarksViews, Matrix, RefocusRow,
     SceneViews,
 };
 use crate::failure::Failure;
@@ -172,7 +172,7 @@ fn table(evaluation: &Evaluation) -> String {
     if !evaluation.refocus.is_empty() {
         text.push_str("\n\nrefocus ratio: a card's gradient energy in focus over out of focus\n");
         text.push_str(&format!("{:>8}{:>18}{:>12}{:>12}", "pupil mm", "marks", "near card", "far card"));
-        for Refocus { contrast, pupil_mm, near_card, far_card } in &evaluation.refocus {
+        for RefocusRow { contrast, pupil_mm, near_card, far_card, .. } in &evaluation.refocus {
             text.push_str(&format!("\n{pupil_mm:>8}{contrast:>18}{near_card:>12.2}{far_card:>12.2}"));
         }
     }

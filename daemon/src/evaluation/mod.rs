@@ -20,10 +20,10 @@ use holod_model::scene_renderer::{Marks, SceneKind};
 use holod_model::scene_shard::SceneShard;
 use holod_model::{LinearImage, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
-use serde::Serialize;
 
 pub use plan::{
-    Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, MarksRow, MarksViews, Matrix, Row, SceneViews,
+    Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, MarksRow, MarksViews, Matrix, RefocusRow, Row,
+    SceneViews,
 };
 pub use statistics::Estimate;
 
@@ -71,7 +71,7 @@ pub struct EndViews {
 }
 
 /// The refocus ratios of one card scene for one pupil: gradient energy in focus over out of focus.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug)]
 pub struct Refocus {
     /// `dark on bright` or `bright on dark`.
     pub contrast: &'static str,

@@ -57,7 +57,7 @@ pub struct Evaluated {
     pub pupils: Vec<PupilDiameter>,
     /// What is seen of the first scenes.
     pub scene_views: Vec<SceneViews>,
-    /// What each pupil sees of each card, focused near and far.
+    /// What each pupil sees of the first cards of each contrast, focused near and far.
     pub card_views: Vec<(Refocus, [LinearImage; 2])>,
     /// What is seen of the first scene of each kind of marks.
     pub marks_views: Vec<MarksViews>,
@@ -105,9 +105,24 @@ pub struct Evaluation {
     /// Holograms made for one pupil and seen by another.
     pub matrix: Matrix,
     /// Refocus ratios of the cards.
-    pub refocus: Vec<Refocus>,
+    pub refocus: Vec<RefocusRow>,
     /// Light of bright marks on exact black.
     pub marks: Vec<MarksRow>,
+}
+
+/// One contrast of cards and one pupil, which the hologram is made for and which looks: means over scenes.
+#[derive(Debug, PartialEq, Serialize)]
+pub struct RefocusRow {
+    /// [`Refocus::contrast`].
+    pub contrast: &'static str,
+    /// The pupil.
+    pub pupil_mm: f32,
+    /// How many scenes there are of this contrast.
+    pub scenes: usize,
+    /// [`Refocus::near_card`].
+    pub near_card: f64,
+    /// [`Refocus::far_card`].
+    pub far_card: f64,
 }
 
 /// One kind of marks and one pupil, which the hologram is made for and which looks: means over scenes.
@@ -202,11 +217,15 @@ impl<'a> EvaluationPlan<'a> {
         let EvaluationSettings { rig, backend, border_px, .. } = settings;
         let judge_of = |shard: &SceneShard| Judge::new(rig, &weights, backend, shard.resolution(), border_px);
         // Cards and marks first: they are few, and what is wrong with them is told before the long work.
-        let mut card_views = Vec::new();
+        let (mut of_cards, mut card_views) = (Vec::new(), Vec::<(Refocus, [LinearImage; 2])>::new());
         if let Some(first) = cards.first() {
             let mut judge = judge_of(first)?;
             for shard in &cards {
-                card_views.extend(judge.cards(shard, &pupils)?);
+                let found = judge.cards(shard, &pupils)?;
+                of_cards.extend(found.iter().map(|(refocus, _)| refocus.clone()));
+                if card_views.iter().all(|(refocus, _)| refocus.contrast != found[0].0.contrast) {
+                    card_views.extend(found);
+                }
                 after_step()?;
             }
         }
@@ -248,7 +267,7 @@ impl<'a> EvaluationPlan<'a> {
             confidence: "95 %, Student's t over scenes",
             rows: pupils.iter().enumerate().map(|(number, &pupil)| row(pupil, number, &judged)).collect(),
             matrix: matrix(&pupils, &judged),
-            refocus: card_views.iter().map(|(refocus, _)| refocus.clone()).collect(),
+            refocus: refocus_rows(&of_cards),
             marks: marks_rows(&pupils, &of_marks),
         };
         Ok(Evaluated { evaluation, pupils, scene_views, card_views, marks_views })
@@ -412,4 +431,51 @@ fn marks_rows(pupils: &[PupilDiameter], scenes: &[Vec<MarksLight>]) -> Vec<Marks
         }
     }
     rows
+}
+
+/// Means over the scenes of each contrast, for each pupil.
+fn refocus_rows(scenes: &[Refocus]) -> Vec<RefocusRow> {
+    let mut rows: Vec<RefocusRow> = Vec::new();
+    for &Refocus { contrast, pupil_mm, near_card, far_card } in scenes {
+        match rows.iter_mut().find(|row| row.contrast == contrast && row.pupil_mm == pupil_mm) {
+            Some(row) => {
+                row.scenes += 1;
+                let share = 1.0 / row.scenes as f64;
+                row.near_card += share * (near_card - row.near_card);
+                row.far_card += share * (far_card - row.far_card);
+            }
+            None => rows.push(RefocusRow { contrast, pupil_mm, scenes: 1, near_card, far_card }),
+        }
+    }
+    rows
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cards_of_one_contrast_have_one_row_for_each_pupil() {
+        let refocus = |contrast, pupil_mm, near_card, far_card| Refocus { contrast, pupil_mm, near_card, far_card };
+        let rows = refocus_rows(&[
+            refocus("dark on bright", 2.0, 1.0, 4.0),
+            refocus("dark on bright", 4.0, 2.0, 5.0),
+            refocus("bright on dark", 2.0, 3.0, 6.0),
+            refocus("dark on bright", 2.0, 5.0, 8.0),
+            refocus("dark on bright", 2.0, 6.0, 9.0),
+        ]);
+        let row = |contrast, pupil_mm, scenes, near_card, far_card| RefocusRow {
+            contrast,
+            pupil_mm,
+            scenes,
+            near_card,
+            far_card,
+        };
+        let expected = [
+            row("dark on bright", 2.0, 3, 4.0, 7.0),
+            row("dark on bright", 4.0, 1, 2.0, 5.0),
+            row("bright on dark", 2.0, 1, 3.0, 6.0),
+        ];
+        assert_eq!(rows, expected);
+    }
 }

@@ -177,6 +177,21 @@ def open_alike(folder: Path, limit: int | None = None, between: bool = False) ->
     return shards
 
 
+def means(rows: list[dict[str, Any]], keys: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Of rows that are alike in `keys`, scenes each, one with the number of `scenes` and the means of all else."""
+    grouped: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        grouped.setdefault(tuple(row[key] for key in keys), []).append(row)
+    return [
+        {
+            **dict(zip(keys, of, strict=True)),
+            "scenes": len(found),
+            **{name: sum(row[name] for row in found) / len(found) for name in found[0] if name not in keys},
+        }
+        for of, found in grouped.items()
+    ]
+
+
 def table_pupils(pupils_mm: Sequence[float]) -> list[float]:
     """The whole millimetres, which tables and the matrix show; all pupils where fewer than two are whole."""
     whole = [p for p in pupils_mm if p == round(p)]

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from holod_training.judging import AFTER, BEFORE, OURS, Bench, Method
+from holod_training.judging import AFTER, BEFORE, OURS, Bench, Method, means
 from holod_training.loss import LEAST_LIGHT, dark_area
 from holod_training.shards import Shard, ShardError
 from holod_training.sheets import save_sheet
@@ -57,20 +57,4 @@ def judge_marks(shards: list[Shard], methods: list[Method], bench: Bench, sheet:
                     if method.name == OURS and stage == AFTER and index == len(shard.pupils_mm) - 1:
                         pictures.append([stack.image, seen[-1], seen[0]])
     save_sheet(sheet, pictures)
-    return _means(rows)
-
-
-def _means(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Means over the scenes of each kind of marks, method, stage and pupil."""
-    keys = ("marks", "method", "double_phase", "pupil_mm")
-    grouped: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for row in rows:
-        grouped.setdefault(tuple(row[key] for key in keys), []).append(row)
-    return [
-        {
-            **dict(zip(keys, of, strict=True)),
-            "scenes": len(found),
-            **{name: sum(row[name] for row in found) / len(found) for name in ("light_ratio", "dark_mean")},
-        }
-        for of, found in grouped.items()
-    ]
+    return means(rows, ("marks", "method", "double_phase", "pupil_mm"))

@@ -431,6 +431,23 @@ def test_card_areas_leave_out_border_and_seam() -> None:
     assert areas["far"].nonzero().amin(0).tolist() == [10, 80]
 
 
+def test_cards_of_one_contrast_have_one_row_for_each_pupil(tmp_path: Path) -> None:
+    for index in range(3):
+        write_card(tmp_path / f"scene_{index:06}.safetensors", seed=index)
+    shards = [Shard(path) for path in sorted(tmp_path.iterdir())]
+    method, bench = rivals(OPTICS)[0], Bench(OPTICS, 1.25, 8)
+
+    def rows(*indices: int) -> dict[tuple[str, float], dict[str, Any]]:
+        of = refocus_cards([shards[i] for i in indices], [method], bench, tmp_path / "sheet.png")
+        return {(row["contrast"], row["pupil_mm"]): row for row in of}
+
+    one, other, found = rows(0), rows(2), rows(0, 1, 2)
+    assert len(found) == 2 * 5 and found["bright on dark", 2.0]["scenes"] == 1
+    key = ("dark on bright", 2.0)
+    assert one[key]["near_card"] != other[key]["near_card"] and found[key]["scenes"] == 2
+    assert found[key]["near_card"] == pytest.approx((one[key]["near_card"] + other[key]["near_card"]) / 2)
+
+
 def test_cards_are_judged_on_a_bench_with_another_depth_range(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They stand at the same place of every bench's depth range, and the eye is focused there."""
     bench = {"far_dpt": "0.5", "near_dpt": "2.0"}
