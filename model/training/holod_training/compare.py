@@ -22,7 +22,7 @@ from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, coc_px, double_phase, panel_field, through_levels, upsample_half_band
 from holod_training.report import NUMBERS
 from holod_training.rivals import flat_oracle
-from holod_training.shards import Shard, open_held_out
+from holod_training.shards import Shard, check_pupils, open_held_out
 from holod_training.train import VALIDATION_PUPILS_MM, Run, TrainConfig, train
 from holod_training.variants import VARIANTS, network_amplitude, variant
 
@@ -103,6 +103,8 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
     require("--variants", ",".join(names), bool(names), f"some of {', '.join(VARIANTS)}")
     networks = {name: variant(name) for name in names}
     check_folder(Path(base.out))
+    shards = open_held_out(Path(base.validation), limit=base.validation_scenes)
+    check_pupils(shards, VALIDATION_PUPILS_MM)
     key_defaults = json.loads(json.dumps(dataclasses.asdict(NetworkConfig())))
     out = Path(base.out)
     rows = []
@@ -127,7 +129,6 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
             row = {"variant": name, "terms": terms, **_contest(config, seconds, device)}
             write_beside(known, (json.dumps(row, indent=1) + "\n").encode())
         rows.append(json.loads(known.read_text()))
-    shards = open_held_out(Path(base.validation), limit=base.validation_scenes)
     flat = judge_flat_oracle(shards, base.validation_border_px)
     table = markdown(rows, flat, len(shards))
     result = {"rows": rows, FLAT_ORACLE: flat, "scenes": [s.path.name for s in shards]}

@@ -16,6 +16,8 @@ from torch import Tensor
 from holod_training.config import ConfigError, OpticsConfig, require
 
 SHARD_FORMAT = "holod-scene-1"
+# A pupil as near to another is the same.
+PUPIL_TOLERANCE_MM = 0.05
 TRAINING_KIND = "train"
 SPECIAL_KINDS = ("cards", "marks")
 DEFAULT_BENCH = OpticsConfig()
@@ -261,6 +263,18 @@ def open_test(folder: Path, limit: int | None = None) -> list[Shard]:
                 f"test`: name a folder of {shard.kind} with `evaluate --{shard.kind}`"
             )
     return shards
+
+
+def check_pupils(shards: Sequence[Shard], pupils_mm: Sequence[float]) -> None:
+    """Raises ShardError for scenes that lack one of the pupils which they are judged with."""
+    for shard in shards:
+        nearest = [shard.pupils_mm[shard.nearest_pupil(pupil_mm)] for pupil_mm in pupils_mm]
+        if any(abs(found - mm) > PUPIL_TOLERANCE_MM for found, mm in zip(nearest, pupils_mm, strict=True)):
+            found, expected = (",".join(f"{mm:g}" for mm in some) for some in (shard.pupils_mm, pupils_mm))
+            raise ShardError(
+                f"{shard.path}: pupils_mm is {found}, expected {expected} among them, which validation has figures of; "
+                f"render such scenes with `holod-scenes generate --kind test --pupils {expected}`"
+            )
 
 
 def check_border(shards: Sequence[Shard], border_px: int, option: str = "", least_px: int = 1) -> None:

@@ -53,7 +53,7 @@ from holod_training.optics import Eye, HalfBandEye, coc_px, shown_by_panel
 from holod_training.optimizer import OPTIMIZERS, make_optimizer
 from holod_training.rivals import flat_oracle
 from holod_training.sampling import AugmentConfig, Sampler
-from holod_training.shards import Shard, Stack, check_border, open_held_out
+from holod_training.shards import Shard, Stack, check_border, check_pupils, open_held_out
 from holod_training.variants import build_network, network_amplitude
 
 VALIDATION_PUPILS_MM = (2.0, 3.0, 4.0)
@@ -235,6 +235,7 @@ class Run:
         if config.validation:
             self.validation = open_held_out(Path(config.validation), limit=config.validation_scenes)
             check_border(self.validation, config.validation_border_px, "--validation-border-px")
+            check_pupils(self.validation, VALIDATION_PUPILS_MM)
             for shard in self.validation if config.network.architecture == "focal-stack" else []:
                 check_focuses(shard, config.network)
 

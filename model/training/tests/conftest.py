@@ -18,7 +18,7 @@ def write_shard(
     path: Path,
     seed: int = 0,
     size: int | tuple[int, int] = 64,
-    pupils_mm: tuple[float, ...] = (1.0, 2.0, 3.0),
+    pupils_mm: tuple[float, ...] = (1.0, 2.0, 3.0, 4.0),
     planes: int = 3,
     metadata: dict[str, str] | None = None,
     places: tuple[float, ...] | None = None,

@@ -35,7 +35,7 @@ def test_each_bench_has_a_row_for_each_network_and_one_for_the_rival(
     found = json.loads((tmp_path / "out" / "benches.json").read_text())["benches"]
     assert [bench["bench"] for bench in found] == ["default", "gaea-40"]
     for bench in found:
-        assert len(bench["rows"]) == 3 * 3 and bench["scenes"] == 2
+        assert len(bench["rows"]) == 3 * 4 and bench["scenes"] == 2
         assert {row["method"] for row in bench["rows"]} == {"one", "other", "smooth phase"}
         assert bench["gain_over_rival"].keys() == bench["matrix_psnr_db"].keys() == {"one", "other"}
         at_two = {row["method"]: row["psnr_db"] for row in bench["rows"] if row["pupil_mm"] == 2.0}
@@ -49,7 +49,7 @@ def test_each_bench_has_a_row_for_each_network_and_one_for_the_rival(
     assert gaea["volume_blur_px"][1] / default["volume_blur_px"][1] == pytest.approx(8 / 3.74, rel=1e-3)
     assert default["rows"][0]["psnr_db"] != gaea["rows"][0]["psnr_db"]
     assert "**gaea-40**: 3.74 um, 40 mm, 633/532/473 nm, 0 to 2.86 dpt" in table
-    assert table.count("| smooth phase | ") == 2 and table.count(" of 3 |") == 4
+    assert table.count("| smooth phase | ") == 2 and table.count(" of 4 |") == 4
 
 
 def test_a_folder_without_scenes_is_said_before_the_long_work(tmp_path: Path) -> None:

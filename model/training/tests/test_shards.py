@@ -45,7 +45,7 @@ def test_garbage_is_named(tmp_path: Path) -> None:
         ({"near_dpt": "-1.0"}, r"near_dpt = -1\.0, pixel_angle_rad = .* expected a depth volume of rising dioptres"),
         ({"pixel_angle_rad": "0"}, "pixel_angle_rad = 0.0, expected a depth volume .* and an angle above 0"),
         ({"far_dpt": "far"}, "far_dpt = 'far' is not JSON"),
-        ({"pupils_mm": "[1.0, 2.0, 3.0, 4.0]"}, "stack_3 has shape None"),
+        ({"pupils_mm": "[1.0, 2.0, 3.0, 4.0, 5.0]"}, "stack_4 has shape None"),
     ],
 )
 def test_wrong_metadata_is_said(tmp_path: Path, metadata: dict[str, str], message: str) -> None:
@@ -59,7 +59,7 @@ def test_a_scene_shows_on_another_bench_what_other_pupils_and_focuses_see(tmp_pa
     shard = Shard(write_shard(tmp_path / "scene_000000.safetensors"))
     other = OpticsConfig((633.0, 532.0, 473.0), 3.74, 40.0, 0.5, 3.5)
     moved = shard.on(other)
-    assert shard.on(OpticsConfig()).pupils_mm == shard.pupils_mm == (1.0, 2.0, 3.0)
+    assert shard.on(OpticsConfig()).pupils_mm == shard.pupils_mm == (1.0, 2.0, 3.0, 4.0)
     assert moved.focus_dpt[0] == pytest.approx(0.5) and moved.focus_dpt[-1] == pytest.approx(3.5)
     # 5 px a dioptre and mm over 20/7 dpt; 10.695 px over 3 dpt.
     assert moved.pupils_mm[1] == pytest.approx(2 * 5 * 20 / 7 / (40 / 3.74 * 3))

@@ -19,6 +19,7 @@ from holod_training import cli
 from holod_training import train as train_module
 from holod_training.benches import ANY_BENCH, BenchDraw
 from holod_training.cli import main
+from holod_training.compare import compare
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig, TrainedRange
 from holod_training.export import WeightsError, load_weights, read_metadata, save_weights
 from holod_training.loss import LossWeights
@@ -243,6 +244,19 @@ def test_validation_scenes_at_other_focuses_are_refused_before_the_first_step(sh
     Run(dataclasses.replace(config, network=TINY), CPU)
 
 
+def test_validation_scenes_without_its_pupils_are_refused_before_the_first_step(shards: Path, tmp_path: Path) -> None:
+    """Figures of the nearest pupil would stand under the name of the one that is missing."""
+    write_shard(tmp_path / "v" / "scene_000000.safetensors", pupils_mm=(1.0, 2.04, 3.0, 3.9))
+    config = tiny(shards, tmp_path / "run", validation=str(tmp_path / "v"))
+    with pytest.raises(ShardError, match=r"v/scene_000000\.safetensors: pupils_mm is 1,2\.04,3,3\.9, expected 2,3,4 "):
+        train(config, CPU)
+    with pytest.raises(ShardError, match="pupils_mm is"):
+        compare(config, ["half-band-8"], 1, CPU)
+    assert not (tmp_path / "run").exists()
+    write_shard(tmp_path / "v" / "scene_000000.safetensors", pupils_mm=(2.04, 3.0, 3.96))
+    Run(config, CPU)
+
+
 def test_bf16_is_near_f32_and_leaves_the_weights_f32(shards: Path, tmp_path: Path) -> None:
     runs = {p: Run(tiny(shards, tmp_path, precision=p), CPU) for p in ("f32", "bf16")}
     rows = {p: [run.train_step() for _ in range(3)] for p, run in runs.items()}
@@ -336,7 +350,7 @@ def test_lpips_joins_the_loss_where_its_files_are_given(shards: Path, tmp_path: 
 
 
 def test_the_in_focus_term_counts_by_the_pupil_of_each_crop(shards: Path, tmp_path: Path) -> None:
-    """The shards' pupils are 1, 2 and 3 mm: the total has the weight of the one that was drawn."""
+    """The shards' pupils are 1 to 4 mm: the total has the weight of the one that was drawn."""
     run = Run(tiny(shards, tmp_path, loss=LossWeights(in_focus=20.0)), CPU)
     run.sampler.rescan()
     drawn = set()
