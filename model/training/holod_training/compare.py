@@ -29,6 +29,8 @@ from holod_training.variants import VARIANTS, network_amplitude, variant
 WARM_STEPS, TIMED_STEPS = 2, 7
 NO_STOP = -10.0
 FLAT_ORACLE = "flat oracle"
+# What a variant's training was begun for, and with how many steps: so it can be gone on with.
+BEGUN = "begun.json"
 FIVE_NUMBERS = NUMBERS[:5]
 
 
@@ -93,7 +95,7 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
 
     What a step takes is measured first, and gives the number of steps: so each run has its whole learning-rate
     schedule and can be had again from its config.json. A variant whose folder holds its row already is not trained
-    again. Raises ConfigError, ShardError, TrainingError.
+    again, and one that was interrupted goes on from its checkpoint. Raises ConfigError, ShardError, TrainingError.
     """
     if not base.validation:
         raise ConfigError("validation: found no folder of held-out scenes; variants are compared on them")
@@ -105,7 +107,6 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
     check_folder(Path(base.out))
     shards = open_held_out(Path(base.validation), limit=base.validation_scenes)
     check_pupils(shards, VALIDATION_PUPILS_MM)
-    key_defaults = json.loads(json.dumps(dataclasses.asdict(NetworkConfig())))
     out = Path(base.out)
     rows = []
     for name, network in networks.items():
@@ -115,18 +116,10 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
         terms = {"minutes": seconds / 60, **json.loads(json.dumps(dataclasses.asdict(config)))}
         del terms["steps"]
         if known.is_file():
-            kept = json.loads(known.read_text())["terms"]
-            # A row may be from before a key of networks was there.
-            kept["network"] = {**key_defaults, **kept["network"]}
-            other = [key for key in terms if kept.get(key) != terms[key]]
-            if other:
-                raise ConfigError(
-                    f"{known}: found a row with another {', '.join(other)}; choose another --out, "
-                    f"or delete {known.parent}"
-                )
+            _require_same_terms(known, json.loads(known.read_text())["terms"], terms)
             print(f"{name}: taken from {known}")
         else:
-            row = {"variant": name, "terms": terms, **_contest(config, seconds, device)}
+            row = {"variant": name, "terms": terms, **_contest(config, terms, device)}
             write_beside(known, (json.dumps(row, indent=1) + "\n").encode())
         rows.append(json.loads(known.read_text()))
     flat = judge_flat_oracle(shards, base.validation_border_px)
@@ -137,17 +130,41 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
     return table
 
 
-def _contest(config: TrainConfig, seconds: float, device: torch.device) -> dict[str, Any]:
-    step_seconds = seconds_per_step(config, device)
-    steps = max(1, round(seconds / step_seconds))
+def _require_same_terms(path: Path, kept: dict[str, Any], terms: dict[str, Any]) -> None:
+    """Raises ConfigError where a variant was trained, or begun, on other terms."""
+    # They may be from before a key of networks was there.
+    network = {**json.loads(json.dumps(dataclasses.asdict(NetworkConfig()))), **kept["network"]}
+    if other := [key for key in terms if {**kept, "network": network}.get(key) != terms[key]]:
+        raise ConfigError(
+            f"{path}: found a row with another {', '.join(other)}; choose another --out, or delete {path.parent}"
+        )
+
+
+def _contest(config: TrainConfig, terms: dict[str, Any], device: torch.device) -> dict[str, Any]:
+    """Trains one variant, or goes on with it where its folder has a checkpoint that was begun on the same terms, and
+    judges it."""
+    begun = Path(config.out) / BEGUN
+    has_checkpoint = begun.with_name("checkpoint.pt").is_file()
+    goes_on = has_checkpoint and begun.is_file()
+    if goes_on:
+        kept = json.loads(begun.read_text())
+        _require_same_terms(begun, kept["terms"], terms)
+    else:
+        step_seconds = seconds_per_step(config, device)
+        steps = max(1, round(60 * terms["minutes"] / step_seconds))
+        kept = {"terms": terms, "steps": steps, "step_seconds": step_seconds}
+        # A run that is none of ours is refused by `train`.
+        if not has_checkpoint:
+            write_beside(begun, (json.dumps(kept, indent=1) + "\n").encode())
+    steps = kept["steps"]
     config = dataclasses.replace(config, steps=steps, validate_every=steps, checkpoint_every=steps)
-    network = load_weights(train(config, device))
+    network = load_weights(train(config, device, resume=goes_on))
     shards = open_held_out(Path(config.validation or ""), limit=config.validation_scenes)
     return {
         "parameters": sum(p.numel() for p in network.parameters()),
         "operations_per_pixel": operations_per_pixel(config.network),
         "steps": steps,
-        "step_seconds": step_seconds,
+        "step_seconds": kept["step_seconds"],
         "seconds": read_rows(Path(config.out))[-1]["seconds"],
         "pupils": judge_held_out(network, shards, config.validation_border_px),
     }

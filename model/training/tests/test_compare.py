@@ -1,3 +1,4 @@
+import dataclasses
 import json
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from holod_training.costs import operations_per_pixel
 from holod_training.curves import plot_curves
 from holod_training.network import DirectNetwork
 from holod_training.shards import ShardError, open_shards
-from holod_training.train import TrainConfig
+from holod_training.train import Run, TrainConfig
 
 CPU = torch.device("cpu")
 
@@ -57,6 +58,40 @@ def test_variants_compete_for_the_same_time(shards: Path, tmp_path: Path, capsys
     # Rows of other terms never share a table.
     assert main([*command, "--in-focus-weight", "7"]) == 65
     assert "half-band-8/comparison.json: found a row with another loss" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_an_interrupted_variant_goes_on_from_its_checkpoint(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TrainConfig(
+        str(shards), str(tmp_path / "out"), 1, validation=str(shards), crop=32, border_px=4, validation_border_px=8
+    )
+    steps_run = []
+    train_step = Run.train_step
+
+    def step(self: Run) -> dict[str, float]:
+        if self.config.out.endswith("half-band-8") and self.config.checkpoint_every == self.config.steps:
+            steps_run.append(self.step)
+        return train_step(self)
+
+    def interrupted(self: Run) -> dict[str, dict[str, float]]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Run, "train_step", step)
+    monkeypatch.setattr("holod_training.compare.seconds_per_step", lambda config, device: 0.5)
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "validate", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            compare(config, ["half-band-8"], 1, CPU)
+    assert steps_run == [0, 1]
+    monkeypatch.setattr("holod_training.compare.seconds_per_step", lambda config, device: 0.1)
+    with pytest.raises(ConfigError, match=r"half-band-8/begun\.json: found a row with another seed; choose another"):
+        compare(dataclasses.replace(config, seed=2), ["half-band-8"], 1, CPU)
+    compare(config, ["half-band-8"], 1, CPU)
+    assert steps_run == [0, 1], "no step was run again"
+    row = json.loads((tmp_path / "out" / "half-band-8" / "comparison.json").read_text())
+    assert (row["steps"], row["step_seconds"]) == (2, 0.5) and row["pupils"]["2.0"]["psnr_db"] > 5
 
 
 def test_comparison_says_what_is_missing(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
