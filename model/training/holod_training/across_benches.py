@@ -20,11 +20,18 @@ LINE = 100
 
 
 @torch.no_grad()
-def across_benches(weights: list[Path], folders: list[Path], out: Path, border_px: int, limit: int | None) -> str:
+def across_benches(
+    weights: list[Path],
+    folders: list[Path],
+    out: Path,
+    border_px: int,
+    limit: int | None,
+    device: torch.device | str = "cpu",
+) -> str:
     """Judges every weights file on every folder's bench; writes benches.md and benches.json into `out`, and returns the
     Markdown. Raises ConfigError, ShardError, WeightsError."""
     check_folder(out)
-    networks = {path.stem: load_weights(path) for path in weights}
+    networks = {path.stem: load_weights(path).to(device) for path in weights}
     if len(networks) < len(weights):
         raise ShardError("weights: found two files of one name; give each a name of its own")
     # All folders are looked at before the long work.
@@ -32,7 +39,7 @@ def across_benches(weights: list[Path], folders: list[Path], out: Path, border_p
     for _, shards in benches:
         check_border(shards, border_px, "--border-px", SSIM_WINDOW_PX)
     judged = {
-        name: {key: _judge(key, network, shards, border_px) for key, network in networks.items()}
+        name: {key: _judge(key, network, shards, border_px, device) for key, network in networks.items()}
         for name, shards in benches
     }
     result = {
@@ -45,10 +52,10 @@ def across_benches(weights: list[Path], folders: list[Path], out: Path, border_p
     return text
 
 
-def _judge(name: str, network: FieldNetwork, shards: list[Shard], border_px: int) -> Judged:
+def _judge(name: str, network: FieldNetwork, shards: list[Shard], border_px: int, device: torch.device | str) -> Judged:
     """One network, which is called `OURS`, and the rival."""
     optics = shards[0].optics
-    bench = Bench(optics, network.config.amplitude_constant, border_px)
+    bench = Bench(optics, network.config.amplitude_constant, border_px, device)
     methods = [network_method(OURS, network.on(optics)), *(one for one in rivals(optics) if one.name == RIVAL)]
     print(f"{name}, {len(shards)} scenes", flush=True)
     return judge_scenes(shards, methods, bench)

@@ -67,9 +67,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="holod_training", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
-    def command(name: str, about: str) -> argparse.ArgumentParser:
+    def command(name: str, about: str, has_device: bool = True) -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=about, description=about)
-        sub.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
+        if has_device:
+            sub.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda"))
         sub.add_argument("--threads", type=int, default=0, help="CPU threads; 0 leaves torch's own choice")
         return sub
 
@@ -141,7 +142,7 @@ def _parser() -> argparse.ArgumentParser:
     eyebox.add_argument("--limit", type=int, help="only so many scenes")
     eyebox.set_defaults(run=_eyebox)
 
-    export = command("export", "Writes a weights file from a checkpoint or another weights file")
+    export = command("export", "Writes a weights file from a checkpoint or another weights file", has_device=False)
     export.add_argument(
         "--source", required=True, help="checkpoint.pt of a run (its averaged weights) or a weights file"
     )
@@ -153,14 +154,15 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--benches-method", default="", help="whose rows of it; the name of --out where left out")
     export.set_defaults(run=_export)
 
-    mean = command("average", "Writes the weighted mean of weights files that went on from the same weights")
+    about = "Writes the weighted mean of weights files that went on from the same weights"
+    mean = command("average", about, has_device=False)
     mean.add_argument(
         "--weights", nargs=2, action="append", required=True, metavar=("FILE", "SHARE"), help="more than once; sum 1"
     )
     mean.add_argument("--out", required=True)
     mean.set_defaults(run=_average)
 
-    golden = command("golden", "Writes the golden vectors that the engines are tested against")
+    golden = command("golden", "Writes the golden vectors that the engines are tested against", has_device=False)
     golden.add_argument("--out", required=True, help="folder, model/golden")
     golden.add_argument("--weights", help="the shipped standard weights, for vectors of them too")
     golden.add_argument("--small-weights", help="the shipped small weights, likewise")
@@ -315,7 +317,8 @@ def _evaluate(options: argparse.Namespace) -> None:
 def _eyebox(options: argparse.Namespace) -> None:
     from holod_training.eyebox import write_eyebox
 
-    print(write_eyebox(Path(options.weights), Path(options.test), Path(options.out), options.limit), end="")
+    weights, test, out = Path(options.weights), Path(options.test), Path(options.out)
+    print(write_eyebox(weights, test, out, options.limit, choose_device(options.device)), end="")
 
 
 def _export(options: argparse.Namespace) -> None:
@@ -369,7 +372,8 @@ def _across_benches(options: argparse.Namespace) -> None:
     from holod_training.across_benches import across_benches
 
     weights, folders = ([Path(path) for path in paths] for paths in (options.weights, options.test))
-    print(across_benches(weights, folders, Path(options.out), options.border_px, options.limit))
+    device = choose_device(options.device)
+    print(across_benches(weights, folders, Path(options.out), options.border_px, options.limit, device))
 
 
 def _bench_engines(options: argparse.Namespace) -> None:

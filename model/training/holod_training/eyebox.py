@@ -58,7 +58,7 @@ def random_phase(stack: Stack, optics: OpticsConfig, seed: int) -> Tensor:
     """The layered field of a surface that scatters: independent uniform phase at every pixel, half band."""
     generator = torch.Generator().manual_seed(seed)
     angle = 2 * math.pi * torch.rand(stack.amplitude.shape, generator=generator)
-    return layered_asm(torch.polar(stack.amplitude, angle), stack.depth, optics)
+    return layered_asm(torch.polar(stack.amplitude, angle.to(stack.depth.device)), stack.depth, optics)
 
 
 def share_inside(spectrum: Tensor, optics: OpticsConfig, fx: Tensor, fy: Tensor) -> list[float]:
@@ -98,11 +98,11 @@ def study(stacks: list[Stack], methods: dict[str, Callable[[Stack], Tensor]], op
     light: dict[tuple[str, float], list[list[float]]] = {}
     alike: dict[tuple[str, float], list[list[float]]] = {}
     for stack in tqdm(stacks, unit="scene", disable=None):
-        height, width = stack.depth.shape
-        fy, fx = frequencies(height, optics.pitch_m), frequencies(width, optics.pitch_m)
+        (height, width), device = stack.depth.shape, stack.depth.device
+        fy, fx = frequencies(height, optics.pitch_m, device), frequencies(width, optics.pitch_m, device)
         kernel = transfer(optics, fx, fy, [optics.distance_m(optics.dioptres(0.5))])[0].to(torch.complex64)
         for name, field_of in methods.items():
-            spectrum = torch.fft.fft2(field_of(stack)) * half_band_mask(height, width)
+            spectrum = torch.fft.fft2(field_of(stack)) * half_band_mask(height, width, device)
             inside[name].append(share_inside(spectrum, optics, fx, fy))
             for pupil_mm in PUPILS_MM:
                 pictures = [
@@ -126,17 +126,17 @@ def study(stacks: list[Stack], methods: dict[str, Callable[[Stack], Tensor]], op
 
 
 @torch.no_grad()
-def write_eyebox(weights: Path, test: Path, out: Path, limit: int | None) -> str:
+def write_eyebox(weights: Path, test: Path, out: Path, limit: int | None, device: torch.device | str = "cpu") -> str:
     """Writes eyebox.md, eyebox.json and eyebox.png into `out`; returns the Markdown.
 
     Raises ConfigError, WeightsError, ShardError.
     """
     check_folder(out)
-    network = load_weights(weights)
+    network = load_weights(weights).to(device)
     shards = open_test(test, limit)
     check_border(shards, BORDER_PX)
     optics = network.on(shards[0].optics).optics
-    stacks = [shard.read(0) for shard in shards]
+    stacks = [shard.read(0).to(device) for shard in shards]
     methods: dict[str, Callable[[Stack], Tensor]] = {
         NETWORK: lambda stack: network_field(network, stack, NETWORK_PUPIL_MM),
         ALL_IN_FOCUS: lambda stack: all_in_focus(stack.amplitude, stack.depth, optics),

@@ -26,7 +26,7 @@ from holod_training.loss import LossWeights
 from holod_training.network import DirectNetwork
 from holod_training.optics import HalfBandEye
 from holod_training.sampling import AugmentConfig
-from holod_training.shards import ShardError
+from holod_training.shards import ShardError, Stack
 from holod_training.train import Run, TrainConfig, TrainingError, see, train
 from holod_training.variants import build_network, variant
 
@@ -575,6 +575,36 @@ def test_a_gpu_that_is_not_there_is_refused(
     assert main(command) == 65
     assert "error: --device: found 'cuda', expected cpu or auto: PyTorch finds no GPU" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+def test_a_device_is_offered_where_it_is_used(
+    shards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_weights(tmp_path / "w.safetensors", DirectNetwork(TINY), {}, {})
+    judged = ["--weights", str(tmp_path / "w.safetensors"), "--test", str(shards), "--limit", "1"]
+    seen: list[torch.device] = []
+
+    def blur(amplitude: torch.Tensor, *_: object) -> None:
+        seen.append(amplitude.device)
+        raise ShardError("seen")
+
+    def study(stacks: list[Stack], *_: object) -> None:
+        seen.append(stacks[0].depth.device)
+        raise ShardError("seen")
+
+    monkeypatch.setattr("holod_training.judging.rgbd_blur", blur)
+    monkeypatch.setattr("holod_training.eyebox.study", study)
+    # A device that needs no machine: it has shapes and no values.
+    monkeypatch.setattr(cli, "choose_device", lambda name: torch.device("meta" if name == "cuda" else name))
+    for command in ("across-benches", "eyebox"):
+        for device in ("cpu", "cuda"):
+            assert main([command, *judged, "--out", str(tmp_path / command), "--device", device]) == 65
+            assert capsys.readouterr().err == "error: seen\n"
+    assert [device.type for device in seen] == ["cpu", "meta", "cpu", "meta"]
+    for command in ("export", "average", "golden"):
+        with pytest.raises(SystemExit):
+            main([command, "--device", "cpu"])
+        assert "--device" not in capsys.readouterr().err.split("error:")[0]
 
 
 def test_programs_are_told_of_what_has_no_option(shards: Path, tmp_path: Path) -> None:
