@@ -208,7 +208,8 @@ def _training_options(sub: argparse.ArgumentParser) -> None:
         "--double-phase",
         type=float,
         metavar="K",
-        help="the loss is of what a panel shows after double phase with this amplitude constant, not of the field",
+        help="the loss is of what a panel shows after double phase with this amplitude constant, not of the field; the "
+        "weights keep it",
     )
     sub.add_argument("--teacher", help="weights file whose pictures the loss compares too")
     _lpips_options(sub, "adds LPIPS to the loss")
@@ -267,7 +268,10 @@ def _train_config(options: argparse.Namespace, **changes: Any) -> TrainConfig:
         **{key: value for key, value in ranges.items() if value is not None},
     )
     benches = BenchDraw(trained) if options.benches == "any" else None
-    return dataclasses.replace(config, benches=benches, network=dataclasses.replace(config.network, trained=trained))
+    network = dataclasses.replace(config.network, trained=trained)
+    if config.double_phase:
+        network = dataclasses.replace(network, amplitude_constant=config.double_phase)
+    return dataclasses.replace(config, benches=benches, network=network)
 
 
 def _compare(options: argparse.Namespace) -> None:

@@ -111,7 +111,8 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
     rows = []
     for name, network in networks.items():
         known = out / name / "comparison.json"
-        network = dataclasses.replace(network, trained=base.network.trained)
+        judged_with = {key: getattr(base.network, key) for key in ("trained", "amplitude_constant")}
+        network = dataclasses.replace(network, **judged_with)
         config = dataclasses.replace(base, network=network, out=str(out / name), stop_below_slope=NO_STOP)
         terms = {"minutes": seconds / 60, **json.loads(json.dumps(dataclasses.asdict(config)))}
         del terms["steps"]

@@ -11,7 +11,14 @@ import torch
 
 from holod_training.costs import network_cost, time_methods
 from holod_training.evaluate_config import EvaluateConfig
-from holod_training.export import WeightsError, check_folder, load_weights, read_metadata, write_beside
+from holod_training.export import (
+    WeightsError,
+    check_folder,
+    load_weights,
+    read_metadata,
+    weights_sha256,
+    write_beside,
+)
 from holod_training.judging import (
     ASKED,
     BETWEEN,
@@ -109,7 +116,9 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
         "pupil_mm": shards[0].pupils_mm[timed],
         "rows": time_methods(methods, bench.read(shards[0], timed), config.timing_calls),
     }
-    result["networks"] = [{"method": name, **network_cost(one)} for name, one in networks.items()]
+    result["networks"] = [
+        {"method": name, **network_cost(one), "weights_sha256": weights_sha256(one)} for name, one in networks.items()
+    ]
     result["offsets"] = offset_statistics(network, shards, bench)
     if config.focus_curve_weights and config.solver_scenes:
         scenes = shards[: config.solver_scenes]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
+import math
 import os
 import pickle
 from pathlib import Path
@@ -95,6 +97,15 @@ def load_weights(path: Path) -> FieldNetwork:
     return network.eval()
 
 
+def weights_sha256(network: FieldNetwork) -> str:
+    """What tells weights from others, whatever file they are in."""
+    digest = hashlib.sha256()
+    for name, value in sorted(network.state_dict().items()):
+        digest.update(f"{name} {list(value.shape)}\n".encode())
+        digest.update(value.detach().float().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
+
+
 def check_engines_run(config: NetworkConfig, source: Path) -> None:
     """Raises WeightsError for a network of a family that no engine runs."""
     if config.architecture not in ENGINE_ARCHITECTURES:
@@ -139,7 +150,7 @@ def export(
             raise WeightsError(f"amplitude constant: found {amplitude_constant}, expected a number above 0")
         network.config = dataclasses.replace(network.config, amplitude_constant=amplitude_constant)
     if evaluation:
-        metrics = _summary(evaluation, method)
+        metrics = _summary(evaluation, method, network)
     if benches:
         metrics = {**metrics, "benches": _of_benches(benches, benches_method or out.stem)}
     save_weights(out, network, metrics, provenance)
@@ -158,8 +169,9 @@ def _from_checkpoint(source: Path) -> tuple[FieldNetwork, dict[str, Any], dict[s
     return network, {}, provenance
 
 
-def _summary(evaluation: Path, method: str) -> dict[str, Any]:
-    """The rows and refocus ratios of one method of an evaluation.json, and the matrix, which it has of `holod` only."""
+def _summary(evaluation: Path, method: str, network: FieldNetwork) -> dict[str, Any]:
+    """The rows and refocus ratios of one method of an evaluation.json, and the matrix, which it has of `holod` only.
+    Raises WeightsError where they are of another network or amplitude constant than `network`'s."""
     try:
         result = json.loads(evaluation.read_text())
         found = {
@@ -170,9 +182,30 @@ def _summary(evaluation: Path, method: str) -> dict[str, Any]:
         if not found["rows"]:
             there = ", ".join(sorted({row["method"] for row in result["rows"]}))
             raise WeightsError(f"{evaluation}: no method {method!r}; found {there}")
+        _require_judged(evaluation, result, method, network)
         return {**found, "matrix_psnr_db": result["matrix_psnr_db"]} if method == "holod" else found
     except (OSError, json.JSONDecodeError, KeyError) as error:
         raise WeightsError(f"{evaluation}: not an evaluation ({error})") from error
+
+
+def _require_judged(evaluation: Path, result: dict[str, Any], method: str, network: FieldNetwork) -> None:
+    """Raises WeightsError for figures that are not `network`'s. Older evaluations tell weights by their count alone."""
+    judged = {row["method"]: row for row in result["networks"]}
+    if method not in judged:
+        raise WeightsError(f"{evaluation}: {method!r} is no network; expected one of {', '.join(judged)}")
+    expected = {"parameters": sum(p.numel() for p in network.parameters()), "weights_sha256": weights_sha256(network)}
+    for key, value in expected.items():
+        if judged[method].get(key, value) != value:
+            raise WeightsError(
+                f"{evaluation}: {key} of {method!r}: found {judged[method][key]}, expected {value}, that of --source: "
+                "evaluate the weights that are exported"
+            )
+    found, constant = result["amplitude_constant"], network.config.amplitude_constant
+    if not math.isclose(found, constant):
+        raise WeightsError(
+            f"{evaluation}: amplitude_constant: found {found:g}, expected {constant:g}, that of the file to write: "
+            "evaluate what `export --amplitude-constant` writes, and export that again with --evaluation"
+        )
 
 
 def _of_benches(benches: Path, method: str) -> list[dict[str, Any]]:

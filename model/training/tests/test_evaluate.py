@@ -381,21 +381,43 @@ def test_cards_and_marks_are_no_test_scenes(kind: str, tmp_path: Path, evaluatio
     assert not (tmp_path / "out").exists()
 
 
-def test_export_stamps_the_constant_and_the_evaluation(evaluation: Path) -> None:
+def test_export_stamps_the_constant_and_the_evaluation(
+    evaluation: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = evaluation / "shipped.safetensors"
     arguments = ["--source", str(evaluation / "w.safetensors"), "--out", str(out), "--amplitude-constant", "1.25"]
-    assert main(["export", *arguments, "--evaluation", str(evaluation / "out" / "evaluation.json")]) == 0
+    assert main(["export", *arguments]) == 0
     metadata = read_metadata(out)
-    assert metadata["config"].amplitude_constant == 1.25
+    assert metadata["config"].amplitude_constant == 1.25 and metadata["metrics"] == {}
+    # What was judged at another constant, or is of other weights, is none of its figures.
+    judged = ["--evaluation", str(evaluation / "out" / "evaluation.json")]
+    capsys.readouterr()
+    assert main(["export", *arguments, *judged]) == 65
+    assert "amplitude_constant: found 1.4, expected 1.25, that of the file to write" in capsys.readouterr().err
+    network = load_weights(evaluation / "w.safetensors")
+    with torch.no_grad():
+        next(network.parameters())[0] += 1e-6
+    save_weights(tmp_path / "near.safetensors", network, {}, {})
+    for source, key in (
+        (tmp_path / "near.safetensors", "weights_sha256"),
+        (evaluation / "deeper.safetensors", "param"),
+    ):
+        assert main(["export", "--source", str(source), "--out", str(tmp_path / "x.safetensors"), *judged]) == 65
+        assert f"evaluation.json: {key}" in capsys.readouterr().err
+    assert not (tmp_path / "x.safetensors").exists()
+    arguments = [*arguments[:4], *judged]
+    assert main(["export", *arguments]) == 0
+    metadata = read_metadata(out)
     assert {row["method"] for row in metadata["metrics"]["rows"]} == {"holod"}
     assert metadata["provenance"] == {"seed": 1}
     before, after = load_weights(evaluation / "w.safetensors").state_dict(), load_weights(out).state_dict()
     assert all(torch.equal(before[name], after[name]) for name in before)
     assert main(["export", *arguments[:4], "--amplitude-constant", "0"]) == 65
-    judged = ["--evaluation", str(evaluation / "out" / "evaluation.json"), "--evaluation-method"]
-    assert main(["export", *arguments, *judged, "layered ASM"]) == 0
+    for method in ("layered ASM", "nobody"):
+        assert main(["export", *arguments, "--evaluation-method", method]) == 65
+    also = ["--source", str(evaluation / "deeper.safetensors"), "--out", str(out), *judged]
+    assert main(["export", *also, "--evaluation-method", "deeper"]) == 0
     assert "matrix_psnr_db" not in read_metadata(out)["metrics"]
-    assert main(["export", *arguments, *judged, "nobody"]) == 65
 
 
 @pytest.mark.parametrize(

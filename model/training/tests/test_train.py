@@ -392,6 +392,7 @@ def test_options_change_the_variant_that_they_name() -> None:
     assert benches("--benches", "any").network.trained == ANY_BENCH == BenchDraw().trained
     wide = benches("--benches", "any", "--volume-fresnel-px2", "150,400")
     assert wide.network.trained == TrainedRange((5.0, 115.0), (150.0, 400.0)) == (wide.benches or BenchDraw()).trained
+    assert benches("--double-phase", "1.25").network.amplitude_constant == 1.25
     assert benches("--volume-blur-px", "20,250").network.trained.volume_blur_px == (20.0, 250.0)
     with pytest.raises(ConfigError, match=r"trained\.volume_blur_px: found \[20\.0\], expected two above 0"):
         benches("--volume-blur-px", "20")
