@@ -172,6 +172,7 @@ def markdown(found: Study, optics: OpticsConfig, scenes: int, weights: str) -> s
         "# The eyebox, and why the hologram must know the pupil",
         "",
         f"Written by `python -m holod_training eyebox`, {scenes} held-out scenes, {weights}; means over scenes.",
+        f"The network's holograms are all made for a pupil of {NETWORK_PUPIL_MM:g} mm, whichever looks.",
         "",
         "A wave of spatial frequency ν leaves the eyepiece through the point λ·f·ν of the pupil's plane. The panel's",
         f"pixels repeat that plane every λ·f/pitch = {orders[0]:.2f} / {orders[1]:.2f} / {orders[2]:.2f} mm (red, "

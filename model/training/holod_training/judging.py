@@ -48,12 +48,13 @@ MOST_AMPLITUDES = 2**16
 class Method:
     """One way to make a hologram: (scene, given pupil) -> complex field [3, H, W] at the SLM plane, half band; or
     [N, 3, H, W], N frames whose intensities the eye averages. `adapts`: whether the field depends on the pupil.
-    `scenes`: only the first so many, where it is slow."""
+    `scenes`: only the first so many, where it is slow. `takes_stack`: it is given what its pupil sees."""
 
     name: str
     field: Callable[[Stack, float], Tensor]
     adapts: bool = False
     scenes: int | None = None
+    takes_stack: bool = False
 
 
 def network_field(network: FieldNetwork, stack: Stack, pupil_mm: float) -> Tensor:
@@ -64,7 +65,8 @@ def network_field(network: FieldNetwork, stack: Stack, pupil_mm: float) -> Tenso
 
 
 def network_method(name: str, network: FieldNetwork) -> Method:
-    return Method(name, lambda stack, pupil: network_field(network, stack, pupil), adapts=True)
+    takes_stack = network.config.architecture == "focal-stack"
+    return Method(name, lambda stack, pupil: network_field(network, stack, pupil), adapts=True, takes_stack=takes_stack)
 
 
 def rivals(optics: OpticsConfig) -> list[Method]:

@@ -47,10 +47,12 @@ def card_areas(depth: Tensor, border_px: int) -> dict[str, Tensor]:
 
 def refocus_cards(shards: list[Shard], methods: list[Method], bench: Bench, sheet: Path) -> list[dict[str, Any]]:
     """The ratio of every method that does not need a target, after double phase, at s = 1 to 5, means over the scenes
-    of each contrast; and a sheet of ours."""
+    of each contrast; and a sheet of ours. Methods that are given focal stacks are judged at the pupils that all cards
+    have these for."""
     rows = []
     pictures = []
     focus = cards_dpt(bench.optics)
+    of_all = [pupil for pupil in PUPILS_MM if all(pupil in shard.pupils_mm for shard in shards)]
     for shard in shards:
         stack = bench.read(shard, 0)
         areas = card_areas(stack.depth, bench.border_px)
@@ -60,7 +62,7 @@ def refocus_cards(shards: list[Shard], methods: list[Method], bench: Bench, shee
         line = [stack.image]
         for method in methods:
             panel = None
-            for pupil in PUPILS_MM:
+            for pupil in of_all if method.takes_stack else PUPILS_MM:
                 if panel is None or method.adapts:
                     given = shard.pupils_mm.index(pupil) if pupil in shard.pupils_mm else 0
                     panel, _ = bench.panel(method.field(bench.read(shard, given), pupil))

@@ -125,8 +125,8 @@ def _refocus(result: dict[str, Any]) -> list[str]:
     by_key = {(row["method"], row["contrast"], row["pupil_mm"]): row for row in rows}
     for method, contrast in dict.fromkeys((row["method"], row["contrast"]) for row in rows):
         for card in ("near", "far"):
-            found = [by_key[method, contrast, p][f"{card}_card"] for p in pupils]
-            lines.append(_line([method, contrast, card, *(f"{v:.2f}" for v in found)]))
+            found = [by_key.get((method, contrast, p), {}).get(f"{card}_card") for p in pupils]
+            lines.append(_line([method, contrast, card, *("-" if v is None else f"{v:.2f}" for v in found)]))
     return lines
 
 

@@ -21,13 +21,13 @@ from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.export import load_weights, read_metadata, save_weights
 from holod_training.goals import ReportError, checks, row_of
 from holod_training.intervals import interval_95
-from holod_training.judging import Bench, rivals
+from holod_training.judging import Bench, Method, rivals
 from holod_training.lpips import Lpips
 from holod_training.network import DirectNetwork
 from holod_training.optics import coc_px, intensity, propagate
 from holod_training.plots import on_all_scenes
 from holod_training.refocus import card_areas, refocus_cards
-from holod_training.report import markdown
+from holod_training.report import _refocus, markdown
 from holod_training.rivals import (
     all_in_focus,
     flat_oracle,
@@ -468,6 +468,24 @@ def test_cards_of_one_contrast_have_one_row_for_each_pupil(tmp_path: Path) -> No
     key = ("dark on bright", 2.0)
     assert one[key]["near_card"] != other[key]["near_card"] and found[key]["scenes"] == 2
     assert found[key]["near_card"] == pytest.approx((one[key]["near_card"] + other[key]["near_card"]) / 2)
+
+
+def test_a_method_that_is_given_stacks_is_judged_at_the_cards_own_pupils(tmp_path: Path) -> None:
+    """The images that another pupil sees are none of its."""
+    write_card(tmp_path / "scene_000000.safetensors", seed=0)
+    given: list[tuple[float, float]] = []
+
+    def field(stack: Stack, pupil_mm: float) -> torch.Tensor:
+        given.append((stack.pupil_mm, pupil_mm))
+        return all_in_focus(stack.amplitude, stack.depth, OPTICS)
+
+    methods = [Method("stacks", field, adapts=True, takes_stack=True), rivals(OPTICS)[0]]
+    rows = refocus_cards(
+        [Shard(tmp_path / "scene_000000.safetensors")], methods, Bench(OPTICS, 1.25, 8), tmp_path / "sheet.png"
+    )
+    assert given == [(1.0, 1.0), (2.0, 2.0)] and len(rows) == 2 + 5
+    (line,) = [line for line in _refocus({"refocus": rows}) if line.startswith("| stacks | dark on bright | near |")]
+    assert line.endswith(" | - | - | - |")
 
 
 def test_cards_are_judged_on_a_bench_with_another_depth_range(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

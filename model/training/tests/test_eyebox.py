@@ -77,7 +77,8 @@ def test_the_command_writes_page_record_and_plot(tmp_path: Path, capsys: pytest.
     )
     arguments = ["--weights", str(tmp_path / "w.safetensors"), "--test", str(tmp_path / "shards")]
     assert main(["eyebox", *arguments, "--out", str(tmp_path / "out")]) == 0
-    assert "| layered, random phase |" in capsys.readouterr().out
+    page = capsys.readouterr().out
+    assert "| layered, random phase |" in page and "all made for a pupil of 3 mm, whichever looks" in page
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"eyebox.md", "eyebox.json", "eyebox.png"}
     assert main(["eyebox", *arguments[:2], "--test", str(tmp_path / "none"), "--out", str(tmp_path / "out")]) == 65
     capsys.readouterr()
