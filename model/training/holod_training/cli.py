@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +31,7 @@ from holod_training.train import PRECISIONS, TrainConfig, TrainingError, train
 from holod_training.variants import DEFAULT_VARIANT, VARIANTS, variant
 
 EX_DATAERR = 65
+EX_INTERRUPTED = 128 + signal.SIGINT
 SOLVER_STARTS = {"network": OURS, "layered-asm": LAYERED_ASM}
 
 
@@ -60,6 +62,9 @@ def main(arguments: list[str] | None = None) -> int:
         named = f"{error.filename2 or error.filename}: " if error.filename else ""
         print(f"error: {named}{error.strerror or error}", file=sys.stderr)
         return EX_DATAERR
+    except KeyboardInterrupt as interrupt:
+        print(f"interrupted{f': {interrupt}' if str(interrupt) else ''}", file=sys.stderr)
+        return EX_INTERRUPTED
     return 0
 
 

@@ -9,8 +9,12 @@ import json
 import math
 import os
 import platform
+import signal
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -478,20 +482,52 @@ class Run:
         }
 
 
+class Interrupt:
+    """Whether somebody pressed Ctrl-C."""
+
+    def __init__(self) -> None:
+        self.came = False
+
+    @contextmanager
+    def heeded(self) -> Iterator[None]:
+        """Keeps the first one for the end of the step; the next ends the run at once, as ever. Of several processes,
+        which would stop at different steps, and outside the main thread each does."""
+        if int(os.environ.get("WORLD_SIZE", "1")) > 1 or threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        before = signal.getsignal(signal.SIGINT)
+
+        def come(number: int, frame: object) -> None:
+            self.came = True
+            signal.signal(signal.SIGINT, before)
+            print("ends after this step; Ctrl-C again ends at once", file=sys.stderr)
+
+        signal.signal(signal.SIGINT, come)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+
 def train(config: TrainConfig, device: torch.device, resume: bool = False) -> Path:
-    """Runs to the last step and returns the weights file. Raises TrainingError, ShardError, WeightsError."""
+    """Runs to the last step and returns the weights file. Raises TrainingError, ShardError, WeightsError, and
+    KeyboardInterrupt after a step with its checkpoint."""
     world = int(os.environ.get("WORLD_SIZE", "1"))
     rank = int(os.environ.get("RANK", "0"))
     if world > 1 and not dist.is_initialized():
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    interrupt = Interrupt()
     try:
-        return _train(config, device, resume, rank, world)
+        with interrupt.heeded():
+            return _train(config, device, resume, rank, world, interrupt)
     finally:
         if world > 1:
             dist.destroy_process_group()
 
 
-def _train(config: TrainConfig, device: torch.device, resume: bool, rank: int, world: int) -> Path:
+def _train(
+    config: TrainConfig, device: torch.device, resume: bool, rank: int, world: int, interrupt: Interrupt
+) -> Path:
     out = Path(config.out)
     check_folder(out)
     run = Run(config, device, rank, world)
@@ -532,12 +568,14 @@ def _train(config: TrainConfig, device: torch.device, resume: bool, rank: int, w
             log.write("train", run, {**means, "shards": len(run.sampler.shards)})
             progress.set_postfix(loss=f"{means['loss']:.4f}", slope=f"{means['slope']:.3f}")
             window.clear()
-        if run.step % config.checkpoint_every == 0 or done:
+        if run.step % config.checkpoint_every == 0 or done or interrupt.came:
             # Every rank meets here, so that none runs ahead of the files.
             if rank == 0:
                 run.save_checkpoint()
             if world > 1:
                 dist.barrier()
+        if interrupt.came and not done:
+            raise KeyboardInterrupt(f"{checkpoint} is of step {run.step}: go on with --resume")
         if log and (run.step % config.validate_every == 0 or done):
             _validate(run, log, weights)
     progress.close()

@@ -2,6 +2,7 @@ import dataclasses
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -698,6 +699,33 @@ def test_weights_of_an_earlier_step_are_not_taken_for_those_of_the_last(
     whole = load_file(train(dataclasses.replace(config, out=str(tmp_path / "whole")), CPU))
     assert all(torch.equal(value, load_file(old)[name]) for name, value in whole.items())
     assert rows_of(tmp_path / "run") == rows_of(tmp_path / "whole"), "validation of the last step has one row"
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_an_interrupt_leaves_a_checkpoint_and_no_traceback(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ctrl-C within a step counts at its end; what is resumed then is the run that was never interrupted."""
+    command = ["train", "--shards", str(shards), "--steps", "5", "--crop", "32", "--border-px", "4", "--device", "cpu"]
+    command += ["--variant", "half-band-8", "--channels", "4", "--layers", "4", "--out"]
+    assert main([*command, str(tmp_path / "whole")]) == 0
+    original = Run.train_step
+
+    def step(self: Run) -> dict[str, float]:
+        if self.step == 2:
+            signal.raise_signal(signal.SIGINT)
+        return original(self)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Run, "train_step", step)
+        capsys.readouterr()
+        assert main([*command, str(tmp_path / "cut")]) == 130
+    said = capsys.readouterr().err
+    assert "interrupted: " in said and "checkpoint.pt is of step 3: go on with --resume" in said
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert main([*command, str(tmp_path / "cut"), "--resume"]) == 0
+    whole, cut = (load_file(tmp_path / name / "weights.safetensors") for name in ("whole", "cut"))
+    assert all(torch.equal(value, cut[name]) for name, value in whole.items())
 
 
 def test_an_out_that_is_no_folder_is_refused_before_the_work(
