@@ -183,7 +183,7 @@ fn scenes_of_the_renderer_are_judged_told_and_written() {
     }
     assert_eq!(printed["refocus"], Value::Array(Vec::new()));
 
-    let one: Value = serde_json::from_str(&with(&["--json", "--limit", "1", "--pupil", "4"])).unwrap();
+    let one: Value = serde_json::from_str(&with(&["--json", "--limit", "1", "--pupil", "4", "--pupil", "4"])).unwrap();
     assert_eq!((one["rows"].as_array().unwrap().len(), &one["rows"][0]["pupil_mm"]), (1, &4.0.into()));
     assert_eq!((&one["scenes"], &one["rows"][0]["psnr_db"]["ci95_half_width"]), (&1.into(), &Value::Null));
 

@@ -330,18 +330,27 @@ fn refuse_special(shard: &SceneShard) -> Result<(), Failure> {
     }
 }
 
-/// The pupils that were asked for, or those of the first scene.
+/// The pupils that were asked for, or those of the first scene, each once.
 fn judged_pupils(shards: &[SceneShard], asked: &[PupilDiameter]) -> Result<Vec<PupilDiameter>, Failure> {
-    let pupils = if asked.is_empty() { shards[0].pupils().to_vec() } else { asked.to_vec() };
+    let mut pupils = Vec::<PupilDiameter>::new();
+    for &pupil in if asked.is_empty() { shards[0].pupils() } else { asked } {
+        if pupils.iter().all(|known| !is_same(*known, pupil)) {
+            pupils.push(pupil);
+        }
+    }
     shards.iter().try_for_each(|shard| pupil_indices(shard, &pupils).map(drop))?;
     Ok(pupils)
+}
+
+fn is_same(one: PupilDiameter, other: PupilDiameter) -> bool {
+    (one.mm() - other.mm()).abs() < 1e-4
 }
 
 /// Where a scene's stacks for `pupils` are.
 fn pupil_indices(shard: &SceneShard, pupils: &[PupilDiameter]) -> Result<Vec<usize>, Failure> {
     let there = shard.pupils();
     let position = |wanted: &PupilDiameter| {
-        there.iter().position(|pupil| (pupil.mm() - wanted.mm()).abs() < 1e-4).ok_or_else(|| {
+        there.iter().position(|pupil| is_same(*pupil, *wanted)).ok_or_else(|| {
             let there_mm: Vec<f32> = there.iter().map(|pupil| pupil.mm()).collect();
             let said = format!(
                 "{}: found stacks for pupils of {there_mm:?} mm; expected one for {} mm in every scene: write the \
