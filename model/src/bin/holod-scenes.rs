@@ -1,7 +1,7 @@
 //! Writes random scenes with their thin-lens focal stacks, for training and judging a network.
 
 use std::fs;
-use std::io::Write;
+use std::io::{Cursor, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::thread;
@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::rig::{Rig, RigError};
-use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution, Sorted, hangup_is_ignored};
+use holod_calibration::{DisplayGeometry, PupilDiameter, Resolution, Sorted, hangup_is_ignored, write_atomically};
 use holod_model::gpu::GpuError;
 use holod_model::scene::FocalStack;
 use holod_model::scene_renderer::shard::{
@@ -158,8 +158,11 @@ struct Sheet {
     /// Folder of scenes.
     folder: PathBuf,
     /// PNG file to write.
-    #[arg(long)]
+    #[arg(long, value_parser = png)]
     out: PathBuf,
+    /// Overwrite what is there already.
+    #[arg(long)]
+    force: bool,
     /// Scenes to show, the first of the folder.
     #[arg(long, default_value_t = 12, value_parser = clap::value_parser!(u16).range(1..=400))]
     scenes: u16,
@@ -205,6 +208,14 @@ fn even_size(text: &str) -> Result<Resolution, String> {
     };
     let (width, height) = text.split_once('x').unwrap_or((text, text));
     Ok(Resolution { width: length(width)?, height: length(height)? })
+}
+
+fn png(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    match path.extension() {
+        Some(extension) if extension.eq_ignore_ascii_case("png") => Ok(path),
+        _ => Err("expected the name of a PNG file, FILE.png".to_owned()),
+    }
 }
 
 #[derive(Clone, Copy)]
@@ -452,6 +463,11 @@ fn noise(options: &Measure) -> Result<String, Failure> {
 }
 
 fn sheet(options: &Sheet) -> Result<String, Failure> {
+    if !options.force && options.out.symlink_metadata().is_ok() {
+        let message =
+            format!("--out: found {}; name another file, or overwrite it with --force", options.out.display());
+        return Err(Failure { code: exit::CANNOT_CREATE, message });
+    }
     let unreadable = |error: std::io::Error| Failure {
         code: exit::NO_INPUT,
         message: format!("cannot read the folder {}: {error}", options.folder.display()),
@@ -510,13 +526,12 @@ fn contact_sheet(previews: &[Preview]) -> image::RgbImage {
     sheet
 }
 
-/// Writes beside and renames.
 fn save_png(picture: &image::RgbImage, path: &Path) -> Result<(), Failure> {
-    let beside = path.with_extension("png.partial");
+    let mut bytes = Cursor::new(Vec::new());
     picture
-        .save_with_format(&beside, image::ImageFormat::Png)
+        .write_to(&mut bytes, image::ImageFormat::Png)
         .map_err(|error| error.to_string())
-        .and_then(|()| fs::rename(&beside, path).map_err(|error| error.to_string()))
+        .and_then(|()| write_atomically(path, |out| out.write_all(bytes.get_ref())).map_err(|error| error.to_string()))
         .map_err(|reason| Failure {
             code: exit::CANNOT_CREATE,
             message: format!("cannot write {}: {reason}", path.display()),

@@ -501,6 +501,12 @@ impl Header {
         };
         Ok(Some(Self { metadata, resolution, start }))
     }
+
+    /// Which of the shard's pupils is the widest; nothing where it does not say.
+    fn widest_pupil(&self) -> Option<usize> {
+        let pupils_mm: Vec<f32> = serde_json::from_str(self.metadata.metadata().as_ref()?.get("pupils_mm")?).ok()?;
+        (0..pupils_mm.len()).max_by(|&one, &other| pupils_mm[one].total_cmp(&pupils_mm[other]))
+    }
 }
 
 /// The parts of a shard that a person wants to see.
@@ -540,8 +546,7 @@ impl Preview {
             file.read_exact(&mut bytes).map_err(unreadable)?;
             Ok(bytes)
         };
-        let stacks = header.metadata.offset_keys().iter().filter(|name| name.starts_with("stack_")).count();
-        let widest = format!("stack_{}", stacks.saturating_sub(1));
+        let widest = format!("stack_{}", header.widest_pupil().unwrap_or(0));
         let pixels = resolution.pixels();
         let depth = read("depth", Dtype::F32, pixels, false)?;
         Ok(Self {

@@ -587,6 +587,17 @@ fn shards_hold_what_the_trainer_reads() {
 }
 
 #[test]
+fn a_preview_shows_the_widest_pupil_wherever_it_is_among_them() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let preview = |name: &str, pupils: [f32; 2]| {
+        let plan = ShardPlan { pupils: PupilPlan::Fixed(pupils.map(mm).to_vec()), ..small_plan() };
+        plan.write(&folder.path().join(name), 7, &Tracer::cpu()).expect("a shard");
+        Preview::read(&folder.path().join(name).join(file_name(7))).expect("a preview").focused_near
+    };
+    assert_eq!(preview("falling", [4.0, 1.0]), preview("rising", [1.0, 4.0]));
+}
+
+#[test]
 fn shards_of_random_planes_say_which_and_are_known_again() {
     let folder = tempfile::tempdir().expect("a folder");
     let plan = ShardPlan { planes: PlanePlan::Strata(3), ..small_plan() };
