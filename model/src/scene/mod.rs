@@ -4,7 +4,7 @@
 //!
 //! ```toml
 //! colour = "rgb/{:05}.png"         # 8- or 16-bit PNG, JPEG or OpenEXR; {} or {:05} is the frame's number
-//! depth = "depth/{:05}.png"        # the colour file, an OpenEXR with a Z channel, where absent
+//! depth = "depth/{:05}.png"        # where absent the colour file, which must be OpenEXR then
 //! depth_encoding = "millimetres"   # metres, millimetres, dioptres, or normalised_dioptres with far_dpt and near_dpt
 //! depth_scale = 1.0                # factor from the file's numbers to that unit; 1 where absent
 //! depth_missing = 0                # the number that means that there is no depth, where there is one
@@ -265,6 +265,13 @@ impl Scene {
             return Err(SceneError::NoSuchFrame { path: path.clone(), index, frames: *frames });
         }
         let [colour_path, depth_path] = self.pictures(index);
+        if colour_path == depth_path && !raster::is_openexr(&colour_path)? {
+            return Err(SceneError::Picture {
+                path: colour_path,
+                found: "one file for colours and depth that is not OpenEXR".into(),
+                expected: "a second file with the depth: name it (`depth` in a scene.toml, or COLOUR,DEPTH)".into(),
+            });
+        }
         let colour = raster::read_colour(&colour_path)?;
         let mut report =
             FrameReport { source: Some(colour.size), colour_clipped_px: colour.clipped_px, ..FrameReport::default() };

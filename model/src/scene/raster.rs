@@ -43,6 +43,11 @@ pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
     }
 }
 
+/// Whether a file is OpenEXR, by its first bytes.
+pub(super) fn is_openexr(path: &Path) -> Result<bool, SceneError> {
+    Ok(matches!(format_of(path)?, Format::OpenExr))
+}
+
 fn format_of(path: &Path) -> Result<Format, SceneError> {
     use std::io::Read;
     let read_error = |source| SceneError::Read { path: path.to_owned(), source, expected: FORMATS };

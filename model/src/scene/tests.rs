@@ -308,6 +308,28 @@ fn an_exrs_colours_are_those_of_one_layer_and_its_depth_is_no_vector() {
 }
 
 #[test]
+fn no_picture_but_an_openexr_one_is_its_own_depth_map() {
+    let files = Files::new();
+    files.depth16("grey.png", 4, 2, |x, _| 400 + x as u16);
+    image::open(files.path("grey.png")).unwrap().to_luma8().save(files.path("grey.jpg")).unwrap();
+    let pair = format!("{0},{0}", files.path("grey.png").display());
+    let of_pair = Scene::open(&pair, Some(DepthEncoding::Millimetres)).unwrap();
+    let named = ["colour = \"grey.png\"", "colour = \"grey.jpg\"", "colour = \"grey.png\"\ndepth = \"./grey.png\""];
+    let of_files = named.map(|names| {
+        files.describe(&format!("{names}\ndepth_encoding = \"millimetres\""));
+        files.open()
+    });
+    for scene in of_files.iter().chain([&of_pair]) {
+        let error = scene.load(0, &BENCH, None, Fit::Native).unwrap_err().to_string();
+        let said = ["grey.", "not OpenEXR", "`depth` in a scene.toml", "COLOUR,DEPTH"];
+        assert!(said.iter().all(|part| error.contains(part)), "{error}");
+    }
+    std::fs::copy(files.path("grey.png"), files.path("other.png")).unwrap();
+    files.describe("colour = \"grey.png\"\ndepth = \"other.png\"\ndepth_encoding = \"millimetres\"");
+    files.open().load(0, &BENCH, None, Fit::Native).unwrap();
+}
+
+#[test]
 fn a_sequence_has_as_many_frames_as_files() {
     let files = Files::new();
     for index in 2..5 {
