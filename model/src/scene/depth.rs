@@ -35,12 +35,13 @@ impl DepthReading {
             _ => 1.0,
         };
         let scale = self.scale.unwrap_or(default_scale);
+        // What a file of single floats can hold of it: of 0.1 or 1e30 that is another number.
+        let missing = missing.map(|number| number as f32);
         let dioptres = move |number: f32| {
-            let number = f64::from(number);
             if number.is_nan() || missing == Some(number) {
                 return f64::NAN;
             }
-            let value = number * scale;
+            let value = f64::from(number) * scale;
             let reciprocal = |length: f64| if length > 0.0 { 1.0 / length } else { f64::NAN };
             match encoding {
                 DepthEncoding::Metres => reciprocal(value),
@@ -154,6 +155,15 @@ mod tests {
         }
         assert!(read(DepthEncoding::Dioptres, None, Some(7.0), None, 7.0).is_nan());
         assert!(!read(DepthEncoding::Dioptres, None, Some(7.0), None, 7.5).is_nan());
+    }
+
+    #[test]
+    fn a_missing_number_that_single_floats_cannot_hold_is_the_nearest_that_they_can() {
+        for missing in [1e30, 0.1, 3.4028235e38, -9999.9] {
+            let read = |number| read(DepthEncoding::Metres, None, Some(missing), None, number);
+            assert!(read(missing as f32).is_nan(), "{missing}");
+            assert!(!read((missing as f32).abs() * 0.999).is_nan(), "{missing}");
+        }
     }
 
     #[test]
