@@ -55,7 +55,7 @@ pub(crate) fn read_scene<'py>(
         scene.frames(),
         scene.fps(),
         picture.report.depth_missing_px,
-        picture.report.colour_clipped_px,
+        picture.report.colour_clipped.in_all(),
     ))
 }
 

@@ -31,6 +31,8 @@ struct Report {
     clipped_share: f32,
     /// Of all images.
     colour_clipped_px: usize,
+    /// Those of them that were brighter than white.
+    colour_above_white_px: usize,
     /// Of each image.
     padded_px: usize,
     /// How the hologram was computed.
@@ -63,7 +65,7 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
         files.load(args.scene.resolution, args.scene.fit.into()).map_err(scene::failure)
     })?;
     let resolution = stack.resolution;
-    scene::warn_of_clipped_colours(&name, done.colour_clipped_px, done.source_px);
+    scene::warn_of_clipped_colours(&name, done.colour_clipped, done.source_px);
     scene::check_fits(resolution, &rig.geometry, &name)?;
     let mut engine = progress::during(&format!("preparing the network for {resolution}"), || {
         let precision = if args.backend == Backend::Cpu { Precision::Single } else { Precision::Half };
@@ -87,7 +89,8 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
         height_px: resolution.height,
         amplitude_constant,
         clipped_share,
-        colour_clipped_px: done.colour_clipped_px,
+        colour_clipped_px: done.colour_clipped.in_all(),
+        colour_above_white_px: done.colour_clipped.above_white_px,
         padded_px: done.padded_px,
         engine: format!("cpu, {}", engine.instruction_set()),
         frame_ms,

@@ -33,6 +33,8 @@ pub(super) struct Report {
     depth_clamped_far_px: usize,
     depth_clamped_near_px: usize,
     colour_clipped_px: usize,
+    /// Those of them that were brighter than white.
+    colour_above_white_px: usize,
     padded_px: usize,
     depth_least_dpt: f64,
     depth_greatest_dpt: f64,
@@ -152,7 +154,8 @@ pub(super) fn compute(
         depth_missing_px: done.depth_missing_px,
         depth_clamped_far_px: done.depth_clamped_far_px,
         depth_clamped_near_px: done.depth_clamped_near_px,
-        colour_clipped_px: done.colour_clipped_px,
+        colour_clipped_px: done.colour_clipped.in_all(),
+        colour_above_white_px: done.colour_clipped.above_white_px,
         padded_px: done.padded_px,
         depth_least_dpt: depth_at(f32::MAX, f32::min),
         depth_greatest_dpt: depth_at(f32::MIN, f32::max),

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use holod_calibration::{DisplayGeometry, Resolution};
-use holod_model::scene::{DepthEncoding, FrameReport, Scene, SceneError};
+use holod_model::scene::{ClippedColours, DepthEncoding, FrameReport, Scene, SceneError};
 use holod_model::{RgbdFrame, scene_renderer};
 
 use crate::cli::SceneArgs;
@@ -137,18 +137,35 @@ pub fn warn_of_oddities(name: &str, report: &FrameReport, geometry: &DisplayGeom
     if let Some(oddity) = odd_depth(source, report, geometry, is_plane) {
         tracing::warn!("{name}: {oddity}");
     }
-    warn_of_clipped_colours(name, report.colour_clipped_px, source.pixels());
+    warn_of_clipped_colours(name, report.colour_clipped, source.pixels());
 }
 
-/// Warns of colours of which most are brighter than white: most often scene-linear light that was never exposed.
-/// Both counts are of the picture as it came, before it was fitted.
-pub fn warn_of_clipped_colours(name: &str, clipped_px: usize, source_px: usize) {
-    if 2 * clipped_px > source_px {
-        tracing::warn!(
-            "{name}: {clipped_px} of {source_px} pixels are brighter than white and were clipped: scale the picture's \
-             light so that white is 1"
-        );
+/// Warns of a picture called `name` of which most pixels were clipped. All counts are of the picture as it came, before
+/// it was fitted.
+pub fn warn_of_clipped_colours(name: &str, clipped: ClippedColours, source_px: usize) {
+    for oddity in odd_colours(clipped, source_px) {
+        tracing::warn!("{name}: {oddity}");
     }
+}
+
+/// Colours of which most are above white are most often scene-linear light that was never exposed; below 0 they are
+/// those of a wider gamut.
+fn odd_colours(clipped: ClippedColours, source_px: usize) -> Vec<String> {
+    let ClippedColours { above_white_px, below_black_px } = clipped;
+    let are_most = |clipped_px: usize| 2 * clipped_px > source_px;
+    let above = are_most(above_white_px).then(|| {
+        format!(
+            "{above_white_px} of {source_px} pixels are brighter than white and were clipped: scale the picture's \
+             light so that white is 1"
+        )
+    });
+    let below = are_most(below_black_px).then(|| {
+        format!(
+            "{below_black_px} of {source_px} pixels have a colour below 0 or that is no number, which became 0: bring \
+             the picture to the primaries of sRGB, whose colours are 0 to 1"
+        )
+    });
+    above.into_iter().chain(below).collect()
 }
 
 /// Depth of which most is clamped, or that is all one, is most often a wrong encoding.
@@ -253,6 +270,15 @@ mod tests {
         let one_depth = odd_at_every_size(|_| 1000);
         let told = "all depths lie within 0.000 dpt: is the depth encoding right?";
         assert_eq!(one_depth, vec![Some(told.to_owned()); 14]);
+    }
+
+    #[test]
+    fn what_was_clipped_is_called_what_it_is() {
+        let odd = |above_white_px, below_black_px| odd_colours(ClippedColours { above_white_px, below_black_px }, 1000);
+        assert_eq!(odd(500, 500), Vec::<String>::new());
+        let [above, below] = [odd(501, 0), odd(0, 501)];
+        assert!(above.len() == 1 && above[0].starts_with("501 of 1000 pixels are brighter than white"), "{above:?}");
+        assert!(below.len() == 1 && below[0].starts_with("501 of 1000 pixels have a colour below 0"), "{below:?}");
     }
 
     #[test]

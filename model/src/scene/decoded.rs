@@ -5,8 +5,8 @@ use std::path::Path;
 use holod_calibration::Resolution;
 use image::metadata::Orientation;
 
-use super::SceneError;
 use super::depth::DepthNumbers;
+use super::{ClippedColours, SceneError};
 
 /// More pixels than an 8K frame are refused before anything is allocated for them.
 pub const MOST_PIXELS: usize = 7680 * 4320;
@@ -20,8 +20,8 @@ pub(super) struct ColourRaster {
     pub(super) turned: Orientation,
     /// [3, height, width], 0..=1
     pub(super) linear: Vec<f32>,
-    /// Pixels of which some colour was above 1, below 0 or not finite.
-    pub(super) clipped_px: usize,
+    /// Pixels of which some colour was outside that.
+    pub(super) clipped: ClippedColours,
     /// Whether one channel of luminance stands for all colours.
     pub(super) is_luminance: bool,
 }

@@ -18,7 +18,7 @@ use toml::Spanned;
 
 use super::description::{line_error, read_text};
 use super::fit::Placement;
-use super::{Fit, SceneError, raster};
+use super::{ClippedColours, Fit, SceneError, raster};
 use crate::LinearImage;
 use crate::engine::{SAME_FOCUS_DPT, WIDEST_PUPIL};
 use crate::weights::MOST_DEPTH_LAYERS;
@@ -45,8 +45,8 @@ pub struct FocalStack {
 pub struct FocalStackReport {
     /// Pixels of all images in their files.
     pub source_px: usize,
-    /// Those of which some colour was above white, below 0 or not finite, and was clipped.
-    pub colour_clipped_px: usize,
+    /// Those of which some colour was clipped.
+    pub colour_clipped: ClippedColours,
     /// Pixels of each image that the picture does not reach: black.
     pub padded_px: usize,
 }
@@ -117,7 +117,7 @@ impl FocalStackFiles {
             let placement =
                 Placement::new(first, wanted, fit).ok_or(SceneError::TooLarge { path: file, found: first, wanted })?;
             report.source_px += first.pixels();
-            report.colour_clipped_px += colour.clipped_px;
+            report.colour_clipped += colour.clipped;
             report.padded_px = placement.padded_px();
             if amplitude.is_empty() {
                 amplitude.reserve_exact(3 * focuses.len() * wanted.pixels());

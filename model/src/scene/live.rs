@@ -3,8 +3,9 @@
 use half::f16;
 use holod_calibration::{Dioptres, DisplayGeometry, Resolution};
 
+use super::clipped::{self, any, is_above_white, is_below_black};
 use super::fit::Placement;
-use super::{Fit, FrameReport, RgbdFrame, clamp, depth};
+use super::{ClippedColours, Fit, FrameReport, ROUNDING, RgbdFrame, clamp, depth};
 use crate::picture::srgb_to_linear;
 
 /// How a picture's colours are stored.
@@ -210,11 +211,16 @@ enum ColourTable {
     Float,
 }
 
-/// A colour value after clipping, and whether it was clipped.
-fn clip(light: f32) -> (f32, bool) {
-    // NaN becomes black.
-    let clipped = if light > 0.0 { light.min(1.0) } else { 0.0 };
-    (clipped, clipped != light)
+/// [`is_above_white`] of a half float.
+fn is_half_above_white(bits: u16) -> bool {
+    bits > f16::ONE.to_bits() && bits <= f16::INFINITY.to_bits()
+}
+
+/// [`is_below_black`] of a half float. Behind infinity come NaNs, numbers from -0 down, and NaNs again.
+fn is_half_below_black(bits: u16) -> bool {
+    /// What is rounding, in steps of 2^-24, as the bits of the smallest numbers count.
+    const ROUNDED: u16 = (ROUNDING * 16_777_216.0) as u16;
+    bits > f16::INFINITY.to_bits() && bits.wrapping_sub(f16::NEG_ZERO.to_bits()) > ROUNDED
 }
 
 impl LiveReader {
@@ -237,7 +243,7 @@ impl LiveReader {
                 transfer(srgb_to_linear(value as f32 / 255.0))
             }))),
             LiveColour::Rgba16F => ColourTable::Sixteen(
-                (0..=u16::MAX).map(|bits| transfer(clip(f16::from_bits(bits).to_f32()).0)).collect(),
+                (0..=u16::MAX).map(|bits| transfer(clipped::shown(f16::from_bits(bits).to_f32()))).collect(),
             ),
             LiveColour::PlanarF32 => ColourTable::Float,
         };
@@ -325,7 +331,7 @@ impl LiveReader {
         let mut report = FrameReport {
             source: Some(self.format.resolution),
             padded_px: self.padded_px,
-            colour_clipped_px: self.read_colours(colour, &mut picture.amplitude),
+            colour_clipped: self.read_colours(colour, &mut picture.amplitude),
             ..FrameReport::default()
         };
         self.read_depths(depth, &mut picture.depth_normalised);
@@ -354,49 +360,37 @@ impl LiveReader {
     }
 
     /// Writes the colours to `planes`, [3, height, width], and counts the pixels that were clipped.
-    fn read_colours(&self, colour: &[u8], planes: &mut [f32]) -> usize {
-        let pixels = self.format.resolution.pixels();
+    fn read_colours(&self, colour: &[u8], planes: &mut [f32]) -> ClippedColours {
+        let mut clipped = ClippedColours::default();
+        let [red, green, blue] = split(planes);
         match &self.colours {
             ColourTable::Eight(table) => {
-                let [red, green, blue] = split(planes);
                 for (pixel, rgba) in colour.as_chunks::<4>().0.iter().enumerate() {
                     red[pixel] = table[usize::from(rgba[0])];
                     green[pixel] = table[usize::from(rgba[1])];
                     blue[pixel] = table[usize::from(rgba[2])];
                 }
-                0
             }
             ColourTable::Sixteen(table) => {
-                let [red, green, blue] = split(planes);
-                let mut clipped_px = 0;
-                let white = f16::ONE.to_bits();
                 for (pixel, rgba) in colour.as_chunks::<8>().0.iter().enumerate() {
-                    let [r, g, b] = [0, 2, 4].map(|at| u16::from_ne_bytes([rgba[at], rgba[at + 1]]));
-                    red[pixel] = table[usize::from(r)];
-                    green[pixel] = table[usize::from(g)];
-                    blue[pixel] = table[usize::from(b)];
-                    // Above white, not finite, or below 0, which -0 is not.
-                    let is_clipped = |bits: u16| bits > white && bits != 0x8000;
-                    clipped_px += usize::from(is_clipped(r) || is_clipped(g) || is_clipped(b));
+                    let rgb = [0, 2, 4].map(|at| u16::from_ne_bytes([rgba[at], rgba[at + 1]]));
+                    [red[pixel], green[pixel], blue[pixel]] = rgb.map(|bits| table[usize::from(bits)]);
+                    clipped.count(any(rgb.map(is_half_above_white)), any(rgb.map(is_half_below_black)));
                 }
-                clipped_px
             }
             ColourTable::Float => {
                 let unscaled = self.placement.is_unscaled();
-                let planes = planes.chunks_exact_mut(pixels).zip(colour.chunks_exact(4 * pixels));
-                let clipped_px = planes.map(|(plane, bytes)| {
-                    let mut clipped_px = 0;
-                    for (value, &bytes) in plane.iter_mut().zip(bytes.as_chunks::<4>().0) {
-                        let (light, is_clipped) = clip(f32::from_ne_bytes(bytes));
-                        *value = if unscaled { light.sqrt() } else { light };
-                        clipped_px += usize::from(is_clipped);
-                    }
-                    clipped_px
-                });
-                // Of each plane: which of them are the same pixels is not worth a mask.
-                clipped_px.max().unwrap_or(0)
+                let transfer = |light: f32| if unscaled { light.sqrt() } else { light };
+                let mut stored = colour.as_chunks::<4>().0.chunks_exact(red.len());
+                let [reds, greens, blues] = std::array::from_fn(|_| stored.next().expect("three planes"));
+                for (pixel, ((r, g), b)) in reds.iter().zip(greens).zip(blues).enumerate() {
+                    let rgb = [r, g, b].map(|bytes| f32::from_ne_bytes(*bytes));
+                    [red[pixel], green[pixel], blue[pixel]] = rgb.map(|light| transfer(clipped::shown(light)));
+                    clipped.count(any(rgb.map(is_above_white)), any(rgb.map(is_below_black)));
+                }
             }
         }
+        clipped
     }
 
     /// Writes normalised depths, not clamped, NaN where there is none.
@@ -581,7 +575,7 @@ mod tests {
                 let (frame, report) = picture(colour, depth).read(SIZE, Fit::Native).unwrap();
                 let off = difference(&frame, &right);
                 assert!(off < colour_tolerance.max(tolerance), "{colour:?} {depth:?}: {off}");
-                assert_eq!((report.depth_missing_px, report.colour_clipped_px), (1, 0));
+                assert_eq!((report.depth_missing_px, report.colour_clipped), (1, ClippedColours::default()));
             }
         }
     }
@@ -606,10 +600,52 @@ mod tests {
         }
         for picture in [wrong, half] {
             let (frame, report) = picture.read(SIZE, Fit::Native).unwrap();
-            assert_eq!(report.colour_clipped_px, 4, "{:?}", picture.format);
+            let expected = ClippedColours { above_white_px: 2, below_black_px: 2 };
+            assert_eq!(report.colour_clipped, expected, "{:?}", picture.format);
             for (pixel, value, amplitude) in values {
                 assert_eq!(frame.amplitude[pixel], amplitude, "{value}");
             }
+        }
+    }
+
+    #[test]
+    fn each_pixel_with_clipped_light_is_counted_once_whatever_its_colours() {
+        // Red above white, green below black, blue of both and of neither, and what rounding leaves.
+        let values: [(usize, [f32; 3], [usize; 2]); 6] = [
+            (0, [2.0, 0.5, 0.5], [1, 0]),
+            (1, [0.5, -0.5, 0.5], [0, 1]),
+            (2, [0.5, 0.5, f32::NEG_INFINITY], [0, 1]),
+            (3, [3.0, f32::NAN, -1.0], [1, 0]),
+            (4, [0.5, -0.5, f32::INFINITY], [1, 0]),
+            (5, [0.5, -9e-6, 1.0], [0, 0]),
+        ];
+        let plane = LiveDepth::Plane(Dioptres(1.0));
+        let (mut planar, mut half) = (picture(LiveColour::PlanarF32, plane), picture(LiveColour::Rgba16F, plane));
+        for (pixel, rgb, _) in values {
+            for (colour, light) in rgb.into_iter().enumerate() {
+                let at = 4 * (colour * SIZE.pixels() + pixel);
+                planar.colour[at..][..4].copy_from_slice(&light.to_ne_bytes());
+                half.colour[8 * pixel + 2 * colour..][..2].copy_from_slice(&f16::from_f32(light).to_ne_bytes());
+            }
+        }
+        let [above_white_px, below_black_px] = [0, 1].map(|kind| values.iter().map(|(.., counts)| counts[kind]).sum());
+        for picture in [planar, half] {
+            let (_, report) = picture.read(SIZE, Fit::Native).unwrap();
+            assert_eq!(
+                report.colour_clipped,
+                ClippedColours { above_white_px, below_black_px },
+                "{:?}",
+                picture.format
+            );
+        }
+    }
+
+    #[test]
+    fn half_floats_are_judged_as_the_numbers_that_they_are() {
+        for bits in 0..=u16::MAX {
+            let light = f16::from_bits(bits).to_f32();
+            assert_eq!(is_half_above_white(bits), is_above_white(light), "{light}");
+            assert_eq!(is_half_below_black(bits), is_below_black(light), "{light}");
         }
     }
 

@@ -19,6 +19,7 @@
 //! their surroundings.
 
 mod array;
+mod clipped;
 mod decoded;
 mod depth;
 mod description;
@@ -40,12 +41,13 @@ use self::description::Description;
 use self::fit::Placement;
 
 pub use self::array::{ArrayColours, ArrayDepths, ArrayError, ArrayPicture};
+pub use self::clipped::ClippedColours;
 pub use self::decoded::MOST_PIXELS;
 pub use self::error::SceneError;
 pub use self::focal_stack::{FocalStack, FocalStackFiles, FocalStackReport};
 pub use self::live::{LiveColour, LiveDepth, LiveError, LiveFormat, LiveReader, LiveReport, MissingDepths};
 
-/// Normalised depths this little outside 0..=1 are rounding, not clamping.
+/// Normalised depths and light this little outside 0..=1 are rounding, not clamping or clipping.
 const ROUNDING: f32 = 1e-5;
 
 /// One RGB-D frame as the network reads it.
@@ -85,8 +87,8 @@ pub struct FrameReport {
     pub depth_clamped_near_px: usize,
     /// The least and the greatest normalised depth of the source's pixels.
     pub depth_range: [f32; 2],
-    /// Pixels of the source with colours above white or not finite, which were clipped.
-    pub colour_clipped_px: usize,
+    /// Pixels of the source with colours that were clipped.
+    pub colour_clipped: ClippedColours,
     /// Pixels of the frame that the picture does not reach: black, at the far end.
     pub padded_px: usize,
 }
@@ -274,7 +276,7 @@ impl Scene {
         }
         let colour = raster::read_colour(&colour_path)?;
         let mut report =
-            FrameReport { source: Some(colour.size), colour_clipped_px: colour.clipped_px, ..FrameReport::default() };
+            FrameReport { source: Some(colour.size), colour_clipped: colour.clipped, ..FrameReport::default() };
 
         let depth = raster::read_depth(&depth_path)?;
         if colour_path == depth_path && colour.is_luminance && depth.is_luminance {

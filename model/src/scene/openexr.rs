@@ -12,9 +12,9 @@ use exr::prelude::{ReadChannels, ReadLayers};
 use holod_calibration::Resolution;
 use image::metadata::Orientation;
 
-use super::SceneError;
 use super::decoded::{ColourRaster, DepthRaster, FORMATS, MOST_PIXELS, check_size};
 use super::depth::DepthNumbers;
+use super::{ClippedColours, SceneError, clipped};
 
 /// A decoded file.
 struct Picture {
@@ -48,15 +48,18 @@ pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
     let is_luminance = std::ptr::eq(channels[0], channels[1]);
     let pixels = picture.size.pixels();
     let mut linear = vec![0.0; 3 * pixels];
-    let mut clipped = vec![false; pixels];
+    let mut is_outside = vec![[false; 2]; pixels];
     for (plane, channel) in linear.chunks_exact_mut(pixels).zip(channels) {
-        picture.place(channel, |index, value| {
-            plane[index] = if value.is_nan() { 0.0 } else { value.clamp(0.0, 1.0) };
-            clipped[index] |= plane[index] != value;
+        picture.place(channel, |index, light| {
+            plane[index] = clipped::shown(light);
+            let [above_white, below_black] = &mut is_outside[index];
+            *above_white |= clipped::is_above_white(light);
+            *below_black |= clipped::is_below_black(light);
         });
     }
-    let clipped_px = clipped.into_iter().filter(|&clipped| clipped).count();
-    Ok(ColourRaster { size: picture.size, turned: Orientation::NoTransforms, linear, clipped_px, is_luminance })
+    let mut clipped = ClippedColours::default();
+    is_outside.into_iter().for_each(|[above_white, below_black]| clipped.count(above_white, below_black));
+    Ok(ColourRaster { size: picture.size, turned: Orientation::NoTransforms, linear, clipped, is_luminance })
 }
 
 pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {

@@ -10,7 +10,7 @@ use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader};
 
 use super::decoded::{ColourRaster, DepthRaster, FORMATS, check_size};
 use super::depth::DepthNumbers;
-use super::{SceneError, jpeg, openexr};
+use super::{ClippedColours, SceneError, jpeg, openexr};
 use crate::picture::srgb_to_linear;
 
 /// What kind of file a path holds, by its first bytes.
@@ -26,7 +26,13 @@ pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
         Format::Other => {
             let (picture, turned) = decode(path)?;
             let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
-            Ok(ColourRaster { size, turned, linear: linear_planes(&picture), clipped_px: 0, is_luminance: false })
+            Ok(ColourRaster {
+                size,
+                turned,
+                linear: linear_planes(&picture),
+                clipped: ClippedColours::default(),
+                is_luminance: false,
+            })
         }
     }
 }

@@ -199,6 +199,8 @@ fn an_exr_with_a_small_data_window_fills_the_display_window() {
         ("Z", _) => 0.7,
         ("R", _) => 0.25,
         ("G", 3) => 4.0,
+        ("B", 0) => -0.25,
+        ("B", 1) => f32::NAN,
         _ => 0.0,
     });
     let path = files.path("both.exr");
@@ -207,7 +209,8 @@ fn an_exr_with_a_small_data_window_fills_the_display_window() {
     assert_eq!(frame.resolution, size(5, 4));
     let red: Vec<_> = frame.amplitude[..20].iter().enumerate().filter(|(_, value)| **value > 0.0).collect();
     assert_eq!(red, [(6, &0.5), (7, &0.5), (11, &0.5), (12, &0.5)]);
-    assert_eq!((report.colour_clipped_px, report.depth_missing_px), (1, 17));
+    assert_eq!(report.colour_clipped, ClippedColours { above_white_px: 1, below_black_px: 2 });
+    assert_eq!(report.depth_missing_px, 17);
     assert!((frame.depth_normalised[12] - 0.5).abs() < 1e-5 && frame.depth_normalised[6] == 0.0);
     assert!(frame.depth_normalised.iter().all(|value| (0.0..=1.0).contains(value)));
 

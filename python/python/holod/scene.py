@@ -29,7 +29,7 @@ class Scene:
     depth_missing_px: int = 0
     """pixels without a depth, which were filled from their surroundings"""
     colour_clipped_px: int = 0
-    """pixels above white or not finite, which were clipped"""
+    """pixels with a colour above white, below 0 or not finite, which was clipped"""
 
 
 def load_scene(

@@ -503,7 +503,7 @@ fn tell_oddities(client: &mut Client, bad: &BadDepths, made: Option<&LiveReport>
     }
     if let Some(report) = made.filter(|_| is_first) {
         if are_bad {
-            scene::warn_of_clipped_colours(&name, report.frame.colour_clipped_px, pixels);
+            scene::warn_of_clipped_colours(&name, report.frame.colour_clipped, pixels);
         } else {
             scene::warn_of_oddities(&name, &report.frame, &target.geometry, client.sends_planes());
         }
