@@ -15,10 +15,14 @@ pub(crate) fn feed_text(feed: &FeedStatus) -> String {
         0 => String::new(),
         pictures => format!("; bad depths in {pictures} of them: {} pixels", feed.bad_depths_in_all.text()),
     };
+    let clipped = match feed.pictures_with_clipped_colours {
+        0 => String::new(),
+        pictures => format!("; colours clipped in {pictures} of them, in pixels: {}", feed.clipped_colours_in_all.text()),
+    };
     let refusal = feed.last_refusal.as_ref().map_or(String::new(), |why| format!("; refused last: {why}"));
     format!(
         "{} pictures taken, {} overtaken, {} refused, {} of clients not shown, {} left out by clients; {} \
-         connections refused{bad_depths}{refusal}",
+         connections refused{bad_depths}{clipped}{refusal}",
         feed.taken, feed.overtaken, feed.refused, feed.not_shown, feed.left_out, feed.connections_refused,
     )
 }

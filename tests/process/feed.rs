@@ -239,17 +239,32 @@ fn a_client_that_stands_still_makes_the_lasers_dark_until_it_goes_on() {
 fn a_picture_that_is_too_bright_and_too_near_is_told_though_it_is_enlarged() {
     let folder = bench();
     let daemon = holod_with_feed(folder.path(), &["--fit", "contain"]);
-    let one_half = 0x3c00_u16;
-    for (name, number, depth_mm) in [("near", 1, 2_u16), ("flat", 2, 1000)] {
+    let white = 0x3c00_u16;
+    // Each picture with so many pixels that are brighter than white.
+    for (name, depth_mm, pictures) in [
+        ("near", 2_u16, &[(1, 1024)][..]),
+        ("flat", 1000, &[(2, 1024)]),
+        ("late", 1000, &[(3, 0), (4, 10), (5, 11), (6, 12)]),
+    ] {
         let mut client = FeedClient::connect(&folder.path().join("pictures")).unwrap();
         let mut hello = hello(32, 32, None, name);
         hello[16..20].copy_from_slice(&2_u32.to_ne_bytes());
         client.say(&hello).unwrap();
         assert_eq!(client.answer(), Answer::Ring);
-        let pixel = [2 * one_half, 0, 0, one_half].map(u16::to_ne_bytes).concat();
-        send(&mut client, number, &(pixel.repeat(32 * 32), depth_mm.to_ne_bytes().repeat(32 * 32)));
-        assert!(wait_until(PATIENCE, || status(&daemon, folder.path())["feed"]["taken"] == number));
+        for &(number, bright) in pictures {
+            let pixel = |red: u16| [red, 0, 0, white].map(u16::to_ne_bytes).concat();
+            let colour = [pixel(0x7bff).repeat(bright), pixel(white).repeat(32 * 32 - bright)].concat();
+            send(&mut client, number, &(colour, depth_mm.to_ne_bytes().repeat(32 * 32)));
+            assert!(wait_until(PATIENCE, || status(&daemon, folder.path())["feed"]["taken"] == number));
+        }
     }
+    let feed = &status(&daemon, folder.path())["feed"];
+    assert_eq!(
+        (&feed["clipped_colours"]["above_white"], &feed["pictures_with_clipped_colours"]),
+        (&12.into(), &5.into())
+    );
+    let text = said_of(&daemon, folder.path(), &[]);
+    assert!(text.contains("colours clipped in 5 of them, in pixels: 2081 above white"), "{text}");
     daemon.signal(Signal::TERM);
     let ended = daemon.wait(PATIENCE);
     assert!(ended.status.success(), "{}", ended.stderr);
@@ -257,10 +272,12 @@ fn a_picture_that_is_too_bright_and_too_near_is_told_though_it_is_enlarged() {
         "`near`: of 1024 depths, these cannot be shown as they are: 1024 nearer than the display",
         "`near`: 1024 of 1024 pixels are brighter than white and were clipped",
         "`flat`: 1024 of 1024 pixels are brighter than white and were clipped",
+        "`late`: 11 of 1024 pixels are brighter than white and were clipped",
         "`flat`: all depths lie within 0.000 dpt: is the depth encoding right?",
     ] {
         assert!(ended.stderr.contains(said), "`{said}` is not in: {}", ended.stderr);
     }
+    assert_eq!(ended.stderr.matches("brighter than white").count(), 3, "once of each client: {}", ended.stderr);
 }
 
 #[test]

@@ -75,7 +75,8 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
     }
     results::print(&format!(
         "{}: hologram of {}x{} for a pupil of {} mm in {:.0} ms, {:.1} s with all else; {:.3} % of amplitudes clipped\n\
-         depth {:.2} to {:.2} dpt; pixels filled {}, clamped to the far end {}, to the near end {}, padded {}\n\
+         depth {:.2} to {:.2} dpt; pixels filled {}, clamped to the far end {}, to the near end {}, with colours \
+         clipped {}, padded {}\n\
          in {}: {}",
         report.scene,
         report.width_px,
@@ -89,6 +90,7 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
         report.depth_missing_px,
         report.depth_clamped_far_px,
         report.depth_clamped_near_px,
+        report.colour_clipped_px,
         report.padded_px,
         args.out.display(),
         FILES.join(", ")

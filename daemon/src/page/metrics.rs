@@ -154,6 +154,9 @@ fn of_run(told: &mut Teller<'_>, snapshot: &Snapshot) -> fmt::Result {
     let bad = feed.bad_depths_in_all.entries();
     told.counters("feed_bad_depth_pixels", "Depths that cannot be shown as they are, by what they are", "kind", bad)?;
     told.counter("feed_bad_depth_pictures", "Pictures that have some", feed.pictures_with_bad_depths)?;
+    let clipped = feed.clipped_colours_in_all.entries();
+    told.counters("feed_clipped_colour_pixels", "Pixels with colours that were clipped, by how", "kind", clipped)?;
+    told.counter("feed_clipped_colour_pictures", "Pictures that have some", feed.pictures_with_clipped_colours)?;
     told.counters(
         "feed_connections_refused",
         "Connections that were refused or broken off",
@@ -247,7 +250,7 @@ mod tests {
 
     use super::super::live::Refused;
     use super::*;
-    use crate::source::feed::FeedStatus;
+    use crate::source::feed::{ClippedPixels, FeedStatus};
 
     #[test]
     fn rejections_and_refusals_are_told_by_their_reasons() {
@@ -260,6 +263,8 @@ mod tests {
         }
         let mut feed = FeedStatus::default();
         feed.connections_refused_by.insert("full".to_owned(), 3);
+        feed.clipped_colours_in_all = ClippedPixels { above_white: 70, below_black: 8 };
+        feed.pictures_with_clipped_colours = 2;
         let mut snapshot = Snapshot { orders_refused: [("busy".to_owned(), 5)].into(), ..Snapshot::default() };
         snapshot.figures.tracker_counts = tracker_counts;
         snapshot.figures.feed = Some(feed);
@@ -280,6 +285,9 @@ mod tests {
             "holod_page_refused_total{reason=\"viewers\"} 0",
             "holod_control_refused_total{reason=\"busy\"} 5",
             "holod_feed_connections_refused_total{reason=\"full\"} 3",
+            "holod_feed_clipped_colour_pixels_total{kind=\"above_white\"} 70",
+            "holod_feed_clipped_colour_pixels_total{kind=\"below_black\"} 8",
+            "holod_feed_clipped_colour_pictures_total 2",
         ] {
             assert!(has(line), "{line} is not in:\n{told}");
         }

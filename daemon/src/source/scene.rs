@@ -12,6 +12,9 @@ use crate::failure::{Exit, Failure};
 /// Size of a hologram of the built-in scene on a processor.
 pub const SAMPLE_RESOLUTION: Resolution = Resolution { width: 512, height: 512 };
 
+/// In this share of a picture's pixels colours may be clipped, as in highlights, without a word.
+const CLIPPED_SHARE_MAX: f64 = 0.01;
+
 /// Frames of a sequence that are kept in memory, in bytes.
 const SEQUENCE_BYTES_MAX: u64 = 4 << 30;
 
@@ -99,11 +102,22 @@ fn load(
             sequence_fits(count as u64, frame.resolution, available_bytes())
                 .map_err(|why| Failure::new(Exit::Data, format!("{spec}: {why}")))?;
         }
-        warn_of_oddities(spec, &report, geometry, false);
+        warn_of_odd_depth(spec, &report, geometry, false);
         loaded.frames.push(Arc::new(frame));
         loaded.reports.push(report);
     }
+    if let Some((index, source, clipped)) = most_clipped(&loaded.reports) {
+        let name = if count > 1 { format!("{spec}, frame {index}") } else { spec.to_owned() };
+        warn_of_clipped_colours(&name, clipped, source.pixels());
+    }
     Ok(loaded)
+}
+
+/// The picture of which most was clipped: all of a sequence are told by it.
+fn most_clipped(reports: &[FrameReport]) -> Option<(usize, Resolution, ClippedColours)> {
+    let each = reports.iter().enumerate();
+    let clipped = each.filter_map(|(index, report)| Some((index, report.source?, report.colour_clipped)));
+    clipped.rev().max_by_key(|(.., clipped)| clipped.in_all())
 }
 
 /// Memory that could be had, where the kernel tells it.
@@ -134,32 +148,39 @@ fn sequence_fits(frames: u64, resolution: Resolution, available_bytes: Option<u6
 /// `is_plane`: one depth for all of it is meant.
 pub fn warn_of_oddities(name: &str, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) {
     let Some(source) = report.source else { return };
-    if let Some(oddity) = odd_depth(source, report, geometry, is_plane) {
-        tracing::warn!("{name}: {oddity}");
-    }
+    warn_of_odd_depth(name, report, geometry, is_plane);
     warn_of_clipped_colours(name, report.colour_clipped, source.pixels());
 }
 
-/// Warns of a picture called `name` of which most pixels were clipped. All counts are of the picture as it came, before
-/// it was fitted.
-pub fn warn_of_clipped_colours(name: &str, clipped: ClippedColours, source_px: usize) {
-    for oddity in odd_colours(clipped, source_px) {
+/// Warns of depth that is most often a mistake, as [`warn_of_oddities`] does.
+pub fn warn_of_odd_depth(name: &str, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) {
+    if let Some(oddity) = report.source.and_then(|source| odd_depth(source, report, geometry, is_plane)) {
         tracing::warn!("{name}: {oddity}");
     }
 }
 
-/// Colours of which most are above white are most often scene-linear light that was never exposed; below 0 they are
+/// Warns of a picture called `name` of which more than some highlights was clipped, and says whether it did. All counts
+/// are of the picture as it came, before it was fitted.
+pub fn warn_of_clipped_colours(name: &str, clipped: ClippedColours, source_px: usize) -> bool {
+    let oddities = odd_colours(clipped, source_px);
+    for oddity in &oddities {
+        tracing::warn!("{name}: {oddity}");
+    }
+    !oddities.is_empty()
+}
+
+/// Colours of which many are above white are most often scene-linear light that was never exposed; below 0 they are
 /// those of a wider gamut.
 fn odd_colours(clipped: ClippedColours, source_px: usize) -> Vec<String> {
     let ClippedColours { above_white_px, below_black_px } = clipped;
-    let are_most = |clipped_px: usize| 2 * clipped_px > source_px;
-    let above = are_most(above_white_px).then(|| {
+    let are_many = |clipped_px: usize| clipped_px as f64 > CLIPPED_SHARE_MAX * source_px as f64;
+    let above = are_many(above_white_px).then(|| {
         format!(
             "{above_white_px} of {source_px} pixels are brighter than white and were clipped: scale the picture's \
              light so that white is 1"
         )
     });
-    let below = are_most(below_black_px).then(|| {
+    let below = are_many(below_black_px).then(|| {
         format!(
             "{below_black_px} of {source_px} pixels have a colour below 0 or that is no number, which became 0: bring \
              the picture to the primaries of sRGB, whose colours are 0 to 1"
@@ -275,10 +296,22 @@ mod tests {
     #[test]
     fn what_was_clipped_is_called_what_it_is() {
         let odd = |above_white_px, below_black_px| odd_colours(ClippedColours { above_white_px, below_black_px }, 1000);
-        assert_eq!(odd(500, 500), Vec::<String>::new());
-        let [above, below] = [odd(501, 0), odd(0, 501)];
-        assert!(above.len() == 1 && above[0].starts_with("501 of 1000 pixels are brighter than white"), "{above:?}");
-        assert!(below.len() == 1 && below[0].starts_with("501 of 1000 pixels have a colour below 0"), "{below:?}");
+        assert_eq!(odd(10, 10), Vec::<String>::new());
+        let [above, below] = [odd(11, 0), odd(0, 11)];
+        assert!(above.len() == 1 && above[0].starts_with("11 of 1000 pixels are brighter than white"), "{above:?}");
+        assert!(below.len() == 1 && below[0].starts_with("11 of 1000 pixels have a colour below 0"), "{below:?}");
+    }
+
+    #[test]
+    fn a_sequence_is_told_by_the_picture_that_is_clipped_most() {
+        let report = |above_white_px| FrameReport {
+            source: Some(SAMPLE_RESOLUTION),
+            colour_clipped: ClippedColours { above_white_px, below_black_px: 1 },
+            ..FrameReport::default()
+        };
+        let worst = most_clipped(&[report(0), report(7), report(7), report(3)]).unwrap();
+        assert_eq!(worst, (1, SAMPLE_RESOLUTION, ClippedColours { above_white_px: 7, below_black_px: 1 }));
+        assert_eq!(most_clipped(&[FrameReport::default()]), None, "the built-in scene");
     }
 
     #[test]

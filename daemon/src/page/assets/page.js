@@ -158,6 +158,9 @@ function tellFacts(snapshot) {
     ["Feed’s trouble", snapshot.feed_trouble],
     ["Feed’s bad depths", feed?.pictures_with_bad_depths > 0 && `${kinds(feed.bad_depths) || "none"} in the newest picture; ` +
       `${kinds(feed.bad_depths_in_all)} in ${feed.pictures_with_bad_depths} pictures`],
+    ["Feed’s clipped colours", feed?.pictures_with_clipped_colours > 0 &&
+      `${kinds(feed.clipped_colours) || "none"} in the newest picture; ` +
+      `${kinds(feed.clipped_colours_in_all)} in ${feed.pictures_with_clipped_colours} pictures`],
     ["Feed refused", feed?.last_refusal],
     ["Record", record && `${record.state === "lost" ? `lost: ${record.reason}` : record.folder}` +
       `${record.rows_lost ? `; ${record.rows_lost} rows left out: the disk is too slow` : ""}`],

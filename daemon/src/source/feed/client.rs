@@ -85,6 +85,8 @@ pub(super) struct Client {
     pub(super) is_known: bool,
     /// Whether it was said that its depths are bad.
     pub(super) told_depths: bool,
+    /// Whether it was said that its colours were clipped.
+    pub(super) told_colours: bool,
     /// Whether its pictures' field of view was looked at.
     pub(super) told_field_of_view: bool,
     stream: Option<Stream>,
@@ -231,6 +233,7 @@ impl Client {
             t_last: TimeNs(i64::MIN / 2),
             is_known: false,
             told_depths: false,
+            told_colours: false,
             told_field_of_view: false,
             stream: None,
         }

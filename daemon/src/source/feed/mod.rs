@@ -6,6 +6,7 @@
 //! the copy after that.
 
 mod client;
+mod colours;
 pub mod cost;
 mod depths;
 #[cfg(fuzzing)]
@@ -32,6 +33,7 @@ use rustix::net::{SocketFlags, SocketType, accept_with};
 use serde::{Deserialize, Serialize};
 
 use self::client::{Client, Copied, Gone, Refusal, TakeError, Target};
+pub use self::colours::ClippedPixels;
 pub use self::depths::BadDepths;
 use self::message::Outcome;
 use self::slots::Picture;
@@ -117,6 +119,15 @@ pub struct FeedStatus {
     /// Pictures that have some.
     #[serde(default)]
     pub pictures_with_bad_depths: u64,
+    /// Pixels of the newest picture that was taken whose colours were clipped.
+    #[serde(default)]
+    pub clipped_colours: ClippedPixels,
+    /// The same of all pictures.
+    #[serde(default)]
+    pub clipped_colours_in_all: ClippedPixels,
+    /// Pictures that have some.
+    #[serde(default)]
+    pub pictures_with_clipped_colours: u64,
     /// Seconds since the newest picture was taken over.
     pub newest_age_s: Option<f64>,
     #[serde(skip)]
@@ -136,6 +147,12 @@ impl FeedStatus {
         self.bad_depths = bad;
         self.bad_depths_in_all.add(&bad);
         self.pictures_with_bad_depths += u64::from(bad.in_all() > 0);
+    }
+
+    fn count_colours(&mut self, clipped: ClippedPixels) {
+        self.clipped_colours = clipped;
+        self.clipped_colours_in_all.add(&clipped);
+        self.pictures_with_clipped_colours += u64::from(clipped.in_all() > 0);
     }
 
     fn tell_refusal(&mut self, what: &str, why: &str, now: TimeNs) {
@@ -416,6 +433,7 @@ impl Server {
                     tell_field_of_view(client, tag.view, target);
                     let bad = BadDepths::from(&report);
                     status.count_depths(bad);
+                    status.count_colours(report.frame.colour_clipped.into());
                     tell_oddities(client, &bad, Some(&report), target);
                 }
                 Err(PictureRefusal::Picture(TakeError::Picture(LiveError::NoDepth { missing, .. }))) => {
@@ -488,8 +506,8 @@ fn make(client: &mut Client, copied: &Copied, frame: &mut Arc<RgbdFrame>) -> Liv
     client.stream().make(copied, frame).expect("a picture that was taken over has a depth")
 }
 
-/// Says once of each client what is most often a mistake: depths of which most are bad, and oddities of its first
-/// picture, where a frame could be made of that.
+/// Says once of each client what is most often a mistake: depths of which most are bad, colours of which many were
+/// clipped, and what is odd about the depth of its first picture of which a frame could be made.
 fn tell_oddities(client: &mut Client, bad: &BadDepths, made: Option<&LiveReport>, target: &Target) {
     let name = format!("the feed's client `{}`", client.name);
     let format = client.stream().format();
@@ -501,12 +519,12 @@ fn tell_oddities(client: &mut Client, bad: &BadDepths, made: Option<&LiveReport>
         let (text, cure) = (bad.text(), bad.likely_cure(format.depth));
         tracing::warn!("{name}: of {pixels} depths, these cannot be shown as they are: {text}; {cure}");
     }
-    if let Some(report) = made.filter(|_| is_first) {
-        if are_bad {
-            scene::warn_of_clipped_colours(&name, report.frame.colour_clipped, pixels);
-        } else {
-            scene::warn_of_oddities(&name, &report.frame, &target.geometry, client.sends_planes());
-        }
+    let Some(report) = made else { return };
+    if is_first && !are_bad {
+        scene::warn_of_odd_depth(&name, &report.frame, &target.geometry, client.sends_planes());
+    }
+    if !client.told_colours {
+        client.told_colours = scene::warn_of_clipped_colours(&name, report.frame.colour_clipped, pixels);
     }
 }
 

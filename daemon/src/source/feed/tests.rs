@@ -368,6 +368,34 @@ fn bad_depths_are_counted_in_each_picture_and_in_all() {
 }
 
 #[test]
+fn clipped_colours_are_counted_in_every_picture() {
+    // Half floats: 0.5, 1, 2 and -1.
+    let [half, white, twice_white, below_black] = [0x3800_u16, 0x3c00, 0x4000, 0xbc00];
+    let mut bench = Bench::new();
+    let mut client = FeedClient::connect(&bench.socket).unwrap();
+    let mut hello = hello(SIZE.width as u32, SIZE.height as u32, None, "bright");
+    hello[16..20].copy_from_slice(&2_u32.to_ne_bytes());
+    client.say(&hello).unwrap();
+    assert_eq!(client.answer(), Answer::Ring);
+    let (_, depth) = picture(0, 1000);
+    let mut show = |sequence: u64, reds: &[u16]| {
+        let reds = reds.iter().chain(std::iter::repeat(&half)).take(PIXELS);
+        let colour: Vec<u8> = reds.flat_map(|&red| [red, half, white, 0]).flat_map(u16::to_ne_bytes).collect();
+        client.write(0, &colour, &depth);
+        client.hand_over(0, sequence, 0).unwrap();
+        bench.shown_next(sequence);
+        client.answer();
+    };
+    show(1, &[white]);
+    show(2, &[twice_white, below_black, twice_white]);
+    show(3, &[below_black]);
+    bench.until("all are counted", |status| status.taken == 3 && status.pictures_with_clipped_colours == 2);
+    let status = bench.status();
+    assert_eq!(status.clipped_colours, ClippedPixels { above_white: 0, below_black: 1 });
+    assert_eq!(status.clipped_colours_in_all, ClippedPixels { above_white: 2, below_black: 2 });
+}
+
+#[test]
 fn how_a_picture_was_taken_goes_with_it_in_version_2_alone() {
     let mut bench = Bench::new();
     let mut newer = FeedClient::connect(&bench.socket).unwrap();
