@@ -14,6 +14,7 @@ mod panel;
 mod pattern;
 mod pictures;
 mod record;
+mod render;
 mod report;
 mod shutdown;
 mod tracker;

@@ -36,6 +36,7 @@ pub(super) struct Report {
     /// Those of them that were brighter than white.
     colour_above_white_px: usize,
     padded_px: usize,
+    /// Of the scene, not of what was padded.
     depth_least_dpt: f64,
     depth_greatest_dpt: f64,
     /// How the hologram was computed.
@@ -142,10 +143,7 @@ pub(super) fn compute(
     })?;
     let frame_ms = began.elapsed().as_secs_f64() * 1e3;
     let done = &frames.reports[0];
-    let depths = &frames.frames[0].depth_normalised;
-    let depth_at = |start: f32, pick: fn(f32, f32) -> f32| {
-        rig.geometry.depth_at(f64::from(depths.iter().copied().fold(start, pick))).0
-    };
+    let [depth_least_dpt, depth_greatest_dpt] = done.depth_range.map(|depth| rig.geometry.depth_at(f64::from(depth)).0);
     let report = Report {
         scene: frames.name.clone(),
         pupil_mm: pupil.mm(),
@@ -159,8 +157,8 @@ pub(super) fn compute(
         colour_clipped_px: done.colour_clipped.in_all(),
         colour_above_white_px: done.colour_clipped.above_white_px,
         padded_px: done.padded_px,
-        depth_least_dpt: depth_at(f32::MAX, f32::min),
-        depth_greatest_dpt: depth_at(f32::MIN, f32::max),
+        depth_least_dpt,
+        depth_greatest_dpt,
         engine: renderer.description().to_owned(),
         frame_ms,
         total_ms: 0.0,

@@ -211,10 +211,12 @@ fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames,
     let resolution = args.resolution.unwrap_or(SAMPLE_RESOLUTION);
     check_fits(resolution, geometry, "--resolution")?;
     let frame = sample_frame(resolution);
+    let least_and_greatest = |[least, greatest]: [f32; 2], &depth: &f32| [least.min(depth), greatest.max(depth)];
+    let depth_range = frame.depth_normalised.iter().fold([f32::MAX, f32::MIN], least_and_greatest);
     Ok(Frames {
         frames: vec![Arc::new(frame)],
         fps: None,
-        reports: vec![FrameReport::default()],
+        reports: vec![FrameReport { depth_range, ..FrameReport::default() }],
         name: "the built-in scene".into(),
     })
 }

@@ -1,0 +1,58 @@
+//! What `holod render` says of its scene.
+
+use std::fs;
+use std::path::Path;
+
+use holod_calibration::{Dioptres, PupilDiameter, Resolution};
+use holod_model::LinearImage;
+use holod_model::scene::FocalStack;
+use holod_tests::daemon::run;
+use serde_json::Value;
+
+use crate::HOLOD;
+
+const SIZE: Resolution = Resolution { width: 40, height: 32 };
+
+/// Writes `light.exr`, all 0.5 but for some pixels of 2 and some of -1, and `depth.png` of 500 mm to 1 m.
+fn write_scene(folder: &Path, above_white_px: usize, below_black_px: usize) {
+    let mut pixels = vec![0.5; 3 * SIZE.pixels()];
+    pixels[..above_white_px].fill(2.0);
+    pixels[above_white_px..][..below_black_px].fill(-1.0);
+    let image = LinearImage { resolution: SIZE, pixels };
+    let pupil = PupilDiameter::from_mm(3.0);
+    FocalStack::save(&folder.join("stack"), &[image], &[Dioptres(1.0)], pupil).unwrap();
+    fs::rename(folder.join("stack/focus-00.exr"), folder.join("light.exr")).unwrap();
+    let (width, height) = (SIZE.width as u32, SIZE.height as u32);
+    let depth_mm = |_, y| image::Luma([if y < height / 2 { 500_u16 } else { 1000 }]);
+    image::ImageBuffer::from_fn(width, height, depth_mm).save(folder.join("depth.png")).unwrap();
+}
+
+#[test]
+fn what_was_clipped_and_how_deep_the_scene_is_are_told_without_the_padding() {
+    let folder = holod_tests::new_folder();
+    write_scene(folder.path(), 9, 3);
+    let args = ["render", "--scene", "light.exr,depth.png", "--depth-encoding", "millimetres", "--pupil", "3"];
+    let args =
+        [&args[..], &["--resolution", "48x48", "--weights", "fast", "--backend", "cpu", "--out", "out"]].concat();
+    let ended = run(HOLOD, &args, folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    for said in ["depth 1.00 to 2.00 dpt;", "with colours clipped 12, padded 1024\n"] {
+        assert!(ended.stdout.contains(said), "`{said}` is not in: {}", ended.stdout);
+    }
+    assert!(!ended.stderr.contains("brighter than white"), "12 of 1280 pixels are few: {}", ended.stderr);
+    let report: Value = serde_json::from_slice(&fs::read(folder.path().join("out/report.json")).unwrap()).unwrap();
+    assert_eq!((&report["colour_clipped_px"], &report["colour_above_white_px"]), (&12.into(), &9.into()));
+    let range_dpt = ["depth_least_dpt", "depth_greatest_dpt"].map(|key| report[key].as_f64().unwrap());
+    assert!((range_dpt[0] - 1.0).abs() < 1e-4 && (range_dpt[1] - 2.0).abs() < 1e-4, "{range_dpt:?}");
+
+    let built_in = ["render", "--pupil", "3", "--resolution", "48x48", "--weights", "fast", "--backend", "cpu"];
+    let ended = run(HOLOD, &[&built_in[..], &["--out", "built-in"]].concat(), folder.path());
+    assert!(ended.stdout.contains("\ndepth 0.") && !ended.stdout.contains("depth 0.00 to 0.00"), "{}", ended.stdout);
+
+    fs::remove_dir_all(folder.path().join("stack")).unwrap();
+    write_scene(folder.path(), 13, 14);
+    let ended = run(HOLOD, &[&args[..], &["--force"]].concat(), folder.path());
+    for said in ["13 of 1280 pixels are brighter than white", "14 of 1280 pixels have a colour below 0"] {
+        assert!(ended.stderr.contains(said), "`{said}` is not in: {}", ended.stderr);
+    }
+}
