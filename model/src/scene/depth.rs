@@ -134,6 +134,10 @@ mod tests {
             (normalised, None, Some(255.0), 0.0, 0.5),
             (normalised, None, Some(255.0), 255.0, 2.5),
             (normalised, None, None, 0.5, 1.5),
+            // A scale is that from the file's numbers, whatever they are.
+            (normalised, Some(1.0 / 255.0), Some(255.0), 255.0, 2.5),
+            (normalised, Some(1.0 / 1023.0), Some(65535.0), 1023.0, 2.5),
+            (normalised, Some(1.0), Some(255.0), 1.0, 2.5),
         ] {
             let actual = read(encoding, scale, None, full_scale, number);
             assert!((actual - expected).abs() < 1e-5, "{encoding:?} {number}: {actual}");

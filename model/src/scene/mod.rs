@@ -6,7 +6,8 @@
 //! colour = "rgb/{:05}.png"         # 8- or 16-bit PNG, JPEG or OpenEXR; {} or {:05} is the frame's number
 //! depth = "depth/{:05}.png"        # where absent the colour file, which must be OpenEXR then
 //! depth_encoding = "millimetres"   # metres, millimetres, dioptres, or normalised_dioptres with far_dpt and near_dpt
-//! depth_scale = 1.0                # factor from the file's numbers to that unit; 1 where absent
+//! depth_scale = 1.0                # factor from the file's numbers to that unit: where absent 1, of integers in
+//!                                  # normalised_dioptres 1 over the largest of the file (1/255 or 1/65535)
 //! depth_missing = 0                # the number that means that there is no depth, where there is one
 //! first = 0                        # for a sequence: its first number,
 //! step = 1                         # the distance of numbers,
@@ -102,7 +103,8 @@ pub enum DepthEncoding {
     Millimetres,
     /// Dioptres.
     Dioptres,
-    /// 0 at `far_dpt` and 1 (the largest integer of an integer file) at `near_dpt`, uniform in dioptres.
+    /// 0 at `far_dpt` and 1 at `near_dpt`, uniform in dioptres. Of an integer file the largest integer is 1, unless a
+    /// scale says otherwise.
     NormalisedDioptres {
         /// Vergence of the value 0.
         far_dpt: f64,
