@@ -699,6 +699,21 @@ fn a_lut_is_read_and_named_among_the_active_files() {
     );
 }
 
+#[test]
+fn a_byte_order_mark_before_a_text_is_no_part_of_it() {
+    let table = |csv: &str| load_lut(csv).unwrap().panel.lut[Colour::Green].clone();
+    let bare: String = (0..256).map(|level| format!("{level},{}\n", straight(level))).collect();
+    for csv in [&bare, &lut_csv(straight), &format!("# measured\n{bare}")] {
+        assert_eq!(table(&format!("\u{feff}{csv}")), table(csv));
+    }
+    assert_lut_fault("\u{feff}100,0.5\n20,0.1\n", "green.csv: row 2 `20,0.1` should be level 101", "");
+
+    let folder = tempfile::tempdir().unwrap();
+    let rig = folder.path().join("rig.toml");
+    fs::write(&rig, format!("\u{feff}{}", Rig::BUILT_IN_TOML)).unwrap();
+    assert_eq!(Rig::load(&rig).unwrap().panel, Rig::default().panel);
+}
+
 fn entry(level: u16, phase_rad: f64) -> LevelPhase {
     LevelPhase { level, phase_rad }
 }

@@ -49,7 +49,7 @@ pub(super) fn plain_file(path: &Path) -> Result<u64, FileFault> {
     })
 }
 
-/// The text of a small file.
+/// The text of a small file, without the byte-order mark that spreadsheets write before it.
 pub(super) fn read_text(path: &Path) -> Result<String, FileFault> {
     let length = plain_file(path)?;
     if length > TEXT_BYTES_MAX {
@@ -60,7 +60,7 @@ pub(super) fn read_text(path: &Path) -> Result<String, FileFault> {
         });
     }
     let bytes = fs::read(path).map_err(|why| FileFault::unreadable(path, &why))?;
-    String::from_utf8(bytes).map_err(|why| {
+    let mut text = String::from_utf8(bytes).map_err(|why| {
         let valid = why.utf8_error().valid_up_to();
         let line = 1 + why.as_bytes()[..valid].iter().filter(|&&b| b == b'\n').count();
         FileFault {
@@ -68,5 +68,9 @@ pub(super) fn read_text(path: &Path) -> Result<String, FileFault> {
             expected: "a text in UTF-8".into(),
             advice: "save the file as UTF-8".into(),
         }
-    })
+    })?;
+    if text.starts_with('\u{feff}') {
+        text.remove(0);
+    }
+    Ok(text)
 }
