@@ -703,7 +703,8 @@ fn a_lut_is_read_and_named_among_the_active_files() {
 fn a_byte_order_mark_before_a_text_is_no_part_of_it() {
     let table = |csv: &str| load_lut(csv).unwrap().panel.lut[Colour::Green].clone();
     let bare: String = (0..256).map(|level| format!("{level},{}\n", straight(level))).collect();
-    for csv in [&bare, &lut_csv(straight), &format!("# measured\n{bare}")] {
+    let one_column: String = (0..256).map(|level| format!("{}\n", straight(level))).collect();
+    for csv in [&bare, &one_column, &lut_csv(straight), &format!("# measured\n{bare}")] {
         assert_eq!(table(&format!("\u{feff}{csv}")), table(csv));
     }
     assert_lut_fault("\u{feff}100,0.5\n20,0.1\n", "green.csv: row 2 `20,0.1` should be level 101", "");
@@ -910,8 +911,15 @@ fn a_flatness_picture_is_read_at_either_depth() {
 #[test]
 fn a_faulty_flatness_picture_is_named() {
     type Write = fn(&Path);
-    let cases: [(Write, &str); 7] = [
+    /// 64x66 pixels of 4 bits, all 1.
+    const FOUR_BITS: &[u8] = b"\x89PNG\x0d\x0a\x1a\x0a\
+        \x00\x00\x00\x0dIHDR\x00\x00\x00\x40\x00\x00\x00B\x04\x00\x00\x00\x00\x07:b\x08\
+        \x00\x00\x00 IDATx\xdac\x10\x24\x00\x18F\x15\x8c\x2a\x18U0\
+        \xaa\x60T\xc1\xa8\x82Q\x05\xa3\x0a\xa8\xad\x00\x00\xc7\xae\x8cAi9\x96\xcd\
+        \x00\x00\x00\x00IEND\xaeB\x60\x82";
+    let cases: [(Write, &str); 8] = [
         (|path| GrayImage::new(66, 64).save(path).unwrap(), "66x64 pixels"),
+        (|path| fs::write(path, FOUR_BITS).unwrap(), "grays of 4 bits"),
         (
             |path| {
                 let mut picture = RgbImage::new(64, 66);

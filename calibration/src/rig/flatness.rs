@@ -8,7 +8,7 @@ use std::path::Path;
 use image::{DynamicImage, ImageFormat, ImageReader};
 
 use super::files::{FileFault, plain_file};
-use crate::Resolution;
+use crate::{Resolution, png_grey_bits};
 
 /// What the grays of a picture mean.
 #[derive(Clone, Copy)]
@@ -25,13 +25,13 @@ pub(super) struct GrayScale {
 /// or colours that are all grays. Gray g is 2π·g/n; n is 256 or 65536, or the gray of 2π that `scale` states.
 ///
 /// # Errors
-/// [`FileFault`] where the file cannot be read, is neither format or damaged, has colours, transparency or another size
-/// than the panel, or fewer grays than `scale` says.
+/// [`FileFault`] where the file cannot be read, is neither format or damaged, has colours, transparency, grays of fewer
+/// bits or another size than the panel, or fewer grays than `scale` says.
 pub(super) fn read(path: &Path, panel: Resolution, scale: GrayScale) -> Result<Vec<f32>, FileFault> {
     plain_file(path)?;
     let fault = |found: String, advice: &str| FileFault {
         found: format!("{}: {found}", path.display()),
-        expected: format!("a gray PNG or BMP, {panel} pixels"),
+        expected: format!("a gray PNG of 8 or 16 bits, or a BMP, {panel} pixels"),
         advice: advice.into(),
     };
     let damaged = |why: image::ImageError| fault(why.to_string(), "save it as a gray PNG or BMP again");
@@ -42,6 +42,10 @@ pub(super) fn read(path: &Path, panel: Resolution, scale: GrayScale) -> Result<V
             format!("{size} pixels"),
             "make it at the panel's own size, or correct panel.width_px and height_px",
         ));
+    }
+    let bits = png_grey_bits(path).map_err(|why| FileFault::unreadable(path, &why))?;
+    if let Some(bits) = bits.filter(|bits| *bits < 8) {
+        return Err(fault(format!("grays of {bits} bits"), "save it with 8 or 16 bits, as its grays were measured"));
     }
     let picture = open(path, &fault)?.decode().map_err(damaged)?;
     let (grays, full_range) = match picture {

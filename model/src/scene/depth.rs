@@ -11,6 +11,16 @@ pub(super) struct DepthNumbers {
     pub(super) full_scale: Option<f32>,
 }
 
+impl DepthNumbers {
+    /// Makes of integers that a decoder stretched from `bits` to 8 those of the file.
+    pub(super) fn shrink_to(&mut self, bits: u8) {
+        let full_scale = f32::from((1_u16 << bits) - 1);
+        let stretch = 255.0 / full_scale;
+        self.values.iter_mut().for_each(|value| *value /= stretch);
+        self.full_scale = Some(full_scale);
+    }
+}
+
 /// How to read depth numbers.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct DepthReading {

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
-use holod_calibration::Resolution;
+use holod_calibration::{Resolution, png_grey_bits};
 use image::metadata::Orientation;
 use image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader};
 
@@ -44,9 +44,18 @@ pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
         Format::Other => {
             let (picture, turned) = decode(path)?;
             let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
-            Ok(DepthRaster { size, turned, numbers: depth_numbers(path, picture)?, is_luminance: false })
+            let bits = png_grey_bits(path).map_err(|source| read_error(path, source))?;
+            let mut numbers = depth_numbers(path, picture)?;
+            if let Some(bits @ ..8) = bits {
+                numbers.shrink_to(bits);
+            }
+            Ok(DepthRaster { size, turned, numbers, is_luminance: false })
         }
     }
+}
+
+fn read_error(path: &Path, source: std::io::Error) -> SceneError {
+    SceneError::Read { path: path.to_owned(), source, expected: FORMATS }
 }
 
 /// Whether a file is OpenEXR, by its first bytes.
@@ -56,7 +65,7 @@ pub(super) fn is_openexr(path: &Path) -> Result<bool, SceneError> {
 
 fn format_of(path: &Path) -> Result<Format, SceneError> {
     use std::io::Read;
-    let read_error = |source| SceneError::Read { path: path.to_owned(), source, expected: FORMATS };
+    let read_error = |source| read_error(path, source);
     let metadata = std::fs::metadata(path).map_err(read_error)?;
     if !metadata.is_file() {
         let found = if metadata.is_dir() { "a directory" } else { "no regular file" };
@@ -74,7 +83,7 @@ fn decode(path: &Path) -> Result<(DynamicImage, Orientation), SceneError> {
         found,
         expected: format!("{FORMATS}; the file may be damaged or cut short: export or copy it again"),
     };
-    let read_error = |source| SceneError::Read { path: path.to_owned(), source, expected: FORMATS };
+    let read_error = |source| read_error(path, source);
     let open = || -> Result<_, SceneError> {
         let reader = BufReader::new(File::open(path).map_err(read_error)?);
         ImageReader::new(reader).with_guessed_format().map_err(read_error)

@@ -143,6 +143,46 @@ fn sixteen_bit_colour_and_eight_bit_depth_are_read() {
     assert!((frame.depth_normalised[0] - 0.5 * 0.35).abs() < 1e-5);
 }
 
+/// A grey PNG of one row of 8 pixels of fewer than 8 bits, which are in `row`.
+fn few_bits(path: &Path, bits: u8, row: &[u8]) {
+    let chunk = |name: &[u8], data: &[u8]| {
+        let named = [name, data].concat();
+        let checksum = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(&named);
+        [&(data.len() as u32).to_be_bytes()[..], &named, &checksum.to_be_bytes()].concat()
+    };
+    let header = [&[0, 0, 0, 8, 0, 0, 0, 1, bits][..], &[0; 4]].concat();
+    // The row, unfiltered, as a block that is not compressed, and its Adler-32.
+    let line = [&[0], row].concat();
+    let (low, high) =
+        line.iter().fold((1_u32, 0), |(low, high), &byte| (low + u32::from(byte), high + low + u32::from(byte)));
+    let length = line.len() as u16;
+    let block = [&[0x78, 1, 1][..], &length.to_le_bytes(), &(!length).to_le_bytes(), &line].concat();
+    let data = [block, (high % 65521 << 16 | low % 65521).to_be_bytes().to_vec()].concat();
+    let chunks = [chunk(b"IHDR", &header), chunk(b"IDAT", &data), chunk(b"IEND", &[])].concat();
+    std::fs::write(path, [&b"\x89PNG\r\n\x1a\n"[..], &chunks].concat()).unwrap();
+}
+
+#[test]
+fn depths_of_few_bits_are_the_numbers_of_the_file() {
+    let files = Files::new();
+    let path = files.path("d.png");
+    for (bits, row, numbers) in [
+        (1, &[0b0110_0101][..], [0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0]),
+        (2, &[0b0001_1011, 0b1110_0100], [0.0, 1.0, 2.0, 3.0, 3.0, 2.0, 1.0, 0.0]),
+        (4, &[0x01, 0x23, 0x4e, 0xf1], [0.0, 1.0, 2.0, 3.0, 4.0, 14.0, 15.0, 1.0]),
+    ] {
+        few_bits(&path, bits, row);
+        let read = raster::read_depth(&path).unwrap().numbers;
+        assert_eq!(
+            (&read.values[..], read.full_scale),
+            (&numbers[..], Some(f32::from((1_u8 << bits) - 1))),
+            "{bits} bits"
+        );
+        let light = raster::read_colour(&path).unwrap().linear;
+        assert_eq!(light[numbers.iter().position(|number| Some(*number) == read.full_scale).unwrap()], 1.0);
+    }
+}
+
 #[test]
 fn depths_beyond_the_display_are_clamped_and_counted() {
     let files = Files::new();
