@@ -16,8 +16,8 @@
 //! ```
 //!
 //! PNG and JPEG are decoded from sRGB once, and each is turned by its own EXIF orientation; OpenEXR is linear already.
-//! NaN, lengths that are not positive and OpenEXR pixels outside the data window have no depth and are filled from
-//! their surroundings.
+//! NaN, lengths that are not positive, wholly transparent pixels of a PNG and pixels outside the data window of an
+//! OpenEXR have no depth and are filled from their surroundings.
 
 mod array;
 mod clipped;

@@ -135,29 +135,39 @@ fn linear_planes(picture: &DynamicImage) -> Vec<f32> {
     planes
 }
 
-/// The numbers of a grey picture, or of a coloured one whose colours are equal everywhere.
+/// The numbers of a grey picture, or of a coloured one whose colours are equal everywhere. Where nothing is drawn, as
+/// alpha is 0, there is none.
 fn depth_numbers(path: &Path, picture: DynamicImage) -> Result<DepthNumbers, SceneError> {
     let coloured = || SceneError::Picture {
         path: path.to_owned(),
         found: "a picture whose red, green and blue differ".into(),
         expected: "depth as one grey channel; a colour-mapped depth picture cannot be read: export the numbers".into(),
     };
-    fn grey<T: Copy + PartialEq + Into<f32>, const N: usize>(pixels: impl Iterator<Item = [T; N]>) -> Option<Vec<f32>> {
-        let number = |pixel: [T; N]| (pixel[0] == pixel[1] && pixel[1] == pixel[2]).then(|| pixel[0].into());
-        pixels.map(number).collect()
-    }
     let (values, full_scale) = match picture {
-        DynamicImage::ImageLuma8(picture) => (Some(picture.into_raw().into_iter().map(f32::from).collect()), 255.0),
-        DynamicImage::ImageLuma16(picture) => (Some(picture.into_raw().into_iter().map(f32::from).collect()), 65535.0),
-        DynamicImage::ImageLumaA8(picture) => (Some(picture.pixels().map(|pixel| pixel.0[0].into()).collect()), 255.0),
-        DynamicImage::ImageLumaA16(picture) => {
-            (Some(picture.pixels().map(|pixel| pixel.0[0].into()).collect()), 65535.0)
-        }
-        DynamicImage::ImageRgb8(picture) => (grey(picture.pixels().map(|pixel| pixel.0)), 255.0),
-        DynamicImage::ImageRgba8(picture) => (grey(picture.pixels().map(|pixel| pixel.0)), 255.0),
-        DynamicImage::ImageRgb16(picture) => (grey(picture.pixels().map(|pixel| pixel.0)), 65535.0),
-        DynamicImage::ImageRgba16(picture) => (grey(picture.pixels().map(|pixel| pixel.0)), 65535.0),
+        DynamicImage::ImageLuma8(picture) => (numbers(picture.pixels().map(|pixel| pixel.0)), 255.0),
+        DynamicImage::ImageLumaA8(picture) => (numbers(picture.pixels().map(|pixel| pixel.0)), 255.0),
+        DynamicImage::ImageRgb8(picture) => (numbers(picture.pixels().map(|pixel| pixel.0)), 255.0),
+        DynamicImage::ImageRgba8(picture) => (numbers(picture.pixels().map(|pixel| pixel.0)), 255.0),
+        DynamicImage::ImageLuma16(picture) => (numbers(picture.pixels().map(|pixel| pixel.0)), 65535.0),
+        DynamicImage::ImageLumaA16(picture) => (numbers(picture.pixels().map(|pixel| pixel.0)), 65535.0),
+        DynamicImage::ImageRgb16(picture) => (numbers(picture.pixels().map(|pixel| pixel.0)), 65535.0),
+        DynamicImage::ImageRgba16(picture) => (numbers(picture.pixels().map(|pixel| pixel.0)), 65535.0),
         _ => return Err(coloured()),
     };
     Ok(DepthNumbers { values: values.ok_or_else(coloured)?, full_scale: Some(full_scale) })
+}
+
+/// The number of each pixel of one grey or three colours, and an alpha where their count is even; NaN where that is 0.
+/// `None` where colours differ.
+fn numbers<T: Copy + Default + PartialEq + Into<f32>, const CHANNELS: usize>(
+    pixels: impl Iterator<Item = [T; CHANNELS]>,
+) -> Option<Vec<f32>> {
+    let number = |pixel: [T; CHANNELS]| {
+        let (colours, alpha) = pixel.split_at((CHANNELS - 1) | 1);
+        if alpha.first() == Some(&T::default()) {
+            return Some(f32::NAN);
+        }
+        colours.iter().all(|colour| *colour == colours[0]).then(|| colours[0].into())
+    };
+    pixels.map(number).collect()
 }

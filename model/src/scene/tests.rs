@@ -8,7 +8,7 @@ use exr::math::Vec2;
 use exr::meta::attribute::{IntegerBounds, Text};
 use exr::meta::header::{ImageAttributes, LayerAttributes};
 use exr::prelude::{Encoding, WritableImage};
-use image::{ImageBuffer, Luma, Rgb};
+use image::{ImageBuffer, Luma, LumaA, Rgb, Rgba};
 
 use super::*;
 
@@ -181,6 +181,32 @@ fn depths_of_few_bits_are_the_numbers_of_the_file() {
         let light = raster::read_colour(&path).unwrap().linear;
         assert_eq!(light[numbers.iter().position(|number| Some(*number) == read.full_scale).unwrap()], 1.0);
     }
+}
+
+#[test]
+fn a_depth_that_is_wholly_transparent_is_none() {
+    let files = Files::new();
+    let path = files.path("d.png");
+    let depths = || {
+        let numbers = raster::read_depth(&path).unwrap().numbers.values;
+        numbers.iter().map(|number| (!number.is_nan()).then_some(*number as u32)).collect::<Vec<_>>()
+    };
+    let [there, faint, gone] = [65535_u16, 1, 0];
+    let alpha = |x: u32| [there, faint, gone, gone][x as usize];
+    let seen = [Some(500), Some(501), None, None];
+    ImageBuffer::from_fn(4, 1, |x, _| LumaA([500 + x as u16, alpha(x)])).save(&path).unwrap();
+    assert_eq!(depths(), seen);
+    // What colour a pixel has that is not drawn says nothing.
+    let colours = |x: u32| [500 + x as u16, 500 + x as u16, if x == 3 { 9 } else { 500 + x as u16 }, alpha(x)];
+    ImageBuffer::from_fn(4, 1, |x, _| Rgba(colours(x))).save(&path).unwrap();
+    assert_eq!(depths(), seen);
+    ImageBuffer::from_fn(4, 1, |x, _| LumaA([50 + x as u8, alpha(x).min(255) as u8])).save(&path).unwrap();
+    assert_eq!(depths(), [Some(50), Some(51), None, None]);
+
+    files.colour8("c.png", 4, 1, |_, _| [9; 3]);
+    ImageBuffer::from_fn(4, 1, |x, _| LumaA([500 + x as u16, alpha(x)])).save(&path).unwrap();
+    files.describe(MILLIMETRES);
+    assert_eq!(files.open().load(0, &BENCH, None, Fit::Native).unwrap().1.depth_missing_px, 2);
 }
 
 #[test]
