@@ -1,4 +1,4 @@
-//! What `holod render` says of its scene.
+//! What `holod render` says of its scene, and where what it made can be looked at.
 
 use std::fs;
 use std::path::Path;
@@ -7,6 +7,7 @@ use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_model::LinearImage;
 use holod_model::scene::FocalStack;
 use holod_tests::daemon::run;
+use holod_tests::small_rig;
 use serde_json::Value;
 
 use crate::HOLOD;
@@ -55,4 +56,26 @@ fn what_was_clipped_and_how_deep_the_scene_is_are_told_without_the_padding() {
     for said in ["13 of 1280 pixels are brighter than white", "14 of 1280 pixels have a colour below 0"] {
         assert!(ended.stderr.contains(said), "`{said}` is not in: {}", ended.stderr);
     }
+}
+
+#[test]
+fn a_hologram_of_another_rig_is_looked_at_with_that_rig_only() {
+    let folder = holod_tests::new_folder();
+    for (name, width) in [("small.toml", 64), ("wide.toml", 96)] {
+        fs::write(folder.path().join(name), small_rig(width, 64, "driver = \"simulated\"")).unwrap();
+    }
+    let render = ["render", "--config", "wide.toml", "--resolution", "96x48", "--pupil", "3", "--weights", "fast"];
+    let ended = run(HOLOD, &[&render[..], &["--backend", "cpu", "--out", "wide"]].concat(), folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    let view = |rig| {
+        let args = ["view", "--hologram", "wide", "--config", rig, "--focus", "1", "--out", "seen.png"];
+        run(HOLOD, &args, folder.path())
+    };
+    let refused = view("small.toml");
+    assert_eq!(refused.status.code(), Some(64));
+    for said in ["--hologram wide: found a hologram of 96x48", "panel of 64x64", "by --config FILE"] {
+        assert!(refused.stderr.contains(said), "`{said}` is not in: {}", refused.stderr);
+    }
+    let seen = view("wide.toml");
+    assert!(seen.status.success(), "{seen:?}");
 }

@@ -56,6 +56,7 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
     let looked_at = match (&args.hologram, args.pupil) {
         (Some(folder), _) => {
             let hologram = load(folder)?;
+            check_fits(folder, &hologram, &rig)?;
             progress::during("computing the panel's levels", || of_hologram(&rig, hologram))?
         }
         (None, Some(pupil)) => of_scene(&rig, &args.scene, pupil, args.backend)?,
@@ -111,6 +112,22 @@ fn load(folder: &Path) -> Result<StoredHologram, Failure> {
         ));
     }
     StoredHologram::load(&path).map_err(Failure::because(Exit::Data))
+}
+
+/// Refuses a hologram that is larger than the rig's panel: it was made with another rig.
+fn check_fits(folder: &Path, stored: &StoredHologram, rig: &Rig) -> Result<(), Failure> {
+    let (hologram, panel) = (stored.hologram.resolution, rig.resolution());
+    if hologram.width <= panel.width && hologram.height <= panel.height {
+        return Ok(());
+    }
+    Err(Failure::new(
+        Exit::Usage,
+        format!(
+            "--hologram {}: found a hologram of {hologram}, larger than this rig's panel of {panel}; name the rig that \
+             it was made with by --config FILE",
+            folder.display()
+        ),
+    ))
 }
 
 /// The phases that the panel shows of a scene's first frame.
