@@ -107,7 +107,7 @@ pub(super) fn describe(spec: &str, encoding: Option<DepthEncoding>) -> Result<De
     if path.extension().is_some_and(|extension| extension == "toml") {
         return read_scene_file(path, encoding);
     }
-    let pair = if path.exists() { None } else { spec.split_once(',') };
+    let pair = if path.exists() { None } else { pair(spec)? };
     let (colour, depth) = pair.map_or((path, path), |(colour, depth)| (Path::new(colour), Path::new(depth)));
     if pair.is_none() {
         single_file(path)?;
@@ -132,6 +132,24 @@ pub(super) fn describe(spec: &str, encoding: Option<DepthEncoding>) -> Result<De
         fps: None,
         sequence_line: 1,
     })
+}
+
+/// The two files of COLOUR,DEPTH. Of several commas it is the one beside which there are two files.
+fn pair(spec: &str) -> Result<Option<(&str, &str)>, SceneError> {
+    let parted: Vec<_> = spec.match_indices(',').map(|(at, _)| (&spec[..at], &spec[at + 1..])).collect();
+    if parted.len() < 2 {
+        return Ok(parted.first().copied());
+    }
+    let are_there = |(colour, depth): &&(&str, &str)| Path::new(colour).is_file() && Path::new(depth).is_file();
+    let there: Vec<_> = parted.iter().filter(are_there).collect();
+    match there[..] {
+        [one] => Ok(Some(*one)),
+        _ => Err(SceneError::Kind {
+            path: spec.into(),
+            found: format!("{} commas, beside {} of which there are two files", parted.len(), there.len()),
+            expected: "COLOUR,DEPTH: correct the names, or name files with a comma in a scene.toml",
+        }),
+    }
 }
 
 /// What a scene can be, for errors.
@@ -400,6 +418,34 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn names_with_a_comma_are_parted_where_both_files_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name).display().to_string();
+        let write = |name: &str| std::fs::write(at(name), b"x").unwrap();
+        let described = |colour: &str, depth: &str| -> Result<_, SceneError> {
+            let described = describe(&format!("{},{}", at(colour), at(depth)), Some(DepthEncoding::Metres))?;
+            Ok([described.colour.path(0), described.depth.path(0)].map(|path| path.display().to_string()))
+        };
+        ["my,c.png", "d.png", "c.png", "the,d,.png"].into_iter().for_each(write);
+        for (colour, depth) in [("my,c.png", "d.png"), ("c.png", "the,d,.png"), ("my,c.png", "the,d,.png")] {
+            assert_eq!(described(colour, depth).unwrap(), [at(colour), at(depth)]);
+        }
+        let missing = described("my,c.png", "nowhere.png").unwrap_err().to_string();
+        assert!(missing.contains("2 commas, beside 0 of which") && missing.contains("scene.toml"), "{missing}");
+        // `c` and `d.png,e.png` as well as `c,d.png` and `e.png`, beside each other.
+        let spec = format!("{},{},{}", at("c"), at("d.png"), at("e.png"));
+        for name in
+            [at("c"), format!("{},{}", at("d.png"), at("e.png")), format!("{},{}", at("c"), at("d.png")), at("e.png")]
+        {
+            let path = Path::new(&name);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, b"x").unwrap();
+        }
+        let ambiguous = describe(&spec, Some(DepthEncoding::Metres)).unwrap_err().to_string();
+        assert!(ambiguous.contains("2 commas, beside 2 of which"), "{ambiguous}");
     }
 
     #[test]
