@@ -165,7 +165,7 @@ pub struct SceneArgs {
     /// How a picture of another size is brought to --resolution.
     #[arg(long, value_enum, default_value_t = FitArg::Native)]
     pub fit: FitArg,
-    /// Size of the hologram in panel pixels; the scene's own size when left out.
+    /// Size of the hologram in panel pixels; when left out the scene's own, and for a feed the panel's.
     #[arg(long, value_name = "WxH", value_parser = parse_resolution)]
     pub resolution: Option<Resolution>,
 }
