@@ -92,7 +92,7 @@ struct SceneFile {
     near_dpt: Option<Spanned<f64>>,
     depth_scale: Option<Spanned<f64>>,
     depth_missing: Option<f64>,
-    first: Option<u64>,
+    first: Option<Spanned<u64>>,
     step: Option<Spanned<u64>>,
     count: Option<Spanned<u64>>,
     fps: Option<Spanned<f64>>,
@@ -284,9 +284,10 @@ fn parse(path: &Path, text: &str, named: Option<DepthEncoding>) -> Result<Descri
     };
     let numbered_key = file.depth.as_ref().filter(|_| !colour.numbered()).unwrap_or(&file.colour);
     let sequence_line = line_at(text, numbered_key.span().start);
-    let (first, step) = (file.first.unwrap_or(0), file.step.map_or(1, Spanned::into_inner));
+    let first = file.first.as_ref().map_or(0, |first| *first.get_ref());
+    let step = file.step.as_ref().map_or(1, |step| *step.get_ref());
     let numbered = colour.numbered() || depth.numbered();
-    let frames = match file.count {
+    let frames = match &file.count {
         Some(count) if !(1..=MOST_FRAMES).contains(count.get_ref()) => {
             let expected = format!("1 to {MOST_FRAMES}");
             return Err(error_at(count.span().start, "count", count.get_ref().to_string(), &expected));
@@ -295,7 +296,7 @@ fn parse(path: &Path, text: &str, named: Option<DepthEncoding>) -> Result<Descri
             let expected = "1, or a {} for the frame's number in colour or depth";
             return Err(error_at(count.span().start, "count", count.get_ref().to_string(), expected));
         }
-        Some(count) => count.into_inner(),
+        Some(count) => *count.get_ref(),
         None if numbered => {
             let there = |index: u64| {
                 let number = first.saturating_add(index.saturating_mul(step));
@@ -306,8 +307,14 @@ fn parse(path: &Path, text: &str, named: Option<DepthEncoding>) -> Result<Descri
         }
         None => 1,
     };
-    if first.checked_add((frames - 1).saturating_mul(step)).is_none() {
-        return Err(error_at(0, "first", first.to_string(), "frame numbers below 2^64"));
+    let last = (frames - 1).checked_mul(step).and_then(|distance| first.checked_add(distance));
+    if last.is_none() {
+        // The largest of them, most likely, is the one that is not meant.
+        let keys = [("first", &file.first), ("step", &file.step), ("count", &file.count)];
+        let given = keys.into_iter().filter_map(|(key, value)| Some((key, value.as_ref()?)));
+        let (key, value) = given.max_by_key(|(_, value)| *value.get_ref()).expect("nothing overflows by itself");
+        let found = format!("{} for the {frames} frames {first}, {first} + {step} and so on", value.get_ref());
+        return Err(error_at(value.span().start, key, found, "frame numbers below 2^64"));
     }
     Ok(Description {
         path: path.to_owned(),
@@ -388,6 +395,16 @@ mod tests {
         assert_refused(&encoded("step = 0"), 4, &["`step`"]);
         assert_refused(&encoded("count = 3"), 4, &["`count`", "{}"]);
         assert_refused(&encoded("count = 0"), 4, &["`count`"]);
+        // Numbers up to 2^63 - 1 are TOML.
+        let numbered = |rest: &str| encoded(rest).replace("c.png", "c{}.png");
+        let large = i64::MAX;
+        let says = |key| [key, "frame numbers below 2^64"];
+        assert_refused(&numbered(&format!("count = 4\nstep = {large}")), 5, &says("`step`: found 9223372036854775807"));
+        assert_refused(
+            &numbered(&format!("first = {large}\ncount = 20000\nstep = 900000000000000")),
+            4,
+            &says("`first`"),
+        );
         assert_refused("colour = \"{x}.png\"\ndepth_encoding = \"metres\"", 1, &["`colour`", "{x}"]);
         assert_refused("colour = ", 1, &["scene"]);
     }
