@@ -190,7 +190,8 @@ impl Stream {
     pub(super) fn copy_out(&mut self, picture: &Picture, copied: &mut Copied) -> Result<(), TakeError> {
         let Layout { slot_bytes, colour_bytes, depth_bytes, .. } = self.layout;
         if !self.is_allocated[picture.slot] {
-            // What its client has not written is not there yet, and there may be no memory for it.
+            // What its client has not written is not there yet, and there may be no memory for it. Asked for again
+            // before each copy it would take half as long as the copy, and a client could still be faster.
             let begin = picture.slot * slot_bytes;
             rustix::io::retry_on_intr(|| {
                 fallocate(&self.memory, FallocateFlags::empty(), begin as u64, slot_bytes as u64)
@@ -214,7 +215,9 @@ impl Stream {
         // SAFETY: what is read lies within the mapping, which lives as long as `self` and cannot be made shorter (it is
         // sealed). No reference into it is made. A client that breaks the rules may write meanwhile, and then the copy
         // holds some of its old and some of its new bytes: of bytes, and of all that is made of them, every value is
-        // allowed.
+        // allowed. It may also punch holes into it, which only a seal against its own writing would forbid: to read one
+        // takes new memory, of zeros, never more than it had given back. Where the machine has none left the kernel
+        // ends this process (out of memory, or by SIGBUS), as it may at any new page; nothing undefined is read.
         unsafe { std::ptr::copy_nonoverlapping(self.mapped.as_ptr().add(at), part.as_mut_ptr(), part.len()) }
     }
 

@@ -438,6 +438,24 @@ fn shared_memory_cannot_be_made_shorter_under_holod() {
 }
 
 #[test]
+fn memory_that_a_client_gives_back_is_read_as_zeros() {
+    use rustix::fs::{FallocateFlags, fallocate, fstat};
+
+    let mut bench = Bench::new();
+    let mut client = bench.client("holes");
+    assert_eq!(send(&mut client, 0, 1, 255).0, TAKEN);
+    bench.shown_next(1);
+    let memory = client.memory().unwrap();
+    let punch = FallocateFlags::PUNCH_HOLE | FallocateFlags::KEEP_SIZE;
+    fallocate(memory, punch, 0, fstat(memory).unwrap().st_size as u64).unwrap();
+    client.hand_over(0, 2, 0).unwrap();
+    let Answer::Free { outcome, text, .. } = client.answer() else { panic!() };
+    assert_eq!((outcome, text.as_str()), (REFUSED, "found no pixel with a valid depth, expected millimetres above 0"));
+    assert_eq!(send(&mut client, 0, 3, 0).0, TAKEN, "and written anew");
+    assert_eq!(bench.shown_next(3).0.amplitude[0], 0.0);
+}
+
+#[test]
 fn a_client_that_never_reads_is_shown_out_and_nobody_waits_for_it() {
     let mut bench = Bench::new();
     let deaf = bench.client("deaf");
