@@ -29,9 +29,9 @@ pub(crate) use self::sources::{
 pub struct FrameRecord {
     /// Number of the frame.
     pub frame: u64,
-    /// Host time of the newest tracker sample behind the estimate, where there is one.
+    /// Host time of the newest tracker sample that the estimate rests on, a believed one, where there is one.
     pub t_sample: Option<TimeNs>,
-    /// That sample's diameter as the tracker gave it.
+    /// That sample's diameter as measured, scaled to millimetres.
     pub pupil_raw_mm: Option<f32>,
     /// The estimate for the time at which the frame's light arrives, for which the hologram was computed.
     pub pupil: PupilDiameter,

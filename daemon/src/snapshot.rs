@@ -33,7 +33,7 @@ pub struct Figures {
     pub speed_advice: Option<String>,
     /// From waking to the submitted levels.
     pub frame_time: Option<Spread>,
-    /// From the newest tracker sample behind a frame to the middle of its first light.
+    /// From the newest believed tracker sample behind a frame to the middle of its first light.
     pub sample_to_photon: Option<Spread>,
     /// From when a feed's client took a picture to the middle of its first light.
     pub picture_to_photon: Option<Spread>,

@@ -63,7 +63,11 @@ fn holod(record: Option<RecordFiles>) -> Vec<Duration> {
     let settings = rig::Tracker { eye: rig::Eye::Left, ..rig::Rig::default().tracker };
     let options = TrackerOptions { record, ..TrackerOptions::from(host_now()) };
     let mut handle: TrackerHandle = Tracker::start(&spec, &settings, options).expect("starts");
-    measure(&mut tracker, |_, diameter_mm| handle.estimate.pupil_at(host_now()).raw_mm == Some(diameter_mm))
+    let mut before = None;
+    measure(&mut tracker, |_, _| {
+        let t_heard = handle.estimate.pupil_at(host_now()).t_heard;
+        t_heard > std::mem::replace(&mut before, t_heard)
+    })
 }
 
 fn bare() -> Vec<Duration> {

@@ -110,10 +110,13 @@ pub struct PupilEstimate {
     pub pupil: PupilDiameter,
     /// What it rests on.
     pub state: PupilState,
-    /// Latest sample as measured, scaled, believed or not.
-    pub raw_mm: Option<f32>,
-    /// When that sample was taken.
+    /// When the newest sample was taken that the estimate rests on, one that is believed; nothing in the fallback, which
+    /// rests on none.
     pub t_sample: Option<TimeNs>,
+    /// That sample's diameter as measured, scaled to millimetres.
+    pub raw_mm: Option<f32>,
+    /// When the newest sample was taken that came of an eye that drives the display, believed or not.
+    pub t_heard: Option<TimeNs>,
     /// Rate of change of `pupil`, mm/s.
     pub velocity_mm_per_s: f32,
 }
@@ -136,11 +139,20 @@ pub struct EstimateSnapshot {
     lost: bool,
     /// Difference between what was shown and the motion, and when; worked off at the return speed.
     blend: Blend,
-    raw: Option<(TimeNs, f32)>,
+    /// The newest believed sample of the eyes that are combined.
+    believed: Option<Measured>,
+    t_heard: Option<TimeNs>,
     /// A last believed sample older than this is held.
     silence: TimeNs,
     clock: StreamClock,
     settings: EstimatorSettings,
+}
+
+/// A sample as measured, scaled to millimetres.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Measured {
+    t: TimeNs,
+    diameter_mm: f32,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -194,7 +206,8 @@ impl EstimateSnapshot {
             motion: None,
             lost: false,
             blend: Blend::NONE,
-            raw: None,
+            believed: None,
+            t_heard: None,
             silence: settings.silence,
             clock: StreamClock::LIVE,
             settings,
@@ -204,11 +217,13 @@ impl EstimateSnapshot {
     /// The pupil at host time `t`, which may lie in the future. Pure: no clock is read, nothing is allocated.
     pub fn pupil_at(&self, t: TimeNs) -> PupilEstimate {
         let shown = self.shown_at(self.clock.to_stream(t));
+        let believed = self.believed.filter(|_| shown.state != PupilState::Fallback);
         PupilEstimate {
             pupil: PupilDiameter::from_mm(shown.diameter_mm),
             state: shown.state,
-            raw_mm: self.raw.map(|(_, raw_mm)| raw_mm),
-            t_sample: self.raw.map(|(t_sample, _)| self.clock.to_host(t_sample)),
+            t_sample: believed.map(|sample| self.clock.to_host(sample.t)),
+            raw_mm: believed.map(|sample| sample.diameter_mm),
+            t_heard: self.t_heard.map(|t_heard| self.clock.to_host(t_heard)),
             velocity_mm_per_s: shown.velocity_mm_per_s * self.clock.rate as f32,
         }
     }
@@ -295,6 +310,8 @@ struct Shown {
 struct Channel {
     gate: Gate,
     filter: Filter,
+    /// The newest sample that the filter has taken.
+    believed: Option<Measured>,
     /// Added to this eye's diameter to give the mean of the eyes, as learnt while there were two.
     to_mean_mm: f32,
     /// Trusted now: believed at least once, and neither a bad sample nor a long silence since.
@@ -311,6 +328,7 @@ impl Channel {
         Self {
             gate: Gate::new(settings.gate),
             filter: Filter::new(settings.filter),
+            believed: None,
             to_mean_mm: 0.0,
             live: false,
             t_changed: TimeNs(0),
@@ -394,6 +412,7 @@ impl Estimator {
         let mut believed = false;
         while let Some(ripe) = channel.gate.ripe(t) {
             channel.filter.update(ripe.t_sample, ripe.diameter_mm, channel.gate.noise_mm());
+            channel.believed = Some(Measured { t: ripe.t_sample, diameter_mm: ripe.diameter_mm });
             believed = true;
             on_decision(Decision { sample: ripe, verdict: Verdict::Accepted });
         }
@@ -423,9 +442,7 @@ impl Estimator {
         let channel = &self.channels[sample.eye.index()];
         self.snapshot.silence = settings.silence.max(settings.gate.lead + channel.gate.usual_silence());
 
-        if self.snapshot.raw.is_none_or(|(latest, _)| t >= latest) {
-            self.snapshot.raw = Some((t, sample.diameter_mm));
-        }
+        self.snapshot.t_heard = self.snapshot.t_heard.max(Some(t));
         if believed || set_changed {
             self.learn_eye_offsets();
             self.combine(t_known.max(t), set_changed);
@@ -516,6 +533,7 @@ impl Estimator {
             self.snapshot.lost = true;
             return;
         };
+        let believed = live().filter_map(|channel| channel.believed).max_by_key(|sample| sample.t);
         let alone = live().count() == 1 && self.snapshot.settings.eye == rig::Eye::Both;
         let mut sum = (0.0, 0.0, 0.0_f32);
         for channel in live() {
@@ -542,6 +560,7 @@ impl Estimator {
                 Blend { t, excess_mm: shown.diameter_mm - motion.at(t).diameter_mm, acquires }
             };
         }
+        self.snapshot.believed = believed;
         self.snapshot.motion = Some(motion);
         self.snapshot.lost = false;
     }

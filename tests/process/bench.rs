@@ -1,5 +1,6 @@
 //! `holod bench`: what it measures and prints, at a size that is measured in no time. No speed is asserted.
 
+use holod_pupil_input::GateSettings;
 use holod_tests::daemon::run;
 use serde_json::Value;
 
@@ -52,6 +53,9 @@ fn bench_measures_stages_the_frame_both_ceilings_and_the_loop() {
     for time in ["frame_time", "sample_to_photon"] {
         assert!(above_zero(&in_loop[time]["median_ms"]), "{time}: {report}");
     }
+    let lead_ms = GateSettings::default().lead.seconds() * 1e3;
+    let latency_ms = in_loop["sample_to_photon"]["median_ms"].as_f64().unwrap();
+    assert!(latency_ms > lead_ms, "no younger sample is believed: {report}");
 }
 
 #[test]

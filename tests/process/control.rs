@@ -225,7 +225,8 @@ fn patterns_take_the_place_of_holograms_and_make_way_again() {
     // The order's time is taken before the change is handed over, so that a few more holograms come.
     let during: Vec<_> = rests_on_a_sample(began..ended).into_iter().skip_while(|rests| *rests).collect();
     assert!(during.len() > 40 && during.iter().all(|rests| !rests), "a pattern rests on no sample");
-    let before = rests_on_a_sample(0..began);
+    // The run's first frames are for the fallback: a sample is believed after 30 ms.
+    let before: Vec<_> = rests_on_a_sample(0..began).into_iter().skip_while(|rests| !rests).collect();
     assert!(!before.is_empty() && before.iter().all(|rests| *rests));
 }
 

@@ -7,7 +7,9 @@ use std::time::{Duration, Instant};
 
 use holod_calibration::TimeNs;
 use holod_pupil_input::wire::line::{LineSample, encode_line};
-use holod_pupil_input::{MOCK_SEED, MockSource, PupilSample, Recording, STATED_LAG, SampleEye, Scenario, host_now};
+use holod_pupil_input::{
+    GateSettings, MOCK_SEED, MockSource, PupilSample, Recording, STATED_LAG, SampleEye, Scenario, host_now,
+};
 use holod_tests::daemon::{Daemon, wait_until};
 use holod_tests::frames::{self, FieldRow};
 use holod_tests::tracker::{PtyTracker, TimedLine};
@@ -149,6 +151,21 @@ fn the_display_follows_the_eye_and_holds_through_blinks() {
     assert!(canary_mm > 2.0 * median_mm, "the judge must object to an eye that is 0.6 s off: {canary_mm}");
     let blinked = rows.iter().filter(|row| row.pupil_state == "holding").count();
     assert!(blinked > 20, "blinks are held: {blinked} fields");
+
+    // How long before its light the sample was taken that a field's pupil rests on: longer through a blink.
+    let ages = |state: &str| -> Vec<TimeNs> {
+        let rows = rows.iter().filter(|row| row.pupil_state == state);
+        let mut ages: Vec<_> = rows.filter_map(|row| Some(TimeNs(row.laser_on_ns? - row.t_sample_ns?))).collect();
+        ages.sort();
+        ages
+    };
+    let [tracked, held] = ["tracking", "holding"].map(ages);
+    let lead = GateSettings::default().lead;
+    let young = |ages: &[TimeNs], newer: TimeNs| ages.iter().filter(|age| **age - newer < lead).count();
+    assert_eq!(young(&tracked, TimeNs(0)) + young(&held, TimeNs(0)), 0, "a sample that cannot be believed yet");
+    assert!(young(&tracked, TimeNs(300_000_000)) > 0, "the judge must object to samples that are newer");
+    let [tracked_median, held_longest] = [tracked[tracked.len() / 2], held[held.len() - 1]];
+    assert!(held_longest - tracked_median > TimeNs(80_000_000), "{held_longest:?} {tracked_median:?}");
 }
 
 #[test]
@@ -248,8 +265,10 @@ fn shared_data_neon_recording_through_a_port_holds_through_both_blinks() {
     let during: Vec<&FieldRow> =
         rows.iter().filter(|row| row.t_present_ns > t_first.0 + 500_000_000 && row.pupil_state != "fallback").collect();
     let lowest = during.iter().map(|row| row.pupil_mm).fold(f64::MAX, f64::min);
-    let raw_lowest = during.iter().filter_map(|row| row.pupil_raw_mm).fold(f64::MAX, f64::min);
-    assert!(raw_lowest < 2.9, "the raw samples that the frames saw fall in the blinks: {raw_lowest}");
+    let raw_lowest = samples.iter().map(|sample| sample.diameter_mm).fold(f32::MAX, f32::min);
+    assert!(raw_lowest < 2.9, "the raw samples fall in the blinks: {raw_lowest}");
+    let believed_lowest = during.iter().filter_map(|row| row.pupil_raw_mm).fold(f64::MAX, f64::min);
+    assert!(believed_lowest >= 3.0, "a frame rests on a sample of {believed_lowest} mm");
     assert!(lowest >= 3.0, "the estimate fell to {lowest} mm");
     let start = samples[0].t_sample;
     let open = |t: TimeNs| {

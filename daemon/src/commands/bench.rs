@@ -82,7 +82,7 @@ struct ClosedLoop {
     panel_frames_hz: f64,
     /// From waking to the submitted levels.
     frame_time: Option<Spread>,
-    /// From the newest tracker sample behind a frame to the middle of its first light.
+    /// From the newest believed tracker sample behind a frame to the middle of its first light.
     sample_to_photon: Option<Spread>,
 }
 

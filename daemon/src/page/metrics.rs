@@ -35,7 +35,7 @@ pub(super) fn registry(live: &Arc<Live>) -> Registry {
     registry.register_with_unit("frame", "From waking to the submitted levels", seconds(), frame.clone());
     registry.register_with_unit(
         "sample_to_photon",
-        "From the newest tracker sample behind a frame to the middle of its first light",
+        "From the newest believed tracker sample behind a frame to the middle of its first light",
         seconds(),
         sample_to_photon.clone(),
     );

@@ -68,7 +68,7 @@ pub struct FirstLight {
     pub frame: u64,
     /// The middle of its first lit field.
     pub t: TimeNs,
-    /// Since the newest tracker sample behind it.
+    /// Since the newest tracker sample that its pupil rests on.
     pub sample_to_photon: Option<TimeNs>,
     /// Since a feed's client took its picture; of a picture that is shown for another pupil again, nothing.
     pub picture_to_photon: Option<TimeNs>,

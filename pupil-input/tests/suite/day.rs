@@ -3,7 +3,7 @@
 
 use crate::support::settings;
 use holod_calibration::{TimeNs, rig};
-use holod_pupil_input::{ClockModel, Estimator, PupilEstimate, PupilSample, PupilState, SampleEye};
+use holod_pupil_input::{ClockModel, Estimator, GateSettings, PupilEstimate, PupilSample, PupilState, SampleEye};
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -92,8 +92,11 @@ impl Judge {
         if !(1.0..=9.0).contains(&mm) {
             self.object(format!("{mm} mm at {now}"));
         }
-        if estimate.t_sample.is_some_and(|t_sample| t_sample.0 > now) {
+        if estimate.t_heard.is_some_and(|t_heard| t_heard.0 > now) {
             self.object(format!("a sample of the future at {now}: {estimate:?}"));
+        }
+        if estimate.t_sample.is_some_and(|t_sample| TimeNs(now) - t_sample < GateSettings::default().lead) {
+            self.object(format!("a sample that cannot be believed yet at {now}: {estimate:?}"));
         }
         if let Some((before, last)) = self.last.replace((now, estimate)) {
             let step_mm = (mm - last.pupil.mm()).abs();
@@ -102,7 +105,8 @@ impl Judge {
             if step_mm > Self::MOST_A_FRAME_MM && now > BEGINS + S / 2 {
                 self.object(format!("{step_mm} mm from {before} to {now}: {last:?}, {estimate:?}"));
             }
-            if estimate.t_sample < last.t_sample {
+            // The fallback rests on none.
+            if estimate.t_sample.zip(last.t_sample).is_some_and(|(this, before)| this < before) {
                 self.object(format!("an older sample: {last:?}, {estimate:?}"));
             }
         }
@@ -292,6 +296,10 @@ fn canary_the_judge_objects_to_one_jump_and_to_one_wrong_time() {
     assert_eq!(frames(&[estimate, moved(0.5)]), 1);
     let older = PupilEstimate { t_sample: estimate.t_sample.map(|t| t - TimeNs(1)), ..estimate };
     assert_eq!(frames(&[estimate, older]), 1);
+    let newest = PupilEstimate { t_sample: Some(TimeNs(now - 20 * MS)), ..estimate };
+    assert_eq!(frames(&[newest]), 1);
+    let unborn = PupilEstimate { t_heard: Some(TimeNs(now + 1)), ..estimate };
+    assert_eq!(frames(&[unborn]), 1);
     let mut judge = Judge::new();
     judge.frame(now, moved(0.0), true);
     let followed = judge.faults.len();

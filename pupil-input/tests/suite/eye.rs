@@ -3,8 +3,8 @@
 use crate::support::settings;
 use holod_calibration::{PupilDiameter, TimeNs, rig};
 use holod_pupil_input::{
-    Decision, Estimator, EstimatorSettings, MockSource, PupilSample, PupilState, Rejection, STATED_LAG, SampleEye,
-    Scenario, Verdict,
+    Decision, Estimator, EstimatorSettings, GateSettings, MockSource, PupilEstimate, PupilSample, PupilState,
+    Rejection, STATED_LAG, SampleEye, Scenario, Verdict,
 };
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -355,7 +355,105 @@ fn only_the_chosen_eye_counts_and_the_scale_is_applied() {
     let estimate = estimator.pupil_at(TimeNs(2_000_000_000));
     assert!((estimate.pupil.mm() - 4.0).abs() < 1e-3);
     assert_eq!(estimate.raw_mm, Some(4.0));
-    assert_eq!(estimate.t_sample, Some(TimeNs(2_000_000_000)));
+    // What came in the gate's 30 ms is heard, and nothing rests on it yet.
+    assert_eq!(estimate.t_sample, Some(TimeNs(1_970_000_000)));
+    assert_eq!(estimate.t_heard, Some(TimeNs(2_000_000_000)));
+}
+
+/// What is wrong with the samples that estimates of their times are said to rest on, given those that were believed.
+fn faults_of_samples(estimates: &[(TimeNs, PupilEstimate)], believed: &[(TimeNs, f32)]) -> Vec<String> {
+    let mut faults = Vec::new();
+    let mut ages = Vec::new();
+    for (now, estimate) in estimates {
+        let measured = estimate.t_sample.zip(estimate.raw_mm);
+        if measured.is_some() == (estimate.state == PupilState::Fallback) {
+            faults.push(format!("{measured:?} in {:?} at {now:?}", estimate.state));
+        }
+        let Some(measured) = measured else { continue };
+        if !believed.contains(&measured) {
+            faults.push(format!("{measured:?} at {now:?} was not believed"));
+        }
+        let age = *now - measured.0;
+        if age < GateSettings::default().lead {
+            faults.push(format!("{age:?} old at {now:?}"));
+        }
+        if estimate.state == PupilState::Holding {
+            ages.push(age);
+        } else if let Some(pair) = std::mem::take(&mut ages).windows(2).find(|pair| pair[0] >= pair[1]) {
+            faults.push(format!("{pair:?}: its age does not grow in the blink before {now:?}"));
+        }
+    }
+    faults
+}
+
+#[test]
+fn the_estimate_rests_on_a_believed_sample_whose_age_grows_through_a_blink() {
+    type Spoil = fn(&mut PupilSample);
+    let blinks: [Spoil; 4] = [
+        |sample| (sample.valid, sample.diameter_mm) = (false, f32::NAN),
+        |sample| sample.diameter_mm = 0.0,
+        |sample| (sample.diameter_mm, sample.confidence) = (3.0, 0.1),
+        |sample| (sample.diameter_mm, sample.aperture_mm) = (2.9, Some(0.2)),
+    ];
+    for blink in blinks {
+        let mut estimator = Estimator::new(settings(rig::Eye::Left));
+        let (mut estimates, mut believed) = (Vec::new(), Vec::new());
+        for k in 0..1200 {
+            // No two neighbours are alike. A blink, and a loss that lasts until the fallback is shown.
+            let mut sample = sample(5 * k, SampleEye::Left, 4.0 + 0.001 * (k % 50) as f32);
+            let shut = (200..240).contains(&k) || (600..1100).contains(&k);
+            if shut {
+                blink(&mut sample);
+            }
+            estimator.push(sample, |decision| {
+                if decision.verdict == Verdict::Accepted {
+                    believed.push((decision.sample.t_sample, decision.sample.diameter_mm));
+                }
+            });
+            let estimate = estimator.pupil_at(sample.t_sample);
+            assert_eq!(estimate.t_heard, Some(sample.t_sample));
+            estimates.push((sample.t_sample, estimate));
+        }
+        assert_eq!(faults_of_samples(&estimates, &believed), Vec::<String>::new());
+        let in_state = |state| estimates.iter().filter(move |(_, estimate)| estimate.state == state).count();
+        assert!(in_state(PupilState::Holding) > 100 && in_state(PupilState::Fallback) > 100);
+
+        // The judge objects to the newest sample that came, and to one believed sample in the place of an older one.
+        let heard: Vec<_> = estimates
+            .iter()
+            .map(|&(now, estimate)| {
+                let t_sample = estimate.t_sample.and(estimate.t_heard);
+                (now, PupilEstimate { t_sample, ..estimate })
+            })
+            .collect();
+        let faults = faults_of_samples(&heard, &believed);
+        assert!(faults.iter().any(|fault| fault.contains("was not believed")), "{faults:?}");
+        assert!(faults.iter().any(|fault| fault.contains("old at")), "{faults:?}");
+        let held = estimates.iter().position(|(_, estimate)| estimate.state == PupilState::Holding).expect("held");
+        estimates[held].1.t_sample = Some(believed[0].0);
+        estimates[held].1.raw_mm = Some(believed[0].1);
+        let faults = faults_of_samples(&estimates, &believed);
+        assert!(faults.len() == 1 && faults[0].contains("does not grow"), "{faults:?}");
+    }
+}
+
+#[test]
+fn the_sample_is_of_an_eye_that_is_shown() {
+    // The left eye is surer, comes 2 ms before the right one, and is lost from 2 s on.
+    for (eye, before, after) in [(rig::Eye::Better, 4.0, 3.5), (rig::Eye::Both, 3.5, 3.5), (rig::Eye::Left, 4.0, 4.0)] {
+        let mut estimator = Estimator::new(settings(eye));
+        let mut raw_mm = Vec::new();
+        for k in 0..520 {
+            let lost = 5 * k >= 2000;
+            let left = PupilSample { valid: !lost, ..sample(5 * k, SampleEye::Left, if lost { 0.0 } else { 4.0 }) };
+            estimator.push(left, |_| {});
+            let right = PupilSample { confidence: 0.8, ..sample(5 * k + 2, SampleEye::Right, 3.5) };
+            estimator.push(right, |_| {});
+            raw_mm.push(estimator.pupil_at(TimeNs((5 * k + 2) * 1_000_000)).raw_mm);
+        }
+        assert!(raw_mm[200..390].iter().all(|mm| *mm == Some(before)), "{eye:?}: {:?}", raw_mm[200]);
+        assert!(raw_mm[460..].iter().all(|mm| *mm == Some(after)), "{eye:?}: {:?}", raw_mm[460]);
+    }
 }
 
 #[test]
