@@ -79,6 +79,14 @@ struct Eye {
     validity: Option<usize>,
 }
 
+impl Eye {
+    /// Whether a row has neither a diameter nor a word on validity.
+    fn is_left_out(&self, row: &Row<'_>) -> bool {
+        let is_empty = |column: usize| row.cell(column).is_ok_and(is_missing);
+        is_empty(self.diameter) && self.validity.is_none_or(is_empty)
+    }
+}
+
 impl Columns {
     fn of(table: &Table) -> Option<Self> {
         let column = |wanted: &str| table.column(|name| plain_name(name).0 == wanted);
@@ -172,12 +180,15 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         let is_event = columns.sensor.is_none()
             && columns.event.and_then(|event| row.cell(event).ok()).is_some_and(|event| !is_missing(event));
         for eye in columns.eyes.iter().flatten() {
+            // An event's own row tells nothing of the eyes.
+            if is_event && eye.is_left_out(&row) {
+                continue;
+            }
             match figure(&row, eye) {
                 Ok(Some((diameter, valid))) => {
                     let sample = LogSample { t, eye: eye.eye, diameter, confidence: 1.0, aperture_mm: None, valid };
                     log.push(sample, row.number);
                 }
-                Ok(None) if is_event => {}
                 Ok(None) => unmeasured += 1,
                 Err(fault) => log.count(fault),
             }

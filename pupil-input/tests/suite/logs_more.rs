@@ -156,6 +156,32 @@ fn tobii_studio_reads_with_its_names_and_validity_codes() {
 }
 
 #[test]
+fn tobii_rows_of_events_are_no_lost_pupils_whatever_columns_there_are() {
+    let log = |validity: bool, event: &str| {
+        let names = if validity { "\tValidity left" } else { "" };
+        let mut text = format!("Recording timestamp [ms]\tEvent\tPupil diameter left [mm]{names}\n");
+        for row in 0..100 {
+            let valid = if validity { "\tValid" } else { "" };
+            writeln!(text, "{}\t\t3.1{valid}", 4 * row).expect("a String takes all");
+            if row % 10 == 0 {
+                let unsaid = if validity { "\t" } else { "" };
+                writeln!(text, "{}\t{event}\t{unsaid}", 4 * row + 1).expect("a String takes all");
+            }
+        }
+        read(text)
+    };
+    for validity in [false, true] {
+        let recording = log(validity, "MouseEvent");
+        assert_eq!((recording.len(), recording.faults().total()), (100, 0), "{validity}");
+        assert!(recording.samples().all(|sample| sample.valid), "{validity}");
+        assert!(!noted(&recording, "has no diameter"), "{:?}", recording.notes());
+    }
+    // Without an event, and without a column of validity, an empty cell is a lost pupil.
+    assert_eq!(log(false, "").samples().filter(|sample| !sample.valid).count(), 10);
+    assert!(noted(&log(true, ""), "10 times an eye is valid and has no diameter"));
+}
+
+#[test]
 fn tobii_whole_milliseconds_give_way_to_the_trackers_microseconds() {
     // 250 Hz in whole milliseconds, and the tracker's own clock a little off; a gyroscope's row has no tracker's time.
     let log = |finer: &str, at: &dyn Fn(i64) -> String| {
