@@ -14,7 +14,7 @@ use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{Blink, LogBuilder, LogSample};
-use super::text::{number, time};
+use super::text::{number, positive_size, time};
 use crate::SampleEye;
 use crate::size_unit::SizeUnit;
 
@@ -168,16 +168,7 @@ impl Reader<'_> {
 
     /// 0 where the eye is lost.
     fn diameter(&self, word: &[u8]) -> Result<f32, LogFault> {
-        if word == b"." {
-            return Ok(0.0);
-        }
-        let figure = number(word).ok_or(LogFault::BadNumber)?;
-        if !figure.is_finite() {
-            return Err(LogFault::NotFinite);
-        }
-        if figure < 0.0 {
-            return Err(LogFault::Negative);
-        }
+        let figure = positive_size(word)?;
         Ok(match self.measure {
             Some(Measure::Diameter) => figure as f32,
             // The tracker's default.

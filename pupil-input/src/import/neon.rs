@@ -15,7 +15,7 @@ use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{Blink, LogBuilder, LogSample};
-use super::text::{self, Header, Picker, number, time};
+use super::text::{Header, Picker, number, positive_size, time};
 use crate::SampleEye;
 
 pub(super) const CLOUD: Importer =
@@ -66,17 +66,13 @@ fn read_cloud(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayEr
         };
         let lids = [lid_left, lid_right, lid_both];
         for (index, (_, _, eye)) in DIAMETERS.into_iter().enumerate().filter(|(index, _)| there[*index]) {
-            let lost = diameters[index] == Some(b"");
-            let diameter = match diameters[index] {
-                None => Err(LogFault::Malformed),
-                Some(b"") => Ok(0.0),
-                Some(cell) => text::diameter(cell),
-            };
-            match diameter {
+            match diameters[index].map_or(Err(LogFault::Malformed), positive_size) {
                 Err(fault) => log.count(fault),
                 Ok(diameter) => {
+                    // Nothing, NaN and 0 are its words for an eye that it does not see.
+                    let (diameter, valid) = (diameter as f32, diameter > 0.0);
                     let aperture_mm = lids[index].and_then(number).map(|aperture| aperture as f32);
-                    log.push(LogSample { t, eye, diameter, confidence: 1.0, aperture_mm, valid: !lost }, line.number);
+                    log.push(LogSample { t, eye, diameter, confidence: 1.0, aperture_mm, valid }, line.number);
                 }
             }
         }

@@ -9,7 +9,7 @@ use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
-use super::text::{Header, Picker, number, time};
+use super::text::{Header, Picker, number, size, time};
 use crate::SampleEye;
 use crate::size_unit::SizeUnit;
 
@@ -118,7 +118,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     Ok(())
 }
 
-/// A model that was not fitted says 0, a negative diameter or nothing, and confidence 0 says that there is no pupil:
+/// A model that was not fitted says 0, a negative diameter, NaN or nothing, and confidence 0 says that there is no pupil:
 /// such samples are lost. A model fitted badly says 16 mm; that is handed on for the gate to judge.
 fn sample(t: &[u8], eye: &[u8], confidence: &[u8], diameter: Option<&[u8]>) -> Result<LogSample, LogFault> {
     let t = time(t, 0).ok_or(LogFault::BadNumber)?;

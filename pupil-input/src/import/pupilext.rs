@@ -14,7 +14,8 @@ use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
-use super::table::{Row, Table, cells, is_missing, number, separator, time_ns};
+use super::table::{Row, Table, cells, number, separator, time_ns};
+use super::text::size;
 use crate::SampleEye;
 use crate::size_unit::SizeUnit;
 
@@ -146,10 +147,9 @@ fn choose_size(input: &LogInput<'_>) -> Result<Option<usize>, ReplayError> {
     Ok(best.or_else(any))
 }
 
-/// -1 where no pupil was found.
+/// -1, 0 or nothing where no pupil was found.
 fn figure(row: &Row<'_>, column: usize) -> Result<f32, LogFault> {
-    let cell = row.cell(column)?;
-    if is_missing(cell) { Err(LogFault::Missing) } else { Ok(number(cell)? as f32) }
+    Ok(size(row.cell(column)?)? as f32)
 }
 
 /// The detector's confidence, the outline's where the detector has none (-1), 1 without either.

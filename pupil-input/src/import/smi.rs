@@ -12,7 +12,7 @@ use super::importer::Importer;
 use super::input::LogInput;
 use super::parts::is_restart;
 use super::recording::{Blink, LogBuilder, LogSample};
-use super::text::{Header, Picker, number, time};
+use super::text::{Header, Picker, number, positive_size, time};
 use crate::SampleEye;
 use crate::size_unit::SizeUnit;
 
@@ -175,17 +175,7 @@ fn stated(line: &[u8], name: &[u8]) -> Option<f64> {
 
 /// A size, or 0 where the eye is lost.
 fn figure(cell: Option<&[u8]>) -> Result<f64, LogFault> {
-    let size = match cell.ok_or(LogFault::Malformed)? {
-        b"" | b"-" | b"." => 0.0,
-        cell => number(cell).ok_or(LogFault::BadNumber)?,
-    };
-    if !size.is_finite() {
-        Err(LogFault::NotFinite)
-    } else if size < 0.0 {
-        Err(LogFault::Negative)
-    } else {
-        Ok(size)
-    }
+    positive_size(cell.ok_or(LogFault::Malformed)?)
 }
 
 /// A run of rows that say `Blink`.

@@ -5,6 +5,7 @@ use holod_calibration::TimeNs;
 use super::fault::{LogFault, ReplayError};
 use super::input::LogInput;
 use super::recording::{GREATEST_NS, LogBuilder};
+pub(super) use super::text::is_missing;
 use super::text::{self, Lines};
 
 /// Columns of a table that are told apart; later ones are not looked at.
@@ -130,12 +131,6 @@ impl<'a> Row<'a> {
         let (begin, end) = *self.cells.get(column).ok_or(LogFault::Malformed)?;
         Ok(&self.line[begin as usize..end as usize])
     }
-}
-
-/// Whether a cell says that there is no figure.
-pub(super) fn is_missing(cell: &[u8]) -> bool {
-    cell.is_empty()
-        || [&b"n/a"[..], b"na", b"nan", b"null", b"none", b"-"].iter().any(|word| cell.eq_ignore_ascii_case(word))
 }
 
 /// A finite number with a decimal point or comma.

@@ -238,20 +238,29 @@ pub(crate) fn time(text: &[u8], places: i32) -> Option<TimeNs> {
     i64::try_from(if negative { -ns } else { ns }).ok().map(TimeNs)
 }
 
-/// Reads a diameter's cell: a finite number that is not negative.
-pub(crate) fn diameter(cell: impl AsRef<[u8]>) -> Result<f32, LogFault> {
-    let cell = cell.as_ref();
-    if cell.is_empty() {
-        return Err(LogFault::Missing);
+/// Whether a cell says that there is no figure.
+pub(super) fn is_missing(cell: &[u8]) -> bool {
+    cell.is_empty()
+        || [&b"n/a"[..], b"na", b"nan", b"null", b"none", b"-"].iter().any(|word| cell.eq_ignore_ascii_case(word))
+}
+
+/// The figure of a pupil's size, 0 where the cell says that there is none: it is empty, a word such as `nan` or a sign
+/// such as `.`, which loggers write of an eye that the tracker did not see.
+pub(super) fn size(cell: &[u8]) -> Result<f64, LogFault> {
+    if is_missing(cell) || cell == b"." {
+        return Ok(0.0);
     }
-    let diameter = number(cell).ok_or(LogFault::BadNumber)? as f32;
-    if !diameter.is_finite() {
-        Err(LogFault::NotFinite)
-    } else if diameter < 0.0 {
-        Err(LogFault::Negative)
-    } else {
-        Ok(diameter)
+    match number(cell) {
+        None => Err(LogFault::BadNumber),
+        Some(size) if size.is_nan() => Ok(0.0),
+        Some(size) if size.is_infinite() => Err(LogFault::NotFinite),
+        Some(size) => Ok(size),
     }
+}
+
+/// The same where no size is negative.
+pub(super) fn positive_size(cell: &[u8]) -> Result<f64, LogFault> {
+    size(cell).and_then(|size| if size < 0.0 { Err(LogFault::Negative) } else { Ok(size) })
 }
 
 #[cfg(test)]
@@ -347,6 +356,18 @@ mod tests {
         for none in ["", " ", "-", ".", "1.2.3", "0x10", "3.5mm", "\u{ff}"] {
             assert_eq!(number(none.as_bytes()), None, "{none}");
         }
+    }
+
+    #[test]
+    fn a_size_is_0_where_the_log_says_that_there_is_none() {
+        for none in [&b""[..], b"-", b".", b"nan", b"NaN", b"-nan", b"n/a", b"NA", b"null", b"None", b"0", b"-0.0"] {
+            assert_eq!(positive_size(none), Ok(0.0), "{}", String::from_utf8_lossy(none));
+        }
+        let of = |cell: &str| (size(cell.as_bytes()), positive_size(cell.as_bytes()));
+        assert_eq!(of("3,5"), (Ok(3.5), Ok(3.5)));
+        assert_eq!(of("-1"), (Ok(-1.0), Err(LogFault::Negative)));
+        assert_eq!(of("inf"), (Err(LogFault::NotFinite), Err(LogFault::NotFinite)));
+        assert_eq!(of("3.5mm"), (Err(LogFault::BadNumber), Err(LogFault::BadNumber)));
     }
 
     proptest! {

@@ -9,7 +9,8 @@ use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::wire::WireFault;
 use holod_pupil_input::wire::line::{LineSample, crc8, encode_line};
 use holod_pupil_input::{
-    Blink, LogFault, LogFormat, LogInfo, PupilSample, PupilState, Recording, ReplayError, SampleEye, SizeUnit,
+    Blink, Estimator, LogFault, LogFormat, LogInfo, PupilSample, PupilState, Recording, ReplayError, SampleEye,
+    SizeUnit, Verdict,
 };
 use proptest::prelude::*;
 use tempfile::TempDir;
@@ -100,16 +101,82 @@ fn each_bad_cell_is_counted_by_its_reason() {
     let dir = TempDir::new().expect("a folder");
     let recording = Recording::read(&written(&dir, "log.csv", format!("\u{feff}{header}{rows}"))).expect("reads");
     let faults = recording.faults();
-    assert_eq!(faults.of(LogFault::NotFinite), 2);
+    assert_eq!(faults.of(LogFault::NotFinite), 1);
     assert_eq!(faults.of(LogFault::Negative), 1);
-    assert_eq!(faults.of(LogFault::Backwards), 1);
+    // Of both eyes, of which one was lost last.
+    assert_eq!(faults.of(LogFault::Backwards), 2);
     assert_eq!(faults.of(LogFault::BadNumber), 2);
     assert_eq!(faults.of(LogFault::Malformed), 2);
     assert_eq!(faults.total(), 8);
-    // An empty cell with a time is an eye that is lost.
-    assert_eq!(recording.samples().filter(|sample| !sample.valid).count(), 1);
+    // An empty cell or NaN with a time is an eye that is lost.
+    let lost = recording.samples().filter(|sample| !sample.valid).map(|sample| (sample.t_sample.0, sample.eye));
+    assert_eq!(lost.collect::<Vec<_>>(), [(15, SampleEye::Right), (25, SampleEye::Right)]);
     let left: Vec<_> = recording.samples().filter(|s| s.eye == SampleEye::Left).map(|s| s.diameter_mm).collect();
     assert_eq!(left, [3.6, 3.6, 3.5]);
+}
+
+/// Logs of 200 Hz with `lost` in the place of a diameter for 0.1 s, one of each format that has cells for it.
+fn logs_with(lost: &str) -> [(LogFormat, String); 5] {
+    let (header, row): ([_; 5], [fn(i64, &str) -> String; 5]) = (
+        [
+            "timestamp [ns],pupil diameter left [mm]\n",
+            "** TYPE: EDF_FILE\nSTART\t1 \tLEFT\tSAMPLES\nPUPIL\tDIAMETER\n",
+            "Time\tType\tTrial\tL Pupil Diameter [mm]\n",
+            "pupil_timestamp,world_index,eye_id,confidence,norm_pos_x,norm_pos_y,diameter,method,diameter_3d\n",
+            "filename,timestamp_ms,algorithm,diameter_px,undistortedDiameter_px,physicalDiameter_mm\n",
+        ],
+        [
+            |t_ms, mm| format!("{}000000,{mm}\n", t_ms),
+            |t_ms, mm| format!("{t_ms}\t  1.0\t  1.0\t {mm}\t...\n"),
+            |t_ms, mm| format!("{t_ms}000\tSMP\t1\t{mm}\n"),
+            |t_ms, mm| format!("{}.{:03},0,1,0.9,0,0,41,pye3d,{mm}\n", t_ms / 1000, t_ms % 1000),
+            |t_ms, mm| format!("x,{t_ms},PuRe,40,41,{mm}\n"),
+        ],
+    );
+    let formats = [LogFormat::NeonEyeStates, LogFormat::EyeLink, LogFormat::Smi, LogFormat::Core, LogFormat::PupilExt];
+    std::array::from_fn(|log| {
+        let cell = |k: i64| if (100..120).contains(&k) { lost } else { "4.0" };
+        let rows: String = (0..300).map(|k| row[log](1000 + 5 * k, cell(k))).collect();
+        (formats[log], format!("{}{rows}", header[log]))
+    })
+}
+
+#[test]
+fn what_a_log_says_of_a_lost_eye_is_a_lost_sample_and_guards_its_neighbours() {
+    let dir = TempDir::new().expect("a folder");
+    let read = |(format, text): (LogFormat, String)| {
+        let recording = Recording::read(&written(&dir, "log", text)).expect("reads");
+        assert_eq!(recording.format(), format);
+        recording
+    };
+    for lost in ["nan", "NaN", "-nan", "n/a", "null", "0"] {
+        for log in logs_with(lost) {
+            let format = log.0;
+            let recording = read(log);
+            assert_eq!((recording.len(), recording.faults().total()), (300, 0), "{format}, {lost}");
+            let valid: Vec<_> = recording.samples().map(|sample| sample.valid).collect();
+            assert!(valid.iter().enumerate().all(|(k, valid)| *valid != (100..120).contains(&k)), "{format}, {lost}");
+            let mut rejected = Vec::new();
+            let mut estimator = Estimator::new(settings(rig::Eye::Left));
+            for sample in recording.samples() {
+                estimator.push(PupilSample { diameter_mm: 4.0, eye: SampleEye::Left, ..sample }, |decision| {
+                    if decision.verdict != Verdict::Accepted {
+                        rejected.push((decision.sample.t_sample - recording.begins()).0 / 5_000_000);
+                    }
+                });
+            }
+            rejected.sort_unstable();
+            // 20 lost ones, with 30 ms before and 50 ms behind them.
+            assert_eq!(rejected, (95..130).collect::<Vec<_>>(), "{format}, {lost}");
+        }
+    }
+    // What no log says of a lost eye is a fault, as before.
+    for (lost, fault) in [("inf", LogFault::NotFinite), ("4.0.1", LogFault::BadNumber)] {
+        for log in logs_with(lost) {
+            let recording = read(log);
+            assert_eq!((recording.len(), recording.faults().of(fault)), (280, 20), "{lost}");
+        }
+    }
 }
 
 #[test]
@@ -372,11 +439,11 @@ fn smi_in_pixels_gives_the_disc_of_the_ellipse_and_counts_bad_rows() {
     let dir = TempDir::new().expect("a folder");
     let (recording, info) = info(&written(&dir, "log", text));
     let read: Vec<_> = recording.samples().map(|s| (s.t_sample.0, s.eye, s.diameter_mm, s.valid)).collect();
-    assert_eq!(read, [(1_000_000, SampleEye::Right, 20.0, true), (3_000_000, SampleEye::Right, 0.0, false)]);
+    let (eye, lost) = (SampleEye::Right, false);
+    assert_eq!(read, [(1_000_000, eye, 20.0, true), (3_000_000, eye, 0.0, lost), (7_000_000, eye, 0.0, lost)]);
     assert_eq!(recording.unit(), SizeUnit::Pixels);
     let faults: Vec<_> = info.faults.iter().map(|fault| (fault.name, fault.count)).collect();
-    let expected = [("log_malformed", 1), ("log_bad_number", 2), ("log_not_finite", 1), ("log_negative", 1)];
-    assert_eq!(faults, expected);
+    assert_eq!(faults, [("log_malformed", 1), ("log_bad_number", 2), ("log_negative", 1)]);
 }
 
 /// BeGaze's raw data of two participants at 60 Hz: P01 for 20 s of 3 mm, P02 for 35 s of 5 mm.
