@@ -57,7 +57,16 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         expected: "a stream with a channel whose label or type tells of a pupil's diameter".into(),
     })?;
     for stream in streams.values_mut() {
-        stream.clock = Clock::fit(&std::mem::take(&mut stream.offsets));
+        stream.clock = Clocks::of(&std::mem::take(&mut stream.offsets));
+        let resets = stream.clock.spans.len().saturating_sub(1);
+        if resets > 0 && !stream.taken.is_empty() {
+            let times = if resets == 1 { "once".to_owned() } else { format!("{resets} times") };
+            log.note(format!(
+                "the clock of the stream `{}` was set or started again {times} in the recording: each part was put on the \
+                 recorder's clock by its own offsets",
+                stream.name.escape_debug()
+            ));
+        }
     }
     let mut record = 0;
     let damage = for_chunks(input, |chunk| match chunk.tag {
@@ -258,7 +267,7 @@ struct Stream {
     /// Of Pupil Capture's relay: a sample is of one eye, and the other eye's figures are NaN in it.
     one_eye_a_sample: bool,
     offsets: Vec<(f64, f64)>,
-    clock: Clock,
+    clock: Clocks,
     /// Index of the size, and of the confidence, of each eye that is taken from this stream.
     taken: Vec<(SampleEye, usize, Option<usize>)>,
     /// Time of the sample before, on the stream's own clock, seconds.
@@ -315,7 +324,7 @@ impl Stream {
             channels,
             one_eye_a_sample,
             offsets: Vec::new(),
-            clock: Clock::default(),
+            clock: Clocks::default(),
             taken: Vec::new(),
             latest_s: 0.0,
             row: Vec::new(),
@@ -450,6 +459,95 @@ fn take_offset(chunk: &mut Chunk<'_>, streams: &mut BTreeMap<u32, Stream>) -> io
     Ok(())
 }
 
+/// An offset that lies this far from those before it, and jitter besides, is of a clock that was set; pyxdf has 1 s.
+const RESET_S: f64 = 0.25;
+/// How many times the usual difference of neighbouring offsets a jump is beyond their jitter.
+const RESET_JITTERS: f64 = 20.0;
+/// So many usual intervals of the offsets a clock may have run before the first and behind the last one of it.
+const RESET_INTERVALS: f64 = 2.0;
+
+/// A stream's clock over a recording in which it may have been set or started again: a line for each span of it.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct Clocks {
+    spans: Vec<Span>,
+    /// The usual interval of the offsets.
+    interval_s: f64,
+    /// The span of the sample before, and the latest time in it.
+    current: usize,
+    latest_s: Option<f64>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Span {
+    /// Times of its first and last offset, on the stream's clock.
+    first_s: f64,
+    last_s: f64,
+    line: Clock,
+}
+
+impl Span {
+    fn of(offsets: &[(f64, f64)]) -> Option<Self> {
+        let (first, last) = (offsets.first()?, offsets.last()?);
+        Some(Self { first_s: first.0, last_s: last.0, line: Clock::fit(offsets) })
+    }
+
+    /// How far a time lies outside it, where it is longer by `slack_s` at both ends.
+    fn distance_s(&self, t_s: f64, slack_s: f64) -> f64 {
+        (self.first_s - slack_s - t_s).max(t_s - self.last_s - slack_s).max(0.0)
+    }
+}
+
+impl Clocks {
+    /// Cuts the offsets, each with the time at which it was taken, where one jumps while time falls or the next one stays
+    /// there. One that is alone is of a packet that was late.
+    fn of(offsets: &[(f64, f64)]) -> Self {
+        let differences = |of: &dyn Fn(&(f64, f64)) -> f64| {
+            let differences = offsets.windows(2).map(|pair| (of(&pair[1]) - of(&pair[0])).abs());
+            Sorted::new(differences).map_or(0.0, |differences| differences.median())
+        };
+        let limit_s = RESET_S.max(RESET_JITTERS * differences(&|at| at.1));
+        let mut spans = Vec::new();
+        let mut begin = 0;
+        // The newest offset that is no late packet's.
+        let mut before = offsets.first();
+        for (index, this) in offsets.iter().enumerate().skip(1) {
+            let Some(reference) = before else { break };
+            let falls = this.0 < offsets[index - 1].0;
+            let jumps = (this.1 - reference.1).abs() > limit_s;
+            let stays = offsets.get(index + 1).is_some_and(|next| (next.1 - this.1).abs() <= limit_s);
+            if jumps && (falls || stays && index > begin + 1) {
+                spans.extend(Span::of(&offsets[begin..index]));
+                begin = index;
+            }
+            if !jumps || falls || stays {
+                before = Some(this);
+            }
+        }
+        spans.extend(Span::of(&offsets[begin..]));
+        Self { spans, interval_s: differences(&|at| at.0), current: 0, latest_s: None }
+    }
+
+    /// What is to be added to the time of the next sample to get the recorder's. A span ends where the samples' times
+    /// fall into the next one, or lie nearer to it.
+    fn offset_s(&mut self, t_s: f64) -> f64 {
+        while let Some([this, next]) = self.spans.get(self.current..self.current + 2) {
+            let falls = self.latest_s.is_some_and(|latest_s| t_s < latest_s - RESET_S);
+            // Of a clock that was set forward, what lies between its spans is of the nearer one.
+            let is_forward = next.line.at(next.first_s) < this.line.at(this.last_s);
+            let slack_s = if is_forward { 0.0 } else { RESET_INTERVALS * self.interval_s };
+            let [of_this_s, of_next_s] = [this, next].map(|span| span.distance_s(t_s, slack_s));
+            let is_next = if falls { of_next_s <= of_this_s } else { t_s > this.last_s && of_next_s < of_this_s };
+            if !is_next {
+                break;
+            }
+            self.current += 1;
+            self.latest_s = None;
+        }
+        self.latest_s = Some(self.latest_s.map_or(t_s, |latest_s| latest_s.max(t_s)));
+        self.spans.get(self.current).map_or(0.0, |span| span.line.at(t_s))
+    }
+}
+
 /// A straight line through a stream's clock offsets: what is to be added to its times to get the recorder's.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Clock {
@@ -519,10 +617,13 @@ fn take_samples(
 }
 
 impl Stream {
-    fn push(&self, t_s: f64, row: &[u8], log: &mut LogBuilder, record: u64) {
-        let t = match ns_of(t_s + self.clock.at(t_s), 1e9) {
-            Ok(t) if t_s.is_finite() => TimeNs(t),
-            _ => return log.count(LogFault::BadNumber),
+    fn push(&mut self, t_s: f64, row: &[u8], log: &mut LogBuilder, record: u64) {
+        if !t_s.is_finite() {
+            return log.count(LogFault::BadNumber);
+        }
+        let t = match ns_of(t_s + self.clock.offset_s(t_s), 1e9) {
+            Ok(t) => TimeNs(t),
+            Err(fault) => return log.count(fault),
         };
         let bytes = self.figure.bytes();
         let figure = |index: usize| self.figure.read(&row[index * bytes..(index + 1) * bytes]);

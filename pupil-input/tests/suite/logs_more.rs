@@ -731,6 +731,74 @@ fn xdf_times_are_completed_and_put_on_the_recorders_clock() {
     assert_eq!(recording.len(), 6);
 }
 
+/// 200 s of 10 Hz: a tracker whose clock says `clock_s` at each second of the recorder's, which begins at 10,000; offsets
+/// every 5 s but those that `left_out` says, each of them late by what `late_s` says.
+fn xdf_of_a_clock(
+    clock_s: impl Fn(f64) -> f64,
+    left_out: impl Fn(f64) -> bool,
+    late_s: impl Fn(f64) -> f64,
+) -> Recording {
+    let mut chunks = vec![stream_header(7, "tracker", "Eye", 10.0, "double64", &[["pupil", "left", "Diameter", "mm"]])];
+    for k in 0..40 {
+        let since_s = 2.0 + 5.0 * f64::from(k);
+        if !left_out(since_s) {
+            // As LabRecorder does: the time is the recorder's less the offset.
+            let offset_s = 10_000.0 + since_s - clock_s(since_s) + late_s(since_s);
+            chunks.push(offset(7, 10_000.0 + since_s - offset_s, offset_s));
+        }
+    }
+    for k in 0..2000 {
+        let since_s = 0.1 * f64::from(k);
+        chunks.push(doubles(7, &[(Some(clock_s(since_s)), &[3.0 + 0.0001 * f64::from(k)])]));
+    }
+    read(xdf(&chunks))
+}
+
+/// The greatest error of the times of [`xdf_of_a_clock`], of those samples that were read, seconds.
+fn worst_time_s(recording: &Recording) -> f64 {
+    let error_s = |sample: (i64, Option<f32>)| {
+        let k = ((f64::from(sample.1.expect("seen")) - 3.0) * 1e4).round();
+        (sample.0 as f64 * 1e-9 - 10_000.0 - 0.1 * k).abs()
+    };
+    of_eye(recording, Left).into_iter().map(error_s).fold(0.0, f64::max)
+}
+
+#[test]
+fn xdf_goes_on_where_the_clock_of_a_tracker_is_set() {
+    let part = |since_s: f64, ends_s: &[f64], begins_s: &[f64]| {
+        let part = ends_s.iter().filter(|end_s| since_s >= **end_s).count();
+        begins_s[part] + since_s * (1.0 + 2e-5)
+    };
+    // Started again; again while its times are the same once more; set forward; back by a little; three times.
+    let cases: [(&[f64], &[f64]); 5] = [
+        (&[93.0], &[5000.0, -90.0]),
+        (&[93.0], &[30.0, -70.0]),
+        (&[93.0], &[30.0, 730.0]),
+        (&[93.0], &[5000.0, 4997.0]),
+        (&[53.0, 104.0, 158.0], &[5000.0, -50.0, 700.0, -150.0]),
+    ];
+    for (ends_s, begins_s) in cases {
+        let clock_s = |since_s| part(since_s, ends_s, begins_s);
+        let recording = xdf_of_a_clock(clock_s, |_| false, |_| 0.0);
+        assert_eq!((recording.len(), recording.faults().total()), (2000, 0), "{begins_s:?}: {:?}", recording.notes());
+        assert!(worst_time_s(&recording) < 1e-3, "{begins_s:?}: {}", worst_time_s(&recording));
+        let times = if ends_s.len() == 1 { "once".to_owned() } else { format!("{} times", ends_s.len()) };
+        assert!(noted(&recording, &format!("started again {times} in")), "{:?}", recording.notes());
+        // The judge sees that the offsets of a part are not there.
+        let blind = xdf_of_a_clock(clock_s, |since_s| since_s > ends_s[0], |_| 0.0);
+        assert!(worst_time_s(&blind) > 0.5, "{begins_s:?}: {}", worst_time_s(&blind));
+    }
+    // A clock that nobody set, with packets that were late, the first one and the last one too.
+    let late_s = |since_s: f64| match since_s as u32 {
+        2 | 52 | 122 | 197 => 0.7,
+        127 => -0.7,
+        _ => 0.0,
+    };
+    let steady = xdf_of_a_clock(|since_s| part(since_s, &[], &[30.0]), |_| false, late_s);
+    assert!(worst_time_s(&steady) < 1e-3, "{}", worst_time_s(&steady));
+    assert!(!noted(&steady, "started again"), "{:?}", steady.notes());
+}
+
 #[test]
 fn xdf_that_is_damaged_reads_on_behind_the_next_boundary() {
     let chunks = relay();
