@@ -6,7 +6,7 @@
 //! i32 and its begin and end as i64 nanoseconds.
 
 use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use holod_calibration::TimeNs;
 
@@ -277,12 +277,14 @@ fn native_layout(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<Layout, R
 const BLINK_BYTES: usize = 20;
 
 fn read_native_blinks(path: &Path, log: &mut LogBuilder) {
-    let name = name_of(path).replacen("eye_state", "blinks", 1);
-    let path: PathBuf = path.with_file_name(&name);
-    if !path.is_file() || name == name_of(&path.with_file_name("")) {
+    let own = name_of(path);
+    let name = own.replacen("eye_state", "blinks", 1);
+    let beside = path.with_file_name(&name);
+    // A file that was given another name has none.
+    if name == own || !beside.is_file() {
         return;
     }
-    let Ok(mut blinks) = LogInput::new(&path).and_then(|input| input.open()) else {
+    let Ok(mut blinks) = LogInput::new(&beside).and_then(|input| input.open()) else {
         return log.note(format!("`{name}` beside the log cannot be read"));
     };
     let mut record = [0; BLINK_BYTES];

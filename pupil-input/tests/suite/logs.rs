@@ -596,6 +596,13 @@ fn neon_of_the_phone_is_read_with_its_companions() {
     assert!(recording.samples().any(|sample| sample.aperture_mm.is_some_and(|lids| lids < 1.0)));
     assert_eq!(recording.faults().total(), 0);
 
+    // Under another name it is not its own blinks, nor are they anybody's.
+    let renamed = written(&dir, "alice.raw", &states);
+    written(&dir, "alice.time", &times);
+    let alice = Recording::read(&renamed).expect("reads");
+    assert_eq!((alice.len(), alice.blinks()), (recording.len(), &[][..]));
+    assert!(!alice.notes().iter().any(|note| note.contains("blinks")), "{:?}", alice.notes());
+
     written(&dir, "eye_state.dtype", "[('pupil_diameter_left_mm', 'float64')]");
     assert!(refused().contains("`eye_state.dtype` of another form"), "{}", refused());
     let names: Vec<_> = (0..20)
