@@ -81,6 +81,12 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
             log.count(LogFault::Malformed);
             continue;
         };
+        // Whatever it is, a row that ends before its columns do is none.
+        let cut_off = |column: usize, cell: Option<&[u8]>| columns[column].is_some() && cell.is_none();
+        if cut_off(4, name) || cut_off(5, diameter_mm) {
+            log.count(LogFault::Malformed);
+            continue;
+        }
         let method = method(name, diameter_mm);
         counts[method as usize] += 1;
         if (method as usize) < best as usize {
@@ -95,9 +101,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     }
 
     let [two_d, live, post_hoc] = counts;
-    let before = std::mem::take(log);
-    *log = std::mem::take(&mut kept[best as usize]);
-    log.faults += before.faults;
+    log.take_samples_of(std::mem::take(&mut kept[best as usize]));
     match best {
         Method::TwoD => {
             log.unit = SizeUnit::Pixels;
@@ -128,13 +132,7 @@ fn sample(t: &[u8], eye: &[u8], confidence: &[u8], diameter: Option<&[u8]>) -> R
         _ => return Err(LogFault::BadEye),
     };
     let confidence = number(confidence).filter(|confidence| confidence.is_finite()).ok_or(LogFault::BadNumber)?;
-    let diameter = match diameter.ok_or(LogFault::Malformed)? {
-        b"" => 0.0,
-        cell => number(cell).ok_or(LogFault::BadNumber)?,
-    };
-    if !diameter.is_finite() {
-        return Err(LogFault::NotFinite);
-    }
+    let diameter = size(diameter.ok_or(LogFault::Malformed)?)?;
     let valid = diameter > 0.0 && confidence > 0.0;
     let confidence = confidence.clamp(0.0, 1.0) as f32;
     Ok(LogSample { t, eye, diameter: diameter as f32, confidence, aperture_mm: None, valid })

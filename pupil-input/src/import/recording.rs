@@ -158,6 +158,14 @@ impl LogBuilder {
         }
     }
 
+    /// Takes what another builder was pushed in the place of its own samples, of which it has none.
+    pub(super) fn take_samples_of(&mut self, other: Self) {
+        let Self { rows, faults, times, first_backwards, parts, fallen, .. } = other;
+        self.faults += faults;
+        (self.rows, self.times, self.first_backwards) = (rows, times, first_backwards);
+        (self.parts, self.fallen) = (parts, fallen);
+    }
+
     /// The file ends within line `line`, which is handed out next.
     pub(crate) const fn ends_within(&mut self, line: u64) {
         self.unended = Some((line, self.faults.of(LogFault::Malformed)));

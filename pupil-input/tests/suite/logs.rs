@@ -310,6 +310,26 @@ fn core_takes_the_3d_rows_of_both_eyes() {
 }
 
 #[test]
+fn core_that_is_cut_off_says_so_wherever_it_is_cut() {
+    let dir = TempDir::new().expect("a folder");
+    for model in [true, false] {
+        let whole = made_up_logs::core(123.0, model);
+        let last = 1 + whole.trim_end().rfind('\n').expect("lines");
+        let notes = |text: &str| info(&written(&dir, "log", text)).1.notes.join("\n");
+        assert!(!notes(&whole).contains("cut off"));
+        assert!(!notes(whole.trim_end()).contains("cut off"), "a whole last line without its ending is none");
+        let row = &whole[last..];
+        let comma = |column: usize| row.match_indices(',').nth(column - 1).expect("columns").0;
+        // In the time, the confidence, the size in pixels, before the method, and before the size in millimetres.
+        for at in [3, comma(3), comma(6) + 2, comma(7), comma(7) + 3, comma(12)] {
+            let told = notes(&whole[..last + at]);
+            let line = format!("line {}, the last one", whole.lines().count());
+            assert!(told.contains(&line) && told.contains("the file is cut off"), "{at} of `{row}`: {told}");
+        }
+    }
+}
+
+#[test]
 fn core_without_3d_rows_is_in_pixels() {
     let dir = TempDir::new().expect("a folder");
     let (recording, info) = info(&written(&dir, "log", made_up_logs::core(123.0, false)));
