@@ -74,13 +74,16 @@ impl Eyes {
         }
     }
 
-    /// As the figures of a sample suggest, where no header names them: flags tell, else two eyes need six figures.
-    fn guessed_from(line: &[u8]) -> Self {
-        let two = match words(line).last().and_then(flag_count) {
-            Some(flags) => matches!(flags, 5 | 17),
-            None => words(line).skip(1).filter(|word| *word == b"." || number(word).is_some()).count() >= 6,
+    /// As the figures of a sample suggest, where no header names them, and whether they leave it open: flags tell, else
+    /// the number of figures. One eye has 3, velocity and resolution 2 more each; two eyes have 6, and 4 and 2 more;
+    /// either may have one of the input port besides. So 7 are of one eye with both, or of two with the port.
+    fn guessed_from(line: &[u8]) -> (Self, bool) {
+        let figures = words(line).skip(1).filter(|word| *word == b"." || number(word).is_some()).count();
+        let (two, open) = match words(line).last().and_then(flag_count) {
+            Some(flags) => (matches!(flags, 5 | 17), false),
+            None => (figures >= 6 && figures != 7, figures == 7),
         };
-        if two { Self::Two } else { Self::One(SampleEye::Both) }
+        (if two { Self::Two } else { Self::One(SampleEye::Both) }, open)
     }
 }
 
@@ -102,7 +105,9 @@ struct Reader<'b> {
     blocks: u64,
     measures_differ: bool,
     rates_differ: bool,
-    guessed: bool,
+    /// No header named the eyes; whether the figures left it open which there are.
+    guessed: Option<bool>,
+    samples: u64,
 }
 
 fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
@@ -118,7 +123,8 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         blocks: 0,
         measures_differ: false,
         rates_differ: false,
-        guessed: false,
+        guessed: None,
+        samples: 0,
     };
     while let Some(line) = lines.next(reader.log) {
         match line.bytes.first() {
@@ -128,6 +134,10 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
             _ => {}
         }
     }
+    if reader.samples == 0 && reader.blocks > 0 {
+        let expected = "samples, too: it was exported with events only; run edf2asc without -e";
+        return Err(input.content("the events of a recording and no line that is a sample", expected));
+    }
     reader.end_blinks(reader.previous);
     reader.notes();
     Ok(())
@@ -135,11 +145,12 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
 
 impl Reader<'_> {
     fn sample(&mut self, line: &[u8], number: u64) {
+        self.samples += 1;
         let eyes = match self.eyes {
             Some(eyes) => eyes,
             None => {
-                let eyes = Eyes::guessed_from(line);
-                self.guessed = true;
+                let (eyes, open) = Eyes::guessed_from(line);
+                self.guessed = Some(open);
                 *self.eyes.insert(eyes)
             }
         };
@@ -270,8 +281,14 @@ impl Reader<'_> {
             "diameters are in the tracker's arbitrary units, {what}; to have millimetres, record a printed disc of known \
              diameter at the eye's place and give the rig scale_mm_per_unit = its millimetres / the figure shown for it"
         ));
-        if self.guessed {
-            self.log.note("no header names the eyes: they are told by the samples' columns");
+        match self.guessed {
+            None => {}
+            Some(false) => self.log.note("no header names the eyes: they are told by the samples' columns"),
+            Some(true) => self.log.note(
+                "no header names the eyes, and the samples have 7 figures: they were read as one eye with velocity and \
+                 resolution, not as two eyes with the input port; where it is two, export the log again with its header \
+                 or its flags",
+            ),
         }
         if self.blocks > 1 {
             self.log.note(format!("{} blocks of recording, with gaps between them", self.blocks));

@@ -29,14 +29,11 @@ pub enum ReplayError {
         expected: String,
     },
     /// Not one sample could be read.
-    #[error(
-        "pupil log {path} holds no sample: {rejected} of its lines were rejected ({reasons}); expected at least one"
-    )]
+    #[error("pupil log {path} holds no sample: {why}; expected at least one")]
     Empty {
         path: PathBuf,
-        rejected: u64,
-        /// How many for which reason.
-        reasons: String,
+        /// What there is in its place.
+        why: String,
     },
     /// Its times are in no order.
     #[error(

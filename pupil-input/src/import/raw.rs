@@ -155,7 +155,7 @@ impl RawLog {
             }
         }
         let Some(span) = span.filter(|_| bytes > 0) else {
-            return Err(ReplayError::Empty { path: path.into(), rejected: 0, reasons: "no bytes came".into() });
+            return Err(ReplayError::Empty { path: path.into(), why: "no bytes came".into() });
         };
         Ok(Self { path: path.into(), profile, datagrams, span, ending: raw.ending(), lost })
     }

@@ -207,8 +207,11 @@ impl LogBuilder {
         if self.rows.is_empty() {
             let reasons = self.faults.entries().filter(|(_, count)| *count > 0);
             let reasons: Vec<_> = reasons.map(|(name, count)| format!("{name} {count}")).collect();
-            let reasons = if reasons.is_empty() { "there are no lines".into() } else { reasons.join(", ") };
-            return Err(ReplayError::Empty { path: path.into(), rejected: self.faults.total(), reasons });
+            let why = match self.faults.total() {
+                0 => "none of its lines is one".into(),
+                rejected => format!("{rejected} of its lines were rejected ({})", reasons.join(", ")),
+            };
+            return Err(ReplayError::Empty { path: path.into(), why });
         }
         if self.rows.len() == MOST_SAMPLES {
             return Err(ReplayError::Content {

@@ -413,11 +413,35 @@ fn eyelink_exports_of_samples_alone_are_read() {
     assert_eq!(read, [(left, true), (right, false), (left, false), (right, true)]);
     assert!((recording.samples().next().expect("one").diameter_mm - 19.995).abs() < 0.001);
     assert!(info.notes.iter().any(|note| note.contains("no header names the eyes")));
-    // Velocity and resolution of one eye are no second eye.
-    let one = "10.5\t  1.0\t  1.0\t  314.0\t  0.1\t  0.1\t 40.0\t 41.0\t...\n";
-    let recording = Recording::read(&written(&dir, "one", one)).expect("reads");
-    assert_eq!(recording.samples().map(|sample| sample.eye).collect::<Vec<_>>(), [SampleEye::Both]);
-    assert_eq!(recording.begins(), TimeNs(10_500_000));
+    // Velocity and resolution of one eye are no second eye, with flags and without.
+    for (flags, is_open) in [("\t...", false), ("", true)] {
+        let one = format!("10.5\t  1.0\t  1.0\t  314.0\t  0.1\t  0.1\t 40.0\t 41.0{flags}\n");
+        let recording = Recording::read(&written(&dir, "one", one)).expect("reads");
+        assert_eq!(recording.samples().map(|sample| sample.eye).collect::<Vec<_>>(), [SampleEye::Both]);
+        assert_eq!(recording.begins(), TimeNs(10_500_000));
+        assert_eq!(recording.notes().iter().any(|note| note.contains("7 figures")), is_open);
+    }
+    // Where no flags tell: 3 figures of an eye, 2 more of each eye for velocity, 2 for resolution, 1 for the port.
+    for (figures, eyes) in [(3, 1), (4, 1), (5, 1), (6, 2), (7, 1), (8, 2), (10, 2), (11, 2), (12, 2), (13, 2)] {
+        let line = format!("10{}\n", "\t  41.0".repeat(figures));
+        let recording = Recording::read(&written(&dir, "log", line)).expect("reads");
+        assert_eq!(recording.len(), eyes, "{figures}");
+    }
+}
+
+#[test]
+fn eyelink_exports_of_events_alone_are_refused_with_what_to_do() {
+    let dir = TempDir::new().expect("a folder");
+    let whole = made_up_logs::eyelink(500.0, "LR", true);
+    let is_sample = |line: &&str| line.starts_with(|letter: char| letter.is_ascii_digit());
+    let events: String = whole.lines().filter(|line| !is_sample(line)).flat_map(|line| [line, "\n"]).collect();
+    let refused = |text: &str| Recording::read(&written(&dir, "log", text)).expect_err("refused").to_string();
+    let message = refused(&events);
+    assert!(message.contains("run edf2asc without -e") && message.contains("no line that is a sample"), "{message}");
+    assert!(Recording::read(&written(&dir, "log", &whole)).is_ok());
+    // A header alone tells nothing of how it was exported.
+    let message = refused("** TYPE: EDF_FILE BINARY EVENT SAMPLE TAGGED\n");
+    assert!(message.contains("holds no sample: none of its lines is one"), "{message}");
 }
 
 #[test]
