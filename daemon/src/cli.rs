@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use holod_calibration::rig::{Eye, WeightsChoice};
+use holod_calibration::rig::{Eye, Tracker, WeightsChoice};
 use holod_calibration::toml_source::did_you_mean;
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_model::scene::Fit;
@@ -753,10 +753,9 @@ fn parse_eye(text: &str) -> Result<Eye, String> {
 }
 
 fn parse_scale(text: &str) -> Result<f64, String> {
-    text.parse()
-        .ok()
-        .filter(|scale: &f64| scale.is_finite() && *scale > 0.0)
-        .ok_or_else(|| format!("found '{text}', expected millimetres for one unit, a number above 0 such as 0.0125"))
+    let scale =
+        text.parse().map_err(|_| format!("found '{text}', expected millimetres for one unit, such as 0.0125"))?;
+    Tracker::scale_fault(scale).map_or(Ok(scale), |fault| Err(format!("found '{text}', {fault}")))
 }
 
 fn parse_silence(text: &str) -> Result<Duration, String> {
@@ -823,6 +822,7 @@ pub fn focus_of_an_eye(dpt: f64) -> Result<Dioptres, String> {
 mod tests {
     use super::*;
     use clap::CommandFactory;
+    use holod_calibration::rig::Rig;
 
     #[test]
     fn the_command_line_is_consistent() {
@@ -888,6 +888,15 @@ mod tests {
             assert!(parse_silence(bad).is_err(), "{bad}");
         }
         assert_eq!(parse_silence("0.5"), Ok(Duration::from_millis(500)));
+        // As the rig's scale_mm_per_unit.
+        for bad in ["0", "-1", "nan", "inf", "9.9e-5", "100.1", "wide", ""] {
+            assert!(parse_scale(bad).is_err(), "{bad}");
+            let rig = format!("[tracker]\nscale_mm_per_unit = {bad}\n");
+            assert!(Rig::parse(&rig, Path::new("rig.toml")).is_err(), "{bad}");
+        }
+        assert_eq!([parse_scale("0.0001"), parse_scale("100")], [Ok(1e-4), Ok(100.0)]);
+        let fault = "expected a number from 0.0001 to 100 mm per unit; 125 looks like micrometres: write 0.125";
+        assert!(parse_scale("125").unwrap_err().contains(fault), "{:?}", parse_scale("125"));
         for bad in ["inf", "nan", "near", "40"] {
             assert!(parse_focus(bad).is_err(), "{bad}");
         }

@@ -336,6 +336,17 @@ impl Panel {
     }
 }
 
+/// Leaves a tracker's spec to whoever opens the tracker.
+const AS_WRITTEN: SpecReader<'_> = &|spec, _| Ok(spec.to_owned());
+
+impl Tracker {
+    /// Says what is wrong with a factor from the tracker's figure to millimetres, where a rig file's `scale_mm_per_unit`
+    /// could not be it: what is expected, and what to do.
+    pub fn scale_fault(scale: f64) -> Option<String> {
+        parse::SCALE.fault(scale)
+    }
+}
+
 impl Rig {
     /// The built-in bench as a rig file; it parses to [`Rig::default`].
     pub const BUILT_IN_TOML: &str = include_str!("built-in.toml");

@@ -107,7 +107,7 @@ const ON_DELAY: Span = Span::new(0.0, 100.0, "ms");
 const LIT: Span = Span::new(0.001, 100.0, "ms").slips(&[("microseconds", 1e-3)]);
 const HEARTBEAT: Span = Span::new(5.0, 1000.0, "ms").slips(&[("seconds", 1e3)]);
 const STALL: Span = Span::new(10.0, 60_000.0, "ms").slips(&[("seconds", 1e3)]);
-const SCALE: Span = Span::new(1e-4, 100.0, "mm per unit");
+pub(super) const SCALE: Span = Span::new(1e-4, 100.0, "mm per unit").slips(&[("metres", 1e3), ("micrometres", 1e-3)]);
 const FALLBACK: Span = Span::new(1.0, 9.0, "mm").slips(&[("metres", 1e3), ("micrometres", 1e-3)]);
 /// A sample is judged with its successors, so that none is known sooner.
 const HOLD: Span = Span::new(150.0, 60_000.0, "ms").slips(&[("seconds", 1e3)]);

@@ -39,6 +39,11 @@ impl Span {
         format!("a number from {} to {}{gap}{}", self.min, self.max, self.unit)
     }
 
+    /// What is expected, and what to do, where `value` is not taken.
+    pub(super) fn fault(&self, value: f64) -> Option<String> {
+        (!self.takes(value)).then(|| format!("expected {}; {}", self.expected(), self.advice(value)))
+    }
+
     fn advice(&self, value: f64) -> String {
         for (unit, factor) in self.slips {
             if self.takes(value * factor) {
