@@ -22,13 +22,8 @@ pub fn rig(args: &RigArgs) -> Result<Rig, Failure> {
         None => Ok(Rig::default()),
         Some(path) => {
             let exit = if path.exists() { Exit::Config } else { Exit::NoInput };
-            let mut rig = Rig::load(path).map_err(Failure::because(exit))?;
-            // As all paths of the file; what is no spec is told where the tracker is needed.
-            if let Some(Ok(spec)) = rig.tracker.spec.as_deref().map(str::parse::<TrackerSpec>) {
-                let folder = path.parent().unwrap_or(Path::new(""));
-                rig.tracker.spec = Some(spec.in_folder(folder).to_string());
-            }
-            Ok(rig)
+            let spec = |text: &str, folder: &Path| TrackerSpec::of_rig(text, folder).map(|spec| spec.to_string());
+            Rig::load_with(path, &spec).map_err(Failure::because(exit))
         }
     }
 }

@@ -65,10 +65,7 @@ impl TrackerSpec {
     /// The same as read in `folder`: where its relative paths start, those of a profile's file included.
     pub fn in_folder(self, folder: &Path) -> Self {
         let path = |path: PathBuf| folder.join(path);
-        let profile = |name: String| match Profile::is_path(&name) {
-            true => folder.join(name).display().to_string(),
-            false => name,
-        };
+        let profile = |name: String| profile_in(folder, &name);
         match self {
             Self::Path(named) => Self::Path(path(named)),
             Self::Serial { path: named, profile: of, baud } => {
@@ -82,6 +79,11 @@ impl TrackerSpec {
             Self::Core(_) | Self::Neon(_) | Self::Mock(_) => self,
         }
     }
+}
+
+/// A profile's name, or the path of its file where that starts at `folder`.
+fn profile_in(folder: &Path, name: &str) -> String {
+    if Profile::is_path(name) { folder.join(name).display().to_string() } else { name.to_owned() }
 }
 
 /// A name or address of a host, and a port.
@@ -129,11 +131,13 @@ impl FromStr for TrackerSpec {
     type Err = SpecError;
 
     fn from_str(spec: &str) -> Result<Self, SpecError> {
-        parse(spec).map_err(|problem| SpecError { spec: spec.into(), problem })
+        parse(spec, Path::new("")).map_err(|problem| SpecError { spec: spec.into(), problem })
     }
 }
 
-fn parse(spec: &str) -> Result<TrackerSpec, String> {
+/// Reads a spec whose relative paths start at `folder`, as it is written; on error, what is wrong with it.
+pub(crate) fn parse(spec: &str, folder: &Path) -> Result<TrackerSpec, String> {
+    let network = |rest| parse_network(rest, folder);
     let (scheme, rest) = match spec.split_once(':') {
         Some((scheme, rest)) => (scheme, Some(rest)),
         None => (spec, None),
@@ -146,8 +150,8 @@ fn parse(spec: &str) -> Result<TrackerSpec, String> {
         ("replay", Some(rest)) => parse_replay(rest),
         ("serial" | "replay", None) => Err(format!("lacks a path: expected `{scheme}:PATH`")),
         ("hid", rest) => parse_hid(rest.unwrap_or_default()),
-        ("tcp", Some(rest)) => parse_network(rest).map(|(address, profile)| TrackerSpec::Tcp { address, profile }),
-        ("udp", Some(rest)) => parse_network(rest).map(|(address, profile)| TrackerSpec::Udp { address, profile }),
+        ("tcp", Some(rest)) => network(rest).map(|(address, profile)| TrackerSpec::Tcp { address, profile }),
+        ("udp", Some(rest)) => network(rest).map(|(address, profile)| TrackerSpec::Udp { address, profile }),
         ("core", None) => Ok(TrackerSpec::Core(HostPort { host: "127.0.0.1".into(), port: CORE_PORT })),
         ("core", Some(rest)) => host_port(rest, Some(CORE_PORT)).map(TrackerSpec::Core),
         ("neon", None) => Ok(TrackerSpec::Neon(HostPort { host: "neon.local".into(), port: NEON_PORT })),
@@ -242,13 +246,19 @@ fn parse_hid(rest: &str) -> Result<TrackerSpec, String> {
     Ok(TrackerSpec::Hid { ids, serial, profile })
 }
 
-fn parse_network(rest: &str) -> Result<(HostPort, String), String> {
+fn parse_network(rest: &str, folder: &Path) -> Result<(HostPort, String), String> {
     let (address, option) = rest.split_once(',').unwrap_or((rest, ""));
     match option.split_once('=') {
         Some(("profile", name)) => {
-            // A profile that cannot be had is told of when the tracker is opened.
-            let port = Profile::find(name).ok().and_then(|profile| profile.network.port);
-            Ok((host_port(address, port)?, name.to_owned()))
+            // Where the address has a port, a profile that cannot be had is told of when the tracker is opened.
+            let address = match Profile::find(&profile_in(folder, name)) {
+                Ok(profile) => host_port(address, profile.network.port),
+                Err(error) => host_port(address, None).map_err(|wrong| match host_port(address, Some(1)) {
+                    Ok(_) => error.to_string(),
+                    Err(_) => wrong,
+                }),
+            };
+            Ok((address?, name.to_owned()))
         }
         _ => Err(format!("found `{option}` behind the address, expected `profile=NAME`")),
     }
@@ -421,7 +431,8 @@ mod tests {
             ("hid:12345:1", "is no USB VID:PID"),
             ("hid", "names no device"),
             ("hid:1234:5678,port=1", "unknown option `port=1`"),
-            ("tcp:host,profile=x", "`host` is no address"),
+            ("tcp:host,profile=x", "no tracker profile `x`"),
+            ("tcp:host,profile=holod", "`host` is no address"),
             ("tcp:host:0,profile=x", "`host:0` is no address"),
             ("tcp:host:4242", "expected `profile=NAME`"),
             ("core::1", "is no address"),

@@ -54,6 +54,13 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
     fs::write(at("junk.toml"), [0xff, 0xfe, 0x00]).unwrap();
     fs::write(at("weights.safetensors"), "no weights").unwrap();
     fs::write(at("bad_weights.toml"), format!("{rig}[model]\nweights_file = \"weights.safetensors\"\n")).unwrap();
+    for (name, tracker) in [
+        ("bad_tracker.toml", "spec = \"hid:1234\"\neye = \"third\"\n"),
+        ("wrong_link.toml", "spec = \"serial:/dev/null,profile=holod-hid\"\n"),
+        ("unknown_hid.toml", "spec = \"hid:046d:c31c\"\n"),
+    ] {
+        fs::write(at(name), format!("[tracker]\n{tracker}")).unwrap();
+    }
     let before = listing(folder.path());
 
     const METRES: [&str; 2] = ["--depth-encoding", "millimetres"];
@@ -132,6 +139,17 @@ fn each_bad_input_gets_a_clear_error_and_leaves_nothing_behind() {
             says: &["729.14 px² in red", "8.00 to 240.00", "model/training/README.md"],
         },
         Case { args: &["--config", "bad_weights.toml"], exit: 65, says: &["weights.safetensors"] },
+        Case {
+            args: &["--config", "bad_tracker.toml"],
+            exit: 78,
+            says: &["bad_tracker.toml", "2 faults", "line 2, tracker.spec", "hid:1234", "line 3, tracker.eye"],
+        },
+        Case { args: &["--config", "wrong_link.toml"], exit: 78, says: &["line 2, tracker.spec", "hid:VID:PID"] },
+        Case {
+            args: &["--config", "unknown_hid.toml"],
+            exit: 78,
+            says: &["line 2, tracker.spec", "no shipped profile"],
+        },
         Case { args: &["--tracker", "/dev/nothing-here"], exit: 66, says: &["/dev/nothing-here", "does not exist"] },
         Case { args: &["--tracker", "directory"], exit: 66, says: &["directory"] },
         Case { args: &["--tracker", "log.csv"], exit: 65, says: &["log.csv", "when,how wide"] },

@@ -164,7 +164,7 @@ fn check_says_where_a_bench_lies_in_what_the_network_was_trained_for() {
 }
 
 #[test]
-fn check_names_a_profile_that_is_not_there() {
+fn a_profile_that_is_not_there_is_a_fault_of_the_rig() {
     let folder = holod_tests::new_folder();
     let rig = |profile: &str| {
         let rig = small_rig(64, 64, "driver = \"simulated\"");
@@ -173,9 +173,17 @@ fn check_names_a_profile_that_is_not_there() {
     fs::write(folder.path().join("good.toml"), rig("open-gaze")).unwrap();
     fs::write(folder.path().join("bad.toml"), rig("open-gase")).unwrap();
     assert!(run(HOLOD, &["check", "--config", "good.toml"], folder.path()).status.success());
-    let ended = run(HOLOD, &["check", "--config", "bad.toml"], folder.path());
-    assert_eq!(ended.status.code(), Some(69));
-    assert!(ended.stderr.contains("did you mean `open-gaze`?"), "{ended:?}");
+    let line = 1 + rig("").lines().position(|line| line.starts_with("spec = ")).unwrap();
+    for command in [&["check"][..], &["tracker", "try"], &[]] {
+        let ended = run(HOLOD, &[command, &["--config", "bad.toml"]].concat(), folder.path());
+        assert_eq!(ended.status.code(), Some(78), "{command:?}: {ended:?}");
+        for told in ["rig file bad.toml", &format!("line {line}, tracker.spec: "), "did you mean `open-gaze`?"] {
+            assert!(ended.stderr.contains(told), "{command:?}: {told} is not in {}", ended.stderr);
+        }
+    }
+    // On the command line it is a fault of the command line.
+    let ended = run(HOLOD, &["--tracker", "tcp:127.0.0.1:4242,profile=open-gase"], folder.path());
+    assert_eq!(ended.status.code(), Some(64), "{ended:?}");
 }
 
 #[test]
@@ -354,8 +362,6 @@ fn check_says_what_would_keep_a_tracker_from_being_started() {
         ("replay:notes.txt", "notes.txt"),
         ("serial:notes.txt", "no serial port"),
         ("serial:/dev/null,profile=livetrack", "millimetres"),
-        ("serial:/dev/null,profile=holod-hid", "hid:VID:PID"),
-        ("hid:046d:c31c", "no shipped profile"),
     ] {
         let check = tracker_check(spec, "");
         assert!(check["passed"] == false && check["says"].as_str().unwrap().contains(says), "{spec}: {check}");

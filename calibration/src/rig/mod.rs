@@ -22,7 +22,12 @@ pub use text_laser::{Expected, Question, TextLaserProfile};
 
 use serde::{Deserialize, Serialize};
 
+use crate::toml_source::Fault;
 use crate::{Colour, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
+
+/// Reads the `tracker.spec` of a rig file that lies in a folder, where relative paths start: gives it as it is meant, or
+/// what is wrong with it, as faults whose key and line are not filled in.
+pub type SpecReader<'a> = &'a dyn Fn(&str, &Path) -> Result<String, Vec<Fault>>;
 
 /// One bench.
 #[derive(Clone, Debug, PartialEq)]
@@ -357,9 +362,17 @@ impl Rig {
     /// [`RigError`] with every fault of the file: one that is missing, no file, or not UTF-8; whatever
     /// [`Rig::parse`] finds.
     pub fn load(path: &Path) -> Result<Self, RigError> {
+        Self::load_with(path, AS_WRITTEN)
+    }
+
+    /// The same, with the tracker's spec as `read_spec` reads it, whose faults are faults of the file.
+    ///
+    /// # Errors
+    /// As [`Rig::load`], and what `read_spec` finds.
+    pub fn load_with(path: &Path, read_spec: SpecReader<'_>) -> Result<Self, RigError> {
         let text = files::read_text(path)
             .map_err(|fault| RigError { origin: path.display().to_string(), faults: vec![fault.of_rig_file()] })?;
-        Self::parse(&text, path)
+        parse::parse(&text, path, read_spec)
     }
 
     /// Validates a rig file's text. Relative paths in it start at the folder of `origin`, and the files there are
@@ -369,7 +382,7 @@ impl Rig {
     /// [`RigError`] with every fault: no TOML, duplicate, unknown, misplaced and missing keys, wrong types, figures
     /// out of range or at odds with each other, and faulty files. Where the text is no TOML, only that is reported.
     pub fn parse(text: &str, origin: &Path) -> Result<Self, RigError> {
-        parse::parse(text, origin)
+        parse::parse(text, origin, AS_WRITTEN)
     }
 
     /// What the rig's figures mean, for a person who checks a bench.

@@ -10,8 +10,9 @@ use super::profile::PanelProfile;
 use super::reader::{Found, Reader, Section, Span};
 use super::{
     Eye, LaserDriver, Lasers, LevelPhase, Model, Orientation, OutOfStroke, Packing, Panel, PanelMode, PhaseSign,
-    Provenance, Rig, RigError, TextLaserProfile, Tracker, WeightsChoice, flatness, lut,
+    Provenance, Rig, RigError, SpecReader, TextLaserProfile, Tracker, WeightsChoice, flatness, lut,
 };
+use crate::toml_source::Fault;
 use crate::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
 
 /// Every key of a rig file, by table.
@@ -115,12 +116,18 @@ const HOLD: Span = Span::new(150.0, 60_000.0, "ms").slips(&[("seconds", 1e3)]);
 const STROKE_TOLERANCE: f64 = 0.02;
 
 /// Parses `text`; relative paths in it start at the folder of `origin`.
-pub(super) fn parse(text: &str, origin: &Path) -> Result<Rig, RigError> {
-    let rig = Reader::read(text, |reader, root| read_rig(reader, root, text, origin));
+pub(super) fn parse(text: &str, origin: &Path, read_spec: SpecReader<'_>) -> Result<Rig, RigError> {
+    let rig = Reader::read(text, |reader, root| read_rig(reader, root, text, origin, read_spec));
     rig.map_err(|faults| RigError { origin: origin.display().to_string(), faults })
 }
 
-fn read_rig<'a>(reader: &Reader<'a>, root: Section<'a>, text: &str, origin: &Path) -> Option<Rig> {
+fn read_rig<'a>(
+    reader: &Reader<'a>,
+    root: Section<'a>,
+    text: &str,
+    origin: &Path,
+    read_spec: SpecReader<'_>,
+) -> Option<Rig> {
     reader.reject_unknown(root, &LAYOUT, &RETIRED);
     let name = match reader.text(root, "name", "a name for logs and reports") {
         Some(name) => name.value.to_owned(),
@@ -140,7 +147,8 @@ fn read_rig<'a>(reader: &Reader<'a>, root: Section<'a>, text: &str, origin: &Pat
         Provenance { origin: origin.display().to_string(), text_hash: Some(fnv1a(text)), ..Provenance::default() };
 
     if built_in {
-        let (tracker, model) = (read_tracker(reader, tracker), read_model(reader, model, folder));
+        let tracker = read_tracker(reader, tracker, &|spec| read_spec(spec, folder));
+        let model = read_model(reader, model, folder);
         return Some(Rig { name, tracker: tracker?, model: model?, provenance, ..Rig::default() });
     }
     // Each part is read whatever became of the others, so that one report holds all the faults.
@@ -156,7 +164,7 @@ fn read_rig<'a>(reader: &Reader<'a>, root: Section<'a>, text: &str, origin: &Pat
     let phase = read_phase(reader, panel, levels, pixels.map(|(resolution, _)| resolution), folder, &mut provenance);
     let geometry = read_optics(reader, optics, pixels);
     let lasers = read_lasers(reader, lasers, timing, folder);
-    let tracker = read_tracker(reader, tracker);
+    let tracker = read_tracker(reader, tracker, &|spec| read_spec(spec, folder));
     let model = read_model(reader, model, folder);
 
     let (timing, (bit_depth, packing), phase) = (timing?, levels?, phase?);
@@ -717,15 +725,27 @@ fn read_text_laser<'a>(reader: &Reader<'a>, lasers: Section<'a>, folder: &Path) 
     }
 }
 
-fn read_tracker<'a>(reader: &Reader<'a>, tracker: Section<'a>) -> Option<Tracker> {
+fn read_tracker<'a>(
+    reader: &Reader<'a>,
+    tracker: Section<'a>,
+    read_spec: &dyn Fn(&str) -> Result<String, Vec<Fault>>,
+) -> Option<Tracker> {
     let default = Rig::default().tracker;
-    let spec = reader.text(tracker, "spec", "a tracker spec, as on the command line");
+    let spec = reader.text(tracker, "spec", "a tracker spec, as on the command line").and_then(|spec| {
+        let read = read_spec(spec.value);
+        read.map_err(|faults| {
+            for fault in faults {
+                reader.fault_in(tracker, "spec", spec.line, &fault.found, &fault.expected, fault.advice);
+            }
+        })
+        .ok()
+    });
     let eye = reader.choice(tracker, "eye", &Eye::NAMES, false);
     let scale = reader.number(tracker, "scale_mm_per_unit", SCALE);
     let fallback_mm = reader.number(tracker, "fallback_mm", FALLBACK);
     let hold_ms = reader.number(tracker, "hold_ms", HOLD);
     Some(Tracker {
-        spec: spec.map(|spec| spec.value.into()),
+        spec,
         eye: eye.map_or(default.eye, |eye| eye.value),
         scale: scale.map(|scale| scale.value),
         fallback: fallback_mm.map_or(default.fallback, |mm| PupilDiameter::from_mm(mm.value as f32)),

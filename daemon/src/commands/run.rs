@@ -38,6 +38,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let hangups = if args.rig.config.is_some() { Hangups::take_over()? } else { None };
     let rig = rig_of(args)?;
     let spec = rig.tracker.spec.clone().unwrap_or_else(|| SAMPLE_TRACKER.to_owned());
+    // The rig's own was judged with the rig.
     let tracker: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
     if let TrackerSpec::Path(path) | TrackerSpec::Replay { path, .. } = &tracker {
         bug_report::refuse_archive(path)?;

@@ -84,18 +84,29 @@ impl Job {
     /// What the sizes of a tracker are before the rig's scale, as far as can be told without opening a link: of a HID
     /// device that its profile does not know to the end, as far as the profile does.
     pub(super) fn unit_unopened(spec: &TrackerSpec) -> Result<SizeUnit, TrackerError> {
-        let profile = match spec {
+        match Self::profile_unopened(spec)? {
+            Some(profile) => Ok(profile.unit),
+            None => Ok(Self::open(spec, TimeNs(0), &[])?.unit()),
+        }
+    }
+
+    /// The profile of a link, which is not opened; none of a log and of a simulated eye.
+    pub(super) fn profile_unopened(spec: &TrackerSpec) -> Result<Option<Profile>, TrackerError> {
+        Ok(Some(match spec {
             TrackerSpec::Path(path) if !path.is_file() => serial_profile(None)?,
             TrackerSpec::Serial { profile, .. } => serial_profile(profile.as_deref())?,
-            TrackerSpec::Hid { ids, profile, .. } => hid_profile(*ids, profile.as_deref())?,
+            TrackerSpec::Hid { ids, serial, profile } => {
+                let profile = hid_profile(*ids, profile.as_deref())?;
+                Wanted::new(*ids, serial.as_deref(), &profile).map_err(SourceError::from)?;
+                profile
+            }
             TrackerSpec::Tcp { profile, .. } | TrackerSpec::Udp { profile, .. } => Profile::find(profile)?,
             TrackerSpec::Core(_) => Profile::find("core")?,
             TrackerSpec::Neon(_) => Profile::find("neon")?,
             TrackerSpec::Path(_) | TrackerSpec::Replay { .. } | TrackerSpec::Mock(_) | TrackerSpec::MockFile(_) => {
-                return Ok(Self::open(spec, TimeNs(0), &[])?.unit());
+                return Ok(None);
             }
-        };
-        Ok(profile.unit)
+        }))
     }
 
     /// What its sizes are before the rig's scale.

@@ -1,6 +1,7 @@
 //! A tracker that runs: one thread reads, decodes, gates and filters; others ask for the pupil without waiting.
 
 mod job;
+mod rig_spec;
 mod worker;
 
 use std::path::PathBuf;

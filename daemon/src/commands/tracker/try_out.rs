@@ -158,6 +158,7 @@ fn keep_what_came(folder: Option<&mut RecordFolder>, tracker: &TrackerHandle) ->
 }
 
 fn spec_of(args: &TryArgs, rig: &Rig) -> Result<TrackerSpec, Failure> {
+    // The rig's was judged with the rig.
     let text = args.spec.as_ref().or(rig.tracker.spec.as_ref()).ok_or_else(|| {
         Failure::new(Exit::Usage, "which tracker? name its spec, or a rig file with tracker.spec by --config")
     })?;
