@@ -1,5 +1,6 @@
 //! `holod demo`: the whole loop on built-in inputs, and pictures of what happened.
 
+use std::collections::HashSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -16,7 +17,7 @@ use crate::pictures::{
     Area, LatencyPlot, PupilPlot, PupilSampleMark, Sheet, Tile, phase_picture, screen_picture, shown_pattern,
 };
 use crate::record::{FieldRecord, FrameLog, FrameRecord};
-use crate::session::{self, Observer, SessionPlan, SessionReport};
+use crate::session::{self, FirstLight, Observer, SessionPlan, SessionReport};
 use crate::source::{Pictures, scene};
 use crate::staging::Staging;
 use crate::{logging, progress, results, run_text, setup};
@@ -56,6 +57,7 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
         frames_csv: FrameLog::create(&staging.path("."))?,
         frames: Vec::new(),
         first_fields: Vec::new(),
+        lights: Vec::new(),
         decisions: Vec::new(),
     };
     let session = session::run(
@@ -200,6 +202,7 @@ struct Log {
     frames_csv: FrameLog,
     frames: Vec<FrameRecord>,
     first_fields: Vec<FieldEvent>,
+    lights: Vec<FirstLight>,
     decisions: Vec<Decision>,
 }
 
@@ -215,6 +218,10 @@ impl Observer for Log {
             self.first_fields.push(*event);
         }
         self.frames_csv.field(&FieldRecord::of(event))
+    }
+
+    fn first_light(&mut self, light: &FirstLight) {
+        self.lights.push(*light);
     }
 
     fn decision(&mut self, decision: &Decision) -> Result<(), Failure> {
@@ -259,19 +266,79 @@ impl Log {
     fn latency_plot(&self, session: &SessionReport, staging: &Staging) -> Result<(), Failure> {
         let since = |t: TimeNs| (t - session.t_origin).seconds();
         let ms = |span: TimeNs| span.seconds() * 1e3;
-        let (mut render, mut photon, mut missed) = (Vec::new(), Vec::new(), Vec::new());
+        let mut render = Vec::new();
         for field in &self.first_fields {
             let Some(frame) = self.frames.iter().find(|frame| frame.frame == field.frame_id) else { continue };
-            let t_s = since(field.t_present);
-            render.push((t_s, ms(frame.t_submit - frame.t_wake)));
-            if let (Some(t_sample), Some(lit)) = (frame.t_sample, field.laser_on) {
-                photon.push((t_s, ms(lit - t_sample)));
-                if field.deadline_missed {
-                    missed.push((t_s, ms(lit - t_sample)));
-                }
-            }
+            render.push((since(field.t_present), ms(frame.t_submit - frame.t_wake)));
         }
+        let (photon, missed) = self.latencies(since);
         LatencyPlot { render_ms: &render, sample_to_photon_ms: &photon, missed: &missed }
             .save(&staging.path("latency.svg"))
+    }
+
+    /// Each frame's time from sample to photons, as the summary counts it, by when its first light was, and of these
+    /// those of frames that were late.
+    fn latencies(&self, since: impl Fn(TimeNs) -> f64) -> (Vec<(f64, f64)>, Vec<(f64, f64)>) {
+        let late: HashSet<u64> =
+            self.first_fields.iter().filter(|field| field.deadline_missed).map(|field| field.frame_id).collect();
+        let (mut all, mut missed) = (Vec::new(), Vec::new());
+        for light in &self.lights {
+            let Some(latency) = light.sample_to_photon else { continue };
+            let mark = (since(light.t), latency.seconds() * 1e3);
+            all.push(mark);
+            if late.contains(&light.frame) {
+                missed.push(mark);
+            }
+        }
+        (all, missed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use holod_slm_output::TimestampSource;
+    use holod_slm_output::laser::DarkReason;
+
+    #[test]
+    fn latencies_are_those_of_first_lights_whichever_field_that_was() {
+        let folder = tempfile::tempdir().unwrap();
+        let frames_csv = FrameLog::create(folder.path()).unwrap();
+        let mut log =
+            Log { frames_csv, frames: Vec::new(), first_fields: Vec::new(), lights: Vec::new(), decisions: Vec::new() };
+        let ms = |ms: i64| TimeNs(1_000_000 * ms);
+        // The first field of frame 2 is late and dark, and of its second one it is told when it was lit.
+        for (frame, t_ms, latency_ms) in [(1, 100, Some(45)), (2, 125, Some(53)), (3, 150, None)] {
+            let is_lit = frame != 2;
+            let t_present = ms(t_ms - 5);
+            let field = FieldEvent {
+                frame_id: frame,
+                field: 0,
+                colour: Colour::Red,
+                t_submit: t_present,
+                t_desired_present: t_present,
+                t_present,
+                t_settled: t_present,
+                t_end: ms(t_ms),
+                provenance: TimestampSource::Software,
+                laser_on: is_lit.then_some(t_present),
+                laser_off: is_lit.then_some(ms(t_ms)),
+                dark: (!is_lit).then_some(DarkReason::Late),
+                repeated: false,
+                deadline_missed: frame == 2,
+            };
+            let sample_to_photon = latency_ms.map(ms);
+            log.first_light(&FirstLight { frame, t: ms(t_ms), sample_to_photon, picture_to_photon: None });
+            log.field(&field).unwrap();
+        }
+        let (all, late) = log.latencies(|t| t.seconds());
+        let expected = [(0.1, 45.0), (0.125, 53.0)];
+        let alike = |marks: &[(f64, f64)], expected: &[(f64, f64)]| {
+            marks.len() == expected.len()
+                && marks.iter().zip(expected).all(|(a, b)| (a.0 - b.0).abs() < 1e-9 && (a.1 - b.1).abs() < 1e-9)
+        };
+        assert!(alike(&all, &expected), "{all:?}");
+        assert!(alike(&late, &expected[1..]), "{late:?}");
+        assert!(!alike(&all, &[(0.1, 45.0), (0.125, 53.1)]) && !alike(&all, &expected[1..]));
     }
 }
