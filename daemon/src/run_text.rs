@@ -17,7 +17,9 @@ pub(crate) fn feed_text(feed: &FeedStatus) -> String {
     };
     let clipped = match feed.pictures_with_clipped_colours {
         0 => String::new(),
-        pictures => format!("; colours clipped in {pictures} of them, in pixels: {}", feed.clipped_colours_in_all.text()),
+        pictures => {
+            format!("; colours clipped in {pictures} of them, in pixels: {}", feed.clipped_colours_in_all.text())
+        }
     };
     let refusal = feed.last_refusal.as_ref().map_or(String::new(), |why| format!("; refused last: {why}"));
     format!(

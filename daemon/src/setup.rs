@@ -3,7 +3,7 @@
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use holod_calibration::rig::{Rig, WeightsChoice};
+use holod_calibration::rig::{Rig, RigError, WeightsChoice};
 use holod_calibration::{DisplayGeometry, PupilDiameter};
 use holod_model::Weights;
 use holod_model::conditions::BenchFit;
@@ -18,14 +18,21 @@ const MOST_EYES_MM: [f32; 2] = [2.0, 6.0];
 
 /// The rig that was named, or the built-in one.
 pub fn rig(args: &RigArgs) -> Result<Rig, Failure> {
-    match &args.config {
-        None => Ok(Rig::default()),
-        Some(path) => {
-            let exit = if path.exists() { Exit::Config } else { Exit::NoInput };
-            let spec = |text: &str, folder: &Path| TrackerSpec::of_rig(text, folder).map(|spec| spec.to_string());
-            Rig::load_with(path, &spec).map_err(Failure::because(exit))
-        }
-    }
+    load(args, |path| {
+        Rig::load_with(path, &|text, folder| TrackerSpec::of_rig(text, folder).map(|spec| spec.to_string()))
+    })
+}
+
+/// The same, whatever its tracker is: what is wrong there keeps no laser from being put out.
+pub fn rig_of_lasers(args: &RigArgs) -> Result<Rig, Failure> {
+    load(args, Rig::load)
+}
+
+fn load(args: &RigArgs, load: impl Fn(&Path) -> Result<Rig, RigError>) -> Result<Rig, Failure> {
+    args.config.as_deref().map_or(Ok(Rig::default()), |path| {
+        let exit = if path.exists() { Exit::Config } else { Exit::NoInput };
+        load(path).map_err(Failure::because(exit))
+    })
 }
 
 /// The same with the network that was named in place of the rig's own.

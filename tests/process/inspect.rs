@@ -181,6 +181,9 @@ fn a_profile_that_is_not_there_is_a_fault_of_the_rig() {
             assert!(ended.stderr.contains(told), "{command:?}: {told} is not in {}", ended.stderr);
         }
     }
+    // It keeps no laser from being put out.
+    let ended = run(HOLOD, &["dark", "--config", "bad.toml"], folder.path());
+    assert!(ended.status.success() && ended.stdout.contains("no laser box"), "{ended:?}");
     // On the command line it is a fault of the command line.
     let ended = run(HOLOD, &["--tracker", "tcp:127.0.0.1:4242,profile=open-gase"], folder.path());
     assert_eq!(ended.status.code(), Some(64), "{ended:?}");

@@ -271,14 +271,14 @@ impl Log {
             let Some(frame) = self.frames.iter().find(|frame| frame.frame == field.frame_id) else { continue };
             render.push((since(field.t_present), ms(frame.t_submit - frame.t_wake)));
         }
-        let (photon, missed) = self.latencies(since);
+        let [photon, missed] = self.latencies(since);
         LatencyPlot { render_ms: &render, sample_to_photon_ms: &photon, missed: &missed }
             .save(&staging.path("latency.svg"))
     }
 
     /// Each frame's time from sample to photons, as the summary counts it, by when its first light was, and of these
     /// those of frames that were late.
-    fn latencies(&self, since: impl Fn(TimeNs) -> f64) -> (Vec<(f64, f64)>, Vec<(f64, f64)>) {
+    fn latencies(&self, since: impl Fn(TimeNs) -> f64) -> [Vec<(f64, f64)>; 2] {
         let late: HashSet<u64> =
             self.first_fields.iter().filter(|field| field.deadline_missed).map(|field| field.frame_id).collect();
         let (mut all, mut missed) = (Vec::new(), Vec::new());
@@ -290,7 +290,7 @@ impl Log {
                 missed.push(mark);
             }
         }
-        (all, missed)
+        [all, missed]
     }
 }
 
@@ -331,7 +331,7 @@ mod tests {
             log.first_light(&FirstLight { frame, t: ms(t_ms), sample_to_photon, picture_to_photon: None });
             log.field(&field).unwrap();
         }
-        let (all, late) = log.latencies(|t| t.seconds());
+        let [all, late] = log.latencies(|t| t.seconds());
         let expected = [(0.1, 45.0), (0.125, 53.0)];
         let alike = |marks: &[(f64, f64)], expected: &[(f64, f64)]| {
             marks.len() == expected.len()

@@ -51,7 +51,7 @@ pub(super) fn dark(args: &LaserArgs) -> Result<(), Failure> {
 
 /// The rig that was named, or the built-in one with a laser box at the port that was named.
 fn bench(args: &LaserArgs) -> Result<Rig, Failure> {
-    let mut rig = setup::rig(&args.rig)?;
+    let mut rig = setup::rig_of_lasers(&args.rig)?;
     if let Some(path) = &args.port {
         rig.lasers.driver = LaserDriver::Serial { path: path.clone(), sync_wire: false };
     }

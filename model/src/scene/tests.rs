@@ -157,7 +157,7 @@ fn few_bits(path: &Path, bits: u8, row: &[u8]) {
         line.iter().fold((1_u32, 0), |(low, high), &byte| (low + u32::from(byte), high + low + u32::from(byte)));
     let length = line.len() as u16;
     let block = [&[0x78, 1, 1][..], &length.to_le_bytes(), &(!length).to_le_bytes(), &line].concat();
-    let data = [block, (high % 65521 << 16 | low % 65521).to_be_bytes().to_vec()].concat();
+    let data = [block, (((high % 65521) << 16) | (low % 65521)).to_be_bytes().to_vec()].concat();
     let chunks = [chunk(b"IHDR", &header), chunk(b"IDAT", &data), chunk(b"IEND", &[])].concat();
     std::fs::write(path, [&b"\x89PNG\r\n\x1a\n"[..], &chunks].concat()).unwrap();
 }

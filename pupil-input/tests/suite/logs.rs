@@ -117,7 +117,8 @@ fn each_bad_cell_is_counted_by_its_reason() {
 
 /// Logs of 200 Hz with `lost` in the place of a diameter for 0.1 s, one of each format that has cells for it.
 fn logs_with(lost: &str) -> [(LogFormat, String); 5] {
-    let (header, row): ([_; 5], [fn(i64, &str) -> String; 5]) = (
+    type Row = fn(i64, &str) -> String;
+    let (header, row): ([_; 5], [Row; 5]) = (
         [
             "timestamp [ns],pupil diameter left [mm]\n",
             "** TYPE: EDF_FILE\nSTART\t1 \tLEFT\tSAMPLES\nPUPIL\tDIAMETER\n",
