@@ -491,11 +491,14 @@ class Interrupt:
     @contextmanager
     def heeded(self) -> Iterator[None]:
         """Keeps the first one for the end of the step; the next ends the run at once, as ever. Of several processes,
-        which would stop at different steps, and outside the main thread each does."""
-        if int(os.environ.get("WORLD_SIZE", "1")) > 1 or threading.current_thread() is not threading.main_thread():
+        which would stop at different steps, and outside the main thread each does. Where it is ignored, as in the
+        background of a script, it stays so."""
+        before = signal.getsignal(signal.SIGINT)
+        is_one_of_several = int(os.environ.get("WORLD_SIZE", "1")) > 1
+        is_main_thread = threading.current_thread() is threading.main_thread()
+        if is_one_of_several or not is_main_thread or before is signal.SIG_IGN:
             yield
             return
-        before = signal.getsignal(signal.SIGINT)
 
         def come(number: int, frame: object) -> None:
             self.came = True

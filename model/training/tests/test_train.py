@@ -716,13 +716,20 @@ def test_an_interrupt_leaves_a_checkpoint_and_no_traceback(
             signal.raise_signal(signal.SIGINT)
         return original(self)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Run, "train_step", step)
-        capsys.readouterr()
-        assert main([*command, str(tmp_path / "cut")]) == 130
-    said = capsys.readouterr().err
-    assert "interrupted: " in said and "checkpoint.pt is of step 3: go on with --resume" in said
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(Run, "train_step", step)
+            capsys.readouterr()
+            assert main([*command, str(tmp_path / "cut")]) == 130
+            said = capsys.readouterr().err
+            assert "interrupted: " in said and "checkpoint.pt is of step 3: go on with --resume" in said
+            assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+            # As in the background of a script.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            assert main([*command, str(tmp_path / "ignored")]) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert main([*command, str(tmp_path / "cut"), "--resume"]) == 0
     whole, cut = (load_file(tmp_path / name / "weights.safetensors") for name in ("whole", "cut"))
     assert all(torch.equal(value, cut[name]) for name, value in whole.items())
