@@ -23,7 +23,7 @@ from holod_training.optics import Eye, coc_px, double_phase, panel_field, throug
 from holod_training.report import NUMBERS
 from holod_training.rivals import flat_oracle
 from holod_training.shards import Shard, check_pupils, open_held_out
-from holod_training.train import VALIDATION_PUPILS_MM, Run, TrainConfig, train
+from holod_training.train import VALIDATION_PUPILS_MM, Run, TrainConfig, TrainingError, train
 from holod_training.variants import VARIANTS, network_amplitude, variant
 
 WARM_STEPS, TIMED_STEPS = 2, 7
@@ -120,7 +120,7 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
             _require_same_terms(known, json.loads(known.read_text())["terms"], terms)
             print(f"{name}: taken from {known}")
         else:
-            row = {"variant": name, "terms": terms, **_contest(config, terms, device)}
+            row = {"variant": name, "terms": terms, **_contest(config, terms, shards, device)}
             write_beside(known, (json.dumps(row, indent=1) + "\n").encode())
         rows.append(json.loads(known.read_text()))
     flat = judge_flat_oracle(shards, base.validation_border_px)
@@ -136,31 +136,31 @@ def _require_same_terms(path: Path, kept: dict[str, Any], terms: dict[str, Any])
     # They may be from before a key of networks was there.
     network = {**json.loads(json.dumps(dataclasses.asdict(NetworkConfig()))), **kept["network"]}
     if other := [key for key in terms if {**kept, "network": network}.get(key) != terms[key]]:
-        raise ConfigError(
-            f"{path}: found a row with another {', '.join(other)}; choose another --out, or delete {path.parent}"
-        )
+        raise ConfigError(f"{path}: found another {', '.join(other)}; choose another --out, or delete {path.parent}")
 
 
-def _contest(config: TrainConfig, terms: dict[str, Any], device: torch.device) -> dict[str, Any]:
+def _contest(config: TrainConfig, terms: dict[str, Any], shards: list[Shard], device: torch.device) -> dict[str, Any]:
     """Trains one variant, or goes on with it where its folder has a checkpoint that was begun on the same terms, and
-    judges it."""
+    judges it by `shards`."""
     begun = Path(config.out) / BEGUN
     has_checkpoint = begun.with_name("checkpoint.pt").is_file()
     goes_on = has_checkpoint and begun.is_file()
     if goes_on:
         kept = json.loads(begun.read_text())
         _require_same_terms(begun, kept["terms"], terms)
+    elif has_checkpoint:
+        raise TrainingError(f"{config.out}: holds a run of no comparison; choose another --out, or delete it")
     else:
         step_seconds = seconds_per_step(config, device)
         steps = max(1, round(60 * terms["minutes"] / step_seconds))
         kept = {"terms": terms, "steps": steps, "step_seconds": step_seconds}
-        # A run that is none of ours is refused by `train`.
-        if not has_checkpoint:
-            write_beside(begun, (json.dumps(kept, indent=1) + "\n").encode())
+        write_beside(begun, (json.dumps(kept, indent=1) + "\n").encode())
     steps = kept["steps"]
     config = dataclasses.replace(config, steps=steps, validate_every=steps, checkpoint_every=steps)
-    network = load_weights(train(config, device, resume=goes_on))
-    shards = open_held_out(Path(config.validation or ""), limit=config.validation_scenes)
+    try:
+        network = load_weights(train(config, device, resume=goes_on))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{config.out} is begun: the same command goes on with it") from None
     return {
         "parameters": sum(p.numel() for p in network.parameters()),
         "operations_per_pixel": operations_per_pixel(config.network),

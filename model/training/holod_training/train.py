@@ -577,10 +577,13 @@ def _train(
                 run.save_checkpoint()
             if world > 1:
                 dist.barrier()
-        if interrupt.came and not done:
-            raise KeyboardInterrupt(f"{checkpoint} is of step {run.step}: go on with --resume")
         if log and (run.step % config.validate_every == 0 or done):
             _validate(run, log, weights)
+        if interrupt.came:
+            left = (
+                f"{weights} is of the last step" if done else f"{checkpoint} is of step {run.step}: go on with --resume"
+            )
+            raise KeyboardInterrupt(left)
     progress.close()
     return weights
 

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import signal
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from holod_training.costs import operations_per_pixel
 from holod_training.curves import plot_curves
 from holod_training.network import DirectNetwork
 from holod_training.shards import ShardError, open_shards
-from holod_training.train import Run, TrainConfig
+from holod_training.train import Run, TrainConfig, TrainingError
 
 CPU = torch.device("cpu")
 
@@ -57,7 +58,7 @@ def test_variants_compete_for_the_same_time(shards: Path, tmp_path: Path, capsys
     assert main([*command[:-5], "half-band-8", *command[-4:]]) == 0
     # Rows of other terms never share a table.
     assert main([*command, "--in-focus-weight", "7"]) == 65
-    assert "half-band-8/comparison.json: found a row with another loss" in capsys.readouterr().err
+    assert "half-band-8/comparison.json: found another loss" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("no_plots")
@@ -86,12 +87,43 @@ def test_an_interrupted_variant_goes_on_from_its_checkpoint(
             compare(config, ["half-band-8"], 1, CPU)
     assert steps_run == [0, 1]
     monkeypatch.setattr("holod_training.compare.seconds_per_step", lambda config, device: 0.1)
-    with pytest.raises(ConfigError, match=r"half-band-8/begun\.json: found a row with another seed; choose another"):
+    with pytest.raises(ConfigError, match=r"half-band-8/begun\.json: found another seed; choose another"):
         compare(dataclasses.replace(config, seed=2), ["half-band-8"], 1, CPU)
     compare(config, ["half-band-8"], 1, CPU)
     assert steps_run == [0, 1], "no step was run again"
     row = json.loads((tmp_path / "out" / "half-band-8" / "comparison.json").read_text())
     assert (row["steps"], row["step_seconds"]) == (2, 0.5) and row["pupils"]["2.0"]["psnr_db"] > 5
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_an_interrupt_in_a_variants_last_step_begins_no_other_variant(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = TrainConfig(
+        str(shards), str(tmp_path / "out"), 1, validation=str(shards), crop=32, border_px=4, validation_border_px=8
+    )
+    train_step = Run.train_step
+
+    def last_step(self: Run) -> dict[str, float]:
+        signal.raise_signal(signal.SIGINT)
+        return train_step(self)
+
+    monkeypatch.setattr("holod_training.compare.seconds_per_step", lambda config, device: 1.0)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(Run, "train_step", last_step)
+            with pytest.raises(KeyboardInterrupt, match=r"half-band-8 is begun: the same command goes on with it"):
+                compare(config, ["half-band-8", "half-band-14"], 1, CPU)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert [folder.name for folder in (tmp_path / "out").iterdir()] == ["half-band-8"]
+    foreign = tmp_path / "foreign" / "half-band-8"
+    foreign.mkdir(parents=True)
+    (foreign / "checkpoint.pt").touch()
+    with pytest.raises(TrainingError, match=r"foreign/half-band-8: holds a run of no comparison; choose"):
+        compare(dataclasses.replace(config, out=str(tmp_path / "foreign")), ["half-band-8"], 1, CPU)
+    assert [path.name for path in foreign.iterdir()] == ["checkpoint.pt"]
 
 
 def test_comparison_says_what_is_missing(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -368,6 +368,10 @@ def test_scenes_of_training_are_refused(tmp_path: Path, evaluation: Path, capsys
         arguments = [command, "--weights", str(evaluation / "w.safetensors"), "--test", str(tmp_path)]
         assert main([*arguments, "--out", str(tmp_path / "out")]) == 65
         assert "scene_000000.safetensors: metadata kind is 'train', expected held-out" in capsys.readouterr().err
+    for folder in ("cards", "marks"):
+        arguments = ["evaluate", "--weights", str(evaluation / "w.safetensors"), "--test", str(evaluation / "test")]
+        assert main([*arguments, f"--{folder}", str(tmp_path), "--out", str(tmp_path / "out")]) == 65
+        assert "scene_000000.safetensors: metadata kind is 'train', expected held-out" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -707,7 +707,7 @@ def test_an_interrupt_leaves_a_checkpoint_and_no_traceback(
 ) -> None:
     """Ctrl-C within a step counts at its end; what is resumed then is the run that was never interrupted."""
     command = ["train", "--shards", str(shards), "--steps", "5", "--crop", "32", "--border-px", "4", "--device", "cpu"]
-    command += ["--variant", "half-band-8", "--channels", "4", "--layers", "4", "--out"]
+    command += ["--variant", "half-band-8", "--channels", "4", "--layers", "4", "--validate-every", "3", "--out"]
     assert main([*command, str(tmp_path / "whole")]) == 0
     original = Run.train_step
 
@@ -724,6 +724,7 @@ def test_an_interrupt_leaves_a_checkpoint_and_no_traceback(
             assert main([*command, str(tmp_path / "cut")]) == 130
             said = capsys.readouterr().err
             assert "interrupted: " in said and "checkpoint.pt is of step 3: go on with --resume" in said
+            assert read_metadata(tmp_path / "cut" / "weights.safetensors")["provenance"]["steps"] == 3, "it was due"
             assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
             # As in the background of a script.
             signal.signal(signal.SIGINT, signal.SIG_IGN)

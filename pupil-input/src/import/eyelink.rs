@@ -74,17 +74,31 @@ impl Eyes {
         }
     }
 
-    /// As the figures of a sample suggest, where no header names them, and whether they leave it open: flags tell, else
-    /// the number of figures. One eye has 3, velocity and resolution 2 more each; two eyes have 6, and 4 and 2 more;
-    /// either may have one of the input port besides. So 7 are of one eye with both, or of two with the port.
-    fn guessed_from(line: &[u8]) -> (Self, bool) {
+    /// As the figures of a sample suggest, where no header names them, and how sure that is: flags tell, else the number
+    /// of figures. One eye has 3, velocity and resolution 2 more each; two eyes have 6, and 4 and 2 more; either may
+    /// have one of the input port besides.
+    fn guessed_from(line: &[u8]) -> (Self, Guess) {
         let figures = words(line).skip(1).filter(|word| *word == b"." || number(word).is_some()).count();
-        let (two, open) = match words(line).last().and_then(flag_count) {
-            Some(flags) => (matches!(flags, 5 | 17), false),
-            None => (figures >= 6 && figures != 7, figures == 7),
+        let (two, guess) = match words(line).last().and_then(flag_count) {
+            Some(flags) => (matches!(flags, 5 | 17), Guess::Told),
+            None => match figures {
+                7 => (false, Guess::OneOfSeven),
+                8 => (true, Guess::TwoOfEight),
+                _ => (figures >= 6, Guess::Told),
+            },
         };
-        (if two { Self::Two } else { Self::One(SampleEye::Both) }, open)
+        (if two { Self::Two } else { Self::One(SampleEye::Both) }, guess)
     }
+}
+
+/// How sure the eyes are that no header names.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Guess {
+    Told,
+    /// One eye with velocity and resolution; or two with the port.
+    OneOfSeven,
+    /// Two eyes with resolution; or one with all.
+    TwoOfEight,
 }
 
 /// What a pupil's figure is.
@@ -105,8 +119,8 @@ struct Reader<'b> {
     blocks: u64,
     measures_differ: bool,
     rates_differ: bool,
-    /// No header named the eyes; whether the figures left it open which there are.
-    guessed: Option<bool>,
+    /// No header named the eyes.
+    guessed: Option<Guess>,
     samples: u64,
 }
 
@@ -149,8 +163,8 @@ impl Reader<'_> {
         let eyes = match self.eyes {
             Some(eyes) => eyes,
             None => {
-                let (eyes, open) = Eyes::guessed_from(line);
-                self.guessed = Some(open);
+                let (eyes, guess) = Eyes::guessed_from(line);
+                self.guessed = Some(guess);
                 *self.eyes.insert(eyes)
             }
         };
@@ -283,11 +297,16 @@ impl Reader<'_> {
         ));
         match self.guessed {
             None => {}
-            Some(false) => self.log.note("no header names the eyes: they are told by the samples' columns"),
-            Some(true) => self.log.note(
+            Some(Guess::Told) => self.log.note("no header names the eyes: they are told by the samples' columns"),
+            Some(Guess::OneOfSeven) => self.log.note(
                 "no header names the eyes, and the samples have 7 figures: they were read as one eye with velocity and \
                  resolution, not as two eyes with the input port; where it is two, export the log again with its header \
                  or its flags",
+            ),
+            Some(Guess::TwoOfEight) => self.log.note(
+                "no header names the eyes, and the samples have 8 figures: they were read as two eyes with resolution, \
+                 not as one eye with velocity, resolution and the input port; where it is one, export the log again \
+                 with its header or its flags",
             ),
         }
         if self.blocks > 1 {

@@ -427,6 +427,9 @@ fn eyelink_exports_of_samples_alone_are_read() {
         let line = format!("10{}\n", "\t  41.0".repeat(figures));
         let recording = Recording::read(&written(&dir, "log", line)).expect("reads");
         assert_eq!(recording.len(), eyes, "{figures}");
+        let note = format!("the samples have {figures} figures");
+        let is_open = recording.notes().iter().any(|told| told.contains(&note));
+        assert_eq!(is_open, matches!(figures, 7 | 8), "{figures}: {:?}", recording.notes());
     }
 }
 

@@ -110,7 +110,7 @@ enum Conv {
 /// A deformable convolution, the prediction of whose offsets is modulated for bench and pupil.
 struct AdjustableConv {
     conv: DeformableConv,
-    inputs: Vec<usize>,
+    channels: Vec<usize>,
     modulation: Modulation,
 }
 
@@ -131,7 +131,7 @@ impl Conv {
                 let width = maps.size.width;
                 Self::Adjustable(Box::new(AdjustableConv {
                     conv: DeformableConv::new(channels, width, bias, weight, epilogue, leaky_slope, products),
-                    inputs: inputs.to_vec(),
+                    channels: (0..channels).collect(),
                     modulation: Modulation::new(parameters, leaky_slope),
                 }))
             }
@@ -142,10 +142,10 @@ impl Conv {
 impl AdjustableConv {
     /// Sets the offset prediction to that for a bench and a pupil, unless it is already.
     fn modulate(&mut self, conditions: Conditions) {
-        let Self { inputs, modulation, conv } = self;
+        let Self { channels, modulation, conv } = self;
         if let Some(parameters) = modulation.change_to(conditions) {
-            conv.offset_conv.fill(inputs, parameters.bias.iter().copied(), |output, input, tap| {
-                parameters.weight[(output * inputs.len() + input) * 9 + tap]
+            conv.offset_conv.fill(channels, parameters.bias.iter().copied(), |output, input, tap| {
+                parameters.weight[(output * channels.len() + input) * 9 + tap]
             });
         }
     }
