@@ -154,6 +154,8 @@ fn figures_in_another_unit_are_recognised() {
             "seconds: write 100 ",
         ),
         ("fallback_mm = 3.0", "fallback_mm = 0.003", "tracker.fallback_mm", "looks like metres: write 3 "),
+        ("depth_far_m = inf", "depth_far_m = 2000", "optics.depth_far_m", "looks like millimetres: write 2 "),
+        ("depth_near_m = 0.35", "depth_near_m = 350", "optics.depth_near_m", "looks like millimetres: write 0.35 "),
         ("hold_ms = 1000.0", "hold_ms = 1", "tracker.hold_ms", "looks like seconds: write 1000 "),
     ] {
         check(from, to, key, "", "a number from", advice);
@@ -438,14 +440,14 @@ fn keys_of_one_panel_mode_are_refused_in_another() {
 fn depths_are_given_once_and_in_order() {
     let inverted = fault_of("depth_far_m = inf", "depth_far_m = 0.2");
     assert_fault(&inverted, "optics.depth_near", line_of("depth_near_m"), "near 2.857 and far 5", "nearer", "exchange");
-    let millimetres = fault_of("depth_near_m = 0.35", "depth_near_m = 350");
+    let centimetres = fault_of("depth_near_m = 0.35", "depth_near_m = 35");
     assert_fault(
-        &millimetres,
+        &centimetres,
         "optics.depth_near",
         line_of("depth_near_m"),
-        "near 0.003",
+        "near 0.029",
         "0.1 dioptres apart",
-        "350 mm",
+        "35 cm",
     );
     let twice = fault_of("depth_near_m = 0.35", "depth_near_m = 0.35\ndepth_near_dpt = 2.5");
     assert_eq!(

@@ -510,7 +510,7 @@ pub struct EvaluateArgs {
     #[arg(long, value_enum, default_value_t = Backend::Auto)]
     pub backend: Backend,
     /// Pupils to judge, in millimetres, among those of the scenes; all of these when left out.
-    #[arg(long, value_name = "MM", value_parser = parse_pupil, num_args = 1.., value_delimiter = ',')]
+    #[arg(long, value_name = "MM", value_parser = parse_scene_pupil, num_args = 1.., value_delimiter = ',')]
     pub pupil: Vec<PupilDiameter>,
     /// Judge only the first N scenes.
     #[arg(long, value_name = "N", value_parser = parse_count)]
@@ -783,9 +783,21 @@ fn parse_resolution(text: &str) -> Result<Resolution, String> {
 }
 
 fn parse_pupil(text: &str) -> Result<PupilDiameter, String> {
-    let mm: f32 =
-        text.parse().map_err(|_| format!("found '{text}', expected a diameter in millimetres such as 3.5"))?;
-    human_pupil(mm)
+    human_pupil(parse_mm(text)?)
+}
+
+/// A pupil of scenes, which may be wider than a human one for benches of little blur.
+fn parse_scene_pupil(text: &str) -> Result<PupilDiameter, String> {
+    let mm = parse_mm(text)?;
+    if mm > 0.0 && mm.is_finite() {
+        Ok(PupilDiameter::from_mm(mm))
+    } else {
+        Err(format!("found {mm} mm, expected a diameter above 0 mm"))
+    }
+}
+
+fn parse_mm(text: &str) -> Result<f32, String> {
+    text.parse().map_err(|_| format!("found '{text}', expected a diameter in millimetres such as 3.5"))
 }
 
 /// A pupil that a human eye can have; what is outside is most often another unit.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use holod_calibration::rig::{Panel, Rig, WeightsChoice};
-use holod_calibration::{PerColour, Resolution};
+use holod_calibration::{PerColour, PupilDiameter, Resolution};
 use holod_model::Weights;
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 
@@ -25,6 +25,8 @@ const LEAST_SIDE_PX: usize = 64;
 
 /// Phases of two engines are the same up to this, the step of a panel of 256 levels.
 const SAME_PHASE_RAD: f32 = TAU / 256.0;
+/// The frames are for this pupil, or the nearest that was trained: one at which every stage has something to do.
+const PUPIL_MM: f32 = 3.0;
 
 /// A GPU whose phases are farther from the processor's at more than this share of the pixels computes wrongly. Where
 /// the field is dark, little changes its phase; of `standard` and `fast` not one pixel was so in half precision.
@@ -122,7 +124,8 @@ impl Timed {
         let encoder = PanelEncoder::new(&panel, size, size).map(Arc::new).map_err(Failure::because(Exit::Config))?;
         let mut renderer = renderer::open(backend, weights, &rig.geometry, &encoder)?;
         let (frame, mut levels) = (Arc::new(scene::sample_frame(size)), LevelsFrame::new(encoder.layout()));
-        let pupil = weights.trained_pupils(&rig.geometry)[0];
+        let [narrowest, widest] = weights.trained_pupils(&rig.geometry).map(PupilDiameter::mm);
+        let pupil = PupilDiameter::from_mm(PUPIL_MM.clamp(narrowest, widest));
         let mut seconds = f64::MAX;
         for _ in 0..2 {
             let began = Instant::now();

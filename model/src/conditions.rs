@@ -21,6 +21,10 @@ const REFERENCE_FRESNEL_PX2: f64 = 40.0;
 const FARTHEST_OUTSIDE: f64 = 1.5;
 /// Relative difference below which two figures are the same.
 const SAME: f64 = 1e-4;
+/// The steps of the figures that would bring a bench inside, which are written with as many digits.
+const FOCAL_LENGTH_STEP_MM: f64 = 0.1;
+const PIXEL_PITCH_STEP_UM: f64 = 0.01;
+const DEPTH_RANGE_STEP_DPT: f64 = 0.01;
 
 /// The least and the most, of all benches and pupils that a network was trained for.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -53,13 +57,20 @@ impl TrainedRange {
         // By what all three would have to be multiplied, where one factor serves them all.
         let (at_least, at_most) = (least_px2 / grown, most_px2 / shrunk);
         let nearest = if at_most < 1.0 { at_most } else { at_least };
+        // Towards the inside, so that what is said of the figures holds as they are written.
+        let [smaller, larger] = if at_most < 1.0 { [f64::floor, f64::ceil] } else { [f64::ceil, f64::floor] };
+        let rounded = |figure: f64, step: f64, round: fn(f64) -> f64| round(figure / step) * step;
         let outside = OutsideTraining {
             found_px2: outside,
             trained_px2: self.volume_fresnel_px2,
             inside_at: (at_least <= at_most * (1.0 + SAME)).then(|| InsideAt {
-                eyepiece_focal_length_mm: bench.eyepiece_focal_length.0 * 1e3 * nearest.sqrt(),
-                pixel_pitch_um: bench.pixel_pitch.0 * 1e6 / nearest.sqrt(),
-                depth_range_dpt: bench.volume().0 * nearest,
+                eyepiece_focal_length_mm: rounded(
+                    bench.eyepiece_focal_length.0 * 1e3 * nearest.sqrt(),
+                    FOCAL_LENGTH_STEP_MM,
+                    smaller,
+                ),
+                pixel_pitch_um: rounded(bench.pixel_pitch.0 * 1e6 / nearest.sqrt(), PIXEL_PITCH_STEP_UM, larger),
+                depth_range_dpt: rounded(bench.volume().0 * nearest, DEPTH_RANGE_STEP_DPT, smaller),
             }),
         };
         if worst <= FARTHEST_OUTSIDE * (1.0 + SAME) { BenchFit::Near(outside) } else { BenchFit::Far(outside) }
@@ -88,7 +99,8 @@ pub struct OutsideTraining {
     pub inside_at: Option<InsideAt>,
 }
 
-/// A figure of the bench any one of which, in place of its own, would bring it inside what was trained.
+/// A figure of the bench any one of which, in place of its own, would bring it inside what was trained; rounded towards
+/// the inside.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[expect(missing_docs, reason = "the names say it")]
 pub struct InsideAt {
@@ -152,7 +164,7 @@ impl Conditions {
 
 #[cfg(test)]
 mod tests {
-    use holod_calibration::{Metres, PerColour};
+    use holod_calibration::{Dioptres, Metres, PerColour};
 
     use super::*;
     use crate::worst::worst;
@@ -240,6 +252,24 @@ mod tests {
             },
         ] {
             assert_eq!(TRAINED.fit(&bench), BenchFit::Inside);
+        }
+        // Each figure as it is written, on benches that are above and below what was trained.
+        for focal_length_mm in (200..1200).step_by(7).map(|tenths| 0.1 * f64::from(tenths)) {
+            let bench = DisplayGeometry { eyepiece_focal_length: Metres(1e-3 * focal_length_mm), ..BENCH };
+            let (BenchFit::Near(outside) | BenchFit::Far(outside)) = TRAINED.fit(&bench) else { continue };
+            let inside = outside.inside_at.unwrap();
+            let written = |figure: f64, digits: usize| format!("{figure:.digits$}").parse::<f64>().unwrap();
+            let depth_far = Dioptres(bench.depth_near.0 - written(inside.depth_range_dpt, 2));
+            for bench in [
+                DisplayGeometry {
+                    eyepiece_focal_length: Metres(written(inside.eyepiece_focal_length_mm, 1) * 1e-3),
+                    ..bench
+                },
+                DisplayGeometry { pixel_pitch: Metres(written(inside.pixel_pitch_um, 2) * 1e-6), ..bench },
+                DisplayGeometry { depth_far, ..bench },
+            ] {
+                assert_eq!(TRAINED.fit(&bench), BenchFit::Inside, "{focal_length_mm} mm: {outside}");
+            }
         }
         let BenchFit::Near(low) = TRAINED.fit(&bench(40.0)) else { panic!("blue has 28 px²") };
         assert_eq!(low.found_px2.len(), 1);

@@ -173,11 +173,18 @@ impl Rig {
         } else {
             given.values::<u16>()?.as_slice()?.to_vec()
         };
-        for (colour, field) in Colour::ALL.into_iter().zip(levels.chunks_exact(panel.pixels())) {
-            self.check_levels(&given, colour, field)?;
-        }
         let resolution = self.pattern_resolution(width_px, height_px)?;
         let encoder = self.encoder(resolution)?;
+        for (colour, field) in Colour::ALL.into_iter().zip(levels.chunks_exact(panel.pixels())) {
+            if let Some(pixel) = encoder.unknown_level(colour, field) {
+                let (level, row, column) = (field[pixel], pixel / panel.width, pixel % panel.width);
+                let bits = self.rig.panel.bit_depth;
+                return Err(given.refusal(
+                    format!("level {level} ({colour}, row {row}, column {column})"),
+                    &format!("levels of the panel's {bits} bits that its look-up table has"),
+                ));
+            }
+        }
         let phases = without_lock(py, || {
             let fields = Colour::ALL.into_iter().zip(levels.chunks_exact(panel.pixels()));
             Ok(fields.flat_map(|(colour, field)| encoder.decode_pattern(colour, field)).collect::<Vec<f32>>())
@@ -224,25 +231,6 @@ impl Rig {
 
     fn pattern_resolution(&self, width_px: Option<usize>, height_px: Option<usize>) -> PyResult<Resolution> {
         pattern_resolution(&self.rig, width_px, height_px)
-    }
-
-    /// Refuses levels that the panel, or its table, does not have.
-    fn check_levels(&self, given: &Given<'_, '_>, colour: Colour, levels: &[u16]) -> PyResult<()> {
-        let bits = self.rig.panel.bit_depth;
-        let table = self.rig.panel.lut[colour].as_deref();
-        let mut known = vec![table.is_none(); 1 << bits];
-        for entry in table.unwrap_or_default() {
-            known[usize::from(entry.level)] = true;
-        }
-        match levels.iter().position(|&level| !known.get(usize::from(level)).is_some_and(|known| *known)) {
-            None => Ok(()),
-            Some(pixel) => {
-                let width = self.rig.resolution().width;
-                let found =
-                    format!("level {} ({colour}, row {}, column {})", levels[pixel], pixel / width, pixel % width);
-                Err(given.refusal(found, &format!("levels of the panel's {bits} bits that its look-up table has")))
-            }
-        }
     }
 }
 

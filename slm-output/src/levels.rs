@@ -265,6 +265,14 @@ impl PanelEncoder {
         });
     }
 
+    /// The index of the first of `levels` that the panel, or the table of `colour`, does not have: what phase it shows
+    /// is not known.
+    pub fn unknown_level(&self, colour: Colour, levels: &[u16]) -> Option<usize> {
+        let phases_rad = &self.colours[colour.index()].phase_of_level_rad;
+        let known = |level: u16| phases_rad.get(usize::from(level)).is_some_and(|phase_rad| phase_rad.is_finite());
+        levels.iter().position(|&level| !known(level))
+    }
+
     /// The phase in [0, 2π) that the panel really shows for `levels` `[panel height, panel width]`, with the panel's
     /// own unflatness (which the flatness picture cancels) taken into account.
     ///
@@ -759,6 +767,16 @@ mod tests {
         };
         let (ordered, unordered) = (shown(&panel_of(rising)), shown(&panel_of(shuffled)));
         assert_eq!(first_wrong(&ordered, &unordered, 1e-5), None);
+    }
+
+    #[test]
+    fn levels_outside_the_table_are_found() {
+        let panel = Panel { lut: PerColour([None, Some(few_levels()), None]), ..panel() };
+        let encoder = PanelEncoder::new(&panel, row(1), row(1)).unwrap();
+        assert_eq!(encoder.unknown_level(Colour::Green, &[3, 40, 77, 200, 255]), None);
+        assert_eq!(encoder.unknown_level(Colour::Green, &[3, 40, 5, 200]), Some(2));
+        assert_eq!(encoder.unknown_level(Colour::Red, &[5, 255]), None);
+        assert_eq!(encoder.unknown_level(Colour::Red, &[5, 256]), Some(1));
     }
 
     #[test]

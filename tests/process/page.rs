@@ -1,5 +1,6 @@
 //! The status page's work gives way to the run's.
 
+use std::f64::consts::TAU;
 use std::fs;
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
@@ -7,6 +8,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use holod_tests::daemon::{Daemon, wait_until};
+use holod_tests::small_rig;
 use rustix::process::{Signal, getpriority_process};
 
 use crate::HOLOD;
@@ -119,4 +121,42 @@ fn pictures_for_the_page_are_computed_behind_everything_else() {
         let of_name: Vec<_> = of_name(name).collect();
         assert!(!of_name.is_empty() && of_name.iter().all(|thread| is_ordinary(thread, 0)), "{name}: {threads:#?}");
     }
+}
+
+#[test]
+fn an_eye_sees_nothing_of_a_level_whose_phase_is_not_known() {
+    let folder = holod_tests::new_folder();
+    let rows: Vec<String> = (0..64).map(|row| format!("{},{}", 4 * row, f64::from(row) * TAU / 64.0)).collect();
+    fs::write(folder.path().join("lut.csv"), format!("level,phase_rad\n{}\n", rows.join("\n"))).unwrap();
+    let rig = small_rig(64, 64, "driver = \"simulated\"");
+    let table = "lut_file = { green = \"lut.csv\" }\nsettle_ms";
+    let rig_with_table = rig.replace("settle_ms", table).replace("green = 1.9921875, ", "");
+    assert_ne!(rig, rig_with_table);
+    fs::write(folder.path().join("rig.toml"), rig_with_table).unwrap();
+    let socket = folder.path().join("page");
+    let page = format!("unix:{}", socket.display());
+    let args = ["--config", "rig.toml", "--resolution", "64x64", "--weights", "fast", "--backend", "cpu"];
+    let more = ["--tracker", "mock:sweep", "--page", &page];
+    let environment = [("XDG_RUNTIME_DIR", folder.path())];
+    let daemon = Daemon::start_with(HOLOD, &[&args[..], &more].concat(), folder.path(), &environment);
+    let sees = |status: &'static str| wait_until(PATIENCE, || get(&socket, "/eye.png").as_deref() == Some(status));
+    let (seen, unseen) = ("HTTP/1.1 200 OK", "HTTP/1.1 503 Service Unavailable");
+    assert!(sees(seen), "no picture");
+
+    let pid = daemon.pid().to_string();
+    let show = |level: &str| {
+        let order = ["ctl", "--pid", &pid, "pattern", "level", level];
+        // The status, which says where orders go, may be written after the page's first picture.
+        let is_shown =
+            || Daemon::start_with(HOLOD, &order, folder.path(), &environment).wait(PATIENCE).status.success();
+        assert!(wait_until(PATIENCE, is_shown), "level {level} is not shown");
+    };
+    show("5");
+    assert!(sees(unseen), "a level without a phase was seen");
+    show("4");
+    assert!(sees(seen), "a level with a phase was not seen");
+
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(PATIENCE);
+    assert!(ended.status.success(), "{}", ended.stderr);
 }

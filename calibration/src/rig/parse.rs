@@ -96,7 +96,7 @@ const SETTLE: Span = Span::new(0.0, 100.0, "ms").slips(&[("microseconds", 1e-3)]
 const WAVELENGTH: Span =
     Span::new(380.0, 780.0, "nm").slips(&[("metres", 1e9), ("micrometres", 1e3), ("ångströms", 0.1)]);
 const FOCAL_LENGTH: Span = Span::new(5.0, 500.0, "mm").slips(&[("metres", 1e3), ("micrometres", 1e-3)]);
-const DEPTH_M: Span = Span::new(0.05, f64::INFINITY, "m");
+const DEPTH_M: Span = Span::new(0.05, 100.0, "m").slips(&[("millimetres", 1e-3)]).or_infinite();
 const DEPTH_DPT: Span = Span::new(0.0, 20.0, "dioptres");
 /// Below this a volume's two ends look alike to any eye.
 const DEPTH_RANGE_MIN_DPT: f64 = 0.1;
@@ -502,7 +502,7 @@ fn read_optics<'a>(
             reader.fault_in(optics, "depth_near", line, &found, "the near end nearer than the far end", advice);
         } else if range_dpt < DEPTH_RANGE_MIN_DPT {
             let expected = format!("ends at least {DEPTH_RANGE_MIN_DPT} dioptres apart");
-            let advice = "depths are in metres or dioptres: 350 mm is depth_near_m = 0.35".into();
+            let advice = "depths are in metres or dioptres: 35 cm is depth_near_m = 0.35".into();
             reader.fault_in(optics, "depth_near", line, &found, &expected, advice);
         }
     }

@@ -17,12 +17,14 @@ pub(super) struct Span {
     pub(super) unit: &'static str,
     /// Units that are given by mistake, each with the factor that turns it into `unit`.
     pub(super) slips: &'static [(&'static str, f64)],
+    /// Whether infinity is taken, too.
+    pub(super) or_infinite: bool,
 }
 
 impl Span {
     /// The numbers from `min` to `max`.
     pub(super) const fn new(min: f64, max: f64, unit: &'static str) -> Self {
-        Self { min, max, unit, slips: &[] }
+        Self { min, max, unit, slips: &[], or_infinite: false }
     }
 
     /// Adds the units that are given by mistake.
@@ -30,13 +32,19 @@ impl Span {
         Self { slips, ..self }
     }
 
+    /// Takes infinity, too.
+    pub(super) const fn or_infinite(self) -> Self {
+        Self { or_infinite: true, ..self }
+    }
+
     fn takes(&self, value: f64) -> bool {
-        value >= self.min && value <= self.max
+        (value >= self.min && value <= self.max) || (self.or_infinite && value == f64::INFINITY)
     }
 
     fn expected(&self) -> String {
         let gap = if self.unit.is_empty() { "" } else { " " };
-        format!("a number from {} to {}{gap}{}", self.min, self.max, self.unit)
+        let infinite = if self.or_infinite { ", or inf" } else { "" };
+        format!("a number from {} to {}{gap}{}{infinite}", self.min, self.max, self.unit)
     }
 
     /// What is expected, and what to do, where `value` is not taken.

@@ -95,7 +95,8 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
             let pattern = shown_pattern(&session.encoder, levels);
             [NEAR, FAR].map(|focus| EyeView::new(&mut eye, &pattern, constant, *pupil, focus, &scene))
         };
-        [narrow, wide].into_iter().flat_map(of_frame).collect()
+        let frames = if narrow.0 == wide.0 { vec![wide] } else { vec![narrow, wide] };
+        frames.into_iter().flat_map(of_frame).collect()
     });
     results::save_png(&eye_sheet(&views).draw(), &staging.path("eye.png"))?;
     let pattern = shown_pattern(&session.encoder, &wide.1);
@@ -123,8 +124,9 @@ struct EyeView {
     pupil: PupilDiameter,
     focus: Dioptres,
     picture: LinearImage,
-    near_energy: f64,
-    far_energy: f64,
+    /// Sharpness of the cards; of one that is not in the picture, nothing.
+    near_energy: Option<f64>,
+    far_energy: Option<f64>,
 }
 
 impl EyeView {
@@ -140,7 +142,7 @@ impl EyeView {
         let energy_at = |depth: Dioptres| {
             let area =
                 Area::at_depth(&scene.depth_normalised, scene.resolution, &DisplayGeometry::DEFAULT, depth, INSET_PX);
-            area.map_or(0.0, |area| metrics::gradient_energy(&picture, area.columns, area.rows))
+            area.map(|area| metrics::gradient_energy(&picture, area.columns, area.rows))
         };
         let (near_energy, far_energy) = (energy_at(NEAR), energy_at(FAR));
         Self { pupil, focus, picture, near_energy, far_energy }
@@ -158,12 +160,15 @@ fn eye_sheet(views: &[EyeView]) -> Sheet {
         ),
         picture: screen_picture(&view.picture),
     };
+    let rows = match views.len() {
+        2 => "The run was too short for a second pupil.",
+        _ => "Top: narrow pupil. Bottom: wide pupil.",
+    };
     Sheet {
         title: "What the eye sees of the recorded panel patterns".into(),
         rows: views.chunks(2).map(|row| row.iter().map(tile).collect()).collect(),
         footer: vec![
-            "Left: the eye focuses on the near card. Right: on the far card. Top: narrow pupil. Bottom: wide pupil."
-                .into(),
+            format!("Left: the eye focuses on the near card. Right: on the far card. {rows}"),
             "What is in focus is sharper than what is not. The wider pupil blurs edges more, but outlines of print stay."
                 .into(),
         ],
@@ -172,14 +177,18 @@ fn eye_sheet(views: &[EyeView]) -> Sheet {
 
 fn summary_text(session: &SessionReport, views: &[EyeView]) -> String {
     let mut table = String::new();
+    let energy = |found: Option<f64>| found.map_or_else(|| "none".to_owned(), |energy| format!("{energy:.1}"));
     for view in views {
         table.push_str(&format!(
-            "  pupil {:.2} mm, focus {:4.2} dpt:   near card {:7.1}   far card {:7.1}\n",
+            "  pupil {:.2} mm, focus {:4.2} dpt:   near card {:>7}   far card {:>7}\n",
             view.pupil.mm(),
             view.focus.0,
-            view.near_energy,
-            view.far_energy
+            energy(view.near_energy),
+            energy(view.far_energy)
         ));
+    }
+    if views.iter().any(|view| view.near_energy.is_none() || view.far_energy.is_none()) {
+        table.push_str("  (none: at this resolution the card is too small to be judged)\n");
     }
     format!(
         "holod demo\n\n\

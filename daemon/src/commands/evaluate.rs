@@ -61,11 +61,11 @@ fn sheet_pupils(pupils: &[PupilDiameter]) -> Vec<usize> {
     match SHEET_PUPILS_MM.iter().map(of).collect::<Option<Vec<_>>>() {
         Some(found) => found,
         None => {
-            if pupils.len() > 1 {
-                vec![0, pupils.len() - 1]
-            } else {
-                vec![0]
-            }
+            let by_size = |a: &usize, b: &usize| pupils[*a].mm().total_cmp(&pupils[*b].mm());
+            let [narrowest, widest] = [(0..pupils.len()).min_by(by_size), (0..pupils.len()).max_by(by_size)];
+            let mut ends: Vec<_> = narrowest.into_iter().chain(widest).collect();
+            ends.dedup();
+            ends
         }
     }
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
 use holod_calibration::rig::Rig;
-use holod_calibration::{Dioptres, PupilDiameter};
+use holod_calibration::{Colour, Dioptres, PupilDiameter};
 use holod_model::optics::{Eye, SimulatedEye};
 use holod_slm_output::present::PanelLook;
 use holod_slm_output::{LevelsFrame, PanelEncoder};
@@ -62,6 +62,8 @@ pub(super) enum Blind {
     Busy,
     #[error("no new frame came on the panel within {FRAME_WITHIN:?}, or the panel cannot say what it shows")]
     NoFrame,
+    #[error("the panel shows level {level} in {colour}, whose phase its look-up table does not say")]
+    UnknownLevel { colour: Colour, level: u16 },
 }
 
 struct Question {
@@ -168,6 +170,13 @@ impl EyeThread {
         let encoder = Arc::clone(&self.encoder);
         let levels = self.next_frame().ok_or(Blind::NoFrame)?;
         let frame = levels.tag().frame_id;
+        // A test pattern may show any level.
+        for colour in Colour::ALL {
+            let shown = levels.unpack_colour(colour).levels;
+            if let Some(pixel) = encoder.unknown_level(colour, &shown) {
+                return Err(Blind::UnknownLevel { colour, level: shown[pixel] });
+            }
+        }
         let pattern = shown_pattern(&encoder, levels);
         let made = self.made_with(frame).ok_or(Blind::NoFrame)?;
         let pupil = gaze.pupil.unwrap_or(made.pupil);

@@ -64,10 +64,18 @@ impl Sight {
             Pattern::Lens { focal_length: Metres(f_m), .. } => {
                 for &field in &fields {
                     let diameter_m = pattern.lens_diameter(optics, field)?.0;
-                    let spot_um = 1.22e6 * optics.wavelengths[field].0 * f_m.abs() / diameter_m;
+                    let wave_m2 = optics.wavelengths[field].0 * f_m.abs();
+                    // The stop passes slopes of the phase below 1/4p in x and in y.
+                    let passed_m = wave_m2 / (2.0 * optics.pixel_pitch.0);
+                    let (aperture, spot_m) = if diameter_m <= passed_m {
+                        (String::new(), 1.22 * wave_m2 / diameter_m)
+                    } else {
+                        (format!(", of which the stop passes a square of {:.3} mm", 1e3 * passed_m), wave_m2 / passed_m)
+                    };
                     notes.push(format!(
-                        "{field}: a lens of {:.3} mm; its focus has a radius of {spot_um:.1} µm",
-                        diameter_m * 1e3
+                        "{field}: a lens of {:.3} mm{aperture}; its focus has a radius of {:.1} µm",
+                        1e3 * diameter_m,
+                        1e6 * spot_m
                     ));
                 }
                 let eyepiece_m = optics.eyepiece_focal_length.0;
@@ -187,5 +195,33 @@ impl fmt::Display for Sight {
             )?;
         }
         self.notes.iter().try_for_each(|note| writeln!(f, "- {note}"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use holod_calibration::PerColour;
+
+    use super::*;
+
+    #[test]
+    fn a_lens_is_as_sharp_as_what_the_stop_leaves_of_it() {
+        let rig = Rig::default();
+        let placement = Placement { axis_px: [0.0; 2], colours: PerColour([false, true, false]) };
+        let lens_notes = |diameter_mm: Option<f64>| {
+            let pattern =
+                Pattern::Lens { focal_length: Metres(0.05), diameter: diameter_mm.map(|mm| Metres(1e-3 * mm)) };
+            Sight::of(&pattern, &placement, &rig).unwrap().notes.join("\n")
+        };
+        // Of 520 nm and 8 µm: λf/p is 3.25 mm, and the first dark line of the half that passes is at 2p.
+        let largest = lens_notes(None);
+        assert!(
+            largest.contains("a lens of 3.250 mm, of which the stop passes a square of 1.625 mm; ")
+                && largest.contains("its focus has a radius of 16.0 µm"),
+            "{largest}"
+        );
+        // Airy's disc: 1.22 · 520 nm · 50 mm / 1 mm.
+        let small = lens_notes(Some(1.0));
+        assert!(small.contains("a lens of 1.000 mm; its focus has a radius of 31.7 µm"), "{small}");
     }
 }
