@@ -314,7 +314,7 @@ fn two_programs_do_not_drive_one_box_but_anybody_may_make_it_dark() {
     let driver = LaserDriver::Serial { path: laser.port.clone(), sync_wire: false };
     make_dark(&driver, host_now).unwrap();
     let log = laser.dark_log();
-    assert!(matches!(log.last(), Some(BoxEvent::Dark { reason: DarkReason::Asked, .. })), "{log:?}");
+    assert!(matches!(log.last(), Some(BoxEvent::Dark { reason: DarkReason::ByHand, .. })), "{log:?}");
     let mut dark = None;
     eventually("the host to notice", || {
         let _refused_once_dark = host.heartbeat(host_now());
@@ -327,7 +327,7 @@ fn two_programs_do_not_drive_one_box_but_anybody_may_make_it_dark() {
         std::thread::sleep(Duration::from_millis(5));
         dark.is_some()
     });
-    assert_eq!(dark, Some(DarkReason::Asked));
+    assert_eq!(dark, Some(DarkReason::ByHand));
     assert!(matches!(host.arm(host_now()), Err(LaserError::MadeDark)), "nobody arms it against that");
     drop(host);
 
@@ -480,11 +480,11 @@ fn real_lasers_stay_dark_over_a_virtual_panel() {
 #[test]
 fn a_box_of_another_version_is_refused_and_both_versions_named() {
     let (reader, writer, served) =
-        line_to(|far| lying_box(far, |text| text.replace("holod-laser-box 2", "holod-laser-box 1")));
+        line_to(|far| lying_box(far, |text| text.replace("holod-laser-box 3", "holod-laser-box 2")));
     let other = identify(reader, writer, "/dev/ttyACM0").unwrap_err();
-    assert!(matches!(&other, LaserError::Version { found: 1, expected: 2, .. }), "{other}");
+    assert!(matches!(&other, LaserError::Version { found: 2, expected: 3, .. }), "{other}");
     let text = other.to_string();
-    assert!(text.contains("/dev/ttyACM0") && text.contains("version 1") && text.contains("version 2"), "{text}");
+    assert!(text.contains("/dev/ttyACM0") && text.contains("version 2") && text.contains("version 3"), "{text}");
     served.join().unwrap();
 }
 
@@ -570,6 +570,74 @@ fn a_box_that_was_unplugged_is_found_again_under_the_same_name() {
         .unwrap();
     eventually("light", || edges(&second.events()).len() == 2);
     laser.dark(DarkReason::Shutdown, host_now()).unwrap();
+}
+
+/// Somebody makes dark what is dark, as while the panel is lost; the box is looked for again meanwhile or not.
+#[test]
+fn a_box_that_is_made_dark_in_the_dark_is_lit_again_only_by_a_host_that_begins() {
+    for reopened in [false, true] {
+        let laser = BoxProcess::start(&[]);
+        let mut host = laser.open(SerialOptions::default());
+        host.program(&host_program(), host_now()).unwrap();
+        let driver = LaserDriver::Serial { path: laser.port.clone(), sync_wire: false };
+        make_dark(&driver, host_now).unwrap();
+        if reopened {
+            drop(host);
+            host = laser.open(SerialOptions::default());
+            host.dark(DarkReason::Asked, host_now()).unwrap();
+            host.program(&host_program(), host_now()).unwrap();
+        } else {
+            // Whatever answer the other program took, the box is asked again.
+            eventually("the host to hear of it", || {
+                let _missed = host.poll(host_now(), &mut |_| ());
+                std::thread::sleep(Duration::from_millis(5));
+                host.is_made_dark()
+            });
+        }
+        assert!(matches!(host.arm(host_now()), Err(LaserError::MadeDark)));
+        assert_eq!(laser.events(), []);
+        host.dark(DarkReason::Boot, host_now()).unwrap();
+        host.arm(host_now()).unwrap();
+    }
+}
+
+#[test]
+fn a_box_that_was_made_dark_stays_dark_when_it_is_plugged_in_anew_or_resets_itself() {
+    for reset in [false, true] {
+        let folder = tempfile::tempdir().unwrap();
+        let link = folder.path().join("lasers");
+        let mut first = BoxProcess::start(&[]);
+        std::os::unix::fs::symlink(&first.port, &link).unwrap();
+        let rig = rig(PanelMode::FieldSequential, &link);
+        let mut laser = open_laser(&rig.lasers, host_now).unwrap();
+        let watch = laser.watch().unwrap();
+        laser.program(&host_program(), host_now()).unwrap();
+        laser.arm(host_now()).unwrap();
+        make_dark(&rig.lasers.driver, host_now).unwrap();
+        // As for each field that is shown.
+        eventually("the host to notice", || {
+            let _refused_once_dark = laser.heartbeat(host_now());
+            let _missed = laser.poll(host_now(), &mut |_| ());
+            std::thread::sleep(Duration::from_millis(5));
+            matches!(laser.arm(host_now()), Err(LaserError::MadeDark))
+        });
+
+        let second = BoxProcess::start(&[]);
+        if reset {
+            first.tell("reset");
+        } else {
+            fs::remove_file(&link).unwrap();
+            std::os::unix::fs::symlink(&second.port, &link).unwrap();
+            drop(first);
+        }
+        eventually("its loss", || matches!(laser.poll(host_now(), &mut |_| ()), Err(LaserError::Lost)));
+        eventually("the box", || watch.trouble().is_none());
+        for _ in 0..20 {
+            laser.poll(host_now(), &mut |_| ()).unwrap();
+            let refused = laser.arm(host_now());
+            assert!(matches!(refused, Err(LaserError::MadeDark)), "reset: {reset}: {refused:?}");
+        }
+    }
 }
 
 #[test]

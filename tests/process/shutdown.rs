@@ -195,6 +195,10 @@ fn a_laser_box_is_looked_at_tried_out_and_put_out_by_its_port_alone() {
         let dark = laser(words);
         assert!(dark.stdout.contains("acknowledged"), "{}", dark.stderr);
     }
+    let status = laser(&["laser", "status"]);
+    assert!(status.stdout.contains("dark last because of by-hand"), "{}", status.stdout);
+    let armed = laser(&["laser", "arm"]);
+    assert!(armed.stdout.contains("dark by itself"), "whoever begins anew may arm it: {}", armed.stderr);
     let none = run(HOLOD, &["laser", "status", "--port", "/dev/no-such-port"], folder);
     assert_eq!(none.status.code(), Some(69));
     assert!(none.stderr.contains("/dev/no-such-port"), "{}", none.stderr);
@@ -230,6 +234,15 @@ fn lasers_are_put_out_beside_a_daemon_that_hangs() {
     daemon.signal(Signal::CONT);
     assert!(ended.status.success(), "{}", ended.stderr);
     assert!(ended.stdout.contains("acknowledged"));
+    // It goes on, and its box is dark; what it armed before it was told counts no more.
+    let armed = |event: &&BoxEvent| matches!(event, BoxEvent::Armed { .. });
+    let times_armed = laser_box.events().iter().filter(armed).count();
+    thread::sleep(Duration::from_secs(3));
+    assert_eq!(laser_box.events().iter().filter(armed).count(), times_armed, "not armed again");
+    laser_box.assert_dark();
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(Duration::from_secs(20));
+    assert!(ended.stderr.contains("restart holod to light lasers again"), "{}", ended.stderr);
 }
 
 fn judge_record(record: &Path) {

@@ -149,7 +149,7 @@ fn arm(rig: &Rig) -> Result<(), Failure> {
 
 /// After which silence the armed box is dark, and why; `None` where it stays armed.
 fn silence(laser: &mut SerialBox, program: &LaserProgram) -> Result<Option<(TimeNs, DarkReason)>, LaserError> {
-    laser.dark(DarkReason::Asked, host_now())?;
+    laser.dark(DarkReason::Boot, host_now())?;
     laser.program(program, host_now())?;
     laser.arm(host_now())?;
     let t_armed = host_now();

@@ -167,10 +167,12 @@ pub enum Refusal {
     HangUp,
     /// The line was damaged or no command.
     Malformed,
+    /// It was made dark by hand, and no host has begun anew since.
+    ByHand,
 }
 
 impl Refusal {
-    const CODES: [(Self, &'static str, &'static str); 12] = [
+    const CODES: [(Self, &'static str, &'static str); 13] = [
         (Self::NotProgrammed, "PROGRAM", "it is not programmed"),
         (Self::NotArmed, "DARK", "it is not armed"),
         (Self::Armed, "ARMED", "it is armed, and takes a program only in the dark"),
@@ -183,6 +185,7 @@ impl Refusal {
         (Self::Interlock, "INTERLOCK", "its interlock is open: close it"),
         (Self::HangUp, "DTR", "the line's data terminal ready signal is low"),
         (Self::Malformed, "LINE", "the line was damaged or is no command"),
+        (Self::ByHand, "BY-HAND", "somebody made it dark with `holod dark`"),
     ];
 
     /// Its code on the line.

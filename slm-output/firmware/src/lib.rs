@@ -24,4 +24,4 @@ pub use machine::{Event, Machine};
 pub use types::{DarkReason, FIELDS_MAX, Laser, Limits, Sequence, State, SyncSeen, TimeUs, Trigger, Window};
 
 /// The protocol's version.
-pub const PROTOCOL_VERSION: u32 = 2;
+pub const PROTOCOL_VERSION: u32 = 3;

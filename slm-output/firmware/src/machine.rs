@@ -229,7 +229,13 @@ impl Machine {
             | Command::Power(_)
             | Command::Timeout(_) => self.set(command)?,
             Command::Arm => self.arm(event)?,
-            Command::Disarm(reason) => self.go_dark(reason, event),
+            Command::Disarm(reason) => {
+                self.go_dark(reason, event);
+                // By hand counts in the dark, too, and keeps it dark until a host says that it begins.
+                if matches!(reason, DarkReason::ByHand | DarkReason::Boot) {
+                    self.reason = reason;
+                }
+            }
             Command::Heartbeat => {
                 self.armed.as_mut().ok_or(Refusal::NotArmed)?.t_heartbeat = t;
                 if self.sync.t_last.is_some() {
@@ -316,6 +322,9 @@ impl Machine {
             return Err(Refusal::HangUp);
         }
         let program = self.program()?;
+        if self.armed.is_none() && self.reason == DarkReason::ByHand {
+            return Err(Refusal::ByHand);
+        }
         if self.armed.is_none() {
             self.armed = Some(Armed { program, t_heartbeat: self.now, t_alive: self.now, frame: None });
             event(Event::Armed { t: self.now });

@@ -217,6 +217,7 @@ dark_reasons! {
     Shutdown, "shutdown", "an orderly end";
     Panic, "panic", "a thread of holod failed";
     Asked, "asked", "as asked";
+    ByHand, "by-hand", "somebody put the lasers out with `holod dark`: restart holod to light them again";
 }
 
 impl DarkReason {

@@ -241,7 +241,7 @@ fn it_says_who_it_is_what_it_is_built_for_and_how_it_is() {
         bench.send(Line::new(text).unwrap().as_bytes());
     }
     let expected = [
-        "OK 1 holod-laser-box 2 bench",
+        "OK 1 holod-laser-box 3 bench",
         "OK 2 600 limits 2000 1000 3000 200000 8000 20 sync",
         "OK 3 600 armed boot G closed 1 100",
         "OK 4 600",
@@ -464,6 +464,26 @@ fn every_fault_makes_dark_from_every_armed_state_until_it_is_armed_again() {
             assert_eq!(bench.edges().len(), edges, "{case}: what was asked before it was dark is forgotten");
             assert_eq!(bench.wires.borrow().pins.last(), Some(&Pin::Power([10, 20, 30])), "{case}");
         }
+    }
+}
+
+/// Lit or dark, whatever its host says meanwhile.
+#[test]
+fn a_box_that_was_made_dark_by_hand_is_not_armed_until_a_host_begins_anew() {
+    for before in [Bench::armed, Bench::programmed] {
+        let mut bench = before(Trigger::Host);
+        bench.ask(Command::Disarm(DarkReason::ByHand)).unwrap();
+        for reason in [DarkReason::Asked, DarkReason::BoxFault, DarkReason::Shutdown] {
+            bench.ask(Command::Disarm(reason)).unwrap();
+            for command in program(Trigger::Host) {
+                bench.ask(command).unwrap();
+            }
+            assert_eq!(bench.ask(Command::Arm), Err(Refusal::ByHand));
+            assert_eq!(bench.state().reason, DarkReason::ByHand);
+        }
+        bench.ask(Command::Disarm(DarkReason::Boot)).unwrap();
+        bench.ask(Command::Arm).unwrap();
+        assert!(bench.state().armed);
     }
 }
 

@@ -281,6 +281,11 @@ pub trait LaserBox: Send {
         self.capability().simulated
     }
 
+    /// Whether somebody else has made it dark, who is not to be contradicted.
+    fn is_made_dark(&self) -> bool {
+        false
+    }
+
     /// What tells a thread that may wait why the box is lost, where it can be.
     fn watch(&self) -> Option<LaserWatch> {
         None
@@ -318,7 +323,8 @@ pub trait LaserBox: Send {
     /// As [`Self::program`].
     fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError>;
 
-    /// All lasers out, at once, and disarmed. `Ok` is the box's acknowledgement.
+    /// All lasers out, at once, and disarmed. `Ok` is the box's acknowledgement. For [`DarkReason::Boot`], with which a
+    /// host begins, a box that was made dark by hand may be armed again.
     ///
     /// # Errors
     /// As [`Self::program`]; the box is then left to its heartbeat timeout.

@@ -5,7 +5,7 @@ use holod_calibration::rig::{LaserDriver, Lasers};
 
 use super::program::power_limit_uw;
 use super::reconnect::Reconnecting;
-use super::{DarkReason, LaserBox, LaserError, SerialBox, SerialOptions, SimulatedLaser, ready_beam, text_laser};
+use super::{LaserBox, LaserError, SerialBox, SerialOptions, SimulatedLaser, ready_beam, text_laser};
 
 /// Opens the laser box of a bench, which is recognised before it is told anything. A box that is lost later is looked
 /// for again by a thread of its own.
@@ -45,7 +45,7 @@ fn serial_options(lasers: &Lasers, sync_wire: bool) -> SerialOptions {
 pub fn make_dark(driver: &LaserDriver, clock: fn() -> TimeNs) -> Result<(), LaserError> {
     match driver {
         LaserDriver::Simulated => Ok(()),
-        LaserDriver::Serial { path, .. } => SerialBox::make_dark(path, DarkReason::Asked, clock),
+        LaserDriver::Serial { path, .. } => SerialBox::make_dark(path, clock),
         LaserDriver::ReadyBeam { path, .. } => ready_beam::make_dark(path, clock),
         LaserDriver::Text { profile, paths } => {
             let mut dark = Ok(());

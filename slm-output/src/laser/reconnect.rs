@@ -54,6 +54,8 @@ pub(super) struct Reconnecting {
     fresh: bool,
     lit: Option<Colour>,
     armed: bool,
+    /// Somebody made a box dark, which holds for those that take its place.
+    made_dark: bool,
     events: VecDeque<BoxEvent>,
     lost: Producer<Lost>,
     found: Consumer<Box<dyn LaserBox>>,
@@ -93,6 +95,7 @@ impl Reconnecting {
             fresh: false,
             lit: None,
             armed: false,
+            made_dark: false,
             events: VecDeque::with_capacity(EVENTS_MAX),
             lost,
             found,
@@ -126,6 +129,7 @@ impl Reconnecting {
         let Some(mut laser) = self.current.take() else { return };
         // What its model knows up to now is all that will ever be known.
         let _lost_anyway = laser.poll(now, &mut |event| self.note(event));
+        self.made_dark |= laser.is_made_dark();
         if let Some(colour) = self.lit {
             self.note(BoxEvent::Edge(LaserEdge { t: now, colour, on: false }));
         }
@@ -155,6 +159,10 @@ impl LaserBox for Reconnecting {
         self.capability
     }
 
+    fn is_made_dark(&self) -> bool {
+        self.made_dark || self.current.as_ref().is_some_and(|laser| laser.is_made_dark())
+    }
+
     fn watch(&self) -> Option<LaserWatch> {
         Some(self.watch.clone())
     }
@@ -168,6 +176,9 @@ impl LaserBox for Reconnecting {
     }
 
     fn arm(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        if self.made_dark {
+            return Err(LaserError::MadeDark);
+        }
         self.with_box(now, |laser| laser.arm(now))
     }
 
@@ -184,6 +195,7 @@ impl LaserBox for Reconnecting {
     }
 
     fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
+        self.made_dark &= reason != DarkReason::Boot;
         self.with_box(now, |laser| laser.dark(reason, now))
     }
 

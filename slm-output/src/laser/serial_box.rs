@@ -28,7 +28,7 @@ const IDENTIFY_WAIT: TimeNs = TimeNs(2_000_000_000);
 /// How long an identity is still waited for after a line that is no box's: it may be the end of an answer to somebody
 /// else, whose beginning they have read.
 const STRANGER_WAIT: TimeNs = TimeNs(500_000_000);
-/// A box that is not spoken to otherwise is asked for its time this often, so that a pulled cable is noticed in the
+/// A box that is not spoken to otherwise is asked for its time or its state this often, so that a pulled cable is noticed in the
 /// dark.
 const ASK_TIME_EVERY: TimeNs = TimeNs(250_000_000);
 /// Commands that may wait for an answer: a quarter of a second of fields at 1000 Hz.
@@ -39,7 +39,7 @@ const CLOCK_EXCHANGES: usize = 8;
 const DARK_TRIES: usize = 40;
 
 /// How an identity is expected to begin, for messages.
-const IDENTITY: &str = "holod-laser-box 2";
+const IDENTITY: &str = "holod-laser-box 3";
 
 /// What the rig says of a box.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -119,11 +119,12 @@ impl SerialBox {
     }
 
     /// Makes the box at `path` dark, whoever else has its port open, and waits for the acknowledgement. Darkness comes
-    /// first: the box is not asked who it is, and to any other device the words mean nothing.
+    /// first: the box is not asked who it is, and to any other device the words mean nothing. It stays dark until a host
+    /// begins anew.
     ///
     /// # Errors
     /// As [`Self::open`], without [`LaserError::InUse`].
-    pub fn make_dark(path: &Path, reason: DarkReason, clock: fn() -> TimeNs) -> Result<(), LaserError> {
+    pub fn make_dark(path: &Path, clock: fn() -> TimeNs) -> Result<(), LaserError> {
         let [reader, writer] = open_port(path, BAUD, Sharing::Beside)?;
         let link = Link::new(reader, writer, clock)?;
         // Numbers that the other program does not wait for.
@@ -132,7 +133,7 @@ impl SerialBox {
         // No LF comes first: it would make an armed box dark as a line that is no command, and its host would arm it
         // again. Where somebody has left half a line, the first try completes and the second one follows it.
         for _ in 0..DARK_TRIES {
-            let number = this.send(&Command::Disarm(reason))?;
+            let number = this.send(&Command::Disarm(DarkReason::ByHand))?;
             this.awaited = Some((number, None));
             let t_end = clock() + TimeNs(50_000_000);
             while clock() < t_end {
@@ -323,9 +324,11 @@ impl SerialBox {
                 }
                 match answer {
                     Answer::Sync { sync, .. } => self.compare_with_wire(sync, t_heard, now)?,
-                    Answer::State { state, .. } if !state.armed && self.model.is_armed() => {
-                        self.made_dark = state.reason == DarkReason::Asked;
-                        self.model.set_dark(state.reason, now);
+                    Answer::State { state, .. } if !state.armed => {
+                        self.made_dark |= state.reason == DarkReason::ByHand;
+                        if self.model.is_armed() {
+                            self.model.set_dark(state.reason, now);
+                        }
                     }
                     _ => {}
                 }
@@ -431,6 +434,10 @@ impl LaserBox for SerialBox {
         }
     }
 
+    fn is_made_dark(&self) -> bool {
+        self.made_dark
+    }
+
     fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
         let limits = self.limits;
         let power_limit_uw = PerColour([0, 1, 2].map(|i| self.options.power_limit_uw.0[i].min(limits.power_uw[i])));
@@ -465,7 +472,13 @@ impl LaserBox for SerialBox {
         if self.made_dark {
             return Err(LaserError::MadeDark);
         }
-        self.ask(&Command::Arm, SWITCH_WAIT)?;
+        match self.ask(&Command::Arm, SWITCH_WAIT) {
+            Err(LaserError::Refused { refusal: Refusal::ByHand, .. }) => {
+                self.made_dark = true;
+                return Err(LaserError::MadeDark);
+            }
+            armed => drop(armed?),
+        }
         if let Some(wire) = &mut self.wire {
             *wire = WireCheck::new(wire.period);
         }
@@ -518,6 +531,7 @@ impl LaserBox for SerialBox {
             Err(_) => drop(self.ask(&Command::Disarm(reason), SWITCH_WAIT)?),
         }
         self.model.set_dark(reason, (self.clock)().max(now));
+        self.made_dark &= reason != DarkReason::Boot;
         Ok(())
     }
 
@@ -535,7 +549,8 @@ impl LaserBox for SerialBox {
             return Err(error);
         }
         if now.0 - self.t_sent.0 > ASK_TIME_EVERY.0 {
-            self.send(&Command::Now)?;
+            // In the dark the question is also whether somebody means it to stay so.
+            self.send(if self.model.is_armed() { &Command::Now } else { &Command::State })?;
         }
         Ok(())
     }

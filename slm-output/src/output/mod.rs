@@ -130,7 +130,7 @@ impl Output {
         let (layout, stall_timeout) = (flat.layout(), options.stall_timeout);
         let scheduler = FieldScheduler::new(&rig.panel, layout, &rig.lasers, evidence, window_clock, stall_timeout)?;
         let program = scheduler.program(&rig.panel, &rig.lasers)?;
-        laser.dark(DarkReason::Asked, clock())?;
+        laser.dark(DarkReason::Boot, clock())?;
         laser.program(&program, clock())?;
 
         let (sink, source) = frame_channel(&flat);
