@@ -420,6 +420,24 @@ fn a_box_on_the_panels_wire_lights_after_its_edges_and_a_wire_that_disagrees_mak
     assert!(laser.dark_log().len() > log.len());
 }
 
+/// The panel's reports end, and its wire goes on.
+#[test]
+fn a_box_on_the_panels_wire_is_told_to_go_dark_where_the_panels_reports_end() {
+    let mut laser = BoxProcess::start(&[]);
+    let rig = rig(PanelMode::ChannelPacked, &laser.port);
+    let program = LaserProgram { heartbeat_timeout: TimeNs(950 * MS), ..program(&rig) };
+    let mut host = laser.open(SerialOptions { sync_wire: true, ..SerialOptions::default() });
+    host.program(&program, host_now()).unwrap();
+    laser.tell("sync 60");
+    eventually("an edge", || host.report().unwrap().state.sync.count > 2);
+    host.arm(host_now()).unwrap();
+    host.heartbeat(host_now()).unwrap();
+    host.sync(host_now(), host_now()).unwrap();
+    assert_eq!(dark_reason(&mut host), DarkReason::SyncLost, "two refreshes without a report");
+    let log = laser.dark_log();
+    assert!(matches!(log.last(), Some(BoxEvent::Dark { reason: DarkReason::SyncLost, .. })), "{log:?}");
+}
+
 /// A box that says of itself what `lie` makes of it.
 fn lying_box(stream: UnixStream, lie: fn(&str) -> String) {
     struct Liar(UnixStream, fn(&str) -> String);

@@ -538,8 +538,19 @@ impl LaserBox for SerialBox {
     fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
         let heard = self.hear(now);
         self.model.advance(now);
+        let mut box_may_go_on = None;
         while let Some(next) = self.model.next_event() {
+            // What the model of a wired box misses, a report or a heartbeat, the box itself may not miss yet.
+            if let BoxEvent::Dark { reason, .. } = next
+                && self.wire.is_some()
+                && reason.is_of_box()
+            {
+                box_may_go_on = Some(reason);
+            }
             event(next);
+        }
+        if let Some(reason) = box_may_go_on {
+            self.send(&Command::Disarm(reason))?;
         }
         heard?;
         let overdue = |sent: &&Sent| now.0 - sent.t.0 > ANSWER_WAIT.0;
