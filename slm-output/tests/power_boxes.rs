@@ -278,12 +278,12 @@ fn another_device_on_the_port_is_refused_before_anything_is_set() {
     }
     let bench = ready_beam(1171);
     let error = open_laser(&lasers(text_lasers("cobolt", [None, Some(&bench), None])), host_now).err().unwrap();
-    assert!(matches!(error, LaserError::NoAnswer { .. }), "{error}");
+    assert!(matches!(error, LaserError::NoAnswerTo { .. }), "{error}");
     assert_eq!(bench.heard(), ["sn?"]);
     let bench = cobolt();
     let error = open_laser(&lasers(text_lasers("coherent-obis", [Some(&bench), None, None])), host_now).err();
     let error = error.unwrap();
-    assert!(matches!(&error, LaserError::NoAnswer { .. } | LaserError::NotABox { .. }), "{error}");
+    assert!(matches!(&error, LaserError::NoAnswerTo { .. } | LaserError::NotABox { .. }), "{error}");
     assert!(bench.heard().iter().all(|line| line == "*IDN?"), "{:?}", bench.heard());
 }
 
@@ -385,6 +385,40 @@ fn a_laser_that_does_not_hear_that_it_must_go_out_is_told_again_beside_a_host_th
     // The host neither polls nor sends heartbeats from here on.
     eventually("darkness", || !bench.with(|device| device.lit));
     assert_eq!(bench.with(|device| device.deaf_to_off), 0);
+}
+
+#[test]
+fn one_laser_that_does_not_answer_keeps_none_of_the_others_lit() {
+    let benches = [cobolt(), cobolt(), cobolt()];
+    benches[0].with(|device| device.mute = true);
+    let driver = text_lasers("cobolt", benches.each_ref().map(Some));
+    let error = std::thread::scope(|scope| {
+        let ended = scope.spawn(|| make_dark(&driver, host_now).unwrap_err());
+        let all_are_out = || benches[1..].iter().all(|bench| !bench.with(|device| device.lit));
+        eventually("darkness", all_are_out);
+        assert!(!ended.is_finished(), "the mute one is told again for seconds meanwhile");
+        ended.join().unwrap().to_string()
+    });
+    let [mute, others @ ..] = benches.each_ref().map(|bench| bench.path.display().to_string());
+    let begin = format!("not known to be dark: {mute}: no answer to `sn?` within 500 ms");
+    let end = format!("acknowledged that they are dark: {}", others.join(", "));
+    assert!(error.starts_with(&begin) && error.ends_with(&end), "{error}");
+}
+
+#[test]
+fn lasers_are_put_out_at_the_start_whatever_is_wrong_with_one_of_them() {
+    let stranger = || Bench::plug_in(b'\r', |_, _| b"P1,1,1000,L,3.1,0.9*00\r\n".to_vec());
+    for red in [cobolt(), stranger()] {
+        red.with(|device| device.interlock = "1");
+        let others = [cobolt(), cobolt()];
+        let driver = text_lasers("cobolt", [Some(&red), Some(&others[0]), Some(&others[1])]);
+        let error = open_laser(&lasers(driver), host_now).err().unwrap();
+        assert!(others.iter().all(|bench| !bench.with(|device| device.lit)), "{error}");
+        if let LaserError::Complaint { .. } = error {
+            let text = error.to_string();
+            assert!(text.ends_with("answered `1` to `ilk?`; expected `0`: check its interlock and its faults"), "{text}");
+        }
+    }
 }
 
 #[test]

@@ -232,6 +232,23 @@ pub enum LaserError {
         /// How long it was waited for.
         waited_ms: i64,
     },
+    /// One of several devices did not answer in time.
+    #[error("{path}: no answer to `{sent}` within {waited_ms} ms: check its cable and power")]
+    NoAnswerTo {
+        path: String,
+        /// What it was told or asked.
+        sent: String,
+        /// How long it was waited for.
+        waited_ms: i64,
+    },
+    /// Some of several lasers did not acknowledge that they are out.
+    #[error("not known to be dark: {lit}; acknowledged that they are dark: {dark}")]
+    NotAllDark {
+        /// Which of them, and why.
+        lit: String,
+        /// The ports of the others.
+        dark: String,
+    },
     /// The box refused a command.
     #[error("the laser box refused `{command}`: {refusal}")]
     Refused { command: &'static str, refusal: Refusal },
@@ -244,6 +261,7 @@ impl LaserError {
             self,
             Self::Line(_)
                 | Self::NoAnswer { .. }
+                | Self::NoAnswerTo { .. }
                 | Self::Reset
                 | Self::ClockJump { .. }
                 | Self::Complaint { .. }

@@ -1,5 +1,8 @@
 //! The laser box that a rig names.
 
+use std::path::{Path, PathBuf};
+use std::thread::ScopedJoinHandle;
+
 use holod_calibration::TimeNs;
 use holod_calibration::rig::{LaserDriver, Lasers};
 
@@ -41,18 +44,46 @@ fn serial_options(lasers: &Lasers, sync_wire: bool) -> SerialOptions {
 /// tried, even where one fails.
 ///
 /// # Errors
-/// The first [`LaserError`].
+/// [`LaserError`]; of several lasers [`LaserError::NotAllDark`].
 pub fn make_dark(driver: &LaserDriver, clock: fn() -> TimeNs) -> Result<(), LaserError> {
     match driver {
         LaserDriver::Simulated => Ok(()),
         LaserDriver::Serial { path, .. } => SerialBox::make_dark(path, clock),
         LaserDriver::ReadyBeam { path, .. } => ready_beam::make_dark(path, clock),
         LaserDriver::Text { profile, paths } => {
-            let mut dark = Ok(());
-            for path in paths.0.iter().flatten() {
-                dark = dark.and(text_laser::make_dark(profile, path, clock));
-            }
-            dark
+            let paths: Vec<&Path> = paths.0.iter().flatten().map(PathBuf::as_path).collect();
+            all_dark(&paths, |path| text_laser::make_dark(profile, path, clock))
         }
     }
+}
+
+/// Puts out the laser at each of `paths` by a thread of its own: one that does not answer, which takes seconds, keeps
+/// none of the others lit.
+fn all_dark(paths: &[&Path], put_out: impl Fn(&Path) -> Result<(), LaserError> + Sync) -> Result<(), LaserError> {
+    if let [path] = paths {
+        return put_out(path);
+    }
+    let put_out = &put_out;
+    let ended = std::thread::scope(|scope| {
+        let spawn = |path| std::thread::Builder::new().spawn_scoped(scope, move || put_out(path));
+        let threads: Vec<_> = paths.iter().map(|&path| spawn(path)).collect();
+        let end = |thread: std::io::Result<ScopedJoinHandle<'_, _>>| {
+            thread?.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+        };
+        threads.into_iter().map(end).collect::<Vec<Result<(), LaserError>>>()
+    });
+    let (mut lit, mut dark) = (Vec::new(), Vec::new());
+    for (path, ended) in paths.iter().zip(ended) {
+        let path = path.display().to_string();
+        match ended {
+            Ok(()) => dark.push(path),
+            Err(why) if why.to_string().starts_with(&format!("{path}:")) => lit.push(why.to_string()),
+            Err(why) => lit.push(format!("{path}: {why}")),
+        }
+    }
+    if lit.is_empty() {
+        return Ok(());
+    }
+    let dark = if dark.is_empty() { "none".to_owned() } else { dark.join(", ") };
+    Err(LaserError::NotAllDark { lit: lit.join("; "), dark })
 }

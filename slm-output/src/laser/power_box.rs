@@ -52,7 +52,7 @@ pub(super) trait PowerDevice: Send + 'static {
     fn probe(&mut self) -> Result<(), LaserError>;
 }
 
-const NONE_LIT: PerColour<bool> = PerColour([false; 3]);
+pub(super) const NONE_LIT: PerColour<bool> = PerColour([false; 3]);
 
 #[derive(Clone, Copy, Debug)]
 enum Order {

@@ -5,11 +5,11 @@
 
 use std::path::{Path, PathBuf};
 
-use holod_calibration::rig::{Lasers, Question, TextLaserProfile};
+use holod_calibration::rig::{Expected, Lasers, Question, TextLaserProfile};
 use holod_calibration::{Colour, PerColour, TimeNs};
 
 use super::line_link::Sharing;
-use super::power_box::{Conversation, PowerBox, PowerDevice, put_out_beside, require_acceptance};
+use super::power_box::{Conversation, NONE_LIT, PowerBox, PowerDevice, put_out_beside, require_acceptance};
 use super::{LaserBox, LaserError};
 
 /// How long an acknowledgement after the answer to a question is waited for, so that it is not taken for the next
@@ -26,10 +26,11 @@ struct TextLaser {
 /// The lasers of a bench.
 struct TextLasers(PerColour<Option<TextLaser>>);
 
-/// Opens the lasers at `paths`. Each is recognised before anything else is said to it.
+/// Opens the lasers at `paths`. Each is recognised before anything else is said to it, and those that are recognised are
+/// put out even where that fails with another.
 ///
 /// # Errors
-/// [`LaserError::Open`], [`LaserError::InUse`], [`LaserError::NotABox`], [`LaserError::NoAnswer`],
+/// [`LaserError::Open`], [`LaserError::InUse`], [`LaserError::NotABox`], [`LaserError::NoAnswerTo`],
 /// [`LaserError::Complaint`], [`LaserError::NotAccepted`].
 pub(super) fn open(
     profile: &TextLaserProfile,
@@ -39,15 +40,21 @@ pub(super) fn open(
 ) -> Result<Box<dyn LaserBox>, LaserError> {
     require_acceptance(lasers)?;
     let mut open = TextLasers(PerColour([None, None, None]));
+    let mut recognised = Ok(());
     for colour in Colour::ALL {
         if let Some(path) = &paths[colour] {
-            let mut laser = TextLaser::open(profile, path, Sharing::Alone, clock)?;
-            laser.recognise()?;
-            open.0[colour] = Some(laser);
+            let laser = TextLaser::open(profile, path, Sharing::Alone, clock)
+                .and_then(|mut laser| laser.recognise().map(|()| laser));
+            match laser {
+                Ok(laser) => open.0[colour] = Some(laser),
+                Err(why) => recognised = recognised.and(Err(why)),
+            }
         }
     }
+    // Whatever is wrong with one of them, no other stays lit.
+    let put_out = open.set_lit(NONE_LIT);
+    recognised.and(put_out)?;
     for laser in open.0.0.iter_mut().flatten() {
-        laser.put_out()?;
         for command in &profile.prepare {
             laser.command(command)?;
         }
@@ -85,7 +92,7 @@ impl TextLaser {
     fn ask(&mut self, question: &str) -> Result<String, LaserError> {
         self.send(question)?;
         let Some(answer) = self.port.line_until(self.port.t_end(self.answer_wait))? else {
-            return Err(LaserError::NoAnswer { command: "question", waited_ms: self.answer_wait.0 / 1_000_000 });
+            return Err(self.no_answer(question));
         };
         let answer = String::from_utf8_lossy(&answer).trim().to_owned();
         if answer != self.profile.acknowledge {
@@ -110,7 +117,7 @@ impl TextLaser {
         for Question { ask, expect } in self.profile.healthy.clone() {
             let found = self.ask(&ask)?;
             if !expect.accepts(&found) {
-                let expected = format!("{expect:?}: check its interlock and its faults");
+                let expected = format!("{}: check its interlock and its faults", text_of(&expect));
                 return Err(LaserError::Complaint { path: self.port.path(), sent: ask, found, expected });
             }
         }
@@ -126,15 +133,29 @@ impl TextLaser {
                 return Ok(());
             }
             if self.profile.error.as_ref().is_some_and(|error| answer.starts_with(error.as_str())) {
-                let (path, expected) = (self.port.path(), self.profile.acknowledge.clone());
+                let (path, expected) = (self.port.path(), format!("`{}`", self.profile.acknowledge));
                 return Err(LaserError::Complaint { path, sent: command.into(), found: answer, expected });
             }
         }
-        Err(LaserError::NoAnswer { command: "command", waited_ms: self.answer_wait.0 / 1_000_000 })
+        Err(self.no_answer(command))
+    }
+
+    fn no_answer(&self, sent: &str) -> LaserError {
+        let waited_ms = self.answer_wait.0 / 1_000_000;
+        LaserError::NoAnswerTo { path: self.port.path(), sent: sent.into(), waited_ms }
     }
 
     fn put_out(&mut self) -> Result<(), LaserError> {
         self.profile.off.clone().iter().try_for_each(|command| self.command(command))
+    }
+}
+
+/// Which answers are right, for messages.
+fn text_of(expect: &Expected) -> String {
+    match expect {
+        Expected::Contains(text) => format!("an answer with `{text}` in it"),
+        Expected::OneOf(texts) => format!("`{}`", texts.join("` or `")),
+        Expected::Digits => "digits".into(),
     }
 }
 
