@@ -388,6 +388,29 @@ fn a_laser_that_does_not_hear_that_it_must_go_out_is_told_again_beside_a_host_th
 }
 
 #[test]
+fn darkness_does_not_wait_for_all_the_questions_whether_lasers_are_well() {
+    let benches = [cobolt(), cobolt(), cobolt()];
+    let driver = text_lasers("cobolt", benches.each_ref().map(Some));
+    let mut laser = open_laser(&lasers(driver), host_now).unwrap();
+    laser.program(&program(GREEN), host_now()).unwrap();
+    for bench in &benches {
+        bench.with(|device| device.slow = Duration::from_millis(150));
+    }
+    for _ in 0..3 {
+        laser.arm(host_now()).unwrap();
+        alive_until(laser.as_mut(), || benches[1].with(|device| device.lit));
+        let asked = || benches[0].heard().len();
+        let before = asked();
+        alive_until(laser.as_mut(), || asked() > before);
+        let heard = benches.each_ref().map(|bench| bench.heard().len());
+        laser.dark(DarkReason::Asked, host_now()).unwrap();
+        let questions = benches.iter().zip(heard).flat_map(|(bench, heard)| bench.heard().split_off(heard));
+        let questions: Vec<_> = questions.filter(|line| line.ends_with('?')).collect();
+        assert!(questions.len() <= 1, "{questions:?} before the lasers went out");
+    }
+}
+
+#[test]
 fn one_laser_that_does_not_answer_keeps_none_of_the_others_lit() {
     let benches = [cobolt(), cobolt(), cobolt()];
     benches[0].with(|device| device.mute = true);

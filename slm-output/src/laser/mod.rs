@@ -299,6 +299,11 @@ pub trait LaserBox: Send {
         self.capability().simulated
     }
 
+    /// How long [`Self::dark`] may wait for the acknowledgement.
+    fn dark_wait(&self) -> TimeNs {
+        TimeNs(450_000_000)
+    }
+
     /// Whether somebody else has made it dark, who is not to be contradicted.
     fn is_made_dark(&self) -> bool {
         false

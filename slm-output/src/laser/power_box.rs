@@ -26,8 +26,6 @@ const PROBE_EVERY: TimeNs = TimeNs(500_000_000);
 const REST: Duration = Duration::from_millis(5);
 /// How long a program is waited for: some lines to each of three lasers.
 const PROGRAM_WAIT: TimeNs = TimeNs(5_000_000_000);
-/// How long darkness is waited for.
-const DARK_WAIT: TimeNs = TimeNs(450_000_000);
 /// How often the lasers are put out at the end where the device does not say that they are.
 const LAST_TRIES: usize = 3;
 /// How long a device is told to go out beside a program that takes its answers away.
@@ -48,8 +46,11 @@ pub(super) trait PowerDevice: Send + 'static {
     /// Lights the lasers of `lit` and puts out all others, and has made sure of both when it returns.
     fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError>;
 
-    /// Asks whether it is there and healthy.
-    fn probe(&mut self) -> Result<(), LaserError>;
+    /// Asks one of the questions whether it is there and healthy, after `asked` of them; whether it was the last one.
+    fn probe(&mut self, asked: usize) -> Result<bool, LaserError>;
+
+    /// How long [`Self::set_lit`] may take to put all lasers out, or to fail, after the rest of a [`Self::probe`].
+    fn dark_wait(&self) -> TimeNs;
 }
 
 pub(super) const NONE_LIT: PerColour<bool> = PerColour([false; 3]);
@@ -76,6 +77,7 @@ pub(super) struct PowerBox {
     has: PerColour<bool>,
     power_limit_uw: PerColour<u32>,
     gated_by_panel: bool,
+    dark_wait: TimeNs,
     /// The lasers of the program, once there is one.
     sequence: Option<PerColour<bool>>,
     armed: bool,
@@ -105,6 +107,7 @@ impl PowerBox {
         let t_heartbeat = Arc::new(AtomicI64::new(clock().0));
         let stop = Arc::new(AtomicBool::new(false));
         let has = PerColour(Colour::ALL.map(|colour| device.has(colour)));
+        let dark_wait = device.dark_wait();
         let worker = Worker {
             device,
             orders: order_consumer,
@@ -114,6 +117,7 @@ impl PowerBox {
             timeout: lasers.heartbeat_timeout,
             maybe_lit: false,
             t_probe: clock(),
+            asked: 0,
             failed: false,
             clock,
         };
@@ -122,6 +126,7 @@ impl PowerBox {
             has,
             power_limit_uw: power_limit_uw(lasers),
             gated_by_panel: lasers.gated_by_panel,
+            dark_wait,
             sequence: None,
             armed: false,
             orders,
@@ -139,7 +144,7 @@ impl PowerBox {
     fn order(&mut self, order: Order) -> Result<u32, LaserError> {
         self.last_order = self.last_order.wrapping_add(1).max(1);
         // Orders come from arming and darkness only; a device that lets 64 of them wait is at fault.
-        let full = LaserError::NoAnswer { command: "power and switch", waited_ms: DARK_WAIT.0 / 1_000_000 };
+        let full = LaserError::NoAnswer { command: "power and switch", waited_ms: self.dark_wait.0 / 1_000_000 };
         self.orders.push((self.last_order, order)).map_err(|_| full)?;
         if let Some(worker) = &self.worker {
             worker.thread().unpark();
@@ -231,6 +236,10 @@ impl LaserBox for PowerBox {
         Capability { simulated: false, gates_fields: false, has_heartbeat: false, sync_wire: false }
     }
 
+    fn dark_wait(&self) -> TimeNs {
+        self.dark_wait
+    }
+
     fn program(&mut self, program: &LaserProgram, _now: TimeNs) -> Result<(), LaserError> {
         let lit = PerColour(Colour::ALL.map(|colour| program.sequence.contains(&colour)));
         if lit.0.iter().filter(|&&lit| lit).count() > 1 && !self.gated_by_panel {
@@ -281,9 +290,9 @@ impl LaserBox for PowerBox {
         self.arming = None;
         let number = self.order(Order::Lit(NONE_LIT))?;
         // What was said to earlier orders, a failure say, is no answer to this one.
-        let answered = match self.wait_for(number, DARK_WAIT, "off") {
+        let answered = match self.wait_for(number, self.dark_wait, "off") {
             Err(error @ LaserError::NoAnswer { .. }) => Err(error),
-            Err(_) => self.wait_for(number, DARK_WAIT, "off"),
+            Err(_) => self.wait_for(number, self.dark_wait, "off"),
             Ok(()) => Ok(()),
         };
         if answered.is_ok() {
@@ -324,6 +333,8 @@ struct Worker<D> {
     /// Not known to be out.
     maybe_lit: bool,
     t_probe: TimeNs,
+    /// Questions of a probe that goes on.
+    asked: usize,
     /// It failed and was not heard of since.
     failed: bool,
     clock: fn() -> TimeNs,
@@ -351,9 +362,15 @@ impl<D: PowerDevice> Worker<D> {
                     }
                 }
             }
-            if now.0 - self.t_probe.0 > PROBE_EVERY.0 {
-                self.t_probe = now;
-                let probed = self.device.probe();
+            // A question at a time: no order waits for all of them.
+            if self.asked > 0 || now.0 - self.t_probe.0 > PROBE_EVERY.0 {
+                let probed = self.device.probe(self.asked);
+                if let Ok(false) = probed {
+                    self.asked += 1;
+                    continue;
+                }
+                (self.t_probe, self.asked) = (now, 0);
+                let probed = probed.map(drop);
                 let news = probed.is_err() && !self.failed;
                 self.failed = probed.is_err();
                 if news {

@@ -195,14 +195,19 @@ impl PowerDevice for ReadyBeam {
         Ok(())
     }
 
-    fn probe(&mut self) -> Result<(), LaserError> {
+    fn dark_wait(&self) -> TimeNs {
+        // The question that goes on, and a write and a read for each colour.
+        TimeNs((1 + 2 * Colour::ALL.len() as i64) * TRIES as i64 * self.answer_wait.0)
+    }
+
+    fn probe(&mut self, _asked: usize) -> Result<bool, LaserError> {
         match self.read(STATUS, 1)? {
             STATUS_ERROR => {
                 let (sent, found) = ("its status".into(), format!("{STATUS_ERROR} (error)"));
                 let expected = "a device without errors: check its interlock and its own software".into();
                 Err(LaserError::Complaint { path: self.port.path(), sent, found, expected })
             }
-            _ => Ok(()),
+            _ => Ok(true),
         }
     }
 }

@@ -49,6 +49,7 @@ struct Lost {
 pub(super) struct Reconnecting {
     current: Option<Box<dyn LaserBox>>,
     capability: Capability,
+    dark_wait: TimeNs,
     program: Option<LaserProgram>,
     /// The box was found again and nothing has gone wrong since: it has its program.
     fresh: bool,
@@ -77,7 +78,7 @@ impl Reconnecting {
         let (lost, lost_consumer) = RingBuffer::new(2);
         let (found_producer, found) = RingBuffer::new(2);
         let (watch, stop) = (LaserWatch::default(), Arc::new(AtomicBool::new(false)));
-        let capability = laser.capability();
+        let (capability, dark_wait) = (laser.capability(), laser.dark_wait());
         let seeker = Seeker {
             open,
             capability,
@@ -91,6 +92,7 @@ impl Reconnecting {
         Ok(Self {
             current: Some(laser),
             capability,
+            dark_wait,
             program: None,
             fresh: false,
             lit: None,
@@ -157,6 +159,10 @@ impl Reconnecting {
 impl LaserBox for Reconnecting {
     fn capability(&self) -> Capability {
         self.capability
+    }
+
+    fn dark_wait(&self) -> TimeNs {
+        self.dark_wait
     }
 
     fn is_made_dark(&self) -> bool {

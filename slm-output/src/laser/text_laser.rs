@@ -102,26 +102,30 @@ impl TextLaser {
     }
 
     fn recognise(&mut self) -> Result<(), LaserError> {
-        for Question { ask, expect } in self.profile.identify.clone() {
-            let answer = self.ask(&ask)?;
-            if !expect.accepts(&answer) {
-                let found = answer.chars().take(40).collect();
-                let expected = "what the laser's profile says that it answers";
-                return Err(LaserError::NotABox { path: self.port.path(), found, expected });
-            }
+        self.profile.identify.clone().iter().try_for_each(|question| self.recognise_by(question))
+    }
+
+    fn recognise_by(&mut self, Question { ask, expect }: &Question) -> Result<(), LaserError> {
+        let answer = self.ask(ask)?;
+        if expect.accepts(&answer) {
+            return Ok(());
         }
-        Ok(())
+        let found = answer.chars().take(40).collect();
+        let expected = "what the laser's profile says that it answers";
+        Err(LaserError::NotABox { path: self.port.path(), found, expected })
     }
 
     fn check(&mut self) -> Result<(), LaserError> {
-        for Question { ask, expect } in self.profile.healthy.clone() {
-            let found = self.ask(&ask)?;
-            if !expect.accepts(&found) {
-                let expected = format!("{}: check its interlock and its faults", text_of(&expect));
-                return Err(LaserError::Complaint { path: self.port.path(), sent: ask, found, expected });
-            }
+        self.profile.healthy.clone().iter().try_for_each(|question| self.check_by(question))
+    }
+
+    fn check_by(&mut self, Question { ask, expect }: &Question) -> Result<(), LaserError> {
+        let found = self.ask(ask)?;
+        if expect.accepts(&found) {
+            return Ok(());
         }
-        Ok(())
+        let expected = format!("{}: check its interlock and its faults", text_of(expect));
+        Err(LaserError::Complaint { path: self.port.path(), sent: ask.clone(), found, expected })
     }
 
     fn command(&mut self, command: &str) -> Result<(), LaserError> {
@@ -192,13 +196,30 @@ impl PowerDevice for TextLasers {
         Ok(())
     }
 
-    fn probe(&mut self) -> Result<(), LaserError> {
+    fn dark_wait(&self) -> TimeNs {
+        // The question that goes on, and each laser's commands to go out.
+        let wait_ns = |laser: &TextLaser| laser.profile.off.len() as i64 * laser.answer_wait.0;
+        let lasers = || self.0.0.iter().flatten();
+        let question_ns = lasers().map(|laser| laser.answer_wait.0 + TRAIL_WAIT.0).max().unwrap_or(0);
+        TimeNs(question_ns + lasers().map(wait_ns).sum::<i64>())
+    }
+
+    fn probe(&mut self, asked: usize) -> Result<bool, LaserError> {
+        let mut before = asked;
         for laser in self.0.0.iter_mut().flatten() {
-            laser.check()?;
+            let TextLaserProfile { healthy, identify, .. } = &laser.profile;
+            let questions = if healthy.is_empty() { identify } else { healthy };
+            let Some(question) = questions.get(before).cloned() else {
+                before -= questions.len();
+                continue;
+            };
             if laser.profile.healthy.is_empty() {
-                laser.recognise()?;
+                laser.recognise_by(&question)?;
+            } else {
+                laser.check_by(&question)?;
             }
+            return Ok(false);
         }
-        Ok(())
+        Ok(true)
     }
 }

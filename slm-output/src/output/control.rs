@@ -14,8 +14,8 @@ use super::{Clock, SLEEP_MAX};
 use crate::fields::LevelsFrame;
 use crate::laser::DarkReason;
 
-/// How long shutdown waits for the lasers' acknowledgement.
-const DARK_WAIT: TimeNs = TimeNs(500_000_000);
+/// How long beyond the box's own wait for an acknowledgement shutdown waits for it.
+const DARK_MARGIN: TimeNs = TimeNs(50_000_000);
 /// Boxes that are asked twice take a second.
 const KEEP_DARK_WAIT: TimeNs = TimeNs(2_000_000_000);
 /// How long the panel's thread is waited for at the end: a mode may be set once more, a display server may hang.
@@ -51,6 +51,8 @@ pub struct OutputControl {
     pub(super) switch: DarkSwitch,
     pub(super) doorbell: Arc<OwnedFd>,
     pub(super) frame_period: TimeNs,
+    /// How long the laser box may wait for an acknowledgement.
+    pub(super) dark_wait: TimeNs,
     pub(super) threads: Option<Threads>,
     pub(super) clock: Clock,
 }
@@ -62,7 +64,7 @@ impl OutputControl {
     }
 
     /// Keeps the lasers dark for the reason `why` until this is taken back with none; then they are lit again by the
-    /// rules. Waits for the box, some two seconds at most; whether it has acknowledged. They are kept dark also where
+    /// rules. Waits for the box, two seconds or as long as its lasers may take; whether it has acknowledged. They are kept dark also where
     /// it has not.
     pub fn keep_dark(&self, why: Option<DarkReason>) -> bool {
         let shared = &self.switch.shared;
@@ -70,7 +72,7 @@ impl OutputControl {
         let request = dark_request(before + 1, why);
         shared.dark_request.store(request, Ordering::Release);
         self.switch.laser.unpark();
-        let t_end = (self.clock)() + KEEP_DARK_WAIT;
+        let t_end = (self.clock)() + KEEP_DARK_WAIT.max(self.dark_wait + DARK_MARGIN);
         loop {
             let answer = shared.dark_answer.load(Ordering::Acquire);
             if answer >> 2 == request {
@@ -105,8 +107,8 @@ impl OutputControl {
             }
             done()
         };
-        let answered = wait_for(&|| shared.acknowledged.load(Ordering::Acquire) != NOT_YET, DARK_WAIT);
-        let lasers_dark = answered && shared.acknowledged.load(Ordering::Acquire) == DARK;
+        let dark_wait = self.dark_wait + DARK_MARGIN;
+        wait_for(&|| shared.acknowledged.load(Ordering::Acquire) != NOT_YET, dark_wait);
         shared.flat_wanted.store(true, Ordering::Release);
         ring(&self.doorbell);
         let flat_patience = TimeNs(4 * self.frame_period.0 + SLEEP_MAX.0 + 200_000_000);
@@ -116,7 +118,7 @@ impl OutputControl {
         shared.stop.store(true, Ordering::Release);
         ring(&self.doorbell);
         let (kept, counts) = (Vec::new(), OutputCounts::default());
-        let mut report = ShutdownReport { lasers_dark, flat_presented, panel_ended: true, kept, counts };
+        let mut report = ShutdownReport { lasers_dark: self.switch.is_dark(), flat_presented, panel_ended: true, kept, counts };
         if let Some(Threads { panel, laser }) = self.threads.take() {
             report.panel_ended = wait_for(&|| panel.is_finished(), PANEL_WAIT);
             if report.panel_ended {
@@ -124,7 +126,8 @@ impl OutputControl {
                 report.kept = panel.join().unwrap_or_default();
             }
             laser.thread().unpark();
-            report.lasers_dark &= laser.join().is_ok();
+            // It may have been late to hear of it.
+            report.lasers_dark = laser.join().is_ok() && self.switch.is_dark();
         }
         report.counts = self.counts();
         report

@@ -142,6 +142,7 @@ impl Output {
         let (fault_producer, fault_consumer) = RingBuffer::new(SHORT_RING);
         let laser_watch = laser.watch();
         let gates_fields = laser.capability().gates_fields;
+        let dark_wait = laser.dark_wait();
         let shared = Arc::new(Shared::default());
         let doorbell =
             Arc::new(eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK).map_err(std::io::Error::from)?);
@@ -196,6 +197,7 @@ impl Output {
                 switch: DarkSwitch { shared, laser: laser.thread().clone() },
                 doorbell,
                 frame_period: gate.timing().frame_period,
+                dark_wait,
                 threads: Some(Threads { panel, laser }),
                 clock,
             },
