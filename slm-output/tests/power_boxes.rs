@@ -439,7 +439,10 @@ fn lasers_are_put_out_at_the_start_whatever_is_wrong_with_one_of_them() {
         assert!(others.iter().all(|bench| !bench.with(|device| device.lit)), "{error}");
         if let LaserError::Complaint { .. } = error {
             let text = error.to_string();
-            assert!(text.ends_with("answered `1` to `ilk?`; expected `0`: check its interlock and its faults"), "{text}");
+            assert!(
+                text.ends_with("answered `1` to `ilk?`; expected `0`: check its interlock and its faults"),
+                "{text}"
+            );
         }
     }
 }

@@ -121,9 +121,41 @@ pub enum PanelFault {
     /// The panel no longer takes its own mode.
     #[error("the display refused the panel's own size or rate: check the cable and the monitor settings")]
     ModeRefused,
+    /// The panel's monitor does not show its pixels as they are any more.
+    #[error("the display does not show the panel's pixels as they are: {0}")]
+    Altered(AlterationKind),
+    /// The panel's monitor has become the one where the desktop is.
+    #[error("the panel's monitor is the desktop's main one now: make another one that, or add ,allow_primary")]
+    Primary,
+    /// More than one monitor could be the panel.
+    #[error("more than one monitor could be the panel now: name it by its connector or serial number")]
+    Ambiguous,
     /// The system refused something else.
     #[error("the display failed: {0}")]
     System(Errno),
+}
+
+/// What changes pixels on their way to a monitor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum AlterationKind {
+    /// The server draws in another size, and scales.
+    #[error("it is scaled; set its scale to 1")]
+    Scaled,
+    /// It rotates, reflects or warps.
+    #[error("it is rotated, reflected or warped; set it upright")]
+    Transformed,
+    /// It shows one half of the lines at a time, or each twice.
+    #[error("its mode is interlaced or doubles lines; set a progressive one")]
+    Interlaced,
+    /// It bends the levels by a gamma ramp, as night-light and calibration tools set one.
+    #[error("a gamma ramp bends its levels; switch off night light and colour profiles for it")]
+    GammaRamp,
+    /// Another monitor shows the same part of the desktop.
+    #[error("another monitor shows the same part of the desktop; move one of them")]
+    Mirrored,
+    /// It is in power-saving.
+    #[error("it is in power-saving; wake it, and switch power-saving off")]
+    Asleep,
 }
 
 impl PanelFault {

@@ -3,7 +3,7 @@
 use holod_calibration::rig::PanelMode;
 use holod_calibration::{Colour, host_now};
 use holod_slm_output::present::window::{DisplayServer, Road, WindowError};
-use holod_slm_output::present::{PanelFault, Presenter, WindowSpec};
+use holod_slm_output::present::{AlterationKind, PanelFault, Presenter, WindowSpec};
 
 use super::bench::{Bench, FLAT, SIZE, differences, expected, levels, named, packed};
 use super::compositor::{Compositor, OTHER, PANEL};
@@ -59,6 +59,8 @@ fn a_compositor_knows_no_primary_monitor_so_that_the_panel_must_be_named() {
     assert!(only.contains("is the only monitor"), "{only}");
 }
 
+const SCALED: PanelFault = PanelFault::Altered(AlterationKind::Scaled);
+
 /// What somebody does to the desktop, in the compositor's words, the fault that it is, and what mends it, where opening
 /// the window again does not.
 const ATTACKS: &[(&str, PanelFault, Option<&str>)] = &[
@@ -77,10 +79,14 @@ const ATTACKS: &[(&str, PanelFault, Option<&str>)] = &[
         PanelFault::ModeRefused,
         Some("output HEADLESS-2 mode --custom 640x480@60Hz"),
     ),
-    ("output HEADLESS-2 scale 2", PanelFault::ModeRefused, Some("output HEADLESS-2 scale 1")),
-    ("output HEADLESS-2 scale 1.25", PanelFault::ModeRefused, Some("output HEADLESS-2 scale 1")),
-    ("output HEADLESS-2 transform 180", PanelFault::ModeRefused, Some("output HEADLESS-2 transform normal")),
-    ("output HEADLESS-2 pos 100 0", PanelFault::ModeRefused, Some("output HEADLESS-2 pos 800 0")),
+    ("output HEADLESS-2 scale 2", SCALED, Some("output HEADLESS-2 scale 1")),
+    ("output HEADLESS-2 scale 1.25", SCALED, Some("output HEADLESS-2 scale 1")),
+    (
+        "output HEADLESS-2 transform 180",
+        PanelFault::Altered(AlterationKind::Transformed),
+        Some("output HEADLESS-2 transform normal"),
+    ),
+    ("output HEADLESS-2 pos 100 0", PanelFault::Altered(AlterationKind::Mirrored), Some("output HEADLESS-2 pos 800 0")),
 ];
 
 #[test]

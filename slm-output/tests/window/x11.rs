@@ -4,7 +4,7 @@
 use holod_calibration::rig::PanelMode;
 use holod_calibration::{Colour, host_now};
 use holod_slm_output::present::window::{DisplayServer, Road, WindowError};
-use holod_slm_output::present::{PanelFault, Presenter, TimestampSource, WindowSpec};
+use holod_slm_output::present::{AlterationKind, PanelFault, Presenter, TimestampSource, WindowSpec};
 
 use super::bench::{Bench, FLAT, SIZE, differences, expected, levels, named, packed, wait_until};
 use super::x11_server::{Desktop, MAIN, MAIN_PLACE, PANEL, PANEL_PLACE, PANEL_SIZE};
@@ -235,13 +235,13 @@ fn attacks() -> Vec<Attack> {
         Attack {
             name: "the panel becomes the primary monitor",
             strike: |desktop| desktop.set_primary(Some(PANEL)),
-            fault: PanelFault::ModeRefused,
+            fault: PanelFault::Primary,
             mend: Some(|desktop| desktop.set_primary(Some(MAIN))),
         },
         Attack {
             name: "the main monitor shows the panel's part of the desktop, too",
             strike: |desktop| desktop.place(MAIN, (PANEL_PLACE.0 - 400, 0, MAIN_PLACE.2, MAIN_PLACE.3), 60.0),
-            fault: PanelFault::ModeRefused,
+            fault: PanelFault::Altered(AlterationKind::Mirrored),
             mend: Some(|desktop| desktop.place(MAIN, MAIN_PLACE, 60.0)),
         },
         Attack {
@@ -259,7 +259,7 @@ fn attacks() -> Vec<Attack> {
         Attack {
             name: "night light",
             strike: |desktop| desktop.dim(PANEL, 0.9),
-            fault: PanelFault::ModeRefused,
+            fault: PanelFault::Altered(AlterationKind::GammaRamp),
             mend: Some(|desktop| desktop.dim(PANEL, 1.0)),
         },
         Attack {

@@ -7,7 +7,7 @@ use holod_calibration::Resolution;
 use holod_calibration::rig::Panel;
 
 use crate::present::drm::Edid;
-use crate::present::{PanelFault, WindowSpec};
+use crate::present::{AlterationKind, PanelFault, WindowSpec};
 
 /// How far a mode's refresh rate may be from the rig's, as a share of it: 59.94 and 59.95 Hz are "60 Hz" to those who
 /// sell monitors, and the next rate that is sold, 59.7, is another one.
@@ -51,17 +51,24 @@ pub enum Alteration {
     Asleep,
 }
 
+impl Alteration {
+    const fn kind(&self) -> AlterationKind {
+        match self {
+            Self::Scaled => AlterationKind::Scaled,
+            Self::Transformed => AlterationKind::Transformed,
+            Self::Interlaced => AlterationKind::Interlaced,
+            Self::GammaRamp => AlterationKind::GammaRamp,
+            Self::Mirrored(_) => AlterationKind::Mirrored,
+            Self::Asleep => AlterationKind::Asleep,
+        }
+    }
+}
+
 impl fmt::Display for Alteration {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Scaled => f.write_str("it is scaled; set its scale to 1"),
-            Self::Transformed => f.write_str("it is rotated, reflected or warped; set it upright"),
-            Self::Interlaced => f.write_str("its mode is interlaced or doubles lines; set a progressive one"),
-            Self::GammaRamp => {
-                f.write_str("a gamma ramp bends its levels; switch off night light and colour profiles for it")
-            }
             Self::Mirrored(other) => write!(f, "{other} shows the same part of the desktop; move one of them"),
-            Self::Asleep => f.write_str("it is in power-saving; wake it, and switch power-saving off"),
+            other => other.kind().fmt(f),
         }
     }
 }
@@ -173,7 +180,12 @@ impl MonitorError {
     pub(super) fn as_fault(&self) -> PanelFault {
         match self {
             Self::NoneThere | Self::NotThere { .. } | Self::NotNamed { fitting: 0, .. } => PanelFault::Unplugged,
-            _ => PanelFault::ModeRefused,
+            Self::Primary { .. } => PanelFault::Primary,
+            Self::Ambiguous { .. } | Self::NotNamed { .. } => PanelFault::Ambiguous,
+            Self::Mode { .. } => PanelFault::ModeRefused,
+            Self::Altered { monitor } => {
+                monitor.alterations.first().map_or(PanelFault::ModeRefused, |first| PanelFault::Altered(first.kind()))
+            }
         }
     }
 }

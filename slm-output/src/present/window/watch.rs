@@ -12,7 +12,7 @@ use rustix::event::{EventfdFlags, eventfd};
 
 use super::WindowError;
 use super::monitors::Monitor;
-use crate::present::PanelFault;
+use crate::present::{AlterationKind, PanelFault};
 
 /// What a display server says of one presented picture.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,7 +61,19 @@ impl Shared {
 }
 
 /// The faults that a watcher finds.
-const FAULTS: [PanelFault; 3] = [PanelFault::WindowLost, PanelFault::Unplugged, PanelFault::ModeRefused];
+const FAULTS: [PanelFault; 11] = [
+    PanelFault::WindowLost,
+    PanelFault::Unplugged,
+    PanelFault::ModeRefused,
+    PanelFault::Primary,
+    PanelFault::Ambiguous,
+    PanelFault::Altered(AlterationKind::Scaled),
+    PanelFault::Altered(AlterationKind::Transformed),
+    PanelFault::Altered(AlterationKind::Interlaced),
+    PanelFault::Altered(AlterationKind::GammaRamp),
+    PanelFault::Altered(AlterationKind::Mirrored),
+    PanelFault::Altered(AlterationKind::Asleep),
+];
 
 /// A counter at its limit is rung already.
 fn ring(bell: &OwnedFd) {
