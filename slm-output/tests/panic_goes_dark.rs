@@ -13,6 +13,8 @@ use holod_slm_output::present::{PanelSetup, open_panel};
 
 /// Whether a panic is one that is caught.
 static IS_CAUGHT: AtomicBool = AtomicBool::new(false);
+/// Whether a panic's message has been written.
+static IS_TOLD: AtomicBool = AtomicBool::new(false);
 
 #[test]
 fn a_panic_in_any_thread_goes_dark_for_good() {
@@ -23,6 +25,11 @@ fn a_panic_in_any_thread_goes_dark_for_good() {
     let laser = open_laser(&rig.lasers, host_now).unwrap();
     let mut output = Output::start(&rig, &encoder, panel.unwrap(), laser, OutputOptions::default(), host_now).unwrap();
     let switch = output.control.dark_switch();
+    // A terminal that takes its time.
+    std::panic::set_hook(Box::new(|_| {
+        std::thread::sleep(Duration::from_millis(200));
+        IS_TOLD.store(true, Ordering::Release);
+    }));
     switch.install_panic_hook(host_now, || IS_CAUGHT.load(Ordering::Acquire));
     let mut pacer = Pacer::new(pacing_config(&rig, TimeNs(1_000_000)).unwrap(), host_now());
     let mut show = |frames: &mut holod_slm_output::FramePort| {
@@ -41,7 +48,14 @@ fn a_panic_in_any_thread_goes_dark_for_good() {
     IS_CAUGHT.store(false, Ordering::Release);
     show(&mut output.frames);
     assert!(!switch.is_dark() && switch.reason().is_none(), "a panic that is caught changes nothing");
-    assert!(std::thread::spawn(|| panic!("meant")).join().is_err());
+    let panicked = std::thread::spawn(|| panic!("meant"));
+    while switch.reason().is_none() {
+        assert!(host_now() < t_end, "nobody hears of it");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    switch.wait_for_panic_message(host_now);
+    assert!(IS_TOLD.load(Ordering::Acquire), "whoever knows of a panic finds its message above");
+    assert!(panicked.join().is_err());
     while !switch.is_dark() {
         assert!(host_now() < t_end, "never dark");
         std::thread::sleep(Duration::from_millis(1));

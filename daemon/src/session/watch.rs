@@ -168,7 +168,9 @@ impl Watch<'_> {
             if let Some(ended) = self.over(limits, now) {
                 return Ok(ended.to_owned());
             }
-            if output.dark_switch().reason() == Some(DarkReason::Panic) {
+            let switch = output.dark_switch();
+            if switch.reason() == Some(DarkReason::Panic) {
+                switch.wait_for_panic_message(host_now);
                 return Err(Failure::new(Exit::Software, "a thread failed (its message stands above)"));
             }
             if let Some(fault) = self.panel.lost().filter(|fault| !fault.is_recoverable()) {

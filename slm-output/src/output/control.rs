@@ -22,6 +22,8 @@ const KEEP_DARK_WAIT: TimeNs = TimeNs(2_000_000_000);
 const PANEL_WAIT: TimeNs = TimeNs(3_000_000_000);
 /// How long a panic waits for it.
 const PANIC_WAIT: TimeNs = TimeNs(20_000_000);
+/// How long a panic's message is waited for.
+const PANIC_MESSAGE_WAIT: TimeNs = TimeNs(1_000_000_000);
 
 /// How the output ended.
 #[derive(Debug)]
@@ -118,7 +120,8 @@ impl OutputControl {
         shared.stop.store(true, Ordering::Release);
         ring(&self.doorbell);
         let (kept, counts) = (Vec::new(), OutputCounts::default());
-        let mut report = ShutdownReport { lasers_dark: self.switch.is_dark(), flat_presented, panel_ended: true, kept, counts };
+        let mut report =
+            ShutdownReport { lasers_dark: self.switch.is_dark(), flat_presented, panel_ended: true, kept, counts };
         if let Some(Threads { panel, laser }) = self.threads.take() {
             report.panel_ended = wait_for(&|| panel.is_finished(), PANEL_WAIT);
             if report.panel_ended {
@@ -176,6 +179,7 @@ impl DarkSwitch {
             if is_caught() {
                 return;
             }
+            switch.shared.panics.fetch_add(1, Ordering::AcqRel);
             switch.dark(DarkReason::Panic);
             let t_end = clock() + PANIC_WAIT;
             let on_laser_thread = std::thread::current().id() == switch.laser.id();
@@ -183,6 +187,15 @@ impl DarkSwitch {
                 std::thread::sleep(Duration::from_micros(200));
             }
             before(info);
+            switch.shared.panics.fetch_sub(1, Ordering::AcqRel);
         }));
+    }
+
+    /// Waits, for a second at most, until what panicked has said so: whoever ends the program earlier ends the message.
+    pub fn wait_for_panic_message(&self, clock: Clock) {
+        let t_end = clock() + PANIC_MESSAGE_WAIT;
+        while self.shared.panics.load(Ordering::Acquire) > 0 && clock() < t_end {
+            std::thread::sleep(Duration::from_millis(1));
+        }
     }
 }

@@ -42,6 +42,8 @@ pub(super) struct Shared {
     pub(super) dark_request: AtomicU64,
     /// The request that has been obeyed, and the box's answer in the two lowest bits.
     pub(super) dark_answer: AtomicU64,
+    /// Panics whose messages have not been written yet.
+    pub(super) panics: AtomicU64,
     pub(super) flat_wanted: AtomicBool,
     pub(super) flat_shown: AtomicBool,
     pub(super) stop: AtomicBool,

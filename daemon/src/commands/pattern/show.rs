@@ -70,6 +70,7 @@ pub(super) fn show(
                 break 'frames Ok(signal.to_owned());
             }
             if switch.reason() == Some(DarkReason::Panic) {
+                switch.wait_for_panic_message(host_now);
                 break 'frames Err(Failure::new(Exit::Software, "a thread failed (its message stands above)"));
             }
             if duration.is_some_and(|duration| now - t_begin >= duration) {
