@@ -159,6 +159,24 @@ fn an_unplugged_laser_box_is_named_at_once_and_lit_again_when_it_is_back() {
 }
 
 #[test]
+fn a_pattern_says_once_why_its_laser_box_is_lost_and_that_it_is_back() {
+    let mut laser_box = LaserBench::plug_in();
+    let args = ["pattern", "field-identity", "--output", "headless", "--config", "rig.toml", "--duration", "60s"];
+    let daemon = Daemon::start(HOLOD, &args, laser_box.folder.path());
+    assert!(wait_until(Duration::from_secs(30), || laser_box.edges().len() > 60));
+    laser_box.unplug();
+    thread::sleep(Duration::from_secs(3));
+    laser_box.plug_in_again();
+    assert!(wait_until(Duration::from_secs(20), || laser_box.edges().len() > 60), "{:?}", laser_box.events().last());
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(Duration::from_secs(20));
+    assert!(ended.status.success(), "{}", ended.stderr);
+    assert_eq!(ended.stderr.matches("the laser box is lost").count(), 1, "{}", ended.stderr);
+    assert!(ended.stderr.contains("check lasers.device"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("the laser box is back"), "{}", ended.stderr);
+}
+
+#[test]
 fn a_run_whose_laser_box_does_not_acknowledge_darkness_says_so_and_fails() {
     let laser_box = LaserBench::plug_in();
     let daemon = laser_box.lit_daemon();

@@ -3,7 +3,7 @@
 use holod_slm_output::laser::{LaserError, LaserWatch};
 
 /// Follows the laser box, and says in the log what changes.
-pub(super) struct LaserBoxWatch {
+pub(crate) struct LaserBoxWatch {
     faults: rtrb::Consumer<LaserError>,
     link: Option<LaserWatch>,
     /// Why the box is lost, as it was said last.
@@ -13,13 +13,13 @@ pub(super) struct LaserBoxWatch {
 }
 
 impl LaserBoxWatch {
-    pub(super) const fn new(faults: rtrb::Consumer<LaserError>, link: Option<LaserWatch>) -> Self {
+    pub(crate) const fn new(faults: rtrb::Consumer<LaserError>, link: Option<LaserWatch>) -> Self {
         Self { faults, link, lost: None, fault: None }
     }
 
     /// Takes note of everything that the laser thread has said. `armed`: lasers may be lit, so whatever was wrong is
     /// over.
-    pub(super) fn drain(&mut self, armed: bool) {
+    pub(crate) fn drain(&mut self, armed: bool) {
         while let Ok(fault) = self.faults.pop() {
             // Why it is lost is said below, once.
             if matches!(fault, LaserError::Lost) {
@@ -45,7 +45,7 @@ impl LaserBoxWatch {
     }
 
     /// What is wrong with the box now, if anything is.
-    pub(super) fn trouble(&self) -> Option<&str> {
+    pub(crate) fn trouble(&self) -> Option<&str> {
         self.lost.as_deref().or(self.fault.as_deref())
     }
 }

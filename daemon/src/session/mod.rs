@@ -26,6 +26,7 @@ mod watch;
 use crate::failure::Failure;
 
 pub(crate) use self::inputs::{Cue, Playback, pupil_state_named, pupil_states};
+pub(crate) use self::laser_watch::LaserBoxWatch;
 pub use self::ledger::LaserSummary;
 pub use self::observer::{Began, FirstLight, Observer};
 pub use self::plan::SessionPlan;

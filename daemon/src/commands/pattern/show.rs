@@ -13,7 +13,7 @@ use holod_slm_output::{LevelsFrame, Output, OutputOptions, OutputSpec, Pacer, Pa
 
 use crate::cli::PatternTarget;
 use crate::failure::{Exit, Failure};
-use crate::session::{NO_ACKNOWLEDGEMENT, PANEL_HANGS, Signals, not_dark};
+use crate::session::{LaserBoxWatch, NO_ACKNOWLEDGEMENT, PANEL_HANGS, Signals, not_dark};
 
 /// Time that a frame may take before it has been measured.
 const FIRST_COPY: TimeNs = TimeNs(5_000_000);
@@ -48,6 +48,7 @@ pub(super) fn show(
     let signals = Signals::install(None)?;
     let pacing = pacing_config(rig, FIRST_COPY).map_err(Failure::because(Exit::Config))?;
     let mut output = open(spec, rig, encoder).map_err(Failure::because(Exit::Unavailable))?;
+    let mut laser_box = LaserBoxWatch::new(output.laser_faults, output.laser_watch);
     let switch = output.control.dark_switch();
     switch.install_panic_hook(host_now, || false);
     if to.dark {
@@ -97,9 +98,7 @@ pub(super) fn show(
             shown.dark = field.dark.or(shown.dark);
         }
         while output.box_events.pop().is_ok() {}
-        while let Ok(fault) = output.laser_faults.pop() {
-            tracing::error!("lasers: {fault}");
-        }
+        laser_box.drain(output.control.counts().armed);
         while let Ok(event) = output.panel_events.pop() {
             match event {
                 PanelEvent::Lost { fault, .. } if fault.is_recoverable() => {
@@ -119,7 +118,7 @@ pub(super) fn show(
         tracing::error!("{PANEL_HANGS}");
     }
     if ended.is_err() && !down.lasers_dark {
-        tracing::error!("{}", not_dark(NO_ACKNOWLEDGEMENT));
+        tracing::error!("{}", not_dark(laser_box.trouble().unwrap_or(NO_ACKNOWLEDGEMENT)));
     }
     shown.ended_by = ended?;
     (shown.lasers_dark, shown.flat_presented) = (down.lasers_dark, down.flat_presented);
