@@ -1,8 +1,9 @@
 //! However the daemon ends, the lasers end dark.
 
 use std::fs::{self, File};
+use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
@@ -12,6 +13,7 @@ use holod_slm_output::laser::edge_log::read_log;
 use holod_slm_output::laser::simulator::{Faults, SimulatedBox, SimulatedTerminal};
 use holod_slm_output::laser::{BoxEvent, DarkReason, LaserEdge};
 use holod_tests::daemon::{Daemon, run, wait_until};
+use holod_tests::tracker::PtyTracker;
 use holod_tests::{FIELD_ORDER, frames, small_rig};
 use rustix::process::Signal;
 
@@ -261,6 +263,52 @@ fn lasers_are_put_out_beside_a_daemon_that_hangs() {
     daemon.signal(Signal::TERM);
     let ended = daemon.wait(Duration::from_secs(20));
     assert!(ended.stderr.contains("restart holod to light lasers again"), "{}", ended.stderr);
+}
+
+/// A Cobolt laser at `link` that takes its time to answer, and what it was told.
+fn slow_cobolt(link: &Path) -> Arc<Mutex<Vec<String>>> {
+    let plugged_in = PtyTracker::plug_in(link).unwrap();
+    let mut line = plugged_in.line().unwrap();
+    let heard = Arc::new(Mutex::new(Vec::new()));
+    let its_words = Arc::clone(&heard);
+    thread::spawn(move || {
+        let _plugged_in = plugged_in;
+        for command in BufReader::new(line.try_clone().unwrap()).split(b'\r') {
+            let command = String::from_utf8(command.unwrap()).unwrap();
+            thread::sleep(Duration::from_millis(100));
+            let answer = match command.as_str() {
+                "sn?" => "12034",
+                "ilk?" | "f?" => "0",
+                _ => "OK",
+            };
+            its_words.lock().unwrap().push(command);
+            line.write_all(format!("{answer}\r\n").as_bytes()).unwrap();
+        }
+    });
+    heard
+}
+
+#[test]
+fn a_second_signal_does_not_leave_lasers_without_a_heartbeat_lit() {
+    let folder = holod_tests::new_folder();
+    let heard = slow_cobolt(&folder.path().join("green"));
+    let lasers = "driver = \"text\"\nprofile = \"cobolt\"\ndevices = { green = \"green\" }\n\
+                  accept_no_heartbeat = \"these lasers stay lit when holod dies\"";
+    let rig = small_rig(64, 64, lasers).replace("\"channel-packed\"", "\"monochrome\"\ncolour = \"green\"");
+    fs::write(folder.path().join("rig.toml"), rig).unwrap();
+    let args = ["--config", "rig.toml", "--tracker", "mock:steady", "--resolution", "64x64"];
+    let mut daemon = Daemon::start(HOLOD, &args, folder.path());
+    // It is asked how it is from time to time once everything goes on.
+    let asked = || heard.lock().unwrap().iter().filter(|words| *words == "f?").count();
+    assert!(wait_until(Duration::from_secs(60), || asked() > 3 || !daemon.runs()));
+    let before = heard.lock().unwrap().len();
+    daemon.signal(Signal::INT);
+    thread::sleep(Duration::from_millis(3));
+    daemon.signal(Signal::INT);
+    let ended = daemon.wait(Duration::from_secs(20));
+    assert_eq!(ended.status.code(), Some(0), "{}", ended.stderr);
+    assert!(heard.lock().unwrap()[before..].iter().any(|words| words == "l0"), "{:?}", heard.lock().unwrap());
+    assert!(ended.stderr.contains("a second signal ends holod only once"), "{}", ended.stderr);
 }
 
 fn judge_record(record: &Path) {

@@ -52,6 +52,11 @@ impl PtyTracker {
         &self.device
     }
 
+    /// Its own end of the line, for a device that is spoken to.
+    pub fn line(&self) -> io::Result<File> {
+        self.master.try_clone()
+    }
+
     /// Sends bytes now.
     pub fn send(&mut self, bytes: &[u8]) -> io::Result<()> {
         self.master.write_all(bytes)

@@ -67,7 +67,7 @@ pub(super) struct Session<'a> {
 pub(super) fn build(
     plan: SessionPlan,
     playback: Option<Playback>,
-    signals: Signals,
+    mut signals: Signals,
     observer: &mut dyn Observer,
 ) -> Result<Session<'_>, Failure> {
     status::remove_leftovers();
@@ -125,6 +125,7 @@ pub(super) fn build(
     let output = progress::during("opening panel and lasers", || {
         scheduling::prompt(|| open_output(&plan, &encoder, options)).map_err(Failure::because(Exit::Unavailable))
     })?;
+    signals.end_after_lasers(&rig.lasers.driver);
     tracing::debug!("panel `{}` is open; lasers by {:?}", plan.output, rig.lasers.driver);
     output
         .control

@@ -10,6 +10,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Once};
 use std::time::Duration;
 
+use holod_calibration::rig::LaserDriver;
 use holod_calibration::{TimeNs, hangup_is_ignored};
 use sd_notify::NotifyState;
 use signal_hook::SigId;
@@ -63,29 +64,63 @@ fn has_terminal() -> bool {
 /// SIGINT, SIGTERM and, where it is not taken over for something else, SIGHUP, as a flag, for as long as this lives.
 pub(crate) struct Signals {
     caught: Arc<AtomicUsize>,
+    /// The next signal ends the process at once.
+    again: Arc<AtomicBool>,
     registered: Vec<SigId>,
+    /// What sets that at the first one.
+    first: Vec<SigId>,
+    /// Nothing ends the process at once before its lasers are out.
+    after_lasers: bool,
 }
 
 impl Signals {
     /// Takes the signals over. A second one while the first is being obeyed ends the process at once: the laser box's
-    /// heartbeat makes it dark.
+    /// heartbeat makes it dark. For lasers without one there is [`Self::end_after_lasers`].
     pub(crate) fn install(hangups: Option<&Hangups>) -> Result<Self, Failure> {
         let caught = Arc::new(AtomicUsize::new(0));
         let again = Arc::new(AtomicBool::new(false));
-        let mut signals = Self { caught, registered: Vec::new() };
+        let mut signals = Self { caught, again, registered: Vec::new(), first: Vec::new(), after_lasers: false };
         leave_signals_to_a_run(true);
         let ends_on_hangup = hangups.is_none() && !hangup_is_ignored();
         for signal in [SIGINT, SIGTERM].into_iter().chain(ends_on_hangup.then_some(SIGHUP)) {
             let caught = Arc::clone(&signals.caught);
             for registered in [
-                signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&again)),
-                signal_hook::flag::register(signal, Arc::clone(&again)),
+                signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&signals.again)),
                 signal_hook::flag::register_usize(signal, caught, signal as usize),
             ] {
                 signals.registered.push(registered.map_err(Failure::because(Exit::Software))?);
             }
+            let at_first = signal_hook::flag::register(signal, Arc::clone(&signals.again));
+            signals.first.push(at_first.map_err(Failure::because(Exit::Software))?);
         }
         Ok(signals)
+    }
+
+    /// From now on a second signal ends the process only after [`Self::lasers_are_out`]: lasers that `driver` does not
+    /// put out by itself would stay lit.
+    pub(crate) fn end_after_lasers(&mut self, driver: &LaserDriver) {
+        if driver.has_heartbeat() {
+            return;
+        }
+        for id in self.first.drain(..) {
+            signal_hook::low_level::unregister(id);
+        }
+        self.again.store(false, Ordering::Release);
+        self.after_lasers = true;
+    }
+
+    /// The way down has begun: says what a second signal does not do.
+    pub(crate) fn lasers_go_out(&self) {
+        if self.after_lasers {
+            tracing::info!("the lasers have no heartbeat: a second signal ends holod only once they have been put out");
+        }
+    }
+
+    /// The lasers have been told to go out, as often as they are told at all.
+    pub(crate) fn lasers_are_out(&self) {
+        if self.caught().is_some() {
+            self.again.store(true, Ordering::Release);
+        }
     }
 
     /// The name of the signal that ends the run, where it came.
@@ -101,7 +136,7 @@ impl Signals {
 
 impl Drop for Signals {
     fn drop(&mut self) {
-        for id in self.registered.drain(..) {
+        for id in self.registered.drain(..).chain(self.first.drain(..)) {
             signal_hook::low_level::unregister(id);
         }
         leave_signals_to_a_run(false);

@@ -29,8 +29,10 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
     let Session { mut watch, output, frame_thread, stop, records_lost, limits, encoder } = session;
     watch.service.stopping();
     tracing::info!("stopping: {}", ended.as_deref().unwrap_or("a failure"));
+    watch.signals.lasers_go_out();
     stop.store(true, Ordering::Release);
     let down = output.shutdown();
+    watch.signals.lasers_are_out();
     let frame_loop = ends_within(&frame_thread, LONGEST_FRAME).then(|| frame_thread.join());
     let tracker_link = watch.tracker.link().name().to_owned();
     watch.tracker.stop();

@@ -45,9 +45,10 @@ pub(super) fn show(
     levels: &LevelsFrame,
     to: &PatternTarget,
 ) -> Result<Shown, Failure> {
-    let signals = Signals::install(None)?;
+    let mut signals = Signals::install(None)?;
     let pacing = pacing_config(rig, FIRST_COPY).map_err(Failure::because(Exit::Config))?;
     let mut output = open(spec, rig, encoder).map_err(Failure::because(Exit::Unavailable))?;
+    signals.end_after_lasers(&rig.lasers.driver);
     let mut laser_box = LaserBoxWatch::new(output.laser_faults, output.laser_watch);
     let switch = output.control.dark_switch();
     switch.install_panic_hook(host_now, || false);
@@ -113,6 +114,7 @@ pub(super) fn show(
     };
     shown.duration_s = (host_now() - t_begin).seconds();
     shown.refresh_hz = output.control.counts().refresh_hz;
+    signals.lasers_go_out();
     let down = output.control.shutdown();
     if !down.panel_ended {
         tracing::error!("{PANEL_HANGS}");
