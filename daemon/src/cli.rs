@@ -73,7 +73,7 @@ pub enum Command {
     Laser(LaserCommand),
     /// Put the lasers out, also while another holod has their port open.
     ///
-    /// A laser box of holod's protocol tells the holod that drives it, which leaves it dark. Lasers without a heartbeat
+    /// A laser box of holod's protocol stays dark until a holod is started anew. Lasers without a heartbeat
     /// (READYBeam, lasers that take commands in text) tell nobody: a holod that goes on may light them again. End it
     /// first.
     Dark(LaserArgs),

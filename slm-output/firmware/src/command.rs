@@ -282,7 +282,8 @@ fn answer<'a>(words: &mut Words<'a>) -> Option<Answer<'a>> {
     let Some(second) = words.next() else { return Some(Answer::Done { t }) };
     match second {
         "armed" | "dark" => {
-            let reason = DarkReason::from_name(words.next()?)?;
+            // As with `!DARK`.
+            let reason = DarkReason::from_name(words.next()?).unwrap_or(DarkReason::BoxFault);
             let lit = match words.next()? {
                 "-" => None,
                 text => Some(letter(text)?),
@@ -566,6 +567,12 @@ mod tests {
             assert_eq!(Command::parse(text), None, "{text:?}");
         }
         assert_eq!(Command::parse("3 DISARM whatever"), Some((3, Command::Disarm(DarkReason::Asked))));
+        let state = Message::parse("OK 3 70 dark overheated - closed 0 -");
+        let is_fault = |state: State| state.reason == DarkReason::BoxFault;
+        assert!(
+            matches!(state, Some(Message::Done { answer: Answer::State { state, .. }, .. }) if is_fault(state)),
+            "a box with reasons of its own is a box all the same: {state:?}"
+        );
         for text in ["", "OK", "OK 1", "OK x 5", "OK 1 5 armed", "OK 1 -", "ERR 1", "!DARK", "!NONSENSE", "P1,1,2"] {
             assert_eq!(Message::parse(text), None, "{text:?}");
         }
