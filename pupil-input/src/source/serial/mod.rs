@@ -113,31 +113,29 @@ impl SerialFeed {
     }
 
     /// The path to open: the one that was named, or where the same device is now.
+    ///
+    /// A name alone says nothing: a bare one is handed out to whoever comes first, and links lead to any device that a
+    /// rule fits, or that lacks a serial number too.
     fn locate(&mut self, ports: &[SerialPortInfo]) -> Result<PathBuf, SerialError> {
         let Some(device) = &self.device else { return Ok(self.path.clone()) };
-        self.shared |=
-            ports.iter().filter_map(|port| port.usb.as_ref()).filter(|usb| usb.looks_like(device)).count() > 1;
+        self.shared |= has_twins(device, ports);
         let named = port_at(&self.path, ports);
-        // A link that udev makes is a word about the device; a bare name is handed out to whoever comes first.
-        let bare = ports.iter().any(|port| port.path == self.path);
-        if self.path.exists() && !bare {
+        let is_ours = |port: &SerialPortInfo| port.usb.as_ref().is_some_and(|usb| usb.is_same(device, self.shared));
+        if named.is_some_and(is_ours) {
             return Ok(self.path.clone());
         }
-        let is_ours = |port: &&SerialPortInfo| {
-            port.usb.as_ref().is_some_and(|usb| usb.is_same(device, self.shared)) && self.owner(port, ports).is_none()
-        };
-        if let Some(found) = named.filter(|port| is_ours(port)).or_else(|| ports.iter().find(is_ours)) {
+        if let Some(found) = ports.iter().find(|port| is_ours(port) && self.owner(port, ports).is_none()) {
             return Ok(found.path.clone());
         }
-        match named.and_then(|port| port.usb.as_ref()) {
-            Some(other) => Err(SerialError::WrongDevice {
-                path: self.path.clone(),
-                found: other.to_string(),
-                expected: format!("{device} again"),
-                hint: "plug the tracker in".into(),
-            }),
-            None => Ok(self.path.clone()),
-        }
+        let Some(other) = named.and_then(|port| port.usb.as_ref()) else { return Ok(self.path.clone()) };
+        let alike = other.looks_like(device);
+        let (found, expected, hint) = if alike {
+            let hint = "plug the tracker in there; nothing else tells it from others like it";
+            (format!("{other} in USB socket {}", other.socket), format!("the one in socket {}", device.socket), hint)
+        } else {
+            (other.to_string(), format!("{device} again"), "plug the tracker in")
+        };
+        Err(SerialError::WrongDevice { path: self.path.clone(), found, expected, hint: hint.into() })
     }
 
     /// The forbidden port that this one is.
@@ -149,10 +147,9 @@ impl SerialFeed {
         let node = path.canonicalize().ok();
         let is_its = |forbidden: &&Forbidden| {
             let same_node = node.is_some() && forbidden.path.canonicalize().ok() == node;
-            let same_device = usb.zip(forbidden.device.as_ref()).is_some_and(|(usb, device)| {
-                let alike = ports.iter().filter_map(|port| port.usb.as_ref()).filter(|usb| usb.looks_like(device));
-                usb.is_same(device, self.shared || alike.count() > 1)
-            });
+            let same_device = usb
+                .zip(forbidden.device.as_ref())
+                .is_some_and(|(usb, device)| usb.is_same(device, self.shared || has_twins(device, ports)));
             same_node || same_device
         };
         self.forbidden.iter().find(is_its).map(|forbidden| forbidden.path.as_path())
@@ -215,6 +212,7 @@ impl Feed for SerialFeed {
         })?;
         if self.device.is_none() {
             self.device = usb.cloned();
+            self.shared = usb.is_some_and(|usb| has_twins(usb, &ports));
         }
         Ok(Box::new(port))
     }
@@ -260,6 +258,11 @@ const LATENCY_TIMER_MAX_MS: u32 = 2;
 fn port_at<'a>(path: &Path, ports: &'a [SerialPortInfo]) -> Option<&'a SerialPortInfo> {
     let node = path.canonicalize().ok()?;
     ports.iter().find(|port| port.path.canonicalize().is_ok_and(|other| other == node))
+}
+
+/// Whether more than one of the ports looks like `device`.
+fn has_twins(device: &UsbPort, ports: &[SerialPortInfo]) -> bool {
+    ports.iter().filter_map(|port| port.usb.as_ref()).filter(|usb| usb.looks_like(device)).count() > 1
 }
 
 /// What else than a tracker of `profile` sends such bytes, if that is certain.
@@ -496,6 +499,32 @@ mod tests {
             assert!(message.contains("nothing was"), "{message}");
             system.plug("ttyUSB5", "1-1", "10c4:ea60", serial, &node);
             assert_eq!(feed.locate(&ports_below(system.path())).expect("found"), system.port("ttyUSB5"));
+        }
+    }
+
+    #[test]
+    fn a_link_that_leads_to_another_device_is_not_followed() {
+        for serial in [None, Some("0001")] {
+            let system = FakeSystem::new();
+            let (mut tracker, port, node) = pty();
+            let (mut other, other_port, other_node) = pty();
+            let by_id = system.plug("ttyUSB0", "1-1", "1a86:7523", serial, &node);
+            assert_eq!(system.plug("ttyUSB1", "1-2", "1a86:7523", serial, &other_node), by_id);
+            let mut feed = feed(&system, &by_id, talks("\"1a86:7523\""), &[]);
+            send(&mut tracker, b"OK");
+            drop(port);
+            drop(feed.open().expect("opens"));
+            system.unplug("ttyUSB0", "1-1");
+            std::os::unix::fs::symlink("../../ttyUSB1", &by_id).expect("links");
+            drop(other_port);
+            let message = error(&mut feed);
+            let expected = "in USB socket 1-2; expected the one in socket 1-1; nothing was written to it";
+            assert!(message.contains(expected), "{message}");
+            assert_eq!(heard(&mut other), b"");
+            // It is back, and the link still leads to the other.
+            system.plug("ttyUSB5", "1-1", "1a86:7523", serial, &node);
+            let found = feed.locate(&ports_below(system.path())).expect("found");
+            assert_eq!(found, system.port("ttyUSB5"));
         }
     }
 
