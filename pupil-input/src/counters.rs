@@ -4,6 +4,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::gate::Rejection;
 use crate::import::{LOG_FAULT_NAMES, LogFault};
+use crate::wire::WireFault;
 
 /// One thing that is counted, beside the reasons for rejection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -174,6 +175,17 @@ impl CounterSnapshot {
         self.faults.iter().sum()
     }
 
+    /// Lost samples that were told beside the faults of their figures.
+    pub(crate) fn lost_beside_faults(&self) -> u64 {
+        let of_figures = WireFault::ALL.into_iter().filter(|fault| fault.is_of_a_figure());
+        of_figures.map(|fault| self.fault(LogFault::Wire(fault))).sum::<u64>().min(self.rejected(Rejection::Lost))
+    }
+
+    /// Samples, lines and cells that were of no use, each counted once.
+    pub fn refused_in_all(&self) -> u64 {
+        self.rejected_in_all() + self.faults_in_all() - self.lost_beside_faults()
+    }
+
     /// Every name with its count: counters, then `wire_*` and `log_*` faults, then `rejected_*`.
     pub fn entries(&self) -> impl Iterator<Item = (String, u64)> {
         let counts = Counter::ALL.into_iter().map(|counter| (counter.name().to_owned(), self.of(counter)));
@@ -189,7 +201,6 @@ mod tests {
     use std::collections::HashSet;
 
     use super::*;
-    use crate::wire::WireFault;
 
     #[test]
     fn every_count_has_a_name_of_its_own_and_its_own_place() {
@@ -206,6 +217,10 @@ mod tests {
         counted.sort();
         let expected = [("log_backwards", 5), ("rejected_guard", 1), ("silences", 3), ("wire_bad_checksum", 2)];
         assert_eq!(counted, expected.map(|(name, count)| (name.to_owned(), count)));
+        assert_eq!(snapshot.refused_in_all(), 8);
+        counters.add_rejected(Rejection::Lost);
+        counters.add_fault(LogFault::Wire(WireFault::Negative), 1);
+        assert_eq!(counters.snapshot().refused_in_all(), 9, "one pupil, lost beside its fault");
         for (index, counter) in Counter::ALL.into_iter().enumerate() {
             assert_eq!(counter as usize, index);
         }

@@ -145,9 +145,13 @@ impl RefusalWatch {
             let of = |counts: &CounterSnapshot| counts.fault(LogFault::Wire(fault));
             (Cause::Wire(fault), of(counts) - of(before))
         });
+        let of_reason = |counts: &CounterSnapshot, reason| match reason {
+            Rejection::Lost => counts.rejected(reason) - counts.lost_beside_faults(),
+            _ => counts.rejected(reason),
+        };
         let rejections = Rejection::ALL
             .into_iter()
-            .map(|reason| (Cause::Gate(reason), counts.rejected(reason) - before.rejected(reason)));
+            .map(|reason| (Cause::Gate(reason), of_reason(counts, reason).saturating_sub(of_reason(before, reason))));
         let causes: Vec<_> = faults.chain(rejections).filter(|(_, count)| *count > 0).collect();
         let refused: u64 = causes.iter().map(|(_, count)| count).sum();
         if refused == 0 {
@@ -327,7 +331,7 @@ impl Cause {
                     | Rejection::Guard
                     | Rejection::Slew
                     | Rejection::OutOfReach
-            ) | Self::Wire(WireFault::NotFinite)
+            ) | Self::Wire(WireFault::NotFinite | WireFault::Negative)
         )
     }
 }
@@ -536,6 +540,21 @@ mod tests {
             assert_eq!(said, Some(RefusalChange::Believed));
             assert_eq!(watch.current(), None);
         }
+    }
+
+    #[test]
+    fn a_figure_that_is_none_is_told_as_its_fault_and_counted_once() {
+        let counters = Counters::new();
+        let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+        assert_eq!(watch.judge(TimeNs(0), &counters.snapshot(), false), None);
+        for _ in 0..40 {
+            counters.add(Counter::Samples, 1);
+            counters.add_fault(LogFault::Wire(WireFault::Negative), 1);
+            counters.add_rejected(Rejection::Lost);
+        }
+        let said = watch.judge(TimeNs(1_500 * MS), &counters.snapshot(), true);
+        let Some(RefusalChange::Refused(refusal)) = said else { panic!("{said:?}") };
+        assert_eq!((refusal.refused, refusal.reason.as_str()), (40, "wire_negative"));
     }
 
     #[test]

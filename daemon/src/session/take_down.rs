@@ -89,7 +89,7 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
         frames_by_pupil_state: tally.by_state,
         pupil_range_mm: tally.pupil_range_mm,
         frames_beyond_trained_pupils: tally.beyond_trained,
-        samples_rejected: counters.rejected_in_all() + counters.faults_in_all(),
+        samples_rejected: counters.refused_in_all(),
         tracker_clock_drift_ppm: watch.tracker.clock().map(|clock| clock.drift_ppm),
         tracker_records_lost: recorded.as_ref().map_or(0, |status| status.chunks_lost + status.decisions_lost),
         clipped_share_max: tally.clipped_share_max,

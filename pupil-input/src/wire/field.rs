@@ -2,6 +2,7 @@
 //!
 //! `P` is a place in a message: a [`Column`](super::delimited::Column) of a line, a [`Field`] of a binary message.
 
+use std::cmp::Ordering;
 use std::f64::consts::PI;
 
 use holod_calibration::TimeNs;
@@ -215,6 +216,7 @@ pub(super) enum Raw {
         mantissa: i64,
         decimals: u32,
     },
+    Single(f32),
     Float(f64),
 }
 
@@ -230,7 +232,16 @@ impl Raw {
         match self {
             Self::Decimal { mantissa, decimals: 0 } => mantissa as f64,
             Self::Decimal { mantissa, decimals } => mantissa as f64 / POWERS_OF_TEN[decimals as usize],
+            Self::Single(number) => f64::from(number),
             Self::Float(number) => number,
+        }
+    }
+
+    /// How it compares with a figure of the profile, in the precision that it was sent in.
+    fn compared_with(self, figure: f64) -> Option<Ordering> {
+        match self {
+            Self::Single(number) => number.partial_cmp(&(figure as f32)),
+            _ => self.number().partial_cmp(&figure),
         }
     }
 
@@ -275,7 +286,7 @@ impl Message<Field> for Bytes<'_> {
                 let number = (number!(u64) >> field.shift) & field.mask.unwrap_or(u64::MAX);
                 return Ok(i64::try_from(number).map_or(Raw::Float(number as f64), Raw::whole));
             }
-            NumberType::F32 => return Ok(Raw::Float(f64::from(number!(f32)))),
+            NumberType::F32 => return Ok(Raw::Single(number!(f32))),
             NumberType::F64 => return Ok(Raw::Float(number!(f64))),
         };
         Ok(Raw::whole((whole >> field.shift) & field.mask.map_or(-1, |mask| mask as i64)))
@@ -328,8 +339,8 @@ impl<P> Fields<P> {
         Self { layout, time: Unwrapped::default(), sequence: Unwrapped::default() }
     }
 
-    /// Reads a message. A fault of one pupil is an event of its own; one of the whole message is returned before any
-    /// event was told.
+    /// Reads a message. A fault of one pupil is an event of its own, with a lost sample behind it where a figure is no
+    /// size; one of the whole message is returned before any event was told.
     pub(super) fn read(
         &mut self,
         message: &impl Message<P>,
@@ -357,18 +368,26 @@ impl<P> Fields<P> {
         };
         for pupil in &layout.pupils {
             let eye = pupil.eye.or(told_eye).unwrap_or(SampleEye::Both);
-            on_event(match read_pupil(message, pupil, layout.size) {
-                Ok(PupilFigures { diameter_mm, confidence, aperture_mm, valid }) => WireEvent::Sample(WireSample {
-                    t_device,
-                    eye,
-                    diameter_mm,
-                    confidence,
-                    aperture_mm,
-                    sequence,
-                    valid,
-                }),
-                Err(fault) => WireEvent::Rejected(fault),
-            });
+            let PupilFigures { diameter_mm, confidence, aperture_mm, valid } =
+                match read_pupil(message, pupil, layout.size) {
+                    Ok(figures) => figures,
+                    Err(fault) => {
+                        on_event(WireEvent::Rejected(fault));
+                        if !fault.is_of_a_figure() {
+                            continue;
+                        }
+                        PupilFigures::LOST
+                    }
+                };
+            on_event(WireEvent::Sample(WireSample {
+                t_device,
+                eye,
+                diameter_mm,
+                confidence,
+                aperture_mm,
+                sequence,
+                valid,
+            }));
         }
         Ok(())
     }
@@ -379,6 +398,10 @@ struct PupilFigures {
     confidence: f32,
     aperture_mm: Option<f32>,
     valid: bool,
+}
+
+impl PupilFigures {
+    const LOST: Self = Self { diameter_mm: 0.0, confidence: 0.0, aperture_mm: None, valid: false };
 }
 
 fn read_pupil<P>(message: &impl Message<P>, pupil: &PupilAt<P>, rule: SizeRule) -> Result<PupilFigures, WireFault> {
@@ -432,9 +455,9 @@ impl<P> Figure<P> {
 /// Whether `literal` stands at `at`, where `raw` was read.
 fn stands<P>(message: &impl Message<P>, at: &P, raw: Result<Raw, WireFault>, literal: &Literal) -> bool {
     match literal {
-        Literal::Number(number) => {
-            raw.is_ok_and(|raw| raw.number() == *number || (number.is_nan() && raw.number().is_nan()))
-        }
+        Literal::Number(number) => raw.is_ok_and(|raw| {
+            raw.compared_with(*number) == Some(Ordering::Equal) || (number.is_nan() && raw.number().is_nan())
+        }),
         Literal::Text(text) => message.has_text(at, text),
     }
 }
@@ -445,8 +468,8 @@ impl Validity {
         Ok(match self {
             Self::Equals(literal) => stands(message, at, raw, literal),
             Self::Differs(literal) => !stands(message, at, raw, literal),
-            Self::AtLeast(least) => raw?.number() >= *least,
-            Self::AtMost(most) => raw?.number() <= *most,
+            Self::AtLeast(least) => raw?.compared_with(*least).is_some_and(Ordering::is_ge),
+            Self::AtMost(most) => raw?.compared_with(*most).is_some_and(Ordering::is_le),
             Self::AllBits(bits) => raw?.whole_number()? as u64 & bits == *bits,
             Self::NoBits(bits) => raw?.whole_number()? as u64 & bits == 0,
         })
@@ -535,6 +558,22 @@ mod tests {
         assert_eq!(Bytes(&[9, 9, 0b1010_1111, 0b1111_1110]).raw(&bits).unwrap().number(), f64::from(0b10_1010));
         assert_eq!(bits.bits(), 6);
         assert!(matches!(Bytes(&[1]).raw(&bits), Err(WireFault::TooShort)));
+    }
+
+    #[test]
+    fn a_figure_of_the_profile_is_compared_in_the_precision_that_was_sent() {
+        let single = |number: f32| Raw::Single(number);
+        let literal = |number| Literal::Number(number);
+        let bytes = (-0.1_f32).to_le_bytes();
+        let at = field(0, NumberType::F32);
+        let holds = |validity: Validity| validity.holds(&Bytes(&bytes), &at).expect("reads");
+        assert!(holds(Validity::Equals(literal(-0.1))) && !holds(Validity::Equals(literal(-0.1001))));
+        assert!(holds(Validity::AtLeast(-0.1)) && holds(Validity::AtMost(-0.1)));
+        assert_eq!(single(f32::NAN).compared_with(f64::NAN), None);
+        let bytes = (-0.1_f64).to_le_bytes();
+        let at = field(0, NumberType::F64);
+        let near = Validity::Equals(literal(-0.100_000_000_1));
+        assert!(!near.holds(&Bytes(&bytes), &at).expect("reads"), "a double is compared as one");
     }
 
     #[test]

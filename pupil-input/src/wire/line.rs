@@ -78,9 +78,14 @@ impl LineDecoder {
         if line[0] == b'#' {
             return on_event(WireEvent::Note);
         }
-        let parsed = if overlong { Err(WireFault::TooLong) } else { parse_line(line) };
+        let parsed = if overlong { Err(WireFault::TooLong) } else { read_line(line) };
         match parsed {
-            Ok(sample) => on_event(WireEvent::Sample(sample.into())),
+            Ok((sample, fault)) => {
+                if let Some(fault) = fault {
+                    on_event(WireEvent::Rejected(fault));
+                }
+                on_event(WireEvent::Sample(sample.into()));
+            }
             Err(fault) => {
                 on_event(if joined { WireEvent::Partial } else { WireEvent::Rejected(fault) });
                 if !overlong && let Some(sample) = later_sample(line) {
@@ -138,6 +143,14 @@ fn later_sample(line: &[u8]) -> Option<LineSample> {
 /// # Errors
 /// The first reason why it is not a sample.
 pub fn parse_line(line: &[u8]) -> Result<LineSample, WireFault> {
+    match read_line(line)? {
+        (sample, None) => Ok(sample),
+        (_, Some(fault)) => Err(fault),
+    }
+}
+
+/// A whole line; a sample without a size beside the fault of its figures.
+fn read_line(line: &[u8]) -> Result<(LineSample, Option<WireFault>), WireFault> {
     if line.len() > MAX_LINE_BYTES {
         return Err(WireFault::TooLong);
     }
@@ -172,16 +185,16 @@ pub fn parse_line(line: &[u8]) -> Result<LineSample, WireFault> {
     };
     let diameter_mm: f32 = field()?.parse().map_err(|_| WireFault::BadNumber)?;
     let confidence: f32 = field()?.parse().map_err(|_| WireFault::BadNumber)?;
-    if !diameter_mm.is_finite() || !confidence.is_finite() {
-        return Err(WireFault::NotFinite);
-    }
-    if diameter_mm < 0.0 {
-        return Err(WireFault::Negative);
-    }
-    if !(0.0..=1.0).contains(&confidence) {
+    let fault = if !diameter_mm.is_finite() || !confidence.is_finite() {
+        WireFault::NotFinite
+    } else if diameter_mm < 0.0 {
+        WireFault::Negative
+    } else if (0.0..=1.0).contains(&confidence) {
+        return Ok((LineSample { sequence, device_us, eye, diameter_mm, confidence }, None));
+    } else {
         return Err(WireFault::BadConfidence);
-    }
-    Ok(LineSample { sequence, device_us, eye, diameter_mm, confidence })
+    };
+    Ok((LineSample { sequence, device_us, eye, diameter_mm: 0.0, confidence: 0.0 }, Some(fault)))
 }
 
 /// Appends the line that says `sample`, with its LF.
@@ -274,8 +287,13 @@ mod tests {
             (with_crc("P1,7,8,L,3,1.01"), WireFault::BadConfidence),
             (with_crc("P1,7,8,L,3,-0.5"), WireFault::BadConfidence),
         ];
+        let lost = LineSample { sequence: 7, device_us: 8, diameter_mm: 0.0, confidence: 0.0, ..sample() };
+        let lost = WireSample { valid: false, ..lost.into() };
         for (text, fault) in cases {
-            assert_eq!(decode(text.as_bytes()), [WireEvent::Rejected(fault)], "{text}");
+            let mut expected = vec![WireEvent::Rejected(fault)];
+            expected.extend(fault.is_of_a_figure().then_some(WireEvent::Sample(lost)));
+            assert_eq!(decode(text.as_bytes()), expected, "{text}");
+            assert_eq!(parse_line(text.trim_end().as_bytes()), Err(fault), "{text}");
         }
     }
 

@@ -172,10 +172,17 @@ impl<'a> Record<'a> {
         for (eye, pupil) in [SampleEye::Left, SampleEye::Right].into_iter().zip(&self.eyes) {
             let Some(size) = pupil.size(settings.size) else { continue };
             told = true;
-            on_event(match size {
-                Ok((diameter_mm, valid)) => WireEvent::Sample(WireSample { eye, diameter_mm, valid, ..common }),
-                Err(fault) => WireEvent::Rejected(fault),
-            });
+            let (diameter_mm, valid) = match size {
+                Ok(figure) => figure,
+                Err(fault) => {
+                    on_event(WireEvent::Rejected(fault));
+                    if !fault.is_of_a_figure() {
+                        continue;
+                    }
+                    (0.0, false)
+                }
+            };
+            on_event(WireEvent::Sample(WireSample { eye, diameter_mm, valid, ..common }));
         }
         if !told {
             on_event(WireEvent::Rejected(WireFault::MissingField));
@@ -311,7 +318,10 @@ mod tests {
             ("<REC LPMM=\"-4.8\" LPMMV=\"1\" />\n".into(), WireFault::Negative),
         ];
         for (text, fault) in cases {
-            assert_eq!(decode(&text), [WireEvent::Rejected(fault)], "{text}");
+            let events = decode(&text);
+            assert_eq!(events[0], WireEvent::Rejected(fault), "{text}");
+            let lost = matches!(events[1..], [WireEvent::Sample(WireSample { valid: false, .. })]);
+            assert_eq!((events.len() > 1, lost), (fault.is_of_a_figure(), fault.is_of_a_figure()), "{text}");
         }
     }
 
