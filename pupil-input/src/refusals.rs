@@ -73,6 +73,8 @@ pub struct RefusalWatch {
     samples: Vec<PupilSample>,
     /// The counts when a sample was believed last.
     believed: Option<CounterSnapshot>,
+    /// A sample was believed with these settings.
+    proven: bool,
     refused_since: Option<TimeNs>,
     current: Option<Refusal>,
 }
@@ -87,6 +89,7 @@ impl RefusalWatch {
             began,
             samples: Vec::with_capacity(KEPT),
             believed: None,
+            proven: false,
             refused_since: None,
             current: None,
         }
@@ -97,13 +100,15 @@ impl RefusalWatch {
         (self.scale, self.eye) = (settings.scale.unwrap_or(1.0), settings.eye);
         self.samples.clear();
         self.believed = Some(*counts);
+        self.proven = false;
         self.refused_since = None;
         self.current = None;
     }
 
     /// Takes note of a decision.
     pub fn note(&mut self, decision: &Decision) {
-        if decision.verdict != Verdict::Accepted {
+        // What is wrong with the eye that is followed, the other one's samples do not tell.
+        if !matches!(decision.verdict, Verdict::Accepted | Verdict::Rejected(Rejection::OtherEye)) {
             if self.samples.len() == KEPT {
                 self.samples.remove(0);
             }
@@ -121,6 +126,7 @@ impl RefusalWatch {
         let before = *self.believed.get_or_insert_with(CounterSnapshot::zero);
         if counts.of(Counter::Accepted) > before.of(Counter::Accepted) {
             self.believed = Some(*counts);
+            self.proven = true;
             self.refused_since = None;
             self.samples.clear();
             return self.current.take().map(|_| RefusalChange::Believed);
@@ -182,15 +188,21 @@ impl RefusalWatch {
         if !over && (now - since < REFUSED_FOR || refused < LEAST_MESSAGES) {
             return None;
         }
-        // A sample beside a bad one is refused, too, and says nothing of the reason; nor does a time that came twice.
+        // A sample beside a bad one is refused, too, and says nothing of the reason; nor does a time that came twice, nor
+        // the other eye, where there are samples of the one that is followed.
+        let is_followed =
+            |(cause, _): &(Cause, u64)| matches!(cause, Cause::Gate(reason) if *reason != Rejection::OtherEye);
+        let follows = causes.iter().any(is_followed);
         let weight = |cause: &Cause| match cause {
-            Cause::Gate(Rejection::Guard | Rejection::Repeated) => 0,
-            _ => 1,
+            Cause::Gate(Rejection::OtherEye) if follows => 0,
+            Cause::Gate(Rejection::Guard | Rejection::Repeated) => 1,
+            _ => 2,
         };
         let (cause, _) = causes.into_iter().max_by_key(|(cause, count)| (weight(cause), *count))?;
-        // Once a tracker has worked, an eye that is shut or away for a while is no fault of its settings.
+        // Once a tracker has worked, an eye that is shut or away for a while is no fault of its settings; some send
+        // nothing of it meanwhile.
         let worked = before.of(Counter::Accepted) > 0;
-        if worked && cause.is_of_the_viewer() {
+        if worked && cause.is_of_the_viewer() || self.proven && cause == Cause::Gate(Rejection::OtherEye) {
             return None;
         }
         Some(Refusal { refused, reason: cause.name(), advice: self.advice(cause) })
@@ -226,11 +238,7 @@ impl RefusalWatch {
                 newest(|sample| sample.aperture_mm.map_or(f64::NAN, f64::from)).unwrap_or(f64::NAN)
             ),
             Rejection::OtherEye => {
-                let eye = self.samples.last().map_or("other", |sample| match sample.eye {
-                    SampleEye::Left => "left",
-                    SampleEye::Right => "right",
-                    SampleEye::Both => "both",
-                });
+                let eye = if self.eye == rig::Eye::Left { "right" } else { "left" };
                 format!(
                     "its samples are of the {eye} eye, and the rig follows the {}: set tracker.eye = \"{eye}\"",
                     self.eye.name()
@@ -488,6 +496,35 @@ mod tests {
             let said = advice(&settings, |k| PupilSample { diameter_mm: figure, ..sample(k) });
             assert!(said.contains(expected) && said.contains("rejected_out_of_range"), "{said}");
         }
+    }
+
+    /// As [`told`] of a tracker of two eyes, of which the rig follows the left one.
+    fn told_of_two_eyes(count: i64, left: impl Fn(i64) -> PupilSample) -> Vec<RefusalChange> {
+        let settings = rig::Tracker { eye: rig::Eye::Left, ..settings() };
+        let of = |k: i64| PupilSample {
+            t_sample: sample(k / 2).t_sample,
+            t_device: sample(k / 2).t_device,
+            ..if k % 2 == 0 { left(k / 2) } else { PupilSample { eye: SampleEye::Right, ..sample(k) } }
+        };
+        told(&settings, count, of).into_iter().map(|(_, change)| change).collect()
+    }
+
+    #[test]
+    fn an_eye_that_is_shut_is_not_taken_for_the_wrong_one() {
+        // Shut from the beginning: the camera sees none.
+        let said = told_of_two_eyes(2000, |k| PupilSample { valid: false, ..sample(k) });
+        let [RefusalChange::Refused(refusal)] = &said[..] else { panic!("{said:?}") };
+        assert!(refusal.reason == "rejected_lost" && refusal.advice.contains("sees no pupil"), "{refusal}");
+        // Unsure, beside an eye that is not: the figures are those of the one that is followed.
+        let said = told_of_two_eyes(2000, |k| PupilSample { confidence: 0.3, ..sample(k) });
+        let [RefusalChange::Refused(refusal)] = &said[..] else { panic!("{said:?}") };
+        assert!(refusal.advice.contains("confidence is 0.30"), "{refusal}");
+        // Shut for three seconds in a run that had worked; some trackers send the other eye alone then.
+        let shut = 400..1000;
+        let said = told_of_two_eyes(3000, |k| PupilSample { valid: !shut.contains(&k), ..sample(k) });
+        assert_eq!(said, []);
+        let gone = |k| if shut.contains(&k) { PupilSample { eye: SampleEye::Right, ..sample(k) } } else { sample(k) };
+        assert_eq!(told_of_two_eyes(3000, gone), []);
     }
 
     #[test]
