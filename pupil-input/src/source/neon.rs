@@ -26,6 +26,10 @@ use crate::wire::neon::{MAX_TEXT_BYTES, gaze_media, header};
 const FIRST_PACKET_WITHIN: Duration = Duration::from_secs(3);
 /// A session's life without a sign of it, where the server does not say (RFC 2326, 12.37).
 const SESSION_LASTS: Duration = Duration::from_secs(60);
+/// After such a silence a Companion is asked whether it is there.
+const SILENT_FOR: Duration = Duration::from_secs(2);
+/// How long its answer, or a packet, is waited for then: a phone may leave the network without a word.
+const ANSWER_WITHIN: Duration = Duration::from_secs(5);
 /// Bytes of the longest status that is read; a Companion's has about 3000.
 const LONGEST_STATUS: usize = 1 << 18;
 /// Tries to find two free ports that follow each other.
@@ -258,7 +262,10 @@ struct NeonSource {
     began: Instant,
     heard: bool,
     alive_each: Duration,
+    /// When it was last asked for a sign of life.
     alive_last: Instant,
+    /// When anything came last.
+    came: Instant,
     interleaved: Arc<AtomicBool>,
 }
 
@@ -314,6 +321,7 @@ impl NeonSource {
             heard: false,
             alive_each: (lasts / 2).clamp(Duration::from_secs(1), SESSION_LASTS),
             alive_last: now,
+            came: now,
             interleaved,
         })
     }
@@ -330,23 +338,35 @@ impl NeonSource {
                 Transport::Interleaved => receive(&mut self.rtsp.stream, buffer)?,
                 Transport::Datagrams { rtp, rtcp, sender } => {
                     // Answers to signs of life; the connection's end is the session's.
-                    receive(&mut self.rtsp.stream, &mut [0; 1024])?;
+                    if receive(&mut self.rtsp.stream, &mut [0; 1024])?.is_some() {
+                        self.came = Instant::now();
+                    }
                     match receive_framed(rtp, 0, *sender, buffer)? {
                         None => receive_framed(rtcp, 1, *sender, buffer)?,
                         packet => packet,
                     }
                 }
             };
-            if count.is_some() {
-                self.heard = true;
-                return Ok(count);
-            }
             let now = Instant::now();
+            if let Some(count) = count {
+                self.came = now;
+                // An answer shows that the Companion is there, and not that the tracker speaks.
+                if is_answer(&buffer[..count]) {
+                    continue;
+                }
+                self.heard = true;
+                return Ok(Some(count));
+            }
             if !self.heard && now - self.began >= FIRST_PACKET_WITHIN {
                 self.interleaved.fetch_xor(true, Ordering::Relaxed);
                 return Err(ErrorKind::TimedOut.into());
             }
-            if now - self.alive_last >= self.alive_each {
+            let silent_for = now - self.came;
+            if silent_for >= SILENT_FOR + ANSWER_WITHIN {
+                return Err(ErrorKind::TimedOut.into());
+            }
+            let asks = silent_for >= SILENT_FOR && self.alive_last <= self.came;
+            if asks || now - self.alive_last >= self.alive_each {
                 self.alive_last = now;
                 let url = std::mem::take(&mut self.url);
                 let sent = self.rtsp.send("OPTIONS", &url, "");
@@ -424,6 +444,11 @@ fn datagram_sockets(control: &TcpStream) -> io::Result<(UdpSocket, UdpSocket)> {
         }
     }
     outcome
+}
+
+/// Whether an answer to a sign of life, and nothing else, has come between interleaved packets.
+fn is_answer(bytes: &[u8]) -> bool {
+    bytes.starts_with(b"RTSP/1.") && split_head(bytes).is_some_and(|(_, behind)| behind.is_empty())
 }
 
 /// What has come by TCP.

@@ -36,6 +36,8 @@ struct Shared {
     /// Whether datagrams get through.
     datagrams: AtomicBool,
     rtsp_port: u16,
+    /// As a phone that has left the network: nothing is answered any more.
+    gone: AtomicBool,
     /// Signs of life.
     options: AtomicU64,
     teardowns: AtomicU64,
@@ -56,6 +58,7 @@ impl Companion {
         let shared = Arc::new(Shared {
             stop: AtomicBool::new(false),
             datagrams: AtomicBool::new(true),
+            gone: AtomicBool::new(false),
             rtsp_port: rtsp.local_addr().expect("bound").port(),
             options: AtomicU64::new(0),
             teardowns: AtomicU64::new(0),
@@ -270,6 +273,9 @@ fn stream(mut stream: TcpStream, shared: &Shared) -> io::Result<()> {
         };
         let length = body.len();
         let answer = format!("RTSP/1.0 200 OK\r\nCSeq: {number}\r\nContent-Length: {length}\r\n{headers}\r\n{body}");
+        if shared.gone.load(Ordering::Acquire) {
+            continue;
+        }
         if method == "PLAY" {
             assert_eq!(url, base);
             // The first packet may be right behind the answer.
@@ -398,6 +404,13 @@ fn packets_come_over_tcp_where_datagrams_do_not() {
     let options = companion.shared.options.load(Ordering::Relaxed);
     let shared = Arc::clone(&companion.shared);
     companion.stream_until("signs of life", || shared.options.load(Ordering::Relaxed) > options);
+
+    // Answers alone are silence, and the session is kept.
+    eventually("silence", || handle.control.link() == Link::Silent);
+    let (options, bytes) = (shared.options.load(Ordering::Relaxed), handle.control.counters().of(Counter::Bytes));
+    eventually("signs of life", || shared.options.load(Ordering::Relaxed) > options + 2);
+    assert_eq!(handle.control.counters().of(Counter::Bytes), bytes);
+    assert_eq!((handle.control.link(), handle.control.counters().of(Counter::Disconnects)), (Link::Silent, 1));
 }
 
 #[test]
@@ -419,6 +432,22 @@ fn a_companion_that_restarts_is_found_at_its_new_port() {
 }
 
 /// What is said where a status page answers so.
+#[test]
+fn a_phone_that_leaves_the_network_is_looked_for_again() {
+    let mut companion = Companion::start(0);
+    let mut handle = start(&companion.spec());
+    companion.stream_until("tracking", || tracks(&mut handle));
+    // Silent, and it answers: it stays.
+    let asked = companion.shared.options.load(Ordering::Relaxed);
+    eventually("signs of life", || companion.shared.options.load(Ordering::Relaxed) > asked + 8);
+    assert_eq!(handle.control.counters().of(Counter::Disconnects), 0);
+    companion.shared.gone.store(true, Ordering::Release);
+    eventually("the loss", || handle.control.counters().of(Counter::Disconnects) == 1);
+    companion.shared.gone.store(false, Ordering::Release);
+    eventually("the session", || handle.control.counters().of(Counter::Connects) == 2);
+    companion.stream_until("tracking again", || tracks(&mut handle));
+}
+
 fn refused_with(answer: impl FnOnce(TcpStream) -> io::Result<()> + Send + 'static) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
     let port = listener.local_addr().expect("bound").port();
