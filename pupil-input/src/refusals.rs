@@ -258,6 +258,13 @@ impl RefusalWatch {
         };
         let figure = mm / self.scale;
         let shown = significant(figure);
+        if self.proven {
+            return format!(
+                "{shown}: no pupil's diameter ({} to {} mm), though samples were believed before: does the tracker see the \
+                 pupil?",
+                self.limits.least_mm, self.limits.greatest_mm
+            );
+        }
         if self.scale != 1.0 && LIKELY_MM.contains(&figure) {
             return format!(
                 "{shown}: looks like millimetres, which scale_mm_per_unit = {} makes {} mm; take that key out of the rig \
@@ -525,6 +532,15 @@ mod tests {
         assert_eq!(said, []);
         let gone = |k| if shut.contains(&k) { PupilSample { eye: SampleEye::Right, ..sample(k) } } else { sample(k) };
         assert_eq!(told_of_two_eyes(3000, gone), []);
+    }
+
+    #[test]
+    fn no_unit_is_guessed_once_samples_were_believed() {
+        let collapsed = |k: i64| PupilSample { diameter_mm: if k < 800 { 3.6 } else { 0.5 }, ..sample(k) };
+        let said = told(&settings(), 1400, collapsed);
+        let [(_, RefusalChange::Refused(refusal))] = &said[..] else { panic!("{said:?}") };
+        assert!(refusal.advice.starts_with("0.5: no pupil's diameter (1 to 9 mm)"), "{refusal}");
+        assert!(!refusal.advice.contains("scale"), "{refusal}");
     }
 
     #[test]
