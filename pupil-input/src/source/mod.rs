@@ -51,6 +51,11 @@ pub(crate) trait Feed: Send {
         None
     }
 
+    /// Why links that do open bring nothing, while that goes on.
+    fn trouble(&self) -> Option<String> {
+        None
+    }
+
     /// What a user should know of the link although it opens, a sentence each.
     fn warnings(&self) -> Vec<String> {
         Vec::new()

@@ -12,7 +12,7 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpStream, UdpSocket};
 use std::os::fd::AsFd;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
@@ -43,13 +43,21 @@ const NOT_UNDERSTOOD: &str = "update the Companion app, and check that this is i
 /// A Companion by its address.
 pub(crate) struct NeonFeed {
     address: HostPort,
+    tries: Arc<Tries>,
+}
+
+/// What its sessions have come to.
+#[derive(Default)]
+struct Tries {
     /// Whether the packets are to come over TCP.
-    interleaved: Arc<AtomicBool>,
+    interleaved: AtomicBool,
+    /// Sessions in a row that no packet came of.
+    unheard: AtomicU32,
 }
 
 impl NeonFeed {
     pub(crate) fn new(address: HostPort) -> Self {
-        Self { address, interleaved: Arc::default() }
+        Self { address, tries: Arc::default() }
     }
 }
 
@@ -59,12 +67,25 @@ impl Feed for NeonFeed {
         let addresses = server.resolve()?;
         let server = Server { deadline: Instant::now() + OPEN_WITHIN, ..server };
         let stream = find_stream(&server, &addresses)?;
-        let open = || NeonSource::open(&server, &stream, Arc::clone(&self.interleaved));
-        let before = self.interleaved.load(Ordering::Relaxed);
+        let open = || NeonSource::open(&server, &stream, Arc::clone(&self.tries));
+        let interleaved = || self.tries.interleaved.load(Ordering::Relaxed);
+        let before = interleaved();
         // A Companion that refuses one transport is asked for the other at once.
-        let refused = |_: &ServerError| self.interleaved.load(Ordering::Relaxed) != before;
+        let refused = |_: &ServerError| interleaved() != before;
         let source = open().or_else(|error| if refused(&error) { open() } else { Err(error) })?;
         Ok(Box::new(source))
+    }
+
+    fn trouble(&self) -> Option<String> {
+        // Both ways have been tried then.
+        (self.tries.unheard.load(Ordering::Relaxed) >= 2).then(|| {
+            format!(
+                "{COMPANION} at {}: no packet of its gaze stream came within {} s by UDP, nor by TCP; put the glasses on, \
+                 and look for a firewall between the phone and this machine",
+                self.address,
+                FIRST_PACKET_WITHIN.as_secs()
+            )
+        })
     }
 }
 
@@ -266,11 +287,11 @@ struct NeonSource {
     alive_last: Instant,
     /// When anything came last.
     came: Instant,
-    interleaved: Arc<AtomicBool>,
+    tries: Arc<Tries>,
 }
 
 impl NeonSource {
-    fn open(server: &Server<'_>, gaze: &GazeStream, interleaved: Arc<AtomicBool>) -> Result<Self, ServerError> {
+    fn open(server: &Server<'_>, gaze: &GazeStream, tries: Arc<Tries>) -> Result<Self, ServerError> {
         let broken = |error| server.broken(error);
         let stream = server.connect(&[gaze.address])?;
         let mut rtsp = Rtsp { stream, rest: Vec::new(), number: 0, session: None };
@@ -280,7 +301,7 @@ impl NeonSource {
         let base = header(head, "content-base").unwrap_or(&gaze.url).to_owned();
         let track = track_url(&base, sdp);
 
-        let (transport, asked) = if interleaved.load(Ordering::Relaxed) {
+        let (transport, asked) = if tries.interleaved.load(Ordering::Relaxed) {
             (Transport::Interleaved, "RTP/AVP/TCP;unicast;interleaved=0-1".into())
         } else {
             let (rtp, rtcp) = datagram_sockets(&rtsp.stream).map_err(broken)?;
@@ -291,7 +312,7 @@ impl NeonSource {
         let answer = rtsp.ask(server, "SETUP", &track, &format!("Transport: {asked}\r\n"));
         if answer.is_err() {
             // One that does not know this transport may know the other.
-            interleaved.fetch_xor(true, Ordering::Relaxed);
+            tries.interleaved.fetch_xor(true, Ordering::Relaxed);
         }
         let answer = answer?;
         let session = header(&answer, "session").unwrap_or_default();
@@ -322,7 +343,7 @@ impl NeonSource {
             alive_each: (lasts / 2).clamp(Duration::from_secs(1), SESSION_LASTS),
             alive_last: now,
             came: now,
-            interleaved,
+            tries,
         })
     }
 
@@ -355,10 +376,12 @@ impl NeonSource {
                     continue;
                 }
                 self.heard = true;
+                self.tries.unheard.store(0, Ordering::Relaxed);
                 return Ok(Some(count));
             }
             if !self.heard && now - self.began >= FIRST_PACKET_WITHIN {
-                self.interleaved.fetch_xor(true, Ordering::Relaxed);
+                self.tries.interleaved.fetch_xor(true, Ordering::Relaxed);
+                self.tries.unheard.fetch_add(1, Ordering::Relaxed);
                 return Err(ErrorKind::TimedOut.into());
             }
             let silent_for = now - self.came;

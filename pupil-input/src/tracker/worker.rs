@@ -73,6 +73,8 @@ impl Worker {
         let mut stream = LiveStream::new(profile, datagrams);
         let mut buffer = vec![0; BUFFER_BYTES];
         let mut back_off = FIRST_BACK_OFF;
+        // What the feed said last.
+        let mut is_troubled = false;
         let mut silent_from = host_now() + FIRST_SILENCE;
         self.connected(host_now());
         self.estimator.begin(host_now());
@@ -85,7 +87,9 @@ impl Worker {
                 back_off = (back_off * 2).min(LONGEST_BACK_OFF);
                 link = match feed.open() {
                     Ok(link) => {
-                        self.trouble(String::new());
+                        let trouble = feed.trouble();
+                        is_troubled = trouble.is_some();
+                        self.trouble(trouble.unwrap_or_default());
                         Some(link)
                     }
                     Err(error) => {
@@ -112,6 +116,10 @@ impl Worker {
                     }
                     stream.push(bytes, arrival, self);
                     self.publish();
+                    if is_troubled && feed.trouble().is_none() {
+                        is_troubled = false;
+                        self.trouble(String::new());
+                    }
                 }
                 ReadEvent::Silence => {
                     if host_now() > silent_from && self.link() == Link::Up {

@@ -98,7 +98,6 @@ impl NeonDecoder {
                 Front::Text(length) => {
                     self.step = Step::In;
                     self.stream.read_text(&rest[..length]);
-                    on_event(WireEvent::Note);
                     at += length;
                 }
                 Front::Unknown | Front::Rubbish => {

@@ -36,6 +36,8 @@ struct Shared {
     /// Whether datagrams get through.
     datagrams: AtomicBool,
     rtsp_port: u16,
+    /// No packet comes by itself, behind the answer to PLAY.
+    mute: AtomicBool,
     /// As a phone that has left the network: nothing is answered any more.
     gone: AtomicBool,
     /// Signs of life.
@@ -58,6 +60,7 @@ impl Companion {
         let shared = Arc::new(Shared {
             stop: AtomicBool::new(false),
             datagrams: AtomicBool::new(true),
+            mute: AtomicBool::new(false),
             gone: AtomicBool::new(false),
             rtsp_port: rtsp.local_addr().expect("bound").port(),
             options: AtomicU64::new(0),
@@ -280,7 +283,8 @@ fn stream(mut stream: TcpStream, shared: &Shared) -> io::Result<()> {
             assert_eq!(url, base);
             // The first packet may be right behind the answer.
             let first = framed(0, &[&[0x80, 96, 0, 1][..], &[0; 8], &payload(9, 255)].concat());
-            let behind = if matches!(playing, Some(Playing::Interleaved(_))) { first } else { Vec::new() };
+            let interleaved = matches!(playing, Some(Playing::Interleaved(_)));
+            let behind = if interleaved && !shared.mute.load(Ordering::Acquire) { first } else { Vec::new() };
             stream.write_all(&[answer.as_bytes(), &behind].concat())?;
             shared.playing.lock().expect("no panic").extend(playing.take());
         } else {
@@ -432,6 +436,20 @@ fn a_companion_that_restarts_is_found_at_its_new_port() {
 }
 
 /// What is said where a status page answers so.
+#[test]
+fn a_stream_without_packets_is_told_until_one_comes() {
+    let mut companion = Companion::start(0);
+    companion.shared.mute.store(true, Ordering::Release);
+    let mut handle = start(&companion.spec());
+    eventually("the reason", || handle.control.trouble().is_some());
+    let told = handle.control.trouble().expect("told").to_owned();
+    assert!(told.contains("no packet of its gaze stream came within 3 s by UDP, nor by TCP"), "{told}");
+    let counters = handle.control.counters();
+    assert_eq!((counters.of(Counter::Notes), counters.of(Counter::Disconnects)), (0, 2), "answers are no messages");
+    companion.stream_until("tracking", || tracks(&mut handle));
+    assert_eq!(handle.control.trouble(), None);
+}
+
 #[test]
 fn a_phone_that_leaves_the_network_is_looked_for_again() {
     let mut companion = Companion::start(0);

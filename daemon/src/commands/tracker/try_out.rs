@@ -144,6 +144,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         None if samples > 0 => {
             format!("{samples} samples came, and none was believed yet: give it a longer --duration")
         }
+        None if report.trouble.is_some() => report.trouble.unwrap_or_default(),
         None if bytes == 0 => "nothing was heard; is it switched on, and does it send without being asked?".to_owned(),
         None => format!("{bytes} bytes came, and no sample was in them: is it this profile and baud rate?"),
     };
