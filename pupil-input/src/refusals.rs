@@ -369,6 +369,11 @@ fn wire_advice(fault: WireFault) -> String {
              tracker sends their names once at its start, restart the tracker, or write `columns = [...]` in the profile"
                 .into()
         }
+        WireFault::MoreViews => {
+            "it sends figures of more eyes or cameras than the profile has: take a copy of the profile with eyes = \"two\" \
+             and no eye at the top, or with stereo = true, and name it (profile=./FILE.toml)"
+                .into()
+        }
         WireFault::BadEye => "the eye is named otherwise than the profile expects: is this the tracker's profile?".into(),
         _ => "no message is of the form that the profile expects: is it this tracker's profile and baud rate? (`holod \
               tracker list` names the profiles, profile=NAME chooses one)"
@@ -574,6 +579,7 @@ mod tests {
             (WireFault::BadChecksum, "CRC-8"),
             (WireFault::Malformed, "profile and baud"),
             (WireFault::NotFinite, "NaN"),
+            (WireFault::MoreViews, "eyes = \"two\""),
         ] {
             let counters = Counters::new();
             let mut watch = RefusalWatch::new(&settings(), TimeNs(0));

@@ -83,11 +83,13 @@ pub enum WireFault {
     MissingField,
     /// Bytes between two messages that belong to neither.
     OutOfStep,
+    /// It tells of more views, of another eye or camera, than the profile has.
+    MoreViews,
 }
 
 impl WireFault {
     /// Every reason, in the order of their indices.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::TooLong,
         Self::TooShort,
         Self::Malformed,
@@ -100,6 +102,7 @@ impl WireFault {
         Self::BadConfidence,
         Self::MissingField,
         Self::OutOfStep,
+        Self::MoreViews,
     ];
 
     /// Its place in [`Self::ALL`].
@@ -128,6 +131,7 @@ impl WireFault {
             Self::BadConfidence => "wire_bad_confidence",
             Self::MissingField => "wire_missing_field",
             Self::OutOfStep => "wire_out_of_step",
+            Self::MoreViews => "wire_more_views",
         }
     }
 }

@@ -255,17 +255,25 @@ fn take_row(settings: &PupilExtSettings, delimiter: u8, row: Line<'_>, on_event:
     let Widths { old, new } = widths(settings);
     // A row as 0.1.1 records it is the shortest, and its columns are one later.
     let is_recorded = count == old + 1 && number(columns[2]) == Err(WireFault::BadNumber);
-    let (columns, first_figure, width) = match (is_recorded, is_new) {
+    let (all, first_figure, width) = match (is_recorded, is_new) {
         (true, _) => (&columns[1..], 2, old),
         (false, true) => (columns, 1, new),
         (false, false) => (columns, 2, old),
     };
-    let Some(columns) = columns.get(..width) else {
+    let Some(columns) = all.get(..width) else {
         return on_event(row.rejected(WireFault::TooShort));
     };
+    let are_figures =
+        |columns: &[&[u8]]| columns[first_figure..].iter().all(|figure| number(figure) != Err(WireFault::BadNumber));
     // A half row with another behind it has the other's algorithm among its figures.
-    if columns[first_figure..].iter().any(|figure| number(figure) == Err(WireFault::BadNumber)) {
+    if !are_figures(columns) {
         return on_event(row.rejected(WireFault::BadNumber));
+    }
+    // Which view would be whose is not known then. A message of the user's may have delimiters, and is no figure.
+    let twice = widths(&PupilExtSettings { eyes: PupilExtEyes::Two, ..*settings });
+    let twice = if first_figure == 1 { twice.new } else { twice.old };
+    if settings.eyes != PupilExtEyes::Two && all.get(..twice).is_some_and(are_figures) {
+        return on_event(row.rejected(WireFault::MoreViews));
     }
     let eyes: &[SampleEye] = match settings.eyes {
         PupilExtEyes::One(ref eye) => std::slice::from_ref(eye),
@@ -327,8 +335,10 @@ struct Scanner {
     depth: usize,
     token: Token,
     at_line_start: bool,
-    /// The message in hand has told of a view.
-    told: bool,
+    /// Views of which the message in hand has told.
+    told: u32,
+    /// The last one told of more than the profile has.
+    crowded: bool,
     /// No message has begun yet.
     first: bool,
     /// Bytes in [`State::Lost`] since that was last told.
@@ -406,7 +416,8 @@ impl Scanner {
             depth: 0,
             token: Token { bytes: [0; MAX_TOKEN_BYTES], used: 0, overlong: false },
             at_line_start: true,
-            told: false,
+            told: 0,
+            crowded: false,
             first: true,
             lost_bytes: 0,
         }
@@ -497,7 +508,7 @@ impl Scanner {
 
     fn begin(&mut self) {
         self.first = false;
-        self.told = false;
+        self.told = 0;
         self.depth = 0;
         self.levels[0] = Level::default();
         self.state = State::Name;
@@ -530,12 +541,14 @@ impl Scanner {
     fn close(&mut self, settings: &PupilExtSettings, on_event: &mut dyn FnMut(WireEvent)) {
         let level = self.levels[self.depth];
         if level.view.known && !level.secondary {
-            self.told = true;
+            self.told += 1;
+            let one = settings.eyes != PupilExtEyes::Two;
             let eye = match settings.eyes {
                 PupilExtEyes::One(eye) => level.eye.filter(|_| eye == SampleEye::Both).unwrap_or(eye),
                 PupilExtEyes::Two => level.eye.unwrap_or(SampleEye::Both),
             };
             on_event(match level.view.sample(eye) {
+                _ if one && (self.told > 1 || self.crowded) => WireEvent::Rejected(WireFault::MoreViews),
                 Ok(sample) => WireEvent::Sample(sample),
                 Err(fault) => WireEvent::Rejected(fault),
             });
@@ -545,7 +558,8 @@ impl Scanner {
             self.state = State::Comma;
         } else {
             self.state = State::Outside;
-            if !self.told {
+            self.crowded = self.told > 1;
+            if self.told == 0 {
                 on_event(WireEvent::Note);
             }
         }
@@ -709,6 +723,32 @@ mod tests {
         assert_eq!(decode(stereo, &format!("1700000000123,{views},3,,36,37\n")), expected);
         let settings = PupilExtSettings { container: PupilExtContainer::Csv { delimiter: b';' }, ..stereo };
         assert_eq!(decode(settings, &format!("1700000000123,{views},3,,36,37\n").replace(',', ";")), expected);
+    }
+
+    #[test]
+    fn two_eyes_are_not_read_as_one() {
+        let one = csv(PupilExtEyes::One(SampleEye::Both), false);
+        let old =
+            "1700000000123,PuRe,41,42,41.5,42.5,3.25,3.5,41,40,1.02,42,40,1.05,1,2,3,4,5,6,127,130,0.9,0.8,0.7,0.6";
+        for row in
+            [format!("1700000000123,{FIGURES},{FIGURES},3,,36,37\n"), format!("{old},3,,36\n"), format!("{old}\n")]
+        {
+            assert_eq!(decode(one, &row), [WireEvent::Rejected(WireFault::MoreViews)], "{row}");
+            assert_eq!(decode(csv(PupilExtEyes::Two, false), &row).len(), 2);
+        }
+        // The message of a row may have commas.
+        let row = format!("1700000000123,{FIGURES},3,{},36,37\n", "a,".repeat(20));
+        assert_eq!(decode(one, &row), [sample(SampleEye::Both, 3.25, 0.95)]);
+
+        let eyes = |names: &[&str]| {
+            message(&names.iter().map(|name| (*name, view("Main", "old", "3.25"))).collect::<Vec<_>>())
+        };
+        let refused = WireEvent::Rejected(WireFault::MoreViews);
+        let first = sample(SampleEye::Both, 3.25, 0.95);
+        // Of the first message one eye is told before the other is seen.
+        assert_eq!(decode(json(), &eyes(&["A", "B"]).repeat(2)), [first, refused, refused, refused]);
+        let alone = format!("{}{}", eyes(&["A", "B"]), eyes(&["A"]).repeat(2));
+        assert_eq!(decode(json(), &alone), [first, refused, refused, first]);
     }
 
     #[test]
