@@ -177,6 +177,12 @@ impl Script {
         Self::parse(&path.display().to_string(), &std::fs::read_to_string(path).map_err(wrong)?)
     }
 
+    /// Whether it says anything of the tracker's clock or link.
+    pub(crate) fn has_link(&self) -> bool {
+        let times = [self.delay_s, self.jitter_s, self.batch_s, self.ahead_s, self.drift];
+        times != [0.0; 5] || self.events.iter().any(|event| matches!(event.what, What::Steps(_)))
+    }
+
     fn take(&mut self, words: &mut Words<'_>) -> Result<(), Wrong> {
         let Some(first) = words.0.next() else { return Ok(()) };
         match first {

@@ -10,6 +10,7 @@ use holod_calibration::{TimeNs, host_now};
 use super::job::{Job, Play};
 use super::{Link, Shared};
 use crate::PupilSample;
+use crate::clock::ClockModel;
 use crate::counters::Counter;
 use crate::estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, StreamClock};
 use crate::gate::Verdict;
@@ -244,13 +245,23 @@ impl Worker {
 
     fn run_mock(&mut self, script: Script, origin: TimeNs) {
         self.clock = StreamClock { host: origin, stream: TimeNs(0), rate: 1.0 };
+        // A script's clock and link are learnt as a real tracker's; without them every sample has its own time.
+        let mut clock = script.has_link().then(ClockModel::new);
         for mock in MockSource::of(script) {
             let mut sample = mock.sample;
-            if !self.wait_until(self.clock.to_host(sample.t_sample)) {
+            if !self.wait_until(self.clock.to_host(sample.t_arrival)) {
                 return;
             }
             sample.t_arrival = host_now();
-            self.take(sample, sample.t_sample);
+            let mut known = sample.t_sample;
+            if let Some(clock) = &mut clock {
+                known = self.clock.to_stream(sample.t_arrival);
+                let resets = clock.resets();
+                sample.t_sample = clock.map(sample.t_device, known);
+                self.count(Counter::ClockResets, clock.resets() - resets);
+                self.shared.clock.set(clock.report());
+            }
+            self.take(sample, known);
             self.publish();
         }
     }

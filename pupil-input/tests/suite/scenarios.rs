@@ -186,3 +186,24 @@ fn a_file_is_a_scenario_for_a_tracker() {
     let error = start("rate many\n").expect_err("is refused").to_string();
     assert!(error.contains("eye.txt, line 1: found `many`"), "{error}");
 }
+
+#[test]
+fn clock_and_link_of_a_script_are_learnt_as_a_real_trackers() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("slow.txt");
+    std::fs::write(&path, "ahead 12s\nbatch 40ms\njitter 10ms\n1s steps -5s\nends 3s\n").expect("writes");
+    let spec: TrackerSpec = format!("mock:{}", path.display()).parse().expect("a spec");
+    let mut tracker =
+        Tracker::start(&spec, &holod_calibration::rig::Rig::default().tracker, host_now()).expect("starts");
+    let mut late_ms = Vec::new();
+    while !tracker.control.finished() {
+        std::thread::sleep(std::time::Duration::from_millis(5));
+        while let Some(decision) = tracker.decisions.pop() {
+            late_ms.push((decision.sample.t_arrival - decision.sample.t_sample).seconds() * 1e3);
+        }
+    }
+    assert!(tracker.control.clock().is_some(), "a clock is learnt");
+    assert!(tracker.control.counters().of(holod_pupil_input::Counter::ClockResets) >= 1, "its step is found");
+    // The first of a batch has waited for 40 ms, the last for none.
+    assert!(late_ms.iter().filter(|late| **late > 25.0).count() > late_ms.len() / 5, "{late_ms:?}");
+}
