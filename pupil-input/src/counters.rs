@@ -41,11 +41,13 @@ pub enum Counter {
     Loops,
     /// Decisions that the tap had no room for.
     DecisionsDropped,
+    /// Datagrams of other senders than the one that is followed.
+    Strangers,
 }
 
 impl Counter {
     /// Every counter, in the order of their indices.
-    pub const ALL: [Self; 16] = [
+    pub const ALL: [Self; 17] = [
         Self::Bytes,
         Self::Samples,
         Self::Accepted,
@@ -62,6 +64,7 @@ impl Counter {
         Self::ClockResets,
         Self::Loops,
         Self::DecisionsDropped,
+        Self::Strangers,
     ];
 
     /// The name used in records.
@@ -83,6 +86,7 @@ impl Counter {
             Self::ClockResets => "clock_resets",
             Self::Loops => "loops",
             Self::DecisionsDropped => "decisions_dropped",
+            Self::Strangers => "datagrams_of_others",
         }
     }
 }

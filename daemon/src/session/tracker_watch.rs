@@ -3,17 +3,28 @@
 use holod_calibration::{TimeNs, rig};
 use holod_pupil_input::{ClockWatch, Counter, Decision, RefusalChange, RefusalWatch, TrackerControl};
 
+/// What is said of [`Counter::Strangers`].
+const STRANGERS: &str = "datagrams of another sender than the tracker's come to its port, and are left out: \
+                         let each tracker and program send to a port of its own";
+
 /// Follows the tracker, and says in the log what changes.
 pub(super) struct TrackerWatch {
     refusals: RefusalWatch,
     clock: ClockWatch,
     /// Why a lost link does not come back.
     lost: Option<String>,
+    /// It was said that datagrams of others are left out.
+    strangers_told: bool,
 }
 
 impl TrackerWatch {
     pub(super) fn new(settings: &rig::Tracker, began: TimeNs) -> Self {
-        Self { refusals: RefusalWatch::new(settings, began), clock: ClockWatch::default(), lost: None }
+        Self {
+            refusals: RefusalWatch::new(settings, began),
+            clock: ClockWatch::default(),
+            lost: None,
+            strangers_told: false,
+        }
     }
 
     /// The tracker goes on with other settings.
@@ -35,6 +46,10 @@ impl TrackerWatch {
                 Some(lost) => tracing::warn!("the tracker is not found again: {lost}"),
                 None => tracing::info!("the tracker is found again"),
             }
+        }
+        if !self.strangers_told && tracker.counters().of(Counter::Strangers) > 0 {
+            self.strangers_told = true;
+            tracing::warn!("{STRANGERS}");
         }
         let resets = tracker.counters().of(Counter::ClockResets);
         if let Some(wrong) = self.clock.judge(now, tracker.clock(), resets) {

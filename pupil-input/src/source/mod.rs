@@ -27,6 +27,8 @@ pub(crate) enum ReadEvent {
     Bytes(usize),
     /// Nothing within [`READ_TIMEOUT`].
     Silence,
+    /// A message of a sender that is not followed.
+    Stranger,
     /// The link is gone.
     Gone,
 }
@@ -35,6 +37,9 @@ pub(crate) enum ReadEvent {
 pub(crate) trait ByteSource: Send {
     /// Waits for bytes, no longer than [`READ_TIMEOUT`]. Without allocation while bytes come, where the link permits.
     fn read(&mut self, buffer: &mut [u8]) -> ReadEvent;
+
+    /// A sample was in the bytes that were read last.
+    fn is_followed(&mut self) {}
 }
 
 /// How a link is opened, and opened again after it was lost.

@@ -56,7 +56,7 @@ impl Feed for UdpFeed {
             let (address, profile) = (self.address.clone(), self.profile.clone());
             return Err(NetworkError::NobodyToTell { address, profile }.into());
         }
-        Ok(Box::new(Listener { socket: self.bind()?, sender: None }))
+        Ok(Box::new(Listener { socket: self.bind()?, sender: None, newest: None }))
     }
 
     fn datagrams(&self) -> bool {
@@ -66,27 +66,31 @@ impl Feed for UdpFeed {
 
 struct Listener {
     socket: UdpSocket,
-    /// Whose datagrams are taken, and when the last one came. Two trackers at once would be mixed up.
+    /// Whose datagrams alone are taken, and when the last one with a sample came. Two trackers at once would be mixed
+    /// up, and what sends no sample is no tracker.
     sender: Option<(IpAddr, Instant)>,
+    /// Who sent the last one that was taken.
+    newest: Option<IpAddr>,
 }
 
 impl ByteSource for Listener {
     fn read(&mut self, buffer: &mut [u8]) -> ReadEvent {
         match self.socket.recv_from(buffer) {
             Ok((count, from)) => {
-                let now = Instant::now();
-                let stranger =
-                    self.sender.is_some_and(|(ip, last)| ip != from.ip() && now.duration_since(last) < SENDER_LASTS);
-                if stranger || count == 0 {
-                    return ReadEvent::Silence;
+                if self.sender.is_some_and(|(ip, last)| ip != from.ip() && last.elapsed() < SENDER_LASTS) {
+                    return ReadEvent::Stranger;
                 }
-                self.sender = Some((from.ip(), now));
-                ReadEvent::Bytes(count)
+                self.newest = Some(from.ip());
+                if count == 0 { ReadEvent::Silence } else { ReadEvent::Bytes(count) }
             }
             Err(error) => match error.kind() {
                 ErrorKind::TimedOut | ErrorKind::WouldBlock | ErrorKind::Interrupted => ReadEvent::Silence,
                 _ => ReadEvent::Gone,
             },
         }
+    }
+
+    fn is_followed(&mut self) {
+        self.sender = self.newest.map(|ip| (ip, Instant::now()));
     }
 }

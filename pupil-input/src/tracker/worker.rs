@@ -115,14 +115,19 @@ impl Worker {
                     if let Some(taps) = &mut self.record {
                         taps.bytes(arrival, bytes);
                     }
-                    stream.push(bytes, arrival, self);
+                    if stream.push(bytes, arrival, self) {
+                        open.is_followed();
+                    }
                     self.publish();
                     if is_troubled && feed.trouble().is_none() {
                         is_troubled = false;
                         self.trouble(String::new());
                     }
                 }
-                ReadEvent::Silence => {
+                event @ (ReadEvent::Silence | ReadEvent::Stranger) => {
+                    if event == ReadEvent::Stranger {
+                        self.count(Counter::Strangers, 1);
+                    }
                     if host_now() > silent_from && self.link() == Link::Up {
                         self.count(Counter::Silences, 1);
                         self.set_link(Link::Silent);
@@ -408,12 +413,15 @@ impl LiveStream {
         (self.sequence, self.stamper) = (SequenceTracker::new(), Stamper::new());
     }
 
-    fn push(&mut self, bytes: &[u8], arrival: TimeNs, worker: &mut Worker) {
+    /// Takes what was read; tells whether a sample was in it.
+    fn push(&mut self, bytes: &[u8], arrival: TimeNs, worker: &mut Worker) -> bool {
         worker.count(Counter::Bytes, bytes.len() as u64);
         let Self { decoder, sequence, stamper, datagrams } = self;
         let resets = stamper.resets();
+        let mut has_sample = false;
         let mut take = |event| match event {
             WireEvent::Sample(sample) => {
+                has_sample = true;
                 if let Some(number) = sample.sequence {
                     worker.count_sequence(sequence.next(number, sample.eye));
                 }
@@ -436,6 +444,7 @@ impl LiveStream {
         stamper.rest(arrival, |sample| worker.take(sample, arrival));
         worker.count(Counter::ClockResets, stamper.resets() - resets);
         worker.shared.clock.set(stamper.report());
+        has_sample
     }
 }
 

@@ -144,6 +144,32 @@ fn what_is_wrong_is_told() {
 }
 
 #[test]
+fn a_sender_without_samples_locks_out_no_tracker() {
+    let port = UdpSocket::bind("127.0.0.1:0").expect("binds").local_addr().expect("bound").port();
+    let mut handle = start(&format!("udp:127.0.0.1:{port},profile=holod"));
+    let [stranger, tracker] = ["127.0.0.2:0", "127.0.0.3:0"].map(|from| UdpSocket::bind(from).expect("binds"));
+    let send = |socket: &UdpSocket, text: &str| {
+        socket.send_to(text.as_bytes(), ("127.0.0.1", port)).expect("sends");
+    };
+    // A first half line would be no fault.
+    send(&stranger, "noise\nnoise\n");
+    eventually("the noise", || handle.control.counters().faults_in_all() > 0);
+    follow(&mut handle, |text| {
+        send(&stranger, "noise\n");
+        send(&tracker, text);
+    });
+    // The last one that was sent may be on its way.
+    std::thread::sleep(Duration::from_millis(200));
+    let counters = handle.control.counters();
+    assert!(counters.of(Counter::Strangers) > 0 && counters.faults_in_all() <= 2, "counted, and no fault of the link");
+    // Another tracker is left out, too, as long as the first one speaks.
+    let (samples, strangers) = (counters.of(Counter::Samples), counters.of(Counter::Strangers));
+    send(&stranger, &line(1_000_000));
+    eventually("it is counted", || handle.control.counters().of(Counter::Strangers) > strangers);
+    assert_eq!(handle.control.counters().of(Counter::Samples), samples);
+}
+
+#[test]
 fn datagrams_stand_for_themselves_live_and_played_again() {
     let folder = TempDir::new().expect("a folder");
     let port = UdpSocket::bind("127.0.0.1:0").expect("binds").local_addr().expect("bound").port();
