@@ -19,7 +19,7 @@ pub enum Counter {
     Notes,
     /// Messages whose beginning was missed when a link was opened.
     Partials,
-    /// Times at which running numbers were skipped.
+    /// Times at which running numbers were skipped, and did not come after others.
     SequenceGaps,
     /// Running numbers skipped in all.
     SequenceMissing,
@@ -114,6 +114,11 @@ impl Counters {
 
     pub(crate) fn add(&self, counter: Counter, count: u64) {
         self.counts[counter as usize].fetch_add(count, Ordering::Relaxed);
+    }
+
+    /// What was counted turned out not to be so.
+    pub(crate) fn take_back(&self, counter: Counter, count: u64) {
+        self.counts[counter as usize].fetch_sub(count, Ordering::Relaxed);
     }
 
     pub(crate) fn add_rejected(&self, reason: Rejection) {

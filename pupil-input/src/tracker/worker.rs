@@ -456,6 +456,14 @@ impl Worker {
                 self.count(Counter::SequenceGaps, 1);
                 self.count(Counter::SequenceMissing, missing);
             }
+            SequenceEvent::Overtaken { gaps } => {
+                self.shared.counters.take_back(Counter::SequenceMissing, 1);
+                match gaps {
+                    1 => self.count(Counter::SequenceGaps, 1),
+                    -1 => self.shared.counters.take_back(Counter::SequenceGaps, 1),
+                    _ => {}
+                }
+            }
             SequenceEvent::Repeat => self.count(Counter::SequenceRepeats, 1),
             SequenceEvent::Restart => self.count(Counter::SequenceRestarts, 1),
         }

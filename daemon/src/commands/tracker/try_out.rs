@@ -81,6 +81,8 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         std::thread::sleep(TICK);
         let now = host_now();
         keep_what_came(folder.as_mut(), &tracker)?;
+        // There is not room for many, and the last one tells that the link is back.
+        tracker.control.trouble();
         while let Some(decision) = tracker.decisions.pop() {
             observed.take(&decision);
             refusals.note(&decision);
