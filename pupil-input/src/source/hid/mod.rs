@@ -44,6 +44,14 @@ pub enum HidError {
         /// Those that fit, in words.
         found: String,
     },
+    /// The one that was open is gone, and another is there.
+    #[error("the HID device that fits is {found}; expected {expected} again; plug the tracker in, or start holod anew")]
+    Another {
+        /// What is there, in words.
+        found: String,
+        /// What was open, in words.
+        expected: String,
+    },
     /// The user may not open it.
     #[error(
         "HID tracker {ids} at {path} does not open: permission denied; as root write this line to {RULE_FILE}:\n\
@@ -148,8 +156,13 @@ impl HidFeed {
     fn connect(&mut self) -> Result<HidSource, HidError> {
         let api = HidApi::new().map_err(|error| HidError::List { reason: error.to_string() })?;
         let candidates = candidates(&api);
-        let candidate = match self.wanted.choose(&candidates, self.last.as_ref().map(|(identity, _)| identity)) {
+        let last = self.last.as_ref().map(|(identity, _)| identity);
+        let candidate = match self.wanted.choose(&candidates, last) {
             Choice::One(candidate) => candidate,
+            Choice::Another(candidate) => {
+                let expected = last.map(Identity::to_string).unwrap_or_default();
+                return Err(HidError::Another { found: candidate.to_string(), expected });
+            }
             Choice::None => {
                 return Err(HidError::Missing { wanted: self.wanted.to_string(), found: in_words(&candidates) });
             }

@@ -26,6 +26,14 @@ pub(super) struct Candidate {
     pub(super) usages: Vec<(u16, u16)>,
 }
 
+impl fmt::Display for Identity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { ids, serial, .. } = self;
+        write!(f, "{ids}")?;
+        if serial.is_empty() { Ok(()) } else { write!(f, " serial={serial}") }
+    }
+}
+
 impl fmt::Display for Candidate {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { path, identity: Identity { ids, serial, .. }, product, bluetooth, usages } = self;
@@ -88,6 +96,8 @@ impl fmt::Display for Wanted {
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Choice<'a> {
     One(&'a Candidate),
+    /// Only one fits, and it is another than the one that was open: their serial numbers differ.
+    Another(&'a Candidate),
     None,
     Several(Vec<&'a Candidate>),
 }
@@ -108,6 +118,9 @@ impl Wanted {
         let fitting: Vec<_> = candidates.iter().filter(|candidate| self.fits(candidate)).collect();
         match fitting[..] {
             [] => Choice::None,
+            [only] if last.is_some_and(|last| !last.serial.is_empty() && last.serial != only.identity.serial) => {
+                Choice::Another(only)
+            }
             [only] => Choice::One(only),
             _ => {
                 let mut same = fitting.iter().filter(|candidate| Some(&candidate.identity) == last);
@@ -149,7 +162,7 @@ mod tests {
         let bench = bench();
         let place = |candidate: &Candidate| bench.iter().position(|other| other == candidate).expect("of the bench");
         match wanted.choose(&bench, last) {
-            Choice::One(one) => vec![place(one)],
+            Choice::One(one) | Choice::Another(one) => vec![place(one)],
             Choice::None => vec![],
             Choice::Several(several) => several.into_iter().map(place).collect(),
         }
@@ -177,6 +190,12 @@ mod tests {
         assert_eq!(chosen(&wanted, Some(&bench()[2].identity)), [2]);
         let stranger = Identity { serial: "A3".into(), ..bench()[1].identity.clone() };
         assert_eq!(chosen(&wanted, Some(&stranger)), [1, 2]);
+        // Nor is a twin followed that is there alone, nor one without a serial number refused.
+        let alone = std::slice::from_ref(&bench()[2]).to_vec();
+        assert!(matches!(wanted.choose(&alone, Some(&bench()[1].identity)), Choice::Another(_)));
+        assert!(matches!(wanted.choose(&alone, Some(&bench()[2].identity)), Choice::One(_)));
+        let nameless = Identity { serial: String::new(), ..bench()[1].identity.clone() };
+        assert!(matches!(wanted.choose(&alone, Some(&nameless)), Choice::One(_)));
         // Two that cannot be told apart are never guessed between.
         let twins = [device(1, TRACKER, "", (0xff00, 1)), device(2, TRACKER, "", (0xff00, 1))];
         assert!(matches!(wanted.choose(&twins, Some(&twins[0].identity)), Choice::Several(_)));

@@ -167,7 +167,7 @@ impl SerialFeed {
             path: path.into(),
             found: usb.to_string(),
             expected: format!("a tracker of profile `{name}`, {}", ids.join(" or ")),
-            hint: format!("name the tracker's port; {}", ports_in_words(&self.root)),
+            hint: format!("name the tracker's port, or put its ids into the profile; {}", ports_in_words(&self.root)),
         })
     }
 
@@ -200,7 +200,7 @@ impl Feed for SerialFeed {
         }
         let Profile { name, serial, .. } = &self.profile;
         let has_commands = !serial.start.is_empty() || !serial.stop.is_empty();
-        let known = has_commands && self.check_device(&path, usb)?;
+        let known = self.check_device(&path, usb)?;
         let mut port = OpenPort::new(&path, self.baud)?;
         if has_commands && !known {
             self.check_protocol(&path, &mut port)?;
@@ -557,6 +557,15 @@ mod tests {
             ),
             "{message}"
         );
+
+        // Nor is one opened that is only listened to: that resets some boards.
+        let listens = Profile::from_toml(
+            "format = \"holod-tracker-1\"\nname = \"listens\"\nabout = \"Listens.\"\n[wire]\nkind = \"holod\"\n\
+             [serial]\nusb = [\"1209:0001\"]\n",
+            "test",
+        );
+        let message = error(&mut feed(&system, &path, listens.expect("a profile"), &[]));
+        assert!(message.contains("expected a tracker of profile `listens`, 1209:0001"), "{message}");
 
         // An adapter that may be any: what it says tells.
         for (says, told) in [
