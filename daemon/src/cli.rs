@@ -104,7 +104,7 @@ pub struct LaserArgs {
 /// What can be done with trackers.
 #[derive(Subcommand, Debug)]
 pub enum TrackerCommand {
-    /// The profiles that holod knows, and the ports and devices that are plugged in.
+    /// The profiles that holod knows, and the serial ports and HID devices that are plugged in.
     List(ListArgs),
     /// Print the udev rule that lets holod open a HID device.
     Rule(RuleArgs),

@@ -75,7 +75,7 @@ pub use size_unit::SizeUnit;
 pub use holod_calibration::host_now;
 pub use source::SourceError;
 pub use source::commands::CommandError;
-pub use source::hid::{HidError, RULE_FILE, udev_rule};
+pub use source::hid::{HidDeviceInfo, HidError, RULE_FILE, hid_devices, udev_rule};
 pub use source::serial::identity::{SerialPortInfo, UsbPort, serial_ports};
 pub use source::serial::{SerialError, serial_port_warnings};
 pub use source::server::ServerError;

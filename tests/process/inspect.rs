@@ -396,8 +396,9 @@ fn the_log_says_more_when_asked_and_a_typo_silences_nothing() {
 fn profiles_are_listed_with_what_they_are() {
     let folder = holod_tests::new_folder();
     let ended = run(HOLOD, &["tracker", "list", "--json"], folder.path());
-    let profiles = json(&ended);
-    let of = |name: &str| profiles.as_array().unwrap().iter().find(|profile| profile["name"] == name).cloned();
+    let list = json(&ended);
+    assert!(list["serial_ports"].is_array() && list["hid_devices"].is_array(), "{list}");
+    let of = |name: &str| list["profiles"].as_array().unwrap().iter().find(|profile| profile["name"] == name).cloned();
     assert_eq!(of("iscan-etl").unwrap()["unit"], "arbitrary units");
     assert_eq!(of("holod-hid").unwrap()["wire"], "report");
     assert!(of("nobody").is_none());

@@ -219,6 +219,32 @@ impl ByteSource for HidSource {
     }
 }
 
+/// A HID device that is plugged in, as far as it tells which it is.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct HidDeviceInfo {
+    /// Its device node, such as `/dev/hidraw0`.
+    pub path: PathBuf,
+    /// Vendor and product.
+    pub ids: UsbIds,
+    /// Serial number; empty where the maker gave it none.
+    pub serial: String,
+    /// The product's name.
+    pub product: String,
+}
+
+/// The HID devices of this machine, keyboards and mice too.
+///
+/// # Errors
+/// [`HidError::List`].
+pub fn hid_devices() -> Result<Vec<HidDeviceInfo>, HidError> {
+    let api = HidApi::new().map_err(|error| HidError::List { reason: error.to_string() })?;
+    let devices = candidates(&api).into_iter().map(|candidate| {
+        let Candidate { path, identity: Identity { ids, serial, .. }, product, .. } = candidate;
+        HidDeviceInfo { path, ids, serial, product }
+    });
+    Ok(devices.collect())
+}
+
 /// The devices there are; one that has several usages is one device.
 fn candidates(api: &HidApi) -> Vec<Candidate> {
     let mut candidates: Vec<Candidate> = Vec::new();
