@@ -188,8 +188,8 @@ impl RefusalWatch {
         if !over && (now - since < REFUSED_FOR || refused < LEAST_MESSAGES) {
             return None;
         }
-        // A sample beside a bad one is refused, too, and says nothing of the reason; nor does a time that came twice, nor
-        // the other eye, where there are samples of the one that is followed.
+        // A sample beside a bad one is refused, too, and says nothing of the reason; nor does a time that came twice.
+        // Nor does the other eye, where there are samples of the one that is followed.
         let is_followed =
             |(cause, _): &(Cause, u64)| matches!(cause, Cause::Gate(reason) if *reason != Rejection::OtherEye);
         let follows = causes.iter().any(is_followed);
@@ -198,7 +198,12 @@ impl RefusalWatch {
             Cause::Gate(Rejection::Guard | Rejection::Repeated) => 1,
             _ => 2,
         };
-        let (cause, _) = causes.into_iter().max_by_key(|(cause, count)| (weight(cause), *count))?;
+        // A followed eye whose every message is faulty is as frequent as the other one.
+        let likely = |(cause, count): &(Cause, u64)| match cause {
+            Cause::Gate(Rejection::OtherEye) => (weight(cause), count / 2),
+            _ => (weight(cause), *count),
+        };
+        let (cause, _) = causes.into_iter().max_by_key(likely)?;
         // Once a tracker has worked, an eye that is shut or away for a while is no fault of its settings; some send
         // nothing of it meanwhile.
         let worked = before.of(Counter::Accepted) > 0;
@@ -537,6 +542,18 @@ mod tests {
         assert_eq!(said, []);
         let gone = |k| if shut.contains(&k) { PupilSample { eye: SampleEye::Right, ..sample(k) } } else { sample(k) };
         assert_eq!(told_of_two_eyes(3000, gone), []);
+    }
+
+    #[test]
+    fn faults_of_the_followed_eye_are_told_before_the_other_eye() {
+        for (faults, expected) in [(40, "wire_missing_field"), (3, "rejected_other_eye")] {
+            let counters = Counters::new();
+            let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+            counters.add_fault(LogFault::Wire(WireFault::MissingField), faults);
+            (0..41).for_each(|_| counters.add_rejected(Rejection::OtherEye));
+            let said = watch.judge(TimeNs(0), &counters.snapshot(), true);
+            assert!(matches!(&said, Some(RefusalChange::Refused(refusal)) if refusal.reason == expected), "{said:?}");
+        }
     }
 
     #[test]
