@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import json
 import os
@@ -172,7 +173,7 @@ class Control:
                 connection.connect(str(self.path))
             except OSError as error:
                 connection.close()
-                raise ControlError(f"no holod answers on {self.path}: {_why(error)}; is it running?") from error
+                raise ControlError(_why_not_connected(self.path, error)) from error
             self._socket, self._answers = connection, connection.makefile("rb")
         return self._socket, self._answers
 
@@ -209,10 +210,20 @@ def _why(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-def _listens(path: str) -> bool:
-    """Whether there is more than the socket of a holod that was killed."""
+def _why_not_connected(path: Path, error: OSError) -> str:
+    if error.errno == errno.EACCES:
+        return f"this user may not open {path}: run as the user that holod runs as, or as a member of its group"
+    if isinstance(error, BlockingIOError | TimeoutError):
+        return f"holod lets nobody in on {path}: it hangs; `holod dark --config RIG` puts the lasers out beside it"
+    return f"no holod answers on {path}: {_why(error)}; is it running?"
+
+
+def _is_of_living(path: str) -> bool:
+    """Whether there is more than the socket of a holod that was killed: also one that hangs, or that this user may not
+    open, of which `_connected` says so."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as trial:
-        return trial.connect_ex(path) == 0
+        trial.setblocking(False)
+        return trial.connect_ex(path) in (0, errno.EAGAIN, errno.EACCES)
 
 
 def _only_socket() -> Path:
@@ -221,7 +232,7 @@ def _only_socket() -> Path:
         if folder != service and not is_own(folder):
             # In the folder for temporary files anybody could have made one of this user's name first.
             continue
-        found = [path for path in sorted(glob.glob(glob.escape(str(folder)) + "/control-*")) if _listens(path)]
+        found = [path for path in sorted(glob.glob(glob.escape(str(folder)) + "/control-*")) if _is_of_living(path)]
         if len(found) > 1:
             raise ControlError(f"several holods run: {', '.join(found)}; give the path of one")
         if found:

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import socket
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -202,6 +203,43 @@ def test_a_folder_of_somebody_elses_is_not_used(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(ControlError, match=f"no holod runs .*; nothing in {folder} is used, which is no folder of"):
         Control()
     own.close()
+
+
+def test_a_service_that_this_user_may_not_open_is_told_from_one_that_does_not_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/dev/null")
+    # Nobody else may look into pytest's own folders.
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        os.chmod(folder, 0o755)
+        monkeypatch.setattr("holod_client.feed.SERVICE_PATH", Path(folder) / "feed")
+        service = FakeControl(Path(folder) / "control-1")
+        os.chmod(service.path, 0)
+        # root may open everything.
+        os.seteuid(os.getuid() or 65534)
+        try:
+            with pytest.raises(ControlError, match=f"may not open {service.path}: .* a member of its group"):
+                Control()
+        finally:
+            os.seteuid(os.getuid())
+            service.close()
+
+
+def test_a_holod_that_lets_nobody_in_is_told_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "holod").mkdir()
+    path = tmp_path / "holod" / "control-1"
+    with contextlib.ExitStack() as closing:
+        listener = closing.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+        listener.bind(str(path))
+        listener.listen(0)
+        waiting = closing.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+        waiting.connect(str(path))
+        for named in (None, path):
+            with pytest.raises(ControlError, match=f"nobody in on {path}: it hangs; `holod dark --config RIG`"):
+                Control(named)
 
 
 def test_nobody_listens(tmp_path: Path) -> None:
