@@ -16,6 +16,7 @@ from holod_client import feed
 from holod_client.folders import is_own, own_folders, warning_of
 
 LONGEST_ANSWER_BYTES = 1 << 20
+BUILT_IN_WEIGHTS = ("standard", "small", "fast")
 
 
 class ControlError(Exception):
@@ -89,14 +90,15 @@ class Control:
         named = os.fspath(scene)
         if named != "feed":
             parts = [named] if os.path.exists(named) else named.split(",")
-            named = ",".join(os.path.abspath(part) for part in parts)
+            named = ",".join(map(_whole_path, parts))
         details = {} if depth_encoding is None else {"depth_encoding": depth_encoding}
         return self.ask("scene", scene=named, fit=fit, **details)
 
     def weights(self, weights: str | os.PathLike[str]) -> str:
-        """Computes with other weights: "standard", "small", "fast", or a file."""
+        """Computes with other weights: "standard", "small", "fast", or a file ("./small" where it has such a name)."""
         named = os.fspath(weights)
-        return self.ask("weights", weights=os.path.abspath(named) if os.path.exists(named) else named)
+        is_file = named not in BUILT_IN_WEIGHTS and os.path.exists(named)
+        return self.ask("weights", weights=_whole_path(named) if is_file else named)
 
     def pause(self) -> str:
         """Lets the picture stand still; the pupil is followed."""
@@ -216,6 +218,11 @@ def _why_not_connected(path: Path, error: OSError) -> str:
     if isinstance(error, BlockingIOError | TimeoutError):
         return f"holod lets nobody in on {path}: it hangs; `holod dark --config RIG` puts the lasers out beside it"
     return f"no holod answers on {path}: {_why(error)}; is it running?"
+
+
+def _whole_path(path: str) -> str:
+    """From the root. It keeps `..`, which leads elsewhere behind a symbolic link than its text says."""
+    return os.path.join(os.getcwd(), path)
 
 
 def _is_of_living(path: str) -> bool:

@@ -31,6 +31,7 @@ class FakeControl:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.orders: list[str] = []
+        self.requests: list[dict[str, str]] = []
         self.connections: list[socket.socket] = []
         self.answer: Answer = ok
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -54,7 +55,8 @@ class FakeControl:
     def _converse(self, connection: socket.socket) -> None:
         with connection, connection.makefile("rb") as lines, contextlib.suppress(OSError):
             for line in lines:
-                do = json.loads(line)["do"]
+                self.requests.append(json.loads(line))
+                do = self.requests[-1]["do"]
                 self.orders.append(do)
                 answer = self.answer(do)
                 if answer == b"":
@@ -240,6 +242,32 @@ def test_a_holod_that_lets_nobody_in_is_told_at_once(tmp_path: Path, monkeypatch
         for named in (None, path):
             with pytest.raises(ControlError, match=f"nobody in on {path}: it hangs; `holod dark --config RIG`"):
                 Control(named)
+
+
+def test_a_path_leads_where_it_does_here(fake: FakeControl, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "pictures" / "here").mkdir(parents=True)
+    (tmp_path / "pictures" / "cards").mkdir()
+    (tmp_path / "link").symlink_to("pictures/here")
+    monkeypatch.chdir(tmp_path)
+    with Control(fake.path) as control:
+        control.scene("link/../cards")
+        control.scene("/a.png,link/../d.png")
+        control.weights("link/../cards")
+    named = [request.get("scene", request.get("weights")) for request in fake.requests]
+    assert named == [f"{tmp_path}/link/../cards", f"/a.png,{tmp_path}/link/../d.png", f"{tmp_path}/link/../cards"]
+
+
+def test_weights_of_a_name_are_the_built_in_ones(
+    fake: FakeControl, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = ("standard", "small", "fast")
+    for name in names:
+        (tmp_path / name).touch()
+    with Control(fake.path) as control:
+        for name in (*names, "./small"):
+            control.weights(name)
+    assert [request["weights"] for request in fake.requests] == [*names, f"{tmp_path}/./small"]
 
 
 def test_nobody_listens(tmp_path: Path) -> None:
