@@ -20,7 +20,7 @@ use crate::runtime_folder;
 use crate::snapshot::Snapshot;
 
 /// The folder that the service's unit asks systemd for.
-const SERVICE_FOLDER: &str = "/run/holod";
+pub(crate) const SERVICE_FOLDER: &str = "/run/holod";
 /// A file older than this was not written by a loop that still turns.
 const STALE: TimeNs = TimeNs(5_000_000_000);
 /// Bytes of the longest file that is read.

@@ -79,6 +79,18 @@ impl TrackerSpec {
             Self::Core(_) | Self::Neon(_) | Self::Mock(_) => self,
         }
     }
+
+    /// The files that are read for it, below `/dev` none: a log, a scenario or a profile of one's own.
+    pub fn files(&self) -> Vec<PathBuf> {
+        let profile = match self {
+            Self::Path(path) if path.starts_with("/dev") => None,
+            Self::Path(path) | Self::Replay { path, .. } | Self::MockFile(path) => return vec![path.clone()],
+            Self::Serial { profile, .. } | Self::Hid { profile, .. } => profile.as_ref(),
+            Self::Tcp { profile, .. } | Self::Udp { profile, .. } => Some(profile),
+            Self::Core(_) | Self::Neon(_) | Self::Mock(_) => None,
+        };
+        profile.filter(|name| Profile::is_path(name)).map(PathBuf::from).into_iter().collect()
+    }
 }
 
 /// A profile's name, or the path of its file where that starts at `folder`.

@@ -61,6 +61,8 @@ pub struct Provenance {
     pub lut_files: PerColour<Option<PathBuf>>,
     /// The file behind each picture of [`Panel::flatness_rad`].
     pub flatness_files: PerColour<Option<PathBuf>>,
+    /// The file behind the profile of lasers that take commands in text.
+    pub laser_profile_file: Option<PathBuf>,
 }
 
 /// The phase panel as a display.

@@ -163,7 +163,7 @@ fn read_rig<'a>(
     let levels = read_levels(reader, panel, timing.map(|timing| timing.mode));
     let phase = read_phase(reader, panel, levels, pixels.map(|(resolution, _)| resolution), folder, &mut provenance);
     let geometry = read_optics(reader, optics, pixels);
-    let lasers = read_lasers(reader, lasers, timing, folder);
+    let lasers = read_lasers(reader, lasers, timing, folder, &mut provenance);
     let tracker = read_tracker(reader, tracker, &|spec| read_spec(spec, folder));
     let model = read_model(reader, model, folder);
 
@@ -544,8 +544,9 @@ fn read_lasers<'a>(
     lasers: Section<'a>,
     timing: Option<FieldTiming>,
     folder: &Path,
+    provenance: &mut Provenance,
 ) -> Option<Lasers> {
-    let driver = read_driver(reader, lasers, folder);
+    let driver = read_driver(reader, lasers, folder, provenance);
     let gated_by_panel = reader.flag(lasers, "gated_by_panel", false);
     let accept_no_heartbeat = read_acceptance(reader, lasers, driver.as_ref());
     let power_mw = reader.numbers(lasers, "power_mw", POWER, PerColour([true; 3]));
@@ -617,7 +618,12 @@ const DRIVERS: [(&str, &[&str]); 4] = [
     ("text", &["devices", "profile", "profile_file", "gated_by_panel", "accept_no_heartbeat"]),
 ];
 
-fn read_driver<'a>(reader: &Reader<'a>, lasers: Section<'a>, folder: &Path) -> Option<LaserDriver> {
+fn read_driver<'a>(
+    reader: &Reader<'a>,
+    lasers: Section<'a>,
+    folder: &Path,
+    provenance: &mut Provenance,
+) -> Option<LaserDriver> {
     const PORT: &str = "a serial port's path";
     let drivers: Vec<_> = DRIVERS.iter().map(|driver| (driver.0, driver)).collect();
     let driver = reader.choice(lasers, "driver", &drivers, true);
@@ -626,7 +632,7 @@ fn read_driver<'a>(reader: &Reader<'a>, lasers: Section<'a>, folder: &Path) -> O
     let devices = reader.texts(lasers, "devices", PORT);
     let sync_wire = reader.flag(lasers, "sync_wire", false);
     let full_power = reader.numbers(lasers, "full_power_mw", FULL_POWER, PerColour([lasers.has("full_power_mw"); 3]));
-    let profile = read_text_laser(reader, lasers, folder);
+    let profile = read_text_laser(reader, lasers, folder, provenance);
     let driver = driver?;
     let (name, own) = *driver.value;
     let keys: BTreeSet<_> = DRIVERS.iter().flat_map(|(_, keys)| *keys).collect();
@@ -701,7 +707,12 @@ fn read_acceptance<'a>(reader: &Reader<'a>, lasers: Section<'a>, driver: Option<
 }
 
 /// The profile that `profile` or `profile_file` names.
-fn read_text_laser<'a>(reader: &Reader<'a>, lasers: Section<'a>, folder: &Path) -> Option<TextLaserProfile> {
+fn read_text_laser<'a>(
+    reader: &Reader<'a>,
+    lasers: Section<'a>,
+    folder: &Path,
+    provenance: &mut Provenance,
+) -> Option<TextLaserProfile> {
     let choices: Vec<_> = TextLaserProfile::names().map(|name| (name, name)).collect();
     let named = reader.choice(lasers, "profile", &choices, false);
     let file = reader.text(lasers, "profile_file", "a TOML file's path");
@@ -710,9 +721,9 @@ fn read_text_laser<'a>(reader: &Reader<'a>, lasers: Section<'a>, folder: &Path) 
         reader.fault_in(lasers, "profile_file", file.line, "a second profile", "one profile", advice);
     }
     let Some(file) = file else { return TextLaserProfile::named(named?.value).cloned() };
-    let path = folder.join(file.value);
-    let text = reader.of_file(lasers, "profile_file", file.line, read_text(&path))?;
-    match TextLaserProfile::parse(&text, &path) {
+    let path = provenance.laser_profile_file.insert(folder.join(file.value));
+    let text = reader.of_file(lasers, "profile_file", file.line, read_text(path))?;
+    match TextLaserProfile::parse(&text, path) {
         Ok(profile) => Some(profile),
         Err(error) => {
             for fault in error.faults {

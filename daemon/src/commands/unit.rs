@@ -6,7 +6,7 @@ use std::fs;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
 use std::path::{Path, PathBuf};
 
-use holod_calibration::rig::Rig;
+use holod_calibration::rig::{Rig, WeightsChoice};
 use holod_pupil_input::TrackerSpec;
 use holod_slm_output::OutputSpec;
 use holod_slm_output::present::drm::DrmTarget;
@@ -14,6 +14,8 @@ use holod_slm_output::present::drm::DrmTarget;
 use super::check::access::{HIDDEN_FROM_SERVICE, files_of};
 use crate::cli::{PageAddress, RunArgs, UnitArgs};
 use crate::failure::{Exit, Failure};
+use crate::source::feed_socket;
+use crate::status::SERVICE_FOLDER;
 use crate::{results, setup};
 
 pub(super) const BINARY: &str = "/usr/bin/holod";
@@ -42,6 +44,7 @@ pub(super) fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -
     let usage = |says: String| Failure::new(Exit::Usage, says);
     let config = run.rig.config.as_deref().ok_or_else(|| usage(format!("name the rig: --config {USUAL_RIG}")))?;
     visible_paths(rig, run).into_iter().try_for_each(|(what, path)| visible(what, &path))?;
+    sockets(run).into_iter().try_for_each(|(what, socket)| makeable(what, &socket))?;
     if let Some(record) = &run.record {
         let found = record.display();
         return Err(usage(format!(
@@ -230,16 +233,46 @@ pub(super) fn below(root: &Path, path: &Path) -> PathBuf {
     root.join(path.strip_prefix("/").unwrap_or(path))
 }
 
+/// The sockets that the run makes by names of one's own, and what named them.
+fn sockets(run: &RunArgs) -> Vec<(&'static str, PathBuf)> {
+    let mut sockets: Vec<(&str, PathBuf)> = Vec::new();
+    if let Some(PageAddress::Unix(path)) = &run.page.page {
+        sockets.push(("--page unix:", path.clone()));
+    }
+    if let Some(path) = run.scene.scene.as_deref().and_then(feed_socket).flatten() {
+        sockets.push(("--scene feed:", PathBuf::from(path)));
+    }
+    sockets
+}
+
+/// Refuses a socket that the service cannot make.
+fn makeable(what: &str, socket: &Path) -> Result<(), Failure> {
+    // Nothing makes a folder in the former.
+    if socket.parent() == Some(Path::new(SERVICE_FOLDER)) || socket.starts_with(STATE_FOLDER) {
+        return Ok(());
+    }
+    let name = socket.file_name().unwrap_or_default().display();
+    Err(Failure::new(
+        Exit::Usage,
+        format!(
+            "{what}{}: the service may make sockets in {SERVICE_FOLDER} and below {STATE_FOLDER} only; write \
+             {what}{SERVICE_FOLDER}/{name}",
+            socket.display()
+        ),
+    ))
+}
+
 /// The files that the run reads, and what named them.
 pub(super) fn visible_paths(rig: &Rig, run: &RunArgs) -> Vec<(&'static str, PathBuf)> {
     let mut paths: Vec<(&str, PathBuf)> = Vec::new();
     paths.extend(run.rig.config.clone().map(|path| ("--config", path)));
-    paths.extend(run.record_in.clone().map(|path| ("--record-in", path)));
     paths.extend(run.page.page_token.clone().map(|path| ("--page-token", path)));
-    if let Some(PageAddress::Unix(path)) = &run.page.page {
-        paths.push(("--page", path.clone()));
+    if let Some(WeightsChoice::File(path)) = &run.network.weights {
+        paths.push(("--weights", path.clone()));
     }
-    if let Some(scene) = run.scene.scene.as_deref().filter(|scene| *scene != "feed" && !scene.starts_with("feed:")) {
+    let tracker = run.tracker.as_ref().and_then(|spec| spec.parse::<TrackerSpec>().ok());
+    paths.extend(tracker.iter().flat_map(TrackerSpec::files).map(|path| ("--tracker", path)));
+    if let Some(scene) = run.scene.scene.as_deref().filter(|scene| feed_socket(scene).is_none()) {
         paths.extend(scene.split(',').map(|path| ("--scene", PathBuf::from(path))));
     }
     paths.extend(files_of(rig).into_iter().map(|path| ("the rig", path)));
@@ -297,7 +330,7 @@ mod tests {
     use std::os::unix::fs::symlink;
 
     use clap::Parser;
-    use holod_calibration::rig::{LaserDriver, WeightsChoice};
+    use holod_calibration::rig::{LaserDriver, Tracker};
 
     use super::*;
     use crate::cli::{Cli, Command};
@@ -422,9 +455,52 @@ mod tests {
         drop_in_of(&[&RIG[..], &["--record-in", "/var/lib/holod/runs"]].concat(), &rig(), root.path()).unwrap();
         assert!(refused(&[&RIG[..], &["--scene", "/srv/a.png,b.png"]].concat()).contains("found b.png"));
         assert!(refused(&[&RIG[..], &["--tracker", "/dev/ttyUSB9"]].concat()).contains("plug the tracker in"));
+        assert!(refused(&[&RIG[..], &["--weights", "mine.safetensors"]].concat()).contains("found mine.safetensors"));
         let mut rig = rig();
         rig.model.weights = WeightsChoice::File("/home/me/weights.safetensors".into());
         assert!(drop_in_of(&RIG, &rig, root.path()).unwrap_err().contains("the rig: found /home"));
+    }
+
+    #[test]
+    fn a_trackers_files_must_be_where_the_service_sees_them() {
+        let root = machine();
+        let drop_in_of =
+            |spec: &str, rig: &Rig| drop_in_of(&[&RIG[..], &["--tracker", spec]].concat(), rig, root.path());
+        for spec in [
+            "mock:/home/me/eye.txt",
+            "replay:/tmp/log.csv",
+            "/tmp/log.csv",
+            "serial:/dev/holod-tracker,profile=/home/me/mine.toml",
+            "udp:192.0.2.7:4242,profile=/home/me/mine.toml",
+            "hid:1209:0001,profile=/home/me/mine.toml",
+        ] {
+            let refused = drop_in_of(spec, &rig()).unwrap_err();
+            assert!(refused.contains("--tracker: found /") && refused.contains("does not see"), "{spec}: {refused}");
+            drop_in_of(&spec.replace("/tmp", "/srv").replace("/home/me", "/srv"), &rig()).unwrap();
+            let of_rig = Rig { tracker: Tracker { spec: Some(spec.into()), ..rig().tracker }, ..rig() };
+            assert!(drop_in_of("mock", &of_rig).unwrap_err().contains("the rig: found /"), "{spec}");
+        }
+        for spec in ["mock:./eye.txt", "replay:log.csv", "udp:192.0.2.7:4242,profile=mine.toml"] {
+            assert!(drop_in_of(spec, &rig()).unwrap_err().contains("write the whole path"), "{spec}");
+        }
+        drop_in_of("udp:192.0.2.7:4242,profile=open-gaze", &rig()).unwrap();
+    }
+
+    #[test]
+    fn sockets_are_made_only_where_the_service_may_write() {
+        let root = machine();
+        let with = |words: &[&str]| drop_in_of(&[&RIG[..], words].concat(), &rig(), root.path());
+        for path in ["/run/bench/x", "/run/holod/deeper/x", "/srv/x", "x"] {
+            for words in [["--scene", &format!("feed:{path}")], ["--page", &format!("unix:{path}")]] {
+                let refused = with(&words).unwrap_err();
+                let cure = format!("write {} {}:/run/holod/x", words[0], words[1].split(':').next().unwrap());
+                assert!(refused.contains("may make sockets in /run/holod and") && refused.contains(&cure), "{refused}");
+            }
+        }
+        for path in ["/run/holod/x", "/var/lib/holod/deeper/x"] {
+            with(&["--scene", &format!("feed:{path}"), "--page", &format!("unix:{path}")]).unwrap();
+        }
+        with(&["--scene", "feed"]).unwrap();
     }
 
     #[test]

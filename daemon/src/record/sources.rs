@@ -259,10 +259,8 @@ pub(super) fn keep_bench(folder: &Path, config: Option<&Path>, rig: &Rig) -> Res
             }
         }
     }
-    let profile = document.get("lasers").and_then(|lasers| lasers.get("profile_file")).and_then(|file| file.as_str());
-    if let (Some(profile), Some(config)) = (profile, config) {
-        let path = config.parent().unwrap_or(Path::new("")).join(profile);
-        document["lasers"]["profile_file"] = keep(&path, LASERS.into())?;
+    if let Some(path) = &rig.provenance.laser_profile_file {
+        document["lasers"]["profile_file"] = keep(path, LASERS.into())?;
     }
     let named = WeightsChoice::BUILT_IN.into_iter().find(|(_, choice)| *choice == rig.model.weights);
     let (key, other, named) = match (&rig.model.weights, named) {

@@ -55,7 +55,7 @@ impl Pictures {
 }
 
 /// The socket that `--scene feed` or `--scene feed:PATH` means; of the former, none.
-fn feed_socket(spec: &str) -> Option<Option<&str>> {
+pub(crate) fn feed_socket(spec: &str) -> Option<Option<&str>> {
     if spec == "feed" { Some(None) } else { spec.strip_prefix("feed:").map(Some) }
 }
 

@@ -131,8 +131,11 @@ pub(in crate::commands) fn files_of(rig: &Rig) -> Vec<PathBuf> {
         _ => None,
     };
     let tables = provenance.lut_files.0.iter().chain(&provenance.flatness_files.0).flatten().cloned();
+    let lasers = provenance.laser_profile_file.clone();
+    let tracker = rig.tracker.spec.as_ref().and_then(|spec| spec.parse::<TrackerSpec>().ok());
+    let tracker = tracker.map(|spec| spec.files()).unwrap_or_default();
     // A file that is named from where the caller stands is elsewhere for the service.
-    let files = origin.into_iter().chain(weights).chain(tables);
+    let files = origin.into_iter().chain(weights).chain(tables).chain(lasers).chain(tracker);
     files.map(|path| std::path::absolute(&path).unwrap_or(path)).collect()
 }
 
@@ -293,6 +296,27 @@ mod tests {
         if root.path().starts_with("/tmp") {
             assert!(!passed(true).passed && passed(true).says.contains("does not see /tmp"));
         }
+    }
+
+    #[test]
+    fn every_file_that_a_rig_names_is_looked_at() {
+        let root = machine(true);
+        let path = |name: &str| root.path().join(name);
+        fs::write(path("lasers.toml"), include_str!("../../../../calibration/profiles/lasers/cobolt.toml")).unwrap();
+        fs::write(path("eye.txt"), "").unwrap();
+        let text = Rig::BUILT_IN_TOML.replace(
+            "driver = \"simulated\"",
+            "driver = \"text\"\nprofile_file = \"lasers.toml\"\ndevices = { green = \"/dev/x\" }\n\
+             accept_no_heartbeat = \"these lasers stay lit when holod dies\"",
+        );
+        fs::write(path("rig.toml"), format!("{text}\n")).unwrap();
+        let mut rig = Rig::load(&path("rig.toml")).unwrap();
+        rig.tracker.spec = Some(format!("mock:{}", path("eye.txt").display()));
+        assert_eq!(files_of(&rig), ["rig.toml", "lasers.toml", "eye.txt"].map(path));
+        let told = || access(&rig, false, root.path()).into_iter().find(|check| check.name == "files").unwrap().says;
+        assert!(told().contains("may read the 3 that"), "{}", told());
+        fs::remove_file(path("lasers.toml")).unwrap();
+        assert!(told().contains("there is no ") && told().contains("lasers.toml"), "{}", told());
     }
 
     #[test]
