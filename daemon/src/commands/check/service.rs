@@ -464,6 +464,17 @@ mod tests {
     }
 
     #[test]
+    fn a_bench_that_fails_soon_after_its_start_is_not_started_for_ever_however_slowly_it_fails() {
+        let unit = Unit::read(Machine::new().root()).unwrap();
+        let figure = |key: &str| unit.all(key).last().and_then(|value| value.parse::<u64>().ok()).unwrap();
+        // It says nothing until it is given up, or its first frame stays; then it does not end by itself.
+        let slowest_s: u64 =
+            ["TimeoutStartSec", "WatchdogSec", "TimeoutStopSec", "RestartSec"].map(figure).into_iter().sum();
+        let interval_s = figure("StartLimitIntervalSec");
+        assert!(figure("StartLimitBurst") * slowest_s <= interval_s, "{slowest_s} s a start, {interval_s} s");
+    }
+
+    #[test]
     fn what_the_services_user_may_not_open_is_named() {
         let machine = Machine::new();
         machine.mode("dev/dri/renderD128", 0o000);
