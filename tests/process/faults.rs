@@ -2,6 +2,7 @@
 
 use std::fs;
 use std::io::{PipeReader, PipeWriter, Read};
+use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::thread;
@@ -175,7 +176,8 @@ fn a_disk_that_is_full_costs_the_record_and_no_frame() {
     fs::create_dir(folder.path().join("disk")).unwrap();
     // A disk of its own, in a mount namespace that only this holod sees.
     let words: Vec<_> = [&[HOLOD][..], &ARGS, &["--record", "disk/record"]].concat();
-    let mount = format!("mount -t tmpfs -o size=256k none disk && exec {}", words.join(" "));
+    let fill = "head -c 256k /dev/zero >disk/other";
+    let mount = format!("mount -t tmpfs -o size=512k none disk && {fill} && exec {}", words.join(" "));
     // As root, or else as root of a namespace of its own.
     let can_mount = |namespaces: &[&str]| {
         let tried = Command::new("unshare").args(namespaces).args(["mount", "-t", "tmpfs", "none", "/mnt"]).status();
@@ -189,9 +191,19 @@ fn a_disk_that_is_full_costs_the_record_and_no_frame() {
     frames_go_on(folder.path());
     let reason = until_record_is_lost(folder.path());
     assert!(["No space left", "disk/record", "make room"].iter().all(|part| reason.contains(part)), "{reason}");
+    // Somebody makes room before the end.
+    let root = format!("/proc/{}/root", daemon.pid());
+    let root = Path::new(&root).join(folder.path().strip_prefix("/").unwrap());
+    let opened = fs::File::open(root.join("disk")).unwrap();
+    let disk = PathBuf::from(format!("/proc/{}/fd/{}", std::process::id(), opened.as_raw_fd()));
+    fs::remove_file(disk.join("other")).unwrap();
     frames_go_on(folder.path());
     daemon.signal(Signal::TERM);
     judge_lost(&daemon.wait(PATIENCE), "No space left");
+    // Out of a disk that only this open folder keeps.
+    let copied = Command::new("cp").arg("-r").arg(disk.join("record")).arg(folder.path()).status().unwrap();
+    assert!(copied.success());
+    judge_what_is_left(folder.path());
 }
 
 /// A pipe that is full, and that nobody reads.

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::fs::{self, File, OpenOptions};
-use std::io::Write;
+use std::io::{self, Write};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
@@ -58,11 +58,33 @@ fn nanoseconds(t: TimeNs) -> String {
 
 /// Writes `frames.csv` as the run goes; what a crash can cost is what came since the last [`FrameLog::flush`].
 pub(crate) struct FrameLog {
-    file: csv::Writer<File>,
+    rows: csv::Writer<UntilRefused>,
     path: PathBuf,
     frames: HashMap<u64, FrameRecord>,
     /// The frame of the last row.
     newest: Option<u64>,
+}
+
+/// A file that takes nothing more once it has refused something: csv's writer keeps what was refused, of which the
+/// disk may have taken a part, and writes it again when it is dropped.
+struct UntilRefused {
+    file: File,
+    has_refused: bool,
+}
+
+impl Write for UntilRefused {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.has_refused {
+            return Err(io::Error::other("it refused a write before"));
+        }
+        let written = self.file.write(bytes);
+        self.has_refused = matches!(&written, Err(error) if error.kind() != io::ErrorKind::Interrupted);
+        written
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
 }
 
 /// Frames remembered for fields that are still to be shown: more than can wait for a control thread that is late.
@@ -71,7 +93,7 @@ const KEPT_FRAMES: u64 = 2048;
 impl FrameLog {
     /// Starts `frames.csv` in `folder`, which is created; a record that is already there is never overwritten.
     pub(crate) fn create(folder: &Path) -> Result<Self, Failure> {
-        let cannot = |error: std::io::Error| {
+        let cannot = |error: io::Error| {
             Failure::new(
                 Exit::CannotCreate,
                 format!("cannot record into {}: {error}; name another directory with --record", folder.display()),
@@ -80,7 +102,7 @@ impl FrameLog {
         fs::create_dir_all(folder).map_err(cannot)?;
         let path = folder.join(FRAMES);
         let file = OpenOptions::new().write(true).create_new(true).open(&path).map_err(|error| match error.kind() {
-            std::io::ErrorKind::AlreadyExists => Failure::new(
+            io::ErrorKind::AlreadyExists => Failure::new(
                 Exit::CannotCreate,
                 format!(
                     "{} holds an earlier record; name another directory with --record, or overwrite it with --force",
@@ -89,9 +111,14 @@ impl FrameLog {
             ),
             _ => cannot(error),
         })?;
-        let mut file = csv::Writer::from_writer(file);
-        file.write_record(COLUMNS.map(|(name, _)| name)).map_err(|error| cannot(error.into()))?;
-        Ok(Self { file, path, frames: HashMap::new(), newest: None })
+        let mut log = Self::of(file, path);
+        log.rows.write_record(COLUMNS.map(|(name, _)| name)).map_err(|error| cannot(error.into()))?;
+        Ok(log)
+    }
+
+    fn of(file: File, path: PathBuf) -> Self {
+        let rows = csv::Writer::from_writer(UntilRefused { file, has_refused: false });
+        Self { rows, path, frames: HashMap::new(), newest: None }
     }
 
     /// Takes note of a rendered frame; its rows are written when its fields are shown.
@@ -114,7 +141,7 @@ impl FrameLog {
             Field(cell) => cell(field),
             Frame(cell) => frame.and_then(cell).unwrap_or_default(),
         });
-        self.file.write_record(row).map_err(|error| self.lost(&error.into()))
+        self.rows.write_record(row).map_err(|error| self.lost(&error.into()))
     }
 
     /// Writes down beside it, in `orders.jsonl`, that a person changed something at host time `t`. The file is there
@@ -134,10 +161,10 @@ impl FrameLog {
     /// # Errors
     /// The disk's, with the file's name.
     pub(crate) fn flush(&mut self) -> Result<(), Failure> {
-        let links = self.file.flush().and_then(|()| self.file.get_ref().metadata()).map(|metadata| metadata.nlink());
-        match links {
+        let metadata = self.rows.flush().and_then(|()| self.rows.get_ref().file.metadata());
+        match metadata.map(|metadata| metadata.nlink()) {
             // What is written into a file without a name is lost when it is closed.
-            Ok(0) => Err(self.lost(&std::io::Error::new(std::io::ErrorKind::NotFound, "the file was deleted"))),
+            Ok(0) => Err(self.lost(&io::Error::new(io::ErrorKind::NotFound, "the file was deleted"))),
             Ok(_) => Ok(()),
             Err(error) => Err(self.lost(&error)),
         }
@@ -148,13 +175,15 @@ impl FrameLog {
         self.frames.is_empty()
     }
 
-    fn lost(&self, error: &std::io::Error) -> Failure {
+    fn lost(&self, error: &io::Error) -> Failure {
         lost(&self.path, error)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::os::fd::OwnedFd;
+
     use holod_calibration::{Colour, PupilDiameter};
 
     use super::*;
@@ -240,6 +269,25 @@ mod tests {
         let column = COLUMNS.iter().position(|(name, _)| *name == "deadline_missed").unwrap();
         let cells: Vec<&str> = text.lines().skip(1).map(|row| row.split(',').nth(column).unwrap()).collect();
         assert_eq!(cells, ["1", "0", "0", "0", "0", "1", "0"]);
+    }
+
+    #[test]
+    fn what_a_full_disk_refused_is_not_written_later_behind_the_part_that_it_took() {
+        let (mut reader, writer) = io::pipe().unwrap();
+        rustix::io::ioctl_fionbio(&writer, true).unwrap();
+        let mut log = FrameLog::of(File::from(OwnedFd::from(writer)), PathBuf::from(FRAMES));
+        let row = (0..).find(|&number| log.field(&field(number)).is_err()).unwrap();
+        assert!(log.flush().is_err());
+        // There is room again when the run ends.
+        let reading = std::thread::spawn(move || io::read_to_string(&mut reader).unwrap());
+        drop(log);
+        let text = reading.join().unwrap();
+        let rows: Vec<&str> = text.lines().collect();
+        let (last, whole) = rows.split_last().unwrap();
+        assert!((100..row).contains(&(whole.len() as u64)), "{} of {row}", whole.len());
+        let expected = |number: usize| format!("{number},1,green,,,,,,,,,30,software,33,36,0,,,,,,,,,");
+        assert!(whole.iter().enumerate().all(|(number, row)| **row == expected(number)), "{text}");
+        assert!(expected(whole.len()).starts_with(last), "{last}");
     }
 
     #[test]
