@@ -8,6 +8,7 @@ use holod_calibration::special_file;
 
 use crate::failure::{Exit, Failure};
 use crate::results;
+use crate::staging::Temporary;
 
 /// A file, or standard output where `-` is named.
 #[derive(Debug)]
@@ -52,7 +53,7 @@ impl Destination {
         match self {
             Self::File(path) => write(path),
             Self::Stdout => {
-                let folder = tempfile::tempdir().map_err(Failure::because(Exit::CannotCreate))?;
+                let folder = Temporary::new("holod-").map_err(Failure::because(Exit::CannotCreate))?;
                 let path = folder.path().join("out");
                 write(&path)?;
                 let copied = File::open(&path).and_then(|mut file| io::copy(&mut file, &mut io::stdout().lock()));

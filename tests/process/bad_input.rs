@@ -277,6 +277,29 @@ fn a_signal_takes_what_is_half_done_away() {
 }
 
 #[test]
+fn a_signal_takes_away_what_waits_for_a_slow_reader() {
+    let folder = holod_tests::new_folder();
+    let temporary = folder.path().join("temporary");
+    fs::create_dir(&temporary).unwrap();
+    // More than a pipe holds.
+    let rows: String = (0..10_000).map(|row| format!("{},left,3.5,1,,1\n", row * 5_000_000_u64)).collect();
+    fs::write(folder.path().join("log.csv"), format!("t_ns,eye,diameter_mm,confidence,aperture_mm,valid\n{rows}"))
+        .unwrap();
+    let mut holod = std::process::Command::new(HOLOD)
+        .args(["log", "convert", "log.csv", "--to", "csv", "--out", "-"])
+        .current_dir(folder.path())
+        .env("TMPDIR", &temporary)
+        .stdout(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    assert!(wait_until(Duration::from_secs(60), || !listing(&temporary).is_empty()));
+    let holods_number = rustix::process::Pid::from_child(&holod);
+    rustix::process::kill_process(holods_number, Signal::INT).unwrap();
+    assert_eq!(holod.wait().unwrap().code(), Some(130));
+    assert_eq!(listing(&temporary), []);
+}
+
+#[test]
 fn a_pipe_is_never_replaced_by_a_file() {
     let folder = holod_tests::new_folder();
     let pipe = folder.path().join("pipe");
