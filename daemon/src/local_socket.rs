@@ -4,10 +4,13 @@ use std::fs::{self, Permissions};
 use std::io;
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::{FileTypeExt, PermissionsExt};
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use rustix::fs::{Mode, fchmod};
 use rustix::io::Errno;
+use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, connect, socket_with};
 
 /// Connections that wait to be accepted.
@@ -58,6 +61,20 @@ pub(crate) fn listen(path: &Path, kind: SocketType) -> Result<OwnedFd, SocketErr
     Ok(listener)
 }
 
+/// Connects to a stream socket. One that hangs lets nobody in once enough wait; for that `patience` is waited, and then
+/// as long for whatever is sent.
+///
+/// # Errors
+/// Nobody listens there, or lets nobody in.
+pub(crate) fn connect_within(path: &Path, patience: Duration) -> io::Result<UnixStream> {
+    let socket = socket_with(AddressFamily::UNIX, SocketType::STREAM, SocketFlags::CLOEXEC, None)?;
+    set_socket_timeout(&socket, Timeout::Send, Some(patience))?;
+    match connect(&socket, &SocketAddrUnix::new(path)?) {
+        Err(Errno::AGAIN) => Err(io::Error::new(io::ErrorKind::TimedOut, "it hangs, and lets nobody in")),
+        connected => connected.map(|()| socket.into()).map_err(io::Error::from),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -81,6 +98,19 @@ mod tests {
         fs::write(&path, "precious").unwrap();
         assert_eq!(taken(SocketType::SEQPACKET), "a file that is no socket is there");
         assert_eq!(fs::read_to_string(&path).unwrap(), "precious");
+    }
+
+    #[test]
+    fn a_socket_that_lets_nobody_in_is_not_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("socket");
+        let listener = listen(&path, SocketType::STREAM).unwrap();
+        let patience = Duration::from_millis(50);
+        let waiting: Vec<_> = (0..=BACKLOG).map(|_| connect_within(&path, patience).unwrap()).collect();
+        let error = connect_within(&path, patience).unwrap_err();
+        assert!(error.to_string().contains("lets nobody in"), "{error}");
+        drop((listener, waiting));
+        assert_eq!(connect_within(&path, patience).unwrap_err().kind(), io::ErrorKind::ConnectionRefused);
     }
 
     #[test]

@@ -3,8 +3,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::File;
-use std::io::Read;
-use std::os::unix::net::UnixStream;
+use std::io::{ErrorKind, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
@@ -16,6 +15,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::aside::{Queue, Taking, join_within};
 use crate::failure::{Exit, Failure};
+use crate::local_socket::connect_within;
 use crate::runtime_folder;
 use crate::snapshot::Snapshot;
 
@@ -131,7 +131,10 @@ fn remove_leftovers_in(folder: &Path) {
         let status = std::fs::read(folder.join(file_name(pid))).unwrap_or_default();
         let began_ticks = serde_json::from_slice::<Written<()>>(&status).ok().and_then(|written| written.began_ticks);
         // The process of another container is not seen from here, but it answers.
-        let answers = || UnixStream::connect(folder.join(format!("control-{pid}"))).is_ok();
+        let answers = || match connect_within(&folder.join(format!("control-{pid}")), PATIENCE) {
+            Ok(_) => true,
+            Err(error) => error.kind() == ErrorKind::TimedOut,
+        };
         if !lives(pid, began_ticks) && !answers() {
             paths.iter().for_each(|path| drop(std::fs::remove_file(path)));
         }

@@ -1,7 +1,6 @@
 //! The other end of the control socket.
 
 use std::io::{BufRead, BufReader, Write};
-use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::time::Duration;
 
@@ -9,9 +8,12 @@ use serde_json::Value;
 
 use super::{Answer, Request};
 use crate::failure::{Exit, Failure};
+use crate::local_socket::connect_within;
 
 /// Longer than a scene of the largest size takes to read.
 const PATIENCE: Duration = Duration::from_secs(120);
+/// A holod that turns lets everybody in within this time.
+const CONNECT_PATIENCE: Duration = Duration::from_secs(3);
 
 /// Asks the holod that listens at `socket`, and waits for its answer.
 ///
@@ -37,7 +39,7 @@ pub fn ask(socket: &Path, request: &Request) -> Result<Value, Failure> {
             ),
         )
     };
-    let mut stream = UnixStream::connect(socket).map_err(gone)?;
+    let mut stream = connect_within(socket, CONNECT_PATIENCE).map_err(gone)?;
     stream.set_read_timeout(Some(PATIENCE)).map_err(gone)?;
     let mut line = serde_json::to_vec(request).map_err(Failure::because(Exit::Software))?;
     line.push(b'\n');
@@ -56,6 +58,17 @@ mod tests {
     use std::os::unix::net::UnixListener;
 
     use super::*;
+
+    #[test]
+    fn a_holod_that_hangs_and_lets_nobody_in_is_told_with_what_puts_the_lasers_out() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("control");
+        let listener = UnixListener::bind(&path).unwrap();
+        rustix::net::listen(&listener, 0).unwrap();
+        let _waiting = connect_within(&path, CONNECT_PATIENCE).unwrap();
+        let hangs = ask(&path, &Request::LasersDark {}).unwrap_err().to_string();
+        assert!(hangs.contains("lets nobody in; `holod dark --config RIG`"), "{hangs}");
+    }
 
     #[test]
     fn an_order_that_nobody_has_heard_is_told_from_one_without_an_answer() {
