@@ -1,14 +1,16 @@
 //! Unix sockets that other programs of this user, or of its group, may connect to.
 
-use std::fs::{self, Permissions};
+use std::fs::{self, File, Metadata, Permissions};
 use std::io;
 use std::os::fd::OwnedFd;
-use std::os::unix::fs::{FileTypeExt, PermissionsExt};
+use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::thread;
 use std::time::Duration;
 
-use rustix::fs::{Mode, fchmod};
+use rustix::fs::{FlockOperation, Mode, fchmod, flock};
 use rustix::io::Errno;
 use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, connect, socket_with};
@@ -17,6 +19,9 @@ use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, 
 const BACKLOG: i32 = 8;
 /// Read and write, which is to connect, for user and group.
 const MODE: u32 = 0o660;
+/// How often, and with what rest, a folder is asked for that another holod has for the moment that it takes to listen.
+const LOCK_TRIES: u32 = 100;
+const LOCK_REST: Duration = Duration::from_millis(5);
 
 /// Why nobody can listen at a socket.
 #[derive(Debug, thiserror::Error)]
@@ -30,17 +35,52 @@ pub enum SocketError {
     Listen { socket: PathBuf, error: io::Error },
 }
 
+/// Where somebody listens.
+#[derive(Debug)]
+pub(crate) struct SocketPlace {
+    path: PathBuf,
+    /// Device and inode of the socket; nothing once it was taken away.
+    socket: Mutex<Option<(u64, u64)>>,
+}
+
+impl SocketPlace {
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Takes the socket away, where it is not another one by now.
+    pub(crate) fn take_away(&self) {
+        let socket = self.socket().take();
+        let _alone = alone_in(folder_of(&self.path));
+        if socket.is_some() && fs::symlink_metadata(&self.path).ok().map(|found| identity(&found)) == socket {
+            let _gone = fs::remove_file(&self.path);
+        }
+    }
+
+    fn socket(&self) -> MutexGuard<'_, Option<(u64, u64)>> {
+        self.socket.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
 /// Listens at `path`, without blocking; a socket that a dead process left there is replaced.
 ///
 /// # Errors
 /// Something else is there, or the socket cannot be made.
-pub(crate) fn listen(path: &Path, kind: SocketType) -> Result<OwnedFd, SocketError> {
+pub(crate) fn listen(path: &Path, kind: SocketType) -> Result<(OwnedFd, SocketPlace), SocketError> {
+    let (listener, bound) = bind_at(path, kind)?;
+    Ok((listener, SocketPlace { path: path.to_owned(), socket: Mutex::new(Some(bound)) }))
+}
+
+/// The same, with the socket's identity.
+fn bind_at(path: &Path, kind: SocketType) -> Result<(OwnedFd, (u64, u64)), SocketError> {
     let cannot = |error: io::Error| SocketError::Listen { socket: path.to_owned(), error };
     let new_socket = || {
         let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
         socket_with(AddressFamily::UNIX, kind, flags, None).map_err(|error| cannot(error.into()))
     };
     let address = SocketAddrUnix::new(path).map_err(|error| cannot(error.into()))?;
+    // Until it listens, another holod would take this socket for a dead one's.
+    let _alone = alone_in(folder_of(path));
     if let Ok(found) = fs::symlink_metadata(path) {
         let taken = |found| SocketError::Taken { socket: path.to_owned(), found };
         if !found.file_type().is_socket() {
@@ -58,7 +98,8 @@ pub(crate) fn listen(path: &Path, kind: SocketType) -> Result<OwnedFd, SocketErr
     bind(&listener, &address).map_err(|error| cannot(error.into()))?;
     fs::set_permissions(path, Permissions::from_mode(MODE)).map_err(cannot)?;
     rustix::net::listen(&listener, BACKLOG).map_err(|error| cannot(error.into()))?;
-    Ok(listener)
+    let bound = fs::symlink_metadata(path).map_err(cannot)?;
+    Ok((listener, identity(&bound)))
 }
 
 /// Connects to a stream socket. One that hangs lets nobody in once enough wait; for that `patience` is waited, and then
@@ -75,15 +116,39 @@ pub(crate) fn connect_within(path: &Path, patience: Duration) -> io::Result<Unix
     }
 }
 
+fn identity(found: &Metadata) -> (u64, u64) {
+    (found.dev(), found.ino())
+}
+
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
+}
+
+/// Keeps other holods from the sockets of a folder for as long as it lives. Where the folder cannot be had, since it
+/// knows no locks or a stranger holds on to it, nobody is kept away.
+fn alone_in(folder: &Path) -> Option<File> {
+    let folder = File::open(folder).ok()?;
+    for _ in 0..LOCK_TRIES {
+        match flock(&folder, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => return Some(folder),
+            Err(Errno::WOULDBLOCK) => thread::sleep(LOCK_REST),
+            Err(_) => return None,
+        }
+    }
+    None
+}
+
 #[cfg(test)]
 mod tests {
+    use std::sync::Barrier;
+
     use super::*;
 
     #[test]
     fn a_socket_of_the_dead_is_replaced_and_one_of_the_living_is_not() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("socket");
-        let listen = |kind| listen(&path, kind);
+        let listen = |kind| listen(&path, kind).map(|(listener, _)| listener);
         let dead = listen(SocketType::SEQPACKET).unwrap();
         assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, MODE);
         let taken = |kind| match listen(kind) {
@@ -101,10 +166,47 @@ mod tests {
     }
 
     #[test]
+    fn of_holods_that_start_at_once_over_a_dead_ones_socket_one_listens() {
+        const HOLODS: usize = 4;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("socket");
+        for round in 0..200 {
+            let barrier = Barrier::new(HOLODS);
+            let start = || {
+                barrier.wait();
+                let listening = listen(&path, SocketType::STREAM);
+                barrier.wait();
+                listening.map(|(listener, _)| {
+                    assert!(UnixStream::connect(&path).is_ok(), "round {round}: its socket is another's");
+                    listener
+                })
+            };
+            let holods: Vec<_> = thread::scope(|scope| {
+                let started: Vec<_> = (0..HOLODS).map(|_| scope.spawn(start)).collect();
+                started.into_iter().map(|thread| thread.join().unwrap()).collect()
+            });
+            assert_eq!(holods.iter().filter(|listening| listening.is_ok()).count(), 1, "round {round}: {holods:?}");
+        }
+    }
+
+    #[test]
+    fn a_socket_in_the_place_of_ones_own_is_left_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("socket");
+        let (_listener, place) = listen(&path, SocketType::STREAM).unwrap();
+        fs::remove_file(&path).unwrap();
+        let (_other, others) = listen(&path, SocketType::STREAM).unwrap();
+        place.take_away();
+        assert!(UnixStream::connect(&path).is_ok());
+        others.take_away();
+        assert!(!path.exists());
+    }
+
+    #[test]
     fn a_socket_that_lets_nobody_in_is_not_waited_for() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("socket");
-        let listener = listen(&path, SocketType::STREAM).unwrap();
+        let (listener, _place) = listen(&path, SocketType::STREAM).unwrap();
         let patience = Duration::from_millis(50);
         let waiting: Vec<_> = (0..=BACKLOG).map(|_| connect_within(&path, patience).unwrap()).collect();
         let error = connect_within(&path, patience).unwrap_err();

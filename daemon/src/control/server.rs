@@ -18,7 +18,7 @@ use tokio::sync::{Semaphore, SemaphorePermit, oneshot};
 use tokio::task::AbortHandle;
 
 use super::{Answer, Order, Ordered, Preparer, Request};
-use crate::local_socket;
+use crate::local_socket::{self, SocketPlace};
 use crate::tally_by::{Reason, TallyBy};
 
 /// Connections at once. A further one takes the place of the oldest, so that nobody who only holds on keeps others out.
@@ -34,7 +34,7 @@ const FAREWELL: Duration = Duration::from_millis(500);
 
 /// A control socket that listens. Dropping it ends that.
 pub(crate) struct ControlServer {
-    socket: PathBuf,
+    place: SocketPlace,
     waiting: Arc<Waiting>,
     runtime: Option<Runtime>,
 }
@@ -48,7 +48,7 @@ impl ControlServer {
         socket: PathBuf,
         preparer: Preparer,
     ) -> Result<(Self, mpsc::Receiver<Ordered>), Box<dyn std::error::Error>> {
-        let listener = local_socket::listen(&socket, SocketType::STREAM)?;
+        let (listener, place) = local_socket::listen(&socket, SocketType::STREAM)?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)
             .max_blocking_threads(1)
@@ -72,7 +72,7 @@ impl ControlServer {
         };
         let waiting = Arc::new(waiting);
         runtime.spawn(serve(listener, Arc::clone(&waiting)));
-        Ok((Self { socket, waiting, runtime: Some(runtime) }, receiver))
+        Ok((Self { place, waiting, runtime: Some(runtime) }, receiver))
     }
 
     /// Has the rig file read again for a signal, which cannot ask twice: after whatever takes long now. What came of it
@@ -100,7 +100,7 @@ impl ControlServer {
 
     /// Where it listens.
     pub(crate) fn socket(&self) -> &Path {
-        &self.socket
+        self.place.path()
     }
 }
 
@@ -115,7 +115,7 @@ impl Drop for ControlServer {
             // What is still being made ready ends with the process.
             runtime.shutdown_background();
         }
-        let _gone = std::fs::remove_file(&self.socket);
+        self.place.take_away();
     }
 }
 

@@ -3,7 +3,6 @@
 use std::io;
 use std::net::SocketAddr;
 use std::os::fd::AsFd;
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -42,7 +41,7 @@ use super::give_up::GivesUp;
 use super::live::{Live, Refused, Viewer};
 use super::metrics;
 use crate::cli::{focus_of_an_eye, human_pupil};
-use crate::local_socket;
+use crate::local_socket::{self, SocketPlace};
 use crate::session::scheduling;
 
 /// Connections at once; further ones are closed. A browser has up to six.
@@ -76,7 +75,7 @@ fn advice(error: &io::Error) -> &'static str {
 /// A page that is served. Dropping it ends that.
 pub(super) struct PageServer {
     place: PageAddress,
-    socket: Option<PathBuf>,
+    socket: Option<SocketPlace>,
     live: Arc<Live>,
     runtime: Option<Runtime>,
 }
@@ -98,7 +97,7 @@ impl PageServer {
                 .build()
         })?;
         let _inside = runtime.enter();
-        let (listener, place) = Listener::bind(address)?;
+        let (listener, place, socket) = Listener::bind(address)?;
         let door = match (token, &place) {
             (Some(token), _) => Door::Token(token),
             (None, PageAddress::Tcp(_)) => Door::OwnName,
@@ -106,10 +105,6 @@ impl PageServer {
         };
         let router = router(door, Arc::clone(&live), eye);
         runtime.spawn(serve(listener, router, Arc::clone(&live), PATIENCE));
-        let socket = match &place {
-            PageAddress::Unix(path) => Some(path.clone()),
-            PageAddress::Tcp(_) => None,
-        };
         drop(_inside);
         Ok(Self { place, socket, live, runtime: Some(runtime) })
     }
@@ -131,7 +126,7 @@ impl Drop for PageServer {
             runtime.shutdown_background();
         }
         if let Some(socket) = &self.socket {
-            let _gone = std::fs::remove_file(socket);
+            socket.take_away();
         }
     }
 }
@@ -145,8 +140,8 @@ trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
 impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
 
 impl Listener {
-    /// With where it really is: port 0 is any port.
-    fn bind(address: &PageAddress) -> Result<(Self, PageAddress), ServeError> {
+    /// With where it really is: port 0 is any port. A socket is to be taken away at the end.
+    fn bind(address: &PageAddress) -> Result<(Self, PageAddress, Option<SocketPlace>), ServeError> {
         match address {
             PageAddress::Tcp(address) => {
                 let cannot = |error| ServeError::Listen { address: *address, error };
@@ -154,11 +149,11 @@ impl Listener {
                 listener.set_nonblocking(true).map_err(cannot)?;
                 let listener = TcpListener::from_std(listener).map_err(cannot)?;
                 let place = listener.local_addr().map_err(cannot)?;
-                Ok((Self::Tcp(listener), PageAddress::Tcp(place)))
+                Ok((Self::Tcp(listener), PageAddress::Tcp(place), None))
             }
             PageAddress::Unix(path) => {
-                let listener = local_socket::listen(path, SocketType::STREAM)?;
-                Ok((Self::Unix(UnixListener::from_std(listener.into())?), address.clone()))
+                let (listener, place) = local_socket::listen(path, SocketType::STREAM)?;
+                Ok((Self::Unix(UnixListener::from_std(listener.into())?), address.clone(), Some(place)))
             }
         }
     }
@@ -352,7 +347,7 @@ mod tests {
         let runtime =
             tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_io().enable_time().build().unwrap();
         let _inside = runtime.enter();
-        let (listener, _) = Listener::bind(&PageAddress::Unix(path.clone())).unwrap();
+        let (listener, ..) = Listener::bind(&PageAddress::Unix(path.clone())).unwrap();
         let router = router(Door::Open, Arc::clone(&live), EyeDesk::default());
         runtime.spawn(serve(listener, router, Arc::clone(&live), SHORT));
         let mut viewer = UnixStream::connect(&path).unwrap();

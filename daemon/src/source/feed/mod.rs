@@ -15,7 +15,6 @@ mod message;
 mod slots;
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::io;
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
@@ -38,7 +37,7 @@ pub use self::depths::BadDepths;
 use self::message::Outcome;
 use self::slots::Picture;
 use super::{PictureSink, PictureTag, PictureView, scene};
-use crate::local_socket::{self, SocketError};
+use crate::local_socket::{self, SocketError, SocketPlace};
 use crate::tally_by::TallyBy;
 
 /// Clients that may be connected at once.
@@ -197,7 +196,9 @@ pub fn default_socket() -> Result<PathBuf, FeedError> {
 
 /// A feed that is listening. Dropping it ends its clients' connections and takes the socket away.
 pub struct Feed {
-    plan: Arc<FeedPlan>,
+    /// Has the black frame, which the frame thread must not be the last to let go.
+    _plan: Arc<FeedPlan>,
+    place: SocketPlace,
     sink: Arc<Mutex<PictureSink>>,
     stop: OwnedFd,
     thread: Option<JoinHandle<()>>,
@@ -215,7 +216,7 @@ impl Feed {
         sink: Arc<Mutex<PictureSink>>,
     ) -> Result<Self, FeedError> {
         let FeedPlan { socket, resolution, fit, .. } = FeedPlan::clone(plan);
-        let listener = local_socket::listen(&socket, SocketType::SEQPACKET)?;
+        let (listener, place) = local_socket::listen(&socket, SocketType::SEQPACKET)?;
         let stop = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)
             .map_err(|error| FeedError::Thread(error.into()))?;
         let status = Arc::new(Mutex::new(FeedStatus::at(&socket)));
@@ -239,7 +240,7 @@ impl Feed {
             .spawn(move || server.serve())
             .map_err(FeedError::Thread)?;
         tracing::info!("waiting for pictures on {}", socket.display());
-        Ok(Self { plan: Arc::clone(plan), sink: shown, stop, thread: Some(thread), status })
+        Ok(Self { _plan: Arc::clone(plan), place, sink: shown, stop, thread: Some(thread), status })
     }
 
     /// Whether pictures come.
@@ -272,7 +273,7 @@ impl Drop for Feed {
         if let Some(thread) = self.thread.take() {
             let _ended = thread.join();
         }
-        let _gone = fs::remove_file(&self.plan.socket);
+        self.place.take_away();
     }
 }
 
