@@ -15,12 +15,16 @@ use rustix::io::Errno;
 use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, connect, socket_with};
 
+use crate::runtime_folder::{self, make_again};
+
 /// Connections that wait to be accepted.
 const BACKLOG: i32 = 8;
 /// Read and write, which is to connect, for user and group.
 const MODE: u32 = 0o660;
+/// How often whoever listens should see to it that its socket is still there.
+pub(crate) const LOOK: Duration = Duration::from_secs(1);
 /// How often, and with what rest, a folder is asked for that another holod has for the moment that it takes to listen.
-const LOCK_TRIES: u32 = 100;
+const LOCK_TRIES: u32 = 200;
 const LOCK_REST: Duration = Duration::from_millis(5);
 
 /// Why nobody can listen at a socket.
@@ -39,6 +43,7 @@ pub enum SocketError {
 #[derive(Debug)]
 pub(crate) struct SocketPlace {
     path: PathBuf,
+    kind: SocketType,
     /// Device and inode of the socket; nothing once it was taken away.
     socket: Mutex<Option<(u64, u64)>>,
 }
@@ -46,6 +51,23 @@ pub(crate) struct SocketPlace {
 impl SocketPlace {
     pub(crate) fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// Listens again where nothing is at the path any more, since its folder was cleared or, at the end of a login
+    /// session, taken away; a run's own folder is made again. Nothing where something is there, or that folder cannot be
+    /// had.
+    pub(crate) fn listen_again(&self) -> Option<Result<OwnedFd, SocketError>> {
+        let mut socket = self.socket();
+        let is_gone = fs::symlink_metadata(&self.path).is_err_and(|error| error.kind() == io::ErrorKind::NotFound);
+        let folder = folder_of(&self.path);
+        let may_be_used = || !runtime_folder::candidates().iter().any(|own| own == folder) || make_again(folder);
+        if socket.is_none() || !is_gone || !may_be_used() {
+            return None;
+        }
+        Some(bind_at(&self.path, self.kind).map(|(listener, bound)| {
+            *socket = Some(bound);
+            listener
+        }))
     }
 
     /// Takes the socket away, where it is not another one by now.
@@ -68,7 +90,7 @@ impl SocketPlace {
 /// Something else is there, or the socket cannot be made.
 pub(crate) fn listen(path: &Path, kind: SocketType) -> Result<(OwnedFd, SocketPlace), SocketError> {
     let (listener, bound) = bind_at(path, kind)?;
-    Ok((listener, SocketPlace { path: path.to_owned(), socket: Mutex::new(Some(bound)) }))
+    Ok((listener, SocketPlace { path: path.to_owned(), kind, socket: Mutex::new(Some(bound)) }))
 }
 
 /// The same, with the socket's identity.
@@ -190,16 +212,24 @@ mod tests {
     }
 
     #[test]
-    fn a_socket_in_the_place_of_ones_own_is_left_alone() {
+    fn a_socket_whose_folder_was_taken_away_is_made_again_and_anothers_is_left_alone() {
         let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("socket");
+        let path = folder.path().join("folder/socket");
+        fs::create_dir(folder.path().join("folder")).unwrap();
         let (_listener, place) = listen(&path, SocketType::STREAM).unwrap();
+        assert!(place.listen_again().is_none());
+        fs::remove_dir_all(folder.path().join("folder")).unwrap();
+        assert!(place.listen_again().unwrap().is_err(), "it is no runtime folder");
+        fs::create_dir(folder.path().join("folder")).unwrap();
+        let _again = place.listen_again().unwrap().unwrap();
+        assert!(UnixStream::connect(&path).is_ok() && place.listen_again().is_none());
+
         fs::remove_file(&path).unwrap();
         let (_other, others) = listen(&path, SocketType::STREAM).unwrap();
         place.take_away();
         assert!(UnixStream::connect(&path).is_ok());
         others.take_away();
-        assert!(!path.exists());
+        assert!(!path.exists() && others.listen_again().is_none(), "it has ended");
     }
 
     #[test]

@@ -3,6 +3,9 @@
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 
+/// What keeps a folder that is gone.
+pub(crate) const LINGER: &str = "`loginctl enable-linger` keeps it where it goes with a user's last login session";
+
 /// The best folder that this process may write to, made where it is missing; nothing where there is none.
 pub(crate) fn own() -> Option<PathBuf> {
     candidates().into_iter().find(|folder| prepare(folder))
@@ -18,6 +21,18 @@ pub(crate) fn candidates() -> Vec<PathBuf> {
         named("XDG_RUNTIME_DIR").or_else(|| login.is_dir().then_some(login)).map(|folder| folder.join("holod"));
     let temporary = std::env::temp_dir().join(format!("holod-{uid}"));
     named("RUNTIME_DIRECTORY").into_iter().chain(runtime).chain([temporary]).collect()
+}
+
+/// Makes the folder of a run again where it is gone; false where it cannot be, or is somebody else's by now.
+pub(crate) fn make_again(folder: &Path) -> bool {
+    if is_own(folder) {
+        return true;
+    }
+    let is_made = prepare(folder);
+    if is_made {
+        tracing::warn!("{} was taken away under this run, and is made again: {LINGER}", folder.display());
+    }
+    is_made
 }
 
 /// Makes a folder that only this user can write to; false where it cannot be, or is somebody else's.

@@ -96,10 +96,16 @@ fn write(newest: &Queue<Vec<u8>>, path: &Path) {
     let mut refuses = false;
     while newest.take(&mut taken, Taking::AtOnce) {
         let Some(bytes) = taken.back() else { continue };
-        let written = write_atomically(path, |out| out.write_all(bytes));
+        let write = || write_atomically(path, |out| out.write_all(bytes));
+        let mut written = write();
+        let is_gone = written.as_ref().is_err_and(|error| error.kind() == ErrorKind::NotFound);
+        if is_gone && path.parent().is_some_and(runtime_folder::make_again) {
+            written = write();
+        }
         match (&written, refuses) {
             (Err(error), false) => {
-                tracing::warn!("`holod status` knows nothing new of this run: {}: {error}", path.display());
+                let cure = if is_gone { format!("; {}", runtime_folder::LINGER) } else { String::new() };
+                tracing::warn!("`holod status` knows nothing new of this run: {}: {error}{cure}", path.display());
             }
             (Ok(()), true) => tracing::info!("`holod status` knows of this run again"),
             _ => {}

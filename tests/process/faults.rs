@@ -9,6 +9,7 @@ use std::thread;
 use std::time::Duration;
 
 use holod_tests::daemon::{Daemon, Ended, run, wait_until};
+use holod_tests::feed::FeedClient;
 use holod_tests::tracker::PtyTracker;
 use holod_tests::{frames, small_rig};
 use rustix::fs::OFlags;
@@ -204,6 +205,30 @@ fn a_disk_that_is_full_costs_the_record_and_no_frame() {
     let copied = Command::new("cp").arg("-r").arg(disk.join("record")).arg(folder.path()).status().unwrap();
     assert!(copied.success());
     judge_what_is_left(folder.path());
+}
+
+#[test]
+fn a_runtime_folder_that_is_taken_away_is_made_again_and_the_run_is_reached_in_it() {
+    let folder = bench();
+    let daemon = start(folder.path(), &["--scene", "feed"]);
+    for taken_away in ["holod", "holod/feed"] {
+        let path = folder.path().join(taken_away);
+        let pause = ask(folder.path(), &["ctl", "pause"]);
+        assert!(pause.status.success(), "{pause:?}");
+        if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) }.unwrap();
+        assert!(wait_until(PATIENCE, || path.exists()), "{taken_away}");
+        let answers = || ask(folder.path(), &["ctl", "resume"]).status.success();
+        assert!(wait_until(PATIENCE, answers), "{:?}", ask(folder.path(), &["ctl", "resume"]));
+        frames_go_on(folder.path());
+        let connects = || FeedClient::connect(&folder.path().join("holod/feed")).is_ok();
+        assert!(wait_until(PATIENCE, connects), "{taken_away}");
+    }
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(PATIENCE);
+    assert!(ended.status.success(), "{ended:?}");
+    let told = "was taken away under this run, and is made again: `loginctl enable-linger` keeps it";
+    assert!(ended.stderr.contains(told), "{}", ended.stderr);
+    assert_eq!(fs::read_dir(folder.path().join("holod")).unwrap().count(), 0, "all of it goes at the end");
 }
 
 /// A pipe that is full, and that nobody reads.

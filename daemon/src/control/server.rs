@@ -18,7 +18,7 @@ use tokio::sync::{Semaphore, SemaphorePermit, oneshot};
 use tokio::task::AbortHandle;
 
 use super::{Answer, Order, Ordered, Preparer, Request};
-use crate::local_socket::{self, SocketPlace};
+use crate::local_socket::{self, LOOK, SocketPlace};
 use crate::tally_by::{Reason, TallyBy};
 
 /// Connections at once. A further one takes the place of the oldest, so that nobody who only holds on keeps others out.
@@ -34,7 +34,7 @@ const FAREWELL: Duration = Duration::from_millis(500);
 
 /// A control socket that listens. Dropping it ends that.
 pub(crate) struct ControlServer {
-    place: SocketPlace,
+    place: Arc<SocketPlace>,
     waiting: Arc<Waiting>,
     runtime: Option<Runtime>,
 }
@@ -49,6 +49,7 @@ impl ControlServer {
         preparer: Preparer,
     ) -> Result<(Self, mpsc::Receiver<Ordered>), Box<dyn std::error::Error>> {
         let (listener, place) = local_socket::listen(&socket, SocketType::STREAM)?;
+        let place = Arc::new(place);
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .worker_threads(1)
             .max_blocking_threads(1)
@@ -71,7 +72,7 @@ impl ControlServer {
             refused: TallyBy::default(),
         };
         let waiting = Arc::new(waiting);
-        runtime.spawn(serve(listener, Arc::clone(&waiting)));
+        runtime.spawn(serve(listener, Arc::clone(&place), Arc::clone(&waiting)));
         Ok((Self { place, waiting, runtime: Some(runtime) }, receiver))
     }
 
@@ -119,10 +120,19 @@ impl Drop for ControlServer {
     }
 }
 
-async fn serve(listener: UnixListener, desk: Arc<Waiting>) {
+async fn serve(mut listener: UnixListener, place: Arc<SocketPlace>, desk: Arc<Waiting>) {
     let mut connections: VecDeque<AbortHandle> = VecDeque::new();
     loop {
-        let Ok((stream, _)) = listener.accept().await else {
+        let Ok(accepted) = tokio::time::timeout(LOOK, listener.accept()).await else {
+            if let Some(Ok(again)) = place.listen_again()
+                && let Ok(again) = UnixListener::from_std(again.into())
+            {
+                tracing::info!("`holod ctl` reaches this run again, at {}", place.path().display());
+                listener = again;
+            }
+            continue;
+        };
+        let Ok((stream, _)) = accepted else {
             // Too many open files, most likely.
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;

@@ -26,7 +26,7 @@ use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
 use holod_model::RgbdFrame;
 use holod_model::scene::{Fit, LiveError, LiveReport};
 use holod_pupil_input::host_now;
-use rustix::event::{EventfdFlags, PollFd, PollFlags, eventfd, poll};
+use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use rustix::io::Errno;
 use rustix::net::{SocketFlags, SocketType, accept_with};
 use serde::{Deserialize, Serialize};
@@ -37,7 +37,7 @@ pub use self::depths::BadDepths;
 use self::message::Outcome;
 use self::slots::Picture;
 use super::{PictureSink, PictureTag, PictureView, scene};
-use crate::local_socket::{self, SocketError, SocketPlace};
+use crate::local_socket::{self, LOOK, SocketError, SocketPlace};
 use crate::tally_by::TallyBy;
 
 /// Clients that may be connected at once.
@@ -198,7 +198,7 @@ pub fn default_socket() -> Result<PathBuf, FeedError> {
 pub struct Feed {
     /// Has the black frame, which the frame thread must not be the last to let go.
     _plan: Arc<FeedPlan>,
-    place: SocketPlace,
+    place: Arc<SocketPlace>,
     sink: Arc<Mutex<PictureSink>>,
     stop: OwnedFd,
     thread: Option<JoinHandle<()>>,
@@ -217,12 +217,15 @@ impl Feed {
     ) -> Result<Self, FeedError> {
         let FeedPlan { socket, resolution, fit, .. } = FeedPlan::clone(plan);
         let (listener, place) = local_socket::listen(&socket, SocketType::SEQPACKET)?;
+        let place = Arc::new(place);
         let stop = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)
             .map_err(|error| FeedError::Thread(error.into()))?;
         let status = Arc::new(Mutex::new(FeedStatus::at(&socket)));
         let shown = Arc::clone(&sink);
         let mut server = Server {
             listener,
+            place: Arc::clone(&place),
+            t_looked: host_now(),
             stop: stop.try_clone().map_err(FeedError::Thread)?,
             target: Target { geometry: *geometry, resolution, fit },
             clients: Vec::new(),
@@ -280,6 +283,9 @@ impl Drop for Feed {
 /// The feed's thread.
 struct Server {
     listener: OwnedFd,
+    place: Arc<SocketPlace>,
+    /// When it was seen to that the socket is still there.
+    t_looked: TimeNs,
     stop: OwnedFd,
     target: Target,
     /// In the order in which they came.
@@ -303,6 +309,7 @@ impl Server {
             if ready.connects {
                 self.accept();
             }
+            self.look_after_socket(now);
             for number in ready.clients {
                 self.with(number, &mut shown, |client, target, status| {
                     client.receive(target, host_now, |outcome| note(status, outcome))
@@ -330,14 +337,25 @@ impl Server {
         }
     }
 
-    /// Waits until somebody has something to say; nothing where it is time to end.
+    fn look_after_socket(&mut self, now: TimeNs) {
+        if (now - self.t_looked).0.unsigned_abs() < LOOK.as_nanos() as u64 {
+            return;
+        }
+        self.t_looked = now;
+        if let Some(Ok(again)) = self.place.listen_again() {
+            tracing::info!("waiting for pictures on {} again", self.place.path().display());
+            self.listener = again;
+        }
+    }
+
+    /// Waits until somebody has something to say, or some time; nothing where it is time to end.
     fn wait(&self) -> Option<Ready> {
         let mut waited: Vec<PollFd<'_>> = [&self.stop, &self.listener]
             .into_iter()
             .chain(self.clients.iter().map(|(_, client)| &client.socket))
             .map(|descriptor| PollFd::new(descriptor, PollFlags::IN))
             .collect();
-        match poll(&mut waited, None) {
+        match poll(&mut waited, Timespec::try_from(LOOK).ok().as_ref()) {
             Ok(_) | Err(Errno::INTR) => {}
             Err(error) => {
                 tracing::error!("the feed has ended: {error}");
