@@ -60,8 +60,12 @@ impl Staging {
         refuse_existing(files.iter().map(|file| target.join(file)), "--out", force)?;
         fs::create_dir_all(folder).map_err(cannot)?;
         take_away_on_signals();
-        let partial = tempfile::Builder::new().prefix(".holod-partial-").tempdir_in(folder).map_err(cannot)?;
-        half_done(|folders| folders.push(partial.path().to_owned()));
+        let partial = half_done(|folders| {
+            let partial = tempfile::Builder::new().prefix(".holod-partial-").tempdir_in(folder)?;
+            folders.push(partial.path().to_owned());
+            Ok(partial)
+        });
+        let partial = partial.map_err(cannot)?;
         Ok(Self { target: target.to_owned(), partial, force })
     }
 
@@ -110,9 +114,11 @@ impl Temporary {
     /// It cannot be made.
     pub(crate) fn new(prefix: &str) -> std::io::Result<Self> {
         take_away_on_signals();
-        let folder = tempfile::Builder::new().prefix(prefix).tempdir()?;
-        half_done(|folders| folders.push(folder.path().to_owned()));
-        Ok(Self(folder))
+        half_done(|folders| {
+            let folder = tempfile::Builder::new().prefix(prefix).tempdir()?;
+            folders.push(folder.path().to_owned());
+            Ok(Self(folder))
+        })
     }
 
     /// Where it is.

@@ -184,7 +184,8 @@ impl CounterSnapshot {
         self.faults.iter().sum()
     }
 
-    /// Lost samples that were told beside the faults of their figures.
+    /// Lost samples that were told beside the faults of their figures: as many as there can be. Of an eye that is not
+    /// followed there are faults alone.
     pub(crate) fn lost_beside_faults(&self) -> u64 {
         let of_figures = WireFault::ALL.into_iter().filter(|fault| fault.is_of_a_figure());
         of_figures.map(|fault| self.fault(LogFault::Wire(fault))).sum::<u64>().min(self.rejected(Rejection::Lost))

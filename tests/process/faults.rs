@@ -215,7 +215,10 @@ fn a_runtime_folder_that_is_taken_away_is_made_again_and_the_run_is_reached_in_i
         let path = folder.path().join(taken_away);
         let pause = ask(folder.path(), &["ctl", "pause"]);
         assert!(pause.status.success(), "{pause:?}");
-        if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) }.unwrap();
+        // Moved away first: the run may put a file into the folder while it is emptied.
+        let taken = folder.path().join("taken");
+        fs::rename(&path, &taken).unwrap();
+        if taken.is_dir() { fs::remove_dir_all(&taken) } else { fs::remove_file(&taken) }.unwrap();
         assert!(wait_until(PATIENCE, || path.exists()), "{taken_away}");
         let answers = || ask(folder.path(), &["ctl", "resume"]).status.success();
         assert!(wait_until(PATIENCE, answers), "{:?}", ask(folder.path(), &["ctl", "resume"]));

@@ -275,7 +275,16 @@ pub(super) fn visible_paths(rig: &Rig, run: &RunArgs) -> Vec<(&'static str, Path
     if let Some(scene) = run.scene.scene.as_deref().filter(|scene| feed_socket(scene).is_none()) {
         paths.extend(scene.split(',').map(|path| ("--scene", PathBuf::from(path))));
     }
-    paths.extend(files_of(rig).into_iter().map(|path| ("the rig", path)));
+    // Another tracker's log or scenario is not opened; its profile is read with the rig.
+    let replaced = match rig.tracker.spec.as_ref().and_then(|spec| spec.parse().ok()) {
+        Some(spec @ (TrackerSpec::Path(_) | TrackerSpec::Replay { .. } | TrackerSpec::MockFile(_)))
+            if tracker.is_some() =>
+        {
+            spec.files()
+        }
+        _ => Vec::new(),
+    };
+    paths.extend(files_of(rig).into_iter().filter(|path| !replaced.contains(path)).map(|path| ("the rig", path)));
     paths
 }
 
@@ -478,7 +487,9 @@ mod tests {
             assert!(refused.contains("--tracker: found /") && refused.contains("does not see"), "{spec}: {refused}");
             drop_in_of(&spec.replace("/tmp", "/srv").replace("/home/me", "/srv"), &rig()).unwrap();
             let of_rig = Rig { tracker: Tracker { spec: Some(spec.into()), ..rig().tracker }, ..rig() };
-            assert!(drop_in_of("mock", &of_rig).unwrap_err().contains("the rig: found /"), "{spec}");
+            let beside_another = drop_in_of("mock", &of_rig).err();
+            let is_refused = beside_another.is_some_and(|says| says.contains("the rig: found /"));
+            assert_eq!(is_refused, spec.contains("profile="), "{spec}: a log is not opened, a profile is");
         }
         for spec in ["mock:./eye.txt", "replay:log.csv", "udp:192.0.2.7:4242,profile=mine.toml"] {
             assert!(drop_in_of(spec, &rig()).unwrap_err().contains("write the whole path"), "{spec}");

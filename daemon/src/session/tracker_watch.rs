@@ -43,8 +43,8 @@ impl TrackerWatch {
         if lost != self.lost.as_deref() {
             self.lost = lost.map(str::to_owned);
             match &self.lost {
-                Some(lost) => tracing::warn!("the tracker is not found again: {lost}"),
-                None => tracing::info!("the tracker is found again"),
+                Some(lost) => tracing::warn!("nothing comes of the tracker: {lost}"),
+                None => tracing::info!("the tracker is there again"),
             }
         }
         if !self.strangers_told && tracker.counters().of(Counter::Strangers) > 0 {

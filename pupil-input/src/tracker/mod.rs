@@ -359,7 +359,7 @@ impl TrackerControl {
         &self.warnings
     }
 
-    /// Why a link that was lost does not come back, while it does not.
+    /// Why a link that was lost does not come back, or why nothing comes of one that is up, while it is so.
     pub fn trouble(&mut self) -> Option<&str> {
         while let Ok(text) = self.untold.pop() {
             self.trouble = Some(text).filter(|text| !text.is_empty());

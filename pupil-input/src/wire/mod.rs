@@ -110,8 +110,8 @@ impl WireFault {
         self as usize
     }
 
-    /// Whether a pupil's figure is no size, as some trackers send through a blink: a lost sample is told beside it, so
-    /// that its neighbours are not believed.
+    /// Whether a pupil's figure is no size, as some trackers send through a blink: a lost sample is told beside it, but
+    /// by PupilEXT and LiveTrack, so that its neighbours are not believed.
     pub(crate) const fn is_of_a_figure(self) -> bool {
         matches!(self, Self::NotFinite | Self::Negative)
     }
@@ -144,7 +144,7 @@ pub enum WireEvent {
     /// A message that is no sample and no fault: a comment, a header, an acknowledgement.
     Note,
     /// A message that is no sample, with the reason; where only the pupil's figure is none, a lost sample comes behind
-    /// it.
+    /// it, but of PupilEXT and LiveTrack.
     Rejected(WireFault),
     /// What was left of a message when reading began in its middle; not a fault.
     Partial,

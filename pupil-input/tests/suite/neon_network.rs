@@ -435,7 +435,6 @@ fn a_companion_that_restarts_is_found_at_its_new_port() {
     assert_eq!(handle.control.counters().of(Counter::Disconnects), 1);
 }
 
-/// What is said where a status page answers so.
 #[test]
 fn a_stream_without_packets_is_told_until_one_comes() {
     let mut companion = Companion::start(0);
@@ -466,6 +465,7 @@ fn a_phone_that_leaves_the_network_is_looked_for_again() {
     companion.stream_until("tracking again", || tracks(&mut handle));
 }
 
+/// What is said where a status page answers so.
 fn refused_with(answer: impl FnOnce(TcpStream) -> io::Result<()> + Send + 'static) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
     let port = listener.local_addr().expect("bound").port();

@@ -7,6 +7,7 @@ import glob
 import json
 import os
 import socket
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +17,8 @@ from holod_client import feed
 from holod_client.folders import is_own, own_folders, warning_of
 
 LONGEST_ANSWER_BYTES = 1 << 20
+# How long others may be before this one at the socket, as for `holod ctl`.
+CONNECTS_WITHIN_S = 3.0
 BUILT_IN_WEIGHTS = ("standard", "small", "fast")
 
 
@@ -169,12 +172,9 @@ class Control:
         if self._is_closed:
             raise ControlError(f"this connection to {self.path} was closed; nothing has changed")
         if self._socket is None or self._answers is None:
-            connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-            connection.settimeout(self.timeout_s)
             try:
-                connection.connect(str(self.path))
+                connection = _connect(self.path, self.timeout_s)
             except OSError as error:
-                connection.close()
                 raise ControlError(_why_not_connected(self.path, error)) from error
             self._socket, self._answers = connection, connection.makefile("rb")
         return self._socket, self._answers
@@ -206,6 +206,25 @@ class Control:
         if not isinstance(answer, dict) or not ("ok" in answer or "error" in answer):
             raise unanswered(f"{self.path} answered {line[:40]!r}, expected `ok` or `error`: is it holod?")
         return answer
+
+
+def _connect(path: Path, timeout_s: float) -> socket.socket:
+    """A connection. Where others are before this one it is tried again for 3 s at most."""
+    given_up_s = time.monotonic() + min(timeout_s, CONNECTS_WITHIN_S)
+    while True:
+        connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        connection.settimeout(timeout_s)
+        try:
+            connection.connect(str(path))
+            return connection
+        except BlockingIOError:
+            connection.close()
+            if time.monotonic() > given_up_s:
+                raise
+            time.sleep(0.02)
+        except BaseException:
+            connection.close()
+            raise
 
 
 def _why(error: OSError) -> str:
