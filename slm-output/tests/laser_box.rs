@@ -431,8 +431,9 @@ fn a_box_on_the_panels_wire_is_told_to_go_dark_where_the_panels_reports_end() {
     laser.tell("sync 60");
     eventually("an edge", || host.report().unwrap().state.sync.count > 2);
     host.arm(host_now()).unwrap();
-    host.heartbeat(host_now()).unwrap();
-    host.sync(host_now(), host_now()).unwrap();
+    // On a busy machine the host's own model may have missed the frames already.
+    let _once_dark = host.heartbeat(host_now());
+    let _once_dark = host.sync(host_now(), host_now());
     assert_eq!(dark_reason(&mut host), DarkReason::SyncLost, "two refreshes without a report");
     let log = laser.dark_log();
     assert!(matches!(log.last(), Some(BoxEvent::Dark { reason: DarkReason::SyncLost, .. })), "{log:?}");

@@ -391,8 +391,10 @@ fn a_laser_that_does_not_hear_that_it_must_go_out_is_told_again_beside_a_host_th
 fn darkness_does_not_wait_for_all_the_questions_whether_lasers_are_well() {
     let benches = [cobolt(), cobolt(), cobolt()];
     let driver = text_lasers("cobolt", benches.each_ref().map(Some));
-    let mut laser = open_laser(&lasers(driver), host_now).unwrap();
-    laser.program(&program(GREEN), host_now()).unwrap();
+    // A busy machine may be late with a heartbeat, which is not what is looked at here.
+    let heartbeat_timeout = TimeNs(5000 * MS);
+    let mut laser = open_laser(&Lasers { heartbeat_timeout, ..lasers(driver) }, host_now).unwrap();
+    laser.program(&LaserProgram { heartbeat_timeout, ..program(GREEN) }, host_now()).unwrap();
     for bench in &benches {
         bench.with(|device| device.slow = Duration::from_millis(150));
     }
@@ -406,7 +408,8 @@ fn darkness_does_not_wait_for_all_the_questions_whether_lasers_are_well() {
         laser.dark(DarkReason::Asked, host_now()).unwrap();
         let questions = benches.iter().zip(heard).flat_map(|(bench, heard)| bench.heard().split_off(heard));
         let questions: Vec<_> = questions.filter(|line| line.ends_with('?')).collect();
-        assert!(questions.len() <= 1, "{questions:?} before the lasers went out");
+        // The one that was being asked, and on a busy machine one before the order came; of six.
+        assert!(questions.len() <= 2, "{questions:?} before the lasers went out");
     }
 }
 

@@ -42,7 +42,9 @@ pub(super) fn dark(args: &LaserArgs) -> Result<(), Failure> {
     make_dark(driver, host_now).map_err(Failure::because(Exit::Unavailable))?;
     let who_knows = match driver {
         LaserDriver::Simulated => "",
-        LaserDriver::Serial { .. } => "; only a holod that is started anew lights them again",
+        LaserDriver::Serial { .. } => {
+            "; only a holod that is started anew lights them again; end one that hangs before the box is reset"
+        }
         LaserDriver::ReadyBeam { .. } | LaserDriver::Text { .. } => {
             "; a holod that still drives them does not know of it and may light them again: end it"
         }

@@ -69,6 +69,8 @@ pub(crate) struct Signals {
     registered: Vec<SigId>,
     /// What sets that at the first one.
     first: Vec<SigId>,
+    /// Those that are taken over.
+    signals: Vec<i32>,
     /// Nothing ends the process at once before its lasers are out.
     after_lasers: bool,
 }
@@ -79,10 +81,12 @@ impl Signals {
     pub(crate) fn install(hangups: Option<&Hangups>) -> Result<Self, Failure> {
         let caught = Arc::new(AtomicUsize::new(0));
         let again = Arc::new(AtomicBool::new(false));
-        let mut signals = Self { caught, again, registered: Vec::new(), first: Vec::new(), after_lasers: false };
+        let mut signals =
+            Self { caught, again, registered: Vec::new(), first: Vec::new(), signals: Vec::new(), after_lasers: false };
         leave_signals_to_a_run(true);
         let ends_on_hangup = hangups.is_none() && !hangup_is_ignored();
         for signal in [SIGINT, SIGTERM].into_iter().chain(ends_on_hangup.then_some(SIGHUP)) {
+            signals.signals.push(signal);
             let caught = Arc::clone(&signals.caught);
             for registered in [
                 signal_hook::flag::register_conditional_shutdown(signal, 128 + signal, Arc::clone(&signals.again)),
@@ -111,13 +115,20 @@ impl Signals {
 
     /// The way down has begun: says what a second signal does not do.
     pub(crate) fn lasers_go_out(&self) {
-        if self.after_lasers {
+        if self.after_lasers && self.caught().is_some() {
             tracing::info!("the lasers have no heartbeat: a second signal ends holod only once they have been put out");
         }
     }
 
-    /// The lasers have been told to go out, as often as they are told at all.
-    pub(crate) fn lasers_are_out(&self) {
+    /// The lasers have been told to go out, as often as they are told at all: a second signal ends the process from now
+    /// on.
+    pub(crate) fn lasers_are_out(&mut self) {
+        if self.after_lasers {
+            for &signal in &self.signals {
+                // Where it cannot be, signals wait for the end as before.
+                self.first.extend(signal_hook::flag::register(signal, Arc::clone(&self.again)));
+            }
+        }
         if self.caught().is_some() {
             self.again.store(true, Ordering::Release);
         }

@@ -66,9 +66,11 @@ fn all_dark(paths: &[&Path], put_out: impl Fn(&Path) -> Result<(), LaserError> +
     let put_out = &put_out;
     let ended = std::thread::scope(|scope| {
         let spawn = |path| std::thread::Builder::new().spawn_scoped(scope, move || put_out(path));
-        let threads: Vec<_> = paths.iter().map(|&path| spawn(path)).collect();
-        let end = |thread: std::io::Result<ScopedJoinHandle<'_, _>>| {
-            thread?.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+        let threads: Vec<_> = paths.iter().map(|&path| (path, spawn(path))).collect();
+        let end = |(path, thread): (_, std::io::Result<ScopedJoinHandle<'_, _>>)| match thread {
+            Ok(thread) => thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)),
+            // A machine that starts no thread any more has this one.
+            Err(_) => put_out(path),
         };
         threads.into_iter().map(end).collect::<Vec<Result<(), LaserError>>>()
     });

@@ -67,8 +67,8 @@ enum Report {
     Done(u32),
     /// A device that was lit was put out for want of a heartbeat.
     TimedOut { t: TimeNs },
-    /// It failed, at an order or by itself.
-    Failed(LaserError),
+    /// It failed at the order of that number; 0 where it failed by itself.
+    Failed(u32, LaserError),
 }
 
 /// Drives a [`PowerDevice`] as a [`LaserBox`].
@@ -152,8 +152,9 @@ impl PowerBox {
         Ok(self.last_order)
     }
 
-    /// Takes in what the worker has said; whether `awaited` has been carried out.
-    fn hear(&mut self, awaited: u32) -> Result<bool, LaserError> {
+    /// Takes in what the worker has said; whether `awaited` has been carried out. A failure comes with the number of the
+    /// order that failed.
+    fn hear(&mut self, awaited: u32) -> Result<bool, (u32, LaserError)> {
         let mut done = false;
         while let Ok(report) = self.reports.pop() {
             match report {
@@ -164,9 +165,9 @@ impl PowerBox {
                     }
                 }
                 Report::TimedOut { t } => self.went_dark(DarkReason::Heartbeat, t),
-                Report::Failed(error) => {
+                Report::Failed(number, error) => {
                     self.went_dark(DarkReason::BoxFault, (self.clock)());
-                    return Err(error);
+                    return Err((number, error));
                 }
             }
         }
@@ -179,11 +180,11 @@ impl PowerBox {
         }
     }
 
-    fn wait_for(&mut self, number: u32, patience: TimeNs, command: &'static str) -> Result<(), LaserError> {
+    fn wait_for(&mut self, number: u32, patience: TimeNs, command: &'static str) -> Result<(), (u32, LaserError)> {
         let t_end = (self.clock)() + patience;
         while !self.hear(number)? {
             if (self.clock)() >= t_end {
-                return Err(LaserError::NoAnswer { command, waited_ms: patience.0 / 1_000_000 });
+                return Err((number, LaserError::NoAnswer { command, waited_ms: patience.0 / 1_000_000 }));
             }
             std::thread::sleep(Duration::from_millis(1));
         }
@@ -257,7 +258,7 @@ impl LaserBox for PowerBox {
         self.sequence = None;
         let order = Order::Power { power_uw: program.power_uw, timeout: program.heartbeat_timeout };
         let number = self.order(order)?;
-        self.wait_for(number, PROGRAM_WAIT, "power")?;
+        self.wait_for(number, PROGRAM_WAIT, "power").map_err(|(_, error)| error)?;
         self.sequence = Some(lit);
         Ok(())
     }
@@ -291,14 +292,13 @@ impl LaserBox for PowerBox {
         let number = self.order(Order::Lit(NONE_LIT))?;
         // What was said to earlier orders, a failure say, is no answer to this one.
         let answered = match self.wait_for(number, self.dark_wait, "off") {
-            Err(error @ LaserError::NoAnswer { .. }) => Err(error),
-            Err(_) => self.wait_for(number, self.dark_wait, "off"),
-            Ok(()) => Ok(()),
+            Err((of, _)) if of != number => self.wait_for(number, self.dark_wait, "off"),
+            answered => answered,
         };
         if answered.is_ok() {
             self.went_dark(reason, (self.clock)());
         }
-        answered
+        answered.map_err(|(_, error)| error)
     }
 
     fn poll(&mut self, _now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
@@ -306,7 +306,7 @@ impl LaserBox for PowerBox {
         if let Some(happened) = self.event.take() {
             event(happened);
         }
-        heard.map(|_| ())
+        heard.map(drop).map_err(|(_, error)| error)
     }
 }
 
@@ -409,7 +409,7 @@ impl<D: PowerDevice> Worker<D> {
     fn report(&mut self, number: u32, done: Result<(), LaserError>) {
         let report = match done {
             Ok(()) => Report::Done(number),
-            Err(error) => Report::Failed(error),
+            Err(error) => Report::Failed(number, error),
         };
         // Where nobody has listened for 64 reports nobody will.
         let _full = self.reports.push(report);

@@ -28,8 +28,8 @@ const IDENTIFY_WAIT: TimeNs = TimeNs(2_000_000_000);
 /// How long an identity is still waited for after a line that is no box's: it may be the end of an answer to somebody
 /// else, whose beginning they have read.
 const STRANGER_WAIT: TimeNs = TimeNs(500_000_000);
-/// A box that is not spoken to otherwise is asked for its time or its state this often, so that a pulled cable is noticed in the
-/// dark.
+/// A box that is not spoken to otherwise is asked for its time or its state this often, so that a pulled cable is
+/// noticed in the dark.
 const ASK_TIME_EVERY: TimeNs = TimeNs(250_000_000);
 /// Commands that may wait for an answer: a quarter of a second of fields at 1000 Hz.
 const UNANSWERED_MAX: usize = 512;
@@ -549,10 +549,8 @@ impl LaserBox for SerialBox {
             }
             event(next);
         }
-        if let Some(reason) = box_may_go_on {
-            self.send(&Command::Disarm(reason))?;
-        }
-        heard?;
+        let told = box_may_go_on.map_or(Ok(()), |reason| self.send(&Command::Disarm(reason)).map(drop));
+        heard.and(told)?;
         let overdue = |sent: &&Sent| now.0 - sent.t.0 > ANSWER_WAIT.0;
         if let Some(sent) = self.unanswered.iter().flatten().find(overdue) {
             let error = LaserError::NoAnswer { command: sent.command, waited_ms: (now.0 - sent.t.0) / 1_000_000 };

@@ -18,6 +18,8 @@ use crate::laser::DarkReason;
 const DARK_MARGIN: TimeNs = TimeNs(50_000_000);
 /// Boxes that are asked twice take a second.
 const KEEP_DARK_WAIT: TimeNs = TimeNs(2_000_000_000);
+/// Whoever asked has an answer before the control socket and the service's watchdog give up.
+const KEEP_DARK_WAIT_MAX: TimeNs = TimeNs(4_000_000_000);
 /// How long the panel's thread is waited for at the end: a mode may be set once more, a display server may hang.
 const PANEL_WAIT: TimeNs = TimeNs(3_000_000_000);
 /// How long a panic waits for it.
@@ -66,15 +68,15 @@ impl OutputControl {
     }
 
     /// Keeps the lasers dark for the reason `why` until this is taken back with none; then they are lit again by the
-    /// rules. Waits for the box, two seconds or as long as its lasers may take; whether it has acknowledged. They are kept dark also where
-    /// it has not.
+    /// rules. Waits for the box, two seconds or as long as its lasers may take, four at most; whether it has
+    /// acknowledged. They are kept dark also where it has not.
     pub fn keep_dark(&self, why: Option<DarkReason>) -> bool {
         let shared = &self.switch.shared;
         let (before, _) = dark_request_parts(shared.dark_request.load(Ordering::Acquire));
         let request = dark_request(before + 1, why);
         shared.dark_request.store(request, Ordering::Release);
         self.switch.laser.unpark();
-        let t_end = (self.clock)() + KEEP_DARK_WAIT.max(self.dark_wait + DARK_MARGIN);
+        let t_end = (self.clock)() + KEEP_DARK_WAIT.max(self.dark_wait + DARK_MARGIN).min(KEEP_DARK_WAIT_MAX);
         loop {
             let answer = shared.dark_answer.load(Ordering::Acquire);
             if answer >> 2 == request {

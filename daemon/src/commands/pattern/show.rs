@@ -116,6 +116,8 @@ pub(super) fn show(
     shown.refresh_hz = output.control.counts().refresh_hz;
     signals.lasers_go_out();
     let down = output.control.shutdown();
+    signals.lasers_are_out();
+    laser_box.drain(false);
     if !down.panel_ended {
         tracing::error!("{PANEL_HANGS}");
     }
