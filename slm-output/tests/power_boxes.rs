@@ -390,9 +390,12 @@ fn a_laser_that_does_not_hear_that_it_must_go_out_is_told_again_beside_a_host_th
 #[test]
 fn darkness_does_not_wait_for_all_the_questions_whether_lasers_are_well() {
     let benches = [cobolt(), cobolt(), cobolt()];
-    let driver = text_lasers("cobolt", benches.each_ref().map(Some));
-    // A busy machine may be late with a heartbeat, which is not what is looked at here.
+    let mut driver = text_lasers("cobolt", benches.each_ref().map(Some));
+    // A busy machine may be late with a heartbeat or an answer, which is not what is looked at here.
     let heartbeat_timeout = TimeNs(5000 * MS);
+    if let LaserDriver::Text { profile, .. } = &mut driver {
+        profile.answer_timeout_ms = 5000;
+    }
     let mut laser = open_laser(&Lasers { heartbeat_timeout, ..lasers(driver) }, host_now).unwrap();
     laser.program(&LaserProgram { heartbeat_timeout, ..program(GREEN) }, host_now()).unwrap();
     for bench in &benches {

@@ -345,8 +345,11 @@ impl Client {
             stream.slots.free(picture);
         }
         let freed = message::free(picture.slot as u32, picture.sequence, outcome);
-        send(&self.socket, &freed, SendFlags::DONTWAIT | SendFlags::NOSIGNAL)?;
-        Ok(())
+        match send(&self.socket, &freed, SendFlags::DONTWAIT | SendFlags::NOSIGNAL) {
+            // It has closed, and may have handed over another picture before: its end is read behind that.
+            Ok(_) | Err(Errno::PIPE | Errno::CONNRESET) => Ok(()),
+            Err(error) => Err(error.into()),
+        }
     }
 
     /// Tells it why it has to go.
