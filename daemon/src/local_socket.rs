@@ -16,6 +16,7 @@ use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, bind, connect, socket_with};
 
 use crate::runtime_folder::{self, make_again};
+use crate::staging::folder_of;
 
 /// Connections that wait to be accepted.
 const BACKLOG: i32 = 8;
@@ -140,10 +141,6 @@ pub(crate) fn connect_within(path: &Path, patience: Duration) -> io::Result<Unix
 
 fn identity(found: &Metadata) -> (u64, u64) {
     (found.dev(), found.ino())
-}
-
-fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// Keeps other holods from the sockets of a folder for as long as it lives. Where the folder cannot be had, since it

@@ -94,7 +94,7 @@ impl Staging {
 }
 
 /// The folder in which a path's last part is.
-fn folder_of(path: &Path) -> &Path {
+pub(crate) fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 

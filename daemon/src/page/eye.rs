@@ -62,7 +62,10 @@ pub(super) enum Blind {
     Busy,
     #[error("no new frame came on the panel within {FRAME_WITHIN:?}, or the panel cannot say what it shows")]
     NoFrame,
-    #[error("the panel shows level {level} in {colour}, whose phase its look-up table does not say")]
+    #[error(
+        "the panel shows level {level} in {colour}, whose phase its look-up table does not say: look again after the test \
+         pattern, or add the level to lut_file"
+    )]
     UnknownLevel { colour: Colour, level: u16 },
 }
 

@@ -233,7 +233,7 @@ def test_a_service_that_this_user_may_not_open_is_told_from_one_that_does_not_ru
             service.close()
 
 
-def test_a_holod_that_lets_nobody_in_is_told_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_holod_that_lets_nobody_in_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "holod").mkdir()
@@ -246,7 +246,20 @@ def test_a_holod_that_lets_nobody_in_is_told_at_once(tmp_path: Path, monkeypatch
         waiting.connect(str(path))
         for named in (None, path):
             with pytest.raises(ControlError, match=f"nobody in on {path}: it hangs; `holod dark --config RIG`"):
-                Control(named)
+                Control(named, timeout_s=0.2)
+
+
+def test_a_place_at_the_socket_is_waited_for(tmp_path: Path) -> None:
+    with contextlib.ExitStack() as closing:
+        listener = closing.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+        listener.bind(str(tmp_path / "control-1"))
+        listener.listen(0)
+        waiting = closing.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+        waiting.connect(str(tmp_path / "control-1"))
+        accepts = threading.Timer(0.2, lambda: closing.push(listener.accept()[0]))
+        accepts.start()
+        Control(tmp_path / "control-1").close()
+        accepts.join()
 
 
 def test_a_path_leads_where_it_does_here(fake: FakeControl, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
