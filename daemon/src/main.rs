@@ -9,6 +9,7 @@ use holod_daemon::failure::{Exit, Failure};
 use holod_daemon::{cli::Cli, commands, logging};
 
 fn main() -> ExitCode {
+    keep_vulkan_from_desktop();
     let cli = Cli::try_parse().unwrap_or_else(|error| {
         let code = if error.use_stderr() { 64 } else { 0 };
         let _ = error.print();
@@ -25,6 +26,16 @@ fn main() -> ExitCode {
     };
     logging::flush();
     code
+}
+
+/// Where no desktop can be reached, Mesa's Vulkan layer that asks one for its graphics processor says so for each device
+/// that is opened, as an error without a name.
+fn keep_vulkan_from_desktop() {
+    let is_set = |name| std::env::var_os(name).is_some();
+    if !["XDG_RUNTIME_DIR", "NODEVICE_SELECT", "MESA_VK_DEVICE_SELECT"].into_iter().any(is_set) {
+        // SAFETY: no other thread has been started, so nobody reads the environment meanwhile.
+        unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
+    }
 }
 
 /// Makes a file that grows beyond the user's limit (`ulimit -f`) an error of whoever writes it, and not the process's

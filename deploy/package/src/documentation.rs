@@ -9,7 +9,7 @@ use std::path::{Component, Path, PathBuf};
 const INSTALLED: &str = "/usr/share/doc/holod";
 
 /// What is taken from the sources, a file or a folder with what lies in it, and its name among the documentation.
-const HELD: [(&str, &str); 16] = [
+const HELD: [(&str, &str); 18] = [
     ("README.md", "README.md"),
     ("deploy/README.md", "service.md"),
     ("daemon/doc", ""),
@@ -17,8 +17,10 @@ const HELD: [(&str, &str); 16] = [
     ("pupil-input/doc", ""),
     ("pupil-input/profiles/README.md", "tracker-profiles.md"),
     ("pupil-input/profiles", "examples/tracker-profiles"),
+    ("calibration/profiles/lasers", "examples/laser-profiles"),
     ("model/weights/README.md", "weights.md"),
     ("deploy/rigs/example.toml", "examples/rig.toml"),
+    ("deploy/udev/60-holod-lasers.rules", "examples/udev/60-holod-lasers.rules"),
     ("deploy/udev/60-holod-tracker.rules", "examples/udev/60-holod-tracker.rules"),
     ("deploy/udev/61-holod-tracker-hid.rules", "examples/udev/61-holod-tracker-hid.rules"),
     ("deploy/udev/62-holod-panel.rules", "examples/udev/62-holod-panel.rules"),

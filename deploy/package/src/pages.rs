@@ -6,8 +6,9 @@ use clap::Command;
 use clap_mangen::Man;
 use clap_mangen::roff::{Inline, Roff, bold, roman};
 
-const EXIT_STATUS: [(&str, &str); 9] = [
+const EXIT_STATUS: [(&str, &str); 10] = [
     ("0", "It did what was asked."),
+    ("1", "A report's frames are shown again, and differ from the recorded ones."),
     ("64", "The command line asks for something that cannot be had."),
     ("65", "An input file's content is wrong."),
     ("66", "An input file is missing or unreadable."),
@@ -15,7 +16,7 @@ const EXIT_STATUS: [(&str, &str); 9] = [
     ("70", "A fault of holod itself."),
     ("73", "An output cannot be written."),
     ("74", "Standard output takes no more."),
-    ("78", "The rig file is faulty."),
+    ("78", "The rig file is faulty, or weights, tracker or token do not go with it."),
 ];
 const FILES: [(&str, &str); 4] = [
     ("/etc/holod/rig.toml", "What is true of the bench that the service drives."),

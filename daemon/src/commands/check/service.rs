@@ -124,8 +124,8 @@ fn unit_fits(
     let output = args.output.as_deref().unwrap_or("OUTPUT");
     let config = args.rig.config.as_deref().unwrap_or(Path::new(USUAL_RIG));
     let anew = format!(
-        "write it anew: holod unit --config {} --output {output}, with the run's other options after these, \
-         >/etc/systemd/system/{UNIT}.d/bench.conf && systemctl daemon-reload",
+        "write it anew: holod unit --config {} --output {output}, with the run's other options after these, >bench.conf \
+         && install -D -m 644 bench.conf /etc/systemd/system/{UNIT}.d/bench.conf && systemctl daemon-reload",
         config.display()
     );
     let (run, words) = match run {

@@ -38,6 +38,8 @@ static BOOT2: [u8; 256] = rp2040_boot2::BOOT_LOADER_GENERIC_03H;
 const CRYSTAL_HZ: u32 = 12_000_000;
 /// The box's name: one word.
 const NAME: &str = "pico";
+/// Its USB serial number, by which a udev rule tells it from another box.
+const SERIAL_NUMBER: &str = "1";
 /// What this box is built for.
 const LIMITS: Limits = Limits {
     power_uw: [1000; 3],
@@ -169,7 +171,7 @@ fn main() -> ! {
     ));
     let serial = SerialPort::new(&bus);
     // The vendor and product of pid.codes for tests; take one of your own before you pass boards on.
-    let strings = StringDescriptors::default().manufacturer("holod").product("laser box").serial_number("1");
+    let strings = StringDescriptors::default().manufacturer("holod").product("laser box").serial_number(SERIAL_NUMBER);
     let device = UsbDeviceBuilder::new(&bus, UsbVidPid(0x1209, 0x0001)).device_class(usbd_serial::USB_CLASS_CDC);
     let Ok(device) = device.strings(&[strings]) else { reset() };
     let Ok(device) = device.max_packet_size_0(64) else { reset() };
