@@ -489,6 +489,38 @@ fn a_laser_box_needs_its_port() {
     );
 }
 
+#[test]
+fn no_advice_has_a_figure_that_nobody_wrote() {
+    let advice = |key: &str, given: &str| {
+        let line = Rig::BUILT_IN_TOML.lines().find(|line| line.starts_with(key)).unwrap();
+        let [fault] = faults_of(&changed(&[(line, &format!("{key} = {given}"))])).try_into().unwrap();
+        assert_eq!(fault.key.split('.').next_back(), Some(key), "{fault}");
+        fault.advice
+    };
+    let placeholder = "write it as { red = ..., green = ..., blue = ... }";
+    let in_order = "if they are red, green and blue: write it as { red = ";
+    for (key, given, expected) in [
+        ("power_mw", "[1.2, 0.8, 1]", format!("{in_order}1.2, green = 0.8, blue = 1 }}")),
+        ("wavelengths_nm", "[639, 532, 473]", format!("{in_order}639, green = 532, blue = 473 }}")),
+        ("power_mw", "1.2", "write it as { red = 1.2, green = 1.2, blue = 1.2 }".into()),
+        // Neither two numbers, nor one that is refused in the next round, nor texts say three powers.
+        ("power_mw", "[1.2, 0.8]", placeholder.into()),
+        ("power_mw", "[1.2, 0.8, 600]", placeholder.into()),
+        ("power_mw", "600", placeholder.into()),
+        ("power_mw", "\"1.2 0.8 1.0\"", placeholder.into()),
+        ("power_mw", "[\"1.2\", \"0.8\", \"1.0\"]", placeholder.into()),
+        ("stroke_pi", "[[1], [2], [3]]", placeholder.into()),
+        ("wavelengths_nm", "[]", placeholder.into()),
+    ] {
+        assert_eq!(advice(key, given), expected, "{key} = {given}");
+    }
+    let beam = "driver = \"ready-beam\"\ndevice = \"/dev/x\"";
+    for full_power in ["", "\nfull_power_mw = [40, 30]"] {
+        let [fault] = with_driver(&format!("{beam}{full_power}\n{ACCEPTED}")).unwrap_err().faults.try_into().unwrap();
+        assert!(fault.advice.contains("{ red = ..., green = ..., blue = ... }"), "{fault}");
+    }
+}
+
 /// The driver's line with other lines in its place.
 fn with_driver(lines: &str) -> Result<Rig, RigError> {
     Rig::parse(&changed(&[("driver = \"simulated\"", lines)]), Path::new("bench/rig.toml"))

@@ -662,7 +662,7 @@ fn read_driver<'a>(
             missing(
                 "full_power_mw",
                 "each colour's power at the panel at 100 %",
-                "full_power_mw = { red = 40.0, green = 30.0, blue = 50.0 }",
+                "full_power_mw = { red = ..., green = ..., blue = ... }, as measured",
             );
             let [Some(red), Some(green), Some(blue)] = full_power.0 else { return None };
             let full_power_uw = PerColour([red, green, blue]).map(|power| (power.value * 1e3).round() as u32);

@@ -1,6 +1,6 @@
 //! Reads keys out of a TOML document and keeps count of everything that is wrong with them.
 
-use toml_edit::{Document, Item, Table, TableLike};
+use toml_edit::{Document, Item, Table, TableLike, Value};
 
 use super::files::FileFault;
 use crate::toml_source::{Fault, TomlSource, describe, describe_unknown, did_you_mean, nearest};
@@ -61,6 +61,23 @@ impl Span {
         }
         "correct it".into()
     }
+
+    /// How to write for each colour what `given` says, where it can be told: a figure that nobody wrote could be a
+    /// power that no eye bears.
+    fn for_each_colour(&self, given: &Item) -> Option<String> {
+        if let Some(number) = number_in(given) {
+            return self.takes(number).then(|| each_colour([number; 3]));
+        }
+        let numbers: Option<Vec<f64>> = given.as_array()?.iter().map(number_of_value).collect();
+        let numbers = <[f64; 3]>::try_from(numbers?).ok().filter(|numbers| numbers.iter().all(|n| self.takes(*n)))?;
+        Some(format!("if they are red, green and blue: {}", each_colour(numbers)))
+    }
+}
+
+/// The advice to write these figures as red's, green's and blue's.
+fn each_colour(figures: [impl std::fmt::Display; 3]) -> String {
+    let [red, green, blue] = figures;
+    format!("write it as {{ red = {red}, green = {green}, blue = {blue} }}")
 }
 
 /// A number without the last digits that a conversion of units leaves behind.
@@ -280,9 +297,9 @@ impl<'a> Reader<'a> {
         span: Span,
         required: PerColour<bool>,
     ) -> PerColour<Option<Found<f64>>> {
-        let given = self.lookup(section, key).and_then(|found| number_in(found.value)).unwrap_or(span.max);
-        let example = format!("{{ red = {given}, green = {given}, blue = {given} }}");
-        let items = self.colours(section, key, &span.expected(), required, &example);
+        let given = self.lookup(section, key).map(|found| found.value);
+        let advice = given.and_then(|given| span.for_each_colour(given)).unwrap_or_else(|| each_colour(["..."; 3]));
+        let items = self.colours(section, key, &span.expected(), required, &advice);
         PerColour(Colour::ALL.map(|colour| {
             let found = items[colour]?;
             let value = self.number_of(section, &format!("{key}.{colour}"), found, span)?;
@@ -292,8 +309,8 @@ impl<'a> Reader<'a> {
 
     /// A text for each colour, none required.
     pub(super) fn texts(&self, section: Section<'a>, key: &str, expected: &str) -> PerColour<Option<Found<&'a str>>> {
-        let example = "{ red = \"red.file\", green = \"green.file\", blue = \"blue.file\" }";
-        let items = self.colours(section, key, expected, PerColour([false; 3]), example);
+        let advice = each_colour(["\"red.file\"", "\"green.file\"", "\"blue.file\""]);
+        let items = self.colours(section, key, expected, PerColour([false; 3]), &advice);
         PerColour(Colour::ALL.map(|colour| {
             let found = items[colour]?;
             self.text_of(section, &format!("{key}.{colour}"), found, expected)
@@ -306,7 +323,7 @@ impl<'a> Reader<'a> {
         key: &str,
         expected: &str,
         required: PerColour<bool>,
-        example: &str,
+        advice: &str,
     ) -> PerColour<Option<Found<&'a Item>>> {
         const NONE: PerColour<Option<Found<&Item>>> = PerColour([None; 3]);
         let Some(found) = self.lookup(section, key) else {
@@ -316,8 +333,7 @@ impl<'a> Reader<'a> {
             return NONE;
         };
         let Some(table) = found.value.as_table_like() else {
-            let advice = format!("write it as {example}");
-            self.wrong_type(section, key, found, &format!("{expected} for each colour"), advice);
+            self.wrong_type(section, key, found, &format!("{expected} for each colour"), advice.into());
             return NONE;
         };
         let names = Colour::ALL.map(Colour::name);
@@ -512,7 +528,11 @@ impl<'a> Reader<'a> {
 
 /// The number that `item` gives: an integer, a float, or the text "inf".
 fn number_in(item: &Item) -> Option<f64> {
-    item.as_float().or_else(|| item.as_integer().map(|integer| integer as f64)).or_else(|| match item.as_str() {
+    item.as_value().and_then(number_of_value)
+}
+
+fn number_of_value(value: &Value) -> Option<f64> {
+    value.as_float().or_else(|| value.as_integer().map(|integer| integer as f64)).or_else(|| match value.as_str() {
         Some("inf" | "infinity") => Some(f64::INFINITY),
         _ => None,
     })
