@@ -5,13 +5,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use holod_calibration::rig::{
-    Eye, LaserDriver, LevelPhase, Orientation, OutOfStroke, Packing, PanelMode, PanelProfile, PhaseSign, Provenance,
-    Rig, RigError, TextLaserProfile, WeightsChoice,
+    Eye, LaserDriver, LevelPhase, Meaning, Orientation, OutOfStroke, Packing, PanelMode, PanelProfile, PhaseSign,
+    Provenance, Rig, RigError, TextLaserProfile, WeightsChoice,
 };
 use holod_calibration::toml_source::Fault;
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, Resolution, TimeNs};
 use image::{GrayImage, ImageBuffer, ImageFormat, Luma, Rgb, RgbImage, RgbaImage};
 use proptest::prelude::*;
+use serde_json::json;
 
 const EXAMPLE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/rigs/example.toml");
 
@@ -74,7 +75,7 @@ fn the_example_rig_says_what_its_comments_say() {
     assert_eq!(rig.geometry.depth_near, DisplayGeometry::DEFAULT.depth_near);
     assert_eq!(rig.lasers.driver, LaserDriver::Serial { path: "/dev/holod-lasers".into(), sync_wire: false });
     assert_eq!(rig.lasers.power_mw, PerColour([1.2, 0.8, 1.0]));
-    assert_eq!(rig.lasers.power_limit_mw, PerColour([2.0; 3]));
+    assert_eq!(rig.lasers.power_limit_mw, PerColour([Some(2.0); 3]));
     assert_eq!(rig.tracker.spec.as_deref(), Some("serial:/dev/holod-tracker"));
     assert_eq!(rig.model.weights, WeightsChoice::Standard);
 
@@ -147,6 +148,12 @@ fn figures_in_another_unit_are_recognised() {
             "write 40 ",
         ),
         ("lit_ms = 3.0", "lit_ms = 3000", "lasers.lit_ms", "looks like microseconds: write 3 "),
+        (
+            "power_mw = { red = 1.0",
+            "power_mw = { red = 1200",
+            "lasers.power_mw.red",
+            "microwatts: write 1.2 for 1.2 mW",
+        ),
         (
             "heartbeat_timeout_ms = 100.0",
             "heartbeat_timeout_ms = 0.1",
@@ -584,9 +591,21 @@ fn a_power_above_the_benchs_limit_is_refused() {
     let error = with_driver(limited).unwrap_err();
     let [fault] = error.faults.as_slice() else { panic!("{error}") };
     assert_eq!((fault.key.as_str(), fault.line.is_some()), ("lasers.power_mw.green", true));
-    assert!(fault.expected.contains("0.5 mW"), "{fault}");
+    assert!(fault.expected.contains("0.5 mW") && fault.advice.starts_with("lower it"), "{fault}");
+    // Of 120 it may be said that they are microwatts; of what is a little too much not.
+    let advice = |power: &str, limit: &str| {
+        let lines = format!("driver = \"simulated\"\npower_limit_mw = {{ green = {limit} }}");
+        let text = changed(&[("driver = \"simulated\"", &lines), ("green = 1.0", &format!("green = {power}"))]);
+        let [fault] = faults_of(&text).try_into().unwrap();
+        fault.advice
+    };
+    assert_eq!(advice("120", "2"), "120 looks like microwatts: write 0.12 for 0.12 mW");
+    assert_eq!(advice("1200", "2"), "1200 looks like microwatts: write 1.2 for 1.2 mW");
+    for (power, limit) in [("2.5", "2"), ("19", "2"), ("1", "0")] {
+        assert!(advice(power, limit).starts_with("lower it"), "{power} of {limit}");
+    }
     let rig = with_driver("driver = \"simulated\"\npower_limit_mw = { red = 2.0 }").unwrap();
-    assert_eq!(rig.lasers.power_limit_mw, PerColour([2.0, 500.0, 500.0]));
+    assert_eq!(rig.lasers.power_limit_mw, PerColour([Some(2.0), None, None]));
 }
 
 #[test]
@@ -1120,6 +1139,58 @@ fn meaning_warns_of_what_a_bench_cannot_do() {
         assert!(notes.iter().any(|said| said.contains(note)), "{note}: {notes:?}");
     }
     assert!(!notes.iter().any(|said| said.starts_with("red: the panel's stroke")));
+}
+
+#[test]
+fn meaning_says_the_lasers_powers_and_what_bounds_them() {
+    let meaning = |lines: &str| with_driver(lines).unwrap().meaning();
+    let unlimited = "no power_limit_mw, so that a power_mw of up to 500 is taken";
+    let is_noted = |meaning: &Meaning, colours: &str| {
+        meaning.notes.iter().any(|note| note.starts_with(&format!("{colours}: {unlimited}")))
+    };
+    let serial = "driver = \"serial\"\ndevice = \"/dev/box\"\nstall_timeout_ms = 900";
+    let limited = meaning(&format!("{serial}\npower_limit_mw = {{ red = 2.5, green = 1, blue = 2 }}"));
+    let text = limited.to_string();
+    for part in [
+        "lasers         serial /dev/box; dark when nothing is heard of holod for 100 ms, or when one hologram has \
+         stayed for 900 ms\n",
+        "power          red 1 mW of at most 2.5, green 1 mW of at most 1, blue 1 mW of at most 2\n",
+        "tracker        none named; eye: both; no scale_mm_per_unit; lost, the last is held for 1000 ms, then 3 mm\n",
+    ] {
+        assert!(text.contains(part), "{part} is not in\n{text}");
+    }
+    assert!(!text.contains(unlimited));
+    let json = serde_json::to_value(&limited).unwrap();
+    assert_eq!((&json["lasers"]["driver"], &json["lasers"]["power_mw"]["red"]), (&json!("serial"), &json!(1.0)));
+    assert_eq!(json["lasers"]["power_limit_mw"], json!({"red": 2.5, "green": 1.0, "blue": 2.0}));
+    assert_eq!((&json["lasers"]["heartbeat_timeout_ms"], &json["tracker"]["eye"]), (&json!(100.0), &json!("both")));
+
+    let in_part = meaning(&format!("{serial}\npower_limit_mw = {{ green = 1 }}"));
+    assert!(is_noted(&in_part, "red, blue") && !is_noted(&limited, "red"), "{:?}", in_part.notes);
+    assert!(in_part.to_string().contains("red 1 mW without a power_limit_mw (500 at most), green 1 mW of at most 1"));
+    let json = serde_json::to_value(&in_part).unwrap();
+    assert_eq!(json["lasers"]["power_limit_mw"], json!({"red": null, "green": 1.0, "blue": null}));
+    assert_eq!(json["lasers"]["power_max_mw"], json!(500.0));
+    // Of lasers that are not there nothing is asked, and of simulated ones no limit.
+    let one =
+        meaning(&format!("driver = \"text\"\nprofile = \"cobolt\"\ndevices = {{ green = \"/dev/g\" }}\n{ACCEPTED}"));
+    assert!(is_noted(&one, "green"), "{:?}", one.notes);
+    assert!(one.to_string().contains("lasers         text /dev/g; without a heartbeat: lit when holod dies\n"));
+    assert!(!Rig::default().meaning().notes.iter().any(|note| note.contains(unlimited)));
+    let beam = meaning(&format!(
+        "driver = \"ready-beam\"\ndevice = \"/dev/b\"\n\
+         full_power_mw = {{ red = 40, green = 30.5, blue = 50 }}\n{ACCEPTED}"
+    ));
+    assert!(beam.to_string().contains("at 100 %       red 40, green 30.5, blue 50 mW\n"), "{beam}");
+    let tracked = Rig::parse(
+        "[tracker]\nspec = \"mock\"\neye = \"left\"\nscale_mm_per_unit = 0.0125\nfallback_mm = 3.3\n",
+        Path::new(""),
+    )
+    .unwrap();
+    assert!(tracked.meaning().to_string().contains(
+        "tracker        mock; eye: left; 0.0125 mm for one unit of its figure; lost, the last is held for 1000 ms, \
+             then 3.3 mm\n"
+    ));
 }
 
 #[test]

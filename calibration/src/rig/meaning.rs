@@ -6,8 +6,8 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{LaserDriver, Orientation, PanelProfile, Rig};
-use crate::{PerColour, PupilDiameter};
+use super::{LaserDriver, Lasers, Orientation, PanelProfile, Rig, Tracker};
+use crate::{Colour, PerColour, PupilDiameter};
 
 /// The pupils for which blur is worked out.
 const PUPILS_MM: [f32; 3] = [2.0, 3.0, 4.0];
@@ -15,10 +15,10 @@ const PUPILS_MM: [f32; 3] = [2.0, 3.0, 4.0];
 /// A figure for each colour.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[expect(missing_docs, reason = "the names say it")]
-pub struct PerColourFigures {
-    pub red: f64,
-    pub green: f64,
-    pub blue: f64,
+pub struct PerColourFigures<T = f64> {
+    pub red: T,
+    pub green: T,
+    pub blue: T,
 }
 
 /// What follows from a rig file.
@@ -65,6 +65,10 @@ pub struct Meaning {
     pub blurs: Vec<BlurMeaning>,
     /// How one colour field passes.
     pub field: FieldMeaning,
+    /// The light that it brings.
+    pub lasers: LaserMeaning,
+    /// The tracker, and what holds without it.
+    pub tracker: TrackerMeaning,
     /// Bits of one level.
     pub bit_depth: u8,
     /// Where these bits travel on the video link.
@@ -111,6 +115,43 @@ pub struct FieldMeaning {
     pub lit_share: f64,
 }
 
+/// The lasers and what keeps them in bounds.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct LaserMeaning {
+    /// `simulated`, `serial`, `ready-beam` or `text`.
+    pub driver: String,
+    /// The ports that it uses.
+    pub ports: Vec<PathBuf>,
+    /// Optical power at the panel while a colour is lit.
+    pub power_mw: PerColourFigures,
+    /// Greatest power that the rig allows; absent where it says none.
+    pub power_limit_mw: PerColourFigures<Option<f64>>,
+    /// What holds in place of a limit that is absent.
+    pub power_max_mw: f64,
+    /// Power at the panel of lasers that are set to 100 %, of those that are set in percent.
+    pub full_power_mw: Option<PerColourFigures>,
+    /// The lasers go dark by themselves when they have heard nothing for this long; absent where they stay lit when
+    /// holod dies.
+    pub heartbeat_timeout_ms: Option<f64>,
+    /// They go dark when one hologram has stayed for this long; absent where that follows from the frames' time.
+    pub stall_timeout_ms: Option<f64>,
+}
+
+/// The eye tracker.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct TrackerMeaning {
+    /// As on the command line; absent where the rig names none.
+    pub spec: Option<String>,
+    /// `left`, `right`, `both` or `better`.
+    pub eye: String,
+    /// Millimetres for one unit of the tracker's figure; absent where the rig says none.
+    pub scale_mm_per_unit: Option<f64>,
+    /// The diameter after a long loss.
+    pub fallback_mm: f64,
+    /// How long the last good diameter is held before.
+    pub hold_ms: f64,
+}
+
 /// A calibration file that is in use.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct ActiveFile {
@@ -122,8 +163,8 @@ pub struct ActiveFile {
     pub path: PathBuf,
 }
 
-impl From<PerColour<f64>> for PerColourFigures {
-    fn from(figures: PerColour<f64>) -> Self {
+impl<T> From<PerColour<T>> for PerColourFigures<T> {
+    fn from(figures: PerColour<T>) -> Self {
         let [red, green, blue] = figures.0;
         Self { red, green, blue }
     }
@@ -168,6 +209,8 @@ impl Meaning {
             panel_half_angle_mrad: panel_half_angle.map(|angle_rad| angle_rad * 1e3).into(),
             blurs: blurs.to_vec(),
             field: FieldMeaning::of(rig),
+            lasers: LaserMeaning::of(&rig.lasers),
+            tracker: TrackerMeaning::of(&rig.tracker),
             bit_depth: rig.panel.bit_depth,
             packing: rig.panel.packing.name().into(),
             files: active_files(rig),
@@ -193,6 +236,38 @@ impl FieldMeaning {
             laser_on_ms,
             laser_off_ms: laser_on_ms + lit_ms,
             lit_share: lit_ms / period_ms,
+        }
+    }
+}
+
+impl LaserMeaning {
+    fn of(lasers: &Lasers) -> Self {
+        let Lasers { driver, power_mw, power_limit_mw, heartbeat_timeout, stall_timeout, .. } = lasers;
+        let full_power_mw = match driver {
+            LaserDriver::ReadyBeam { full_power_uw, .. } => Some(full_power_uw.map(|uw| f64::from(uw) / 1e3).into()),
+            _ => None,
+        };
+        Self {
+            driver: driver.name().into(),
+            ports: driver.paths().into_iter().map(PathBuf::from).collect(),
+            power_mw: (*power_mw).into(),
+            power_limit_mw: (*power_limit_mw).into(),
+            power_max_mw: Lasers::POWER_MAX_MW,
+            full_power_mw,
+            heartbeat_timeout_ms: driver.has_heartbeat().then(|| heartbeat_timeout.seconds() * 1e3),
+            stall_timeout_ms: stall_timeout.map(|timeout| timeout.seconds() * 1e3),
+        }
+    }
+}
+
+impl TrackerMeaning {
+    fn of(tracker: &Tracker) -> Self {
+        Self {
+            spec: tracker.spec.clone(),
+            eye: tracker.eye.name().into(),
+            scale_mm_per_unit: tracker.scale,
+            fallback_mm: (f64::from(tracker.fallback.mm()) * 1e3).round() / 1e3,
+            hold_ms: tracker.hold.seconds() * 1e3,
         }
     }
 }
@@ -231,6 +306,16 @@ fn notes(rig: &Rig) -> Vec<String> {
         if *power_mw == 0.0 {
             notes.push(format!("{colour}: the laser's power is 0, so this colour stays dark"));
         }
+    }
+    let unlimited = |colour: &Colour| rig.lasers.driver.has(*colour) && rig.lasers.power_limit_mw[*colour].is_none();
+    let unlimited: Vec<&str> = Colour::ALL.into_iter().filter(unlimited).map(Colour::name).collect();
+    if rig.lasers.driver != LaserDriver::Simulated && !unlimited.is_empty() {
+        notes.push(format!(
+            "{}: no power_limit_mw, so that a power_mw of up to {} is taken, a slip too: write what this bench's \
+             optics allow an eye",
+            unlimited.join(", "),
+            Lasers::POWER_MAX_MW
+        ));
     }
     if rig.panel.orientation != Orientation::Normal {
         notes.push(format!("pictures lie on the panel in the orientation {}", rig.panel.orientation.name()));
@@ -271,6 +356,51 @@ fn notes(rig: &Rig) -> Vec<String> {
 impl fmt::Display for PerColourFigures {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "red {:.2}, green {:.2}, blue {:.2}", self.red, self.green, self.blue)
+    }
+}
+
+impl fmt::Display for LaserMeaning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "lasers         {}", self.driver)?;
+        self.ports.iter().try_for_each(|port| write!(f, " {}", port.display()))?;
+        match self.heartbeat_timeout_ms {
+            Some(timeout_ms) => write!(f, "; dark when nothing is heard of holod for {timeout_ms} ms")?,
+            None => f.write_str("; without a heartbeat: lit when holod dies")?,
+        }
+        match self.stall_timeout_ms {
+            Some(timeout_ms) => writeln!(f, ", or when one hologram has stayed for {timeout_ms} ms")?,
+            None => writeln!(f)?,
+        }
+        let PerColourFigures { red, green, blue } = self.power_limit_mw;
+        let limits_mw = PerColour([red, green, blue]);
+        let PerColourFigures { red, green, blue } = self.power_mw;
+        let powers = PerColour([red, green, blue]).0.into_iter().zip(limits_mw.0).zip(Colour::ALL);
+        let powers = powers.map(|((power_mw, limit_mw), colour)| match limit_mw {
+            Some(limit_mw) => format!("{colour} {power_mw} mW of at most {limit_mw}"),
+            None => format!("{colour} {power_mw} mW without a power_limit_mw ({} at most)", self.power_max_mw),
+        });
+        writeln!(f, "power          {}", powers.collect::<Vec<_>>().join(", "))?;
+        match &self.full_power_mw {
+            Some(PerColourFigures { red, green, blue }) => {
+                writeln!(f, "at 100 %       red {red}, green {green}, blue {blue} mW")
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+impl fmt::Display for TrackerMeaning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { spec, eye, scale_mm_per_unit, fallback_mm, hold_ms } = self;
+        let spec = spec.as_deref().unwrap_or("none named");
+        let scale = match scale_mm_per_unit {
+            Some(scale) => format!("{scale} mm for one unit of its figure"),
+            None => "no scale_mm_per_unit".into(),
+        };
+        writeln!(
+            f,
+            "tracker        {spec}; eye: {eye}; {scale}; lost, the last is held for {hold_ms} ms, then {fallback_mm} mm"
+        )
     }
 }
 
@@ -330,6 +460,7 @@ impl fmt::Display for Meaning {
             field.laser_off_ms,
             field.lit_share * 100.0
         )?;
+        write!(f, "{}{}", self.lasers, self.tracker)?;
         writeln!(f, "levels         {} bits, packing {}", self.bit_depth, self.packing)?;
         if self.files.is_empty() {
             writeln!(f, "files          none: phase is linear in the level, and the panel is taken as flat")?;

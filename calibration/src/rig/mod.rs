@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 
 pub use drive::{LevelPhase, Orientation, OutOfStroke, Packing};
 pub use error::RigError;
-pub use meaning::{ActiveFile, BlurMeaning, FieldMeaning, Meaning, PerColourFigures};
+pub use meaning::{ActiveFile, BlurMeaning, FieldMeaning, LaserMeaning, Meaning, PerColourFigures, TrackerMeaning};
 pub use profile::PanelProfile;
 pub use text_laser::{Expected, Question, TextLaserProfile};
 
@@ -126,7 +126,8 @@ pub struct Lasers {
     /// Optical power of each colour while it is lit, milliwatts at the panel.
     pub power_mw: PerColour<f64>,
     /// Greatest optical power that this bench allows each colour, milliwatts at the panel; not less than `power_mw`.
-    pub power_limit_mw: PerColour<f64>,
+    /// Where the rig says none, [`Lasers::POWER_MAX_MW`] holds.
+    pub power_limit_mw: PerColour<Option<f64>>,
     /// From the field's settled phase to the laser's on edge.
     pub on_delay: TimeNs,
     /// Length of the lit window within a field.
@@ -170,7 +171,35 @@ pub enum LaserDriver {
     },
 }
 
+impl Lasers {
+    /// The greatest power that a rig may name, milliwatts at the panel.
+    pub const POWER_MAX_MW: f64 = 500.0;
+
+    /// The power that no colour exceeds, milliwatts at the panel: the rig's limit, or what holds without one.
+    pub fn greatest_power_mw(&self) -> PerColour<f64> {
+        self.power_limit_mw.map(|limit_mw| limit_mw.unwrap_or(Self::POWER_MAX_MW))
+    }
+}
+
 impl LaserDriver {
+    /// The driver's name in a rig file.
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::Simulated => "simulated",
+            Self::Serial { .. } => "serial",
+            Self::ReadyBeam { .. } => "ready-beam",
+            Self::Text { .. } => "text",
+        }
+    }
+
+    /// Whether it has a laser of `colour`.
+    pub const fn has(&self, colour: Colour) -> bool {
+        match self {
+            Self::Text { paths, .. } => paths.0[colour.index()].is_some(),
+            _ => true,
+        }
+    }
+
     /// The ports that it uses.
     pub fn paths(&self) -> Vec<&Path> {
         match self {
@@ -278,7 +307,7 @@ impl Default for Rig {
             lasers: Lasers {
                 driver: LaserDriver::Simulated,
                 power_mw: PerColour([1.0; 3]),
-                power_limit_mw: PerColour([500.0; 3]),
+                power_limit_mw: PerColour([None; 3]),
                 on_delay: TimeNs(100_000),
                 width: TimeNs(3_000_000),
                 heartbeat_timeout: TimeNs(100_000_000),

@@ -100,8 +100,11 @@ const DEPTH_M: Span = Span::new(0.05, 100.0, "m").slips(&[("millimetres", 1e-3)]
 const DEPTH_DPT: Span = Span::new(0.0, 20.0, "dioptres");
 /// Below this a volume's two ends look alike to any eye.
 const DEPTH_RANGE_MIN_DPT: f64 = 0.1;
-const POWER: Span = Span::new(0.0, 500.0, "mW");
-const FULL_POWER: Span = Span::new(0.001, 4000.0, "mW");
+const POWER: Span = Span::new(0.0, Lasers::POWER_MAX_MW, "mW").slips(POWER_SLIPS);
+const FULL_POWER: Span = Span::new(0.001, 4000.0, "mW").slips(POWER_SLIPS);
+const POWER_SLIPS: &[(&str, f64)] = &[("microwatts", 1e-3)];
+/// How many times below its limit a power still seems to be meant, where it would be that in another unit.
+const POWER_BELOW_LIMIT_MAX: f64 = 100.0;
 /// What accepts lasers without a heartbeat.
 const ACCEPTANCE: &str = "these lasers stay lit when holod dies";
 const ON_DELAY: Span = Span::new(0.0, 100.0, "ms");
@@ -556,7 +559,9 @@ fn read_lasers<'a>(
             && power.value > limit.value
         {
             let expected = format!("{} mW at most, as power_limit_mw says", limit.value);
-            let advice = "lower it; power_limit_mw is what this bench's optics allow an eye".into();
+            let allowed = Span::new(limit.value / POWER_BELOW_LIMIT_MAX, limit.value, "mW").slips(POWER_SLIPS);
+            let lower = || "lower it; power_limit_mw is what this bench's optics allow an eye".into();
+            let advice = allowed.slip(power.value).unwrap_or_else(lower);
             let found = format!("{} mW", power.value);
             reader.fault_in(lasers, &format!("power_mw.{colour}"), power.line, &found, &expected, advice);
         }
@@ -600,7 +605,7 @@ fn read_lasers<'a>(
     Some(Lasers {
         driver: driver?,
         power_mw: PerColour([red.value, green.value, blue.value]),
-        power_limit_mw: power_limit_mw.map(|limit| limit.map_or(POWER.max, |limit| limit.value)),
+        power_limit_mw: power_limit_mw.map(|limit| limit.map(|limit| limit.value)),
         on_delay: milliseconds(on_delay_ms?.value),
         width: milliseconds(lit_ms?.value),
         heartbeat_timeout: milliseconds(heartbeat_ms?.value),

@@ -53,13 +53,14 @@ impl Span {
     }
 
     fn advice(&self, value: f64) -> String {
-        for (unit, factor) in self.slips {
-            if self.takes(value * factor) {
-                let converted = rounded(value * factor);
-                return format!("{value} looks like {unit}: write {converted} for {converted} {}", self.unit);
-            }
-        }
-        "correct it".into()
+        self.slip(value).unwrap_or_else(|| "correct it".into())
+    }
+
+    /// What to write where `value` is given in one of the units that are given by mistake.
+    pub(super) fn slip(&self, value: f64) -> Option<String> {
+        let (unit, factor) = self.slips.iter().find(|(_, factor)| self.takes(value * factor))?;
+        let converted = rounded(value * factor);
+        Some(format!("{value} looks like {unit}: write {converted} for {converted} {}", self.unit))
     }
 
     /// How to write for each colour what `given` says, where it can be told: a figure that nobody wrote could be a

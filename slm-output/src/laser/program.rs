@@ -8,7 +8,7 @@ use super::{LaserError, LaserProgram};
 
 /// The rig's power limits in microwatts, rounded down.
 pub(super) fn power_limit_uw(lasers: &Lasers) -> PerColour<u32> {
-    lasers.power_limit_mw.map(|mw| (mw * 1e3 + 1e-6) as u32)
+    lasers.greatest_power_mw().map(|mw| (mw * 1e3 + 1e-6) as u32)
 }
 
 /// The laser of a colour.
