@@ -12,7 +12,7 @@ use crc::{CRC_16_XMODEM, Crc};
 use holod_calibration::rig::{LaserDriver, Lasers, PanelMode, Rig, TextLaserProfile};
 use holod_calibration::{Colour, PerColour, TimeNs, host_now};
 use holod_slm_output::laser::{
-    BoxEvent, DarkReason, LaserBox, LaserError, LaserProgram, Refusal, make_dark, open_laser,
+    BoxEvent, DarkReason, LaserBox, LaserError, LaserProgram, Refusal, make_dark, open_laser, takes,
 };
 use holod_slm_output::schedule::FieldGate;
 use serialport::{SerialPort, TTYPort};
@@ -302,6 +302,10 @@ fn text_lasers_are_recognised_put_out_set_lit_and_put_out() {
 
         let missing = laser.program(&program(PanelMode::Monochrome(Colour::Red)), host_now()).unwrap_err();
         assert!(matches!(missing, LaserError::NoLaser { colour: Colour::Red }), "{missing}");
+        let foretold = |mode| takes(&lasers(driver.clone()), &program(mode), None);
+        let said = foretold(PanelMode::Monochrome(Colour::Red)).unwrap_err();
+        assert_eq!(said.to_string(), missing.to_string());
+        foretold(GREEN).unwrap();
         bench.with(|device| device.lit = true);
         make_dark(&driver, host_now).unwrap();
         assert!(!bench.with(|device| device.lit), "{name}");
@@ -316,11 +320,14 @@ fn lasers_that_cannot_gate_fields_light_several_colours_only_where_the_panel_gat
     for mode in [PanelMode::ChannelPacked, PanelMode::FieldSequential] {
         let refused = laser.program(&program(mode), host_now()).unwrap_err();
         assert!(matches!(refused, LaserError::CannotGate), "{refused}");
+        let foretold = takes(&lasers(driver.clone()), &program(mode), None);
+        assert!(matches!(foretold, Err(LaserError::CannotGate)), "{foretold:?}");
         assert!(laser.arm(host_now()).is_err());
     }
     drop(laser);
     let gated = Lasers { gated_by_panel: true, ..lasers(driver.clone()) };
     let mut laser = open_laser(&gated, host_now).unwrap();
+    takes(&gated, &program(PanelMode::ChannelPacked), None).unwrap();
     laser.program(&program(PanelMode::ChannelPacked), host_now()).unwrap();
     laser.arm(host_now()).unwrap();
     alive_until(laser.as_mut(), || benches.iter().all(|bench| bench.with(|device| device.lit)));

@@ -5,7 +5,8 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use holod_pupil_input::wire::line::{LineSample, encode_line};
-use holod_pupil_input::{MockSource, Scenario};
+use holod_pupil_input::{MockSource, Scenario, host_now};
+use holod_slm_output::laser::simulator::{Faults, SimulatedBox, SimulatedTerminal};
 use holod_tests::daemon::{Daemon, Ended, run, wait_until};
 use holod_tests::small_rig;
 use holod_tests::tracker::{PtyTracker, TimedLine};
@@ -371,6 +372,40 @@ fn check_says_what_would_keep_a_tracker_from_being_started() {
     }
     let check = tracker_check("log.asc", "scale_mm_per_unit = 0.0125");
     assert!(check["passed"] == true, "{check}");
+}
+
+#[test]
+fn check_refuses_what_a_laser_box_would_refuse_at_the_start_of_a_run_in_the_same_words() {
+    let folder = holod_tests::new_folder();
+    let terminal = SimulatedTerminal::open().unwrap();
+    let device = terminal.path().to_owned();
+    let mut simulated = SimulatedBox::new(host_now());
+    (simulated.limits.power_uw, simulated.limits.timeout_us) = ([1000; 3], 250_000);
+    let log = fs::File::create(folder.path().join("box.csv")).unwrap();
+    std::thread::spawn(move || terminal.serve(simulated, log, &Faults::default(), host_now));
+    let rig = small_rig(64, 64, &format!("driver = \"serial\"\ndevice = {device:?}"));
+    let lasers = |(from, to): (&str, &str)| {
+        fs::write(folder.path().join("rig.toml"), rig.replacen(from, to, 1)).unwrap();
+        let args = ["check", "--config", "rig.toml", "--resolution", "64x64", "--json"];
+        let checks = json(&run(HOLOD, &args, folder.path()))["checks"].clone();
+        let check = checks.as_array().unwrap().iter().find(|check| check["name"] == "lasers").unwrap().clone();
+        (check["passed"] == true, check["says"].as_str().unwrap().to_owned())
+    };
+    for (change, refused) in [
+        (("red = 1.0", "red = 1.2"), "the laser box takes 1 mW of red power at most; the rig asks for 1.2"),
+        (
+            ("timeout_ms = 100.0", "timeout_ms = 300.0"),
+            "the laser box takes 250 ms of heartbeat timeout at most; the rig asks for 300",
+        ),
+    ] {
+        let (passed, says) = lasers(change);
+        assert!(!passed && says.contains(refused), "{says}");
+        let args = ["--config", "rig.toml", "--tracker", "mock", "--resolution", "64x64", "--frames", "1"];
+        let ended = run(HOLOD, &args, folder.path());
+        assert!(!ended.status.success() && ended.stderr.contains(refused), "{ended:?}");
+    }
+    let (passed, says) = lasers(("red = 1.0", "red = 1.0"));
+    assert!(passed && says.contains("dark, interlock closed"), "{says}");
 }
 
 #[test]

@@ -30,7 +30,7 @@ mod text_laser;
 pub mod verify;
 
 pub use holod_laser_firmware::{DarkReason, Refusal};
-pub use open::{make_dark, open_laser};
+pub use open::{make_dark, open_laser, takes};
 pub use reconnect::LaserWatch;
 pub use serial_box::{BoxReport, SerialBox, SerialOptions};
 pub use simulated::SimulatedLaser;
@@ -173,10 +173,10 @@ pub enum LaserError {
     /// The box is not built for what the rig asks of it.
     #[error("the laser box takes {limit} {unit} of {what} at most; the rig asks for {asked}: correct the rig file")]
     BeyondBox {
-        what: &'static str,
-        limit: u32,
+        what: String,
+        limit: f64,
         /// What the rig asks for.
-        asked: u32,
+        asked: f64,
         /// Of both.
         unit: &'static str,
     },

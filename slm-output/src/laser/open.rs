@@ -3,12 +3,15 @@
 use std::path::{Path, PathBuf};
 use std::thread::ScopedJoinHandle;
 
-use holod_calibration::TimeNs;
 use holod_calibration::rig::{LaserDriver, Lasers};
+use holod_calibration::{Colour, PerColour, TimeNs};
 
-use super::program::power_limit_uw;
+use super::power_box::colours_lit;
+use super::program::{power_limit_uw, within_limits, within_powers};
 use super::reconnect::Reconnecting;
-use super::{LaserBox, LaserError, SerialBox, SerialOptions, SimulatedLaser, ready_beam, text_laser};
+use super::{
+    BoxReport, LaserBox, LaserError, LaserProgram, SerialBox, SerialOptions, SimulatedLaser, ready_beam, text_laser,
+};
 
 /// Opens the laser box of a bench, which is recognised before it is told anything. A box that is lost later is looked
 /// for again by a thread of its own.
@@ -38,6 +41,25 @@ fn open_once(lasers: &Lasers, clock: fn() -> TimeNs) -> Result<Box<dyn LaserBox>
 
 fn serial_options(lasers: &Lasers, sync_wire: bool) -> SerialOptions {
     SerialOptions { sync_wire, power_limit_uw: power_limit_uw(lasers) }
+}
+
+/// Whether the lasers of a bench can do what its `program` asks for, as far as that is known before they are told:
+/// `found` is what a box of holod's protocol says of itself.
+///
+/// # Errors
+/// What [`LaserBox::program`] says then: [`LaserError::BeyondBox`], [`LaserError::CannotGate`],
+/// [`LaserError::NoLaser`].
+pub fn takes(lasers: &Lasers, program: &LaserProgram, found: Option<&BoxReport>) -> Result<(), LaserError> {
+    let has = PerColour(Colour::ALL.map(|colour| lasers.driver.has(colour)));
+    match &lasers.driver {
+        LaserDriver::Simulated => Ok(()),
+        LaserDriver::Serial { .. } => found.map_or(Ok(()), |found| within_limits(program, &found.limits)),
+        LaserDriver::ReadyBeam { full_power_uw, .. } => {
+            colours_lit(program, lasers.gated_by_panel, has)?;
+            within_powers(program.power_uw, *full_power_uw)
+        }
+        LaserDriver::Text { .. } => colours_lit(program, lasers.gated_by_panel, has).map(drop),
+    }
 }
 
 /// Makes the lasers of a bench dark, whoever else has their ports open, and waits for their acknowledgement. All are

@@ -232,6 +232,25 @@ pub(super) fn put_out_beside<D>(
     }
 }
 
+/// The lasers that are lit in `program`, of those that a bench `has`.
+///
+/// # Errors
+/// [`LaserError::CannotGate`], [`LaserError::NoLaser`].
+pub(super) fn colours_lit(
+    program: &LaserProgram,
+    gated_by_panel: bool,
+    has: PerColour<bool>,
+) -> Result<PerColour<bool>, LaserError> {
+    let lit = PerColour(Colour::ALL.map(|colour| program.sequence.contains(&colour)));
+    if lit.0.iter().filter(|&&lit| lit).count() > 1 && !gated_by_panel {
+        return Err(LaserError::CannotGate);
+    }
+    match Colour::ALL.into_iter().find(|&colour| lit[colour] && !has[colour]) {
+        None => Ok(lit),
+        Some(colour) => Err(LaserError::NoLaser { colour }),
+    }
+}
+
 impl LaserBox for PowerBox {
     fn capability(&self) -> Capability {
         Capability { simulated: false, gates_fields: false, has_heartbeat: false, sync_wire: false }
@@ -242,14 +261,8 @@ impl LaserBox for PowerBox {
     }
 
     fn program(&mut self, program: &LaserProgram, _now: TimeNs) -> Result<(), LaserError> {
-        let lit = PerColour(Colour::ALL.map(|colour| program.sequence.contains(&colour)));
-        if lit.0.iter().filter(|&&lit| lit).count() > 1 && !self.gated_by_panel {
-            return Err(LaserError::CannotGate);
-        }
+        let lit = colours_lit(program, self.gated_by_panel, self.has)?;
         for colour in Colour::ALL.into_iter().filter(|&colour| lit[colour]) {
-            if !self.has[colour] {
-                return Err(LaserError::NoLaser { colour });
-            }
             if program.power_uw[colour] > self.power_limit_uw[colour] {
                 let found = format!("{} mW for {colour}", f64::from(program.power_uw[colour]) / 1e3);
                 return Err(LaserError::Figure { what: "power_mw", found, expected: "not more than power_limit_mw" });

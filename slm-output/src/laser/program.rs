@@ -2,13 +2,46 @@
 
 use holod_calibration::rig::Lasers;
 use holod_calibration::{Colour, PerColour, TimeNs};
-use holod_laser_firmware::{Command, Laser, Sequence, TimeUs, Trigger, Window};
+use holod_laser_firmware::{Command, Laser, Limits, Sequence, TimeUs, Trigger, Window};
 
 use super::{LaserError, LaserProgram};
 
 /// The rig's power limits in microwatts, rounded down.
 pub(super) fn power_limit_uw(lasers: &Lasers) -> PerColour<u32> {
     lasers.greatest_power_mw().map(|mw| (mw * 1e3 + 1e-6) as u32)
+}
+
+/// Whether a box that is built for `limits` takes `program`.
+///
+/// # Errors
+/// [`LaserError::BeyondBox`].
+pub(super) fn within_limits(program: &LaserProgram, limits: &Limits) -> Result<(), LaserError> {
+    within_powers(program.power_uw, PerColour(limits.power_uw))?;
+    let lit = program.windows.iter().map(|window| window.width.0 / 1000).max().unwrap_or(0);
+    for (what, asked_us, limit_us) in [
+        ("heartbeat timeout", program.heartbeat_timeout.0 / 1000, limits.timeout_us),
+        ("lit time", lit - i64::from(limits.jitter_us), limits.lit_us),
+    ] {
+        if asked_us > i64::from(limit_us) {
+            let (limit, asked) = (f64::from(limit_us) / 1e3, asked_us as f64 / 1e3);
+            return Err(LaserError::BeyondBox { what: what.into(), limit, asked, unit: "ms" });
+        }
+    }
+    Ok(())
+}
+
+/// Whether lasers of at most `limit_uw` can give `power_uw`.
+///
+/// # Errors
+/// [`LaserError::BeyondBox`].
+pub(super) fn within_powers(power_uw: PerColour<u32>, limit_uw: PerColour<u32>) -> Result<(), LaserError> {
+    match Colour::ALL.into_iter().find(|&colour| power_uw[colour] > limit_uw[colour]) {
+        None => Ok(()),
+        Some(colour) => {
+            let [limit, asked] = [limit_uw, power_uw].map(|power_uw| f64::from(power_uw[colour]) / 1e3);
+            Err(LaserError::BeyondBox { what: format!("{colour} power"), limit, asked, unit: "mW" })
+        }
+    }
 }
 
 /// The laser of a colour.

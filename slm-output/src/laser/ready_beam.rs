@@ -12,6 +12,7 @@ use holod_calibration::{Colour, PerColour, TimeNs};
 use super::line_link::Sharing;
 use super::mecom::{Reply, Request, frame, reply};
 use super::power_box::{Conversation, PowerBox, PowerDevice, put_out_beside, require_acceptance};
+use super::program::within_powers;
 use super::{LaserBox, LaserError};
 
 const BAUD: u32 = 57_600;
@@ -170,11 +171,9 @@ impl PowerDevice for ReadyBeam {
     }
 
     fn set_power(&mut self, power_uw: PerColour<u32>) -> Result<(), LaserError> {
+        within_powers(power_uw, self.full_power_uw)?;
         for colour in Colour::ALL {
             let (asked, full) = (power_uw[colour], self.full_power_uw[colour]);
-            if asked > full {
-                return Err(LaserError::BeyondBox { what: "power", limit: full, asked, unit: "µW" });
-            }
             let percent = (f64::from(asked) / f64::from(full) * 100.0) as f32;
             self.write(POWER_PERCENT, colour, percent.to_bits())?;
         }

@@ -13,7 +13,7 @@ use holod_laser_firmware::{
 
 use super::box_clock::{BoxClock, Offset};
 use super::line_link::{Arrival, Link, Sharing, open_port};
-use super::program::{ceil_us, commands, floor_us, laser_of, nanoseconds};
+use super::program::{ceil_us, commands, floor_us, laser_of, nanoseconds, within_limits};
 use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow, SimulatedLaser, Trigger};
 
 const BAUD: u32 = 115_200;
@@ -441,16 +441,7 @@ impl LaserBox for SerialBox {
     fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
         let limits = self.limits;
         let power_limit_uw = PerColour([0, 1, 2].map(|i| self.options.power_limit_uw.0[i].min(limits.power_uw[i])));
-        for (&asked, &limit) in program.power_uw.0.iter().zip(&limits.power_uw) {
-            if asked > limit {
-                return Err(LaserError::BeyondBox { what: "power", limit, asked, unit: "µW" });
-            }
-        }
-        let timeout_us = u32::try_from(program.heartbeat_timeout.0 / 1000).unwrap_or(u32::MAX);
-        if timeout_us > limits.timeout_us {
-            let limit = limits.timeout_us;
-            return Err(LaserError::BeyondBox { what: "heartbeat timeout", limit, asked: timeout_us, unit: "µs" });
-        }
+        within_limits(program, &limits)?;
         let trigger = self.trigger(program);
         for command in commands(program, trigger, power_limit_uw, limits.jitter_us)? {
             self.ask(&command, SET_UP_WAIT)?;

@@ -2,9 +2,10 @@
 
 use holod_calibration::rig::{LaserDriver, Rig};
 use holod_pupil_input::host_now;
-use holod_slm_output::laser::{SerialBox, open_laser};
+use holod_slm_output::laser::{BoxReport, LaserError, SerialBox, open_laser, takes};
 use holod_slm_output::present::drm::Verdict;
 use holod_slm_output::present::{PanelSetup, open_panel};
+use holod_slm_output::schedule::FieldGate;
 use holod_slm_output::{OutputSpec, PanelEncoder};
 
 use super::{Check, present};
@@ -40,7 +41,13 @@ pub(super) fn lasers(rig: &Rig) -> Vec<Check> {
                 );
                 check(false, says)
             }
-            Ok(found) => check(true, format!("{}: {}, dark, interlock closed", path.display(), found.name)),
+            Ok(found) => {
+                let says = format!("{}: {}", path.display(), found.name);
+                match can_do(rig, Some(&found)) {
+                    Ok(()) => check(true, format!("{says}, dark, interlock closed")),
+                    Err(error) => check(false, format!("{says}: {error}")),
+                }
+            }
         },
         driver => match open_laser(&rig.lasers, host_now) {
             Err(error) => check(false, error.to_string()),
@@ -48,10 +55,19 @@ pub(super) fn lasers(rig: &Rig) -> Vec<Check> {
                 drop(laser);
                 let paths: Vec<_> = driver.paths().iter().map(|path| path.display().to_string()).collect();
                 let says = "recognised and dark; it stays lit when holod is killed, and cannot time single fields";
-                check(true, format!("{}: {says}", paths.join(", ")))
+                match can_do(rig, None) {
+                    Ok(()) => check(true, format!("{}: {says}", paths.join(", "))),
+                    Err(error) => check(false, format!("{}: {error}", paths.join(", "))),
+                }
             }
         },
     }
+}
+
+/// Whether the lasers take what they are told at the start of a run.
+fn can_do(rig: &Rig, found: Option<&BoxReport>) -> Result<(), LaserError> {
+    let program = FieldGate::new(&rig.panel, &rig.lasers)?.program(&rig.panel, &rig.lasers)?;
+    takes(&rig.lasers, &program, found)
 }
 
 /// The way to the panel: opened as a run would, with the flat pattern on it, looked at, and closed.
