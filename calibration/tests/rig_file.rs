@@ -753,6 +753,21 @@ fn a_lut_is_read_and_named_among_the_active_files() {
 }
 
 #[test]
+fn a_table_whose_range_is_like_multiples_of_pi_is_asked_for_its_unit() {
+    let in_pi = "; where the phases in its table are multiples of π, multiply them by π";
+    let told = |rig: Rig| rig.panel.short_strokes();
+    let [green] = told(load_sparse_lut("0,0.0\n255,1.9921875\n").unwrap()).try_into().unwrap();
+    assert!(green.starts_with("green: the panel's stroke is 0.634 π; ") && green.ends_with(in_pi), "{green}");
+    let [green] = told(load_sparse_lut("0,0.0\n255,5.0\n").unwrap()).try_into().unwrap();
+    assert!(green.starts_with("green: the panel's stroke is 1.592 π; ") && !green.contains(in_pi), "{green}");
+    // Without a table there is nothing to multiply.
+    let text = changed(&[("green = 1.9921875", "green = 0.634")]);
+    let [green] = told(Rig::parse(&text, Path::new("")).unwrap()).try_into().unwrap();
+    assert!(!green.contains(in_pi), "{green}");
+    assert!(told(load_lut(&lut_csv(straight)).unwrap()).is_empty());
+}
+
+#[test]
 fn a_byte_order_mark_before_a_text_is_no_part_of_it() {
     let table = |csv: &str| load_lut(csv).unwrap().panel.lut[Colour::Green].clone();
     let bare: String = (0..256).map(|level| format!("{level},{}\n", straight(level))).collect();
@@ -921,6 +936,8 @@ fn a_faulty_lut_names_its_file_and_row() {
         "monotonic",
     );
     assert_lut_fault(&lut_csv(|level| straight(level) / TAU), "changes by 0.317 π", "0.5 to 6 π");
+    let turns = load_lut(&lut_csv(|level| straight(level) / TAU)).unwrap_err().to_string();
+    assert!(turns.contains("in radians: multiply turns by 2π, multiples of π by π"), "{turns}");
     assert_lut_fault(&lut_csv(|level| -straight(level)), "-1.992 π", "a rising table");
     assert_lut_fault(&lut_csv(|level| straight(level) * 1.03), "2.052 π", "1.992 π that stroke_pi states");
     assert_lut_fault(&good.replace(',', ";"), "and 253 rows more", "");

@@ -375,6 +375,27 @@ fn check_says_what_would_keep_a_tracker_from_being_started() {
 }
 
 #[test]
+fn a_run_warns_at_its_start_of_phases_that_the_panel_cannot_show_in_the_words_of_check() {
+    let folder = holod_tests::new_folder();
+    let rig = small_rig(64, 64, "driver = \"simulated\"");
+    let told = |rig: &str| {
+        fs::write(folder.path().join("rig.toml"), rig).unwrap();
+        let checked = run(HOLOD, &["check", "--config", "rig.toml", "--resolution", "64x64", "--json"], folder.path());
+        let notes = json(&checked)["meaning"]["notes"].clone();
+        let args = ["--config", "rig.toml", "--tracker", "mock", "--resolution", "64x64", "--frames", "1"];
+        let ran = run(HOLOD, &args, folder.path());
+        let warned =
+            ran.stderr.lines().find_map(|line| line.split_once(" WARN ").filter(|(_, says)| says.contains("stroke")));
+        (notes, warned.map(|(_, says)| says.to_owned()))
+    };
+    let (notes, warned) = told(&rig.replacen("blue = 1.9921875", "blue = 1.5", 1));
+    let warned = warned.expect("a warning");
+    assert!(warned.starts_with("blue: the panel's stroke is 1.500 π; "), "{warned}");
+    assert!(notes.as_array().unwrap().iter().any(|note| *note == *warned), "{notes}");
+    assert_eq!(told(&rig).1, None);
+}
+
+#[test]
 fn check_refuses_what_a_laser_box_would_refuse_at_the_start_of_a_run_in_the_same_words() {
     let folder = holod_tests::new_folder();
     let terminal = SimulatedTerminal::open().unwrap();

@@ -2,15 +2,19 @@
 
 use std::f64::consts::{PI, TAU};
 use std::fmt;
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{LaserDriver, Lasers, Orientation, PanelProfile, Rig, Tracker};
+use super::{LaserDriver, Lasers, Orientation, Panel, PanelProfile, Rig, Tracker};
 use crate::{Colour, PerColour, PupilDiameter};
 
 /// The pupils for which blur is worked out.
 const PUPILS_MM: [f32; 3] = [2.0, 3.0, 4.0];
+
+/// The ranges, in radians, of tables that may hold multiples of π.
+const IN_PI: RangeInclusive<f64> = 1.5..=2.1;
 
 /// A figure for each colour.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -272,6 +276,25 @@ impl TrackerMeaning {
     }
 }
 
+impl Panel {
+    /// For each colour whose stroke is less than 2π, what becomes of the phases that cannot be shown.
+    pub fn short_strokes(&self) -> Vec<String> {
+        let levels = f64::from(1u32 << self.bit_depth);
+        // The top level of a 2π panel stands one step short of 2π.
+        let short = self.stroke_rad.iter().filter(|(_, stroke_rad)| **stroke_rad < TAU * (levels - 1.5) / levels);
+        let told = short.map(|(colour, &stroke_rad)| {
+            let is_in_pi = self.lut[colour].is_some() && IN_PI.contains(&stroke_rad);
+            format!(
+                "{colour}: the panel's stroke is {:.3} π; phases between that and 2 π cannot be shown and {}{}",
+                stroke_rad / PI,
+                self.out_of_stroke.meaning(),
+                if is_in_pi { "; where the phases in its table are multiples of π, multiply them by π" } else { "" }
+            )
+        });
+        told.collect()
+    }
+}
+
 fn active_files(rig: &Rig) -> Vec<ActiveFile> {
     let kinds = [("lut", &rig.provenance.lut_files), ("flatness", &rig.provenance.flatness_files)];
     let files = kinds.into_iter().flat_map(|(kind, paths)| {
@@ -284,20 +307,11 @@ fn active_files(rig: &Rig) -> Vec<ActiveFile> {
 
 fn notes(rig: &Rig) -> Vec<String> {
     let mut notes = Vec::new();
-    let levels = f64::from(1u32 << rig.panel.bit_depth);
-    for (colour, &stroke_rad) in rig.panel.stroke_rad.iter() {
-        // The top level of a 2π panel stands one step short of 2π.
-        if stroke_rad < TAU * (levels - 1.5) / levels {
-            notes.push(format!(
-                "{colour}: the panel's stroke is {:.3} π; phases between that and 2 π cannot be shown and {}",
-                stroke_rad / PI,
-                rig.panel.out_of_stroke.meaning()
-            ));
-        }
-    }
+    notes.extend(rig.panel.short_strokes());
+    let levels = 1u32 << rig.panel.bit_depth;
     for (colour, table) in rig.panel.lut.iter() {
         if let Some(table) = table
-            && table.len() < 1 << rig.panel.bit_depth
+            && table.len() < levels as usize
         {
             notes.push(format!("{colour}: of {levels} levels only the {} in the table are used", table.len()));
         }

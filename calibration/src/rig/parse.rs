@@ -459,7 +459,7 @@ fn check_lut<'a>(
             line,
             &found,
             &expected,
-            "give its phases in radians, not unwrapped to turns".into(),
+            "give its phases in radians: multiply turns by 2π, multiples of π by π".into(),
         );
         return;
     }

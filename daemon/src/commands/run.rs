@@ -44,6 +44,9 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         bug_report::refuse_archive(path)?;
     }
     tracing::info!("{}: tracker {tracker}, panel {output} of {}", rig.name, rig.resolution());
+    for short in rig.panel.short_strokes() {
+        tracing::warn!("{short}");
+    }
     let weights = progress::during("loading the network", || setup::weights(&rig))?;
     let pictures =
         progress::during("loading the scene", || source::named(&args.scene, args.feed_dark_after, &rig.geometry))?;
