@@ -429,6 +429,9 @@ pub struct CheckArgs {
     /// Eye tracker's spec, as `run` takes it; the rig's own when left out.
     #[arg(long, value_name = "SPEC")]
     pub tracker: Option<String>,
+    /// Millimetres for one unit of the tracker's figure, in place of the rig's tracker.scale_mm_per_unit.
+    #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
+    pub scale: Option<f64>,
     /// Size of the hologram whose frames a second are estimated; that of the built-in scene and the panel's when left
     /// out.
     #[arg(long, value_name = "WxH", value_parser = parse_resolution)]

@@ -292,7 +292,8 @@ impl RefusalWatch {
         }
         format!(
             "{shown}: no pupil's millimetres ({} to {}), and no other unit of length; if it is camera pixels or the \
-             tracker's own unit, measure an artificial pupil and set scale_mm_per_unit = its millimetres / its figure",
+             tracker's own unit, measure an artificial pupil and set scale_mm_per_unit = its millimetres / the figure \
+             that stands here for it, which of an area A is 2·√(A/π)",
             self.limits.least_mm, self.limits.greatest_mm
         )
     }

@@ -372,6 +372,13 @@ fn check_says_what_would_keep_a_tracker_from_being_started() {
     }
     let check = tracker_check("log.asc", "scale_mm_per_unit = 0.0125");
     assert!(check["passed"] == true, "{check}");
+    // Without a rig file, too.
+    let args = ["check", "--tracker", "log.asc", "--resolution", "64x64", "--json"];
+    let without = json(&run(HOLOD, &args, folder.path()));
+    assert!(without["checks"].to_string().contains("of an area A that is 2·√(A/π)"), "{without}");
+    let scaled = json(&run(HOLOD, &[&args[..], &["--scale", "0.0125"]].concat(), folder.path()));
+    assert_eq!(scaled["meaning"]["tracker"]["scale_mm_per_unit"], 0.0125);
+    assert!(!scaled["checks"].to_string().contains("artificial pupil"), "{scaled}");
 }
 
 #[test]

@@ -41,6 +41,7 @@ pub(super) fn check(args: &CheckArgs) -> Result<(), Failure> {
     if let Some(spec) = &args.tracker {
         rig.tracker.spec = Some(spec.clone());
     }
+    rig.tracker.scale = args.scale.or(rig.tracker.scale);
     let output = args.output.as_deref().map(str::parse).transpose().map_err(Failure::because(Exit::Usage))?;
     let network = setup::load_weights(&rig);
     let mut checks = weights_checks(&rig, &network);

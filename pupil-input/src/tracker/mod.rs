@@ -47,7 +47,8 @@ pub enum TrackerError {
     /// Its figures are no millimetres, and nobody said how many millimetres one of them is.
     #[error(
         "tracker `{spec}` gives pupil sizes in {unit}; holod needs millimetres: measure an artificial pupil of known \
-         diameter and write tracker.scale_mm_per_unit = (its millimetres / its units) into the rig file"
+         diameter and write tracker.scale_mm_per_unit = (its millimetres / the figure that `holod log info` shows for \
+         it, or `holod tracker try --scale 1`: of an area A that is 2·√(A/π)) into the rig file, or give it with --scale"
     )]
     NoScale { spec: String, unit: &'static str },
     /// The profile is for another kind of link.
