@@ -269,7 +269,8 @@ impl Log {
                 (eyes[0].sample.t_sample.seconds(), f64::from(mean_mm))
             })
             .collect();
-        PupilPlot { unit: None, samples: &samples, estimate: &estimate, truth: &truth }.save(&staging.path("pupil.svg"))
+        PupilPlot { unit: None, of_log: false, samples: &samples, estimate: &estimate, truth: &truth }
+            .save(&staging.path("pupil.svg"))
     }
 
     fn latency_plot(&self, session: &SessionReport, staging: &Staging) -> Result<(), Failure> {

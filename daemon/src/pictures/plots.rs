@@ -22,9 +22,11 @@ pub struct PupilSampleMark {
 pub struct PupilPlot<'a> {
     /// The unit of all figures; millimetres where there is none. Samples in another unit were not judged.
     pub unit: Option<&'static str>,
+    /// Of a log, which nothing was shown of: the estimate is at its samples' own times.
+    pub of_log: bool,
     /// Every raw sample.
     pub samples: &'a [PupilSampleMark],
-    /// (seconds, millimetres) that each frame was rendered for.
+    /// (seconds, millimetres) that each frame was rendered for, or that a log's samples come to.
     pub estimate: &'a [(f64, f64)],
     /// (seconds, millimetres) of the simulated eye, where there is one.
     pub truth: &'a [(f64, f64)],
@@ -56,10 +58,13 @@ impl PupilPlot<'_> {
         let end_s = last_time(&[self.estimate, self.truth]).max(self.samples.last().map_or(0.0, |s| s.t_s));
         let greatest = self.samples.iter().map(|mark| mark.raw_mm).fold(f64::MIN_POSITIVE, f64::max);
         let top = if self.unit.is_none() { GREATEST_MM } else { 1.1 * greatest };
-        let caption = match self.unit {
-            None => "Pupil diameter: what the tracker said, what the gate kept, what the display used",
-            Some(_) => "Pupil size: what the tracker said, in its own unit",
+        let caption = match (self.unit, self.of_log) {
+            (None, false) => "Pupil diameter: what the tracker said, what the gate kept, what the display used",
+            (None, true) => "Pupil diameter: what the tracker said, what the gate kept, what the filter makes of it",
+            (Some(_), _) => "Pupil size: what the tracker said, in its own unit",
         };
+        let estimate_name =
+            if self.of_log { "estimate at the samples' times" } else { "estimate at the photons' time, per frame" };
         let y_name = format!("pupil diameter / {}", self.unit.unwrap_or("mm"));
         let mut chart = ChartBuilder::on(root)
             .caption(caption, ("sans-serif", 20))
@@ -93,7 +98,7 @@ impl PupilPlot<'_> {
         if !self.estimate.is_empty() {
             chart
                 .draw_series(LineSeries::new(self.estimate.iter().copied(), used.stroke_width(2)))?
-                .label("estimate at the photons' time, per frame")
+                .label(estimate_name)
                 .legend(move |(x, y)| PathElement::new([(x, y), (x + 16, y)], used.stroke_width(2)));
         }
         chart.configure_series_labels().background_style(WHITE.mix(0.85)).border_style(BLACK.mix(0.3)).draw()?;
@@ -158,13 +163,23 @@ mod tests {
             PupilSampleMark { t_s: 0.0, raw_mm: 3.5, accepted: true },
             PupilSampleMark { t_s: 0.5, raw_mm: 1.1, accepted: false },
         ];
-        PupilPlot { unit: None, samples: &marks, estimate: &[(0.0, 3.5), (0.5, 3.5)], truth: &[] }.save(&path).unwrap();
+        let estimate = [(0.0, 3.5), (0.5, 3.5)];
+        let plot = PupilPlot { unit: None, of_log: false, samples: &marks, estimate: &estimate, truth: &[] };
+        plot.save(&path).unwrap();
         let svg = std::fs::read_to_string(&path).unwrap();
         assert!(svg.contains("#D63C28") && svg.contains("#96AAC8"));
         assert!(!svg.contains("simulated eye itself"));
+        let [of_run, of_log] = ["what the display used", "what the filter makes of it"];
+        assert!(svg.contains(of_run) && svg.contains("photons") && !svg.contains(of_log));
+        PupilPlot { of_log: true, ..plot }.save(&path).unwrap();
+        let svg = std::fs::read_to_string(&path).unwrap();
+        assert!(svg.contains(of_log) && svg.contains("estimate at the samples") && !svg.contains("photons"));
+        assert!(!svg.contains(of_run));
         // Figures that are no millimetres have their own axis, and nobody judged them.
         let marks = [PupilSampleMark { t_s: 0.5, raw_mm: 964.0, accepted: true }];
-        PupilPlot { unit: Some("arbitrary units"), samples: &marks, estimate: &[], truth: &[] }.save(&path).unwrap();
+        let plot =
+            PupilPlot { unit: Some("arbitrary units"), of_log: true, samples: &marks, estimate: &[], truth: &[] };
+        plot.save(&path).unwrap();
         let svg = std::fs::read_to_string(&path).unwrap();
         assert!(svg.contains("arbitrary units") && svg.contains("#96AAC8"));
         assert!(!svg.contains("rejected") && !svg.contains("estimate") && !svg.contains(" mm"));
@@ -177,7 +192,7 @@ mod tests {
 
     #[test]
     fn a_plot_that_cannot_be_written_says_where() {
-        let plot = PupilPlot { unit: None, samples: &[], estimate: &[], truth: &[] };
+        let plot = PupilPlot { unit: None, of_log: false, samples: &[], estimate: &[], truth: &[] };
         let failure = plot.save(Path::new("no/such/folder/pupil.svg")).unwrap_err();
         assert!(failure.to_string().contains("no/such/folder"));
     }

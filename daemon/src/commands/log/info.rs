@@ -57,11 +57,12 @@ pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
     let judged = in_mm.then(|| judge(&recording, args.scale));
     if let Some(plot) = &plot {
         let raw = raw_marks(&recording);
-        let drawn = match &judged {
-            Some(judged) => PupilPlot { unit: None, samples: &judged.marks, estimate: &judged.estimate, truth: &[] },
-            // The gate judges millimetres only.
-            None => PupilPlot { unit: Some(recording.unit().name()), samples: &raw, estimate: &[], truth: &[] },
+        // The gate judges millimetres only.
+        let (unit, samples, estimate) = match &judged {
+            Some(judged) => (None, &judged.marks, &judged.estimate[..]),
+            None => (Some(recording.unit().name()), &raw, &[][..]),
         };
+        let drawn = PupilPlot { unit, of_log: true, samples, estimate, truth: &[] };
         plot.write(|path| drawn.save(path))?;
     }
     if plots_to_stdout {
