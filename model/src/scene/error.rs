@@ -40,7 +40,7 @@ pub enum SceneError {
     },
     /// The depth encoding is not named, or not one of those known.
     #[error(
-        "depth encoding: found {found}; expected metres, millimetres, dioptres or normalised_dioptres[:FAR,NEAR] (ends in dioptres): give it with --depth-encoding"
+        "depth encoding: found {found}; expected metres, millimetres, dioptres or normalised_dioptres[:FAR,NEAR] (ends in dioptres, NEAR more than FAR; the rig's depth range where they are left out): give it with --depth-encoding"
     )]
     DepthEncoding { found: String },
     /// A scene file says another encoding than was named beside it.

@@ -360,11 +360,15 @@ impl DepthEncoding {
                 let (far, near) = bounds.split_once(',').ok_or_else(unknown)?;
                 let number = |text: &str| text.trim().parse::<f64>().map_err(|_| unknown());
                 let (far_dpt, near_dpt) = (number(far)?, number(near)?);
-                if far_dpt >= 0.0 && near_dpt > far_dpt && near_dpt.is_finite() {
-                    Ok(Self::NormalisedDioptres { far_dpt, near_dpt })
-                } else {
-                    Err(unknown())
+                if !(far_dpt >= 0.0 && near_dpt >= 0.0 && far_dpt.is_finite() && near_dpt.is_finite()) {
+                    return Err(unknown());
                 }
+                if near_dpt <= far_dpt {
+                    let found =
+                        format!("\"{text}\", whose second end, the near one, has no more dioptres than the first");
+                    return Err(SceneError::DepthEncoding { found });
+                }
+                Ok(Self::NormalisedDioptres { far_dpt, near_dpt })
             }
         }
     }

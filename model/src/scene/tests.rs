@@ -548,7 +548,7 @@ fn what_is_no_picture_says_so() {
 
 #[test]
 fn encodings_are_read_from_a_command_line() {
-    let parse = |text| DepthEncoding::parse(text, &BENCH);
+    let parse = |text: &str| DepthEncoding::parse(text, &BENCH);
     let normalised = |far_dpt, near_dpt| DepthEncoding::NormalisedDioptres { far_dpt, near_dpt };
     assert_eq!(parse("metres").unwrap(), DepthEncoding::Metres);
     assert_eq!(parse("normalised_dioptres:0.25,2.5").unwrap(), normalised(0.25, 2.5));
@@ -556,6 +556,11 @@ fn encodings_are_read_from_a_command_line() {
     for unknown in ["inches", "", "normalised_dioptres:", "normalised_dioptres:2,1", "normalised_dioptres:0,x"] {
         let error = parse(unknown).unwrap_err().to_string();
         assert!(error.contains("metres, millimetres, dioptres") && error.contains(unknown), "{error}");
+    }
+    for (ends, told) in [("2.5,0", true), ("1,1", true), ("-1,2", false), ("0,inf", false), ("inf,inf", false)] {
+        let error = parse(&format!("normalised_dioptres:{ends}")).unwrap_err().to_string();
+        assert_eq!(error.contains("the near one, has no more dioptres than the first"), told, "{error}");
+        assert!(error.contains("NEAR more than FAR; the rig's depth range where they are left out"), "{error}");
     }
 }
 
