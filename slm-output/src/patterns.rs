@@ -6,8 +6,8 @@
 //!
 //! **Where light goes.** A pattern of period Λ sends the light of wavelength λ into orders m at the angles
 //! asin(m·λ/Λ). In the focal plane of the eyepiece, where the viewer's pupil is, order m is a spot f·tan(asin(m·λ/Λ))
-//! from the axis. The stop of the display's relay lets frequencies below 1/4p through, p the pixels' pitch: periods
-//! above four pixels.
+//! from the axis. The stop of the display's relay is one for all colours and set for the longest wavelength λ₀: it lets
+//! frequencies below λ₀/4pλ through, p the pixels' pitch: periods above four pixels of λ₀, and shorter ones of others.
 //!
 //! **Light and dark.** A phase panel has neither. Where a pattern shall look bright ([`Pattern::Dots`],
 //! [`Pattern::CrossHair`]) its phase is 0; where it shall look dark, neighbouring pixels stand π apart as on a
@@ -439,7 +439,7 @@ impl Order {
         let sine = (optics.wavelengths[laser].0 * fx.hypot(fy)).min(1.0);
         let radius_m = radius_of(sine, optics.eyepiece_focal_length.0);
         let direction = if fx.hypot(fy) > 0.0 { frequencies.map(|along| along / fx.hypot(fy)) } else { [0.0; 2] };
-        let stop = 1.0 / (4.0 * optics.pixel_pitch.0);
+        let stop = stop_frequency(optics, laser);
         Self {
             number,
             angle_deg: sine.asin().to_degrees(),
@@ -448,6 +448,12 @@ impl Order {
             passes_stop: fx.abs() < stop && fy.abs() < stop,
         }
     }
+}
+
+/// The greatest frequency of `colour` that the stop of the relay lets through, cycles per metre across or up.
+pub fn stop_frequency(optics: &DisplayGeometry, colour: Colour) -> f64 {
+    let [set_for, passed] = [optics.longest(), colour].map(|colour| optics.wavelengths[colour].0);
+    set_for / passed / (4.0 * optics.pixel_pitch.0)
 }
 
 /// Distance from the axis, in the focal plane of a lens, of light whose angle to the axis has this sine.
@@ -677,7 +683,14 @@ mod tests {
         assert!((green[0].angle_deg - (520e-9f64 / 64e-6).asin().to_degrees()).abs() < 1e-9);
         assert!((green[0].position[0].0 - 0.325e-3).abs() < 1e-7 && green[0].position[1].0.abs() < 1e-15);
         assert!((green[2].position[0].0 + 0.325e-3).abs() < 1e-7, "order -1 is on the other side");
-        assert!(green[0].passes_stop && !green[3].passes_stop, "the second order is at the stop's edge");
+        let red = grating(8.0, 0.0, Profile::Blazed).orders(&BENCH, Colour::Red, Colour::Red).unwrap();
+        assert!(red[0].passes_stop && !red[3].passes_stop, "the second order is at the edge of the stop, set for red");
+        assert!(green[3].passes_stop, "which green's lies within");
+        for (period_px, passes) in [(2.83, true), (2.82, false)] {
+            // 638 nm over 450 nm of the four pixels.
+            let blue = grating(period_px, 90.0, Profile::Blazed).orders(&BENCH, Colour::Blue, Colour::Blue).unwrap();
+            assert_eq!(blue[0].passes_stop, passes, "{period_px} px");
+        }
         // The same field lit by red light goes farther out, and no longer all into the first order.
         let red = grating(8.0, 0.0, Profile::Blazed).orders(&BENCH, Colour::Green, Colour::Red).unwrap();
         assert!((red[0].position[0].0 / green[0].position[0].0 - 638.0 / 520.0).abs() < 1e-3);

@@ -334,15 +334,12 @@ fn notes(rig: &Rig) -> Vec<String> {
     if rig.panel.orientation != Orientation::Normal {
         notes.push(format!("pictures lie on the panel in the orientation {}", rig.panel.orientation.name()));
     }
-    let wavelengths = &rig.geometry.wavelengths;
-    if let Some((longest, wavelength)) = wavelengths.iter().max_by(|(_, one), (_, other)| one.0.total_cmp(&other.0)) {
-        // Set for blue it would cut into the half band of red, set for red it passes a little more of blue.
-        notes.push(format!(
-            "the stop of the 4f relay is one for all colours: set it for {longest}, λ·F/2p = {:.2} mm wide for each 100 mm \
-             of the focal length F before it",
-            100.0 * wavelength.0 / (2.0 * rig.geometry.pixel_pitch.0)
-        ));
-    }
+    let longest = rig.geometry.longest();
+    notes.push(format!(
+        "the stop of the 4f relay is one for all colours: set it for {longest}, λ·F/2p = {:.2} mm wide for each \
+         100 mm of the focal length F before it",
+        100.0 * rig.geometry.wavelengths[longest].0 / (2.0 * rig.geometry.pixel_pitch.0)
+    ));
     let eyebox_mm = rig.geometry.eyebox().map(|width| width.0 * 1e3);
     for (colour, width_mm) in eyebox_mm.iter() {
         if *width_mm < f64::from(PUPILS_MM[PUPILS_MM.len() - 1]) {

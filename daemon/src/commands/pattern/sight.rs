@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use holod_calibration::rig::{PanelMode, Rig};
 use holod_calibration::{Colour, Metres};
-use holod_slm_output::patterns::{Order, Pattern, PatternError, Placement};
+use holod_slm_output::patterns::{Order, Pattern, PatternError, Placement, stop_frequency};
 use serde::Serialize;
 
 /// Orders with less light are left out, but for the middle.
@@ -52,7 +52,6 @@ impl Sight {
             spots.extend(seen.map(|order| Spot::of(field, order)));
         }
         let mut notes = Vec::new();
-        let largest_mm = rig.geometry.eyebox().map(|width| width.0 * 1e3 / 4.0);
         match *pattern {
             Pattern::Level { .. } => notes.push("no pattern of phases: all light stays in the middle".into()),
             Pattern::Checkerboard { .. } => notes.push(
@@ -65,8 +64,8 @@ impl Sight {
                 for &field in &fields {
                     let diameter_m = pattern.lens_diameter(optics, field)?.0;
                     let wave_m2 = optics.wavelengths[field].0 * f_m.abs();
-                    // The stop passes slopes of the phase below 1/4p in x and in y.
-                    let passed_m = wave_m2 / (2.0 * optics.pixel_pitch.0);
+                    // What it passes are slopes of the phase, in x and in y.
+                    let passed_m = 2.0 * wave_m2 * stop_frequency(optics, field);
                     let (aperture, spot_m) = if diameter_m <= passed_m {
                         (String::new(), 1.22 * wave_m2 / diameter_m)
                     } else {
@@ -102,12 +101,11 @@ impl Sight {
             Pattern::FieldIdentity { .. } => notes.extend(identity_notes(pattern, rig, &fields)?),
         }
         if !spots.is_empty() {
+            let longest = optics.longest();
             notes.push(format!(
-                "the stop of the relay lets spots up to {:.3} mm (red), {:.3} mm (green) and {:.3} mm (blue) right, left, up and \
-                 down through",
-                largest_mm[Colour::Red],
-                largest_mm[Colour::Green],
-                largest_mm[Colour::Blue]
+                "the stop of the relay, one for all colours and set for {longest}, lets spots up to {:.3} mm right, left, up \
+                 and down through",
+                1e3 * optics.eyebox()[longest].0 / 4.0
             ));
         }
         Ok(Self { pattern: pattern.to_string(), rig: rig.name.clone(), files: Vec::new(), spots, notes })
@@ -213,11 +211,11 @@ mod tests {
                 Pattern::Lens { focal_length: Metres(0.05), diameter: diameter_mm.map(|mm| Metres(1e-3 * mm)) };
             Sight::of(&pattern, &placement, &rig).unwrap().notes.join("\n")
         };
-        // Of 520 nm and 8 µm: λf/p is 3.25 mm, and the first dark line of the half that passes is at 2p.
+        // Of 520 nm and 8 µm: λf/p is 3.25 mm. The stop is set for 638 nm, which passes 1.99 mm.
         let largest = lens_notes(None);
         assert!(
-            largest.contains("a lens of 3.250 mm, of which the stop passes a square of 1.625 mm; ")
-                && largest.contains("its focus has a radius of 16.0 µm"),
+            largest.contains("a lens of 3.250 mm, of which the stop passes a square of 1.994 mm; ")
+                && largest.contains("its focus has a radius of 13.0 µm"),
             "{largest}"
         );
         // Airy's disc: 1.22 · 520 nm · 50 mm / 1 mm.
