@@ -283,7 +283,7 @@ pub struct RunArgs {
     #[arg(long, value_name = "N", conflicts_with = "duration")]
     pub frames: Option<u64>,
     /// Stop after this long, for example 10s or 2m; a log that is replayed and ends sooner ends the run.
-    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration)]
+    #[arg(long, value_name = "TIME", value_parser = parse_time)]
     pub duration: Option<Duration>,
     /// Write frames.csv, summary.json, what the tracker sent (tracker.holodraw, samples.csv), what `holod ctl` changed
     /// (orders.jsonl), the log and the bench into this directory, for `holod report`.
@@ -343,7 +343,7 @@ pub struct DemoArgs {
     #[arg(long, requires = "out")]
     pub force: bool,
     /// How long the loop runs.
-    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration, default_value = "10s")]
+    #[arg(long, value_name = "TIME", value_parser = parse_time, default_value = "10s")]
     pub duration: Duration,
 }
 
@@ -485,7 +485,7 @@ pub struct BenchArgs {
     /// How long the loop then runs with a simulated eye and a virtual panel, for the time from tracker sample to
     /// photons;
     /// 0s leaves it out.
-    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration, default_value = "5s")]
+    #[arg(long, value_name = "TIME", value_parser = parse_time, default_value = "5s")]
     pub duration: Duration,
     /// Print the figures as JSON.
     #[arg(long)]
@@ -684,7 +684,7 @@ pub struct TryArgs {
     #[command(flatten)]
     pub rig: RigArgs,
     /// How long it is read, for example 10s or 2m.
-    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration, default_value = "10s")]
+    #[arg(long, value_name = "TIME", value_parser = parse_time, default_value = "10s")]
     pub duration: Duration,
     /// Millimetres for one unit of the tracker's figure, in place of the rig's tracker.scale_mm_per_unit.
     #[arg(long, value_name = "MM_PER_UNIT", value_parser = parse_scale)]
@@ -762,11 +762,17 @@ fn parse_scale(text: &str) -> Result<f64, String> {
     Tracker::scale_fault(scale).map_or(Ok(scale), |fault| Err(format!("found '{text}', {fault}")))
 }
 
+/// A time with its unit, or in seconds.
+fn parse_time(text: &str) -> Result<Duration, String> {
+    let seconds = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    let time = seconds.or_else(|| humantime::parse_duration(text).ok());
+    time.ok_or_else(|| format!("found '{text}', expected a time such as 10s or 2m, or a number of seconds"))
+}
+
 fn parse_silence(text: &str) -> Result<Duration, String> {
-    let seconds = text.parse().ok().filter(|seconds| (0.1..=3600.0).contains(seconds));
-    seconds
-        .map(Duration::from_secs_f64)
-        .ok_or_else(|| format!("found '{text}', expected seconds without a picture, 0.1 to 3600"))
+    let allowed = Duration::from_millis(100)..=Duration::from_secs(3600);
+    let silence = parse_time(text).ok().filter(|silence| allowed.contains(silence));
+    silence.ok_or_else(|| format!("found '{text}', expected seconds without a picture, 0.1 to 3600"))
 }
 
 fn parse_count(text: &str) -> Result<usize, String> {
@@ -900,8 +906,16 @@ mod tests {
         for bad in ["0", "-1", "all", ""] {
             assert!(parse_count(bad).is_err(), "{bad}");
         }
-        for bad in ["0", "0.09", "3601", "nan", "2s", ""] {
+        for bad in ["0", "0.09", "99ms", "3601", "2h", "nan", "2 parsecs", "-1", ""] {
             assert!(parse_silence(bad).is_err(), "{bad}");
+        }
+        for bad in ["nan", "inf", "-1", "1e300", "s", "2 parsecs", ""] {
+            assert!(parse_time(bad).unwrap_err().contains(bad), "{bad}");
+        }
+        let millis =
+            |text| (parse_time(text).map(|time| time.as_millis()), parse_silence(text).map(|time| time.as_millis()));
+        for (text, ms) in [("2", 2000), ("2s", 2000), ("0.5", 500), ("500ms", 500), ("1m", 60_000)] {
+            assert_eq!(millis(text), (Ok(ms), Ok(ms)), "{text}");
         }
         assert_eq!(parse_silence("0.5"), Ok(Duration::from_millis(500)));
         // As the rig's scale_mm_per_unit.

@@ -292,7 +292,7 @@ fn what_cannot_be_a_feed_is_said() {
     refused(&[&feed[..], &["--depth-encoding", "metres"]].concat(), 64, "a feed's clients say what their depths are");
     refused(&[&feed[..], &["--resolution", "128x64"]].concat(), 64, "larger than the panel of 64x64");
     refused(&["--feed-dark-after", "2"], 64, "name it with --scene feed");
-    refused(&[&feed[..], &["--feed-dark-after", "2s"]].concat(), 64, "expected seconds without a picture, 0.1 to 3600");
+    refused(&[&feed[..], &["--feed-dark-after", "2h"]].concat(), 64, "expected seconds without a picture, 0.1 to 3600");
     refused(&["render", "--scene", "feed", "--pupil", "3", "--out", "x"], 64, "for `holod run` alone");
     let daemon = holod_with_feed(folder.path(), &[]);
     refused(&feed, 69, "another holod listens there; name another socket with --scene feed:PATH");

@@ -176,7 +176,7 @@ pub struct PatternTarget {
     #[arg(long, value_name = "SPEC")]
     pub output: Option<String>,
     /// Show it for so long, for example 10s; until a signal comes when left out.
-    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration, requires = "output")]
+    #[arg(long, value_name = "TIME", value_parser = super::parse_time, requires = "output")]
     pub duration: Option<Duration>,
     /// Show it with every laser dark.
     #[arg(long, requires = "output")]

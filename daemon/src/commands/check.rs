@@ -209,7 +209,13 @@ fn reachable(spec: &TrackerSpec) -> (bool, String) {
         | TrackerSpec::Serial { path, .. }
         | TrackerSpec::Replay { path, .. }
         | TrackerSpec::MockFile(path) => {
-            let (passed, says) = present(path, "plug the tracker in or correct tracker.spec");
+            let is_ports = matches!(spec, TrackerSpec::Serial { .. }) || path.starts_with("/dev");
+            let otherwise = if is_ports {
+                "plug the tracker in or correct tracker.spec"
+            } else {
+                "correct the file's path in the spec"
+            };
+            let (passed, says) = present(path, otherwise);
             let is_port = path.metadata().is_ok_and(|metadata| metadata.file_type().is_char_device());
             let may_be_file = !matches!(spec, TrackerSpec::Serial { .. });
             if passed && !is_port && !(may_be_file && path.is_file()) {
@@ -237,6 +243,20 @@ fn present(path: &Path, otherwise: &str) -> (bool, String) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_is_not_there_is_to_be_plugged_in_or_named_otherwise() {
+        for (spec, cure) in [
+            ("/dev/none", "plug the tracker in"),
+            ("serial:none", "plug the tracker in"),
+            ("none.csv", "correct the file's path"),
+            ("replay:none.csv", "correct the file's path"),
+            ("mock:none.txt", "correct the file's path"),
+        ] {
+            let (passed, says) = reachable(&spec.parse().unwrap());
+            assert!(!passed && says.contains("none") && says.contains(cure), "{spec}: {says}");
+        }
+    }
 
     #[test]
     fn a_gpu_that_computes_wrongly_is_told_with_what_to_take() {

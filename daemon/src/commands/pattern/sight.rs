@@ -1,6 +1,7 @@
 //! What is to be seen on the bench while a test pattern is shown.
 
 use std::fmt;
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use holod_calibration::rig::{PanelMode, Rig};
@@ -10,6 +11,9 @@ use serde::Serialize;
 
 /// Orders with less light are left out, but for the middle.
 const SHARE_MIN: f64 = 5e-4;
+
+/// Where usual cameras focus.
+const CAMERA_DPT: RangeInclusive<f64> = 0.0..=10.0;
 
 /// What a person with a camera or a photodiode sees.
 #[derive(Serialize)]
@@ -79,10 +83,17 @@ impl Sight {
                 }
                 let eyepiece_m = optics.eyepiece_focal_length.0;
                 let (side, focus_dpt) = (if f_m > 0.0 { "in front of" } else { "behind" }, f_m / (eyepiece_m * eyepiece_m));
-                notes.push(format!(
-                    "the focus is {:.2} mm {side} the panel's image: a camera in the display sees it sharp at {focus_dpt:.2} dioptres",
-                    1e3 * f_m.abs()
-                ));
+                let seen = if CAMERA_DPT.contains(&focus_dpt) {
+                    format!("a camera in the display sees it sharp at {focus_dpt:.2} dioptres")
+                } else {
+                    let greatest_mm = 1e3 * CAMERA_DPT.end() * eyepiece_m * eyepiece_m;
+                    format!(
+                        "at {focus_dpt:.2} dioptres, where no usual camera in the display is sharp; focal lengths of \
+                         up to {greatest_mm:.1} mm are within {} dioptres",
+                        CAMERA_DPT.end()
+                    )
+                };
+                notes.push(format!("the focus is {:.2} mm {side} the panel's image: {seen}", 1e3 * f_m.abs()));
             }
             Pattern::Dots { spacing_px, .. } => {
                 let spacing_mrad = spacing_px as f64 * optics.pixel_angle_rad() * 1e3;
@@ -103,8 +114,8 @@ impl Sight {
         if !spots.is_empty() {
             let longest = optics.longest();
             notes.push(format!(
-                "the stop of the relay, one for all colours and set for {longest}, lets spots up to {:.3} mm right, left, up \
-                 and down through",
+                "the stop of the relay, one for all colours and set for {longest}, lets spots up to {:.3} mm right, \
+                 left, up and down through",
                 1e3 * optics.eyebox()[longest].0 / 4.0
             ));
         }
@@ -218,8 +229,16 @@ mod tests {
                 && largest.contains("its focus has a radius of 13.0 µm"),
             "{largest}"
         );
+        // D = f/40² mm².
+        assert!(largest.contains("at 31.25 dioptres, where no usual camera"), "{largest}");
+        assert!(largest.contains("focal lengths of up to 16.0 mm are within 10 dioptres"), "{largest}");
         // Airy's disc: 1.22 · 520 nm · 50 mm / 1 mm.
         let small = lens_notes(Some(1.0));
         assert!(small.contains("a lens of 1.000 mm; its focus has a radius of 31.7 µm"), "{small}");
+        for (focal_length_mm, sharp) in [(0.016, true), (0.0161, false), (-0.01, false)] {
+            let pattern = Pattern::Lens { focal_length: Metres(focal_length_mm), diameter: None };
+            let notes = Sight::of(&pattern, &placement, &rig).unwrap().notes.join("\n");
+            assert_eq!(notes.contains("a camera in the display sees it sharp at 10.00 dioptres"), sharp, "{notes}");
+        }
     }
 }

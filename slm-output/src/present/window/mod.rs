@@ -79,7 +79,7 @@ impl fmt::Display for DisplayServer {
 pub enum WindowError {
     /// There is no display server to ask.
     #[error(
-        "--output window needs a display server, and neither WAYLAND_DISPLAY nor DISPLAY is set; start holod within the desktop's session, or use --output drm:CONNECTOR without one"
+        "a window needs a display server, and neither WAYLAND_DISPLAY nor DISPLAY is set; start holod within the desktop's session, or use --output drm:CONNECTOR without one"
     )]
     NoServer,
     /// It failed.
