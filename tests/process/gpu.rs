@@ -15,11 +15,14 @@ fn rendered(folder: &Path, backend: &str, out: &str) -> Ended {
 }
 
 /// Where Vulkan has no driver.
-fn rendered_without_vulkan(folder: &Path, backend: &str) -> Ended {
+fn run_without_vulkan(args: &[&str], folder: &Path) -> Ended {
     let nowhere = Path::new("/nowhere.json");
     let environment = [("VK_DRIVER_FILES", nowhere), ("VK_ICD_FILENAMES", nowhere)];
-    let args = [&RENDER[..], &["--backend", backend, "--out", "without"]].concat();
-    Daemon::start_with(HOLOD, &args, folder, &environment).wait(Duration::from_secs(60))
+    Daemon::start_with(HOLOD, args, folder, &environment).wait(Duration::from_secs(60))
+}
+
+fn rendered_without_vulkan(folder: &Path, backend: &str) -> Ended {
+    run_without_vulkan(&[&RENDER[..], &["--backend", backend, "--out", "without"]].concat(), folder)
 }
 
 fn engine(folder: &Path, out: &str) -> String {
@@ -78,4 +81,21 @@ fn without_a_gpu_the_processor_computes_and_one_that_is_asked_for_is_refused() {
     for part in ["--backend gpu", "Vulkan shows nothing", "mesa-vulkan-drivers", "--backend cpu"] {
         assert!(ended.stderr.contains(part), "{part}: {ended:?}");
     }
+}
+
+#[test]
+fn a_bench_is_not_ready_without_the_gpu_that_is_asked_for() {
+    let folder = holod_tests::new_folder();
+    let checked = |backend| {
+        let args = ["check", "--weights", "fast", "--resolution", "64x48", "--backend", backend];
+        run_without_vulkan(&args, folder.path())
+    };
+    for backend in ["gpu", "gpu-half"] {
+        let ended = checked(backend);
+        assert_eq!(ended.status.code(), Some(69), "{ended:?}");
+        let says = format!("FAIL speed      --backend {backend}: Vulkan shows nothing");
+        assert!(ended.stdout.contains(&says), "{ended:?}");
+    }
+    let ended = checked("auto");
+    assert!(ended.stdout.contains("ok   speed      cpu, "), "{ended:?}");
 }

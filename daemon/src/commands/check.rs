@@ -128,7 +128,8 @@ fn weights_checks(rig: &Rig, weights: &Result<Weights, Failure>) -> Vec<Check> {
     checks
 }
 
-/// Frames a second, estimated from a small frame: slow is no fault of the bench. A GPU that computes wrongly is one.
+/// Frames a second, estimated from a small frame: slow is no fault of the bench. An engine that is not to be had is
+/// one, and so is a GPU that computes wrongly.
 fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, Option<Resolution>)) -> Vec<Check> {
     let panel = rig.resolution();
     let sizes = match resolution {
@@ -146,7 +147,8 @@ fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, 
     let (passed, says) = match (estimated, &sizes[..]) {
         // Why is said above, of the weights.
         (None, _) => (true, "not estimated without weights that fit".into()),
-        (Some(Err(failure)), _) => (true, format!("not estimated: {failure}")),
+        // As `run` would be.
+        (Some(Err(failure)), _) => (false, failure.to_string()),
         (Some(Ok(_)), []) => (false, format!("--resolution is larger than the panel of {panel}")),
         (Some(Ok(estimate)), [first, ..]) => {
             let rates = sizes.iter().map(|&size| format!("{:.2} frames a second of {size}", estimate.frames_hz(size)));
