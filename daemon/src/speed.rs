@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use holod_calibration::rig::{Panel, Rig, WeightsChoice};
 use holod_calibration::{PerColour, PupilDiameter, Resolution};
-use holod_model::Weights;
+use holod_model::{RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 use crate::cli::Backend;
@@ -83,7 +83,7 @@ impl Estimate {
     /// Times small frames on the rig's panel, each after one that warms up.
     ///
     /// # Errors
-    /// The backend is not to be had, or the rig contradicts itself.
+    /// The backend is not to be had, its device fails, or the rig contradicts itself.
     pub(crate) fn of(rig: &Rig, weights: &Weights, backend: Backend) -> Result<Self, Failure> {
         let panel = rig.resolution();
         let timed = TIMED_PX.map(|side| Resolution { width: side.min(panel.width), height: side.min(panel.height) });
@@ -122,14 +122,26 @@ impl Timed {
         // A panel of the frame's size: what surrounds the frame would be timed, too, and does not go with its pixels.
         let panel = Panel { flatness_rad: PerColour([None, None, None]), ..rig.panel.clone() };
         let encoder = PanelEncoder::new(&panel, size, size).map(Arc::new).map_err(Failure::because(Exit::Config))?;
-        let mut renderer = renderer::open(backend, weights, &rig.geometry, &encoder)?;
-        let (frame, mut levels) = (Arc::new(scene::sample_frame(size)), LevelsFrame::new(encoder.layout()));
+        let renderer = renderer::open(backend, weights, &rig.geometry, &encoder)?;
+        let (frame, levels) = (Arc::new(scene::sample_frame(size)), LevelsFrame::new(encoder.layout()));
         let [narrowest, widest] = weights.trained_pupils(&rig.geometry).map(PupilDiameter::mm);
         let pupil = PupilDiameter::from_mm(PUPIL_MM.clamp(narrowest, widest));
+        Self::by(renderer, &frame, pupil, levels)
+    }
+
+    fn by(
+        mut renderer: Box<dyn Renderer>,
+        frame: &Arc<RgbdFrame>,
+        pupil: PupilDiameter,
+        mut levels: LevelsFrame,
+    ) -> Result<Self, Failure> {
         let mut seconds = f64::MAX;
         for _ in 0..2 {
             let began = Instant::now();
-            renderer.render(&frame, pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))?;
+            let rendered = renderer.render(frame, pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))?;
+            if rendered.engine_changed {
+                return Err(renderer::failed_while_timed(&*renderer));
+            }
             seconds = seconds.min(began.elapsed().as_secs_f64());
         }
         Ok(Self { renderer, seconds })
@@ -154,7 +166,10 @@ fn share_apart(found: &[f32], expected: &[f32]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
+    use crate::renderer::failing::Failing;
     use holod_calibration::rig::PanelMode;
 
     const SIZE: Resolution = Resolution { width: 1920, height: 1080 };
@@ -211,6 +226,23 @@ mod tests {
         let expected = [0.0, 0.01, 3.0, 6.279, 1.0, 2.0, 4.0, 5.0];
         assert_eq!(share_apart(&[6.279, 0.02, 3.02, 0.0, 1.0, 2.0, 4.0, 5.0], &expected), 0.0);
         assert_eq!(share_apart(&[0.0, 0.01, 3.03, 6.279, 1.0, 2.0, f32::NAN, 5.0], &expected), 0.25);
+    }
+
+    #[test]
+    fn an_engine_that_fails_is_not_timed_as_another_one() {
+        let timed = |frames: &[(Duration, bool)]| {
+            let renderer = Box::new(Failing { frames: frames.iter().copied().collect() });
+            let size = Resolution { width: 8, height: 8 };
+            let encoder = renderer::panel_encoder(&Rig::default(), size).unwrap();
+            let frame = Arc::new(scene::sample_frame(size));
+            Timed::by(renderer, &frame, PupilDiameter::from_mm(3.0), LevelsFrame::new(encoder.layout()))
+        };
+        let [good, fails] = [(Duration::ZERO, false), (Duration::ZERO, true)];
+        assert!(timed(&[good]).is_ok());
+        for frames in [[fails, good], [good, fails]] {
+            let failure = timed(&frames).err().expect("a failure").to_string();
+            assert!(failure.contains("failed while it was timed") && failure.contains("another engine"), "{failure}");
+        }
     }
 
     /// On Mesa's software device, which `Auto` does not take.

@@ -205,9 +205,7 @@ impl Laps {
             let rendered = renderer.render(frame, pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))?;
             frames.push(Lap { frame: began.elapsed(), stages: renderer.timings().to_vec() });
             if rendered.engine_changed {
-                let now = renderer.description();
-                let said = format!("the engine failed while it was timed, frames are now computed by {now}");
-                return Err(Failure::new(Exit::Unavailable, said));
+                return Err(renderer::failed_while_timed(&*renderer));
             }
             peaks.extend(threads.map(fma_peak));
         }

@@ -118,6 +118,12 @@ pub fn open(
     }
 }
 
+/// What is said where a renderer whose frames were to be timed had to take another engine.
+pub fn failed_while_timed(renderer: &dyn Renderer) -> Failure {
+    let now = renderer.description();
+    Failure::new(Exit::Unavailable, format!("the engine failed while it was timed, frames are now computed by {now}"))
+}
+
 /// An engine's error with its exit code.
 pub fn failure(error: EngineError) -> Failure {
     let exit = if matches!(error, EngineError::Family { .. }) { Exit::Config } else { Exit::Unavailable };
@@ -152,4 +158,59 @@ fn on_gpu(
 /// The rig contradicts itself, or the patterns do not fit on the panel.
 pub fn panel_encoder(rig: &Rig, resolution: Resolution) -> Result<Arc<PanelEncoder>, Failure> {
     PanelEncoder::new(&rig.panel, rig.resolution(), resolution).map(Arc::new).map_err(Failure::because(Exit::Config))
+}
+
+/// A renderer whose engines fail on command.
+#[cfg(test)]
+pub(crate) mod failing {
+    use std::collections::VecDeque;
+    use std::time::Duration;
+
+    use super::*;
+
+    pub(crate) struct Failing {
+        /// Of each of the next frames: how long it takes, and whether its engine fails. Those that follow are like the
+        /// last.
+        pub(crate) frames: VecDeque<(Duration, bool)>,
+    }
+
+    impl Renderer for Failing {
+        fn render(
+            &mut self,
+            _: &Arc<RgbdFrame>,
+            _: PupilDiameter,
+            _: &mut LevelsFrame,
+        ) -> Result<Rendered, EngineError> {
+            let (takes, engine_changed) = self.frames[0];
+            if self.frames.len() > 1 {
+                self.frames.pop_front();
+            }
+            std::thread::sleep(takes);
+            Ok(Rendered { engine_changed, ..Rendered::default() })
+        }
+
+        fn hologram(&mut self) -> Result<&ComplexHologram, EngineError> {
+            unreachable!("nobody asks for it")
+        }
+
+        fn pattern(&mut self) -> Result<&PhasePattern, EngineError> {
+            unreachable!("nobody asks for it")
+        }
+
+        fn timings(&self) -> &[StageTiming] {
+            &[]
+        }
+
+        fn cpu_threads(&self) -> Option<usize> {
+            None
+        }
+
+        fn amplitude_constant(&self) -> f32 {
+            1.0
+        }
+
+        fn description(&self) -> &str {
+            "another engine"
+        }
+    }
 }
