@@ -34,6 +34,20 @@ pub(crate) fn most_apart(engine: &str) -> f64 {
     if engine.contains("half precision") { 1e-2 } else { 1e-3 }
 }
 
+/// Whether an engine of this description computes on a GPU, or on what plays one.
+pub(crate) fn is_gpu(engine: &str) -> bool {
+    engine.starts_with("gpu, ")
+}
+
+/// Which engine a run would have for frames of `size` on the rig's panel, by its description.
+///
+/// # Errors
+/// The backend is not to be had at this size, or the rig contradicts itself.
+pub(crate) fn engine_at(rig: &Rig, weights: &Weights, backend: Backend, size: Resolution) -> Result<String, Failure> {
+    let encoder = renderer::panel_encoder(rig, size)?;
+    Ok(renderer::open(backend, weights, &rig.geometry, &encoder)?.description().to_owned())
+}
+
 /// Frames of all colours that the panel can show in a second.
 pub(crate) fn panel_frames_hz(panel: &Panel) -> f64 {
     panel.refresh_hz * panel.mode.fields_per_refresh() / panel.fields() as f64
@@ -99,6 +113,12 @@ impl Estimate {
         };
         let engine = larger.renderer.description().to_owned();
         Ok(Self { engine, timed, seconds: [smaller.seconds, larger.seconds], apart })
+    }
+
+    /// As if they had taken `seconds` by `engine`.
+    #[cfg(test)]
+    pub(crate) fn taking(engine: &str, timed: [Resolution; 2], seconds: [f64; 2]) -> Self {
+        Self { engine: engine.to_owned(), timed, seconds, apart: None }
     }
 
     /// Frames of `size` a second: a GPU takes some of the time for each frame, the rest goes with the pixels.
@@ -206,8 +226,7 @@ mod tests {
     #[test]
     fn the_estimate_goes_with_the_pixels_and_leaves_out_what_each_frame_takes() {
         let square = |side| Resolution { width: side, height: side };
-        let estimate =
-            |seconds| Estimate { engine: "cpu".into(), timed: [square(256), square(512)], seconds, apart: None };
+        let estimate = |seconds| Estimate::taking("cpu", [square(256), square(512)], seconds);
         let frames_hz = |seconds, side| estimate(seconds).frames_hz(square(side));
         let near = |found: f64, expected: f64| assert!((found / expected - 1.0).abs() < 1e-9, "{found} for {expected}");
         near(frames_hz([0.25, 1.0], 256), 4.0);
@@ -217,7 +236,7 @@ mod tests {
         // A lap that something disturbed.
         near(frames_hz([0.5, 0.4], 1024), 1.0 / 0.4);
         near(frames_hz([0.0, 0.4], 1024), 1.0 / 1.6);
-        let same = Estimate { engine: "cpu".into(), timed: [square(64); 2], seconds: [0.1, 0.1], apart: None };
+        let same = Estimate::taking("cpu", [square(64); 2], [0.1, 0.1]);
         near(same.frames_hz(square(128)), 2.5);
     }
 
@@ -243,6 +262,19 @@ mod tests {
             let failure = timed(&frames).err().expect("a failure").to_string();
             assert!(failure.contains("failed while it was timed") && failure.contains("another engine"), "{failure}");
         }
+    }
+
+    #[cfg(feature = "gpu")]
+    #[test]
+    fn a_size_that_the_gpu_cannot_hold_has_no_engine() {
+        let mut rig = Rig::default();
+        // Of its half no workgroup's memory holds a line.
+        rig.geometry.resolution = Resolution { width: 40_000, height: 48 };
+        let engine_at =
+            |width| engine_at(&rig, &Weights::builtin_fast(), Backend::Gpu, Resolution { width, height: 48 });
+        assert!(is_gpu(&engine_at(64).unwrap()));
+        let refused = engine_at(40_000).unwrap_err().to_string();
+        assert!(refused.contains("--backend gpu: a line of 20000 samples"), "{refused}");
     }
 
     /// On Mesa's software device, which `Auto` does not take.

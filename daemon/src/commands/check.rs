@@ -151,21 +151,52 @@ fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, 
         (Some(Err(failure)), _) => (false, failure.to_string()),
         (Some(Ok(_)), []) => (false, format!("--resolution is larger than the panel of {panel}")),
         (Some(Ok(estimate)), [first, ..]) => {
-            let rates = sizes.iter().map(|&size| format!("{:.2} frames a second of {size}", estimate.frames_hz(size)));
-            let rates: Vec<String> = rates.collect();
+            let engine_at = |size| {
+                let weights = weights.expect("the estimate's");
+                progress::during(&format!("opening the engine for {size}"), || {
+                    speed::engine_at(rig, weights, backend, size)
+                })
+            };
+            let (passed, rates) = rates(&estimate, &sizes, engine_at);
             let advice = speed::advice(estimate.frames_hz(*first), rig, *first);
             let says = format!(
                 "{}; estimated from frames of up to {}: {}; the panel could show {:.1}{}",
                 estimate.engine,
                 estimate.timed[1],
-                rates.join(", "),
+                rates,
                 speed::panel_frames_hz(&rig.panel),
                 advice.map_or(String::new(), |advice| format!("; {advice}"))
             );
-            (true, says)
+            (passed, says)
         }
     };
     [Check { name: "speed", passed, says }].into_iter().chain(gpu).collect()
+}
+
+/// The frames a second of each of `sizes`, in words; and whether there is an engine for the first, that of a run. Small
+/// frames fit on a GPU where those of a panel do not: there `engine_at` says what computes them.
+fn rates(
+    estimate: &Estimate,
+    sizes: &[Resolution],
+    engine_at: impl Fn(Resolution) -> Result<String, Failure>,
+) -> (bool, String) {
+    let mut passed = true;
+    let mut rate = |(index, &size): (usize, &Resolution)| {
+        let estimated = || format!("{:.2} frames a second of {size}", estimate.frames_hz(size));
+        if !speed::is_gpu(&estimate.engine) || size == estimate.timed[1] {
+            return estimated();
+        }
+        match engine_at(size) {
+            Ok(engine) if speed::is_gpu(&engine) => estimated(),
+            Ok(other) => format!("frames of {size} are computed by {other}"),
+            Err(failure) => {
+                passed &= index > 0;
+                format!("no frames of {size}: {failure}")
+            }
+        }
+    };
+    let rates: Vec<String> = sizes.iter().enumerate().map(&mut rate).collect();
+    (passed, rates.join(", "))
 }
 
 /// Whether a GPU computes what the processor does; of a share `apart` of the pixels it does not.
@@ -258,6 +289,25 @@ mod tests {
             let (passed, says) = reachable(&spec.parse().unwrap());
             assert!(!passed && says.contains("none") && says.contains(cure), "{spec}: {says}");
         }
+    }
+
+    #[test]
+    fn a_size_that_does_not_fit_on_the_gpu_is_not_promised() {
+        let square = |side| Resolution { width: side, height: side };
+        let [small, large] = [square(512), square(4096)];
+        let estimate = |engine: &str| Estimate::taking(engine, [square(256), small], [0.1, 0.2]);
+        let on_gpu = estimate("gpu, X, single precision");
+        let (passed, says) = rates(&on_gpu, &[small, large], |_| Ok("gpu, X, single precision".into()));
+        assert!(
+            passed && says.contains("5.00 frames a second of 512x512, ") && says.ends_with("a second of 4096x4096")
+        );
+        let full = |_| Err(Failure::new(Exit::Unavailable, "no room for the sky"));
+        let (passed, says) = rates(&on_gpu, &[small, large], full);
+        assert!(passed && says.ends_with("512x512, no frames of 4096x4096: no room for the sky"), "{says}");
+        assert!(!rates(&on_gpu, &[large], full).0);
+        let (passed, says) = rates(&on_gpu, &[large], |_| Ok("cpu, 8 threads, as X is full".into()));
+        assert!(passed && says == "frames of 4096x4096 are computed by cpu, 8 threads, as X is full", "{says}");
+        assert!(rates(&estimate("cpu, 8 threads"), &[large], full).1.contains("frames a second of 4096x4096"));
     }
 
     #[test]
