@@ -12,7 +12,7 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
-use crate::renderer::{self, Renderer};
+use crate::renderer::{self, Renderer, Use};
 use crate::source::scene;
 
 /// A display that shows less than this share of the panel's frames is called slow.
@@ -45,7 +45,7 @@ pub(crate) fn is_gpu(engine: &str) -> bool {
 /// The backend is not to be had at this size, or the rig contradicts itself.
 pub(crate) fn engine_at(rig: &Rig, weights: &Weights, backend: Backend, size: Resolution) -> Result<String, Failure> {
     let encoder = renderer::panel_encoder(rig, size)?;
-    Ok(renderer::open(backend, weights, &rig.geometry, &encoder)?.description().to_owned())
+    Ok(renderer::open(backend, weights, &rig.geometry, &encoder, &Use::Command)?.description().to_owned())
 }
 
 /// Frames of all colours that the panel can show in a second.
@@ -142,7 +142,7 @@ impl Timed {
         // A panel of the frame's size: what surrounds the frame would be timed, too, and does not go with its pixels.
         let panel = Panel { flatness_rad: PerColour([None, None, None]), ..rig.panel.clone() };
         let encoder = PanelEncoder::new(&panel, size, size).map(Arc::new).map_err(Failure::because(Exit::Config))?;
-        let renderer = renderer::open(backend, weights, &rig.geometry, &encoder)?;
+        let renderer = renderer::open(backend, weights, &rig.geometry, &encoder, &Use::Command)?;
         let (frame, levels) = (Arc::new(scene::sample_frame(size)), LevelsFrame::new(encoder.layout()));
         let [narrowest, widest] = weights.trained_pupils(&rig.geometry).map(PupilDiameter::mm);
         let pupil = PupilDiameter::from_mm(PUPIL_MM.clamp(narrowest, widest));

@@ -8,7 +8,7 @@ use holod_calibration::{Colour, Resolution};
 use holod_daemon::cli::Backend;
 use holod_daemon::failure::{Exit, Failure};
 use holod_daemon::pictures::shown_pattern;
-use holod_daemon::renderer::{self, Rendered};
+use holod_daemon::renderer::{self, Rendered, Use};
 use holod_daemon::setup;
 use holod_daemon::source::scene::warn_of_oddities;
 use holod_model::scene::{ArrayColours, ArrayDepths, ArrayError, ArrayPicture, FrameReport};
@@ -80,7 +80,7 @@ impl Renderer {
         without_lock(py, || {
             let weights: Weights = setup::weights(&rig)?;
             let encoder = renderer::panel_encoder(&rig, resolution)?;
-            let renderer = renderer::open(backend, &weights, &rig.geometry, &encoder)?;
+            let renderer = renderer::open(backend, &weights, &rig.geometry, &encoder, &Use::Command)?;
             Ok(Self {
                 resolution,
                 amplitude_constant: weights.config().amplitude_constant,

@@ -24,7 +24,7 @@ use crate::record::{
     BENCH, FRAMES, FrameRecord, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SCENE, SceneSource, SourceFile,
     content_xxh3, hash_text,
 };
-use crate::renderer;
+use crate::renderer::{self, Use};
 use crate::session::{Cue, Observer, Playback};
 use crate::source::Pictures;
 use crate::source::scene::{self, Frames};
@@ -490,6 +490,7 @@ impl Material<'_> {
                 resolution: self.resolution,
                 frame: Arc::new(RgbdFrame::black(self.resolution)),
                 backend: self.backend,
+                used_for: Use::Command,
                 encoder,
                 has_feed: false,
                 plays: false,

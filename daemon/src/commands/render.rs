@@ -15,7 +15,7 @@ use super::focal_stack;
 use crate::cli::{Backend, RenderArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
 use crate::progress;
-use crate::renderer::{self, Renderer};
+use crate::renderer::{self, Renderer, Use};
 use crate::source::scene;
 use crate::staging::Staging;
 use crate::{results, setup};
@@ -133,7 +133,7 @@ pub(super) fn compute(
     let resolution = frames.resolution();
     let encoder = renderer::panel_encoder(rig, resolution)?;
     let mut renderer = progress::during(&format!("preparing the network for {resolution}"), || {
-        renderer::open(backend, &weights, &rig.geometry, &encoder)
+        renderer::open(backend, &weights, &rig.geometry, &encoder, &Use::Command)
     })?;
     tracing::info!("holograms are computed by {}", renderer.description());
     let mut levels = LevelsFrame::new(encoder.layout());

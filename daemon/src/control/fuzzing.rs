@@ -8,7 +8,7 @@ use holod_model::RgbdFrame;
 
 use super::{NewPattern, Order, Preparer, Request};
 use crate::cli::Backend;
-use crate::renderer;
+use crate::renderer::{self, Use};
 
 const RESOLUTION: Resolution = Resolution { width: 64, height: 48 };
 
@@ -23,6 +23,7 @@ static PREPARER: LazyLock<Preparer> = LazyLock::new(|| {
         resolution: RESOLUTION,
         frame: Arc::new(RgbdFrame::black(RESOLUTION)),
         backend: Backend::Cpu,
+        used_for: Use::Command,
         encoder,
         has_feed: true,
         plays: false,

@@ -14,7 +14,7 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 use super::{NewPattern, NewRig, Order, Request};
 use crate::cli::{self, Backend, SceneArgs};
 use crate::failure::Failure;
-use crate::renderer::{self, Renderer};
+use crate::renderer::{self, Renderer, Use};
 use crate::session::scheduling;
 use crate::setup;
 use crate::source::scene;
@@ -42,6 +42,7 @@ pub(crate) struct Preparer {
     /// What engines are tried out with. It lives as long as the run: an engine keeps the last frame that it has seen.
     pub(crate) frame: Arc<RgbdFrame>,
     pub(crate) backend: Backend,
+    pub(crate) used_for: Use,
     pub(crate) encoder: Arc<PanelEncoder>,
     pub(crate) has_feed: bool,
     /// Frames of a record are made again, with what they were made of.
@@ -168,7 +169,9 @@ impl Preparer {
         let mut rig = self.rig.clone();
         rig.model.weights = choice.clone();
         let weights = setup::weights(&rig).map_err(in_words)?;
-        let renderer = scheduling::patient(|| renderer::open(self.backend, &weights, &rig.geometry, &self.encoder));
+        let renderer = scheduling::patient(|| {
+            renderer::open(self.backend, &weights, &rig.geometry, &self.encoder, &self.used_for)
+        });
         let mut renderer = renderer.map_err(in_words)?;
         let frame_time = self.warm_up(&mut *renderer, &weights)?;
         if FRAMES_BEFORE_STALL * frame_time.0 > self.stall_timeout.0 {

@@ -30,7 +30,7 @@ pub use statistics::Estimate;
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
 use crate::pictures::shown_pattern;
-use crate::renderer::{self, Renderer};
+use crate::renderer::{self, Renderer, Use};
 
 /// PSNR of a picture that is exactly right, so that means over scenes stay finite.
 const HIGHEST_PSNR_DB: f64 = 120.0;
@@ -115,7 +115,7 @@ impl Judge {
         border_px: usize,
     ) -> Result<Self, Failure> {
         let encoder = renderer::panel_encoder(rig, resolution)?;
-        let renderer = renderer::open(backend, weights, &rig.geometry, &encoder)?;
+        let renderer = renderer::open(backend, weights, &rig.geometry, &encoder, &Use::Command)?;
         tracing::info!("holograms are computed by {}", renderer.description());
         Ok(Self {
             geometry: rig.geometry,

@@ -2,8 +2,9 @@
 //! the processor takes over, so that the display goes on.
 
 use std::sync::Arc;
+use std::time::Duration;
 
-use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter};
+use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter, TimeNs, host_now};
 use holod_model::engine::{EngineError, GpuEngine, Precision, StageTiming};
 use holod_model::gpu::{Adapters, GpuError};
 use holod_model::optics::PhasePattern;
@@ -11,10 +12,12 @@ use holod_model::{ComplexHologram, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 use super::cpu::CpuRenderer;
-use super::{Rendered, Renderer};
+use super::{Rendered, Renderer, Use};
 
-/// A device that failed is opened anew so often, in one renderer's life.
-const REOPENINGS: u32 = 3;
+/// How long a device that failed is left alone before each time that it is opened anew: a card's reset takes seconds.
+const PAUSES: [Duration; 3] = [Duration::from_millis(500), Duration::from_secs(1), Duration::from_secs(2)];
+/// A device that did not fail for so long may be opened anew as often as at first.
+const FORGIVEN_AFTER: TimeNs = TimeNs(3_600_000_000_000);
 
 pub(super) struct GpuRenderer {
     weights: Weights,
@@ -22,8 +25,9 @@ pub(super) struct GpuRenderer {
     encoder: Arc<PanelEncoder>,
     adapters: Adapters,
     precision: Option<Precision>,
+    used_for: Use,
     engine: Engine,
-    reopenings_left: u32,
+    reopenings: Reopenings,
     description: String,
     /// What has been read back of the last frame; made when it is first asked for.
     hologram: ReadBack<ComplexHologram>,
@@ -33,8 +37,29 @@ pub(super) struct GpuRenderer {
 enum Engine {
     Gpu(Box<GpuEngine>),
     Cpu(CpuRenderer),
-    /// The device failed, and the processor's threads could not be started.
+    /// The device failed, and the processor's threads could not be started, or the run ends.
     None(EngineError),
+}
+
+/// When a device that failed is opened anew.
+#[derive(Default)]
+struct Reopenings {
+    spent: usize,
+    t_fault: Option<TimeNs>,
+}
+
+impl Reopenings {
+    /// How long to wait before the device is opened anew that failed at `now`, at work or when it was opened; nothing
+    /// where it was often enough.
+    fn after_fault(&mut self, now: TimeNs) -> Option<Duration> {
+        if self.t_fault.is_some_and(|t_fault| now - t_fault >= FORGIVEN_AFTER) {
+            self.spent = 0;
+        }
+        self.t_fault = Some(now);
+        let pause = *PAUSES.get(self.spent)?;
+        self.spent += 1;
+        Some(pause)
+    }
 }
 
 /// A copy on the host, and whether it is of the last frame.
@@ -72,6 +97,7 @@ impl GpuRenderer {
         encoder: &Arc<PanelEncoder>,
         adapters: Adapters,
         precision: Option<Precision>,
+        used_for: &Use,
     ) -> Result<Self, EngineError> {
         let engine = Box::new(GpuEngine::open(weights, bench, &encoder.tables(), adapters, precision)?);
         Ok(Self {
@@ -81,36 +107,38 @@ impl GpuRenderer {
             encoder: Arc::clone(encoder),
             adapters,
             precision,
+            used_for: used_for.clone(),
             engine: Engine::Gpu(engine),
-            reopenings_left: REOPENINGS,
+            reopenings: Reopenings::default(),
             hologram: ReadBack::NONE,
             pattern: ReadBack::NONE,
         })
     }
 
-    /// Puts another engine in the place of the one whose device failed.
+    /// Puts another engine in the place of the one whose device failed, or none where the run ends before that.
     fn replace(&mut self, error: &GpuError) {
         tracing::error!("{error}");
         let failed = std::mem::replace(&mut self.engine, Engine::None(EngineError::Gpu(error.clone())));
         if matches!(error, GpuError::Hung { .. }) {
             // To drop it would wait for work that does not end, and the same device would be no better.
             std::mem::forget(failed);
-            self.reopenings_left = 0;
         } else {
             // Its memory is given back before the next one asks for as much.
             drop(failed);
-        }
-        if self.reopenings_left > 0 {
-            self.reopenings_left -= 1;
             let tables = self.encoder.tables();
-            match GpuEngine::open(&self.weights, &self.bench, &tables, self.adapters, self.precision) {
-                Ok(engine) => {
-                    self.description = described(&engine, self.adapters);
-                    tracing::warn!("the GPU was opened again: holograms are computed by {}", self.description);
-                    self.engine = Engine::Gpu(Box::new(engine));
+            while let Some(pause) = self.reopenings.after_fault(host_now()) {
+                if !self.used_for.let_pass(pause) {
                     return;
                 }
-                Err(again) => tracing::error!("the GPU cannot be opened again: {again}"),
+                match GpuEngine::open(&self.weights, &self.bench, &tables, self.adapters, self.precision) {
+                    Ok(engine) => {
+                        self.description = described(&engine, self.adapters);
+                        tracing::warn!("the GPU was opened again: holograms are computed by {}", self.description);
+                        self.engine = Engine::Gpu(Box::new(engine));
+                        return;
+                    }
+                    Err(again) => tracing::error!("the GPU cannot be opened again: {again}"),
+                }
             }
         }
         let precision = self.precision.unwrap_or(Precision::Half);
@@ -231,7 +259,7 @@ impl Renderer for GpuRenderer {
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
+    use std::sync::atomic::AtomicBool;
 
     use holod_calibration::Resolution;
     use holod_calibration::rig::Rig;
@@ -243,8 +271,12 @@ mod tests {
     const PANEL: Resolution = Resolution { width: 41, height: 25 };
 
     fn renderer(encoder: &Arc<PanelEncoder>) -> GpuRenderer {
+        renderer_for(&Use::Command, encoder)
+    }
+
+    fn renderer_for(used_for: &Use, encoder: &Arc<PanelEncoder>) -> GpuRenderer {
         let (weights, bench) = (Weights::builtin_small(), DisplayGeometry::DEFAULT);
-        GpuRenderer::new(&weights, &bench, encoder, Adapters::Software, Some(Precision::Single))
+        GpuRenderer::new(&weights, &bench, encoder, Adapters::Software, Some(Precision::Single), used_for)
             .expect("Mesa's software device; install mesa-vulkan-drivers")
     }
 
@@ -290,10 +322,43 @@ mod tests {
         gpu.lose_device();
         assert!(render(&mut gpu) && gpu.description().starts_with("gpu, "), "{}", gpu.description());
         assert!(!render(&mut gpu));
-        gpu.reopenings_left = 0;
+        gpu.reopenings.spent = PAUSES.len();
         gpu.lose_device();
         assert!(render(&mut gpu) && gpu.description().starts_with("cpu, "), "{}", gpu.description());
         assert!(gpu.description().contains("failed") && !render(&mut gpu));
+    }
+
+    #[test]
+    fn a_device_is_opened_again_after_longer_and_longer_and_anew_after_an_hour() {
+        let hour = TimeNs(3_600_000_000_000);
+        let mut reopenings = Reopenings::default();
+        let mut pauses_ms = |times: &[TimeNs]| -> Vec<Option<u128>> {
+            times.iter().map(|&t| reopenings.after_fault(t).map(|pause| pause.as_millis())).collect()
+        };
+        // In one outage, however the openings fail.
+        let t = TimeNs(7);
+        assert_eq!(pauses_ms(&[t, t + TimeNs(9), t + TimeNs(30)]), [Some(500), Some(1000), Some(2000)]);
+        let t_last = hour;
+        assert_eq!(pauses_ms(&[t_last - TimeNs(1), t_last]), [None, None]);
+        // An hour after the last fault, not after the first.
+        assert_eq!(pauses_ms(&[t_last + hour - TimeNs(1)]), [None]);
+        let t_well = t_last + hour - TimeNs(1) + hour;
+        assert_eq!(pauses_ms(&[t_well, t_well + TimeNs(1)]), [Some(500), Some(1000)]);
+    }
+
+    #[test]
+    fn the_end_of_a_run_waits_for_no_device() {
+        let encoder = Arc::new(PanelEncoder::new(&Rig::default().panel, PANEL, SIZE).unwrap());
+        let stop = Arc::new(AtomicBool::new(false));
+        let mut gpu = renderer_for(&Use::Loop { stop: Arc::clone(&stop) }, &encoder);
+        let (frame, mut levels) = (Arc::new(scene::sample_frame(SIZE)), LevelsFrame::new(encoder.layout()));
+        let mut render = |gpu: &mut GpuRenderer| gpu.render(&frame, PupilDiameter::from_mm(3.0), &mut levels);
+        gpu.lose_device();
+        assert!(render(&mut gpu).unwrap().engine_changed, "it is waited for while the run goes on");
+        stop.store(true, std::sync::atomic::Ordering::Release);
+        gpu.lose_device();
+        assert!(matches!(render(&mut gpu), Err(EngineError::Gpu(GpuError::Failed { .. }))));
+        assert!(matches!(gpu.engine, Engine::None(_)));
     }
 
     #[test]

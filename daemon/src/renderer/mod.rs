@@ -5,6 +5,8 @@ mod cpu;
 mod gpu;
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter, Resolution};
@@ -18,6 +20,38 @@ use self::cpu::CpuRenderer;
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
 
+/// An order to end the loop is seen within this time.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// What a renderer is opened for, which says how long a device that fails is waited for.
+#[derive(Clone, Debug)]
+pub enum Use {
+    /// Frames that a command waits for, as long as they take.
+    Command,
+    /// The frames of a run. Once `stop` is set nothing more is waited for.
+    Loop {
+        /// The run ends.
+        stop: Arc<AtomicBool>,
+    },
+}
+
+impl Use {
+    /// Lets `pause` go by; false where the run ends before that.
+    fn let_pass(&self, pause: Duration) -> bool {
+        let t_end = Instant::now() + pause;
+        loop {
+            if matches!(self, Self::Loop { stop } if stop.load(Ordering::Acquire)) {
+                return false;
+            }
+            let left = t_end.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return true;
+            }
+            std::thread::sleep(left.min(LOOK));
+        }
+    }
+}
+
 /// Makes panel levels of frames of one size for one panel.
 pub trait Renderer: Send {
     /// Writes the levels of the hologram of `frame` for an eye with `pupil` to `levels`, which has the panel's layout.
@@ -28,7 +62,7 @@ pub trait Renderer: Send {
     ///
     /// # Errors
     /// [`EngineError`] for a frame of another size than the renderer was made for, a pupil that is none, and
-    /// a device that failed where no other engine could take its place.
+    /// a device that failed where no other engine could take its place, or the run ended before that.
     ///
     /// # Panics
     /// Where `levels` is not of the panel's size.
@@ -88,6 +122,7 @@ pub fn open(
     weights: &Weights,
     bench: &DisplayGeometry,
     encoder: &Arc<PanelEncoder>,
+    used_for: &Use,
 ) -> Result<Box<dyn Renderer>, Failure> {
     let precision = match backend {
         Backend::Auto => None,
@@ -95,7 +130,7 @@ pub fn open(
         Backend::CpuHalf | Backend::GpuHalf => Some(Precision::Half),
     };
     let on_cpu = |no_gpu| CpuRenderer::new(weights, bench, encoder, precision.unwrap_or(Precision::Half), no_gpu);
-    let on_gpu = |adapters| on_gpu(weights, bench, encoder, adapters, precision);
+    let on_gpu = |adapters| on_gpu(weights, bench, encoder, adapters, precision, used_for);
     match backend {
         Backend::Cpu | Backend::CpuHalf => Ok(Box::new(on_cpu(None)?)),
         Backend::Auto => match on_gpu(Adapters::Hardware) {
@@ -137,8 +172,9 @@ fn on_gpu(
     encoder: &Arc<PanelEncoder>,
     adapters: Adapters,
     precision: Option<Precision>,
+    used_for: &Use,
 ) -> Result<Box<dyn Renderer>, EngineError> {
-    Ok(Box::new(gpu::GpuRenderer::new(weights, bench, encoder, adapters, precision)?))
+    Ok(Box::new(gpu::GpuRenderer::new(weights, bench, encoder, adapters, precision, used_for)?))
 }
 
 #[cfg(not(feature = "gpu"))]
@@ -148,6 +184,7 @@ fn on_gpu(
     _: &Arc<PanelEncoder>,
     _: Adapters,
     _: Option<Precision>,
+    _: &Use,
 ) -> Result<Box<dyn Renderer>, EngineError> {
     Err(GpuError::NotBuilt.into())
 }

@@ -31,7 +31,7 @@ use super::watch::{Announced, Limits, Names, Rings, Watch};
 use crate::control::{self, Preparer, Steering};
 use crate::failure::{Exit, Failure};
 use crate::record::FrameOrders;
-use crate::renderer::{self, Renderer};
+use crate::renderer::{self, Renderer, Use};
 use crate::source::{OpenPictures, Pictures};
 use crate::status::{self, StatusFile};
 use crate::{progress, setup, source, speed};
@@ -81,9 +81,11 @@ pub(super) fn build(
     let encoder = progress::during(&format!("preparing the levels of the panel of {}", rig.resolution()), || {
         renderer::panel_encoder(rig, resolution)
     })?;
+    let stop = Arc::new(AtomicBool::new(false));
+    let used_for = Use::Loop { stop: Arc::clone(&stop) };
     let (renderer, frame_time) = progress::during(&format!("preparing the network for {resolution}"), || {
         let mut renderer =
-            scheduling::patient(|| renderer::open(plan.backend, &plan.weights, &rig.geometry, &encoder))?;
+            scheduling::patient(|| renderer::open(plan.backend, &plan.weights, &rig.geometry, &encoder, &used_for))?;
         let frame_time = first_frame_time(&mut *renderer, &plan, LevelsFrame::new(encoder.layout()))?;
         Ok::<_, Failure>((renderer, frame_time))
     })?;
@@ -132,7 +134,6 @@ pub(super) fn build(
         .dark_switch()
         .install_panic_hook(host_now, || holod_model::gpu::panic_is_caught() || control::panic_is_caught());
 
-    let stop = Arc::new(AtomicBool::new(false));
     let records_lost = Arc::new(AtomicU64::new(0));
     let (record_producer, records) = rtrb::RingBuffer::new(RECORDS);
     let (places, change_consumer) = rtrb::RingBuffer::new(CHANGES);
@@ -147,6 +148,7 @@ pub(super) fn build(
         resolution,
         frame: plan.pictures.first_frame(),
         backend: plan.backend,
+        used_for,
         encoder: Arc::clone(&encoder),
         has_feed: feed.is_some(),
         plays,

@@ -98,7 +98,10 @@ impl FrameLoop {
             if !self.sleep_until(plan.t_wake) {
                 break;
             }
-            self.frame(plan)?;
+            if let Err(failed) = self.frame(plan) {
+                // An engine that fails is not replaced any more where the run ends: that is no failure of the run.
+                return if self.stop.load(Ordering::Acquire) { Ok(()) } else { Err(failed) };
+            }
             made += 1;
             if let Inputs::Recorded(playback) = &mut self.inputs {
                 playback.advance();
