@@ -349,6 +349,8 @@ fn the_watchdog_is_fed_and_readiness_told_only_once_frames_are_shown() {
     }
     assert!(child.wait().unwrap().success(), "process {pid}");
     let ready = told.iter().position(|line| line.contains("READY=1")).expect("readiness is told");
+    let more_time = told.iter().position(|line| line.contains("EXTEND_TIMEOUT_USEC=120000000"));
+    assert!(more_time.is_some_and(|more_time| more_time < ready), "{told:?}");
     let first_food = told.iter().position(|line| line.contains("WATCHDOG=1")).expect("the watchdog is fed");
     assert!(ready <= first_food);
     let food = told.iter().filter(|line| line.contains("WATCHDOG=1")).count();

@@ -2,7 +2,8 @@
 //! the processor takes over, so that the display goes on.
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
 
 use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter, TimeNs, host_now};
 use holod_model::engine::{EngineError, GpuEngine, Precision, StageTiming};
@@ -14,10 +15,46 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 use super::cpu::CpuRenderer;
 use super::{Rendered, Renderer, Use};
 
+/// An order to end the loop is seen within this time.
+const LOOK: Duration = Duration::from_millis(20);
+
+/// How long a run waits for a GPU's work before the processor takes over: less than the service's watchdog waits for a
+/// frame (`WatchdogSec=`) with what passes between the last time that it was fed and the hang.
+const LOOP_PATIENCE: Duration = Duration::from_secs(5);
+/// The same for the first frame of a run or of new weights, which nobody sees yet: a driver may compile shaders only
+/// then.
+const FIRST_FRAME_PATIENCE: Duration = Duration::from_secs(30);
 /// How long a device that failed is left alone before each time that it is opened anew: a card's reset takes seconds.
 const PAUSES: [Duration; 3] = [Duration::from_millis(500), Duration::from_secs(1), Duration::from_secs(2)];
 /// A device that did not fail for so long may be opened anew as often as at first.
 const FORGIVEN_AFTER: TimeNs = TimeNs(3_600_000_000_000);
+
+impl Use {
+    /// How long a device's work may take before it hangs, for a renderer's first frame and those after it; where
+    /// that is not left to the engine.
+    fn patience(&self, adapters: Adapters) -> Option<[Duration; 2]> {
+        match (self, adapters) {
+            (Self::Loop { .. }, Adapters::Hardware) => Some([FIRST_FRAME_PATIENCE, LOOP_PATIENCE]),
+            // A processor that plays a GPU is slow, and does not hang.
+            (Self::Command, _) | (_, Adapters::Software) => None,
+        }
+    }
+
+    /// Lets `pause` go by; false where the run ends before that.
+    fn let_pass(&self, pause: Duration) -> bool {
+        let t_end = Instant::now() + pause;
+        loop {
+            if matches!(self, Self::Loop { stop } if stop.load(Ordering::Acquire)) {
+                return false;
+            }
+            let left = t_end.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return true;
+            }
+            std::thread::sleep(left.min(LOOK));
+        }
+    }
+}
 
 pub(super) struct GpuRenderer {
     weights: Weights,
@@ -99,7 +136,10 @@ impl GpuRenderer {
         precision: Option<Precision>,
         used_for: &Use,
     ) -> Result<Self, EngineError> {
-        let engine = Box::new(GpuEngine::open(weights, bench, &encoder.tables(), adapters, precision)?);
+        let mut engine = GpuEngine::open(weights, bench, &encoder.tables(), adapters, precision)?;
+        if let Some([first_frame, _]) = used_for.patience(adapters) {
+            engine.hangs_after(first_frame);
+        }
         Ok(Self {
             description: described(&engine, adapters),
             weights: weights.clone(),
@@ -108,7 +148,7 @@ impl GpuRenderer {
             adapters,
             precision,
             used_for: used_for.clone(),
-            engine: Engine::Gpu(engine),
+            engine: Engine::Gpu(Box::new(engine)),
             reopenings: Reopenings::default(),
             hologram: ReadBack::NONE,
             pattern: ReadBack::NONE,
@@ -131,7 +171,8 @@ impl GpuRenderer {
                     return;
                 }
                 match GpuEngine::open(&self.weights, &self.bench, &tables, self.adapters, self.precision) {
-                    Ok(engine) => {
+                    Ok(mut engine) => {
+                        first_frame_is_made(&mut engine, &self.used_for, self.adapters);
                         self.description = described(&engine, self.adapters);
                         tracing::warn!("the GPU was opened again: holograms are computed by {}", self.description);
                         self.engine = Engine::Gpu(Box::new(engine));
@@ -158,6 +199,13 @@ impl GpuRenderer {
         if let Engine::Gpu(engine) = &self.engine {
             engine.lose_device();
         }
+    }
+}
+
+/// From now on a frame takes its usual time; also on a device that is opened again, which is waited for in mid-run.
+fn first_frame_is_made(engine: &mut GpuEngine, used_for: &Use, adapters: Adapters) {
+    if let Some([_, usual]) = used_for.patience(adapters) {
+        engine.hangs_after(usual);
     }
 }
 
@@ -190,6 +238,7 @@ impl Renderer for GpuRenderer {
             let failed = match &mut self.engine {
                 Engine::Gpu(engine) => match engine.render(frame, pupil, levels.samples_mut()) {
                     Ok(counts) => {
+                        first_frame_is_made(engine, &self.used_for, self.adapters);
                         let pixels = self.encoder.pattern_resolution().pixels() as f32;
                         return Ok(Rendered {
                             clipped_share: counts.clipped as f32 / (3.0 * pixels),
@@ -329,6 +378,22 @@ mod tests {
     }
 
     #[test]
+    fn a_run_waits_less_for_a_gpu_than_its_watchdog_does() {
+        let run = Use::Loop { stop: Arc::default() };
+        let [first, patience] = run.patience(Adapters::Hardware).unwrap();
+        assert!(first > patience && first < Duration::from_secs(90), "the start's own limit");
+        let service = include_str!("../../../deploy/systemd/holod.service");
+        let watchdog_s = service.lines().find_map(|line| line.strip_prefix("WatchdogSec=")).unwrap();
+        let watchdog = Duration::from_secs(watchdog_s.parse().unwrap());
+        // It is fed four times in its time.
+        let left = |patience: Duration| watchdog.checked_sub(watchdog / 4 + patience).unwrap_or_default();
+        assert!(left(patience) >= Duration::from_secs(2), "{:?} for the processor's first frame", left(patience));
+        assert_eq!(left(Duration::from_secs(120)), Duration::ZERO, "the comparison is blind");
+        assert_eq!(run.patience(Adapters::Software), None);
+        assert_eq!(Use::Command.patience(Adapters::Hardware), None);
+    }
+
+    #[test]
     fn a_device_is_opened_again_after_longer_and_longer_and_anew_after_an_hour() {
         let hour = TimeNs(3_600_000_000_000);
         let mut reopenings = Reopenings::default();
@@ -365,8 +430,8 @@ mod tests {
     fn a_device_that_hangs_is_left_to_itself_and_the_processor_takes_over() {
         let encoder = Arc::new(PanelEncoder::new(&Rig::default().panel, PANEL, SIZE).unwrap());
         let mut gpu = renderer(&encoder);
-        gpu.replace(&GpuError::Hung { name: "a card".into(), waited: Duration::from_secs(120) });
-        assert!(matches!(gpu.engine, Engine::Cpu(_)) && gpu.description().contains("120 s"), "{}", gpu.description());
+        gpu.replace(&GpuError::Hung { name: "a card".into(), waited: Duration::from_secs(5) });
+        assert!(matches!(gpu.engine, Engine::Cpu(_)) && gpu.description().contains("5 s"), "{}", gpu.description());
         let (frame, mut levels) = (Arc::new(scene::sample_frame(SIZE)), LevelsFrame::new(encoder.layout()));
         gpu.render(&frame, PupilDiameter::from_mm(3.0), &mut levels).unwrap();
     }

@@ -5,8 +5,7 @@ mod cpu;
 mod gpu;
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::sync::atomic::AtomicBool;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter, Resolution};
@@ -20,9 +19,6 @@ use self::cpu::CpuRenderer;
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
 
-/// An order to end the loop is seen within this time.
-const LOOK: Duration = Duration::from_millis(20);
-
 /// What a renderer is opened for, which says how long a device that fails is waited for.
 #[derive(Clone, Debug)]
 pub enum Use {
@@ -33,23 +29,6 @@ pub enum Use {
         /// The run ends.
         stop: Arc<AtomicBool>,
     },
-}
-
-impl Use {
-    /// Lets `pause` go by; false where the run ends before that.
-    fn let_pass(&self, pause: Duration) -> bool {
-        let t_end = Instant::now() + pause;
-        loop {
-            if matches!(self, Self::Loop { stop } if stop.load(Ordering::Acquire)) {
-                return false;
-            }
-            let left = t_end.saturating_duration_since(Instant::now());
-            if left.is_zero() {
-                return true;
-            }
-            std::thread::sleep(left.min(LOOK));
-        }
-    }
 }
 
 /// Makes panel levels of frames of one size for one panel.

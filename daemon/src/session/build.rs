@@ -71,6 +71,7 @@ pub(super) fn build(
     observer: &mut dyn Observer,
 ) -> Result<Session<'_>, Failure> {
     status::remove_leftovers();
+    let service = Service::connect();
     // Its threads keep the priority of whoever calls it first, which must not be the panel's.
     scheduling::patient(rayon::current_num_threads);
     let plays = playback.is_some();
@@ -84,8 +85,10 @@ pub(super) fn build(
     let stop = Arc::new(AtomicBool::new(false));
     let used_for = Use::Loop { stop: Arc::clone(&stop) };
     let (renderer, frame_time) = progress::during(&format!("preparing the network for {resolution}"), || {
+        service.starting();
         let mut renderer =
             scheduling::patient(|| renderer::open(plan.backend, &plan.weights, &rig.geometry, &encoder, &used_for))?;
+        service.starting();
         let frame_time = first_frame_time(&mut *renderer, &plan, LevelsFrame::new(encoder.layout()))?;
         Ok::<_, Failure>((renderer, frame_time))
     })?;
@@ -226,7 +229,7 @@ pub(super) fn build(
         desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }),
         signals,
         hangups: plan.hangups,
-        service: Service::connect(),
+        service,
         status: StatusFile::create(),
         t_origin,
         announced: Announced::new(advised),

@@ -154,6 +154,9 @@ impl Drop for Signals {
     }
 }
 
+/// How long the service manager waits for a part of the start at least, beside its own limit for the whole.
+const LONGEST_STEP: Duration = Duration::from_secs(120);
+
 /// The service manager's end of the line; silent where there is none.
 pub(super) struct Service {
     watchdog: Option<Watchdog>,
@@ -188,6 +191,11 @@ impl Service {
             frames_fed: 0,
         });
         Self { watchdog, ready: false }
+    }
+
+    /// A part of the start begins that may take [`LONGEST_STEP`]: compiled shaders, a network's first frame.
+    pub(super) fn starting(&self) {
+        tell(&[NotifyState::ExtendTimeoutUsec(LONGEST_STEP.as_micros() as u32)]);
     }
 
     /// Frames were shown, or cannot be before a lost panel is back: tells readiness after the first, feeds the watchdog.

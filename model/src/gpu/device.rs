@@ -12,6 +12,8 @@ pub(crate) struct Gpu {
     pub(crate) queue: wgpu::Queue,
     name: String,
     fault: Arc<OnceLock<String>>,
+    /// The longest that any piece of work may take before the device counts as hung.
+    pub(crate) patience: Duration,
     /// The most bytes that a shader can see as one buffer.
     pub(crate) largest_buffer: u64,
     /// The memory that the threads of a workgroup share, bytes.
@@ -27,7 +29,7 @@ pub(crate) struct Gpu {
 
 /// Bytes that are read back at a time.
 const READ_BYTES: u64 = 64 << 20;
-/// The longest that any piece of work may take before the device counts as hung.
+/// That, unless another one is set.
 const PATIENCE: Duration = Duration::from_secs(if cfg!(test) { 900 } else { 120 });
 
 impl Gpu {
@@ -99,6 +101,7 @@ impl Gpu {
             queue,
             name,
             fault,
+            patience: PATIENCE,
             largest_buffer,
             workgroup_bytes,
             workgroup_threads,
@@ -222,10 +225,10 @@ impl Gpu {
 
     /// Waits until the work of `submission`, and all before it, is done.
     pub(crate) fn wait(&self, submission: wgpu::SubmissionIndex) -> Result<(), GpuError> {
-        let until = wgpu::PollType::Wait { submission_index: Some(submission), timeout: Some(PATIENCE) };
+        let until = wgpu::PollType::Wait { submission_index: Some(submission), timeout: Some(self.patience) };
         match self.guarded(|| has_ended(self.device.poll(until)))? {
             true => Ok(()),
-            false => Err(GpuError::Hung { name: self.name.clone(), waited: PATIENCE }),
+            false => Err(GpuError::Hung { name: self.name.clone(), waited: self.patience }),
         }
     }
 

@@ -139,6 +139,12 @@ impl GpuEngine {
         self.gpu.name()
     }
 
+    /// From now on the device counts as hung ([`GpuError::Hung`]) where a frame, or what is read back, takes longer
+    /// than `patience`; at first that is two minutes.
+    pub fn hangs_after(&mut self, patience: Duration) {
+        self.gpu.patience = patience;
+    }
+
     /// What its features are.
     pub fn precision(&self) -> Precision {
         self.precision

@@ -2,6 +2,7 @@
 
 use std::f32::consts::{FRAC_PI_2, TAU};
 use std::sync::Arc;
+use std::time::Duration;
 
 use holod_calibration::{Colour, DisplayGeometry, LevelTables, PerColour, PupilDiameter, Resolution};
 use num_complex::{Complex32, Complex64};
@@ -496,6 +497,18 @@ fn wrong_sizes_and_pupils_are_refused_and_a_lost_device_is_told() {
     let nothing = linear_tables(Resolution { width: 0, height: 4 });
     let refused = GpuEngine::open(&weights, &DisplayGeometry::DEFAULT, &nothing, test_adapters(), None);
     assert!(matches!(refused.err(), Some(EngineError::Empty { .. })));
+}
+
+#[test]
+fn a_device_is_waited_for_as_long_as_was_said() {
+    let (weights, resolution) = (Weights::builtin_small(), Resolution { width: 256, height: 256 });
+    let mut engine = engine(&weights, &DisplayGeometry::DEFAULT, resolution);
+    let mut samples = vec![0; 3 * resolution.pixels()];
+    let (frame, pupil) = (Arc::new(frame(resolution, 0)), PupilDiameter::from_mm(3.0));
+    engine.hangs_after(Duration::from_nanos(1));
+    let hung = engine.render(&frame, pupil, &mut samples);
+    assert!(matches!(hung, Err(EngineError::Gpu(GpuError::Hung { .. }))), "{hung:?}");
+    // Dropped, it waits for its work.
 }
 
 #[test]
