@@ -4,7 +4,8 @@ use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
-use holod_calibration::TimeNs;
+use holod_calibration::{PupilDiameter, TimeNs};
+use holod_model::RgbdFrame;
 use holod_model::engine::EngineError;
 use holod_pupil_input::{ReplaySpeed, Tracker, TrackerHandle, TrackerOptions, TrackerSpec};
 use holod_slm_output::laser::open_laser;
@@ -89,7 +90,9 @@ pub(super) fn build(
         let mut renderer =
             scheduling::patient(|| renderer::open(plan.backend, &plan.weights, &rig.geometry, &encoder, &used_for))?;
         service.starting();
-        let frame_time = first_frame_time(&mut *renderer, &plan, LevelsFrame::new(encoder.layout()))?;
+        let [pupil, _] = plan.weights.trained_pupils(&rig.geometry);
+        let levels = LevelsFrame::new(encoder.layout());
+        let frame_time = first_frame_time(&mut *renderer, &plan.pictures.first_frame(), pupil, levels)?;
         Ok::<_, Failure>((renderer, frame_time))
     })?;
     tracing::info!("holograms are computed by {}", renderer.description());
@@ -280,23 +283,60 @@ fn open_output(plan: &SessionPlan, encoder: &PanelEncoder, options: OutputOption
 }
 
 /// How long a frame takes, measured before anything is shown: the second one, unless the first took very long. A GPU's
-/// driver still prepares things while it does the first.
+/// driver still prepares things while it does the first. One in which an engine failed tells the time of that.
 fn first_frame_time(
     renderer: &mut dyn Renderer,
-    plan: &SessionPlan,
+    frame: &Arc<RgbdFrame>,
+    pupil: PupilDiameter,
     mut levels: LevelsFrame,
 ) -> Result<TimeNs, Failure> {
-    let [pupil, _] = plan.weights.trained_pupils(&plan.rig.geometry);
-    let frame = plan.pictures.first_frame();
     let mut time = || {
         let began = host_now();
-        renderer.render(&frame, pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))?;
-        Ok(host_now() - began)
+        let rendered = renderer.render(frame, pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))?;
+        Ok::<_, Failure>((host_now() - began, rendered.engine_changed))
     };
-    let first = time()?;
-    if first > LONG_FRAME { Ok(first) } else { time() }
+    let (mut taken, mut engine_failed) = time()?;
+    if taken <= LONG_FRAME && !engine_failed {
+        (taken, engine_failed) = time()?;
+    }
+    while engine_failed {
+        (taken, engine_failed) = time()?;
+    }
+    Ok(taken)
 }
 
 fn stall_timeout(frame_time: TimeNs) -> TimeNs {
     TimeNs(STALL_FRAMES * frame_time.0).clamp(STALL_TIMEOUT_MIN, STALL_TIMEOUT_MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use holod_calibration::Resolution;
+    use holod_calibration::rig::Rig;
+
+    use super::*;
+    use crate::renderer::failing::Failing;
+
+    #[test]
+    fn a_frame_in_which_an_engine_fails_tells_no_frame_time() {
+        let size = Resolution { width: 8, height: 8 };
+        let encoder = renderer::panel_encoder(&Rig::default(), size).unwrap();
+        let (slow, quick) = (Duration::from_millis(200), Duration::ZERO);
+        let frame_time = |frames: &[(Duration, bool)]| {
+            let mut renderer = Failing { frames: frames.iter().copied().collect() };
+            let (frame, levels) = (Arc::new(RgbdFrame::black(size)), LevelsFrame::new(encoder.layout()));
+            first_frame_time(&mut renderer, &frame, PupilDiameter::from_mm(3.0), levels).unwrap()
+        };
+        assert!(frame_time(&[(quick, false), (slow, false)]) >= TimeNs(200_000_000), "the second frame's");
+        for frames in [
+            &[(slow, false), (quick, false)][..],
+            &[(slow, true), (quick, false)],
+            &[(quick, false), (slow, true), (quick, false)],
+            &[(slow, true), (slow, true), (quick, false)],
+        ] {
+            assert!(frame_time(frames) < TimeNs(200_000_000), "{frames:?}");
+        }
+    }
 }
