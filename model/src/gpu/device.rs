@@ -1,6 +1,7 @@
 //! One device with its queue. Faults that the driver tells late, between calls, are kept and given by the next call
 //! that can fail, so that none is missed.
 
+use std::ops::Deref;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -9,7 +10,7 @@ use super::{Adapters, GpuError, MatrixUnits, caught};
 /// A device and its queue.
 pub(crate) struct Gpu {
     pub(crate) device: wgpu::Device,
-    pub(crate) queue: wgpu::Queue,
+    pub(crate) queue: GivenBack<wgpu::Queue>,
     name: String,
     fault: Arc<OnceLock<String>>,
     /// The longest that any piece of work may take before the device counts as hung.
@@ -98,7 +99,7 @@ impl Gpu {
         let timestamp_ns = (!timestamps.is_empty()).then(|| queue.get_timestamp_period());
         Ok(Self {
             device,
-            queue,
+            queue: GivenBack(Some(queue)),
             name,
             fault,
             patience: PATIENCE,
@@ -263,6 +264,25 @@ impl Gpu {
     }
 }
 
+/// Something whose end is no panic: that of a queue waits for its device, and wgpu panics where the driver then says
+/// anything but that the device is lost.
+pub(crate) struct GivenBack<T>(Option<T>);
+
+impl<T> Deref for GivenBack<T> {
+    type Target = T;
+
+    fn deref(&self) -> &T {
+        self.0.as_ref().expect("it is there until it is dropped")
+    }
+}
+
+impl<T> Drop for GivenBack<T> {
+    fn drop(&mut self) {
+        // Nothing is left to be done with a device that fails now.
+        let _given_back = caught(|| drop(self.0.take()));
+    }
+}
+
 /// Whether the adapter multiplies matrices as [`MatrixUnits`] does, in subgroups of 32 threads always: where their size
 /// may vary, a workgroup of 32 could be half of one.
 fn has_matrix_units(adapter: &wgpu::Adapter) -> bool {
@@ -350,6 +370,21 @@ pub(crate) mod tests {
         assert!(panicked.to_string().contains("it was lost"), "{panicked}");
         gpu.device.destroy();
         assert!(matches!(gpu.read(&buffer, &mut [0.0_f32; 3]), Err(GpuError::Failed { .. })));
+    }
+
+    #[test]
+    fn what_panics_at_its_end_is_given_back_all_the_same() {
+        struct Panics;
+        impl Drop for Panics {
+            fn drop(&mut self) {
+                assert!(panic_is_caught());
+                panic!("as wgpu's queue does")
+            }
+        }
+        assert!(std::panic::catch_unwind(|| drop(Panics)).is_err(), "the test is blind");
+        drop(GivenBack(Some(Panics)));
+        assert!(!panic_is_caught());
+        assert_eq!(*GivenBack(Some(9)), 9);
     }
 
     #[test]
