@@ -31,7 +31,7 @@ const PATIENCE: Duration = Duration::from_secs(1);
 static STDERR: OnceLock<Outlet> = OnceLock::new();
 
 /// Starts the log on standard error, which says as much as `HOLOD_LOG` asks for. A standard error that nobody reads,
-/// that is closed or full, stops nobody.
+/// that is closed or full, stops nobody. It says panics, too, but for those that become an error of the GPU.
 ///
 /// # Errors
 /// The system gives no thread for it.
@@ -44,6 +44,9 @@ pub fn start() -> io::Result<()> {
         Err(_closed) => drop(STDERR.set(Outlet::start("holod-log", io::sink())?)),
     }
     std::panic::set_hook(Box::new(|panic| {
+        if holod_model::gpu::panic_is_caught() {
+            return;
+        }
         let backtrace = Backtrace::capture();
         let backtrace = match backtrace.status() {
             BacktraceStatus::Captured => format!("\n{backtrace}"),
