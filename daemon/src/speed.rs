@@ -53,19 +53,23 @@ pub(crate) fn panel_frames_hz(panel: &Panel) -> f64 {
     panel.refresh_hz * panel.mode.fields_per_refresh() / panel.fields() as f64
 }
 
-/// What would bring `frames_hz` frames of `size` nearer to the panel's; nothing where there are enough.
-pub(crate) fn advice(frames_hz: f64, rig: &Rig, size: Resolution) -> Option<String> {
+/// What would bring `frames_hz` frames of `size`, by an engine of the description `engine`, nearer to the panel's;
+/// nothing where there are enough.
+pub(crate) fn advice(frames_hz: f64, engine: &str, rig: &Rig, size: Resolution) -> Option<String> {
     let panel_hz = panel_frames_hz(&rig.panel);
     if frames_hz >= ENOUGH * panel_hz {
         return None;
     }
     let mut cures = Vec::new();
-    match rig.model.weights {
-        WeightsChoice::Standard => {
-            cures.push("--weights small takes about 0.7 of the time, --weights fast 0.5".to_owned());
-        }
-        WeightsChoice::Small => cures.push("--weights fast takes about 0.7 of the time".to_owned()),
-        WeightsChoice::Fast | WeightsChoice::File(_) => {}
+    let smaller = match (&rig.model.weights, is_gpu(engine)) {
+        (WeightsChoice::Standard, false) => "--weights small takes about 0.7 of the time, --weights fast 0.5",
+        (WeightsChoice::Standard, true) => "--weights small takes about 0.5 of the time, --weights fast 0.3",
+        (WeightsChoice::Small, false) => "--weights fast takes about 0.7 of the time",
+        (WeightsChoice::Small, true) => "--weights fast takes about 0.6 of the time",
+        (WeightsChoice::Fast | WeightsChoice::File(_), _) => "",
+    };
+    if !smaller.is_empty() {
+        cures.push(smaller.to_owned());
     }
     // Time goes with the number of pixels.
     let shrunk = |side: usize| {
@@ -76,7 +80,12 @@ pub(crate) fn advice(frames_hz: f64, rig: &Rig, size: Resolution) -> Option<Stri
     if small.width < size.width && small.height < size.height {
         cures.push(format!("--resolution {small} (with --fit contain where a scene is named) is about what keeps up"));
     }
-    cures.push("a GPU helps, or more or faster cores".to_owned());
+    let other = match is_gpu(engine) {
+        true if engine.contains(renderer::PLAYS_A_GPU) => "--backend cpu helps, and a GPU",
+        true => "a faster GPU helps",
+        false => "a GPU helps, or more or faster cores",
+    };
+    cures.push(other.to_owned());
     Some(cures.join("; "))
 }
 
@@ -197,6 +206,7 @@ mod tests {
     #[test]
     fn a_slow_display_is_told_what_helps_and_a_fast_one_nothing() {
         let mut rig = Rig::default();
+        let advice = |frames_hz, rig: &Rig, size| advice(frames_hz, "cpu, 8 threads", rig, size);
         assert_eq!(advice(60.0, &rig, SIZE), None);
         assert_eq!(advice(54.1, &rig, SIZE), None);
         let said = advice(0.6, &rig, SIZE).unwrap();
@@ -211,6 +221,20 @@ mod tests {
         assert!(!advice(0.6, &rig, SIZE).unwrap().contains("--weights"));
         let least = Resolution { width: 64, height: 64 };
         assert!(!advice(0.6, &rig, least).unwrap().contains("--resolution"));
+    }
+
+    #[test]
+    fn a_slow_gpu_is_told_what_helps_there() {
+        let mut rig = Rig::default();
+        let card = "gpu, X, single precision";
+        let of = |rig: &Rig, engine: &str| advice(0.6, engine, rig, SIZE).unwrap();
+        let said = of(&rig, card);
+        assert!(said.contains("small takes about 0.5 of the time, --weights fast 0.3"), "{said}");
+        assert!(said.ends_with("; a faster GPU helps"), "{said}");
+        assert!(of(&rig, &format!("{card}, {}", renderer::PLAYS_A_GPU)).ends_with("--backend cpu helps, and a GPU"));
+        rig.model.weights = WeightsChoice::Small;
+        assert!(of(&rig, card).contains("--weights fast takes about 0.6"));
+        assert!(of(&rig, "cpu, 8 threads").contains("--weights fast takes about 0.7"));
     }
 
     #[test]

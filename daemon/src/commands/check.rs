@@ -158,7 +158,7 @@ fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, 
                 })
             };
             let (passed, rates) = rates(&estimate, &sizes, engine_at);
-            let advice = speed::advice(estimate.frames_hz(*first), rig, *first);
+            let advice = speed::advice(estimate.frames_hz(*first), &estimate.engine, rig, *first);
             let says = format!(
                 "{}; estimated from frames of up to {}: {}; the panel could show {:.1}{}",
                 estimate.engine,

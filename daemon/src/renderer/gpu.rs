@@ -13,7 +13,7 @@ use holod_model::{ComplexHologram, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 use super::cpu::CpuRenderer;
-use super::{Rendered, Renderer, Use};
+use super::{PLAYS_A_GPU, Rendered, Renderer, Use};
 
 /// An order to end the loop is seen within this time.
 const LOOK: Duration = Duration::from_millis(20);
@@ -210,7 +210,7 @@ fn first_frame_is_made(engine: &mut GpuEngine, used_for: &Use, adapters: Adapter
 }
 
 fn described(engine: &GpuEngine, adapters: Adapters) -> String {
-    let slow = if adapters == Adapters::Software { ", a processor that plays a GPU" } else { "" };
+    let slow = if adapters == Adapters::Software { format!(", {PLAYS_A_GPU}") } else { String::new() };
     let precision = match engine.precision() {
         Precision::Single => "single",
         Precision::Half => "half",

@@ -19,6 +19,9 @@ use self::cpu::CpuRenderer;
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
 
+/// How a processor that plays a GPU is described.
+pub(crate) const PLAYS_A_GPU: &str = "a processor that plays a GPU";
+
 /// What a renderer is opened for, which says how long a device that fails is waited for.
 #[derive(Clone, Debug)]
 pub enum Use {

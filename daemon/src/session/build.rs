@@ -97,7 +97,7 @@ pub(super) fn build(
     })?;
     tracing::info!("holograms are computed by {}", renderer.description());
     let engine = Arc::new(Mutex::new(renderer.description().to_owned()));
-    let advised = tell_frame_time(&plan, frame_time);
+    let advised = tell_frame_time(&plan, frame_time, renderer.description());
     let pacing = pacing_config(rig, frame_time).map_err(Failure::because(Exit::Config))?;
 
     let t_origin = host_now();
@@ -246,14 +246,14 @@ pub(super) fn build(
 }
 
 /// Says how many frames a second are to be expected. Whether it has said what would bring more.
-fn tell_frame_time(plan: &SessionPlan, frame_time: TimeNs) -> bool {
+fn tell_frame_time(plan: &SessionPlan, frame_time: TimeNs, engine: &str) -> bool {
     let panel_hz = speed::panel_frames_hz(&plan.rig.panel);
     let frames_hz = 1.0 / frame_time.seconds();
     let first_frame = format!(
         "a frame takes {:.0} ms, so about {frames_hz:.2} frames a second of the panel's {panel_hz:.1}",
         frame_time.seconds() * 1e3
     );
-    let advice = speed::advice(frames_hz, &plan.rig, plan.pictures.resolution());
+    let advice = speed::advice(frames_hz, engine, &plan.rig, plan.pictures.resolution());
     match &advice {
         None => tracing::info!("{first_frame}"),
         Some(advice) => tracing::warn!("{first_frame}: {advice}"),

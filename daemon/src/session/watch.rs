@@ -76,6 +76,12 @@ pub(super) struct Names {
     pub(super) hologram: Resolution,
 }
 
+impl Names {
+    fn engine(&self) -> String {
+        self.engine.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
 /// What the other threads say.
 pub(super) struct Rings {
     pub(super) records: rtrb::Consumer<LoopRecord>,
@@ -345,7 +351,8 @@ impl Watch<'_> {
         let Some(reached_hz) = self.announced.rate.reached_hz(self.tally.frames_shown, now) else { return };
         let panel_hz = speed::panel_frames_hz(&self.rig.panel);
         let reached = format!("{reached_hz:.2} frames a second are shown, of the panel's {panel_hz:.1}");
-        match speed::advice(reached_hz, &self.rig, self.names.hologram).filter(|_| !self.announced.advised) {
+        let advice = speed::advice(reached_hz, &self.names.engine(), &self.rig, self.names.hologram);
+        match advice.filter(|_| !self.announced.advised) {
             None => tracing::info!("{reached}"),
             Some(advice) => tracing::warn!("{reached}: {advice}"),
         }
@@ -398,20 +405,22 @@ impl Watch<'_> {
     pub(super) fn figures(&self, output: &OutputCounts, now: TimeNs) -> Figures {
         let Self { tally, names, .. } = self;
         let frame_time = tally.frame_time.spread();
+        let engine = names.engine();
+        let speed_advice = frame_time
+            .and_then(|time| speed::advice(1e3 / f64::from(time.median_ms), &engine, &self.rig, names.hologram));
         Figures {
             rig: self.rig.name.clone(),
             scene: names.scene.clone(),
             weights: setup::weights_name(&self.rig.model.weights),
             tracker: names.tracker.clone(),
-            engine: names.engine.lock().unwrap_or_else(PoisonError::into_inner).clone(),
+            engine,
             hologram: names.hologram.to_string(),
             frames_made: tally.frames_made,
             frames_shown: tally.frames_shown,
             deadline_misses: tally.deadline_misses,
             panel_frames_hz: speed::panel_frames_hz(&self.rig.panel),
             panel_refresh_hz: output.refresh_hz,
-            speed_advice: frame_time
-                .and_then(|time| speed::advice(1e3 / f64::from(time.median_ms), &self.rig, names.hologram)),
+            speed_advice,
             frame_time,
             sample_to_photon: tally.sample_to_photon.spread(),
             picture_to_photon: tally.picture_to_photon.spread(),
