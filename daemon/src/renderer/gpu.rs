@@ -14,6 +14,7 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 use super::cpu::CpuRenderer;
 use super::{PLAYS_A_GPU, Rendered, Renderer, Use};
+use crate::session::scheduling;
 
 /// An order to end the loop is seen within this time.
 const LOOK: Duration = Duration::from_millis(20);
@@ -183,7 +184,14 @@ impl GpuRenderer {
             }
         }
         let precision = self.precision.unwrap_or(Precision::Half);
-        match CpuRenderer::new(&self.weights, &self.bench, &self.encoder, precision, Some(error)) {
+        let (weights, bench, encoder) = (&self.weights, &self.bench, &self.encoder);
+        let on_cpu = || CpuRenderer::new(weights, bench, encoder, precision, Some(error));
+        let opened = match &self.used_for {
+            Use::Command => on_cpu(),
+            // As the threads of a run's first renderer.
+            Use::Loop { .. } => scheduling::patient(on_cpu),
+        };
+        match opened {
             Ok(cpu) => {
                 self.description = cpu.description().to_owned();
                 tracing::warn!("holograms are computed by {}", self.description);
