@@ -34,12 +34,20 @@ const READ_BYTES: u64 = 64 << 20;
 const PATIENCE: Duration = Duration::from_secs(if cfg!(test) { 900 } else { 120 });
 
 impl Gpu {
-    /// Opens the best device: a card of its own before one that is a part of the processor. Its matrix units can be
-    /// used where that is asked for.
+    /// Opens the best device that opens. Its matrix units can be used where that is asked for.
     ///
     /// # Errors
-    /// There is none, or its driver refuses.
+    /// There is none, or the driver of the best one refuses, and those of all others.
     pub(crate) fn open(adapters: Adapters, with_matrices: bool) -> Result<Self, GpuError> {
+        first_that_opens(&Self::candidates(adapters)?, |adapter| Self::on(adapter, with_matrices))
+    }
+
+    /// The devices that will do, of which there is one at least, the best first: cards of their own before those that
+    /// are a part of the processor.
+    ///
+    /// # Errors
+    /// There is none.
+    pub(crate) fn candidates(adapters: Adapters) -> Result<Vec<wgpu::Adapter>, GpuError> {
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
             backends: wgpu::Backends::VULKAN,
             ..wgpu::InstanceDescriptor::new_without_display_handle()
@@ -52,15 +60,24 @@ impl Gpu {
         };
         let mut found = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::VULKAN));
         found.sort_by_key(rank);
-        let usable = |adapter: &&wgpu::Adapter| (adapters == Adapters::Software) == (rank(adapter) == 3);
-        let Some(adapter) = found.iter().find(usable) else {
+        let is_usable = |adapter: &wgpu::Adapter| (adapters == Adapters::Software) == (rank(adapter) == 3);
+        let (usable, others): (Vec<_>, Vec<_>) = found.into_iter().partition(is_usable);
+        if usable.is_empty() {
             let wanted = match adapters {
                 Adapters::Hardware => "GPU; install its driver",
                 Adapters::Software => "software device; install mesa-vulkan-drivers",
             };
-            let passed_over = found.iter().map(|adapter| adapter.get_info().name).collect();
+            let passed_over = others.iter().map(|adapter| adapter.get_info().name).collect();
             return Err(GpuError::None { wanted, passed_over });
-        };
+        }
+        Ok(usable)
+    }
+
+    /// Opens a device.
+    ///
+    /// # Errors
+    /// Its driver refuses.
+    pub(crate) fn on(adapter: &wgpu::Adapter, with_matrices: bool) -> Result<Self, GpuError> {
         let name = adapter.get_info().name;
         let timestamps = adapter.features() & wgpu::Features::TIMESTAMP_QUERY;
         let half_precision = adapter.features() & wgpu::Features::SHADER_F16;
@@ -264,6 +281,12 @@ impl Gpu {
     }
 }
 
+/// What `open` makes of the first candidate with which it can; where there is none, why not with the first.
+pub(crate) fn first_that_opens<A, T, E>(candidates: &[A], open: impl Fn(&A) -> Result<T, E>) -> Result<T, E> {
+    let (first, others) = candidates.split_first().expect("one candidate at least");
+    open(first).or_else(|why| others.iter().find_map(|other| open(other).ok()).ok_or(why))
+}
+
 /// Something whose end is no panic: that of a queue waits for its device, and wgpu panics where the driver then says
 /// anything but that the device is lost.
 pub(crate) struct GivenBack<T>(Option<T>);
@@ -370,6 +393,14 @@ pub(crate) mod tests {
         assert!(panicked.to_string().contains("it was lost"), "{panicked}");
         gpu.device.destroy();
         assert!(matches!(gpu.read(&buffer, &mut [0.0_f32; 3]), Err(GpuError::Failed { .. })));
+    }
+
+    #[test]
+    fn where_the_best_device_will_not_do_the_next_one_is_tried() {
+        let tried = |candidates: &[i32]| first_that_opens(candidates, |&n| if n > 10 { Ok(n) } else { Err(n) });
+        assert_eq!(tried(&[11, 12]), Ok(11));
+        assert_eq!(tried(&[1, 2, 12, 13]), Ok(12));
+        assert_eq!(tried(&[2, 1]), Err(2), "the best one's reason");
     }
 
     #[test]

@@ -6,10 +6,10 @@ mod device;
 use std::cell::Cell;
 use std::time::Duration;
 
-#[cfg(feature = "gpu")]
-pub(crate) use device::Gpu;
 #[cfg(all(test, feature = "gpu"))]
 pub(crate) use device::tests::{test_adapters, test_gpu};
+#[cfg(feature = "gpu")]
+pub(crate) use device::{Gpu, first_that_opens};
 
 /// Which devices will do.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -13,7 +13,7 @@ use super::network::NetworkPlan;
 use super::plan::{BufferId, Plan, Stage};
 use super::shared::pupil_values;
 use crate::engine::{EngineError, Precision, StageTiming, StageTimings, check_pupil};
-use crate::gpu::{Adapters, Gpu, GpuError};
+use crate::gpu::{Adapters, Gpu, GpuError, first_that_opens};
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
 
 /// Network, double phase and levels on the GPU, for frames of one size and one panel.
@@ -62,12 +62,13 @@ const TIMESTAMP_BYTES: u64 = 8;
 
 impl GpuEngine {
     /// An engine for frames of the pattern's size of `tables`, which may be odd, on the optics of `bench`, whose own
-    /// resolution does not matter. Features are in `precision` where the device has it; where that is left to the
-    /// device, in half precision if it multiplies matrices so, since it sums up in single, and else in single
-    /// precision.
+    /// resolution does not matter; on the best device of the kind `adapters` that has room for it. Features are in
+    /// `precision` where the device has it; where that is left to the device, in half precision if it multiplies
+    /// matrices so, since it sums up in single, and else in single precision.
     ///
     /// # Errors
-    /// There is no device, it lacks what the network needs at this size, or the size is nothing.
+    /// There is no device, all lack what the network needs at this size, or the size is nothing; of several devices it
+    /// is why the best one will not do.
     pub fn open(
         weights: &Weights,
         bench: &DisplayGeometry,
@@ -75,12 +76,14 @@ impl GpuEngine {
         adapters: Adapters,
         precision: Option<Precision>,
     ) -> Result<Self, EngineError> {
-        let open = |with_matrices| Self::on(Gpu::open(adapters, with_matrices)?, weights, bench, tables, precision);
-        if precision.is_some() {
-            return open(precision == Some(Precision::Half));
-        }
-        let (engine, refused_matrices) = without_matrices_if_need_be(open)?;
-        Ok(Self { refused_matrices, ..engine })
+        first_that_opens(&Gpu::candidates(adapters)?, |adapter| {
+            let open = |matrices| Self::on(Gpu::on(adapter, matrices)?, weights, bench, tables, precision);
+            if precision.is_some() {
+                return open(precision == Some(Precision::Half));
+            }
+            let (engine, refused_matrices) = without_matrices_if_need_be(open)?;
+            Ok(Self { refused_matrices, ..engine })
+        })
     }
 
     pub(super) fn on(
