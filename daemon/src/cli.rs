@@ -437,8 +437,8 @@ pub struct CheckArgs {
     /// out.
     #[arg(long, value_name = "WxH", value_parser = parse_resolution)]
     pub resolution: Option<Resolution>,
-    /// Engine for the network, as `run` takes it: its frames a second are estimated, and a GPU's phases compared with
-    /// the processor's.
+    /// Engine for the network, as `run` takes it: its frames a second are estimated, and a GPU's phases and levels
+    /// compared with the processor's.
     #[arg(long, value_enum, default_value_t)]
     pub backend: Backend,
     /// The panel, as `run` takes it: opened, looked at with the flat pattern on it, and closed.

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use holod_calibration::rig::{Panel, Rig, WeightsChoice};
-use holod_calibration::{PerColour, PupilDiameter, Resolution};
+use holod_calibration::{Colour, PerColour, PupilDiameter, Resolution};
 use holod_model::{RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 
@@ -23,13 +23,16 @@ const TIMED_PX: [usize; 2] = [256, 512];
 const SIDE_STEP_PX: usize = 16;
 const LEAST_SIDE_PX: usize = 64;
 
+/// Rows or columns of what a GPU is compared at.
+const STRIP_PX: usize = 64;
 /// Phases of two engines are the same up to this, the step of a panel of 256 levels.
 const SAME_PHASE_RAD: f32 = TAU / 256.0;
 /// The frames are for this pupil, or the nearest that was trained: one at which every stage has something to do.
 const PUPIL_MM: f32 = 3.0;
 
-/// A GPU whose phases are farther from the processor's at more than this share of the pixels computes wrongly. Where
-/// the field is dark, little changes its phase; of `standard` and `fast` not one pixel was so in half precision.
+/// A GPU whose phases or levels are farther from the processor's at more than this share of the pixels computes
+/// wrongly. Where the field is dark, little changes its phase; of `standard` and `fast` not one pixel was so in half
+/// precision.
 pub(crate) fn most_apart(engine: &str) -> f64 {
     if engine.contains("half precision") { 1e-2 } else { 1e-3 }
 }
@@ -97,9 +100,6 @@ pub(crate) struct Estimate {
     /// Their sizes, the smaller first.
     pub timed: [Resolution; 2],
     seconds: [f64; 2],
-    /// Where they were computed by a GPU: the share of the smaller one's phases, of all colours, that are not the
-    /// processor's.
-    pub apart: Option<f64>,
 }
 
 impl Estimate {
@@ -111,23 +111,15 @@ impl Estimate {
         let panel = rig.resolution();
         let timed = TIMED_PX.map(|side| Resolution { width: side.min(panel.width), height: side.min(panel.height) });
         let time = |backend, size| Timed::new(rig, weights, backend, size);
-        let [mut smaller, larger] = [time(backend, timed[0])?, time(backend, timed[1])?];
-        let apart = match smaller.renderer.cpu_threads() {
-            Some(_) => None,
-            None => {
-                let mut processor = time(Backend::Cpu, timed[0])?;
-                let [found, expected] = [smaller.phases_rad()?, processor.phases_rad()?];
-                Some(share_apart(found, expected))
-            }
-        };
+        let [smaller, larger] = [time(backend, timed[0])?, time(backend, timed[1])?];
         let engine = larger.renderer.description().to_owned();
-        Ok(Self { engine, timed, seconds: [smaller.seconds, larger.seconds], apart })
+        Ok(Self { engine, timed, seconds: [smaller.seconds, larger.seconds] })
     }
 
     /// As if they had taken `seconds` by `engine`.
     #[cfg(test)]
     pub(crate) fn taking(engine: &str, timed: [Resolution; 2], seconds: [f64; 2]) -> Self {
-        Self { engine: engine.to_owned(), timed, seconds, apart: None }
+        Self { engine: engine.to_owned(), timed, seconds }
     }
 
     /// Frames of `size` a second: a GPU takes some of the time for each frame, the rest goes with the pixels.
@@ -153,9 +145,7 @@ impl Timed {
         let encoder = PanelEncoder::new(&panel, size, size).map(Arc::new).map_err(Failure::because(Exit::Config))?;
         let renderer = renderer::open(backend, weights, &rig.geometry, &encoder, &Use::Command)?;
         let (frame, levels) = (Arc::new(scene::sample_frame(size)), LevelsFrame::new(encoder.layout()));
-        let [narrowest, widest] = weights.trained_pupils(&rig.geometry).map(PupilDiameter::mm);
-        let pupil = PupilDiameter::from_mm(PUPIL_MM.clamp(narrowest, widest));
-        Self::by(renderer, &frame, pupil, levels)
+        Self::by(renderer, &frame, usual_pupil(weights, rig), levels)
     }
 
     fn by(
@@ -175,12 +165,65 @@ impl Timed {
         }
         Ok(Self { renderer, seconds })
     }
+}
 
-    /// The frame's phases, [3, height, width].
-    fn phases_rad(&mut self) -> Result<&[f32], Failure> {
-        let pattern = self.renderer.pattern().map_err(Failure::because(Exit::Unavailable))?;
-        Ok(&pattern.phase_rad)
+fn usual_pupil(weights: &Weights, rig: &Rig) -> PupilDiameter {
+    let [narrowest, widest] = weights.trained_pupils(&rig.geometry).map(PupilDiameter::mm);
+    PupilDiameter::from_mm(PUPIL_MM.clamp(narrowest, widest))
+}
+
+/// What a GPU is compared at for frames of `size`: its shaders are written for the lengths of lines, so a frame's width
+/// and a frame's height, by few rows and columns.
+pub(crate) fn strips(size: Resolution) -> [Resolution; 2] {
+    let Resolution { width, height } = size;
+    [Resolution { width, height: height.min(STRIP_PX) }, Resolution { width: width.min(STRIP_PX), height }]
+}
+
+/// The share of pixels, of all colours, at which a GPU does not compute what the processor does: the phases of strips
+/// of a frame of `size`, for two pupils, or the levels that it makes of its phases for the rig's panel, whichever are
+/// more. Nothing where the processor computes them.
+///
+/// # Errors
+/// The backend is not to be had, its device fails, or the rig contradicts itself.
+pub(crate) fn compare(
+    rig: &Rig,
+    weights: &Weights,
+    backend: Backend,
+    size: Resolution,
+) -> Result<Option<f64>, Failure> {
+    let failed = Failure::because(Exit::Unavailable);
+    let [narrowest, _] = weights.trained_pupils(&rig.geometry);
+    let mut apart = 0.0_f64;
+    for strip in strips(size) {
+        let encoder = renderer::panel_encoder(rig, strip)?;
+        let open = |backend| renderer::open(backend, weights, &rig.geometry, &encoder, &Use::Command);
+        let mut gpu = open(backend)?;
+        if gpu.cpu_threads().is_some() {
+            return Ok(None);
+        }
+        let mut processor = open(Backend::Cpu)?;
+        let frame = Arc::new(scene::sample_frame(strip));
+        let [mut found, mut expected] = [(); 2].map(|()| LevelsFrame::new(encoder.layout()));
+        for pupil in [usual_pupil(weights, rig), narrowest] {
+            processor.render(&frame, pupil, &mut expected).map_err(&failed)?;
+            if gpu.render(&frame, pupil, &mut found).map_err(&failed)?.engine_changed {
+                return Err(renderer::failed_while_timed(&*gpu));
+            }
+            let [of_gpu, of_processor] = [gpu.pattern().map_err(&failed)?, processor.pattern().map_err(&failed)?];
+            let phases_apart = share_apart(&of_gpu.phase_rad, &of_processor.phase_rad);
+            encoder.encode(PerColour(Colour::ALL.map(|colour| of_gpu.plane(colour))), &mut expected);
+            let levels_apart = levels_apart(found.samples(), expected.samples());
+            let levels_apart = levels_apart as f64 / of_gpu.phase_rad.len() as f64;
+            apart = apart.max(phases_apart).max(levels_apart);
+        }
     }
+    Ok(Some(apart))
+}
+
+/// How many levels are more than one from those that are expected: a phase may lie where two engines round it apart.
+fn levels_apart(found: &[u16], expected: &[u16]) -> usize {
+    assert_eq!(found.len(), expected.len());
+    found.iter().zip(expected).filter(|(found, expected)| found.abs_diff(**expected) > 1).count()
 }
 
 /// The share of phases that are not the same, round the circle; those that are no numbers are not.
@@ -301,17 +344,32 @@ mod tests {
         assert!(refused.contains("--backend gpu: a line of 20000 samples"), "{refused}");
     }
 
-    /// On Mesa's software device, which `Auto` does not take.
+    #[test]
+    fn levels_are_compared_up_to_one() {
+        let expected = [7, 0, 255, 12];
+        assert_eq!(levels_apart(&[8, 1, 254, 12], &expected), 0);
+        assert_eq!(levels_apart(&[9, 0, 253, 12], &expected), 2);
+        // As of an engine that writes each pixel to its neighbour's place.
+        assert_eq!(levels_apart(&[0, 255, 12, 7], &expected), 4);
+    }
+
+    #[test]
+    fn strips_are_as_long_as_a_frames_lines_and_no_larger_than_it() {
+        let of =
+            |width, height| strips(Resolution { width, height }).map(|Resolution { width, height }| (width, height));
+        assert_eq!(of(1920, 1080), [(1920, 64), (64, 1080)]);
+        assert_eq!(of(40, 30), [(40, 30); 2]);
+    }
+
+    /// On Mesa's software device, which `Auto` does not take; on a panel with mirrors, and larger than the frame.
     #[cfg(feature = "gpu")]
     #[test]
     fn a_gpu_is_compared_with_the_processor() {
-        let rig = Rig::default();
-        let estimate = |backend| Estimate::of(&rig, &Weights::builtin_fast(), backend).expect("an engine");
-        let on_gpu = estimate(Backend::Gpu);
-        assert!(
-            on_gpu.engine.starts_with("gpu, ") && on_gpu.apart.expect("compared") < most_apart(&on_gpu.engine),
-            "{on_gpu:?}"
-        );
-        assert_eq!(estimate(Backend::Cpu).apart, None);
+        let mut rig = Rig::default();
+        rig.panel.orientation = holod_calibration::rig::Orientation::MirrorX;
+        let size = Resolution { width: 240, height: 150 };
+        let compare = |backend| compare(&rig, &Weights::builtin_fast(), backend, size).expect("an engine");
+        assert!(compare(Backend::Gpu).expect("compared") < most_apart("gpu, X, single precision"));
+        assert_eq!(compare(Backend::Cpu), None);
     }
 }

@@ -140,8 +140,12 @@ fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, 
     let sizes: Vec<Resolution> = sizes.into_iter().filter(fits).collect();
     let estimate = |weights| progress::during("estimating the frames a second", || Estimate::of(rig, weights, backend));
     let estimated = weights.map(estimate);
-    let gpu = match &estimated {
-        Some(Ok(Estimate { engine, apart: Some(apart), .. })) => Some(gpu(engine, *apart)),
+    let gpu = match (&estimated, weights, &sizes[..]) {
+        (Some(Ok(Estimate { engine, .. })), Some(weights), &[size, ..]) if speed::is_gpu(engine) => {
+            let compare = || speed::compare(rig, weights, backend, size).transpose();
+            let compared = progress::during("comparing the GPU with the processor", compare);
+            compared.map(|apart| gpu(engine, size, apart))
+        }
         _ => None,
     };
     let (passed, says) = match (estimated, &sizes[..]) {
@@ -199,10 +203,20 @@ fn rates(
     (passed, rates.join(", "))
 }
 
-/// Whether a GPU computes what the processor does; of a share `apart` of the pixels it does not.
-fn gpu(engine: &str, apart: f64) -> Check {
+/// Whether a GPU computes what the processor does for frames of `size`; of a share `apart` of the pixels it does not.
+fn gpu(engine: &str, size: Resolution, apart: Result<f64, Failure>) -> Check {
+    let name = "gpu";
+    let apart = match apart {
+        Ok(apart) => apart,
+        Err(failure) => return Check { name, passed: false, says: format!("not compared: {failure}") },
+    };
     let most = speed::most_apart(engine);
-    let found = format!("{:.2} % of a frame's phases are more than 1/256 of a turn from the processor's", 1e2 * apart);
+    let [wide, high] = speed::strips(size);
+    let found = format!(
+        "{:.2} % of the phases or levels of strips of {wide} and {high} are more than 1/256 of a turn or a level from \
+         the processor's",
+        1e2 * apart
+    );
     let says = if apart <= most {
         found
     } else {
@@ -213,7 +227,7 @@ fn gpu(engine: &str, apart: f64) -> Check {
              another version of its driver"
         )
     };
-    Check { name: "gpu", passed: apart <= most, says }
+    Check { name, passed: apart <= most, says }
 }
 
 fn tracker(rig: &Rig) -> Check {
@@ -313,10 +327,17 @@ mod tests {
     #[test]
     fn a_gpu_that_computes_wrongly_is_told_with_what_to_take() {
         let [single, half] = ["gpu, X, single precision", "gpu, X, matrix units, half precision"];
+        let size = Resolution { width: 1920, height: 1080 };
+        let gpu = |engine, apart| gpu(engine, size, Ok(apart));
         assert!(gpu(single, 0.0005).passed && gpu(half, 0.005).passed);
         for (engine, cure) in [(single, "--backend cpu"), (half, "--backend gpu, or cpu")] {
             let Check { passed, says, .. } = gpu(engine, 0.02);
-            assert!(!passed && says.contains("2.00 % of a frame's phases") && says.contains(cure), "{says}");
+            assert!(
+                !passed
+                    && says.contains("2.00 % of the phases or levels of strips of 1920x64 and 64x1080")
+                    && says.contains(cure),
+                "{says}"
+            );
         }
     }
 }
