@@ -100,6 +100,8 @@ pub(crate) struct Estimate {
     /// Their sizes, the smaller first.
     pub timed: [Resolution; 2],
     seconds: [f64; 2],
+    /// Seconds that the processor takes for the smaller one, where a GPU computed it.
+    processor_s: Option<f64>,
 }
 
 impl Estimate {
@@ -113,13 +115,25 @@ impl Estimate {
         let time = |backend, size| Timed::new(rig, weights, backend, size);
         let [smaller, larger] = [time(backend, timed[0])?, time(backend, timed[1])?];
         let engine = larger.renderer.description().to_owned();
-        Ok(Self { engine, timed, seconds: [smaller.seconds, larger.seconds] })
+        let processor_s = match is_gpu(&engine) {
+            true => Some(time(Backend::Cpu, timed[0])?.seconds),
+            false => None,
+        };
+        Ok(Self { engine, timed, seconds: [smaller.seconds, larger.seconds], processor_s })
     }
 
     /// As if they had taken `seconds` by `engine`.
     #[cfg(test)]
     pub(crate) fn taking(engine: &str, timed: [Resolution; 2], seconds: [f64; 2]) -> Self {
-        Self { engine: engine.to_owned(), timed, seconds }
+        Self { engine: engine.to_owned(), timed, seconds, processor_s: None }
+    }
+
+    /// What the processor would take, where it is faster than the GPU that computes.
+    pub(crate) fn faster_processor(&self) -> Option<String> {
+        let ([gpu_s, _], [size, _]) = (self.seconds, self.timed);
+        let processor_s = self.processor_s.filter(|&processor_s| processor_s < gpu_s)?;
+        let [gpu_ms, processor_ms] = [gpu_s, processor_s].map(|seconds| seconds * 1e3);
+        Some(format!("for {size} the processor takes {processor_ms:.0} ms (--backend cpu), this GPU {gpu_ms:.0} ms"))
     }
 
     /// Frames of `size` a second: a GPU takes some of the time for each frame, the rest goes with the pixels.
@@ -305,6 +319,18 @@ mod tests {
         near(frames_hz([0.0, 0.4], 1024), 1.0 / 1.6);
         let same = Estimate::taking("cpu", [square(64); 2], [0.1, 0.1]);
         near(same.frames_hz(square(128)), 2.5);
+    }
+
+    #[test]
+    fn a_processor_that_is_faster_than_the_gpu_is_told() {
+        let square = |side| Resolution { width: side, height: side };
+        let of = |processor_s| {
+            let estimate = Estimate::taking("gpu, X", [square(256), square(512)], [0.05, 0.2]);
+            Estimate { processor_s, ..estimate }.faster_processor()
+        };
+        let said = of(Some(0.02)).expect("it is faster");
+        assert_eq!(said, "for 256x256 the processor takes 20 ms (--backend cpu), this GPU 50 ms");
+        assert_eq!([of(Some(0.06)), of(None)], [None, None]);
     }
 
     #[test]

@@ -163,13 +163,14 @@ fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, 
             };
             let (passed, rates) = rates(&estimate, &sizes, engine_at);
             let advice = speed::advice(estimate.frames_hz(*first), &estimate.engine, rig, *first);
+            let more = [estimate.faster_processor(), advice].into_iter().flatten();
             let says = format!(
                 "{}; estimated from frames of up to {}: {}; the panel could show {:.1}{}",
                 estimate.engine,
                 estimate.timed[1],
                 rates,
                 speed::panel_frames_hz(&rig.panel),
-                advice.map_or(String::new(), |advice| format!("; {advice}"))
+                more.map(|said| format!("; {said}")).collect::<String>()
             );
             (passed, says)
         }
