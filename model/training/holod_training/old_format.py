@@ -60,9 +60,9 @@ def from_old_format(path: Path) -> tuple[FieldNetwork, dict[str, Any], dict[str,
 
 def converted(state: dict[str, Tensor], config: NetworkConfig) -> dict[str, Tensor]:
     """Every net's first layer and every modulation with one input more, for the bench, that they do not yet heed."""
-    told = 5 * (4 if config.grid == "half-band" else 1) + 1
-    inserted = {"layers.0.weight": told, "lighting.0.weight": told, "correction.0.weight": 2 * 3 + told}
-    assert OUTPUT_CHANNELS == 2 * 3
+    maps = 3 * config.planes if config.architecture == "focal-stack" else 5 + config.blur_input
+    told = maps * (4 if config.grid == "half-band" else 1) + 1
+    inserted = {"layers.0.weight": told, "lighting.0.weight": told, "correction.0.weight": OUTPUT_CHANNELS + told}
     result = dict(state)
     for name, weight in state.items():
         if name in inserted:
