@@ -29,7 +29,7 @@ def across_benches(
     device: torch.device | str = "cpu",
 ) -> str:
     """Judges every weights file on every folder's bench; writes benches.md and benches.json into `out`, and returns the
-    Markdown. Raises ConfigError, ShardError, WeightsError."""
+    Markdown. Raises ConfigError, ShardError, WeightsError, JudgementError."""
     check_folder(out)
     networks = {path.stem: load_weights(path).to(device) for path in weights}
     if len(networks) < len(weights):

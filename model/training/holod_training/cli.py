@@ -22,6 +22,7 @@ from holod_training.export import WeightsError
 from holod_training.goals import ReportError
 from holod_training.judging import LAYERED_ASM, OURS
 from holod_training.loss import LossWeights, option_of
+from holod_training.metrics import JudgementError
 from holod_training.optimizer import OPTIMIZERS
 from holod_training.rgbd import RgbdError
 from holod_training.sampling import AugmentConfig
@@ -55,7 +56,10 @@ def main(arguments: list[str] | None = None) -> int:
         if options.threads:
             torch.set_num_threads(options.threads)
         options.run(options)
-    except (BenchError, ConfigError, ReportError, RgbdError, ShardError, TrainingError, WeightsError) as error:
+    except (
+        *(BenchError, ConfigError, JudgementError, ReportError),
+        *(RgbdError, ShardError, TrainingError, WeightsError),
+    ) as error:
         print(f"error: {error}", file=sys.stderr)
         return EX_DATAERR
     except OSError as error:

@@ -95,7 +95,8 @@ def compare(base: TrainConfig, names: list[str], seconds: float, device: torch.d
 
     What a step takes is measured first, and gives the number of steps: so each run has its whole learning-rate
     schedule and can be had again from its config.json. A variant whose folder holds its row already is not trained
-    again, and one that was interrupted goes on from its checkpoint. Raises ConfigError, ShardError, TrainingError.
+    again, and one that was interrupted goes on from its checkpoint. Raises ConfigError, ShardError, TrainingError,
+    JudgementError.
     """
     if not base.validation:
         raise ConfigError("validation: found no folder of held-out scenes; variants are compared on them")

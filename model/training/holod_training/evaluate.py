@@ -55,7 +55,7 @@ TIMED_PUPIL_MM = 3.0
 def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Writes evaluation.json, scenes.json, evaluation.md, plots and sheets into `config.out`.
 
-    Raises ConfigError, WeightsError, ShardError, RgbdError.
+    Raises ConfigError, WeightsError, ShardError, RgbdError, JudgementError.
     """
     check_folder(config.out)
     metadata = read_metadata(config.weights)

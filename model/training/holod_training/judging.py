@@ -16,7 +16,7 @@ from holod_training.config import OpticsConfig
 from holod_training.intervals import interval_95
 from holod_training.loss import inner
 from holod_training.lpips import Lpips
-from holod_training.metrics import Judgement, judge, psnr_db
+from holod_training.metrics import Judgement, JudgementError, judge, psnr_db
 from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, coc_px, double_phase, panel_field, through_levels, upsample_half_band
 from holod_training.rivals import (
@@ -282,7 +282,8 @@ def _intervals(numbers: dict[str, list[float]]) -> dict[str, list[float]]:
 
 
 def judge_scenes(shards: list[Shard], methods: list[Method], bench: Bench) -> Judged:
-    """Every method at every pupil, and for ours the matrix PSNR(given, judged); one scene in memory at a time."""
+    """Every method at every pupil, and for ours the matrix PSNR(given, judged); one scene in memory at a time. Raises
+    ShardError and JudgementError for scenes and pictures with values that are no numbers."""
     pupils = shards[0].pupils_mm
     judged = Judged(pupils, table_pupils(pupils))
     for scene, shard in enumerate(tqdm(shards, unit="scene", disable=None)):
@@ -319,7 +320,13 @@ def _judge_method(judged: Judged, scene: int, shard: Shard, method: Method, benc
                     picture, seen_with = None, bench.same_to_the_eye(pupil)
                     picture = bench.look(shown, seen_with, stack.focus_dpt)
                 if index in wanted:
-                    found = bench.judge(picture, stack)
+                    try:
+                        found = bench.judge(picture, stack)
+                    except JudgementError as error:
+                        raise JudgementError(
+                            f"{shard.path}: {method.name} for s = {given_mm:g} mm: {error}; leave that method out, or "
+                            "name other weights"
+                        ) from error
                     judged.add(method.name, stage, pupil, scene, found)
                     cell = found.psnr_db
                 else:

@@ -15,6 +15,10 @@ from holod_training.loss import IN_FOCUS_PX, inner
 SSIM_WINDOW_PX = 11
 
 
+class JudgementError(ValueError):
+    """A picture that has no figures; the message says whose, where that is known, and why."""
+
+
 @dataclass(frozen=True)
 class Judgement:
     """One scene at one pupil, or a mean over scenes. NaN: of a part of the picture that is empty, or not asked for."""
@@ -100,7 +104,9 @@ def judge(
     lpips: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Judgement:
     """picture, target [K, 3, H, W] linear light; coc_px [K, H, W]; a border is left out. Plane by plane: a stack of
-    fifty focuses in full HD leaves no room for copies. `lpips`: distances [N] of pictures [N, 3, H, W]."""
+    fifty focuses in full HD leaves no room for copies. `lpips`: distances [N] of pictures [N, 3, H, W].
+
+    Raises JudgementError for a picture with values that are no numbers: NaN in a Judgement is an empty part."""
     picture, target, coc_px = (inner(t, border_px) for t in (picture, target, coc_px))
     whole, sharp, blurred = _Mean(), _Mean(), _Mean()
     foam, foam_pixels = 0.0, 0.0
@@ -112,6 +118,8 @@ def judge(
         if min(blur.shape) >= REGION_PX:
             energy, pixels = foam_energy(shown[None], wanted[None], blur[None])
             foam, foam_pixels = foam + energy.item(), foam_pixels + pixels.item()
+    if not math.isfinite(whole.total):
+        raise JudgementError("found a picture with values that are no numbers, expected finite light")
     slope, correlation = focus_response(picture, target)
     return Judgement(
         psnr_db=whole.psnr_db(),

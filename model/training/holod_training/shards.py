@@ -195,14 +195,24 @@ class Shard:
         return min(range(len(self.pupils_mm)), key=lambda i: abs(self.pupils_mm[i] - pupil_mm))
 
     def read(self, pupil_index: int, top: int = 0, left: int = 0, size: int | None = None) -> Stack:
-        """The stack of one pupil, whole or a square crop."""
+        """The stack of one pupil, whole or a square crop. Raises ShardError for values that are no numbers."""
         rows = slice(top, self.height if size is None else top + size)
         columns = slice(left, self.width if size is None else left + size)
         with safe_open(self.path, framework="pt") as file:
+
+            def part(name: str) -> Tensor:
+                found: Tensor = file.get_slice(name)[..., rows, columns].float()
+                if not found.isfinite().all():
+                    raise ShardError(
+                        f"{self.path}: {name} has values that are no numbers, expected finite ones; delete the file "
+                        "and run `holod-scenes generate` again"
+                    )
+                return found
+
             return Stack(
-                image=file.get_slice("image")[:, rows, columns].float(),
-                depth=file.get_slice("depth")[rows, columns].float(),
-                target=file.get_slice(f"stack_{pupil_index}")[:, :, rows, columns].float(),
+                image=part("image"),
+                depth=part("depth"),
+                target=part(f"stack_{pupil_index}"),
                 pupil_mm=self.pupils_mm[pupil_index],
                 focus_dpt=self.focus_dpt,
                 optics=self.optics,

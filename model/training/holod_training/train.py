@@ -51,7 +51,7 @@ from holod_training.loss import (
     option_of,
 )
 from holod_training.lpips import SMALLEST_PX, Lpips
-from holod_training.metrics import Judgement, judge, psnr_db
+from holod_training.metrics import Judgement, JudgementError, judge, psnr_db
 from holod_training.network import FieldNetwork
 from holod_training.optics import Eye, HalfBandEye, coc_px, shown_by_panel
 from holod_training.optimizer import OPTIMIZERS, make_optimizer
@@ -344,7 +344,7 @@ class Run:
             )
         loss = torch.stack([p.total for p in parts]).mean()
         if not torch.isfinite(loss):
-            raise TrainingError(f"step {self.step}: the loss is {loss.item()}: {self._likely_cause(stacks)}")
+            raise TrainingError(f"step {self.step}: the loss is {loss.item()}: {self._likely_cause()}")
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_clip)
@@ -361,21 +361,25 @@ class Run:
             **{f"loss_{name}": sum(p.terms[name] for p in parts) / n for name in parts[0].terms},
         }
 
-    def _likely_cause(self, stacks: list[Stack]) -> str:
+    def _likely_cause(self) -> str:
         """Of a loss that is no number, and what to do."""
         config = self.config
-        if not all(t.isfinite().all() for s in stacks for t in (s.image, s.depth, s.target)):
-            return f"a scene of {config.shards} has values that are no numbers; write its scenes again"
         for path, network in ((config.initial_weights, self.network), (config.teacher, self.teacher)):
             if self.step == 0 and path and network and not all(p.isfinite().all() for p in network.parameters()):
                 return f"{path} has values that are no numbers; name other weights"
-        narrow = ", or train with --precision f32" if config.precision == "bf16" else ""
         if self.step == 0:
-            return f"no step has changed a weight, so it is not the learning rate; lower the loss's weights{narrow}"
+            change = "no step has changed a weight, so it is not the learning rate; lower the loss's weights"
+            return f"{change}{self._or_wider()}"
+        return self._diverged()
+
+    def _diverged(self) -> str:
         return (
             "the run diverged; lower --learning-rate, lengthen --warm-up-steps, lower the weight of the term that "
-            f"grew, loss_* in {Path(config.out) / 'metrics.jsonl'}{narrow}"
+            f"grew, loss_* in {Path(self.config.out) / 'metrics.jsonl'}{self._or_wider()}"
         )
+
+    def _or_wider(self) -> str:
+        return ", or train with --precision f32" if self.config.precision == "bf16" else ""
 
     @torch.no_grad()
     def _average(self) -> None:
@@ -385,7 +389,8 @@ class Run:
 
     @torch.no_grad()
     def validate(self) -> dict[str, dict[str, float]]:
-        """The averaged weights on held-out scenes, before double phase: {"2.0": {psnr_db: ..., flat_oracle_db: ..}}."""
+        """The averaged weights on held-out scenes, before double phase: {"2.0": {psnr_db: ..., flat_oracle_db: ..}}.
+        Raises TrainingError where they give no numbers."""
         result = {}
         for wanted in VALIDATION_PUPILS_MM:
             judged = []
@@ -394,7 +399,12 @@ class Run:
                 low = self._fields(self.average, self.config.network, [stack], [stack.depth])[0]
                 picture = see(low, stack)
                 blur = coc_px(stack.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
-                judged.append(judge(picture, stack.target, blur, self.config.validation_border_px, with_ssim=False))
+                try:
+                    judged.append(judge(picture, stack.target, blur, self.config.validation_border_px, with_ssim=False))
+                except JudgementError as error:
+                    raise TrainingError(
+                        f"step {self.step}: {shard.path} at s = {wanted:g} mm: {error}: {self._diverged()}"
+                    ) from error
             result[str(wanted)] = Judgement.mean(judged).known() | self.flat_oracle_db.get(str(wanted), {})
         return result
 

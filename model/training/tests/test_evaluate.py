@@ -21,8 +21,9 @@ from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.export import load_weights, read_metadata, save_weights
 from holod_training.goals import ReportError, checks, row_of
 from holod_training.intervals import interval_95
-from holod_training.judging import Bench, Method, rivals
+from holod_training.judging import Bench, Method, judge_scenes, rivals
 from holod_training.lpips import Lpips
+from holod_training.metrics import JudgementError
 from holod_training.network import DirectNetwork
 from holod_training.optics import coc_px, intensity, propagate
 from holod_training.plots import on_all_scenes
@@ -290,6 +291,17 @@ def test_the_report_refuses_mixed_pupils(evaluation: Path) -> None:
         change(mixed)
         with pytest.raises(ReportError, match=message):
             markdown(mixed)
+
+
+def test_a_method_that_gives_no_numbers_is_told_and_not_left_out(evaluation: Path) -> None:
+    """A scene on which it fails would be missing in its mean, and it would look the better for it."""
+
+    def field(stack: Stack, pupil_mm: float) -> torch.Tensor:
+        return all_in_focus(stack.amplitude, stack.depth, OPTICS) * (math.nan if pupil_mm == 2.5 else 1)
+
+    shard = Shard(evaluation / "test" / "scene_000001.safetensors")
+    with pytest.raises(JudgementError, match=r"scene_000001\.safetensors: failing for s = 2\.5 mm: found a picture"):
+        judge_scenes([shard], [Method("failing", field, adapts=True)], Bench(OPTICS, 1.25, 8))
 
 
 @pytest.mark.parametrize(

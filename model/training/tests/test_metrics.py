@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from holod_training.metrics import Judgement, focus_response, gradient_energy, judge, ssim
+from holod_training.metrics import Judgement, JudgementError, focus_response, gradient_energy, judge, ssim
 
 
 def pictures(seed: int, planes: int = 4, size: int = 40) -> torch.Tensor:
@@ -64,6 +64,17 @@ def test_means_leave_out_what_is_unknown() -> None:
     mean = Judgement.mean([a, b])
     assert (mean.psnr_db, mean.psnr_in_focus_db, mean.slope) == (25, 25, pytest.approx(0.4))
     assert "psnr_in_focus_db" not in a.known()
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_picture_that_is_no_light_has_no_figures(value: float) -> None:
+    """But in the border, which nobody judges. NaN in a figure is left out of means, as an empty part's."""
+    target, blur = pictures(1), torch.full((len(pictures(1)), *pictures(1).shape[-2:]), 1.0)
+    picture = target.clone()
+    picture[0, 0, 0, 0] = value
+    assert judge(picture, target, blur, 1).ssim == pytest.approx(1)
+    with pytest.raises(JudgementError, match="found a picture with values that are no numbers"):
+        judge(picture, target, blur, 0)
 
 
 def test_gradient_energy_counts_the_area_only() -> None:

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 import torch
 from conftest import write_shard
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
 from holod_training.benches import ANY_BENCH, BenchDraw
 from holod_training.config import ConfigError, OpticsConfig
@@ -27,6 +29,20 @@ def test_truncated_file_is_named(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-1000])
     with pytest.raises(ShardError, match=r"scene_000000\.safetensors: not a whole safetensors file"):
         Shard(path)
+
+
+@pytest.mark.parametrize("name", ["image", "depth", "stack_1"])
+def test_values_that_are_no_numbers_are_named(name: str, tmp_path: Path) -> None:
+    path = write_shard(tmp_path / "scene_000000.safetensors")
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    tensors = load_file(path)
+    tensors[name][..., 5, 7] = float("nan")
+    save_file(tensors, path, metadata)
+    shard = Shard(path)
+    with pytest.raises(ShardError, match=rf"scene_000000\.safetensors: {name} has values that are no numbers"):
+        shard.read(1)
+    assert shard.read(1, top=6, left=0, size=8).target.isfinite().all(), "a crop without them is whole"
 
 
 def test_garbage_is_named(tmp_path: Path) -> None:
