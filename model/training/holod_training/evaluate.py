@@ -117,7 +117,13 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
         "rows": time_methods(methods, bench.read(shards[0], timed), config.timing_calls),
     }
     result["networks"] = [
-        {"method": name, **network_cost(one), "weights_sha256": weights_sha256(one)} for name, one in networks.items()
+        {
+            "method": name,
+            **network_cost(one),
+            "weights_sha256": weights_sha256(one),
+            "amplitude_constant": one.config.amplitude_constant,
+        }
+        for name, one in networks.items()
     ]
     result["offsets"] = offset_statistics(network, shards, bench)
     if config.focus_curve_weights and config.solver_scenes:

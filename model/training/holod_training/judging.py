@@ -48,13 +48,15 @@ MOST_AMPLITUDES = 2**16
 class Method:
     """One way to make a hologram: (scene, given pupil) -> complex field [3, H, W] at the SLM plane, half band; or
     [N, 3, H, W], N frames whose intensities the eye averages. `adapts`: whether the field depends on the pupil.
-    `scenes`: only the first so many, where it is slow. `takes_stack`: it is given what its pupil sees."""
+    `scenes`: only the first so many, where it is slow. `takes_stack`: it is given what its pupil sees.
+    `amplitude_constant`: of its double phase, where that is not the bench's."""
 
     name: str
     field: Callable[[Stack, float], Tensor]
     adapts: bool = False
     scenes: int | None = None
     takes_stack: bool = False
+    amplitude_constant: float | None = None
 
 
 def network_field(network: FieldNetwork, stack: Stack, pupil_mm: float) -> Tensor:
@@ -65,8 +67,13 @@ def network_field(network: FieldNetwork, stack: Stack, pupil_mm: float) -> Tenso
 
 
 def network_method(name: str, network: FieldNetwork) -> Method:
-    takes_stack = network.config.architecture == "focal-stack"
-    return Method(name, lambda stack, pupil: network_field(network, stack, pupil), adapts=True, takes_stack=takes_stack)
+    return Method(
+        name,
+        lambda stack, pupil: network_field(network, stack, pupil),
+        adapts=True,
+        takes_stack=network.config.architecture == "focal-stack",
+        amplitude_constant=network.config.amplitude_constant,
+    )
 
 
 def rivals(optics: OpticsConfig) -> list[Method]:
@@ -135,10 +142,12 @@ class Bench:
             self.eyes[key] = Eye(self.optics, height, width, list(focus_dpt), self.device)
         return self.eyes[key]
 
-    def panel(self, field: Tensor) -> tuple[Tensor, float]:
-        """The field after double phase, scaled so that its signal is `field` again; and the clipped share."""
-        phase, clipped = double_phase(field, self.amplitude_constant)
-        return panel_field(through_levels(phase)) * self.amplitude_constant, clipped
+    def panel(self, field: Tensor, amplitude_constant: float | None = None) -> tuple[Tensor, float]:
+        """The field after double phase, with the bench's constant where none is given, scaled so that its signal is
+        `field` again; and the clipped share."""
+        constant = amplitude_constant or self.amplitude_constant
+        phase, clipped = double_phase(field, constant)
+        return panel_field(through_levels(phase)) * constant, clipped
 
     def same_to_the_eye(self, pupil_mm: float) -> float:
         """Pupils wider than the stop's diagonal all see alike: the widest that must be told apart."""
@@ -303,7 +312,7 @@ def _judge_method(judged: Judged, scene: int, shard: Shard, method: Method, benc
     psnr = {stage: np.zeros((len(of_matrix), len(of_matrix))) for stage in judged.matrix}
     for given, given_mm in enumerate(judged.pupils_mm[: None if method.adapts else 1]):
         field_ = method.field(bench.read(shard, given), given_mm)
-        panel, share = bench.panel(field_)
+        panel, share = bench.panel(field_, method.amplitude_constant)
         if method.name == OURS:
             stride = max(LEAST_AMPLITUDE_STRIDE, field_.numel() // MOST_AMPLITUDES)
             judged.amplitudes.append(field_.abs().flatten()[::stride].cpu())

@@ -42,7 +42,8 @@ def judge_marks(shards: list[Shard], methods: list[Method], bench: Bench, sheet:
                 )
             for method in methods:
                 field = method.field(stack, pupil)
-                for stage, shown in ((BEFORE, field), (AFTER, bench.panel(field)[0])):
+                panel, _ = bench.panel(field, method.amplitude_constant)
+                for stage, shown in ((BEFORE, field), (AFTER, panel)):
                     seen = bench.look(shown, bench.same_to_the_eye(pupil), stack.focus_dpt)
                     rows.append(
                         {

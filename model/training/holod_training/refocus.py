@@ -65,7 +65,8 @@ def refocus_cards(shards: list[Shard], methods: list[Method], bench: Bench, shee
             for pupil in of_all if method.takes_stack else PUPILS_MM:
                 if panel is None or method.adapts:
                     given = shard.pupils_mm.index(pupil) if pupil in shard.pupils_mm else 0
-                    panel, _ = bench.panel(method.field(bench.read(shard, given), pupil))
+                    field = method.field(bench.read(shard, given), pupil)
+                    panel, _ = bench.panel(field, method.amplitude_constant)
                 near_focus, far_focus = bench.look(panel, pupil, focus)
                 energy = {
                     name: (gradient_energy(near_focus, area), gradient_energy(far_focus, area))

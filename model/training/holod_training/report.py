@@ -50,13 +50,16 @@ def _opening(result: dict[str, Any]) -> list[str]:
         if solver["scenes"]
         else ""
     )
+    own = {row["method"]: row.get("amplitude_constant", result["amplitude_constant"]) for row in result["networks"]}
+    other = [f"{name}: {constant}" for name, constant in own.items() if constant != result["amplitude_constant"]]
+    others = f" ({', '.join(other)})" if other else ""
     return [
         f"# Evaluation of {result['weights']}",
         "",
         f"{result['date']}: {result['scenes']} held-out scenes of {width}x{height}, "
         f"{planes}, a border of {result['border_px']} px left out; linear light, peak 1. Means over scenes, in "
-        f"brackets their 95 % interval (Student's t). Amplitude constant {result['amplitude_constant']}. Slope and "
-        "correlation: P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, 0 = one picture at all "
+        f"brackets their 95 % interval (Student's t). Amplitude constant {result['amplitude_constant']}{others}. Slope "
+        "and correlation: P_k − mean_k P against R_k − mean_k R (1 = the target's full refocus, 0 = one picture at all "
         "depths). In focus: CoC < 2 px; out of focus: CoC > 8 px. Foam: mean energy of structure of 4 to 16 px out of "
         f"focus that the target does not have there; less is better. Everything is after double phase.{optimised} Two "
         "rows are no holograms: the flat oracle is the target's mean at every focus, RGB-D blur is what a simple "

@@ -94,7 +94,8 @@ def write_rgbd_sheet(path: Path, pictures: list[tuple[Tensor, Tensor]], ours: Me
         focus = tuple(bench.optics.dioptres(float(end)) for end in ends)
         line = [image]
         for pupil in SHEET_PUPILS_MM:
-            panel, _ = bench.panel(ours.field(Stack(image, depth, image[None], pupil, focus), pupil))
+            field = ours.field(Stack(image, depth, image[None], pupil, focus), pupil)
+            panel, _ = bench.panel(field, ours.amplitude_constant)
             line += list(bench.look(panel, pupil, focus))
         lines.append(line)
     save_sheet(path, lines)

@@ -39,7 +39,7 @@ def write_sheet(path: Path, shards: list[Shard], ours: Method, bench: Bench) -> 
         chosen = [i for i, p in enumerate(shard.pupils_mm) if p in SHEET_PUPILS_MM] or [len(shard.pupils_mm) - 1]
         for index in chosen:
             stack = bench.read(shard, index)
-            panel, _ = bench.panel(ours.field(stack, stack.pupil_mm))
+            panel, _ = bench.panel(ours.field(stack, stack.pupil_mm), ours.amplitude_constant)
             far, near = bench.look(panel, stack.pupil_mm, (stack.focus_dpt[0], stack.focus_dpt[-1]))
             lines.append([stack.target[0], far, stack.target[-1], near])
     save_sheet(path, lines)

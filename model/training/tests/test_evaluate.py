@@ -21,7 +21,7 @@ from holod_training.config import NetworkConfig, OpticsConfig
 from holod_training.export import load_weights, read_metadata, save_weights
 from holod_training.goals import ReportError, checks, row_of
 from holod_training.intervals import interval_95
-from holod_training.judging import Bench, Method, judge_scenes, rivals
+from holod_training.judging import Bench, Method, judge_scenes, network_field, rivals
 from holod_training.lpips import Lpips
 from holod_training.metrics import JudgementError
 from holod_training.network import DirectNetwork
@@ -59,11 +59,12 @@ def write_card(path: Path, seed: int, metadata: dict[str, str] | None = None) ->
 
 @pytest.fixture(scope="module")
 def evaluation(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two scenes that are not square, two networks, cards and a real-looking RGB-D pair, everything on."""
+    """Two scenes that are not square, two networks with a constant each, cards and a real-looking RGB-D pair,
+    everything on."""
     torch.manual_seed(1)
     tmp_path = tmp_path_factory.mktemp("evaluation")
-    for name, layers in (("w", 4), ("deeper", 6)):
-        config = NetworkConfig(layers=layers, channels=8, adjustable_layers=(1,))
+    for name, layers, constant in (("w", 4, 1.4), ("deeper", 6, 0.8)):
+        config = NetworkConfig(layers=layers, channels=8, adjustable_layers=(1,), amplitude_constant=constant)
         save_weights(tmp_path / f"{name}.safetensors", DirectNetwork(config), {}, {"seed": 1})
     for index in range(2):
         write_shard(tmp_path / "test" / f"scene_{index:06}.safetensors", index, size=(64, 80), pupils_mm=PUPILS)
@@ -148,6 +149,29 @@ def test_means_and_pairs_are_those_of_the_scenes(evaluation: Path) -> None:
     assert shown == pytest.approx(sum(ours) / 2 - (ours[0] - values("optimised, 2 frames", "after")[0]))
     assert on_all_scenes(result, "smooth phase", 2.0, "psnr_db") == pytest.approx(sum(theirs) / 2)
     assert few["scenes"] == 1 and ("holod", 2.0) not in pairs
+
+
+def test_each_network_is_judged_with_its_own_amplitude_constant(evaluation: Path) -> None:
+    result = read(evaluation)
+    network = load_weights(evaluation / "deeper.safetensors")
+    stack = Shard(evaluation / "test" / "scene_000000.safetensors").read(1)
+
+    def psnr_db(constant: float) -> float:
+        bench = Bench(OPTICS, constant, result["border_px"])
+        with torch.no_grad():
+            panel, _ = bench.panel(network_field(network, stack, 2.0))
+        return bench.judge(bench.look(panel, 2.0, stack.focus_dpt), stack).psnr_db
+
+    scenes = json.loads((evaluation / "out" / "scenes.json").read_text())
+    (found,) = [
+        row["psnr_db"]
+        for row in scenes
+        if (row["scene"], row["method"], row["double_phase"], row["pupil_mm"])
+        == ("scene_000000.safetensors", "deeper", "after", 2.0)
+    ]
+    assert found == pytest.approx(psnr_db(0.8), abs=1e-4) and abs(found - psnr_db(1.4)) > 0.01
+    assert [row["amplitude_constant"] for row in result["networks"]] == [1.4, 0.8]
+    assert "Amplitude constant 1.4 (deeper: 0.8)." in (evaluation / "out" / "evaluation.md").read_text()
 
 
 def test_costs_and_offsets(evaluation: Path) -> None:
