@@ -25,6 +25,7 @@ from holod_training.judging import (
     OURS,
     Bench,
     Method,
+    check_alike,
     judge_scenes,
     network_field,
     network_method,
@@ -66,7 +67,9 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     for one in networks.values():
         one.on(optics)
     cards = open_held_out(config.cards, optics) if config.cards else []
+    check_alike(cards, ("size",), "with one `--size`")
     marks = open_held_out(config.marks, optics) if config.marks else []
+    check_alike(marks, ("pupils_mm", "size"), "with one `--size` and given `--pupils`, such as 1,2,3,4,5")
     pictures = read_pictures(config.rgbd, optics) if config.rgbd else []
     lpips = Lpips.open(config.lpips_backbone, config.lpips_linear, device)
     least_px = SMALLEST_PX if lpips else SSIM_WINDOW_PX

@@ -161,22 +161,24 @@ class Bench:
         return coc_px(self.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
 
 
+def check_alike(shards: Sequence[Shard], in_what: Sequence[str], cure: str) -> None:
+    """Raises ShardError that names the first that is not as the first of all."""
+    for shard in shards[1:]:
+        for what in in_what:
+            found, expected = getattr(shard, what), getattr(shards[0], what)
+            if found != expected:
+                raise ShardError(
+                    f"{shard.path}: {what} is {found}, but {expected} in {shards[0].path.name}; "
+                    f"evaluate scenes that are alike, each kind in its own folder, {cure}"
+                )
+
+
 def open_alike(folder: Path, limit: int | None = None, between: bool = False) -> list[Shard]:
     """The shards of one evaluation: held out, of one bench, same size, pupils and focuses; to judge `between`, an odd
     number of focuses. Raises ShardError that names the odd one."""
     shards = open_test(folder, limit)
     first = shards[0]
-    for shard in shards[1:]:
-        for what, found, expected in (
-            ("pupils_mm", shard.pupils_mm, first.pupils_mm),
-            ("focus_dpt", shard.focus_dpt, first.focus_dpt),
-            ("size", (shard.width, shard.height), (first.width, first.height)),
-        ):
-            if found != expected:
-                raise ShardError(
-                    f"{shard.path}: {what} is {found}, but {expected} in {first.path.name}; "
-                    "evaluate scenes that are alike, each kind in its own folder, rendered with `--planes N` or `auto`"
-                )
+    check_alike(shards, ("pupils_mm", "focus_dpt", "size"), "rendered with `--planes N` or `auto`")
     if list(first.pupils_mm) != sorted(set(first.pupils_mm)):
         raise ShardError(f"{first.path}: pupils_mm is {first.pupils_mm}, expected rising values, each once")
     most = 2 * SolverConfig().planes - 1

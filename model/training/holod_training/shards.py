@@ -190,6 +190,11 @@ class Shard:
             shard.focus_dpt = tuple(optics.dioptres((dpt - theirs.depth_far_dpt) / volume) for dpt in self.focus_dpt)
         return shard
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.width, self.height
+
     def nearest_pupil(self, pupil_mm: float) -> int:
         """The index of the stack whose pupil is nearest."""
         return min(range(len(self.pupils_mm)), key=lambda i: abs(self.pupils_mm[i] - pupil_mm))

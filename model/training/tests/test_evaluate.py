@@ -1,6 +1,7 @@
 import copy
 import json
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -339,6 +340,30 @@ def test_scenes_must_be_alike(tmp_path: Path, evaluation: Path, capsys, odd: dic
     assert main(["evaluate", *arguments, "--out", str(tmp_path / "out")]) == 65
     error = capsys.readouterr().err
     assert "scene_000001.safetensors" in error and message in error
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "odd", "message"),
+    [
+        (
+            "--marks",
+            {"pupils_mm": (1.9, 4.0)},
+            r"pupils_mm is \(1\.9, 4\.0\), but \(2\.0, 4\.0\) in .*given `--pupils`",
+        ),
+        ("--marks", {"size": 64}, r"size is \(64, 64\), but \(128, 128\) in scene_000000"),
+        ("--cards", {"size": 64}, r"size is \(64, 64\), but \(128, 128\) in scene_000000"),
+    ],
+)
+def test_cards_and_marks_must_be_alike(
+    evaluation: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, odd: dict, message: str
+) -> None:
+    for index, changes in enumerate(({}, odd)):
+        path = tmp_path / "odd" / f"scene_{index:06}.safetensors"
+        write_shard(path, **{"pupils_mm": (2.0, 4.0), "size": 128, "metadata": {"kind": option[2:]}, **changes})
+    arguments = ["--weights", str(evaluation / "w.safetensors"), "--test", str(evaluation / "test")]
+    assert main(["evaluate", *arguments, option, str(tmp_path / "odd"), "--out", str(tmp_path / "out")]) == 65
+    assert re.search(rf"scene_000001\.safetensors: {message}", capsys.readouterr().err)
     assert not (tmp_path / "out").exists()
 
 
