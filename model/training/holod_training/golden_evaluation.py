@@ -14,11 +14,10 @@ from safetensors.torch import save
 from torch import Tensor
 
 from holod_training.config import OpticsConfig
-from holod_training.evaluate import network_field
 from holod_training.export import load_weights, write_beside
+from holod_training.judging import Bench, network_field
 from holod_training.loss import inner
-from holod_training.metrics import gradient_energy, judge, psnr_db
-from holod_training.optics import Eye, coc_px, double_phase, panel_field, through_levels
+from holod_training.metrics import gradient_energy, psnr_db
 from holod_training.rivals import flat_oracle
 from holod_training.shards import SHARD_FORMAT, Shard
 
@@ -94,30 +93,27 @@ def card_area(columns: range) -> Tensor:
 def found(shard: Shard, weights: Path) -> dict[str, Any]:
     """What the evaluation finds from 8-bit panel levels: a row for each pupil, and the matrix PSNR(given, judged)."""
     network = load_weights(weights)
-    config = network.config
+    bench = Bench(network.optics, network.config.amplitude_constant, BORDER_PX)
     stacks = list(shard.stacks())
     areas = {name: card_area(columns) for name, columns in (("near", COLUMNS[0]), ("far", COLUMNS[2]))}
-    eye = Eye(network.optics, shard.height, shard.width, list(shard.focus_dpt))
-    card_eye = Eye(network.optics, shard.height, shard.width, [NEAR_DPT, FAR_DPT])
     rows, matrix = [], []
     for stack in stacks:
-        phase, clipped = double_phase(network_field(network, stack, stack.pupil_mm), config.amplitude_constant)
-        shown = panel_field(through_levels(phase)) * config.amplitude_constant
-        blur = coc_px(network.optics, stack.depth, list(stack.focus_dpt), stack.pupil_mm)
-        near_focus, far_focus = card_eye.look(shown, stack.pupil_mm)
-        judged = judge(eye.look(shown, stack.pupil_mm), stack.target, blur, BORDER_PX).known()
+        shown, clipped = bench.panel(network_field(network, stack, stack.pupil_mm))
+        near_focus, far_focus = bench.look(shown, stack.pupil_mm, (NEAR_DPT, FAR_DPT))
+        judged = bench.judge(bench.look(shown, stack.pupil_mm, stack.focus_dpt), stack).known()
         near, far = ([gradient_energy(p, areas[name]) for p in (near_focus, far_focus)] for name in ("near", "far"))
         rows.append(
             {
                 "pupil_mm": stack.pupil_mm,
                 **judged,
-                "flat_oracle_psnr_db": judge(flat_oracle(stack.target), stack.target, blur, BORDER_PX).psnr_db,
+                "flat_oracle_psnr_db": bench.judge(flat_oracle(stack.target), stack).psnr_db,
                 "clipped_share": clipped,
                 "near_card": near[0] / near[1],
                 "far_card": far[1] / far[0],
             }
         )
-        errors = [inner(eye.look(shown, seen.pupil_mm) - seen.target, BORDER_PX).square() for seen in stacks]
+        pictures = [bench.look(shown, seen.pupil_mm, seen.focus_dpt) for seen in stacks]
+        errors = [inner(p - seen.target, BORDER_PX).square() for p, seen in zip(pictures, stacks, strict=True)]
         matrix.append([psnr_db(error) for error in errors])
     return {"rows": rows, "matrix_psnr_db": matrix}
 

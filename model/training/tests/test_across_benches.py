@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -11,11 +12,26 @@ from conftest import write_shard
 
 from holod_training.cli import main
 from holod_training.config import NetworkConfig
-from holod_training.export import read_metadata, save_weights
+from holod_training.export import load_weights, read_metadata, save_weights
+from holod_training.judging import Bench, network_field, open_alike
 from holod_training.variants import build_network
 
 TINY = NetworkConfig(layers=4, channels=4, adjustable_layers=(1,), modulation_hidden=4)
 GAEA = {"pixel_angle_rad": str(3.74e-6 / 40e-3), "pixel_pitch_um": "3.74", "wavelengths_nm": "[633.0, 532.0, 473.0]"}
+
+
+@torch.no_grad()
+def psnr_db(folder: Path, bench_name: str, network_name: str, amplitude_constant: float) -> float:
+    """At a pupil of 2 mm, mean over scenes."""
+    network = load_weights(folder / f"{network_name}.safetensors")
+    found = []
+    for shard in open_alike(folder / bench_name):
+        index = shard.nearest_pupil(2.0)
+        bench = Bench(shard.optics, amplitude_constant, 8)
+        stack = bench.read(shard, index)
+        panel, _ = bench.panel(network_field(network.on(shard.optics), stack, stack.pupil_mm))
+        found.append(bench.judge(bench.look(panel, stack.pupil_mm, stack.focus_dpt), stack).psnr_db)
+    return sum(found) / len(found)
 
 
 def test_each_bench_has_a_row_for_each_network_and_one_for_the_rival(
@@ -23,8 +39,9 @@ def test_each_bench_has_a_row_for_each_network_and_one_for_the_rival(
 ) -> None:
     torch.manual_seed(1)
     command = ["across-benches", "--out", str(tmp_path / "out"), "--border-px", "8"]
-    for name in ("one", "other"):
-        save_weights(tmp_path / f"{name}.safetensors", build_network(TINY), {}, {})
+    for name, constant in (("one", 1.4), ("other", 0.8)):
+        network = build_network(dataclasses.replace(TINY, amplitude_constant=constant))
+        save_weights(tmp_path / f"{name}.safetensors", network, {}, {})
         command += ["--weights", str(tmp_path / f"{name}.safetensors")]
     for folder, metadata in (("default", {}), ("gaea-40", GAEA)):
         for index in range(2):
@@ -43,6 +60,11 @@ def test_each_bench_has_a_row_for_each_network_and_one_for_the_rival(
         assert gain == pytest.approx(at_two["one"] - at_two["smooth phase"], abs=1e-4)
         assert bench["matrix_psnr_db"]["one"][1][1] == pytest.approx(at_two["one"], abs=1e-3)
         assert at_two["one"] != at_two["other"]
+        own, others = (psnr_db(tmp_path, bench["bench"], "other", constant) for constant in (0.8, 1.4))
+        assert at_two["other"] == pytest.approx(own, abs=1e-3) and abs(own - others) > 0.01
+        # The rival is seen with the constant of the network that it stands beside; its row has the first one's.
+        beside_other = at_two["other"] - bench["gain_over_rival"]["other"][1]["psnr_db"]["mean"]
+        assert abs(beside_other - at_two["smooth phase"]) > 0.01
     default, gaea = found
     assert default["volume_fresnel_px2"] == pytest.approx([45.57, 37.14, 32.14])
     assert gaea["volume_fresnel_px2"][1] == pytest.approx(532e-9 * (40e-3 / 3.74e-6) ** 2 / 0.35, abs=0.01)

@@ -205,3 +205,13 @@ def test_levels_are_the_nearest_ones_on_the_circle() -> None:
     many = torch.linspace(0, 2 * math.pi, 1001)[:-1]
     assert (panel_field(through_levels(many)) - panel_field(many)).abs().max() <= math.pi / 256 + 1e-6
     assert len(through_levels(torch.linspace(0, 2 * math.pi, 9999)).unique()) == 256
+
+
+def test_blur_and_diffraction_go_by_the_depth_of_the_volume_not_by_where_it_lies() -> None:
+    far = OpticsConfig(depth_far_dpt=0.5, depth_near_dpt=3.0)
+    from_infinity = OpticsConfig(depth_far_dpt=0.0, depth_near_dpt=2.5)
+    expected = [nm * 1e-9 * 5000**2 * 2.5 for nm in (638, 520, 450)]
+    assert far.volume_fresnel_px2 == pytest.approx(expected)
+    assert far.volume_fresnel_px2 == pytest.approx(from_infinity.volume_fresnel_px2)
+    assert far.volume_blur_px(3.0) == pytest.approx(37.5) == from_infinity.volume_blur_px(3.0)
+    assert far.pupil_mm(37.5) == pytest.approx(3.0)

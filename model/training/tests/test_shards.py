@@ -163,6 +163,8 @@ def test_each_crop_has_a_bench_of_its_own_where_benches_are_drawn(shards: Path) 
         least, most = ANY_BENCH.volume_fresnel_px2
         assert all(least <= fresnel <= most for fresnel in stack.optics.volume_fresnel_px2)
         assert 0 <= stack.optics.depth_far_dpt <= 1
+        red, green, blue = stack.optics.wavelengths_nm
+        assert 630 <= red <= 665 and 512 <= green <= 536 and 442 <= blue <= 475
     again = Sampler(shards, 32, 1, 0, AugmentConfig(), benches=BenchDraw())
     again.rescan()
     assert again.draw(7, 1)[0].optics == drawn[7].optics
@@ -215,3 +217,5 @@ def test_no_augmentation_but_turns_keeps_every_value(shards: Path) -> None:
     none = AugmentConfig(permute_colours=0, desaturate=0, dim=0, invert=0)
     out = augment(stack, none, np.random.default_rng(1))
     assert torch.equal(out.target.flatten().sort().values, stack.target.flatten().sort().values)
+    turned = [augment(stack, none, np.random.default_rng(seed)).depth for seed in range(16)]
+    assert {bool((depth[0] == depth[1]).all()) for depth in turned} == {False, True}, "upright and by a quarter"

@@ -21,8 +21,8 @@ from holod_training.benches import ANY_BENCH, BenchDraw
 from holod_training.cli import main
 from holod_training.compare import compare
 from holod_training.config import ConfigError, NetworkConfig, OpticsConfig, TrainedRange
-from holod_training.export import WeightsError, load_weights, read_metadata, save_weights
-from holod_training.loss import LossWeights
+from holod_training.export import WeightsError, export, load_weights, read_metadata, save_weights
+from holod_training.loss import LossWeights, focus_loss
 from holod_training.network import DirectNetwork
 from holod_training.optics import HalfBandEye
 from holod_training.sampling import AugmentConfig
@@ -412,6 +412,67 @@ def test_each_step_has_a_bench_of_its_own(shards: Path, tmp_path: Path) -> None:
     assert len(set(seen)) > 1
     with pytest.raises(ConfigError, match="--batch: found 2, expected 1 where each crop has a bench of its own"):
         tiny(shards, tmp_path / "two", network=network, benches=BenchDraw(), batch=2)
+
+
+def test_the_loss_is_of_the_bench_that_a_scene_is_seen_on(tmp_path: Path) -> None:
+    """Its eye, its circles of confusion, and the weight of what is in focus, which grows with the blur."""
+    bench = OpticsConfig((650.0, 530.0, 460.0), 6.0, 40.0, depth_far_dpt=0.5, depth_near_dpt=3.0)
+    metadata = {"pixel_pitch_um": "6.0", "pixel_angle_rad": str(6e-6 / 40e-3), "wavelengths_nm": "[650.0,530.0,460.0]"}
+    write_shard(tmp_path / "s" / "scene_000000.safetensors", metadata=metadata, depth_dpt=(0.5, 3.0))
+    network = dataclasses.replace(TINY, trained=ANY_BENCH)
+    weights = LossWeights(in_focus=20.0)
+    run = Run(tiny(tmp_path / "s", tmp_path / "run", network=network, loss=weights, validation=None), CPU)
+    run.sampler.rescan()
+    (stack,) = run.sampler.draw(0, 1)
+
+    def loss(optics: OpticsConfig) -> dict[str, float]:
+        pupil_mm, focus_dpt = stack.pupil_mm, list(stack.focus_dpt)
+        with torch.no_grad():
+            field = run.network.on(bench)(stack.amplitude[None], stack.depth[None], torch.tensor([pupil_mm]))[0]
+        dioptres = 0.5 + 2.5 * stack.depth
+        blur = torch.stack([(dioptres - dpt).abs() * 1e-3 * pupil_mm / optics.pixel_angle_rad for dpt in focus_dpt])
+        picture = HalfBandEye(optics, 48, 48, focus_dpt, "cpu").look(field, pupil_mm)
+        counted = weights.for_blur(1e-3 * pupil_mm / optics.pixel_angle_rad * 2.5)
+        found = focus_loss(picture, stack.target, blur, counted, border_px=8)
+        return {"loss": found.total.item(), **{f"loss_{name}": value for name, value in found.terms.items()}}
+
+    expected, of_default = loss(bench), loss(OpticsConfig())
+    row = run.train_step()
+    assert row["loss_in_focus"] > 0
+    for name, value in expected.items():
+        assert row[name] == pytest.approx(value, rel=1e-4), name
+        assert row[name] != pytest.approx(of_default[name], rel=1e-3), f"{name}: the comparison is blind"
+
+
+def test_what_is_validated_and_exported_is_the_average(shards: Path, tmp_path: Path) -> None:
+    """Of the first weights and those after each step: a tenth of the way stays after the first, 2 of 11 after the
+    second, until `ema_decay` is less."""
+    run = Run(tiny(shards, tmp_path / "run", learning_rate=0.05, ema_decay=0.15), CPU)
+    expected = [p.detach().clone() for p in run.network.parameters()]
+    for kept in (1 / 10, 0.15):
+        run.train_step()
+        pairs = zip(expected, run.network.parameters(), strict=True)
+        expected = [kept * before + (1 - kept) * live.detach() for before, live in pairs]
+    averaged = list(run.average.parameters())
+    for wanted, found in zip(expected, averaged, strict=True):
+        torch.testing.assert_close(found, wanted)
+    live = [p.detach() for p in run.network.parameters()]
+    assert any(not torch.allclose(p, q, rtol=1e-3) for p, q in zip(live, averaged, strict=True))
+    run.save_checkpoint()
+    exported = load_weights(export(tmp_path / "run" / "checkpoint.pt", tmp_path / "w.safetensors", None, None))
+    assert all(torch.equal(p, q) for p, q in zip(exported.parameters(), averaged, strict=True))
+    before = run.validate()
+    with torch.no_grad():
+        for parameter in run.network.parameters():
+            parameter.zero_()
+    assert run.validate() == before
+
+
+def test_gradients_are_clipped(shards: Path, tmp_path: Path) -> None:
+    run = Run(tiny(shards, tmp_path / "run", gradient_clip=1e-3), CPU)
+    row = run.train_step()
+    clipped = torch.cat([p.grad.flatten() for p in run.network.parameters()]).norm()
+    assert row["gradient_norm"] > 2e-3 and clipped.item() == pytest.approx(1e-3, rel=1e-2)
 
 
 def test_scenes_of_another_bench_are_refused(shards: Path, tmp_path: Path) -> None:
