@@ -20,6 +20,8 @@ from holod_training.network import FieldNetwork
 from holod_training.old_format import OLD_FORMAT, from_old_format, is_old
 from holod_training.variants import build_network
 
+CHECKPOINT_KEYS = {"step", "seconds", "network", "average", "optimizer", "shards", "provenance", "config"}
+
 
 class WeightsError(ValueError):
     """A weights file that cannot be used; the message names the file and what was found."""
@@ -30,7 +32,11 @@ def write_beside(path: Path, content: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        part.write_bytes(content)
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            # Else a power cut can leave an empty file where a whole one was.
+            os.fsync(file.fileno())
         part.replace(path)
     except OSError:
         part.unlink(missing_ok=True)
@@ -157,14 +163,28 @@ def export(
     return out
 
 
-def _from_checkpoint(source: Path) -> tuple[FieldNetwork, dict[str, Any], dict[str, Any]]:
+def read_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """What `Run.state` put there. Raises WeightsError for a file that is damaged, or of something else."""
     try:
-        state = torch.load(source, map_location="cpu", weights_only=True)
+        state = torch.load(path, map_location=device, weights_only=True)
+    except (OSError, EOFError, LookupError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError) as error:
+        # PyTorch's words on a pickle advise to load it unsafely.
+        told = "" if isinstance(error, pickle.UnpicklingError) else str(error).partition("\n")[0]
+        raise WeightsError(f"{path}: not a whole checkpoint ({told or 'its content cannot be read'})") from error
+    found = state.keys() if isinstance(state, dict) else set()
+    if missing := CHECKPOINT_KEYS - found:
+        raise WeightsError(f"{path}: not a checkpoint of a run (without {', '.join(sorted(missing))})")
+    return dict(state)
+
+
+def _from_checkpoint(source: Path) -> tuple[FieldNetwork, dict[str, Any], dict[str, Any]]:
+    state = read_checkpoint(source)
+    try:
         run = json.loads(state["config"])
         network = build_network(NetworkConfig.from_json(json.dumps(run["network"])))
         network.load_state_dict(state["average"])
         provenance = state["provenance"]
-    except (OSError, RuntimeError, KeyError, ValueError, pickle.UnpicklingError) as error:
+    except (KeyError, RuntimeError, TypeError, ValueError) as error:
         raise WeightsError(f"{source}: not a checkpoint of a run ({error})") from error
     return network, {}, provenance
 

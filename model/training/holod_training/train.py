@@ -35,6 +35,7 @@ from holod_training.export import (
     WeightsError,
     check_folder,
     load_weights,
+    read_checkpoint,
     read_metadata,
     save_weights,
     write_beside,
@@ -548,7 +549,7 @@ def _train(
     if resume:
         if not checkpoint.is_file():
             raise TrainingError(f"{checkpoint}: no checkpoint to resume; start without --resume")
-        run.load_state(torch.load(checkpoint, map_location=device, weights_only=True))
+        run.load_state(_state_in(checkpoint, device))
         if run.step > config.steps:
             raise TrainingError(f"--steps: found {config.steps}, expected at least {run.step}, where {checkpoint} is")
     elif checkpoint.exists():
@@ -596,6 +597,16 @@ def _train(
             raise KeyboardInterrupt(left)
     progress.close()
     return weights
+
+
+def _state_in(checkpoint: Path, device: torch.device) -> dict[str, Any]:
+    try:
+        return read_checkpoint(checkpoint, device)
+    except WeightsError as error:
+        raise TrainingError(
+            f"{error}; go on from {checkpoint.with_name('weights.safetensors')} by --initial-weights with an --out of "
+            "its own"
+        ) from error
 
 
 def _steps_of(weights: Path) -> int | None:

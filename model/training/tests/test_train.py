@@ -720,6 +720,31 @@ def test_a_loss_that_is_no_number_is_told_with_its_likely_cause(shards: Path, tm
         run.validate()
 
 
+def test_a_damaged_checkpoint_is_named_with_a_way_on(
+    shards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tiny(shards, tmp_path / "run")
+    run = Run(config, CPU)
+    run.train_step()
+    run.save_checkpoint()
+    checkpoint = tmp_path / "run" / "checkpoint.pt"
+    whole = checkpoint.read_bytes()
+    others = []
+    for other in ({"step": 1}, [1, 2], 3.0):
+        torch.save(other, tmp_path / "other.pt")
+        others.append((tmp_path / "other.pt").read_bytes())
+    for content in (b"", whole[:100], whole[: len(whole) // 2], whole[:-1], b"no checkpoint", *others):
+        checkpoint.write_bytes(content)
+        with pytest.raises(
+            TrainingError, match=r"checkpoint\.pt: not a .*; go on from .*weights\.safetensors by --initial"
+        ):
+            train(config, CPU, resume=True)
+        assert main(["export", "--source", str(checkpoint), "--out", str(tmp_path / "w.safetensors")]) == 65
+        assert f"error: {checkpoint}: not a " in capsys.readouterr().err
+    checkpoint.write_bytes(whole)
+    assert main(["export", "--source", str(checkpoint), "--out", str(tmp_path / "w.safetensors")]) == 0
+
+
 @pytest.mark.usefixtures("no_plots")
 def test_a_run_that_is_done_says_so_and_has_its_weights(shards: Path, tmp_path: Path) -> None:
     weights = train(tiny(shards, tmp_path / "run"), CPU)
