@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -169,8 +170,10 @@ class NetworkConfig:
             f"1 at the adjustable layers {self.adjustable_layers}",
         )
         for key, found in dataclasses.asdict(self.trained).items():
-            if len(found) != 2 or not 0 < found[0] <= found[1]:
+            if len(found) != 2 or not 0 < found[0] <= found[1] < math.inf:
                 raise ConfigError(f"trained.{key}: found {list(found)}, expected two above 0, in ascending order")
+        constant = self.amplitude_constant
+        self._require("amplitude_constant", 0 < constant < math.inf, "a number above 0")
         direct = self.architecture == "direct"
         self._require("frames", self.frames >= 1 and (direct or self.frames == 1), "1; `direct` may have more")
         self._require("blur_input", direct or not self.blur_input, "false; only `direct` can have it")

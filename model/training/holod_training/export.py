@@ -38,8 +38,10 @@ def write_beside(path: Path, content: bytes) -> None:
             # Else a power cut can leave an empty file where a whole one was.
             os.fsync(file.fileno())
         part.replace(path)
-    except OSError:
+    except OSError as error:
         part.unlink(missing_ok=True)
+        # A write that finds the disk full does not say what it wrote.
+        error.filename = error.filename or str(path)
         raise
 
 
@@ -152,7 +154,7 @@ def export(
         network, metrics, provenance = load_weights(source), metadata["metrics"], metadata["provenance"]
     check_engines_run(network.config, source)
     if amplitude_constant is not None:
-        if not amplitude_constant > 0:
+        if not 0 < amplitude_constant < math.inf:
             raise WeightsError(f"amplitude constant: found {amplitude_constant}, expected a number above 0")
         network.config = dataclasses.replace(network.config, amplitude_constant=amplitude_constant)
     if evaluation:

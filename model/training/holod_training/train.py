@@ -664,5 +664,9 @@ class RunLog:
 
     def write(self, kind: str, run: Run, values: dict[str, Any]) -> None:
         row = {"kind": kind, "step": run.step, "seconds": round(run.seconds, 1), **values}
-        with self.path.open("a") as file:
-            file.write(json.dumps(row) + "\n")
+        try:
+            with self.path.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+        except OSError as error:
+            error.filename = error.filename or str(self.path)
+            raise

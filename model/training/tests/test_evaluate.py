@@ -477,7 +477,8 @@ def test_export_stamps_the_constant_and_the_evaluation(
     assert metadata["provenance"] == {"seed": 1}
     before, after = load_weights(evaluation / "w.safetensors").state_dict(), load_weights(out).state_dict()
     assert all(torch.equal(before[name], after[name]) for name in before)
-    assert main(["export", *arguments[:4], "--amplitude-constant", "0"]) == 65
+    for constant in ("0", "inf", "nan"):
+        assert main(["export", *arguments[:4], "--amplitude-constant", constant]) == 65
     for method in ("layered ASM", "nobody"):
         assert main(["export", *arguments, "--evaluation-method", method]) == 65
     also = ["--source", str(evaluation / "deeper.safetensors"), "--out", str(out), *judged]

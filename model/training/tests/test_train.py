@@ -1,4 +1,5 @@
 import dataclasses
+import errno
 import json
 import math
 import os
@@ -851,6 +852,26 @@ def test_what_cannot_be_written_or_read_is_an_error_not_a_traceback(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "source.safetensors"]
     assert main(["export", "--source", str(source), "--out", str(source / "below")]) == 65
     assert f"error: {source}: " in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_a_full_disk_is_told_with_the_file(
+    shards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    source = tmp_path / "source.safetensors"
+    save_weights(source, DirectNetwork(TINY), {}, {})
+    run = Run(tiny(shards, tmp_path / "run"), CPU)
+    log = train_module.RunLog(tmp_path / "run", run.config, 0)
+    monkeypatch.setattr(os, "fsync", full)
+    assert main(["export", "--source", str(source), "--out", str(tmp_path / "out.safetensors")]) == 65
+    assert capsys.readouterr().err == f"error: {tmp_path / 'out.safetensors'}: No space left on device\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", "shards", "source.safetensors"]
+    log.path = Path("/dev/full")
+    with pytest.raises(OSError, match="No space left on device: '/dev/full'"):
+        log.write("train", run, {})
 
 
 def test_cli_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -96,6 +96,8 @@ def test_configs_that_do_not_fit_say_which_key() -> None:
         ({"architecture": "focal-stack", "grid": "full", "feedback": True}, "feedback: .* a half-band `focal-stack`"),
         ({"trained": TrainedRange((9.0, 5.0))}, r"trained\.volume_blur_px: found \[9.0, 5.0\], expected two"),
         ({"trained": TrainedRange((5.0, 9.0), (0.0, 5.0))}, r"trained\.volume_fresnel_px2: .* two above 0"),
+        ({"trained": TrainedRange((20.0, math.inf))}, r"trained\.volume_blur_px: found \[20\.0, inf\], expected two"),
+        ({"amplitude_constant": math.inf}, "amplitude_constant: found inf, expected a number above 0"),
         ({"specialists_mm": (3.0, 2.0)}, "specialists_mm: .* rising order"),
     ):
         with pytest.raises(ConfigError, match=message):
