@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from holod_training.config import OpticsConfig
 from holod_training.export import check_folder, load_weights, write_beside
 from holod_training.judging import AFTER, OURS, Bench, Judged, judge_scenes, network_method, open_alike, rivals
 from holod_training.metrics import SSIM_WINDOW_PX
@@ -44,12 +45,20 @@ def across_benches(
     }
     result = {
         "border_px": border_px,
-        "benches": [_bench(name, shards, judged[name]) for name, shards in benches],
+        "benches": [
+            {**_bench(name, shards, judged[name]), "outside_training": _outside(networks, shards[0].optics)}
+            for name, shards in benches
+        ],
     }
     text = markdown(result)
     write_beside(out / "benches.json", (json.dumps(result, indent=1) + "\n").encode())
     write_beside(out / "benches.md", text.encode())
     return text
+
+
+def _outside(networks: dict[str, FieldNetwork], optics: OpticsConfig) -> list[str]:
+    """The networks that were trained for other benches."""
+    return [name for name, network in networks.items() if network.config.trained.outside(optics) > 1]
 
 
 def _judge(name: str, network: FieldNetwork, shards: list[Shard], border_px: int, device: torch.device | str) -> Judged:
@@ -128,12 +137,14 @@ def markdown(result: dict[str, Any]) -> str:
 def _about(bench: dict[str, Any]) -> str:
     red, green, blue = bench["wavelengths_nm"]
     far, near = bench["depth_dpt"]
+    names = bench["outside_training"]
+    outside = f"; outside what {', '.join(names)} {'was' if len(names) == 1 else 'were'} trained for" if names else ""
     least, most = min(bench["volume_fresnel_px2"]), max(bench["volume_fresnel_px2"])
     return (
         f"**{bench['bench']}**: {bench['pixel_pitch_um']:g} um, {bench['eyepiece_focal_length_mm']:g} mm, "
         f"{red:g}/{green:g}/{blue:g} nm, {far:g} to {near:.3g} dpt; diffraction {least:.0f} to {most:.0f} px2, "
         f"blur {', '.join(f'{blur:.0f}' for blur in bench['volume_blur_px'])} px; {bench['scenes']} scenes of "
-        f"{bench['size'][1]}x{bench['size'][0]}"
+        f"{bench['size'][1]}x{bench['size'][0]}{outside}"
     )
 
 

@@ -15,6 +15,10 @@ ARCHITECTURES = ("direct", "layered", "expected-stack", "focal-stack")
 # Those of them that the engines run; a `focal-stack` with feedback.
 ENGINE_ARCHITECTURES = ("direct", "expected-stack", "focal-stack")
 CONDITIONINGS = ("adjustable", "deformable", "modulated")
+# By which factor a bench's diffraction may lie outside what was trained before `holod` no longer runs it.
+FARTHEST_OUTSIDE = 1.5
+# Relative difference below which two figures are the same.
+SAME = 1e-4
 
 
 class ConfigError(ValueError):
@@ -87,6 +91,20 @@ class TrainedRange:
 
     volume_blur_px: tuple[float, float] = (14.0, 72.0)
     volume_fresnel_px2: tuple[float, float] = (32.0, 46.0)
+
+    def outside(self, optics: OpticsConfig) -> float:
+        """By what factor the diffraction of a bench lies outside, of the colour that is farthest; 1 where none is."""
+        least, most = self.volume_fresnel_px2
+        worst = max(max(least / px2, px2 / most) for px2 in optics.volume_fresnel_px2)
+        return worst if worst > 1 + SAME else 1.0
+
+    def told_of(self, optics: OpticsConfig) -> str:
+        """How a bench lies outside, in `holod`'s words."""
+        found, (least, most) = optics.volume_fresnel_px2, self.volume_fresnel_px2
+        return (
+            f"diffraction over this bench's depth range, λ·(f/p)²·V, is {min(found):.2f} to {max(found):.2f} px²; the "
+            f"network was trained for {least:.2f} to {most:.2f} px²"
+        )
 
 
 def _optional(default: Any) -> Any:

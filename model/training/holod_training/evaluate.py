@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from holod_training.config import FARTHEST_OUTSIDE, SAME
 from holod_training.costs import network_cost, time_methods
 from holod_training.evaluate_config import EvaluateConfig
 from holod_training.export import (
@@ -64,8 +65,8 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     network = networks[OURS]
     shards = open_alike(config.test, config.limit, config.judge_between)
     optics = shards[0].optics
-    for one in networks.values():
-        one.on(optics)
+    for name, one in networks.items():
+        _check_bench(name, one.on(optics), config)
     cards = open_held_out(config.cards, optics) if config.cards else []
     check_alike(cards, ("size",), "with one `--size`")
     marks = open_held_out(config.marks, optics) if config.marks else []
@@ -125,6 +126,7 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
             **network_cost(one),
             "weights_sha256": weights_sha256(one),
             "amplitude_constant": one.config.amplitude_constant,
+            "outside_training": _outside(one),
         }
         for name, one in networks.items()
     ]
@@ -140,6 +142,21 @@ def evaluate(config: EvaluateConfig, device: torch.device | str = "cpu") -> dict
     write_beside(config.out / "evaluation.json", (json.dumps(result, indent=1) + "\n").encode())
     write_beside(config.out / "evaluation.md", markdown(result).encode())
     return result
+
+
+def _outside(network: FieldNetwork) -> str | None:
+    trained = network.config.trained
+    return trained.told_of(network.optics) if trained.outside(network.optics) > 1 else None
+
+
+def _check_bench(name: str, network: FieldNetwork, config: EvaluateConfig) -> None:
+    """Raises WeightsError where `holod evaluate` refuses the bench, too."""
+    trained = network.config.trained
+    if trained.outside(network.optics) > FARTHEST_OUTSIDE * (1 + SAME):
+        raise WeightsError(
+            f"{config.weights if name == OURS else name}: {trained.told_of(network.optics)}: judge it on scenes of a "
+            "bench like those, train a network for this bench (README.md), or see by `across-benches` how it does"
+        )
 
 
 def _load(config: EvaluateConfig, device: torch.device | str) -> dict[str, FieldNetwork]:

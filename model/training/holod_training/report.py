@@ -53,6 +53,11 @@ def _opening(result: dict[str, Any]) -> list[str]:
     own = {row["method"]: row.get("amplitude_constant", result["amplitude_constant"]) for row in result["networks"]}
     other = [f"{name}: {constant}" for name, constant in own.items() if constant != result["amplitude_constant"]]
     others = f" ({', '.join(other)})" if other else ""
+    outside = [
+        f"Not what {row['method']} is for: {told}."
+        for row in result["networks"]
+        if (told := row.get("outside_training"))
+    ]
     return [
         f"# Evaluation of {result['weights']}",
         "",
@@ -64,6 +69,7 @@ def _opening(result: dict[str, Any]) -> list[str]:
         f"focus that the target does not have there; less is better. Everything is after double phase.{optimised} Two "
         "rows are no holograms: the flat oracle is the target's mean at every focus, RGB-D blur is what a simple "
         "incoherent display would show that knows the picture and its depth alone, and guesses nothing that is hidden.",
+        *(line for told in outside for line in ("", told)),
     ]
 
 

@@ -241,6 +241,7 @@ class Run:
             self.validation = open_held_out(Path(config.validation), limit=config.validation_scenes)
             check_border(self.validation, config.validation_border_px, "--validation-border-px")
             check_pupils(self.validation, VALIDATION_PUPILS_MM)
+            self._check_told(config.validation, self.validation[0].optics)
             for shard in self.validation if config.network.architecture == "focal-stack" else []:
                 check_focuses(shard, config.network)
 
@@ -279,11 +280,15 @@ class Run:
                 f"{self.config.shards}: found scenes of several benches in a batch of {self.config.batch}, expected "
                 "one bench: train with `--batch 1` (torchrun adds more), or with scenes of one bench"
             )
-        least, most = self.config.network.trained.volume_fresnel_px2
-        found = benches[0].volume_fresnel_px2
-        if self.config.benches is None and not (min(found) > 0.99 * least and max(found) < 1.01 * most):
+        if self.config.benches is None:
+            self._check_told(self.config.shards, benches[0])
+
+    def _check_told(self, folder: str, bench: OpticsConfig) -> None:
+        trained, found = self.config.network.trained, bench.volume_fresnel_px2
+        if trained.outside(bench) > 1.01:
+            least, most = trained.volume_fresnel_px2
             raise TrainingError(
-                f"{self.config.shards}: found scenes of a bench whose diffraction is {min(found):.1f} to "
+                f"{folder}: found scenes of a bench whose diffraction is {min(found):.1f} to "
                 f"{max(found):.1f} px2, expected {least:g} to {most:g}, which the network is told: give this bench's "
                 "`--volume-fresnel-px2` and `--volume-blur-px` (`holod check` says them), or `--benches any`"
             )

@@ -71,6 +71,8 @@ def test_each_bench_has_a_row_for_each_network_and_one_for_the_rival(
     assert gaea["volume_blur_px"][1] / default["volume_blur_px"][1] == pytest.approx(8 / 3.74, rel=1e-3)
     assert default["rows"][0]["psnr_db"] != gaea["rows"][0]["psnr_db"]
     assert "**gaea-40**: 3.74 um, 40 mm, 633/532/473 nm, 0 to 2.86 dpt" in table
+    assert "2 scenes of 64x64; outside what one, other were trained for" in " ".join(table.split())
+    assert (default["outside_training"], gaea["outside_training"]) == ([], ["one", "other"])
     assert table.count("| smooth phase | ") == 2 and table.count(" of 4 |") == 4
 
 

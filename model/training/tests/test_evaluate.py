@@ -18,7 +18,7 @@ from test_marks import write_marks
 from test_rgbd import write_pair
 
 from holod_training.cli import main
-from holod_training.config import NetworkConfig, OpticsConfig
+from holod_training.config import NetworkConfig, OpticsConfig, TrainedRange
 from holod_training.export import load_weights, read_metadata, save_weights
 from holod_training.goals import ReportError, checks, row_of
 from holod_training.intervals import interval_95
@@ -327,6 +327,23 @@ def test_a_method_that_gives_no_numbers_is_told_and_not_left_out(evaluation: Pat
     shard = Shard(evaluation / "test" / "scene_000001.safetensors")
     with pytest.raises(JudgementError, match=r"scene_000001\.safetensors: failing for s = 2\.5 mm: found a picture"):
         judge_scenes([shard], [Method("failing", field, adapts=True)], Bench(OPTICS, 1.25, 8))
+
+
+def test_a_bench_that_weights_are_not_for_is_told(evaluation: Path, tmp_path: Path, capsys) -> None:
+    """Refused where `holod evaluate` does, noted where it warns."""
+    weights, trained = tmp_path / "w.safetensors", {"near": (40.0, 60.0), "far": (140.0, 400.0)}
+    arguments = ["evaluate", "--weights", str(weights), "--test", str(evaluation / "test"), "--limit", "1"]
+    arguments += ["--solver-scenes", "0", "--timing-calls", "1", "--out"]
+    for name, fresnel_px2 in trained.items():
+        config = NetworkConfig(
+            layers=4, channels=4, adjustable_layers=(1,), trained=TrainedRange((14, 72), fresnel_px2)
+        )
+        save_weights(weights, DirectNetwork(config), {}, {})
+        assert main([*arguments, str(tmp_path / name)]) == (65 if name == "far" else 0)
+    told = "diffraction over this bench's depth range, λ·(f/p)²·V, is 32.14 to 45.57 px²; the network was trained for "
+    assert f"{weights}: {told}140.00 to 400.00 px²: " in capsys.readouterr().err and not (tmp_path / "far").exists()
+    assert f"Not what holod is for: {told}40.00 to 60.00 px²." in (tmp_path / "near" / "evaluation.md").read_text()
+    assert "Not what" not in (evaluation / "out" / "evaluation.md").read_text()
 
 
 @pytest.mark.parametrize(

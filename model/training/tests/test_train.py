@@ -491,6 +491,18 @@ def test_scenes_of_another_bench_are_refused(shards: Path, tmp_path: Path) -> No
     assert Run(tiny(shards, tmp_path / "told", batch=4, network=network, validation=None), CPU).train_step()["loss"] > 0
 
 
+def test_validation_scenes_of_another_bench_are_refused_before_the_first_step(shards: Path, tmp_path: Path) -> None:
+    """Such as of the default one, where `--rig` was forgotten: the network would be told a wrong diffraction."""
+    gaea = dataclasses.replace(TINY, trained=TrainedRange((20.0, 250.0), (140.0, 400.0)))
+    for benches in (None, BenchDraw(trained=gaea.trained)):
+        with pytest.raises(
+            TrainingError, match=r"shards: found .* diffraction is 32\.1 to 45\.6 px2, expected 140 to 400"
+        ):
+            Run(tiny(shards, tmp_path / "run", network=gaea, benches=benches), CPU)
+    any_bench = dataclasses.replace(TINY, trained=ANY_BENCH)
+    Run(tiny(shards, tmp_path / "run", network=any_bench, benches=BenchDraw()), CPU)
+
+
 @pytest.mark.usefixtures("no_plots")
 def test_a_flat_run_is_stopped(shards: Path, tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match="shows one blurred picture"):
