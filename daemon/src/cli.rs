@@ -159,8 +159,8 @@ pub struct SceneArgs {
     #[arg(long, value_name = "PATH")]
     pub scene: Option<String>,
     /// What the depth file's numbers are; required for COLOUR,DEPTH, while a scene.toml names its own: metres,
-    /// millimetres, dioptres, or normalised_dioptres[:FAR,NEAR] (both in dioptres, NEAR more than FAR, which is 0 in
-    /// the file; the rig's depth range when left out).
+    /// millimetres, dioptres, or normalised_dioptres:FAR,NEAR (both in dioptres, NEAR more than FAR, which is 0 in the
+    /// file; without them normalised_dioptres is over the rig's depth range).
     #[arg(long, value_name = "ENCODING")]
     pub depth_encoding: Option<String>,
     /// How a picture of another size is brought to --resolution.
