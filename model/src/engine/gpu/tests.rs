@@ -513,7 +513,7 @@ fn wrong_sizes_and_pupils_are_refused_and_a_lost_device_is_told() {
 
 #[test]
 fn a_device_is_waited_for_as_long_as_was_said() {
-    let (weights, resolution) = (Weights::builtin_small(), Resolution { width: 256, height: 256 });
+    let (weights, resolution) = (random_weights(weights_tests::config(), 5), Resolution { width: 64, height: 64 });
     let mut engine = engine(&weights, &DisplayGeometry::DEFAULT, resolution);
     let mut samples = vec![0; 3 * resolution.pixels()];
     let (frame, pupil) = (Arc::new(frame(resolution, 0)), PupilDiameter::from_mm(3.0));
