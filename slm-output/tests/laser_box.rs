@@ -563,8 +563,9 @@ fn a_box_that_was_unplugged_is_found_again_under_the_same_name() {
     laser.arm(host_now()).unwrap();
     assert_eq!(watch.trouble(), None);
 
-    drop(first);
+    // First its name: that of its terminal may be another test's at once.
     fs::remove_file(&link).unwrap();
+    drop(first);
     let t_pulled = host_now();
     assert_eq!(dark_reason(laser.as_mut()), DarkReason::BoxFault);
     assert!(host_now() - t_pulled < TimeNs(10_000 * MS));
@@ -672,9 +673,9 @@ fn real_lasers_do_not_take_the_place_of_a_simulated_box() {
     let rig = rig(PanelMode::FieldSequential, &link);
     let mut laser = open_laser(&rig.lasers, host_now).unwrap();
     laser.program(&host_program(), host_now()).unwrap();
+    fs::remove_file(&link).unwrap();
     drop(first);
     let real = BoxProcess::start(&["--name", "bench-4"]);
-    fs::remove_file(&link).unwrap();
     std::os::unix::fs::symlink(&real.port, &link).unwrap();
     let watch = laser.watch().unwrap();
     eventually("refusal", || {

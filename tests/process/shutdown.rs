@@ -51,9 +51,10 @@ impl LaserBench {
         thread::spawn(move || terminal.serve(simulated, log, &faults, host_now));
     }
 
+    /// Its name goes first: that of its terminal may be another test's at once.
     fn unplug(&self) {
-        self.faults.unplug();
         fs::remove_file(&self.device).unwrap();
+        self.faults.unplug();
     }
 
     fn events(&self) -> Vec<BoxEvent> {

@@ -1,6 +1,6 @@
 //! A tracker on a pseudo-terminal: the daemon opens the one end, the test writes bytes into the other.
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, Write};
 use std::os::fd::OwnedFd;
 use std::os::unix::fs::symlink;
@@ -21,12 +21,14 @@ pub struct TimedLine {
     pub bytes: Vec<u8>,
 }
 
-/// A serial tracker that is plugged in while this lives.
+/// A serial tracker that is plugged in while this lives. Its link goes before its terminal does, whose name another
+/// test's terminal may have at once.
 pub struct PtyTracker {
     master: File,
     // Held open: a pseudo-terminal whose last reader closes loses what was written.
     _slave: OwnedFd,
     device: PathBuf,
+    link: PathBuf,
 }
 
 impl PtyTracker {
@@ -41,10 +43,10 @@ impl PtyTracker {
         raw.make_raw();
         tcsetattr(&slave, OptionalActions::Now, &raw)?;
         if link.is_symlink() {
-            std::fs::remove_file(link)?;
+            fs::remove_file(link)?;
         }
         symlink(&device, link)?;
-        Ok(Self { master: File::from(master), _slave: slave, device })
+        Ok(Self { master: File::from(master), _slave: slave, device, link: link.into() })
     }
 
     /// The device's own path.
@@ -71,5 +73,13 @@ impl PtyTracker {
             self.send(&line.bytes)?;
         }
         Ok(())
+    }
+}
+
+impl Drop for PtyTracker {
+    fn drop(&mut self) {
+        if fs::read_link(&self.link).is_ok_and(|device| device == self.device) {
+            let _taken_away_already = fs::remove_file(&self.link);
+        }
     }
 }

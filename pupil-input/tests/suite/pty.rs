@@ -139,8 +139,9 @@ fn a_port_that_is_unplugged_is_opened_again_where_it_comes_back() {
     let mut handle = start(&format!("serial:{},baud=9600", by_id.display()));
     feed_until(&mut tracker, 0, "tracking", || tracks(&mut handle));
 
-    drop(tracker);
+    // First its name: that of its terminal may be another test's at once.
     std::fs::remove_file(&by_id).expect("unlinks");
+    drop(tracker);
     eventually("the loss", || handle.control.link() == Link::Down);
     eventually("holding", || handle.estimate.pupil_at(host_now()).state == PupilState::Holding);
     eventually("tries", || handle.control.counters().of(Counter::ReconnectAttempts) >= 2);
