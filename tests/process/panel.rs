@@ -56,6 +56,25 @@ fn a_panel_of_another_rate_stays_dark_and_both_rates_are_said() {
 }
 
 #[test]
+fn a_panel_a_little_off_its_rate_is_lit_and_one_whose_reports_scatter_is_not_which_is_said() {
+    for output in ["headless:refresh=59.92", "headless:refresh=60.2"] {
+        let (ended, summary) = run_over(output, false, "3s");
+        assert!(count(&summary, "lit") > 100, "{output}: {summary:#}");
+        assert!(!ended.stderr.contains("is believed"), "{}", ended.stderr);
+    }
+    for sequential in [false, true] {
+        let (ended, summary) = run_over("headless:jitter=0.3ms,seed=5", sequential, "6s");
+        assert_eq!(count(&summary, "lit"), 0, "{summary:#}");
+        assert_eq!(
+            ended.stderr.matches("no report of the panel's refreshes is believed").count(),
+            1,
+            "{}",
+            ended.stderr
+        );
+    }
+}
+
+#[test]
 fn lying_reports_cost_light_and_nothing_else() {
     let lies = "headless:jitter=20us,early=0.01,doubled=0.01,dropped=0.01,late=0.01,seed=3";
     let (_, summary) = run_over(lies, true, "4s");

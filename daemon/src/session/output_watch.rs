@@ -3,13 +3,15 @@
 use holod_calibration::TimeNs;
 use holod_slm_output::PanelEvent;
 use holod_slm_output::laser::DarkReason;
-use holod_slm_output::output::OutputCounts;
-use holod_slm_output::present::PanelFault;
+use holod_slm_output::output::{FieldEvent, OutputCounts};
+use holod_slm_output::present::{PanelFault, TimestampSource};
 
 /// A panel whose rate differs from the rig's by more than this share is not the one that the rig describes.
 const RATE_TOLERANCE: f64 = 0.005;
 /// How long the panel's rate is watched before it is judged.
 const RATE_WATCHED: TimeNs = TimeNs(1_000_000_000);
+/// How long no report may be believed before that is said.
+const UNBELIEVED: TimeNs = TimeNs(3_000_000_000);
 /// At most one line in this time says that lasers went dark: lasers that flicker must not flood the log.
 const DARK_EVERY: TimeNs = TimeNs(1_000_000_000);
 
@@ -21,12 +23,14 @@ pub(super) struct OutputWatch {
     lost: Option<PanelFault>,
     /// Since when the rate has been off, and whether that has been said.
     off_rate: Option<(TimeNs, bool)>,
+    /// Since when no field has been lit for reports that are not believed, and whether that has been said.
+    unbelieved: Option<(TimeNs, bool)>,
     t_next_dark_line: TimeNs,
 }
 
 impl OutputWatch {
     pub(super) fn new(events: rtrb::Consumer<PanelEvent>, nominal_hz: f64) -> Self {
-        Self { events, nominal_hz, lost: None, off_rate: None, t_next_dark_line: TimeNs(i64::MIN) }
+        Self { events, nominal_hz, lost: None, off_rate: None, unbelieved: None, t_next_dark_line: TimeNs(i64::MIN) }
     }
 
     /// Why the panel is lost now, if it is.
@@ -45,7 +49,7 @@ impl OutputWatch {
                 PanelEvent::Back { .. } => {
                     tracing::info!("the panel is back");
                     self.lost = None;
-                    self.off_rate = None;
+                    (self.off_rate, self.unbelieved) = (None, None);
                 }
             }
         }
@@ -68,6 +72,31 @@ impl OutputWatch {
                 self.nominal_hz
             );
         }
+    }
+
+    /// Warns once where no report of a panel of the rig's rate is believed.
+    pub(super) fn judge_reports(&mut self, field: &FieldEvent) {
+        if field.dark.is_none() {
+            self.unbelieved = None;
+        }
+        if field.dark != Some(DarkReason::Untrusted) {
+            return;
+        }
+        let (since, said) = self.unbelieved.get_or_insert((field.t_present, false));
+        if *said || self.off_rate.is_some() || field.t_present - *since < UNBELIEVED {
+            return;
+        }
+        *said = true;
+        let why = match field.provenance {
+            TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External => {
+                "their times scatter by more than the rig leaves room for; a longer lasers.on_delay_ms and a shorter \
+                 lit_ms leave more, and a wire from the panel's sync output to the laser box (lasers.sync_wire) needs none"
+            }
+            TimestampSource::Software | TimestampSource::Estimated => {
+                "their times are software's, not the display's, or scatter; `holod check` says what an output is good for"
+            }
+        };
+        tracing::warn!("no report of the panel's refreshes is believed, so lasers stay dark: {why}");
     }
 
     /// The laser box went dark.

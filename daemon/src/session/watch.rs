@@ -37,6 +37,10 @@ const TICKS_PER_REPORT: u32 = 10;
 const TICKS_PER_STATUS: u32 = 100;
 /// How long the end of a run waits for its last frame to be shown.
 const LAST_FRAME_WAIT: TimeNs = TimeNs(1_000_000_000);
+/// A state of the run that follows another line on it sooner than this is logged once it has held for so long: a tracker
+/// that pauses or lasers that flicker must not flood the log.
+const STATE_EVERY: TimeNs = TimeNs(10_000_000_000);
+const STATE_HOLDS: TimeNs = TimeNs(1_000_000_000);
 
 /// The control thread's view of a run.
 pub(super) struct Watch<'a> {
@@ -99,12 +103,26 @@ pub(super) struct Announced {
     rate: RateWatch,
     state: State,
     text: String,
+    text_since: TimeNs,
+    logged: Option<(String, TimeNs)>,
     armed: bool,
 }
 
 impl Announced {
     pub(super) fn new(advised: bool) -> Self {
         Self { advised, ..Self::default() }
+    }
+
+    /// Logs how the run is where that has changed; whether it does.
+    fn log_state(&mut self, now: TimeNs) -> bool {
+        let is_due = self.logged.as_ref().is_none_or(|(logged, t_logged)| {
+            *logged != self.text && (now - *t_logged >= STATE_EVERY || now - self.text_since >= STATE_HOLDS)
+        });
+        if is_due {
+            tracing::info!("{}", self.text);
+            self.logged = Some((self.text.clone(), now));
+        }
+        is_due
     }
 }
 
@@ -278,6 +296,7 @@ impl Watch<'_> {
         }
         self.panel.drain();
         for event in fields_over.drain(..) {
+            self.panel.judge_reports(&event);
             if let Some(light) = self.tally.field(&event) {
                 self.observer.first_light(&light);
             }
@@ -293,7 +312,7 @@ impl Watch<'_> {
 
     /// What is looked at ten times a second.
     fn report(&mut self, output: &OutputCounts, now: TimeNs) -> Result<(), Failure> {
-        let is_new = self.tell_state(output);
+        let is_new = self.tell_state(output, now);
         if is_new | (std::mem::replace(&mut self.announced.armed, output.armed) != output.armed) {
             self.write_status(output, now);
         }
@@ -315,7 +334,7 @@ impl Watch<'_> {
     }
 
     /// Says how the run is, where that has changed; whether it has.
-    fn tell_state(&mut self, output: &OutputCounts) -> bool {
+    fn tell_state(&mut self, output: &OutputCounts, now: TimeNs) -> bool {
         let lit = output.armed && self.tally.frames_shown > 0;
         let link = self.tracker.link();
         let is_fixed = self.tally.newest_state == FIXED_PUPIL;
@@ -337,13 +356,13 @@ impl Watch<'_> {
         };
         let record = if record_lost { ", record lost" } else { "" };
         let text = format!("{}: tracker {}, pupil {pupil}{record}", state.name(), link.name());
-        if text == self.announced.text {
-            return false;
+        let is_new = text != self.announced.text;
+        if is_new {
+            self.service.status(&text);
+            (self.announced.text, self.announced.text_since) = (text, now);
         }
-        tracing::info!("{text}");
-        self.service.status(&text);
-        self.announced.text = text;
-        true
+        self.announced.log_state(now);
+        is_new
     }
 
     /// Says once how many frames a second are really reached.
@@ -430,5 +449,31 @@ impl Watch<'_> {
             feed: self.feed.as_ref().map(|feed| feed.status(now)),
             record: self.record.as_ref().map(|record| record.state()),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// At how many of the times, ten a second for a minute, a state is logged that is another one every `changes` of them.
+    fn logged(changes: usize) -> usize {
+        let mut announced = Announced::new(false);
+        let times = (0..600).filter(|look| {
+            let now = TimeNs(*look as i64 * 100_000_000);
+            if look % changes == 0 {
+                (announced.text, announced.text_since) = (format!("state {}", look / changes % 2), now);
+            }
+            announced.log_state(now)
+        });
+        times.count()
+    }
+
+    #[test]
+    fn states_that_hold_are_logged_at_once_and_those_that_flicker_now_and_then() {
+        assert_eq!(logged(600), 1);
+        assert_eq!(logged(150), 4);
+        assert_eq!(logged(20), 30, "each once it has held for a second");
+        assert!((4..=7).contains(&logged(3)), "{}", logged(3));
     }
 }

@@ -3,8 +3,9 @@
 use holod_calibration::TimeNs;
 use holod_laser_firmware::TimeUs;
 
-/// By how much the two clocks may run apart: each may be wrong by 100 parts per million.
-const DRIFT_PPM: i64 = 200;
+/// By how much the two clocks may run apart: each may be wrong by 100 parts per million, and NTP has the host's run
+/// faster or slower by up to 500 while it corrects the wall clock, which the monotonic one goes with.
+const DRIFT_PPM: i64 = 1000;
 
 /// What is known of box time minus host time: never a guess, always an interval.
 ///
@@ -105,11 +106,11 @@ mod tests {
         assert_eq!(clock.offset_at(TimeNs(0)), None);
         clock.learn(TimeNs(1_000_000), TimeNs(1_400_000), TimeUs(5_000)).unwrap();
         let offset = clock.offset_at(TimeNs(1_400_000)).unwrap();
-        // 80 ns of drift on the way, and what integers round off.
-        assert_eq!((offset.least_ns, offset.greatest_ns), (3_599_918, 4_001_081));
-        assert_eq!((offset.middle_ns(), offset.error_ns()), (3_800_499, 200_582));
+        // 400 ns of drift on the way, and what integers round off.
+        assert_eq!((offset.least_ns, offset.greatest_ns), (3_599_598, 4_001_401));
+        assert_eq!((offset.middle_ns(), offset.error_ns()), (3_800_499, 200_902));
         let later = clock.offset_at(TimeNs(1_400_000 + 1_000_000_000)).unwrap();
-        assert_eq!(later.error_ns() - offset.error_ns(), 200_000, "200 µs a second");
+        assert_eq!(later.error_ns() - offset.error_ns(), 1_000_000, "1 ms a second");
     }
 
     #[test]
@@ -136,7 +137,7 @@ mod tests {
         #[test]
         fn the_truth_is_always_inside(
             offset_ms in -1_000i64..1_000_000,
-            drift_ppm in -190i64..190,
+            drift_ppm in -950i64..950,
             exchanges in prop::collection::vec((0i64..20_000_000, 0i64..3_000_000, 0i64..3_000_000), 1..60),
         ) {
             let t_origin = 2_000_000_000_000i64;
@@ -153,7 +154,7 @@ mod tests {
                 let offset = clock.offset_at(TimeNs(t)).unwrap();
                 let true_ns = truth(t) - t;
                 prop_assert!((offset.least_ns..=offset.greatest_ns).contains(&true_ns), "{:?} {}", offset, true_ns);
-                best = best.saturating_add((pause + there + back) / 5000 + 2).min((there + back) * 5002 / 10_000 + 502);
+                best = best.saturating_add((pause + there + back) / 1000 + 2).min((there + back) * 1002 / 2000 + 502);
                 prop_assert!(offset.error_ns() <= best, "{} {}", offset.error_ns(), best);
             }
         }

@@ -184,7 +184,9 @@ pub enum LaserError {
     #[error("the laser box has reset itself: check its supply and its watchdog")]
     Reset,
     /// The box's clock does not go with the host's.
-    #[error("the laser box's clock jumped by {jump_us} µs or more: it has reset itself, or the computer was suspended")]
+    #[error(
+        "the laser box's clock jumped by {jump_us} µs or more: it has reset itself, the computer was suspended, or NTP corrects this computer's clock fast"
+    )]
     ClockJump {
         /// By how much more than drift allows, microseconds.
         jump_us: i64,

@@ -188,7 +188,9 @@ fn every_field_is_lit_once_by_its_own_laser() {
             let report = bench.verdict();
             assert_eq!(report.unsafe_findings().collect::<Vec<_>>(), Vec::<&Finding>::new());
             assert!(report.fields >= 170, "{report:?}");
-            assert!(report.lit >= report.fields - 8, "{mode:?} late {late_ns}: {report:?}");
+            // But for the refreshes by which the rhythm is believed.
+            let fields_dark = if mode == PanelMode::ChannelPacked { 3 * 9 } else { 9 + 5 };
+            assert!(report.lit >= report.fields - fields_dark, "{mode:?} late {late_ns}: {report:?}");
             assert!(bench.all_events.iter().any(|event| !event.repeated && event.laser_on.is_some()));
         }
     }
@@ -197,7 +199,7 @@ fn every_field_is_lit_once_by_its_own_laser() {
 #[test]
 fn events_carry_the_edges_of_their_own_field() {
     let mut bench = Bench::new(PanelMode::ChannelPacked);
-    bench.run(TimeNs(300 * MS), TimeNs(50_000));
+    bench.run(TimeNs(400 * MS), TimeNs(50_000));
     let lit: Vec<_> = bench.all_events.iter().filter(|event| event.dark.is_none()).collect();
     assert!(lit.len() > 30);
     for event in lit {

@@ -98,7 +98,7 @@ impl FieldScheduler {
         Ok(Self {
             layout,
             gate,
-            judge: RefreshJudge::new(gate.timing().refresh_period, tolerance, layout.refreshes()),
+            judge: RefreshJudge::new(gate.timing().refresh_period, tolerance, layout.refreshes(), clock),
             interlock: Interlock::new(gate, trigger, evidence, stall_timeout),
             balance: Balance::new(&layout, gate.width()),
             current: None,
