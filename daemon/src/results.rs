@@ -1,11 +1,11 @@
 //! The results of commands: text or JSON on standard output, JSON and pictures in files.
 
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use holod_calibration::write_atomically;
 use image::RgbImage;
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use crate::failure::{Exit, Failure};
 use crate::logging;
@@ -64,6 +64,21 @@ pub fn save_png(picture: &RgbImage, path: &Path) -> Result<(), Failure> {
 fn save(bytes: &[u8], path: &Path) -> Result<(), Failure> {
     let cannot = |error| Failure::new(Exit::CannotCreate, format!("{}: {error}", path.display()));
     write_atomically(path, |out| out.write_all(bytes)).map_err(cannot)
+}
+
+/// Writes a path as text, whatever bytes are in it: JSON knows no others.
+pub(crate) fn path_text<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
+    path.to_string_lossy().serialize(serializer)
+}
+
+/// The same of a path where there is one.
+pub(crate) fn optional_path_text<S: Serializer>(path: &Option<PathBuf>, serializer: S) -> Result<S::Ok, S::Error> {
+    path.as_ref().map(|path| path.to_string_lossy()).serialize(serializer)
+}
+
+/// The same of several.
+pub(crate) fn paths_text<S: Serializer>(paths: &[PathBuf], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(paths.iter().map(|path| path.to_string_lossy()))
 }
 
 /// A value as JSON.

@@ -60,6 +60,7 @@ pub struct Snapshot {
     /// How long it has run.
     pub uptime_s: f64,
     /// Where `holod ctl` may ask it.
+    #[serde(serialize_with = "crate::results::optional_path_text")]
     pub control: Option<PathBuf>,
     /// Orders that were refused, by reason.
     #[serde(default)]

@@ -274,7 +274,9 @@ fn read(path: &Path, now: TimeNs) -> std::io::Result<Option<Found>> {
         return Ok(None);
     }
     let written = serde_json::from_slice::<Written<Snapshot>>(&read_file(path)?);
-    let Ok(Written { written_ns, began_ticks, status }) = written else { return Ok(None) };
+    let Ok(Written { written_ns, began_ticks, mut status }) = written else { return Ok(None) };
+    // The socket is beside the file; its folder's name may be none that JSON can say.
+    status.control = status.control.and_then(|socket| Some(path.with_file_name(socket.file_name()?)));
     let lives = name == file_name(status.pid) && lives(status.pid, began_ticks);
     let age_ns = written_ns.map_or(0, |written_ns| now.0.saturating_sub(written_ns).max(0));
     let stale = (age_ns > STALE.0).then(|| Duration::from_nanos(age_ns.unsigned_abs()));
@@ -295,10 +297,14 @@ fn read_file(path: &Path) -> std::io::Result<Vec<u8>> {
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;
+    use std::ffi::OsStr;
+    use std::os::unix::ffi::OsStrExt;
     use std::os::unix::net::UnixListener;
     use std::time::SystemTime;
 
     use super::*;
+    use crate::record::RecordState;
+    use crate::source::feed::FeedStatus;
 
     const NOW: TimeNs = TimeNs(1_000_000_000_000);
     const LONG: Duration = Duration::from_secs(20);
@@ -322,6 +328,26 @@ mod tests {
         assert_eq!(found_in(&folders).unwrap(), [Found { status: status(), stale: None }]);
         drop(file);
         assert!(found_in(&folders).is_err());
+    }
+
+    #[test]
+    fn folders_whose_names_are_no_text_hide_nothing() {
+        let parent = tempfile::tempdir().unwrap();
+        let folder = parent.path().join(OsStr::from_bytes(b"m\xfcller"));
+        std::fs::create_dir(&folder).unwrap();
+        let control = Some(folder.join(format!("control-{}", std::process::id())));
+        let mut status = Snapshot { control: control.clone(), ..status() };
+        status.figures.record = Some(RecordState { folder: folder.clone(), ..RecordState::default() });
+        let mut feed = FeedStatus::default();
+        feed.socket = folder.join("feed");
+        status.figures.feed = Some(feed);
+        let mut file = StatusFile::of(std::process::id(), &folder);
+        file.write(&status, NOW);
+        assert!(file.newest.wait_until_done(LONG));
+        let found = found_in(std::slice::from_ref(&folder)).unwrap();
+        assert_eq!(found[0].status.control, control, "it can be asked");
+        let record = found[0].status.figures.record.as_ref().unwrap();
+        assert_eq!(record.folder, parent.path().join("m\u{fffd}ller"));
     }
 
     #[test]

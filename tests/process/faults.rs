@@ -1,8 +1,10 @@
 //! Disks, pipes and folders that fail under a run cost the record or the log, and neither frames nor lasers.
 
+use std::ffi::OsStr;
 use std::fs;
 use std::io::{PipeReader, PipeWriter, Read};
 use std::os::fd::AsRawFd;
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::thread;
@@ -169,6 +171,24 @@ fn judge_what_is_left(folder: &Path) {
     let again = run(HOLOD, &["--tracker", "replay:report.tar.gz", "--frames", "20", "--json"], folder);
     let again_json: Value = serde_json::from_str(&again.stdout).unwrap_or_else(|_| panic!("{again:?}"));
     assert_eq!(again_json["report"]["frames_different"], 0, "{again_json}");
+}
+
+#[test]
+fn a_run_in_folders_whose_names_are_no_text_is_reached_and_its_record_is_whole() {
+    let folder = holod_tests::new_folder();
+    let bench = folder.path().join(OsStr::from_bytes(b"m\xfcller"));
+    fs::create_dir(&bench).unwrap();
+    fs::write(bench.join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let mut holod = Process::start(by_shell(&bench, "", &[], "--record \"$(printf 'k\\344se')\" >out 2>err"));
+    frames_go_on(&bench);
+    assert_eq!(status(&bench)["record"]["folder"], "k\u{fffd}se");
+    let stopped = ask(&bench, &["ctl", "stop"]);
+    assert!(stopped.status.success(), "{stopped:?}");
+    assert_eq!(holod.code(), Some(0), "{}", fs::read_to_string(bench.join("err")).unwrap());
+    let record = bench.join(OsStr::from_bytes(b"k\xe4se"));
+    let summary: Value = serde_json::from_slice(&fs::read(record.join("summary.json")).unwrap()).unwrap();
+    assert_eq!(summary["record"]["state"], "written", "{summary:#}");
+    assert!(record.join("run.json").exists());
 }
 
 #[test]

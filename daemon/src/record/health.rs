@@ -23,6 +23,7 @@ pub enum RecordCondition {
 /// How the record of a run is, as its status says it.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct RecordState {
+    #[serde(serialize_with = "crate::results::path_text")]
     pub folder: PathBuf,
     /// Whether it goes on.
     pub state: RecordCondition,

@@ -31,6 +31,7 @@ pub(crate) const SCENE: &str = "scene.toml";
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct SourceFile {
+    #[serde(serialize_with = "crate::results::path_text")]
     pub path: PathBuf,
     /// What it is called in a report.
     pub name: String,
@@ -284,6 +285,9 @@ pub(super) fn keep_bench(folder: &Path, config: Option<&Path>, rig: &Rig) -> Res
 
 #[cfg(test)]
 mod tests {
+    use std::ffi::OsStr;
+    use std::os::unix::ffi::OsStrExt;
+
     use super::*;
     use crate::cli::FitArg;
 
@@ -333,6 +337,11 @@ mod tests {
         assert_eq!((files[1].bytes, files[1].path.clone()), (5, folder.path().join("d.png")));
         assert_eq!(files[1].xxh3, content_xxh3(&mut &b"d.png"[..]).unwrap().1);
         assert_ne!(files[1].xxh3, content_xxh3(&mut &b"e.png"[..]).unwrap().1);
+
+        let no_text = folder.path().join(OsStr::from_bytes(b"d\xff.png"));
+        fs::write(&no_text, "d.png").unwrap();
+        let json = serde_json::to_value(SourceFile::of(&no_text, "depth.png".into()).unwrap()).unwrap();
+        assert!(json["path"].as_str().unwrap().ends_with("/d\u{fffd}.png"), "{json}");
     }
 
     #[test]

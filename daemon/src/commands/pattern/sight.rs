@@ -23,6 +23,7 @@ pub(super) struct Sight {
     /// The rig's name.
     rig: String,
     /// The files that were written.
+    #[serde(serialize_with = "crate::results::paths_text")]
     pub(super) files: Vec<PathBuf>,
     /// Where light goes.
     spots: Vec<Spot>,

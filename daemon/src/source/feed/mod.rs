@@ -84,6 +84,7 @@ impl FeedPlan {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct FeedStatus {
     /// The socket.
+    #[serde(serialize_with = "crate::results::path_text")]
     pub socket: PathBuf,
     /// Who is connected.
     pub clients: Vec<String>,
