@@ -3,7 +3,7 @@
 mod pattern;
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use holod_calibration::rig::{Eye, Tracker, WeightsChoice};
@@ -282,7 +282,8 @@ pub struct RunArgs {
     /// Stop after this many frames.
     #[arg(long, value_name = "N", conflicts_with = "duration")]
     pub frames: Option<u64>,
-    /// Stop after this long, for example 10s or 2m; a log that is replayed and ends sooner ends the run.
+    /// Stop after this long, for example 10s or 2m; a log that is replayed and ends sooner ends the run, but not one
+    /// that is played by speed=max.
     #[arg(long, value_name = "TIME", value_parser = parse_time)]
     pub duration: Option<Duration>,
     /// Write frames.csv, summary.json, what the tracker sent (tracker.holodraw, samples.csv), what `holod ctl` changed
@@ -302,17 +303,6 @@ pub struct RunArgs {
     /// Print the summary as JSON.
     #[arg(long)]
     pub json: bool,
-}
-
-impl RunArgs {
-    /// The same for a run that starts `now`: `record` is the folder that it records into, if any.
-    pub fn starting(&self, now: SystemTime) -> Self {
-        let Some(parent) = &self.record_in else { return self.clone() };
-        let time = humantime::format_rfc3339_seconds(now).to_string().replace(':', "-");
-        let names = std::iter::once(time.clone()).chain((2..).map(|start| format!("{time}-{start}")));
-        let unused = names.map(|name| parent.join(name)).find(|folder| !folder.exists());
-        Self { record: unused, record_in: None, ..self.clone() }
-    }
 }
 
 /// Where the status page is served.
@@ -860,20 +850,8 @@ mod tests {
     }
 
     #[test]
-    fn each_start_has_a_record_of_its_own() {
-        let parent = tempfile::tempdir().unwrap();
-        let asked = parent.path().to_str().unwrap();
-        let cli = Cli::try_parse_from(["holod", "--record-in", asked]).unwrap();
-        let now = SystemTime::UNIX_EPOCH + Duration::from_millis(1_000_000_000_700);
-        let folders = ["2001-09-09T01-46-40Z", "2001-09-09T01-46-40Z-2", "2001-09-09T01-46-40Z-3"];
-        for folder in folders.map(|name| parent.path().join(name)) {
-            let run = cli.run.starting(now);
-            assert_eq!((run.record.as_ref(), run.record_in), (Some(&folder), None));
-            std::fs::create_dir(folder).unwrap();
-        }
-        let named = Cli::try_parse_from(["holod", "--record", "here"]).unwrap().run;
-        assert_eq!(named.starting(now).record, named.record);
-        assert!(Cli::try_parse_from(["holod", "--record", "here", "--record-in", asked]).is_err());
+    fn a_run_records_into_one_folder() {
+        assert!(Cli::try_parse_from(["holod", "--record", "here", "--record-in", "there"]).is_err());
     }
 
     #[test]

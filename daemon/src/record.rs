@@ -135,11 +135,18 @@ pub(crate) const FRAMES: &str = "frames.csv";
 pub(crate) const ORDERS: &str = "orders.jsonl";
 /// The files of a record whose names are always the same.
 const FILES: [&str; 8] = [FRAMES, ORDERS, "summary.json", "samples.csv", "tracker.holodraw", RUN, LOG, ORDER_FILES];
-/// How the names of the levels that were shown begin and end.
-const SHOWN: (&str, &str) = ("shown_pupil_", ".png");
+/// The name in a record of levels that were shown: those of a frame that was made for a pupil.
+pub(crate) fn shown_name(pupil_mm: f32, frame: u64) -> String {
+    format!("shown_pupil_{pupil_mm:.2}mm_frame_{frame:06}.png")
+}
 
+/// Whether a run has given this name, and nobody else.
 fn is_shown_levels(name: &str) -> bool {
-    name.starts_with(SHOWN.0) && name.ends_with(SHOWN.1)
+    let parts = || {
+        let (pupil, frame) = name.strip_prefix("shown_pupil_")?.strip_suffix(".png")?.split_once("mm_frame_")?;
+        Some(shown_name(pupil.parse().ok()?, frame.parse().ok()?))
+    };
+    parts().is_some_and(|given| given == name)
 }
 
 /// The names of the levels that were shown, in a record, in order.
@@ -153,4 +160,24 @@ pub(crate) fn shown_levels(folder: &Path) -> std::io::Result<Vec<String>> {
     }
     names.sort();
     Ok(names)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn levels_are_known_by_the_whole_of_their_name() {
+        for (pupil_mm, frame) in [(2.0, 1), (6.995, 123_456), (1.004, 1_234_567)] {
+            assert!(is_shown_levels(&shown_name(pupil_mm, frame)), "{pupil_mm} {frame}");
+        }
+        let others = [
+            "shown_pupil_overview.png",
+            "shown_pupil_3.00mm_frame_000001 (copy).png",
+            "shown_pupil_3.00mm_frame_1.png",
+            "shown_pupil_3mm_frame_000001.png",
+            "shown_pupil_3.00mm_frame_000001.jpg",
+        ];
+        assert!(others.iter().all(|name| !is_shown_levels(name)));
+    }
 }

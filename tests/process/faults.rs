@@ -174,6 +174,29 @@ fn judge_what_is_left(folder: &Path) {
 }
 
 #[test]
+fn levels_that_the_disk_does_not_take_at_the_end_are_told_in_the_record() {
+    let folder = holod_tests::new_folder();
+    fs::write(folder.path().join("rig.toml"), small_rig(512, 512, "driver = \"simulated\"")).unwrap();
+    let more = ["--resolution", "512x512", "--frames", "2", "--record", "record"];
+    let args = [&ARGS[..4], &ARGS[6..], &more].concat();
+    let words = args.join(" ");
+    // Larger than all that is written while the run goes on, and smaller than its levels.
+    let limited = ["-c", &format!("ulimit -f 300; exec {HOLOD} {words}")];
+    let ended = Daemon::start_with("sh", &limited, folder.path(), &[("XDG_RUNTIME_DIR", folder.path())]).wait(PATIENCE);
+    judge_lost(&ended, "cannot finish it: record/shown_pupil_");
+    let record = folder.path().join("record");
+    let log = fs::read_to_string(record.join("log.txt")).unwrap();
+    assert!(log.contains("the record is lost from here on: cannot finish it"), "{log}");
+    let summary: Value = serde_json::from_slice(&fs::read(record.join("summary.json")).unwrap()).unwrap();
+    assert_eq!(summary["record"]["state"], "lost", "{summary:#}");
+    let parts = fs::read_dir(&record).unwrap().filter(|entry| {
+        let name = entry.as_ref().unwrap().file_name().into_string().unwrap();
+        name.contains("shown_pupil_") || name.ends_with(".part")
+    });
+    assert_eq!(parts.count(), 0, "what is there is whole");
+}
+
+#[test]
 fn a_run_in_folders_whose_names_are_no_text_is_reached_and_its_record_is_whole() {
     let folder = holod_tests::new_folder();
     let bench = folder.path().join(OsStr::from_bytes(b"m\xfcller"));

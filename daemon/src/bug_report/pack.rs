@@ -580,15 +580,16 @@ mod tests {
         let record = folder.path().join("record");
         fs::create_dir(&record).unwrap();
         fs::write(record.join(record::FRAMES), "frame,field\n").unwrap();
-        let links = ["log.txt", "samples.csv", "tracker.holodraw", "orders.jsonl", "shown_pupil_2.0mm.png"];
+        let links =
+            ["log.txt", "samples.csv", "tracker.holodraw", "orders.jsonl", "shown_pupil_2.00mm_frame_000001.png"];
         for name in links {
             std::os::unix::fs::symlink(&secret, record.join(name)).unwrap();
         }
-        fs::create_dir(record.join("shown_pupil_3.0mm.png")).unwrap();
+        fs::create_dir(record.join("shown_pupil_3.00mm_frame_000002.png")).unwrap();
         let contents = Contents::of_record(&record, true, &Scrubber::default()).unwrap();
         let names: Vec<_> = contents.entries.iter().map(|entry| entry.name.as_str()).collect();
         assert_eq!(names, [record::FRAMES]);
-        for name in links.iter().chain(&["shown_pupil_3.0mm.png"]) {
+        for name in links.iter().chain(&["shown_pupil_3.00mm_frame_000002.png"]) {
             assert!(contents.left_out.contains(&format!("{name}: no file, as a run writes one")), "{name}");
         }
     }

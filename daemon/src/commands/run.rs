@@ -17,7 +17,7 @@ use crate::failure::{Exit, Failure};
 use crate::page::Page;
 use crate::pictures::levels_picture;
 use crate::progress;
-use crate::record::{RecordFolder, RecordHealth, Recorder};
+use crate::record::{self, RecordFolder, RecordHealth, Recorder};
 use crate::session::{self, Hangups, SessionPlan, SessionReport, Summary, not_dark};
 use crate::{results, run_text, setup, source};
 
@@ -33,7 +33,6 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     {
         return replay(args, output, &report);
     }
-    let args = &args.starting(SystemTime::now());
     // From the first reading on, another may be asked for.
     let hangups = if args.rig.config.is_some() { Hangups::take_over()? } else { None };
     let rig = rig_of(args)?;
@@ -51,7 +50,11 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let pictures =
         progress::during("loading the scene", || source::named(&args.scene, args.feed_dark_after, &rig.geometry))?;
     let page = Page::open(&args.page)?;
-    let folder = args.record.as_deref().map(|path| RecordFolder::claim(path, args.force)).transpose()?;
+    let folder = match (&args.record, &args.record_in) {
+        (Some(path), _) => Some(RecordFolder::claim(path, args.force)?),
+        (None, Some(parent)) => Some(RecordFolder::claim_new(parent, SystemTime::now())?),
+        (None, None) => None,
+    };
     let recorder = |folder| Recorder::create(folder, args, &rig, pictures.resolution());
     let recorder = folder.map(recorder).transpose()?;
     let mut observers = (recorder.map(|recorder| recorder.with_tracker(tracker.to_string())), page);
@@ -74,14 +77,14 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         output,
         tracker,
         pupil: args.pupil,
-        record_tracker: args.record.as_deref().map(RecordFiles::in_folder),
+        record_tracker: observers.0.as_ref().map(|recorder| RecordFiles::in_folder(recorder.folder())),
         record: observers.0.as_ref().map(Recorder::health),
         frame_limit: args.frames,
         duration: args.duration,
-        keep_levels: args.record.is_some(),
-        hash_levels: args.record.is_some(),
+        keep_levels: observers.0.is_some(),
+        hash_levels: observers.0.is_some(),
     };
-    let mut session = match session::run(plan, &mut observers) {
+    let session = match session::run(plan, &mut observers) {
         Ok(session) => session,
         Err(failure) => {
             if let (Some(recorder), _) = observers {
@@ -93,12 +96,13 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let (Some(mut recorder), _) = observers else { return tell(args, &session.summary, None) };
     let has_record = recorder.finish();
     let health = recorder.health();
-    session.summary.figures.record = (has_record || health.is_lost()).then(|| health.state());
     let session = Arc::new(session);
     if has_record && !health.is_lost() {
         finish_record(&session, recorder.folder(), &health)?;
     }
-    let told = tell(args, &session.summary, None);
+    let mut summary = session.summary.clone();
+    summary.figures.record = (has_record || health.is_lost()).then(|| health.state());
+    let told = tell(args, &summary, None);
     if let (Err(_), Err(lost)) = (&told, health.judge()) {
         tracing::error!("{lost}");
     }
@@ -222,27 +226,34 @@ fn rig_of(args: &RunArgs) -> Result<Rig, Failure> {
     Ok(rig)
 }
 
-/// Writes `summary.json` and the levels that the panel showed into the record, which is lost where they cannot be
+/// Writes the levels that the panel showed and `summary.json` into the record, which is lost where they cannot be
 /// written.
 ///
 /// # Errors
 /// The system gives no thread for it.
-fn finish_record(session: &Arc<SessionReport>, folder: &Path, health: &RecordHealth) -> Result<(), Failure> {
-    let (of_session, into) = (Arc::clone(session), folder.to_owned());
-    let save = move || save(&of_session, &into);
+fn finish_record(session: &Arc<SessionReport>, folder: &Path, health: &Arc<RecordHealth>) -> Result<(), Failure> {
+    let (of_session, into, of_health) = (Arc::clone(session), folder.to_owned(), Arc::clone(health));
+    let save = move || save(&of_session, &into, &of_health);
     let saved = progress::during("finishing the record", || aside::within(SAVING, save));
     match saved.map_err(Failure::because(Exit::Unavailable))? {
-        Some(Ok(())) => {}
-        Some(Err(failure)) => health.give_up(&format!("cannot finish it: {failure}")),
+        Some(()) => {}
         None => health.give_up(&format!("the disk of {} does not take its end within {SAVING:?}", folder.display())),
     }
     Ok(())
 }
 
-fn save(session: &SessionReport, folder: &Path) -> Result<(), Failure> {
-    results::save_json(&session.summary, &folder.join("summary.json"))?;
+/// Saves the levels first: the summary says whether they are there.
+fn save(session: &SessionReport, folder: &Path, health: &RecordHealth) {
+    let cannot = |failure: Failure| health.give_up(&format!("cannot finish it: {failure}"));
+    save_shown(session, folder).unwrap_or_else(cannot);
+    let mut summary = session.summary.clone();
+    summary.figures.record = Some(health.state());
+    results::save_json(&summary, &folder.join("summary.json")).unwrap_or_else(cannot);
+}
+
+fn save_shown(session: &SessionReport, folder: &Path) -> Result<(), Failure> {
     for (pupil, levels) in &session.shown {
-        let name = format!("shown_pupil_{:.2}mm_frame_{:06}.png", pupil.mm(), levels.tag().frame_id);
+        let name = record::shown_name(pupil.mm(), levels.tag().frame_id);
         results::save_png(&levels_picture(levels), &folder.join(name))?;
     }
     Ok(())

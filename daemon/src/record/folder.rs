@@ -5,6 +5,7 @@
 use std::fs::{self, File, TryLockError};
 use std::io;
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
 use super::sources::{self, BENCH};
 use super::{FILES, shown_levels};
@@ -39,10 +40,7 @@ impl RecordFolder {
     /// # Errors
     /// A record is there, another process records there, or the folder cannot be written.
     pub(crate) fn claim(path: &Path, force: bool) -> Result<Self, Failure> {
-        let cannot = |error: io::Error| {
-            let what = format!("cannot record into {}: {error}; name another directory with --record", path.display());
-            Failure::new(Exit::CannotCreate, what)
-        };
+        let cannot = |error: io::Error| refused(path, error, "--record");
         let is_new = !path.exists();
         fs::create_dir_all(path).map_err(cannot)?;
         let lock = File::open(path).map_err(cannot)?;
@@ -67,6 +65,29 @@ impl RecordFolder {
             })?;
         }
         Ok(Self { path: path.to_owned(), is_new, earlier_waits: !earlier.is_empty(), is_kept: false, _lock: lock })
+    }
+
+    /// A folder of its own in `parent` for a run that starts `now`, whose name is the time.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    pub(crate) fn claim_new(parent: &Path, now: SystemTime) -> Result<Self, Failure> {
+        let cannot = |error: io::Error| refused(parent, error, "--record-in");
+        fs::create_dir_all(parent).map_err(cannot)?;
+        let time = humantime::format_rfc3339_seconds(now).to_string().replace(':', "-");
+        let mut path = parent.join(&time);
+        let mut start = 1;
+        // Whoever has made it has it: several may start within one second.
+        while let Err(error) = fs::create_dir(&path) {
+            if error.kind() != io::ErrorKind::AlreadyExists {
+                return Err(cannot(error));
+            }
+            start += 1;
+            path = parent.join(format!("{time}-{start}"));
+        }
+        let mut folder = Self::claim(&path, false)?;
+        folder.is_new = true;
+        Ok(folder)
     }
 
     /// Where it is.
@@ -132,6 +153,11 @@ impl Drop for RecordFolder {
     }
 }
 
+fn refused(path: &Path, error: io::Error, option: &str) -> Failure {
+    let what = format!("cannot record into {}: {error}; name another directory with {option}", path.display());
+    Failure::new(Exit::CannotCreate, what)
+}
+
 /// Moves the record in `folder` out of its place.
 fn set_aside(folder: &Path) -> io::Result<()> {
     let moving = folder.join(MOVING);
@@ -195,6 +221,11 @@ fn remove_files(folder: &Path) -> io::Result<()> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+    use std::sync::Barrier;
+    use std::thread;
+    use std::time::Duration;
+
     use super::*;
 
     /// One of each kind of a record's files, and others.
@@ -239,6 +270,33 @@ mod tests {
         put(folder.path(), &OTHERS, "others");
         RecordFolder::claim(folder.path(), true).unwrap().keep().unwrap();
         assert!(holds_none(folder.path(), &OF_RECORD) && holds(folder.path(), &OTHERS, "others"));
+    }
+
+    #[test]
+    fn each_start_has_a_record_of_its_own_though_they_are_at_one_time() {
+        const STARTS: usize = 8;
+        let root = tempfile::tempdir().unwrap();
+        let parent = root.path().join("all");
+        let now = SystemTime::UNIX_EPOCH + Duration::from_millis(1_000_000_000_700);
+        let barrier = Barrier::new(STARTS);
+        let start = || {
+            barrier.wait();
+            RecordFolder::claim_new(&parent, now).unwrap()
+        };
+        let claimed: Vec<_> = thread::scope(|scope| {
+            let started: Vec<_> = (0..STARTS).map(|_| scope.spawn(start)).collect();
+            started.into_iter().map(|thread| thread.join().unwrap()).collect()
+        });
+        let paths: BTreeSet<_> = claimed.iter().map(|folder| folder.path().to_owned()).collect();
+        let numbered = (2..=STARTS).map(|start| format!("2001-09-09T01-46-40Z-{start}"));
+        let expected = std::iter::once("2001-09-09T01-46-40Z".to_owned()).chain(numbered);
+        assert_eq!(paths, expected.map(|name| parent.join(name)).collect());
+        drop(claimed);
+        assert!(paths.iter().all(|path| !path.exists()), "none made a frame");
+
+        put(root.path(), &["file"], "mine");
+        let failure = RecordFolder::claim_new(&root.path().join("file"), now).unwrap_err();
+        assert!(failure.to_string().contains("name another directory with --record-in"), "{failure}");
     }
 
     #[test]

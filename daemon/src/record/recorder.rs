@@ -10,7 +10,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use holod_calibration::rig::{Rig, WeightsChoice};
-use holod_calibration::{DisplayGeometry, Resolution, TimeNs};
+use holod_calibration::{DisplayGeometry, Resolution, TimeNs, host_now};
 use holod_slm_output::FieldEvent;
 use serde::{Deserialize, Serialize};
 
@@ -183,7 +183,7 @@ impl Recorder {
         sources::keep_bench(folder, args.rig.config.as_deref(), rig)?;
         let facts = RunFacts {
             holod: env!("HOLOD_VERSION").into(),
-            started_unix_ms: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_millis() as u64),
+            started_unix_ms: 0,
             t_origin_ns: 0,
             scene: SceneSource::of(&args.scene, &rig.geometry)?,
             hologram: [resolution.width, resolution.height],
@@ -204,14 +204,13 @@ impl Recorder {
         self
     }
 
-    /// Hands everything to the operating system and ends the log. A disk that does not take it within seconds has lost
-    /// the record. Whether there is one: where no frame was written, an earlier record is put back when this is
-    /// dropped.
+    /// Hands everything to the operating system. A disk that does not take it within seconds has lost the record.
+    /// Whether there is one: where no frame was written, an earlier record is put back when this is dropped, with which
+    /// the log ends, too.
     pub(crate) fn finish(&mut self) -> bool {
         self.written = self.end_writing();
         self.log.flush();
         self.note_log();
-        self.log.end();
         let Some(Writing { folder, .. }) = &mut self.written else { return false };
         if folder.earlier_waits() {
             tracing::warn!("no frame was recorded: the earlier record in {} stays", self.folder.display());
@@ -307,6 +306,12 @@ impl Recorder {
     }
 }
 
+/// What the wall clock showed at host time `t`, as it goes now.
+fn unix_ms_at(t: TimeNs) -> u64 {
+    let unix_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as i64);
+    ((unix_ns - (host_now() - t).0).max(0) / 1_000_000) as u64
+}
+
 fn order_source(order: u32, request: &Request, named: &Named) -> Result<OrderSource, Failure> {
     let (mut scene, mut weights) = (None, None);
     match request {
@@ -372,6 +377,7 @@ fn write_entries(entries: &Queue<Entry>, mut writing: Writing, run: &Path, healt
 impl Observer for Recorder {
     fn began(&mut self, bench: &mut Began) {
         self.facts.t_origin_ns = bench.t_origin.0;
+        self.facts.started_unix_ms = unix_ms_at(bench.t_origin);
         self.facts.engine.clone_from(&bench.engine);
         self.put(Entry::Began(Box::new(self.facts.clone())));
     }
@@ -417,6 +423,7 @@ mod tests {
     use crate::record::{FRAMES, FrameOrders, ORDERS, RecordCondition};
     use crate::source::PictureTag;
     use holod_calibration::PupilDiameter;
+    use holod_slm_output::PanelEncoder;
 
     fn recorder(folder: &Path) -> Recorder {
         recorder_in(RecordFolder::claim(folder, false).unwrap())
@@ -476,6 +483,30 @@ mod tests {
         recorder.finish();
         assert!(!recorder.health.is_lost());
         assert_eq!(fs::read_to_string(folder.path().join("record").join(ORDERS)).unwrap().lines().count(), 1);
+    }
+
+    #[test]
+    fn the_two_times_at_which_a_run_began_are_one_moment() {
+        const HOUR: TimeNs = TimeNs(3_600_000_000_000);
+        let folder = tempfile::tempdir().unwrap();
+        let mut recorder = recorder(folder.path());
+        let rig = Rig::default();
+        let encoder = PanelEncoder::new(&rig.panel, rig.resolution(), Resolution { width: 64, height: 64 });
+        let mut began = Began {
+            t_origin: host_now() - HOUR,
+            encoder: Arc::new(encoder.unwrap()),
+            rig,
+            engine: String::new(),
+            look: None,
+        };
+        recorder.began(&mut began);
+        recorder.frame(&frame(1)).unwrap();
+        assert!(recorder.finish());
+        let run: RunFacts = serde_json::from_slice(&fs::read(folder.path().join(RUN)).unwrap()).unwrap();
+        assert_eq!(run.t_origin_ns, began.t_origin.0);
+        let since = SystemTime::now().duration_since(UNIX_EPOCH + Duration::from_millis(run.started_unix_ms)).unwrap();
+        let off_s = since.as_secs_f64() - (host_now() - began.t_origin).seconds();
+        assert!(off_s.abs() < 60.0, "{off_s}");
     }
 
     #[test]

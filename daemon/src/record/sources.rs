@@ -198,7 +198,15 @@ fn name_pictures(
 
 /// Whether a record keeps a file of the bench, its rig or what the rig names, under this name.
 pub(crate) fn is_of_bench(name: &str) -> bool {
-    is_weights(name) || [RIG, LASERS].contains(&name) || TABLES.iter().any(|table| name.starts_with(table))
+    is_weights(name) || [RIG, LASERS].contains(&name) || is_table(name)
+}
+
+/// Whether a record calls a table so: what it is, its colour and its file's ending.
+fn is_table(name: &str) -> bool {
+    let ending = extension(Path::new(name));
+    let stem = name.strip_suffix(&ending).unwrap_or(name);
+    let colour = TABLES.iter().find_map(|table| stem.strip_prefix(table));
+    colour.is_some_and(|named| Colour::ALL.iter().any(|colour| colour.name() == named))
 }
 
 /// Whether a file of the bench with this name holds its weights.
@@ -397,7 +405,10 @@ mod tests {
         let failure = keep_bench(&folder.path().join("third"), None, &rig).unwrap_err();
         assert_eq!(failure.exit, Exit::CannotCreate, "{failure}");
 
-        fs::write(record.join(BENCH).join("notes.txt"), "mine").unwrap();
+        // What somebody else has put there, under names that a run does not give.
+        for name in ["notes.txt", "lut-notes.csv", "lut-green-old.csv", "flatness-measured-2026.png", "lut-green."] {
+            fs::write(record.join(BENCH).join(name), "mine").unwrap();
+        }
         assert_eq!(names_of_bench(&record).unwrap(), ["lut-green", RIG, WEIGHTS]);
         assert!(names_of_bench(&folder.path().join("absent")).unwrap().is_empty());
     }
