@@ -6,7 +6,12 @@ use crate::spread::Spread;
 
 /// Median and tail in words.
 pub(crate) fn spread_text(spread: Option<Spread>) -> String {
-    spread.map_or("not measured".to_owned(), |s| format!("median {:.1} ms, p99 {:.1} ms", s.median_ms, s.p99_ms))
+    let Some(Spread { median_ms, p99_ms, max_ms, values }) = spread else { return "not measured".to_owned() };
+    let newest = match values > Spread::NEWEST as u64 {
+        true => format!(" of the newest {}, longest ever {max_ms:.1} ms", Spread::NEWEST),
+        false => String::new(),
+    };
+    format!("median {median_ms:.1} ms, p99 {p99_ms:.1} ms{newest}")
 }
 
 /// What became of a feed's pictures.
@@ -83,4 +88,17 @@ pub(crate) fn summary_text(summary: &Summary) -> String {
         summary.lasers_not_dark.as_ref().map_or("true".to_owned(), |why| format!("false ({why})")),
         summary.flat_at_end,
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_told_of_the_newest_values_alone_says_so() {
+        let text = |values| spread_text(Some(Spread { median_ms: 0.5, p99_ms: 3.25, max_ms: 75.5, values }));
+        assert_eq!(text(16_384), "median 0.5 ms, p99 3.2 ms");
+        assert_eq!(text(16_385), "median 0.5 ms, p99 3.2 ms of the newest 16384, longest ever 75.5 ms");
+        assert_eq!(spread_text(None), "not measured");
+    }
 }

@@ -12,6 +12,8 @@ use serde::Serialize;
 const WAITING_FIELDS: usize = 600;
 /// Findings that are kept word for word.
 const KEPT_FINDINGS: usize = 20;
+/// Times of going dark that are kept: the first ones, and as many of the newest.
+const KEPT_DARK: usize = 10;
 
 /// What the lasers did in the whole run.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -31,7 +33,9 @@ pub struct LaserSummary {
     pub findings_in_all: usize,
     /// The first findings in words.
     pub findings: Vec<String>,
-    /// Times and reasons of going dark, newest last.
+    /// How often the box went dark.
+    pub went_dark_in_all: usize,
+    /// Times and reasons of going dark, newest last: the first ten and the newest ten.
     pub went_dark: Vec<String>,
 }
 
@@ -63,8 +67,9 @@ impl LaserLedger {
             BoxEvent::Edge(edge) => self.edges.push_back(*edge),
             BoxEvent::Armed { .. } => {}
             BoxEvent::Dark { t, reason } => {
-                if self.summary.went_dark.len() == KEPT_FINDINGS {
-                    self.summary.went_dark.remove(0);
+                self.summary.went_dark_in_all += 1;
+                if self.summary.went_dark.len() == 2 * KEPT_DARK {
+                    self.summary.went_dark.remove(KEPT_DARK);
                 }
                 self.summary.went_dark.push(format!("{} at {} ns", reason.name(), t.0));
             }
@@ -166,6 +171,17 @@ mod tests {
         let summary = ledger.finish();
         assert_eq!((summary.fields, summary.lit, summary.dark, summary.not_told), (3, 0, 3, 27));
         assert_eq!(summary.findings, Vec::<String>::new());
+    }
+
+    #[test]
+    fn of_many_times_of_going_dark_the_first_and_the_newest_are_kept_and_all_are_counted() {
+        let mut ledger = LaserLedger::default();
+        for t in 0..61 {
+            ledger.box_event(&BoxEvent::Dark { t: TimeNs(t), reason: DarkReason::Stall });
+        }
+        let summary = ledger.finish();
+        let kept: Vec<_> = (0..10).chain(51..61).map(|t| format!("stall at {t} ns")).collect();
+        assert_eq!((summary.went_dark_in_all, summary.went_dark), (61, kept));
     }
 
     #[test]

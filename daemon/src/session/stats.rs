@@ -4,24 +4,26 @@ use holod_calibration::{Sorted, TimeNs};
 
 use crate::spread::Spread;
 
-const WINDOW: usize = 1 << 14;
-
-/// The newest values of a quantity.
+/// The newest values of a quantity, and the largest ever.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Recent {
     values: Vec<f32>,
     next: usize,
+    max_ms: f32,
+    count: u64,
 }
 
 impl Recent {
-    /// Takes note of a value; the oldest is forgotten after 16384.
+    /// Takes note of a value; the oldest is forgotten after [`Spread::NEWEST`].
     pub(super) fn push(&mut self, value_ms: f32) {
-        if self.values.len() < WINDOW {
+        self.max_ms = if self.count == 0 { value_ms } else { self.max_ms.max(value_ms) };
+        self.count += 1;
+        if self.values.len() < Spread::NEWEST {
             self.values.push(value_ms);
         } else {
             self.values[self.next] = value_ms;
         }
-        self.next = (self.next + 1) % WINDOW;
+        self.next = (self.next + 1) % Spread::NEWEST;
     }
 
     /// The same, where there is one.
@@ -34,8 +36,8 @@ impl Recent {
     /// Nothing where there are no values.
     pub(super) fn spread(&self) -> Option<Spread> {
         let sorted = Sorted::new(self.values.iter().copied().map(f64::from))?;
-        let [median_ms, p99_ms, max_ms] = [0.5, 0.99, 1.0].map(|share| sorted.quantile(share) as f32);
-        Some(Spread { median_ms, p99_ms, max_ms })
+        let [median_ms, p99_ms] = [0.5, 0.99].map(|share| sorted.quantile(share) as f32);
+        Some(Spread { median_ms, p99_ms, max_ms: self.max_ms, values: self.count })
     }
 }
 
@@ -64,7 +66,7 @@ mod tests {
         for value in (0..=100).rev() {
             recent.push(value as f32);
         }
-        assert_eq!(recent.spread(), Some(Spread { median_ms: 50.0, p99_ms: 99.0, max_ms: 100.0 }));
+        assert_eq!(recent.spread(), Some(Spread { median_ms: 50.0, p99_ms: 99.0, max_ms: 100.0, values: 101 }));
     }
 
     #[test]
@@ -75,13 +77,16 @@ mod tests {
     }
 
     #[test]
-    fn old_values_are_forgotten() {
+    fn old_values_are_forgotten_but_for_the_largest() {
         let mut recent = Recent::default();
-        recent.push(1e9);
-        for _ in 0..WINDOW {
+        for _ in 0..Spread::NEWEST {
+            recent.push(1e9);
+        }
+        for _ in 0..Spread::NEWEST {
             recent.push(1.0);
         }
-        assert_eq!(recent.spread().unwrap().max_ms, 1.0);
-        assert_eq!(recent.values.len(), WINDOW);
+        let values = 2 * Spread::NEWEST as u64;
+        assert_eq!(recent.spread(), Some(Spread { median_ms: 1.0, p99_ms: 1.0, max_ms: 1e9, values }));
+        assert_eq!(recent.values.len(), Spread::NEWEST);
     }
 }
