@@ -16,7 +16,7 @@ use twox_hash::XxHash3_64;
 
 use crate::source::PictureTag;
 
-pub(crate) use self::folder::RecordFolder;
+pub(crate) use self::folder::{EARLIER, RecordFolder};
 pub(crate) use self::frame_log::FrameLog;
 pub(crate) use self::health::{RecordCondition, RecordHealth, RecordState};
 pub(crate) use self::recorder::{LOG, ORDER_FILES, OrderSource, RUN, Recorder, RunFacts};

@@ -66,7 +66,7 @@ pub use import::{
     Blink, BlinkCounts, EyeInfo, FaultCount, LogFault, LogFaults, LogFormat, LogInfo, Range, Recording, ReplayError,
 };
 pub use profile::{Command, DEFAULT_PROFILE, HidSettings, NetworkSettings, Profile, ProfileError, SerialSettings};
-pub use record::{RecordError, RecordFiles, RecordStatus, with_header};
+pub use record::{RecordError, RecordFiles, RecordStatus, payloads, with_header};
 pub use refusals::{Refusal, RefusalChange, RefusalWatch};
 pub use sample::{PupilSample, SampleEye};
 pub use simulate::{MOCK_SEED, MockSample, MockSource, Scenario, Script, ScriptError};

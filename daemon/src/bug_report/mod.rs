@@ -17,6 +17,7 @@ mod recorded;
 mod scrub;
 mod unpack;
 
+use std::io;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
@@ -34,6 +35,16 @@ const FOLDER: &str = "holod-report";
 const MANIFEST: &str = "report.json";
 /// The folder of the scene with which the run began; that of an order is [`order_folder`].
 const SCENE_FOLDER: &str = "scene";
+
+/// Text that is read as a whole to be scrubbed; more of a log is cut off.
+const LARGEST_TEXT: u64 = 256 << 20;
+
+/// Which side of a copy failed.
+#[derive(Debug)]
+enum Copy {
+    Read(io::Error),
+    Write(io::Error),
+}
 
 /// The folder of what an order brought.
 fn order_folder(order: u32) -> String {

@@ -8,22 +8,19 @@ use std::time::{Duration, UNIX_EPOCH};
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use holod_calibration::rig::{LaserDriver, Provenance, Rig};
-use holod_pupil_input::{RecordFiles, with_header};
+use holod_pupil_input::{RecordFiles, payloads, with_header};
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 use tar::{Builder, EntryType, Header};
 use toml_edit::DocumentMut;
 
-use super::{FOLDER, MANIFEST, Manifest, Packed, SCENE_FOLDER, Scrubber, order_folder, unix_ms};
+use super::{Copy, FOLDER, LARGEST_TEXT, MANIFEST, Manifest, Packed, SCENE_FOLDER, Scrubber, order_folder, unix_ms};
 use crate::failure::{Exit, Failure};
 use crate::record::{
-    self, BENCH, Hashed, LOG, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SCENE, SceneSource, SourceFile,
-    content_xxh3, is_of_bench, is_weights,
+    self, BENCH, EARLIER, Hashed, LOG, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SCENE, SceneSource,
+    SourceFile, content_xxh3, is_of_bench, is_weights,
 };
 use crate::snapshot::Snapshot;
-
-/// Text that is read as a whole to be scrubbed; more of a log is cut off.
-const LARGEST_TEXT: u64 = 256 << 20;
 
 /// What a report will hold.
 #[derive(Debug, Default)]
@@ -93,11 +90,20 @@ impl Contents {
             Some(Ok(run)) => {
                 contents.started_unix_ms = Some(run.started_unix_ms);
                 contents.add_lines(RUN, facts.as_deref().unwrap_or_default(), scrubber);
-                contents.add_bench(folder, scrubber)?;
                 contents.add_scene(SCENE_FOLDER, &run.scene, with_scene, scrubber);
             }
             Some(Err(error)) => contents.left_out.push(format!("{RUN}, which is damaged: {error}; {NO_FRAMES}")),
-            None => contents.left_out.push(format!("{RUN}: an earlier holod, which wrote none, made it; {NO_FRAMES}")),
+            None => contents.left_out.push(format!(
+                "{RUN}: the run broke off before its first frame, or an earlier holod, which wrote none, made it; \
+                 {NO_FRAMES}"
+            )),
+        }
+        contents.add_bench(folder, scrubber)?;
+        if folder.join(EARLIER).exists() {
+            contents.left_out.push(format!(
+                "{EARLIER}/: an earlier record, whose place this one has not taken; the next run that records there puts \
+                 it back"
+            ));
         }
         contents.add_recorded(record::FRAMES, &folder.join(record::FRAMES));
         if let Some(path) = &samples.samples {
@@ -292,7 +298,7 @@ impl Contents {
         }
         let recording = fs::read(path).map_err(cannot)?;
         match with_header(&recording, |header| scrubber.text(header)) {
-            Some((changed, records)) if !scrubber.finds(&changed[records..]) => {
+            Some(changed) if !payloads(&recording).is_some_and(|brought| scrubber.finds(&brought)) => {
                 self.entries.push(Entry { name: name.into(), content: Content::Bytes(changed) });
             }
             Some(_) => self.left_out.push(format!(
@@ -332,8 +338,10 @@ impl Contents {
                     append(&mut archive, &name, t_s, bytes.len() as u64, &bytes[..]).map_err(cannot)?;
                     Packed::of(&name, &bytes)
                 }
-                Content::File(path) => add_file(&mut archive, &name, t_s, &path)
-                    .map_err(|error| Failure::new(Exit::NoInput, format!("{}: {error}", path.display())))?,
+                Content::File(path) => add_file(&mut archive, &name, t_s, &path).map_err(|fault| match fault {
+                    Copy::Read(error) => Failure::new(Exit::NoInput, format!("{}: {error}", path.display())),
+                    Copy::Write(error) => cannot(error),
+                })?,
             };
             manifest.files.push(packed);
         }
@@ -385,16 +393,29 @@ fn scene_values(text: &str) -> Option<Vec<(String, String)>> {
     Some(document.iter().map(|(key, item)| (key.to_owned(), plain(item))).collect())
 }
 
+/// A reader that tells whether it was it that failed.
+struct Source<R> {
+    reader: R,
+    has_failed: bool,
+}
+
+impl<R: Read> Read for Source<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        self.reader.read(buffer).inspect_err(|error| self.has_failed |= error.kind() != io::ErrorKind::Interrupted)
+    }
+}
+
 /// Adds a file as long as it is now, whoever goes on writing it.
-fn add_file(archive: &mut Builder<GzEncoder<File>>, name: &str, t_s: u64, path: &Path) -> io::Result<Packed> {
-    let file = File::open(path)?;
-    let bytes = file.metadata()?.len();
-    let mut content = Hashed::new(file.take(bytes));
-    append(archive, name, t_s, bytes, &mut content)?;
-    let (found, xxh3) = content.finish();
+fn add_file(archive: &mut Builder<GzEncoder<File>>, name: &str, t_s: u64, path: &Path) -> Result<Packed, Copy> {
+    let file = File::open(path).map_err(Copy::Read)?;
+    let bytes = file.metadata().map_err(Copy::Read)?.len();
+    let mut content = Source { reader: Hashed::new(file.take(bytes)), has_failed: false };
+    let added = append(archive, name, t_s, bytes, &mut content);
+    added.map_err(if content.has_failed { Copy::Read } else { Copy::Write })?;
+    let (found, xxh3) = content.reader.finish();
     if found < bytes {
         let what = format!("it had {bytes} bytes and ended after {found}: something shortens it; pack again");
-        return Err(io::Error::other(what));
+        return Err(Copy::Read(io::Error::other(what)));
     }
     Ok(Packed { name: name.to_owned(), bytes, xxh3 })
 }
@@ -453,6 +474,8 @@ impl Manifest {
 
 #[cfg(test)]
 mod tests {
+    use flate2::Crc;
+
     use super::*;
 
     #[test]
@@ -474,6 +497,7 @@ mod tests {
         let names: Vec<_> = contents.entries.iter().map(|entry| entry.name.as_str()).collect();
         assert_eq!(names, ["frames.csv", "log.txt"]);
         assert!(contents.left_out[0].contains("an earlier holod"), "{:?}", contents.left_out);
+        assert!(contents.left_out[1].contains("bench/: it is not in the record"), "{:?}", contents.left_out);
 
         let path = folder.path().join("report.tar.gz");
         let manifest = contents.write(&path, &scrubber).unwrap();
@@ -603,11 +627,80 @@ mod tests {
             let file = File::create(folder.path().join(name)).unwrap();
             Builder::new(GzEncoder::new(file, Compression::fast()))
         };
-        let packed = add_file(&mut archive("a"), "x", 0, &path).unwrap();
-        assert_eq!(packed, Packed::of("x", b"12345"));
+        let packed = add_file(&mut archive("a"), "x", 0, &path);
+        assert!(packed.is_ok_and(|packed| packed == Packed::of("x", b"12345")));
         // Such files say that they have a page and bring fewer bytes.
         let error = add_file(&mut archive("b"), "x", 0, Path::new("/sys/kernel/mm/transparent_hugepage/enabled"));
-        assert!(error.unwrap_err().to_string().contains("something shortens it"));
+        assert!(matches!(error, Err(Copy::Read(error)) if error.to_string().contains("something shortens it")));
+    }
+
+    #[test]
+    fn a_disk_that_takes_no_report_is_told_from_a_file_that_cannot_be_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let failure = |from: &Path, to: &Path| {
+            let mut contents = Contents::default();
+            contents.add_file("x", from);
+            contents.write(to, &Scrubber::default()).unwrap_err()
+        };
+        let path = folder.path().join("x");
+        fs::write(&path, "12345").unwrap();
+        let full = failure(&path, Path::new("/dev/full"));
+        assert!(full.to_string().starts_with("cannot write the report: No space left"), "{full}");
+        assert_eq!(full.exit, Exit::CannotCreate);
+        // A folder opens, and cannot be read.
+        let unread = failure(folder.path(), &folder.path().join("report"));
+        assert!(unread.to_string().starts_with(&format!("{}: ", folder.path().display())), "{unread}");
+        assert_eq!(unread.exit, Exit::NoInput);
+    }
+
+    #[test]
+    fn a_run_that_broke_off_at_its_start_is_packed_with_its_bench() {
+        let folder = tempfile::tempdir().unwrap();
+        for path in [BENCH, EARLIER] {
+            fs::create_dir(folder.path().join(path)).unwrap();
+        }
+        fs::write(folder.path().join(record::FRAMES), "").unwrap();
+        fs::write(folder.path().join(BENCH).join(RIG), Rig::BUILT_IN_TOML).unwrap();
+        for run in [None, Some("{\"holod\":")] {
+            if let Some(half) = run {
+                fs::write(folder.path().join(RUN), half).unwrap();
+            }
+            let contents = Contents::of_record(folder.path(), true, &Scrubber::default()).unwrap();
+            assert_eq!(packed_text(&contents, "bench/rig.toml"), Rig::BUILT_IN_TOML);
+            assert_eq!(contents.left_out[0].contains("broke off before its first frame"), run.is_none());
+            assert!(contents.left_out[1].contains(".holod-earlier/: an earlier record"), "{:?}", contents.left_out);
+        }
+    }
+
+    /// A recording of a stream, which was read in these pieces.
+    fn recording(reads: &[&str]) -> Vec<u8> {
+        let framed = |mut bytes: Vec<u8>| {
+            let mut crc = Crc::new();
+            crc.update(&bytes);
+            bytes.extend(crc.sum().to_le_bytes());
+            bytes
+        };
+        let header =
+            "spec = \"tcp:x:1\"\nprofile = \"holod\"\ndatagrams = false\nt_started_ns = 0\nstarted_unix_ns = 0\n";
+        let lengths = [1_u32, header.len() as u32].map(u32::to_le_bytes).concat();
+        let mut file = framed([b"HOLOD\x1a\r\n", &lengths[..], header.as_bytes()].concat());
+        for read in reads {
+            let head = [&(read.len() as u32).to_le_bytes()[..], &[2], &7_i64.to_le_bytes(), &1_u32.to_le_bytes()];
+            file.extend(framed([&head.concat()[..], read.as_bytes()].concat()));
+        }
+        file
+    }
+
+    #[test]
+    fn a_name_that_two_reads_tore_apart_keeps_the_trackers_bytes_out() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tracker.holodraw");
+        for (reads, is_packed) in [(["subject: an", "na\n"], false), (["subject: an", "other\n"], true)] {
+            fs::write(&path, recording(&reads)).unwrap();
+            let mut contents = Contents::default();
+            contents.add_tracker_bytes(&path, &anna()).unwrap();
+            assert_eq!(contents.entries.len(), usize::from(is_packed), "{reads:?}: {:?}", contents.left_out);
+        }
     }
 
     #[test]

@@ -26,8 +26,11 @@ const SHORTEST_NAME: usize = 3;
 /// How much is searched at once, and how much more where the next begins: longer than any name.
 const WINDOW_BYTES: usize = 1 << 20;
 const OVERLAP_BYTES: usize = 1 << 12;
-/// The first number of people's accounts, and the last one.
-const PEOPLE: std::ops::RangeInclusive<u32> = 1000..=60_000;
+/// The first number of people's accounts, on older systems; and that of nobody, which lies among them.
+const FIRST_PERSON: u32 = 500;
+const NOBODY: u32 = 65_534;
+/// The programs with which nobody logs in.
+const NO_SHELLS: [&str; 2] = ["nologin", "false"];
 
 /// What must not be said.
 #[derive(Clone, Debug, Default)]
@@ -66,7 +69,7 @@ impl Scrubber {
         let is_somebodys = |name: &str| name.len() >= SHORTEST_NAME && !NOBODYS.contains(&name);
         let mut names: Vec<(String, &str)> = Vec::new();
         for (known, place) in [(hosts, "HOST"), (users, "USER")] {
-            let known = known.into_iter().map(|name| name.to_ascii_lowercase());
+            let known = known.into_iter().map(|name| lower(&name));
             names.extend(known.filter(|name| is_somebodys(name)).map(|name| (name, place)));
         }
         // A machine's whole name goes before its first part.
@@ -87,7 +90,7 @@ impl Scrubber {
     pub fn paths(&self, text: &str) -> String {
         let mut text = text.to_owned();
         for home in &self.homes {
-            text = replaced(&text, &home.to_ascii_lowercase(), "~", is_name_byte);
+            text = replaced(&text, &lower(home), "~", is_name_byte);
         }
         for homes in HOMES {
             text = without_names_in(&text, homes);
@@ -111,8 +114,9 @@ impl Scrubber {
 /// account, and the person's own.
 fn person(line: &str) -> Vec<(String, String)> {
     let fields: Vec<&str> = line.split(':').collect();
-    let [name, _, uid, _, about, home, ..] = fields[..] else { return Vec::new() };
-    if !uid.parse::<u32>().is_ok_and(|uid| uid == 0 || PEOPLE.contains(&uid)) {
+    let [name, _, uid, _, about, home, shell] = fields[..] else { return Vec::new() };
+    let logs_in = !Path::new(shell).file_name().is_some_and(|program| NO_SHELLS.iter().any(|shell| program == *shell));
+    if !uid.parse::<u32>().is_ok_and(|uid| uid == 0 || (uid >= FIRST_PERSON && uid != NOBODY && logs_in)) {
         return Vec::new();
     }
     // What follows a comma is a room or a telephone.
@@ -129,12 +133,21 @@ const fn is_name_byte(byte: u8) -> bool {
     is_word_byte(byte) || matches!(byte, b'-' | b'.' | b'@')
 }
 
-/// Each occurrence of `lower`, which is in lower case, in any case and with nothing of a name around it.
-fn replaced(text: &str, lower: &str, place: &str, goes_on: fn(u8) -> bool) -> String {
-    let (folded, bytes) = (text.to_ascii_lowercase(), text.as_bytes());
+/// Text in lower case, where a letter is as long in it: all places stay the same.
+fn lower(text: &str) -> String {
+    let lower = |letter: char| {
+        let mut letters = letter.to_lowercase();
+        letters.next().filter(|lower| letters.len() == 0 && lower.len_utf8() == letter.len_utf8()).unwrap_or(letter)
+    };
+    text.chars().map(lower).collect()
+}
+
+/// Each occurrence of `name`, which is in lower case, in any case and with nothing of a name around it.
+fn replaced(text: &str, name: &str, place: &str, goes_on: fn(u8) -> bool) -> String {
+    let (folded, bytes) = (lower(text), text.as_bytes());
     let mut out = String::with_capacity(text.len());
     let mut done = 0;
-    for (at, found) in folded.match_indices(lower) {
+    for (at, found) in folded.match_indices(name) {
         let end = at + found.len();
         let is_whole = (at == 0 || !goes_on(bytes[at - 1])) && bytes.get(end).is_none_or(|&byte| !goes_on(byte));
         if at >= done && is_whole {
@@ -181,6 +194,7 @@ mod tests {
                 user("", "/srv/people/anna"),
                 user("al", "/"),
                 user("Anna Huber", ""),
+                user("Jörg Müller", "/data/müller"),
             ],
             ["Optics7.lab.example".to_owned(), String::new()],
         )
@@ -201,6 +215,8 @@ mod tests {
             ("/media/anna/disk", "/media/USER/disk"),
             ("/mnt/home/berta/x of Anna Huber", "/mnt/home/USER/x of USER"),
             ("/home/ alone", "/home/ alone"),
+            ("JÖRG MÜLLER, jörg müller in /data/MÜLLER/x", "USER, USER in ~/x"),
+            ("İstanbul, ẞ and K of ANNA", "İstanbul, ẞ and K of USER"),
             ("nothing to hide: 0.125,üß", "nothing to hide: 0.125,üß"),
         ] {
             assert_eq!(scrubber().text(text), expected, "{text}");
@@ -235,8 +251,23 @@ mod tests {
         let names = |line: &str| person(line).into_iter().map(|(name, _)| name).collect::<Vec<_>>();
         assert_eq!(names("anna:x:1000:1000:Anna Huber,7,,:/home/anna:/bin/sh"), ["anna", "Anna Huber"]);
         assert_eq!(person("anna:x:1000:1000::/home/anna:/bin/sh")[0].1, "/home/anna");
-        assert!(person("daemon:x:1:1:daemon:/usr/sbin:/usr/sbin/nologin").is_empty());
-        assert!(person("nonsense").is_empty());
+        assert_eq!(names("bertav:x:210045:210045:Berta Vogel:/data/bertav:/bin/bash"), ["bertav", "Berta Vogel"]);
+        assert_eq!(names("claraw:x:501:100:Clara Wolf:/srv/clara:"), ["claraw", "Clara Wolf"]);
+        assert_eq!(person("root:x:0:0:root:/root:/usr/sbin/nologin")[0].1, "/root");
+        for system in [
+            "daemon:x:1:1:daemon:/usr/sbin:/usr/sbin/nologin",
+            "sync:x:4:65534:sync:/bin:/bin/sync",
+            "_apt:x:42:65534::/nonexistent:/usr/sbin/nologin",
+            "nobody:x:65534:65534:nobody:/nonexistent:/bin/sh",
+            "messagebus:x:100:107::/nonexistent:/usr/sbin/nologin",
+            "Debian-gdm:x:107:115:Gnome Display Manager:/var/lib/gdm3:/bin/false",
+            "postgres:x:110:118:PostgreSQL administrator,,,:/var/lib/postgresql:/bin/bash",
+            "systemd-network:x:998:998:systemd Network Management:/:/usr/sbin/nologin",
+            "libvirt-qemu:x:64055:64055:Libvirt Qemu:/var/lib/libvirt:/usr/sbin/nologin",
+            "nonsense",
+        ] {
+            assert!(person(system).is_empty(), "{system}");
+        }
         Scrubber::of_this_machine();
     }
 }

@@ -8,7 +8,7 @@ use std::path::{Component, Path, PathBuf};
 use flate2::read::GzDecoder;
 use tar::{Archive, EntryType};
 
-use super::{FOLDER, MANIFEST, Manifest, Packed};
+use super::{Copy, FOLDER, MANIFEST, Manifest, Packed};
 use crate::failure::{Exit, Failure};
 use crate::record::content_xxh3;
 use crate::staging::Temporary;
@@ -21,8 +21,8 @@ const USTAR: std::ops::Range<usize> = 257..262;
 const LARGEST: u64 = 64 << 30;
 const MOST_ENTRIES: usize = 1 << 20;
 const DEEPEST: usize = 4;
-/// Longest list, and longest text of orders.
-const LARGEST_TEXT: u64 = 64 << 20;
+/// Longest list, and longest text: what stands for names in it may have made it longer than it was.
+const LARGEST_TEXT: u64 = 2 * super::LARGEST_TEXT;
 /// What a program may say of a file before it; nothing of it is used.
 const LARGEST_REMARK: u64 = 1 << 16;
 
@@ -204,12 +204,6 @@ fn take_apart(path: &Path, folder: &Path) -> Result<(), Fault> {
     Ok(())
 }
 
-/// Which side of a copy failed.
-enum Copy {
-    Read(io::Error),
-    Write(io::Error),
-}
-
 fn copy(from: &mut impl Read, to: &mut impl Write) -> Result<u64, Copy> {
     let mut buffer = vec![0; 1 << 18];
     let mut copied = 0;
@@ -371,5 +365,16 @@ mod tests {
         assert!(!at.exists(), "the folder goes with it");
         write(b"12346");
         assert!(refusal(&path).contains("frames.csv is another one than was packed"));
+    }
+
+    #[test]
+    fn text_as_long_as_any_that_is_packed_is_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("orders.jsonl");
+        let file = File::create(&path).unwrap();
+        file.set_len(super::super::LARGEST_TEXT).unwrap();
+        assert_eq!(read_text(&path).unwrap().map(|text| text.len() as u64), Some(super::super::LARGEST_TEXT));
+        file.set_len(LARGEST_TEXT + 1).unwrap();
+        assert!(read_text(&path).is_err());
     }
 }

@@ -15,7 +15,7 @@ use crate::failure::{Exit, Failure};
 /// Part of an earlier record, on its way from its place or back to it.
 const MOVING: &str = ".holod-earlier-moving";
 /// An earlier record, whole.
-const EARLIER: &str = ".holod-earlier";
+pub(crate) const EARLIER: &str = ".holod-earlier";
 /// An earlier record whose place another one has taken.
 const REPLACED: &str = ".holod-earlier-replaced";
 

@@ -175,18 +175,38 @@ fn framed(text: &str) -> Vec<u8> {
     bytes
 }
 
-/// A recording whose header, TOML, reads as `change` makes it, with the place at which its records begin; these stay as
-/// they are. Nothing where `recording` begins with no header, or none would be left of it.
-pub fn with_header(recording: &[u8], change: impl FnOnce(&str) -> String) -> Option<(Vec<u8>, usize)> {
+/// A recording whose header, TOML, reads as `change` makes it; its records stay as they are. Nothing where `recording`
+/// begins with no header, or none would be left of it.
+pub fn with_header(recording: &[u8], change: impl FnOnce(&str) -> String) -> Option<Vec<u8>> {
     let before = RawReader::new(recording).ok()?;
     let records = before.input;
     let text = str::from_utf8(&recording[16..recording.len() - records.len() - 4]).ok()?;
     let text = change(text);
     Header::parse(&text)?;
     let mut changed = framed(&text);
-    let begin = changed.len();
     changed.extend(records);
-    Some((changed, begin))
+    Some(changed)
+}
+
+/// What the link of a recording brought, put together however it was read, with a line's end where a message ended or the
+/// stream broke off; behind it what is in the file and no whole record. Nothing where `recording` begins with no header.
+pub fn payloads(recording: &[u8]) -> Option<Vec<u8>> {
+    let mut reader = RawReader::new(recording).ok()?;
+    let datagrams = reader.header.datagrams;
+    let mut brought = Vec::with_capacity(recording.len());
+    while let Ok(Some((head, payload))) = reader.next() {
+        brought.extend(payload);
+        if datagrams || head.kind != Kind::Bytes {
+            brought.push(b'\n');
+        }
+    }
+    let behind = match reader.ending {
+        Some(Ending::Torn { unread_bytes }) => &recording[recording.len() - unread_bytes as usize..],
+        _ => reader.input,
+    };
+    brought.push(b'\n');
+    brought.extend(behind);
+    Some(brought)
 }
 
 fn bytes_of_hex(text: &str) -> Option<Vec<u8>> {
@@ -355,13 +375,35 @@ mod tests {
     fn a_header_is_changed_and_the_records_stay() {
         let records = vec![(RecordHead { kind: Kind::Bytes, t: TimeNs(3), connection: 1 }, b"odd".to_vec())];
         let (bytes, _) = file(&records);
-        let (changed, begin) = with_header(&bytes, |text| text.replace("odd", "even")).expect("a header");
-        assert!(bytes.ends_with(&changed[begin..]));
+        let changed = with_header(&bytes, |text| text.replace("odd", "even")).expect("a header");
         let mut reader = RawReader::new(&changed[..]).expect("a header");
         assert_eq!(reader.header().spec, "serial:/dev/\"even\"\nname");
         assert_eq!(reader.next().expect("memory reads").map(|(_, payload)| payload.to_vec()), Some(b"odd".to_vec()));
         assert!(with_header(&bytes, |_| "spec = 3".into()).is_none(), "no header is left");
         assert!(with_header(&bytes[..40], str::to_owned).is_none(), "it is torn");
+    }
+
+    #[test]
+    fn what_a_link_brought_is_put_together_and_what_is_torn_stands_behind() {
+        let record = |kind, payload: &[u8]| (RecordHead { kind, t: TimeNs(3), connection: 1 }, payload.to_vec());
+        let records = [
+            record(Kind::Connected, b""),
+            record(Kind::Bytes, b"an"),
+            record(Kind::Bytes, b"na"),
+            record(Kind::Disconnected, b""),
+            record(Kind::Bytes, b"x"),
+        ];
+        let file = |datagrams| {
+            let mut bytes = Header { datagrams, ..header() }.encode();
+            records.iter().for_each(|(head, payload)| encode_record(head, payload, &mut bytes));
+            bytes
+        };
+        let brought = |bytes: &[u8]| payloads(bytes).map(|brought| String::from_utf8_lossy(&brought).into_owned());
+        assert_eq!(brought(&file(false)).as_deref(), Some("\nanna\nx\n"));
+        assert_eq!(brought(&file(true)).as_deref(), Some("\nan\nna\n\nx\n\n"));
+        assert_eq!(brought(&[&file(false)[..], b"torn"].concat()).as_deref(), Some("\nanna\nx\ntorn"));
+        assert_eq!(brought(&[&file(false)[..], &end(), b"more"].concat()).as_deref(), Some("\nanna\nx\nmore"));
+        assert_eq!(brought(&file(false)[..40]), None);
     }
 
     fn any_record() -> impl Strategy<Value = (RecordHead, Vec<u8>)> {
