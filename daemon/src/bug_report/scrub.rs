@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::fs;
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 /// Where people's directories are on most systems.
@@ -26,7 +27,8 @@ const SHORTEST_NAME: usize = 3;
 /// How much is searched at once, and how much more where the next begins: longer than any name.
 const WINDOW_BYTES: usize = 1 << 20;
 const OVERLAP_BYTES: usize = 1 << 12;
-/// The first number of people's accounts, on older systems; and that of nobody, which lies among them.
+/// Numbers that are given to people alone; the first that is on older systems; and that of nobody, above both.
+const PEOPLE: RangeInclusive<u32> = 1000..=60_000;
 const FIRST_PERSON: u32 = 500;
 const NOBODY: u32 = 65_534;
 /// The programs with which nobody logs in.
@@ -116,7 +118,8 @@ fn person(line: &str) -> Vec<(String, String)> {
     let fields: Vec<&str> = line.split(':').collect();
     let [name, _, uid, _, about, home, shell] = fields[..] else { return Vec::new() };
     let logs_in = !Path::new(shell).file_name().is_some_and(|program| NO_SHELLS.iter().any(|shell| program == *shell));
-    if !uid.parse::<u32>().is_ok_and(|uid| uid == 0 || (uid >= FIRST_PERSON && uid != NOBODY && logs_in)) {
+    let is_person = |uid: u32| uid == 0 || PEOPLE.contains(&uid) || uid >= FIRST_PERSON && uid != NOBODY && logs_in;
+    if !uid.parse().is_ok_and(is_person) {
         return Vec::new();
     }
     // What follows a comma is a room or a telephone.
@@ -254,6 +257,7 @@ mod tests {
         assert_eq!(names("bertav:x:210045:210045:Berta Vogel:/data/bertav:/bin/bash"), ["bertav", "Berta Vogel"]);
         assert_eq!(names("claraw:x:501:100:Clara Wolf:/srv/clara:"), ["claraw", "Clara Wolf"]);
         assert_eq!(person("root:x:0:0:root:/root:/usr/sbin/nologin")[0].1, "/root");
+        assert_eq!(names("dora:x:1002:1002:Dora Lang:/home/dora:/usr/sbin/nologin"), ["dora", "Dora Lang"]);
         for system in [
             "daemon:x:1:1:daemon:/usr/sbin:/usr/sbin/nologin",
             "sync:x:4:65534:sync:/bin:/bin/sync",
