@@ -236,6 +236,61 @@ fn a_client_that_stands_still_makes_the_lasers_dark_until_it_goes_on() {
 }
 
 #[test]
+fn a_picture_that_the_feed_gave_up_is_not_lit_again_after_a_pattern_or_a_pause() {
+    let folder = bench();
+    let daemon = holod_with_feed(folder.path(), &["--feed-dark-after", "0.5", "--record", "record"]);
+    let until = |what: &str, is_so: &dyn Fn(&Value) -> bool| {
+        assert!(wait_until(PATIENCE, || is_so(&status(&daemon, folder.path()))), "{what}");
+    };
+    let order = |order: &[&str]| {
+        let pid = daemon.pid().to_string();
+        let args = [&["ctl", "--pid", &pid], order].concat();
+        let ended = Daemon::start_with(HOLOD, &args, folder.path(), &[("XDG_RUNTIME_DIR", folder.path())]);
+        assert!(ended.wait(PATIENCE).status.success(), "{order:?}");
+    };
+    let is_dark = |status: &Value| status["lasers"] == "dark" && status["feed_trouble"].is_string();
+    let is_lit = |status: &Value| status["lasers"] == "armed" && status["feed_trouble"].is_null();
+    let frames_go_on = || {
+        let then = status(&daemon, folder.path())["frames_shown"].as_u64();
+        until("frames go on", &|status| status["frames_shown"].as_u64() > then.map(|then| then + 20));
+    };
+    let mut client = connect(folder.path());
+    send(&mut client, 1, &picture(0));
+    until("it gives no more", &|status| is_dark(status) && status["feed"]["taken"] == 1);
+    let t_given_up_ns = host_now().0;
+    order(&["flat"]);
+    until("the pattern is lit", &is_lit);
+    order(&["hologram"]);
+    until("the old picture is dark", &is_dark);
+    frames_go_on();
+    order(&["pause"]);
+    order(&["flat"]);
+    until("the pattern is lit", &is_lit);
+    order(&["hologram"]);
+    until("what stands still is dark", &is_dark);
+    frames_go_on();
+    order(&["resume"]);
+    frames_go_on();
+    let lit = |pictures: std::ops::RangeInclusive<u64>| {
+        let rows = frames::read(&folder.path().join("record/frames.csv")).unwrap_or_default();
+        let lit = rows.into_iter().filter(move |row| pictures.contains(&row.picture));
+        lit.filter_map(|row| row.laser_on_ns).collect::<Vec<_>>()
+    };
+    let mut number = 1;
+    let new_picture_is_lit = || {
+        number += 1;
+        send(&mut client, number, &picture(9));
+        !lit(2..=number).is_empty()
+    };
+    assert!(wait_until(PATIENCE, new_picture_is_lit));
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(PATIENCE);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let of_old = lit(1..=1);
+    assert!(!of_old.is_empty() && of_old.iter().all(|on_ns| *on_ns < t_given_up_ns), "{t_given_up_ns}: {of_old:?}");
+}
+
+#[test]
 fn a_picture_that_is_too_bright_and_too_near_is_told_though_it_is_enlarged() {
     let folder = bench();
     let daemon = holod_with_feed(folder.path(), &["--fit", "contain"]);

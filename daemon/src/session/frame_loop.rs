@@ -75,6 +75,8 @@ pub(super) const RECORDS: usize = 1024;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct LoopRecord {
     pub frame: FrameRecord,
+    /// When the feed's picture was taken over that the loop had in hand, also where a pattern took its place.
+    pub t_picture_in_hand: Option<TimeNs>,
     /// Whether the pupil is one that the network was not trained for.
     pub beyond_trained: bool,
     /// Share of amplitudes above the double phase's constant.
@@ -112,8 +114,9 @@ impl FrameLoop {
 
     /// One frame, top to bottom.
     fn frame(&mut self, plan: FramePlan) -> Result<(), EngineError> {
-        self.make_changes();
+        // A change that comes after this may be left to the next frame, none that came before.
         let t_wake = host_now();
+        self.make_changes();
         let mut pupil = self.inputs.pupil(t_wake, plan.t_predicted_photon);
 
         let t_render_begin = host_now();
@@ -128,6 +131,7 @@ impl FrameLoop {
         };
         let is_hologram = pattern.is_none();
         self.orders.scene = tag.order;
+        let t_picture_in_hand = tag.t_came;
         if !is_hologram {
             (pupil.t_sample, pupil.raw_mm, tag) = (None, None, PictureTag::default());
         }
@@ -161,6 +165,7 @@ impl FrameLoop {
                 orders: self.orders,
                 levels_xxh3,
             },
+            t_picture_in_hand,
             beyond_trained: !self.trained.contain(pupil.pupil),
             clipped_share: rendered.clipped_share,
             unreachable_share: rendered.unreachable_share.0.into_iter().fold(0.0, f32::max),

@@ -40,6 +40,8 @@ impl Watch<'_> {
                 _ => request,
             };
             let done = self.carry_out(order, output, now);
+            // Before the frame loop can have brought back a picture that is not to be lit any more.
+            self.judge_feed(output, host_now());
             // Lasers are kept dark even where the box did not acknowledge it.
             if (done.is_ok() || is_urgent) && request.changes_something() {
                 let request_text = serde_json::to_string(&request).unwrap_or_default();

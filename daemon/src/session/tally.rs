@@ -10,7 +10,6 @@ use super::ledger::LaserLedger;
 use super::observer::FirstLight;
 use super::recorded_levels::KEEP_SLOTS;
 use super::stats::Recent;
-use crate::record::FrameRecord;
 
 /// Frames whose fields may still come: all that the ring of records can hold at once, and some more.
 const REMEMBERED: usize = RECORDS + 64;
@@ -18,7 +17,7 @@ const REMEMBERED: usize = RECORDS + 64;
 /// Running numbers of a run.
 #[derive(Default)]
 pub(super) struct Tally {
-    recent: VecDeque<FrameRecord>,
+    recent: VecDeque<LoopRecord>,
     kept: [Option<(u64, PupilDiameter)>; KEEP_SLOTS],
     pub(super) lasers: LaserLedger,
     pub(super) frames_made: u64,
@@ -34,8 +33,8 @@ pub(super) struct Tally {
     pub(super) sample_to_photon: Recent,
     pub(super) picture_to_photon: Recent,
     newest_picture: Option<TimeNs>,
-    /// When the feed's picture that the panel shows was taken over.
-    shown_picture_came: Option<TimeNs>,
+    t_picture_in_hand: Option<TimeNs>,
+    t_shown_begun: Option<TimeNs>,
     pub(super) by_state: BTreeMap<&'static str, u64>,
     pub(super) pupil_range_mm: Option<[f32; 2]>,
     pub(super) beyond_trained: u64,
@@ -61,7 +60,7 @@ impl Tally {
         if self.recent.len() == REMEMBERED {
             self.recent.pop_front();
         }
-        self.recent.push_back(*frame);
+        self.recent.push_back(*record);
     }
 
     /// A field was shown and is over. What its light is the first of.
@@ -78,9 +77,11 @@ impl Tally {
             self.frames_shown += 1;
             self.deadline_misses += u64::from(event.deadline_missed);
         }
-        let frame = self.recent.iter().find(|frame| frame.frame == event.frame_id)?;
+        let record = self.recent.iter().find(|record| record.frame.frame == event.frame_id)?;
+        let frame = &record.frame;
         if is_new {
-            self.shown_picture_came = frame.picture.t_came;
+            self.t_picture_in_hand = record.t_picture_in_hand;
+            self.t_shown_begun = Some(frame.t_wake);
             if let Some(slot) = frame.keep {
                 self.kept[slot] = Some((frame.frame, frame.pupil));
             }
@@ -107,14 +108,19 @@ impl Tally {
         Some(light)
     }
 
-    /// When the feed's picture was taken over that the panel shows, where it shows one.
-    pub(super) const fn shown_picture_came(&self) -> Option<TimeNs> {
-        self.shown_picture_came
+    /// When the feed's picture was taken over that the frame loop had in hand for what the panel shows.
+    pub(super) const fn t_picture_in_hand(&self) -> Option<TimeNs> {
+        self.t_picture_in_hand
+    }
+
+    /// When the frame was begun that the panel shows.
+    pub(super) const fn t_shown_begun(&self) -> Option<TimeNs> {
+        self.t_shown_begun
     }
 
     /// The pupil that the newest frame was made for.
     pub(super) fn newest_pupil(&self) -> Option<PupilDiameter> {
-        self.recent.back().map(|frame| frame.pupil)
+        self.recent.back().map(|record| record.frame.pupil)
     }
 
     /// Whether the newest frame has come on the panel.
@@ -131,6 +137,7 @@ impl Tally {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::record::FrameRecord;
     use holod_calibration::Colour;
     use holod_slm_output::TimestampSource;
     use holod_slm_output::laser::DarkReason;
@@ -138,7 +145,7 @@ mod tests {
     fn record(frame: u64) -> LoopRecord {
         let pupil = PupilDiameter::from_mm(3.0);
         let frame = FrameRecord { t_sample: Some(TimeNs(1_000)), ..FrameRecord::of_pupil(frame, pupil) };
-        LoopRecord { frame, beyond_trained: false, clipped_share: 0.0, unreachable_share: 0.0 }
+        LoopRecord { frame, t_picture_in_hand: None, beyond_trained: false, clipped_share: 0.0, unreachable_share: 0.0 }
     }
 
     fn field(frame_id: u64, field: usize, is_lit: bool) -> FieldEvent {

@@ -14,7 +14,7 @@ use holod_slm_output::{FieldEvent, OutputControl};
 
 use super::clock::host_now;
 use super::desk::Desk;
-use super::feed_watch::{FeedPart, FeedSeen, FeedWatch};
+use super::feed_watch::{FeedSeen, FeedWatch};
 use super::frame_loop::LoopRecord;
 use super::inputs::FIXED_PUPIL;
 use super::laser_watch::LaserBoxWatch;
@@ -216,21 +216,24 @@ impl Watch<'_> {
     }
 
     /// Puts the lasers out where the feed gives no pictures any more, and lets them be lit where it does again.
-    fn judge_feed(&mut self, output: &OutputControl, now: TimeNs) {
+    pub(super) fn judge_feed(&mut self, output: &OutputControl, now: TimeNs) {
         let Some(feed) = &self.feed else { return };
         let pulse = feed.pulse();
-        let part = match (pulse.is_live && self.desk.pattern().is_none(), self.desk.is_paused()) {
-            (false, _) => FeedPart::Nothing,
-            (true, true) => FeedPart::Still,
-            (true, false) => FeedPart::Pictures,
+        let seen = FeedSeen {
+            is_live: pulse.is_live,
+            is_paused: self.desk.is_paused(),
+            has_pattern: self.desk.pattern().is_some(),
+            t_newest: pulse.t_newest,
+            t_in_hand: self.tally.t_picture_in_hand(),
+            t_begun: self.tally.t_shown_begun(),
         };
-        let seen = FeedSeen { part, t_newest: pulse.t_newest, t_shown: self.tally.shown_picture_came() };
         if !self.feed_watch.judge(seen, now) {
             return;
         }
         let acknowledged = output.keep_dark(self.dark_wish());
         if !self.feed_watch.keeps_dark() {
-            tracing::info!("{}: lasers are lit by the rules", self.why_feed_is_over(part));
+            let what = if seen.is_live && !seen.has_pattern { "gives pictures again" } else { "is not shown any more" };
+            tracing::info!("the live feed {what}: lasers are lit by the rules");
         } else if acknowledged {
             tracing::warn!("{}", self.feed_trouble().unwrap_or_default());
         } else {
@@ -240,13 +243,6 @@ impl Watch<'_> {
             );
         }
         self.write_status(&output.counts(), now);
-    }
-
-    fn why_feed_is_over(&self, part: FeedPart) -> &'static str {
-        match part {
-            FeedPart::Nothing => "the live feed is not shown any more",
-            FeedPart::Pictures | FeedPart::Still => "the live feed gives pictures again",
-        }
     }
 
     /// Why lasers are to be kept dark, where they are: what a person asks for comes first.
