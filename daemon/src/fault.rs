@@ -37,7 +37,7 @@ enum Fault {
     GpuLost,
 }
 
-const FAULTS: [(&str, Fault); 14] = [
+const FAULTS: [(&str, Fault); 15] = [
     ("panic-frame", Fault::Panic("holod-frame")),
     ("panic-panel", Fault::Panic("holod-panel")),
     ("panic-laser", Fault::Panic("holod-laser")),
@@ -45,6 +45,7 @@ const FAULTS: [(&str, Fault); 14] = [
     ("stall-frame", Fault::Stall("holod-frame")),
     ("stall-panel", Fault::Stall("holod-panel")),
     ("stall-laser", Fault::Stall("holod-laser")),
+    ("stall-control", Fault::Stall("main")),
     ("memory", Fault::Memory),
     ("clock-forward", Fault::Clock(10_000_000_000)),
     ("clock-back", Fault::Clock(-10_000_000_000)),

@@ -151,6 +151,33 @@ fn light_in_the_dark(events: &[BoxEvent]) -> Option<BoxEvent> {
 }
 
 #[test]
+fn a_person_puts_the_lasers_out_though_the_control_thread_stands_still() {
+    let folder = holod_tests::new_folder();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let environment = [("XDG_RUNTIME_DIR", folder.path()), ("HOLOD_FAULT", Path::new("stall-control"))];
+    let args = ["--config", "rig.toml", "--tracker", "mock:steady", "--resolution", "64x64", "--weights", "small"];
+    let daemon = Daemon::start_with(HOLOD, &args, folder.path(), &environment);
+    let pid = daemon.pid().to_string();
+    let holod = |args: &[&str]| {
+        let args = [args, &["--pid", &pid]].concat();
+        Daemon::start_with(HOLOD, &args, folder.path(), &environment[..1]).wait(Duration::from_secs(60))
+    };
+    assert!(wait_until(Duration::from_secs(60), || holod(&["status"]).stdout.contains("lasers   armed")));
+    daemon.signal(Signal::USR1);
+    // It stands still once it looks at the clock.
+    assert!(wait_until(Duration::from_secs(60), || holod(&["ctl", "status"]).stderr.contains("does not answer")));
+    let dark = holod(&["ctl", "lasers", "dark"]);
+    assert_eq!(dark.status.code(), Some(69));
+    assert!(
+        dark.stderr.contains("the lasers have been put out beside it, as their box acknowledged"),
+        "{}",
+        dark.stderr
+    );
+    let other = holod(&["ctl", "resume"]).stderr;
+    assert!(other.contains("is not known") && other.contains("`holod dark --config RIG` puts them out"), "{other}");
+}
+
+#[test]
 fn canary_light_in_the_dark_is_noticed() {
     let judged = |lines: &str| light_in_the_dark(&read_log(&format!("{LOG_HEADER}\n{lines}")).unwrap()).is_some();
     let right = "1,armed,,\n2,on,red,\n3,off,red,\n4,on,blue,\n5,off,blue,\n6,dark,,asked\n";

@@ -10,6 +10,7 @@ use holod_calibration::rig::{LaserDriver, Rig, WeightsChoice};
 use holod_calibration::{Colour, Resolution, TimeNs};
 use holod_model::RgbdFrame;
 use holod_model::scene::Scene;
+use holod_slm_output::output::DarkSwitch;
 use holod_slm_output::{FieldEvent, LevelsFrame};
 use serde::Serialize;
 use serde_json::Value;
@@ -495,6 +496,7 @@ impl Material<'_> {
                 has_feed: false,
                 plays: false,
                 stall_timeout: TimeNs(i64::MAX),
+                lasers: DarkSwitch::of_no_output(),
             });
         }
         self.preparer.as_ref().ok_or("no preparer")?.prepare(request)

@@ -48,7 +48,7 @@ pub fn ask(socket: &Path, request: &Request) -> Result<Value, Failure> {
     BufReader::new(stream).read_line(&mut answer).map_err(unanswered)?;
     match serde_json::from_str(&answer) {
         Ok(Answer::Ok(value)) => Ok(value),
-        Ok(Answer::Error(why)) => Err(Failure::new(Exit::Unavailable, why)),
+        Ok(Answer::Error(why) | Answer::Unanswered(why)) => Err(Failure::new(Exit::Unavailable, why)),
         Err(_) => Err(unanswered(std::io::ErrorKind::UnexpectedEof.into())),
     }
 }

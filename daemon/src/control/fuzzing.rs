@@ -5,6 +5,7 @@ use std::sync::{Arc, LazyLock, Mutex};
 use holod_calibration::rig::Rig;
 use holod_calibration::{Resolution, TimeNs};
 use holod_model::RgbdFrame;
+use holod_slm_output::output::DarkSwitch;
 
 use super::{NewPattern, Order, Preparer, Request};
 use crate::cli::Backend;
@@ -28,6 +29,7 @@ static PREPARER: LazyLock<Preparer> = LazyLock::new(|| {
         has_feed: true,
         plays: false,
         stall_timeout: TimeNs(2_000_000_000),
+        lasers: DarkSwitch::of_no_output(),
     }
 });
 

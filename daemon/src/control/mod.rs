@@ -17,6 +17,7 @@ use holod_calibration::rig::{Eye, Rig};
 use holod_calibration::{Colour, PupilDiameter};
 use holod_model::scene::Fit;
 use holod_slm_output::LevelsFrame;
+use holod_slm_output::output::DarkWish;
 use holod_slm_output::patterns::Pattern;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -129,13 +130,51 @@ impl Request {
 
 /// An answer.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
+#[serde(into = "AnswerLine", try_from = "AnswerLine")]
 pub enum Answer {
     /// It is done; with what was asked for.
     Ok(Value),
     /// It is not, and nothing has changed, but that lasers which do not acknowledge darkness are kept dark all the
     /// same: what was found, what was expected, what to do.
     Error(String),
+    /// Whether it is done, or still will be, is not known: what is, and what to do.
+    Unanswered(String),
+}
+
+/// An answer as it is written: what is not known has an `error`, too, for those who know of nothing else.
+#[derive(Default, Serialize, Deserialize)]
+#[serde(default)]
+struct AnswerLine {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    ok: Option<Value>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<String>,
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    unanswered: bool,
+}
+
+impl From<Answer> for AnswerLine {
+    fn from(answer: Answer) -> Self {
+        match answer {
+            Answer::Ok(value) => Self { ok: Some(value), ..Self::default() },
+            Answer::Error(why) => Self { error: Some(why), ..Self::default() },
+            Answer::Unanswered(why) => Self { error: Some(why), unanswered: true, ..Self::default() },
+        }
+    }
+}
+
+impl TryFrom<AnswerLine> for Answer {
+    type Error = &'static str;
+
+    fn try_from(line: AnswerLine) -> Result<Self, &'static str> {
+        match line {
+            AnswerLine { ok: Some(value), error: None, .. } => Ok(Self::Ok(value)),
+            AnswerLine { ok: None, error: Some(why), unanswered } => {
+                Ok(if unanswered { Self::Unanswered(why) } else { Self::Error(why) })
+            }
+            _ => Err("expected `ok` or `error`"),
+        }
+    }
 }
 
 /// A request that is ready to be obeyed by the control thread.
@@ -149,7 +188,9 @@ pub(crate) enum Order {
     Eye(Eye),
     Reload(Box<NewRig>),
     Pattern(Option<NewPattern>),
-    KeepDark(bool),
+    /// The lasers are on their way to darkness.
+    LasersDark(DarkWish),
+    LasersArm,
     Stop,
 }
 
@@ -205,7 +246,15 @@ mod tests {
         for wrong in [r#"{"do":"pupil","cm":1}"#, r#"{"do":"dance"}"#, r#"{}"#, "[]", "status", r#"["pupil",3.5]"#] {
             assert!(Request::from_line(wrong.as_bytes()).is_err(), "{wrong}");
         }
-        assert_eq!(serde_json::to_string(&Answer::Error("no".into())).unwrap(), r#"{"error":"no"}"#);
+        for (answer, line) in [
+            (Answer::Ok("done".into()), r#"{"ok":"done"}"#),
+            (Answer::Error("no".into()), r#"{"error":"no"}"#),
+            (Answer::Unanswered("who knows".into()), r#"{"error":"who knows","unanswered":true}"#),
+        ] {
+            assert_eq!(serde_json::to_string(&answer).unwrap(), line);
+            assert_eq!(serde_json::from_str::<Answer>(line).unwrap(), answer);
+        }
+        assert!(serde_json::from_str::<Answer>("{}").is_err());
     }
 
     #[test]

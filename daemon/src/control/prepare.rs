@@ -8,6 +8,7 @@ use holod_calibration::{PupilDiameter, Resolution, TimeNs};
 use holod_model::scene::Fit;
 use holod_model::{RgbdFrame, Weights};
 use holod_pupil_input::host_now;
+use holod_slm_output::output::DarkSwitch;
 use holod_slm_output::patterns::{PatternError, Placement};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 
@@ -48,6 +49,8 @@ pub(crate) struct Preparer {
     /// Frames of a record are made again, with what they were made of.
     pub(crate) plays: bool,
     pub(crate) stall_timeout: TimeNs,
+    /// Puts the lasers out, whatever the control thread does.
+    pub(crate) lasers: DarkSwitch,
 }
 
 /// An engine that has made a frame.
@@ -75,8 +78,8 @@ impl Preparer {
             Request::Status {} => Ok(Order::Status),
             Request::Pause {} => Ok(Order::Pause(true)),
             Request::Resume {} => Ok(Order::Pause(false)),
-            Request::LasersDark {} => Ok(Order::KeepDark(true)),
-            Request::LasersArm {} => Ok(Order::KeepDark(false)),
+            Request::LasersDark {} => Ok(Order::LasersDark(self.lasers.wish_dark())),
+            Request::LasersArm {} => Ok(Order::LasersArm),
             Request::Stop {} => Ok(Order::Stop),
             Request::Pupil { mm: None } => Ok(Order::Pupil(None)),
             Request::Pupil { mm: Some(mm) } => cli::human_pupil(*mm).map(|pupil| Order::Pupil(Some(pupil))),

@@ -89,7 +89,7 @@ impl ControlServer {
             waiting.signal_waits.store(false, Ordering::Release);
             match take_time(Request::Reload { changed: BTreeMap::new() }, &waiting, alone).await {
                 Answer::Ok(said) => tracing::info!("SIGHUP: {}", said.as_str().unwrap_or_default()),
-                Answer::Error(why) => tracing::error!("SIGHUP: {why}"),
+                Answer::Error(why) | Answer::Unanswered(why) => tracing::error!("SIGHUP: {why}"),
             }
         });
     }
@@ -216,6 +216,7 @@ async fn hand_over(prepared: Result<Order, String>, request: Request, desk: &Wai
         Ok(order) => order,
         Err(why) => return desk.refuse(Refused::Impossible, why),
     };
+    let wish = if let Order::LasersDark(wish) = &order { Some(wish.request()) } else { None };
     let (answer, answered) = oneshot::channel();
     let ending = || desk.refuse(Refused::Unanswered, "holod is ending");
     if desk.orders.send(Ordered { order, request, answer }).is_err() {
@@ -225,7 +226,32 @@ async fn hand_over(prepared: Result<Order, String>, request: Request, desk: &Wai
         Ok(Ok(Answer::Error(why))) => desk.refuse(Refused::Declined, why),
         Ok(Ok(done)) => done,
         Ok(Err(_dropped)) => ending(),
-        Err(_elapsed) => desk.refuse(Refused::Unanswered, "holod's control thread does not answer: see its log"),
+        Err(_elapsed) => {
+            desk.refused.count(Refused::Unanswered);
+            let acknowledged = wish.map(|wish| desk.preparer.lasers.answer_to(wish) == Some(true));
+            Answer::Unanswered(format!(
+                "holod's control thread does not answer: see its log; {}",
+                what_holds(acknowledged)
+            ))
+        }
+    }
+}
+
+/// What is known of an order that the control thread has not answered; of one for darkness, whether the laser box has
+/// acknowledged it.
+const fn what_holds(acknowledged: Option<bool>) -> &'static str {
+    match acknowledged {
+        Some(true) => {
+            "the lasers have been put out beside it, as their box acknowledged, and stay dark until `lasers arm`"
+        }
+        Some(false) => {
+            "the laser box has not acknowledged darkness: `holod dark --config RIG` puts the lasers out beside it; look \
+             at them"
+        }
+        None => {
+            "whether the order took effect, or still will, is not known; the lasers may be lit: `holod dark --config \
+             RIG` puts them out beside it"
+        }
     }
 }
 

@@ -159,6 +159,7 @@ pub(super) fn build(
         has_feed: feed.is_some(),
         plays,
         stall_timeout: options.stall_timeout,
+        lasers: output.control.dark_switch(),
     };
     let inputs = match playback {
         Some(playback) => Inputs::Recorded(playback),

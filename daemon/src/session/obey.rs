@@ -6,6 +6,7 @@ use std::sync::{Arc, PoisonError};
 use holod_calibration::rig::{Eye, LaserDriver, Rig};
 use holod_calibration::{PupilDiameter, TimeNs, rig};
 use holod_slm_output::OutputControl;
+use holod_slm_output::output::DarkWish;
 use serde_json::Value;
 
 use super::clock::host_now;
@@ -29,7 +30,7 @@ impl Watch<'_> {
             self.desk.give_back();
             let Some(Ordered { order, request, answer }) = self.desk.next() else { break };
             let ends = matches!(order, Order::Stop);
-            let is_urgent = ends || matches!(order, Order::KeepDark(true));
+            let is_urgent = ends || matches!(order, Order::LasersDark(_));
             // Whoever asked was told that it is not done.
             if answer.is_closed() && !is_urgent {
                 continue;
@@ -98,7 +99,8 @@ impl Watch<'_> {
             }
             Order::Reload(new) => self.reload(*new),
             Order::Pattern(pattern) => self.change_pattern(pattern, output),
-            Order::KeepDark(dark) => self.keep_dark(dark, output),
+            Order::LasersDark(wish) => self.lasers_dark(wish, output),
+            Order::LasersArm => Ok(self.lasers_arm(output)),
             Order::Stop => Ok("holod ends".into()),
         }
     }
@@ -175,20 +177,23 @@ impl Watch<'_> {
         self.desk.changes.places.push((number, change)).map_err(|_| BUSY.to_owned())
     }
 
-    fn keep_dark(&mut self, dark: bool, output: &OutputControl) -> Result<Value, String> {
-        self.desk.keeps_dark = dark;
-        match (output.keep_dark(self.dark_wish()), dark) {
-            (_, false) if self.feed_watch.keeps_dark() => {
-                Ok("lasers are lit again by the rules, once the live feed gives a picture".into())
-            }
-            (_, false) => Ok(format!("lasers are lit again by the rules{}", self.pattern_warning()).into()),
-            (true, true) => Ok("the lasers are dark, and stay so until `holod ctl lasers arm`".into()),
-            (false, true) => {
-                Err("the laser box did not acknowledge darkness: look at the lasers, and switch them off by \
-                                  hand. holod lights none until `holod ctl lasers arm`"
-                    .into())
-            }
+    fn lasers_dark(&mut self, wish: DarkWish, output: &OutputControl) -> Result<Value, String> {
+        self.desk.keeps_dark = true;
+        if output.keep_dark_as_wished(wish) {
+            return Ok("the lasers are dark, and stay so until `holod ctl lasers arm`".into());
         }
+        Err("the laser box did not acknowledge darkness: look at the lasers, and switch them off by hand. holod lights \
+             none until `holod ctl lasers arm`"
+            .into())
+    }
+
+    fn lasers_arm(&mut self, output: &OutputControl) -> Value {
+        self.desk.keeps_dark = false;
+        output.keep_dark(self.dark_wish());
+        if self.feed_watch.keeps_dark() {
+            return "lasers are lit again by the rules, once the live feed gives a picture".into();
+        }
+        format!("lasers are lit again by the rules{}", self.pattern_warning()).into()
     }
 }
 

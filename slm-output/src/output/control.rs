@@ -9,7 +9,7 @@ use std::time::Duration;
 use holod_calibration::TimeNs;
 
 use super::panel_thread::ring;
-use super::shared::{DARK, NOT_YET, OutputCounts, Shared, code_of, dark_request, dark_request_parts};
+use super::shared::{DARK, NEXT, NOT_YET, OutputCounts, Shared, WISH, code_of, dark_because, dark_request_parts};
 use super::{Clock, SLEEP_MAX};
 use crate::fields::LevelsFrame;
 use crate::laser::DarkReason;
@@ -71,16 +71,26 @@ impl OutputControl {
     /// rules. Waits for the box, two seconds or as long as its lasers may take, four at most; whether it has
     /// acknowledged. They are kept dark also where it has not.
     pub fn keep_dark(&self, why: Option<DarkReason>) -> bool {
-        let shared = &self.switch.shared;
-        let (before, _) = dark_request_parts(shared.dark_request.load(Ordering::Acquire));
-        let request = dark_request(before + 1, why);
-        shared.dark_request.store(request, Ordering::Release);
-        self.switch.laser.unpark();
+        let request = self.switch.request(|request| dark_because(request + NEXT, why));
+        self.wait_for(request)
+    }
+
+    /// Keeps the lasers dark as a person has wished, from when it was wished on; waits and answers as
+    /// [`Self::keep_dark`], which takes it back.
+    pub fn keep_dark_as_wished(&self, wish: DarkWish) -> bool {
+        // The laser thread has the request already, and keeps to it.
+        self.switch.request(|request| dark_because(request, Some(DarkReason::Asked)));
+        let request = wish.request;
+        drop(wish);
+        self.wait_for(request)
+    }
+
+    /// Waits for the box's answer to a request, or a later one; whether it has acknowledged.
+    fn wait_for(&self, request: u64) -> bool {
         let t_end = (self.clock)() + KEEP_DARK_WAIT.max(self.dark_wait + DARK_MARGIN).min(KEEP_DARK_WAIT_MAX);
         loop {
-            let answer = shared.dark_answer.load(Ordering::Acquire);
-            if answer >> 2 == request {
-                return answer & 3 == u64::from(DARK);
+            if let Some(acknowledged) = self.switch.answer_to(request) {
+                return acknowledged;
             }
             if (self.clock)() > t_end {
                 return false;
@@ -147,7 +157,7 @@ impl Drop for OutputControl {
     }
 }
 
-/// Makes the lasers dark for good, from any thread.
+/// Makes the lasers dark, for good or as a person wishes, from any thread.
 #[derive(Clone, Debug)]
 pub struct DarkSwitch {
     pub(super) shared: Arc<Shared>,
@@ -155,6 +165,33 @@ pub struct DarkSwitch {
 }
 
 impl DarkSwitch {
+    /// A switch that switches nothing, for whoever has no output.
+    pub fn of_no_output() -> Self {
+        Self { shared: Arc::default(), laser: std::thread::current() }
+    }
+
+    /// Asks the laser thread for darkness because a person wishes it. Does not wait; whatever the control of the output
+    /// asks for meanwhile, lasers are dark until it has taken the wish over ([`OutputControl::keep_dark_as_wished`]).
+    pub fn wish_dark(&self) -> DarkWish {
+        let request = self.request(|request| request + NEXT + WISH);
+        DarkWish { switch: self.clone(), request }
+    }
+
+    /// Whether the box has acknowledged darkness, once it has answered to this request of [`DarkWish::request`] or to a
+    /// later one.
+    pub fn answer_to(&self, request: u64) -> Option<bool> {
+        let answer = self.shared.dark_answer.load(Ordering::Acquire);
+        (answer >> 2 >= request).then_some(answer & 3 == u64::from(DARK))
+    }
+
+    /// Changes the request for darkness, of which other threads may have another one; its number.
+    fn request(&self, change: impl Fn(u64) -> u64) -> u64 {
+        let changed = |request| Some(change(request));
+        let before = self.shared.dark_request.fetch_update(Ordering::AcqRel, Ordering::Acquire, changed);
+        self.laser.unpark();
+        dark_request_parts(change(before.unwrap_or_else(|unchanged| unchanged))).0
+    }
+
     /// Asks the laser thread for darkness; the first reason stays. Does not wait.
     pub fn dark(&self, reason: DarkReason) {
         let _first = self.shared.latch.compare_exchange(0, code_of(Some(reason)), Ordering::AcqRel, Ordering::Acquire);
@@ -199,5 +236,26 @@ impl DarkSwitch {
         while self.shared.panics.load(Ordering::Acquire) > 0 && clock() < t_end {
             std::thread::sleep(Duration::from_millis(1));
         }
+    }
+}
+
+/// A person's wish for darkness. In force until it is taken over; dropped without that, lasers stay dark until the
+/// control of the output asks for something else.
+#[derive(Debug)]
+pub struct DarkWish {
+    switch: DarkSwitch,
+    request: u64,
+}
+
+impl DarkWish {
+    /// The number of its request.
+    pub const fn request(&self) -> u64 {
+        self.request
+    }
+}
+
+impl Drop for DarkWish {
+    fn drop(&mut self) {
+        self.switch.shared.dark_request.fetch_sub(WISH, Ordering::AcqRel);
     }
 }

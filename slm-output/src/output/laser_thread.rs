@@ -25,7 +25,7 @@ pub(super) struct LaserThread {
     pub(super) ledger: Ledger,
     /// What went wrong with the box, for whoever tells people.
     pub(super) faults: Producer<LaserError>,
-    /// The last of the requests for darkness, or to take it back.
+    /// The number of the last of the requests for darkness, or to take it back.
     pub(super) dark_request: u64,
     /// A box that failed is left alone until then.
     pub(super) t_retry: TimeNs,
@@ -59,9 +59,9 @@ impl LaserThread {
         if let Some(reason) = self.shared.latched() {
             self.latch(reason, now);
         }
-        let request = self.shared.dark_request.load(Ordering::Acquire);
+        let (request, why) = dark_request_parts(self.shared.dark_request.load(Ordering::Acquire));
         if request != std::mem::replace(&mut self.dark_request, request) {
-            let orders = self.scheduler.hold(dark_request_parts(request).1);
+            let orders = self.scheduler.hold(why);
             let answer = self.darkness(orders, now);
             self.shared.dark_answer.store(request << 2 | u64::from(answer), Ordering::Release);
         }

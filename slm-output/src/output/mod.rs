@@ -18,7 +18,7 @@ mod shared;
 #[cfg(test)]
 mod tests;
 
-pub use self::control::{DarkSwitch, OutputControl, ShutdownReport};
+pub use self::control::{DarkSwitch, DarkWish, OutputControl, ShutdownReport};
 pub use self::ledger::FieldEvent;
 pub use self::panel_thread::PanelEvent;
 pub use self::port::{FramePort, PresentReport};

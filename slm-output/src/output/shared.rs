@@ -38,9 +38,9 @@ pub(super) struct Shared {
     pub(super) latch: AtomicU8,
     /// What the box said to that.
     pub(super) acknowledged: AtomicU8,
-    /// A [`dark_request`].
+    /// A request for darkness, or to take it back ([`dark_request_parts`]), with the wishes for darkness that the control of the output has not taken over.
     pub(super) dark_request: AtomicU64,
-    /// The request that has been obeyed, and the box's answer in the two lowest bits.
+    /// The number of the request that has been obeyed, and the box's answer in the two lowest bits.
     pub(super) dark_answer: AtomicU64,
     /// Panics whose messages have not been written yet.
     pub(super) panics: AtomicU64,
@@ -91,14 +91,19 @@ fn reason_of(code: u8) -> Option<DarkReason> {
     DarkReason::ALL.get(usize::from(code).wrapping_sub(1)).copied()
 }
 
-/// Asks for darkness with the number of the request: why, as [`code_of`], in the lowest eight bits.
-pub(super) fn dark_request(number: u64, why: Option<DarkReason>) -> u64 {
-    number << 8 | u64::from(code_of(why))
+/// In a request for darkness: from one number to the next, and one wish more. Below them is why, as [`code_of`].
+pub(super) const NEXT: u64 = 1 << 32;
+pub(super) const WISH: u64 = 1 << 8;
+
+/// A request as it was, but for the reason.
+pub(super) fn dark_because(request: u64, why: Option<DarkReason>) -> u64 {
+    request & !(WISH - 1) | u64::from(code_of(why))
 }
 
-/// The number of a request, and why it asks for darkness, where it does.
+/// The number of a request, and why it asks for darkness, where it does: a person's wish comes first.
 pub(super) fn dark_request_parts(request: u64) -> (u64, Option<DarkReason>) {
-    (request >> 8, reason_of(request as u8))
+    let has_wishes = request % NEXT >= WISH;
+    (request / NEXT, if has_wishes { Some(DarkReason::Asked) } else { reason_of(request as u8) })
 }
 
 /// One more.

@@ -11,7 +11,7 @@ use proptest::prelude::*;
 use rtrb::Producer;
 
 use super::panel_thread::PanelNews;
-use super::shared::{DARK, dark_request};
+use super::shared::{DARK, NEXT, dark_because, dark_request_parts};
 use super::*;
 use crate::fields::{FrameLayout, FrameTag};
 use crate::laser::verify::{EdgeReport, Finding, verify_edges};
@@ -244,8 +244,7 @@ fn lasers_that_are_kept_dark_stay_so_until_that_is_taken_back() {
     for (mode, reason) in MODES.into_iter().zip([DarkReason::Asked, DarkReason::NoPicture].into_iter().cycle()) {
         let mut bench = Bench::new(mode);
         bench.run(TimeNs(300 * MS), TimeNs(0));
-        let request = dark_request(1, Some(reason));
-        bench.laser.shared.dark_request.store(request, Ordering::Release);
+        bench.laser.shared.dark_request.store(dark_because(NEXT, Some(reason)), Ordering::Release);
         let t_asked = bench.now + TimeNs(MS);
         bench.wake(t_asked);
         let &[(t_dark, told)] = bench.darks.as_slice() else { panic!("{:?}", bench.darks) };
@@ -255,8 +254,8 @@ fn lasers_that_are_kept_dark_stay_so_until_that_is_taken_back() {
         bench.run(TimeNs(600 * MS), TimeNs(0));
         assert_eq!(bench.edges.len(), edges);
         assert_eq!(bench.all_events.last().unwrap().dark, Some(reason));
-        assert_eq!(bench.laser.shared.dark_answer.load(Ordering::Acquire), request << 2 | u64::from(DARK));
-        bench.laser.shared.dark_request.store(dark_request(2, None), Ordering::Release);
+        assert_eq!(bench.laser.shared.dark_answer.load(Ordering::Acquire), 1 << 2 | u64::from(DARK));
+        bench.laser.shared.dark_request.store(dark_because(2 * NEXT, None), Ordering::Release);
         bench.run(TimeNs(900 * MS), TimeNs(0));
         assert!(bench.edges.len() > edges + 10, "lit again by the rules");
         assert_eq!(bench.verdict().unsafe_findings().collect::<Vec<_>>(), Vec::<&Finding>::new());
@@ -576,6 +575,32 @@ fn darkness_that_is_asked_for_is_acknowledged_each_time_or_said_not_to_be() {
     assert!(!failing.control.keep_dark(ASKED) && !failing.control.keep_dark(ASKED));
     fails.store(false, Ordering::Relaxed);
     assert!(failing.control.keep_dark(ASKED));
+}
+
+#[test]
+fn a_wish_for_darkness_holds_whatever_the_control_does_until_that_takes_it_back_after_it() {
+    let rig = rig(PanelMode::ChannelPacked);
+    let encoder = PanelEncoder::new(&rig.panel, SIZE, SIZE).unwrap();
+    let output = headless(&rig, &encoder, OutputOptions::default());
+    let switch = output.control.dark_switch();
+    let asked_for = || dark_request_parts(switch.shared.dark_request.load(Ordering::Acquire)).1;
+    let (first, second) = (switch.wish_dark(), switch.wish_dark());
+    let patience = host_now() + TimeNs(20_000 * MS);
+    while switch.answer_to(second.request()).is_none() {
+        assert!(host_now() < patience, "the laser thread answers");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    assert_eq!(switch.answer_to(first.request()), Some(true), "the box is dark, with nobody at the control");
+    // Orders of before the wishes.
+    assert!(output.control.keep_dark(None) && output.control.keep_dark(Some(DarkReason::NoPicture)));
+    assert_eq!(asked_for(), Some(DarkReason::Asked));
+    assert!(output.control.keep_dark_as_wished(first));
+    assert!(output.control.keep_dark(None));
+    assert_eq!(asked_for(), Some(DarkReason::Asked), "the second wish came after that");
+    assert!(output.control.keep_dark_as_wished(second));
+    assert_eq!(asked_for(), Some(DarkReason::Asked));
+    assert!(output.control.keep_dark(None));
+    assert_eq!(asked_for(), None);
 }
 
 #[test]

@@ -23,14 +23,16 @@ BUILT_IN_WEIGHTS = ("standard", "small", "fast")
 
 
 class ControlError(Exception):
-    """holod is not there, or refuses the order; nothing has changed then, but for `lasers_dark()`: it is in force.
+    """holod is not there, or refuses the order; nothing has changed then, but that a holod which refuses
+    `lasers_dark()`, since its laser box does not acknowledge it, lights nothing more.
 
     An `UnansweredError`, which is one of these, is the exception: what holod has done is not known.
     """
 
 
 class UnansweredError(ControlError):
-    """holod has the order, but its answer did not come. Whether the order took effect, or still will, is not known."""
+    """holod has the order, but its answer did not come, or is that it hangs. Whether the order took effect, or still
+    will, is not known: the lasers may be lit. Of `lasers_dark()` the words say what is known."""
 
 
 class Control:
@@ -79,7 +81,7 @@ class Control:
             self._disconnect()
             raise
         if "error" in answer:
-            raise ControlError(answer["error"])
+            raise (UnansweredError if answer.get("unanswered") else ControlError)(answer["error"])
         return answer["ok"]
 
     def status(self) -> dict[str, Any]:
@@ -143,7 +145,10 @@ class Control:
         return self.ask("hologram")
 
     def lasers_dark(self) -> str:
-        """Keeps the lasers dark. Raises ControlError where the box does not acknowledge that: look at the lasers."""
+        """Keeps the lasers dark. Raises ControlError where the box does not acknowledge that: look at the lasers.
+
+        Where holod's control thread hangs, the lasers are put out beside it, and UnansweredError says whether the box
+        acknowledged. Where holod hangs as a whole or is not there, `holod dark --config RIG` puts them out beside it."""
         return self.ask("lasers-dark")
 
     def lasers_arm(self) -> str:

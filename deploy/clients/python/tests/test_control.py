@@ -166,6 +166,16 @@ def test_refusals_keep_the_connection(fake: FakeControl) -> None:
     assert len(fake.connections) == 1
 
 
+def test_what_a_holod_whose_control_thread_hangs_has_done_is_not_known(fake: FakeControl) -> None:
+    with Control(fake.path) as control:
+        fake.answer = lambda do: b'{"error": "the control thread does not answer", "unanswered": true}\n'
+        with pytest.raises(UnansweredError, match="does not answer"):
+            control.lasers_dark()
+        fake.answer = ok
+        assert control.status() == "did status"
+    assert len(fake.connections) == 1
+
+
 def test_a_closed_control_sends_nothing(fake: FakeControl) -> None:
     control = Control(fake.path)
     control.close()

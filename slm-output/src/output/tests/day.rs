@@ -11,7 +11,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use super::*;
-use crate::output::shared::dark_request;
+use crate::output::shared::{NEXT, dark_because};
 use crate::pacing::FramePlan;
 
 const S: i64 = 1_000 * MS;
@@ -340,7 +340,7 @@ impl Day {
     /// A person asks for darkness, or takes that back.
     fn ask(&mut self, why: Option<DarkReason>) {
         self.asked += 1;
-        self.laser.shared.dark_request.store(dark_request(self.asked, why), Ordering::Release);
+        self.laser.shared.dark_request.store(dark_because(self.asked * NEXT, why), Ordering::Release);
     }
 
     /// One more thing goes wrong.
