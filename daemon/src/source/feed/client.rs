@@ -79,7 +79,7 @@ impl From<Errno> for Gone {
 pub(super) struct Client {
     pub(super) socket: OwnedFd,
     pub(super) name: String,
-    /// When it handed its last picture over.
+    /// When a picture of it was taken over last; long ago where none was.
     pub(super) t_last: TimeNs,
     /// Whether a picture of it has been taken.
     pub(super) is_known: bool,
@@ -296,8 +296,7 @@ impl Client {
                         "FRAM: reserved bytes that are not 0 were found, expected 0 in version 1".into(),
                     ));
                 }
-                self.t_last = now;
-                let freed = stream.slots.hand_over(slot, sequence, t_taken.unwrap_or(now))?;
+                let freed = stream.slots.hand_over(slot, sequence, t_taken, now)?;
                 stream.views[slot as usize] = view;
                 match freed {
                     None => Ok(Ok(())),

@@ -36,7 +36,7 @@ pub fn measure(resolution: Resolution, rounds: u32) -> std::io::Result<FeedCost>
     let colour: Vec<u8> = (0..format.colour_bytes()).map(|at| (at * 7) as u8).collect();
     let depth: Vec<u8> = (0..resolution.pixels()).flat_map(|at| (400 + (at % 3000) as u16).to_ne_bytes()).collect();
     let (mut colour_copy, mut depth_copy) = (vec![0; colour.len()], vec![0; depth.len()]);
-    let picture = Picture { slot: 0, sequence: 0, t_taken: TimeNs(0) };
+    let picture = Picture { slot: 0, sequence: 0, t_taken: TimeNs(0), t_heard: TimeNs(0) };
     let (mut copied, mut frame) = (Copied::default(), RgbdFrame::black(resolution));
 
     let mut cost =

@@ -46,8 +46,6 @@ const CLIENTS: usize = 8;
 const SILENCE: TimeNs = TimeNs(2_000_000_000);
 /// At first: three on their way to the frame thread, one that the renderer keeps, and one that is written.
 const FRAMES: usize = 5;
-/// Clocks of one machine agree better than this.
-const LONGEST_FUTURE: TimeNs = TimeNs(1_000_000_000);
 /// Rest after a connection that could not be accepted.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
 /// Clients that go on doing wrong make one line in the log in this time.
@@ -238,6 +236,7 @@ impl Feed {
             status: FeedStatus::at(&socket),
             left_out_of_gone: 0,
             refused: TallyBy::default(),
+            shown_last: None,
         };
         let thread = std::thread::Builder::new()
             .name("holod-feed".into())
@@ -300,10 +299,13 @@ struct Server {
     status: FeedStatus,
     left_out_of_gone: u64,
     refused: TallyBy<Refusal>,
+    /// Of which client a picture was taken last, since the feed is shown.
+    shown_last: Option<u64>,
 }
 
 impl Server {
     fn serve(&mut self) {
+        // Whose turn it is to be shown.
         let mut shown = None;
         while let Some(ready) = self.wait() {
             let now = host_now();
@@ -319,7 +321,7 @@ impl Server {
             if self.sink.lock().unwrap_or_else(PoisonError::into_inner).is_live() {
                 self.choose(&mut shown, now);
             } else {
-                shown = None;
+                (shown, self.shown_last) = (None, None);
             }
             let waiting: Vec<u64> =
                 self.clients.iter().filter(|(_, client)| client.has_picture()).map(|(number, _)| *number).collect();
@@ -401,10 +403,10 @@ impl Server {
             Gone::Closed => tracing::info!("the feed's client `{}` is gone", client.name),
             Gone::Refused(..) => self.refuse(&client.name, &gone),
         }
-        if *shown == Some(number) {
+        if self.shown_last == Some(number) {
             tracing::info!("the last picture of `{}` stays", client.name);
-            *shown = None;
         }
+        *shown = shown.filter(|one| *one != number);
     }
 
     fn refuse(&mut self, name: &str, gone: &Gone) {
@@ -416,16 +418,15 @@ impl Server {
         }
     }
 
-    /// Whose pictures are shown: the one that is, while it sends; else the first that does.
+    /// Whose turn it is: the one's whose it was, while pictures of it are taken; else the next one's that sends some.
     fn choose(&self, shown: &mut Option<u64>, now: TimeNs) {
-        let of = |number: u64| self.clients.iter().find(|(one, _)| *one == number).map(|(_, client)| client);
-        if shown.and_then(of).is_some_and(|client| now - client.t_last < SILENCE) {
+        let is_shown = |number: u64| *shown == Some(number);
+        let gives = |(number, client): &(u64, Client)| is_shown(*number) && now - client.t_last < SILENCE;
+        if self.clients.iter().any(gives) {
             return;
         }
-        if let Some((number, client)) = self.clients.iter().find(|(_, client)| client.has_picture())
-            && *shown != Some(*number)
-        {
-            tracing::info!("the feed's client `{}` is shown", client.name);
+        let sends = |(number, client): &&(u64, Client)| !is_shown(*number) && client.has_picture();
+        if let Some((number, _)) = self.clients.iter().find(sends) {
             *shown = Some(*number);
         }
     }
@@ -438,6 +439,8 @@ impl Server {
             .map_or_else(|| Arc::new(RgbdFrame::black(self.target.resolution)), |free| self.frames.swap_remove(free));
         let sink = Arc::clone(&self.sink);
         let mut copied = std::mem::take(&mut self.copied);
+        let was_shown = self.shown_last == Some(number);
+        let mut is_shown = was_shown;
         self.with(number, shown, |client, target, status| {
             let Some(picture) = client.take() else { return Ok(()) };
             let taken = take_over(client, &picture, &mut copied, now);
@@ -447,6 +450,11 @@ impl Server {
             match taken {
                 Ok(tag) => {
                     status.t_newest = Some(now);
+                    client.t_last = now;
+                    is_shown = true;
+                    if !was_shown {
+                        tracing::info!("the feed's client `{}` is shown", client.name);
+                    }
                     status.view = tag.view;
                     let report = make(client, &copied, &mut frame);
                     sink.lock().unwrap_or_else(PoisonError::into_inner).show_live(Arc::clone(&frame), tag);
@@ -465,6 +473,9 @@ impl Server {
             }
             freed
         });
+        if is_shown {
+            self.shown_last = Some(number);
+        }
         // Its memory may be large.
         if !self.clients.is_empty() {
             self.copied = copied;
@@ -474,7 +485,7 @@ impl Server {
 
     fn publish(&mut self, shown: Option<u64>) {
         let name = |number: u64| self.clients.iter().find(|(one, _)| *one == number).map(|(_, one)| one.name.clone());
-        self.status.shown = shown.and_then(name);
+        self.status.shown = shown.filter(|_| shown == self.shown_last).and_then(name);
         self.status.clients = self.clients.iter().map(|(_, client)| client.name.clone()).collect();
         self.status.left_out =
             self.clients.iter().fold(self.left_out_of_gone, |sum, (_, client)| sum.saturating_add(client.left_out()));
@@ -492,10 +503,12 @@ struct Ready {
 #[derive(Debug, thiserror::Error)]
 enum PictureRefusal {
     #[error(
-        "a picture taken {ahead_s:.0} s from now was found, expected nanoseconds of CLOCK_MONOTONIC (not of the calendar's \
-         clock), or 0"
+        "a picture taken {ahead_s:.3} s from now was found, expected nanoseconds of CLOCK_MONOTONIC (not of the calendar's \
+         clock) when it was taken (not when it is to be shown), or 0"
     )]
     Future { ahead_s: f64 },
+    #[error("a picture taken at {t_ns} ns was found, expected nanoseconds of CLOCK_MONOTONIC, or 0")]
+    BeforeTime { t_ns: i64 },
     #[error(transparent)]
     Picture(#[from] TakeError),
 }
@@ -507,8 +520,11 @@ fn take_over(
     copied: &mut Copied,
     now: TimeNs,
 ) -> Result<PictureTag, PictureRefusal> {
-    if picture.t_taken > now + LONGEST_FUTURE {
-        return Err(PictureRefusal::Future { ahead_s: (picture.t_taken - now).seconds() });
+    if picture.t_taken > picture.t_heard {
+        return Err(PictureRefusal::Future { ahead_s: (picture.t_taken - picture.t_heard).seconds() });
+    }
+    if picture.t_taken < TimeNs(0) {
+        return Err(PictureRefusal::BeforeTime { t_ns: picture.t_taken.0 });
     }
     client.stream().copy_out(picture, copied)?;
     Ok(PictureTag {

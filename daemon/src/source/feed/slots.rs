@@ -7,13 +7,18 @@ use holod_calibration::TimeNs;
 
 use super::message::{Outcome, SLOTS, Wrong};
 
+/// A picture that was taken so little after it was heard of was taken then: its client converts times of another clock.
+const CLOCK_TOLERANCE: TimeNs = TimeNs(1_000_000);
+
 /// A picture that waits to be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Picture {
     pub(super) slot: usize,
     pub(super) sequence: u64,
-    /// When it was taken, or else when it came.
+    /// When it was taken, or else when it was heard of.
     pub(super) t_taken: TimeNs,
+    /// When it was heard of.
+    pub(super) t_heard: TimeNs,
 }
 
 /// The slots of one client.
@@ -36,9 +41,12 @@ impl Slots {
         &mut self,
         slot: u32,
         sequence: u64,
-        t_taken: TimeNs,
+        t_taken: Option<TimeNs>,
+        t_heard: TimeNs,
     ) -> Result<Option<(Picture, Outcome)>, Wrong> {
-        let picture = Picture { slot: slot as usize, sequence, t_taken };
+        let slightly_ahead = t_heard..=t_heard + CLOCK_TOLERANCE;
+        let t_taken = t_taken.filter(|t_taken| !slightly_ahead.contains(t_taken)).unwrap_or(t_heard);
+        let picture = Picture { slot: slot as usize, sequence, t_taken, t_heard };
         match self.held.get_mut(picture.slot) {
             None => {
                 let last = SLOTS - 1;
@@ -93,27 +101,40 @@ mod tests {
     #[test]
     fn the_newest_is_read_and_the_others_come_back() {
         let mut slots = Slots::default();
-        assert_eq!(slots.hand_over(0, 5, TimeNs(0)), Ok(None));
-        let (overtaken, outcome) = slots.hand_over(2, 8, TimeNs(3)).unwrap().unwrap();
+        assert_eq!(slots.hand_over(0, 5, None, TimeNs(0)), Ok(None));
+        let (overtaken, outcome) = slots.hand_over(2, 8, Some(TimeNs(3)), TimeNs(4)).unwrap().unwrap();
         assert_eq!((overtaken.slot, overtaken.sequence, outcome), (0, 5, Outcome::Overtaken));
         slots.free(&overtaken);
         let newest = slots.take().unwrap();
         assert_eq!((newest.slot, newest.sequence, newest.t_taken), (2, 8, TimeNs(3)));
         assert_eq!((slots.take(), slots.left_out), (None, 2));
-        assert!(slots.hand_over(2, 9, TimeNs(0)).unwrap_err().0.contains("wait for its FREE"));
-        assert_eq!(slots.hand_over(0, 9, TimeNs(0)), Ok(None));
-        assert!(slots.hand_over(3, 10, TimeNs(0)).unwrap_err().0.contains("expected 0 to 2"));
+        assert!(slots.hand_over(2, 9, None, TimeNs(0)).unwrap_err().0.contains("wait for its FREE"));
+        assert_eq!(slots.hand_over(0, 9, None, TimeNs(0)), Ok(None));
+        assert!(slots.hand_over(3, 10, None, TimeNs(0)).unwrap_err().0.contains("expected 0 to 2"));
     }
 
     #[test]
     fn a_sequence_that_does_not_rise_is_refused_and_nothing_else() {
         let mut slots = Slots::default();
-        slots.hand_over(0, 5, TimeNs(0)).unwrap();
-        let (refused, outcome) = slots.hand_over(1, 5, TimeNs(0)).unwrap().unwrap();
+        slots.hand_over(0, 5, None, TimeNs(0)).unwrap();
+        let (refused, outcome) = slots.hand_over(1, 5, None, TimeNs(0)).unwrap().unwrap();
         assert_eq!(refused.slot, 1);
         assert_eq!(outcome, Outcome::Refused("sequence 5 was found after 5, expected it to rise".into()));
         slots.free(&refused);
         assert_eq!(slots.take().unwrap().sequence, 5);
+    }
+
+    #[test]
+    fn a_picture_is_not_taken_after_it_is_heard_of_but_for_what_clocks_differ_by() {
+        let t_heard = TimeNs(5_000_000);
+        for (t_taken_ns, expected_ns) in
+            [(4_999_999, 4_999_999), (5_000_001, 5_000_000), (6_000_000, 5_000_000), (6_000_001, 6_000_001)]
+        {
+            let mut slots = Slots::default();
+            slots.hand_over(0, 1, Some(TimeNs(t_taken_ns)), t_heard).unwrap();
+            let picture = slots.take().unwrap();
+            assert_eq!((picture.t_taken, picture.t_heard), (TimeNs(expected_ns), t_heard));
+        }
     }
 
     proptest! {
@@ -124,7 +145,7 @@ mod tests {
             let mut with_holod = [false; SLOTS];
             for (slot, sequence, read) in orders {
                 let was_free = with_holod.get(slot as usize) == Some(&false);
-                match slots.hand_over(slot, sequence, TimeNs(0)) {
+                match slots.hand_over(slot, sequence, None, TimeNs(0)) {
                     Ok(freed) => {
                         prop_assert!(was_free);
                         with_holod[slot as usize] = true;
@@ -194,7 +215,7 @@ mod tests {
         'turns: while seen < PICTURES {
             while let Some((slot, sequence)) = to_holod.received() {
                 // A client that breaks the rules is shown out, but may have written by then.
-                let Ok(freed) = slots.hand_over(slot, sequence, TimeNs(0)) else { break 'turns };
+                let Ok(freed) = slots.hand_over(slot, sequence, None, TimeNs(0)) else { break 'turns };
                 if let Some((freed, _)) = freed {
                     slots.free(&freed);
                     to_client.send(freed.slot as u32);

@@ -201,9 +201,17 @@ fn pictures_that_cannot_be_shown_are_refused_in_words_and_the_last_good_one_stay
     let Answer::Free { outcome, text, .. } = client.answer() else { panic!() };
     assert_eq!(outcome, REFUSED);
     assert!(text.contains("expected nanoseconds of CLOCK_MONOTONIC"), "{text}");
+    // A game engine's predicted display time, and a difference of clocks that came out below 0.
+    for (sequence, t_taken_ns, said) in
+        [(8, host_now().0 + 600_000_000, "(not when it is to be shown)"), (9, -1, "taken at -1 ns was found")]
+    {
+        client.hand_over(0, sequence, t_taken_ns).unwrap();
+        let Answer::Free { outcome, text, .. } = client.answer() else { panic!() };
+        assert!(outcome == REFUSED && text.contains(said), "{text}");
+    }
     assert_eq!((bench.shown().0.amplitude[0], bench.shown().1.number), (1.0, 5));
-    bench.until("three are counted", |status| status.refused == 3);
-    assert_eq!(send(&mut client, 0, 8, 0).0, TAKEN, "it may go on");
+    bench.until("five are counted", |status| status.refused == 5);
+    assert_eq!(send(&mut client, 0, 10, 0).0, TAKEN, "it may go on");
 }
 
 #[test]
@@ -273,6 +281,46 @@ fn another_client_is_shown_once_the_first_is_gone_or_silent() {
     drop(second);
     bench.until("the second is gone", |status| status.clients.len() == 1);
     assert_eq!(send(&mut first, 0, 3, 255).0, TAKEN);
+}
+
+#[test]
+fn the_time_just_before_a_picture_is_handed_over_is_when_it_was_taken() {
+    let mut bench = Bench::new();
+    let mut client = bench.client("prompt");
+    let (colour, depth) = picture(9, 1000);
+    client.write(0, &colour, &depth);
+    for sequence in 1..200 {
+        let t_taken = host_now();
+        client.hand_over(0, sequence, t_taken.0).unwrap();
+        let Answer::Free { outcome: TAKEN, .. } = client.answer() else { panic!("picture {sequence}") };
+        assert_eq!(bench.shown_next(sequence).1.t_taken, Some(t_taken));
+    }
+}
+
+#[test]
+fn a_client_of_which_nothing_can_be_shown_is_not_shown_and_keeps_nobody_away() {
+    let mut bench = Bench::new();
+    let (mut covered, mut good) = (bench.client("covered"), bench.client("good"));
+    let (colour, _) = picture(9, 1000);
+    let mut refused = |sequence: u64| {
+        covered.write(0, &colour, &[0; 2 * PIXELS]);
+        covered.hand_over(0, sequence, 0).unwrap();
+        assert!(matches!(covered.answer(), Answer::Free { outcome: REFUSED | NOT_SHOWN, .. }));
+    };
+    refused(1);
+    bench.until("it is counted", |status| status.refused == 1 && status.shown.is_none());
+    assert_eq!(send(&mut good, 0, 1, 255).0, TAKEN);
+    bench.until("the good one is shown", |status| status.shown.as_deref() == Some("good"));
+    refused(2);
+    assert_eq!(send(&mut good, 0, 2, 255).0, TAKEN);
+    bench.shown_next(2);
+    // As one does whose lens was covered while it was shown.
+    drop(good);
+    bench.until("the good one is gone", |status| status.clients.len() == 1 && status.shown.is_none());
+    refused(3);
+    bench.until("it is counted", |status| status.refused >= 2 && status.shown.is_none());
+    let mut late = bench.client("late");
+    assert_eq!(send(&mut late, 0, 1, 255).0, TAKEN, "at once");
 }
 
 #[test]
