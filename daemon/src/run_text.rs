@@ -18,12 +18,12 @@ pub(crate) fn spread_text(spread: Option<Spread>) -> String {
 pub(crate) fn feed_text(feed: &FeedStatus) -> String {
     let bad_depths = match feed.pictures_with_bad_depths {
         0 => String::new(),
-        pictures => format!("; bad depths in {pictures} of them: {} pixels", feed.bad_depths_in_all.text()),
+        pictures => format!("; bad depths in {pictures} pictures: {} pixels", feed.bad_depths_in_all.text()),
     };
     let clipped = match feed.pictures_with_clipped_colours {
         0 => String::new(),
         pictures => {
-            format!("; colours clipped in {pictures} of them, in pixels: {}", feed.clipped_colours_in_all.text())
+            format!("; colours clipped in {pictures} pictures, in pixels: {}", feed.clipped_colours_in_all.text())
         }
     };
     let refusal = feed.last_refusal.as_ref().map_or(String::new(), |why| format!("; refused last: {why}"));

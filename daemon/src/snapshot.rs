@@ -51,6 +51,15 @@ pub struct Figures {
     pub record: Option<RecordState>,
 }
 
+/// A run as far as it is known now.
+#[derive(Clone, Debug, Serialize)]
+pub(crate) struct SnapshotNow<'a> {
+    #[serde(flatten)]
+    pub(crate) snapshot: &'a Snapshot,
+    /// How old that is, where the loop does not turn any more.
+    pub(crate) stale_s: Option<f64>,
+}
+
 /// A run at one moment.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Snapshot {

@@ -173,9 +173,26 @@ impl Drop for StatusFile {
 /// What a running holod wrote last.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Found {
-    pub status: Snapshot,
+    pub pid: u32,
+    /// Its control socket.
+    pub control: Option<PathBuf>,
+    /// Nothing where it cannot be understood, as it may not be of another version.
+    pub status: Option<Snapshot>,
     /// How long ago that was, where it is too long.
     pub stale: Option<Duration>,
+}
+
+/// What every version says of itself.
+#[derive(Deserialize)]
+struct Owner {
+    pid: u32,
+    #[serde(default)]
+    control: Option<PathBuf>,
+}
+
+/// How old something is that a loop which turns says anew each second, where that is too old.
+pub(crate) fn stale(age: TimeNs) -> Option<Duration> {
+    (age > STALE).then(|| Duration::from_nanos(age.0.unsigned_abs()))
 }
 
 /// Every holod that runs, that of the service first, else in the order of their numbers.
@@ -198,7 +215,7 @@ pub(crate) fn of_running() -> Result<Vec<Found>, Failure> {
 pub(crate) fn of_running_as(pid: Option<u32>) -> Result<Vec<Found>, Failure> {
     let look = || {
         let mut running = of_running()?;
-        running.retain(|found| pid.is_none_or(|pid| found.status.pid == pid));
+        running.retain(|found| pid.is_none_or(|pid| found.pid == pid));
         if running.is_empty() {
             return Err(Failure::new(Exit::Unavailable, "no holod of that process number is running"));
         }
@@ -212,11 +229,11 @@ pub(crate) fn of_running_as(pid: Option<u32>) -> Result<Vec<Found>, Failure> {
 ///
 /// # Errors
 /// There are several.
-pub(crate) fn only(running: &[Found]) -> Result<&Snapshot, Failure> {
+pub(crate) fn only(running: &[Found]) -> Result<&Found, Failure> {
     if let [one] = running {
-        return Ok(&one.status);
+        return Ok(one);
     }
-    let pids: Vec<_> = running.iter().map(|found| found.status.pid.to_string()).collect();
+    let pids: Vec<_> = running.iter().map(|found| found.pid.to_string()).collect();
     let several = format!("{} holods are running, {}: name one with --pid", pids.len(), pids.join(" and "));
     Err(Failure::new(Exit::Usage, several))
 }
@@ -239,8 +256,8 @@ fn of_running_in(folders: &[PathBuf], now: TimeNs) -> Result<Vec<Found>, Failure
                 Err(error) => note_closed(&mut closed, &path, error),
             }
         }
-        found.sort_by_key(|found| found.status.pid);
-        found.retain(|one| running.iter().all(|other| other.status.pid != one.status.pid));
+        found.sort_by_key(|found| found.pid);
+        found.retain(|one| running.iter().all(|other| other.pid != one.pid));
         running.extend(found);
     }
     if !running.is_empty() {
@@ -273,14 +290,16 @@ fn read(path: &Path, now: TimeNs) -> std::io::Result<Option<Found>> {
     if !(name.starts_with("status-") && name.ends_with(".json")) {
         return Ok(None);
     }
-    let written = serde_json::from_slice::<Written<Snapshot>>(&read_file(path)?);
-    let Ok(Written { written_ns, began_ticks, mut status }) = written else { return Ok(None) };
-    // The socket is beside the file; its folder's name may be none that JSON can say.
-    status.control = status.control.and_then(|socket| Some(path.with_file_name(socket.file_name()?)));
-    let lives = name == file_name(status.pid) && lives(status.pid, began_ticks);
-    let age_ns = written_ns.map_or(0, |written_ns| now.0.saturating_sub(written_ns).max(0));
-    let stale = (age_ns > STALE.0).then(|| Duration::from_nanos(age_ns.unsigned_abs()));
-    Ok(lives.then_some(Found { status, stale }))
+    let bytes = read_file(path)?;
+    let written = serde_json::from_slice::<Written<Owner>>(&bytes);
+    let Ok(Written { written_ns, began_ticks, status: Owner { pid, control } }) = written else { return Ok(None) };
+    if name != file_name(pid) || !lives(pid, began_ticks) {
+        return Ok(None);
+    }
+    // It is beside the file; its folder's name may be none that JSON can say.
+    let control = control.and_then(|socket| Some(path.with_file_name(socket.file_name()?)));
+    let age = written_ns.map_or(TimeNs(0), |written_ns| TimeNs(now.0.saturating_sub(written_ns)));
+    Ok(Some(Found { pid, control, status: serde_json::from_slice(&bytes).ok(), stale: stale(age) }))
 }
 
 /// What a file holds, as far as a status goes; nothing of a link, a FIFO, which would be waited for, or a device.
@@ -325,7 +344,8 @@ mod tests {
         let mut file = StatusFile::of(std::process::id(), folder.path());
         file.write(&status(), NOW);
         assert!(file.newest.wait_until_done(LONG));
-        assert_eq!(found_in(&folders).unwrap(), [Found { status: status(), stale: None }]);
+        let found = Found { pid: std::process::id(), control: None, status: Some(status()), stale: None };
+        assert_eq!(found_in(&folders).unwrap(), [found]);
         drop(file);
         assert!(found_in(&folders).is_err());
     }
@@ -380,6 +400,18 @@ mod tests {
         assert_eq!(found_in(&folders).unwrap()[0].stale, None);
         std::fs::write(&own, "{").unwrap();
         assert!(found_in(&folders).is_err());
+    }
+
+    #[test]
+    fn a_holod_that_lives_is_found_though_its_status_cannot_be_understood() {
+        let folder = tempfile::tempdir().unwrap();
+        let (pid, control) = (std::process::id(), PathBuf::from("/run/holod/control-1"));
+        let mut of_another_version =
+            serde_json::to_value(Snapshot { control: Some(control.clone()), ..status() }).unwrap();
+        of_another_version["uptime_s"] = "a while".into();
+        std::fs::write(folder.path().join(file_name(pid)), of_another_version.to_string()).unwrap();
+        let found = Found { pid, control: Some(control), status: None, stale: None };
+        assert_eq!(found_in(&[folder.path().to_owned()]).unwrap(), [found]);
     }
 
     #[test]
@@ -462,7 +494,7 @@ mod tests {
             assert!(file.newest.wait_until_done(LONG));
             file
         });
-        let pids = || found_in(&folders).unwrap().iter().map(|found| found.status.pid).collect::<Vec<_>>();
+        let pids = || found_in(&folders).unwrap().iter().map(|found| found.pid).collect::<Vec<_>>();
         assert_eq!(pids(), [1, std::process::id()]);
         drop(other);
         assert_eq!(pids(), [1]);

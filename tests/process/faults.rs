@@ -388,6 +388,27 @@ fn a_second_holod_on_a_tracker_is_refused_and_the_first_goes_on() {
     assert!(first.wait(PATIENCE).status.success());
 }
 
+#[test]
+fn a_holod_that_stands_still_is_not_said_to_run() {
+    let folder = bench();
+    let daemon = Daemon::start_with(HOLOD, &ARGS, folder.path(), &[("XDG_RUNTIME_DIR", folder.path())]);
+    frames_go_on(folder.path());
+    let text = ask(folder.path(), &["status"]);
+    assert!(text.status.success() && text.stdout.contains(", up for "), "{text:?}");
+    assert_eq!(status(folder.path())["stale_s"], Value::Null);
+    daemon.signal(Signal::STOP);
+    assert!(wait_until(PATIENCE, || status(folder.path())["stale_s"].as_f64() > Some(5.0)));
+    for args in [&["status", "--json"][..], &["status"]] {
+        let told = ask(folder.path(), args);
+        assert_eq!(told.status.code(), Some(69), "{told:?}");
+        assert!(told.stdout.contains("running") && told.stderr.contains("its loop does not turn"), "{told:?}");
+    }
+    daemon.signal(Signal::CONT);
+    assert!(wait_until(PATIENCE, || ask(folder.path(), &["status"]).status.success()));
+    daemon.signal(Signal::TERM);
+    daemon.wait(PATIENCE);
+}
+
 /// Gives a program a wall clock of its own, which a file sets.
 fn faked_wall_clock() -> PathBuf {
     let folders = fs::read_dir("/usr/lib").unwrap();

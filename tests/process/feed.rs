@@ -319,7 +319,7 @@ fn a_picture_that_is_too_bright_and_too_near_is_told_though_it_is_enlarged() {
         (&12.into(), &5.into())
     );
     let text = said_of(&daemon, folder.path(), &[]);
-    assert!(text.contains("colours clipped in 5 of them, in pixels: 2081 above white"), "{text}");
+    assert!(text.contains("colours clipped in 5 pictures, in pixels: 2081 above white"), "{text}");
     daemon.signal(Signal::TERM);
     let ended = daemon.wait(PATIENCE);
     assert!(ended.status.success(), "{}", ended.stderr);

@@ -15,7 +15,8 @@ pub(super) fn report(args: &ReportArgs) -> Result<(), Failure> {
             Contents::of_record(folder, !args.without_scene, &scrubber)
         })?,
         None => {
-            let running = status::of_running().map(|found| found.into_iter().map(|found| found.status).collect());
+            let running =
+                status::of_running().map(|found| found.into_iter().filter_map(|found| found.status).collect());
             Contents::of_running(running, &scrubber)?
         }
     };

@@ -1,24 +1,42 @@
 //! `holod status`: what the running daemon says of itself.
 
 use crate::cli::StatusArgs;
-use crate::failure::Failure;
-use crate::snapshot::Snapshot;
+use crate::failure::{Exit, Failure};
+use crate::snapshot::{Snapshot, SnapshotNow};
 use crate::status::{self, Found};
 use crate::{results, run_text};
 
 pub(super) fn status(args: &StatusArgs) -> Result<(), Failure> {
     let running = status::of_running_as(args.pid)?;
-    for Found { status, stale } in &running {
-        if let Some(age) = stale {
-            let (pid, age_s) = (status.pid, age.as_secs_f64());
-            tracing::warn!("process {pid} wrote its status {age_s:.0} s ago: its loop does not turn");
+    if args.json {
+        let Found { status, stale, .. } = status::only(&running)?;
+        if let Some(status) = status {
+            results::print_json(&SnapshotNow { snapshot: status, stale_s: stale.map(|age| age.as_secs_f64()) })?;
+        }
+    } else {
+        let texts: Vec<_> = running.iter().filter_map(|found| found.status.as_ref()).map(text_of).collect();
+        if !texts.is_empty() {
+            results::print(&texts.join("\n\n"))?;
         }
     }
-    if args.json {
-        return results::print_json(status::only(&running)?);
+    let troubles: Vec<_> = running.iter().filter_map(trouble_of).collect();
+    if troubles.is_empty() { Ok(()) } else { Err(Failure::new(Exit::Unavailable, troubles.join("\n"))) }
+}
+
+/// Why a status does not say how the run is now.
+fn trouble_of(Found { pid, status, stale, .. }: &Found) -> Option<String> {
+    match (status, stale) {
+        (None, _) => Some(format!(
+            "process {pid} runs, but its status cannot be understood: is it of another version? `holod ctl --pid {pid}` \
+             may reach it"
+        )),
+        (Some(_), Some(age)) => Some(format!(
+            "process {pid} wrote its status {:.0} s ago: its loop does not turn; the lasers may be lit: `holod dark \
+             --config RIG` puts them out beside it",
+            age.as_secs_f64()
+        )),
+        (Some(_), None) => None,
     }
-    let texts: Vec<_> = running.iter().map(|found| text_of(&found.status)).collect();
-    results::print(&texts.join("\n\n"))
 }
 
 fn text_of(status: &Snapshot) -> String {
@@ -46,7 +64,7 @@ fn text_of(status: &Snapshot) -> String {
     });
     let record = figures.record.as_ref().map_or(String::new(), |record| format!("\nrecord   {}", record.text()));
     format!(
-        "{} for {:.0} s, process {}, {}{}\n\
+        "{}, up for {:.0} s, process {}, {}{}\n\
          pupil    {}, {}; eye: {}\n\
          tracker  {}: link {}{}\n\
          \x20        {}\n\

@@ -1,8 +1,9 @@
 //! The other end of the control socket.
 
-use std::io::{BufRead, BufReader, Write};
+use std::io::{self, ErrorKind, Read, Write};
+use std::os::unix::net::UnixStream;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
@@ -12,6 +13,8 @@ use crate::local_socket::connect_within;
 
 /// Longer than a scene of the largest size takes to read.
 const PATIENCE: Duration = Duration::from_secs(120);
+/// Bytes of the longest answer.
+const LONGEST: usize = 1 << 20;
 /// A holod that turns lets everybody in within this time.
 const CONNECT_PATIENCE: Duration = Duration::from_secs(3);
 
@@ -40,21 +43,46 @@ pub fn ask(socket: &Path, request: &Request) -> Result<Value, Failure> {
         )
     };
     let mut stream = connect_within(socket, CONNECT_PATIENCE).map_err(gone)?;
-    stream.set_read_timeout(Some(PATIENCE)).map_err(gone)?;
     let mut line = serde_json::to_vec(request).map_err(Failure::because(Exit::Software))?;
     line.push(b'\n');
     stream.write_all(&line).map_err(gone)?;
-    let mut answer = String::new();
-    BufReader::new(stream).read_line(&mut answer).map_err(unanswered)?;
-    match serde_json::from_str(&answer) {
+    let answer = read_line(&mut stream, Instant::now() + PATIENCE).map_err(unanswered)?;
+    match serde_json::from_slice(&answer) {
         Ok(Answer::Ok(value)) => Ok(value),
         Ok(Answer::Error(why) | Answer::Unanswered(why)) => Err(Failure::new(Exit::Unavailable, why)),
         Err(_) => Err(unanswered(std::io::ErrorKind::UnexpectedEof.into())),
     }
 }
 
+/// One line, as far as it comes before the end of the stream.
+///
+/// # Errors
+/// It is too long, or does not come until `t_end`.
+fn read_line(stream: &mut UnixStream, t_end: Instant) -> io::Result<Vec<u8>> {
+    let mut line = Vec::new();
+    let mut part = [0; 1 << 12];
+    while !line.ends_with(b"\n") {
+        let left = t_end.saturating_duration_since(Instant::now());
+        if left.is_zero() {
+            return Err(ErrorKind::TimedOut.into());
+        }
+        stream.set_read_timeout(Some(left))?;
+        match stream.read(&mut part) {
+            Ok(0) => break,
+            Ok(length) => line.extend_from_slice(&part[..length]),
+            Err(error) if error.kind() == ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
+        }
+        if line.len() > LONGEST {
+            return Err(io::Error::other(format!("its answer is longer than {LONGEST} bytes: is it holod?")));
+        }
+    }
+    Ok(line)
+}
+
 #[cfg(test)]
 mod tests {
+    use std::io::{BufRead, BufReader};
     use std::os::unix::net::UnixListener;
 
     use super::*;
@@ -85,5 +113,20 @@ mod tests {
         assert!(holod.join().unwrap().contains("pause") && unanswered.contains("is not known"), "{unanswered}");
         let unheard = ask(&path, &Request::Pause {}).unwrap_err().to_string();
         assert!(unheard.contains("does not answer there") && !unheard.contains("is not known"), "{unheard}");
+    }
+
+    #[test]
+    fn an_answer_without_an_end_is_given_up() {
+        let (mut ours, mut theirs) = UnixStream::pair().unwrap();
+        let sends = std::thread::spawn(move || while theirs.write_all(&[b'x'; 4096]).is_ok() {});
+        let late = Instant::now() + PATIENCE;
+        assert!(read_line(&mut ours, late).unwrap_err().to_string().contains("longer than 1048576 bytes"));
+        drop(ours);
+        sends.join().unwrap();
+        let (mut ours, mut theirs) = UnixStream::pair().unwrap();
+        theirs.write_all(b"{").unwrap();
+        assert!(read_line(&mut ours, Instant::now()).is_err(), "no byte is waited for beyond the end");
+        theirs.write_all(b"}\n").unwrap();
+        assert_eq!(read_line(&mut ours, late).unwrap(), b"{}\n");
     }
 }

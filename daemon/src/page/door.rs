@@ -15,7 +15,6 @@ use subtle::ConstantTimeEq;
 use super::live::{Live, Refused};
 
 const SHORTEST: usize = 16;
-const COOKIE_NAME: &str = "holod_token";
 
 /// The secret that opens the page to other machines.
 pub(super) struct Token(pub(super) String);
@@ -116,10 +115,9 @@ impl Door {
             }
             Self::Token(token) => {
                 if let Some(offered) = in_query(query).filter(|offered| token.is(offered)) {
-                    return Admission::ByCookie(let_in(offered));
+                    return Admission::ByCookie(let_in(offered, headers));
                 }
-                let offered = bearer(headers).or_else(|| in_cookies(headers));
-                if offered.is_some_and(|offered| token.is(offered)) {
+                if bearer(headers).into_iter().chain(in_cookies(headers)).any(|offered| token.is(offered)) {
                     return Admission::In;
                 }
                 let said = "a token is needed, the content of the file that holod was given with --page-token: open \
@@ -144,8 +142,8 @@ pub(super) async fn admit(State(keeper): State<Arc<Doorkeeper>>, request: Reques
 
 /// Takes the token out of the address bar into a cookie. It comes with a link on another page, too, which the page can
 /// afford as it only tells; what another page loads by itself comes without.
-fn let_in(token: &str) -> Response {
-    let cookie = format!("{COOKIE_NAME}={token}; HttpOnly; SameSite=Lax; Path=/");
+fn let_in(token: &str, headers: &HeaderMap) -> Response {
+    let cookie = format!("{}={token}; HttpOnly; SameSite=Lax; Path=/", cookie_name(headers));
     let cookie = HeaderValue::from_str(&cookie).expect("a token has letters, digits, - and _");
     (StatusCode::SEE_OTHER, [(LOCATION, HeaderValue::from_static("/")), (SET_COOKIE, cookie)]).into_response()
 }
@@ -155,12 +153,21 @@ fn in_query(query: Option<&str>) -> Option<&str> {
 }
 
 fn bearer(headers: &HeaderMap) -> Option<&str> {
-    text(headers, AUTHORIZATION.as_str()).strip_prefix("Bearer ").map(str::trim)
+    let (scheme, offered) = text(headers, AUTHORIZATION.as_str()).split_once(' ')?;
+    scheme.eq_ignore_ascii_case("Bearer").then(|| offered.trim())
 }
 
-fn in_cookies(headers: &HeaderMap) -> Option<&str> {
+fn in_cookies(headers: &HeaderMap) -> impl Iterator<Item = &str> {
+    let own_name = cookie_name(headers);
     let cookies = text(headers, COOKIE.as_str()).split(';').map(str::trim);
-    cookies.filter_map(|cookie| cookie.split_once('=')).find(|(name, _)| *name == COOKIE_NAME).map(|(_, value)| value)
+    let named = cookies.filter_map(|cookie| cookie.split_once('='));
+    named.filter(move |(name, _)| *name == own_name).map(|(_, value)| value)
+}
+
+/// The cookie has the name of the port that the browser asked: it keeps those of all ports of a machine together.
+fn cookie_name(headers: &HeaderMap) -> String {
+    let port = text(headers, HOST.as_str()).rsplit_once(':').and_then(|(_, port)| port.parse::<u16>().ok());
+    port.map_or("holod_token".to_owned(), |port| format!("holod_token_{port}"))
 }
 
 fn text<'a>(headers: &'a HeaderMap, name: &str) -> &'a str {
@@ -200,6 +207,26 @@ mod tests {
         ] {
             assert!(!is_own_name(other), "{other}");
         }
+    }
+
+    #[test]
+    fn a_token_is_known_by_its_ports_cookie_among_others_and_by_its_header() {
+        const TOKEN: &str = "0123456789abcdef";
+        let door = Door::Token(Token(TOKEN.into()));
+        let headers = |pairs: &[(&str, &str)]| {
+            let header = |text: &str| HeaderValue::from_str(text).unwrap();
+            pairs.iter().map(|(name, text)| (name.parse().unwrap(), header(text))).collect::<HeaderMap>()
+        };
+        let is_in = |pairs: &[(&str, &str)]| matches!(door.decide(None, &headers(pairs)), Admission::In);
+        let asked = headers(&[("host", "bench:8431")]);
+        let Admission::ByCookie(answer) = door.decide(Some(&format!("token={TOKEN}")), &asked) else { panic!() };
+        let cookie = answer.headers()[SET_COOKIE].to_str().unwrap().split(';').next().unwrap().to_owned();
+        assert_eq!(cookie, format!("holod_token_8431={TOKEN}"));
+        let both = format!("holod_token_8432=of-the-other-holod; holod_token_8431=an-older-one; {cookie}");
+        assert!(is_in(&[("host", "bench:8431"), ("cookie", &both)]));
+        assert!(!is_in(&[("host", "bench:8432"), ("cookie", &both)]));
+        assert!(is_in(&[("authorization", &format!("bearer {TOKEN}"))]));
+        assert!(!is_in(&[("authorization", TOKEN)]));
     }
 
     #[test]

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use arc_swap::ArcSwapOption;
 use axum::body::Bytes;
+use holod_calibration::TimeNs;
 use serde::Serialize;
 use tokio::sync::broadcast;
 
@@ -23,12 +24,19 @@ const IN_FLIGHT: usize = 32;
 #[derive(Default)]
 pub(super) struct Live {
     /// The newest; nothing before the first.
-    pub(super) snapshot: ArcSwapOption<Snapshot>,
+    pub(super) snapshot: ArcSwapOption<Published>,
     pub(super) latencies: Latencies,
     pub(super) viewers: AtomicUsize,
     /// Requests that were refused.
     pub(super) refused: TallyBy<Refused>,
     channel: Mutex<Channel>,
+}
+
+/// How the run was.
+pub(super) struct Published {
+    pub(super) snapshot: Snapshot,
+    /// When, on the host's clock.
+    pub(super) t: TimeNs,
 }
 
 /// Why a request was refused.
@@ -77,10 +85,10 @@ impl Default for Channel {
 }
 
 impl Live {
-    /// Tells everybody how the run is.
-    pub(super) fn publish(&self, snapshot: &Snapshot) {
+    /// Tells everybody how the run is at host time `t`.
+    pub(super) fn publish(&self, snapshot: &Snapshot, t: TimeNs) {
         let event = event("snapshot", snapshot);
-        self.snapshot.store(Some(Arc::new(snapshot.clone())));
+        self.snapshot.store(Some(Arc::new(Published { snapshot: snapshot.clone(), t })));
         let mut channel = self.channel();
         channel.newest_snapshot = Some(event.clone());
         channel.send(event);
@@ -204,8 +212,8 @@ mod tests {
     #[test]
     fn a_newcomer_is_told_what_was_and_then_what_comes() {
         let live = Live::default();
-        live.publish(&Snapshot { state: "dark".into(), ..Snapshot::default() });
-        live.publish(&Snapshot { state: "running".into(), ..Snapshot::default() });
+        live.publish(&Snapshot { state: "dark".into(), ..Snapshot::default() }, TimeNs(0));
+        live.publish(&Snapshot { state: "running".into(), ..Snapshot::default() }, TimeNs(0));
         for t in 0..REMEMBERED + 5 {
             live.hand_out(Batch { light: vec![Light(t as f64, None, None)], ..Batch::default() });
         }

@@ -7,6 +7,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
+use holod_calibration::host_now;
 use prometheus_client::collector::Collector;
 use prometheus_client::encoding::{DescriptorEncoder, EncodeLabelSet, EncodeMetric, text};
 use prometheus_client::metrics::counter::ConstCounter;
@@ -74,7 +75,11 @@ impl Collector for OfSnapshot {
         told.counters("page_refused", "Requests that the status page refused", "reason", live.refused.each())?;
         told.counter("log_lines_lost", "Lines that standard error did not take", logging::lines_lost())?;
         match &*live.snapshot.load() {
-            Some(snapshot) => of_run(&mut told, snapshot),
+            Some(published) => {
+                let age_s = (host_now() - published.t).seconds();
+                told.gauge("snapshot_age", "How old the figures of the run are", Some(Unit::Seconds), age_s)?;
+                of_run(&mut told, &published.snapshot)
+            }
             None => Ok(()),
         }
     }
@@ -268,7 +273,7 @@ mod tests {
         let mut snapshot = Snapshot { orders_refused: [("busy".to_owned(), 5)].into(), ..Snapshot::default() };
         snapshot.figures.tracker_counts = tracker_counts;
         snapshot.figures.feed = Some(feed);
-        live.publish(&snapshot);
+        live.publish(&snapshot, host_now());
         let told = text(&registry(&live));
         let has = |line: &str| told.lines().any(|told| told == line);
         for (count, reason) in Rejection::ALL.into_iter().enumerate() {

@@ -23,7 +23,7 @@ mod server;
 
 use std::sync::Arc;
 
-use holod_calibration::TimeNs;
+use holod_calibration::{TimeNs, host_now};
 use holod_pupil_input::{Decision, Verdict};
 use holod_slm_output::FieldEvent;
 
@@ -143,7 +143,7 @@ impl Observer for Page {
     }
 
     fn snapshot(&mut self, snapshot: &Snapshot) {
-        self.live.publish(snapshot);
+        self.live.publish(snapshot, host_now());
     }
 
     fn tick(&mut self) -> Result<(), Failure> {

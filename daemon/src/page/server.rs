@@ -18,7 +18,7 @@ use axum::middleware::{from_fn_with_state, map_response};
 use axum::response::{IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, Router};
-use holod_calibration::Dioptres;
+use holod_calibration::{Dioptres, host_now};
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
@@ -43,6 +43,8 @@ use super::metrics;
 use crate::cli::{focus_of_an_eye, human_pupil};
 use crate::local_socket::{self, SocketPlace};
 use crate::session::scheduling;
+use crate::snapshot::SnapshotNow;
+use crate::status::stale;
 
 /// Connections at once; further ones are closed. A browser has up to six.
 const CONNECTIONS: usize = 256;
@@ -306,10 +308,11 @@ async fn eye_picture(State(shown): State<Shown>, query: Result<Query<EyeQuery>, 
 }
 
 async fn status(State(shown): State<Shown>) -> Response {
-    match shown.live.snapshot.load_full() {
-        Some(snapshot) => Json(&*snapshot).into_response(),
-        None => over(),
-    }
+    let Some(published) = shown.live.snapshot.load_full() else { return over() };
+    let stale = stale(host_now() - published.t);
+    let now = SnapshotNow { snapshot: &published.snapshot, stale_s: stale.map(|age| age.as_secs_f64()) };
+    let code = if stale.is_some() { StatusCode::SERVICE_UNAVAILABLE } else { StatusCode::OK };
+    (code, Json(now)).into_response()
 }
 
 async fn figures(State(shown): State<Shown>) -> Response {
@@ -325,8 +328,13 @@ mod tests {
     use std::io::Write;
     use std::os::unix::net::UnixStream;
 
+    use std::io::Read;
+
+    use holod_calibration::TimeNs;
+
     use super::super::live::{Batch, Light};
     use super::*;
+    use crate::snapshot::Snapshot;
 
     /// Short, so that the test is; a viewer is never closed for being slow to read less than its socket takes.
     const SHORT: Duration = Duration::from_millis(200);
@@ -339,17 +347,49 @@ mod tests {
         }
     }
 
+    /// Serves `live` at a socket.
+    fn served(path: &std::path::Path, live: &Arc<Live>, patience: Duration) -> Runtime {
+        let runtime =
+            tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_io().enable_time().build().unwrap();
+        let inside = runtime.enter();
+        let (listener, ..) = Listener::bind(&PageAddress::Unix(path.to_owned())).unwrap();
+        let router = router(Door::Open, Arc::clone(live), EyeDesk::default());
+        runtime.spawn(serve(listener, router, Arc::clone(live), patience));
+        drop(inside);
+        runtime
+    }
+
+    #[test]
+    fn figures_of_a_loop_that_does_not_turn_are_told_from_those_of_one_that_does() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("page");
+        let live = Arc::new(Live::default());
+        let _runtime = served(&path, &live, PATIENCE);
+        let get = |page: &str| {
+            let mut stream = UnixStream::connect(&path).unwrap();
+            write!(stream, "GET {page} HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n").unwrap();
+            let mut answer = String::new();
+            stream.read_to_string(&mut answer).unwrap();
+            answer
+        };
+        let running = Snapshot { state: "running".into(), ..Snapshot::default() };
+        live.publish(&running, host_now() + TimeNs(3_600_000_000_000));
+        let now = get("/status.json");
+        assert!(now.starts_with("HTTP/1.1 200") && now.contains("\"stale_s\":null"), "{now}");
+        live.publish(&running, host_now() - TimeNs(60_000_000_000));
+        let old = get("/status.json");
+        assert!(old.starts_with("HTTP/1.1 503") && old.contains("\"state\":\"running\""), "{old}");
+        assert!(old.contains("\"stale_s\":6"), "{old}");
+        let figures = get("/metrics");
+        assert!(figures.starts_with("HTTP/1.1 200") && figures.contains("\nholod_snapshot_age_seconds 6"), "{figures}");
+    }
+
     #[test]
     fn a_viewer_who_takes_nothing_loses_its_place() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("page");
         let live = Arc::new(Live::default());
-        let runtime =
-            tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_io().enable_time().build().unwrap();
-        let _inside = runtime.enter();
-        let (listener, ..) = Listener::bind(&PageAddress::Unix(path.clone())).unwrap();
-        let router = router(Door::Open, Arc::clone(&live), EyeDesk::default());
-        runtime.spawn(serve(listener, router, Arc::clone(&live), SHORT));
+        let _runtime = served(&path, &live, SHORT);
         let mut viewer = UnixStream::connect(&path).unwrap();
         viewer.write_all(b"GET /events HTTP/1.1\r\nHost: x\r\n\r\n").unwrap();
         let watching = || live.viewers.load(Ordering::Relaxed);
