@@ -59,6 +59,15 @@ def network(name: str) -> Estimate | None:
     return estimate
 
 
+def middle(picture: NDArray[Any], size_px: tuple[int, int]) -> NDArray[Any]:
+    """The largest part of a picture around its middle that has the shape of the size."""
+    height, width = picture.shape[:2]
+    size_x, size_y = size_px
+    part_x, part_y = min(width, height * size_x // size_y), min(height, width * size_y // size_x)
+    left, top = (width - part_x) // 2, (height - part_y) // 2
+    return picture[top : top + part_y, left : left + part_x]
+
+
 def pictures(source: str, size_px: tuple[int, int], seconds: float) -> Iterator[tuple[NDArray[Any], int]]:
     """RGB of one size, and when it was taken: a camera by its number, or each picture of a folder for some seconds."""
     if source.isdecimal():
@@ -67,11 +76,11 @@ def pictures(source: str, size_px: tuple[int, int], seconds: float) -> Iterator[
             found, bgr = camera.read()
             if not found:
                 sys.exit(f"error: camera {source} gives no picture")
-            yield cv2.cvtColor(cv2.resize(bgr, size_px), cv2.COLOR_BGR2RGB), time.monotonic_ns()
+            yield cv2.cvtColor(cv2.resize(middle(bgr, size_px), size_px), cv2.COLOR_BGR2RGB), time.monotonic_ns()
     for path in sorted(Path(source).iterdir()):
         picture = cv2.imread(str(path))
         if picture is not None:
-            yield cv2.cvtColor(cv2.resize(picture, size_px), cv2.COLOR_BGR2RGB), 0
+            yield cv2.cvtColor(cv2.resize(middle(picture, size_px), size_px), cv2.COLOR_BGR2RGB), 0
             time.sleep(seconds)
 
 
@@ -80,7 +89,7 @@ def main() -> None:
     parser.add_argument("source", help="a camera's number, or a folder of pictures")
     parser.add_argument("--near", type=float, default=2.5, metavar="DPT", help="the display's nearest distance")
     parser.add_argument("--far", type=float, default=0.0, metavar="DPT", help="the display's farthest distance")
-    parser.add_argument("--size", default="640x480", metavar="WxH", help="to which pictures are brought")
+    parser.add_argument("--size", default="640x480", metavar="WxH", help="to which pictures are cut and brought")
     parser.add_argument("--seconds", type=float, default=2.0, help="for each picture of a folder")
     parser.add_argument(
         "--network", default="depth-anything/Depth-Anything-V2-Small-hf", help="on the Hugging Face hub"

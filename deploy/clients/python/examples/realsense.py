@@ -37,7 +37,9 @@ def capture_time_ns(frame: Any, domains: set[Any]) -> int:
     """On the clock of time.monotonic_ns(); 0 where the camera tells the time of another clock than the computer's."""
     if frame.get_frame_timestamp_domain() not in domains:
         return 0
-    return time.monotonic_ns() - (time.time_ns() - int(frame.get_timestamp() * 1e6))
+    # The wall clock may have been set since the frame was taken.
+    age_ns = max(0, time.time_ns() - int(frame.get_timestamp() * 1e6))
+    return max(0, time.monotonic_ns() - age_ns)
 
 
 def main() -> None:

@@ -115,7 +115,7 @@ class Control:
 
     def pupil(self, mm: float | None) -> str:
         """Computes for one pupil, in millimetres, whatever the tracker says; None follows the tracker again."""
-        return self.ask("pupil", mm=mm)
+        return self.ask("pupil", mm=None if mm is None else float(mm))
 
     def eye(self, eye: str) -> str:
         """Follows another eye: "left", "right", "both" (their mean) or "better" (of which the tracker is surer)."""
@@ -148,7 +148,7 @@ class Control:
         """Keeps the lasers dark. Raises ControlError where the box does not acknowledge that: look at the lasers.
 
         Where holod's control thread hangs, the lasers are put out beside it, and UnansweredError says whether the box
-        acknowledged. Where holod hangs as a whole or is not there, `holod dark --config RIG` puts them out beside it."""
+        acknowledged. Where holod hangs as a whole, or is not there, `holod dark --config RIG` puts them out."""
         return self.ask("lasers-dark")
 
     def lasers_arm(self) -> str:

@@ -11,7 +11,7 @@ import os
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -71,9 +71,12 @@ _OUTCOMES = ("taken", "overtaken", "refused", "not_shown")
 
 @dataclass
 class Slot:
-    """Shared memory for one picture. What it holds at first is an old one, or 0.
+    """Shared memory for one picture, to be written into: slot.colour[...] = picture. What it holds at first is an old
+    one, or 0.
 
-    A masked array that is assigned to it loses its mask, without a word of numpy: assign what its filled() gives."""
+    numpy converts and repeats what is assigned, without a word: of floats from 0 to 1 the 8-bit colours are black, of
+    metres the millimetres are 1 or 2, one row becomes all of them, and a masked array loses its mask. `Feed.send`
+    checks all that."""
 
     colour: NDArray[Any]
     """of the shape and type of the feed's `Colour`"""
@@ -187,14 +190,20 @@ class Feed:
         """Gives the memory for a picture to write into, and hands it over at the end of the block; not where that
         raises. The slot's arrays are read-only afterwards; their slices must not be written to either.
 
-        Raises FeedTimeoutError, FeedError; ValueError for a time or a view that cannot be, or a view that the feed does
-        not tell; TypeError for a time that is no whole number.
+        Raises FeedTimeoutError, FeedError; ValueError for a time or a view that cannot be, a view that the feed does
+        not tell, or an array that was put in the place of the slot's own; TypeError for a time that is no whole number.
         """
         index = self._begin()
         slot = self._slot(index)
+        colour, depth = slot.colour, slot.depth
         try:
             yield slot
+            for label, own, found in (("colour", colour, slot.colour), ("depth", depth, slot.depth)):
+                if found is not own:
+                    raise ValueError(f"{label}: found another array in the slot's place: slot.{label}[...] = ...")
             self._check_view(slot)
+            if self._sequence == messages.MOST_SEQUENCE:
+                raise FeedError("this feed has no numbers left for pictures: open it again")
             # In here as well, so that nothing that cannot be said costs a slot.
             view = (slot.focus_dpt, slot.field_of_view_deg)
             message = messages.fram(index, self._sequence + 1, _time(slot.t_capture_ns), *view)
@@ -202,8 +211,8 @@ class Feed:
             self._free.add(index)
             raise
         finally:
-            slot.colour.flags.writeable = False
-            slot.depth.flags.writeable = False
+            colour.flags.writeable = False
+            depth.flags.writeable = False
         self._say(message)
         self._sent.add(index)
         self._sequence += 1
@@ -234,6 +243,9 @@ class Feed:
     def close(self) -> None:
         """Does not wait. The last picture stays on the panel. May be called again."""
         if self._socket is not None:
+            # A program that was forked has the socket, too, and would keep the place of this feed.
+            with suppress(OSError):
+                self._socket.shutdown(socket.SHUT_RDWR)
             self._socket.close()
             self._socket = None
             # Not closed: arrays of a slot may still look into it.
@@ -481,10 +493,8 @@ def _whole(label: str, number: object, expected: str) -> int:
 
 def _time(t_capture_ns: object) -> int:
     time_ns = _whole("t_capture_ns", t_capture_ns, "whole nanoseconds, as time.monotonic_ns() tells them")
-    if not -messages.MOST_TIME_NS - 1 <= time_ns <= messages.MOST_TIME_NS:
-        raise ValueError(
-            f"t_capture_ns: found {time_ns}, expected {-messages.MOST_TIME_NS - 1} to {messages.MOST_TIME_NS}"
-        )
+    if not 0 <= time_ns <= messages.MOST_TIME_NS:
+        raise ValueError(f"t_capture_ns: found {time_ns}, expected 0 to {messages.MOST_TIME_NS}")
     return time_ns
 
 

@@ -154,6 +154,10 @@ class FakeHolod:
         self.connection.send(b"NOPE" + text.encode())
         self.connection.close()
 
+    def wait_for_the_end(self) -> None:
+        """Of the connection, by its client."""
+        assert self.connection.recv(4096) == b""
+
     def die(self) -> None:
         self._work.join()
         self.connection.close()

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 
+import numpy as np
 import pytest
 
 from holod_client import Control, ControlError, UnansweredError
@@ -174,6 +175,13 @@ def test_what_a_holod_whose_control_thread_hangs_has_done_is_not_known(fake: Fak
         fake.answer = ok
         assert control.status() == "did status"
     assert len(fake.connections) == 1
+
+
+def test_a_pupil_may_be_a_number_of_numpys(fake: FakeControl) -> None:
+    with Control(fake.path) as control:
+        for mm in (np.float32(3.5), np.int64(4), None):
+            control.pupil(mm)
+    assert [request["mm"] for request in fake.requests] == [3.5, 4, None]
 
 
 def test_a_closed_control_sends_nothing(fake: FakeControl) -> None:

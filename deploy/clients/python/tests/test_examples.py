@@ -50,6 +50,9 @@ def test_a_cameras_time_is_of_the_monotonic_clock(monkeypatch: pytest.MonkeyPatc
     frame = SimpleNamespace(get_timestamp=lambda: 1_700_000_000_000.0, get_frame_timestamp_domain=lambda: "system")
     assert realsense.capture_time_ns(frame, {"system"}) == 5_000_000_000 - 40_000_000
     assert realsense.capture_time_ns(frame, {"global"}) == 0
+    for set_by_ns, expected_ns in [(-3_600_000_000_000, 5_000_000_000), (3_600_000_000_000, 0)]:
+        clocks.time_ns = lambda set_by_ns=set_by_ns: 1_700_000_000_040_000_000 + set_by_ns
+        assert realsense.capture_time_ns(frame, {"system"}) == expected_ns
 
 
 def test_relative_depth_fills_the_displays_range(monocular: ModuleType) -> None:
@@ -58,6 +61,18 @@ def test_relative_depth_fills_the_displays_range(monocular: ModuleType) -> None:
     assert dioptres.dtype == np.float32
     np.testing.assert_allclose(dioptres, [[0.5, 1.5], [1.0, 2.5]])
     np.testing.assert_allclose(monocular.dioptres(relative * 30 - 4, 2.5, 0.5), dioptres, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected"), [((480, 640), (480, 640)), ((600, 900), (600, 800)), ((1000, 400), (300, 400))]
+)
+def test_pictures_are_cut_and_not_stretched(
+    monocular: ModuleType, shape: tuple[int, int], expected: tuple[int, int]
+) -> None:
+    picture = np.arange(np.prod(shape)).reshape(shape)
+    part = monocular.middle(picture, (640, 480))
+    assert part.shape == expected
+    assert abs(int(part[0, 0]) + int(part[-1, -1]) - int(picture[-1, -1])) <= shape[1]
 
 
 def test_relative_depth_that_is_not_there(monocular: ModuleType) -> None:
