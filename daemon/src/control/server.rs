@@ -2,11 +2,11 @@
 //! real-time thread waits for either.
 
 use std::cell::Cell;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::BTreeMap;
 use std::io;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicUsize, Ordering};
 use std::sync::{Arc, mpsc};
 use std::time::{Duration, Instant};
 
@@ -21,7 +21,7 @@ use super::{Answer, Order, Ordered, Preparer, Request};
 use crate::local_socket::{self, LOOK, SocketPlace};
 use crate::tally_by::{Reason, TallyBy};
 
-/// Connections at once. A further one takes the place of the oldest, so that nobody who only holds on keeps others out.
+/// Connections at once. A further one takes the place of another, so that nobody who only holds on keeps others out.
 const CONNECTIONS: usize = 32;
 /// The longest request, in bytes.
 const LONGEST: u64 = 1 << 16;
@@ -121,7 +121,7 @@ impl Drop for ControlServer {
 }
 
 async fn serve(mut listener: UnixListener, place: Arc<SocketPlace>, desk: Arc<Waiting>) {
-    let mut connections: VecDeque<AbortHandle> = VecDeque::new();
+    let mut connections: Vec<Connection> = Vec::new();
     loop {
         let Ok(accepted) = tokio::time::timeout(LOOK, listener.accept()).await else {
             if let Some(Ok(again)) = place.listen_again()
@@ -137,22 +137,53 @@ async fn serve(mut listener: UnixListener, place: Arc<SocketPlace>, desk: Arc<Wa
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;
         };
-        connections.retain(|connection| !connection.is_finished());
+        connections.retain(|connection| !connection.task.is_finished());
         if connections.len() == CONNECTIONS
-            && let Some(oldest) = connections.pop_front()
+            && let Some(place) = to_be_closed(connections.iter().map(|connection| connection.claim.get()))
         {
-            oldest.abort();
+            connections.remove(place).task.abort();
         }
         let desk = Arc::clone(&desk);
+        let claim = Arc::new(Claim::default());
+        let its_claim = Arc::clone(&claim);
         let connection = tokio::spawn(async move {
             // A client that has gone away is no fault.
-            let _gone = converse(stream, &desk).await;
+            let _gone = converse(stream, &desk, &its_claim).await;
         });
-        connections.push_back(connection.abort_handle());
+        connections.push(Connection { task: connection.abort_handle(), claim });
     }
 }
 
-async fn converse(stream: UnixStream, desk: &Arc<Waiting>) -> io::Result<()> {
+struct Connection {
+    task: AbortHandle,
+    claim: Arc<Claim>,
+}
+
+/// What a connection's place is needed for.
+#[derive(Default)]
+struct Claim(AtomicU8);
+
+impl Claim {
+    const NOTHING: u8 = 0;
+    const AN_ORDER: u8 = 1;
+    const DARKNESS: u8 = 2;
+
+    fn get(&self) -> u8 {
+        self.0.load(Ordering::Relaxed)
+    }
+
+    fn set(&self, claim: u8) {
+        self.0.store(claim, Ordering::Relaxed);
+    }
+}
+
+/// Which connection makes way, of those that came in this order: the oldest of those that need their places least. An
+/// answer to whoever wants the lasers dark is lost last.
+fn to_be_closed(claims: impl Iterator<Item = u8>) -> Option<usize> {
+    claims.enumerate().min_by_key(|(_, claim)| *claim).map(|(place, _)| place)
+}
+
+async fn converse(stream: UnixStream, desk: &Arc<Waiting>, claim: &Claim) -> io::Result<()> {
     let (read, mut write) = stream.into_split();
     let mut read = BufReader::new(read);
     loop {
@@ -163,8 +194,10 @@ async fn converse(stream: UnixStream, desk: &Arc<Waiting>) -> io::Result<()> {
         }
         let _until_it_is_answered = UnderWay::count(&desk.under_way);
         let is_whole = line.ends_with(b"\n");
+        let request = Request::from_line(&line);
+        claim.set(if request == Ok(Request::LasersDark {}) { Claim::DARKNESS } else { Claim::AN_ORDER });
         let answer = if is_whole {
-            answer(&line, desk).await
+            answer(request, desk).await
         } else {
             let why = format!("a request without an end was found, expected a line of at most {LONGEST} bytes");
             desk.refuse(Refused::Malformed, why)
@@ -172,14 +205,15 @@ async fn converse(stream: UnixStream, desk: &Arc<Waiting>) -> io::Result<()> {
         let mut bytes = serde_json::to_vec(&answer).map_err(io::Error::other)?;
         bytes.push(b'\n');
         write.write_all(&bytes).await?;
+        claim.set(Claim::NOTHING);
         if !is_whole {
             return Ok(());
         }
     }
 }
 
-async fn answer(line: &[u8], desk: &Arc<Waiting>) -> Answer {
-    match Request::from_line(line) {
+async fn answer(request: Result<Request, String>, desk: &Arc<Waiting>) -> Answer {
+    match request {
         Ok(request) => answer_to(request, desk).await,
         Err(error) => desk.refuse(Refused::Malformed, format!("the request is not understood: {error}")),
     }
@@ -338,5 +372,23 @@ impl Waiting {
         let order = catch_unwind(AssertUnwindSafe(|| self.preparer.prepare(request)));
         CATCHES_PANICS.set(false);
         order.unwrap_or_else(|panic| resume_unwind(panic))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_oldest_connection_makes_way_that_waits_for_nothing_and_last_one_that_waits_for_darkness() {
+        use Claim as Of;
+        for (claims, expected) in [
+            ([Of::NOTHING, Of::NOTHING, Of::NOTHING], 0),
+            ([Of::AN_ORDER, Of::NOTHING, Of::NOTHING], 1),
+            ([Of::DARKNESS, Of::AN_ORDER, Of::AN_ORDER], 1),
+            ([Of::DARKNESS, Of::DARKNESS, Of::DARKNESS], 0),
+        ] {
+            assert_eq!(to_be_closed(claims.into_iter()), Some(expected), "{claims:?}");
+        }
     }
 }

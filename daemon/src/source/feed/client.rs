@@ -19,6 +19,9 @@ use crate::tally_by::Reason;
 /// Messages of one client that are read at once, so that a hasty one leaves time to the others.
 const MESSAGES_AT_ONCE: usize = 64;
 
+/// A client that has not said by then what its pictures will be like makes way.
+const HELLO_WITHIN: TimeNs = TimeNs(5_000_000_000);
+
 /// What every client's pictures become.
 #[derive(Clone, Debug)]
 pub(super) struct Target {
@@ -79,6 +82,8 @@ impl From<Errno> for Gone {
 pub(super) struct Client {
     pub(super) socket: OwnedFd,
     pub(super) name: String,
+    /// When it came.
+    t_came: TimeNs,
     /// When a picture of it was taken over last; long ago where none was.
     pub(super) t_last: TimeNs,
     /// Whether a picture of it has been taken.
@@ -229,10 +234,12 @@ impl Stream {
 }
 
 impl Client {
-    pub(super) fn new(socket: OwnedFd, number: u64) -> Self {
+    /// A client that has connected at host time `now`.
+    pub(super) fn new(socket: OwnedFd, number: u64, now: TimeNs) -> Self {
         Self {
             socket,
             name: format!("connection {number}"),
+            t_came: now,
             t_last: TimeNs(i64::MIN / 2),
             is_known: false,
             told_depths: false,
@@ -311,6 +318,15 @@ impl Client {
                 }
             }
         }
+    }
+
+    /// Shows it out where it has not said by host time `now` what its pictures will be like.
+    pub(super) fn expect_hello(&self, now: TimeNs) -> Result<(), Gone> {
+        if self.stream.is_some() || now - self.t_came < HELLO_WITHIN {
+            return Ok(());
+        }
+        let why = format!("nothing was found for {} s, expected HELO", HELLO_WITHIN.seconds());
+        Err(self.show_out(Refusal::Protocol, &why))
     }
 
     /// Whether a picture of it waits.

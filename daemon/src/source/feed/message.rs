@@ -119,9 +119,25 @@ fn hello(bytes: &[u8; HELLO_BYTES]) -> Result<Message, Wrong> {
     }
     let name = bytes[NAME].split(|&byte| byte == 0).next().unwrap_or_default();
     // What a terminal or a log would take for an order has no place in a name.
-    let name: String = String::from_utf8_lossy(name).chars().filter(|c| !c.is_control()).collect();
+    let name: String = String::from_utf8_lossy(name).chars().filter(|&c| !(c.is_control() || is_unseen(c))).collect();
     let name = if name.trim().is_empty() { "unnamed".to_owned() } else { name.trim().to_owned() };
     Ok(Message::Hello { version, format: LiveFormat { resolution, colour, depth }, name })
+}
+
+/// Whether a character is not seen itself, and may change how those around it are: their direction, their line.
+const fn is_unseen(c: char) -> bool {
+    matches!(
+        c,
+        '\u{ad}'
+            | '\u{61c}'
+            | '\u{180e}'
+            | '\u{200b}'..='\u{200f}'
+            | '\u{2028}'..='\u{202e}'
+            | '\u{2060}'..='\u{206f}'
+            | '\u{feff}'
+            | '\u{fff9}'..='\u{fffb}'
+            | '\u{e0000}'..='\u{e007f}'
+    )
 }
 
 fn frame(bytes: &[u8; FRAME_BYTES]) -> Result<Message, Wrong> {
@@ -364,6 +380,7 @@ pub(super) mod tests {
         };
         assert_eq!(name_of("Kamera für Tiefe".as_bytes()), "Kamera für Tiefe");
         assert_eq!(name_of(b"\x1b[2J\n"), "[2J");
+        assert_eq!(name_of("a\u{202e}b\u{2028}c\u{2066}d".as_bytes()), "abcd");
         assert_eq!(name_of(b""), "unnamed");
         assert_eq!(name_of(&[b'x'; 32]).len(), 32);
         assert_eq!(name_of(b"\xff"), "\u{fffd}");

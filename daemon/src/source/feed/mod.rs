@@ -310,13 +310,17 @@ impl Server {
         while let Some(ready) = self.wait() {
             let now = host_now();
             if ready.connects {
-                self.accept();
+                self.accept(now);
             }
             self.look_after_socket(now);
             for number in ready.clients {
                 self.with(number, &mut shown, |client, target, status| {
                     client.receive(target, host_now, |outcome| note(status, outcome))
                 });
+            }
+            let connected: Vec<u64> = self.clients.iter().map(|(number, _)| *number).collect();
+            for number in connected {
+                self.with(number, &mut shown, |client, _, _| client.expect_hello(now));
             }
             if self.sink.lock().unwrap_or_else(PoisonError::into_inner).is_live() {
                 self.choose(&mut shown, now);
@@ -371,14 +375,14 @@ impl Server {
         (!is_ready(0)).then(|| Ready { connects: is_ready(1), clients })
     }
 
-    fn accept(&mut self) {
+    fn accept(&mut self, now: TimeNs) {
         let Ok(socket) = accept_with(&self.listener, SocketFlags::CLOEXEC) else {
             // Too many open files, most likely, which the next look would find again at once.
             std::thread::sleep(ACCEPT_AGAIN);
             return;
         };
         self.connections += 1;
-        let client = Client::new(socket, self.connections);
+        let client = Client::new(socket, self.connections, now);
         if self.clients.len() == CLIENTS {
             let full = format!("{CLIENTS} clients are connected already; end one of them");
             self.refuse(&client.name, &client.show_out(Refusal::Full, &full));
