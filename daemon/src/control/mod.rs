@@ -2,7 +2,8 @@
 //! a Unix socket. The page is `daemon/doc/control.md`.
 //!
 //! Everything here is on the control side. A request is made ready by ordinary threads, which may take their time; what
-//! then changes in the loop is handed over by the control thread, wait-free.
+//! then changes in the loop is handed over by the control thread, wait-free. Darkness is asked of the laser thread at
+//! once: it must not wait for a control thread that hangs.
 
 mod client;
 #[cfg(fuzzing)]
