@@ -38,7 +38,8 @@ pub(super) struct Shared {
     pub(super) latch: AtomicU8,
     /// What the box said to that.
     pub(super) acknowledged: AtomicU8,
-    /// A request for darkness, or to take it back ([`dark_request_parts`]), with the wishes for darkness that the control of the output has not taken over.
+    /// A request for darkness, or to take it back ([`dark_request_parts`]), with the wishes for darkness that the
+    /// control of the output has not taken over.
     pub(super) dark_request: AtomicU64,
     /// The number of the request that has been obeyed, and the box's answer in the two lowest bits.
     pub(super) dark_answer: AtomicU64,
