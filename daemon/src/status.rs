@@ -365,8 +365,8 @@ mod tests {
         file.write(&status, NOW);
         assert!(file.newest.wait_until_done(LONG));
         let found = found_in(std::slice::from_ref(&folder)).unwrap();
-        assert_eq!(found[0].status.control, control, "it can be asked");
-        let record = found[0].status.figures.record.as_ref().unwrap();
+        assert_eq!(found[0].control, control, "it can be asked");
+        let record = found[0].status.as_ref().unwrap().figures.record.as_ref().unwrap();
         assert_eq!(record.folder, parent.path().join("m\u{fffd}ller"));
     }
 

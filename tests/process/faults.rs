@@ -5,6 +5,7 @@ use std::fs;
 use std::io::{PipeReader, PipeWriter, Read};
 use std::os::fd::AsRawFd;
 use std::os::unix::ffi::OsStrExt;
+use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::thread;
@@ -253,8 +254,10 @@ fn a_disk_that_is_full_costs_the_record_and_no_frame() {
 #[test]
 fn a_runtime_folder_that_is_taken_away_is_made_again_and_the_run_is_reached_in_it() {
     let folder = bench();
-    let daemon = start(folder.path(), &["--scene", "feed"]);
-    for taken_away in ["holod", "holod/feed"] {
+    let page = folder.path().join("holod/page");
+    let address = format!("unix:{}", page.display());
+    let daemon = start(folder.path(), &["--scene", "feed", "--page", &address]);
+    for taken_away in ["holod", "holod/feed", "holod/page"] {
         let path = folder.path().join(taken_away);
         let pause = ask(folder.path(), &["ctl", "pause"]);
         assert!(pause.status.success(), "{pause:?}");
@@ -268,6 +271,7 @@ fn a_runtime_folder_that_is_taken_away_is_made_again_and_the_run_is_reached_in_i
         frames_go_on(folder.path());
         let connects = || FeedClient::connect(&folder.path().join("holod/feed")).is_ok();
         assert!(wait_until(PATIENCE, connects), "{taken_away}");
+        assert!(wait_until(PATIENCE, || UnixStream::connect(&page).is_ok()), "{taken_away}: the page");
     }
     daemon.signal(Signal::TERM);
     let ended = daemon.wait(PATIENCE);

@@ -41,7 +41,7 @@ use super::give_up::GivesUp;
 use super::live::{Live, Refused, Viewer};
 use super::metrics;
 use crate::cli::{focus_of_an_eye, human_pupil};
-use crate::local_socket::{self, SocketPlace};
+use crate::local_socket::{self, LOOK, SocketPlace};
 use crate::session::scheduling;
 use crate::snapshot::SnapshotNow;
 use crate::status::stale;
@@ -77,7 +77,7 @@ fn advice(error: &io::Error) -> &'static str {
 /// A page that is served. Dropping it ends that.
 pub(super) struct PageServer {
     place: PageAddress,
-    socket: Option<SocketPlace>,
+    socket: Option<Arc<SocketPlace>>,
     live: Arc<Live>,
     runtime: Option<Runtime>,
 }
@@ -135,7 +135,7 @@ impl Drop for PageServer {
 
 enum Listener {
     Tcp(TcpListener),
-    Unix(UnixListener),
+    Unix(UnixListener, Arc<SocketPlace>),
 }
 
 trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
@@ -143,7 +143,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
 
 impl Listener {
     /// With where it really is: port 0 is any port. A socket is to be taken away at the end.
-    fn bind(address: &PageAddress) -> Result<(Self, PageAddress, Option<SocketPlace>), ServeError> {
+    fn bind(address: &PageAddress) -> Result<(Self, PageAddress, Option<Arc<SocketPlace>>), ServeError> {
         match address {
             PageAddress::Tcp(address) => {
                 let cannot = |error| ServeError::Listen { address: *address, error };
@@ -155,7 +155,8 @@ impl Listener {
             }
             PageAddress::Unix(path) => {
                 let (listener, place) = local_socket::listen(path, SocketType::STREAM)?;
-                Ok((Self::Unix(UnixListener::from_std(listener.into())?), address.clone(), Some(place)))
+                let (listener, place) = (UnixListener::from_std(listener.into())?, Arc::new(place));
+                Ok((Self::Unix(listener, Arc::clone(&place)), address.clone(), Some(place)))
             }
         }
     }
@@ -169,15 +170,30 @@ impl Listener {
                 set_tcp_user_timeout(stream.as_fd(), PATIENCE.as_millis() as u32)?;
                 Ok(Box::new(stream))
             }
-            Self::Unix(listener) => Ok(Box::new(listener.accept().await?.0)),
+            Self::Unix(listener, _) => Ok(Box::new(listener.accept().await?.0)),
+        }
+    }
+
+    /// Listens again where the socket was taken away.
+    fn look_after_socket(&mut self) {
+        if let Self::Unix(listener, place) = self
+            && let Some(Ok(again)) = place.listen_again()
+            && let Ok(again) = UnixListener::from_std(again.into())
+        {
+            tracing::info!("the page is there again, at {}", place.path().display());
+            *listener = again;
         }
     }
 }
 
-async fn serve(listener: Listener, router: Router, live: Arc<Live>, patience: Duration) {
+async fn serve(mut listener: Listener, router: Router, live: Arc<Live>, patience: Duration) {
     let connections = Arc::new(Semaphore::new(CONNECTIONS));
     loop {
-        let Ok(stream) = listener.accept().await else {
+        let Ok(accepted) = tokio::time::timeout(LOOK, listener.accept()).await else {
+            listener.look_after_socket();
+            continue;
+        };
+        let Ok(stream) = accepted else {
             // Too many open files, most likely.
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;
