@@ -405,7 +405,7 @@ mod tests {
     #[test]
     fn a_holod_that_lives_is_found_though_its_status_cannot_be_understood() {
         let folder = tempfile::tempdir().unwrap();
-        let (pid, control) = (std::process::id(), PathBuf::from("/run/holod/control-1"));
+        let (pid, control) = (std::process::id(), folder.path().join("control-1"));
         let mut of_another_version =
             serde_json::to_value(Snapshot { control: Some(control.clone()), ..status() }).unwrap();
         of_another_version["uptime_s"] = "a while".into();
