@@ -54,27 +54,28 @@ impl FeedWatch {
         self.keeps_dark
     }
 
-    /// Judges what is seen at host time `now`, by which the frame loop has been handed what is to be shown; whether that
-    /// has changed anything.
+    /// Judges what is seen at host time `now`, by which the frame loop has been handed what is to be shown; whether
+    /// that has changed anything.
     pub(super) fn judge(&mut self, seen: FeedSeen, now: TimeNs) -> bool {
         let Some(dark_after) = self.dark_after else { return false };
         if !seen.is_live {
             self.t_since = now;
         }
+        let is_to_be_shown = !seen.has_pattern && (seen.is_live || seen.is_paused);
+        if std::mem::replace(&mut self.is_to_be_shown, is_to_be_shown) != is_to_be_shown {
+            self.t_changed = now;
+        }
+        // What the panel shows was begun before that: a picture may be on its way there.
+        let may_be_older = seen.t_begun <= Some(self.t_changed);
         let t_last = seen.t_newest.map_or(self.t_since, |t_newest| t_newest.max(self.t_since));
         self.given_up = match (seen.is_paused, seen.is_live) {
             // What was in hand when it began stays in hand.
             (true, _) => self.given_up,
             (false, true) if now - t_last > dark_after => Some(seen.t_newest),
             (false, true) => self.given_up.filter(|&t_before| seen.t_in_hand <= t_before),
-            (false, false) => self.given_up.filter(|_| seen.t_in_hand.is_some()),
+            (false, false) => self.given_up.filter(|_| seen.t_in_hand.is_some() || may_be_older),
         };
-        let is_to_be_shown = !seen.has_pattern && (seen.is_live || seen.is_paused);
-        if std::mem::replace(&mut self.is_to_be_shown, is_to_be_shown) != is_to_be_shown {
-            self.t_changed = now;
-        }
-        let may_be_on_panel = is_to_be_shown || seen.t_begun <= Some(self.t_changed);
-        let keeps_dark = self.given_up.is_some() && may_be_on_panel;
+        let keeps_dark = self.given_up.is_some() && (is_to_be_shown || may_be_older);
         std::mem::replace(&mut self.keeps_dark, keeps_dark) != keeps_dark
     }
 }
@@ -212,6 +213,19 @@ mod tests {
         bench.comes(5_510);
         bench.shows(5_511, Some(5_510));
         assert!(!bench.is_dark_at(5_520));
+    }
+
+    #[test]
+    fn a_picture_that_is_on_its_way_to_the_panel_when_a_scene_is_asked_for_stays_dark() {
+        let mut bench = Bench::new();
+        bench.comes(0);
+        assert!(bench.is_dark_at(501), "it has not been shown yet");
+        bench.seen.is_live = false;
+        assert!(bench.is_dark_at(510));
+        bench.shows(400, Some(0));
+        assert!(bench.is_dark_at(520), "the old picture has come on the panel");
+        bench.shows(511, None);
+        assert!(!bench.is_dark_at(530));
     }
 
     #[test]

@@ -31,6 +31,7 @@ impl Watch<'_> {
             let Some(Ordered { order, request, answer }) = self.desk.next() else { break };
             let ends = matches!(order, Order::Stop);
             let is_urgent = ends || matches!(order, Order::LasersDark(_));
+            let is_of_lasers = matches!(order, Order::LasersDark(_) | Order::LasersArm);
             // Whoever asked was told that it is not done.
             if answer.is_closed() && !is_urgent {
                 continue;
@@ -42,7 +43,9 @@ impl Watch<'_> {
             };
             let done = self.carry_out(order, output, now);
             // Before the frame loop can have brought back a picture that is not to be lit any more.
-            self.judge_feed(output, host_now());
+            if !is_of_lasers {
+                self.judge_feed(output, host_now());
+            }
             // Lasers are kept dark even where the box did not acknowledge it.
             if (done.is_ok() || is_urgent) && request.changes_something() {
                 let request_text = serde_json::to_string(&request).unwrap_or_default();

@@ -23,14 +23,23 @@ pub(super) struct OutputWatch {
     lost: Option<PanelFault>,
     /// Since when the rate has been off, and whether that has been said.
     off_rate: Option<(TimeNs, bool)>,
-    /// Since when no field has been lit for reports that are not believed, and whether that has been said.
-    unbelieved: Option<(TimeNs, bool)>,
+    /// Since when fields have been dark for nothing but reports that are not believed.
+    unbelieved_since: Option<TimeNs>,
+    has_said_unbelieved: bool,
     t_next_dark_line: TimeNs,
 }
 
 impl OutputWatch {
     pub(super) fn new(events: rtrb::Consumer<PanelEvent>, nominal_hz: f64) -> Self {
-        Self { events, nominal_hz, lost: None, off_rate: None, unbelieved: None, t_next_dark_line: TimeNs(i64::MIN) }
+        Self {
+            events,
+            nominal_hz,
+            lost: None,
+            off_rate: None,
+            unbelieved_since: None,
+            has_said_unbelieved: false,
+            t_next_dark_line: TimeNs(i64::MIN),
+        }
     }
 
     /// Why the panel is lost now, if it is.
@@ -49,7 +58,7 @@ impl OutputWatch {
                 PanelEvent::Back { .. } => {
                     tracing::info!("the panel is back");
                     self.lost = None;
-                    (self.off_rate, self.unbelieved) = (None, None);
+                    (self.off_rate, self.unbelieved_since, self.has_said_unbelieved) = (None, None, false);
                 }
             }
         }
@@ -74,26 +83,26 @@ impl OutputWatch {
         }
     }
 
-    /// Warns once where no report of a panel of the rig's rate is believed.
+    /// Warns once, until the panel is lost and back, where reports of a panel of the rig's rate are not believed.
     pub(super) fn judge_reports(&mut self, field: &FieldEvent) {
-        if field.dark.is_none() {
-            self.unbelieved = None;
-        }
         if field.dark != Some(DarkReason::Untrusted) {
+            self.unbelieved_since = None;
             return;
         }
-        let (since, said) = self.unbelieved.get_or_insert((field.t_present, false));
-        if *said || self.off_rate.is_some() || field.t_present - *since < UNBELIEVED {
+        let since = *self.unbelieved_since.get_or_insert(field.t_present);
+        if self.has_said_unbelieved || self.off_rate.is_some() || field.t_present - since < UNBELIEVED {
             return;
         }
-        *said = true;
+        self.has_said_unbelieved = true;
         let why = match field.provenance {
             TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External => {
                 "their times scatter by more than the rig leaves room for; a longer lasers.on_delay_ms and a shorter \
-                 lit_ms leave more, and a wire from the panel's sync output to the laser box (lasers.sync_wire) needs none"
+                 lit_ms leave more, and a wire from the panel's sync output to the laser box (lasers.sync_wire) needs \
+                 none"
             }
             TimestampSource::Software | TimestampSource::Estimated => {
-                "their times are software's, not the display's, or scatter; `holod check` says what an output is good for"
+                "their times are software's, not the display's, or scatter; `holod check` says what an output is good \
+                 for"
             }
         };
         tracing::warn!("no report of the panel's refreshes is believed, so lasers stay dark: {why}");

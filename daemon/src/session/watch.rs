@@ -37,8 +37,8 @@ const TICKS_PER_REPORT: u32 = 10;
 const TICKS_PER_STATUS: u32 = 100;
 /// How long the end of a run waits for its last frame to be shown.
 const LAST_FRAME_WAIT: TimeNs = TimeNs(1_000_000_000);
-/// A state of the run that follows another line on it sooner than this is logged once it has held for so long: a tracker
-/// that pauses or lasers that flicker must not flood the log.
+/// A state of the run that follows another line on it sooner than this is logged once it has held for so long: a
+/// tracker that pauses or lasers that flicker must not flood the log.
 const STATE_EVERY: TimeNs = TimeNs(10_000_000_000);
 const STATE_HOLDS: TimeNs = TimeNs(1_000_000_000);
 
@@ -452,7 +452,7 @@ impl Watch<'_> {
 mod tests {
     use super::*;
 
-    /// At how many of the times, ten a second for a minute, a state is logged that is another one every `changes` of them.
+    /// At how many of the times, ten a second for a minute, a state is logged that changes every `changes` of them.
     fn logged(changes: usize) -> usize {
         let mut announced = Announced::new(false);
         let times = (0..600).filter(|look| {

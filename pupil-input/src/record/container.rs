@@ -188,8 +188,9 @@ pub fn with_header(recording: &[u8], change: impl FnOnce(&str) -> String) -> Opt
     Some(changed)
 }
 
-/// What the link of a recording brought, put together however it was read, with a line's end where a message ended or the
-/// stream broke off; behind it what is in the file and no whole record. Nothing where `recording` begins with no header.
+/// What the link of a recording brought, put together however it was read, with a line's end where a message ended or
+/// the stream broke off; behind it what is in the file and no whole record. Nothing where `recording` begins with no
+/// header.
 pub fn payloads(recording: &[u8]) -> Option<Vec<u8>> {
     let mut reader = RawReader::new(recording).ok()?;
     let datagrams = reader.header.datagrams;

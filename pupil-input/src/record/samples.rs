@@ -7,8 +7,7 @@ use crate::gate::Verdict;
 
 /// Its first line. Times are ns: `t_device` on the tracker's own clock, the others on the host's monotonic clock (of a
 /// log that is played: `t_sample` on the log's; of a recording that is played both, on the clock of the run that
-/// recorded it). Diameters are scaled to millimetres; empty cells are what the tracker
-/// does not tell.
+/// recorded it). Diameters are scaled to millimetres; empty cells are what the tracker does not tell.
 pub(crate) const SAMPLES_HEADER: &str =
     "t_device_ns,t_sample_ns,t_arrival_ns,eye,diameter_mm,confidence,aperture_mm,sequence,valid,verdict";
 

@@ -12,8 +12,8 @@ use crate::spec::HostPort;
 /// A sender that was silent for so long may be followed by another.
 const SENDER_LASTS: Duration = Duration::from_secs(2);
 
-/// A group is joined again after so long without a datagram: the membership goes with the network interface, and does not
-/// come back with it.
+/// A group is joined again after so long without a datagram: the membership goes with the network interface, and does
+/// not come back with it.
 const JOINED_AGAIN_AFTER: Duration = Duration::from_secs(5);
 
 /// A port of this machine at which datagrams are received; a multicast address joins its group.

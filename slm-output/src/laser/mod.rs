@@ -185,7 +185,8 @@ pub enum LaserError {
     Reset,
     /// The box's clock does not go with the host's.
     #[error(
-        "the laser box's clock jumped by {jump_us} µs or more: it has reset itself, the computer was suspended, or NTP corrects this computer's clock fast"
+        "the laser box's clock jumped by {jump_us} µs or more: it has reset itself, the computer was suspended, or NTP \
+         corrects this computer's clock fast"
     )]
     ClockJump {
         /// By how much more than drift allows, microseconds.

@@ -173,7 +173,7 @@ impl DarkSwitch {
     /// Asks the laser thread for darkness because a person wishes it. Does not wait; whatever the control of the output
     /// asks for meanwhile, lasers are dark until it has taken the wish over ([`OutputControl::keep_dark_as_wished`]).
     pub fn wish_dark(&self) -> DarkWish {
-        let request = self.request(|request| request + NEXT + WISH);
+        let request = self.request(|request| dark_because(request + NEXT + WISH, Some(DarkReason::Asked)));
         DarkWish { switch: self.clone(), request }
     }
 

@@ -32,9 +32,9 @@ const RATE_GAIN: f64 = 0.05;
 ///
 /// A panel refreshes in a steady rhythm. A report is believed when it lies on that rhythm, as the ones that were
 /// believed before made it, to within a tolerance, when the display controller's own count, where there is one, has
-/// gone on by that number, when the field that it carries can follow, and when [`AGREEING_MIN`] reports in a row have
-/// done so. A report that is early, doubled, of no time, or of a time that runs back, is not; nor are those right after
-/// it.
+/// gone on by that number, when the field that it carries can follow, and when [`AGREEING_AT_FIRST`] reports in a row
+/// have done so, or [`AGREEING_MIN`] once a rhythm was believed. A report that is early, doubled, of no time, or of a
+/// time that runs back, is not; nor are those right after it.
 #[derive(Clone, Debug)]
 pub(super) struct RefreshJudge {
     nominal_ns: f64,
@@ -131,7 +131,7 @@ impl RefreshJudge {
                 self.strays = 0;
                 self.needed = agreeing_at_first(self.clock);
                 self.anchor = Some(Anchor::of(refresh, refresh.t_present));
-                if in_order {
+                if in_order && self.clock == WindowClock::Reports {
                     self.begin_at_period((refresh.t_present - t_before).0 as f64);
                 }
             }
@@ -154,14 +154,13 @@ impl RefreshJudge {
         Ok(())
     }
 
-    /// Shares of a report's error that move phase and period. Where a rhythm begins they are those that make of all its
-    /// reports the line of least squares (the α-β filter of growing memory): α = 2(2n − 1)/(n(n + 1)) and
-    /// β = 6/(n(n + 1)) at the n-th.
+    /// Shares of a report's error that move phase and period. Where a rhythm begins they are those of the α-β filter of
+    /// growing memory, which makes of n reports, those since the last one that did not agree and the two that made the
+    /// clock, their line of least squares: α = 2(2n − 1)/(n(n + 1)) and β = 6/(n(n + 1)).
     fn gains(&self) -> (f64, f64) {
         if self.needed == AGREEING_MIN {
             return (PHASE_GAIN, PERIOD_GAIN);
         }
-        // Two reports made the clock.
         let n = f64::from(self.agreeing + 3);
         (2.0 * (2.0 * n - 1.0) / (n * (n + 1.0)), 6.0 / (n * (n + 1.0)))
     }

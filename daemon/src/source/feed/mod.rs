@@ -422,15 +422,18 @@ impl Server {
         }
     }
 
-    /// Whose turn it is: the one's whose it was, while pictures of it are taken; else the next one's that sends some.
+    /// Whose turn it is: the one's whose it was, while pictures of it are taken; else the next one's that sends some,
+    /// in the order in which they came, round and round.
     fn choose(&self, shown: &mut Option<u64>, now: TimeNs) {
         let is_shown = |number: u64| *shown == Some(number);
         let gives = |(number, client): &(u64, Client)| is_shown(*number) && now - client.t_last < SILENCE;
         if self.clients.iter().any(gives) {
             return;
         }
+        let place = self.clients.iter().position(|(number, _)| is_shown(*number));
+        let (before, behind) = self.clients.split_at(place.map_or(0, |place| place + 1));
         let sends = |(number, client): &&(u64, Client)| !is_shown(*number) && client.has_picture();
-        if let Some((number, _)) = self.clients.iter().find(sends) {
+        if let Some((number, _)) = behind.iter().chain(before).find(sends) {
             *shown = Some(*number);
         }
     }
@@ -507,8 +510,8 @@ struct Ready {
 #[derive(Debug, thiserror::Error)]
 enum PictureRefusal {
     #[error(
-        "a picture taken {ahead_s:.3} s from now was found, expected nanoseconds of CLOCK_MONOTONIC (not of the calendar's \
-         clock) when it was taken (not when it is to be shown), or 0"
+        "a picture taken {ahead_s:.3} s from now was found, expected nanoseconds of CLOCK_MONOTONIC (not of the \
+         calendar's clock) when it was taken (not when it is to be shown), or 0"
     )]
     Future { ahead_s: f64 },
     #[error("a picture taken at {t_ns} ns was found, expected nanoseconds of CLOCK_MONOTONIC, or 0")]
