@@ -297,14 +297,14 @@ impl Contents {
             return Ok(());
         }
         let recording = fs::read(path).map_err(cannot)?;
-        match with_header(&recording, |header| scrubber.text(header)) {
-            Some(changed) if !payloads(&recording).is_some_and(|brought| scrubber.finds(&brought)) => {
-                self.entries.push(Entry { name: name.into(), content: Content::Bytes(changed) });
-            }
-            Some(_) => self.left_out.push(format!(
+        match (with_header(&recording, |header| scrubber.text(header)), payloads(&recording)) {
+            (Some(_), Some(brought)) if scrubber.finds(&brought) => self.left_out.push(format!(
                 "{name}: a name of a user or of this machine is among the tracker's bytes; samples.csv has the samples"
             )),
-            None => self.left_out.push(format!("{name}: it broke off within its header")),
+            (Some(changed), Some(_)) => {
+                self.entries.push(Entry { name: name.into(), content: Content::Bytes(changed) });
+            }
+            _ => self.left_out.push(format!("{name}: it broke off within its header, or that cannot be understood")),
         }
         Ok(())
     }
