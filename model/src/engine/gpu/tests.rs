@@ -303,11 +303,14 @@ fn the_built_in_networks_match_the_reference_at_both_ends_of_the_pupil_range() {
     }
 }
 
+/// Of tests that can have any size: the software device compiles every shader for each one.
+const SIZE: Resolution = Resolution { width: 37, height: 22 };
+
 #[test]
 fn networks_on_another_bench_match_the_reference() {
     let direct = random_weights(NetworkConfig { channels: 12, ..weights_tests::config() }, 5);
     for (weights, pupil_mm) in [(direct, 2.0), (Weights::builtin_small(), 1.0), (Weights::builtin_small(), 9.0)] {
-        check_on(&OTHER_BENCH, &weights, Resolution { width: 37, height: 22 }, pupil_mm, 6);
+        check_on(&OTHER_BENCH, &weights, SIZE, pupil_mm, 6);
     }
 }
 
@@ -335,7 +338,7 @@ const HALF_FIELD_TOLERANCE: f64 = 0.05;
 
 #[test]
 fn whole_networks_in_half_precision_are_near_the_same_in_single() {
-    let frame = Arc::new(frame(Resolution { width: 48, height: 32 }, 4));
+    let frame = Arc::new(frame(SIZE, 4));
     for weights in [Weights::builtin(), Weights::builtin_small(), Weights::builtin_fast()] {
         let bench = DisplayGeometry::DEFAULT;
         let mut half = engine_in(Precision::Half, &weights, &bench, frame.resolution);
@@ -362,7 +365,7 @@ fn assert_near_single(half: &mut GpuEngine, weights: &Weights, bench: &DisplayGe
 /// With matrices in one network, whose inputs and layers do not fill them.
 #[test]
 fn a_whole_network_of_matrices_is_near_the_same_in_single_precision() {
-    let frame = Arc::new(frame(Resolution { width: 50, height: 34 }, 4));
+    let frame = Arc::new(frame(SIZE, 4));
     let weights = Weights::builtin_fast();
     let mut matrices = of_matrices(&weights, frame.resolution);
     assert!(matrices.uses_matrix_units(), "it is left to the device");
@@ -448,9 +451,8 @@ proptest! {
 fn of_pupils_beyond_the_trained_ones_the_nearest_is_told_and_a_frame_is_the_same_each_time() {
     // All that the pupil changes of this family is what it is told.
     let weights = random_weights(weights_tests::config(), 2);
-    let resolution = Resolution { width: 31, height: 18 };
-    let mut engine = engine(&weights, &DisplayGeometry::DEFAULT, resolution);
-    let frame = Arc::new(frame(resolution, 4));
+    let mut engine = engine(&weights, &DisplayGeometry::DEFAULT, SIZE);
+    let frame = Arc::new(frame(SIZE, 4));
     let first = rendered(&mut engine, &frame, 5.0);
     for (given_mm, same) in [(1.5, false), (9.0, true), (0.2, false), (5.0, true)] {
         assert_eq!(rendered(&mut engine, &frame, given_mm) == first, same, "{given_mm} mm");
@@ -462,22 +464,21 @@ fn of_pupils_beyond_the_trained_ones_the_nearest_is_told_and_a_frame_is_the_same
 
 #[test]
 fn what_is_no_number_leaves_no_trace_in_the_next_frame() {
-    let resolution = Resolution { width: 31, height: 18 };
-    let direct = random_weights(NetworkConfig { channels: 8, ..weights_tests::config() }, 2);
-    let on_default = |weights: &Weights| engine(weights, &DisplayGeometry::DEFAULT, resolution);
+    let direct = random_weights(NetworkConfig { channels: 12, ..weights_tests::config() }, 2);
+    let on_default = |weights: &Weights| engine(weights, &DisplayGeometry::DEFAULT, SIZE);
     for mut engine in [
         on_default(&direct),
         on_default(&Weights::builtin_small()),
-        of_matrices(&direct, resolution),
-        of_matrices(&Weights::builtin_fast(), resolution),
+        of_matrices(&direct, SIZE),
+        of_matrices(&Weights::builtin_fast(), SIZE),
     ] {
         let given = |spoil: &dyn Fn(&mut RgbdFrame)| {
-            let mut frame = frame(resolution, 4);
+            let mut frame = frame(SIZE, 4);
             spoil(&mut frame);
             Arc::new(frame)
         };
         let clean = rendered(&mut engine, &given(&|_| ()), 3.0);
-        for (pixel, spoiler) in [(0, f32::NAN), (30, f32::INFINITY), (31 * 18 - 1, f32::NEG_INFINITY)] {
+        for (pixel, spoiler) in [(0, f32::NAN), (30, f32::INFINITY), (SIZE.pixels() - 1, f32::NEG_INFINITY)] {
             let spoilt = rendered(&mut engine, &given(&|frame| frame.amplitude[pixel] = spoiler), 3.0);
             assert_ne!(spoilt.0, clean.0, "pixel {pixel} is not seen");
             assert_eq!(rendered(&mut engine, &given(&|_| ()), 3.0), clean, "pixel {pixel} left a trace");
