@@ -28,11 +28,12 @@ fn main() -> ExitCode {
     code
 }
 
-/// Where no desktop can be reached, Mesa's Vulkan layer that asks one for its graphics processor says so for each device
-/// that is opened, as an error without a name.
+/// Keeps a layer of Mesa's Vulkan from asking the desktop which graphics processor it uses: holod chooses its own. A
+/// display server that hangs would be waited for without end, also by commands that show nothing; and where none can be
+/// reached the layer says so for each device that is opened, as an error without a name.
 fn keep_vulkan_from_desktop() {
     let is_set = |name| std::env::var_os(name).is_some();
-    if !["XDG_RUNTIME_DIR", "NODEVICE_SELECT", "MESA_VK_DEVICE_SELECT"].into_iter().any(is_set) {
+    if !["NODEVICE_SELECT", "MESA_VK_DEVICE_SELECT"].into_iter().any(is_set) {
         // SAFETY: no other thread has been started, so nobody reads the environment meanwhile.
         unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
     }

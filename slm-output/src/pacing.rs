@@ -184,7 +184,7 @@ impl Pacer {
         } else if was_in_time {
             // Frames that were under way at the time had no more.
             let more = slot.lead + self.config.submit_margin;
-            self.lead = self.lead.max(more).min(TimeNs(self.config.refresh_period.0 / 2));
+            self.lead = self.lead.max(more).min(self.config.refresh_period);
         }
     }
 
@@ -464,7 +464,7 @@ mod tests {
     #[test]
     fn a_panel_that_chooses_its_frames_early_gets_them_earlier() {
         for (lead_ms, report_delay_ms, render_ms) in
-            [(2, 0, 5.0), (4, 0, 5.0), (4, 100, 5.0), (7, 0, 5.0), (4, 0, 14.0)]
+            [(2, 0, 5.0), (4, 0, 5.0), (4, 100, 5.0), (7, 0, 5.0), (4, 0, 14.0), (9, 0, 1.5), (12, 0, 1.5)]
         {
             let mut bench = Bench::new(REFRESH.0 as f64, render_ms, 0.5);
             (bench.lead_ns, bench.report_delay_ns) = (lead_ms * MS, 300_000 + report_delay_ms * MS);

@@ -95,10 +95,17 @@ const LEAD_STEP: i64 = 8;
 /// three in a row do, one in a second does not.
 const MISS_WEIGHT: u32 = 8;
 const MISSES_MAX: u32 = 2;
+/// What the lead has grown by falls by this part with each refresh that was met, so that hiccups at the start do not make
+/// every later picture an old one: where all of it was needed, at 60 Hz some three refreshes are missed in 20 s.
+const FORGET_LEAD: i64 = 4096;
 
 impl Lead {
     pub(super) fn new(period: TimeNs) -> Self {
-        Self { period, lead: LEAD_FIRST.min(TimeNs(period.0 / 2)), misses: 0 }
+        Self { period, lead: Self::first(period), misses: 0 }
+    }
+
+    fn first(period: TimeNs) -> TimeNs {
+        LEAD_FIRST.min(TimeNs(period.0 / 2))
     }
 
     /// When to choose the picture of the refresh after the one at `t_refresh`.
@@ -110,6 +117,7 @@ impl Lead {
     pub(super) fn learn(&mut self, t_before: TimeNs, t_present: TimeNs) {
         if (t_present - t_before).0 < self.period.0 + self.period.0 / 2 {
             self.misses = self.misses.saturating_sub(1);
+            self.lead.0 -= (self.lead - Self::first(self.period)).0 / FORGET_LEAD;
             return;
         }
         self.misses += MISS_WEIGHT;
@@ -159,7 +167,7 @@ mod tests {
 
     #[test]
     fn the_lead_grows_until_refreshes_are_met_and_no_further() {
-        for deadline_ms in [0, 3, 7, 12, 16] {
+        for deadline_ms in [0, 3, 7, 11, 15] {
             assert_eq!(missed(TimeNs(deadline_ms * MS), 0, 150), 0, "{deadline_ms}");
         }
         // What no lead meets is missed each time.
@@ -175,6 +183,21 @@ mod tests {
         }
         assert_eq!(lead.t_choose(TimeNs(0)), before);
         assert_eq!(missed(TimeNs(3 * MS), 20, 200), 10);
+    }
+
+    #[test]
+    fn what_hiccups_at_the_start_have_taught_is_forgotten() {
+        let mut lead = Lead::new(TimeNs(16 * MS));
+        let at_first = lead.t_choose(TimeNs(0));
+        for _ in 0..24 {
+            lead.learn(TimeNs(0), TimeNs(32 * MS));
+        }
+        assert_eq!(lead.t_choose(TimeNs(0)), TimeNs(0), "all of a refresh");
+        // Five minutes at 60 Hz.
+        for _ in 0..18_000 {
+            lead.learn(TimeNs(0), TimeNs(16 * MS));
+        }
+        assert!(at_first - lead.t_choose(TimeNs(0)) < TimeNs(MS / 2));
     }
 
     #[test]
