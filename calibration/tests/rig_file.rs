@@ -380,6 +380,52 @@ fn a_field_order_is_a_permutation() {
 }
 
 #[test]
+fn an_order_of_channels_is_a_permutation_and_for_channel_packed_panels() {
+    let channels = "channel_order = [\"green\", \"red\", \"blue\"]\nmode = ";
+    let rig = Rig::parse(&changed(&[("mode = ", channels)]), Path::new("")).unwrap();
+    assert_eq!(
+        (rig.panel.field_order, rig.panel.channel_order),
+        (Colour::ALL, [Colour::Green, Colour::Red, Colour::Blue])
+    );
+    check(
+        "mode = ",
+        "channel_order = [\"green\"]\nmode = ",
+        "panel.channel_order",
+        "",
+        "each once",
+        "channel_order = [",
+    );
+    check(
+        "mode = \"channel-packed\"",
+        "channel_order = [\"green\", \"red\", \"blue\"]\nmode = \"field-sequential\"",
+        "panel.channel_order",
+        "field-sequential mode",
+        "none outside channel-packed mode",
+        "take it out",
+    );
+}
+
+/// Its channel is the colour that such a panel lights.
+#[test]
+fn a_panel_that_lights_its_own_lasers_shows_each_colour_in_its_channel() {
+    let green_first = "[\"green\", \"red\", \"blue\"]";
+    let beam = "driver = \"ready-beam\"\ndevice = \"/dev/x\"\nfull_power_mw = { red = 9, green = 9, blue = 9 }";
+    let parsed = |field_order: &str| {
+        let text = changed(&[
+            ("driver = \"simulated\"", &format!("{beam}\n{ACCEPTED}\ngated_by_panel = true")),
+            ("field_order = [\"red\", \"green\", \"blue\"]", &format!("field_order = {field_order}")),
+            ("mode = ", &format!("channel_order = {green_first}\nmode = ")),
+        ]);
+        Rig::parse(&text, Path::new(""))
+    };
+    let faults = parsed("[\"red\", \"green\", \"blue\"]").unwrap_err().faults;
+    assert_eq!(faults.len(), 1, "{faults:?}");
+    assert_eq!(faults[0].key, "lasers.gated_by_panel");
+    assert!(faults[0].expected.contains("green, red, blue"), "{faults:?}");
+    parsed(green_first).unwrap();
+}
+
+#[test]
 fn timings_that_do_not_fit_into_the_field_state_the_numbers() {
     check(
         "settle_ms = 2.0",

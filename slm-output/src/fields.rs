@@ -16,6 +16,8 @@ pub struct FrameLayout {
     pub mode: PanelMode,
     /// The order in which the colours are shown; it is that of the patterns in a frame's samples.
     pub field_order: [Colour; FIELDS],
+    /// The order in which the panel shows the video's channels, in channel-packed mode.
+    pub channel_order: [Colour; FIELDS],
     /// Video frames in a row that show one colour's pattern in field-sequential mode; 1 in the other modes.
     pub frames_per_colour: u8,
     /// Where the bits of a level travel on the video link.
@@ -25,8 +27,8 @@ pub struct FrameLayout {
 impl FrameLayout {
     /// The layout for `panel` with `resolution` pixels.
     pub fn new(panel: &Panel, resolution: Resolution) -> Self {
-        let Panel { mode, field_order, frames_per_colour, packing, .. } = *panel;
-        Self { resolution, mode, field_order, frames_per_colour, packing }
+        let Panel { mode, field_order, channel_order, frames_per_colour, packing, .. } = *panel;
+        Self { resolution, mode, field_order, channel_order, frames_per_colour, packing }
     }
 
     /// Colour fields from the start of one colour frame to the start of the next.
@@ -69,6 +71,16 @@ impl FrameLayout {
         self.field_order.iter().position(|&shown| shown == colour).expect("a field order holds each colour once")
     }
 
+    /// Red, green and blue of a video pixel of a channel-packed frame, of whose fields `shown` are the levels in the
+    /// order in which they are shown.
+    pub fn channels_of(&self, shown: [u16; FIELDS]) -> [u16; FIELDS] {
+        let mut channels = [0; FIELDS];
+        for (channel, level) in self.channel_order.into_iter().zip(shown) {
+            channels[channel.index()] = level;
+        }
+        channels
+    }
+
     /// Distance in samples between neighbouring pixels of one field.
     const fn stride(&self) -> usize {
         match self.mode {
@@ -88,8 +100,8 @@ impl FrameLayout {
 
 /// One colour frame of levels, laid out as the panel takes it.
 ///
-/// - Channel-packed: one video frame `[height, width, 3]`, row-major; the video's R, G and B channels carry the first,
-///   second and third *shown* field, whatever their colours are.
+/// - Channel-packed: one video frame `[height, width, 3]`, row-major, the fields in the order in which they are *shown*,
+///   whatever their colours are; the video's channels carry them as [`FrameLayout::channel_order`] says.
 /// - Field-sequential and monochrome: three gray video frames `[3 (shown order), height, width]`; whoever sends one to
 ///   a colour video link repeats each level in R, G and B. In monochrome mode the panel shows one of them only.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -304,7 +316,9 @@ mod tests {
             field_order in orders(), mode in modes(), red in levels(), green in levels(), blue in levels(),
         ) {
             let layout =
-                FrameLayout { resolution: SMALL, mode, field_order, frames_per_colour: 1, packing: Packing::Gray };
+                FrameLayout {
+                    resolution: SMALL, mode, field_order, channel_order: Colour::ALL, frames_per_colour: 1, packing: Packing::Gray
+                };
             let mut frame = LevelsFrame::new(layout);
             let given = [red, green, blue];
             for colour in Colour::ALL {
@@ -328,6 +342,7 @@ mod tests {
             resolution: Resolution { width: 2, height: 1 },
             mode: PanelMode::ChannelPacked,
             field_order,
+            channel_order: Colour::ALL,
             frames_per_colour: 1,
             packing: Packing::Gray,
         };
@@ -346,6 +361,7 @@ mod tests {
             resolution: Resolution { width: 2, height: 1 },
             mode: PanelMode::FieldSequential,
             field_order,
+            channel_order: Colour::ALL,
             frames_per_colour: 2,
             packing: Packing::Gray,
         };

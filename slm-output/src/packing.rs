@@ -3,6 +3,7 @@
 //! What travels is exact: no gamma, no dithering, full range. [`channels`] says what one level becomes; [`write_frame`]
 //! and [`pack_row`] do the same for whole pictures as fast as memory allows.
 
+use holod_calibration::Colour;
 use holod_calibration::rig::{Packing, PanelMode};
 
 use crate::fields::{FIELDS, FrameLayout, LevelsFrame};
@@ -108,9 +109,14 @@ fn pack_as<const RED: u32, const GREEN: u32, const BLUE: u32, const BITS: u32>(
     if layout.mode == PanelMode::ChannelPacked {
         let (fields, rest) = samples.as_chunks::<FIELDS>();
         assert!(rest.is_empty() && fields.len() == pixels.len(), "a row has {FIELDS} samples for each pixel");
-        for (pixel, &[red, green, blue]) in pixels.iter_mut().zip(fields) {
-            let [red, green, blue] = [red, green, blue].map(|level| u32::from(level) & mask);
-            *pixel = (red << RED | green << GREEN | blue << BLUE | full).to_le_bytes();
+        let shifts = layout.channel_order.map(|channel| match channel {
+            Colour::Red => RED,
+            Colour::Green => GREEN,
+            Colour::Blue => BLUE,
+        });
+        for (pixel, &fields) in pixels.iter_mut().zip(fields) {
+            let [first, second, third] = fields.map(|level| u32::from(level) & mask);
+            *pixel = (first << shifts[0] | second << shifts[1] | third << shifts[2] | full).to_le_bytes();
         }
         return;
     }
@@ -137,12 +143,19 @@ fn each(samples: &[u16], pixels: &mut [[u8; PIXEL_BYTES]], pixel_of: impl Fn(u32
 #[cfg(test)]
 mod tests {
     use super::*;
-    use holod_calibration::{Colour, Resolution};
+    use holod_calibration::Resolution;
     use proptest::prelude::*;
 
     fn layout(mode: PanelMode, packing: Packing) -> FrameLayout {
         let resolution = Resolution { width: 7, height: 1 };
-        FrameLayout { resolution, mode, field_order: Colour::ALL, frames_per_colour: 1, packing }
+        FrameLayout {
+            resolution,
+            mode,
+            field_order: Colour::ALL,
+            channel_order: Colour::ALL,
+            frames_per_colour: 1,
+            packing,
+        }
     }
 
     /// What a panel reads out of a video pixel, written bit by bit from the makers' descriptions.
@@ -248,16 +261,21 @@ mod tests {
         #[test]
         fn a_channel_packed_row_has_a_field_in_each_channel(
             fields in prop::collection::vec(any::<[u16; 3]>(), 0..400), ten_bits in prop::bool::ANY,
+            channel_order in prop::sample::select(vec![Colour::ALL, [Colour::Green, Colour::Blue, Colour::Red]]),
         ) {
             let packing = if ten_bits { Packing::Gray10 } else { Packing::Gray };
             let top = (1u16 << packing.bit_depth()) - 1;
             let samples: Vec<u16> = fields.iter().flatten().map(|&level| level & top).collect();
-            let layout = layout(PanelMode::ChannelPacked, packing);
+            let layout = FrameLayout { channel_order, ..layout(PanelMode::ChannelPacked, packing) };
             for format in formats(packing) {
                 let mut pixels = vec![7; PIXEL_BYTES * fields.len()];
                 pack_row(&layout, &samples, format, &mut pixels);
-                for (bytes, levels) in pixels.chunks_exact(PIXEL_BYTES).zip(samples.as_chunks::<3>().0) {
-                    prop_assert_eq!(bytes, bytes_of(format, *levels));
+                for (bytes, &shown) in pixels.chunks_exact(PIXEL_BYTES).zip(samples.as_chunks::<3>().0) {
+                    let [first, second, third] = shown;
+                    // Blue is shown second there, red third.
+                    let channels = if channel_order == Colour::ALL { shown } else { [third, first, second] };
+                    prop_assert_eq!(bytes, bytes_of(format, channels));
+                    prop_assert_eq!(layout.channels_of(shown), channels);
                 }
             }
         }

@@ -74,6 +74,8 @@ pub struct Panel {
     pub mode: PanelMode,
     /// The order in which the panel shows the colours.
     pub field_order: [Colour; 3],
+    /// The order in which it shows the video's channels, in channel-packed mode.
+    pub channel_order: [Colour; 3],
     /// Video frames in a row that show one colour's pattern in field-sequential mode; 1 in the other modes.
     pub frames_per_colour: u8,
     /// Bits of one level: 8, 10 or 16.
@@ -292,6 +294,7 @@ impl Default for Rig {
                 refresh_hz: 60.0,
                 mode: PanelMode::ChannelPacked,
                 field_order: Colour::ALL,
+                channel_order: Colour::ALL,
                 frames_per_colour: 1,
                 bit_depth: 8,
                 packing: Packing::Gray,

@@ -28,6 +28,7 @@ const LAYOUT: [(&str, &[&str]); 6] = [
             "refresh_hz",
             "mode",
             "field_order",
+            "channel_order",
             "frames_per_colour",
             "colour",
             "bit_depth",
@@ -175,6 +176,7 @@ fn read_rig<'a>(
         refresh_hz: timing.refresh_hz,
         mode: timing.mode,
         field_order: timing.field_order,
+        channel_order: timing.channel_order,
         frames_per_colour: timing.frames_per_colour,
         settle: milliseconds(timing.settle_ms.value),
         bit_depth,
@@ -214,6 +216,7 @@ struct FieldTiming {
     refresh_hz: f64,
     mode: PanelMode,
     field_order: [Colour; 3],
+    channel_order: [Colour; 3],
     frames_per_colour: u8,
     settle_ms: Found<f64>,
     field_ms: f64,
@@ -242,13 +245,13 @@ fn read_field_timing<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<Fiel
         Some(PanelMode::Monochrome(_)) if !panel.has("field_order") => Some(Colour::ALL),
         _ => reader.colour_order(panel, "field_order"),
     };
+    let channel_order = read_channel_order(reader, panel, mode);
     let frames_per_colour = read_frames_per_colour(reader, panel, mode);
     let settle_ms = reader.required_number(panel, "settle_ms", SETTLE);
     let (refresh_hz, mode, settle_ms) = (refresh_hz?.value, mode?, settle_ms?);
     let field_ms = 1e3 / (refresh_hz * mode.fields_per_refresh());
-    let field_order = field_order?;
-    let timing =
-        FieldTiming { refresh_hz, mode, field_order, frames_per_colour: frames_per_colour?, settle_ms, field_ms };
+    let (field_order, channel_order, frames_per_colour) = (field_order?, channel_order?, frames_per_colour?);
+    let timing = FieldTiming { refresh_hz, mode, field_order, channel_order, frames_per_colour, settle_ms, field_ms };
     if settle_ms.value >= field_ms {
         let expected = format!("less than the {}", timing.describe_field());
         let advice = "no phase would ever settle: correct the settle time or lower refresh_hz".into();
@@ -275,6 +278,21 @@ fn read_mode<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<PanelMode> {
         ("field-sequential", None) => Some(PanelMode::FieldSequential),
         (_, None) => Some(PanelMode::ChannelPacked),
     }
+}
+
+fn read_channel_order<'a>(reader: &Reader<'a>, panel: Section<'a>, mode: Option<PanelMode>) -> Option<[Colour; 3]> {
+    if !panel.has("channel_order") {
+        return Some(Colour::ALL);
+    }
+    let order = reader.colour_order(panel, "channel_order")?;
+    if let Some(mode) = mode.filter(|&mode| mode != PanelMode::ChannelPacked) {
+        let found = format!("an order of channels in {} mode", mode.name());
+        let expected = "none outside channel-packed mode, where all channels carry one colour";
+        let line = reader.line_of_key(panel, "channel_order");
+        reader.fault_in(panel, "channel_order", line, &found, expected, "take it out".into());
+        return None;
+    }
+    Some(order)
 }
 
 fn read_frames_per_colour<'a>(reader: &Reader<'a>, panel: Section<'a>, mode: Option<PanelMode>) -> Option<u8> {
@@ -571,6 +589,17 @@ fn read_lasers<'a>(
     let heartbeat_ms = reader.required_number(lasers, "heartbeat_timeout_ms", HEARTBEAT);
     let stall_ms = reader.number(lasers, "stall_timeout_ms", STALL);
 
+    if let Some(timing) = timing.filter(|timing| timing.mode == PanelMode::ChannelPacked)
+        && gated_by_panel
+        && timing.field_order != timing.channel_order
+    {
+        let line = reader.line_of_key(lasers, "gated_by_panel");
+        let names = |order: [Colour; 3]| order.map(Colour::name).join(", ");
+        let expected = format!("panel.field_order = panel.channel_order, which is {}", names(timing.channel_order));
+        let advice = "a panel that lights its own lasers lights each channel's colour: correct either order".into();
+        let found = format!("true with panel.field_order = {}", names(timing.field_order));
+        reader.fault_in(lasers, "gated_by_panel", line, &found, &expected, advice);
+    }
     if let (Some(timing), Some(on_delay_ms), Some(lit_ms)) = (timing, on_delay_ms, lit_ms) {
         let before_ms = timing.settle_ms.value + on_delay_ms.value;
         let end_ms = before_ms + lit_ms.value;

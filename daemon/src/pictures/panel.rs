@@ -32,10 +32,13 @@ pub fn video_pictures(levels: &LevelsFrame) -> Vec<(Option<Colour>, RgbImage)> {
     // A picture's channels have eight bits: of ten, the high ones.
     let byte = |channel: u16| (channel >> (layout.packing.channel_bits() - 8)) as u8;
     let picture = |first_field: usize| {
-        let samples = (0..height).map(|row| levels.video_row(first_field, row));
+        let rows = (0..height).map(|row| levels.video_row(first_field, row));
         let bytes = match layout.mode {
-            PanelMode::ChannelPacked => samples.flatten().map(|&level| byte(level)).collect(),
-            _ => samples.flatten().flat_map(|&level| channels(layout.packing, level).map(byte)).collect(),
+            PanelMode::ChannelPacked => {
+                let pixels = rows.flat_map(|row| row.as_chunks().0);
+                pixels.flat_map(|&shown| layout.channels_of(shown).map(byte)).collect()
+            }
+            _ => rows.flatten().flat_map(|&level| channels(layout.packing, level).map(byte)).collect(),
         };
         RgbImage::from_raw(width as u32, height as u32, bytes).expect("three bytes for each pixel")
     };

@@ -93,8 +93,13 @@ pub(super) fn panel(rig: &Rig, output: Option<&OutputSpec>) -> Vec<Check> {
         Err(error) => return vec![check(false, error.to_string())],
     };
     let mut checks = vec![check(true, format!("{spec}: {described}, as the rig says; the flat pattern came on it"))];
+    let passes = |verdict| match verdict {
+        Verdict::Right | Verdict::Unverified => true,
+        Verdict::Wrong => false,
+        Verdict::Dark => !matches!(rig.lasers.driver, LaserDriver::Serial { sync_wire: false, .. }),
+    };
     for found in panel.checks() {
-        checks.push(check(found.verdict != Verdict::Wrong, found.to_string()));
+        checks.push(check(passes(found.verdict), found.to_string()));
     }
     checks.push(check(true, CABLE.to_owned()));
     checks

@@ -24,6 +24,8 @@ pub enum Verdict {
     Wrong,
     /// The driver does not tell.
     Unverified,
+    /// Lasers that nothing but the panel's reports times stay dark by it.
+    Dark,
 }
 
 impl fmt::Display for DisplayCheck {
@@ -32,6 +34,7 @@ impl fmt::Display for DisplayCheck {
             Verdict::Right => "right",
             Verdict::Wrong => "WRONG",
             Verdict::Unverified => "not verified",
+            Verdict::Dark => "lasers stay dark that only the panel's reports time",
         };
         write!(f, "{}: {}, wanted {} ({verdict})", self.name, self.found, self.wanted)
     }

@@ -28,7 +28,7 @@ use std::time::Duration;
 use std::{fmt, io};
 
 use holod_calibration::rig::{Packing, PanelMode};
-use holod_calibration::{TimeNs, host_now};
+use holod_calibration::{Resolution, TimeNs, host_now};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use self::monitors::{Monitor, MonitorError, PanelMonitor};
@@ -36,6 +36,7 @@ use self::timeline::{Lead, Outcome, Presented, Timeline};
 use self::watch::Watched;
 use crate::fields::{FIELDS, FrameTag, LevelsFrame};
 use crate::packing::{PIXEL_BYTES, PixelFormat, write_frame};
+use crate::present::drm::{DisplayCheck, Verdict};
 use crate::present::{
     FrameSource, PanelFault, PanelSetup, PanelTiming, PresentedRefresh, Presenter, TimestampSource, WindowSpec,
 };
@@ -200,8 +201,10 @@ struct Wanted {
 
 /// How long a display server may take to bring a window up, its graphics driver included.
 const OPEN_WAIT: Duration = Duration::from_secs(10);
-/// How long the first picture may take to come on the monitor.
-const FIRST_PICTURE: TimeNs = TimeNs(1_000_000_000);
+/// How long the first pictures may take to come on the monitor, all of them flat.
+const FIRST_PICTURES_WAIT: TimeNs = TimeNs(1_000_000_000);
+/// So many: some servers copy the first ones and flip later ones.
+const FIRST_PICTURES: u32 = 6;
 /// A picture that has been on its way for this long is stuck.
 const STUCK: TimeNs = TimeNs(500_000_000);
 /// A panel on a monitor of the desktop.
@@ -218,6 +221,7 @@ pub struct WindowPanel {
     fields_per_refresh: usize,
     /// `None` while the panel is lost.
     open: Option<Open>,
+    checks: Vec<DisplayCheck>,
     flat: LevelsFrame,
     flat_wanted: bool,
     /// The frame that was reported last, and its levels.
@@ -302,6 +306,7 @@ impl WindowPanel {
             refreshes_per_plane: layout.refreshes() / planes,
             fields_per_refresh: layout.fields_per_refresh(),
             open: None,
+            checks: Vec::new(),
             flat: flat.clone(),
             flat_wanted: false,
             reported: None,
@@ -329,33 +334,42 @@ impl WindowPanel {
         let monitor = Box::new(watched.monitor().clone());
         let (lead, t_refresh) = (Lead::new(self.timing.refresh_period), host_now());
         let mut open = Open { draw, watched, timeline: None, lead, t_refresh };
-        let first = self.show_first(&mut open).map_err(|fault| WindowError::NothingShown { monitor, fault })?;
-        open.timeline = first.map(Timeline::starting_with);
+        let last = self.show_first(&mut open);
+        let last = last.map_err(|fault| WindowError::NothingShown { monitor: monitor.clone(), fault })?;
+        self.checks = checks(&monitor, &self.wanted.panel, last);
+        open.timeline = last.map(Timeline::starting_with);
         self.t_next = host_now();
         self.open = Some(open);
         Ok(())
     }
 
-    /// Writes the flat pattern and waits until it is on the monitor, with what the display server says of that. `None`
-    /// where the server says nothing.
+    /// Writes the flat pattern and waits until it is on the monitor, with what the display server says of the last time
+    /// that it was presented. `None` where the server says nothing.
     fn show_first(&mut self, open: &mut Open) -> Result<Option<watch::Completion>, PanelFault> {
         for plane in 0..self.planes {
             write_pixels(&self.flat, plane * self.refreshes_per_plane, &mut self.pixels);
             open.draw.write(self.planes + plane, &self.pixels)?;
         }
         open.draw.present(self.planes)?;
-        let t_end = host_now() + FIRST_PICTURE;
-        let mut first = None;
+        let t_end = host_now() + FIRST_PICTURES_WAIT;
+        let (mut last, mut shown) = (None, 0);
         loop {
             open.watched.check()?;
-            first = first.or_else(|| open.watched.completion());
-            let is_there = open.watched.is_placed() && (first.is_some() || !open.watched.reports_completions());
-            let rest = t_end - host_now();
-            if is_there {
-                return Ok(first);
+            if let Some(completion) = open.watched.completion() {
+                (last, shown) = (Some(completion), shown + 1);
+                if shown < FIRST_PICTURES {
+                    open.draw.present(self.planes)?;
+                }
             }
+            let is_shown = shown == FIRST_PICTURES || !open.watched.reports_completions();
+            if open.watched.is_placed() && is_shown {
+                return Ok(last);
+            }
+            let rest = t_end - host_now();
             if rest <= TimeNs(0) {
-                return if open.watched.is_placed() { Ok(None) } else { Err(PanelFault::WindowLost) };
+                // One that is still on its way would be taken for the next.
+                let all_came = shown == 0 || shown == FIRST_PICTURES;
+                return if open.watched.is_placed() && all_came { Ok(last) } else { Err(PanelFault::WindowLost) };
             }
             let timeout = Timespec { tv_sec: 0, tv_nsec: rest.0.min(999_999_999) };
             let bell = PollFd::from_borrowed_fd(open.watched.bell(), PollFlags::IN);
@@ -514,9 +528,38 @@ impl Presenter for WindowPanel {
         self.open_anew().map_err(|why| why.as_fault())
     }
 
+    fn checks(&self) -> &[DisplayCheck] {
+        &self.checks
+    }
+
     fn shown(&self) -> Option<&LevelsFrame> {
         self.reported.map(|_| &self.shown)
     }
+}
+
+/// What is to be said of a window that has come up on `monitor`, and whose last picture came as `last` says.
+fn checks(monitor: &Monitor, panel: &PanelMonitor, last: Option<watch::Completion>) -> Vec<DisplayCheck> {
+    let is_stamped = last.is_some_and(|last| last.shown == watch::Shown::Flipped);
+    let found = if is_stamped { "the display driver's" } else { "software's" };
+    let check = |name: &str, found: String, wanted: String, verdict| DisplayCheck {
+        name: name.to_owned(),
+        found,
+        wanted,
+        verdict,
+    };
+    let times = if is_stamped { Verdict::Right } else { Verdict::Dark };
+    let mut checks = vec![
+        check("monitor", monitor.to_string(), panel.to_string(), Verdict::Right),
+        check("times of refreshes", found.to_owned(), "the display driver's".to_owned(), times),
+    ];
+    if let Some(native) = monitor.edid.as_ref().and_then(|edid| edid.native) {
+        let size = |size: Resolution| format!("{}x{}", size.width, size.height);
+        let verdict = if native == panel.resolution { Verdict::Right } else { Verdict::Unverified };
+        checks.push(check("the monitor's own size by its EDID", size(native), size(panel.resolution), verdict));
+    }
+    let unseen = "the display server is not asked; set them in the graphics driver's settings, or use drm:CONNECTOR";
+    checks.push(DisplayCheck::unverified("full range, no underscan, no dithering", unseen, "all three"));
+    checks
 }
 
 /// Writes the pixels of the video frame that begins with the `first_field`-th field of `frame`.
