@@ -7,7 +7,7 @@ use holod_daemon::evaluation::{EvaluationPlan, EvaluationSettings};
 use holod_daemon::failure::{Exit, Failure};
 use pyo3::prelude::*;
 
-use crate::outcome::{HolodError, without_lock};
+use crate::outcome::{HolodError, with_threads};
 use crate::renderer::backend_named;
 use crate::rig::Rig;
 use crate::view::pupil;
@@ -55,7 +55,7 @@ pub(crate) fn evaluate<'py>(
         border_px,
     };
     let mut interrupt = None;
-    let judged = without_lock(py, || {
+    let judged = with_threads(py, || {
         let evaluated = EvaluationPlan::new(settings)?.judge(0, || {
             Python::attach(|py| py.check_signals()).map_err(|error| {
                 interrupt = Some(error);

@@ -2,7 +2,7 @@
 
 use std::ffi::CString;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use holod_daemon::failure::{Exit, Failure};
 use holod_daemon::logging::text_of;
@@ -34,6 +34,21 @@ pub(crate) fn without_lock<T: Send>(py: Python<'_>, work: impl FnOnce() -> Resul
             Err(HolodError::new_err(format!("a fault of holod itself: {text}; its place stands on standard error")))
         }
     }
+}
+
+/// [`without_lock`] for work that is shared out among rayon's threads or the graphics driver's. A process that was
+/// forked after such work has none of them and would wait for them for ever, so there it is an error.
+pub(crate) fn with_threads<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T, Failure> + Send) -> PyResult<T> {
+    static STARTED_IN: OnceLock<u32> = OnceLock::new();
+    let process = std::process::id();
+    if *STARTED_IN.get_or_init(|| process) != process {
+        return Err(HolodError::new_err(
+            "this process was forked from one in which holod had computed, and the threads that compute stayed there: \
+             start processes with multiprocessing's \"spawn\" or \"forkserver\", or compute and make renderers in the \
+             forked processes only",
+        ));
+    }
+    without_lock(py, work)
 }
 
 /// A failure as an exception with its whole text.

@@ -18,7 +18,7 @@ use numpy::Complex32;
 use pyo3::prelude::*;
 
 use crate::arrays::{Given, Out, array};
-use crate::outcome::{HolodError, InputError, without_lock};
+use crate::outcome::{HolodError, InputError, with_threads, without_lock};
 use crate::rig::{Rig, levels_of, levels_shape, pattern_resolution};
 use crate::view::{eye, pupil, see};
 
@@ -77,7 +77,7 @@ impl Renderer {
         let backend = backend_named(backend)?;
         let rig = Rig::with_weights(rig, weights.as_deref())?;
         let resolution = pattern_resolution(&rig, width_px, height_px)?;
-        without_lock(py, || {
+        with_threads(py, || {
             let weights: Weights = setup::weights(&rig)?;
             let encoder = renderer::panel_encoder(&rig, resolution)?;
             let renderer = renderer::open(backend, &weights, &rig.geometry, &encoder, &Use::Command)?;
@@ -141,7 +141,7 @@ impl Renderer {
         let phase_to = Out::new::<f32>("out_phase_rad", out_phase_rad, [3, height, width])?;
         let (frame, report) = self.frame(rgb, colour, depth, depth_unit, fill_missing)?;
         let frame = Arc::new(frame);
-        let made = without_lock(py, || {
+        let made = with_threads(py, || {
             warn_of_oddities("the picture", &report, &self.rig.geometry, false);
             let mut state = self
                 .state

@@ -10,7 +10,7 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 use pyo3::prelude::*;
 
 use crate::arrays::{Given, array};
-use crate::outcome::{InputError, RigError, exception, without_lock};
+use crate::outcome::{InputError, RigError, exception, with_threads, without_lock};
 
 /// More turns than this are no phase: the encoder's arithmetic is exact to it.
 const MOST_TURNS: f32 = 50.0;
@@ -143,7 +143,7 @@ impl Rig {
     fn levels_of<'py>(&self, py: Python<'py>, phase_rad: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         let (phases, resolution) = phases_of("phase_rad", phase_rad)?;
         let encoder = self.encoder(resolution)?;
-        let levels = without_lock(py, || {
+        let levels = with_threads(py, || {
             let planes = PerColour([0, 1, 2].map(|colour| plane(&phases, colour)));
             let mut levels = LevelsFrame::new(encoder.layout());
             encoder.encode(planes, &mut levels);

@@ -9,7 +9,7 @@ use holod_model::optics::{Eye, PhasePattern, SimulatedEye};
 use pyo3::prelude::*;
 
 use crate::arrays::{Given, array, interleaved};
-use crate::outcome::{InputError, without_lock};
+use crate::outcome::{InputError, with_threads};
 use crate::rig::{Rig, phases_of};
 
 /// What an eye sees of phases on the rig's panel, which pass its 4f stop, the eye's pupil and its focus.
@@ -80,7 +80,7 @@ pub(crate) fn see<'py>(
     amplitude_constant: f32,
     pattern: impl FnOnce() -> Result<PhasePattern, Failure> + Send,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let (pixels, size) = without_lock(py, || {
+    let (pixels, size) = with_threads(py, || {
         let pattern = pattern()?;
         let seen = SimulatedEye::new(&rig.geometry, pattern.resolution).view(&pattern, amplitude_constant, eye);
         Ok((interleaved(&seen.pixels), pattern.resolution))

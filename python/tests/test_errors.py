@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 import threading
 import time
@@ -233,6 +234,62 @@ def test_scenes_that_cannot_be_read_are_told(tmp_path: Path, picture_files: tupl
         with pytest.raises(holod.InputError) as raised:
             holod.load_scene(path, **options)  # type: ignore[arg-type]
         assert said in str(raised.value)
+
+
+FORKS = """
+import multiprocessing
+
+import holod
+import numpy as np
+
+FLAT = np.zeros((3, 8, 8), np.float32)
+RENDERERS = []
+
+
+def seen():
+    return str(holod.view(FLAT, pupil_mm=3.0, focus_dpt=1.0).shape)
+
+
+def levels():
+    return str(holod.Rig.builtin().levels_of(FLAT).shape)
+
+
+def rendered():
+    scene = holod.builtin_scene(16, 16)
+    told = {"colour": scene.colour, "depth_unit": scene.depth_unit}
+    return str(RENDERERS[0].render(scene.rgb, scene.depth, 3.0, **told).levels.shape)
+
+
+def told(work):
+    try:
+        return work()
+    except holod.HolodError as error:
+        return str(error)
+
+
+def forked(*work):
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        return pool.map(told, work, chunksize=1)
+
+
+print(forked(seen, levels, seen))
+print(seen())
+RENDERERS.append(holod.Renderer(weights="fast", width_px=16, height_px=16, backend="cpu"))
+for said in forked(seen, levels, rendered):
+    print(said)
+"""
+
+
+def test_a_forked_process_is_told_that_it_has_no_threads(tmp_path: Path) -> None:
+    script = tmp_path / "forks.py"
+    script.write_text(FORKS)
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=120)
+    assert ended.returncode == 0, ended.stderr
+    before, parent, *after = ended.stdout.splitlines()
+    assert before == "['(8, 8, 3)', '(3, 1080, 1920)', '(8, 8, 3)']"
+    assert parent == "(8, 8, 3)"
+    assert len(after) == 3
+    assert all("this process was forked" in said and '"spawn"' in said for said in after), after
 
 
 def most_turns_during(work: Callable[[], object], calls: int, enough: int) -> int:
