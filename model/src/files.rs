@@ -56,9 +56,9 @@ impl BenchOptics {
     pub fn geometry(&self, resolution: Resolution) -> DisplayGeometry {
         DisplayGeometry {
             resolution,
-            pixel_pitch: Metres(self.pixel_pitch_um * 1e-6),
-            wavelengths: PerColour(self.wavelengths_nm.map(|wavelength_nm| Metres(wavelength_nm * 1e-9))),
-            eyepiece_focal_length: Metres(self.eyepiece_focal_length_mm * 1e-3),
+            pixel_pitch: Metres(self.pixel_pitch_um / 1e6),
+            wavelengths: PerColour(self.wavelengths_nm.map(|wavelength_nm| Metres(wavelength_nm / 1e9))),
+            eyepiece_focal_length: Metres(self.eyepiece_focal_length_mm / 1e3),
             depth_far: Dioptres(self.depth_far_dpt),
             depth_near: Dioptres(self.depth_near_dpt),
         }
@@ -67,13 +67,21 @@ impl BenchOptics {
     /// The optics of `geometry` in this type's units.
     pub fn of(geometry: &DisplayGeometry) -> Self {
         Self {
-            wavelengths_nm: geometry.wavelengths.0.map(|wavelength| wavelength.0 * 1e9),
-            pixel_pitch_um: geometry.pixel_pitch.0 * 1e6,
-            eyepiece_focal_length_mm: geometry.eyepiece_focal_length.0 * 1e3,
+            wavelengths_nm: geometry.wavelengths.0.map(|wavelength| as_written(wavelength, 1e9)),
+            pixel_pitch_um: as_written(geometry.pixel_pitch, 1e6),
+            eyepiece_focal_length_mm: as_written(geometry.eyepiece_focal_length, 1e3),
             depth_far_dpt: geometry.depth_far.0,
             depth_near_dpt: geometry.depth_near.0,
         }
     }
+}
+
+/// The figure that a rig file gave for a length, in a unit of which there are `per_m` to the metre: divided by that it
+/// is the same length, to the last bit.
+fn as_written(Metres(length_m): Metres, per_m: f64) -> f64 {
+    let figure = length_m * per_m;
+    let short = (figure * 1e9).round() / 1e9;
+    if short / per_m == length_m { short } else { figure }
 }
 
 /// A file that cannot be written or read.
@@ -242,6 +250,24 @@ mod tests {
         hologram().save(&path).unwrap();
         assert_eq!(StoredHologram::load(&path).unwrap(), hologram());
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn optics_come_back_from_a_file_to_the_last_bit() {
+        for step in 0..5000_u32 {
+            let [pitch_um, length_mm] = [100 + step, 500 + 10 * step].map(|hundredths| f64::from(hundredths) / 100.0);
+            let wavelength_nm = f64::from(38_000 + 8 * step) / 100.0;
+            let geometry = DisplayGeometry {
+                pixel_pitch: Metres(pitch_um / 1e6),
+                wavelengths: PerColour([Metres(wavelength_nm / 1e9); 3]),
+                eyepiece_focal_length: Metres(length_mm / 1e3),
+                ..DisplayGeometry::DEFAULT
+            };
+            let text = serde_json::to_string(&BenchOptics::of(&geometry)).unwrap();
+            let read: BenchOptics = serde_json::from_str(&text).unwrap();
+            assert_eq!(read.geometry(geometry.resolution), geometry, "{text}");
+            assert_eq!((read.pixel_pitch_um, read.eyepiece_focal_length_mm), (pitch_um, length_mm));
+        }
     }
 
     #[test]

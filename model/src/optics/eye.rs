@@ -81,11 +81,11 @@ impl SimulatedEye {
 
     fn see(&mut self, colour: Colour, eye: Eye, gain: f32, intensity: &mut [f32]) {
         let Metres(wavelength_m) = self.geometry.wavelengths[colour];
-        let stop = 1.0 / (4.0 * self.geometry.pixel_pitch.0);
         let pupil_radius = 0.5 * eye.pupil.metres().0 / (wavelength_m * self.geometry.eyepiece_focal_length.0);
         let u = self.geometry.image_distance(eye.focus);
-        self.propagator.filter(colour, u, |fx, fy| {
-            fx.abs() < stop && fy.abs() < stop && fx * fx + fy * fy <= pupil_radius * pupil_radius
+        self.propagator.filter(colour, u, |[x, y]| {
+            let in_pupil = x.per_m * x.per_m + y.per_m * y.per_m <= pupil_radius * pupil_radius;
+            x.in_half_band && y.in_half_band && in_pupil
         });
         let width = self.propagator.resolution().width;
         for (y, row) in intensity.chunks_exact_mut(width).enumerate() {
@@ -174,6 +174,32 @@ mod tests {
             // A wide pupil leaves the square 4f stop, corners included.
             assert!(seen(9.0, 0.225, 0.225, colour) > 0.7 && seen(9.0, -0.225, 0.0, colour) > 0.7, "{colour}");
             assert!(seen(9.0, 0.275, 0.0, colour) < 0.1 && seen(9.0, 0.0, 0.275, colour) < 0.1, "{colour}");
+        }
+    }
+
+    #[test]
+    fn the_stop_takes_light_on_its_edge_whatever_pitch_and_size_are() {
+        for pitch_um in [3.6, 3.74, 6.4, 8.0, 9.2, 12.5] {
+            let bench = DisplayGeometry { pixel_pitch: Metres(pitch_um / 1e6), ..BENCH };
+            for width in 48..57 {
+                for (size, fx, fy) in
+                    [(Resolution { width, height: 8 }, 0.25, 0.0), (Resolution { width: 8, height: width }, 0.0, 0.25)]
+                {
+                    let mut simulated = SimulatedEye::repeating(&bench, size);
+                    let mut seen = |scale: f32| {
+                        let mut hologram = ComplexHologram::dark(size);
+                        for (index, value) in hologram.plane_mut(Colour::Green).iter_mut().enumerate() {
+                            let (x, y) = ((index % size.width) as f32, (index / size.width) as f32);
+                            *value = Complex32::cis(std::f32::consts::TAU * scale * (fx * x + fy * y));
+                        }
+                        simulated.view_field(&hologram, eye(9.0, 0.0)).plane(Colour::Green)[0]
+                    };
+                    assert!(seen(0.0) > 0.99, "{pitch_um} µm, {size}");
+                    if width % 4 == 0 {
+                        assert!(seen(1.0) < 1e-6, "{pitch_um} µm, {size}");
+                    }
+                }
+            }
         }
     }
 

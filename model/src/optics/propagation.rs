@@ -50,7 +50,7 @@ impl Propagator {
     /// Carries `field` [height, width] of one colour over the distance `u`, towards the images where it is positive.
     pub fn propagate(&mut self, field: &mut [Complex32], colour: Colour, u: Metres) {
         self.pad(|index| field[index]);
-        self.filter(colour, u, |_, _| true);
+        self.filter(colour, u, |_| true);
         let width = self.resolution.width;
         for (row, from) in field.chunks_exact_mut(width).zip(self.padded.chunks_exact(self.padded_size.width)) {
             row.copy_from_slice(&from[..width]);
@@ -70,9 +70,9 @@ impl Propagator {
         });
     }
 
-    /// Multiplies the padded field's spectrum by the transfer function where `passes` (fx, fy in cycles per metre) and
-    /// by zero elsewhere.
-    pub(super) fn filter(&mut self, colour: Colour, u: Metres, passes: impl Fn(f64, f64) -> bool + Sync) {
+    /// Multiplies the padded field's spectrum by the transfer function where `passes` (of a bin along x and one along
+    /// y) and by zero elsewhere.
+    pub(super) fn filter(&mut self, colour: Colour, u: Metres, passes: impl Fn([Bin; 2]) -> bool + Sync) {
         let Resolution { width, height } = self.padded_size;
         let pitch_m = self.geometry.pixel_pitch.0;
         let wavelength_m = self.geometry.wavelengths[colour].0;
@@ -84,11 +84,11 @@ impl Propagator {
         let norm = 1.0 / (width * height) as f64;
         self.fft.forward(&mut self.padded);
         self.fft.spectrum.par_chunks_exact_mut(height).enumerate().for_each(|(kx, column)| {
-            let fx = signed_bin(kx, width) as f64 / (width as f64 * pitch_m);
+            let x = Bin::new(signed_bin(kx, width), width, pitch_m);
             // The transfer function is even in fy and so are the stops: each value serves two bins.
             for ky in 0..=height / 2 {
-                let fy = ky as f64 / (height as f64 * pitch_m);
-                let value = if passes(fx, fy) { transfer.at(fx, fy) * norm } else { Complex64::ZERO };
+                let y = Bin::new(ky as isize, height, pitch_m);
+                let value = if passes([x, y]) { transfer.at(x.per_m, y.per_m) * norm } else { Complex64::ZERO };
                 let value = Complex32::new(value.re as f32, value.im as f32);
                 column[ky] *= value;
                 if ky > 0 && 2 * ky < height {
@@ -106,6 +106,21 @@ impl Propagator {
 
     pub(super) fn resolution(&self) -> Resolution {
         self.resolution
+    }
+}
+
+/// One place of a spectrum along one axis.
+#[derive(Clone, Copy)]
+pub(super) struct Bin {
+    /// Its frequency in cycles per metre.
+    pub(super) per_m: f64,
+    /// Whether that is below a quarter of a cycle per pixel, which no rounding decides.
+    pub(super) in_half_band: bool,
+}
+
+impl Bin {
+    fn new(signed: isize, bins: usize, pitch_m: f64) -> Self {
+        Self { per_m: signed as f64 / (bins as f64 * pitch_m), in_half_band: 4 * signed.unsigned_abs() < bins }
     }
 }
 

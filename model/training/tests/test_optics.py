@@ -78,6 +78,12 @@ def test_upsampled_field_is_strictly_half_band() -> None:
     assert spectrum[..., mask].abs().max() > 1
 
 
+@pytest.mark.parametrize("size", [4, 5, 6, 7, 196, 392, 412, 1012])
+def test_the_bin_at_a_quarter_is_stopped_whatever_the_size(size: int) -> None:
+    inside = [4 * min(k, size - k) < size for k in range(size)]
+    assert half_band_mask(1, size)[0].tolist() == half_band_mask(size, 1)[:, 0].tolist() == inside
+
+
 def test_upsampling_keeps_a_wave_where_it_was() -> None:
     """exp(j·2π(…)) sampled at block centres becomes the same wave at pixel positions."""
     h, w = 24, 32
