@@ -1205,6 +1205,68 @@ fn meaning_warns_of_what_a_bench_cannot_do() {
 }
 
 #[test]
+fn times_in_seconds_are_asked_for_their_unit() {
+    let told = |changes: &[(&str, &str)]| {
+        let rig = Rig::parse(&changed(changes), Path::new("")).unwrap();
+        let warnings = rig.warnings();
+        assert!(warnings.iter().all(|warning| rig.meaning().notes.contains(warning)), "{warnings:?}");
+        warnings
+    };
+    let [settle, delay, lit] = [
+        ("settle_ms = 2.0", "settle_ms = 0.002"),
+        ("on_delay_ms = 0.1", "on_delay_ms = 0.0001"),
+        ("lit_ms = 3.0", "lit_ms = 0.003"),
+    ];
+    assert_eq!(
+        told(&[settle, delay, lit]),
+        ["settle_ms = 0.002, on_delay_ms = 0.0001, lit_ms = 0.003: short for a field of 5.556 ms; where that is in \
+          seconds, write settle_ms = 2, on_delay_ms = 0.1, lit_ms = 3"]
+    );
+    let [alone] = told(&[settle]).try_into().unwrap();
+    assert!(alone.starts_with("settle_ms = 0.002: short") && alone.ends_with("write settle_ms = 2"), "{alone}");
+    assert_eq!(told(&[delay]), [""; 0]);
+    assert_eq!(told(&[("settle_ms = 2.0", "settle_ms = 0")]), [""; 0]);
+    // In seconds it would be longer than the field.
+    assert_eq!(told(&[("settle_ms = 2.0", "settle_ms = 0.02")]), [""; 0]);
+    assert_eq!(Rig::default().warnings(), [""; 0]);
+}
+
+#[test]
+fn powers_in_watts_are_asked_for_their_unit() {
+    let told = |limits: &str, power: &str| {
+        let lasers = format!("driver = \"serial\"\ndevice = \"/dev/box\"\n{limits}");
+        let text = changed(&[("driver = \"simulated\"", &lasers), ("green = 1.0", power)]);
+        Rig::parse(&text, Path::new("")).unwrap().warnings()
+    };
+    let watts = ["green: the laser's power is 0.001 mW; where power_mw is in watts, write 1"];
+    assert_eq!(told("", "green = 0.001"), watts);
+    assert_eq!(told("power_limit_mw = { green = 0.0025 }", "green = 0.001"), watts);
+    // A limit in milliwatts says that the power is in these, too.
+    assert_eq!(told("power_limit_mw = { green = 2.5 }", "green = 0.001"), [""; 0]);
+    assert_eq!(told("", "green = 0"), [""; 0]);
+    let simulated = changed(&[("green = 1.0", "green = 0.001")]);
+    assert_eq!(Rig::parse(&simulated, Path::new("")).unwrap().warnings(), [""; 0]);
+}
+
+#[test]
+fn strokes_of_much_more_than_a_turn_are_asked_for_their_unit() {
+    let told = |red: &str, green: &str, blue: &str| {
+        let strokes = [("red = ", red), ("green = ", green), ("blue = ", blue)];
+        let strokes = strokes.map(|(colour, stroke)| [format!("{colour}1.9921875"), format!("{colour}{stroke}")]);
+        let changes = strokes.each_ref().map(|[from, to]| (from.as_str(), to.as_str()));
+        Rig::parse(&changed(&changes), Path::new("")).unwrap().warnings()
+    };
+    let used = "green: of 256 levels only 0 to 90 are used, the first 2 π of the panel's 5.650 π";
+    assert_eq!(told("2.0", "5.65", "2.4"), [used]);
+    // Where all could be radians, they are asked.
+    let warnings = told("5.7", "5.65", "3.2");
+    assert_eq!(warnings.len(), 3);
+    assert_eq!(warnings[1], format!("{used}; where stroke_pi is in radians, write 1.798"));
+    // Of a table the phases say what they are, or are asked otherwise.
+    assert_eq!(load_sparse_lut("0,0.0\n255,15.0\n").unwrap().warnings(), [""; 0]);
+}
+
+#[test]
 fn meaning_says_the_lasers_powers_and_what_bounds_them() {
     let meaning = |lines: &str| with_driver(lines).unwrap().meaning();
     let unlimited = "no power_limit_mw, so that a power_mw of up to 500 is taken";

@@ -8,13 +8,20 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use super::{LaserDriver, Lasers, Orientation, Panel, PanelProfile, Rig, Tracker};
-use crate::{Colour, PerColour, PupilDiameter};
+use crate::{Colour, PerColour, PupilDiameter, TimeNs};
 
 /// The pupils for which blur is worked out.
 const PUPILS_MM: [f32; 3] = [2.0, 3.0, 4.0];
 
 /// The ranges, in radians, of tables that may hold multiples of π.
 const IN_PI: RangeInclusive<f64> = 1.5..=2.1;
+
+/// Above this a stroke leaves so few levels that somebody should know.
+const LONG_STROKE_RAD: f64 = 2.5 * PI;
+
+/// Powers below this, with limits below that, may be in watts.
+const LOW_POWER_MW: f64 = 0.01;
+const LOW_LIMIT_MW: f64 = 0.1;
 
 /// A figure for each colour.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -276,7 +283,85 @@ impl TrackerMeaning {
     }
 }
 
+impl Rig {
+    /// What a run, too, should say of the rig's figures before it shows anything: phases that cannot be shown, and
+    /// figures that are likely to be in another unit.
+    pub fn warnings(&self) -> Vec<String> {
+        let mut warnings = self.panel.short_strokes();
+        warnings.extend(self.panel.long_strokes());
+        warnings.extend(self.times_in_seconds());
+        warnings.extend(self.lasers.powers_in_watts());
+        warnings
+    }
+
+    /// Times of a field that are so short that they would also fit into it if they were in seconds.
+    fn times_in_seconds(&self) -> Option<String> {
+        let field_ns = self.panel.field_period().0;
+        let times =
+            [("settle_ms", self.panel.settle), ("on_delay_ms", self.lasers.on_delay), ("lit_ms", self.lasers.width)];
+        let short: Vec<_> = times.into_iter().filter(|(_, TimeNs(ns))| (1..field_ns / 1000).contains(ns)).collect();
+        // A delay as short as that is nothing odd by itself.
+        if short.iter().all(|(key, _)| *key == "on_delay_ms") {
+            return None;
+        }
+        let written = |per_unit: f64| {
+            let figures = short.iter().map(|(key, TimeNs(ns))| format!("{key} = {}", *ns as f64 / per_unit));
+            figures.collect::<Vec<_>>().join(", ")
+        };
+        Some(format!(
+            "{}: short for a field of {:.3} ms; where that is in seconds, write {}",
+            written(1e6),
+            field_ns as f64 / 1e6,
+            written(1e3)
+        ))
+    }
+}
+
+impl Lasers {
+    /// Powers of real lasers that are so low, with limits that are none or low, too, that they may be in watts.
+    fn powers_in_watts(&self) -> Vec<String> {
+        if self.driver == LaserDriver::Simulated {
+            return Vec::new();
+        }
+        let doubtful = self.power_mw.iter().filter(|&(colour, &power_mw)| {
+            let limit_mw = self.power_limit_mw[colour].unwrap_or(0.0);
+            self.driver.has(colour) && power_mw > 0.0 && power_mw < LOW_POWER_MW && limit_mw < LOW_LIMIT_MW
+        });
+        let told = doubtful.map(|(colour, power_mw)| {
+            format!(
+                "{colour}: the laser's power is {power_mw} mW; where power_mw is in watts, write {}",
+                (power_mw * 1e9).round() / 1e6
+            )
+        });
+        told.collect()
+    }
+}
+
 impl Panel {
+    /// For each colour whose stroke is much more than 2π, how few levels that leaves.
+    fn long_strokes(&self) -> Vec<String> {
+        let levels = 1u32 << self.bit_depth;
+        let long = self
+            .stroke_rad
+            .iter()
+            .filter(|&(colour, stroke_rad)| self.lut[colour].is_none() && *stroke_rad > LONG_STROKE_RAD);
+        // All of them would be radians, and hardly any panel has less than half a wave.
+        let may_be_radians = self.stroke_rad.0.iter().all(|stroke_rad| stroke_rad / PI >= PI);
+        let told = long.map(|(colour, stroke_rad)| {
+            let stroke_pi = stroke_rad / PI;
+            let last_level = (f64::from(levels - 1) * TAU / stroke_rad) as u32;
+            let mut said = format!(
+                "{colour}: of {levels} levels only 0 to {last_level} are used, the first 2 π of the panel's \
+                 {stroke_pi:.3} π"
+            );
+            if may_be_radians {
+                said += &format!("; where stroke_pi is in radians, write {:.3}", stroke_pi / PI);
+            }
+            said
+        });
+        told.collect()
+    }
+
     /// For each colour whose stroke is less than 2π, what becomes of the phases that cannot be shown.
     pub fn short_strokes(&self) -> Vec<String> {
         let levels = f64::from(1u32 << self.bit_depth);
@@ -307,7 +392,7 @@ fn active_files(rig: &Rig) -> Vec<ActiveFile> {
 
 fn notes(rig: &Rig) -> Vec<String> {
     let mut notes = Vec::new();
-    notes.extend(rig.panel.short_strokes());
+    notes.extend(rig.warnings());
     let levels = 1u32 << rig.panel.bit_depth;
     for (colour, table) in rig.panel.lut.iter() {
         if let Some(table) = table

@@ -43,8 +43,8 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         bug_report::refuse_archive(path)?;
     }
     tracing::info!("{}: tracker {tracker}, panel {output} of {}", rig.name, rig.resolution());
-    for short in rig.panel.short_strokes() {
-        tracing::warn!("{short}");
+    for warning in rig.warnings() {
+        tracing::warn!("{warning}");
     }
     let weights = progress::during("loading the network", || setup::weights(&rig))?;
     let pictures =
