@@ -1197,7 +1197,7 @@ fn meaning_warns_of_what_a_bench_cannot_do() {
         "blue: the panel's stroke is 1.500 π",
         "green: the laser's power is 0",
         "simulated",
-        "blue: the eyebox is 2.25 mm",
+        "the half band fills red 1.59, green 1.30, blue 1.12 mm of the eyebox; a wider pupil is not filled",
     ] {
         assert!(notes.iter().any(|said| said.contains(note)), "{note}: {notes:?}");
     }
@@ -1264,6 +1264,13 @@ fn strokes_of_much_more_than_a_turn_are_asked_for_their_unit() {
     assert_eq!(warnings[1], format!("{used}; where stroke_pi is in radians, write 1.798"));
     // Of a table the phases say what they are, or are asked otherwise.
     assert_eq!(load_sparse_lut("0,0.0\n255,15.0\n").unwrap().warnings(), [""; 0]);
+}
+
+#[test]
+fn times_are_told_as_they_were_written() {
+    let text = changed(&[("heartbeat_timeout_ms = 100.0", "heartbeat_timeout_ms = 150.0")]);
+    let told = Rig::parse(&text, Path::new("")).unwrap().meaning().to_string();
+    assert!(told.contains("heard of holod for 150 ms"), "{told}");
 }
 
 #[test]

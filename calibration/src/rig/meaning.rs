@@ -234,9 +234,9 @@ impl FieldMeaning {
     fn of(rig: &Rig) -> Self {
         let panel = &rig.panel;
         let period_ms = 1e3 / (panel.refresh_hz * panel.mode.fields_per_refresh());
-        let settled_ms = panel.settle.seconds() * 1e3;
-        let laser_on_ms = settled_ms + rig.lasers.on_delay.seconds() * 1e3;
-        let lit_ms = rig.lasers.width.seconds() * 1e3;
+        let settled_ms = milliseconds(panel.settle);
+        let laser_on_ms = settled_ms + milliseconds(rig.lasers.on_delay);
+        let lit_ms = milliseconds(rig.lasers.width);
         Self {
             mode: panel.mode.name().into(),
             refresh_hz: panel.refresh_hz,
@@ -265,8 +265,8 @@ impl LaserMeaning {
             power_limit_mw: (*power_limit_mw).into(),
             power_max_mw: Lasers::POWER_MAX_MW,
             full_power_mw,
-            heartbeat_timeout_ms: driver.has_heartbeat().then(|| heartbeat_timeout.seconds() * 1e3),
-            stall_timeout_ms: stall_timeout.map(|timeout| timeout.seconds() * 1e3),
+            heartbeat_timeout_ms: driver.has_heartbeat().then(|| milliseconds(*heartbeat_timeout)),
+            stall_timeout_ms: stall_timeout.map(milliseconds),
         }
     }
 }
@@ -277,8 +277,8 @@ impl TrackerMeaning {
             spec: tracker.spec.clone(),
             eye: tracker.eye.name().into(),
             scale_mm_per_unit: tracker.scale,
-            fallback_mm: (f64::from(tracker.fallback.mm()) * 1e3).round() / 1e3,
-            hold_ms: tracker.hold.seconds() * 1e3,
+            fallback_mm: rounded(f64::from(tracker.fallback.mm())),
+            hold_ms: milliseconds(tracker.hold),
         }
     }
 }
@@ -380,6 +380,15 @@ impl Panel {
     }
 }
 
+fn milliseconds(TimeNs(ns): TimeNs) -> f64 {
+    ns as f64 / 1e6
+}
+
+/// To three decimals.
+fn rounded(figure: f64) -> f64 {
+    (figure * 1e3).round() / 1e3
+}
+
 fn active_files(rig: &Rig) -> Vec<ActiveFile> {
     let kinds = [("lut", &rig.provenance.lut_files), ("flatness", &rig.provenance.flatness_files)];
     let files = kinds.into_iter().flat_map(|(kind, paths)| {
@@ -425,13 +434,10 @@ fn notes(rig: &Rig) -> Vec<String> {
          100 mm of the focal length F before it",
         100.0 * rig.geometry.wavelengths[longest].0 / (2.0 * rig.geometry.pixel_pitch.0)
     ));
-    let eyebox_mm = rig.geometry.eyebox().map(|width| width.0 * 1e3);
-    for (colour, width_mm) in eyebox_mm.iter() {
-        if *width_mm < f64::from(PUPILS_MM[PUPILS_MM.len() - 1]) {
-            notes.push(format!(
-                "{colour}: the eyebox is {width_mm:.2} mm wide; a pupil wider than that cannot be filled"
-            ));
-        }
+    let filled_mm = rig.geometry.half_band_eyebox().map(|width| width.0 * 1e3);
+    if filled_mm.0.into_iter().any(|width_mm| width_mm < f64::from(PUPILS_MM[PUPILS_MM.len() - 1])) {
+        let filled_mm = PerColourFigures::from(filled_mm);
+        notes.push(format!("the half band fills {filled_mm} mm of the eyebox; a wider pupil is not filled"));
     }
     if let Some(profile) = rig.provenance.panel_profile.and_then(PanelProfile::named)
         && !profile.unverified.is_empty()
