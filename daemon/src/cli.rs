@@ -379,7 +379,8 @@ pub struct ViewArgs {
     /// The network.
     #[command(flatten)]
     pub network: NetworkArgs,
-    /// A directory that `holod render` wrote.
+    /// A directory that `holod render` wrote, with the rig for which it did so; without a rig the panel is the built-in
+    /// bench's, and pitch, wavelengths and eyepiece are those of the hologram.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["scene", "pupil", "weights", "resolution", "fit", "depth_encoding", "backend"])]
     pub hologram: Option<PathBuf>,
     /// The scene.

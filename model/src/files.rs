@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::f32::consts::TAU;
+use std::fmt;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
@@ -73,6 +74,24 @@ impl BenchOptics {
             depth_far_dpt: geometry.depth_far.0,
             depth_near_dpt: geometry.depth_near.0,
         }
+    }
+
+    /// Whether an eye sees the same of a hologram through both: all but the depth range, with which holograms are made
+    /// but not looked at, is equal to a millionth.
+    pub fn shows_alike(&self, other: &Self) -> bool {
+        let figures = |optics: &Self| {
+            let [red_nm, green_nm, blue_nm] = optics.wavelengths_nm;
+            [red_nm, green_nm, blue_nm, optics.pixel_pitch_um, optics.eyepiece_focal_length_mm]
+        };
+        figures(self).into_iter().zip(figures(other)).all(|(a, b)| (a - b).abs() <= 1e-6 * b.abs())
+    }
+}
+
+impl fmt::Display for BenchOptics {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let [red, green, blue] = self.wavelengths_nm;
+        let Self { pixel_pitch_um, eyepiece_focal_length_mm, .. } = self;
+        write!(f, "{pixel_pitch_um} µm, f = {eyepiece_focal_length_mm} mm, {red}, {green} and {blue} nm")
     }
 }
 

@@ -78,4 +78,27 @@ fn a_hologram_of_another_rig_is_looked_at_with_that_rig_only() {
     }
     let seen = view("wide.toml");
     assert!(seen.status.success(), "{seen:?}");
+    // One that fits, but of other optics, says which.
+    let other = fs::read_to_string(folder.path().join("wide.toml")).unwrap();
+    assert!(other.contains("eyepiece_focal_length_mm = 40.0"), "{other}");
+    let other = other.replace("eyepiece_focal_length_mm = 40.0", "eyepiece_focal_length_mm = 20.0");
+    fs::write(folder.path().join("other.toml"), other).unwrap();
+    let args = ["render", "--config", "other.toml", "--resolution", "48x48", "--pupil", "3", "--weights", "fast"];
+    let ended = run(HOLOD, &[&args[..], &["--backend", "cpu", "--out", "other"]].concat(), folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    let view = |rig: &[&str]| {
+        let args = ["view", "--hologram", "other", "--focus", "1", "--out", "seen.png", "--force"];
+        run(HOLOD, &[&args[..], rig].concat(), folder.path())
+    };
+    let refused = view(&["--config", "wide.toml"]);
+    assert_eq!(refused.status.code(), Some(64));
+    for said in ["--hologram other: found a hologram for 8 µm, f = 20 mm, ", "this rig's 8 µm, f = 40 mm, ", "--config"]
+    {
+        assert!(refused.stderr.contains(said), "`{said}` is not in: {}", refused.stderr);
+    }
+    let seen = view(&["--config", "other.toml"]);
+    assert!(seen.status.success() && !seen.stderr.contains("its own optics"), "{seen:?}");
+    let warned = view(&[]);
+    assert!(warned.status.success(), "{warned:?}");
+    assert!(warned.stderr.contains("its own optics, 8 µm, f = 20 mm, "), "{}", warned.stderr);
 }

@@ -57,6 +57,7 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
         (Some(folder), _) => {
             let hologram = load(folder)?;
             check_fits(folder, &hologram, &rig)?;
+            check_optics(folder, &hologram.optics, &rig, args.rig.config.is_some())?;
             progress::during("computing the panel's levels", || of_hologram(&rig, hologram))?
         }
         (None, Some(pupil)) => of_scene(&rig, &args.scene, pupil, args.backend)?,
@@ -128,6 +129,30 @@ fn check_fits(folder: &Path, stored: &StoredHologram, rig: &Rig) -> Result<(), F
             folder.display()
         ),
     ))
+}
+
+/// Refuses a hologram that was made for other optics than those of the rig file that was named. Without one its own
+/// hold, and only the panel is the built-in bench's.
+fn check_optics(folder: &Path, made_for: &BenchOptics, rig: &Rig, is_named: bool) -> Result<(), Failure> {
+    let bench = BenchOptics::of(&rig.geometry);
+    if made_for.shows_alike(&bench) {
+        return Ok(());
+    }
+    let folder = folder.display();
+    if is_named {
+        return Err(Failure::new(
+            Exit::Usage,
+            format!(
+                "--hologram {folder}: found a hologram for {made_for}, expected one for this rig's {bench}; name the \
+                 rig that it was made with by --config FILE, or render it again with this one"
+            ),
+        ));
+    }
+    tracing::warn!(
+        "--hologram {folder}: it is looked at with its own optics, {made_for}, but with the levels of the built-in \
+         bench's panel; name the rig that it was made with by --config FILE"
+    );
+    Ok(())
 }
 
 /// The phases that the panel shows of a scene's first frame.
