@@ -1274,6 +1274,16 @@ fn times_are_told_as_they_were_written() {
 }
 
 #[test]
+fn colours_that_are_never_seen_have_no_light() {
+    let light = |changes: &[(&str, &str)]| Rig::parse(&changed(changes), Path::new("")).unwrap().light().0;
+    assert_eq!(light(&[]), [1.0; 3]);
+    assert_eq!(light(&[("\"channel-packed\"", "\"monochrome\"\ncolour = \"green\"")]), [0.0, 1.0, 0.0]);
+    assert_eq!(light(&[("green = 1.0", "green = 0")]), [1.0, 0.0, 1.0]);
+    let one = format!("driver = \"text\"\nprofile = \"cobolt\"\ndevices = {{ green = \"/dev/g\" }}\n{ACCEPTED}");
+    assert_eq!(with_driver(&one).unwrap().light().0, [0.0, 1.0, 0.0]);
+}
+
+#[test]
 fn meaning_says_the_lasers_powers_and_what_bounds_them() {
     let meaning = |lines: &str| with_driver(lines).unwrap().meaning();
     let unlimited = "no power_limit_mw, so that a power_mw of up to 500 is taken";

@@ -42,6 +42,8 @@ pub enum Command {
     /// Compute one hologram and its phase patterns.
     Render(RenderArgs),
     /// Show what an eye sees of a hologram at one focus.
+    ///
+    /// Colours that the rig's panel never shows, or its lasers never light, are black.
     View(ViewArgs),
     /// Say what the rig file means and whether this bench is ready.
     Check(CheckArgs),

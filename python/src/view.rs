@@ -17,7 +17,8 @@ use crate::rig::{Rig, phases_of};
 /// `phase_rad` is float32 (3, rows, columns) in radians: red, green, blue; of holod, another program, or what
 /// `Rig.phase_of` says that the panel shows. `focus_dpt` is where the eye is focused: 0 is infinity, 2 is 50 cm.
 /// `amplitude_constant` is the amplitude that full modulation stands for, `Hologram.amplitude_constant` of holod's own
-/// phases; light is multiplied by its square. Darkness is around the pattern.
+/// phases; light is multiplied by its square. Darkness is around the pattern. Colours that the rig's panel never shows,
+/// or its lasers never light, are black.
 ///
 /// Returns float32 (rows, columns, 3), linear light, 1 is white. Raises InputError.
 #[pyfunction]
@@ -82,7 +83,8 @@ pub(crate) fn see<'py>(
 ) -> PyResult<Bound<'py, PyAny>> {
     let (pixels, size) = with_threads(py, || {
         let pattern = pattern()?;
-        let seen = SimulatedEye::new(&rig.geometry, pattern.resolution).view(&pattern, amplitude_constant, eye);
+        let mut simulated = SimulatedEye::new(&rig.geometry, pattern.resolution);
+        let seen = simulated.view_weighted(&pattern, amplitude_constant, eye, rig.light());
         Ok((interleaved(&seen.pixels), pattern.resolution))
     })?;
     array(py, pixels, [size.height, size.width, 3])

@@ -91,6 +91,17 @@ def test_a_scene_of_files_has_the_daemons_phases_however_it_is_read(
     assert differences(render(fitted, 4.0), daemon.folder / "fitted") == []
 
 
+def test_a_monochrome_panel_shows_one_colour(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    mode = 'mode = "field-sequential"\nfield_order = ["green", "red", "blue"]'
+    assert mode in RIG
+    path.write_text(RIG.replace(mode, 'mode = "monochrome"\ncolour = "green"'))
+    flat = np.zeros((3, 16, 16), np.float32)
+    seen = holod.view(flat, pupil_mm=3.0, focus_dpt=0.0, rig=holod.Rig.load(path))
+    assert (seen[..., 0].max(), seen[..., 2].max()) == (0, 0)
+    assert seen[..., 1].max() > 0.1
+
+
 def test_levels_are_those_that_a_run_sends_to_its_panel(daemon: Daemon) -> None:
     rig = daemon.folder / "rig.toml"
     rig.write_text(RIG)

@@ -102,3 +102,18 @@ fn a_hologram_of_another_rig_is_looked_at_with_that_rig_only() {
     assert!(warned.status.success(), "{warned:?}");
     assert!(warned.stderr.contains("its own optics, 8 µm, f = 20 mm, "), "{}", warned.stderr);
 }
+
+#[test]
+fn colours_that_a_monochrome_panel_never_shows_are_black() {
+    let folder = holod_tests::new_folder();
+    let rig = small_rig(64, 64, "driver = \"simulated\"");
+    let mode = rig.lines().find(|line| line.starts_with("mode = ")).expect("the rig has a mode").to_owned();
+    fs::write(folder.path().join("rig.toml"), rig.replace(&mode, "mode = \"monochrome\"\ncolour = \"green\"")).unwrap();
+    let args = ["view", "--config", "rig.toml", "--pupil", "3", "--resolution", "48x48", "--weights", "fast"];
+    let args = [&args[..], &["--backend", "cpu", "--focus", "1", "--out", "seen.png"]].concat();
+    let ended = run(HOLOD, &args, folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    let seen = image::open(folder.path().join("seen.png")).unwrap().into_rgb8();
+    let brightest = seen.pixels().fold([0; 3], |most, pixel| std::array::from_fn(|c| pixel.0[c].max(most[c])));
+    assert!(brightest[0] == 0 && brightest[1] > 100 && brightest[2] == 0, "{brightest:?}");
+}

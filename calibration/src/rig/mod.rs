@@ -424,6 +424,16 @@ impl Rig {
         Meaning::of(self)
     }
 
+    /// Each colour's light relative to that at which white is white: 1, and 0 of a colour that the panel's mode never
+    /// shows or whose laser is not there or has no power.
+    pub fn light(&self) -> PerColour<f32> {
+        PerColour(Colour::ALL.map(|colour| {
+            let is_shown = !matches!(self.panel.mode, PanelMode::Monochrome(only) if only != colour);
+            let is_lit = self.lasers.driver.has(colour) && self.lasers.power_mw[colour] > 0.0;
+            if is_shown && is_lit { 1.0 } else { 0.0 }
+        }))
+    }
+
     /// Panel pixels.
     pub fn resolution(&self) -> Resolution {
         self.geometry.resolution

@@ -74,7 +74,7 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
     let geometry = optics.geometry(resolution);
     let eye = Eye { pupil: args.eye_pupil.unwrap_or(pupil), focus: args.focus };
     let seen = progress::during("computing what the eye sees", || {
-        SimulatedEye::new(&geometry, resolution).view(&pattern, amplitude_constant, eye)
+        SimulatedEye::new(&geometry, resolution).view_weighted(&pattern, amplitude_constant, eye, rig.light())
     });
     out.write(|path| files::save_picture(&seen, path).map_err(Failure::because(Exit::CannotCreate)))?;
     if out.is_stdout() {

@@ -185,7 +185,8 @@ impl EyeThread {
         let pupil = gaze.pupil.unwrap_or(made.pupil);
         let geometry = &self.rig.geometry;
         let eye = self.eye.get_or_insert_with(|| SimulatedEye::new(geometry, pattern.resolution));
-        let picture = eye.view(&pattern, made.amplitude_constant, Eye { pupil, focus: gaze.focus });
+        let looking = Eye { pupil, focus: gaze.focus };
+        let picture = eye.view_weighted(&pattern, made.amplitude_constant, looking, self.rig.light());
         let mut png = Cursor::new(Vec::new());
         screen_picture(&picture).write_to(&mut png, image::ImageFormat::Png).expect("memory takes everything");
         let seen = Seen { png: png.into_inner().into(), frame: made.frame, made_for: made.pupil, pupil };
