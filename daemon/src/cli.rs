@@ -361,7 +361,8 @@ pub struct RenderArgs {
     /// Engine for the network.
     #[arg(long, value_enum, default_value_t = Backend::Auto)]
     pub backend: Backend,
-    /// Directory for field.safetensors, phase_{red,green,blue}.png and report.json.
+    /// Directory for field.safetensors, phase_{red,green,blue}.png and report.json. The PNGs are phases from 0 to 65535
+    /// for 0 to 2π (65536), as the hologram has them: neither levels of the rig's panel nor turned by its orientation.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Overwrite what is there already.

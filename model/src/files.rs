@@ -214,11 +214,15 @@ pub fn save_picture(image: &LinearImage, path: &Path) -> Result<(), FileError> {
     save_png(path, image.resolution, |x, y| Rgb(planes.map(|plane| srgb8(plane[y * width + x]))))
 }
 
-/// Writes one colour's phase as a 16-bit grey PNG: level·2π/65536, rounded.
+/// What 2π would be in a PNG that [`save_phase`] writes.
+pub const PHASE_LEVELS: u32 = 65536;
+
+/// Writes one colour's phase as a 16-bit grey PNG: level·2π/65536, rounded. It is the hologram's phase, neither a
+/// panel's levels nor turned as a panel lies.
 pub fn save_phase(pattern: &PhasePattern, colour: Colour, path: &Path) -> Result<(), FileError> {
     let (plane, width) = (pattern.plane(colour), pattern.resolution.width);
     save_png(path, pattern.resolution, |x, y| {
-        Luma([((plane[y * width + x] / TAU * 65536.0).round() as u32 % 65536) as u16])
+        Luma([((plane[y * width + x] / TAU * PHASE_LEVELS as f32).round() as u32 % PHASE_LEVELS) as u16])
     })
 }
 

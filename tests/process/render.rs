@@ -49,6 +49,10 @@ fn what_was_clipped_and_how_deep_the_scene_is_are_told_without_the_padding() {
     let built_in = ["render", "--pupil", "3", "--resolution", "48x48", "--weights", "fast", "--backend", "cpu"];
     let ended = run(HOLOD, &[&built_in[..], &["--out", "built-in"]].concat(), folder.path());
     assert!(ended.stdout.contains("\ndepth 0.") && !ended.stdout.contains("depth 0.00 to 0.00"), "{}", ended.stdout);
+    assert!(ended.stdout.contains(" dpt; its cards stand at 2.50 and 0.25 dpt; pixels filled"), "{}", ended.stdout);
+    let report: Value = serde_json::from_slice(&fs::read(folder.path().join("built-in/report.json")).unwrap()).unwrap();
+    assert_eq!((&report["weights"], &report["rig"]), (&"fast".into(), &"built-in bench".into()));
+    assert_eq!((&report["rig_hash"], &report["phase_png_2pi"]), (&Value::Null, &65536.into()));
 
     fs::remove_dir_all(folder.path().join("stack")).unwrap();
     write_scene(folder.path(), 13, 14);
@@ -78,6 +82,7 @@ fn a_hologram_of_another_rig_is_looked_at_with_that_rig_only() {
     }
     let seen = view("wide.toml");
     assert!(seen.status.success(), "{seen:?}");
+
     // One that fits, but of other optics, says which.
     let other = fs::read_to_string(folder.path().join("wide.toml")).unwrap();
     assert!(other.contains("eyepiece_focal_length_mm = 40.0"), "{other}");

@@ -12,7 +12,7 @@ use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::scene::FocalStackFiles;
 use serde::Serialize;
 
-use super::render::{self, FILES};
+use super::render::{self, FILES, MadeWith};
 use crate::cli::{Backend, RenderArgs};
 use crate::failure::{Exit, Failure};
 use crate::source::scene;
@@ -22,6 +22,8 @@ use crate::{progress, renderer, results, setup};
 /// What was done, and what the reader should know of it; `report.json`.
 #[derive(Serialize)]
 struct Report {
+    #[serde(flatten)]
+    made_with: MadeWith,
     focal_stack: String,
     pupil_mm: f32,
     focus_dpt: Vec<f64>,
@@ -83,6 +85,7 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
     let optics = BenchOptics::of(&DisplayGeometry { resolution, ..rig.geometry });
     render::save(&StoredHologram { hologram, pupil: stack.pupil, optics, amplitude_constant }, &pattern, &staging)?;
     let report = Report {
+        made_with: MadeWith::of(rig),
         pupil_mm: stack.pupil.mm(),
         focus_dpt: stack.focuses.iter().map(|&Dioptres(focus_dpt)| focus_dpt).collect(),
         width_px: resolution.width,

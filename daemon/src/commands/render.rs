@@ -8,6 +8,7 @@ use holod_calibration::{Colour, DisplayGeometry, PupilDiameter};
 use holod_model::Weights;
 use holod_model::files::{self, BenchOptics, StoredHologram};
 use holod_model::optics::PhasePattern;
+use holod_model::refocus::{self, FAR_CARD, NEAR_CARD};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 use serde::Serialize;
 
@@ -20,9 +21,35 @@ use crate::source::scene;
 use crate::staging::Staging;
 use crate::{results, setup};
 
+/// What a hologram was made with.
+#[derive(Serialize)]
+pub(super) struct MadeWith {
+    /// The network's weights by name, or their file's name.
+    weights: String,
+    /// The rig's name.
+    rig: String,
+    /// Of the rig file's text, as `holod check` states it; none of the built-in rig.
+    rig_hash: Option<String>,
+    /// What 2π would be in the PNGs of phases.
+    phase_png_2pi: u32,
+}
+
+impl MadeWith {
+    pub(super) fn of(rig: &Rig) -> Self {
+        Self {
+            weights: setup::weights_name(&rig.model.weights),
+            rig: rig.name.clone(),
+            rig_hash: rig.provenance.text_hash.map(|hash| format!("{hash:016x}")),
+            phase_png_2pi: files::PHASE_LEVELS,
+        }
+    }
+}
+
 /// What was done, and what the reader should know of it; `report.json`.
 #[derive(Serialize)]
 pub(super) struct Report {
+    #[serde(flatten)]
+    made_with: MadeWith,
     scene: String,
     pupil_mm: f32,
     pub(super) width_px: usize,
@@ -74,9 +101,13 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
     if args.json {
         return results::print_json(&report);
     }
+    let cards = args.scene.scene.is_none().then(|| {
+        let [near, far] = [NEAR_CARD, FAR_CARD].map(|card| refocus::depth_on(&rig.geometry, card).0);
+        format!("; its cards stand at {near:.2} and {far:.2} dpt")
+    });
     results::print(&format!(
         "{}: hologram of {}x{} for a pupil of {} mm in {:.0} ms, {:.1} s with all else; {:.3} % of amplitudes clipped\n\
-         depth {:.2} to {:.2} dpt; pixels filled {}, clamped to the far end {}, to the near end {}, with colours \
+         depth {:.2} to {:.2} dpt{}; pixels filled {}, clamped to the far end {}, to the near end {}, with colours \
          clipped {}, padded {}\n\
          in {}: {}",
         report.scene,
@@ -88,6 +119,7 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
         report.clipped_share * 100.0,
         report.depth_least_dpt,
         report.depth_greatest_dpt,
+        cards.unwrap_or_default(),
         report.depth_missing_px,
         report.depth_clamped_far_px,
         report.depth_clamped_near_px,
@@ -145,6 +177,7 @@ pub(super) fn compute(
     let done = &frames.reports[0];
     let [depth_least_dpt, depth_greatest_dpt] = done.depth_range.map(|depth| rig.geometry.depth_at(f64::from(depth)).0);
     let report = Report {
+        made_with: MadeWith::of(rig),
         scene: frames.name.clone(),
         pupil_mm: pupil.mm(),
         width_px: resolution.width,

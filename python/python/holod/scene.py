@@ -59,7 +59,11 @@ def load_scene(
 
 
 def builtin_scene(width_px: int | None = None, height_px: int | None = None) -> Scene:
-    """The daemon's built-in scene at any size, 512 x 512 where it is left out: text cards at 40 cm and 4 m, objects
-    between them, and a floor through all depths. Its depth is normalised to the rig's depth range."""
+    """The daemon's built-in scene at any size, 512 x 512 where it is left out: text cards, objects between them, and a
+    floor through all depths.
+
+    Its depth is normalised to the rig's depth range. The cards stand at 0.875 and 0.0875 of it: on the built-in bench
+    at 2.5 and 0.25 dioptres, 40 cm and 4 m, as is written on them; on another one at
+    `rig.depth_far_dpt + 0.875 * (rig.depth_near_dpt - rig.depth_far_dpt)` dioptres, and likewise."""
     rgb, depth = render_builtin_scene(width_px, height_px)
     return Scene(rgb, depth, "normalised_dioptres")
