@@ -7,7 +7,7 @@ use holod_daemon::evaluation::{EvaluationPlan, EvaluationSettings};
 use holod_daemon::failure::{Exit, Failure};
 use pyo3::prelude::*;
 
-use crate::outcome::{HolodError, with_threads};
+use crate::outcome::{Count, HolodError, count, with_threads};
 use crate::renderer::backend_named;
 use crate::rig::Rig;
 use crate::view::pupil;
@@ -37,8 +37,8 @@ pub(crate) fn evaluate<'py>(
     cards: Option<PathBuf>,
     marks: Option<PathBuf>,
     pupils_mm: Option<Vec<f32>>,
-    limit: Option<usize>,
-    border_px: usize,
+    limit: Option<Count>,
+    #[pyo3(from_py_with = count)] border_px: usize,
     backend: &str,
 ) -> PyResult<Bound<'py, PyAny>> {
     let rig = Rig::with_weights(rig, weights.as_deref())?;
@@ -51,7 +51,7 @@ pub(crate) fn evaluate<'py>(
         cards: cards.as_deref(),
         marks: marks.as_deref(),
         pupils: &pupils,
-        limit,
+        limit: limit.map(|Count(scenes)| scenes),
         border_px,
     };
     let mut interrupt = None;

@@ -6,6 +6,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use holod_daemon::failure::{Exit, Failure};
 use holod_daemon::logging::text_of;
+use pyo3::exceptions::PyOverflowError;
 use pyo3::prelude::*;
 use pyo3::{PyTypeInfo, import_exception};
 use tracing::span;
@@ -60,6 +61,28 @@ pub(crate) fn exception(failure: &Failure) -> PyErr {
         Exit::Software | Exit::Different | Exit::Output => HolodError::new_err(text),
         Exit::Usage | Exit::Data | Exit::NoInput | Exit::CannotCreate => InputError::new_err(text),
     }
+}
+
+/// A whole number from 0 on as an argument: Python's own error for a negative one is none of this package's.
+pub(crate) struct Count(pub(crate) usize);
+
+impl<'py> FromPyObject<'_, 'py> for Count {
+    type Error = PyErr;
+
+    fn extract(given: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        given.extract::<usize>().map(Self).map_err(|error| {
+            if error.is_instance_of::<PyOverflowError>(given.py()) {
+                InputError::new_err(format!("found {}, expected a whole number from 0 to {}", *given, usize::MAX))
+            } else {
+                error
+            }
+        })
+    }
+}
+
+/// The same for an argument with a default.
+pub(crate) fn count(given: &Bound<'_, PyAny>) -> PyResult<usize> {
+    given.extract().map(|Count(count)| count)
 }
 
 /// Keeps what is warned of in the thread that it is set for.

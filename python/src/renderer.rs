@@ -18,7 +18,7 @@ use numpy::Complex32;
 use pyo3::prelude::*;
 
 use crate::arrays::{Given, Out, array};
-use crate::outcome::{HolodError, InputError, with_threads, without_lock};
+use crate::outcome::{Count, HolodError, InputError, with_threads, without_lock};
 use crate::rig::{Rig, levels_of, levels_shape, pattern_resolution};
 use crate::view::{eye, pupil, see};
 
@@ -70,8 +70,8 @@ impl Renderer {
         py: Python<'_>,
         rig: Option<&Bound<'_, Rig>>,
         weights: Option<std::path::PathBuf>,
-        width_px: Option<usize>,
-        height_px: Option<usize>,
+        width_px: Option<Count>,
+        height_px: Option<Count>,
         backend: &str,
     ) -> PyResult<Self> {
         let backend = backend_named(backend)?;

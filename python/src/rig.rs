@@ -10,7 +10,7 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 use pyo3::prelude::*;
 
 use crate::arrays::{Given, array};
-use crate::outcome::{InputError, RigError, exception, with_threads, without_lock};
+use crate::outcome::{Count, InputError, RigError, exception, with_threads, without_lock};
 
 /// More turns than this are no phase: the encoder's arithmetic is exact to it.
 const MOST_TURNS: f32 = 50.0;
@@ -128,8 +128,13 @@ impl Rig {
     }
 
     /// Distance from the panel to the image plane that an eye sees at `depth_dpt` dioptres, metres: f² · depth.
-    fn image_distance_m(&self, depth_dpt: f64) -> f64 {
-        self.rig.geometry.image_distance(Dioptres(depth_dpt)).0
+    ///
+    /// Raises InputError for what is no finite number.
+    fn image_distance_m(&self, depth_dpt: f64) -> PyResult<f64> {
+        if !depth_dpt.is_finite() {
+            return Err(InputError::new_err(format!("depth_dpt: found {depth_dpt}, expected dioptres")));
+        }
+        Ok(self.rig.geometry.image_distance(Dioptres(depth_dpt)).0)
     }
 
     /// The levels that the panel is sent for phases of any origin.
@@ -162,8 +167,8 @@ impl Rig {
         &self,
         py: Python<'py>,
         levels: &Bound<'py, PyAny>,
-        width_px: Option<usize>,
-        height_px: Option<usize>,
+        width_px: Option<Count>,
+        height_px: Option<Count>,
     ) -> PyResult<Bound<'py, PyAny>> {
         let panel = self.rig.resolution();
         let given =
@@ -229,7 +234,7 @@ impl Rig {
             .map_err(|failure| exception(&failure))
     }
 
-    fn pattern_resolution(&self, width_px: Option<usize>, height_px: Option<usize>) -> PyResult<Resolution> {
+    fn pattern_resolution(&self, width_px: Option<Count>, height_px: Option<Count>) -> PyResult<Resolution> {
         pattern_resolution(&self.rig, width_px, height_px)
     }
 }
@@ -237,11 +242,14 @@ impl Rig {
 /// The size of a pattern on the panel of `rig`, which is the panel's where nothing is said.
 pub(crate) fn pattern_resolution(
     rig: &calibration::Rig,
-    width_px: Option<usize>,
-    height_px: Option<usize>,
+    width_px: Option<Count>,
+    height_px: Option<Count>,
 ) -> PyResult<Resolution> {
     let panel = rig.resolution();
-    let resolution = Resolution { width: width_px.unwrap_or(panel.width), height: height_px.unwrap_or(panel.height) };
+    let resolution = Resolution {
+        width: width_px.map_or(panel.width, |Count(px)| px),
+        height: height_px.map_or(panel.height, |Count(px)| px),
+    };
     check_size(resolution, rig)?;
     Ok(resolution)
 }

@@ -9,7 +9,7 @@ use numpy::PyArrayMethods;
 use pyo3::prelude::*;
 
 use crate::arrays::{array, interleaved};
-use crate::outcome::{InputError, without_lock};
+use crate::outcome::{Count, InputError, without_lock};
 use crate::rig::Rig;
 
 /// rgb, depth, frames, frames a second, pixels without a depth, pixels that were clipped.
@@ -24,16 +24,16 @@ pub(crate) fn read_scene<'py>(
     path: &str,
     rig: Option<&Bound<'py, Rig>>,
     depth_encoding: Option<&str>,
-    frame: usize,
-    width_px: Option<usize>,
-    height_px: Option<usize>,
+    frame: Count,
+    width_px: Option<Count>,
+    height_px: Option<Count>,
     fit: &str,
 ) -> PyResult<Read<'py>> {
     let geometry = Rig::given(rig).geometry;
     let fit: Fit = serde_json::from_value(fit.into()).map_err(|why| InputError::new_err(format!("fit: {why}")))?;
     let size = match (width_px, height_px) {
         (None, None) => None,
-        (Some(width), Some(height)) => Some(checked(Resolution { width, height })?),
+        (Some(Count(width)), Some(Count(height))) => Some(checked(Resolution { width, height })?),
         _ => {
             return Err(InputError::new_err(
                 "width_px and height_px: found one of them, expected both, or none for the picture's own size",
@@ -44,7 +44,7 @@ pub(crate) fn read_scene<'py>(
         let data = Failure::because(Exit::Data);
         let encoding = depth_encoding.map(|text| DepthEncoding::parse(text, &geometry)).transpose().map_err(&data)?;
         let scene = Scene::open(path, encoding).map_err(&data)?;
-        let mut picture = scene.picture(frame, size, fit).map_err(&data)?;
+        let mut picture = scene.picture(frame.0, &geometry, size, fit).map_err(&data)?;
         picture.linear = interleaved(&picture.linear);
         Ok((scene, picture))
     })?;
@@ -64,11 +64,11 @@ pub(crate) fn read_scene<'py>(
 #[pyfunction]
 pub(crate) fn render_builtin_scene(
     py: Python<'_>,
-    width_px: Option<usize>,
-    height_px: Option<usize>,
+    width_px: Option<Count>,
+    height_px: Option<Count>,
 ) -> PyResult<(Bound<'_, PyAny>, Bound<'_, PyAny>)> {
-    let width = width_px.unwrap_or(SAMPLE_RESOLUTION.width);
-    let height = height_px.unwrap_or(SAMPLE_RESOLUTION.height);
+    let width = width_px.map_or(SAMPLE_RESOLUTION.width, |Count(px)| px);
+    let height = height_px.map_or(SAMPLE_RESOLUTION.height, |Count(px)| px);
     let size = checked(Resolution { width, height })?;
     let (pixels, depth) = without_lock(py, || {
         let picture = scene_renderer::sample_scene(size).picture();

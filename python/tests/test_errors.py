@@ -292,6 +292,25 @@ def test_a_forked_process_is_told_that_it_has_no_threads(tmp_path: Path) -> None
     assert all("this process was forked" in said and '"spawn"' in said for said in after), after
 
 
+def test_numbers_that_are_none_are_input_errors() -> None:
+    with pytest.raises(holod.InputError, match="found -1, expected a whole number from 0 to"):
+        holod.Renderer(width_px=-1, height_px=8)
+    with pytest.raises(holod.InputError, match="found -2, expected a whole number"):
+        holod.builtin_scene(8, -2)
+    with pytest.raises(TypeError):
+        holod.Renderer(width_px=1.5)  # type: ignore[arg-type]
+    for depth_dpt in (float("nan"), float("inf")):
+        with pytest.raises(holod.InputError, match="depth_dpt: found"):
+            holod.Rig.builtin().image_distance_m(depth_dpt)
+
+
+def test_scenes_are_compared_and_hashed_as_objects(scene: holod.Scene) -> None:
+    other = holod.builtin_scene(*SIZE)
+    assert scene == scene
+    assert scene != other
+    assert len({scene, other}) == 2
+
+
 def most_turns_during(work: Callable[[], object], calls: int, enough: int) -> int:
     """The most turns that `work` gives this thread in one of so many calls by another one, which end when it is enough.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import holod
@@ -89,6 +90,23 @@ def test_a_scene_of_files_has_the_daemons_phases_however_it_is_read(
     daemon.run("render", "--pupil", "4", "--out", "fitted", "--resolution", "64x64", "--fit", "cover", *told, *OPTIONS)
     fitted = holod.load_scene(named, depth_encoding="millimetres", width_px=64, height_px=64, fit="cover")
     assert differences(render(fitted, 4.0), daemon.folder / "fitted") == []
+
+
+def test_what_a_picture_does_not_reach_is_at_the_rigs_far_end(daemon: Daemon, picture_files: tuple[Path, Path]) -> None:
+    path = daemon.folder / "rig.toml"
+    path.write_text(RIG.replace("depth_far_m = inf", "depth_far_m = 3.0"))
+    named = ",".join(map(str, picture_files))
+    told = ["--scene", named, "--depth-encoding", "millimetres", "--resolution", "90x70"]
+    daemon.run("render", "--config", path, "--pupil", "3", "--out", "out", *told, *OPTIONS)
+    report = json.loads((daemon.folder / "out" / "report.json").read_text())
+    rig = holod.Rig.load(path)
+    scene = holod.load_scene(named, depth_encoding="millimetres", width_px=90, height_px=70, rig=rig)
+    renderer = holod.Renderer(rig, "fast", width_px=90, height_px=70, backend="cpu")
+    hologram = renderer.render(
+        scene.rgb, scene.depth, 3.0, colour=scene.colour, depth_unit=scene.depth_unit, field=True
+    )
+    assert hologram.depth_clamped_far_px == report["depth_clamped_far_px"] > 0
+    assert differences(hologram, daemon.folder / "out") == []
 
 
 def test_a_monochrome_panel_shows_one_colour(tmp_path: Path) -> None:

@@ -224,6 +224,8 @@ impl ArrayDepths<'_> {
 
 #[cfg(test)]
 mod tests {
+    use holod_calibration::Dioptres;
+
     use super::super::{Fit, Scene};
     use super::*;
 
@@ -259,7 +261,7 @@ mod tests {
         assert_eq!(found, expected);
         assert!(found.1.depth_clamped_near_px > 0, "nothing was clamped: the counts are not compared");
 
-        let picture = scene.picture(0, None, Fit::Native).unwrap();
+        let picture = scene.picture(0, &BENCH, None, Fit::Native).unwrap();
         let linear: Vec<f32> = (0..105).map(|value| picture.linear[value % 3 * SIZE.pixels() + value / 3]).collect();
         let (again, _) = frame(ArrayColours::LinearF32(&linear), ArrayDepths::DioptresF32(&picture.depth_dpt)).unwrap();
         assert_eq!(again, expected.0);
@@ -278,18 +280,24 @@ mod tests {
         let scene = Scene::open(&format!("{},{}", colour.display(), depth.display()), Some(DepthEncoding::Millimetres))
             .unwrap();
         let wanted = Resolution { width: 12, height: 12 };
-        let (expected, _) = scene.load(0, &BENCH, Some(wanted), Fit::Contain).unwrap();
-        let picture = scene.picture(0, Some(wanted), Fit::Contain).unwrap();
-        assert_eq!(picture.resolution, wanted);
-        let linear: Vec<f32> =
-            (0..3 * wanted.pixels()).map(|value| picture.linear[value % 3 * wanted.pixels() + value / 3]).collect();
-        let arrays = ArrayPicture {
-            resolution: wanted,
-            colours: ArrayColours::LinearF32(&linear),
-            depths: ArrayDepths::DioptresF32(&picture.depth_dpt),
-            fills_missing: false,
-        };
-        assert_eq!(arrays.frame(&BENCH).unwrap().0, expected);
+        for far_dpt in [0.0, 0.1, 1.0 / 3.0, 0.7] {
+            let bench = DisplayGeometry { depth_far: Dioptres(far_dpt), ..BENCH };
+            let (expected, told) = scene.load(0, &bench, Some(wanted), Fit::Contain).unwrap();
+            let picture = scene.picture(0, &bench, Some(wanted), Fit::Contain).unwrap();
+            assert_eq!(picture.resolution, wanted);
+            let linear: Vec<f32> =
+                (0..3 * wanted.pixels()).map(|value| picture.linear[value % 3 * wanted.pixels() + value / 3]).collect();
+            let arrays = ArrayPicture {
+                resolution: wanted,
+                colours: ArrayColours::LinearF32(&linear),
+                depths: ArrayDepths::DioptresF32(&picture.depth_dpt),
+                fills_missing: false,
+            };
+            let (frame, report) = arrays.frame(&bench).unwrap();
+            assert_eq!(frame, expected, "{far_dpt} dpt");
+            // What is padded was not clamped. Of the picture's pixels there are more here, since it was enlarged.
+            assert_eq!(report.depth_clamped_far_px > 0, told.depth_clamped_far_px > 0, "{far_dpt} dpt");
+        }
     }
 
     #[test]

@@ -215,16 +215,26 @@ impl Scene {
         Ok((frame, report))
     }
 
-    /// Loads frame `index` as [`Self::load`] does, for any bench. What the picture does not reach is black, at
-    /// infinity.
-    pub fn picture(&self, index: usize, resolution: Option<Resolution>, fit: Fit) -> Result<ScenePicture, SceneError> {
+    /// Loads frame `index` as [`Self::load`] does, with depths that are not clamped to any range. What the picture does
+    /// not reach is black, at the far end of `geometry`.
+    pub fn picture(
+        &self,
+        index: usize,
+        geometry: &DisplayGeometry,
+        resolution: Option<Resolution>,
+        fit: Fit,
+    ) -> Result<ScenePicture, SceneError> {
         let ScenePicture { resolution: size, linear, depth_dpt, mut report } = self.read(index, fit)?;
         let (placement, resolution) = self.placement(index, size, resolution, fit)?;
         report.padded_px = placement.padded_px();
+        let Dioptres(far_dpt) = geometry.depth_far;
+        // Never nearer than that by rounding, so that it becomes the end itself.
+        let outside_dpt =
+            if f64::from(far_dpt as f32) > far_dpt { (far_dpt as f32).next_down() } else { far_dpt as f32 };
         Ok(ScenePicture {
             resolution,
             linear: linear.chunks_exact(size.pixels()).flat_map(|plane| placement.light(plane)).collect(),
-            depth_dpt: placement.nearest(&depth_dpt, 0.0),
+            depth_dpt: placement.nearest(&depth_dpt, outside_dpt),
             report,
         })
     }

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from holod._holod import Rig, read_scene, render_builtin_scene
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A picture with depth; `colour` and `depth_unit` are what `Renderer.render` is to be told of it."""
 
@@ -48,7 +48,8 @@ def load_scene(
     `depth_encoding` says what the depth file's numbers are: "metres", "millimetres", "dioptres", or
     "normalised_dioptres:FAR,NEAR" in dioptres, whose ends are those of `rig` where they are left out; a scene.toml
     names its own, and another one beside it is refused. `frame` is the picture's place in a sequence. `width_px` and
-    `height_px` bring it to another size in the way of `fit`; nothing is stretched.
+    `height_px` bring it to another size in the way of `fit`; nothing is stretched. What the picture does not reach is
+    black, at the far end of the depth range of `rig`, the built-in one without.
 
     Raises InputError with the file, what was found in it and what was expected.
     """
