@@ -21,6 +21,10 @@ pub struct Eye {
 /// Light leaves the panel, passes the 4f stop (|fx|, |fy| < 1/4p) and the pupil (a disc of radius (s/2)/(λf) in the
 /// panel's spectrum), and is focused at u = f²·D. Both stops are hard. The panel is surrounded by darkness, unless it
 /// is [`repeating`](Self::repeating).
+///
+/// The 4f stop is one of its own for each colour. A bench has one for all, as wide as red's: it passes |fx|, |fy| up to
+/// λ_red/λ of that. Pictures differ little by it (40 to 46 dB in green and blue), but black beside bright marks is 2
+/// times as bright there in green and 5 in blue, and 10 in blue around dots of 3 px.
 pub struct SimulatedEye {
     geometry: DisplayGeometry,
     propagator: Propagator,
