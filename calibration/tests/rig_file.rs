@@ -801,7 +801,7 @@ fn a_lut_is_read_and_named_among_the_active_files() {
 #[test]
 fn a_table_whose_range_is_like_multiples_of_pi_is_asked_for_its_unit() {
     let in_pi = "; where the phases in its table are multiples of π, multiply them by π";
-    let told = |rig: Rig| rig.panel.short_strokes();
+    let told = |rig: Rig| rig.warnings();
     let [green] = told(load_sparse_lut("0,0.0\n255,1.9921875\n").unwrap()).try_into().unwrap();
     assert!(green.starts_with("green: the panel's stroke is 0.634 π; ") && green.ends_with(in_pi), "{green}");
     let [green] = told(load_sparse_lut("0,0.0\n255,5.0\n").unwrap()).try_into().unwrap();

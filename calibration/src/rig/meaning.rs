@@ -363,7 +363,7 @@ impl Panel {
     }
 
     /// For each colour whose stroke is less than 2π, what becomes of the phases that cannot be shown.
-    pub fn short_strokes(&self) -> Vec<String> {
+    fn short_strokes(&self) -> Vec<String> {
         let levels = f64::from(1u32 << self.bit_depth);
         // The top level of a 2π panel stands one step short of 2π.
         let short = self.stroke_rad.iter().filter(|(_, stroke_rad)| **stroke_rad < TAU * (levels - 1.5) / levels);
