@@ -236,81 +236,6 @@ def test_scenes_that_cannot_be_read_are_told(tmp_path: Path, picture_files: tupl
         assert said in str(raised.value)
 
 
-FORKS = """
-import multiprocessing
-
-import holod
-import numpy as np
-
-FLAT = np.zeros((3, 8, 8), np.float32)
-RENDERERS = []
-
-
-def seen():
-    return str(holod.view(FLAT, pupil_mm=3.0, focus_dpt=1.0).shape)
-
-
-def levels():
-    return str(holod.Rig.builtin().levels_of(FLAT).shape)
-
-
-def rendered():
-    scene = holod.builtin_scene(16, 16)
-    told = {"colour": scene.colour, "depth_unit": scene.depth_unit}
-    return str(RENDERERS[0].render(scene.rgb, scene.depth, 3.0, **told).levels.shape)
-
-
-def told(work):
-    try:
-        return work()
-    except holod.HolodError as error:
-        return str(error)
-
-
-def forked(*work):
-    with multiprocessing.get_context("fork").Pool(1) as pool:
-        return pool.map(told, work, chunksize=1)
-
-
-print(forked(seen, levels, seen))
-print(seen())
-RENDERERS.append(holod.Renderer(weights="fast", width_px=16, height_px=16, backend="cpu"))
-for said in forked(seen, levels, rendered):
-    print(said)
-"""
-
-
-def test_a_forked_process_is_told_that_it_has_no_threads(tmp_path: Path) -> None:
-    script = tmp_path / "forks.py"
-    script.write_text(FORKS)
-    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=120)
-    assert ended.returncode == 0, ended.stderr
-    before, parent, *after = ended.stdout.splitlines()
-    assert before == "['(8, 8, 3)', '(3, 1080, 1920)', '(8, 8, 3)']"
-    assert parent == "(8, 8, 3)"
-    assert len(after) == 3
-    assert all("this process was forked" in said and '"spawn"' in said for said in after), after
-
-
-def test_numbers_that_are_none_are_input_errors() -> None:
-    with pytest.raises(holod.InputError, match="found -1, expected a whole number from 0 to"):
-        holod.Renderer(width_px=-1, height_px=8)
-    with pytest.raises(holod.InputError, match="found -2, expected a whole number"):
-        holod.builtin_scene(8, -2)
-    with pytest.raises(TypeError):
-        holod.Renderer(width_px=1.5)  # type: ignore[arg-type]
-    for depth_dpt in (float("nan"), float("inf")):
-        with pytest.raises(holod.InputError, match="depth_dpt: found"):
-            holod.Rig.builtin().image_distance_m(depth_dpt)
-
-
-def test_scenes_are_compared_and_hashed_as_objects(scene: holod.Scene) -> None:
-    other = holod.builtin_scene(*SIZE)
-    assert scene == scene
-    assert scene != other
-    assert len({scene, other}) == 2
-
-
 def most_turns_during(work: Callable[[], object], calls: int, enough: int) -> int:
     """The most turns that `work` gives this thread in one of so many calls by another one, which end when it is enough.
 
@@ -398,3 +323,78 @@ def test_holograms_are_given_back(tmp_path: Path) -> None:
     # A hologram with its arrays and its view is 0.8 MB: of 200, even the smallest array would be 12 MB.
     assert grown_by(200, keep=False) < 10e6
     assert grown_by(60, keep=True) > 30e6, "the measurement is blind"
+
+
+FORKS = """
+import multiprocessing
+
+import holod
+import numpy as np
+
+FLAT = np.zeros((3, 8, 8), np.float32)
+RENDERERS = []
+
+
+def seen():
+    return str(holod.view(FLAT, pupil_mm=3.0, focus_dpt=1.0).shape)
+
+
+def levels():
+    return str(holod.Rig.builtin().levels_of(FLAT).shape)
+
+
+def rendered():
+    scene = holod.builtin_scene(16, 16)
+    told = {"colour": scene.colour, "depth_unit": scene.depth_unit}
+    return str(RENDERERS[0].render(scene.rgb, scene.depth, 3.0, **told).levels.shape)
+
+
+def told(work):
+    try:
+        return work()
+    except holod.HolodError as error:
+        return str(error)
+
+
+def forked(*work):
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        return pool.map(told, work, chunksize=1)
+
+
+print(forked(seen, levels, seen))
+print(seen())
+RENDERERS.append(holod.Renderer(weights="fast", width_px=16, height_px=16, backend="cpu"))
+for said in forked(seen, levels, rendered):
+    print(said)
+"""
+
+
+def test_a_forked_process_is_told_that_it_has_no_threads(tmp_path: Path) -> None:
+    script = tmp_path / "forks.py"
+    script.write_text(FORKS)
+    ended = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=120)
+    assert ended.returncode == 0, ended.stderr
+    before, parent, *after = ended.stdout.splitlines()
+    assert before == "['(8, 8, 3)', '(3, 1080, 1920)', '(8, 8, 3)']"
+    assert parent == "(8, 8, 3)"
+    assert len(after) == 3
+    assert all("this process was forked" in said and '"spawn"' in said for said in after), after
+
+
+def test_numbers_that_are_none_are_input_errors() -> None:
+    with pytest.raises(holod.InputError, match="found -1, expected a whole number from 0 to"):
+        holod.Renderer(width_px=-1, height_px=8)
+    with pytest.raises(holod.InputError, match="found -2, expected a whole number"):
+        holod.builtin_scene(8, -2)
+    with pytest.raises(TypeError):
+        holod.Renderer(width_px=1.5)  # type: ignore[arg-type]
+    for depth_dpt in (float("nan"), float("inf")):
+        with pytest.raises(holod.InputError, match="depth_dpt: found"):
+            holod.Rig.builtin().image_distance_m(depth_dpt)
+
+
+def test_scenes_are_compared_and_hashed_as_objects(scene: holod.Scene) -> None:
+    other = holod.builtin_scene(*SIZE)
+    assert scene == scene
+    assert scene != other
+    assert len({scene, other}) == 2
