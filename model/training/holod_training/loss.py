@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from holod_training.config import OpticsConfig
 from holod_training.foam import foam_energy
 
 IN_FOCUS_PX = 2.0
@@ -34,8 +35,9 @@ class LossWeights:
     """The weight of each term, and the CoC below which sharpness counts no more.
 
     `in_focus` is for a pupil of 2 mm on the default bench: what is in focus is a share of a stack that falls as the
-    blur over the depth volume grows, so `for_blur` lets its weight grow in proportion, or by another power,
-    `in_focus_growth`: with 2 wide pupils lose less of their sharpness.
+    blur over the depth volume grows, so `for_bench` lets its weight grow in proportion, or by another power,
+    `in_focus_growth`: with 2 wide pupils lose less of their sharpness. On benches of more diffraction than the default
+    one, which blurs what is in focus, too, it grows by the power `in_focus_diffraction_growth` of green's.
     `absolute` and `gradient` are the paper's: |P − R| and |∇P − ∇R| weighted by W; so is a perceptual error of some
     planes: `lpips` where a run has its weights, `structure` needs none. `outlines` is |∇P − ∇R|² where the scene is out
     of focus: what stands there of a mark is small in every other term. `black` is the light where there should be
@@ -51,6 +53,7 @@ class LossWeights:
     coc_floor_px: float = 0.2
     in_focus: float = 0.0
     in_focus_growth: float = 1.0
+    in_focus_diffraction_growth: float = 0.0
     focus_absolute: float = 0.0
     outlines: float = 0.0
     black: float = 0.0
@@ -60,9 +63,12 @@ class LossWeights:
     lpips: float = 1.0
     teacher: float = 8.0
 
-    def for_blur(self, volume_blur_px: float) -> LossWeights:
-        growth = min(volume_blur_px, MOST_IN_FOCUS_BLUR_PX) / IN_FOCUS_BLUR_PX
-        return replace(self, in_focus=self.in_focus * growth**self.in_focus_growth)
+    def for_bench(self, optics: OpticsConfig, pupil_mm: float) -> LossWeights:
+        blur = min(optics.volume_blur_px(pupil_mm), MOST_IN_FOCUS_BLUR_PX) / IN_FOCUS_BLUR_PX
+        (_, green, _), (_, of_default, _) = optics.volume_fresnel_px2, OpticsConfig().volume_fresnel_px2
+        diffraction = max(1.0, green / of_default)
+        growth = blur**self.in_focus_growth * diffraction**self.in_focus_diffraction_growth
+        return replace(self, in_focus=self.in_focus * growth)
 
 
 def option_of(loss_key: str) -> str:

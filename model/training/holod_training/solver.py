@@ -77,7 +77,7 @@ def optimise(
     for iteration in range(config.iterations + 1):
         frames = shown_by_panel(torch.view_as_complex(low), amplitude_constant, (height, width))
         picture = torch.stack([eye.look(frame, stack.pupil_mm) for frame in frames]).mean(dim=0)
-        loss = focus_loss(picture, target, blur, config.loss.for_blur(optics.volume_blur_px(stack.pupil_mm))).total
+        loss = focus_loss(picture, target, blur, config.loss.for_bench(optics, stack.pupil_mm)).total
         if iteration == 0:
             first_loss = loss.item()
         if loss.item() < best_loss:

@@ -341,7 +341,7 @@ class Run:
                     picture,
                     stack.target,
                     blur,
-                    config.loss.for_blur(stack.optics.volume_blur_px(stack.pupil_mm)),
+                    config.loss.for_bench(stack.optics, stack.pupil_mm),
                     perceptual_planes[index],
                     self.lpips,
                     taught[index] if taught else None,

@@ -154,7 +154,7 @@ def test_a_wider_pupil_weighs_the_in_focus_term_more_and_no_other() -> None:
     weights = LossWeights(in_focus=7.0, squared=3.0)
 
     def of_pupil(of: LossWeights, mm: float) -> LossWeights:
-        return of.for_blur(OpticsConfig().volume_blur_px(mm))
+        return of.for_bench(OpticsConfig(), mm)
 
     assert of_pupil(weights, 2.0).in_focus == pytest.approx(7.0)
     assert dataclasses.replace(of_pupil(weights, 4.0), in_focus=7.0) == weights
@@ -162,6 +162,18 @@ def test_a_wider_pupil_weighs_the_in_focus_term_more_and_no_other() -> None:
     squarely = dataclasses.replace(weights, in_focus_growth=2.0)
     assert [of_pupil(squarely, s).in_focus for s in (1.0, 2.0, 4.0)] == pytest.approx([1.75, 7.0, 28.0])
     assert of_pupil(LossWeights(), 5.0) == LossWeights()
+
+
+def test_more_diffraction_than_the_default_benchs_weighs_the_in_focus_term_more_where_that_is_asked() -> None:
+    short, long = (dataclasses.replace(OpticsConfig(), eyepiece_focal_length_mm=mm) for mm in (20.0, 80.0))
+    plain, growing = LossWeights(in_focus=7.0), LossWeights(in_focus=7.0, in_focus_diffraction_growth=1.5)
+
+    def at_equal_blur(of: LossWeights, optics: OpticsConfig) -> float:
+        return of.for_bench(optics, optics.pupil_mm(200 / 7)).in_focus
+
+    assert [at_equal_blur(plain, bench) for bench in (short, long)] == pytest.approx([7.0, 7.0])
+    # Four times the default's: it goes with the square of the focal length.
+    assert [at_equal_blur(growing, bench) for bench in (short, long)] == pytest.approx([7.0, 7.0 * 8.0])
 
 
 def test_light_where_there_should_be_none_is_weighed_and_no_other() -> None:

@@ -433,7 +433,7 @@ def test_the_loss_is_of_the_bench_that_a_scene_is_seen_on(tmp_path: Path) -> Non
         dioptres = 0.5 + 2.5 * stack.depth
         blur = torch.stack([(dioptres - dpt).abs() * 1e-3 * pupil_mm / optics.pixel_angle_rad for dpt in focus_dpt])
         picture = HalfBandEye(optics, 48, 48, focus_dpt, "cpu").look(field, pupil_mm)
-        counted = weights.for_blur(1e-3 * pupil_mm / optics.pixel_angle_rad * 2.5)
+        counted = weights.for_bench(optics, pupil_mm)
         found = focus_loss(picture, stack.target, blur, counted, border_px=8)
         return {"loss": found.total.item(), **{f"loss_{name}": value for name, value in found.terms.items()}}
 
