@@ -3,6 +3,7 @@
 
 use holod_calibration::rig::PanelMode;
 use holod_calibration::{Colour, host_now};
+use holod_slm_output::present::drm::Verdict;
 use holod_slm_output::present::window::{DisplayServer, Road, WindowError};
 use holod_slm_output::present::{AlterationKind, PanelFault, Presenter, TimestampSource, WindowSpec};
 
@@ -392,6 +393,37 @@ fn a_server_without_window_manager_or_rates_shows_the_pattern_where_its_only_mon
     drop(bench);
     let refused = open(&desktop, &WindowSpec::default(), PanelMode::ChannelPacked).err().unwrap();
     assert!(refused.to_string().contains("is the only monitor"), "{refused}");
+}
+
+#[test]
+fn a_panel_that_another_holod_shows_patterns_on_is_left_to_it() {
+    use x11rb::protocol::xproto::{AtomEnum, PropMode};
+    use x11rb::wrapper::ConnectionExt as _;
+    let desktop = Desktop::with_two_monitors();
+    let mut first = open(&desktop, &named(PANEL), PanelMode::ChannelPacked).unwrap();
+    // As if it were another process's.
+    let (window, pid) = (window_of(&desktop), desktop.atom("_NET_WM_PID"));
+    desktop.x.change_property32(PropMode::REPLACE, window, pid, AtomEnum::CARDINAL, &[4711]).unwrap().check().unwrap();
+    let refused = open(&desktop, &named(PANEL), PanelMode::ChannelPacked).err().unwrap().to_string();
+    assert!(refused.contains("DUMMY1 is the panel of another holod, process 4711"), "{refused}");
+    first.submit();
+    first.run_for(30).expect("the first one is not disturbed");
+    drop(first);
+    assert!(wait_until(|| open(&desktop, &named(PANEL), PanelMode::ChannelPacked).is_ok()), "the monitor is free");
+}
+
+#[test]
+fn what_a_panel_is_good_for_is_said_when_it_is_opened() {
+    let desktop = Desktop::with_two_monitors();
+    desktop.set_edid(PANEL, "PLUTO-2", "SN 0042");
+    let bench = open(&desktop, &named(PANEL), PanelMode::ChannelPacked).unwrap();
+    let said: Vec<_> = bench.panel.checks().iter().map(|check| (check.verdict, check.to_string())).collect();
+    let [(Verdict::Right, monitor), (Verdict::Dark, times), (Verdict::Unverified, unseen)] = &said[..] else {
+        panic!("{said:?}")
+    };
+    assert!(monitor.contains("DUMMY1") && monitor.contains("PLUTO-2") && monitor.contains("60.00 Hz"), "{monitor}");
+    assert!(times.contains("software's") && times.contains("lasers stay dark"), "{times}");
+    assert!(unseen.contains("full range"), "{unseen}");
 }
 
 #[test]

@@ -103,6 +103,11 @@ enum X11Error {
     ReplyOrId(#[from] ReplyOrIdError),
     #[error("it has no {0}, which holod needs")]
     Lacks(&'static str),
+    #[error(
+        "{connector} is the panel of another holod, process {process}; end that one, or name another monitor",
+        process = pid.map_or("unknown".to_owned(), |pid| pid.to_string())
+    )]
+    Taken { connector: String, pid: Option<u32> },
     #[error(transparent)]
     System(#[from] rustix::io::Errno),
 }
@@ -122,6 +127,8 @@ fn create_window(connection: &impl Connection, screen: usize, monitor: &Monitor)
     if !true_colour {
         return Err(X11Error::Lacks("picture of 8 bits for each colour (screen depth 24)"));
     }
+    let claim = Claim::of(connection, monitor)?;
+    claim.check(connection)?;
     // A cursor of one pixel, which its mask takes away.
     let (cursor, blank, clear) = (connection.generate_id()?, connection.generate_id()?, connection.generate_id()?);
     connection.create_pixmap(1, blank, root.root, 1, 1)?;
@@ -143,8 +150,48 @@ fn create_window(connection: &impl Connection, screen: usize, monitor: &Monitor)
     connection.change_property8(PropMode::REPLACE, window, AtomEnum::WM_CLASS, AtomEnum::STRING, b"holod\0holod\0")?;
     let bypass = connection.intern_atom(false, b"_NET_WM_BYPASS_COMPOSITOR")?.reply()?.atom;
     connection.change_property32(PropMode::REPLACE, window, bypass, AtomEnum::CARDINAL, &[1])?;
+    claim.make(connection, window)?;
     connection.sync()?;
     Ok(window)
+}
+
+/// A monitor as one holod's panel: a selection of the X server, which its window owns for as long as it is there.
+struct Claim {
+    connector: String,
+    selection: u32,
+    pid_atom: u32,
+}
+
+impl Claim {
+    fn of(connection: &impl Connection, monitor: &Monitor) -> Result<Self, X11Error> {
+        let connector = monitor.connector.clone();
+        let name = format!("_HOLOD_PANEL_{connector}");
+        let selection = connection.intern_atom(false, name.as_bytes())?.reply()?.atom;
+        let pid_atom = connection.intern_atom(false, b"_NET_WM_PID")?.reply()?.atom;
+        Ok(Self { connector, selection, pid_atom })
+    }
+
+    /// Whether the monitor is free, or was this process's, whose last window the server may not have taken away yet.
+    fn check(&self, connection: &impl Connection) -> Result<(), X11Error> {
+        let owner = connection.get_selection_owner(self.selection)?.reply()?.owner;
+        if owner == x11rb::NONE {
+            return Ok(());
+        }
+        let property = connection.get_property(false, owner, self.pid_atom, AtomEnum::CARDINAL, 0, 1)?.reply();
+        let pid = property.ok().and_then(|property| property.value32()?.next());
+        if pid == Some(std::process::id()) {
+            return Ok(());
+        }
+        Err(X11Error::Taken { connector: self.connector.clone(), pid })
+    }
+
+    fn make(&self, connection: &impl Connection, window: u32) -> Result<(), X11Error> {
+        let pid = [std::process::id()];
+        connection.change_property32(PropMode::REPLACE, window, self.pid_atom, AtomEnum::CARDINAL, &pid)?;
+        connection.set_selection_owner(window, self.selection, x11rb::CURRENT_TIME)?;
+        // Another one may have come at the same time.
+        self.check(connection)
+    }
 }
 
 /// Red, green and blue as bits of a pixel: the layout of `Bgra8Unorm`.
