@@ -54,25 +54,18 @@ impl LaserThread {
     /// Does all that is to be done at the time that `clock` says, which is handed back. The clock is read again for
     /// each field: a field that came since the last reading is not one that was reported before it was shown.
     pub(super) fn step(&mut self, clock: impl Fn() -> TimeNs) -> TimeNs {
-        let now = clock();
-        self.poll(now);
-        if let Some(reason) = self.shared.latched() {
-            self.latch(reason, now);
-        }
-        let (request, why) = dark_request_parts(self.shared.dark_request.load(Ordering::Acquire));
-        if request != std::mem::replace(&mut self.dark_request, request) {
-            let orders = self.scheduler.hold(why);
-            let answer = self.darkness(orders, now);
-            self.shared.dark_answer.store(request << 2 | u64::from(answer), Ordering::Release);
-        }
-        self.decide_fields(clock());
-        while let Ok(news) = self.news.pop() {
+        self.poll(clock());
+        self.decide_fields(clock(), &clock);
+        // What comes meanwhile waits for the next turn: where a box answers more slowly than refreshes come, this one
+        // would never end.
+        for _ in 0..self.news.slots() {
+            let Ok(news) = self.news.pop() else { break };
             match news {
                 PanelNews::Refresh(refresh) => {
                     // What the panel showed before is over by then, however late this thread is.
-                    self.decide_fields(refresh.t_present.min(clock()));
+                    self.decide_fields(refresh.t_present.min(clock()), &clock);
                     self.scheduler.on_refresh(&refresh);
-                    self.decide_fields(clock());
+                    self.decide_fields(clock(), &clock);
                 }
                 PanelNews::Lost => {
                     let orders = self.scheduler.panel_lost();
@@ -90,9 +83,26 @@ impl LaserThread {
         now
     }
 
+    /// Obeys those who want darkness, for good or until they take it back.
+    fn heed(&mut self, now: TimeNs) {
+        if let Some(reason) = self.shared.latched() {
+            self.latch(reason, now);
+        }
+        let (request, why) = dark_request_parts(self.shared.dark_request.load(Ordering::Acquire));
+        if request != std::mem::replace(&mut self.dark_request, request) {
+            let orders = self.scheduler.hold(why);
+            let answer = self.darkness(orders, now);
+            self.shared.dark_answer.store(request << 2 | u64::from(answer), Ordering::Release);
+        }
+    }
+
     /// Does what is to be done about the fields that have begun by `now`.
-    fn decide_fields(&mut self, now: TimeNs) {
-        while let Some(FieldDecision { shown, orders, mut dark }) = self.scheduler.next_field(now) {
+    fn decide_fields(&mut self, now: TimeNs, clock: &impl Fn() -> TimeNs) {
+        loop {
+            // Before each of them: the box may have been waited for since the last one, and it must not be armed
+            // against an order.
+            self.heed(clock());
+            let Some(FieldDecision { shown, orders, mut dark }) = self.scheduler.next_field(now) else { return };
             if orders.arm && now < self.t_retry {
                 self.scheduler.box_went_dark();
                 dark = Some(DarkReason::BoxFault);

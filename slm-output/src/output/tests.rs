@@ -2,7 +2,8 @@
 
 mod day;
 
-use std::sync::atomic::AtomicBool;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64};
 use std::time::Duration;
 
 use holod_calibration::rig::{Panel, PanelMode};
@@ -11,7 +12,7 @@ use proptest::prelude::*;
 use rtrb::Producer;
 
 use super::panel_thread::PanelNews;
-use super::shared::{DARK, NEXT, dark_because, dark_request_parts};
+use super::shared::{DARK, NEXT, NOT_YET, dark_because, dark_request_parts};
 use super::*;
 use crate::fields::{FrameLayout, FrameTag};
 use crate::laser::verify::{EdgeReport, Finding, verify_edges};
@@ -400,6 +401,148 @@ fn a_box_that_fails_goes_dark_by_itself_and_is_tried_again_later() {
         bench.run(TimeNs(2500 * MS), TimeNs(0));
         assert!(bench.edges.last().unwrap().t > TimeNs(2400 * MS));
         assert_eq!(bench.verdict().unsafe_findings().count(), 0);
+    }
+}
+
+/// A panel that goes on whatever the laser thread does: true reports of a new frame's fields, up to a time.
+struct Reporter {
+    news: Producer<PanelNews>,
+    field_period: TimeNs,
+    fields: i64,
+}
+
+impl Reporter {
+    const T_END: TimeNs = TimeNs(4000 * MS);
+
+    fn report(&mut self, now: TimeNs) {
+        loop {
+            let t_present = T_FIRST + TimeNs(self.fields * self.field_period.0);
+            if t_present > now.min(Self::T_END) {
+                return;
+            }
+            let field = self.fields as usize % 3;
+            let frame = FrameTag { frame_id: 1 + self.fields as u64 / 3, ..FrameTag::default() };
+            let refresh = PresentedRefresh {
+                frame: Some(frame),
+                field,
+                repeated: field > 0,
+                t_present,
+                provenance: TimestampSource::Software,
+                refresh_count: None,
+            };
+            self.news.push(PanelNews::Refresh(refresh)).expect("the laser thread reads them");
+            self.fields += 1;
+        }
+    }
+}
+
+/// A box that answers late, while the panel goes on.
+struct Slow {
+    inner: SimulatedLaser,
+    now: Arc<AtomicI64>,
+    there_and_back: TimeNs,
+    reporter: Arc<Mutex<Reporter>>,
+    shared: Arc<Shared>,
+    /// When somebody orders darkness, and what.
+    t_order: TimeNs,
+    order: fn(&Shared),
+    armed_after_order: Arc<AtomicU64>,
+}
+
+impl Slow {
+    fn wait(&self) -> TimeNs {
+        let before = TimeNs(self.now.fetch_add(self.there_and_back.0, Ordering::Relaxed));
+        let now = before + self.there_and_back;
+        self.reporter.lock().unwrap().report(now);
+        if (before..now).contains(&self.t_order) {
+            (self.order)(&self.shared);
+        }
+        now
+    }
+}
+
+impl LaserBox for Slow {
+    fn capability(&self) -> Capability {
+        self.inner.capability()
+    }
+    fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
+        self.inner.program(program, now)
+    }
+    fn arm(&mut self, _now: TimeNs) -> Result<(), LaserError> {
+        if self.now.load(Ordering::Relaxed) > self.t_order.0 {
+            self.armed_after_order.fetch_add(1, Ordering::Relaxed);
+        }
+        let now = self.wait();
+        self.inner.arm(now)
+    }
+    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        self.inner.sync(t_sync, now)
+    }
+    fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        self.inner.light(window, now)
+    }
+    fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        self.inner.heartbeat(now)
+    }
+    fn dark(&mut self, reason: DarkReason, _now: TimeNs) -> Result<(), LaserError> {
+        let now = self.wait();
+        self.inner.dark(reason, now)
+    }
+    fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
+        self.inner.poll(now, event)
+    }
+}
+
+#[test]
+fn a_box_that_answers_more_slowly_than_refreshes_come_is_not_armed_against_an_order() {
+    let orders: [fn(&Shared); 2] = [
+        |shared| shared.dark_request.store(dark_because(NEXT, Some(DarkReason::Asked)), Ordering::Release),
+        |shared| shared.latch.store(1, Ordering::Release),
+    ];
+    for there_and_back_ms in [4, 12, 20, 40, 180] {
+        for (index, order) in orders.into_iter().enumerate() {
+            let mut bench = Bench::new(PanelMode::FieldSequential);
+            let field_period = bench.laser.scheduler.gate().timing().field_period;
+            let (news, reports) = RingBuffer::new(SHORT_RING);
+            bench.laser.news = reports;
+            let reporter = Arc::new(Mutex::new(Reporter { news, field_period, fields: 0 }));
+            let now = Arc::new(AtomicI64::new(0));
+            let armed_after_order = Arc::new(AtomicU64::new(0));
+            // While the first ARM is waited for.
+            let t_order = T_FIRST + TimeNs(8 * field_period.0 + 3 * MS);
+            let mut inner = SimulatedLaser::new(TimeNs(0));
+            inner.program(&bench.laser.program, TimeNs(0)).unwrap();
+            bench.laser.laser = Box::new(Slow {
+                inner,
+                now: Arc::clone(&now),
+                there_and_back: TimeNs(there_and_back_ms * MS),
+                reporter: Arc::clone(&reporter),
+                shared: Arc::clone(&bench.laser.shared),
+                t_order,
+                order,
+                armed_after_order: Arc::clone(&armed_after_order),
+            });
+            let obeyed = |shared: &Shared| {
+                let [asked, latched] = [
+                    shared.dark_answer.load(Ordering::Acquire) != 0,
+                    shared.acknowledged.load(Ordering::Acquire) != NOT_YET,
+                ];
+                [asked, latched][index]
+            };
+            let mut t_obeyed = None;
+            while now.load(Ordering::Relaxed) < Reporter::T_END.0 {
+                let t = TimeNs(now.fetch_add(MS, Ordering::Relaxed) + MS);
+                reporter.lock().unwrap().report(t);
+                bench.laser.step(|| TimeNs(now.load(Ordering::Relaxed)));
+                if obeyed(&bench.laser.shared) {
+                    t_obeyed.get_or_insert(TimeNs(now.load(Ordering::Relaxed)));
+                }
+            }
+            let case = format!("{there_and_back_ms} ms there and back");
+            assert_eq!(armed_after_order.load(Ordering::Relaxed), 0, "{case}");
+            let took = t_obeyed.expect("obeyed") - t_order;
+            assert!(took <= TimeNs((2 * there_and_back_ms + 2) * MS), "{case}: {took:?}");
+        }
     }
 }
 

@@ -98,6 +98,11 @@ impl Interlock {
         if let Err(reason) = self.known_to_be_shown(field, verdict, now) {
             return (self.dark(reason), Some(reason));
         }
+        // As good as no report. Where none comes in time [`Self::watch`] makes dark: a box that must be waited for
+        // would else be told to go dark, for the reports that waited meanwhile, and be armed again without an end.
+        if now.0 - field.t_present.0 > MISSING_REFRESHES * self.gate.timing().refresh_period.0 {
+            return (Orders::default(), Some(DarkReason::Late));
+        }
         if field.reported {
             self.t_known = Some(field.t_present);
         }
@@ -187,13 +192,11 @@ impl Interlock {
             return Err(DarkReason::Untrusted);
         }
         verdict?;
-        let age_ns = now.0 - field.t_present.0;
-        let again = field.reported && self.t_known.is_some_and(|before| field.t_present <= before);
-        if age_ns > MISSING_REFRESHES * self.gate.timing().refresh_period.0 || again {
+        if field.reported && self.t_known.is_some_and(|before| field.t_present <= before) {
             return Err(DarkReason::Late);
         }
         // A field that is reported before it is shown is a guess.
-        if age_ns < 0 {
+        if field.t_present > now {
             return Err(DarkReason::Untrusted);
         }
         if field.t_present.0.saturating_sub(self.t_new_frame.0) > self.stall_timeout.0 {
