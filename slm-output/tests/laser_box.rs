@@ -715,16 +715,20 @@ proptest! {
 const SOUND: u8 = 0;
 const DAMAGES: u8 = 1;
 const SWALLOWS: u8 = 2;
+/// Until something is sent while it is sound again.
+const HOLDS_UP: u8 = 3;
 
-/// A wire that can go bad.
-struct BadWire(UnixStream, Arc<AtomicU8>);
+/// A wire that can go bad, and what it holds up.
+struct BadWire(UnixStream, Arc<AtomicU8>, Vec<u8>);
 
 impl Write for BadWire {
     fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        let mut sent = bytes.to_vec();
+        let mut sent = [self.2.as_slice(), bytes].concat();
+        self.2.clear();
         match self.1.load(Ordering::Relaxed) {
             SWALLOWS => sent.clear(),
             DAMAGES => sent[0] ^= 4,
+            HOLDS_UP => std::mem::swap(&mut sent, &mut self.2),
             _ => {}
         }
         self.0.write_all(&sent).map(|()| bytes.len())
@@ -748,7 +752,7 @@ fn host_on_a_bad_wire() -> (SerialBox, Arc<AtomicU8>, std::thread::JoinHandle<Ve
     };
     let served = std::thread::spawn(serve);
     let state = Arc::new(AtomicU8::new(SOUND));
-    let wire = BadWire(host.try_clone().unwrap(), Arc::clone(&state));
+    let wire = BadWire(host.try_clone().unwrap(), Arc::clone(&state), Vec::new());
     let host = SerialBox::identify(host, wire, "wire", SerialOptions::default(), host_now).unwrap();
     (host, state, served)
 }
@@ -779,6 +783,49 @@ fn a_box_that_does_not_answer_is_an_error_and_never_an_acknowledgement() {
     assert!(matches!(unheard, LaserError::NoAnswer { command: "ARM", .. }), "{unheard}");
     drop(host);
     served.join().unwrap();
+}
+
+#[test]
+fn a_window_of_which_the_box_hears_late_is_told_as_the_box_lit_it() {
+    let (mut host, wire, served) = host_on_a_bad_wire();
+    host.program(&host_program(), host_now()).unwrap();
+    host.arm(host_now()).unwrap();
+    let mut told = Vec::new();
+    let mut missed = Vec::new();
+    let mut asked = Vec::new();
+    for (colour, after_ms) in [(Colour::Red, 20), (Colour::Green, 140)] {
+        let now = host_now();
+        let window = LitWindow { colour, t_on: now + TimeNs(5 * MS), t_off: now + TimeNs(after_ms * MS) };
+        wire.store(HOLDS_UP, Ordering::Relaxed);
+        assert_eq!(host.light(window, now).unwrap(), None);
+        asked.push(window);
+        std::thread::sleep(Duration::from_millis(50));
+        host.poll(host_now(), &mut |event| told.push(event)).unwrap();
+        assert_eq!(edges(&told), [], "nobody knows yet");
+        assert!(host.known_until(host_now()) <= window.t_on, "and that is said");
+        wire.store(SOUND, Ordering::Relaxed);
+        host.heartbeat(host_now()).unwrap();
+        eventually("what was missed", || {
+            host.poll(host_now(), &mut |event| told.push(event)).unwrap();
+            missed.extend(host.next_missed());
+            std::thread::sleep(Duration::from_millis(1));
+            missed.len() == asked.len()
+        });
+    }
+    std::thread::sleep(Duration::from_millis(300));
+    host.dark(DarkReason::Asked, host_now()).unwrap();
+    host.poll(host_now(), &mut |event| told.push(event)).unwrap();
+    drop(host);
+    let log = read_log(&String::from_utf8(served.join().unwrap()).unwrap()).unwrap();
+    let (told, lit) = (edges(&told), edges(&log));
+    assert!(missed[0].is_whole() && !missed[1].is_whole(), "{missed:?}");
+    assert!(missed[1].time > TimeNs(40 * MS), "{missed:?}");
+    assert_eq!(told.len(), 2, "the first window stayed dark: {told:?}");
+    for (told, lit) in told.iter().zip(&lit) {
+        assert_eq!((told.colour, told.on), (Colour::Green, lit.on));
+        // As well as the clocks are known.
+        assert!((told.t - lit.t).0.abs() < 5 * MS, "{told:?} {lit:?}");
+    }
 }
 
 #[test]

@@ -27,6 +27,8 @@ pub struct LaserSummary {
     /// Fields of lasers that are simply on while their box is armed: nobody tells which were lit, and they are not
     /// judged.
     pub not_told: u64,
+    /// Windows of which the box heard too late for their beginning, and that it lit in part.
+    pub lit_in_part: u64,
     /// Light where there must be none.
     pub unsafe_findings: usize,
     /// Everything that was not as it should be.

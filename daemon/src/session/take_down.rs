@@ -8,6 +8,7 @@ use holod_slm_output::LevelsFrame;
 
 use super::build::Session;
 use super::clock::host_now;
+use super::ledger::LaserSummary;
 use super::summary::{SessionReport, Summary};
 use crate::aside::ends_within;
 use crate::failure::{Exit, Failure};
@@ -94,7 +95,7 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
         tracker_records_lost: recorded.as_ref().map_or(0, |status| status.chunks_lost + status.decisions_lost),
         clipped_share_max: tally.clipped_share_max,
         unreachable_share_max: tally.unreachable_share_max,
-        lasers: tally.lasers.finish(),
+        lasers: LaserSummary { lit_in_part: down.counts.lit_in_part, ..tally.lasers.finish() },
         lasers_dark_at_end: down.lasers_dark,
         lasers_not_dark,
         flat_at_end: down.flat_presented,

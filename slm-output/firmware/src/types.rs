@@ -203,7 +203,7 @@ dark_reasons! {
     Line, "line", "the box was sent a line that it does not understand: check the cable";
     HangUp, "hang-up", "the line to the box was closed";
     MissingReport, "missing-report", "the panel reported no refresh in time";
-    Late, "late", "the report of a field came when it had gone by: the machine is too busy";
+    Late, "late", "the report of a field, or the order to light it, came when it had gone by: the machine, the panel's reports or the line to the box are too slow";
     Untrusted, "untrusted", "the panel's reports contradict each other, or their times are guesses";
     WrongColour, "wrong-colour", "the panel reported a field that its colour frame does not have";
     Flat, "flat", "the flat pattern is on the panel";

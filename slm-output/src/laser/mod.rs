@@ -61,6 +61,22 @@ pub struct LitWindow {
     pub t_off: TimeNs,
 }
 
+/// Light that a box missed because it heard of its window too late.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MissedLight {
+    /// What was to be lit.
+    pub window: LitWindow,
+    /// How much of its beginning stayed dark.
+    pub time: TimeNs,
+}
+
+impl MissedLight {
+    /// Whether nothing of it was lit.
+    pub fn is_whole(&self) -> bool {
+        self.time >= self.window.t_off - self.window.t_on
+    }
+}
+
 /// What happened at a laser box.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[allow(missing_docs, reason = "the variants say what their fields are")]
@@ -355,6 +371,17 @@ pub trait LaserBox: Send {
     /// # Errors
     /// As [`Self::program`]; the box is then left to its heartbeat timeout.
     fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError>;
+
+    /// Until when, of the time up to `now`, [`Self::poll`] has told of everything: of a box that answers late what it
+    /// did is known later.
+    fn known_until(&self, now: TimeNs) -> TimeNs {
+        now
+    }
+
+    /// A window of which the box heard too late for all of it; each once.
+    fn next_missed(&mut self) -> Option<MissedLight> {
+        None
+    }
 
     /// Calls `event` for all that has happened at the box up to `now`, in order. A box that does not tell its edges
     /// reports those of its own model of itself.

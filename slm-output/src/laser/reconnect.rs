@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use holod_calibration::{Colour, TimeNs};
 use rtrb::{Consumer, Producer, RingBuffer};
 
-use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserEdge, LaserError, LaserProgram, LitWindow};
+use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserEdge, LaserError, LaserProgram, LitWindow, MissedLight};
 
 /// How long a box that was not found is left alone.
 const RETRY_EVERY: Duration = Duration::from_millis(250);
@@ -203,6 +203,14 @@ impl LaserBox for Reconnecting {
     fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
         self.made_dark &= reason != DarkReason::Boot;
         self.with_box(now, |laser| laser.dark(reason, now))
+    }
+
+    fn known_until(&self, now: TimeNs) -> TimeNs {
+        self.current.as_ref().map_or(now, |laser| laser.known_until(now))
+    }
+
+    fn next_missed(&mut self) -> Option<MissedLight> {
+        self.current.as_mut()?.next_missed()
     }
 
     fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {

@@ -1,5 +1,6 @@
 //! A laser box at the other end of a serial line, spoken to by the protocol of `holod-laser-firmware`.
 
+use std::collections::VecDeque;
 use std::io::{Read, Write};
 use std::path::Path;
 use std::time::Duration;
@@ -14,7 +15,10 @@ use holod_laser_firmware::{
 use super::box_clock::{BoxClock, Offset};
 use super::line_link::{Arrival, Link, Sharing, open_port};
 use super::program::{ceil_us, commands, floor_us, laser_of, nanoseconds, within_limits};
-use super::{BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow, SimulatedLaser, Trigger};
+use super::{
+    BoxEvent, Capability, DarkReason, LaserBox, LaserError, LaserProgram, LitWindow, MissedLight, SimulatedLaser,
+    Trigger,
+};
 
 const BAUD: u32 = 115_200;
 /// A box that does not answer for this long is at fault. It makes itself dark much sooner.
@@ -76,9 +80,10 @@ pub struct BoxReport {
 /// answer ([`BoxClock`]), windows are cut by what is not known of it, and where nothing is left of one the field stays
 /// dark.
 ///
-/// The box does not tell its edges, so the ones reported here are those of a model that is told the same as the box:
-/// what it does if it keeps its rules. Once it contradicts the model (it went dark, it refuses, it does not answer)
-/// that is an event or an error.
+/// The box does not tell its edges, so the ones reported here are those of a model that does what the box has said it
+/// did, at the time at which it did it: what it does if it keeps its rules. So the model is behind by the box's answers,
+/// and a window that came too late is lit by neither. Once the box contradicts the model (it went dark, it refuses, it
+/// does not answer) that is an event or an error.
 #[derive(Debug)]
 pub struct SerialBox {
     link: Link,
@@ -95,6 +100,10 @@ pub struct SerialBox {
     last_number: u32,
     t_sent: TimeNs,
     unanswered: [Option<Sent>; UNANSWERED_MAX],
+    /// What the box missed of its windows, until it is fetched.
+    missed: VecDeque<MissedLight>,
+    /// It is told to go dark: what goes wrong with earlier commands no longer matters.
+    goes_dark: bool,
     /// The command whose answer is waited for, and the answer.
     awaited: Option<(u32, Option<Result<Answer<'static>, Refusal>>)>,
     clock: fn() -> TimeNs,
@@ -105,6 +114,20 @@ struct Sent {
     number: u32,
     command: &'static str,
     t: TimeNs,
+    effect: Effect,
+}
+
+/// What a command does at the box, for the model to do once the box has done it.
+#[derive(Clone, Copy, Debug)]
+enum Effect {
+    /// Nothing, or its answer is waited for.
+    None,
+    Heartbeat,
+    Frame {
+        t: TimeNs,
+        error_us: u32,
+    },
+    Light(LitWindow),
 }
 
 impl SerialBox {
@@ -222,6 +245,8 @@ impl SerialBox {
             last_number: first_number,
             t_sent: now,
             unanswered: [None; UNANSWERED_MAX],
+            missed: VecDeque::with_capacity(UNANSWERED_MAX),
+            goes_dark: false,
             awaited: None,
             clock,
         }
@@ -265,13 +290,19 @@ impl SerialBox {
     }
 
     fn send(&mut self, command: &Command) -> Result<u32, LaserError> {
+        self.send_with(command, Effect::None)
+    }
+
+    fn send_with(&mut self, command: &Command, effect: Effect) -> Result<u32, LaserError> {
         let number = self.last_number.wrapping_add(1);
         let t = (self.clock)();
         let place = &mut self.unanswered[number as usize % UNANSWERED_MAX];
-        if let Some(oldest) = place {
+        if let Some(oldest) = place
+            && !self.goes_dark
+        {
             return Err(LaserError::NoAnswer { command: oldest.command, waited_ms: (t.0 - oldest.t.0) / 1_000_000 });
         }
-        *place = Some(Sent { number, command: command.word(), t });
+        *place = Some(Sent { number, command: command.word(), t, effect });
         self.last_number = number;
         self.t_sent = t;
         let line = Line::new(format_args!("{number} {command}")).expect("every command fits into a line");
@@ -285,11 +316,14 @@ impl SerialBox {
         self.awaited = Some((number, None));
         let t_end = (self.clock)() + patience;
         loop {
-            self.hear((self.clock)())?;
-            if let Some((_, Some(answer))) = self.awaited {
+            let heard = self.hear((self.clock)());
+            if let Some((_, Some(answer))) = self.awaited
+                && (heard.is_ok() || self.goes_dark)
+            {
                 self.awaited = None;
                 return answer.map_err(|refusal| LaserError::Refused { command: command.word(), refusal });
             }
+            heard?;
             if (self.clock)() >= t_end {
                 self.awaited = None;
                 self.unanswered[number as usize % UNANSWERED_MAX] = None;
@@ -322,6 +356,7 @@ impl SerialBox {
                 if let Some(t) = answer.t() {
                     self.learn(sent.t, t_heard, t)?;
                 }
+                self.take_effect(&sent, self.done_at(&answer, sent.t, t_heard))?;
                 match answer {
                     Answer::Sync { sync, .. } => self.compare_with_wire(sync, t_heard, now)?,
                     Answer::State { state, .. } if !state.armed => {
@@ -340,13 +375,17 @@ impl SerialBox {
                 if self.give(number, Err(refusal)) {
                     return Ok(());
                 }
-                match refusal {
+                match (refusal, sent.effect) {
                     // A window that came too late stays dark, no more.
-                    Refusal::Late => Ok(()),
+                    (Refusal::Late, Effect::Light(window)) => {
+                        self.note_missed(window, window.t_off);
+                        Ok(())
+                    }
+                    _ if self.goes_dark => Ok(()),
                     // It went dark by itself and has said so; or somebody else made it dark.
-                    Refusal::NotArmed if !self.model.is_armed() => Ok(()),
-                    Refusal::NotArmed => self.send(&Command::State).map(|_| ()),
-                    refusal => Err(LaserError::Refused { command: sent.command, refusal }),
+                    (Refusal::NotArmed, _) if !self.model.is_armed() => Ok(()),
+                    (Refusal::NotArmed, _) => self.send(&Command::State).map(|_| ()),
+                    (refusal, _) => Err(LaserError::Refused { command: sent.command, refusal }),
                 }
             }
             Message::Dark { reason, .. } => {
@@ -358,6 +397,41 @@ impl SerialBox {
                 self.box_clock.forget();
                 Err(LaserError::Reset)
             }
+        }
+    }
+
+    /// When the box did what it answers to, between sending and hearing.
+    fn done_at(&self, answer: &Answer<'_>, t_sent: TimeNs, t_heard: TimeNs) -> TimeNs {
+        let done = answer.t().zip(self.box_clock.offset_at(t_heard));
+        done.map_or(t_heard, |(t, offset)| nanoseconds(t) - TimeNs(offset.middle_ns())).min(t_heard).max(t_sent)
+    }
+
+    /// Has the model do what the box did at `t`.
+    fn take_effect(&mut self, sent: &Sent, t: TimeNs) -> Result<(), LaserError> {
+        let done = match sent.effect {
+            Effect::None => Ok(()),
+            Effect::Heartbeat => self.model.obey(&Command::Heartbeat, t),
+            Effect::Frame { t: t_frame, error_us } => self.model.see_frame(t_frame, error_us, t),
+            Effect::Light(window) => match self.model.take_window(window, t) {
+                Ok(()) => {
+                    self.note_missed(window, t);
+                    Ok(())
+                }
+                Err(Refusal::Late) => {
+                    self.note_missed(window, window.t_off);
+                    Ok(())
+                }
+                refused => refused,
+            },
+        };
+        if self.goes_dark { Ok(()) } else { done.map_err(refused(sent.command)) }
+    }
+
+    /// The box missed what of a window was over at `t`.
+    fn note_missed(&mut self, window: LitWindow, t: TimeNs) {
+        let time = t.min(window.t_off) - window.t_on;
+        if time > TimeNs(0) && self.missed.len() < UNANSWERED_MAX {
+            self.missed.push_back(MissedLight { window, time });
         }
     }
 
@@ -390,6 +464,10 @@ impl SerialBox {
         self.send(&Command::Disarm(DarkReason::SyncDisagrees))?;
         self.model.set_dark(DarkReason::SyncDisagrees, now);
         Err(LaserError::SyncDisagrees)
+    }
+
+    fn require_armed(&self, command: &'static str) -> Result<(), LaserError> {
+        if self.model.is_armed() { Ok(()) } else { Err(refused(command)(Refusal::NotArmed)) }
     }
 
     fn trigger(&self, program: &LaserProgram) -> BoxTrigger {
@@ -463,17 +541,18 @@ impl LaserBox for SerialBox {
         if self.made_dark {
             return Err(LaserError::MadeDark);
         }
-        match self.ask(&Command::Arm, SWITCH_WAIT) {
+        let answer = match self.ask(&Command::Arm, SWITCH_WAIT) {
             Err(LaserError::Refused { refusal: Refusal::ByHand, .. }) => {
                 self.made_dark = true;
                 return Err(LaserError::MadeDark);
             }
-            armed => drop(armed?),
-        }
+            armed => armed?,
+        };
         if let Some(wire) = &mut self.wire {
             *wire = WireCheck::new(wire.period);
         }
-        self.model.obey(&Command::Arm, now).map_err(refused("ARM"))
+        let t = self.done_at(&answer, now, (self.clock)().max(now));
+        self.model.obey(&Command::Arm, t).map_err(refused("ARM"))
     }
 
     fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
@@ -481,16 +560,19 @@ impl LaserBox for SerialBox {
             wire.frame_began(t_sync);
             return self.model.see_frame(t_sync, 0, now).map(|()| None).map_err(refused("FRM"));
         }
+        self.require_armed("FRM")?;
         let Some(offset) = self.box_clock.offset_at(now) else { return Ok(Some(DarkReason::ClockUnsure)) };
         let t = floor_us(t_sync + TimeNs(offset.middle_ns()));
         let error_us = u32::try_from(offset.error_ns() / 1000 + 1).unwrap_or(u32::MAX);
-        self.send(&Command::Frame { t, error_us })?;
-        self.model.see_frame(t_sync, error_us, now).map_err(refused("FRM"))?;
+        self.send_with(&Command::Frame { t, error_us }, Effect::Frame { t: t_sync, error_us })?;
         // What is not known of the frame's start is cut off its windows at both ends.
         Ok((2 * i64::from(error_us) * 1000 >= self.narrowest.0).then_some(DarkReason::ClockUnsure))
     }
 
     fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        self.require_armed("LIT")?;
+        // The box may have been waited for since.
+        let now = now.max((self.clock)());
         let Some(offset) = self.box_clock.offset_at(now) else { return Ok(Some(DarkReason::ClockUnsure)) };
         // Wherever the truth lies within the bounds, the box lights inside the window.
         let t_on = ceil_us(window.t_on + TimeNs(offset.greatest_ns));
@@ -498,37 +580,52 @@ impl LaserBox for SerialBox {
         if t_off <= t_on {
             return Ok(Some(DarkReason::ClockUnsure));
         }
-        self.send(&Command::Light { laser: laser_of(window.colour), t_on, t_off })?;
-        let cut = TimeNs(offset.error_ns());
-        let window = LitWindow { t_on: window.t_on + cut, t_off: window.t_off - cut, ..window };
-        match self.model.take_window(window, now) {
-            Ok(()) => Ok(None),
-            Err(Refusal::Late) => Ok(Some(DarkReason::Late)),
-            Err(refusal) => Err(LaserError::Refused { command: "LIT", refusal }),
+        // So late it is there at least.
+        if t_off <= floor_us(now + TimeNs(offset.least_ns)) {
+            return Ok(Some(DarkReason::Late));
         }
+        let cut = TimeNs(offset.error_ns());
+        let lit = LitWindow { t_on: window.t_on + cut, t_off: window.t_off - cut, ..window };
+        self.send_with(&Command::Light { laser: laser_of(window.colour), t_on, t_off }, Effect::Light(lit))?;
+        Ok(None)
     }
 
-    fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
-        self.send(&Command::Heartbeat)?;
-        self.model.obey(&Command::Heartbeat, now).map_err(refused("HB"))
+    fn heartbeat(&mut self, _now: TimeNs) -> Result<(), LaserError> {
+        self.require_armed("HB")?;
+        self.send_with(&Command::Heartbeat, Effect::Heartbeat).map(drop)
     }
 
     fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
-        // Answers to earlier commands no longer matter.
-        self.unanswered = [None; UNANSWERED_MAX];
-        match self.ask(&Command::Disarm(reason), SWITCH_WAIT) {
-            Ok(_) => {}
+        self.goes_dark = true;
+        let mut told = self.ask(&Command::Disarm(reason), SWITCH_WAIT);
+        if told.is_err() {
             // The line may have swallowed the first one.
-            Err(_) => drop(self.ask(&Command::Disarm(reason), SWITCH_WAIT)?),
+            told = self.ask(&Command::Disarm(reason), SWITCH_WAIT);
         }
+        self.goes_dark = false;
+        self.unanswered = [None; UNANSWERED_MAX];
+        told?;
         self.model.set_dark(reason, (self.clock)().max(now));
         self.made_dark &= reason != DarkReason::Boot;
         Ok(())
     }
 
+    fn known_until(&self, now: TimeNs) -> TimeNs {
+        self.unanswered.iter().flatten().map(|sent| sent.t).min().unwrap_or(now).min(now)
+    }
+
+    fn next_missed(&mut self) -> Option<MissedLight> {
+        self.missed.pop_front()
+    }
+
     fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
         let heard = self.hear(now);
-        self.model.advance(now);
+        let overdue = |sent: &&Sent| now.0 - sent.t.0 > ANSWER_WAIT.0;
+        let unheard = self.unanswered.iter().flatten().find(overdue).copied();
+        if unheard.is_some() {
+            self.unanswered = [None; UNANSWERED_MAX];
+        }
+        self.model.advance(self.known_until(now));
         let mut box_may_go_on = None;
         while let Some(next) = self.model.next_event() {
             // What the model of a wired box misses, a report or a heartbeat, the box itself may not miss yet.
@@ -541,13 +638,10 @@ impl LaserBox for SerialBox {
             event(next);
         }
         let told = box_may_go_on.map_or(Ok(()), |reason| self.send(&Command::Disarm(reason)).map(drop));
-        heard.and(told)?;
-        let overdue = |sent: &&Sent| now.0 - sent.t.0 > ANSWER_WAIT.0;
-        if let Some(sent) = self.unanswered.iter().flatten().find(overdue) {
-            let error = LaserError::NoAnswer { command: sent.command, waited_ms: (now.0 - sent.t.0) / 1_000_000 };
-            self.unanswered = [None; UNANSWERED_MAX];
-            return Err(error);
+        if let Some(Sent { command, t, .. }) = unheard {
+            return Err(LaserError::NoAnswer { command, waited_ms: (now.0 - t.0) / 1_000_000 });
         }
+        heard.and(told)?;
         if now.0 - self.t_sent.0 > ASK_TIME_EVERY.0 {
             // In the dark the question is also whether somebody means it to stay so.
             self.send(if self.model.is_armed() { &Command::Now } else { &Command::State })?;

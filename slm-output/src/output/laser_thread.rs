@@ -79,7 +79,7 @@ impl LaserThread {
         self.poll(now);
         self.shared.armed.store(self.scheduler.is_armed(), Ordering::Relaxed);
         self.shared.refresh_millihz.store((self.scheduler.refresh_hz() * 1e3).round() as u64, Ordering::Relaxed);
-        self.ledger.flush(now, &self.shared);
+        self.ledger.flush(self.laser.known_until(now), &self.shared);
         now
     }
 
@@ -134,6 +134,8 @@ impl LaserThread {
                 self.laser.program(&self.program, now)?;
             }
             self.laser.arm(now)?;
+            // Of windows of before, which the colours' light is no longer counted from.
+            self.take_missed(false);
         }
         if orders.heartbeat {
             self.laser.heartbeat(now)?;
@@ -199,6 +201,21 @@ impl LaserThread {
             && now >= self.t_retry
         {
             self.fault(error, now);
+        }
+        self.take_missed(true);
+    }
+
+    /// Takes note of the light that the box missed; whether it counts for the `balance` of the colours.
+    fn take_missed(&mut self, balance: bool) {
+        while let Some(missed) = self.laser.next_missed() {
+            if balance {
+                self.scheduler.missed(missed.window.colour, missed.time);
+            }
+            if missed.is_whole() {
+                self.ledger.came_late(&missed.window);
+            } else {
+                count(&self.shared.lit_in_part);
+            }
         }
     }
 }

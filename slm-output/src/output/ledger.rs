@@ -7,7 +7,7 @@ use rtrb::Producer;
 
 use super::shared::{Shared, count};
 use crate::laser::verify::FieldSpan;
-use crate::laser::{BoxEvent, DarkReason, LaserEdge};
+use crate::laser::{BoxEvent, DarkReason, LaserEdge, LitWindow};
 use crate::present::TimestampSource;
 use crate::schedule::{FieldGate, ShownField};
 
@@ -115,6 +115,17 @@ impl Ledger {
         }
         if self.box_events.push(event).is_err() {
             count(&shared.lost);
+        }
+    }
+
+    /// The box heard of a field's window when it had gone by.
+    pub(super) fn came_late(&mut self, window: &LitWindow) {
+        let Self { open, gate, .. } = self;
+        let is_its = |field: &ShownField| {
+            field.colour == window.colour && (field.t_present..gate.t_end(field)).contains(&window.t_on)
+        };
+        if let Some((_, dark)) = open.iter_mut().find(|(field, _)| is_its(field)) {
+            dark.get_or_insert(DarkReason::Late);
         }
     }
 

@@ -13,6 +13,8 @@ pub struct OutputCounts {
     pub repeated: u64,
     /// Fields that were not lit.
     pub dark_fields: u64,
+    /// Windows of which the laser box heard too late for their beginning, and that it lit in part.
+    pub lit_in_part: u64,
     /// Times that the lasers went dark while they were armed.
     pub went_dark: u64,
     /// Commands that the laser box failed or refused.
@@ -56,6 +58,7 @@ pub(super) struct Shared {
     pub(super) fields: AtomicU64,
     pub(super) repeated: AtomicU64,
     pub(super) dark_fields: AtomicU64,
+    pub(super) lit_in_part: AtomicU64,
     pub(super) went_dark: AtomicU64,
     pub(super) box_faults: AtomicU64,
     pub(super) lost: AtomicU64,
@@ -68,6 +71,7 @@ impl Shared {
             fields: get(&self.fields),
             repeated: get(&self.repeated),
             dark_fields: get(&self.dark_fields),
+            lit_in_part: get(&self.lit_in_part),
             went_dark: get(&self.went_dark),
             box_faults: get(&self.box_faults),
             lost: get(&self.lost),

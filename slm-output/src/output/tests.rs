@@ -2,6 +2,7 @@
 
 mod day;
 
+use std::collections::VecDeque;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64};
 use std::time::Duration;
@@ -16,7 +17,7 @@ use super::shared::{DARK, NEXT, NOT_YET, dark_because, dark_request_parts};
 use super::*;
 use crate::fields::{FrameLayout, FrameTag};
 use crate::laser::verify::{EdgeReport, Finding, verify_edges};
-use crate::laser::{Capability, LaserEdge, LaserProgram, LitWindow, Refusal, SimulatedLaser};
+use crate::laser::{Capability, LaserEdge, LaserProgram, LitWindow, MissedLight, Refusal, SimulatedLaser};
 use crate::pacing::Pacer;
 use crate::present::{FrameSink, FrameSource, HeadlessPanel, PresentedRefresh, ReportFaults, TimestampSource};
 
@@ -543,6 +544,86 @@ fn a_box_that_answers_more_slowly_than_refreshes_come_is_not_armed_against_an_or
             let took = t_obeyed.expect("obeyed") - t_order;
             assert!(took <= TimeNs((2 * there_and_back_ms + 2) * MS), "{case}: {took:?}");
         }
+    }
+}
+
+/// A box that hears of every `each`th window too late, for half of it or for all, and says so only at the next poll.
+struct Deaf {
+    inner: SimulatedLaser,
+    asked: u64,
+    each: u64,
+    is_whole: bool,
+    answered: VecDeque<MissedLight>,
+    missed: VecDeque<MissedLight>,
+}
+
+impl LaserBox for Deaf {
+    fn capability(&self) -> Capability {
+        self.inner.capability()
+    }
+    fn program(&mut self, program: &LaserProgram, now: TimeNs) -> Result<(), LaserError> {
+        self.inner.program(program, now)
+    }
+    fn arm(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        self.inner.arm(now)
+    }
+    fn sync(&mut self, t_sync: TimeNs, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        self.inner.sync(t_sync, now)
+    }
+    fn light(&mut self, window: LitWindow, now: TimeNs) -> Result<Option<DarkReason>, LaserError> {
+        self.asked += 1;
+        if !self.asked.is_multiple_of(self.each) {
+            return self.inner.light(window, now);
+        }
+        let whole = window.t_off - window.t_on;
+        let time = if self.is_whole { whole } else { TimeNs(whole.0 / 2) };
+        self.answered.push_back(MissedLight { window, time });
+        if self.is_whole {
+            return Ok(None);
+        }
+        self.inner.light(LitWindow { t_on: window.t_on + time, ..window }, now)
+    }
+    fn heartbeat(&mut self, now: TimeNs) -> Result<(), LaserError> {
+        self.inner.heartbeat(now)
+    }
+    fn dark(&mut self, reason: DarkReason, now: TimeNs) -> Result<(), LaserError> {
+        self.inner.dark(reason, now)
+    }
+    fn next_missed(&mut self) -> Option<MissedLight> {
+        self.missed.pop_front()
+    }
+    fn poll(&mut self, now: TimeNs, event: &mut dyn FnMut(BoxEvent)) -> Result<(), LaserError> {
+        self.missed.append(&mut self.answered);
+        self.inner.poll(now, event)
+    }
+}
+
+#[test]
+fn light_that_the_box_missed_is_told_and_costs_the_other_colours_as_much() {
+    // Of every fourth window each colour loses one in turn, of every third always the same.
+    for (each, is_whole) in [(4, false), (4, true), (3, false), (3, true)] {
+        let inner = SimulatedLaser::new(TimeNs(0));
+        let (answered, missed) = (VecDeque::new(), VecDeque::new());
+        let laser = Deaf { inner, asked: 0, each, is_whole, answered, missed };
+        let mut bench = Bench::with_box(PanelMode::FieldSequential, Box::new(laser));
+        bench.run(TimeNs(4000 * MS), TimeNs(0));
+        bench.laser.latch(DarkReason::Shutdown, TimeNs(4000 * MS));
+        bench.wake(TimeNs(4001 * MS));
+        assert_eq!(bench.verdict().findings, []);
+        let dark = |reason| bench.all_events.iter().filter(|event| event.dark == Some(reason)).count();
+        let in_part = bench.laser.shared.counts().lit_in_part;
+        if is_whole {
+            assert!(dark(DarkReason::Late) > 50 && in_part == 0, "{} {in_part}", dark(DarkReason::Late));
+        } else {
+            assert!(dark(DarkReason::Late) == 0 && in_part > 50, "{} {in_part}", dark(DarkReason::Late));
+        }
+        let lit_ns = Colour::ALL.map(|colour| {
+            let lit = bench.all_events.iter().filter(|event| event.colour == colour);
+            lit.filter_map(|event| Some((event.laser_off? - event.laser_on?).0)).sum::<i64>()
+        });
+        // One colour frame's light, and what one more takes in before a miss is known.
+        let spread_ns = lit_ns.iter().max().unwrap() - lit_ns.iter().min().unwrap();
+        assert!(spread_ns <= 2 * bench.laser.scheduler.gate().width().0, "{each} {is_whole}: {lit_ns:?}");
     }
 }
 

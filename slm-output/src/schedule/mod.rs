@@ -190,6 +190,11 @@ impl FieldScheduler {
         self.balance.give_back();
     }
 
+    /// Of the windows ordered for `colour`, `time` stayed dark at the box.
+    pub fn missed(&mut self, colour: Colour, time: TimeNs) {
+        self.balance.give_back_of(colour, time);
+    }
+
     /// Darkness is asked for and why, or that is taken back.
     pub fn hold(&mut self, held: Option<DarkReason>) -> Orders {
         self.interlock.hold(held)
