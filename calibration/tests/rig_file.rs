@@ -443,10 +443,21 @@ fn timings_that_do_not_fit_into_the_field_state_the_numbers() {
         line_of("lit_ms"),
         sum,
         "5.556 ms of one field",
-        "write lit_ms = 3.455 at most",
+        "write lit_ms = 3.332 at most",
     );
     check("lit_ms = 3.0", "lit_ms = 3.456", "lasers.lit_ms", "= 5.556 ms", "", "");
-    assert!(Rig::parse(&changed(&[("lit_ms = 3.0", "lit_ms = 3.455")]), Path::new("")).is_ok());
+    let cut = Rig::parse(&changed(&[("lit_ms = 3.0", "lit_ms = 3.455")]), Path::new("")).unwrap();
+    let note = "lit_ms is cut to 3.332: a window ends 0.123 ms before its field at least";
+    assert!(cut.meaning().to_string().contains(note), "{}", cut.meaning());
+    let whole = Rig::parse(&changed(&[("lit_ms = 3.0", "lit_ms = 3.332")]), Path::new("")).unwrap();
+    assert!(!whole.meaning().to_string().contains("is cut"));
+    // No window at all would be left.
+    let none = changed(&[("on_delay_ms = 0.1", "on_delay_ms = 3.45"), ("lit_ms = 3.0", "lit_ms = 0.05")]);
+    let none = Rig::parse(&none, Path::new("")).unwrap_err().to_string();
+    assert!(
+        none.contains("= 5.5 ms") && none.contains("0.123 ms before its own") && none.contains("shorten"),
+        "{none}"
+    );
     check(
         "heartbeat_timeout_ms = 100.0",
         "heartbeat_timeout_ms = 30",
@@ -1202,6 +1213,15 @@ fn meaning_warns_of_what_a_bench_cannot_do() {
         assert!(notes.iter().any(|said| said.contains(note)), "{note}: {notes:?}");
     }
     assert!(!notes.iter().any(|said| said.starts_with("red: the panel's stroke")));
+    let notes_at = |red_mw: &str| {
+        let text = changed(&[("power_mw = { red = 1.0", &format!("power_mw = {{ red = {red_mw}"))]);
+        Rig::parse(&text, Path::new("")).map(|rig| rig.meaning().notes)
+    };
+    let is_noted = |notes: &[String]| notes.iter().any(|said| said.starts_with("red: lit with 0.001 mW, as lasers"));
+    assert!(is_noted(&notes_at("0.0015").unwrap()) && !is_noted(&notes_at("0.001").unwrap()));
+    assert!(!notes_at("1.001").unwrap().iter().any(|said| said.contains("whole microwatts")));
+    let too_small = notes_at("0.0004").unwrap_err().to_string();
+    assert!(too_small.contains("0, or 0.001 mW at least: lasers are told whole microwatts"), "{too_small}");
 }
 
 #[test]

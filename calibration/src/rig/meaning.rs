@@ -414,6 +414,19 @@ fn notes(rig: &Rig) -> Vec<String> {
         if *power_mw == 0.0 {
             notes.push(format!("{colour}: the laser's power is 0, so this colour stays dark"));
         }
+        let told_mw = f64::from(Lasers::whole_uw(*power_mw)) / 1e3;
+        if told_mw < *power_mw * (1.0 - 1e-6) {
+            notes.push(format!("{colour}: lit with {told_mw} mW, as lasers are told whole microwatts"));
+        }
+    }
+    let slack = rig.panel.mode.window_slack(rig.panel.field_period());
+    let room = rig.panel.field_period() - rig.panel.settle - rig.lasers.on_delay - slack;
+    if rig.lasers.width > room {
+        notes.push(format!(
+            "lit_ms is cut to {:.3}: a window ends {:.3} ms before its field at least, for a panel that is a little fast",
+            room.0.max(0) as f64 / 1e6,
+            slack.0 as f64 / 1e6
+        ));
     }
     let unlimited = |colour: &Colour| rig.lasers.driver.has(*colour) && rig.lasers.power_limit_mw[*colour].is_none();
     let unlimited: Vec<&str> = Colour::ALL.into_iter().filter(unlimited).map(Colour::name).collect();

@@ -65,6 +65,12 @@ pub struct Provenance {
     pub laser_profile_file: Option<PathBuf>,
 }
 
+/// A panel's rate may be off the rig's by this share: beyond, its fields are not as long as the rig says.
+pub const RATE_TOLERANCE: f64 = 0.005;
+/// The report of a refresh may lie off the panel's rhythm by this much whatever the rig says: display controllers stamp
+/// to the microsecond, and rounding to whole scan lines is below it. So may the rhythm itself, as it was learned.
+pub const REPORT_TOLERANCE_MIN: TimeNs = TimeNs(20_000);
+
 /// The phase panel as a display.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Panel {
@@ -176,6 +182,12 @@ pub enum LaserDriver {
 impl Lasers {
     /// The greatest power that a rig may name, milliwatts at the panel.
     pub const POWER_MAX_MW: f64 = 500.0;
+
+    /// A power in the whole microwatts that lasers are told, never more than it is.
+    pub fn whole_uw(power_mw: f64) -> u32 {
+        // The product of a figure that is whole may be a little less.
+        (power_mw * 1e3 + 1e-6) as u32
+    }
 
     /// The power that no colour exceeds, milliwatts at the panel: the rig's limit, or what holds without one.
     pub fn greatest_power_mw(&self) -> PerColour<f64> {
@@ -347,6 +359,13 @@ impl PanelMode {
             Self::ChannelPacked => 3.0,
             Self::FieldSequential | Self::Monochrome(_) => 1.0,
         }
+    }
+
+    /// What a laser's window leaves free at the end of its field, which lasts `field_period`: what the fields may be
+    /// shorter than the rig's since the report that it follows, and what that report and the panel's rhythm may be off.
+    pub fn window_slack(self, field_period: TimeNs) -> TimeNs {
+        let drift_ns = self.fields_per_refresh() * field_period.0 as f64 * RATE_TOLERANCE;
+        TimeNs(drift_ns.ceil() as i64 + 2 * REPORT_TOLERANCE_MIN.0)
     }
 }
 

@@ -103,6 +103,8 @@ const DEPTH_DPT: Span = Span::new(0.0, 20.0, "dioptres");
 const DEPTH_RANGE_MIN_DPT: f64 = 0.1;
 const POWER: Span = Span::new(0.0, Lasers::POWER_MAX_MW, "mW").slips(POWER_SLIPS);
 const FULL_POWER: Span = Span::new(0.001, 4000.0, "mW").slips(POWER_SLIPS);
+/// Lasers are told whole microwatts: less than one is darkness.
+const POWER_LIT_MIN_MW: f64 = 0.001;
 const POWER_SLIPS: &[(&str, f64)] = &[("microwatts", 1e-3)];
 /// How many times below its limit a power still seems to be meant, where it would be that in another unit.
 const POWER_BELOW_LIMIT_MAX: f64 = 100.0;
@@ -226,6 +228,11 @@ impl FieldTiming {
     fn describe_field(&self) -> String {
         let mode = self.mode.name();
         format!("{} ms of one field ({} Hz, {mode})", shown(self.field_ms), self.refresh_hz)
+    }
+
+    /// What a window leaves free at the end of its field.
+    fn slack_ms(&self) -> f64 {
+        self.mode.window_slack(milliseconds(self.field_ms)).0 as f64 / 1e6
     }
 
     fn colour_frame_ms(&self) -> f64 {
@@ -573,6 +580,14 @@ fn read_lasers<'a>(
     let power_mw = reader.numbers(lasers, "power_mw", POWER, PerColour([true; 3]));
     let power_limit_mw = reader.numbers(lasers, "power_limit_mw", POWER, PerColour([false; 3]));
     for colour in Colour::ALL {
+        if let Some(power) = power_mw[colour].as_ref().filter(|power| Lasers::whole_uw(power.value) == 0)
+            && power.value > 0.0
+        {
+            let (found, key) = (format!("{} mW", power.value), format!("power_mw.{colour}"));
+            let expected = format!("0, or {POWER_LIT_MIN_MW} mW at least: lasers are told whole microwatts");
+            let advice = format!("write {POWER_LIT_MIN_MW} and put a filter before the laser, or 0 to keep it dark");
+            reader.fault_in(lasers, &key, power.line, &found, &expected, advice);
+        }
         if let (Some(power), Some(limit)) = (power_mw[colour], power_limit_mw[colour])
             && power.value > limit.value
         {
@@ -603,7 +618,8 @@ fn read_lasers<'a>(
     if let (Some(timing), Some(on_delay_ms), Some(lit_ms)) = (timing, on_delay_ms, lit_ms) {
         let before_ms = timing.settle_ms.value + on_delay_ms.value;
         let end_ms = before_ms + lit_ms.value;
-        if timing.settle_ms.value < timing.field_ms && end_ms > timing.field_ms {
+        let room_ms = timing.field_ms - timing.slack_ms() - before_ms;
+        if timing.settle_ms.value < timing.field_ms && (end_ms > timing.field_ms || room_ms < LIT.min) {
             let settle = shown(timing.settle_ms.value);
             let found = format!(
                 "settle {settle} + on_delay {} + lit {} = {} ms",
@@ -611,8 +627,8 @@ fn read_lasers<'a>(
                 shown(lit_ms.value),
                 shown(end_ms)
             );
-            let expected = format!("an end within the {}", timing.describe_field());
-            let room_ms = timing.field_ms - before_ms;
+            let slack = shown(timing.slack_ms());
+            let expected = format!("an end within the {}, {slack} ms before its own", timing.describe_field());
             let advice = if room_ms >= LIT.min {
                 format!("write lit_ms = {} at most", (room_ms * 1e3).floor() / 1e3)
             } else {

@@ -131,13 +131,15 @@ pub struct LaserProgram {
 pub enum LaserError {
     /// The field ends before its window begins.
     #[error(
-        "a field lasts {field_us} µs but its window begins {delay_us} µs after it: shorten panel.settle or lasers.on_delay, or lower panel.refresh"
+        "a field lasts {field_us} µs, but its window begins {delay_us} µs after it and ends {slack_us} µs before the next: shorten panel.settle_ms or lasers.on_delay_ms, or lower panel.refresh_hz"
     )]
     NoRoom {
         /// Length of a field, microseconds.
         field_us: i64,
         /// Settle time and on delay, microseconds.
         delay_us: i64,
+        /// What is left free at the field's end, microseconds.
+        slack_us: i64,
     },
     /// A laser figure of the rig that no box can take.
     #[error("lasers: {what} is {found}; expected {expected}: correct the rig file")]

@@ -8,7 +8,7 @@ use super::{LaserError, LaserProgram};
 
 /// The rig's power limits in microwatts, rounded down.
 pub(super) fn power_limit_uw(lasers: &Lasers) -> PerColour<u32> {
-    lasers.greatest_power_mw().map(|mw| (mw * 1e3 + 1e-6) as u32)
+    lasers.greatest_power_mw().map(Lasers::whole_uw)
 }
 
 /// Whether a box that is built for `limits` takes `program`.

@@ -1,17 +1,12 @@
 //! The lit window of each field.
 
-use holod_calibration::rig::{Lasers, Panel, PanelMode};
+use holod_calibration::rig::{Lasers, Panel, PanelMode, RATE_TOLERANCE, REPORT_TOLERANCE_MIN};
 use holod_calibration::{PerColour, TimeNs};
 
 use super::ShownField;
-use super::refreshes::PERIOD_TOLERANCE;
 use crate::fields::FIELDS;
 use crate::laser::{Capability, FieldWindow, LaserError, LaserProgram, LitWindow, Trigger};
 use crate::present::PanelTiming;
-
-/// A report may lie off the panel's rhythm by this much whatever the rig says: display controllers stamp to the
-/// microsecond, and rounding to whole scan lines is below it.
-const TOLERANCE_MIN: TimeNs = TimeNs(20_000);
 
 /// What a window's place on the panel depends on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -36,7 +31,7 @@ impl WindowClock {
 }
 
 /// Cuts a window out of each colour field: after the panel's settle time and the laser's on delay, and never past the
-/// field's end.
+/// field's end, also where the panel is as fast as it may be and its reports as late.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FieldGate {
     timing: PanelTiming,
@@ -48,10 +43,11 @@ pub struct FieldGate {
 }
 
 impl FieldGate {
-    /// The gate for one bench; a window that is longer than its field is cut at the field's end.
+    /// The gate for one bench; a window that is longer than its field has room for is cut
+    /// ([`PanelMode::window_slack`]).
     ///
     /// # Errors
-    /// [`LaserError::NoRoom`] where the window would begin after the field's end; [`LaserError::Figure`] for a
+    /// [`LaserError::NoRoom`] where the field has room for none; [`LaserError::Figure`] for a
     /// negative time or a width of 0.
     pub fn new(panel: &Panel, lasers: &Lasers) -> Result<Self, LaserError> {
         let timing = PanelTiming::new(panel);
@@ -66,10 +62,11 @@ impl FieldGate {
             return Err(LaserError::Figure { what: "width", found, expected: "more than 0" });
         }
         let delay = panel.settle + lasers.on_delay;
-        let room = timing.field_period - delay;
+        let slack = panel.mode.window_slack(timing.field_period);
+        let room = timing.field_period - delay - slack;
         if room <= TimeNs(0) {
-            let (field_us, delay_us) = (timing.field_period.0 / 1000, delay.0 / 1000);
-            return Err(LaserError::NoRoom { field_us, delay_us });
+            let [field_us, delay_us, slack_us] = [timing.field_period, delay, slack].map(|time| time.0 / 1000);
+            return Err(LaserError::NoRoom { field_us, delay_us, slack_us });
         }
         Ok(Self { timing, delay, width: lasers.width.min(room), settle: panel.settle })
     }
@@ -86,19 +83,19 @@ impl FieldGate {
     /// How far the reported time of a refresh may be wrong without light where it must not be.
     ///
     /// Where windows follow the reports that is half of the time that the rig leaves free at both ends of a window, on
-    /// delay and the rest of the field; the other half is for what the rhythm itself is off by. The windows of a whole
-    /// colour frame that follow one report leave less: the last field's start is off by what the panel's period may be
-    /// off the rig's, twice.
+    /// delay and the rest of the field; the other half is for what the rhythm itself is off by. What the panel's fields
+    /// may be longer or shorter than the rig's comes off before: at the end of a window that of its own field, and where
+    /// a whole colour frame follows one report, that of the fields before it at both ends.
     pub fn time_tolerance(&self, trigger: Trigger, clock: WindowClock) -> TimeNs {
         let fields_later = match (clock, trigger) {
             (WindowClock::Panel, _) => return TimeNs(self.timing.refresh_period.0 / 16),
             (WindowClock::Reports, Trigger::PanelSync) => FIELDS - 1,
             (WindowClock::Reports, Trigger::Host) => 0,
         };
-        let before = self.delay - self.settle;
-        let after = self.timing.field_period - self.delay - self.width;
-        let drift_ns = (self.timing.field_period.0 as f64 * PERIOD_TOLERANCE) as i64 * fields_later as i64;
-        TimeNs((before.min(after).0 - drift_ns) / 2).max(TOLERANCE_MIN)
+        let drift_ns = |fields: usize| (self.timing.field_period.0 as f64 * RATE_TOLERANCE) as i64 * fields as i64;
+        let before_ns = (self.delay - self.settle).0 - drift_ns(fields_later);
+        let after_ns = (self.timing.field_period - self.delay - self.width).0 - drift_ns(fields_later + 1);
+        TimeNs(before_ns.min(after_ns) / 2).max(REPORT_TOLERANCE_MIN)
     }
 
     /// Length of a window.
@@ -143,7 +140,7 @@ impl FieldGate {
                 let found = format!("{power_mw} mW");
                 return Err(LaserError::Figure { what: "power_mw", found, expected: "0 to 4000" });
             }
-            power_uw[colour] = (power_mw * 1e3).round() as u32;
+            power_uw[colour] = Lasers::whole_uw(power_mw);
         }
         if lasers.heartbeat_timeout <= TimeNs(0) {
             let found = format!("{} ns", lasers.heartbeat_timeout.0);
@@ -180,7 +177,8 @@ mod tests {
     fn windows_lie_after_settling_and_end_with_their_field() {
         let rig = Rig::default();
         let long = Lasers { width: TimeNs(50 * MS), ..rig.lasers.clone() };
-        for (lasers, t_off) in [(&rig.lasers, TimeNs(105_100_000)), (&long, TimeNs(105_555_556))] {
+        // Of the panel's 0.5 % in three fields 83.3 µs, and 20 µs each for a report and the rhythm.
+        for (lasers, t_off) in [(&rig.lasers, TimeNs(105_100_000)), (&long, TimeNs(105_432_222))] {
             let gate = FieldGate::new(&rig.panel, lasers).unwrap();
             let field = ShownField {
                 frame: None,
@@ -214,11 +212,47 @@ mod tests {
         // 0.5 % of two fields of 5.56 ms less.
         assert_eq!(tolerance(&roomy, Trigger::PanelSync, WindowClock::Reports), TimeNs(172_223));
         let tight = Lasers { on_delay: TimeNs(0), ..rig.lasers.clone() };
-        assert_eq!(tolerance(&tight, Trigger::PanelSync, WindowClock::Reports), TOLERANCE_MIN);
+        assert_eq!(tolerance(&tight, Trigger::PanelSync, WindowClock::Reports), REPORT_TOLERANCE_MIN);
         assert_eq!(
             tolerance(&tight, Trigger::PanelSync, WindowClock::Panel),
             TimeNs(rig.panel.field_period().0 * 3 / 16)
         );
+    }
+
+    /// The panel as fast as is believed, its report as late as is believed and the rhythm as far off: the last window
+    /// that follows the report ends with its field.
+    #[test]
+    fn the_longest_window_ends_with_its_field_on_the_fastest_panel_that_is_believed() {
+        for mode in [PanelMode::ChannelPacked, PanelMode::FieldSequential, PanelMode::Monochrome(Colour::Red)] {
+            for refresh_hz in [24.0, 60.0, 240.0] {
+                let rig = Rig::default();
+                let panel = Panel { mode, refresh_hz, settle: TimeNs(100_000), ..rig.panel };
+                let lasers = Lasers { width: TimeNs(50 * MS), on_delay: TimeNs(100_000), ..rig.lasers };
+                let gate = FieldGate::new(&panel, &lasers).unwrap();
+                let tolerance = gate.time_tolerance(FieldGate::trigger(&panel), WindowClock::Reports);
+                let field_ns = gate.timing().field_period.0;
+                let fields = if mode == PanelMode::ChannelPacked { 3 } else { 1 };
+                let t_end = fields as f64 * field_ns as f64 * (1.0 - RATE_TOLERANCE);
+                let t_off = (fields - 1) * field_ns + gate.delay.0 + gate.width.0 + 2 * tolerance.0;
+                assert!((t_off as f64) <= t_end + 4.0, "{mode:?} {refresh_hz} Hz: {t_off} {t_end}");
+            }
+        }
+    }
+
+    #[test]
+    fn powers_are_whole_microwatts_and_never_more_than_the_rig_says() {
+        let rig = Rig::default();
+        for (power_mw, power_uw) in [(1.001, 1001), (1.0006, 1000), (0.0015, 1), (0.1236, 123), (0.001, 1), (0.0, 0)] {
+            let lasers = Lasers {
+                power_mw: PerColour([power_mw; 3]),
+                power_limit_mw: PerColour([Some(power_mw); 3]),
+                ..rig.lasers.clone()
+            };
+            let gate = FieldGate::new(&rig.panel, &lasers).unwrap();
+            let program = gate.program(&rig.panel, &lasers).unwrap();
+            assert_eq!(program.power_uw, PerColour([power_uw; 3]), "{power_mw} mW");
+            assert_eq!(lasers.greatest_power_mw().map(Lasers::whole_uw), program.power_uw, "a limit takes itself");
+        }
     }
 
     #[test]
@@ -241,7 +275,7 @@ mod tests {
         let slow = Panel { settle: TimeNs(6 * MS), ..rig.panel.clone() };
         assert!(matches!(
             FieldGate::new(&slow, &rig.lasers),
-            Err(LaserError::NoRoom { field_us: 5555, delay_us: 6100 })
+            Err(LaserError::NoRoom { field_us: 5555, delay_us: 6100, slack_us: 123 })
         ));
         let backwards = Panel { settle: TimeNs(-1), ..rig.panel.clone() };
         assert!(matches!(

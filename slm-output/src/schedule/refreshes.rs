@@ -3,6 +3,7 @@
 use std::ops::RangeInclusive;
 
 use holod_calibration::TimeNs;
+use holod_calibration::rig::RATE_TOLERANCE;
 
 use super::gate::WindowClock;
 use crate::laser::DarkReason;
@@ -21,8 +22,8 @@ const PHASE_GAIN: f64 = 0.2;
 /// Share of an interval's error that moves the period.
 const PERIOD_GAIN: f64 = 0.02;
 /// A panel's period may be learned to differ from the nominal one by this share, and the intervals may on average lie
-/// off the learned one by as much: beyond, the fields are not as long as the rig says, and nothing is believed.
-pub(super) const PERIOD_TOLERANCE: f64 = 0.005;
+/// off the learned one by as much; beyond, nothing is believed.
+const PERIOD_TOLERANCE: f64 = RATE_TOLERANCE;
 /// Share of a new interval's error in their average.
 const BIAS_GAIN: f64 = 0.05;
 /// Share of a new interval in the rate that is shown to people.
