@@ -357,6 +357,10 @@ impl<D: PowerDevice> Worker<D> {
     fn run(mut self) {
         while !self.stop.load(Ordering::Acquire) {
             while let Ok((number, order)) = self.orders.pop() {
+                // What comes after it puts them out.
+                if matches!(order, Order::Lit(lit) if lit != NONE_LIT) && !self.orders.is_empty() {
+                    continue;
+                }
                 let done = self.obey(order);
                 self.report(number, done);
             }
@@ -483,5 +487,68 @@ impl Conversation {
             }
         }
         Ok(None)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+
+    use super::*;
+
+    /// A device that remembers what it was told, and ends its thread when it is put out.
+    struct Told(Arc<Mutex<Vec<PerColour<bool>>>>, Arc<AtomicBool>);
+
+    impl PowerDevice for Told {
+        fn has(&self, _colour: Colour) -> bool {
+            true
+        }
+
+        fn set_power(&mut self, _power_uw: PerColour<u32>) -> Result<(), LaserError> {
+            Ok(())
+        }
+
+        fn set_lit(&mut self, lit: PerColour<bool>) -> Result<(), LaserError> {
+            self.0.lock().unwrap().push(lit);
+            self.1.store(lit == NONE_LIT, Ordering::Release);
+            Ok(())
+        }
+
+        fn probe(&mut self, _asked: usize) -> Result<bool, LaserError> {
+            Ok(true)
+        }
+
+        fn dark_wait(&self) -> TimeNs {
+            TimeNs(0)
+        }
+    }
+
+    #[test]
+    fn an_order_to_light_that_one_for_darkness_follows_is_left_out() {
+        let (mut orders, order_consumer) = RingBuffer::new(RING);
+        let (report_producer, mut reports) = RingBuffer::new(RING);
+        let (told, stop) = (Arc::default(), Arc::new(AtomicBool::new(false)));
+        let all = PerColour([true; 3]);
+        for (number, lit) in [(1, all), (2, NONE_LIT), (3, all), (4, NONE_LIT)] {
+            orders.push((number, Order::Lit(lit))).unwrap();
+        }
+        let worker = Worker {
+            device: Told(Arc::clone(&told), Arc::clone(&stop)),
+            orders: order_consumer,
+            reports: report_producer,
+            t_heartbeat: Arc::new(AtomicI64::new(0)),
+            stop,
+            timeout: TimeNs(1_000_000_000),
+            maybe_lit: false,
+            t_probe: TimeNs(0),
+            asked: 0,
+            failed: false,
+            clock: || TimeNs(1),
+        };
+        worker.run();
+        let told = told.lock().unwrap();
+        assert!(!told.is_empty() && told.iter().all(|lit| *lit == NONE_LIT), "{told:?}");
+        let done: Vec<_> = std::iter::from_fn(|| reports.pop().ok()).collect();
+        assert!(matches!(done[..], [Report::Done(2), Report::Done(4)]), "{done:?}");
     }
 }
