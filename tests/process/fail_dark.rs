@@ -177,6 +177,14 @@ fn a_person_puts_the_lasers_out_though_the_control_thread_stands_still() {
     assert!(other.contains("is not known") && other.contains("`holod dark --config RIG` puts them out"), "{other}");
 }
 
+/// Neither a signal nor a limit would be obeyed, and none has to come.
+#[test]
+fn lasers_go_dark_where_the_control_thread_stands_still() {
+    let (dark_ms, reason) = dark_after("control thread stands still", true, Cause::Inside("stall-control"));
+    assert_eq!(reason, "unattended");
+    assert!((4900.0..5000.0 + BUSY_MS).contains(&dark_ms), "after {dark_ms} ms");
+}
+
 #[test]
 fn canary_light_in_the_dark_is_noticed() {
     let judged = |lines: &str| light_in_the_dark(&read_log(&format!("{LOG_HEADER}\n{lines}")).unwrap()).is_some();

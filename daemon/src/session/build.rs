@@ -133,6 +133,7 @@ pub(super) fn build(
     let output = progress::during("opening panel and lasers", || {
         scheduling::prompt(|| open_output(&plan, &encoder, options)).map_err(Failure::because(Exit::Unavailable))
     })?;
+    output.control.attend();
     signals.end_after_lasers(&rig.lasers.driver);
     tracing::debug!("panel `{}` is open; lasers by {:?}", plan.output, rig.lasers.driver);
     output

@@ -167,6 +167,7 @@ impl Watch<'_> {
         let mut ticks = 0_u32;
         loop {
             std::thread::sleep(TICK);
+            output.attend();
             let now = host_now();
             self.drain()?;
             if self.obey(output)? {

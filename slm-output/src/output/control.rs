@@ -67,6 +67,12 @@ impl OutputControl {
         self.switch.clone()
     }
 
+    /// The control goes on: signals and limits are looked at. From the first call on lasers are kept dark, as
+    /// [`DarkReason::Unattended`], while the last one is 5 s ago or more. The waits of [`Self::keep_dark`] count as calls.
+    pub fn attend(&self) {
+        self.switch.shared.t_attended_ns.store((self.clock)().0, Ordering::Release);
+    }
+
     /// Keeps the lasers dark for the reason `why` until this is taken back with none; then they are lit again by the
     /// rules. Waits for the box, two seconds or as long as its lasers may take, four at most; whether it has
     /// acknowledged. They are kept dark also where it has not.
@@ -94,6 +100,9 @@ impl OutputControl {
             }
             if (self.clock)() > t_end {
                 return false;
+            }
+            if self.switch.shared.t_attended_ns.load(Ordering::Acquire) != 0 {
+                self.attend();
             }
             std::thread::sleep(Duration::from_micros(500));
         }

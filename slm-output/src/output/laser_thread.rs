@@ -27,6 +27,10 @@ pub(super) struct LaserThread {
     pub(super) faults: Producer<LaserError>,
     /// The number of the last of the requests for darkness, or to take it back.
     pub(super) dark_request: u64,
+    /// Why it asks for darkness, where it does.
+    pub(super) asked: Option<DarkReason>,
+    /// Nobody has been at the control for too long.
+    pub(super) is_unattended: bool,
     /// A box that failed is left alone until then.
     pub(super) t_retry: TimeNs,
     /// The box failed and may have lost its program.
@@ -83,15 +87,24 @@ impl LaserThread {
         now
     }
 
-    /// Obeys those who want darkness, for good or until they take it back.
+    /// Obeys those who want darkness, for good or until they take it back, and keeps to it while nobody could ask for it.
     fn heed(&mut self, now: TimeNs) {
         if let Some(reason) = self.shared.latched() {
             self.latch(reason, now);
         }
         let (request, why) = dark_request_parts(self.shared.dark_request.load(Ordering::Acquire));
-        if request != std::mem::replace(&mut self.dark_request, request) {
-            let orders = self.scheduler.hold(why);
-            let answer = self.darkness(orders, now);
+        let is_new = request != self.dark_request;
+        let is_unattended = !self.shared.is_attended(now);
+        if !is_new && is_unattended == self.is_unattended {
+            return;
+        }
+        if is_new {
+            (self.dark_request, self.asked) = (request, why);
+        }
+        self.is_unattended = is_unattended;
+        let orders = self.scheduler.hold(self.asked.or(is_unattended.then_some(DarkReason::Unattended)));
+        let answer = self.darkness(orders, now);
+        if is_new {
             self.shared.dark_answer.store(request << 2 | u64::from(answer), Ordering::Release);
         }
     }

@@ -158,6 +158,8 @@ impl Output {
             t_retry: TimeNs(i64::MIN),
             program_lost: false,
             dark_request: 0,
+            asked: None,
+            is_unattended: false,
             shared: Arc::clone(&shared),
             clock,
         };

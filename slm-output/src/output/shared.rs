@@ -1,8 +1,13 @@
 //! What the output's threads share: orders, acknowledgements and counters, all of them atomic.
 
-use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU8, AtomicU64, Ordering};
+
+use holod_calibration::TimeNs;
 
 use crate::laser::DarkReason;
+
+/// How long the control of the output may not be heard of before lasers are kept dark. It does not wait for so long.
+const UNATTENDED_AFTER: TimeNs = TimeNs(5_000_000_000);
 
 /// Counters of the output's threads.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -45,6 +50,8 @@ pub(super) struct Shared {
     pub(super) dark_request: AtomicU64,
     /// The number of the request that has been obeyed, and the box's answer in the two lowest bits.
     pub(super) dark_answer: AtomicU64,
+    /// When the control of the output was last there; 0 until it has first said so.
+    pub(super) t_attended_ns: AtomicI64,
     /// Panics whose messages have not been written yet.
     pub(super) panics: AtomicU64,
     pub(super) flat_wanted: AtomicBool,
@@ -79,6 +86,12 @@ impl Shared {
             panel_lost: self.panel_lost.load(Ordering::Relaxed),
             armed: self.armed.load(Ordering::Relaxed),
         }
+    }
+
+    /// Whether signals and limits that ask for darkness find somebody who obeys them, where anybody has said that he does.
+    pub(super) fn is_attended(&self, now: TimeNs) -> bool {
+        let t_attended_ns = self.t_attended_ns.load(Ordering::Acquire);
+        t_attended_ns == 0 || now.0 - t_attended_ns <= UNATTENDED_AFTER.0
     }
 
     pub(super) fn latched(&self) -> Option<DarkReason> {

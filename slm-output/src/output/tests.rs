@@ -96,6 +96,8 @@ impl Bench {
             t_retry: TimeNs(i64::MIN),
             program_lost: false,
             dark_request: 0,
+            asked: None,
+            is_unattended: false,
             shared: Arc::default(),
             clock: || TimeNs(0),
         };
@@ -261,6 +263,31 @@ fn lasers_that_are_kept_dark_stay_so_until_that_is_taken_back() {
         bench.run(TimeNs(900 * MS), TimeNs(0));
         assert!(bench.edges.len() > edges + 10, "lit again by the rules");
         assert_eq!(bench.verdict().unsafe_findings().collect::<Vec<_>>(), Vec::<&Finding>::new());
+    }
+}
+
+#[test]
+fn lasers_are_dark_while_nobody_is_at_the_control_who_was() {
+    for (mode, asked) in MODES.into_iter().zip([None, Some(DarkReason::Asked)]) {
+        let mut bench = Bench::new(mode);
+        let attend = |bench: &Bench| bench.laser.shared.t_attended_ns.store(bench.now.0, Ordering::Release);
+        bench.run(TimeNs(7000 * MS), TimeNs(0));
+        assert!(bench.edges.last().unwrap().t > TimeNs(6900 * MS), "nobody has said that he is there");
+        attend(&bench);
+        bench.run(TimeNs(11_900 * MS), TimeNs(0));
+        assert_eq!(bench.darks, []);
+        bench.run(TimeNs(14_000 * MS), TimeNs(0));
+        let &[(t_dark, DarkReason::Unattended)] = bench.darks.as_slice() else { panic!("{:?}", bench.darks) };
+        assert!(t_dark < TimeNs(12_050 * MS) && bench.edges.last().unwrap().t <= t_dark, "{t_dark:?}");
+        assert_eq!(bench.all_events.last().unwrap().dark, Some(DarkReason::Unattended));
+        // Whoever comes back lights nothing against a person's order of meanwhile.
+        bench.laser.shared.dark_request.store(dark_because(NEXT, asked), Ordering::Release);
+        bench.run(TimeNs(14_100 * MS), TimeNs(0));
+        attend(&bench);
+        bench.run(TimeNs(15_000 * MS), TimeNs(0));
+        let is_lit = bench.edges.last().unwrap().t > TimeNs(14_900 * MS);
+        assert_eq!(is_lit, asked.is_none());
+        assert_eq!(bench.all_events.last().unwrap().dark, asked);
     }
 }
 
