@@ -78,8 +78,11 @@ impl LaserThread {
             }
         }
         let now = clock();
-        let orders = self.scheduler.watch(now);
-        self.obey(orders, now);
+        // Reports that wait are not missing.
+        if self.news.is_empty() {
+            let orders = self.scheduler.watch(now);
+            self.obey(orders, now);
+        }
         self.poll(now);
         self.shared.armed.store(self.scheduler.is_armed(), Ordering::Relaxed);
         self.shared.refresh_millihz.store((self.scheduler.refresh_hz() * 1e3).round() as u64, Ordering::Relaxed);

@@ -474,6 +474,7 @@ struct Slow {
     /// When somebody orders darkness, and what.
     t_order: TimeNs,
     order: fn(&Shared),
+    armed: Arc<AtomicU64>,
     armed_after_order: Arc<AtomicU64>,
 }
 
@@ -497,6 +498,7 @@ impl LaserBox for Slow {
         self.inner.program(program, now)
     }
     fn arm(&mut self, _now: TimeNs) -> Result<(), LaserError> {
+        self.armed.fetch_add(1, Ordering::Relaxed);
         if self.now.load(Ordering::Relaxed) > self.t_order.0 {
             self.armed_after_order.fetch_add(1, Ordering::Relaxed);
         }
@@ -522,10 +524,12 @@ impl LaserBox for Slow {
 }
 
 #[test]
-fn a_box_that_answers_more_slowly_than_refreshes_come_is_not_armed_against_an_order() {
-    let orders: [fn(&Shared); 2] = [
+fn a_box_that_answers_more_slowly_than_refreshes_come_is_armed_once_and_not_against_an_order() {
+    // The last one comes too late.
+    let orders: [fn(&Shared); 3] = [
         |shared| shared.dark_request.store(dark_because(NEXT, Some(DarkReason::Asked)), Ordering::Release),
         |shared| shared.latch.store(1, Ordering::Release),
+        |_| unreachable!(),
     ];
     for there_and_back_ms in [4, 12, 20, 40, 180] {
         for (index, order) in orders.into_iter().enumerate() {
@@ -537,7 +541,8 @@ fn a_box_that_answers_more_slowly_than_refreshes_come_is_not_armed_against_an_or
             let now = Arc::new(AtomicI64::new(0));
             let armed_after_order = Arc::new(AtomicU64::new(0));
             // While the first ARM is waited for.
-            let t_order = T_FIRST + TimeNs(8 * field_period.0 + 3 * MS);
+            let t_order = if index == 2 { TimeNs(i64::MAX) } else { T_FIRST + TimeNs(8 * field_period.0 + 3 * MS) };
+            let armed = Arc::new(AtomicU64::new(0));
             let mut inner = SimulatedLaser::new(TimeNs(0));
             inner.program(&bench.laser.program, TimeNs(0)).unwrap();
             bench.laser.laser = Box::new(Slow {
@@ -548,17 +553,16 @@ fn a_box_that_answers_more_slowly_than_refreshes_come_is_not_armed_against_an_or
                 shared: Arc::clone(&bench.laser.shared),
                 t_order,
                 order,
+                armed: Arc::clone(&armed),
                 armed_after_order: Arc::clone(&armed_after_order),
             });
             let obeyed = |shared: &Shared| {
-                let [asked, latched] = [
-                    shared.dark_answer.load(Ordering::Acquire) != 0,
-                    shared.acknowledged.load(Ordering::Acquire) != NOT_YET,
-                ];
-                [asked, latched][index]
+                let asked = shared.dark_answer.load(Ordering::Acquire) != 0;
+                [asked, shared.acknowledged.load(Ordering::Acquire) != NOT_YET, false][index]
             };
             let mut t_obeyed = None;
-            while now.load(Ordering::Relaxed) < Reporter::T_END.0 {
+            // At the end of the reports it goes dark.
+            while now.load(Ordering::Relaxed) < Reporter::T_END.0 - 10 * MS {
                 let t = TimeNs(now.fetch_add(MS, Ordering::Relaxed) + MS);
                 reporter.lock().unwrap().report(t);
                 bench.laser.step(|| TimeNs(now.load(Ordering::Relaxed)));
@@ -567,7 +571,11 @@ fn a_box_that_answers_more_slowly_than_refreshes_come_is_not_armed_against_an_or
                 }
             }
             let case = format!("{there_and_back_ms} ms there and back");
+            assert_eq!(armed.load(Ordering::Relaxed), 1, "{case}");
             assert_eq!(armed_after_order.load(Ordering::Relaxed), 0, "{case}");
+            if index == 2 {
+                continue;
+            }
             let took = t_obeyed.expect("obeyed") - t_order;
             assert!(took <= TimeNs((2 * there_and_back_ms + 2) * MS), "{case}: {took:?}");
         }
