@@ -153,7 +153,8 @@ impl FieldScheduler {
             let t_begin = window.t_on.max(now);
             let left = window.t_off - t_begin;
             let taken = self.balance.take(shown.field, left);
-            window.t_off = t_begin + taken;
+            // What is cut off is its beginning, which a box that hears of it late would miss anyway.
+            window.t_on = window.t_off - taken;
             if taken == TimeNs(0) {
                 orders.light = None;
                 dark = Some(if left < LIGHT_MIN { DarkReason::Late } else { DarkReason::Balance });
