@@ -77,7 +77,7 @@ pub use source::SourceError;
 pub use source::commands::CommandError;
 pub use source::hid::{HidDeviceInfo, HidError, RULE_FILE, hid_devices, udev_rule};
 pub use source::serial::identity::{SerialPortInfo, UsbPort, serial_ports};
-pub use source::serial::{SerialError, serial_port_warnings};
+pub use source::serial::{SerialError, adapter_delay_warning, serial_port_warnings};
 pub use source::server::ServerError;
 pub use source::tcp::NetworkError;
 pub use spec::{HostPort, ReplaySpeed, SpecError, TrackerSpec};

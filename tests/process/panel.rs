@@ -74,6 +74,16 @@ fn a_panel_a_little_off_its_rate_is_lit_and_one_whose_reports_scatter_is_not_whi
     }
 }
 
+/// As those of a compositor may be: each field's report comes when it has gone by.
+#[test]
+fn a_panel_whose_reports_all_come_too_late_stays_dark_which_is_said_and_counted() {
+    let (ended, summary) = run_over("headless:late=1", true, "8s");
+    assert_eq!(count(&summary, "lit"), 0, "{summary:#}");
+    assert_eq!(ended.stderr.matches("no field is lit: late (").count(), 1, "{}", ended.stderr);
+    assert!(ended.stderr.contains("dark: tracker up"), "it is not said to be running: {}", ended.stderr);
+    assert!(summary["lasers"]["dark_by_reason"]["late"].as_u64() > Some(300), "{summary:#}");
+}
+
 #[test]
 fn lying_reports_cost_light_and_nothing_else() {
     let lies = "headless:jitter=20us,early=0.01,doubled=0.01,dropped=0.01,late=0.01,seed=3";

@@ -4,10 +4,11 @@ use std::sync::atomic::{AtomicBool, AtomicU64};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
 
+use holod_calibration::rig::LaserDriver;
 use holod_calibration::{PupilDiameter, TimeNs};
 use holod_model::RgbdFrame;
 use holod_model::engine::EngineError;
-use holod_pupil_input::{ReplaySpeed, Tracker, TrackerHandle, TrackerOptions, TrackerSpec};
+use holod_pupil_input::{ReplaySpeed, Tracker, TrackerHandle, TrackerOptions, TrackerSpec, adapter_delay_warning};
 use holod_slm_output::laser::open_laser;
 use holod_slm_output::output::{OutputError, pacing_config};
 use holod_slm_output::present::{PanelSetup, open_panel};
@@ -134,6 +135,11 @@ pub(super) fn build(
         scheduling::prompt(|| open_output(&plan, &encoder, options)).map_err(Failure::because(Exit::Unavailable))
     })?;
     output.control.attend();
+    if let LaserDriver::Serial { path, .. } = &rig.lasers.driver
+        && let Some(warning) = adapter_delay_warning("laser", path)
+    {
+        tracing::warn!("{warning}");
+    }
     signals.end_after_lasers(&rig.lasers.driver);
     tracing::debug!("panel `{}` is open; lasers by {:?}", plan.output, rig.lasers.driver);
     output

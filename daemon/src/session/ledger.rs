@@ -1,6 +1,6 @@
 //! Running judgement of the lasers against the fields that were shown.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 
 use holod_calibration::TimeNs;
 use holod_slm_output::FieldEvent;
@@ -29,6 +29,8 @@ pub struct LaserSummary {
     pub not_told: u64,
     /// Windows of which the box heard too late for their beginning, and that it lit in part.
     pub lit_in_part: u64,
+    /// Fields that stayed dark, by reason.
+    pub dark_by_reason: BTreeMap<&'static str, u64>,
     /// Light where there must be none.
     pub unsafe_findings: usize,
     /// Everything that was not as it should be.
@@ -52,9 +54,13 @@ pub(super) struct LaserLedger {
 impl LaserLedger {
     /// A field is over.
     pub(super) fn field(&mut self, event: &FieldEvent) {
-        if event.laser_on.is_none() && event.dark.is_none() {
-            self.summary.not_told += 1;
-            return;
+        match event.dark.filter(|_| event.laser_on.is_none()) {
+            Some(reason) => *self.summary.dark_by_reason.entry(reason.name()).or_default() += 1,
+            None if event.laser_on.is_none() => {
+                self.summary.not_told += 1;
+                return;
+            }
+            None => {}
         }
         self.fields.push_back(event.span());
         if self.fields.len() >= 2 * WAITING_FIELDS {
@@ -172,6 +178,7 @@ mod tests {
         }
         let summary = ledger.finish();
         assert_eq!((summary.fields, summary.lit, summary.dark, summary.not_told), (3, 0, 3, 27));
+        assert_eq!(summary.dark_by_reason, BTreeMap::from([("sync-lost", 3)]));
         assert_eq!(summary.findings, Vec::<String>::new());
     }
 

@@ -10,8 +10,8 @@ use holod_slm_output::present::{PanelFault, TimestampSource};
 const RATE_TOLERANCE: f64 = 0.005;
 /// How long the panel's rate is watched before it is judged.
 const RATE_WATCHED: TimeNs = TimeNs(1_000_000_000);
-/// How long no report may be believed before that is said.
-const UNBELIEVED: TimeNs = TimeNs(3_000_000_000);
+/// Fields are judged together that came within so long.
+const JUDGED: TimeNs = TimeNs(3_000_000_000);
 /// At most one line in this time says that lasers went dark: lasers that flicker must not flood the log.
 const DARK_EVERY: TimeNs = TimeNs(1_000_000_000);
 
@@ -23,9 +23,11 @@ pub(super) struct OutputWatch {
     lost: Option<PanelFault>,
     /// Since when the rate has been off, and whether that has been said.
     off_rate: Option<(TimeNs, bool)>,
-    /// Since when fields have been dark for nothing but reports that are not believed.
-    unbelieved_since: Option<TimeNs>,
-    has_said_unbelieved: bool,
+    fields: FieldsSeen,
+    /// Why most fields were dark that were judged last, where they were, and whether all of them.
+    trouble: Option<(DarkReason, bool)>,
+    /// Of what that has been said.
+    said: Vec<DarkReason>,
     t_next_dark_line: TimeNs,
 }
 
@@ -36,8 +38,9 @@ impl OutputWatch {
             nominal_hz,
             lost: None,
             off_rate: None,
-            unbelieved_since: None,
-            has_said_unbelieved: false,
+            fields: FieldsSeen::default(),
+            trouble: None,
+            said: Vec::new(),
             t_next_dark_line: TimeNs(i64::MIN),
         }
     }
@@ -53,12 +56,14 @@ impl OutputWatch {
             match event {
                 PanelEvent::Lost { fault, .. } => {
                     tracing::error!("the panel is lost, lasers dark: {fault}");
+                    (self.fields, self.trouble) = (FieldsSeen::default(), None);
                     self.lost = Some(fault);
                 }
                 PanelEvent::Back { .. } => {
                     tracing::info!("the panel is back");
                     self.lost = None;
-                    (self.off_rate, self.unbelieved_since, self.has_said_unbelieved) = (None, None, false);
+                    self.off_rate = None;
+                    self.said.clear();
                 }
             }
         }
@@ -83,29 +88,42 @@ impl OutputWatch {
         }
     }
 
-    /// Warns once, until the panel is lost and back, where reports of a panel of the rig's rate are not believed.
-    pub(super) fn judge_reports(&mut self, field: &FieldEvent) {
-        if field.dark != Some(DarkReason::Untrusted) {
-            self.unbelieved_since = None;
-            return;
+    /// Takes note of a field that is over. What to say, once until the panel is lost and back, where most fields stay
+    /// dark for a reason that nobody asked for.
+    pub(super) fn judge_field(&mut self, field: &FieldEvent) -> Option<String> {
+        let since = *self.fields.since.get_or_insert(field.t_present);
+        self.fields.note(field);
+        if field.t_present - since < JUDGED {
+            return None;
         }
-        let since = *self.unbelieved_since.get_or_insert(field.t_present);
-        if self.has_said_unbelieved || self.off_rate.is_some() || field.t_present - since < UNBELIEVED {
-            return;
+        let seen = std::mem::take(&mut self.fields);
+        self.trouble = seen.trouble();
+        let (reason, is_all) = self.trouble?;
+        // What is said of the rate explains that.
+        if reason == DarkReason::Untrusted && self.off_rate.is_some() || self.said.contains(&reason) {
+            return None;
         }
-        self.has_said_unbelieved = true;
-        let why = match field.provenance {
-            TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External => {
-                "their times scatter by more than the rig leaves room for; a longer lasers.on_delay_ms and a shorter \
-                 lit_ms leave more, and a wire from the panel's sync output to the laser box (lasers.sync_wire) needs \
-                 none"
+        self.said.push(reason);
+        Some(match reason {
+            DarkReason::Untrusted if is_all => {
+                let why = why_unbelieved(field.provenance);
+                format!("no report of the panel's refreshes is believed, so lasers stay dark: {why}")
             }
-            TimestampSource::Software | TimestampSource::Estimated => {
-                "their times are software's, not the display's, or scatter; `holod check` says what an output is good \
-                 for"
+            DarkReason::Untrusted => {
+                let why = why_unbelieved(field.provenance);
+                format!("few reports of the panel's refreshes are believed, so lasers flicker: {why}")
             }
-        };
-        tracing::warn!("no report of the panel's refreshes is believed, so lasers stay dark: {why}");
+            reason => {
+                let fields = if is_all { "no field is lit" } else { "few fields are lit" };
+                format!("{fields}: {reason} ({}){}", reason.meaning(), cure(reason))
+            }
+        })
+    }
+
+    /// Why no field is lit though lasers may be, where that is so.
+    pub(super) fn unlit(&self) -> Option<String> {
+        let (reason, _) = self.trouble.filter(|(_, is_all)| *is_all)?;
+        Some(format!("no field is lit: {reason} ({})", reason.meaning()))
     }
 
     /// The laser box went dark.
@@ -113,6 +131,146 @@ impl OutputWatch {
         if t >= self.t_next_dark_line {
             tracing::info!("lasers dark: {reason} ({})", reason.meaning());
             self.t_next_dark_line = t + DARK_EVERY;
+        }
+    }
+}
+
+/// What became of the fields of some seconds.
+#[derive(Default)]
+struct FieldsSeen {
+    since: Option<TimeNs>,
+    fields: usize,
+    lit: usize,
+    dark: [usize; DarkReason::ALL.len()],
+}
+
+impl FieldsSeen {
+    fn note(&mut self, field: &FieldEvent) {
+        self.fields += 1;
+        match field.dark.filter(|_| field.laser_on.is_none()) {
+            Some(reason) => self.dark[reason as usize] += 1,
+            // Lasers that tell no edges among them.
+            None => self.lit += 1,
+        }
+    }
+
+    /// The commonest of the reasons for which more than half of the fields were dark; whether all fields were dark.
+    fn trouble(&self) -> Option<(DarkReason, bool)> {
+        // The other reasons are what somebody asked for, or are told elsewhere.
+        const TROUBLE: [DarkReason; 8] = [
+            DarkReason::Untrusted,
+            DarkReason::Late,
+            DarkReason::ClockUnsure,
+            DarkReason::MissingReport,
+            DarkReason::WrongColour,
+            DarkReason::Heartbeat,
+            DarkReason::SyncLost,
+            DarkReason::SyncRate,
+        ];
+        let of = |reason: DarkReason| self.dark[reason as usize];
+        // A colour waits for the others only where those are dark.
+        let dark: usize = TROUBLE.into_iter().chain([DarkReason::Balance]).map(of).sum();
+        let commonest = TROUBLE.into_iter().max_by_key(|reason| of(*reason)).filter(|reason| of(*reason) > 0)?;
+        (2 * dark > self.fields).then_some((commonest, self.lit == 0))
+    }
+}
+
+const fn why_unbelieved(provenance: TimestampSource) -> &'static str {
+    match provenance {
+        TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External => {
+            "their times scatter by more than the rig leaves room for; a longer lasers.on_delay_ms and a shorter lit_ms \
+             leave more, and a wire from the panel's sync output to the laser box (lasers.sync_wire) needs none"
+        }
+        TimestampSource::Software | TimestampSource::Estimated => {
+            "their times are software's, not the display's, or scatter; `holod check` says what an output is good for"
+        }
+    }
+}
+
+/// What helps against it, as the end of a sentence.
+const fn cure(reason: DarkReason) -> &'static str {
+    match reason {
+        DarkReason::ClockUnsure => {
+            "; the line to the laser box takes too long there and back, which `holod check` measures: USB CDC, or an \
+             adapter whose latency_timer is 1 (deploy/udev/60-holod-latency.rules), or in channel-packed mode a wire \
+             from the panel's sync output to the box (lasers.sync_wire)"
+        }
+        DarkReason::Late => {
+            "; `holod check` measures the line; a compositor may report its refreshes one later (--output \
+             drm:CONNECTOR does not), and a longer lit_ms leaves more time"
+        }
+        _ => "",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use holod_calibration::Colour;
+
+    use super::*;
+
+    fn watch() -> OutputWatch {
+        OutputWatch::new(rtrb::RingBuffer::new(1).1, 60.0)
+    }
+
+    /// What is said of the fields of a minute, 180 a second, each dark as `dark` says of its number.
+    fn said(watch: &mut OutputWatch, minute: i64, dark: impl Fn(i64) -> Option<DarkReason>) -> Vec<String> {
+        let fields = (60 * 180 * minute..60 * 180 * (minute + 1)).filter_map(|index| {
+            let t_present = TimeNs(index * 5_555_556);
+            let dark = dark(index);
+            watch.judge_field(&FieldEvent {
+                frame_id: index as u64 / 3,
+                field: index as usize % 3,
+                colour: Colour::ALL[index as usize % 3],
+                t_submit: TimeNs(0),
+                t_desired_present: TimeNs(0),
+                t_present,
+                t_settled: t_present,
+                t_end: t_present,
+                provenance: TimestampSource::Hardware,
+                laser_on: dark.is_none().then_some(t_present),
+                laser_off: dark.is_none().then_some(t_present),
+                dark,
+                repeated: false,
+                deadline_missed: false,
+            })
+        });
+        fields.collect()
+    }
+
+    #[test]
+    fn fields_that_stay_dark_are_told_once_by_the_commonest_reason() {
+        for (reason, words) in [
+            (DarkReason::ClockUnsure, "no field is lit: clock-unsure (how the box's clock"),
+            (DarkReason::Late, "no field is lit: late (the report of a field, or the order"),
+            (DarkReason::Untrusted, "no report of the panel's refreshes is believed, so lasers stay dark: their times"),
+        ] {
+            let mut watch = watch();
+            let told = said(&mut watch, 0, |index| Some(if index % 3 == 0 { DarkReason::Balance } else { reason }));
+            assert!(matches!(&told[..], [told] if told.starts_with(words)), "{told:?}");
+            assert!(watch.unlit().unwrap().starts_with(&format!("no field is lit: {reason} (")));
+            assert_eq!(said(&mut watch, 1, |_| None), [""; 0]);
+            assert_eq!(watch.unlit(), None);
+        }
+    }
+
+    #[test]
+    fn lasers_that_flicker_are_told_and_some_dark_fields_are_not() {
+        // As of reports that scatter just at the tolerance: one field in five is lit, at times.
+        let flickers = |index: i64| (index % 50 >= 10).then_some(DarkReason::Untrusted);
+        let mut watch = watch();
+        let told = said(&mut watch, 0, flickers);
+        assert!(matches!(&told[..], [told] if told.starts_with("few reports of the panel's refreshes")), "{told:?}");
+        assert_eq!(watch.unlit(), None);
+        assert_eq!(said(&mut watch, 1, |index| (index % 50 >= 30).then_some(DarkReason::Late)), [""; 0]);
+    }
+
+    #[test]
+    fn darkness_that_was_asked_for_is_no_trouble() {
+        for reason in [DarkReason::Asked, DarkReason::NoPicture, DarkReason::ByHand, DarkReason::Stall] {
+            let mut watch = watch();
+            assert_eq!(said(&mut watch, 0, |_| Some(reason)), [""; 0]);
+            assert_eq!(watch.unlit(), None);
         }
     }
 }

@@ -293,7 +293,9 @@ impl Watch<'_> {
         }
         self.panel.drain();
         for event in fields_over.drain(..) {
-            self.panel.judge_reports(&event);
+            if let Some(warning) = self.panel.judge_field(&event) {
+                tracing::warn!("{warning}");
+            }
             if let Some(light) = self.tally.field(&event) {
                 self.observer.first_light(&light);
             }
@@ -332,7 +334,7 @@ impl Watch<'_> {
 
     /// Says how the run is, where that has changed; whether it has.
     fn tell_state(&mut self, output: &OutputCounts, now: TimeNs) -> bool {
-        let lit = output.armed && self.tally.frames_shown > 0;
+        let lit = output.armed && self.tally.frames_shown > 0 && self.panel.unlit().is_none();
         let link = self.tracker.link();
         let is_fixed = self.tally.newest_state == FIXED_PUPIL;
         let follows =
@@ -411,7 +413,7 @@ impl Watch<'_> {
             panel: self.names.panel.clone(),
             panel_trouble: self.panel.lost().map(|fault| fault.to_string()),
             lasers: if output.armed { "armed" } else { "dark" }.to_owned(),
-            lasers_trouble: self.laser_box.trouble().map(str::to_owned),
+            lasers_trouble: self.laser_box.trouble().map(str::to_owned).or_else(|| self.panel.unlit()),
             feed_trouble: self.feed_trouble(),
             figures: self.figures(output, now),
         }

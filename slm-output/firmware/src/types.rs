@@ -197,8 +197,8 @@ macro_rules! dark_reasons {
 dark_reasons! {
     Boot, "boot", "the box has just booted or reset itself";
     Heartbeat, "heartbeat", "the box heard nothing from holod for its timeout";
-    SyncLost, "sync-lost", "the box saw no sync from the panel for two refreshes: check the sync cable";
-    SyncRate, "sync-rate", "sync came much earlier than the panel's rate allows: check the sync cable and the panel's mode";
+    SyncLost, "sync-lost", "the box heard of no colour frame's start for two of them: check the sync cable where there is one; else the machine, the panel's reports or the line to the box are late";
+    SyncRate, "sync-rate", "a colour frame began much earlier than the panel's rate allows: check the panel's mode, and the sync cable where there is one";
     Interlock, "interlock", "the box's interlock is open";
     Line, "line", "the box was sent a line that it does not understand: check the cable";
     HangUp, "hang-up", "the line to the box was closed";

@@ -1,7 +1,7 @@
 //! Whether levels get to the panel as they are, and light from the right box.
 
-use holod_calibration::rig::{LaserDriver, Rig};
-use holod_pupil_input::host_now;
+use holod_calibration::rig::{LaserDriver, PanelMode, Rig};
+use holod_pupil_input::{adapter_delay_warning, host_now};
 use holod_slm_output::laser::{BoxReport, LaserError, SerialBox, open_laser, takes};
 use holod_slm_output::present::drm::Verdict;
 use holod_slm_output::present::{PanelSetup, open_panel};
@@ -44,7 +44,12 @@ pub(super) fn lasers(rig: &Rig) -> Vec<Check> {
             Ok(found) => {
                 let says = format!("{}: {}", path.display(), found.name);
                 match can_do(rig, Some(&found)) {
-                    Ok(()) => check(true, format!("{says}, dark, interlock closed")),
+                    Ok(()) => match unsure(rig, found.clock_error_ns, found.limits.jitter_us) {
+                        Some((some_is_left, unsure)) => {
+                            check(some_is_left, format!("{says}, dark, interlock closed; {unsure}"))
+                        }
+                        None => check(true, format!("{says}, dark, interlock closed")),
+                    },
                     Err(error) => check(false, format!("{says}: {error}")),
                 }
             }
@@ -68,6 +73,28 @@ pub(super) fn lasers(rig: &Rig) -> Vec<Check> {
 fn can_do(rig: &Rig, found: Option<&BoxReport>) -> Result<(), LaserError> {
     let program = FieldGate::new(&rig.panel, &rig.lasers)?.program(&rig.panel, &rig.lasers)?;
     takes(&rig.lasers, &program, found)
+}
+
+/// Where most of each window is cut off for what is not known of the box's clock over its line: whether something is
+/// left, and what helps.
+fn unsure(rig: &Rig, clock_error_ns: i64, jitter_us: u32) -> Option<(bool, String)> {
+    let LaserDriver::Serial { path, sync_wire: false } = &rig.lasers.driver else { return None };
+    let window_ns = FieldGate::new(&rig.panel, &rig.lasers).ok()?.width().0;
+    let cut_ns = clock_error_ns.saturating_mul(2).saturating_add(i64::from(jitter_us) * 1000);
+    if 2 * cut_ns.min(window_ns) < window_ns {
+        return None;
+    }
+    let [cut_ms, window_ms] = [cut_ns, window_ns].map(|time_ns| time_ns as f64 / 1e6);
+    let wire = match rig.panel.mode {
+        PanelMode::ChannelPacked => ", or a wire from the panel's sync output to the box (lasers.sync_wire)",
+        PanelMode::FieldSequential | PanelMode::Monochrome(_) => "",
+    };
+    let adapter = adapter_delay_warning("laser", path).map_or(String::new(), |warning| format!("; {warning}"));
+    let says = format!(
+        "its line takes so long there and back that {cut_ms:.2} ms are cut off each window of {window_ms:.2} ms, for \
+         what is not known of its clock (clock-unsure): USB CDC or a quicker adapter{wire}{adapter}"
+    );
+    Some((cut_ns < window_ns, says))
 }
 
 /// The way to the panel: opened as a run would, with the flat pattern on it, looked at, and closed.
@@ -103,4 +130,29 @@ pub(super) fn panel(rig: &Rig, output: Option<&OutputSpec>) -> Vec<Check> {
     }
     checks.push(check(true, CABLE.to_owned()));
     checks
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_that_leaves_nothing_of_a_window_fails_and_one_that_leaves_little_is_said() {
+        let mut rig = Rig::default();
+        rig.panel.mode = PanelMode::FieldSequential;
+        rig.panel.refresh_hz = 180.0;
+        let over_line = |rig: &Rig, clock_error_ns| unsure(rig, clock_error_ns, 0);
+        rig.lasers.driver = LaserDriver::Serial { path: "/dev/none".into(), sync_wire: false };
+        let (some_is_left, says) = over_line(&rig, 2_161_000).unwrap();
+        assert!(!some_is_left && says.contains("4.32 ms are cut off each window of 3.00 ms"), "{says}");
+        assert!(!says.contains("sync_wire"), "not in this mode: {says}");
+        assert!(over_line(&rig, i64::MAX).is_some_and(|(some_is_left, _)| !some_is_left));
+        assert!(over_line(&rig, 1_000_000).is_some_and(|(some_is_left, _)| some_is_left));
+        assert_eq!(over_line(&rig, 500_000), None);
+        rig.panel.mode = PanelMode::ChannelPacked;
+        rig.panel.refresh_hz = 60.0;
+        assert!(over_line(&rig, 1_000_000).unwrap().1.contains("sync_wire"));
+        rig.lasers.driver = LaserDriver::Serial { path: "/dev/none".into(), sync_wire: true };
+        assert_eq!(over_line(&rig, 2_161_000), None);
+    }
 }

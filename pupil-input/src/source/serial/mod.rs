@@ -230,6 +230,22 @@ pub fn serial_port_warnings(path: &Path) -> Vec<String> {
     port_at(path, &ports).map_or_else(Vec::new, |port| port_warnings(port, path))
 }
 
+/// What a user should know of a serial port `path` of `whose`, "tracker" say, whose adapter holds bytes back.
+pub fn adapter_delay_warning(whose: &str, path: &Path) -> Option<String> {
+    let ports = serial_ports();
+    delay_warning(whose, port_at(path, &ports)?, path)
+}
+
+fn delay_warning(whose: &str, port: &SerialPortInfo, path: &Path) -> Option<String> {
+    let held_ms = port.latency_timer_ms.filter(|held_ms| *held_ms > LATENCY_TIMER_MAX_MS)?;
+    let (shown, name) = (path.display(), port.path.file_name().unwrap_or_default().display());
+    Some(format!(
+        "the adapter of {whose} port {shown} holds bytes back for up to {held_ms} ms (latency_timer); install \
+         deploy/udev/60-holod-latency.rules, or write 1 into /sys/bus/usb-serial/devices/{name}/latency_timer after \
+         each replug"
+    ))
+}
+
 /// What is wrong with reading a tracker at this port by that path.
 fn port_warnings(port: &SerialPortInfo, path: &Path) -> Vec<String> {
     let mut warnings = Vec::new();
@@ -240,14 +256,7 @@ fn port_warnings(port: &SerialPortInfo, path: &Path) -> Vec<String> {
             "tracker port {shown} may have another number after a replug or a restart; write {by_id} instead, which stays"
         ));
     }
-    if let Some(held_ms) = port.latency_timer_ms.filter(|held_ms| *held_ms > LATENCY_TIMER_MAX_MS) {
-        let name = port.path.file_name().unwrap_or_default().display();
-        warnings.push(format!(
-            "the adapter of tracker port {shown} holds bytes back for up to {held_ms} ms (latency_timer); install \
-             deploy/udev/60-holod-latency.rules, or write 1 into /sys/bus/usb-serial/devices/{name}/latency_timer after \
-             each replug"
-        ));
-    }
+    warnings.extend(delay_warning("tracker", port, path));
     warnings
 }
 
