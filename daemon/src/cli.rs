@@ -75,9 +75,9 @@ pub enum Command {
     Laser(LaserCommand),
     /// Put the lasers out, also while another holod has their port open.
     ///
-    /// A laser box of holod's protocol stays dark until a holod is started anew. Lasers without a heartbeat
-    /// (READYBeam, lasers that take commands in text) tell nobody: a holod that goes on may light them again. End it
-    /// first.
+    /// A laser box of holod's protocol stays dark until a holod is started anew, as a service that fails is by itself
+    /// (`systemctl stop holod` keeps it from that). Lasers without a heartbeat (READYBeam, lasers that take commands in
+    /// text) tell nobody: a holod that goes on may light them again. End it first.
     Dark(LaserArgs),
 }
 

@@ -43,7 +43,8 @@ pub(super) fn dark(args: &LaserArgs) -> Result<(), Failure> {
     let who_knows = match driver {
         LaserDriver::Simulated => "",
         LaserDriver::Serial { .. } => {
-            "; only a holod that is started anew lights them again; end one that hangs before the box is reset"
+            "; only a holod that is started anew lights them again, as a service that fails is by itself (`systemctl stop \
+             holod` keeps it from that); end one that hangs before the box is reset"
         }
         LaserDriver::ReadyBeam { .. } | LaserDriver::Text { .. } => {
             "; a holod that still drives them does not know of it and may light them again: end it"

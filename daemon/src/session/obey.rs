@@ -183,7 +183,9 @@ impl Watch<'_> {
     fn lasers_dark(&mut self, wish: DarkWish, output: &OutputControl) -> Result<Value, String> {
         self.desk.keeps_dark = true;
         if output.keep_dark_as_wished(wish) {
-            return Ok("the lasers are dark, and stay so until `holod ctl lasers arm`".into());
+            let said = "the lasers are dark, and stay so until `holod ctl lasers arm` or a new start of holod, as of a \
+                        service that fails (`systemctl stop holod` keeps it from that)";
+            return Ok(said.into());
         }
         Err("the laser box did not acknowledge darkness: look at the lasers, and switch them off by hand. holod lights \
              none until `holod ctl lasers arm`"
@@ -196,7 +198,10 @@ impl Watch<'_> {
         if self.feed_watch.keeps_dark() {
             return "lasers are lit again by the rules, once the live feed gives a picture".into();
         }
-        format!("lasers are lit again by the rules{}", self.pattern_warning()).into()
+        match self.laser_box.trouble() {
+            Some(trouble) => format!("lasers are lit again by the rules, but for this: {trouble}").into(),
+            None => format!("lasers are lit again by the rules{}", self.pattern_warning()).into(),
+        }
     }
 }
 
