@@ -424,7 +424,12 @@ impl SerialBox {
                 refused => refused,
             },
         };
-        if self.goes_dark { Ok(()) } else { done.map_err(refused(sent.command)) }
+        match done {
+            // By its model it went dark before; it is told so, in case that it did not.
+            Err(Refusal::NotArmed) => Ok(()),
+            Err(_) if self.goes_dark => Ok(()),
+            done => done.map_err(refused(sent.command)),
+        }
     }
 
     /// The box missed what of a window was over at `t`.
@@ -628,9 +633,8 @@ impl LaserBox for SerialBox {
         self.model.advance(self.known_until(now));
         let mut box_may_go_on = None;
         while let Some(next) = self.model.next_event() {
-            // What the model of a wired box misses, a report or a heartbeat, the box itself may not miss yet.
+            // What the model misses, a frame or a heartbeat, the box itself may not miss yet.
             if let BoxEvent::Dark { reason, .. } = next
-                && self.wire.is_some()
                 && reason.is_of_box()
             {
                 box_may_go_on = Some(reason);
