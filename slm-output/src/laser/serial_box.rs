@@ -81,9 +81,9 @@ pub struct BoxReport {
 /// dark.
 ///
 /// The box does not tell its edges, so the ones reported here are those of a model that does what the box has said it
-/// did, at the time at which it did it: what it does if it keeps its rules. So the model is behind by the box's answers,
-/// and a window that came too late is lit by neither. Once the box contradicts the model (it went dark, it refuses, it
-/// does not answer) that is an event or an error.
+/// did, at the time at which it did it: what it does if it keeps its rules. So the model is behind by the box's
+/// answers, and a window that came too late is lit by neither. Once the box contradicts the model (it went dark, it
+/// refuses, it does not answer) that is an event or an error.
 #[derive(Debug)]
 pub struct SerialBox {
     link: Link,

@@ -68,7 +68,8 @@ impl OutputControl {
     }
 
     /// The control goes on: signals and limits are looked at. From the first call on lasers are kept dark, as
-    /// [`DarkReason::Unattended`], while the last one is 5 s ago or more. The waits of [`Self::keep_dark`] count as calls.
+    /// [`DarkReason::Unattended`], while the last one is more than 5 s ago. The waits of [`Self::keep_dark`] count as
+    /// calls.
     pub fn attend(&self) {
         self.switch.shared.t_attended_ns.store((self.clock)().0, Ordering::Release);
     }

@@ -90,7 +90,7 @@ impl LaserThread {
         now
     }
 
-    /// Obeys those who want darkness, for good or until they take it back, and keeps to it while nobody could ask for it.
+    /// Obeys those who want darkness, for good or until they take it back, and keeps dark while nobody could want it.
     fn heed(&mut self, now: TimeNs) {
         if let Some(reason) = self.shared.latched() {
             self.latch(reason, now);

@@ -88,7 +88,7 @@ impl Shared {
         }
     }
 
-    /// Whether signals and limits that ask for darkness find somebody who obeys them, where anybody has said that he does.
+    /// Whether signals and limits that ask for darkness find somebody who obeys them, where anybody ever did.
     pub(super) fn is_attended(&self, now: TimeNs) -> bool {
         let t_attended_ns = self.t_attended_ns.load(Ordering::Acquire);
         t_attended_ns == 0 || now.0 - t_attended_ns <= UNATTENDED_AFTER.0

@@ -84,8 +84,8 @@ impl FieldGate {
     ///
     /// Where windows follow the reports that is half of the time that the rig leaves free at both ends of a window, on
     /// delay and the rest of the field; the other half is for what the rhythm itself is off by. What the panel's fields
-    /// may be longer or shorter than the rig's comes off before: at the end of a window that of its own field, and where
-    /// a whole colour frame follows one report, that of the fields before it at both ends.
+    /// may be longer or shorter than the rig's comes off before: at the end of a window that of its own field, and
+    /// where a whole colour frame follows one report, that of the fields before it at both ends.
     pub fn time_tolerance(&self, trigger: Trigger, clock: WindowClock) -> TimeNs {
         let fields_later = match (clock, trigger) {
             (WindowClock::Panel, _) => return TimeNs(self.timing.refresh_period.0 / 16),
