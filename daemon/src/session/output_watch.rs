@@ -3,7 +3,7 @@
 use holod_calibration::TimeNs;
 use holod_slm_output::PanelEvent;
 use holod_slm_output::laser::DarkReason;
-use holod_slm_output::output::{FieldEvent, OutputCounts};
+use holod_slm_output::output::FieldEvent;
 use holod_slm_output::present::{PanelFault, TimestampSource};
 
 /// A panel whose rate differs from the rig's by more than this share is not the one that the rig describes.
@@ -21,8 +21,11 @@ pub(super) struct OutputWatch {
     /// Refreshes a second that the rig names.
     nominal_hz: f64,
     lost: Option<PanelFault>,
-    /// Since when the rate has been off, and whether that has been said.
-    off_rate: Option<(TimeNs, bool)>,
+    /// Whether the times of the last field were not software's, whose rate means nothing.
+    stamped: bool,
+    /// Since when the rate has been off.
+    off_rate: Option<TimeNs>,
+    has_said_rate: bool,
     fields: FieldsSeen,
     /// Why most fields were dark that were judged last, where they were, and whether all of them.
     trouble: Option<(DarkReason, bool)>,
@@ -37,7 +40,9 @@ impl OutputWatch {
             events,
             nominal_hz,
             lost: None,
+            stamped: false,
             off_rate: None,
+            has_said_rate: false,
             fields: FieldsSeen::default(),
             trouble: None,
             said: Vec::new(),
@@ -62,35 +67,36 @@ impl OutputWatch {
                 PanelEvent::Back { .. } => {
                     tracing::info!("the panel is back");
                     self.lost = None;
-                    self.off_rate = None;
+                    (self.off_rate, self.has_said_rate) = (None, false);
                     self.said.clear();
                 }
             }
         }
     }
 
-    /// Warns once where the panel's rate is not the rig's.
-    pub(super) fn judge_rate(&mut self, counts: &OutputCounts, now: TimeNs) {
-        let off = counts.refresh_hz > 0.0 && (counts.refresh_hz / self.nominal_hz - 1.0).abs() > RATE_TOLERANCE;
-        if !off || self.lost.is_some() {
+    /// What to say, once until the panel is lost and back, where its rate is not the rig's.
+    pub(super) fn judge_rate(&mut self, refresh_hz: f64, now: TimeNs) -> Option<String> {
+        let off = refresh_hz > 0.0 && (refresh_hz / self.nominal_hz - 1.0).abs() > RATE_TOLERANCE;
+        if !off || !self.stamped || self.lost.is_some() {
             self.off_rate = None;
-            return;
+            return None;
         }
-        let (since, said) = self.off_rate.get_or_insert((now, false));
-        if !*said && now - *since >= RATE_WATCHED {
-            *said = true;
-            tracing::warn!(
-                "the panel refreshes at {:.2} Hz, the rig says {} Hz: its fields are not as long as the lasers' windows \
-                 suppose, so lasers stay dark; set the panel's mode to the rig's rate, or correct panel.refresh_hz",
-                counts.refresh_hz,
-                self.nominal_hz
-            );
+        let since = *self.off_rate.get_or_insert(now);
+        if self.has_said_rate || now - since < RATE_WATCHED {
+            return None;
         }
+        self.has_said_rate = true;
+        Some(format!(
+            "the panel refreshes at {refresh_hz:.2} Hz, the rig says {} Hz: its fields are not as long as the lasers' \
+             windows suppose, so lasers stay dark; set the panel's mode to the rig's rate, or correct panel.refresh_hz",
+            self.nominal_hz
+        ))
     }
 
     /// Takes note of a field that is over. What to say, once until the panel is lost and back, where most fields stay
     /// dark for a reason that nobody asked for.
     pub(super) fn judge_field(&mut self, field: &FieldEvent) -> Option<String> {
+        self.stamped = !matches!(field.provenance, TimestampSource::Software | TimestampSource::Estimated);
         let since = *self.fields.since.get_or_insert(field.t_present);
         self.fields.note(field);
         if field.t_present - since < JUDGED {
@@ -213,29 +219,45 @@ mod tests {
         OutputWatch::new(rtrb::RingBuffer::new(1).1, 60.0)
     }
 
-    /// What is said of the fields of a minute, 180 a second, each dark as `dark` says of its number.
+    /// The field of this number, of 180 a second.
+    fn field(index: i64, provenance: TimestampSource, dark: Option<DarkReason>) -> FieldEvent {
+        let t_present = TimeNs(index * 5_555_556);
+        FieldEvent {
+            frame_id: index as u64 / 3,
+            field: index as usize % 3,
+            colour: Colour::ALL[index as usize % 3],
+            t_submit: TimeNs(0),
+            t_desired_present: TimeNs(0),
+            t_present,
+            t_settled: t_present,
+            t_end: t_present,
+            provenance,
+            laser_on: dark.is_none().then_some(t_present),
+            laser_off: dark.is_none().then_some(t_present),
+            dark,
+            repeated: false,
+            deadline_missed: false,
+        }
+    }
+
+    /// What is said of the fields of a minute, each dark as `dark` says of its number.
     fn said(watch: &mut OutputWatch, minute: i64, dark: impl Fn(i64) -> Option<DarkReason>) -> Vec<String> {
-        let fields = (60 * 180 * minute..60 * 180 * (minute + 1)).filter_map(|index| {
-            let t_present = TimeNs(index * 5_555_556);
-            let dark = dark(index);
-            watch.judge_field(&FieldEvent {
-                frame_id: index as u64 / 3,
-                field: index as usize % 3,
-                colour: Colour::ALL[index as usize % 3],
-                t_submit: TimeNs(0),
-                t_desired_present: TimeNs(0),
-                t_present,
-                t_settled: t_present,
-                t_end: t_present,
-                provenance: TimestampSource::Hardware,
-                laser_on: dark.is_none().then_some(t_present),
-                laser_off: dark.is_none().then_some(t_present),
-                dark,
-                repeated: false,
-                deadline_missed: false,
-            })
-        });
-        fields.collect()
+        let fields = 60 * 180 * minute..60 * 180 * (minute + 1);
+        fields.filter_map(|index| watch.judge_field(&field(index, TimestampSource::Hardware, dark(index)))).collect()
+    }
+
+    #[test]
+    fn another_rate_is_told_once_and_only_of_times_that_are_not_softwares() {
+        for (provenance, told) in [(TimestampSource::Driver, 1), (TimestampSource::Software, 0)] {
+            let mut watch = watch();
+            watch.judge_field(&field(0, provenance, Some(DarkReason::Untrusted)));
+            // A rate that crosses the tolerance again and again, as measured.
+            let rates = (0..60).map(|second| if second % 6 == 5 { 60.0 } else { 58.3 + 0.1 * f64::from(second % 3) });
+            let said = rates.zip(0..).filter_map(|(hz, second)| watch.judge_rate(hz, TimeNs(second * 1_000_000_000)));
+            let said: Vec<_> = said.collect();
+            assert_eq!(said.len(), told, "{said:?}");
+            assert!(said.iter().all(|words| words.contains("the rig says 60 Hz")), "{said:?}");
+        }
     }
 
     #[test]

@@ -318,7 +318,9 @@ impl Watch<'_> {
         self.tell_rate(now);
         self.tracker_watch.look(&mut self.tracker, now);
         self.judge_recording();
-        self.panel.judge_rate(output, now);
+        if let Some(warning) = self.panel.judge_rate(output.refresh_hz, now) {
+            tracing::warn!("{warning}");
+        }
         self.laser_box.drain(output.armed);
         self.desk.tidy();
         self.observer.tick()
