@@ -100,6 +100,9 @@ pub struct Snapshot {
     pub lasers: String,
     /// What is wrong with the laser box, where something is.
     pub lasers_trouble: Option<String>,
+    /// Why no field is lit though lasers may be, where that is so.
+    #[serde(default)]
+    pub unlit: Option<String>,
     /// Why the live feed keeps lasers dark, where it does.
     #[serde(default)]
     pub feed_trouble: Option<String>,

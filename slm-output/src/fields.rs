@@ -315,10 +315,14 @@ mod tests {
         fn unpacking_gives_back_each_colour_in_its_place(
             field_order in orders(), mode in modes(), red in levels(), green in levels(), blue in levels(),
         ) {
-            let layout =
-                FrameLayout {
-                    resolution: SMALL, mode, field_order, channel_order: Colour::ALL, frames_per_colour: 1, packing: Packing::Gray
-                };
+            let layout = FrameLayout {
+                resolution: SMALL,
+                mode,
+                field_order,
+                channel_order: Colour::ALL,
+                frames_per_colour: 1,
+                packing: Packing::Gray,
+            };
             let mut frame = LevelsFrame::new(layout);
             let given = [red, green, blue];
             for colour in Colour::ALL {

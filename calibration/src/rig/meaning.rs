@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{LaserDriver, Lasers, Orientation, Panel, PanelProfile, Rig, Tracker};
+use super::{LaserDriver, Lasers, Orientation, Panel, PanelMode, PanelProfile, Rig, Tracker};
 use crate::{Colour, PerColour, PupilDiameter, TimeNs};
 
 /// The pupils for which blur is worked out.
@@ -112,8 +112,10 @@ pub struct FieldMeaning {
     pub refresh_hz: f64,
     /// Complete colour frames a second.
     pub colour_frames_hz: f64,
-    /// The colour of each field of a colour frame, in the order in which the panel shows them.
+    /// The colour of each field of a colour frame, in the order in which they are shown.
     pub order: Vec<String>,
+    /// The channel of the video that carries each of them, in channel-packed mode.
+    pub channels: Option<[&'static str; 3]>,
     /// Length of one field.
     pub period_ms: f64,
     /// When the phase has settled.
@@ -242,6 +244,7 @@ impl FieldMeaning {
             refresh_hz: panel.refresh_hz,
             colour_frames_hz: 1e3 / (panel.fields() as f64 * period_ms),
             order: (0..panel.fields()).map(|field| panel.colour_of_field(field).name().to_owned()).collect(),
+            channels: (panel.mode == PanelMode::ChannelPacked).then(|| panel.channel_order.map(Colour::name)),
             period_ms,
             settled_ms,
             laser_on_ms,
@@ -560,10 +563,11 @@ impl fmt::Display for Meaning {
         let field = &self.field;
         writeln!(
             f,
-            "colour fields  {} at {} Hz: {}, {:.3} ms each, {:.1} colour frames a second",
+            "colour fields  {} at {} Hz: {}{}, {:.3} ms each, {:.1} colour frames a second",
             field.mode,
             field.refresh_hz,
             field.order.join(", "),
+            field.channels.map_or(String::new(), |channels| format!(" in the channels {}", channels.join(", "))),
             field.period_ms,
             field.colour_frames_hz
         )?;

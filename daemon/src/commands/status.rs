@@ -98,7 +98,11 @@ fn text_of(status: &Snapshot) -> String {
             Some(_) => ", kept dark as the live feed gives no pictures",
             None => "",
         },
-        status.lasers_trouble.as_ref().map_or(String::new(), |trouble| format!("; {trouble}")),
+        status
+            .lasers_trouble
+            .as_ref()
+            .or(status.unlit.as_ref())
+            .map_or(String::new(), |trouble| format!("; {trouble}")),
         figures.engine,
         figures.weights,
         status.frames_shown_hz,

@@ -230,7 +230,7 @@ pub(super) fn build(
         names,
         plays,
         rings,
-        panel: OutputWatch::new(output.panel_events, rig.panel.refresh_hz),
+        panel: OutputWatch::new(output.panel_events, rig.panel.refresh_hz, output.takes_software_times),
         laser_box: LaserBoxWatch::new(output.laser_faults, output.laser_watch),
         tracker,
         tracker_watch: TrackerWatch::new(&rig.tracker, t_origin),

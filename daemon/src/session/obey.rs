@@ -198,10 +198,9 @@ impl Watch<'_> {
         if self.feed_watch.keeps_dark() {
             return "lasers are lit again by the rules, once the live feed gives a picture".into();
         }
-        match self.laser_box.trouble() {
-            Some(trouble) => format!("lasers are lit again by the rules, but for this: {trouble}").into(),
-            None => format!("lasers are lit again by the rules{}", self.pattern_warning()).into(),
-        }
+        let trouble =
+            self.laser_box.trouble().map_or(String::new(), |trouble| format!(" once this is over: {trouble}"));
+        format!("lasers are lit again by the rules{trouble}{}", self.pattern_warning()).into()
     }
 }
 

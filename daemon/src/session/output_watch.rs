@@ -1,13 +1,12 @@
 //! What a person should hear of the panel and the lasers while the loop runs.
 
 use holod_calibration::TimeNs;
+use holod_calibration::rig::RATE_TOLERANCE;
 use holod_slm_output::PanelEvent;
 use holod_slm_output::laser::DarkReason;
 use holod_slm_output::output::FieldEvent;
 use holod_slm_output::present::{PanelFault, TimestampSource};
 
-/// A panel whose rate differs from the rig's by more than this share is not the one that the rig describes.
-const RATE_TOLERANCE: f64 = 0.005;
 /// How long the panel's rate is watched before it is judged.
 const RATE_WATCHED: TimeNs = TimeNs(1_000_000_000);
 /// Fields are judged together that came within so long.
@@ -21,8 +20,10 @@ pub(super) struct OutputWatch {
     /// Refreshes a second that the rig names.
     nominal_hz: f64,
     lost: Option<PanelFault>,
-    /// Whether the times of the last field were not software's, whose rate means nothing.
-    stamped: bool,
+    /// Whether software's times are good enough to light lasers by.
+    takes_software_times: bool,
+    /// Whether the times of the last field were such that lasers are lit by them, which others' rate says nothing of.
+    are_times_good: bool,
     /// Since when the rate has been off.
     off_rate: Option<TimeNs>,
     has_said_rate: bool,
@@ -35,12 +36,13 @@ pub(super) struct OutputWatch {
 }
 
 impl OutputWatch {
-    pub(super) fn new(events: rtrb::Consumer<PanelEvent>, nominal_hz: f64) -> Self {
+    pub(super) fn new(events: rtrb::Consumer<PanelEvent>, nominal_hz: f64, takes_software_times: bool) -> Self {
         Self {
             events,
             nominal_hz,
             lost: None,
-            stamped: false,
+            takes_software_times,
+            are_times_good: false,
             off_rate: None,
             has_said_rate: false,
             fields: FieldsSeen::default(),
@@ -77,7 +79,7 @@ impl OutputWatch {
     /// What to say, once until the panel is lost and back, where its rate is not the rig's.
     pub(super) fn judge_rate(&mut self, refresh_hz: f64, now: TimeNs) -> Option<String> {
         let off = refresh_hz > 0.0 && (refresh_hz / self.nominal_hz - 1.0).abs() > RATE_TOLERANCE;
-        if !off || !self.stamped || self.lost.is_some() {
+        if !off || !self.are_times_good || self.lost.is_some() {
             self.off_rate = None;
             return None;
         }
@@ -96,7 +98,11 @@ impl OutputWatch {
     /// Takes note of a field that is over. What to say, once until the panel is lost and back, where most fields stay
     /// dark for a reason that nobody asked for.
     pub(super) fn judge_field(&mut self, field: &FieldEvent) -> Option<String> {
-        self.stamped = !matches!(field.provenance, TimestampSource::Software | TimestampSource::Estimated);
+        self.are_times_good = match field.provenance {
+            TimestampSource::Hardware | TimestampSource::Driver | TimestampSource::External => true,
+            TimestampSource::Software => self.takes_software_times,
+            TimestampSource::Estimated => false,
+        };
         let since = *self.fields.since.get_or_insert(field.t_present);
         self.fields.note(field);
         if field.t_present - since < JUDGED {
@@ -216,7 +222,7 @@ mod tests {
     use super::*;
 
     fn watch() -> OutputWatch {
-        OutputWatch::new(rtrb::RingBuffer::new(1).1, 60.0)
+        OutputWatch::new(rtrb::RingBuffer::new(1).1, 60.0, false)
     }
 
     /// The field of this number, of 180 a second.
@@ -247,9 +253,13 @@ mod tests {
     }
 
     #[test]
-    fn another_rate_is_told_once_and_only_of_times_that_are_not_softwares() {
-        for (provenance, told) in [(TimestampSource::Driver, 1), (TimestampSource::Software, 0)] {
-            let mut watch = watch();
+    fn another_rate_is_told_once_and_only_of_times_by_which_lasers_are_lit() {
+        for (provenance, takes_software_times, told) in [
+            (TimestampSource::Driver, false, 1),
+            (TimestampSource::Software, false, 0),
+            (TimestampSource::Software, true, 1),
+        ] {
+            let mut watch = OutputWatch { takes_software_times, ..watch() };
             watch.judge_field(&field(0, provenance, Some(DarkReason::Untrusted)));
             // A rate that crosses the tolerance again and again, as measured.
             let rates = (0..60).map(|second| if second % 6 == 5 { 60.0 } else { 58.3 + 0.1 * f64::from(second % 3) });

@@ -415,7 +415,8 @@ impl Watch<'_> {
             panel: self.names.panel.clone(),
             panel_trouble: self.panel.lost().map(|fault| fault.to_string()),
             lasers: if output.armed { "armed" } else { "dark" }.to_owned(),
-            lasers_trouble: self.laser_box.trouble().map(str::to_owned).or_else(|| self.panel.unlit()),
+            lasers_trouble: self.laser_box.trouble().map(str::to_owned),
+            unlit: self.panel.unlit(),
             feed_trouble: self.feed_trouble(),
             figures: self.figures(output, now),
         }

@@ -214,7 +214,7 @@ dark_reasons! {
     PanelLost, "panel-lost", "the panel is gone";
     Balance, "balance", "another colour has been lit for less time";
     NoPicture, "no-picture", "the live feed has given no new picture for the time of --feed-dark-after";
-    Unattended, "unattended", "holod's control thread stands still and obeys no signal: end holod with SIGKILL and start it again";
+    Unattended, "unattended", "holod's control thread stood still for 5 s and obeyed no signal meanwhile; where it still does, end holod with SIGKILL";
     Shutdown, "shutdown", "an orderly end";
     Panic, "panic", "a thread of holod failed";
     Asked, "asked", "as asked";

@@ -131,7 +131,8 @@ pub struct LaserProgram {
 pub enum LaserError {
     /// The field ends before its window begins.
     #[error(
-        "a field lasts {field_us} µs, but its window begins {delay_us} µs after it and ends {slack_us} µs before the next: shorten panel.settle_ms or lasers.on_delay_ms, or lower panel.refresh_hz"
+        "a field lasts {field_us} µs, but its window begins {delay_us} µs after it and ends {slack_us} µs before the \
+         next: shorten panel.settle_ms or lasers.on_delay_ms, or lower panel.refresh_hz"
     )]
     NoRoom {
         /// Length of a field, microseconds.

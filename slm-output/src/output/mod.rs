@@ -97,6 +97,8 @@ pub struct Output {
     pub box_events: Consumer<BoxEvent>,
     /// For whoever tells people: the panel was lost or came back.
     pub panel_events: Consumer<PanelEvent>,
+    /// Whether lasers are lit by software's times of the panel: of a virtual one, or where the box times its own windows.
+    pub takes_software_times: bool,
     /// For whoever tells people: what went wrong with the laser box.
     pub laser_faults: Consumer<LaserError>,
     /// For whoever tells people: why the laser box is lost, where it can be.
@@ -192,6 +194,7 @@ impl Output {
             events: event_consumer,
             box_events: box_consumer,
             panel_events: panel_consumer,
+            takes_software_times: evidence == Evidence::Seen,
             laser_faults: fault_consumer,
             laser_watch,
             look,

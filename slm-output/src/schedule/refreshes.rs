@@ -21,9 +21,6 @@ const STRAYS_MAX: u32 = 2;
 const PHASE_GAIN: f64 = 0.2;
 /// Share of an interval's error that moves the period.
 const PERIOD_GAIN: f64 = 0.02;
-/// A panel's period may be learned to differ from the nominal one by this share, and the intervals may on average lie
-/// off the learned one by as much; beyond, nothing is believed.
-const PERIOD_TOLERANCE: f64 = RATE_TOLERANCE;
 /// Share of a new interval's error in their average.
 const BIAS_GAIN: f64 = 0.05;
 /// Share of a new interval in the rate that is shown to people.
@@ -147,7 +144,7 @@ impl RefreshJudge {
             (self.period_ns + period_gain * error_ns / periods).clamp(*limits_ns.start(), *limits_ns.end());
         self.bias_ns += BIAS_GAIN * (error_ns / periods - self.bias_ns);
         self.agreeing = self.agreeing.saturating_add(1);
-        let steady = self.bias_ns.abs() <= PERIOD_TOLERANCE * self.nominal_ns;
+        let steady = self.bias_ns.abs() <= RATE_TOLERANCE * self.nominal_ns;
         if self.agreeing < self.needed || !steady {
             return Err(DarkReason::Untrusted);
         }
@@ -176,7 +173,7 @@ impl RefreshJudge {
     }
 
     fn period_limits_ns(&self) -> RangeInclusive<f64> {
-        (1.0 - PERIOD_TOLERANCE) * self.nominal_ns..=(1.0 + PERIOD_TOLERANCE) * self.nominal_ns
+        (1.0 - RATE_TOLERANCE) * self.nominal_ns..=(1.0 + RATE_TOLERANCE) * self.nominal_ns
     }
 
     /// The panel goes on by at least one refresh of a colour frame, and by no more than the time allows; a doubled

@@ -75,10 +75,28 @@ fn can_do(rig: &Rig, found: Option<&BoxReport>) -> Result<(), LaserError> {
     takes(&rig.lasers, &program, found)
 }
 
+/// Whether a run of `rig` is what it should be with a display of which that is found.
+fn passes(rig: &Rig, found: Verdict) -> bool {
+    match found {
+        Verdict::Right | Verdict::Unverified => true,
+        Verdict::Wrong => false,
+        Verdict::Dark => times_itself(rig) || matches!(rig.lasers.driver, LaserDriver::Simulated),
+    }
+}
+
+/// Whether the box times its windows by the panel's sync output, and needs no report of it.
+fn times_itself(rig: &Rig) -> bool {
+    matches!(rig.lasers.driver, LaserDriver::Serial { sync_wire: true, .. })
+        && rig.panel.mode == PanelMode::ChannelPacked
+}
+
 /// Where most of each window is cut off for what is not known of the box's clock over its line: whether something is
 /// left, and what helps.
 fn unsure(rig: &Rig, clock_error_ns: i64, jitter_us: u32) -> Option<(bool, String)> {
-    let LaserDriver::Serial { path, sync_wire: false } = &rig.lasers.driver else { return None };
+    let LaserDriver::Serial { path, .. } = &rig.lasers.driver else { return None };
+    if times_itself(rig) {
+        return None;
+    }
     let window_ns = FieldGate::new(&rig.panel, &rig.lasers).ok()?.width().0;
     let cut_ns = clock_error_ns.saturating_mul(2).saturating_add(i64::from(jitter_us) * 1000);
     if 2 * cut_ns.min(window_ns) < window_ns {
@@ -120,13 +138,8 @@ pub(super) fn panel(rig: &Rig, output: Option<&OutputSpec>) -> Vec<Check> {
         Err(error) => return vec![check(false, error.to_string())],
     };
     let mut checks = vec![check(true, format!("{spec}: {described}, as the rig says; the flat pattern came on it"))];
-    let passes = |verdict| match verdict {
-        Verdict::Right | Verdict::Unverified => true,
-        Verdict::Wrong => false,
-        Verdict::Dark => !matches!(rig.lasers.driver, LaserDriver::Serial { sync_wire: false, .. }),
-    };
     for found in panel.checks() {
-        checks.push(check(passes(found.verdict), found.to_string()));
+        checks.push(check(passes(rig, found.verdict), found.to_string()));
     }
     checks.push(check(true, CABLE.to_owned()));
     checks
@@ -134,6 +147,8 @@ pub(super) fn panel(rig: &Rig, output: Option<&OutputSpec>) -> Vec<Check> {
 
 #[cfg(test)]
 mod tests {
+    use holod_calibration::PerColour;
+
     use super::*;
 
     #[test]
@@ -154,5 +169,23 @@ mod tests {
         assert!(over_line(&rig, 1_000_000).unwrap().1.contains("sync_wire"));
         rig.lasers.driver = LaserDriver::Serial { path: "/dev/none".into(), sync_wire: true };
         assert_eq!(over_line(&rig, 2_161_000), None);
+    }
+
+    #[test]
+    fn a_display_whose_times_are_softwares_fails_for_lasers_that_it_leaves_dark() {
+        let serial = |sync_wire| LaserDriver::Serial { path: "/dev/none".into(), sync_wire };
+        let ready_beam = LaserDriver::ReadyBeam { path: "/dev/none".into(), full_power_uw: PerColour([1000; 3]) };
+        for (driver, mode, fits) in [
+            (LaserDriver::Simulated, PanelMode::ChannelPacked, true),
+            (serial(true), PanelMode::ChannelPacked, true),
+            (serial(true), PanelMode::FieldSequential, false),
+            (serial(false), PanelMode::ChannelPacked, false),
+            (ready_beam, PanelMode::ChannelPacked, false),
+        ] {
+            let mut rig = Rig::default();
+            (rig.lasers.driver, rig.panel.mode) = (driver, mode);
+            assert_eq!(passes(&rig, Verdict::Dark), fits, "{:?}", rig.lasers.driver);
+            assert!(passes(&rig, Verdict::Right) && passes(&rig, Verdict::Unverified) && !passes(&rig, Verdict::Wrong));
+        }
     }
 }

@@ -142,7 +142,7 @@ function tellFacts(snapshot) {
     ["Hologram", snapshot.hologram],
     ["Panel", snapshot.panel],
     ["Panel’s trouble", snapshot.panel_trouble],
-    ["Lasers’ trouble", snapshot.lasers_trouble],
+    ["Lasers’ trouble", snapshot.lasers_trouble || snapshot.unlit],
     ["Tracker", `${snapshot.tracker}, link ${snapshot.tracker_link}`],
     ["Tracker’s trouble", snapshot.tracker_trouble],
     ["Pupil", `${number(snapshot.pupil_mm, 2)} mm, ${snapshot.pupil_state || "not known yet"}; eye: ${snapshot.eye}`],

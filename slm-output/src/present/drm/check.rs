@@ -24,7 +24,7 @@ pub enum Verdict {
     Wrong,
     /// The driver does not tell.
     Unverified,
-    /// Lasers that nothing but the panel's reports times stay dark by it.
+    /// Lasers stay dark by it, but those of a box that times itself by the panel's sync output.
     Dark,
 }
 
@@ -34,7 +34,7 @@ impl fmt::Display for DisplayCheck {
             Verdict::Right => "right",
             Verdict::Wrong => "WRONG",
             Verdict::Unverified => "not verified",
-            Verdict::Dark => "lasers stay dark that only the panel's reports time",
+            Verdict::Dark => "lasers stay dark but those of a box with a sync wire in channel-packed mode",
         };
         write!(f, "{}: {}, wanted {} ({verdict})", self.name, self.found, self.wanted)
     }

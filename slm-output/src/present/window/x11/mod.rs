@@ -127,8 +127,6 @@ fn create_window(connection: &impl Connection, screen: usize, monitor: &Monitor)
     if !true_colour {
         return Err(X11Error::Lacks("picture of 8 bits for each colour (screen depth 24)"));
     }
-    let claim = Claim::of(connection, monitor)?;
-    claim.check(connection)?;
     // A cursor of one pixel, which its mask takes away.
     let (cursor, blank, clear) = (connection.generate_id()?, connection.generate_id()?, connection.generate_id()?);
     connection.create_pixmap(1, blank, root.root, 1, 1)?;
@@ -150,48 +148,36 @@ fn create_window(connection: &impl Connection, screen: usize, monitor: &Monitor)
     connection.change_property8(PropMode::REPLACE, window, AtomEnum::WM_CLASS, AtomEnum::STRING, b"holod\0holod\0")?;
     let bypass = connection.intern_atom(false, b"_NET_WM_BYPASS_COMPOSITOR")?.reply()?.atom;
     connection.change_property32(PropMode::REPLACE, window, bypass, AtomEnum::CARDINAL, &[1])?;
-    claim.make(connection, window)?;
+    claim(connection, window, monitor)?;
     connection.sync()?;
     Ok(window)
 }
 
-/// A monitor as one holod's panel: a selection of the X server, which its window owns for as long as it is there.
-struct Claim {
-    connector: String,
-    selection: u32,
-    pid_atom: u32,
-}
-
-impl Claim {
-    fn of(connection: &impl Connection, monitor: &Monitor) -> Result<Self, X11Error> {
-        let connector = monitor.connector.clone();
-        let name = format!("_HOLOD_PANEL_{connector}");
-        let selection = connection.intern_atom(false, name.as_bytes())?.reply()?.atom;
-        let pid_atom = connection.intern_atom(false, b"_NET_WM_PID")?.reply()?.atom;
-        Ok(Self { connector, selection, pid_atom })
-    }
-
-    /// Whether the monitor is free, or was this process's, whose last window the server may not have taken away yet.
-    fn check(&self, connection: &impl Connection) -> Result<(), X11Error> {
-        let owner = connection.get_selection_owner(self.selection)?.reply()?.owner;
-        if owner == x11rb::NONE {
-            return Ok(());
+/// Makes the monitor this process's panel, where it is no other holod's: a selection of the X server says whose, which
+/// its window owns for as long as it is there.
+fn claim(connection: &impl Connection, window: u32, monitor: &Monitor) -> Result<(), X11Error> {
+    let name = format!("_HOLOD_PANEL_{}", monitor.connector);
+    let selection = connection.intern_atom(false, name.as_bytes())?.reply()?.atom;
+    let pid_atom = connection.intern_atom(false, b"_NET_WM_PID")?.reply()?.atom;
+    let own_pid = std::process::id();
+    connection.change_property32(PropMode::REPLACE, window, pid_atom, AtomEnum::CARDINAL, &[own_pid])?;
+    // Between the look and the claim nobody else may come.
+    connection.grab_server()?;
+    let owner = connection.get_selection_owner(selection)?.reply()?.owner;
+    let pid = match owner {
+        x11rb::NONE => Some(own_pid),
+        owner => {
+            let property = connection.get_property(false, owner, pid_atom, AtomEnum::CARDINAL, 0, 1)?.reply();
+            property.ok().and_then(|property| property.value32()?.next())
         }
-        let property = connection.get_property(false, owner, self.pid_atom, AtomEnum::CARDINAL, 0, 1)?.reply();
-        let pid = property.ok().and_then(|property| property.value32()?.next());
-        if pid == Some(std::process::id()) {
-            return Ok(());
-        }
-        Err(X11Error::Taken { connector: self.connector.clone(), pid })
+    };
+    // The server may not have taken away yet this process's last window.
+    let is_free = pid == Some(own_pid);
+    if is_free {
+        connection.set_selection_owner(window, selection, x11rb::CURRENT_TIME)?;
     }
-
-    fn make(&self, connection: &impl Connection, window: u32) -> Result<(), X11Error> {
-        let pid = [std::process::id()];
-        connection.change_property32(PropMode::REPLACE, window, self.pid_atom, AtomEnum::CARDINAL, &pid)?;
-        connection.set_selection_owner(window, self.selection, x11rb::CURRENT_TIME)?;
-        // Another one may have come at the same time.
-        self.check(connection)
-    }
+    connection.ungrab_server()?.check()?;
+    if is_free { Ok(()) } else { Err(X11Error::Taken { connector: monitor.connector.clone(), pid }) }
 }
 
 /// Red, green and blue as bits of a pixel: the layout of `Bgra8Unorm`.
