@@ -1364,7 +1364,7 @@ fn meaning_is_readable_and_becomes_json() {
         "0.000 to 2.857 dioptres: infinity to 0.35 m, u = 0.000 to 4.571 mm",
         "red 3.19, green 2.60, blue 2.25 mm",
         "pupil 4 mm     blur up to 57.1 px; needs 50.0 mrad, of the panel's band red 1.25, green 1.54, blue 1.78",
-        "channel-packed at 60 Hz: red, green, blue, 5.556 ms each, 60.0 colour frames a second",
+        "at 60 Hz: red, green, blue in the channels red, green, blue, 5.556 ms each, 60.0 colour frames a second",
         "settled at 2.000 ms, laser on at 2.100, off at 5.100: lit for 54 % of it",
     ] {
         assert!(text.contains(part), "{part} is not in\n{text}");
