@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use holod_calibration::rig::{
     Eye, LaserDriver, LevelPhase, Meaning, Orientation, OutOfStroke, Packing, PanelMode, PanelProfile, PhaseSign,
-    Provenance, Rig, RigError, TextLaserProfile, WeightsChoice,
+    Provenance, Rig, RigError, TextLaserProfile, VideoMargins, WeightsChoice,
 };
 use holod_calibration::toml_source::Fault;
 use holod_calibration::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, Resolution, TimeNs};
@@ -423,6 +423,53 @@ fn a_panel_that_lights_its_own_lasers_shows_each_colour_in_its_channel() {
     assert_eq!(faults[0].key, "lasers.gated_by_panel");
     assert!(faults[0].expected.contains("green, red, blue"), "{faults:?}");
     parsed(green_first).unwrap();
+}
+
+#[test]
+fn a_panel_may_lie_in_a_larger_video_frame() {
+    let with =
+        |keys: &str| Rig::parse(&changed(&[("refresh_hz = ", &format!("{keys}\nrefresh_hz = "))]), Path::new(""));
+    let plain = with("").unwrap();
+    assert_eq!(plain.panel.video_margins, VideoMargins::default());
+    let Resolution { width, height } = plain.resolution();
+    let keys = format!(
+        "video_width_px = {}\nvideo_height_px = {}\nvideo_left_px = 8\nvideo_top_px = 1",
+        width + 80,
+        height + 4
+    );
+    let rig = with(&keys).unwrap();
+    assert_eq!(rig.panel.video_margins, VideoMargins { left: 8, right: 72, top: 1, bottom: 3 });
+    assert_eq!(rig.resolution(), plain.resolution(), "the panel's own pixels stay");
+    let video = Resolution { width: width + 80, height: height + 4 };
+    assert_eq!(rig.panel.video_margins.around(rig.resolution()), video);
+    let text = rig.meaning().to_string();
+    let said = format!("pixels in a video frame of {}x{} from column 8, row 1 on;", width + 80, height + 4);
+    assert!(text.contains(&said), "{said} is not in\n{text}");
+    let expected =
+        ["video_width_px", "video_height_px", "video_left_px", "video_top_px"].map(|key| format!("panel.{key}"));
+    assert_eq!(rig.differences(&plain), expected);
+
+    let profile = format!("profile = \"hamamatsu-x15213\"\nwidth_px = {width}\nrefresh_hz = ");
+    assert!(width > 1280, "the profile's frame is narrower");
+    let text = changed(&[(&format!("width_px = {width}\n"), ""), ("refresh_hz = ", &profile)]);
+    let faults = Rig::parse(&text, Path::new("")).unwrap_err().faults;
+    assert_eq!(faults[0].key, "panel.video_width_px", "{faults:?}");
+}
+
+#[test]
+fn a_video_frame_that_does_not_hold_the_panel_is_refused() {
+    let fault = |keys: &str, key: &str, found: &str, expected: &str, advice: &str| {
+        let fault = fault_of("refresh_hz = ", &format!("{keys}\nrefresh_hz = "));
+        assert_fault(&fault, key, line_of("refresh_hz"), found, expected, advice);
+    };
+    let least = "at least 1920 px, width_px and video_left_px together";
+    fault("video_width_px = 1280", "panel.video_width_px", "1280 px", least, "the mode");
+    let rows = "video_height_px = 1080";
+    let above = fault_of("refresh_hz = ", &format!("{rows}\nvideo_top_px = 2\nrefresh_hz = "));
+    let least = "at least 1082 px, height_px and video_top_px together";
+    assert_fault(&above, "panel.video_height_px", line_of("refresh_hz"), "1080 px", least, "");
+    fault("video_left_px = 8", "panel.video_left_px", "alone", "video_width_px beside it", "add video_width_px");
+    fault("video_left_px = -1", "panel.video_left_px", "-1", "16384", "");
 }
 
 #[test]

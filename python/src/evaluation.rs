@@ -7,7 +7,7 @@ use holod_daemon::evaluation::{EvaluationPlan, EvaluationSettings};
 use holod_daemon::failure::{Exit, Failure};
 use pyo3::prelude::*;
 
-use crate::outcome::{Count, HolodError, count, with_threads};
+use crate::outcome::{Count, HolodError, optional_count, with_threads};
 use crate::renderer::backend_named;
 use crate::rig::Rig;
 use crate::view::pupil;
@@ -38,7 +38,7 @@ pub(crate) fn evaluate<'py>(
     marks: Option<PathBuf>,
     pupils_mm: Option<Vec<f32>>,
     limit: Option<Count>,
-    #[pyo3(from_py_with = count)] border_px: usize,
+    #[pyo3(from_py_with = border_px)] border_px: usize,
     backend: &str,
 ) -> PyResult<Bound<'py, PyAny>> {
     let rig = Rig::with_weights(rig, weights.as_deref())?;
@@ -51,7 +51,7 @@ pub(crate) fn evaluate<'py>(
         cards: cards.as_deref(),
         marks: marks.as_deref(),
         pupils: &pupils,
-        limit: limit.map(|Count(scenes)| scenes),
+        limit: optional_count(limit, "limit")?,
         border_px,
     };
     let mut interrupt = None;
@@ -73,4 +73,8 @@ pub(crate) fn evaluate<'py>(
 /// The Python value of a JSON text.
 pub(crate) fn from_json<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyAny>> {
     py.import("json")?.call_method1("loads", (text,)).map_err(|error| HolodError::new_err(error.to_string()))
+}
+
+fn border_px(given: &Bound<'_, PyAny>) -> PyResult<usize> {
+    given.extract::<Count>()?.of("border_px")
 }

@@ -63,26 +63,34 @@ pub(crate) fn exception(failure: &Failure) -> PyErr {
     }
 }
 
-/// A whole number from 0 on as an argument: Python's own error for a negative one is none of this package's.
-pub(crate) struct Count(pub(crate) usize);
+/// A whole number from 0 on as an argument, or what was given in its place: Python's own error for a negative one is
+/// none of this package's, and does not name the argument.
+pub(crate) struct Count(Result<usize, String>);
+
+impl Count {
+    /// The number; `argument` is the name that a refusal gives it.
+    pub(crate) fn of(self, argument: &str) -> PyResult<usize> {
+        let expected = usize::MAX;
+        self.0.map_err(|found| {
+            InputError::new_err(format!("{argument}: found {found}, expected a whole number from 0 to {expected}"))
+        })
+    }
+}
+
+/// The number of an argument that may be left out.
+pub(crate) fn optional_count(given: Option<Count>, argument: &str) -> PyResult<Option<usize>> {
+    given.map(|count| count.of(argument)).transpose()
+}
 
 impl<'py> FromPyObject<'_, 'py> for Count {
     type Error = PyErr;
 
     fn extract(given: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
-        given.extract::<usize>().map(Self).map_err(|error| {
-            if error.is_instance_of::<PyOverflowError>(given.py()) {
-                InputError::new_err(format!("found {}, expected a whole number from 0 to {}", *given, usize::MAX))
-            } else {
-                error
-            }
-        })
+        match given.extract::<usize>() {
+            Err(error) if error.is_instance_of::<PyOverflowError>(given.py()) => Ok(Self(Err(given.to_string()))),
+            extracted => extracted.map(|count| Self(Ok(count))),
+        }
     }
-}
-
-/// The same for an argument with a default.
-pub(crate) fn count(given: &Bound<'_, PyAny>) -> PyResult<usize> {
-    given.extract().map(|Count(count)| count)
 }
 
 /// Keeps what is warned of in the thread that it is set for.

@@ -10,7 +10,7 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 use pyo3::prelude::*;
 
 use crate::arrays::{Given, array};
-use crate::outcome::{Count, InputError, RigError, exception, with_threads, without_lock};
+use crate::outcome::{Count, InputError, RigError, exception, optional_count, with_threads, without_lock};
 
 /// More turns than this are no phase: the encoder's arithmetic is exact to it.
 const MOST_TURNS: f32 = 50.0;
@@ -247,8 +247,8 @@ pub(crate) fn pattern_resolution(
 ) -> PyResult<Resolution> {
     let panel = rig.resolution();
     let resolution = Resolution {
-        width: width_px.map_or(panel.width, |Count(px)| px),
-        height: height_px.map_or(panel.height, |Count(px)| px),
+        width: optional_count(width_px, "width_px")?.unwrap_or(panel.width),
+        height: optional_count(height_px, "height_px")?.unwrap_or(panel.height),
     };
     check_size(resolution, rig)?;
     Ok(resolution)

@@ -9,7 +9,7 @@ use numpy::PyArrayMethods;
 use pyo3::prelude::*;
 
 use crate::arrays::{array, interleaved};
-use crate::outcome::{Count, InputError, without_lock};
+use crate::outcome::{Count, InputError, optional_count, without_lock};
 use crate::rig::Rig;
 
 /// rgb, depth, frames, frames a second, pixels without a depth, pixels that were clipped.
@@ -31,9 +31,10 @@ pub(crate) fn read_scene<'py>(
 ) -> PyResult<Read<'py>> {
     let geometry = Rig::given(rig).geometry;
     let fit: Fit = serde_json::from_value(fit.into()).map_err(|why| InputError::new_err(format!("fit: {why}")))?;
-    let size = match (width_px, height_px) {
+    let frame = frame.of("frame")?;
+    let size = match (optional_count(width_px, "width_px")?, optional_count(height_px, "height_px")?) {
         (None, None) => None,
-        (Some(Count(width)), Some(Count(height))) => Some(checked(Resolution { width, height })?),
+        (Some(width), Some(height)) => Some(checked(Resolution { width, height })?),
         _ => {
             return Err(InputError::new_err(
                 "width_px and height_px: found one of them, expected both, or none for the picture's own size",
@@ -44,7 +45,7 @@ pub(crate) fn read_scene<'py>(
         let data = Failure::because(Exit::Data);
         let encoding = depth_encoding.map(|text| DepthEncoding::parse(text, &geometry)).transpose().map_err(&data)?;
         let scene = Scene::open(path, encoding).map_err(&data)?;
-        let mut picture = scene.picture(frame.0, &geometry, size, fit).map_err(&data)?;
+        let mut picture = scene.picture(frame, &geometry, size, fit).map_err(&data)?;
         picture.linear = interleaved(&picture.linear);
         Ok((scene, picture))
     })?;
@@ -67,8 +68,8 @@ pub(crate) fn render_builtin_scene(
     width_px: Option<Count>,
     height_px: Option<Count>,
 ) -> PyResult<(Bound<'_, PyAny>, Bound<'_, PyAny>)> {
-    let width = width_px.map_or(SAMPLE_RESOLUTION.width, |Count(px)| px);
-    let height = height_px.map_or(SAMPLE_RESOLUTION.height, |Count(px)| px);
+    let width = optional_count(width_px, "width_px")?.unwrap_or(SAMPLE_RESOLUTION.width);
+    let height = optional_count(height_px, "height_px")?.unwrap_or(SAMPLE_RESOLUTION.height);
     let size = checked(Resolution { width, height })?;
     let (pixels, depth) = without_lock(py, || {
         let picture = scene_renderer::sample_scene(size).picture();

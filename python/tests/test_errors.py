@@ -382,10 +382,12 @@ def test_a_forked_process_is_told_that_it_has_no_threads(tmp_path: Path) -> None
 
 
 def test_numbers_that_are_none_are_input_errors() -> None:
-    with pytest.raises(holod.InputError, match="found -1, expected a whole number from 0 to"):
+    with pytest.raises(holod.InputError, match="width_px: found -1, expected a whole number from 0 to"):
         holod.Renderer(width_px=-1, height_px=8)
-    with pytest.raises(holod.InputError, match="found -2, expected a whole number"):
+    with pytest.raises(holod.InputError, match="height_px: found -2, expected a whole number"):
         holod.builtin_scene(8, -2)
+    with pytest.raises(holod.InputError, match="border_px: found -3, expected a whole number"):
+        holod.evaluate("scenes", border_px=-3)
     with pytest.raises(TypeError):
         holod.Renderer(width_px=1.5)  # type: ignore[arg-type]
     for depth_dpt in (float("nan"), float("inf")):

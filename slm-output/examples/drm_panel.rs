@@ -1,12 +1,13 @@
 //! Drives a connector as holod does, with patterns that are known, and tells what came of it: what `tests/qemu/display`
 //! judges. It can be run on any machine with a connector to spare.
 //!
-//! - `drm_panel show CONNECTOR WIDTHxHEIGHT@HZ MODE [refreshes=N] [losses=N] [crc=FOLDER] [wrong=level|submission]`
+//! - `drm_panel show CONNECTOR WIDTHxHEIGHT@HZ MODE [refreshes=N] [losses=N] [crc=FOLDER]
+//!   [margins=LEFT,RIGHT,TOP,BOTTOM] [wrong=level|submission]`
 //!   shows a new frame as often as the panel takes one, until `losses` losses are over and N refreshes have come since.
 //!   `crc` is the controller's folder in debugfs (such as `/sys/kernel/debug/dri/0/crtc-0/crc`), whose check sums of
-//!   what was scanned out are compared with those of the patterns; only vkms's are known. `wrong` is there so that a
-//!   test of this can be shown to fail: `level` expects another level in one pattern, `submission` leaves out a frame
-//!   now and then.
+//!   what was scanned out are compared with those of the patterns; only vkms's are known. `margins` are of the video
+//!   frame around the panel, in pixels of the mode. `wrong` is there so that a test of this can be shown to fail:
+//!   `level` expects another level in one pattern, `submission` leaves out a frame now and then.
 //! - `drm_panel steal PROCESS CARD MILLISECONDS` takes the card away from a process, as a session manager does, is its
 //!   master for a while, and lets it go.
 //! - `drm_panel hold CARD MILLISECONDS` is the card's master for a while.
@@ -24,7 +25,7 @@ use std::time::Duration;
 
 use crc::{Algorithm, Crc};
 use drm::Device;
-use holod_calibration::rig::{Panel, PanelMode, Rig};
+use holod_calibration::rig::{Panel, PanelMode, Rig, VideoMargins};
 use holod_calibration::{Colour, Resolution, TimeNs, host_now};
 use holod_slm_output::fields::FrameTag;
 use holod_slm_output::present::drm::{DrmPanel, DrmTarget, Verdict};
@@ -75,15 +76,28 @@ struct Options {
     crc: Option<PathBuf>,
     wrong_level: bool,
     wrong_submission: bool,
+    margins: VideoMargins,
 }
 
 fn parse_options(words: &[&str]) -> Result<Options, Box<dyn Error>> {
-    let mut options = Options { refreshes: 1000, losses: 0, crc: None, wrong_level: false, wrong_submission: false };
+    let mut options = Options {
+        refreshes: 1000,
+        losses: 0,
+        crc: None,
+        wrong_level: false,
+        wrong_submission: false,
+        margins: VideoMargins::default(),
+    };
     for word in words {
         match word.split_once('=') {
             Some(("refreshes", count)) => options.refreshes = count.parse()?,
             Some(("losses", count)) => options.losses = count.parse()?,
             Some(("crc", folder)) => options.crc = Some(folder.into()),
+            Some(("margins", pixels)) => {
+                let pixels: Vec<usize> = pixels.split(',').map(str::parse).collect::<Result<_, _>>()?;
+                let [left, right, top, bottom] = pixels[..] else { return Err("margins=LEFT,RIGHT,TOP,BOTTOM".into()) };
+                options.margins = VideoMargins { left, right, top, bottom };
+            }
             Some(("wrong", "level")) => options.wrong_level = true,
             Some(("wrong", "submission")) => options.wrong_submission = true,
             _ => return Err(format!("no option is `{word}`").into()),
@@ -120,8 +134,16 @@ fn pattern(layout: FrameLayout, seed: u64) -> LevelsFrame {
     frame
 }
 
-/// The R, G and B that the pixel `index` shows at `field`.
+/// The R, G and B of the video frame's pixel `index` at `field`.
 fn pixel(frame: &LevelsFrame, field: usize, index: usize) -> [u16; 3] {
+    let FrameLayout { resolution: Resolution { width, height }, video_margins: VideoMargins { left, top, .. }, .. } =
+        frame.layout();
+    let video_width = frame.layout().video_resolution().width;
+    let (column, row) = (index % video_width, index / video_width);
+    if !(left..left + width).contains(&column) || !(top..top + height).contains(&row) {
+        return [0; 3];
+    }
+    let index = (row - top) * width + column - left;
     match frame.layout().mode {
         PanelMode::ChannelPacked => [0, 1, 2].map(|channel| frame.samples()[3 * index + channel]),
         _ => [frame.plane(frame.layout().colour_of_field(field))[index]; 3],
@@ -133,7 +155,7 @@ fn vkms_crc(frame: &LevelsFrame, field: usize, wrong: bool) -> u32 {
     const PLAIN: Algorithm<u32> = Algorithm { init: 0, xorout: 0, ..crc::CRC_32_ISO_HDLC };
     let crc = Crc::<u32>::new(&PLAIN);
     let mut digest = crc.digest();
-    for index in 0..frame.layout().resolution.pixels() {
+    for index in 0..frame.layout().video_resolution().pixels() {
         let [red, green, mut blue] = pixel(frame, field, index);
         if wrong && index == 1234 {
             blue ^= 1;
@@ -189,7 +211,11 @@ struct Notes {
 
 fn show(connector: &str, mode: &str, panel_mode: &str, options: &[&str]) -> Result<(), Box<dyn Error>> {
     let options = parse_options(options)?;
-    let (panel, resolution) = parse_panel(mode, panel_mode)?;
+    let (panel, video) = parse_panel(mode, panel_mode)?;
+    let video_margins = options.margins;
+    let VideoMargins { left, right, top, bottom } = video_margins;
+    let resolution = Resolution { width: video.width - left - right, height: video.height - top - bottom };
+    let panel = Panel { video_margins, ..panel };
     let layout = FrameLayout::new(&panel, resolution);
     let patterns: Vec<LevelsFrame> = (0..PATTERNS).map(|seed| pattern(layout, seed)).collect();
     let flat = LevelsFrame::new(layout);

@@ -1,6 +1,6 @@
 //! The levels of a colour frame as the panel is sent them, and back again.
 
-use holod_calibration::rig::{Packing, Panel, PanelMode};
+use holod_calibration::rig::{Packing, Panel, PanelMode, VideoMargins};
 use holod_calibration::{Colour, Resolution};
 use rayon::prelude::*;
 
@@ -22,13 +22,20 @@ pub struct FrameLayout {
     pub frames_per_colour: u8,
     /// Where the bits of a level travel on the video link.
     pub packing: Packing,
+    /// What the video frame has around the panel's pixels.
+    pub video_margins: VideoMargins,
 }
 
 impl FrameLayout {
     /// The layout for `panel` with `resolution` pixels.
     pub fn new(panel: &Panel, resolution: Resolution) -> Self {
-        let Panel { mode, field_order, channel_order, frames_per_colour, packing, .. } = *panel;
-        Self { resolution, mode, field_order, channel_order, frames_per_colour, packing }
+        let Panel { mode, field_order, channel_order, frames_per_colour, packing, video_margins, .. } = *panel;
+        Self { resolution, mode, field_order, channel_order, frames_per_colour, packing, video_margins }
+    }
+
+    /// Pixels of the video frame: the panel's, and those around them.
+    pub fn video_resolution(&self) -> Resolution {
+        self.video_margins.around(self.resolution)
     }
 
     /// Colour fields from the start of one colour frame to the start of the next.
@@ -322,6 +329,7 @@ mod tests {
                 channel_order: Colour::ALL,
                 frames_per_colour: 1,
                 packing: Packing::Gray,
+                video_margins: VideoMargins::default(),
             };
             let mut frame = LevelsFrame::new(layout);
             let given = [red, green, blue];
@@ -349,6 +357,7 @@ mod tests {
             channel_order: Colour::ALL,
             frames_per_colour: 1,
             packing: Packing::Gray,
+            video_margins: VideoMargins::default(),
         };
         let mut frame = LevelsFrame::new(layout);
         frame.field_mut(Colour::Red).write(&[10, 11]);
@@ -368,6 +377,7 @@ mod tests {
             channel_order: Colour::ALL,
             frames_per_colour: 2,
             packing: Packing::Gray,
+            video_margins: VideoMargins::default(),
         };
         let [blue, red, green] = field_order;
         let shown: Vec<_> = (0..layout.fields()).map(|field| layout.colour_of_field(field)).collect();

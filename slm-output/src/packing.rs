@@ -4,7 +4,7 @@
 //! and [`pack_row`] do the same for whole pictures as fast as memory allows.
 
 use holod_calibration::Colour;
-use holod_calibration::rig::{Packing, PanelMode};
+use holod_calibration::rig::{Packing, PanelMode, VideoMargins};
 
 use crate::fields::{FIELDS, FrameLayout, LevelsFrame};
 
@@ -46,7 +46,8 @@ pub const fn channels(packing: Packing, level: u16) -> [u16; 3] {
 }
 
 /// Writes the video frame that begins with the `first_field`-th field of the colour frame `levels` to `pixels`, whose
-/// rows are `pitch` bytes apart. What lies behind the end of a row stays as it is. Neither allocates nor locks.
+/// rows are `pitch` bytes apart; around the panel's pixels level 0. What lies behind the end of a row stays as it is.
+/// Neither allocates nor locks.
 ///
 /// Each byte is written once and in order, and none is read, as memory wants it that the processor does not cache.
 ///
@@ -55,12 +56,28 @@ pub const fn channels(packing: Packing, level: u16) -> [u16; 3] {
 /// the frame's packing needs.
 pub fn write_frame(levels: &LevelsFrame, first_field: usize, format: PixelFormat, pitch: usize, pixels: &mut [u8]) {
     let layout = levels.layout();
-    let row_bytes = PIXEL_BYTES * layout.resolution.width;
-    let rows = pixels.chunks_mut(pitch).take(layout.resolution.height);
-    assert_eq!(rows.len(), layout.resolution.height, "a video frame has {} rows", layout.resolution.height);
+    let (video, VideoMargins { left, top, .. }) = (layout.video_resolution(), layout.video_margins);
+    let panel_rows = top..top + layout.resolution.height;
+    let panel_bytes = PIXEL_BYTES * left..PIXEL_BYTES * (left + layout.resolution.width);
+    let rows = pixels.chunks_mut(pitch).take(video.height);
+    assert_eq!(rows.len(), video.height, "a video frame has {} rows", video.height);
     for (row, pixels) in rows.enumerate() {
-        pack_row(&layout, levels.video_row(first_field, row), format, &mut pixels[..row_bytes]);
+        let pixels = &mut pixels[..PIXEL_BYTES * video.width];
+        if panel_rows.contains(&row) {
+            fill(format, &mut pixels[..panel_bytes.start]);
+            let samples = levels.video_row(first_field, row - top);
+            pack_row(&layout, samples, format, &mut pixels[panel_bytes.clone()]);
+            fill(format, &mut pixels[panel_bytes.end..]);
+        } else {
+            fill(format, pixels);
+        }
     }
+}
+
+/// Writes pixels of level 0, which is black in every packing.
+fn fill(format: PixelFormat, pixels: &mut [u8]) {
+    let black = u32::MAX << (3 * format.channel_bits());
+    pixels.as_chunks_mut::<PIXEL_BYTES>().0.fill(black.to_le_bytes());
 }
 
 /// Writes one row of a video frame: `samples` as [`LevelsFrame::video_row`] gives them, `pixels` of [`PIXEL_BYTES`]
@@ -155,6 +172,7 @@ mod tests {
             channel_order: Colour::ALL,
             frames_per_colour: 1,
             packing,
+            video_margins: VideoMargins::default(),
         }
     }
 
@@ -276,6 +294,50 @@ mod tests {
                     let channels = if channel_order == Colour::ALL { shown } else { [third, first, second] };
                     prop_assert_eq!(bytes, bytes_of(format, channels));
                     prop_assert_eq!(layout.channels_of(shown), channels);
+                }
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn around_the_panel_a_video_frame_is_black_and_inside_it_is_the_panels(
+            [left, right, top, bottom] in prop::array::uniform4(0usize..4), packed in any::<bool>(),
+            packing in prop::sample::select(&Packing::ALL[..]), extra in 0usize..9, seed in any::<u16>(),
+        ) {
+            let packed = packed && matches!(packing, Packing::Gray | Packing::Gray10);
+            let mode = if packed { PanelMode::ChannelPacked } else { PanelMode::FieldSequential };
+            let resolution = Resolution { width: 5, height: 3 };
+            let plain = FrameLayout { resolution, ..layout(mode, packing) };
+            let framed = FrameLayout { video_margins: VideoMargins { left, right, top, bottom }, ..plain };
+            let levels_mask = ((1u32 << packing.bit_depth()) - 1) as u16;
+            let frames = [plain, framed].map(|layout| {
+                let mut frame = LevelsFrame::new(layout);
+                for (index, sample) in frame.samples_mut().iter_mut().enumerate() {
+                    *sample = (index as u16 + 1).wrapping_mul(seed | 1) & levels_mask;
+                }
+                frame
+            });
+            for format in formats(packing) {
+                let [panel, video] = frames.each_ref().map(|frame| {
+                    let video = frame.layout().video_resolution();
+                    let pitch = PIXEL_BYTES * video.width + extra;
+                    let mut pixels = vec![0xee; pitch * video.height];
+                    write_frame(frame, 0, format, pitch, &mut pixels);
+                    pixels.chunks(pitch).map(<[u8]>::to_vec).collect::<Vec<_>>()
+                });
+                let black = bytes_of(format, channels(packing, 0));
+                for (y, row) in video.iter().enumerate() {
+                    for (x, pixel) in row.as_chunks::<PIXEL_BYTES>().0[..left + 5 + right].iter().enumerate() {
+                        let inside = (left..left + 5).contains(&x) && (top..top + 3).contains(&y);
+                        let expected = if inside {
+                            &panel[y - top][PIXEL_BYTES * (x - left)..][..PIXEL_BYTES]
+                        } else {
+                            &black
+                        };
+                        prop_assert_eq!(&pixel[..], expected, "column {}, row {}", x, y);
+                    }
+                    prop_assert!(row[row.len() - extra..].iter().all(|&byte| byte == 0xee), "behind the row");
                 }
             }
         }

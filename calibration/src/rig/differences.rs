@@ -1,7 +1,7 @@
 //! What one rig has that another has not, by the keys of the rig file.
 
 use super::{Lasers, Model, Panel, Rig, Tracker};
-use crate::DisplayGeometry;
+use crate::{DisplayGeometry, Resolution};
 
 impl Rig {
     /// The keys, such as `tracker.hold_ms`, whose figures in `self` are not those in `other`. A panel profile counts as
@@ -18,6 +18,7 @@ impl Rig {
             frames_per_colour,
             bit_depth,
             packing,
+            video_margins,
             orientation,
             phase_sign,
             stroke_rad,
@@ -41,10 +42,16 @@ impl Rig {
         } = lasers;
         let Tracker { spec, eye, scale, fallback, hold } = tracker;
         let Model { weights } = model;
+        let none = Resolution { width: 0, height: 0 };
+        let (margins, other_margins) = (video_margins.around(none), other.panel.video_margins.around(none));
         [
             ("name", *name == other.name),
             ("panel.width_px", resolution.width == other.geometry.resolution.width),
             ("panel.height_px", resolution.height == other.geometry.resolution.height),
+            ("panel.video_width_px", margins.width == other_margins.width),
+            ("panel.video_height_px", margins.height == other_margins.height),
+            ("panel.video_left_px", video_margins.left == other.panel.video_margins.left),
+            ("panel.video_top_px", video_margins.top == other.panel.video_margins.top),
             ("panel.pixel_pitch_um", *pixel_pitch == other.geometry.pixel_pitch),
             ("panel.refresh_hz", *refresh_hz == other.panel.refresh_hz),
             ("panel.mode", *mode == other.panel.mode),

@@ -7,8 +7,8 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::{LaserDriver, Lasers, Orientation, Panel, PanelMode, PanelProfile, Rig, Tracker};
-use crate::{Colour, PerColour, PupilDiameter, TimeNs};
+use super::{LaserDriver, Lasers, Orientation, Panel, PanelMode, PanelProfile, Rig, Tracker, VideoMargins};
+use crate::{Colour, PerColour, PupilDiameter, Resolution, TimeNs};
 
 /// The pupils for which blur is worked out.
 const PUPILS_MM: [f32; 3] = [2.0, 3.0, 4.0];
@@ -47,6 +47,8 @@ pub struct Meaning {
     pub width_px: usize,
     /// Panel height in pixels.
     pub height_px: usize,
+    /// The video frame around the panel's pixels; absent where it is theirs.
+    pub video: Option<VideoMeaning>,
     /// Angle that one pixel subtends at the eye.
     pub pixel_angle_mrad: f64,
     /// Field of view across the panel's width and height.
@@ -126,6 +128,19 @@ pub struct FieldMeaning {
     pub laser_off_ms: f64,
     /// Share of the field for which the laser is lit.
     pub lit_share: f64,
+}
+
+/// A video frame that is larger than the panel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct VideoMeaning {
+    /// Its width in pixels.
+    pub width_px: usize,
+    /// Its height in pixels.
+    pub height_px: usize,
+    /// The column that the panel shows first.
+    pub left_px: usize,
+    /// The row that it shows first.
+    pub top_px: usize,
 }
 
 /// The lasers and what keeps them in bounds.
@@ -208,6 +223,7 @@ impl Meaning {
             panel_profile: rig.provenance.panel_profile.map(str::to_owned),
             width_px: geometry.resolution.width,
             height_px: geometry.resolution.height,
+            video: VideoMeaning::of(rig),
             pixel_angle_mrad: geometry.pixel_angle_rad() * 1e3,
             field_of_view_deg,
             depth_far_dpt: geometry.depth_far.0,
@@ -229,6 +245,26 @@ impl Meaning {
             files: active_files(rig),
             notes: notes(rig),
         }
+    }
+}
+
+impl VideoMeaning {
+    fn of(rig: &Rig) -> Option<Self> {
+        let margins = rig.panel.video_margins;
+        let Resolution { width, height } = margins.around(rig.geometry.resolution);
+        (margins != VideoMargins::default()).then_some(Self {
+            width_px: width,
+            height_px: height,
+            left_px: margins.left,
+            top_px: margins.top,
+        })
+    }
+}
+
+impl fmt::Display for VideoMeaning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { width_px, height_px, left_px, top_px } = self;
+        write!(f, "in a video frame of {width_px}x{height_px} from column {left_px}, row {top_px} on")
     }
 }
 
@@ -530,6 +566,9 @@ impl fmt::Display for Meaning {
         }
         writeln!(f)?;
         write!(f, "panel          {}x{} pixels", self.width_px, self.height_px)?;
+        if let Some(video) = &self.video {
+            write!(f, " {video}")?;
+        }
         if let Some(profile) = &self.panel_profile {
             write!(f, ", profile {profile}")?;
         }

@@ -88,6 +88,8 @@ pub struct Panel {
     pub bit_depth: u8,
     /// Where these bits travel on the video link.
     pub packing: Packing,
+    /// What the video frame has around the panel's own pixels.
+    pub video_margins: VideoMargins,
     /// How patterns lie on it; look-up tables and flatness are the panel's own and stay.
     pub orientation: Orientation,
     /// Whether a higher level retards or advances the phase.
@@ -104,6 +106,30 @@ pub struct Panel {
     pub flatness_rad: PerColour<Option<Vec<f32>>>,
     /// Time from the panel's update to a settled phase.
     pub settle: TimeNs,
+}
+
+/// Columns and rows of a video frame around the panel's own pixels, for panels that take a larger frame than they show.
+/// They carry level 0.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct VideoMargins {
+    /// Columns before the panel's first one.
+    pub left: usize,
+    /// Columns behind its last one.
+    pub right: usize,
+    /// Rows above its first one.
+    pub top: usize,
+    /// Rows below its last one.
+    pub bottom: usize,
+}
+
+impl VideoMargins {
+    /// The video frame's size, around a panel of `resolution`.
+    pub const fn around(self, resolution: Resolution) -> Resolution {
+        Resolution {
+            width: self.left + resolution.width + self.right,
+            height: self.top + resolution.height + self.bottom,
+        }
+    }
 }
 
 /// How the three colour fields of a frame are carried to the panel.
@@ -310,6 +336,7 @@ impl Default for Rig {
                 frames_per_colour: 1,
                 bit_depth: 8,
                 packing: Packing::Gray,
+                video_margins: VideoMargins::default(),
                 orientation: Orientation::Normal,
                 phase_sign: PhaseSign::Positive,
                 stroke_rad: PerColour([std::f64::consts::TAU * 255.0 / 256.0; 3]),

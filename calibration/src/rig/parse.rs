@@ -10,7 +10,7 @@ use super::profile::PanelProfile;
 use super::reader::{Found, Reader, Section, Span};
 use super::{
     Eye, LaserDriver, Lasers, LevelPhase, Model, Orientation, OutOfStroke, Packing, Panel, PanelMode, PhaseSign,
-    Provenance, Rig, RigError, SpecReader, TextLaserProfile, Tracker, WeightsChoice, flatness, lut,
+    Provenance, Rig, RigError, SpecReader, TextLaserProfile, Tracker, VideoMargins, WeightsChoice, flatness, lut,
 };
 use crate::toml_source::Fault;
 use crate::{Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, TimeNs};
@@ -25,6 +25,10 @@ const LAYOUT: [(&str, &[&str]); 6] = [
             "width_px",
             "height_px",
             "pixel_pitch_um",
+            "video_width_px",
+            "video_height_px",
+            "video_left_px",
+            "video_top_px",
             "refresh_hz",
             "mode",
             "field_order",
@@ -84,9 +88,21 @@ const RETIRED: [(&str, &str, &str); 1] =
     [("model", "allow_optics_mismatch", "remove it: networks compute with the rig's own optics")];
 
 /// The keys that a panel profile gives.
-const PROFILE_KEYS: [&str; 6] = ["width_px", "height_px", "pixel_pitch_um", "refresh_hz", "bit_depth", "packing"];
+const PROFILE_KEYS: [&str; 10] = [
+    "width_px",
+    "height_px",
+    "pixel_pitch_um",
+    "video_width_px",
+    "video_height_px",
+    "video_left_px",
+    "video_top_px",
+    "refresh_hz",
+    "bit_depth",
+    "packing",
+];
 
 const PIXELS: Span = Span::new(64.0, 16384.0, "px");
+const MARGIN: Span = Span::new(0.0, 16384.0, "px");
 const PITCH: Span = Span::new(1.0, 50.0, "µm").slips(&[("metres", 1e6), ("millimetres", 1e3), ("nanometres", 1e-3)]);
 const REFRESH: Span = Span::new(10.0, 2000.0, "Hz").slips(&[("millihertz", 1e-3)]);
 const FRAMES_PER_COLOUR: Span = Span::new(1.0, 8.0, "video frames");
@@ -165,6 +181,7 @@ fn read_rig<'a>(
         panel = panel.excusing(&PROFILE_KEYS);
     }
     let pixels = read_pixels(reader, panel);
+    let video_margins = read_video_margins(reader, panel, pixels.map(|(resolution, _)| resolution));
     let timing = read_field_timing(reader, panel);
     let levels = read_levels(reader, panel, timing.map(|timing| timing.mode));
     let phase = read_phase(reader, panel, levels, pixels.map(|(resolution, _)| resolution), folder, &mut provenance);
@@ -183,6 +200,7 @@ fn read_rig<'a>(
         settle: milliseconds(timing.settle_ms.value),
         bit_depth,
         packing,
+        video_margins: video_margins?,
         orientation: phase.orientation,
         phase_sign: phase.sign,
         stroke_rad: phase.stroke_rad,
@@ -210,6 +228,40 @@ fn read_pixels<'a>(reader: &Reader<'a>, panel: Section<'a>) -> Option<(Resolutio
     });
     let pitch_um = reader.required_number(panel, "pixel_pitch_um", PITCH);
     Some((Resolution { width: width?, height: height? }, Metres(pitch_um?.value / 1e6)))
+}
+
+fn read_video_margins<'a>(
+    reader: &Reader<'a>,
+    panel: Section<'a>,
+    resolution: Option<Resolution>,
+) -> Option<VideoMargins> {
+    // Before the panel, and behind it.
+    let read = |[size_key, first_key, own_key]: [&'static str; 3], own: Option<usize>| {
+        let first = if panel.gives(first_key) { reader.required_integer(panel, first_key, MARGIN)?.value } else { 0 };
+        if !panel.gives(size_key) {
+            if first == 0 {
+                return Some((0, 0));
+            }
+            let line = reader.line_of_key(panel, first_key);
+            let expected = format!("{size_key} beside it, the size of the video frame");
+            let advice = format!("add {size_key}, or take {first_key} out");
+            reader.fault_in(panel, first_key, line, &format!("{first_key} alone"), &expected, advice);
+            return None;
+        }
+        let size = reader.required_integer(panel, size_key, PIXELS)?;
+        let behind = size.value.checked_sub(first + own?);
+        if behind.is_none() {
+            let least = first + own?;
+            let expected = format!("at least {least} px, {own_key} and {first_key} together");
+            let advice = format!("{size_key} is the size of the mode that the panel's video input takes");
+            reader.fault_in(panel, size_key, size.line, &format!("{} px", size.value), &expected, advice);
+        }
+        Some((first, behind?))
+    };
+    let columns = read(["video_width_px", "video_left_px", "width_px"], resolution.map(|pixels| pixels.width));
+    let rows = read(["video_height_px", "video_top_px", "height_px"], resolution.map(|pixels| pixels.height));
+    let ((left, right), (top, bottom)) = (columns?, rows?);
+    Some(VideoMargins { left, right, top, bottom })
 }
 
 /// The panel as a clock.

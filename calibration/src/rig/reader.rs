@@ -120,6 +120,11 @@ impl<'a> Section<'a> {
         self.table.is_some_and(|table| table.contains_key(key))
     }
 
+    /// Whether the rig file or the panel's profile gives `key`.
+    pub(super) fn gives(&self, key: &str) -> bool {
+        self.has(key) || self.profile.is_some_and(|profile| profile.contains_key(key))
+    }
+
     fn path(&self, key: &str) -> String {
         if self.name.is_empty() { key.into() } else { format!("{}.{key}", self.name) }
     }

@@ -45,10 +45,20 @@ impl Bench {
         spec: &WindowSpec,
         mode: PanelMode,
     ) -> Result<Self, WindowError> {
-        let panel = panel(mode);
-        let mut flat = LevelsFrame::new(FrameLayout::new(&panel, SIZE));
+        Self::open_panel(server, road, spec, panel(mode), SIZE)
+    }
+
+    /// The same for `panel` of `resolution`.
+    pub(crate) fn open_panel(
+        server: DisplayServer,
+        road: Road,
+        spec: &WindowSpec,
+        panel: Panel,
+        resolution: Resolution,
+    ) -> Result<Self, WindowError> {
+        let mut flat = LevelsFrame::new(FrameLayout::new(&panel, resolution));
         for colour in Colour::ALL {
-            flat.field_mut(colour).write(&vec![FLAT; SIZE.pixels()]);
+            flat.field_mut(colour).write(&vec![FLAT; resolution.pixels()]);
         }
         let (sink, source) = frame_channel(&flat);
         let panel = WindowPanel::open(server, road, spec, &PanelSetup { panel, flat })?;

@@ -1,13 +1,13 @@
 //! Under a real X server: what the monitors show, pixel for pixel, and what happens when somebody moves the window, the
 //! monitors or the server.
 
-use holod_calibration::rig::PanelMode;
-use holod_calibration::{Colour, host_now};
+use holod_calibration::rig::{Panel, PanelMode, VideoMargins};
+use holod_calibration::{Colour, Resolution, host_now};
 use holod_slm_output::present::drm::Verdict;
 use holod_slm_output::present::window::{DisplayServer, Road, WindowError};
 use holod_slm_output::present::{AlterationKind, PanelFault, Presenter, TimestampSource, WindowSpec};
 
-use super::bench::{Bench, FLAT, SIZE, differences, expected, levels, named, packed, wait_until};
+use super::bench::{Bench, FLAT, SIZE, differences, expected, levels, named, packed, panel, wait_until};
 use super::x11_server::{Desktop, MAIN, MAIN_PLACE, PANEL, PANEL_PLACE, PANEL_SIZE};
 
 fn open_by(road: Road, desktop: &Desktop, spec: &WindowSpec, mode: PanelMode) -> Result<Bench, WindowError> {
@@ -51,6 +51,27 @@ fn the_pattern_is_on_the_panels_monitor(road: Road) {
     bench.run(|refresh| refresh.frame.is_none()).unwrap();
     bench.run_for(2).unwrap();
     assert_eq!(differences(&desktop.picture(PANEL_PLACE), &flat), []);
+}
+
+#[test]
+fn a_panel_that_shows_a_part_of_its_video_frame_has_black_around_it() {
+    let desktop = Desktop::with_two_monitors();
+    let video_margins = VideoMargins { left: 8, right: 32, top: 3, bottom: 7 };
+    let resolution = Resolution { width: SIZE.width - 40, height: SIZE.height - 10 };
+    for &road in ROADS {
+        let server = DisplayServer::X11(desktop.name.clone());
+        let panel = Panel { video_margins, ..panel(PanelMode::ChannelPacked) };
+        let bench = Bench::open_panel(server, road, &named(PANEL), panel, resolution).unwrap();
+        let mut expected = vec![[0; 3]; SIZE.pixels()];
+        for row in expected.chunks_mut(SIZE.width).skip(3).take(resolution.height) {
+            row[8..8 + resolution.width].fill([FLAT as u8; 3]);
+        }
+        assert_eq!(differences(&desktop.picture(PANEL_PLACE), &expected), []);
+        // Canary: a column further.
+        expected.rotate_right(1);
+        assert_ne!(differences(&desktop.picture(PANEL_PLACE), &expected), []);
+        drop(bench);
+    }
 }
 
 #[test]

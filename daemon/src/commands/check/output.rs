@@ -118,7 +118,8 @@ fn unsure(rig: &Rig, clock_error_ns: i64, jitter_us: u32) -> Option<(bool, Strin
 /// The way to the panel: opened as a run would, with the flat pattern on it, looked at, and closed.
 pub(super) fn panel(rig: &Rig, output: Option<&OutputSpec>) -> Vec<Check> {
     let check = |passed, says| Check { name: "panel", passed, says };
-    let described = format!("{} at {} Hz", rig.resolution(), rig.panel.refresh_hz);
+    let video = rig.meaning().video.map_or(String::new(), |video| format!(" {video},"));
+    let described = format!("{}{video} at {} Hz", rig.resolution(), rig.panel.refresh_hz);
     let spec = match output {
         None | Some(OutputSpec::Headless(_)) => {
             let says = format!(

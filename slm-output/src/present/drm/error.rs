@@ -73,7 +73,8 @@ pub enum DrmError {
     /// The monitor says that it has other pixels.
     #[error(
         "the panel at {connector} has {} by {} pixels, as its EDID says, and the rig says {} by {}. Another panel would \
-         scale the pattern: correct the rig file or the connector", found.width, found.height, wanted.width, wanted.height
+         scale the pattern: correct the connector or the rig file, with `video_width_px` and `video_height_px` where the \
+         panel shows a part of its video frame", found.width, found.height, wanted.width, wanted.height
     )]
     OtherSize {
         connector: String,

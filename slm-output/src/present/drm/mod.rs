@@ -114,7 +114,7 @@ impl DrmPanel {
         let wanted = Wanted {
             asked: target.connector.clone(),
             card: target.card.clone(),
-            size: layout.resolution,
+            size: layout.video_resolution(),
             refresh_hz: setup.panel.refresh_hz,
             channel_bits: layout.packing.channel_bits(),
         };

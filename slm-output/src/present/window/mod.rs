@@ -54,12 +54,15 @@ impl DisplayServer {
     /// The one that the environment names: a compositor, where it names both.
     ///
     /// # Errors
-    /// It names none.
+    /// It names none, or a compositor in a folder that it does not name.
     pub fn from_environment() -> Result<Self, WindowError> {
         let named = |variable| std::env::var(variable).ok().filter(|name| !name.is_empty());
-        if let Some(socket) = named("WAYLAND_DISPLAY") {
-            // An absolute path stays what it is.
-            return Ok(Self::Wayland(Path::new(&named("XDG_RUNTIME_DIR").unwrap_or_default()).join(socket)));
+        if let Some(socket) = named("WAYLAND_DISPLAY").map(PathBuf::from) {
+            return match named("XDG_RUNTIME_DIR") {
+                _ if socket.is_absolute() => Ok(Self::Wayland(socket)),
+                Some(folder) => Ok(Self::Wayland(Path::new(&folder).join(socket))),
+                None => Err(WindowError::NoSocketFolder { socket }),
+            };
         }
         named("DISPLAY").map(Self::X11).ok_or(WindowError::NoServer)
     }
@@ -83,6 +86,15 @@ pub enum WindowError {
         "a window needs a display server, and neither WAYLAND_DISPLAY nor DISPLAY is set; start holod within the desktop's session, or use --output drm:CONNECTOR without one"
     )]
     NoServer,
+    /// The compositor's socket is in no folder.
+    #[error(
+        "WAYLAND_DISPLAY is `{}`, in the folder of XDG_RUNTIME_DIR, which is not set: start holod within the desktop's session, or set it, such as to /run/user/1000",
+        socket.display()
+    )]
+    NoSocketFolder {
+        /// As the environment names it.
+        socket: PathBuf,
+    },
     /// It failed.
     #[error("{server}: {reason}")]
     Server { server: String, reason: String },
@@ -300,7 +312,7 @@ impl WindowPanel {
         let mut window = Self {
             server,
             road,
-            wanted: Wanted { spec: spec.clone(), panel: PanelMonitor::new(panel, layout.resolution) },
+            wanted: Wanted { spec: spec.clone(), panel: PanelMonitor::new(panel, layout.video_resolution()) },
             timing: PanelTiming::new(panel),
             planes,
             refreshes_per_plane: layout.refreshes() / planes,
@@ -317,7 +329,7 @@ impl WindowPanel {
             next_refresh: 0,
             on_its_way: None,
             t_next: TimeNs(0),
-            pixels: vec![0; PIXEL_BYTES * layout.resolution.pixels()],
+            pixels: vec![0; PIXEL_BYTES * layout.video_resolution().pixels()],
         };
         window.open_anew()?;
         Ok(window)
@@ -564,6 +576,6 @@ fn checks(monitor: &Monitor, panel: &PanelMonitor, last: Option<watch::Completio
 
 /// Writes the pixels of the video frame that begins with the `first_field`-th field of `frame`.
 fn write_pixels(frame: &LevelsFrame, first_field: usize, pixels: &mut [u8]) {
-    let layout = frame.layout();
-    write_frame(frame, first_field, FORMAT, PIXEL_BYTES * layout.resolution.width, pixels);
+    let pitch = PIXEL_BYTES * frame.layout().video_resolution().width;
+    write_frame(frame, first_field, FORMAT, pitch, pixels);
 }

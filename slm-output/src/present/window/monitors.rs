@@ -102,14 +102,14 @@ impl fmt::Display for Monitor {
 /// What the monitor must be, from the rig.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PanelMonitor {
-    /// The panel's own pixels.
+    /// Pixels of the video frame that the panel takes.
     pub resolution: Resolution,
     /// Its own refreshes a second.
     pub refresh_hz: f64,
 }
 
 impl PanelMonitor {
-    /// What `panel` with `resolution` pixels asks for.
+    /// What `panel` asks for, whose video frames have `resolution` pixels.
     pub fn new(panel: &Panel, resolution: Resolution) -> Self {
         Self { resolution, refresh_hz: panel.refresh_hz }
     }
