@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use holod_calibration::special_file;
 
 use crate::failure::{Exit, Failure};
+use crate::overwriting::refuse_existing;
 use crate::results;
 use crate::staging::Temporary;
 
@@ -64,28 +65,6 @@ impl Destination {
             }
         }
     }
-}
-
-/// Refuses to overwrite any of `paths`, unless with `force`; devices, pipes and sockets always.
-///
-/// # Errors
-/// One of them is there already.
-pub(crate) fn refuse_existing(
-    paths: impl IntoIterator<Item = PathBuf>,
-    option: &str,
-    force: bool,
-) -> Result<(), Failure> {
-    for path in paths {
-        let found = match special_file(&path) {
-            Some(found) => format!("is {found}, which no file takes the place of; name another place with {option}"),
-            None if !force && path.symlink_metadata().is_ok() => {
-                format!("exists already; name another place with {option}, or overwrite it with --force")
-            }
-            None => continue,
-        };
-        return Err(Failure::new(Exit::CannotCreate, format!("{} {found}", path.display())));
-    }
-    Ok(())
 }
 
 #[cfg(test)]

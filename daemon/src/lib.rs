@@ -15,6 +15,7 @@ mod local_socket;
 pub mod logging;
 mod machine;
 mod memory;
+mod overwriting;
 pub mod page;
 pub mod pictures;
 mod progress;

@@ -85,6 +85,20 @@ pub fn few_pupils(weights: &Weights, bench: &DisplayGeometry) -> Option<String> 
     })
 }
 
+/// Says why a pupil cannot be had, where the weights were not trained for it.
+pub(crate) fn check_pupil(weights: &Weights, bench: &DisplayGeometry, pupil: PupilDiameter) -> Result<(), String> {
+    let [narrowest, widest] = weights.trained_pupils(bench);
+    if (narrowest..=widest).contains(&pupil) {
+        return Ok(());
+    }
+    Err(format!(
+        "found {} mm, expected {:.2} to {:.2} mm, the pupils that these weights were trained for on this bench",
+        pupil.mm(),
+        narrowest.mm(),
+        widest.mm()
+    ))
+}
+
 /// What weights are called in reports.
 pub fn weights_name(weights: &WeightsChoice) -> String {
     match weights {

@@ -9,8 +9,8 @@ use holod_calibration::hangup_is_ignored;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 use tempfile::TempDir;
 
-use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
+use crate::overwriting::refuse_existing;
 
 /// Files on their way into a directory: written in a hidden folder on its disk, moved in by rename when all are whole.
 /// What is half done when a signal ends the process is taken away first.

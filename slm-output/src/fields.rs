@@ -303,6 +303,19 @@ mod tests {
     use proptest::prelude::*;
 
     const SMALL: Resolution = Resolution { width: 5, height: 3 };
+    const TWO: Resolution = Resolution { width: 2, height: 1 };
+
+    fn layout(resolution: Resolution, mode: PanelMode, field_order: [Colour; FIELDS]) -> FrameLayout {
+        FrameLayout {
+            resolution,
+            mode,
+            field_order,
+            channel_order: Colour::ALL,
+            frames_per_colour: 1,
+            packing: Packing::Gray,
+            video_margins: VideoMargins::default(),
+        }
+    }
 
     fn orders() -> impl Strategy<Value = [Colour; FIELDS]> {
         Just(Colour::ALL).prop_shuffle()
@@ -322,15 +335,7 @@ mod tests {
         fn unpacking_gives_back_each_colour_in_its_place(
             field_order in orders(), mode in modes(), red in levels(), green in levels(), blue in levels(),
         ) {
-            let layout = FrameLayout {
-                resolution: SMALL,
-                mode,
-                field_order,
-                channel_order: Colour::ALL,
-                frames_per_colour: 1,
-                packing: Packing::Gray,
-                video_margins: VideoMargins::default(),
-            };
+            let layout = layout(SMALL, mode, field_order);
             let mut frame = LevelsFrame::new(layout);
             let given = [red, green, blue];
             for colour in Colour::ALL {
@@ -350,15 +355,7 @@ mod tests {
     #[test]
     fn channel_packed_puts_the_first_shown_field_in_the_first_channel() {
         let field_order = [Colour::Green, Colour::Red, Colour::Blue];
-        let layout = FrameLayout {
-            resolution: Resolution { width: 2, height: 1 },
-            mode: PanelMode::ChannelPacked,
-            field_order,
-            channel_order: Colour::ALL,
-            frames_per_colour: 1,
-            packing: Packing::Gray,
-            video_margins: VideoMargins::default(),
-        };
+        let layout = layout(TWO, PanelMode::ChannelPacked, field_order);
         let mut frame = LevelsFrame::new(layout);
         frame.field_mut(Colour::Red).write(&[10, 11]);
         frame.field_mut(Colour::Green).write(&[20, 21]);
@@ -370,15 +367,7 @@ mod tests {
     #[test]
     fn field_sequential_puts_the_first_shown_field_first() {
         let field_order = [Colour::Blue, Colour::Red, Colour::Green];
-        let layout = FrameLayout {
-            resolution: Resolution { width: 2, height: 1 },
-            mode: PanelMode::FieldSequential,
-            field_order,
-            channel_order: Colour::ALL,
-            frames_per_colour: 2,
-            packing: Packing::Gray,
-            video_margins: VideoMargins::default(),
-        };
+        let layout = FrameLayout { frames_per_colour: 2, ..layout(TWO, PanelMode::FieldSequential, field_order) };
         let [blue, red, green] = field_order;
         let shown: Vec<_> = (0..layout.fields()).map(|field| layout.colour_of_field(field)).collect();
         assert_eq!(shown, [blue, blue, red, red, green, green]);

@@ -12,7 +12,7 @@ use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::scene::FocalStackFiles;
 use serde::Serialize;
 
-use super::render::{self, FILES, MadeWith};
+use super::hologram_files::{FILES, MadeWith, save};
 use crate::cli::{Backend, RenderArgs};
 use crate::failure::{Exit, Failure};
 use crate::source::scene;
@@ -61,7 +61,7 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
     };
     let files = FocalStackFiles::open(directory).map_err(scene::failure)?;
     FocalStackEngine::check(&weights, &rig.geometry, files.focuses()).map_err(at_fault)?;
-    render::check_pupil(&weights, &rig.geometry, files.pupil())
+    setup::check_pupil(&weights, &rig.geometry, files.pupil())
         .map_err(|why| Failure::new(Exit::Data, format!("{name}/stack.toml: `pupil_mm`: {why}")))?;
     let (stack, done) = progress::during("loading the focal stack", || {
         files.load(args.scene.resolution, args.scene.fit.into()).map_err(scene::failure)
@@ -83,7 +83,7 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
     })?;
     let frame_ms = computing.elapsed().as_secs_f64() * 1e3;
     let optics = BenchOptics::of(&DisplayGeometry { resolution, ..rig.geometry });
-    render::save(&StoredHologram { hologram, pupil: stack.pupil, optics, amplitude_constant }, &pattern, &staging)?;
+    save(&StoredHologram { hologram, pupil: stack.pupil, optics, amplitude_constant }, &pattern, &staging)?;
     let report = Report {
         made_with: MadeWith::of(rig),
         pupil_mm: stack.pupil.mm(),

@@ -6,6 +6,7 @@ mod ctl;
 mod demo;
 mod evaluate;
 mod focal_stack;
+mod hologram_files;
 mod laser;
 mod log;
 mod pattern;

@@ -4,15 +4,14 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use holod_calibration::rig::Rig;
-use holod_calibration::{Colour, DisplayGeometry, PupilDiameter};
-use holod_model::Weights;
-use holod_model::files::{self, BenchOptics, StoredHologram};
-use holod_model::optics::PhasePattern;
+use holod_calibration::{DisplayGeometry, PupilDiameter};
+use holod_model::files::{BenchOptics, StoredHologram};
 use holod_model::refocus::{self, FAR_CARD, NEAR_CARD};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 use serde::Serialize;
 
 use super::focal_stack;
+use super::hologram_files::{FILES, MadeWith, save};
 use crate::cli::{Backend, RenderArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
 use crate::progress;
@@ -20,30 +19,6 @@ use crate::renderer::{self, Renderer, Use};
 use crate::source::scene;
 use crate::staging::Staging;
 use crate::{results, setup};
-
-/// What a hologram was made with.
-#[derive(Serialize)]
-pub(super) struct MadeWith {
-    /// The network's weights by name, or their file's name.
-    weights: String,
-    /// The rig's name.
-    rig: String,
-    /// Of the rig file's text, as `holod check` states it; none of the built-in rig.
-    rig_hash: Option<String>,
-    /// What 2π would be in the PNGs of phases.
-    phase_png_2pi: u32,
-}
-
-impl MadeWith {
-    pub(super) fn of(rig: &Rig) -> Self {
-        Self {
-            weights: setup::weights_name(&rig.model.weights),
-            rig: rig.name.clone(),
-            rig_hash: rig.provenance.text_hash.map(|hash| format!("{hash:016x}")),
-            phase_png_2pi: files::PHASE_LEVELS,
-        }
-    }
-}
 
 /// What was done, and what the reader should know of it; `report.json`.
 #[derive(Serialize)]
@@ -74,9 +49,6 @@ pub(super) struct Report {
     total_ms: f64,
     files: [&'static str; 5],
 }
-
-pub(super) const FILES: [&str; 5] =
-    ["field.safetensors", "phase_red.png", "phase_green.png", "phase_blue.png", "report.json"];
 
 pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
     let rig = setup::rig_with_network(&args.rig, &args.network)?;
@@ -130,18 +102,6 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
     ))
 }
 
-/// Writes all files but the report.
-pub(super) fn save(hologram: &StoredHologram, pattern: &PhasePattern, staging: &Staging) -> Result<(), Failure> {
-    progress::during("writing the hologram", || {
-        let cannot = Failure::because(Exit::CannotCreate);
-        hologram.save(&staging.path(FILES[0])).map_err(&cannot)?;
-        for (colour, name) in Colour::ALL.into_iter().zip(&FILES[1..4]) {
-            files::save_phase(pattern, colour, &staging.path(name)).map_err(&cannot)?;
-        }
-        Ok(())
-    })
-}
-
 /// A scene's first frame on its way to the panel.
 pub(super) struct Computed {
     /// Holds the hologram and its phases.
@@ -160,7 +120,8 @@ pub(super) fn compute(
     backend: Backend,
 ) -> Result<Computed, Failure> {
     let weights = progress::during("loading the network", || setup::weights(rig))?;
-    check_pupil(&weights, &rig.geometry, pupil).map_err(|why| Failure::new(Exit::Usage, format!("--pupil: {why}")))?;
+    setup::check_pupil(&weights, &rig.geometry, pupil)
+        .map_err(|why| Failure::new(Exit::Usage, format!("--pupil: {why}")))?;
     let frames = progress::during("loading the scene", || scene::first_frame(named, &rig.geometry))?;
     let resolution = frames.resolution();
     let encoder = renderer::panel_encoder(rig, resolution)?;
@@ -199,18 +160,4 @@ pub(super) fn compute(
     };
     let optics = BenchOptics::of(&DisplayGeometry { resolution, ..rig.geometry });
     Ok(Computed { renderer, encoder, levels, optics, report })
-}
-
-/// Says why a pupil cannot be had, where the weights were not trained for it.
-pub(super) fn check_pupil(weights: &Weights, bench: &DisplayGeometry, pupil: PupilDiameter) -> Result<(), String> {
-    let [narrowest, widest] = weights.trained_pupils(bench);
-    if (narrowest..=widest).contains(&pupil) {
-        return Ok(());
-    }
-    Err(format!(
-        "found {} mm, expected {:.2} to {:.2} mm, the pupils that these weights were trained for on this bench",
-        pupil.mm(),
-        narrowest.mm(),
-        widest.mm()
-    ))
 }

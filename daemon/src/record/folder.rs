@@ -9,8 +9,8 @@ use std::time::SystemTime;
 
 use super::sources::{self, BENCH};
 use super::{FILES, shown_levels};
-use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
+use crate::overwriting::refuse_existing;
 
 /// Part of an earlier record, on its way from its place or back to it.
 const MOVING: &str = ".holod-earlier-moving";

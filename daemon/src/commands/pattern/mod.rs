@@ -11,8 +11,8 @@ use holod_slm_output::{FrameLayout, LevelsFrame, OutputSpec, PanelEncoder};
 
 use self::sight::Sight;
 use crate::cli::{PatternKind, PatternTarget};
-use crate::destination::refuse_existing;
 use crate::failure::{Exit, Failure};
+use crate::overwriting::refuse_existing;
 use crate::pictures::video_pictures;
 use crate::session::{NO_ACKNOWLEDGEMENT, not_dark};
 use crate::{results, setup};
