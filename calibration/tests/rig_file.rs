@@ -1213,9 +1213,20 @@ fn a_key_that_is_gone_is_told_with_what_to_do() {
         "allow_optics_mismatch = true",
         "model.allow_optics_mismatch",
         "an unknown key",
-        "one of network, weights_file",
+        "one of network, weights_file, gpu",
         "remove it: networks compute with the rig's own optics",
     );
+}
+
+#[test]
+fn a_gpu_may_be_named() {
+    let plain = Rig::parse(Rig::BUILT_IN_TOML, Path::new("")).unwrap();
+    assert_eq!(plain.model.gpu, None);
+    let text = changed(&[("network = \"standard\"", "network = \"standard\"\ngpu = \"RTX 4090\"")]);
+    let named = Rig::parse(&text, Path::new("")).unwrap();
+    assert_eq!(named.model.gpu.as_deref(), Some("RTX 4090"));
+    assert_eq!(named.differences(&plain), ["model.gpu"]);
+    check("network = \"standard\"", "gpu = \"\"", "model.gpu", "an empty text", "a part of a GPU's name", "");
 }
 
 #[test]

@@ -48,7 +48,7 @@ pub(crate) fn is_gpu(engine: &str) -> bool {
 /// The backend is not to be had at this size, or the rig contradicts itself.
 pub(crate) fn engine_at(rig: &Rig, weights: &Weights, backend: Backend, size: Resolution) -> Result<String, Failure> {
     let encoder = renderer::panel_encoder(rig, size)?;
-    Ok(renderer::open(backend, weights, &rig.geometry, &encoder, &Use::Command)?.description().to_owned())
+    Ok(renderer::open(backend, weights, rig, &encoder, &Use::Command)?.description().to_owned())
 }
 
 /// Frames of all colours that the panel can show in a second.
@@ -157,7 +157,7 @@ impl Timed {
         // A panel of the frame's size: what surrounds the frame would be timed, too, and does not go with its pixels.
         let panel = Panel { flatness_rad: PerColour([None, None, None]), ..rig.panel.clone() };
         let encoder = PanelEncoder::new(&panel, size, size).map(Arc::new).map_err(Failure::because(Exit::Config))?;
-        let renderer = renderer::open(backend, weights, &rig.geometry, &encoder, &Use::Command)?;
+        let renderer = renderer::open(backend, weights, rig, &encoder, &Use::Command)?;
         let (frame, levels) = (Arc::new(scene::sample_frame(size)), LevelsFrame::new(encoder.layout()));
         Self::by(renderer, &frame, usual_pupil(weights, rig), levels)
     }
@@ -210,7 +210,7 @@ pub(crate) fn compare(
     let mut apart = 0.0_f64;
     for strip in strips(size) {
         let encoder = renderer::panel_encoder(rig, strip)?;
-        let open = |backend| renderer::open(backend, weights, &rig.geometry, &encoder, &Use::Command);
+        let open = |backend| renderer::open(backend, weights, rig, &encoder, &Use::Command);
         let mut gpu = open(backend)?;
         if gpu.cpu_threads().is_some() {
             return Ok(None);

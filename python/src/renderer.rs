@@ -80,7 +80,7 @@ impl Renderer {
         with_threads(py, || {
             let weights: Weights = setup::weights(&rig)?;
             let encoder = renderer::panel_encoder(&rig, resolution)?;
-            let renderer = renderer::open(backend, &weights, &rig.geometry, &encoder, &Use::Command)?;
+            let renderer = renderer::open(backend, &weights, &rig, &encoder, &Use::Command)?;
             Ok(Self {
                 resolution,
                 amplitude_constant: weights.config().amplitude_constant,

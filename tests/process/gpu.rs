@@ -84,6 +84,29 @@ fn without_a_gpu_the_processor_computes_and_one_that_is_asked_for_is_refused() {
 }
 
 #[test]
+fn the_gpu_that_a_rig_names_is_taken_or_none() {
+    let folder = holod_tests::new_folder();
+    let rendered = |named: &str, backend: &str| {
+        std::fs::write(folder.path().join("rig.toml"), format!("[model]\ngpu = \"{named}\"\n")).unwrap();
+        let args = [&RENDER[..], &["--config", "rig.toml", "--backend", backend, "--out", "named"]].concat();
+        run(HOLOD, &args, folder.path())
+    };
+    let ended = rendered("LLVMpipe", "gpu");
+    assert!(ended.status.success(), "{ended:?}");
+    let engine = engine(folder.path(), "named");
+    assert!(engine.starts_with("gpu, llvmpipe"), "{engine}");
+    // The processor does not take the place of a GPU that was named.
+    for backend in ["auto", "gpu"] {
+        let ended = rendered("rtx 4090", backend);
+        assert_eq!(ended.status.code(), Some(69), "{ended:?}");
+        for part in ["Vulkan shows llvmpipe", "`rtx 4090`", "model.gpu"] {
+            assert!(ended.stderr.contains(part), "{part}: {ended:?}");
+        }
+    }
+    assert!(rendered("rtx 4090", "cpu").status.success(), "it takes no GPU");
+}
+
+#[test]
 fn a_bench_is_not_ready_without_the_gpu_that_is_asked_for() {
     let folder = holod_tests::new_folder();
     let checked = |backend| {

@@ -41,7 +41,7 @@ impl Rig {
             accept_no_heartbeat,
         } = lasers;
         let Tracker { spec, eye, scale, fallback, hold } = tracker;
-        let Model { weights } = model;
+        let Model { weights, gpu } = model;
         let none = Resolution { width: 0, height: 0 };
         let (margins, other_margins) = (video_margins.around(none), other.panel.video_margins.around(none));
         [
@@ -86,6 +86,7 @@ impl Rig {
             ("tracker.fallback_mm", *fallback == other.tracker.fallback),
             ("tracker.hold_ms", *hold == other.tracker.hold),
             ("model.network", *weights == other.model.weights),
+            ("model.gpu", *gpu == other.model.gpu),
         ]
         .into_iter()
         .filter_map(|(key, same)| (!same).then_some(key))

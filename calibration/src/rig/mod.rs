@@ -290,6 +290,8 @@ pub enum Eye {
 pub struct Model {
     /// Which network computes the holograms.
     pub weights: WeightsChoice,
+    /// The GPU that computes them, by a part of its name or its place on the PCI bus; the best one where none is named.
+    pub gpu: Option<String>,
 }
 
 /// A network's weights by name or by file.
@@ -364,7 +366,7 @@ impl Default for Rig {
                 fallback: PupilDiameter::from_mm(3.0),
                 hold: TimeNs(1_000_000_000),
             },
-            model: Model { weights: WeightsChoice::Standard },
+            model: Model { weights: WeightsChoice::Standard, gpu: None },
             provenance: Provenance::default(),
         }
     }

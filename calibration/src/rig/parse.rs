@@ -80,7 +80,7 @@ const LAYOUT: [(&str, &[&str]); 6] = [
         ],
     ),
     ("tracker", &["spec", "eye", "scale_mm_per_unit", "fallback_mm", "hold_ms"]),
-    ("model", &["network", "weights_file"]),
+    ("model", &["network", "weights_file", "gpu"]),
 ];
 
 /// Keys that earlier rig files had, with what to do about them.
@@ -882,7 +882,8 @@ fn read_model<'a>(reader: &Reader<'a>, model: Section<'a>, folder: &Path) -> Opt
         Some(file) => WeightsChoice::File(file),
         None => network.map_or(WeightsChoice::Standard, |network| network.value),
     };
-    Some(Model { weights })
+    let gpu = reader.text(model, "gpu", "a part of a GPU's name, or its place on the PCI bus");
+    Some(Model { weights, gpu: gpu.map(|gpu| gpu.value.to_owned()) })
 }
 
 fn milliseconds(ms: f64) -> TimeNs {

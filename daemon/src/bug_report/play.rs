@@ -87,6 +87,8 @@ pub fn prepare(report: &Unpacked, backend: Backend) -> Result<Played, Failure> {
     let mut rig = Rig::load(&config).map_err(Failure::because(Exit::Data))?;
     // Nothing that a report says lights a laser.
     rig.lasers.driver = LaserDriver::Simulated;
+    // Nor does it name this machine's GPU.
+    rig.model.gpu = None;
     if let Some(scale) = facts.scale_mm_per_unit {
         rig.tracker.scale = Some(scale);
     }

@@ -190,7 +190,7 @@ impl FeedReport {
 impl Laps {
     fn run(args: &BenchArgs, rig: &Rig, weights: &Weights, frame: &Arc<RgbdFrame>) -> Result<Self, Failure> {
         let encoder = renderer::panel_encoder(rig, args.resolution)?;
-        let mut renderer = renderer::open(args.backend, weights, &rig.geometry, &encoder, &renderer::Use::Command)?;
+        let mut renderer = renderer::open(args.backend, weights, rig, &encoder, &renderer::Use::Command)?;
         let threads = renderer.cpu_threads();
         let mut levels = LevelsFrame::new(encoder.layout());
         let pupil = PupilDiameter::from_mm(3.0);

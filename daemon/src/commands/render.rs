@@ -126,7 +126,7 @@ pub(super) fn compute(
     let resolution = frames.resolution();
     let encoder = renderer::panel_encoder(rig, resolution)?;
     let mut renderer = progress::during(&format!("preparing the network for {resolution}"), || {
-        renderer::open(backend, &weights, &rig.geometry, &encoder, &Use::Command)
+        renderer::open(backend, &weights, rig, &encoder, &Use::Command)
     })?;
     tracing::info!("holograms are computed by {}", renderer.description());
     let mut levels = LevelsFrame::new(encoder.layout());

@@ -147,8 +147,8 @@ impl Preparer {
         fixed.retain(|key| !CHANGEABLE.contains(key));
         if !fixed.is_empty() {
             return Err(format!(
-                "the rig file has other figures for {} than this run was started with, which is a restart: panel, lasers \
-                 or tracker must be opened anew. Nothing has changed. While holod runs, these can: {}",
+                "the rig file has other figures for {} than this run was started with, which is a restart: panel, lasers, \
+                 tracker or GPU must be opened anew. Nothing has changed. While holod runs, these can: {}",
                 fixed.join(", "),
                 CHANGEABLE.join(", ")
             ));
@@ -172,9 +172,8 @@ impl Preparer {
         let mut rig = self.rig.clone();
         rig.model.weights = choice.clone();
         let weights = setup::weights(&rig).map_err(in_words)?;
-        let renderer = scheduling::patient(|| {
-            renderer::open(self.backend, &weights, &rig.geometry, &self.encoder, &self.used_for)
-        });
+        let renderer =
+            scheduling::patient(|| renderer::open(self.backend, &weights, &rig, &self.encoder, &self.used_for));
         let mut renderer = renderer.map_err(in_words)?;
         let frame_time = self.warm_up(&mut *renderer, &weights)?;
         if FRAMES_BEFORE_STALL * frame_time.0 > self.stall_timeout.0 {

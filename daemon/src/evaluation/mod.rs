@@ -115,7 +115,7 @@ impl Judge {
         border_px: usize,
     ) -> Result<Self, Failure> {
         let encoder = renderer::panel_encoder(rig, resolution)?;
-        let renderer = renderer::open(backend, weights, &rig.geometry, &encoder, &Use::Command)?;
+        let renderer = renderer::open(backend, weights, rig, &encoder, &Use::Command)?;
         tracing::info!("holograms are computed by {}", renderer.description());
         Ok(Self {
             geometry: rig.geometry,

@@ -394,7 +394,8 @@ mod tests {
         assert_eq!(kept.model.weights, WeightsChoice::File(record.join(BENCH).join("weights.safetensors")));
         assert!(fs::read_to_string(record.join(BENCH).join(RIG)).unwrap().contains("# measured"));
 
-        let named = Rig { model: holod_calibration::rig::Model { weights: WeightsChoice::Fast }, ..Rig::default() };
+        let named =
+            Rig { model: holod_calibration::rig::Model { weights: WeightsChoice::Fast, gpu: None }, ..Rig::default() };
         for name in ["other", "third"] {
             fs::create_dir(folder.path().join(name)).unwrap();
         }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter, TimeNs, host_now};
 use holod_model::engine::{EngineError, GpuEngine, Precision, StageTiming};
-use holod_model::gpu::{Adapters, GpuError};
+use holod_model::gpu::{Adapters, GpuChoice, GpuError};
 use holod_model::optics::PhasePattern;
 use holod_model::{ComplexHologram, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
@@ -62,6 +62,8 @@ pub(super) struct GpuRenderer {
     bench: DisplayGeometry,
     encoder: Arc<PanelEncoder>,
     adapters: Adapters,
+    /// The GPU that the rig names.
+    named: Option<String>,
     precision: Option<Precision>,
     used_for: Use,
     engine: Engine,
@@ -124,7 +126,7 @@ impl<T> ReadBack<T> {
 }
 
 impl GpuRenderer {
-    /// On the best device of the kind `adapters`, with features in `precision` where it has that, as
+    /// On the best device of `choice`, with features in `precision` where it has that, as
     /// [`GpuEngine::open`].
     ///
     /// # Errors
@@ -133,11 +135,12 @@ impl GpuRenderer {
         weights: &Weights,
         bench: &DisplayGeometry,
         encoder: &Arc<PanelEncoder>,
-        adapters: Adapters,
+        choice: GpuChoice<'_>,
         precision: Option<Precision>,
         used_for: &Use,
     ) -> Result<Self, EngineError> {
-        let mut engine = GpuEngine::open(weights, bench, &encoder.tables(), adapters, precision)?;
+        let mut engine = GpuEngine::open(weights, bench, &encoder.tables(), choice, precision)?;
+        let GpuChoice { adapters, named } = choice;
         if let Some([first_frame, _]) = used_for.patience(adapters) {
             engine.hangs_after(first_frame);
         }
@@ -147,6 +150,7 @@ impl GpuRenderer {
             bench: *bench,
             encoder: Arc::clone(encoder),
             adapters,
+            named: named.map(str::to_owned),
             precision,
             used_for: used_for.clone(),
             engine: Engine::Gpu(Box::new(engine)),
@@ -171,7 +175,8 @@ impl GpuRenderer {
                 if !self.used_for.let_pass(pause) {
                     return;
                 }
-                match GpuEngine::open(&self.weights, &self.bench, &tables, self.adapters, self.precision) {
+                let choice = GpuChoice { adapters: self.adapters, named: self.named.as_deref() };
+                match GpuEngine::open(&self.weights, &self.bench, &tables, choice, self.precision) {
                     Ok(mut engine) => {
                         first_frame_is_made(&mut engine, &self.used_for, self.adapters);
                         self.description = described(&engine, self.adapters);
@@ -333,7 +338,7 @@ mod tests {
 
     fn renderer_for(used_for: &Use, encoder: &Arc<PanelEncoder>) -> GpuRenderer {
         let (weights, bench) = (Weights::builtin_small(), DisplayGeometry::DEFAULT);
-        GpuRenderer::new(&weights, &bench, encoder, Adapters::Software, Some(Precision::Single), used_for)
+        GpuRenderer::new(&weights, &bench, encoder, Adapters::Software.into(), Some(Precision::Single), used_for)
             .expect("Mesa's software device; install mesa-vulkan-drivers")
     }
 

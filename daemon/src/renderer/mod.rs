@@ -10,7 +10,7 @@ use std::sync::atomic::AtomicBool;
 use holod_calibration::rig::Rig;
 use holod_calibration::{DisplayGeometry, PerColour, PupilDiameter, Resolution};
 use holod_model::engine::{EngineError, Precision, StageTiming};
-use holod_model::gpu::{Adapters, GpuError};
+use holod_model::gpu::{Adapters, GpuChoice, GpuError};
 use holod_model::optics::PhasePattern;
 use holod_model::{ComplexHologram, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
@@ -91,7 +91,8 @@ pub struct Rendered {
     pub engine_changed: bool,
 }
 
-/// A renderer of frames of the pattern's size of `encoder`, on the optics of `bench`.
+/// A renderer of frames of the pattern's size of `encoder`, on the optics of `rig`, and on the GPU that it names, if it
+/// names one.
 ///
 /// `Auto` takes a GPU where there is one that will do, else the processor; `Gpu` a GPU, or where there is none a
 /// processor that plays one. `GpuHalf` and `CpuHalf` compute in half precision where the device has it; `Auto` does so
@@ -102,27 +103,33 @@ pub struct Rendered {
 pub fn open(
     backend: Backend,
     weights: &Weights,
-    bench: &DisplayGeometry,
+    rig: &Rig,
     encoder: &Arc<PanelEncoder>,
     used_for: &Use,
 ) -> Result<Box<dyn Renderer>, Failure> {
+    let bench = &rig.geometry;
     let precision = match backend {
         Backend::Auto => None,
         Backend::Cpu | Backend::Gpu => Some(Precision::Single),
         Backend::CpuHalf | Backend::GpuHalf => Some(Precision::Half),
     };
     let on_cpu = |no_gpu| CpuRenderer::new(weights, bench, encoder, precision.unwrap_or(Precision::Half), no_gpu);
-    let on_gpu = |adapters| on_gpu(weights, bench, encoder, adapters, precision, used_for);
+    let on_gpu = |adapters| {
+        let choice = GpuChoice { adapters, named: rig.model.gpu.as_deref() };
+        on_gpu(weights, bench, encoder, choice, precision, used_for)
+    };
     match backend {
         Backend::Cpu | Backend::CpuHalf => Ok(Box::new(on_cpu(None)?)),
         Backend::Auto => match on_gpu(Adapters::Hardware) {
             Ok(renderer) => Ok(renderer),
+            // What was named is not to be guessed.
+            Err(error @ EngineError::Gpu(GpuError::NotNamed { .. })) => Err(failure(error)),
             Err(EngineError::Gpu(error)) => Ok(Box::new(on_cpu(Some(&error))?)),
             Err(other) => Err(failure(other)),
         },
         Backend::Gpu | Backend::GpuHalf => on_gpu(Adapters::Hardware)
             .or_else(|error| match error {
-                EngineError::Gpu(GpuError::None { .. }) => on_gpu(Adapters::Software),
+                EngineError::Gpu(GpuError::None { .. } | GpuError::NotNamed { .. }) => on_gpu(Adapters::Software),
                 other => Err(other),
             })
             .map_err(|error| {
@@ -152,11 +159,11 @@ fn on_gpu(
     weights: &Weights,
     bench: &DisplayGeometry,
     encoder: &Arc<PanelEncoder>,
-    adapters: Adapters,
+    choice: GpuChoice<'_>,
     precision: Option<Precision>,
     used_for: &Use,
 ) -> Result<Box<dyn Renderer>, EngineError> {
-    Ok(Box::new(gpu::GpuRenderer::new(weights, bench, encoder, adapters, precision, used_for)?))
+    Ok(Box::new(gpu::GpuRenderer::new(weights, bench, encoder, choice, precision, used_for)?))
 }
 
 #[cfg(not(feature = "gpu"))]
@@ -164,7 +171,7 @@ fn on_gpu(
     _: &Weights,
     _: &DisplayGeometry,
     _: &Arc<PanelEncoder>,
-    _: Adapters,
+    _: GpuChoice<'_>,
     _: Option<Precision>,
     _: &Use,
 ) -> Result<Box<dyn Renderer>, EngineError> {

@@ -89,7 +89,7 @@ pub(super) fn build(
     let (renderer, frame_time) = progress::during(&format!("preparing the network for {resolution}"), || {
         service.starting();
         let mut renderer =
-            scheduling::patient(|| renderer::open(plan.backend, &plan.weights, &rig.geometry, &encoder, &used_for))?;
+            scheduling::patient(|| renderer::open(plan.backend, &plan.weights, rig, &encoder, &used_for))?;
         service.starting();
         let [pupil, _] = plan.weights.trained_pupils(&rig.geometry);
         let levels = LevelsFrame::new(encoder.layout());

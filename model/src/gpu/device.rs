@@ -5,7 +5,7 @@ use std::ops::Deref;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use super::{Adapters, GpuError, MatrixUnits, caught};
+use super::{Adapters, GpuChoice, GpuError, MatrixUnits, caught};
 
 /// A device and its queue.
 pub(crate) struct Gpu {
@@ -38,16 +38,17 @@ impl Gpu {
     ///
     /// # Errors
     /// There is none, or the driver of the best one refuses, and those of all others.
-    pub(crate) fn open(adapters: Adapters, with_matrices: bool) -> Result<Self, GpuError> {
-        first_that_opens(&Self::candidates(adapters)?, |adapter| Self::on(adapter, with_matrices))
+    pub(crate) fn open(choice: GpuChoice<'_>, with_matrices: bool) -> Result<Self, GpuError> {
+        first_that_opens(&Self::candidates(choice)?, |adapter| Self::on(adapter, with_matrices))
     }
 
     /// The devices that will do, of which there is one at least, the best first: cards of their own before those that
     /// are a part of the processor.
     ///
     /// # Errors
-    /// There is none.
-    pub(crate) fn candidates(adapters: Adapters) -> Result<Vec<wgpu::Adapter>, GpuError> {
+    /// There is none, or none that is called so.
+    pub(crate) fn candidates(choice: GpuChoice<'_>) -> Result<Vec<wgpu::Adapter>, GpuError> {
+        let GpuChoice { adapters, named } = choice;
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
             backends: wgpu::Backends::VULKAN,
             ..wgpu::InstanceDescriptor::new_without_display_handle()
@@ -61,6 +62,15 @@ impl Gpu {
         let mut found = pollster::block_on(instance.enumerate_adapters(wgpu::Backends::VULKAN));
         found.sort_by_key(rank);
         let is_usable = |adapter: &wgpu::Adapter| (adapters == Adapters::Software) == (rank(adapter) == 3);
+        if let Some(named) = named {
+            let there = found.iter().map(|adapter| adapter.get_info().name).collect();
+            found.retain(|adapter| is_usable(adapter) && is_called(&adapter.get_info(), named));
+            return if found.is_empty() {
+                Err(GpuError::NotNamed { named: named.to_owned(), there })
+            } else {
+                Ok(found)
+            };
+        }
         let (usable, others): (Vec<_>, Vec<_>) = found.into_iter().partition(is_usable);
         if usable.is_empty() {
             let wanted = match adapters {
@@ -287,6 +297,11 @@ pub(crate) fn first_that_opens<A, T, E>(candidates: &[A], open: impl Fn(&A) -> R
     open(first).or_else(|why| others.iter().find_map(|other| open(other).ok()).ok_or(why))
 }
 
+/// Whether somebody who says `named` means this device: by a part of its name, or by its place on the PCI bus.
+fn is_called(info: &wgpu::AdapterInfo, named: &str) -> bool {
+    info.name.to_lowercase().contains(&named.to_lowercase()) || info.device_pci_bus_id.eq_ignore_ascii_case(named)
+}
+
 /// Something whose end is no panic: that of a queue waits for its device, and wgpu panics where the driver then says
 /// anything but that the device is lost.
 pub(crate) struct GivenBack<T>(Option<T>);
@@ -345,7 +360,26 @@ pub(crate) mod tests {
 
     pub(crate) fn test_gpu() -> Gpu {
         let adapters = test_adapters();
-        Gpu::open(adapters, true).unwrap_or_else(|error| panic!("{adapters:?} for tests: {error}"))
+        Gpu::open(adapters.into(), true).unwrap_or_else(|error| panic!("{adapters:?} for tests: {error}"))
+    }
+
+    #[test]
+    fn a_device_is_named_by_a_part_of_its_name_or_its_place() {
+        let info = wgpu::AdapterInfo {
+            name: "NVIDIA GeForce RTX 4090".into(),
+            device_pci_bus_id: "0000:0a:00.0".into(),
+            ..Gpu::candidates(test_adapters().into()).expect("a device")[0].get_info()
+        };
+        assert!(["rtx 4090", "NVIDIA", "0000:0A:00.0"].iter().all(|named| is_called(&info, named)));
+        assert!(["rtx 2080", "0000:0b:00.0", "0a:00"].iter().all(|named| !is_called(&info, named)));
+
+        let test_gpu = test_gpu();
+        let choice = |named| GpuChoice { adapters: test_adapters(), named: Some(named) };
+        let found = Gpu::open(choice(test_gpu.name()), false).expect("by its name");
+        assert_eq!(found.name(), test_gpu.name());
+        let refused = Gpu::candidates(choice("no such card")).expect_err("no such card");
+        let text = refused.to_string();
+        assert!(["no such card", "model.gpu", test_gpu.name()].iter().all(|part| text.contains(part)), "{text}");
     }
 
     #[test]

@@ -20,6 +20,22 @@ pub enum Adapters {
     Software,
 }
 
+/// Which device is wanted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct GpuChoice<'a> {
+    /// Of these.
+    pub adapters: Adapters,
+    /// The one that has this in its name, whatever its case, or is at this place of the PCI bus (`0000:01:00.0`); the
+    /// best one where none is named.
+    pub named: Option<&'a str>,
+}
+
+impl From<Adapters> for GpuChoice<'_> {
+    fn from(adapters: Adapters) -> Self {
+        Self { adapters, named: None }
+    }
+}
+
 /// What multiplies matrices of 16 by 16 numbers of half precision, and sums up in single precision.
 #[cfg(feature = "gpu")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,7 +53,7 @@ pub(crate) enum MatrixUnits {
 /// There is none that can be opened.
 pub fn find() -> Result<String, GpuError> {
     #[cfg(feature = "gpu")]
-    return Gpu::open(Adapters::Hardware, false).map(|gpu| gpu.name().to_owned());
+    return Gpu::open(Adapters::Hardware.into(), false).map(|gpu| gpu.name().to_owned());
     #[cfg(not(feature = "gpu"))]
     Err(GpuError::NotBuilt)
 }
@@ -75,6 +91,17 @@ pub enum GpuError {
         wanted: &'static str,
         /// Names of devices of the other kind, such as a processor that plays a GPU.
         passed_over: Vec<String>,
+    },
+    /// The one that was named is not there.
+    #[error(
+        "Vulkan shows {} and no GPU with `{named}` in its name or at that place; correct the rig's model.gpu, or take it out for the best GPU",
+        found(there)
+    )]
+    NotNamed {
+        /// A part of its name, or its place.
+        named: String,
+        /// Names of the devices that are there.
+        there: Vec<String>,
     },
     /// The device could not be opened.
     #[error("the GPU {name} could not be opened: {reason}; choose --backend cpu")]
@@ -127,6 +154,7 @@ impl GpuError {
         match self {
             Self::NotBuilt => "this program was built without the GPU".to_owned(),
             Self::None { passed_over, .. } => format!("Vulkan shows {} and no GPU", found(passed_over)),
+            Self::NotNamed { named, there } => format!("Vulkan shows {} and no GPU `{named}`", found(there)),
             Self::Refused { name, reason } => format!("the GPU {name} could not be opened: {reason}"),
             Self::TooLarge { what, bytes, name, limit } => {
                 format!("{what} takes {bytes} bytes, of which the GPU {name} can see {limit} as one")

@@ -33,7 +33,7 @@ impl Tracer {
     /// There is none, its driver refuses, or this program was built without the feature `gpu`.
     pub fn gpu() -> Result<Self, GpuError> {
         #[cfg(feature = "gpu")]
-        return Self::on(Gpu::open(Adapters::Hardware, false)?);
+        return Self::on(Gpu::open(Adapters::Hardware.into(), false)?);
         #[cfg(not(feature = "gpu"))]
         Err(GpuError::NotBuilt)
     }
@@ -44,7 +44,7 @@ impl Tracer {
     /// As [`Tracer::gpu`].
     pub fn software_gpu() -> Result<Self, GpuError> {
         #[cfg(feature = "gpu")]
-        return Self::on(Gpu::open(Adapters::Software, false)?);
+        return Self::on(Gpu::open(Adapters::Software.into(), false)?);
         #[cfg(not(feature = "gpu"))]
         Err(GpuError::NotBuilt)
     }

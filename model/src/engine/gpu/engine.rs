@@ -13,7 +13,7 @@ use super::network::NetworkPlan;
 use super::plan::{BufferId, Plan, Stage};
 use super::shared::pupil_values;
 use crate::engine::{EngineError, Precision, StageTiming, StageTimings, check_pupil};
-use crate::gpu::{Adapters, Gpu, GpuError, first_that_opens};
+use crate::gpu::{Gpu, GpuChoice, GpuError, first_that_opens};
 use crate::{ComplexHologram, PhasePattern, RgbdFrame, Weights};
 
 /// Network, double phase and levels on the GPU, for frames of one size and one panel.
@@ -62,7 +62,7 @@ const TIMESTAMP_BYTES: u64 = 8;
 
 impl GpuEngine {
     /// An engine for frames of the pattern's size of `tables`, which may be odd, on the optics of `bench`, whose own
-    /// resolution does not matter; on the best device of the kind `adapters` that has room for it. Features are in
+    /// resolution does not matter; on the best device of `choice` that has room for it. Features are in
     /// `precision` where the device has it; where that is left to the device, in half precision if it multiplies
     /// matrices so, since it sums up in single, and else in single precision.
     ///
@@ -73,10 +73,10 @@ impl GpuEngine {
         weights: &Weights,
         bench: &DisplayGeometry,
         tables: &LevelTables,
-        adapters: Adapters,
+        choice: GpuChoice<'_>,
         precision: Option<Precision>,
     ) -> Result<Self, EngineError> {
-        first_that_opens(&Gpu::candidates(adapters)?, |adapter| {
+        first_that_opens(&Gpu::candidates(choice)?, |adapter| {
             let open = |matrices| Self::on(Gpu::on(adapter, matrices)?, weights, bench, tables, precision);
             if precision.is_some() {
                 return open(precision == Some(Precision::Half));

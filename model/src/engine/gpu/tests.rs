@@ -206,7 +206,7 @@ fn engine(weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) ->
 
 fn engine_in(precision: Precision, weights: &Weights, bench: &DisplayGeometry, resolution: Resolution) -> GpuEngine {
     let tables = linear_tables(resolution);
-    GpuEngine::open(weights, bench, &tables, test_adapters(), Some(precision)).expect("an engine")
+    GpuEngine::open(weights, bench, &tables, test_adapters().into(), Some(precision)).expect("an engine")
 }
 
 /// Samples and hologram of a frame.
@@ -508,7 +508,7 @@ fn wrong_sizes_and_pupils_are_refused_and_a_lost_device_is_told() {
     assert!(matches!(lost, Err(EngineError::Gpu(GpuError::Failed { .. }))), "{lost:?}");
 
     let nothing = linear_tables(Resolution { width: 0, height: 4 });
-    let refused = GpuEngine::open(&weights, &DisplayGeometry::DEFAULT, &nothing, test_adapters(), None);
+    let refused = GpuEngine::open(&weights, &DisplayGeometry::DEFAULT, &nothing, test_adapters().into(), None);
     assert!(matches!(refused.err(), Some(EngineError::Empty { .. })));
 }
 
