@@ -5,6 +5,7 @@ pub mod bug_report;
 pub mod cli;
 pub mod commands;
 pub mod control;
+mod dark_note;
 mod destination;
 pub mod evaluation;
 pub mod exposure;

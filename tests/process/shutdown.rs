@@ -131,6 +131,43 @@ fn signals_end_in_order_with_lasers_dark_and_a_flat_panel() {
 }
 
 #[test]
+fn what_a_person_put_out_stays_dark_after_a_failure_and_is_lit_after_an_end_in_order() {
+    let laser_box = LaserBench::plug_in();
+    let holod = |args: &[&str]| run(HOLOD, args, laser_box.folder.path());
+    let args = ["--config", "rig.toml", "--tracker", "mock:steady", "--resolution", "64x64"];
+    let kept_dark = |is_kept: bool| {
+        let status = || serde_json::from_str::<serde_json::Value>(&holod(&["ctl", "status"]).stdout).ok();
+        let is_so =
+            || status().is_some_and(|status| status["lasers_kept_dark"] == is_kept && status["frames_shown"] != 0);
+        assert!(wait_until(Duration::from_secs(30), is_so), "{:?}", status());
+    };
+    let daemon = laser_box.lit_daemon();
+    let asked = holod(&["ctl", "lasers", "dark"]);
+    assert!(asked.status.success() && asked.stdout.contains("one that fails"), "{asked:?}");
+    daemon.signal(Signal::KILL);
+    drop(daemon);
+    let lit_before = laser_box.edges().len();
+
+    let daemon = Daemon::start(HOLOD, &args, laser_box.folder.path());
+    kept_dark(true);
+    thread::sleep(Duration::from_millis(500));
+    assert_eq!(laser_box.edges().len(), lit_before, "nothing was lit since");
+    assert!(holod(&["ctl", "lasers", "arm"]).status.success());
+    assert!(wait_until(Duration::from_secs(30), || laser_box.edges().len() > lit_before), "lit once a person says so");
+    assert!(holod(&["ctl", "lasers", "dark"]).status.success());
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(Duration::from_secs(20));
+    assert!(ended.status.success() && ended.stderr.contains("the lasers stay dark"), "{}", ended.stderr);
+
+    let lit_before = laser_box.edges().len();
+    let daemon = Daemon::start(HOLOD, &args, laser_box.folder.path());
+    kept_dark(false);
+    assert!(wait_until(Duration::from_secs(30), || laser_box.edges().len() > lit_before), "lit after an end in order");
+    daemon.signal(Signal::TERM);
+    assert!(daemon.wait(Duration::from_secs(20)).status.success());
+}
+
+#[test]
 fn an_unplugged_laser_box_is_named_at_once_and_lit_again_when_it_is_back() {
     let mut laser_box = LaserBench::plug_in();
     let runtime = holod_tests::new_folder();

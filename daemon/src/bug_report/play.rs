@@ -20,6 +20,7 @@ use super::recorded::{self, Made, RecordedFrame};
 use super::{SCENE_FOLDER, Unpacked, order_folder};
 use crate::cli::{Backend, SceneArgs};
 use crate::control::{Order, Preparer, Request};
+use crate::dark_note::DarkNote;
 use crate::failure::{Exit, Failure};
 use crate::record::{
     BENCH, FRAMES, FrameRecord, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SCENE, SceneSource, SourceFile,
@@ -487,6 +488,7 @@ impl Material<'_> {
         if self.preparer.is_none() {
             let encoder = renderer::panel_encoder(self.rig, self.resolution).map_err(|failure| failure.to_string())?;
             self.preparer = Some(Preparer {
+                dark_note: DarkNote::on(&self.rig.lasers.driver),
                 rig: self.rig.clone(),
                 rig_again: None,
                 weights: Arc::new(Mutex::new(self.rig.model.weights.clone())),

@@ -9,6 +9,7 @@ use holod_slm_output::output::DarkSwitch;
 
 use super::{NewPattern, Order, Preparer, Request};
 use crate::cli::Backend;
+use crate::dark_note::DarkNote;
 use crate::renderer::{self, Use};
 
 const RESOLUTION: Resolution = Resolution { width: 64, height: 48 };
@@ -18,6 +19,7 @@ static PREPARER: LazyLock<Preparer> = LazyLock::new(|| {
     rig.geometry.resolution = RESOLUTION;
     let encoder = renderer::panel_encoder(&rig, RESOLUTION).expect("the built-in panel has levels");
     Preparer {
+        dark_note: DarkNote::on(&rig.lasers.driver),
         weights: Arc::new(Mutex::new(rig.model.weights.clone())),
         rig,
         rig_again: None,

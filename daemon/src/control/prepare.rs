@@ -14,6 +14,7 @@ use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 use super::{NewPattern, NewRig, Order, Request};
 use crate::cli::{self, Backend, SceneArgs};
+use crate::dark_note::DarkNote;
 use crate::failure::Failure;
 use crate::renderer::{self, Renderer, Use};
 use crate::session::scheduling;
@@ -51,6 +52,7 @@ pub(crate) struct Preparer {
     pub(crate) stall_timeout: TimeNs,
     /// Puts the lasers out, whatever the control thread does.
     pub(crate) lasers: DarkSwitch,
+    pub(crate) dark_note: DarkNote,
 }
 
 /// An engine that has made a frame.
@@ -78,7 +80,12 @@ impl Preparer {
             Request::Status {} => Ok(Order::Status),
             Request::Pause {} => Ok(Order::Pause(true)),
             Request::Resume {} => Ok(Order::Pause(false)),
-            Request::LasersDark {} => Ok(Order::LasersDark(self.lasers.wish_dark())),
+            Request::LasersDark {} => {
+                let wish = self.lasers.wish_dark();
+                // Here, too: a control thread that hangs is ended by the watchdog.
+                self.dark_note.leave();
+                Ok(Order::LasersDark(wish))
+            }
             Request::LasersArm {} => Ok(Order::LasersArm),
             Request::Stop {} => Ok(Order::Stop),
             Request::Pupil { mm: None } => Ok(Order::Pupil(None)),

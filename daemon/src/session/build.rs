@@ -9,7 +9,7 @@ use holod_calibration::{PupilDiameter, TimeNs};
 use holod_model::RgbdFrame;
 use holod_model::engine::EngineError;
 use holod_pupil_input::{ReplaySpeed, Tracker, TrackerHandle, TrackerOptions, TrackerSpec, adapter_delay_warning};
-use holod_slm_output::laser::open_laser;
+use holod_slm_output::laser::{DarkReason, open_laser};
 use holod_slm_output::output::{OutputError, pacing_config};
 use holod_slm_output::present::{PanelSetup, open_panel};
 use holod_slm_output::{LevelsFrame, Output, OutputControl, OutputOptions, Pacer, PanelEncoder};
@@ -31,6 +31,7 @@ use super::tally::Tally;
 use super::tracker_watch::TrackerWatch;
 use super::watch::{Announced, Limits, Names, Rings, Watch};
 use crate::control::{self, Preparer, Steering};
+use crate::dark_note::DarkNote;
 use crate::failure::{Exit, Failure};
 use crate::record::FrameOrders;
 use crate::renderer::{self, Renderer, Use};
@@ -135,6 +136,15 @@ pub(super) fn build(
         scheduling::prompt(|| open_output(&plan, &encoder, options)).map_err(Failure::because(Exit::Unavailable))
     })?;
     output.control.attend();
+    let dark_note = DarkNote::on(&rig.lasers.driver);
+    let keeps_dark = dark_note.is_there();
+    if keeps_dark {
+        output.control.keep_dark(Some(DarkReason::Asked));
+        tracing::warn!(
+            "the lasers stay dark: `holod ctl lasers dark` put them out before this holod was started; `holod ctl lasers \
+             arm` lets them be lit"
+        );
+    }
     if let LaserDriver::Serial { path, .. } = &rig.lasers.driver
         && let Some(warning) = adapter_delay_warning("laser", path)
     {
@@ -167,6 +177,7 @@ pub(super) fn build(
         plays,
         stall_timeout: options.stall_timeout,
         lasers: output.control.dark_switch(),
+        dark_note,
     };
     let inputs = match playback {
         Some(playback) => Inputs::Recorded(playback),
@@ -237,7 +248,7 @@ pub(super) fn build(
         feed,
         feed_watch: FeedWatch::new(dark_after, t_origin),
         record: plan.record,
-        desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }),
+        desk: Desk::open(preparer, Changes { steering, sink, places, retired, weights }, keeps_dark),
         signals,
         hangups: plan.hangups,
         service,

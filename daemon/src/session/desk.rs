@@ -8,6 +8,7 @@ use holod_calibration::rig::WeightsChoice;
 
 use super::frame_loop::Change;
 use crate::control::{ControlServer, Ordered, Preparer, Steering};
+use crate::dark_note::DarkNote;
 use crate::memory;
 use crate::runtime_folder;
 use crate::source::PictureSink;
@@ -28,6 +29,7 @@ pub(super) struct Desk {
     server: Option<(ControlServer, mpsc::Receiver<Ordered>)>,
     pub(super) changes: Changes,
     pub(super) keeps_dark: bool,
+    pub(super) dark_note: DarkNote,
     /// Orders that took effect: lines of `orders.jsonl`.
     pub(super) orders: u32,
     /// What is shown in place of holograms.
@@ -35,8 +37,10 @@ pub(super) struct Desk {
 }
 
 impl Desk {
-    /// A run goes on without one where it cannot be had, and says so.
-    pub(super) fn open(preparer: Preparer, changes: Changes) -> Self {
+    /// A run goes on without one where it cannot be had, and says so. `keeps_dark` says whether the lasers are kept dark
+    /// from the beginning.
+    pub(super) fn open(preparer: Preparer, changes: Changes, keeps_dark: bool) -> Self {
+        let dark_note = preparer.dark_note.clone();
         let server = runtime_folder::own()
             .ok_or_else(|| "no folder for it".into())
             .and_then(|folder| ControlServer::listen(folder.join(format!("control-{}", std::process::id())), preparer));
@@ -47,7 +51,7 @@ impl Desk {
                 None
             }
         };
-        Self { server, changes, keeps_dark: false, orders: 0, pattern: None }
+        Self { server, changes, keeps_dark, dark_note, orders: 0, pattern: None }
     }
 
     pub(super) fn socket(&self) -> Option<PathBuf> {

@@ -182,9 +182,11 @@ impl Watch<'_> {
 
     fn lasers_dark(&mut self, wish: DarkWish, output: &OutputControl) -> Result<Value, String> {
         self.desk.keeps_dark = true;
-        if output.keep_dark_as_wished(wish) {
-            let said = "the lasers are dark, and stay so until `holod ctl lasers arm` or a new start of holod, as of a \
-                        service that fails (`systemctl stop holod` keeps it from that)";
+        let acknowledged = output.keep_dark_as_wished(wish);
+        self.desk.dark_note.leave();
+        if acknowledged {
+            let said = "the lasers are dark, and stay so until `holod ctl lasers arm`, or until holod is stopped and \
+                        started again; one that fails, or a service that is restarted, keeps them dark";
             return Ok(said.into());
         }
         Err("the laser box did not acknowledge darkness: look at the lasers, and switch them off by hand. holod lights \
@@ -194,6 +196,7 @@ impl Watch<'_> {
 
     fn lasers_arm(&mut self, output: &OutputControl) -> Value {
         self.desk.keeps_dark = false;
+        self.desk.dark_note.take_away();
         output.keep_dark(self.dark_wish());
         if self.feed_watch.keeps_dark() {
             return "lasers are lit again by the rules, once the live feed gives a picture".into();

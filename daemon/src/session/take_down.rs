@@ -66,6 +66,7 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
         }
         Some(Ok(rendered)) => rendered.map_err(Failure::because(Exit::Unavailable))?,
     }
+    watch.desk.dark_note.ends_in_order();
 
     let tally = watch.tally;
     if tally.frames_shown == 0 {
