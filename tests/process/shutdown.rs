@@ -168,6 +168,33 @@ fn what_a_person_put_out_stays_dark_after_a_failure_and_is_lit_after_an_end_in_o
 }
 
 #[test]
+fn fields_are_dark_for_what_keeps_the_box_from_being_armed() {
+    for (reason, is_by_hand) in [("interlock", false), ("by-hand", true)] {
+        let laser_box = LaserBench::plug_in();
+        let daemon = laser_box.lit_daemon();
+        let holod = |args: &[&str]| run(HOLOD, args, laser_box.folder.path());
+        if is_by_hand {
+            assert!(holod(&["dark", "--config", "rig.toml"]).status.success());
+        } else {
+            laser_box.faults.set_interlock_open(true);
+        }
+        // Longer than fields are looked at before something is said of them.
+        thread::sleep(Duration::from_secs(7));
+        let status = holod(&["ctl", "status"]);
+        let status: serde_json::Value = serde_json::from_str(&status.stdout).unwrap();
+        assert_eq!(status["unlit"], serde_json::Value::Null, "{status:#}");
+        daemon.signal(Signal::TERM);
+        let ended = daemon.wait(Duration::from_secs(20));
+        assert!(!ended.stderr.contains("no field is lit"), "{}", ended.stderr);
+        let summary = fs::read_to_string(laser_box.folder.path().join("record/summary.json")).unwrap();
+        let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
+        let dark = &summary["lasers"]["dark_by_reason"];
+        let count = |reason: &str| dark[reason].as_u64().unwrap_or(0);
+        assert!(count(reason) > 900 && count("late") + count("box-fault") < count(reason) / 10, "{dark:#}");
+    }
+}
+
+#[test]
 fn an_unplugged_laser_box_is_named_at_once_and_lit_again_when_it_is_back() {
     let mut laser_box = LaserBench::plug_in();
     let runtime = holod_tests::new_folder();

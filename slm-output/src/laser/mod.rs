@@ -277,6 +277,16 @@ pub enum LaserError {
 }
 
 impl LaserError {
+    /// Why lasers are dark after it.
+    pub const fn dark_reason(&self) -> DarkReason {
+        match self {
+            Self::MadeDark | Self::Refused { refusal: Refusal::ByHand, .. } => DarkReason::ByHand,
+            Self::Refused { refusal: Refusal::Interlock, .. } => DarkReason::Interlock,
+            Self::SyncDisagrees => DarkReason::SyncDisagrees,
+            _ => DarkReason::BoxFault,
+        }
+    }
+
     /// Whether the box has to be opened anew after it.
     pub const fn means_lost(&self) -> bool {
         matches!(

@@ -120,8 +120,7 @@ impl LaserThread {
             self.heed(clock());
             let Some(FieldDecision { shown, orders, mut dark }) = self.scheduler.next_field(now) else { return };
             if orders.arm && now < self.t_retry {
-                self.scheduler.box_went_dark();
-                dark = Some(DarkReason::BoxFault);
+                dark = Some(self.scheduler.not_armed());
             } else {
                 let unlit = self.obey(orders, now);
                 if unlit.is_some() && orders.light.is_some() {
@@ -136,8 +135,9 @@ impl LaserThread {
     /// Does what the scheduler says. Why the box does not light the field all the same, if so.
     fn obey(&mut self, orders: Orders, now: TimeNs) -> Option<DarkReason> {
         self.try_obey(orders, now).unwrap_or_else(|error| {
+            let reason = error.dark_reason();
             self.fault(error, now);
-            Some(DarkReason::BoxFault)
+            Some(reason)
         })
     }
 
@@ -168,11 +168,12 @@ impl LaserThread {
     }
 
     fn fault(&mut self, error: LaserError, now: TimeNs) {
+        let reason = error.dark_reason();
         self.note(error);
-        self.scheduler.box_went_dark();
+        self.scheduler.box_went_dark(reason);
         self.program_lost = true;
         self.t_retry = now + RETRY_AFTER;
-        if let Err(error) = self.laser.dark(DarkReason::BoxFault, now) {
+        if let Err(error) = self.laser.dark(reason, now) {
             self.note(error);
         }
     }
@@ -207,8 +208,8 @@ impl LaserThread {
     fn poll(&mut self, now: TimeNs) {
         let Self { laser, ledger, scheduler, shared, .. } = self;
         let polled = laser.poll(now, &mut |event| {
-            if matches!(event, BoxEvent::Dark { .. }) {
-                scheduler.box_went_dark();
+            if let BoxEvent::Dark { reason, .. } = event {
+                scheduler.box_went_dark(reason);
                 count(&shared.went_dark);
             }
             ledger.box_event(event, shared);

@@ -57,6 +57,8 @@ pub(super) struct Interlock {
     stall_timeout: TimeNs,
     armed: bool,
     /// Set for good by shutdown and panic.
+    /// Why it is not armed where nothing else forbids light: it is armed again at the next colour frame's start.
+    why_unarmed: DarkReason,
     latched: Option<DarkReason>,
     /// Why darkness is asked for, until that is taken back.
     held: Option<DarkReason>,
@@ -75,6 +77,7 @@ impl Interlock {
             evidence,
             stall_timeout,
             armed: false,
+            why_unarmed: DarkReason::Late,
             latched: None,
             held: None,
             t_known: None,
@@ -109,7 +112,7 @@ impl Interlock {
         // In the panel's own sequence a field may be lit only from the colour frame's start on, which arms.
         let starts_frame = field.field == 0;
         if !self.armed && self.trigger == Trigger::PanelSync && !starts_frame {
-            return (Orders::default(), Some(DarkReason::Late));
+            return (Orders::default(), Some(self.why_unarmed));
         }
         let window = self.gate.window(field);
         let gone_by = now >= window.t_off;
@@ -142,8 +145,14 @@ impl Interlock {
     }
 
     /// The box went dark by itself; it is armed again when fields are known to be shown again.
-    pub(super) fn box_went_dark(&mut self) {
+    pub(super) fn box_went_dark(&mut self, reason: DarkReason) {
+        (self.armed, self.why_unarmed) = (false, reason);
+    }
+
+    /// The box was not armed after all. Why it is dark.
+    pub(super) fn not_armed(&mut self) -> DarkReason {
         self.armed = false;
+        self.why_unarmed
     }
 
     /// Dark for good: shutdown, panic.
@@ -166,6 +175,9 @@ impl Interlock {
     /// Puts the lasers out for `reason` if they are armed.
     pub(super) fn dark(&mut self, reason: DarkReason) -> Orders {
         let was_armed = std::mem::replace(&mut self.armed, false);
+        if was_armed {
+            self.why_unarmed = reason;
+        }
         Orders { dark: was_armed.then_some(reason), ..Orders::default() }
     }
 

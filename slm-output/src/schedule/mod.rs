@@ -182,8 +182,13 @@ impl FieldScheduler {
     }
 
     /// The box went dark by itself; it is armed again when fields are known to be shown again.
-    pub fn box_went_dark(&mut self) {
-        self.interlock.box_went_dark();
+    pub fn box_went_dark(&mut self, reason: DarkReason) {
+        self.interlock.box_went_dark(reason);
+    }
+
+    /// The box was not armed as the last field wanted it. Why it is dark.
+    pub fn not_armed(&mut self) -> DarkReason {
+        self.interlock.not_armed()
     }
 
     /// The window that was ordered last stayed dark at the box.

@@ -149,7 +149,7 @@ fn run_with(rig: &Rig, mut scheduler: FieldScheduler, steps: &[Step]) -> Ran {
     let decide = |scheduler: &mut FieldScheduler, laser: &mut SimulatedLaser, now: TimeNs| {
         while let Some(decision) = scheduler.next_field(now) {
             if !obey(laser, decision.orders, now) {
-                scheduler.box_went_dark();
+                scheduler.box_went_dark(DarkReason::Heartbeat);
             }
         }
     };
