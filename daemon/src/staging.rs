@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, Once, PoisonError};
 
 use holod_calibration::hangup_is_ignored;
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 use tempfile::TempDir;
 
 use crate::failure::{Exit, Failure};
@@ -151,7 +151,7 @@ fn take_away_on_signals() {
     static STARTED: Once = Once::new();
     STARTED.call_once(|| {
         let hangup = (!hangup_is_ignored()).then_some(SIGHUP);
-        let ending = [SIGINT, SIGTERM].into_iter().chain(hangup);
+        let ending = [SIGINT, SIGTERM, SIGQUIT].into_iter().chain(hangup);
         let Ok(mut signals) = signal_hook::iterator::Signals::new(ending) else { return };
         let wait = move || {
             for signal in signals.forever() {

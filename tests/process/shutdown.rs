@@ -116,7 +116,7 @@ fn kill_a_daemon_and_judge_its_lasers() -> DarkReason {
 
 #[test]
 fn signals_end_in_order_with_lasers_dark_and_a_flat_panel() {
-    for signal in [Signal::TERM, Signal::INT] {
+    for signal in [Signal::TERM, Signal::INT, Signal::QUIT] {
         let laser_box = LaserBench::plug_in();
         let daemon = laser_box.lit_daemon();
         daemon.signal(signal);
@@ -313,6 +313,20 @@ fn a_second_holod_on_a_laser_box_is_refused_and_the_first_goes_on() {
 }
 
 #[test]
+fn an_order_beside_a_daemon_that_hangs_is_soon_given_up_with_what_puts_the_lasers_out() {
+    let folder = holod_tests::new_folder();
+    let daemon = Daemon::start(HOLOD, &["--tracker", "mock:steady", "--resolution", "64x64"], folder.path());
+    let holod = |args: &[&str]| run(HOLOD, args, folder.path());
+    assert!(wait_until(Duration::from_secs(30), || holod(&["ctl", "status"]).status.success()));
+    daemon.signal(Signal::STOP);
+    let t_asked = host_now();
+    let asked = holod(&["ctl", "lasers", "dark"]);
+    assert!(host_now() - t_asked < TimeNs(30_000_000_000), "long after it could still be answered");
+    assert!(!asked.status.success() && asked.stderr.contains("nothing came for 8 s"), "{}", asked.stderr);
+    assert!(asked.stderr.contains("`holod dark --config RIG` puts the lasers out"), "{}", asked.stderr);
+}
+
+#[test]
 fn lasers_are_put_out_beside_a_daemon_that_hangs() {
     let laser_box = LaserBench::plug_in();
     let daemon = laser_box.lit_daemon();
@@ -368,6 +382,9 @@ fn a_second_signal_does_not_leave_lasers_without_a_heartbeat_lit() {
     // It is asked how it is from time to time once everything goes on.
     let asked = || heard.lock().unwrap().iter().filter(|words| *words == "f?").count();
     assert!(wait_until(Duration::from_secs(60), || asked() > 3 || !daemon.runs()));
+    let asked_before = asked();
+    daemon.signal(Signal::TSTP);
+    assert!(wait_until(Duration::from_secs(30), || asked() > asked_before + 1), "it was suspended");
     let before = heard.lock().unwrap().len();
     // Two of one kind at once may come as one.
     daemon.signal(Signal::INT);
@@ -376,6 +393,7 @@ fn a_second_signal_does_not_leave_lasers_without_a_heartbeat_lit() {
     assert_eq!(ended.status.code(), Some(0), "{}", ended.stderr);
     assert!(heard.lock().unwrap()[before..].iter().any(|words| words == "l0"), "{:?}", heard.lock().unwrap());
     assert!(ended.stderr.contains("a second signal ends holod only once"), "{}", ended.stderr);
+    assert!(ended.stderr.contains("SIGTSTP (Ctrl-Z) is not obeyed"), "{}", ended.stderr);
 }
 
 fn judge_record(record: &Path) {

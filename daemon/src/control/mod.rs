@@ -121,7 +121,7 @@ impl Request {
     }
 
     /// Whether files must be read or an engine opened for it, which takes a while.
-    fn takes_long(&self) -> bool {
+    pub(crate) fn takes_long(&self) -> bool {
         matches!(
             self,
             Self::Scene { .. } | Self::Weights { .. } | Self::Reload { .. } | Self::Pattern { .. } | Self::Flat {}

@@ -14,7 +14,7 @@ use holod_calibration::rig::LaserDriver;
 use holod_calibration::{TimeNs, hangup_is_ignored};
 use sd_notify::NotifyState;
 use signal_hook::SigId;
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM, SIGTSTP};
 
 use crate::failure::{Exit, Failure};
 use crate::staging::leave_signals_to_a_run;
@@ -61,7 +61,8 @@ fn has_terminal() -> bool {
     terminal != Some("0")
 }
 
-/// SIGINT, SIGTERM and, where it is not taken over for something else, SIGHUP, as a flag, for as long as this lives.
+/// SIGINT, SIGTERM, SIGQUIT and, where it is not taken over for something else, SIGHUP, as a flag, for as long as this
+/// lives.
 pub(crate) struct Signals {
     caught: Arc<AtomicUsize>,
     /// The next signal ends the process at once.
@@ -73,6 +74,8 @@ pub(crate) struct Signals {
     signals: Vec<i32>,
     /// Nothing ends the process at once before its lasers are out.
     after_lasers: bool,
+    /// SIGTSTP came, which is not obeyed then.
+    suspended: Arc<AtomicBool>,
 }
 
 impl Signals {
@@ -81,11 +84,18 @@ impl Signals {
     pub(crate) fn install(hangups: Option<&Hangups>) -> Result<Self, Failure> {
         let caught = Arc::new(AtomicUsize::new(0));
         let again = Arc::new(AtomicBool::new(false));
-        let mut signals =
-            Self { caught, again, registered: Vec::new(), first: Vec::new(), signals: Vec::new(), after_lasers: false };
+        let mut signals = Self {
+            caught,
+            again,
+            registered: Vec::new(),
+            first: Vec::new(),
+            signals: Vec::new(),
+            after_lasers: false,
+            suspended: Arc::default(),
+        };
         leave_signals_to_a_run(true);
         let ends_on_hangup = hangups.is_none() && !hangup_is_ignored();
-        for signal in [SIGINT, SIGTERM].into_iter().chain(ends_on_hangup.then_some(SIGHUP)) {
+        for signal in [SIGINT, SIGTERM, SIGQUIT].into_iter().chain(ends_on_hangup.then_some(SIGHUP)) {
             signals.signals.push(signal);
             let caught = Arc::clone(&signals.caught);
             for registered in [
@@ -100,8 +110,8 @@ impl Signals {
         Ok(signals)
     }
 
-    /// From now on a second signal ends the process only after [`Self::lasers_are_out`]: lasers that `driver` does not
-    /// put out by itself would stay lit.
+    /// From now on a second signal ends the process only after [`Self::lasers_are_out`], and SIGTSTP does not suspend
+    /// it: lasers that `driver` does not put out by itself would stay lit.
     pub(crate) fn end_after_lasers(&mut self, driver: &LaserDriver) {
         if driver.has_heartbeat() {
             return;
@@ -111,6 +121,17 @@ impl Signals {
         }
         self.again.store(false, Ordering::Release);
         self.after_lasers = true;
+        // Where it cannot be taken over, the process is suspended as ever.
+        self.registered.extend(signal_hook::flag::register(SIGTSTP, Arc::clone(&self.suspended)));
+    }
+
+    /// Says why the process was not suspended, where somebody wanted it.
+    pub(crate) fn tell_of_suspension(&self) {
+        if self.suspended.swap(false, Ordering::AcqRel) {
+            tracing::warn!(
+                "SIGTSTP (Ctrl-Z) is not obeyed: the lasers have no heartbeat and would stay lit; Ctrl-C ends holod"
+            );
+        }
     }
 
     /// The way down has begun: says what a second signal does not do.
@@ -140,6 +161,7 @@ impl Signals {
             0 => None,
             SIGINT => Some("SIGINT"),
             SIGTERM => Some("SIGTERM"),
+            SIGQUIT => Some("SIGQUIT"),
             _ => Some("SIGHUP"),
         }
     }

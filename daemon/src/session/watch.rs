@@ -187,6 +187,7 @@ impl Watch<'_> {
                 self.frames_shown_hz = self.frame_rate.at(self.tally.frames_shown, now);
                 self.write_status(&output.counts(), now);
             }
+            self.signals.tell_of_suspension();
             if let Some(signal) = self.signals.caught() {
                 return Ok(signal.to_owned());
             }

@@ -68,6 +68,7 @@ pub(super) fn show(
         let plan = pacer.predict(host_now());
         loop {
             let now = host_now();
+            signals.tell_of_suspension();
             if let Some(signal) = signals.caught() {
                 break 'frames Ok(signal.to_owned());
             }

@@ -19,6 +19,9 @@ from holod_client.folders import is_own, own_folders, warning_of
 LONGEST_ANSWER_BYTES = 1 << 20
 # How long others may be before this one at the socket, as for `holod ctl`.
 CONNECTS_WITHIN_S = 3.0
+# Orders for which holod reads files or draws; to the others it answers within 5 s even where its control thread hangs.
+TAKES_LONG = ("scene", "weights", "reload", "pattern", "flat")
+ANSWERS_WITHIN_S = 8.0
 BUILT_IN_WEIGHTS = ("standard", "small", "fast")
 
 
@@ -39,7 +42,7 @@ class Control:
     """A connection to the control socket of a running holod, for orders one after the other.
 
     `path` is the socket; without one it is that of the only holod in this user's runtime folder, or else of the
-    service. Each order waits for holod up to `timeout_s` seconds, which may be changed at any time: weights and long
+    service. An order waits for holod up to `timeout_s` seconds, which may be changed at any time: weights and long
     sequences take a while to read.
 
     An order whose answer does not come raises UnansweredError. It may have taken effect, and where holod hangs it may
@@ -67,7 +70,8 @@ class Control:
         """
         request = json.dumps({"do": do, **details}).encode() + b"\n"
         connection, answers = self._connected()
-        connection.settimeout(self.timeout_s)
+        timeout_s = self.timeout_s if do in TAKES_LONG else min(self.timeout_s, ANSWERS_WITHIN_S)
+        connection.settimeout(timeout_s)
         try:
             try:
                 # What raises here has left out the end of the line at least, without which holod does nothing.
@@ -76,7 +80,7 @@ class Control:
                 raise ControlError(
                     f"{self.path} takes no order ({_why(error)}), and nothing has changed: does that holod still run?"
                 ) from error
-            answer = self._answer(do, answers)
+            answer = self._answer(do, answers, timeout_s)
         except BaseException:
             self._disconnect()
             raise
@@ -190,14 +194,14 @@ class Control:
                 one.close()
         self._socket = self._answers = None
 
-    def _answer(self, do: str, answers: BinaryIO) -> dict[str, Any]:
+    def _answer(self, do: str, answers: BinaryIO, timeout_s: float) -> dict[str, Any]:
         def unanswered(what: str) -> UnansweredError:
             return UnansweredError(f"{what}; whether `{do}` took effect is not known: see its status and its log")
 
         try:
             line = answers.readline(LONGEST_ANSWER_BYTES)
         except TimeoutError as error:
-            raise unanswered(f"holod has not answered on {self.path} for {self.timeout_s:g} s") from error
+            raise unanswered(f"holod has not answered on {self.path} for {timeout_s:g} s") from error
         except OSError as error:
             raise unanswered(f"holod does not answer on {self.path}: {_why(error)}") from error
         if len(line) == LONGEST_ANSWER_BYTES:
