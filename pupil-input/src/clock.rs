@@ -58,6 +58,7 @@ pub struct ClockModel {
     /// Delay over the line that 19 of 20 samples stay below.
     spread_ns: f64,
     resets: u64,
+    leaps: u64,
 }
 
 /// What a [`ClockModel`] has found.
@@ -133,7 +134,7 @@ impl Default for ClockModel {
 impl ClockModel {
     /// A model that knows nothing yet: the first sample is taken to have arrived at once.
     pub const fn new() -> Self {
-        Self { line: Line::new(), strays: None, newest: None, spread_ns: 1e6, resets: 0 }
+        Self { line: Line::new(), strays: None, newest: None, spread_ns: 1e6, resets: 0, leaps: 0 }
     }
 
     /// Host time at which a sample of device time `device` was taken, given that it arrived at `arrival`; never later
@@ -146,7 +147,7 @@ impl ClockModel {
             if !self.is_reset(device, offset_ns, arrival) {
                 return self.map_stray(device, offset_ns, arrival);
             }
-            self.resets += u64::from(self.line.noted >= ESTABLISHED);
+            *(if self.line.noted >= ESTABLISHED { &mut self.resets } else { &mut self.leaps }) += 1;
             self.line = Line::new();
             self.newest = None;
         }
@@ -184,6 +185,12 @@ impl ClockModel {
     /// How often the device's clock was found to have been reset or stepped.
     pub const fn resets(&self) -> u64 {
         self.resets
+    }
+
+    /// How often a line was given up before it was established: at the beginning of a stream once or twice, and again and
+    /// again where the device's clock is no clock, or runs many times too fast.
+    pub const fn leaps(&self) -> u64 {
+        self.leaps
     }
 
     /// What has been found; nothing before the first sample.

@@ -37,6 +37,8 @@ pub enum Counter {
     Silences,
     /// Times at which the tracker's clock was reset or stepped.
     ClockResets,
+    /// Times at which the tracker's clock leapt away before anything was known of it.
+    ClockLeaps,
     /// Times at which a looped log began again.
     Loops,
     /// Decisions that the tap had no room for.
@@ -47,7 +49,7 @@ pub enum Counter {
 
 impl Counter {
     /// Every counter, in the order of their indices.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 18] = [
         Self::Bytes,
         Self::Samples,
         Self::Accepted,
@@ -62,6 +64,7 @@ impl Counter {
         Self::ReconnectAttempts,
         Self::Silences,
         Self::ClockResets,
+        Self::ClockLeaps,
         Self::Loops,
         Self::DecisionsDropped,
         Self::Strangers,
@@ -84,6 +87,7 @@ impl Counter {
             Self::ReconnectAttempts => "reconnect_attempts",
             Self::Silences => "silences",
             Self::ClockResets => "clock_resets",
+            Self::ClockLeaps => "clock_leaps",
             Self::Loops => "loops",
             Self::DecisionsDropped => "decisions_dropped",
             Self::Strangers => "datagrams_of_others",

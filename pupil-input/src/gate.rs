@@ -372,6 +372,11 @@ impl StepScale {
     }
 }
 
+/// Of the slowest tracker that is followed: 6 Hz.
+const LONGEST_INTERVAL: TimeNs = TimeNs(160_000_000);
+/// Where all samples are farther apart than this, none is believed.
+pub(crate) const LONGEST_GAP: TimeNs = TimeNs(3 * LONGEST_INTERVAL.0);
+
 /// A running median of the time between samples, from 1 kHz to 6 Hz, so that a slow tracker is not taken for a lost
 /// one.
 #[derive(Clone, Copy, Debug)]
@@ -389,7 +394,7 @@ impl Interval {
     fn note(&mut self, interval: TimeNs) {
         let tenth = self.median_ns / 10;
         self.median_ns += if interval.0 > self.median_ns { tenth } else { -tenth };
-        self.median_ns = self.median_ns.clamp(1_000_000, 160_000_000);
+        self.median_ns = self.median_ns.clamp(1_000_000, LONGEST_INTERVAL.0);
     }
 }
 

@@ -70,7 +70,7 @@ pub use record::{RecordError, RecordFiles, RecordStatus, payloads, with_header};
 pub use refusals::{Refusal, RefusalChange, RefusalWatch};
 pub use sample::{PupilSample, SampleEye};
 pub use simulate::{MOCK_SEED, MockSample, MockSource, Scenario, Script, ScriptError};
-pub use size_unit::SizeUnit;
+pub use size_unit::{Figures, SizeUnit};
 
 pub use holod_calibration::host_now;
 pub use source::SourceError;

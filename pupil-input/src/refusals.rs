@@ -6,8 +6,9 @@ use holod_calibration::{Sorted, TimeNs, rig};
 
 use crate::counters::{Counter, CounterSnapshot};
 use crate::estimator::Decision;
-use crate::gate::{GateSettings, Rejection, Verdict};
+use crate::gate::{GateSettings, LONGEST_GAP, Rejection, Verdict};
 use crate::import::LogFault;
+use crate::size_unit::{Figures, SizeUnit};
 use crate::wire::WireFault;
 use crate::{PupilSample, SampleEye};
 
@@ -22,6 +23,10 @@ const OTHER_MESSAGES: &str = "notes";
 const OTHER_MESSAGES_ADVICE: &str = "is the tracker's pupil measurement switched on (Neon: \"compute eye state\" in the \
                                      Companion; Pupil Core: the 3D detector), and are a profile's `prefix` or report `id` \
                                      those that it sends?";
+/// The reason where bytes come, and nothing that could be refused is in them.
+const UNREAD_BYTES: &str = "bytes";
+const FORM_ADVICE: &str = "is it this tracker's profile and baud rate? (`holod tracker list` names the profiles, \
+                           profile=NAME chooses one)";
 /// Samples of which the figures are looked at.
 const KEPT: usize = 64;
 /// Diameters at which an eye is likely to be, in millimetres: narrower than what the gate allows, so that a guess at
@@ -29,8 +34,13 @@ const KEPT: usize = 64;
 const LIKELY_MM: std::ops::RangeInclusive<f64> = 1.5..=9.0;
 /// No tracker's samples of one eye are nearer to each other, or, while they come, farther apart.
 const LIKELY_INTERVAL: std::ops::RangeInclusive<TimeNs> = TimeNs(100_000)..=TimeNs(1_000_000_000);
+/// A step of noise alone, millimetres.
+const SMALL_STEP_MM: f64 = 0.3;
 /// Units that are mistaken for millimetres: their name, and millimetres for one of them.
-const MISTAKEN_UNITS: [(&str, f64); 3] = [("micrometres", 1e-3), ("centimetres", 10.0), ("metres", 1e3)];
+const MISTAKEN_UNITS: [(&str, f64); 3] = [(MICROMETRES, 1e-3), ("centimetres", 10.0), ("metres", 1e3)];
+const MICROMETRES: &str = "micrometres";
+const MEASURE: &str = "measure an artificial pupil and set scale_mm_per_unit = its millimetres / the figure that stands \
+                       here for it, which of an area A is 2·√(A/π)";
 
 /// That nothing is believed, the most frequent reason, and what to do.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -38,7 +48,8 @@ pub struct Refusal {
     /// Messages and samples that were refused in a row, none that was believed between them; 0 where nothing was heard,
     /// or nothing that could be refused.
     pub refused: u64,
-    /// The counter's name of the most frequent reason; nothing where nothing was heard.
+    /// The counter's name of the most frequent reason, or of what came and was no sample; nothing where nothing was
+    /// heard.
     pub reason: String,
     /// What was found, and the likely cure.
     pub advice: String,
@@ -66,6 +77,7 @@ pub enum RefusalChange {
 #[derive(Clone, Debug)]
 pub struct RefusalWatch {
     scale: f64,
+    figures: Figures,
     eye: rig::Eye,
     limits: GateSettings,
     began: TimeNs,
@@ -76,14 +88,41 @@ pub struct RefusalWatch {
     /// A sample was believed with these settings.
     proven: bool,
     refused_since: Option<TimeNs>,
+    unread: Unread,
     current: Option<Refusal>,
 }
 
+/// Bytes without a sample in them.
+#[derive(Clone, Copy, Debug, Default)]
+struct Unread {
+    /// At the last look.
+    bytes: u64,
+    since: Option<TimeNs>,
+    /// Looks at which there were more than at the one before.
+    looks: u64,
+}
+
+impl Unread {
+    fn look(&mut self, now: TimeNs, bytes: u64) {
+        if bytes > self.bytes {
+            self.bytes = bytes;
+            self.since.get_or_insert(now);
+            self.looks += 1;
+        }
+    }
+
+    /// They go on coming: no sample is under way.
+    fn is_long(&self, now: TimeNs) -> bool {
+        self.looks >= LEAST_MESSAGES && self.since.is_some_and(|since| now - since >= UNHEARD_FOR)
+    }
+}
+
 impl RefusalWatch {
-    /// A watch over a tracker that was started with `settings` at host time `began`.
-    pub fn new(settings: &rig::Tracker, began: TimeNs) -> Self {
+    /// A watch over a tracker of such figures that was started with `settings` at host time `began`.
+    pub fn new(settings: &rig::Tracker, figures: Figures, began: TimeNs) -> Self {
         Self {
             scale: settings.scale.unwrap_or(1.0),
+            figures,
             eye: settings.eye,
             limits: GateSettings::default(),
             began,
@@ -91,6 +130,7 @@ impl RefusalWatch {
             believed: None,
             proven: false,
             refused_since: None,
+            unread: Unread::default(),
             current: None,
         }
     }
@@ -102,6 +142,7 @@ impl RefusalWatch {
         self.believed = Some(*counts);
         self.proven = false;
         self.refused_since = None;
+        self.unread = Unread { bytes: counts.of(Counter::Bytes), ..Unread::default() };
         self.current = None;
     }
 
@@ -128,6 +169,7 @@ impl RefusalWatch {
             self.believed = Some(*counts);
             self.proven = true;
             self.refused_since = None;
+            self.unread = Unread { bytes: counts.of(Counter::Bytes), ..Unread::default() };
             self.samples.clear();
             return self.current.take().map(|_| RefusalChange::Believed);
         }
@@ -160,9 +202,12 @@ impl RefusalWatch {
             .map(|reason| (Cause::Gate(reason), of_reason(counts, reason).saturating_sub(of_reason(before, reason))));
         let causes: Vec<_> = faults.chain(rejections).filter(|(_, count)| *count > 0).collect();
         let refused: u64 = causes.iter().map(|(_, count)| count).sum();
+        let samples = counts.of(Counter::Samples) - before.of(Counter::Samples);
+        let bytes = counts.of(Counter::Bytes) - before.of(Counter::Bytes);
+        self.unread.look(now, counts.of(Counter::Bytes));
+        let is_unread = samples == 0 && self.unread.is_long(now);
         if refused == 0 {
             let messages = counts.of(Counter::Notes) - before.of(Counter::Notes);
-            let samples = counts.of(Counter::Samples) - before.of(Counter::Samples);
             if messages > 0 && samples == 0 {
                 let since = *self.refused_since.get_or_insert(now);
                 let is_long = messages >= LEAST_MESSAGES && now - since >= REFUSED_FOR;
@@ -175,6 +220,15 @@ impl RefusalWatch {
                     ),
                 });
             }
+            let is_all = over && before.of(Counter::Accepted) == 0;
+            if bytes > 0 && samples == 0 && (is_unread || is_all) {
+                let is_known = self.current.as_ref().is_some_and(|current| current.reason == UNREAD_BYTES);
+                return (!is_known).then(|| Refusal {
+                    refused: 0,
+                    reason: UNREAD_BYTES.into(),
+                    advice: format!("{bytes} bytes came, and no sample was in them: {FORM_ADVICE}"),
+                });
+            }
             let unheard = counts.of(Counter::Connects) > 0 && counts.of(Counter::Bytes) == 0;
             return (unheard && self.current.is_none() && now - self.began >= UNHEARD_FOR).then(|| Refusal {
                 refused: 0,
@@ -185,7 +239,7 @@ impl RefusalWatch {
             });
         }
         let since = *self.refused_since.get_or_insert(now);
-        if !over && (now - since < REFUSED_FOR || refused < LEAST_MESSAGES) {
+        if !over && !is_unread && (now - since < REFUSED_FOR || refused < LEAST_MESSAGES) {
             return None;
         }
         // A sample beside a bad one is refused, too, and says nothing of the reason; nor does a time that came twice.
@@ -250,7 +304,7 @@ impl RefusalWatch {
                 )
             }
             Rejection::Backwards | Rejection::Repeated | Rejection::Guard | Rejection::Slew | Rejection::OutOfReach => {
-                self.motion_advice()
+                self.motion_advice(reason)
             }
         }
     }
@@ -263,11 +317,29 @@ impl RefusalWatch {
         };
         let figure = mm / self.scale;
         let shown = significant(figure);
+        let (least_mm, greatest_mm) = (self.limits.least_mm, self.limits.greatest_mm);
         if self.proven {
             return format!(
-                "{shown}: no pupil's diameter ({} to {} mm), though samples were believed before: does the tracker see the \
-                 pupil?",
-                self.limits.least_mm, self.limits.greatest_mm
+                "{shown}: no pupil's diameter ({least_mm} to {greatest_mm} mm), though samples were believed before: does \
+                 the tracker see the pupil?"
+            );
+        }
+        if figure == 0.0 {
+            return "the tracker sends 0: does it see the pupil?".into();
+        }
+        let Figures { unit, mm_per_unit } = self.figures;
+        if mm_per_unit != 1.0 {
+            return self.profile_advice(figure / mm_per_unit, mm);
+        }
+        // Any figure may be a right one.
+        if unit != SizeUnit::Millimetres {
+            let made = match self.scale {
+                1.0 => String::new(),
+                scale => format!(", nor are {} mm, which scale_mm_per_unit = {scale} makes of it", significant(mm)),
+            };
+            return format!(
+                "{shown} in {}: no pupil's millimetres ({least_mm} to {greatest_mm}){made}; {MEASURE}",
+                unit.name()
             );
         }
         if self.scale != 1.0 && LIKELY_MM.contains(&figure) {
@@ -282,24 +354,47 @@ impl RefusalWatch {
         let slips = [1.0, self.scale].map(|scale| MISTAKEN_UNITS.map(|(unit, factor)| (unit, scale * factor)));
         if let Some((unit, scale)) = slips.concat().into_iter().find(|(_, scale)| LIKELY_MM.contains(&(figure * scale)))
         {
+            let else_ = match unit {
+                MICROMETRES => format!("; an EyeLink's own units look like this, too: for those {MEASURE}"),
+                _ => String::new(),
+            };
             return format!(
-                "{shown}: looks like {unit}; scale_mm_per_unit = {scale} in the rig file, or --scale {scale}",
+                "{shown}: looks like {unit}; if it is, scale_mm_per_unit = {scale} in the rig file, or --scale \
+                 {scale}{else_}",
                 scale = significant(scale)
             );
         }
-        if figure == 0.0 {
-            return "the tracker sends 0: does it see the pupil?".into();
-        }
         format!(
-            "{shown}: no pupil's millimetres ({} to {}), and no other unit of length; if it is camera pixels or the \
-             tracker's own unit, measure an artificial pupil and set scale_mm_per_unit = its millimetres / the figure \
-             that stands here for it, which of an area A is 2·√(A/π)",
-            self.limits.least_mm, self.limits.greatest_mm
+            "{shown}: no pupil's millimetres ({least_mm} to {greatest_mm}), and no other unit of length; if it is camera \
+             pixels or the tracker's own unit, {MEASURE}"
         )
     }
 
-    /// Figures or times that jump.
-    fn motion_advice(&self) -> String {
+    /// Diameters that the profile has made millimetres of `raw`, and the rig `mm`.
+    fn profile_advice(&self, raw: f64, mm: f64) -> String {
+        let (shown, factor) = (significant(raw), self.figures.mm_per_unit);
+        if LIKELY_MM.contains(&raw) {
+            return format!(
+                "{shown}: looks like millimetres, which mm_per_unit = {factor} in the profile's [size] makes {} mm; take \
+                 that key out, and write unit = \"mm\"",
+                significant(raw * factor)
+            );
+        }
+        let scaled = match self.scale {
+            1.0 => String::new(),
+            scale => format!(" and scale_mm_per_unit = {scale} in the rig file"),
+        };
+        format!(
+            "{shown}: mm_per_unit = {factor} in the profile's [size]{scaled} makes {} mm of it, which is no pupil's ({} to \
+             {}); measure an artificial pupil and set mm_per_unit = its millimetres / the figure that stands here for it",
+            significant(mm),
+            self.limits.least_mm,
+            self.limits.greatest_mm
+        )
+    }
+
+    /// Figures or times that jump, or are too few.
+    fn motion_advice(&self, reason: Rejection) -> String {
         let steps = |step: fn(&PupilSample, &PupilSample) -> f64| {
             let pairs = SampleEye::ALL.into_iter().flat_map(|eye| {
                 let of_eye: Vec<_> = self.samples.iter().filter(|sample| sample.eye == eye).collect();
@@ -307,20 +402,34 @@ impl RefusalWatch {
             });
             median(pairs)
         };
-        let interval = steps(|before, after| (after.t_device.0.saturating_sub(before.t_device.0)).abs() as f64);
-        match interval.map(|ns| TimeNs(ns as i64)) {
-            Some(TimeNs(0)) => "its times do not advance: does the tracker's clock run?".into(),
-            Some(interval) if !LIKELY_INTERVAL.contains(&interval) => format!(
+        let taken = steps(|before, after| (after.t_device.0.saturating_sub(before.t_device.0)).abs() as f64);
+        let arrived = steps(|before, after| (after.t_arrival.0.saturating_sub(before.t_arrival.0)).abs() as f64);
+        let [interval, arrived] = [taken, arrived].map(|ns| ns.map(|ns| TimeNs(ns as i64)));
+        let is_few = |apart: &TimeNs| *apart > LONGEST_GAP;
+        let few = arrived.filter(is_few).or(interval.filter(is_few).filter(|apart| LIKELY_INTERVAL.contains(apart)));
+        let jump_mm = steps(|before, after| f64::from((after.diameter_mm - before.diameter_mm).abs()));
+        if let Some(apart) = few.filter(|_| reason == Rejection::Guard) {
+            let rate_hz = 1.0 / apart.seconds();
+            return format!("{rate_hz:.1} samples a second are too few: a live tracker gives 5 or more");
+        }
+        match (interval, jump_mm) {
+            (Some(TimeNs(0)), _) => "its times do not advance: does the tracker's clock run?".into(),
+            (Some(interval), _) if !LIKELY_INTERVAL.contains(&interval) => format!(
                 "its times advance by {} from sample to sample, as no tracker's do: they look like another unit than the \
                  one that is expected, such as milliseconds in the place of microseconds; correct the sender, or the \
                  profile's unit of time",
                 span(interval)
             ),
-            _ => format!(
-                "the figures jump by {:.2} mm from one to the next, as no pupil does: are they a pupil's diameter, of one \
-                 eye?",
-                steps(|before, after| f64::from((after.diameter_mm - before.diameter_mm).abs())).unwrap_or(f64::NAN)
+            (_, Some(jump_mm)) if reason != Rejection::Guard || jump_mm > SMALL_STEP_MM => format!(
+                "the figures jump by {jump_mm:.2} mm from one to the next, as no pupil does: are they a pupil's diameter, \
+                 of one eye?"
             ),
+            (_, Some(_)) => {
+                "each lies beside a silence or a sample that is refused: does the link lose samples, or bring \
+                             them in bursts?"
+                    .into()
+            }
+            (_, None) => "too few have come to tell more".into(),
         }
     }
 }
@@ -352,7 +461,7 @@ impl Cause {
                     | Rejection::Guard
                     | Rejection::Slew
                     | Rejection::OutOfReach
-            ) | Self::Wire(WireFault::NotFinite | WireFault::Negative)
+            ) | Self::Wire(WireFault::NotFinite | WireFault::Negative | WireFault::Uncalibrated)
         )
     }
 }
@@ -368,11 +477,19 @@ fn wire_advice(fault: WireFault) -> String {
         }
         WireFault::Negative => "the tracker sends negative diameters: does it see the pupil, and is this its profile?".into(),
         WireFault::BadConfidence => {
-            "the confidence is not between 0 and 1: let the sender divide it, or give a profile that does".into()
+            "the confidence is not between 0 and 1: let the sender divide it, or give a profile that does; where the sender \
+             writes decimal commas (3,75 for 3.75), let it write points"
+                .into()
         }
         WireFault::MissingField => {
-            "messages lack a figure that the profile reads: is it this tracker's profile? Where it names columns, and the \
-             tracker sends their names once at its start, restart the tracker, or write `columns = [...]` in the profile"
+            "messages lack a figure that the profile reads: is it this tracker's profile? Where it names columns, are they \
+             those of the tracker's header line, and is each there once? Where that line is sent at the tracker's start \
+             alone, restart the tracker, or write `columns = [...]` in the profile"
+                .into()
+        }
+        WireFault::Uncalibrated => {
+            "the tracker sees the pupil and gives no millimetres: calibrate it, or \
+             take a copy of its profile with size = \"pixels\" and set scale_mm_per_unit"
                 .into()
         }
         WireFault::MoreViews => {
@@ -381,9 +498,7 @@ fn wire_advice(fault: WireFault) -> String {
                 .into()
         }
         WireFault::BadEye => "the eye is named otherwise than the profile expects: is this the tracker's profile?".into(),
-        _ => "no message is of the form that the profile expects: is it this tracker's profile and baud rate? (`holod \
-              tracker list` names the profiles, profile=NAME chooses one)"
-            .into(),
+        _ => format!("no message is of the form that the profile expects: {FORM_ADVICE}"),
     }
 }
 
@@ -411,6 +526,7 @@ mod tests {
     use crate::estimator::{Estimator, EstimatorSettings};
 
     const MS: i64 = 1_000_000;
+    const MILLIMETRES: Figures = Figures { unit: SizeUnit::Millimetres, mm_per_unit: 1.0 };
 
     fn settings() -> rig::Tracker {
         rig::Rig::default().tracker
@@ -434,9 +550,18 @@ mod tests {
     /// Sends `count` samples at 200 Hz through gate and watch and looks ten times a second, as the daemon does; what
     /// was told, and when.
     fn told(settings: &rig::Tracker, count: i64, of: impl Fn(i64) -> PupilSample) -> Vec<(TimeNs, RefusalChange)> {
+        told_of(settings, MILLIMETRES, count, of)
+    }
+
+    fn told_of(
+        settings: &rig::Tracker,
+        figures: Figures,
+        count: i64,
+        of: impl Fn(i64) -> PupilSample,
+    ) -> Vec<(TimeNs, RefusalChange)> {
         let counters = Counters::new();
         let mut estimator = Estimator::new(EstimatorSettings::from(settings));
-        let mut watch = RefusalWatch::new(settings, TimeNs(0));
+        let mut watch = RefusalWatch::new(settings, figures, TimeNs(0));
         let mut told = Vec::new();
         for k in 0..count {
             counters.add(Counter::Samples, 1);
@@ -457,7 +582,11 @@ mod tests {
 
     /// What is said of samples that are all refused, once and within two seconds.
     fn advice(settings: &rig::Tracker, of: impl Fn(i64) -> PupilSample) -> String {
-        let told = told(settings, 2000, of);
+        advice_of(settings, MILLIMETRES, of)
+    }
+
+    fn advice_of(settings: &rig::Tracker, figures: Figures, of: impl Fn(i64) -> PupilSample) -> String {
+        let told = told_of(settings, figures, 2000, of);
         let [(t, RefusalChange::Refused(refusal))] = &told[..] else { panic!("told once: {told:?}") };
         assert!(*t <= TimeNs(2_000 * MS), "{t:?}");
         refusal.to_string()
@@ -467,7 +596,7 @@ mod tests {
     fn other_settings_are_judged_anew() {
         let counters = Counters::new();
         let of_scale = |scale| rig::Tracker { scale: Some(scale), ..settings() };
-        let mut watch = RefusalWatch::new(&of_scale(100.0), TimeNs(0));
+        let mut watch = RefusalWatch::new(&of_scale(100.0), MILLIMETRES, TimeNs(0));
         let mut said = Vec::new();
         for k in 0..80_i64 {
             let scale = if k < 40 { 100.0 } else { 50.0 };
@@ -500,12 +629,13 @@ mod tests {
     #[test]
     fn each_unit_that_is_mistaken_for_millimetres_is_named_with_its_scale() {
         let cases = [
-            (3500.0, None, "3500: looks like micrometres; scale_mm_per_unit = 0.001"),
-            (0.35, None, "0.35: looks like centimetres; scale_mm_per_unit = 10 "),
-            (0.0035, None, "0.0035: looks like metres; scale_mm_per_unit = 1000 "),
+            (3500.0, None, "3500: looks like micrometres; if it is, scale_mm_per_unit = 0.001"),
+            (3500.0, None, "--scale 0.001; an EyeLink's own units look like this, too"),
+            (0.35, None, "0.35: looks like centimetres; if it is, scale_mm_per_unit = 10 "),
+            (0.0035, None, "0.0035: looks like metres; if it is, scale_mm_per_unit = 1000 "),
             (3.5, Some(0.0125), "3.5: looks like millimetres, which scale_mm_per_unit = 0.0125 makes 0.04375 mm"),
-            (3500.0, Some(2.0), "3500: looks like micrometres; scale_mm_per_unit = 0.001"),
-            (70.0, Some(50.0), "70: looks like micrometres; scale_mm_per_unit = 0.05"),
+            (3500.0, Some(2.0), "3500: looks like micrometres; if it is, scale_mm_per_unit = 0.001"),
+            (70.0, Some(50.0), "70: looks like micrometres; if it is, scale_mm_per_unit = 0.05"),
             (41.3, None, "41.3: no pupil's millimetres"),
             (0.0, None, "sends 0"),
         ];
@@ -514,6 +644,109 @@ mod tests {
             let said = advice(&settings, |k| PupilSample { diameter_mm: figure, ..sample(k) });
             assert!(said.contains(expected) && said.contains("rejected_out_of_range"), "{said}");
         }
+    }
+
+    #[test]
+    fn no_unit_of_length_is_guessed_of_what_is_none() {
+        let arbitrary = Figures { unit: SizeUnit::Arbitrary, mm_per_unit: 1.0 };
+        let known = Figures { unit: SizeUnit::Millimetres, mm_per_unit: 0.05 };
+        let cases = [
+            (arbitrary, 3303.0, 1.0, "3303 in arbitrary units: no pupil's millimetres (1 to 9); measure an artificial"),
+            (arbitrary, 3303.0, 0.01, "nor are 33.03 mm, which scale_mm_per_unit = 0.01 makes of it; measure"),
+            (arbitrary, 0.35, 1.0, "0.35 in arbitrary units"),
+            (
+                known,
+                0.2,
+                1.0,
+                "4: looks like millimetres, which mm_per_unit = 0.05 in the profile's [size] makes 0.2 mm",
+            ),
+            (known, 20.0, 1.0, "400: mm_per_unit = 0.05 in the profile's [size] makes 20 mm of it"),
+            (known, 20.0, 2.0, "[size] and scale_mm_per_unit = 2 in the rig file makes 40 mm"),
+        ];
+        for (figures, figure, scale, expected) in cases {
+            let settings = rig::Tracker { scale: Some(scale), ..settings() };
+            let said = advice_of(&settings, figures, |k| PupilSample { diameter_mm: figure, ..sample(k) });
+            assert!(said.contains(expected) && !said.contains("metres;"), "{said}");
+        }
+    }
+
+    #[test]
+    fn samples_that_are_too_few_are_told_so() {
+        let sparse = |apart_ms: i64| {
+            move |k: i64| {
+                let t = TimeNs(k * apart_ms * MS);
+                PupilSample { t_device: t, t_sample: t, t_arrival: t, ..sample(k) }
+            }
+        };
+        for (apart_ms, expected) in [(500, "2.0 samples a second are too few"), (2000, "0.5 samples a second")] {
+            let said = advice(&settings(), sparse(apart_ms));
+            assert!(said.contains(expected), "{said}");
+        }
+        // The clock of a tracker that is kept up by its link says nothing of it.
+        let late = |k: i64| PupilSample { t_device: sample(k).t_device, ..sparse(600)(k) };
+        let said = advice(&settings(), late);
+        assert!(said.contains("1.7 samples a second are too few"), "{said}");
+        // One of each eye.
+        let counters = Counters::new();
+        let mut watch = RefusalWatch::new(&settings(), MILLIMETRES, TimeNs(0));
+        for eye in [SampleEye::Left, SampleEye::Right] {
+            counters.add_rejected(Rejection::Guard);
+            let sample = PupilSample { eye, ..sample(0) };
+            watch.note(&Decision { sample, verdict: Verdict::Rejected(Rejection::Guard) });
+        }
+        let said = watch.judge(TimeNs(0), &counters.snapshot(), true);
+        assert!(
+            matches!(&said, Some(RefusalChange::Refused(refusal)) if refusal.advice == "too few have come to tell more"),
+            "{said:?}"
+        );
+    }
+
+    #[test]
+    fn bytes_without_a_message_are_told_once() {
+        let counters = Counters::new();
+        let mut watch = RefusalWatch::new(&settings(), MILLIMETRES, TimeNs(0));
+        counters.add(Counter::Connects, 1);
+        counters.add(Counter::Partials, 1);
+        let mut told = Vec::new();
+        for tenth in 1..40 {
+            counters.add(Counter::Bytes, 90);
+            told.extend(
+                watch.judge(TimeNs(tenth * 100 * MS), &counters.snapshot(), false).map(|change| (tenth, change)),
+            );
+        }
+        let [(19, RefusalChange::Refused(refusal))] = &told[..] else { panic!("{told:?}") };
+        assert!(refusal.to_string().starts_with("1710 bytes came, and no sample was in them"), "{refusal}");
+        counters.add(Counter::Samples, 5);
+        counters.add(Counter::Accepted, 5);
+        assert_eq!(watch.judge(TimeNs(5_000 * MS), &counters.snapshot(), false), Some(RefusalChange::Believed));
+        // The beginning of a line, and then silence: the link tells that.
+        counters.add(Counter::Bytes, 9);
+        for tenth in 51..90 {
+            assert_eq!(watch.judge(TimeNs(tenth * 100 * MS), &counters.snapshot(), false), None);
+        }
+        assert_eq!(watch.judge(TimeNs(9_000 * MS), &counters.snapshot(), true), None, "the log's last line is cut off");
+    }
+
+    #[test]
+    fn one_fault_and_then_bytes_alone_are_told_as_the_fault() {
+        let counters = Counters::new();
+        let mut watch = RefusalWatch::new(&settings(), MILLIMETRES, TimeNs(0));
+        counters.add_fault(LogFault::Wire(WireFault::OutOfStep), 1);
+        let mut told = Vec::new();
+        for tenth in 1..40 {
+            counters.add(Counter::Bytes, 90);
+            told.extend(watch.judge(TimeNs(tenth * 100 * MS), &counters.snapshot(), false));
+        }
+        let [RefusalChange::Refused(refusal)] = &told[..] else { panic!("{told:?}") };
+        assert_eq!((refusal.refused, refusal.reason.as_str()), (1, "wire_out_of_step"));
+    }
+
+    #[test]
+    fn a_log_of_bytes_without_a_sample_is_told_at_its_end() {
+        let counters = Counters::new();
+        let mut watch = RefusalWatch::new(&settings(), MILLIMETRES, TimeNs(0));
+        counters.add(Counter::Bytes, 90);
+        assert!(watch.judge(TimeNs(0), &counters.snapshot(), true).is_some());
     }
 
     /// As [`told`] of a tracker of two eyes, of which the rig follows the left one.
@@ -549,7 +782,7 @@ mod tests {
     fn faults_of_the_followed_eye_are_told_before_the_other_eye() {
         for (faults, expected) in [(40, "wire_missing_field"), (3, "rejected_other_eye")] {
             let counters = Counters::new();
-            let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+            let mut watch = RefusalWatch::new(&settings(), MILLIMETRES, TimeNs(0));
             counters.add_fault(LogFault::Wire(WireFault::MissingField), faults);
             (0..41).for_each(|_| counters.add_rejected(Rejection::OtherEye));
             let said = watch.judge(TimeNs(0), &counters.snapshot(), true);
@@ -600,7 +833,7 @@ mod tests {
             (WireFault::MoreViews, "eyes = \"two\""),
         ] {
             let counters = Counters::new();
-            let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+            let mut watch = RefusalWatch::new(&settings(), MILLIMETRES, TimeNs(0));
             counters.add(Counter::Connects, 1);
             counters.add(Counter::Bytes, 30);
             counters.add_fault(LogFault::Wire(fault), 4);
@@ -622,7 +855,7 @@ mod tests {
     #[test]
     fn a_figure_that_is_none_is_told_as_its_fault_and_counted_once() {
         let counters = Counters::new();
-        let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+        let mut watch = RefusalWatch::new(&settings(), MILLIMETRES, TimeNs(0));
         assert_eq!(watch.judge(TimeNs(0), &counters.snapshot(), false), None);
         for _ in 0..40 {
             counters.add(Counter::Samples, 1);
@@ -637,7 +870,7 @@ mod tests {
     #[test]
     fn silence_is_told_and_what_is_heard_after_it() {
         let counters = Counters::new();
-        let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+        let mut watch = RefusalWatch::new(&settings(), MILLIMETRES, TimeNs(0));
         counters.add(Counter::Connects, 1);
         assert_eq!(watch.judge(TimeNs(1_000 * MS), &counters.snapshot(), false), None);
         let said = watch.judge(TimeNs(2_000 * MS), &counters.snapshot(), false);
@@ -655,7 +888,7 @@ mod tests {
     #[test]
     fn messages_that_are_of_no_pupil_are_told_once() {
         let counters = Counters::new();
-        let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+        let mut watch = RefusalWatch::new(&settings(), MILLIMETRES, TimeNs(0));
         counters.add(Counter::Connects, 1);
         let mut told = Vec::new();
         for tenth in 1..40 {
@@ -685,7 +918,7 @@ mod tests {
     #[test]
     fn a_log_that_has_ended_is_judged_at_once() {
         let counters = Counters::new();
-        let mut watch = RefusalWatch::new(&settings(), TimeNs(0));
+        let mut watch = RefusalWatch::new(&settings(), MILLIMETRES, TimeNs(0));
         counters.add_rejected(Rejection::Lost);
         assert!(watch.judge(TimeNs(0), &counters.snapshot(), true).is_some());
     }

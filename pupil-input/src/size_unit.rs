@@ -22,3 +22,19 @@ impl SizeUnit {
         }
     }
 }
+
+/// What a tracker's figures are, and what its profile makes of them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Figures {
+    /// What they are when the profile has converted them.
+    pub unit: SizeUnit,
+    /// What the profile multiplies them by; 1 where it knows no conversion.
+    pub mm_per_unit: f64,
+}
+
+impl From<SizeUnit> for Figures {
+    /// Figures that are as they came.
+    fn from(unit: SizeUnit) -> Self {
+        Self { unit, mm_per_unit: 1.0 }
+    }
+}

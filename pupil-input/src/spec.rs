@@ -168,8 +168,12 @@ pub(crate) fn parse(spec: &str, folder: &Path) -> Result<TrackerSpec, String> {
         ("core", Some(rest)) => host_port(rest, Some(CORE_PORT)).map(TrackerSpec::Core),
         ("neon", None) => Ok(TrackerSpec::Neon(HostPort { host: "neon.local".into(), port: NEON_PORT })),
         ("neon", Some(rest)) => host_port(rest, Some(NEON_PORT)).map(TrackerSpec::Neon),
-        (scheme, Some(_)) if !scheme.contains('/') && !scheme.contains('.') => {
-            Err(format!("unknown kind `{scheme}:`; expected {FORMS}"))
+        (scheme, Some(rest)) if !scheme.contains('/') && !scheme.contains('.') => {
+            let advice = match rest.contains('/') {
+                true => format!("; for the file or port at that path write `./{spec}`"),
+                false => String::new(),
+            };
+            Err(format!("unknown kind `{scheme}:`; expected {FORMS}{advice}"))
         }
         _ => parse_path(spec),
     }
@@ -178,8 +182,7 @@ pub(crate) fn parse(spec: &str, folder: &Path) -> Result<TrackerSpec, String> {
 /// A path by itself, or one with the options that `serial:` or `replay:` has.
 fn parse_path(spec: &str) -> Result<TrackerSpec, String> {
     let (path, options) = split_options(spec)?;
-    let keys = || options.iter().map(|option| option.split_once('=').map_or(*option, |(key, _)| key));
-    let any = |of: &[&str]| keys().any(|key| of.contains(&key));
+    let any = |of: &[&str]| options.iter().any(|option| of.contains(&key_of(option)));
     match (any(&["profile", "baud"]), any(&["speed", "loop"])) {
         (false, false) => Ok(TrackerSpec::Path(spec.into())),
         (true, false) => parse_serial(spec),
@@ -212,11 +215,22 @@ fn split_options(rest: &str) -> Result<(&str, Vec<&str>), String> {
             break;
         }
     }
+    refuse_repeats(&options)?;
     if path.is_empty() { Err("lacks a path".into()) } else { Ok((path, options)) }
 }
 
+fn refuse_repeats(options: &[&str]) -> Result<(), String> {
+    let keys: Vec<_> = options.iter().map(|option| key_of(option)).collect();
+    let repeated = (1..keys.len()).find(|index| keys[..*index].contains(&keys[*index]));
+    repeated.map_or(Ok(()), |index| Err(format!("the option `{}` is given twice; take one of them out", keys[index])))
+}
+
+fn key_of(option: &str) -> &str {
+    option.split_once('=').map_or(option, |(key, _)| key)
+}
+
 fn is_word_option(option: &str) -> bool {
-    let key = option.split_once('=').map_or(option, |(key, _)| key);
+    let key = key_of(option);
     !key.is_empty() && key.bytes().all(|byte| byte.is_ascii_lowercase())
 }
 
@@ -243,6 +257,7 @@ fn parse_hid(rest: &str) -> Result<TrackerSpec, String> {
         Some((ids, options)) => (ids, options.split(',').collect()),
         None => (rest, Vec::new()),
     };
+    refuse_repeats(&options)?;
     let ids = if ids.is_empty() { None } else { Some(ids.parse()?) };
     let (mut serial, mut profile) = (None, None);
     for option in options {
@@ -461,6 +476,11 @@ mod tests {
             ("replay:x,speed=max,loop", "never end"),
             ("/dev/ttyS0,baud=fast", "baud `fast`"),
             ("./x,baud=9600,loop", "options of a port and of a log"),
+            ("replay:x,speed=2,speed=3", "the option `speed` is given twice"),
+            ("./x,loop,loop", "the option `loop` is given twice"),
+            ("/dev/ttyS0,baud=9600,profile=x,baud=9600", "the option `baud` is given twice"),
+            ("hid:1209:0001,serial=A,serial=B", "the option `serial` is given twice"),
+            ("2026-01-01T12:00:00/x.csv", "at that path write `./2026-01-01T12:00:00/x.csv`"),
             ("mock:lights", "no scenario `lights`; there are light-steps"),
         ];
         for (spec, told) in cases {

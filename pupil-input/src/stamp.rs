@@ -45,6 +45,10 @@ impl Stamper {
         self.clock.resets()
     }
 
+    pub(crate) const fn leaps(&self) -> u64 {
+        self.clock.leaps()
+    }
+
     pub(crate) fn report(&self) -> Option<ClockReport> {
         self.clock.report()
     }

@@ -172,8 +172,8 @@ fn the_display_follows_the_eye_and_holds_through_blinks() {
 fn samples_that_are_all_refused_are_told_with_their_cure() {
     type Spoil = fn(&mut LineSample);
     let cases: [(Spoil, &str); 3] = [
-        (|line| line.diameter_mm *= 1000.0, "looks like micrometres; scale_mm_per_unit = 0.001"),
-        (|line| line.diameter_mm *= 0.1, "looks like centimetres; scale_mm_per_unit = 10"),
+        (|line| line.diameter_mm *= 1000.0, "looks like micrometres; if it is, scale_mm_per_unit = 0.001"),
+        (|line| line.diameter_mm *= 0.1, "looks like centimetres; if it is, scale_mm_per_unit = 10"),
         (|line| line.device_us /= 1000, "such as milliseconds in the place of microseconds"),
     ];
     for (spoil, cure) in cases {

@@ -1,7 +1,7 @@
 //! What a person should hear of the tracker while the loop runs.
 
 use holod_calibration::{TimeNs, rig};
-use holod_pupil_input::{ClockWatch, Counter, Decision, RefusalChange, RefusalWatch, TrackerControl};
+use holod_pupil_input::{ClockWatch, Counter, Decision, Figures, RefusalChange, RefusalWatch, TrackerControl};
 
 /// What is said of [`Counter::Strangers`].
 const STRANGERS: &str = "datagrams of another sender than the tracker's come to its port, and are left out: \
@@ -18,9 +18,9 @@ pub(super) struct TrackerWatch {
 }
 
 impl TrackerWatch {
-    pub(super) fn new(settings: &rig::Tracker, began: TimeNs) -> Self {
+    pub(super) fn new(settings: &rig::Tracker, figures: Figures, began: TimeNs) -> Self {
         Self {
-            refusals: RefusalWatch::new(settings, began),
+            refusals: RefusalWatch::new(settings, figures, began),
             clock: ClockWatch::default(),
             lost: None,
             strangers_told: false,
@@ -51,8 +51,7 @@ impl TrackerWatch {
             self.strangers_told = true;
             tracing::warn!("{STRANGERS}");
         }
-        let resets = tracker.counters().of(Counter::ClockResets);
-        if let Some(wrong) = self.clock.judge(now, tracker.clock(), resets) {
+        if let Some(wrong) = self.clock.judge(now, tracker.clock(), &tracker.counters()) {
             tracing::warn!("{wrong}");
         }
         self.judge(tracker, now);

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use holod_calibration::toml_source::{Fault, did_you_mean};
 
-use crate::size_unit::SizeUnit;
+use crate::size_unit::{Figures, SizeUnit};
 use crate::usb_ids::UsbIds;
 use crate::wire::hid_descriptor::DescriptorError;
 use crate::wire::{Decoder, Format};
@@ -26,6 +26,8 @@ pub struct Profile {
     pub about: String,
     /// What its sizes are before the rig's scale.
     pub unit: SizeUnit,
+    /// What one unit on the wire is multiplied by to that; 1 where the profile knows no conversion.
+    pub mm_per_unit: f64,
     /// Its serial port.
     pub serial: SerialSettings,
     /// Its HID device.
@@ -187,6 +189,11 @@ impl Profile {
             format => format,
         };
         Ok(Self { format, ..self })
+    }
+
+    /// What its sizes are, and what was made of those on the wire.
+    pub(crate) const fn figures(&self) -> Figures {
+        Figures { unit: self.unit, mm_per_unit: self.mm_per_unit }
     }
 
     /// A decoder for a stream that may be joined in the middle of a message.

@@ -1,5 +1,6 @@
 //! From a profile's text to a [`Profile`].
 
+use std::cell::Cell;
 use std::time::Duration;
 
 use holod_calibration::toml_source::Fault;
@@ -28,19 +29,24 @@ fn read(root: &Section<'_>) -> Option<Profile> {
     let name = root.require("name", "the profile's name").and_then(|at| root.reader().text(&at, "the profile's name"));
     let about = root.text("about", "one sentence about the tracker").unwrap_or_default();
     let eye = root.get("eye").and_then(|found| Some(found.with(root.reader().choose(&found, &EYES)?)));
-    let rate_hz = root.positive("rate_hz");
+    let rate_hz = root.positive("rate_hz").and_then(|rate_hz| Some(root.get("rate_hz")?.with(rate_hz)));
     let size_at = root.get("size").map(|found| found.with(()));
     let (unit, size) = read_size(&root.section("size"));
     let serial = read_serial(&root.section("serial"));
     let hid = read_hid(&root.section("hid"));
     let network = read_network(&root.section("network"));
     let wire = root.require("wire", "the table that says how bytes are read");
-    let context = Context { eye, rate_hz, size, unit, size_at };
+    let mm_per_unit = size.mm_per_unit;
+    let context = Context { eye, rate_hz, counts_frames: Cell::new(false), size, unit, size_at };
     let wire = wire.and_then(|wire| read_wire(&root.reader().table(&wire), &context));
+    if let Some(rate_hz) = context.rate_hz.as_ref().filter(|_| wire.is_some() && !context.counts_frames.get()) {
+        let advice = "take it out, or write unit = \"frames\" where the time counts frames";
+        root.reader().fault(rate_hz, rate_hz.value, "none: no time is made from a frame counter", advice);
+    }
     root.finish();
     let (name, about) = (name?.to_owned(), about.to_owned());
     let (format, unit) = wire?;
-    Some(Profile { name, about, unit, serial, hid, network, format })
+    Some(Profile { name, about, unit, mm_per_unit, serial, hid, network, format })
 }
 
 fn read_serial(serial: &Section<'_>) -> SerialSettings {
@@ -104,6 +110,13 @@ fn read_size(size: &Section<'_>) -> (SizeUnit, SizeRule) {
     let kind = size.choice("kind", &KINDS).unwrap_or(SizeKind::Diameter);
     let unit = size.choice("unit", &UNITS).unwrap_or_default();
     let mm_per_unit = size.positive("mm_per_unit");
+    if unit == SizeUnit::Millimetres
+        && let Some(factor) = mm_per_unit.filter(|factor| *factor != 1.0)
+        && let Some(found) = size.get("mm_per_unit")
+    {
+        let advice = "take it out, or write unit = \"pixels\" or unit = \"arbitrary\"";
+        size.reader().fault(&found, factor, "none where the unit is mm", advice);
+    }
     size.finish();
     // Where the profile knows the conversion, what it gives is millimetres.
     let given = if mm_per_unit.is_some() { SizeUnit::Millimetres } else { unit };

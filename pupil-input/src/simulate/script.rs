@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use holod_calibration::TimeNs;
+
 use crate::SampleEye;
 
 use super::MOCK_SEED;
@@ -151,10 +153,23 @@ impl Script {
     /// A line is no setting and no event; the error names the line, the word, and what was expected.
     pub fn parse(name: &str, text: &str) -> Result<Self, ScriptError> {
         let mut script = Self::default();
+        let mut settings: Vec<(&str, usize)> = Vec::new();
+        let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         for (number, line) in (1..).zip(text.lines()) {
             let line = line.split('#').next().unwrap_or_default();
-            let mut words = Words(line.split_whitespace());
-            script.take(&mut words).map_err(|Wrong { found, expected }| ScriptError::Line {
+            let first = line.split_whitespace().next().unwrap_or_default();
+            let again = settings.iter().find(|(known, _)| *known == first);
+            let taken = match again {
+                Some((_, before)) => {
+                    let expected = format!("each setting once: line {before} has it, too");
+                    Err(Wrong { found: Some(first.into()), expected })
+                }
+                None => script.take(&mut Words(line.split_whitespace())),
+            };
+            if SETTINGS.split(", ").any(|setting| setting == first) {
+                settings.push((first, number));
+            }
+            taken.map_err(|Wrong { found, expected }| ScriptError::Line {
                 name: name.into(),
                 line: number,
                 found: found.map_or("the end of the line".into(), |word| format!("`{}`", word.escape_debug())),
@@ -181,6 +196,11 @@ impl Script {
     pub(crate) fn has_link(&self) -> bool {
         let times = [self.delay_s, self.jitter_s, self.batch_s, self.ahead_s, self.drift];
         times != [0.0; 5] || self.events.iter().any(|event| matches!(event.what, What::Steps(_)))
+    }
+
+    /// Its end, where it has one.
+    pub(crate) fn ends(&self) -> Option<TimeNs> {
+        self.ends_s.is_finite().then(|| TimeNs::from_seconds(self.ends_s))
     }
 
     fn take(&mut self, words: &mut Words<'_>) -> Result<(), Wrong> {
@@ -349,6 +369,7 @@ mod tests {
         assert_eq!(script, expected);
         assert_eq!(parsed("eyes B").eyes, [SampleEye::Both]);
         assert_eq!(parsed(""), Script::default());
+        assert_eq!(parsed("\u{feff}rate 60\n\n\n1s lost 1s\n1s lost 1s"), parsed("rate 60\n1s lost 1s\n1s lost 1s"));
     }
 
     #[test]
@@ -370,9 +391,9 @@ mod tests {
         let cases = [
             ("noise 0.1", "found `0.1`, expected a standard deviation such as 0.05mm"),
             ("noise", "found the end of the line, expected a standard deviation"),
-            ("rate 0", "found `0`, expected samples a second from 1 to 4000"),
-            ("rate NaN", "found `NaN`"),
-            ("rate 200 Hz", "found `Hz`, expected the end"),
+            ("seed -1", "found `-1`, expected a whole number"),
+            ("seed NaN", "found `NaN`"),
+            ("seed 3 4", "found `4`, expected the end"),
             ("eyes L B", "found `B`, expected L, R, L R or B"),
             ("eyes L L", "found `L`"),
             ("eyes left", "found `left`, expected L, R or B"),
@@ -386,6 +407,7 @@ mod tests {
             ("2s blink 0.2s whole", "found `whole`, expected half or the end"),
             ("2s unsure 3 1s", "found `3`, expected a confidence from 0 to 1"),
             ("2s explode", "found `explode`, expected every SPAN, or light"),
+            ("rate 100", "found `rate`, expected each setting once: line 1 has it, too"),
         ];
         for (line, told) in cases {
             let error = Script::parse("a.txt", &format!("rate 60\n{line}\n")).expect_err(line).to_string();

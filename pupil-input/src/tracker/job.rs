@@ -9,7 +9,7 @@ use crate::import::Recording;
 use crate::import::raw::RawLog;
 use crate::profile::{DEFAULT_PROFILE, Profile};
 use crate::simulate::Script;
-use crate::size_unit::SizeUnit;
+use crate::size_unit::{Figures, SizeUnit};
 use crate::source::hid::{self, HidFeed, Wanted};
 use crate::source::neon::NeonFeed;
 use crate::source::pupil_labs_core::CoreFeed;
@@ -86,7 +86,7 @@ impl Job {
     pub(super) fn unit_unopened(spec: &TrackerSpec) -> Result<SizeUnit, TrackerError> {
         match Self::profile_unopened(spec)? {
             Some(profile) => Ok(profile.unit),
-            None => Ok(Self::open(spec, TimeNs(0), &[])?.unit()),
+            None => Ok(Self::open(spec, TimeNs(0), &[])?.figures().unit),
         }
     }
 
@@ -110,12 +110,12 @@ impl Job {
     }
 
     /// What its sizes are before the rig's scale.
-    pub(super) fn unit(&self) -> SizeUnit {
+    pub(super) fn figures(&self) -> Figures {
         match self {
-            Self::Live { profile, .. } => profile.unit,
-            Self::Replay { recording, .. } => recording.unit(),
-            Self::Rerun { raw, .. } => raw.profile().unit,
-            Self::Mock { .. } => SizeUnit::Millimetres,
+            Self::Live { profile, .. } => profile.figures(),
+            Self::Replay { recording, .. } => recording.unit().into(),
+            Self::Rerun { raw, .. } => raw.profile().figures(),
+            Self::Mock { .. } => SizeUnit::Millimetres.into(),
         }
     }
 

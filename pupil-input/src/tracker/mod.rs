@@ -21,7 +21,7 @@ use crate::import::ReplayError;
 use crate::profile::ProfileError;
 use crate::record::{self, Header, RecordError, RecordFiles, RecordStatus, Recorder};
 use crate::simulate::ScriptError;
-use crate::size_unit::SizeUnit;
+use crate::size_unit::{Figures, SizeUnit};
 use crate::source::SourceError;
 use crate::spec::TrackerSpec;
 
@@ -186,9 +186,10 @@ impl Tracker {
     ) -> Result<TrackerHandle, TrackerError> {
         let TrackerOptions { origin, record, forbidden, reader_begins } = options.into();
         let job = Job::open(spec, origin, &forbidden)?;
-        check_scale(spec, job.unit(), settings)?;
+        let figures = job.figures();
+        check_scale(spec, figures.unit, settings)?;
         let mut warnings = job.warnings();
-        warnings.extend(needless_scale(&format!("tracker `{spec}`"), job.unit(), settings));
+        warnings.extend(needless_scale(&format!("tracker `{spec}`"), figures.unit, settings));
         let header = job.link().map(|(profile, datagrams)| Header {
             spec: spec.to_string(),
             profile: profile.name.clone(),
@@ -208,7 +209,6 @@ impl Tracker {
         let (producer, consumer) = rtrb::RingBuffer::new(TAP_DECISIONS);
         let (troubles, untold) = rtrb::RingBuffer::new(TROUBLES);
         let (changes, change_consumer) = rtrb::RingBuffer::new(CHANGES);
-        let unit = job.unit();
         let shared = Arc::new(Shared {
             counters: Counters::new(),
             clock: ClockGauge::new(),
@@ -247,7 +247,7 @@ impl Tracker {
                 untold,
                 trouble: None,
                 changes,
-                unit,
+                figures,
             },
         })
     }
@@ -277,7 +277,7 @@ impl TrackerHandle {
                 untold,
                 trouble: None,
                 changes,
-                unit: SizeUnit::Millimetres,
+                figures: SizeUnit::Millimetres.into(),
             },
         }
     }
@@ -330,7 +330,7 @@ pub struct TrackerControl {
     untold: rtrb::Consumer<String>,
     trouble: Option<String>,
     changes: rtrb::Producer<EstimatorSettings>,
-    unit: SizeUnit,
+    figures: Figures,
 }
 
 impl TrackerControl {
@@ -354,6 +354,11 @@ impl TrackerControl {
         self.link() == Link::Finished
     }
 
+    /// What its sizes are before the rig's scale.
+    pub const fn figures(&self) -> Figures {
+        self.figures
+    }
+
     /// What a user should know of the tracker although it runs, found at its start: a port that will change its name,
     /// an adapter that holds bytes back, a recording that is torn. A sentence each.
     pub fn warnings(&self) -> &[String] {
@@ -374,8 +379,9 @@ impl TrackerControl {
     /// # Errors
     /// [`ChangeError`]; nothing has changed then.
     pub fn change(&mut self, settings: &rig::Tracker) -> Result<Option<String>, ChangeError> {
-        if self.unit != SizeUnit::Millimetres && settings.scale.is_none() {
-            return Err(ChangeError::NoScale(self.unit.name()));
+        let unit = self.figures.unit;
+        if unit != SizeUnit::Millimetres && settings.scale.is_none() {
+            return Err(ChangeError::NoScale(unit.name()));
         }
         if self.finished() {
             return Err(ChangeError::Finished);
@@ -384,7 +390,7 @@ impl TrackerControl {
         if let Some(thread) = &self.thread {
             thread.thread().unpark();
         }
-        Ok(needless_scale("the tracker", self.unit, settings))
+        Ok(needless_scale("the tracker", unit, settings))
     }
 
     /// How the recording goes, where there is one.

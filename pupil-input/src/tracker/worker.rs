@@ -250,6 +250,7 @@ impl Worker {
 
     fn run_mock(&mut self, script: Script, origin: TimeNs) {
         self.clock = StreamClock { host: origin, stream: TimeNs(0), rate: 1.0 };
+        let ends = script.ends().map_or(TimeNs(i64::MAX), |ends| self.clock.to_host(ends));
         // A script's clock and link are learnt as a real tracker's; without them every sample has its own time.
         let mut clock = script.has_link().then(ClockModel::new);
         for mock in MockSource::of(script) {
@@ -261,14 +262,17 @@ impl Worker {
             let mut known = sample.t_sample;
             if let Some(clock) = &mut clock {
                 known = self.clock.to_stream(sample.t_arrival);
-                let resets = clock.resets();
+                let (resets, leaps) = (clock.resets(), clock.leaps());
                 sample.t_sample = clock.map(sample.t_device, known);
                 self.count(Counter::ClockResets, clock.resets() - resets);
+                self.count(Counter::ClockLeaps, clock.leaps() - leaps);
                 self.shared.clock.set(clock.report());
             }
             self.take(sample, known);
             self.publish();
         }
+        // One that falls silent for good has not ended.
+        self.wait_until(ends);
     }
 
     /// Takes a sample that is known from `t_known` on, on the stream's clock.
@@ -417,7 +421,7 @@ impl LiveStream {
     fn push(&mut self, bytes: &[u8], arrival: TimeNs, worker: &mut Worker) -> bool {
         worker.count(Counter::Bytes, bytes.len() as u64);
         let Self { decoder, sequence, stamper, datagrams } = self;
-        let resets = stamper.resets();
+        let (resets, leaps) = (stamper.resets(), stamper.leaps());
         let mut has_sample = false;
         let mut take = |event| match event {
             WireEvent::Sample(sample) => {
@@ -443,6 +447,7 @@ impl LiveStream {
         }
         stamper.rest(arrival, |sample| worker.take(sample, arrival));
         worker.count(Counter::ClockResets, stamper.resets() - resets);
+        worker.count(Counter::ClockLeaps, stamper.leaps() - leaps);
         worker.shared.clock.set(stamper.report());
         has_sample
     }

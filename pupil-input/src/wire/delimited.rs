@@ -12,6 +12,8 @@ pub const MAX_LINE_BYTES: usize = 4096;
 /// Columns that are told apart; what lies beyond is not read.
 pub const MAX_COLUMNS: usize = 128;
 
+const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
+
 /// How lines are read.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DelimitedSettings {
@@ -194,6 +196,8 @@ impl Decoder for DelimitedDecoder {
 
 impl Rows {
     fn take(&mut self, line: &[u8], on_event: &mut dyn FnMut(WireEvent)) {
+        // What Windows' editors put before a text is no part of it.
+        let line = line.strip_prefix(BYTE_ORDER_MARK).unwrap_or(line);
         if line.iter().all(u8::is_ascii_whitespace) {
             return;
         }
@@ -281,12 +285,12 @@ impl Columns {
         line.first().is_some_and(letter) && self.wanted.iter().any(|column| matches!(column, Column::Name(_)))
     }
 
-    /// Takes a line that names all named columns for the header, and tells whether it is one.
+    /// Takes a line that names all named columns, each once, for the header, and tells whether it is one.
     fn adopt(&mut self, line: &[u8]) -> bool {
         self.split(line, MAX_COLUMNS);
         let place = |columns: &Self, column: &Column| match column {
             Column::Number(number) => Some(number.saturating_sub(1)),
-            Column::Name(name) => (0..columns.found).find(|index| columns.cell(line, *index) == Some(name.as_bytes())),
+            Column::Name(name) => columns.named(line, name.as_bytes()),
         };
         if !self.wanted.iter().all(|column| place(self, column).is_some()) {
             return false;
@@ -296,6 +300,22 @@ impl Columns {
         }
         self.count_needed();
         true
+    }
+
+    /// The only column of that name, or else, in capitals or not, the only one.
+    fn named(&self, line: &[u8], name: &[u8]) -> Option<usize> {
+        let called = |is_name: &dyn Fn(&[u8]) -> bool| {
+            let mut found = (0..self.found).filter(|index| self.cell(line, *index).is_some_and(is_name));
+            (found.next(), found.next())
+        };
+        match called(&|cell| cell == name) {
+            (None, _) => match called(&|cell| cell.eq_ignore_ascii_case(name)) {
+                (only, None) => only,
+                _ => None,
+            },
+            (only, None) => only,
+            _ => None,
+        }
     }
 }
 
@@ -552,6 +572,23 @@ mod tests {
         // With names in the profile no header need come, and one that comes is no fault.
         settings.columns = ["time", "left"].map(str::to_owned).to_vec();
         assert_eq!(decode(&settings, "5,3,4\ntime,left\n6,4\n"), [left(5, 3.0), WireEvent::Note, left(6, 4.0)]);
+    }
+
+    #[test]
+    fn a_header_may_have_a_byte_order_mark_and_capitals_and_names_each_column_once() {
+        let mut settings = one_eye();
+        settings.layout.time.as_mut().unwrap().at = Column::Name("time".into());
+        settings.layout.pupils[0].size.at = Column::Name("left".into());
+        for header in ["\u{FEFF}time,left", "Time,LEFT", "LEFT,time,left"] {
+            let mut decoder = DelimitedDecoder::joining(&settings);
+            let row = if header.starts_with("LEFT") { "9,5,4\n" } else { "5,4\n" };
+            let read = events_of(&mut decoder, format!("{header}\n{row}").as_bytes());
+            assert_eq!(read, [WireEvent::Note, left(5, 4.0)], "{header}");
+        }
+        for header in ["time,left,left", "time,Left,LEFT"] {
+            let read = events_of(&mut DelimitedDecoder::joining(&settings), format!("{header}\n5,4,3\n").as_bytes());
+            assert_eq!(read, [WireEvent::Partial, WireEvent::Rejected(WireFault::MissingField)], "{header}");
+        }
     }
 
     #[test]

@@ -6,7 +6,7 @@
 //! P1,<seq>,<device_us>,<L|R|B>,<diameter_mm>,<confidence 0..1>*<CRC-8, two hex digits>
 //! ```
 //!
-//! ending in LF (CR LF accepted). The CRC has polynomial 0x07 and initial value 0 and covers the bytes before `*`. A
+//! ending in LF (CR and CR LF accepted; blanks before it are ignored). The CRC has polynomial 0x07 and initial value 0 and covers the bytes before `*`. A
 //! line that starts with `#` is a comment; fields after the confidence are ignored. `seq` counts up by one a line (two
 //! eyes of one instant may share a number).
 
@@ -71,7 +71,7 @@ impl LineDecoder {
         let joined = std::mem::take(&mut self.first);
         let overlong = std::mem::take(&mut self.overlong);
         let used = std::mem::take(&mut self.used);
-        let line = self.line[..used].strip_suffix(b"\r").unwrap_or(&self.line[..used]);
+        let line = self.line[..used].trim_ascii_end();
         if line.is_empty() {
             return;
         }
@@ -99,7 +99,7 @@ impl LineDecoder {
 impl Decoder for LineDecoder {
     fn push(&mut self, bytes: &[u8], on_event: &mut dyn FnMut(WireEvent)) {
         for &byte in bytes {
-            if byte == b'\n' {
+            if matches!(byte, b'\n' | b'\r') {
                 self.end_line(on_event);
             } else if self.used < MAX_LINE_BYTES {
                 self.line[self.used] = byte;
@@ -250,6 +250,15 @@ mod tests {
     fn a_known_line_reads_as_its_fields() {
         assert_eq!(decode(encoded(&sample()).as_bytes()), [WireEvent::Sample(sample().into())]);
         assert_eq!(encoded(&sample()), with_crc("P1,7,1234567,L,3.25,0.9").to_uppercase());
+    }
+
+    #[test]
+    fn lines_end_in_cr_too_and_blanks_at_their_end_are_ignored() {
+        let line = encoded(&sample());
+        let good = WireEvent::Sample(sample().into());
+        for ending in ["\r", "\r\n", "  \r\n", "\t\n"] {
+            assert_eq!(decode(line.replace('\n', ending).repeat(3).as_bytes()), [good; 3], "{ending:?}");
+        }
     }
 
     #[test]

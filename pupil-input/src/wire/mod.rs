@@ -85,11 +85,13 @@ pub enum WireFault {
     OutOfStep,
     /// It tells of more views, of another eye or camera, than the profile has.
     MoreViews,
+    /// The pupil is seen, and has no size in millimetres: the tracker was not calibrated.
+    Uncalibrated,
 }
 
 impl WireFault {
     /// Every reason, in the order of their indices.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 14] = [
         Self::TooLong,
         Self::TooShort,
         Self::Malformed,
@@ -103,6 +105,7 @@ impl WireFault {
         Self::MissingField,
         Self::OutOfStep,
         Self::MoreViews,
+        Self::Uncalibrated,
     ];
 
     /// Its place in [`Self::ALL`].
@@ -111,9 +114,9 @@ impl WireFault {
     }
 
     /// Whether a pupil's figure is no size, as some trackers send through a blink: a lost sample is told beside it, but
-    /// by PupilEXT and LiveTrack, so that its neighbours are not believed.
+    /// of the first two by PupilEXT and LiveTrack, so that its neighbours are not believed.
     pub(crate) const fn is_of_a_figure(self) -> bool {
-        matches!(self, Self::NotFinite | Self::Negative)
+        matches!(self, Self::NotFinite | Self::Negative | Self::Uncalibrated)
     }
 
     /// The name under which it is counted.
@@ -132,6 +135,7 @@ impl WireFault {
             Self::MissingField => "wire_missing_field",
             Self::OutOfStep => "wire_out_of_step",
             Self::MoreViews => "wire_more_views",
+            Self::Uncalibrated => "wire_uncalibrated",
         }
     }
 }

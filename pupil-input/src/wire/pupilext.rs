@@ -141,7 +141,7 @@ impl Decoder for PupilExtDecoder {
         let settings = &self.settings;
         match &mut self.reader {
             Reader::Csv { delimiter, lines } => lines.finish(|row| take_row(settings, *delimiter, row, on_event)),
-            Reader::Json(scanner) => **scanner = Scanner::joining(),
+            Reader::Json(scanner) => scanner.end(),
         }
     }
 }
@@ -151,6 +151,8 @@ impl Decoder for PupilExtDecoder {
 struct View {
     t_device: Option<TimeNs>,
     diameter: Option<f64>,
+    /// The main camera's, where the size that is read is another.
+    diameter_px: Option<f64>,
     confidence: Option<f64>,
     outline_confidence: Option<f64>,
     fault: Option<WireFault>,
@@ -159,7 +161,8 @@ struct View {
 }
 
 impl View {
-    fn sample(&self, eye: SampleEye) -> Result<WireSample, WireFault> {
+    /// A sample; a lost one beside the fault, where it is for want of a calibration alone.
+    fn sample(&self, eye: SampleEye) -> Result<(WireSample, Option<WireFault>), WireFault> {
         if let Some(fault) = self.fault {
             return Err(fault);
         }
@@ -173,7 +176,8 @@ impl View {
         if !(0.0..=1.0).contains(&confidence) {
             return Err(WireFault::BadConfidence);
         }
-        Ok(WireSample {
+        let is_seen = self.diameter_px.is_some_and(|diameter_px| diameter_px > 0.0);
+        let sample = WireSample {
             t_device: Some(t_device),
             eye,
             diameter_mm: size(diameter)?,
@@ -181,7 +185,8 @@ impl View {
             aperture_mm: None,
             sequence: None,
             valid: diameter > 0.0,
-        })
+        };
+        Ok((sample, (diameter == NOT_FOUND && is_seen).then_some(WireFault::Uncalibrated)))
     }
 }
 
@@ -282,9 +287,18 @@ fn take_row(settings: &PupilExtSettings, delimiter: u8, row: Line<'_>, on_event:
     for (index, &eye) in eyes.iter().enumerate() {
         let places = if first_figure == 1 { new_columns(settings, index) } else { old_columns(settings, index) };
         match view_of(settings, columns, places).and_then(|view| view.sample(eye)) {
-            Ok(sample) => on_event(WireEvent::Sample(sample)),
+            Ok((sample, fault)) => {
+                on_fault(fault, on_event);
+                on_event(WireEvent::Sample(sample));
+            }
             Err(fault) => on_event(row.rejected(fault)),
         }
+    }
+}
+
+fn on_fault(fault: Option<WireFault>, on_event: &mut dyn FnMut(WireEvent)) {
+    if let Some(fault) = fault {
+        on_event(WireEvent::Rejected(fault));
     }
 }
 
@@ -297,6 +311,10 @@ fn view_of(settings: &PupilExtSettings, columns: &[&[u8]], places: Columns) -> R
     Ok(View {
         t_device: Some(time(columns[0], NS_PER_MS)?),
         diameter: Some(number(columns[diameter])?),
+        diameter_px: match settings.size {
+            PupilExtSize::Millimetres => Some(number(columns[places.diameter])?),
+            PupilExtSize::Pixels | PupilExtSize::UndistortedPixels => None,
+        },
         confidence: Some(number(columns[places.confidence])?),
         outline_confidence: Some(number(columns[places.confidence + 1])?),
         fault: None,
@@ -423,6 +441,11 @@ impl Scanner {
         }
     }
 
+    /// Drops what has come of a message, as at a datagram's end. What is known of the stream stays.
+    const fn end(&mut self) {
+        (self.state, self.at_line_start) = (State::Outside, true);
+    }
+
     fn push(&mut self, settings: &PupilExtSettings, mut bytes: &[u8], on_event: &mut dyn FnMut(WireEvent)) {
         while let Some(&byte) = bytes.first() {
             // What a string holds and the blanks of an indent come in runs.
@@ -547,11 +570,14 @@ impl Scanner {
                 PupilExtEyes::One(eye) => level.eye.filter(|_| eye == SampleEye::Both).unwrap_or(eye),
                 PupilExtEyes::Two => level.eye.unwrap_or(SampleEye::Both),
             };
-            on_event(match level.view.sample(eye) {
-                _ if one && (self.told > 1 || self.crowded) => WireEvent::Rejected(WireFault::MoreViews),
-                Ok(sample) => WireEvent::Sample(sample),
-                Err(fault) => WireEvent::Rejected(fault),
-            });
+            match level.view.sample(eye) {
+                _ if one && (self.told > 1 || self.crowded) => on_event(WireEvent::Rejected(WireFault::MoreViews)),
+                Ok((sample, fault)) => {
+                    on_fault(fault, on_event);
+                    on_event(WireEvent::Sample(sample));
+                }
+                Err(fault) => on_event(WireEvent::Rejected(fault)),
+            }
         }
         if self.depth > 0 {
             self.depth -= 1;
@@ -601,6 +627,9 @@ impl Scanner {
                 Err(fault) => view.fault = Some(fault),
             },
             Field::Size(size) if size == settings.size => keep(&mut view.diameter),
+            Field::Size(PupilExtSize::Pixels) if settings.size == PupilExtSize::Millimetres => {
+                view.diameter_px = number(text).ok();
+            }
             Field::Size(_) => {}
             Field::Confidence => keep(&mut view.confidence),
             Field::OutlineConfidence => keep(&mut view.outline_confidence),
@@ -719,7 +748,8 @@ mod tests {
         assert_eq!(decode(two, row), expected);
         let stereo = csv(PupilExtEyes::Two, true);
         let views = [FIGURES, "0,0,0,0,0,0,0,0,0,0,0,0", "40,40.5,-1,40,39,1,1,2,3,127,-1,-1", FIGURES].join(",");
-        let expected = [sample(SampleEye::Right, 3.25, 0.95), sample(SampleEye::Left, -1.0, 1.0)];
+        let uncalibrated = WireEvent::Rejected(WireFault::Uncalibrated);
+        let expected = [sample(SampleEye::Right, 3.25, 0.95), uncalibrated, sample(SampleEye::Left, -1.0, 1.0)];
         assert_eq!(decode(stereo, &format!("1700000000123,{views},3,,36,37\n")), expected);
         let settings = PupilExtSettings { container: PupilExtContainer::Csv { delimiter: b';' }, ..stereo };
         assert_eq!(decode(settings, &format!("1700000000123,{views},3,,36,37\n").replace(',', ";")), expected);
@@ -749,6 +779,46 @@ mod tests {
         assert_eq!(decode(json(), &eyes(&["A", "B"]).repeat(2)), [first, refused, refused, refused]);
         let alone = format!("{}{}", eyes(&["A", "B"]), eyes(&["A"]).repeat(2));
         assert_eq!(decode(json(), &alone), [first, refused, refused, first]);
+    }
+
+    #[test]
+    fn two_eyes_in_datagrams_are_not_read_as_one() {
+        let both = message(&[("A", view("Main", "old", "3.25")), ("B", view("Main", "old", "6.5"))]);
+        let mut decoder = PupilExtDecoder::new(json());
+        let mut events = Vec::new();
+        for datagram in [&both, &both, &both[..300].to_owned(), &both] {
+            decoder.push(datagram.as_bytes(), &mut |event| events.push(event));
+            decoder.finish(&mut |event| events.push(event));
+        }
+        let refused = WireEvent::Rejected(WireFault::MoreViews);
+        assert_eq!(events, [&[sample(SampleEye::Both, 3.25, 0.95)][..], &[refused; 5]].concat());
+        // Another connection may be to another tracker.
+        assert!(!decoder.rejoin());
+    }
+
+    #[test]
+    fn datagrams_that_are_no_json_are_told_each() {
+        let mut decoder = PupilExtDecoder::new(json());
+        let mut events = Vec::new();
+        for _ in 0..3 {
+            decoder.push(b"hello", &mut |event| events.push(event));
+            decoder.finish(&mut |event| events.push(event));
+        }
+        let refused = WireEvent::Rejected(WireFault::OutOfStep);
+        assert_eq!(events, [WireEvent::Partial, refused, refused]);
+    }
+
+    #[test]
+    fn a_pupil_that_is_seen_and_has_no_millimetres_is_uncalibrated() {
+        let expected = [WireEvent::Rejected(WireFault::Uncalibrated), sample(SampleEye::Both, -1.0, 0.95)];
+        assert_eq!(decode(json(), &message(&[("A", view("Main", "old", "-1"))])), expected);
+        assert_eq!(decode(json(), &message(&[("R", view("Main", "new", "-1"))]))[0], expected[0]);
+        let one = csv(PupilExtEyes::One(SampleEye::Both), false);
+        let row = format!("1700000000123,PuRe,{},3,,36.5\n", FIGURES.replace("3.25", "-1"));
+        assert_eq!(decode(one, &row), expected);
+        // In pixels nothing is missing.
+        let pixels = PupilExtSettings { size: PupilExtSize::Pixels, ..one };
+        assert_eq!(decode(pixels, &row), [sample(SampleEye::Both, 41.2, 0.95)]);
     }
 
     #[test]
@@ -817,7 +887,8 @@ mod tests {
             ("A", format!("{},\n{}", view("Main", "old", "3.25"), view("Sec", "old", "3.25"))),
             ("B", view("Main", "old", "-1")),
         ]);
-        let expected = [sample(SampleEye::Right, 3.25, 0.95), sample(SampleEye::Left, -1.0, 0.95)];
+        let uncalibrated = WireEvent::Rejected(WireFault::Uncalibrated);
+        let expected = [sample(SampleEye::Right, 3.25, 0.95), uncalibrated, sample(SampleEye::Left, -1.0, 0.95)];
         assert_eq!(decode(two, &text.repeat(2)), [expected, expected].concat());
         let pixels = PupilExtSettings { size: PupilExtSize::UndistortedPixels, ..two };
         assert_eq!(decode(pixels, &text), [SampleEye::Right, SampleEye::Left].map(|eye| sample(eye, 41.5, 0.95)));

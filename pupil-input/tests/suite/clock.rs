@@ -139,6 +139,22 @@ fn slow_and_fast_feeds_are_followed() {
 }
 
 #[test]
+fn a_clock_that_runs_many_times_too_fast_leaps() {
+    let leaps = |times: i64| {
+        let mut model = ClockModel::new();
+        for sample in send(200, 10, Link::Uniform(MS, 2 * MS), 13, |since| since * times) {
+            model.map(TimeNs(sample.device), TimeNs(sample.arrival));
+        }
+        model.leaps()
+    };
+    // The canary: as a clock runs.
+    assert_eq!(leaps(1), 0);
+    for times in [100, 1000, 1_000_000] {
+        assert!((20..200).contains(&leaps(times)), "{times} times: {}", leaps(times));
+    }
+}
+
+#[test]
 fn every_rate_is_followed() {
     for rate_hz in [6, 30, 60, 123, 500, 1000, 2000] {
         let mut model = ClockModel::new();

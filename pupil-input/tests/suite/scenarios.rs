@@ -188,6 +188,26 @@ fn a_file_is_a_scenario_for_a_tracker() {
 }
 
 #[test]
+fn a_scenario_that_falls_silent_has_not_ended() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("lost.txt");
+    for (end, ends) in [("", false), ("ends 200ms\n", true)] {
+        std::fs::write(&path, format!("100ms lost 100000s\n{end}")).expect("writes");
+        let spec: TrackerSpec = format!("mock:{}", path.display()).parse().expect("a spec");
+        let began = host_now();
+        let mut tracker =
+            Tracker::start(&spec, &holod_calibration::rig::Rig::default().tracker, began).expect("starts");
+        std::thread::sleep(std::time::Duration::from_millis(150));
+        // A machine that is slow may come to look too late.
+        let finished = tracker.control.finished();
+        assert!(!finished || ends && (host_now() - began).seconds() > 0.2, "ended in the silence");
+        std::thread::sleep(std::time::Duration::from_millis(400));
+        assert_eq!(tracker.control.finished(), ends);
+        tracker.control.stop();
+    }
+}
+
+#[test]
 fn clock_and_link_of_a_script_are_learnt_as_a_real_trackers() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("slow.txt");

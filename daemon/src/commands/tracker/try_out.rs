@@ -7,8 +7,8 @@ use std::time::Duration;
 use holod_calibration::TimeNs;
 use holod_calibration::rig::Rig;
 use holod_pupil_input::{
-    ClockWatch, Counter, RecordFiles, RefusalWatch, Tracker, TrackerHandle, TrackerOptions, TrackerSpec, Verdict,
-    host_now,
+    ClockWatch, Counter, RecordFiles, Refusal, RefusalWatch, Tracker, TrackerHandle, TrackerOptions, TrackerSpec,
+    Verdict, host_now,
 };
 use ratatui::style::Color;
 use serde::Serialize;
@@ -73,7 +73,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         }
     }
     let mut observed = Observed::default();
-    let mut refusals = RefusalWatch::new(&rig.tracker, began);
+    let mut refusals = RefusalWatch::new(&rig.tracker, tracker.control.figures(), began);
     let mut clock = ClockWatch::default();
     let mut live = LiveText::default();
     let mut redrawn = began;
@@ -87,8 +87,7 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
             observed.take(&decision);
             refusals.note(&decision);
         }
-        let resets = tracker.control.counters().of(Counter::ClockResets);
-        if let Some(wrong) = clock.judge(now, tracker.control.clock(), resets) {
+        if let Some(wrong) = clock.judge(now, tracker.control.clock(), &tracker.control.counters()) {
             tracing::warn!("{wrong}");
         }
         if let Some(signal) = signals.caught() {
@@ -141,14 +140,15 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
     // Logs and simulated eyes have no bytes.
     let [bytes, samples] = [Counter::Bytes, Counter::Samples].map(|counter| counters.of(counter));
     refusals.judge(now, &counters, true);
-    let heard = match refusals.current().filter(|_| bytes > 0 || samples > 0) {
+    let came = |refusal: &&Refusal| refusal.refused > 0 || bytes > 0 && report.trouble.is_none();
+    let heard = match refusals.current().filter(came) {
         Some(refusal) => refusal.to_string(),
         None if samples > 0 => {
             format!("{samples} samples came, and none was believed yet: give it a longer --duration")
         }
-        None if report.trouble.is_some() => report.trouble.unwrap_or_default(),
-        None if bytes == 0 => "nothing was heard; is it switched on, and does it send without being asked?".to_owned(),
-        None => format!("{bytes} bytes came, and no sample was in them: is it this profile and baud rate?"),
+        None => report.trouble.unwrap_or_else(|| {
+            "nothing was heard; is it switched on, and does it send without being asked?".to_owned()
+        }),
     };
     Err(Failure::new(Exit::Unavailable, format!("tracker {spec}: {heard}")))
 }

@@ -1,5 +1,7 @@
 //! What every kind of message is read with.
 
+use std::cell::Cell;
+
 use crate::SampleEye;
 use crate::profile::reader::Found;
 use crate::size_unit::SizeUnit;
@@ -12,9 +14,19 @@ pub(in crate::profile) const EYES: [(&str, SampleEye); 3] =
 /// What the rest of the profile says about the figures on the wire.
 pub(in crate::profile) struct Context {
     pub(in crate::profile) eye: Option<Found<SampleEye>>,
-    pub(in crate::profile) rate_hz: Option<f64>,
+    pub(in crate::profile) rate_hz: Option<Found<f64>>,
+    /// A frame counter is made a time by it.
+    pub(in crate::profile) counts_frames: Cell<bool>,
     pub(in crate::profile) size: SizeRule,
     pub(in crate::profile) unit: SizeUnit,
     /// Where `[size]` is.
     pub(in crate::profile) size_at: Option<Found<()>>,
+}
+
+impl Context {
+    /// Frames a second, for what counts them.
+    pub(super) fn frames_per_second(&self) -> Option<f64> {
+        self.counts_frames.set(true);
+        self.rate_hz.as_ref().map(|rate_hz| rate_hz.value)
+    }
 }

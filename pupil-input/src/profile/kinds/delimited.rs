@@ -88,6 +88,14 @@ pub(super) fn read_delimited<'a>(wire: &Section<'a>, context: &Context) -> Optio
         Some(bytes)
     };
     let (prefix, comment) = (line_part("prefix").unwrap_or_default(), line_part("comment").unwrap_or(b"#".to_vec()));
+    if !comment.is_empty()
+        && prefix.starts_with(&comment)
+        && let Some(found) = wire.get("prefix")
+    {
+        let sign = String::from_utf8_lossy(&comment).into_owned();
+        let advice = "write comment = \"\" where there are none, or the sign of those that there are";
+        reader.fault(&found, found.value.to_string().trim(), &format!("no comment: those begin with `{sign}`"), advice);
+    }
     let columns = wire.get("columns").map_or(Vec::new(), |found| {
         const EXPECTED: &str = "the columns' names, each once, such as [\"time\", \"left_mm\"]";
         let items = reader.items(&found, EXPECTED);

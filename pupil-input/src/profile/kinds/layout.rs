@@ -133,7 +133,8 @@ fn read_tick(table: &Section<'_>, context: &Context) -> Option<f64> {
     if let Some(ns) = table.reader().choose(&unit, &UNITS)? {
         return Some(ns);
     }
-    if context.rate_hz.is_none() {
+    let frames_per_second = context.frames_per_second();
+    if frames_per_second.is_none() {
         table.reader().fault(
             &unit,
             "\"frames\" and no rate_hz",
@@ -141,7 +142,7 @@ fn read_tick(table: &Section<'_>, context: &Context) -> Option<f64> {
             "add rate_hz = 60.0 to the top of the file",
         );
     }
-    Some(1e9 / context.rate_hz?)
+    Some(1e9 / frames_per_second?)
 }
 
 fn read_pupil<'a, P: Places<'a>>(places: &P, table: &Section<'a>, eye: Option<SampleEye>) -> Option<PupilAt<P::Place>> {

@@ -68,6 +68,12 @@ fn each_mistake_is_told_with_its_line_and_key() {
         ),
         ("", "[size]\nkind = \"diametre\"", "did you mean `diameter`?"),
         ("", "[size]\nmm_per_unit = -1", "line 2, size.mm_per_unit: found -1"),
+        (
+            LINES,
+            "left = { size = 1 }\n[size]\nmm_per_unit = 0.05",
+            "line 7, size.mm_per_unit: found 0.05; expected none where the unit is mm",
+        ),
+        (LINES, "left = { size = 1 }\n[size]\nunit = \"mm\"\nmm_per_unit = 2", "line 8, size.mm_per_unit: found 2"),
         ("", "name = \"x\"", "wire: found nothing"),
         (
             "",
@@ -96,6 +102,21 @@ fn each_mistake_is_told_with_its_line_and_key() {
         (LINES, "left = { size = 1 }\ntime = 2", "line 6, wire.time.unit: found nothing"),
         (LINES, "left = { size = 1 }\ntime = { column = 2, unit = \"h\" }", "wire.time.unit: found \"h\""),
         (LINES, "left = { size = 1 }\ntime = { column = 2, unit = \"frames\" }", "found \"frames\" and no rate_hz"),
+        (
+            "format = \"holod-tracker-1\"\nname = \"x\"\nrate_hz = 60\n[wire]\nkind = \"delimited\"\n",
+            "left = { size = 1 }\ntime = { column = 2, unit = \"ms\" }",
+            "line 3, rate_hz: found 60; expected none: no time is made from a frame counter; take it out",
+        ),
+        (
+            "format = \"holod-tracker-1\"\nname = \"x\"\nrate_hz = 60\n[wire]\nkind = \"holod\"\n",
+            "",
+            "line 3, rate_hz: found 60",
+        ),
+        (
+            LINES,
+            "left = { size = 1 }\nprefix = \"#P\"",
+            "line 6, wire.prefix: found \"#P\"; expected no comment: those begin with `#`",
+        ),
         (LINES, "left = { size = 1 }\ntime = { column = 2, unit = \"s\", tick_ns = 5 }", "found unit and tick_ns"),
         (LINES, "left = { size = 1 }\ntime = { column = 2, unit = \"s\", wrap_bits = 63 }", "wrap_bits: found 63"),
         (LINES, "left = { size = 1 }\nseparator = \"ab\"", "line 6, wire.separator: found \"ab\""),

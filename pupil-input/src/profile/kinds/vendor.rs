@@ -89,7 +89,7 @@ pub(super) fn read_livetrack(wire: &Section<'_>, context: &Context) -> Option<(F
     let counter_bits = wire.integer("counter_bits", 1..=63).map_or(usual.counter_bits, |bits| bits as u32);
     let settings = LiveTrackSettings {
         size: sizes.pop().unwrap_or(usual.size),
-        frames_per_second: context.rate_hz,
+        frames_per_second: context.frames_per_second(),
         counter_bits,
         mono_eye: context.eye.as_ref().map_or(usual.mono_eye, |eye| eye.value),
     };
