@@ -1,6 +1,7 @@
 //! What ends holod early, with its exit code.
 
-use std::fmt;
+use std::path::Path;
+use std::{fmt, io};
 
 /// Exit codes, after BSD's sysexits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -57,8 +58,43 @@ impl Failure {
     }
 }
 
+/// Whether there is a file at `path`.
+///
+/// # Errors
+/// That cannot be told, as where its folder may not be entered.
+pub fn is_file(path: &Path) -> Result<bool, Failure> {
+    match path.metadata() {
+        Ok(found) => Ok(found.is_file()),
+        Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => Ok(false),
+        Err(error) => Err(Failure::new(Exit::NoInput, format!("{}: {error}", path.display()))),
+    }
+}
+
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.message)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::symlink;
+
+    use super::*;
+
+    #[test]
+    fn a_file_that_cannot_be_looked_at_is_not_taken_for_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        std::fs::write(at("file"), "").unwrap();
+        assert!(is_file(&at("file")).unwrap());
+        for none in ["", "absent", "absent/deeper", "file/deeper"] {
+            assert!(!is_file(&at(none)).unwrap(), "{none}");
+        }
+        // As a folder that may not be entered, which root enters all the same.
+        symlink("circle", at("circle")).unwrap();
+        let failure = is_file(&at("circle/file")).unwrap_err();
+        assert_eq!(failure.exit, Exit::NoInput);
+        assert!(failure.to_string().contains("circle/file: Too many levels of symbolic links"), "{failure}");
     }
 }

@@ -92,7 +92,7 @@ pub struct FrameOrders {
     pub pattern: u32,
 }
 
-/// XXH3 of 64 bits of a frame's levels: of its samples, each as two bytes, the low one first.
+/// XXH3 of 64 bits of a frame's levels: of its samples as [`LevelsFrame`] has them, each as two bytes, the low one first.
 pub(crate) fn levels_xxh3(levels: &LevelsFrame) -> u64 {
     XxHash3_64::oneshot(bytemuck::cast_slice(levels.samples()))
 }

@@ -87,8 +87,8 @@ pub struct Snapshot {
     /// What holds at the end, too.
     #[serde(flatten)]
     pub figures: Figures,
-    /// Frames that came on the panel in the last second.
-    pub frames_shown_hz: f64,
+    /// Frames that came on the panel in the last second; in the first two seconds of a run that is not known yet.
+    pub frames_shown_hz: Option<f64>,
     /// What the pupil's estimate rests on.
     pub pupil_state: String,
     /// The pupil that the newest frame was made for.

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use crate::gate::Rejection;
+use crate::gate::{Rejection, Verdict};
 use crate::import::{LOG_FAULT_NAMES, LogFault};
 use crate::wire::WireFault;
 
@@ -159,8 +159,17 @@ pub struct CounterSnapshot {
 
 impl CounterSnapshot {
     /// The counts before anything was counted.
-    pub(crate) const fn zero() -> Self {
+    pub const fn zero() -> Self {
         Self { counts: [0; COUNTERS], rejected: [0; REJECTIONS], faults: [0; FAULTS] }
+    }
+
+    /// Counts a sample by what the gate said of it, where no tracker counts.
+    pub const fn add(&mut self, verdict: Verdict) {
+        self.counts[Counter::Samples as usize] += 1;
+        match verdict {
+            Verdict::Accepted => self.counts[Counter::Accepted as usize] += 1,
+            Verdict::Rejected(reason) => self.rejected[reason.index()] += 1,
+        }
     }
 
     /// One count.

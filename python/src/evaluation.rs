@@ -7,7 +7,7 @@ use holod_daemon::evaluation::{EvaluationPlan, EvaluationSettings};
 use holod_daemon::failure::{Exit, Failure};
 use pyo3::prelude::*;
 
-use crate::outcome::{Count, HolodError, optional_count, with_threads};
+use crate::outcome::{Count, HolodError, InputError, optional_count, with_threads};
 use crate::renderer::backend_named;
 use crate::rig::Rig;
 use crate::view::pupil;
@@ -43,6 +43,15 @@ pub(crate) fn evaluate<'py>(
 ) -> PyResult<Bound<'py, PyAny>> {
     let rig = Rig::with_weights(rig, weights.as_deref())?;
     let backend = backend_named(backend)?;
+    if pupils_mm.as_ref().is_some_and(Vec::is_empty) {
+        return Err(InputError::new_err(
+            "pupils_mm: found none, expected some of the scenes' own; leave it out for all",
+        ));
+    }
+    let limit = optional_count(limit, "limit")?;
+    if limit == Some(0) {
+        return Err(InputError::new_err("limit: found 0, expected at least 1"));
+    }
     let pupils: Vec<PupilDiameter> = pupils_mm.unwrap_or_default().into_iter().map(pupil).collect::<PyResult<_>>()?;
     let settings = EvaluationSettings {
         rig: &rig,
@@ -51,7 +60,7 @@ pub(crate) fn evaluate<'py>(
         cards: cards.as_deref(),
         marks: marks.as_deref(),
         pupils: &pupils,
-        limit: optional_count(limit, "limit")?,
+        limit,
         border_px,
     };
     let mut interrupt = None;

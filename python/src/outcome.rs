@@ -52,9 +52,18 @@ pub(crate) fn with_threads<T: Send>(py: Python<'_>, work: impl FnOnce() -> Resul
     without_lock(py, work)
 }
 
+/// Options of the command line that failures name, and the arguments that they are here.
+const ARGUMENTS: [(&str, &str); 4] = [
+    ("with --depth-encoding", "by depth_encoding"),
+    ("--depth-encoding", "depth_encoding"),
+    ("--border-px", "border_px"),
+    ("with --pupil", "by pupils_mm"),
+];
+
 /// A failure as an exception with its whole text.
 pub(crate) fn exception(failure: &Failure) -> PyErr {
-    let text = failure.to_string();
+    let named = |text: String, (option, argument): (&str, &str)| text.replace(option, argument);
+    let text = ARGUMENTS.into_iter().fold(failure.to_string(), named);
     match failure.exit {
         Exit::Config => RigError::new_err(text),
         Exit::Unavailable => UnavailableError::new_err(text),

@@ -223,6 +223,7 @@ def test_scenes_that_cannot_be_read_are_told(tmp_path: Path, picture_files: tupl
     for said, path, options in [
         ("absent", tmp_path / "absent", {}),
         ("depth encoding: found", named, {}),
+        ("where they are left out): give it by depth_encoding", named, {}),
         ("found 1 frames; expected more than 3", named, {"frame": 3, "depth_encoding": "millimetres"}),
         ("expected at most 8x8", named, {"width_px": 8, "height_px": 8, "depth_encoding": "millimetres"}),
         ("fit: unknown variant `stretch`, expected one of `native`, `contain`", named, {"fit": "stretch"}),

@@ -40,8 +40,12 @@ def test_the_figures_are_those_of_the_command(daemon: Daemon, scenes: Path) -> N
 def test_what_cannot_be_judged_is_told(scenes: Path, tmp_path: Path) -> None:
     for said, options in [
         ("absent", {"scenes": tmp_path / "absent"}),
-        ("expected at most", {"border_px": 400}),
+        ("border_px: found 400, expected at most", {"border_px": 400}),
         ("expected one for 8.25 mm in every scene", {"pupils_mm": [8.25]}),
+        ("or choose among theirs by pupils_mm", {"pupils_mm": [8.25]}),
+        ("pupils_mm: found none, expected some of the scenes' own", {"pupils_mm": []}),
+        ("limit: found 0, expected at least 1", {"limit": 0}),
+        ("limit: found -1", {"limit": -1}),
         ("pupil_mm: found 0", {"pupils_mm": [0.0]}),
     ]:
         with pytest.raises(holod.InputError) as raised:

@@ -153,6 +153,38 @@ fn a_client_that_dies_leaves_its_picture_and_the_loop_goes_on() {
     assert_eq!(summary["lasers"]["unsafe_findings"], 0);
 }
 
+#[test]
+fn a_client_of_another_clock_is_told_and_one_that_comes_and_goes_does_not_fill_the_log() {
+    let folder = bench();
+    let daemon = holod_with_feed(folder.path(), &["--json"]);
+    let mut client = connect(folder.path());
+    client.write(0, &picture(0).0, &picture(0).1);
+    for t_taken_ns in [1, 2] {
+        client.hand_over(0, t_taken_ns as u64, t_taken_ns).unwrap();
+        assert!(matches!(client.answer(), Answer::Free { outcome: 0, .. }), "it is shown all the same");
+    }
+    let feed = |key: &str| status(&daemon, folder.path())["feed"][key].clone();
+    assert!(wait_until(PATIENCE, || feed("shown") == "test camera"));
+    std::thread::sleep(Duration::from_secs(1));
+    drop(client);
+    for sequence in 0..150 {
+        send(&mut connect(folder.path()), sequence, &picture(0));
+    }
+    assert!(wait_until(PATIENCE, || feed("clients").as_array().is_some_and(Vec::is_empty)));
+    std::thread::sleep(Duration::from_secs(3));
+    daemon.signal(Signal::TERM);
+    let ended = daemon.wait(PATIENCE);
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let lines = |about: &str| ended.stderr.lines().filter(|line| line.contains(about)).count();
+    assert_eq!(lines("s before it came was found, expected nanoseconds of CLOCK_MONOTONIC"), 1, "{}", ended.stderr);
+    let of_clients = lines("the feed's client ") + lines("the last picture of ");
+    assert!((10..100).contains(&of_clients), "{of_clients} of 450: {}", ended.stderr);
+    assert!(lines("lines about the feed's clients were left out") > 0, "{}", ended.stderr);
+    let summary: Value = serde_json::from_str(&ended.stdout).unwrap();
+    let longest_ms = summary["picture_to_photon"]["max_ms"].as_f64();
+    assert!(longest_ms.is_none_or(|ms| ms < 10_000.0), "{longest_ms:?}");
+}
+
 /// The client in C with its moving cards, as a process of its own; killed when it is dropped.
 struct TwoCards(Child);
 

@@ -15,7 +15,7 @@ use tar::{Builder, EntryType, Header};
 use toml_edit::DocumentMut;
 
 use super::{Copy, FOLDER, LARGEST_TEXT, MANIFEST, Manifest, Packed, SCENE_FOLDER, Scrubber, order_folder, unix_ms};
-use crate::failure::{Exit, Failure};
+use crate::failure::{Exit, Failure, is_file};
 use crate::record::{
     self, BENCH, EARLIER, Hashed, LOG, ORDER_FILES, ORDERS, OrderSource, RIG, RUN, RunFacts, SCENE, SceneSource,
     SourceFile, content_xxh3, is_of_bench, is_weights,
@@ -74,7 +74,7 @@ impl Contents {
     /// The folder is no record, or cannot be read.
     pub fn of_record(folder: &Path, with_scene: bool, scrubber: &Scrubber) -> Result<Self, Failure> {
         let mut contents = Self::default();
-        if !folder.join(record::FRAMES).is_file() {
+        if !is_file(&folder.join(record::FRAMES))? {
             return Err(Failure::new(
                 Exit::NoInput,
                 format!(

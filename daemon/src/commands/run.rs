@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use holod_calibration::rig::Rig;
-use holod_pupil_input::{RecordFiles, ReplaySpeed, TrackerSpec};
+use holod_pupil_input::{RecordFiles, ReplaySpeed, Tracker, TrackerSpec};
 use holod_slm_output::OutputSpec;
 use serde::Serialize;
 
@@ -14,7 +14,7 @@ use crate::bug_report::{self, Outcome, Played};
 use crate::cli::{FitArg, RunArgs};
 use crate::control::RigReader;
 use crate::failure::{Exit, Failure};
-use crate::page::Page;
+use crate::page::{self, Page};
 use crate::pictures::levels_picture;
 use crate::progress;
 use crate::record::{self, RecordFolder, RecordHealth, Recorder};
@@ -107,6 +107,25 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
         tracing::error!("{lost}");
     }
     told.and_then(|()| health.judge())
+}
+
+/// Refuses what `run` would by its options and its rig alone. Devices are not opened; files that are not there may be
+/// when it is run.
+pub(super) fn judge(args: &RunArgs, rig: &Rig) -> Result<(), Failure> {
+    if let Some(spec) = &args.tracker
+        && let Some(report) = report_of(spec)?
+    {
+        refuse_options(args, &report)?;
+    }
+    page::judge(&args.page)?;
+    source::judge(&args.scene, args.feed_dark_after, &rig.geometry)?;
+    let rig = with_options(rig.clone(), args);
+    let spec = rig.tracker.spec.as_deref().unwrap_or(SAMPLE_TRACKER);
+    let spec: TrackerSpec = spec.parse().map_err(Failure::because(Exit::Usage))?;
+    if spec.files().iter().all(|file| file.exists()) {
+        Tracker::examine(&spec, &rig.tracker).map_err(setup::tracker_failure)?;
+    }
+    Ok(())
 }
 
 /// The report that a tracker's spec names.
@@ -218,12 +237,15 @@ fn tell(args: &RunArgs, summary: &Summary, outcome: Option<&Outcome>) -> Result<
 
 /// The rig with what the command line says in its place.
 fn rig_of(args: &RunArgs) -> Result<Rig, Failure> {
-    let mut rig = setup::rig_with_network(&args.rig, &args.network)?;
+    setup::rig_with_network(&args.rig, &args.network).map(|rig| with_options(rig, args))
+}
+
+fn with_options(mut rig: Rig, args: &RunArgs) -> Rig {
     let tracker = &mut rig.tracker;
     tracker.spec = args.tracker.clone().or(tracker.spec.take());
     tracker.eye = args.eye.unwrap_or(tracker.eye);
     tracker.scale = args.scale.or(tracker.scale);
-    Ok(rig)
+    rig
 }
 
 /// Writes the levels that the panel showed and `summary.json` into the record, which is lost where they cannot be

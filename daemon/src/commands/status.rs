@@ -71,7 +71,7 @@ fn text_of(status: &Snapshot) -> String {
          panel    {}: {:.2} refreshes a second{}\n\
          lasers   {}{}{}\n\
          engine   {}; weights {}\n\
-         frames   {:.1} a second of the panel's {:.1}{}; {} made, {} shown, {} late\n\
+         frames   {} a second of the panel's {:.1}{}; {} made, {} shown, {} late\n\
          time     per frame {}; tracker sample to photons {}{feed}{record}",
         status.state,
         status.uptime_s,
@@ -105,7 +105,7 @@ fn text_of(status: &Snapshot) -> String {
             .map_or(String::new(), |trouble| format!("; {trouble}")),
         figures.engine,
         figures.weights,
-        status.frames_shown_hz,
+        status.frames_shown_hz.map_or("not known yet how many".to_owned(), |hz| format!("{hz:.1}")),
         figures.panel_frames_hz,
         figures.speed_advice.as_ref().map_or(String::new(), |advice| format!(" ({advice})")),
         figures.frames_made,

@@ -12,6 +12,7 @@ use holod_slm_output::OutputSpec;
 use holod_slm_output::present::drm::DrmTarget;
 
 use super::check::access::{HIDDEN_FROM_SERVICE, files_of};
+use super::run;
 use crate::cli::{PageAddress, RunArgs, UnitArgs};
 use crate::failure::{Exit, Failure};
 use crate::source::feed_socket;
@@ -56,6 +57,7 @@ pub(super) fn drop_in(rig: &Rig, run: &RunArgs, words: &[String], root: &Path) -
         let found = folder.display();
         return Err(usage(format!("--record-in {found}: the service may write below {STATE_FOLDER} only")));
     }
+    run::judge(run, rig)?;
     let command: Vec<String> = words.iter().map(|word| quoted(word)).collect();
     let mut text = format!(
         "# Written by `holod unit`: what this bench needs of the unit. Write it anew when rig or devices change.\n\
@@ -446,7 +448,7 @@ mod tests {
         let expected = format!("localhost {PRIVATE_NETWORKS} 131.114.5.0/24 2001:db8:0:5::/64");
         let page = ["--page", "131.114.5.7:8420", "--page-token", "/etc/holod/token"];
         assert_eq!(allowed(&page), expected);
-        assert_eq!(allowed(&["--tracker", "tcp:gazepc.uni.example:4242,profile=gazepoint"]), expected);
+        assert_eq!(allowed(&["--tracker", "tcp:gazepc.uni.example:4242,profile=open-gaze"]), expected);
         assert_eq!(allowed(&["--tracker", "core:131.114.5.20"]), "localhost 131.114.5.20");
     }
 
@@ -468,6 +470,40 @@ mod tests {
         let mut rig = rig();
         rig.model.weights = WeightsChoice::File("/home/me/weights.safetensors".into());
         assert!(drop_in_of(&RIG, &rig, root.path()).unwrap_err().contains("the rig: found /home"));
+    }
+
+    /// All of these are refused by `holod run`, too.
+    #[test]
+    fn what_holod_run_refuses_by_its_options_is_refused() {
+        let root = machine();
+        let with = |words: &[&str]| drop_in_of(&[&RIG[..], words].concat(), &rig(), root.path());
+        let cases: [(&[&str], &str); 11] = [
+            (&["--page", "192.168.1.5:8420"], "it needs a token: --page-token FILE"),
+            (&["--feed-dark-after", "2"], "name it with --scene feed"),
+            (&["--scene", "/srv/no.png,/srv/no.exr"], "give it with --depth-encoding"),
+            (&["--scene", "/srv/no.png,/srv/no.exr", "--depth-encoding", "meters"], "found \"meters\""),
+            (
+                &["--scene", "/srv/no.png,/srv/no.exr", "--depth-encoding", "metres", "--resolution", "4000x4000"],
+                "4000x4000",
+            ),
+            (&["--scene", "feed", "--depth-encoding", "metres"], "a feed's clients say"),
+            (&["--scene", "feed", "--resolution", "4000x4000"], "larger than the panel of 1920x1080"),
+            (&["--depth-encoding", "metres"], "name one with --scene"),
+            (&["--resolution", "4000x4000"], "larger than the panel of 1920x1080"),
+            (&["--tracker", "serial:/dev/ttyS0,profile=none"], "none"),
+            (&["--tracker", "serial:/dev/ttyS0,profile=asl-eye-trac"], "give it with --scale"),
+        ];
+        for (words, says) in cases {
+            let refused = with(words).unwrap_err();
+            assert!(refused.contains(says), "{words:?}: {refused}");
+        }
+        for sound in [
+            &["--scene", "feed", "--feed-dark-after", "2"][..],
+            &["--scene", "/srv/no.png,/srv/no.exr", "--depth-encoding", "metres", "--resolution", "1920x1080"],
+            &["--tracker", "serial:/dev/ttyS0,profile=asl-eye-trac", "--scale", "0.02"],
+        ] {
+            with(sound).unwrap_or_else(|refused| panic!("{sound:?}: {refused}"));
+        }
     }
 
     #[test]

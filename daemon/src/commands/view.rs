@@ -15,7 +15,7 @@ use serde::Serialize;
 use super::render::{self, Computed};
 use crate::cli::{Backend, SceneArgs, ViewArgs};
 use crate::destination::Destination;
-use crate::failure::{Exit, Failure};
+use crate::failure::{Exit, Failure, is_file};
 use crate::pictures::shown_pattern;
 use crate::{progress, renderer, results, setup};
 
@@ -102,7 +102,7 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
 
 fn load(folder: &Path) -> Result<StoredHologram, Failure> {
     let path = folder.join("field.safetensors");
-    if !path.is_file() {
+    if !is_file(&path)? {
         return Err(Failure::new(
             Exit::NoInput,
             format!(

@@ -39,6 +39,15 @@ use crate::record::FrameRecord;
 use crate::session::{Began, FirstLight, Observer};
 use crate::snapshot::Snapshot;
 
+/// Refuses an address that others could reach without a token.
+///
+/// # Errors
+/// It is one.
+pub fn judge(args: &PageArgs) -> Result<(), Failure> {
+    let judged = args.page.as_ref().map_or(Ok(()), |address| address.may_be_served(args.page_token.is_some()));
+    judged.map_err(Failure::because(Exit::Usage))
+}
+
 /// A page that is served for as long as this lives.
 pub struct Page {
     live: Arc<Live>,
@@ -56,8 +65,8 @@ impl Page {
     /// The address cannot be had, or would be open to others without a token.
     pub fn open(args: &PageArgs) -> Result<Option<Self>, Failure> {
         let Some(address) = &args.page else { return Ok(None) };
+        judge(args)?;
         let token = args.page_token.as_deref().map(Token::read).transpose().map_err(Failure::because(Exit::Config))?;
-        address.may_be_served(token.is_some()).map_err(Failure::because(Exit::Usage))?;
         let live = Arc::new(Live::default());
         let eye = EyeDesk::default();
         let server = PageServer::start(address, token, Arc::clone(&live), eye.clone())

@@ -118,6 +118,9 @@ pub(super) fn build(
     for warning in tracker.warnings() {
         tracing::warn!("{warning}");
     }
+    for remark in tracker.remarks() {
+        tracing::info!("{remark}");
+    }
     tracing::debug!("tracker `{}` is open, link {}", plan.tracker, tracker.link().name());
 
     let scene = plan.pictures.name().to_owned();
@@ -257,7 +260,7 @@ pub(super) fn build(
         announced: Announced::new(advised),
         tally: Tally::default(),
         frame_rate: FrameRate::default(),
-        frames_shown_hz: 0.0,
+        frames_shown_hz: None,
         rig: plan.rig,
         observer,
     };

@@ -48,10 +48,10 @@ pub(super) struct FrameRate {
 }
 
 impl FrameRate {
-    /// Frames a second since the last call, of which `frames_shown` there are by `now`; 0 at the first call.
-    pub(super) fn at(&mut self, frames_shown: u64, now: TimeNs) -> f64 {
-        let before = self.before.replace((frames_shown, now));
-        before.map_or(0.0, |(frames, t)| (frames_shown - frames) as f64 / (now - t).seconds())
+    /// Frames a second since the last call, of which `frames_shown` there are by `now`; not known at the first call.
+    pub(super) fn at(&mut self, frames_shown: u64, now: TimeNs) -> Option<f64> {
+        let (frames, t) = self.before.replace((frames_shown, now))?;
+        Some((frames_shown - frames) as f64 / (now - t).seconds())
     }
 }
 
@@ -73,7 +73,8 @@ mod tests {
     fn the_frame_rate_is_that_since_the_last_look() {
         let mut rate = FrameRate::default();
         let looks = [(0, 0), (60, 1_000), (90, 2_000), (90, 3_000)];
-        assert_eq!(looks.map(|(frames, ms)| rate.at(frames, TimeNs(ms * 1_000_000))), [0.0, 60.0, 30.0, 0.0]);
+        let rates = looks.map(|(frames, ms)| rate.at(frames, TimeNs(ms * 1_000_000)));
+        assert_eq!(rates, [None, Some(60.0), Some(30.0), Some(0.0)]);
     }
 
     #[test]

@@ -100,7 +100,7 @@ impl Tally {
             frame: frame.frame,
             t,
             sample_to_photon: frame.t_sample.map(|t_sample| t - t_sample),
-            picture_to_photon: new_picture.map(|t_taken| t - t_taken),
+            picture_to_photon: new_picture.filter(|_| frame.picture.is_live()).map(|t_taken| t - t_taken),
         };
         let milliseconds = |time: TimeNs| time.seconds() as f32 * 1e3;
         self.sample_to_photon.extend(light.sample_to_photon.map(milliseconds));
@@ -138,6 +138,7 @@ impl Tally {
 mod tests {
     use super::*;
     use crate::record::FrameRecord;
+    use crate::source::{LIVE_WITHIN, PictureTag};
     use holod_calibration::Colour;
     use holod_slm_output::TimestampSource;
     use holod_slm_output::laser::DarkReason;
@@ -179,5 +180,21 @@ mod tests {
         assert_eq!(first_light(2, [false, true, true]), [None, Some(75_000), None]);
         assert_eq!(first_light(3, [false; 3]), [None; 3]);
         assert_eq!((tally.frames_shown, tally.fields_shown), (3, 9));
+    }
+
+    #[test]
+    fn a_picture_that_was_old_when_it_came_counts_for_no_latency() {
+        let mut tally = Tally::default();
+        let mut latency = |frame: u64, age: TimeNs| {
+            let t_came = TimeNs(60_000_000_000 + frame as i64);
+            let mut record = record(frame);
+            record.frame.picture =
+                PictureTag { t_taken: Some(t_came - age), t_came: Some(t_came), ..PictureTag::default() };
+            tally.frame(&record);
+            tally.field(&field(frame, 0, true)).unwrap().picture_to_photon.is_some()
+        };
+        assert_eq!([1, 2].map(|frame| latency(frame, LIVE_WITHIN)), [true; 2]);
+        assert!(!latency(3, LIVE_WITHIN + TimeNs(1)));
+        assert!(latency(4, TimeNs(0)));
     }
 }

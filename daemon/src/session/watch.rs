@@ -66,7 +66,7 @@ pub(super) struct Watch<'a> {
     pub(super) tally: Tally,
     pub(super) frame_rate: FrameRate,
     /// In the last second.
-    pub(super) frames_shown_hz: f64,
+    pub(super) frames_shown_hz: Option<f64>,
     pub(super) observer: &'a mut dyn Observer,
 }
 
@@ -385,7 +385,7 @@ impl Watch<'_> {
         self.observer.snapshot(&snapshot);
         let figures = &snapshot.figures;
         tracing::debug!(
-            "{}: {} frames made, {} shown, {:.1} a second; pupil {:?} mm, {}; {} samples, {} rejected; lasers {}",
+            "{}: {} frames made, {} shown, {:.1?} a second; pupil {:?} mm, {}; {} samples, {} rejected; lasers {}",
             snapshot.state,
             figures.frames_made,
             figures.frames_shown,

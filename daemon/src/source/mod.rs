@@ -69,19 +69,9 @@ pub(crate) fn is_feed(spec: &str) -> bool {
 /// # Errors
 /// The scene cannot be read, or what was named does not fit on the panel.
 pub fn named(args: &SceneArgs, dark_after: Option<Duration>, geometry: &DisplayGeometry) -> Result<Pictures, Failure> {
-    let Some(socket) = args.scene.as_deref().and_then(feed_socket) else {
-        if dark_after.is_some() {
-            let only = "--feed-dark-after is for a live feed: name it with --scene feed";
-            return Err(Failure::new(Exit::Usage, only));
-        }
+    let Some((socket, resolution)) = feed_of(args, dark_after, geometry)? else {
         return scene::frames(args, geometry).map(|frames| Pictures::Scene(Arc::new(frames)));
     };
-    if args.depth_encoding.is_some() {
-        let own = "--depth-encoding is for files: a feed's clients say what their depths are";
-        return Err(Failure::new(Exit::Usage, own));
-    }
-    let resolution = args.resolution.unwrap_or(geometry.resolution);
-    scene::check_fits(resolution, geometry, "--resolution")?;
     let socket = match socket {
         Some(path) => path.into(),
         None => feed::default_socket().map_err(Failure::because(Exit::Unavailable))?,
@@ -89,6 +79,39 @@ pub fn named(args: &SceneArgs, dark_after: Option<Duration>, geometry: &DisplayG
     let dark_after = dark_after.map(|time| TimeNs(i64::try_from(time.as_nanos()).unwrap_or(i64::MAX)));
     let plan = FeedPlan { dark_after, ..FeedPlan::new(socket, resolution, args.fit.into()) };
     Ok(Pictures::Feed(Arc::new(plan)))
+}
+
+/// Refuses what [`named`] would by its options alone. A scene that cannot be read may be there later.
+///
+/// # Errors
+/// The options do not go together, or what they name does not fit on the panel.
+pub fn judge(args: &SceneArgs, dark_after: Option<Duration>, geometry: &DisplayGeometry) -> Result<(), Failure> {
+    match feed_of(args, dark_after, geometry)? {
+        Some(_) => Ok(()),
+        None => scene::judge(args, geometry),
+    }
+}
+
+/// The socket of the feed that was named, and the size of its frames; nothing where a scene was.
+fn feed_of<'a>(
+    args: &'a SceneArgs,
+    dark_after: Option<Duration>,
+    geometry: &DisplayGeometry,
+) -> Result<Option<(Option<&'a str>, Resolution)>, Failure> {
+    let Some(socket) = args.scene.as_deref().and_then(feed_socket) else {
+        if dark_after.is_some() {
+            let only = "--feed-dark-after is for a live feed: name it with --scene feed";
+            return Err(Failure::new(Exit::Usage, only));
+        }
+        return Ok(None);
+    };
+    if args.depth_encoding.is_some() {
+        let own = "--depth-encoding is for files: a feed's clients say what their depths are";
+        return Err(Failure::new(Exit::Usage, own));
+    }
+    let resolution = args.resolution.unwrap_or(geometry.resolution);
+    scene::check_fits(resolution, geometry, "--resolution")?;
+    Ok(Some((socket, resolution)))
 }
 
 /// Pictures on their way, by the threads that hold their parts.
@@ -157,6 +180,22 @@ pub struct PictureTag {
     pub view: PictureView,
     /// The line in `orders.jsonl` of the order that brought its scene, from 1; 0 for what the run began with.
     pub order: u32,
+}
+
+/// Of a picture that is older when it comes no time from picture to photons is had: it was not taken to be shown live,
+/// or by another clock.
+pub const LIVE_WITHIN: TimeNs = TimeNs(10_000_000_000);
+
+impl PictureTag {
+    /// How old it was when it came.
+    pub fn age(&self) -> Option<TimeNs> {
+        self.t_came.zip(self.t_taken).map(|(came, taken)| came - taken)
+    }
+
+    /// Whether it came soon after it was taken, as far as is known.
+    pub fn is_live(&self) -> bool {
+        self.age().is_none_or(|age| age <= LIVE_WITHIN)
+    }
 }
 
 /// The two ends, with what is to be shown first.

@@ -52,6 +52,16 @@ pub fn frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Fa
     load(spec, &scene, scene.frames(), fps, args, geometry)
 }
 
+/// Refuses options that fit no scene, or not the one that was named. What cannot be read may be there later.
+pub(super) fn judge(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<(), Failure> {
+    match (open(args, geometry), args.scene.as_deref().zip(args.resolution)) {
+        (Err(failure), _) if failure.exit == Exit::Usage => Err(failure),
+        (_, Some((spec, resolution))) => check_fits(resolution, geometry, spec),
+        (Ok(None), None) => sample_resolution(args, geometry).map(drop),
+        (_, None) => Ok(()),
+    }
+}
+
 /// Loads the first frame of the scene that was named, or renders the built-in one.
 pub fn first_frame(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
     let Some((spec, scene)) = open(args, geometry)? else { return sample_frames(args, geometry) };
@@ -154,24 +164,27 @@ pub fn warn_of_oddities(name: &str, report: &FrameReport, geometry: &DisplayGeom
 
 /// Warns of depth that is most often a mistake, as [`warn_of_oddities`] does.
 pub fn warn_of_odd_depth(name: &str, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) {
-    if let Some(oddity) = report.source.and_then(|source| odd_depth(source, report, geometry, is_plane)) {
+    if let Some(oddity) = depth_oddity(report, geometry, is_plane) {
         tracing::warn!("{name}: {oddity}");
     }
 }
 
-/// Warns of a picture called `name` of which more than some highlights was clipped, and says whether it did. All counts
-/// are of the picture as it came, before it was fitted.
-pub fn warn_of_clipped_colours(name: &str, clipped: ClippedColours, source_px: usize) -> bool {
-    let oddities = odd_colours(clipped, source_px);
-    for oddity in &oddities {
+/// What [`warn_of_odd_depth`] says.
+pub(super) fn depth_oddity(report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) -> Option<String> {
+    report.source.and_then(|source| odd_depth(source, report, geometry, is_plane))
+}
+
+/// Warns of a picture called `name` of which more than some highlights was clipped. All counts are of the picture as it
+/// came, before it was fitted.
+pub fn warn_of_clipped_colours(name: &str, clipped: ClippedColours, source_px: usize) {
+    for oddity in odd_colours(clipped, source_px) {
         tracing::warn!("{name}: {oddity}");
     }
-    !oddities.is_empty()
 }
 
 /// Colours of which many are above white are most often scene-linear light that was never exposed; below 0 they are
 /// those of a wider gamut.
-fn odd_colours(clipped: ClippedColours, source_px: usize) -> Vec<String> {
+pub(super) fn odd_colours(clipped: ClippedColours, source_px: usize) -> Vec<String> {
     let ClippedColours { above_white_px, below_black_px } = clipped;
     let are_many = |clipped_px: usize| clipped_px as f64 > CLIPPED_SHARE_MAX * source_px as f64;
     let above = are_many(above_white_px).then(|| {
@@ -204,13 +217,18 @@ fn odd_depth(source: Resolution, report: &FrameReport, geometry: &DisplayGeometr
         .then(|| format!("all depths lie within {spread_dpt:.3} dpt: is the depth encoding right?"))
 }
 
-fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
+/// Size of the built-in scene.
+fn sample_resolution(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Resolution, Failure> {
     if args.depth_encoding.is_some() {
         return Err(Failure::new(Exit::Usage, "--depth-encoding says how to read a depth file: name one with --scene"));
     }
     let resolution = args.resolution.unwrap_or(SAMPLE_RESOLUTION);
     check_fits(resolution, geometry, "--resolution")?;
-    let frame = sample_frame(resolution);
+    Ok(resolution)
+}
+
+fn sample_frames(args: &SceneArgs, geometry: &DisplayGeometry) -> Result<Frames, Failure> {
+    let frame = sample_frame(sample_resolution(args, geometry)?);
     let least_and_greatest = |[least, greatest]: [f32; 2], &depth: &f32| [least.min(depth), greatest.max(depth)];
     let depth_range = frame.depth_normalised.iter().fold([f32::MAX, f32::MIN], least_and_greatest);
     Ok(Frames {
@@ -247,7 +265,9 @@ pub fn check_fits(resolution: Resolution, geometry: &DisplayGeometry, name: &str
 pub fn failure(error: SceneError) -> Failure {
     let exit = match &error {
         SceneError::Read { .. } | SceneError::Kind { .. } => Exit::NoInput,
-        SceneError::DepthEncoding { .. } | SceneError::EncodingsDiffer { .. } => Exit::Usage,
+        SceneError::DepthEncoding { .. } | SceneError::EncodingsDiffer { .. } | SceneError::BlurScaled { .. } => {
+            Exit::Usage
+        }
         _ => Exit::Data,
     };
     Failure::because(exit)(error)

@@ -90,6 +90,13 @@ pub enum SceneError {
     /// The picture is larger than the frame and no fit was asked for.
     #[error("{path} is {found}; expected at most {wanted}: ask for a fit (contain, cover or crop)", path = path.display())]
     TooLarge { path: PathBuf, found: Resolution, wanted: Resolution },
+    /// An image of a focal stack would have to be scaled, and the blur in it with it.
+    #[error(
+        "{path} is {found}; expected a fit to {wanted} that cuts or pads it, as crop does: an image that is scaled has the \
+         blur of another pupil than its own",
+        path = path.display()
+    )]
+    BlurScaled { path: PathBuf, found: Resolution, wanted: Resolution },
     /// The sequence has no such frame.
     #[error("scene {path}: found {frames} frames; expected more than {index}", path = path.display())]
     NoSuchFrame {

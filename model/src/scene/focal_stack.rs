@@ -9,6 +9,8 @@
 //! file = "focus-0.png"       # a picture as in a scene: 8- or 16-bit PNG, JPEG or OpenEXR
 //! focus_dpt = 0.0            # where the eye is focused
 //! ```
+//!
+//! Images are cut or padded to another size and never scaled, which would scale the blur in them, too.
 
 use std::path::{Path, PathBuf};
 
@@ -62,7 +64,7 @@ struct StackFile {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct ImageEntry {
-    file: String,
+    file: Spanned<String>,
     focus_dpt: Spanned<f64>,
 }
 
@@ -84,7 +86,7 @@ impl FocalStackFiles {
         let text = read_text(&path, "a directory with a stack.toml, of at most 1 MiB, which names images and focuses")?;
         let (pupil, images) = parse(&path, &text)?;
         let focuses = images.iter().map(|image| Dioptres(*image.focus_dpt.get_ref())).collect();
-        let files = images.into_iter().map(|image| directory.join(image.file)).collect();
+        let files = images.into_iter().map(|image| directory.join(image.file.into_inner())).collect();
         Ok(Self { files, focuses, pupil })
     }
 
@@ -98,10 +100,11 @@ impl FocalStackFiles {
         self.pupil
     }
 
-    /// Loads the images, at `resolution` or, without one, at their own.
+    /// Loads the images, at `resolution` or, without one, at their own. They are never scaled: what is blurred in them
+    /// is as large as their pupil makes it.
     ///
     /// # Errors
-    /// One cannot be read, or has another size than the first.
+    /// One cannot be read, has another size than the first, or would have to be scaled for `fit`.
     pub fn load(self, resolution: Option<Resolution>, fit: Fit) -> Result<(FocalStack, FocalStackReport), SceneError> {
         let Self { files, focuses, pupil } = self;
         let mut report = FocalStackReport::default();
@@ -114,8 +117,9 @@ impl FocalStackFiles {
                 let (found, expected) = (format!("an image of {}", colour.size), format!("{first}, as the others"));
                 return Err(SceneError::Picture { path: file, found, expected });
             }
-            let placement =
-                Placement::new(first, wanted, fit).ok_or(SceneError::TooLarge { path: file, found: first, wanted })?;
+            let placement = Placement::new(first, wanted, fit)
+                .filter(Placement::is_unscaled)
+                .ok_or(SceneError::BlurScaled { path: file, found: first, wanted })?;
             report.source_px += first.pixels();
             report.colour_clipped += colour.clipped;
             report.padded_px = placement.padded_px();
@@ -216,8 +220,16 @@ fn parse(path: &Path, text: &str) -> Result<(PupilDiameter, Vec<ImageEntry>), Sc
     for pair in images.windows(2) {
         let [far, near] = [&pair[0], &pair[1]].map(|image| *image.focus_dpt.get_ref());
         if near - far <= SAME_FOCUS_DPT {
-            let found = format!("{near} of \"{}\" beside {far} of \"{}\"", pair[1].file, pair[0].file);
+            let [far_file, near_file] = [&pair[0], &pair[1]].map(|image| image.file.get_ref());
+            let found = format!("{near} of \"{near_file}\" beside {far} of \"{far_file}\"");
             return Err(error_at(pair[1].focus_dpt.span(), "focus_dpt", found, "each image at a depth of its own"));
+        }
+    }
+    for (index, image) in images.iter().enumerate() {
+        if let Some(other) = images[..index].iter().find(|other| other.file.get_ref() == image.file.get_ref()) {
+            let (far, near) = (other.focus_dpt.get_ref(), image.focus_dpt.get_ref());
+            let found = format!("\"{}\" for {far} and {near} dpt", image.file.get_ref());
+            return Err(error_at(image.file.span(), "file", found, "an image of its own for each depth"));
         }
     }
     Ok((pupil, images))
@@ -274,6 +286,27 @@ mod tests {
     }
 
     #[test]
+    fn images_are_cut_and_padded_and_never_scaled_as_their_blur_is_that_of_their_pupil() {
+        let folder = folder(&two());
+        let load = |width, height, fit| {
+            FocalStackFiles::open(folder.path()).unwrap().load(Some(Resolution { width, height }), fit)
+        };
+        for (width, height, fit) in
+            [(10, 6, Fit::Contain), (4, 2, Fit::Contain), (10, 6, Fit::Cover), (5, 4, Fit::Cover), (4, 3, Fit::Native)]
+        {
+            let error = load(width, height, fit).unwrap_err().to_string();
+            let says = format!("0.png is 5x3; expected a fit to {width}x{height} that cuts or pads it, as crop does");
+            assert!(error.contains(&says) && error.contains("the blur of another pupil"), "{fit:?}: {error}");
+        }
+        for (width, height, fit) in
+            [(5, 3, Fit::Contain), (5, 4, Fit::Contain), (4, 3, Fit::Cover), (2, 2, Fit::Crop), (9, 2, Fit::Crop)]
+        {
+            let (stack, _) = load(width, height, fit).unwrap();
+            assert_eq!((stack.resolution, stack.pupil.mm()), (Resolution { width, height }, 2.5), "{fit:?}");
+        }
+    }
+
+    #[test]
     fn what_is_saved_is_loaded() {
         let folder = tempfile::tempdir().unwrap();
         let directory = folder.path().join("stack");
@@ -294,7 +327,7 @@ mod tests {
 
     #[test]
     fn what_cannot_be_used_is_told_with_its_line() {
-        let cases: [(&str, &[&str]); 11] = [
+        let cases: [(&str, &[&str]); 12] = [
             (&two().replace("2.5\n[", "0\n["), &["line 1: `pupil_mm`", "found 0", "millimetres", "up to 20"]),
             (&two().replace("2.5\n[", "300\n["), &["line 1: `pupil_mm`", "found 300"]),
             (&two().replace("pupil_mm", "pupil"), &["line 1", "unknown field `pupil`", "pupil_mm", "focus_dpt"]),
@@ -306,6 +339,7 @@ mod tests {
                 &two().replace("focus_dpt = 0\n", "focus_dpt = 2.5003\n"),
                 &["line 7: `focus_dpt`", "2.5003 of \"0.png\" beside 2.5 of \"1.png\"", "of its own"],
             ),
+            (&two().replace("1.png", "0.png"), &["line 3: `file`", "\"0.png\" for 0 and 2.5 dpt", "of its own"]),
             (&two().replace("\"0.png\"", "\"none.png\""), &["none.png", "PNG"]),
             (&two().replace("\"1.png\"", "\"2.png\""), &["2.png: an image of 4x4", "5x3, as the others"]),
             (&two().replace("file = \"0.png\"\n", ""), &["line 5", "missing field `file`"]),
@@ -317,9 +351,6 @@ mod tests {
                 assert!(error.contains(words), "no '{words}' in: {error}\nof {text}");
             }
         }
-        let small = Some(Resolution { width: 4, height: 3 });
-        let error = load(folder(&two()).path(), small).unwrap_err().to_string();
-        assert!(error.contains("0.png is 5x3; expected at most 4x3"), "{error}");
         let absent = load(Path::new("nowhere"), None).unwrap_err().to_string();
         assert!(absent.contains("nowhere/stack.toml") && absent.contains("a directory with a stack.toml"), "{absent}");
     }

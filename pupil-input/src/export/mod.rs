@@ -42,6 +42,19 @@ pub enum ExportError {
     BadScale { path: PathBuf, scale: f64 },
 }
 
+impl ExportError {
+    /// The same of another path, where what was written is a step on the way to that.
+    #[must_use]
+    pub fn of(self, path: &Path) -> Self {
+        let path = path.to_owned();
+        match self {
+            Self::Io { source, .. } => Self::Io { path, source },
+            Self::NoScale { unit, .. } => Self::NoScale { path, unit },
+            Self::BadScale { scale, .. } => Self::BadScale { path, scale },
+        }
+    }
+}
+
 /// Writes a file whole or not at all.
 fn atomically(path: &Path, write: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), ExportError> {
     write_atomically(path, write).map_err(|source| ExportError::Io { path: path.into(), source })

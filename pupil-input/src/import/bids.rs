@@ -386,7 +386,7 @@ impl Part {
                 log.note(format!("{}: the {eye} eye's pupil areas were made diameters", self.path.display()));
             }
             if let Some(doubt) = size.doubt {
-                log.note(format!(
+                log.warn(format!(
                     "{}: `{column}` is taken for {}, though {doubt}; give it \"Units\": \"mm\" for diameters or \"mm^2\" \
                      for areas, or a \"Description\" that says diameter or area where its unit is arbitrary",
                     self.sidecar.path.display(),
@@ -456,7 +456,7 @@ impl Part {
         let blinks = events.sidecar().and_then(|sidecar| self.blinks(&path, &sidecar, ns_per_tick));
         match blinks {
             Ok(blinks) => blinks.into_iter().for_each(|blink| log.blink_beside(blink)),
-            Err(error) => log.note(format!("its blinks could not be read: {error}")),
+            Err(error) => log.warn(format!("its blinks could not be read: {error}")),
         }
     }
 
@@ -513,7 +513,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     for sibling in stem.siblings() {
         let Some(path) = sibling.table() else { continue };
         match Part::load(&sibling, path.clone()) {
-            Err(error) => log.note(format!("{} was left out: {error}", path.display())),
+            Err(error) => log.warn(format!("{} was left out: {error}", path.display())),
             Ok(part) => {
                 // A pupil of an eye that is there already, or of both eyes, adds nothing.
                 let known: Vec<_> = parts.iter().flat_map(Part::eyes).collect();
@@ -533,7 +533,7 @@ fn read_parts(parts: &[Part], log: &mut LogBuilder) -> Result<(), ReplayError> {
     log.unit = first.pupils[0].2.unit;
     log.stated_rate_hz = first.sidecar.rate_hz();
     if let Some(kind) = first.sidecar.text("PhysioType").filter(|kind| *kind != "eyetrack") {
-        log.note(format!("the sidecar's PhysioType is `{}`, not `eyetrack`", kind.escape_debug()));
+        log.warn(format!("the sidecar's PhysioType is `{}`, not `eyetrack`", kind.escape_debug()));
     }
     for part in parts {
         part.read(log.unit, log)?;

@@ -292,18 +292,18 @@ impl Reader<'_> {
             None => "those of discs of the given figures, taken to be areas as by default, 2·√(A/π): no header says",
         };
         self.log.note(format!(
-            "diameters are in the tracker's arbitrary units, {what}; to have millimetres, record a printed disc of known \
-             diameter at the eye's place and give the rig scale_mm_per_unit = its millimetres / the figure shown for it"
+            "its own diameters are in the tracker's arbitrary units, {what}; to have millimetres, record a printed disc of \
+             known diameter at the eye's place and give the rig scale_mm_per_unit = its millimetres / the figure shown for it"
         ));
         match self.guessed {
             None => {}
             Some(Guess::Told) => self.log.note("no header names the eyes: they are told by the samples' columns"),
-            Some(Guess::OneOfSeven) => self.log.note(
+            Some(Guess::OneOfSeven) => self.log.warn(
                 "no header names the eyes, and the samples have 7 figures: they were read as one eye with velocity and \
                  resolution, not as two eyes with the input port; where it is two, export the log again with its header \
                  or its flags",
             ),
-            Some(Guess::TwoOfEight) => self.log.note(
+            Some(Guess::TwoOfEight) => self.log.warn(
                 "no header names the eyes, and the samples have 8 figures: they were read as two eyes with resolution, \
                  not as one eye with velocity, resolution and the input port; where it is one, export the log again \
                  with its header or its flags",
@@ -313,10 +313,10 @@ impl Reader<'_> {
             self.log.note(format!("{} blocks of recording, with gaps between them", self.blocks));
         }
         if self.measures_differ {
-            self.log.note("some blocks give areas and some diameters: their units are not the same");
+            self.log.warn("some blocks give areas and some diameters: their units are not the same");
         }
         if self.rates_differ {
-            self.log.note("the blocks differ in rate: the stated one is the first's");
+            self.log.warn("the blocks differ in rate: the stated one is the first's");
         }
     }
 }

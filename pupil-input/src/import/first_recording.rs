@@ -28,7 +28,7 @@ impl<const N: usize> FirstRecording<N> {
         let named =
             |(column, name): (&str, Vec<u8>)| format!("{column} `{}`", String::from_utf8_lossy(&name).escape_debug());
         let names: Vec<_> = self.columns.into_iter().zip(first).map(named).collect();
-        log.note(format!(
+        log.warn(format!(
             "the file holds several recordings; only the first was read ({}), and {} rows of others were left out; \
              export each into a file of its own to read it",
             names.join(", "),

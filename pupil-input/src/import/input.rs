@@ -8,7 +8,7 @@ use std::rc::Rc;
 
 use super::fault::ReplayError;
 use super::text::Lines;
-use super::unpack;
+use super::unpack::{self, Shortened};
 
 /// A log file that has not been read yet.
 pub(crate) struct LogInput<'a> {
@@ -16,6 +16,7 @@ pub(crate) struct LogInput<'a> {
     /// Its first 64 KiB (all of a shorter one), as [`Self::open`] gives them.
     pub(crate) head: Vec<u8>,
     failure: Failure,
+    shortened: Shortened,
 }
 
 /// The first error of any reader of a log.
@@ -34,20 +35,26 @@ impl<'a> LogInput<'a> {
 
     /// A file whose beginning nobody looks at.
     pub(crate) fn at(path: &'a Path) -> Self {
-        Self { path, head: Vec::new(), failure: Failure::default() }
+        Self { path, head: Vec::new(), failure: Failure::default(), shortened: Shortened::default() }
     }
 
     /// From its beginning: unpacked if it is gzip, in UTF-8 if it is UTF-16, without a byte order mark.
     ///
     /// Where reading fails the file seems to end, and [`Self::failed`] tells why.
     pub(crate) fn open(&self) -> Result<Box<dyn BufRead>, ReplayError> {
-        let reader = File::open(self.path).and_then(unpack::plain).map_err(|source| self.io(source))?;
+        let reader = File::open(self.path).and_then(|file| unpack::plain(file, &self.shortened));
+        let reader = reader.map_err(|source| self.io(source))?;
         Ok(Box::new(Watched { reader, failure: self.failure.clone() }))
     }
 
     /// Why reading failed, if it did.
     pub(crate) fn failed(&self) -> Result<(), ReplayError> {
         self.failure.take().map_or(Ok(()), |source| Err(self.io(source)))
+    }
+
+    /// Why the archive that it is was not unpacked to its end, if it was not.
+    pub(super) fn shortened(&self) -> Option<&'static str> {
+        self.shortened.get()
     }
 
     /// Its lines from its beginning.

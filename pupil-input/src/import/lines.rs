@@ -13,10 +13,27 @@ use crate::wire::{Decoder, WireEvent, WireSample};
 
 pub(super) const IMPORTER: Importer = Importer { format: LogFormat::Lines, recognises, read };
 
+/// Lines of a log in which a whole one of the protocol is looked for: what a board says as it starts, or a terminal
+/// program's header, may come first.
+const LINES_LOOKED_AT: usize = 64;
+
 fn recognises(input: &LogInput<'_>) -> bool {
     let first = input.head_lines().find(|line| line[0] != b'#');
     let tag = first.and_then(|line| line.strip_prefix(b"P")?.split(|byte| *byte == b',').next());
     tag.is_some_and(|digits| !digits.is_empty() && digits.iter().all(u8::is_ascii_digit))
+        || input.head_lines().take(LINES_LOOKED_AT).any(is_checked)
+}
+
+/// Whether a line is one of the protocol, with a checksum that is right.
+fn is_checked(line: &[u8]) -> bool {
+    let mut decoder = LineDecoder::new();
+    let mut is_sample = false;
+    let mut take = |event| is_sample |= matches!(event, WireEvent::Sample(_));
+    if line.starts_with(b"P1,") {
+        decoder.push(line, &mut take);
+        decoder.finish(&mut take);
+    }
+    is_sample
 }
 
 fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {

@@ -13,6 +13,7 @@ mod gazepoint;
 mod importer;
 mod info;
 mod input;
+pub(crate) mod leaps;
 mod lines;
 mod neon;
 mod parts;
@@ -37,6 +38,8 @@ pub use info::{BlinkCounts, EyeInfo, FaultCount, LogInfo, Range};
 use input::LogInput;
 use recording::LogBuilder;
 pub use recording::{Blink, Recording};
+
+use crate::record::SAMPLES_HEADER;
 
 /// In the order in which they are asked; no two recognise the same log.
 const IMPORTERS: &[Importer] = &[
@@ -73,12 +76,21 @@ impl Recording {
         }
         let input = LogInput::new(path)?;
         input.failed()?;
+        if input.head_lines().next() == Some(SAMPLES_HEADER.as_bytes()) {
+            return Err(input.content(
+                "the samples of a run's record with what the gate said of each",
+                "what they were made of: play `tracker.holodraw` beside it again, or the log or scenario that the run had",
+            ));
+        }
         let importer = IMPORTERS.iter().find(|importer| (importer.recognises)(&input)).ok_or_else(|| {
             ReplayError::UnknownFormat { path: path.into(), found: beginning(&input), formats: known_formats() }
         })?;
         let mut builder = LogBuilder::default();
         (importer.read)(&input, &mut builder)?;
         input.failed()?;
+        if let Some(shortened) = input.shortened() {
+            builder.warn(shortened);
+        }
         builder.finish(importer.format, path)
     }
 }
@@ -193,5 +205,29 @@ mod tests {
         let path = dir.path().join("log");
         std::fs::write(&path, b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\x03").expect("writes");
         assert!(matches!(Recording::read(&path), Err(ReplayError::Io { .. })));
+    }
+
+    #[test]
+    fn a_records_table_of_samples_is_refused_with_what_to_play_instead() {
+        let dir = tempfile::TempDir::new().expect("a folder");
+        let path = dir.path().join("samples.csv");
+        std::fs::write(&path, format!("{SAMPLES_HEADER}\n1,2,3,left,3.5,1,,,1,accepted\n")).expect("writes");
+        let error = Recording::read(&path).expect_err("is refused").to_string();
+        assert!(error.contains("what the gate said of each") && error.contains("play `tracker.holodraw`"), "{error}");
+    }
+
+    #[test]
+    fn lines_behind_what_a_board_says_first_are_a_log() {
+        let mut lines = String::new();
+        for sequence in 0..5 {
+            let (eye, device_us) = (crate::SampleEye::Left, sequence as i64 * 5000);
+            let sample = crate::wire::line::LineSample { sequence, device_us, eye, diameter_mm: 4.0, confidence: 1.0 };
+            crate::wire::line::encode_line(&sample, &mut lines);
+        }
+        let putty = "=~=~=~=~=~=~=~=~=~=~=~= PuTTY log 2026.01.01 12:00:00 =~=~=~=~=~=~=~=~=~=~=~=\r\n";
+        for before in [putty, "boot: tracker v1.2\n\nP\n", ",5000,L,4.000,1.00*00\n", "\u{1}\u{2}\n"] {
+            assert_eq!(recognised(format!("{before}{lines}").as_bytes()), [LogFormat::Lines], "{before}");
+        }
+        assert_eq!(recognised(format!("boot\n{}", lines.replace('*', "*0")).as_bytes()), []);
     }
 }

@@ -15,6 +15,7 @@ use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{Blink, LogBuilder, LogSample};
+use super::table::separator;
 use super::text::{Header, Picker, number, positive_size, time};
 use crate::SampleEye;
 
@@ -33,7 +34,7 @@ const DIAMETERS: [(&str, &str, SampleEye); 3] = [
 
 fn recognises_cloud(input: &LogInput<'_>) -> bool {
     let Some(line) = input.head_lines().next() else { return false };
-    let header = Header::of(line, b',');
+    let header = Header::of(line, separator(line));
     header.has(TIME) && DIAMETERS.iter().any(|(diameter, _, _)| header.has(diameter))
 }
 
@@ -42,9 +43,10 @@ fn read_cloud(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayEr
     let header = loop {
         let Some(line) = lines.next(log) else { return Ok(()) };
         if !line.bytes.trim_ascii().is_empty() {
-            break Header::of(line.bytes, b',');
+            break Header::of(line.bytes, separator(line.bytes));
         }
     };
+    lines.are_rows(header.separator, header.len());
     let [left, right, both] = DIAMETERS.map(|(diameter, _, _)| header.column(diameter));
     let [lid_left, lid_right, lid_both] = DIAMETERS.map(|(_, aperture, _)| header.column(aperture));
     let there = [left, right, both].map(|column| column.is_some());
@@ -88,16 +90,17 @@ fn read_cloud_blinks(path: &Path, log: &mut LogBuilder) {
     }
     let opened = LogInput::new(path).and_then(|input| input.lines());
     let Ok(mut lines) = opened else {
-        return log.note("blinks.csv beside the log cannot be read");
+        return log.warn("blinks.csv beside the log cannot be read");
     };
     // Its faults are its own, not the log's.
     let mut faults = LogBuilder::default();
-    let Some(header) = lines.next(&mut faults).map(|line| Header::of(line.bytes, b',')) else { return };
+    let header = lines.next(&mut faults).map(|line| Header::of(line.bytes, separator(line.bytes)));
+    let Some(header) = header else { return };
     let columns = ["start timestamp [ns]", "end timestamp [ns]"].map(|name| header.column(name));
     if columns.contains(&None) {
-        return log.note("blinks.csv beside the log lacks the columns of begin and end");
+        return log.warn("blinks.csv beside the log lacks the columns of begin and end");
     }
-    let picker = Picker::new(b',', columns);
+    let picker = Picker::new(header.separator, columns);
     let mut unread = 0;
     while let Some(line) = lines.next(&mut faults) {
         let [begins, ends] = picker.pick(line.bytes).map(|cell| cell.and_then(|cell| time(cell, 9)));
@@ -108,7 +111,7 @@ fn read_cloud_blinks(path: &Path, log: &mut LogBuilder) {
         }
     }
     if unread > 0 {
-        log.note(format!("{unread} rows of blinks.csv beside the log are no blinks"));
+        log.warn(format!("{unread} rows of blinks.csv beside the log are no blinks"));
     }
 }
 
@@ -223,7 +226,7 @@ fn read_native(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayE
     times_input.failed()?;
     let mut cut_off = [0; 1];
     if states.read(&mut cut_off).is_ok_and(|count| count > 0) {
-        log.note("the file ends within a record: it is cut off; copy it again");
+        log.warn("the file ends within a record: it is cut off; copy it again");
         log.count(LogFault::Malformed);
     }
     let parts = other_parts(input.path);
@@ -285,7 +288,7 @@ fn read_native_blinks(path: &Path, log: &mut LogBuilder) {
         return;
     }
     let Ok(mut blinks) = LogInput::new(&beside).and_then(|input| input.open()) else {
-        return log.note(format!("`{name}` beside the log cannot be read"));
+        return log.warn(format!("`{name}` beside the log cannot be read"));
     };
     let mut record = [0; BLINK_BYTES];
     let mut unread = 0;
@@ -299,6 +302,6 @@ fn read_native_blinks(path: &Path, log: &mut LogBuilder) {
         }
     }
     if unread > 0 {
-        log.note(format!("{unread} records of `{name}` beside the log are no blinks"));
+        log.warn(format!("{unread} records of `{name}` beside the log are no blinks"));
     }
 }

@@ -9,6 +9,7 @@ use super::format::LogFormat;
 use super::importer::Importer;
 use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
+use super::table::separator;
 use super::text::{Header, Picker, number, size, time};
 use crate::SampleEye;
 use crate::size_unit::SizeUnit;
@@ -21,7 +22,7 @@ const EYE: [&str; 2] = ["eye_id", "id"];
 
 fn recognises(input: &LogInput<'_>) -> bool {
     let Some(line) = input.head_lines().next() else { return false };
-    let header = Header::of(line, b',');
+    let header = Header::of(line, separator(line));
     header.first_of(&TIME).is_some()
         && header.first_of(&EYE).is_some()
         && ["confidence", "norm_pos_x", "diameter"].iter().all(|name| header.has(name))
@@ -55,9 +56,10 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let header = loop {
         let Some(line) = lines.next(log) else { return Ok(()) };
         if !line.bytes.trim_ascii().is_empty() {
-            break Header::of(line.bytes, b',');
+            break Header::of(line.bytes, separator(line.bytes));
         }
     };
+    lines.are_rows(header.separator, header.len());
     let columns = [
         header.first_of(&TIME),
         header.first_of(&EYE),

@@ -13,7 +13,7 @@ use super::input::LogInput;
 use super::recording::{LogBuilder, LogSample};
 use crate::PupilSample;
 use crate::profile::Profile;
-use crate::record::{Ending, Header, HeaderFault, Kind, MAGIC, RawReader};
+use crate::record::{Header, HeaderFault, Kind, MAGIC, RawReader};
 use crate::stamp::Stamper;
 use crate::wire::WireEvent;
 
@@ -28,7 +28,10 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     let mut raw = RawReader::new(input.open()?).map_err(|fault| header_error(input.path, fault))?;
     let profile = profile_of(raw.header(), input.path)?;
     log.unit = profile.unit;
-    log.notes.push(format!("recorded from `{}`, profile `{}`", raw.header().spec, raw.header().profile));
+    let Header { spec, profile: name, scale_mm_per_unit, .. } = raw.header();
+    log.recorded_scale = *scale_mm_per_unit;
+    let scale = scale_mm_per_unit.map_or(String::new(), |scale| format!(", scale_mm_per_unit = {scale}"));
+    log.note(format!("recorded from `{spec}`, profile `{name}`{scale}"));
     let datagrams = raw.header().datagrams;
     let mut decoder = profile.decoder();
     let mut stamper = Stamper::new();
@@ -64,8 +67,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
             Kind::Disconnected | Kind::End => {}
         }
     }
-    log.notes.extend(raw.ending().and_then(Ending::in_words));
-    log.notes.extend(lost_in_words(lost));
+    raw.flaws().chain(lost_in_words(lost)).for_each(|flaw| log.warn(flaw));
     Ok(())
 }
 
@@ -127,8 +129,9 @@ pub(crate) struct RawLog {
     datagrams: bool,
     /// Time of its first and of its last record.
     span: (TimeNs, TimeNs),
-    ending: Option<Ending>,
-    lost: u64,
+    recorded_scale: Option<f64>,
+    /// What is wrong with it, a sentence each.
+    flaws: Vec<String>,
 }
 
 impl RawLog {
@@ -143,7 +146,7 @@ impl RawLog {
         let io = |source| ReplayError::Io { path: path.into(), source };
         let mut raw = reader(path)?;
         let profile = profile_of(raw.header(), path)?;
-        let datagrams = raw.header().datagrams;
+        let (datagrams, recorded_scale) = (raw.header().datagrams, raw.header().scale_mm_per_unit);
         let (mut span, mut lost, mut bytes) = (None, 0_u64, 0);
         while let Some((head, payload)) = raw.next().map_err(io)? {
             let (first, last) = span.unwrap_or((head.t, head.t));
@@ -154,10 +157,12 @@ impl RawLog {
                 Kind::Connected | Kind::Disconnected | Kind::End => {}
             }
         }
+        let flaws: Vec<_> = raw.flaws().chain(lost_in_words(lost)).collect();
         let Some(span) = span.filter(|_| bytes > 0) else {
-            return Err(ReplayError::Empty { path: path.into(), why: "no bytes came".into() });
+            let why = std::iter::once("no bytes came".to_owned()).chain(flaws).collect::<Vec<_>>().join("; ");
+            return Err(ReplayError::Empty { path: path.into(), why });
         };
-        Ok(Self { path: path.into(), profile, datagrams, span, ending: raw.ending(), lost })
+        Ok(Self { path: path.into(), profile, datagrams, span, recorded_scale, flaws })
     }
 
     /// From its beginning.
@@ -186,8 +191,12 @@ impl RawLog {
 
     /// What is missing in it.
     pub(crate) fn warnings(&self) -> Vec<String> {
-        let told = [self.ending.and_then(Ending::in_words), lost_in_words(self.lost)];
-        told.into_iter().flatten().map(|told| format!("{}: {told}", self.path.display())).collect()
+        self.flaws.iter().map(|flaw| format!("{}: {flaw}", self.path.display())).collect()
+    }
+
+    /// Millimetres for one unit of its figures, where the run that recorded it had a scale.
+    pub(crate) const fn recorded_scale(&self) -> Option<f64> {
+        self.recorded_scale
     }
 }
 

@@ -6,6 +6,7 @@ use holod_calibration::{Sorted, TimeNs};
 
 use super::fault::{LogFault, LogFaults, ReplayError};
 use super::format::LogFormat;
+use super::leaps::Leaps;
 use super::parts::{Parts, is_restart};
 use crate::size_unit::SizeUnit;
 use crate::{PupilSample, SampleEye};
@@ -59,8 +60,12 @@ pub(crate) struct LogBuilder {
     blinks: Vec<Blink>,
     /// Blinks of companion files.
     blinks_beside: Vec<Blink>,
-    /// What a user should know of how the log was read, a sentence each.
-    pub(crate) notes: Vec<String>,
+    /// The scale of the run that recorded it.
+    pub(crate) recorded_scale: Option<f64>,
+    /// How the log was read, a sentence each.
+    notes: Vec<String>,
+    /// What is wrong with it or with how it was read.
+    warnings: Vec<String>,
     /// Lines or rows whose time could be read.
     times: u64,
     first_backwards: Option<u64>,
@@ -71,6 +76,7 @@ pub(crate) struct LogBuilder {
     fallen: [Vec<(LogSample, u64)>; 3],
     /// Blinks told among those.
     fallen_blinks: Vec<Blink>,
+    leaps: Leaps,
 }
 
 /// So many samples of an eye in a row are a part of their own; fewer that lie far back are wrong times.
@@ -146,6 +152,7 @@ impl LogBuilder {
             Some(t_ns) if self.parts.advance(t_ns, eye) => t_ns,
             _ => return self.reject_backwards(line),
         };
+        self.leaps.follow(t_ns, line, eye);
         let aperture_mm = aperture_mm.unwrap_or(f32::NAN);
         let row = Row { t_ns, diameter_mm: diameter, confidence, aperture_mm, eye, valid };
         // The eyes come interleaved, a few samples out of step; what lies farther back is left to one sort at the end.
@@ -160,14 +167,14 @@ impl LogBuilder {
 
     /// Takes what another builder was pushed in the place of its own samples, of which it has none.
     pub(super) fn take_samples_of(&mut self, other: Self) {
-        let Self { rows, faults, times, first_backwards, parts, fallen, .. } = other;
+        let Self { rows, faults, times, first_backwards, parts, fallen, leaps, .. } = other;
         self.faults += faults;
         (self.rows, self.times, self.first_backwards) = (rows, times, first_backwards);
-        (self.parts, self.fallen) = (parts, fallen);
+        (self.parts, self.fallen, self.leaps) = (parts, fallen, leaps);
     }
 
     /// The file ends within line `line`, which is handed out next.
-    pub(crate) const fn ends_within(&mut self, line: u64) {
+    pub(super) const fn ends_within(&mut self, line: u64) {
         self.unended = Some((line, self.faults.of(LogFault::Malformed)));
     }
 
@@ -192,9 +199,14 @@ impl LogBuilder {
         self.blinks_beside.push(blink);
     }
 
-    /// Tells the user something of how the log was read.
+    /// Tells the user how the log was read, as any log of its kind may be.
     pub(crate) fn note(&mut self, note: impl Into<String>) {
         self.notes.push(note.into());
+    }
+
+    /// Tells the user what is wrong with the log, or what of it was not read.
+    pub(crate) fn warn(&mut self, warning: impl Into<String>) {
+        self.warnings.push(warning.into());
     }
 
     pub(super) fn finish(mut self, format: LogFormat, path: &Path) -> Result<Recording, ReplayError> {
@@ -211,6 +223,7 @@ impl LogBuilder {
                 0 => "none of its lines is one".into(),
                 rejected => format!("{rejected} of its lines were rejected ({})", reasons.join(", ")),
             };
+            let why = std::iter::once(why).chain(self.warnings).collect::<Vec<_>>().join("; ");
             return Err(ReplayError::Empty { path: path.into(), why });
         }
         if self.rows.len() == MOST_SAMPLES {
@@ -228,39 +241,47 @@ impl LogBuilder {
         if let Some((line, malformed)) = self.unended
             && self.faults.of(LogFault::Malformed) > malformed
         {
-            self.notes.push(format!(
+            self.warn(format!(
                 "line {line}, the last one, ends before its columns do: the file is cut off; copy or export it again"
             ));
         }
-        if let Some(rate_hz) = slow_rate_hz(&self.rows) {
-            self.notes.push(format!(
-                "{rate_hz:.1} samples a second is no eye tracker's rate: this looks like a table of fixations or of means; \
-                 export every sample instead (with Gazepoint: `..._all_gaze.csv`)"
-            ));
+        // Those of a recording of a link are the host's.
+        if format != LogFormat::Raw
+            && let Some(doubt) = doubtful_times(&self.rows, self.stated_rate_hz)
+        {
+            self.warn(doubt);
         }
         self.end_parts();
+        if let Some(told) = self.leaps.close(&mut self.rows, [&mut self.blinks, &mut self.blinks_beside]) {
+            self.warn(told);
+        }
+        self.blinks.append(&mut self.blinks_beside);
         self.blinks.sort_by_key(|blink| blink.begins);
-        let Self { rows, faults, unit, stated_rate_hz, blinks, notes, .. } = self;
-        Ok(Recording { format, unit, rows, blinks, faults, stated_rate_hz, notes })
+        let Self { rows, faults, unit, stated_rate_hz, recorded_scale, blinks, warnings, notes: mut all, .. } = self;
+        let warned = warnings.len();
+        all.splice(0..0, warnings);
+        Ok(Recording { format, unit, rows, blinks, faults, stated_rate_hz, recorded_scale, notes: all, warned })
     }
 
+    /// Tells of the parts.
     fn end_parts(&mut self) {
         let restarts = self.parts.restarts();
         let count = restarts.len();
         if count == 0 {
-            return self.blinks.append(&mut self.blinks_beside);
+            return;
         }
         let lines: Vec<_> = restarts.take(RESTARTS_TOLD).map(|line| line.to_string()).collect();
         let more = count - lines.len();
         let more = if more > 0 { format!(" and {more} more") } else { String::new() };
-        self.note(format!(
+        self.warn(format!(
             "the clock begins anew in {} {}{more}: each part was put 1 s behind the one before it; to read one \
              alone, put its lines, below the header if there is one, into a file of their own",
             if count == 1 { "line" } else { "lines" },
             lines.join(", ")
         ));
         if !self.blinks_beside.is_empty() {
-            self.note("the blinks of the file beside it are left out: it does not say of which part they are");
+            self.blinks_beside.clear();
+            self.warn("the blinks of the file beside it are left out: it does not say of which part they are");
         }
     }
 }
@@ -277,7 +298,10 @@ pub struct Recording {
     blinks: Vec<Blink>,
     faults: LogFaults,
     stated_rate_hz: Option<f64>,
+    recorded_scale: Option<f64>,
+    /// The first `warned` of them are warnings.
     notes: Vec<String>,
+    warned: usize,
 }
 
 impl Recording {
@@ -296,9 +320,24 @@ impl Recording {
         self.stated_rate_hz
     }
 
-    /// What a user should know of how the log was read.
+    /// Of a recording of a link: millimetres for one unit of its figures, where the run that recorded it had a scale.
+    pub const fn recorded_scale(&self) -> Option<f64> {
+        self.recorded_scale
+    }
+
+    /// What a user should know of how the log was read: [`Self::warnings`], then [`Self::remarks`].
     pub fn notes(&self) -> &[String] {
         &self.notes
+    }
+
+    /// What is wrong with the log, or what of it was not read, a sentence each.
+    pub fn warnings(&self) -> &[String] {
+        &self.notes[..self.warned]
+    }
+
+    /// How the log was read, as any log of its kind may be, a sentence each.
+    pub fn remarks(&self) -> &[String] {
+        &self.notes[self.warned..]
     }
 
     /// How many samples there are.
@@ -361,17 +400,63 @@ impl Recording {
     }
 }
 
-/// Rows of one eye that must be as far apart as no tracker's samples before that is said.
-const SLOW_ROWS: usize = 8;
+/// Rows of one eye by which its times are judged, at least.
+const JUDGED_ROWS: usize = 8;
 /// An eye tracker takes a sample at least this often.
 const LEAST_RATE_HZ: f64 = 8.0;
+/// And at most so often: the fastest take 2000.
+const GREATEST_RATE_HZ: f64 = 4000.0;
+/// The rate that a log states and that of its times are alike within this.
+const LIKE_RATES: std::ops::Range<f64> = 0.8..1.25;
+/// They are a power of ten apart within this.
+const LIKE_POWERS: std::ops::Range<f64> = 0.9..1.1;
 
-/// Samples a second of the first eye of `rows`, by the median interval, where they are fewer than a tracker takes.
-fn slow_rate_hz(rows: &[Row]) -> Option<f64> {
+/// What cannot be right with the times of the first eye of `rows`, if anything.
+fn doubtful_times(rows: &[Row], stated_rate_hz: Option<f64>) -> Option<String> {
     let eye = rows.first()?.eye;
     let times: Vec<f64> = rows.iter().filter(|row| row.eye == eye).map(|row| row.t_ns as f64 * 1e-9).collect();
-    let rate_hz = 1.0 / usual_step(&times)?;
-    (times.len() >= SLOW_ROWS && rate_hz < LEAST_RATE_HZ).then_some(rate_hz)
+    if times.len() < JUDGED_ROWS {
+        return None;
+    }
+    let standing = times.windows(2).filter(|pair| pair[0] == pair[1]).count();
+    if 2 * standing > times.len() {
+        return Some(format!(
+            "its times do not advance: {standing} of {} samples have that of the one before; were they rounded, as \
+             spreadsheets do with long figures, or given in another unit than the column's? Export the log again and \
+             leave it as it is",
+            times.len()
+        ));
+    }
+    // A clock of whole milliseconds repeats itself at more than 1 kHz.
+    let repeats = times.len() as f64 / (times.len() - standing) as f64;
+    let rate_hz = repeats / usual_step(&times)?;
+    // Of samples that come in bursts the usual step says little.
+    let mean_hz = (times.len() - 1) as f64 / (times[times.len() - 1] - times[0]);
+    let shown = rate_in_words(rate_hz);
+    let is_like = |stated: &f64| [rate_hz, mean_hz].into_iter().any(|rate_hz| LIKE_RATES.contains(&(rate_hz / stated)));
+    if let Some(stated) = stated_rate_hz.filter(|stated| *stated > 0.0 && !is_like(stated)) {
+        let power = (rate_hz / stated).log10().round();
+        let is_power = power != 0.0 && LIKE_POWERS.contains(&(rate_hz / stated / 10_f64.powf(power)));
+        let cause = if is_power {
+            "a power of ten apart: the unit of time of the one or the other is wrong"
+        } else {
+            "which is not alike: is it that of this log, and are all samples in it?"
+        };
+        return Some(format!("it states {stated} samples a second, and its times make {shown}, {cause}"));
+    }
+    if rate_hz < LEAST_RATE_HZ {
+        return Some(format!(
+            "{shown} samples a second is no eye tracker's rate: this looks like a table of fixations or of means, or its \
+             times are in another unit; export every sample (with Gazepoint: `..._all_gaze.csv`)"
+        ));
+    }
+    (rate_hz.min(mean_hz) > GREATEST_RATE_HZ).then(|| {
+        format!("{shown} samples a second is no eye tracker's rate: its times are in another unit than the column's")
+    })
+}
+
+fn rate_in_words(rate_hz: f64) -> String {
+    if rate_hz < 1.0 { format!("{rate_hz:.2e}") } else { format!("{rate_hz:.1}") }
 }
 
 /// The usual step of `times`: the median of those that are positive.

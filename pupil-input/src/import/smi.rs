@@ -156,7 +156,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
     }
     first.note(log);
     if let Some(stated) = stated_samples.filter(|stated| (rows as f64) < *stated) {
-        log.note(format!(
+        log.warn(format!(
             "the header promises {stated} samples and there are {rows}: the file is cut off; copy it again"
         ));
     }

@@ -77,6 +77,9 @@ impl Table {
             }
         };
         let width = names.len();
+        if width < MAX_COLUMNS {
+            lines.are_rows(separator, width);
+        }
         Ok(Some(Self { lines, separator, names, width, line: Vec::new(), number: 0, cells: Vec::new() }))
     }
 

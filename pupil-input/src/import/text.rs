@@ -20,6 +20,8 @@ pub(crate) struct Lines {
     to: usize,
     ended: bool,
     number: u64,
+    /// Separator and number of the columns that each line should have.
+    columns: Option<(u8, usize)>,
 }
 
 /// One line, without its ending.
@@ -32,7 +34,13 @@ pub(crate) struct Line<'l> {
 
 impl Lines {
     pub(super) fn new(reader: Box<dyn Read>) -> Self {
-        Self { reader, buffer: vec![0; BUFFER_BYTES], from: 0, to: 0, ended: false, number: 0 }
+        Self { reader, buffer: vec![0; BUFFER_BYTES], from: 0, to: 0, ended: false, number: 0, columns: None }
+    }
+
+    /// The lines from now on are rows of a table: where the file ends within one that has fewer cells than `columns`, it
+    /// was cut off there, and that row is counted as malformed and not handed out.
+    pub(crate) const fn are_rows(&mut self, separator: u8, columns: usize) {
+        self.columns = Some((separator, columns));
     }
 
     /// The next line, be it empty; overlong ones are counted in `log` and skipped. None at the end, or where reading
@@ -63,6 +71,10 @@ impl Lines {
                 continue;
             }
             let bytes = &self.buffer[begin..end];
+            if next == end && self.columns.is_some_and(|(separator, columns)| has_fewer(bytes, separator, columns)) {
+                log.count(LogFault::Malformed);
+                return None;
+            }
             return Some(Line { number: self.number, bytes: bytes.strip_suffix(b"\r").unwrap_or(bytes) });
         }
     }
@@ -105,6 +117,11 @@ impl Header {
     /// The column of the first of these names that there is.
     pub(crate) fn first_of(&self, names: &[&str]) -> Option<usize> {
         names.iter().find_map(|name| self.column(name))
+    }
+
+    /// How many columns there are.
+    pub(crate) const fn len(&self) -> usize {
+        self.names.len()
     }
 
     pub(crate) fn has(&self, name: &str) -> bool {
@@ -156,6 +173,19 @@ fn first_cell(line: &[u8], separator: u8) -> (&[u8], Option<&[u8]>) {
 
 fn after_cell(line: &[u8], separator: u8) -> Option<&[u8]> {
     line.get(cell_end(line, separator) + 1..)
+}
+
+/// Whether a line that is not empty has fewer cells than `columns`.
+fn has_fewer(line: &[u8], separator: u8, columns: usize) -> bool {
+    let mut cells = 0;
+    let mut rest = Some(line).filter(|line| !line.trim_ascii().is_empty());
+    while let Some(line) = rest
+        && cells < columns
+    {
+        rest = after_cell(line, separator);
+        cells += 1;
+    }
+    (1..columns).contains(&cells)
 }
 
 fn cell_end(line: &[u8], separator: u8) -> usize {
@@ -317,6 +347,27 @@ mod tests {
         }
         assert_eq!(lines_of(&vec![0; 2 * BUFFER_BYTES], usize::MAX), (vec![], 1));
         assert_eq!(lines_of(b"", 1), (vec![], 0));
+    }
+
+    #[test]
+    fn a_last_row_that_ends_before_its_columns_is_none() {
+        for (last, cut) in
+            [("3,4,5", false), ("3,4,", false), ("3,4", true), ("\"3,4\",5", true), ("3", true), ("", false)]
+        {
+            for end in ["", "\n"] {
+                let mut log = LogBuilder::default();
+                let text = format!("1,2\n{last}{end}");
+                let mut lines = Lines::new(Box::new(std::io::Cursor::new(text.into_bytes())));
+                lines.are_rows(b',', 3);
+                let mut count = 0;
+                while lines.next(&mut log).is_some() {
+                    count += 1;
+                }
+                let cut = cut && end.is_empty();
+                let whole = 2 - usize::from(cut || last.is_empty() && end.is_empty());
+                assert_eq!((count, log.faults.of(LogFault::Malformed)), (whole, u64::from(cut)), "{last:?}{end:?}");
+            }
+        }
     }
 
     #[test]

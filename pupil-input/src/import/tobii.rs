@@ -195,7 +195,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         }
     }
     if unmeasured > 0 {
-        log.note(format!(
+        log.warn(format!(
             "{unmeasured} times an eye is valid and has no diameter: some trackers measure pupils at a lower rate than gaze"
         ));
     }

@@ -1,9 +1,11 @@
 //! A log's bytes as they should have been stored: unpacked from gzip and turned from UTF-16 into UTF-8, both told by
 //! their first bytes.
 
+use std::cell::Cell;
 use std::io::{self, BufRead, BufReader, Read};
+use std::rc::Rc;
 
-use flate2::bufread::MultiGzDecoder;
+use flate2::bufread::GzDecoder;
 
 /// Bytes read at a time.
 const BUFFER_BYTES: usize = 1 << 18;
@@ -12,15 +14,82 @@ const UTF8_MARK: &[u8] = b"\xEF\xBB\xBF";
 const UTF16_LE_MARK: &[u8] = b"\xFF\xFE";
 const UTF16_BE_MARK: &[u8] = b"\xFE\xFF";
 
-/// `source` without gzip, UTF-16 and byte order mark.
+/// Why an archive was not unpacked to its end, if it was not.
+pub(super) type Shortened = Rc<Cell<Option<&'static str>>>;
+
+/// `source` without gzip, UTF-16 and byte order mark; of an archive that is not whole what can be unpacked, as `gunzip`
+/// does, with a word in `shortened`.
 ///
 /// Of a bomb of gzip nothing is kept but the samples in it, and [`LogBuilder`](super::LogBuilder) bounds those.
-pub(super) fn plain(source: impl Read + 'static) -> io::Result<Box<dyn BufRead>> {
+pub(super) fn plain(source: impl Read + 'static, shortened: &Shortened) -> io::Result<Box<dyn BufRead>> {
     let mut reader = BufReader::with_capacity(BUFFER_BYTES, source);
     if reader.fill_buf()?.starts_with(GZIP) {
-        text(BufReader::with_capacity(BUFFER_BYTES, MultiGzDecoder::new(reader)))
+        let member = Some(GzDecoder::new(reader));
+        let archive = Archive { member, unpacked: false, shortened: Rc::clone(shortened) };
+        text(BufReader::with_capacity(BUFFER_BYTES, archive))
     } else {
         text(reader)
+    }
+}
+
+/// The members of a gzip archive as one stream.
+struct Archive<R: BufRead> {
+    /// None at the end.
+    member: Option<GzDecoder<R>>,
+    /// Something was unpacked.
+    unpacked: bool,
+    shortened: Shortened,
+}
+
+impl<R: BufRead> Read for Archive<R> {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        while let Some(member) = &mut self.member {
+            match member.read(out) {
+                Ok(0) if !out.is_empty() => self.member = self.next_member()?,
+                Ok(count) => {
+                    self.unpacked = true;
+                    return Ok(count);
+                }
+                Err(error) if error.kind() == io::ErrorKind::UnexpectedEof && self.unpacked => {
+                    self.shortened.set(Some("the gzip archive is cut off: copy the file again"));
+                    self.member = None;
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(0)
+    }
+}
+
+impl<R: BufRead> Archive<R> {
+    /// What follows the member that has ended, if it is another.
+    fn next_member(&mut self) -> io::Result<Option<GzDecoder<R>>> {
+        let Some(mut source) = self.member.take().map(GzDecoder::into_inner) else { return Ok(None) };
+        // Archives on tape are filled up with zeros.
+        let mut is_padding = false;
+        loop {
+            let buffer = match source.fill_buf() {
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+                buffer => buffer?,
+            };
+            match buffer.iter().position(|byte| *byte != 0) {
+                _ if buffer.is_empty() => return Ok(None),
+                // The buffer may hold one byte of the next member's two.
+                Some(0) if !is_padding && (buffer.starts_with(GZIP) || buffer == &GZIP[..1]) => {
+                    return Ok(Some(GzDecoder::new(source)));
+                }
+                Some(_) => {
+                    let behind = "bytes behind the end of the gzip archive are none of it, and were not read";
+                    self.shortened.set(Some(behind));
+                    return Ok(None);
+                }
+                None => {
+                    is_padding = true;
+                    let count = buffer.len();
+                    source.consume(count);
+                }
+            }
+        }
     }
 }
 
@@ -121,9 +190,13 @@ mod tests {
     use super::*;
 
     fn read(bytes: Vec<u8>) -> io::Result<String> {
-        let mut text = String::new();
-        plain(io::Cursor::new(bytes))?.read_to_string(&mut text)?;
-        Ok(text)
+        read_with_word(bytes).map(|(text, _)| text)
+    }
+
+    fn read_with_word(bytes: Vec<u8>) -> io::Result<(String, Option<&'static str>)> {
+        let (mut text, shortened) = (String::new(), Shortened::default());
+        plain(io::Cursor::new(bytes), &shortened)?.read_to_string(&mut text)?;
+        Ok((text, shortened.take()))
     }
 
     fn gzip(bytes: &[u8]) -> Vec<u8> {
@@ -158,8 +231,30 @@ mod tests {
             read(b"\xFF\xFE\x41\xD8a\0\x41\xDCb\0\x41\xD8c".to_vec()).expect("reads"),
             "\u{fffd}a\u{fffd}b\u{fffd}"
         );
-        let packed = gzip(b"P1,1,2,L,3,1\n");
-        assert!(read(packed[..packed.len() - 4].to_vec()).is_err(), "a cut archive is an error, not a shorter log");
+    }
+
+    #[test]
+    fn an_archive_that_is_not_whole_is_unpacked_as_far_as_it_goes_and_said_to_be_so() {
+        let text: String = (0..4000).map(|k| format!("P1,{k},{},L,3,1\n", k * k)).collect();
+        let packed = gzip(text.as_bytes());
+        for cut in [1, 4, 8, 9, packed.len() / 2] {
+            let (unpacked, told) = read_with_word(packed[..packed.len() - cut].to_vec()).expect("reads");
+            assert!(text.starts_with(&unpacked) && unpacked.len() > text.len() / 3, "{cut}: {}", unpacked.len());
+            assert!(told.is_some_and(|told| told.contains("cut off")), "{cut}");
+        }
+        for (behind, told) in [(&b"\0\0\0\0"[..], false), (b"rubbish", true), (b"\0\0x", true), (b"\x1Fx", true)] {
+            let read = read_with_word([&packed, behind].concat());
+            match read {
+                Ok((unpacked, word)) => assert_eq!((unpacked == text, word.is_some()), (true, told), "{behind:?}"),
+                Err(error) => panic!("{behind:?}: {error}"),
+            }
+        }
+        // Of nothing there is no log, and a wrong checksum is no cut.
+        assert!(read(packed[..10].to_vec()).is_err());
+        let mut wrong = packed.clone();
+        let at = wrong.len() - 6;
+        wrong[at] ^= 1;
+        assert!(read(wrong).is_err());
     }
 
     #[test]

@@ -61,7 +61,7 @@ fn read(input: &LogInput<'_>, log: &mut LogBuilder) -> Result<(), ReplayError> {
         let resets = stream.clock.spans.len().saturating_sub(1);
         if resets > 0 && !stream.taken.is_empty() {
             let times = if resets == 1 { "once".to_owned() } else { format!("{resets} times") };
-            log.note(format!(
+            log.warn(format!(
                 "the clock of the stream `{}` was set or started again {times} in the recording: each part was put on the \
                  recorder's clock by its own offsets",
                 stream.name.escape_debug()
@@ -283,7 +283,7 @@ fn take_header(chunk: &mut Chunk<'_>, streams: &mut BTreeMap<u32, Stream>, log: 
         Ok(stream) => stream,
         Err(error) => {
             log.count(LogFault::Malformed);
-            log.note(format!("stream {id} was left out: its header cannot be read ({error})"));
+            log.warn(format!("stream {id} was left out: its header cannot be read ({error})"));
             return Ok(());
         }
     };

@@ -7,7 +7,7 @@
 //! | 8 | `HOLOD`, 0x1A, CR, LF |
 //! | 4 | version of the format, 1 |
 //! | 4 | length of the header, n |
-//! | n | the header, TOML: `spec`, `profile`, `profile_toml` where it is a user's own, `hid_descriptor` in hexadecimals for a HID device, `datagrams`, `holod`, `t_started_ns` (the host's monotonic clock) and `started_unix_ns` (the wall clock at the same moment) |
+//! | n | the header, TOML: `spec`, `profile`, `profile_toml` where it is a user's own, `hid_descriptor` in hexadecimals for a HID device, `datagrams`, `scale_mm_per_unit` where the run had one (at its start), `holod`, `t_started_ns` (the host's monotonic clock) and `started_unix_ns` (the wall clock at the same moment) |
 //! | 4 | CRC-32 of all of these |
 //!
 //! and goes on with records:
@@ -29,8 +29,9 @@
 //! | 4 | pieces found no room on their way to the file | how many, 8 bytes |
 //! | 5 | the run ended as it should | none |
 //!
-//! A file whose last record is not of kind 5 was cut off. A record that is incomplete, or whose checksum is wrong, is
-//! where the file was torn; nothing behind it is read.
+//! A file whose last record is not of kind 5 was cut off. Where a record is incomplete, or its checksum is wrong, reading
+//! goes on at the next byte from which on one is whole: so damage costs what it hit. Behind a record of kind 5, and from
+//! the beginning of another recording on, nothing is read.
 
 use std::io::{self, Read};
 
@@ -110,7 +111,7 @@ fn u32_at(bytes: &[u8], at: usize) -> u32 {
 }
 
 /// What a recording says of itself.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Header {
     pub(crate) spec: String,
     /// The name of the profile by which it was read.
@@ -121,6 +122,8 @@ pub(crate) struct Header {
     pub(crate) hid_descriptor: Option<Vec<u8>>,
     /// Whether each piece is a message of its own, at whose end the decoder's stream ends.
     pub(crate) datagrams: bool,
+    /// Millimetres for one unit of its figures, where the run had a scale at its start.
+    pub(crate) scale_mm_per_unit: Option<f64>,
     /// When the run began, on the host's monotonic clock.
     pub(crate) t_started: TimeNs,
     /// The same on the wall clock, ns since 1970.
@@ -140,6 +143,9 @@ impl Header {
             text["hid_descriptor"] = value(descriptor.iter().map(|byte| format!("{byte:02x}")).collect::<String>());
         }
         text["datagrams"] = value(self.datagrams);
+        if let Some(scale) = self.scale_mm_per_unit {
+            text["scale_mm_per_unit"] = value(scale);
+        }
         text["holod"] = value(env!("CARGO_PKG_VERSION"));
         text["t_started_ns"] = value(self.t_started.0);
         text["started_unix_ns"] = value(self.started_unix_ns);
@@ -159,6 +165,11 @@ impl Header {
                 Some(item) => Some(bytes_of_hex(item.as_str()?)?),
             },
             datagrams: text.get("datagrams")?.as_bool()?,
+            // A scale that is none is no fault of the bytes.
+            scale_mm_per_unit: text
+                .get("scale_mm_per_unit")
+                .and_then(toml_edit::Item::as_float)
+                .filter(|scale| scale.is_normal() && *scale > 0.0),
             t_started: TimeNs(integer("t_started_ns")?),
             started_unix_ns: integer("started_unix_ns")?,
         })
@@ -189,22 +200,27 @@ pub fn with_header(recording: &[u8], change: impl FnOnce(&str) -> String) -> Opt
 }
 
 /// What the link of a recording brought, put together however it was read, with a line's end where a message ended or
-/// the stream broke off; behind it what is in the file and no whole record. Nothing where `recording` begins with no
+/// the stream broke off; behind it what is in the file and no whole record of this recording. Nothing where `recording` begins with no
 /// header.
 pub fn payloads(recording: &[u8]) -> Option<Vec<u8>> {
     let mut reader = RawReader::new(recording).ok()?;
     let datagrams = reader.header.datagrams;
     let mut brought = Vec::with_capacity(recording.len());
+    let mut behind: Vec<u8> = Vec::new();
+    let mut from = reader.at as usize;
     while let Ok(Some((head, payload))) = reader.next() {
         brought.extend(payload);
         if datagrams || head.kind != Kind::Bytes {
             brought.push(b'\n');
         }
+        let record_bytes = RECORD_HEAD_BYTES + payload.len() + 4;
+        let to = reader.at as usize;
+        behind.extend(&recording[from..to - record_bytes]);
+        from = to;
     }
-    let behind = match reader.ending {
-        Some(Ending::Torn { unread_bytes }) => &recording[recording.len() - unread_bytes as usize..],
-        _ => reader.input,
-    };
+    let to = reader.at as usize;
+    behind.extend(&recording[from..to]);
+    behind.extend(&recording[to + reader.end_bytes..]);
     brought.push(b'\n');
     brought.extend(behind);
     Some(brought)
@@ -230,29 +246,86 @@ pub(crate) enum Ending {
     Whole,
     /// Between two records.
     CutOff,
-    /// Within a record, with so many bytes from there to the end of the file.
+    /// Within a record, with so many bytes from there to the end of the file, and no whole record in them.
     Torn { unread_bytes: u64 },
+    /// With something of `bytes` bytes behind it, from byte `at` of the file (counted from 0) on.
+    Followed { at: u64, bytes: u64 },
 }
 
 impl Ending {
     /// What is to be told of it, if it is no proper end.
-    pub(crate) fn in_words(self) -> Option<String> {
+    fn in_words(self) -> Option<String> {
         let lost = "what came in the last second of that run may be lost";
         match self {
             Self::Whole => None,
             Self::CutOff => Some(format!("the recording was cut off; {lost}")),
-            Self::Torn { unread_bytes } => {
+            Self::Torn { unread_bytes } if unread_bytes <= LONGEST_RECORD as u64 => {
                 Some(format!("the recording is torn: its last {unread_bytes} bytes are no whole record; {lost}"))
             }
+            Self::Torn { unread_bytes } => Some(format!(
+                "the recording is torn: its last {unread_bytes} bytes hold no whole record, and what came in them is lost"
+            )),
+            Self::Followed { at, bytes } => Some(format!(
+                "behind the recording's end {bytes} more bytes were not read: where they are another recording, \
+                 `tail -c +{} FILE > OTHER` makes a file of its own of it",
+                at.saturating_add(1)
+            )),
         }
     }
 }
+
+/// Places in a recording that hold no whole record, with whole ones behind them.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Damage {
+    places: u64,
+    /// Byte of the file at which the first begins, counted from 0.
+    at: u64,
+    bytes: u64,
+    /// Between the records before and behind, in all.
+    span: TimeNs,
+}
+
+impl Damage {
+    fn in_words(self) -> Option<String> {
+        let Self { places, at, bytes, span } = self;
+        let more = match places {
+            0 | 1 => String::new(),
+            2 => " and at one more place".into(),
+            _ => format!(" and at {} more places", places - 1),
+        };
+        (places > 0).then(|| {
+            format!(
+                "the recording is damaged at byte {at}{more}: {bytes} bytes are no whole record and were left out, with \
+                 what came within {:.3} s there; what lies behind was read",
+                span.seconds()
+            )
+        })
+    }
+}
+
+/// A record's bytes at most.
+const LONGEST_RECORD: usize = RECORD_HEAD_BYTES + MAX_PAYLOAD_BYTES + 4;
+/// Bytes read at a time, at least.
+const READ_BYTES: usize = 4096;
+/// In a search for the next record so many bytes may be summed, and so many more for each that is passed over: what was
+/// made up to look like the beginnings of records does not take hours.
+const SUMMED: u64 = 1 << 22;
+const SUMMED_PER_BYTE: u64 = 64;
 
 /// Reads a recording record by record, in constant memory.
 pub(crate) struct RawReader<R> {
     input: R,
     header: Header,
-    record: Vec<u8>,
+    /// What was read; the next record is looked for from `from` on.
+    window: Vec<u8>,
+    from: usize,
+    /// Byte of the file at which the record that was handed out last ends, counted from 0; at the end of a whole
+    /// recording that at which the record that says so begins.
+    at: u64,
+    /// Length of that record, 0 where there is none.
+    end_bytes: usize,
+    t_last: Option<TimeNs>,
+    damage: Damage,
     ending: Option<Ending>,
 }
 
@@ -277,50 +350,104 @@ impl<R: Read> RawReader<R> {
         let header = sound
             .and_then(|text| Header::parse(std::str::from_utf8(text).ok()?))
             .ok_or_else(|| HeaderFault::Bad("a torn header".into()))?;
-        let record = Vec::with_capacity(RECORD_HEAD_BYTES + MAX_PAYLOAD_BYTES + 4);
-        Ok(Self { input, header, record, ending: None })
+        Ok(Self {
+            input,
+            header,
+            window: Vec::with_capacity(LONGEST_RECORD),
+            from: 0,
+            at: bytes.len() as u64,
+            end_bytes: 0,
+            t_last: None,
+            damage: Damage::default(),
+            ending: None,
+        })
     }
 
     pub(crate) const fn header(&self) -> &Header {
         &self.header
     }
 
-    /// The next record; none at the end, of which [`Self::ending`] then tells. After the first call it allocates
+    /// The next record; none at the end, of which [`Self::flaws`] then tells. After the first call it allocates
     /// nothing.
     pub(crate) fn next(&mut self) -> io::Result<Option<(RecordHead, &[u8])>> {
         if self.ending.is_some() {
             return Ok(None);
         }
-        self.record.clear();
-        take(&mut self.input, RECORD_HEAD_BYTES, &mut self.record)?;
-        if self.record.is_empty() {
-            self.ending = Some(Ending::CutOff);
-            return Ok(None);
-        }
-        let whole = self.record.len() == RECORD_HEAD_BYTES;
-        let Some((head, length)) = whole.then(|| RecordHead::decode(&self.record)).flatten() else {
-            return self.torn();
+        let (mut skipped, mut summed) = (0, 0);
+        let (head, length) = loop {
+            if !self.has(RECORD_HEAD_BYTES)? {
+                let unread_bytes = skipped + (self.window.len() - self.from) as u64;
+                return self.end(if unread_bytes == 0 { Ending::CutOff } else { Ending::Torn { unread_bytes } });
+            }
+            if self.window[self.from..].starts_with(&MAGIC) {
+                self.damaged(skipped, None);
+                return self.followed(skipped);
+            }
+            if let Some((head, length)) = RecordHead::decode(&self.window[self.from..]) {
+                let end = RECORD_HEAD_BYTES + length;
+                if summed <= SUMMED + SUMMED_PER_BYTE * skipped && self.has(end + 4)? {
+                    summed += end as u64;
+                    let record = &self.window[self.from..];
+                    if crc32(&record[..end]) == u32_at(record, end) {
+                        break (head, length);
+                    }
+                }
+            }
+            self.from += 1;
+            skipped += 1;
         };
-        take(&mut self.input, length + 4, &mut self.record)?;
-        let end = RECORD_HEAD_BYTES + length;
-        if self.record.len() != end + 4 || crc32(&self.record[..end]) != u32_at(&self.record, end) {
-            return self.torn();
-        }
+        self.damaged(skipped, Some(head.t));
+        self.t_last = Some(head.t);
+        self.at += skipped;
+        let (begin, record_bytes) = (self.from + RECORD_HEAD_BYTES, RECORD_HEAD_BYTES + length + 4);
+        self.from += record_bytes;
         if head.kind == Kind::End {
-            self.ending = Some(Ending::Whole);
-            return Ok(None);
+            self.end_bytes = record_bytes;
+            return self.followed(record_bytes as u64);
         }
-        Ok(Some((head, &self.record[RECORD_HEAD_BYTES..end])))
+        self.at += record_bytes as u64;
+        Ok(Some((head, &self.window[begin..begin + length])))
     }
 
-    /// How it ended, once all of it has been read.
-    pub(crate) const fn ending(&self) -> Option<Ending> {
-        self.ending
+    /// What is wrong with the recording, for people, once all of it has been read.
+    pub(crate) fn flaws(&self) -> impl Iterator<Item = String> + use<R> {
+        [self.damage.in_words(), self.ending.and_then(Ending::in_words)].into_iter().flatten()
     }
 
-    fn torn(&mut self) -> io::Result<Option<(RecordHead, &[u8])>> {
-        let behind = io::copy(&mut self.input, &mut io::sink())?;
-        self.ending = Some(Ending::Torn { unread_bytes: self.record.len() as u64 + behind });
+    /// Whether the window holds `count` bytes from `from` on; reads what is missing, up to the longest record.
+    fn has(&mut self, count: usize) -> io::Result<bool> {
+        if self.window.len() - self.from < count {
+            self.window.drain(..self.from);
+            self.from = 0;
+            let room = LONGEST_RECORD - self.window.len();
+            take(&mut self.input, count.max(READ_BYTES).min(room), &mut self.window)?;
+        }
+        Ok(self.window.len() - self.from >= count)
+    }
+
+    /// `bytes` bytes behind the record that was read last are no record; the next one is of `t_next`.
+    fn damaged(&mut self, bytes: u64, t_next: Option<TimeNs>) {
+        if bytes == 0 {
+            return;
+        }
+        if self.damage.places == 0 {
+            self.damage.at = self.at;
+        }
+        self.damage.places += 1;
+        self.damage.bytes += bytes;
+        if let Some((last, next)) = self.t_last.zip(t_next) {
+            self.damage.span = self.damage.span + (next - last).max(TimeNs(0));
+        }
+    }
+
+    /// The recording ends `passed` bytes on, and the file may not.
+    fn followed(&mut self, passed: u64) -> io::Result<Option<(RecordHead, &[u8])>> {
+        let bytes = (self.window.len() - self.from) as u64 + io::copy(&mut self.input, &mut io::sink())?;
+        self.end(if bytes == 0 { Ending::Whole } else { Ending::Followed { at: self.at + passed, bytes } })
+    }
+
+    fn end(&mut self, ending: Ending) -> io::Result<Option<(RecordHead, &[u8])>> {
+        self.ending = Some(ending);
         Ok(None)
     }
 }
@@ -355,21 +482,23 @@ mod tests {
             profile_toml: Some("name = '''x'''\n".into()),
             hid_descriptor: Some(vec![0x05, 0xFF, 0x00]),
             datagrams: true,
+            scale_mm_per_unit: Some(0.001),
             t_started: TimeNs(-5),
             started_unix_ns: 1_700_000_000_000_000_000,
         }
     }
 
     type Read = Vec<(RecordHead, Vec<u8>)>;
+    const NONE: Damage = Damage { places: 0, at: 0, bytes: 0, span: TimeNs(0) };
 
-    fn read(bytes: &[u8]) -> Result<(Read, Ending), HeaderFault> {
+    fn read(bytes: &[u8]) -> Result<(Read, Ending, Damage), HeaderFault> {
         let mut reader = RawReader::new(bytes)?;
         assert_eq!(reader.header(), &header());
         let mut records = Vec::new();
         while let Some((head, payload)) = reader.next().expect("memory reads") {
             records.push((head, payload.to_vec()));
         }
-        Ok((records, reader.ending().expect("it has ended")))
+        Ok((records, reader.ending.expect("it has ended"), reader.damage))
     }
 
     #[test]
@@ -434,9 +563,9 @@ mod tests {
         #[test]
         fn what_is_written_is_read(records in prop::collection::vec(any_record(), 0..12)) {
             let (mut bytes, _) = file(&records);
-            prop_assert_eq!(read(&bytes).expect("reads"), (records.clone(), Ending::CutOff));
+            prop_assert_eq!(read(&bytes).expect("reads"), (records.clone(), Ending::CutOff, NONE));
             bytes.extend(end());
-            prop_assert_eq!(read(&bytes).expect("reads"), (records, Ending::Whole));
+            prop_assert_eq!(read(&bytes).expect("reads"), (records, Ending::Whole, NONE));
         }
 
         /// What a killed process leaves: a file that ends anywhere.
@@ -452,7 +581,7 @@ mod tests {
                 let whole = ends.iter().filter(|end| **end <= length).count() - 1;
                 let unread_bytes = (length - ends[whole]) as u64;
                 let ending = if unread_bytes == 0 { Ending::CutOff } else { Ending::Torn { unread_bytes } };
-                prop_assert_eq!(read(cut).expect("reads"), (records[..whole].to_vec(), ending));
+                prop_assert_eq!(read(cut).expect("reads"), (records[..whole].to_vec(), ending, NONE));
             }
         }
 
@@ -466,22 +595,28 @@ mod tests {
             let (mut bytes, _) = file(&records);
             let unread_bytes = tail.len() as u64;
             if zeros { bytes.resize(bytes.len() + tail.len(), 0) } else { bytes.extend(tail) }
-            prop_assert_eq!(read(&bytes).expect("reads"), (records, Ending::Torn { unread_bytes }));
+            prop_assert_eq!(read(&bytes).expect("reads"), (records, Ending::Torn { unread_bytes }, NONE));
         }
 
         #[test]
-        fn no_wrong_bit_passes(records in prop::collection::vec(any_record(), 1..5), at in any::<prop::sample::Index>(),
-                               bit in 0..8_u8) {
+        fn no_wrong_bit_passes_and_what_lies_behind_it_is_read(
+            records in prop::collection::vec(any_record(), 1..5), at in any::<prop::sample::Index>(), bit in 0..8_u8,
+        ) {
             let (mut bytes, ends) = file(&records);
             let at = at.index(bytes.len());
             bytes[at] ^= 1 << bit;
             match read(&bytes) {
                 Err(_) => prop_assert!(at < ends[0]),
-                Ok((read, ending)) => {
-                    let before = ends.iter().filter(|end| **end <= at).count() - 1;
-                    prop_assert_eq!(&read[..], &records[..before]);
-                    let is_torn = matches!(ending, Ending::Torn { .. });
-                    prop_assert!(is_torn);
+                Ok((read, ending, damage)) => {
+                    let hit = ends.iter().filter(|end| **end <= at).count() - 1;
+                    prop_assert_eq!(&read[..], &[&records[..hit], &records[hit + 1..]].concat());
+                    let bytes = (ends[hit + 1] - ends[hit]) as u64;
+                    if hit + 1 == records.len() {
+                        prop_assert_eq!((ending, damage), (Ending::Torn { unread_bytes: bytes }, NONE));
+                    } else {
+                        prop_assert_eq!(ending, Ending::CutOff);
+                        prop_assert_eq!((damage.places, damage.at, damage.bytes), (1, ends[hit] as u64, bytes));
+                    }
                 }
             }
         }
@@ -498,7 +633,66 @@ mod tests {
         for t in [i64::MIN, -1, LATEST.0 + 1, i64::MAX] {
             let head = RecordHead { kind: Kind::Bytes, t: TimeNs(t), connection: 1 };
             let (bytes, _) = file(&vec![(head, b"x".to_vec())]);
-            assert!(matches!(read(&bytes), Ok((records, Ending::Torn { .. })) if records.is_empty()), "{t}");
+            assert!(matches!(read(&bytes), Ok((records, Ending::Torn { .. }, NONE)) if records.is_empty()), "{t}");
+        }
+    }
+
+    #[test]
+    fn damage_is_told_with_what_it_costs_and_where_it_is() {
+        let record = |ms: i64| {
+            (RecordHead { kind: Kind::Bytes, t: TimeNs(ms * 1_000_000), connection: 1 }, vec![7; 40 + ms as usize])
+        };
+        let records: Vec<_> = (0..2000).map(record).collect();
+        let (mut bytes, ends) = file(&records);
+        bytes.extend(end());
+        // The length of one, so that what follows seems to be its payload, and two others.
+        bytes[ends[3] + 1] = 0xFF;
+        bytes[ends[700] + 30] ^= 1;
+        bytes[ends[701] + 30] ^= 1;
+        let mut reader = RawReader::new(&bytes[..]).expect("a header");
+        let mut read = 0;
+        while reader.next().expect("memory reads").is_some() {
+            read += 1;
+        }
+        let told: Vec<_> = reader.flaws().collect();
+        assert_eq!((read, told.len()), (1997, 1), "{told:?}");
+        let left_out = (ends[4] - ends[3]) + (ends[702] - ends[700]);
+        let at = format!("damaged at byte {} and at one more place: {left_out} bytes", ends[3]);
+        assert!(told[0].contains(&at) && told[0].contains("within 0.005 s"), "{told:?}");
+        let brought = payloads(&bytes).expect("a header");
+        let hit = &bytes[ends[3]..ends[4]];
+        assert!(brought.windows(hit.len()).any(|piece| piece == hit), "a report sees what is in no record, too");
+    }
+
+    #[test]
+    fn another_recording_behind_is_not_read_as_this_one() {
+        let record = |t: i64| (RecordHead { kind: Kind::Bytes, t: TimeNs(t), connection: 1 }, b"abc".to_vec());
+        let (cut_off, _) = file(&vec![record(1), record(2)]);
+        let whole = [&cut_off[..], &end()].concat();
+        for (first, torn) in [(&whole, 0), (&cut_off, 0), (&cut_off, 5)] {
+            let bytes = [&first[..], &b"torn!"[..torn], &whole].concat();
+            let (read, ending, damage) = read(&bytes).expect("reads");
+            let behind = Ending::Followed { at: (first.len() + torn) as u64, bytes: whole.len() as u64 };
+            assert_eq!((read.len(), ending, damage.bytes), (2, behind, torn as u64));
+        }
+    }
+
+    #[test]
+    fn what_is_made_up_to_look_like_records_does_not_take_hours() {
+        // Each fifth byte seems to begin a record of the greatest length.
+        let bytes = [header().encode(), b"\xFF\xFF\x00\x00\x01".repeat(400_000)].concat();
+        let begun = std::time::Instant::now();
+        let (read, ending, _) = read(&bytes).expect("reads");
+        assert_eq!((read.len(), ending), (0, Ending::Torn { unread_bytes: 2_000_000 }));
+        assert!(begun.elapsed() < std::time::Duration::from_secs(60), "{:?}", begun.elapsed());
+    }
+
+    #[test]
+    fn a_scale_that_is_none_is_none() {
+        for (scale, read) in [("0.05", Some(0.05)), ("-1.0", None), ("0.0", None), ("inf", None), ("\"x\"", None)] {
+            let text = Header { scale_mm_per_unit: Some(2.0), ..header() }.encode();
+            let bytes = with_header(&text, |text| text.replace("= 2.0", &format!("= {scale}"))).expect("a header");
+            assert_eq!(RawReader::new(&bytes[..]).expect("a header").header().scale_mm_per_unit, read, "{scale}");
         }
     }
 
@@ -521,6 +715,7 @@ mod tests {
                 profile_toml: None,
                 hid_descriptor,
                 datagrams: true,
+                scale_mm_per_unit: None,
                 t_started: TimeNs(0),
                 started_unix_ns: 0,
             };

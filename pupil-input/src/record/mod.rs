@@ -11,10 +11,11 @@ mod writer;
 
 use std::path::{Path, PathBuf};
 
-pub(crate) use container::{Ending, Header, HeaderFault, Kind, MAGIC, RawReader};
+pub(crate) use container::{Header, HeaderFault, Kind, MAGIC, RawReader};
 #[cfg(fuzzing)]
 pub(crate) use container::{RECORD_HEAD_BYTES, crc32};
 pub use container::{payloads, with_header};
+pub(crate) use samples::SAMPLES_HEADER;
 pub(crate) use writer::{ROOM, Recorder, Taps, start};
 
 /// Where a run is written down.

@@ -358,7 +358,7 @@ mod tests {
 
     use tempfile::TempDir;
 
-    use super::super::container::{Ending, RawReader};
+    use super::super::container::RawReader;
     use super::*;
 
     fn header() -> Header {
@@ -368,6 +368,7 @@ mod tests {
             profile_toml: None,
             hid_descriptor: None,
             datagrams: false,
+            scale_mm_per_unit: None,
             t_started: TimeNs(7),
             started_unix_ns: 0,
         }
@@ -384,13 +385,15 @@ mod tests {
         (taps, writer)
     }
 
-    fn records(path: &Path) -> (Vec<(RecordHead, Vec<u8>)>, Option<Ending>) {
+    /// What a file holds, and what is wrong with it.
+    fn records(path: &Path) -> (Vec<(RecordHead, Vec<u8>)>, Vec<String>) {
         let mut reader = RawReader::new(BufReader::new(File::open(path).expect("opens"))).expect("a header");
         let mut records = Vec::new();
         while let Some((head, payload)) = reader.next().expect("reads") {
             records.push((head, payload.to_vec()));
         }
-        (records, reader.ending())
+        let flaws = reader.flaws().collect();
+        (records, flaws)
     }
 
     #[test]
@@ -411,9 +414,9 @@ mod tests {
             taps.bytes(TimeNs(t), &[1; 30]);
         }
         writer.write(true, true);
-        let (read, ending) = records(&path);
+        let (read, flaws) = records(&path);
         assert_eq!(read, [bytes(1), bytes(2), lost(2, 2), bytes(5), lost(5, 1), lost(5, 2)]);
-        assert_eq!(ending, Some(Ending::Whole));
+        assert_eq!(flaws, [""; 0]);
         assert_eq!(taps.shared.chunks_lost.load(Ordering::Relaxed), 5);
     }
 
@@ -428,7 +431,7 @@ mod tests {
         writer.write(false, true);
         ring.push_entire_slice(b"abc").expect("room");
         writer.write(true, true);
-        assert_eq!(records(&path), (vec![(head, b"abc".to_vec())], Some(Ending::Whole)));
+        assert_eq!(records(&path), (vec![(head, b"abc".to_vec())], vec![]));
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! A tracker that sends datagrams to this machine, each a message of its own.
 
 use std::io::{self, ErrorKind};
-use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, UdpSocket};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
 use std::time::{Duration, Instant};
 
 use super::tcp::{NetworkError, resolve};
@@ -11,6 +11,10 @@ use crate::spec::HostPort;
 
 /// A sender that was silent for so long may be followed by another.
 const SENDER_LASTS: Duration = Duration::from_secs(2);
+
+/// A port of a sender from which a sample comes while it is one of so many of the newest is a port of its own, and no
+/// other port of that sender is followed while it lasts. Some take a new port for each datagram.
+const PORTS_REMEMBERED: usize = 8;
 
 /// A group is joined again after so long without a datagram: the membership goes with the network interface, and does
 /// not come back with it.
@@ -63,7 +67,7 @@ impl Feed for UdpFeed {
             return Err(NetworkError::NobodyToTell { address, profile }.into());
         }
         let (socket, group) = self.bind()?;
-        Ok(Box::new(Listener { socket, group, t_quiet: Instant::now(), sender: None, newest: None }))
+        Ok(Box::new(Listener { socket, group, t_quiet: Instant::now(), senders: Senders::default() }))
     }
 
     fn datagrams(&self) -> bool {
@@ -77,23 +81,60 @@ struct Listener {
     group: Option<IpAddr>,
     /// Since when nothing has come, or when the group was joined again.
     t_quiet: Instant,
-    /// Whose datagrams alone are taken, and when the last one with a sample came. Two trackers at once would be mixed
-    /// up, and what sends no sample is no tracker.
-    sender: Option<(IpAddr, Instant)>,
-    /// Who sent the last one that was taken.
-    newest: Option<IpAddr>,
+    senders: Senders,
+}
+
+/// Whose datagrams are taken. Two trackers at once would be mixed up, and what sends no sample is no tracker.
+#[derive(Debug, Default)]
+struct Senders {
+    /// Who sent the last sample, and when it came.
+    followed: Option<(SocketAddr, Instant)>,
+    /// It sends from one port.
+    keeps_port: bool,
+    /// Who sent the newest samples, in no order.
+    recent: [Option<SocketAddr>; PORTS_REMEMBERED],
+    next: usize,
+    /// Who sent the last datagram that was taken.
+    newest: Option<SocketAddr>,
+}
+
+impl Senders {
+    /// Whether a datagram that comes now is taken.
+    fn takes(&mut self, from: SocketAddr, now: Instant) -> bool {
+        let is_other =
+            |followed: SocketAddr| followed.ip() != from.ip() || self.keeps_port && followed.port() != from.port();
+        let lasts = |last: Instant| now.saturating_duration_since(last) < SENDER_LASTS;
+        let is_stranger = self.followed.is_some_and(|(followed, last)| is_other(followed) && lasts(last));
+        if !is_stranger {
+            self.newest = Some(from);
+        }
+        !is_stranger
+    }
+
+    /// A sample was in the datagram that was taken last.
+    fn follow(&mut self, now: Instant) {
+        let Some(from) = self.newest else { return };
+        let is_known = self.recent.contains(&Some(from));
+        if !is_known {
+            self.recent[self.next] = Some(from);
+            self.next = (self.next + 1) % PORTS_REMEMBERED;
+        }
+        self.keeps_port = is_known;
+        self.followed = Some((from, now));
+    }
 }
 
 impl ByteSource for Listener {
     fn read(&mut self, buffer: &mut [u8]) -> ReadEvent {
         match self.socket.recv_from(buffer) {
             Ok((count, from)) => {
-                self.t_quiet = Instant::now();
-                if self.sender.is_some_and(|(ip, last)| ip != from.ip() && last.elapsed() < SENDER_LASTS) {
-                    return ReadEvent::Stranger;
+                let now = Instant::now();
+                self.t_quiet = now;
+                match count {
+                    _ if !self.senders.takes(from, now) => ReadEvent::Stranger,
+                    0 => ReadEvent::Silence,
+                    _ => ReadEvent::Bytes(count),
                 }
-                self.newest = Some(from.ip());
-                if count == 0 { ReadEvent::Silence } else { ReadEvent::Bytes(count) }
             }
             Err(error) => match error.kind() {
                 ErrorKind::TimedOut | ErrorKind::WouldBlock | ErrorKind::Interrupted if self.stays_joined() => {
@@ -105,7 +146,7 @@ impl ByteSource for Listener {
     }
 
     fn is_followed(&mut self) {
-        self.sender = self.newest.map(|ip| (ip, Instant::now()));
+        self.senders.follow(Instant::now());
     }
 }
 
@@ -131,5 +172,46 @@ fn leave(socket: &UdpSocket, group: IpAddr) -> io::Result<()> {
     match group {
         IpAddr::V4(group) => socket.leave_multicast_v4(&group, &Ipv4Addr::UNSPECIFIED),
         IpAddr::V6(group) => socket.leave_multicast_v6(&group, 0),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Which of datagrams with samples, each 10 ms behind the one before it, are taken.
+    fn taken(froms: impl IntoIterator<Item = (u8, u16)>) -> Vec<(u8, u16)> {
+        let mut senders = Senders::default();
+        let begun = Instant::now();
+        let mut taken = Vec::new();
+        for (index, from) in (0..).zip(froms) {
+            let (now, ip) = (begun + Duration::from_millis(10 * index), Ipv4Addr::new(127, 0, 0, from.0));
+            if senders.takes((ip, from.1).into(), now) {
+                senders.follow(now);
+                taken.push(from);
+            }
+        }
+        taken
+    }
+
+    #[test]
+    fn of_two_senders_on_one_machine_one_is_followed() {
+        let alternate = (0..600).map(|k| (1, 40_000 + k % 2));
+        let taken_of = |port| taken(alternate.clone()).iter().filter(|from| from.1 == port).count();
+        assert_eq!([taken_of(40_000), taken_of(40_001)], [300, 1]);
+        // One that comes later is none either, and takes over once the first one is gone.
+        let later = (0..50).map(|_| (1, 7)).chain((0..100).flat_map(|_| [(1, 7), (1, 8)])).chain([(1, 8); 300]);
+        let taken = taken(later);
+        assert!(
+            taken[..150].iter().all(|from| from.1 == 7) && taken[150..].iter().all(|from| from.1 == 8),
+            "{taken:?}"
+        );
+        assert_eq!(taken.len(), 150 + 300 - 198);
+    }
+
+    #[test]
+    fn a_sender_with_a_new_port_for_each_datagram_is_followed_and_no_other_machine() {
+        let froms = || (0..400).map(|k| if k % 4 == 3 { (2, 9) } else { (1, 20_000 + k) });
+        assert_eq!(taken(froms()), froms().filter(|from| from.0 == 1).collect::<Vec<_>>());
     }
 }

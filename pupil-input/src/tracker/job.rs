@@ -81,13 +81,17 @@ impl Job {
         }
     }
 
-    /// What the sizes of a tracker are before the rig's scale, as far as can be told without opening a link: of a HID
-    /// device that its profile does not know to the end, as far as the profile does.
-    pub(super) fn unit_unopened(spec: &TrackerSpec) -> Result<SizeUnit, TrackerError> {
-        match Self::profile_unopened(spec)? {
-            Some(profile) => Ok(profile.unit),
-            None => Ok(Self::open(spec, TimeNs(0), &[])?.figures().unit),
-        }
+    /// What the sizes of a tracker are before the rig's scale, as far as can be told without opening a link (of a HID
+    /// device that its profile does not know to the end, as far as the profile does), and the scale that a recording
+    /// has itself.
+    pub(super) fn unit_unopened(spec: &TrackerSpec) -> Result<(SizeUnit, Option<f64>), TrackerError> {
+        Ok(match Self::profile_unopened(spec)? {
+            Some(profile) => (profile.unit, None),
+            None => {
+                let job = Self::open(spec, TimeNs(0), &[])?;
+                (job.figures().unit, job.recorded_scale())
+            }
+        })
     }
 
     /// The profile of a link, which is not opened; none of a log and of a simulated eye.
@@ -139,9 +143,25 @@ impl Job {
     pub(super) fn warnings(&self) -> Vec<String> {
         match self {
             Self::Live { feed, .. } => feed.warnings(),
-            Self::Replay { recording, .. } => recording.notes().to_vec(),
+            Self::Replay { recording, .. } => recording.warnings().to_vec(),
             Self::Rerun { raw, .. } => raw.warnings(),
             Self::Mock { .. } => Vec::new(),
+        }
+    }
+
+    /// How a log was read.
+    pub(super) fn remarks(&self) -> &[String] {
+        match self {
+            Self::Replay { recording, .. } => recording.remarks(),
+            Self::Live { .. } | Self::Rerun { .. } | Self::Mock { .. } => &[],
+        }
+    }
+
+    /// The scale of the run whose link was recorded.
+    pub(super) fn recorded_scale(&self) -> Option<f64> {
+        match self {
+            Self::Rerun { raw, .. } => raw.recorded_scale(),
+            Self::Live { .. } | Self::Replay { .. } | Self::Mock { .. } => None,
         }
     }
 

@@ -73,12 +73,24 @@ pub fn scaled_millimetres(whose: &str, scale: f64) -> String {
     )
 }
 
-fn check_scale(spec: &TrackerSpec, unit: SizeUnit, settings: &rig::Tracker) -> Result<(), TrackerError> {
-    match settings.scale {
+fn check_scale(spec: &TrackerSpec, unit: SizeUnit, scale: Option<f64>) -> Result<(), TrackerError> {
+    match scale {
         None if unit != SizeUnit::Millimetres => {
             Err(TrackerError::NoScale { spec: spec.to_string(), unit: unit.name() })
         }
         _ => Ok(()),
+    }
+}
+
+/// That a recording has a scale of its own, and which one is taken.
+fn scale_in_words(recorded: f64, given: Option<f64>) -> String {
+    match given {
+        None => format!("the recording was made with scale_mm_per_unit = {recorded}, and is played with it"),
+        Some(given) => {
+            format!(
+                "the recording was made with scale_mm_per_unit = {recorded}, and is played with {given}, which is given"
+            )
+        }
     }
 }
 
@@ -171,7 +183,8 @@ impl Tracker {
     /// # Errors
     /// The profile, the log or the script is not there or wrong, or the unit wants a scale.
     pub fn examine(spec: &TrackerSpec, settings: &rig::Tracker) -> Result<(), TrackerError> {
-        check_scale(spec, Job::unit_unopened(spec)?, settings)
+        let (unit, recorded_scale) = Job::unit_unopened(spec)?;
+        check_scale(spec, unit, settings.scale.or(recorded_scale))
     }
 
     /// Opens what `spec` names and starts the thread that reads it. In the place of options an origin will do.
@@ -187,8 +200,12 @@ impl Tracker {
         let TrackerOptions { origin, record, forbidden, reader_begins } = options.into();
         let job = Job::open(spec, origin, &forbidden)?;
         let figures = job.figures();
-        check_scale(spec, figures.unit, settings)?;
+        let recorded_scale = job.recorded_scale();
+        let scale = settings.scale.or(recorded_scale);
+        check_scale(spec, figures.unit, scale)?;
         let mut warnings = job.warnings();
+        let mut remarks = job.remarks().to_vec();
+        remarks.extend(recorded_scale.map(|recorded| scale_in_words(recorded, settings.scale)));
         warnings.extend(needless_scale(&format!("tracker `{spec}`"), figures.unit, settings));
         let header = job.link().map(|(profile, datagrams)| Header {
             spec: spec.to_string(),
@@ -196,6 +213,7 @@ impl Tracker {
             profile_toml: job::own_profile(spec),
             hid_descriptor: job.descriptor().map(<[u8]>::to_vec),
             datagrams,
+            scale_mm_per_unit: settings.scale,
             t_started: host_now(),
             started_unix_ns: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as i64),
         });
@@ -204,7 +222,7 @@ impl Tracker {
                 .push(format!("tracker `{spec}` is no link, so it has no bytes to record; its samples are recorded"));
         }
         let (taps, recorder) = record.map(|files| record::start(&files, header.as_ref())).transpose()?.unzip();
-        let settings = EstimatorSettings::from(settings);
+        let settings = EstimatorSettings::from(&rig::Tracker { scale, ..settings.clone() });
         let (input, output) = triple_buffer::triple_buffer(&EstimateSnapshot::new(settings));
         let (producer, consumer) = rtrb::RingBuffer::new(TAP_DECISIONS);
         let (troubles, untold) = rtrb::RingBuffer::new(TROUBLES);
@@ -244,10 +262,12 @@ impl Tracker {
                 thread: Some(thread),
                 recorder,
                 warnings,
+                remarks,
                 untold,
                 trouble: None,
                 changes,
                 figures,
+                recorded_scale,
             },
         })
     }
@@ -274,10 +294,12 @@ impl TrackerHandle {
                 thread: None,
                 recorder: None,
                 warnings: Vec::new(),
+                remarks: Vec::new(),
                 untold,
                 trouble: None,
                 changes,
                 figures: SizeUnit::Millimetres.into(),
+                recorded_scale: None,
             },
         }
     }
@@ -327,10 +349,13 @@ pub struct TrackerControl {
     thread: Option<JoinHandle<()>>,
     recorder: Option<Recorder>,
     warnings: Vec<String>,
+    remarks: Vec<String>,
     untold: rtrb::Consumer<String>,
     trouble: Option<String>,
     changes: rtrb::Producer<EstimatorSettings>,
     figures: Figures,
+    /// Of a recording of a link: the scale that it has itself.
+    recorded_scale: Option<f64>,
 }
 
 impl TrackerControl {
@@ -365,7 +390,12 @@ impl TrackerControl {
         &self.warnings
     }
 
-    /// Why a link that was lost does not come back, or why nothing comes of one that is up, while it is so.
+    /// How a log was read, as any of its kind may be. A sentence each.
+    pub fn remarks(&self) -> &[String] {
+        &self.remarks
+    }
+
+    /// Why a link that was lost does not come back, why a log brings nothing for long, or why nothing comes of one that is up, while it is so.
     pub fn trouble(&mut self) -> Option<&str> {
         while let Ok(text) = self.untold.pop() {
             self.trouble = Some(text).filter(|text| !text.is_empty());
@@ -380,13 +410,15 @@ impl TrackerControl {
     /// [`ChangeError`]; nothing has changed then.
     pub fn change(&mut self, settings: &rig::Tracker) -> Result<Option<String>, ChangeError> {
         let unit = self.figures.unit;
-        if unit != SizeUnit::Millimetres && settings.scale.is_none() {
+        let scale = settings.scale.or(self.recorded_scale);
+        if unit != SizeUnit::Millimetres && scale.is_none() {
             return Err(ChangeError::NoScale(unit.name()));
         }
         if self.finished() {
             return Err(ChangeError::Finished);
         }
-        self.changes.push(settings.into()).map_err(|_| ChangeError::Busy)?;
+        let scaled = rig::Tracker { scale, ..settings.clone() };
+        self.changes.push((&scaled).into()).map_err(|_| ChangeError::Busy)?;
         if let Some(thread) = &self.thread {
             thread.thread().unpark();
         }

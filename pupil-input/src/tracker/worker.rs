@@ -14,6 +14,7 @@ use crate::clock::ClockModel;
 use crate::counters::Counter;
 use crate::estimator::{Decision, EstimateSnapshot, Estimator, EstimatorSettings, StreamClock};
 use crate::gate::Verdict;
+use crate::import::leaps::span_in_words;
 use crate::import::raw::RawLog;
 use crate::import::{LogFault, Recording};
 use crate::profile::Profile;
@@ -31,6 +32,8 @@ const SILENCE: TimeNs = TimeNs(500_000_000);
 const FIRST_SILENCE: TimeNs = TimeNs(2_500_000_000);
 const FIRST_BACK_OFF: Duration = Duration::from_millis(100);
 const LONGEST_BACK_OFF: Duration = Duration::from_secs(2);
+/// A log that brings nothing for longer is said to.
+const LONG_WAIT: TimeNs = TimeNs(10_000_000_000);
 /// Whoever reads decisions, and has taken none for this long, reads none.
 const UNREAD: TimeNs = TimeNs(1_000_000_000);
 /// The longest datagram there is.
@@ -177,7 +180,7 @@ impl Worker {
                 let arrival = head.t + later;
                 match speed {
                     ReplaySpeed::Times(_) => {
-                        if !self.wait_until(self.clock.to_host(arrival)) {
+                        if !self.wait_for_log(self.clock.to_host(arrival)) {
                             return;
                         }
                     }
@@ -224,7 +227,7 @@ impl Worker {
                 sample.t_sample = sample.t_sample + later;
                 match speed {
                     ReplaySpeed::Times(_) => {
-                        if !self.wait_until(self.clock.to_host(sample.t_sample)) {
+                        if !self.wait_for_log(self.clock.to_host(sample.t_sample)) {
                             return;
                         }
                     }
@@ -311,6 +314,19 @@ impl Worker {
             }
             thread::park_timeout(Duration::from_nanos(left.0.unsigned_abs()));
         }
+    }
+
+    /// Waits until host time `t` for what comes next of a log, and tells where that takes long; false if the tracker is
+    /// to stop.
+    fn wait_for_log(&mut self, t: TimeNs) -> bool {
+        let left = t - host_now();
+        if left <= LONG_WAIT {
+            return self.wait_until(t);
+        }
+        self.trouble(format!("what comes next in the log is {} away", span_in_words(left.0)));
+        let goes_on = self.wait_until(t);
+        self.trouble(String::new());
+        goes_on
     }
 
     /// Waits until recording and tap have room for what one piece of a log brings, since a log can be read faster than

@@ -132,13 +132,15 @@ fn one_wrong_byte_in_a_recording_is_not_played() {
     eventually("the end", || handle.control.finished());
     handle.control.stop();
     let [warning] = handle.control.warnings() else { panic!("{:?}", handle.control.warnings()) };
-    assert!(warning.contains("is torn: its last"), "{warning}");
+    assert!(warning.contains("the recording is damaged at byte"), "{warning}");
     let played = fs::read_to_string(&again).expect("reads");
     assert_ne!(played, samples);
-    // The gate decides on a sample by its successors too, so the last rows before the tear may differ.
+    // The gate decides on a sample by its successors too, so the last rows before the damage may differ.
     let (played, samples): (Vec<_>, Vec<_>) = (played.lines().collect(), samples.lines().collect());
     let same = played.iter().zip(&samples).take_while(|(a, b)| a == b).count();
-    assert!(played.len() < samples.len() && same + 100 > played.len() && same > 100, "{same} of {}", played.len());
+    assert!(same > 100, "{same} of {}", played.len());
+    let lost = samples.len() - played.len();
+    assert!((1..samples.len() / 4).contains(&lost), "what lies behind it is played: {lost} of {}", samples.len());
 }
 
 #[test]

@@ -442,6 +442,9 @@ mod tests {
         machine.edit_drop_in("--output drm:DP-1", "--output drm:DP-1 --no-such-option");
         machine.fault("unit", &["--no-such-option", "write it anew"]);
         let machine = Machine::new();
+        machine.edit_drop_in("--output drm:DP-1", "--output drm:DP-1 --page 192.168.1.5:8420");
+        machine.fault("unit", &["--page 192.168.1.5:8420: other machines reach this address, so it needs a token"]);
+        let machine = Machine::new();
         machine.write_drop_in(&[]);
         machine.fault("unit", &["shows on headless, this check is of drm:DP-1"]);
         let machine = Machine::new();

@@ -1,5 +1,7 @@
 //! `holod log convert`: a log in another format.
 
+use std::path::Path;
+
 use holod_pupil_input::export;
 
 use super::{odd_scale, read};
@@ -14,15 +16,19 @@ pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
         return Err(Failure::new(Exit::Usage, "--scale is for --to lines: CSV keeps the log's own unit"));
     }
     let recording = read(&args.log)?;
-    for note in recording.notes() {
-        tracing::info!("{note}");
+    for warning in recording.warnings() {
+        tracing::warn!("{warning}");
+    }
+    for remark in recording.remarks() {
+        tracing::info!("{remark}");
     }
     if let Some(warning) = odd_scale(&args.log, &recording, args.scale) {
         tracing::warn!("{warning}");
     }
+    let scale = args.scale.or(recording.recorded_scale());
     out.write(|path| {
         let written = match args.to {
-            LogFormatArg::Lines => export::write_lines(&recording, args.scale, path),
+            LogFormatArg::Lines => export::write_lines(&recording, scale, path),
             LogFormatArg::Csv => export::write_csv(&recording, path),
         };
         written.map_err(|error| {
@@ -30,7 +36,8 @@ pub(super) fn convert(args: &LogConvertArgs) -> Result<(), Failure> {
                 export::ExportError::Io { .. } => Exit::CannotCreate,
                 _ => Exit::Usage,
             };
-            Failure::because(exit)(error)
+            // A way to standard output is no file that a person named.
+            Failure::because(exit)(if out.is_stdout() { error.of(Path::new("standard output")) } else { error })
         })
     })?;
     if args.to == LogFormatArg::Lines && recording.samples().any(|sample| sample.aperture_mm.is_some()) {

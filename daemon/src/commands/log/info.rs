@@ -5,7 +5,10 @@ use std::fmt::Write as _;
 
 use holod_calibration::TimeNs;
 use holod_calibration::rig::Rig;
-use holod_pupil_input::{Decision, Estimator, EstimatorSettings, LogInfo, Recording, SizeUnit, Verdict};
+use holod_pupil_input::{
+    CounterSnapshot, Decision, Estimator, EstimatorSettings, LogInfo, Recording, RefusalChange, RefusalWatch, SizeUnit,
+    Verdict,
+};
 use ratatui::style::Color;
 use serde::Serialize;
 
@@ -30,6 +33,9 @@ struct Report<'a> {
 struct GateCounts {
     believed: u64,
     rejected: BTreeMap<&'static str, u64>,
+    /// Why nothing is believed, and the likely cure.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    advice: Option<String>,
 }
 
 /// What a plot can show of the samples with their verdicts, and the estimate of their times.
@@ -52,9 +58,10 @@ pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
     if let Some(warning) = odd_scale(&args.log, &recording, args.scale) {
         tracing::warn!("{warning}");
     }
-    let info = LogInfo::of(&recording, args.scale);
-    let in_mm = recording.unit() == SizeUnit::Millimetres || args.scale.is_some();
-    let judged = in_mm.then(|| judge(&recording, args.scale));
+    let scale = args.scale.or(recording.recorded_scale());
+    let info = LogInfo::of(&recording, scale);
+    let in_mm = recording.unit() == SizeUnit::Millimetres || scale.is_some();
+    let judged = in_mm.then(|| judge(&recording, scale));
     if let Some(plot) = &plot {
         let raw = raw_marks(&recording);
         // The gate judges millimetres only.
@@ -72,14 +79,15 @@ pub(super) fn info(args: &LogInfoArgs) -> Result<(), Failure> {
         let gate = judged.as_ref().map(|judged| &judged.counts);
         return results::print_json(&Report { info: &info, gate });
     }
-    let mut text = format!("{}\n{}", args.log.display(), text_of(&info));
+    let scaled = scale.map(|scale| (recording.unit(), scale)).filter(|(_, scale)| *scale != 1.0);
+    let mut text = format!("{}\n{}", args.log.display(), text_of(&info, scaled));
     match &judged {
         Some(judged) => text.push_str(&gate_text(judged)),
         None => text.push_str(
             "gate     not asked: it judges millimetres; give --scale MM_PER_UNIT, measured with an artificial pupil\n",
         ),
     }
-    text.push_str(&drawn(&recording, args.scale, info.duration_s));
+    text.push_str(&drawn(&recording, scale, info.duration_s));
     results::print(text.trim_end())
 }
 
@@ -90,7 +98,9 @@ fn judge(recording: &Recording, scale: Option<f64>) -> Judged {
     let mut estimator = Estimator::new(EstimatorSettings::from(&settings));
     let begins = recording.begins();
     let seconds = |t: TimeNs| (t - begins).seconds();
-    let mut counts = GateCounts { believed: 0, rejected: BTreeMap::new() };
+    let mut counts = GateCounts { believed: 0, rejected: BTreeMap::new(), advice: None };
+    let mut watch = RefusalWatch::new(&settings, recording.unit().into(), begins);
+    let mut decisions = CounterSnapshot::zero();
     let every = step(recording);
     let mut marks = Vec::with_capacity(PLOTTED);
     let mut decided = 0_usize;
@@ -100,6 +110,8 @@ fn judge(recording: &Recording, scale: Option<f64>) -> Judged {
             Verdict::Accepted => counts.believed += 1,
             Verdict::Rejected(reason) => *counts.rejected.entry(reason.name()).or_default() += 1,
         }
+        decisions.add(decision.verdict);
+        watch.note(&decision);
         decided += 1;
         let shown = decided.is_multiple_of(every) && decision.sample.valid;
         if shown && decision.sample.diameter_mm.is_finite() {
@@ -116,6 +128,9 @@ fn judge(recording: &Recording, scale: Option<f64>) -> Judged {
         }
     }
     estimator.finish(&mut note);
+    if let Some(RefusalChange::Refused(refusal)) = watch.judge(begins, &decisions, true) {
+        counts.advice = Some(refusal.advice).filter(|_| !OF_TIMES.contains(&&refusal.reason[..]));
+    }
     Judged { counts, marks, estimate }
 }
 
@@ -134,6 +149,9 @@ fn raw_marks(recording: &Recording) -> Vec<PupilSampleMark> {
         .collect()
 }
 
+/// Reasons of which the log's own notes say more than what is said of a tracker's clock.
+const OF_TIMES: [&str; 2] = ["rejected_repeated", "rejected_backwards"];
+
 /// More points than this say no more in a plot.
 const PLOTTED: usize = 20_000;
 
@@ -143,17 +161,20 @@ fn step(recording: &Recording) -> usize {
 }
 
 fn gate_text(judged: &Judged) -> String {
-    let GateCounts { believed, rejected } = &judged.counts;
+    let GateCounts { believed, rejected, advice } = &judged.counts;
     let reasons: Vec<_> = rejected.iter().map(|(name, count)| format!("{name} {count}")).collect();
     let reasons = if reasons.is_empty() { "none rejected".to_owned() } else { reasons.join(", ") };
     let share = 100.0 * *believed as f64 / (believed + rejected.values().sum::<u64>()).max(1) as f64;
-    format!("gate     {believed} samples believed ({share:.1} %); {reasons}\n")
+    let advice = advice.as_ref().map_or(String::new(), |advice| format!("         {advice}\n"));
+    format!("gate     {believed} samples believed ({share:.1} %); {reasons}\n{advice}")
 }
 
-fn text_of(info: &LogInfo) -> String {
+/// The figures; `scaled` tells the log's own unit and by what it was multiplied.
+fn text_of(info: &LogInfo, scaled: Option<(SizeUnit, f64)>) -> String {
     let mut text = String::new();
     let mut put = |name: &str, says: String| writeln!(text, "{name:8} {says}").expect("a String takes all");
-    put("format", format!("{}, diameters in {}", info.format, info.unit));
+    let own = scaled.map_or(String::new(), |(unit, scale)| format!(", the log's {} times {scale}", unit.name()));
+    put("format", format!("{}, diameters in {}{own}", info.format, info.unit));
     put("length", format!("{:.3} s, {} samples, first at {} ns", info.duration_s, info.samples, info.begins_ns));
     if let Some(rate_hz) = info.stated_rate_hz {
         put("states", format!("{rate_hz} Hz"));

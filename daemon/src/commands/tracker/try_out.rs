@@ -71,6 +71,9 @@ pub(super) fn try_out(args: &TryArgs) -> Result<(), Failure> {
         for warning in tracker.control.warnings() {
             tracing::warn!("{warning}");
         }
+        for remark in tracker.control.remarks() {
+            tracing::info!("{remark}");
+        }
     }
     let mut observed = Observed::default();
     let mut refusals = RefusalWatch::new(&rig.tracker, tracker.control.figures(), began);

@@ -92,6 +92,8 @@ pub(super) struct Client {
     pub(super) told_depths: bool,
     /// Whether it was said that its colours were clipped.
     pub(super) told_colours: bool,
+    /// Whether it was said that its pictures are old when they come.
+    pub(super) told_age: bool,
     /// Whether its pictures' field of view was looked at.
     pub(super) told_field_of_view: bool,
     stream: Option<Stream>,
@@ -244,6 +246,7 @@ impl Client {
             is_known: false,
             told_depths: false,
             told_colours: false,
+            told_age: false,
             told_field_of_view: false,
             stream: None,
         }

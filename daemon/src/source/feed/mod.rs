@@ -11,6 +11,7 @@ pub mod cost;
 mod depths;
 #[cfg(fuzzing)]
 pub mod fuzzing;
+mod line_limit;
 mod message;
 mod slots;
 
@@ -34,9 +35,10 @@ use serde::{Deserialize, Serialize};
 use self::client::{Client, Copied, Gone, Refusal, TakeError, Target};
 pub use self::colours::ClippedPixels;
 pub use self::depths::BadDepths;
+use self::line_limit::LineLimit;
 use self::message::Outcome;
 use self::slots::Picture;
-use super::{PictureSink, PictureTag, PictureView, scene};
+use super::{LIVE_WITHIN, PictureSink, PictureTag, PictureView, scene};
 use crate::local_socket::{self, LOOK, SocketError, SocketPlace};
 use crate::tally_by::TallyBy;
 
@@ -132,6 +134,8 @@ pub struct FeedStatus {
     t_newest: Option<TimeNs>,
     #[serde(skip)]
     t_told: Option<TimeNs>,
+    #[serde(skip)]
+    lines: LineLimit,
 }
 
 impl FeedStatus {
@@ -151,6 +155,26 @@ impl FeedStatus {
         self.clipped_colours = clipped;
         self.clipped_colours_in_all.add(&clipped);
         self.pictures_with_clipped_colours += u64::from(clipped.in_all() > 0);
+    }
+
+    /// Says how clients come, what they send and how they go, as far as the log has room for it.
+    fn tell(&mut self, line: &str) {
+        if self.lines.has_room(host_now()) {
+            tracing::info!("{line}");
+        }
+    }
+
+    /// The same of what may be a mistake.
+    fn warn(&mut self, line: &str) {
+        if self.lines.has_room(host_now()) {
+            tracing::warn!("{line}");
+        }
+    }
+
+    fn tell_left_out(&mut self, now: TimeNs) {
+        if let Some(lines) = self.lines.left_out(now) {
+            tracing::warn!("{lines} lines about the feed's clients were left out: clients come and go all the time");
+        }
     }
 
     fn tell_refusal(&mut self, what: &str, why: &str, now: TimeNs) {
@@ -313,6 +337,7 @@ impl Server {
                 self.accept(now);
             }
             self.look_after_socket(now);
+            self.status.tell_left_out(now);
             for number in ready.clients {
                 self.with(number, &mut shown, |client, target, status| {
                     client.receive(target, host_now, |outcome| note(status, outcome))
@@ -404,11 +429,11 @@ impl Server {
         let (_, client) = self.clients.remove(index);
         self.left_out_of_gone = self.left_out_of_gone.saturating_add(client.left_out());
         match gone {
-            Gone::Closed => tracing::info!("the feed's client `{}` is gone", client.name),
+            Gone::Closed => self.status.tell(&format!("the feed's client `{}` is gone", client.name)),
             Gone::Refused(..) => self.refuse(&client.name, &gone),
         }
         if self.shown_last == Some(number) {
-            tracing::info!("the last picture of `{}` stays", client.name);
+            self.status.tell(&format!("the last picture of `{}` stays", client.name));
         }
         *shown = shown.filter(|one| *one != number);
     }
@@ -460,21 +485,22 @@ impl Server {
                     client.t_last = now;
                     is_shown = true;
                     if !was_shown {
-                        tracing::info!("the feed's client `{}` is shown", client.name);
+                        status.tell(&format!("the feed's client `{}` is shown", client.name));
                     }
                     status.view = tag.view;
                     let report = make(client, &copied, &mut frame);
                     sink.lock().unwrap_or_else(PoisonError::into_inner).show_live(Arc::clone(&frame), tag);
-                    tell_field_of_view(client, tag.view, target);
+                    tell_age(client, tag, status);
+                    tell_field_of_view(client, tag.view, target, status);
                     let bad = BadDepths::from(&report);
                     status.count_depths(bad);
                     status.count_colours(report.frame.colour_clipped.into());
-                    tell_oddities(client, &bad, Some(&report), target);
+                    tell_oddities(client, &bad, Some(&report), target, status);
                 }
                 Err(PictureRefusal::Picture(TakeError::Picture(LiveError::NoDepth { missing, .. }))) => {
                     let bad = BadDepths::from(missing);
                     status.count_depths(bad);
-                    tell_oddities(client, &bad, None, target);
+                    tell_oddities(client, &bad, None, target, status);
                 }
                 Err(_) => {}
             }
@@ -551,7 +577,13 @@ fn make(client: &mut Client, copied: &Copied, frame: &mut Arc<RgbdFrame>) -> Liv
 
 /// Says once of each client what is most often a mistake: depths of which most are bad, colours of which many were
 /// clipped, and what is odd about the depth of its first picture of which a frame could be made.
-fn tell_oddities(client: &mut Client, bad: &BadDepths, made: Option<&LiveReport>, target: &Target) {
+fn tell_oddities(
+    client: &mut Client,
+    bad: &BadDepths,
+    made: Option<&LiveReport>,
+    target: &Target,
+    status: &mut FeedStatus,
+) {
     let name = format!("the feed's client `{}`", client.name);
     let format = client.stream().format();
     let pixels = format.resolution.pixels();
@@ -560,19 +592,39 @@ fn tell_oddities(client: &mut Client, bad: &BadDepths, made: Option<&LiveReport>
     let are_bad = 2 * bad.missing().max(bad.beyond()) > pixels as u64;
     if are_bad && !std::mem::replace(&mut client.told_depths, true) {
         let (text, cure) = (bad.text(), bad.likely_cure(format.depth));
-        tracing::warn!("{name}: of {pixels} depths, these cannot be shown as they are: {text}; {cure}");
+        status.warn(&format!("{name}: of {pixels} depths, these cannot be shown as they are: {text}; {cure}"));
     }
     let Some(report) = made else { return };
-    if is_first && !are_bad {
-        scene::warn_of_odd_depth(&name, &report.frame, &target.geometry, client.sends_planes());
+    if is_first
+        && !are_bad
+        && let Some(oddity) = scene::depth_oddity(&report.frame, &target.geometry, client.sends_planes())
+    {
+        status.warn(&format!("{name}: {oddity}"));
     }
     if !client.told_colours {
-        client.told_colours = scene::warn_of_clipped_colours(&name, report.frame.colour_clipped, pixels);
+        for oddity in scene::odd_colours(report.frame.colour_clipped, pixels) {
+            client.told_colours = true;
+            status.warn(&format!("{name}: {oddity}"));
+        }
     }
 }
 
+/// Says once of each client that its pictures are too old to be live, most often since its clock is another one.
+fn tell_age(client: &mut Client, tag: PictureTag, status: &mut FeedStatus) {
+    let Some(age) = tag.age().filter(|_| !tag.is_live() && !client.told_age) else { return };
+    client.told_age = true;
+    status.warn(&format!(
+        "the feed's client `{}`: a picture taken {:.1} s before it came was found, expected nanoseconds of \
+         CLOCK_MONOTONIC (not of another clock, nor from a pipeline's start) when it was taken, or 0; the time from \
+         picture to photons leaves out pictures that are older than {} s when they come",
+        client.name,
+        age.seconds(),
+        LIVE_WITHIN.seconds()
+    ));
+}
+
 /// Says once of each client that its pictures were taken with another field of view than they are seen with.
-fn tell_field_of_view(client: &mut Client, view: PictureView, target: &Target) {
+fn tell_field_of_view(client: &mut Client, view: PictureView, target: &Target, status: &mut FeedStatus) {
     let Some(taken_deg) = view.field_of_view_deg.filter(|_| !client.told_field_of_view) else { return };
     client.told_field_of_view = true;
     let shown_deg = client.stream().shown_field_of_view_deg(&target.geometry);
@@ -580,11 +632,11 @@ fn tell_field_of_view(client: &mut Client, view: PictureView, target: &Target) {
     let factor = half_tangent(shown_deg[0]) / half_tangent(taken_deg[0]);
     if (factor - 1.0).abs() > FIELD_TOLERANCE {
         let [[taken_x, taken_y], [shown_x, shown_y]] = [taken_deg, shown_deg];
-        tracing::warn!(
+        status.warn(&format!(
             "the feed's client `{}`: pictures taken with {taken_x:.1} x {taken_y:.1} degrees are shown in {shown_x:.1} x \
              {shown_y:.1}: things look {factor:.2} times as large as they are; set the camera's field of view to the latter",
             client.name
-        );
+        ));
     }
 }
 

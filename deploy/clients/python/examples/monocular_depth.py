@@ -64,6 +64,7 @@ def middle(picture: NDArray[Any], size_px: tuple[int, int]) -> NDArray[Any]:
     height, width = picture.shape[:2]
     size_x, size_y = size_px
     part_x, part_y = min(width, height * size_x // size_y), min(height, width * size_y // size_x)
+    part_x, part_y = max(part_x, 1), max(part_y, 1)
     left, top = (width - part_x) // 2, (height - part_y) // 2
     return picture[top : top + part_y, left : left + part_x]
 
@@ -84,19 +85,28 @@ def pictures(source: str, size_px: tuple[int, int], seconds: float) -> Iterator[
             time.sleep(seconds)
 
 
+def size(text: str) -> tuple[int, int]:
+    width_px, height_px = (int(part) for part in text.split("x"))
+    if width_px < 1 or height_px < 1:
+        raise ValueError
+    return width_px, height_px
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", help="a camera's number, or a folder of pictures")
     parser.add_argument("--near", type=float, default=2.5, metavar="DPT", help="the display's nearest distance")
     parser.add_argument("--far", type=float, default=0.0, metavar="DPT", help="the display's farthest distance")
-    parser.add_argument("--size", default="640x480", metavar="WxH", help="to which pictures are cut and brought")
+    parser.add_argument(
+        "--size", type=size, default=(640, 480), metavar="WxH", help="to which pictures are cut and brought: 640x480"
+    )
     parser.add_argument("--seconds", type=float, default=2.0, help="for each picture of a folder")
     parser.add_argument(
         "--network", default="depth-anything/Depth-Anything-V2-Small-hf", help="on the Hugging Face hub"
     )
     parser.add_argument("--socket", metavar="PATH", help="where holod listens, if not in its runtime folder")
     options = parser.parse_args()
-    width_px, height_px = (int(part) for part in options.size.split("x"))
+    width_px, height_px = options.size
 
     estimate = network(options.network)
     depth, plane_dpt = ("none", options.far) if estimate is None else ("f32_dpt", None)
@@ -111,7 +121,7 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except holod_client.FeedError as error:
+    except (holod_client.FeedError, OSError) as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
         sys.exit(130)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from holod_client.feed import Feed, FeedError
+from holod_client.feed import MOST_PX, Feed, FeedError
 from holod_client.formats import Colour, Depth
 
 
@@ -25,6 +25,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if (options.depth == Depth.NONE) != (options.plane is not None):
         parser.error("give one of --plane DPT, the distance of pictures without depth, and --depth FORMAT")
+    # What python makes of one that was closed before it began.
+    if sys.stdin is None:
+        parser.error("standard input is closed: pipe pictures into it, such as from ffmpeg or GStreamer")
     if sys.stdin.isatty():
         parser.error("standard input is a terminal: pipe pictures into it, such as from ffmpeg or GStreamer")
     try:
@@ -103,7 +106,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _size(text: str) -> tuple[int, int]:
     width_px, height_px = (int(part) for part in text.split("x"))
-    if width_px < 1 or height_px < 1:
+    if not (0 < width_px < MOST_PX and 0 < height_px < MOST_PX):
         raise ValueError
     return width_px, height_px
 

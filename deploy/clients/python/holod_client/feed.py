@@ -26,6 +26,8 @@ from holod_client.formats import Colour, Depth
 
 ANSWER_TIMEOUT_S = 5.0
 MOST_MESSAGE_BYTES = 16384
+MOST_PX = 2**32
+"""More than a side of a picture can be said to have."""
 NEAREST_DPT = 20.0
 SERVICE_PATH = Path("/run/holod/feed")
 
@@ -138,8 +140,8 @@ class Feed:
         if (self.depth is Depth.NONE) != (plane_dpt is not None):
             raise ValueError(f"plane_dpt: found {plane_dpt} with depth {str(self.depth)!r}, expected one of the two")
         for label, size in (("width_px", width_px), ("height_px", height_px)):
-            if not 0 < _whole(label, size, "a whole number of pixels") < 2**32:
-                raise ValueError(f"{label}: found {size}, expected more than 0")
+            if not 0 < _whole(label, size, "a whole number of pixels") < MOST_PX:
+                raise ValueError(f"{label}: found {size}, expected 1 to {MOST_PX - 1}")
 
         self._sequence = 0
         self._memory: mmap.mmap | None = None

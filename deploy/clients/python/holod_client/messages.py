@@ -51,8 +51,8 @@ def helo(
 
 
 def cut(name: str) -> bytes:
-    """As much of `name` in UTF-8 as fits, without breaking a character."""
-    return name.encode()[:NAME_BYTES].decode(errors="ignore").encode()
+    """As much of `name` in UTF-8 as fits, without breaking a character; `?` for what is no character."""
+    return name.encode(errors="replace")[:NAME_BYTES].decode(errors="ignore").encode()
 
 
 def fram(

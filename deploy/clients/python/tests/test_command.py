@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -128,6 +129,23 @@ def test_an_interrupt_ends_it_between_pictures(path: Path) -> None:
     assert errors.startswith((b"0 sent", b"1 sent")) and b"Traceback" not in errors
 
 
+def test_a_closed_standard_input_is_told(path: Path) -> None:
+    command = [sys.executable, "-m", "holod_client", "stdin", "--size", "4x4", "--plane", "0", "--socket", str(path)]
+    done = subprocess.run(
+        ["sh", "-c", 'exec "$@" <&-', "sh", *command], capture_output=True, timeout=30, cwd=Path(__file__).parents[1]
+    )
+    assert done.returncode == 2
+    assert b"error: standard input is closed: pipe pictures into it" in done.stderr
+
+
+def test_a_name_that_is_no_text(path: Path) -> None:
+    with FakeHolod(path) as holod:
+        holod.serve()
+        done = stdin(path, "--plane", "0", "--name", os.fsdecode(b"film \xff"), pictures=noise(0, 4))
+        holod.served()
+    assert (done.returncode, holod.hello().name) == (0, "film ?")
+
+
 def test_no_holod(path: Path) -> None:
     done = stdin(path, "--plane", "0", pictures=noise(0, 4))
     assert done.returncode == 69
@@ -142,6 +160,7 @@ def test_no_holod(path: Path) -> None:
         (("--depth", "mm"), "invalid choice: 'mm'"),
         (("--plane", "1", "--size", "640"), "invalid WxH value: '640'"),
         (("--plane", "1", "--size", "0x9"), "invalid WxH value: '0x9'"),
+        (("--plane", "1", "--size", "99999999999x1"), "invalid WxH value: '99999999999x1'"),
         (("--plane", "1", "--fps", "0"), "invalid pictures a second value: '0'"),
     ],
 )
