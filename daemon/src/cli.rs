@@ -611,7 +611,7 @@ pub enum PupilOrder {
 /// What the lasers are to do.
 #[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LasersArg {
-    /// Stay dark.
+    /// Stay dark until `arm`, also where holod fails and is started again.
     Dark,
     /// Be lit by the rules.
     Arm,

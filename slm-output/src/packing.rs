@@ -64,18 +64,18 @@ pub fn write_frame(levels: &LevelsFrame, first_field: usize, format: PixelFormat
     for (row, pixels) in rows.enumerate() {
         let pixels = &mut pixels[..PIXEL_BYTES * video.width];
         if panel_rows.contains(&row) {
-            fill(format, &mut pixels[..panel_bytes.start]);
+            fill_black(format, &mut pixels[..panel_bytes.start]);
             let samples = levels.video_row(first_field, row - top);
             pack_row(&layout, samples, format, &mut pixels[panel_bytes.clone()]);
-            fill(format, &mut pixels[panel_bytes.end..]);
+            fill_black(format, &mut pixels[panel_bytes.end..]);
         } else {
-            fill(format, pixels);
+            fill_black(format, pixels);
         }
     }
 }
 
 /// Writes pixels of level 0, which is black in every packing.
-fn fill(format: PixelFormat, pixels: &mut [u8]) {
+fn fill_black(format: PixelFormat, pixels: &mut [u8]) {
     let black = u32::MAX << (3 * format.channel_bits());
     pixels.as_chunks_mut::<PIXEL_BYTES>().0.fill(black.to_le_bytes());
 }

@@ -1,7 +1,7 @@
 //! What one rig has that another has not, by the keys of the rig file.
 
-use super::{Lasers, Model, Panel, Rig, Tracker};
-use crate::{DisplayGeometry, Resolution};
+use super::{Lasers, Model, Panel, Rig, Tracker, VideoMargins};
+use crate::DisplayGeometry;
 
 impl Rig {
     /// The keys, such as `tracker.hold_ms`, whose figures in `self` are not those in `other`. A panel profile counts as
@@ -42,14 +42,16 @@ impl Rig {
         } = lasers;
         let Tracker { spec, eye, scale, fallback, hold } = tracker;
         let Model { weights, gpu } = model;
-        let none = Resolution { width: 0, height: 0 };
-        let (margins, other_margins) = (video_margins.around(none), other.panel.video_margins.around(none));
+        // Without margins the video frame is the panel.
+        let is_framed = [*video_margins, other.panel.video_margins] != [VideoMargins::default(); 2];
+        let video = video_margins.around(*resolution);
+        let other_video = other.panel.video_margins.around(other.geometry.resolution);
         [
             ("name", *name == other.name),
             ("panel.width_px", resolution.width == other.geometry.resolution.width),
             ("panel.height_px", resolution.height == other.geometry.resolution.height),
-            ("panel.video_width_px", margins.width == other_margins.width),
-            ("panel.video_height_px", margins.height == other_margins.height),
+            ("panel.video_width_px", !is_framed || video.width == other_video.width),
+            ("panel.video_height_px", !is_framed || video.height == other_video.height),
             ("panel.video_left_px", video_margins.left == other.panel.video_margins.left),
             ("panel.video_top_px", video_margins.top == other.panel.video_margins.top),
             ("panel.pixel_pitch_um", *pixel_pitch == other.geometry.pixel_pitch),

@@ -253,7 +253,10 @@ fn read_video_margins<'a>(
         if behind.is_none() {
             let least = first + own?;
             let expected = format!("at least {least} px, {own_key} and {first_key} together");
-            let advice = format!("{size_key} is the size of the mode that the panel's video input takes");
+            let advice = match size.line {
+                Some(_) => format!("{size_key} is the size of the mode that the panel's video input takes"),
+                None => format!("the panel's profile gives {size_key}: give it here, or take the profile out"),
+            };
             reader.fault_in(panel, size_key, size.line, &format!("{} px", size.value), &expected, advice);
         }
         Some((first, behind?))

@@ -123,7 +123,7 @@ pub fn open(
         Backend::Auto => match on_gpu(Adapters::Hardware) {
             Ok(renderer) => Ok(renderer),
             // What was named is not to be guessed.
-            Err(error @ EngineError::Gpu(GpuError::NotNamed { .. })) => Err(failure(error)),
+            Err(error @ EngineError::Gpu(_)) if rig.model.gpu.is_some() => Err(failure(error)),
             Err(EngineError::Gpu(error)) => Ok(Box::new(on_cpu(Some(&error))?)),
             Err(other) => Err(failure(other)),
         },

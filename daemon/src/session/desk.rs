@@ -37,8 +37,8 @@ pub(super) struct Desk {
 }
 
 impl Desk {
-    /// A run goes on without one where it cannot be had, and says so. `keeps_dark` says whether the lasers are kept dark
-    /// from the beginning.
+    /// A run goes on without one where it cannot be had, and says so. `keeps_dark`: the lasers are kept dark from the
+    /// beginning.
     pub(super) fn open(preparer: Preparer, changes: Changes, keeps_dark: bool) -> Self {
         let dark_note = preparer.dark_note.clone();
         let server = runtime_folder::own()

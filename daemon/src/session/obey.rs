@@ -183,10 +183,14 @@ impl Watch<'_> {
     fn lasers_dark(&mut self, wish: DarkWish, output: &OutputControl) -> Result<Value, String> {
         self.desk.keeps_dark = true;
         let acknowledged = output.keep_dark_as_wished(wish);
-        self.desk.dark_note.leave();
+        let is_noted = self.desk.dark_note.leave();
         if acknowledged {
-            let said = "the lasers are dark, and stay so until `holod ctl lasers arm`, or until holod is stopped and \
-                        started again; one that fails, or a service that is restarted, keeps them dark";
+            let said = if is_noted {
+                "the lasers are dark, and stay so until `holod ctl lasers arm`, also where holod fails, or as a service is \
+                 restarted; a run by hand that was ended in order lights them when it is started again"
+            } else {
+                "the lasers are dark, and stay so until `holod ctl lasers arm` or a new start of holod"
+            };
             return Ok(said.into());
         }
         Err("the laser box did not acknowledge darkness: look at the lasers, and switch them off by hand. holod lights \

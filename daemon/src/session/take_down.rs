@@ -34,6 +34,7 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
     stop.store(true, Ordering::Release);
     let down = output.shutdown();
     watch.signals.lasers_are_out();
+    watch.signals.tell_of_suspension();
     let frame_loop = ends_within(&frame_thread, LONGEST_FRAME).then(|| frame_thread.join());
     let tracker_link = watch.tracker.link().name().to_owned();
     watch.tracker.stop();
@@ -66,7 +67,9 @@ pub(super) fn take_down(session: Session<'_>, ended: Result<String, Failure>) ->
         }
         Some(Ok(rendered)) => rendered.map_err(Failure::because(Exit::Unavailable))?,
     }
-    watch.desk.dark_note.ends_in_order();
+    if down.lasers_dark {
+        watch.desk.dark_note.take_away_unless_of_service();
+    }
 
     let tally = watch.tally;
     if tally.frames_shown == 0 {

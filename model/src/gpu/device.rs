@@ -63,7 +63,7 @@ impl Gpu {
         found.sort_by_key(rank);
         let is_usable = |adapter: &wgpu::Adapter| (adapters == Adapters::Software) == (rank(adapter) == 3);
         if let Some(named) = named {
-            let there = found.iter().map(|adapter| adapter.get_info().name).collect();
+            let there = found.iter().map(|adapter| name_and_place(&adapter.get_info())).collect();
             found.retain(|adapter| is_usable(adapter) && is_called(&adapter.get_info(), named));
             return if found.is_empty() {
                 Err(GpuError::NotNamed { named: named.to_owned(), there })
@@ -295,6 +295,10 @@ impl Gpu {
 pub(crate) fn first_that_opens<A, T, E>(candidates: &[A], open: impl Fn(&A) -> Result<T, E>) -> Result<T, E> {
     let (first, others) = candidates.split_first().expect("one candidate at least");
     open(first).or_else(|why| others.iter().find_map(|other| open(other).ok()).ok_or(why))
+}
+
+fn name_and_place(wgpu::AdapterInfo { name, device_pci_bus_id, .. }: &wgpu::AdapterInfo) -> String {
+    if device_pci_bus_id.is_empty() { name.clone() } else { format!("{name} ({device_pci_bus_id})") }
 }
 
 /// Whether somebody who says `named` means this device: by a part of its name, or by its place on the PCI bus.

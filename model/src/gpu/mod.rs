@@ -94,13 +94,13 @@ pub enum GpuError {
     },
     /// The one that was named is not there.
     #[error(
-        "Vulkan shows {} and no GPU with `{named}` in its name or at that place; correct the rig's model.gpu, or take it out for the best GPU",
+        "Vulkan shows {}, of which none that is a GPU has `{named}` in its name or is at that place; correct the rig's model.gpu, or take it out for the best GPU",
         found(there)
     )]
     NotNamed {
         /// A part of its name, or its place.
         named: String,
-        /// Names of the devices that are there.
+        /// The devices that are there, by name and place.
         there: Vec<String>,
     },
     /// The device could not be opened.
@@ -154,7 +154,7 @@ impl GpuError {
         match self {
             Self::NotBuilt => "this program was built without the GPU".to_owned(),
             Self::None { passed_over, .. } => format!("Vulkan shows {} and no GPU", found(passed_over)),
-            Self::NotNamed { named, there } => format!("Vulkan shows {} and no GPU `{named}`", found(there)),
+            Self::NotNamed { named, there } => format!("Vulkan shows {}, of which no GPU is `{named}`", found(there)),
             Self::Refused { name, reason } => format!("the GPU {name} could not be opened: {reason}"),
             Self::TooLarge { what, bytes, name, limit } => {
                 format!("{what} takes {bytes} bytes, of which the GPU {name} can see {limit} as one")

@@ -56,9 +56,9 @@ pub(super) struct Interlock {
     evidence: Evidence,
     stall_timeout: TimeNs,
     armed: bool,
-    /// Set for good by shutdown and panic.
     /// Why it is not armed where nothing else forbids light: it is armed again at the next colour frame's start.
     why_unarmed: DarkReason,
+    /// Set for good by shutdown and panic.
     latched: Option<DarkReason>,
     /// Why darkness is asked for, until that is taken back.
     held: Option<DarkReason>,
