@@ -168,7 +168,11 @@ fn a_client_of_another_clock_is_told_and_one_that_comes_and_goes_does_not_fill_t
     std::thread::sleep(Duration::from_secs(1));
     drop(client);
     for sequence in 0..150 {
-        send(&mut connect(folder.path()), sequence, &picture(0));
+        let mut client = connect(folder.path());
+        client.write(0, &picture(0).0, &picture(0).1);
+        client.hand_over(0, sequence, 0).unwrap();
+        // The one before may still be shown.
+        assert!(matches!(client.answer(), Answer::Free { .. }));
     }
     assert!(wait_until(PATIENCE, || feed("clients").as_array().is_some_and(Vec::is_empty)));
     std::thread::sleep(Duration::from_secs(3));

@@ -95,7 +95,7 @@ fn other_stacks_weights_and_options_are_refused_in_words_and_nothing_is_left() {
         (&["--focal-stack", "stack", "--backend", "gpu"], 64, &["--backend", "processor alone", "`cpu`"]),
         (&["--focal-stack", "stack", "--pupil", "3"], 64, &["--focal-stack", "--pupil"]),
         (&["--focal-stack", "stack", "--scene", "stack"], 64, &["--focal-stack", "--scene"]),
-        (&["--focal-stack", "stack", "--resolution", "40x32"], 65, &["48x32", "at most 40x32", "fit"]),
+        (&["--focal-stack", "stack", "--resolution", "40x32"], 64, &["48x32", "a fit to 40x32", "crop"]),
         (&["--focal-stack", "stack", "--resolution", "4000x32"], 64, &["4000x32", "larger than the panel"]),
         (&["--pupil", "3"], 78, &["`focal-stack` network", "--focal-stack"]),
         (&["--pupil", "3", "--backend", "cpu"], 78, &["`focal-stack` network", "--focal-stack"]),

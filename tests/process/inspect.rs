@@ -238,7 +238,10 @@ fn a_log_in_arbitrary_units_needs_a_scale_and_says_so() {
     assert!(ended.stderr.contains("arbitrary units") && ended.stderr.contains("scale_mm_per_unit"), "{ended:?}");
     let ended = tried(&["--scale", "100"]);
     assert_eq!(ended.status.code(), Some(69), "{ended:?}");
-    assert!(ended.stderr.contains("--scale") && !ended.stderr.contains("nothing was heard"), "{ended:?}");
+    assert!(
+        ended.stderr.contains("scale_mm_per_unit = 100") && !ended.stderr.contains("nothing was heard"),
+        "{ended:?}"
+    );
     let report = json(&tried(&["--scale", "0.1"]));
     // A disc of area 1256 is 40 units wide.
     let median_mm = report["eyes"]["left"]["believed_mm"]["median"].as_f64().unwrap();
