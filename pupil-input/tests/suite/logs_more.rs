@@ -335,6 +335,51 @@ fn a_table_of_fixations_is_told_from_one_of_samples() {
 }
 
 #[test]
+fn times_that_cannot_be_are_told() {
+    let neon = |t: &dyn Fn(u64) -> String, separator: &str| {
+        let mut text = "section id,timestamp [ns],pupil diameter left [mm],eyelid aperture left [mm]\n".to_owned();
+        for k in 0..400 {
+            writeln!(text, "a,{},3.5,9.1", t(k)).expect("writes");
+        }
+        read(text.replace(',', separator))
+    };
+    let told = |step_ns: u64| neon(&|k| (1_760_676_790_465_965_534 + k * step_ns).to_string(), ",").notes().to_vec();
+    assert_eq!(told(5_000_000), [""; 0]);
+    assert!(told(17)[0].contains("its times are in another unit"), "{:?}", told(17));
+    let excel = neon(&|_| "1.76068E+18".into(), ",");
+    assert!(
+        noted(&excel, "its times do not advance: 399 of 400") && noted(&excel, "spreadsheets"),
+        "{:?}",
+        excel.notes()
+    );
+    // As a German spreadsheet writes them.
+    let semicolons = neon(&|k| (1_760_676_790_465_965_534 + k * 5_000_000).to_string(), ";");
+    assert_eq!((semicolons.len(), semicolons.faults().total()), (400, 0));
+    assert_eq!(semicolons.samples().next().and_then(|sample| sample.aperture_mm), Some(9.1));
+    let smi = |rate: u32| {
+        let mut text = format!("## [iView]\n## Sample Rate:\t{rate}\nTime\tType\tTrial\tL Pupil Diameter [mm]\n");
+        for k in 0..400 {
+            writeln!(text, "{}\tSMP\t1\t3.5", 1_000_000 + k * 4000).expect("writes");
+        }
+        read(text)
+    };
+    assert_eq!(smi(250).notes(), [""; 0]);
+    assert!(
+        noted(&smi(2500), "a power of ten apart") && noted(&smi(60), "which is not alike"),
+        "{:?}",
+        smi(60).notes()
+    );
+}
+
+#[test]
+fn a_neon_log_that_is_cut_within_its_lids_is_told() {
+    let text = "section id,timestamp [ns],pupil diameter left [mm],eyelid aperture left [mm],x\na,1000,3.5,9.1,0\n";
+    let cut = read(format!("{text}a,2000,3.5,9"));
+    assert!(noted(&cut, "line 3, the last one") && cut.len() == 1, "{:?}", cut.notes());
+    assert_eq!(read(format!("{text}a,2000,3.5,9.1,")).notes(), [""; 0]);
+}
+
+#[test]
 fn a_log_that_is_cut_off_says_so() {
     let whole = gazepoint(true);
     assert!(!noted(&read(&whole), "cut off"));

@@ -175,6 +175,53 @@ fn a_run_that_was_killed_keeps_what_had_come() {
 }
 
 #[test]
+fn a_recording_is_played_with_the_scale_of_its_run() {
+    let folder = TempDir::new().expect("a folder");
+    let begin = |spec: &str, scale, record| {
+        let settings = rig::Tracker { scale, ..rig::Rig::default().tracker };
+        let options = TrackerOptions { record: Some(record), ..TrackerOptions::from(host_now()) };
+        Tracker::start(&spec.parse().expect("a spec"), &settings, options).expect("starts")
+    };
+    let (mut tracker, port) = TTYPort::pair().expect("a PTY");
+    let port = port.name().expect("a path");
+    let mut handle = begin(&port, Some(0.5), RecordFiles::in_folder(folder.path()));
+    send(&mut tracker, &lines(), &handle);
+    handle.control.stop();
+    let samples = fs::read_to_string(folder.path().join("samples.csv")).expect("reads");
+    let raw = folder.path().join("tracker.holodraw");
+    assert_eq!(Recording::read(&raw).expect("reads").recorded_scale(), Some(0.5));
+    for (scale, told) in [(None, "is played with it"), (Some(1.0), "is played with 1")] {
+        let again = folder.path().join("again.csv");
+        let files = RecordFiles { raw: None, samples: Some(again.clone()) };
+        let mut handle = begin(&format!("replay:{},speed=max", raw.display()), scale, files);
+        eventually("the end", || handle.control.finished());
+        handle.control.stop();
+        assert!(handle.control.remarks()[0].contains(told), "{:?}", handle.control.remarks());
+        assert_eq!(fs::read_to_string(&again).expect("reads") == samples, scale.is_none());
+        fs::remove_file(again).expect("removes");
+    }
+}
+
+#[test]
+fn a_replay_that_waits_for_long_says_so() {
+    let folder = TempDir::new().expect("a folder");
+    let path = folder.path().join("log.csv");
+    let rows =
+        |from: i64| (0..50).map(move |k| format!("{},left,3.5,1,,1\n", from + k * 10_000_000)).collect::<String>();
+    let header = "t_ns,eye,diameter_mm,confidence,aperture_mm,valid\n";
+    fs::write(&path, format!("{header}{}{}", rows(0), rows(60_000_000_000))).expect("writes");
+    let mut handle = start(&path.display().to_string(), None);
+    eventually("the word", || handle.control.trouble().is_some_and(|told| told.contains("59.5 s away")));
+    assert_eq!(handle.control.counters().of(Counter::Samples), 50);
+    // Longer than any pause of a recording, it is passed over.
+    fs::write(&path, format!("{header}{}{}", rows(0), rows(86_400_000_000_000))).expect("writes");
+    let mut handle = start(&path.display().to_string(), None);
+    eventually("the end", || handle.control.finished());
+    assert_eq!((handle.control.counters().of(Counter::Samples), handle.control.trouble()), (100, None));
+    assert!(handle.control.warnings()[0].contains("leaps ahead in line 52"), "{:?}", handle.control.warnings());
+}
+
+#[test]
 fn nothing_is_overwritten_and_what_cannot_be_made_is_told() {
     let folder = TempDir::new().expect("a folder");
     let settings = rig::Rig::default().tracker;

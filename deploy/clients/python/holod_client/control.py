@@ -43,7 +43,7 @@ class Control:
 
     `path` is the socket; without one it is that of the only holod in this user's runtime folder, or else of the
     service. An order waits for holod up to `timeout_s` seconds, which may be changed at any time: weights and long
-    sequences take a while to read.
+    sequences take a while to read. One for which holod reads no file waits for 8 s at most.
 
     An order whose answer does not come raises UnansweredError. It may have taken effect, and where holod hangs it may
     take effect later, even after orders that are given meanwhile: ask for the `status()` before relying on either. The
