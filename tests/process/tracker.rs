@@ -113,7 +113,7 @@ fn errors(rows: &[FieldRow], t_first: TimeNs, delay: TimeNs, truth_mm: impl Fn(T
         })
         .collect();
     errors.sort_by(f64::total_cmp);
-    assert!(errors.len() > 60, "{} frames to judge", errors.len());
+    assert!(errors.len() > 30, "{} frames to judge", errors.len());
     (errors[errors.len() - 1], errors[errors.len() / 2])
 }
 
