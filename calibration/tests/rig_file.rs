@@ -859,16 +859,48 @@ fn a_lut_is_read_and_named_among_the_active_files() {
 #[test]
 fn a_table_whose_range_is_like_multiples_of_pi_is_asked_for_its_unit() {
     let in_pi = "; where the phases in its table are multiples of π, multiply them by π";
-    let told = |rig: Rig| rig.warnings();
-    let [green] = told(load_sparse_lut("0,0.0\n255,1.9921875\n").unwrap()).try_into().unwrap();
+    let [green] = strokes_told(&load_sparse_lut("0,0.0\n255,1.9921875\n").unwrap()).try_into().unwrap();
     assert!(green.starts_with("green: the panel's stroke is 0.634 π; ") && green.ends_with(in_pi), "{green}");
-    let [green] = told(load_sparse_lut("0,0.0\n255,5.0\n").unwrap()).try_into().unwrap();
+    let eleven: String = (0..11).map(|step| format!("{},{}\n", 20 * step, 0.5 * f64::from(step))).collect();
+    let [green] = strokes_told(&load_sparse_lut(&eleven).unwrap()).try_into().unwrap();
     assert!(green.starts_with("green: the panel's stroke is 1.592 π; ") && !green.contains(in_pi), "{green}");
     // Without a table there is nothing to multiply.
     let text = changed(&[("green = 1.9921875", "green = 0.634")]);
-    let [green] = told(Rig::parse(&text, Path::new("")).unwrap()).try_into().unwrap();
+    let [green] = strokes_told(&Rig::parse(&text, Path::new("")).unwrap()).try_into().unwrap();
     assert!(!green.contains(in_pi), "{green}");
-    assert!(told(load_lut(&lut_csv(straight)).unwrap()).is_empty());
+    assert!(load_lut(&lut_csv(straight)).unwrap().warnings().is_empty());
+}
+
+fn strokes_told(rig: &Rig) -> Vec<String> {
+    rig.warnings().into_iter().filter(|said| said.contains("the panel's stroke is")).collect()
+}
+
+/// A gap is what is wider than a step of the table's own levels, wherever on the circle it is.
+#[test]
+fn a_table_of_few_levels_all_round_has_no_short_stroke() {
+    let eighth = |of_step: fn(u32) -> u32| -> Rig {
+        let rows = (0..32).map(|step| format!("{},{}\n", 8 * step, f64::from(of_step(step)) * TAU / 32.0));
+        load_sparse_lut(&rows.collect::<String>()).unwrap()
+    };
+    for rig in [eighth(|step| step), eighth(|step| step * 5 % 32)] {
+        assert_eq!(strokes_told(&rig), Vec::<String>::new());
+        let [few] = rig.warnings().try_into().unwrap();
+        assert!(few.starts_with("green: of 256 levels only the 32 in the table are used"), "{few}");
+    }
+    // Of steps 0 to 3 none.
+    let [green] = strokes_told(&eighth(|step| 4 + step * 5 % 28)).try_into().unwrap();
+    assert!(green.starts_with("green: the panel's stroke is 1.688 π"), "{green}");
+}
+
+#[test]
+fn a_table_for_a_panel_of_fewer_bits_is_refused() {
+    for (bits, rows) in [(7, 128), (6, 64)] {
+        let csv: String = (0..rows).map(|level| format!("{level},{}\n", f64::from(level) * TAU / 256.0)).collect();
+        let fault = load_sparse_lut(&csv).unwrap_err().to_string();
+        assert!(fault.contains(&format!("a table of {bits} bits")) && fault.contains("correct bit_depth"), "{fault}");
+    }
+    let all_but_one: String = (0..127).map(|level| format!("{level},{}\n", f64::from(level) * 0.02)).collect();
+    assert!(load_sparse_lut(&all_but_one).is_ok());
 }
 
 #[test]
@@ -1341,7 +1373,8 @@ fn strokes_of_much_more_than_a_turn_are_asked_for_their_unit() {
     assert_eq!(warnings.len(), 3);
     assert_eq!(warnings[1], format!("{used}; where stroke_pi is in radians, write 1.798"));
     // Of a table the phases say what they are, or are asked otherwise.
-    assert_eq!(load_sparse_lut("0,0.0\n255,15.0\n").unwrap().warnings(), [""; 0]);
+    let warnings = load_sparse_lut("0,0.0\n255,15.0\n").unwrap().warnings();
+    assert!(!warnings.iter().any(|said| said.contains("stroke") || said.contains("2 π")), "{warnings:?}");
 }
 
 #[test]

@@ -44,6 +44,15 @@ pub fn rig_with_network(args: &RigArgs, network: &NetworkArgs) -> Result<Rig, Fa
     Ok(rig)
 }
 
+/// The same for what is shown on its panel, with a warning of what that cannot show.
+pub fn rig_to_show(args: &RigArgs, network: &NetworkArgs) -> Result<Rig, Failure> {
+    let rig = rig_with_network(args, network)?;
+    for warning in rig.panel.warnings() {
+        tracing::warn!("{warning}");
+    }
+    Ok(rig)
+}
+
 /// The rig's weights, for whatever bench they were trained.
 pub fn load_weights(rig: &Rig) -> Result<Weights, Failure> {
     match &rig.model.weights {

@@ -6,9 +6,11 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use holod_calibration::rig::{Panel, Rig, WeightsChoice};
-use holod_calibration::{Colour, PerColour, PupilDiameter, Resolution};
+use holod_calibration::{Colour, PerColour, PupilDiameter, Resolution, TimeNs};
 use holod_model::{RgbdFrame, Weights};
-use holod_slm_output::{LevelsFrame, PanelEncoder};
+use holod_slm_output::LevelsFrame;
+use holod_slm_output::pacing::refreshes_for;
+use holod_slm_output::present::PanelTiming;
 
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
@@ -54,6 +56,14 @@ pub(crate) fn engine_at(rig: &Rig, weights: &Weights, backend: Backend, size: Re
 /// Frames of all colours that the panel can show in a second.
 pub(crate) fn panel_frames_hz(panel: &Panel) -> f64 {
     panel.refresh_hz * panel.mode.fields_per_refresh() / panel.fields() as f64
+}
+
+/// Frames a second that the panel shows where each takes so long to make: one for every n-th of its own, as they are
+/// paced.
+pub(crate) fn shown_hz(frame_time: TimeNs, panel: &Panel) -> f64 {
+    let timing = PanelTiming::new(panel);
+    let taken = refreshes_for(frame_time + timing.submit_margin(), timing.frame_period.0 as f64);
+    panel_frames_hz(panel) / taken
 }
 
 /// What would bring `frames_hz` frames of `size`, by an engine of the description `engine`, nearer to the panel's;
@@ -136,13 +146,14 @@ impl Estimate {
         Some(format!("for {size} the processor takes {processor_ms:.0} ms (--backend cpu), this GPU {gpu_ms:.0} ms"))
     }
 
-    /// Frames of `size` a second: a GPU takes some of the time for each frame, the rest goes with the pixels.
-    pub(crate) fn frames_hz(&self, size: Resolution) -> f64 {
+    /// The time of a frame of `size`: what surrounds it on the panel, and a GPU, take some of it for each frame, the rest
+    /// goes with the pixels.
+    pub(crate) fn frame_time(&self, size: Resolution) -> TimeNs {
         let ([smaller, larger], [smaller_s, larger_s]) = (self.timed.map(|size| size.pixels() as f64), self.seconds);
         // Not less for a frame that took longer, nor more for each pixel than all of them took.
         let by_pixel = if larger > smaller { (larger_s - smaller_s) / (larger - smaller) } else { f64::INFINITY };
         let by_pixel = by_pixel.clamp(0.0, larger_s / larger);
-        1.0 / (larger_s + by_pixel * (size.pixels() as f64 - larger))
+        TimeNs::from_seconds(larger_s + by_pixel * (size.pixels() as f64 - larger))
     }
 }
 
@@ -154,9 +165,7 @@ struct Timed {
 
 impl Timed {
     fn new(rig: &Rig, weights: &Weights, backend: Backend, size: Resolution) -> Result<Self, Failure> {
-        // A panel of the frame's size: what surrounds the frame would be timed, too, and does not go with its pixels.
-        let panel = Panel { flatness_rad: PerColour([None, None, None]), ..rig.panel.clone() };
-        let encoder = PanelEncoder::new(&panel, size, size).map(Arc::new).map_err(Failure::because(Exit::Config))?;
+        let encoder = renderer::panel_encoder(rig, size)?;
         let renderer = renderer::open(backend, weights, rig, &encoder, &Use::Command)?;
         let (frame, levels) = (Arc::new(scene::sample_frame(size)), LevelsFrame::new(encoder.layout()));
         Self::by(renderer, &frame, usual_pupil(weights, rig), levels)
@@ -304,12 +313,28 @@ mod tests {
         assert!((panel_frames_hz(&panel) - 10.0).abs() < 1e-6);
     }
 
+    /// As the pacer plans it: half of a panel's frames as soon as one takes longer than there is.
+    #[test]
+    fn slow_frames_are_shown_at_whole_parts_of_the_panels_rate() {
+        let mut panel = Rig::default().panel;
+        let near = |found: f64, expected: f64| assert!((found / expected - 1.0).abs() < 1e-6, "{found} for {expected}");
+        let ms = |ms: f64| TimeNs::from_seconds(ms / 1e3);
+        // A sixteenth of a refresh is left for handing it over.
+        for (frame_ms, expected_hz) in [(3.0, 60.0), (15.6, 60.0), (15.7, 30.0), (18.0, 30.0), (280.0, 60.0 / 17.0)] {
+            near(shown_hz(ms(frame_ms), &panel), expected_hz);
+        }
+        panel.mode = PanelMode::FieldSequential;
+        for (frame_ms, expected_hz) in [(48.0, 20.0), (49.5, 10.0)] {
+            near(shown_hz(ms(frame_ms), &panel), expected_hz);
+        }
+    }
+
     #[test]
     fn the_estimate_goes_with_the_pixels_and_leaves_out_what_each_frame_takes() {
         let square = |side| Resolution { width: side, height: side };
         let estimate = |seconds| Estimate::taking("cpu", [square(256), square(512)], seconds);
-        let frames_hz = |seconds, side| estimate(seconds).frames_hz(square(side));
-        let near = |found: f64, expected: f64| assert!((found / expected - 1.0).abs() < 1e-9, "{found} for {expected}");
+        let frames_hz = |seconds, side| 1.0 / estimate(seconds).frame_time(square(side)).seconds();
+        let near = |found: f64, expected: f64| assert!((found / expected - 1.0).abs() < 1e-6, "{found} for {expected}");
         near(frames_hz([0.25, 1.0], 256), 4.0);
         near(frames_hz([0.25, 1.0], 1024), 0.25);
         // 2 ms, and 1 ms for each 256x256.
@@ -318,7 +343,7 @@ mod tests {
         near(frames_hz([0.5, 0.4], 1024), 1.0 / 0.4);
         near(frames_hz([0.0, 0.4], 1024), 1.0 / 1.6);
         let same = Estimate::taking("cpu", [square(64); 2], [0.1, 0.1]);
-        near(same.frames_hz(square(128)), 2.5);
+        near(1.0 / same.frame_time(square(128)).seconds(), 2.5);
     }
 
     #[test]

@@ -64,6 +64,11 @@ pub struct FramePlan {
     pub t_predicted_photon: TimeNs,
 }
 
+/// Refreshes from one frame to the next where each keeps its maker busy for so long, its margin included.
+pub fn refreshes_for(busy: TimeNs, refresh_period_ns: f64) -> f64 {
+    (busy.0 as f64 / refresh_period_ns).ceil().max(1.0)
+}
+
 /// Plans frames and learns from what became of them.
 #[derive(Clone, Debug)]
 pub struct Pacer {
@@ -121,7 +126,7 @@ impl Pacer {
         if let Some(t_last) = self.t_last_desired {
             // While a frame waits for its refresh the next one is made.
             let busy = self.frame_times.estimate + self.config.submit_margin;
-            let every = (busy.0 as f64 / self.clock.period_ns).ceil().max(1.0);
+            let every = refreshes_for(busy, self.clock.period_ns);
             let space = TimeNs((every * self.clock.period_ns).round() as i64);
             let last = self.slots[slot_index(self.last_frame_id)].filter(|slot| slot.frame_id == self.last_frame_id);
             let t_last = match last.and_then(|slot| slot.t_submit) {

@@ -440,6 +440,32 @@ fn check_refuses_what_a_laser_box_would_refuse_at_the_start_of_a_run_in_the_same
 }
 
 #[test]
+fn amplitudes_that_double_phase_clips_are_told_once() {
+    let folder = holod_tests::new_folder();
+    fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();
+    let built_in = fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("../model/weights/fast.safetensors")).unwrap();
+    let key = br#"amplitude_constant\": "#;
+    let at = built_in.windows(key.len()).position(|window| window == key).expect("the key") + key.len();
+    let mut dim = built_in;
+    assert_eq!(&dim[at..at + 4], b"1.25");
+    dim[at..at + 4].copy_from_slice(b"0.01");
+    fs::write(folder.path().join("dim.safetensors"), dim).unwrap();
+    let told = |command: &str, weights: &str| {
+        let frame = ["--config", "rig.toml", "--resolution", "64x64", "--weights", weights];
+        let args = match command {
+            "run" => vec!["run", "--tracker", "mock", "--frames", "3"],
+            _ => vec!["render", "--pupil", "3", "--out", "out", "--force"],
+        };
+        let ran = run(HOLOD, &[&args[..], &frame].concat(), folder.path());
+        assert!(ran.status.success(), "{}", ran.stderr);
+        ran.stderr.lines().filter(|line| line.contains("amplitudes are above the amplitude_constant")).count()
+    };
+    for command in ["run", "render"] {
+        assert_eq!((told(command, "dim.safetensors"), told(command, "fast")), (1, 0), "{command}");
+    }
+}
+
+#[test]
 fn the_log_says_more_when_asked_and_a_typo_silences_nothing() {
     let folder = holod_tests::new_folder();
     fs::write(folder.path().join("rig.toml"), small_rig(64, 64, "driver = \"simulated\"")).unwrap();

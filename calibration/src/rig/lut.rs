@@ -10,6 +10,8 @@ use super::files::{FileFault, read_text};
 const ROWS_QUOTED_MAX: usize = 3;
 /// No panel's stroke is this large: above it the table is in degrees.
 const PHASE_MAX_RAD: f64 = 16.0 * PI;
+/// Tables of the first 2^k levels are those of a panel with k bits from so many on.
+const OTHER_DEPTH_MIN: usize = 64;
 /// A panel of one level shows nothing.
 const LEVELS_MIN: usize = 2;
 
@@ -63,6 +65,15 @@ pub(super) fn read(path: &Path, bit_depth: u8) -> Result<Vec<LevelPhase>, FileFa
         return Err(fault(found, "correct the rows, with a decimal point and phases in radians"));
     }
     let complete = table.len() == levels;
+    let last = usize::from(table.last().map_or(0, |last| last.level));
+    // A panel with few levels has none of a lower depth; a rest of a table that was cut short is no power of two.
+    let is_of_another_depth =
+        last + 1 == table.len() && table.len().is_power_of_two() && table.len() >= OTHER_DEPTH_MIN;
+    if !complete && is_of_another_depth {
+        let found = format!("the levels 0 to {last} and none above, a table of {} bits", table.len().ilog2());
+        let advice = format!("measure the panel at its {bit_depth}-bit levels, or correct bit_depth");
+        return Err(fault(found, &advice));
+    }
     if !complete && (!all_named || table.len() < LEVELS_MIN) {
         let advice = format!("measure the panel at each of its {bit_depth}-bit levels, or name the level in each row");
         return Err(fault(format!("{} rows", table.len()), &advice));

@@ -326,8 +326,7 @@ impl Rig {
     /// What a run, too, should say of the rig's figures before it shows anything: phases that cannot be shown, and
     /// figures that are likely to be in another unit.
     pub fn warnings(&self) -> Vec<String> {
-        let mut warnings = self.panel.short_strokes();
-        warnings.extend(self.panel.long_strokes());
+        let mut warnings = self.panel.warnings();
         warnings.extend(self.times_in_seconds());
         warnings.extend(self.lasers.powers_in_watts());
         warnings
@@ -377,6 +376,36 @@ impl Lasers {
 }
 
 impl Panel {
+    /// What of [`Rig::warnings`] is in whatever the panel shows: phases and levels that it does without.
+    pub fn warnings(&self) -> Vec<String> {
+        let mut warnings = self.short_strokes();
+        warnings.extend(self.long_strokes());
+        let levels = 1usize << self.bit_depth;
+        let tables = self.lut.iter().filter_map(|(colour, table)| Some((colour, table.as_ref()?.len())));
+        warnings.extend(tables.filter(|(_, named)| *named < levels).map(|(colour, named)| {
+            format!("{colour}: of {levels} levels only the {named} in the table are used; none is put between them")
+        }));
+        warnings
+    }
+
+    /// The widest part of the circle that no level of `colour` reaches, and the widest step elsewhere, in radians.
+    fn gap_and_step(&self, colour: Colour) -> [f64; 2] {
+        let stroke_rad = self.stroke_rad[colour];
+        let Some(table) = &self.lut[colour] else {
+            return [TAU - stroke_rad, stroke_rad / f64::from((1u32 << self.bit_depth) - 1)];
+        };
+        let mut phases_rad: Vec<f64> = table.iter().map(|entry| entry.phase_rad).collect();
+        if phases_rad.is_sorted() || phases_rad.is_sorted_by(|a, b| a >= b) {
+            let step_rad = phases_rad.windows(2).map(|pair| (pair[1] - pair[0]).abs()).fold(0.0, f64::max);
+            return [TAU - stroke_rad, step_rad];
+        }
+        phases_rad.iter_mut().for_each(|phase_rad| *phase_rad = phase_rad.rem_euclid(TAU));
+        phases_rad.sort_by(f64::total_cmp);
+        let across_0 = phases_rad[0] + TAU - phases_rad[phases_rad.len() - 1];
+        let steps = phases_rad.windows(2).map(|pair| pair[1] - pair[0]).chain([across_0]);
+        steps.fold([0.0; 2], |[gap, step], next| [gap.max(next), step.max(next.min(gap))])
+    }
+
     /// For each colour whose stroke is much more than 2π, how few levels that leaves.
     fn long_strokes(&self) -> Vec<String> {
         let levels = 1u32 << self.bit_depth;
@@ -401,19 +430,22 @@ impl Panel {
         told.collect()
     }
 
-    /// For each colour whose stroke is less than 2π, what becomes of the phases that cannot be shown.
+    /// For each colour whose levels leave a gap on the circle, what becomes of the phases that cannot be shown.
     fn short_strokes(&self) -> Vec<String> {
-        let levels = f64::from(1u32 << self.bit_depth);
-        // The top level of a 2π panel stands one step short of 2π.
-        let short = self.stroke_rad.iter().filter(|(_, stroke_rad)| **stroke_rad < TAU * (levels - 1.5) / levels);
-        let told = short.map(|(colour, &stroke_rad)| {
+        let told = Colour::ALL.into_iter().filter_map(|colour| {
+            let [gap_rad, step_rad] = self.gap_and_step(colour);
+            // The top level of a 2π panel stands one step short of 2π.
+            if gap_rad <= 1.5 * step_rad {
+                return None;
+            }
+            let stroke_rad = TAU - gap_rad;
             let is_in_pi = self.lut[colour].is_some() && IN_PI.contains(&stroke_rad);
-            format!(
+            Some(format!(
                 "{colour}: the panel's stroke is {:.3} π; phases between that and 2 π cannot be shown and {}{}",
                 stroke_rad / PI,
                 self.out_of_stroke.meaning(),
                 if is_in_pi { "; where the phases in its table are multiples of π, multiply them by π" } else { "" }
-            )
+            ))
         });
         told.collect()
     }
@@ -441,14 +473,6 @@ fn active_files(rig: &Rig) -> Vec<ActiveFile> {
 fn notes(rig: &Rig) -> Vec<String> {
     let mut notes = Vec::new();
     notes.extend(rig.warnings());
-    let levels = 1u32 << rig.panel.bit_depth;
-    for (colour, table) in rig.panel.lut.iter() {
-        if let Some(table) = table
-            && table.len() < levels as usize
-        {
-            notes.push(format!("{colour}: of {levels} levels only the {} in the table are used", table.len()));
-        }
-    }
     for (colour, power_mw) in rig.lasers.power_mw.iter() {
         if *power_mw == 0.0 {
             notes.push(format!("{colour}: the laser's power is 0, so this colour stays dark"));

@@ -140,13 +140,16 @@ fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, 
     let sizes: Vec<Resolution> = sizes.into_iter().filter(fits).collect();
     let estimate = |weights| progress::during("estimating the frames a second", || Estimate::of(rig, weights, backend));
     let estimated = weights.map(estimate);
-    let gpu = match (&estimated, weights, &sizes[..]) {
-        (Some(Ok(Estimate { engine, .. })), Some(weights), &[size, ..]) if speed::is_gpu(engine) => {
-            let compare = || speed::compare(rig, weights, backend, size).transpose();
-            let compared = progress::during("comparing the GPU with the processor", compare);
-            compared.map(|apart| gpu(engine, size, apart))
+    let compared: Vec<Check> = match (&estimated, weights) {
+        (Some(Ok(Estimate { engine, .. })), Some(weights)) if speed::is_gpu(engine) => {
+            let compare = |&size: &Resolution| {
+                let compare = || speed::compare(rig, weights, backend, size).transpose();
+                let what = format!("comparing the GPU with the processor at {size}");
+                progress::during(&what, compare).map(|apart| gpu(engine, size, apart))
+            };
+            sizes.iter().filter_map(compare).collect()
         }
-        _ => None,
+        _ => Vec::new(),
     };
     let (passed, says) = match (estimated, &sizes[..]) {
         // Why is said above, of the weights.
@@ -161,8 +164,9 @@ fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, 
                     speed::engine_at(rig, weights, backend, size)
                 })
             };
-            let (passed, rates) = rates(&estimate, &sizes, engine_at);
-            let advice = speed::advice(estimate.frames_hz(*first), &estimate.engine, rig, *first);
+            let frames_hz = |size| speed::shown_hz(estimate.frame_time(size), &rig.panel);
+            let (passed, rates) = rates(&estimate, &sizes, frames_hz, engine_at);
+            let advice = speed::advice(frames_hz(*first), &estimate.engine, rig, *first);
             let more = [estimate.faster_processor(), advice].into_iter().flatten();
             let says = format!(
                 "{}; estimated from frames of up to {}: {}; the panel could show {:.1}{}",
@@ -175,19 +179,20 @@ fn speed(rig: &Rig, weights: Option<&Weights>, (backend, resolution): (Backend, 
             (passed, says)
         }
     };
-    [Check { name: "speed", passed, says }].into_iter().chain(gpu).collect()
+    [Check { name: "speed", passed, says }].into_iter().chain(compared).collect()
 }
 
-/// The frames a second of each of `sizes`, in words; and whether there is an engine for the first, that of a run. Small
+/// The frames a second of each of `sizes`, which `frames_hz` says, in words; and whether there is an engine for the first, that of a run. Small
 /// frames fit on a GPU where those of a panel do not: there `engine_at` says what computes them.
 fn rates(
     estimate: &Estimate,
     sizes: &[Resolution],
+    frames_hz: impl Fn(Resolution) -> f64,
     engine_at: impl Fn(Resolution) -> Result<String, Failure>,
 ) -> (bool, String) {
     let mut passed = true;
     let mut rate = |(index, &size): (usize, &Resolution)| {
-        let estimated = || format!("{:.2} frames a second of {size}", estimate.frames_hz(size));
+        let estimated = || format!("{:.2} frames a second of {size}", frames_hz(size));
         if !speed::is_gpu(&estimate.engine) || size == estimate.timed[1] {
             return estimated();
         }
@@ -312,15 +317,19 @@ mod tests {
         let [small, large] = [square(512), square(4096)];
         let estimate = |engine: &str| Estimate::taking(engine, [square(256), small], [0.1, 0.2]);
         let on_gpu = estimate("gpu, X, single precision");
-        let (passed, says) = rates(&on_gpu, &[small, large], |_| Ok("gpu, X, single precision".into()));
+        let rates =
+            |estimate: &Estimate, sizes: &[Resolution], engine_at: &dyn Fn(Resolution) -> Result<String, Failure>| {
+                rates(estimate, sizes, |size| 1.0 / estimate.frame_time(size).seconds(), engine_at)
+            };
+        let (passed, says) = rates(&on_gpu, &[small, large], &|_| Ok("gpu, X, single precision".into()));
         assert!(
             passed && says.contains("5.00 frames a second of 512x512, ") && says.ends_with("a second of 4096x4096")
         );
-        let full = |_| Err(Failure::new(Exit::Unavailable, "no room for the sky"));
+        let full: &dyn Fn(_) -> _ = &|_| Err(Failure::new(Exit::Unavailable, "no room for the sky"));
         let (passed, says) = rates(&on_gpu, &[small, large], full);
         assert!(passed && says.ends_with("512x512, no frames of 4096x4096: no room for the sky"), "{says}");
         assert!(!rates(&on_gpu, &[large], full).0);
-        let (passed, says) = rates(&on_gpu, &[large], |_| Ok("cpu, 8 threads, as X is full".into()));
+        let (passed, says) = rates(&on_gpu, &[large], &|_| Ok("cpu, 8 threads, as X is full".into()));
         assert!(passed && says == "frames of 4096x4096 are computed by cpu, 8 threads, as X is full", "{says}");
         assert!(rates(&estimate("cpu, 8 threads"), &[large], full).1.contains("frames a second of 4096x4096"));
     }

@@ -20,7 +20,7 @@ const SHEET_SCENES: usize = 2;
 const SHEET_PUPILS_MM: [f32; 2] = [2.0, 4.0];
 
 pub(super) fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
-    let rig = setup::rig_with_network(&args.rig, &args.network)?;
+    let rig = setup::rig_to_show(&args.rig, &args.network)?;
     let plan = EvaluationPlan::new(EvaluationSettings {
         rig: &rig,
         backend: args.backend,

@@ -31,6 +31,8 @@ pub(super) struct Report {
     pub(super) height_px: usize,
     pub(super) amplitude_constant: f32,
     clipped_share: f32,
+    /// Of the colour that has most, the share of phases that the panel has no level near.
+    unreachable_share: f32,
     depth_missing_px: usize,
     depth_clamped_far_px: usize,
     depth_clamped_near_px: usize,
@@ -51,7 +53,7 @@ pub(super) struct Report {
 }
 
 pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
-    let rig = setup::rig_with_network(&args.rig, &args.network)?;
+    let rig = setup::rig_to_show(&args.rig, &args.network)?;
     let began = Instant::now();
     let pupil = match (&args.focal_stack, args.pupil) {
         (Some(directory), _) => return focal_stack::render(args, &rig, directory, began),
@@ -135,6 +137,9 @@ pub(super) fn compute(
         renderer.render(&frames.frames[0], pupil, &mut levels).map_err(Failure::because(Exit::Unavailable))
     })?;
     let frame_ms = began.elapsed().as_secs_f64() * 1e3;
+    if let Some(fault) = renderer::clipping_fault(rendered.clipped_share) {
+        tracing::warn!("{fault}");
+    }
     let done = &frames.reports[0];
     let [depth_least_dpt, depth_greatest_dpt] = done.depth_range.map(|depth| rig.geometry.depth_at(f64::from(depth)).0);
     let report = Report {
@@ -145,6 +150,7 @@ pub(super) fn compute(
         height_px: resolution.height,
         amplitude_constant: weights.config().amplitude_constant,
         clipped_share: rendered.clipped_share,
+        unreachable_share: rendered.unreachable_share.0.into_iter().fold(0.0, f32::max),
         depth_missing_px: done.depth_missing_px,
         depth_clamped_far_px: done.depth_clamped_far_px,
         depth_clamped_near_px: done.depth_clamped_near_px,

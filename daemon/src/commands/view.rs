@@ -52,7 +52,7 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
             "--out - and --json would both write to standard output: give one of them",
         ));
     }
-    let rig = setup::rig_with_network(&args.rig, &args.network)?;
+    let rig = setup::rig_to_show(&args.rig, &args.network)?;
     let looked_at = match (&args.hologram, args.pupil) {
         (Some(folder), _) => {
             let hologram = load(folder)?;

@@ -186,6 +186,20 @@ pub fn panel_encoder(rig: &Rig, resolution: Resolution) -> Result<Arc<PanelEncod
     PanelEncoder::new(&rig.panel, rig.resolution(), resolution).map(Arc::new).map_err(Failure::because(Exit::Config))
 }
 
+/// Above this share of clipped amplitudes a picture is visibly wrong; of the built-in networks' some thousandths are.
+const MUCH_CLIPPED: f32 = 0.05;
+
+/// What is wrong with a hologram of which so large a share of all amplitudes was clipped by double phase.
+pub(crate) fn clipping_fault(clipped_share: f32) -> Option<String> {
+    (clipped_share > MUCH_CLIPPED).then(|| {
+        format!(
+            "{:.0} % of a hologram's amplitudes are above the amplitude_constant of the weights, and were clipped: bright \
+             parts are too dark; export the weights with a greater constant, or take others",
+            100.0 * clipped_share
+        )
+    })
+}
+
 /// A renderer whose engines fail on command.
 #[cfg(test)]
 pub(crate) mod failing {

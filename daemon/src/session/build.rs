@@ -270,7 +270,7 @@ pub(super) fn build(
 /// Says how many frames a second are to be expected. Whether it has said what would bring more.
 fn tell_frame_time(plan: &SessionPlan, frame_time: TimeNs, engine: &str) -> bool {
     let panel_hz = speed::panel_frames_hz(&plan.rig.panel);
-    let frames_hz = 1.0 / frame_time.seconds();
+    let frames_hz = speed::shown_hz(frame_time, &plan.rig.panel);
     let first_frame = format!(
         "a frame takes {:.0} ms, so about {frames_hz:.2} frames a second of the panel's {panel_hz:.1}",
         frame_time.seconds() * 1e3

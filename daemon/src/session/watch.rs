@@ -30,7 +30,7 @@ use crate::record::RecordHealth;
 use crate::snapshot::{Figures, Snapshot};
 use crate::source::feed::Feed;
 use crate::status::StatusFile;
-use crate::{setup, speed};
+use crate::{renderer, setup, speed};
 
 const TICK: Duration = Duration::from_millis(10);
 const TICKS_PER_REPORT: u32 = 10;
@@ -100,6 +100,8 @@ pub(super) struct Rings {
 pub(super) struct Announced {
     /// What would bring more frames a second has been said.
     advised: bool,
+    /// So has that much of a hologram is clipped.
+    clipped: bool,
     rate: RateWatch,
     state: State,
     text: String,
@@ -283,6 +285,12 @@ impl Watch<'_> {
         }
         while let Ok(record) = records.pop() {
             self.tally.frame(&record);
+            if !self.announced.clipped
+                && let Some(fault) = renderer::clipping_fault(record.clipped_share)
+            {
+                self.announced.clipped = true;
+                tracing::warn!("{fault}");
+            }
             tracing::trace!("{:?}", record.frame);
             self.observer.frame(&record.frame)?;
         }
@@ -429,7 +437,8 @@ impl Watch<'_> {
         let frame_time = tally.frame_time.spread();
         let engine = names.engine();
         let speed_advice = frame_time
-            .and_then(|time| speed::advice(1e3 / f64::from(time.median_ms), &engine, &self.rig, names.hologram));
+            .map(|time| speed::shown_hz(TimeNs::from_seconds(f64::from(time.median_ms) / 1e3), &self.rig.panel))
+            .and_then(|frames_hz| speed::advice(frames_hz, &engine, &self.rig, names.hologram));
         Figures {
             rig: self.rig.name.clone(),
             scene: names.scene.clone(),

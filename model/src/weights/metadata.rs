@@ -118,6 +118,7 @@ impl Metadata<'_> {
             )?;
         }
         let constant = config.amplitude_constant;
-        require(constant > 0.0 && constant.is_finite(), "amplitude_constant", constant.to_string(), "a positive number")
+        let is_usable = constant > 0.0 && constant.is_finite() && (1.0 / constant).is_finite();
+        require(is_usable, "amplitude_constant", constant.to_string(), "a positive number above 1e-38")
     }
 }

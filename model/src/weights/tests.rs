@@ -294,7 +294,10 @@ fn faulty_metadata_is_named() {
         let fresnel = configured(&|c| c.trained.volume_fresnel_px2 = unusable);
         assert_mentions(&fresnel, &["config.trained.volume_fresnel_px2", "ascending"]);
     }
-    assert_mentions(&configured(&|c| c.amplitude_constant = 0.0), &["config.amplitude_constant"]);
+    // The reciprocal of 1e-40 is no number of single precision.
+    for constant in [0.0, 1e-40] {
+        assert_mentions(&configured(&|c| c.amplitude_constant = constant), &["config.amplitude_constant"]);
+    }
 }
 
 #[test]

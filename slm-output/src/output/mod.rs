@@ -222,7 +222,7 @@ pub fn pacing_config(rig: &Rig, first_frame_time: TimeNs) -> Result<PacingConfig
     Ok(PacingConfig {
         refresh_period: timing.frame_period,
         photon_delay: TimeNs(middle_field_ns) + gate.middle(),
-        submit_margin: TimeNs(timing.refresh_period.0 / 16),
+        submit_margin: timing.submit_margin(),
         first_frame_time,
     })
 }

@@ -78,6 +78,11 @@ impl PanelTiming {
         let refresh_period = if panel.mode == PanelMode::ChannelPacked { frame_period } else { field_period };
         Self { field_period, refresh_period, frame_period, fields }
     }
+
+    /// How long before a refresh the frame that is for it must be submitted, as far as nothing else is known.
+    pub fn submit_margin(self) -> TimeNs {
+        TimeNs(self.refresh_period.0 / 16)
+    }
 }
 
 /// A video frame that has come on the panel.
