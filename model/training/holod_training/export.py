@@ -56,8 +56,8 @@ def check_folder(out: Path) -> None:
 
 def refuse_existing(paths: list[Path], force: bool) -> None:
     """Raises WeightsError where one of `paths` is there already, unless with `force`."""
-    for path in paths if not force else ():
-        if os.path.lexists(path):
+    for path in paths:
+        if not force and os.path.lexists(path):
             raise WeightsError(f"{path} exists already; name another place with --out, or overwrite it with --force")
 
 
