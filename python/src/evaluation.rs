@@ -10,7 +10,6 @@ use pyo3::prelude::*;
 use crate::outcome::{Count, HolodError, InputError, optional_count, with_threads};
 use crate::renderer::backend_named;
 use crate::rig::Rig;
-use crate::view::pupil;
 
 /// Judges weights by what an eye sees of the panel's levels on held-out scenes, as `holod evaluate` does.
 ///
@@ -52,7 +51,7 @@ pub(crate) fn evaluate<'py>(
     if limit == Some(0) {
         return Err(InputError::new_err("limit: found 0, expected at least 1"));
     }
-    let pupils: Vec<PupilDiameter> = pupils_mm.unwrap_or_default().into_iter().map(pupil).collect::<PyResult<_>>()?;
+    let pupils: Vec<_> = pupils_mm.unwrap_or_default().into_iter().map(scene_pupil).collect::<PyResult<_>>()?;
     let settings = EvaluationSettings {
         rig: &rig,
         backend,
@@ -76,6 +75,15 @@ pub(crate) fn evaluate<'py>(
     match interrupt {
         Some(interrupt) => Err(interrupt),
         None => from_json(py, &judged?),
+    }
+}
+
+/// A pupil of scenes, which may be wider than a human one for benches of little blur.
+fn scene_pupil(mm: f32) -> PyResult<PupilDiameter> {
+    if mm > 0.0 && mm.is_finite() {
+        Ok(PupilDiameter::from_mm(mm))
+    } else {
+        Err(InputError::new_err(format!("pupils_mm: found {mm} mm, expected diameters above 0 mm")))
     }
 }
 

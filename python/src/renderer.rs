@@ -100,9 +100,9 @@ impl Renderer {
     /// `depth` is (height_px, width_px) of float32, or of uint16 with "millimetres". `depth_unit` must be said:
     /// "metres" or "millimetres" (along the axis of view, as cameras and renderers give it; infinity is one),
     /// "dioptres" (1/metres), or "normalised_dioptres" (0 the far end of the rig's depth range, 1 the near end, uniform
-    /// in dioptres). NaN, lengths that are not above 0, and negative dioptres are no depths: they are an error, or with
-    /// `fill_missing` are filled from their surroundings as the daemon does. Depths outside the rig's range are clamped
-    /// to it and counted.
+    /// in dioptres). NaN, lengths that are not above 0, negative or infinite dioptres, and infinite normalised depths are
+    /// no depths: they are an error, or with `fill_missing` are filled from their surroundings as the daemon does. Depths
+    /// outside the rig's range are clamped to it and counted.
     ///
     /// Of a pupil outside `trained_pupils_mm` the network is told the nearest, as in a run; blur and stop are its own.
     ///

@@ -83,7 +83,11 @@ def masked(array: np.ndarray) -> np.ndarray:
         ),
         wrong("the first 0 in row 0, column 0", depth=changed(METRES, (0, 0), 0)),
         wrong("the first -1 in row 0, column 0", depth=changed(METRES, (0, 0), -1), depth_unit="dioptres"),
-        wrong("the first 2 in row 0, column 0", depth=METRES, depth_unit="normalised_dioptres"),
+        wrong(
+            "the first inf in row 0, column 0; expected finite numbers, 0 the far end",
+            depth=changed(METRES, (0, 0), np.inf),
+            depth_unit="normalised_dioptres",
+        ),
         wrong("no pixel with a valid one; expected metres above 0", depth=METRES * 0, fill_missing=True),
         wrong("pupil_mm: found 0.003 mm, expected a human pupil of 0.5 to 9 mm", pupil_mm=0.003),
         wrong("pupil_mm: found NaN", pupil_mm=float("nan")),
@@ -134,6 +138,18 @@ def test_infinity_is_a_distance_and_what_cannot_be_shown_is_counted(renderer: ho
     depth = changed(changed(METRES, (0, slice(0, 5)), np.inf), (1, slice(0, 7)), 0.1)
     hologram = renderer.render(RGB8, depth, 3.0, depth_unit="metres")
     assert (hologram.depth_clamped_far_px, hologram.depth_clamped_near_px) == (0, 7)
+
+
+@pytest.mark.parametrize("fill_missing", [False, True])
+def test_normalised_depths_outside_the_range_are_clamped_and_counted(
+    renderer: holod.Renderer, fill_missing: bool
+) -> None:
+    beyond = changed(changed(METRES * 0 + np.float32(0.5), (0, slice(0, 5)), 1.2), (1, slice(0, 7)), -0.1)
+    told = {"depth_unit": "normalised_dioptres", "fill_missing": fill_missing}
+    hologram = renderer.render(RGB8, beyond, 3.0, **told)
+    assert (hologram.depth_clamped_far_px, hologram.depth_clamped_near_px, hologram.depth_missing_px) == (7, 5, 0)
+    assert np.array_equal(hologram.levels, renderer.render(RGB8, beyond.clip(0, 1), 3.0, **told).levels)
+    assert not np.array_equal(hologram.levels, renderer.render(RGB8, beyond.clip(0, 0.5), 3.0, **told).levels)
 
 
 def test_depth_of_a_wrong_unit_is_warned_of(renderer: holod.Renderer) -> None:

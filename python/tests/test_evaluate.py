@@ -46,7 +46,12 @@ def test_what_cannot_be_judged_is_told(scenes: Path, tmp_path: Path) -> None:
         ("pupils_mm: found none, expected some of the scenes' own", {"pupils_mm": []}),
         ("limit: found 0, expected at least 1", {"limit": 0}),
         ("limit: found -1", {"limit": -1}),
-        ("pupil_mm: found 0", {"pupils_mm": [0.0]}),
+        ("pupils_mm: found 0 mm, expected diameters above 0 mm", {"pupils_mm": [2.0, 0.0]}),
+        ("pupils_mm: found NaN mm", {"pupils_mm": [float("nan")]}),
+        ("pupils_mm: found inf mm", {"pupils_mm": [float("inf")]}),
+        # Scenes for benches of little blur have such pupils, for which the command looks, too.
+        ("expected one for 12.5 mm in every scene", {"pupils_mm": [12.5]}),
+        ("expected one for 0.25 mm in every scene", {"pupils_mm": [0.25]}),
     ]:
         with pytest.raises(holod.InputError) as raised:
             holod.evaluate(**({"scenes": scenes, "weights": "fast"} | options))  # type: ignore[arg-type]

@@ -28,7 +28,7 @@ pub enum ArrayDepths<'a> {
     MillimetresU16(&'a [u16]),
     /// Dioptres of 0 or more.
     DioptresF32(&'a [f32]),
-    /// 0 at the far end of the display's depth range, 1 at its near end, uniform in dioptres.
+    /// 0 at the far end of the display's depth range, 1 at its near end, uniform in dioptres; others are clamped.
     NormalisedDioptresF32(&'a [f32]),
 }
 
@@ -164,7 +164,9 @@ impl ArrayDepths<'_> {
             Self::MetresF32(_) => "metres above 0",
             Self::MillimetresF32(_) | Self::MillimetresU16(_) => "millimetres above 0",
             Self::DioptresF32(_) => "dioptres of 0 or more",
-            Self::NormalisedDioptresF32(_) => "0 (the far end of the display's depth range) to 1 (its near end)",
+            Self::NormalisedDioptresF32(_) => {
+                "finite numbers, 0 the far end of the display's depth range and 1 its near end"
+            }
         }
     }
 
@@ -186,8 +188,7 @@ impl ArrayDepths<'_> {
             }
             Self::DioptresF32(numbers) => numbers.iter().copied().map(dioptres(DepthEncoding::Dioptres)).collect(),
             Self::NormalisedDioptresF32(numbers) => {
-                let is_one = |number: f32| (-ROUNDING..=1.0 + ROUNDING).contains(&number);
-                numbers.iter().map(|&number| if is_one(number) { number } else { f32::NAN }).collect()
+                numbers.iter().map(|&number| if number.is_finite() { number } else { f32::NAN }).collect()
             }
         };
         check_length("depths", depths.len(), resolution.pixels())?;
@@ -350,7 +351,6 @@ mod tests {
             ArrayDepths::MetresF32(&numbers),
             ArrayDepths::MillimetresF32(&numbers),
             ArrayDepths::DioptresF32(&numbers),
-            ArrayDepths::NormalisedDioptresF32(&numbers),
         ] {
             let refused = frame(colours, depths).unwrap_err();
             assert!(matches!(refused, ArrayError::Missing { count: 1, row: 1, column: 1, .. }), "{refused}");
@@ -368,5 +368,47 @@ mod tests {
         let short = frame(colours, ArrayDepths::MetresF32(&[1.0; 34])).unwrap_err();
         assert_eq!(short, ArrayError::Length { what: "depths", found: 34, expected: 35 });
         assert!(frame(ArrayColours::Srgb8(&[0; 104]), depths).is_err());
+    }
+
+    #[test]
+    fn normalised_depths_outside_the_range_are_clamped_and_counted_as_those_of_files_are() {
+        let mut numbers: Vec<f32> = (0..35_u16).map(|index| f32::from(index % 7) / 6.0).collect();
+        numbers[8..12].copy_from_slice(&[1.2, 1e30, -0.1, f32::MIN]);
+        let frame_of = |numbers: &[f32], fills_missing| {
+            let (colours, depths) = (ArrayColours::Srgb8(&[0; 105]), ArrayDepths::NormalisedDioptresF32(numbers));
+            ArrayPicture { resolution: SIZE, colours, depths, fills_missing }.frame(&BENCH)
+        };
+        let from_file = |numbers: &[f32]| {
+            let encoding =
+                DepthEncoding::NormalisedDioptres { far_dpt: BENCH.depth_far.0, near_dpt: BENCH.depth_near.0 };
+            let reading = DepthReading { encoding, scale: None, missing: None };
+            let mut dioptres: Vec<f32> = numbers.iter().copied().map(reading.converter(None)).collect();
+            let mut report = FrameReport::default();
+            report.depth_missing_px = fill_missing(&mut dioptres, SIZE).unwrap();
+            (normalised(&dioptres, &BENCH, &mut report), report)
+        };
+        let same = |numbers: &[f32], fills_missing| {
+            let (frame, report) = frame_of(numbers, fills_missing).unwrap();
+            let (depths, expected) = from_file(numbers);
+            for (index, (found, expected)) in frame.depth_normalised.iter().zip(depths).enumerate() {
+                assert!((found - expected).abs() < 1e-6, "{found} for {expected} of {}", numbers[index]);
+            }
+            let counts = |report: &FrameReport| {
+                [report.depth_missing_px, report.depth_clamped_far_px, report.depth_clamped_near_px]
+            };
+            assert_eq!(counts(&report), counts(&expected));
+            (frame.depth_normalised, counts(&report))
+        };
+        let (depths, counts) = same(&numbers, false);
+        assert_eq!((&depths[8..12], counts), (&[1.0, 1.0, 0.0, 0.0][..], [0, 2, 2]));
+        for wrong in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            numbers[17] = wrong;
+            let refused = frame_of(&numbers, false).unwrap_err();
+            assert!(matches!(refused, ArrayError::Missing { count: 1, row: 2, column: 3, .. }), "{wrong}: {refused}");
+            assert!(refused.to_string().contains("expected finite numbers"), "{refused}");
+            let (depths, counts) = same(&numbers, true);
+            // Above it lies what is beyond the far end.
+            assert_eq!((depths[17], counts), (0.0, [1, 3, 2]), "{wrong}");
+        }
     }
 }

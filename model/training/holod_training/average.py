@@ -12,14 +12,16 @@ from pathlib import Path
 
 import torch
 
-from holod_training.export import WeightsError, load_weights, read_metadata, save_weights
+from holod_training.export import WeightsError, load_weights, read_metadata, refuse_existing, save_weights
 
 SUM_TOLERANCE = 1e-6
 
 
-def average(parts: list[tuple[Path, float]], out: Path) -> Path:
+def average(parts: list[tuple[Path, float]], out: Path, force: bool = False) -> Path:
     """Writes Σ share · weights of `parts`, files and their shares, which sum to 1. Raises WeightsError where they do
-    not, and where a file is unreadable or holds another network than the first."""
+    not, where a file is unreadable or holds another network than the first, and where `out` is there already without
+    `force`."""
+    refuse_existing([out], force)
     if len(parts) < 2:
         raise WeightsError(f"found {len(parts)} file(s) to take the mean of, expected at least two")
     total = sum(share for _, share in parts)

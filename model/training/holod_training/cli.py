@@ -33,6 +33,7 @@ from holod_training.variants import DEFAULT_VARIANT, VARIANTS, variant
 
 EX_DATAERR = 65
 EX_INTERRUPTED = 128 + signal.SIGINT
+FORCE_HELP = "overwrite what is there already"
 SOLVER_STARTS = {"network": OURS, "layered-asm": LAYERED_ASM}
 
 
@@ -156,6 +157,7 @@ def _parser() -> argparse.ArgumentParser:
         "--source", required=True, help="checkpoint.pt of a run (its averaged weights) or a weights file"
     )
     export.add_argument("--out", required=True)
+    export.add_argument("--force", action="store_true", help=FORCE_HELP)
     export.add_argument("--amplitude-constant", type=float, help="double phase's K; the source's own where left out")
     export.add_argument("--evaluation", help="evaluation.json whose numbers the file is to carry")
     export.add_argument("--evaluation-method", default="holod", help="whose rows of it: another file named by --also")
@@ -169,10 +171,12 @@ def _parser() -> argparse.ArgumentParser:
         "--weights", nargs=2, action="append", required=True, metavar=("FILE", "SHARE"), help="more than once; sum 1"
     )
     mean.add_argument("--out", required=True)
+    mean.add_argument("--force", action="store_true", help=FORCE_HELP)
     mean.set_defaults(run=_average)
 
     golden = command("golden", "Writes the golden vectors that the engines are tested against", has_device=False)
     golden.add_argument("--out", required=True, help="folder, model/golden")
+    golden.add_argument("--force", action="store_true", help=FORCE_HELP)
     golden.add_argument("--weights", help="the shipped standard weights, for vectors of them too")
     golden.add_argument("--small-weights", help="the shipped small weights, likewise")
     golden.add_argument("--fast-weights", help="the shipped fast weights, likewise")
@@ -347,6 +351,7 @@ def _export(options: argparse.Namespace) -> None:
             options.evaluation_method,
             benches,
             options.benches_method,
+            options.force,
         )
     )
 
@@ -354,7 +359,7 @@ def _export(options: argparse.Namespace) -> None:
 def _average(options: argparse.Namespace) -> None:
     from holod_training.average import average
 
-    print(average([(Path(path), _share(share)) for path, share in options.weights], Path(options.out)))
+    print(average([(Path(path), _share(share)) for path, share in options.weights], Path(options.out), options.force))
 
 
 def _share(text: str) -> float:
@@ -369,7 +374,7 @@ def _golden(options: argparse.Namespace) -> None:
 
     named = (options.weights, options.small_weights, options.fast_weights)
     standard, small, fast = (Path(path) if path else None for path in named)
-    for path in write_golden(Path(options.out), standard, small, fast, options.seed):
+    for path in write_golden(Path(options.out), standard, small, fast, options.seed, options.force):
         print(path)
 
 

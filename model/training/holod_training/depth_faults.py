@@ -54,18 +54,27 @@ def holes(shape: torch.Size, rng: np.random.Generator) -> Tensor:
 
 
 def fill_holes(depth: Tensor, missing: Tensor) -> Tensor:
-    """Missing pixels get the mean of their known neighbours, from the rim inwards; all missing gives 0."""
-    known = (~missing).to(depth.dtype)
-    result = depth * known
-    for _ in range(max(depth.shape)):
-        if bool(known.all()) or not bool(known.any()):
-            break
-        share = F.avg_pool2d(known[None, None], 3, stride=1, padding=1)[0, 0]
-        mean = F.avg_pool2d(result[None, None], 3, stride=1, padding=1)[0, 0] / share.clamp_min(1e-6)
-        reached = share > 1e-6
-        result = torch.where(known > 0, result, torch.where(reached, mean, result))
-        known = reached.to(depth.dtype)
-    return result
+    """Missing pixels get the farthest of the nearest known ones to their left, right, top and bottom, as holod fills
+    them; those that see none, of the pixels that were filled so. All missing gives 0."""
+    if bool(missing.all()):
+        return torch.zeros_like(depth)
+    while bool(missing.any()):
+        unseen = torch.where(missing, torch.inf, depth)
+        farthest = torch.full_like(depth, torch.inf)
+        for axis in (0, 1):
+            farthest = farthest.minimum(_last_known(unseen, axis))
+            farthest = farthest.minimum(_last_known(unseen.flip(axis), axis).flip(axis))
+        depth = torch.where(missing, farthest, depth)
+        missing = depth.isinf()
+    return depth
+
+
+def _last_known(depth: Tensor, axis: int) -> Tensor:
+    """For each pixel the last finite one up to it along `axis`; infinity where there is none."""
+    places = torch.arange(depth.shape[axis], device=depth.device)
+    places = places[:, None] if axis == 0 else places
+    last = torch.where(depth.isinf(), -1, places).cummax(axis).values
+    return torch.where(last < 0, torch.inf, depth.gather(axis, last.clamp_min(0)))
 
 
 def coarse_steps(depth: Tensor) -> Tensor:

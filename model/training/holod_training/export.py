@@ -54,6 +54,13 @@ def check_folder(out: Path) -> None:
         raise ConfigError(f"--out: found {there}, which may not be written, expected a folder to write into")
 
 
+def refuse_existing(paths: list[Path], force: bool) -> None:
+    """Raises WeightsError where one of `paths` is there already, unless with `force`."""
+    for path in paths:
+        if not force and os.path.lexists(path):
+            raise WeightsError(f"{path} exists already; name another place with --out, or overwrite it with --force")
+
+
 def save_weights(path: Path, network: FieldNetwork, metrics: dict[str, Any], provenance: dict[str, Any]) -> None:
     tensors = {name: value.detach().float().cpu().contiguous() for name, value in network.state_dict().items()}
     metadata = {
@@ -142,9 +149,12 @@ def export(
     method: str = "holod",
     benches: Path | None = None,
     benches_method: str = "",
+    force: bool = False,
 ) -> Path:
     """Writes `out`, for the engines, from a run's checkpoint or a weights file, with what an `evaluate` and an
-    `across-benches` found of it; raises WeightsError, also for a network of a family that they do not run."""
+    `across-benches` found of it; raises WeightsError, also for a network of a family that they do not run, and for a
+    file that is there already without `force`."""
+    refuse_existing([out], force)
     if source.suffix == ".pt":
         network, metrics, provenance = _from_checkpoint(source)
     elif is_old(source):

@@ -15,7 +15,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from holod_training.config import ENGINE_ARCHITECTURES, NetworkConfig, OpticsConfig
-from holod_training.export import check_takes_pictures, load_weights, save_weights, write_beside
+from holod_training.export import check_takes_pictures, load_weights, refuse_existing, save_weights, write_beside
 from holod_training.golden_evaluation import write_evaluation
 from holod_training.network import AdjustableLayer, FieldNetwork, Trunk
 from holod_training.optics import (
@@ -165,10 +165,21 @@ def write_vectors(path: Path, result: dict[str, Tensor], about: dict[str, Any]) 
 
 
 def write_golden(
-    out: Path, standard: Path | None, small: Path | None = None, fast: Path | None = None, seed: int = 20
+    out: Path,
+    standard: Path | None,
+    small: Path | None = None,
+    fast: Path | None = None,
+    seed: int = 20,
+    force: bool = False,
 ) -> list[Path]:
     """Writes every golden file into `out`; `standard`, `small` and `fast` are the weights that the product has, and a
-    file of another family's in their place goes. Raises WeightsError."""
+    file of another family's in their place goes. Raises WeightsError, also where such a file is there already without
+    `force`."""
+    shipped_as = [(suffix, path) for suffix, path in (("", standard), ("-small", small), ("-fast", fast)) if path]
+    names = [f"{name}{kind}" for name in NARROW for kind in (".weights", "")]
+    names += [f"{family}-shipped{suffix}" for suffix, _ in shipped_as for family in ENGINE_ARCHITECTURES]
+    names += ["evaluation"] if standard else []
+    refuse_existing([out / f"{name}.safetensors" for name in names], force)
     written = []
     for name, (config, height, width, pupil_mm, optics) in NARROW.items():
         weights = out / f"{name}.weights.safetensors"
@@ -181,9 +192,7 @@ def write_golden(
         about = {"seed": seed, "weights": weights.name, "optics": dataclasses.asdict(optics)}
         write_vectors(out / f"{name}.safetensors", result, about)
         written += [weights, out / f"{name}.safetensors"]
-    for suffix, shipped in (("", standard), ("-small", small), ("-fast", fast)):
-        if not shipped:
-            continue
+    for suffix, shipped in shipped_as:
         built_in = load_weights(shipped)
         check_takes_pictures(built_in.config, shipped)
         family = built_in.config.architecture

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 from torch import Tensor
 
 from holod_training.config import OpticsConfig
@@ -41,16 +41,17 @@ def find_pairs(folder: Path) -> list[tuple[Path, Path]]:
 
 
 def read_image(path: Path, mode: str | None = None) -> Tensor:
-    """The file's values as they are, float32, or converted to a mode of Pillow's."""
+    """The file's values, float32, turned by its EXIF orientation; as they are, or converted to a mode of Pillow's."""
     try:
         with Image.open(path) as image:
-            return torch.from_numpy(np.array(image if mode is None else image.convert(mode)).astype(np.float32))
+            turned = ImageOps.exif_transpose(image)
+            return torch.from_numpy(np.array(turned if mode is None else turned.convert(mode)).astype(np.float32))
     except (OSError, SyntaxError) as error:
         raise RgbdError(f"{path}: not a readable picture ({error})") from error
 
 
 def read_pair(colour: Path, depth: Path, optics: OpticsConfig) -> tuple[Tensor, Tensor]:
-    """Linear light [3, H, W] and normalised depth [H, W]; depth in millimetres, 0 = missing, filled from around it.
+    """Linear light [3, H, W] and normalised depth [H, W]; depth in millimetres, 0 = missing, filled as holod does.
 
     Odd sizes lose their last row or column; what lies outside the bench's depth volume is put on its near or far end.
     """

@@ -62,3 +62,29 @@ def test_another_network_is_refused(files: dict[str, str], capsys) -> None:
 def test_one_file_has_no_mean(files: dict[str, str], capsys) -> None:
     assert main(["average", "--weights", files["first"], "1", "--out", files["mean"]]) != 0
     assert "found 1 file(s)" in capsys.readouterr().err
+
+
+def test_what_is_there_is_overwritten_by_force_only(files: dict[str, str], tmp_path: Path, capsys) -> None:
+    """One's own trial in the place of the built-in weights would be holod's `standard` at its next build."""
+    mean = Path(files["mean"])
+    parts = ["--weights", files["first"], "0.5", "--weights", files["second"], "0.5"]
+    for command in (["average", *parts], ["export", "--source", files["first"]]):
+        mean.write_bytes(b"shipped")
+        assert main([*command, "--out", files["mean"]]) == 65
+        told = f"error: {mean} exists already; name another place with --out, or overwrite it with --force\n"
+        assert capsys.readouterr().err == told
+        assert mean.read_bytes() == b"shipped"
+        assert main([*command, "--out", files["mean"], "--force"]) == 0
+        load_weights(mean)
+    mean.unlink()
+    mean.symlink_to(tmp_path / "nowhere")
+    assert main(["export", "--source", files["first"], "--out", files["mean"]]) == 65
+    golden = ["golden", "--out", str(tmp_path / "golden")]
+    (tmp_path / "golden").mkdir()
+    vector = tmp_path / "golden" / "focal-stack-narrow.safetensors"
+    vector.write_bytes(b"committed")
+    assert main(golden) == 65
+    assert capsys.readouterr().err.splitlines()[-1].startswith(f"error: {vector} exists already; ")
+    assert [*vector.parent.iterdir()] == [vector] and vector.read_bytes() == b"committed"
+    assert main([*golden, "--force"]) == 0
+    assert vector.stat().st_size > 1000

@@ -42,20 +42,43 @@ def test_edges_move_by_one_pixel() -> None:
     assert torch.equal(right[:, 4:7], depth[:, 3:6]) and torch.equal(down[4:7], depth[3:6])
 
 
-def test_holes_are_filled_from_their_rims() -> None:
-    depth = torch.linspace(0, 1, 40).expand(30, 40).contiguous()
-    missing = torch.zeros(30, 40, dtype=torch.bool)
-    missing[8:20, 10:22] = True
-    filled = fill_holes(depth, missing)
-    assert torch.equal(filled[~missing], depth[~missing])
-    error = (filled - depth)[missing].abs()
-    assert 0.01 < error.max() < 0.2
-    poisoned = torch.where(missing, torch.tensor(7.0), depth)
-    assert torch.equal(fill_holes(poisoned, missing), filled)
-    step, hole = torch.full((7, 7), 4.0), torch.zeros(7, 7, dtype=torch.bool)
-    step[:, 4:], hole[2:5, 1:4] = 8.0, True
-    across = fill_holes(step, hole)
-    assert (across[3, 1], across[3, 3]) == (4, 8) and 4 < across[3, 2] < 8
+def filled_one_by_one(depth: torch.Tensor, missing: torch.Tensor) -> torch.Tensor:
+    """holod's rule (`fill_missing` of `model/src/scene/depth.rs`), pixel by pixel."""
+    filled, missing = depth.clone(), missing.clone()
+    height, width = depth.shape
+    while missing.any():
+        known, seen = filled.clone(), missing.clone()
+        for y, x in missing.nonzero().tolist():
+            ways = (
+                [(y, k) for k in range(x - 1, -1, -1)],
+                [(y, k) for k in range(x + 1, width)],
+                [(k, x) for k in range(y - 1, -1, -1)],
+                [(k, x) for k in range(y + 1, height)],
+            )
+            nearest = [next((known[at] for at in way if not missing[at]), None) for way in ways]
+            if found := [value for value in nearest if value is not None]:
+                filled[y, x], seen[y, x] = min(found), False
+        missing = seen
+    return filled
+
+
+def test_holes_take_the_farther_side_as_holod_fills_them() -> None:
+    row, hole = torch.tensor([[2.0, 7.0, 7.0, 0.5, 7.0]]), torch.tensor([[0, 1, 1, 0, 1]]) > 0
+    assert fill_holes(row, hole).tolist() == [[2, 0.5, 0.5, 0.5, 0.5]]
+    assert fill_holes(row.T, hole.T).tolist() == [[2], [0.5], [0.5], [0.5], [0.5]]
+    corner = torch.full((3, 3), torch.nan)
+    corner[2, 2] = 1.5
+    assert fill_holes(corner, corner.isnan()).tolist() == [[1.5] * 3] * 3
+    generator = torch.Generator().manual_seed(4)
+    for share in (0.1, 0.6, 0.97):
+        depth = torch.rand(13, 17, generator=generator)
+        missing = torch.rand(13, 17, generator=generator) < share
+        poisoned = torch.where(missing, torch.tensor(-7.0), depth)
+        filled = fill_holes(poisoned, missing)
+        assert torch.equal(filled, filled_one_by_one(depth, missing)) and torch.equal(filled[~missing], depth[~missing])
+    wrong = missing.clone()
+    wrong[tuple((~missing).nonzero()[0])] = True
+    assert not torch.equal(fill_holes(depth, wrong), filled)
     flat = torch.full((5, 5), 0.3)
     torch.testing.assert_close(fill_holes(flat, torch.eye(5) > 0), flat)
     assert fill_holes(flat, torch.ones(5, 5) > 0).abs().max() == 0

@@ -472,7 +472,7 @@ def test_export_stamps_the_constant_and_the_evaluation(
     metadata = read_metadata(out)
     assert metadata["config"].amplitude_constant == 1.25 and metadata["metrics"] == {}
     # What was judged at another constant, or is of other weights, is none of its figures.
-    judged = ["--evaluation", str(evaluation / "out" / "evaluation.json")]
+    judged = ["--evaluation", str(evaluation / "out" / "evaluation.json"), "--force"]
     capsys.readouterr()
     assert main(["export", *arguments, *judged]) == 65
     assert "amplitude_constant: found 1.4, expected 1.25, that of the file to write" in capsys.readouterr().err
@@ -495,7 +495,8 @@ def test_export_stamps_the_constant_and_the_evaluation(
     before, after = load_weights(evaluation / "w.safetensors").state_dict(), load_weights(out).state_dict()
     assert all(torch.equal(before[name], after[name]) for name in before)
     for constant in ("0", "inf", "nan"):
-        assert main(["export", *arguments[:4], "--amplitude-constant", constant]) == 65
+        assert main(["export", *arguments[:4], "--amplitude-constant", constant, "--force"]) == 65
+        assert "amplitude constant: found" in capsys.readouterr().err
     for method in ("layered ASM", "nobody"):
         assert main(["export", *arguments, "--evaluation-method", method]) == 65
     also = ["--source", str(evaluation / "deeper.safetensors"), "--out", str(out), *judged]

@@ -118,7 +118,10 @@ def test_shipped_weights_have_files_named_for_them(tmp_path: Path) -> None:
     stale, other = (tmp_path / "out" / f"direct-shipped{suffix}.safetensors" for suffix in ("-small", ""))
     for path in (stale, other):
         write_beside(path, b"")
-    files = write_golden(tmp_path / "out", None, shipped)
+    with pytest.raises(WeightsError, match=r"direct-shipped-small\.safetensors exists already; .* with --force"):
+        write_golden(tmp_path / "out", None, shipped)
+    assert sorted((tmp_path / "out").iterdir()) == [stale, other], "nothing was written"
+    files = write_golden(tmp_path / "out", None, shipped, force=True)
     assert files[-1] == tmp_path / "out" / "expected-stack-shipped-small.safetensors"
     assert other.exists() and not stale.exists()
     written = load_file(files[-1]).keys()

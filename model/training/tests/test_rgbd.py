@@ -3,7 +3,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+import torch
+from PIL import ExifTags, Image
 
 from holod_training.config import OpticsConfig
 from holod_training.rgbd import RgbdError, find_pairs, read_pair, read_pictures
@@ -31,6 +32,42 @@ def test_a_pair_becomes_linear_light_and_dioptres(tmp_path: Path) -> None:
     assert depth[2, 0] == depth[0, 0] == pytest.approx(1 / OPTICS.depth_near_dpt)
     assert depth[0, 5] == 1
     assert find_pairs(tmp_path) == [(tmp_path / "rgb" / "a.png", tmp_path / "depth" / "a.png")]
+
+
+def test_holes_take_the_farther_side_as_holod_fills_them(tmp_path: Path) -> None:
+    """Background that a nearer edge hides from the camera is background."""
+    millimetres = np.full((6, 8), 500)
+    millimetres[:, 4:], millimetres[:, 2:4] = 2000, 0
+    _, depth = read_pair(*write_pair(tmp_path, millimetres), OPTICS)
+    assert torch.equal(depth[:, 2:4], depth[:, 4:6]) and not torch.equal(depth[:, 2:4], depth[:, :2])
+
+
+def test_each_picture_is_turned_by_its_own_orientation(tmp_path: Path) -> None:
+    """A telephone's JPEG lies on its side and says so; holod turns it."""
+    colour, depth = write_pair(tmp_path, np.full((4, 6), 1000))
+    on_its_side = Image.new("RGB", (6, 4), (0, 0, 0))
+    on_its_side.paste((255, 255, 255), (0, 0, 3, 2))
+    turned = Image.Exif()
+    turned[ExifTags.Base.Orientation] = 6
+    on_its_side.save(colour, exif=turned)
+    with pytest.raises(RgbdError, match=r"shape \[4, 6\], expected one channel of \[6, 4\]"):
+        read_pair(colour, depth, OPTICS)
+    millimetres = np.full((6, 4), 1000, "uint16")
+    millimetres[:3, 2:] = 500
+    Image.fromarray(millimetres).save(depth)
+    image, upright = read_pair(colour, depth, OPTICS)
+    near = upright > upright.min()
+    assert near.sum() == 6 and torch.equal(image[0] > 0.5, near)
+    # A wrong turn is noticed.
+    turned[ExifTags.Base.Orientation] = 8
+    on_its_side.save(colour, exif=turned)
+    assert not torch.equal(read_pair(colour, depth, OPTICS)[0][0] > 0.5, near)
+    Image.fromarray(np.rot90(millimetres).copy()).save(depth, exif=Image.Exif())
+    with pytest.raises(RgbdError, match=r"shape \[4, 6\], expected one channel of \[6, 4\]"):
+        read_pair(colour, depth, OPTICS)
+    turned[ExifTags.Base.Orientation] = 6
+    Image.fromarray(np.rot90(millimetres).copy()).save(depth, exif=turned)
+    assert torch.equal(read_pair(colour, depth, OPTICS)[1], upright)
 
 
 def test_what_is_wrong_is_said(tmp_path: Path) -> None:

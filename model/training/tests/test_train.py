@@ -859,7 +859,7 @@ def test_what_cannot_be_written_or_read_is_an_error_not_a_traceback(
     source = tmp_path / "source.safetensors"
     save_weights(source, DirectNetwork(TINY), {}, {})
     (tmp_path / "folder").mkdir()
-    assert main(["export", "--source", str(source), "--out", str(tmp_path / "folder")]) == 65
+    assert main(["export", "--source", str(source), "--out", str(tmp_path / "folder"), "--force"]) == 65
     assert capsys.readouterr().err == f"error: {tmp_path / 'folder'}: Is a directory\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["folder", "source.safetensors"]
     assert main(["export", "--source", str(source), "--out", str(source / "below")]) == 65
