@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use holod_calibration::rig::{Eye, Tracker, WeightsChoice};
+use holod_calibration::rig::{DEPTH_DPT, Eye, Tracker, WeightsChoice};
 use holod_calibration::toml_source::did_you_mean;
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_model::scene::Fit;
@@ -822,15 +822,16 @@ fn parse_focus(text: &str) -> Result<Dioptres, String> {
     focus_of_an_eye(dpt)
 }
 
-/// A focus that an eye can have, with glasses or without.
+/// A focus that an eye can have, with glasses or without, as near as a rig may show anything.
 ///
 /// # Errors
 /// What was found, and the range, in dioptres.
 pub fn focus_of_an_eye(dpt: f64) -> Result<Dioptres, String> {
-    if (-1.0..=10.0).contains(&dpt) {
+    let nearest_dpt = DEPTH_DPT.max;
+    if (-1.0..=nearest_dpt).contains(&dpt) {
         Ok(Dioptres(dpt))
     } else {
-        Err(format!("found {dpt} dpt, expected -1 to 10 dioptres (0 is infinity, 2.857 is 35 cm)"))
+        Err(format!("found {dpt} dpt, expected -1 to {nearest_dpt} dioptres (0 is infinity, 2.857 is 35 cm)"))
     }
 }
 
@@ -909,8 +910,12 @@ mod tests {
         assert_eq!([parse_scale("0.0001"), parse_scale("100")], [Ok(1e-4), Ok(100.0)]);
         let fault = "expected a number from 0.0001 to 100 mm per unit; 125 looks like micrometres: write 0.125";
         assert!(parse_scale("125").unwrap_err().contains(fault), "{:?}", parse_scale("125"));
-        for bad in ["inf", "nan", "near", "40"] {
+        for bad in ["inf", "nan", "near", "40", "20.1", "-1.1"] {
             assert!(parse_focus(bad).is_err(), "{bad}");
+        }
+        // Whatever depth a rig may have.
+        for (text, focus_dpt) in [("20", DEPTH_DPT.max), ("10.5", 10.5), ("0", DEPTH_DPT.min), ("-1", -1.0)] {
+            assert_eq!(parse_focus(text), Ok(Dioptres(focus_dpt)), "{text}");
         }
         assert_eq!(parse_resolution("640x480").unwrap(), Resolution { width: 640, height: 480 });
     }

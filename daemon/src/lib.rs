@@ -15,6 +15,7 @@ mod fault;
 mod local_socket;
 pub mod logging;
 mod machine;
+pub mod made_with;
 mod memory;
 mod overwriting;
 pub mod page;

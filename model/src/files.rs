@@ -6,6 +6,7 @@ use std::fmt;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
+use holod_calibration::rig::{DEPTH_DPT, FOCAL_LENGTH, PITCH, Provenance, Span, WAVELENGTH};
 use holod_calibration::{
     Colour, Dioptres, DisplayGeometry, Metres, PerColour, PupilDiameter, Resolution, write_atomically,
 };
@@ -14,12 +15,15 @@ use num_complex::Complex32;
 use safetensors::{Dtype, SafeTensors};
 use serde::{Deserialize, Serialize};
 
+use crate::engine::WIDEST_PUPIL;
 use crate::picture::srgb8;
 use crate::safetensors_file::{self, Tensor};
 use crate::{ComplexHologram, LinearImage, PhasePattern};
 
 /// The value of the metadata key `format` of a hologram file.
 const FORMAT: &str = "holod-hologram-1";
+/// The value of the metadata key `rig_hash` of a hologram of the built-in rig, which has no file.
+const BUILT_IN_RIG: &str = "built-in";
 /// Larger hologram files are refused: this is more than an 8K frame takes.
 const LARGEST_FILE_BYTES: u64 = 1 << 30;
 
@@ -34,6 +38,48 @@ pub struct StoredHologram {
     pub optics: BenchOptics,
     /// Amplitude that double phase maps to 1.
     pub amplitude_constant: f32,
+    /// The rig that it was made with; nothing where the file is of a holod that did not say.
+    pub rig: Option<RigHash>,
+}
+
+/// Which rig a hologram was made with.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum RigHash {
+    /// The built-in one.
+    BuiltIn,
+    /// That of a file, whose text has this hash in hexadecimal digits.
+    File(String),
+}
+
+impl RigHash {
+    /// That of a rig.
+    pub fn of(provenance: &Provenance) -> Self {
+        provenance.hash_text().map_or(Self::BuiltIn, Self::File)
+    }
+
+    fn parse(text: &str) -> Option<Self> {
+        let is_hash = text.len() == 16 && text.bytes().all(|byte| matches!(byte, b'0'..=b'9' | b'a'..=b'f'));
+        match text {
+            BUILT_IN_RIG => Some(Self::BuiltIn),
+            _ => is_hash.then(|| Self::File(text.to_owned())),
+        }
+    }
+
+    fn text(&self) -> &str {
+        match self {
+            Self::BuiltIn => BUILT_IN_RIG,
+            Self::File(hash) => hash,
+        }
+    }
+}
+
+impl fmt::Display for RigHash {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::BuiltIn => f.write_str("the built-in rig"),
+            Self::File(hash) => write!(f, "the rig file of hash {hash}"),
+        }
+    }
 }
 
 /// The optics of a bench, as files state them.
@@ -74,6 +120,22 @@ impl BenchOptics {
             depth_far_dpt: geometry.depth_far.0,
             depth_near_dpt: geometry.depth_near.0,
         }
+    }
+
+    /// The first figure that no rig file may have: what is found, and what is expected.
+    fn fault(&self) -> Option<(String, String)> {
+        let [red_nm, green_nm, blue_nm] = self.wavelengths_nm;
+        let figures: [(&str, f64, Span); 7] = [
+            ("wavelengths_nm", red_nm, WAVELENGTH),
+            ("wavelengths_nm", green_nm, WAVELENGTH),
+            ("wavelengths_nm", blue_nm, WAVELENGTH),
+            ("pixel_pitch_um", self.pixel_pitch_um, PITCH),
+            ("eyepiece_focal_length_mm", self.eyepiece_focal_length_mm, FOCAL_LENGTH),
+            ("depth_far_dpt", self.depth_far_dpt, DEPTH_DPT),
+            ("depth_near_dpt", self.depth_near_dpt, DEPTH_DPT),
+        ];
+        let (key, figure, span) = figures.into_iter().find(|(_, figure, span)| !span.takes(*figure))?;
+        Some((format!("{figure} in `{key}` of `optics`"), span.expected()))
     }
 
     /// Whether an eye sees the same of a hologram through both: all but the depth range, with which holograms are made
@@ -121,7 +183,7 @@ pub enum FileError {
 
 impl StoredHologram {
     /// Writes a safetensors file: `field` [3, height, width, 2] (real, imaginary) in F32, and in the metadata format,
-    /// pupil_mm, amplitude_constant and optics (JSON).
+    /// pupil_mm, amplitude_constant, optics (JSON) and rig_hash (`built-in`, or hexadecimal digits).
     pub fn save(&self, path: &Path) -> Result<(), FileError> {
         let Resolution { width, height } = self.hologram.resolution;
         let bytes: Vec<u8> =
@@ -131,12 +193,13 @@ impl StoredHologram {
             found: error.to_string(),
             expected: "optics that JSON can hold".into(),
         })?;
-        let metadata = BTreeMap::from([
+        let mut metadata = BTreeMap::from([
             ("format".to_owned(), FORMAT.to_owned()),
             ("pupil_mm".to_owned(), self.pupil.mm().to_string()),
             ("amplitude_constant".to_owned(), self.amplitude_constant.to_string()),
             ("optics".to_owned(), optics),
         ]);
+        metadata.extend(self.rig.as_ref().map(|rig| ("rig_hash".to_owned(), rig.text().to_owned())));
         let field =
             Tensor { name: "field".to_owned(), dtype: Dtype::F32, shape: vec![3, height, width, 2], bytes: &bytes };
         write_atomically(path, |out| safetensors_file::write(out, vec![field], &metadata))
@@ -168,17 +231,32 @@ impl StoredHologram {
                 .map(String::as_str)
                 .ok_or_else(|| content(format!("no metadata `{key}`"), "a hologram file"))
         };
-        let positive = |key: &str| -> Result<f32, FileError> {
+        let number = |key: &str, is_taken: &dyn Fn(f32) -> bool, expected: &str| -> Result<f32, FileError> {
             let text = entry(key)?;
-            let number = text.parse().ok().filter(|number: &f32| *number > 0.0 && number.is_finite());
-            number.ok_or_else(|| content(format!("`{key}` = {text}"), "a positive number"))
+            let number = text.parse().ok().filter(|&number| is_taken(number));
+            number.ok_or_else(|| content(format!("`{key}` = {text}"), expected))
         };
         if entry("format")? != FORMAT {
             return Err(content(format!("format \"{}\"", entry("format")?), &format!("\"{FORMAT}\"")));
         }
-        let optics = serde_json::from_str(entry("optics")?).map_err(|error| {
+        let optics: BenchOptics = serde_json::from_str(entry("optics")?).map_err(|error| {
             content(format!("`optics` that cannot be used ({error})"), "the hologram's optics as JSON")
         })?;
+        if let Some((found, expected)) = optics.fault() {
+            return Err(content(found, &expected));
+        }
+        let widest_mm = WIDEST_PUPIL.mm();
+        let is_pupil = |mm| mm > 0.0 && mm <= widest_mm;
+        let pupil_mm = number("pupil_mm", &is_pupil, &format!("a diameter above 0 and up to {widest_mm} mm"))?;
+        // Double phase multiplies by its reciprocal, which of the smallest numbers is infinite.
+        let is_constant = |constant: f32| constant > 0.0 && constant.is_finite() && constant.recip().is_finite();
+        let amplitude_constant =
+            number("amplitude_constant", &is_constant, "a number above 0 whose reciprocal is finite")?;
+        let rig = entries.get("rig_hash").map(|text| {
+            let expected = "the hash of a rig file, 16 hexadecimal digits, or `built-in`";
+            RigHash::parse(text).ok_or_else(|| content(format!("`rig_hash` = {text}"), expected))
+        });
+        let rig = rig.transpose()?;
 
         let view = tensors.tensor("field").map_err(|_| content("no tensor `field`".into(), "the field"))?;
         let &[3, height, width, 2] = view.shape() else {
@@ -190,19 +268,20 @@ impl StoredHologram {
                 "F32 and at least one pixel",
             ));
         }
-        let number = |bytes: &[u8; 8]| {
+        let sample = |bytes: &[u8; 8]| {
             let [a, b, c, d, e, f, g, h] = *bytes;
             Complex32::new(f32::from_le_bytes([a, b, c, d]), f32::from_le_bytes([e, f, g, h]))
         };
-        let field: Vec<_> = view.data().as_chunks().0.iter().map(number).collect();
+        let field: Vec<_> = view.data().as_chunks().0.iter().map(sample).collect();
         if let Some(index) = field.iter().position(|value| !value.is_finite()) {
             return Err(content(format!("{} at index {index} of `field`", field[index]), "finite values"));
         }
         Ok(Self {
             hologram: ComplexHologram { resolution: Resolution { width, height }, field },
-            pupil: PupilDiameter::from_mm(positive("pupil_mm")?),
+            pupil: PupilDiameter::from_mm(pupil_mm),
             optics,
-            amplitude_constant: positive("amplitude_constant")?,
+            amplitude_constant,
+            rig,
         })
     }
 }
@@ -263,6 +342,7 @@ mod tests {
             pupil: PupilDiameter::from_mm(3.25),
             optics: BenchOptics::of(&DisplayGeometry::DEFAULT),
             amplitude_constant: 1.4,
+            rig: Some(RigHash::File("00c0ffee00c0ffee".into())),
         }
     }
 
@@ -270,9 +350,50 @@ mod tests {
     fn a_hologram_round_trips_and_leaves_nothing_beside_it() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("field.safetensors");
-        hologram().save(&path).unwrap();
-        assert_eq!(StoredHologram::load(&path).unwrap(), hologram());
+        // A file of a holod that did not write the rig's hash has none.
+        for rig in [hologram().rig, Some(RigHash::BuiltIn), None] {
+            let stored = StoredHologram { rig, ..hologram() };
+            stored.save(&path).unwrap();
+            assert_eq!(StoredHologram::load(&path).unwrap(), stored);
+        }
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn what_no_rig_and_no_eye_could_have_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("field.safetensors");
+        let refusal = |spoil: &dyn Fn(&mut StoredHologram)| {
+            let mut stored = hologram();
+            spoil(&mut stored);
+            stored.save(&path).unwrap();
+            StoredHologram::load(&path).err().map(|error| error.to_string())
+        };
+        assert_eq!(refusal(&|_| {}), None);
+        type Spoil = fn(&mut StoredHologram);
+        let cases: [(Spoil, &str, &str); 11] = [
+            (|h| h.optics.pixel_pitch_um = 0.0, "0 in `pixel_pitch_um` of `optics`", "from 1 to 50 µm"),
+            (|h| h.optics.eyepiece_focal_length_mm = -40.0, "-40 in `eyepiece_focal_length_mm`", "from 5 to 500 mm"),
+            (|h| h.optics.wavelengths_nm[0] = 0.0, "0 in `wavelengths_nm`", "from 380 to 780 nm"),
+            (|h| h.optics.wavelengths_nm[2] = 4500.0, "4500 in `wavelengths_nm`", "from 380 to 780 nm"),
+            (|h| h.optics.depth_far_dpt = -1.0, "-1 in `depth_far_dpt`", "from 0 to 20 dioptres"),
+            (|h| h.optics.depth_near_dpt = 21.0, "21 in `depth_near_dpt`", "from 0 to 20 dioptres"),
+            (|h| h.pupil = PupilDiameter::from_mm(1e9), "`pupil_mm` = 1000000000", "above 0 and up to 20 mm"),
+            (|h| h.pupil = PupilDiameter::from_mm(0.0), "`pupil_mm` = 0", "above 0 and up to 20 mm"),
+            (|h| h.amplitude_constant = 1e-42, "`amplitude_constant` = 0.00", "whose reciprocal is finite"),
+            (|h| h.amplitude_constant = f32::INFINITY, "`amplitude_constant` = inf", "whose reciprocal is finite"),
+            (|h| h.rig = Some(RigHash::File("c0ffee".into())), "`rig_hash` = c0ffee", "16 hexadecimal digits"),
+        ];
+        for (spoil, found, expected) in cases {
+            let said = refusal(&spoil).unwrap_or_else(|| panic!("{found} is taken"));
+            assert!(said.contains(found) && said.contains(expected) && said.contains("holod render"), "{said}");
+        }
+        let ends: Spoil = |h| {
+            h.optics.depth_near_dpt = 20.0;
+            h.pupil = WIDEST_PUPIL;
+            h.amplitude_constant = 3e-39;
+        };
+        assert_eq!(refusal(&ends), None, "the ends of the spans are taken");
     }
 
     #[test]

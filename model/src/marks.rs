@@ -2,6 +2,8 @@
 //!
 //! Looked at on the scenes of [`SceneKind::Marks`](crate::scene_renderer::SceneKind::Marks).
 
+use holod_calibration::Colour;
+
 use crate::LinearImage;
 use crate::neighbourhood::any_within;
 
@@ -32,10 +34,10 @@ impl DarkArea {
         (inside.iter().filter(|&&inside| inside).count() >= FEWEST_PX).then_some(Self { inside })
     }
 
-    /// Mean light in it, over the pictures and colours of a stack of the size that it was found in; white is 1.
-    pub fn mean_light(&self, stack: &[LinearImage]) -> f64 {
+    /// Mean light in it, over the pictures of a stack of the size that it was found in and over `colours`; white is 1.
+    pub fn mean_light(&self, stack: &[LinearImage], colours: &[Colour]) -> f64 {
         let (mut sum, mut count) = (0.0, 0usize);
-        for plane in stack.iter().flat_map(|picture| picture.pixels.chunks_exact(self.inside.len())) {
+        for plane in stack.iter().flat_map(|picture| colours.iter().map(|&colour| picture.plane(colour))) {
             for (&light, _) in plane.iter().zip(&self.inside).filter(|(_, inside)| **inside) {
                 sum += f64::from(light);
                 count += 1;
@@ -84,15 +86,17 @@ mod tests {
             let (x, y) = (index % SIZE.width, index / SIZE.width);
             assert_eq!(*inside, !((4..=38).contains(&x) && (14..=46).contains(&y)), "({x}, {y})");
         }
-        assert_eq!(area.mean_light(&target), 0.0);
+        assert_eq!(area.mean_light(&target, &Colour::ALL), 0.0);
         let mut seen = target.clone();
         seen[1].pixels[0] = 0.3;
         let dark_px = area.inside.iter().filter(|inside| **inside).count();
-        let mean = area.mean_light(&seen);
+        let mean = area.mean_light(&seen, &Colour::ALL);
         assert!((mean - 0.3 / (6 * dark_px) as f64).abs() < 1e-9, "{mean}");
+        let red = area.mean_light(&seen, &[Colour::Red]);
+        assert!((red - 3.0 * mean).abs() < 1e-9 && area.mean_light(&seen, &[Colour::Blue]) == 0.0, "{red}");
         // What is beside a mark is none of it.
         seen[1].pixels[SIZE.pixels() + 30 * SIZE.width + 25] = 1.0;
-        assert_eq!(area.mean_light(&seen), mean);
+        assert_eq!(area.mean_light(&seen, &Colour::ALL), mean);
     }
 
     #[test]

@@ -20,30 +20,46 @@ const OUT_OF_FOCUS_COC_PX: f64 = 8.0;
 /// A stack whose squared changes with focus sum to no more does not change.
 const NO_CHANGE: f64 = 1e-12;
 
-/// Peak signal-to-noise ratio in dB with peak 1, over all colours, leaving out `border_px` at each edge; infinite for
-/// equal pictures.
-pub fn psnr_db(actual: &LinearImage, expected: &LinearImage, border_px: usize) -> f64 {
+/// What of pictures is judged.
+#[derive(Clone, Copy, Debug)]
+pub struct Part<'a> {
+    /// These colours, at least one.
+    pub colours: &'a [Colour],
+    /// Without so many pixels at each edge.
+    pub border_px: usize,
+}
+
+impl Part<'_> {
+    /// All colours, without `border_px` at each edge.
+    pub fn inside(border_px: usize) -> Self {
+        Self { colours: &Colour::ALL, border_px }
+    }
+}
+
+/// Peak signal-to-noise ratio in dB with peak 1, over all colours of `part`; infinite for equal pictures.
+pub fn psnr_db(actual: &LinearImage, expected: &LinearImage, part: Part<'_>) -> f64 {
     assert_same_size(actual, expected);
-    stack_psnr_db(std::slice::from_ref(actual), std::slice::from_ref(expected), border_px)
+    stack_psnr_db(std::slice::from_ref(actual), std::slice::from_ref(expected), part)
 }
 
 /// [`psnr_db`] over all pictures of a stack together.
-pub fn stack_psnr_db(actual: &[LinearImage], expected: &[LinearImage], border_px: usize) -> f64 {
+pub fn stack_psnr_db(actual: &[LinearImage], expected: &[LinearImage], part: Part<'_>) -> f64 {
     assert_same_length(actual, expected);
     let mut error = SquaredError::default();
     for (actual, expected) in actual.iter().zip(expected) {
         assert_same_size(actual, expected);
-        for_each_inside(actual.resolution, border_px, |index| {
+        for_each_inside(actual.resolution, part, |index| {
             error.add(actual.pixels[index], expected.pixels[index]);
         });
     }
     error.psnr_db()
 }
 
-/// Structural similarity with an 11x11 Gaussian window of σ = 1.5 that lies wholly inside the picture, mean over pixels
-/// and colours, leaving out `border_px` at each edge. `None` where no window fits.
-pub fn ssim(actual: &LinearImage, expected: &LinearImage, border_px: usize) -> Option<f64> {
+/// Structural similarity with an 11x11 Gaussian window of σ = 1.5 that lies wholly inside `part`, mean over pixels and
+/// colours. `None` where no window fits.
+pub fn ssim(actual: &LinearImage, expected: &LinearImage, part: Part<'_>) -> Option<f64> {
     assert_same_size(actual, expected);
+    let Part { colours, border_px } = part;
     let Resolution { width, height } = actual.resolution;
     let (inner_width, inner_height) = (width.checked_sub(2 * border_px)?, height.checked_sub(2 * border_px)?);
     if inner_width < SSIM_WINDOW || inner_height < SSIM_WINDOW {
@@ -53,7 +69,7 @@ pub fn ssim(actual: &LinearImage, expected: &LinearImage, border_px: usize) -> O
         let rows = plane.chunks_exact(width).skip(border_px).take(inner_height);
         rows.flat_map(|row| &row[border_px..][..inner_width]).map(|&value| f64::from(value)).collect()
     };
-    let mean_of_planes = Colour::ALL.par_iter().map(|&colour| {
+    let mean_of_planes = colours.par_iter().map(|&colour| {
         let (x, y) = (inner(actual.plane(colour)), inner(expected.plane(colour)));
         let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).collect::<Vec<_>>();
         let windowed = |plane: &[f64]| gaussian_means(plane, inner_width);
@@ -68,7 +84,7 @@ pub fn ssim(actual: &LinearImage, expected: &LinearImage, border_px: usize) -> O
         });
         similarity.sum::<f64>() / mean_x.len() as f64
     });
-    Some(mean_of_planes.sum::<f64>() / 3.0)
+    Some(mean_of_planes.sum::<f64>() / colours.len() as f64)
 }
 
 /// Sum of squared differences of neighbouring pixels, along x and y, over all colours and the rectangle of `columns`
@@ -115,7 +131,7 @@ pub struct StackScore {
 }
 
 /// Judges the pictures `actual` against `expected`, seen by an eye with `pupil` at each of `focuses`, of a scene whose
-/// normalised depth [height, width] is `depth_normalised`; `border_px` at each edge are left out.
+/// normalised depth [height, width] is `depth_normalised`.
 pub fn score_stack(
     actual: &[LinearImage],
     expected: &[LinearImage],
@@ -123,7 +139,7 @@ pub fn score_stack(
     depth_normalised: &[f32],
     geometry: &DisplayGeometry,
     pupil: PupilDiameter,
-    border_px: usize,
+    part: Part<'_>,
 ) -> StackScore {
     let planes = expected.len();
     assert_same_length(actual, expected);
@@ -136,7 +152,7 @@ pub fn score_stack(
     let (mut all, mut sharp, mut blurred, mut flat) =
         (SquaredError::default(), SquaredError::default(), SquaredError::default(), SquaredError::default());
     let (mut cross, mut actual_energy, mut expected_energy) = (0.0f64, 0.0f64, 0.0f64);
-    for_each_inside(resolution, border_px, |index| {
+    for_each_inside(resolution, part, |index| {
         let mean = |stack: &[LinearImage]| {
             stack.iter().map(|image| f64::from(image.pixels[index])).sum::<f64>() / planes as f64
         };
@@ -161,9 +177,9 @@ pub fn score_stack(
     let refocuses = expected_energy > NO_CHANGE;
     let correlation = if actual_energy > NO_CHANGE { cross / (actual_energy * expected_energy).sqrt() } else { 0.0 };
     let ssims: Option<Vec<f64>> =
-        actual.par_iter().zip(expected).map(|(actual, expected)| ssim(actual, expected, border_px)).collect();
+        actual.par_iter().zip(expected).map(|(actual, expected)| ssim(actual, expected, part)).collect();
     let foam = (0..planes).into_par_iter().map(|plane| {
-        Foam::of(&actual[plane], &expected[plane], border_px, |index| {
+        Foam::of(&actual[plane], &expected[plane], part, |index| {
             let depth = geometry.depth_at(depth_normalised[index].into());
             geometry.coc_px(pupil, depth, focuses[plane]) > OUT_OF_FOCUS_COC_PX
         })
@@ -206,10 +222,11 @@ fn assert_same_size(actual: &LinearImage, expected: &LinearImage) {
     assert_eq!(actual.resolution, expected.resolution, "pictures that are compared have one size");
 }
 
-/// Calls `visit` with each index into [3, height, width] that is not in the border.
-fn for_each_inside(resolution: Resolution, border_px: usize, mut visit: impl FnMut(usize)) {
+/// Calls `visit` with each index into [3, height, width] that is in `part`.
+fn for_each_inside(resolution: Resolution, part: Part<'_>, mut visit: impl FnMut(usize)) {
     let Resolution { width, height } = resolution;
-    for colour in 0..3 {
+    let Part { colours, border_px } = part;
+    for colour in colours.iter().map(|colour| colour.index()) {
         for y in border_px..height.saturating_sub(border_px) {
             for x in border_px..width.saturating_sub(border_px) {
                 visit((colour * height + y) * width + x);
@@ -253,24 +270,24 @@ mod tests {
     fn psnr_of_a_known_error() {
         let expected = image(8, 8, wave);
         let actual = image(8, 8, |index| wave(index) + 0.01);
-        assert!((psnr_db(&actual, &expected, 0) - 40.0).abs() < 1e-3);
-        assert_eq!(psnr_db(&expected, &expected, 2), f64::INFINITY);
+        assert!((psnr_db(&actual, &expected, Part::inside(0)) - 40.0).abs() < 1e-3);
+        assert_eq!(psnr_db(&expected, &expected, Part::inside(2)), f64::INFINITY);
         let mut spoiled = expected.clone();
         spoiled.pixels[0] += 1.0;
-        assert!((psnr_db(&spoiled, &expected, 0) - 10.0 * 192f64.log10()).abs() < 1e-4);
-        assert_eq!(psnr_db(&spoiled, &expected, 1), f64::INFINITY, "the border is left out");
+        assert!((psnr_db(&spoiled, &expected, Part::inside(0)) - 10.0 * 192f64.log10()).abs() < 1e-4);
+        assert_eq!(psnr_db(&spoiled, &expected, Part::inside(1)), f64::INFINITY, "the border is left out");
     }
 
     #[test]
     fn ssim_is_one_for_equals_and_follows_its_formula_for_constants() {
         let expected = image(24, 20, wave);
-        assert!((ssim(&expected, &expected, 2).unwrap() - 1.0).abs() < 1e-12);
+        assert!((ssim(&expected, &expected, Part::inside(2)).unwrap() - 1.0).abs() < 1e-12);
         let (dark, light) = (image(16, 16, |_| 0.25), image(16, 16, |_| 0.75));
         let formula = (2.0 * 0.25 * 0.75 + 1e-4) / (0.25f64.powi(2) + 0.75f64.powi(2) + 1e-4);
-        assert!((ssim(&dark, &light, 0).unwrap() - formula).abs() < 1e-9);
+        assert!((ssim(&dark, &light, Part::inside(0)).unwrap() - formula).abs() < 1e-9);
         let inverted = image(24, 20, |index| 1.0 - wave(index));
-        assert!(ssim(&inverted, &expected, 0).unwrap() < 0.0);
-        assert_eq!(ssim(&dark, &light, 3), None);
+        assert!(ssim(&inverted, &expected, Part::inside(0)).unwrap() < 0.0);
+        assert_eq!(ssim(&dark, &light, Part::inside(3)), None);
     }
 
     #[test]
@@ -291,7 +308,7 @@ mod tests {
     fn score(actual: &[LinearImage], expected: &[LinearImage]) -> StackScore {
         let focuses = [0.0, 1.0, 2.5].map(Dioptres);
         let pupil = PupilDiameter::from_mm(4.0);
-        score_stack(actual, expected, &focuses, &[0.0; 100], &DisplayGeometry::DEFAULT, pupil, 1)
+        score_stack(actual, expected, &focuses, &[0.0; 100], &DisplayGeometry::DEFAULT, pupil, Part::inside(1))
     }
 
     #[test]
@@ -302,7 +319,7 @@ mod tests {
         let (slope, correlation) = response(&flat_score);
         assert!(slope.abs() < 1e-6 && correlation.abs() < 1e-6);
         assert!((flat_score.psnr_db - flat_score.flat_oracle_psnr_db).abs() < 1e-3);
-        assert_eq!(flat_score.in_focus_psnr_db.unwrap(), psnr_db(&flat[0], &target[0], 1));
+        assert_eq!(flat_score.in_focus_psnr_db.unwrap(), psnr_db(&flat[0], &target[0], Part::inside(1)));
         let perfect = score(&target, &target);
         let (slope, correlation) = response(&perfect);
         assert!((slope - 1.0).abs() < 1e-9 && (correlation - 1.0).abs() < 1e-9);
@@ -313,13 +330,55 @@ mod tests {
     fn a_stacks_psnr_and_ssim_are_over_all_its_planes() {
         let expected = [image(24, 20, wave), image(24, 20, |index| 0.5 * wave(index))];
         let brighter = [image(24, 20, |index| wave(index) + 0.02), expected[1].clone()];
-        assert!((stack_psnr_db(&brighter, &expected, 1) - 10.0 * (2.0 / 4e-4f64).log10()).abs() < 1e-3);
+        assert!((stack_psnr_db(&brighter, &expected, Part::inside(1)) - 10.0 * (2.0 / 4e-4f64).log10()).abs() < 1e-3);
         let (depth, pupil) = ([0.0; 480], PupilDiameter::from_mm(3.0));
         let focuses = [0.0, 2.0].map(Dioptres);
-        let judged = score_stack(&brighter, &expected, &focuses, &depth, &DisplayGeometry::DEFAULT, pupil, 1);
-        assert!((judged.psnr_db - stack_psnr_db(&brighter, &expected, 1)).abs() < 1e-9);
-        let mean = 0.5 * (ssim(&brighter[0], &expected[0], 1).unwrap() + 1.0);
+        let judged =
+            score_stack(&brighter, &expected, &focuses, &depth, &DisplayGeometry::DEFAULT, pupil, Part::inside(1));
+        assert!((judged.psnr_db - stack_psnr_db(&brighter, &expected, Part::inside(1))).abs() < 1e-9);
+        let mean = 0.5 * (ssim(&brighter[0], &expected[0], Part::inside(1)).unwrap() + 1.0);
         assert!((judged.ssim.unwrap() - mean).abs() < 1e-12 && mean < 0.9999);
+    }
+
+    #[test]
+    fn colours_that_do_not_count_change_no_figure() {
+        let size = Resolution { width: 96, height: 80 };
+        let wavy = |scale: f32| image(size.width, size.height, |index| scale * wave(index));
+        let (target, seen) = ([wavy(1.0), wavy(0.8)], [wavy(0.95), wavy(0.9)]);
+        // Near enough that all is out of focus through a wide pupil.
+        let (depth, pupil) = (vec![1.0; size.pixels()], PupilDiameter::from_mm(8.0));
+        let focuses = [0.0, 0.5].map(Dioptres);
+        let judged = |seen: &[LinearImage], target: &[LinearImage], colours: &[Colour]| {
+            let part = Part { colours, border_px: 2 };
+            score_stack(seen, target, &focuses, &depth, &DisplayGeometry::DEFAULT, pupil, part)
+        };
+        let painted = |stack: &[LinearImage; 2], colour: Colour, light: f32| {
+            stack.clone().map(|mut picture| {
+                picture.plane_mut(colour).fill(light);
+                picture
+            })
+        };
+        let green = judged(&seen, &target, &[Colour::Green]);
+        let in_all = judged(&seen, &target, &Colour::ALL);
+        assert!(green.foam.is_some() && green.ssim.is_some() && green.psnr_db.is_finite(), "{green:?}");
+        assert_ne!(green, in_all);
+        let dark = painted(&painted(&seen, Colour::Red, 0.0), Colour::Blue, 0.0);
+        assert_eq!(judged(&dark, &target, &[Colour::Green]), green);
+        assert_ne!(judged(&dark, &target, &Colour::ALL), in_all);
+        let other = painted(&seen, Colour::Green, 0.5);
+        assert_ne!(judged(&other, &target, &[Colour::Green]), green, "the comparison is blind");
+        // Three colours alike are as one of them.
+        let grey = |stack: &[LinearImage; 2]| {
+            stack.clone().map(|mut picture| {
+                let plane = picture.plane(Colour::Green).to_vec();
+                Colour::ALL.iter().for_each(|&colour| picture.plane_mut(colour).copy_from_slice(&plane));
+                picture
+            })
+        };
+        let (of_three, of_one) = (judged(&grey(&seen), &grey(&target), &Colour::ALL), green);
+        let close = |a: Option<f64>, b: Option<f64>| (a.unwrap() - b.unwrap()).abs() < 1e-9;
+        assert!(close(Some(of_three.psnr_db), Some(of_one.psnr_db)) && close(of_three.ssim, of_one.ssim));
+        assert!(close(of_three.foam, of_one.foam) && close(of_three.focus_slope, of_one.focus_slope));
     }
 
     #[test]

@@ -72,6 +72,7 @@ pub struct SceneShard {
     data_start: u64,
     resolution: Resolution,
     kind: String,
+    seed: u64,
     index: u64,
     pupils: Vec<PupilDiameter>,
     focuses: Vec<Dioptres>,
@@ -142,12 +143,14 @@ impl SceneShard {
             entries.require_tensor(&format!("stack_{number}"), Dtype::F16, &[focus_dpt.len(), 3, height, width])?;
         }
         let kind = entries.text("kind")?.to_owned();
+        let seed = entries.parsed("seed", "the number that scenes were drawn with")?;
         let index = entries.parsed("index", "a scene's number")?;
         Ok(Self {
             path: path.to_owned(),
             data_start,
             resolution,
             kind,
+            seed,
             index,
             pupils: pupils_mm.into_iter().map(|pupil_mm| PupilDiameter::from_mm(pupil_mm as f32)).collect(),
             focuses: focus_dpt.into_iter().map(Dioptres).collect(),
@@ -168,6 +171,11 @@ impl SceneShard {
     /// What the scene is for: `train`, `test`, `cards` or `marks`.
     pub fn kind(&self) -> &str {
         &self.kind
+    }
+
+    /// The seed that the scene was drawn with.
+    pub fn seed(&self) -> u64 {
+        self.seed
     }
 
     /// The scene's number among those of its seed.

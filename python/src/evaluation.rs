@@ -19,8 +19,9 @@ use crate::rig::Rig;
 /// judged.
 ///
 /// Returns the dict that `holod evaluate --json` prints: "rows" (PSNR, slope, correlation, SSIM for each pupil, each
-/// with its "mean" and "ci95_half_width"), "matrix", "refocus", "marks". Takes minutes; other threads of Python run
-/// meanwhile, and Ctrl-C ends it after a scene.
+/// with its "mean" and "ci95_half_width"), "matrix", "refocus", "marks"; "colours" are those that were judged, which the
+/// rig's panel shows and its lasers light. Takes minutes; other threads of Python run meanwhile, and Ctrl-C ends it
+/// after a scene.
 ///
 /// Raises InputError, RigError, UnavailableError; warns (HolodWarning) of what the weights were not trained for.
 #[pyfunction]

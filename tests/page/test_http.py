@@ -153,7 +153,7 @@ def test_a_pattern_is_seen_in_place_of_the_hologram(start: Start) -> None:
 @pytest.mark.parametrize(
     ("path", "status", "said"),
     [
-        ("/eye.png?focus_dpt=NaN", 400, "focus_dpt: found NaN dpt, expected -1 to 10"),
+        ("/eye.png?focus_dpt=NaN", 400, "focus_dpt: found NaN dpt, expected -1 to 20"),
         ("/eye.png?focus_dpt=99", 400, "focus_dpt: found 99 dpt"),
         ("/eye.png?pupil_mm=30", 400, "pupil_mm: found 30 mm, expected a human pupil"),
         ("/eye.png?focus=1", 400, "unknown field `focus`"),

@@ -3,6 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use holod_calibration::rig::Rig;
 use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
 use holod_model::scene_renderer::SceneKind;
 use holod_model::scene_renderer::shard::{PlanePlan, PupilPlan, ShardPlan, file_name};
@@ -43,17 +44,40 @@ fn entry(bytes: &[u8], key: &str) -> Value {
     serde_json::from_str(header(bytes).0["__metadata__"][key].as_str().unwrap()).unwrap()
 }
 
-/// Evaluates the golden scene whose file is `bytes`, as scene and as cards, with the weights and border that it names.
-fn evaluated(bytes: &[u8]) -> Value {
+/// The shard `bytes` with other entries in its metadata.
+fn with_entries(bytes: &[u8], entries: &[(&str, &str)]) -> Vec<u8> {
+    let (mut changed, start) = header(bytes);
+    for (key, value) in entries {
+        changed["__metadata__"][key] = (*value).into();
+    }
+    let mut text = serde_json::to_vec(&changed).unwrap();
+    text.resize(text.len().next_multiple_of(8), b' ');
+    [&(text.len() as u64).to_le_bytes()[..], &text, &bytes[start..]].concat()
+}
+
+/// Writes a shard as the only one of a new folder.
+fn write_alone(folder: PathBuf, bytes: &[u8]) {
+    fs::create_dir(&folder).unwrap();
+    fs::write(folder.join(file_name(0)), bytes).unwrap();
+}
+
+/// Evaluates the golden scene whose file is `bytes`, as scene and as cards, with the weights and border that it names,
+/// on the built-in rig or on that of `more`.
+fn evaluated_with(bytes: &[u8], more: &[&str]) -> Value {
     let folder = holod_tests::new_folder();
-    fs::write(folder.path().join(file_name(0)), bytes).unwrap();
+    write_alone(folder.path().join("scenes"), bytes);
+    write_alone(folder.path().join("cards"), &with_entries(bytes, &[("kind", "cards")]));
     let weights = model().join("weights").join(entry(bytes, "weights").as_str().unwrap());
     let border_px = entry(bytes, "border_px").to_string();
-    let args = ["evaluate", "--scenes", ".", "--cards", ".", "--border-px", &border_px, "--json", "--backend", "cpu"];
-    let args = [&args[..], &["--weights", weights.to_str().unwrap()]].concat();
+    let args = ["evaluate", "--scenes", "scenes", "--cards", "cards", "--border-px", &border_px, "--backend", "cpu"];
+    let args = [&args[..], &["--json", "--weights", weights.to_str().unwrap()], more].concat();
     let ended = run(HOLOD, &args, folder.path());
     assert!(ended.status.success(), "{ended:?}");
     serde_json::from_str(&ended.stdout).unwrap()
+}
+
+fn evaluated(bytes: &[u8]) -> Value {
+    evaluated_with(bytes, &[])
 }
 
 /// Every figure in which `evaluated` is not what the trainer `found`.
@@ -119,6 +143,80 @@ fn the_trainers_evaluation_finds_the_same() {
     assert!(wrong.iter().any(|what| what.starts_with("psnr_db at 2")), "{wrong:?}");
 }
 
+/// The built-in rig with each colour's laser at so many milliwatts.
+fn rig_with_powers(powers_mw: [f64; 3]) -> String {
+    let rig = Rig::BUILT_IN_TOML;
+    let line = rig.lines().find(|line| line.starts_with("power_mw")).expect("the rig has powers");
+    let [red, green, blue] = powers_mw;
+    rig.replace(line, &format!("power_mw = {{ red = {red:?}, green = {green:?}, blue = {blue:?} }}"))
+}
+
+#[test]
+fn colours_without_light_are_not_judged() {
+    let golden = fs::read(model().join("golden/evaluation.safetensors")).unwrap();
+    let folder = holod_tests::new_folder();
+    let rig = folder.path().join("rig.toml");
+    let on_rig = |powers_mw, bytes: &[u8]| {
+        fs::write(&rig, rig_with_powers(powers_mw)).unwrap();
+        evaluated_with(bytes, &["--config", rig.to_str().unwrap()])
+    };
+    let all = evaluated(&golden);
+    assert_eq!(all["colours"], serde_json::json!(["red", "green", "blue"]));
+    let figures = |of: &Value| -> Vec<f64> {
+        let row = &of["rows"][0];
+        ["psnr_db", "ssim", "foam", "flat_oracle_psnr_db", "clipped_share"]
+            .map(|figure| row[figure]["mean"].as_f64().unwrap())
+            .to_vec()
+    };
+    let alone = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|powers_mw| on_rig(powers_mw, &golden));
+    for (judged, name) in alone.iter().zip(["red", "green", "blue"]) {
+        assert_eq!(judged["colours"], serde_json::json!([name]));
+        // What is black would cost more than 10 dB.
+        let psnr_db = figures(judged)[0];
+        assert!((psnr_db - figures(&all)[0]).abs() < 5.0, "{name}: {psnr_db} dB");
+        for (row, of_all) in judged["refocus"].as_array().unwrap().iter().zip(all["refocus"].as_array().unwrap()) {
+            let [near, of_all] = [row, of_all].map(|row| row["near_card"].as_f64().unwrap());
+            assert!(near > 1.0 && (near / of_all).ln().abs() < 1.0, "{name}: {near} beside {of_all}");
+        }
+    }
+    // Over all colours each of these figures is the mean of the three, PSNR that of the squared errors.
+    let mean = |of: &dyn Fn(&Value) -> f64| alone.iter().map(of).sum::<f64>() / 3.0;
+    for (number, figure) in figures(&all).into_iter().enumerate() {
+        let is_db = [0, 3].contains(&number);
+        let of_three = match is_db {
+            true => -10.0 * mean(&|judged| 10f64.powf(-0.1 * figures(judged)[number])).log10(),
+            false => mean(&|judged| figures(judged)[number]),
+        };
+        assert!((of_three - figure).abs() < 1e-4 * figure.abs().max(1e-3), "figure {number}: {of_three} for {figure}");
+    }
+    let dark = folder.path().join("scenes");
+    write_alone(dark, &golden);
+    fs::write(&rig, rig_with_powers([0.0; 3])).unwrap();
+    let ended = run(HOLOD, &["evaluate", "--config", "rig.toml", "--scenes", "scenes"], folder.path());
+    assert_eq!(ended.status.code(), Some(78), "{ended:?}");
+    for words in ["no colour that the panel shows and the lasers light", "lasers.power_mw"] {
+        assert!(ended.stderr.contains(words), "no '{words}' in {}", ended.stderr);
+    }
+}
+
+#[test]
+fn an_evaluation_says_what_computed_it_and_of_which_scenes() {
+    let golden = fs::read(model().join("golden/evaluation.safetensors")).unwrap();
+    let folder = holod_tests::new_folder();
+    let rig = folder.path().join("rig.toml");
+    fs::write(&rig, rig_with_powers([1.0; 3])).unwrap();
+    let file = evaluated_with(&golden, &["--config", rig.to_str().unwrap()]);
+    assert!(file["engine"].as_str().unwrap().starts_with("cpu, "), "{}", file["engine"]);
+    assert_eq!(file["weights"], entry(&golden, "weights"));
+    let hashes = ["weights_xxh3", "rig_hash"].map(|key| file[key].as_str().unwrap().to_owned());
+    assert!(hashes.iter().all(|hash| hash.len() == 16), "{hashes:?}");
+    let checked = run(HOLOD, &["check", "--config", "rig.toml"], folder.path());
+    assert!(checked.stdout.contains(&hashes[1]), "{} is not in {}", hashes[1], checked.stdout);
+    let set = |kind: &str| serde_json::json!([{ "kind": kind, "seed": entry(&golden, "seed"), "indices": [0] }]);
+    assert_eq!([&file["scene_sets"], &file["card_sets"]], [&set("test"), &set("cards")]);
+    assert_eq!(file["mark_sets"], serde_json::json!([]));
+}
+
 /// Renders `count` scenes of `kind` into `folder`.
 fn render(folder: &Path, kind: SceneKind, resolution: Resolution, count: u64) {
     render_for(DisplayGeometry::DEFAULT, folder, kind, resolution, count);
@@ -168,6 +266,9 @@ fn scenes_of_the_renderer_are_judged_told_and_written() {
 
     assert_eq!((&printed["scenes"], &printed["width_px"], &printed["height_px"]), (&2.into(), &64.into(), &48.into()));
     assert_eq!((&printed["panel_bit_depth"], &printed["border_px"]), (&8.into(), &8.into()));
+    assert_eq!((&printed["weights"], &printed["weights_xxh3"]), (&"standard".into(), &Value::Null));
+    assert_eq!((&printed["rig"], &printed["rig_hash"]), (&"built-in bench".into(), &Value::Null));
+    assert_eq!(printed["scene_sets"], serde_json::json!([{ "kind": "test", "seed": 11, "indices": [0, 1] }]));
     let rows = printed["rows"].as_array().unwrap();
     assert_eq!(rows.iter().map(|row| row["pupil_mm"].as_f64().unwrap()).collect::<Vec<_>>(), [2.0, 4.0]);
     for (number, row) in rows.iter().enumerate() {
@@ -188,7 +289,16 @@ fn scenes_of_the_renderer_are_judged_told_and_written() {
     assert_eq!((&one["scenes"], &one["rows"][0]["psnr_db"]["ci95_half_width"]), (&1.into(), &Value::Null));
 
     let told = with(&["--limit", "1"]);
-    for words in ["1 scenes of 64x48", "8-bit levels", "in focus", "foam", "flat oracle", "seen by another"] {
+    for words in [
+        "1 scenes of 64x48",
+        "judged in red, green, blue",
+        "computed by ",
+        "8-bit levels",
+        "in focus",
+        "foam",
+        "flat oracle",
+        "seen by another",
+    ] {
         assert!(told.contains(words), "no '{words}' in {told}");
     }
 }
@@ -293,6 +403,23 @@ fn cards_are_judged_on_a_bench_with_another_depth_range() {
     }
 }
 
+/// Scenes of other indices or seeds are others, whatever their files are called.
+#[test]
+fn scenes_of_two_seeds_are_judged_together() {
+    let folder = holod_tests::new_folder();
+    let scenes = folder.path().join("scenes");
+    render(&scenes, SceneKind::Test, SIZE, 1);
+    let first = fs::read(scenes.join(file_name(0))).unwrap();
+    fs::write(scenes.join(file_name(1)), with_entries(&first, &[("seed", "12")])).unwrap();
+    fs::write(scenes.join(file_name(2)), with_entries(&first, &[("index", "5")])).unwrap();
+    let args = ["evaluate", "--scenes", "scenes", "--border-px", "8", "--weights", "fast", "--json"];
+    let ended = run(HOLOD, &args, folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    let judged: Value = serde_json::from_str(&ended.stdout).unwrap();
+    let set = |seed: u64, indices: &[u64]| serde_json::json!({ "kind": "test", "seed": seed, "indices": indices });
+    assert_eq!(judged["scene_sets"], serde_json::json!([set(11, &[0, 5]), set(12, &[0])]));
+}
+
 #[test]
 fn each_bad_folder_gets_a_clear_error_and_leaves_nothing_behind() {
     let folder = holod_tests::new_folder();
@@ -305,7 +432,10 @@ fn each_bad_folder_gets_a_clear_error_and_leaves_nothing_behind() {
     let whole = fs::read(at("scenes").join(file_name(0))).unwrap();
     fs::write(at("cut").join(file_name(3)), &whole[..whole.len() / 2]).unwrap();
     fs::write(at("file"), "").unwrap();
-    let cases: [(&[&str], i32, &[&str]); 14] = [
+    fs::create_dir(at("twice")).unwrap();
+    fs::write(at("twice").join(file_name(0)), &whole).unwrap();
+    std::os::unix::fs::symlink("scene_000000.safetensors", at("twice").join(file_name(7))).unwrap();
+    let cases: [(&[&str], i32, &[&str]); 15] = [
         (&["--scenes", "nowhere"], 66, &["nowhere", "holod-scenes"]),
         (&["--scenes", "empty"], 66, &["empty", "scene_*.safetensors", "holod-scenes generate"]),
         (&["--scenes", "cut"], 65, &["cut/scene_000003.safetensors", "bytes", "holod-scenes generate"]),
@@ -314,7 +444,7 @@ fn each_bad_folder_gets_a_clear_error_and_leaves_nothing_behind() {
         (
             &["--scenes", "scenes", "--border-px", "8", "--cards", "scenes"],
             65,
-            &["scene_000000", "card", "--kind cards"],
+            &["scene_000000", "kind `test`", "--kind cards"],
         ),
         (
             &["--scenes", "scenes", "--border-px", "8", "--marks", "scenes"],
@@ -325,6 +455,11 @@ fn each_bad_folder_gets_a_clear_error_and_leaves_nothing_behind() {
             &["--scenes", "scenes", "--border-px", "8", "--marks", "small"],
             65,
             &["scene_000000", "no mark in 64x48", "96x120", "--kind marks"],
+        ),
+        (
+            &["--scenes", "twice", "--border-px", "8"],
+            65,
+            &["twice/scene_000007", "number 0 of seed 11, as in twice/scene_000000", "each scene once"],
         ),
         (&["--scenes", "learned"], 65, &["scene_000000", "`kind` is `train`", "held-out", "--kind test"]),
         (&["--scenes", "scenes", "--cards", "learned"], 65, &["scene_000000", "`kind` is `train`", "held-out"]),

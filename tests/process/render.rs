@@ -5,6 +5,7 @@ use std::path::Path;
 
 use holod_calibration::{Dioptres, PupilDiameter, Resolution};
 use holod_model::LinearImage;
+use holod_model::files::{BenchOptics, StoredHologram};
 use holod_model::scene::FocalStack;
 use holod_tests::daemon::run;
 use holod_tests::small_rig;
@@ -106,6 +107,72 @@ fn a_hologram_of_another_rig_is_looked_at_with_that_rig_only() {
     let warned = view(&[]);
     assert!(warned.status.success(), "{warned:?}");
     assert!(warned.stderr.contains("its own optics, 8 µm, f = 20 mm, "), "{}", warned.stderr);
+}
+
+#[test]
+fn a_hologram_of_another_rig_of_the_same_optics_is_looked_at_with_a_warning() {
+    let folder = holod_tests::new_folder();
+    let rig = small_rig(64, 64, "driver = \"simulated\"");
+    let turned = rig.replace("phase_sign = \"positive\"", "phase_sign = \"negative\"");
+    assert_ne!(turned, rig);
+    fs::write(folder.path().join("other.toml"), rig).unwrap();
+    fs::write(folder.path().join("turned.toml"), turned).unwrap();
+    let render = |out, rig: &[&str]| {
+        let args = ["render", "--resolution", "48x48", "--pupil", "3", "--weights", "fast", "--backend", "cpu"];
+        let ended = run(HOLOD, &[&args[..], &["--out", out], rig].concat(), folder.path());
+        assert!(ended.status.success(), "{ended:?}");
+    };
+    let turned = ["--config", "turned.toml"];
+    render("turned", &turned);
+    render("built-in", &[]);
+    let view = |hologram, rig: &[&str]| {
+        let args = ["view", "--hologram", hologram, "--focus", "1", "--out", "seen.png", "--force"];
+        let ended = run(HOLOD, &[&args[..], rig].concat(), folder.path());
+        assert!(ended.status.success(), "{ended:?}");
+        ended.stderr
+    };
+    let report: Value = serde_json::from_slice(&fs::read(folder.path().join("turned/report.json")).unwrap()).unwrap();
+    let hash = report["rig_hash"].as_str().unwrap();
+    for (hologram, rig, says) in [
+        ("turned", &turned[..], None),
+        ("built-in", &[], None),
+        ("turned", &[], Some(["panel and lasers of the built-in rig", "by --config FILE"])),
+        ("turned", &["--config", "other.toml"], Some(["panel and lasers of the rig file of hash", "by --config FILE"])),
+        ("built-in", &turned, Some(["made with the built-in rig", "leave --config out"])),
+    ] {
+        let said = view(hologram, rig);
+        match says {
+            None => assert!(!said.contains("it was made with"), "{said}"),
+            Some(says) => assert!(says.iter().all(|words| said.contains(words)), "{says:?} in {said}"),
+        }
+        let names_the_hash = said.contains(&format!("made with the rig file of hash {hash}"));
+        assert_eq!(names_the_hash, hologram == "turned" && says.is_some(), "{said}");
+    }
+}
+
+#[test]
+fn a_hologram_for_what_no_bench_has_is_refused() {
+    let folder = holod_tests::new_folder();
+    let args = ["render", "--resolution", "48x48", "--pupil", "3", "--weights", "fast", "--backend", "cpu"];
+    let ended = run(HOLOD, &[&args[..], &["--out", "made"]].concat(), folder.path());
+    assert!(ended.status.success(), "{ended:?}");
+    let path = folder.path().join("made/field.safetensors");
+    let whole = StoredHologram::load(&path).unwrap();
+    let view = |stored: StoredHologram| {
+        stored.save(&path).unwrap();
+        let args = ["view", "--hologram", "made", "--focus", "20", "--out", "seen.png", "--force"];
+        run(HOLOD, &args, folder.path())
+    };
+    let optics = BenchOptics { eyepiece_focal_length_mm: -40.0, ..whole.optics.clone() };
+    let refused = view(StoredHologram { optics, ..whole.clone() });
+    assert_eq!(refused.status.code(), Some(65), "{refused:?}");
+    for said in ["field.safetensors: -40 in `eyepiece_focal_length_mm`", "expected a number from 5 to 500 mm"] {
+        assert!(refused.stderr.contains(said), "`{said}` is not in: {}", refused.stderr);
+    }
+    let refused = view(StoredHologram { amplitude_constant: 1e-42, ..whole.clone() });
+    assert_eq!(refused.status.code(), Some(65), "{refused:?}");
+    assert!(refused.stderr.contains("`amplitude_constant`") && !refused.stderr.contains("panicked"), "{refused:?}");
+    assert!(view(whole).status.success());
 }
 
 #[test]

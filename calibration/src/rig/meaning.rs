@@ -219,7 +219,7 @@ impl Meaning {
         Self {
             name: rig.name.clone(),
             origin: rig.provenance.origin.clone(),
-            text_hash: rig.provenance.text_hash.map(|hash| format!("{hash:016x}")),
+            text_hash: rig.provenance.hash_text(),
             panel_profile: rig.provenance.panel_profile.map(str::to_owned),
             width_px: geometry.resolution.width,
             height_px: geometry.resolution.height,

@@ -17,7 +17,9 @@ use std::path::{Path, PathBuf};
 pub use drive::{LevelPhase, Orientation, OutOfStroke, Packing};
 pub use error::RigError;
 pub use meaning::{ActiveFile, BlurMeaning, FieldMeaning, LaserMeaning, Meaning, PerColourFigures, TrackerMeaning};
+pub use parse::{DEPTH_DPT, FOCAL_LENGTH, PITCH, WAVELENGTH};
 pub use profile::PanelProfile;
+pub use reader::Span;
 pub use text_laser::{Expected, Question, TextLaserProfile};
 
 use serde::{Deserialize, Serialize};
@@ -53,7 +55,7 @@ pub struct Rig {
 pub struct Provenance {
     /// The rig file as it was named; empty for the built-in rig.
     pub origin: String,
-    /// FNV-1a hash of the rig file's text.
+    /// FNV-1a hash of the rig file's text; none of the built-in rig.
     pub text_hash: Option<u64>,
     /// The panel profile that the rig file names.
     pub panel_profile: Option<&'static str>,
@@ -63,6 +65,13 @@ pub struct Provenance {
     pub flatness_files: PerColour<Option<PathBuf>>,
     /// The file behind the profile of lasers that take commands in text.
     pub laser_profile_file: Option<PathBuf>,
+}
+
+impl Provenance {
+    /// [`Self::text_hash`] as reports and files state it.
+    pub fn hash_text(&self) -> Option<String> {
+        self.text_hash.map(|hash| format!("{hash:016x}"))
+    }
 }
 
 /// A panel's rate may be off the rig's by this share: beyond, its fields are not as long as the rig says.

@@ -103,18 +103,23 @@ const PROFILE_KEYS: [&str; 10] = [
 
 const PIXELS: Span = Span::new(64.0, 16384.0, "px");
 const MARGIN: Span = Span::new(0.0, 16384.0, "px");
-const PITCH: Span = Span::new(1.0, 50.0, "µm").slips(&[("metres", 1e6), ("millimetres", 1e3), ("nanometres", 1e-3)]);
+/// What `panel.pixel_pitch_um` may be.
+pub const PITCH: Span =
+    Span::new(1.0, 50.0, "µm").slips(&[("metres", 1e6), ("millimetres", 1e3), ("nanometres", 1e-3)]);
 const REFRESH: Span = Span::new(10.0, 2000.0, "Hz").slips(&[("millihertz", 1e-3)]);
 const FRAMES_PER_COLOUR: Span = Span::new(1.0, 8.0, "video frames");
 const BIT_DEPTH: Span = Span::new(8.0, 16.0, "bits");
 const STROKE: Span = Span::new(0.5, 6.0, "π").slips(&[("radians", 1.0 / PI), ("degrees", 1.0 / 180.0)]);
 const GRAY_OF_2PI: Span = Span::new(16.0, 65536.0, "");
 const SETTLE: Span = Span::new(0.0, 100.0, "ms").slips(&[("microseconds", 1e-3)]);
-const WAVELENGTH: Span =
+/// What each colour's figure in `optics.wavelengths_nm` may be.
+pub const WAVELENGTH: Span =
     Span::new(380.0, 780.0, "nm").slips(&[("metres", 1e9), ("micrometres", 1e3), ("ångströms", 0.1)]);
-const FOCAL_LENGTH: Span = Span::new(5.0, 500.0, "mm").slips(&[("metres", 1e3), ("micrometres", 1e-3)]);
-const DEPTH_M: Span = Span::new(0.05, 100.0, "m").slips(&[("millimetres", 1e-3)]).or_infinite();
-const DEPTH_DPT: Span = Span::new(0.0, 20.0, "dioptres");
+/// What `optics.eyepiece_focal_length_mm` may be.
+pub const FOCAL_LENGTH: Span = Span::new(5.0, 500.0, "mm").slips(&[("metres", 1e3), ("micrometres", 1e-3)]);
+const DEPTH_M: Span = Span::new(1.0 / DEPTH_DPT.max, 100.0, "m").slips(&[("millimetres", 1e-3)]).or_infinite();
+/// What `optics.depth_far_dpt` and `optics.depth_near_dpt` may be.
+pub const DEPTH_DPT: Span = Span::new(0.0, 20.0, "dioptres");
 /// Below this a volume's two ends look alike to any eye.
 const DEPTH_RANGE_MIN_DPT: f64 = 0.1;
 const POWER: Span = Span::new(0.0, Lasers::POWER_MAX_MW, "mW").slips(POWER_SLIPS);

@@ -7,12 +7,12 @@ use crate::toml_source::{Fault, TomlSource, describe, describe_unknown, did_you_
 use crate::{Colour, PerColour};
 
 /// The numbers that a key takes.
-#[derive(Clone, Copy)]
-pub(super) struct Span {
+#[derive(Clone, Copy, Debug)]
+pub struct Span {
     /// Smallest number taken.
-    pub(super) min: f64,
+    pub min: f64,
     /// Largest number taken.
-    pub(super) max: f64,
+    pub max: f64,
     /// The unit that the key's suffix names.
     pub(super) unit: &'static str,
     /// Units that are given by mistake, each with the factor that turns it into `unit`.
@@ -37,11 +37,13 @@ impl Span {
         Self { or_infinite: true, ..self }
     }
 
-    fn takes(&self, value: f64) -> bool {
+    /// Whether `value` is one of them.
+    pub fn takes(&self, value: f64) -> bool {
         (value >= self.min && value <= self.max) || (self.or_infinite && value == f64::INFINITY)
     }
 
-    fn expected(&self) -> String {
+    /// What is expected, for errors.
+    pub fn expected(&self) -> String {
         let gap = if self.unit.is_empty() { "" } else { " " };
         let infinite = if self.or_infinite { ", or inf" } else { "" };
         format!("a number from {} to {}{gap}{}{infinite}", self.min, self.max, self.unit)

@@ -10,6 +10,7 @@ use crate::evaluation::{
     SceneViews,
 };
 use crate::failure::Failure;
+use crate::made_with::MadeWith;
 use crate::pictures::{Sheet, Tile, screen_picture};
 use crate::staging::Staging;
 use crate::{results, setup};
@@ -96,25 +97,29 @@ fn sheet(evaluated: &Evaluated) -> Sheet {
         ]);
     }
     Sheet {
-        title: format!("What an eye sees of the panel's levels: weights {}", evaluation.weights),
+        title: format!("What an eye sees of the panel's levels: weights {}", evaluation.made_with.weights),
         rows,
         footer: vec!["Far and near: focused at the first and the last plane of the stack, or at the cards.".into()],
     }
 }
 
 fn table(evaluation: &Evaluation) -> String {
-    let Evaluation { scenes, border_px, panel_bit_depth, weights, .. } = evaluation;
+    let Evaluation { scenes, border_px, panel_bit_depth, made_with, engine, .. } = evaluation;
+    let MadeWith { weights, rig, .. } = made_with;
+    let colours: Vec<&str> = evaluation.colours.iter().map(|colour| colour.name()).collect();
     let size = Resolution { width: evaluation.width_px, height: evaluation.height_px };
     let focus = &evaluation.focus_dpt;
     let mut text = format!(
         "weights {weights} on {scenes} scenes of {size}, {} planes from {:.2} to {:.2} dpt, {panel_bit_depth}-bit levels; \
          a border of {border_px} px is left out\n\
+         rig {rig}, judged in {}; computed by {engine}\n\
          mean over scenes ± half of its confidence interval ({})\n\n\
          {:>8}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>11}\n\
          {:>8}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>11}\n",
         focus.len(),
         focus.iter().copied().fold(f64::INFINITY, f64::min),
         focus.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+        colours.join(", "),
         evaluation.confidence,
         "pupil",
         "PSNR",

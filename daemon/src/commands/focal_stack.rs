@@ -7,14 +7,15 @@ use holod_calibration::rig::Rig;
 use holod_calibration::{Dioptres, DisplayGeometry};
 use holod_model::ComplexHologram;
 use holod_model::engine::{EngineError, FocalStackEngine, Precision};
-use holod_model::files::{BenchOptics, StoredHologram};
+use holod_model::files::{self, BenchOptics, RigHash, StoredHologram};
 use holod_model::optics::{DoublePhase, PhasePattern};
 use holod_model::scene::FocalStackFiles;
 use serde::Serialize;
 
-use super::hologram_files::{FILES, MadeWith, save};
+use super::hologram_files::{FILES, save};
 use crate::cli::{Backend, RenderArgs};
 use crate::failure::{Exit, Failure};
+use crate::made_with::MadeWith;
 use crate::source::scene;
 use crate::staging::Staging;
 use crate::{progress, renderer, results, setup};
@@ -24,6 +25,8 @@ use crate::{progress, renderer, results, setup};
 struct Report {
     #[serde(flatten)]
     made_with: MadeWith,
+    /// What 2π would be in the PNGs of phases.
+    phase_png_2pi: u32,
     focal_stack: String,
     pupil_mm: f32,
     focus_dpt: Vec<f64>,
@@ -83,9 +86,12 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
     })?;
     let frame_ms = computing.elapsed().as_secs_f64() * 1e3;
     let optics = BenchOptics::of(&DisplayGeometry { resolution, ..rig.geometry });
-    save(&StoredHologram { hologram, pupil: stack.pupil, optics, amplitude_constant }, &pattern, &staging)?;
+    let made_for = Some(RigHash::of(&rig.provenance));
+    let stored = StoredHologram { hologram, pupil: stack.pupil, optics, amplitude_constant, rig: made_for };
+    save(&stored, &pattern, &staging)?;
     let report = Report {
-        made_with: MadeWith::of(rig),
+        made_with: MadeWith::of(rig)?,
+        phase_png_2pi: files::PHASE_LEVELS,
         pupil_mm: stack.pupil.mm(),
         focus_dpt: stack.focuses.iter().map(|&Dioptres(focus_dpt)| focus_dpt).collect(),
         width_px: resolution.width,

@@ -5,15 +5,16 @@ use std::time::Instant;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{DisplayGeometry, PupilDiameter};
-use holod_model::files::{BenchOptics, StoredHologram};
+use holod_model::files::{self, BenchOptics, RigHash, StoredHologram};
 use holod_model::refocus::{self, FAR_CARD, NEAR_CARD};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 use serde::Serialize;
 
 use super::focal_stack;
-use super::hologram_files::{FILES, MadeWith, save};
+use super::hologram_files::{FILES, save};
 use crate::cli::{Backend, RenderArgs, SceneArgs};
 use crate::failure::{Exit, Failure};
+use crate::made_with::MadeWith;
 use crate::progress;
 use crate::renderer::{self, Renderer, Use};
 use crate::source::scene;
@@ -25,6 +26,8 @@ use crate::{results, setup};
 pub(super) struct Report {
     #[serde(flatten)]
     made_with: MadeWith,
+    /// What 2π would be in the PNGs of phases.
+    phase_png_2pi: u32,
     scene: String,
     pupil_mm: f32,
     pub(super) width_px: usize,
@@ -67,6 +70,7 @@ pub(super) fn render(args: &RenderArgs) -> Result<(), Failure> {
         pupil,
         optics,
         amplitude_constant: report.amplitude_constant,
+        rig: Some(RigHash::of(&rig.provenance)),
     };
     save(&hologram, renderer.pattern().map_err(Failure::because(Exit::Unavailable))?, &staging)?;
     report.total_ms = began.elapsed().as_secs_f64() * 1e3;
@@ -143,7 +147,8 @@ pub(super) fn compute(
     let done = &frames.reports[0];
     let [depth_least_dpt, depth_greatest_dpt] = done.depth_range.map(|depth| rig.geometry.depth_at(f64::from(depth)).0);
     let report = Report {
-        made_with: MadeWith::of(rig),
+        made_with: MadeWith::of(rig)?,
+        phase_png_2pi: files::PHASE_LEVELS,
         scene: frames.name.clone(),
         pupil_mm: pupil.mm(),
         width_px: resolution.width,

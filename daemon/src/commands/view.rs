@@ -7,7 +7,7 @@ use std::path::Path;
 
 use holod_calibration::rig::Rig;
 use holod_calibration::{Colour, PerColour, PupilDiameter};
-use holod_model::files::{self, BenchOptics, StoredHologram};
+use holod_model::files::{self, BenchOptics, RigHash, StoredHologram};
 use holod_model::optics::{DoublePhase, Eye, PhasePattern, SimulatedEye};
 use holod_slm_output::LevelsFrame;
 use serde::Serialize;
@@ -57,7 +57,7 @@ pub(super) fn view(args: &ViewArgs) -> Result<(), Failure> {
         (Some(folder), _) => {
             let hologram = load(folder)?;
             check_fits(folder, &hologram, &rig)?;
-            check_optics(folder, &hologram.optics, &rig, args.rig.config.is_some())?;
+            check_made_for(folder, &hologram, &rig, args.rig.config.is_some())?;
             progress::during("computing the panel's levels", || of_hologram(&rig, hologram))?
         }
         (None, Some(pupil)) => of_scene(&rig, &args.scene, pupil, args.backend)?,
@@ -131,14 +131,25 @@ fn check_fits(folder: &Path, stored: &StoredHologram, rig: &Rig) -> Result<(), F
     ))
 }
 
-/// Refuses a hologram that was made for other optics than those of the rig file that was named. Without one its own
-/// hold, and only the panel is the built-in bench's.
-fn check_optics(folder: &Path, made_for: &BenchOptics, rig: &Rig, is_named: bool) -> Result<(), Failure> {
-    let bench = BenchOptics::of(&rig.geometry);
+/// Refuses a hologram that was made for other optics than those of the rig file that was named, and warns of another
+/// rig. Without one its own optics hold, and only the panel is the built-in bench's.
+fn check_made_for(folder: &Path, stored: &StoredHologram, rig: &Rig, is_named: bool) -> Result<(), Failure> {
+    let (made_for, bench) = (&stored.optics, BenchOptics::of(&rig.geometry));
+    let folder = folder.display();
     if made_for.shows_alike(&bench) {
+        let this = RigHash::of(&rig.provenance);
+        if let Some(made_with) = stored.rig.as_ref().filter(|made_with| **made_with != this) {
+            let remedy = match made_with {
+                RigHash::BuiltIn => "leave --config out",
+                RigHash::File(_) => "name the rig that it was made with by --config FILE",
+            };
+            tracing::warn!(
+                "--hologram {folder}: it was made with {made_with}, but is looked at with panel and lasers of {this}, \
+                 which may show it otherwise; {remedy}"
+            );
+        }
         return Ok(());
     }
-    let folder = folder.display();
     if is_named {
         return Err(Failure::new(
             Exit::Usage,
@@ -164,7 +175,7 @@ fn of_scene(rig: &Rig, scene: &SceneArgs, pupil: PupilDiameter, backend: Backend
 
 /// The phases that the panel shows of a hologram: double phase, the panel's levels, and what those levels show.
 fn of_hologram(rig: &Rig, stored: StoredHologram) -> Result<LookedAt, Failure> {
-    let StoredHologram { hologram, pupil, optics, amplitude_constant } = stored;
+    let StoredHologram { hologram, pupil, optics, amplitude_constant, .. } = stored;
     let mut pattern = PhasePattern::flat(hologram.resolution);
     DoublePhase::new(hologram.resolution, amplitude_constant).encode(&hologram, &mut pattern);
     let encoder = renderer::panel_encoder(rig, hologram.resolution)?;

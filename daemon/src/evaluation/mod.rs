@@ -3,7 +3,8 @@
 //!
 //! Each hologram goes network → double phase → levels of the rig's panel → the phases that these show → 4f stop, pupil
 //! and focus of a simulated eye. The scenes are pieces cut out of a wider view, so the eye takes the pattern as going
-//! on beyond its edges ([`SimulatedEye::repeating`]), as the trainer's own evaluation does.
+//! on beyond its edges ([`SimulatedEye::repeating`]), as the trainer's own evaluation does. Colours that the panel never
+//! shows, or the lasers never light, are black in pictures and in targets, and no figure counts them.
 
 mod plan;
 mod statistics;
@@ -11,9 +12,9 @@ mod statistics;
 use std::sync::Arc;
 
 use holod_calibration::rig::Rig;
-use holod_calibration::{Dioptres, DisplayGeometry, PupilDiameter, Resolution};
+use holod_calibration::{Colour, Dioptres, DisplayGeometry, PerColour, PupilDiameter, Resolution};
 use holod_model::marks::{self, DarkArea};
-use holod_model::metrics::{self, StackScore};
+use holod_model::metrics::{self, Part, StackScore};
 use holod_model::optics::{Eye, PhasePattern, SimulatedEye};
 use holod_model::refocus::{self, CardArea, FAR_CARD, NEAR_CARD};
 use holod_model::scene_renderer::{Marks, SceneKind};
@@ -22,7 +23,7 @@ use holod_model::{LinearImage, RgbdFrame, Weights};
 use holod_slm_output::{LevelsFrame, PanelEncoder};
 
 pub use plan::{
-    Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, MarksRow, MarksViews, Matrix, RefocusRow, Row,
+    Evaluated, Evaluation, EvaluationPlan, EvaluationSettings, MarksRow, MarksViews, Matrix, RefocusRow, Row, SceneSet,
     SceneViews,
 };
 pub use statistics::Estimate;
@@ -38,6 +39,9 @@ const HIGHEST_PSNR_DB: f64 = 120.0;
 /// Looks at scenes of one size through one bench.
 pub struct Judge {
     geometry: DisplayGeometry,
+    light: PerColour<f32>,
+    /// Those with light.
+    colours: Vec<Colour>,
     amplitude_constant: f32,
     border_px: usize,
     renderer: Box<dyn Renderer>,
@@ -52,7 +56,7 @@ pub struct JudgedScene {
     pub scores: Vec<StackScore>,
     /// PSNR of what is made for the pupil of the row and seen by the pupil of the column.
     pub matrix_psnr_db: Vec<Vec<f64>>,
-    /// For each pupil, the share of amplitudes above the double phase's constant.
+    /// For each pupil, the share of amplitudes above the double phase's constant, in the colours that are judged.
     pub clipped_share: Vec<f32>,
     /// For each pupil, the pictures at the farthest and at the nearest focus.
     pub views: Vec<EndViews>,
@@ -106,7 +110,7 @@ impl Judge {
     /// A judge of `weights` on `rig` for scenes of `resolution`, of which `border_px` at each edge are not judged.
     ///
     /// # Errors
-    /// Where the engine cannot be had, or the scenes do not fit on the panel.
+    /// Where the rig lights no colour, the engine cannot be had, or the scenes do not fit on the panel.
     pub fn new(
         rig: &Rig,
         weights: &Weights,
@@ -114,11 +118,14 @@ impl Judge {
         resolution: Resolution,
         border_px: usize,
     ) -> Result<Self, Failure> {
+        let colours = lit_colours(rig)?;
         let encoder = renderer::panel_encoder(rig, resolution)?;
         let renderer = renderer::open(backend, weights, rig, &encoder, &Use::Command)?;
         tracing::info!("holograms are computed by {}", renderer.description());
         Ok(Self {
             geometry: rig.geometry,
+            light: rig.light(),
+            colours,
             amplitude_constant: weights.config().amplitude_constant,
             border_px,
             renderer,
@@ -128,13 +135,17 @@ impl Judge {
         })
     }
 
+    /// How holograms are computed.
+    pub fn engine(&self) -> &str {
+        self.renderer.description()
+    }
+
     /// Judges a scene with the stacks `pupil_indices` of the shard, each made for its pupil and seen by every one.
     ///
     /// # Errors
     /// Where the shard cannot be read.
     pub fn scene(&mut self, shard: &SceneShard, pupil_indices: &[usize]) -> Result<JudgedScene, Failure> {
-        let unreadable = Failure::because(Exit::Data);
-        let frame = Arc::new(shard.frame().map_err(&unreadable)?);
+        let frame = Arc::new(shard.frame().map_err(Failure::because(Exit::Data))?);
         let pupils: Vec<PupilDiameter> = pupil_indices.iter().map(|&index| shard.pupils()[index]).collect();
         let mut shown = Vec::new();
         for &pupil in &pupils {
@@ -147,10 +158,10 @@ impl Judge {
             views: Vec::new(),
         };
         for (column, (&pupil, &index)) in pupils.iter().zip(pupil_indices).enumerate() {
-            let target = shard.stack(index).map_err(&unreadable)?;
+            let target = self.target(shard, index)?;
             for (row, (pattern, _)) in shown.iter().enumerate() {
                 let seen = self.look(pattern, pupil, shard.focuses());
-                let psnr_db = metrics::stack_psnr_db(&seen, &target, self.border_px).min(HIGHEST_PSNR_DB);
+                let psnr_db = metrics::stack_psnr_db(&seen, &target, self.part()).min(HIGHEST_PSNR_DB);
                 judged.matrix_psnr_db[row].push(psnr_db);
                 if row == column {
                     judged.scores.push(self.score(&seen, &target, shard, &frame, pupil));
@@ -161,26 +172,23 @@ impl Judge {
         Ok(judged)
     }
 
-    /// Judges how a scene of [`cards`](holod_model::scene_renderer::SceneKind::Cards) refocuses, and returns what each
-    /// pupil sees of it, focused near and far.
+    /// Judges how a scene of [`SceneKind::Cards`] refocuses, and returns what each pupil sees of it, focused near and
+    /// far.
     ///
     /// # Errors
-    /// Where the shard cannot be read or holds no cards.
+    /// Where the shard cannot be read, is of another kind or too small for cards.
     pub fn cards(
         &mut self,
         shard: &SceneShard,
         pupils: &[PupilDiameter],
     ) -> Result<Vec<(Refocus, [LinearImage; 2])>, Failure> {
+        require_kind(shard, SceneKind::Cards)?;
         let frame = Arc::new(shard.frame().map_err(Failure::because(Exit::Data))?);
         let depth_on_bench = |card: Dioptres| refocus::depth_on(&self.geometry, card);
         let area = |name: &str, card: Dioptres| {
             CardArea::find(&frame.depth_normalised, shard.resolution(), card, self.border_px).ok_or_else(|| {
-                let said = format!(
-                    "{}: found no {name} card at {:.2} dpt; expected a scene of `holod-scenes generate --kind cards`",
-                    shard.path().display(),
-                    depth_on_bench(card).0
-                );
-                Failure::new(Exit::Data, said)
+                let found = format!("no {name} card at {:.2} dpt in {}", depth_on_bench(card).0, shard.resolution());
+                wrong(shard, SceneKind::Cards, &found, "a larger scene")
             })
         };
         let (near, far) = (area("near", NEAR_CARD)?, area("far", FAR_CARD)?);
@@ -213,21 +221,12 @@ impl Judge {
         shard: &SceneShard,
         pupil_indices: &[usize],
     ) -> Result<Vec<(MarksLight, EndViews)>, Failure> {
-        let unreadable = Failure::because(Exit::Data);
-        let wrong = |found: &str, expected: &str| {
-            let said = format!(
-                "{}: found {found}; expected {expected} of `holod-scenes generate --kind marks`",
-                shard.path().display()
-            );
-            Failure::new(Exit::Data, said)
-        };
-        if shard.kind() != SceneKind::Marks.name() {
-            return Err(wrong(&format!("a scene of the kind `{}`", shard.kind()), "one"));
-        }
-        let frame = Arc::new(shard.frame().map_err(&unreadable)?);
+        require_kind(shard, SceneKind::Marks)?;
+        let wrong = |found: &str, expected: &str| wrong(shard, SceneKind::Marks, found, expected);
+        let frame = Arc::new(shard.frame().map_err(Failure::because(Exit::Data))?);
         let mut found = Vec::new();
         for &index in pupil_indices {
-            let target = shard.stack(index).map_err(&unreadable)?;
+            let target = self.target(shard, index)?;
             if !marks::is_lit(&target) {
                 return Err(wrong(&format!("no mark in {}", shard.resolution()), "a scene of 96x120 pixels or more"));
             }
@@ -240,7 +239,7 @@ impl Judge {
             let light = MarksLight {
                 marks: Marks::of_index(shard.index()),
                 light_ratio: marks::light_ratio(&seen, &target),
-                dark_mean: dark.mean_light(&seen),
+                dark_mean: dark.mean_light(&seen, &self.colours),
             };
             found.push((light, EndViews::of(&target, &seen)));
         }
@@ -249,9 +248,27 @@ impl Judge {
 
     /// The phases that the panel's levels show of the hologram of `frame` for `pupil`, and the share that was clipped.
     fn shown(&mut self, frame: &Arc<RgbdFrame>, pupil: PupilDiameter) -> Result<(PhasePattern, f32), Failure> {
-        let rendered =
-            self.renderer.render(frame, pupil, &mut self.levels).map_err(Failure::because(Exit::Unavailable))?;
-        Ok((shown_pattern(&self.encoder, &self.levels), rendered.clipped_share))
+        let unavailable = Failure::because(Exit::Unavailable);
+        self.renderer.render(frame, pupil, &mut self.levels).map_err(&unavailable)?;
+        let hologram = self.renderer.hologram().map_err(&unavailable)?;
+        let largest = self.amplitude_constant * self.amplitude_constant;
+        let clipped = |&colour: &Colour| hologram.plane(colour).iter().filter(|a| a.norm_sqr() > largest).count();
+        let clipped = self.colours.iter().map(clipped).sum::<usize>();
+        let clipped_share = clipped as f32 / (self.colours.len() * hologram.resolution.pixels()) as f32;
+        Ok((shown_pattern(&self.encoder, &self.levels), clipped_share))
+    }
+
+    /// Stack number `index` of a shard, black in colours without light.
+    fn target(&self, shard: &SceneShard, index: usize) -> Result<Vec<LinearImage>, Failure> {
+        let mut stack = shard.stack(index).map_err(Failure::because(Exit::Data))?;
+        for colour in Colour::ALL.into_iter().filter(|colour| !self.colours.contains(colour)) {
+            stack.iter_mut().for_each(|picture| picture.plane_mut(colour).fill(0.0));
+        }
+        Ok(stack)
+    }
+
+    fn part(&self) -> Part<'_> {
+        Part { colours: &self.colours, border_px: self.border_px }
     }
 
     fn look(&mut self, pattern: &PhasePattern, pupil: PupilDiameter, focuses: &[Dioptres]) -> Vec<LinearImage> {
@@ -259,7 +276,7 @@ impl Judge {
     }
 
     fn view(&mut self, pattern: &PhasePattern, eye: Eye) -> LinearImage {
-        self.eye.view(pattern, self.amplitude_constant, eye)
+        self.eye.view_weighted(pattern, self.amplitude_constant, eye, self.light)
     }
 
     fn score(
@@ -277,7 +294,7 @@ impl Judge {
             &frame.depth_normalised,
             &self.geometry,
             pupil,
-            self.border_px,
+            self.part(),
         );
         StackScore {
             psnr_db: score.psnr_db.min(HIGHEST_PSNR_DB),
@@ -287,4 +304,32 @@ impl Judge {
             ..score
         }
     }
+}
+
+/// The colours that the panel shows and the lasers light.
+fn lit_colours(rig: &Rig) -> Result<Vec<Colour>, Failure> {
+    let colours: Vec<Colour> =
+        rig.light().iter().filter(|(_, light)| **light > 0.0).map(|(colour, _)| colour).collect();
+    if colours.is_empty() {
+        let said = "found no colour that the panel shows and the lasers light, expected at least one to judge: in the \
+                    rig, give lasers.power_mw of a colour that the panel shows more than 0";
+        return Err(Failure::new(Exit::Config, said));
+    }
+    Ok(colours)
+}
+
+fn require_kind(shard: &SceneShard, kind: SceneKind) -> Result<(), Failure> {
+    if shard.kind() == kind.name() {
+        return Ok(());
+    }
+    Err(wrong(shard, kind, &format!("a scene of the kind `{}`", shard.kind()), "one"))
+}
+
+/// What is said of a shard that should hold a scene of `kind`.
+fn wrong(shard: &SceneShard, kind: SceneKind, found: &str, expected: &str) -> Failure {
+    let (path, kind) = (shard.path().display(), kind.name());
+    Failure::new(
+        Exit::Data,
+        format!("{path}: found {found}; expected {expected} of `holod-scenes generate --kind {kind}`"),
+    )
 }

@@ -1,18 +1,20 @@
 //! The judgement of weights on folders of scenes, from opening them to means over all.
 
+use std::collections::HashMap;
 use std::path::Path;
 
 use holod_calibration::rig::Rig;
-use holod_calibration::{DisplayGeometry, PupilDiameter};
+use holod_calibration::{Colour, DisplayGeometry, PupilDiameter};
 use holod_model::metrics::StackScore;
 use holod_model::scene_renderer::{Marks, SceneKind};
 use holod_model::scene_shard::{SceneShard, SceneShardError};
 use holod_model::{LinearImage, Weights};
 use serde::Serialize;
 
-use super::{EndViews, Estimate, Judge, JudgedScene, MarksLight, Refocus};
+use super::{EndViews, Estimate, Judge, JudgedScene, MarksLight, Refocus, lit_colours};
 use crate::cli::Backend;
 use crate::failure::{Exit, Failure};
+use crate::made_with::MadeWith;
 use crate::setup;
 
 /// SSIM's window must fit between the borders.
@@ -42,6 +44,8 @@ pub struct EvaluationSettings<'a> {
 /// Weights and scenes that are known to fit each other.
 pub struct EvaluationPlan<'a> {
     settings: EvaluationSettings<'a>,
+    made_with: MadeWith,
+    colours: Vec<Colour>,
     weights: Weights,
     shards: Vec<SceneShard>,
     cards: Vec<SceneShard>,
@@ -82,11 +86,22 @@ pub struct SceneViews {
 /// `evaluation.json`. Means are over scenes, of figures in each figure's own unit: dB are averaged as dB.
 #[derive(Serialize)]
 pub struct Evaluation {
-    /// The name of the weights.
-    pub weights: String,
+    /// Whose holograms were judged.
+    #[serde(flatten)]
+    pub made_with: MadeWith,
+    /// How they were computed.
+    pub engine: String,
+    /// The colours that were judged: those that the panel shows and the lasers light.
+    pub colours: Vec<Colour>,
     /// How many scenes were judged.
     pub scenes: usize,
-    /// Their width.
+    /// Which they were.
+    pub scene_sets: Vec<SceneSet>,
+    /// Which cards were judged.
+    pub card_sets: Vec<SceneSet>,
+    /// Which scenes of marks were judged.
+    pub mark_sets: Vec<SceneSet>,
+    /// Width of the scenes.
     pub width_px: usize,
     /// Their height.
     pub height_px: usize,
@@ -108,6 +123,17 @@ pub struct Evaluation {
     pub refocus: Vec<RefocusRow>,
     /// Light of bright marks on exact black.
     pub marks: Vec<MarksRow>,
+}
+
+/// Scenes of one kind and seed, as `holod-scenes generate` makes them.
+#[derive(Debug, PartialEq, Serialize)]
+pub struct SceneSet {
+    /// `test`, `cards` or `marks`.
+    pub kind: String,
+    /// The seed.
+    pub seed: u64,
+    /// The scenes' numbers, in the order in which they were judged.
+    pub indices: Vec<u64>,
 }
 
 /// One contrast of cards and one pupil, which the hologram is made for and which looks: means over scenes.
@@ -181,10 +207,13 @@ impl<'a> EvaluationPlan<'a> {
     /// Opens weights and scenes.
     ///
     /// # Errors
-    /// They cannot be read, do not fit each other or the panel, or lack a pupil that is asked for.
+    /// They cannot be read, do not fit each other or the panel, or lack a pupil that is asked for; or the rig lights no
+    /// colour.
     pub fn new(settings: EvaluationSettings<'a>) -> Result<Self, Failure> {
         let EvaluationSettings { rig, scenes, cards, marks, limit, .. } = settings;
+        let colours = lit_colours(rig)?;
         let weights = setup::weights(rig)?;
+        let made_with = MadeWith::of(rig)?;
         let shards = open(scenes, limit, rig)?;
         shards.iter().try_for_each(refuse_special)?;
         let cards = cards.map(|folder| open(folder, None, rig)).transpose()?.unwrap_or_default();
@@ -195,7 +224,7 @@ impl<'a> EvaluationPlan<'a> {
         for shard in [shards.first(), cards.first()].into_iter().flatten() {
             check_border(settings.border_px, shard)?;
         }
-        Ok(Self { settings, weights, shards, cards, marks, pupils })
+        Ok(Self { settings, made_with, colours, weights, shards, cards, marks, pupils })
     }
 
     /// How often [`Self::judge`] tells of a step.
@@ -213,7 +242,7 @@ impl<'a> EvaluationPlan<'a> {
         views_kept: usize,
         mut after_step: impl FnMut() -> Result<(), Failure>,
     ) -> Result<Evaluated, Failure> {
-        let Self { settings, weights, shards, cards, marks, pupils } = self;
+        let Self { settings, made_with, colours, weights, shards, cards, marks, pupils } = self;
         let EvaluationSettings { rig, backend, border_px, .. } = settings;
         let judge_of = |shard: &SceneShard| Judge::new(rig, &weights, backend, shard.resolution(), border_px);
         // Cards and marks first: they are few, and what is wrong with them is told before the long work.
@@ -256,8 +285,13 @@ impl<'a> EvaluationPlan<'a> {
             after_step()?;
         }
         let evaluation = Evaluation {
-            weights: setup::weights_name(&rig.model.weights),
+            made_with,
+            engine: judge.engine().to_owned(),
+            colours,
             scenes: shards.len(),
+            scene_sets: scene_sets(&shards),
+            card_sets: scene_sets(&cards),
+            mark_sets: scene_sets(&marks),
             width_px: shards[0].resolution().width,
             height_px: shards[0].resolution().height,
             focus_dpt: shards[0].focuses().iter().map(|focus| focus.0).collect(),
@@ -274,7 +308,21 @@ impl<'a> EvaluationPlan<'a> {
     }
 }
 
-/// The shards of a folder, which must be held out and have one size and the same planes.
+/// Which scenes shards hold.
+fn scene_sets(shards: &[SceneShard]) -> Vec<SceneSet> {
+    let mut sets: Vec<SceneSet> = Vec::new();
+    for shard in shards {
+        match sets.iter_mut().find(|set| set.kind == shard.kind() && set.seed == shard.seed()) {
+            Some(set) => set.indices.push(shard.index()),
+            None => {
+                sets.push(SceneSet { kind: shard.kind().to_owned(), seed: shard.seed(), indices: vec![shard.index()] });
+            }
+        }
+    }
+    sets
+}
+
+/// The shards of a folder, which must be held out, each scene once, and have one size and the same planes.
 fn open(folder: &Path, limit: Option<usize>, rig: &Rig) -> Result<Vec<SceneShard>, Failure> {
     let shards = SceneShard::open_folder(folder, limit, &rig.geometry).map_err(|error| {
         let exit = match error {
@@ -285,6 +333,7 @@ fn open(folder: &Path, limit: Option<usize>, rig: &Rig) -> Result<Vec<SceneShard
     })?;
     let first = &shards[0];
     let panel = rig.resolution();
+    let mut known = HashMap::new();
     for shard in &shards {
         let wrong = |what: &str, found: String, expected: String| {
             let path = shard.path().display();
@@ -294,6 +343,11 @@ fn open(folder: &Path, limit: Option<usize>, rig: &Rig) -> Result<Vec<SceneShard
             let expected = "held-out scenes: networks are not judged on what they learn from; write others with \
                             `holod-scenes generate --kind test`";
             return Err(wrong("metadata `kind`", format!("`{}`", shard.kind()), expected.into()));
+        }
+        if let Some(same) = known.insert((shard.kind(), shard.seed(), shard.index()), shard.path()) {
+            let found = format!("number {} of seed {}, as in {}", shard.index(), shard.seed(), same.display());
+            let expected = "each scene once, for intervals take scenes for independent: delete one of the two";
+            return Err(wrong("the scene", found, expected.into()));
         }
         let size = shard.resolution();
         if size != first.resolution() || shard.focuses() != first.focuses() {

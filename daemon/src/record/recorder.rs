@@ -14,7 +14,7 @@ use holod_calibration::{DisplayGeometry, Resolution, TimeNs, host_now};
 use holod_slm_output::FieldEvent;
 use serde::{Deserialize, Serialize};
 
-use super::sources::{self, SceneSource, SourceFile};
+use super::sources::{self, SceneSource, SourceFile, weights_file};
 use super::{FieldRecord, FrameLog, FrameRecord, RecordFolder, RecordHealth};
 use crate::aside::{Queue, Taking, join_within};
 use crate::cli::{self, Backend, NetworkArgs, RigArgs, RunArgs, SceneArgs};
@@ -333,12 +333,6 @@ fn order_source(order: u32, request: &Request, named: &Named) -> Result<OrderSou
         _ => {}
     }
     Ok(OrderSource { order, scene, weights })
-}
-
-/// The file that holds weights, where they are in a file.
-fn weights_file(weights: &WeightsChoice) -> Result<Option<SourceFile>, Failure> {
-    let WeightsChoice::File(path) = weights else { return Ok(None) };
-    SourceFile::of(path, sources::WEIGHTS.into()).map(Some).map_err(Failure::because(Exit::NoInput))
 }
 
 fn append(path: &Path, source: &OrderSource) -> Result<(), Failure> {

@@ -21,7 +21,7 @@ pub(crate) const BENCH: &str = "bench";
 pub(crate) const RIG: &str = "rig.toml";
 /// The profile of its lasers, and its weights.
 const LASERS: &str = "lasers.toml";
-pub(super) const WEIGHTS: &str = "weights.safetensors";
+const WEIGHTS: &str = "weights.safetensors";
 /// How the names of its tables begin: look-up tables and pictures of flatness, each with its colour behind it.
 const TABLES: [&str; 2] = ["lut-", "flatness-"];
 /// The file that says what a scene is made of, in its folder.
@@ -100,6 +100,15 @@ impl<R: Read> Read for Hashed<R> {
 /// A hash as records write it.
 pub(crate) fn hash_text(hash: u64) -> String {
     format!("{hash:016x}")
+}
+
+/// The file that holds weights, where they are in a file.
+///
+/// # Errors
+/// It cannot be read.
+pub(crate) fn weights_file(weights: &WeightsChoice) -> Result<Option<SourceFile>, Failure> {
+    let WeightsChoice::File(path) = weights else { return Ok(None) };
+    SourceFile::of(path, WEIGHTS.into()).map(Some).map_err(Failure::because(Exit::NoInput))
 }
 
 /// What a run shows.

@@ -9,8 +9,9 @@
 
 use std::ops::{Add, AddAssign};
 
-use holod_calibration::{Colour, Resolution};
+use holod_calibration::Resolution;
 
+use super::Part;
 use crate::LinearImage;
 
 const FINEST_PX: usize = 2;
@@ -25,14 +26,15 @@ pub(super) struct Foam {
 }
 
 impl Foam {
-    /// The foam of `shown` against `wanted`, leaving out `border_px` at each edge, where `out_of_focus` says so of an
-    /// index into [height, width]. What is left of a region at the right and the bottom is left out, too.
+    /// The foam of `shown` against `wanted` in `part`, where `out_of_focus` says so of an index into [height, width].
+    /// What is left of a region at the right and the bottom is left out.
     pub(super) fn of(
         shown: &LinearImage,
         wanted: &LinearImage,
-        border_px: usize,
+        part: Part<'_>,
         out_of_focus: impl Fn(usize) -> bool,
     ) -> Self {
+        let Part { colours, border_px } = part;
         let Resolution { width, height } = shown.resolution;
         let whole_regions = |size: usize| size.saturating_sub(2 * border_px) / REGION_PX * REGION_PX;
         let inner = Resolution { width: whole_regions(width), height: whole_regions(height) };
@@ -42,7 +44,7 @@ impl Foam {
         };
         let blurred = Grid::new(inner, |index| out_of_focus(pixels(index)));
         let mut foam = Self::default();
-        for colour in Colour::ALL {
+        for &colour in colours {
             let light = |image: &LinearImage| {
                 let plane = image.plane(colour);
                 Grid::new(inner, |index| f64::from(plane[pixels(index)])).halved(mean)
@@ -151,7 +153,7 @@ mod tests {
     }
 
     fn foam(shown: &LinearImage, wanted: &LinearImage) -> f64 {
-        Foam::of(shown, wanted, 0, |_| true).mean().unwrap()
+        Foam::of(shown, wanted, Part::inside(0), |_| true).mean().unwrap()
     }
 
     fn assert_near(found: f64, expected: f64) {
@@ -187,12 +189,12 @@ mod tests {
         for (index, value) in spoilt.pixels.iter_mut().enumerate().filter(|(index, _)| index % SIZE.width < 32) {
             *value = ticks.pixels[index];
         }
-        assert_near(Foam::of(&spoilt, &grey(), 0, |index| index % SIZE.width >= 32).mean().unwrap(), 0.0);
-        assert_near(Foam::of(&ticks, &grey(), 0, |index| index % SIZE.width >= 32).mean().unwrap(), 0.01);
+        assert_near(Foam::of(&spoilt, &grey(), Part::inside(0), |index| index % SIZE.width >= 32).mean().unwrap(), 0.0);
+        assert_near(Foam::of(&ticks, &grey(), Part::inside(0), |index| index % SIZE.width >= 32).mean().unwrap(), 0.01);
         assert_near(foam(&spoilt, &grey()), 0.01 / 3.0);
-        assert!(Foam::of(&ticks, &grey(), 0, |_| false).mean().is_none());
+        assert!(Foam::of(&ticks, &grey(), Part::inside(0), |_| false).mean().is_none());
         // 56 x 24 pixels hold no region; 88 x 56 hold two.
-        assert!(Foam::of(&ticks, &grey(), 20, |_| true).mean().is_none());
-        assert_near(Foam::of(&ticks, &grey(), 4, |_| true).mean().unwrap(), 0.01);
+        assert!(Foam::of(&ticks, &grey(), Part::inside(20), |_| true).mean().is_none());
+        assert_near(Foam::of(&ticks, &grey(), Part::inside(4), |_| true).mean().unwrap(), 0.01);
     }
 }

@@ -119,8 +119,8 @@ def found(shard: Shard, weights: Path) -> dict[str, Any]:
 
 
 def write_evaluation(path: Path, weights: Path, seed: int) -> None:
-    """A shard that serves as a test scene and as cards, whose metadata has `weights`, `border_px` and what is to be
-    `found` besides."""
+    """A shard that serves as a test scene and, once its `kind` says so, as cards, whose metadata has `weights`,
+    `border_px` and what is to be `found` besides."""
     optics = OpticsConfig()
     image, depth, stacks = scene(optics, seed)
     tensors = {"image": image.half(), "depth": depth.float()}
