@@ -17,7 +17,8 @@
 use holod_calibration::TimeNs;
 use serde::Serialize;
 
-use super::recording::{Blink, Recording, Row};
+use super::recording::Recording;
+use super::rows::{Blink, Row};
 use crate::{GateSettings, SampleEye};
 
 const LEAST_CONFIDENCE: f32 = 0.6;

@@ -1,7 +1,7 @@
 //! Silences of a log that are longer than any of a recording: a clock that was set, or two recordings in one file. What
 //! comes behind one is put shortly behind what came before it.
 
-use super::recording::{Blink, Row};
+use super::rows::{Blink, Row};
 use crate::SampleEye;
 
 /// A longer silence is none of one recording.

@@ -21,6 +21,7 @@ mod pupil_labs_core;
 mod pupilext;
 pub(crate) mod raw;
 mod recording;
+mod rows;
 mod smi;
 mod table;
 mod text;
@@ -37,7 +38,8 @@ use importer::Importer;
 pub use info::{BlinkCounts, EyeInfo, FaultCount, LogInfo, Range};
 use input::LogInput;
 use recording::LogBuilder;
-pub use recording::{Blink, Recording};
+pub use recording::Recording;
+pub use rows::Blink;
 
 use crate::record::SAMPLES_HEADER;
 

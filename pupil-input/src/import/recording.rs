@@ -8,20 +8,9 @@ use super::fault::{LogFault, LogFaults, ReplayError};
 use super::format::LogFormat;
 use super::leaps::Leaps;
 use super::parts::{Parts, is_restart};
+use super::rows::{Blink, Row};
 use crate::size_unit::SizeUnit;
 use crate::{PupilSample, SampleEye};
-
-/// One recorded sample, compact.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Row {
-    pub(super) t_ns: i64,
-    pub(super) diameter_mm: f32,
-    pub(super) confidence: f32,
-    /// NaN where there is none.
-    pub(super) aperture_mm: f32,
-    pub(super) eye: SampleEye,
-    pub(super) valid: bool,
-}
 
 /// A sample for [`LogBuilder::push`].
 #[derive(Clone, Copy, Debug)]
@@ -36,17 +25,6 @@ pub(crate) struct LogSample {
     /// False where the log says that the tracker saw no pupil: such a sample tells the gate of a blink, a missing one
     /// does not.
     pub(crate) valid: bool,
-}
-
-/// A blink that the tracker or its software found.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Blink {
-    /// The eye; both where the log does not say.
-    pub eye: SampleEye,
-    /// Its first instant on the log's clock.
-    pub begins: TimeNs,
-    /// Its last instant on the log's clock.
-    pub ends: TimeNs,
 }
 
 /// What an importer fills.
