@@ -9,7 +9,7 @@ use holod_calibration::special_file;
 use crate::failure::{Exit, Failure};
 use crate::overwriting::refuse_existing;
 use crate::results;
-use crate::staging::Temporary;
+use crate::staging::{Temporary, folder_of};
 
 /// A file, or standard output where `-` is named.
 #[derive(Debug)]
@@ -46,13 +46,20 @@ impl Destination {
         matches!(self, Self::Stdout)
     }
 
-    /// Lets `write` write the file.
+    /// Lets `write` write the file, whose folder is made where it is missing.
     ///
     /// # Errors
     /// That of `write`, or standard output takes no more.
     pub(crate) fn write(&self, write: impl FnOnce(&Path) -> Result<(), Failure>) -> Result<(), Failure> {
         match self {
-            Self::File(path) => write(path),
+            Self::File(path) => {
+                let folder = folder_of(path);
+                std::fs::create_dir_all(folder).map_err(|error| {
+                    let what = format!("cannot make the folder {}: {error}; name one that can be", folder.display());
+                    Failure::new(Exit::CannotCreate, what)
+                })?;
+                write(path)
+            }
             Self::Stdout => {
                 let folder = Temporary::new("holod-").map_err(Failure::because(Exit::CannotCreate))?;
                 let path = folder.path().join("out");
@@ -88,6 +95,19 @@ mod tests {
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "third");
         assert!(Destination::new(folder.path(), "--out", true).is_err(), "a directory is no file");
         assert!(Destination::new(Path::new("-"), "--out", false).unwrap().is_stdout());
+    }
+
+    #[test]
+    fn a_folder_that_is_missing_is_made() {
+        let folder = tempfile::tempdir().unwrap();
+        let put = |path: &Path| {
+            Destination::new(path, "--out", false)?
+                .write(|path| std::fs::write(path, "x").map_err(Failure::because(Exit::CannotCreate)))
+        };
+        put(&folder.path().join("a/b/c.png")).unwrap();
+        let refused = put(&folder.path().join("a/b/c.png/d.png")).unwrap_err();
+        assert!(refused.to_string().contains("cannot make the folder"), "{refused}");
+        assert_eq!(refused.exit, Exit::CannotCreate);
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use holod_calibration::write_atomically;
-use image::RgbImage;
+use image::DynamicImage;
 use serde::{Serialize, Serializer};
 
 use crate::failure::{Exit, Failure};
@@ -53,9 +53,10 @@ pub fn save_json(value: &impl Serialize, path: &Path) -> Result<(), Failure> {
 }
 
 /// Saves a picture as PNG.
-pub fn save_png(picture: &RgbImage, path: &Path) -> Result<(), Failure> {
+pub fn save_png(picture: impl Into<DynamicImage>, path: &Path) -> Result<(), Failure> {
     let mut bytes = io::Cursor::new(Vec::new());
     picture
+        .into()
         .write_to(&mut bytes, image::ImageFormat::Png)
         .map_err(|error| Failure::new(Exit::Software, format!("{}: {error}", path.display())))?;
     save(bytes.get_ref(), path)

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::record::RecordState;
 use crate::source::feed::FeedStatus;
+use crate::source::scene::SceneFigures;
 use crate::spread::Spread;
 
 /// What holds of a run that goes on and of one that is over alike.
@@ -14,6 +15,9 @@ use crate::spread::Spread;
 pub struct Figures {
     pub rig: String,
     pub scene: String,
+    /// The scene in figures, where it is no feed.
+    #[serde(default)]
+    pub scene_figures: Option<SceneFigures>,
     pub tracker: String,
     /// How holograms are computed.
     pub engine: String,

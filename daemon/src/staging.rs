@@ -85,9 +85,19 @@ impl Staging {
         }
         // Looked for again: it may have come meanwhile.
         refuse_existing(names.iter().map(|name| self.target.join(name)), "--out", self.force)?;
+        if let Some(folder) = names.iter().map(|name| self.target.join(name)).find(|path| path.is_dir()) {
+            let what = format!("{}: found a directory in the place of a file: move it away", folder.display());
+            return Err(Failure::new(Exit::CannotCreate, what));
+        }
         fs::create_dir_all(&self.target).map_err(cannot)?;
-        for name in names {
-            fs::rename(self.partial.path().join(&name), self.target.join(&name)).map_err(cannot)?;
+        for (moved, name) in names.iter().enumerate() {
+            fs::rename(self.partial.path().join(name), self.target.join(name)).map_err(|error| {
+                let new: Vec<_> = names[..moved].iter().map(|name| name.to_string_lossy()).collect();
+                let new = if new.is_empty() { "none".into() } else { new.join(", ") };
+                let (name, target) = (name.display(), self.target.display());
+                let what = format!("cannot move {name} into {target}: {error}; of its files these are new: {new}");
+                Failure::new(Exit::CannotCreate, what)
+            })?;
         }
         Ok(())
     }
@@ -213,6 +223,26 @@ mod tests {
         fs::write(forced.path("x"), "new").unwrap();
         forced.commit().unwrap();
         assert_eq!(fs::read_to_string(target.join("x")).unwrap(), "new");
+    }
+
+    #[test]
+    fn a_directory_in_the_place_of_a_file_leaves_all_as_it_was() {
+        let root = tempfile::tempdir().unwrap();
+        for blocked in ["a", "b", "c"] {
+            let target = root.path().join(blocked);
+            fs::create_dir_all(target.join(blocked).join("full")).unwrap();
+            let names = ["a", "b", "c"];
+            names.iter().filter(|name| **name != blocked).for_each(|name| fs::write(target.join(name), "old").unwrap());
+            let staging = Staging::new(&target, &names, true).unwrap();
+            names.iter().for_each(|name| fs::write(staging.path(name), "new").unwrap());
+            let refused = staging.commit().unwrap_err();
+            assert_eq!(refused.exit, Exit::CannotCreate);
+            let says = format!("{}: found a directory in the place of a file", target.join(blocked).display());
+            assert!(refused.to_string().contains(&says), "{refused}");
+            for name in names.iter().filter(|name| **name != blocked) {
+                assert_eq!(fs::read_to_string(target.join(name)).unwrap(), "old");
+            }
+        }
     }
 
     #[test]

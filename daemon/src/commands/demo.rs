@@ -98,10 +98,10 @@ pub(super) fn demo(args: &DemoArgs) -> Result<(), Failure> {
         let frames = if narrow.0 == wide.0 { vec![wide] } else { vec![narrow, wide] };
         frames.into_iter().flat_map(of_frame).collect()
     });
-    results::save_png(&eye_sheet(&views).draw(), &staging.path("eye.png"))?;
+    results::save_png(eye_sheet(&views).draw(), &staging.path("eye.png"))?;
     let pattern = shown_pattern(&session.encoder, &wide.1);
     for colour in Colour::ALL {
-        results::save_png(&phase_picture(&pattern, colour), &staging.path(&format!("phase_{colour}.png")))?;
+        results::save_png(phase_picture(&pattern, colour), &staging.path(&format!("phase_{colour}.png")))?;
     }
     log.pupil_plot(&session, &staging)?;
     log.latency_plot(&session, &staging)?;

@@ -44,7 +44,7 @@ pub(super) fn evaluate(args: &EvaluateArgs) -> Result<(), Failure> {
     progress.finish_and_clear();
     if let Some(staging) = staging {
         results::save_json(evaluation, &staging.path("evaluation.json"))?;
-        results::save_png(&sheet(&evaluated).draw(), &staging.path("sheet.png"))?;
+        results::save_png(sheet(&evaluated).draw(), &staging.path("sheet.png"))?;
         staging.commit()?;
     }
     if args.json { results::print_json(evaluation) } else { results::print(&table(evaluation)) }
@@ -114,8 +114,8 @@ fn table(evaluation: &Evaluation) -> String {
          a border of {border_px} px is left out\n\
          rig {rig}, judged in {}; computed by {engine}\n\
          mean over scenes ± half of its confidence interval ({})\n\n\
-         {:>8}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>11}\n\
-         {:>8}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>11}\n",
+         {:>8} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>11}\n\
+         {:>8} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>11}\n",
         focus.len(),
         focus.iter().copied().fold(f64::INFINITY, f64::min),
         focus.iter().copied().fold(f64::NEG_INFINITY, f64::max),
@@ -155,7 +155,7 @@ fn table(evaluation: &Evaluation) -> String {
         let figure = |estimate, decimals| scaled(estimate, 1.0, decimals);
         let clipped = row.clipped_share.map_or("none".to_owned(), |share| format!("{:.3}", 100.0 * share.mean));
         text.push_str(&format!(
-            "{:>8}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{:>14}{clipped:>11}\n",
+            "{:>8} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {:>14} {clipped:>11}\n",
             row.pupil_mm,
             figure(row.psnr_db, 2),
             figure(row.psnr_in_focus_db, 2),

@@ -71,6 +71,9 @@ pub(super) fn render(args: &RenderArgs, rig: &Rig, directory: &Path, began: Inst
     })?;
     let resolution = stack.resolution;
     scene::warn_of_clipped_colours(&name, done.colour_clipped, done.source_px);
+    if done.has_foreign_primaries {
+        scene::warn_of_foreign_primaries(&name);
+    }
     scene::check_fits(resolution, &rig.geometry, &name)?;
     let mut engine = progress::during(&format!("preparing the network for {resolution}"), || {
         let precision = if args.backend == Backend::Cpu { Precision::Single } else { Precision::Half };

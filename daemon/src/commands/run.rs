@@ -60,9 +60,10 @@ pub(super) fn run(args: &RunArgs) -> Result<(), Failure> {
     let mut observers = (recorder.map(|recorder| recorder.with_tracker(tracker.to_string())), page);
     let network = weights.config();
     tracing::info!(
-        "{} of {} by network {} {}",
+        "{} of {}{} by network {} {}",
         pictures.resolution(),
         pictures.name(),
+        pictures.extent(),
         network.architecture,
         network.version
     );
@@ -276,7 +277,7 @@ fn save(session: &SessionReport, folder: &Path, health: &RecordHealth) {
 fn save_shown(session: &SessionReport, folder: &Path) -> Result<(), Failure> {
     for (pupil, levels) in &session.shown {
         let name = record::shown_name(pupil.mm(), levels.tag().frame_id);
-        results::save_png(&levels_picture(levels), &folder.join(name))?;
+        results::save_png(levels_picture(levels), &folder.join(name))?;
     }
     Ok(())
 }

@@ -6,7 +6,7 @@ use holod_model::LinearImage;
 use holod_model::optics::PhasePattern;
 use holod_slm_output::packing::channels;
 use holod_slm_output::{LevelsFrame, PanelEncoder};
-use image::RgbImage;
+use image::{DynamicImage, ImageBuffer, Rgb, RgbImage};
 
 /// The phases that the panel shows for `levels`, where it carries the pattern.
 pub fn shown_pattern(encoder: &PanelEncoder, levels: &LevelsFrame) -> PhasePattern {
@@ -24,28 +24,34 @@ pub fn levels_picture(levels: &LevelsFrame) -> RgbImage {
     from_planes(levels.layout().resolution, |colour, pixel| fields[colour][pixel] as u8)
 }
 
-/// What travels to the panel for `levels`, bit for bit on a link of eight bits a channel: each different video frame of
-/// the colour frame, with the colour whose field it carries where it carries one.
-pub fn video_pictures(levels: &LevelsFrame) -> Vec<(Option<Colour>, RgbImage)> {
+/// What travels to the panel for `levels`, bit for bit: each different video frame of the colour frame, with the colour
+/// whose field it carries where it carries one. Ten bits of a channel are the high ones of sixteen, and below them the
+/// highest again, so that white is white.
+pub fn video_pictures(levels: &LevelsFrame) -> Vec<(Option<Colour>, DynamicImage)> {
     let layout = levels.layout();
     let Resolution { width, height } = layout.resolution;
-    // A picture's channels have eight bits: of ten, the high ones.
-    let byte = |channel: u16| (channel >> (layout.packing.channel_bits() - 8)) as u8;
-    let picture = |first_field: usize| {
+    let picture = |first_field: usize| -> DynamicImage {
         let rows = (0..height).map(|row| levels.video_row(first_field, row));
-        let bytes = match layout.mode {
+        let channels: Vec<u16> = match layout.mode {
             PanelMode::ChannelPacked => {
                 let pixels = rows.flat_map(|row| row.as_chunks().0);
-                pixels.flat_map(|&shown| layout.channels_of(shown).map(byte)).collect()
+                pixels.flat_map(|&shown| layout.channels_of(shown)).collect()
             }
-            _ => rows.flatten().flat_map(|&level| channels(layout.packing, level).map(byte)).collect(),
+            _ => rows.flatten().flat_map(|&level| channels(layout.packing, level)).collect(),
         };
-        RgbImage::from_raw(width as u32, height as u32, bytes).expect("three bytes for each pixel")
+        let (width, height) = (width as u32, height as u32);
+        if layout.packing.channel_bits() == 8 {
+            let bytes = channels.into_iter().map(|channel| channel as u8).collect();
+            RgbImage::from_raw(width, height, bytes).expect("three bytes for each pixel").into()
+        } else {
+            let words = channels.into_iter().map(|channel| channel << 6 | channel >> 4).collect();
+            ImageBuffer::<Rgb<u16>, _>::from_raw(width, height, words).expect("three words for each pixel").into()
+        }
     };
     if layout.mode == PanelMode::ChannelPacked {
         return vec![(None, picture(0))];
     }
-    let mut pictures: Vec<(Option<Colour>, RgbImage)> = Vec::new();
+    let mut pictures: Vec<(Option<Colour>, DynamicImage)> = Vec::new();
     for field in 0..layout.fields() {
         let colour = Some(layout.colour_of_field(field));
         if pictures.last().is_none_or(|(last, _)| *last != colour) {

@@ -123,7 +123,7 @@ pub(super) fn build(
     }
     tracing::debug!("tracker `{}` is open, link {}", plan.tracker, tracker.link().name());
 
-    let scene = plan.pictures.name().to_owned();
+    let (scene, scene_figures) = (plan.pictures.name().to_owned(), plan.pictures.figures());
     let dark_after = match &plan.pictures {
         Pictures::Feed(feed) => feed.dark_after,
         Pictures::Scene(_) => None,
@@ -228,6 +228,7 @@ pub(super) fn build(
     };
     let names = Names {
         scene,
+        scene_figures,
         tracker: plan.tracker.to_string(),
         panel: plan.output.to_string(),
         engine,

@@ -74,6 +74,7 @@ impl Watch<'_> {
             }
             Order::Scene(frames) => {
                 self.names.scene.clone_from(&frames.name);
+                self.names.scene_figures = Some(frames.figures());
                 let later = if self.desk.is_paused() { " once the picture goes on: `holod ctl resume`" } else { "" };
                 let said = format!("{} is shown{later}", frames.name);
                 sink(&self.desk).lock().unwrap_or_else(PoisonError::into_inner).show_scene(frames, now, number);
@@ -81,6 +82,7 @@ impl Watch<'_> {
             }
             Order::Feed => {
                 self.names.scene = "the live feed".into();
+                self.names.scene_figures = None;
                 sink(&self.desk).lock().unwrap_or_else(PoisonError::into_inner).go_live();
                 Ok("the live feed is shown from its next picture on".into())
             }

@@ -29,6 +29,7 @@ use crate::failure::{Exit, Failure};
 use crate::record::RecordHealth;
 use crate::snapshot::{Figures, Snapshot};
 use crate::source::feed::Feed;
+use crate::source::scene::SceneFigures;
 use crate::status::StatusFile;
 use crate::{renderer, setup, speed};
 
@@ -73,6 +74,8 @@ pub(super) struct Watch<'a> {
 /// What the parts of a run are called.
 pub(super) struct Names {
     pub(super) scene: String,
+    /// Of a scene, and not of a feed.
+    pub(super) scene_figures: Option<SceneFigures>,
     pub(super) tracker: String,
     pub(super) panel: String,
     /// How holograms are computed; another engine may take the place of the first.
@@ -442,6 +445,7 @@ impl Watch<'_> {
         Figures {
             rig: self.rig.name.clone(),
             scene: names.scene.clone(),
+            scene_figures: names.scene_figures,
             weights: setup::weights_name(&self.rig.model.weights),
             tracker: names.tracker.clone(),
             engine,

@@ -17,7 +17,7 @@ use crate::cli::SceneArgs;
 use crate::failure::{Exit, Failure};
 
 use self::feed::{Feed, FeedError, FeedPlan};
-use self::scene::Frames;
+use self::scene::{Frames, SceneFigures};
 
 /// What a run is to show.
 #[derive(Clone)]
@@ -42,6 +42,25 @@ impl Pictures {
         match self {
             Self::Scene(frames) => &frames.name,
             Self::Feed(_) => "the live feed",
+        }
+    }
+
+    /// A scene in figures.
+    pub fn figures(&self) -> Option<SceneFigures> {
+        match self {
+            Self::Scene(frames) => Some(frames.figures()),
+            Self::Feed(_) => None,
+        }
+    }
+
+    /// How long a sequence is, for reports; nothing of stills.
+    pub fn extent(&self) -> String {
+        match self {
+            Self::Scene(frames) if frames.frames.len() > 1 => {
+                let rate = frames.fps.map(|fps| format!(" at {fps} a second")).unwrap_or_default();
+                format!(", {} frames{rate},", frames.frames.len())
+            }
+            _ => String::new(),
         }
     }
 
@@ -329,6 +348,13 @@ mod tests {
     fn sequence(count: usize) -> Arc<Frames> {
         let frames = (0..count).map(|_| Arc::new(RgbdFrame::black(SIZE))).collect();
         Arc::new(Frames { frames, fps: Some(10.0), reports: Vec::new(), name: String::new() })
+    }
+
+    #[test]
+    fn a_sequence_is_told_with_its_length() {
+        let extent = |count| Pictures::Scene(sequence(count)).extent();
+        assert_eq!((extent(3).as_str(), extent(1).as_str()), (", 3 frames at 10 a second,", ""));
+        assert_eq!((feed().extent().as_str(), feed().figures()), ("", None));
     }
 
     #[test]

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use holod_calibration::{DisplayGeometry, Resolution};
 use holod_model::scene::{ClippedColours, DepthEncoding, FrameReport, Scene, SceneError};
 use holod_model::{RgbdFrame, scene_renderer};
+use serde::{Deserialize, Serialize};
 
 use crate::cli::SceneArgs;
 use crate::failure::{Exit, Failure};
@@ -14,6 +15,10 @@ pub const SAMPLE_RESOLUTION: Resolution = Resolution { width: 512, height: 512 }
 
 /// In this share of a picture's pixels colours may be clipped, as in highlights, without a word.
 const CLIPPED_SHARE_MAX: f64 = 0.01;
+
+/// What is said of a file whose colours are of other primaries.
+const FOREIGN_PRIMARIES: &str = "its `chromaticities` are not those of Rec. 709, as which its colours are shown: convert \
+                                 the picture to linear light with the primaries and the white of sRGB";
 
 /// Frames of a sequence that are kept in memory, in bytes.
 const SEQUENCE_BYTES_MAX: u64 = 4 << 30;
@@ -30,7 +35,34 @@ pub struct Frames {
     pub name: String,
 }
 
+/// A scene from files in figures.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SceneFigures {
+    /// Its frames.
+    pub frames: u64,
+    /// Depths of all their files.
+    pub depth_px: u64,
+    /// Those that were missing and were filled from their surroundings.
+    pub depth_missing_px: u64,
+    /// Pixels farther than the display shows, set to its far end.
+    pub depth_clamped_far_px: u64,
+    /// Pixels nearer than the display shows, set to its near end.
+    pub depth_clamped_near_px: u64,
+}
+
 impl Frames {
+    /// What can be said of them in figures.
+    pub fn figures(&self) -> SceneFigures {
+        let all = |of: fn(&FrameReport) -> usize| self.reports.iter().map(|report| of(report) as u64).sum();
+        SceneFigures {
+            frames: self.frames.len() as u64,
+            depth_px: all(|report| report.depth_px),
+            depth_missing_px: all(|report| report.depth_missing_px),
+            depth_clamped_far_px: all(|report| report.depth_clamped_far_px),
+            depth_clamped_near_px: all(|report| report.depth_clamped_near_px),
+        }
+    }
+
     /// Size of every frame.
     pub fn resolution(&self) -> Resolution {
         self.frames[0].resolution
@@ -112,13 +144,25 @@ fn load(
             sequence_fits(count as u64, frame.resolution, available_bytes())
                 .map_err(|why| Failure::new(Exit::Data, format!("{spec}: {why}")))?;
         }
-        warn_of_odd_depth(spec, &report, geometry, false);
         loaded.frames.push(Arc::new(frame));
         loaded.reports.push(report);
     }
+    let name_of = |index: usize| if count > 1 { format!("{spec}, frame {index}") } else { spec.to_owned() };
+    let odd = |oddity: &dyn Fn(&FrameReport) -> Option<String>| {
+        let mut odd = loaded.reports.iter().map(oddity).enumerate().filter_map(|(index, odd)| Some((index, odd?)));
+        if let Some((index, first)) = odd.next() {
+            let alike = match odd.count() {
+                0 => String::new(),
+                others => format!(" (and {others} more of its {count} frames)"),
+            };
+            tracing::warn!("{}{alike}: {first}", name_of(index));
+        }
+    };
+    odd(&|report| depth_oddity(report, geometry, false));
+    odd(&|report| report.turned_apart.map(odd_turns));
+    odd(&|report| report.has_foreign_primaries.then(|| FOREIGN_PRIMARIES.to_owned()));
     if let Some((index, source, clipped)) = most_clipped(&loaded.reports) {
-        let name = if count > 1 { format!("{spec}, frame {index}") } else { spec.to_owned() };
-        warn_of_clipped_colours(&name, clipped, source.pixels());
+        warn_of_clipped_colours(&name_of(index), clipped, source.pixels());
     }
     Ok(loaded)
 }
@@ -158,18 +202,26 @@ fn sequence_fits(frames: u64, resolution: Resolution, available_bytes: Option<u6
 /// `is_plane`: one depth for all of it is meant.
 pub fn warn_of_oddities(name: &str, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) {
     let Some(source) = report.source else { return };
-    warn_of_odd_depth(name, report, geometry, is_plane);
-    warn_of_clipped_colours(name, report.colour_clipped, source.pixels());
-}
-
-/// Warns of depth that is most often a mistake, as [`warn_of_oddities`] does.
-pub fn warn_of_odd_depth(name: &str, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) {
     if let Some(oddity) = depth_oddity(report, geometry, is_plane) {
         tracing::warn!("{name}: {oddity}");
     }
+    warn_of_clipped_colours(name, report.colour_clipped, source.pixels());
 }
 
-/// What [`warn_of_odd_depth`] says.
+/// Warns of the colours of files called `name`, which say that they are of other primaries.
+pub(crate) fn warn_of_foreign_primaries(name: &str) {
+    tracing::warn!("{name}: {FOREIGN_PRIMARIES}");
+}
+
+/// Says of colour and depth that their files are turned by these EXIF orientations.
+fn odd_turns([of_colour, of_depth]: [u8; 2]) -> String {
+    format!(
+        "colours are turned by their EXIF orientation {of_colour} and depths by {of_depth}, where 1 is as stored: does \
+         the depth lie on the picture? Export both with one orientation"
+    )
+}
+
+/// What is odd about the depth of a picture, in words.
 pub(super) fn depth_oddity(report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) -> Option<String> {
     report.source.and_then(|source| odd_depth(source, report, geometry, is_plane))
 }
@@ -202,8 +254,16 @@ pub(super) fn odd_colours(clipped: ClippedColours, source_px: usize) -> Vec<Stri
     above.into_iter().chain(below).collect()
 }
 
-/// Depth of which most is clamped, or that is all one, is most often a wrong encoding.
+/// Depth of which most is missing or clamped, or that is all one, is most often a wrong encoding.
 fn odd_depth(source: Resolution, report: &FrameReport, geometry: &DisplayGeometry, is_plane: bool) -> Option<String> {
+    let FrameReport { depth_px, depth_missing_px, .. } = *report;
+    if 2 * depth_missing_px > depth_px {
+        let share_percent = 100.0 * depth_missing_px as f64 / depth_px as f64;
+        return Some(format!(
+            "{depth_missing_px} of {depth_px} depths ({share_percent:.1} %) are missing and were filled from their \
+             surroundings: are the depth encoding and the number that means none right?"
+        ));
+    }
     let pixels = source.pixels();
     let clamped = report.depth_clamped_far_px + report.depth_clamped_near_px;
     if 2 * clamped > pixels {
@@ -313,6 +373,38 @@ mod tests {
         let one_depth = odd_at_every_size(|_| 1000);
         let told = "all depths lie within 0.000 dpt: is the depth encoding right?";
         assert_eq!(one_depth, vec![Some(told.to_owned()); 14]);
+    }
+
+    #[test]
+    fn depth_of_which_most_is_missing_is_told_with_its_share() {
+        let holes =
+            |every: u32| odd_at_every_size(move |index| if index % every == 0 { 600 + index as u16 } else { 0 });
+        assert_eq!(holes(2), vec![None; 14], "a half");
+        let told = "2976 of 3072 depths (96.9 %) are missing and were filled from their surroundings: are the depth \
+                    encoding and the number that means none right?";
+        assert_eq!(holes(32), vec![Some(told.to_owned()); 14]);
+    }
+
+    #[test]
+    fn a_scenes_figures_are_those_of_all_its_frames() {
+        let report = FrameReport {
+            depth_px: 9,
+            depth_missing_px: 5,
+            depth_clamped_far_px: 2,
+            depth_clamped_near_px: 1,
+            ..FrameReport::default()
+        };
+        let frame = || Arc::new(RgbdFrame::black(SAMPLE_RESOLUTION));
+        let frames = vec![frame(), frame()];
+        let scene = Frames { frames, fps: None, reports: vec![report.clone(), report], name: String::new() };
+        let figures = SceneFigures {
+            frames: 2,
+            depth_px: 18,
+            depth_missing_px: 10,
+            depth_clamped_far_px: 4,
+            depth_clamped_near_px: 2,
+        };
+        assert_eq!(scene.figures(), figures);
     }
 
     #[test]

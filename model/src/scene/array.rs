@@ -100,7 +100,8 @@ impl ArrayPicture<'_> {
     /// [`ArrayError`] for arrays of a wrong length and values that are no colours or depths.
     pub fn frame(&self, geometry: &DisplayGeometry) -> Result<(RgbdFrame, FrameReport), ArrayError> {
         let resolution = self.resolution;
-        let mut report = FrameReport { source: Some(resolution), ..FrameReport::default() };
+        let mut report =
+            FrameReport { source: Some(resolution), depth_px: resolution.pixels(), ..FrameReport::default() };
         let amplitude = self.colours.amplitude(resolution)?;
         let depth_normalised = self.depths.normalised(resolution, geometry, self.fills_missing, &mut report)?;
         Ok((RgbdFrame { resolution, amplitude, depth_normalised }, report))

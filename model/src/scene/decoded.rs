@@ -24,6 +24,8 @@ pub(super) struct ColourRaster {
     pub(super) clipped: ClippedColours,
     /// Whether one channel of luminance stands for all colours.
     pub(super) is_luminance: bool,
+    /// Whether the file names other primaries than Rec. 709's.
+    pub(super) has_foreign_primaries: bool,
 }
 
 /// A depth picture.

@@ -6,7 +6,7 @@ use serde::Deserialize;
 use toml::Spanned;
 
 use super::depth::DepthReading;
-use super::{DepthEncoding, SceneError};
+use super::{DepthEncoding, SceneError, raster};
 
 /// Scene files are small; a larger one is something else.
 const LARGEST_FILE_BYTES: u64 = 1 << 20;
@@ -69,6 +69,22 @@ impl FilePattern {
 
     fn numbered(&self) -> bool {
         self.digits.is_some()
+    }
+
+    /// The greatest number that is not below `least`, of the frames from `first` on in steps of `step`, which has a file.
+    fn greatest(&self, least: u64, first: u64, step: u64) -> Option<u64> {
+        self.digits?;
+        let (folder, name) = self.before.rsplit_once('/').unwrap_or(("", &self.before));
+        let after = self.after.split('/').next().unwrap_or_default();
+        let number = |entry: std::io::Result<std::fs::DirEntry>| -> Option<u64> {
+            let found = entry.ok()?.file_name();
+            let number: u64 = found.to_str()?.strip_prefix(name)?.strip_suffix(after)?.parse().ok()?;
+            let is_one = number >= least && (number - first).is_multiple_of(step) && self.path(number).exists();
+            is_one.then_some(number)
+        };
+        let root = if self.before.starts_with('/') { Path::new("/") } else { &self.directory };
+        // An empty folder's name is the current folder.
+        std::fs::read_dir(Path::new(".").join(root).join(folder)).ok()?.filter_map(number).max()
     }
 
     /// The file of frame number `number`.
@@ -158,8 +174,9 @@ const KINDS: &str = "a directory with a scene.toml, COLOUR,DEPTH, or one OpenEXR
 /// Checks that `path` can be one file with both colour and depth.
 fn single_file(path: &Path) -> Result<(), SceneError> {
     std::fs::metadata(path).map_err(|source| SceneError::Read { path: path.to_owned(), source, expected: KINDS })?;
-    let is_exr = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("exr"));
-    if is_exr {
+    // What is called one and is none is damaged, which its reader says.
+    let is_called_exr = path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("exr"));
+    if is_called_exr || raster::is_openexr(path)? {
         return Ok(());
     }
     Err(SceneError::Kind { path: path.to_owned(), found: "one file that is not OpenEXR".into(), expected: KINDS })
@@ -302,8 +319,23 @@ fn parse(path: &Path, text: &str, named: Option<DepthEncoding>) -> Result<Descri
                 let number = first.saturating_add(index.saturating_mul(step));
                 colour.path(number).exists() && depth.path(number).exists()
             };
+            let frames = (0..MOST_FRAMES).take_while(|&index| there(index)).count() as u64;
+            let missing = first.saturating_add(frames.saturating_mul(step));
+            if let Some(greatest) =
+                [&colour, &depth].into_iter().filter_map(|files| files.greatest(missing, first, step)).max()
+            {
+                let path = [&colour, &depth].map(|files| files.path(missing)).into_iter().find(|path| !path.exists());
+                let path = path.unwrap_or_else(|| colour.path(missing));
+                let found = format!("none, and {} is missing where files go on to number {greatest}", path.display());
+                let cure = match frames {
+                    0 => "the number of the first frame as `first`".into(),
+                    _ => format!("`count = {frames}` for the frames before it alone"),
+                };
+                let expected = format!("a file for each number: supply it, or write {cure}");
+                return Err(error_at(numbered_key.span().start, "count", found, &expected));
+            }
             // A sequence without its first frame is reported when that is loaded.
-            (0..MOST_FRAMES).take_while(|&index| there(index)).count().max(1) as u64
+            frames.max(1)
         }
         None => 1,
     };
@@ -473,6 +505,9 @@ mod tests {
         let pair = format!("{0},{0}", png.display());
         assert!(matches!(describe(&pair, None), Err(SceneError::DepthEncoding { .. })));
         assert!(describe(&pair, Some(DepthEncoding::Metres)).is_ok());
+        let exr = folder.path().join("a.hdr");
+        std::fs::write(&exr, [0x76, 0x2f, 0x31, 0x01, 2]).unwrap();
+        assert!(describe(exr.to_str().unwrap(), Some(DepthEncoding::Metres)).is_ok(), "known by its content");
         let single = describe(png.to_str().unwrap(), Some(DepthEncoding::Metres)).unwrap_err();
         assert!(matches!(single, SceneError::Kind { .. }), "{single}");
         let absent = describe("/no/such/scene", None).unwrap_err();

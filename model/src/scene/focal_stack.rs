@@ -51,6 +51,8 @@ pub struct FocalStackReport {
     pub colour_clipped: ClippedColours,
     /// Pixels of each image that the picture does not reach: black.
     pub padded_px: usize,
+    /// Whether a file says that its colours are of other primaries than those that they are taken for.
+    pub has_foreign_primaries: bool,
 }
 
 /// `stack.toml`.
@@ -122,6 +124,7 @@ impl FocalStackFiles {
                 .ok_or(SceneError::BlurScaled { path: file, found: first, wanted })?;
             report.source_px += first.pixels();
             report.colour_clipped += colour.clipped;
+            report.has_foreign_primaries |= colour.has_foreign_primaries;
             report.padded_px = placement.padded_px();
             if amplitude.is_empty() {
                 amplitude.reserve_exact(3 * focuses.len() * wanted.pixels());
@@ -154,9 +157,9 @@ impl FocalStack {
         if directory.exists() {
             return Err(std::io::ErrorKind::AlreadyExists.into());
         }
-        let mut part = directory.as_os_str().to_owned();
+        let mut part = directory.file_name().ok_or(std::io::ErrorKind::InvalidInput)?.to_owned();
         part.push(".part");
-        let part = PathBuf::from(part);
+        let part = directory.with_file_name(part);
         std::fs::create_dir_all(&part)?;
         let written = Self::write(&part, images, focuses, pupil).and_then(|()| std::fs::rename(&part, directory));
         if written.is_err() {

@@ -330,6 +330,7 @@ impl LiveReader {
     fn read_picture(&self, colour: &[u8], depth: &[u8], picture: &mut RgbdFrame) -> Result<LiveReport, LiveError> {
         let mut report = FrameReport {
             source: Some(self.format.resolution),
+            depth_px: self.format.resolution.pixels(),
             padded_px: self.padded_px,
             colour_clipped: self.read_colours(colour, &mut picture.amplitude),
             ..FrameReport::default()

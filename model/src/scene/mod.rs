@@ -11,7 +11,7 @@
 //! depth_missing = 0                # the number that means that there is no depth, where there is one
 //! first = 0                        # for a sequence: its first number,
 //! step = 1                         # the distance of numbers,
-//! count = 240                      # how many (as many as are there, where absent)
+//! count = 240                      # how many (all that are there, where absent: none may be missing)
 //! fps = 30.0                       # and how many a second, without which it cannot be played
 //! ```
 //!
@@ -38,6 +38,7 @@ use std::path::{Path, PathBuf};
 use holod_calibration::{Dioptres, DisplayGeometry, Resolution};
 use serde::{Deserialize, Serialize};
 
+use self::decoded::{ColourRaster, DepthRaster};
 use self::description::Description;
 use self::fit::Placement;
 
@@ -80,7 +81,9 @@ impl RgbdFrame {
 pub struct FrameReport {
     /// Size of the colour picture in its file.
     pub source: Option<Resolution>,
-    /// Pixels without a valid depth, which were filled from their surroundings.
+    /// Pixels of the depth picture in its file.
+    pub depth_px: usize,
+    /// Those without a valid depth, which were filled from their surroundings.
     pub depth_missing_px: usize,
     /// Pixels of the source farther than the display shows, set to its far end.
     pub depth_clamped_far_px: usize,
@@ -92,6 +95,10 @@ pub struct FrameReport {
     pub colour_clipped: ClippedColours,
     /// Pixels of the frame that the picture does not reach: black, at the far end.
     pub padded_px: usize,
+    /// The EXIF orientations of colour and depth, where they differ and the sizes cannot tell whether that is meant.
+    pub turned_apart: Option<[u8; 2]>,
+    /// Whether the colours' file says that they are of other primaries than those that they are taken for.
+    pub has_foreign_primaries: bool,
 }
 
 /// What the numbers of a depth file mean.
@@ -287,10 +294,15 @@ impl Scene {
             });
         }
         let colour = raster::read_colour(&colour_path)?;
-        let mut report =
-            FrameReport { source: Some(colour.size), colour_clipped: colour.clipped, ..FrameReport::default() };
-
-        let depth = raster::read_depth(&depth_path)?;
+        let depth = raster::read_depth(&depth_path, colour_path != depth_path)?;
+        let mut report = FrameReport {
+            source: Some(colour.size),
+            depth_px: depth.size.pixels(),
+            colour_clipped: colour.clipped,
+            turned_apart: turned_apart(&colour, &depth),
+            has_foreign_primaries: colour.has_foreign_primaries,
+            ..FrameReport::default()
+        };
         if colour_path == depth_path && colour.is_luminance && depth.is_luminance {
             return Err(SceneError::Picture {
                 path: colour_path,
@@ -325,6 +337,16 @@ impl Scene {
         }
         Ok(ScenePicture { resolution: colour.size, linear: colour.linear, depth_dpt, report })
     }
+}
+
+/// The EXIF orientations, where they differ and sizes that agree say nothing of that: a quarter turn of a picture that is
+/// not square was made of the other's pixels, too.
+fn turned_apart(colour: &ColourRaster, depth: &DepthRaster) -> Option<[u8; 2]> {
+    let turns = [colour.turned, depth.turned];
+    let [of_colour, of_depth] = turns.map(|turned| turned.to_exif());
+    // From 5 on width and height change places.
+    let keeps_size = colour.size.width == colour.size.height || (of_colour < 5) == (of_depth < 5);
+    (of_colour != of_depth && keeps_size).then_some([of_colour, of_depth])
 }
 
 /// The place of each depth in the range of `geometry`, clamped to it; counts what was clamped.

@@ -8,6 +8,7 @@ use std::path::Path;
 
 use exr::image::{AnyChannel, FlatSamples};
 use exr::meta::MetaData;
+use exr::meta::attribute::Chromaticities;
 use exr::prelude::{ReadChannels, ReadLayers};
 use holod_calibration::Resolution;
 use image::metadata::Orientation;
@@ -21,6 +22,8 @@ struct Picture {
     size: Resolution,
     /// Position of the display window's first pixel.
     origin: [i64; 2],
+    /// What primaries and white its colours are of, where it says so.
+    chromaticities: Option<Chromaticities>,
     channels: Vec<Channel>,
 }
 
@@ -59,12 +62,22 @@ pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
     }
     let mut clipped = ClippedColours::default();
     is_outside.into_iter().for_each(|[above_white, below_black]| clipped.count(above_white, below_black));
-    Ok(ColourRaster { size: picture.size, turned: Orientation::NoTransforms, linear, clipped, is_luminance })
+    let has_foreign_primaries = !is_luminance && picture.chromaticities.is_some_and(|of| !are_rec709(of));
+    let (size, turned) = (picture.size, Orientation::NoTransforms);
+    Ok(ColourRaster { size, turned, linear, clipped, is_luminance, has_foreign_primaries })
 }
 
-pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
+/// Whether colours are of the primaries and the white of sRGB.
+fn are_rec709(Chromaticities { red, green, blue, white }: Chromaticities) -> bool {
+    const REC709: [[f32; 2]; 4] = [[0.64, 0.33], [0.30, 0.60], [0.15, 0.06], [0.3127, 0.3290]];
+    let alike = |found: f32, expected: f32| (found - expected).abs() <= 1e-3;
+    let all = [red, green, blue, white].into_iter().zip(REC709);
+    all.into_iter().all(|(found, [x, y])| alike(found.x(), x) && alike(found.y(), y))
+}
+
+pub(super) fn read_depth(path: &Path, is_alone: bool) -> Result<DepthRaster, SceneError> {
     let picture = read(path)?;
-    let channel = picture.depth(path)?;
+    let channel = picture.depth(path, is_alone)?;
     let mut values = vec![f32::NAN; picture.size.pixels()];
     picture.place(channel, |index, value| values[index] = value);
     let numbers = DepthNumbers { values, full_scale: None };
@@ -77,7 +90,7 @@ impl Picture {
     /// them may have luminance.
     fn colours(&self, path: &Path) -> Result<[&Channel; 3], SceneError> {
         let mut candidates = Vec::new();
-        for layer in self.layers() {
+        for layer in self.layers().into_iter().filter(|layer| !layer.is_called("Depth")) {
             if let [Some(red), Some(green), Some(blue)] = ["R", "G", "B"].map(|name| layer.channel(name)) {
                 let rules = [layer.name.is_empty(), layer.is_called("Combined"), red.is_bare, true];
                 let rank = rules.iter().take_while(|keeps| !**keeps).count();
@@ -90,15 +103,16 @@ impl Picture {
         self.best(path, candidates, "colours", expected)
     }
 
-    /// Z in no layer or in one called Depth. A file of depth alone often calls it luminance.
-    fn depth(&self, path: &Path) -> Result<&Channel, SceneError> {
+    /// Z in no layer or in one called Depth. A file of depth alone often calls it luminance, or anything, or has it as
+    /// grey.
+    fn depth(&self, path: &Path, is_alone: bool) -> Result<&Channel, SceneError> {
         let mut candidates = Vec::new();
         for layer in self.layers() {
             let z = layer.channel("Z").filter(|_| !layer.is_vector());
             let named = match &layer.channels[..] {
                 _ if !layer.is_called("Depth") => layer.channel("Depth"),
                 [only] => Some(*only),
-                _ => z,
+                _ => z.or_else(|| layer.grey()),
             };
             let found = match (named, z) {
                 (_, Some(z)) if layer.name.is_empty() => Some((0, z)),
@@ -108,7 +122,18 @@ impl Picture {
             };
             candidates.extend(found.map(|(rank, channel)| (rank, channel.name.as_str(), channel)));
         }
-        let expected = "one depth channel: Z in no layer or in one called Depth, without X and Y, or else Y";
+        if !is_alone {
+            let expected = "one depth channel: Z in no layer or in one called Depth, without X and Y, or else Y";
+            return self.best(path, candidates, "depth", expected);
+        }
+        if candidates.is_empty() {
+            let all = self.layers();
+            let grey = all.iter().filter_map(Layer::grey);
+            let only = self.channels.first().filter(|_| self.channels.len() == 1);
+            candidates.extend(only.into_iter().chain(grey).map(|channel| (0, channel.name.as_str(), channel)));
+        }
+        let expected = "one depth channel: Z in no layer or in one called Depth, without X and Y, or else Y, the only \
+                        channel, or R, G and B that are equal everywhere";
         self.best(path, candidates, "depth", expected)
     }
 
@@ -187,6 +212,18 @@ impl Channel {
 impl<'a> Layer<'a> {
     fn channel(&self, component: &str) -> Option<&'a Channel> {
         self.channels.iter().copied().find(|channel| channel.component().eq_ignore_ascii_case(component))
+    }
+
+    /// Red, where green and blue are the same everywhere.
+    fn grey(&self) -> Option<&'a Channel> {
+        let [red, green, blue] = ["R", "G", "B"].map(|name| self.channel(name));
+        let red = red?;
+        let is_alike = |other: &Channel| {
+            let pairs = red.samples.values_as_f32().zip(other.samples.values_as_f32());
+            red.samples.len() == other.samples.len()
+                && pairs.into_iter().all(|(a, b)| a == b || a.is_nan() && b.is_nan())
+        };
+        (is_alike(green?) && is_alike(blue?)).then_some(red)
     }
 
     /// Whether that is the last part of its name.
@@ -271,5 +308,6 @@ fn read(path: &Path) -> Result<Picture, SceneError> {
             })
         })
         .collect();
-    Ok(Picture { size, origin: [i64::from(window.position.x()), i64::from(window.position.y())], channels })
+    let origin = [i64::from(window.position.x()), i64::from(window.position.y())];
+    Ok(Picture { size, origin, chromaticities: image.attributes.chromaticities, channels })
 }

@@ -32,15 +32,16 @@ pub(super) fn read_colour(path: &Path) -> Result<ColourRaster, SceneError> {
                 linear: linear_planes(&picture),
                 clipped: ClippedColours::default(),
                 is_luminance: false,
+                has_foreign_primaries: false,
             })
         }
     }
 }
 
-/// Reads the depth numbers of a picture.
-pub(super) fn read_depth(path: &Path) -> Result<DepthRaster, SceneError> {
+/// Reads the depth numbers of a picture. `is_alone`: its file is not that of the colours.
+pub(super) fn read_depth(path: &Path, is_alone: bool) -> Result<DepthRaster, SceneError> {
     match format_of(path)? {
-        Format::OpenExr => openexr::read_depth(path),
+        Format::OpenExr => openexr::read_depth(path, is_alone),
         Format::Other => {
             let (picture, turned) = decode(path)?;
             let size = Resolution { width: picture.width() as usize, height: picture.height() as usize };
@@ -94,7 +95,14 @@ fn decode(path: &Path) -> Result<(DynamicImage, Orientation), SceneError> {
             return Err(damaged("the JPEG data end before the end-of-image marker".into()));
         }
     }
-    let damaged = |error: ImageError| damaged(error.to_string());
+    let damaged = |error: ImageError| match error {
+        ImageError::Unsupported(_) => SceneError::Picture {
+            path: path.to_owned(),
+            found: error.to_string(),
+            expected: format!("{FORMATS}: export it as one of them"),
+        },
+        _ => damaged(error.to_string()),
+    };
     let mut decoder = open()?.into_decoder().map_err(damaged)?;
     let (width, height) = decoder.dimensions();
     check_size(path, width as usize, height as usize)?;

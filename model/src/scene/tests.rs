@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use crc::{CRC_32_ISO_HDLC, Crc};
 use exr::image::{AnyChannel, AnyChannels, FlatSamples, Image, Layer};
 use exr::math::Vec2;
-use exr::meta::attribute::{IntegerBounds, Text};
+use exr::meta::attribute::{Chromaticities, IntegerBounds, Text};
 use exr::meta::header::{ImageAttributes, LayerAttributes};
 use exr::prelude::{Encoding, WritableImage};
 use image::{ImageBuffer, Luma, LumaA, Rgb, Rgba};
@@ -119,6 +119,7 @@ fn a_pair_of_pngs_becomes_amplitude_and_normalised_depth() {
     }
     let expected = FrameReport {
         source: Some(size(3, 1)),
+        depth_px: 3,
         depth_missing_px: 1,
         depth_range: [frame.depth_normalised[1], frame.depth_normalised[0]],
         ..FrameReport::default()
@@ -172,7 +173,7 @@ fn depths_of_few_bits_are_the_numbers_of_the_file() {
         (4, &[0x01, 0x23, 0x4e, 0xf1], [0.0, 1.0, 2.0, 3.0, 4.0, 14.0, 15.0, 1.0]),
     ] {
         few_bits(&path, bits, row);
-        let read = raster::read_depth(&path).unwrap().numbers;
+        let read = raster::read_depth(&path, false).unwrap().numbers;
         assert_eq!(
             (&read.values[..], read.full_scale),
             (&numbers[..], Some(f32::from((1_u8 << bits) - 1))),
@@ -188,7 +189,7 @@ fn a_depth_that_is_wholly_transparent_is_none() {
     let files = Files::new();
     let path = files.path("d.png");
     let depths = || {
-        let numbers = raster::read_depth(&path).unwrap().numbers.values;
+        let numbers = raster::read_depth(&path, false).unwrap().numbers.values;
         numbers.iter().map(|number| (!number.is_nan()).then_some(*number as u32)).collect::<Vec<_>>()
     };
     let [there, faint, gone] = [65535_u16, 1, 0];
@@ -289,7 +290,7 @@ fn an_exrs_colours_are_those_of_one_layer_and_its_depth_is_no_vector() {
     let files = Files::new();
     let path = files.path("layers.exr");
     let colours = || raster::read_colour(&path).map(|colour| [0, 2, 4].map(|plane| colour.linear[plane]));
-    let depth = || raster::read_depth(&path).map(|depth| depth.numbers.values[0]);
+    let depth = || raster::read_depth(&path, false).map(|depth| depth.numbers.values[0]);
     let rgb = |layer: &str, red: f32| {
         [("R", red), ("G", red + 0.01), ("B", red + 0.02)].map(|(name, value)| (format!("{layer}{name}"), value))
     };
@@ -419,6 +420,125 @@ fn a_sequence_has_as_many_frames_as_files() {
 }
 
 #[test]
+fn a_sequence_with_a_gap_is_refused_with_the_first_file_that_is_missing() {
+    let files = Files::new();
+    let colour = |index: u32| files.colour8(&format!("c{index}.png"), 2, 2, |_, _| [50; 3]);
+    let depth = |index: u32| {
+        std::fs::create_dir_all(files.path(&format!("{index:03}"))).unwrap();
+        files.depth16(&format!("{index:03}/d.png"), 2, 2, |_, _| 500);
+    };
+    let opened = |rest: &str| {
+        let names = "colour = \"c{}.png\"\ndepth = \"{:03}/d.png\"\n";
+        files.describe(&format!("{names}depth_encoding = \"millimetres\"\nfps = 25.0\n{rest}"));
+        Scene::open(&files.spec(), None).map(|scene| scene.frames()).map_err(|error| error.to_string())
+    };
+    (0..4).chain(6..10).for_each(|index| {
+        colour(index);
+        depth(index);
+    });
+    colour(5);
+    let refused = |rest: &str, says: &[&str]| {
+        let why = opened(rest).unwrap_err();
+        assert!(says.iter().all(|part| why.contains(part)), "{why}");
+    };
+    refused("", &["scene.toml, line 1: `count`", "c4.png is missing", "number 9", "supply it", "`count = 4`"]);
+    assert_eq!(opened("count = 4"), Ok(4));
+    refused("first = 5", &["005/d.png is missing", "number 9", "`first`"]);
+    assert_eq!((opened("first = 6"), opened("first = 8")), (Ok(4), Ok(2)));
+    assert_eq!(opened("first = 1\nstep = 10"), Ok(1), "what is between the steps is none of it");
+    // The last of one kind has none of the other.
+    colour(10);
+    refused("first = 6", &["010/d.png is missing", "number 10", "`count = 4`"]);
+    std::fs::remove_file(files.path("c10.png")).unwrap();
+    std::fs::write(files.path("c11.txt"), "x").unwrap();
+    std::fs::write(files.path("c0012.png"), "x").unwrap();
+    assert_eq!(opened("first = 6"), Ok(4), "other names are no frames");
+}
+
+#[test]
+fn orientations_that_differ_are_reported_where_sizes_cannot_tell() {
+    let files = Files::new();
+    let pair = format!("{},{}", files.path("c.jpg").display(), files.path("d.jpg").display());
+    let report = |of_colour, of_depth| {
+        jpeg_turned(&files.path("c.jpg"), of_colour);
+        jpeg_turned(&files.path("d.jpg"), of_depth);
+        let scene =
+            Scene::open(&pair, Some(DepthEncoding::NormalisedDioptres { far_dpt: 0.0, near_dpt: 2.0 })).unwrap();
+        scene.load(0, &BENCH, None, Fit::Native).unwrap().1.turned_apart
+    };
+    assert_eq!([report(1, 1), report(3, 3), report(6, 6)], [None; 3]);
+    assert_eq!([report(3, 1), report(1, 2), report(6, 8)], [Some([3, 1]), Some([1, 2]), Some([6, 8])]);
+    // An upright depth picture of the size that the photo has once it is turned.
+    files.depth16("d.png", 8, 16, |x, _| 500 + x as u16);
+    let upright = Scene::open(&pair.replace("d.jpg", "d.png"), Some(DepthEncoding::Millimetres)).unwrap();
+    assert_eq!(upright.load(0, &BENCH, None, Fit::Native).unwrap().1.turned_apart, None);
+}
+
+#[test]
+fn primaries_that_are_not_rec_709s_are_reported() {
+    let files = Files::new();
+    let path = files.path("c.exr");
+    let with = |chromaticities| {
+        let channels = ["B", "G", "R"].map(|name| AnyChannel::new(name, FlatSamples::F32(vec![0.5; 2])));
+        let channels = AnyChannels::sort(channels.into_iter().collect());
+        let layer = Layer::new(Vec2(2, 1), LayerAttributes::default(), Encoding::UNCOMPRESSED, channels);
+        let window = IntegerBounds { position: Vec2(0, 0), size: Vec2(2, 1) };
+        let attributes = ImageAttributes { chromaticities, ..ImageAttributes::new(window) };
+        Image::empty(attributes).with_layer(layer).write().to_file(&path).unwrap();
+        raster::read_colour(&path).unwrap().has_foreign_primaries
+    };
+    let of = |red: (f32, f32), green: (f32, f32), blue: (f32, f32), white: (f32, f32)| {
+        let [red, green, blue, white] = [red, green, blue, white].map(|(x, y)| Vec2(x, y));
+        Some(Chromaticities { red, green, blue, white })
+    };
+    assert!(!with(None));
+    assert!(!with(of((0.64, 0.33), (0.3, 0.6), (0.15, 0.06), (0.3127, 0.329))));
+    assert!(!with(of((0.6405, 0.33), (0.3, 0.6), (0.15, 0.06), (0.3128, 0.3291))), "rounded");
+    assert!(with(of((0.64, 0.33), (0.3, 0.6), (0.15, 0.06), (0.3217, 0.3377))), "another white");
+    assert!(with(of((0.7347, 0.2653), (0.0, 1.0), (0.0001, -0.077), (0.32168, 0.33767))), "ACES AP0");
+}
+
+#[test]
+fn a_depth_file_of_its_own_may_be_grey_or_have_one_channel_of_any_name() {
+    let files = Files::new();
+    let path = files.path("d.exr");
+    let depth = |is_alone| {
+        let read = raster::read_depth(&path, is_alone);
+        read.map(|depth| depth.numbers.values[0]).map_err(|error| error.to_string())
+    };
+    for channels in [
+        &[("V", 3.0)][..],
+        &[("scene.V", 3.0)],
+        &[("B", 3.0), ("G", 3.0), ("R", 3.0)],
+        &[("A", 1.0), ("B", 3.0), ("G", 3.0), ("R", 3.0)],
+        &[("B", f32::INFINITY), ("G", f32::INFINITY), ("R", f32::INFINITY)],
+    ] {
+        write_parts(&path, &[("", channels)]);
+        assert_eq!(depth(true), Ok(channels.last().unwrap().1), "{channels:?}");
+        assert!(depth(false).unwrap_err().contains("expected one depth channel: Z"), "colours are no depth");
+    }
+    for channels in [&[("B", 3.0), ("G", 3.0), ("R", 3.5)][..], &[("U", 3.0), ("V", 3.0)]] {
+        write_parts(&path, &[("", channels)]);
+        assert!(depth(true).unwrap_err().contains("R, G and B that are equal everywhere"), "{channels:?}");
+    }
+    let both =
+        [("Depth.B", 3.0), ("Depth.G", 3.0), ("Depth.R", 3.0), ("view.B", 0.5), ("view.G", 0.5), ("view.R", 0.5)];
+    write_parts(&path, &[("", &both)]);
+    assert_eq!((depth(false), depth(true)), (Ok(3.0), Ok(3.0)));
+    assert_eq!(raster::read_colour(&path).unwrap().linear[0], 0.5, "the only other layer");
+}
+
+#[test]
+fn a_format_that_is_not_read_is_not_called_damaged() {
+    let files = Files::new();
+    let path = files.path("m.tiff");
+    std::fs::write(&path, b"II*\0\x08\0\0\0\0\0\0\0\0\0").unwrap();
+    let error = raster::read_colour(&path).err().unwrap().to_string();
+    assert!(error.contains("m.tiff") && error.contains("export it as one of them"), "{error}");
+    assert!(!error.contains("damaged"), "{error}");
+}
+
+#[test]
 fn damaged_files_are_refused_and_never_half_read() {
     let files = Files::new();
     files.colour8("c.png", 40, 40, |x, y| [(x * y) as u8, x as u8, y as u8]);
@@ -499,7 +619,7 @@ fn a_picture_is_turned_by_its_own_orientation() {
         assert!(said.iter().all(|part| error.contains(part)), "{error}");
     }
     jpeg_turned(&files.path("d.jpg"), 8);
-    let turned = raster::read_depth(&files.path("d.jpg")).unwrap();
+    let turned = raster::read_depth(&files.path("d.jpg"), true).unwrap();
     assert_eq!((turned.size, turned.turned.to_exif()), (size(8, 16), 8), "depth is turned by its own");
 }
 

@@ -58,6 +58,10 @@ fn save(levels: &LevelsFrame, out: &Path, force: bool) -> Result<Vec<PathBuf>, F
             format!("--out {}: expected the name of a PNG file to write", out.display()),
         ));
     }
+    if let Some(found) = out.extension().filter(|extension| !extension.eq_ignore_ascii_case("png")) {
+        let found = found.display();
+        return Err(Failure::new(Exit::Usage, format!("--out: found a file of kind .{found}; expected FILE.png")));
+    }
     let pictures = video_pictures(levels);
     let single = pictures.len() == 1;
     let name = |position: usize, colour: Option<Colour>| match colour {
@@ -70,7 +74,7 @@ fn save(levels: &LevelsFrame, out: &Path, force: bool) -> Result<Vec<PathBuf>, F
     let files: Vec<PathBuf> =
         pictures.iter().enumerate().map(|(position, (colour, _))| name(position, *colour)).collect();
     refuse_existing(files.iter().cloned(), "--out", force)?;
-    for ((_, picture), file) in pictures.iter().zip(&files) {
+    for ((_, picture), file) in pictures.into_iter().zip(&files) {
         results::save_png(picture, file)?;
     }
     Ok(files)
