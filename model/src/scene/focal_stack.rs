@@ -312,7 +312,8 @@ mod tests {
     #[test]
     fn what_is_saved_is_loaded() {
         let folder = tempfile::tempdir().unwrap();
-        let directory = folder.path().join("stack");
+        // With a slash behind it, as shells complete it.
+        let directory = folder.path().join("stack/");
         let image = |number: usize| LinearImage {
             resolution: SIZE,
             pixels: (0..3 * SIZE.pixels()).map(|index| (index + number) as f32 / 64.0).collect(),
