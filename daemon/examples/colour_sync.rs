@@ -121,5 +121,5 @@ fn run(out: &Path) -> Result<(), Failure> {
     };
     let tiles = vec![tile("in step", TimeNs(0)), tile("lasers one field late", field)];
     let sheet = Sheet { title: "One colour frame".into(), rows: vec![tiles], footer: Vec::new() };
-    results::save_png(&sheet.draw(), out)
+    results::save_png(sheet.draw(), out)
 }
