@@ -384,8 +384,8 @@ mod tests {
                 DepthEncoding::NormalisedDioptres { far_dpt: BENCH.depth_far.0, near_dpt: BENCH.depth_near.0 };
             let reading = DepthReading { encoding, scale: None, missing: None };
             let mut dioptres: Vec<f32> = numbers.iter().copied().map(reading.converter(None)).collect();
-            let mut report = FrameReport::default();
-            report.depth_missing_px = fill_missing(&mut dioptres, SIZE).unwrap();
+            let depth_missing_px = fill_missing(&mut dioptres, SIZE).unwrap();
+            let mut report = FrameReport { depth_missing_px, ..FrameReport::default() };
             (normalised(&dioptres, &BENCH, &mut report), report)
         };
         let same = |numbers: &[f32], fills_missing| {
