@@ -219,8 +219,8 @@ pub enum Backend {
     Auto,
     /// Native code on the processor's cores, in single precision.
     Cpu,
-    /// The same with what a network's layers multiply in half precision (bfloat16), where the processor gains by that:
-    /// faster, a little less exact.
+    /// The same with what a network's layers multiply in half precision (bfloat16, or with AVX2 integers of 16 bits),
+    /// where the processor gains by that: faster, a little less exact.
     CpuHalf,
     /// A GPU by Vulkan, in single precision; where there is none, a processor that plays one, which is slow.
     Gpu,

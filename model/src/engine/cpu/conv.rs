@@ -7,9 +7,9 @@
 //! and ∞ it is 4 times.
 
 use super::feature_map::{FeatureMap, TILE};
-use super::product::{ROWS, Shape, panel_place, panels_len};
+use super::product::{ROWS, Shape, integers_scale, panel_place, panels_len};
 use super::workers::WORKERS;
-use crate::simd::{Products, Simd, Task};
+use crate::simd::{MOST_LANES, Products, Simd, Task};
 
 pub(super) const TAPS: usize = 9;
 /// Inputs of a tile each way, and points.
@@ -17,6 +17,8 @@ const POINTS: usize = TILE + 2;
 /// The finite points are 0, ±NEAR and ±FAR.
 const NEAR: f32 = 0.625;
 const FAR: f32 = 1.5;
+/// No input's magnitude grows by more on its way to a point; the near ones have it.
+const POINTS_GAIN: f32 = (1.0 + FAR * FAR) * (1.0 + NEAR);
 /// Between the rows of a buffer, so that they do not fall on the same lines of a cache.
 const ROW_PAD: usize = 16;
 
@@ -33,19 +35,40 @@ pub(super) enum Epilogue {
 
 /// What a layer does with its sums: the bias of each channel of the output map, and the epilogue.
 pub(super) struct Activation {
+    /// Of each channel, what its sums are multiplied by where its weights are integers: their scale's reciprocal.
+    pub(super) scale: Vec<f32>,
     pub(super) bias: Vec<f32>,
     pub(super) epilogue: Epilogue,
     pub(super) leaky_slope: f32,
 }
 
 impl Activation {
-    /// Turns a vector of sums, whose bias is given, into what is stored at `place`.
+    /// Room for so many channels, in whole vectors; all biases are zero.
+    pub(super) fn new(channels: usize, epilogue: Epilogue, leaky_slope: f32) -> Self {
+        Self { scale: vec![1.0; channels], bias: vec![0.0; channels], epilogue, leaky_slope }
+    }
+
+    /// The scale and the bias of a vector of channels from `channel` on, whose inputs' scale has the reciprocal `scale`.
+    #[inline(always)]
+    pub(super) fn of_channels<S: Simd>(&self, simd: S, channel: usize, scale: f32) -> [S::Vector; 2] {
+        let bias = simd.read(&self.bias[channel..]);
+        let scale = simd.splat(scale);
+        [if S::INTEGERS { simd.mul(simd.read(&self.scale[channel..]), scale) } else { scale }, bias]
+    }
+
+    /// Turns a vector of sums, whose scale and bias are given, into what is stored at `place`.
     ///
     /// # Safety
     /// A vector can be loaded from `place` and stored there.
     #[inline(always)]
-    pub(super) unsafe fn store<S: Simd>(&self, simd: S, sum: S::Vector, bias: S::Vector, place: *mut f32) {
-        let mut sum = simd.add(sum, bias);
+    pub(super) unsafe fn store<S: Simd>(
+        &self,
+        simd: S,
+        sum: S::Vector,
+        [scale, bias]: [S::Vector; 2],
+        place: *mut f32,
+    ) {
+        let mut sum = if S::INTEGERS { simd.mul_add(sum, scale, bias) } else { simd.add(sum, bias) };
         // SAFETY: the caller's promise.
         unsafe {
             if self.epilogue == Epilogue::ResidualLeaky {
@@ -89,7 +112,7 @@ impl PlainConv {
             out_stride,
             shape,
             weights: vec![0.0; POINTS * POINTS * shape.weights_len()],
-            activation: Activation { bias: vec![0.0; out_stride], epilogue, leaky_slope },
+            activation: Activation::new(out_stride, epilogue, leaky_slope),
             products,
         }
     }
@@ -103,19 +126,30 @@ impl PlainConv {
         weight: impl Fn(usize, usize, usize) -> f32,
     ) {
         for (output, value) in bias.enumerate() {
+            let points_of = |input| weight_points(|tap| weight(output, input, tap));
+            let scale =
+                if self.products.integers() { self.weights_scale((0..inputs.len()).map(points_of)) } else { 1.0 };
+            self.activation.scale[output] = 1.0 / scale;
             self.activation.bias[output] = value;
             for (input, channel) in inputs.iter().enumerate() {
-                let rows: [[f64; POINTS]; 3] = std::array::from_fn(|row| {
-                    weight_points(std::array::from_fn(|column| weight(output, input, 3 * row + column).into()))
-                });
-                for column in 0..POINTS {
-                    for (row, value) in weight_points(rows.map(|row| row[column])).into_iter().enumerate() {
-                        let weights = &mut self.weights[(row * POINTS + column) * self.shape.weights_len()..];
-                        self.shape.set_weight(weights, [0, *channel, output], value as f32);
-                    }
+                let weights = self.weights.chunks_exact_mut(self.shape.weights_len());
+                for (weights, value) in weights.zip(points_of(input).as_flattened()) {
+                    self.shape.set_weight(weights, [0, *channel, output], scale * *value as f32);
                 }
             }
         }
+    }
+
+    /// What the weights of an output are multiplied by, given those of each input at the points.
+    fn weights_scale(&self, points: impl Iterator<Item = [[f64; POINTS]; POINTS]>) -> f32 {
+        let (mut largest, mut together) = (0.0_f64, [0.0; POINTS * POINTS]);
+        for points in points {
+            for (together, value) in together.iter_mut().zip(points.as_flattened()) {
+                largest = largest.max(value.abs());
+                *together += value.abs();
+            }
+        }
+        self.shape.weights_scale(largest as f32, together.into_iter().fold(0.0, f64::max) as f32)
     }
 
     /// Runs the convolution over `input` into `output`.
@@ -157,8 +191,21 @@ impl PlainConv {
     }
 }
 
+/// G·g·Gᵀ: the weights of the taps, row-major over the kernel, at the points, rows first.
+fn weight_points(weight: impl Fn(usize) -> f32) -> [[f64; POINTS]; POINTS] {
+    let rows: [[f64; POINTS]; 3] =
+        std::array::from_fn(|row| taps_at_points(std::array::from_fn(|column| weight(3 * row + column).into())));
+    let mut points = [[0.0; POINTS]; POINTS];
+    for column in 0..POINTS {
+        for (points, value) in points.iter_mut().zip(taps_at_points(rows.map(|row| row[column]))) {
+            points[column] = value;
+        }
+    }
+    points
+}
+
 /// G: the weights of three taps in a row or column, at the points.
-fn weight_points(taps: [f64; 3]) -> [f64; POINTS] {
+fn taps_at_points(taps: [f64; 3]) -> [f64; POINTS] {
     let (near, far) = (f64::from(NEAR), f64::from(FAR));
     let at = |point: f64, norm: f64| (taps[0] + point * (taps[1] + point * taps[2])) / norm;
     let near_norm = 2.0 * near * near * (near * near - far * far);
@@ -219,6 +266,8 @@ pub(super) struct Scratch {
 pub(super) struct WorkerScratch {
     /// Six rows of the input at its vertical points [point, pixel, channel].
     inputs: Vec<f32>,
+    /// Of each pixel of them, a vector of magnitudes, the largest of whose is that of its six values of all channels.
+    magnitudes: Vec<f32>,
     /// Of one vertical point, the panels at each horizontal point, before the products and after.
     points: Vec<f32>,
     products: Vec<f32>,
@@ -241,7 +290,8 @@ impl Scratch {
 impl WorkerScratch {
     /// Makes room for `layer` too.
     pub(super) fn fit(&mut self, layer: &PlainConv) {
-        let Self { inputs, points, products, sums } = self;
+        let Self { inputs, magnitudes, points, products, sums } = self;
+        magnitudes.resize((ROWS * TILE + 2) * MOST_LANES, 0.0);
         for (buffer, row_len) in [
             (inputs, layer.inputs_row_len()),
             (points, layer.shape.inputs_len()),
@@ -286,43 +336,64 @@ impl Task for TileRow<'_> {
     fn run<S: Simd>(mut self, simd: S) {
         for x in (0..self.width).step_by(ROWS * TILE) {
             let pixels = (self.width - x).min(ROWS * TILE);
-            self.transform_columns(simd, x, pixels.div_ceil(TILE));
+            let scales = self.transform_columns(simd, x, pixels.div_ceil(TILE));
             for point in 0..POINTS {
-                self.multiply(simd, point, pixels.div_ceil(TILE));
+                self.multiply(simd, point, &scales[..pixels.div_ceil(TILE)]);
             }
-            self.finish_columns(simd, x, pixels);
+            self.finish_columns(simd, x, pixels, &scales);
         }
     }
 }
 
 impl TileRow<'_> {
-    /// Brings the columns of the strip that begins at pixel `x` to their points.
+    /// Brings the columns of the strip that begins at pixel `x` to their points, and returns for each tile, where factors
+    /// are integers, what its points are multiplied by to be some and what its sums are multiplied by then.
     #[inline(always)]
-    fn transform_columns<S: Simd>(&mut self, simd: S, x: usize, tiles: usize) {
-        let Self { conv: &PlainConv { in_channels, .. }, rows, row_len, stride, ref mut scratch, .. } = *self;
-        let pixels = tiles * TILE + 2;
-        let to_row_len = self.conv.inputs_row_len();
-        let (from, to) = (&rows[x * stride..], &mut scratch.inputs[..POINTS * to_row_len]);
-        // Pixels of which all channels are read are one run.
-        let (runs, len) = if stride == in_channels { (1, pixels * in_channels) } else { (pixels, in_channels) };
-        assert!(in_channels.is_multiple_of(S::LANES) && to_row_len >= runs * len);
-        assert!(from.len() >= (POINTS - 1) * row_len + (runs - 1) * stride + len);
-        for (run, place) in (0..runs).flat_map(|run| (0..len).step_by(S::LANES).map(move |place| (run, place))) {
-            // SAFETY: `len` is a multiple of LANES; so much is readable in each run of each of six rows of `from`, and
-            // writable in each of `to`.
-            unsafe {
-                let values = simd.load_strided(from.as_ptr().add(run * stride + place), row_len);
-                for (point, value) in to_points(simd, values).into_iter().enumerate() {
-                    simd.store(to.as_mut_ptr().add(point * to_row_len + run * len + place), value);
+    fn transform_columns<S: Simd>(&mut self, simd: S, x: usize, tiles: usize) -> [[f32; 2]; ROWS] {
+        let Self { conv, rows, row_len, stride, ref mut scratch, .. } = *self;
+        let &PlainConv { in_channels, shape, .. } = conv;
+        let WorkerScratch { inputs, magnitudes, .. } = &mut **scratch;
+        let (pixels, to_row_len) = (tiles * TILE + 2, conv.inputs_row_len());
+        let (from, to) = (&rows[x * stride..], &mut inputs[..POINTS * to_row_len]);
+        assert!(tiles <= ROWS && in_channels.is_multiple_of(S::LANES) && to_row_len >= pixels * in_channels);
+        assert!(from.len() >= (POINTS - 1) * row_len + (pixels - 1) * stride + in_channels);
+        for (pixel, to_magnitudes) in magnitudes.chunks_exact_mut(S::LANES).enumerate().take(pixels) {
+            let mut magnitude = simd.splat(0.0);
+            for channel in (0..in_channels).step_by(S::LANES) {
+                // SAFETY: `channel` and the LANES values after it are readable of this pixel in each of six rows of
+                // `from`, and writable in each of `to`.
+                unsafe {
+                    let values = simd.load_strided(from.as_ptr().add(pixel * stride + channel), row_len);
+                    if S::INTEGERS {
+                        for value in values {
+                            magnitude = simd.larger_magnitude(magnitude, value);
+                        }
+                    }
+                    let place = to.as_mut_ptr().add(pixel * in_channels + channel);
+                    for (point, value) in to_points(simd, values).into_iter().enumerate() {
+                        simd.store(place.add(point * to_row_len), value);
+                    }
                 }
             }
+            if S::INTEGERS {
+                simd.write(to_magnitudes, magnitude);
+            }
         }
+        let mut scales = [[1.0; 2]; ROWS];
+        if S::INTEGERS {
+            let largest = shape.largest_input() / (POINTS_GAIN * POINTS_GAIN);
+            for (tile, scales) in scales.iter_mut().enumerate().take(tiles) {
+                *scales = integers_scale(simd, &magnitudes[tile * TILE * S::LANES..][..POINTS * S::LANES], largest);
+            }
+        }
+        scales
     }
 
     /// Brings the rows at one vertical point to their points, multiplies, and brings the products to pixels.
     #[inline(always)]
-    fn multiply<S: Simd>(&mut self, simd: S, point: usize, tiles: usize) {
-        let Self { conv, scratch: WorkerScratch { inputs, points, products, sums }, .. } = self;
+    fn multiply<S: Simd>(&mut self, simd: S, point: usize, scales: &[[f32; 2]]) {
+        let Self { conv, scratch: WorkerScratch { inputs, points, products, sums, .. }, .. } = self;
+        let tiles = scales.len();
         let PlainConv { in_channels, out_stride, shape, .. } = **conv;
         let (points_len, products_len, weights_len) = (shape.inputs_len(), shape.outputs_len(), shape.weights_len());
         let from = &inputs[point * conv.inputs_row_len()..][..conv.inputs_row_len()];
@@ -331,14 +402,18 @@ impl TileRow<'_> {
             from.len() >= (tiles * TILE + 2) * in_channels && tiles <= ROWS && in_channels.is_multiple_of(S::LANES)
         );
         assert!(points_len * S::FACTORS >= panels_len(in_channels));
-        for channel in (0..in_channels).step_by(S::LANES) {
-            for tile in 0..tiles {
+        for (tile, [scale, _]) in scales.iter().enumerate() {
+            let scale = simd.splat(*scale);
+            for channel in (0..in_channels).step_by(S::LANES) {
                 // SAFETY: a tile's six pixels lie in `from`, and its row of the channel's panel in each point's panels.
                 unsafe {
                     let pixel = from.as_ptr().add(tile * TILE * in_channels + channel);
                     let values = simd.load_strided(pixel, in_channels);
                     let place = points.as_mut_ptr().add(panel_place(tile, channel) / S::FACTORS);
-                    for (point, value) in to_points(simd, values).into_iter().enumerate() {
+                    for (point, mut value) in to_points(simd, values).into_iter().enumerate() {
+                        if S::INTEGERS {
+                            value = simd.mul(value, scale);
+                        }
                         simd.store_factors(place.add(point * points_len), value);
                     }
                 }
@@ -356,8 +431,8 @@ impl TileRow<'_> {
         let to = &mut sums[point * conv.sums_row_len()..][..conv.sums_row_len()];
         assert!(to.len() >= tiles * TILE * out_stride && out_stride.is_multiple_of(S::LANES));
         assert!(products_len >= panels_len(out_stride));
-        for channel in (0..out_stride).step_by(S::LANES) {
-            for tile in 0..tiles {
+        for tile in 0..tiles {
+            for channel in (0..out_stride).step_by(S::LANES) {
                 // SAFETY: as above, from each point's panels to a tile's four pixels in `to`.
                 unsafe {
                     let place = products.as_ptr().add(panel_place(tile, channel));
@@ -373,7 +448,7 @@ impl TileRow<'_> {
 
     /// Brings the columns of sums to rows of the output, from pixel `x` on.
     #[inline(always)]
-    fn finish_columns<S: Simd>(&mut self, simd: S, x: usize, pixels: usize) {
+    fn finish_columns<S: Simd>(&mut self, simd: S, x: usize, pixels: usize, scales: &[[f32; 2]; ROWS]) {
         let Self { conv, scratch, output_rows, out_row_len, .. } = self;
         let PlainConv { out_stride, ref activation, .. } = **conv;
         let (from, from_row_len) = (&scratch.sums[..POINTS * conv.sums_row_len()], conv.sums_row_len());
@@ -383,15 +458,16 @@ impl TileRow<'_> {
         assert!(from_row_len >= pixels * out_stride && activation.bias.len() == out_stride);
         assert!(out_stride.is_multiple_of(S::LANES));
         for pixel in 0..pixels {
+            let [_, scale] = scales[pixel / TILE];
             for channel in (0..out_stride).step_by(S::LANES) {
                 let place = pixel * out_stride + channel;
                 // SAFETY: `place` and the LANES values after it lie in each of six rows of `from` and of `rows` of
                 // `to`; `channel` likewise in the bias.
                 unsafe {
                     let values = simd.load_strided(from.as_ptr().add(place), from_row_len);
-                    let bias = simd.load(activation.bias.as_ptr().add(channel));
+                    let scale_and_bias = activation.of_channels(simd, channel, scale);
                     for (row, value) in from_points(simd, values).into_iter().enumerate().take(rows) {
-                        activation.store(simd, value, bias, to.as_mut_ptr().add(row * *out_row_len + place));
+                        activation.store(simd, value, scale_and_bias, to.as_mut_ptr().add(row * *out_row_len + place));
                     }
                 }
             }
@@ -409,8 +485,9 @@ mod tests {
     /// Largest error allowed, over the output's root mean square: a quarter of what stages of whole networks may have,
     /// which are judged by their largest value.
     const TOLERANCE: f64 = 2e-5;
-    /// The same of bfloat16s, which have 8 bits.
+    /// The same of bfloat16s, which have 8 bits, and of integers.
     const HALF_TOLERANCE: f64 = 0.15;
+    const INTEGERS_TOLERANCE: f64 = 0.05;
     /// Between sets whose points differ in the last bit, so that few of them are rounded the other way.
     const ROUNDED_ALIKE: f64 = 1e-2;
     const SLOPE: f32 = 0.1;
@@ -506,7 +583,11 @@ mod tests {
                     .flat_map(|(x, y)| (0..channels).map(move |channel| expected(size, epilogue, [x, y, channel])))
                     .collect();
                 let context = format!("{size:?} {epilogue:?} on {}", products.name());
-                let tolerance = if products.factors() == 1 { TOLERANCE } else { HALF_TOLERANCE };
+                let tolerance = match (products.factors(), products.integers()) {
+                    (1, _) => TOLERANCE,
+                    (_, false) => HALF_TOLERANCE,
+                    (_, true) => INTEGERS_TOLERANCE,
+                };
                 assert_near(&context, outputs(size, epilogue, products), &wanted, tolerance);
             }
         }
@@ -515,8 +596,9 @@ mod tests {
     /// Whichever way factors lie in vectors, and whatever multiplies them, they are rounded alike.
     #[test]
     fn layers_in_half_precision_are_the_same_on_all_sets() {
-        for size in SIZES {
-            let mut half = Products::available().filter(|products| products.factors() == 2);
+        for (size, integers) in SIZES.into_iter().flat_map(|size| [(size, false), (size, true)]) {
+            let is_alike = |products: &Products| products.factors() == 2 && products.integers() == integers;
+            let mut half = Products::available().filter(is_alike);
             let wanted = outputs(size, Epilogue::Leaky, half.next().expect("one of plain Rust"));
             for products in half {
                 let context = format!("{size:?} on {}", products.name());

@@ -1,6 +1,6 @@
 //! Products of rows of channels with packed weights, with as many sums as fit the registers.
 
-use crate::simd::{Products, Simd, factors_of, word_of};
+use crate::simd::{MOST_LANES, Products, Simd};
 
 /// Rows that are multiplied together at most; each kernel's number of rows divides it.
 pub(super) const ROWS: usize = 24;
@@ -9,6 +9,11 @@ pub(super) const ROWS: usize = 24;
 const PANEL: usize = 32;
 /// Words of inputs that are taken together.
 const PAIR: usize = 2;
+/// Integers, where factors are some, are no larger than 16 bits hold, and neither are their products' sums than 32 do.
+const LARGEST_FACTOR: f32 = 32_767.0;
+const SUMS_BELOW: f32 = 2_147_483_648.0;
+/// What is smaller is scaled as if it were this, so that the scale and its reciprocal are numbers.
+const SMALLEST: f32 = 1e-30;
 /// Output channels are rounded up to a multiple of this.
 const OUTPUTS_STEP: usize = 8;
 
@@ -44,14 +49,26 @@ impl Shape {
             + (row - row % together) * block.channels
             + (output - block.first) * together
             + row % together;
-        let word = &mut weights[place];
-        *word = if factors == 1 {
-            weight
-        } else {
-            let mut values = factors_of(*word);
-            values[input % factors] = weight;
-            word_of(values)
-        };
+        self.products.set_factor(&mut weights[place], input % factors, weight);
+    }
+
+    /// The largest magnitude of the integers that inputs are scaled to. They have up to four bits more than weights,
+    /// since these are scaled by their true magnitudes, and inputs by a bound of theirs.
+    pub(super) fn largest_input(self) -> f32 {
+        let inputs = (self.groups * self.words * self.products.factors()) as f32;
+        (16.0 * SUMS_BELOW / inputs).sqrt().min(LARGEST_FACTOR)
+    }
+
+    /// What the weights of an output are multiplied by, of which `largest` is the largest magnitude and `together` what
+    /// all magnitudes that are added up come to; 1 where factors are no integers. No sum overflows then.
+    pub(super) fn weights_scale(self, largest: f32, together: f32) -> f32 {
+        if !self.products.integers() {
+            return 1.0;
+        }
+        let inputs = (self.groups * self.words * self.products.factors()) as f32;
+        // Each may be rounded up by a half.
+        let most_together = SUMS_BELOW / (self.largest_input() + 1.0) - inputs;
+        (most_together / together.max(SMALLEST)).min(LARGEST_FACTOR / largest.max(SMALLEST))
     }
 
     /// Words of the panels that a product of up to [`ROWS`] rows reads.
@@ -78,16 +95,33 @@ impl Shape {
             let outputs = &mut outputs[first / PANEL * ROWS * PANEL + first % PANEL..];
             // Sums, weights and one input fit the registers: 16, or 32 with 16 lanes.
             match (block.channels * block.words_together / S::LANES, block.words_together, S::LANES) {
-                (4, 1, _) => kernel::<S, 4, 1, 2>(simd, self, rows, inputs, weights, outputs),
                 (3, 1, _) => kernel::<S, 3, 1, 3>(simd, self, rows, inputs, weights, outputs),
                 (2, 1, 16) => kernel::<S, 2, 1, 8>(simd, self, rows, inputs, weights, outputs),
-                (2, 1, _) => kernel::<S, 2, 1, 4>(simd, self, rows, inputs, weights, outputs),
+                (2, 1, _) => kernel::<S, 2, 1, 6>(simd, self, rows, inputs, weights, outputs),
                 (_, 1, _) => kernel::<S, 1, 1, 8>(simd, self, rows, inputs, weights, outputs),
                 (3, _, _) => kernel::<S, 3, PAIR, 8>(simd, self, rows, inputs, weights, outputs),
                 (_, _, _) => kernel::<S, 1, PAIR, 12>(simd, self, rows, inputs, weights, outputs),
             }
         }
     }
+}
+
+/// What values are multiplied by to become integers up to `largest`, by the largest magnitude of `values`, in whole
+/// vectors, and its reciprocal. One of the two is no finite number where one of the values is none.
+#[inline(always)]
+pub(super) fn integers_scale<S: Simd>(simd: S, values: &[f32], largest: f32) -> [f32; 2] {
+    let mut magnitudes = simd.splat(0.0);
+    for vector in values.chunks_exact(S::LANES) {
+        magnitudes = simd.larger_magnitude(magnitudes, simd.read(vector));
+    }
+    let mut lanes = [0.0; MOST_LANES];
+    simd.write(&mut lanes, magnitudes);
+    let mut found = SMALLEST.to_bits();
+    for magnitude in lanes {
+        found = found.max(magnitude.to_bits());
+    }
+    let found = f32::from_bits(found);
+    [largest / found, found / largest]
 }
 
 /// Values of the panels of [`ROWS`] rows of `channels`.
@@ -115,7 +149,7 @@ struct Block {
 
 impl Block {
     const fn most_channels(lanes: usize) -> usize {
-        if 4 * lanes < PANEL { 4 * lanes } else { PANEL }
+        if 2 * lanes < PANEL { 2 * lanes } else { PANEL }
     }
 
     /// The block in which an output channel falls.
@@ -155,20 +189,29 @@ fn kernel<S: Simd, const V: usize, const I: usize, const P: usize>(
             for panel in 0..groups * panels {
                 let from = inputs.as_ptr().add((panel * ROWS + row) * panel_words);
                 let used = (group_words - panel % panels * panel_words).min(panel_words);
-                for word in (0..used).step_by(I) {
-                    let weights: [S::Vector; V] = simd.load_strided(weight_row, S::LANES);
-                    weight_row = weight_row.add(V * S::LANES);
-                    for (row, sums) in sums.iter_mut().enumerate() {
-                        let word = from.add(row * panel_words + word);
-                        let value = if I == PAIR { simd.splat_pair(word) } else { simd.splat(*word) };
-                        for (sum, weight) in sums.iter_mut().zip(weights) {
-                            *sum = simd.mul_add_factors(value, weight, *sum);
+                let mut from = from;
+                let end = from.add(used);
+                while from < end {
+                    for _ in 0..PAIR / I {
+                        let weights: [S::Vector; V] = simd.load_strided(weight_row, S::LANES);
+                        weight_row = weight_row.add(V * S::LANES);
+                        for (row, sums) in sums.iter_mut().enumerate() {
+                            let word = from.add(row * panel_words);
+                            let value = if I == PAIR { simd.splat_pair(word) } else { simd.splat(*word) };
+                            for (sum, weight) in sums.iter_mut().zip(weights) {
+                                *sum = simd.mul_add_factors(value, weight, *sum);
+                            }
                         }
+                        from = from.add(I);
                     }
                 }
             }
             for (index, sums) in sums.into_iter().enumerate() {
-                for (vector, sums) in sums.chunks(I).enumerate() {
+                let mut values = sums;
+                for (value, sum) in values.iter_mut().zip(sums) {
+                    *value = simd.values_of_sums(sum);
+                }
+                for (vector, sums) in values.chunks(I).enumerate() {
                     let sum = match *sums {
                         [sum] if I == 1 => sum,
                         [sum] => simd.add_pairs(sum, simd.splat(0.0)),
@@ -177,6 +220,56 @@ fn kernel<S: Simd, const V: usize, const I: usize, const P: usize>(
                     };
                     simd.store(outputs.as_mut_ptr().add((row + index) * PANEL + vector * S::LANES), sum);
                 }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::simd::Task;
+
+    /// Multiplies rows of the largest integers with weights that are all `weight`.
+    struct Largest<'a> {
+        shape: Shape,
+        inputs: usize,
+        weight: f32,
+        output: &'a mut f32,
+    }
+
+    impl Task for Largest<'_> {
+        #[inline(always)]
+        fn run<S: Simd>(self, simd: S) {
+            let Self { shape, inputs, weight, output } = self;
+            let (mut weights, mut words) = (vec![0.0; shape.weights_len()], vec![0.0; shape.inputs_len()]);
+            let mut outputs = vec![0.0; shape.outputs_len()];
+            for input in 0..inputs {
+                shape.set_weight(&mut weights, [0, input, 0], weight);
+                let word = &mut words[panel_place(0, input) / S::FACTORS];
+                shape.products.set_factor(word, input % S::FACTORS, shape.largest_input());
+            }
+            shape.multiply(simd, 1, &words, &weights, &mut outputs);
+            *output = outputs[0];
+        }
+    }
+
+    #[test]
+    fn the_largest_sum_of_integers_does_not_overflow_and_little_more_would() {
+        for products in Products::available().filter(|products| products.integers()) {
+            for inputs in [1, 2, 31, 288, 1000] {
+                let shape = Shape::new(1, inputs, 8, products);
+                let scale = shape.weights_scale(0.7, 0.7 * inputs as f32);
+                let sum_of = |weight: f32| {
+                    let mut sum = 0.0;
+                    products.run(Largest { shape, inputs, weight, output: &mut sum });
+                    f64::from(sum)
+                };
+                let expected = f64::from(shape.largest_input()) * f64::from((0.7 * scale).round()) * inputs as f64;
+                let context = format!("{inputs} on {}: {} of {expected}", products.name(), sum_of(0.7 * scale));
+                assert!((sum_of(0.7 * scale) - expected).abs() < 1e-3 * expected, "{context}");
+                // One or two inputs' weights are bounded by their own 16 bits.
+                assert!(inputs < 3 || sum_of(0.77 * scale) < 0.0, "{context}");
             }
         }
     }
