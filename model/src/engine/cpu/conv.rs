@@ -35,7 +35,7 @@ pub(super) enum Epilogue {
 
 /// What a layer does with its sums: the bias of each channel of the output map, and the epilogue.
 pub(super) struct Activation {
-    /// Of each channel, what its sums are multiplied by where its weights are integers: their scale's reciprocal.
+    /// What a channel's sums are multiplied by where its weights are integers: their scale's reciprocal.
     pub(super) scale: Vec<f32>,
     pub(super) bias: Vec<f32>,
     pub(super) epilogue: Epilogue,
@@ -266,7 +266,7 @@ pub(super) struct Scratch {
 pub(super) struct WorkerScratch {
     /// Six rows of the input at its vertical points [point, pixel, channel].
     inputs: Vec<f32>,
-    /// Of each pixel of them, a vector of magnitudes, the largest of whose is that of its six values of all channels.
+    /// Of each pixel a vector, whose largest value is the largest magnitude of six rows of all its channels.
     magnitudes: Vec<f32>,
     /// Of one vertical point, the panels at each horizontal point, before the products and after.
     points: Vec<f32>,

@@ -95,7 +95,6 @@ impl Shape {
             let outputs = &mut outputs[first / PANEL * ROWS * PANEL + first % PANEL..];
             // Sums, weights and one input fit the registers: 16, or 32 with 16 lanes.
             match (block.channels * block.words_together / S::LANES, block.words_together, S::LANES) {
-                (3, 1, _) => kernel::<S, 3, 1, 3>(simd, self, rows, inputs, weights, outputs),
                 (2, 1, 16) => kernel::<S, 2, 1, 8>(simd, self, rows, inputs, weights, outputs),
                 (2, 1, _) => kernel::<S, 2, 1, 6>(simd, self, rows, inputs, weights, outputs),
                 (_, 1, _) => kernel::<S, 1, 1, 8>(simd, self, rows, inputs, weights, outputs),
@@ -135,7 +134,7 @@ pub(super) const fn panel_place(row: usize, channel: usize) -> usize {
     (channel / PANEL * ROWS + row) * PANEL + channel % PANEL
 }
 
-/// Output channels that are computed together: four vectors of them, or two of 16 lanes, or the rest.
+/// Output channels that are computed together: two vectors of them, or the rest.
 ///
 /// An odd number of half vectors, which a rest has at 16 lanes only, would leave lanes idle. There each output channel
 /// takes two neighbouring lanes, one for the sum over even words and one for that over odd ones: 24 channels fill three
@@ -149,7 +148,7 @@ struct Block {
 
 impl Block {
     const fn most_channels(lanes: usize) -> usize {
-        if 2 * lanes < PANEL { 2 * lanes } else { PANEL }
+        2 * lanes
     }
 
     /// The block in which an output channel falls.
